@@ -145,8 +145,8 @@ def legendre(L: Callable[..., Any], newton: Newton = Newton()) -> Callable[..., 
     discrete, continuous = (callable(L) and accepts(L, count) for count in (5, 4))
     if discrete == continuous:
         raise TypeError(
-            "L must be a function of (t0, t1, q0, v, args), a discrete Lagrangian, or of "
-            f"(t, q, v, args), a continuous one; got {_described(L)}, which "
+            "L must be a function of (t, q, v, args) for a continuous Lagrangian, or of "
+            f"(t0, t1, q0, v, args) for a discrete Lagrangian. The given {_described(L)} "
             + (
                 "accepts both four and five arguments: wrap it in a function of four or of five."
                 if discrete
@@ -376,8 +376,8 @@ def _require_scalar(value: Any, name: str, shape: tuple[int, ...], what: str) ->
     if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
         raise ValueError(
             f"{name} must return a real scalar ({what}); for q0 of shape {shape} it returned an "
-            f"array of shape {value.shape}, dtype {value.dtype}. Sum its entries with jnp.sum, or "
-            "take one component."
+            f"array of shape {value.shape}, dtype {value.dtype}. Return one floating-point number: "
+            "sum an array with jnp.sum or take one component, and take jnp.real of a complex value."
         )
     return value
 

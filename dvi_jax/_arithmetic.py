@@ -200,8 +200,8 @@ class FixedPoint(Arithmetic):
         mantissa, exponent = math.frexp(quantum)
         if mantissa != 0.5:
             raise ValueError(
-                f"quantum must be a power of two, so that multiples of it are exact; got "
-                f"{quantum!r}, which lies between 2.0**{exponent - 1} and 2.0**{exponent}."
+                f"quantum must be a power of two, got {quantum!r}. The nearest powers of two are "
+                f"2.0**{exponent - 1} and 2.0**{exponent}: use one of these."
             )
 
     def prepare(self, method, equations, interval, q0, p0):
@@ -217,9 +217,9 @@ class FixedPoint(Arithmetic):
         ):
             raise ValueError(
                 "arithmetic=dvi.FixedPoint(...) requires steps that are explicit forwards and "
-                "backwards. In this system ∂H_D/∂q0 or the force depends on p1, or ∂H_D/∂p1 "
-                "depends on q0. Use a separable H_D = T(p1) + V(q0) with a force that depends on "
-                "q0 and t only, or arithmetic=dvi.Compensated()."
+                "backwards, but this system has implicit steps. Use a separable H_D = T(p1) + "
+                "V(q0), perturbation included, and a force that depends on q0 and t only. For "
+                "other systems use arithmetic=dvi.Compensated()."
             )
         # Both the quantum and its reciprocal, by which a state is multiplied, must be normal.
         smallest, largest = jnp.finfo(q0.dtype).tiny, 1 / jnp.finfo(q0.dtype).tiny

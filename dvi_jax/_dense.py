@@ -66,8 +66,8 @@ def requested_times(save: Save, task: Task, num_steps: int) -> tuple[RequestedTi
     all reductions."""
     if task.has_running_values:
         raise ValueError(
-            "observe has a dvi.Running, whose values exist at grid points only, but "
-            "save=dvi.Save(ts=...) requests other times: use save=dvi.Save(every=m)."
+            "dvi.Running in observe has values only at the grid points, but save=dvi.Save(ts=...) "
+            "requests other times: use save=dvi.Save(every=m), or remove dvi.Running."
         )
     # Functions that are not reductions are evaluated at the requested times, after the run.
     kept = jax.tree.map(

@@ -104,12 +104,13 @@ def read_npz(
             raise ValueError("an array is missing in it")
     except Exception as error:  # zipfile and NumPy raise many types for damaged bytes
         raise ValueError(
-            f"{path} is not the file of a {what} of this package, or it is damaged ({error}): "
-            "restore it from a backup, or remove it and compute it again."
+            f"{path} is not the file of a {what} of this package, or it is damaged: check the "
+            "path, restore the file from a backup, or remove it and repeat the computation. "
+            f"Cause: {error}."
         ) from None
     if found != form:
         raise ValueError(
             f"the file {path} has the format {found!r}, but this version of dvi_jax reads only "
-            f"{form!r}: use the version that wrote it, or remove it and compute it again."
+            f"{form!r}: use the version that wrote the file, or remove it and compute again."
         )
     return about, arrays

@@ -58,8 +58,8 @@ def _real_array(name: str, value: Any) -> Array:
         refuse_double_without_x64(name, kind)
     if kind.kind == "c":
         raise TypeError(
-            f"{name} must be real, got dtype {kind}. Write a complex variable as its real and "
-            "imaginary parts (a canonical pair, up to a factor)."
+            f"{name} must be real, got dtype {kind}. If the imaginary part is zero, take jnp.real. "
+            "Otherwise use its real and imaginary parts as a canonical pair, up to a factor."
         )
     if not _is_real(kind):
         raise TypeError(f"{name} must be an array of real numbers, got dtype {kind}.")
@@ -97,7 +97,7 @@ def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> A
     if known is not None and not zero_allowed and known == 0:
         raise ValueError(
             f"{name} must not be zero: no step would advance time. Give a positive h (forward) "
-            "or a negative one (backward)."
+            "or a negative h (backward)."
         )
     # Cast in NumPy: each operation of JAX on a known number would cost some ten microseconds.
     return jnp.asarray(value, dtype) if known is None else jnp.asarray(known.astype(dtype))

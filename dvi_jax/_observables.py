@@ -25,9 +25,9 @@ def check_observe(task: Task, q0: Array, p0: Array) -> int:
     for leaf in jax.tree.leaves(task.observe, is_leaf=is_observable):
         if isinstance(leaf, type) and issubclass(leaf, Reduction | Running):
             raise TypeError(
-                f"observe contains the class {leaf.__name__}: give an object, such as dvi.MEGNO(), "
-                "dvi.Running(dvi.MEGNO()) or dvi.MaxDrift(function), where the function has the "
-                f"arguments {FORMS}."
+                f"observe contains the class {leaf.__name__}: give an object of this class. "
+                "Examples are dvi.MEGNO(), dvi.Running(dvi.MEGNO()) and dvi.MaxDrift(function), "
+                f"with a function of {FORMS}."
             )
         if not is_observable(leaf):
             raise TypeError(
@@ -57,9 +57,8 @@ def check_observe(task: Task, q0: Array, p0: Array) -> int:
             )
         if isinstance(leaf, Range) and jnp.issubdtype(jnp.result_type(out), jnp.complexfloating):
             raise TypeError(
-                "dvi.Range requires real values, since complex numbers have no order, but the "
-                f"observable {called} returns complex ones. Take its real part, imaginary part or "
-                "absolute value."
+                f"dvi.Range requires real values, but the observable {called} returns complex "
+                "values. Take their real part, imaginary part or absolute value."
             )
         if not isinstance(leaf, Reduction):
             size += int(np.prod(np.shape(out), dtype=int)) * jnp.result_type(out).itemsize
@@ -71,8 +70,8 @@ def _check_deviations(leaf: Deviations, task: Task, q0: Array, p0: Array) -> Non
     # The derivative of a step is taken at a fixed h; the derivative of h would be missing.
     if task.lattice.has_memory:
         raise ValueError(
-            f"{name} requires steps whose size does not depend on the state, but those of "
-            f"{task.lattice!r} do: use lattice=dvi.Uniform() or dvi.Given(ts)."
+            f"{name} requires steps whose size does not depend on the state, but "
+            f"{task.lattice!r} adapts h to the state: use lattice=dvi.Uniform() or dvi.Given(ts)."
         )
     eqx.filter_eval_shape(leaf.start, jnp.zeros(2 * q0.size, q0.dtype))  # counts and units
 

@@ -66,12 +66,15 @@ class Save(eqx.Module):
             check_takes("the clock of Save", self.clock, "(t, q, p, args)")
         if self.ts is None:
             if self.clock is not None:
-                raise ValueError("clock requires ts, its values: write Save(ts=values, clock=...).")
+                raise ValueError(
+                    "clock requires ts: write Save(ts=values, clock=...) with the values of the "
+                    "clock at which states are saved."
+                )
             return
         if self.every is not None or self.final:
             raise ValueError(
-                "Save(ts=...) saves only at the times ts: leave out every and final, or add their "
-                "times to ts."
+                "Save(ts=...) saves only at the times ts: leave out every and final. If you need "
+                "their times too, add these times to ts."
             )
         if self.ts.ndim != 1 or self.ts.shape[0] == 0:
             raise ValueError(

@@ -90,8 +90,8 @@ class System(eqx.Module):
         functions = (self.H_D, self.perturbation)
         if self.slow_time and any(getattr(f, "step_is_from_times", False) for f in functions):
             raise ValueError(
-                "with slow_time=True, t0 and t1 are multiplied by ε, and t1 − t0 is not the step. "
-                "But functions of dvi.discretise(H, order) with order ≥ 2, dvi.from_lagrangian and "
+                "with slow_time=True, t1 − t0 is ε h, not the step h. But the results of "
+                "dvi.discretise(H, order) with order ≥ 2, dvi.from_lagrangian and "
                 "dvi.from_type_iii compute the step as t1 − t0. Use dvi.discretise(H, order=1); "
                 "for a higher order use method=dvi.Strang() or dvi.Yoshida(4)."
             )
@@ -111,8 +111,9 @@ class System(eqx.Module):
         if any(parts.values()):
             has = " and ".join(name for name, is_there in parts.items() if is_there)
             raise ValueError(
-                f"the system has {has}, but epsilon, its strength, is not given: pass epsilon=... "
-                "(0.0 for the unperturbed motion, 1.0 if the functions contain the strength)."
+                f"the system has {has}, but epsilon is not given. Pass epsilon=0.0 for the "
+                "unperturbed motion, epsilon=1.0 if the functions contain the strength of the "
+                "perturbation, or another strength."
             )
         return 0.0
 
@@ -160,7 +161,7 @@ class System(eqx.Module):
             out = _traced_output(function, name, kinds, t, q, p, args)
             if out.shape == shape and jnp.issubdtype(out.dtype, jnp.floating):
                 continue
-            hint = "" if shape else "Take the real part, if it is the energy."
+            hint = "" if shape else "Return a floating-point number."
             if out.shape and not shape:
                 hint = "Sum its entries with jnp.sum, or take one component."
             raise ValueError(

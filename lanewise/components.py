@@ -131,7 +131,7 @@ class Evaluator:
         way round, so that its numbers have the same bits wherever it is called."""
         program = eqn.params["program"]
         if eqn.params["lanes"] is not None:
-            raise Unsupported("the function of one trajectory contains a batch")
+            raise Unsupported("the function of one trajectory calls a function for a batch")
         outs = self.closed(program.traced.all_inputs, [self.closed_off(v) for v in values])
         return [self.closed_off(v) for v in outs]
 

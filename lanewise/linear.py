@@ -133,8 +133,8 @@ def on_any(x: Array, rare: bool = True) -> Array:
     kind = jnp.asarray(x)
     if kind.dtype != bool or kind.shape != ():
         raise TypeError(
-            f"x must be one bool of one trajectory, got {kind.dtype} of shape {kind.shape}: write "
-            "a comparison, and reduce an array with jnp.any(...)."
+            f"x must be one bool of one trajectory, got {kind.dtype} of shape {kind.shape}. "
+            "Write a comparison for a number, and jnp.any(...) for an array."
         )
     if not isinstance(rare, bool):
         raise TypeError(f"rare must be True or False, got {rare!r}.")

@@ -145,7 +145,7 @@ def _can_start() -> bool:
     except Exception as error:
         warnings.warn(
             f"No machine code can be generated ({type(error).__name__}: {error}). XLA compiles the "
-            "batches, which run several times slower. Results agree to round-off.",
+            "batches instead: they run several times slower. Results agree to round-off.",
             stacklevel=2,
         )
         return False

@@ -389,7 +389,7 @@ ONE = dvi.Observations([0.0], np.zeros((1, 1)), sigma=0.1)
 IDLE = {"p0": np.ones(1), "args": {"unused": 1.0}}
 RESTING = dvi.Model(dvi.System(free), h=H, q0=jnp.zeros(1))
 OUTSIDE = {"bounds": {"q0": dvi.Bounds(0, 1)}, "start": {"q0": np.ones(1) * 2, "p0": np.ones(1)}}
-OTHERS = r"parameters that are sampled, p0\[0\], q0\[0\], but it has q0\[0\]\."
+OTHERS = r"begin with p0\[0\], q0\[0\]; the names in start begin with q0\[0\]\."
 INVALID_POSTERIORS = [
     (ONE, {}, ValueError, "2 parameters .* from 1 observed"),
     (on_a_line(None, 2), {}, ValueError, "and the size of the errors, cannot be determined from 2"),

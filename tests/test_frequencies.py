@@ -331,7 +331,7 @@ ROUNDED = (1e6 + 0.05 * np.arange(N)).astype(np.float32)
         (lambda: frequencies(TS[:64], torus()[:64], count=22), ValueError, "66 unknowns"),
         (lambda: frequencies(TS, torus(), window=6), ValueError, "from 0 to 5, got 6"),
         (lambda: frequencies(TS, torus(), refine="no"), ValueError, "True, False, got 'no'"),
-        (lambda: frequencies(resting(), torus()), ValueError, "whose signal is q"),
+        (lambda: frequencies(resting(), torus()), ValueError, "signal of a Solution is q"),
         (lambda: frequency_diffusion(TS[:60], torus()[:60]), ValueError, "at least 64"),
     ],
 )

@@ -124,7 +124,9 @@ def _named(methods: Any) -> dict[str, dvi.Method]:
         return {name: METHODS[name] for name in chosen("method", methods, METHODS, own)}
     for name, method in methods.items():
         if not isinstance(method, dvi.Method):
-            raise TypeError(f"{name!r} must be a method such as dvi.TypeII(), got {method!r}.")
+            raise TypeError(
+                f"methods[{name!r}] must be a method such as dvi.TypeII(), got {method!r}."
+            )
         order = method.order
         if isinstance(order, bool) or not isinstance(order, int | float):
             raise TypeError(f"the order of {name!r} must be a number, got {order!r}.")

@@ -88,7 +88,7 @@ def noether_balance(
         )
     if steps != solution.stats["num_steps"] or steps != jnp.size(solution.hs):
         raise ValueError(
-            "a balance needs every lattice point, but solution has "
+            "solution must have the state at every lattice point, but it has "
             f"{steps + 1} states for {solution.stats['num_steps']} steps"
             + (", saved at requested times" if steps != jnp.size(solution.hs) else "")
             + ". Integrate with save=dvi.Save()."

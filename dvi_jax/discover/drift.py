@@ -142,15 +142,15 @@ def drift_surface(
     is_number = isinstance(duration, int | float | np.number)
     if not is_number or not np.isfinite(duration) or duration < 2 * hs[-1]:
         raise ValueError(
-            f"duration must be finite and at least {2 * hs[-1]:g} (two of the longest steps), got "
-            f"{duration!r}."
+            f"duration must be a finite number. It must be at least {2 * hs[-1]:g}, the length of "
+            f"two of the longest steps (the largest value of hs); got {duration!r}."
         )
     given = isinstance(invariant, Sequence)
     invariants = list(invariant) if given else [invariant] * len(hs)
     if len(invariants) != len(hs):
         raise ValueError(
-            "invariant must be one observable for all step sizes, or a list with one for each: got "
-            f"{len(invariants)} observables for {len(hs)} step sizes."
+            "invariant must be one observable, or a list with one observable for each step size "
+            f"in hs; got {len(invariants)} observables for {len(hs)} step sizes."
         )
     for each in invariants:
         _check_observable(each)

@@ -229,9 +229,9 @@ class Discovery(eqx.Module):
         inner, to_basis = bound.about(arrays["middle"])
         if list(bound.names) != about["names"]:
             raise ValueError(
-                f"basis must be the basis of the search saved in {os.fspath(path)}, which has "
-                f"{len(about['names'])} functions ({', '.join(about['names'][:4])} …), but the "
-                f"given basis has {bound.size} ({', '.join(bound.names[:4])} …)."
+                f"basis must be the basis of the search saved in {os.fspath(path)}. That basis has "
+                f"{len(about['names'])} functions, {', '.join(about['names'][:4])} …; the given "
+                f"basis has {bound.size} functions, {', '.join(bound.names[:4])} …."
             )
         differs = ~np.isclose(_probed(bound, probe), values, rtol=1e-9)
         if differs.any():

@@ -177,7 +177,8 @@ def _fitted(name: str, value: np.ndarray, q: State) -> Array:
     try:
         return jnp.broadcast_to(value, q.shape).astype(q.dtype)
     except ValueError:
+        bodies = " or one mass for each body" if name == "mass" else ""
         raise ValueError(
             f"{name} of shape {value.shape} does not match q of shape {q.shape}: give an array "
-            "with the shape of q, or with the shape of the last axes of q."
+            f"with the shape of q or of its last axes{bodies}."
         ) from None

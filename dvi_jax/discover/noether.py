@@ -120,8 +120,9 @@ class AdiabaticInvariant(eqx.Module):
     def __check_init__(self):
         if len(self.generators) != len(self.gauges) or not self.gauges:
             raise ValueError(
-                "generators and gauges must have one entry for each order (None: the gauge is "
-                f"zero), got {len(self.generators)} generators and {len(self.gauges)} gauges."
+                "generators and gauges must both have one entry for each order, at least one; got "
+                f"{len(self.generators)} generators and {len(self.gauges)} gauges. Use None for a "
+                "gauge that is zero."
             )
 
     @property

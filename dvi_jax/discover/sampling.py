@@ -141,8 +141,8 @@ def as_samples(samples: Any, t0: float = 0.0) -> Samples:
     q, p = arrays[:2]
     if q.shape != p.shape or q.ndim < 1 or len(q) == 0:
         raise ValueError(
-            "qs and ps of samples must have the same shape, with the points along the first axis; "
-            f"got {q.shape} for qs and {p.shape} for ps."
+            "qs and ps of samples must have the same shape, with at least one point along the "
+            f"first axis; got {q.shape} for qs and {p.shape} for ps."
         )
     t = arrays[2] if len(arrays) == 3 else np.full(len(q), float(t0))
     if t.shape != (len(q),):
@@ -194,8 +194,8 @@ def require_enough(samples: Samples, unknowns: int, conditions: int = 1) -> None
     needed = int(np.ceil(2 * unknowns / conditions))
     if len(samples.q) < needed:
         raise ValueError(
-            f"{len(samples.q)} samples are too few for {unknowns} unknown coefficients (a quarter "
-            f"of them is held out for validation): give at least {needed}."
+            f"{len(samples.q)} samples are too few for {unknowns} unknown coefficients: give at "
+            f"least {needed} samples. A quarter of the samples is held out for validation."
         )
 
 
@@ -214,8 +214,8 @@ def require_steps(good: Any, samples: Samples) -> None:
     if not good.all():
         i = int(np.argmin(good))
         raise ValueError(
-            f"the step fails at {int(np.sum(~good))} of {len(good)} samples, the first of which is "
-            f"q = {samples.q[i].tolist()}, p = {samples.p[i].tolist()}: take samples where the map "
+            f"the step fails at {int(np.sum(~good))} of {len(good)} samples. The first of these is "
+            f"q = {samples.q[i].tolist()}, p = {samples.p[i].tolist()}. Take samples where the map "
             "is defined, or a smaller h."
         )
 

@@ -75,8 +75,8 @@ class InvariantSeries(eqx.Module):
         """
         if self.slow_time and self.basis.uses_time:
             raise ValueError(
-                "this invariant depends on the slow time εt, but a generator must be a function of "
-                "t: for `generators` search with a basis that has no functions of the time."
+                "`generators` requires an invariant that does not depend on the slow time εt: "
+                "repeat the search with a basis that has no functions of time."
             )
         return [_symplectic_gradient(self.basis, c) for c in self.coefficients]
 

@@ -154,8 +154,8 @@ def find_symmetries(
     relative = relative_step(samples, _moved(raw))
     if relative < _NO_STEP:
         raise ValueError(
-            f"a step of h = {h:g} moves the samples by only {relative:.0e} of their spread, which "
-            "is close to round-off: symmetries cannot be identified. Take a larger h."
+            f"a step of h = {h:g} changes the samples by only {relative:.0e} times their spread. "
+            "This is close to round-off, so symmetries cannot be identified. Take a larger h."
         )
     if relative < SMALL and np.ptp(samples.t) == 0:
         shifts = later(h, relative)

@@ -221,8 +221,9 @@ def check_count(settings: Settings, signal: Array) -> None:
     unknowns = 3 * settings.lines * (1 if jnp.iscomplexobj(signal) else 2)
     if unknowns >= signal.shape[-1]:
         raise ValueError(
-            f"count = {settings.lines} lines have {unknowns} unknowns, which require more than "
-            f"{unknowns} samples; signal has {signal.shape[-1]}. Use fewer lines or more samples."
+            f"count = {settings.lines} lines have {unknowns} unknowns and require more than "
+            f"{unknowns} samples, but only {signal.shape[-1]} are analysed together (half of the "
+            "signal in frequency_diffusion). Use fewer lines or more samples."
         )
 
 
@@ -233,8 +234,8 @@ def signals_of(ts: Any, signal: Any) -> tuple[Array, Array, float, int]:
     state_axes = None
     if isinstance(ts, Solution) == (signal is not None):
         raise ValueError(
-            "the arguments must be times and a signal, frequencies(ts, signal), or a Solution "
-            "alone, frequencies(solution), whose signal is q − i p."
+            "the arguments must be times and a signal, as in frequencies(ts, signal), or only a "
+            "Solution, as in frequencies(solution). The signal of a Solution is q − i p."
         )
     if isinstance(ts, Solution):
         qs, ps = (_double("the solution", x) for x in (ts.qs, ts.ps))
@@ -252,8 +253,9 @@ def signals_of(ts: Any, signal: Any) -> tuple[Array, Array, float, int]:
     sizes = zip(ts.shape[::-1], signal.shape[::-1], strict=False)
     if ts.ndim > signal.ndim or any(n not in (1, size) for n, size in sizes):
         raise ValueError(
-            f"ts of shape {ts.shape} does not match a signal of shape {signal.shape}: give times "
-            f"for all signals, shape {ts.shape[-1:]}, or for each one, shape {signal.shape}."
+            f"ts of shape {ts.shape} does not match a signal of shape {signal.shape}: give ts of "
+            f"shape {ts.shape[-1:]} for common times, or of shape {signal.shape} for times of each "
+            "signal."
         )
     if signal.shape[-1] < _FEWEST:
         raise ValueError(

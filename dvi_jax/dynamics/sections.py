@@ -188,8 +188,8 @@ def poincare_section(
     for name, length in varied.items():
         if length != q.shape[0]:
             raise ValueError(
-                f"{name} must be one number or one for each of the {q.shape[0]} orbits, got "
-                f"{length} numbers."
+                f"{name} must be one number, or {q.shape[0]} numbers (one number for each orbit in "
+                f"q0); got {length} numbers."
             )
     start = (as_scalar("t0", keywords["t0"], q.dtype), _Varied(q), _Varied(p))
     h = as_scalar("h", h, q.dtype, zero_allowed=False)

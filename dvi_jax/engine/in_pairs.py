@@ -305,7 +305,10 @@ _NEXT_CORRECTION = 2.0**-96
 def _call(eqn: Any, values: list[Any]) -> list[Any]:
     program = eqn.params["program"]
     if eqn.params["lanes"] is not None:
-        raise NotImplementedError("arithmetic=dvi.DoubleDouble() has no rule for lanewise.batched.")
+        raise NotImplementedError(
+            "arithmetic=dvi.DoubleDouble() has no rule for lanewise.batched: call the function "
+            "without lanewise.batched, or use arithmetic=dvi.Compensated()."
+        )
     inner = program.traced.all_inputs
     return _evaluate(inner.jaxpr, inner.consts, values)
 

@@ -129,7 +129,10 @@ def fit(
     if batch is not None:
         whole("batch", batch)
         if not by_optax:
-            raise ValueError("batch requires an optimiser of optax, such as optax.adam(1e-3).")
+            raise ValueError(
+                "batch requires an optimiser of optax: give, for example, "
+                "optimiser=optax.adam(1e-3), or leave batch out."
+            )
     if isinstance(shooting, MultipleShooting) and not is_vector:
         raise ValueError(
             "MultipleShooting requires a loss of residuals, such as dvi.LeastSquares(), and an "
@@ -155,8 +158,8 @@ def fit(
         return found
     raise FitError(
         f"the fit did not converge (status {found.status} after {len(run.records)} steps, loss "
-        f"{found.loss:.6g}). {FIT_RESULTS[status]} With throw=False the result is returned with "
-        "its status; here it is the `fit` attribute of this error.",
+        f"{found.loss:.6g}). {FIT_RESULTS[status]} The result is in the attribute `fit` "
+        "of this error. With throw=False it is returned without an error.",
         found,
     )
 

@@ -261,8 +261,9 @@ def _start_of(posterior: Posterior, start: Any, bounds: PyTree, priors: PyTree) 
     space, x = make_space(*given)
     if list(space.names) != posterior.names:
         raise ValueError(
-            f"start must have the parameters that are sampled, {', '.join(posterior.names[:8])}, "
-            f"but it has {', '.join(space.names[:8])}."
+            "start must have the parameters that are sampled. The names of these begin with "
+            f"{', '.join(posterior.names[:8])}; the names in start begin with "
+            f"{', '.join(space.names[:8])}."
         )
     if is_fit:
         at_bounds = np.isin(posterior.names, posterior._space.at_bounds(x, start.sigma))

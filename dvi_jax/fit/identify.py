@@ -167,7 +167,9 @@ def identify(
         if full.status != "not_finite":
             break
     else:
-        raise FitError(f"the fit of all candidates failed. {FIT_RESULTS[full.result]}", full)
+        raise FitError(
+            f"the first fit, with all candidates, failed. {FIT_RESULTS[full.result]}", full
+        )
     problem = Problem(whole, weighed, many, full.params, **held)
     search = Elimination(problem, library, penalty, arcs[0].has_errors)
     search.eliminate()
@@ -218,8 +220,8 @@ def _check_input(
         instance(name, {} if given is None else given, Mapping, "a dict or None")
         if given is not None and KEY in given:
             raise ValueError(
-                f"{name} must not contain the key {KEY!r}, under which dvi.identify adds the "
-                "coefficients of library with the initial value 0: remove this key."
+                f"{name} must not contain the key {KEY!r}: remove it. dvi.identify itself adds the "
+                "coefficients of library under this key, with the initial value 0."
             )
     if penalty is not None:
         positive("penalty", penalty)
@@ -260,8 +262,8 @@ def _extended(
     args, system, epsilon = spec.get("args"), spec["system"], spec.get("epsilon", 0.0)
     if not (args is None or (isinstance(args, Mapping) and KEY not in args)):
         raise TypeError(
-            f"args of the model must be None or a dict without {KEY!r}, to which the coefficients "
-            f"are added, got {args!r}."
+            f"args of the model must be None or a dict without the key {KEY!r}, got {args!r}. "
+            "dvi.identify itself adds the coefficients of library under this key."
         )
     is_perturbed = system.force is not None or system.perturbation is not None
     if "epsilon" in params and not is_perturbed:

@@ -120,9 +120,9 @@ class ForceLibrary(eqx.Module):
     def _check_shape(self, c: Array, called: str) -> None:
         if c.shape != (len(self.names),):
             raise ValueError(
-                f"{called} must have shape ({len(self.names)},), one number for each candidate "
-                f"({', '.join(self.names[:4])}{', …' if len(self.names) > 4 else ''}), got shape "
-                f"{c.shape}."
+                f"{called} must have shape ({len(self.names)},), got shape {c.shape}. Give one "
+                "number for each candidate: "
+                f"{', '.join(self.names[:4])}{', …' if len(self.names) > 4 else ''}."
             )
 
     def __len__(self) -> int:
@@ -182,8 +182,8 @@ class _Monomial(eqx.Module):
         if q0.shape != (self.n,):
             raise ValueError(
                 f"this dvi.ForceLibrary is for q0 of shape (n,) with n = {self.n}, got q0 of "
-                f"shape {q0.shape}. q0 must be one-dimensional: make the library for its length "
-                "with dvi.ForceLibrary.monomials(degree, n)."
+                f"shape {q0.shape}. Make the library with dvi.ForceLibrary.monomials(degree, n), "
+                "where n is the length of q0. A q0 with more axes is not possible."
             )
         value = jnp.ones((), q0.dtype)
         for (v, i), power in self.powers:

@@ -208,8 +208,9 @@ def make_groups(arcs: list[Observations], specs: list[dict[str, Any]]) -> list[G
     longest = max(abs((arc.ts[-1] - arc.t0) / spec["h"]) for arc, spec in pairs)
     if _is_uniform(specs[0]) and 0 < longest < 0.5:
         raise ValueError(
-            f"all observations lie within {longest:.3g} steps of h = {specs[0]['h']:g}, less than "
-            "half of one: give a smaller h, or h and the times of the data in the same unit."
+            "the last observation must be at least half a step from t0, but it is only "
+            f"{longest:.3g} steps from t0 with h = {specs[0]['h']:g}. Give a smaller h, or give h "
+            "and the times of the data in the same unit."
         )
     # Compiling takes seconds for each program; some millions of steps too many do not.
     apart = len(arcs) * max(steps) - sum(steps) > _WASTE
@@ -238,22 +239,22 @@ def _steps(i: int, arc: Observations, spec: Mapping[str, Any]) -> int:
         raise ValueError(
             f"arc {i}: the observations (t = {arc.ts.min():g} to {arc.ts.max():g}) lie {side} t0 "
             f"= {arc.t0:g}, but h = {h:g} leads to {direction} times. Give h = {-h:g}, or the t0 "
-            "to which the model's q0 and p0 belong, as Observations(..., t0=...); without it t0 "
-            "is the first time."
+            "of the model's q0 and p0 as dvi.Observations(..., t0=...). The default of t0 is ts[0]."
         )
     if not _is_uniform(spec):
         if not isinstance(spec.get("num_steps"), int):
             raise ValueError(
-                f"on the lattice {_lattice(spec)!r} the model requires num_steps, an int: the "
-                f"number of steps to the last observation; got {spec.get('num_steps')!r}. Give it "
-                "in dvi.Model, or in the dict that the model returns."
+                f"on the lattice {_lattice(spec)!r} the model requires num_steps as an int, got "
+                f"{spec.get('num_steps')!r}. Give the number of steps to the last observation in "
+                "dvi.Model(..., num_steps=...), or in the dict that the model returns."
             )
         return spec["num_steps"]
     steps = span / h
     if steps > 2e9:
         raise ValueError(
-            f"arc {i}: {steps:.3g} steps of h = {h:g} would be needed for a span of {span:g}: "
-            "give a larger h, or h and the times of the data in the same unit."
+            f"arc {i}: h = {h:g} requires {steps:.3g} steps from t0 to the last observation, over "
+            f"the time {span:g}. At most 2e9 steps are possible: give a larger h, or give h and "
+            "the times of the data in the same unit."
         )
     return max(1, math.ceil(steps - 1e-9))
 
@@ -372,6 +373,7 @@ def check_observable(i: int, arc: Observations, spec: Mapping[str, Any]) -> bool
         name = arc.observe if isinstance(arc.observe, str) else "observe"
         raise ValueError(
             f"arc {i}: values has shape {arc.values.shape}, so one observation has shape "
-            f"{of_one}, but {name} returns shape {shape} for a state of shape {q.shape}."
+            f"{of_one}, but {name} returns shape {shape} for a state of shape {q.shape}. "
+            "The two shapes must be the same: change values or observe."
         )
     return False

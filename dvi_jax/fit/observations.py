@@ -85,8 +85,8 @@ class Observations:
         if ts.min() < t0 < ts.max():
             raise ValueError(
                 f"t0 = {t0:.17g}, the start of the arc, lies between the times of the "
-                f"observations ({ts.min():.17g} to {ts.max():.17g}). All must be on one side of "
-                "it: move t0, or give the observations before t0 as a second arc, with h < 0."
+                f"observations ({ts.min():.17g} to {ts.max():.17g}). Change t0, so that all "
+                "times are on one side, or give the times before t0 as a second arc, with h < 0."
             )
         checked: dict[str, Any] = {"ts": ts, "values": values, "t0": t0}
         if self.sigma is not None:
@@ -198,15 +198,15 @@ def _check_times(ts: np.ndarray) -> None:
     if at := _first(~np.isfinite(ts)):
         [i] = at
         raise ValueError(
-            f"ts[{i}] is {ts[i]}: every observation needs a time. Leave out those without one."
+            f"ts[{i}] is {ts[i]}: every time must be finite. Leave out observations without a time."
         )
     steps = np.diff(ts)
     if at := _first(steps == 0):
         [i] = at
         raise ValueError(
-            f"ts[{i}] and ts[{i + 1}] are the same time, {ts[i]:.17g}. Combine observations at "
-            "one time into one row: use an observe that returns all of their components, or their "
-            "mean with its smaller sigma."
+            f"ts[{i}] and ts[{i + 1}] are the same time, {ts[i]:.17g}. Give one row for each "
+            "time. For measurements of different components use an observe that returns all of "
+            "them; for repeated measurements give the mean with its smaller sigma."
         )
     is_up = (steps > 0).sum() >= (steps < 0).sum()
     if at := _first(steps < 0 if is_up else steps > 0):
@@ -271,9 +271,9 @@ def _covariance(covariance: Any, values: np.ndarray) -> np.ndarray:
         [i] = at
         smallest = np.where(good, smallest, np.nan)  # not defined if a variance is not positive
         raise ValueError(
-            f"the covariance of observation {i} is not positive definite (smallest eigenvalue of "
-            f"its correlation matrix: {smallest[i]:.3g}): {full[i].tolist()}. An error of zero has "
-            "no finite weight: if a combination of the values is known exactly, leave it out of "
-            "the observations, and make the model satisfy it."
+            f"the covariance of observation {i} is not positive definite: {full[i].tolist()}. The "
+            f"smallest eigenvalue of its correlation matrix is {smallest[i]:.3g}. An error of zero "
+            "has no finite weight: if a combination of the values is known exactly, leave it out "
+            "of the observations, and make the model satisfy it."
         )
     return full

@@ -369,6 +369,9 @@ def _with_leaves(state: Any, leaves: list[np.ndarray]) -> Any:
     arrays, rest = eqx.partition(state, eqx.is_array)
     old, tree = jax.tree.flatten(arrays)
     if [np.shape(x) for x in old] != [np.shape(x) for x in leaves]:
-        raise ValueError("the checkpoint is of a fit with another optimiser: give another file.")
+        raise ValueError(
+            "the checkpoint is of a fit with another optimiser. Give another path in checkpoint, "
+            "or remove the file to start again."
+        )
     new = [jnp.asarray(x, o.dtype) for x, o in zip(leaves, old, strict=True)]
     return eqx.combine(jax.tree.unflatten(tree, new), rest)

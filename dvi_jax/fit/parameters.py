@@ -177,7 +177,10 @@ def make_space(
         name, shape = _name(path), np.shape(leaf)
         refuse_unit_or_mask(f"the parameter {name}", leaf)
         if np.iscomplexobj(leaf):
-            raise TypeError(f"the parameter {name} is complex: give its real and imaginary parts.")
+            raise TypeError(
+                f"the parameter {name} is complex: give its real and imaginary parts as two "
+                "parameters."
+            )
         places[name] = len(names) + np.arange(math.prod(shape)).reshape(shape)
         each = np.ndindex(shape)
         names += [f"{name}[{', '.join(map(str, i))}]" for i in each] if shape else [name]

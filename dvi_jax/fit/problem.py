@@ -113,7 +113,9 @@ class Core(eqx.Module):
 
     def _likelihood(self, group: Group, found: Array, horizon: Any, params: PyTree) -> Array:
         if group.whiten.ndim == 4:
-            raise ValueError("dvi.Likelihood requires Observations with sigma, not covariance.")
+            raise ValueError(
+                "dvi.Likelihood cannot use covariance: give sigma in dvi.Observations instead."
+            )
         keep, values = within(group, horizon), jnp.asarray(group.values)
         sigma = 1 / jnp.where(keep, jnp.asarray(group.whiten), 1.0)
         # Missing values get the observed ones as predictions, so that no NaN reaches the density.
@@ -338,7 +340,8 @@ class Problem:
         if largest < data:
             raise ValueError(
                 f"{where}values up to {largest:.3g}, but the observed values are up to "
-                f"{data:.3g}, {data / largest:.3g} times as large. Use the same units. {intended}"
+                f"{data:.3g}, {data / largest:.3g} times as large. Give the model and the "
+                f"data in the same units. {intended}"
             )
         large, each = _UNITS * data, zip(self.groups, own, strict=True)
         group, size = next((g, s) for g, s in each if (s >= large).any())
@@ -348,9 +351,9 @@ class Problem:
         q0, p0 = (jnp.asarray(spec[name], float) for name in ("q0", "p0"))
         first = float(jnp.max(jnp.abs(seen.function(seen.t0, q0, p0, spec.get("args")))))
         raise ValueError(
-            f"{where}{size[a, row]:.3g} for arc {arc} at t = {group.ts[a, row]:g} (it gives "
-            f"{first:.3g} at the start, t = {group.t0[a]:g}, and at most {size[a].max():.3g}), "
-            f"but the observed values are only up to {data:.3g}. Likely causes: (a) the "
-            "trajectory diverges at these parameters: start from others, give bounds, or use a "
-            f"smaller h; (b) the model and the data are not in the same units. {intended}"
+            f"{where}{size[a, row]:.3g} for arc {arc} at t = {group.ts[a, row]:g}, but the "
+            f"observed values are only up to {data:.3g}. For this arc the model gives {first:.3g} "
+            f"at the start, t = {group.t0[a]:g}, and at most {size[a].max():.3g}. Likely causes: "
+            "(a) the trajectory diverges at these parameters: start from others, give bounds, or "
+            f"use a smaller h; (b) the model and the data are not in the same units. {intended}"
         )

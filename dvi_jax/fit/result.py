@@ -225,8 +225,9 @@ class FitResult:
         space, _ = make_space(params)
         if list(space.names) != about["names"]:
             raise ValueError(
-                f"params must have the same parameters as the fit in {path}, which begin with "
-                f"{about['names'][:5]}, but they begin with {space.names[:5]}."
+                f"params must have the same parameters as the fit in {path}. The names in "
+                f"the file begin with {about['names'][:5]}; those in params begin with "
+                f"{space.names[:5]}."
             )
         by_arc: dict[str, Any] = {
             n: [arrays[f"{n}.{i}"] for i in range(about["arcs"])] for n in _BY_ARC

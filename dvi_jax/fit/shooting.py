@@ -88,8 +88,8 @@ class Segments:
             raise ValueError("MultipleShooting requires dvi.Uniform() and the same h for all arcs.")
         if len({(a.function, a.values.shape[1:], a.covariance is None) for a in arcs}) > 1:
             raise ValueError(
-                "MultipleShooting requires arcs with the same observe and the same number of "
-                "values at a time, all of them with covariance or all without."
+                "MultipleShooting requires the same observe and the same shape of one observation "
+                "for all arcs. Give covariance for all arcs or for no arc."
             )
         h = float(spec["h"])
         steps = max(math.ceil(abs(a.ts[-1] - a.t0) / abs(h) - 1e-9) for a in arcs)
@@ -153,7 +153,7 @@ class Segments:
             raise ValueError(
                 f"arc {i}: the guess of the initial states of the segments is not finite at t = "
                 f"{times[np.argmin(np.isfinite(found).all(axis=1))]:g}. Give another guess in "
-                "dvi.MultipleShooting(..., guess=...), a function t → (q, p)."
+                "dvi.MultipleShooting(..., guess=...), for example a function t → (q, p)."
             )
         return found
 
@@ -237,8 +237,9 @@ def from_data(arc: Observations, spec: dict[str, Any], times: np.ndarray) -> np.
     """
     if arc.observe not in ("positions", "state"):
         raise ValueError(
-            'guess="data" of dvi.MultipleShooting needs observations of "positions" or of the '
-            f'"state", but this arc observes {arc.observe!r}. Give guess as a function t → (q, p).'
+            'guess="data" of dvi.MultipleShooting requires observations of "positions" or of the '
+            f'"state", but this arc observes {arc.observe!r}. Use guess="model", or give guess as '
+            "a function t → (q, p)."
         )
     flat = arc.values.reshape(len(arc.ts), -1)
     good = np.isfinite(flat).all(axis=1)

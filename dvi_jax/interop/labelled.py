@@ -92,8 +92,9 @@ def to_xarray(
         own = value.shape[len(dims) :]
         if per_step and own[:1] != hs.shape[-1:]:
             raise ValueError(
-                f"according to observe, {name!r} has a value for each of {hs.shape[-1]} steps, but "
-                f"its values have the shape {own}: give the same observe as to integrate."
+                "observe must be the same as for integrate. In this observe, "
+                f"{name!r} has a value for each of {hs.shape[-1]} steps, but in solution its "
+                f"values have the shape {own}."
             )
         front = [step] * per_step
         add(name, [*front, *_own(name, own[len(front) :])], value)

@@ -203,8 +203,8 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
     for name, values in (("q", q), ("p", p), ("t", t)):
         if not np.isfinite(values).all():
             raise ValueError(
-                f"{name} has values that are not finite. The states of a run that failed are NaN "
-                "after the failure: give an earlier state."
+                f"{name} has values that are not finite. In a run that failed, the states "
+                "after the failure are NaN: give an earlier state."
             )
     v = p / masses[:, None]
     if velocities is not None and np.array_equal(p, masses[:, None] * np.asarray(velocities)):
@@ -281,9 +281,9 @@ def _with_mass(sim: Any, masses: np.ndarray, massless: float | None) -> np.ndarr
         return masses
     if massless is None:
         raise ValueError(
-            f"{empty.sum()} of {len(masses)} bodies have mass 0 (the first has index "
-            f"{int(np.argmax(empty))}), so that p = m v does not determine their velocity. Give "
-            f"them a tiny mass: from_rebound(sim, massless={1e-20 * masses.max() or 1e-20:.0e})."
+            f"{empty.sum()} of {len(masses)} bodies have mass 0; the first of them has index "
+            f"{int(np.argmax(empty))}. Then p = m v does not determine their velocity. Give them a "
+            f"tiny mass: from_rebound(sim, massless={1e-20 * masses.max() or 1e-20:.0e})."
         )
     if not 0 < massless < np.inf:
         raise ValueError(f"massless must be a positive and finite mass, got {massless!r}.")

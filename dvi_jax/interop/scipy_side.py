@@ -204,7 +204,9 @@ def _span(t_span: Any, h: Any) -> tuple[float, float, int]:
         raise ValueError(f"t_span must be two finite times (t0, t1) that differ, got {t_span!r}.")
     step = float(h) if np.ndim(h) == 0 and np.asarray(h).dtype.kind in "iuf" else math.nan
     if not (math.isfinite(step) and step > 0):
-        raise ValueError(f"h must be positive and finite (t_span gives the direction), got {h}.")
+        raise ValueError(
+            f"h must be a positive and finite number, got {h}: t_span gives the direction of time."
+        )
     # 1/0.1 is 10 steps, not 11.
     return t0, t1, max(1, math.ceil(abs(t1 - t0) / step * (1 - 1e-12)))
 
@@ -214,8 +216,8 @@ def _halves(y0: Any, shape: Any) -> tuple[np.ndarray, np.ndarray]:
     shape = (y0.size // 2,) if shape is None else tuple(np.ravel(shape).tolist())
     if y0.ndim != 1 or y0.size == 0 or y0.size != 2 * math.prod(shape):
         raise ValueError(
-            "y0 must be one vector with all of q0 and then all of p0, twice as many numbers as q0 "
-            f"has; got the shape {y0.shape} for a q0 of shape {shape}."
+            "y0 must be a one-dimensional array with all of q0 and then all of p0. Its size must "
+            f"be twice the size of q0: got y0 of shape {y0.shape} for q0 of shape {shape}."
         )
     q0, p0 = np.split(y0, 2)
     return q0.reshape(shape), p0.reshape(shape)
@@ -245,8 +247,8 @@ def _method(method: Any) -> dvi.Method:
         return METHODS[method]
     raise ValueError(
         f"method must be a dvi.Method or one of {', '.join(METHODS)}, got {method!r}. For SciPy's "
-        "own methods, which choose their steps and conserve no structure, call "
-        "scipy.integrate.solve_ivp with interop.vector_field."
+        "own methods call scipy.integrate.solve_ivp with interop.vector_field. They choose their "
+        "steps and conserve no structure."
     )
 
 
@@ -257,8 +259,8 @@ def _event(event: Any) -> _Event:
     terminal = int(terminal or 0) if isinstance(terminal, bool | None | np.bool_) else terminal
     if not isinstance(terminal, int | np.integer) or terminal < 0:
         raise ValueError(
-            "the attribute terminal of an event must be True, False or a number of crossings, got "
-            f"{terminal!r}."
+            "the attribute terminal of an event must be True, False, or the number of crossings "
+            f"after which the run ends, an integer that is not negative. Got {terminal!r}."
         )
     direction = int(np.sign(getattr(event, "direction", 0)))
     return _Event(event, _takes_args(event), int(terminal), direction)

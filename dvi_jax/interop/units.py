@@ -69,8 +69,8 @@ class UnitSystem:
                 return u.CompositeUnit(1.0, parts.bases, parts.powers)
             except (AttributeError, u.UnitConversionError):  # °C, magnitudes, photons
                 raise ValueError(
-                    f"{name} cannot be in {unit}, which is not proportional to a product of powers "
-                    "of m, s, kg, rad, A, K, mol and cd: convert it to such a product."
+                    f"{name} cannot be in {unit}: units must be proportional to a product of "
+                    "powers of m, s, kg, rad, A, K, mol and cd. Convert it to such a unit."
                 ) from None
 
         named = {name: coherent(name, unit) for name, unit in (args or {}).items()}
@@ -257,8 +257,8 @@ def _arguments(u: Any, args: Any, units: UnitSystem) -> Any:
     unmet = [name for name in units.args if name not in seen]
     if unmet and bare:  # a mistyped name would let a bare number through
         raise ValueError(
-            f"UnitSystem(args=...) has units for {', '.join(unmet)}, which args does not have, and "
-            f"no units for {', '.join(bare)} in args: use the same names in both."
+            f"UnitSystem(args=...) has units for {', '.join(unmet)}, but args has no such names. "
+            f"In args, {', '.join(bare)} have no unit. Use the same names in both."
         )
     return numbers
 
@@ -271,7 +271,8 @@ def _number(u: Any, name: str, given: Any, unit: Any) -> Any:
             value = u.Quantity(given)
         except (TypeError, u.UnitsError) as error:
             raise TypeError(
-                f"{name} mixes quantities with plain numbers, or incompatible units: {error}."
+                f"{name} mixes quantities with plain numbers, or incompatible units: {error}. Give "
+                "all of its entries as quantities with convertible units."
             ) from None
     if np.any(getattr(value, "mask", False)):
         raise ValueError(f"{name} must not have masked values, got {value!r}.")
@@ -281,7 +282,7 @@ def _number(u: Any, name: str, given: Any, unit: Any) -> Any:
         seen = "is missing" if value is None else f"= {value!r} has no unit"
         raise TypeError(
             f"{name} {seen}: give a quantity, such as {name.split()[-1]} * u.Unit({str(unit)!r}), "
-            "in this unit or another one of this kind."
+            "in this unit or in a unit that can be converted to it."
         )
     try:
         return value.to_value(unit, equivalencies=u.dimensionless_angles())

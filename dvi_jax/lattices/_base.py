@@ -62,8 +62,8 @@ class Lattice(eqx.Module):
         """Number of steps to the time t1, or over a duration. **Raises** `ValueError`."""
         raise ValueError(
             f"t1 and duration require equal steps, but the lattice is {self!r}. Leave them out "
-            "and give num_steps (but not with Given(ts), which determines it). For the state at a "
-            "time t1 within the run add save=dvi.Save(ts=[t1])."
+            "and give num_steps; with Given(ts) leave num_steps out too, because ts determines it. "
+            "For the state at a time t1 within the run add save=dvi.Save(ts=[t1])."
         )
 
     @abc.abstractmethod

@@ -59,7 +59,7 @@ class Given(Lattice):
         if num_steps is not None and check_num_steps(num_steps) != available:
             raise ValueError(
                 f"num_steps={num_steps} contradicts Given(ts), whose {available + 1} times make "
-                f"{available} steps. Leave num_steps out, or shorten ts."
+                f"{available} steps. Leave num_steps out, or give ts with num_steps + 1 times."
             )
         return self.ts[0], 1.0, available  # any h: the steps do not depend on it
 

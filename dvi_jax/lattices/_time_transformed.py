@@ -149,13 +149,14 @@ class Extended(eqx.Module):
             return Running(self.seen(observable.reduction))
         if isinstance(observable, Trend):
             raise ValueError(
-                "observe has a dvi.Trend, which would be a slope in the fictitious time of "
+                "observe has a dvi.Trend. Its slope would be per unit of the fictitious time of "
                 "TimeTransformed: observe the function itself and fit a line over solution.ts."
             )
         if isinstance(observable, Deviations):
             raise ValueError(
                 f"{type(observable).__name__} requires steps whose size does not depend on the "
-                "state, but those of TimeTransformed do: use dvi.Uniform() or dvi.Given(ts)."
+                "state. The step size of TimeTransformed depends on the state: use "
+                "lattice=dvi.Uniform() or lattice=dvi.Given(ts)."
             )
         if isinstance(observable, Section):
             return eqx.tree_at(lambda s: s.g, observable, _SeenPoint(observable.g, self))

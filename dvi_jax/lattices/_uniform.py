@@ -30,16 +30,17 @@ class Uniform(StepSizes):
         if count < 0:
             raise ValueError(
                 f"{names[0]}={given[names[0]]!r} cannot be reached from t0={t0!r} with steps of "
-                f"h={h!r}: give a finite {names[0]}, and h > 0 for a run forwards in time or h < 0 "
-                "for a run backwards (a duration has the sign of h)."
+                f"h={h!r}. {names[0]} and t0 must be finite. Use h > 0 for a run forwards in time, "
+                "h < 0 for a run backwards; a duration has the sign of h."
             )
         # (t1 − t0)/h has round-off, which is not a remaining part of a step.
         if abs(steps - count) > 1e-9 * max(1, count):
             raise ValueError(
+                "the number of steps must be a whole number, but "
                 f"{names[0]}={given[names[0]]!r} requires {steps:.6g} steps of h={h!r} from "
-                f"t0={t0!r}, not a whole number. Use h={length / max(1, count)!r}; or give "
-                f"num_steps in place of {names[0]}, and save=dvi.Save(ts=[...]) for times between "
-                "two steps."
+                f"t0={t0!r}. Use h={length / max(1, count)!r}, "
+                f"or give num_steps in place of {names[0]}. For states at times between two steps "
+                "use save=dvi.Save(ts=[...])."
             )
         return count
 

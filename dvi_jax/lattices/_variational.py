@@ -89,8 +89,8 @@ class Variational(StepSizes):
         one_of("on_no_root", self.on_no_root, get_args(Policy))
         if not (isinstance(self.reach, int | float) and 1 < self.reach < float("inf")):
             raise ValueError(
-                "reach (the largest ratio of a step size to the one before it) must be finite and "
-                f"greater than 1, got {self.reach!r}."
+                "reach of Variational must be a number, finite and greater than 1, got "
+                f"{self.reach!r}. It is the largest ratio of a step size to the previous one."
             )
         try:
             smallest, largest = map(float, self.bounds)
@@ -98,16 +98,16 @@ class Variational(StepSizes):
             smallest, largest = 1.0, 0.0
         if not 0 < smallest <= 1 <= largest < float("inf"):
             raise ValueError(
-                "bounds, the smallest and the largest step as multiples of the first one, must be "
-                f"two numbers with 0 < smallest ≤ 1 ≤ largest, got {self.bounds!r}."
+                "bounds of Variational must be two finite numbers with 0 < smallest ≤ 1 ≤ largest, "
+                f"got {self.bounds!r}. They are multiples of the first step size."
             )
 
     def check(self, method, arithmetic):
         if not method.is_the_map:
             raise ValueError(
                 "the lattice Variational() requires method=dvi.TypeII(), got "
-                f"{method!r}: the lattice equation (14) is derived for that map. For a higher "
-                "order use an H_D of higher order, dvi.discretise(H, order=2)."
+                f"{method!r}: the lattice equation, (14) in the paper, is derived for TypeII. For "
+                "a higher order use an H_D of higher order, dvi.discretise(H, order=2)."
             )
         if arithmetic.undoes_steps:
             raise ValueError(

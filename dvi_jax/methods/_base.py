@@ -75,7 +75,8 @@ class Method(eqx.Module):
         except (TypeError, IndexError, KeyError, ValueError, AttributeError) as error:
             raise ValueError(
                 f"the functions of the system fail for q of shape {q.shape} and args={args!r} "
-                f"({error}). Give an example: is_explicit(system, q=jnp.zeros(shape), args=...)."
+                f"({error}). Give an example of a valid q and of valid args: "
+                "is_explicit(system, q=jnp.zeros(shape), args=...)."
             ) from error
         return found[0]
 

@@ -198,8 +198,8 @@ class Composition(CompositionMethod):
         found = next((n for n, defect in enumerate(defects) if defect > _DEFECT), order)
         if found < order:
             raise ValueError(
-                f"the coefficients have order {found}, not {order}: in the conditions of order "
-                f"{found + 1} their relative defect is {defects[found]:.1e}. Set order={found}, or "
+                f"the coefficients have order {found}, not {order}. Their relative defect in the "
+                f"conditions of order {found + 1} is {defects[found]:.1e}. Set order={found}, or "
                 "give the coefficients with more digits."
             )
 

@@ -43,9 +43,9 @@ def warn_of_dissipation(
             f"{type(method).__name__} has a substep backwards in time of {backwards:.2g} h, in "
             "which the damping force amplifies the momenta. At the initial conditions the damping "
             f"rate is {damping:.3g} per unit of time, and its product with that substep is "
-            f"{growth:.3g}. If this product is 1 the map is singular; if it exceeds {_STRONG} the "
-            "map is not more accurate than one of order 2. Use a smaller h, or dvi.Strang(), which "
-            "has no substep backwards.",
+            f"{growth:.3g}. Above {_STRONG} the map is not more accurate than a map of order 2, "
+            "and at 1 the map is singular. Use a smaller h, or use dvi.Strang(): it has no "
+            "substep backwards.",
             stacklevel=3,
         )
 

@@ -217,9 +217,9 @@ def event(
     value = jnp.asarray(g(t, q, p, args))
     if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
         raise ValueError(
-            f"{name} (t, q, p, args) must return a real scalar that passes through zero, or "
-            f"through the requested values; it returned shape {value.shape}, dtype {value.dtype}. "
-            "For a condition such as |q| > 2 take the difference, |q| − 2."
+            f"{name} (t, q, p, args) must return a real scalar (a floating-point number), got "
+            f"shape {value.shape}, dtype {value.dtype}. For a condition such as |q| > 2 take the "
+            "difference, |q| − 2: it passes through zero where the condition changes."
         )
     return value.astype(q.dtype)
 

@@ -52,8 +52,8 @@ def reproduce(out: Path | str, force: bool = False, console: Console | None = No
         raise NotADirectoryError(f"{out} is a file: choose the name of a folder for the results.")
     if out.exists() and any(out.iterdir()) and not force:
         raise FileExistsError(
-            f"{out} is not empty. Choose another folder, or set force (--force) to overwrite the "
-            "files of an earlier reproduction in it; other files stay."
+            f"{out} is not empty. Choose another folder, or use force=True (command line: --force)."
+            " This overwrites the files of an earlier reproduction; other files stay."
         )
     out.mkdir(parents=True, exist_ok=True)
     console = Console() if console is None else console

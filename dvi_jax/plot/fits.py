@@ -318,8 +318,8 @@ def _of_parameters(fit: Any, params: Sequence[str] | None) -> tuple[list[int], n
     known = [n for n, v in zip(names, variances, strict=True) if np.isfinite(v) and v > 0]
     if not known:
         raise ValueError(
-            "fit has no covariance to draw: it had too many parameters for a Jacobian, it failed, "
-            "or the data determine none of its parameters."
+            "fit has no covariance to draw. Possible causes: the fit failed, it had too many "
+            "parameters for a Jacobian, or the data determine none of its parameters."
         )
     if params is None:
         draw.at_most(_PARAMETERS, len(names), "parameters", f"params={names[:3]}")
@@ -338,11 +338,15 @@ def _draws(samples: Any, names: list[str]) -> list[np.ndarray]:
     instance("samples", found, Mapping, "a dvi.Samples or a dict of names with arrays of draws")
     if missing := [name for name in names if name not in found]:
         raise ValueError(
-            f"samples has no draws of {missing[0]!r}, only of {', '.join(map(str, found))}."
+            f"samples has no draws of {missing[0]!r}, only of {', '.join(map(str, found))}. Choose "
+            "params from the names that samples has."
         )
     flat = [np.ravel(np.asarray(found[n], float)) for n in names]
     if len({len(f) for f in flat}) > 1:
-        raise ValueError(f"samples must have equal numbers of draws, got {[*map(len, flat)]}.")
+        raise ValueError(
+            "samples must have the same number of draws for each of params, got "
+            f"{[*map(len, flat)]}."
+        )
     return flat
 
 

@@ -228,7 +228,9 @@ class Plane(NamedTuple):
     def of(self, lane: Lane, k: int = 0) -> Any:
         """(q, p) along an orbit, shape (S,) each."""
         if lane.ps is None:
-            raise TypeError("this picture needs momenta: give a Solution or (ts, qs, ps).")
+            raise TypeError(
+                "this picture needs momenta: give a Solution or (ts, qs, ps) as orbits."
+            )
         return [x[(slice(None), *self.place)] for x in (lane.qs, lane.ps)]
 
     def lines(self, lanes: Sequence[Lane]) -> Iterator[tuple[int, int, int, str]]:
@@ -299,8 +301,8 @@ def view_of(
     shape = one_shape(lanes)
     if names is not None and (len(lanes) > 1 or math.prod(shape) == 1):
         raise ValueError(
-            f"names must be those of the bodies of one orbit, but there are {len(lanes)} orbits "
-            f"with states of shape {shape}: use labels=[...] for the orbits, or draw only one."
+            "names are only for the bodies of a single orbit, not for a state of one number; got "
+            f"{len(lanes)} orbits with states of shape {shape}. Use labels=[...] to name orbits."
         )
     if len(shape) not in (1, 2):
         raise ValueError(f"orbits must have states of shape (n,) or (bodies, dim), got {shape}.")

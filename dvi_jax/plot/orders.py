@@ -50,7 +50,8 @@ def balance(
         ts, drift = ts.ts, ts.drift if drift is None else drift
     if drift is None or not causes:
         raise TypeError(
-            "ts must be a result of dvi.noether_balance, or drift and causes must be given too."
+            "ts must be a result of dvi.noether_balance. With an array of times as ts, give both "
+            "drift and causes."
         )
     given = {"ts": ts, "drift": drift, **causes}
     arrays = {name: np.asarray(x, float) for name, x in given.items()}
@@ -115,7 +116,8 @@ def drift_orders(
     slopes = [*promised] if isinstance(promised, Sequence) else [promised] * len(results)
     if len(slopes) != len(results):
         raise ValueError(
-            f"promised must have {len(results)} orders, one for each result, got {len(slopes)}."
+            f"promised or expected must have {len(results)} orders, one for each result, got "
+            f"{len(slopes)}."
         )
     axis, new = canvas(ax, (6.4, 4.8))
     left = 0.7 * min(order.epsilons.min() for order in results.values())
@@ -348,8 +350,9 @@ def _checked(name: str, pair: Any) -> tuple[np.ndarray, np.ndarray]:
     positive = bool((np.isfinite(costs) & (costs > 0)).all())
     if costs.ndim != 1 or costs.shape != errors.shape or not len(costs) or not positive:
         raise ValueError(
-            f"results[{name!r}] must have costs and errors of the same shape (runs,), and "
-            f"positive costs; got shapes {costs.shape} and {errors.shape}, and the costs {costs}."
+            f"results[{name!r}] must have costs and errors of the same shape (runs,), with at "
+            "least one run, and positive costs without NaN or inf. The shapes are "
+            f"{costs.shape} and {errors.shape}, the costs {costs}."
         )
     order = np.argsort(costs, kind="stable")
     return costs[order], np.abs(errors[order])

@@ -152,7 +152,7 @@ def _points_of(crossings: Any) -> _Points:
     found = _crossings_in(crossings)
     if len(found) != 1:
         raise TypeError(
-            "crossings must be the result of one dvi.Section in solution.observed, got "
+            "crossings must be the result of one dvi.Section, as solution.observed has it, got "
             + (f"{len(found)} results: choose one." if found else f"{crossings!r:.60}.")
         )
     ((one, status),) = found

@@ -175,10 +175,14 @@ def _read(
             watched[name] = [np.asarray(x) for x in v]
         else:
             raise ValueError(
-                f"values[{name!r}] must be a list of {len(lanes)} arrays, one for each orbit."
+                f"values[{name!r}] must be a function (q, p), or a list of {len(lanes)} arrays, "
+                "one for each orbit."
             )
     if not watched:
-        raise ValueError("no observable of orbits has a value for each saved state: give values.")
+        raise ValueError(
+            "no observable of orbits has a value for each saved state: give "
+            "values={'energy': numbers or a function (q, p)}."
+        )
     return ts, names, lanes, watched
 
 

@@ -104,9 +104,9 @@ def frequency_map(
     check_shapes(on_grid or len({a.shape for a in arrays.values()}) == 1, wanted, **arrays)
     if on_grid and len(resonances):
         raise ValueError(
-            "resonances are lines between frequencies, but here x and y are initial conditions: "
-            "leave out resonances, or give as x and y the frequencies of each orbit, of shape "
-            f"{(len(x), len(y))}."
+            "resonances are lines between frequencies, but x and y are a grid of initial "
+            "conditions. Leave out resonances, or give the frequencies of all orbits as x and y, "
+            f"both of shape {(len(x), len(y))}."
         )
     axis, new = canvas(ax, (6.0, 4.8))
     shown = D if on_grid or D is None else D[np.isfinite(x) & np.isfinite(y)]
@@ -160,7 +160,7 @@ def _draw_resonances(axis: Any, resonances: Sequence[tuple[int, int]]) -> None:
     axis.autoscale(False)
     for k in resonances:
         if tuple(k) == (0, 0) or len(k) != 2:
-            raise ValueError(f"a resonance must be two integers that are not both 0, got {k!r}.")
+            raise ValueError(f"resonances must be pairs of integers, not both 0, got {k!r}.")
         a, b = k
         axis.axline((0, 0), (b, -a), color=GREY, lw=0.8, ls="--", zorder=0.9)
         places = [((-b * high / a, high), "center", "bottom", (0, 2))] if a else []

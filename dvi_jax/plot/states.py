@@ -53,7 +53,7 @@ def lanes_of(orbits: Any, labels: Sequence[str] | None = None, momenta: bool = T
     if not lanes:
         raise ValueError("orbits is empty: give at least one orbit.")
     if momenta and any(lane.ps is None for lane in lanes):
-        raise TypeError("this picture needs momenta: give a Solution or (ts, qs, ps).")
+        raise TypeError("this picture needs momenta: give a Solution or (ts, qs, ps) as orbits.")
     names = labels_of(labels, len(lanes), "orbits")
     return [lane._replace(label=name) for lane, name in zip(lanes, names, strict=True)]
 

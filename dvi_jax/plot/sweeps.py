@@ -122,7 +122,7 @@ def slope_map(
     others, facet = where.get("over", ()), where.get("facet")
     others = [*([others] if isinstance(others, str) else others), *([facet] if facet else [])]
     if any(dim_of(data, name) == dim for name in others):
-        raise ValueError(f"facet and over must not be {along!r}, along which slopes are computed.")
+        raise ValueError(f"facet and over must not be {along!r}: slopes are computed along it.")
     x, y = (along if name is not None and dim_of(data, name) == dim else name for name in (x, y))
     local = local or along in (x, y)
     made: dict[str, Any] = {along: None}
@@ -312,7 +312,8 @@ def _positive(data: Any, along: str) -> tuple[np.ndarray, np.ndarray]:
     """(positive values of a coordinate, rising; their places along the dimension)."""
     if along not in data.coords or data.coords[along].dtype.kind not in "iuf":
         raise ValueError(
-            f"along={along!r} has no numbers for a slope: choose one of {names_of(data)}."
+            f"along={along!r} has no numbers for a slope: choose a coordinate that has numbers. "
+            f"The dimensions are {names_of(data)}."
         )
     values = data.coords[along].values
     order = np.argsort(values, kind="stable")
@@ -390,8 +391,8 @@ def _count_beside(status: Any, grid: Grid) -> _Statuses:
     others = [d for d in status.dims if d not in (*wanted, *grid.over) and status.sizes[d] > 1]
     if others or any(d not in status.dims for d in wanted):
         raise ValueError(
-            f"the status has the dimensions {names_of(status)}, but the map has the dimensions "
-            f"{', '.join(wanted)}: select the same values in both."
+            f"the status must have the dimensions of the map, {', '.join(wanted)}, and no others; "
+            f"it has {names_of(status)}. Before the plot, select the same values in both."
         )
     selections = (dict.fromkeys(along, i) for i in range(len(grid.panels)))
     return _count(status, grid, (status.isel(one) for one in selections))

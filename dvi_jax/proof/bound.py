@@ -111,7 +111,10 @@ def bound_drift(
     check_system(system)
     how = only(chosen(integrator, method=method), "bound_drift", "method", "arithmetic")
     if how.arithmetic != FloatingPoint():
-        raise ValueError(f"bound_drift bounds the rounding of float64, not of {how.arithmetic!r}.")
+        raise ValueError(
+            f"bound_drift bounds the rounding of plain float64, not of {how.arithmetic!r}: leave "
+            "arithmetic out."
+        )
     h = finite("h", h)
     shape, (lower, upper) = _domain(domain, found)
     strengths, times = (
@@ -152,7 +155,10 @@ def bound_drift(
     try:
         result = search.subdivide(checker, identities, seen, ratio=ratio, **limits)
     except exact.Failed as error:
-        raise ProofError(f"{error}. Take a smaller domain, ε or h.") from None
+        raise ProofError(
+            f"{error}. If the arguments are correct, take a smaller domain, ε or h, or larger "
+            "max_boxes and max_seconds."
+        ) from None
     per_step = [exact.up(b) for b in result.bounds]
     certificate |= {
         "per_step": [b.hex() for b in per_step],
@@ -211,8 +217,8 @@ def _step_of(
         )
         if not np.allclose(first, later, rtol=1e-12, atol=1e-12, equal_nan=True):
             raise ValueError(
-                "the map depends on the time: give the interval in which steps begin as "
-                "time=(t_begin, t_end)."
+                "the map depends on the time: give the interval in which steps begin, "
+                "time=(t_begin, t_end). With slow_time=True it is an interval of τ = εt."
             )
     zero = jnp.zeros(())
     at = stepped if times else lambda q, p, t, epsilon, h: stepped(q, p, zero, epsilon, h)
@@ -241,8 +247,8 @@ def _functions(found: Any, system: System, timed: bool) -> list[tuple[Callable, 
     if isinstance(found, InvariantSeries):
         if found.basis.uses_time and not timed:
             raise ValueError(
-                "the invariant depends on the time: give the interval in which steps begin as "
-                "time=(t_begin, t_end), an interval of τ = εt for a system with slow_time=True."
+                "the invariant depends on the time: give the interval in which steps begin, "
+                "time=(t_begin, t_end). With slow_time=True it is an interval of τ = εt."
             )
         if found.basis.uses_time and found.slow_time != system.slow_time:
             raise ValueError(
@@ -276,7 +282,10 @@ def _domain(domain: Any, found: Any) -> tuple[tuple[int, ...], tuple[list[float]
     """Shape of a state, and the lower and upper bounds of the raveled (q, p)."""
     parts = domain if isinstance(domain, tuple) else (domain, domain)
     if len(parts) != 2:
-        raise ValueError(f"domain must be a number or a pair for q and p, got {domain!r}.")
+        raise ValueError(
+            "domain must be half-widths (a number or an array), or a pair (domain of q, domain "
+            f"of p); got a tuple of {len(parts)}: {domain!r}."
+        )
     shapes = [np.shape(x)[1:] if np.ndim(x) > 1 else np.shape(x) for x in parts]
     one = found if isinstance(found, Discovery) else None
     shape = one.shape if one is not None else max(shapes, key=len)
@@ -304,8 +313,8 @@ def _interval(name: str, ends: Any) -> tuple[float, float]:
     given, ends = ends, [finite(name, float(x)) for x in (ends if np.ndim(ends) else (0.0, ends))]
     if len(ends) != 2 or not ends[0] < ends[1]:
         raise ValueError(
-            f"{name} must be the largest value, above 0, or a pair with a least value below its "
-            f"largest, got {given!r}."
+            f"{name} must be a pair (least, largest) with least < largest, or one positive number "
+            f"x for the pair (0, x); got {given!r}."
         )
     low, high = ends
     return low, high

@@ -91,7 +91,8 @@ def exact_coefficients(invariant: InvariantSeries, h: float) -> ExactInvariant:
             raise ValueError(
                 f"the coefficient {c[place]:.10g} of ε^{place[0]} "
                 f"{invariant.basis.names[place[1]]} has no form (n_0 + n_1 h + n_2 h²)/d with "
-                "small integers. It is not exact, or the invariant was found with another h."
+                f"small integers. Check that the invariant was found with h={h!r}; if it was, its "
+                "coefficients have no exact form."
             )
     return ExactInvariant(invariant.basis, numbers)
 

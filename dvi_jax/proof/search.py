@@ -251,11 +251,11 @@ def subdivide(
     failed = [leaf for leaf in inner if leaf.failed]
     if failed:
         raise TooMany(
-            f"on {len(failed)} of {count} boxes nothing is bounded. The first is "
+            f"on {len(failed)} of {count} boxes of the domain nothing is bounded. The first is "
             f"{place(failed[0].box)}: {failed[0].failed}"
         )
     if not inner:
-        raise exact.Failed("no state satisfies `inside`: the domain is empty")
+        raise exact.Failed("no state of the domain has inside(q, p) ≥ 0: correct inside or domain")
     columns = (
         [max(column) for column in zip(*(getattr(leaf, name) for leaf in inner), strict=True)]
         for name in ("bounds", "rounding", "moved")
@@ -343,7 +343,7 @@ def enclose(
         late = count > max_boxes or time.monotonic() - began > max_seconds
         narrow = all(b - a <= (d - c) / 4096 for (a, b), (c, d) in zip(box, whole, strict=True))
         if late or narrow or hopeless.any():
-            raise TooMany(f"no invariant excludes that a trajectory gets to {place(box)}")
+            raise TooMany(f"the invariants do not prove that no trajectory reaches {place(box)}")
         if not borders:
             first, second = halves(box, axis)
             return ["cut", axis, float(first[axis][1]).hex(), node(first, ()), node(second, ())]

@@ -133,9 +133,9 @@ def sweep(
         there = machine_memory() or 8 * 2**30
         if needed > _SHARE * there:
             raise ValueError(
-                f"the results need {needed / 2**30:.1f} GiB of memory, but this machine has only "
-                f"{there / 2**30:.1f} GiB: give store=..., a directory, so that only one task at a "
-                "time is in memory."
+                f"the results need {needed / 2**30:.1f} GiB, but may use only {_SHARE:.0%} of the "
+                f"{there / 2**30:.1f} GiB of memory: give store=..., a directory. "
+                "Then only one task at a time is in memory."
             )
         sink = Memory(program.plan, found)
         about |= {"config": json.dumps(config), "config_sha256": digest(config)}
@@ -282,8 +282,8 @@ def _check_steps(num_steps: Any, lattice: Lattice, inputs: Mapping[str, Any]) ->
     if isinstance(lattice, Given):
         if num_steps is not None or any(is_axis(inputs[name]) for name in ("h", "t0")):
             raise ValueError(
-                "num_steps, or an axis h or t0, is given with the lattice dvi.Given(ts), which "
-                "determines all of them: leave them out."
+                "the lattice dvi.Given(ts) determines num_steps, h and t0: leave num_steps out, "
+                "and do not give an axis h or t0."
             )
     elif num_steps is None:
         raise ValueError("num_steps is missing: give the number of steps of each trajectory.")

@@ -94,9 +94,9 @@ def as_axis(name: str, value: Any) -> Any:
         return value
     if np.ndim(value) > 1:
         raise ValueError(
-            f"{name} must be a number or a one-dimensional array, got shape {np.shape(value)}: "
-            "for a grid give one-dimensional axes; for arguments that vary together give each of "
-            'them dvi.Axis("name", values) with the same name.'
+            f"{name} must be a number or a one-dimensional array, got shape {np.shape(value)}. "
+            "For a grid give a one-dimensional array for each argument. For arguments that vary "
+            'together give each a dvi.Axis("name", values) with the same name.'
         )
     return Axis(name, value)
 

@@ -103,8 +103,8 @@ def run_on(
         raise error.args[0] from None
     except (OSError, TimeoutError) as error:
         raise ClusterError(
-            f"the connection to the cluster was lost ({error!r}). If store is given, finished "
-            "tasks are there: start a new cluster, and the same call continues."
+            f"the connection to the cluster was lost ({error!r}). Start a new cluster and repeat "
+            "the call. With store=..., the same call continues after the finished tasks."
         ) from error
     finally:
         with contextlib.suppress(OSError, TimeoutError):
@@ -161,8 +161,8 @@ def _task(pickled: bytes, number: int) -> tuple[Any, dict[str, int]]:
         store = Store.open(path)
         if store.sha != sha:
             raise StoreError(
-                f"a worker found another sweep in {path}, which must be the same directory on "
-                "every worker."
+                f"{path} must be the same directory on every worker, but a worker found another "
+                "sweep there. Give a path in store that all workers share."
             )
         known = store.record(number)
         if known is None:

@@ -94,8 +94,8 @@ def _columns(part: Any, grid: list[str]) -> dict[str, np.ndarray]:
                 parts = {f"{column}_re": np.real(entries), f"{column}_im": np.imag(entries)}
             if taken := [c for c in parts if c in columns]:
                 raise ValueError(
-                    f"two variables would have the column {taken[0]!r} (a variable with components "
-                    "has the columns NAME_0, NAME_1, …): rename an observable or an axis."
+                    f"two variables would have the column {taken[0]!r}. The components of a "
+                    "variable have the columns NAME_0, NAME_1, …. Rename an observable or an axis."
                 )
             columns.update(parts)
     names = np.asarray(("not_computed", *STATUS_NAMES))

@@ -92,8 +92,8 @@ def make(
     """Make a store under another name and rename it: it appears as a whole or not at all."""
     if bad := [name for name in (*coordinates, *variables) if not is_array_name(name)]:
         raise ValueError(
-            f"{bad[0]!r} cannot be the name of an array in a store: {ARRAY_NAMES}. It is a key of "
-            "args or the name of an observable: rename it."
+            f"{bad[0]!r} cannot be the name of an array in a store. Rename this key of args or "
+            f"observable: {ARRAY_NAMES}."
         )
     plan = Plan(dict(config["dims"]), tuple(config["chunk"]))
     about = {"Conventions": "CF-1.11", "dvi_jax_sweep": FORMAT, "config": json.dumps(config)}

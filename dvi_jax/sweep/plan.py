@@ -51,7 +51,9 @@ class Plan:
         for name, n in (*self.dims.items(), *(("chunk", n) for n in self.chunk)):
             whole(name, n)
         if len(self.dims) != len(self.chunk):
-            raise ValueError(f"a task needs one size for each of {[*self.dims]}, got {self.chunk}.")
+            raise ValueError(
+                f"chunk must have one size for each dimension {[*self.dims]}, got {self.chunk}."
+            )
 
     @property
     def shape(self) -> tuple[int, ...]:

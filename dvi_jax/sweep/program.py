@@ -220,10 +220,10 @@ def traced(sweep: Sweep) -> tuple[dict[str, Any], list[ClosedJaxpr]]:
         kinds.add(tuple((name, x.shape, x.dtype) for name, x in out.items()))
         if len(kinds) > 1:
             raise ValueError(
-                "the results for different values of method and num_steps have different shapes, "
-                "but all must have the same shape. With several values of num_steps, save only the "
-                "final state, save=dvi.Save(final=True), or the states at given times, "
-                "save=dvi.Save(ts=...)."
+                "the results for all values of method and num_steps must have the same shapes and "
+                "types, but they differ. With several values of num_steps, save only the final "
+                "state, save=dvi.Save(final=True), or the states at given times, "
+                "save=dvi.Save(ts=...). Otherwise use a separate sweep for each value."
             )
         found = out
     return found, programs

@@ -94,7 +94,10 @@ class SweepResult:
         **Raises** `StoreError` for results that are in memory.
         """
         if not isinstance(self._source, Store):
-            raise StoreError("results in memory have no checksums: only a store can be verified.")
+            raise StoreError(
+                "results in memory cannot be verified: only a store has checksums. To make one, "
+                "give a path in dvi.sweep(store=...)."
+            )
         return self._source.verify(progress)
 
     def to_xarray(self) -> Any:

@@ -29,9 +29,9 @@ from .variables import Variable
 
 CLAIMS = ".claims"
 _RESTORE = (
-    "Restore the file from a backup, or copy it from a store that the same call of dvi.sweep makes "
-    "elsewhere: that call may be stopped as soon as its progress is shown. The results are in the "
-    "arrays next to the file."
+    "Restore the file from a backup, or copy it from a new store. To make the new store, call "
+    "dvi.sweep with the same arguments and another path in store; stop the call when it shows its "
+    "progress. The computed results are in other files of the directory."
 )
 
 
@@ -104,20 +104,19 @@ class Store:
             attributes = json.loads((path / "zarr.json").read_text())["attributes"]
             if not (path / TASKS).is_dir():
                 raise StoreError(
-                    f"{path}: the directory {TASKS}, with the records of tasks, is missing. Copy "
-                    "the store with its hidden files (names that begin with a point)."
+                    f"{path}: the directory {TASKS} is missing. It has the records of tasks. Copy "
+                    "the store again with its hidden files (names that begin with a point)."
                 )
             if (found := attributes["dvi_jax_sweep"]) != FORMAT:
                 raise StoreError(
-                    f"{path}: the store has format {found}, but this version reads {FORMAT}: use "
-                    f"the version that made it ({attributes.get('dvi-jax', 'unknown')})."
+                    f"{path}: the store has format {found}, but this version reads {FORMAT}. Use "
+                    f"the dvi-jax that made the store: {attributes.get('dvi-jax', 'unknown')}."
                 )
             store = cls(path, attributes)
         except FileNotFoundError:
-            lost = f" The file was lost. {_RESTORE}" if (path / TASKS).is_dir() else ""
-            raise StoreError(
-                f"{path}: there is no sweep here (no zarr.json). Check the path.{lost}"
-            ) from None
+            is_lost = (path / TASKS).is_dir()
+            then = f"The file was lost. {_RESTORE}" if is_lost else "Check the path."
+            raise StoreError(f"{path}: there is no sweep here (no zarr.json). {then}") from None
         except OSError as error:
             raise StoreError(
                 f"{path}: zarr.json cannot be read ({error.strerror or error}): check its "
@@ -125,8 +124,8 @@ class Store:
             ) from None
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise StoreError(
-                f"{path}: zarr.json does not describe a sweep ({error!r}): it is damaged or was "
-                f"edited. {_RESTORE}"
+                f"{path}: zarr.json does not describe a sweep ({error!r}). The file is damaged "
+                f"or was edited. {_RESTORE}"
             ) from None
         for name in store.variables:
             store.array(name)
@@ -159,7 +158,7 @@ class Store:
         if not os.access(path / TASKS, os.W_OK):
             raise StoreError(
                 f"{path} cannot be written by this user. Give another path in store, or change "
-                "the permissions of this one; dvi.open_sweep(path) reads it without writing."
+                "the permissions of this path. To read only, call dvi.open_sweep(path)."
             )
         store._restore(coordinates)
         return store
@@ -180,7 +179,8 @@ class Store:
         if seen != expected:
             raise StoreError(
                 f"{self.path}: zarr.json does not describe the array {name!r} of this sweep "
-                f"(found {seen}, expected {expected}). It is damaged or was edited. {_RESTORE}"
+                f"(found {seen}, expected {expected}). The file is damaged or was edited. "
+                f"{_RESTORE}"
             )
         self._arrays[name] = found
         return found
@@ -193,7 +193,8 @@ class Store:
         except Exception as error:  # codecs have many errors for bytes that they cannot decode
             raise StoreError(
                 f"{self.shard_path(name, number)} is damaged ({error}). Call "
-                "dvi.open_sweep(path).verify(); then the same call of dvi.sweep repeats its task."
+                "dvi.open_sweep(path).verify(). Then repeat the call of dvi.sweep: it computes the "
+                "damaged part again."
             ) from error
 
     def coordinates(self) -> dict[str, Any]:
@@ -216,8 +217,8 @@ class Store:
             values = array[:]
         except Exception as error:  # codecs have many errors for bytes that they cannot decode
             raise StoreError(
-                f"{self.path}: the coordinate {name!r} cannot be read ({error}). The same call of "
-                "dvi.sweep writes it again."
+                f"{self.path}: the coordinate {name!r} cannot be read ({error}). Call dvi.sweep "
+                "again with the same arguments: this call writes it again."
             ) from error
         if values.dtype.kind == "T":
             values = np.asarray(values.tolist())
@@ -307,9 +308,9 @@ class Store:
         found = {i: self._damage(i, x, size_only=True) for i, x in written.items() if x is not None}
         if lost := [damage[0] for damage in found.values() if damage]:
             warnings.warn(
-                f"{self.path}: files of {len(lost)} finished tasks are missing or have another "
-                f"size (the first is {lost[0]}). These tasks count as not computed; the same call "
-                "of dvi.sweep computes them again.",
+                f"{self.path}: files of {len(lost)} finished tasks are missing or have the "
+                f"wrong size. The first is {lost[0]}. These tasks count as not computed. dvi.sweep "
+                "with the same arguments computes them again.",
                 stacklevel=2,
             )
         return [i for i, damage in found.items() if not damage]

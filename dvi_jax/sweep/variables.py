@@ -15,8 +15,8 @@ from .program import Sweep
 _NAME = re.compile(r"[\w +-]+(\.[\w +-]+)*")
 
 ARRAY_NAMES = (
-    "a name may contain letters, digits, spaces, _, - and +, with points between them, but must "
-    "not be zarr.json, because it becomes the name of a file"
+    "a name may contain letters, digits, spaces, _, - and +. It may have single points, but not at "
+    "the beginning or end. The name zarr.json is reserved for a file of the store"
 )
 
 RESERVED = ("status", "failed_step", "residual", "t", "q", "p", "save", "q0", "p0")
@@ -53,12 +53,16 @@ def variables(sweep: Sweep, shapes: Mapping[str, Any]) -> dict[str, Variable]:
     taken = (*RESERVED, *(d for d in sweep.dims if d not in RESERVED))
     for name in given:
         if given.count(name) > 1:
-            raise ValueError(f"two observables have the name {name!r}: rename one of them.")
+            raise ValueError(
+                f"two observables have the name {name!r}. The keys of nested containers are joined "
+                "by points to one name. Rename one of the two observables."
+            )
         if not is_array_name(name):
             raise ValueError(f"the observable {name!r} cannot have this name: {ARRAY_NAMES}.")
         if name in taken or name.split(".")[0] in RESERVED:
             raise ValueError(
-                f"the observable {name!r} has a reserved name ({', '.join(taken)}): rename it."
+                f"the observable {name!r} has a reserved name: rename it. Reserved, also before a "
+                f"point, are {', '.join(taken)}."
             )
     # Observables that are not reduced have a row for each step that ends at a save point: one less
     # than states, except for `Save(ts=...)`.

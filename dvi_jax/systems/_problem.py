@@ -98,8 +98,8 @@ class Problem:
         ):
             for name in set(getattr(self, what)) - set(known):
                 raise ValueError(
-                    f"{what} of the problem {self.name} contains {name!r}, which is not among its "
-                    f"{kind} ({', '.join(sorted(known)) or 'it has none'})."
+                    f"{what} of the problem {self.name} contains {name!r}, but this is not among "
+                    f"its {kind} ({', '.join(sorted(known)) or 'it has none'})."
                 )
 
 
@@ -142,7 +142,7 @@ class Start:
             point: Any = at(args) if callable(at) else at
             if (q == point).all():
                 raise ValueError(
-                    f"q0 must not be at {what}, {list(point)}, where the system is singular."
+                    f"q0 must not be at {what} {list(point)}: the system is singular there."
                 )
         if self.also is not None:
             self.also(q, p, args)
@@ -290,8 +290,9 @@ class InSlowTime(eqx.Module):
     def __call__(self, t0, t1, q0, p0, q1, p1, args):
         if self.epsilon is None:
             raise ValueError(
-                "an observable in slow time needs the value of ε: call "
-                "observable.bind(system, epsilon)(...), or give it to dvi.integrate(observe=...)."
+                "an observable in slow time needs the value of ε. Call "
+                "observable.bind(system, epsilon)(...), or give the observable in "
+                "dvi.integrate(observe=...)."
             )
         return self.function(self.epsilon * t0, self.epsilon * t1, q0, p0, q1, p1, args)
 

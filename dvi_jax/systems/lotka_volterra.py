@@ -34,7 +34,7 @@ def from_populations(x, y):
     **Raises** `ValueError` for populations that are not positive.
     """
     x, y = np.asarray(x, float), np.asarray(y, float)
-    for name, number in (("prey", x), ("predators", y)):
+    for name, number in (("prey x", x), ("predators y", y)):
         if not (number > 0).all():
             raise ValueError(f"the number of {name} must be positive, got {number}.")
     return np.log(x), np.log(y)

@@ -122,8 +122,8 @@ def check_bodies(q0: Any, p0: Any, args: Any, names: Sequence[str] | None = None
     if i.size:
         a, b = int(i[0]), int(j[0])
         raise ValueError(
-            f"{called(a)} and {called(b)} are at the same position, {q[a].tolist()}, where their "
-            "attraction is infinite. Give them different positions."
+            f"{called(a)} and {called(b)} are at the same position {q[a].tolist()} up to "
+            "rounding: their attraction would be infinite. Give them different positions."
         )
 
 

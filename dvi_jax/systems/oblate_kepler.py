@@ -77,7 +77,9 @@ def secular_rates(a, e, i, args):
 
 def _outside(q, p, args):
     if (r := float(np.linalg.norm(q))) < args["R"]:
-        raise ValueError(f"|q0| = {r} lies inside the planet: it must be at least R = {args['R']}.")
+        raise ValueError(
+            f"|q0| must be at least R = {args['R']}, got {r}. This point is inside the planet."
+        )
 
 
 def oblate_kepler() -> Problem:

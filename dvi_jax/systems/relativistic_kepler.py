@@ -58,8 +58,8 @@ def _misses_the_centre(q, p, args):
     L = q[0] * p[1] - q[1] * p[0]
     if abs(L) * args["c"] <= args["K"] ** 2:
         raise ValueError(
-            f"the angular momentum {L} must be larger than K²/c = {args['K'] ** 2 / args['c']} in "
-            "size: otherwise the orbit falls into the centre. Give other q0 and p0, or a larger c."
+            f"the angular momentum must satisfy |L| > K²/c = {args['K'] ** 2 / args['c']}, got "
+            f"L = {L}: the orbit falls into the centre. Give other q0 and p0, or a larger c."
         )
 
 

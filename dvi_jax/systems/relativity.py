@@ -134,8 +134,8 @@ def oblateness(q, args):
     pole = jnp.asarray(args.get("pole", SUN_POLE), q.dtype)
     if pole.shape != q.shape[1:]:
         raise ValueError(
-            'args["pole"], the axis of the Sun, must have as many components as a position; got a '
-            f"pole of shape {pole.shape} and q of shape {q.shape}."
+            'args["pole"] must have as many components as a position, got a pole of shape '
+            f"{pole.shape} and q of shape {q.shape}. The pole is the axis of the Sun."
         )
     r = _from_sun(q)
     r2 = jnp.sum(r**2, axis=-1)

@@ -128,8 +128,8 @@ def _possible(q, p, args):
     L, G, K = p
     if not (abs(L) < G and abs(K) <= G):
         raise ValueError(
-            "the momenta p0 = (L, G, K) must satisfy |L| < G and |K| ≤ G, since L and K are "
-            f"components of an angular momentum of magnitude G; got L = {L}, G = {G}, K = {K}."
+            f"p0 = (L, G, K) must satisfy |L| < G and |K| ≤ G, got L = {L}, G = {G}, K = {K}. G is "
+            "the magnitude of the angular momentum; L and K are two of its components."
         )
 
 

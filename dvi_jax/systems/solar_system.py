@@ -86,7 +86,9 @@ def julian_date(date: str | datetime.date | float) -> float:
                 f'date must be a day such as "1900-01-31" (year-month-day), got {date!r}.'
             ) from None
     if isinstance(date, datetime.datetime):
-        raise ValueError(f"date must be a day without a time of day, got {date}.")
+        raise ValueError(
+            f"date must not have a time of day, got {date}. Give a datetime.date or a Julian date."
+        )
     if isinstance(date, datetime.date):
         jd = date.toordinal() + 1721424.5
     else:

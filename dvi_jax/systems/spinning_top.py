@@ -145,8 +145,7 @@ def exact(t, q0, p0, args):
 def _leans(q, p, args):
     if not 0 < q[1] < np.pi:
         raise ValueError(
-            f"θ = q0[1] must lie between 0 and π (both excluded, since Euler's angles are singular "
-            f"there), got {q[1]}."
+            f"θ = q0[1] must satisfy 0 < θ < π, got {q[1]}. Euler's angles are singular at 0 and π."
         )
 
 

@@ -72,7 +72,9 @@ class Expressions:
             case ast.BinOp(left=left, op=ast.Add() | ast.Mult() as op, right=right):
                 left, right = self._made(left), self._made(right)
                 if not (isinstance(left, self.kind) and isinstance(right, self.kind)):
-                    raise ValueError("+ and * cannot be used with numbers: for 2 + 2 write 4")
+                    raise ValueError(
+                        "+ and * combine only allowed objects, not numbers: for 2 + 2 write 4"
+                    )
                 return left + right if isinstance(op, ast.Add) else left * right
             case ast.Name(id=name):
                 try:

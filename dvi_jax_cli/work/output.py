@@ -87,8 +87,8 @@ class Output(Report):
         """
         if not self.force and any(p.name != keep for p in self.folder.iterdir()):
             raise FileExistsError(
-                f"another process has written to {self.folder} since this command began; give "
-                "another directory, or --force"
+                f"another process has written to {self.folder} since this command began. "
+                "Repeat the command with another directory or with --force"
             )
         for name in self.names:
             if name != keep:
@@ -99,7 +99,7 @@ class Output(Report):
             there = ", ".join(sorted(file.name for file in self.folder.iterdir())) or "nothing"
             raise KeyboardInterrupt(
                 f"by Ctrl-C while results were written to {self.folder}, which contains: {there}. "
-                "The last file may be incomplete; the same command with --force writes all again"
+                "The last file may be incomplete. To write all again, add --force to the command"
             ) from None
 
     def path(self, name: str) -> Path:

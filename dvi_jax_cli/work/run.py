@@ -89,7 +89,8 @@ def _arguments(file: RunFile, source: Source) -> dict[str, Any]:
             check_covered(source.jd + span)
         except ValueError as error:
             seen = f"the run ends {span:g} days after its start: {error}"
-            raise InputError("steps", seen, "fewer steps, a smaller h, or another date") from None
+            allowed = "a shorter run (fewer steps, a smaller h, earlier times), or another date"
+            raise InputError("steps", seen, allowed) from None
     return run
 
 

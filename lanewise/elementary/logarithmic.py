@@ -222,7 +222,7 @@ def half_integer_power(twice: int) -> Callable[[Array], Array]:
     only if x^(|twice|/2) does.
     """
     if twice % 2 == 0:
-        raise ValueError(f"in half_integer_power twice must be odd, got {twice}.")
+        raise ValueError(f"twice must be odd, got {twice}.")
     count = abs(twice) // 2
     at_infinity, at_0 = (0.0, math.inf) if twice < 0 else (math.inf, 0.0)
 
