@@ -337,7 +337,7 @@ def test_cost_of_a_step(name, method):
 
     ratio = seconds(dvi.DoubleDouble()) / seconds(dvi.FloatingPoint())
     print(f"{name}, {method!r}: a step in pairs takes {ratio:.1f} times as long")
-    assert 2 < ratio < 25
+    assert 2 < ratio < 45  # 8 to 32 were measured; the most for a polynomial step
 
 
 @pytest.mark.slow
