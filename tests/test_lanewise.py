@@ -850,7 +850,7 @@ def test_an_unknown_parameter_is_left_to_xla():
     np.testing.assert_array_equal(rules.moved("reshape", of, x)[0], [0, 1, 2, 3])
     of["dimensions"] = (1, 0)
     np.testing.assert_array_equal(rules.moved("reshape", of, x)[0], [0, 2, 1, 3])
-    with pytest.raises(lanewise.ir.Unsupported, match="reshape with order"):
+    with pytest.raises(lanewise.ir.Unsupported, match="reshape with parameter order"):
         rules.moved("reshape", {**of, "order": "F"}, x)
 
 

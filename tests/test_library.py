@@ -512,7 +512,7 @@ def test_invalid_arguments_of_systems_are_refused(make, options, said):
     ("name", "q0", "p0", "said"),
     [
         ("relativistic_kepler", [0.0, 0.0], [0.0, 1.0], "q0 must not be at the centre"),
-        ("two_centres", [0.0, 0.0, -0.5], [0.0, 1.0, 0.0], r"second centre, \[0.0, 0.0, -0.5"),
+        ("two_centres", [0.0, 0.0, -0.5], [0.0, 1.0, 0.0], r"second centre \[0.0, 0.0, -0.5"),
         ("hill", [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], "q0 must not be at the small body"),
         ("dipole_field", [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], "q0 must not be at the dipole"),
         ("rigid_body", [0.0, 0.0, 0.0], [1.0, 1.0, 0.5], r"\|L\| < G and"),

@@ -220,7 +220,7 @@ def test_a_substep_backwards_against_strong_dissipation_warns():
         UserWarning, match=r"Yoshida .*backwards .* 0.85 h.*substep is 0\.306\. .*St"
     ):
         check(dvi.Yoshida(4), 3.6)
-    with pytest.warns(UserWarning, match="not more accurate than one of order 2"):
+    with pytest.warns(UserWarning, match="not more accurate than a map of order 2"):
         check(dvi.Adjoint(dvi.Yoshida(4)), 3.6)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -841,7 +841,7 @@ def test_work_precision_finds_the_front_and_marks_runs_without_a_place():
     refuses(
         plot.work_precision,
         (({},), {}, "results is empty"),
-        (({"a": ([1, 2], [1])},), {}, r"got shapes \(2,\) and \(1,\)"),
+        (({"a": ([1, 2], [1])},), {}, r"The shapes are \(2,\) and \(1,\)"),
         (({"a": ([0, 2], [1, 1])},), {}, "and positive costs"),
         (({"a": 3},), {}, r"must be \(costs, errors\)"),
     )

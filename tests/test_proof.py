@@ -408,7 +408,7 @@ def test_no_number_of_steps_is_claimed(epsilon, function):
 @pytest.mark.parametrize(
     ("how", "kind", "message"),
     [
-        ({"epsilon": (0.1, 0.1)}, ValueError, "a least value below its largest"),
+        ({"epsilon": (0.1, 0.1)}, ValueError, "with least < largest"),
         ({"ratio": 1.0}, ValueError, "larger than 1"),
         ({"domain": 0.5}, ValueError, "does not contain the number of coordinates"),
         ({"domain": np.array([-1.0])}, ValueError, "lower bounds below"),

@@ -207,7 +207,10 @@ def diagram(q, p, **options):
     [
         (lambda q, p: section(q, p[:2]), r"the same shape, got \(3, 2\) for q0 and \(2, 2\)"),
         (lambda q, p: section(q, p, num_steps=0), "num_steps must be a whole .* from 1 on, got 0"),
-        (lambda q, p: section(q, p, epsilon=[0.0, 0.1]), "one for each of the 3 orbits, got 2"),
+        (
+            lambda q, p: section(q, p, epsilon=[0.0, 0.1]),
+            "one number for each orbit in q0.; got 2 numbers",
+        ),
         (lambda q, p: section(q, p, skip=-1), "skip must be a whole"),
         (lambda q, p: section(q, p, crossings=0), "crossings must be a whole .* from 1 on, got 0"),
         (lambda q, p: section(q, p, system=HENON), "be a dvi.System, got Problem.*problem.system"),

@@ -252,7 +252,7 @@ def test_damage_is_not_read_as_numbers_without_verification(copy, expected):
     found = dvi.open_sweep(copy)
     with pytest.warns(UserWarning, match=r"files of 1 finished tasks are missing .*drift"):
         assert found.tasks_done == 10
-    with pytest.warns(UserWarning, match="the same call"):
+    with pytest.warns(UserWarning, match="the same arguments"):
         assert found.status_counts()["not_computed"] == 200
     assert (found["status"][12:16] == -1).all()
     assert np.isnan(found["end"][12:16]).all()
@@ -297,7 +297,7 @@ def test_a_damaged_coordinate_is_an_error_and_written_again(copy, finished, dama
         file.unlink()
         if damage == "cut":
             file.write_bytes(content)
-    with pytest.raises(dvi.StoreError, match=r"the coordinate 'epsilon' .*The same call of dvi"):
+    with pytest.raises(dvi.StoreError, match=r"the coordinate 'epsilon' .*Call dvi.sweep again"):
         dvi.open_sweep(copy)
     sweep(copy)
     assert file.read_bytes() == (finished / "epsilon" / "c" / "0").read_bytes()

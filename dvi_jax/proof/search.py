@@ -343,7 +343,10 @@ def enclose(
         late = count > max_boxes or time.monotonic() - began > max_seconds
         narrow = all(b - a <= (d - c) / 4096 for (a, b), (c, d) in zip(box, whole, strict=True))
         if late or narrow or hopeless.any():
-            raise TooMany(f"the invariants do not prove that no trajectory reaches {place(box)}")
+            raise TooMany(
+                f"a trajectory may reach the box {place(box)}: the invariants do not exclude it. "
+                "A smaller ε or h, or larger max_boxes and max_seconds, may help"
+            )
         if not borders:
             first, second = halves(box, axis)
             return ["cut", axis, float(first[axis][1]).hex(), node(first, ()), node(second, ())]

@@ -271,7 +271,7 @@ def _start(given: Any, source: Source) -> dvi.starts.Starts:
         return made(**options)
     except (TypeError, ValueError) as error:
         raise InputError(
-            "start", str(error), f"keys that are valid for kind = {given.kind}"
+            "start", str(error), f"values that dvi.starts accepts for kind = {given.kind}"
         ) from None
 
 
