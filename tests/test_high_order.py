@@ -167,3 +167,11 @@ def test_an_invariant_of_order_six_changes_by_epsilon_to_the_seventh():
         slopes.append(np.log2(float(changes[0] / changes[1])))
     assert slopes[0] == pytest.approx(7, abs=0.2)
     assert slopes[1] < 5  # 4 in the limit of small ε
+
+
+def test_orders_above_six_are_not_silent():
+    system = dvi.System(lambda t0, t1, q, p, args: (p @ p + q @ q) / 2)
+    samples = np.random.default_rng(0).uniform(-1, 1, (2, 40, 1))
+    how = {"h": 0.1, "samples": samples}
+    with pytest.warns(UserWarning, match="order=7: above order 6 rounding in float64"):
+        dvi.discover_invariants(system, dvi.Polynomials(2), order=7, **how)

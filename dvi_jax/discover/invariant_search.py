@@ -1,6 +1,7 @@
 """Adiabatic invariants as the null space of a linear system on the iterated map."""
 
 import time
+import warnings
 from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
@@ -48,6 +49,7 @@ _FUZZY = 30.0
 _FUZZIEST = 1e-3  # No larger shares than this are taken for errors of others
 _AS_GOOD = 10.0  # An invariant with fewer terms may change by so many times more
 _ROUND_OFF = 1e-12  # Changes below this need not be smaller
+_RELIABLE = 6  # The largest order that float64 decides reliably
 
 
 @both_names
@@ -123,6 +125,12 @@ def discover_invariants(
     one_step = map_of("discover_invariants", system, **how)
     samples = as_samples(samples, one_step.t0)
     order = whole("order", order, least=0)
+    if order > _RELIABLE:
+        warnings.warn(
+            f"order={order}: above order {_RELIABLE} rounding in float64 can hide an invariant, or "
+            "let a false one pass. Check what is found with bound_drift or drift_order.",
+            stacklevel=2,
+        )
     if tolerance is not None:
         tolerance = fraction("tolerance", tolerance)
     one_of("representative", representative, ("least", "simplest"))
