@@ -9,7 +9,7 @@ the number of boxes, seconds of the search and of the check of the certificate. 
 status 1 if a bound is smaller than a change, more than 30 times larger, or larger than its limit,
 or if a search takes more than its time.
 
-`--long`: computed trajectories of 1 024 starts next to the proved line.
+`--long`: computed trajectories of 1 024 starts, and their proved lines.
 """
 
 import argparse
@@ -272,8 +272,8 @@ def exact_energy(q, p, epsilon):
 
 
 def long_run(name: str, steps: int) -> list[str]:
-    """1 024 computed trajectories, and their proved line: an invariant of order 1, and one that only
-    the rounding changes."""
+    """1 024 computed trajectories and their proved line, for an invariant of order 1 and for one
+    that only the rounding changes."""
     given = cubic(1)
     if name == "rounding":
         spring = dvi.System(quadratic)
