@@ -20,7 +20,7 @@ import pytest
 from jax import lax
 
 import lanewise
-from lanewise import components, primitive
+from lanewise import components, kernel, primitive
 
 LANES = 9
 ULPS = 16
@@ -773,8 +773,19 @@ def swapped(rule):
     return lambda e, params, a, b: rule(e, params, b, a)
 
 
+@pytest.fixture
+def nothing_is_stored():
+    """Programs that are compiled in a test are compiled again in others."""
+    yield
+    jax.clear_caches()
+    for module in (kernel, primitive):
+        for stored in vars(module).values():
+            if hasattr(stored, "cache_clear"):
+                stored.cache_clear()
+
+
 @pytest.mark.slow
-def test_a_wrong_rule_is_found(monkeypatch):
+def test_a_wrong_rule_is_found(nothing_is_stored, monkeypatch):
     """Control: a difference with its operands exchanged, among 20 programs."""
     monkeypatch.setitem(components.ELEMENTWISE, "sub", swapped(components.ELEMENTWISE["sub"]))
     checker, per_program = run(0, 20, SHORT)
