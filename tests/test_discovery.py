@@ -409,7 +409,7 @@ def test_a_discovery_is_saved_and_loaded(tmp_path, monkeypatch):
         np.testing.assert_array_equal(back.coefficients, d.coefficients)
         at = np.array([0.3]), np.array([0.2]), 0.1
         np.testing.assert_array_equal(back.evaluate(*at), d.evaluate(*at))
-    with pytest.raises(ValueError, match=r"which has 44 functions .* has 14 "):
+    with pytest.raises(ValueError, match=r"basis has 44 functions.* has 14 "):
         dvi.Discovery.load(path, dvi.Polynomials(4))
     named = dvi.Basis({"f": lambda q, p: q @ q + p @ p - 0.1 * (q @ p)})
     discover(OSCILLATOR, named, samples=box(1, 20)).save(path)
