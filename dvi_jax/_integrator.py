@@ -61,7 +61,7 @@ class Integrator(eqx.Module):
         for name, (kind, hint) in _FIELDS.items():
             value = getattr(self, name)
             if name != "method" or value is not None:
-                instance(name, value, kind, f"a {kind.__name__}", f"Take {hint}.")
+                instance(name, value, kind, f"an instance of dvi.{kind.__name__}", f"Take {hint}.")
 
     @property
     def newton(self) -> RootSolver:

@@ -323,3 +323,15 @@ def _abstract(function: Callable, avals: Any, params: dict[str, Any]) -> Any:
         return ShapedArray(x.shape, x.dtype, sharding=sharding, manual_axis_type=varying)
 
     return jax.tree.map(typed, out)
+
+
+def of_one_equation(jaxpr: Jaxpr, eqn: Any, inputs: Sequence[Any]) -> ClosedJaxpr:
+    """The jaxpr of one equation of a jaxpr, a function of these variables."""
+    alone = jaxpr.replace(
+        constvars=[],
+        invars=list(inputs),
+        outvars=eqn.outvars,
+        eqns=[eqn],
+        debug_info=jaxpr.debug_info.with_unknown_names(),
+    )
+    return ClosedJaxpr(alone, ())

@@ -118,6 +118,7 @@ def test_functions_of_two_pairs():
     assert worst(functions.raised, lambda x, y: x**y, drawn(0.1, 10), y) < 1e-30
 
 
+@pytest.mark.slow
 def test_special_values_are_those_of_float64():
     x = jnp.array([0.0, jnp.inf, jnp.nan, -jnp.inf])
     for ours, plain in (
@@ -299,15 +300,17 @@ def test_a_batch_has_the_bits_of_single_runs(method):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "method"),
+    ("name", "method", "most"),
     [
-        ("pendulum", dvi.Strang()),
-        ("kepler", dvi.Strang()),
-        ("henon_heiles", dvi.Strang()),
-        ("kepler", dvi.GaussLegendre(2)),
+        ("pendulum", dvi.Strang(), 25),
+        ("kepler", dvi.Strang(), 25),
+        # The target of 25 is missed: in float64 most of this step is fused multiply-adds, each of
+        # which takes about 25 operations in pairs.
+        ("henon_heiles", dvi.Strang(), 35),
+        ("kepler", dvi.GaussLegendre(2), 25),
     ],
 )
-def test_cost_of_a_step(name, method):
+def test_cost_of_a_step(name, method, most):
     """In a batch, relative to float64: the least of some runs of each."""
     problem = systems.LIBRARY[name]()
 
@@ -337,7 +340,7 @@ def test_cost_of_a_step(name, method):
 
     ratio = seconds(dvi.DoubleDouble()) / seconds(dvi.FloatingPoint())
     print(f"{name}, {method!r}: a step in pairs takes {ratio:.1f} times as long")
-    assert 2 < ratio < 45  # 8 to 32 were measured; the most for a polynomial step
+    assert 2 < ratio < most
 
 
 @pytest.mark.slow

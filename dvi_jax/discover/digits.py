@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .block_triangular import BlockTriangular, above
 from .nullspace import DENSE, NULL, series_changes, toeplitz, triangle
-from .staircase import Staircase, above
 
 # Coefficients below such shares of the largest may be rounding; the first level that the held-out
 # samples confirm counts.
@@ -46,8 +46,8 @@ class Conditions(NamedTuple):
         free[0, np.argmax(np.abs(shares[0]))] = False
         return free
 
-    def _solver(self, free: np.ndarray, share: float) -> Staircase:
-        return Staircase(self.terms, above(share), free.reshape(self.terms.shape[1:]))
+    def _solver(self, free: np.ndarray, share: float) -> BlockTriangular:
+        return BlockTriangular(self.terms, above(share), free.reshape(self.terms.shape[1:]))
 
     def _residual(self, shares: np.ndarray) -> np.ndarray:
         """The left sides, shape (orders, rows, 1)."""

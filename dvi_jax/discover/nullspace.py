@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .staircase import Staircase
+from .block_triangular import BlockTriangular
 
 NULL = 1e-11  # Without a tolerance, a singular value above this share of the largest is never zero
 CLEAR = 1e3  # A gap in the singular values below this is not clear
@@ -94,14 +94,14 @@ def _spaces_of_orders(terms: np.ndarray, tolerance: float | None) -> list[NullSp
     if tolerance is not None or terms.shape[1] * terms.shape[2] <= DENSE:
         orders = range(terms.shape[1])
         return [null_space(toeplitz(terms, k), tolerance, 1.0) for k in orders]
-    stairs, spaces = Staircase(terms, lambda relative: _cut(relative, None)[0], unit=1.0), []
-    for k, (step, order) in enumerate(zip(stairs.steps, stairs.orders, strict=True)):
-        leading, shifts = (c.reshape((k + 1) * terms.shape[2], -1) for c in stairs.null(k))
+    system, spaces = BlockTriangular(terms, lambda relative: _cut(relative, None)[0], unit=1.0), []
+    for k, (step, order) in enumerate(zip(system.steps, system.orders, strict=True)):
+        leading, shifts = (c.reshape((k + 1) * terms.shape[2], -1) for c in system.null(k))
         shifts = np.linalg.qr(shifts)[0]
         kept, null = [step.singular], [step.every[len(step.singular) :]]
         for columns, split in ((leading, order.rest), (shifts, order.later)):
             # Singular values of the residuals, which may be less than the rounding on the way.
-            left = stairs.left_sides(columns.reshape(k + 1, terms.shape[2], -1))
+            left = system.left_sides(columns.reshape(k + 1, terms.shape[2], -1))
             null.append(singular_vectors(np.concatenate(left))[0])
             kept.append(split.singular)
         ratios = [

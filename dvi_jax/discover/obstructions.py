@@ -5,11 +5,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .basis import linear_text
+from .block_triangular import Split, above
 from .echelon import reduced
 from .families import raised
 from .nullspace import RANK, orthonormal_range
 from .series import shortened
-from .staircase import Split, above
 
 # A drift law is reported when it leaves less than this share of the drift unexplained.
 EXPLAINED = 1e-6

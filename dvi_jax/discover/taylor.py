@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from lanewise.jaxapi import ClosedJaxpr, Literal, bodies, jaxpr_as_fun
+from lanewise.jaxapi import ClosedJaxpr, Literal, bodies, jaxpr_as_fun, of_one_equation
 
 _CALLS = {"jit", "pjit", "closed_call"}
 # Linear in their operands of real numbers, of which any may be constant.
@@ -115,14 +115,7 @@ class _Operation:
         # A jaxpr of this equation alone.
         variables = dict.fromkeys(v for v in eqn.invars if not isinstance(v, Literal))
         self.places = [eqn.invars.index(v) for v in variables]
-        alone = jaxpr.replace(
-            constvars=[],
-            invars=list(variables),
-            outvars=eqn.outvars,
-            eqns=[eqn],
-            debug_info=jaxpr.debug_info.with_unknown_names(),
-        )
-        self.alone = ClosedJaxpr(alone, ())
+        self.alone = of_one_equation(jaxpr, eqn, list(variables))
 
     def function(self, *operands: Any) -> list[Any]:
         """g: all outputs from all operands."""

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.patches import Patch
 
+from .._checks import one_of
 from ..discover import DriftOrder, DriftSurface
 from . import axes as draw
 from .axes import canvas, counted, entry, legend, stack
@@ -265,6 +266,7 @@ def drift_bound(
     `Axes`. **Raises** `ValueError` for shapes that do not fit.
     """
     draw.check_attributes(bound, ("per_step", "rounding"), "bound must be a dvi.DriftBound")
+    one_of("invariant", invariant, range(len(bound.per_step)))
     n, v = np.asarray(steps, float), np.asarray(values, float)
     fits = n.ndim == 1 and v.shape[-1:] == n.shape and len(n) > 1
     draw.check_shapes(fits, "values must have one number for each of steps", steps=n, values=v)

@@ -15,9 +15,10 @@ from .._precision import refuse_double_without_x64
 from .._step import Equations
 from .._system import System, check_system, of_problem
 from .._types import Interval
+from ..discover.basis import check_step_size
 from ..discover.found import Discovery
 from ..discover.series import InvariantSeries
-from .components import program_of
+from .components import Unsupported, program_of
 from .confinement import confine
 from .rational import ExactInvariant
 from .result import DriftBound
@@ -115,7 +116,7 @@ def bound_drift(
             f"bound_drift bounds the rounding of plain float64, not of {how.arithmetic!r}: leave "
             "arithmetic out."
         )
-    h = finite("h", h)
+    h = check_step_size(h)
     shape, (lower, upper) = _domain(domain, found)
     strengths, times = (
         _interval("epsilon", epsilon),
@@ -123,7 +124,8 @@ def bound_drift(
     )
     functions = _functions(found, system, time is not None)
     stepped, programs = _step_of(system, how.method_for(system), shape, args, h, times)
-    invariants = [program_of(f, shape, shape, (), (), ()) for f, _ in functions]
+    numbers = [shape, shape, (), (), ()]
+    invariants = [_listed(f"the invariant {name}", f, numbers, 0) for f, name in functions]
     n, t = len(lower) // 2, ["input", len(lower)]
     certificate = {
         "format": exact.FORMAT,
@@ -134,7 +136,7 @@ def bound_drift(
         "slow": system.slow_time,
         "timed": any(t in p["operations"] for p in (programs["step"], *invariants)),
         "domain": [[x.hex() for x in side] for side in (lower, upper)],
-        "inside": program_of(inside or (lambda q, p: jnp.zeros(0)), shape, shape),
+        "inside": _listed("inside", inside or (lambda q, p: jnp.zeros(0)), [shape, shape], None),
         "invariants": invariants,
         "unit": (2.0**-53).hex(),
         "bits": 100,
@@ -258,6 +260,11 @@ def _functions(found: Any, system: System, timed: bool) -> list[tuple[Callable, 
         return [(lambda q, p, t, e, h: found.evaluate(q, p, e, t), found.formula(terms=8))]
     if isinstance(found, ExactInvariant):
         return [(lambda q, p, t, e, h: found.evaluate(q, p, e, h, t), str(found))]
+    if isinstance(found, str) or not (callable(found) or np.iterable(found)):
+        raise TypeError(
+            "found must be a Discovery, an InvariantSeries, an ExactInvariant, a function (q, p, "
+            f"epsilon), or a list of these, got {found!r:.200}."
+        )
     if callable(found):
         name = getattr(found, "__name__", "a function")
         if _takes(found, 4) and (timed or not _takes(found, 3)):
@@ -267,6 +274,18 @@ def _functions(found: Any, system: System, timed: bool) -> list[tuple[Callable, 
     if not pairs:
         raise ValueError("found is empty: give an invariant, or a list of at least one.")
     return pairs
+
+
+def _listed(what: str, function: Callable, shapes: list, ndim: int | None) -> dict[str, Any]:
+    """The operations of a function, whose result must have so many axes (None: any)."""
+    structs = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes]
+    result = jax.eval_shape(function, *structs)
+    if ndim is not None and getattr(result, "ndim", None) != ndim:
+        raise ValueError(f"{what} must return one number, got shape {jnp.shape(result)}.")
+    try:
+        return program_of(function, *shapes)
+    except Unsupported as error:
+        raise Unsupported(f"{what}: {error}") from None
 
 
 def _takes(function: Callable, count: int) -> bool:
@@ -310,7 +329,7 @@ def _domain(domain: Any, found: Any) -> tuple[tuple[int, ...], tuple[list[float]
 
 
 def _interval(name: str, ends: Any) -> tuple[float, float]:
-    given, ends = ends, [finite(name, float(x)) for x in (ends if np.ndim(ends) else (0.0, ends))]
+    given, ends = ends, [finite(name, x) for x in (ends if np.ndim(ends) else (0.0, ends))]
     if len(ends) != 2 or not ends[0] < ends[1]:
         raise ValueError(
             f"{name} must be a pair (least, largest) with least < largest, or one positive number "

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import linprog
 
-from .tools import tools
+from .tools import combination, tools
 
 _LEVELS = (0.97, 0.9, 0.75, 0.5)
 """Fractions of the range between the least value in the domain and that at its border that are
@@ -44,12 +44,12 @@ def confine(
             last = checker.h * (checker.epsilon[1] if checker.slow else 1)
             steps = min(steps, math.floor((checker.time[1] - checker.time[0]) / last))
         if not steps:
-            reason = f"{_named(weights)} may change by more than change={change:g} in one step"
+            reason = f"{combination(weights)} may change by more than change={change:g} in one step"
             continue
         for part in _LEVELS:
             level = least + part * (border - least) - change
             if level <= least:
-                reason = f"change={change:g} is larger than the range of {_named(weights)}"
+                reason = f"change={change:g} is larger than the range of {combination(weights)}"
                 continue
             value = Fraction(level)
             quick = _value(functions, weights, shape, float(checker.h))
@@ -72,10 +72,6 @@ def _value(functions: list, weights: list[float], shape: Any, h: float) -> Any:
     return jax.jit(
         jax.vmap(lambda x: sum(w * f(*_state(x[:-2], shape), x[-2], x[-1], h) for w, f in used))
     )
-
-
-def _named(weights: list[float]) -> str:
-    return " + ".join(f"{w:.4g} I_{k}" for k, w in enumerate(weights) if w)
 
 
 def _candidates(checker: Any, functions: list, inside: Any, shape: Any, reach: list) -> list[tuple]:
@@ -112,13 +108,13 @@ def _candidates(checker: Any, functions: list, inside: Any, shape: Any, reach: l
 
 def _best_combination(within: np.ndarray, around: np.ndarray) -> list[np.ndarray]:
     """The w whose least w·I around the domain is largest next to its mean inside: a linear program.
-    None if no w·I is larger around the domain than at its middle, where I is 0 here."""
+    Empty if no w·I is larger around the domain than at its middle, where I is 0 here."""
     mean = np.mean(within, axis=0)
     n = len(mean)
     size = np.std(within, axis=0) + 1e-300
     # max m  with  w·I(border) ≥ m  and  w·mean = 1.
-    rows = np.column_stack([-around[:: max(1, len(around) // 20000)] / size, np.ones(1).repeat(
-        len(around[:: max(1, len(around) // 20000)]))])  # fmt: skip
+    border = around[:: max(1, len(around) // 20000)]
+    rows = np.column_stack([-border / size, np.ones(len(border))])
     solution = linprog(
         [*np.zeros(n), -1.0],
         A_ub=rows,

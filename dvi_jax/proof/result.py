@@ -10,8 +10,9 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
+from .._checks import finite
 from .._files import publish
-from .tools import tools
+from .tools import combination, tools
 
 
 class DriftBound(eqx.Module):
@@ -27,7 +28,7 @@ class DriftBound(eqx.Module):
     - `level`: (w, c): trajectories that start in the domain with Σ w_k I_k ≤ c stay in it for
       `steps` steps, exact or computed; None if that is not shown, and `reason` says why.
     - `start`: factor by which the domain is scaled about its middle so that all its states satisfy
-      that. `change`: the change of I_k that `steps` steps exclude.
+      that. `change`: the change of Σ w_k I_k that `steps` steps exclude.
     - `boxes`: number of boxes of the proof. `formulas`: the invariants as text.
     - `certificate`: all that `dvi-jax verify` checks, see `save`.
     """
@@ -70,6 +71,9 @@ class DriftBound(eqx.Module):
                 f"they have {np.size(q0)} and {np.size(p0)}."
             )
         low, high = map(float, checker.epsilon)
+        epsilon = finite("epsilon", epsilon)
+        if not np.isfinite(x).all():
+            raise ValueError(f"q0 and p0 must be finite numbers, got {q0!r} and {p0!r}.")
         if not low <= epsilon <= high:
             raise ValueError(
                 f"epsilon={epsilon!r} is not in the interval [{low:g}, {high:g}] of the proof: "
@@ -138,16 +142,11 @@ class DriftBound(eqx.Module):
         if self.level is None:
             lines.append(f"it is not shown that trajectories stay in the domain: {self.reason}")
         else:
-            lines.append(
-                f"no trajectory that starts in the domain with {self._combination()} ≤ "
-                f"{self.level[1]:.6g} leaves it in {self.steps:.3g} steps; all states of the "
-                f"domain scaled by {self.start:.3g} are such"
-            )
+            weights, level = self.level
+            text = f"no trajectory that starts in the domain with {combination(weights)} ≤ "
+            text += f"{level:.6g} leaves it in {self.steps:.3g} steps"
+            if self.start:
+                text += f"; all states of the domain scaled by {self.start:.3g} satisfy this"
+            lines.append(text)
         lines.extend(f"I_{k} = {text}" for k, text in enumerate(self.formulas))
         return "\n".join(lines)
-
-    def _combination(self) -> str:
-        """Σ w_k I_k as text."""
-        weights = enumerate(self.level[0] if self.level else ())
-        text = " + ".join(f"{w:.4g} I_{k}" if w != 1 else f"I_{k}" for k, w in weights if w)
-        return text.replace("+ -", "− ").replace("-1 I", "−I").replace("-", "−")

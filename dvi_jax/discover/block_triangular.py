@@ -82,7 +82,7 @@ class Secular(NamedTuple):
         return np.vstack([a, later]), np.vstack([np.zeros((self.first, shifts.shape[1])), shifts])
 
 
-class Staircase:
+class BlockTriangular:
     """The conditions of all orders.
 
     - `terms`: A_0 … A_z, shape (rows, z + 1, size). `cut`: see `Cut`.
