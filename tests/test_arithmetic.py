@@ -396,7 +396,7 @@ def test_steps_that_fixed_point_cannot_undo_are_rejected():
                 run(system, method, epsilon=0.1)
     with pytest.raises(ValueError, match="too small or too large for a state in float32"):
         run(separable, q0=np.array([0.3], np.float32), quantum=2.0**-140)
-    with pytest.raises(TypeError, match=r"arithmetic must be an instance of dvi.Arithmetic.*parentheses"):
+    with pytest.raises(TypeError, match=r"must be an instance of dvi.Arithmetic.*parentheses"):
         dvi.integrate(separable, [0.3], [1.0], h=0.1, num_steps=1, arithmetic=dvi.Compensated)
 
 

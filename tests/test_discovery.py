@@ -597,7 +597,7 @@ def test_arguments_of_the_wrong_kind_are_refused():
             search(SPRING, two, newton=5, **given)
     with pytest.raises(ValueError, match=r"the shape \(1,\) for .* got q of shape \(2,\)"):
         found("spring", 4, 2).evaluate([0.1, 0.2], [0.3, 0.4], 0.1)
-    with pytest.raises(TypeError, match="method must be an instance of dvi.Method"):
+    with pytest.raises(TypeError, match=r"method must be an instance of dvi.Method"):
         discover(SPRING, 2, method=5)
     broadcast = dvi.System(H_D, force=lambda t0, t1, q, p, args: jnp.sum(q))
     with pytest.raises(ValueError, match="shaped like q0"):
