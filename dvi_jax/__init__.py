@@ -176,9 +176,11 @@ if TYPE_CHECKING:  # names that are imported at their first use (`_namespaces`)
     from .proof import (
         DriftBound as DriftBound,
         ExactInvariant as ExactInvariant,
+        NoetherProof as NoetherProof,
         ProofError as ProofError,
         bound_drift as bound_drift,
         exact_coefficients as exact_coefficients,
+        prove_noether as prove_noether,
     )
     from .sweep import (
         Axis as Axis,

@@ -44,7 +44,10 @@ HOMES = {
         *("MultipleShooting", "NetworkForce", "Observations", "Posterior", "Prior", "Samples"),
         *("SingleShooting", "SoftL1", "fit", "identify", "sample"),
     ),
-    "proof": ("DriftBound", "ExactInvariant", "ProofError", "bound_drift", "exact_coefficients"),
+    "proof": (
+        *("DriftBound", "ExactInvariant", "NoetherProof", "ProofError", "bound_drift"),
+        *("exact_coefficients", "prove_noether"),
+    ),
     "sweep": (
         *("Axis", "ClusterError", "StoreError", "StoreMismatch", "SweepCost"),
         *("SweepInterrupted", "SweepProgress", "SweepResult", "open_sweep", "sweep"),

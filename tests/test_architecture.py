@@ -250,7 +250,7 @@ generators random_pairs solution_pairs find_symmetries Symmetries Symmetry
 Polynomials Basis Chebyshev Radial Trigonometric
 discover_invariants InvariantSeries ShadowHamiltonian drift_order drift_surface
 noether_balance solve_gauge
-bound_drift DriftBound ProofError ExactInvariant exact_coefficients
+bound_drift DriftBound ProofError ExactInvariant exact_coefficients prove_noether NoetherProof
 sweep Axis starts open_sweep SweepResult SweepProgress SweepInterrupted StoreError StoreMismatch
 ClusterError sweep_cost SweepCost
 fit Model Observations Bounds Prior LeastSquares SoftL1 Cauchy Likelihood

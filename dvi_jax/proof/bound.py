@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._arithmetic import FloatingPoint
+from .._arithmetic import DoubleDouble, FixedPoint, FloatingPoint
 from .._checks import finite, positive, whole
 from .._integrator import Integrator, chosen, only
 from .._precision import refuse_double_without_x64
@@ -24,8 +24,9 @@ from .rational import ExactInvariant
 from .result import DriftBound
 from .tools import tools
 
-_ACCEPTED = 8.0
-"""Residual of an implicit equation that a solver accepts, in units of round-off of the momenta."""
+_ACCEPTED = {"float64": 2.0**-49, "pairs of float64": 2.0**-94}
+"""Residual of an implicit equation that a solver accepts, relative to the largest momentum: eight
+units of round-off, and twice what `DoubleDouble` leaves out."""
 
 
 class ProofError(Exception):
@@ -43,6 +44,7 @@ def bound_drift(
     inside: Callable | None = None,
     args: Any = None,
     method: Any = None,
+    arithmetic: Any = None,
     integrator: Integrator | None = None,
     change: float = 1e-3,
     ratio: float = 2.0,
@@ -53,7 +55,7 @@ def bound_drift(
 
     The change I(Φ(x, ε), ε) − I(x, ε) of each invariant I = Σ ε^m I_m is expanded on boxes that
     cover the domain, in exact arithmetic and with a rigorous bound of the remainder, so that terms
-    that cancel do so exactly. The rounding of one step in float64 is bounded as well. Then N steps
+    that cancel do so exactly. The rounding of a computed step is bounded as well. Then N steps
     change I by at most N (per_step + rounding) as long as the trajectory is in the domain; and
     where an invariant is larger all around the domain than inside, this is proved, too: such
     trajectories cannot leave it.
@@ -69,8 +71,10 @@ def bound_drift(
     - `inside`: function ``(q, p)`` → array; the domain has only states where no value is negative.
     - `time`: if the map or an invariant depends on the time, the interval (t_begin, t_end) in which
       steps begin, of the slow time τ = εt where the system has one (`slow_time`).
-    - `h`, `args`: of the map. `method`, `integrator`: explicit methods, or `TypeII()`, whose
-      implicit step is a function of (q0, p1).
+    - `h`, `args`: of the map. `method`: an explicit one, or `TypeII()`, whose implicit step is a
+      function of (q0, p1). `arithmetic`: the one whose rounding is bounded, `FloatingPoint()`,
+      `DoubleDouble()` or `FixedPoint(quantum)`; in the latter each increment is rounded by at most
+      quantum/2. `integrator`: an object that contains these two.
     - `change`: of an invariant, for which a number of steps is stated.
     - `ratio`: the boxes are cut until no bound exceeds the largest change seen by this factor, or
       the limits `max_boxes` or `max_seconds` are reached.
@@ -84,6 +88,8 @@ def bound_drift(
     **Assumes** that each operation of float64 is rounded to nearest, with or without contraction
     of products and sums, that elementary functions have errors of at most 4 ulp; and that the
     solver of an implicit step accepts residuals of at most 8 units of round-off of the momenta.
+    For `DoubleDouble` these are relative errors of 2⁻¹⁰³ of sums, products and roots, 2⁻¹⁰² of
+    quotients and 2⁻¹⁰⁰ of functions (proved by Joldes et al., functions measured), and 2⁻⁹⁴.
 
     **Source** Taylor models: Makino & Berz 2003, *Int. J. Pure Appl. Math.* 4, 379. Balls:
     Johansson 2017, *IEEE Trans. Computers* 66, 1281.
@@ -110,11 +116,13 @@ def bound_drift(
         raise ValueError(f"ratio must be larger than 1, got {ratio!r}.")
     system, _, _, h, args = of_problem(system, None, None, h, args, has_start=True)
     check_system(system)
-    how = only(chosen(integrator, method=method), "bound_drift", "method", "arithmetic")
-    if how.arithmetic != FloatingPoint():
+    given = chosen(integrator, method=method, arithmetic=arithmetic)
+    how = only(given, "bound_drift", "method", "arithmetic")
+    if not isinstance(how.arithmetic, FloatingPoint | DoubleDouble | FixedPoint):
         raise ValueError(
-            f"bound_drift bounds the rounding of plain float64, not of {how.arithmetic!r}: leave "
-            "arithmetic out."
+            "arithmetic must be dvi.FloatingPoint(), dvi.DoubleDouble() or "
+            f"dvi.FixedPoint(quantum), got {how.arithmetic!r}: bound_drift does not bound the "
+            "rounding of others."
         )
     h = check_step_size(h)
     shape, (lower, upper) = _domain(domain, found)
@@ -123,7 +131,8 @@ def bound_drift(
         None if time is None else _interval("time", time),
     )
     functions = _functions(found, system, time is not None)
-    stepped, programs = _step_of(system, how.method_for(system), shape, args, h, times)
+    stepped, programs = _step_of(system, how, shape, args, h, times)
+    digits = "pairs of float64" if isinstance(how.arithmetic, DoubleDouble) else "float64"
     numbers = [shape, shape, (), (), ()]
     invariants = [_listed(f"the invariant {name}", f, numbers, 0) for f, name in functions]
     n, t = len(lower) // 2, ["input", len(lower)]
@@ -138,10 +147,10 @@ def bound_drift(
         "domain": [[x.hex() for x in side] for side in (lower, upper)],
         "inside": _listed("inside", inside or (lambda q, p: jnp.zeros(0)), [shape, shape], None),
         "invariants": invariants,
-        "unit": (2.0**-53).hex(),
+        "arithmetic": digits,
         "bits": 100,
         "orders": 24 if n < 2 else 10 if n < 3 else 8,  # of the expansion of a function
-        "accepted": (_ACCEPTED * 2.0**-52 * max(map(abs, (*lower[n:], *upper[n:])))).hex(),
+        "accepted": (_ACCEPTED[digits] * max(map(abs, (*lower[n:], *upper[n:])))).hex(),
         "spread": [(0.0).hex()] * n,
     }
     if certificate["implicit"]:
@@ -190,11 +199,22 @@ def bound_drift(
     )
 
 
+class _WithErrors(Equations):
+    """Equations of which each increment has an error."""
+
+    error: Any = 0.0
+
+    def increment(self, h: Any, rate: Any) -> Any:
+        return h * rate + self.error
+
+
 def _step_of(
-    system: System, method: Any, shape: Any, args: Any, h: float, times: tuple | None
+    system: System, how: Integrator, shape: Any, args: Any, h: float, times: tuple | None
 ) -> tuple[Callable, dict[str, Any]]:
-    """The step, a function of (q, p, t, ε, h), and its list of operations: of (q0, p0), or of
-    (q0, p1) if it is implicit. Without `times` it is that at t = 0."""
+    """The step, a function of (q, p, t, ε, h), and what the certificate has about it: the list of
+    operations, of (q0, p0), or of (q0, p1) if it is implicit. Without `times` it is that at t = 0.
+    """
+    method = how.method_for(system)
     explicit = method.is_explicit(system, jnp.zeros(shape), args)
     if not (explicit or method.is_the_map):
         raise ValueError(
@@ -202,9 +222,14 @@ def _step_of(
             "function of (q0, p1), or a method that is explicit for this system."
         )
     plain = System(system.H_D, system.force, system.perturbation)
+    start = jnp.full(shape, 0.1)
+    how.arithmetic.prepare(
+        method, Equations(plain, jnp.asarray(0.1), args), Interval(0.0, h, h), start, start
+    )
+    quantum = getattr(how.arithmetic, "quantum", 0.0)
 
-    def stepped(q, p, t, epsilon, h):
-        equations = Equations(plain, epsilon, args)
+    def stepped(q, p, t, epsilon, h, error=0.0):
+        equations = _WithErrors(plain, epsilon, args, error=error)
         interval = Interval(t, t + (epsilon * h if system.slow_time else h), h)
         if explicit:
             return method.step(equations, interval, q, p)[:2]
@@ -223,9 +248,9 @@ def _step_of(
                 "time=(t_begin, t_end). With slow_time=True it is an interval of τ = εt."
             )
     zero = jnp.zeros(())
-    at = stepped if times else lambda q, p, t, epsilon, h: stepped(q, p, zero, epsilon, h)
-    program = program_of(at, shape, shape, (), (), ())
-    return batched, {"step": program, "implicit": not explicit}
+    at = stepped if times else lambda q, p, t, *rest: stepped(q, p, zero, *rest)
+    program = program_of(at, shape, shape, *[()] * (4 if quantum else 3))
+    return batched, {"step": program, "implicit": not explicit, "quantum": float(quantum).hex()}
 
 
 def _spread(

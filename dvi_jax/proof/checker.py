@@ -5,8 +5,8 @@ I_k(x, t, ε) of x = (q, p), given as lists of scalar operations, which also con
 
 1. |I_k(Φ(x, t, ε), t1, ε) − I_k(x, t, ε)| ≤ `per_step`[k] in exact arithmetic, in the domain, for
    all t and ε of their intervals, with t1 = t + h, or t + εh if t is a slow time;
-2. a step that is computed with the unit round-off `unit` changes I_k by at most `rounding`[k] more,
-   and moves no coordinate by more than `reach`;
+2. a step that is computed in the `arithmetic` changes I_k by at most `rounding`[k] more, and moves
+   no coordinate by more than `reach`;
 3. trajectories that start in the domain with Σ w_k I_k ≤ c, where (w, c) is the `level`, stay in
    the domain for `steps` steps, exact or computed.
 
@@ -15,7 +15,8 @@ and a bound of the remainder (a Taylor model; Makino & Berz 2003); elementary fu
 by balls (Arb). For 3, boxes cover all places outside of the domain that one step can reach, and on
 each Σ w_k I_k exceeds c by more than `steps` steps can change it: no trajectory gets there. A step
 that is implicit in p1 is a function of (q0, p1): each (q0, p0) of the domain has one p1 within
-`spread`, because p1 → p0 + h·rate maps this box into itself and is a contraction.
+`spread`, because p1 → p0 + h·rate maps this box into itself and is a contraction. If increments are
+rounded to multiples of `quantum`, the step has one more input, the error of each of them.
 """
 
 import hashlib
@@ -32,6 +33,7 @@ FORMAT = "dvi_jax drift bound 1"
 FUNCTIONS = ("exp", "log", "sin", "cos", "tan", "atan", "asin", "acos", "sqrt", "inverse")
 ULPS = {"sqrt": 1, "inverse": 1}  # errors of functions in units of round-off; 8 (4 ulp) for others
 MALFORMED = (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RecursionError)
+UNITS = {"float64": Fraction(1, 2**53), "pairs of float64": Fraction(1, 2**103)}  # round-off
 LEVEL = 30  # bits for levels, where nothing cancels
 LEAST = 2.0**-1000  # added to each error, for results below the normal numbers
 
@@ -108,7 +110,7 @@ class Models:
         self.bits, self.one, self.orders = bits, 1 << bits, range(orders + 1)
         self.ring = fmpz_mpoly_ctx.get([f"s{i}" for i in range(size)], "lex")
 
-    def constant(self, value):
+    def constant(self, value, error=0):  # exact arithmetic has no error
         scaled = value * self.one
         return self.ring.constant(math.floor(scaled)), int(scaled.denominator != 1)
 
@@ -158,16 +160,14 @@ class Models:
 
 class Rounding:
     """Values (ball, error): a computed number differs by at most `error` from one in the ball.
-
     Each operation has a relative error of at most `unit`, a quotient of two. If a product is
-    contracted with a sum, there is one rounding less; a sum may be taken in any order.
-    """
+    contracted with a sum, there is one rounding less; a sum may be taken in any order."""
 
     def __init__(self, unit):
         self.unit = ball(Fraction(unit))
 
-    def constant(self, value):
-        return ball(value), arb(0)
+    def constant(self, value, error=0):
+        return ball(value), ball(Fraction(error))
 
     def rounded(self, value, error, units=1):
         return value, arb((error + units * self.unit * (abs(value) + error) + LEAST).upper())
@@ -196,7 +196,7 @@ class Identities:
         self.one, self.values = self.ring.constant(1), {}
         self.x, self.free = self.ring.gens()[:size], list(self.ring.gens()[size:])
 
-    def constant(self, value):
+    def constant(self, value, error=0):
         return self.ring.constant(fmpq(value.numerator, value.denominator)), self.one
 
     def sum(self, *terms):
@@ -225,10 +225,12 @@ class Checker:
         self.lower, self.upper = exact(certificate["domain"])
         self.time, self.epsilon = exact(certificate["time"]), exact(certificate["epsilon"])
         self.n, self.slow = len(self.lower) // 2, certificate["slow"]
-        numbers = (exact(certificate[name]) for name in ("h", "unit", "accepted", "spread"))
-        self.h, self.unit, self.accepted, self.spread = numbers
+        numbers = (exact(certificate[name]) for name in ("h", "quantum", "accepted", "spread"))
+        self.h, self.quantum, self.accepted, self.spread = numbers
         self.bits, self.orders = certificate["bits"], certificate["orders"]
-        require(self.unit >= Fraction(1, 2**53), "the unit is not that of float64", self.root())
+        self.arithmetic, self.unit = certificate["arithmetic"], UNITS[certificate["arithmetic"]]
+        used = ["input", 2 * self.n + 3] in self.step["operations"]
+        require(used == (self.quantum > 0), "a grid is used or stated, but not both")
         ctx.prec = self.bits + 60
 
     def root(self):
@@ -241,8 +243,7 @@ class Checker:
         """The coordinates of a box as Taylor models; ε from 0 keeps its orders apart."""
         algebra = Models(len(box), self.bits, self.orders)
         parts = [((a + b) / 2, (b - a) / 2) for a, b in box]
-        if box[-1][0] == 0:
-            parts[-1] = Fraction(0), box[-1][1]
+        parts[-1] = (Fraction(0), box[-1][1]) if box[-1][0] == 0 else parts[-1]
         gens = [(s * algebra.one, 0) for s in algebra.ring.gens()]
         c = [[algebra.constant(value) for value in part] for part in parts]
         pairs = zip(gens, c, strict=True)
@@ -257,8 +258,8 @@ class Checker:
     def stepped(self, x, algebra):
         """(q, p, t, ε, h) before and after a step, from the coordinates of a box."""
         q0, p0, (t0, epsilon) = x[: self.n], x[self.n : -2], x[-2:]
-        h = algebra.constant(self.h)
-        end = run(self.step, [*x, h], algebra)
+        h, off = algebra.constant(self.h), algebra.constant(Fraction(0), self.quantum / 2)
+        end = run(self.step, [*x, h, off], algebra)
         if self.implicit:  # (q0, p1) → (h·rate, q1)
             end, moves, p1 = [*end[self.n :], *p0], end[: self.n], p0
             p0 = [difference(p, m, algebra) for p, m in zip(p1, moves, strict=True)]
@@ -283,10 +284,11 @@ class Checker:
         return numerator == 0 and denominator != 0
 
     def rounding(self, box):
-        """The changes of the I_k by the rounding of a step, and the errors of the coordinates."""
+        """The changes of the I_k by the rounding of a step, and the errors of the coordinates.
+        The solver accepts a p1 whose residual is `accepted` and as computed."""
         algebra, exactly, n = Rounding(self.unit), Rounding(0), self.n
         x = [(ball((a + b) / 2, (b - a) / 2), arb(0)) for a, b in box]
-        x[-2] = x[-2][0], 2 * algebra.unit * abs(x[-2][0])  # t of step k is computed as t0 + kh
+        x[-2] = x[-2][0], 2 * ball(UNITS["float64"]) * abs(x[-2][0])  # t = t0 + kh in float64
         start, end = self.stepped(x, algebra)
         if self.implicit:
             # A Lipschitz constant of p1 → h·rate(q0, p1) in the maximum norm: the effect of errors.
@@ -294,7 +296,6 @@ class Checker:
             inputs = [*x[:n], *near, *x[-2:], exactly.constant(self.h)]
             lipschitz = max(up(e) * 2.0**60 for _, e in run(self.step, inputs, exactly)[:n])
             require(lipschitz < 1 / 3, "the implicit step is not shown to be a contraction", box)
-            # The solver accepts a p1 whose residual is `accepted` and as computed.
             error = max((e + arb(up(self.accepted)) for _, e in start[n : 2 * n]), key=up)
             x[n:-2] = [(p1, error / (1 - arb(lipschitz))) for p1, _ in near]
             end = self.stepped(x, algebra)[1]
@@ -305,8 +306,7 @@ class Checker:
 def leaves(box, node):
     """The boxes of a tree of cuts ["cut", axis, where, part, part], with what is claimed there."""
     if not (isinstance(node, list) and node[0] == "cut"):
-        yield box, node
-        return
+        return (yield box, node)
     _, axis, where, *parts = node
     require(axis in range(len(box)) and len(parts) == 2, "a cut has no axis or part", box)
     (a, b), c = box[axis], exact(where)
@@ -326,9 +326,8 @@ def check_step(checker, box, claim, stated):
     require(not checker.implicit or all(m <= s for m, s in near), "p1 is far from p0", box)
     if claim == "outside":
         return require(checker.is_outside(algebra, step[0]), "not shown to be outside", box)
-    found = [
-        algebra.bound(checker.change(k, step, algebra)) for k in range(len(checker.invariants))
-    ]
+    found = [checker.change(k, step, algebra) for k in range(len(checker.invariants))]
+    found = map(algebra.bound, found)
     found = [0 if stated[k] == 0 and checker.is_identity(k) else b for k, b in enumerate(found)]
     moved = [m + Fraction(e) for m, e in zip(moved, errors, strict=True)]
     fits = [a <= b for a, b in zip([*found, *rounded, *moved], stated, strict=True)]
@@ -369,7 +368,8 @@ def check(certificate):
     for box, claim in boxes:
         check_step(checker, box, claim, [*per_step, *rounding, *reach])
     text = f"on {len(boxes)} boxes a step changes I by ≤ {[*map(float, per_step)]}"
-    text += f", its rounding by ≤ {[*map(float, rounding)]}"
+    text += f", its rounding in {checker.arithmetic} by ≤ {[*map(float, rounding)]}"
+    text += f" on a grid of {float(checker.quantum)}" * bool(checker.quantum)
     text += f" if a solver accepts residuals ≤ {float(checker.accepted):.3g}" * checker.implicit
     if certificate["level"] is None:
         return text

@@ -3,11 +3,13 @@
 The list is what a certificate contains: it is read from the jaxpr of the package's own step, so
 that a user writes no second definition of the system. Operations that only move numbers (slices,
 reshapes, gathers) disappear; what remains are sums, products, quotients, integer powers and
-elementary functions.
+elementary functions. Those of constants remain, too, where float64 would round the result.
 """
 
 import math
+import operator
 from collections.abc import Callable, Sequence
+from fractions import Fraction
 from typing import Any
 
 import jax
@@ -95,11 +97,22 @@ class Scalar:
     def _of(self, other: Any) -> "Scalar":
         return other if isinstance(other, Scalar) else self.program.constant(other)
 
+    def _constant(self, operation: Callable, other: "Scalar") -> "Scalar | None":
+        """The result for two constants, if it is a number of float64."""
+        if self.known is None or other.known is None:
+            return None
+        value = operation(Fraction(self.known), Fraction(other.known))
+        is_exact = abs(value) < 2**1000 and Fraction(float(value)) == value
+        return self.program.constant(float(value)) if is_exact else None
+
     def __add__(self, other: Any) -> "Scalar":
         other = self._of(other)
         if self.known == 0:
             return other
-        return self if other.known == 0 else self.program.write("sum", self.index, other.index)
+        if other.known == 0:
+            return self
+        constant = self._constant(operator.add, other)
+        return constant or self.program.write("sum", self.index, other.index)
 
     def __neg__(self) -> "Scalar":
         if self.known is not None:
@@ -114,7 +127,8 @@ class Scalar:
         for a, b in ((self, other), (other, self)):
             if a.known == 0 or b.known == 1:
                 return a
-        return self.program.write("multiply", self.index, other.index)
+        constant = self._constant(operator.mul, other)
+        return constant or self.program.write("multiply", self.index, other.index)
 
     def __truediv__(self, other: Any) -> "Scalar":
         other = self._of(other)
@@ -185,6 +199,13 @@ def _is_symbolic(x: Any) -> bool:
     return isinstance(x, np.ndarray) and x.dtype == object
 
 
+def _concrete(x: Any) -> Any:
+    """The numbers of an array, if all of them are constants."""
+    if not _is_symbolic(x) or any(scalar.known is None for scalar in x.ravel()):
+        return x
+    return np.array([scalar.known for scalar in x.ravel()]).reshape(x.shape)
+
+
 def _symbolic(program: Program, x: Any) -> np.ndarray:
     if _is_symbolic(x):
         return x
@@ -217,7 +238,9 @@ def _apply(program: Program, equation: Any, values: list) -> list:
     if name == "cond" and not _is_symbolic(values[0]):
         branch = params["branches"][int(values[0])]
         return _evaluate(program, branch.jaxpr, branch.consts, values[1:])
-    if not any(map(_is_symbolic, values)):
+    values = [_concrete(v) for v in values]
+    rounds = name in _ROUNDED and equation.outvars[0].aval.dtype == jnp.float64
+    if not (rounds or any(map(_is_symbolic, values))):
         out = equation.primitive.bind(*map(jnp.asarray, values), **params)
         return list(out) if equation.primitive.multiple_results else [out]
     if name in _MOVES and not (name == "select_n" and _is_symbolic(values[0])):
@@ -284,6 +307,13 @@ _ELEMENTWISE: dict[str, Callable] = {
     "sinh": lambda a: (a.apply("exp") - (-a).apply("exp")) * 0.5,
     "cosh": lambda a: (a.apply("exp") + (-a).apply("exp")) * 0.5,
 }
+
+
+_ROUNDED = {
+    *_ELEMENTWISE, *UNARY, "pow", "integer_pow", "reduce_sum", "reduce_prod", "dot_general",
+    "cumsum",
+} - {"neg"}  # fmt: skip
+"""Operations whose results float64 rounds."""
 
 
 def _dot(dimensions: Any, a: np.ndarray, b: np.ndarray) -> np.ndarray:

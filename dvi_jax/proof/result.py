@@ -21,7 +21,7 @@ class DriftBound(eqx.Module):
     For all states (q, p) of the domain and all ε of the interval, in one step of the map
 
         |I_k(q1, p1) − I_k(q0, p0)| ≤ per_step[k]                 in exact arithmetic,
-                                    ≤ per_step[k] + rounding[k]   as computed in float64.
+                                    ≤ per_step[k] + rounding[k]   as computed.
 
     - `per_step`, `rounding`: [unit of the invariant]. `seen`: the largest change found at sample
       points of the boxes, a lower estimate of the least possible `per_step`.
@@ -112,7 +112,7 @@ class DriftBound(eqx.Module):
     def report(self) -> str:
         """What is proved, as text."""
         c = self.certificate
-        low, high = (float.fromhex(x) for x in c["epsilon"])
+        low, high, quantum = (float.fromhex(x) for x in (*c["epsilon"], c["quantum"]))
         n = len(c["domain"][0]) // 2
         names = [f"{x}{i + 1 if n > 1 else ''}" for x in "qp" for i in range(n)]
         if c["timed"]:
@@ -125,7 +125,9 @@ class DriftBound(eqx.Module):
         lines = [
             f"proved for each step from a state with {sides}"
             + (" and inside(q, p) ≥ 0" if c["inside"]["outputs"] else "")
-            + f", for all ε in [{low:.6g}, {high:.6g}], h = {float.fromhex(c['h']):.6g}:",
+            + f", for all ε in [{low:.6g}, {high:.6g}], h = {float.fromhex(c['h']):.6g}, "
+            + f"computed in {c['arithmetic']}"
+            + (f" with increments on a grid of {quantum:.3g}:" if quantum else ":"),
             f"{'':4}{'change ≤':>10} {'seen':>9} {'rounding ≤':>10} "
             f"{'steps for ' + format(self.change, 'g'):>18}",
         ]

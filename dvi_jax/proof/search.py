@@ -75,6 +75,14 @@ def examine(checker: Any, box: list, rng: Any, identities: frozenset = frozenset
         at = _points(box, rng)
         counts = _is_inside(checker, algebra, step[0], at)
         leaf.seen = [_largest(algebra, change, at[counts]) for change in changes]
+        if identities:  # their boxes are cut until the bound of the rounding is that at points
+            points = [[(x := half(side, rng.random() < 0.5)[i], x) for side in box] for i in (0, 1)]
+            rounded = zip(*(checker.rounding(point)[0] for point in points), strict=True)
+            largest = map(max, rounded)
+            leaf.seen = [
+                r if k in identities else s
+                for k, (r, s) in enumerate(zip(largest, leaf.seen, strict=True))
+            ]
         leaf.shares = [_shares(change, len(box)) for change in changes]
         leaf.moved = [exact.up(m + Fraction(e)) for m, e in zip(moved, errors, strict=True)]
         finite = all(map(math.isfinite, (*leaf.rounding, *leaf.moved)))
@@ -261,7 +269,8 @@ def subdivide(
         for name in ("bounds", "rounding", "moved")
     )
     bounds, rounding, moved = columns
-    return Found(_tree(root), count, bounds, best, rounding, moved)
+    seen = [0.0 if k in identities else s for k, s in enumerate(best)]
+    return Found(_tree(root), count, bounds, seen, rounding, moved)
 
 
 def _tree(leaf: Leaf) -> Any:
@@ -279,8 +288,8 @@ def _rank(leaf: Leaf, best: list) -> float:
 
 
 def _excesses(leaf: Leaf, best: list) -> list[float]:
-    pairs = zip(leaf.bounds, best, strict=True)
-    return [(float(b) / s if s else math.inf) if b else 0.0 for b, s in pairs]
+    rows = zip(leaf.bounds, leaf.rounding, best, strict=True)
+    return [(float(b or r) / s if s else math.inf) if b or r else 0.0 for b, r, s in rows]
 
 
 def _axis(checker: Any, leaf: Leaf, best: list) -> int:
@@ -290,6 +299,8 @@ def _axis(checker: Any, leaf: Leaf, best: list) -> int:
         return _widest(leaf.box, checker.root(), curved(checker))
     excesses = _excesses(leaf, best)
     k = max(range(len(excesses)), key=excesses.__getitem__)
+    if not leaf.bounds[k]:
+        return _widest(leaf.box, checker.root())
     if leaf.remainders[k] > 0.5 * float(leaf.bounds[k]):
         return _widest(leaf.box, checker.root(), curved(checker))
     return max(range(len(leaf.box)), key=leaf.shares[k].__getitem__)

@@ -1,0 +1,143 @@
+"""Noether's identities as exact statements: proved for all states, all ε, all times and steps."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from .._energies import disturbing_work, outgoing_energy
+from .._step import Equations
+from .._system import check_system, of_problem
+from .._types import Args, Interval
+from ..discover.generators import Generator, LatticePoint
+from ..discover.noether import AdiabaticInvariant, Gauge, noether_identity
+from .components import program_of
+from .tools import tools
+
+
+class NoetherProof(eqx.Module):
+    """Result of `prove_noether`: which statements hold for all (t0, h, q0, p1, ε).
+
+    - `identities`: for each order m, whether N_m = 0.
+    - `work`: whether W·(ξ_z − Dq ξ0_z) = 0. `fixed_time`: whether all ξ0_m = 0, so that the time
+      grid has no effect.
+    - `balance`: whether the balance law holds. It is a theorem: False means that the two sides are
+      equal only by relations between elementary functions, which are not used here.
+    - `conserved`: whether I_z is conserved exactly, with `TypeII` on every time grid.
+    """
+
+    identities: tuple[bool, ...]
+    work: bool
+    fixed_time: bool
+    balance: bool
+
+    @property
+    def conserved(self) -> bool:
+        """All identities hold, the perturbing force does no work, and no ξ0_m is nonzero."""
+        return self.balance and all(self.identities) and self.work and self.fixed_time
+
+    def __repr__(self) -> str:
+        z = len(self.identities) - 1
+        rows = [
+            f"N_{m} = 0: {'proved' if zero else 'not an identity'}"
+            for m, zero in enumerate(self.identities)
+        ]
+        rows.append(f"W·(ξ_{z} − Dq ξ0_{z}) = 0: {'proved' if self.work else 'not an identity'}")
+        rows.append(f"balance law: {'proved' if self.balance else 'not shown'}")
+        if self.conserved:
+            rows.append(f"I_{z} is conserved exactly by the map, on every time grid")
+        elif self.balance and all(self.identities):
+            change = "0" if self.work else f"ε^{z + 1} W·(ξ_{z} − Dq ξ0_{z})"
+            grid = "on every time grid" if self.fixed_time else "on the variational time grid"
+            rows.append(f"D(I_{z}) = {change} {grid}")
+        return "\n".join(rows)
+
+
+def prove_noether(
+    system: Any,
+    generators: Sequence[Generator],
+    gauges: Sequence[Gauge | None],
+    q0: Any = None,
+    *,
+    args: Args = None,
+) -> NoetherProof:
+    r"""Prove Noether's identities and the balance law of an adiabatic invariant of `TypeII`.
+
+        N_m = 0  for m = 0 … z,        W·(ξ_z − Dq ξ0_z) = 0,
+        D(I_z) = Σ_m ε^m N_m + ε^{z+1} W·(ξ_z − Dq ξ0_z) − Σ_m ε^m ξ0_m r
+
+    as identities in (t0, h, q0, p1, ε), with p0 and q1 from the map. Both sides are written as
+    quotients of polynomials with rational coefficients, in which each value of an elementary
+    function is a variable; a statement is proved if the difference is the polynomial 0. So they
+    hold for every state, step and ε, and not only at the points where they were evaluated.
+
+    **Arguments** `system`: a `System` or a problem of the library. `generators`, `gauges`: as for
+    `AdiabaticInvariant`. `q0`: an array with the shape of q; by default that of the problem.
+    `args`: of the system.
+
+    **Returns** a `NoetherProof`; ``print`` shows the statements.
+
+    **Raises** `ValueError` for a function that is not analytic; `ImportError` without python-flint.
+
+    **Source** the identities: (25), (28) and (31) of the paper. The balance law is ours.
+
+    **Example**
+
+    ```python
+    kepler = systems.kepler()
+    turn = dvi.generators.rotation()
+    print(dvi.prove_noether(kepler, [turn, turn], [None, None]))
+    # N_0 = 0: proved
+    # N_1 = 0: proved
+    # W·(ξ_1 − Dq ξ0_1) = 0: proved
+    # balance law: proved
+    # I_1 is conserved exactly by the map, on every time grid
+    ```
+    """
+    exact, _ = tools()
+    q0 = getattr(system, "q0", None) if q0 is None else q0
+    if q0 is None:
+        raise TypeError(
+            "q0 is missing: give an array with the shape of q, for example q0=jnp.zeros(2)."
+        )
+    system, *_, args = of_problem(system, None, None, None, args, has_start=True)
+    check_system(system)
+    series = AdiabaticInvariant(generators, gauges)
+    z, shape = series.order, jnp.shape(q0)
+
+    def statements(t0, h, q0, p1, epsilon, energy):
+        """The differences that have to be zero; `energy`: E⁻ at the first point, any number."""
+        t1 = t0 + h
+        moves = Equations(system, epsilon, args)
+        at = Interval(t0, t1, h)
+        p0 = p1 - h * moves.momentum_rate(at, q0, p1)
+        q1 = q0 + h * moves.position_rate(at, q0, p1)
+        first, second = LatticePoint(t0, q0, p0), LatticePoint(t1, q1, p1)
+        noether = [
+            noether_identity(system, generators, gauges, m, first, second, epsilon, args)
+            for m in range(z + 1)
+        ]
+        here = [generator(first, args) for generator in generators]
+        work = jnp.zeros(())
+        if system.force is not None:
+            W = system.force(*system.times(t0, t1, epsilon), q0, p1, args)
+            work = jnp.sum(W * (here[-1].q - (q1 - q0) / h * here[-1].t))
+        after = series.bind(system, epsilon)(t0, t1, q0, p0, q1, p1, args)
+        before, clock = jnp.zeros(()), jnp.zeros(())
+        for m, (x, gauge) in enumerate(zip(here, gauges, strict=True)):
+            term = jnp.sum(x.q * p0) - x.t * energy
+            before += epsilon**m * (term if gauge is None else term + gauge(*first, args))
+            clock += epsilon**m * x.t
+        gained = disturbing_work(system, t0, t1, q0, q1, p1, epsilon, args)
+        residual = outgoing_energy(system, t0, t1, q0, p1, epsilon, args) - energy - gained
+        right = h * sum(epsilon**m * N for m, N in enumerate(noether))
+        right += h * epsilon ** (z + 1) * work - clock * residual
+        return *noether, work, after - before - right, jnp.stack([x.t for x in here])
+
+    program = program_of(statements, (), (), shape, shape, (), ())
+    algebra = exact.Identities(2 * int(np.prod(shape)) + 4)
+    values = exact.run(program, [(x, algebra.one) for x in algebra.x], algebra)
+    zero = [bool(numerator == 0 and denominator != 0) for numerator, denominator in values]
+    return NoetherProof(tuple(zero[: z + 1]), zero[z + 1], all(zero[z + 3 :]), zero[z + 2])
