@@ -546,7 +546,7 @@ def test_bad_sweeps_are_refused(change, match):
         ({"epsilons": [0.2, 0.1]}, "epsilons must be in increasing order"),
         ({"duration": 0.3}, "two of the longest steps"),
         ({"duration": np.nan}, "two of the longest steps"),
-        ({"invariant": [KEPT]}, "got 1 observables for 2"),
+        ({"invariant": [KEPT]}, "hs is 2, but the length of invariant is 1"),
     ],
 )
 def test_bad_surfaces_are_refused(change, match):
