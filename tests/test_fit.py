@@ -427,7 +427,7 @@ def test_results_have_the_order_of_the_given_observations(regular):
 def test_rows_for_arcs_are_counted(regular):
     for rows in (2, 4):
         model = model_of(q0=np.ones((rows, 1)), p0=np.zeros((3, 1)))
-        with pytest.raises(ValueError, match=r"one row for each of 3 arcs"):
+        with pytest.raises(ValueError, match=r"length 3, one row for each arc"):
             dvi.fit(model, [regular[0]] * 3, {"epsilon": 0.0, "args": {"k": 1.3}})
 
 
