@@ -430,8 +430,8 @@ def test_orbits_and_choices_that_do_not_fit_are_named():
         ((two,), {"dof": 2}, "dof must be a number from 0 to 1 .*, got 2"),
         ((two,), {"dof": "q"}, "dof must be a number .*, got 'q'"),
         ((two,), {"dof": []}, "dof is empty"),
-        ((two,), {"labels": ["a", "b"]}, r"one for each of 1 orbits, got \['a', 'b'\]"),
-        ((two,), {"labels": "ab"}, "one for each of 1 orbits, got 'ab'"),
+        ((two,), {"labels": ["a", "b"]}, r"orbits \(1 in total\), got \['a', 'b'\]"),
+        ((two,), {"labels": "ab"}, r"orbits \(1 in total\), got 'ab'"),
         ((bodies,), {"dof": 0}, "a tuple of 2 numbers"),
         ((two,), {"period": 0}, "period must be a positive"),
         ((arrays(3),), {"colour": [1, 2]}, "colour must have length 3, .*got length 2"),
@@ -447,7 +447,7 @@ def test_orbits_and_choices_that_do_not_fit_are_named():
         ((two,), {"centre": [1.0]}, r"shape \(2,\)"),
         ((two,), {"colour": [1.0]}, "several orbits"),
         ((bodies,), {"bodies": [3]}, "from 0 to 2"),
-        ((bodies,), {"names": ["A"]}, "one for each of 3 bodies"),
+        ((bodies,), {"names": ["A"]}, r"one for each of the bodies \(3 in"),
         ((arrays(2, n=2),), {"names": ["A", "B"]}, "2 orbits.*labels="),
     )
 
@@ -775,7 +775,7 @@ def test_sections_take_functions_of_the_state():
         ((made,), {"x": "r[0]"}, r'such as "q\[0\]"'),
         ((made,), {"x": "q"}, r'such as "q\[0\]"'),
         ((made,), {"colour": [1.0]}, "colour must have length 2, .*got length 1"),
-        ((made,), {"labels": ["a"]}, r"one for each of 2 orbits, got \['a'\]"),
+        ((made,), {"labels": ["a"]}, r"orbits \(2 in total\), got \['a'\]"),
         *(((x,), {}, wrong, TypeError) for x in (np.ones((3, 2)), nothing, several)),
     )
 

@@ -41,7 +41,7 @@ def spectrum(
     do not fit.
     """
     if amplitudes is None:
-        wanted = "without amplitudes, frequencies must be an object that has both"
+        wanted = "amplitudes must be given, or frequencies must be an object that has both"
         draw.check_attributes(frequencies, ("frequencies", "amplitudes"), wanted)
         frequencies, amplitudes = frequencies.frequencies, frequencies.amplitudes
     w, A = np.asarray(frequencies), np.abs(np.asarray(amplitudes))
