@@ -243,7 +243,7 @@ BAD_DATA = [
     (HEAD + "0.3,1\n,2\n", "data.time: ts[1] is nan", "finite times in order in the column t"),
     (HEAD + "0.3,1\n0.9,2\n0.6,2\n", "data.time: ts is not in order: ts[1] = 0.9", "in order"),
     (HEAD + "0.3,1\n0.3,2\n", "data.time: ts[0] and ts[1] are the same time, 0.3:", "in order"),
-    (HEAD + "0.3,1\n", "2 parameters cannot be determined from 1 observed values", "data that fit"),
+    (HEAD + "0.3,1\n", "2 parameters cannot be determined from 1 observed value ", "data that fit"),
     (HEAD + "0.3,\n0.6,nan\n", "data: all values are NaN", "values that fit"),
     ("0.3,1\n0.6,2\n", "line 1: 0.3 is a number", "different names"),
     ("t,t\n0.3,1\n", "'t' is empty or repeated", "different names"),
