@@ -146,9 +146,9 @@ def legendre(L: Callable[..., Any], newton: Newton = Newton()) -> Callable[..., 
     if discrete == continuous:
         raise TypeError(
             "L must be a function of (t, q, v, args) for a continuous Lagrangian, or of "
-            f"(t0, t1, q0, v, args) for a discrete Lagrangian. The given {_described(L)} "
+            f"(t0, t1, q0, v, args) for a discrete Lagrangian, got {_described(L)}. This object "
             + (
-                "accepts both four and five arguments: wrap it in a function of four or of five."
+                "accepts both four and five arguments: wrap it in a lambda of four or of five."
                 if discrete
                 else "accepts neither four nor five arguments."
             )
@@ -375,9 +375,9 @@ def _require_scalar(value: Any, name: str, shape: tuple[int, ...], what: str) ->
     value = jnp.asarray(value)
     if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
         raise ValueError(
-            f"{name} must return a real scalar ({what}); for q0 of shape {shape} it returned an "
-            f"array of shape {value.shape}, dtype {value.dtype}. Return one floating-point number: "
-            "sum an array with jnp.sum or take one component, and take jnp.real of a complex value."
+            f"{name} must return a real scalar ({what}), got an array of shape {value.shape} and "
+            f"dtype {value.dtype} for q0 of shape {shape}. Return one floating-point number: use "
+            "jnp.sum or one component of an array, and jnp.real of a complex value."
         )
     return value
 

@@ -132,7 +132,8 @@ class DoubleDouble(Arithmetic):
         if q0.dtype != jnp.float64:
             raise ValueError(
                 f"arithmetic=dvi.DoubleDouble() requires q0 and p0 in float64, got {q0.dtype}: "
-                "convert them, or use arithmetic=dvi.Compensated()."
+                'call jax.config.update("jax_enable_x64", True) first and convert them, or use '
+                "arithmetic=dvi.Compensated()."
             )
         return equations, q0, p0
 
@@ -195,7 +196,10 @@ class FixedPoint(Arithmetic):
         quantum = self.quantum
         is_number = isinstance(quantum, int | float) and not isinstance(quantum, bool)
         if not is_number or not 0 < quantum < math.inf:
-            raise ValueError(f"quantum must be a power of two such as 2.0**-40, got {quantum!r}.")
+            raise ValueError(
+                "quantum must be a power of two such as 2.0**-40, as a Python number, got "
+                f"{quantum!r}. Convert a number of NumPy or JAX with float(...)."
+            )
         # A power of two: multiplication by it and by its reciprocal is exact, and so are sums.
         mantissa, exponent = math.frexp(quantum)
         if mantissa != 0.5:
@@ -217,9 +221,9 @@ class FixedPoint(Arithmetic):
         ):
             raise ValueError(
                 "arithmetic=dvi.FixedPoint(...) requires steps that are explicit forwards and "
-                "backwards, but this system has implicit steps. Use a separable H_D = T(p1) + "
-                "V(q0), perturbation included, and a force that depends on q0 and t only. For "
-                "other systems use arithmetic=dvi.Compensated()."
+                "backwards, but the steps of this system are implicit. H_D and the perturbation "
+                "must be separable, T(p1) + V(q0), and the force must not depend on p1. For other "
+                "systems use arithmetic=dvi.Compensated()."
             )
         # Both the quantum and its reciprocal, by which a state is multiplied, must be normal.
         smallest, largest = jnp.finfo(q0.dtype).tiny, 1 / jnp.finfo(q0.dtype).tiny

@@ -16,8 +16,9 @@ def whole(name: str, value: Any, least: int = 1, most: int | None = None, hint: 
     fits = isinstance(value, int | np.integer) and not isinstance(value, bool)
     if not fits or value < least or (most is not None and value > most):
         last = "on" if most is None else f"to {most}"
+        seen = f"{value!r:.200}" + ("" if fits else f" (type {type(value).__name__}, not int)")
         raise ValueError(
-            f"{name} must be a whole number from {least} {last}, got {value!r}.{_more(hint)}"
+            f"{name} must be a whole number from {least} {last}, got {seen}.{_more(hint)}"
         )
     return int(value)
 
@@ -34,7 +35,7 @@ def positive(name: str, value: Any, zero: bool = False, hint: str = "") -> float
 def fraction(name: str, value: Any) -> float:
     """A number between 0 and 1, both excluded. **Raises** `ValueError`."""
     if not _is_number(value) or not 0 < value < 1:
-        raise ValueError(f"{name} must lie between 0 and 1 (both excluded), got {value!r}.")
+        raise ValueError(f"{name} must be a number between 0 and 1 (both excluded), got {value!r}.")
     return float(value)
 
 
@@ -50,8 +51,9 @@ def one_of(name: str, value: Any, known: Iterable[Any], hint: str = "") -> Any:
     known = list(known)
     # The types are compared as well: True == 1, and an array has no truth value.
     if not any(value is one or (type(value) is type(one) and value == one) for one in known):
-        these = ", ".join(map(repr, known))
-        raise ValueError(f"{name} must be one of {these}, got {value!r}.{_more(hint)}")
+        these = ("one of " if len(known) > 1 else "") + ", ".join(map(repr, known))
+        kind = f" (type {type(value).__name__})" if isinstance(value, bool | float) else ""
+        raise ValueError(f"{name} must be {these}, got {value!r:.200}{kind}.{_more(hint)}")
     return value
 
 

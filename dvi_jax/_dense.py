@@ -66,8 +66,8 @@ def requested_times(save: Save, task: Task, num_steps: int) -> tuple[RequestedTi
     all reductions."""
     if task.has_running_values:
         raise ValueError(
-            "dvi.Running in observe has values only at the grid points, but save=dvi.Save(ts=...) "
-            "requests other times: use save=dvi.Save(every=m), or remove dvi.Running."
+            "dvi.Running in observe cannot be combined with save=dvi.Save(ts=...), because its "
+            "values exist at grid points only. Use save=dvi.Save(every=m), or remove dvi.Running."
         )
     # Functions that are not reductions are evaluated at the requested times, after the run.
     kept = jax.tree.map(

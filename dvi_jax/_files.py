@@ -73,7 +73,8 @@ def publish_npz(
     header = {"format": form, "holds": sorted(arrays), **about}
     if not path.parent.is_dir():
         raise FileNotFoundError(
-            f"{path.name} cannot be written: there is no directory {path.parent}. Create it first."
+            f"the file '{path.name}' cannot be written: there is no directory '{path.parent}'. "
+            "Create this directory, or give another path."
         )
     np.savez(content, about=np.array(json.dumps(header)), **arrays)
     try:
@@ -92,7 +93,9 @@ def read_npz(
     """
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"the file {path} of a {what} does not exist: check the path.")
+        raise FileNotFoundError(
+            f"the file of a {what} does not exist: there is no file '{path}'. Check the path."
+        )
     try:
         # Without pickles: loading one would execute code from the file.
         with np.load(path, allow_pickle=False) as file:
@@ -104,13 +107,13 @@ def read_npz(
             raise ValueError("an array is missing in it")
     except Exception as error:  # zipfile and NumPy raise many types for damaged bytes
         raise ValueError(
-            f"{path} is not the file of a {what} of this package, or it is damaged: check the "
-            "path, restore the file from a backup, or remove it and repeat the computation. "
-            f"Cause: {error}."
+            f"'{path}' is not the file of a {what} of this package, or it is damaged "
+            f"({type(error).__name__}: {str(error).split('. ')[0]}). Check the path. If the path "
+            "is correct, restore the file from a backup, or remove it and repeat the computation."
         ) from None
     if found != form:
         raise ValueError(
-            f"the file {path} has the format {found!r}, but this version of dvi_jax reads only "
-            f"{form!r}: use the version that wrote the file, or remove it and compute again."
+            f"the file '{path}' has the format {found!r}, but this version of dvi_jax reads only "
+            f"{form!r}: use the version that wrote the file, or remove the file and compute again."
         )
     return about, arrays

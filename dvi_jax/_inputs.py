@@ -23,7 +23,7 @@ def start_state(q0: Any, p0: Any) -> tuple[Array, Array]:
             "one momentum for each position."
         )
     if q.size == 0:
-        raise ValueError(f"q0 is empty, of shape {q.shape}: give at least one position.")
+        raise ValueError(f"q0 must not be empty, got shape {q.shape}: give at least one position.")
     if q.dtype != p.dtype:
         dtype = jnp.result_type(q.dtype, p.dtype)
         q, p = q.astype(dtype), p.astype(dtype)
@@ -42,7 +42,7 @@ def as_times(of: str, ts: Any) -> Array:
     if jnp.issubdtype(ts.dtype, jnp.integer):
         ts = ts.astype(jnp.result_type(float))
     if not jnp.issubdtype(ts.dtype, jnp.floating):
-        raise TypeError(f"the times ts of {of} must be real numbers, got dtype {ts.dtype}.")
+        raise TypeError(f"ts in {of} must be real numbers, got dtype {ts.dtype}: use floats.")
     return jnp.asarray(ts)
 
 
@@ -58,11 +58,13 @@ def _real_array(name: str, value: Any) -> Array:
         refuse_double_without_x64(name, kind)
     if kind.kind == "c":
         raise TypeError(
-            f"{name} must be real, got dtype {kind}. If the imaginary part is zero, take jnp.real. "
-            "Otherwise use its real and imaginary parts as a canonical pair, up to a factor."
+            f"{name} must be real, got dtype {kind}. If its imaginary part is zero, take jnp.real. "
+            "Otherwise use real and imaginary parts as positions and momenta: for "
+            "ψ = (q0 + i p0)/√2 give q0 = √2 Re ψ and p0 = √2 Im ψ."
         )
     if not _is_real(kind):
-        raise TypeError(f"{name} must be an array of real numbers, got dtype {kind}.")
+        seen = f": {value!s:.80}" if isinstance(value, np.ndarray) else ""
+        raise TypeError(f"{name} must be an array of real numbers, got dtype {kind}{seen}.")
     # A traced value that is not finite becomes the status of its trajectory.
     if isinstance(value, np.ndarray) and not np.isfinite(value).all():
         where = tuple(np.argwhere(~np.isfinite(value))[0].tolist())
@@ -86,11 +88,12 @@ def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> A
         refuse_double_without_x64(name, value.dtype)
     kind, shape = (value.dtype, value.shape) if known is None else (known.dtype, known.shape)
     if not _is_real(kind):
-        raise TypeError(f"{name} must be a real number, got {value!r}.")
+        raise TypeError(f"{name} must be a real number, got {value!r:.200}.")
     if shape != ():
         raise ValueError(
-            f"{name} must be one number, got an array of shape {shape}. For several values use "
-            f"jax.vmap over {name}" + (", or lattice=dvi.Given(ts)." if name == "h" else ".")
+            f"{name} must be one number, got an array of shape {shape}. For one run per value use "
+            f"jax.vmap over {name}"
+            + ("; for one run with such steps use lattice=dvi.Given(ts)." if name == "h" else ".")
         )
     if known is not None and not np.isfinite(known):
         raise ValueError(f"{name} must be finite, got {known}.")
@@ -108,7 +111,10 @@ def _as_numpy(name: str, value: Any) -> np.ndarray:
     try:
         return np.asarray(value)
     except (TypeError, ValueError) as error:
-        raise TypeError(f"{name} must consist of real numbers, got {value!r} ({error}).") from None
+        raise TypeError(
+            f"{name} must be a real number or an array of real numbers, got {value!r:.200}. Rows "
+            f"of nested lists must have the same length. NumPy reports: {error}"
+        ) from None
 
 
 def as_parameter(leaf: Any) -> Any:
@@ -118,7 +124,8 @@ def as_parameter(leaf: Any) -> Any:
         leaf = np.asarray(leaf)
         refuse_double_without_x64("args", leaf.dtype)
         if leaf.dtype.kind in "OMm":
-            raise TypeError(f"args contains an array of dtype {leaf.dtype}: give numbers instead.")
+            seen = f"dtype {leaf.dtype}: {leaf!s:.80}"
+            raise TypeError(f"args must contain arrays of numbers, got {seen}. Convert this array.")
         return jnp.asarray(leaf)
     if not isinstance(leaf, jax.Array):
         # Everything but arrays is static: compiled programs are looked up by its hash.
@@ -126,8 +133,8 @@ def as_parameter(leaf: Any) -> Any:
             hash(leaf)
         except TypeError:
             raise TypeError(
-                f"args contains a {type(leaf).__name__}, which is neither an array nor hashable: "
-                f"{leaf!r:.80}. Give arrays and numbers, in dicts, lists and tuples."
+                "args must contain arrays, numbers or hashable objects, in dicts, lists and "
+                f"tuples, got {leaf!r:.80} of type {type(leaf).__name__}. Use an array or tuple."
             ) from None
     # A float becomes an array: a new value needs no new compilation, and has a derivative.
     return jnp.asarray(leaf) if isinstance(leaf, float) else leaf

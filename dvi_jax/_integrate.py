@@ -200,9 +200,15 @@ def integrate(
     if progress is None or progress is False:
         solution = _whole(task, plan, asked.observe, q0, p0, integrator.adjoint, layout)
     elif traced:
-        raise ValueError("progress cannot be reported under jit, vmap or grad: leave progress out.")
+        raise ValueError(
+            "progress cannot be reported inside of jax.jit, jax.vmap, jax.grad or another "
+            "transformation of JAX: leave progress out, or call dvi.integrate outside of it."
+        )
     elif getattr(integrator.adjoint, "report_defect", False):
-        raise ValueError("report_defect=True cannot be combined with progress: leave one out.")
+        raise ValueError(
+            "dvi.Reversible(report_defect=True) cannot be combined with progress: leave out "
+            "report_defect or progress."
+        )
     else:
         with _reported(progress) as report:
             outcome = _in_pieces(task, plan, q0, p0, report, layout)
@@ -389,15 +395,15 @@ def _raise_on_failure(solution: Solution, task: Task) -> Solution:
         return eqx.combine(checked, rest)
     if status_name(result) in ("successful", "stopped"):
         return solution
-    kept = "With throw=False the solution up to this point is returned, with its status; it is "
-    kept += "also the attribute `solution` of this error."
+    kept = "The solution is the attribute `solution` of this error. With throw=False it is "
+    kept += "returned with its status, without an error."
     if bool(result == RESULTS.not_reached):
         missed = np.isnan(np.asarray(solution.qs)).reshape(len(solution.ts), -1).any(1)
         first = float(solution.ts[missed.argmax()])
-        which = f", the first at t = {first:.17g}" if np.isfinite(first) else ""
+        which = f"; the first missing one is t = {first:.17g}" if np.isfinite(first) else ""
         raise IntegrationError(
-            f"{missed.sum()} of {missed.size} requested states were not reached{which}. "
-            f"{RESULTS[result]} {kept}",
+            f"the run reached {(~missed).sum()} of {missed.size} values of ts in "
+            f"dvi.Save(ts=...){which}. {RESULTS[result]} {kept}",
             solution,
         )
     step = int(solution.stats["failed_step"])
@@ -407,10 +413,10 @@ def _raise_on_failure(solution: Solution, task: Task) -> Solution:
         at = f"h = {float(task.interval(jnp.asarray(step, jnp.int32)).h):g}"
     solved = int(solution.stats["newton_iterations"]) > 0
     residual = float(solution.stats["failed_residual"])
-    how = f"; relative residual of the implicit solve {residual:.3g}" if solved else ""
+    how = f" and relative residual {residual:.3g} of the implicit solve" if solved else ""
     raise IntegrationError(
-        f"the trajectory failed at step {step} of {solution.stats['num_steps']} ({at}{how}). "
-        f"{RESULTS[result]} {kept}",
+        f"the trajectory failed at step {step} of {solution.stats['num_steps']} (the first step "
+        f"has number 0), with {at}{how}. {RESULTS[result]} {kept}",
         solution,
     )
 
@@ -430,10 +436,11 @@ def _check_memory(
     if is_compiled and (layout.form == "arrays" or not generates()):
         return
     batch = f" of each of {count} trajectories" if count > 1 else ""
-    disk = ", and dvi.sweep(store=...) writes results of many trajectories to disk" if batch else ""
+    disk = ", run fewer trajectories at once, or write results to disk with dvi.sweep(store=...)"
     raise ValueError(
-        f"the results need {count * saved * each / 2**30:.3g} GiB of memory ({saved} saved states"
-        f"{batch}), but only {memory / 2**30:.3g} GiB are available. Save fewer states: "
-        "save=dvi.Save(every=m), dvi.Save(final=True) or dvi.Save(ts=times). A reduction such as "
-        f"dvi.MaxDrift(function) observes every step in constant memory{disk}."
+        f"the results need {count * saved * each / 2**30:.3g} GiB of memory ({saved} saved "
+        f"state{'s' * (saved > 1)}{batch}), but only {memory / 2**30:.3g} GiB are available. Save "
+        "fewer states with save=dvi.Save(every=m), dvi.Save(final=True) or dvi.Save(ts=times)"
+        f"{disk * (count > 1)}. A reduction such as dvi.MaxDrift(function) observes every step in "
+        "constant memory."
     )

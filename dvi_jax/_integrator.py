@@ -109,7 +109,7 @@ def chosen(integrator: Integrator | None, **given: Any) -> Integrator:
         return Integrator(**given) if given else _DEFAULT
     instance("integrator", integrator, Integrator, "a dvi.Integrator(...)")
     if given:
-        names = ", ".join("newton" if name == "root_finder" else name for name in given)
+        names = ", ".join(given).replace("root_finder", "root_finder (or newton)")
         raise ValueError(
             f"{names} and integrator cannot be given together: set {names} in "
             "dvi.Integrator(...), or leave integrator out."
@@ -125,7 +125,7 @@ def only(integrator: Integrator, function: str, *used: str) -> Integrator:
         value, default = getattr(integrator, name), getattr(_DEFAULT, name)
         if name not in used and not eqx.tree_equal(value, default):
             raise ValueError(
-                f"{function} does not use {name}, but integrator has {name}={value!r}: leave "
-                f"{name} out of it. {function} uses only {', '.join(used)}."
+                f"{function} does not use {name}, but integrator has {name}={value!r:.200}: leave "
+                f"{name} out of dvi.Integrator(...). {function} uses only {' and '.join(used)}."
             )
     return integrator

@@ -116,7 +116,7 @@ def _hint(name: str) -> str:
         return f" Did you mean {_MEANT[name]!r}?"
     known = {*names(), *ALIASES, *NAMESPACES}
     close = difflib.get_close_matches(name, known, 1, 0.7)
-    return f" Did you mean {close[0]!r}?" if close else ""
+    return f" Did you mean {close[0]!r}?" if close else " dir(dvi_jax) lists the main names."
 
 
 class Package(ModuleType):

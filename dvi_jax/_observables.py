@@ -32,7 +32,7 @@ def check_observe(task: Task, q0: Array, p0: Array) -> int:
         if not is_observable(leaf):
             raise TypeError(
                 f"observe must be a function of {FORMS}, a reduction such as "
-                f"dvi.MaxDrift(function), or a dict, list or tuple of these, got {leaf!r}."
+                f"dvi.MaxDrift(function), or a dict, list or tuple of these, got {leaf!r:.200}."
             )
         if isinstance(leaf, Running):
             leaf = leaf.reduction
@@ -51,13 +51,14 @@ def check_observe(task: Task, q0: Array, p0: Array) -> int:
             error.add_note(tracing_note(called, error))
             raise
         if not hasattr(out, "shape") and not isinstance(out, int | float):
+            seen = "None (is a return missing?)" if out is None else f"type {type(out).__name__}"
             raise TypeError(
-                f"the observable {called} must return one array, but it returned an object of type "
-                f"{type(out).__name__}. For several values use jnp.stack, or a dict of observables."
+                f"the observable {called!r} must return one array, got {seen}. For several values "
+                "use jnp.stack, or give observe a dict of observables."
             )
         if isinstance(leaf, Range) and jnp.issubdtype(jnp.result_type(out), jnp.complexfloating):
             raise TypeError(
-                f"dvi.Range requires real values, but the observable {called} returns complex "
+                f"dvi.Range requires real values, but the observable {called!r} returns complex "
                 "values. Take their real part, imaginary part or absolute value."
             )
         if not isinstance(leaf, Reduction):
@@ -70,8 +71,8 @@ def _check_deviations(leaf: Deviations, task: Task, q0: Array, p0: Array) -> Non
     # The derivative of a step is taken at a fixed h; the derivative of h would be missing.
     if task.lattice.has_memory:
         raise ValueError(
-            f"{name} requires steps whose size does not depend on the state, but "
-            f"{task.lattice!r} adapts h to the state: use lattice=dvi.Uniform() or dvi.Given(ts)."
+            f"{name} requires steps whose size does not depend on the state, got "
+            f"lattice={task.lattice!r}. Use lattice=dvi.Uniform() or dvi.Given(ts)."
         )
     eqx.filter_eval_shape(leaf.start, jnp.zeros(2 * q0.size, q0.dtype))  # counts and units
 

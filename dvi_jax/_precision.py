@@ -12,16 +12,18 @@ def refuse_double_without_x64(name: str, dtype: Any) -> None:
     of more than double precision."""
     # JAX would round both without a warning, and invariants with them.
     if np.issubdtype(dtype, np.inexact) and np.finfo(dtype).eps < np.finfo(np.float64).eps:
+        double = "complex128" if np.dtype(dtype).kind == "c" else "float64"
         raise TypeError(
-            f"{name} has the type {np.dtype(dtype)}, but JAX has at most double precision: use "
-            f"np.asarray({name}, np.float64), which rounds the numbers."
+            f"{name} has the type {np.dtype(dtype)}, but JAX has at most double precision. Round "
+            f"the numbers to {double}, for example with np.asarray(x, np.{double})."
         )
     if np.dtype(dtype) in (np.dtype(np.float64), np.dtype(np.complex128)) and not x64_enabled():
+        single = "complex64" if np.dtype(dtype).kind == "c" else "float32"
         raise TypeError(
             f"{name} has the type {np.dtype(dtype)}, but this process computes in float32. "
             "Invariants need double precision: put the line\n    "
-            'jax.config.update("jax_enable_x64", True)\nbefore the first array is made. If single '
-            "precision is sufficient, give arrays of type float32."
+            'jax.config.update("jax_enable_x64", True)\nbefore the first array is made. Functions '
+            f"that also work in single precision accept {single} arrays without this line."
         )
 
 
@@ -29,6 +31,6 @@ def require_double(what: str) -> None:
     """**Raises** `ValueError` in a process that computes in float32: `what` needs more."""
     if not x64_enabled():
         raise ValueError(
-            f"{what} needs double precision: put the line\n    "
-            'jax.config.update("jax_enable_x64", True)\nbefore the first array is made.'
+            f"{what} needs double precision, but this process computes in float32: put the line\n"
+            '    jax.config.update("jax_enable_x64", True)\nbefore the first array is made.'
         )

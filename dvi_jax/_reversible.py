@@ -95,13 +95,13 @@ class Reversible(AbstractAdjoint):
         # A traced value that a function closes over is not an input of the trajectory: a custom
         # derivative with respect to the inputs would miss it.
         if not why and any(map(is_traced, jax.make_jaxpr(forward)(inputs, whole).consts)):
-            why = "a function of the run closes over a traced value (pass it in args)"
+            why = "a function of the run uses a traced value from outside (pass it in args)"
         if why:
             if self.report_defect:
                 raise ValueError(
-                    "report_defect=True requires states that can be reconstructed backwards, "
-                    f"but {why}. Leave report_defect out: gradients are then those of "
-                    "dvi.Checkpointed()."
+                    "dvi.Reversible(report_defect=True) requires states that can be reconstructed "
+                    f"backwards, but {why}. Leave report_defect out: gradients are then computed "
+                    "in the same way as with dvi.Checkpointed()."
                 )
             return Checkpointed().rollout(task, plan, q0, p0, layout)
 

@@ -73,22 +73,23 @@ class Save(eqx.Module):
             return
         if self.every is not None or self.final:
             raise ValueError(
-                "Save(ts=...) saves only at the times ts: leave out every and final. If you need "
-                "their times too, add these times to ts."
+                f"Save(ts=...) saves at the times ts only, got also every={self.every} and "
+                f"final={self.final}: leave out every and final. Add their times to ts if needed."
             )
         if self.ts.ndim != 1 or self.ts.shape[0] == 0:
             raise ValueError(
-                "ts in Save(ts=...) must be a one-dimensional array of at least one time, got "
-                f"shape {self.ts.shape}."
+                "ts in Save(ts=...) must be a one-dimensional array with at least one time, such "
+                f"as [0.5], got shape {self.ts.shape}."
             )
         if not is_traced(self.ts):
             steps = np.diff(np.asarray(self.ts))
             # In order, since a step finds its times by bisection. Traced ones are sorted in a run.
             ordered = bool((steps >= 0).all() or (steps <= 0).all())
             if not (ordered and np.isfinite(np.asarray(self.ts)).all()):
+                seen = np.array2string(np.asarray(self.ts), threshold=20)
                 raise ValueError(
-                    "ts in Save(ts=...) must have finite times in ascending order (descending for "
-                    f"h < 0), got {np.asarray(self.ts)}."
+                    "ts in Save(ts=...) must be finite and in ascending order, or for h < 0 in "
+                    f"descending order, got {seen}. Remove NaN and infinity, and use np.sort(ts)."
                 )
 
 
@@ -148,8 +149,9 @@ class Solution(eqx.Module):
     def __getattr__(self, name: str) -> Any:
         # Called for names that do not exist only.
         meant = _OTHER_NAMES.get(name)
-        hint = f" The {meant}." if meant else ""
-        raise AttributeError(f"a Solution has no attribute {name!r}.{hint}", name=name, obj=self)
+        meant = meant or "attributes are " + ", ".join([*self.__dataclass_fields__, "status"])
+        text = f"a Solution has no attribute {name!r}. The {meant}."
+        raise AttributeError(text, name=name, obj=self)
 
     def __repr__(self) -> str:
         """Status, size and last state in words; the shapes under jit."""
@@ -178,12 +180,12 @@ class Solution(eqx.Module):
 
 _OTHER_NAMES = {
     **dict.fromkeys(
-        ("q", "x", "positions", "coordinates"), "positions are qs, the last ones q_final"
+        ("q", "x", "positions", "coordinates"), "positions are in qs, the last ones in q_final"
     ),
-    **dict.fromkeys(("p", "v", "momenta"), "momenta are ps, the last ones p_final"),
-    **dict.fromkeys(("t", "times", "time"), "times are ts"),
-    **dict.fromkeys(("y", "ys", "states", "state"), "states are qs and ps"),
+    **dict.fromkeys(("p", "v", "momenta"), "momenta are in ps, the last ones in p_final"),
+    **dict.fromkeys(("t", "times", "time"), "times are in ts"),
+    **dict.fromkeys(("y", "ys", "states", "state"), "states are in qs and ps"),
     **dict.fromkeys(("success", "converged"), 'status is "successful" for a run without a failure'),
-    **dict.fromkeys(("observables", "observe"), "values of observables are observed"),
+    **dict.fromkeys(("observables", "observe"), "values of observables are in observed"),
 }
 """Names in other packages → where it is here."""

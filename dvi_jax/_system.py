@@ -87,13 +87,15 @@ class System(eqx.Module):
         instance("slow_time", self.slow_time, bool, "True or False")
         if self.epsilon is not None:
             finite("epsilon of a System", self.epsilon)
-        functions = (self.H_D, self.perturbation)
-        if self.slow_time and any(getattr(f, "step_is_from_times", False) for f in functions):
+        functions = {"H_D": self.H_D, "perturbation": self.perturbation}
+        timed = [n for n, f in functions.items() if getattr(f, "step_is_from_times", False)]
+        if self.slow_time and timed:
             raise ValueError(
-                "with slow_time=True, t1 − t0 is ε h, not the step h. But the results of "
-                "dvi.discretise(H, order) with order ≥ 2, dvi.from_lagrangian and "
-                "dvi.from_type_iii compute the step as t1 − t0. Use dvi.discretise(H, order=1); "
-                "for a higher order use method=dvi.Strang() or dvi.Yoshida(4)."
+                f"{timed[0]} must not compute the step as t1 − t0 if slow_time=True, because then "
+                "t1 − t0 is ε h. The results of dvi.discretise(H, order) with order ≥ 2, of "
+                "dvi.from_lagrangian and of dvi.from_type_iii do so. Use dvi.discretise(H, "
+                "order=1), or dvi.legendre(L) for a Lagrangian. For a higher order pass "
+                "method=dvi.Strang() or dvi.Yoshida(4) to dvi.integrate."
             )
 
     def strength(self, epsilon: Any) -> Any:
@@ -106,14 +108,14 @@ class System(eqx.Module):
         parts = {
             "a force": self.force is not None,
             "a perturbation": self.perturbation is not None,
-            "a slow time": self.slow_time,
+            "slow_time=True": self.slow_time,
         }
         if any(parts.values()):
             has = " and ".join(name for name, is_there in parts.items() if is_there)
             raise ValueError(
-                f"the system has {has}, but epsilon is not given. Pass epsilon=0.0 for the "
-                "unperturbed motion, epsilon=1.0 if the functions contain the strength of the "
-                "perturbation, or another strength."
+                f"epsilon must be given for a system with {has}. Pass the strength of the "
+                "perturbation, such as epsilon=0.01. With epsilon=0.0 the motion is unperturbed; "
+                "with epsilon=1.0 the functions are used as they are."
             )
         return 0.0
 
@@ -193,8 +195,8 @@ def of_problem(
         q0, p0, h, args = (None, None, *tuple(given)[2:]) if has_start else given
     elif isinstance(system, System) and not has_start and (q0 is None or p0 is None):
         raise TypeError(
-            f"{'q0' if q0 is None else 'p0'} is missing: give the initial positions and momenta, "
-            "integrate(system, q0, p0, ...)."
+            f"q0 and p0 must both be given for a dvi.System, but {'q0' if q0 is None else 'p0'} is "
+            "missing. Call integrate(system, q0, p0, ...)."
         )
     return system, q0, p0, h, args
 
@@ -203,10 +205,11 @@ def check_system(system: Any) -> None:
     """**Raises** `TypeError` for an object that is not a `System`, `ValueError` for a system whose
     functions read a value that has changed since it was made."""
     if not isinstance(system, System):
-        hint = "Wrap the discrete Hamiltonian: dvi.System(H_D, force=W)."
+        hint = "Wrap the discrete Hamiltonian H_D(t0, t1, q0, p1, args) in it: dvi.System(H_D)."
         if isinstance(getattr(system, "system", None), System):
             hint = "Take the system of a problem of the library: problem.system."
-        raise TypeError(f"system must be a dvi.System, got {type(system).__name__}. {hint}")
+        seen = f"{type(system).__name__} {getattr(system, '__name__', '')}".rstrip()
+        raise TypeError(f"system must be a dvi.System, got a value of type {seen}. {hint}")
     # Programs that are compiled already would compute with the old value.
     now = _read_by(system)
     names = changed(system.reads, now) if now != system.reads else []
@@ -257,8 +260,9 @@ def _traced_output(
     # JAX moves such an index to the end of the array, so that the result would be wrong silently.
     for index, size in out_of_bounds(traced):
         raise IndexError(
-            f"{name}{_NAMES} uses the index {index}, which is out of bounds for an axis with "
-            f"{size} entries (q0 and p1 have shape {q.shape}). Correct the index, or the shape."
+            f"{name}{_NAMES} must use indices inside its arrays, but the index {index} is out of "
+            f"bounds for an axis of length {size}. q0 and p1 have the shape {q.shape}. Correct the "
+            "index, or the shape of the array."
         )
     out = eqx.combine(*out)
     after = reads(function)
@@ -270,8 +274,7 @@ def _traced_output(
     if out is None or not hasattr(out, "shape"):
         if isinstance(out, int | float):
             return seen.setdefault(kinds, jax.ShapeDtypeStruct((), jnp.result_type(float)))
-        raise TypeError(
-            f"{name}{_NAMES} must return one array; it returned "
-            f"{'None (is a return missing?)' if out is None else type(out).__name__}."
-        )
+        got = "None (is a return missing?)" if out is None else f"type {type(out).__name__}"
+        wanted = f"an array of shape {q.shape}, that of q0" if name == "force" else "a real scalar"
+        raise TypeError(f"{name}{_NAMES} must return {wanted}, got {got}.")
     return seen.setdefault(kinds, jax.ShapeDtypeStruct(out.shape, out.dtype))

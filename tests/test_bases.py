@@ -85,7 +85,7 @@ def test_functions_of_time_are_recognised():
         (lambda: dvi.Trigonometric(2, "q", period=0.0), ValueError, "period must be positive"),
         (lambda: dvi.Radial([0.5]), ValueError, "list of one or more integers"),
         (lambda: dvi.Basis([]), ValueError, "at least one"),
-        (lambda: dvi.Basis([lambda q: q]), TypeError, "takes .q., not"),
+        (lambda: dvi.Basis([lambda q: q]), TypeError, r"must take .*a function of \(q\)"),
         (lambda: dvi.Basis([3.0]), TypeError, "must be a function"),
     ],
 )
@@ -95,6 +95,6 @@ def test_bad_families_are_refused(make, error, says):
 
 
 def test_a_basis_that_is_too_large_to_search_is_refused_at_once():
-    with pytest.raises(ValueError, match=r"Polynomials\(400\) of 4 variables has 1.09e\+09 mono"):
+    with pytest.raises(ValueError, match=r"Polynomials\(400\) of 4 variables has 1.09\d+e\+09"):
         dvi.Polynomials(400).for_shape((2,))
     assert len(dvi.Polynomials(19).for_shape((2,)).names) == 8854  # just below the limit

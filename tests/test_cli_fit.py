@@ -224,7 +224,7 @@ def test_bounds_priors_and_options(folder):
 # Rejected input: the key, what was seen, what is allowed
 
 HEAD = "t,x\n"
-AWAY = "but h = 0.1 leads to later times. Give h = -0.1, or the t0"
+AWAY = "but h = 0.1 leads to later times. Give h = -0.1; or, if q0"
 BAD_DATA = [
     ("", "data.file: ", "a line of names"),
     (HEAD, "has names but no numbers", "at least one line"),
@@ -242,8 +242,8 @@ BAD_DATA = [
     (HEAD + "0.3,1\n0.6\n", "line 3: it has 1 cells", "2 cells, one for each"),
     (HEAD + "0.3,1\n,2\n", "data.time: ts[1] is nan", "finite times in order in the column t"),
     (HEAD + "0.3,1\n0.9,2\n0.6,2\n", "data.time: ts is not in order: ts[1] = 0.9", "in order"),
-    (HEAD + "0.3,1\n0.3,2\n", "data.time: ts[0] and ts[1] are the same time, 0.29", "in order"),
-    (HEAD + "0.3,1\n", "2 parameters cannot be determined from 1 observed values", "data that fit"),
+    (HEAD + "0.3,1\n0.3,2\n", "data.time: ts[0] and ts[1] are the same time, 0.3:", "in order"),
+    (HEAD + "0.3,1\n", "2 parameters cannot be determined from 1 observed value ", "data that fit"),
     (HEAD + "0.3,\n0.6,nan\n", "data: all values are NaN", "values that fit"),
     ("0.3,1\n0.6,2\n", "line 1: 0.3 is a number", "different names"),
     ("t,t\n0.3,1\n", "'t' is empty or repeated", "different names"),
@@ -254,7 +254,7 @@ BAD_DATA = [
     ),
     ("time,x\n0.3,1\n", "data.time: the file has no column 't'", "a column of the file: time, x"),
     ("t\n0.3\n0.6\n", "no column is left", "one or more of t"),
-    (HEAD + "-0.3,1\n0.6,2\n", "data: t0 = 0, the start of the arc, lies between", "in order"),
+    (HEAD + "-0.3,1\n0.6,2\n", "data: t0 = 0.0, the start of the arc, lies between", "in order"),
     (HEAD + "-0.3,1\n-0.6,2\n", AWAY, "data that fit"),
     (HEAD + "-0.6,1\n-0.3,2\n", AWAY, "data that fit"),
 ]

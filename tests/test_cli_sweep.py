@@ -375,7 +375,7 @@ REJECTED = [
     (E + "{values = [1], axis = 'a b'}", "epsilon.axis: the value is 'a b'", "a name"),
     (E + "{values = [1], axis = 'status'}", "epsilon.axis: the value is 'status'", "except status"),
     (E + "{values = [1], units = 3}", "epsilon.units: the value is 3", "text"),
-    (E + "{values = [1, 2], axis = 'a'}\nh = " + IN_A, "has 2 values in epsilon, but 1", "axes"),
+    (E + "{values = [1, 2], axis = 'a'}\nh = " + IN_A, "length 2 in epsilon, but 1", "axes"),
     (EPS + "[observables]\n'zarr.json' = 'energy'", "the observable 'zarr.json'", "fit"),
     (
         EPS + "[observables]\n'../../x' = 'energy'",

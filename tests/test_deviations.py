@@ -588,8 +588,8 @@ TRANSFORMED = {"lattice": dvi.TimeTransformed(lambda t, q, p, a: 1.0)}
 SOLVED_FOR = {"lattice": dvi.Variational(), "method": dvi.TypeII()}
 AT_TIMES = {"save": dvi.Save(ts=[0.1])}
 INVALID_RUNS = [
-    (dvi.GALI(5), {}, "5 deviation vectors, .* only 4 directions: use at most 4"),
-    (dvi.MEGNO(scale=(np.ones(3), 1.0)), {}, r"scale of q .* 2 numbers .*of q\); got 3 numbers"),
+    (dvi.GALI(5), {}, "at most 4 deviation vectors, .* got 5"),
+    (dvi.MEGNO(scale=(np.ones(3), 1.0)), {}, r"scale of q .* size of q \(2\); got 3 numbers"),
     (dvi.MEGNO(), TRANSFORMED, "MEGNO requires steps"),
     (dvi.SALI(), SOLVED_FOR, "whose size does not depend on the state"),
     (dvi.Running(dvi.MEGNO()), AT_TIMES, r"Running.*=dvi.Save\(every=m\)"),

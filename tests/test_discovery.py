@@ -409,7 +409,7 @@ def test_a_discovery_is_saved_and_loaded(tmp_path, monkeypatch):
         np.testing.assert_array_equal(back.coefficients, d.coefficients)
         at = np.array([0.3]), np.array([0.2]), 0.1
         np.testing.assert_array_equal(back.evaluate(*at), d.evaluate(*at))
-    with pytest.raises(ValueError, match=r"basis has 44 functions.* has 14 "):
+    with pytest.raises(ValueError, match=r"is 44 in the file and 14 in basis.*differ are"):
         dvi.Discovery.load(path, dvi.Polynomials(4))
     named = dvi.Basis({"f": lambda q, p: q @ q + p @ p - 0.1 * (q @ p)})
     discover(OSCILLATOR, named, samples=box(1, 20)).save(path)
@@ -473,7 +473,7 @@ def test_series_differentiates_batches_and_refuses_to_guess():
         ({"order": -1}, "from 0 on"),
         ({"tolerance": 2.0}, "between 0 and 1"),
         ({"basis": dvi.Chebyshev(3, "t")}, "all samples have the same time"),
-        ({"samples": (*box(1, 60), np.zeros(50))}, "for 60 samples"),
+        ({"samples": (*box(1, 60), np.zeros(50))}, r"shape \(60,\)"),
         ({"basis": dvi.Polynomials(2) + dvi.Polynomials(1)}, "rank-deficient"),
         ({"basis": dvi.Basis([lambda q, p: 1 / (0 * q[0])])}, "'f1' is not finite"),
         ({"basis": dvi.Basis([lambda q, p: q**2])}, r"'f1' must return a real scalar.*\(1,\)"),

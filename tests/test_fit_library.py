@@ -221,7 +221,7 @@ INVALID_LIBRARIES = [
     (lambda: ONE + ONE, ValueError, "both libraries"),
     (lambda: ONE(*AT, None), ValueError, r"args\[.coefficients.\]"),
     (lambda: ONE(*AT, {"coefficients": Q}), ValueError, r"shape \(20,\)"),
-    (lambda: TWO(*AT, {"coefficients": jnp.ones(20)}), ValueError, r"shape \(n,\) with n = 2, got"),
+    (lambda: TWO(*AT, {"coefficients": jnp.ones(20)}), ValueError, r"shape \(2,\), .*got shape"),
     (lambda: SCALAR(*AT, None), ValueError, "'f' must return an array of the shape of q0"),
     (lambda: dvi.ForceLibrary.monomials(0, 1), ValueError, "degree must be"),
     (lambda: dvi.ForceLibrary.monomials(1, 1.0), ValueError, "n must be"),

@@ -218,7 +218,7 @@ def test_times_in_single_precision_are_uniform_to_their_rounding(start):
     assert found.frequencies.dtype == np.float64
     assert found.frequencies[0] == pytest.approx(2, rel=3e-8)
     np.testing.assert_allclose(found.amplitudes[0], 1, atol=1e-4)
-    with pytest.raises(ValueError, match="not uniform"):  # in double precision they are not
+    with pytest.raises(ValueError, match="equal steps"):  # in double precision they are not
         frequencies(ts.astype(float), z)
     with pytest.raises(ValueError, match="float32: give the times in float64"):
         frequencies(ts + 0.01 * (k % 2).astype(np.float32), z)
@@ -316,9 +316,9 @@ ROUNDED = (1e6 + 0.05 * np.arange(N)).astype(np.float32)
 @pytest.mark.parametrize(
     ("give", "error", "words"),
     [
-        (lambda: frequencies(IRREGULAR, torus()), ValueError, "not uniform.*dvi.Uniform"),
-        (lambda: frequencies(TS * 0, torus()), ValueError, "not uniform"),
-        (lambda: frequencies(ROUNDED, torus()), ValueError, "not uniform"),
+        (lambda: frequencies(IRREGULAR, torus()), ValueError, "equal steps.*dvi.Uniform"),
+        (lambda: frequencies(TS * 0, torus()), ValueError, "equal steps"),
+        (lambda: frequencies(ROUNDED, torus()), ValueError, "equal steps"),
         (lambda: frequencies(TS[:20], torus()[:20]), ValueError, "at least 32 samples, got 20"),
         (lambda: frequencies(TS[:-1], torus()), ValueError, "same length along their last axis"),
         (lambda: frequencies(TS, torus()[:, None]), ValueError, "signal.T"),
@@ -328,7 +328,7 @@ ROUNDED = (1e6 + 0.05 * np.arange(N)).astype(np.float32)
         (lambda: frequencies(TS, ["a"] * N), TypeError, "array of numbers"),
         (lambda: frequencies(TS, torus(), count=0), ValueError, "from 1 on, got 0"),
         (lambda: frequencies(TS, torus(), count=2.0), ValueError, "from 1 on, got 2.0"),
-        (lambda: frequencies(TS[:64], torus()[:64], count=22), ValueError, "66 unknowns"),
+        (lambda: frequencies(TS[:64], torus()[:64], count=22), ValueError, "at most 21 for"),
         (lambda: frequencies(TS, torus(), window=6), ValueError, "from 0 to 5, got 6"),
         (lambda: frequencies(TS, torus(), refine="no"), ValueError, "True, False, got 'no'"),
         (lambda: frequencies(resting(), torus()), ValueError, "signal of a Solution is q"),

@@ -367,7 +367,7 @@ def test_round_trip_defect_is_that_of_reconstructed_states(form):
 def test_round_trip_defect_without_reconstruction_is_an_error():
     with pytest.raises(ValueError, match=r"backwards, but RungeKutta4 has no inverse step.*Leave"):
         rebuilt(4, method=dvi.RungeKutta4())
-    with pytest.raises(ValueError, match="report_defect=True cannot be combined with progress"):
+    with pytest.raises(ValueError, match=r"report_defect=True\) cannot be combined with progress"):
         rebuilt(4, progress=lambda *_: None)
 
 

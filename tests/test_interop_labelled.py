@@ -105,7 +105,7 @@ def test_bodies_and_axes_have_names():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"dims": ("batch",)}, "0 dimensions"),
+        ({"dims": ("batch",)}, "the length of dims must be 0"),
         ({"components": ["x"]}, r"q has the shape \(2,\)"),
         ({"observe": {"E": ENERGY}}, "observe must be the same as for integrate"),
         ({"observe": {"E": ENERGY, "kept": {"drift": ENERGY}}}, "kept.drift"),

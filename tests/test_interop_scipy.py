@@ -175,7 +175,7 @@ def unit():
 @pytest.mark.parametrize(
     ("options", "error", "words"),
     [
-        ({"rtol": 1e-3}, TypeError, "'rtol': .*lattice is fixed"),
+        ({"rtol": 1e-3}, TypeError, "'rtol'. The size of the steps is fixed"),
         ({"dense_output": True}, TypeError, "t_eval"),
         ({"vectorized": True}, TypeError, "vmap"),
         ({"jac": None}, TypeError, "autodiff"),

@@ -70,8 +70,8 @@ def test_observables_see_numbers_in_the_units():
         ({"h": 1 * u.m}, ValueError, r"h is in m \(length\).*time"),
         ({"h": 1.0}, TypeError, "no unit"),
         ({"q0": np.array([1.0, 0.0])}, TypeError, "q0 .*no unit"),
-        ({"q0": [1 * u.au, 0.1]}, TypeError, "mixes"),
-        ({"q0": [1 * u.au, 0 * u.s]}, TypeError, "mixes"),
+        ({"q0": [1 * u.au, 0.1]}, TypeError, "all entries of q0 must"),
+        ({"q0": [1 * u.au, 0 * u.s]}, TypeError, "all entries of q0 must"),
         ({"q0": None}, TypeError, "q0 is missing"),
         ({"p0": [0, 29.78] * u.km / u.s}, ValueError, "speed.*momentum"),
         ({"t0": 1 * u.kg}, ValueError, "mass.*time"),
@@ -128,7 +128,7 @@ def test_angles_and_their_momenta():
 def test_a_unit_of_another_kind_is_no_base():
     with pytest.raises(ValueError, match=r"time must be a unit of time.*\(length\)"):
         interop.UnitSystem(u.m, u.m, u.kg)
-    with pytest.raises(ValueError, match="is unknown to astropy"):
+    with pytest.raises(ValueError, match="q must be a unit of astropy"):
         interop.UnitSystem(u.m, u.s, u.kg, q="longitude")
     made = interop.UnitSystem(u.m, u.s, u.kg, args={"mu": u.au**3 / u.yr**2})
     assert made.args["mu"] == u.m**3 / u.s**2
@@ -197,7 +197,7 @@ def test_a_unit_applies_to_all_parameters_below_its_name():
 
 
 def test_mistyped_names_of_parameters():
-    with pytest.raises(ValueError, match=r"units for kk, .* In args, k have no unit"):
+    with pytest.raises(ValueError, match=r"units for kk, .* without a unit: k\. "):
         weights([1, 2] * u.kg, k=5.0, kinds={"kk": u.N / u.m})
     with pytest.raises(ValueError, match=r"'J22', but oblate_kepler has no such.*mu, R, J2"):
         interop.integrate(systems.oblate_kepler(), h=10 * u.s, num_steps=1, args={"J22": 0.0})
@@ -223,5 +223,5 @@ def test_masked_values_and_units_without_a_factor():
     for unit in (u.deg_C, u.mag, u.ABmag, u.photon / u.s):
         with pytest.raises(ValueError, match="T cannot be in"):
             interop.UnitSystem(u.m, u.s, u.kg, args={"T": unit})
-    with pytest.raises(ValueError, match=r"in kelvin it is x\.to\(u\.K, u\.temperature"):
+    with pytest.raises(ValueError, match=r"Convert it: k\.to\(u\.K, u\.temperature"):
         weights([1, 2] * u.kg, k=5 * u.deg_C, kinds={"k": u.K})

@@ -363,7 +363,7 @@ def test_what_a_bound_says_of_a_start(cubic):
         cubic.steps_inside([0.1], [0.1], 0.02)
     with pytest.raises(ValueError, match="must be finite numbers"):
         cubic.steps_inside([np.nan], [0.1], 0.01)
-    with pytest.raises(ValueError, match="1 numbers each"):
+    with pytest.raises(ValueError, match=r"size 1, .* got the sizes 2 and 2"):
         cubic.steps_inside([0.1, 0.2], [0.1, 0.2], 0.01)
 
 
@@ -460,7 +460,7 @@ def test_a_wrong_balance_is_not_proved(monkeypatch):
 
 def test_a_singularity_in_the_domain():
     kepler = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 - 1 / jnp.sqrt(q @ q))
-    with pytest.raises(dvi.ProofError, match=r"nothing is bounded. The first is .* is singular"):
+    with pytest.raises(dvi.ProofError, match=r"no bound was found on .* is singular"):
         dvi.bound_drift(
             lambda q, p, e: q[0] * p[1] - q[1] * p[0], kepler, h=0.1, epsilon=0.1,
             domain=np.full(2, 0.5), max_boxes=4,
@@ -496,8 +496,8 @@ def test_no_number_of_steps_is_claimed(epsilon, function):
     [
         ({"epsilon": (0.1, 0.1)}, ValueError, "with least < largest"),
         ({"ratio": 1.0}, ValueError, "larger than 1"),
-        ({"domain": 0.5}, ValueError, "does not contain the number of coordinates"),
-        ({"domain": np.array([-1.0])}, ValueError, "lower bounds below"),
+        ({"domain": 0.5}, ValueError, "domain must be an array with the shape"),
+        ({"domain": np.array([-1.0])}, ValueError, "lower bounds below finite"),
         ({"method": dvi.GaussLegendre(2)}, ValueError, "is implicit for this system"),
         ({"h": 0.0}, ValueError, "other than zero"),
         ({"epsilon": None}, ValueError, "epsilon must be a finite number"),

@@ -424,7 +424,7 @@ E = {"epsilon": [0.1]}
     ("settings", "error", "message"),
     [
         ({}, ValueError, "nothing varies"),
-        ({"epsilon": [0.1, np.nan]}, ValueError, r"is nan at index \[1\]"),
+        ({"epsilon": [0.1, np.nan]}, ValueError, r"got nan at index \[1\]"),
         ({"epsilon": ["a"]}, TypeError, "epsilon must be numbers"),
         ({"epsilon": []}, ValueError, "no values"),
         ({"epsilon": np.zeros((2, 2))}, ValueError, r"epsilon must be .* shape \(2, 2\)"),
@@ -437,7 +437,7 @@ E = {"epsilon": [0.1]}
         (E | {"threads": 0}, ValueError, "threads must be"),
         (E | {"lanes_per_task": 1.5}, ValueError, "lanes_per_task must be"),
         (E | {"progress": 3}, TypeError, "progress must be"),
-        (E | {"units": {"drft": "J"}}, ValueError, "'drft', which is not a result"),
+        (E | {"units": {"drft": "J"}}, ValueError, "units has the unknown name 'drft'"),
         (E | {"units": "J"}, TypeError, "units must be a dict"),
         ({"method": [dvi.TypeII(), "Strang"]}, TypeError, "of method must be a dvi.Method, got 'S"),
         (E | {"start": 3}, TypeError, "one of dvi.starts"),
@@ -454,7 +454,7 @@ E = {"epsilon": [0.1]}
         (
             {"epsilon": dvi.Axis("a", [0.1]), "h": dvi.Axis("a", [0.1, 0.2])},
             ValueError,
-            "1 values in epsilon, but 2 in h",
+            "length 1 in epsilon, but 2 in h",
         ),
         (
             {"num_steps": dvi.Axis("n", [2, 3]), "save": dvi.Save(every=1)},

@@ -146,8 +146,8 @@ def test_brackets_close_the_algebra():
         (lambda: library.scaling(t=[1.0, 2.0]), "must be one number"),
         (lambda: library.boost([1.0, 0.0], mass=-1.0), "positive"),
         (lambda: library.rotation(0, 2)(POINT), "at least 3 components"),
-        (lambda: library.space_translation([1.0, 0.0, 0.0])(POINT), r"does not match q of shape"),
-        (lambda: library.boost([1.0, 0.0], [1.0, 2.0, 3.0])(POINT), "mass of shape"),
+        (lambda: library.space_translation([1.0, 0.0, 0.0])(POINT), r"direction must .*\(2,\)"),
+        (lambda: library.boost([1.0, 0.0], [1.0, 2.0, 3.0])(POINT), "mass must be a number"),
     ],
 )
 def test_library_refuses_what_does_not_fit(make, message):

@@ -164,8 +164,8 @@ def test_gradients_batches_and_statuses_go_through():
 @pytest.mark.parametrize(
     ("speed", "observe", "says"),
     [
-        (lambda t, q, p, args: -1.0, None, "positive scalar; at t0, q0, p0 it returns -1"),
-        (lambda t, q, p, args: q, None, "positive scalar; at t0, q0, p0 it returns an array"),
+        (lambda t, q, p, args: -1.0, None, "one positive number .* it returns -1"),
+        (lambda t, q, p, args: q, None, "one positive number .* it returns an array"),
         (radius, dvi.Trend(energy), "fictitious time"),
     ],
 )

@@ -8,6 +8,7 @@ from typing import Any
 
 import dvi_jax as dvi
 
+from .._checks import instance
 from ..testing import CHECKS, CONTROLS, METHODS, Candidate, Control, Measured
 from ..testing.check import chosen, require_double_precision
 from ..testing.problems import COUPLED, FORCED, reference
@@ -118,20 +119,23 @@ def certify(
 def _named(methods: Any) -> dict[str, dvi.Method]:
     """Name → method, checked."""
     if isinstance(methods, dvi.Method):
-        raise TypeError(f'methods must have names: write certify({{"mine": {methods!r}}}).')
+        raise TypeError(
+            "methods must have names as keys of a dict, got one method without a name. Write "
+            f'certify({{"mine": {methods!r}}}).'
+        )
     if not isinstance(methods, Mapping):
         own = " For your own method call certify({name: method})."
         return {name: METHODS[name] for name in chosen("method", methods, METHODS, own)}
     for name, method in methods.items():
-        if not isinstance(method, dvi.Method):
-            raise TypeError(
-                f"methods[{name!r}] must be a method such as dvi.TypeII(), got {method!r}."
-            )
+        instance(f"methods[{name!r}]", method, dvi.Method, "a method such as dvi.TypeII()")
         order = method.order
         if isinstance(order, bool) or not isinstance(order, int | float):
-            raise TypeError(f"the order of {name!r} must be a number, got {order!r}.")
+            raise TypeError(f"methods[{name!r}].order must be an int or a float, got {order!r}.")
         if not (math.isfinite(order) and order > 0):
-            raise ValueError(f"the order of {name!r} must be positive and finite, got {order!r}.")
+            raise ValueError(f"methods[{name!r}].order must be positive and finite, got {order!r}.")
     if not methods:
-        raise ValueError("methods is empty: give at least one, certify({name: method}).")
+        raise ValueError(
+            'methods is empty: give at least one method with its name, such as {"mine": '
+            "dvi.TypeII()}, or None for all methods of the package."
+        )
     return {str(name): method for name, method in methods.items()}

@@ -83,15 +83,15 @@ def noether_balance(
     steps = int(jnp.size(solution.ts)) - 1
     if jnp.ndim(solution.ts) != 1 or steps < 2:
         raise ValueError(
-            "solution must be one trajectory with at least two steps, got times of shape "
-            f"{jnp.shape(solution.ts)}. For a batch use jax.vmap over solutions."
+            "solution must be one trajectory with at least three states, got solution.ts of shape "
+            f"{jnp.shape(solution.ts)}. Integrate at least two steps with save=dvi.Save(). For a "
+            "batch use jax.vmap over the solutions."
         )
     if steps != solution.stats["num_steps"] or steps != jnp.size(solution.hs):
         raise ValueError(
-            "solution must have the state at every lattice point, but it has "
-            f"{steps + 1} states for {solution.stats['num_steps']} steps"
-            + (", saved at requested times" if steps != jnp.size(solution.hs) else "")
-            + ". Integrate with save=dvi.Save()."
+            f"solution must have the state at every lattice point, but it has {steps + 1} states"
+            + (" at requested times" if steps != jnp.size(solution.hs) else "")
+            + f" for num_steps={solution.stats['num_steps']}. Integrate with save=dvi.Save()."
         )
     return _balance(
         system,

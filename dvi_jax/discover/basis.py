@@ -50,7 +50,7 @@ def check_step_size(h: Any) -> float:
     except (TypeError, ValueError):
         number = np.nan
     if not np.isfinite(number) or number == 0:
-        raise ValueError(f"h must be one finite step size other than zero, got {h!r}.")
+        raise ValueError(f"h must be one finite step size other than zero, got {h!r:.200}.")
     return number
 
 
@@ -79,8 +79,8 @@ class BoundBasis(eqx.Module):
         q, p = jnp.asarray(q), jnp.asarray(p)
         if self.shape is not None and not q.shape == p.shape == self.shape:
             raise ValueError(
-                f"q and p must have the shape {self.shape} for which this basis was made, got q of "
-                f"shape {q.shape} and p of shape {p.shape}."
+                f"q and p must have the shape {self.shape} for this basis, that of one state; got "
+                f"q of shape {q.shape} and p of shape {p.shape}. For many states use jax.vmap."
             )
         return self.function(q, p, jnp.asarray(t, float))
 
@@ -174,7 +174,10 @@ class Basis(AbstractBasis):
             function(f"basis function {name!r}", each, "(q, p) or (q, p, t)")
             if not (_takes(each, 2) or _takes(each, 3)):
                 seen = inspect.signature(each)
-                raise TypeError(f"basis function {name!r} takes {seen}, not (q, p) or (q, p, t).")
+                raise TypeError(
+                    f"the basis function {name!r} must take the arguments (q, p) or (q, p, t), got "
+                    f"a function of {seen}."
+                )
         self.functions, self.names = tuple(named.values()), tuple(named)
         self.complexity = complexity
 
@@ -210,7 +213,7 @@ def _require_real_scalar(name, function, timed: bool, shape) -> None:
         seen = "None" if out is None else f"shape {kind}, type {np.dtype(dtype).name}"
         raise ValueError(
             f"the basis function {name!r} must return a real scalar; for q of shape {shape} it "
-            f"returned {seen}. Return one number, such as the component q[0]."
+            f"returned {seen}. Return one real number, such as jnp.sum(q**2)."
         )
 
 

@@ -120,8 +120,8 @@ def _require_no_time(stepped, order, samples, found) -> None:
         allowed[:, 0] = np.maximum(1e-8, lost) * predicted + 8 * found.motion.rounding
         if not (np.abs(other - found.terms) <= allowed).all():
             raise ValueError(
-                "the map depends on the time, but all samples have the same time: give "
-                "samples=(qs, ps, ts) with different times."
+                "the map depends on the time, but all samples have the same time, "
+                f"t = {samples.t[0]:g}. Give samples=(qs, ps, ts) with different times in ts."
             )
 
 

@@ -137,8 +137,8 @@ def require_times(raw: Conditions, samples: Samples, h: float, shift: float) -> 
     same = np.max(np.abs(raw.later)) <= 1e-8 * size + rounding  # False for NaN
     if np.ptp(samples.t) == 0 and not same:
         raise ValueError(
-            "the discrete equations depend on the time, but all samples have the same time: give "
-            "samples=(qs, ps, ts) with different times."
+            "the discrete equations depend on the time, but all samples have the same time, "
+            f"t = {samples.t[0]:g}. Give samples=(qs, ps, ts) with different times in ts."
         )
 
 

@@ -122,8 +122,9 @@ def conformal_factor(
     samples, size = len(first.q), 2 * first.q[0].size
     if not pointwise and samples < size:
         raise ValueError(
-            f"first and second must have at least {size} points for a {size}×{size} conformal "
-            f"factor, got {samples}: give more points, or pointwise=True."
+            f"the number of points in first and in second must be at least {size} for a constant "
+            f"{size}×{size} conformal factor, got {samples}. Give more points. For a factor that "
+            "differs from point to point pass pointwise=True."
         )
     find = _pointwise if pointwise else _constant
     return find(system, generators, first, second, jnp.asarray(epsilon), args)

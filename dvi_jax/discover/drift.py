@@ -142,15 +142,16 @@ def drift_surface(
     is_number = isinstance(duration, int | float | np.number)
     if not is_number or not np.isfinite(duration) or duration < 2 * hs[-1]:
         raise ValueError(
-            f"duration must be a finite number. It must be at least {2 * hs[-1]:g}, the length of "
-            f"two of the longest steps (the largest value of hs); got {duration!r}."
+            f"duration must be a finite float or int and at least {2 * hs[-1]}, the length of two "
+            f"of the longest steps in hs; got {duration!r:.200}."
         )
     given = isinstance(invariant, Sequence)
     invariants = list(invariant) if given else [invariant] * len(hs)
     if len(invariants) != len(hs):
         raise ValueError(
             "invariant must be one observable, or a list with one observable for each step size "
-            f"in hs; got {len(invariants)} observables for {len(hs)} step sizes."
+            f"in hs. The length of hs is {len(hs)}, but the length of invariant is "
+            f"{len(invariants)}."
         )
     for each in invariants:
         _check_observable(each)
@@ -196,8 +197,8 @@ def _sweep(system, invariant, starts, epsilons, h, num_steps, settings) -> _Lane
     )
     if drifts.ndim != 1:
         raise ValueError(
-            f"invariant must return a scalar, but returns values of shape {drifts.shape[1:]}: take "
-            "one component."
+            "invariant must return a scalar, but it returned an array of shape "
+            f"{drifts.shape[1:]}. Return one component of it."
         )
     drifts = np.asarray(drifts, float)
     # An odd observable may end near zero: its drift shows how large it was.
@@ -278,11 +279,13 @@ def _positive(name: str, values: Any, increasing: bool = False) -> np.ndarray:
     except (TypeError, ValueError):
         array = np.zeros(())
     if array.ndim != 1 or len(array) == 0 or not (np.isfinite(array) & (array > 0)).all():
-        raise ValueError(f"{name} must be a list of positive, finite numbers, got {values!r:.200}.")
+        raise ValueError(
+            f"{name} must be a list of positive, finite numbers, at least one; got {values!r:.200}."
+        )
     fits = (np.diff(array) > 0).all() if increasing else len(np.unique(array)) == len(array)
     if not fits:
-        rule = "be in increasing order" if increasing else "have distinct values"
-        raise ValueError(f"{name} must {rule}, got {array.tolist()}.")
+        rule = "be in increasing order, without equal values" if increasing else "be distinct"
+        raise ValueError(f"the values of {name} must {rule}, got {array.tolist()!s:.200}.")
     return array
 
 
@@ -293,8 +296,8 @@ def _starts(q0: Any, p0: Any, batched: bool):
         return q0[None], p0[None]
     if q0.ndim == 0:
         raise ValueError(
-            "with batched=True, q0 and p0 must be arrays with the initial conditions along the "
-            "first axis, (S, *state), got single numbers: leave batched out."
+            "q0 and p0 must have the initial conditions along the first axis if batched=True, got "
+            f"the numbers q0 = {q0} and p0 = {p0}. For one initial condition leave out batched."
         )
     return q0, p0
 

@@ -29,9 +29,11 @@ def _places(variables: Sequence[str], shape: tuple[int, ...]) -> tuple[int, ...]
     every = coordinate_names(shape)
     unknown = [v for v in variables if v not in every + TIME]
     if unknown:
+        n = len(every) // 2
+        known = ", ".join(every) if n < 4 else f"q1 to q{n}, p1 to p{n}"
         raise ValueError(
-            f"the basis has the variable {unknown[0]!r}, but states of shape {shape} have only the "
-            f"components {', '.join(every)} and the time t: use these names."
+            f"the basis has the variable {unknown[0]!r}, but for states of shape {shape} the names "
+            f"of variables are {known}, and t for the time. Use these names."
         )
     return tuple(len(every) if v in TIME else every.index(v) for v in variables)
 
@@ -97,9 +99,9 @@ class Polynomials(AbstractBasis):
         size = math.comb(len(chosen) + self.degree, self.degree)
         if size > _MOST:
             raise ValueError(
-                f"Polynomials({self.degree}) of {len(chosen)} variables has {size:.3g} monomials, "
-                f"but at most {_MOST} can be searched: use a lower degree, or fewer variables, "
-                'as in Polynomials(degree, ("q1", "p1")).'
+                f"Polynomials({self.degree}) of {len(chosen)} variables has {size:.6g} monomials, "
+                f"but at most {_MOST} are allowed. Use a lower degree, or choose fewer components "
+                f"in variables, such as variables={chosen[:1]!r}."
             )
         exponents = [
             tuple(sorted(c))
@@ -196,7 +198,9 @@ class Chebyshev(AbstractBasis):
         whole("count", self.count)
         ends = np.asarray(self.domain, float)
         if ends.shape != (2,) or not np.isfinite(ends).all() or not ends[0] < ends[1]:
-            raise ValueError(f"domain must be two numbers (a, b) with a < b, got {self.domain!r}.")
+            raise ValueError(
+                f"domain must be two finite numbers (a, b) with a < b, got {self.domain!r}."
+            )
 
     def for_shape(self, shape):
         names = ("1", *(f"T{k}({self.variable})" for k in range(1, self.count)))
@@ -271,7 +275,10 @@ class Radial(AbstractBasis):
     def __check_init__(self):
         whole = all(isinstance(k, int) and not isinstance(k, bool) for k in self.powers)
         if not self.powers or not whole:
-            raise ValueError(f"powers must be a list of one or more integers, got {self.powers!r}.")
+            raise ValueError(
+                "powers must be a list of one or more integers (of type int), such as [-1, 2]; got "
+                f"{self.powers!r}."
+            )
 
     def for_shape(self, shape):
         names = coordinate_names(shape)

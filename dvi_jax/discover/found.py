@@ -224,20 +224,27 @@ class Discovery(eqx.Module):
             probe = Samples(*(found[f"probe_{name}"] for name in Samples._fields))
             values = found["probe_values"]
         except KeyError as error:
-            raise ValueError(f"{os.fspath(path)} was not written by Discovery.save.") from error
+            raise ValueError(
+                f"path must be a file of Discovery.save, but {os.fspath(path)} has no array "
+                f"{error}. Check the path, or repeat the search and save it."
+            ) from error
         bound = bind_basis(basis, tuple(about["shape"]))
         inner, to_basis = bound.about(arrays["middle"])
-        if list(bound.names) != about["names"]:
+        own, saved = list(bound.names), about["names"]
+        if own != saved:
+            pairs = enumerate(zip(own, saved, strict=False))
+            i = next((i for i, (a, b) in pairs if a != b), min(len(own), len(saved)))
             raise ValueError(
-                f"basis must be the basis of the search saved in {os.fspath(path)}. That basis has "
-                f"{len(about['names'])} functions, {', '.join(about['names'][:4])} …; the given "
-                f"basis has {bound.size} functions, {', '.join(bound.names[:4])} …."
+                f"basis must be the basis of the search saved in {os.fspath(path)}. The number of "
+                f"functions is {len(saved)} in the file and {len(own)} in basis. The first names "
+                f"that differ are {saved[i : i + 3]} in the file and {own[i : i + 3]} in basis."
             )
         differs = ~np.isclose(_probed(bound, probe), values, rtol=1e-9)
         if differs.any():
             raise ValueError(
                 f"basis must be the basis of the search saved in {os.fspath(path)}, but the values "
-                f"of {bound.names[int(np.argmax(differs.any(axis=0)))]!r} differ from those saved."
+                f"of {bound.names[int(np.argmax(differs.any(axis=0)))]!r} differ from those saved. "
+                "Define this function as in the search."
             )
         for name in ("inner_coefficients", "inner_dependent"):
             arrays[name] = jnp.asarray(arrays[name])

@@ -134,10 +134,11 @@ def solve_gauge(
     """
     check_system(system)
     samples = as_samples(samples, t0)
-    if isinstance(generators, Generator) or len(generators) == 0:
+    single = isinstance(generators, Generator)
+    if single or len(generators) == 0:
         raise ValueError(
             "generators must be a list with one Generator for each order, order 0 first; got "
-            f"{generators!r}."
+            f"{'a Generator: put it into a list, [generator]' if single else 'an empty list'}."
         )
     bound, h = bind_basis(basis, samples.q.shape[1:]), check_step_size(h)
     require_enough(samples, bound.size)

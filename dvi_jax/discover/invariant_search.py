@@ -128,7 +128,8 @@ def discover_invariants(
     if order > _RELIABLE:
         warnings.warn(
             f"order={order}: above order {_RELIABLE} rounding in float64 can hide an invariant, or "
-            "let a false one pass. Check what is found with bound_drift or drift_order.",
+            "add a false invariant to the result. Use a lower order, or check each invariant with "
+            "dvi.bound_drift or dvi.drift_order.",
             stacklevel=2,
         )
     if tolerance is not None:

@@ -46,7 +46,10 @@ def rotation(i: int = 0, j: int = 1) -> Generator:
     """
     axes = (i, j)
     if any(isinstance(a, bool) or not isinstance(a, int) or a < 0 for a in axes) or i == j:
-        raise ValueError(f"i and j must be two different axes ≥ 0, got i = {i!r} and j = {j!r}.")
+        raise ValueError(
+            "i and j must be the numbers of two different axes of q, of type int and ≥ 0; got "
+            f"i = {i!r} and j = {j!r}."
+        )
     return Generator(xi=eqx.Partial(_turned, 1, i, j), eta=eqx.Partial(_turned, 2, i, j))
 
 
@@ -63,7 +66,7 @@ def scaling(q: Any = 1.0, p: Any = 1.0, t: float = 0.0) -> Generator:
     if a.shape != ():
         raise ValueError(f"the weight t must be one number, got an array of shape {a.shape}.")
     if not (a.any() or b.any() or c.any()):
-        raise ValueError("the weights t, q and p of the scaling are all 0: change one of them.")
+        raise ValueError("at least one of the weights q, p, t must not be 0, but they are all 0.")
     weights = enumerate((a, b, c))
     return Generator(*(eqx.Partial(_scaled, i, w) if w.any() else None for i, w in weights))
 
@@ -80,7 +83,7 @@ def boost(direction: Any, mass: Any = 1.0) -> Generator:
     """
     masses = _finite("mass", mass)
     if not (masses > 0).all():
-        raise ValueError(f"mass must be positive for every body, got {mass!r}.")
+        raise ValueError(f"mass must be positive for every body, got {mass!r:.200}.")
     v = _direction(direction)
     return Generator(xi=eqx.Partial(_boosted, v, None), eta=eqx.Partial(_boosted, v, masses))
 
@@ -124,15 +127,15 @@ def _turned(place, i, j, t, q, p, args):
     v = (t, q, p)[place]
     if v.ndim == 0 or v.shape[-1] <= max(i, j):
         raise ValueError(
-            f"rotation({i}, {j}) requires that the last axis of q has at least {max(i, j) + 1} "
-            f"components, but q has shape {q.shape}: use smaller axes i, j."
+            f"q must have at least {max(i, j) + 1} components along its last axis for "
+            f"rotation({i}, {j}), got q of shape {q.shape}. Correct i and j, or the shape of q."
         )
     return jnp.zeros_like(v).at[..., i].set(-v[..., j]).at[..., j].set(v[..., i])
 
 
 def _scaled(place, weight, t, q, p, args):
     value = (t, q, p)[place]
-    return value * _fitted("weight", weight, value)
+    return value * _fitted(f"the weight {'tqp'[place]}", weight, value)
 
 
 def _boosted(direction, mass, t, q, p, args):
@@ -177,8 +180,8 @@ def _fitted(name: str, value: np.ndarray, q: State) -> Array:
     try:
         return jnp.broadcast_to(value, q.shape).astype(q.dtype)
     except ValueError:
-        bodies = " or one mass for each body" if name == "mass" else ""
+        bodies = f", or one per body, ({len(q)},)" if name == "mass" and q.ndim == 2 else ""
         raise ValueError(
-            f"{name} of shape {value.shape} does not match q of shape {q.shape}: give an array "
-            f"with the shape of q or of its last axes{bodies}."
+            f"{name} must be a number or have the shape of q, {q.shape}, or of the last axes of q"
+            f"{bodies}; got shape {value.shape}."
         ) from None

@@ -120,9 +120,9 @@ class AdiabaticInvariant(eqx.Module):
     def __check_init__(self):
         if len(self.generators) != len(self.gauges) or not self.gauges:
             raise ValueError(
-                "generators and gauges must both have one entry for each order, at least one; got "
-                f"{len(self.generators)} generators and {len(self.gauges)} gauges. Use None for a "
-                "gauge that is zero."
+                "generators and gauges must be lists of the same length, one entry for each order. "
+                f"They must not be empty. The length of generators is {len(self.generators)}, that "
+                f"of gauges {len(self.gauges)}. Use None for a gauge that is zero."
             )
 
     @property
@@ -137,8 +137,9 @@ class AdiabaticInvariant(eqx.Module):
     def __call__(self, t0, t1, q0, p0, q1, p1, args):
         if self.system is None:
             raise ValueError(
-                "this AdiabaticInvariant has no system and no ε yet: call "
-                "invariant.bind(system, epsilon)(...), or give it to dvi.integrate(observe=...)."
+                "an AdiabaticInvariant must have a system and ε before it is called. Call "
+                "invariant.bind(system, epsilon)(...), or pass the invariant to dvi.integrate as "
+                "observe."
             )
         energy = incoming_energy(self.system, t0, t1, q0, p1, self.epsilon, args)
         end = LatticePoint(t1, q1, p1)

@@ -123,9 +123,9 @@ def as_samples(samples: Any, t0: float = 0.0) -> Samples:
     """(qs, ps) at the time t0, or (qs, ps, ts), after rejecting what cannot be sampled points."""
     if not x64_enabled():
         raise TypeError(
-            "this process computes in float32, but a search needs double precision for samples of "
-            'any type: put the line\n    jax.config.update("jax_enable_x64", True)\nbefore the '
-            "first array is made."
+            "this function must compute in float64, but JAX is set to float32. Put the line\n"
+            '    jax.config.update("jax_enable_x64", True)\nafter "import jax", before the first '
+            "array is made."
         )
     if isinstance(samples, Samples):
         return samples
@@ -135,8 +135,8 @@ def as_samples(samples: Any, t0: float = 0.0) -> Samples:
         arrays = []
     if len(arrays) not in (2, 3):
         raise ValueError(
-            "samples must be a pair (qs, ps) of arrays of numbers with one row for each point, or "
-            f"(qs, ps, ts) with their times; got {samples!r:.100}."
+            "samples must be a pair of arrays (qs, ps), or (qs, ps, ts) with the times. Each array "
+            f"must have real numbers, and one row for each point. Got {samples!r:.100}."
         )
     q, p = arrays[:2]
     if q.shape != p.shape or q.ndim < 1 or len(q) == 0:
@@ -146,12 +146,16 @@ def as_samples(samples: Any, t0: float = 0.0) -> Samples:
         )
     t = arrays[2] if len(arrays) == 3 else np.full(len(q), float(t0))
     if t.shape != (len(q),):
-        raise ValueError(f"ts must have the shape ({len(q)},) for {len(q)} samples, got {t.shape}.")
+        raise ValueError(
+            f"ts of samples must have one time for each point, shape ({len(q)},), got {t.shape}."
+        )
     finite = [np.isfinite(x).reshape(len(q), -1).all(axis=1) for x in (q, p, t)]
     if len(bad := np.flatnonzero(~np.all(finite, axis=0))):
+        i = bad[0]
         raise ValueError(
-            f"{len(bad)} of {len(q)} samples are not finite (the first has index {bad[0]}): give "
-            "only points with finite q, p and t."
+            f"samples must be finite, but {len(bad)} of {len(q)} points have values that are not "
+            f"finite. The first has the index {i}: q = {q[i].tolist()!s:.80}, "
+            f"p = {p[i].tolist()!s:.80}, t = {t[i]}. Correct these points, or leave them out."
         )
     return Samples(q, p, t)
 
@@ -194,8 +198,9 @@ def require_enough(samples: Samples, unknowns: int, conditions: int = 1) -> None
     needed = int(np.ceil(2 * unknowns / conditions))
     if len(samples.q) < needed:
         raise ValueError(
-            f"{len(samples.q)} samples are too few for {unknowns} unknown coefficients: give at "
-            f"least {needed} samples. A quarter of the samples is held out for validation."
+            f"samples must have at least {needed} points for {unknowns} unknown coefficients, got "
+            f"too few, {len(samples.q)}. Give more points, or a smaller basis. A quarter of the "
+            "points is used only for validation."
         )
 
 
@@ -203,8 +208,8 @@ def require_time(basis: BoundBasis, samples: Samples) -> None:
     """Reject a basis with functions of time when all samples are of one time."""
     if basis.uses_time and np.ptp(samples.t) == 0:
         raise ValueError(
-            "the basis has functions of time, but all samples have the same time: give "
-            "samples=(qs, ps, ts) with different times."
+            "the basis has functions of time, but all samples have the same time, "
+            f"t = {samples.t[0]:g}. Give samples=(qs, ps, ts) with different times in ts."
         )
 
 
@@ -230,10 +235,10 @@ def require_finite(
     bad = ~np.isfinite(values)
     if bad.any():
         i, *index = np.argwhere(bad)[0]
-        count = int(bad.reshape(len(bad), -1).any(axis=1).sum())
+        count = int(bad[(slice(None), *index)].sum())  # those of the function that is named
         raise ValueError(
-            f"{what(*index)} is not finite at {count} of {len(bad)} samples (the first has index "
-            f"{i}): {hint}."
+            f"{what(*index)} is not finite at {count} of {len(bad)} samples, first at index {i}: "
+            f"{hint}."
         )
 
 
@@ -257,14 +262,17 @@ def check_basis(basis: BoundBasis, values: np.ndarray) -> float:
         members = ", ".join(repr(basis.names[j]) for j in zero[:4])
         raise ValueError(
             f"the basis is rank-deficient: {zero.size} of {len(scale)} functions are 0 on all "
-            f"samples ({members}{' …' if zero.size > 4 else ''}). Leave them out; if the "
-            "coordinates are so small that their powers underflow, use smaller units."
+            f"samples ({members}{' …' if zero.size > 4 else ''}). Leave these functions out, or "
+            "take samples where they are not 0. If powers of small coordinates underflow, use "
+            "smaller units."
         )
     if singular[-1] < 1e-13 * singular[0]:
-        members = ", ".join(repr(basis.names[j]) for j in np.argsort(-abs(V[-1]))[:4])
+        shares = abs(V[-1]) / np.max(abs(V[-1]))
+        used = [j for j in np.argsort(-shares) if shares[j] > 1e-6]
+        members = ", ".join(repr(basis.names[j]) for j in used[:4]) + " …" * (len(used) > 4)
         raise ValueError(
-            f"the basis is rank-deficient: a combination of the functions {members} … vanishes on "
-            "all samples. Leave one of them out, or take samples that fill the domain."
+            f"the basis is rank-deficient: a linear combination of its functions {members} is 0 on "
+            "all samples. Leave one of these functions out, or take samples that fill the domain."
         )
     return float(singular[0] / singular[-1])
 

@@ -58,8 +58,8 @@ class InvariantSeries(eqx.Module):
     def __call__(self, t0, t1, q0, p0, q1, p1, args):
         if self.epsilon is None:
             raise ValueError(
-                "this InvariantSeries has no value of ε yet: call invariant.bind(system, "
-                "epsilon)(...), or give it to dvi.integrate(observe=...)."
+                "this InvariantSeries has no value of ε. Give it to dvi.integrate(observe=...), or "
+                "set ε before the call: invariant = invariant.bind(system, epsilon)."
             )
         time = self.epsilon * t1 if self.slow_time else t1
         return self.evaluate(q1, p1, self.epsilon, time)
@@ -75,8 +75,8 @@ class InvariantSeries(eqx.Module):
         """
         if self.slow_time and self.basis.uses_time:
             raise ValueError(
-                "`generators` requires an invariant that does not depend on the slow time εt: "
-                "repeat the search with a basis that has no functions of time."
+                "`generators` requires a basis without functions of time, but the basis of this "
+                "invariant has functions of the slow time εt. Search again without them."
             )
         return [_symplectic_gradient(self.basis, c) for c in self.coefficients]
 

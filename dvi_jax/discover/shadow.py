@@ -93,7 +93,7 @@ class ShadowHamiltonian(eqx.Module):
         if self.h is None or is_traced(self.h):
             return
         if np.shape(self.h) != () or not np.isfinite(self.h) or self.h == 0:
-            raise ValueError(f"h must be a finite number other than zero, or None, got {self.h!r}.")
+            raise ValueError(f"h must be None or a finite number other than zero, got {self.h!r}.")
 
     def bind(self, system: System, epsilon: Any) -> "ShadowHamiltonian":
         """The same Hamiltonian for this system and ε, unless they were given before."""
@@ -119,8 +119,8 @@ class ShadowHamiltonian(eqx.Module):
         system = self.system
         if system is None:
             raise ValueError(
-                "this ShadowHamiltonian has no system yet: write ShadowHamiltonian(order, system), "
-                "call shadow.bind(system, epsilon), or give it to dvi.integrate(observe=...)."
+                "this ShadowHamiltonian has no system yet. Give it to dvi.integrate(observe=...), "
+                "or set the system before the call: shadow = shadow.bind(system, epsilon)."
             )
         for name, value in (("q", q), ("p", p)):
             if not is_traced(value):

@@ -154,8 +154,9 @@ def find_symmetries(
     relative = relative_step(samples, _moved(raw))
     if relative < _NO_STEP:
         raise ValueError(
-            f"a step of h = {h:g} changes the samples by only {relative:.0e} times their spread. "
-            "This is close to round-off, so symmetries cannot be identified. Take a larger h."
+            f"one step must change the samples by at least {_NO_STEP:g} times their spread, got "
+            f"{relative:.0e} for h = {h:g}. Smaller changes are close to round-off, so that "
+            "symmetries cannot be identified. Take a larger |h|."
         )
     if relative < SMALL and np.ptp(samples.t) == 0:
         shifts = later(h, relative)

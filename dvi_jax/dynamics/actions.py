@@ -104,13 +104,13 @@ def actions(
     ts, signal, eps, axes = signals_of(ts, signal)
     if not jnp.iscomplexobj(signal):
         raise TypeError(
-            f"signal of shape {signal.shape} is real, but actions require q and p of every degree "
-            "of freedom: give the complex signal q − i p of shape (n, N), or a Solution."
+            f"signal must be complex, got a real array of shape {signal.shape}. Give the complex "
+            "signal q − i p, of shape (degrees of freedom, times), or only a Solution."
         )
     if is_traced(signal) or is_traced(ts):
         raise ValueError(
-            "ts or signal is traced, but a part of the computation uses NumPy: call actions "
-            "outside of jit, vmap and grad, once for the whole batch."
+            "actions must be called outside of jit, vmap and grad, since it uses NumPy, but its "
+            "input is traced by JAX. Call it once, with the whole batch."
         )
     # One axis for all degrees of freedom of a trajectory.
     lead, N = signal.shape[: signal.ndim - 1 - axes], signal.shape[-1]

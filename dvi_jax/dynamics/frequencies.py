@@ -186,8 +186,8 @@ def frequency_diffusion(
     halves = jnp.stack([signal[..., :half], signal[..., half : 2 * half]])
     if half < _FEWEST:
         raise ValueError(
-            f"signal must have at least {2 * _FEWEST} samples, since its two halves are compared; "
-            f"got {signal.shape[-1]} samples: save more often, or run longer."
+            f"signal must have at least {2 * _FEWEST} samples ({_FEWEST} in each half), got "
+            f"{signal.shape[-1]}: save more often, or run longer."
         )
     times = jnp.stack([ts[..., :half], ts[..., half : 2 * half]])
     times = times.reshape(2, *(1,) * (halves.ndim - times.ndim), *times.shape[1:])
@@ -218,12 +218,12 @@ def settings_of(count: Any, window: Any, refine: Any) -> Settings:
 
 
 def check_count(settings: Settings, signal: Array) -> None:
-    unknowns = 3 * settings.lines * (1 if jnp.iscomplexobj(signal) else 2)
-    if unknowns >= signal.shape[-1]:
+    unknowns, N = 3 if jnp.iscomplexobj(signal) else 6, signal.shape[-1]
+    if unknowns * settings.lines >= N:
         raise ValueError(
-            f"count = {settings.lines} lines have {unknowns} unknowns and require more than "
-            f"{unknowns} samples, but only {signal.shape[-1]} are analysed together (half of the "
-            "signal in frequency_diffusion). Use fewer lines or more samples."
+            f"count must be at most {(N - 1) // unknowns} for {N} samples, since each line has "
+            f"{unknowns} unknowns, got {settings.lines}. Decrease count, or give more samples. "
+            "(frequency_diffusion uses half of the samples at a time.)"
         )
 
 
@@ -233,9 +233,11 @@ def signals_of(ts: Any, signal: Any) -> tuple[Array, Array, float, int]:
     signals of a `Solution` are q − i p."""
     state_axes = None
     if isinstance(ts, Solution) == (signal is not None):
+        kind = type(ts).__name__
+        seen = f"ts of type {kind} without signal" if signal is None else "a Solution and signal"
         raise ValueError(
-            "the arguments must be times and a signal, as in frequencies(ts, signal), or only a "
-            "Solution, as in frequencies(solution). The signal of a Solution is q − i p."
+            "the arguments must be times and a signal, (ts, signal), or only a Solution, got "
+            f"{seen}. The signal of a Solution is q − i p."
         )
     if isinstance(ts, Solution):
         qs, ps = (_double("the solution", x) for x in (ts.qs, ts.ps))
@@ -248,14 +250,14 @@ def signals_of(ts: Any, signal: Any) -> tuple[Array, Array, float, int]:
     if signal.ndim == 0 or ts.ndim == 0 or ts.shape[-1] != signal.shape[-1]:
         raise ValueError(
             f"ts and signal must have the same length along their last axis, got shapes {ts.shape} "
-            f"and {signal.shape}. For trajectories saved as (N, n) give signal.T."
+            f"and {signal.shape}. If the first axis of signal is the time, give signal.T."
         )
     sizes = zip(ts.shape[::-1], signal.shape[::-1], strict=False)
     if ts.ndim > signal.ndim or any(n not in (1, size) for n, size in sizes):
         raise ValueError(
-            f"ts of shape {ts.shape} does not match a signal of shape {signal.shape}: give ts of "
-            f"shape {ts.shape[-1:]} for common times, or of shape {signal.shape} for times of each "
-            "signal."
+            f"ts of shape {ts.shape} does not match a signal of shape {signal.shape}. Give ts of "
+            f"shape {ts.shape[-1:]} if all signals have the same times, or of shape "
+            f"{signal.shape} if each signal has its own times."
         )
     if signal.shape[-1] < _FEWEST:
         raise ValueError(
@@ -268,11 +270,11 @@ def signals_of(ts: Any, signal: Any) -> tuple[Array, Array, float, int]:
         uneven = np.asarray(_unevenness(jnp.asarray(rows), eps)) if len(rows) else np.zeros(1)
         if not (uneven <= 1).all():
             steps = np.diff(rows[uneven.argmax()])
-            coarse = f" Their type is {dtype}: give the times in float64." if eps > EPS else ""
+            coarse = f" ts has dtype {dtype}: give the times in float64." if eps > EPS else ""
             raise ValueError(
-                f"the times ts are not uniform: the shortest step is {steps.min():.17g} and the "
-                f"longest is {steps.max():.17g}. Save with dvi.Save(every=m) on the lattice "
-                f"dvi.Uniform(), without final=True.{coarse}"
+                "the times ts must have equal steps, other than zero, got steps from "
+                f"{steps.min():.17g} to {steps.max():.17g}. Save with dvi.Save(every=m) on the "
+                f"lattice dvi.Uniform(), without final=True.{coarse}"
             )
     return ts, signal, eps, min(signal.ndim - 1, 1) if state_axes is None else state_axes
 
@@ -281,8 +283,8 @@ def _real_times(name: str, value: Any) -> Array:
     value = _double(name, value)
     if jnp.iscomplexobj(value):
         raise TypeError(
-            f"{name} must be real, got dtype {value.dtype}: give the times as the first argument, "
-            "frequencies(ts, signal)."
+            f"{name} must be real, got dtype {value.dtype}. Give the times as the first argument, "
+            "and the signal as the second."
         )
     return value
 
@@ -296,8 +298,8 @@ def _double(name: str, value: Any) -> Array:
         raise TypeError(f"{name} must be an array of numbers, got dtype {value.dtype}.")
     if not x64_enabled():
         raise TypeError(
-            "frequency analysis needs double precision, but this process computes in float32: put "
-            'this line\n    jax.config.update("jax_enable_x64", True)\nbefore any array is made.'
+            "frequency analysis requires double precision, but JAX computes in float32: put this "
+            'line\n    jax.config.update("jax_enable_x64", True)\nbefore any array is made.'
         )
     return jnp.asarray(value, jnp.complex128 if value.dtype.kind == "c" else jnp.float64)
 

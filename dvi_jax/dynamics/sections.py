@@ -84,9 +84,9 @@ def _settings(
     has_default = integrator.method is None and not isinstance(default_method(system), Strang)
     if has_default and level is not None:
         warnings.warn(
-            "the default method of sections has changed: it was Strang(), and is now the default "
-            "of integrate, which is TypeII() for this system. Give method=dvi.Strang() for the "
-            "results of earlier versions, or method=dvi.TypeII() for the map of H_D itself.",
+            "the default method of Poincaré sections has changed: it was Strang(), and for this "
+            "system it is now TypeII(), as in integrate. Give method=dvi.Strang() for the results "
+            "of earlier versions, or method=dvi.TypeII() to keep the present results.",
             FutureWarning,
             stacklevel=level,
         )
@@ -179,8 +179,8 @@ def poincare_section(
     q, p = start_state(q0, p0)
     if q.ndim == 0 or q.shape[0] == 0:
         raise ValueError(
-            f"q0 and p0 must have the orbits along the first axis, (orbits, …); got shape "
-            f"{q.shape}. Give a single initial condition as q0[None], p0[None]."
+            f"q0 and p0 must have the orbits along the first axis, got shape {q.shape}. For one "
+            "orbit give [q0] and [p0]."
         )
     section = Section(g, direction, whole("crossings", crossings), skip)
     settings = _settings(system, section, num_steps, keywords)
@@ -188,8 +188,8 @@ def poincare_section(
     for name, length in varied.items():
         if length != q.shape[0]:
             raise ValueError(
-                f"{name} must be one number, or {q.shape[0]} numbers (one number for each orbit in "
-                f"q0); got {length} numbers."
+                f"{name} must be a single number, or an array of length {q.shape[0]} with "
+                f"one number for each orbit in q0, got length {length}."
             )
     start = (as_scalar("t0", keywords["t0"], q.dtype), _Varied(q), _Varied(p))
     h = as_scalar("h", h, q.dtype, zero_allowed=False)
@@ -242,11 +242,11 @@ def bifurcation(
     epsilon, args, varied = _varied(system.strength(keywords["epsilon"]), keywords["args"])
     lengths = set(varied.values())
     if len(lengths) != 1 or 0 in lengths:
+        seen = ", ".join(f"{name} of length {n}" for name, n in varied.items())
         raise ValueError(
-            "a bifurcation diagram requires a parameter that varies: give epsilon as a "
-            "one-dimensional array of at least one value, or a dvi.Axis in args. If several "
-            "parameters vary, they vary together and must have the same length. Lengths in this "
-            f"call: {varied or 'not given: each parameter is one number'}."
+            "bifurcation requires a parameter that varies: give epsilon as a 1-D array of at least "
+            "one value, or a dvi.Axis in args. All parameters that vary must have the same length, "
+            f"got {seen or 'only single numbers'}."
         )
     start = (as_scalar("t0", keywords["t0"], q.dtype), q, p)
     h = as_scalar("h", keywords["h"], q.dtype, zero_allowed=False)
@@ -370,8 +370,9 @@ def _raise_on_failure(found: PoincareSection, settings: _Settings) -> PoincareSe
     own = str(np.atleast_1d(status_name(found.run))[i])
     wanted, num_steps = settings.section.capacity, settings.options["num_steps"]
     raise SectionError(
-        f"{bad.size} of {len(names)} orbits did not cross the section {wanted} times in "
-        f"{num_steps} steps. The first of them is orbit {i}, with {int(found.count[i])} crossings. "
-        f"Its status is {names[i]}; the status of its run is {own}. {text} {AS_ATTRIBUTE}",
+        f"{bad.size} of {len(names)} orbits did not cross the section {wanted} times (after skip = "
+        f"{settings.section.skip} crossings) in {num_steps} steps. The first is orbit {i}, with "
+        f"{int(found.count[i])} of {wanted} crossings. Its status is {names[i]}; the status of its "
+        f"run is {own}. {text} {AS_ATTRIBUTE}",
         found,
     )

@@ -104,7 +104,10 @@ def fundamental_frequencies(
     hint = "Write dvi.fundamental_frequencies(dvi.frequencies(solution))."
     instance("lines", lines, Frequencies, "a result of dvi.frequencies", hint)
     if is_traced(lines.frequencies):
-        raise ValueError("lines is traced: call this function outside of jit, vmap and grad.")
+        raise ValueError(
+            "fundamental_frequencies must be called outside of jit, vmap and grad, since it uses "
+            "NumPy, but lines is traced by JAX. Call it once, with the whole batch."
+        )
     omega, A = np.asarray(lines.frequencies), np.asarray(lines.amplitudes)
     code, resolution = np.asarray(code_of(lines.result)), np.asarray(lines.resolution)
     axes = min(lines.state_axes, omega.ndim - 1)  # fewer if one degree of freedom was selected
@@ -130,17 +133,14 @@ class Search(NamedTuple):
 
 def search_of(n: int, num: Any, guess: Any, order: Any, tolerance: Any, threshold: Any) -> Search:
     if n == 0:
-        raise ValueError(
-            "the number of degrees of freedom must be at least 1, got 0: give a signal, or lines, "
-            "with at least one degree of freedom."
-        )
+        raise ValueError("signal (or lines) must have at least one degree of freedom, got 0.")
     if guess is not None:
         guess = np.array([finite("each frequency of guess", x) for x in np.atleast_1d(guess)])
     if num is None:
         num = n if guess is None else len(guess)
     num = whole("num", num, hint="It is the number of frequencies.")
     if guess is not None and len(guess) != num:
-        raise ValueError(f"guess must have num = {num} frequencies, got {len(guess)}: {guess}.")
+        raise ValueError(f"guess must have the length num = {num}, got {len(guess)}: {guess}.")
     order = _ORDERS.get(num, 5) if order is None else whole("order", order, hint="It limits Σ|k|.")
     tolerance = None if tolerance is None else positive("tolerance", tolerance)
     fraction = "It is a fraction of the leading amplitude."

@@ -27,9 +27,9 @@ def configure_cpu() -> None:
     """
     if backends_are_initialized():
         raise RuntimeError(
-            "configure_cpu() was called too late: JAX reads XLA_FLAGS only when it starts, and it "
-            "has started already. Call it right after the imports, before the first array is made, "
-            f'or set the variable before Python starts: XLA_FLAGS="{_with_flags("")}".'
+            "configure_cpu() must be called before JAX makes its first array, but JAX has started "
+            "already. Restart Python, and call configure_cpu() right after the imports. Or set "
+            f'XLA_FLAGS="{_with_flags(os.environ.get("XLA_FLAGS", ""))}" before Python starts.'
         )
     os.environ["XLA_FLAGS"] = _with_flags(os.environ.get("XLA_FLAGS", ""))
 

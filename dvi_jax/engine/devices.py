@@ -50,14 +50,14 @@ def over_devices(
         each = [in_axes] * len(args) if isinstance(in_axes, int | None) else list(in_axes)
         if len(each) != len(args):
             raise ValueError(
-                f"in_axes has {len(each)} entries, but there are {len(args)} arguments: give one "
-                "entry for each argument, or one number for all."
+                "in_axes must be one number for all arguments, or a list of one entry for each of "
+                f"them (here {len(args)}), got {in_axes!r}."
             )
         for axis in each:
             instance("each entry of in_axes", axis, int | None, "a whole number or None")
         specs = tuple(
-            jax.tree.map(lambda x, axis=axis: _spec(x, axis, chosen.size), argument)
-            for argument, axis in zip(args, each, strict=True)
+            jax.tree.map(lambda x, i=i: _spec(x, i, each[i], chosen.size), argument)
+            for i, argument in enumerate(args)
         )
         out = PartitionSpec(*(None,) * out_axes, LANES)
         # With check_vma=True there would be no reversible gradient, see `_reversible`.
@@ -67,18 +67,19 @@ def over_devices(
     return call
 
 
-def _spec(x: Any, axis: int | None, count: int) -> PartitionSpec:
+def _spec(x: Any, i: int, axis: int | None, count: int) -> PartitionSpec:
     if axis is None:
         return PartitionSpec()
     shape = np.shape(x)
     if not -len(shape) <= axis < len(shape):
         raise ValueError(
-            f"in_axes has the batch axis {axis}, but an argument has the shape {shape}: give an "
-            "axis of this argument, or None if the argument has no batch axis."
+            f"in_axes must give an axis of each array, got axis {axis} for an array of shape "
+            f"{shape} in argument {i}, counted from 0. Use None for an argument without batch axis."
         )
     if shape[axis] % count:
         raise ValueError(
-            f"{shape[axis]} trajectories (shape {shape}, axis {axis}) cannot be divided equally "
-            f"between {count} devices: use a multiple of {count}, or another number of devices."
+            f"the length of the batch axis must be a multiple of {count}, the number of devices, "
+            f"got {shape[axis]} (axis {axis} of shape {shape} in argument {i}, counted from 0). "
+            "Change the batch, or give fewer devices: devices=jax.devices()[:n]."
         )
     return PartitionSpec(*(None,) * (axis % len(shape)), LANES)

@@ -49,7 +49,7 @@ def with_keywords_of(source: Callable[..., Any], names: str = "", **more: Any) -
                 refuse_unknown(function.__name__, call, unknown)
             given = {**defaults, **given}
             if missing := [name for name, value in given.items() if value is empty]:
-                raise TypeError(f"{function.__name__} requires {missing[0]}=..., which is missing.")
+                raise TypeError(f"{function.__name__} requires {missing[0]}=...: give a value.")
             return function(*args, **given)
 
         call.__dict__["__signature__"] = signature.replace(parameters=shown)

@@ -14,7 +14,7 @@ def refuse_unit_or_mask(name: str, value: Any) -> None:
         raise ValueError(
             f"{name} is a masked array with a masked number"
             + (f" at index {where}" if where else "")
-            + ", which would be used as if it were valid: give an array without masked numbers."
+            + ". The mask would be ignored: remove the masked numbers, or replace them."
         )
     unit = None
     if hasattr(value, "to_value"):
@@ -24,6 +24,7 @@ def refuse_unit_or_mask(name: str, value: Any) -> None:
     if unit is not None:
         raise TypeError(
             f"{name} has the unit {str(unit) or '1'!r}, but numbers without units are required "
-            f"here. Divide {name} by the unit of the run, or call dvi_jax.interop.integrate(..., "
-            "units=...), which accepts quantities of astropy and converts them."
+            "here. Convert all quantities to one system of units and give plain numbers: "
+            "x.to_value(unit) of astropy, x.m_as(unit) of pint. For trajectories, "
+            "dvi_jax.interop.integrate(..., units=...) accepts quantities of astropy."
         )

@@ -62,8 +62,9 @@ def warn_of_exchanged(name: str, function: Callable[..., Any], arguments: str) -
     q, p = (next(i for i, x in enumerate(expected) if x[0] == letter) for letter in "qp")
     if p < len(taken) and taken[q][:1].lower() == "p" and taken[p][:1].lower() == "q":
         warnings.warn(
-            f"{name} has the arguments ({', '.join(taken)}), but is called with {arguments}, the "
-            "positions before the momenta. Check the order of q and p in its definition.",
+            f"{name} is called with {arguments}, but its definition has the arguments "
+            f"({', '.join(taken)}). If it takes p before q, exchange them in the definition. If "
+            "only the names are exchanged, rename them.",
             stacklevel=5,
         )
 

@@ -130,14 +130,15 @@ def fit(
         whole("batch", batch)
         if not by_optax:
             raise ValueError(
-                "batch requires an optimiser of optax: give, for example, "
-                "optimiser=optax.adam(1e-3), or leave batch out."
+                f"batch requires an optimiser of optax, got {type(solver).__name__}: give, for "
+                "example, optimiser=optax.adam(1e-3), or leave batch out."
             )
     if isinstance(shooting, MultipleShooting) and not is_vector:
         raise ValueError(
-            "MultipleShooting requires a loss of residuals, such as dvi.LeastSquares(), and an "
-            "optimiser such as optimistix.LevenbergMarquardt(rtol=1e-10, atol=1e-10), got the "
-            f"loss {type(problem.loss).__name__} and the optimiser {type(solver).__name__}."
+            "MultipleShooting requires a loss of residuals, such as dvi.LeastSquares(), and a "
+            "least-squares optimiser, such as optimistix.LevenbergMarquardt(rtol=1e-10, "
+            f"atol=1e-10). Got the loss {type(problem.loss).__name__} and the optimiser "
+            f"{type(solver).__name__}. Change them, or use shooting=dvi.SingleShooting()."
         )
     wanted = _horizons(horizons)
     u = problem.space.to_u(problem.start)
@@ -157,7 +158,7 @@ def fit(
     if fine or not throw:
         return found
     raise FitError(
-        f"the fit did not converge (status {found.status} after {len(run.records)} steps, loss "
+        f"the fit did not converge (status: {found.status}, steps: {len(run.records)}, loss: "
         f"{found.loss:.6g}). {FIT_RESULTS[status]} The result is in the attribute `fit` "
         "of this error. With throw=False it is returned without an error.",
         found,
@@ -173,7 +174,10 @@ def _horizons(horizons: Any) -> list[float] | None:
         return [np.inf]
     found = np.asarray(horizons, float)
     if found.ndim != 1 or not (np.diff(found) > 0).all() or not (found > 0).all():
-        raise ValueError(f"horizons must be a list of increasing positive times, got {horizons!r}.")
+        raise ValueError(
+            "horizons must be 'auto', None or a list of increasing positive times, got "
+            f"{horizons!r:.200}."
+        )
     return [*found.tolist(), np.inf]
 
 

@@ -134,10 +134,10 @@ class Samples:
         """
         try:
             import arviz  # pyright: ignore[reportMissingImports]
-        except ImportError:
+        except ImportError as error:
             raise ImportError(
-                "to_arviz requires arviz: pip install arviz. Without it, print(samples) shows a "
-                "summary, and to_xarray() returns the draws in the same layout."
+                f"to_arviz requires arviz, but its import failed ({error}): pip install arviz. "
+                "Without arviz, print(samples) shows a summary and to_xarray() returns the draws."
             ) from None
         tree = self.to_xarray()
         if int(arviz.__version__.split(".")[0]) >= 1:
@@ -241,10 +241,10 @@ def _numpyro() -> Any:
     try:
         import numpyro.diagnostics
         import numpyro.infer
-    except ImportError:
+    except ImportError as error:
         raise ImportError(
-            'dvi.sample requires numpyro: pip install "dvi-jax[bayes]". (dvi.Posterior does not '
-            "require it: use it with your own sampler.)"
+            f"dvi.sample requires numpyro, but its import failed ({error}): pip install "
+            '"dvi-jax[bayes]". Without numpyro, use dvi.Posterior with your own sampler.'
         ) from None
     return numpyro
 
@@ -260,10 +260,13 @@ def _start_of(posterior: Posterior, start: Any, bounds: PyTree, priors: PyTree) 
     given = (start.params,) if is_fit else (start, bounds, priors)
     space, x = make_space(*given)
     if list(space.names) != posterior.names:
+        missing, unknown = (
+            ", ".join([name for name in a if name not in b][:8]) or "none"
+            for a, b in ((posterior.names, space.names), (space.names, posterior.names))
+        )
         raise ValueError(
-            "start must have the parameters that are sampled. The names of these begin with "
-            f"{', '.join(posterior.names[:8])}; the names in start begin with "
-            f"{', '.join(space.names[:8])}."
+            "start must have the same parameters as params. Missing in start: "
+            f"{missing}. Unknown in start: {unknown}."
         )
     if is_fit:
         at_bounds = np.isin(posterior.names, posterior._space.at_bounds(x, start.sigma))

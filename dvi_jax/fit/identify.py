@@ -168,7 +168,9 @@ def identify(
             break
     else:
         raise FitError(
-            f"the first fit, with all candidates, failed. {FIT_RESULTS[full.result]}", full
+            "dvi.identify fits all terms of library first, and this fit failed. "
+            f"{FIT_RESULTS[full.result]} Its result is in the attribute `fit` of this error.",
+            full,
         )
     problem = Problem(whole, weighed, many, full.params, **held)
     search = Elimination(problem, library, penalty, arcs[0].has_errors)
@@ -220,8 +222,8 @@ def _check_input(
         instance(name, {} if given is None else given, Mapping, "a dict or None")
         if given is not None and KEY in given:
             raise ValueError(
-                f"{name} must not contain the key {KEY!r}: remove it. dvi.identify itself adds the "
-                "coefficients of library under this key, with the initial value 0."
+                f"{name} must not contain the key {KEY!r}: remove or rename this key. dvi.identify "
+                "adds the coefficients of library to the parameters under this key."
             )
     if penalty is not None:
         positive("penalty", penalty)
@@ -262,20 +264,22 @@ def _extended(
     args, system, epsilon = spec.get("args"), spec["system"], spec.get("epsilon", 0.0)
     if not (args is None or (isinstance(args, Mapping) and KEY not in args)):
         raise TypeError(
-            f"args of the model must be None or a dict without the key {KEY!r}, got {args!r}. "
-            "dvi.identify itself adds the coefficients of library under this key."
+            f"args of the model must be None or a dict without the key {KEY!r}, got {args!r:.200}. "
+            "Use other keys: dvi.identify adds the coefficients of library under this key."
         )
     is_perturbed = system.force is not None or system.perturbation is not None
     if "epsilon" in params and not is_perturbed:
         raise ValueError(
-            "epsilon and the coefficients cannot both be fitted: only their product is in the map. "
-            "Leave epsilon out of params."
+            "epsilon and the coefficients of library cannot both be fitted, since the system of "
+            "the model has no force and no perturbation: only their product is determined by the "
+            "data. Remove epsilon from params."
         )
     alone = not np.any(np.asarray(epsilon)) and "epsilon" not in params
     if alone and is_perturbed:
         raise ValueError(
-            "the model has a known perturbation, but epsilon = 0 would remove it and the library: "
-            "let the model return another epsilon, or fit epsilon as a parameter."
+            "the model must have an epsilon other than 0, since its system has a force or a "
+            "perturbation: epsilon = 0 (the default) would remove this term and the library. Let "
+            "the model return another epsilon, or add epsilon to params."
         )
     return _Extended(model, library, many, alone)
 

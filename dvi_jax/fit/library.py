@@ -14,7 +14,7 @@ from jaxtyping import Array
 from .._checks import instance, one_of, whole
 from .._system import System
 from .._types import Args, Scalar, State
-from ..engine.signature import accepts
+from ..engine.signature import accepts, signature_of
 
 KEY = "coefficients"
 """Key of the coefficients in args and parameters."""
@@ -53,9 +53,10 @@ class ForceLibrary(eqx.Module):
         for name, function in candidates.items():
             instance("the name of a candidate", name, str, "a string")
             if not (callable(function) and accepts(function, 5)):
+                seen = signature_of(function) if callable(function) else f"{function!r:.200}"
                 raise TypeError(
-                    f"the candidate {name!r} must be a function (t0, t1, q0, p1, args), got "
-                    f"{function!r}."
+                    f"the candidate {name!r} must be a function with the five arguments "
+                    f"(t0, t1, q0, p1, args), got {seen}."
                 )
         self.functions, self.names = tuple(candidates.values()), tuple(candidates)
         if coefficients is not None:
@@ -98,8 +99,8 @@ class ForceLibrary(eqx.Module):
             value = function(t0, t1, q0, p1, args)
             if jnp.shape(value) != q0.shape:
                 raise ValueError(
-                    f"the candidate {name!r} must return an array of the shape of q0, {q0.shape}; "
-                    f"it returned shape {jnp.shape(value)}."
+                    f"the candidate {name!r} must return an array of the shape of q0, {q0.shape}, "
+                    f"got shape {jnp.shape(value)}."
                 )
             total = total + c[i] * value
         return total
@@ -108,10 +109,12 @@ class ForceLibrary(eqx.Module):
         if self.coefficients is not None:
             return self.coefficients
         if not (isinstance(args, Mapping) and KEY in args):
+            other = "None" if args is None else "an object that is not a dict"
+            seen = f"a dict with the keys {list(args)}" if isinstance(args, Mapping) else other
             raise ValueError(
-                f'a dvi.ForceLibrary without coefficients reads them from args["{KEY}"]: give '
-                f'args={{"{KEY}": array of shape ({len(self.names)},)}}, or use '
-                f"library.with_coefficients(...). Got args={args!r}."
+                f'args["{KEY}"] is missing: it must contain the coefficients of a dvi.ForceLibrary '
+                f'that was made without coefficients. Got {seen}. Give args={{"{KEY}": c}} with an '
+                f"array c of shape ({len(self.names)},), or use library.with_coefficients(c)."
             )
         c = jnp.asarray(args[KEY])
         self._check_shape(c, f'args["{KEY}"]')
@@ -133,9 +136,16 @@ class ForceLibrary(eqx.Module):
             return NotImplemented
         both = sorted(set(self.names) & set(other.names))
         if both:
-            raise ValueError(f"both libraries have a candidate {both[0]!r}: rename one of them.")
+            raise ValueError(
+                f"both libraries of a sum have a candidate {both[0]!r}, but the names "
+                "must differ. Take only the others with library.only(names), or rename one of them."
+            )
         if (self.coefficients is None) != (other.coefficients is None):
-            raise ValueError("only one library has coefficients: give them to both or to none.")
+            raise ValueError(
+                "either both libraries of a sum must have coefficients, or neither. Here only the "
+                f"{'second' if self.coefficients is None else 'first'} library has them: give "
+                "coefficients to the other one with library.with_coefficients(c)."
+            )
         c = None
         if self.coefficients is not None and other.coefficients is not None:
             c = jnp.concatenate([self.coefficients, other.coefficients])
@@ -163,7 +173,11 @@ class ForceLibrary(eqx.Module):
         names = tuple(names)
         for name in names:
             if name not in self.names:
-                raise ValueError(f"unknown candidate {name!r}; known are {', '.join(self.names)}.")
+                raise ValueError(
+                    f"unknown candidate {name!r}. Give names as a list, or as the keys of a dict. "
+                    f"library.names has {', '.join(map(repr, self.names[:8]))}"
+                    + (", …" if len(self.names) > 8 else ".")
+                )
         return names
 
     def _candidates(self) -> dict[str, Callable[..., Any]]:
@@ -181,9 +195,9 @@ class _Monomial(eqx.Module):
         del t0, t1, args
         if q0.shape != (self.n,):
             raise ValueError(
-                f"this dvi.ForceLibrary is for q0 of shape (n,) with n = {self.n}, got q0 of "
-                f"shape {q0.shape}. Make the library with dvi.ForceLibrary.monomials(degree, n), "
-                "where n is the length of q0. A q0 with more axes is not possible."
+                f"q0 must have shape ({self.n},), because the library was made by "
+                f"dvi.ForceLibrary.monomials(degree, n) with n = {self.n}, got shape {q0.shape}. "
+                "Set n to the length of q0; q0 must have exactly one axis."
             )
         value = jnp.ones((), q0.dtype)
         for (v, i), power in self.powers:

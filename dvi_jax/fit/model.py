@@ -32,8 +32,14 @@ _OPTIONS = (
     *("integrator", "num_steps"),
 )
 _MAY_BE_FITTED = ("q0", "p0", "epsilon", "args")
-_OWN = ("num_steps", "save", "observe", "throw", "progress", "stop", "t0")
-"""Arguments of `integrate` that `fit` sets itself."""
+_OWN = {
+    "num_steps": "it follows from h and the times of the data",
+    **dict.fromkeys(("save", "stop"), "the times of the data determine which states are saved"),
+    **dict.fromkeys(("throw", "progress"), "it is an argument of dvi.fit"),
+    "observe": "it is an argument of dvi.Observations",
+    "t0": "give it as dvi.Observations(..., t0=...)",
+}
+"""Arguments of `integrate` that `fit` sets itself, and why, for messages."""
 
 
 class Model(eqx.Module):
@@ -73,10 +79,9 @@ class Model(eqx.Module):
         instance("system", system, System, "a dvi.System")
         for name in options:
             if name not in _OPTIONS:
-                raise TypeError(
-                    f"dvi.Model has no option {name!r}; it has {', '.join(_OPTIONS)}. The data "
-                    "determine which states and observables are saved: give no save or observe."
-                )
+                known = ", ".join(("system", "h", *_MAY_BE_FITTED, *_OPTIONS))
+                hint = _OWN.get(name, f"its arguments are {known}")
+                raise TypeError(f"dvi.Model has no argument {name!r}: {hint}.")
         # Arrays, so that another value needs no other compilation.
         fixed = {"q0": q0, "p0": p0, "epsilon": epsilon, "args": args}
         self.fixed = jax.tree.map(_as_array, fixed)
@@ -86,24 +91,30 @@ class Model(eqx.Module):
         """The arguments of `integrate` for an arc (None: there is one, without rows)."""
         allowed = ", ".join(_MAY_BE_FITTED)
         if not isinstance(params, Mapping):
+            kind = f"an object of type {type(params).__name__}"
             raise TypeError(
                 f"params of a dvi.Model must be a dict with keys among {allowed}, got "
-                f"{type(params).__name__}. For other structures write the model as a function "
-                "(params) that returns the arguments of dvi.integrate."
+                f"{'a number or an array' if hasattr(params, 'shape') else kind}. For other "
+                "parameters write the model as a function of params that returns the arguments of "
+                "dvi.integrate as a dict."
             )
         found = dict(self.fixed)
         for name, value in params.items():
             if name not in _MAY_BE_FITTED:
                 raise TypeError(
-                    f"{name!r} is not a parameter of a dvi.Model, which has {allowed}. Put a "
-                    f'parameter of the system into args: {{"args": {{{name!r}: ...}}}}.'
+                    f"params of a dvi.Model must be a dict with keys among {allowed}, got the key "
+                    f"{name!r}. Put a parameter of the system into args: "
+                    f"{{'args': {{{name!r}: ...}}}}."
                 )
             old = found[name]
             both = isinstance(old, Mapping) and isinstance(value, Mapping)
             found[name] = {**old, **value} if both else value
         for name in ("q0", "p0"):
             if found[name] is None:
-                raise TypeError(f"{name} is missing: give dvi.Model(..., {name}=...), or fit it.")
+                raise TypeError(
+                    f"{name} is missing: give dvi.Model(..., {name}=...), or an initial value in "
+                    f"params to fit it, {{{name!r}: ...}}."
+                )
             if arc is not None:
                 found[name] = _row(name, found[name], arc)
         return {**self.rest, **found}
@@ -113,9 +124,10 @@ class Model(eqx.Module):
         for name in ("q0", "p0"):
             shape = np.shape(params.get(name, self.fixed[name]))
             if shape[0] != arcs:
+                hint = " For a single arc give data without the list." if arcs == 1 else ""
                 raise ValueError(
-                    f"{name} must have one row for each of {arcs} arcs along its first axis, got "
-                    f"shape {shape}."
+                    f"the first axis of {name} must have length {arcs}, one row for each arc in "
+                    f"data, got shape {shape}. Give the initial state of every arc.{hint}"
                 )
 
 
@@ -129,7 +141,10 @@ def _row(name: str, rows: Any, arc: Any) -> Array:
     rows = jnp.asarray(rows)
     # JAX takes the last row for a number that is too large, without an error.
     if rows.ndim == 0 or (not is_traced(arc) and arc >= len(rows)):
-        raise ValueError(f"{name} needs one row for each arc in data, got shape {rows.shape}.")
+        raise ValueError(
+            f"{name} must have one row for each arc along its first axis, got shape {rows.shape}. "
+            "Give the initial state of every arc, or, for a single arc, data without the list."
+        )
     return rows[arc]
 
 
@@ -149,15 +164,18 @@ def specification(model: Callable[..., Any], params: PyTree, arc: Any, many: boo
     found = dict(instance("the return value of the model", found, Mapping, called))
     for name in ("system", "q0", "p0", "h"):
         if found.get(name) is None:
-            raise ValueError(f"the model does not return {name!r}, which dvi.integrate requires.")
+            raise ValueError(
+                f"the model does not return {name!r}, or returns None for it. It must return a "
+                f"dict with values of system, q0, p0 and h. Got the keys {list(found)}."
+            )
     for name in _OWN:
         if name in found and not (name == "num_steps" and not _is_uniform(found)):
-            hint = " (Observations(..., t0=...))" if name == "t0" else ""
-            raise ValueError(f"leave {name!r} out of the model: it follows from the data{hint}.")
+            raise ValueError(f"leave {name!r} out of the model: {_OWN[name]}.")
     if isinstance(found["h"], jax.Array):
         raise ValueError(
             "the step size h of the model must be a Python number such as 0.1, not a parameter or "
-            "JAX array: it determines the number of steps."
+            "another JAX array, because h determines the number of steps. It cannot be fitted; if "
+            "it is a constant, give float(h)."
         )
     return found
 
@@ -205,12 +223,12 @@ def make_groups(arcs: list[Observations], specs: list[dict[str, Any]]) -> list[G
     """
     pairs = list(zip(arcs, specs, strict=True))
     steps = [_steps(i, arc, spec) for i, (arc, spec) in enumerate(pairs)]
-    longest = max(abs((arc.ts[-1] - arc.t0) / spec["h"]) for arc, spec in pairs)
+    longest, h = max((abs((arc.ts[-1] - arc.t0) / spec["h"]), spec["h"]) for arc, spec in pairs)
     if _is_uniform(specs[0]) and 0 < longest < 0.5:
         raise ValueError(
-            "the last observation must be at least half a step from t0, but it is only "
-            f"{longest:.3g} steps from t0 with h = {specs[0]['h']:g}. Give a smaller h, or give h "
-            "and the times of the data in the same unit."
+            "the last observation must be at least half a step from t0. With h = "
+            f"{h:g} its distance from t0 is only {longest:.3g} steps. Give a smaller |h|, or give "
+            "h and the times of the data in the same unit."
         )
     # Compiling takes seconds for each program; some millions of steps too many do not.
     apart = len(arcs) * max(steps) - sum(steps) > _WASTE
@@ -238,13 +256,14 @@ def _steps(i: int, arc: Observations, spec: Mapping[str, Any]) -> int:
         side, direction = ("before", "later") if span < 0 else ("after", "earlier")
         raise ValueError(
             f"arc {i}: the observations (t = {arc.ts.min():g} to {arc.ts.max():g}) lie {side} t0 "
-            f"= {arc.t0:g}, but h = {h:g} leads to {direction} times. Give h = {-h:g}, or the t0 "
-            "of the model's q0 and p0 as dvi.Observations(..., t0=...). The default of t0 is ts[0]."
+            f"= {arc.t0:g}, but h = {h:g} leads to {direction} times. Give h = {-h:g}; or, if q0 "
+            "and p0 belong to another time, give this time as dvi.Observations(..., t0=...). "
+            "Without it t0 is ts[0]."
         )
     if not _is_uniform(spec):
         if not isinstance(spec.get("num_steps"), int):
             raise ValueError(
-                f"on the lattice {_lattice(spec)!r} the model requires num_steps as an int, got "
+                f"num_steps of the model must be an int on the lattice {_lattice(spec)!r}, got "
                 f"{spec.get('num_steps')!r}. Give the number of steps to the last observation in "
                 "dvi.Model(..., num_steps=...), or in the dict that the model returns."
             )
@@ -252,9 +271,9 @@ def _steps(i: int, arc: Observations, spec: Mapping[str, Any]) -> int:
     steps = span / h
     if steps > 2e9:
         raise ValueError(
-            f"arc {i}: h = {h:g} requires {steps:.3g} steps from t0 to the last observation, over "
-            f"the time {span:g}. At most 2e9 steps are possible: give a larger h, or give h and "
-            "the times of the data in the same unit."
+            f"arc {i}: at most 2e9 steps are possible from t0 to the last observation, but h = "
+            f"{h:g} requires {steps:.3g} steps for the time {span:g} between them. Give a larger "
+            "|h|, or give h and the times of the data in the same unit."
         )
     return max(1, math.ceil(steps - 1e-9))
 
@@ -370,10 +389,11 @@ def check_observable(i: int, arc: Observations, spec: Mapping[str, Any]) -> bool
     if of_one == () and shape == (1,) and arc.covariance is None:
         return True
     if shape != of_one:
-        name = arc.observe if isinstance(arc.observe, str) else "observe"
+        name = f"observe={arc.observe!r}" if isinstance(arc.observe, str) else "observe"
+        seen = f"an object of type {type(out).__name__}" if shape is None else f"shape {shape}"
         raise ValueError(
-            f"arc {i}: values has shape {arc.values.shape}, so one observation has shape "
-            f"{of_one}, but {name} returns shape {shape} for a state of shape {q.shape}. "
-            "The two shapes must be the same: change values or observe."
+            f"arc {i}: values has shape {arc.values.shape}, so observe must return an array of "
+            f"shape {of_one} at each time. Got {seen} from {name}, for q of shape {q.shape}: "
+            "change values or observe."
         )
     return False

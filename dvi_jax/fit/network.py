@@ -157,8 +157,9 @@ class NetworkForce(eqx.Module):
         x = jnp.asarray(x)
         if x.shape != (self.n,):
             raise ValueError(
-                f"this dvi.NetworkForce is for q and p of shape (n,) with n = {self.n}, got shape "
-                f"{x.shape}: make it with the number of coordinates of the system as n."
+                "q and p of a dvi.NetworkForce(n, ...) must have shape (n,), here with n = "
+                f"{self.n}, got shape {x.shape}. Set n to the length of q; q and p must have "
+                "exactly one axis."
             )
         return x
 

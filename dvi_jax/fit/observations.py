@@ -9,7 +9,7 @@ import numpy as np
 
 from .._checks import finite, instance
 from ..engine.quantities import refuse_unit_or_mask
-from ..engine.signature import accepts
+from ..engine.signature import accepts, signature_of
 
 _RANGE = (1e-140, 1e140)
 """Standard errors relative to the largest value for which a sum of squares can be computed."""
@@ -64,12 +64,16 @@ class Observations:
         ts, values = _real("ts", self.ts), _real("values", values)
         by_name, of = isinstance(self.observe, str), self.observe
         if not (of in NAMED if by_name else callable(of) and accepts(of, 4)):
+            seen = signature_of(of) if callable(of) else f"{of!r:.200}"
             raise TypeError(
-                'observe must be "positions", "momenta", "state" or a function (t, q, p, args) of '
-                f"a state, got {self.observe!r}."
+                'observe must be "positions", "momenta", "state" or a function with the four '
+                f"arguments (t, q, p, args), got {seen}."
             )
         if ts.ndim != 1 or ts.size == 0:
-            raise ValueError(f"ts must be a one-dimensional array of times, got shape {ts.shape}.")
+            raise ValueError(
+                "ts must be a one-dimensional array of times that is not empty, got shape "
+                f"{ts.shape}."
+            )
         if values.shape[:1] != ts.shape:
             raise ValueError(
                 f"values must have one row for each time: ts has shape {ts.shape}, values has "
@@ -79,14 +83,16 @@ class Observations:
         if where := _first(np.isinf(values)):
             raise ValueError(f"values is infinite at index {where}: give NaN for a missing value.")
         if np.isnan(values).all():
-            raise ValueError("all values are NaN, which means missing: give at least one number.")
+            seen = "all values are NaN" if values.size else f"values has shape {values.shape}"
+            raise ValueError(f"{seen}: give at least one number. NaN means a missing value.")
         refuse_unit_or_mask("t0", self.t0)
         t0 = finite("t0", ts[0] if self.t0 is None else self.t0)
         if ts.min() < t0 < ts.max():
             raise ValueError(
-                f"t0 = {t0:.17g}, the start of the arc, lies between the times of the "
-                f"observations ({ts.min():.17g} to {ts.max():.17g}). Change t0, so that all "
-                "times are on one side, or give the times before t0 as a second arc, with h < 0."
+                f"t0 = {t0}, the start of the arc, lies between the times {ts.min()} and "
+                f"{ts.max()} of the observations, but all times must be on one side of t0. Give "
+                f"t0 <= {ts.min()} with h > 0, or t0 >= {ts.max()} with h < 0, and q0 and p0 at "
+                "this t0, or leave out the observations on one side."
             )
         checked: dict[str, Any] = {"ts": ts, "values": values, "t0": t0}
         if self.sigma is not None:
@@ -172,8 +178,9 @@ def as_arcs(data: Any) -> tuple[list[Observations], bool]:
     known = [arc.has_errors for arc in data]
     if any(known) and not all(known):
         raise ValueError(
-            f"data[{known.index(False)}] has neither sigma nor covariance, but other arcs have one "
-            "of them. Give errors for all arcs, or for none; otherwise their weights are arbitrary."
+            f"data[{known.index(False)}] has neither sigma nor covariance, but "
+            f"data[{known.index(True)}] has one of them. Give sigma or covariance for all arcs or "
+            "for none: otherwise the relative weights of the arcs are unknown."
         )
     return list(data), True
 
@@ -183,7 +190,10 @@ def _real(name: str, value: Any) -> np.ndarray:
     try:
         found = np.asarray(value)
     except (TypeError, ValueError) as error:
-        raise TypeError(f"{name} must be an array of real numbers ({error}).") from None
+        raise TypeError(
+            f"{name} must be an array of real numbers with rows of equal length. NumPy cannot "
+            f"convert this {type(value).__name__}: {str(error).partition(chr(10))[0]}"
+        ) from None
     if found.dtype.kind not in "fiu":
         raise TypeError(f"{name} must be an array of real numbers, got dtype {found.dtype}.")
     return found.astype(float)
@@ -204,17 +214,17 @@ def _check_times(ts: np.ndarray) -> None:
     if at := _first(steps == 0):
         [i] = at
         raise ValueError(
-            f"ts[{i}] and ts[{i + 1}] are the same time, {ts[i]:.17g}. Give one row for each "
-            "time. For measurements of different components use an observe that returns all of "
-            "them; for repeated measurements give the mean with its smaller sigma."
+            f"ts[{i}] and ts[{i + 1}] are the same time, {ts[i]}: give one row for each time. If "
+            "the two rows are different components, use a function observe that returns all of "
+            "them. If they repeat a measurement, give the mean, with its standard error as sigma."
         )
     is_up = (steps > 0).sum() >= (steps < 0).sum()
     if at := _first(steps < 0 if is_up else steps > 0):
         [i] = at
         raise ValueError(
-            f"ts is not in order: ts[{i}] = {ts[i]:.17g} is followed by ts[{i + 1}] = "
-            f"{ts[i + 1]:.17g}. Sort times and values together: order = np.argsort(ts); "
-            "ts[order], values[order]."
+            f"ts is not in order: ts[{i}] = {ts[i]} is followed by ts[{i + 1}] = {ts[i + 1]}. "
+            "Times must all increase or all decrease. Sort times, values and errors together: "
+            "order = np.argsort(ts); ts[order], values[order], sigma[order]."
         )
 
 
@@ -224,22 +234,25 @@ def _sigma(sigma: Any, values: np.ndarray) -> np.ndarray:
         full = np.array(np.broadcast_to(sigma, values.shape))
     except ValueError:
         raise ValueError(
-            f"sigma of shape {sigma.shape} does not broadcast to values of shape {values.shape}. "
-            "For one error at each time give shape (N, 1, ...)."
+            f"sigma must be one number or an array that broadcasts to the shape {values.shape} of "
+            f"values, got shape {sigma.shape}. For one standard error at each time give shape "
+            f"{(len(values), *[1] * (values.ndim - 1))}."
         ) from None
     seen = ~np.isnan(values)
     if at := _first(~(np.isfinite(full) & (full > 0)) & seen):
         raise ValueError(
             f"sigma is {full[tuple(at)]} for the value at index {at}: standard errors must be "
-            "positive and finite. To ignore a value, set it to NaN; put a value that is known "
-            "exactly into the model."
+            "positive and finite. To ignore a value, set it to NaN. If an initial value is known "
+            "exactly, give it to the model in q0 or p0 instead."
         )
-    size = np.nanmax(np.abs(values)) or 1.0
+    largest = np.nanmax(np.abs(values))
+    size = largest or 1.0
     if at := _first(~((full > _RANGE[0] * size) & (full < _RANGE[1] * size)) & seen):
         raise ValueError(
             f"sigma is {full[tuple(at)]:g} for the value at index {at}, but the values are up to "
-            f"{size:.3g}: the square of their ratio is outside the range of double precision. "
-            "Give the standard errors in the units of the values."
+            f"{largest:.3g}. Here sigma must lie between {_RANGE[0] * size:.3g} and "
+            f"{_RANGE[1] * size:.3g}, the range in which squares of values / sigma can be computed "
+            "in double precision. Give the standard errors in the units of the values."
         )
     return full
 
@@ -259,9 +272,14 @@ def _covariance(covariance: Any, values: np.ndarray) -> np.ndarray:
     # The comparison is written so that NaN is refused.
     if at := _first(~(skew <= 1e-10 * (scale.max(axis=1) ** 2 + np.finfo(float).tiny))):
         [i] = at
+        off = np.nan_to_num(np.abs(full[i] - full[i].T), nan=np.inf, posinf=np.inf)
+        a, b = np.unravel_index(np.argmax(off), off.shape)
+        hint = "If these differ only by round-off, give (C + C.T) / 2 for each covariance matrix C."
+        if not np.isfinite(off[a, b]):
+            hint = "Mark a missing value by NaN in values only, not in covariance."
         raise ValueError(
-            f"the covariance of observation {i} must be symmetric and finite, got "
-            f"{full[i].tolist()}."
+            f"the covariance of observation {i} must be symmetric and finite, got {full[i, a, b]} "
+            f"at index [{a}, {b}] and {full[i, b, a]} at [{b}, {a}]. {hint}"
         )
     with np.errstate(divide="ignore", invalid="ignore"):
         unit = full / (scale[:, :, None] * scale[:, None, :])
@@ -269,11 +287,12 @@ def _covariance(covariance: Any, values: np.ndarray) -> np.ndarray:
     smallest = np.linalg.eigvalsh(np.where(good[:, None, None], unit, np.eye(k)))[:, 0]
     if at := _first(~good | (smallest <= 1e-14)):
         [i] = at
-        smallest = np.where(good, smallest, np.nan)  # not defined if a variance is not positive
+        seen = f"smallest eigenvalue of its correlation matrix is {smallest[i]:.3g}, not > 1e-14"
+        if not good[i]:  # then the correlation matrix is not defined
+            seen = f"smallest variance on its diagonal is {variance[i].min():.3g}"
         raise ValueError(
-            f"the covariance of observation {i} is not positive definite: {full[i].tolist()}. The "
-            f"smallest eigenvalue of its correlation matrix is {smallest[i]:.3g}. An error of zero "
-            "has no finite weight: if a combination of the values is known exactly, leave it out "
-            "of the observations, and make the model satisfy it."
+            f"the covariance of observation {i} is not positive definite: the {seen}. Errors of "
+            "zero are not possible: if a value or a combination of values is known exactly, leave "
+            "it out of the observations, and write the model so that it has this value."
         )
     return full

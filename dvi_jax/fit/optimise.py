@@ -320,8 +320,9 @@ class ScalarStage:
         state = self.solver.init(function, zero, known(), {}, struct, None, frozenset())
         if not (hasattr(state, "f") or hasattr(state, "f_info")):
             raise TypeError(
-                f"optimiser={type(self.solver).__name__} cannot be used, because it does not "
-                "report the loss of its steps: leave optimiser out, or use another one."
+                f"optimiser={type(self.solver).__name__} cannot be used: its state has no "
+                "attribute f or f_info with the loss of a step. Leave optimiser out, or use, for "
+                "example, optimistix.BFGS(rtol=1e-10, atol=1e-10)."
             )
         if task.resume is not None:
             state = _with_leaves(state, at.leaves)
@@ -354,9 +355,11 @@ class ScalarStage:
 def _check_same(now: Any, then: Any) -> None:
     """Refuse a checkpoint whose residuals are not those of this model."""
     if not np.allclose(now, then, rtol=1e-6, atol=1e-6 * float(np.abs(then).max(initial=0.0))):
+        off = np.abs(np.subtract(now, then)).max()
         raise ValueError(
-            "the checkpoint is of another model, which predicts other values at the same "
-            "parameters. Give another path in checkpoint, or remove the file to start again."
+            "the checkpoint is of another model: at the same parameters its residuals differ from "
+            f"those of this model by up to {off:.3g}. Use the model "
+            "of the checkpoint, give another path in checkpoint, or remove the file to start again."
         )
 
 
@@ -370,8 +373,9 @@ def _with_leaves(state: Any, leaves: list[np.ndarray]) -> Any:
     old, tree = jax.tree.flatten(arrays)
     if [np.shape(x) for x in old] != [np.shape(x) for x in leaves]:
         raise ValueError(
-            "the checkpoint is of a fit with another optimiser. Give another path in checkpoint, "
-            "or remove the file to start again."
+            "the checkpoint is of a fit with another optimiser, or another version of it: the "
+            "arrays of its state have other shapes. Use that optimiser, give another path in "
+            "checkpoint, or remove the file to start again."
         )
     new = [jnp.asarray(x, o.dtype) for x, o in zip(leaves, old, strict=True)]
     return eqx.combine(jax.tree.unflatten(tree, new), rest)

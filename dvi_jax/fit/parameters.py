@@ -37,7 +37,8 @@ class Bounds:
         numbers = all(isinstance(x, int | float) for x in (self.lower, self.upper))
         if numbers and self.lower >= self.upper:
             raise ValueError(
-                f"lower of Bounds must be less than upper, got {self.lower!r} and {self.upper!r}."
+                "lower of dvi.Bounds must be less than upper, got "
+                f"lower={self.lower!r} and upper={self.upper!r}."
             )
 
 
@@ -169,8 +170,8 @@ def make_space(
     paths, tree = jax.tree_util.tree_flatten_with_path(numbers)
     if not paths:
         raise ValueError(
-            f"params has no number that can be fitted: {params!r}. Give initial values as floats "
-            "or floating-point arrays."
+            "params has no number that can be fitted. Give initial values as floats or "
+            f"floating-point arrays, got {params!r:.200}."
         )
     names, places = [], {}
     for path, leaf in paths:
@@ -240,16 +241,19 @@ def _given(
     for path, given in jax.tree_util.tree_leaves_with_path(tree):
         name = _name(path)
         if not isinstance(given, kind):
+            of = f"dvi.{kind.__name__}"
             raise TypeError(
-                f"{called} must have the structure of params, with dvi.{kind.__name__}(...) or "
-                f"None in place of numbers; at {name} it has {given!r}."
+                f"{called} must have the structure of params, with {of}(...) or None in place of "
+                f"each number or array. Got {given!r:.200} at {name}. Write a pair (a, b) as "
+                f"{of}(a, b)."
             )
         under = tuple(name + end for end in ("[", "."))
         below = [k for k in places if not path or k == name or k.startswith(under)]
         if not below:
             raise ValueError(
-                f"{called} are given for {name!r}, which is not a fitted parameter. The fitted "
-                f"parameters are {', '.join(map(repr, places))}."
+                f"{called} are given for {name!r}, but the fitted parameters are "
+                f"{', '.join(map(repr, places))}. For an array give one dvi.{kind.__name__} with "
+                "numbers or with arrays of its shape."
             )
         where = np.concatenate([places[k].ravel() for k in below])
         has[where] = True
@@ -265,9 +269,11 @@ def _spread(value: Any, size: int, shape: tuple[int, ...], called: str) -> np.nd
     try:
         value = np.asarray(value, float)
     except (TypeError, ValueError):
-        raise TypeError(f"{called} must be a number or an array, got {value!r}.") from None
+        known = "a real number or an array of real numbers"
+        raise TypeError(f"{called} must be {known}, got {value!r:.200}.") from None
     if value.ndim and value.shape != shape:
-        raise ValueError(f"{called} must be a number or of shape {shape}, got shape {value.shape}.")
+        known = f"a number or an array of shape {shape}" if shape else "a single number"
+        raise ValueError(f"{called} must be {known}, got shape {value.shape}.")
     return value.ravel() if value.ndim else np.full(size, float(value))
 
 

@@ -80,10 +80,15 @@ class Posterior:
         lost = not (self._problem.has_errors or self._has_density)
         if count < free + lost:
             raise ValueError(
-                f"{free} parameters without a prior or bounds on both sides"
-                + (", and the size of the errors," if lost else "")
-                + f" cannot be determined from {count} observed values: the posterior cannot be "
-                "normalised. Give priors, bounds on both sides, or more observations."
+                f"data must have at least {free + lost} observed values: one for each parameter "
+                f"that has neither a prior nor bounds on both sides (here {free})"
+                + (
+                    ", and one for the size of the errors, because sigma is not given"
+                    if lost
+                    else ""
+                )
+                + f". Got {count}: the posterior cannot be normalised. Give priors, bounds on both "
+                "sides, or more observations."
             )
         self._slopes = self._forward if gradient == "forward" else self._reverse
         self._potential = jax.jit(_guarded(self._value, self._slopes))
@@ -180,8 +185,9 @@ class Posterior:
         if about.undetermined.size:
             words = "; ".join(in_words(d, self.names) for d in about.undetermined.T)
             raise ValueError(
-                f"neither the data nor priors determine {words}: the posterior cannot be "
-                "normalised. Give a prior or bounds on both sides, or sample fewer parameters."
+                f"neither the data nor priors determine {words} (linear combinations of scaled "
+                "parameters): the posterior cannot be normalised. Give a prior or bounds on both "
+                "sides for these parameters, or sample fewer parameters."
             )
         return u, about.directions / about.singular_values
 
@@ -190,8 +196,8 @@ class Posterior:
             x = np.asarray(self.to_x(jnp.asarray(u)))
             raise ValueError(
                 f"the posterior density is 0 at the start ({self._space.in_words(x)}): the "
-                "model's trajectory fails, or its misfit is NaN. Start from other "
-                "parameters, or use a smaller h."
+                "trajectory of the model fails there, or the log likelihood is not finite. Start "
+                "from other parameters, or use a smaller h."
             )
 
     def _descend(self, u: np.ndarray, max_steps: int) -> tuple[np.ndarray, np.ndarray]:

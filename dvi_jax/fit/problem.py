@@ -114,7 +114,8 @@ class Core(eqx.Module):
     def _likelihood(self, group: Group, found: Array, horizon: Any, params: PyTree) -> Array:
         if group.whiten.ndim == 4:
             raise ValueError(
-                "dvi.Likelihood cannot use covariance: give sigma in dvi.Observations instead."
+                "loss=dvi.Likelihood(...) accepts sigma in dvi.Observations, but got covariance. "
+                "Give sigma instead, or use dvi.LeastSquares(), which accepts covariance."
             )
         keep, values = within(group, horizon), jnp.asarray(group.values)
         sigma = 1 / jnp.where(keep, jnp.asarray(group.whiten), 1.0)
@@ -124,8 +125,9 @@ class Core(eqx.Module):
         )
         if jnp.shape(each) != jnp.shape(found):
             raise ValueError(
-                "the function of dvi.Likelihood must return one number for each value, shape "
-                f"{found.shape[1:]} for an arc, got shape {jnp.shape(each)[1:]}."
+                "the function of dvi.Likelihood must return −log of the density of each value: an "
+                f"array of shape {found.shape[1:]}, as its argument predicted has, got shape "
+                f"{jnp.shape(each)[1:]}. Do not sum over the values."
             )
         return jnp.sum(jnp.where(keep, each, 0.0))
 
@@ -155,9 +157,9 @@ def _warn_of_times(model: Model, params: Any, arcs: list[Observations]) -> None:
     for i, arc in enumerate(arcs):
         if fixed and not arc.t0_is_given and arc.t0 != 0:
             warnings.warn(
-                f"arc {i}: t0 is not given, so {' and '.join(fixed)} of the model are taken as the "
-                f"state at the first observation, t = {arc.t0:g}. If they are the state at another "
-                "time, pass dvi.Observations(..., t0=...).",
+                f"arc {i}: t0 is not given, so the fit uses {' and '.join(fixed)} of the model at "
+                f"the first observation, t = {arc.t0:g}. If the state of the model belongs to "
+                "another time, give this time: dvi.Observations(..., t0=...).",
                 stacklevel=5,
             )
 
@@ -211,9 +213,10 @@ class Problem:
         if not self.has_errors and not isinstance(loss, Likelihood):
             robust = not isinstance(loss, LeastSquares)
             if self.space.count_of_priors or robust:
+                by = f"a robust loss ({type(loss).__name__})" if robust else "a fit with priors"
                 raise ValueError(
-                    f"{'a robust loss' if robust else 'priors'} can only be used with data that "
-                    "have errors: give sigma or covariance in dvi.Observations."
+                    f"{by} requires standard errors of the data, but dvi.Observations has none: "
+                    "give sigma or covariance there."
                 )
         if isinstance(model, Model):
             check_system(model.rest["system"])
@@ -258,11 +261,10 @@ class Problem:
     def check_count(self) -> None:
         """**Raises** `ValueError` for fewer observed values than parameters."""
         if self.degrees_of_freedom < 0:
-            priors = self.space.count_of_priors
             raise ValueError(
-                f"{self.size} parameters cannot be determined from {self.count} observed values"
-                + (f" and {priors} priors" if priors else "")
-                + ". Fit fewer parameters, or give priors or more observations."
+                f"{self.size} parameters cannot be determined from {self.count} observed "
+                f"value{'s' * (self.count != 1)} (number of priors: {self.space.count_of_priors}). "
+                "Fit fewer parameters, or give priors or more observations."
             )
 
     # ---- the functions of `core`, compiled
@@ -320,11 +322,13 @@ class Problem:
             names = np.atleast_1d(status_name(result))
             for a, arc in enumerate(group.arcs):
                 first = group.seen[a].any(axis=1).argmax()
-                if not np.isfinite(np.asarray(found)[a, first][group.seen[a, first]]).all():
+                values = np.asarray(found)[a, first][group.seen[a, first]]
+                if not np.isfinite(values).all():
                     raise ValueError(
-                        f"{where}no finite number for the first observation of arc {arc} (t = "
-                        f"{group.ts[a, first]:g}; status {str(names[a])!r}). Start from other "
-                        "parameters or use a smaller h."
+                        f"{where}{values[~np.isfinite(values)][0]} for the first observation of "
+                        f"arc {arc}, at t = {group.ts[a, first]:g}. The status of the trajectory "
+                        f"is {str(names[a])!r}. Start from other parameters or use a smaller h. "
+                        "If the status is 'successful', check the function observe."
                     )
         if check_units:
             self._check_sizes([np.asarray(found) for found, _ in known], where)
@@ -339,9 +343,9 @@ class Problem:
         intended = "If the difference is intended, use check_units=False."
         if largest < data:
             raise ValueError(
-                f"{where}values up to {largest:.3g}, but the observed values are up to "
-                f"{data:.3g}, {data / largest:.3g} times as large. Give the model and the "
-                f"data in the same units. {intended}"
+                f"{where}values of at most {largest:.3g}, but the largest observed value is "
+                f"{data:.3g} (absolute values). Give the model and the data in the same units, or "
+                f"start from other parameters. {intended}"
             )
         large, each = _UNITS * data, zip(self.groups, own, strict=True)
         group, size = next((g, s) for g, s in each if (s >= large).any())
@@ -352,8 +356,8 @@ class Problem:
         first = float(jnp.max(jnp.abs(seen.function(seen.t0, q0, p0, spec.get("args")))))
         raise ValueError(
             f"{where}{size[a, row]:.3g} for arc {arc} at t = {group.ts[a, row]:g}, but the "
-            f"observed values are only up to {data:.3g}. For this arc the model gives {first:.3g} "
-            f"at the start, t = {group.t0[a]:g}, and at most {size[a].max():.3g}. Likely causes: "
-            "(a) the trajectory diverges at these parameters: start from others, give bounds, or "
-            f"use a smaller h; (b) the model and the data are not in the same units. {intended}"
+            f"largest observed value is {data:.3g} (absolute values). For this arc the model gives "
+            f"{first:.3g} at the start, t = {group.t0[a]:g}, and at most {size[a].max():.3g} "
+            "later. If the trajectory diverges, start from other parameters, give bounds, or use a "
+            f"smaller h. Otherwise give the model and the data in the same units. {intended}"
         )

@@ -218,16 +218,20 @@ class FitResult:
         if params is None:
             if about["shape"] is None:
                 raise ValueError(
-                    f"the parameters in {path} are not only dicts, lists and numbers: call "
-                    "FitResult.load(path, params) with params of the same structure."
+                    f"params is required to load {path}, because the fitted parameters contained "
+                    "objects other than dicts, lists and numbers. Call FitResult.load(path, "
+                    "params) with params of the same structure as in dvi.fit."
                 )
             params = jax.tree.map(np.array, about["shape"], is_leaf=lambda x: isinstance(x, list))
         space, _ = make_space(params)
-        if list(space.names) != about["names"]:
+        own, wanted = list(space.names), about["names"]
+        if own != wanted:
+            pairs = enumerate(zip(own, wanted, strict=False))
+            i = next((i for i, (a, b) in pairs if a != b), min(len(own), len(wanted)))
             raise ValueError(
-                f"params must have the same parameters as the fit in {path}. The names in "
-                f"the file begin with {about['names'][:5]}; those in params begin with "
-                f"{space.names[:5]}."
+                f"params must have the same parameters as the fit in {path}. The first difference "
+                f"is number {i + 1}: {''.join(wanted[i : i + 1]) or 'no parameter'} in the file, "
+                f"{''.join(own[i : i + 1]) or 'no parameter'} in params. Give params as in dvi.fit."
             )
         by_arc: dict[str, Any] = {
             n: [arrays[f"{n}.{i}"] for i in range(about["arcs"])] for n in _BY_ARC

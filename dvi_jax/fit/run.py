@@ -55,10 +55,14 @@ class Run:
             file = Path(self.checkpoint)
             if not file.parent.is_dir():
                 raise FileNotFoundError(
-                    f"there is no directory for the checkpoint {file}: create it first."
+                    f"there is no directory {str(file.parent)!r} for checkpoint={str(file)!r}. "
+                    "Create this directory, or give another path."
                 )
             if file.is_dir():
-                raise IsADirectoryError(f"checkpoint must be a file, but {file} is a directory.")
+                raise IsADirectoryError(
+                    f"checkpoint must be the path of a file, but {str(file)!r} is a directory. Add "
+                    "a file name, such as fit.npz."
+                )
             if file.exists():
                 self.resume, self.records = _read_checkpoint(file, self.identity)
 
@@ -85,8 +89,9 @@ class Run:
                 _write_checkpoint(self.checkpoint, self.identity, position, self.records)
             except OSError as error:  # no reason to lose the fit as well
                 warnings.warn(
-                    f"the checkpoint cannot be written ({error}). The fit continues and tries "
-                    "again; a checkpoint that was written before is unchanged.",
+                    f"the checkpoint {self.checkpoint} cannot be written. The fit continues and "
+                    "tries again later. If an earlier checkpoint exists, it is unchanged. Cause: "
+                    f"{error}.",
                     stacklevel=2,
                 )
             self.saved = time.monotonic()
@@ -131,8 +136,9 @@ def _read_checkpoint(path: Any, identity: str) -> tuple[Position, list[Record]]:
     about, arrays = read_npz(path, _FORMAT, "checkpoint of a fit")
     if about.get("identity") != identity:
         raise ValueError(
-            f"the checkpoint {path} is of another fit: the data, parameters, initial values or "
-            "settings differ. Give another path in checkpoint, or remove this file to start again."
+            f"the checkpoint {path} is of another fit: the data, the model, the parameters, their "
+            "starting values or the settings differ. To continue the earlier fit, repeat its call "
+            "unchanged. To start a new fit, give another path in checkpoint, or remove this file."
         )
     known = {name: about[name] for name in Position.__dataclass_fields__ if name in about}
     known |= {name: arrays[name] for name in _VECTORS}

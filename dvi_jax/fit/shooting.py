@@ -52,7 +52,8 @@ class MultipleShooting:
         fraction("tolerance", self.tolerance)
         if not (self.guess in (None, "data", "model") or callable(self.guess)):
             raise TypeError(
-                f'guess must be "data", "model", a function t → (q, p) or None, got {self.guess!r}.'
+                'guess must be "data", "model", None or a function (t) that returns (q, p), got '
+                f"{self.guess!r}."
             )
 
 
@@ -84,18 +85,31 @@ class Segments:
     def __init__(self, problem: Problem, shooting: MultipleShooting):
         self.problem, self.shooting = problem, shooting
         spec, arcs, S = problem.specs[0], problem.arcs, shooting.segments
-        if any(s["h"] != spec["h"] for s in problem.specs) or problem.groups[0].block == 0:
-            raise ValueError("MultipleShooting requires dvi.Uniform() and the same h for all arcs.")
-        if len({(a.function, a.values.shape[1:], a.covariance is None) for a in arcs}) > 1:
+        other = next((s["h"] for s in problem.specs if s["h"] != spec["h"]), None)
+        if other is not None or problem.groups[0].block == 0:
+            own = spec.get("lattice", getattr(spec.get("integrator"), "lattice", None))
+            got = type(own).__name__ if other is None else f"h = {spec['h']} and h = {other}"
             raise ValueError(
-                "MultipleShooting requires the same observe and the same shape of one observation "
-                "for all arcs. Give covariance for all arcs or for no arc."
+                "dvi.MultipleShooting requires lattice=dvi.Uniform() and the same h for all arcs, "
+                f"got {got}. Change the model, or use dvi.SingleShooting()."
+            )
+        kinds = [(a.function, a.values.shape[1:], a.covariance is None) for a in arcs]
+        if unlike := [i for i, kind in enumerate(kinds) if kind != kinds[0]]:
+            names = "observe", "the shape of one observation", "the use of covariance"
+            pairs = zip(names, kinds[0], kinds[unlike[0]], strict=True)
+            raise ValueError(
+                f"dvi.MultipleShooting requires that all arcs agree in {', '.join(names[:2])} and "
+                f"{names[2]}, but arcs 0 and {unlike[0]} differ in "
+                f"{' and '.join(name for name, a, b in pairs if a != b)}."
             )
         h = float(spec["h"])
         steps = max(math.ceil(abs(a.ts[-1] - a.t0) / abs(h) - 1e-9) for a in arcs)
         self.steps = math.ceil(steps / S)
         if self.steps < 1 or steps < S:
-            raise ValueError(f"segments={S} must be at most the number of steps, {steps}.")
+            raise ValueError(
+                "segments of dvi.MultipleShooting must be at most the number of steps of the "
+                f"longest arc, {steps}, got {S}. Give fewer segments or a smaller h."
+            )
         self.cuts = np.array([[arc.t0 + s * self.steps * h for s in range(S)] for arc in arcs])
         parts = []
         for arc, cuts in zip(arcs, self.cuts, strict=True):
@@ -139,8 +153,8 @@ class Segments:
             found = np.array([np.concatenate([np.ravel(q), np.ravel(p)]) for q, p in pairs], float)
             if found.shape != (len(times), 2 * self.half):
                 raise ValueError(
-                    "guess of dvi.MultipleShooting must return (q, p), each of shape "
-                    f"{self.shape}, got {found.shape[1]} numbers in all."
+                    "the function guess of dvi.MultipleShooting must return (q, p), each of shape "
+                    f"{self.shape}, got shapes {' and '.join(str(np.shape(x)) for x in pairs[0])}."
                 )
         elif guess == "data":
             found = from_data(arc, spec, times)
@@ -151,9 +165,10 @@ class Segments:
             found = np.concatenate(flat, axis=1)
         if not np.isfinite(found).all():
             raise ValueError(
-                f"arc {i}: the guess of the initial states of the segments is not finite at t = "
-                f"{times[np.argmin(np.isfinite(found).all(axis=1))]:g}. Give another guess in "
-                "dvi.MultipleShooting(..., guess=...), for example a function t → (q, p)."
+                f"arc {i}: guess={'a function' if callable(guess) else repr(guess)} of "
+                "dvi.MultipleShooting must give finite states, got NaN or inf at t = "
+                f"{times[np.argmin(np.isfinite(found).all(axis=1))]:g}. Give another guess, for "
+                "example a function (t) that returns (q, p), or start from other parameters."
             )
         return found
 
@@ -237,9 +252,9 @@ def from_data(arc: Observations, spec: dict[str, Any], times: np.ndarray) -> np.
     """
     if arc.observe not in ("positions", "state"):
         raise ValueError(
-            'guess="data" of dvi.MultipleShooting requires observations of "positions" or of the '
-            f'"state", but this arc observes {arc.observe!r}. Use guess="model", or give guess as '
-            "a function t → (q, p)."
+            'guess="data" of dvi.MultipleShooting requires observe="positions" or observe="state", '
+            f"got {repr(arc.observe) if isinstance(arc.observe, str) else 'a function'}. Use "
+            'guess="model", or give a function (t) that returns (q, p) as guess.'
         )
     flat = arc.values.reshape(len(arc.ts), -1)
     good = np.isfinite(flat).all(axis=1)

@@ -61,8 +61,9 @@ def solver_for(optimiser: Any, residuals: bool, many: bool, steps: int) -> Any:
         return optx.OptaxMinimiser(optimiser, rtol=0.0, atol=0.0)
     if is_gauss_newton(optimiser) and not residuals:
         raise ValueError(
-            "dvi.Likelihood has no residuals, so an optimiser for least squares cannot be used: "
-            "use optimistix.BFGS(rtol=1e-10, atol=1e-10), or leave optimiser out."
+            "optimiser must be a minimiser if the loss is a dvi.Likelihood, got the least-squares "
+            f"solver {type(optimiser).__name__}. A likelihood has no residuals. Use "
+            "optimistix.BFGS(rtol=1e-10, atol=1e-10), or leave optimiser out."
         )
     minimisers = optx.OptaxMinimiser, optx.AbstractQuasiNewton, optx.AbstractLBFGS
     known = optx.AbstractGaussNewton, optx.AbstractGradientDescent, *minimisers

@@ -16,22 +16,23 @@ def needed(package: str, by: str) -> Any:
         if error.name not in (None, package, package.partition(".")[0]):
             raise  # the package is installed, and something that it needs is not
         raise ImportError(
-            f"{by} requires {package.partition('.')[0]}, which is not installed: run "
-            'pip install "dvi-jax[interop]".',
+            f"{by} requires the package {package.partition('.')[0]}, which cannot be imported. "
+            'Install it: pip install "dvi-jax[interop]".',
             name=package,
         ) from None
 
 
-def expect(name: str, value: Any, kind: Any, called: str) -> Any:
+def expect(name: str, value: Any, kind: Any, called: str, hint: str = "") -> Any:
     """The value, of a kind that the message calls `called`. **Raises** `TypeError`."""
     if not isinstance(value, kind):
-        seen = value.__name__ if isinstance(value, type) else f"{value!r:.100}"
-        raise TypeError(f"{name} must be {called}, got {seen} of type {type(value).__name__}.")
+        seen = f"{value!r:.100} of type {type(value).__name__}"
+        seen = f"the class {value.__name__}" if isinstance(value, type) else seen
+        raise TypeError(f"{name} must be {called}, got {seen}.{' ' * bool(hint)}{hint}")
     return value
 
 
 def system_of(what: Any) -> dvi.System:
     """The `System` itself, or that of a `Problem`. **Raises** `TypeError` for anything else."""
-    called = "a problem of dvi_jax.systems or a dvi.System, such as dvi.System(H_D, force=W), or "
-    called += "dvi.System(dvi.discretise(H)) for a continuous Hamiltonian"
-    return expect("system", what.system if isinstance(what, Problem) else what, dvi.System, called)
+    hint = "For a continuous Hamiltonian H give dvi.System(dvi.discretise(H))."
+    what = what.system if isinstance(what, Problem) else what
+    return expect("system", what, dvi.System, "a problem of dvi_jax.systems or a dvi.System", hint)

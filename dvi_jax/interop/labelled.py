@@ -60,20 +60,23 @@ def to_xarray(
     """
     import xarray as xr
 
-    hint = "(a sweep has its own to_xarray(); for a UnitSolution give its solution, and units=)"
-    expect("solution", solution, dvi.Solution, f"a dvi.Solution {hint}")
+    hint = "For a sweep call sweep.to_xarray(). For a UnitSolution s give s.solution and units=."
+    expect("solution", solution, dvi.Solution, "a dvi.Solution", hint)
     dims = (dims,) if isinstance(dims, str) else tuple(dims)
     if solution.result.is_traced():
-        raise TypeError("solution is traced: call to_xarray outside of jit, vmap and grad.")
+        raise TypeError(
+            "solution must have numerical values, but inside jax.jit, jax.vmap and jax.grad it has "
+            "only JAX tracers. Return solution, and call to_xarray outside of jit, vmap and grad."
+        )
     ts, hs = np.asarray(solution.ts), np.asarray(solution.hs)
     *batch, count = ts.shape
     if len(dims) != len(batch):
         raise ValueError(
-            f"dims must have a name for each of the {len(batch)} dimensions of the batch, of sizes "
-            f"{batch}, got {len(dims)} names: {dims}. The outermost vmap comes first."
+            f"the length of dims must be {len(batch)}: one name for each batch dimension of "
+            f"solution (sizes {tuple(batch)}). Got {dims}. Give the outermost vmap first."
         )
     for name in dims:
-        _check_free("dimension", name, name in _TAKEN or dims.count(name) > 1)
+        _check_free("dims", name, name in _TAKEN or dims.count(name) > 1)
     rows = ts.reshape(-1, count)
     alike = bool(np.isfinite(rows).all() and (rows == rows[:1]).all())
     at, index = ("time", rows[0]) if alike else ("save", np.arange(count))
@@ -85,16 +88,18 @@ def to_xarray(
     found["h"] = ((*dims, step), hs)
 
     def add(name: str, axes: Sequence[str], value: Any) -> None:
-        _check_free("observable", name, name in found or name.partition(".")[0] in _TAKEN)
+        first = name.partition(".")[0]
+        name_in_use = first if first in _TAKEN else name
+        _check_free("observe of dvi.integrate", name_in_use, first in _TAKEN or name in found)
         found[name] = ((*dims, *axes), np.asarray(value))
 
     for name, value, per_step in _observed(solution.observed, observe):
         own = value.shape[len(dims) :]
         if per_step and own[:1] != hs.shape[-1:]:
             raise ValueError(
-                "observe must be the same as for integrate. In this observe, "
-                f"{name!r} has a value for each of {hs.shape[-1]} steps, but in solution its "
-                f"values have the shape {own}."
+                "observe must be the same as for integrate. With this observe, "
+                f"{name!r} has one value per step, so the first axis of its values has length "
+                f"{hs.shape[-1]}, but in solution its values have shape {own}."
             )
         front = [step] * per_step
         add(name, [*front, *_own(name, own[len(front) :])], value)
@@ -143,8 +148,8 @@ def to_inference_data(samples: dvi.Samples, observed: Any = None) -> Any:
     """
     import xarray as xr
 
-    hint = "(for trajectories use interop.to_xarray)"
-    expect("samples", samples, dvi.Samples, f"a result of dvi.sample {hint}")
+    hint = "For trajectories use interop.to_xarray."
+    expect("samples", samples, dvi.Samples, "a result of dvi.sample", hint)
     try:
         arviz = needed("arviz", "interop.to_inference_data")
     except ImportError:
@@ -175,9 +180,12 @@ def to_inference_data(samples: dvi.Samples, observed: Any = None) -> Any:
     return xr.DataTree.from_dict(groups)
 
 
-def _check_free(kind: str, name: str, is_taken: bool) -> None:
+def _check_free(where: str, name: str, is_taken: bool) -> None:
     if is_taken:
-        raise ValueError(f"the name of the {kind} {name!r} is already in use: choose another.")
+        raise ValueError(
+            f"in the dataset the name {name!r} is already in use by another variable or dimension: "
+            f"choose another name in {where}."
+        )
 
 
 def _components(
@@ -191,8 +199,8 @@ def _components(
     sizes = tuple(len(labels) for labels in components.values())
     if sizes != tuple(shape):
         raise ValueError(
-            f"components has labels for axes of sizes {sizes}, but q has the shape {tuple(shape)}: "
-            "give a list of labels for each axis, one label for each index."
+            "components must have a list of labels for each axis of q, with one label for each "
+            f"index. Got lists of lengths {sizes}, but at each time q has the shape {tuple(shape)}."
         )
     return tuple(components), {name: list(labels) for name, labels in components.items()}
 
@@ -215,8 +223,12 @@ def _observed(observed: Any, observe: Any) -> list[tuple[str, np.ndarray, bool]]
     try:
         # Without `observe` one None applies to all.
         flags = jax.tree.map(flags_of, observe, observed, is_leaf=is_observable)
-    except ValueError as error:
-        raise ValueError(f"observe must be the same as for integrate ({error}).") from None
+    except ValueError:
+        given = jax.tree.structure(observe, is_leaf=is_observable)
+        raise ValueError(
+            f"observe must be the same as for integrate. Its structure is {given}, but that of "
+            f"solution.observed is {jax.tree.structure(observed)} (each * is one leaf)."
+        ) from None
     arrays = jax.tree.leaves_with_path(observed, is_leaf=eqx.is_array)
     names = [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in arrays]
     names = [f"observed.{n}".rstrip(".") if not n or n[0].isdigit() else n for n in names]

@@ -119,19 +119,28 @@ def from_rebound(
     rebound = needed("rebound", "interop.from_rebound")
     if isinstance(simulation, str | PathLike):
         if not Path(simulation).is_file():
-            raise FileNotFoundError(f"the Simulationarchive {str(simulation)!r} does not exist.")
+            raise FileNotFoundError(
+                "simulation must be a rebound.Simulation or the path of a Simulationarchive, but "
+                f"the file {str(simulation)!r} does not exist. Check the path."
+            )
         try:
             simulation = rebound.Simulation(str(simulation), snapshot=snapshot)
         except (RuntimeError, ValueError) as error:
             raise ValueError(
-                f"REBOUND cannot read snapshot {snapshot} of {str(simulation)!r} ({error}): give "
-                "the number of a snapshot in this archive."
+                f"REBOUND cannot read snapshot {snapshot} of {str(simulation)!r}. Check that the "
+                "file is a Simulationarchive, and give the number of one of its snapshots: 0 for "
+                f"the first, −1 for the last. Cause: {error}"
             ) from None
         simulation.synchronize()  # a snapshot may have been taken between half steps
     elif snapshot != -1:
-        raise ValueError(f"snapshot={snapshot} has no effect on a Simulation: leave it out.")
-    called = "a rebound.Simulation (archive[i] for one in an archive), or the path of a file"
-    expect("simulation", simulation, rebound.Simulation, called)
+        raise ValueError(
+            "snapshot can only be used if simulation is the path of a Simulationarchive, got "
+            f"snapshot={snapshot} for an object of type {type(simulation).__name__}: leave "
+            "snapshot out."
+        )
+    called = "a rebound.Simulation, or the path of a Simulationarchive"
+    hint = "For snapshot i of an open archive give archive[i]."
+    expect("simulation", simulation, rebound.Simulation, called, hint)
     _check_convertible(simulation)
     numbers = _finite("the simulation", simulation, ("t", "dt", "G", "softening"))
     names = tuple(_name(b) for b in simulation.particles)
@@ -184,14 +193,22 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
     rebound = needed("rebound", "interop.to_rebound")
     expect("problem", problem, Problem, "a problem of dvi_jax.systems or of from_rebound")
     system, args = problem.system, problem.args
-    known = system.H_D in (hamiltonian, softened_hamiltonian) and isinstance(args, Mapping)
-    if not known or system.force is not None or system.perturbation is not None:
+    unlike = {
+        "another Hamiltonian": system.H_D not in (hamiltonian, softened_hamiltonian),
+        "args that are not a dict": not isinstance(args, Mapping),
+        "a force": system.force is not None,
+        "a perturbation": system.perturbation is not None,
+    }
+    if any(unlike.values()):
         raise ValueError(
-            "to_rebound converts only N bodies under Newton's law, such as systems.n_body(), but "
-            f"{problem.name} has another Hamiltonian, a force or a perturbation."
+            "problem must be N bodies under Newton's law, such as systems.n_body(), but "
+            f"{problem.name} has {' and '.join(name for name in unlike if unlike[name])}."
         )
     if (q is None) != (p is None):
-        raise TypeError("only one of q and p is given: give both, or leave both out.")
+        raise TypeError(
+            f"q and p must be given together, got only {'p' if q is None else 'q'}: give both, or "
+            "leave both out."
+        )
     masses = np.asarray(args["masses"], float)
     theirs = problem if isinstance(problem, ReboundProblem) else None
     velocities = theirs.velocities if theirs is not None and q is None else None
@@ -200,11 +217,11 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
     q, p = (np.asarray(x, float) for x in ((problem.q0, problem.p0) if q is None else (q, p)))
     t = float(t if t is not None else theirs.t0 if theirs is not None else 0.0)
     check_bodies(q, p, args)
-    for name, values in (("q", q), ("p", p), ("t", t)):
-        if not np.isfinite(values).all():
+    for name, values in (("q", q), ("p", p), ("t", np.array(t))):
+        if (bad := ~np.isfinite(values)).any():
             raise ValueError(
-                f"{name} has values that are not finite. In a run that failed, the states "
-                "after the failure are NaN: give an earlier state."
+                f"{name} must be finite, got {values[bad][0]}. If a run failed, its states after "
+                "the failure are NaN: give an earlier state."
             )
     v = p / masses[:, None]
     if velocities is not None and np.array_equal(p, masses[:, None] * np.asarray(velocities)):
@@ -243,9 +260,9 @@ def _check_convertible(sim: Any) -> None:
         found.append("the shearing sheet, integrator sei (see the system hill)")
     if found:
         raise ValueError(
-            "this simulation has features that cannot be converted: "
-            f"{'; '.join(found)}. Remove them in REBOUND, and convert again; sim.copy() is a copy "
-            "without callbacks."
+            f"from_rebound cannot convert these features of the simulation: {'; '.join(found)}. "
+            "Remove them in REBOUND, and convert again. A copy made by sim.copy() has no "
+            "callbacks, such as additional_forces or heartbeat."
         )
     if not sim.is_synchronized:
         raise ValueError("the simulation is in the middle of a step: call sim.synchronize() first.")
@@ -259,8 +276,8 @@ def _finite(whose: str, what: Any, fields: Sequence[str]) -> dict[str, float]:
     for name, value in numbers.items():
         if not np.isfinite(value):
             raise ValueError(
-                f"{name} of {whose} is {value}, but must be a finite number. A simulation that "
-                "failed contains NaN: take a snapshot before the failure."
+                f"{name} of {whose} is {value}, but must be a finite number. If the simulation "
+                "failed, take a snapshot before the failure. Otherwise correct the number."
             )
     return numbers
 
@@ -272,18 +289,20 @@ def _with_mass(sim: Any, masses: np.ndarray, massless: float | None) -> np.ndarr
     heavy = np.flatnonzero(masses[active:]) + active
     if heavy.size and (sim.testparticle_type == 0 or len(masses) - active > 1):
         raise ValueError(
-            f"body {heavy[0]} is a test particle, since N_active = {active}, but has the mass "
-            f"{masses[heavy[0]]:g}. REBOUND leaves out some attractions of such bodies: there is "
-            "no Hamiltonian. Set their masses to 0, or sim.N_active to the number of all bodies."
+            f"body {heavy[0]} has mass {masses[heavy[0]]:g}, but must have mass 0: it is a test "
+            f"particle, because N_active = {active}. REBOUND omits some of its attractions, so its "
+            "motion has no Hamiltonian. Set the masses of all test particles to 0, or set "
+            f"sim.N_active = {len(masses)}, the number of all bodies."
         )
     empty = masses == 0
     if not empty.any():
         return masses
     if massless is None:
         raise ValueError(
-            f"{empty.sum()} of {len(masses)} bodies have mass 0; the first of them has index "
-            f"{int(np.argmax(empty))}. Then p = m v does not determine their velocity. Give them a "
-            f"tiny mass: from_rebound(sim, massless={1e-20 * masses.max() or 1e-20:.0e})."
+            "every mass must be positive, because p = m v does not determine v if m = 0. Number of "
+            f"bodies with mass 0: {empty.sum()}, the first at index {int(np.argmax(empty))}. Give "
+            "them a small mass, for example: "
+            f"from_rebound(sim, massless={1e-20 * masses.max() or 1e-20:.0e})."
         )
     if not 0 < massless < np.inf:
         raise ValueError(f"massless must be a positive and finite mass, got {massless!r}.")

@@ -16,18 +16,17 @@ from ..engine.quantities import refuse_unit_or_mask
 from ..systems import Problem
 from .extras import needed, system_of
 
-_JACOBIAN = "Jacobians of implicit steps are computed by autodiff; leave it out"
+_JACOBIAN = "Jacobians of implicit steps are computed by autodiff. Leave it out"
 _ESTIMATE = (
-    "steps are not chosen by an estimate of the error: the lattice is fixed, which conserves the "
-    "invariants. Choose h, and compare with h/2"
+    "The size of the steps is fixed, so that the invariants are conserved. Leave it out, choose h, "
+    "and compare the results for h and h/2 to estimate the error"
 )
 _REJECTED = {
     **dict.fromkeys(("rtol", "atol"), _ESTIMATE),
-    **dict.fromkeys(("max_step", "min_step", "first_step"), "all steps have the size h"),
+    **dict.fromkeys(("max_step", "min_step", "first_step"), "Give the largest step size as h"),
     **dict.fromkeys(("jac", "jac_sparsity", "lband", "uband"), _JACOBIAN),
-    "vectorized": "functions are written for one state; use jax.vmap for a batch",
-    "dense_output": "no interpolant is made; give the output times as t_eval, and the method "
-    "computes a step to each of them",
+    "vectorized": "Functions are written for one state. Use jax.vmap for a batch",
+    "dense_output": "The result has no interpolant. Give the output times as t_eval",
 }
 """Argument of SciPy's → why it has no meaning here."""
 
@@ -102,8 +101,8 @@ def solve_ivp(
     through it; take ``dvi.integrate`` for that.
     """
     for name in unsupported:
-        reason = _REJECTED.get(name, "SciPy's solve_ivp does not have it either; check its name")
-        raise TypeError(f"interop.solve_ivp has no argument {name!r}: {reason}.")
+        reason = _REJECTED.get(name, "Check its name: SciPy's solve_ivp does not have it either")
+        raise TypeError(f"interop.solve_ivp has no argument {name!r}. {reason}.")
     for name, given in (("t_span", t_span), ("y0", y0), ("t_eval", t_eval), ("h", h)):
         refuse_unit_or_mask(name, given)
     bunch = needed("scipy.optimize", "interop.solve_ivp").OptimizeResult
@@ -205,7 +204,8 @@ def _span(t_span: Any, h: Any) -> tuple[float, float, int]:
     step = float(h) if np.ndim(h) == 0 and np.asarray(h).dtype.kind in "iuf" else math.nan
     if not (math.isfinite(step) and step > 0):
         raise ValueError(
-            f"h must be a positive and finite number, got {h}: t_span gives the direction of time."
+            f"h must be a positive and finite number, got {h!r}. The order of t0 and t1 in t_span "
+            "gives the direction of time."
         )
     # 1/0.1 is 10 steps, not 11.
     return t0, t1, max(1, math.ceil(abs(t1 - t0) / step * (1 - 1e-12)))
@@ -213,11 +213,12 @@ def _span(t_span: Any, h: Any) -> tuple[float, float, int]:
 
 def _halves(y0: Any, shape: Any) -> tuple[np.ndarray, np.ndarray]:
     y0 = np.asarray(y0)
+    known = "even" if shape is None else f"twice the size of q of shape {shape}"
     shape = (y0.size // 2,) if shape is None else tuple(np.ravel(shape).tolist())
     if y0.ndim != 1 or y0.size == 0 or y0.size != 2 * math.prod(shape):
         raise ValueError(
-            "y0 must be a one-dimensional array with all of q0 and then all of p0. Its size must "
-            f"be twice the size of q0: got y0 of shape {y0.shape} for q0 of shape {shape}."
+            "y0 must be a one-dimensional array with all of q0 and then all of p0. Its length must "
+            f"be positive and {known}, got shape {y0.shape}."
         )
     q0, p0 = np.split(y0, 2)
     return q0.reshape(shape), p0.reshape(shape)
@@ -228,13 +229,17 @@ def _times(t_eval: Any, t0: float, t1: float) -> np.ndarray | None:
         return None
     times, low, high = np.asarray(t_eval, float), min(t0, t1), max(t0, t1)
     if times.ndim != 1 or not ((times >= low) & (times <= high)).all():
+        seen = f"{times.min()} to {times.max()}" if times.ndim == 1 else f"shape {times.shape}"
         raise ValueError(
             f"t_eval must be a one-dimensional array of times within t_span, from {low} to {high}, "
-            f"got {t_eval!r:.200}."
+            f"got {seen}."
         )
-    if not (np.diff(times) * np.sign(t1 - t0) > 0).all():
-        order = "increasing" if t1 > t0 else "decreasing"
-        raise ValueError(f"t_eval must be strictly {order}, as t_span is, got {t_eval!r:.200}.")
+    if not (rises := np.diff(times) * np.sign(t1 - t0) > 0).all():
+        order, i = "increasing" if t1 > t0 else "decreasing", int(np.argmin(rises))
+        raise ValueError(
+            f"t_eval must be strictly {order}, as t_span is, got t_eval[{i}] = {times[i]} and "
+            f"t_eval[{i + 1}] = {times[i + 1]}. Sort the times, and remove equal ones."
+        )
     return times
 
 
@@ -246,21 +251,26 @@ def _method(method: Any) -> dvi.Method:
     if isinstance(method, str) and method in METHODS:
         return METHODS[method]
     raise ValueError(
-        f"method must be a dvi.Method or one of {', '.join(METHODS)}, got {method!r}. For SciPy's "
-        "own methods call scipy.integrate.solve_ivp with interop.vector_field. They choose their "
-        "steps and conserve no structure."
+        f"method must be a dvi.Method or one of the names {', '.join(METHODS)}, got {method!r}. "
+        "For a method of SciPy call scipy.integrate.solve_ivp with fun(t, y) = "
+        "np.concatenate(field(t, np.split(y, 2), args)), where field = "
+        "interop.vector_field(system, epsilon). Such a method does not conserve the invariants."
     )
 
 
 def _event(event: Any) -> _Event:
     if not callable(event):
-        raise TypeError(f"each event must be a function event(t, y), got {event!r}.")
+        raise TypeError(
+            "each of the events must be a function event(t, y) or event(t, y, args), got "
+            f"{event!r:.100}."
+        )
     terminal = getattr(event, "terminal", False)
     terminal = int(terminal or 0) if isinstance(terminal, bool | None | np.bool_) else terminal
     if not isinstance(terminal, int | np.integer) or terminal < 0:
         raise ValueError(
-            "the attribute terminal of an event must be True, False, or the number of crossings "
-            f"after which the run ends, an integer that is not negative. Got {terminal!r}."
+            f"terminal of the event {getattr(event, '__name__', event)} must be True, False or a "
+            f"whole number from 0 on, got {terminal!r}. The run ends after that number of "
+            "crossings. With 0 or False the event does not end the run."
         )
     direction = int(np.sign(getattr(event, "direction", 0)))
     return _Event(event, _takes_args(event), int(terminal), direction)

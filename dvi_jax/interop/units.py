@@ -69,8 +69,9 @@ class UnitSystem:
                 return u.CompositeUnit(1.0, parts.bases, parts.powers)
             except (AttributeError, u.UnitConversionError):  # °C, magnitudes, photons
                 raise ValueError(
-                    f"{name} cannot be in {unit}: units must be proportional to a product of "
-                    "powers of m, s, kg, rad, A, K, mol and cd. Convert it to such a unit."
+                    f"{name} cannot be in {unit}. The unit of {name} must be a constant times "
+                    "powers of m, s, kg, rad, A, K, mol and cd. Give such a unit, and convert the "
+                    f"values of {name} to it."
                 ) from None
 
         named = {name: coherent(name, unit) for name, unit in (args or {}).items()}
@@ -88,12 +89,13 @@ class UnitSystem:
         """
         u = needed("astropy.units", "interop.UnitSystem")
         expect("problem", problem, Problem, "a problem of dvi_jax.systems")
-        texts = {name: problem.units.get(name, "?") for name in ("q", "p", "t")}
+        texts = {name: problem.units.get(name, "unknown units") for name in ("q", "p", "t")}
         read = {name: _read(u, text) for name, text in texts.items()}
         if bad := [name for name, unit in read.items() if unit is None]:
             raise ValueError(
-                f"{problem.name} measures {bad[0]} in {texts[bad[0]]!r}, which is not a unit of "
-                "astropy: call dvi.integrate with numbers, or give units=UnitSystem(...)."
+                f"{problem.name} measures {bad[0]} in {texts[bad[0]]!r}, but astropy has no such "
+                "unit. Call dvi.integrate with numbers, or call interop.integrate with "
+                "units=interop.UnitSystem(length, time, mass)."
             )
         brackets = {n: re.search(r"\[([^\]]*)\]\s*$", m) for n, m in problem.parameters.items()}
         args = {name: _read(u, found[1]) for name, found in brackets.items() if found}
@@ -188,13 +190,20 @@ def integrate(
     called = "interop.UnitSystem(length=u.au, time=u.day, mass=u.Msun, args={...})"
     taken: UnitSystem = expect("units", own if units is None else units, UnitSystem, called)
     save, lattice = options.get("save"), options.get("lattice")
-    if getattr(save, "ts", None) is not None or isinstance(lattice, dvi.Given):
+    if isinstance(lattice, dvi.Given):
         raise TypeError(
-            "the times in dvi.Save(ts=...) and dvi.Given(ts) have no unit. In place of Save give a "
-            "quantity as ts=...; for dvi.Given(ts) call dvi.integrate with numbers."
+            "the times in lattice=dvi.Given(ts) have no unit: call dvi.integrate with numbers."
+        )
+    if getattr(save, "ts", None) is not None:
+        raise TypeError(
+            "the times in save=dvi.Save(ts=...) have no unit: leave save out, and give the times "
+            "as a quantity, interop.integrate(..., ts=...)."
         )
     if ts is not None and save is not None:
-        raise TypeError("ts=... already determines which states are saved: leave save out.")
+        raise TypeError(
+            f"ts and save must not be given together, got save={save!r:.100}: leave save out. "
+            "The states are saved at the times ts."
+        )
     if ts is not None:
         options["save"] = dvi.Save(ts=_number(u, "ts", ts, taken.t))
     q0, p0, args = _filled(u, problem, own, q0, p0, args)
@@ -246,9 +255,10 @@ def _arguments(u: Any, args: Any, units: UnitSystem) -> Any:
             seen.add(declared)
             return _number(u, f"args {name}", leaf, units.args[declared])
         if isinstance(leaf, u.Quantity) and leaf.unit != u.dimensionless_unscaled:
+            more = f'add the unit: UnitSystem(..., args={{"{name}": u.Unit("{leaf.unit}")}})'
             raise TypeError(
-                f"{name} in args has the unit {leaf.unit}, but units has no unit for {name}: add "
-                f'one, UnitSystem(..., args={{"{name}": u.Unit("{leaf.unit}")}}).'
+                f"{name} in args has the unit {leaf.unit}, but units has no unit for {name}. Give "
+                f"a number without a unit, or {more if path else 'give args as a dict'}."
             )
         bare.append(name)
         return _number(u, f"args {name}", leaf, u.dimensionless_unscaled)
@@ -258,7 +268,8 @@ def _arguments(u: Any, args: Any, units: UnitSystem) -> Any:
     if unmet and bare:  # a mistyped name would let a bare number through
         raise ValueError(
             f"UnitSystem(args=...) has units for {', '.join(unmet)}, but args has no such names. "
-            f"In args, {', '.join(bare)} have no unit. Use the same names in both."
+            f"Names in args without a unit: {', '.join(bare)}. Use the same names in both, or "
+            f"remove {', '.join(unmet)} from UnitSystem."
         )
     return numbers
 
@@ -271,26 +282,31 @@ def _number(u: Any, name: str, given: Any, unit: Any) -> Any:
             value = u.Quantity(given)
         except (TypeError, u.UnitsError) as error:
             raise TypeError(
-                f"{name} mixes quantities with plain numbers, or incompatible units: {error}. Give "
-                "all of its entries as quantities with convertible units."
+                f"all entries of {name} must be quantities that can be converted to one unit, got "
+                f"{given!r:.100}. Give one array with a unit, such as [1.0, 2.0] * "
+                f"u.Unit({str(unit)!r}). Cause: {error}."
             ) from None
     if np.any(getattr(value, "mask", False)):
-        raise ValueError(f"{name} must not have masked values, got {value!r}.")
+        raise ValueError(
+            f"{name} must not have masked values, got {value!r:.200}. Give valid values in their "
+            "place."
+        )
     if not isinstance(value, u.Quantity):
         if unit == u.dimensionless_unscaled:
             return value
-        seen = "is missing" if value is None else f"= {value!r} has no unit"
+        seen = "is missing" if value is None else f"= {value!r:.100} has no unit"
         raise TypeError(
-            f"{name} {seen}: give a quantity, such as {name.split()[-1]} * u.Unit({str(unit)!r}), "
-            "in this unit or in a unit that can be converted to it."
+            f"{name} {seen}. Give a quantity, such as {name.split()[-1]} * u.Unit({str(unit)!r}). "
+            "Other units are allowed if they can be converted to this unit."
         )
     try:
         return value.to_value(unit, equivalencies=u.dimensionless_angles())
     except u.UnitConversionError:
-        offset = "; in kelvin it is x.to(u.K, u.temperature())" if value.unit == u.deg_C else ""
+        to_kelvin = f" Convert it: {name.split()[-1]}.to(u.K, u.temperature())."
+        is_celsius = value.unit == u.deg_C and unit.is_equivalent(u.K)
         raise ValueError(
-            f"{name} is in {str(value.unit) or 1} ({value.unit.physical_type}), but must be "
-            f"convertible to {str(unit) or 1} ({unit.physical_type}){offset}."
+            f"{name} is in {str(value.unit) or 1} ({value.unit.physical_type}), but its unit must "
+            f"be convertible to {str(unit) or 1} ({unit.physical_type}).{to_kelvin * is_celsius}"
         ) from None
 
 
@@ -298,7 +314,9 @@ def _unit(u: Any, name: str, what: Any) -> Any:
     try:
         return u.Unit(what)
     except (ValueError, TypeError) as error:
-        raise ValueError(f"the unit of {name}, {what!r}, is unknown to astropy: {error}") from None
+        more = "" if name in ("length", "time", "mass") else ", or a word such as 'momentum'"
+        text = f"{name} must be a unit of astropy or its name{more}, got {what!r:.100}."
+        raise ValueError(f"{text} Cause: {error}") from None
 
 
 def _read(u: Any, text: str) -> Any:

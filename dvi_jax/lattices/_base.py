@@ -61,9 +61,10 @@ class Lattice(eqx.Module):
     def steps_to(self, t0: Any, h: Any, num_steps: Any, t1: Any, duration: Any) -> int:
         """Number of steps to the time t1, or over a duration. **Raises** `ValueError`."""
         raise ValueError(
-            f"t1 and duration require equal steps, but the lattice is {self!r}. Leave them out "
-            "and give num_steps; with Given(ts) leave num_steps out too, because ts determines it. "
-            "For the state at a time t1 within the run add save=dvi.Save(ts=[t1])."
+            f"t1 and duration must be left out with lattice={self!r}, because its steps can have "
+            f"different sizes; got t1={t1!r}, duration={duration!r}. Give num_steps instead; with "
+            "Given(ts) leave it out too, because ts determines it. For the state at a time t "
+            "within the run use save=dvi.Save(ts=[t])."
         )
 
     @abc.abstractmethod
@@ -103,9 +104,10 @@ class StepSizes(Lattice):
     def prepare(self, t0, h, num_steps):
         missing = [name for name, x in (("h", h), ("num_steps", num_steps)) if x is None]
         if missing:
+            hint = " The lattice dvi.Uniform() also accepts t1 or duration in place of num_steps."
             raise TypeError(
-                f"{' and '.join(missing)} must be given, since lattice={self!r} requires h and "
-                "num_steps (with dvi.Uniform() you can give t1 or duration in place of num_steps)."
+                f"{' and '.join(missing)} must be given, because lattice={self!r} requires h and "
+                f"num_steps.{hint if num_steps is None else ''}"
             )
         return t0, h, check_num_steps(num_steps)
 
@@ -123,8 +125,9 @@ def check_num_steps(num_steps: object) -> int:
         count = None
     if count is None:
         raise TypeError(
-            f"num_steps must be a Python integer (it determines array shapes), got {num_steps!r}. "
-            'Under jax.jit mark it static: static_argnames="num_steps".'
+            "num_steps must be a Python integer, because it determines array shapes; got "
+            f"{num_steps!r}. If it is an argument of a function under jax.jit, mark it as static: "
+            'jax.jit(function, static_argnames="num_steps").'
         )
     hint = "To go backwards in time give a negative h; divide a longer run into several runs, each "
     hint += "from the end of the one before."

@@ -44,22 +44,31 @@ class Given(Lattice):
             bad = ~np.isfinite(steps) | (steps * (np.sign(steps[0]) if steps.size else 1) <= 0)
             if not np.isfinite(np.asarray(self.ts)).all() or bad.any():
                 k = int(np.argmax(bad)) if bad.any() else 0
+                # The first two times as well: they determine the direction.
+                pairs = {i: np.asarray(self.ts)[i : i + 2].tolist() for i in (0, k)}
                 raise ValueError(
                     "ts in Given(ts) must have finite times in strictly increasing or strictly "
-                    f"decreasing order, but ts[{k}:{k + 2}] is "
-                    f"{np.asarray(self.ts)[k : k + 2].tolist()}."
+                    "decreasing order throughout, got "
+                    f"{' and '.join(f'ts[{i}:{i + 2}] = {pair}' for i, pair in pairs.items())}. "
+                    "np.unique(ts) sorts times and removes equal ones."
                 )
 
     def prepare(self, t0, h, num_steps):
         available = self.ts.shape[0] - 1
         if h is not None:
-            raise ValueError(f"h={h!r} must be left out with Given(ts): ts determines the steps.")
+            raise ValueError(
+                "h must be left out with lattice=Given(ts), because ts determines the steps; got "
+                f"h={h!r}. If this is the h of a problem of dvi.systems, give problem.system, "
+                "problem.q0, problem.p0 and args=problem.args in place of the problem."
+            )
         if not is_traced(t0) and not is_traced(self.ts) and t0 != 0.0 and t0 != self.ts[0]:
-            raise ValueError(f"t0={t0} contradicts ts[0]={self.ts[0]} of Given(ts): leave t0 out.")
+            raise ValueError(
+                f"t0 must be left out with Given(ts), or equal ts[0] = {self.ts[0]}; got t0={t0}."
+            )
         if num_steps is not None and check_num_steps(num_steps) != available:
             raise ValueError(
-                f"num_steps={num_steps} contradicts Given(ts), whose {available + 1} times make "
-                f"{available} steps. Leave num_steps out, or give ts with num_steps + 1 times."
+                "num_steps must be left out with Given(ts), or equal len(ts) − 1 = "
+                f"{available}; got num_steps={num_steps}."
             )
         return self.ts[0], 1.0, available  # any h: the steps do not depend on it
 

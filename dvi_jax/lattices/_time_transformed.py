@@ -149,8 +149,9 @@ class Extended(eqx.Module):
             return Running(self.seen(observable.reduction))
         if isinstance(observable, Trend):
             raise ValueError(
-                "observe has a dvi.Trend. Its slope would be per unit of the fictitious time of "
-                "TimeTransformed: observe the function itself and fit a line over solution.ts."
+                "observe must not contain a dvi.Trend with lattice=TimeTransformed(...): its slope "
+                "would be the change per unit of fictitious time, not of t. In place of "
+                "dvi.Trend(f) observe f, and fit a line to its values over solution.ts."
             )
         if isinstance(observable, Deviations):
             raise ValueError(
@@ -230,6 +231,8 @@ def _check_speed(speed, t0, q0, p0, args) -> None:
     value = jnp.asarray(speed(t0, q0, p0, args))
     if value.shape != () or (not is_traced(value) and not float(value) > 0):
         raise ValueError(
-            "the speed of TimeTransformed must return a positive scalar; at t0, q0, p0 it returns "
-            f"{value if value.shape == () else f'an array of shape {value.shape}'}."
+            "speed of TimeTransformed must return one positive number for each state, but at the "
+            "initial state (t0, q0, p0) it returns "
+            f"{value if value.shape == () else f'an array of shape {value.shape}'}. An example is "
+            "lambda t, q, p, args: jnp.sqrt(q @ q) for an orbit around the origin."
         )

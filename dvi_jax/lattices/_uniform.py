@@ -15,32 +15,35 @@ class Uniform(StepSizes):
         given = {"num_steps": num_steps, "t1": t1, "duration": duration}
         names = [name for name, value in given.items() if value is not None]
         if len(names) > 1:
-            raise ValueError(f"{' and '.join(names)} cannot be given together: give one of them.")
+            got = ", ".join(f"{name}={given[name]!r}" for name in names)
+            raise ValueError(
+                f"only one of num_steps, t1 and duration can be given, got {got}. Keep one of them "
+                "and leave out the others."
+            )
+        name, span = ("duration", "duration") if t1 is None else ("t1", "t1 − t0")
+        seen = f"h={h!r}, {name}={given[name]!r}" + ("" if t1 is None else f", t0={t0!r}")
         try:
             length = float(duration) if t1 is None else float(t1) - float(t0)
             # h = 0 has its own message later.
             steps = length / (float(h) or 1.0)
         except TypeError:
             raise TypeError(
-                f"t0, h and {names[0]} must be numbers that are known before compilation, because "
-                f"they determine array shapes; got t0={t0!r}, h={h!r}, "
-                f"{names[0]}={given[names[0]]!r}. Under jit give num_steps in place of {names[0]}."
+                f"{span} and h must be numbers that are not traced, because they determine the "
+                f"number of steps; got {seen}. Under jax.jit, jax.vmap or jax.grad with respect to "
+                f"one of them give num_steps in place of {name}."
             ) from None
         count = round(steps) if math.isfinite(steps) else -1
         if count < 0:
             raise ValueError(
-                f"{names[0]}={given[names[0]]!r} cannot be reached from t0={t0!r} with steps of "
-                f"h={h!r}. {names[0]} and t0 must be finite. Use h > 0 for a run forwards in time, "
-                "h < 0 for a run backwards; a duration has the sign of h."
+                f"{span} and h must be finite and have the same sign, got {seen}. For a run "
+                "forwards in time both are positive; for a run backwards both are negative."
             )
         # (t1 − t0)/h has round-off, which is not a remaining part of a step.
         if abs(steps - count) > 1e-9 * max(1, count):
             raise ValueError(
-                "the number of steps must be a whole number, but "
-                f"{names[0]}={given[names[0]]!r} requires {steps:.6g} steps of h={h!r} from "
-                f"t0={t0!r}. Use h={length / max(1, count)!r}, "
-                f"or give num_steps in place of {names[0]}. For states at times between two steps "
-                "use save=dvi.Save(ts=[...])."
+                f"{span} must be a whole multiple of h, got {seen}. Use "
+                f"h={length / max(1, count):.12g}, or give num_steps in place of {name}. For "
+                "states at times between two steps use save=dvi.Save(ts=[...])."
             )
         return count
 

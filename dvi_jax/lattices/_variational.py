@@ -89,7 +89,7 @@ class Variational(StepSizes):
         one_of("on_no_root", self.on_no_root, get_args(Policy))
         if not (isinstance(self.reach, int | float) and 1 < self.reach < float("inf")):
             raise ValueError(
-                "reach of Variational must be a number, finite and greater than 1, got "
+                "reach of Variational must be a Python number, finite and greater than 1; got "
                 f"{self.reach!r}. It is the largest ratio of a step size to the previous one."
             )
         try:
@@ -98,22 +98,25 @@ class Variational(StepSizes):
             smallest, largest = 1.0, 0.0
         if not 0 < smallest <= 1 <= largest < float("inf"):
             raise ValueError(
-                "bounds of Variational must be two finite numbers with 0 < smallest ≤ 1 ≤ largest, "
-                f"got {self.bounds!r}. They are multiples of the first step size."
+                "bounds of Variational must be a pair (smallest, largest) of finite numbers with "
+                f"0 < smallest ≤ 1 ≤ largest, got {self.bounds!r}. They limit the ratio of each "
+                "step size to the first step size h."
             )
 
     def check(self, method, arithmetic):
         if not method.is_the_map:
             raise ValueError(
-                "the lattice Variational() requires method=dvi.TypeII(), got "
-                f"{method!r}: the lattice equation, (14) in the paper, is derived for TypeII. For "
-                "a higher order use an H_D of higher order, dvi.discretise(H, order=2)."
+                "lattice=dvi.Variational() requires method=dvi.TypeII(), got "
+                f"method={method!r}. The equation for the step sizes, (14) in the paper, is "
+                "derived for TypeII only. For a higher order give the system a discrete "
+                "Hamiltonian of higher order: dvi.System(dvi.discretise(H, order=2))."
             )
         if arithmetic.undoes_steps:
             raise ValueError(
-                f"the lattice Variational() cannot be used with arithmetic={arithmetic!r}: the "
-                "size of each step is the solution of an equation, and a solve cannot be undone "
-                "bit for bit. Use arithmetic=dvi.Compensated(), or another lattice."
+                f"arithmetic={arithmetic!r} cannot be used with lattice=dvi.Variational(). This "
+                "arithmetic undoes steps bit for bit, but the step sizes of Variational are "
+                "solutions of an equation, and a solve cannot be undone bit for bit. Use "
+                "arithmetic=dvi.Compensated(), or lattice=dvi.Uniform()."
             )
 
     def interval(self, t0, h, k):
@@ -222,8 +225,8 @@ class LatticeCondition(eqx.Module):
     ) -> Scalar:
         if self.system is None:
             raise ValueError(
-                "LatticeCondition requires the system and ε: call "
-                "condition.bind(system, epsilon)(...), or give it to dvi.integrate(observe=...)."
+                "LatticeCondition requires the system and ε when it is called directly: make it by "
+                "dvi.LatticeCondition(system, epsilon). In dvi.integrate(observe=...) both are set."
             )
         equations = Equations(self.system, self.epsilon, args)
 

@@ -74,9 +74,10 @@ class Method(eqx.Module):
         # The errors that a function raises for a q or args of another structure than it expects.
         except (TypeError, IndexError, KeyError, ValueError, AttributeError) as error:
             raise ValueError(
-                f"the functions of the system fail for q of shape {q.shape} and args={args!r} "
-                f"({error}). Give an example of a valid q and of valid args: "
-                "is_explicit(system, q=jnp.zeros(shape), args=...)."
+                f"the functions of the system raise an error for q of shape {q.shape} and "
+                f"args={args!r:.200}. Give an example of a valid q and of valid args: "
+                "is_explicit(system, q=jnp.zeros(shape), args=...). The error is "
+                f"{type(error).__name__}: {error}"
             ) from error
         return found[0]
 
@@ -87,6 +88,6 @@ def check_invertible(name: str, method: Any) -> None:
     instance(name, method, Method, "a method such as dvi.TypeII()")
     if not method.is_invertible:
         raise ValueError(
-            f"{name} must have an inverse step, but {method!r} has none: use a variational method, "
-            "such as dvi.TypeII()."
+            f"{name} must have an inverse step, got {method!r}, a method without an inverse step. "
+            "Use another method, such as dvi.TypeII()."
         )

@@ -142,7 +142,8 @@ def _as_coefficients(values: Sequence[float]) -> tuple[float, ...]:
         return tuple(float(c) for c in values)
     except (TypeError, ValueError):
         raise TypeError(
-            f"the coefficients of a composition must be a sequence of numbers, got {values!r}."
+            "coefficients of Composition must be a sequence of numbers that are not traced, got "
+            f"{values!r:.200}. An example is dvi.Composition((0.2, 0.3, 0.3, 0.2), order=2)."
         ) from None
 
 
@@ -189,8 +190,9 @@ class Composition(CompositionMethod):
         check_invertible("base", base)  # the defects below depend on the base
         if not c or not all(math.isfinite(x) for x in c) or abs(math.fsum(c) - 1) > 1e-12:
             raise ValueError(
-                "the coefficients of a composition must be finite and sum to 1 (consistency); "
-                f"got {c}" + (f", which sum to {math.fsum(c)!r}." if c else ".")
+                f"coefficients of Composition must be finite and sum to 1 up to 1e-12, got {c} "
+                f"with the sum {sum(c)!r}. If the coefficients of a table have too few digits, "
+                "compute one of them as 1 minus the sum of the others."
             )
         hint = "Conditions of higher orders cannot be checked."
         whole("order", order, most=_MOST_CHECKED, hint=hint)
@@ -198,9 +200,10 @@ class Composition(CompositionMethod):
         found = next((n for n, defect in enumerate(defects) if defect > _DEFECT), order)
         if found < order:
             raise ValueError(
-                f"the coefficients have order {found}, not {order}. Their relative defect in the "
-                f"conditions of order {found + 1} is {defects[found]:.1e}. Set order={found}, or "
-                "give the coefficients with more digits."
+                f"order={order} is too high: the coefficients have order {found}, not {order}. "
+                f"They violate the conditions of order {found + 1} by {defects[found]:.1e}; at "
+                f"most {_DEFECT} is allowed. Set order={found}, or give correct coefficients with "
+                "16 digits."
             )
 
     def fractions(self):

@@ -40,12 +40,13 @@ def warn_of_dissipation(
     growth = backwards * float(interval.h) * damping
     if growth > _STRONG and np.isfinite(growth):
         warnings.warn(
-            f"{type(method).__name__} has a substep backwards in time of {backwards:.2g} h, in "
-            "which the damping force amplifies the momenta. At the initial conditions the damping "
-            f"rate is {damping:.3g} per unit of time, and its product with that substep is "
-            f"{growth:.3g}. Above {_STRONG} the map is not more accurate than a map of order 2, "
-            "and at 1 the map is singular. Use a smaller h, or use dvi.Strang(): it has no "
-            "substep backwards.",
+            f"{type(method).__name__} may be inaccurate for this damping. The method has a "
+            f"substep backwards in time of {backwards:.2g} h, and in this substep the damping "
+            f"force amplifies the momenta. The damping rate at the initial conditions is "
+            f"{damping:.3g} per unit of time; the rate times the length of this substep is "
+            f"{growth:.3g}. Above {_STRONG} the map is not more accurate than a map of order 2; "
+            "at 1 it is singular. Use a smaller h, or a method without substeps backwards in "
+            "time, such as dvi.Strang() or dvi.GaussLegendre(2).",
             stacklevel=3,
         )
 

@@ -51,11 +51,14 @@ def as_method(given: Any) -> Any:
     for name, kind in with_number.items():
         if found and found[1] == name.lower():
             return kind(int(found[2]))
-    known = {name.lower(): name for name in (*plain, *(f"{n}8" for n in with_number))}
+    number = found[2] if found else ""
+    known = {name.lower(): name for name in plain}
+    known |= {f"{n}{number}".lower(): f"{n}{number or '(...)'}" for n in with_number}
     close = difflib.get_close_matches(key, known, 1, 0.5)
     meant = f" Did you mean {known[close[0]]!r}?" if close else ""
     raise ValueError(
-        f"method {text!r} is not known.{meant} Allowed are {', '.join(plain)}; "
-        f"{', '.join(with_number)} followed by an order or a number of stages, as in 'Yoshida4'; "
-        "and objects such as dvi.Strang()."
+        f"method must be a known name or an object such as dvi.Strang(), got {text!r}.{meant} The "
+        f"names without a number are {', '.join(plain)}. The names with a number, as in "
+        f"'Yoshida4', are {', '.join(with_number)}. The number is the order; for the last two it "
+        "is the number of stages."
     )

@@ -27,10 +27,10 @@ class Published(CompositionMethod):
     def __check_init__(self):
         if self.order not in self.tables:
             *most, last = self.tables
-            which = f"orders {', '.join(map(str, most))} and {last}" if most else f"order {last}"
+            which = f"{', '.join(map(str, most))} or {last}" if most else f"{last}"
             raise ValueError(
-                f"{type(self).__name__} has coefficients for {which}, got order={self.order!r}. "
-                "For order 2 use dvi.Strang(); for other coefficients, "
+                f"order of {type(self).__name__} must be {which}, got {self.order!r}. For order 2 "
+                "use dvi.Strang(); for coefficients of your own use "
                 "dvi.Composition(coefficients, order=...)."
             )
 

@@ -43,8 +43,9 @@ class RungeKutta4(Method):
     def inverse(self, equations, interval, q1, p1):
         # Callers check `is_invertible` first; only code of a user gets here.
         raise TypeError(
-            "RungeKutta4 has no inverse step in closed form, so it has no adjoint and no "
-            "reversible gradient: use a variational method, or adjoint=dvi.Checkpointed()."
+            "RungeKutta4 has no inverse step: its inverse has no closed form. Use another method, "
+            "such as dvi.Strang(). For gradients without inverse steps use "
+            "adjoint=dvi.Checkpointed()."
         )
 
     def needs_no_solve(self, equations, interval, q):

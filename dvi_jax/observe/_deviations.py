@@ -97,8 +97,8 @@ class _Framed(Deviations):
         whole(f"seed of {type(self).__name__}", self.seed, 0)
         if not isinstance(self.scale, tuple | list) or len(self.scale) != 2:
             raise TypeError(
-                f"scale of {type(self).__name__} must be a pair (unit of q, unit of p), got "
-                f"{self.scale!r}."
+                f"scale of {type(self).__name__} must be a pair (unit of q, unit of p), as a tuple "
+                f"or a list of two entries; got {self.scale!r:.200}."
             )
         for which, unit in zip("qp", self.scale, strict=True):
             if any(is_traced(x) for x in jax.tree.leaves(unit)):
@@ -110,7 +110,8 @@ class _Framed(Deviations):
             if not good:
                 raise ValueError(
                     f"the scale of {which} in {type(self).__name__} must be a positive and finite "
-                    f"number, or an array of such numbers with the shape of {which}; got {unit!r}."
+                    f"number, or an array of such numbers with the shape of {which}; got "
+                    f"{unit!r:.200}."
                 )
 
     def vectors(self, memory):
@@ -127,8 +128,8 @@ class _Framed(Deviations):
         size = value.shape[0]
         if count is not None and count > size:
             raise ValueError(
-                f"{type(self).__name__} has {count} deviation vectors, but a state of {size} "
-                f"components has only {size} directions: use at most {size}."
+                f"{type(self).__name__} can have at most {size} deviation vectors, one for each "
+                f"component of q and p; got {count}. Give it a smaller number."
             )
         # All `size` vectors are drawn, so that the first ones do not depend on the count.
         random = np.random.default_rng(self.seed).standard_normal((size, size))
@@ -146,8 +147,8 @@ class _Framed(Deviations):
             unit = jnp.asarray(unit, like.dtype).ravel()
             if unit.size not in (1, size):
                 raise ValueError(
-                    f"the scale of {which} in {type(self).__name__} must be one number, or {size} "
-                    f"numbers (one for each component of {which}); got {unit.size} numbers."
+                    f"the scale of {which} in {type(self).__name__} must be one number, or an "
+                    f"array with the size of {which} ({size}); got {unit.size} numbers."
                 )
             parts.append(jnp.broadcast_to(unit, (size,)))
         return jnp.concatenate(parts)[None, :]

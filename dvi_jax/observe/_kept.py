@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from .._checks import one_of, whole
 from .._types import Args, Scalar, State
-from ..engine.signature import accepts
+from ..engine.signature import check_takes
 from ._reductions import Reduction
 
 _UNLESS_FIRST = 2
@@ -216,15 +216,15 @@ def event(
     """g at a point, refused unless it is a real scalar that can pass through a value."""
     value = jnp.asarray(g(t, q, p, args))
     if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
+        hint = "For a condition such as |q| > 2 take the difference |q| − 2."
         raise ValueError(
-            f"{name} (t, q, p, args) must return a real scalar (a floating-point number), got "
-            f"shape {value.shape}, dtype {value.dtype}. For a condition such as |q| > 2 take the "
-            "difference, |q| − 2: it passes through zero where the condition changes."
+            f"{name} (t, q, p, args) must return a real scalar of a floating-point type, got a "
+            f"value of shape {value.shape} and dtype {value.dtype}. "
+            + (hint if value.shape == () else "Return for example one component of the array.")
         )
     return value.astype(q.dtype)
 
 
 def check_event(g: Any, of: str) -> None:
     """Refuse a g that cannot be called as ``g(t, q, p, args)``."""
-    if not callable(g) or not accepts(g, 4):
-        raise TypeError(f"g of {of} must be a function of (t, q, p, args) → scalar, got {g!r}.")
+    check_takes(f"g of {of}", g, "(t, q, p, args)")

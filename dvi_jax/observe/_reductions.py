@@ -45,8 +45,9 @@ class Reduction(eqx.Module):
         ``memory + self.change(value, k == at)``.
         """
         raise NotImplementedError(
-            f"{type(self).__name__} cannot be differentiated with dvi.Reversible(): define its "
-            "method combine(memory, k, t, value), or use adjoint=dvi.Direct()."
+            f"{type(self).__name__} cannot be differentiated with adjoint=dvi.Reversible(): it has "
+            "no method combine(memory, k, t, value). Define this method in the class, or use "
+            "adjoint=dvi.Checkpointed()."
         )
 
     @staticmethod
@@ -241,9 +242,11 @@ class Running(eqx.Module):
 
     def __check_init__(self):
         if not (isinstance(self.reduction, Reduction) and self.reduction.has_running_value):
+            seen = getattr(self.reduction, "__name__", f"{self.reduction!r:.200}")
             raise TypeError(
-                "the reduction of Running must have a value at every step, as dvi.MEGNO() or "
-                f"dvi.Mean(f) has, got {self.reduction!r}."
+                "reduction of Running must be an object such as dvi.Mean(f) or dvi.MEGNO(), got "
+                f"{seen}. A function, a class without parentheses and dvi.Section(...) are not "
+                "allowed: a Section has no value at every step."
             )
 
 

@@ -57,4 +57,4 @@ def _of_step(leaf: Any) -> Any:
     for count in (4, 2):
         if accepts(leaf, count):
             return OfState(leaf, count == 4)
-    raise TypeError(f"an observable must have the arguments {FORMS}, got {signature_of(leaf)}.")
+    raise TypeError(f"an observable must be a function of {FORMS}, got {signature_of(leaf)}.")

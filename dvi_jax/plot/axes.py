@@ -36,8 +36,10 @@ def canvas(ax: Any, size: Any = None, space: bool = False) -> tuple[Any, bool]:
     instance("ax", ax, Axes, "the matplotlib Axes to draw on")
     if space != (ax.name == "3d"):
         raise ValueError(
-            f'ax has the projection "{ax.name}", but this picture needs axes that were made '
-            + ('with projection="3d".' if space else "without a projection.")
+            f'ax must be Axes {"with" if space else "without"} projection="3d", got Axes with '
+            f'projection="{ax.name}". Make them by figure.add_subplot('
+            + ('projection="3d"' if space else "")
+            + "), or leave ax out."
         )
     return ax, False
 
@@ -59,7 +61,10 @@ def stack(
     found = [canvas(axis)[0] for axis in np.ravel(np.asarray(ax, object))]
     count = len({name for row in places for name in row} - {"."})
     if len(found) != count:
-        raise ValueError(f"this picture needs {count} Axes ({what}), got {len(found)}.")
+        raise ValueError(
+            f"this picture needs {count} Axes to draw on, {what}; got {len(found)}. Give this "
+            "number of Axes, or none: then a new figure is made."
+        )
     return found, False
 
 
@@ -79,7 +84,7 @@ def at_most(most: int, count: int, what: str, choice: str) -> None:
 def check_attributes(thing: Any, names: Sequence[str], wanted: str) -> None:
     """**Raises** `TypeError` for an object without these attributes."""
     if lacking := ", ".join(name for name in names if not hasattr(thing, name)):
-        raise TypeError(f"{wanted}, got {type(thing).__name__}, which has no {lacking}.")
+        raise TypeError(f"{wanted}; got {type(thing).__name__} without {lacking}.")
 
 
 def labels_of(labels: Any, count: int, what: str, name: str = "labels") -> list[str]:
@@ -89,7 +94,8 @@ def labels_of(labels: Any, count: int, what: str, name: str = "labels") -> list[
     found = [labels] if isinstance(labels, str) else labels
     if len(found) != count or isinstance(labels, str):
         raise ValueError(
-            f"{name} must be a list of names, one for each of {count} {what}, got {labels!r}."
+            f"{name} must be a list of names, one for each of the {what} ({count} in total), got "
+            f"{labels!r:.200}."
         )
     return [str(label) for label in found]
 

@@ -144,8 +144,9 @@ def selections(
         unit |= {d: int(np.diff(b.ends).max()) for d, b in bins.items() if d != line}
         if math.prod(unit.values()) > BLOCK:
             raise ValueError(
-                f"reduce='median' needs all {math.prod(unit.values())} numbers of a pixel at "
-                f"once, but the limit is {BLOCK}: use reduce='mean', more pixels, or less data."
+                f"reduce='median' needs all numbers of a pixel in memory at once, at most {BLOCK}; "
+                f"got {math.prod(unit.values())}. Use reduce='mean' or more "
+                "pixels=(width, height), or select a part of the data by data.isel(...)."
             )
     else:
         known = data.encoding.get("preferred_chunks") or {}

@@ -89,8 +89,8 @@ def animate(
     pixels = round(width * dpi) * round(height * dpi)
     if suffix == ".gif" and pixels * len(times) > _MOST_BYTES:
         raise ValueError(
-            f"a GIF of {len(times)} frames of {pixels} pixels needs too much memory: use fewer "
-            "seconds, a lower fps, a smaller size or dpi, or .mp4."
+            f"a GIF must have at most {_MOST_BYTES} pixels in all frames together, got "
+            f"{len(times)} frames of {pixels} pixels: reduce seconds, fps, size or dpi, or use mp4."
         )
     figure = Figure(figsize=(width, height), dpi=dpi, layout="constrained")
     canvas = FigureCanvasAgg(figure)
@@ -124,7 +124,8 @@ def _check_film(path: Path, suffix: str, seconds: Any, fps: Any, tail: Any, besi
     if suffix not in (".gif", ".mp4"):
         raise ValueError(f"path must end with .gif or .mp4, got {path.name!r}.")
     if not path.parent.is_dir():
-        raise ValueError(f"the folder of path does not exist: create {path.parent} first.")
+        folder = f"create the folder {str(path.parent)!r} first"
+        raise ValueError(f"path must lie in an existing folder, got {str(path)!r}: {folder}.")
     positive("seconds", seconds)
     positive("fps", fps)
     one_of("beside", beside, _BESIDE)
@@ -132,12 +133,13 @@ def _check_film(path: Path, suffix: str, seconds: Any, fps: Any, tail: Any, besi
         raise ValueError(f"tail must be a fraction from 0 to 1, got {tail!r}.")
     if suffix == ".gif" and fps > _FASTEST_GIF:
         raise ValueError(
-            f"fps of a GIF must be at most {_FASTEST_GIF}, got {fps:g} (an .mp4 can have more)."
+            f"fps must be at most {_FASTEST_GIF} for a GIF, got {fps}: reduce fps or write an .mp4."
         )
     if suffix == ".mp4" and not writers.is_available("ffmpeg"):
         raise RuntimeError(
-            "an .mp4 requires ffmpeg, which was not found: install it (apt, brew or conda install "
-            'ffmpeg), set matplotlib.rcParams["animation.ffmpeg_path"], or write a .gif.'
+            f"path {path.name!r} requires the program ffmpeg, but ffmpeg was not found: install it "
+            "(with conda install ffmpeg, apt or brew), set its path in "
+            'matplotlib.rcParams["animation.ffmpeg_path"], or write a .gif.'
         )
 
 
@@ -145,7 +147,10 @@ def _moments(lanes: Sequence[Lane], frames: float) -> np.ndarray:
     """Times of the frames, evenly from the first to the last finite state."""
     known = [lane.ts[lane.there] for lane in lanes if lane.there.any()]
     if not known:
-        raise ValueError("there is nothing to draw: all states of all orbits are NaN or infinite.")
+        raise ValueError(
+            "orbits must have at least one finite state, but each of its saved states contains NaN "
+            "or inf in ts, qs or ps. Check the arrays, or the status of the Solution."
+        )
     count = max(2, min(round(frames), max(len(t) for t in known)))
     ends = np.array([[t[0], t[-1]] for t in known])
     times = np.linspace(ends.min(), ends.max(), count)

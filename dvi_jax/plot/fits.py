@@ -211,7 +211,9 @@ def learning_curve(fit: Any, ax: Any = None) -> Any:
     columns = ("stage", "loss", "accepted", "horizon")
     stage, loss, accepted, horizon = (np.asarray(fit.history[name]) for name in columns)
     if loss.size == 0:
-        raise ValueError("fit has no history to draw, because it took no step.")
+        raise ValueError(
+            "fit.history must have at least one step, but the fit took no step: see fit.status."
+        )
     ax, new = canvas(ax)
     steps, accepted, finite = np.arange(1, len(loss) + 1), accepted.astype(bool), np.isfinite(loss)
     looks = zip(np.unique(stage), itertools.cycle(COLOURS[:-1]), itertools.cycle(MARKERS))
@@ -318,8 +320,9 @@ def _of_parameters(fit: Any, params: Sequence[str] | None) -> tuple[list[int], n
     known = [n for n, v in zip(names, variances, strict=True) if np.isfinite(v) and v > 0]
     if not known:
         raise ValueError(
-            "fit has no covariance to draw. Possible causes: the fit failed, it had too many "
-            "parameters for a Jacobian, or the data determine none of its parameters."
+            "fit.covariance must have a positive and finite number on its diagonal, which starts "
+            f"with {variances[:3].tolist()}. Possible causes: the fit failed, it has more than 400 "
+            "parameters, the data determine none, or sigma is missing and cannot be estimated."
         )
     if params is None:
         draw.at_most(_PARAMETERS, len(names), "parameters", f"params={names[:3]}")
@@ -327,7 +330,11 @@ def _of_parameters(fit: Any, params: Sequence[str] | None) -> tuple[list[int], n
     if len(set(params)) < len(params) or not params or not {*params} <= {*names}:
         raise ValueError(f"params must be one or more different names from {names}, got {params}.")
     if unknown := [name for name in params if name not in known]:
-        raise ValueError(f"the data do not determine {unknown[0]}: choose params from {known}.")
+        seen = f"{variances[names.index(unknown[0])]} for {unknown[0]!r}"
+        raise ValueError(
+            f"params must have positive and finite variances, got {seen}. The data do not "
+            f"determine it, or it is at a bound: choose params from {known}."
+        )
     values = np.asarray(fit.x if np.ndim(fit.x) == 1 else fit.mean)
     return [names.index(n) for n in params], values
 
@@ -338,14 +345,14 @@ def _draws(samples: Any, names: list[str]) -> list[np.ndarray]:
     instance("samples", found, Mapping, "a dvi.Samples or a dict of names with arrays of draws")
     if missing := [name for name in names if name not in found]:
         raise ValueError(
-            f"samples has no draws of {missing[0]!r}, only of {', '.join(map(str, found))}. Choose "
-            "params from the names that samples has."
+            f"samples must have draws of each of params, {names}, got only the names {[*found]}: "
+            f"add draws of {missing[0]!r}, or choose params without it."
         )
     flat = [np.ravel(np.asarray(found[n], float)) for n in names]
     if len({len(f) for f in flat}) > 1:
         raise ValueError(
             "samples must have the same number of draws for each of params, got "
-            f"{[*map(len, flat)]}."
+            f"{dict(zip(names, map(len, flat), strict=True))}."
         )
     return flat
 

@@ -91,13 +91,19 @@ def find_place(data: Any, name: str, pixels: int) -> Place:
     return Place(dim, label, bins, edges[bins.ends], centres, log, zero)
 
 
-def dim_of(data: Any, name: str) -> str:
-    """The dimension of a name, which may be a coordinate along it. **Raises** `ValueError`."""
+def dim_of(data: Any, name: str, role: str = "each of x, y, facet, over and along") -> str:
+    """The dimension of a name, which may be a coordinate along it; `role`: its argument.
+
+    **Raises** `ValueError` with this role.
+    """
     if name in data.dims:
         return name
     if name in data.coords and data.coords[name].ndim == 1:
         return str(data.coords[name].dims[0])
-    raise ValueError(f"the data has no dimension {name!r}: choose from {names_of(data)}.")
+    raise ValueError(
+        f"{role} must be a dimension of the data, got {name!r}. The dimensions (with their sizes) "
+        f"are {names_of(data)}."
+    )
 
 
 def names_of(data: Any) -> str:
@@ -153,7 +159,10 @@ class Grid(NamedTuple):
         count = len(self.panels)
         if ax is not None:
             if count > 1:
-                raise ValueError("facet makes a new figure: leave out ax or facet.")
+                raise ValueError(
+                    f"ax is for one map, but facet={self.facet!r} makes a new figure of {count} "
+                    "maps: leave out ax or facet."
+                )
             return [canvas(ax)[0]]
         if count == 1:
             size = None if height is None else (plt.rcParams["figure.figsize"][0], height)
@@ -194,14 +203,20 @@ def arrange(
     if not (width >= 1 and height >= 1):
         raise ValueError(f"pixels must be (width, height), both at least 1, got {pixels!r}.")
     if empty := [str(d) for d, n in data.sizes.items() if n == 0]:
-        raise ValueError(f"the data has no values to draw along {', '.join(empty)}.")
+        raise ValueError(
+            "data must have at least one value along each dimension, got size 0 along "
+            f"{', '.join(map(repr, empty))}: change the selection."
+        )
     over = (over,) if isinstance(over, str) else tuple(over)
     roles = {"x": x, "y": y, "facet": facet, **{f"over={name!r}": name for name in over}}
     taken: dict[str, str] = {}
     for role, name in roles.items():
-        dim = None if name is None else dim_of(data, name)
+        dim = None if name is None else dim_of(data, name, role.partition("=")[0])
         if dim in taken:
-            raise ValueError(f"{role} and {taken[dim]} both use {dim!r}: change one of them.")
+            raise ValueError(
+                f"{role} and {taken[dim]} must use different dimensions of the data, but both use "
+                f"{dim!r}: change one of them."
+            )
         taken |= {} if dim is None else {dim: role}
     made = made or {}
     gone = [dim_of(data, name) for name, array in made.items() if array is None]
@@ -212,12 +227,17 @@ def arrange(
     if y is None and free:
         y = free.pop(0)
     if x is None:
-        raise ValueError("no dimension of the data has more than one value to draw.")
+        raise ValueError(
+            "data must have a free dimension of size 2 or more for x. Its dimensions (with their "
+            f"sizes) are {names_of(data)}; already used: {[*taken, *gone] or 'none'}. Give x, or "
+            "remove a dimension from facet or over."
+        )
     if free:
         raise ValueError(
-            f"a map has two dimensions, here {x!r} and {y!r}, but the data also has "
-            f"{', '.join(map(repr, free))}. Select one value with data.isel({free[0]}=0), reduce "
-            f"all with over={free[0]!r}, or draw a map for each with facet={free[0]!r}."
+            f"a map has two dimensions, here {x!r} and {y!r}, but data also has "
+            f"{', '.join(map(repr, free))}. Select one value with "
+            f"data.isel({', '.join(f'{d}=0' for d in free)}), or reduce all values with "
+            f"over={[*over, *free]}. With facet, each value of one dimension has its own map."
         )
     data = data.isel({d: 0 for d in left if data.sizes[d] == 1})
     along: dict[Any, Any] = dict.fromkeys((x, y), data) | made

@@ -229,7 +229,8 @@ class Plane(NamedTuple):
         """(q, p) along an orbit, shape (S,) each."""
         if lane.ps is None:
             raise TypeError(
-                "this picture needs momenta: give a Solution or (ts, qs, ps) as orbits."
+                "this picture needs momenta, but an orbit has only times and positions: give each "
+                "orbit as a Solution or (ts, qs, ps)."
             )
         return [x[(slice(None), *self.place)] for x in (lane.qs, lane.ps)]
 
@@ -300,18 +301,20 @@ def view_of(
     """The checked choice of what is drawn of orbits."""
     shape = one_shape(lanes)
     if names is not None and (len(lanes) > 1 or math.prod(shape) == 1):
+        seen = f"{len(lanes)} orbits" if len(lanes) > 1 else f"states of shape {shape}"
         raise ValueError(
-            "names are only for the bodies of a single orbit, not for a state of one number; got "
-            f"{len(lanes)} orbits with states of shape {shape}. Use labels=[...] to name orbits."
+            f"names requires a single orbit with states of at least two numbers, got {seen}: use "
+            "labels=[...] to name orbits."
         )
     if len(shape) not in (1, 2):
         raise ValueError(f"orbits must have states of shape (n,) or (bodies, dim), got {shape}.")
     many, dim, count = len(shape) == 2, shape[-1], shape[0] if len(shape) == 2 else 1
     axes = tuple(chosen("coordinates", coordinates, dim))
     if len(axes) not in (2, 3):
+        one = "For a single coordinate use phase_portrait."
         raise ValueError(
-            f"coordinates must be two or three of the {dim} coordinates, got {len(axes)}: choose "
-            "for example coordinates=(0, 1). For a single coordinate use phase_portrait."
+            f"coordinates must select two or three coordinates, got {len(axes)} for states of "
+            f"shape {shape}. {'Choose for example coordinates=(0, 1).' if dim > 1 else one}"
         )
     drawn = chosen("bodies", bodies, count)
     view = View(axes, drawn, [], many)
@@ -352,7 +355,10 @@ def trajectory(
     """
     lanes = lanes_of(ts if qs is None else (ts, qs, ps))
     if len(lanes) > 1:
-        raise ValueError(f"trajectory draws one orbit, got {len(lanes)}: use orbit for several.")
+        raise ValueError(
+            f"ts must contain a single orbit, got {len(lanes)}: choose one, or draw all with "
+            "phase_portrait or orbit."
+        )
     t, q, p = lanes[0][:3]
     assert p is not None
     units, shape = {"q": position or "", "p": momentum or ""}, q.shape[1:]

@@ -50,9 +50,10 @@ def balance(
         causes = {name: getattr(ts, name) for name in _CAUSES} if causes is None else causes
         ts, drift = ts.ts, ts.drift if drift is None else drift
     if drift is None or not causes:
+        name, seen = ("drift", drift) if drift is None else ("causes", causes)
         raise TypeError(
-            "ts must be a result of dvi.noether_balance. With an array of times as ts, give both "
-            "drift and causes."
+            f"{name} must be given if ts is an array of times, got {name}={seen!r}. A result of "
+            "dvi.noether_balance as ts requires neither drift nor causes."
         )
     given = {"ts": ts, "drift": drift, **causes}
     arrays = {name: np.asarray(x, float) for name, x in given.items()}
@@ -117,8 +118,8 @@ def drift_orders(
     slopes = [*promised] if isinstance(promised, Sequence) else [promised] * len(results)
     if len(slopes) != len(results):
         raise ValueError(
-            f"promised or expected must have {len(results)} orders, one for each result, got "
-            f"{len(slopes)}."
+            "promised or expected must have one order for each result. The number of results is "
+            f"{len(results)}, got the orders {slopes}."
         )
     axis, new = canvas(ax, (6.4, 4.8))
     left = 0.7 * min(order.epsilons.min() for order in results.values())
@@ -315,7 +316,10 @@ def work_precision(
     methods, for shapes that do not fit and for costs that are not positive.
     """
     if not results:
-        raise ValueError("results is empty: give at least one method, {name: (costs, errors)}.")
+        raise ValueError(
+            "results must have at least one method, such as {'Verlet': (costs, errors)}, got "
+            f"{results!r}."
+        )
     axis, new = canvas(ax, (6.4, 4.8))
     runs = {name: _checked(name, pair) for name, pair in results.items()}
     points, lost = np.hstack(list(runs.values())), np.zeros(2, int)
@@ -348,13 +352,17 @@ def _checked(name: str, pair: Any) -> tuple[np.ndarray, np.ndarray]:
     try:
         costs, errors = (np.asarray(x, float) for x in pair)
     except (TypeError, ValueError):
-        raise ValueError(f"results[{name!r}] must be (costs, errors), got {pair!r}.") from None
-    positive = bool((np.isfinite(costs) & (costs > 0)).all())
-    if costs.ndim != 1 or costs.shape != errors.shape or not len(costs) or not positive:
         raise ValueError(
-            f"results[{name!r}] must have costs and errors of the same shape (runs,), with at "
-            "least one run, and positive costs without NaN or inf. The shapes are "
-            f"{costs.shape} and {errors.shape}, the costs {costs}."
+            f"results[{name!r}] must be (costs, errors), two arrays of numbers, got {pair!r:.100}."
+        ) from None
+    if costs.ndim != 1 or costs.shape != errors.shape or not len(costs):
+        raise ValueError(
+            f"results[{name!r}] must be (costs, errors) of the same shape (runs,), with at least "
+            f"one run, got the shapes {costs.shape} and {errors.shape}."
+        )
+    if (bad := ~(np.isfinite(costs) & (costs > 0))).any():
+        raise ValueError(
+            f"the costs in results[{name!r}] must be positive and finite, got {costs[bad][0]}."
         )
     order = np.argsort(costs, kind="stable")
     return costs[order], np.abs(errors[order])

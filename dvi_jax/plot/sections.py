@@ -151,9 +151,11 @@ def section(
 def _points_of(crossings: Any) -> _Points:
     found = _crossings_in(crossings)
     if len(found) != 1:
+        kind = type(crossings).__name__
+        many = f"{len(found)} results: choose one, such as solution.observed['name']"
+        none = f"no such result in {kind}: integrate with observe=dvi.Section(...)"
         raise TypeError(
-            "crossings must be the result of one dvi.Section, as solution.observed has it, got "
-            + (f"{len(found)} results: choose one." if found else f"{crossings!r:.60}.")
+            f"crossings must have the result of one dvi.Section, got {many if found else none}."
         )
     ((one, status),) = found
     qs, ps, ts = (np.asarray(v) for v in (one.qs, one.ps, one.ts))

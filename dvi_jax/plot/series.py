@@ -150,7 +150,10 @@ def _read(
     else:
         lanes, times = [], np.asarray(getattr(orbits, "ts", orbits))
         if times.dtype.kind not in "iuf" or times.ndim == 0:
-            raise TypeError(f"orbits must be a Solution, or times with values=..., got {orbits!r}.")
+            raise TypeError(
+                "orbits must be a Solution, arrays (ts, qs, ps), a list of these, or an array of "
+                f"times together with values, got {orbits!r:.60}."
+            )
         ts = list(times.reshape(-1, times.shape[-1]))
         names = labels_of(labels, len(ts), "orbits")
     watched: dict[str, list[np.ndarray]] = {}
@@ -174,14 +177,16 @@ def _read(
         elif isinstance(v, list) and len(v) == len(lanes):
             watched[name] = [np.asarray(x) for x in v]
         else:
+            kind = f"list of length {len(v)}" if isinstance(v, list) else type(v).__name__
             raise ValueError(
-                f"values[{name!r}] must be a function (q, p), or a list of {len(lanes)} arrays, "
-                "one for each orbit."
+                f"values[{name!r}] must be a function (q, p), or a list with one array for each "
+                f"orbit, of length {len(lanes)}; got {kind}."
             )
     if not watched:
+        what = "orbits has no observable with one value for each saved state or each step"
         raise ValueError(
-            "no observable of orbits has a value for each saved state: give "
-            "values={'energy': numbers or a function (q, p)}."
+            f"{what if values is None else 'values is empty'}: give for example "
+            "values={'energy': f}, where f is an array or a function (q, p)."
         )
     return ts, names, lanes, watched
 
@@ -190,9 +195,10 @@ def _observed(one: Any) -> dict[str, Any]:
     """The observables of a solution that have a value per step."""
     observed = getattr(one, "observed", None)
     if not isinstance(observed, Mapping):
+        seen = "no observables" if observed is None else type(observed).__name__
         raise TypeError(
-            "orbits has no observables: give a solution of integrate(..., observe={'energy': f}), "
-            "or values={'energy': numbers or a function (q, p)}."
+            f"without values, orbits must have a dict of observables, got {seen}. Give values, or "
+            "integrate(...) with observe={'energy': f}."
         )
     *lead, n = np.shape(one.ts)
     shapes, front = ((*lead, n), (*lead, n - 1)), len(lead) + 1

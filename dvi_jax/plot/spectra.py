@@ -41,7 +41,7 @@ def spectrum(
     do not fit.
     """
     if amplitudes is None:
-        wanted = "without amplitudes, frequencies must be an object that has both"
+        wanted = "amplitudes must be given, or frequencies must be an object that has both"
         draw.check_attributes(frequencies, ("frequencies", "amplitudes"), wanted)
         frequencies, amplitudes = frequencies.frequencies, frequencies.amplitudes
     w, A = np.asarray(frequencies), np.abs(np.asarray(amplitudes))
@@ -126,8 +126,13 @@ def frequency_map(
 def _draw_plane(axis: Any, x: Any, y: Any, D: Any, norm: Any) -> tuple[Any, list[Any]]:
     """(cells over a grid of initial conditions, legend entries)."""
     for name, values in (("x", x), ("y", y)):
-        if not (np.diff(values) > 0).all() or not np.isfinite(values).all():
-            raise ValueError(f"{name} of a grid must be increasing and finite, got {values}.")
+        wrong = ~np.isfinite(values) | ~(np.diff(values, prepend=-np.inf) > 0)
+        if wrong.any():
+            i = int(np.argmax(wrong))
+            raise ValueError(
+                f"{name} of a grid must be increasing and finite, got {name}[{i}] = {values[i]}"
+                + (f" after {values[i - 1]}." if i else ".")
+            )
     mesh = draw.cells(axis, draw.cell_edges(x), draw.cell_edges(y), D.T, norm, draw.SHADES)
     texts = counted({f"of {D.size} orbits have no value": np.sum(~np.isfinite(D))})
     return mesh, [Patch(label=text, **draw.HATCH) for text in texts]

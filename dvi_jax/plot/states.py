@@ -53,7 +53,10 @@ def lanes_of(orbits: Any, labels: Sequence[str] | None = None, momenta: bool = T
     if not lanes:
         raise ValueError("orbits is empty: give at least one orbit.")
     if momenta and any(lane.ps is None for lane in lanes):
-        raise TypeError("this picture needs momenta: give a Solution or (ts, qs, ps) as orbits.")
+        raise TypeError(
+            "this picture needs momenta, but an orbit has only times and positions: give each "
+            "orbit as a Solution or (ts, qs, ps)."
+        )
     names = labels_of(labels, len(lanes), "orbits")
     return [lane._replace(label=name) for lane, name in zip(lanes, names, strict=True)]
 
@@ -64,13 +67,14 @@ def _lanes_of_one(one: Any) -> list[Lane]:
     elif isinstance(one, tuple) and len(one) in (2, 3):
         given = list(one)
     else:
+        seen = type(one).__name__ + (f" of length {len(one)}" if isinstance(one, tuple) else "")
         raise TypeError(
-            "orbits must be a Solution, the arrays (ts, qs, ps), or a list of either, got "
-            f"{type(one).__name__}."
+            f"each orbit must be a Solution or a tuple of arrays (ts, qs, ps), got {seen}."
         )
     ts, *states = (np.asarray(x) for x in given if x is not None)
-    if bad := [x.dtype for x in (ts, *states) if x.dtype.kind not in "iuf"]:
-        raise TypeError(f"orbits must consist of real numbers, got an array of dtype {bad[0]}.")
+    for name, x in zip(("ts", "qs", "ps"), (ts, *states), strict=False):
+        if x.dtype.kind not in "iuf":
+            raise TypeError(f"{name} of an orbit must be real numbers, got dtype {x.dtype}.")
     if ts.ndim and states[0].shape == ts.shape:  # a state that is one number
         states = [x[..., None] for x in states]
     fits = all(x.shape[: ts.ndim] == ts.shape and x.ndim > ts.ndim for x in states)
@@ -99,7 +103,7 @@ def chosen(name: str, which: Any, count: int) -> list[int]:
     """Numbers below `count`: all of them for None."""
     numbers = range(count) if which is None else np.ravel(which).tolist()
     if not len(numbers):
-        raise ValueError(f"{name} is empty: choose at least one, from 0 to {count - 1}.")
+        raise ValueError(f"{name} is empty: choose at least one number from 0 to {count - 1}.")
     return [whole(name, i, 0, count - 1) for i in numbers]
 
 
@@ -139,8 +143,8 @@ def component(
     if found is None or (found[2] is None and math.prod(shape) != 1):
         example = f"q[{', '.join('0' * len(shape))}]"
         raise ValueError(
-            f'a coordinate must be the name of a component, such as "{example}" for a state of '
-            f"shape {shape}, or a function (q, p) → number; got {which!r}."
+            f'x or y must be a component of the state, such as "{example}", or a function (q, p) '
+            f"that returns a number. The states have shape {shape}; got {which!r}."
         )
     letter, inside = found.groups()
     index = tuple(map(int, inside.split(","))) if inside else (0,) * len(shape)
@@ -153,7 +157,8 @@ def each_state(function: Callable[..., Any], qs: Any, ps: Any) -> np.ndarray:
     """A function ``(q, p)`` of every state, shape (N, ...)."""
     values = np.asarray(jax.vmap(function)(qs, ps))
     if values.dtype.kind not in "biuf":
-        raise TypeError(f"a function (q, p) must return real numbers, got dtype {values.dtype}.")
+        name = getattr(function, "__name__", "a function")
+        raise TypeError(f"{name}(q, p) must return real numbers, got dtype {values.dtype}.")
     return values
 
 
@@ -191,7 +196,9 @@ def looks_of(count: int, values: Any = None, limits: tuple[float, float] | None 
         return Looks([tuple(c) for c in SHADES(np.linspace(0, 1, count))], ["-"] * count)
     values = np.ravel(np.asarray(values, float))
     if len(values) != count:
-        raise ValueError(f"colour has {len(values)} values for {count} orbits: give one for each.")
+        raise ValueError(
+            f"colour must have length {count}, one value for each orbit, got length {len(values)}."
+        )
     known = np.isfinite(values)
     scale = ScalarMappable(scale_of(values, limits)[0], SHADES)
     shades = [tuple(scale.to_rgba(v)) if k else PALE for v, k in zip(values, known, strict=True)]

@@ -103,7 +103,10 @@ def look_of(options: Mapping[str, Any], *but: str) -> Look:
 def check_keywords(given: Mapping[str, Any], *known: str) -> None:
     """**Raises** `TypeError` for a keyword that is not one of those known."""
     if unknown := [name for name in given if name not in known]:
-        raise TypeError(f"unknown keyword {unknown[0]!r}; allowed are {', '.join(known)}.")
+        raise TypeError(
+            f"unknown keyword {unknown[0]!r}; allowed are {', '.join(known)} and the arguments in "
+            "the signature of the function."
+        )
 
 
 @in_style
@@ -116,10 +119,16 @@ def save(drawn: Any, path: str | Path) -> Path:
     path = Path(path)
     axes = np.ravel(np.asarray(drawn, object)).tolist()
     if not axes or not all(hasattr(axis, "figure") for axis in axes):
-        raise TypeError(f"drawn must be a figure or the axes that a plot returns, got {drawn!r}.")
+        raise TypeError(
+            "drawn must be a figure, or the Axes that a function of dvi_jax.plot returns, got "
+            f"{drawn!r:.200}."
+        )
     figures = {figure_of(axis) for axis in axes}  # a figure's own `figure` is itself
     if len(figures) > 1:
-        raise ValueError(f"drawn has axes of {len(figures)} figures: save one figure at a time.")
+        raise ValueError(
+            f"drawn must be from one figure, got axes of {len(figures)} figures: call save once "
+            "for each figure."
+        )
     figure = figures.pop()
     figure.savefig(path)
     plt.close(figure)

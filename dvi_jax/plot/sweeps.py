@@ -121,14 +121,20 @@ def slope_map(
     values, order = _positive(data, along)
     others, facet = where.get("over", ()), where.get("facet")
     others = [*([others] if isinstance(others, str) else others), *([facet] if facet else [])]
-    if any(dim_of(data, name) == dim for name in others):
-        raise ValueError(f"facet and over must not be {along!r}: slopes are computed along it.")
+    if wrong := [name for name in others if dim_of(data, name) == dim]:
+        raise ValueError(
+            f"facet and over must not use the dimension {dim!r}, got {wrong[0]!r}: the slopes are "
+            "computed along this dimension. Choose another one."
+        )
     x, y = (along if name is not None and dim_of(data, name) == dim else name for name in (x, y))
     local = local or along in (x, y)
     made: dict[str, Any] = {along: None}
     if local:
         if along not in (x, y) and None not in (x, y):
-            raise ValueError(f"local=True needs {along!r} as x or y: give it, or leave x or y out.")
+            raise ValueError(
+                f"local=True needs {along!r} as x or y, got x={x!r} and y={y!r}: set x or y to "
+                f"{along!r}, or leave one of them out."
+            )
         if along not in (x, y):
             x, y = (along, y) if x is None else (x, along)
         middle = np.sqrt(values[1:] * values[:-1])
@@ -165,10 +171,10 @@ def failure_map(
     **Returns** the `Axes`, an array of them with `facet`. **Raises** `TypeError` or `ValueError`
     for data without a status, and as `sweep_map`.
     """
-    status = _status_of(data)
+    status = _status_of("data", data)
     one_of("reduce", reduce, ("any", "fraction"))
     grid = arrange(status, x, y, where)
-    found = _count(status, grid, (panel for _, panel in grid.panels))
+    found = _count("data", status, grid, (panel for _, panel in grid.panels))
     codes, names = found.codes, found.names
     if reduce == "fraction":
         pictures = []
@@ -215,8 +221,8 @@ def _scale(pictures: Sequence[Picture], log: bool | None, limits: Any) -> tuple[
         log = log and bool(positive.max() > 10**_DECADES * positive.min())
     if log and (found < 0).any():
         raise ValueError(
-            f"a logarithmic scale cannot show the {np.sum(found < 0)} pixels below 0: leave out "
-            "log=True, or draw abs(data)."
+            "log=True is not allowed for negative values, and the smallest value of a pixel is "
+            f"{found.min():.3g}: leave out log=True, or draw abs(data)."
         )
     if limits is not None:
         low, high = two_numbers(limits)
@@ -310,10 +316,13 @@ def _share(count: int, total: int) -> str:
 
 def _positive(data: Any, along: str) -> tuple[np.ndarray, np.ndarray]:
     """(positive values of a coordinate, rising; their places along the dimension)."""
-    if along not in data.coords or data.coords[along].dtype.kind not in "iuf":
+    kind = data.coords[along].dtype if along in data.coords else None
+    if kind is None or kind.kind not in "iuf":
+        seen = "has no coordinate values" if kind is None else f"has values of dtype {kind}"
         raise ValueError(
-            f"along={along!r} has no numbers for a slope: choose a coordinate that has numbers. "
-            f"The dimensions are {names_of(data)}."
+            f"along={along!r} must have numbers as coordinate values, but it {seen}: add "
+            "numbers with data.assign_coords, or choose another dimension or coordinate. The "
+            f"dimensions are {names_of(data)}."
         )
     values = data.coords[along].values
     order = np.argsort(values, kind="stable")
@@ -321,8 +330,9 @@ def _positive(data: Any, along: str) -> tuple[np.ndarray, np.ndarray]:
     different = len(np.unique(values[order]))
     if different < max(2, len(order)):
         raise ValueError(
-            f"along={along!r} must have at least two positive values, all different, for a slope; "
-            f"it has {len(order)} positive values, {different} of them different."
+            f"along={along!r} must have at least two positive values, and none of them twice. The "
+            f"number of positive values is {len(order)}, that of different ones is {different}. "
+            "Select other values, or choose another coordinate."
         )
     return np.asarray(values[order], float), order
 
@@ -357,24 +367,28 @@ class _Statuses(NamedTuple):
     counts: list[np.ndarray]
 
 
-def _status_of(data: Any) -> Any:
+def _status_of(name: str, data: Any) -> Any:
     import xarray as xr
 
     if isinstance(data, xr.Dataset):
         if "status" not in data:
-            held = ", ".join(map(str, data.data_vars))
-            raise ValueError(f"data has no status, only {held}: give to_xarray() of a sweep.")
+            held = ", ".join(map(str, data.data_vars)) or "no variables"
+            raise ValueError(
+                f"{name} must contain the variable status, got a Dataset with {held}: give "
+                "result.to_xarray(), where result is the result of dvi.sweep."
+            )
         data = data["status"]
     return checked_array(data)
 
 
-def _count(status: Any, grid: Grid, panels: Iterable[Any]) -> _Statuses:
+def _count(name: str, status: Any, grid: Grid, panels: Iterable[Any]) -> _Statuses:
     """The statuses in the pixels of a map."""
-    values, meanings = (status.attrs.get(name) for name in ("flag_values", "flag_meanings"))
+    values, meanings = map(status.attrs.get, ("flag_values", "flag_meanings"))
     if values is None or meanings is None or len(values) != len(meanings.split()):
         raise ValueError(
-            "the status must have the attributes flag_values and flag_meanings, with one name for "
-            "each value: take it from to_xarray() of a sweep."
+            f"{name} must have the attributes flag_values and flag_meanings, with one word in "
+            f"flag_meanings for each value, got {values!r} and {meanings!r}: give "
+            "result.to_xarray().status, where result is the result of dvi.sweep."
         )
     codes, names = zip(*sorted(zip(map(int, values), meanings.split(), strict=True)), strict=True)
     counts = [count_codes(panel, grid.bins, codes) for panel in panels]
@@ -385,14 +399,15 @@ def _count(status: Any, grid: Grid, panels: Iterable[Any]) -> _Statuses:
 
 def _count_beside(status: Any, grid: Grid) -> _Statuses:
     """The statuses in the pixels of a map of other numbers."""
-    status = _status_of(status)
+    status = _status_of("status", status)
     along = [] if grid.facet is None else [dim_of(status, grid.facet)]
     wanted = [*grid.bins, *along]
     others = [d for d in status.dims if d not in (*wanted, *grid.over) and status.sizes[d] > 1]
     if others or any(d not in status.dims for d in wanted):
         raise ValueError(
-            f"the status must have the dimensions of the map, {', '.join(wanted)}, and no others; "
-            f"it has {names_of(status)}. Before the plot, select the same values in both."
+            f"status must have the dimensions {', '.join(wanted)} of the map and no others, got "
+            f"{names_of(status)}: use the status of the same sweep as data, and select the same "
+            "values in both before the plot."
         )
     selections = (dict.fromkeys(along, i) for i in range(len(grid.panels)))
-    return _count(status, grid, (status.isel(one) for one in selections))
+    return _count("status", status, grid, (status.isel(one) for one in selections))

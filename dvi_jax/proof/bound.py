@@ -28,6 +28,11 @@ _ACCEPTED = {"float64": 2.0**-49, "pairs of float64": 2.0**-94}
 """Residual of an implicit equation that a solver accepts, relative to the largest momentum: eight
 units of round-off, and twice what `DoubleDouble` leaves out."""
 
+_GIVE_TIME = (
+    "give the interval in which steps begin, time=(t_begin, t_end). If the system has "
+    "slow_time=True, give an interval of τ = εt."
+)
+
 
 class ProofError(Exception):
     """Nothing is proved: the message says what failed, and for which states."""
@@ -166,10 +171,7 @@ def bound_drift(
     try:
         result = search.subdivide(checker, identities, seen, ratio=ratio, **limits)
     except exact.Failed as error:
-        raise ProofError(
-            f"{error}. If the arguments are correct, take a smaller domain, ε or h, or larger "
-            "max_boxes and max_seconds."
-        ) from None
+        raise ProofError(f"{error}.") from None
     per_step = [exact.up(b) for b in result.bounds]
     certificate |= {
         "per_step": [b.hex() for b in per_step],
@@ -218,8 +220,8 @@ def _step_of(
     explicit = method.is_explicit(system, jnp.zeros(shape), args)
     if not (explicit or method.is_the_map):
         raise ValueError(
-            f"{method!r} is implicit for this system. Use dvi.TypeII(), whose step is an explicit "
-            "function of (q0, p1), or a method that is explicit for this system."
+            "method must be dvi.TypeII(), or another method that is explicit for this system. "
+            f"{method!r} is implicit for this system: use method=dvi.TypeII()."
         )
     plain = System(system.H_D, system.force, system.perturbation)
     start = jnp.full(shape, 0.1)
@@ -243,13 +245,11 @@ def _step_of(
             batched(q, p, np.full(8, t), np.full(8, 0.1), jnp.asarray(h)) for t in (0.0, 1.0)
         )
         if not np.allclose(first, later, rtol=1e-12, atol=1e-12, equal_nan=True):
-            raise ValueError(
-                "the map depends on the time: give the interval in which steps begin, "
-                "time=(t_begin, t_end). With slow_time=True it is an interval of τ = εt."
-            )
+            raise ValueError(f"time is missing, but the map depends on the time: {_GIVE_TIME}")
     zero = jnp.zeros(())
     at = stepped if times else lambda q, p, t, *rest: stepped(q, p, zero, *rest)
-    program = program_of(at, shape, shape, *[()] * (4 if quantum else 3))
+    shapes = [shape, shape, *[()] * (4 if quantum else 3)]
+    program = _listed("the step of the system", at, shapes, None)
     return batched, {"step": program, "implicit": not explicit, "quantum": float(quantum).hex()}
 
 
@@ -269,18 +269,20 @@ def _functions(found: Any, system: System, timed: bool) -> list[tuple[Callable, 
     """(function of (q, p, t, ε, h), formula) for each invariant."""
     if isinstance(found, Discovery):
         if not found.count:
-            raise ValueError("the Discovery has found no invariant: there is nothing to bound.")
+            raise ValueError(
+                "found must contain at least one invariant, but this Discovery has none: call "
+                "dvi.discover_invariants with more functions in the basis, or with a lower order."
+            )
         return _functions(list(found.invariants), system, timed)
     if isinstance(found, InvariantSeries):
         if found.basis.uses_time and not timed:
             raise ValueError(
-                "the invariant depends on the time: give the interval in which steps begin, "
-                "time=(t_begin, t_end). With slow_time=True it is an interval of τ = εt."
+                f"time is missing, but the invariant depends on the time: {_GIVE_TIME}"
             )
         if found.basis.uses_time and found.slow_time != system.slow_time:
             raise ValueError(
-                f"the invariant was found with slow_time={found.slow_time}, and the system has "
-                f"slow_time={system.slow_time}: give the system with which it was found."
+                f"the invariant was found with slow_time={found.slow_time}, but system has "
+                f"slow_time={system.slow_time}: give the system for which the invariant was found."
             )
         return [(lambda q, p, t, e, h: found.evaluate(q, p, e, t), found.formula(terms=8))]
     if isinstance(found, ExactInvariant):
@@ -297,7 +299,7 @@ def _functions(found: Any, system: System, timed: bool) -> list[tuple[Callable, 
         return [(lambda q, p, t, e, h: found(q, p, e), name)]
     pairs = [pair for one in found for pair in _functions(one, system, timed)]
     if not pairs:
-        raise ValueError("found is empty: give an invariant, or a list of at least one.")
+        raise ValueError(f"found must contain at least one invariant, got {found!r:.200}.")
     return pairs
 
 
@@ -306,7 +308,9 @@ def _listed(what: str, function: Callable, shapes: list, ndim: int | None) -> di
     structs = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes]
     result = jax.eval_shape(function, *structs)
     if ndim is not None and getattr(result, "ndim", None) != ndim:
-        raise ValueError(f"{what} must return one number, got shape {jnp.shape(result)}.")
+        kind = type(result).__name__
+        seen = f"an array of shape {result.shape}" if hasattr(result, "shape") else f"a {kind}"
+        raise ValueError(f"{what} must return one number, got {seen}.")
     try:
         return program_of(function, *shapes)
     except Unsupported as error:
@@ -327,16 +331,18 @@ def _domain(domain: Any, found: Any) -> tuple[tuple[int, ...], tuple[list[float]
     parts = domain if isinstance(domain, tuple) else (domain, domain)
     if len(parts) != 2:
         raise ValueError(
-            "domain must be half-widths (a number or an array), or a pair (domain of q, domain "
-            f"of p); got a tuple of {len(parts)}: {domain!r}."
+            "domain must be a half-width, an array of half-widths, or a pair (domain of q, domain "
+            f"of p), got a tuple of length {len(parts)}: {domain!r:.200}. Give half-widths of "
+            "several coordinates as an array."
         )
     shapes = [np.shape(x)[1:] if np.ndim(x) > 1 else np.shape(x) for x in parts]
     one = found if isinstance(found, Discovery) else None
     shape = one.shape if one is not None else max(shapes, key=len)
     if not shape:
         raise ValueError(
-            f"domain={domain!r} does not contain the number of coordinates of q: give half-widths "
-            "as an array like q, for example domain=np.full(2, 0.5)."
+            "domain must be an array with the shape of q, unless found is a Discovery, got "
+            f"{domain!r}: give one half-width for each coordinate, such as "
+            "domain=np.full(2, 0.5) for two coordinates."
         )
     lower, upper = [], []
     for name, x in zip("qp", parts, strict=True):
@@ -345,8 +351,8 @@ def _domain(domain: Any, found: Any) -> tuple[tuple[int, ...], tuple[list[float]
         low, high = (np.broadcast_to(side, shape).ravel() for side in (low, high))
         if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
             raise ValueError(
-                f"the domain of {name} must have finite bounds, with lower bounds below upper "
-                f"bounds, got {low.tolist()} and {high.tolist()}. A half-width must be positive."
+                f"domain of {name} must have finite lower bounds below finite upper bounds, got "
+                f"{low.tolist()} and {high.tolist()}. Half-widths must be positive."
             )
         lower.extend(low.tolist())
         upper.extend(high.tolist())

@@ -65,8 +65,9 @@ class Program:
         unknown = {self.operations[i][1] for i in order if self.operations[i][0] == "unknown"}
         if unknown:
             raise Unsupported(
-                f"the function uses {', '.join(sorted(unknown))}; a proof needs sums, products, "
-                f"quotients, powers and {', '.join(UNARY)}."
+                f"the function uses {', '.join(sorted(unknown))}, but a proof allows only sums, "
+                f"products, quotients, powers and {', '.join(UNARY)}. Remove the other "
+                "operations. For example, select_n is the name of jnp.where in JAX."
             )
         new = {old: i for i, old in enumerate(order)}
         operations = []

@@ -89,10 +89,10 @@ def exact_coefficients(invariant: InvariantSeries, h: float) -> ExactInvariant:
         numbers[place] = _relation(ratio, h, error) if ratio else (1, 0, 0, 0)
         if not numbers[place][0]:
             raise ValueError(
-                f"the coefficient {c[place]:.10g} of ε^{place[0]} "
-                f"{invariant.basis.names[place[1]]} has no form (n_0 + n_1 h + n_2 h²)/d with "
-                f"small integers. Check that the invariant was found with h={h!r}; if it was, its "
-                "coefficients have no exact form."
+                f"the coefficient of ε^{place[0]} {invariant.basis.names[place[1]]}, divided by "
+                f"the largest one, is {ratio:.10g}. It has no form (n_0 + n_1 h + n_2 h²)/d "
+                "with small integers n_0, n_1, n_2 and d. Check that the invariant was found with "
+                f"h={h!r}. If it was, no exact form of this invariant can be given."
             )
     return ExactInvariant(invariant.basis, numbers)
 

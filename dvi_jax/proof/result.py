@@ -67,8 +67,8 @@ class DriftBound(eqx.Module):
         checker, x = exact.Checker(self.certificate), [*np.ravel(q0), *np.ravel(p0)]
         if len(x) != 2 * checker.n:
             raise ValueError(
-                f"q0 and p0 must have {checker.n} numbers each, as in the domain of the proof; "
-                f"they have {np.size(q0)} and {np.size(p0)}."
+                f"q0 and p0 must each have the size {checker.n}, as in the domain of the proof, "
+                f"got the sizes {np.size(q0)} and {np.size(p0)}."
             )
         low, high = map(float, checker.epsilon)
         epsilon = finite("epsilon", epsilon)
@@ -76,8 +76,8 @@ class DriftBound(eqx.Module):
             raise ValueError(f"q0 and p0 must be finite numbers, got {q0!r} and {p0!r}.")
         if not low <= epsilon <= high:
             raise ValueError(
-                f"epsilon={epsilon!r} is not in the interval [{low:g}, {high:g}] of the proof: "
-                "call bound_drift with an interval that contains it."
+                f"epsilon={epsilon!r} is not in the interval [{low!r}, {high!r}] of the proof: "
+                "call bound_drift with an interval that contains this epsilon."
             )
         if self.level is None:
             return 0

@@ -259,11 +259,16 @@ def subdivide(
     failed = [leaf for leaf in inner if leaf.failed]
     if failed:
         raise TooMany(
-            f"on {len(failed)} of {count} boxes of the domain nothing is bounded. The first is "
-            f"{place(failed[0].box)}: {failed[0].failed}"
+            f"no bound was found on {len(failed)} of {count} boxes of the domain. The first is "
+            f"{place(checker, failed[0].box)}: {failed[0].failed}. If the domain has singular "
+            "states, exclude them with domain or inside. Otherwise use a smaller domain, epsilon "
+            "or h, or larger max_boxes and max_seconds"
         )
     if not inner:
-        raise exact.Failed("no state of the domain has inside(q, p) ≥ 0: correct inside or domain")
+        raise exact.Failed(
+            "inside(q, p) must be ≥ 0 for some states of the domain, but for each state it has a "
+            "negative value: correct inside or domain"
+        )
     columns = (
         [max(column) for column in zip(*(getattr(leaf, name) for leaf in inner), strict=True)]
         for name in ("bounds", "rounding", "moved")
@@ -355,8 +360,9 @@ def enclose(
         narrow = all(b - a <= (d - c) / 4096 for (a, b), (c, d) in zip(box, whole, strict=True))
         if late or narrow or hopeless.any():
             raise TooMany(
-                f"a trajectory may reach the box {place(box)}: the invariants do not exclude it. "
-                "A smaller ε or h, or larger max_boxes and max_seconds, may help"
+                "the invariants do not exclude that a trajectory leaves the domain and reaches "
+                f"the box {place(checker, box)}. Try a smaller epsilon or h, or larger max_boxes "
+                "and max_seconds"
             )
         if not borders:
             first, second = halves(box, axis)
@@ -386,9 +392,11 @@ def _corners(box: list, rng: Any) -> np.ndarray:
     return (low + high) / 2 + signs * (high - low) / 2
 
 
-def place(box: list) -> str:
-    """A box as text."""
-    return " × ".join(f"[{float(a):.4g}, {float(b):.4g}]" for a, b in box if a < b)
+def place(checker: Any, box: list) -> str:
+    """A box as text, without the coordinates that are constant."""
+    names = [f"{x}{i + 1 if checker.n > 1 else ''}" for x in "qp" for i in range(checker.n)]
+    sides = zip([*names, "τ" if checker.slow else "t", "ε"], box, strict=True)
+    return ", ".join(f"{n} in [{float(a):.4g}, {float(b):.4g}]" for n, (a, b) in sides if a < b)
 
 
 def _widest(box: list, whole: list, of: Any = ()) -> int:

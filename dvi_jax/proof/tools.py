@@ -9,8 +9,8 @@ def tools() -> tuple[Any, Any]:
         from . import checker, search
     except ImportError as error:
         raise ImportError(
-            "bound_drift computes with python-flint, which is not installed: "
-            'pip install "dvi-jax[proof]", or pip install python-flint.'
+            f"proofs need the package python-flint, but the import failed ({error}). Install it "
+            'with pip install "dvi-jax[proof]" or pip install python-flint.'
         ) from error
     return checker, search
 

@@ -122,20 +122,21 @@ def sweep(
         _check_units(units, found)
         about["units"] = json.dumps(dict(units))
     if client is not None and not hasattr(client, "submit"):
-        raise TypeError(f"client must be a distributed.Client, got {client!r}.")
+        raise TypeError(f"client must be a distributed.Client, got {client!r:.200}.")
     if threads is not None:
         whole("threads", threads)
         if client is not None:
-            raise ValueError("threads has no effect with client: leave threads out.")
+            raise ValueError(f"threads={threads} has no effect with client: leave threads out.")
     config = description(made, program.plan, found, programs)
     if store is None:
         needed = program.plan.lanes * sum(v.bytes for v in found.values())
-        there = machine_memory() or 8 * 2**30
+        memory = machine_memory()
+        there = memory or 8 * 2**30
         if needed > _SHARE * there:
             raise ValueError(
-                f"the results need {needed / 2**30:.1f} GiB, but may use only {_SHARE:.0%} of the "
-                f"{there / 2**30:.1f} GiB of memory: give store=..., a directory. "
-                "Then only one task at a time is in memory."
+                f"the results need {needed / 2**30:.2f} GiB, but may use only {_SHARE:.0%} of the "
+                f"{there / 2**30:.2f} GiB of memory{'' if memory else ' (an assumed size)'}: give "
+                "store=..., a directory to which the results of each task are written."
             )
         sink = Memory(program.plan, found)
         about |= {"config": json.dumps(config), "config_sha256": digest(config)}
@@ -177,10 +178,13 @@ def sweep_cost(system: System, q0: Any = None, p0: Any = None, **settings: Any) 
 
 def _check_units(units: Any, found: Mapping[str, Any]) -> None:
     if not isinstance(units, Mapping) or not all(isinstance(u, str) for u in units.values()):
-        raise TypeError(f'units must be a dict such as {{"drift": "J"}}, got {units!r}.')
+        example = '{"drift": "J"}'
+        raise TypeError(
+            f"units must be a dict from names to text, such as {example}, got {units!r}."
+        )
     if unknown := [name for name in units if name not in found]:
         raise ValueError(
-            f"units are given for {unknown[0]!r}, which is not a result. The results are "
+            f"units has the unknown name {unknown[0]!r}: use the names of results. These are "
             f"{', '.join(found)}."
         )
 
@@ -232,8 +236,8 @@ def _make_sweep(system: Any, q0: Any, p0: Any, given: dict[str, Any]) -> Sweep:
         Axis(start.name, [0])  # raises for a name that is not an identifier
         if start.name in (name for name, *_ in axes):
             raise ValueError(
-                f"an Axis and the initial conditions {type(start).__name__}(...) have the same "
-                f"name, {start.name!r}: give one of them another name=..."
+                f"start={type(start).__name__}(...) and an axis have the same name, "
+                f"{start.name!r}: give start another name=..."
             )
         axes.append((start.name, start.count, "start"))
     dims = lengths(axes)
@@ -258,32 +262,41 @@ def _states(q0: Any, p0: Any, start: Any) -> dict[str, Any]:
             return {}
     elif q0 is not None and p0 is not None:
         return {"q0": q0, "p0": p0}
-    raise ValueError("give both q0 and p0, or only start=..., such as dvi.starts.Random(...).")
+    given = {"q0": q0, "p0": p0, "start": start}
+    seen = ", ".join(name for name, x in given.items() if x is not None) or "none of them"
+    raise ValueError(
+        f"give both q0 and p0, or only start=..., such as dvi.starts.Random(...), got {seen}."
+    )
 
 
 def _check_dims(dims: Mapping[str, int]) -> None:
     if bad := [name for name in dims if name in RESERVED]:
         raise ValueError(
-            f"the axis {bad[0]!r} has a reserved name ({', '.join(RESERVED)}): rename it."
+            f"the axis {bad[0]!r} has a reserved name: choose another name. Reserved are "
+            f"{', '.join(RESERVED)}."
         )
     if not dims:
         raise ValueError(
-            'nothing varies: give an array for epsilon or h, a dvi.Axis("name", values) anywhere, '
-            "or start=dvi.starts.Random(...). For one trajectory use dvi.integrate."
+            "nothing varies in this sweep: give an array for epsilon, h or t0, or a "
+            'dvi.Axis("name", values) in place of another number, or '
+            "start=dvi.starts.Random(...). For one trajectory use dvi.integrate."
         )
-    if not x64_enabled() and max(dims.values()) >= 2**31:
+    longest = max(dims, key=dims.__getitem__)
+    if not x64_enabled() and dims[longest] >= 2**31:
         raise ValueError(
-            "more than 2³¹ values along one axis need 64-bit indices: put\n"
+            f"the axis {longest!r} must have fewer than 2³¹ values if jax_enable_x64 is not set, "
+            f"got {dims[longest]}: put the line\n"
             '    jax.config.update("jax_enable_x64", True)\nbefore the first array is made.'
         )
 
 
 def _check_steps(num_steps: Any, lattice: Lattice, inputs: Mapping[str, Any]) -> None:
     if isinstance(lattice, Given):
-        if num_steps is not None or any(is_axis(inputs[name]) for name in ("h", "t0")):
+        given = [] if num_steps is None else ["num_steps"]
+        if given := [*given, *(f"the axis of {n}" for n in ("h", "t0") if is_axis(inputs[n]))]:
             raise ValueError(
-                "the lattice dvi.Given(ts) determines num_steps, h and t0: leave num_steps out, "
-                "and do not give an axis h or t0."
+                "the lattice dvi.Given(ts) determines num_steps, h and t0: leave out "
+                f"{' and '.join(given)}."
             )
     elif num_steps is None:
         raise ValueError("num_steps is missing: give the number of steps of each trajectory.")

@@ -37,8 +37,8 @@ class Axis:
     def __init__(self, name: str, values: Any, units: str = ""):
         if not isinstance(name, str) or not (name.isascii() and name.isidentifier()):
             raise ValueError(
-                "the name of a dvi.Axis must be an identifier of ASCII letters, digits and _, "
-                f'such as "epsilon", got {name!r}.'
+                'the name of a dvi.Axis, or of start, must be an identifier such as "epsilon": '
+                f"only ASCII letters, digits and _, and no digit at the beginning. Got {name!r}."
             )
         of = f"the axis {name!r}"
         instance(f"the units of {of}", units, str, "text")
@@ -49,7 +49,7 @@ class Axis:
             try:
                 values = list(values)
             except TypeError:
-                raise TypeError(f"{of} requires a list or array, got {values!r}.") from None
+                raise TypeError(f"{of} requires a list or array, got {values!r:.200}.") from None
             if values and all(isinstance(v, _NUMBERS) for v in values):
                 array = np.asarray(values)
                 # Numbers of Python have the precision of the process, as in JAX.
@@ -76,12 +76,13 @@ _NUMBERS = (int, float, np.ndarray, np.generic, jax.Array, list, tuple)
 
 def _check(of: str, values: np.ndarray) -> None:
     if values.ndim == 0:
-        raise ValueError(f"{of} must have a sequence of values, such as [{values}], got {values}.")
+        raise ValueError(f"{of} requires a sequence of values, got only {values}: give [{values}].")
     if values.dtype.kind not in "iuf":
         raise TypeError(f"{of} must have real numbers as values, got dtype {values.dtype}.")
     if not np.isfinite(values).all():
         where = tuple(np.argwhere(~np.isfinite(values))[0].tolist())
-        raise ValueError(f"{of} must be finite, but is {values[where]} at index {list(where)}.")
+        seen = f"{values[where]} at index {list(where)}"
+        raise ValueError(f"{of} must have finite values, got {seen}.")
 
 
 def is_axis(x: Any) -> bool:
@@ -110,10 +111,10 @@ def axes_in(arguments: Mapping[str, Any]) -> list[tuple[str, Axis]]:
                 continue
             where = ".".join(filter(None, (name, place(path))))
             if not isinstance(axis.values, np.ndarray):
-                seen = type(axis.values[0]).__name__
+                wrong = next(x for x in axis.values if not isinstance(x, _NUMBERS))
                 raise TypeError(
-                    f"{where} must be numbers, but the values of its axis {axis.name!r} are of "
-                    f"the type {seen}."
+                    f"{where} must be numbers, but its axis {axis.name!r} has the value "
+                    f"{wrong!r:.200} of type {type(wrong).__name__}."
                 )
             refuse_double_without_x64(f"the axis {axis.name!r}", axis.values.dtype)
             found.append((where, axis))
@@ -133,7 +134,8 @@ def lengths(axes: Sequence[tuple[str, int, str]]) -> dict[str, int]:
         known, first = dims.setdefault(name, (length, where))
         if known != length:
             raise ValueError(
-                f"the axis {name!r} has {known} values in {first}, but {length} in {where}: axes "
-                "of the same name vary together and need equal lengths; for a grid rename one."
+                "axes of the same name vary together and must have equal lengths. The axis "
+                f"{name!r} has the length {known} in {first}, but {length} in {where}. For a grid, "
+                "give the axes different names."
             )
     return {name: length for name, (length, _) in dims.items()}

@@ -57,8 +57,9 @@ def _lock_byte(file: Path, number: int) -> bool:
         if error.errno in (errno.EACCES, errno.EAGAIN):  # another process holds it
             return False
         warnings.warn(
-            f"{file.parent}: files cannot be locked here ({error.strerror or error}): several "
-            "processes may compute the same tasks, with the same results.",
+            f"{file.parent}: files cannot be locked here ({error.strerror or error}). If several "
+            "processes work on this store, they may compute the same tasks. The results stay "
+            "correct. To avoid repeated work, use one process.",
             stacklevel=2,
         )
     return True
