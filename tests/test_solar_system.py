@@ -169,7 +169,7 @@ def test_bodies_in_one_place_are_not_finite():
         ([1, 1, 1], [[0, 0], [1, 0], [1, 1e-17]], "body 1 and body 2 are at the same"),
         ([1, -1, 1], [[0, 0], [1, 0], [2, 0]], "mass of body 1 is -1.0"),
         ([1, np.nan, 1], [[0, 0], [1, 0], [2, 0]], "mass of body 1 is nan"),
-        ([1, 1], [[0, 0], [1, 0], [2, 0]], "one number for each of the 3 bodies"),
+        ([1, 1], [[0, 0], [1, 0], [2, 0]], r"one number for each body in q0, shape \(3,\)"),
         ([1, 1, 1], [0, 1, 2], r"\(bodies, 2\) or \(bodies, 3\)"),
     ],
 )
