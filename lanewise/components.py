@@ -79,7 +79,7 @@ class Evaluator:
                 outputs = [self.as_tangent(v) for v in outputs]
             known.update(zip(eqn.outvars, outputs, strict=True))
         if self.b.operations > self.b.most:
-            raise Unsupported(f"a step has more than {self.b.most} operations")
+            raise Unsupported(f"the function has more than {self.b.most} operations")
         return [read(v) for v in jaxpr.outvars]
 
     def sine_or_cosine(self, eqn: Any, value: Value) -> Value:
@@ -103,7 +103,8 @@ class Evaluator:
             return self.by_itself(eqn, values)
         for v in eqn.outvars:
             if str(v.aval.dtype) not in TYPES:
-                raise Unsupported(f"{name} is not compiled for type {v.aval.dtype}")
+                types = "float64, float32, bool or integers of 8 to 64 bits"
+                raise Unsupported(f"{name} must return {types}, got {v.aval.dtype}")
         if name == "reshape" or name in VIEWS:
             seen = self._viewed(eqn, values)
             if seen is not None:
@@ -131,7 +132,10 @@ class Evaluator:
         way round, so that its numbers have the same bits wherever it is called."""
         program = eqn.params["program"]
         if eqn.params["lanes"] is not None:
-            raise Unsupported("the function of one trajectory calls a function for a batch")
+            raise Unsupported(
+                "the function contains a batch of another lanewise function, made by "
+                "lanewise.batched or jax.vmap: make a batch of the outer function only"
+            )
         outs = self.closed(program.traced.all_inputs, [self.closed_off(v) for v in values])
         return [self.closed_off(v) for v in outs]
 
@@ -154,7 +158,8 @@ class Evaluator:
         buffer = value.buffer
         assert buffer is not None
         if value.size > most:
-            raise Unsupported(f"an array has {value.size} elements, but registers hold {most}")
+            rule = f"an operation on single elements is compiled for at most {most} elements"
+            raise Unsupported(f"{rule}, got an array of shape {value.shape}")
 
         def make() -> tuple[Value, Entries]:  # the value as well, so that no other one gets its id
             return value, objects(load_row(self.b, buffer), value.shape)
@@ -251,7 +256,8 @@ class Evaluator:
             ]
         found = [Value.in_memory(x) for x in buffers if x is not None]
         if len(found) < len(buffers):
-            raise Unsupported(f"{name} requires a copy of a long array in memory")
+            rule = f"{name} with a copy is compiled for at most {SMALL} elements"
+            raise Unsupported(f"{rule}, got an array of shape {value.shape}")
         return found
 
     def _joined(self, eqn: Any, values: list[Value], place: Buffer | None) -> Value:

@@ -99,7 +99,8 @@ def _elementary(name: str) -> Callable:
     def rule(e: "Evaluator", _: Any, *xs: Num) -> Num:
         if not xs[0].is_float:
             raise Unsupported(
-                f"the function {name} is compiled for floating-point numbers, not for {xs[0].dtype}"
+                f"{name} is compiled for floating-point numbers only, got {xs[0].dtype}: convert "
+                "them with .astype(float)"
             )
         if xs[0].dtype == "float32":
             # Own functions for float32 would be faster, and one more set to test.
@@ -118,7 +119,10 @@ def _bitcast(e: "Evaluator", params: dict, x: Num) -> Num:
     new = np.dtype(params["new_dtype"])
     # Other sizes change the shape of the array, which a rule for one number cannot.
     if new.itemsize != np.dtype(x.dtype).itemsize or "bool" in (x.dtype, str(new)):
-        raise Unsupported(f"the bits of {x.dtype} cannot be read as {new}")
+        raise Unsupported(
+            "bitcast_convert_type is compiled for two types of equal size other than bool, got "
+            f"{x.dtype} and {new}"
+        )
     return e.b.bitcast(x, str(new))
 
 
@@ -133,7 +137,9 @@ def _same(e: "Evaluator", _: Any, x: Num) -> Num:
 def _reduced_precision(e: "Evaluator", params: dict, x: Num) -> Num:
     wide = {"float64": (11, 52), "float32": (8, 23)}.get(x.dtype)
     if wide is None or params["exponent_bits"] < wide[0] or params["mantissa_bits"] < wide[1]:
-        raise Unsupported("reduce_precision to fewer bits is not compiled")
+        bits = f"(exponent_bits, mantissa_bits) = {wide} of {x.dtype}"
+        got = params["exponent_bits"], params["mantissa_bits"]
+        raise Unsupported(f"reduce_precision must keep {bits}, got {got}")
     return x
 
 

@@ -33,7 +33,8 @@ def eliminate(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> li
     matrices, vectors = values
     if matrices.size > MADE // 4:
         raise Unsupported(
-            f"the matrices of linear systems have {matrices.size} elements, more than {MADE // 4}"
+            f"the matrices of linear systems must have at most {MADE // 4} elements in all, got "
+            f"shape {matrices.shape}"
         )
     (out,) = eqn.outvars
     front = out.aval.shape[:-1]

@@ -308,7 +308,7 @@ def runtime() -> Any:
 def set_threads(count: int) -> None:
     """Set the number of threads of a batch; 0 means all of XLA's pool."""
     if isinstance(count, bool) or not isinstance(count, int):
-        raise TypeError(f"count, the number of threads, must be an integer, got {count!r}.")
+        raise TypeError(f"count must be a number of threads of the type int, got {count!r}.")
     if count < 0:
         raise ValueError(f"count must be a positive number of threads, or 0 for all, got {count}.")
     _threads().value = count

@@ -120,7 +120,10 @@ def dynamic_update_slice(
     entries = e.entries(value).copy()
     # Each element is compared with each start: the code grows with the product of the sizes.
     if value.size * update.size > MADE:
-        raise Unsupported(f"{value.size} elements are too many for an update at a computed index")
+        raise Unsupported(
+            f"size of array × size of update must be at most {MADE} for an update at a computed "
+            f"index, got shapes {value.shape} and {update.shape}"
+        )
     news = e.entries(update)
     for i in np.ndindex(value.shape):
         for k in np.ndindex(update.shape):
@@ -197,7 +200,10 @@ def scatter(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list
     for d, k in zip(window, dims.update_window_dims, strict=True):
         sizes[d] = updates.shape[k]
     if value.size * updates.size > 4 * MADE:
-        raise Unsupported(f"{value.size} elements are too many for a scatter")
+        raise Unsupported(
+            f"size of array × size of update must be at most {4 * MADE} for {eqn.primitive.name}, "
+            f"got shapes {value.shape} and {updates.shape}"
+        )
 
     def updated(old: Num, new: Num) -> Num:
         if op is None:

@@ -157,7 +157,7 @@ class Writer:
     def known(self, value: Any, dtype: str, structural: bool = False) -> Num:
         if dtype not in TYPES:
             raise Unsupported(
-                f"numbers of type {dtype} are not compiled: use float64, float32, integers or bool"
+                f"numbers must be float64, float32, bool or integers of 8 to 64 bits, got {dtype}"
             )
         return Num((), dtype, False, np.asarray(value, dtype)[()], structural=structural)
 

@@ -56,7 +56,10 @@ class Module:
         # Whole cache lines, so that no vector lies in two of them.
         self.scratch_bytes += (size * block * 8 + 63) // 64 * 64
         if self.scratch_bytes > LARGEST_SCRATCH:
-            raise Unsupported(f"intermediate arrays need more than {LARGEST_SCRATCH} bytes")
+            raise Unsupported(
+                f"intermediate arrays must have at most {LARGEST_SCRATCH} bytes, got "
+                f"{self.scratch_bytes} or more (block size {self.W * self.U})"
+            )
         item = np.dtype(dtype).itemsize
         bases = tuple(
             self.b.new(f"getelementptr i8, ptr %scratch, i64 {start + u * self.W * item}")
@@ -160,7 +163,10 @@ class Module:
         b, jaxpr = self.b, closed.jaxpr
         for v in (*jaxpr.invars, *jaxpr.outvars):
             if str(v.aval.dtype) not in TYPES:
-                raise Unsupported(f"an argument or a result of type {v.aval.dtype} is not compiled")
+                raise Unsupported(
+                    "arguments and results must be float64, float32, bool or integers of 8 to 64 "
+                    f"bits, got {v.aval.dtype}"
+                )
         operands = []
         for i, (v, o) in enumerate(zip(jaxpr.invars, on, strict=True)):
             b.emit(f"%ap{i} = getelementptr ptr, ptr %args, i64 {i}")

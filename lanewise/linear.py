@@ -134,7 +134,7 @@ def on_any(x: Array, rare: bool = True) -> Array:
     if kind.dtype != bool or kind.shape != ():
         raise TypeError(
             f"x must be one bool of one trajectory, got {kind.dtype} of shape {kind.shape}. "
-            "Write a comparison for a number, and jnp.any(...) for an array."
+            "For a number write a comparison such as x > 0; for an array write jnp.any(x)."
         )
     if not isinstance(rare, bool):
         raise TypeError(f"rare must be True or False, got {rare!r}.")

@@ -20,7 +20,9 @@ def started() -> Any:
     try:
         import llvmlite.binding as llvm
     except ImportError as error:
-        raise ImportError(f"{error}: for machine code run pip install llvmlite.") from error
+        raise ImportError(
+            f"llvmlite cannot be imported: {error}. Run pip install --force-reinstall llvmlite"
+        ) from error
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     return llvm

@@ -144,7 +144,10 @@ def store(b: Builder, buffer: Buffer, x: Num, by: Num | int = 0) -> None:
     if buffer.lane is None:
         if x.vec or moving.vec:
             # Which trajectory wrote last would decide.
-            raise Unsupported("the function writes to an array that all trajectories share")
+            raise Unsupported(
+                "all trajectories share one array, but the function writes numbers of single "
+                f"trajectories to it (shape {buffer.shape})"
+            )
         where = _moved(b, buffer.base[0], moving, fixed, item)
         _store(b, item, _to_memory(b, x, 0, False), where)
         return

@@ -60,8 +60,8 @@ class Layout:
             raise ValueError(f'form must be "auto", "components" or "arrays", got {self.form!r}.')
         if self.form == "kernel":
             warnings.warn(
-                'Layout(form="kernel") now means form="auto", since the Pallas kernel was removed: '
-                'write form="auto". On a GPU a batch runs as lax.scan under vmap.',
+                'form="kernel" is deprecated and means form="auto": the Pallas kernel was removed. '
+                'Write Layout(form="auto"). On a GPU, XLA compiles the batch.',
                 DeprecationWarning,
                 stacklevel=3,
             )
@@ -70,7 +70,7 @@ class Layout:
         if width is not None and (
             isinstance(width, bool) or not isinstance(width, int) or width < 1
         ):
-            raise ValueError(f"width must be a positive integer or None, got {width!r}.")
+            raise ValueError(f"width must be None or a positive int, got {width!r}.")
 
 
 AUTO = Layout()
@@ -123,9 +123,14 @@ def batched(function: Callable, in_axes: Any = 0, layout: Layout = AUTO) -> Call
     ```
     """
     if not callable(function):
-        raise TypeError(f"function must be a function of one trajectory, got {function!r}.")
+        raise TypeError(
+            "function must be a function of one trajectory, got an object of the type "
+            f"{type(function).__name__}. Write batched(f), not batched(f(x))."
+        )
     if not isinstance(layout, Layout):
-        raise TypeError(f"layout must be a lanewise.Layout(form=...), got {layout!r}.")
+        raise TypeError(
+            f"layout must be a lanewise.Layout, got {layout!r}. Write Layout(form=...)."
+        )
     one = functools.partial(call, function, layout=layout)
     return jax.vmap(one, in_axes)
 
@@ -144,8 +149,9 @@ def _can_start() -> bool:
         handler.runtime()
     except Exception as error:
         warnings.warn(
-            f"No machine code can be generated ({type(error).__name__}: {error}). XLA compiles the "
-            "batches instead: they run several times slower. Results agree to round-off.",
+            "No machine code can be generated. XLA compiles the batches: they run several times "
+            "slower, results agree to round-off. To suppress this warning set the environment "
+            f"variable {SWITCH}=off. Reason: {type(error).__name__}: {error}",
             stacklevel=2,
         )
         return False
@@ -229,7 +235,10 @@ def compiled(
     **Raises** `Unsupported` where no code is generated, with the reason.
     """
     if not generates():
-        raise Unsupported("no machine code is generated in this process")
+        raise Unsupported(
+            f"no machine code is generated in this process: the environment has {SWITCH}=off, or a "
+            "warning reported the reason"
+        )
     if lanes == 0:
         raise Unsupported("the batch has no trajectories")
     module, text = kernel_of(program, on, 1 if lanes is None else lanes, vectors)
@@ -253,7 +262,9 @@ def kernel_of(
     count = operation_count(closed.jaxpr)
     most = most_operations(closed.jaxpr)
     if count > most:
-        raise Unsupported(f"the function has {count} operations, more than {most}")
+        raise Unsupported(
+            f"the function has {count} operations, more than {most} (a loop counts once)"
+        )
     if vectors is None and program.layout.width is not None:
         vectors = max(program.layout.width // machine.width(), 1)
     if vectors is None:

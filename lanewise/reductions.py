@@ -66,11 +66,17 @@ def dot(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Val
     # As `preferred_element_type` requires it.
     wider = dtype == "float64" and {a.dtype, c.dtype} <= {"float64", "float32"}
     if not (same or wider):
-        raise Unsupported(f"a product of {a.dtype} and {c.dtype} arrays is not compiled")
+        raise Unsupported(
+            "the arrays of a product and the result must have one type other than bool, got "
+            f"{a.dtype} and {c.dtype}, result {dtype}"
+        )
     contracted = math.prod(a.shape[i] for i in of_a)
     # Each term is an instruction of its own: the code, and the time to compile it, grow with them.
     if out.aval.size * contracted > 8 * MADE:
-        raise Unsupported(f"a product has {out.aval.size * contracted} terms, more than {8 * MADE}")
+        raise Unsupported(
+            f"a product must have at most {8 * MADE} terms, got {out.aval.size * contracted} of "
+            f"arrays with shapes {a.shape} and {c.shape}"
+        )
     x = _as_stack_of_matrices(e.entries(a), batch_a, of_a)
     y = _as_stack_of_matrices(e.entries(c), batch_c, of_c)
     results = []

@@ -88,7 +88,8 @@ def moved(name: str, params: dict[str, Any], *arrays: np.ndarray) -> tuple[np.nd
     # A later release of JAX may add a parameter: better no code than wrong code.
     unknown = params.keys() - inspect.signature(rule).parameters.keys()
     if unknown:
-        raise Unsupported(f"no rule compiles {name} with parameter {', '.join(sorted(unknown))}")
+        names = ", ".join(sorted(unknown))
+        raise Unsupported(f"{name} has parameters that this version cannot compile: {names}")
     out = rule(*arrays, **params)
     return out if isinstance(out, tuple) else (out,)
 

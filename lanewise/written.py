@@ -19,7 +19,9 @@ MOST_SORTED = 16  # longer arrays are sorted by XLA
 
 def _square(x: Array, name: str) -> int:
     if x.shape[0] > MOST_UNKNOWNS:
-        raise Unsupported(f"{name} is not compiled for arrays of shape {x.shape}")
+        raise Unsupported(
+            f"{name} is compiled for at most {MOST_UNKNOWNS} rows, got shape {x.shape}"
+        )
     return x.shape[0]
 
 
@@ -32,7 +34,10 @@ def _of_each_matrix(one: Callable) -> Callable:
             return one(*arrays, **parameters)
         count = math.prod(front)
         if not 0 < count * n**3 <= MOST_UNKNOWNS**3:
-            raise Unsupported(f"{one.__name__} is not compiled for shape {arrays[0].shape}")
+            raise Unsupported(
+                f"number of matrices × rows³ must be from 1 to {MOST_UNKNOWNS**3} for "
+                f"{one.__name__}, got shape {arrays[0].shape}"
+            )
         flat = [x.reshape(count, *x.shape[len(front) :]) for x in arrays]
         found = [one(*(x[i] for x in flat), **parameters) for i in range(count)]
         return jax.tree.map(lambda *x: jnp.stack(x).reshape(*front, *x[0].shape), *found)
@@ -44,7 +49,7 @@ def lu(a: Array, **_) -> tuple[Array, Array, Array]:
     """L and U in one matrix, the row that each row was exchanged with, and the permutation."""
     n = _square(a, "lu")
     if a.shape[1] != n:
-        raise Unsupported(f"lu is not compiled for arrays of shape {a.shape}")
+        raise Unsupported(f"lu is compiled for square matrices only, got shape {a.shape}")
     rows = [[a[i, j] for j in range(n)] for i in range(n)]
     order, pivots = [jnp.int32(i) for i in range(n)], []
     for c in range(n):
@@ -119,7 +124,7 @@ def sort(*arrays: Array, dimension: int, num_keys: int, **_) -> list[Array]:
     """Arrays in the order of the first `num_keys` of them, by exchanges of neighbours."""
     n = arrays[0].shape[dimension]
     if n > MOST_SORTED:
-        raise Unsupported(f"sort is not compiled for {n} numbers, more than {MOST_SORTED}")
+        raise Unsupported(f"sort is compiled for at most {MOST_SORTED} numbers, got {n}")
     items = [[lax.index_in_dim(x, i, dimension, False) for x in arrays] for i in range(n)]
     # Exchanges at fixed places, whatever the numbers are: odd and even neighbours in turn.
     for turn in range(n):

@@ -226,8 +226,8 @@ def test_a_control_that_passes_is_missed(monkeypatch):
 @pytest.mark.parametrize(
     ("methods", "checks", "error", "said"),
     [
-        (["yoshida4"], None, ValueError, r"unknown method 'yoshida4' \(did you mean Yoshida4\?\)"),
-        (None, ["symmetry"], ValueError, "unknown check 'symmetry'.*known are order, forced-order"),
+        (["yoshida4"], None, ValueError, r"got 'yoshida4' \(did you mean Yoshida4\?\)"),
+        (None, ["symmetry"], ValueError, r"got 'symmetry'.*Known are order, forced"),
         ([], None, ValueError, "methods is empty: name"),
         ({}, None, ValueError, "methods is empty: give"),
         (None, [], ValueError, "checks is empty: name"),

@@ -285,7 +285,7 @@ def test_all_wrong_keys_of_a_file_are_named(folder):
 @pytest.mark.parametrize(
     ("date", "steps", "seen"),
     [
-        ("1850-01-01", 5, "choose a date from 1899-07-29"),
+        ("1850-01-01", 5, "DE421, 1899-07-29 to 2053-10-09"),
         ("2053-10-01", 10_000, "the run ends 312.5 days after"),
     ],
 )
@@ -421,7 +421,7 @@ def test_ctrl_c_while_results_are_written_lists_the_files(tmp_path):
             (tmp_path / "a.npz").touch()
             raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt, match=r"which contains: a\.npz"):
+    with pytest.raises(KeyboardInterrupt, match=r"now contains: a\.npz"):
         interrupted()
     with pytest.raises(FileExistsError, match="another process has written"):
         interrupted()

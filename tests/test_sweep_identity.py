@@ -252,7 +252,7 @@ def test_links_and_relative_paths(tmp_path, monkeypatch):
     monkeypatch.chdir("/")
     np.testing.assert_array_equal(relative["q"], found["q"])
     (tmp_path / "there" / ".tasks").rename(tmp_path / "elsewhere")
-    with pytest.raises(dvi.StoreError, match="names that begin with a point"):
+    with pytest.raises(dvi.StoreError, match="names begin with a dot"):
         dvi.open_sweep(tmp_path / "there")
 
 

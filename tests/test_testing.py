@@ -55,7 +55,7 @@ def test_another_problem_takes_the_place_of_the_own_one():
 def test_an_order_is_measured_on_its_own_problem():
     with pytest.raises(AssertionError, match=r"order: measured 1(\.\d*)?, required 2 ± 0.2"):
         check_order(altered(dvi.TypeII(), order=2))
-    with pytest.raises(ValueError, match="order is measured on its own problem"):
+    with pytest.raises(ValueError, match="order is measured on a fixed problem"):
         check_order(dvi.TypeII(), problem("double_pendulum"))
 
 

@@ -81,8 +81,10 @@ def run_on(
                 lost[number] += 1
                 if lost[number] >= _ATTEMPTS:
                     raise ClusterError(
-                        f"{_ATTEMPTS} workers were lost during task {number}, probably because it "
-                        f"needs too much memory: use a smaller lanes_per_task. ({error})"
+                        f"the workers of task {number} stopped in all of {_ATTEMPTS} attempts, "
+                        "probably for lack of memory. Give the workers more memory, or use a "
+                        "smaller lanes_per_task (with store=..., this needs a new path for the "
+                        f"store). The last error was: {error}"
                     ) from error
                 again.append(number)
             except CancelledError as error:
@@ -103,8 +105,9 @@ def run_on(
         raise error.args[0] from None
     except (OSError, TimeoutError) as error:
         raise ClusterError(
-            f"the connection to the cluster was lost ({error!r}). Start a new cluster and repeat "
-            "the call. With store=..., the same call continues after the finished tasks."
+            f"the connection to the Dask cluster was lost ({error!r}). Start a new cluster and "
+            "repeat the call with its client. With store=..., the same call continues after the "
+            "finished tasks; otherwise all tasks are computed again."
         ) from error
     finally:
         with contextlib.suppress(OSError, TimeoutError):
@@ -161,8 +164,8 @@ def _task(pickled: bytes, number: int) -> tuple[Any, dict[str, int]]:
         store = Store.open(path)
         if store.sha != sha:
             raise StoreError(
-                f"{path} must be the same directory on every worker, but a worker found another "
-                "sweep there. Give a path in store that all workers share."
+                f"store must be the same directory on every worker, but on one worker {path!r} "
+                "contains another sweep. Use a directory that all workers share."
             )
         known = store.record(number)
         if known is None:

@@ -17,11 +17,15 @@ def _whole_or_not(path: Any, force: bool, package: str) -> Iterator[Path]:
     """A temporary name next to `path`, renamed once everything is written."""
     path = Path(path)
     if path.exists() and not force:
-        raise FileExistsError(f"{path} exists: give another path, or force=True to replace it.")
+        raise FileExistsError(
+            f"'{path}' already exists. Give another path. To replace a file, set force=True."
+        )
     try:
         __import__(package)
     except ImportError:
-        raise ImportError(f"export requires {package}: pip install 'dvi-jax[export]'.") from None
+        raise ImportError(
+            f'the export requires the package {package}. Install it: pip install "dvi-jax[export]".'
+        ) from None
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
     try:
         yield temporary
@@ -94,8 +98,9 @@ def _columns(part: Any, grid: list[str]) -> dict[str, np.ndarray]:
                 parts = {f"{column}_re": np.real(entries), f"{column}_im": np.imag(entries)}
             if taken := [c for c in parts if c in columns]:
                 raise ValueError(
-                    f"two variables would have the column {taken[0]!r}. The components of a "
-                    "variable have the columns NAME_0, NAME_1, …. Rename an observable or an axis."
+                    f"each column of a table needs its own name, but {name!r} and an earlier "
+                    f"variable both give the column {taken[0]!r}. (An array gives the columns "
+                    "NAME_0, NAME_1, ….) Use to_netcdf, or rename the observable or axis."
                 )
             columns.update(parts)
     names = np.asarray(("not_computed", *STATUS_NAMES))

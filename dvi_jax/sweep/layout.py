@@ -34,12 +34,15 @@ class StoreError(Exception):
 
 
 @contextlib.contextmanager
-def as_store_error(path: Path, what: str, then: str = " Check the permissions.") -> Iterator[None]:
+def as_store_error(path: Path, what: str, then: str = "") -> Iterator[None]:
     """Turn an error of the operating system into a `StoreError`: `what` failed, `then` do this."""
     try:
         yield
     except OSError as error:
-        raise StoreError(f"{path}: {what} ({error.strerror or error}).{then}") from error
+        raise StoreError(
+            f"{path}: {what} ({error.strerror or error}). Check the path, its permissions and the "
+            f"free disk space.{then}"
+        ) from error
 
 
 def layout(chunk: tuple[int, ...], variable: Variable) -> dict[str, Any]:
@@ -92,8 +95,8 @@ def make(
     """Make a store under another name and rename it: it appears as a whole or not at all."""
     if bad := [name for name in (*coordinates, *variables) if not is_array_name(name)]:
         raise ValueError(
-            f"{bad[0]!r} cannot be the name of an array in a store. Rename this key of args or "
-            f"observable: {ARRAY_NAMES}."
+            f"{bad[0]!r} cannot be the name of an array in a store: {ARRAY_NAMES}. Rename this key "
+            "of args."
         )
     plan = Plan(dict(config["dims"]), tuple(config["chunk"]))
     about = {"Conventions": "CF-1.11", "dvi_jax_sweep": FORMAT, "config": json.dumps(config)}

@@ -219,11 +219,13 @@ def traced(sweep: Sweep) -> tuple[dict[str, Any], list[ClosedJaxpr]]:
         programs.append(program)
         kinds.add(tuple((name, x.shape, x.dtype) for name, x in out.items()))
         if len(kinds) > 1:
+            differing = min(set.symmetric_difference(*map(set, kinds)))[0]
+            seen = [f"shape {s} ({d})" for kind in kinds for n, s, d in kind if n == differing]
             raise ValueError(
-                "the results for all values of method and num_steps must have the same shapes and "
-                "types, but they differ. With several values of num_steps, save only the final "
-                "state, save=dvi.Save(final=True), or the states at given times, "
-                "save=dvi.Save(ts=...). Otherwise use a separate sweep for each value."
+                "each result must have the same shape and dtype for all values of method and "
+                f"num_steps, but {differing!r} has {' and '.join(sorted(seen))}. For several "
+                "values of num_steps use save=dvi.Save(final=True) or save=dvi.Save(ts=...). "
+                "Otherwise call dvi.sweep separately for each value."
             )
         found = out
     return found, programs

@@ -95,8 +95,8 @@ class SweepResult:
         """
         if not isinstance(self._source, Store):
             raise StoreError(
-                "results in memory cannot be verified: only a store has checksums. To make one, "
-                "give a path in dvi.sweep(store=...)."
+                "verify() requires results in a store, because only a store has checksums. These "
+                "results are in memory. To make a store, call dvi.sweep with store=PATH."
             )
         return self._source.verify(progress)
 

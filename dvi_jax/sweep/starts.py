@@ -44,17 +44,24 @@ def _box(of: str, **ends: Any) -> tuple[list[tuple[float, ...]], tuple[int, ...]
     arrays = []
     for which, pair in ends.items():
         if not isinstance(pair, tuple | list) or len(pair) != 2:
-            raise TypeError(f"{which} of {of} must be a pair (q, p) of arrays, got {pair!r}.")
+            raise TypeError(
+                f"{which} of {of} must be a pair, that is a tuple (of q, of p), got {pair!r:.200}."
+            )
         arrays += [np.asarray(x, float) for x in pair]
-        if not all(np.isfinite(x).all() for x in arrays):
-            raise ValueError(f"{which} of {of} must be finite, got {pair!r}.")
+        if bad := [x for array in arrays for x in array.flat if not np.isfinite(x)]:
+            raise ValueError(f"all components of {which} of {of} must be finite, got {bad[0]}.")
     shapes = [x.shape for x in arrays]
     if len(set(shapes)) > 1:
-        names = " and ".join(ends)
-        raise ValueError(f"all arrays in {names} of {of} must have the same shape, got {shapes}.")
+        names, seen = " and ".join(ends), " and ".join(map(str, dict.fromkeys(shapes)))
+        raise ValueError(
+            f"all arrays in {names} of {of} must have the same shape, got the shapes {seen}."
+        )
     flat = [np.ravel(arrays[i : i + 2]) for i in range(0, len(arrays), 2)]
-    if (flat[0] > flat[-1]).any():
-        raise ValueError(f"low of {of} must not be greater than high in any component, got {ends}.")
+    if (above := flat[0] > flat[-1]).any():
+        raise ValueError(
+            f"low of {of} must not be greater than high in any component, got low = "
+            f"{flat[0][above][0]} and high = {flat[-1][above][0]} in one component."
+        )
     return [tuple(x.tolist()) for x in flat], shapes[0]
 
 
@@ -160,7 +167,7 @@ class Normal(_Seeded):
             sigma = [np.broadcast_to(np.asarray(s, float), shape) for s in sigma]
         (self.sigma,), _ = _box("Normal", sigma=sigma)
         if min(self.sigma, default=0) < 0:
-            raise ValueError(f"sigma of Normal must not be negative, got {sigma!r}.")
+            raise ValueError(f"sigma of Normal must not be negative, got {min(self.sigma)}.")
         super().__init__(count, shape, seed, name)
 
     def at(self, index, t0, args):

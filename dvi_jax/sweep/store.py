@@ -30,8 +30,8 @@ from .variables import Variable
 CLAIMS = ".claims"
 _RESTORE = (
     "Restore the file from a backup, or copy it from a new store. To make the new store, call "
-    "dvi.sweep with the same arguments and another path in store; stop the call when it shows its "
-    "progress. The computed results are in other files of the directory."
+    "dvi.sweep with the same arguments, but with another path as store. Stop this call when its "
+    "first task is done. The computed results are in other files: do not delete them."
 )
 
 
@@ -85,7 +85,7 @@ class Store:
         self.config = json.loads(attributes["config"])
         self.sha = attributes["config_sha256"]
         if digest(self.config) != self.sha:
-            raise ValueError("the configuration does not match its checksum")
+            raise ValueError("the attribute config does not match its checksum config_sha256")
         dict(json.loads(attributes.get("units", "{}")))  # raises what is wrong with the units
         self.plan = Plan(dict(self.config["dims"]), tuple(self.config["chunk"]))
         self.variables = {
@@ -104,28 +104,33 @@ class Store:
             attributes = json.loads((path / "zarr.json").read_text())["attributes"]
             if not (path / TASKS).is_dir():
                 raise StoreError(
-                    f"{path}: the directory {TASKS} is missing. It has the records of tasks. Copy "
-                    "the store again with its hidden files (names that begin with a point)."
+                    f"{path} must contain the directory {TASKS} (the records of finished tasks), "
+                    "but it is missing. If this is a copy of a store, copy it again with hidden "
+                    "files (their names begin with a dot). If it is no store, give another path."
                 )
             if (found := attributes["dvi_jax_sweep"]) != FORMAT:
                 raise StoreError(
-                    f"{path}: the store has format {found}, but this version reads {FORMAT}. Use "
-                    f"the dvi-jax that made the store: {attributes.get('dvi-jax', 'unknown')}."
+                    f"{path}: the store has format {found!r}, but this version of dvi-jax reads "
+                    f"only format {FORMAT}. Use the version of dvi-jax that made the store: "
+                    f"{attributes.get('dvi-jax', 'unknown')}."
                 )
             store = cls(path, attributes)
         except FileNotFoundError:
             is_lost = (path / TASKS).is_dir()
             then = f"The file was lost. {_RESTORE}" if is_lost else "Check the path."
-            raise StoreError(f"{path}: there is no sweep here (no zarr.json). {then}") from None
+            raise StoreError(
+                f"{path}: there is no sweep here, because the file zarr.json does not exist. {then}"
+            ) from None
         except OSError as error:
             raise StoreError(
-                f"{path}: zarr.json cannot be read ({error.strerror or error}): check its "
-                "permissions and the disk."
+                f"{path}: zarr.json cannot be read ({error.strerror or error}). Check the "
+                "permissions and the disk, and that the path is a directory."
             ) from None
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise StoreError(
-                f"{path}: zarr.json does not describe a sweep ({error!r}). The file is damaged "
-                f"or was edited. {_RESTORE}"
+                f"{path}: zarr.json does not describe a sweep ({type(error).__name__}: {error}). "
+                "If this is not the store of a sweep, give another path. Otherwise the file is "
+                f"damaged or was edited. {_RESTORE}"
             ) from None
         for name in store.variables:
             store.array(name)
@@ -150,15 +155,17 @@ class Store:
         if store.sha != digest(config):
             made, differing = store.attributes, differences(store.config, config)
             raise StoreMismatch(
-                f"{path} holds another sweep. Differences:\n  " + "\n  ".join(differing) + "\n"
-                f"(made {made.get('created')} with dvi-jax {made.get('dvi-jax')}, jax "
-                f"{made.get('jax')}). Give another path in store, or the arguments of that sweep.",
+                f"{path} holds another sweep, made {made.get('created')} with dvi-jax "
+                f"{made.get('dvi-jax')} and jax {made.get('jax')}. Differences (there: in the "
+                "store; now: in this call):" + "".join(f"\n  {line}" for line in differing) + "\n"
+                "Use another path as store. To continue the stored sweep, use its arguments, "
+                "functions and package versions.",
                 differing,
             )
         if not os.access(path / TASKS, os.W_OK):
             raise StoreError(
-                f"{path} cannot be written by this user. Give another path in store, or change "
-                "the permissions of this path. To read only, call dvi.open_sweep(path)."
+                f"{path} cannot be written by this user. Change the permissions of this directory "
+                "and its files, or use another path as store. To read it, use dvi.open_sweep(path)."
             )
         store._restore(coordinates)
         return store
@@ -173,14 +180,15 @@ class Store:
         expected = (*self.plan.shape, *variable.shape), np.dtype(variable.dtype)
         try:
             found = self._group()[name]
-            seen = found.shape, found.dtype
+            seen: Any = found.shape, found.dtype
         except Exception as error:  # zarr has many errors for damaged metadata
             found, seen = None, repr(error)
         if seen != expected:
             raise StoreError(
-                f"{self.path}: zarr.json does not describe the array {name!r} of this sweep "
-                f"(found {seen}, expected {expected}). The file is damaged or was edited. "
-                f"{_RESTORE}"
+                f"{self.path}: zarr.json must describe the array {name!r} with shape {expected[0]} "
+                f"and dtype {expected[1]}, but found "
+                f"{seen if found is None else '{} and {}'.format(*seen)}. The file is damaged or "
+                f"was edited. {_RESTORE}"
             )
         self._arrays[name] = found
         return found
@@ -192,9 +200,9 @@ class Store:
             return array.get_orthogonal_selection(where)
         except Exception as error:  # codecs have many errors for bytes that they cannot decode
             raise StoreError(
-                f"{self.shard_path(name, number)} is damaged ({error}). Call "
-                "dvi.open_sweep(path).verify(). Then repeat the call of dvi.sweep: it computes the "
-                "damaged part again."
+                f"{self.shard_path(name, number)} is damaged or cannot be read ({error}). First "
+                f"call dvi.open_sweep({str(self.path)!r}).verify(). Then call dvi.sweep with the "
+                "same arguments: it computes the damaged tasks again."
             ) from error
 
     def coordinates(self) -> dict[str, Any]:
@@ -217,8 +225,8 @@ class Store:
             values = array[:]
         except Exception as error:  # codecs have many errors for bytes that they cannot decode
             raise StoreError(
-                f"{self.path}: the coordinate {name!r} cannot be read ({error}). Call dvi.sweep "
-                "again with the same arguments: this call writes it again."
+                f"{self.path}: the values of the coordinate {name!r} cannot be read ({error}). "
+                "Call dvi.sweep again with the same arguments and store: it writes them again."
             ) from error
         if values.dtype.kind == "T":
             values = np.asarray(values.tolist())
@@ -308,9 +316,9 @@ class Store:
         found = {i: self._damage(i, x, size_only=True) for i, x in written.items() if x is not None}
         if lost := [damage[0] for damage in found.values() if damage]:
             warnings.warn(
-                f"{self.path}: files of {len(lost)} finished tasks are missing or have the "
-                f"wrong size. The first is {lost[0]}. These tasks count as not computed. dvi.sweep "
-                "with the same arguments computes them again.",
+                f"{self.path}: for {len(lost)} of {len(found)} finished tasks, a file is missing, "
+                f"unreadable or of the wrong size. The first such file is {lost[0]}. These tasks "
+                "count as not computed. dvi.sweep with the same arguments computes them again.",
                 stacklevel=2,
             )
         return [i for i, damage in found.items() if not damage]
@@ -326,7 +334,7 @@ class Store:
     def commit(self, task: Task, results: Mapping[str, np.ndarray], facts: Mapping) -> None:
         """Write the results of a task; it is done once this returns."""
         what = f"task {task.number} cannot be written"
-        then = " Finished tasks are not lost; once there is free space, the same call goes on."
+        then = " Then repeat the call: it continues after the finished tasks."
         shards = {}
         with as_store_error(self.path, what, then):
             for name in sorted(results, key=lambda n: n == STATUS):
@@ -366,7 +374,8 @@ def _resolved(path: str | os.PathLike) -> Path:
     except (OSError, ValueError, RuntimeError) as error:
         raise StoreError(
             f"{os.fspath(path)!r:.80} cannot be the path of a store "
-            f"({getattr(error, 'strerror', None) or error}): give the path of a directory."
+            f"({getattr(error, 'strerror', None) or error}): give the path of a directory that "
+            "this user can open."
         ) from None
     return found
 

@@ -15,7 +15,7 @@ from .program import Sweep
 _NAME = re.compile(r"[\w +-]+(\.[\w +-]+)*")
 
 ARRAY_NAMES = (
-    "a name may contain letters, digits, spaces, _, - and +. It may have single points, but not at "
+    "a name may contain letters, digits, spaces, _, - and +. It may have single dots, but not at "
     "the beginning or end. The name zarr.json is reserved for a file of the store"
 )
 
@@ -54,15 +54,16 @@ def variables(sweep: Sweep, shapes: Mapping[str, Any]) -> dict[str, Variable]:
     for name in given:
         if given.count(name) > 1:
             raise ValueError(
-                f"two observables have the name {name!r}. The keys of nested containers are joined "
-                "by points to one name. Rename one of the two observables."
+                f"two observables have the name {name!r}, but each must have its own. The keys of "
+                "nested dicts are joined with dots: {'a': {'b': f}} gives 'a.b'. Rename one."
             )
         if not is_array_name(name):
             raise ValueError(f"the observable {name!r} cannot have this name: {ARRAY_NAMES}.")
         if name in taken or name.split(".")[0] in RESERVED:
             raise ValueError(
-                f"the observable {name!r} has a reserved name: rename it. Reserved, also before a "
-                f"point, are {', '.join(taken)}."
+                f"the observable {name!r} has a reserved name: rename it. It must not have the "
+                f"name of an axis ({', '.join(sweep.dims)}). Its name, or the part of it before "
+                f"the first dot, must not be one of {', '.join(RESERVED)}."
             )
     # Observables that are not reduced have a row for each step that ends at a save point: one less
     # than states, except for `Save(ts=...)`.
@@ -78,7 +79,10 @@ def variables(sweep: Sweep, shapes: Mapping[str, Any]) -> dict[str, Variable]:
             dims.insert(0, first[name])
         dtype = np.dtype(x.dtype)
         if dtype.kind not in "iufbc":
-            raise TypeError(f"the observable {name!r} must return numbers, got dtype {dtype}.")
+            raise TypeError(
+                f"{name!r} must have a dtype of NumPy (bool, integer, float or complex), got dtype "
+                f"{dtype}. If it is an observable, convert its result with .astype(float)."
+            )
         found[name] = Variable("int8" if dtype.kind == "b" else dtype.name, x.shape, tuple(dims))
     return found
 

@@ -98,8 +98,9 @@ class Problem:
         ):
             for name in set(getattr(self, what)) - set(known):
                 raise ValueError(
-                    f"{what} of the problem {self.name} contains {name!r}, but this is not among "
-                    f"its {kind} ({', '.join(sorted(known)) or 'it has none'})."
+                    f"{what} of the problem {self.name!r} contains {name!r}, but must contain only "
+                    f"names in {kind} ({', '.join(sorted(known)) or 'it is empty'}). Correct the "
+                    f"name, or add {name!r} to {kind}."
                 )
 
 
@@ -141,9 +142,8 @@ class Start:
         for what, at in self.singular.items():
             point: Any = at(args) if callable(at) else at
             if (q == point).all():
-                raise ValueError(
-                    f"q0 must not be at {what} {list(point)}: the system is singular there."
-                )
+                seen = np.asarray(point, float).tolist()
+                raise ValueError(f"q0 must not be at {what} {seen}: the system is singular there.")
         if self.also is not None:
             self.also(q, p, args)
 
@@ -159,7 +159,7 @@ class Start:
     def _wanted(self) -> str:
         if self.shape is None:
             return "the same shape"
-        range_of_n = f", n ≥ {self.least}" if None in self.shape else ""
+        range_of_n = f" with the same n ≥ {self.least}" if None in self.shape else ""
         return f"shape {self.shape}{range_of_n}".replace("None", "n")
 
 
@@ -167,7 +167,7 @@ def check_shape(q0: Any, p0: Any, fits: Callable[[tuple[int, ...]], bool], wante
     """Require q0 and p0 of one shape for which `fits` holds; `wanted`: these shapes, a sentence."""
     q, p = np.shape(q0), np.shape(p0)
     if q != p or not fits(q):
-        raise ValueError(f"{wanted}; got q0 of shape {q} and p0 of shape {p}.")
+        raise ValueError(f"{wanted}, got q0 of shape {q} and p0 of shape {p}.")
 
 
 def parameter(args: Any, name: str) -> Any:
@@ -176,7 +176,7 @@ def parameter(args: Any, name: str) -> Any:
         there = ", ".join(map(str, args)) if isinstance(args, Mapping) else ""
         raise ParameterError(
             f"the parameter {name} is missing: args must be a dict with the key {name!r}, got "
-            + (f"the keys {there}." if there else f"{args!r}.")
+            + (f"the keys {there}." if there else f"{args!r:.200}.")
         )
     return args[name]
 
@@ -216,7 +216,7 @@ def vector(size: int) -> Check:
             value = np.asarray(given, float)
         except (TypeError, ValueError) as error:
             raise ValueError(
-                f"{name} must be an array of {size} numbers, got {given!r} ({error})."
+                f"{name} must be an array of {size} numbers, got {given!r:.200} ({error})."
             ) from None
         if value.shape != (size,):
             raise ValueError(f"{name} must have shape ({size},), got shape {value.shape}.")
@@ -290,9 +290,9 @@ class InSlowTime(eqx.Module):
     def __call__(self, t0, t1, q0, p0, q1, p1, args):
         if self.epsilon is None:
             raise ValueError(
-                "an observable in slow time needs the value of ε. Call "
-                "observable.bind(system, epsilon)(...), or give the observable in "
-                "dvi.integrate(observe=...)."
+                f"the observable {getattr(self.function, '__name__', 'f')} needs the value of "
+                "epsilon, because its system has slow_time=True. Call observable.bind(system, "
+                "epsilon)(t0, t1, ...), or give the observable in dvi.integrate(observe=...)."
             )
         return self.function(self.epsilon * t0, self.epsilon * t1, q0, p0, q1, p1, args)
 
@@ -308,7 +308,7 @@ def over_times(
     shape t.shape + q0.shape and the dtype of the initial conditions. It **raises** `ValueError` for
     initial conditions of another shape.
     """
-    wanted = "q0 and p0 of the same shape" if shape is None else f"q0 and p0 of shape {shape}"
+    wanted = "the same shape" if shape is None else f"shape {shape}"
 
     def decorate(at_time):
         @functools.wraps(at_time)
@@ -318,8 +318,8 @@ def over_times(
                 q0,
                 p0,
                 lambda seen: shape is None or seen == shape,
-                f"the exact solution is for one initial condition, with {wanted} (for several use "
-                "jax.vmap(exact, (None, 0, 0, None)))",
+                "exact requires one initial condition (for several use jax.vmap(exact, (None, 0, "
+                f"0, None))): q0 and p0 must have {wanted}",
             )
             dtype = jnp.result_type(q0, p0, float)
             q0, p0 = q0.astype(dtype), p0.astype(dtype)

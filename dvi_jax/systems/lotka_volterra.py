@@ -34,9 +34,10 @@ def from_populations(x, y):
     **Raises** `ValueError` for populations that are not positive.
     """
     x, y = np.asarray(x, float), np.asarray(y, float)
-    for name, number in (("prey x", x), ("predators y", y)):
-        if not (number > 0).all():
-            raise ValueError(f"the number of {name} must be positive, got {number}.")
+    for name, number in (("x of prey", x), ("y of predators", y)):
+        if not (positive := number > 0).all():
+            seen = number[~positive][0]
+            raise ValueError(f"the population {name} must be positive, got {seen}.")
     return np.log(x), np.log(y)
 
 

@@ -101,7 +101,7 @@ def check_bodies(q0: Any, p0: Any, args: Any, names: Sequence[str] | None = None
     check_shape(q, p, lambda shape: len(shape) == 2 and shape[1] in (2, 3), wanted)
     if masses.shape != q.shape[:1]:
         raise ValueError(
-            f"masses must have one number for each of the {q.shape[0]} bodies, got shape "
+            f"masses must have one number for each body in q0, shape {q.shape[:1]}, got shape "
             f"{masses.shape}."
         )
 
@@ -170,8 +170,11 @@ def n_body(
     """
     if masses is None and q0 is None and p0 is None:
         masses, q0, p0 = np.ones(3), EIGHT_POSITIONS, EIGHT_MOMENTA
-    if masses is None or q0 is None or p0 is None:
-        raise TypeError("masses, q0 and p0 must all be given, or none of them.")
+    given = {"masses": masses, "q0": q0, "p0": p0}
+    if missing := [name for name, x in given.items() if x is None]:
+        raise TypeError(
+            "give all of masses, q0 and p0, or none of them. Missing: " + ", ".join(missing) + "."
+        )
     args = {"masses": np.asarray(masses, float), "G": finite("G", G)}
     check_bodies(q0, p0, args)
     return Problem(

@@ -77,8 +77,8 @@ def read_polar_motion(path: str | Path | None = None) -> PolarMotion:
         lines = [(i, line) for i, line in enumerate(file, 1) if line[_FLAG : _FLAG + 1] == "I"]
     if not lines:
         raise ValueError(
-            f"{path.name} has no measured pole (no line with I in column 17): give a file in the "
-            "format of finals2000A."
+            f"{path.name} has no measured pole positions, because no line has the letter I in "
+            "column 17. Give a file in the format finals2000A that has measured positions."
         )
     table = np.empty((len(lines), 5))
     for row, (number, line) in zip(table, lines, strict=True):

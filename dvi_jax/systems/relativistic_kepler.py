@@ -59,7 +59,8 @@ def _misses_the_centre(q, p, args):
     if abs(L) * args["c"] <= args["K"] ** 2:
         raise ValueError(
             f"the angular momentum must satisfy |L| > K²/c = {args['K'] ** 2 / args['c']}, got "
-            f"L = {L}: the orbit falls into the centre. Give other q0 and p0, or a larger c."
+            f"L = {L} from q0 and p0: the orbit falls into the centre. Give other q0 and p0, or a "
+            "larger c."
         )
 
 

@@ -134,8 +134,9 @@ def oblateness(q, args):
     pole = jnp.asarray(args.get("pole", SUN_POLE), q.dtype)
     if pole.shape != q.shape[1:]:
         raise ValueError(
-            'args["pole"] must have as many components as a position, got a pole of shape '
-            f"{pole.shape} and q of shape {q.shape}. The pole is the axis of the Sun."
+            f'args["pole"], the axis of the Sun, must have shape {q.shape[1:]} for q of shape '
+            f"{q.shape}, got shape {pole.shape}. The default pole has shape (3,): in the plane, "
+            'add a "pole" of shape (2,) to args.'
         )
     r = _from_sun(q)
     r2 = jnp.sum(r**2, axis=-1)

@@ -48,7 +48,8 @@ def momentum(q, v):
 def _mass_fraction(name, mu):
     if not 0 < finite(name, mu) <= 0.5:
         raise ValueError(
-            f"{name} must be the smaller body's fraction of the total mass, 0 < mu ≤ 1/2; got {mu}."
+            f"{name} must satisfy 0 < mu ≤ 1/2, got {mu}. It is the mass of the smaller body "
+            "divided by the total mass."
         )
 
 

@@ -61,12 +61,14 @@ def installed_file(name: str, what: str) -> Path:
     # The package is located, not imported: its import warns about the age of its files.
     package = find_spec("skyfield_data")
     if package is None or package.origin is None:
-        raise EphemerisMissing(f"{what} is not installed: install it with {_EXTRA}")
+        raise EphemerisMissing(
+            f"{what} requires the package skyfield-data. It is not installed: run {_EXTRA}"
+        )
     path = Path(package.origin).parent / "data" / name
     if not path.is_file():
         raise EphemerisMissing(
-            f"the installed skyfield-data has no file {name}. Install a newer version: "
-            "pip install --upgrade skyfield-data"
+            f"the installed package skyfield-data has no file {path}. Install its newest version: "
+            "pip install --upgrade --force-reinstall skyfield-data"
         )
     return path
 
@@ -83,29 +85,34 @@ def julian_date(date: str | datetime.date | float) -> float:
             date = datetime.date.fromisoformat(date)
         except ValueError:
             raise ValueError(
-                f'date must be a day such as "1900-01-31" (year-month-day), got {date!r}.'
+                'date must be an existing day such as "1900-01-31" (year-month-day), or a Julian '
+                f"date as a number, got {date!r}."
             ) from None
     if isinstance(date, datetime.datetime):
         raise ValueError(
-            f"date must not have a time of day, got {date}. Give a datetime.date or a Julian date."
+            f"date must not be a datetime.datetime, got {date}. Give a datetime.date for a day at "
+            "0h TDB, or a Julian date (TDB) for another time."
         )
     if isinstance(date, datetime.date):
-        jd = date.toordinal() + 1721424.5
+        jd, day = date.toordinal() + 1721424.5, f" ({date})"
     else:
-        jd = finite("date", date, hint="Give a calendar day or a Julian date.")
-    check_covered(jd)
+        jd, day = finite("date", date, hint="Give a calendar day or a Julian date."), ""
+    check_covered(jd, day)
     return jd
 
 
-def check_covered(jd: Any) -> None:
-    """Require TDB Julian dates that the ephemeris covers. **Raises** `ValueError`."""
+def check_covered(jd: Any, day: str = "") -> None:
+    """Require TDB Julian dates that the ephemeris covers; `day`: the same date, for the message.
+
+    **Raises** `ValueError`.
+    """
     first, last = COVERAGE
     jd = np.atleast_1d(jd)
     outside = jd[~((jd >= first) & (jd <= last))]  # NaN is outside
     if outside.size:
         raise ValueError(
-            f"the Julian date {outside[0]} is outside of the range of the ephemeris DE421: choose "
-            f"a date from 1899-07-29 to 2053-10-09 (Julian dates {first} to {last})."
+            "dates must be in the range of the ephemeris DE421, 1899-07-29 to 2053-10-09 (Julian "
+            f"dates {first} to {last}), got the Julian date {outside[0]}{day}."
         )
 
 
@@ -126,7 +133,10 @@ def ephemeris(jd: Any) -> tuple[np.ndarray, np.ndarray]:
     """
     jd = np.asarray(jd, float)
     if jd.ndim != 1:
-        raise ValueError(f"jd must be a one-dimensional array of dates, got shape {jd.shape}.")
+        raise ValueError(
+            f"jd must be a one-dimensional array of Julian dates, got shape {jd.shape}. Give a "
+            "single date as [jd]."
+        )
     check_covered(jd)
     kernel = _kernel()
     states = [kernel[0, code].compute_and_differentiate(jd) for code, _ in _BODIES.values()]

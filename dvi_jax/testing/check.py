@@ -100,7 +100,10 @@ def check(name: str, remedy: str, digits: str = ".0e", any_problem: bool = False
 
         def required(method: dvi.Method, problem: Problem | None = None) -> Measured:
             if problem is not None and not any_problem:
-                raise ValueError(f"{name} is measured on its own problem: leave `problem` out.")
+                raise ValueError(
+                    f"problem must be None, because {name} is measured on a fixed problem. Call "
+                    f"{required.__name__}(method)."
+                )
             return _require(Candidate(method, problem), [name])[name]
 
         # Not functools.wraps: the signature shown must be that of `required`.
@@ -143,7 +146,7 @@ def require_double_precision() -> None:
     """**Raises** `ValueError` where x64 is off: the bounds are those of double precision."""
     if jnp.result_type(float) != jnp.float64:
         raise ValueError(
-            "methods are measured in double precision, but x64 is off. First turn it on with "
+            "methods must be measured in double precision, but x64 is off. First call "
             'jax.config.update("jax_enable_x64", True).'
         )
 
@@ -157,14 +160,21 @@ def chosen(kind: str, names: Any, known: Iterable[str], hint: str = "") -> list[
     if names is None:
         return known
     if isinstance(names, str) or not isinstance(names, Iterable):
-        raise TypeError(f"{kind}s must be a list of names, got {names!r}.")
+        raise TypeError(
+            f"{kind}s must be a list of names such as [{known[0]!r}], got {names!r:.200}.{hint}"
+        )
     names = list(dict.fromkeys(names))
     if not names:
-        raise ValueError(f"{kind}s is empty: name at least one of {', '.join(known)}.")
+        raise ValueError(
+            f"{kind}s is empty: name at least one of {', '.join(known)}; or give None for all."
+        )
     lowered = {name.lower(): name for name in known}
     for name in names:
         if name not in known:
             near = difflib.get_close_matches(str(name).lower(), lowered, n=1)
             meant = f" (did you mean {lowered[near[0]]}?)" if near else ""
-            raise ValueError(f"unknown {kind} {name!r}{meant}; known are {', '.join(known)}.{hint}")
+            raise ValueError(
+                f"{kind}s must be known names, got {name!r:.200}{meant}. Known are "
+                f"{', '.join(known)}.{hint}"
+            )
     return names

@@ -62,7 +62,7 @@ def _csv(path: Path, key: str) -> dict[str, np.ndarray]:
     table = np.array([[_number(cell) for cell in cells] for _, cells in rows])
     for i, j in np.argwhere(np.isinf(table))[:1]:
         place, cells = rows[i]
-        allowed = "a finite number; empty, or nan, where nothing was observed"
+        allowed = "a finite number such as -1000.5; empty, or nan, where nothing was observed"
         raise InputError(key, f"{place}, column {names[j]}: the cell is {cells[j]!r}", allowed)
     return dict(zip(names, table.T, strict=True))
 

@@ -73,7 +73,8 @@ class Expressions:
                 left, right = self._made(left), self._made(right)
                 if not (isinstance(left, self.kind) and isinstance(right, self.kind)):
                     raise ValueError(
-                        "+ and * combine only allowed objects, not numbers: for 2 + 2 write 4"
+                        f"+ and * do not apply to numbers, texts or lists, got {ast.unparse(node)}."
+                        " Write the result (4 for 2 + 2), or leave the number out"
                     )
                 return left + right if isinstance(op, ast.Add) else left * right
             case ast.Name(id=name):
@@ -84,7 +85,11 @@ class Expressions:
                     raise self.error(seen) from None
             case ast.Call(func=ast.Name(id=name), args=arguments, keywords=keywords):
                 return self._called(name, arguments, keywords)
-        raise ValueError(f"{ast.unparse(node)!r} is not one of these names, a number or a list")
+        name = next(iter(self.known))
+        raise ValueError(
+            f"{ast.unparse(node)!r} is not one of these: an allowed name ({name}, not dvi.{name}), "
+            "a number (0.5, not 1/2), a text or a list"
+        )
 
     def _called(self, name: str, arguments: list[Any], keywords: list[ast.keyword]) -> Any:
         if name not in self.known:

@@ -48,7 +48,8 @@ def _observable(key: str, text: str, names: dict[str, Callable], source: Source)
         require(callable(function), key, seen, _A_FUNCTION)
         # An energy has `bind` and is called with the system.
         if not hasattr(function, "bind") and not accepts(function, 7):
-            raise InputError(key, f"{inner!r} takes {inspect.signature(function)}", _A_FUNCTION)
+            seen = f"{inner!r} takes {inspect.signature(function)}, but is called with 7 arguments"
+            raise InputError(key, seen, _A_FUNCTION)
         return wrap(function)
     calls = ", ".join(f"{name}()" for name in indicators)
     allowed = f'{{}}; or "file.py:name"; alone or in {", ".join(reductions)}; or {calls}'

@@ -85,10 +85,11 @@ class Output(Report):
         **Raises** `FileExistsError` where another process has written meanwhile, unless `force`;
         after Ctrl-C a `KeyboardInterrupt` that lists the files.
         """
-        if not self.force and any(p.name != keep for p in self.folder.iterdir()):
+        new = [] if self.force else sorted({p.name for p in self.folder.iterdir()} - {keep})
+        if new:
             raise FileExistsError(
-                f"another process has written to {self.folder} since this command began. "
-                "Repeat the command with another directory or with --force"
+                f"another process has written to {self.folder} since this command began (file "
+                f"{new[0]}). Repeat the command with another {self.key}, or with --force"
             )
         for name in self.names:
             if name != keep:
@@ -97,9 +98,10 @@ class Output(Report):
             yield
         except KeyboardInterrupt:
             there = ", ".join(sorted(file.name for file in self.folder.iterdir())) or "nothing"
+            last = self.files[-1] if self.files else "The last file"
             raise KeyboardInterrupt(
-                f"by Ctrl-C while results were written to {self.folder}, which contains: {there}. "
-                "The last file may be incomplete. To write all again, add --force to the command"
+                f"by Ctrl-C while results were written. {self.folder} now contains: {there}. "
+                f"{last} may be incomplete. To write all again, repeat the command with --force"
             ) from None
 
     def path(self, name: str) -> Path:

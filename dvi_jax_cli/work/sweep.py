@@ -270,9 +270,8 @@ def _start(given: Any, source: Source) -> dvi.starts.Starts:
     try:
         return made(**options)
     except (TypeError, ValueError) as error:
-        raise InputError(
-            "start", str(error), f"values that dvi.starts accepts for kind = {given.kind}"
-        ) from None
+        allowed = f'arguments of dvi.starts.{made.__name__}, because kind = "{given.kind}"'
+        raise InputError("start", str(error), allowed) from None
 
 
 # Stores

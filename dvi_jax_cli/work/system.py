@@ -70,7 +70,8 @@ class Source:
         if given is None or problem is None:
             return names if given is None else given
         if not isinstance(names, dict):
-            why = "no parameters" if names is None else "parameters without names (not a dict)"
+            why = f"args of the type {type(names).__name__}, not dict: set them in its Python code"
+            why = "no parameters" if names is None else why
             raise InputError("args", shown(given), f"no key args, because {problem.name} has {why}")
         for name, value in given.items():
             known(f"args.{name}", name, names, seen="there is no such parameter")
@@ -136,10 +137,10 @@ def find_source(file: SystemFile, folder: Path) -> Source:
     require(date is None or name == "solar_system", "state.date", shown(date), allowed)
     if ":" not in name:
         return _of_the_library(file, loader)
-    made = loader.load("system", name)
+    made, seen = loader.load("system", name), repr(name)
     if callable(made) and not isinstance(made, type | dvi.System) and accepts(made, 0):
         try:
-            made = made()
+            made, seen = made(), f"the result of {name!r}"
         except (Exception, SystemExit) as error:
             seen = f"{name!r} failed: {in_one_line(error, *loader.modules)}"
             raise InputError("system", seen, "a function that returns a system") from error
@@ -147,8 +148,8 @@ def find_source(file: SystemFile, folder: Path) -> Source:
         return Source(file, loader, made, made.system)
     if isinstance(made, dvi.System):
         return Source(file, loader, None, made)
-    allowed = "a dvi.System, a systems.Problem, or a function without arguments that returns one"
-    raise InputError("system", f"{name!r} has the type {type(made).__name__}", allowed)
+    allowed = "a dvi.System or systems.Problem, or a function () that returns one of these"
+    raise InputError("system", f"{seen} has the type {type(made).__name__}", allowed)
 
 
 def _of_the_library(file: SystemFile, loader: Loader) -> Source:
