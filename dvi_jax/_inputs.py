@@ -36,8 +36,7 @@ def start_state(q0: Any, p0: Any) -> tuple[Array, Array]:
 def as_times(of: str, ts: Any) -> Array:
     """Times as an array of real numbers; `of`: the name of the call in messages."""
     if not is_traced(ts):
-        refuse_unit_or_mask("ts", ts)
-        ts = np.asarray(ts)
+        ts = _as_numpy("ts", ts)
         refuse_double_without_x64("ts", ts.dtype)
     if jnp.issubdtype(ts.dtype, jnp.integer):
         ts = ts.astype(jnp.result_type(float))

@@ -154,7 +154,7 @@ def integrate(
     ```
     """
     refuse_unknown("integrate", integrate, unknown)
-    system, q0, p0, h, args = of_problem(system, q0, p0, h, args)
+    system, q0, p0, default_h, args = of_problem(system, q0, p0, h, args)
     check_system(system)
     options = {"method": method, "lattice": lattice, "adjoint": adjoint, "newton": newton}
     options |= {"root_finder": root_finder, "arithmetic": arithmetic, "layout": layout}
@@ -168,6 +168,7 @@ def integrate(
         observe = of_steps(observe)
     # A method of the class, here and below: equinox takes 20 µs to make a bound method of a module.
     kind = type(lattice)
+    h = default_h if kind.takes_h else h  # that of a problem does not count where ts is given
     if t1 is not None or duration is not None:
         num_steps = kind.steps_to(lattice, t0, h, num_steps, t1, duration)
     t0, h, num_steps = kind.prepare(lattice, t0, h, num_steps)

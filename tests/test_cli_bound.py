@@ -1,6 +1,8 @@
 """Proofs from TOML files: what they prove and write, which input they reject."""
 
 import json
+import shutil
+from pathlib import Path
 
 import pytest
 from cli import command, found, names, refuses, write
@@ -44,6 +46,17 @@ def folder(tmp_path, monkeypatch):
     write(tmp_path, OWN, "own.py")
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+@pytest.mark.slow
+def test_the_example(folder):
+    examples = Path(__file__).parents[1] / "examples"
+    for name in ("bound.toml", "proved.py"):
+        shutil.copy(examples / name, folder)
+    result = command("bound", "bound.toml")
+    assert result.exit_code == 0, result.output
+    assert "no trajectory that starts in the domain with I_0" in result.output
+    assert command("verify", "results/bound/certificate.json").exit_code == 0
 
 
 def test_a_small_proof(folder):

@@ -96,6 +96,8 @@ def test_a_basis_is_read_as_it_is_written(folder):
     assert parse_basis("own.py:basis", loader).for_shape((1,)).size == 3
     with pytest.raises(InputError, match="is not one of these"):  # nothing else is called
         parse_basis("(lambda: 3)()", loader)
+    with pytest.raises(InputError, match=r"argument with \*\*"):
+        parse_basis("Polynomials(**{'degree': 3})", loader)
 
 
 BASIS, LOW, SEVERAL = '"Polynomials(2)"', "low = {q = [-1.0]", "[1e-4, 1e-3, 1e-2]"

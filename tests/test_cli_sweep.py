@@ -330,7 +330,7 @@ def test_ctrl_c_leaves_a_store_that_can_be_resumed(folder):
     _, message = process.communicate(timeout=60)
     assert process.returncode == 130, message
     assert message.startswith("interrupted: ")
-    assert re.search(r"tasks are done and kept in \S+out\.zarr;", message)
+    assert re.search(r"tasks are done and stored in \S+out\.zarr;", message)
     assert "--resume" in message
     assert "Traceback" not in message
     tasks = sweep_status("out.zarr").contents["tasks"]

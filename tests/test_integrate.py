@@ -129,6 +129,8 @@ def test_given_rejects_times_that_are_no_grid_and_contradictions():
     for contradiction in ({"h": 0.1}, {"num_steps": 5}, {"t0": 1.0}):
         with pytest.raises(ValueError, match="Given"):
             dvi.integrate(OSCILLATOR, *START, lattice=dvi.Given(np.arange(4.0)), **contradiction)
+    kepler, ts = dvi.systems.kepler(), np.array([0.0, 0.1, 0.3])
+    assert dvi.integrate(kepler, lattice=dvi.Given(ts)).ts.tolist() == ts.tolist()
     whole = dvi.integrate(OSCILLATOR, *START, lattice=dvi.Given([0, 1, 2]))
     np.testing.assert_array_equal(whole.hs, [1.0, 1.0])
 

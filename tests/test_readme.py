@@ -116,6 +116,7 @@ RUN_BY = {
     "discover examples/discover.toml": "test_cli_discover.py",
     "sweep examples/sweep.toml": "test_cli_sweep.py",
     "fit examples/fit.toml": "test_cli_fit.py",
+    "bound examples/bound.toml": "test_cli_bound.py",
     "certify --quick": "test_certify.py",
     "paper": "test_paper.py",
 }

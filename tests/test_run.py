@@ -176,7 +176,7 @@ REJECTED = [
     (FIVE + 'epsilon = "big"', "epsilon: the value is 'big' (text)", "finite number"),
     (FIVE + "epsilon = 1" + 400 * "0", "epsilon: the value is 1000", "finite number"),
     (FIVE + 'method = "Yosida(4)"', "method: 'Yosida'", "did you mean Yoshida?"),
-    (FIVE + 'method = "Yoshida(5)"', "orders 4, 6 and 8, got order=5", "Strang"),
+    (FIVE + 'method = "Yoshida(5)"', "order of Yoshida must be 4, 6 or 8, got 5", "Strang"),
     (FIVE + 'method = "3"', "method: '3'", "Strang"),
     (FIVE + f'method = "{3000 * "-"}5"', "method: ", "Strang"),
     (FIVE + 'lattice = "given"', "lattice: the value is 'given' (text)", "uniform"),

@@ -34,6 +34,11 @@ def start(e):
     return [1 - e, 0.0], [0.0, np.sqrt((1 + e) / (1 - e))]
 
 
+def test_the_number_of_steps_does_not_follow_from_a_time():
+    with pytest.raises(ValueError, match="t1 and duration require equal steps"):
+        dvi.integrate(KEPLER, *start(0.5), h=0.1, t1=3.0, lattice=dvi.TimeTransformed(radius))
+
+
 def fictitious_period(e, power):
     """∮ dt / r^power over one revolution with a = 1."""
     E = np.linspace(0, 2 * np.pi, 4001)[:-1]

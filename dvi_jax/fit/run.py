@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._files import publish_npz, read_npz
+from ..engine.reads import reads
 from .optimise import Position, Record, Task
 from .problem import Problem
 from .progress import FitProgress
@@ -112,7 +113,10 @@ def _columns(records: list[Record]) -> dict[str, np.ndarray]:
 
 def identity(problem: Problem, u: np.ndarray, *of: Any) -> str:
     """Hash by which a checkpoint is recognised: data, names, start and settings."""
-    settings = re.sub(r" at 0x[0-9a-f]+", "", repr((problem.space.names, problem.loss, *of)))
+    # The repr of an optax optimiser does not contain its numbers: its functions read them.
+    read = [(n, mark) for n, mark in reads(problem.core.model, *of) if mark[0] == "value"]
+    settings = repr((problem.space.names, problem.loss, *of, read))
+    settings = re.sub(r" at 0x[0-9a-f]+", "", settings)
     groups = [(g.ts, g.values, g.seen, g.whiten, g.t0) for g in problem.groups]
     steps = [(group.num_steps, group.block) for group in problem.groups]
     known = eqx.filter((u, problem.space, problem.core.model, groups), eqx.is_array_like)

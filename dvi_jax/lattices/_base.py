@@ -54,6 +54,9 @@ class Lattice(eqx.Module):
     # that can be rebuilt backwards.
     has_memory: ClassVar[bool] = False
 
+    takes_h: ClassVar[bool] = True
+    """Whether the steps depend on the h of the call."""
+
     @abc.abstractmethod
     def prepare(self, t0: Any, h: Any, num_steps: Any) -> tuple[Any, Any, int]:
         """(t0, h, num_steps) with defaults filled in. **Raises** for values that do not fit."""

@@ -31,6 +31,8 @@ class Given(Lattice):
     not strictly monotonic (a traced `ts` gives the status `bad_step_size` instead).
     """
 
+    takes_h = False
+
     ts: Float[Array, " times"] = eqx.field(converter=_times)
 
     def __check_init__(self):
@@ -58,8 +60,7 @@ class Given(Lattice):
         if h is not None:
             raise ValueError(
                 "h must be left out with lattice=Given(ts), because ts determines the steps; got "
-                f"h={h!r}. If this is the h of a problem of dvi.systems, give problem.system, "
-                "problem.q0, problem.p0 and args=problem.args in place of the problem."
+                f"h={h!r}."
             )
         if not is_traced(t0) and not is_traced(self.ts) and t0 != 0.0 and t0 != self.ts[0]:
             raise ValueError(

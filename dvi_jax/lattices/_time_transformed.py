@@ -28,7 +28,7 @@ from ..observe import (
     has_initial_value,
     is_observable,
 )
-from ._base import Run
+from ._base import Lattice, Run
 from ._uniform import Uniform
 
 
@@ -69,6 +69,9 @@ class TimeTransformed(Uniform):
     """
 
     speed: Callable[..., Any]
+
+    # The steps are equal in σ: their number does not follow from a time t1.
+    steps_to = Lattice.steps_to
 
     def __check_init__(self):
         check_takes("the speed of TimeTransformed", self.speed, "(t, q, p, args)")

@@ -347,7 +347,12 @@ def _domain(domain: Any, found: Any) -> tuple[tuple[int, ...], tuple[list[float]
     lower, upper = [], []
     for name, x in zip("qp", parts, strict=True):
         x = np.asarray(x, float)
-        low, high = x if x.ndim > len(shape) else (-x, x)
+        low, high = (x[0], x[-1]) if x.ndim > len(shape) else (-x, x)
+        if np.shape(low) not in ((), shape) or x.ndim > len(shape) and len(x) != 2:
+            raise ValueError(
+                f"domain of {name} must be a half-width, an array of half-widths of shape {shape} "
+                f"like q, or an array (lower, upper) of shape {(2, *shape)}, got shape {x.shape}."
+            )
         low, high = (np.broadcast_to(side, shape).ravel() for side in (low, high))
         if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
             raise ValueError(

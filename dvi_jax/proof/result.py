@@ -65,7 +65,7 @@ class DriftBound(eqx.Module):
         """
         exact, _ = tools()
         checker, x = exact.Checker(self.certificate), [*np.ravel(q0), *np.ravel(p0)]
-        if len(x) != 2 * checker.n:
+        if not np.size(q0) == np.size(p0) == checker.n:
             raise ValueError(
                 f"q0 and p0 must each have the size {checker.n}, as in the domain of the proof, "
                 f"got the sizes {np.size(q0)} and {np.size(p0)}."

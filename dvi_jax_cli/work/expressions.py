@@ -94,7 +94,9 @@ class Expressions:
     def _called(self, name: str, arguments: list[Any], keywords: list[ast.keyword]) -> Any:
         if name not in self.known:
             raise self.error(f"{name!r} is not a known name", name)
-        options = {k.arg: self._made(k.value) for k in keywords if k.arg is not None}
+        if any(k.arg is None for k in keywords):
+            raise self.error(f"{name!r} has an argument with **: write each argument as name=value")
+        options = {str(k.arg): self._made(k.value) for k in keywords}
         return self.known[name](*(self._made(a) for a in arguments), **options)
 
 
