@@ -204,7 +204,7 @@ def draw_layers(path: Path) -> None:
 
 
 LIMITS = {
-    "lines": 52_500,
+    "lines": 53_300,
     "raise statements": 668,
     COMMENTS: 5,
     f"files of more than {LONGEST_FILE} lines": 0,

@@ -77,7 +77,7 @@ def test_a_small_proof(folder):
 def test_nothing_is_proved_at_a_singularity(folder):
     result = command("bound", write(folder, SMALL.replace("energy", "singular")))
     assert result.exit_code == 1
-    assert "nothing is proved: on " in result.output
+    assert "nothing is proved: no bound was found on " in result.output
 
 
 @pytest.mark.parametrize(

@@ -546,7 +546,7 @@ def test_a_failed_trial_step_does_not_end_the_fit():
 
 def test_too_few_steps_raise_with_the_result(regular):
     data, _ = regular
-    with pytest.raises(dvi.FitError, match="max_steps_reached after 2 steps") as error:
+    with pytest.raises(dvi.FitError, match="status: max_steps_reached, steps: 2") as error:
         dvi.fit(MODEL, data, START, max_steps=2)
     kept = error.value.fit
     assert len(kept.history["loss"]) == 2

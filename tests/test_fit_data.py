@@ -194,7 +194,7 @@ REFUSED = {
     dvi.FitError: [
         (
             {"data": dvi.Observations(TS, VALUES, covariance=[[1e-310]], t0=0.0)},
-            "not_finite after 0 steps, loss inf.* the sum of their squares",
+            "status: not_finite, steps: 0, loss: inf.* the sum of their squares",
         )
     ],
 }

@@ -282,7 +282,7 @@ def test_invalid_input_is_rejected():
         ((fit,), {"component": "q"}, "component must be .*'q'"),
         ((fit,), {"names": ["x"]}, r"one for each .*2 in total.*got \['x'\]"),
         ((fit,), {"arcs": []}, "arcs is empty: .*at least one"),
-        ((fit,), {"axes": three}, r"needs 2 Axes \(one for each panel.*got 3"),
+        ((fit,), {"axes": three}, r"needs 2 Axes .*one for each panel.*got 3"),
     )
     refuses(
         plot.fit_corner,

@@ -374,15 +374,15 @@ WARNINGS = {
     ),
     "p and q of H_D in the other order": (
         lambda: dvi.System(lambda t0, t1, p1, q0, args: p1 @ p1 / 2 + jnp.cos(q0[0])),
-        "order",
+        "exchange them",
     ),
     "p and q of H in the other order": (
         lambda: dvi.discretise(lambda t, p, q, args: p @ p),
-        "order",
+        "exchange them",
     ),
     "p and q of the force in the other order": (
         lambda: dvi.System(H_D, force=lambda t0, t1, p, q, args: -q),
-        "order",
+        "exchange them",
     ),
 }
 """Mistake → (call, what the warning contains)."""

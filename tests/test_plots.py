@@ -183,7 +183,7 @@ def test_save_takes_what_the_pictures_return(tmp_path):
     refuses(
         plot.save,
         (([one, several[0]], tmp_path / "b.png"), {}, "2 figures"),
-        (("picture", tmp_path / "b.png"), {}, "a figure or the axes", TypeError),
+        (("picture", tmp_path / "b.png"), {}, "a figure, or the Axes", TypeError),
     )
     assert not (tmp_path / "b.png").exists()
 
@@ -458,7 +458,7 @@ def test_a_trajectory_is_drawn_as_its_shape_suggests(single):
     axis = plot.trajectory(*arrays(n=4), time="t [s]", position="m")
     assert len(lines(axis)) == 4
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("t [s]", "q [m]")
-    refuses(plot.trajectory, ((arrays(2),), {}, "one orbit, got 2"))
+    refuses(plot.trajectory, ((arrays(2),), {}, "a single orbit, got 2"))
 
 
 def test_a_long_line_is_drawn_whole_in_pieces():
@@ -506,7 +506,7 @@ def test_solutions_of_several_runs_share_a_panel_for_observables_of_all(single, 
     mine = {"E": [np.ones(61), np.ones(61), np.r_[1, 2 * np.ones(20)]]}
     assert lines(plot.invariants([good, short], mine))[2][1].max() == 1
     wrong = ([good, short], {"E": np.ones(61)})
-    refuses(plot.invariants, (wrong, {}, "list of 3 arrays, one for each"))
+    refuses(plot.invariants, (wrong, {}, "one array for each orbit, of length 3"))
 
 
 def test_vectors_change_by_the_length_of_their_difference():
@@ -884,7 +884,7 @@ def test_a_spectrum_draws_sizes_at_their_frequencies():
     refuses(
         plot.spectrum,
         ((w, A[0]), {}, shapes),
-        ((w,), {}, "has no frequencies, amplitudes", TypeError),
+        ((w,), {}, "without frequencies, amplitudes", TypeError),
     )
 
 

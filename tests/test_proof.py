@@ -363,7 +363,7 @@ def test_what_a_bound_says_of_a_start(cubic):
         cubic.steps_inside([0.1], [0.1], 0.02)
     with pytest.raises(ValueError, match="must be finite numbers"):
         cubic.steps_inside([np.nan], [0.1], 0.01)
-    with pytest.raises(ValueError, match=r"size 1, .* got the sizes 2 and 2"):
+    with pytest.raises(ValueError, match=r"size 1, .* got the sizes 2 and 0"):
         cubic.steps_inside([0.1, 0.2], [], 0.01)
 
 
@@ -497,7 +497,7 @@ def test_no_number_of_steps_is_claimed(epsilon, function):
         ({"epsilon": (0.1, 0.1)}, ValueError, "with least < largest"),
         ({"ratio": 1.0}, ValueError, "larger than 1"),
         ({"domain": 0.5}, ValueError, "domain must be an array with the shape"),
-        ({"domain": (np.ones(1), np.ones(2))}, ValueError, r"of q must be .* got shape \(1,\)"),
+        ({"domain": (np.ones(1), np.ones(2))}, ValueError, r"of p must be .* got shape \(2,\)"),
         ({"domain": np.array([-1.0])}, ValueError, "lower bounds below finite"),
         ({"method": dvi.GaussLegendre(2)}, ValueError, "is implicit for this system"),
         ({"h": 0.0}, ValueError, "other than zero"),

@@ -213,7 +213,10 @@ def diagram(q, p, **options):
         ),
         (lambda q, p: section(q, p, skip=-1), "skip must be a whole"),
         (lambda q, p: section(q, p, crossings=0), "crossings must be a whole .* from 1 on, got 0"),
-        (lambda q, p: section(q, p, system=HENON), "be a dvi.System, got Problem.*problem.system"),
+        (
+            lambda q, p: section(q, p, system=HENON),
+            "be a dvi.System, got .*Problem.*problem.system",
+        ),
         (lambda q, p: section(0.0, 0.0), r"orbits along the first axis.*got shape \(\)"),
         (lambda q, p: section(q, p, crosings=3), "argument 'crosings'. Did you mean 'crossings'"),
         (lambda q, p: dvi.poincare_section(HENON.system, q, p, plane, h=1), "'num_steps'"),

@@ -284,7 +284,7 @@ def test_van_der_pol_ends_on_its_cycle():
 def test_populations_go_to_logarithms_and_back():
     numbers = np.array([[3.0, 40.0], [7.0, 0.1]])
     np.testing.assert_allclose(to_populations(*from_populations(*numbers)), numbers, rtol=1e-14)
-    with pytest.raises(ValueError, match=r"number of predators y must be positive, got 0\.0"):
+    with pytest.raises(ValueError, match=r"population y of predators must be positive, got 0\.0"):
         from_populations(1.0, 0.0)
     args = problem("lotka_volterra").args
     at = from_populations(*([x] for x in equilibrium(args)))

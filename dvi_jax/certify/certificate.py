@@ -8,7 +8,6 @@ from typing import Any
 
 import dvi_jax as dvi
 
-from .._checks import instance
 from ..testing import CHECKS, CONTROLS, METHODS, Candidate, Control, Measured
 from ..testing.check import chosen, require_double_precision
 from ..testing.problems import COUPLED, FORCED, reference
@@ -127,7 +126,10 @@ def _named(methods: Any) -> dict[str, dvi.Method]:
         own = " For your own method call certify({name: method})."
         return {name: METHODS[name] for name in chosen("method", methods, METHODS, own)}
     for name, method in methods.items():
-        instance(f"methods[{name!r}]", method, dvi.Method, "a method such as dvi.TypeII()")
+        if not isinstance(method, dvi.Method):
+            raise TypeError(
+                f"methods[{name!r}] must be a method such as dvi.TypeII(), got {method!r:.200}."
+            )
         order = method.order
         if isinstance(order, bool) or not isinstance(order, int | float):
             raise TypeError(f"methods[{name!r}].order must be an int or a float, got {order!r}.")

@@ -348,7 +348,7 @@ def _domain(domain: Any, found: Any) -> tuple[tuple[int, ...], tuple[list[float]
     for name, x in zip("qp", parts, strict=True):
         x = np.asarray(x, float)
         low, high = (x[0], x[-1]) if x.ndim > len(shape) else (-x, x)
-        if np.shape(low) not in ((), shape) or x.ndim > len(shape) and len(x) != 2:
+        if np.shape(low) not in ((), shape) or (x.ndim > len(shape) and len(x) != 2):
             raise ValueError(
                 f"domain of {name} must be a half-width, an array of half-widths of shape {shape} "
                 f"like q, or an array (lower, upper) of shape {(2, *shape)}, got shape {x.shape}."
