@@ -137,9 +137,11 @@ def _same(e: "Evaluator", _: Any, x: Num) -> Num:
 def _reduced_precision(e: "Evaluator", params: dict, x: Num) -> Num:
     wide = {"float64": (11, 52), "float32": (8, 23)}.get(x.dtype)
     if wide is None or params["exponent_bits"] < wide[0] or params["mantissa_bits"] < wide[1]:
-        bits = f"(exponent_bits, mantissa_bits) = {wide} of {x.dtype}"
         got = params["exponent_bits"], params["mantissa_bits"]
-        raise Unsupported(f"reduce_precision must keep {bits}, got {got}")
+        raise Unsupported(
+            f"reduce_precision is compiled only if it does not reduce the precision of {x.dtype}: "
+            f"(exponent_bits, mantissa_bits) must be at least {wide}, got {got}"
+        )
     return x
 
 

@@ -277,7 +277,7 @@ def _finite(whose: str, what: Any, fields: Sequence[str]) -> dict[str, float]:
         if not np.isfinite(value):
             raise ValueError(
                 f"{name} of {whose} is {value}, but must be a finite number. If the simulation "
-                "failed, take a snapshot before the failure. Otherwise correct the number."
+                "failed, use a snapshot from before the failure. Otherwise correct the number."
             )
     return numbers
 

@@ -113,8 +113,8 @@ def axes_in(arguments: Mapping[str, Any]) -> list[tuple[str, Axis]]:
             if not isinstance(axis.values, np.ndarray):
                 wrong = next(x for x in axis.values if not isinstance(x, _NUMBERS))
                 raise TypeError(
-                    f"{where} must be numbers, but its axis {axis.name!r} has the value "
-                    f"{wrong!r:.200} of type {type(wrong).__name__}."
+                    f"all values of {where} must be numbers, but its axis {axis.name!r} contains "
+                    f"{wrong!r:.200} of type {type(wrong).__name__}. Replace or remove this value."
                 )
             refuse_double_without_x64(f"the axis {axis.name!r}", axis.values.dtype)
             found.append((where, axis))

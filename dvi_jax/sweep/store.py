@@ -374,8 +374,8 @@ def _resolved(path: str | os.PathLike) -> Path:
     except (OSError, ValueError, RuntimeError) as error:
         raise StoreError(
             f"{os.fspath(path)!r:.80} cannot be the path of a store "
-            f"({getattr(error, 'strerror', None) or error}): give the path of a directory that "
-            "this user can open."
+            f"({getattr(error, 'strerror', None) or error}). Give a valid path, in a directory "
+            "that you have permission to access."
         ) from None
     return found
 
