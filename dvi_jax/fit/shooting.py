@@ -50,7 +50,10 @@ class MultipleShooting:
     def __post_init__(self):
         whole("segments", self.segments, 2)
         fraction("tolerance", self.tolerance)
-        if not (self.guess in (None, "data", "model") or callable(self.guess)):
+        named = self.guess is None or (
+            isinstance(self.guess, str) and self.guess in ("data", "model")
+        )
+        if not (named or callable(self.guess)):
             raise TypeError(
                 'guess must be "data", "model", None or a function (t) that returns (q, p), got '
                 f"{self.guess!r}."
