@@ -136,9 +136,9 @@ def integrate(
     `IntegrationError` when the trajectory fails and `throw` is True, with the status, the step
     and the residual (inside jit or vmap an equinox runtime error with the status).
 
-    **Accuracy** order of the method in h. Symplectic methods conserve the invariants of the map to
-    round-off and energy to O(h^order) without drift. Gradients are those of the discrete map, by
-    the implicit function theorem through each solve.
+    **Accuracy** order of the method in h. If h is small enough, the energy error of a symplectic
+    method without perturbing force is O(h^order) and does not grow over very long times. Gradients
+    are those of the discrete map, by the implicit function theorem through each solve.
 
     **Example**
 

@@ -2,14 +2,14 @@
 
     python examples/many_hosts.py --launch 2
 
-The strength ε of the perturbation is fitted to the mean of a cloud of Kepler orbits by gradient
-descent. The mean is over all trajectories, so that hosts cannot work on their own: they run one
-program, `dvi.over_devices`, with the trajectories divided between them. When a host is lost the
-others cannot go on either; the launcher then starts all of them again, and they continue from the
-last finished iteration, which host 0 keeps in a file.
+The strength ε of the perturbation is fitted to the mean of a set of Kepler orbits by a damped
+Gauss–Newton iteration. The mean is over all trajectories. Therefore all hosts run one program,
+`dvi.over_devices`, and the trajectories are divided between them. If a host is lost, the other
+hosts cannot continue. The launcher then starts all of them again, and they continue after the last
+finished iteration, which host 0 has stored in a file.
 
-`--launch N` plays the cluster: N processes on this machine. On a real one the scheduler does that
-(Slurm: srun and --requeue), and each process is called without --launch; see docs/clusters.md.
+`--launch N` starts N processes on this machine in place of a cluster. On a cluster the scheduler
+starts the processes (Slurm: srun), each without --launch; see docs/clusters.md.
 """
 
 import argparse

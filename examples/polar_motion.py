@@ -1,8 +1,8 @@
 """The Chandler wobble from measured poles: its period, its damping, and how well they are known.
 
-Four arcs of eight years share the physics and have a start each. Formal errors are far too small,
-as what atmosphere and ocean do to the pole is no white noise; leaving out each arc in turn
-(jackknife) gives honest ones.
+Four arcs of eight years have common parameters, and an initial state each. The formal errors are
+much too small, because the excitation by atmosphere and ocean is not white noise. Errors that
+include it come from fits that leave out each arc in turn (jackknife).
 
 Run: python examples/polar_motion.py [--out DIR] [--years N]
 """

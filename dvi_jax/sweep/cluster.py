@@ -34,8 +34,8 @@ _ATTEMPTS = 10
 
 
 class ClusterError(RuntimeError):
-    """Raised if the cluster is lost or a task kills its workers. Finished tasks are in the store,
-    and the same call continues from there."""
+    """Raised if the cluster is lost or a task kills its workers. With a store the finished tasks
+    are in it, and the same call continues from there."""
 
 
 def run_on(
