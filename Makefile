@@ -22,7 +22,7 @@ help:
 paper: $(READY)
 	$(BIN)/dvi-jax paper --out $(OUT)
 
-## make notebooks   execute the notebooks anew (NOTEBOOKS=--check to compare, or names of some)
+## make notebooks   execute the notebooks again (NOTEBOOKS=--check to compare, or names of some)
 notebooks: $(READY)
 	$(BIN)/python notebooks/make.py $(NOTEBOOKS)
 
@@ -63,7 +63,7 @@ lint: $(READY)
 types: $(READY)
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-## make format      put the code into the house format
+## make format      format the code with ruff
 format: $(READY)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .

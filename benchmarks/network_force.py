@@ -153,7 +153,7 @@ class KnownH(eqx.Module):
 
 
 @eqx.filter_jit
-def run_foil(field, start, num_steps):
+def run_reference(field, start, num_steps):
     return runge_kutta(field, jnp.array(start), H, num_steps)
 
 
@@ -174,14 +174,14 @@ def _evaluate(static, tree, u, horizon, values, sigma):
     return Evaluation(residual(u), jax.jacfwd(residual)(u))
 
 
-def fit_foil(kind, seed, key, steps):
+def fit_reference(kind, seed, key, steps):
     """The same stages, steps and scaled Levenberg–Marquardt as `dvi.fit` takes, for the better of
     two activations."""
-    both = [_fit_foil(kind(key, a), seed, steps) for a in (jnp.tanh, jax.nn.softplus)]
+    both = [_fit_reference(kind(key, a), seed, steps) for a in (jnp.tanh, jax.nn.softplus)]
     return min(both, key=_loss)
 
 
-def _fit_foil(field, seed, steps):
+def _fit_reference(field, seed, steps):
     numbers, static = eqx.partition(field, eqx.is_inexact_array)
     leaves, tree = jax.tree.flatten(numbers)
     u = np.concatenate([np.ravel(x) for x in leaves])
@@ -235,8 +235,8 @@ def compare(seed, steps, restarts):
     """{name: (rms in training, after it, from another start)}, the runs, numbers of parameters."""
     fits = {
         "ours": (run_ours, lambda key: fit_ours(seed, key, steps)),
-        "RK4, known H": (run_foil, lambda key: fit_foil(KnownH, seed, key, steps)),
-        "RK4, general": (run_foil, lambda key: fit_foil(General, seed, key, steps)),
+        "RK4, known H": (run_reference, lambda key: fit_reference(KnownH, seed, key, steps)),
+        "RK4, general": (run_reference, lambda key: fit_reference(General, seed, key, steps)),
     }
     fitted = {name: (run, best_of(fit, seed, restarts)) for name, (run, fit) in fits.items()}
     true, other = truth(START, TRAIN + AFTER), truth(OTHER_START, OTHER)

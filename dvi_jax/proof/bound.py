@@ -71,8 +71,9 @@ def bound_drift(
       epsilon)`` or ``(q, p, epsilon, t)`` → scalar, or a list of these. `system`: a `System` or a
       problem of the library.
     - `epsilon`: the largest ε of an interval from 0, or the pair (least, largest).
-    - `domain`: half-width r of |q_i|, |p_i| ≤ r; or a pair for q and p, each a half-width, an array
-      of half-widths like q, or an array (lower, upper) of shape (2, *shape of q).
+    - `domain`: an array of half-widths like q, |q_i|, |p_i| ≤ r_i, or one number r if `found` is a
+      `Discovery`; or a pair for q and p, each half-widths or an array (lower, upper) of shape
+      (2, *shape of q).
     - `inside`: function ``(q, p)`` → array; the domain has only states where no value is negative.
     - `time`: if the map or an invariant depends on the time, the interval (t_begin, t_end) in which
       steps begin, of the slow time τ = εt where the system has one (`slow_time`).

@@ -46,7 +46,7 @@ class DriftBound(eqx.Module):
     certificate: dict[str, Any] = eqx.field(static=True)
 
     def num_steps(self, change: float, invariant: int = 0) -> int | float:
-        """The number of computed steps within which I_k changes by less than `change`, as long as
+        """The number of computed steps within which I_k changes by at most `change`, as long as
         the trajectory is in the domain; inf if it is conserved exactly, without rounding."""
         each = self.per_step[invariant] + self.rounding[invariant]
         return math.floor(change / each) if each else math.inf
