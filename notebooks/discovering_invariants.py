@@ -65,10 +65,10 @@ plt.show()
 #
 # ## No invariant
 #
-# Van der Pol's force $(1 - q^2)\,p$ amplifies small oscillations and damps large ones. Therefore no
-# invariant of first order exists, and the search must return none. A quantity $I$ is conserved for
-# $\varepsilon = 0$ only. The report must give the mean change of $I$ in one step, as a function of
-# $I$.
+# Van der Pol's force $(1 - q^2)\,p$ amplifies small oscillations and damps large ones. Therefore an
+# invariant of first order does not exist, and the list `invariants` must be empty. A quantity $I$
+# is conserved for $\varepsilon = 0$ only. The report must give the mean change of $I$ in one step,
+# as a function of $I$.
 
 # %%
 van_der_pol = dvi.System(oscillator, force=lambda t0, t1, q0, p1, args: (1 - q0**2) * p1)
@@ -135,8 +135,8 @@ assert found.survivors == (13, 4, 2)
 # Thirteen terms exist at order 0: the four quadratic forms and nine products of them, of degree
 # four. The corrections of the products would have degree five, but the basis ends at degree four.
 # Therefore only the four quadratic forms remain at order 1. Two of them, the angular momentum and
-# the energy, also have corrections of second order. For large $\varepsilon$ the motion is chaotic,
-# and of these quantities only the energy is conserved.
+# the energy, also have corrections of second order. For large $\varepsilon$ most trajectories are
+# chaotic. Then only the energy is conserved approximately, and the angular momentum is not.
 
 # %% [markdown]
 # ## A basis that is too small
@@ -144,9 +144,9 @@ assert found.survivors == (13, 4, 2)
 # If the basis cannot represent an invariant, the search does not find the invariant, but it must
 # not report a wrong one. For Kepler's problem and a basis of polynomials, only the angular momentum
 # is found. With $1/r$ in the basis, three approximate invariants are found, too: the energy and the
-# two components of the Laplace–Runge–Lenz vector. The better the map conserves a quantity, the
-# smaller is its singular value. A singular value counts as zero if it is below `tolerance` times
-# the largest one.
+# two components of the Laplace–Runge–Lenz vector. A quantity that the map conserves more accurately
+# has a smaller singular value. A singular value counts as zero if it is below `tolerance` times the
+# largest one.
 
 # %%
 kepler = dvi.System(lambda t0, t1, q0, p1, args: p1 @ p1 / 2 - 1 / jnp.sqrt(q0 @ q0))

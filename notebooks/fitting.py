@@ -2,16 +2,18 @@
 # # Fit ε to data
 #
 # In this notebook you determine the strength $\varepsilon$ of a perturbation and its error from
-# noisy observations, and test whether the data require a perturbation at all. `dvi.fit` minimises
-# $\chi^2$ with the derivatives of the discrete trajectory.
+# noisy observations. You also test whether the data require a perturbation at all, and identify an
+# unknown force law. `dvi.fit` minimises $\chi^2$, the sum of the squared residuals divided by their
+# variances, with the derivatives of the discrete trajectory.
 #
 # The example is an oscillator with weak friction, whose exact solution is known,
 #
 # $$H = \tfrac12 p^2 + \tfrac12 k q^2, \qquad \dot p = -kq - \varepsilon p, \qquad
 # k = 1.3,\ \varepsilon = 0.02 .$$
 #
-# Its position is observed 60 times within 30 units of time, with a standard deviation of 0.01. The
-# data are generated from the exact solution, not from the model.
+# The units of length and time are arbitrary. The position is observed at 60 times between 0.5 and
+# 30, with a standard deviation of 0.01. The data are generated from the exact solution, not from
+# the model.
 
 # %%
 import jax
@@ -40,8 +42,9 @@ def observed(seed, epsilon=EPSILON):
 # ## The fit
 #
 # `Model` contains the known quantities. The third argument of `fit` contains the initial guesses of
-# the unknown ones. The guess $\varepsilon = 0$ means no perturbation; it replaces the `epsilon` of
-# the model.
+# the unknown quantities. The guess $\varepsilon = 0$ means no perturbation. It replaces the
+# `epsilon` of the model. The `epsilon` of the model is used in fits without $\varepsilon$ among the
+# unknown quantities (below).
 
 
 # %%
@@ -73,8 +76,9 @@ plt.show()
 # %% [markdown]
 # ## Are the errors correct?
 #
-# The fit is repeated for thirty noise realisations. The standard deviation of the estimates of
-# $\varepsilon$ must agree with the error that the fit reports.
+# The fit is repeated for thirty noise realisations. If the errors are correct, the standard
+# deviation of the estimates of $\varepsilon$ agrees with the error that the fit reports. With
+# thirty realisations the standard deviation is itself known only to about 13 %.
 
 # %%
 epsilon_at = found.names.index("epsilon")
@@ -95,9 +99,9 @@ assert 0.7 < pulls.std(ddof=1) < 1.3
 # %% [markdown]
 # ## Do the data require the friction?
 #
-# There are two controls. A fit to the same data with a model without friction must have a reduced
-# $\chi^2$ far above 1. A fit to data without friction must give an $\varepsilon$ that is compatible
-# with zero.
+# Two control fits answer this question. If the data require friction, a model without friction has
+# a reduced $\chi^2$ far above 1 for the same data. The second control uses data without friction:
+# the fitted $\varepsilon$ must then be compatible with zero.
 
 # %%
 unperturbed = {"q0": np.array([0.9]), "args": {"k": 1.2}}
@@ -115,10 +119,11 @@ assert abs(none.x[epsilon_at]) < 3 * none.sigma[epsilon_at]
 # ## Which force is it?
 #
 # Suppose that the force law is unknown, and that positions and momenta are observed. `identify`
-# fits the coefficients of many candidate terms to the trajectory and removes the terms that the
-# data do not support. The candidates are the nine monomials $q^i p^j$ of degree 1 to 3. The true
-# force is $-\varepsilon p$. The printed criterion is $\chi^2$ plus a penalty for each term; smaller
-# is better.
+# fits the coefficients of many candidate terms to the trajectory, and removes a term if the fit is
+# nearly as good without it. The candidates are the nine monomials $q^i p^j$ of degree 1 to 3. The
+# true force is $-\varepsilon p$, so that only the term `p` should remain, with the coefficient
+# $-0.02$. The printed criterion is $\chi^2$ plus a penalty for each term; smaller values are
+# better.
 
 # %%
 times = np.linspace(0.25, 30, 120)
@@ -155,8 +160,8 @@ plt.show()
 # %% [markdown]
 # ## Next steps
 #
-# - Fit real data, with systematic errors: [general relativity](general_relativity.ipynb) and
-#   the [Chandler wobble](polar_motion.ipynb).
+# - Fit data with systematic errors: [general relativity](general_relativity.ipynb) from an
+#   ephemeris, and the [Chandler wobble](polar_motion.ipynb) from measured positions of the pole.
 # - Use the arguments `bounds`, `priors`, `loss` (for data with outliers) and `shooting`
 #   (`MultipleShooting`, for chaotic trajectories) of `dvi.fit`, or fit several data sets together.
 # - Fit an unknown force: in `dvi.NetworkForce` neural networks represent its potential and its

@@ -1,12 +1,12 @@
 # %% [markdown]
 # # GPU: devices, batches, precision
 #
-# In this notebook you run a batch of trajectories on a GPU or another device that JAX finds, and
-# measure how much accuracy is lost in single precision. The stored outputs are those of a CPU.
+# After this notebook you can run a batch of trajectories on a GPU or another device that JAX finds,
+# and you know how much accuracy is lost in single precision. The stored outputs are those of a CPU.
 #
 # **The package has not been tested on a GPU**, and its speed there has not been measured
 # (`docs/gpu.md`). On a GPU a batch is an ordinary JAX program, `jax.lax.scan` over the steps under
-# `jax.vmap`, which XLA compiles.
+# `jax.vmap`. XLA compiles this program.
 
 # %%
 import jax
@@ -25,15 +25,16 @@ print("platform:", device.platform)
 # %% [markdown]
 # For an NVIDIA GPU install the extra `cuda12`. To select the device, set `JAX_PLATFORMS=cpu` or
 # `JAX_PLATFORMS=cuda` in the environment before Python starts. In a program,
-# `jax.default_device(device)` selects the device for a `with` block. Arrays that `jax.device_put`
-# has moved to a device are used on this device.
+# `jax.default_device(device)` selects the device for a `with` block. A computation with arrays that
+# `jax.device_put` has moved to a device runs on this device.
 #
 # ## A batch
 #
-# One trajectory is a sequence of small operations, which cannot run in parallel. To use a whole
-# GPU, compute many trajectories at once: `jax.vmap` maps the function of one trajectory over the
-# initial conditions, and `jax.jit` compiles the result. With `Save(final=True)` and reductions such
-# as `MaxDrift`, memory does not grow with the number of steps.
+# The steps of one trajectory cannot run in parallel, because each step needs the result of the step
+# before it. To use a whole GPU, compute many trajectories at once: `jax.vmap` maps the function of
+# one trajectory over the initial conditions, and `jax.jit` compiles the result. With
+# `Save(final=True)` and reductions such as `MaxDrift`, the memory of a run without derivatives does
+# not grow with the number of steps.
 
 
 # %%
@@ -74,7 +75,7 @@ assert float(drift.max()) < 1e-12
 # %% [markdown]
 # With several devices, `dvi.over_devices(jax.vmap(one))` divides the trajectories between them, and
 # `dvi.sweep` distributes its tasks to all of them. With one device, the result must be identical
-# bit for bit to that without `over_devices`.
+# bit for bit to that without `over_devices`. The next cell checks this.
 
 # %%
 divided = jax.jit(dvi.over_devices(jax.vmap(one)))
@@ -86,7 +87,8 @@ print(len(jax.devices()), "device")
 #
 # With `Layout()`, the default, this package compiles a run to machine code on a CPU, and XLA
 # compiles it on a GPU. With `Layout(form="arrays")`, XLA compiles it on every device. The results
-# must agree to round-off, which the next cell checks with eight trajectories of twenty steps.
+# of the two must agree to round-off. The next cell checks this for eight trajectories of twenty
+# steps.
 
 # %%
 few = q0[:8], p0[:8]
@@ -103,9 +105,10 @@ assert worst < 1e-14
 # ## Single precision
 #
 # Many GPUs compute much faster in float32 than in float64. A run uses float32 only if the initial
-# state has this type. If x64 is switched off, float64 input raises an error. The next cell computes
-# the same orbits in both precisions. The map conserves the angular momentum exactly, so its drift
-# is round-off. The plot shows how this drift grows with the number of steps.
+# state has this type. If `jax_enable_x64` is false, a float64 initial state raises an error. The
+# next cell computes the same orbits in both precisions. In exact arithmetic the map conserves the
+# angular momentum $L$ exactly. Therefore the computed drift of $L$ is round-off. The plot shows how
+# this drift grows with the number of steps.
 
 # %%
 marks = np.unique(np.geomspace(10, 200_000, 40).astype(int))
@@ -153,13 +156,13 @@ with plot.style():
 plt.show()
 
 # %% [markdown]
-# In float32 the drift is larger approximately by the ratio of the rounding units of float32 and
-# float64, $5 \times 10^8$. After 200 000 steps in float32 an exact invariant has changed by $2
-# \times 10^{-5}$; smaller drifts of adiabatic invariants cannot be measured in this arithmetic.
-# Therefore the package raises an error where JAX would round float64 input to float32.
-# `Compensated()` stores the rounding error of each step and adds it in the next step, which reduces
-# the drift to $2 \times 10^{-7}$.
+# In float32 the drift is larger by a factor of the order of $5 \times 10^8$, the ratio of the
+# rounding units of float32 and float64. After 200 000 steps in float32 the rms relative change of
+# $L$, an exact invariant, is $2 \times 10^{-5}$. In such a run, smaller drifts of adiabatic
+# invariants cannot be measured. Therefore the package raises an error where JAX would round float64
+# input to float32. `Compensated()` stores the rounding error of each step and adds it in the next
+# step. In this example it reduces the change to $2 \times 10^{-7}$.
 #
-# ## Next steps
+# ## Next step
 #
 # - Run this notebook on a GPU, and compare the printed numbers with those stored here.

@@ -46,11 +46,12 @@ print(bound)
 
 # %% [markdown]
 # The report states the bound of the change in a step in exact arithmetic, the largest change that
-# was found at sample points, and the bound of the change by rounding in float64. The name `I_0` in
-# the report means the whole series of invariant number 0. The report also states a level and a
-# number of steps: a trajectory that starts in the domain with an invariant below this level does
-# not leave the domain in these steps. The bounds are therefore valid in all of these steps; no
-# assumption on the motion is necessary.
+# was found at sample points, and the bound of the change by rounding in float64. In the report
+# `I_0` is the name of invariant number 0, the whole series, and not its leading term $I_0$. The
+# report also states a value $L$ of the invariant (level) and a number of steps $N$: if the initial
+# state is in the domain and its invariant is less than $L$, the trajectory stays in the domain for
+# $N$ steps. Therefore the bounds hold in all of these steps, without an assumption about the
+# trajectory.
 #
 # The next cell computes twenty trajectories with $10^4$ steps. The measured changes must be below
 # the proved bound.
@@ -73,8 +74,8 @@ assert largest < proved
 
 # %% [markdown]
 # After about twenty steps the largest changes do not grow: the changes in single steps cancel along
-# an orbit. The proof cannot show this, because it adds the largest possible changes. It gives a
-# number of steps within which the invariant cannot change by more than a given amount.
+# an orbit. The proof cannot show this, because it adds the largest possible changes. It proves a
+# number of steps in which the change of the invariant is less than a given value.
 #
 # ## Smaller perturbations
 #
@@ -103,13 +104,14 @@ with plot.style():
     plt.show()
 
 # %% [markdown]
-# The theorems of Nekhoroshev and Neishtadt apply to certain analytic systems. They state that an
-# adiabatic invariant is conserved for a time that grows faster than any power of $1/\varepsilon$.
-# With the best order $z^*(\varepsilon)$ for each $\varepsilon$, this time is exponentially long. In
-# the picture, the highest line at each $\varepsilon_0$ gives the longest proved time. Here this is
-# the line of order 4 everywhere. Invariants of an order above 4 may give longer times. For
-# $\varepsilon_0 = 2$ the orders 1 to 3 have no point, because their bound of the change in one step
-# is larger than $10^{-3}$.
+# The figure shows the proved $N$ for four orders. Order 4 gives the largest $N$ for every
+# $\varepsilon_0$ in the figure. The theorems of Nekhoroshev and Neishtadt apply to certain analytic
+# systems. They state that an adiabatic invariant is conserved for a time that grows faster than any
+# power of $1/\varepsilon$. With the best order $z^*(\varepsilon)$ for each $\varepsilon$, this time
+# is exponentially long. Invariants of an order above 4 may give longer times. For $\varepsilon_0 =
+# 2$ the orders 1 to 3, and for $\varepsilon_0 = 1$ order 1, have no point: their bound of the
+# change in one step is larger than $10^{-3}$.
+#
 # Rounding limits all orders: it changes the invariant by up to $2 \times 10^{-16}$ in a step, so
 # that $N$ cannot exceed about $5 \times 10^{12}$.
 
@@ -118,8 +120,8 @@ with plot.style():
 #
 # Hénon and Heiles' system has the force $-\varepsilon\,(2 q_1 q_2,\; q_1^2 - q_2^2)$. The search at
 # order 3 finds two invariants; the second one is the energy with corrections. Its level surfaces
-# around the middle of the domain are closed. Therefore a trajectory that starts near the middle is
-# proved to stay in the domain for the printed number of steps.
+# around the centre of the domain are closed. This proves that a trajectory with an initial state
+# near the centre stays in the domain for the printed number of steps.
 
 # %%
 henon_heiles = dvi.System(

@@ -1,11 +1,12 @@
 # %% [markdown]
 # # Limits of adiabatic invariance
 #
-# In this notebook you measure how adiabatic invariance fails. The action is an adiabatic invariant
-# under three conditions: the perturbation is not resonant with the frequencies of the motion, phase
-# volume is conserved, and the orbit does not cross a separatrix. You violate one condition after
-# the other, measure how the change of the action $J$ scales with $\varepsilon$, and compare it with
-# a case in which an invariant exists. The table gives the expected results; $c$ is a constant.
+# After this notebook you can recognise three causes by which adiabatic invariance fails, and
+# measure how the change of an action scales with $\varepsilon$. The action $J$ of a system with one
+# degree of freedom is an adiabatic invariant under three conditions: the perturbation is not
+# resonant with the motion, phase volume is conserved, and the orbit does not cross a separatrix.
+# You violate one condition after the other, measure the change of $J$, and compare it with a case
+# in which an invariant exists. The table gives the expected results; $c$ is a constant.
 #
 # | violation | change of $J$ | change in the comparison case |
 # |---|---|---|
@@ -50,13 +51,13 @@ def power_law(epsilons, changes):
 # (\sqrt\omega\, q + i p/\sqrt\omega)/\sqrt2$ with the amplitude $\sqrt J$ and the phase $\theta$.
 # Close to the resonance and up to terms that oscillate fast, the force changes the amplitude at the
 # rate $-\tfrac{\varepsilon}{2\sqrt2} \sin\phi$, with $\phi = \theta - t$. At the resonance $\phi$
-# is stationary for a time of about $\sqrt{2\pi/\dot\omega}$, in which these changes add up. To
-# leading order in $\varepsilon$ the amplitude changes by at most
+# is nearly constant for a time of about $\sqrt{2\pi/\dot\omega}$, and the changes in this time add
+# up. To leading order in $\varepsilon$ the amplitude changes by at most
 #
 # $$|\Delta \sqrt J| \le \frac{\varepsilon}{2\sqrt2} \sqrt{\frac{2\pi}{0.3\,\varepsilon}},
 # \qquad |\Delta J| \le 2\sqrt{J}\, |\Delta\sqrt J| + |\Delta\sqrt J|^2 \sim \varepsilon^{1/2}.$$
 #
-# For $\bar\omega = 1.7$ there is no resonance.
+# For $\bar\omega = 1.7$ the frequency $\omega$ is always above 1, and there is no resonance.
 
 
 # %%
@@ -102,12 +103,14 @@ print("largest change over the phases, measured / predicted:", np.round(passed /
 print(f"no resonance: the change scales as ε^{power(epsilons, missed):.2f}")
 
 # %% [markdown]
-# The measured change agrees with the estimate within 3 % for the three smallest $\varepsilon$, and
-# is 16 % larger than the estimate at the largest $\varepsilon$. Only the term $2\sqrt{J}\,
+# The output gives the measured change divided by the estimate, from the smallest to the largest
+# $\varepsilon$. They agree within 3 % for the three smallest $\varepsilon$. The measured change is
+# 16 % larger than the estimate at the largest $\varepsilon$; the estimate contains only the leading
+# order. Only the term $2\sqrt{J}\,
 # |\Delta\sqrt J|$ scales as $\varepsilon^{1/2}$; the quadratic term $|\Delta\sqrt J|^2$ is
-# proportional to $\varepsilon$. The quadratic term has the same value at the maximum and at the
-# minimum of $\Delta J$ over the phases, and cancels in their difference. Therefore we fit the
-# exponent to half of this difference.
+# proportional to $\varepsilon$. To leading order the quadratic term has the same value at the
+# maximum and at the minimum of $\Delta J$ over the phases, and cancels in their difference.
+# Therefore we fit the exponent to half of this difference.
 
 # %%
 half_range = np.ptp(through, axis=1) / 2
@@ -122,8 +125,9 @@ assert np.all(np.abs(passed / jump - 1)[epsilons < 2e-3] < 0.05)
 #
 # The system is a pendulum with friction, $\dot p = -\sin q - \varepsilon p$. The average over an
 # oscillation is $\langle \dot J \rangle = -\varepsilon J$, because $\oint p^2 dt = \oint p\, dq =
-# 2\pi J$. Therefore the action decreases by a factor $e$, that is by 63 %, within a time
-# $1/\varepsilon$, for any small $\varepsilon$. The adiabatic invariant is $J e^{\varepsilon t}$.
+# 2\pi J$. Therefore the action decreases by a factor of $e$, which is a decrease of 63 %, within a
+# time $1/\varepsilon$, for every small $\varepsilon$. The adiabatic invariant is
+# $J e^{\varepsilon t}$.
 
 # %%
 pendulum = systems.pendulum()
@@ -156,9 +160,9 @@ assert np.all(np.abs(lost - (1 - np.exp(-1))) < 0.01)
 assert abs(power(epsilons, kept) - 1) < 0.05
 
 # %% [markdown]
-# With this friction, `dvi.TypeII`, the default method, is a *conformally* symplectic map: each step
-# multiplies the phase volume by the same number, $1/(1 + \varepsilon h)$, at every state. The next
-# cell verifies this at three states.
+# With this friction, the map of `dvi.TypeII`, the default method, is *conformally* symplectic: each
+# step multiplies the phase volume by the same number, $1/(1 + \varepsilon h)$, at every state. The
+# next cell verifies this number at three states.
 
 
 # %%
@@ -203,13 +207,14 @@ assert len(found.invariants) == 0
 #
 # The area inside the separatrix is $16\,\omega$. If $\omega$ decreases, this area becomes smaller
 # than the area inside the orbit: the orbit crosses the separatrix, and the pendulum begins to
-# rotate. At the crossing the period is infinite, so $\omega$ does not change slowly in comparison.
-# $J$ then changes by an amount that depends on the phase. In theory (Cary, Escande & Tennyson 1986;
-# Neishtadt 1986) this amount has order $\varepsilon$, in general with a logarithm,
-# $\varepsilon \ln \varepsilon$.
+# rotate. The period of the motion on the separatrix is infinite, so that $\omega$ does not change
+# slowly compared with the motion close to it. $J$ then changes by an amount that depends on the
+# phase. In theory (Cary, Escande & Tennyson 1986; Neishtadt 1986) this amount has order
+# $\varepsilon$, in general with a logarithm, $\varepsilon \ln \varepsilon$.
 #
 # If $\omega$ increases, the orbit does not cross the separatrix. Because $\omega(t)$ is analytic,
-# the change of $J$ from $t = -\infty$ to $\infty$ is then smaller than any power of $\varepsilon$.
+# the change of $J$ from $t = -\infty$ to $\infty$ is then exponentially small in
+# $1/\varepsilon$.
 
 # %%
 swinging = dvi.System(
@@ -262,9 +267,10 @@ assert abs(power(crossing_epsilons, crossed) - 1) < 0.1
 assert slowest > 10
 
 # %% [markdown]
-# With a crossing, the change is proportional to $\varepsilon$. While $\varepsilon$ increases by a
-# factor of 15, the change divided by $\varepsilon$ decreases from 0.49 to 0.46 only, so that a
-# logarithm is hardly visible. Without a crossing, the change is exponentially small.
+# With a crossing, the rms change over the phases is nearly proportional to $\varepsilon$: the
+# fitted exponent is 0.98. While $\varepsilon$ increases by a factor of 15, the change divided by
+# $\varepsilon$ decreases only from 0.49 to 0.46, so that a logarithm is hardly visible. Without a
+# crossing, the measured changes agree with an exponential law, $e^{-1.67/\varepsilon}$.
 #
 # ## Summary
 
@@ -290,11 +296,11 @@ plt.show()
 # %% [markdown]
 # ## Next steps
 #
-# - Replace $\tanh$ by a ramp with a corner, `jnp.clip(x, -1, 1)`: the change without a crossing
-#   becomes a power of $\varepsilon$, because an exponentially small change requires a smooth
+# - Replace $\tanh$ by a ramp with corners, `jnp.clip(x, -1, 1)`: the change without a crossing then
+#   scales as a power of $\varepsilon$, because an exponentially small change requires a smooth
 #   $\omega$.
 # - Search for invariants close to a resonance that is constant in time. Their series in
-#   $\varepsilon$ are useful only below a small $\varepsilon$, which `reach` in the result of
-#   `discover_invariants` gives.
-# - Chaos destroys invariants, too: `dvi.LyapunovSpectrum()`, `dvi.GALI(2)` and
-#   `dvi.frequency_diffusion` distinguish regular from chaotic orbits.
+#   $\varepsilon$ are useful only far below the value `reach` of each invariant that
+#   `discover_invariants` finds, and this value is small close to a resonance.
+# - Chaos destroys invariants, too: use `dvi.LyapunovSpectrum()`, `dvi.GALI(2)` and
+#   `dvi.frequency_diffusion` to distinguish regular from chaotic orbits.

@@ -4,19 +4,20 @@
 # In this notebook you measure how well a magnetic mirror conserves the magnetic moment of a charged
 # particle, and whether the particle is reflected where the magnetic moment predicts it.
 #
-# The particle gyrates around a field line. If the field increases along the line, the particle is
-# reflected. The reason is an adiabatic invariant, the magnetic moment. Its leading-order term is
+# The particle gyrates around a field line. If the field increases enough along the line, the
+# particle is reflected. The reason is an adiabatic invariant, the magnetic moment. Its
+# leading-order term is
 #
 # $$\mu_0 = \frac{m v_\perp^2}{2 B},$$
 #
-# where $m$ is the mass, $v_\perp$ the velocity perpendicular to the field and $B$ the field
-# strength. The small parameter is the gyroradius divided by the length over which the field
-# changes.
+# where $m$ is the mass, $v_\perp$ the component of the velocity perpendicular to the field and $B$
+# the field strength. The small parameter is the gyroradius divided by the length over which the
+# field changes.
 #
 # The system is `systems.magnetic_mirror`, $H = |p - eA(q)|^2/2m$ with the charge $e$ and the vector
-# potential $A$. On the axis $B = B_0 (1 + z^2/\ell^2)$. The gyroradius and the gyrofrequency are 1
-# at the initial state, so the small parameter is $1/\ell$. $H$ is not separable, so each step is
-# implicit.
+# potential $A$. On the axis $B = B_0 (1 + z^2/\ell^2)$. At the initial state the gyroradius and the
+# gyrofrequency are 1. Therefore the small parameter is $1/\ell$. $H$ is not separable, so each step
+# is implicit.
 
 # %%
 import jax
@@ -33,9 +34,9 @@ jax.config.update("jax_enable_x64", True)
 # ## The motion
 #
 # The guiding centre (the centre of the gyration) is initially at a distance $\ell/2$ from the axis.
-# The run covers about two bounces; a bounce leads from one mirror point to the other and back. The
-# method is Gauss' method of order 4. The left plot shows one bounce, the right plot the magnetic
-# moment without and with its first correction $\mu_1$.
+# A bounce is the motion from one mirror point to the other and back. The run covers about two
+# bounces. The method is Gauss' method of order 4, with a step of 0.1. The left plot shows one
+# bounce, the right plot the magnetic moment without and with its first correction $\mu_1$.
 
 
 # %%
@@ -74,14 +75,14 @@ plt.show()
 # %% [markdown]
 # ## Conservation
 #
-# Two quantities check the integration. The method conserves the canonical angular momentum to
-# round-off, because the field is symmetric about the axis. The energy has the error of the method.
+# Two quantities check the integration. The field is symmetric about the axis. Therefore the method
+# conserves the canonical angular momentum to round-off. The energy has the error of the method.
 #
-# $\mu_0$ oscillates at the gyrofrequency, with an amplitude proportional to $1/\ell$. The amplitude
-# of $\mu_0 + \mu_1$ is proportional to $1/\ell^2$. (The formula for $\mu_1$ requires a field with
+# $\mu_0$ oscillates at the gyrofrequency, with an amplitude that scales as $1/\ell$. The amplitude
+# of $\mu_0 + \mu_1$ scales as $1/\ell^2$. (The formula for $\mu_1$ requires a field with
 # $b \cdot (\nabla \times b) = 0$, where $b$ is the unit vector along the field.) The second
-# adiabatic invariant is the *bounce action* $J = \oint p_\parallel\, ds$ along the field line. Its
-# amplitude is also proportional to $1/\ell^2$.
+# adiabatic invariant is the *bounce action* $J = \oint p_\parallel\, ds$ along the field line. The
+# amplitude of its oscillation also scales as $1/\ell^2$. The table shows the measured powers.
 
 # %%
 keys = ["magnetic_moment", "corrected_moment", "bounce_action"]
@@ -103,8 +104,9 @@ assert energy < 2e-6
 # %% [markdown]
 # ## The mirror point
 #
-# At the mirror point the whole energy $E$ is in the gyration: $E = \mu B$ with $\mu = \mu_0 +
-# \mu_1$. The field strength at the mirror point must therefore be $E/\mu$.
+# At the mirror point the velocity along the field line is zero, and nearly the whole energy $E$ is
+# in the gyration: $E \approx \mu B$ with $\mu = \mu_0 + \mu_1$. The field strength at the mirror
+# point must therefore agree with $E/\mu$ to a relative accuracy of about $1/\ell$.
 
 
 # %%
@@ -128,8 +130,8 @@ for run, length in zip(runs, lengths, strict=True):
 # ## Controls
 #
 # There are two controls, in which the range must not be small. The energy of the gyration,
-# $m v_\perp^2/2 = \mu_0 B$, changes as much as the field, for any $\ell$. If the field changes
-# within a few gyroradii ($\ell = 2$), $\mu_0$ is not an adiabatic invariant.
+# $m v_\perp^2/2 = \mu_0 B$, changes by about the same factor as the field, for each of the three
+# $\ell$. If the field changes within a few gyroradii ($\ell = 2$), $\mu_0$ is not conserved.
 
 # %%
 gyration = []
@@ -161,6 +163,6 @@ plt.show()
 # ## Next steps
 #
 # - Use the Earth's field (Störmer's problem): `systems.dipole_field`.
-# - Find $\mu$ in a field with a weak gradient, with `dvi.discover_invariants`: `magnetic_moment()`
-#   in `examples/what_is_conserved.py`.
-# - Find the initial conditions for which $\mu$ is not conserved at small $\ell$, with `dvi.sweep`.
+# - `magnetic_moment()` in `examples/what_is_conserved.py` finds $\mu$ in a field with a weak
+#   gradient, with `dvi.discover_invariants`.
+# - At small $\ell$, find the initial conditions for which $\mu$ is not conserved, with `dvi.sweep`.

@@ -2,7 +2,7 @@
 # # The Chandler wobble from measured poles
 #
 # In this notebook you fit the period and the damping of the Chandler wobble to measured positions
-# of the Earth's pole, and determine realistic errors.
+# of the Earth's pole, and estimate errors that take the correlation of the residuals into account.
 #
 # The Earth's pole of rotation moves around a mean position in about 433 days (Chandler wobble). The
 # motion is damped, and driven with a period of one year. The model is a damped and driven
@@ -10,7 +10,7 @@
 # the perturbation; its strength is $\varepsilon = 1$. The data are four arcs of eight years. The
 # period, the damping and the driving are the same for all arcs; each arc has its own initial state.
 #
-# The notebook needs the extra `ephemeris`, which contains the measured poles:
+# The notebook needs the extra `ephemeris`, which installs a package with the measured poles:
 # `pip install ".[ephemeris]"` in a clone. `python examples/polar_motion.py` computes the same fit.
 
 # %%
@@ -31,8 +31,10 @@ YEARS = 8  # length of an arc
 # ## The data
 #
 # The published errors of the poles are not used. They do not include the effects that the model
-# neglects (atmosphere, ocean), and from 1984 on they are much smaller than these effects. All
-# values have the same weight, and the fit estimates their standard deviation from the residuals.
+# neglects (atmosphere, ocean), and from 1984 on they are much smaller than these effects: about
+# one milliarcsecond (mas) or less, compared with about 20 mas in some years. All values have the
+# same weight, and the fit estimates their standard deviation from the residuals. There is one
+# position every ten days.
 
 # %%
 pole = read_polar_motion()
@@ -71,8 +73,9 @@ assert fit.rms < 0.05  # arcsec
 #
 # The formal errors assume white noise. But atmosphere and ocean excite the wobble itself, so the
 # residuals are correlated over months. Therefore we repeat the fit four times, each time without
-# one arc (jackknife). The scatter of these fits gives realistic errors. The damping is described by
-# $1/Q$, where $Q$ is the quality factor.
+# one arc (jackknife). The scatter of these fits gives more realistic errors. With only four arcs
+# the jackknife errors are themselves rough estimates. The damping is described by $1/Q$, where $Q$
+# is the quality factor.
 
 # %%
 at = [fit.names.index(name) for name in ("args.period", "args.inverse_Q")]
@@ -91,8 +94,8 @@ assert np.all(error > 8 * fit.sigma[at])  # formal errors are far too small
 assert abs(inverse_Q) < 2 * error[1]  # 1/Q is compatible with 0
 
 # %% [markdown]
-# The period agrees with the literature, 433.0 ± 1.1 days. $1/Q$ differs from zero by less than its
-# jackknife error: these data do not determine $Q$.
+# The period agrees with the literature, 433.0 ± 1.1 days (Wilson & Vicente 1990). $1/Q$ differs
+# from zero by less than its jackknife error: this fit does not determine $Q$.
 
 # %%
 with plot.style():
@@ -115,4 +118,5 @@ plt.show()
 # ## Next steps
 #
 # - Use shorter arcs, `YEARS = 4`, and compare the residuals and the jackknife errors.
-# - Repeat the fit with `h=10.0`: the discretisation error must be smaller than the noise.
+# - Repeat the fit with `h=10.0`. If the results change by less than their errors, the
+#   discretisation error is small enough.

@@ -1,16 +1,17 @@
 # %% [markdown]
 # # Quick start: find an adiabatic invariant and verify it
 #
-# In this notebook you find an adiabatic invariant of a perturbed oscillator and verify it by long
-# runs and by controls. A weak nonlinear force perturbs a mass on a spring,
+# In this notebook you find an adiabatic invariant of a perturbed oscillator. You verify it by runs
+# of 5000 steps, and by quantities that are not invariants (controls). A weak nonlinear force
+# perturbs a mass on a spring,
 #
 # $$H = \tfrac12\,(p^2 + q^2), \qquad \dot p = -q - \varepsilon q^3 .$$
 #
 # The energy $H$ is not conserved: it changes by $O(\varepsilon)$. A quantity $I = I_0 + \varepsilon
-# I_1$ whose change stays $O(\varepsilon^2)$ over a long time is an *adiabatic invariant of first
-# order*.
+# I_1$ whose rate of change is $O(\varepsilon^2)$ is an *adiabatic invariant of first order*. In
+# this example its total change also stays $O(\varepsilon^2)$ in 5000 steps.
 #
-# In place of the differential equation, `dvi_jax` iterates a map, which is one step of a
+# `dvi_jax` does not solve the differential equation exactly. It iterates a map: one step of a
 # variational integrator with the step size $h$. You therefore search for an invariant of the *map*,
 # here at $h = 0.1$.
 
@@ -32,9 +33,10 @@ jax.config.update("jax_enable_x64", True)  # invariants need double precision
 # from the time `t0` to the time `t1`: `q0` is the position at the beginning of the step, `p1` the
 # momentum at its end. `args` contains parameters, which are not used here.
 #
-# `discover_invariants` searches the polynomials up to degree 8, at random states. `drift_order`
-# measures how the drift of the invariant, its largest change in 5000 steps, scales with
-# $\varepsilon$.
+# `discover_invariants` searches for invariants among the polynomials up to degree 8, at 400 random
+# states. With `representative="simplest"` it selects the formula with the simplest terms, because
+# the invariant is not unique. `drift_order` measures how the drift of the invariant, its largest
+# change in 5000 steps, scales with $\varepsilon$.
 
 
 # %%
@@ -103,7 +105,7 @@ plt.show()
 
 # %% [markdown]
 # Open symbols mark drifts that are less than ten times the drift at $\varepsilon = 0$. They are not
-# used for the slope. All points of the energy are open, so it has no slope (`nan`).
+# used for the slope. All points of the energy are open. Therefore its slope is `nan`.
 #
 # The next cell plots the same quantities against time, for $\varepsilon = 0.1$.
 

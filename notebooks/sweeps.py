@@ -3,8 +3,8 @@
 #
 # In this notebook you compute many trajectories with one call of `dvi.sweep`, for example to find
 # how the drift of an invariant depends on the perturbation and on the initial condition.
-# `dvi.sweep` runs a grid of parameters, labels the results, gives each trajectory a status and
-# stores finished results on disk.
+# `dvi.sweep` runs a grid of parameters, labels the results and gives each trajectory a status. With
+# `store=` it stores finished results on disk.
 #
 # The system is the Kepler problem in the plane, perturbed by the central force $-\varepsilon q$.
 # You measure with which power of $\varepsilon$ the drift of the energy $H$ scales, whether the
@@ -56,8 +56,8 @@ print(dict(data.sizes), result.status_counts())
 
 # %% [markdown]
 # A failed trajectory affects only its own entry. Orbits with initial momenta close to $-0.25$ come
-# so close to the centre that the solver does not converge with this step. The failed trajectories
-# are counted, hatched in the first two plots, and excluded from the statistics.
+# so close to the centre that the solver does not converge with the step 0.05. The failed
+# trajectories are counted, hatched in the first two plots, and excluded from the statistics below.
 
 # %%
 data.p_x.attrs["long_name"] = "initial momentum p$_x$"
@@ -81,8 +81,8 @@ with plot.style():
 # the effect of $\varepsilon$. The local exponent of $\varepsilon$ (second plot) then changes
 # irregularly from pixel to pixel, and the exponent of the median drift is close to 0.
 #
-# The angular momentum must not drift at all: the force has no torque, and Gauss' methods conserve
-# quadratic invariants.
+# The angular momentum must not drift, except for round-off and the tolerance of the solver: the
+# force has no torque, and Gauss' methods conserve quadratic invariants.
 
 # %%
 good = data.where(data.status == 0)
@@ -111,12 +111,12 @@ assert 0 < share < 0.2
 # ## Repeat and resume
 #
 # The store contains a description of this sweep and its results. If you repeat the call, it reads
-# all results and computes nothing. If you repeat it after an interruption, it computes only the
-# missing results. The results are then identical bit for bit to those of a sweep without
-# interruption.
+# all results and computes no trajectory. If you repeat the call after an interruption, it computes
+# only the missing tasks. On the same machine, with the same versions, the results are then
+# identical bit for bit to those of a sweep without interruption.
 #
 # `integrate` computes a single trajectory with another compiled program. Its result agrees with
-# that of the sweep to round-off.
+# that of the sweep at least to round-off.
 
 # %%
 again = dvi.sweep(kepler.system, **asked, store=store)
@@ -133,8 +133,9 @@ print(f"in the sweep {in_sweep:.12f}, alone {float(alone.observed['energy_drift'
 assert abs(in_sweep / float(alone.observed["energy_drift"]) - 1) < 1e-10
 
 # %% [markdown]
-# As a control, the step is changed. `sweep` must then reject the store, because it contains the
-# results of another sweep.
+# As a control, the step h is changed from 0.05 to 0.051. `sweep` must then reject the store,
+# because the store contains the results of another sweep. The line below is a part of the error
+# message.
 
 # %%
 try:
@@ -150,8 +151,9 @@ folder.cleanup()
 # %% [markdown]
 # ## Next steps
 #
-# - Generate initial conditions on the device: `start=dvi.starts.Halton(count, low, high)`. Even
-#   $10^{12}$ of them need no memory.
+# - Generate initial conditions on the device: `start=dvi.starts.Halton(count, low, high)`. They are
+#   computed when they are needed, so that even $10^{12}$ of them need no memory.
 # - Run a sweep from a file: `dvi-jax sweep examples/sweep.toml`.
-# - Estimate the time and the size of a large sweep: `dvi.sweep_cost(...)` runs one task of it.
+# - Estimate the time and the size of a large sweep: `dvi.sweep_cost(...)` computes one task for
+#   each method and number of steps.
 # - Use many machines: pass a Dask client as `client=`.

@@ -9,8 +9,8 @@
 #
 # with the mass $m$, the stiffness $k$, the natural length 1 m and the gravitational acceleration
 # $g$. The perturbation is air drag, $\varepsilon W = -\varepsilon\, (p_r, p_\theta)$. The kinetic
-# energy depends on $r$, so each step is implicit. The package detects this and solves the
-# equations.
+# energy depends on $r$. Therefore the equations of a step are implicit. The package detects this
+# and solves them by iteration.
 
 # %%
 import jax
@@ -28,10 +28,10 @@ jax.config.update("jax_enable_x64", True)
 # ## Hamiltonian, force, observables
 #
 # `H(t, q, p, args)` is the usual Hamiltonian; `args` contains its parameters. `dvi.discretise`
-# converts it to a discrete Hamiltonian, a function of one step with the arguments
-# `(t0, t1, q0, p1, args)`: `q0` is the position at the beginning of the step, `p1` the momentum at
-# its end. A force has the same arguments. An observable is a function of `(q, p)` or of
-# `(t, q, p, args)`.
+# converts it to a discrete Hamiltonian, a function of one step with the arguments `(t0, t1, q0, p1,
+# args)`: `q0` is the position at the beginning of the step, `p1` the momentum at its end. A force
+# has the same arguments. An observable is a function of `(q, p)`, of `(t, q, p, args)`, or of one
+# step, `(t0, t1, q0, p0, q1, p1, args)`.
 
 
 # %%
@@ -80,8 +80,9 @@ plt.show()
 # %% [markdown]
 # ## Four checks
 #
-# **1. Order.** `dvi.Strang`, the composition of the map with its adjoint, has order 2: half the
-# step gives a quarter of the error. The reference is the same method with a much smaller step.
+# **1. Order.** `dvi.Strang` is the composition of a half step of the map with a half step of its
+# adjoint. It has order 2: if the step is halved, the error is divided by four. The reference is the
+# same method with a much smaller step.
 
 # %%
 reference = run(h=2.0 / 6400, num_steps=6400)
@@ -194,13 +195,13 @@ print(f"∂y/∂k = {slope:.8f} m/(N/m), by differences {differences:.8f}")
 assert abs(slope / differences - 1) < 1e-6
 
 # %% [markdown]
-# ## When a step has no solution
+# ## When the solver of a step does not converge
 #
 # In the next cell the weight moves fast towards the point of suspension, and the step is much too
-# long. The solver finds no solution of the equations of Gauss' method. By default this raises an
-# error that names the step. With `throw=False` the run returns its status, and the states are NaN
-# from this step on. With `Strang` the solver finds a solution even here, but the result is not
-# accurate.
+# long. The solver does not converge for the equations of the Gauss–Legendre method with two stages.
+# By default this raises an error that names the step. With `throw=False` the run returns its
+# status, and the states are NaN from this step on. With `Strang` the solver finds a solution even
+# here, but the result is not accurate.
 
 # %%
 too_long = {"h": 0.5, "num_steps": 20, "epsilon": 0.0, "args": args, "throw": False}
