@@ -1,0 +1,131 @@
+"""The search for a proof in several processes: the same result, and no process remains."""
+
+import signal
+import subprocess
+import time
+from functools import partial
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dvi_jax as dvi
+
+pytest.importorskip("flint")
+from dvi_jax.proof import workers
+from dvi_jax.proof.workers import Workers
+
+PENDULUM = dvi.System(
+    lambda t0, t1, q, p, args: p @ p / 2 - jnp.sum(jnp.cos(q)),
+    force=lambda t0, t1, q, p, args: -(q**3),
+)
+
+
+@pytest.fixture
+def started(monkeypatch):
+    """The processes that are started, at once and not after a second. All must have ended."""
+    found, start = [], subprocess.Popen
+
+    def popen(*args, **kwargs):
+        found.append(start(*args, **kwargs))
+        return found[-1]
+
+    monkeypatch.setattr(subprocess, "Popen", popen)
+    monkeypatch.setattr(workers, "_SECONDS", -1.0)
+    yield found
+    assert all(process.returncode is not None for process in found)
+
+
+def bound_with(monkeypatch, count):
+    monkeypatch.setattr("dvi_jax.proof.bound.processors", lambda: count)
+    return dvi.bound_drift(
+        lambda q, p, e: p @ p / 2 - jnp.sum(jnp.cos(q)) - 0.05 * p @ jnp.sin(q),
+        PENDULUM, h=0.1, epsilon=0.01, domain=np.array([0.8]), ratio=1.2,
+    )  # fmt: skip
+
+
+def test_the_certificate_does_not_depend_on_the_number_of_processes(monkeypatch, started):
+    one = bound_with(monkeypatch, 1)
+    assert started == []
+    assert one.boxes > 20
+    assert one.certificate["shell"]
+    assert bound_with(monkeypatch, 2).certificate == one.certificate
+    assert len(started) == 2
+
+
+def test_a_small_search_starts_no_process(monkeypatch, started):
+    monkeypatch.setattr(workers, "_SECONDS", 60.0)
+    assert bound_with(monkeypatch, 2).boxes > 20
+    assert started == []
+
+
+def test_a_killed_process(monkeypatch, started):
+    """The search continues in this process, with the same result."""
+    one, send = bound_with(monkeypatch, 1), workers._send
+
+    def kill(pipe, message):
+        send(pipe, message)
+        if isinstance(message, tuple):  # a box, and not the first message
+            started[0].kill()
+
+    monkeypatch.setattr(workers, "_send", kill)
+    with pytest.warns(RuntimeWarning, match=r"ended early \(exit statuses .*-9"):
+        two = bound_with(monkeypatch, 2)
+    assert two.certificate == one.certificate
+    assert len(started) == 2
+
+
+def test_processes_that_cannot_be_started(monkeypatch):
+    def popen(*args, **kwargs):
+        raise OSError("no more processes")
+
+    monkeypatch.setattr(subprocess, "Popen", popen)
+    monkeypatch.setattr(workers, "_SECONDS", -1.0)
+    with Workers(2) as alone, pytest.warns(RuntimeWarning, match="not start .no more processes"):
+        assert list(alone.map(53, partial(pow, 2), [1, 2, 3])) == [2, 4, 8]
+    assert alone.count == 1
+
+
+def test_what_a_process_imports(started):
+    """Neither JAX nor the main module of the user, which need not have a guard."""
+    name = "__import__('__main__').__file__"
+    loaded = "sorted({'jax', 'dvi_jax', '__mp_main__'} & {*__import__('sys').modules})"
+    bits = "__import__('flint').ctx.prec"
+    with Workers(2) as two:
+        names, modules, precision = two.map(77, eval, [name, loaded, bits])
+    assert names == workers.__file__
+    assert modules == []
+    assert precision == 77
+    assert "jax" in eval(loaded)  # the control: it would be found
+
+
+def interrupted():
+    with Workers(2) as two:
+        for _ in two.map(53, eval, ["1", "__import__('time').sleep(60)"]):
+            raise KeyboardInterrupt
+
+
+def test_errors_and_interruptions(started):
+    with Workers(2) as two:
+        values = two.map(53, partial(divmod, 1), [1, 0])
+        assert next(values) == (1, 0)
+        with pytest.raises(ZeroDivisionError):  # of this process, although another one has it first
+            next(values)
+        for process in started:
+            process.send_signal(signal.SIGINT)  # as Ctrl-C in a terminal does
+        assert list(two.map(53, partial(pow, 2), [1, 2, 3])) == [2, 4, 8]
+        assert [process.poll() for process in started] == [None, None]
+    assert [process.returncode for process in started] == [-signal.SIGKILL] * 2
+    began = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert time.monotonic() - began < 20
+    assert len(started) == 4
+
+
+def test_a_process_ends_with_the_one_that_started_it(started):
+    with Workers(2) as two:
+        assert list(two.map(53, partial(pow, 2), [1, 2])) == [2, 4]
+        for process in started:
+            process.stdin.close()
+        assert [process.wait(timeout=20) for process in started] == [0, 0]
