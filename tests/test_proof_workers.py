@@ -15,10 +15,29 @@ pytest.importorskip("flint")
 from dvi_jax.proof import workers
 from dvi_jax.proof.workers import Workers
 
-PENDULUM = dvi.System(
-    lambda t0, t1, q, p, args: p @ p / 2 - jnp.sum(jnp.cos(q)),
-    force=lambda t0, t1, q, p, args: -(q**3),
+HENON_HEILES = dvi.System(
+    lambda t0, t1, q, p, args: (p @ p + q @ q) / 2,
+    force=lambda t0, t1, q, p, args: -jnp.array([2 * q[0] * q[1], q[0] ** 2 - q[1] ** 2]),
 )
+
+
+def energy(q, p, epsilon):
+    return (p @ p + q @ q - 0.1 * (p @ q)) / 2 + epsilon * (q[0] ** 2 * q[1] - q[1] ** 3 / 3)
+
+
+def bound_with(count):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("dvi_jax.proof.bound.processors", lambda: count)
+        return dvi.bound_drift(
+            energy, HENON_HEILES, h=0.1, epsilon=0.01, domain=np.full(2, 0.4), ratio=1.2,
+            max_boxes=60,
+        )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def one():
+    """The bound that one process finds."""
+    return bound_with(1)
 
 
 @pytest.fixture
@@ -36,32 +55,24 @@ def started(monkeypatch):
     assert all(process.returncode is not None for process in found)
 
 
-def bound_with(monkeypatch, count):
-    monkeypatch.setattr("dvi_jax.proof.bound.processors", lambda: count)
-    return dvi.bound_drift(
-        lambda q, p, e: p @ p / 2 - jnp.sum(jnp.cos(q)) - 0.05 * p @ jnp.sin(q),
-        PENDULUM, h=0.1, epsilon=0.01, domain=np.array([0.8]), ratio=1.2,
-    )  # fmt: skip
-
-
-def test_the_certificate_does_not_depend_on_the_number_of_processes(monkeypatch, started):
-    one = bound_with(monkeypatch, 1)
-    assert started == []
-    assert one.boxes > 20
+def test_the_result_does_not_depend_on_the_number_of_processes(one, started):
+    assert one.boxes > 30
     assert one.certificate["shell"]
-    assert bound_with(monkeypatch, 2).certificate == one.certificate
+    two = bound_with(2)
     assert len(started) == 2
+    assert two.certificate == one.certificate
+    assert two.seen == one.seen  # at random points, which depend on the box only
 
 
-def test_a_small_search_starts_no_process(monkeypatch, started):
+def test_a_small_search_starts_no_process(one, started, monkeypatch):
     monkeypatch.setattr(workers, "_SECONDS", 60.0)
-    assert bound_with(monkeypatch, 2).boxes > 20
+    assert bound_with(2).certificate == one.certificate
     assert started == []
 
 
-def test_a_killed_process(monkeypatch, started):
+def test_a_killed_process(one, started, monkeypatch):
     """The search continues in this process, with the same result."""
-    one, send = bound_with(monkeypatch, 1), workers._send
+    send = workers._send
 
     def kill(pipe, message):
         send(pipe, message)
@@ -70,9 +81,9 @@ def test_a_killed_process(monkeypatch, started):
 
     monkeypatch.setattr(workers, "_send", kill)
     with pytest.warns(RuntimeWarning, match=r"ended early \(exit statuses .*-9"):
-        two = bound_with(monkeypatch, 2)
-    assert two.certificate == one.certificate
+        two = bound_with(2)
     assert len(started) == 2
+    assert two.certificate == one.certificate
 
 
 def test_processes_that_cannot_be_started(monkeypatch):

@@ -79,7 +79,9 @@ def bound_drift(
       quantum/2. `integrator`: an object that contains these two.
     - `change`: of an invariant, for which a number of steps is stated.
     - `ratio`: the boxes are cut until no bound exceeds the largest change seen by this factor, or
-      the limits `max_boxes` or `max_seconds` are reached.
+      the limits `max_boxes` or `max_seconds` are reached. After one second the search
+      continues in one process per processor. Their number has no effect on the result, unless
+      `max_seconds` is reached.
 
     **Returns** a `DriftBound`; ``print`` shows what is proved.
 

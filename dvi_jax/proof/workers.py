@@ -56,7 +56,7 @@ class Workers:
         """The results of a function of the search for all items, in order, with so many bits."""
         if self.spent > _SECONDS:
             self._start(min(self.count, len(items)))
-        if not self.processes:
+        if not self.processes or len(items) == 1:
             for item in items:
                 began = time.monotonic()
                 result = function(item)
