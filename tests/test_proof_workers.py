@@ -100,7 +100,8 @@ def test_processes_that_cannot_be_started(monkeypatch):
 def test_what_a_process_imports(started):
     """Neither JAX nor the main module of the user, which need not have a guard."""
     name = "__import__('__main__').__file__"
-    loaded = "sorted({'jax', 'dvi_jax', '__mp_main__'} & {*__import__('sys').modules})"
+    loaded = "sorted({'jax', 'lanewise', '__mp_main__'} & {*__import__('sys').modules})"
+    loaded = f"__import__('dvi_jax.proof.search') and {loaded}"
     bits = "__import__('flint').ctx.prec"
     with Workers(2) as two:
         names, modules, precision = two.map(77, eval, [name, loaded, bits])

@@ -20,8 +20,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-_PACKAGE = "dvi_jax.proof"
-
 _SECONDS = 1.0
 """Processes start after so many seconds: about as many may be left, and a start takes 0.2 s."""
 
@@ -121,9 +119,9 @@ def _serve() -> None:
     given, results = sys.stdin.buffer, sys.stdout.buffer
     sys.stdout, known, function = sys.stderr, b"", len
     sys.path[:] = pickle.load(given)
-    package = types.ModuleType(_PACKAGE)  # without dvi_jax/__init__.py, which imports JAX
-    package.__path__ = [str(Path(__file__).parent)]
-    sys.modules[_PACKAGE] = package
+    for name in ("dvi_jax", "dvi_jax.proof"):  # without their __init__.py, which import JAX
+        sys.modules[name] = types.ModuleType(name)
+    sys.modules["dvi_jax.proof"].__path__ = [str(Path(__file__).parent)]
     flint = importlib.import_module("flint")
     while True:
         task, item = pickle.load(given)
