@@ -18,11 +18,13 @@ from .._types import Interval
 from ..discover.basis import check_step_size
 from ..discover.found import Discovery
 from ..discover.series import InvariantSeries
+from ..engine.threads import processors
 from .components import Unsupported, program_of
 from .confinement import confine
 from .rational import ExactInvariant
 from .result import DriftBound
 from .tools import tools
+from .workers import Workers
 
 _ACCEPTED = {"float64": 2.0**-49, "pairs of float64": 2.0**-94}
 """Residual of an implicit equation that a solver accepts, relative to the largest momentum: eight
@@ -83,7 +85,9 @@ def bound_drift(
       quantum/2. `integrator`: an object that contains these two.
     - `change`: of an invariant, for which a number of steps is stated.
     - `ratio`: the boxes are cut until no bound exceeds the largest change seen by this factor, or
-      the limits `max_boxes` or `max_seconds` are reached.
+      the limits `max_boxes` or `max_seconds` are reached. After one second the search
+      continues in one process per processor. Their number has no effect on the result, unless
+      `max_seconds` is reached.
 
     **Returns** a `DriftBound`; ``print`` shows what is proved.
 
@@ -163,29 +167,30 @@ def bound_drift(
         guess = _spread(stepped, shape, (lower, upper), strengths, times, h)
         certificate["spread"] = guess
     checker = exact.Checker(certificate)
-    limits = {"max_boxes": max_boxes, "max_seconds": max_seconds}
     seen = search.estimate(checker)
     identities = frozenset(k for k, s in enumerate(seen) if s == 0 and checker.is_identity(k))
     search.resolve(checker, seen, ratio)
     certificate["bits"] = checker.bits
     checker = exact.Checker(certificate)
-    try:
-        result = search.subdivide(checker, identities, seen, ratio=ratio, **limits)
-    except exact.Failed as error:
-        raise ProofError(f"{error}.") from None
-    per_step = [exact.up(b) for b in result.bounds]
-    certificate |= {
-        "per_step": [b.hex() for b in per_step],
-        "rounding": [r.hex() for r in result.rounding],
-        "reach": [m.hex() for m in result.moved],
-        "boxes": result.tree,
-        "steps": 0,
-        "level": None,
-        "shell": None,
-    }
-    level, start, reason, count = confine(
-        checker, certificate, functions, inside, shape, change, limits
-    )
+    with Workers(processors()) as workers:
+        limits = {"max_boxes": max_boxes, "max_seconds": max_seconds, "workers": workers}
+        try:
+            result = search.subdivide(checker, identities, seen, ratio=ratio, **limits)
+        except exact.Failed as error:
+            raise ProofError(f"{error}.") from None
+        per_step = [exact.up(b) for b in result.bounds]
+        certificate |= {
+            "per_step": [b.hex() for b in per_step],
+            "rounding": [r.hex() for r in result.rounding],
+            "reach": [m.hex() for m in result.moved],
+            "boxes": result.tree,
+            "steps": 0,
+            "level": None,
+            "shell": None,
+        }
+        level, start, reason, count = confine(
+            checker, certificate, functions, inside, shape, change, limits
+        )
     certificate["hash"] = exact.digest(certificate)
     return DriftBound(
         per_step=tuple(per_step),

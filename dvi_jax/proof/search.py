@@ -7,10 +7,11 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from fractions import Fraction
+from functools import partial
 from typing import Any
 
 import numpy as np
-from flint import arb
+from flint import arb, ctx
 
 from . import checker as exact
 
@@ -23,6 +24,9 @@ SINGULAR = exact.Failed, ValueError, ArithmeticError
 _POINTS = 64
 """Random points of a box at which a change is evaluated, for a lower estimate of its supremum."""
 
+_BATCH = 32
+"""Boxes that are examined at once, for any number of processors: the result is the same for all."""
+
 
 @dataclass
 class Leaf:
@@ -33,10 +37,12 @@ class Leaf:
     - `rounding`, `moved`: changes by rounding, and how far a step moves each coordinate.
     - `remainders`: of the models of the changes. `shares`: for each invariant and coordinate, by
       how much the bound would decrease if the coordinate were cut.
-    - `axis`, `parts`: of the cut, if there is one.
+    - `axis`, `parts`: of the cut, if there is one. `number`: of the box in the tree; its halves
+      have the numbers 2 `number` and 2 `number` + 1.
     """
 
     box: list
+    number: int = 1
     failed: str = ""
     outside: bool = False
     bounds: list = field(default_factory=list)
@@ -89,6 +95,13 @@ def examine(checker: Any, box: list, rng: Any, identities: frozenset = frozenset
         exact.require(finite, "a value is not bounded")
     except SINGULAR as error:
         leaf.failed = str(error) if isinstance(error, exact.Failed) else "a function is singular"
+    return leaf
+
+
+def _part(checker: Any, identities: frozenset, part: tuple[list, int]) -> Leaf:
+    """A box with its number, which selects the random points."""
+    leaf = examine(checker, part[0], np.random.default_rng(part[1]), identities)
+    leaf.number = part[1]
     return leaf
 
 
@@ -179,7 +192,8 @@ def _values(algebra: exact.Models, model: Any, s: np.ndarray) -> np.ndarray:
     terms = model[0].to_dict()
     powers = np.array([[int(k) for k in powers] for powers in terms]).reshape(-1, s.shape[1])
     values = np.array([float(Fraction(int(c), algebra.one)) for c in terms.values()])
-    return np.prod(s[:, None, :] ** powers[None], axis=2) @ values
+    # Not by BLAS, whose rounding depends on the number of its threads.
+    return np.einsum("ij,j->i", np.prod(s[:, None, :] ** powers[None], axis=2), values)
 
 
 def _largest(algebra: exact.Models, model: Any, s: np.ndarray) -> float:
@@ -205,7 +219,7 @@ def _shares(model: Any, size: int) -> list[float]:
     terms = model[0].to_dict()
     powers = np.array([[int(k) for k in powers] for powers in terms]).reshape(-1, size)
     sizes = np.array([abs(float(c)) for c in terms.values()])
-    return (sizes @ (1 - 0.5**powers)).tolist()
+    return np.einsum("i,ij->j", sizes, 1 - 0.5**powers).tolist()
 
 
 class TooMany(exact.Failed):
@@ -232,26 +246,37 @@ def subdivide(
     ratio: float,
     max_boxes: int,
     max_seconds: float,
+    workers: Any,
 ) -> Found:
     """Cut the domain until no bound exceeds `ratio` times the largest change seen, at least `best`.
 
-    The box with the worst bound is cut first. **Raises** `TooMany` where boxes on which nothing is
-    bounded remain.
+    The boxes with the worst bounds are cut first. **Raises** `TooMany` where boxes on which nothing
+    is bounded remain.
     """
-    rng, began, order = np.random.default_rng(0), time.monotonic(), itertools.count()
-    root = examine(checker, checker.root(), rng, identities)
+    end, order = time.monotonic() + max_seconds, itertools.count()
+    root = _part(checker, identities, (checker.root(), 1))
     best = [max(b, s) for b, s in itertools.zip_longest(best, root.seen, fillvalue=0.0)]
     heap = [(_rank(root, best), next(order), root)]
     count = 1
-    while -heap[0][0] > ratio and count < max_boxes and time.monotonic() - began < max_seconds:
-        leaf = heapq.heappop(heap)[2]
-        leaf.axis = _axis(checker, leaf, best)
-        leaf.parts = [examine(checker, p, rng, identities) for p in halves(leaf.box, leaf.axis)]
-        count += 1
+    while -heap[0][0] > ratio and count < max_boxes and time.monotonic() < end:
+        worst = []
+        while heap and -heap[0][0] > ratio and len(worst) < min(_BATCH // 2, max_boxes - count):
+            worst.append(heapq.heappop(heap)[2])
+            worst[-1].axis = _axis(checker, worst[-1], best)
+        parts = [
+            (half, 2 * leaf.number + i)
+            for leaf in worst
+            for i, half in enumerate(halves(leaf.box, leaf.axis))
+        ]
+        examined = workers.map(ctx.prec, partial(_part, checker, identities), parts)
         old = best
-        for part in leaf.parts:
-            best = [max(b, s) for b, s in itertools.zip_longest(best, part.seen, fillvalue=0.0)]
-            heapq.heappush(heap, (_rank(part, best), next(order), part))
+        for leaf in worst:
+            if time.monotonic() < end:
+                leaf.parts = [next(examined), next(examined)]
+                count += 1
+            for part in leaf.parts or [leaf]:
+                best = [max(b, s) for b, s in itertools.zip_longest(best, part.seen, fillvalue=0.0)]
+                heapq.heappush(heap, (_rank(part, best), next(order), part))
         if best != old:
             heap = [(_rank(item[2], best), *item[1:]) for item in heap]
             heapq.heapify(heap)
@@ -327,53 +352,74 @@ def enclose(
     *,
     max_boxes: int,
     max_seconds: float,
+    workers: Any,
 ) -> tuple[Any, int]:
     """The tree of boxes around the domain on which no trajectory can be, and their number.
 
     `value`: Σ w_k I_k of an array of points (q, p, t, ε), a quick estimate. **Raises** `TooMany`
     with a box on which Σ w_k I_k does not exclude a trajectory.
     """
-    began, count, rng = time.monotonic(), 0, np.random.default_rng(0)
+    end, count = time.monotonic() + max_seconds, 0
     *around, span, epsilon = checker.root()
     around = [(a - w, b + w) for (a, b), w in zip(around, reach, strict=True)]
     whole, sides = [*around, span, epsilon], [*zip(checker.lower, checker.upper, strict=True)]
     domain = np.array(sides, float).T
+    top: list = [None]
+    heap: list = []
 
-    def node(box, borders):
-        nonlocal count
-        claim, axis = None, _widest(box, whole)
-        for claim in ("inside", "unreachable"):
-            if _is_shown(checker, box, claim, weights, limit, reach):
-                count += 1
-                return claim
-        points = _corners(box, rng)
+    def add(box, number, borders, *home):
+        """`borders` of the domain to cut first, `home`: the list of the tree, and the place in it.
+        The boxes with small values around the domain come first: there a failure is found soon."""
+        points = _corners(box, np.random.default_rng(number))
+        values = np.nan_to_num(value(points), nan=-math.inf, posinf=math.inf, neginf=-math.inf)
         beside = ((points[:, :-2] < domain[0]) | (points[:, :-2] > domain[1])).any(1)
-        low = ~(value(points) > float(limit))
-        hopeless = low & beside if not checker.inside["outputs"] else low & False
-        if not low.any():
-            model = exact.combined(checker, weights, box)
-            if model[0].range(model[1])[0] > limit:
-                count += 1
-                return "above"
-            axis = int(np.argmax(_shares(model[1], len(box))))
-        late = count > max_boxes or time.monotonic() - began > max_seconds
-        narrow = all(b - a <= (d - c) / 4096 for (a, b), (c, d) in zip(box, whole, strict=True))
-        if late or narrow or hopeless.any():
-            raise TooMany(
-                "the invariants do not exclude that a trajectory leaves the domain and reaches "
-                f"the box {place(checker, box)}. Try a smaller epsilon or h, or larger max_boxes "
-                "and max_seconds"
-            )
-        if not borders:
-            first, second = halves(box, axis)
-            return ["cut", axis, float(first[axis][1]).hex(), node(first, ()), node(second, ())]
-        (axis, where), *others = borders  # first the domain itself is cut out
-        first, second = halves(box, axis, where)
-        # The part outside of a border has no further ones.
-        left, right = ((), others) if where == checker.lower[axis] else (others, ())
-        return ["cut", axis, float(where).hex(), node(first, left), node(second, right)]
+        least, low = np.min(values[beside], initial=math.inf), values.min() <= float(limit)
+        heapq.heappush(heap, (float(least), number, box, borders, bool(low), *home))
 
-    return node(whole, [(i, side) for i, pair in enumerate(sides) for side in pair]), count
+    add(whole, 1, [(i, side) for i, pair in enumerate(sides) for side in pair], top, 0)
+    claim_on = partial(_claim, checker, (weights, limit, reach), whole)
+    while heap:
+        batch = [heapq.heappop(heap) for _ in range(min(_BATCH, len(heap)))]
+        found = workers.map(ctx.prec, claim_on, [(row[2], row[4]) for row in batch])
+        for (least, number, box, borders, _, *home), (claim, axis) in zip(
+            batch, found, strict=True
+        ):
+            tree, i = home
+            if claim:
+                tree[i] = claim
+                count += 1
+                continue
+            late = count > max_boxes or time.monotonic() > end
+            narrow = all(b - a <= (d - c) / 4096 for (a, b), (c, d) in zip(box, whole, strict=True))
+            if late or narrow or (least <= float(limit) and not checker.inside["outputs"]):
+                raise TooMany(
+                    "the invariants do not exclude that a trajectory leaves the domain and reaches "
+                    f"the box {place(checker, box)}. Try a smaller epsilon or h, or larger "
+                    "max_boxes and max_seconds"
+                )
+            left, right, where = [], [], None
+            if borders:  # first the domain itself is cut out
+                (axis, where), *others = borders
+                # The part outside of a border has no further ones.
+                left, right = ([], others) if where == checker.lower[axis] else (others, [])
+            first, second = halves(box, axis, where)
+            tree[i] = ["cut", axis, float(first[axis][1]).hex(), None, None]
+            add(first, 2 * number, left, tree[i], 3)
+            add(second, 2 * number + 1, right, tree[i], 4)
+    return top[0], count
+
+
+def _claim(checker: Any, level: tuple, whole: list, task: tuple[list, bool]) -> tuple[str, int]:
+    """What is shown on a box, if anything, and the coordinate along which it would be cut. `task`:
+    the box, and whether Σ w_k I_k is known to be too small at a point of it."""
+    (box, low), (weights, limit, _) = task, level
+    for claim in ("inside", "unreachable"):
+        if _is_shown(checker, box, claim, *level):
+            return claim, 0
+    if low:
+        return "", _widest(box, whole)
+    algebra, value = exact.combined(checker, weights, box)
+    return "above" * (algebra.range(value)[0] > limit), int(np.argmax(_shares(value, len(box))))
 
 
 def _is_shown(checker: Any, box: list, claim: str, *level: Any) -> bool:
