@@ -137,7 +137,7 @@ DIVERGES = (
 REFUSED = {
     ValueError: [
         ({"model": lambda params: {"system": SYSTEM}}, "does not return 'q0'"),
-        ({"model": returning(num_steps=3)}, "leave 'num_steps' out of the model"),
+        ({"model": returning(num_steps=3)}, "the model must not return 'num_steps'"),
         ({"model": returning(t0=0.0)}, r"Observations\(\.\.\., t0"),
         ({"model": returning(h=0.0)}, "finite and not zero"),
         ({"model": returning(h=-0.1)}, LATER + ".*Give h = 0.1"),

@@ -34,8 +34,9 @@ _OPTIONS = (
 _MAY_BE_FITTED = ("q0", "p0", "epsilon", "args")
 _OWN = {
     "num_steps": "it follows from h and the times of the data",
-    **dict.fromkeys(("save", "stop"), "the times of the data determine which states are saved"),
-    **dict.fromkeys(("throw", "progress"), "it is an argument of dvi.fit"),
+    "save": "the times of the data determine which states are saved",
+    "stop": "each run must reach the last time of the data",
+    **dict.fromkeys(("throw", "progress"), "it is an argument of the function that fits"),
     "observe": "it is an argument of dvi.Observations",
     "t0": "give it as dvi.Observations(..., t0=...)",
 }
@@ -170,7 +171,7 @@ def specification(model: Callable[..., Any], params: PyTree, arc: Any, many: boo
             )
     for name in _OWN:
         if name in found and not (name == "num_steps" and not _is_uniform(found)):
-            raise ValueError(f"leave {name!r} out of the model: {_OWN[name]}.")
+            raise ValueError(f"the model must not return {name!r}: {_OWN[name]}.")
     if isinstance(found["h"], jax.Array):
         raise ValueError(
             "the step size h of the model must be a Python number such as 0.1, not a parameter or "

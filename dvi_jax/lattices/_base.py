@@ -65,9 +65,9 @@ class Lattice(eqx.Module):
         """Number of steps to the time t1, or over a duration. **Raises** `ValueError`."""
         raise ValueError(
             f"t1 and duration must be left out with lattice={self!r}, because its steps can have "
-            f"different sizes; got t1={t1!r}, duration={duration!r}. Give num_steps instead; with "
-            "Given(ts) leave it out too, because ts determines it. For the state at a time t "
-            "within the run use save=dvi.Save(ts=[t])."
+            f"different sizes; got t1={t1!r}, duration={duration!r}. "
+            f"{'Give num_steps' if self.takes_h else 'ts determines the end of the run'}. To save "
+            "the state at a time t use save=dvi.Save(ts=[t])."
         )
 
     @abc.abstractmethod

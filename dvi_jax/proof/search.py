@@ -73,22 +73,15 @@ def examine(checker: Any, box: list, rng: Any, identities: frozenset = frozenset
                 leaf.outside = True
                 return leaf
         changes = [checker.change(k, step, algebra) for k in range(len(checker.invariants))]
-        leaf.bounds = [
-            Fraction(0) if k in identities else algebra.bound(change)
-            for k, change in enumerate(changes)
-        ]
+        rows = enumerate(changes)
+        leaf.bounds = [Fraction(0) if k in identities else algebra.bound(x) for k, x in rows]
         leaf.remainders = [change[1] / algebra.one for change in changes]
         at = _points(box, rng)
         counts = _is_inside(checker, algebra, step[0], at)
         leaf.seen = [_largest(algebra, change, at[counts]) for change in changes]
-        if identities:  # their boxes are cut until the bound of the rounding is that at points
-            points = [[(x := half(side, rng.random() < 0.5)[i], x) for side in box] for i in (0, 1)]
-            rounded = zip(*(checker.rounding(point)[0] for point in points), strict=True)
-            largest = map(max, rounded)
-            leaf.seen = [
-                r if k in identities else s
-                for k, (r, s) in enumerate(zip(largest, leaf.seen, strict=True))
-            ]
+        corner = [(x := side[rng.integers(2)], x) for side in box]
+        for k in identities:  # boxes are cut until the bound of the rounding is near that of points
+            leaf.seen[k] = checker.rounding(corner)[0][k]
         leaf.shares = [_shares(change, len(box)) for change in changes]
         leaf.moved = [exact.up(m + Fraction(e)) for m, e in zip(moved, errors, strict=True)]
         finite = all(map(math.isfinite, (*leaf.rounding, *leaf.moved)))
