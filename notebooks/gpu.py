@@ -1,12 +1,12 @@
 # %% [markdown]
 # # GPU: devices, batches, precision
 #
-# After this notebook you can run a batch of trajectories on a GPU or another device that JAX finds,
-# and you know how much accuracy is lost in single precision. The stored outputs are those of a CPU.
+# After this notebook you can start a batch of trajectories on a device that JAX finds, and you can
+# measure how much accuracy is lost in single precision. The stored outputs are those of a CPU.
 #
 # **The package has not been tested on a GPU**, and its speed there has not been measured
-# (`docs/gpu.md`). On a GPU a batch is an ordinary JAX program, `jax.lax.scan` over the steps under
-# `jax.vmap`. XLA compiles this program.
+# ([GPU](../docs/gpu.md)). On a GPU a batch is an ordinary JAX program, `jax.lax.scan` over the
+# steps under `jax.vmap`. XLA compiles this program.
 
 # %%
 import jax
@@ -73,9 +73,10 @@ print(
 assert float(drift.max()) < 1e-12
 
 # %% [markdown]
-# With several devices, `dvi.over_devices(jax.vmap(one))` divides the trajectories between them, and
-# `dvi.sweep` distributes its tasks to all of them. With one device, the result must be identical
-# bit for bit to that without `over_devices`. The next cell checks this.
+# With several devices, `dvi.over_devices(jax.vmap(one))` divides the batch between them; the size
+# of the batch must be a multiple of the number of devices. `dvi.sweep` distributes its tasks to all
+# devices. With one device, the result must be identical bit for bit to that without `over_devices`.
+# The next cell checks this.
 
 # %%
 divided = jax.jit(dvi.over_devices(jax.vmap(one)))
@@ -83,7 +84,7 @@ assert np.array_equal(divided(q0, p0)[0], q)
 print(len(jax.devices()), "device")
 
 # %% [markdown]
-# ## Two ways to compile
+# ## Two ways to compile on a CPU
 #
 # With `Layout()`, the default, this package compiles a run to machine code on a CPU, and XLA
 # compiles it on a GPU. With `Layout(form="arrays")`, XLA compiles it on every device. The results
@@ -106,9 +107,9 @@ assert worst < 1e-14
 #
 # Many GPUs compute much faster in float32 than in float64. A run uses float32 only if the initial
 # state has this type. If `jax_enable_x64` is false, a float64 initial state raises an error. The
-# next cell computes the same orbits in both precisions. In exact arithmetic the map conserves the
-# angular momentum $L$ exactly. Therefore the computed drift of $L$ is round-off. The plot shows how
-# this drift grows with the number of steps.
+# next cell computes the same orbits in both precisions. Without round-off the map would conserve
+# the angular momentum $L$. Therefore the computed drift of $L$ is caused by round-off only. The
+# plot shows how this drift grows with the number of steps.
 
 # %%
 marks = np.unique(np.geomspace(10, 200_000, 40).astype(int))

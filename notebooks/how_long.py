@@ -1,13 +1,14 @@
 # %% [markdown]
 # # How long is an adiabatic invariant conserved?
 #
-# In this notebook you prove upper bounds of the change of adiabatic invariants in one step of the
-# map, for all states of a domain, and compare them with measured changes. A bound $b$ of the change
-# in a step proves that $N$ steps change the invariant by at most $N b$, as long as the trajectory
-# is in the domain.
+# In this notebook you prove an upper bound on the change of an adiabatic invariant in one step of
+# the map. The bound holds for all states of a domain. You then compare it with measured changes. A
+# bound $b$ of the change in a step proves that $N$ steps change the invariant by at most $N b$, as
+# long as the trajectory is in the domain.
 #
 # There are three systems: an oscillator with a cubic force, the system of Hénon and Heiles, and a
-# pendulum in a field that varies slowly. The proofs require the extra `proof` (python-flint).
+# pendulum in a field that varies slowly. The proofs require python-flint: `pip install ".[proof]"`
+# in a clone of the repository.
 
 # %%
 import jax
@@ -48,10 +49,10 @@ print(bound)
 # The report states the bound of the change in a step in exact arithmetic, the largest change that
 # was found at sample points, and the bound of the change by rounding in float64. In the report
 # `I_0` is the name of invariant number 0, the whole series, and not its leading term $I_0$. The
-# report also states a value $L$ of the invariant (level) and a number of steps $N$: if the initial
-# state is in the domain and its invariant is less than $L$, the trajectory stays in the domain for
-# $N$ steps. Therefore the bounds hold in all of these steps, without an assumption about the
-# trajectory.
+# report also contains a value $L$ of the invariant and a number of steps $N$. If the initial state
+# is in the domain and the initial value of the invariant is at most $L$, the trajectory stays in
+# the domain for $N$ steps. Therefore the bounds hold in all of these steps, without an assumption
+# about the trajectory.
 #
 # The next cell computes twenty trajectories with $10^4$ steps. The measured changes must be below
 # the proved bound.
@@ -73,9 +74,10 @@ print(f"largest measured change {largest:.1e}, proved for 10000 steps {proved:.1
 assert largest < proved
 
 # %% [markdown]
-# After about twenty steps the largest changes do not grow: the changes in single steps cancel along
-# an orbit. The proof cannot show this, because it adds the largest possible changes. It proves a
-# number of steps in which the change of the invariant is less than a given value.
+# After about 25 steps the largest change does not grow any more (figure), because the changes in
+# single steps cancel along an orbit. The proof cannot show this, because it adds the largest
+# possible changes. It proves a number of steps in which the change of the invariant is less than a
+# given value.
 #
 # ## Smaller perturbations
 #
@@ -140,7 +142,7 @@ print(f"no trajectory that starts in {scaled} leaves the domain in {energy.steps
 assert energy.num_steps(1e-3) > 9e9
 
 # %% [markdown]
-# ## A slow time
+# ## A slowly varying parameter
 #
 # A pendulum moves in a field whose strength varies slowly: $H = p^2/2 - (1 +
 # \varepsilon \sin\tau) \cos q$ with $\tau = \varepsilon t$. We bound the change of the modified

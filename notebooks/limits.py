@@ -11,7 +11,7 @@
 # | violation | change of $J$ | change in the comparison case |
 # |---|---|---|
 # | resonance | $\propto \varepsilon^{1/2}$ | without resonance $\propto \varepsilon$ |
-# | dissipation, $t \le 1/\varepsilon$ | 63 % | of $J e^{\varepsilon t}$: $\propto \varepsilon$ |
+# | dissipation, $t \le 1/\varepsilon$ | 63 % | the quantity $J e^{\varepsilon t}$ changes by $\propto \varepsilon$ |
 # | separatrix crossing | $\propto \varepsilon$ | without crossing $\propto e^{-c/\varepsilon}$ |
 
 # %%
@@ -104,9 +104,9 @@ print(f"no resonance: the change scales as ε^{power(epsilons, missed):.2f}")
 
 # %% [markdown]
 # The output gives the measured change divided by the estimate, from the smallest to the largest
-# $\varepsilon$. They agree within 3 % for the three smallest $\varepsilon$. The measured change is
-# 16 % larger than the estimate at the largest $\varepsilon$; the estimate contains only the leading
-# order. Only the term $2\sqrt{J}\,
+# $\varepsilon$. For the three smallest $\varepsilon$ measurement and estimate agree within 3 %. At
+# the largest $\varepsilon$ the measured change is 16 % larger than the estimate, because the
+# estimate contains only the leading order in $\varepsilon$. Only the term $2\sqrt{J}\,
 # |\Delta\sqrt J|$ scales as $\varepsilon^{1/2}$; the quadratic term $|\Delta\sqrt J|^2$ is
 # proportional to $\varepsilon$. To leading order the quadratic term has the same value at the
 # maximum and at the minimum of $\Delta J$ over the phases, and cancels in their difference.
@@ -207,10 +207,10 @@ assert len(found.invariants) == 0
 #
 # The area inside the separatrix is $16\,\omega$. If $\omega$ decreases, this area becomes smaller
 # than the area inside the orbit: the orbit crosses the separatrix, and the pendulum begins to
-# rotate. The period of the motion on the separatrix is infinite, so that $\omega$ does not change
-# slowly compared with the motion close to it. $J$ then changes by an amount that depends on the
-# phase. In theory (Cary, Escande & Tennyson 1986; Neishtadt 1986) this amount has order
-# $\varepsilon$, in general with a logarithm, $\varepsilon \ln \varepsilon$.
+# rotate. The period tends to infinity at the separatrix. Close to the separatrix $\omega$ therefore
+# changes considerably within one period. $J$ then changes by an amount that depends on the phase.
+# In theory (Cary, Escande & Tennyson 1986; Neishtadt 1986) this amount has order $\varepsilon$, in
+# general with a logarithm, $\varepsilon \ln \varepsilon$.
 #
 # If $\omega$ increases, the orbit does not cross the separatrix. Because $\omega(t)$ is analytic,
 # the change of $J$ from $t = -\infty$ to $\infty$ is then exponentially small in
@@ -299,8 +299,9 @@ plt.show()
 # - Replace $\tanh$ by a ramp with corners, `jnp.clip(x, -1, 1)`: the change without a crossing then
 #   scales as a power of $\varepsilon$, because an exponentially small change requires a smooth
 #   $\omega$.
-# - Search for invariants close to a resonance that is constant in time. Their series in
-#   $\varepsilon$ are useful only far below the value `reach` of each invariant that
-#   `discover_invariants` finds, and this value is small close to a resonance.
+# - Search for invariants close to a resonance that is constant in time. For each invariant,
+#   `discover_invariants` returns `reach`: the $\varepsilon$ at which a correction is as large as
+#   the leading-order term. The series is useful only for $\varepsilon$ much smaller than `reach`,
+#   and close to a resonance `reach` is small.
 # - Chaos destroys invariants, too: use `dvi.LyapunovSpectrum()`, `dvi.GALI(2)` and
 #   `dvi.frequency_diffusion` to distinguish regular from chaotic orbits.

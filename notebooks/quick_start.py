@@ -1,9 +1,9 @@
 # %% [markdown]
 # # Quick start: find an adiabatic invariant and verify it
 #
-# In this notebook you find an adiabatic invariant of a perturbed oscillator. You verify it by runs
-# of 5000 steps, and by quantities that are not invariants (controls). A weak nonlinear force
-# perturbs a mass on a spring,
+# In this notebook you find an adiabatic invariant of a perturbed oscillator. You verify it in runs
+# of 5000 steps. As a control you apply the same test to two quantities that are not adiabatic
+# invariants. A weak nonlinear force perturbs a mass on a spring,
 #
 # $$H = \tfrac12\,(p^2 + q^2), \qquad \dot p = -q - \varepsilon q^3 .$$
 #
@@ -34,9 +34,9 @@ jax.config.update("jax_enable_x64", True)  # invariants need double precision
 # momentum at its end. `args` contains parameters, which are not used here.
 #
 # `discover_invariants` searches for invariants among the polynomials up to degree 8, at 400 random
-# states. With `representative="simplest"` it selects the formula with the simplest terms, because
-# the invariant is not unique. `drift_order` measures how the drift of the invariant, its largest
-# change in 5000 steps, scales with $\varepsilon$.
+# states. The invariant is not unique: with `representative="simplest"` the function returns the one
+# with the simplest terms. The drift of the invariant is its largest change in 5000 steps.
+# `drift_order` measures how the drift scales with $\varepsilon$.
 
 
 # %%
@@ -96,7 +96,7 @@ orders = {
 for name, measured in orders.items():
     print(f"{name}: at ε = 0 it changes by {measured.floor:.1e}, slope {measured.slope:.3f}")
 
-assert np.isnan(orders["energy"].slope)  # the discretisation hides the effect of ε
+assert np.isnan(orders["energy"].slope)  # the energy error of the map is larger than the effect of ε
 assert abs(orders["I₀ alone"].slope - 1) < 0.05
 
 # %%

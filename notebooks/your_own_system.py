@@ -10,7 +10,7 @@
 # with the mass $m$, the stiffness $k$, the natural length 1 m and the gravitational acceleration
 # $g$. The perturbation is air drag, $\varepsilon W = -\varepsilon\, (p_r, p_\theta)$. The kinetic
 # energy depends on $r$. Therefore the equations of a step are implicit. The package detects this
-# and solves them by iteration.
+# (the next cell prints `explicit: False`) and solves the equations by iteration.
 
 # %%
 import jax
@@ -93,9 +93,9 @@ print("errors:", ", ".join(f"{e:.1e}" for e in errors), f"  order {order:.2f}")
 assert abs(order - 2) < 0.1
 
 # %% [markdown]
-# **2. Symplecticity.** Without the force, the Jacobian $M$ of the map satisfies
-# $M^T \Omega M = \Omega$, where $\Omega$ is the symplectic matrix (`omega` below). With the force,
-# phase volume shrinks, and the check must fail.
+# **2. Symplecticity.** Without the force, the Jacobian $M$ of the map satisfies $M^T \Omega M =
+# \Omega$, where $\Omega$ is the symplectic matrix (`omega` below). With the drag force the phase
+# volume shrinks. The map is then not symplectic, and the difference must not be zero.
 
 
 # %%
@@ -200,8 +200,8 @@ assert abs(slope / differences - 1) < 1e-6
 # In the next cell the weight moves fast towards the point of suspension, and the step is much too
 # long. The solver does not converge for the equations of the Gauss–Legendre method with two stages.
 # By default this raises an error that names the step. With `throw=False` the run returns its
-# status, and the states are NaN from this step on. With `Strang` the solver finds a solution even
-# here, but the result is not accurate.
+# status, and the states are NaN from this step on. With `Strang` the solver converges even for this
+# step, but the result is not accurate, because the step is too long.
 
 # %%
 too_long = {"h": 0.5, "num_steps": 20, "epsilon": 0.0, "args": args, "throw": False}
