@@ -87,7 +87,11 @@ def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> A
         refuse_double_without_x64(name, value.dtype)
     kind, shape = (value.dtype, value.shape) if known is None else (known.dtype, known.shape)
     if not _is_real(kind):
-        raise TypeError(f"{name} must be a real number, got {value!r:.200}.")
+        kind = type(value).__name__
+        raise TypeError(
+            f"{name} must be an integer or a floating-point number, got {value!r:.200} of type "
+            f"{kind}. If it is a real number, convert it with float(...)."
+        )
     if shape != ():
         raise ValueError(
             f"{name} must be one number, got an array of shape {shape}. For one run per value use "

@@ -133,8 +133,9 @@ def on_any(x: Array, rare: bool = True) -> Array:
     kind = jnp.asarray(x)
     if kind.dtype != bool or kind.shape != ():
         raise TypeError(
-            f"x must be one bool of one trajectory, got {kind.dtype} of shape {kind.shape}. "
-            "For a number write a comparison such as x > 0; for an array write jnp.any(x)."
+            "x must be a boolean scalar, the condition for one trajectory, got dtype "
+            f"{kind.dtype} and shape {kind.shape}. For a number use a comparison, such as x > 0. "
+            "For a boolean array use jnp.any(x)."
         )
     if not isinstance(rare, bool):
         raise TypeError(f"rare must be True or False, got {rare!r}.")

@@ -2,9 +2,9 @@
 # # How long is an adiabatic invariant conserved?
 #
 # In this notebook you prove an upper bound on the change of an adiabatic invariant in one step of
-# the map. The bound holds for all states of a domain. You then compare it with measured changes. A
-# bound $b$ of the change in a step proves that $N$ steps change the invariant by at most $N b$, as
-# long as the trajectory is in the domain.
+# the map. The bound holds for all states of a domain. You then compare it with measured changes. If
+# $b$ is an upper bound on the change in one step, then $N$ steps change the invariant by at most $N
+# b$, as long as the trajectory stays in the domain.
 #
 # There are three systems: an oscillator with a cubic force, the system of Hénon and Heiles, and a
 # pendulum in a field that varies slowly. The proofs require python-flint: `pip install ".[proof]"`
@@ -46,13 +46,13 @@ bound = dvi.bound_drift(found[2], cubic, h=0.1, epsilon=0.01, domain=0.5)
 print(bound)
 
 # %% [markdown]
-# The report states the bound of the change in a step in exact arithmetic, the largest change that
-# was found at sample points, and the bound of the change by rounding in float64. In the report
-# `I_0` is the name of invariant number 0, the whole series, and not its leading term $I_0$. The
-# report also contains a value $L$ of the invariant and a number of steps $N$. If the initial state
-# is in the domain and the initial value of the invariant is at most $L$, the trajectory stays in
-# the domain for $N$ steps. Therefore the bounds hold in all of these steps, without an assumption
-# about the trajectory.
+# In the report, the column `change ≤` is the upper bound on the change in one step in exact
+# arithmetic, `seen` is the largest change found at sample points, and `rounding ≤` is the upper
+# bound on the change by rounding in float64. In the report `I_0` is the name of invariant number 0,
+# the whole series, and not its leading term $I_0$. The report also contains a value $L$ of the
+# invariant and a number of steps $N$. If the initial state is in the domain and the initial value
+# of the invariant is at most $L$, the trajectory stays in the domain for $N$ steps. Therefore the
+# bounds hold in all of these steps, without an assumption about the trajectory.
 #
 # The next cell computes twenty trajectories with $10^4$ steps. The measured changes must be below
 # the proved bound.
@@ -110,9 +110,9 @@ with plot.style():
 # $\varepsilon_0$ in the figure. The theorems of Nekhoroshev and Neishtadt apply to certain analytic
 # systems. They state that an adiabatic invariant is conserved for a time that grows faster than any
 # power of $1/\varepsilon$. With the best order $z^*(\varepsilon)$ for each $\varepsilon$, this time
-# is exponentially long. Invariants of an order above 4 may give longer times. For $\varepsilon_0 =
-# 2$ the orders 1 to 3, and for $\varepsilon_0 = 1$ order 1, have no point: their bound of the
-# change in one step is larger than $10^{-3}$.
+# is exponentially long. Invariants of an order above 4 may give longer times. Orders 1 to 3 are not
+# plotted at $\varepsilon_0 = 2$, and order 1 is not plotted at $\varepsilon_0 = 1$, because their
+# bound on the change in one step is larger than $10^{-3}$.
 #
 # Rounding limits all orders: it changes the invariant by up to $2 \times 10^{-16}$ in a step, so
 # that $N$ cannot exceed about $5 \times 10^{12}$.
@@ -121,7 +121,7 @@ with plot.style():
 # ## Two degrees of freedom
 #
 # Hénon and Heiles' system has the force $-\varepsilon\,(2 q_1 q_2,\; q_1^2 - q_2^2)$. The search at
-# order 3 finds two invariants; the second one is the energy with corrections. Its level surfaces
+# order 3 finds two invariants; the last one is the energy with corrections. Its level surfaces
 # around the centre of the domain are closed. This proves that a trajectory with an initial state
 # near the centre stays in the domain for the printed number of steps.
 

@@ -74,8 +74,8 @@ assert abs(order.slope - 2) < 0.02
 # A test is meaningful only if it can fail. We therefore test two quantities that are not adiabatic
 # invariants of first order. The energy must fail for two reasons: the force changes it at first
 # order in $\varepsilon$, and the map does not conserve it even at $\varepsilon = 0$. $I_0$ without
-# its correction must fail for the first reason only. Its drift must scale as $\varepsilon$: the
-# slope in the output must be 1.
+# its correction must fail for the first reason only. The drift of $I_0$ must scale as
+# $\varepsilon$: its slope in the output must be 1.
 
 
 # %%
@@ -96,7 +96,9 @@ orders = {
 for name, measured in orders.items():
     print(f"{name}: at ε = 0 it changes by {measured.floor:.1e}, slope {measured.slope:.3f}")
 
-assert np.isnan(orders["energy"].slope)  # the energy error of the map is larger than the effect of ε
+assert np.isnan(
+    orders["energy"].slope
+)  # the energy error of the map is larger than the effect of ε
 assert abs(orders["I₀ alone"].slope - 1) < 0.05
 
 # %%
@@ -105,7 +107,8 @@ plt.show()
 
 # %% [markdown]
 # Open symbols mark drifts that are less than ten times the drift at $\varepsilon = 0$. They are not
-# used for the slope. All points of the energy are open. Therefore its slope is `nan`.
+# used for the slope. All symbols of the energy are open. Therefore its slope is not measured
+# (`nan`).
 #
 # The next cell plots the same quantities against time, for $\varepsilon = 0.1$.
 

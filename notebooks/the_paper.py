@@ -4,8 +4,8 @@
 # In this notebook you measure whether five claims of a paper hold, with public functions of the
 # package. The paper is "Preservation of adiabatic invariants for disturbed Hamiltonian systems
 # under variational discretization" (Acta Mechanica, doi:10.1007/s00707-019-02571-z). Numbers in
-# parentheses, such as (34), are those of its equations. The package implements its discrete
-# equations, which are, with corrected signs,
+# parentheses, such as (34), are equation numbers of the paper. The package implements the discrete
+# equations of the paper. With corrected signs they are
 #
 # $$q_1 = q_0 + h\,\frac{\partial H_D}{\partial p_1}, \qquad
 # p_1 = p_0 - h\,\frac{\partial H_D}{\partial q_0} + h\,\varepsilon W . \tag{12, 13}$$
@@ -18,7 +18,7 @@
 #
 # $$I_z = \sum_{m \le z} \varepsilon^m (\xi_m \cdot p - \xi^0_m E^- + G_m), \tag{29}$$
 #
-# where $E^-$, the incoming energy at a grid point, is the energy of the step that ends there. The
+# where $E^-$ at a grid point is the energy of the step that ends at this point. The
 # command `dvi-jax paper` measures all claims of the paper and writes a table of verdicts.
 
 # %%
@@ -94,9 +94,9 @@ plt.show()
 #
 # For $W = -q$ the paper gives $(1 + \varepsilon)(p^2 + q^2)/2$ as an invariant of first order. The
 # drift of such an invariant scales as $\varepsilon^2$: the slope of log(drift) against
-# log($\varepsilon$) is 2. A slope of 1 means that the quantity is conserved only for
-# $\varepsilon = 0$. For the limit $h \to 0$ we use a composition of order 4 with $h = 0.01$, whose
-# discretisation error is negligible here.
+# log($\varepsilon$) is 2. A slope of 1 means that the quantity is conserved only for $\varepsilon =
+# 0$. For the limit $h \to 0$ we use a composition of order 4 with $h = 0.01$, whose discretisation
+# error (second line of the output) is much smaller than the drift of (34).
 
 
 # %%
@@ -212,10 +212,11 @@ assert abs(slopes[1] - 1) < 0.1  # not for the force +εq
 # (49) is conserved to round-off on any time grid, because $\xi^0 = 0$ for (49) and the force is
 # central. For (50) $\xi^0$ is not 0. Therefore (50) requires a time grid on which each step size
 # satisfies the energy equation: the change of the energy in a step equals the work of the
-# perturbing force. `dvi.Variational` computes this grid. On a fixed time grid (50) oscillates with
-# an amplitude $O(h)$ for any $\varepsilon$. For $h \to 0$ and the force $-\varepsilon q$, (50) is
-# an invariant of first order. The force $+\varepsilon q$ is a control, for which (50) must not be
-# an invariant of first order: the slope is 1.
+# perturbing force. `dvi.Variational` computes this grid; for this orbit with $h = 0.1$ the equation
+# for the step loses its root after 77 steps ([time grids](../docs/lattices.md)). On a fixed time
+# grid (50) oscillates with an amplitude $O(h)$ for any $\varepsilon$. For $h \to 0$ and the force
+# $-\varepsilon q$, (50) is an invariant of first order. The force $+\varepsilon q$ is a control,
+# for which (50) must not be an invariant of first order: the slope is 1.
 
 # %%
 with plot.style():

@@ -128,7 +128,7 @@ def test_a_new_system_reads_the_new_value_and_the_old_one_raises(name, monkeypat
 def test_the_message_names_the_value(monkeypatch):
     system = dvi.System(of_a_function_of_a_global)
     monkeypatch.setitem(globals(), "STIFFNESS", 4.0)
-    with pytest.raises(ValueError, match=r"STIFFNESS \(value 1.0, now value 4.0\). Make a new"):
+    with pytest.raises(ValueError, match=r"STIFFNESS \(value 1.0, now 4.0\). Make a new"):
         final(system)
 
 

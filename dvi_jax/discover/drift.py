@@ -270,7 +270,7 @@ def _order(epsilons: np.ndarray, lanes: _Lanes, kept: np.ndarray) -> DriftOrder:
 
 
 def _check_observable(invariant: Any) -> None:
-    function("invariant", invariant, hint="Of a Discovery give one of its `invariants`.")
+    function("invariant", invariant, hint="If you have a Discovery, give one of its `invariants`.")
 
 
 def _positive(name: str, values: Any, increasing: bool = False) -> np.ndarray:

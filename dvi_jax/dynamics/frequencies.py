@@ -254,10 +254,13 @@ def signals_of(ts: Any, signal: Any) -> tuple[Array, Array, float, int]:
         )
     sizes = zip(ts.shape[::-1], signal.shape[::-1], strict=False)
     if ts.ndim > signal.ndim or any(n not in (1, size) for n, size in sizes):
-        own = f", or of shape {signal.shape} if each signal has its own" if signal.ndim > 1 else ""
+        both = (
+            f"{ts.shape[-1:]} if all signals have the same times, or of shape {signal.shape} if "
+            "each signal has its own times. Axes of length 1 are broadcast"
+        )
         raise ValueError(
             f"ts of shape {ts.shape} does not match a signal of shape {signal.shape}. Give ts of "
-            f"shape {ts.shape[-1:]}, the times of all signals{own}."
+            f"shape {both if signal.ndim > 1 else signal.shape}."
         )
     if signal.shape[-1] < _FEWEST:
         raise ValueError(

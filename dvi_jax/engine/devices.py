@@ -50,8 +50,9 @@ def over_devices(
         each = [in_axes] * len(args) if isinstance(in_axes, int | None) else list(in_axes)
         if len(each) != len(args):
             raise ValueError(
-                "in_axes must be one number for all arguments, or a list of one entry for each of "
-                f"them (here {len(args)}), got {in_axes!r}."
+                "in_axes must be an integer or None for all arguments, or a list with one such "
+                f"entry per argument. The function was called with {len(args)} arguments, got "
+                f"in_axes={in_axes!r}."
             )
         for axis in each:
             instance("each entry of in_axes", axis, int | None, "a whole number or None")

@@ -65,14 +65,16 @@ def changed(before: Reads, now: Reads) -> list[str]:
     """The names in both whose values differ, with the values where they can be printed."""
     old = dict(before)
     return [
-        f"{name} ({_shown(old[name])}, now {_shown(mark)})"
+        f"{name} ({_shown(old[name], mark)})"
         for name, mark in now
         if name in old and old[name] != mark
     ]
 
 
-def _shown(mark: Any) -> str:
-    return f"{mark[0]} {mark[1]}" if mark[0] in ("value", "length") else f"one {mark[0]}"
+def _shown(old: Any, now: Any) -> str:
+    if old[0] == now[0] and old[0] in ("value", "length"):
+        return f"{old[0]} {old[1]}, now {now[1]}"
+    return "an array whose values have changed" if old[0] == now[0] == "array" else "replaced"
 
 
 def _functions(value: Any) -> Iterator[Callable]:

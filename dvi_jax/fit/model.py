@@ -104,7 +104,7 @@ class Model(eqx.Module):
             if name not in _MAY_BE_FITTED:
                 raise TypeError(
                     f"params of a dvi.Model must be a dict with keys among {allowed}, got the key "
-                    f"{name!r}. Put a parameter of the system into args: "
+                    f"{name!r}. If it is a parameter of the system, put it into args: "
                     f"{{'args': {{{name!r}: ...}}}}."
                 )
             old = found[name]

@@ -74,10 +74,10 @@ class Method(eqx.Module):
         # The errors that a function raises for a q or args of another structure than it expects.
         except (TypeError, IndexError, KeyError, ValueError, AttributeError) as error:
             raise ValueError(
-                f"the functions of the system raise an error for q of shape {q.shape} and "
-                f"args={args!r:.200}. Give an example of a valid q and of valid args: "
-                "is_explicit(system, q=jnp.zeros(shape), args=...). The error is "
-                f"{type(error).__name__}: {error}"
+                f"the functions of the system raise {type(error).__name__} for q of shape "
+                f"{q.shape} and args={args!r:.200}: {error}. If this shape or these args are wrong, "
+                "give others, in is_explicit as q=jnp.zeros(shape) and args=...; otherwise correct "
+                "the function."
             ) from error
         return found[0]
 

@@ -205,7 +205,7 @@ def arrange(
     if empty := [str(d) for d, n in data.sizes.items() if n == 0]:
         raise ValueError(
             "data must have at least one value along each dimension, got size 0 along "
-            f"{', '.join(map(repr, empty))}: change the selection."
+            f"{', '.join(map(repr, empty))}. Change the selection, so that it is not empty."
         )
     over = (over,) if isinstance(over, str) else tuple(over)
     roles = {"x": x, "y": y, "facet": facet, **{f"over={name!r}": name for name in over}}
