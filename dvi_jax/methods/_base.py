@@ -75,9 +75,9 @@ class Method(eqx.Module):
         except (TypeError, IndexError, KeyError, ValueError, AttributeError) as error:
             raise ValueError(
                 f"the functions of the system raise {type(error).__name__} for q of shape "
-                f"{q.shape} and args={args!r:.200}: {error}. If this shape or these args are wrong, "
-                "give others, in is_explicit as q=jnp.zeros(shape) and args=...; otherwise correct "
-                "the function."
+                f"{q.shape} and args={args!r:.200}: {error}. If this shape or these args are "
+                "wrong, give others, in is_explicit as q=jnp.zeros(shape) and args=...; otherwise "
+                "correct the function."
             ) from error
         return found[0]
 
