@@ -11,7 +11,7 @@
 # | violation | change of $J$ | change in the comparison case |
 # |---|---|---|
 # | resonance | $\propto \varepsilon^{1/2}$ | without resonance $\propto \varepsilon$ |
-# | dissipation, $t \le 1/\varepsilon$ | 63 % | $J e^{\varepsilon t}$ changes by $\propto \varepsilon$ |
+# | dissipation, $t \le 1/\varepsilon$ | 63 % | for $J e^{\varepsilon t}$: $\propto \varepsilon$ |
 # | separatrix crossing | $\propto \varepsilon$ | without crossing $\propto e^{-c/\varepsilon}$ |
 
 # %%
