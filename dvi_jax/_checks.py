@@ -15,11 +15,9 @@ def whole(name: str, value: Any, least: int = 1, most: int | None = None, hint: 
     # True is an integer in Python, but as a number it is nearly always a mistake.
     fits = isinstance(value, int | np.integer) and not isinstance(value, bool)
     if not fits or value < least or (most is not None and value > most):
-        last = "on" if most is None else f"to {most}"
-        seen = f"{value!r:.200}" + ("" if fits else f" (type {type(value).__name__}, not int)")
-        raise ValueError(
-            f"{name} must be a whole number from {least} {last}, got {seen}.{_more(hint)}"
-        )
+        span = f"of at least {least}" if most is None else f"from {least} to {most}"
+        seen = f"{value!r:.200}" + ("" if fits else f" (type {type(value).__name__})")
+        raise ValueError(f"{name} must be an integer {span}, got {seen}.{_more(hint)}")
     return int(value)
 
 

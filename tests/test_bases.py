@@ -79,7 +79,7 @@ def test_functions_of_time_are_recognised():
 @pytest.mark.parametrize(
     ("make", "error", "says"),
     [
-        (lambda: dvi.Chebyshev(0, "q"), ValueError, "count must be a whole number from 1 on"),
+        (lambda: dvi.Chebyshev(0, "q"), ValueError, "count must be an integer of at least 1"),
         (lambda: dvi.Chebyshev(3, "q", domain=(1, 1)), ValueError, "a < b"),
         (lambda: dvi.Chebyshev(3, "x").for_shape(()), ValueError, "the variable 'x', but"),
         (lambda: dvi.Trigonometric(2, "q", period=0.0), ValueError, "period must be positive"),

@@ -122,7 +122,7 @@ def test_order_conditions_hold_and_the_next_does_not(kind, stages):
     ],
 )
 def test_other_numbers_of_stages_are_rejected(kind, stages, range):
-    with pytest.raises(ValueError, match=f"stages must be a whole number from {range}"):
+    with pytest.raises(ValueError, match=f"stages must be an integer from {range}"):
         kind(stages)
 
 

@@ -696,7 +696,7 @@ def test_invalid_multiple_shooting():
     energy = observed(np.ones(60), sigma=1.0, observe=lambda t, q, p, a: q[0] ** 2)
     with pytest.raises(ValueError, match='observe="positions" or observe="state"'):
         dvi.fit(MODEL, energy, START, shooting=dvi.MultipleShooting(6, guess="data"))
-    with pytest.raises(ValueError, match="segments must be a whole number from 2 on"):
+    with pytest.raises(ValueError, match="segments must be an integer of at least 2"):
         dvi.MultipleShooting(1)
 
 

@@ -398,7 +398,7 @@ INVALID_POSTERIORS = [
     (on_a_line(None), {"loss": dvi.SoftL1()}, ValueError, "a robust loss .*sigma or covariance"),
 ]
 INVALID_SAMPLES = [
-    ({"num_samples": 2}, ValueError, "num_samples must be a whole number from 4 on, got 2"),
+    ({"num_samples": 2}, ValueError, "num_samples must be an integer of at least 4, got 2"),
     ({"chains": 0}, ValueError, "chains must be"),
     ({"target_accept": 1.0}, ValueError, "target_accept must be a number between 0 and 1"),
     ({"progress": 3}, TypeError, "progress must be"),

@@ -488,10 +488,10 @@ def test_every_parameter_must_be_there_and_be_a_number(name):
     ("make", "options", "said"),
     [
         ("stiff_fput", {"omega": 0.0}, "omega must be a positive.*got 0.0"),
-        ("stiff_fput", {"m": 0}, "m must be a whole number from 1 on, got 0.*m springs"),
-        ("fput", {"n": -1}, "n must be a whole number from 1 on, got -1.*row of particles"),
+        ("stiff_fput", {"m": 0}, "m must be an integer of at least 1, got 0.*m springs"),
+        ("fput", {"n": -1}, "n must be an integer of at least 1, got -1.*row of particles"),
         ("fput", {"alpha": math.nan}, "alpha must be a finite number, got nan"),
-        ("toda", {"n": 2}, "n must be a whole number from 3 on, got 2.*at least three particles"),
+        ("toda", {"n": 2}, "n must be an integer of at least 3, got 2.*at least three particles"),
         ("nls_lattice", {"n": 2.5}, "got 2.5.*ring of at least three sites"),
         (
             "n_body",

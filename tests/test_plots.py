@@ -293,7 +293,7 @@ def test_unknown_keywords_are_rejected_with_those_that_there_are():
         (plot.animate, (arrays(), "a.gif"), "colour", "labels, units, title"),
         (plot.sweep_map, (xr.DataArray(t),), "facets", "facet, over, pixels"),
     ):
-        match = f"unknown keyword '{wrong}'; allowed are {known}"
+        match = f"unknown keyword '{wrong}'. Allowed are {known}"
         refuses(draw, (args, {wrong: 1}, match, TypeError))
 
 
@@ -796,7 +796,7 @@ def test_a_bifurcation_has_a_column_of_points_for_each_parameter():
     refuses(
         plot.bifurcation,
         (([1, 2], np.ones((3, 4))), {}, shapes),
-        (([1, 2], np.ones((2, 4))), {"skip": -1}, "from 0 on, got -1"),
+        (([1, 2], np.ones((2, 4))), {"skip": -1}, "of at least 0, got -1"),
         (([0, 2], np.ones((2, 4))), {"log": True}, "positive values of parameter"),
     )
 

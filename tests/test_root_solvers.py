@@ -552,7 +552,7 @@ def test_settings_that_cannot_work_are_rejected():
         ):  # fmt: skip
             with pytest.raises(ValueError, match=r"must be|both 0"):
                 kind(**bad)
-    with pytest.raises(ValueError, match="newton_up_to must be a whole number"):
+    with pytest.raises(ValueError, match="newton_up_to must be an integer"):
         PicardThenNewton(newton_up_to=-1)
     with pytest.raises(TypeError, match="picard must be a dvi"):
         PicardThenNewton(picard=Newton())

@@ -206,13 +206,13 @@ def diagram(q, p, **options):
     ("make", "message"),
     [
         (lambda q, p: section(q, p[:2]), r"the same shape, got \(3, 2\) for q0 and \(2, 2\)"),
-        (lambda q, p: section(q, p, num_steps=0), "num_steps must be a whole .* from 1 on, got 0"),
+        (lambda q, p: section(q, p, num_steps=0), "num_steps must be an integer of at least 1, got 0"),
         (
             lambda q, p: section(q, p, epsilon=[0.0, 0.1]),
             "one number for each orbit in q0.*got length 2",
         ),
-        (lambda q, p: section(q, p, skip=-1), "skip must be a whole"),
-        (lambda q, p: section(q, p, crossings=0), "crossings must be a whole .* from 1 on, got 0"),
+        (lambda q, p: section(q, p, skip=-1), "skip must be an integer"),
+        (lambda q, p: section(q, p, crossings=0), "crossings must be an integer of at least 1, got 0"),
         (
             lambda q, p: section(q, p, system=HENON),
             "be a dvi.System, got .*Problem.*problem.system",
@@ -225,7 +225,7 @@ def diagram(q, p, **options):
         (lambda q, p: diagram(q, p, epsilon=[[0.0]]), "1-D array, got shape"),
         (lambda q, p: diagram(q, p, folow=True), "has no argument 'folow'. Did you mean 'follow'"),
         (lambda q, p: return_map(HENON), "problem.system"),
-        (lambda q, p: return_map(returns=0), "returns must be a whole number"),
+        (lambda q, p: return_map(returns=0), "returns must be an integer"),
         (lambda q, p: dvi.stroboscope(1.0, np.nan), "phase of a stroboscope must be a finite"),
         (lambda q, p: dvi.stroboscope(0.0), "period of a stroboscope must be a positive"),
     ],

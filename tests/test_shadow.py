@@ -234,7 +234,7 @@ def test_states_of_any_shape_and_precision_batches_and_gradients():
 
 @pytest.mark.parametrize("order", [-1, 1.0, True, None])
 def test_order_is_refused(order):
-    with pytest.raises(ValueError, match="order must be a whole number from 0 on"):
+    with pytest.raises(ValueError, match="order must be an integer of at least 0"):
         dvi.ShadowHamiltonian(order)
 
 

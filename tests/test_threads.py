@@ -65,10 +65,10 @@ def test_an_error_of_the_function_is_raised():
 @pytest.mark.parametrize(
     ("function", "threads", "error", "match"),
     [
-        (jnp.sin, 0, ValueError, "whole number from 1 on, got 0"),
-        (jnp.sin, -2, ValueError, "whole number from 1 on, got -2"),
+        (jnp.sin, 0, ValueError, "integer of at least 1, got 0"),
+        (jnp.sin, -2, ValueError, "integer of at least 1, got -2"),
         (jnp.sin, 1.5, TypeError, "positive integer or None, got 1.5"),
-        (jnp.sin, True, ValueError, "whole number from 1 on, got True"),
+        (jnp.sin, True, ValueError, "integer of at least 1, got True"),
         (jnp.ones(3), None, TypeError, "argument of over_threads must be a function"),
     ],
 )

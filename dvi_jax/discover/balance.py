@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from lanewise.jaxapi import is_traced
+
 from .._solution import Solution
 from .._system import System
 from .._types import Args
@@ -84,10 +86,11 @@ def noether_balance(
     if jnp.ndim(solution.ts) != 1 or steps < 2:
         raise ValueError(
             "solution must be one trajectory with at least three states, got solution.ts of shape "
-            f"{jnp.shape(solution.ts)}. Integrate at least two steps with save=dvi.Save(). For a "
-            "batch use jax.vmap over the solutions."
+            f"{jnp.shape(solution.ts)}. Integrate at least two steps with save=dvi.Save(). From a "
+            "batch take one trajectory: jax.tree.map(lambda x: x[i], solution)."
         )
-    if steps != solution.stats["num_steps"] or steps != jnp.size(solution.hs):
+    made = solution.stats["num_steps"]
+    if steps != jnp.size(solution.hs) or not (is_traced(made) or steps == made):
         raise ValueError(
             f"solution must have the state at every lattice point, but it has {steps + 1} states"
             + (" at requested times" if steps != jnp.size(solution.hs) else "")

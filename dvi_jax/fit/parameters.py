@@ -251,9 +251,9 @@ def _given(
         below = [k for k in places if not path or k == name or k.startswith(under)]
         if not below:
             raise ValueError(
-                f"{called} are given for {name!r}, but the fitted parameters are "
-                f"{', '.join(map(repr, places))}. For an array give one dvi.{kind.__name__} with "
-                "numbers or with arrays of its shape."
+                f"{called} are given for {name!r}, but params has no fitted parameter of this "
+                f"name. The fitted parameters are {', '.join(map(repr, places))}. For an array "
+                f"give one dvi.{kind.__name__} for the whole array."
             )
         where = np.concatenate([places[k].ravel() for k in below])
         has[where] = True

@@ -267,9 +267,9 @@ def _arguments(u: Any, args: Any, units: UnitSystem) -> Any:
     unmet = [name for name in units.args if name not in seen]
     if unmet and bare:  # a mistyped name would let a bare number through
         raise ValueError(
-            f"UnitSystem(args=...) has units for {', '.join(unmet)}, but args has no such names. "
-            f"Names in args without a unit: {', '.join(bare)}. Use the same names in both, or "
-            f"remove {', '.join(unmet)} from UnitSystem."
+            f"UnitSystem(args=...) has units for {', '.join(unmet)}, but args has no entries of "
+            f"these names. Entries of args without a unit: {', '.join(bare)}. Give args as a dict "
+            f"with the same names, or remove {', '.join(unmet)} from UnitSystem(args=...)."
         )
     return numbers
 

@@ -153,8 +153,9 @@ class Extended(eqx.Module):
         if isinstance(observable, Trend):
             raise ValueError(
                 "observe must not contain a dvi.Trend with lattice=TimeTransformed(...): its slope "
-                "would be the change per unit of fictitious time, not of t. In place of "
-                "dvi.Trend(f) observe f, and fit a line to its values over solution.ts."
+                "would be the change per unit of fictitious time, not of t. Use observe=f instead "
+                "of dvi.Trend(f), and fit a line to its values against solution.ts, or "
+                "solution.ts[1:] if f is a function of a step."
             )
         if isinstance(observable, Deviations):
             raise ValueError(

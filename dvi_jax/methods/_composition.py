@@ -142,8 +142,9 @@ def _as_coefficients(values: Sequence[float]) -> tuple[float, ...]:
         return tuple(float(c) for c in values)
     except (TypeError, ValueError):
         raise TypeError(
-            "coefficients of Composition must be a sequence of numbers that are not traced, got "
-            f"{values!r:.200}. An example is dvi.Composition((0.2, 0.3, 0.3, 0.2), order=2)."
+            "coefficients of Composition must be a sequence of numbers, such as (0.2, 0.3, 0.3, "
+            f"0.2), got {values!r:.200}. Numbers traced by JAX are not possible: make the "
+            "Composition outside of jax.jit, jax.grad and jax.vmap."
         ) from None
 
 

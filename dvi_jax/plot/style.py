@@ -104,8 +104,8 @@ def check_keywords(given: Mapping[str, Any], *known: str) -> None:
     """**Raises** `TypeError` for a keyword that is not one of those known."""
     if unknown := [name for name in given if name not in known]:
         raise TypeError(
-            f"unknown keyword {unknown[0]!r}; allowed are {', '.join(known)} and the arguments in "
-            "the signature of the function."
+            f"unknown keyword {unknown[0]!r}. Allowed are {', '.join(known)}, and those that the "
+            "docstring of the function describes."
         )
 
 

@@ -148,8 +148,13 @@ def find_source(file: SystemFile, folder: Path) -> Source:
         return Source(file, loader, made, made.system)
     if isinstance(made, dvi.System):
         return Source(file, loader, None, made)
-    allowed = "a dvi.System or systems.Problem, or a function () that returns one of these"
-    raise InputError("system", f"{seen} has the type {type(made).__name__}", allowed)
+    allowed = "a dvi.System, a systems.Problem, or a function without arguments that returns one"
+    kind = f"an object of type {type(made).__name__}"
+    if isinstance(made, type):
+        kind = f"the class {made.__name__}, not an object"
+    elif callable(made):
+        kind = "a function or object with required arguments"
+    raise InputError("system", f"{seen} is {kind}", allowed)
 
 
 def _of_the_library(file: SystemFile, loader: Loader) -> Source:
