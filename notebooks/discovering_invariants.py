@@ -144,9 +144,9 @@ assert found.survivors == (13, 4, 2)
 # If the basis cannot represent an invariant, the search does not find the invariant, but it must
 # not report a wrong one. For Kepler's problem and a basis of polynomials, only the angular momentum
 # is found. With $1/r$ in the basis, three approximate invariants are found, too: the energy and the
-# two components of the Laplace–Runge–Lenz vector. A quantity that the map conserves more accurately
-# has a smaller singular value. A singular value counts as zero if it is below `tolerance` times the
-# largest one.
+# two components of the Laplace–Runge–Lenz vector. The map conserves these three only approximately.
+# Therefore their singular values are small but not round-off. A singular value counts as zero if it
+# is below `tolerance` times the largest one.
 
 # %%
 kepler = dvi.System(lambda t0, t1, q0, p1, args: p1 @ p1 / 2 - 1 / jnp.sqrt(q0 @ q0))

@@ -177,8 +177,9 @@ print("steps proved for the initial state (0.3, 0):", slow.steps_inside([0.3], [
 # In one step this quantity changes by $O(h^3)$, because it contains only the first correction of
 # the energy, and by $O(\varepsilon^2 h)$, because the strength of the field varies. Both parts have
 # about the same size here. Therefore the number of steps for a change of 0.001 is small. The last
-# line of the output does not refer to this change: from the initial state (0.3, 0) the trajectory
-# is proved to stay in the domain for all 12 566 steps of one period.
+# line of the output answers another question: for how many steps does a trajectory stay in the
+# domain? From (0.3, 0) the quantity may change by much more than 0.001 before the trajectory can
+# leave the domain. Therefore all 12 566 steps of one period are proved.
 #
 # ## Proved and measured statements
 #
@@ -186,7 +187,7 @@ print("steps proved for the initial state (0.3, 0):", slow.steps_inside([0.3], [
 # |---|---|
 # | proved | the bound of the change in a step, for *all* states of the domain and all ε |
 # | proved | the bound of the change by rounding, under the assumptions of `bound_drift` |
-# | proved | trajectories that start below the level stay in the domain for the stated steps |
+# | proved | a trajectory in the domain whose initial value of the invariant is at most $L$ stays in the domain for the printed number of steps |
 # | only measured | the changes in single steps cancel: for 10 000 steps their sum is below 1e-11 |
 #
 # `bound.save("bound.json")` writes the certificate, and `dvi-jax verify bound.json` checks it with

@@ -1,11 +1,11 @@
 # %% [markdown]
 # # The paper: claims and measurements
 #
-# In this notebook you measure whether five claims of a paper hold, with public functions of the
-# package. The paper is "Preservation of adiabatic invariants for disturbed Hamiltonian systems
-# under variational discretization" (Acta Mechanica, doi:10.1007/s00707-019-02571-z). Numbers in
-# parentheses, such as (34), are equation numbers of the paper. The package implements the discrete
-# equations of the paper. With corrected signs they are
+# In this notebook you test five claims of a paper by numerical measurements, with public functions
+# of the package. The paper is "Preservation of adiabatic invariants for disturbed Hamiltonian
+# systems under variational discretization" (Acta Mechanica, doi:10.1007/s00707-019-02571-z).
+# Numbers in parentheses, such as (34), are equation numbers of the paper. The package implements
+# the discrete equations of the paper. With corrected signs they are
 #
 # $$q_1 = q_0 + h\,\frac{\partial H_D}{\partial p_1}, \qquad
 # p_1 = p_0 - h\,\frac{\partial H_D}{\partial q_0} + h\,\varepsilon W . \tag{12, 13}$$
@@ -213,7 +213,7 @@ assert abs(slopes[1] - 1) < 0.1  # not for the force +εq
 # central. For (50) $\xi^0$ is not 0. Therefore (50) requires a time grid on which each step size
 # satisfies the energy equation: the change of the energy in a step equals the work of the
 # perturbing force. `dvi.Variational` computes this grid; for this orbit with $h = 0.1$ the equation
-# for the step loses its root after 77 steps ([time grids](../docs/lattices.md)). On a fixed time
+# for the step size has no root after 77 steps ([time grids](../docs/lattices.md)). On a fixed time
 # grid (50) oscillates with an amplitude $O(h)$ for any $\varepsilon$. For $h \to 0$ and the force
 # $-\varepsilon q$, (50) is an invariant of first order. The force $+\varepsilon q$ is a control,
 # for which (50) must not be an invariant of first order: the slope is 1.

@@ -10,7 +10,7 @@
 # with the mass $m$, the stiffness $k$, the natural length 1 m and the gravitational acceleration
 # $g$. The perturbation is air drag, $\varepsilon W = -\varepsilon\, (p_r, p_\theta)$. The kinetic
 # energy depends on $r$. Therefore the equations of a step are implicit. The package detects this
-# (the next cell prints `explicit: False`) and solves the equations by iteration.
+# and solves the equations by iteration.
 
 # %%
 import jax
@@ -94,8 +94,8 @@ assert abs(order - 2) < 0.1
 
 # %% [markdown]
 # **2. Symplecticity.** Without the force, the Jacobian $M$ of the map satisfies $M^T \Omega M =
-# \Omega$, where $\Omega$ is the symplectic matrix (`omega` below). With the drag force the phase
-# volume shrinks. The map is then not symplectic, and the difference must not be zero.
+# \Omega$, where $\Omega$ is the symplectic matrix (`omega` below). With the drag force the
+# phase-space volume decreases. The map is then not symplectic, and the difference must not be zero.
 
 
 # %%
