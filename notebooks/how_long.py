@@ -187,7 +187,7 @@ print("steps proved for the initial state (0.3, 0):", slow.steps_inside([0.3], [
 # |---|---|
 # | proved | the bound of the change in a step, for *all* states of the domain and all ε |
 # | proved | the bound of the change by rounding, under the assumptions of `bound_drift` |
-# | proved | a trajectory whose invariant is initially at most $L$ stays in the domain for $N$ steps |
+# | proved | from an invariant of at most $L$ a trajectory stays in the domain for $N$ steps |
 # | only measured | the changes in single steps cancel: for 10 000 steps their sum is below 1e-11 |
 #
 # `bound.save("bound.json")` writes the certificate, and `dvi-jax verify bound.json` checks it with
