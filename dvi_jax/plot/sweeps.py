@@ -117,7 +117,7 @@ def slope_map(
 
     data = checked_array(data)
     one_of("reduce", reduce, REDUCTIONS)
-    dim = dim_of(data, along)
+    dim = dim_of(data, along, "along")
     values, order = _positive(data, along)
     others, facet = where.get("over", ()), where.get("facet")
     others = [*([others] if isinstance(others, str) else others), *([facet] if facet else [])]
