@@ -197,8 +197,8 @@ class FixedPoint(Arithmetic):
         is_number = isinstance(quantum, int | float) and not isinstance(quantum, bool)
         if not is_number or not 0 < quantum < math.inf:
             raise ValueError(
-                "quantum must be a power of two such as 2.0**-40, as a Python number, got "
-                f"{quantum!r}. Convert a number of NumPy or JAX with float(...)."
+                "quantum must be a power of two of the type float or int, such as 2.0**-40, got "
+                f"{quantum!r} (type {type(quantum).__name__})."
             )
         # A power of two: multiplication by it and by its reciprocal is exact, and so are sums.
         mantissa, exponent = math.frexp(quantum)

@@ -61,10 +61,13 @@ def instance(name: str, value: Any, kind: Any, called: str, hint: str = "") -> A
     **Raises** `TypeError`.
     """
     if not isinstance(value, kind):
+        seen = f"{value!r:.200}"
         # The class in place of an object is the usual mistake: dvi.Strang for dvi.Strang().
-        seen = f"the class {value.__name__}" if isinstance(value, type) else f"{value!r:.200}"
-        missing = " (is a pair of parentheses missing?)" if isinstance(value, type) else ""
-        raise TypeError(f"{name} must be {called}, got {seen}{missing}.{_more(hint)}")
+        if isinstance(value, type):
+            seen = f"the class {value.__name__} (is a pair of parentheses missing?)"
+        elif inspect.isfunction(value):  # its repr has an address
+            seen = f"the function {value.__name__}"
+        raise TypeError(f"{name} must be {called}, got {seen}.{_more(hint)}")
     return value
 
 

@@ -105,6 +105,8 @@ def read_npz(
         # The directory of a zip file has no checksum: a flipped bit there can hide an array.
         if set(about.get("holds", arrays)) != set(arrays):
             raise ValueError("an array is missing in it")
+    except PermissionError:
+        raise
     except Exception as error:  # zipfile and NumPy raise many types for damaged bytes
         raise ValueError(
             f"'{path}' is not the file of a {what} of this package, or it is damaged "

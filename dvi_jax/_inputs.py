@@ -35,6 +35,7 @@ def start_state(q0: Any, p0: Any) -> tuple[Array, Array]:
 
 def as_times(of: str, ts: Any) -> Array:
     """Times as an array of real numbers; `of`: the name of the call in messages."""
+    ts = _joined(ts)
     if not is_traced(ts):
         ts = _as_numpy("ts", ts)
         refuse_double_without_x64("ts", ts.dtype)
@@ -45,9 +46,14 @@ def as_times(of: str, ts: Any) -> Array:
     return jnp.asarray(ts)
 
 
+def _joined(value: Any) -> Any:
+    """A list with traced numbers as one array, which NumPy cannot make."""
+    traced = isinstance(value, list | tuple) and any(is_traced(x) for x in jax.tree.leaves(value))
+    return jnp.asarray(value) if traced else value
+
+
 def _real_array(name: str, value: Any) -> Array:
-    if isinstance(value, list | tuple) and any(is_traced(x) for x in jax.tree.leaves(value)):
-        value = jnp.asarray(value)
+    value = _joined(value)
     if isinstance(value, jax.Array) and is_traced(value):
         kind = value.dtype
     else:
@@ -67,8 +73,9 @@ def _real_array(name: str, value: Any) -> Array:
     # A traced value that is not finite becomes the status of its trajectory.
     if isinstance(value, np.ndarray) and not np.isfinite(value).all():
         where = tuple(np.argwhere(~np.isfinite(value))[0].tolist())
+        at = f" at index {list(where)}" if where else ""
         raise ValueError(
-            f"{name} has a value that is not finite at index {list(where)}: {value[where]}. "
+            f"{name} has a value that is not finite{at}: {value[where]}. "
             "Every component of the initial conditions must be a finite number."
         )
     array = jnp.asarray(value)
@@ -81,6 +88,7 @@ def _is_real(dtype: Any) -> bool:
 
 def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> Array:
     """A number of this precision. **Raises** `ValueError` or `TypeError` with its name."""
+    value = _joined(value)
     known = None if is_traced(value) else _as_numpy(name, value)
     # Not for a Python float, which has no precision of its own and takes that of the state.
     if isinstance(value, np.ndarray | np.generic) and value.dtype == np.float64:
@@ -90,13 +98,13 @@ def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> A
         kind = type(value).__name__
         raise TypeError(
             f"{name} must be an integer or a floating-point number, got {value!r:.200} of type "
-            f"{kind}. If it is a real number, convert it with float(...)."
+            f"{kind}. Convert a real number x with float(x), or with x.real if its type is complex."
         )
     if shape != ():
         raise ValueError(
-            f"{name} must be one number, got an array of shape {shape}. For one run per value use "
-            f"jax.vmap over {name}"
-            + ("; for one run with such steps use lattice=dvi.Given(ts)." if name == "h" else ".")
+            f"{name} must be one number, got an array of shape {shape}. Call the function once for "
+            f"each value. For dvi.integrate you can use jax.vmap over {name}."
+            + (" Steps of different sizes need lattice=dvi.Given(ts)." if name == "h" else "")
         )
     if known is not None and not np.isfinite(known):
         raise ValueError(f"{name} must be finite, got {known}.")

@@ -203,7 +203,7 @@ def integrate(
     elif traced:
         raise ValueError(
             "progress cannot be reported inside of jax.jit, jax.vmap, jax.grad or another "
-            "transformation of JAX: leave progress out, or call dvi.integrate outside of it."
+            "transformation of JAX. Leave out progress, or use none of these transformations."
         )
     elif getattr(integrator.adjoint, "report_defect", False):
         raise ValueError(

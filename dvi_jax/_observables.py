@@ -31,8 +31,8 @@ def check_observe(task: Task, q0: Array, p0: Array) -> int:
             )
         if not is_observable(leaf):
             raise TypeError(
-                f"observe must be a function of {FORMS}, a reduction such as "
-                f"dvi.MaxDrift(function), or a dict, list or tuple of these, got {leaf!r:.200}."
+                f"observe must be a function of {FORMS}, a reduction such as dvi.MaxDrift(f), "
+                f"dvi.Running(reduction), or a dict, list or tuple of these, got {leaf!r:.200}."
             )
         if isinstance(leaf, Running):
             leaf = leaf.reduction

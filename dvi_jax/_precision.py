@@ -19,9 +19,10 @@ def refuse_double_without_x64(name: str, dtype: Any) -> None:
         )
     if np.dtype(dtype) in (np.dtype(np.float64), np.dtype(np.complex128)) and not x64_enabled():
         single = "complex64" if np.dtype(dtype).kind == "c" else "float32"
+        python = "complex numbers" if single == "complex64" else "floats"
         raise TypeError(
-            f"{name} has the type {np.dtype(dtype)}, but this process computes in float32. "
-            "Invariants need double precision: put the line\n    "
+            f"{name} has the type {np.dtype(dtype)} (Python {python} have this type), but this "
+            "process computes in float32. Invariants need double precision: put the line\n    "
             'jax.config.update("jax_enable_x64", True)\nbefore the first array is made. Functions '
             f"that also work in single precision accept {single} arrays without this line."
         )

@@ -113,9 +113,9 @@ class System(eqx.Module):
         if any(parts.values()):
             has = " and ".join(name for name, is_there in parts.items() if is_there)
             raise ValueError(
-                f"epsilon must be given for a system with {has}. Pass the strength of the "
-                "perturbation, such as epsilon=0.01. With epsilon=0.0 the motion is unperturbed; "
-                "with epsilon=1.0 the functions are used as they are."
+                f"epsilon must be given for a system with {has}. epsilon is the factor of the "
+                "force, of the perturbation and of the slow time ε t. Pass a value such as 0.01, "
+                "or epsilon=1.0 to use the functions as they are."
             )
         return 0.0
 
@@ -208,8 +208,12 @@ def check_system(system: Any) -> None:
         hint = "Wrap the discrete Hamiltonian H_D(t0, t1, q0, p1, args) in it: dvi.System(H_D)."
         if isinstance(getattr(system, "system", None), System):
             hint = "Take the system of a problem of the library: problem.system."
-        seen = f"{type(system).__name__} {getattr(system, '__name__', '')}".rstrip()
-        raise TypeError(f"system must be a dvi.System, got a value of type {seen}. {hint}")
+        name = getattr(system, "__name__", "")
+        if name and str(getattr(system, "__module__", "")).startswith("dvi_jax.systems."):
+            hint = f"Call the function: {name}()."
+        kind = "class" if isinstance(system, type) else type(system).__name__
+        seen = f"the {kind} {name}" if name else f"a value of type {kind}"
+        raise TypeError(f"system must be a dvi.System, got {seen}. {hint}")
     # Programs that are compiled already would compute with the old value.
     now = _read_by(system)
     names = changed(system.reads, now) if now != system.reads else []

@@ -57,8 +57,8 @@ class Module:
         self.scratch_bytes += (size * block * 8 + 63) // 64 * 64
         if self.scratch_bytes > LARGEST_SCRATCH:
             raise Unsupported(
-                f"intermediate arrays must have at most {LARGEST_SCRATCH} bytes, got "
-                f"{self.scratch_bytes} or more (block size {self.W * self.U})"
+                f"intermediate arrays must have at most {LARGEST_SCRATCH} bytes in all, got "
+                f"{self.scratch_bytes} or more for a block of {self.W * self.U} trajectories"
             )
         item = np.dtype(dtype).itemsize
         bases = tuple(

@@ -145,8 +145,8 @@ def store(b: Builder, buffer: Buffer, x: Num, by: Num | int = 0) -> None:
         if x.vec or moving.vec:
             # Which trajectory wrote last would decide.
             raise Unsupported(
-                "all trajectories share one array, but the function writes numbers of single "
-                f"trajectories to it (shape {buffer.shape})"
+                f"an array of shape {buffer.shape} is shared by all trajectories, but the value or "
+                "the index that the function writes to it differs between trajectories"
             )
         where = _moved(b, buffer.base[0], moving, fixed, item)
         _store(b, item, _to_memory(b, x, 0, False), where)

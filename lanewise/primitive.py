@@ -236,8 +236,8 @@ def compiled(
     """
     if not generates():
         raise Unsupported(
-            f"no machine code is generated in this process: the environment has {SWITCH}=off, or a "
-            "warning reported the reason"
+            "no machine code is generated in this process: the environment variable "
+            f"{SWITCH} switches it off, or a warning reported the reason"
         )
     if lanes == 0:
         raise Unsupported("the batch has no trajectories")

@@ -67,8 +67,8 @@ def dot(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Val
     wider = dtype == "float64" and {a.dtype, c.dtype} <= {"float64", "float32"}
     if not (same or wider):
         raise Unsupported(
-            "the arrays of a product and the result must have one type other than bool, got "
-            f"{a.dtype} and {c.dtype}, result {dtype}"
+            "both arrays of a product and its result must have the same type, not bool (a float64 "
+            f"result may be of float32 arrays), got {a.dtype} and {c.dtype}, result {dtype}"
         )
     contracted = math.prod(a.shape[i] for i in of_a)
     # Each term is an instruction of its own: the code, and the time to compile it, grow with them.

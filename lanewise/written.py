@@ -124,7 +124,7 @@ def sort(*arrays: Array, dimension: int, num_keys: int, **_) -> list[Array]:
     """Arrays in the order of the first `num_keys` of them, by exchanges of neighbours."""
     n = arrays[0].shape[dimension]
     if n > MOST_SORTED:
-        raise Unsupported(f"sort is compiled for at most {MOST_SORTED} numbers, got {n}")
+        raise Unsupported(f"sort is compiled for an axis of at most {MOST_SORTED} numbers, got {n}")
     items = [[lax.index_in_dim(x, i, dimension, False) for x in arrays] for i in range(n)]
     # Exchanges at fixed places, whatever the numbers are: odd and even neighbours in turn.
     for turn in range(n):

@@ -342,9 +342,9 @@ def of_one_line(**options):
     [
         (lambda: actions(TS, np.cos(TS)), TypeError, "the complex signal q − i p"),
         (lambda: actions(TS, np.exp(1j * TS), leftover=0), ValueError, "finite number, got 0"),
-        (lambda: actions(TS, np.exp(1j * TS), num=0), ValueError, "from 1 on, got 0"),
+        (lambda: actions(TS, np.exp(1j * TS), num=0), ValueError, "at least 1, got 0"),
         (lambda: fundamental_frequencies(TS), TypeError, "a result of dvi.frequencies"),
-        (lambda: of_one_line(order=0), ValueError, "from 1 on"),
+        (lambda: of_one_line(order=0), ValueError, "at least 1"),
         (lambda: of_one_line(guess=[np.nan]), ValueError, "finite"),
         (lambda: of_one_line(tolerance=0), ValueError, "positive"),
         (lambda: of_one_line(threshold=2), ValueError, "a fraction"),

@@ -227,7 +227,7 @@ def test_a_control_that_passes_is_missed(monkeypatch):
     ("methods", "checks", "error", "said"),
     [
         (["yoshida4"], None, ValueError, r"got 'yoshida4' \(did you mean Yoshida4\?\)"),
-        (None, ["symmetry"], ValueError, r"got 'symmetry'.*Known are order, forced"),
+        (None, ["symmetry"], ValueError, r"got 'symmetry'.*The known names are order, forced"),
         ([], None, ValueError, "methods is empty: name"),
         ({}, None, ValueError, "methods is empty: give"),
         (None, [], ValueError, "checks is empty: name"),

@@ -564,8 +564,8 @@ def test_indicators_under_sweep():
 
 
 INVALID = [
-    (lambda: dvi.LyapunovSpectrum(0), ValueError, "from 1 on, got 0"),
-    (lambda: dvi.GALI(1), ValueError, "from 2 on, got 1"),
+    (lambda: dvi.LyapunovSpectrum(0), ValueError, "at least 1, got 0"),
+    (lambda: dvi.GALI(1), ValueError, "at least 2, got 1"),
     (lambda: dvi.GALI(2.0), ValueError, "got 2.0"),
     (lambda: dvi.MEGNO(seed=-1), ValueError, "seed of MEGNO .* got -1"),
     (lambda: dvi.SALI(scale=1.0), TypeError, "scale of SALI must be a pair"),

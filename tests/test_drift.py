@@ -542,10 +542,10 @@ def test_bad_sweeps_are_refused(change, match):
     [
         ({"hs": [0.2, 0.1]}, "hs must be in increasing order"),
         ({"hs": [0.1, 0.1]}, "hs must be in increasing order"),
-        ({"hs": [-0.1, 0.1]}, "hs must be a list of positive"),
+        ({"hs": [-0.1, 0.1]}, "hs must be a list of one or more"),
         ({"epsilons": [0.2, 0.1]}, "epsilons must be in increasing order"),
-        ({"duration": 0.3}, "two of the longest steps"),
-        ({"duration": np.nan}, "two of the longest steps"),
+        ({"duration": 0.3}, "twice the longest"),
+        ({"duration": np.nan}, "twice the longest"),
         ({"invariant": [KEPT]}, "hs is 2, but the length of invariant is 1"),
     ],
 )

@@ -137,13 +137,13 @@ DIVERGES = (
 REFUSED = {
     ValueError: [
         ({"model": lambda params: {"system": SYSTEM}}, "does not return 'q0'"),
-        ({"model": returning(num_steps=3)}, "the model must not return 'num_steps'"),
+        ({"model": returning(num_steps=3)}, "the model must not set 'num_steps'"),
         ({"model": returning(t0=0.0)}, r"Observations\(\.\.\., t0"),
         ({"model": returning(h=0.0)}, "finite and not zero"),
         ({"model": returning(h=-0.1)}, LATER + ".*Give h = 0.1"),
         ({"data": data(ts=-TS[::-1])}, EARLIER),
         ({"model": VARIATIONAL}, "lie after t0 = 0, but h = -0.1 leads to earlier"),
-        ({"model": TRANSFORMED}, "num_steps .* on the lattice TimeTransformed"),
+        ({"model": TRANSFORMED}, "num_steps .* its lattice is not dvi.Uniform"),
         ({"model": returning(h=1e-12)}, "times of the data in the same unit"),
         ({"model": returning(h=1e3)}, "times of the data in the same unit"),
         ({"model": lambda p: {**MODEL(p), "h": p["epsilon"] + 0.1}}, "not a parameter"),

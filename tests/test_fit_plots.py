@@ -287,7 +287,7 @@ def test_invalid_input_is_rejected():
     refuses(
         plot.fit_corner,
         ((bare,), {}, "a FitResult.* names, covariance", TypeError),
-        ((made(covariance=none),), {}, r"diagonal, which starts with \[nan, "),
+        ((made(covariance=none),), {}, r"diagonal; the first variances are \[nan, "),
         ((fit, ["mu"]), {}, names),
         ((fit, ["epsilon"] * 2), {}, "different names"),
         ((fit, []), {}, "one or more"),

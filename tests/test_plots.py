@@ -506,7 +506,7 @@ def test_solutions_of_several_runs_share_a_panel_for_observables_of_all(single, 
     mine = {"E": [np.ones(61), np.ones(61), np.r_[1, 2 * np.ones(20)]]}
     assert lines(plot.invariants([good, short], mine))[2][1].max() == 1
     wrong = ([good, short], {"E": np.ones(61)})
-    refuses(plot.invariants, (wrong, {}, "one array for each orbit, of length 3"))
+    refuses(plot.invariants, (wrong, {}, "a list of length 3 with one array for each orbit"))
 
 
 def test_vectors_change_by_the_length_of_their_difference():
@@ -908,7 +908,7 @@ def test_frequencies_are_drawn_against_each_other_or_their_diffusion_over_a_grid
     assert plot.frequency_map(a, b, D).get_xlabel() == "x"
     A, B = np.meshgrid(a, b, indexing="ij")
     assert plot.frequency_map(A, B, D, resonances=[(1, -1)]).get_xlabel() == "ω$_1$"
-    line = r"lines between frequencies.*x and y .* of shape \(4, 3\)"
+    line = r"only if x and y are frequencies.* of shape \(4, 3\)"
     refuses(
         plot.frequency_map,
         ((x, y), {"resonances": [(0, 0)]}, "not both 0"),

@@ -494,7 +494,7 @@ def test_no_number_of_steps_is_claimed(epsilon, function):
         ({"method": dvi.GaussLegendre(2)}, ValueError, "is implicit for this system"),
         ({"h": 0.0}, ValueError, "other than zero"),
         ({"epsilon": None}, ValueError, "epsilon must be a finite number"),
-        ({"arithmetic": dvi.Compensated()}, ValueError, "does not bound the rounding of others"),
+        ({"arithmetic": dvi.Compensated()}, ValueError, "does not bound the rounding of other"),
     ],
 )
 def test_bad_input(how, kind, message):

@@ -239,7 +239,7 @@ def test_order_is_refused(order):
 
 
 def test_bad_input_is_refused():
-    with pytest.raises(TypeError, match=r"must be a dvi\.System or None, got <function"):
+    with pytest.raises(TypeError, match=r"must be a dvi\.System or None, got the function"):
         dvi.ShadowHamiltonian(1, pendulum)
     for h in (0.0, np.nan, [0.1, 0.2]):
         with pytest.raises(ValueError, match="a finite number other than zero"):

@@ -180,7 +180,7 @@ def observed(**observe):
              **observed(h=dvi.Last(position))},
             "'h' has the name of an axis or argument",
         ),
-        ({"num_steps": 0}, "from 1 on, got 0"),
+        ({"num_steps": 0}, "at least 1, got 0"),
         ({"lattice": dvi.Given([0.0, 0.1]), "h": None, "num_steps": None}, "out the axis of t0"),
         ({"lattice": dvi.Given([0.0, 0.1]), "t0": 0.0, "epsilon": [0.0, 0.1]}, "leave out num_s"),
         ({"start": dvi.starts.Random(4, ([0.0], [0.0]), ([1.0], [1.0]))}, "give both q0 and p0"),

@@ -446,7 +446,7 @@ def test_invalid_input_is_rejected():
         ((three, "a", "a"), {}, "y and x must use different .*both use 'a'"),
         ((three, "a"), {"over": "a"}, "both use 'a'"),
         ((three[:, :0],), {}, "got size 0 along 'b'"),
-        ((three[0, 0, 0],), {}, "have a free dimension of size 2 .*used: none"),
+        ((three[0, 0, 0],), {}, "have a dimension of size 2 .*used: none"),
         ((two,), {"reduce": "sum"}, "one of 'max', 'min'"),
         ((two,), {"pixels": 3}, "pixels must be"),
         ((two,), {"limits": (2, 1)}, "two increasing numbers"),

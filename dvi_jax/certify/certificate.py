@@ -127,9 +127,10 @@ def _named(methods: Any) -> dict[str, dvi.Method]:
         return {name: METHODS[name] for name in chosen("method", methods, METHODS, own)}
     for name, method in methods.items():
         if not isinstance(method, dvi.Method):
-            raise TypeError(
-                f"methods[{name!r}] must be a method such as dvi.TypeII(), got {method!r:.200}."
+            seen = (
+                f"the class {method.__name__}" if isinstance(method, type) else f"{method!r:.200}"
             )
+            raise TypeError(f"methods[{name!r}] must be a method such as dvi.TypeII(), got {seen}.")
         order = method.order
         if isinstance(order, bool) or not isinstance(order, int | float):
             raise TypeError(f"methods[{name!r}].order must be an int or a float, got {order!r}.")

@@ -210,7 +210,9 @@ def _require_real_scalar(name, function, timed: bool, shape) -> None:
     kind, dtype = np.shape(out), getattr(out, "dtype", type(out))
     real = np.issubdtype(dtype, np.floating) or np.issubdtype(dtype, np.integer)
     if out is None or kind != () or not real:
-        seen = "None" if out is None else f"shape {kind}, type {np.dtype(dtype).name}"
+        seen = f"a value of type {type(out).__name__}"
+        if hasattr(out, "dtype"):
+            seen = f"an array of shape {kind}, type {dtype}"
         raise ValueError(
             f"the basis function {name!r} must return a real scalar; for q of shape {shape} it "
             f"returned {seen}. Return one real number, such as jnp.sum(q**2)."

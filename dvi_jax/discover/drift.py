@@ -142,8 +142,8 @@ def drift_surface(
     is_number = isinstance(duration, int | float | np.number)
     if not is_number or not np.isfinite(duration) or duration < 2 * hs[-1]:
         raise ValueError(
-            f"duration must be a finite float or int and at least {2 * hs[-1]}, the length of two "
-            f"of the longest steps in hs; got {duration!r:.200}."
+            f"duration must be a finite float or int of at least {2 * hs[-1]} (twice the longest "
+            f"step in hs), got {duration!r:.200}."
         )
     given = isinstance(invariant, Sequence)
     invariants = list(invariant) if given else [invariant] * len(hs)
@@ -280,7 +280,7 @@ def _positive(name: str, values: Any, increasing: bool = False) -> np.ndarray:
         array = np.zeros(())
     if array.ndim != 1 or len(array) == 0 or not (np.isfinite(array) & (array > 0)).all():
         raise ValueError(
-            f"{name} must be a list of positive, finite numbers, at least one; got {values!r:.200}."
+            f"{name} must be a list of one or more positive, finite numbers, got {values!r:.200}."
         )
     fits = (np.diff(array) > 0).all() if increasing else len(np.unique(array)) == len(array)
     if not fits:

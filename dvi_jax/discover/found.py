@@ -234,10 +234,11 @@ class Discovery(eqx.Module):
         if own != saved:
             pairs = enumerate(zip(own, saved, strict=False))
             i = next((i for i, (a, b) in pairs if a != b), min(len(own), len(saved)))
+            there, here = (repr(x[i]) if i < len(x) else "missing" for x in (saved, own))
             raise ValueError(
                 f"basis must be the basis of the search saved in {os.fspath(path)}. The number of "
-                f"functions is {len(saved)} in the file and {len(own)} in basis. The first names "
-                f"that differ are {saved[i : i + 3]} in the file and {own[i : i + 3]} in basis."
+                f"functions is {len(saved)} in the file and {len(own)} in basis. The function with "
+                f"index {i} is {there} in the file and {here} in basis."
             )
         differs = ~np.isclose(_probed(bound, probe), values, rtol=1e-9)
         if differs.any():

@@ -180,8 +180,9 @@ def _fitted(name: str, value: np.ndarray, q: State) -> Array:
     try:
         return jnp.broadcast_to(value, q.shape).astype(q.dtype)
     except ValueError:
-        bodies = f", or one per body, ({len(q)},)" if name == "mass" and q.ndim == 2 else ""
+        shapes = [q.shape[i:] for i in range(q.ndim)] + [q.shape[:1]] * (name == "mass")
+        allowed = " or ".join(map(str, dict.fromkeys(shapes))) if q.ndim else "()"
         raise ValueError(
-            f"{name} must be a number or have the shape of q, {q.shape}, or of the last axes of q"
-            f"{bodies}; got shape {value.shape}."
+            f"{name} must be a number, or an array of shape {allowed}, since q has shape "
+            f"{q.shape}; got shape {value.shape}."
         ) from None

@@ -10,6 +10,7 @@ import numpy as np
 
 from lanewise.jaxapi import x64_enabled
 
+from .._checks import finite as finite_number
 from .._integrate import integrate
 from .._integrator import Integrator, chosen, only
 from .._results import RESULTS
@@ -144,7 +145,7 @@ def as_samples(samples: Any, t0: float = 0.0) -> Samples:
             "qs and ps of samples must have the same shape, with at least one point along the "
             f"first axis; got {q.shape} for qs and {p.shape} for ps."
         )
-    t = arrays[2] if len(arrays) == 3 else np.full(len(q), float(t0))
+    t = arrays[2] if len(arrays) == 3 else np.full(len(q), finite_number("t0", t0))
     if t.shape != (len(q),):
         raise ValueError(
             f"ts of samples must have one time for each point, shape ({len(q)},), got {t.shape}."
@@ -198,9 +199,9 @@ def require_enough(samples: Samples, unknowns: int, conditions: int = 1) -> None
     needed = int(np.ceil(2 * unknowns / conditions))
     if len(samples.q) < needed:
         raise ValueError(
-            f"samples must have at least {needed} points for {unknowns} unknown coefficients, got "
-            f"too few, {len(samples.q)}. Give more points, or a smaller basis. A quarter of the "
-            "points is used only for validation."
+            f"samples have too few points for {unknowns} unknown coefficients: at least {needed} "
+            f"are required, got {len(samples.q)}. Give more points, or a smaller basis. A quarter "
+            "of the points is used only for validation."
         )
 
 

@@ -156,7 +156,7 @@ def find_symmetries(
         raise ValueError(
             f"one step must change the samples by at least {_NO_STEP:g} times their spread, got "
             f"{relative:.0e} for h = {h:g}. Smaller changes are close to round-off, so that "
-            "symmetries cannot be identified. Take a larger |h|."
+            "symmetries cannot be identified. Take a larger |h|, or samples away from equilibria."
         )
     if relative < SMALL and np.ptp(samples.t) == 0:
         shifts = later(h, relative)

@@ -191,7 +191,7 @@ def frequency_diffusion(
         )
     times = jnp.stack([ts[..., :half], ts[..., half : 2 * half]])
     times = times.reshape(2, *(1,) * (halves.ndim - times.ndim), *times.shape[1:])
-    check_count(settings, halves)
+    check_count(settings, halves, " in each half")
     _, raw = analyse(times, halves, settings, eps)
     omega, first = raw.s, raw.s[0, ..., 0]
     size = jnp.abs(raw.amplitudes)
@@ -217,13 +217,12 @@ def settings_of(count: Any, window: Any, refine: Any) -> Settings:
     )
 
 
-def check_count(settings: Settings, signal: Array) -> None:
+def check_count(settings: Settings, signal: Array, where: str = "") -> None:
     unknowns, N = 3 if jnp.iscomplexobj(signal) else 6, signal.shape[-1]
     if unknowns * settings.lines >= N:
         raise ValueError(
-            f"count must be at most {(N - 1) // unknowns} for {N} samples, since each line has "
-            f"{unknowns} unknowns, got {settings.lines}. Decrease count, or give more samples. "
-            "(frequency_diffusion uses half of the samples at a time.)"
+            f"count must be at most {(N - 1) // unknowns} for {N} samples{where}, since each line "
+            f"has {unknowns} unknowns, got {settings.lines}. Decrease count, or give more samples."
         )
 
 
@@ -276,8 +275,9 @@ def signals_of(ts: Any, signal: Any) -> tuple[Array, Array, float, int]:
             coarse = f" ts has dtype {dtype}: give the times in float64." if eps > EPS else ""
             raise ValueError(
                 "the times ts must have equal steps, other than zero, got steps from "
-                f"{steps.min():.17g} to {steps.max():.17g}. Save with dvi.Save(every=m) on the "
-                f"lattice dvi.Uniform(), without final=True.{coarse}"
+                f"{steps.min():.17g} to {steps.max():.17g}. To obtain such times from "
+                "dvi.integrate, use dvi.Save(every=m) without final=True, and the lattice "
+                f"dvi.Uniform().{coarse}"
             )
     return ts, signal, eps, min(signal.ndim - 1, 1) if state_axes is None else state_axes
 
@@ -286,8 +286,8 @@ def _real_times(name: str, value: Any) -> Array:
     value = _double(name, value)
     if jnp.iscomplexobj(value):
         raise TypeError(
-            f"{name} must be real, got dtype {value.dtype}. Give the times as the first argument, "
-            "and the signal as the second."
+            f"{name} must be real, got dtype {value.dtype}. In a call with times and signal, give "
+            "the times as the first argument."
         )
     return value
 

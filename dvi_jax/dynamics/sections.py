@@ -188,8 +188,8 @@ def poincare_section(
     for name, length in varied.items():
         if length != q.shape[0]:
             raise ValueError(
-                f"{name} must be a single number, or an array of length {q.shape[0]} with "
-                f"one number for each orbit in q0, got length {length}."
+                f"{name} must be a single number, or have one number for each orbit in q0 "
+                f"(in all {q.shape[0]}), got length {length}."
             )
     start = (as_scalar("t0", keywords["t0"], q.dtype), _Varied(q), _Varied(p))
     h = as_scalar("h", h, q.dtype, zero_allowed=False)
@@ -242,12 +242,14 @@ def bifurcation(
     epsilon, args, varied = _varied(system.strength(keywords["epsilon"]), keywords["args"])
     lengths = set(varied.values())
     if len(lengths) != 1 or 0 in lengths:
-        seen = ", ".join(f"{name} of length {n}" for name, n in varied.items())
-        raise ValueError(
+        seen = " and ".join(f"{name} of length {n}" for name, n in varied.items())
+        rule = (
             "bifurcation requires a parameter that varies: give epsilon as a 1-D array of at least "
-            "one value, or a dvi.Axis in args. All parameters that vary must have the same length, "
-            f"got {seen or 'only single numbers'}."
+            "one value, or a dvi.Axis in args"
         )
+        if len(lengths) > 1:
+            rule = "all parameters of bifurcation that vary must have the same length"
+        raise ValueError(f"{rule}, got {seen or 'only single numbers'}.")
     start = (as_scalar("t0", keywords["t0"], q.dtype), q, p)
     h = as_scalar("h", keywords["h"], q.dtype, zero_allowed=False)
     compute = _one_after_another if follow else _orbits

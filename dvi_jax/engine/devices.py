@@ -47,12 +47,12 @@ def over_devices(
     mesh = jax.sharding.Mesh(chosen, (LANES,), axis_types=(AxisType.Auto,))
 
     def call(*args: Any) -> Any:
-        each = [in_axes] * len(args) if isinstance(in_axes, int | None) else list(in_axes)
+        each = list(in_axes) if isinstance(in_axes, list | tuple) else [in_axes] * len(args)
         if len(each) != len(args):
             raise ValueError(
-                "in_axes must be an integer or None for all arguments, or a list with one such "
-                f"entry per argument. The function was called with {len(args)} arguments, got "
-                f"in_axes={in_axes!r}."
+                "in_axes must be an integer, None, or a list with one entry for each argument. The "
+                f"function was called with {len(args)} arguments, but in_axes is {in_axes!r}, of "
+                f"length {len(each)}."
             )
         for axis in each:
             instance("each entry of in_axes", axis, int | None, "a whole number or None")

@@ -130,15 +130,15 @@ def fit(
         whole("batch", batch)
         if not by_optax:
             raise ValueError(
-                f"batch requires an optimiser of optax, got {type(solver).__name__}: give, for "
-                "example, optimiser=optax.adam(1e-3), or leave batch out."
+                f"batch requires an optimiser of optax, but this fit uses {type(solver).__name__}. "
+                "Give, for example, optimiser=optax.adam(1e-3), or leave batch out."
             )
     if isinstance(shooting, MultipleShooting) and not is_vector:
         raise ValueError(
             "MultipleShooting requires a loss of residuals, such as dvi.LeastSquares(), and a "
             "least-squares optimiser, such as optimistix.LevenbergMarquardt(rtol=1e-10, "
-            f"atol=1e-10). Got the loss {type(problem.loss).__name__} and the optimiser "
-            f"{type(solver).__name__}. Change them, or use shooting=dvi.SingleShooting()."
+            f"atol=1e-10). This fit uses the loss {type(problem.loss).__name__} and the optimiser "
+            f"{type(solver).__name__}. Change loss or optimiser, or use dvi.SingleShooting()."
         )
     wanted = _horizons(horizons)
     u = problem.space.to_u(problem.start)

@@ -265,7 +265,7 @@ def _extended(
     if not (args is None or (isinstance(args, Mapping) and KEY not in args)):
         raise TypeError(
             f"args of the model must be None or a dict without the key {KEY!r}, got {args!r:.200}. "
-            "Use other keys: dvi.identify adds the coefficients of library under this key."
+            "Use a dict with other keys: dvi.identify adds the coefficients under this key."
         )
     is_perturbed = system.force is not None or system.perturbation is not None
     if "epsilon" in params and not is_perturbed:

@@ -49,7 +49,7 @@ class ForceLibrary(eqx.Module):
         a_dict = "a dict {name: function (t0, t1, q0, p1, args)}"
         instance("the candidates of a dvi.ForceLibrary", candidates, Mapping, a_dict)
         if not candidates:
-            raise ValueError("candidates is empty: give dvi.ForceLibrary at least one candidate.")
+            raise ValueError("a dvi.ForceLibrary must have at least one candidate, got none.")
         for name, function in candidates.items():
             instance("the name of a candidate", name, str, "a string")
             if not (callable(function) and accepts(function, 5)):
@@ -137,8 +137,8 @@ class ForceLibrary(eqx.Module):
         both = sorted(set(self.names) & set(other.names))
         if both:
             raise ValueError(
-                f"both libraries of a sum have a candidate {both[0]!r}, but the names "
-                "must differ. Take only the others with library.only(names), or rename one of them."
+                f"a sum cannot have two candidates {both[0]!r}, but both libraries have it. Rename "
+                "it in one library, or select the other candidates there with library.only(names)."
             )
         if (self.coefficients is None) != (other.coefficients is None):
             raise ValueError(
@@ -170,13 +170,14 @@ class ForceLibrary(eqx.Module):
         return ForceLibrary(self._candidates(), coefficients)
 
     def _known(self, names: Iterable[str]) -> tuple[str, ...]:
+        hint = " Give a list of names, not one string." if isinstance(names, str) else ""
         names = tuple(names)
         for name in names:
             if name not in self.names:
                 raise ValueError(
-                    f"unknown candidate {name!r}. Give names as a list, or as the keys of a dict. "
-                    f"library.names has {', '.join(map(repr, self.names[:8]))}"
-                    + (", …" if len(self.names) > 8 else ".")
+                    f"unknown candidate {name!r}. The library has "
+                    f"{', '.join(map(repr, self.names[:8]))}"
+                    f"{', …' if len(self.names) > 8 else '.'}{hint}"
                 )
         return names
 

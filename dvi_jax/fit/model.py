@@ -171,7 +171,7 @@ def specification(model: Callable[..., Any], params: PyTree, arc: Any, many: boo
             )
     for name in _OWN:
         if name in found and not (name == "num_steps" and not _is_uniform(found)):
-            raise ValueError(f"the model must not return {name!r}: {_OWN[name]}.")
+            raise ValueError(f"the model must not set {name!r}: {_OWN[name]}.")
     if isinstance(found["h"], jax.Array):
         raise ValueError(
             "the step size h of the model must be a Python number such as 0.1, not a parameter or "
@@ -259,14 +259,14 @@ def _steps(i: int, arc: Observations, spec: Mapping[str, Any]) -> int:
             f"arc {i}: the observations (t = {arc.ts.min():g} to {arc.ts.max():g}) lie {side} t0 "
             f"= {arc.t0:g}, but h = {h:g} leads to {direction} times. Give h = {-h:g}; or, if q0 "
             "and p0 belong to another time, give this time as dvi.Observations(..., t0=...). "
-            "Without it t0 is ts[0]."
+            "The default of t0 is ts[0]."
         )
     if not _is_uniform(spec):
         if not isinstance(spec.get("num_steps"), int):
             raise ValueError(
-                f"num_steps of the model must be an int on the lattice {_lattice(spec)!r}, got "
-                f"{spec.get('num_steps')!r}. Give the number of steps to the last observation in "
-                "dvi.Model(..., num_steps=...), or in the dict that the model returns."
+                "num_steps of the model must be an int, since its lattice is not dvi.Uniform(), "
+                f"got {spec.get('num_steps')!r}. Give the number of steps to the last observation "
+                "in dvi.Model(..., num_steps=...), or in the dict that the model returns."
             )
         return spec["num_steps"]
     steps = span / h

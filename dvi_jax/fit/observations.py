@@ -91,8 +91,8 @@ class Observations:
             raise ValueError(
                 f"t0 = {t0}, the start of the arc, lies between the times {ts.min()} and "
                 f"{ts.max()} of the observations, but all times must be on one side of t0. Give "
-                f"t0 <= {ts.min()} with h > 0, or t0 >= {ts.max()} with h < 0, and q0 and p0 at "
-                "this t0, or leave out the observations on one side."
+                f"t0 <= {ts.min()} with h > 0 or t0 >= {ts.max()} with h < 0; q0 and p0 must "
+                "belong to this t0. Alternatively, leave out the observations on one side of t0."
             )
         checked: dict[str, Any] = {"ts": ts, "values": values, "t0": t0}
         if self.sigma is not None:
@@ -172,7 +172,7 @@ def as_arcs(data: Any) -> tuple[list[Observations], bool]:
         return [data], False
     instance("data", data, list | tuple, "a dvi.Observations or a list of them, one for each arc")
     if not data:
-        raise ValueError("data is an empty list: give at least one dvi.Observations.")
+        raise ValueError("data is empty: give at least one dvi.Observations.")
     for i, arc in enumerate(data):
         instance(f"data[{i}]", arc, Observations, "a dvi.Observations")
     known = [arc.has_errors for arc in data]
@@ -223,8 +223,9 @@ def _check_times(ts: np.ndarray) -> None:
         [i] = at
         raise ValueError(
             f"ts is not in order: ts[{i}] = {ts[i]} is followed by ts[{i + 1}] = {ts[i + 1]}. "
-            "Times must all increase or all decrease. Sort times, values and errors together: "
-            "order = np.argsort(ts); ts[order], values[order], sigma[order]."
+            "Times must all increase or all decrease. Sort the rows by time: with "
+            "order = np.argsort(ts) give np.array(ts)[order] and np.array(values)[order]. Sort "
+            "sigma or covariance in the same way if it has one entry for each time."
         )
 
 
@@ -287,12 +288,13 @@ def _covariance(covariance: Any, values: np.ndarray) -> np.ndarray:
     smallest = np.linalg.eigvalsh(np.where(good[:, None, None], unit, np.eye(k)))[:, 0]
     if at := _first(~good | (smallest <= 1e-14)):
         [i] = at
-        seen = f"smallest eigenvalue of its correlation matrix is {smallest[i]:.3g}, not > 1e-14"
+        seen = "smallest eigenvalue of its correlation matrix must be greater than 1e-14, got "
+        seen += f"{smallest[i]:.3g}"
         if not good[i]:  # then the correlation matrix is not defined
-            seen = f"smallest variance on its diagonal is {variance[i].min():.3g}"
+            seen = f"variances on its diagonal must be positive, got {variance[i].min():.3g}"
         raise ValueError(
-            f"the covariance of observation {i} is not positive definite: the {seen}. Errors of "
-            "zero are not possible: if a value or a combination of values is known exactly, leave "
-            "it out of the observations, and write the model so that it has this value."
+            f"the covariance of observation {i} is not positive definite: the {seen}. Correct the "
+            "matrix. If a value or a combination of values is known exactly, leave it out of the "
+            "observations, and write the model so that it has this value."
         )
     return full

@@ -125,8 +125,8 @@ class Core(eqx.Module):
         )
         if jnp.shape(each) != jnp.shape(found):
             raise ValueError(
-                "the function of dvi.Likelihood must return −log of the density of each value: an "
-                f"array of shape {found.shape[1:]}, as its argument predicted has, got shape "
+                "the function of dvi.Likelihood must return −log of the density of each value, in "
+                f"an array of the shape of its first argument, {found.shape[1:]}. Got shape "
                 f"{jnp.shape(each)[1:]}. Do not sum over the values."
             )
         return jnp.sum(jnp.where(keep, each, 0.0))
@@ -324,11 +324,13 @@ class Problem:
                 first = group.seen[a].any(axis=1).argmax()
                 values = np.asarray(found)[a, first][group.seen[a, first]]
                 if not np.isfinite(values).all():
+                    hint = f"The status of the trajectory is {str(names[a])!r}: use a smaller h"
+                    if str(names[a]) == "successful":
+                        hint = "The trajectory does not fail: correct the function observe"
                     raise ValueError(
                         f"{where}{values[~np.isfinite(values)][0]} for the first observation of "
-                        f"arc {arc}, at t = {group.ts[a, first]:g}. The status of the trajectory "
-                        f"is {str(names[a])!r}. Start from other parameters or use a smaller h. "
-                        "If the status is 'successful', check the function observe."
+                        f"arc {arc}, at t = {group.ts[a, first]:g}. {hint}, or start from other "
+                        "parameters."
                     )
         if check_units:
             self._check_sizes([np.asarray(found) for found, _ in known], where)

@@ -218,8 +218,8 @@ class FitResult:
         if params is None:
             if about["shape"] is None:
                 raise ValueError(
-                    f"params is required to load {path}, because the fitted parameters contained "
-                    "objects other than dicts, lists and numbers. Call FitResult.load(path, "
+                    f"params is required to load {path}, because not all fitted parameters are "
+                    "numbers or arrays in dicts with text as keys. Call FitResult.load(path, "
                     "params) with params of the same structure as in dvi.fit."
                 )
             params = jax.tree.map(np.array, about["shape"], is_leaf=lambda x: isinstance(x, list))

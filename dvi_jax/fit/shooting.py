@@ -167,11 +167,14 @@ class Segments:
             flat = [np.asarray(x[:-1]).reshape(len(times), -1) for x in (sol.qs, sol.ps)]
             found = np.concatenate(flat, axis=1)
         if not np.isfinite(found).all():
+            by = f"guess={guess!r}"
+            hint = "Start from other parameters, or give a function (t) → (q, p) as guess."
+            if callable(guess):
+                by, hint = "the function guess", "Correct this function."
             raise ValueError(
-                f"arc {i}: guess={'a function' if callable(guess) else repr(guess)} of "
-                "dvi.MultipleShooting must give finite states, got NaN or inf at t = "
-                f"{times[np.argmin(np.isfinite(found).all(axis=1))]:g}. Give another guess, for "
-                "example a function (t) that returns (q, p), or start from other parameters."
+                "the initial states of the segments of dvi.MultipleShooting must be finite, but "
+                f"{by} gives NaN or inf for arc {i} at t = "
+                f"{times[np.argmin(np.isfinite(found).all(axis=1))]:g}. {hint}"
             )
         return found
 

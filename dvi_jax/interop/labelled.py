@@ -71,10 +71,10 @@ def to_xarray(
     ts, hs = np.asarray(solution.ts), np.asarray(solution.hs)
     *batch, count = ts.shape
     if len(dims) != len(batch):
-        raise ValueError(
-            f"the length of dims must be {len(batch)}: one name for each batch dimension of "
-            f"solution (sizes {tuple(batch)}). Got {dims}. Give the outermost vmap first."
-        )
+        known = f"one name for each batch dimension of solution, of sizes {tuple(batch)}, with the "
+        known += "name for the outermost vmap first"
+        known = known if batch else "solution is a single trajectory, without batch dimensions"
+        raise ValueError(f"the length of dims must be {len(batch)}: {known}. Got dims={dims}.")
     for name in dims:
         _check_free("dims", name, name in _TAKEN or dims.count(name) > 1)
     rows = ts.reshape(-1, count)

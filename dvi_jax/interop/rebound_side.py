@@ -121,7 +121,7 @@ def from_rebound(
         if not Path(simulation).is_file():
             raise FileNotFoundError(
                 "simulation must be a rebound.Simulation or the path of a Simulationarchive, but "
-                f"the file {str(simulation)!r} does not exist. Check the path."
+                f"there is no file at the path {str(simulation)!r}. Check the path."
             )
         try:
             simulation = rebound.Simulation(str(simulation), snapshot=snapshot)
@@ -132,11 +132,10 @@ def from_rebound(
                 f"the first, −1 for the last. Cause: {error}"
             ) from None
         simulation.synchronize()  # a snapshot may have been taken between half steps
-    elif snapshot != -1:
+    elif snapshot != -1 and isinstance(simulation, rebound.Simulation):
         raise ValueError(
             "snapshot can only be used if simulation is the path of a Simulationarchive, got "
-            f"snapshot={snapshot} for an object of type {type(simulation).__name__}: leave "
-            "snapshot out."
+            f"snapshot={snapshot} with a rebound.Simulation: leave snapshot out."
         )
     called = "a rebound.Simulation, or the path of a Simulationarchive"
     hint = "For snapshot i of an open archive give archive[i]."
@@ -289,10 +288,10 @@ def _with_mass(sim: Any, masses: np.ndarray, massless: float | None) -> np.ndarr
     heavy = np.flatnonzero(masses[active:]) + active
     if heavy.size and (sim.testparticle_type == 0 or len(masses) - active > 1):
         raise ValueError(
-            f"body {heavy[0]} has mass {masses[heavy[0]]:g}, but must have mass 0: it is a test "
-            f"particle, because N_active = {active}. REBOUND omits some of its attractions, so its "
-            "motion has no Hamiltonian. Set the masses of all test particles to 0, or set "
-            f"sim.N_active = {len(masses)}, the number of all bodies."
+            f"body {heavy[0]} has mass {masses[heavy[0]]:g}, but N_active = {active} makes it a "
+            "test particle, and REBOUND omits some of its attractions. The Hamiltonian of N "
+            f"bodies has all of them. Set sim.N_active = {len(masses)}, the number of all bodies, "
+            "or set the masses of all test particles to 0 and call from_rebound with massless=..."
         )
     empty = masses == 0
     if not empty.any():

@@ -16,15 +16,16 @@ from ..engine.quantities import refuse_unit_or_mask
 from ..systems import Problem
 from .extras import needed, system_of
 
-_JACOBIAN = "Jacobians of implicit steps are computed by autodiff. Leave it out"
+_JACOBIAN = "Jacobians of implicit steps are computed by autodiff. Leave this argument out"
 _ESTIMATE = (
-    "The size of the steps is fixed, so that the invariants are conserved. Leave it out, choose h, "
-    "and compare the results for h and h/2 to estimate the error"
+    "The size of the steps is fixed, so that the invariants are conserved. Leave this argument "
+    "out, choose h, and compare the results for h and h/2 to estimate the error"
 )
 _REJECTED = {
     **dict.fromkeys(("rtol", "atol"), _ESTIMATE),
     **dict.fromkeys(("max_step", "min_step", "first_step"), "Give the largest step size as h"),
     **dict.fromkeys(("jac", "jac_sparsity", "lband", "uband"), _JACOBIAN),
+    "fun": "Give a dvi.System as the first argument",
     "vectorized": "Functions are written for one state. Use jax.vmap for a batch",
     "dense_output": "The result has no interpolant. Give the output times as t_eval",
 }
@@ -268,8 +269,8 @@ def _event(event: Any) -> _Event:
     terminal = int(terminal or 0) if isinstance(terminal, bool | None | np.bool_) else terminal
     if not isinstance(terminal, int | np.integer) or terminal < 0:
         raise ValueError(
-            f"terminal of the event {getattr(event, '__name__', event)} must be True, False or a "
-            f"whole number from 0 on, got {terminal!r}. The run ends after that number of "
+            f"terminal of the event {getattr(event, '__name__', event)} must be True, False or an "
+            f"integer of at least 0, got {terminal!r}. The run ends after that number of "
             "crossings. With 0 or False the event does not end the run."
         )
     direction = int(np.sign(getattr(event, "direction", 0)))

@@ -94,8 +94,8 @@ class UnitSystem:
         if bad := [name for name, unit in read.items() if unit is None]:
             raise ValueError(
                 f"{problem.name} measures {bad[0]} in {texts[bad[0]]!r}, but astropy has no such "
-                "unit. Call dvi.integrate with numbers, or call interop.integrate with "
-                "units=interop.UnitSystem(length, time, mass)."
+                "unit. Call dvi.integrate with numbers, or call interop.integrate with q0, "
+                "p0, args and units=interop.UnitSystem(length, time, mass)."
             )
         brackets = {n: re.search(r"\[([^\]]*)\]\s*$", m) for n, m in problem.parameters.items()}
         args = {name: _read(u, found[1]) for name, found in brackets.items() if found}
@@ -255,10 +255,12 @@ def _arguments(u: Any, args: Any, units: UnitSystem) -> Any:
             seen.add(declared)
             return _number(u, f"args {name}", leaf, units.args[declared])
         if isinstance(leaf, u.Quantity) and leaf.unit != u.dimensionless_unscaled:
-            more = f'add the unit: UnitSystem(..., args={{"{name}": u.Unit("{leaf.unit}")}})'
+            key, of = (name, f"{name} in args") if path else ("name", "args")
+            more = f'add the unit: UnitSystem(..., args={{"{key}": u.Unit("{leaf.unit}")}})'
+            as_dict = "" if path else 'give args as a dict {"name": value} and '
             raise TypeError(
-                f"{name} in args has the unit {leaf.unit}, but units has no unit for {name}. Give "
-                f"a number without a unit, or {more if path else 'give args as a dict'}."
+                f"{of} has the unit {leaf.unit}, but units has no unit for {name}. Give a number "
+                f"without a unit, or {as_dict}{more}."
             )
         bare.append(name)
         return _number(u, f"args {name}", leaf, u.dimensionless_unscaled)
@@ -268,7 +270,7 @@ def _arguments(u: Any, args: Any, units: UnitSystem) -> Any:
     if unmet and bare:  # a mistyped name would let a bare number through
         raise ValueError(
             f"UnitSystem(args=...) has units for {', '.join(unmet)}, but args has no entries of "
-            f"these names. Entries of args without a unit: {', '.join(bare)}. Give args as a dict "
+            f"these names. No unit is declared for {', '.join(bare)}. Give args as a dict "
             f"with the same names, or remove {', '.join(unmet)} from UnitSystem(args=...)."
         )
     return numbers

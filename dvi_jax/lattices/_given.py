@@ -49,10 +49,10 @@ class Given(Lattice):
                 # The first two times as well: they determine the direction.
                 pairs = {i: np.asarray(self.ts)[i : i + 2].tolist() for i in (0, k)}
                 raise ValueError(
-                    "ts in Given(ts) must have finite times in strictly increasing or strictly "
-                    "decreasing order throughout, got "
+                    "ts in Given(ts) must be finite times in strictly increasing order, or finite "
+                    "times in strictly decreasing order; got "
                     f"{' and '.join(f'ts[{i}:{i + 2}] = {pair}' for i, pair in pairs.items())}. "
-                    "np.unique(ts) sorts times and removes equal ones."
+                    "np.unique(ts) puts finite times in increasing order and removes equal times."
                 )
 
     def prepare(self, t0, h, num_steps):

@@ -22,6 +22,10 @@ class Uniform(StepSizes):
             )
         name, span = ("duration", "duration") if t1 is None else ("t1", "t1 − t0")
         seen = f"h={h!r}, {name}={given[name]!r}" + ("" if t1 is None else f", t0={t0!r}")
+        if h is None:
+            raise TypeError(
+                f"h must be given with {name}, because h determines the number of steps."
+            )
         try:
             length = float(duration) if t1 is None else float(t1) - float(t0)
             # h = 0 has its own message later.

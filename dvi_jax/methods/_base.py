@@ -74,10 +74,10 @@ class Method(eqx.Module):
         # The errors that a function raises for a q or args of another structure than it expects.
         except (TypeError, IndexError, KeyError, ValueError, AttributeError) as error:
             raise ValueError(
-                f"the functions of the system raise {type(error).__name__} for q of shape "
-                f"{q.shape} and args={args!r:.200}: {error}. If this shape or these args are "
-                "wrong, give others, in is_explicit as q=jnp.zeros(shape) and args=...; otherwise "
-                "correct the function."
+                f"a function of the system raises {type(error).__name__} for q of shape {q.shape} "
+                f"and args={args!r:.200}: {error}. If the shape of q or args is wrong, change it "
+                "(method.is_explicit takes q=jnp.zeros(shape) and args=...). Otherwise correct the "
+                "function."
             ) from error
         return found[0]
 

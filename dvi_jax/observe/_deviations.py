@@ -129,7 +129,7 @@ class _Framed(Deviations):
         if count is not None and count > size:
             raise ValueError(
                 f"{type(self).__name__} can have at most {size} deviation vectors, one for each "
-                f"component of q and p; got {count}. Give it a smaller number."
+                f"component of q and p; got {count}. Choose a smaller number."
             )
         # All `size` vectors are drawn, so that the first ones do not depend on the count.
         random = np.random.default_rng(self.seed).standard_normal((size, size))

@@ -36,10 +36,10 @@ def canvas(ax: Any, size: Any = None, space: bool = False) -> tuple[Any, bool]:
     instance("ax", ax, Axes, "the matplotlib Axes to draw on")
     if space != (ax.name == "3d"):
         raise ValueError(
-            f'ax must be Axes {"with" if space else "without"} projection="3d", got Axes with '
-            f'projection="{ax.name}". Make them by figure.add_subplot('
+            f'the given Axes must be Axes {"with" if space else "without"} projection="3d", got '
+            f'Axes with projection="{ax.name}". Make them by figure.add_subplot('
             + ('projection="3d"' if space else "")
-            + "), or leave ax out."
+            + "), or give no Axes."
         )
     return ax, False
 

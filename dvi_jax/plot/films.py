@@ -148,7 +148,7 @@ def _moments(lanes: Sequence[Lane], frames: float) -> np.ndarray:
     known = [lane.ts[lane.there] for lane in lanes if lane.there.any()]
     if not known:
         raise ValueError(
-            "orbits must have at least one finite state, but each of its saved states contains NaN "
+            "orbits must have at least one finite state, but each saved state contains NaN "
             "or inf in ts, qs or ps. Check the arrays, or the status of the Solution."
         )
     count = max(2, min(round(frames), max(len(t) for t in known)))

@@ -283,7 +283,8 @@ def fit_corner(
     `ValueError` for one without a covariance, parameters that the data do not determine, and names
     that do not exist.
     """
-    _check(fit, "names", "x", "covariance")
+    wanted = "fit must be a FitResult, as dvi.fit returns it, or a dvi.Samples"
+    draw.check_attributes(fit, ("names", "x", "covariance"), wanted)
     numbers, values = _of_parameters(fit, params)
     C, n = np.asarray(fit.covariance)[np.ix_(numbers, numbers)], len(numbers)
     about = zip(numbers, np.sqrt(np.diag(C)).tolist(), strict=True)
@@ -320,9 +321,10 @@ def _of_parameters(fit: Any, params: Sequence[str] | None) -> tuple[list[int], n
     known = [n for n, v in zip(names, variances, strict=True) if np.isfinite(v) and v > 0]
     if not known:
         raise ValueError(
-            "fit.covariance must have a positive and finite number on its diagonal, which starts "
-            f"with {variances[:3].tolist()}. Possible causes: the fit failed, it has more than 400 "
-            "parameters, the data determine none, or sigma is missing and cannot be estimated."
+            "fit.covariance must have at least one positive and finite variance on its diagonal; "
+            f"the first variances are {variances[:3].tolist()}. Possible causes: the fit failed, "
+            "there are more than 400 parameters, the data determine no parameter, sigma is missing "
+            "and cannot be estimated, or all draws of dvi.Samples are equal."
         )
     if params is None:
         draw.at_most(_PARAMETERS, len(names), "parameters", f"params={names[:3]}")

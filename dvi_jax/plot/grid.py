@@ -228,9 +228,10 @@ def arrange(
         y = free.pop(0)
     if x is None:
         raise ValueError(
-            "data must have a free dimension of size 2 or more for x. Its dimensions (with their "
-            f"sizes) are {names_of(data)}; already used: {[*taken, *gone] or 'none'}. Give x, or "
-            "remove a dimension from facet or over."
+            "data must have a dimension of size 2 or more for x that is not used otherwise. The "
+            f"dimensions (with their sizes) are {names_of(data)}; used: "
+            f"{[*taken, *gone] or 'none'}. Remove a dimension from facet or over, or use data "
+            "with one more dimension."
         )
     if free:
         raise ValueError(

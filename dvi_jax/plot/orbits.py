@@ -86,7 +86,8 @@ def _planes(shape: tuple[int, ...], dof: Any) -> list["Plane"]:
         some = "0, 1" if len(shape) == 1 else "(0, 0), (0, 1)"
         at_most(_PANELS, len(places), "degrees of freedom", f"dof=[{some}]")
     if not places:
-        raise ValueError("dof is empty: choose at least one degree of freedom, such as dof=[0].")
+        first = 0 if len(shape) == 1 else (0,) * len(shape)
+        raise ValueError(f"dof is empty: choose a degree of freedom, such as dof=[{first}].")
     return [Plane(place, shape) for place in places]
 
 
@@ -311,7 +312,7 @@ def view_of(
     many, dim, count = len(shape) == 2, shape[-1], shape[0] if len(shape) == 2 else 1
     axes = tuple(chosen("coordinates", coordinates, dim))
     if len(axes) not in (2, 3):
-        one = "For a single coordinate use phase_portrait."
+        one = "For a single coordinate use phase_portrait, which requires momenta."
         raise ValueError(
             f"coordinates must select two or three coordinates, got {len(axes)} for states of "
             f"shape {shape}. {'Choose for example coordinates=(0, 1).' if dim > 1 else one}"

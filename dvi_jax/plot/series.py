@@ -179,14 +179,14 @@ def _read(
         else:
             kind = f"list of length {len(v)}" if isinstance(v, list) else type(v).__name__
             raise ValueError(
-                f"values[{name!r}] must be a function (q, p), or a list with one array for each "
-                f"orbit, of length {len(lanes)}; got {kind}."
+                f"values[{name!r}] must be a function (q, p), or a list of length {len(lanes)} "
+                f"with one array for each orbit, got {kind}."
             )
     if not watched:
-        what = "orbits has no observable with one value for each saved state or each step"
+        what = "no observable has, in all orbits, one value for each saved state or each step"
         raise ValueError(
-            f"{what if values is None else 'values is empty'}: give for example "
-            "values={'energy': f}, where f is an array or a function (q, p)."
+            f"{what if values is None else 'values is empty'}: give values={{'energy': f}}, "
+            "where f is a function (q, p) or an array (for a list of orbits, a list of arrays)."
         )
     return ts, names, lanes, watched
 

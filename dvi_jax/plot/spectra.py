@@ -104,9 +104,9 @@ def frequency_map(
     check_shapes(on_grid or len({a.shape for a in arrays.values()}) == 1, wanted, **arrays)
     if on_grid and len(resonances):
         raise ValueError(
-            "resonances are lines between frequencies, but x and y are a grid of initial "
-            "conditions. Leave out resonances, or give the frequencies of all orbits as x and y, "
-            f"both of shape {(len(x), len(y))}."
+            "resonances can be drawn only if x and y are frequencies, but here they are a grid of "
+            "initial conditions. Leave out resonances, or give the frequencies of all orbits as x "
+            f"and y, both of shape {(len(x), len(y))}."
         )
     axis, new = canvas(ax, (6.0, 4.8))
     shown = D if on_grid or D is None else D[np.isfinite(x) & np.isfinite(y)]

@@ -157,8 +157,10 @@ def each_state(function: Callable[..., Any], qs: Any, ps: Any) -> np.ndarray:
     """A function ``(q, p)`` of every state, shape (N, ...)."""
     values = np.asarray(jax.vmap(function)(qs, ps))
     if values.dtype.kind not in "biuf":
-        name = getattr(function, "__name__", "a function")
-        raise TypeError(f"{name}(q, p) must return real numbers, got dtype {values.dtype}.")
+        name = getattr(function, "__name__", type(function).__name__)
+        raise TypeError(
+            f"a function (q, p) must return real numbers, but {name} returned dtype {values.dtype}."
+        )
     return values
 
 
@@ -197,7 +199,8 @@ def looks_of(count: int, values: Any = None, limits: tuple[float, float] | None 
     values = np.ravel(np.asarray(values, float))
     if len(values) != count:
         raise ValueError(
-            f"colour must have length {count}, one value for each orbit, got length {len(values)}."
+            f"colour must have length {count}, one value for each orbit or line, got length "
+            f"{len(values)}."
         )
     known = np.isfinite(values)
     scale = ScalarMappable(scale_of(values, limits)[0], SHADES)

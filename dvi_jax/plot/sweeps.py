@@ -117,14 +117,14 @@ def slope_map(
 
     data = checked_array(data)
     one_of("reduce", reduce, REDUCTIONS)
-    dim = dim_of(data, along)
+    dim = dim_of(data, along, "along")
     values, order = _positive(data, along)
     others, facet = where.get("over", ()), where.get("facet")
     others = [*([others] if isinstance(others, str) else others), *([facet] if facet else [])]
     if wrong := [name for name in others if dim_of(data, name) == dim]:
         raise ValueError(
             f"facet and over must not use the dimension {dim!r}, got {wrong[0]!r}: the slopes are "
-            "computed along this dimension. Choose another one."
+            "computed along this dimension. Choose another dimension for facet or over."
         )
     x, y = (along if name is not None and dim_of(data, name) == dim else name for name in (x, y))
     local = local or along in (x, y)
@@ -327,11 +327,11 @@ def _positive(data: Any, along: str) -> tuple[np.ndarray, np.ndarray]:
     values = data.coords[along].values
     order = np.argsort(values, kind="stable")
     order = order[np.isfinite(values[order]) & (values[order] > 0)]
-    different = len(np.unique(values[order]))
-    if different < max(2, len(order)):
+    equal = np.flatnonzero(np.diff(values[order]) == 0)
+    if len(order) < 2 or len(equal):
+        found = f"{values[order[equal[0]]]} more than once" if len(equal) else f"only {len(order)}"
         raise ValueError(
-            f"along={along!r} must have at least two positive values, and none of them twice. The "
-            f"number of positive values is {len(order)}, that of different ones is {different}. "
+            f"along={along!r} must have at least two positive values, all different, got {found}. "
             "Select other values, or choose another coordinate."
         )
     return np.asarray(values[order], float), order

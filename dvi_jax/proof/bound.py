@@ -132,7 +132,7 @@ def bound_drift(
         raise ValueError(
             "arithmetic must be dvi.FloatingPoint(), dvi.DoubleDouble() or "
             f"dvi.FixedPoint(quantum), got {how.arithmetic!r}: bound_drift does not bound the "
-            "rounding of others."
+            "rounding of other kinds of arithmetic."
         )
     h = check_step_size(h)
     shape, (lower, upper) = _domain(domain, found)
@@ -296,10 +296,11 @@ def _functions(found: Any, system: System, timed: bool) -> list[tuple[Callable, 
     if isinstance(found, str) or not (callable(found) or np.iterable(found)):
         raise TypeError(
             "found must be a Discovery, an InvariantSeries, an ExactInvariant, a function (q, p, "
-            f"epsilon), or a list of these, got {found!r:.200}."
+            "epsilon) or (q, p, epsilon, t), or a list that contains only these, got "
+            f"{found!r:.200}."
         )
     if callable(found):
-        name = getattr(found, "__name__", "a function")
+        name = getattr(found, "__name__", type(found).__name__)
         if _takes(found, 4) and (timed or not _takes(found, 3)):
             return [(lambda q, p, t, e, h: found(q, p, e, t), name)]
         return [(lambda q, p, t, e, h: found(q, p, e), name)]

@@ -64,10 +64,11 @@ class Program:
         order = sorted(needed)
         unknown = {self.operations[i][1] for i in order if self.operations[i][0] == "unknown"}
         if unknown:
+            names = ", ".join(sorted(unknown)).replace("select_n", "select_n (jnp.where)")
             raise Unsupported(
-                f"the function uses {', '.join(sorted(unknown))}, but a proof allows only sums, "
-                f"products, quotients, powers and {', '.join(UNARY)}. Remove the other "
-                "operations. For example, select_n is the name of jnp.where in JAX."
+                f"the function uses operations of JAX that a proof does not allow: {names}. "
+                "Allowed are sums, products, quotients, powers with constant exponents, sinh, "
+                f"cosh, tanh, {', '.join(UNARY)}. Remove all other operations."
             )
         new = {old: i for i, old in enumerate(order)}
         operations = []

@@ -96,8 +96,8 @@ def as_axis(name: str, value: Any) -> Any:
     if np.ndim(value) > 1:
         raise ValueError(
             f"{name} must be a number or a one-dimensional array, got shape {np.shape(value)}. "
-            "For a grid give a one-dimensional array for each argument. For arguments that vary "
-            'together give each a dvi.Axis("name", values) with the same name.'
+            "For a grid, give a one-dimensional array for each argument. For arguments that vary "
+            'together, give each argument as dvi.Axis("name", values) with the same name.'
         )
     return Axis(name, value)
 

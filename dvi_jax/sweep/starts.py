@@ -45,7 +45,8 @@ def _box(of: str, **ends: Any) -> tuple[list[tuple[float, ...]], tuple[int, ...]
     for which, pair in ends.items():
         if not isinstance(pair, tuple | list) or len(pair) != 2:
             raise TypeError(
-                f"{which} of {of} must be a pair, that is a tuple (of q, of p), got {pair!r:.200}."
+                f"{which} of {of} must be a pair: a tuple (values for q, values for p), got "
+                f"{pair!r:.200}."
             )
         arrays += [np.asarray(x, float) for x in pair]
         if bad := [x for array in arrays for x in array.flat if not np.isfinite(x)]:

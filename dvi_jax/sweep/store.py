@@ -106,7 +106,7 @@ class Store:
                 raise StoreError(
                     f"{path} must contain the directory {TASKS} (the records of finished tasks), "
                     "but it is missing. If this is a copy of a store, copy it again with hidden "
-                    "files (their names begin with a dot). If it is no store, give another path."
+                    "files (their names begin with a dot). If it is not a store, give another path."
                 )
             if (found := attributes["dvi_jax_sweep"]) != FORMAT:
                 raise StoreError(
@@ -117,10 +117,9 @@ class Store:
             store = cls(path, attributes)
         except FileNotFoundError:
             is_lost = (path / TASKS).is_dir()
-            then = f"The file was lost. {_RESTORE}" if is_lost else "Check the path."
-            raise StoreError(
-                f"{path}: there is no sweep here, because the file zarr.json does not exist. {then}"
-            ) from None
+            lost = f"The directory {TASKS} of a store exists: zarr.json was lost. {_RESTORE}"
+            then = lost if is_lost else "Check the path: there is no sweep here."
+            raise StoreError(f"{path}: the file zarr.json does not exist. {then}") from None
         except OSError as error:
             raise StoreError(
                 f"{path}: zarr.json cannot be read ({error.strerror or error}). Check the "
@@ -165,7 +164,7 @@ class Store:
         if not os.access(path / TASKS, os.W_OK):
             raise StoreError(
                 f"{path} cannot be written by this user. Change the permissions of this directory "
-                "and its files, or use another path as store. To read it, use dvi.open_sweep(path)."
+                "and its files, or give another path. To read the store, call dvi.open_sweep(path)."
             )
         store._restore(coordinates)
         return store
@@ -178,17 +177,18 @@ class Store:
             return self._arrays[name]
         variable = self.variables[name]
         expected = (*self.plan.shape, *variable.shape), np.dtype(variable.dtype)
+        wanted = "shape {} and dtype {}".format(*expected)
         try:
             found = self._group()[name]
             seen: Any = found.shape, found.dtype
+            what = "has shape {} and dtype {}, but must have {}".format(*seen, wanted)
         except Exception as error:  # zarr has many errors for damaged metadata
-            found, seen = None, repr(error)
+            found, seen = None, None
+            what = f"cannot be opened ({type(error).__name__}: {error})"
         if seen != expected:
             raise StoreError(
-                f"{self.path}: zarr.json must describe the array {name!r} with shape {expected[0]} "
-                f"and dtype {expected[1]}, but found "
-                f"{seen if found is None else '{} and {}'.format(*seen)}. The file is damaged or "
-                f"was edited. {_RESTORE}"
+                f"{self.path}: the array {name!r} {what}. The description of the arrays in "
+                f"zarr.json is damaged or was edited. {_RESTORE}"
             )
         self._arrays[name] = found
         return found

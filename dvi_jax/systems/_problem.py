@@ -94,13 +94,13 @@ class Problem:
         for what, known, kind in (
             ("invariants", self.observables, "observables"),
             ("adiabatic", self.observables, "observables"),
-            ("parameters", args, "args"),
+            ("parameters", args, "the dict args"),
         ):
             for name in set(getattr(self, what)) - set(known):
                 raise ValueError(
                     f"{what} of the problem {self.name!r} contains {name!r}, but must contain only "
-                    f"names in {kind} ({', '.join(sorted(known)) or 'it is empty'}). Correct the "
-                    f"name, or add {name!r} to {kind}."
+                    f"names in {kind} ({', '.join(sorted(known)) or 'it has no names'}). Correct "
+                    f"the name, or add {name!r} to {kind}."
                 )
 
 

@@ -55,8 +55,8 @@ def masses_of(q, args):
     masses = jnp.asarray(args["masses"], q.dtype)
     if q.ndim != 2 or masses.shape != q.shape[:1]:
         raise ValueError(
-            "the N-body system needs q0 of shape (bodies, dim) and masses of shape (bodies,), got "
-            f"q0 of shape {q.shape} and masses of shape {masses.shape}."
+            "the N-body system needs positions of shape (bodies, dim) and masses of shape (bodies,)"
+            f", got positions of shape {q.shape} and masses of shape {masses.shape}."
         )
     return masses
 

@@ -174,7 +174,7 @@ def chosen(kind: str, names: Any, known: Iterable[str], hint: str = "") -> list[
             near = difflib.get_close_matches(str(name).lower(), lowered, n=1)
             meant = f" (did you mean {lowered[near[0]]}?)" if near else ""
             raise ValueError(
-                f"{kind}s must be known names, got {name!r:.200}{meant}. Known are "
+                f"{kind}s must be known names, got {name!r:.200}{meant}. The known names are "
                 f"{', '.join(known)}.{hint}"
             )
     return names

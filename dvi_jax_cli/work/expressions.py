@@ -72,10 +72,10 @@ class Expressions:
             case ast.BinOp(left=left, op=ast.Add() | ast.Mult() as op, right=right):
                 left, right = self._made(left), self._made(right)
                 if not (isinstance(left, self.kind) and isinstance(right, self.kind)):
-                    raise ValueError(
-                        f"+ and * do not apply to numbers, texts or lists, got {ast.unparse(node)}."
-                        " Write the result (4 for 2 + 2), or leave the number out"
-                    )
+                    is_mixed = isinstance(left, self.kind) or isinstance(right, self.kind)
+                    then = "Leave the number, text or list out" if is_mixed else "Write the result"
+                    seen = f"got {ast.unparse(node)}. {then}"
+                    raise ValueError(f"+ and * do not apply to numbers, texts or lists, {seen}")
                 return left + right if isinstance(op, ast.Add) else left * right
             case ast.Name(id=name):
                 try:

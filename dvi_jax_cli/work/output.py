@@ -98,10 +98,10 @@ class Output(Report):
             yield
         except KeyboardInterrupt:
             there = ", ".join(sorted(file.name for file in self.folder.iterdir())) or "nothing"
-            last = self.files[-1] if self.files else "The last file"
+            last = f" {self.files[-1]} may be incomplete." if self.files else ""
             raise KeyboardInterrupt(
-                f"by Ctrl-C while results were written. {self.folder} now contains: {there}. "
-                f"{last} may be incomplete. To write all again, repeat the command with --force"
+                f"by Ctrl-C while results were written. {self.folder} now contains: {there}."
+                f"{last} To write all files again, repeat the command with --force"
             ) from None
 
     def path(self, name: str) -> Path:
