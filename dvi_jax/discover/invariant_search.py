@@ -95,17 +95,19 @@ def discover_invariants(
       no component along what order 0 conserves), unless the simplest ones are exact; "simplest"
       takes those of simple functions, which tend to drift less and are easier to read.
     - the keywords `t0`, `args`, `method`, `root_finder` (or `newton`), `integrator`: as for
-      `integrate`; only the map of one step is used.
+      `integrate`; only the map of one step is used. `arithmetic`: ``dvi.DoubleDouble()`` decides
+      the null space with 30 digits (orders above 6); the default is ``dvi.FloatingPoint()``.
 
     **Returns** a `Discovery`; print it for a report.
 
     **Raises** `ValueError` for too few samples, samples or basis functions that are not
     finite there, a step that fails there, a basis that is rank-deficient on them, a basis or a
-    map of time with samples of one time, a tolerance outside (0, 1), or h = 0; `TypeError` for
-    anything but a system, basis, method or root finder, and for samples without x64.
+    map of time with samples of one time, a tolerance outside (0, 1) or in pairs, another
+    arithmetic, or h = 0; `TypeError` for anything but a system, basis, method or root finder, and
+    for samples without x64.
 
     **Accuracy** round-off of the singular values, times the conditioning of the basis; Taylor
-    coefficients by nested forward autodiff, through implicit steps.
+    coefficients by nested forward autodiff, through implicit steps. Coefficients are float64.
 
     **Source** our own.
 

@@ -121,7 +121,8 @@ def _equation(eqn: Any, values: list[Any]) -> list[Any]:
     raise NotImplementedError(
         f"arithmetic=dvi.DoubleDouble() has no rule for the operation {name} of JAX, which a "
         "function of this run uses. Write the function with elementary functions, sums, products, "
-        "lanewise.solve(A, b) or loops, or use arithmetic=dvi.Compensated()."
+        "lanewise.solve(A, b) or loops, or use arithmetic=dvi.Compensated() (in a search "
+        "dvi.FloatingPoint())."
     )
 
 
