@@ -1,14 +1,10 @@
 """Null spaces of series order by order, with 30 digits, where float64 cannot tell small from zero.
 
-The conditions Σ_{m≤k} B_{k−m} c_m = 0, k = 0 … z, are a block-Toeplitz system. Its null vectors of
-order 0 are those of B_0, c_0 = N a_0. The correction c_k of each is the smallest that makes the
-left side of order k orthogonal to the range of B_0; the rest of it is a secular term D_k a_0. The
-same correction, later by m orders, belongs to c_m = N a_m. What remains is
-
-    Σ_{m<k} D_{k−m} a_m = 0,    k = 1 … z,
-
-a block-Toeplitz system of one order less, with as many unknowns as B_0 has null vectors. Its
-leading block D_1 decides which of them survive order 1; and so on.
+The conditions Σ_{m≤k} B_{k−m} c_m = 0, k = 0 … z, are a block-Toeplitz system. Series that satisfy
+those up to order k − 1 have a correction c_k that makes the left side of order k orthogonal to the
+range of B_0; the rest of it is a secular term. A series that was lost at an order m < k, multiplied
+by ε^(k−m), has its own secular term at order k and may cancel that of another one. The combinations
+of series that have no secular term then survive order k.
 """
 
 from collections.abc import Sequence
@@ -76,7 +72,7 @@ class _Split:
             largest = singular.max(initial=0.0)
             if largest <= _ZERO * noise:
                 break
-            count = int(np.sum(singular > _SHARE * largest))
+            count = int(np.sum(singular > max(_SHARE * largest, _ZERO * noise)))
             rest = exact(V[count:].T)
             factors = Left(U[:, :count].T), singular[:count], V[:count]
             stage = _Stage(Left(self.null), Left(matrix), *factors)
@@ -95,14 +91,14 @@ class _Split:
 def _corrected(
     stages: Sequence[_Stage], c: Pair, left: Pair, inner: bool = False
 ) -> tuple[Pair, Pair]:
-    """c and the left side M c + x without the part of it in the range of the stages; `inner`: c in
-    terms of the columns of the stage."""
+    """c and the left side without the part of it in the range of the stages; `inner`: c in terms of
+    the columns of the stage."""
     first = last = None
     for _ in range(_SWEEPS if stages else 0):
         largest = np.zeros(c.hi.shape[1])
         for stage in stages:
             y = stage.correction(left)
-            c = plus(c, y if inner else stage.basis @ y)
+            c = plus(c, y if inner else _lowest(stage.basis @ y, len(c.hi)))
             left = plus(left, stage.image @ y)
             largest = np.maximum(largest, np.max(np.abs(y), axis=0, initial=0.0))
         first = largest if first is None else first
@@ -116,12 +112,15 @@ def _corrected(
 class Step(NamedTuple):
     """The conditions of one order k.
 
-    - `series`: c_0 … c_k one below the other, shape ((k + 1) · size, count), with orthonormal c_0.
+    - `series`: c_0 … c_k one below the other, shape ((k + 1) · size, count), with orthonormal c_0
+      and the smallest corrections. `shifts`: orthonormal series that may be added to any of them,
+      those of the orders below, later in ε.
     - `kept`, `zeros`: singular values that are not zero, and those that are.
     - `noise`: the largest zero up to this order. `undecided`: how many of `kept` are hardly larger.
     """
 
     series: Pair
+    shifts: Pair
     kept: np.ndarray
     zeros: np.ndarray
     noise: float
@@ -134,46 +133,28 @@ def staircase(blocks: Sequence[Pair], basis: np.ndarray, noise: float) -> list[S
     - `blocks`: B_0 … B_z, (rows, size). `basis`: columns, (size, size), taken as exact: the series
       are those of B_m · `basis`. `noise`: rounding of the elements of B_0 · `basis`.
     """
-    columns: Left | None = Left(basis)
-    series: list[Pair] = []
+    size, columns, lefts = len(basis), Left(basis), [Left(b) for b in blocks]
+    first = split = _Split(lefts[0] @ basis, noise)
+    c, shifts = split.null, zeros(size, 0)
+    lost: list[_Stage] = []
     found: list[Step] = []
     for k in range(len(blocks)):
-        split = _Split(Left(blocks[0]) @ basis if columns else blocks[0], noise)
-        y, blocks = _next(blocks, columns, split)
-        series = _composed(series, y) if k else y
+        if k:
+            x = zeros(len(blocks[0].hi), c.hi.shape[1])
+            for m in range(k):
+                x = plus(x, lefts[k - m] @ (columns @ _block(c, m, size)))
+            last, x = first.solved(x)
+            c, x = _corrected(lost, _stacked([c, last]), x)
+            split, series = _Split(x, noise), Left(c)
+            lost += [s._replace(basis=Left(series @ s.basis.matrix)) for s in split.stages]
+            c, left = series @ split.null, Left(shifts)
+            for _ in range(_SWEEPS // 2):
+                c = plus(c, left @ -(shifts.hi.T @ c.hi))
         undecided = int(np.sum(split.kept < _UNDECIDED * noise))
         noise = max(noise, float(split.zeros.max(initial=0.0)))
-        stacked = _stacked(series[: k + 1])
-        found.append(Step(stacked, split.kept, split.zeros, noise, undecided))
-        columns = None
-    return found
-
-
-def _next(
-    blocks: Sequence[Pair], columns: Left | None, split: _Split
-) -> tuple[list[Pair], list[Pair]]:
-    """The series that begins with each null vector of B_0, and its secular terms."""
-    lefts = [Left(b) for b in blocks[1:]]
-    series, moved, secular = [split.null], [], []
-    for k in range(len(lefts)):
-        moved.append(columns @ series[-1] if columns else series[-1])
-        x = zeros(len(blocks[0].hi), split.null.hi.shape[1])
-        for m, c in enumerate(moved):
-            x = plus(x, lefts[k - m] @ c)
-        c, x = split.solved(x)
-        series.append(c)
-        secular.append(x)
-    return series, secular
-
-
-def _composed(series: Sequence[Pair], y: Sequence[Pair]) -> list[Pair]:
-    """Σ_j c_{k−j} y_j for each order k."""
-    lefts, found = [Left(c) for c in series], []
-    for k in range(len(series)):
-        total = zeros(len(series[0].hi), y[0].hi.shape[1])
-        for j in range(min(k + 1, len(y))):
-            total = plus(total, lefts[k - j] @ y[j])
-        found.append(total)
+        found.append(Step(c, shifts, split.kept, split.zeros, noise, undecided))
+        own = Left(c) @ np.linalg.inv(triangle(np.asarray(c.hi)))
+        shifts = _lowest(_stacked([own, shifts], axis=1), (k + 2) * size)
     return found
 
 
@@ -182,24 +163,14 @@ def _stacked(matrices: Sequence[Pair], axis: int = 0) -> Pair:
     return Pair(*parts)
 
 
+def _lowest(x: Pair, rows: int) -> Pair:
+    """Series that begin later in ε, so that there are so many rows."""
+    return _stacked([zeros(rows - len(x.hi), x.hi.shape[1]), x])
+
+
 def _block(series: Pair, m: int, size: int) -> Pair:
     """c_m."""
     return Pair(*(x[m * size : (m + 1) * size] for x in series))
-
-
-def _smallest(steps: Sequence[Step], size: int) -> list[tuple[Pair, Pair]]:
-    """For each order the series with the smallest corrections, and orthonormal ones that may be
-    added to them: all of the orders below, later in ε."""
-    shifts, found = zeros(size, 0), []
-    for step in steps:
-        c, left = step.series, Left(shifts)
-        for _ in range(_SWEEPS // 2):
-            c = plus(c, left @ -(shifts.hi.T @ c.hi))
-        found.append((c, shifts))
-        own = Left(c) @ np.linalg.inv(triangle(np.asarray(c.hi)))
-        later = _stacked([own, shifts], axis=1)
-        shifts = _stacked([zeros(size, later.hi.shape[1]), later])
-    return found
 
 
 def spaces_in_pairs(
@@ -234,24 +205,23 @@ def spaces_in_pairs(
     errors = np.sqrt((each * rounding) ** 2 @ orthonormal**2)[~held_out]
     noise = float(np.max(np.linalg.norm(errors, axis=0), initial=np.finfo(float).tiny))
     steps = staircase([Pair(*(x[~held_out] for x in b)) for b in blocks], orthonormal, noise)
-    series = _smallest(steps, size)
-    left = _left_sides(blocks, orthonormal, [c for c, _ in series])
+    left = _left_sides(blocks, orthonormal, [step.series for step in steps])
     spaces: list[SeriesSpace] = []
     kept, gap = [], np.inf
-    for step, (c, shifts), x in zip(steps, series, left, strict=True):
+    for step, x in zip(steps, left, strict=True):
         kept.append(step.kept)
         gap = min(gap, step.kept.min(initial=1.0) / step.noise)
         # The same conditions on samples that were not fitted.
         changes, V = singular_vectors(x[held_out])
-        leading = np.asarray(c.hi) @ V[changes <= HELD_OUT * _ZERO * step.noise].T
+        leading = np.asarray(step.series.hi) @ V[changes <= HELD_OUT * _ZERO * step.noise].T
         count = leading.shape[1]
         if trivial is not None:
             leading = leading @ orthogonal_to(trivial @ leading[:size])
         if spaces:
             leading = within(leading, spaces[-1].leading[:size])
         singular = np.sort(np.concatenate([*kept, step.zeros]))[::-1]
-        refused = c.hi.shape[1] - count
-        shifts = np.asarray(shifts.hi)
+        refused = step.series.hi.shape[1] - count
+        shifts = np.asarray(step.shifts.hi)
         spaces.append(SeriesSpace(leading, shifts, singular, float(gap), refused, 0))
     return spaces, sum(step.undecided for step in steps)
 

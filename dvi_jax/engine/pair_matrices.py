@@ -33,8 +33,8 @@ class Left:
     """A matrix as the left factor of several products."""
 
     def __init__(self, x: Any):
-        self.bits = _bits(x)
-        self.slices = _slices(exact(x), 1, self.bits)
+        self.matrix, self.bits = exact(x), _bits(x)
+        self.slices = _slices(self.matrix, 1, self.bits)
 
     def __matmul__(self, x: Any) -> Pair:
         """The product with an array or a pair, with errors of 2⁻¹⁰⁰ times the largest numbers of
