@@ -54,6 +54,8 @@ def conditions(secular):
                 for part, x in zip(terms[m], in_range, strict=True):
                     part[:, column] = x[:, hidden]
     end = Pair(*(x[:, -1:] for x in terms[3]))
+    # The first one, two orders later, cancels this.
+    end = plus(end, 2.0 * terms[1].hi[:, -3:-2])
     for part, x in zip(terms[3], plus(end, secular * rng.normal(size=(40, 1))), strict=True):
         part[:, -1:] = x
     return terms
