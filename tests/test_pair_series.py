@@ -1,7 +1,8 @@
-"""Series in ε in pairs of numbers: where float64 cannot tell a small secular term from zero."""
+"""Series in ε in pairs of numbers: secular terms that float64 does not distinguish from zero."""
 
 import warnings
 from fractions import Fraction
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +14,7 @@ from dvi_jax.discover.block_triangular import BlockTriangular, above
 from dvi_jax.discover.changes import Stepped, terms_in_pairs
 from dvi_jax.discover.pair_series import staircase
 from dvi_jax.discover.sampling import as_samples
-from dvi_jax.engine.pair_matrices import Left, plus
+from dvi_jax.engine.pair_matrices import Left, plus, zeros
 from dvi_jax.engine.pairs import Pair
 
 
@@ -70,7 +71,7 @@ def test_null_vectors_with_a_tiny_secular_term_are_lost(secular, count):
     in_float64 = BlockTriangular(np.stack([x.hi for x in terms], axis=1), above(1e-10))
     assert in_float64.null(3)[0].shape[2] == (count if secular == 1e-6 else 1)
     for k, step in enumerate(steps):
-        left = np.zeros((40, step.series.hi.shape[1]))
+        left = zeros(40, step.series.hi.shape[1])
         for m in range(k + 1):
             c = Pair(*(x[m * 9 : (m + 1) * 9] for x in step.series))
             left = plus(left, Left(terms[k - m]) @ c)
@@ -100,6 +101,7 @@ def find(degree, order, system=DAMPED, args=0.0, **how):
 def test_terms_in_pairs_are_those_of_exact_arithmetic():
     """Polynomials in ε: with p1 = p + h (−q − ε q²), q1 = q + h p1."""
     basis, h = dvi.Polynomials(4).for_shape((1,)), Fraction(0.1)
+    monomials: Any = basis.function
     samples = as_samples(np.random.default_rng(0).uniform(-0.5, 0.5, (2, 3, 1)))
     stepped = Stepped(Equations(DAMPED, jnp.zeros(()), 0.0), np.asarray(0.1), dvi.TypeII(), basis)
     terms = terms_in_pairs(stepped, 3, samples)
@@ -107,7 +109,7 @@ def test_terms_in_pairs_are_those_of_exact_arithmetic():
         q, p = Fraction(float(q)), Fraction(float(p))
         p1 = p - h * q, -h * q**2
         q1 = q + h * p1[0], h * p1[1]
-        for j, powers in enumerate(basis.function.counts.tolist()):
+        for j, powers in enumerate(monomials.counts.tolist()):
             series = [Fraction(1)]
             for factor, power in zip((q1, p1), powers, strict=True):
                 for _ in range(power):

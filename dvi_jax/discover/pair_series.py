@@ -1,4 +1,4 @@
-"""Null spaces of series order by order, with 30 digits, where float64 cannot tell small from zero.
+"""Null spaces of series order by order, with 30 digits, where float64 is not enough.
 
 The conditions Σ_{m≤k} B_{k−m} c_m = 0, k = 0 … z, are a block-Toeplitz system. Series that satisfy
 those up to order k − 1 have a correction c_k that makes the left side of order k orthogonal to the
