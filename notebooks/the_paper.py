@@ -2,8 +2,9 @@
 # # The paper: claims and measurements
 #
 # In this notebook you test five claims of a paper by numerical measurements, with public functions
-# of the package. The paper is "Preservation of adiabatic invariants for disturbed Hamiltonian
-# systems under variational discretization" (Acta Mechanica, doi:10.1007/s00707-019-02571-z).
+# of the package. The paper is
+# "Preservation of adiabatic invariants for disturbed Hamiltonian systems under variational
+# discretization" (Acta Mechanica, doi:10.1007/s00707-019-02571-z).
 # Numbers in parentheses, such as (34), are equation numbers of the paper. The package implements
 # the discrete equations of the paper. With corrected signs they are
 #

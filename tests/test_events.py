@@ -320,7 +320,7 @@ INVALID = [
     (
         lambda: dvi.Section(on_axis, max_crossings=0),
         ValueError,
-        "max_crossings must be a whole num",
+        "max_crossings must be an integer",
     ),
     (lambda: kepler(observe=dvi.Section(vector)), ValueError, "must return a real scalar"),
     (lambda: kepler(stop=dvi.Stop(vector)), ValueError, "must return a real scalar"),

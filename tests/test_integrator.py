@@ -222,8 +222,10 @@ def test_invalid_integrators_are_rejected(how, error, message):
 
 
 def test_fields_without_effect_are_rejected():
-    with pytest.raises(ValueError, match="discover_invariants does not use arithmetic"):
+    with pytest.raises(ValueError, match="arithmetic of discover_invariants must be"):
         invariants(integrator=ACCURATE)
+    with pytest.raises(ValueError, match="find_symmetries does not use"):
+        symmetries(integrator=ACCURATE)
     with pytest.raises(ValueError, match="find_symmetries does not use method"):
         symmetries(integrator=STRANG)
 

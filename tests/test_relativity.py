@@ -352,7 +352,9 @@ def test_shapes_that_do_not_agree(function):
     args = {"masses": np.ones(3), "J2": 0.1}
     function(0.0, 0.0, jnp.asarray(Q), jnp.asarray(V), args)
     for q in (jnp.asarray(Q[:2]), jnp.ones(3)):
-        with pytest.raises(ValueError, match=r"needs q0 of shape \(bodies, dim\) and masses"):
+        with pytest.raises(
+            ValueError, match=r"needs positions of shape \(bodies, dim\) and masses"
+        ):
             function(0.0, 0.0, q, q, args)
 
 

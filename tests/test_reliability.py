@@ -31,6 +31,7 @@ UNSAFE = {"pickle", "cloudpickle", "dill", "joblib", "marshal", "shelve"}
 IMPORTING = {"import_module", "__import__", "exec_module", "eval", "exec", "compile"}
 
 ALLOWED = {
+    "dvi_jax/proof/workers.py": {"pickle", "import_module"},  # between processes of one search
     "dvi_jax/sweep/cluster.py": {"pickle", "cloudpickle"},  # between processes of one cluster
     "dvi_jax_cli/work/loader.py": {"exec_module"},  # the Python files that a TOML file names
     "dvi_jax/interop/extras.py": {"import_module"},  # names that are in the code

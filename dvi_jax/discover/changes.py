@@ -15,6 +15,8 @@ from .._results import RESULTS
 from .._step import Equations
 from .._system import System
 from .._types import Interval
+from ..engine.in_pairs import at_points_in_pairs
+from ..engine.pairs import Pair
 from ..methods import Method
 from .basis import BoundBasis
 from .motion import Motion
@@ -199,6 +201,25 @@ def batched_changes(stepped: Stepped, order: int, samples):
         return basis(q, p, t), terms, volumes, end[3], slopes, z1 - z, blur
 
     return jax.vmap(at_point)(*samples)
+
+
+def terms_in_pairs(stepped: Stepped, order: int, samples: Samples) -> Pair:
+    """A_0 … A_z, shape (S, z + 1, B), with 31 digits: see `Changes`."""
+    basis = stepped.basis
+
+    def terms(q, p, t):
+        def change(epsilon):
+            *end, info = _map(stepped, epsilon)(q, p, t)
+            good = info.result == RESULTS.successful
+            return jnp.where(good, basis(*end) - basis(q, p, t), jnp.nan)
+
+        return taylor_coefficients(change, jnp.zeros(()), order)
+
+    (found,) = at_points_in_pairs(terms, *map(jnp.asarray, samples))
+    # Numbers below 1e-290 have no lower part; above 1e300 it is NaN.
+    what = "the change of the basis functions in a step, in pairs of numbers,"
+    require_finite(found.lo, lambda *_: what, "scale the coordinates, or use dvi.FloatingPoint()")
+    return found
 
 
 def _log_determinant(D: Array) -> Array:

@@ -14,7 +14,7 @@ from .._system import System, check_system
 from ..engine.keywords import with_keywords_of
 from ..engine.names import both_names
 from .basis import AbstractBasis, bind_basis, check_step_size
-from .changes import Changes, Stepped, changes_at, checked_changes, is_exact
+from .changes import Changes, Stepped, changes_at, checked_changes, is_exact, terms_in_pairs
 from .digits import Conditions
 from .energy import unconserved_energy
 from .expansions import Larger, at_larger_step, in_larger_box, powers_of_size
@@ -31,6 +31,7 @@ from .nullspace import (
     triangle,
 )
 from .obstructions import drift_laws
+from .pair_series import ROUNDING, spaces_in_pairs, uses_pairs
 from .representatives import Span
 from .sampling import (
     TYPE_2,
@@ -53,7 +54,7 @@ _RELIABLE = 6  # The largest order that float64 decides reliably
 
 
 @both_names
-@with_keywords_of(integrate, f"{TYPE_2} method")
+@with_keywords_of(integrate, f"{TYPE_2} method arithmetic")
 def discover_invariants(
     system: System,
     basis: AbstractBasis,
@@ -94,17 +95,19 @@ def discover_invariants(
       no component along what order 0 conserves), unless the simplest ones are exact; "simplest"
       takes those of simple functions, which tend to drift less and are easier to read.
     - the keywords `t0`, `args`, `method`, `root_finder` (or `newton`), `integrator`: as for
-      `integrate`; only the map of one step is used.
+      `integrate`; only the map of one step is used. `arithmetic`: ``dvi.DoubleDouble()`` decides
+      the null space with 30 digits (orders above 6); the default is ``dvi.FloatingPoint()``.
 
     **Returns** a `Discovery`; print it for a report.
 
     **Raises** `ValueError` for too few samples, samples or basis functions that are not
     finite there, a step that fails there, a basis that is rank-deficient on them, a basis or a
-    map of time with samples of one time, a tolerance outside (0, 1), or h = 0; `TypeError` for
-    anything but a system, basis, method or root finder, and for samples without x64.
+    map of time with samples of one time, a tolerance outside (0, 1) or in pairs, another
+    arithmetic, or h = 0; `TypeError` for anything but a system, basis, method or root finder, and
+    for samples without x64.
 
     **Accuracy** round-off of the singular values, times the conditioning of the basis; Taylor
-    coefficients by nested forward autodiff, through implicit steps.
+    coefficients by nested forward autodiff, through implicit steps. Coefficients are float64.
 
     **Source** our own.
 
@@ -125,11 +128,11 @@ def discover_invariants(
     one_step = map_of("discover_invariants", system, **how)
     samples = as_samples(samples, one_step.t0)
     order = whole("order", order, least=0)
-    if order > _RELIABLE:
+    in_pairs = uses_pairs(one_step.arithmetic, tolerance)
+    if order > _RELIABLE and not in_pairs:
         warnings.warn(
             f"order={order}: above order {_RELIABLE} rounding in float64 can hide an invariant, or "
-            "add a false invariant to the result. Use a lower order, or check each invariant with "
-            "dvi.bound_drift or dvi.drift_order.",
+            "add a false invariant to the result. Use arithmetic=dvi.DoubleDouble().",
             stacklevel=2,
         )
     if tolerance is not None:
@@ -145,7 +148,8 @@ def discover_invariants(
     inner, to_basis = bound.about(at)
     stepped = Stepped(equations, np.asarray(h), one_step.method, inner)
     changes = checked_changes(stepped, order, samples)
-    found = Search(stepped, changes, samples, order, tolerance)
+    terms = terms_in_pairs(stepped, order, samples) if in_pairs else None
+    found = Search(stepped, changes, samples, order, tolerance, terms)
     chosen = found.best(representative)
     coefficients, dependent, exact = chosen.coefficients, chosen.dependent, chosen.exact
     errors = chosen.errors
@@ -254,7 +258,9 @@ class Search:
     """The null space of a search, in functions that are orthonormal on the fitted samples:
     singular values then measure functions, not their scaling."""
 
-    def __init__(self, stepped: Stepped, changes: Changes, samples: Samples, order, tolerance):
+    def __init__(
+        self, stepped: Stepped, changes: Changes, samples: Samples, order, tolerance, pairs=None
+    ):
         self.stepped, self.order, self.tolerance = stepped, order, tolerance
         basis, fit = stepped.basis, ~samples.held_out
         self.basis, self.fitted = basis, samples.at(fit)
@@ -281,7 +287,15 @@ class Search:
 
         trivial = None if self.constant is None else self.R @ self.constant
         compressed = compress(self.rows)
-        self.spaces = series_spaces(compressed, judge, tolerance, trivial)
+        if pairs is None:
+            self.spaces, self.undecided = series_spaces(compressed, judge, tolerance, trivial), 0
+        else:
+            rounding = ROUNDING / np.finfo(float).eps
+            self.motion = self.motion._replace(rounding=rounding * self.motion.rounding)
+            errors = rounding * changes.motion.rounding
+            self.spaces, self.undecided = spaces_in_pairs(
+                pairs, self.scale, self.orthonormal, self.motion.weights(), ~fit, errors, trivial
+            )
         self.conditions = Conditions.of(times(compressed, self.R))
         step = triangle(calm[fit, None] * terms[fit, 0]) / np.sqrt(len(self.values))
         self.typical = np.linalg.norm(step, 2) or 1.0
@@ -403,7 +417,8 @@ class Search:
     @property
     def unclear(self) -> int:
         """Null vectors of which rounding decides whether they are series."""
-        return max(space.unclear for space in self.spaces) if self.tolerance is None else 0
+        unclear = max(space.unclear for space in self.spaces) + self.undecided
+        return unclear if self.tolerance is None else 0
 
     def laws(self, volume: np.ndarray, slow_time: bool, blur: float):
         """The `DriftLaw` of each leading-order term that is lost."""

@@ -209,11 +209,11 @@ def series_spaces(
         led, free = by_leading(space.columns[:size], max(RANK, tolerance or 0.0))
         leading, shifts = space.columns @ led, space.columns @ free
         if trivial is not None:
-            leading = leading @ _orthogonal_to(trivial @ leading[:size])
+            leading = leading @ orthogonal_to(trivial @ leading[:size])
         found = leading.shape[1] + shifts.shape[1]
         leading, shifts, unclear = judge(leading, shifts)
         if spaces:
-            leading = _within(leading, spaces[-1].leading[:size])
+            leading = within(leading, spaces[-1].leading[:size])
         refused = found - leading.shape[1] - shifts.shape[1]
         spaces.append(
             SeriesSpace(leading, shifts, space.singular_values, space.gap, refused, unclear)
@@ -221,7 +221,7 @@ def series_spaces(
     return spaces
 
 
-def _within(leading: np.ndarray, before: np.ndarray) -> np.ndarray:
+def within(leading: np.ndarray, before: np.ndarray) -> np.ndarray:
     """The combinations whose first blocks lie in the span of orthonormal columns."""
     if leading.shape[1] == 0 or before.shape[1] == 0:
         return leading[:, :0]
@@ -229,7 +229,7 @@ def _within(leading: np.ndarray, before: np.ndarray) -> np.ndarray:
     return leading @ V[cosines > 0.9].T
 
 
-def _orthogonal_to(direction: np.ndarray) -> np.ndarray:
+def orthogonal_to(direction: np.ndarray) -> np.ndarray:
     """Orthonormal columns orthogonal to a direction, or all of them where it is outside."""
     length = np.linalg.norm(direction)
     if length < 1e-6:

@@ -10,6 +10,7 @@ import numpy as np
 
 from lanewise.jaxapi import x64_enabled
 
+from .._arithmetic import Arithmetic
 from .._checks import finite as finite_number
 from .._integrate import integrate
 from .._integrator import Integrator, chosen, only
@@ -168,6 +169,7 @@ class Map(NamedTuple):
     args: Args
     method: Method
     root_finder: RootSolver
+    arithmetic: Arithmetic
 
 
 TYPE_2 = "t0 args newton integrator"
@@ -181,17 +183,17 @@ def map_of(
     args: Args,
     newton: RootSolver | None,
     integrator: Integrator | None,
-    **method: Method | None,
+    **more: Any,
 ) -> Map:
-    """The map from the keywords of a search, with or without `method`.
+    """The map from the keywords of a search, with or without `method` and `arithmetic`.
 
     By default by Newton's iteration, through which Taylor coefficients in ε are exact.
     """
     if integrator is None and newton is None:
         newton = Newton()
-    integrator = chosen(integrator, root_finder=newton, **method)
-    found = only(integrator, function, *method, "root_finder")
-    return Map(t0, args, found.method_for(system), found.root_finder)
+    integrator = chosen(integrator, root_finder=newton, **more)
+    found = only(integrator, function, *more, "root_finder")
+    return Map(t0, args, found.method_for(system), found.root_finder, found.arithmetic)
 
 
 def require_enough(samples: Samples, unknowns: int, conditions: int = 1) -> None:

@@ -57,6 +57,32 @@ def in_pairs(function: Callable, *args: Any) -> Any:
     return jax.tree.unflatten(traced.out_tree, evaluated([*traced.outer, *leaves]))
 
 
+def at_points_in_pairs(function: Callable, *points: Array) -> list[Any]:
+    """The arrays of ``jax.vmap(function)(*points)`` in pairs, as NumPy arrays: see `in_pairs`. Each
+    of `points` has the points as its first axis and is exact.
+
+    Machine code of a function with many results takes long to compile: then each operation is
+    computed for many points before the next one.
+    """
+    # The shapes of one point are those of all.
+    closed = jax.make_jaxpr(function)(*(x[0] for x in points))
+    if sum(aval.size for aval in closed.out_avals) <= _FEW:
+        found = jax.jit(jax.vmap(lambda *point: in_pairs(function, *point)))(*points)
+        return jax.tree.map(np.asarray, jax.tree.leaves(found, is_leaf=is_pair))
+    evaluated = jax.vmap(_closed(closed))
+    count, blocks = len(points[0]), []
+    for first in range(0, count, _BLOCK):
+        # All blocks have one size, so that each operation is compiled once.
+        some = np.minimum(np.arange(first, first + _BLOCK), count - 1)
+        blocks.append(evaluated(*(x[some] for x in points)))
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *blocks)
+
+
+_FEW = 100
+_BLOCK = 128
+"""Points at once: intermediate results of them fit into memory."""
+
+
 def _evaluate(jaxpr: Jaxpr, consts: Sequence[Any], values: Sequence[Any]) -> list[Any]:
     known: dict[Any, Any] = dict(zip(jaxpr.constvars, consts, strict=True))
     known.update(zip(jaxpr.invars, values, strict=True))
@@ -96,7 +122,8 @@ def _equation(eqn: Any, values: list[Any]) -> list[Any]:
     raise NotImplementedError(
         f"arithmetic=dvi.DoubleDouble() has no rule for the operation {name} of JAX, but a "
         "function of this run uses it. Write this function with elementary functions, sums, "
-        "products, lanewise.solve(A, b) or loops. Or use arithmetic=dvi.Compensated()."
+        "products, lanewise.solve(A, b) or loops. Or use arithmetic=dvi.Compensated(), and in a "
+        "search dvi.FloatingPoint()."
     )
 
 
