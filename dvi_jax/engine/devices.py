@@ -47,7 +47,8 @@ def over_devices(
     mesh = jax.sharding.Mesh(chosen, (LANES,), axis_types=(AxisType.Auto,))
 
     def call(*args: Any) -> Any:
-        each = list(in_axes) if isinstance(in_axes, list | tuple) else [in_axes] * len(args)
+        given: Any = in_axes
+        each = list(given) if isinstance(given, list | tuple) else [given] * len(args)
         if len(each) != len(args):
             raise ValueError(
                 "in_axes must be an integer, None, or a list with one entry for each argument. The "

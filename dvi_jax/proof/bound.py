@@ -230,10 +230,9 @@ def _step_of(
             f"{method!r} is implicit for this system: use method=dvi.TypeII()."
         )
     plain = System(system.H_D, system.force, system.perturbation)
-    start = jnp.full(shape, 0.1)
-    how.arithmetic.prepare(
-        method, Equations(plain, jnp.asarray(0.1), args), Interval(0.0, h, h), start, start
-    )
+    start, number = jnp.full(shape, 0.1), jnp.asarray(0.1)
+    at = Interval(0 * number, number, number)
+    how.arithmetic.prepare(method, Equations(plain, number, args), at, start, start)
     quantum = getattr(how.arithmetic, "quantum", 0.0)
 
     def stepped(q, p, t, epsilon, h, error=0.0):

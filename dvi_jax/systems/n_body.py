@@ -190,5 +190,5 @@ def n_body(
         check=check_bodies,
         parameters=PARAMETERS,
         invariants=INVARIANTS,
-        symmetries=symmetries(np.shape(q0)[-1]),
+        symmetries=symmetries(np.asarray(q0).shape[-1]),
     )
