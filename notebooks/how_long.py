@@ -122,8 +122,9 @@ with plot.style():
 #
 # Hénon and Heiles' system has the force $-\varepsilon\,(2 q_1 q_2,\; q_1^2 - q_2^2)$. The search at
 # order 3 finds two invariants; the last one is the energy with corrections. Its level surfaces
-# around the centre of the domain are closed. This proves that a trajectory with an initial state
-# near the centre stays in the domain for the printed number of steps.
+# around the centre of the domain are closed, and its change in one step is bounded. Together these
+# prove that a trajectory with an initial state near the centre stays in the domain for the printed
+# number of steps.
 
 # %%
 henon_heiles = dvi.System(

@@ -160,9 +160,9 @@ assert np.all(np.abs(lost - (1 - np.exp(-1))) < 0.01)
 assert abs(power(epsilons, kept) - 1) < 0.05
 
 # %% [markdown]
-# With this friction, the map of `dvi.TypeII`, the default method, is *conformally* symplectic: each
-# step multiplies the phase volume by the same number, $1/(1 + \varepsilon h)$, at every state. The
-# next cell verifies this number at three states.
+# With this friction, the map of `dvi.TypeII`, the default method for an H_D that you write
+# yourself, is *conformally* symplectic: each step multiplies the phase volume by the same number,
+# $1/(1 + \varepsilon h)$, at every state. The next cell verifies this number at three states.
 
 
 # %%

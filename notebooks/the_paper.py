@@ -217,7 +217,7 @@ assert abs(slopes[1] - 1) < 0.1  # not for the force +εq
 # for the step size has no root after 77 steps ([time grids](../docs/lattices.md)). On a fixed time
 # grid (50) oscillates with an amplitude $O(h)$ for any $\varepsilon$. For $h \to 0$ and the force
 # $-\varepsilon q$, (50) is an invariant of first order. The force $+\varepsilon q$ is a control,
-# for which (50) must not be an invariant of first order: the slope is 1.
+# for which (50) is not an invariant of first order: the slope is 1.
 
 # %%
 with plot.style():

@@ -197,7 +197,7 @@ def test_a_unit_applies_to_all_parameters_below_its_name():
 
 
 def test_mistyped_names_of_parameters():
-    with pytest.raises(ValueError, match=r"units for kk, .* unit is declared for k\. "):
+    with pytest.raises(ValueError, match=r"units for 'kk', .* without a unit: 'k'\. "):
         weights([1, 2] * u.kg, k=5.0, kinds={"kk": u.N / u.m})
     with pytest.raises(ValueError, match=r"'J22', but oblate_kepler has no such.*mu, R, J2"):
         interop.integrate(systems.oblate_kepler(), h=10 * u.s, num_steps=1, args={"J22": 0.0})

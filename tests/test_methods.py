@@ -196,7 +196,7 @@ def test_explicitness_is_read_from_the_system():
     ):
         assert [method.is_explicit(s, q, 1.0) for s in (spring, damped)] == explicit
     assert dvi.TypeII().is_explicit(dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + q @ q))
-    with pytest.raises(ValueError, match=r"takes q=jnp.zeros"):
+    with pytest.raises(ValueError, match="that the system requires"):
         dvi.TypeII().is_explicit(spring)
 
 

@@ -268,10 +268,16 @@ def _arguments(u: Any, args: Any, units: UnitSystem) -> Any:
     numbers = jax.tree.map_with_path(number, args)
     unmet = [name for name in units.args if name not in seen]
     if unmet and bare:  # a mistyped name would let a bare number through
+        names, others = (", ".join(map(repr, some)) for some in (unmet, bare))
+        kind = f"args is of type {type(args).__name__}, whose entries have no names: give a dict."
+        if isinstance(args, Mapping):
+            kind = (
+                f"Entries of args without a unit: {others}. Use the same names in both, or remove "
+            )
+            kind += f"{names} from UnitSystem(args=...)."
         raise ValueError(
-            f"UnitSystem(args=...) has units for {', '.join(unmet)}, but args has no entries of "
-            f"these names. No unit is declared for {', '.join(bare)}. Give args as a dict "
-            f"with the same names, or remove {', '.join(unmet)} from UnitSystem(args=...)."
+            f"UnitSystem(args=...) has units for {names}, but args has no entries of these names. "
+            + kind
         )
     return numbers
 

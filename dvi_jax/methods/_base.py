@@ -74,10 +74,10 @@ class Method(eqx.Module):
         # The errors that a function raises for a q or args of another structure than it expects.
         except (TypeError, IndexError, KeyError, ValueError, AttributeError) as error:
             raise ValueError(
-                f"a function of the system raises {type(error).__name__} for q of shape {q.shape} "
-                f"and args={args!r:.200}: {error}. If the shape of q or args is wrong, change it "
-                "(method.is_explicit takes q=jnp.zeros(shape) and args=...). Otherwise correct the "
-                "function."
+                "the functions of the system cannot be evaluated or differentiated for q of shape "
+                f"{q.shape} and args={args!r:.200}. {type(error).__name__}: {error}. Give the q "
+                "and the args that the system requires. If they are right, correct the functions: "
+                "H_D must return a scalar, and the force an array like q."
             ) from error
         return found[0]
 

@@ -89,8 +89,9 @@ def animate(
     pixels = round(width * dpi) * round(height * dpi)
     if suffix == ".gif" and pixels * len(times) > _MOST_BYTES:
         raise ValueError(
-            f"a GIF must have at most {_MOST_BYTES} pixels in all frames together, got "
-            f"{len(times)} frames of {pixels} pixels: reduce seconds, fps, size or dpi, or use mp4."
+            f"a GIF must have at most {_MOST_BYTES:.2g} pixels in all frames together, got "
+            f"{pixels * len(times):.2g} ({len(times)} frames of {pixels} pixels): reduce seconds, "
+            "fps, size or dpi, or write an .mp4 file."
         )
     figure = Figure(figsize=(width, height), dpi=dpi, layout="constrained")
     canvas = FigureCanvasAgg(figure)
