@@ -12,7 +12,7 @@ from ._checks import finite, instance
 from ._types import Args, ForceFn, HamiltonianFn, Scalar, State
 from .engine.indices import out_of_bounds
 from .engine.reads import Reads, changed, reads
-from .engine.signature import check_takes, tracing_note, warn_of_exchanged
+from .engine.signature import accepts, check_takes, tracing_note, warn_of_exchanged
 
 _NAMES = "(t0, t1, q0, p1, args)"
 _CONTINUOUS = "Make a discrete Hamiltonian of a continuous H(t, q, p, args) by dvi.discretise(H)."
@@ -209,7 +209,8 @@ def check_system(system: Any) -> None:
         if isinstance(getattr(system, "system", None), System):
             hint = "Take the system of a problem of the library: problem.system."
         name = getattr(system, "__name__", "")
-        if name and str(getattr(system, "__module__", "")).startswith("dvi_jax.systems."):
+        of_library = str(getattr(system, "__module__", "")).startswith("dvi_jax.systems.")
+        if of_library and accepts(system, 0):
             hint = f"Call the function: {name}()."
         kind = "class" if isinstance(system, type) else type(system).__name__
         seen = f"the {kind} {name}" if name else f"a value of type {kind}"

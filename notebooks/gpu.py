@@ -5,7 +5,7 @@
 # measure how much accuracy is lost in single precision. The stored outputs are those of a CPU.
 #
 # **The package has not been tested on a GPU**, and its speed there has not been measured
-# ([GPU](../docs/gpu.md)). On a GPU a batch is an ordinary JAX program, `jax.lax.scan` over the
+# (`docs/gpu.md`). On a GPU a batch is an ordinary JAX program, `jax.lax.scan` over the
 # steps under `jax.vmap`. XLA compiles this program.
 
 # %%

@@ -214,7 +214,7 @@ assert abs(slopes[1] - 1) < 0.1  # not for the force +εq
 # central. For (50) $\xi^0$ is not 0. Therefore (50) requires a time grid on which each step size
 # satisfies the energy equation: the change of the energy in a step equals the work of the
 # perturbing force. `dvi.Variational` computes this grid; for this orbit with $h = 0.1$ the equation
-# for the step size has no root after 77 steps ([time grids](../docs/lattices.md)). On a fixed time
+# for the step size has no root after 77 steps (`docs/lattices.md`). On a fixed time
 # grid (50) oscillates with an amplitude $O(h)$ for any $\varepsilon$. For $h \to 0$ and the force
 # $-\varepsilon q$, (50) is an invariant of first order. The force $+\varepsilon q$ is a control,
 # for which (50) is not an invariant of first order: the slope is 1.

@@ -276,7 +276,7 @@ def test_progress_reports_and_changes_nothing():
     assert 10 < len(calls) <= 101
     assert calls[-1] == (1037, 1037)
     assert [c[0] for c in calls] == sorted({c[0] for c in calls})
-    with pytest.raises(ValueError, match="leave progress out"):
+    with pytest.raises(ValueError, match="Leave out progress"):
         jax.jit(lambda e: run(epsilon=e, progress=print).qs)(0.1)
 
 
