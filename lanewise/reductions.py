@@ -67,8 +67,9 @@ def dot(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Val
     wider = dtype == "float64" and {a.dtype, c.dtype} <= {"float64", "float32"}
     if not (same or wider):
         raise Unsupported(
-            "both arrays of a product and its result must have the same type, not bool (a float64 "
-            f"result may be of float32 arrays), got {a.dtype} and {c.dtype}, result {dtype}"
+            "a matrix product requires two arrays and a result of the same type, which must not "
+            "be bool; only a float64 result may have float32 arrays. Got arrays of type "
+            f"{a.dtype} and {c.dtype} and a result of type {dtype}"
         )
     contracted = math.prod(a.shape[i] for i in of_a)
     # Each term is an instruction of its own: the code, and the time to compile it, grow with them.

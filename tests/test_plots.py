@@ -884,7 +884,7 @@ def test_a_spectrum_draws_sizes_at_their_frequencies():
     refuses(
         plot.spectrum,
         ((w, A[0]), {}, shapes),
-        ((w,), {}, "without frequencies, amplitudes", TypeError),
+        ((w,), {}, "without the attributes frequencies, amplitudes", TypeError),
     )
 
 

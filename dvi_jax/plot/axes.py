@@ -84,7 +84,8 @@ def at_most(most: int, count: int, what: str, choice: str) -> None:
 def check_attributes(thing: Any, names: Sequence[str], wanted: str) -> None:
     """**Raises** `TypeError` for an object without these attributes."""
     if lacking := ", ".join(name for name in names if not hasattr(thing, name)):
-        raise TypeError(f"{wanted}; got {type(thing).__name__} without {lacking}.")
+        kind = type(thing).__name__
+        raise TypeError(f"{wanted}; got an object of type {kind} without the attributes {lacking}.")
 
 
 def labels_of(labels: Any, count: int, what: str, name: str = "labels") -> list[str]:
