@@ -204,8 +204,8 @@ def draw_layers(path: Path) -> None:
 
 
 LIMITS = {
-    "lines": 54_000,
-    "raise statements": 675,
+    "lines": 53_950,
+    "raise statements": 671,
     COMMENTS: 5,
     f"files of more than {LONGEST_FILE} lines": 0,
     f"functions with more than {MOST_PARAMETERS} parameters": 7,

@@ -433,6 +433,10 @@ def test_noether_identities_of_the_paper():
     assert fifty.balance
     with pytest.raises(TypeError, match="q0 is missing"):
         dvi.prove_noether(free, [scaling], gauges[:1])
+    with pytest.raises(ValueError, match="Got a Generator and a NoneType"):
+        dvi.prove_noether(kepler, turn, None)
+    with pytest.raises(TypeError, match="q0"):
+        dvi.prove_noether(free, [scaling], gauges[:1], "abc")
 
 
 def test_a_wrong_balance_is_not_proved(monkeypatch):

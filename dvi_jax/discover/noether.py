@@ -118,11 +118,16 @@ class AdiabaticInvariant(eqx.Module):
     epsilon: Any = None
 
     def __check_init__(self):
-        if len(self.generators) != len(self.gauges) or not self.gauges:
+        given = self.generators, self.gauges
+        sizes = [len(x) if isinstance(x, list | tuple) else 0 for x in given]
+        if sizes[0] != sizes[1] or not all(sizes):
+            kinds = " and ".join(
+                f"a {type(x).__name__}" + (f" of length {n}" if isinstance(x, list | tuple) else "")
+                for x, n in zip(given, sizes, strict=True)
+            )
             raise ValueError(
                 "generators and gauges must be lists of the same length, one entry for each order. "
-                f"They must not be empty. The length of generators is {len(self.generators)}, that "
-                f"of gauges {len(self.gauges)}. Use None for a gauge that is zero."
+                f"They must not be empty. Got {kinds}. Use None for a gauge that is zero."
             )
 
     @property

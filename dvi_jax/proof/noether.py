@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._energies import disturbing_work, outgoing_energy
+from .._inputs import start_state
 from .._step import Equations
 from .._system import check_system, of_problem
 from .._types import Args, Interval
@@ -105,7 +106,7 @@ def prove_noether(
     system, *_, args = of_problem(system, None, None, None, args, has_start=True)
     check_system(system)
     series = AdiabaticInvariant(generators, gauges)
-    z, shape = series.order, jnp.shape(q0)
+    z, shape = series.order, start_state(q0, q0)[0].shape
 
     def statements(t0, h, q0, p1, epsilon, energy):
         """The differences that have to be zero; `energy`: E⁻ at the first point, any number."""
