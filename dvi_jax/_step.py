@@ -82,6 +82,14 @@ class Equations(eqx.Module):
             return _position_rate(*at)
         return one_by_one(_position_rate, *at)
 
+    def rates(self, interval: Interval, q: State, p: State) -> tuple[State, State]:
+        """(`position_rate`, `momentum_rate`) at one point, from one gradient of H_D."""
+        # The two functions would evaluate H_D twice where XLA or `lanewise` sees no common part.
+        if self.quantum is not None:
+            return self.position_rate(interval, q, p), self.momentum_rate(interval, q, p)
+        at = (self.system, *interval[:2], *self.absolute(q, p), self.epsilon, self.args)
+        return _rates(*at)
+
     def step_is_explicit(self, interval: Interval, like: State) -> bool:
         """Whether p1 enters neither ∂H_D/∂q0 nor W, so that (13) needs no solve."""
         # Read from the jaxpr: a value-dependent test could not run under jit.
@@ -107,6 +115,14 @@ def _momentum_rate(system: System, *at) -> State:
 @eqx.filter_jit
 def _position_rate(system: System, *at) -> State:
     return jax.grad(system.hamiltonian, argnums=3)(*at)
+
+
+@eqx.filter_jit
+def _rates(system: System, *at) -> tuple[State, State]:
+    gradient, velocity = jax.grad(system.hamiltonian, argnums=(2, 3))(*at)
+    if system.force is None:
+        return velocity, -gradient
+    return velocity, -gradient + system.disturbing_force(*at).astype(gradient.dtype)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))

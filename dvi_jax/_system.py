@@ -31,7 +31,8 @@ class System(eqx.Module):
     - `H_D`: function ``(t0, t1, q0, p1, args)`` → scalar [energy].
     - `force`: W, function of the same arguments → array like q0 [energy / unit of q]; or None.
     - `perturbation`: H1_D, function of the same arguments → scalar [energy]; or None.
-      ``epsilon * H1_D`` is added to H_D: a perturbation that derives from a Hamiltonian.
+      ``epsilon * H1_D`` is added to H_D: a perturbation that derives from a Hamiltonian. It may
+      take ``epsilon`` as a sixth argument, for an energy that is not linear in ε.
     - `slow_time`: if True all three functions receive the slow times ``epsilon * t0`` and
       ``epsilon * t1`` in place of t0 and t1.
     - `epsilon`: strength of the perturbation in runs without ``epsilon=``. None: each run of a
@@ -80,6 +81,8 @@ class System(eqx.Module):
     def __check_init__(self):
         for name in ("H_D", "force", "perturbation"):
             function = getattr(self, name)
+            if name == "perturbation" and self._is_nonlinear:
+                continue
             if function is not None or name == "H_D":
                 check_takes(name, function, _NAMES, {4: _CONTINUOUS})
             if function is not None:
@@ -97,6 +100,12 @@ class System(eqx.Module):
                 "order=1), or dvi.legendre(L) for a Lagrangian. For a higher order pass "
                 "method=dvi.Strang() or dvi.Yoshida(4) to dvi.integrate."
             )
+
+    @property
+    def _is_nonlinear(self) -> bool:
+        """Whether the perturbation takes ε."""
+        f = self.perturbation
+        return callable(f) and accepts(f, 6) and not accepts(f, 5)
 
     def strength(self, epsilon: Any) -> Any:
         """ε of a run: the one given, else the default of the system, else 0 for a system that does
@@ -126,7 +135,8 @@ class System(eqx.Module):
         s0, s1 = self.times(t0, t1, epsilon)
         H = self.H_D(s0, s1, q0, p1, args)
         if self.perturbation is not None:
-            H = H + epsilon * self.perturbation(s0, s1, q0, p1, args)
+            extra = (epsilon,) if self._is_nonlinear else ()
+            H = H + epsilon * self.perturbation(s0, s1, q0, p1, args, *extra)
         return jnp.asarray(H, p1.dtype)  # also where args are in double and the state is not
 
     def disturbing_force(
@@ -160,7 +170,8 @@ class System(eqx.Module):
         ):
             if function is None:
                 continue
-            out = _traced_output(function, name, kinds, t, q, p, args)
+            extra = (t,) if name == "perturbation" and self._is_nonlinear else ()
+            out = _traced_output(function, name, kinds, (t, t, q, p, args, *extra))
             if out.shape == shape and jnp.issubdtype(out.dtype, jnp.floating):
                 continue
             hint = "" if shape else "Return a floating-point number."
@@ -241,8 +252,9 @@ def _changed_by_tracing(function: Callable | None) -> frozenset[str]:
 
 
 def _traced_output(
-    function: Callable, name: str, kinds: tuple, t: Scalar, q: State, p: State, args: Args
+    function: Callable, name: str, kinds: tuple, at: tuple[Any, ...]
 ) -> jax.ShapeDtypeStruct:
+    q, args = at[2], at[4]
     try:
         seen = _SEEN.setdefault(function, {})
         if kinds in seen:
@@ -252,7 +264,7 @@ def _traced_output(
     # Traced, not called: at a start in a singularity a value would be NaN, its shape is the same.
     before = reads(function)
     try:
-        traced, *out = eqx.filter_make_jaxpr(function)(t, t, q, p, args)
+        traced, *out = eqx.filter_make_jaxpr(function)(*at)
     except Exception as error:
         error.add_note(f"(in {name}{_NAMES}, called with q0 of shape {q.shape} and args={args!r})")
         error.add_note(tracing_note(name, error))

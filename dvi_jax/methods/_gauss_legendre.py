@@ -1,6 +1,7 @@
 """The Gauss–Legendre collocation methods."""
 
 import functools
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -8,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._checks import whole
-from .._step import judge
+from .._implicit import Implicit
+from .._step import Equations, judge
+from .._types import Interval
 from ..engine.newton import find_root
 from ._collocation import (
     Collocation,
     coefficients,
-    continuous_rates,
     exact_nodes,
     integrals,
     legendre,
@@ -35,6 +37,42 @@ def _table(stages: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     )
     b = [1 / ((1 - y * y) * legendre_slope(y, stages) ** 2) for y in x]
     return (np.array(x, object) + 1) / 2, np.array(b, object), integrals(x, b, stages)
+
+
+class _Inner(NamedTuple):
+    """The rates of a system whose H is an `Implicit`, with the inner unknowns y given."""
+
+    implicit: Implicit
+    equations: Equations
+
+    def rates(self, interval: Interval, z: Any, y: Any) -> tuple[Any, Any]:
+        """(q̇, ṗ) at z = (q, p) and y."""
+        e = self.equations
+        s, _ = e.system.times(*interval[:2], e.epsilon)
+        q, p = e.absolute(*z)
+        rise, velocity = self.implicit.rates(s, q, p, y, e.args)
+        force = e.system.disturbing_force(*interval[:2], q, p, e.epsilon, e.args)
+        return velocity, force - rise
+
+    def defect(self, t: Any, z: Any, y: Any) -> Any:
+        e = self.equations
+        s, _ = e.system.times(t, t, e.epsilon)
+        return self.implicit.relation(s, *e.absolute(*z), y, e.args)
+
+    def start(self, t: Any, z: Any, stages: int) -> Any:
+        """The y of the first point, for each stage."""
+        e = self.equations
+        s, _ = e.system.times(t, t, e.epsilon)
+        y = self.implicit.guess(s, *e.absolute(*z), e.args)
+        return jnp.broadcast_to(y, (stages, *y.shape))
+
+
+def _inner(equations: Equations) -> _Inner | None:
+    H = getattr(equations.system.H_D, "H", None)
+    # A perturbation of such a system has an inner solve of its own: then all of it has.
+    if not isinstance(H, Implicit) or equations.system.perturbation is not None:
+        return None
+    return _Inner(H, equations)
 
 
 class GaussLegendre(Collocation):
@@ -89,28 +127,47 @@ class GaussLegendre(Collocation):
         times = t0 + c * (t1 - t0)
         z0 = jnp.stack([q0, p0])
         all_at_start = jnp.broadcast_to(z0, (self.stages, *z0.shape))
+        inner = _inner(equations)
 
-        position_rate, momentum_rate = continuous_rates(equations, h)
+        def rates(t, z, y):
+            # Both times of H_D are t. The rates do not use the h of the interval.
+            at = Interval(t, t, jnp.zeros_like(h))
+            return jnp.stack(equations.rates(at, *z) if inner is None else inner.rates(at, z, y))
 
-        def rates(t, z):
-            return jnp.stack([position_rate(t, *z), momentum_rate(t, *z)])
-
-        def advanced(weights, stages):
+        def advanced(weights, stages, y):
             """z0 + h Σ_j weights_j (q̇, ṗ)_j: shape (2, *q0.shape), with weights' rows in front."""
-            change = jnp.tensordot(weights, jax.vmap(rates)(times, stages), 1)
+            change = jnp.tensordot(weights, jax.vmap(rates)(times, stages, y), 1)
             return jnp.broadcast_to(z0, change.shape) + h * change
 
+        def split(x):
+            """The stages, and the inner unknowns of each stage."""
+            return x[: all_at_start.size].reshape(all_at_start.shape), x[
+                all_at_start.size :
+            ].reshape((self.stages, -1))
+
         def residual(x):
-            return x - advanced(a, x.reshape(all_at_start.shape)).ravel()
+            stages, y = split(x)
+            implicit = (stages - advanced(a, stages, y)).ravel()
+            if inner is None:
+                return implicit
+            return jnp.concatenate([implicit, jax.vmap(inner.defect)(times, stages, y).ravel()])
 
         # One fixed-point sweep: for one more evaluation of the rates the guess is good to O(h²).
-        guess = advanced(a, all_at_start)
+        y0 = (
+            jnp.zeros((self.stages, 0), q0.dtype)
+            if inner is None
+            else inner.start(t0, z0, self.stages)
+        )
+        guess = advanced(a, all_at_start, y0)
         # The accuracy of a solve is relative to the whole state, also where increments relative to
         # an origin are solved for, as in compensated summation.
         known = jnp.broadcast_to(jnp.stack(equations.absolute(q0, p0)), all_at_start.shape)
-        represented = jnp.maximum(jnp.abs(all_at_start), jnp.abs(guess)).ravel()
-        x, info = find_root(residual, guess.ravel(), known.ravel(), equations.newton, represented)
-        q1, p1 = advanced(b, x.reshape(all_at_start.shape))
+        represented = jnp.maximum(jnp.abs(all_at_start), jnp.abs(guess))
+        x, info = find_root(
+            residual, *(jnp.concatenate([u.ravel(), y0.ravel()]) for u in (guess, known)),
+            equations.newton, jnp.concatenate([represented.ravel(), y0.ravel()]),
+        )  # fmt: skip
+        q1, p1 = advanced(b, *split(x))
         return q1, p1, judge(info, q1, p1)
 
     def needs_no_solve(self, equations, interval, q) -> bool:

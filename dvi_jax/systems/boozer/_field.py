@@ -1,0 +1,311 @@
+"""Magnetic fields in Boozer coordinates: a spectrum of |B| and profiles of flux functions."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..._checks import finite, positive, whole
+from ._sums import Coefficients, Shape, total
+
+Profile = Float[Array, " d"]
+"""A polynomial in s: its coefficients, the constant first."""
+
+
+class Field(eqx.Module):
+    r"""A magnetic field in Boozer coordinates (ψ, θ, ζ), right-handed, s = ψ/ψ_edge.
+
+        B = ∇ψ × ∇θ + ι(s) ∇ζ × ∇ψ = G(s) ∇ζ + I(s) ∇θ
+
+        |B| = Σ_mn s^{m/2} [b_mn(s) cos(mθ − nζ) + b'_mn(s) sin(mθ − nζ)]
+
+    with polynomials b_mn, b'_mn, ι, G and I in s. The motion of guiding centres depends on nothing
+    else. 2πψ is the toroidal flux. K(ψ, θ, ζ)∇ψ, the radial covariant part of B, is left out: it is
+    zero in a vacuum field, and otherwise of the order of the plasma pressure.
+
+    **Arguments** (made by `from_modes`, `from_surfaces`, `read_booz_xform`, `from_near_axis`)
+
+    - `psi_edge`: ψ at s = 1 [T m²], positive.
+    - `coefficients`: of b_mn and b'_mn, shape (1 or 2, M + 1, 2K + 1, d + 1) [T]; entry (·, m, k) is
+      the mode m, n = periods · (k − K + helicity · m).
+    - `iota`, `G`, `I`: coefficients of polynomials in s [1, T m, T m]. I is zero at s = 0. `I` is
+      None for a field without toroidal current, whose guiding centres need no root solve for s.
+    - `shape`: number of periods and helicity.
+
+    All arrays are differentiable. Methods take arrays of any one shape.
+
+    **Source** Boozer 1981, *Phys. Fluids* 24, 1999; White & Chance 1984, *Phys. Fluids* 27, 2455.
+    """
+
+    psi_edge: Any
+    coefficients: Coefficients
+    iota: Profile
+    G: Profile
+    I: Profile | None  # noqa: E741 - the name of the literature
+    shape: Shape = eqx.field(static=True)
+
+    def strength(self, s: Any, theta: Any, zeta: Any) -> Array:
+        """|B| [T] at s, θ, ζ."""
+        s, theta, zeta = jnp.broadcast_arrays(*map(jnp.asarray, (s, theta, zeta)))
+        r = jnp.sqrt(s)
+        return self.at(r * jnp.cos(theta), r * jnp.sin(theta), zeta)
+
+    def at(self, x: Any, y: Any, zeta: Any) -> Array:
+        """|B| [T] at x = √s cos θ, y = √s sin θ and ζ: smooth at the magnetic axis."""
+        return total(self.coefficients, self.shape, x, y, zeta)
+
+    def poloidal_flux(self, s: Any) -> Array:
+        """χ(s) = ψ_edge ∫₀ˢ ι ds [T m²]: the poloidal flux/2π."""
+        powers = jnp.arange(1, self.iota.shape[0] + 1)
+        return self.psi_edge * s * polynomial(self.iota / powers, s)
+
+    @property
+    def modes(self) -> list[tuple[int, int]]:
+        """(m, n) of all modes, in the order of ``coefficients.reshape(parts, -1, d + 1)``."""
+        _, M, K2, _ = self.coefficients.shape
+        N, h = self.shape
+        return [(m, N * (k - K2 // 2 + h * m)) for m in range(M) for k in range(K2)]
+
+    @property
+    def average(self) -> Array:
+        """The mean of |B| on the axis [T]."""
+        return self.coefficients[0, 0, self.coefficients.shape[2] // 2, 0]
+
+    def scaled(self, B: float = 5.7, minor_radius: float = 1.7) -> "Field":
+        """The same field with another mean |B| on the axis [T] and another minor radius
+        a = √(2ψ_edge/B) [m]; the defaults are those of a reactor."""
+        B, a = positive("B", B), positive("minor_radius", minor_radius)
+        b = B / self.average
+        length = a / jnp.sqrt(2 * self.psi_edge / self.average)
+        return eqx.tree_at(
+            lambda f: (f.psi_edge, f.coefficients, f.G, f.I),
+            self,
+            (
+                self.psi_edge * b * length**2,
+                self.coefficients * b,
+                self.G * b * length,
+                None if self.I is None else self.I * b * length,
+            ),
+            is_leaf=lambda x: x is None,
+        )
+
+    def split(self, helicity: int | None = None) -> "tuple[Field, Coefficients]":
+        """The quasi-symmetric part, and the coefficients of the modes that break the symmetry.
+
+        - `helicity`: h of the symmetry n = periods · h · m; that of the field by default. 0:
+          quasi-axisymmetry, 1 or −1: quasi-helical symmetry.
+        """
+        N, h = self.shape
+        h = h if helicity is None else whole("helicity", helicity, -99)
+        is_symmetric = np.array([n == N * h * m for m, n in self.modes])
+        c = self.coefficients
+        mask = is_symmetric.reshape(c.shape[1:3])[None, :, :, None]
+        symmetric = eqx.tree_at(lambda f: f.coefficients, self, jnp.where(mask, c, 0))
+        return symmetric, jnp.where(mask, 0, c)
+
+    def ripple(self, helicity: int | None = None) -> Array:
+        """√(Σ B_mn²) of the symmetry-breaking modes over |B_00|, at s = 1."""
+        symmetric, breaking = self.split(helicity)
+        at_edge = jnp.sum(breaking, axis=-1)
+        return jnp.sqrt(jnp.sum(at_edge**2)) / jnp.abs(symmetric.average)
+
+
+def polynomial(c: Profile, s: Any) -> Array:
+    """Σ_d c_d s^d, of any shape."""
+    value = c[-1] * jnp.ones_like(s)
+    for d in range(c.shape[0] - 2, -1, -1):
+        value = value * s + c[d]
+    return value
+
+
+def _array(name: str, values: Any, ndim: int) -> np.ndarray:
+    try:
+        found = np.asarray(values, float)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{name} must be an array of numbers, got {values!r:.200}.") from error
+    if found.ndim != ndim or not np.isfinite(found).all():
+        raise ValueError(
+            f"{name} must be an array of {ndim} dimensions with finite numbers, got shape "
+            f"{found.shape} with {np.count_nonzero(~np.isfinite(found))} values that are not finite."
+        )
+    return found
+
+
+def from_modes(
+    m: Sequence[int],
+    n: Sequence[int],
+    B: Any,
+    *,
+    psi_edge: float,
+    iota: Any,
+    G: Any,
+    I: Any = None,  # noqa: E741
+    B_sin: Any = None,
+    periods: int = 1,
+    helicity: int = 0,
+) -> Field:
+    r"""A `Field` from the polynomials of its modes, |B| = Σ s^{m/2} b_mn(s) cos(mθ − nζ).
+
+    - `m`, `n`: mode numbers; each n is a multiple of `periods`, m is not negative.
+    - `B`: coefficients of b_mn [T], shape (modes, d + 1), the constant first; `B_sin` those of the
+      sine terms.
+    - `psi_edge`: ψ at the edge s = 1 [T m²]. `iota`, `G`, `I`: coefficients of polynomials in s; a
+      number is a constant. I is zero on the axis: its first coefficient must be 0.
+    - `helicity`: modes are stored around n = periods · helicity · m, so that a quasi-helical field
+      (1 or −1) needs fewer of them. It does not change the field.
+
+    **Raises** `ValueError` for a spectrum without the mode (0, 0), or with |B| ≤ 0 somewhere.
+    """
+    periods, h = whole("periods", periods), whole("helicity", helicity, -99)
+    positive("psi_edge", psi_edge)
+    ms, ns = (_array(name, x, 1).astype(int) for name, x in (("m", m), ("n", n)))
+    parts = [_array("B", B, 2)]
+    if B_sin is not None:
+        parts.append(_array("B_sin", B_sin, 2))
+    if any(len(x) != len(ms) for x in (ns, *parts)):
+        raise ValueError(
+            "m, n, B and B_sin must have one entry for each mode, got the lengths "
+            f"{[len(x) for x in (ms, ns, *parts)]}."
+        )
+    if len(ms) == 0 or ms.min() < 0 or (ns % periods).any():
+        raise ValueError(
+            f"the modes must have m ≥ 0 and n a multiple of periods={periods}, got m = {list(ms)} "
+            f"and n = {list(ns)}."
+        )
+    k = ns // periods - h * ms
+    K = int(np.abs(k).max())
+    table = np.zeros((len(parts), int(ms.max()) + 1, 2 * K + 1, parts[0].shape[1]))
+    for part, values in enumerate(parts):
+        np.add.at(table[part], (ms, k + K), values)
+    if not table[0, 0, K, 0] > 0:
+        raise ValueError(
+            "the spectrum must contain the mode m = n = 0 with a positive value on the axis, which "
+            f"is the mean of |B| there, got {table[0, 0, K, 0]} T. Add it to m, n and B."
+        )
+    profiles = [np.atleast_1d(np.asarray(x, float)) for x in (iota, G, 0.0 if I is None else I)]
+    for name, profile in zip(("iota", "G", "I"), profiles, strict=True):
+        _array(name, profile, 1)
+    if profiles[2][0] != 0:
+        raise ValueError(
+            "I must be zero on the axis (the toroidal current inside of a surface of no area), got "
+            f"the constant {profiles[2][0]}. Give I as [0, ...]: the coefficients of s, s², …"
+        )
+    field = Field(
+        jnp.asarray(float(psi_edge)),
+        jnp.asarray(table),
+        *map(jnp.asarray, profiles[:2]),
+        None if I is None else jnp.asarray(profiles[2]),
+        Shape(periods, h),
+    )
+    _check_positive(field)
+    return field
+
+
+def _check_positive(field: Field) -> None:
+    s, theta, zeta = np.meshgrid(
+        np.linspace(0, 1, 9),
+        np.linspace(0, 2 * np.pi, 32, endpoint=False),
+        np.linspace(0, 2 * np.pi / field.shape.periods, 32, endpoint=False),
+    )
+    least = jnp.min(field.strength(s, theta, zeta))
+    if not least > 0:
+        raise ValueError(
+            f"|B| must be positive for 0 ≤ s ≤ 1, but its least value on a grid is {least:.3g} T. "
+            "Check signs and units of the modes."
+        )
+    G = polynomial(field.G, jnp.linspace(0, 1, 65))
+    if not (jnp.all(G > 0) or jnp.all(G < 0)):
+        raise ValueError("G must not be zero for 0 ≤ s ≤ 1: it is the poloidal current outside.")
+
+
+def from_surfaces(
+    s: Any,
+    m: Sequence[int],
+    n: Sequence[int],
+    B: Any,
+    iota: Any,
+    G: Any,
+    I: Any = None,  # noqa: E741
+    *,
+    psi_edge: float,
+    periods: int = 1,
+    helicity: int = 0,
+    B_sin: Any = None,
+    degree: int = 6,
+    modes: int | None = None,
+    tolerance: float = 1e-2,
+) -> Field:
+    r"""A `Field` from values on flux surfaces, by least-squares polynomials in s.
+
+    Each B_mn(s) becomes s^{m/2} b_mn(s) with a polynomial b_mn, which is smooth also on the axis:
+    splines of low order would limit the order of a method. |B| is then a polynomial in √s cos θ and
+    √s sin θ.
+
+    - `s`: surfaces in 0 ≤ s ≤ 1, increasing, the last one at 0.9 or more.
+    - `m`, `n`: mode numbers; `B`: values [T], shape (surfaces, modes); `B_sin` of the sine terms.
+    - `iota`, `G`, `I`: values on the surfaces [1, T m, T m]; `psi_edge`, `periods`, `helicity` as
+      for `from_modes`.
+    - `degree`: of the polynomials. `modes`: only the largest ones, by the maximum over s.
+    - `tolerance`: largest error of |B| over its mean, on the given surfaces.
+
+    **Raises** `ValueError` for surfaces that do not reach the edge, or if the error of |B| is
+    larger than `tolerance`.
+    """
+    s = _array("s", s, 1)
+    values = [_array("B", B, 2)] + ([] if B_sin is None else [_array("B_sin", B_sin, 2)])
+    degree = whole("degree", degree, 0)
+    if len(s) < 2 or np.any(np.diff(s) <= 0) or s[0] < 0 or s[-1] > 1 or s[-1] < 0.9:
+        raise ValueError(
+            "s must increase, from 0 or more to the edge (at least 0.9, at most 1), got "
+            f"{len(s)} surfaces from {s[0] if len(s) else None} to {s[-1] if len(s) else None}. "
+            "If the grid ends inside of the plasma, divide s by its last value and give psi_edge "
+            "of that surface."
+        )
+    if len(s) <= degree:
+        raise ValueError(f"degree={degree} requires more than {degree} surfaces, got {len(s)}.")
+    ms, ns = (_array(name, x, 1).astype(int) for name, x in (("m", m), ("n", n)))
+    for name, x in zip(("B", "B_sin"), values, strict=False):
+        if x.shape != (len(s), len(ms)):
+            raise ValueError(
+                f"{name} must have the shape (surfaces, modes) = {(len(s), len(ms))}, got "
+                f"{x.shape}."
+            )
+    if modes is not None:
+        size = sum(np.abs(x).max(0) for x in values)
+        chosen = np.sort(np.argsort(-size, kind="stable")[: whole("modes", modes)])
+        ms, ns, values = ms[chosen], ns[chosen], [x[:, chosen] for x in values]
+    fits = [
+        np.stack([_fit(s, x[:, i], degree, power / 2) for i, power in enumerate(ms)])
+        for x in values
+    ]
+    error = sum(
+        np.abs(s ** (power / 2) * np.polynomial.polynomial.polyval(s, c) - x[:, i])
+        for x, fit in zip(values, fits, strict=True)
+        for i, (power, c) in enumerate(zip(ms, fit, strict=True))
+    )
+    mean = np.abs(values[0][:, (ms == 0) & (ns == 0)]).mean() if len(ms) else 0.0
+    if mean > 0 and error.max() > finite("tolerance", tolerance) * mean:
+        raise ValueError(
+            f"polynomials of degree {degree} give |B| with an error of up to "
+            f"{error.max() / mean:.1g} of its mean, more than tolerance={tolerance}. Give a larger "
+            "degree or more surfaces near the axis, or leave modes with a large m out."
+        )
+    profiles = [_fit(s, _array(name, x, 1), degree) for name, x in (("iota", iota), ("G", G))]
+    current = None
+    if I is not None and np.abs(I).max() > 1e-9 * np.abs(G).max():
+        current = np.concatenate([[0.0], _fit(s, _array("I", I, 1), degree - 1, 1.0)])
+    return from_modes(
+        ms, ns, fits[0], psi_edge=psi_edge, iota=profiles[0], G=profiles[1], I=current,
+        B_sin=fits[1] if len(fits) > 1 else None, periods=periods, helicity=helicity,
+    )  # fmt: skip
+
+
+def _fit(s: np.ndarray, values: np.ndarray, degree: int, power: float = 0.0) -> np.ndarray:
+    """c with values ≈ s^power Σ_d c_d s^d, by least squares in Chebyshev polynomials of 2s − 1."""
+    columns = np.polynomial.chebyshev.chebvander(2 * s - 1, degree) * (s**power)[:, None]
+    c, *_ = np.linalg.lstsq(columns, values, rcond=1e-10)
+    series = np.polynomial.chebyshev.Chebyshev(c, domain=[0, 1])
+    return np.pad(series.convert(kind=np.polynomial.Polynomial).coef, (0, degree + 1))[: degree + 1]

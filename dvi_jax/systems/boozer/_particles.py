@@ -1,0 +1,172 @@
+"""Particles of one species and one energy in a field: SI units, initial conditions, losses."""
+
+import functools
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..._checks import instance, one_of, positive
+from ..._discretise import discretise
+from ..._system import System
+from ...observe import Stop
+from ._field import Field, polynomial
+from ._motion import Angles, Breaking, Regular, continuous_hamiltonian, flux, speed_along
+
+# CODATA 2018: e and the electronvolt exactly, and the mass of the alpha particle.
+_EV = 1.602176634e-19
+_ALPHA_MASS = 6.6446573357e-27
+_CHARTS = {"regular": Regular(), "angles": Angles()}
+
+
+class Coordinates(NamedTuple):
+    """Boozer coordinates of guiding centres: s = ψ/ψ_edge, θ and ζ [rad], v∥ [m/s], |B| [T]."""
+
+    s: Array
+    theta: Array
+    zeta: Array
+    v_parallel: Array
+    B: Array
+
+
+class GuidingCentres(eqx.Module):
+    r"""Guiding centres of particles of one species and one energy in a magnetic field.
+
+    Canonical equations of motion in Boozer coordinates, in units of the particles (see `seconds`
+    and `step`): lengths in m, speeds in units of v0 = √(2E/m), fields in T.
+
+        H = u²/2 + μB,   p_θ = ψ/ρ + u I/B,   p_ζ = −χ/ρ + u G/B,   u = v∥/v0,   ρ = m v0/(Ze)
+
+    The state is q = (Y, ζ), p = (X, p_ζ) with X + iY = √(2p_θ) e^{iθ} (`coordinates="regular"`:
+    smooth at the magnetic axis), or q = (θ, ζ), p = (p_θ, p_ζ) (`"angles"`). There are no
+    collisions, no electric field and no finite gyroradius: H is the drift Hamiltonian of first
+    order in ρ. The energy is H = 1/2.
+
+    **Arguments**
+
+    - `field`: a `Field`.
+    - `energy`: of the particles [eV]; `mass` [kg] and `charge` [e]. The defaults are the alpha
+      particles of fusion, 3.5 MeV.
+    - `breaking`: coefficients of further modes (from `Field.split`): ``epsilon`` of a run is their
+      factor. None: the field is complete.
+    - `coordinates`: "regular" or "angles".
+
+    **Source** Littlejohn 1983, *J. Plasma Phys.* 29, 111; White & Chance 1984, *Phys. Fluids* 27,
+    2455; with symplectic integrators: Albert, Kasilov & Kernbichler 2020, *J. Comput. Phys.* 403,
+    109065. (A discretisation of the Lagrangian in the coordinates (ψ, θ, ζ, v∥), which is linear
+    in velocities, is a *degenerate* variational integrator, as in Qin & Guan 2008, *Phys. Rev.
+    Lett.* 100, 035006. The integrators here are those of canonical coordinates.)
+    """
+
+    field: Field
+    energy: float = eqx.field(static=True, default=3.5e6)
+    mass: float = eqx.field(static=True, default=_ALPHA_MASS)
+    charge: float = eqx.field(static=True, default=2.0)
+    breaking: Any = None
+    coordinates: str = eqx.field(static=True, default="regular")
+
+    def __check_init__(self):
+        instance("field", self.field, Field, "a Field, such as boozer.precise_qa()")
+        for name in ("energy", "mass"):
+            positive(name, getattr(self, name))
+        if self.charge == 0:
+            raise ValueError("charge must not be zero: neutral particles do not follow the field.")
+        one_of("coordinates", self.coordinates, _CHARTS)
+
+    @property
+    def speed(self) -> float:
+        """v0 = √(2E/m) [m/s]."""
+        return float(np.sqrt(2 * self.energy * _EV / self.mass))
+
+    @property
+    def rho(self) -> float:
+        """ρ = m v0/(Ze) [T m]: the gyroradius times the field."""
+        return self.mass * self.speed / (self.charge * _EV)
+
+    @property
+    def chart(self) -> Any:
+        return _CHARTS[self.coordinates]
+
+    @property
+    def system(self) -> System:
+        """The `System`: continuous equations, for `GaussLegendre`."""
+        H = continuous_hamiltonian(self.field, self.chart)
+        extra = None if self.breaking is None else Breaking(self.chart)
+        return System(discretise(H), perturbation=extra)
+
+    def step(self, seconds: Any) -> Any:
+        """The h or t of a run [m] for a time in seconds."""
+        return self.speed * seconds
+
+    def seconds(self, t: Any) -> Any:
+        """The time in seconds of a t of a run."""
+        return t / self.speed
+
+    def args(self, mu: Any) -> dict[str, Any]:
+        """The args of a run, for the moment μ [1/T], in units of m v0²."""
+        found = {"field": self.field, "mu": mu, "rho": self.rho}
+        return found if self.breaking is None else {**found, "breaking": self.breaking}
+
+    def start(self, s: Any, theta: Any, zeta: Any, pitch: Any) -> tuple[Array, Array, dict]:
+        """(q0, p0, args) at s, θ, ζ with the pitch v∥/v0; arrays of one shape, which is that of
+        the batch: map `integrate` over q0, p0 and args["mu"].
+
+        **Raises** `ValueError` for s outside of [0, 1], or a pitch outside of [−1, 1].
+        """
+        for name, value, low in (("s", s, 0.0), ("pitch", pitch, -1.0)):
+            _check_range(name, value, low)
+        s, theta, zeta, pitch = jnp.broadcast_arrays(
+            *(jnp.asarray(x, jnp.result_type(float)) for x in (s, theta, zeta, pitch))
+        )
+        return self.state(s, theta, zeta, pitch)
+
+    def state(self, s: Any, theta: Any, zeta: Any, pitch: Any) -> tuple[Array, Array, dict]:
+        """`start` without checks, for traced arrays of one shape."""
+        field, rho = self.field, self.rho
+        # Of the field without `breaking`, so that a start does not depend on ε.
+        B = field.strength(s, theta, zeta)
+        p_theta = field.psi_edge * s / rho
+        if field.I is not None:
+            p_theta = p_theta + pitch * polynomial(field.I, s) / B
+        p_zeta = pitch * polynomial(field.G, s) / B - field.poloidal_flux(s) / rho
+        q, p = self.chart.state(theta, zeta, p_theta, p_zeta)
+        return q, p, self.args((1 - pitch**2) / (2 * B))
+
+    def coordinates_of(self, q: Any, p: Any) -> Coordinates:
+        """Boozer coordinates of states: q, p of shape (…, 2) → arrays of shape (…)."""
+
+        @functools.partial(jnp.vectorize, signature="(n),(n)->(),(),(),(),()")
+        def one(q, p):
+            args = self.args(0.0)
+            s = flux(self.chart, q, p, args)
+            x, y = self.chart.point(self.field, self.rho, q, p, s)
+            B = self.field.at(x, y, q[1])
+            u = speed_along(self.field, self.rho, s, p[1], B)
+            return s, self.chart.angle(q, p), q[1], self.speed * u, B
+
+        return Coordinates(*one(jnp.asarray(q), jnp.asarray(p)))
+
+    @property
+    def loss(self) -> Stop:
+        """Ends a run where the guiding centre reaches the edge, s = 1."""
+        return Stop(_Outside(self.chart))
+
+
+class _Outside(eqx.Module):
+    chart: Any
+
+    def __call__(self, t, q, p, args):
+        return flux(self.chart, q, p, args) - 1
+
+
+def _check_range(name: str, value: Any, low: float) -> None:
+    try:
+        x = np.asarray(value, float)
+    except (TypeError, ValueError):
+        raise TypeError(
+            f"{name} must be a number or an array of them, got {value!r:.200}."
+        ) from None
+    if wrong := x[~((x >= low) & (x <= 1))].ravel().tolist():
+        raise ValueError(f"{name} must be between {low:g} and 1, got {wrong[0]}.")

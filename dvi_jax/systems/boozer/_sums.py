@@ -1,0 +1,199 @@
+r"""|B| and its derivatives as a sum over Fourier modes, without a singularity on the axis.
+
+With w = x + iy = √s e^{iθ}, s = x² + y², the sum over the modes of a field is
+
+    B(x, y, ζ) = Re Σ_m w^m A_m(s, ζ),    A_m = Σ_k C_mk(s) e^{−inζ},    n = N (k + hm),
+
+with N field periods, the helicity h, k = −K…K and polynomials C_mk(s) = Σ_d c_mkd s^d. In real
+terms C = b − i b' stands for s^{m/2} [b cos(mθ − nζ) + b' sin(mθ − nζ)]. It is a polynomial in x
+and y, and so smooth on the axis.
+"""
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, Float
+
+Coefficients = Float[Array, "parts m k d"]
+"""b, and b' in a second part if the field is not symmetric under (θ, ζ) → (−θ, −ζ)."""
+
+# A complex number is a pair of real ones here: machine code is generated for real numbers only.
+Complex = tuple[Any, Any]
+
+
+class Shape(NamedTuple):
+    """Integers of the sum: N field periods, and the helicity h."""
+
+    periods: int
+    helicity: int
+
+
+def _times(a: Complex, b: Complex) -> Complex:
+    return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
+
+
+def _plus(a: Complex, b: Complex) -> Complex:
+    return a[0] + b[0], a[1] + b[1]
+
+
+def _scaled(number: Any, a: Complex) -> Complex:
+    return number * a[0], number * a[1]
+
+
+def _turned(number: Any, a: Complex) -> Complex:
+    """−i·number·a."""
+    return number * a[1], -number * a[0]
+
+
+def _phase(angle: Any) -> Complex:
+    """e^{−i·angle}."""
+    return jnp.cos(angle), -jnp.sin(angle)
+
+
+def _polynomials(c: Float[Array, " d"], s: Any, order: int) -> list[Any]:
+    """Σ_d c_d s^d and its first `order` derivatives."""
+    value: list[Any] = [c[-1], *[None] * order]
+    for d in range(c.shape[0] - 2, -1, -1):
+        for j in range(order, 0, -1):
+            if value[j - 1] is not None:
+                value[j] = j * value[j - 1] + (0 if value[j] is None else value[j] * s)
+        value[0] = value[0] * s + c[d]
+    return [0.0 if v is None else v for v in value]
+
+
+def _over_k(c: Any, s: Any, first: Complex, turn: Complex, n: Any, shape: Shape, order: int):
+    """A_m and its derivatives up to `order`, in the order of `_derivatives`."""
+    zero = jnp.zeros_like(s)
+
+    def add(carry, c_k):
+        sums, e, n = carry
+        real = _polynomials(c_k[0], s, order)
+        terms = [_scaled(x, e) for x in real]
+        if c_k.shape[0] == 2:
+            imaginary = _polynomials(c_k[1], s, order)
+            terms = [_plus(x, _turned(y, e)) for x, y in zip(terms, imaginary, strict=True)]
+        if order >= 1:
+            by_zeta = [_turned(n, x) for x in terms[:order]]
+            terms = [*terms, *by_zeta]
+        if order == 2:
+            terms.append(_turned(n, terms[3]))
+        sums = tuple(_plus(x, y) for x, y in zip(sums, terms, strict=True))
+        return (sums, _times(e, turn), n + shape.periods), None
+
+    start = tuple((zero, zero) for _ in range((1, 3, 6)[order]))
+    (sums, _, _), _ = lax.scan(add, (start, first, n), jnp.swapaxes(c, 0, 1))
+    return sums
+
+
+def derivatives(c: Coefficients, shape: Shape, x: Any, y: Any, zeta: Any, order: int) -> tuple:
+    """B and its derivatives up to `order` (0, 1, 2): B; B_x, B_y, B_ζ; B_xx, B_xy, B_xζ, B_yy,
+    B_yζ, B_ζζ."""
+    s, w, (N, h) = x * x + y * y, (x, y), shape
+    K = c.shape[2] // 2
+    one, zero = jnp.ones_like(s), jnp.zeros_like(s)
+    turn, per_m = _phase(N * zeta), _phase(N * h * zeta)
+
+    def add(carry, c_m):
+        sums, (w0, w1, w2), e, m = carry
+        A, *rest = _over_k(c_m, s, e, turn, N * (h * m - K), shape, order)
+        terms = [_times(w0, A)[0]]
+        if order >= 1:
+            A_s, *rest = rest
+            if order == 2:
+                A_ss, *rest = rest
+            A_zeta, *rest = rest
+            down = _scaled(m, w1)  # m w^{m−1}
+            terms += [_times(w0, A_s)[0], *_times(down, A), _times(w0, A_zeta)[0]]
+        if order == 2:
+            A_szeta, A_zetazeta = rest
+            down_twice = _scaled(m * (m - 1), w2)
+            terms += [
+                _times(w0, A_ss)[0],
+                *_times(down, A_s),
+                *_times(down_twice, A),
+                _times(w0, A_szeta)[0],
+                *_times(down, A_zeta),
+                _times(w0, A_zetazeta)[0],
+            ]
+        sums = tuple(a + b for a, b in zip(sums, terms, strict=True))
+        return (sums, (_times(w0, w), w0, w1), _times(e, per_m), m + 1.0), None
+
+    start = (
+        tuple(zero for _ in range((1, 5, 14)[order])),
+        ((one, zero), (zero, zero), (zero, zero)),  # w^m, w^{m−1}, w^{m−2} at m = 0
+        _phase(-N * K * zeta),
+        jnp.zeros((), s.dtype),
+    )
+    (sums, *_), _ = lax.scan(add, start, jnp.swapaxes(c, 0, 1))
+    B, *rest = sums
+    if order == 0:
+        return (B,)
+    S, Tr, Ti, Z, *rest = rest
+    # ∂x Re(w^m A) = Re(m w^{m−1} A) + 2x Re(w^m A_s), ∂y the same with i w^{m−1} and 2y.
+    first = (B, 2 * x * S + Tr, 2 * y * S - Ti, Z)
+    if order == 1:
+        return first
+    SS, TSr, TSi, Ur, Ui, SZ, TZr, TZi, ZZ = rest
+    return (
+        *first,
+        2 * S + 4 * x * (x * SS + TSr) + Ur,
+        4 * x * y * SS + 2 * (y * TSr - x * TSi) - Ui,
+        2 * x * SZ + TZr,
+        2 * S + 4 * y * (y * SS - TSi) - Ur,
+        2 * y * SZ - TZi,
+        ZZ,
+    )
+
+
+# With derivatives by autodiff each order would be a new sum over all modes, and a step would have
+# too many operations for machine code. One sum returns a value and the derivatives that its own
+# derivative needs. Third derivatives are those of autodiff.
+@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
+def total(c: Coefficients, shape: Shape, x: Any, y: Any, zeta: Any) -> Any:
+    """B(x, y, ζ), of arrays of one shape. Differentiable to any order, also in `c`."""
+    return derivatives(c, shape, x, y, zeta, 0)[0]
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
+def _with_gradient(c: Coefficients, shape: Shape, x: Any, y: Any, zeta: Any) -> tuple:
+    return derivatives(c, shape, x, y, zeta, 1)
+
+
+def _sum_of_products(factors: tuple, changes: tuple) -> Any:
+    """Σ factor·change, without the changes that are zero by construction."""
+    parts = [f * d for f, d in zip(factors, changes, strict=True) if d is not None]
+    return functools.reduce(jnp.add, parts) if parts else jnp.zeros_like(factors[0])
+
+
+def _known(changes: Any) -> list[Any]:
+    return [None if isinstance(d, SymbolicZero) else d for d in changes]
+
+
+def _total_jvp(shape, primals, changes):
+    c, x, y, zeta = primals
+    B, *slopes = _with_gradient(c, shape, x, y, zeta)
+    of_c, *of_point = _known(changes)
+    change = _sum_of_products(tuple(slopes), tuple(of_point))
+    if of_c is not None:  # B is linear in its coefficients
+        change = change + total(of_c, shape, x, y, zeta)
+    return B, change
+
+
+def _with_gradient_jvp(shape, primals, changes):
+    c, x, y, zeta = primals
+    B, bx, by, bz, xx, xy, xz, yy, yz, zz = derivatives(c, shape, x, y, zeta, 2)
+    of_c, *of_point = _known(changes)
+    rows = ((bx, by, bz), (xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+    out = tuple(_sum_of_products(row, tuple(of_point)) for row in rows)
+    if of_c is not None:
+        more = _with_gradient(of_c, shape, x, y, zeta)
+        out = tuple(a + b for a, b in zip(out, more, strict=True))
+    return (B, bx, by, bz), out
+
+
+total.defjvp(_total_jvp, symbolic_zeros=True)
+_with_gradient.defjvp(_with_gradient_jvp, symbolic_zeros=True)
