@@ -14,7 +14,7 @@ from .engine.newton import Newton, Vector, find_root
 
 
 class Implicit(eqx.Module):
-    r"""The Hamiltonian H(t, q, p, args) = E(t, q, p, y, args) at the y with R(t, q, p, y, args) = 0.
+    r"""The Hamiltonian H(t, q, p, args) = E(t, q, p, y, args) at the y where R(…, y, args) = 0.
 
     For energies that are known in other variables than (q, p): the flux label of a guiding centre,
     the velocity of a Lagrangian, a constraint that defines an inner state. Give it to `discretise`.

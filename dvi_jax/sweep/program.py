@@ -101,7 +101,8 @@ class Lanes(eqx.Module):
             number = index[self.names.index(self.start.name)]
             lattice = self.options["lattice"]
             t0 = lattice.ts[0] if isinstance(lattice, Given) else inputs["t0"]
-            q0, p0 = self.start.at(number, t0, inputs["args"])
+            q0, p0, *own = self.start.at(number, t0, inputs["args"])
+            inputs["args"] = own[0] if own else inputs["args"]
         save = self.options["save"]
         options = {**self.options, "save": save or Save(final=True)}
         options |= {"method": self.method, "num_steps": self.num_steps, "throw": False}

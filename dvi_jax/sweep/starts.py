@@ -34,8 +34,9 @@ class Starts(eqx.Module):
     name: eqx.AbstractVar[str]
 
     @abc.abstractmethod
-    def at(self, index: Array, t0: Scalar, args: Args) -> tuple[Array, Array]:
-        """Initial condition number `index` as (q0, p0). It is traced: a function of JAX arrays."""
+    def at(self, index: Array, t0: Scalar, args: Args) -> tuple[Any, ...]:
+        """Initial condition number `index` as (q0, p0), or as (q0, p0, args) where parameters of
+        the system belong to it. It is traced: a function of JAX arrays."""
 
 
 def _box(of: str, **ends: Any) -> tuple[list[tuple[float, ...]], tuple[int, ...]]:
@@ -66,8 +67,8 @@ def _box(of: str, **ends: Any) -> tuple[list[tuple[float, ...]], tuple[int, ...]
     return [tuple(x.tolist()) for x in flat], shapes[0]
 
 
-class _Seeded(Starts):
-    """Base class of the generators here."""
+class Seeded(Starts):
+    """Base class of generators with a seed: a key for each index."""
 
     count: int = eqx.field(static=True)
     shape: tuple[int, ...] = eqx.field(static=True)
@@ -91,7 +92,7 @@ class _Seeded(Starts):
         return q.reshape(self.shape), p.reshape(self.shape)
 
 
-class InBox(_Seeded):
+class InBox(Seeded):
     """Base class of initial conditions in a box: scaled points of the unit cube.
 
     - `count`, `low`, `high`, `seed`, `name`: as for `Random`.
@@ -149,7 +150,7 @@ class Halton(InBox):
         return u
 
 
-class Normal(_Seeded):
+class Normal(Seeded):
     """Normally distributed initial conditions, with independent components.
 
     - `count`: number of initial conditions. `q0`, `p0`: their mean.
@@ -194,7 +195,7 @@ def _primes(count: int) -> list[int]:
     return found
 
 
-class EnergyShell(_Seeded):
+class EnergyShell(Seeded):
     r"""Random initial conditions on the surface H(t0, q, p, args) = energy.
 
     q is drawn uniformly from a box and a direction d of p from the sphere; then p = λ d with the

@@ -208,7 +208,14 @@ class EnergyShellStart(_Start):
     high: Array = key(..., f"a corner of the box of q, {ARRAY}")
 
 
-Start = union_by_kind(BoxStart, NormalStart, EnergyShellStart)
+class OwnStart(Table):
+    """Initial conditions of a Python file."""
+
+    kind: Literal["own"]
+    starts: Text = key(..., f"{FILE}, an object of a subclass of dvi.starts.Starts")
+
+
+Start = union_by_kind(BoxStart, NormalStart, EnergyShellStart, OwnStart)
 
 
 class SaveEvery(Table):
@@ -233,11 +240,12 @@ class SweepFile(SystemFile, Integration):
 
     state: SweepState = SweepState()
     start: Start | None = key(
-        None, "initial conditions: a table with kind = halton, random, normal or energy_shell"
+        None, "initial conditions: a table with kind = halton, random, normal, energy_shell or own"
     )
     args: dict[str, SweepParameter] | None = key(
         None, f"{ARGS}; a number may be an axis, {AN_AXIS}"
     )
+    stop: Text | None = key(None, f"{FILE}, a dvi.Stop that ends trajectories")
     t0: number_or_axis(Number) = key(0.0, FINITE + OR_AXIS)
     h: number_or_axis(StepSize) | None = key(None, STEP_SIZE + OR_AXIS)
     steps: number_or_axis(Count, Annotated[Count, BeforeValidator(_whole)]) | None = key(

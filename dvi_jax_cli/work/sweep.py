@@ -18,7 +18,7 @@ import dvi_jax as dvi
 from dvi_jax.sweep.bar import shown as shown_bar
 from dvi_jax.sweep.variables import RESERVED
 
-from .._errors import InputError, require
+from .._errors import InputError, require, shown
 from .._show import Table
 from .expressions import parse_method
 from .observables import read_observables
@@ -171,6 +171,7 @@ def sweep_problem(file: SweepFile, folder: Path) -> tuple[Source, dict[str, Any]
         "method": _methods(file.method),
         "save": None if file.save is None else save,
         "observe": _observe(file, source),
+        "stop": _stop(file, source),
         "lanes_per_task": file.output.lanes_per_task,
     }
     arguments |= {name: _for_sweep(_KEYS.get(name, name), value) for name, value in times.items()}
@@ -228,6 +229,14 @@ def _observe(file: SweepFile, source: Source) -> dict[str, Any] | None:
     return reduced or None
 
 
+def _stop(file: SweepFile, source: Source) -> dvi.Stop | None:
+    if file.stop is None:
+        return None
+    made = source.loader.load("stop", file.stop)
+    require(isinstance(made, dvi.Stop), "stop", shown(made), "a dvi.Stop")
+    return made
+
+
 def _initial_conditions(file: SweepFile, source: Source) -> dict[str, Any]:
     """`start`, or `q0` and `p0`, checked for one of the trajectories at least."""
     if file.start is None:
@@ -240,11 +249,11 @@ def _initial_conditions(file: SweepFile, source: Source) -> dict[str, Any]:
     start = _start(file.start, source)
     t0, args = at(file.t0, 0), at(source.args, 0)
     try:
-        q0, p0 = (np.asarray(x) for x in start.at(jnp.zeros((), jnp.int32), t0, args))
+        q0, p0, *own = start.at(jnp.zeros((), jnp.int32), t0, args)
     except Exception as error:  # whatever a user's H raises
         allowed = "an H (t, q, p, args) that fits the box and args"
         raise InputError("start", source.reported(error), allowed) from error
-    source.check_start(q0, p0, args)
+    source.check_start(np.asarray(q0), np.asarray(p0), own[0] if own else args)
     return {"start": start}
 
 
@@ -256,6 +265,11 @@ def _check(source: Source, q0: Any, p0: Any, which: int) -> None:
 
 def _start(given: Any, source: Source) -> dvi.starts.Starts:
     """Generated initial conditions; normally distributed ones are by default about the system's."""
+    if given.kind == "own":
+        made = source.loader.load("start.starts", given.starts)
+        allowed = "a dvi.starts.Starts, such as boozer.Births(...)"
+        require(isinstance(made, dvi.starts.Starts), "start.starts", shown(made), allowed)
+        return made
     options = {name: getattr(given, name) for name in given.model_fields_set - {"kind"}}
     for name, value in options.items():
         if isinstance(value, Pair):

@@ -1,4 +1,14 @@
 """Guiding centres in the magnetic fields of stellarators and tokamaks, in Boozer coordinates."""
 
+from ._births import Births as Births, fusion_rate as fusion_rate
 from ._field import Field as Field, from_modes as from_modes, from_surfaces as from_surfaces
+from ._files import (
+    Geometry as Geometry,
+    load_field as load_field,
+    precise_qa as precise_qa,
+    read_booz_xform as read_booz_xform,
+    read_geometry as read_geometry,
+    save_field as save_field,
+    w7x as w7x,
+)
 from ._particles import Coordinates as Coordinates, GuidingCentres as GuidingCentres

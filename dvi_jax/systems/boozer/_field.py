@@ -29,8 +29,8 @@ class Field(eqx.Module):
     **Arguments** (made by `from_modes`, `from_surfaces`, `read_booz_xform`, `from_near_axis`)
 
     - `psi_edge`: ψ at s = 1 [T m²], positive.
-    - `coefficients`: of b_mn and b'_mn, shape (1 or 2, M + 1, 2K + 1, d + 1) [T]; entry (·, m, k) is
-      the mode m, n = periods · (k − K + helicity · m).
+    - `coefficients`: of b_mn and b'_mn, shape (1 or 2, M + 1, 2K + 1, d + 1) [T]; entry (·, m, k)
+      is the mode m, n = periods · (k − K + helicity · m).
     - `iota`, `G`, `I`: coefficients of polynomials in s [1, T m, T m]. I is zero at s = 0. `I` is
       None for a field without toroidal current, whose guiding centres need no root solve for s.
     - `shape`: number of periods and helicity.
@@ -129,7 +129,7 @@ def _array(name: str, values: Any, ndim: int) -> np.ndarray:
     if found.ndim != ndim or not np.isfinite(found).all():
         raise ValueError(
             f"{name} must be an array of {ndim} dimensions with finite numbers, got shape "
-            f"{found.shape} with {np.count_nonzero(~np.isfinite(found))} values that are not finite."
+            f"{found.shape}; {np.count_nonzero(~np.isfinite(found))} values are not finite."
         )
     return found
 
@@ -235,7 +235,7 @@ def from_surfaces(
     helicity: int = 0,
     B_sin: Any = None,
     degree: int = 6,
-    modes: int | None = None,
+    box: tuple[int, int] | None = None,
     tolerance: float = 1e-2,
 ) -> Field:
     r"""A `Field` from values on flux surfaces, by least-squares polynomials in s.
@@ -248,11 +248,12 @@ def from_surfaces(
     - `m`, `n`: mode numbers; `B`: values [T], shape (surfaces, modes); `B_sin` of the sine terms.
     - `iota`, `G`, `I`: values on the surfaces [1, T m, T m]; `psi_edge`, `periods`, `helicity` as
       for `from_modes`.
-    - `degree`: of the polynomials. `modes`: only the largest ones, by the maximum over s.
+    - `degree`: of the polynomials. `box`: (M, K), only modes with m ≤ M and |n/periods −
+      helicity·m| ≤ K. The cost of a step is proportional to (M + 1)(2K + 1).
     - `tolerance`: largest error of |B| over its mean, on the given surfaces.
 
     **Raises** `ValueError` for surfaces that do not reach the edge, or if the error of |B| is
-    larger than `tolerance`.
+    larger than `tolerance`. The modes outside of `box` are not part of that error.
     """
     s = _array("s", s, 1)
     values = [_array("B", B, 2)] + ([] if B_sin is None else [_array("B_sin", B_sin, 2)])
@@ -273,9 +274,9 @@ def from_surfaces(
                 f"{name} must have the shape (surfaces, modes) = {(len(s), len(ms))}, got "
                 f"{x.shape}."
             )
-    if modes is not None:
-        size = sum(np.abs(x).max(0) for x in values)
-        chosen = np.sort(np.argsort(-size, kind="stable")[: whole("modes", modes)])
+    if box is not None:
+        M, K = (whole(f"entry {i} of box", x, 0) for i, x in enumerate(box))
+        chosen = (ms <= M) & (np.abs(ns / periods - helicity * ms) <= K)
         ms, ns, values = ms[chosen], ns[chosen], [x[:, chosen] for x in values]
     fits = [
         np.stack([_fit(s, x[:, i], degree, power / 2) for i, power in enumerate(ms)])
@@ -301,6 +302,25 @@ def from_surfaces(
         ms, ns, fits[0], psi_edge=psi_edge, iota=profiles[0], G=profiles[1], I=current,
         B_sin=fits[1] if len(fits) > 1 else None, periods=periods, helicity=helicity,
     )  # fmt: skip
+
+
+def fitted_modes(
+    s: np.ndarray,
+    m: np.ndarray,
+    n: np.ndarray,
+    values: np.ndarray,
+    periods: int,
+    helicity: int,
+    degree: int,
+    box: tuple[int, int] | None,
+) -> np.ndarray:
+    """The table of polynomials, shape (M + 1, 2K + 1, d + 1), of any function on surfaces."""
+    k = n // periods - helicity * m
+    M, K = box if box is not None else (int(m.max()), int(np.abs(k).max()))
+    table = np.zeros((M + 1, 2 * K + 1, degree + 1))
+    for i in np.flatnonzero((m <= M) & (np.abs(k) <= K)):
+        table[m[i], k[i] + K] += _fit(s, values[:, i], degree, m[i] / 2)
+    return table
 
 
 def _fit(s: np.ndarray, values: np.ndarray, degree: int, power: float = 0.0) -> np.ndarray:

@@ -116,7 +116,7 @@ class GuidingCentres(eqx.Module):
         **Raises** `ValueError` for s outside of [0, 1], or a pitch outside of [−1, 1].
         """
         for name, value, low in (("s", s, 0.0), ("pitch", pitch, -1.0)):
-            _check_range(name, value, low)
+            check_range(name, value, low)
         s, theta, zeta, pitch = jnp.broadcast_arrays(
             *(jnp.asarray(x, jnp.result_type(float)) for x in (s, theta, zeta, pitch))
         )
@@ -161,7 +161,7 @@ class _Outside(eqx.Module):
         return flux(self.chart, q, p, args) - 1
 
 
-def _check_range(name: str, value: Any, low: float) -> None:
+def check_range(name: str, value: Any, low: float) -> None:
     try:
         x = np.asarray(value, float)
     except (TypeError, ValueError):

@@ -1,0 +1,218 @@
+"""Fields and geometry from files: booz_xform's netCDF, and JSON of our own."""
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+from scipy.io import netcdf_file
+
+from ._field import Field, fitted_modes, from_modes, from_surfaces
+from ._sums import Coefficients, Shape, total
+
+DATA = Path(__file__).with_name("data")
+
+
+class Geometry(eqx.Module):
+    """Cylindrical coordinates of the points (s, θ, ζ) of a field.
+
+    - `R`, `Z`: coefficients as those of `Field`, R [m] of cosines and Z of sines. `nu`: of sines,
+      the cylindrical angle is φ = direction·(ζ − ν) [rad].
+    - `direction`: 1, or −1 where the right-handed ζ runs against φ.
+    """
+
+    R: Coefficients
+    Z: Coefficients
+    nu: Coefficients
+    shape: Shape = eqx.field(static=True)
+    direction: int = eqx.field(static=True)
+
+    def cylindrical(self, s: Any, theta: Any, zeta: Any) -> tuple[Array, Array, Array]:
+        """(R, φ, Z) [m, rad, m] for arrays of one shape."""
+        s, theta, zeta = jnp.broadcast_arrays(*map(jnp.asarray, (s, theta, zeta)))
+        r = jnp.sqrt(s)
+        at = (self.shape, r * jnp.cos(theta), r * jnp.sin(theta), zeta)
+        R, Z, nu = (total(c, *at) for c in (self.R, self.Z, self.nu))
+        return R, self.direction * (zeta - nu), Z
+
+    def cartesian(self, s: Any, theta: Any, zeta: Any) -> Array:
+        """(x, y, z) [m], shape (…, 3)."""
+        R, phi, Z = self.cylindrical(s, theta, zeta)
+        return jnp.stack([R * jnp.cos(phi), R * jnp.sin(phi), Z], axis=-1)
+
+
+class _Surfaces(NamedTuple):
+    """What a file holds, in right-handed coordinates with ψ ≥ 0."""
+
+    periods: int
+    psi_edge: float
+    direction: int
+    s: np.ndarray
+    m: np.ndarray
+    n: np.ndarray
+    iota: np.ndarray
+    G: np.ndarray
+    I: np.ndarray  # noqa: E741
+    even: dict[str, np.ndarray]
+    odd: dict[str, np.ndarray]
+
+
+def read_booz_xform(
+    path: Any,
+    *,
+    box: tuple[int, int] | None = None,
+    degree: int = 6,
+    helicity: int = 0,
+    tolerance: float = 1e-2,
+) -> Field:
+    """A `Field` from a file of booz_xform (``boozmn_*.nc``), or one that DESC writes in that format.
+
+    Left-handed angles of the file become right-handed ones with ψ ≥ 0: θ is reversed if the
+    toroidal flux of the file is positive, otherwise ζ.
+
+    - `box`, `degree`, `helicity`, `tolerance`: as for `from_surfaces`.
+
+    **Raises** `ValueError` for a file that is not netCDF of version 3, has no spectrum of |B|, or
+    too few surfaces; `OSError` if it cannot be read.
+
+    **Source** Sanchez et al. 2000, *J. Comput. Phys.* 161, 576 (booz_xform).
+    """
+    f = _surfaces(path, ["bmnc_b"], ["bmns_b"])
+    sine = f.odd.get("bmns_b")
+    return from_surfaces(
+        f.s, f.m, f.n, f.even["bmnc_b"], f.iota, f.G, f.I, psi_edge=f.psi_edge, periods=f.periods,
+        helicity=helicity, B_sin=sine, degree=degree, box=box, tolerance=tolerance,
+    )  # fmt: skip
+
+
+def read_geometry(
+    path: Any, *, box: tuple[int, int] | None = None, degree: int = 6, scale: float = 1.0
+) -> Geometry:
+    """The `Geometry` of such a file, for a stellarator-symmetric field; lengths times `scale`.
+
+    **Raises** as `read_booz_xform`; `ValueError` for a field without that symmetry.
+    """
+    f = _surfaces(path, ["bmnc_b", "rmnc_b"], ["zmns_b", "pmns_b", "bmns_b"])
+    if "bmns_b" in f.odd:
+        raise ValueError(
+            f"{path}: the field is not symmetric under (θ, ζ) → (−θ, −ζ). read_geometry requires "
+            "this symmetry."
+        )
+    tables = {}
+    for name, values, factor in (
+        ("R", f.even["rmnc_b"], scale),
+        ("Z", f.odd["zmns_b"], scale),
+        ("nu", f.odd["pmns_b"], 1.0),
+    ):
+        table = fitted_modes(f.s, f.m, f.n, factor * values, f.periods, 0, degree, box)
+        zeros = np.zeros_like(table)
+        tables[name] = jnp.asarray(np.stack([table, zeros] if name == "R" else [zeros, table]))
+    return Geometry(**tables, shape=Shape(f.periods, 0), direction=f.direction)
+
+
+def _surfaces(path: Any, even: list[str], odd: list[str]) -> _Surfaces:
+    try:
+        with netcdf_file(str(path), "r", mmap=False) as file:
+            found = {k: np.array(v.data) for k, v in file.variables.items()}
+    except TypeError as error:  # of a file in another format
+        raise ValueError(
+            f"{path} is not a file of netCDF version 3, the format of booz_xform and of "
+            f"desc.vmec_utils.make_boozmn_output ({error})."
+        ) from None
+    wanted = ["nfp_b", "ns_b", "jlist", "ixm_b", "ixn_b", "iota_b", "bvco_b", "buco_b", "phi_b"]
+    missing = [name for name in (*wanted, *even) if name not in found]
+    if missing:
+        raise ValueError(f"{path} is not a file of booz_xform: it has no {', '.join(missing)}.")
+    # Surfaces are in the middle between those of VMEC, and entry 0 of profiles is not used.
+    rows = found["jlist"].astype(int) - 1
+    s = (rows - 0.5) / (int(found["ns_b"]) - 1)
+    flux = float(found["phi_b"][-1]) / (2 * np.pi)
+    if flux == 0:
+        raise ValueError(f"{path}: the toroidal flux phi_b at the edge is 0.")
+    m, n = found["ixm_b"].astype(int), -found["ixn_b"].astype(int)
+    G, I = found["bvco_b"][rows], found["buco_b"][rows]  # noqa: E741
+    # The angles of the file are left-handed with R, φ, Z. Of θ → −θ and ζ → −ζ, the one that
+    # makes ψ positive; mode (m, n) becomes (m, −n) in both, and an odd function changes its sign
+    # with θ.
+    by_theta = flux > 0
+    sign = -1 if by_theta else 1
+    # A negative n of m = 0 is the same mode as the positive one.
+    turned = (m == 0) & (n < 0)
+    odd_sign = np.where(turned, -1, 1)
+    evens = {k: np.asarray(found[k], float) for k in even}
+    odds = {}
+    for k in (k for k in odd if k in found):
+        # ν = ζ − direction·φ has the sign of pmns_b for both reversals.
+        own = 1 if k == "pmns_b" else sign
+        odds[k] = own * odd_sign * np.asarray(found[k], float)
+    return _Surfaces(
+        int(found["nfp_b"]), abs(flux), 1 if by_theta else -1, s, m, np.where(turned, -n, n),
+        -found["iota_b"][rows], G if by_theta else -G, -I if by_theta else I, evens, odds,
+    )  # fmt: skip
+
+
+def save_field(field: Field, path: Any, source: str = "") -> None:
+    """Write a field as JSON. `source`: where it comes from, as text."""
+    table = np.asarray(field.coefficients)
+    contents = {
+        "source": source,
+        "periods": field.shape.periods,
+        "helicity": field.shape.helicity,
+        "psi_edge": float(field.psi_edge),
+        "iota": np.asarray(field.iota).tolist(),
+        "G": np.asarray(field.G).tolist(),
+        "I": None if field.I is None else np.asarray(field.I).tolist(),
+        "modes": [
+            [m, n, *(part.reshape(-1, part.shape[-1])[i].tolist() for part in table)]
+            for i, (m, n) in enumerate(field.modes)
+            if table.reshape(len(table), -1, table.shape[-1])[:, i].any()
+        ],
+    }
+    lines = ",\n".join(json.dumps(row) for row in contents.pop("modes"))
+    text = json.dumps(contents, indent=1)[:-2] + ',\n "modes": [\n' + lines + "\n]}\n"
+    Path(path).write_text(text)
+
+
+def load_field(path: Any) -> Field:
+    """A field that `save_field` has written. **Raises** `ValueError` for another file."""
+    try:
+        found = json.loads(Path(path).read_text())
+        rows = found["modes"]
+        return from_modes(
+            [row[0] for row in rows],
+            [row[1] for row in rows],
+            [row[2] for row in rows],
+            B_sin=[row[3] for row in rows] if len(rows[0]) > 3 else None,
+            **{k: found[k] for k in ("psi_edge", "iota", "G", "I", "periods", "helicity")},
+        )
+    except (KeyError, IndexError, TypeError, json.JSONDecodeError) as error:
+        raise ValueError(
+            f"{path} is not a field that save_field has written: {error!r}."
+        ) from error
+
+
+def precise_qa() -> Field:
+    """A precisely quasi-axisymmetric vacuum field at reactor size; 2 periods, aspect ratio 6.
+
+    Volume average of |B| 5.7 T, minor radius 1.7 m. Modes up to m = 6, |n| = 8; those left out are
+    1e-5 of |B| (root mean square). The largest symmetry-breaking mode is 2e-4 of |B|.
+
+    **Source** Landreman & Paul 2022, *Phys. Rev. Lett.* 128, 035001, from the equilibrium
+    ``precise_QA`` in the package desc-opt.
+    """
+    return load_field(DATA / "precise_qa.json")
+
+
+def w7x() -> Field:
+    """A field like that of Wendelstein 7-X at reactor size: 5 periods, aspect ratio 11.
+
+    Volume average of |B| 5.7 T, minor radius 1.7 m. Modes up to m = 8, |n| = 50; those left out are
+    1.5e-3 of |B| (root mean square, at the edge). It has a small toroidal current.
+
+    **Source** the equilibrium ``W7-X`` in the package desc-opt (Dudt & Kolemen 2020, *Phys. Plasmas*
+    27, 102513).
+    """
+    return load_field(DATA / "w7x.json")
