@@ -334,6 +334,6 @@ def coordinates_of(made: Sweep) -> dict[str, Any]:
     vary = any(map(is_axis, jax.tree.leaves(of, is_leaf=is_axis)))  # with another axis
     if start is not None and start.count <= _MANY_STARTS and not vary:
         states = jax.jit(jax.vmap(lambda i: start.at(i, *of)))(np.arange(start.count))
-        for name, x in zip(("q0", "p0"), map(np.asarray, states), strict=True):
+        for name, x in zip(("q0", "p0"), map(np.asarray, states[:2]), strict=True):
             found[name] = ((start.name, *own_dims("component", x.shape[1:])), x, {})
     return found

@@ -162,6 +162,7 @@ _ABOUT = {
         "flag_meanings": " ".join(("not_computed", *STATUS_NAMES)),
     },
     "failed_step": {"long_name": "number of the failing step from 0, or -1"},
+    "stop_t": {"long_name": "time at which the trajectory stopped, or NaN"},
     "residual": {"long_name": "largest relative residual of an implicit solve"},
 }
 

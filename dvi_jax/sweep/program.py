@@ -111,6 +111,8 @@ class Lanes(eqx.Module):
         found = {place(path) or "observed": value for path, value in leaves}
         if save is not None:
             found |= {"t": solution.ts, "q": solution.qs, "p": solution.ps}
+        if solution.stop is not None:
+            found["stop_t"] = solution.stop.t
         return found | {
             "status": status_code(solution.result).astype(jnp.int8),
             "failed_step": solution.stats["failed_step"],

@@ -19,7 +19,7 @@ ARRAY_NAMES = (
     "the beginning or end. The name zarr.json is reserved for a file of the store"
 )
 
-RESERVED = ("status", "failed_step", "residual", "t", "q", "p", "save", "q0", "p0")
+RESERVED = ("status", "failed_step", "residual", "stop_t", "t", "q", "p", "save", "q0", "p0")
 """Names that the result itself uses."""
 
 

@@ -11,4 +11,5 @@ from ._files import (
     save_field as save_field,
     w7x as w7x,
 )
+from ._losses import LossFraction as LossFraction, loss_fraction as loss_fraction
 from ._particles import Coordinates as Coordinates, GuidingCentres as GuidingCentres

@@ -67,20 +67,23 @@ def read_booz_xform(
     degree: int = 6,
     helicity: int = 0,
     tolerance: float = 1e-2,
+    psi_edge: float | None = None,
 ) -> Field:
-    """A `Field` from a file of booz_xform (``boozmn_*.nc``), or one that DESC writes in that format.
+    """A `Field` from a file of booz_xform (``boozmn_*.nc``), also as DESC writes it.
 
     Left-handed angles of the file become right-handed ones with ψ ≥ 0: θ is reversed if the
     toroidal flux of the file is positive, otherwise ζ.
 
     - `box`, `degree`, `helicity`, `tolerance`: as for `from_surfaces`.
+    - `psi_edge`: toroidal flux of the edge/2π [T m²], with the sign of the file, where the file has
+      none (booz_xform writes it only after ``read_wout(path, True)``).
 
     **Raises** `ValueError` for a file that is not netCDF of version 3, has no spectrum of |B|, or
     too few surfaces; `OSError` if it cannot be read.
 
     **Source** Sanchez et al. 2000, *J. Comput. Phys.* 161, 576 (booz_xform).
     """
-    f = _surfaces(path, ["bmnc_b"], ["bmns_b"])
+    f = _surfaces(path, ["bmnc_b"], ["bmns_b"], psi_edge)
     sine = f.odd.get("bmns_b")
     return from_surfaces(
         f.s, f.m, f.n, f.even["bmnc_b"], f.iota, f.G, f.I, psi_edge=f.psi_edge, periods=f.periods,
@@ -113,7 +116,9 @@ def read_geometry(
     return Geometry(**tables, shape=Shape(f.periods, 0), direction=f.direction)
 
 
-def _surfaces(path: Any, even: list[str], odd: list[str]) -> _Surfaces:
+def _surfaces(
+    path: Any, even: list[str], odd: list[str], psi_edge: float | None = None
+) -> _Surfaces:
     try:
         with netcdf_file(str(path), "r", mmap=False) as file:
             found = {k: np.array(v.data) for k, v in file.variables.items()}
@@ -129,9 +134,13 @@ def _surfaces(path: Any, even: list[str], odd: list[str]) -> _Surfaces:
     # Surfaces are in the middle between those of VMEC, and entry 0 of profiles is not used.
     rows = found["jlist"].astype(int) - 1
     s = (rows - 0.5) / (int(found["ns_b"]) - 1)
-    flux = float(found["phi_b"][-1]) / (2 * np.pi)
+    flux = float(found["phi_b"][-1]) / (2 * np.pi) if psi_edge is None else psi_edge
     if flux == 0:
-        raise ValueError(f"{path}: the toroidal flux phi_b at the edge is 0.")
+        raise ValueError(
+            f"{path}: the toroidal flux phi_b at the edge is 0. Give psi_edge= (its value/2π, with "
+            "its sign), or make the file again: booz_xform writes phi_b if its read_wout is called "
+            "as read_wout(path, True)."
+        )
     m, n = found["ixm_b"].astype(int), -found["ixn_b"].astype(int)
     G, I = found["bvco_b"][rows], found["buco_b"][rows]  # noqa: E741
     # The angles of the file are left-handed with R, φ, Z. Of θ → −θ and ζ → −ζ, the one that
@@ -212,7 +221,7 @@ def w7x() -> Field:
     Volume average of |B| 5.7 T, minor radius 1.7 m. Modes up to m = 8, |n| = 50; those left out are
     1.5e-3 of |B| (root mean square, at the edge). It has a small toroidal current.
 
-    **Source** the equilibrium ``W7-X`` in the package desc-opt (Dudt & Kolemen 2020, *Phys. Plasmas*
-    27, 102513).
+    **Source** the equilibrium ``W7-X`` in the package desc-opt (Dudt & Kolemen 2020, *Phys.
+    Plasmas* 27, 102513).
     """
     return load_field(DATA / "w7x.json")
