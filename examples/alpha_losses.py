@@ -4,8 +4,8 @@ Run: python examples/alpha_losses.py [DIRECTORY] [--field precise_qa] [--particl
      [--seconds 0.01]
 
 `--field` is precise_qa, w7x, or a file of booz_xform. The same command again continues an
-interrupted run: what is computed is in DIRECTORY/alpha_losses.zarr. As a command: alpha_losses.toml next to this
-file.
+interrupted run: what is computed is in DIRECTORY/alpha_losses.zarr. As a command of the command
+line: alpha_losses.toml next to this file.
 """
 
 import argparse

@@ -11,7 +11,7 @@ from jax import lax
 
 from ..._checks import function, instance
 from ...sweep.starts import Seeded
-from ._field import polynomial
+from ._field import Field, polynomial
 from ._particles import GuidingCentres, check_range
 
 _TABLE = 513
@@ -35,6 +35,12 @@ def fusion_rate(s: Any) -> Any:
     return (1 - s**5) ** 2 * T ** (-2 / 3) * jnp.exp(-19.94 * T ** (-1 / 3))
 
 
+def volume_element(field: Field, s: Any, theta: Any, zeta: Any) -> Any:
+    """|√g| of (ψ, θ, ζ) [m³/(T m²)]: |G + ιI|/B²."""
+    current = 0.0 if field.I is None else polynomial(field.iota, s) * polynomial(field.I, s)
+    return jnp.abs(polynomial(field.G, s) + current) / field.strength(s, theta, zeta) ** 2
+
+
 class Births(Seeded):
     r"""Random guiding centres of particles at birth: isotropic, at the rate of the reactions.
 
@@ -54,7 +60,8 @@ class Births(Seeded):
 
     particles: GuidingCentres
     surface: float | None = eqx.field(static=True)
-    table: Any
+    cumulated: Any
+    largest: Any
 
     def __init__(
         self,
@@ -71,42 +78,39 @@ class Births(Seeded):
         function("rate", rate, "(s)")
         if surface is not None:
             check_range("surface", surface, 0.0)
-        self.surface, self.table = surface, None if surface is not None else self._cumulated(rate)
+        self.surface = surface
+        self.cumulated, self.largest = self._tables(rate)
 
-    def _cumulated(self, rate: Callable[[Any], Any]) -> Any:
-        """The share of births inside of equidistant s."""
+    def _tables(self, rate: Callable[[Any], Any]) -> tuple[Any, Any]:
+        """The fraction of births inside of equidistant s, and the largest √g there, on a grid."""
         s = np.linspace(0, 1, _TABLE)
         angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
         theta, zeta = np.meshgrid(angles, angles / self.particles.field.shape.periods)
-        mean = jax.vmap(lambda s: jnp.mean(self._jacobian(s, theta, zeta)))(jnp.asarray(s))
-        density = np.asarray(rate(jnp.asarray(s)) * jnp.ones_like(s) * mean)
+        jacobian = np.asarray(
+            eqx.filter_jit(volume_element)(self.particles.field, s[:, None, None], theta, zeta)
+        )
+        mean = jacobian.mean((1, 2))
+        density = np.asarray(rate(jnp.asarray(s)) * jnp.ones_like(s)) * mean
         if not np.isfinite(density).all() or (density < 0).any() or not density.any():
             raise ValueError(
                 "rate(s) must be finite and not negative for 0 ≤ s ≤ 1, and positive somewhere, "
                 f"got values from {np.min(density / mean):.3g} to {np.max(density / mean):.3g}."
             )
         between = (density[1:] + density[:-1]) / 2
-        return jnp.asarray(np.concatenate([[0.0], np.cumsum(between) / np.sum(between)]))
-
-    def _jacobian(self, s: Any, theta: Any, zeta: Any) -> Any:
-        """|√g|, up to a constant factor."""
-        field = self.particles.field
-        current = 0.0 if field.I is None else polynomial(field.iota, s) * polynomial(field.I, s)
-        return jnp.abs(polynomial(field.G, s) + current) / field.strength(s, theta, zeta) ** 2
+        inside = np.concatenate([[0.0], np.cumsum(between) / np.sum(between)])
+        return jnp.asarray(inside), jnp.asarray(jacobian.max((1, 2)))
 
     def at(self, index, t0, args):
         of_s, of_pitch, of_angles = jax.random.split(self.key(index), 3)
         like = jnp.zeros((), jnp.result_type(float))
+        nodes = jnp.linspace(0, 1, _TABLE)
+        s = like + (0.0 if self.surface is None else self.surface)
         if self.surface is None:
-            share = jax.random.uniform(of_s, (), like.dtype)
-            s = jnp.interp(share, self.table, jnp.linspace(0, 1, _TABLE))
-        else:
-            s = like + self.surface
-        N = self.particles.field.shape.periods
-        # √g on a surface is largest where B is smallest: a bound from a grid, with a margin.
-        grid = jnp.linspace(0, 2 * np.pi, 24, endpoint=False)
-        theta, zeta = (x.ravel() for x in jnp.meshgrid(grid, grid / N))
-        most = 1.05 * jnp.max(self._jacobian(s, theta, zeta))
+            s = jnp.interp(jax.random.uniform(of_s, (), like.dtype), self.cumulated, nodes)
+        # A margin, since the largest √g is known on a grid only.
+        most = 1.05 * jnp.interp(s, nodes, self.largest)
+
+        field = self.particles.field
 
         def draw(k):
             u = jax.random.uniform(jax.random.fold_in(of_angles, k), (3,), like.dtype)
@@ -114,7 +118,7 @@ class Births(Seeded):
 
         def proceed(k):
             angles, u = draw(k)
-            return (u * most > self._jacobian(s, *angles)) & (k < _TRIES)
+            return (u * most > volume_element(field, s, *angles)) & (k < _TRIES)
 
         k = lax.while_loop(proceed, lambda k: k + 1, jnp.zeros((), jnp.int32))
         pitch = jax.random.uniform(of_pitch, (), like.dtype, -1.0, 1.0)

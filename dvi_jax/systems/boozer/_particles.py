@@ -98,9 +98,12 @@ class GuidingCentres(eqx.Module):
 
     @property
     def h(self) -> float:
-        """A step for `GaussLegendre(2)` [m], 0.5/k with the largest k∥ = |mι − n| |B|/|G| of the
-        modes, each weighted by (amplitude at the edge/largest)^{1/5}, as in an error of fourth order. The
-        energy then oscillates by less than about 1e-5 of itself; check it with `MaxDrift`."""
+        """A step for `GaussLegendre(2)` [m]: 0.5/k with the largest k∥ = |mι − n| |B|/|G|.
+
+        Each mode is weighted by (amplitude at the edge/largest)^{1/5}, as in an error of fourth
+        order. The energy then oscillates by less than about 1e-5 of itself; check it with
+        `MaxDrift`.
+        """
         field = self.field
         table = jnp.abs(field.coefficients.sum(3)).sum(0).ravel()  # at the edge
         m, n = np.array(field.modes).T

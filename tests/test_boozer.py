@@ -1,0 +1,491 @@
+"""Guiding centres in Boozer coordinates: fields, equations of motion, files, initial conditions."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.io import netcdf_file
+
+import dvi_jax as dvi
+from dvi_jax.systems import boozer
+from dvi_jax.systems.boozer import _sums
+
+slow = pytest.mark.slow
+EDGE = 5.7 * 1.7**2 / 2
+
+
+def axisymmetric(current=True):
+    """A tokamak-like field; with `current` its I and the profile of G are not constant."""
+    return boozer.from_modes(
+        [0, 1, 2], [0, 0, 0], [[5.7, 0.05], [-0.9, 0.1], [0.05, 0.0]],
+        psi_edge=EDGE, iota=[0.42, 0.05],
+        G=[57.0, -0.5] if current else 57.0, I=[0, 0.4, -0.1] if current else None,
+    )  # fmt: skip
+
+
+def helical():
+    """Two periods, with modes that trap particles in helical wells."""
+    return boozer.from_modes(
+        [0, 1, 1, 0], [0, 0, 2, 4], [[5.7, 0.05], [-0.3, 0.0], [-0.9, 0.0], [0.02, 0.01]],
+        psi_edge=EDGE, iota=[0.42, 0.05], G=57.0, I=[0, 0.2], periods=2, helicity=1,
+    )  # fmt: skip
+
+
+FIELDS = {
+    "axisymmetric": axisymmetric,
+    "helical": helical,
+    "precise_qa": boozer.precise_qa,
+    "w7x": boozer.w7x,
+}
+
+
+@functools.cache
+def rates_of_literature(name):
+    """dψ/dt, dθ/dt, dζ/dt and dρ∥/dt of White & Chance 1984, eqs. (15)–(18), with K = 0.
+
+    ρ∥ = v∥/Ω in place of momenta. Written from the field alone, without our Lagrangian.
+    """
+    field = FIELDS[name]()
+    slopes = jax.value_and_grad(lambda x: field.strength(x[0], x[1], x[2]))
+
+    def profile(c, s):
+        value = functools.partial(jnp.polyval, jnp.asarray(c)[::-1])
+        return value(s), jax.grad(value)(s) / field.psi_edge
+
+    @jax.jit
+    def rates(z, mu, rho):
+        psi, theta, zeta, parallel = z
+        s = psi / field.psi_edge
+        B, (Bs, Bt, Bz) = slopes(jnp.stack([s, theta, zeta]))
+        Bpsi = Bs / field.psi_edge
+        G, Gp = profile(field.G, s)
+        I, Ip = (0.0, 0.0) if field.I is None else profile(field.I, s)  # noqa: E741
+        iota, _ = profile(field.iota, s)
+        # In units with m = v0 = 1 and the charge 1/ρ.
+        D = G + iota * I + parallel * (G * Ip - I * Gp)
+        by_B = mu * rho + parallel**2 * B / rho
+        u = parallel * B / rho
+        return jnp.stack([
+            (I * Bz - G * Bt) * by_B / D,
+            (u * B * (iota - parallel * Gp) + G * by_B * Bpsi) / D,
+            (u * B * (1 + parallel * Ip) - I * by_B * Bpsi) / D,
+            -((1 + parallel * Ip) * Bz + (iota - parallel * Gp) * Bt) * by_B / D,
+        ])  # fmt: skip
+
+    return rates
+
+
+def orbit_of_literature(name, particles, s, theta, zeta, pitch, mu, t):
+    """(s, θ, ζ, v∥/v0) at t by SciPy's DOP853."""
+    field, rho = particles.field, particles.rho
+    rates = rates_of_literature(name)
+    start = [s * field.psi_edge, theta, zeta, rho * pitch / field.strength(s, theta, zeta)]
+    found = solve_ivp(
+        lambda _, z: np.asarray(rates(z, mu, rho)), (0, t), np.asarray(start, float),
+        method="DOP853", rtol=1e-12, atol=1e-13,
+    )  # fmt: skip
+    psi, theta, zeta, parallel = found.y[:, -1]
+    s = psi / field.psi_edge
+    return np.array([s, theta, zeta, parallel * field.strength(s, theta, zeta) / rho])
+
+
+@functools.cache
+def _run(name, coordinates, stages, steps):
+    particles = boozer.GuidingCentres(FIELDS[name](), coordinates=coordinates)
+    args = particles.args(0.0)
+    system = particles.system
+
+    def energy(t0, t1, q0, p0, q1, p1, args):
+        return 2 * system.hamiltonian(t1, t1, q1, p1, 0.0, args)
+
+    def run(q, p, mu, h):
+        return dvi.integrate(
+            system, q, p, h=h, num_steps=steps, args={**args, "mu": mu},
+            observe=dvi.MaxDrift(energy),
+            method=dvi.GaussLegendre(stages), save=dvi.Save(final=True), stop=particles.loss,
+            throw=False,
+        )  # fmt: skip
+
+    return particles, jax.jit(jax.vmap(run, in_axes=(0, 0, 0, None)))
+
+
+def final(name, start, t, steps, stages=3, coordinates="regular"):
+    """Coordinates at t, and the drift of the energy, for a batch of initial conditions."""
+    particles, run = _run(name, coordinates, stages, steps)
+    q, p, args = particles.start(*(np.asarray(x, float) for x in start))
+    found = run(q, p, args["mu"], t / steps)
+    at = particles.coordinates_of(found.qs[:, -1], found.ps[:, -1])
+    z = np.stack([at.s, at.theta, at.zeta, at.v_parallel / particles.speed], axis=-1)
+    return z, np.asarray(found.observed), np.asarray(args["mu"]), found
+
+
+def difference(z, reference):
+    """The largest difference of orbits, angles modulo 2π."""
+    d = np.asarray(z) - reference
+    d[..., 1] = (d[..., 1] + np.pi) % (2 * np.pi) - np.pi
+    return np.abs(d).max()
+
+
+# Passing, banana, and trapped in a helical well (where there is one): s, θ, ζ, pitch.
+ORBITS = {
+    "axisymmetric": ([0.3, 0.3, 0.5], [0.3, 0.2, 2.0], [0.1, 0.4, 0.2], [0.8, 0.3, -0.6]),
+    "helical": (
+        [0.3, 0.209, 0.171],
+        [0.3, 1.876, 3.014],
+        [0.1, 0.782, 4.871],
+        [-0.9, 0.023, 0.174],
+    ),
+    "precise_qa": ([0.3, 0.25], [0.3, 0.2], [0.1, 0.4], [0.8, -0.25]),
+    "w7x": ([0.3, 0.25], [0.3, 0.0], [0.1, 0.1], [0.9, 0.1]),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "t", "steps"),
+    [
+        ("axisymmetric", 2000.0, 2500),
+        ("helical", 1500.0, 3000),
+        pytest.param("precise_qa", 5000.0, 5000, marks=slow),
+        pytest.param("w7x", 400.0, 3200, marks=slow),
+    ],
+)
+def test_orbits_agree_with_the_equations_of_the_literature(name, t, steps):
+    start = [np.array(x) for x in ORBITS[name]]
+    z, drift, mu, _ = final(name, start, t, steps)
+    particles, _ = _run(name, "regular", 3, steps)
+    for i in range(len(z)):
+        at = [x[i] for x in start]
+        reference = orbit_of_literature(name, particles, *at, mu[i], t)
+        assert difference(z[i], reference) < 1e-8
+        # Negative control: a moment 1e-6 smaller is another orbit.
+        if i == 0 and name == "axisymmetric":
+            other = orbit_of_literature(name, particles, *at, mu[i] * (1 - 1e-6), t)
+            assert difference(z[i], other) > 1e-7
+    assert drift.max() < 1e-9
+
+
+def test_trapped_orbits_bounce_and_passing_ones_do_not():
+    particles = boozer.GuidingCentres(helical())
+    s, theta, zeta, pitch = (np.array(x) for x in ORBITS["helical"])
+    q, p, args = particles.start(s, theta, zeta, pitch)
+
+    def run(q, p, mu):
+        sol = dvi.integrate(
+            particles.system, q, p, h=2.0, num_steps=750, args={**args, "mu": mu},
+            method=dvi.GaussLegendre(2), save=dvi.Save(every=5),
+        )  # fmt: skip
+        return sol.qs, sol.ps
+
+    u = np.asarray(particles.coordinates_of(*jax.jit(jax.vmap(run))(q, p, args["mu"])).v_parallel)
+    bounces = (np.diff(np.sign(u), axis=1) != 0).sum(axis=1)
+    assert bounces[0] == 0
+    assert (bounces[1:] >= 10).all()
+
+
+def test_both_charts_and_the_nested_solve_give_one_orbit():
+    start = [np.array(x) for x in ORBITS["axisymmetric"]]
+    a, *_ = final("axisymmetric", start, 500.0, 1000)
+    b, *_ = final("axisymmetric", start, 500.0, 1000, coordinates="angles")
+    assert difference(a, b) < 1e-9
+    # RungeKutta4 evaluates H with its inner solve; GaussLegendre takes s among its unknowns.
+    particles, _ = _run("axisymmetric", "regular", 3, 1000)
+    q, p, args = particles.start(*(x[1] for x in start))
+    sol = dvi.integrate(
+        particles.system, q, p, h=0.25, num_steps=2000, args=args, method=dvi.RungeKutta4(),
+        save=dvi.Save(final=True),
+    )  # fmt: skip
+    at = particles.coordinates_of(sol.qs[-1], sol.ps[-1])
+    c = np.array([at.s, at.theta, at.zeta, at.v_parallel / particles.speed])
+    assert difference(c, a[1]) < 1e-8
+
+
+def test_energy_error_scales_with_the_order_and_does_not_grow():
+    start = [np.array(x)[1:2] for x in ORBITS["axisymmetric"]]
+    drifts = [final("axisymmetric", start, 2000.0, n, stages=2)[1][0] for n in (250, 500)]
+    assert np.log2(drifts[0] / drifts[1]) == pytest.approx(4, abs=0.3)
+    long = final("axisymmetric", start, 20000.0, 2500, stages=2)[1][0]
+    assert long < 1.2 * drifts[0]  # ten times as long: it oscillates
+
+
+def test_the_toroidal_momentum_is_conserved_in_an_axisymmetric_field():
+    start = [np.array(x) for x in ORBITS["axisymmetric"]]
+    *_, found = final("axisymmetric", start, 2000.0, 500, stages=2)
+    p = np.asarray(found.ps)[:, :, 1]
+    assert np.abs(p[:, -1] / p[:, 0] - 1).max() < 1e-12
+    *_, found = final("helical", [np.array(x) for x in ORBITS["helical"]], 1500.0, 3000)
+    p = np.asarray(found.ps)[:, :, 1]
+    assert np.abs(p[:, -1] / p[:, 0] - 1).max() > 1e-4  # no symmetry, not conserved
+
+
+def test_a_step_is_symplectic():
+    particles, _ = _run("helical", "regular", 3, 3000)
+    q, p, args = particles.start(0.3, 0.2, 0.1, 0.4)
+
+    def step(z):
+        sol = dvi.integrate(
+            particles.system, z[:2], z[2:], h=2.0, num_steps=1, args=args,
+            method=dvi.GaussLegendre(2), save=dvi.Save(final=True),
+        )  # fmt: skip
+        return jnp.concatenate([sol.qs[-1], sol.ps[-1]])
+
+    A = np.asarray(jax.jit(jax.jacfwd(step))(jnp.concatenate([q, p])))
+    J = np.block([[np.zeros((2, 2)), np.eye(2)], [-np.eye(2), np.zeros((2, 2))]])
+    # Relative to the entries of A, which has units.
+    assert np.abs(A.T @ J @ A - J).max() < 1e-13 * np.abs(A).max() ** 2
+    assert np.abs(A.T @ J @ A * 1.001 - J).max() > 1e-4
+
+
+def test_orbits_cross_the_magnetic_axis():
+    """A start on the axis, and orbits near it: the energy error is that of other orbits."""
+    start = np.array([0.0, 1e-14, 1e-3]), np.zeros(3), np.zeros(3), np.array([0.7, 0.7, -0.5])
+    z, drift, _, found = final("axisymmetric", start, 1000.0, 1000)
+    assert (np.asarray(found.stats["failed_step"]) == -1).all()
+    assert drift.max() < 1e-10
+    assert np.isfinite(z).all()
+    assert z[0, 0] < 0.05
+    assert difference(z[:1, [0, 2, 3]], z[1:2, [0, 2, 3]]) < 1e-6  # neighbours on the axis
+
+
+def test_starts_without_parallel_velocity_and_at_the_edge():
+    start = np.array([0.3, 1.0]), np.array([0.5, 0.1]), np.zeros(2), np.zeros(2)
+    z, drift, _, found = final("axisymmetric", start, 100.0, 1000)
+    assert abs(z[0, 3]) > 1e-3
+    assert drift[0] < 1e-12
+    assert np.isnan(np.asarray(found.stop.t)[0])
+    assert np.asarray(found.stop.t)[1] == 0
+
+
+def test_without_rotational_transform():
+    field = boozer.from_modes([0, 1], [0, 0], [[5.7], [-0.5]], psi_edge=EDGE, iota=0.0, G=57.0)
+    particles = boozer.GuidingCentres(field)
+    q, p, args = particles.start(0.2, 0.3, 0.0, 0.5)
+    sol = dvi.integrate(
+        particles.system, q, p, h=4.0, num_steps=400, args=args, method=dvi.GaussLegendre(2),
+        save=dvi.Save(final=True), stop=particles.loss,
+    )  # fmt: skip
+    # Without ι the vertical drift is not averaged: it leaves, at constant p_ζ.
+    assert sol.status == "stopped"
+    at = particles.coordinates_of(sol.stop.q, sol.stop.p)
+    assert float(at.s) == pytest.approx(1, abs=1e-12)
+
+
+@pytest.mark.parametrize(("parts", "helicity"), [(1, 0), (2, -1)])
+def test_sums_and_their_derivatives(parts, helicity):
+    """Against the definition with powers, cosines and sines, to the third derivative."""
+    c = np.random.default_rng(1).normal(size=(parts, 3, 3, 3))
+
+    def defined(c, x, y, zeta):
+        s, theta, total = x * x + y * y, jnp.arctan2(y, x), 0.0
+        for m in range(3):
+            for k in (-1, 0, 1):
+                angle = m * theta - 4 * (k + helicity * m) * zeta
+                for part, wave in zip(
+                    c[:, m, k + 1], (jnp.cos(angle), jnp.sin(angle)), strict=False
+                ):
+                    total += s ** (m / 2) * (part[0] + s * (part[1] + s * part[2])) * wave
+        return total
+
+    def all_of(f):
+        slopes = jax.grad(f, argnums=(0, 1, 2, 3))
+        second = jax.jacfwd(lambda *a: slopes(*a)[1:], argnums=(1, 2, 3))
+        third = jax.jvp(lambda x: second(c, x, 0.3, 0.7), (0.4,), (1.0,))[1]
+        at = (jnp.asarray(c), 0.4, 0.3, 0.7)
+        return jax.tree.leaves((f(*at), slopes(*at), second(*at), third))
+
+    ours = all_of(lambda c, *u: _sums.total(c, _sums.Shape(4, helicity), *map(jnp.asarray, u)))
+    for a, b in zip(ours, all_of(defined), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12 * np.abs(b).max())
+
+
+# |B| [T] of the equilibria in real space, computed by DESC 0.17.3 at points (s, θ, ζ).
+DESC = {
+    "precise_qa": (3e-4, [
+        (0.702, 2.49045163, 0.0788524218, 6.13753427),
+        (0.304, 0.335845496, 2.33264812, 5.42868165),
+        (0.05, 4.42149705, 1.5911114, 5.7818621),
+        (0.304, 3.71553328, 0.527013261, 6.02145407),
+        (0.95, 4.90191066, 2.93871249, 5.58311071),
+    ]),
+    "w7x": (3e-2, [
+        (0.702, -6.24692483, -0.011179643, 5.49970743),
+        (0.95, -5.79044646, -0.711939686, 5.57677502),
+        (0.05, -3.9138894, -0.67249337, 5.35825211),
+        (0.702, -1.08437384, -1.14233985, 5.63751466),
+        (0.304, -0.256524107, -0.0850196739, 5.60595212),
+    ]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DESC)
+def test_shipped_fields_against_the_equilibria(name):
+    """The angles of DESC are right-handed with ψ > 0 for precise_QA. For W7-X its toroidal flux is
+    negative, and the angles were converted."""
+    tolerance, rows = DESC[name]
+    s, theta, zeta, B = np.array(rows).T
+    found = np.asarray(FIELDS[name]().strength(s, theta, zeta))
+    assert np.abs(found - B).max() < tolerance
+    # Negative control: the angles of the other handedness.
+    assert np.abs(np.asarray(FIELDS[name]().strength(s, theta, -zeta)) - B).max() > 2 * tolerance
+
+
+def written(path, sign=1, drop=(), B00=5.7):
+    """A file as booz_xform writes it; `sign`: of the toroidal flux."""
+    surfaces, modes = 11, [(0, 0), (0, 4), (1, -4), (1, 0), (2, 4)]
+    s = (np.arange(2, surfaces + 1) - 1.5) / (surfaces - 1)
+    B = np.array([B00 + 0 * s, 0.02 * s, 0.03 * s**0.5, -0.5 * s**0.5, 0.1 * s]).T
+    profile = np.concatenate([[0.0], 0.4 + 0.1 * s])
+    arrays = {
+        "nfp_b": 4, "ns_b": surfaces, "jlist": np.arange(2, surfaces + 1),
+        "ixm_b": [m for m, _ in modes], "ixn_b": [n for _, n in modes], "iota_b": -profile,
+        "bvco_b": 57.0 + 0 * profile, "buco_b": np.concatenate([[0.0], -0.3 * s]),
+        "phi_b": sign * np.linspace(0, 2 * np.pi * EDGE, surfaces), "bmnc_b": B,
+        "rmnc_b": 0 * B + np.array([10.0, 0, 0, 0, 0]), "zmns_b": 0 * B, "pmns_b": 0 * B,
+    }  # fmt: skip
+    with netcdf_file(path, "w") as file:
+        for name, x in arrays.items():
+            if name in drop:
+                continue
+            x = np.asarray(x, "i4" if np.asarray(x).dtype.kind == "i" else "f8")
+            dims = [f"{name}_{i}" for i in range(x.ndim)]
+            for dim, size in zip(dims, x.shape, strict=True):
+                file.createDimension(dim, size)
+            file.createVariable(name, x.dtype, dims)[...] = x
+    return path
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_reading_a_file_of_booz_xform(tmp_path, sign):
+    field = boozer.read_booz_xform(written(tmp_path / "boozmn.nc", sign), degree=3)
+    assert float(field.psi_edge) == pytest.approx(EDGE)
+    np.testing.assert_allclose(field.iota[:2], [0.4, 0.1], atol=1e-9)
+    np.testing.assert_allclose(field.I[:2], [0, 0.3 * sign], atol=1e-9)
+    assert float(field.G[0]) == pytest.approx(57 * sign)
+    s, theta, zeta = 0.4, 0.7, 0.3
+    # cos(mθ − nζ) of the file, of −θ or of −ζ: of the same |B|.
+    t, z = (-theta, zeta) if sign > 0 else (theta, -zeta)
+    expected = (
+        5.7 + 0.02 * s * np.cos(4 * z) + 0.03 * s**0.5 * np.cos(t + 4 * z)
+        - 0.5 * s**0.5 * np.cos(t) + 0.1 * s * np.cos(2 * t - 4 * z)
+    )  # fmt: skip
+    assert float(field.strength(s, theta, zeta)) == pytest.approx(expected, abs=1e-9)
+    geometry = boozer.read_geometry(tmp_path / "boozmn.nc", degree=3)
+    R, phi, Z = geometry.cylindrical(s, theta, zeta)
+    assert (float(R), float(Z)) == (pytest.approx(10), 0)
+    assert float(phi) == pytest.approx(sign * zeta)
+    boozer.save_field(field, tmp_path / "field.json", "a test")
+    again = boozer.load_field(tmp_path / "field.json")
+    assert jax.tree.all(jax.tree.map(lambda a, b: (a == b).all(), field, again))
+
+
+def test_bad_files(tmp_path):
+    with pytest.raises(ValueError, match=r"it has no bmnc_b\.$"):
+        boozer.read_booz_xform(written(tmp_path / "a.nc", drop=["bmnc_b"]))
+    (tmp_path / "b.nc").write_text("not netCDF, and long enough to look at")
+    with pytest.raises(ValueError, match="not a file of netCDF version 3"):
+        boozer.read_booz_xform(tmp_path / "b.nc")
+    with pytest.raises(ValueError, match=r"psi_edge=.*read_wout\(path, True\)"):
+        boozer.read_booz_xform(written(tmp_path / "c.nc", sign=0))
+    with pytest.raises(ValueError, match="more than 6 surfaces"):
+        boozer.from_surfaces([0.1, 0.95], [0], [0], [[1.0], [1.0]], [1, 1], [1, 1], psi_edge=1.0)
+    (tmp_path / "d.json").write_text("{}")
+    with pytest.raises(ValueError, match="not a field that save_field has written"):
+        boozer.load_field(tmp_path / "d.json")
+
+
+def test_bad_fields_and_particles():
+    good = {"psi_edge": 1.0, "iota": 0.4, "G": 10.0}
+    with pytest.raises(ValueError, match="mode m = n = 0"):
+        boozer.from_modes([1], [0], [[1.0]], **good)
+    with pytest.raises(ValueError, match=r"\|B\| must be positive"):
+        boozer.from_modes([0, 1], [0, 0], [[1.0], [1.5]], **good)
+    with pytest.raises(ValueError, match="G must not be zero"):
+        boozer.from_modes([0], [0], [[1.0]], **good | {"G": [1.0, -2.0]})
+    with pytest.raises(ValueError, match="zero on the axis"):
+        boozer.from_modes([0], [0], [[1.0]], I=[0.1], **good)
+    with pytest.raises(ValueError, match="a multiple of periods=2"):
+        boozer.from_modes([0, 1], [0, 1], [[1.0], [0.1]], periods=2, **good)
+    with pytest.raises(ValueError, match="1 values are not finite"):
+        boozer.from_modes([0], [0], [[np.nan]], **good)
+    s = np.linspace(0.05, 0.8, 20)
+    with pytest.raises(ValueError, match="to the edge"):
+        boozer.from_surfaces(s, [0], [0], np.ones((20, 1)), s, s, psi_edge=1.0)
+    particles = boozer.GuidingCentres(axisymmetric())
+    with pytest.raises(ValueError, match=r"s must be between 0 and 1, got 1\.2"):
+        particles.start([0.5, 1.2], 0.0, 0.0, 0.1)
+    with pytest.raises(ValueError, match="pitch must be between -1 and 1, got nan"):
+        particles.start(0.5, 0.0, 0.0, np.nan)
+    with pytest.raises(ValueError, match="charge must not be zero"):
+        boozer.GuidingCentres(axisymmetric(), charge=0.0)
+    with pytest.raises(ValueError, match="rate"):
+        boozer.Births(10, particles, rate=lambda s: s - 0.5)
+
+
+def test_births_have_the_distribution_of_the_reactions():
+    particles = boozer.GuidingCentres(helical())
+    births = boozer.Births(4000, particles, seed=3)
+    q, p, args = jax.jit(jax.vmap(lambda i: births.at(i, 0.0, None)))(jnp.arange(4000))
+    at = particles.coordinates_of(q, p)
+    s, pitch = np.asarray(at.s), np.asarray(at.v_parallel) / particles.speed
+    nodes = np.linspace(0, 1, 400)
+    angles = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    B = np.asarray(particles.field.strength(nodes[:, None, None], angles[:, None], angles / 2))
+    I = 0.2 * nodes * (0.42 + 0.05 * nodes)  # noqa: E741
+    density = np.asarray(boozer.fusion_rate(nodes)) * (57 + I) * (B**-2).mean((1, 2))
+    share = np.cumsum(density) / density.sum()
+    # Kolmogorov–Smirnov at 1 %, and negative controls.
+    limit = 1.63 / np.sqrt(4000)
+
+    def distance(x, cumulated):
+        return np.abs(np.sort(cumulated(x)) - (np.arange(x.size) + 0.5) / x.size).max()
+
+    assert distance(s, lambda x: np.interp(x, nodes, share)) < limit
+    assert distance(s, lambda x: x) > limit
+    assert distance(pitch, lambda x: (x + 1) / 2) < limit
+    B_there = np.asarray(at.B)
+    assert np.mean(B_there**2) < np.mean(B[40] ** 2)  # more births where B is small
+    np.testing.assert_allclose(args["mu"], (1 - pitch**2) / (2 * B_there), rtol=1e-9)
+    alone = births.at(jnp.asarray(17), 0.0, None)
+    np.testing.assert_allclose(alone[0], q[17], rtol=1e-12)
+    on = boozer.Births(5, particles, surface=0.25, seed=1).at(jnp.asarray(2), 0.0, None)
+    assert float(particles.coordinates_of(*on[:2]).s) == pytest.approx(0.25)
+
+
+def test_loss_fractions_have_wilsons_interval():
+    found = boozer.loss_fraction([0.1, np.nan, 0.3, np.nan], [0.2, 1.0], sigmas=1.0)
+    np.testing.assert_allclose(found.fraction, [0.25, 0.5])
+    # (p + 1/2N ± √(p(1−p)/N + 1/4N²))/(1 + 1/N) with N = 4
+    half = np.sqrt(0.25 * 0.75 / 4 + 1 / 64) / 1.25
+    np.testing.assert_allclose(found.low[0], (0.25 + 0.125) / 1.25 - half)
+    np.testing.assert_allclose(found.high[1], 1 - found.low[1])
+    with pytest.raises(ValueError, match="got none"):
+        boozer.loss_fraction([], [1.0])
+
+
+def test_a_sweep_over_births():
+    """Each particle has its own μ; losses at the times of single runs."""
+    field = boozer.from_modes(
+        [0, 1, 1], [0, 0, 2], [[5.7], [-0.8], [0.3]], psi_edge=2.0, iota=0.42, G=57.0, periods=2
+    )
+    particles = boozer.GuidingCentres(field)
+    births = boozer.Births(16, particles, seed=2)
+    result = dvi.sweep(
+        particles.system, start=births, args=particles.args(0.0), h=2.0, num_steps=400,
+        method=dvi.GaussLegendre(2), stop=particles.loss, observe={"last": dvi.Last(_time)},
+    )  # fmt: skip
+    stops = np.asarray(result["stop_t"])
+    counts = result.status_counts()
+    assert 0 < counts["stopped"] == np.isfinite(stops).sum() < 16
+    i = int(np.nanargmin(stops))
+    q, p, args = births.at(jnp.asarray(i), 0.0, None)
+    alone = dvi.integrate(
+        particles.system, q, p, h=2.0, num_steps=400, args=args, method=dvi.GaussLegendre(2),
+        stop=particles.loss, save=dvi.Save(final=True),
+    )  # fmt: skip
+    assert float(alone.stop.t) == pytest.approx(stops[i], rel=1e-9)
+
+
+def _time(t0, t1, q0, p0, q1, p1, args):
+    return t1
