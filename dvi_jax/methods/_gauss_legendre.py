@@ -48,11 +48,8 @@ class _Inner(NamedTuple):
     def rates(self, interval: Interval, z: Any, y: Any) -> tuple[Any, Any]:
         """(q̇, ṗ) at z = (q, p) and y."""
         e = self.equations
-        s, _ = e.system.times(*interval[:2], e.epsilon)
-        q, p = e.absolute(*z)
-        rise, velocity = self.implicit.rates(s, q, p, y, e.args)
-        force = e.system.disturbing_force(*interval[:2], q, p, e.epsilon, e.args)
-        return velocity, force - rise
+        at = (*interval[:2], *e.absolute(*z), y, e.epsilon, e.args)
+        return _inner_rates(e.system, self.implicit, *at)
 
     def defect(self, t: Any, z: Any, y: Any) -> Any:
         e = self.equations
@@ -65,6 +62,14 @@ class _Inner(NamedTuple):
         s, _ = e.system.times(t, t, e.epsilon)
         y = self.implicit.guess(s, *e.absolute(*z), e.args)
         return jnp.broadcast_to(y, (stages, *y.shape))
+
+
+# Jitted, as the rates of other systems: all calls in a step share one trace.
+@eqx.filter_jit
+def _inner_rates(system, implicit, t0, t1, q, p, y, epsilon, args):
+    s, _ = system.times(t0, t1, epsilon)
+    rise, velocity = implicit.rates(s, q, p, y, args)
+    return velocity, system.disturbing_force(t0, t1, q, p, epsilon, args) - rise
 
 
 def _inner(equations: Equations) -> _Inner | None:

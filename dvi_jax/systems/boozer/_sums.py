@@ -89,6 +89,8 @@ def _over_k(c: Any, s: Any, first: Complex, turn: Complex, n: Any, shape: Shape,
     return sums
 
 
+# Jitted, so that all calls in a step share one trace.
+@functools.partial(jax.jit, static_argnames=("shape", "order"))
 def derivatives(c: Coefficients, shape: Shape, x: Any, y: Any, zeta: Any, order: int) -> tuple:
     """B and its derivatives up to `order` (0, 1, 2): B; B_x, B_y, B_ζ; B_xx, B_xy, B_xζ, B_yy,
     B_yζ, B_ζζ."""
@@ -155,12 +157,12 @@ def derivatives(c: Coefficients, shape: Shape, x: Any, y: Any, zeta: Any, order:
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
 def total(c: Coefficients, shape: Shape, x: Any, y: Any, zeta: Any) -> Any:
     """B(x, y, ζ), of arrays of one shape. Differentiable to any order, also in `c`."""
-    return derivatives(c, shape, x, y, zeta, 0)[0]
+    return derivatives(c, shape, x, y, zeta, order=0)[0]
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
 def _with_gradient(c: Coefficients, shape: Shape, x: Any, y: Any, zeta: Any) -> tuple:
-    return derivatives(c, shape, x, y, zeta, 1)
+    return derivatives(c, shape, x, y, zeta, order=1)
 
 
 def _sum_of_products(factors: tuple, changes: tuple) -> Any:
@@ -185,7 +187,7 @@ def _total_jvp(shape, primals, changes):
 
 def _with_gradient_jvp(shape, primals, changes):
     c, x, y, zeta = primals
-    B, bx, by, bz, xx, xy, xz, yy, yz, zz = derivatives(c, shape, x, y, zeta, 2)
+    B, bx, by, bz, xx, xy, xz, yy, yz, zz = derivatives(c, shape, x, y, zeta, order=2)
     of_c, *of_point = _known(changes)
     rows = ((bx, by, bz), (xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
     out = tuple(_sum_of_products(row, tuple(of_point)) for row in rows)
