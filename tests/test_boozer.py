@@ -168,7 +168,7 @@ ORBITS = {
     [
         ("axisymmetric", 0.8, 5),
         ("helical", 0.5, 6),
-        pytest.param("precise_qa", 1.0, 10, marks=slow),
+        pytest.param("precise_qa", 1.0, 6, marks=slow),
         pytest.param("w7x", 0.125, 7, marks=slow),
     ],
 )

@@ -248,7 +248,7 @@ def from_surfaces(
     - `m`, `n`: mode numbers; `B`: values [T], shape (surfaces, modes); `B_sin` of the sine terms.
     - `iota`, `G`, `I`: values on the surfaces [1, T m, T m]; `psi_edge`, `periods`, `helicity` as
       for `from_modes`.
-    - `degree`: of the polynomials. `box`: (M, K), only modes with m ≤ M and |n/periods −
+    - `degree`: of the polynomials of the modes; those of the profiles have two more. `box`: (M, K), only modes with m ≤ M and |n/periods −
       helicity·m| ≤ K. The cost of a step is proportional to (M + 1)(2K + 1).
     - `tolerance`: largest error of |B| over its mean, on the given surfaces.
 
@@ -294,10 +294,11 @@ def from_surfaces(
             f"{error.max() / mean:.1g} of its mean, more than tolerance={tolerance}. Give a larger "
             "degree or more surfaces near the axis, or leave modes with a large m out."
         )
-    profiles = [_fit(s, _array(name, x, 1), degree) for name, x in (("iota", iota), ("G", G))]
+    high = min(degree + 2, len(s) - 1)
+    profiles = [_fit(s, _array(name, x, 1), high) for name, x in (("iota", iota), ("G", G))]
     current = None
     if I is not None and np.abs(I).max() > 1e-9 * np.abs(G).max():
-        current = np.concatenate([[0.0], _fit(s, _array("I", I, 1), degree - 1, 1.0)])
+        current = np.concatenate([[0.0], _fit(s, _array("I", I, 1), high - 1, 1.0)])
     return from_modes(
         ms, ns, fits[0], psi_edge=psi_edge, iota=profiles[0], G=profiles[1], I=current,
         B_sin=fits[1] if len(fits) > 1 else None, periods=periods, helicity=helicity,

@@ -206,8 +206,9 @@ def load_field(path: Any) -> Field:
 def precise_qa() -> Field:
     """A precisely quasi-axisymmetric vacuum field at reactor size; 2 periods, aspect ratio 6.
 
-    Volume average of |B| 5.7 T, minor radius 1.7 m. Modes up to m = 6, |n| = 8; those left out are
-    1e-5 of |B| (root mean square). The largest symmetry-breaking mode is 2e-4 of |B|.
+    Volume average of |B| 5.7 T, minor radius 1.7 m. Modes up to m = 5, |n| = 6; those left out are
+    1.4e-5 of |B| (root mean square at the edge, 1e-6 at s = 0.5), less than the equilibrium deviates
+    from the form of Boozer coordinates there. The largest symmetry-breaking mode is 2e-4 of |B|.
 
     **Source** Landreman & Paul 2022, *Phys. Rev. Lett.* 128, 035001, from the equilibrium
     ``precise_QA`` in the package desc-opt.
