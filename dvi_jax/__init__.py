@@ -24,6 +24,7 @@ from ._arithmetic import (
 )
 from ._discretise import discretise as discretise
 from ._energies import incoming_energy as incoming_energy, outgoing_energy as outgoing_energy
+from ._implicit import Implicit as Implicit
 from ._integrate import integrate as integrate
 from ._integrator import Integrator as Integrator
 from ._results import RESULTS as RESULTS, IntegrationError as IntegrationError

@@ -11,6 +11,7 @@ import lanewise
 
 from ._types import Args, Scalar, State
 from .engine.newton import Newton, Vector, find_root
+from .engine.signature import check_takes
 
 
 class Implicit(eqx.Module):
@@ -43,11 +44,20 @@ class Implicit(eqx.Module):
     guess: Callable[..., Any]
     newton: Newton = Newton()
 
+    def __check_init__(self):
+        for name, arguments in (
+            ("energy", "(t, q, p, y, args)"),
+            ("relation", "(t, q, p, y, args)"),
+            ("guess", "(t, q, p, args)"),
+        ):
+            check_takes(name, getattr(self, name), arguments)
+
     def solved(self, t: Scalar, q: State, p: State, args: Args) -> Vector:
         """y at (t, q, p); NaN where it is not found. Differentiable to any order."""
         guess = self.guess(t, q, p, args)
         y, how = find_root(lambda y: self.relation(t, q, p, y, args), guess, guess, self.newton)
-        return jnp.where(how.converged, y, jnp.nan)
+        # A factor and not jnp.where(…, y, nan), of which the derivative would be 0 and not NaN.
+        return y * jnp.where(how.converged, 1.0, jnp.nan).astype(y.dtype)
 
     def __call__(self, t: Scalar, q: State, p: State, args: Args) -> Scalar:
         return self.energy(t, q, p, self.solved(t, q, p, args), args)

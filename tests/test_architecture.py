@@ -20,7 +20,7 @@ FLOORS = [
     ["engine"],
     ["_inputs"],
     ["_system", "_solution"],
-    ["_discretise", "_adapters", "_energies", "_step", "_plan", "observe"],
+    ["_discretise", "_adapters", "_implicit", "_energies", "_step", "_plan", "observe"],
     ["methods", "lattices"],
     ["_arithmetic"],
     ["_rollout"],
@@ -238,7 +238,8 @@ def test_door_has_no_logic():
 PUBLIC = """
 System discretise integrate Save Solution RESULTS IntegrationError Newton
 RootSolver SimplifiedNewton Picard PicardThenNewton
-legendre from_lagrangian from_type_iii velocity_force Layout configure_cpu over_threads over_devices
+legendre from_lagrangian from_type_iii velocity_force Implicit
+Layout configure_cpu over_threads over_devices
 TypeII Adjoint Strang Yoshida Suzuki BlanesMoan McLachlan KahanLi Composition
 GaussLegendre LobattoIIIAIIIB RungeKutta4
 Uniform Given TimeTransformed Variational FloatingPoint Compensated DoubleDouble FixedPoint

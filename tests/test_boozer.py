@@ -400,6 +400,25 @@ def test_reading_a_file_of_booz_xform(tmp_path, sign):
     assert jax.tree.all(jax.tree.map(lambda a, b: (a == b).all(), field, again))
 
 
+@pytest.mark.parametrize("name", ["precise QA", "precise QH", "r2 section 5.5"])
+def test_near_axis_expansions(name):
+    """Against |B| as the package qsc computes it."""
+    qsc = pytest.importorskip("qsc", reason='pip install "dvi-jax[stellarator]"')
+    stellarator = qsc.Qsc.from_paper(name)
+    field = boozer.from_near_axis(stellarator, minor_radius=0.1)
+    s, theta, zeta = np.random.default_rng(0).uniform([0, 0, 0], [1, 6, 3], (20, 3)).T
+    expected = [
+        stellarator.B_mag(0.1 * np.sqrt(x), y, z, Boozer_toroidal=True)
+        for x, y, z in zip(s, theta, zeta, strict=True)
+    ]  # fmt: skip
+    np.testing.assert_allclose(field.strength(s, theta, zeta), expected, rtol=1e-6)
+    assert float(field.G[0]) == pytest.approx(stellarator.G0)
+    particles = boozer.GuidingCentres(field.scaled())
+    assert float(particles.field.average) == pytest.approx(5.7)
+    q, p, args = particles.start(0.2, 0.3, 0.1, 0.3)
+    assert float(particles.system.hamiltonian(0.0, 0.0, q, p, 0.0, args)) == pytest.approx(0.5)
+
+
 def test_bad_files(tmp_path):
     with pytest.raises(ValueError, match=r"it has no bmnc_b\.$"):
         boozer.read_booz_xform(written(tmp_path / "a.nc", drop=["bmnc_b"]))

@@ -46,6 +46,7 @@ MODULES = {
     "generators": ("Generators of common symmetries", "generators"),
     "starts": ("Initial conditions of a sweep", "starts"),
     "systems": ("Library of systems", "systems"),
+    "boozer": ("Guiding centres in Boozer coordinates", "systems.boozer"),
     "plot": ("Plots", "plot"),
     "interop": ("Other packages", "interop"),
 }

@@ -4,6 +4,7 @@ from ._births import Births as Births, fusion_rate as fusion_rate
 from ._field import Field as Field, from_modes as from_modes, from_surfaces as from_surfaces
 from ._files import (
     Geometry as Geometry,
+    from_near_axis as from_near_axis,
     load_field as load_field,
     precise_qa as precise_qa,
     read_booz_xform as read_booz_xform,

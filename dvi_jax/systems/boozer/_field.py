@@ -248,7 +248,8 @@ def from_surfaces(
     - `m`, `n`: mode numbers; `B`: values [T], shape (surfaces, modes); `B_sin` of the sine terms.
     - `iota`, `G`, `I`: values on the surfaces [1, T m, T m]; `psi_edge`, `periods`, `helicity` as
       for `from_modes`.
-    - `degree`: of the polynomials of the modes; those of the profiles have two more. `box`: (M, K), only modes with m ≤ M and |n/periods −
+    - `degree`: of the polynomials of the modes; those of the profiles have two more.
+    - `box`: (M, K), only modes with m ≤ M and |n/periods −
       helicity·m| ≤ K. The cost of a step is proportional to (M + 1)(2K + 1).
     - `tolerance`: largest error of |B| over its mean, on the given surfaces.
 
