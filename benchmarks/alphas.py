@@ -280,7 +280,8 @@ def many_bounces(particles, bounces=100_000):
     slope = x @ (energy - energy.mean()) / (x @ x)
     residual = energy - energy.mean() - slope * x
     error = np.sqrt(residual @ residual / (len(x) - 2) / (x @ x))
-    assert (u > 0).any() and (u < 0).any()  # it is trapped
+    assert (u > 0).any()
+    assert (u < 0).any()
     print(f"   energy over {bounces} bounces: slope {slope:.1e} ± {error:.1e} over the whole run,")
     print(f"   oscillation {np.ptp(energy):.1e}")
     return abs(slope) / error
