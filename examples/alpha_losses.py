@@ -36,7 +36,7 @@ def field_named(name):
 
 def swept(alphas, particles, seconds, store=None, seed=1):
     """The sweep over all particles: when each is lost, and how well its energy is conserved."""
-    system, h = alphas.system, alphas.h
+    system = alphas.system
 
     def energy(t0, t1, q0, p0, q1, p1, args):
         """2H, which is 1."""
@@ -46,8 +46,8 @@ def swept(alphas, particles, seconds, store=None, seed=1):
         system,
         start=boozer.Births(particles, alphas, seed=seed),
         args=alphas.args(0.0),  # each particle has its own mu
-        h=h,
-        num_steps=int(np.ceil(alphas.step(seconds) / h)),
+        h=alphas.h,
+        num_steps=alphas.steps(seconds),
         method=dvi.GaussLegendre(2),
         stop=alphas.loss,
         observe={"energy_drift": dvi.MaxDrift(energy)},

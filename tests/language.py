@@ -47,7 +47,7 @@ PHRASES = {
     r"\bcomes? back\b": "result, returns",
     r"\bto and fro\b|\bthere and back\b|\bthe other way about\b": "in both directions",
     r"\bworth knowing\b|\bin hand\b|\bat hand\b": "notes, in progress, available",
-    r"\bhands? (?:it|them|over|out|back)\b|\bhanded\b": "passes, receives",
+    r"\bhands? (?:it|them|over|out|back)\b|(?<!-)\bhanded\b": "passes, receives",
     r"\bof one's own\b": "user-defined",
 }
 """Phrase → what to write."""

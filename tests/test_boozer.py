@@ -428,7 +428,9 @@ def test_bad_files(tmp_path):
     with pytest.raises(ValueError, match=r"psi_edge=.*read_wout\(path, True\)"):
         boozer.read_booz_xform(written(tmp_path / "c.nc", sign=0))
     with pytest.raises(ValueError, match="more than 6 surfaces"):
-        boozer.from_surfaces([0.1, 0.95], [0], [0], [[1.0], [1.0]], [1, 1], [1, 1], psi_edge=1.0)
+        boozer.from_surfaces(
+            [0.1, 0.95], [0], [0], [[1.0], [1.0]], iota=[1, 1], G=[1, 1], psi_edge=1.0
+        )
     (tmp_path / "d.json").write_text("{}")
     with pytest.raises(ValueError, match="not a field that save_field has written"):
         boozer.load_field(tmp_path / "d.json")
@@ -450,7 +452,7 @@ def test_bad_fields_and_particles():
         boozer.from_modes([0], [0], [[np.nan]], **good)
     s = np.linspace(0.05, 0.8, 20)
     with pytest.raises(ValueError, match="to the edge"):
-        boozer.from_surfaces(s, [0], [0], np.ones((20, 1)), s, s, psi_edge=1.0)
+        boozer.from_surfaces(s, [0], [0], np.ones((20, 1)), iota=s, G=s, psi_edge=1.0)
     particles = boozer.GuidingCentres(axisymmetric())
     with pytest.raises(ValueError, match=r"s must be between 0 and 1, got 1\.2"):
         particles.start([0.5, 1.2], 0.0, 0.0, 0.1)

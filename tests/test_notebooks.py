@@ -19,6 +19,7 @@ for needed in ("jupytext", "nbclient", "nbformat", "ipykernel"):
     pytest.importorskip(needed)
 
 NAMES = [
+    "alpha_particles",
     "discovering_invariants",
     "fitting",
     "general_relativity",

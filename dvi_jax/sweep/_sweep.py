@@ -213,9 +213,9 @@ def _make_sweep(system: Any, q0: Any, p0: Any, given: dict[str, Any]) -> Sweep:
     numbers = {n: float(x) if type(x := given[n]) is int else x for n in ("epsilon", "h", "t0")}
     inputs = {name: as_axis(name, value) for name, value in numbers.items()}
     inputs |= {"args": given["args"], **_states(q0, p0, given["start"])}
-    if given["observe"] is None and given["save"] is None:
+    if all(given[name] is None for name in ("observe", "save", "stop")):
         raise ValueError(
-            "there is nothing to store, because observe and save are both missing: give "
+            "there is nothing to store, because observe, save and stop are all missing: give "
             "observe={...}, or save=dvi.Save(final=True) to store the final states."
         )
     start, of_integrator = given["start"], taken(dict(given), INTEGRATOR)

@@ -4,6 +4,7 @@ Each is a function without obligatory arguments that returns a `Problem`. Its en
 gives the name in run files; `tests/test_library.py` tests every entry.
 """
 
+from . import boozer as boozer
 from ._problem import (
     Adiabatic as Adiabatic,
     InSlowTime as InSlowTime,

@@ -72,9 +72,7 @@ class State(Table):
 
     q0: Array | None = key(None, ARRAY)
     p0: Array | None = key(None, ARRAY)
-    date: Date | None = key(
-        None, 'a day such as "1900-01-01" or a Julian date; for solar_system alone'
-    )
+    date: Date | None = key(None, 'a day, "1900-01-01", or a Julian date; for solar_system')
 
     @model_validator(mode="after")
     def _date_or_arrays(self) -> Any:
@@ -212,7 +210,7 @@ class OwnStart(Table):
     """Initial conditions of a Python file."""
 
     kind: Literal["own"]
-    starts: Text = key(..., f"{FILE}, an object of a subclass of dvi.starts.Starts")
+    starts: Text = key(..., f"{FILE}, a dvi.starts.Starts")
 
 
 Start = union_by_kind(BoxStart, NormalStart, EnergyShellStart, OwnStart)
@@ -239,9 +237,7 @@ class SweepFile(SystemFile, Integration):
     """Many trajectories: the keys of a run with axes in the place of numbers."""
 
     state: SweepState = SweepState()
-    start: Start | None = key(
-        None, "initial conditions: a table with kind = halton, random, normal, energy_shell or own"
-    )
+    start: Start | None = key(None, "a table, kind = halton, random, normal, energy_shell or own")
     args: dict[str, SweepParameter] | None = key(
         None, f"{ARGS}; a number may be an axis, {AN_AXIS}"
     )
@@ -255,9 +251,7 @@ class SweepFile(SystemFile, Integration):
     method: union(text=Text, array=Many[Text], table=Axis[Text]) = key(
         "TypeII", f"{METHOD}; or an array of such texts"
     )
-    save: union(text=Literal["final"], table=SaveEvery) | None = key(
-        None, '"final", or {every = n} with a positive whole number'
-    )
+    save: union(text=Literal["final"], table=SaveEvery) | None = key(None, '"final", {every = n}')
     output: SweepOutput = SweepOutput()
 
     @model_validator(mode="after")

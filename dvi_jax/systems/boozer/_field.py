@@ -143,15 +143,14 @@ def from_modes(
     iota: Any,
     G: Any,
     I: Any = None,  # noqa: E741
-    B_sin: Any = None,
     periods: int = 1,
     helicity: int = 0,
 ) -> Field:
     r"""A `Field` from the polynomials of its modes, |B| = Σ s^{m/2} b_mn(s) cos(mθ − nζ).
 
     - `m`, `n`: mode numbers; each n is a multiple of `periods`, m is not negative.
-    - `B`: coefficients of b_mn [T], shape (modes, d + 1), the constant first; `B_sin` those of the
-      sine terms.
+    - `B`: coefficients of b_mn [T], shape (modes, d + 1), the constant first; or (2, modes, d + 1)
+      with those of the sine terms.
     - `psi_edge`: ψ at the edge s = 1 [T m²]. `iota`, `G`, `I`: coefficients of polynomials in s; a
       number is a constant. I is zero on the axis: its first coefficient must be 0.
     - `helicity`: modes are stored around n = periods · helicity · m, so that a quasi-helical field
@@ -162,13 +161,11 @@ def from_modes(
     periods, h = whole("periods", periods), whole("helicity", helicity, -99)
     positive("psi_edge", psi_edge)
     ms, ns = (_array(name, x, 1).astype(int) for name, x in (("m", m), ("n", n)))
-    parts = [_array("B", B, 2)]
-    if B_sin is not None:
-        parts.append(_array("B_sin", B_sin, 2))
-    if any(len(x) != len(ms) for x in (ns, *parts)):
+    parts = _parts(B)
+    if len({len(ms), len(ns), len(parts[0])}) > 1:
         raise ValueError(
-            "m, n, B and B_sin must have one entry for each mode, got the lengths "
-            f"{[len(x) for x in (ms, ns, *parts)]}."
+            "m, n and B must have one entry for each mode, got the lengths "
+            f"{[len(x) for x in (ms, ns, parts[0])]}."
         )
     if len(ms) == 0 or ms.min() < 0 or (ns % periods).any():
         raise ValueError(
@@ -204,6 +201,15 @@ def from_modes(
     return field
 
 
+def _parts(B: Any) -> list[np.ndarray]:
+    """The cosine part of B and, if it has three dimensions, the sine part."""
+    if np.ndim(B) != 3:
+        return [_array("B", B, 2)]
+    if len(B) not in (1, 2):
+        raise ValueError(f"the first of three dimensions of B must be 1 or 2, got {len(B)}.")
+    return list(_array("B", B, 3))
+
+
 def _check_positive(field: Field) -> None:
     s, theta, zeta = np.meshgrid(
         np.linspace(0, 1, 9),
@@ -226,14 +232,13 @@ def from_surfaces(
     m: Sequence[int],
     n: Sequence[int],
     B: Any,
+    *,
+    psi_edge: float,
     iota: Any,
     G: Any,
     I: Any = None,  # noqa: E741
-    *,
-    psi_edge: float,
     periods: int = 1,
     helicity: int = 0,
-    B_sin: Any = None,
     degree: int = 6,
     box: tuple[int, int] | None = None,
     tolerance: float = 1e-2,
@@ -245,7 +250,8 @@ def from_surfaces(
     √s sin θ.
 
     - `s`: surfaces in 0 ≤ s ≤ 1, increasing, the last one at 0.9 or more.
-    - `m`, `n`: mode numbers; `B`: values [T], shape (surfaces, modes); `B_sin` of the sine terms.
+    - `m`, `n`: mode numbers; `B`: values [T], shape (surfaces, modes), or (2, surfaces, modes) with
+      those of the sine terms.
     - `iota`, `G`, `I`: values on the surfaces [1, T m, T m]; `psi_edge`, `periods`, `helicity` as
       for `from_modes`.
     - `degree`: of the polynomials of the modes; those of the profiles have two more.
@@ -257,7 +263,7 @@ def from_surfaces(
     larger than `tolerance`. The modes outside of `box` are not part of that error.
     """
     s = _array("s", s, 1)
-    values = [_array("B", B, 2)] + ([] if B_sin is None else [_array("B_sin", B_sin, 2)])
+    values = _parts(B)
     degree = whole("degree", degree, 0)
     if len(s) < 2 or np.any(np.diff(s) <= 0) or s[0] < 0 or s[-1] > 1 or s[-1] < 0.9:
         raise ValueError(
@@ -269,12 +275,10 @@ def from_surfaces(
     if len(s) <= degree:
         raise ValueError(f"degree={degree} requires more than {degree} surfaces, got {len(s)}.")
     ms, ns = (_array(name, x, 1).astype(int) for name, x in (("m", m), ("n", n)))
-    for name, x in zip(("B", "B_sin"), values, strict=False):
-        if x.shape != (len(s), len(ms)):
-            raise ValueError(
-                f"{name} must have the shape (surfaces, modes) = {(len(s), len(ms))}, got "
-                f"{x.shape}."
-            )
+    if values[0].shape != (len(s), len(ms)):
+        raise ValueError(
+            f"B must have the shape (surfaces, modes) = {(len(s), len(ms))}, got {values[0].shape}."
+        )
     if box is not None:
         M, K = (whole(f"entry {i} of box", x, 0) for i, x in enumerate(box))
         chosen = (ms <= M) & (np.abs(ns / periods - helicity * ms) <= K)
@@ -301,8 +305,8 @@ def from_surfaces(
     if I is not None and np.abs(I).max() > 1e-9 * np.abs(G).max():
         current = np.concatenate([[0.0], _fit(s, _array("I", I, 1), high - 1, 1.0)])
     return from_modes(
-        ms, ns, fits[0], psi_edge=psi_edge, iota=profiles[0], G=profiles[1], I=current,
-        B_sin=fits[1] if len(fits) > 1 else None, periods=periods, helicity=helicity,
+        ms, ns, np.stack(fits), psi_edge=psi_edge, iota=profiles[0], G=profiles[1], I=current,
+        periods=periods, helicity=helicity,
     )  # fmt: skip
 
 

@@ -8,7 +8,6 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
-from scipy.io import netcdf_file
 
 from ..._checks import positive
 from ._field import Field, fitted_modes, from_modes, from_surfaces
@@ -85,10 +84,10 @@ def read_booz_xform(
     **Source** Sanchez et al. 2000, *J. Comput. Phys.* 161, 576 (booz_xform).
     """
     f = _surfaces(path, ["bmnc_b"], ["bmns_b"], psi_edge)
-    sine = f.odd.get("bmns_b")
+    B = [f.even["bmnc_b"], *f.odd.values()]
     return from_surfaces(
-        f.s, f.m, f.n, f.even["bmnc_b"], f.iota, f.G, f.I, psi_edge=f.psi_edge, periods=f.periods,
-        helicity=helicity, B_sin=sine, degree=degree, box=box, tolerance=tolerance,
+        f.s, f.m, f.n, np.stack(B) if len(B) > 1 else B[0], psi_edge=f.psi_edge, iota=f.iota, G=f.G,
+        I=f.I, periods=f.periods, helicity=helicity, degree=degree, box=box, tolerance=tolerance,
     )  # fmt: skip
 
 
@@ -129,10 +128,10 @@ def from_near_axis(stellarator: Any, minor_radius: float) -> Field:
     if second:
         sine[list(modes).index((2, 2 * N)), 0] = a**2 * q.B2s
     r2 = [q.G0, a**2 * (np.nan_to_num(float(q.G2)) if second else 0.0)]
+    B = np.stack([rows[:, :2], sine]) if sine.any() else rows[:, :2]
     return from_modes(
-        m, n, rows[:, :2], psi_edge=q.B0 * a**2 / 2, iota=float(q.iota), G=r2,
-        I=[0.0, a**2 * q.I2] if q.I2 else None, B_sin=sine if sine.any() else None,
-        periods=int(q.nfp), helicity=N // int(q.nfp),
+        m, n, B, psi_edge=q.B0 * a**2 / 2, iota=float(q.iota), G=r2,
+        I=[0.0, a**2 * q.I2] if q.I2 else None, periods=int(q.nfp), helicity=N // int(q.nfp),
     )  # fmt: skip
 
 
@@ -164,6 +163,8 @@ def read_geometry(
 def _surfaces(
     path: Any, even: list[str], odd: list[str], psi_edge: float | None = None
 ) -> _Surfaces:
+    from scipy.io import netcdf_file  # a part of import time
+
     try:
         with netcdf_file(str(path), "r", mmap=False) as file:
             found = {k: np.array(v.data) for k, v in file.variables.items()}
@@ -238,8 +239,7 @@ def load_field(path: Any) -> Field:
         return from_modes(
             [row[0] for row in rows],
             [row[1] for row in rows],
-            [row[2] for row in rows],
-            B_sin=[row[3] for row in rows] if len(rows[0]) > 3 else None,
+            np.moveaxis(np.array([row[2:] for row in rows], float), 1, 0),
             **{k: found[k] for k in ("psi_edge", "iota", "G", "I", "periods", "helicity")},
         )
     except (KeyError, IndexError, TypeError, json.JSONDecodeError) as error:

@@ -120,6 +120,10 @@ class GuidingCentres(eqx.Module):
         """The h or t of a run [m] for a time in seconds."""
         return self.speed * seconds
 
+    def steps(self, seconds: float, h: float | None = None) -> int:
+        """The number of steps `h` (default: `self.h`) that cover a time."""
+        return int(np.ceil(self.step(positive("seconds", seconds)) / (self.h if h is None else h)))
+
     def seconds(self, t: Any) -> Any:
         """The time in seconds of a t of a run."""
         return t / self.speed
