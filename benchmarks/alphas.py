@@ -269,7 +269,7 @@ def many_bounces(particles, bounces=100_000):
     """The slope of the energy of a banana orbit over many bounces, and its standard error."""
     q, p, args = particles.start(0.25, 0.2, 0.4, -0.25)
     system, h = particles.system, particles.h
-    # A bounce, there and back, takes less than 1e-4 s: steps for all of them, saved 2000 times.
+    # A bounce, in both directions, takes less than 1e-4 s: steps for all of them, saved 2000 times.
     steps = int(bounces * particles.step(1e-4) / h) // 2000
 
     def one(q, p):
