@@ -12,3 +12,9 @@ from ._files import (
     w7x as w7x,
 )
 from ._particles import Coordinates as Coordinates, GuidingCentres as GuidingCentres
+from ._proxies import (
+    lost_at as lost_at,
+    mean_drift as mean_drift,
+    radial_drift as radial_drift,
+    symmetry_error as symmetry_error,
+)
