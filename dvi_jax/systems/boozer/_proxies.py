@@ -64,7 +64,7 @@ def symmetry_error(
 
 
 class _Weighted(eqx.Module):
-    """(2π)⁻¹(16π²/3) sin(2πτ) sin²(πτ) s with τ = t/t1, whose mean over a run is −Δs."""
+    """(16π/3) sin(2πτ) sin²(πτ) s with τ = t/T, whose mean over a run is −Δs."""
 
     chart: Any
 
