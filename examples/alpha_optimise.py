@@ -19,6 +19,11 @@ bounces is so large that its gradient is dominated by a few chaotic orbits.
 The spectrum is free here. That of a real plasma follows from a boundary or from coils: multiply the
 gradients of this example by the derivatives of the spectrum with respect to those.
 
+Measured with 1000 particles born at s = 0.25: after 1 ms 9.6 ± 0.9 % are lost at the start of the
+descents, 7.0 ± 0.8 % after (a), 3.7 ± 0.6 % after (b); after 10 ms 18.7 ± 1.2, 19.4 ± 1.3 and
+14.4 ± 1.1 %. (b) increases the symmetry error by one half: at s = 0.25 its modes (1, ±2) turn the
+fixed cos(2ζ) into (1 − 1.1 cos θ) cos(2ζ), which is small on the outboard side.
+
 Run: python examples/alpha_optimise.py [--quick] [DIRECTORY for the picture]
 """
 
@@ -164,7 +169,9 @@ def draw(curves, times, times_of, points):
         at = points[name]
         axes[2].errorbar(at[:, 1], 100 * at[:, 2], 100 * at[:, 3], ls="-", lw=0.7, color=colour,
                          marker=marker, mfc="white", label=f"along ({name})")  # fmt: skip
-    axes[2].plot(points["a"][0, 1], 100 * points["a"][0, 2], "o", color="black", label="start")
+    axes[2].plot(
+        points["a"][0, 1], 100 * points["a"][0, 2], "D", color="black", label="start", zorder=5
+    )
     axes[2].set(xlabel="mean drift", ylabel="lost after 1 ms [%]", ylim=(0, None),
                 title="Mean drift and losses")  # fmt: skip
     axes[2].legend(loc="upper left")
@@ -216,7 +223,7 @@ def main(arguments=None):
     along = starts_of(boozer.Births(on_path, ALPHAS, surface=0.25, seed=4))
     points = {}
     for name, path in paths.items():
-        chosen = np.unique(np.linspace(0, len(path) - 1, 9).astype(int) ** 2 // (len(path) - 1))
+        chosen = np.unique(np.linspace(0, len(path) - 1, 7).astype(int) ** 2 // (len(path) - 1))
         lost = [share(np.isfinite(loss_times(path[i], along, steps_for(shorter)))) for i in chosen]
         points[name] = np.column_stack([curves[name][chosen], lost])
     everything = np.concatenate([points["a"], points["b"][1:]])

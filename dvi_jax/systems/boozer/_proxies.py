@@ -82,7 +82,9 @@ def radial_drift(
         Δs = −(16π/3) (1/T) ∫₀ᵀ s(t) sin(2πt/T) sin²(πt/T) dt,    T = num_steps · h
 
     For s = s0 + v t it equals v T. An oscillation of s with a period below T/3 contributes little:
-    the weight and its first two derivatives are zero at both ends.
+    the weight and its first two derivatives are zero at both ends. In a symmetric field Δs → 0 with
+    T; for ions of 35 keV in a reactor it is below 1e-4 at T = 8000 m, and up to 0.1 for barely
+    trapped ones at T = 2000 m (``pytest tests/test_boozer_gradients.py``).
 
     - `particles`: field and species. Particles of a lower energy have thinner orbits: their drift
       is that of the bounce average at one surface, and its gradients are less chaotic.
@@ -93,7 +95,8 @@ def radial_drift(
     is continued by its polynomials.
 
     **Accuracy** that of `GaussLegendre(2)`, O(h⁴). Differentiable in the arrays of `particles` and
-    in `start` by the adjoint `Reversible`.
+    in `start` by the adjoint `Reversible`: value and gradient take 3.7 times as long as the value (with
+    `Checkpointed` or `Direct` about 50 times, as those are not machine code).
     """
     instance("particles", particles, GuidingCentres, "such as boozer.GuidingCentres(field)")
     num_steps = whole("num_steps", num_steps)
