@@ -95,8 +95,9 @@ def radial_drift(
     is continued by its polynomials.
 
     **Accuracy** that of `GaussLegendre(2)`, O(h⁴). Differentiable in the arrays of `particles` and
-    in `start` by the adjoint `Reversible`: value and gradient take 3.7 times as long as the value (with
-    `Checkpointed` or `Direct` about 50 times, as those are not machine code).
+    in `start` by the adjoint `Reversible`. Value and gradient together take 3.7 times as long as
+    the value alone (``python examples/alpha_optimise.py``). With `Checkpointed` or `Direct`,
+    which are not machine code, it is about 50 times.
     """
     instance("particles", particles, GuidingCentres, "such as boozer.GuidingCentres(field)")
     num_steps = whole("num_steps", num_steps)
