@@ -14,3 +14,9 @@ from ._files import (
 )
 from ._losses import LossFraction as LossFraction, loss_fraction as loss_fraction
 from ._particles import Coordinates as Coordinates, GuidingCentres as GuidingCentres
+from ._proxies import (
+    lost_at as lost_at,
+    mean_drift as mean_drift,
+    radial_drift as radial_drift,
+    symmetry_error as symmetry_error,
+)
