@@ -15,3 +15,4 @@ from ._files import (
 )
 from ._losses import LossFraction as LossFraction, loss_fraction as loss_fraction
 from ._particles import Coordinates as Coordinates, GuidingCentres as GuidingCentres
+from ._waves import momentum_basis as momentum_basis
