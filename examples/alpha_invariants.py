@@ -125,17 +125,18 @@ def main(file="alpha_invariants.png"):
             x = np.broadcast_to(EPSILONS[:, None], labels.shape)[of_class]
             look = {"marker": mark, "color": colour, "ls": "none", "ms": 4.5, "alpha": 0.7}
             left.loglog(x, spread[of_class], **look, label=name)
-            right.loglog(x, momentum[of_class], **look, label=f"{name}: p_ζ")
+            right.loglog(x, momentum[of_class], **look, label=f"{name}: $p_ζ$")
         for order, measured in enumerate(momenta(alphas)):
-            name = ("p_ζ", "p_ζ with order 1", "p_ζ with orders 1, 2")[order]
+            name = ("$p_ζ$", "with order 1", "with orders 1, 2")[order]
             label = f"passing: {name}, ∝ ε$^{{{measured.slope:.2f}}}$"
             colour, mark = dvi.plot.COLOURS[2 + order], "oDv"[order]
             right.loglog(STRENGTHS, measured.drifts, marker=mark, color=colour, label=label)
-        left.set(xlabel="ε", ylabel="(largest − smallest J∥) / mean")
-        left.set_title("J∥ at the bounce points of each orbit")
+        left.set(xlabel="ε", ylabel="(largest − smallest $J_∥$) / mean")
+        left.set_title("$J_∥$ at the bounce points of each orbit")
         right.set(xlabel="ε", ylabel="largest change along an orbit [m]", ylim=(1e-7, 1e4))
-        right.set_title("The momentum p_ζ, and its corrections")
-        left.legend(loc="lower right")
+        right.set_title("The momentum $p_ζ$, and its corrections")
+        left.set_ylim(1e-7, 1e3)
+        left.legend(loc="upper left")
         right.legend(loc="upper left", fontsize=7.5, ncols=2)
         dvi.plot.save(figure, file)
 
