@@ -14,7 +14,7 @@ Afterwards the losses of alpha particles of 3.5 MeV are measured, with other ini
 
 The orbits of (b) are those of ions of 35 keV, whose bounces and radial drift are similar in shape
 and whose orbits are ten times thinner. The drift of 3.5 MeV alphas within the same number of
-bounces is so large that its gradient is dominated by a few chaotic orbits.
+bounces is so large that its gradient is, probably, dominated by a few chaotic orbits.
 
 The spectrum is free here. That of a real plasma follows from a boundary or from coils: multiply the
 gradients of this example by the derivatives of the spectrum with respect to those.

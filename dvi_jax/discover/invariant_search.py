@@ -302,7 +302,8 @@ class Search:
         in_units = changes._replace(terms=in_units_of(self.scale, changes.terms))
         digits = coefficient_errors(terms)
         self.judge, self.judge_fitted = (
-            Judge(in_units.at(some), calm[some], self.scale, digits[some]) for some in (~fit, fit)
+            Judge(in_units.at(some), calm[some], self.scale, digits[some], tolerance is not None)
+            for some in (~fit, fit)
         )
         of_fit = changes.terms[fit, 0], changes.motion.at(fit), self.values
         self.fewest = Fewest(basis.complexity, self.rms, *of_fit)

@@ -16,12 +16,13 @@ _ROUND_OFF = 1e-13  # Shares below this of the largest are not there
 
 class Judge(NamedTuple):
     """Changes of the functions at some samples in units of ε · `scale`, their weights, (S,), and
-    `coefficient_errors` of functions of size one, (S,)."""
+    `coefficient_errors` of functions of size one, (S,); whether the search has a tolerance."""
 
     changes: Changes
     calm: np.ndarray
     scale: float = 1.0
     digits: np.ndarray | float = 0.0
+    approximately: bool = False
 
     def quantiles(self, coefficients: np.ndarray, share: float, sizes=None) -> np.ndarray:
         """The change that the given share of the samples stays below, shape (count, z + 1).
@@ -33,7 +34,8 @@ class Judge(NamedTuple):
         for i, c in enumerate(coefficients):
             series = c / self.scale ** np.arange(len(c))[:, None]
             terms, motion, spread = self.changes.terms, self.changes.motion, self._spread(c[0])
-            found = relative_changes(terms, series, motion, spread, sizes[i] * self.digits)
+            digits = sizes[i] * self.digits
+            found = relative_changes(terms, series, motion, spread, digits, self.approximately)
             out[i] = np.quantile(found, share, axis=0)
         return out
 

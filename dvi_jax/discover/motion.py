@@ -52,6 +52,17 @@ class Motion(NamedTuple):
         """Of combinations of the functions, columns of shape (size, count)."""
         return Motion(times(self.changes, combinations), self.rounding @ np.abs(combinations))
 
+    def with_perturbation(self, terms: np.ndarray, combinations: np.ndarray) -> "Motion":
+        """The same, and what the perturbation changes the combinations by, order by order: the
+        size that an approximate correction is compared with. Slopes alone predict no change of a
+        momentum that the unperturbed step conserves exactly, and no correction would be accepted.
+
+        `terms`: A_0 … A_z of the functions, shape (S, z + 1, …, size).
+        """
+        perturbed = times(terms[:, 1:], combinations)
+        perturbed = perturbed.reshape(len(terms), -1, combinations.shape[1])
+        return self._replace(changes=np.concatenate([self.changes, perturbed], axis=1))
+
     def at_most(self, spread: float) -> "Motion":
         """The same, with no larger changes than the functions differ by between samples: a step
         that expands goes beyond the range where slopes predict anything."""
@@ -175,6 +186,8 @@ def conserved(
         return leading, 0
     own = motion.of(leading[:size])
     digits = coefficient_errors(terms)[:, None]
+    if tolerance is not None:
+        own = own.with_perturbation(terms, leading[:size])
     own = own._replace(rounding=own.rounding + digits).at_most(1.0)
     weights = own.weights() / np.sqrt(len(terms))
     changes = series_changes(terms, leading).reshape(len(terms), -1, count)
@@ -196,11 +209,14 @@ def relative_changes(
     motion: Motion | FieldMotion,
     spread: float,
     digits: np.ndarray | float = 0.0,
+    approximately: bool = False,
 ) -> np.ndarray:
     """The change of one series, shape (z + 1, size), at each order, by the measure of `conserved`:
     shape (S, z + 1). `spread`: of its leading-order term; `digits`: see
-    `coefficient_errors`."""
+    `coefficient_errors`; `approximately`: see `Motion.with_perturbation`."""
     own = motion.of(series[:1].T)
+    if approximately:
+        own = own.with_perturbation(terms, series[:1].T)
     own = own._replace(rounding=own.rounding + np.reshape(digits, (-1, 1))).at_most(spread)
     changes = series_changes(terms, series.reshape(-1, 1))[..., 0]
     changes = np.linalg.norm(changes.reshape(*changes.shape[:2], -1), axis=2)

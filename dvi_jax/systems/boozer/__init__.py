@@ -1,6 +1,8 @@
 """Guiding centres in the magnetic fields of stellarators and tokamaks, in Boozer coordinates."""
 
 from ._births import Births as Births, fusion_rate as fusion_rate
+from ._bounce import Well as Well, second_invariant as second_invariant, well as well
+from ._classes import Extremes as Extremes, classify as classify
 from ._field import Field as Field, from_modes as from_modes, from_surfaces as from_surfaces
 from ._files import (
     Geometry as Geometry,
@@ -20,3 +22,4 @@ from ._proxies import (
     radial_drift as radial_drift,
     symmetry_error as symmetry_error,
 )
+from ._waves import momentum_basis as momentum_basis

@@ -1,5 +1,6 @@
 """Particles of one species and one energy in a field: SI units, initial conditions, losses."""
 
+import dataclasses
 import functools
 from typing import Any, NamedTuple
 
@@ -11,7 +12,9 @@ from jaxtyping import Array
 from ..._checks import instance, one_of, positive
 from ..._discretise import discretise
 from ..._system import System
-from ...observe import Stop
+from ...observe import Crossings, Section, Stop
+from ._bounce import Pitch, SecondInvariant, at_crossings, complete
+from ._classes import Trapping, largest_strength
 from ._field import Field, polynomial
 from ._motion import Angles, Breaking, Regular, continuous_hamiltonian, flux, speed_along
 
@@ -171,6 +174,54 @@ class GuidingCentres(eqx.Module):
             return s, self.chart.angle(q, p), q[1], self.speed * u, B
 
         return Coordinates(*one(jnp.asarray(q), jnp.asarray(p)))
+
+    def second_invariant(self, q: Any, p: Any, args: Any, epsilon: Any = None) -> Array:
+        """J∥ = ∮ v∥ dl [m] of one state, in the well of |B| where it lies; NaN for a passing
+        particle. See `boozer.second_invariant`; E is that of the state, H(q, p)."""
+        return SecondInvariant(self.chart, epsilon).of(q, p, args)
+
+    def bounces(self, max_crossings: int = 100, direction: int = 0) -> Section:
+        """Observable: the bounce points v∥ = 0 of an orbit, a `dvi.Section`.
+
+        - `direction`: 1 for those where v∥ increases, −1 where it decreases, 0 for both.
+
+        `second_invariant_at` gives J∥ at the points that it records.
+        """
+        return Section(Pitch(self.chart), direction, max_crossings)
+
+    def second_invariant_at(self, bounces: Crossings, args: Any, epsilon: Any = None) -> Array:
+        """J∥ [m] at the bounce points of one orbit, NaN after the last one."""
+        return at_crossings(SecondInvariant(self.chart, epsilon), bounces, args)
+
+    @property
+    def observables(self) -> dict[str, Any]:
+        """Observables by name, for `integrate`: "second_invariant" [m], and "trapping" [1] where
+        the field is complete. The first uses the ε of the run."""
+        found: dict[str, Any] = {"second_invariant": SecondInvariant(self.chart)}
+        return found if self.breaking is not None else {**found, "trapping": self.trapping}
+
+    @property
+    def trapping(self) -> Any:
+        """Observable: the margin 1 − μ B_max(s)/E of a state, with the largest |B| on its surface.
+
+        A particle with a negative margin bounces, one with a positive margin does not while it is
+        on this surface: see `boozer.classify`. B_max is that of `field` when this property is read.
+
+        **Raises** `ValueError` where `breaking` is given: use ``at_epsilon(ε).trapping``, and
+        integrate these particles.
+        """
+        if self.breaking is not None:
+            raise ValueError(
+                "trapping requires a complete field, but these GuidingCentres have modes "
+                "`breaking`, whose strength ε is not known here. Use centres.at_epsilon(ε), its "
+                "trapping and its system."
+            )
+        return Trapping(self.chart, largest_strength(self.field))
+
+    def at_epsilon(self, epsilon: Any) -> "GuidingCentres":
+        """The same particles in the field with ε·breaking included, without `breaking`."""
+        field = complete(self.args(0.0), epsilon)
+        return dataclasses.replace(self, field=field, breaking=None)
 
     @property
     def loss(self) -> Stop:
