@@ -13,5 +13,3 @@ loss = alphas.loss
 def energy(t0, t1, q0, p0, q1, p1, args):
     """2H, which is 1 for all particles."""
     return 2 * alphas.system.hamiltonian(t1, t1, q1, p1, 0.0, args)
-
-

@@ -204,16 +204,17 @@ def draw_layers(path: Path) -> None:
 
 
 LIMITS = {
-    "lines": 53_950,
-    "raise statements": 671,
+    "lines": 56_260,
+    "raise statements": 697,
     COMMENTS: 5,
     f"files of more than {LONGEST_FILE} lines": 0,
-    f"functions with more than {MOST_PARAMETERS} parameters": 7,
+    f"functions with more than {MOST_PARAMETERS} parameters": 8,
     "circles of imports": 0,
 }
 """What the tests allow. When the code has become smaller lower them; only a new capability raises
 them, by its own size (`proof`, its command and its picture: 2 150 lines; series of high order in
-`discover`: 400; pairs of numbers: 1 200; null spaces in pairs: 400)."""
+`discover`: 400; pairs of numbers: 1 200; null spaces in pairs: 400; guiding centres
+in Boozer coordinates: 2 200; `Implicit`: 100)."""
 
 
 GOALS = dict(zip(LIMITS, (33_000, 450, 5, 0, 15, 0), strict=True))

@@ -159,6 +159,7 @@ def test_second_invariant_at_the_tips_of_banana_orbits_is_constant():
     assert np.log2(coarse / fine) > 3.65
 
 
+@pytest.mark.slow
 def test_second_invariant_varies_where_the_symmetry_is_broken():
     assert spreads(6.0, 1.0) > 1e3 * spreads(6.0, 0.0)
 
@@ -224,6 +225,7 @@ def momentum_of_order(order, degree, poloidal, count, strengths):
     return slopes, slope(c.at[1, largest].multiply(0.5))
 
 
+@pytest.mark.slow
 def test_momentum_of_order_1():
     slopes, wrong = momentum_of_order(1, 3, 3, 260, np.geomspace(0.3, 2, 4))
     assert slopes == pytest.approx([1, 2], abs=0.1)
@@ -237,6 +239,7 @@ def test_momentum_of_order_2():
     assert wrong == pytest.approx(1, abs=0.3)
 
 
+@pytest.mark.slow
 def test_momentum_of_a_helical_symmetry():
     """With n = N h m in all modes p_ζ + N h p_θ is conserved, and p_ζ − N h p_θ is not."""
     helical = boozer.from_modes(

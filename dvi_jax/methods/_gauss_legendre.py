@@ -58,6 +58,7 @@ class _Inner(NamedTuple):
 
     def start(self, t: Any, z: Any, stages: int) -> Any:
         """The y of the first point, for each stage."""
+        # The guess of the user suffices: Newton's first iteration corrects it with the stages.
         e = self.equations
         s, _ = e.system.times(t, t, e.epsilon)
         y = self.implicit.guess(s, *e.absolute(*z), e.args)
@@ -144,6 +145,7 @@ class GaussLegendre(Collocation):
             change = jnp.tensordot(weights, jax.vmap(rates)(times, stages, y), 1)
             return jnp.broadcast_to(z0, change.shape) + h * change
 
+        # The inner unknowns follow the stages, so that without them nothing is concatenated.
         def split(x):
             """The stages, and the inner unknowns of each stage."""
             return x[: all_at_start.size].reshape(all_at_start.shape), x[
