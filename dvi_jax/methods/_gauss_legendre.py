@@ -170,11 +170,12 @@ class GaussLegendre(Collocation):
         # an origin are solved for, as in compensated summation.
         known = jnp.broadcast_to(jnp.stack(equations.absolute(q0, p0)), all_at_start.shape)
         represented = jnp.maximum(jnp.abs(all_at_start), jnp.abs(guess))
-        x, info = find_root(
-            residual, *(jnp.concatenate([u.ravel(), y0.ravel()]) for u in (guess, known)),
-            equations.newton, jnp.concatenate([represented.ravel(), y0.ravel()]),
-        )  # fmt: skip
-        q1, p1 = advanced(b, *split(x))
+        guess, known, represented = (
+            jnp.concatenate([u.ravel(), y0.ravel()]) for u in (guess, known, represented)
+        )
+        x, info = find_root(residual, guess, known, equations.newton, represented)
+        z, y = split(x)
+        q1, p1 = advanced(b, z, y)
         return q1, p1, judge(info, q1, p1)
 
     def needs_no_solve(self, equations, interval, q) -> bool:

@@ -122,4 +122,5 @@ class Births(Seeded):
 
         k = lax.while_loop(proceed, lambda k: k + 1, jnp.zeros((), jnp.int32))
         pitch = jax.random.uniform(of_pitch, (), like.dtype, -1.0, 1.0)
-        return self.particles.state(s, *draw(k)[0], pitch)
+        (theta, zeta), _ = draw(k)
+        return self.particles.state(s, theta, zeta, pitch)

@@ -32,14 +32,14 @@ def largest_strength(field: Field) -> Float[Array, " degree"]:
     B = field.strength(s, theta, zeta).reshape(_SURFACES, _ANGLES, _ANGLES)
     largest = jnp.stack([_improved(each) for each in B])
     pseudo_inverse = np.linalg.pinv(np.polynomial.chebyshev.chebvander(2 * r - 1, _DEGREE))
-    return pseudo_inverse @ largest
+    return jnp.asarray(pseudo_inverse) @ largest
 
 
 def _improved(B: Array) -> Array:
     """The maximum of the parabola through the largest value on a periodic grid and its eight
     neighbours; the largest value itself where that parabola has no maximum."""
     i, j = jnp.unravel_index(jnp.argmax(B), B.shape)
-    near = jnp.roll(B, (1 - i, 1 - j), (0, 1))[:3, :3]
+    near = jnp.roll(jnp.roll(B, 1 - i, 0), 1 - j, 1)[:3, :3]
     gx, gy = (near[2, 1] - near[0, 1]) / 2, (near[1, 2] - near[1, 0]) / 2
     xx = near[2, 1] - 2 * near[1, 1] + near[0, 1]
     yy = near[1, 2] - 2 * near[1, 1] + near[1, 0]

@@ -1,6 +1,5 @@
 """Magnetic fields in Boozer coordinates: a spectrum of |B| and profiles of flux functions."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -135,8 +134,8 @@ def _array(name: str, values: Any, ndim: int) -> np.ndarray:
 
 
 def from_modes(
-    m: Sequence[int],
-    n: Sequence[int],
+    m: Any,
+    n: Any,
     B: Any,
     *,
     psi_edge: float,
@@ -193,7 +192,8 @@ def from_modes(
     field = Field(
         jnp.asarray(float(psi_edge)),
         jnp.asarray(table),
-        *map(jnp.asarray, profiles[:2]),
+        jnp.asarray(profiles[0]),
+        jnp.asarray(profiles[1]),
         None if I is None else jnp.asarray(profiles[2]),
         Shape(periods, h),
     )
@@ -229,8 +229,8 @@ def _check_positive(field: Field) -> None:
 
 def from_surfaces(
     s: Any,
-    m: Sequence[int],
-    n: Sequence[int],
+    m: Any,
+    n: Any,
     B: Any,
     *,
     psi_edge: float,
@@ -287,11 +287,12 @@ def from_surfaces(
         np.stack([_fit(s, x[:, i], degree, power / 2) for i, power in enumerate(ms)])
         for x in values
     ]
-    error = sum(
+    errors = [
         np.abs(s ** (power / 2) * np.polynomial.polynomial.polyval(s, c) - x[:, i])
         for x, fit in zip(values, fits, strict=True)
         for i, (power, c) in enumerate(zip(ms, fit, strict=True))
-    )
+    ]
+    error = np.sum(errors, axis=0)
     mean = np.abs(values[0][:, (ms == 0) & (ns == 0)]).mean() if len(ms) else 0.0
     if mean > 0 and error.max() > finite("tolerance", tolerance) * mean:
         raise ValueError(

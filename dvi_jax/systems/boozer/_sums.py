@@ -106,6 +106,7 @@ def derivatives(c: Coefficients, shape: Shape, x: Any, y: Any, zeta: Any, order:
         sums, (w0, w1, w2), e, m = carry
         A, *rest = _over_k(c_m, s, e, turn, N * (h * m - K), shape, order)
         terms = [_times(w0, A)[0]]
+        A_s = A_ss = A_zeta = down = A  # replaced below, where they are used
         if order >= 1:
             A_s, *rest = rest
             if order == 2:
