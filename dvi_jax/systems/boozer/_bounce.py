@@ -245,5 +245,5 @@ class Pitch(eqx.Module):
 
 
 def at_crossings(observable: SecondInvariant, crossings: Any, args: Any) -> Array:
-    """J∥ of recorded crossings of one orbit; NaN where there is none."""
+    """J∥ of recorded crossings of one orbit; NaN after the last one."""
     return jax.vmap(lambda q, p: observable.of(q, p, args))(crossings.qs, crossings.ps)
