@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import lanewise
 
 from ._types import Args, Scalar, State
-from .engine.newton import Newton, Vector, find_root
+from .engine.newton import Newton, RootSolver, Vector, find_root
 from .engine.signature import check_takes
 
 
@@ -26,7 +26,7 @@ class Implicit(eqx.Module):
     - `relation`: R, function of the same arguments → array like y, zero at the y wanted, with a
       regular ∂R/∂y there.
     - `guess`: function ``(t, q, p, args)`` → y of shape (k,), near that root.
-    - `newton`: settings of the inner solve, where there is one.
+    - `root_finder`: of the inner solve, where there is one.
 
     `GaussLegendre` needs no inner solve: it takes the y of each stage among its unknowns, and
     solves for all of them together. Other methods find y in each evaluation, to round-off. The
@@ -42,7 +42,7 @@ class Implicit(eqx.Module):
     energy: Callable[..., Any]
     relation: Callable[..., Any]
     guess: Callable[..., Any]
-    newton: Newton = Newton()
+    root_finder: RootSolver = Newton()
 
     def __check_init__(self):
         for name, arguments in (
@@ -55,7 +55,9 @@ class Implicit(eqx.Module):
     def solved(self, t: Scalar, q: State, p: State, args: Args) -> Vector:
         """y at (t, q, p); NaN where it is not found. Differentiable to any order."""
         guess = self.guess(t, q, p, args)
-        y, how = find_root(lambda y: self.relation(t, q, p, y, args), guess, guess, self.newton)
+        y, how = find_root(
+            lambda y: self.relation(t, q, p, y, args), guess, guess, self.root_finder
+        )
         # A factor and not jnp.where(…, y, nan), of which the derivative would be 0 and not NaN.
         return y * jnp.where(how.converged, 1.0, jnp.nan).astype(y.dtype)
 

@@ -39,6 +39,7 @@ EXTRAS = {
     "export": ("h5netcdf", "h5py", "pyarrow"),
     "proof": ("flint",),
     "ephemeris": ("jplephem", "skyfield_data"),
+    "stellarator": ("qsc",),
     "interop": ("astropy", "diffrax", "rebound", "scipy"),
 }
 """Extra of the package → modules that it brings."""

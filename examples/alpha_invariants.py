@@ -5,10 +5,11 @@ A field with the modes (m, n) = (0, 0) and (1, 0), which is axisymmetric, and ε
 invariant J∥ at the bounce points. Right: the momentum p_ζ, and p_ζ with the corrections that
 `dvi.discover_invariants` finds for passing orbits.
 
-Run: python examples/alpha_invariants.py [FILE]
+Run: python examples/alpha_invariants.py [DIRECTORY for the picture]
 """
 
 import sys
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -113,8 +114,9 @@ def bouncing(alphas):
     return labels, momentum, spread
 
 
-def main(file="alpha_invariants.png"):
+def main(directory="."):
     """Compute, print and draw."""
+    Path(directory).mkdir(parents=True, exist_ok=True)
     alphas = particles()
     labels, momentum, spread = bouncing(alphas)
     marks = {"trapped": "s", "transitional": "^"}
@@ -138,7 +140,7 @@ def main(file="alpha_invariants.png"):
         left.set_ylim(1e-7, 1e3)
         left.legend(loc="upper left")
         right.legend(loc="upper left", fontsize=7.5, ncols=2)
-        dvi.plot.save(figure, file)
+        dvi.plot.save(figure, Path(directory) / "alpha_invariants.png")
 
 
 if __name__ == "__main__":

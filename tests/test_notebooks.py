@@ -197,7 +197,7 @@ def test_an_unknown_notebook_is_refused():
         check=False,
     )
     assert run.returncode == 2
-    assert "no source for no_such; there are discovering_invariants" in run.stderr
+    assert "no source for no_such; there are alpha_particles" in run.stderr
 
 
 # --- executed again -----------------------------------------------------------------------------
