@@ -64,9 +64,39 @@ def births(alphas, particles, seed=1):
     return np.asarray(at.s), np.asarray(at.v_parallel) / alphas.speed
 
 
+def tips(alphas, seconds=2e-3):
+    """s and ζ of the points where trapped particles turn: a Poincaré section at v∥ = 0."""
+    s = np.linspace(0.05, 0.75, 15)
+    start = alphas.coordinates_of(*alphas.start(s, 0.0, 0.0, 0.0)[:2])
+    # From θ = 0, where |B| is smallest, with a pitch that turns half way to the largest |B|.
+    far = np.asarray(alphas.field.strength(s, np.pi / 2, 0.0))
+    pitch = np.sqrt(np.maximum(1 - np.asarray(start.B) / far, 0.0))
+    q, p, args = alphas.start(s, 0.0, 0.0, pitch)
+
+    def one(q, p, mu):
+        return dvi.integrate(
+            alphas.system,
+            q,
+            p,
+            h=alphas.h,
+            num_steps=alphas.steps(seconds),
+            args={**args, "mu": mu},
+            method=dvi.GaussLegendre(2),
+            observe=alphas.bounces(200),
+            stop=alphas.loss,
+            save=dvi.Save(final=True),
+            throw=False,
+        ).observed
+
+    found = jax.jit(jax.vmap(one))(q, p, args["mu"])
+    at = alphas.coordinates_of(found.qs, found.ps)
+    return np.asarray(at.s), np.asarray(at.zeta)
+
+
 def draw(alphas, stop_seconds, s, pitch, seconds):
-    """The fraction lost against time, and the time of the loss over s and pitch at birth."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
+    """The fraction lost against time, the time of the loss over s and pitch at birth, and where
+    trapped particles turn."""
+    figure, (left, right, last) = plt.subplots(1, 3, figsize=(15, 4.2), layout="constrained")
     times = np.geomspace(1e-5, seconds, 200)
     found = boozer.loss_fraction(stop_seconds, times)
     left.fill_between(times, 100 * found.low, 100 * found.high, alpha=0.3, label="68 % interval")
@@ -84,6 +114,11 @@ def draw(alphas, stop_seconds, s, pitch, seconds):
     right.set(xlim=(0, 1), ylim=(-1, 1), xlabel="s at birth", ylabel="v$_∥$/v at birth")
     right.set_title("Which particles are lost")
     right.legend(loc="lower right")
+    for of_orbit, zeta in zip(*tips(alphas), strict=True):
+        period = 2 * np.pi / alphas.field.shape.periods
+        last.plot(zeta % period, of_orbit, ".", markersize=2)
+    last.set(ylim=(0, 1), xlabel="ζ, modulo a period", ylabel="s")
+    last.set_title("Where trapped particles turn, v$_∥$ = 0")
     return figure
 
 

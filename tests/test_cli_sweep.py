@@ -214,6 +214,44 @@ def test_observables_of_several_numbers_on_given_times(folder):
     assert report.contents["observed"]["energy"]["max"] == energy.max()
 
 
+OF_A_FILE = """
+import jax.numpy as jnp
+import dvi_jax as dvi
+
+class Stiffness(dvi.starts.Seeded):
+    \"\"\"From q = 1 at rest; the stiffness of number i is (1 + i)².\"\"\"
+    def at(self, index, t0, args):
+        k = (1.0 + index) ** 2
+        return jnp.ones(1), jnp.zeros(1), {**args, "k": k}
+
+starts = Stiffness(3, (1,), 0, "start")
+at_zero = dvi.Stop(lambda t, q, p, args: -q[0])
+"""
+
+
+def test_starts_with_parameters_and_a_stop_from_a_file(folder):
+    """An oscillator of frequency ω = 1 + i is at q = 0 after a quarter of its period."""
+    write(folder, OF_A_FILE, "file.py")
+    text = SMALL.replace(
+        "epsilon = {linspace = [0.0, 0.2, 12]}", 'epsilon = 0.0\nstop = "file.py:at_zero"'
+    )
+    text = text.replace(
+        "[state]\nq0 = [0.5]\np0 = [0.1]\n", '[start]\nkind = "own"\nstarts = "file.py:starts"\n'
+    )
+    text = text.replace("h = 0.1", 'h = 0.02\nmethod = "Yoshida(4)"').replace(
+        "steps = 30", "steps = 100"
+    )
+    report = sweep_file(write(folder, text), threads=1)
+    assert report.contents["trajectories"]["stopped"] == 3
+    np.testing.assert_allclose(
+        contents("out.zarr")["stop_t"], np.pi / 2 / np.arange(1, 4), rtol=1e-6
+    )
+    for name, bad in (("stop", "starts"), ("starts", "at_zero")):
+        wrong = re.sub(f'{name} = "file.py:\\w+"', f'{name} = "file.py:{bad}"', text)
+        with pytest.raises(InputError, match=name):
+            sweep_file(write(folder, wrong, "wrong.toml"), store=folder / "other.zarr")
+
+
 # Stores
 
 
