@@ -292,7 +292,7 @@ def test_without_rotational_transform():
     assert float(at.s) == pytest.approx(1, abs=1e-12)
 
 
-@pytest.mark.parametrize(("parts", "helicity"), [(1, 0), (2, -1)])
+@pytest.mark.parametrize(("parts", "helicity"), [pytest.param(1, 0, marks=slow), (2, -1)])
 def test_sums_and_their_derivatives(parts, helicity):
     """Against the definition with powers, cosines and sines, to the third derivative."""
     c = np.random.default_rng(1).normal(size=(parts, 3, 3, 3))

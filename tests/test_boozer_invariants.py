@@ -151,6 +151,7 @@ def spreads(h, epsilon):
     return np.nanmax(trapped) / np.nanmin(trapped) - 1
 
 
+@pytest.mark.slow
 def test_second_invariant_at_the_tips_of_banana_orbits_is_constant():
     """At a tip u = 0 and p_ζ = −χ(s)/ρ: all tips of an axisymmetric field are on one surface. The
     method leaves O(h⁴)."""
