@@ -65,12 +65,26 @@ def _polynomials(c: Float[Array, " d"], s: Any, order: int) -> list[Any]:
     return [0.0 if v is None else v for v in value]
 
 
-def _over_k(c: Any, s: Any, first: Complex, turn: Complex, n: Any, shape: Shape, order: int):
-    """A_m and its derivatives up to `order`, in the order of `_derivatives`."""
+def _powers(first: Complex, factor: Complex, count: int) -> Complex:
+    """first · factor^k for k = 0 … count − 1, in arrays with k first."""
+    _, found = lax.scan(lambda a, _: (_times(a, factor), a), first, None, length=count)
+    return found
+
+
+def _shifted(a: Complex) -> Complex:
+    """(0, a_0, a_1, …) without the last entry."""
+    real, imaginary = (jnp.concatenate([jnp.zeros_like(x[:1]), x[:-1]]) for x in a)
+    return real, imaginary
+
+
+# In both loops only sums are carried. Powers are computed before: a loop can be transposed, for
+# derivatives with respect to `c`, only if all that it carries is linear in `c`.
+def _over_k(c: Any, s: Any, phases: Complex, n: Any, order: int) -> tuple[Complex, ...]:
+    """A_m and its derivatives up to `order`, in the order of `derivatives`."""
     zero = jnp.zeros_like(s)
 
-    def add(carry, c_k):
-        sums, e, n = carry
+    def add(sums, row):
+        c_k, e, n = row
         real = _polynomials(c_k[0], s, order)
         terms = [_scaled(x, e) for x in real]
         if c_k.shape[0] == 2:
@@ -81,15 +95,13 @@ def _over_k(c: Any, s: Any, first: Complex, turn: Complex, n: Any, shape: Shape,
             terms = [*terms, *by_zeta]
         if order == 2:
             terms.append(_turned(n, terms[3]))
-        sums = tuple(_plus(x, y) for x, y in zip(sums, terms, strict=True))
-        return (sums, _times(e, turn), n + shape.periods), None
+        return tuple(_plus(x, y) for x, y in zip(sums, terms, strict=True)), None
 
     start = tuple((zero, zero) for _ in range((1, 3, 6)[order]))
     # A loop in machine code is short to compile. On a GPU each round of a loop would be several
     # kernels: written out it takes half the time.
     unroll = 1 if jax.default_backend() == "cpu" else c.shape[1]
-    (sums, _, _), _ = lax.scan(add, (start, first, n), jnp.swapaxes(c, 0, 1), unroll=unroll)
-    return sums
+    return lax.scan(add, start, (jnp.swapaxes(c, 0, 1), phases, n), unroll=unroll)[0]
 
 
 # Jitted, so that all calls in a step share one trace.
@@ -98,13 +110,19 @@ def derivatives(c: Coefficients, shape: Shape, x: Any, y: Any, zeta: Any, order:
     """B and its derivatives up to `order` (0, 1, 2): B; B_x, B_y, B_ζ; B_xx, B_xy, B_xζ, B_yy,
     B_yζ, B_ζζ."""
     s, w, (N, h) = x * x + y * y, (x, y), shape
-    K = c.shape[2] // 2
+    _, M, K2, _ = c.shape  # M + 1, 2K + 1
     one, zero = jnp.ones_like(s), jnp.zeros_like(s)
-    turn, per_m = _phase(N * zeta), _phase(N * h * zeta)
+    k = jnp.arange(K2, dtype=s.dtype) - K2 // 2
+    phases = _powers(_phase(-N * (K2 // 2) * zeta), _phase(N * zeta), K2)
+    power = _powers((one, zero), w, M)
+    down_one = _shifted(power)
+    of_m = _powers((one, zero), _phase(N * h * zeta), M) if h else None
 
-    def add(carry, c_m):
-        sums, (w0, w1, w2), e, m = carry
-        A, *rest = _over_k(c_m, s, e, turn, N * (h * m - K), shape, order)
+    def add(sums, row):
+        c_m, m, w0, w1, w2, turn = row
+        A, *rest = _over_k(c_m, s, phases, N * (k + h * m), order)
+        if h:
+            A, *rest = (_times(turn, a) for a in (A, *rest))
         terms = [_times(w0, A)[0]]
         A_s = A_ss = A_zeta = down = A  # replaced below, where they are used
         if order >= 1:
@@ -125,17 +143,11 @@ def derivatives(c: Coefficients, shape: Shape, x: Any, y: Any, zeta: Any, order:
                 *_times(down, A_zeta),
                 _times(w0, A_zetazeta)[0],
             ]
-        sums = tuple(a + b for a, b in zip(sums, terms, strict=True))
-        return (sums, (_times(w0, w), w0, w1), _times(e, per_m), m + 1.0), None
+        return tuple(a + b for a, b in zip(sums, terms, strict=True)), None
 
-    start = (
-        tuple(zero for _ in range((1, 5, 14)[order])),
-        ((one, zero), (zero, zero), (zero, zero)),  # w^m, w^{m−1}, w^{m−2} at m = 0
-        _phase(-N * K * zeta),
-        jnp.zeros((), s.dtype),
-    )
-    (sums, *_), _ = lax.scan(add, start, jnp.swapaxes(c, 0, 1))
-    B, *rest = sums
+    start = tuple(zero for _ in range((1, 5, 14)[order]))
+    rows = jnp.arange(M, dtype=s.dtype), power, down_one, _shifted(down_one), of_m
+    B, *rest = lax.scan(add, start, (jnp.swapaxes(c, 0, 1), *rows))[0]
     if order == 0:
         return (B,)
     S, Tr, Ti, Z, *rest = rest
