@@ -2,8 +2,8 @@
 # # Alpha particles in a stellarator
 #
 # In this notebook you follow fusion-born alpha particles in a quasi-axisymmetric stellarator, see
-# which orbits exist, check what is conserved, and compute which fraction is lost. The page [Alpha
-# particles in stellarators](../docs/alpha-particles.md) explains the equations and the units.
+# which orbits exist, check what is conserved, and compute which fraction is lost. The page
+# `docs/alpha-particles.md` explains the equations and the units.
 
 # %%
 import jax
