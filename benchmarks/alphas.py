@@ -48,9 +48,9 @@ except ImportError:
 EV, ALPHA = 1.602176634e-19, 6.6446573357e-27
 ENERGY = 3.5e6
 
-SLOWEST_RATIO, SLOWEST_RATIO_ALONE, MOST_SECONDS = 5.0, 2.0, 600.0
-"""Limits of --check. The aim for one particle alone is 3, which the loosest tolerance of simsopt
-misses (2.5)."""
+SLOWEST_RATIO, SLOWEST_RATIO_ALONE, MOST_SECONDS = 5.0, 3.0, 600.0
+"""Limits of --check: the aims. That for one particle alone is missed (2.5) at the loosest tolerance
+of simsopt."""
 
 
 def particles_of(name):

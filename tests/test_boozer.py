@@ -167,7 +167,7 @@ ORBITS = {
     ("name", "h", "blocks"),
     [
         ("axisymmetric", 0.8, 5),
-        ("helical", 0.5, 6),
+        pytest.param("helical", 0.5, 6, marks=slow),
         pytest.param("precise_qa", 1.0, 6, marks=slow),
         pytest.param("w7x", 0.125, 7, marks=slow),
     ],
@@ -187,6 +187,7 @@ def test_orbits_agree_with_the_equations_of_the_literature(name, h, blocks):
     assert found.drift.max() < 1e-9
 
 
+@pytest.mark.slow
 def test_trapped_orbits_bounce_and_passing_ones_do_not():
     particles = boozer.GuidingCentres(helical())
     s, theta, zeta, pitch = (np.array(x) for x in ORBITS["helical"])
@@ -205,6 +206,7 @@ def test_trapped_orbits_bounce_and_passing_ones_do_not():
     assert (bounces[1:] >= 10).all()
 
 
+@pytest.mark.slow
 def test_both_charts_and_the_nested_solve_give_one_orbit():
     start = [np.array(x) for x in ORBITS["axisymmetric"]]
     a = final("axisymmetric", start, 0.5).z
@@ -278,6 +280,7 @@ def test_a_start_at_the_edge_is_lost_at_once():
     assert (sol.status, float(sol.stop.t)) == ("stopped", 0.0)
 
 
+@pytest.mark.slow
 def test_without_rotational_transform():
     field = boozer.from_modes([0, 1], [0, 0], [[5.7], [-0.5]], psi_edge=EDGE, iota=0.0, G=57.0)
     particles = boozer.GuidingCentres(field)
@@ -464,6 +467,7 @@ def test_bad_fields_and_particles():
         boozer.Births(10, particles, rate=lambda s: s - 0.5)
 
 
+@pytest.mark.slow
 def test_births_have_the_distribution_of_the_reactions():
     particles = boozer.GuidingCentres(helical())
     births = boozer.Births(4000, particles, seed=3)

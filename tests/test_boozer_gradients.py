@@ -77,6 +77,7 @@ def test_gradient_of_the_drift_equals_differences(broken, starts, name):
     assert abs(found - expected) < 1e-6 * abs(expected)
 
 
+@pytest.mark.slow
 def test_differences_detect_a_wrong_gradient(broken, starts):
     """Negative control: a gradient that neglects that the initial state depends on the field."""
 
@@ -137,6 +138,7 @@ def test_the_symmetry_error_is_the_measure_of_two_terms(helicity):
     assert abs(found / expected - 1) < 1e-12
 
 
+@pytest.mark.slow
 def test_a_symmetric_field_has_no_drift_and_no_symmetry_error(broken, starts):
     symmetric, _ = broken.split()
     assert boozer.symmetry_error(symmetric) < 1e-28
@@ -153,6 +155,7 @@ def test_a_symmetric_field_has_no_drift_and_no_symmetry_error(broken, starts):
     assert jnp.median(drifts(broken)) > 1e-2
 
 
+@pytest.mark.slow
 def test_isotropic_particles_change_p_zeta_by_the_symmetry_error(broken):
     """Mean of (dp_ζ/dt)² = (∂H/∂ζ)² is (7/15) f."""
     particles = boozer.GuidingCentres(broken)
@@ -176,6 +179,7 @@ def test_isotropic_particles_change_p_zeta_by_the_symmetry_error(broken):
     assert abs(mean / expected - 1) < 1e-6
 
 
+@pytest.mark.slow
 def test_a_descent_lowers_the_drift(broken, starts):
     """Only the breaking modes change."""
     _, breaking = broken.split()
@@ -187,6 +191,7 @@ def test_a_descent_lowers_the_drift(broken, starts):
     assert drift(field, starts) < 0.8 * first
 
 
+@pytest.mark.slow
 def test_times_of_losses(broken):
     inside, at_edge = [0.1, 0.3, 0.0, 0.9], [0.99, 1.5, 0.3, 0.1]
     times = jax.jit(
