@@ -461,6 +461,18 @@ def test_bad_fields_and_particles():
         particles.start([0.5, 1.2], 0.0, 0.0, 0.1)
     with pytest.raises(ValueError, match="pitch must be between -1 and 1, got nan"):
         particles.start(0.5, 0.0, 0.0, np.nan)
+    with pytest.raises(ValueError, match=r"m must be integers \(mode numbers\), got 1\.5"):
+        boozer.from_modes([0, 1.5], [0, 0], [[1.0], [0.1]], **good)
+    to_edge = np.linspace(0.01, 0.99, 20)
+    values = {"psi_edge": 1.0, "iota": 0 * to_edge, "G": 1 + 0 * to_edge}
+    with pytest.raises(ValueError, match=r"iota must have one value .* the shape \(3,\)"):
+        boozer.from_surfaces(to_edge, [0], [0], np.ones((20, 1)), **values | {"iota": np.ones(3)})
+    with pytest.raises(TypeError, match=r"box must be a pair"):
+        boozer.from_surfaces(to_edge, [0], [0], np.ones((20, 1)), box=3, **values)
+    with pytest.raises(ValueError, match="charge must be a finite number, got nan"):
+        boozer.GuidingCentres(axisymmetric(), charge=np.nan)
+    with pytest.raises(ValueError, match=r"breaking must have the shape of field\.coefficients"):
+        boozer.GuidingCentres(axisymmetric(), breaking=np.zeros((1, 1, 1, 1)))
     with pytest.raises(ValueError, match="charge must not be zero"):
         boozer.GuidingCentres(axisymmetric(), charge=0.0)
     with pytest.raises(ValueError, match="rate"):

@@ -159,7 +159,7 @@ def from_modes(
     """
     periods, h = whole("periods", periods), whole("helicity", helicity, -99)
     positive("psi_edge", psi_edge)
-    ms, ns = (_array(name, x, 1).astype(int) for name, x in (("m", m), ("n", n)))
+    ms, ns = (_integers(name, x) for name, x in (("m", m), ("n", n)))
     parts = _parts(B)
     if len({len(ms), len(ns), len(parts[0])}) > 1:
         raise ValueError(
@@ -199,6 +199,13 @@ def from_modes(
     )
     _check_positive(field)
     return field
+
+
+def _integers(name: str, values: Any) -> np.ndarray:
+    found = _array(name, values, 1)
+    if wrong := found[found != np.round(found)].tolist():
+        raise ValueError(f"{name} must be integers (mode numbers), got {wrong[0]}.")
+    return found.astype(int)
 
 
 def _parts(B: Any) -> list[np.ndarray]:
@@ -274,12 +281,20 @@ def from_surfaces(
         )
     if len(s) <= degree:
         raise ValueError(f"degree={degree} requires more than {degree} surfaces, got {len(s)}.")
-    ms, ns = (_array(name, x, 1).astype(int) for name, x in (("m", m), ("n", n)))
+    ms, ns = (_integers(name, x) for name, x in (("m", m), ("n", n)))
     if values[0].shape != (len(s), len(ms)):
         raise ValueError(
             f"B must have the shape (surfaces, modes) = {(len(s), len(ms))}, got {values[0].shape}."
         )
+    for name, x in (("iota", iota), ("G", G), ("I", I)):
+        if x is not None and np.shape(x) != s.shape:
+            raise ValueError(
+                f"{name} must have one value for each of the {len(s)} surfaces, got the shape "
+                f"{np.shape(x)}."
+            )
     if box is not None:
+        if not isinstance(box, tuple | list) or len(box) != 2:
+            raise TypeError(f"box must be a pair (M, K), such as (6, 4), got {box!r}.")
         M, K = (whole(f"entry {i} of box", x, 0) for i, x in enumerate(box))
         chosen = (ms <= M) & (np.abs(ns / periods - helicity * ms) <= K)
         ms, ns, values = ms[chosen], ns[chosen], [x[:, chosen] for x in values]

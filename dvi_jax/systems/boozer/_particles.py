@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..._checks import instance, one_of, positive
+from ..._checks import finite, instance, one_of, positive
 from ..._discretise import discretise
 from ..._system import System
 from ...observe import Crossings, Section, Stop
@@ -74,9 +74,15 @@ class GuidingCentres(eqx.Module):
         instance("field", self.field, Field, "a Field, such as boozer.precise_qa()")
         for name in ("energy", "mass"):
             positive(name, getattr(self, name))
-        if self.charge == 0:
+        if finite("charge", self.charge) == 0:
             raise ValueError("charge must not be zero: neutral particles do not follow the field.")
         one_of("coordinates", self.coordinates, _CHARTS)
+        shape = self.field.coefficients.shape
+        if self.breaking is not None and np.shape(self.breaking) != shape:
+            raise ValueError(
+                f"breaking must have the shape of field.coefficients, {shape}, got "
+                f"{np.shape(self.breaking)}. Field.split returns such coefficients."
+            )
 
     @property
     def speed(self) -> float:
