@@ -11,6 +11,7 @@ from ._adapters import (
     legendre as legendre,
     velocity_force as velocity_force,
 )
+from . import flows as flows
 from ._adjoints import (
     Checkpointed as Checkpointed,
     Direct as Direct,
@@ -30,6 +31,7 @@ from ._integrator import Integrator as Integrator
 from ._results import RESULTS as RESULTS, IntegrationError as IntegrationError
 from ._reversible import Reversible as Reversible
 from ._solution import Save as Save, Solution as Solution
+from ._split import Split as Split
 from ._step import Equations as Equations, StepInfo as StepInfo
 from ._system import System as System
 from ._types import Interval as Interval
@@ -58,9 +60,11 @@ from .methods import (
     McLachlan as McLachlan,
     Method as Method,
     RungeKutta4 as RungeKutta4,
+    Splitting as Splitting,
     Strang as Strang,
     Suzuki as Suzuki,
     TypeII as TypeII,
+    WisdomHolman as WisdomHolman,
     Yoshida as Yoshida,
 )
 from .observe import (

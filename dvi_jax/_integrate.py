@@ -10,7 +10,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, PyTree
 
 import lanewise
@@ -34,6 +33,7 @@ from ._rollout import (
     StepTaken,
     Task,
     make_plan,
+    one_loop,
     reduce,
     run,
     start,
@@ -191,6 +191,8 @@ def integrate(
     _check_memory(save, plan, q0, check_observe(task, q0, p0), leaves, layout)
     traced = any(is_traced(x) for x in leaves)
     # The warning needs the damping as a number, which is not known of traced values.
+    if not traced:
+        type(method).check(method, task.equations, task.first_interval(), q0, p0)
     if not traced and asked.system.force is not None:
         warn_of_dissipation(method, task.equations, task.first_interval, q0, p0)
     if save.ts is not None:

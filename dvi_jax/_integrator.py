@@ -11,12 +11,13 @@ from ._arithmetic import Arithmetic, FloatingPoint
 from ._checks import instance
 from ._discretise import is_first_order
 from ._reversible import Reversible
+from ._split import Split
 from ._system import System
 from .engine.names import both_names
 from .engine.newton import RootSolver
 from .engine.picard import PicardThenNewton
 from .lattices import Lattice, Uniform
-from .methods import Method, Strang, TypeII, as_method
+from .methods import Method, Splitting, Strang, TypeII, as_method
 
 
 @both_names
@@ -24,7 +25,7 @@ class Integrator(eqx.Module):
     """The options of an integration: the keywords of `integrate` that are not the problem itself.
 
     - `method`: see `integrate`. None: the map that the user wrote, `TypeII()`; for a system with
-      `discretise(H, order=1)`, whose map has order one, `Strang()`.
+      `discretise(H, order=1)`, whose map has order one, `Strang()`; with a `Split`, `Splitting()`.
     - `root_finder`: the solver of implicit steps. Here, and in every function that takes one of the
       two names, `newton` is another name of it; both at once raise a `TypeError`.
     - `lattice`: the time grid. `arithmetic`: the representation of the state.
@@ -96,6 +97,8 @@ def default_method(system: System) -> Method:
     """The method of a run without `method`."""
     # A map of order one that `discretise` made was not chosen by the user, and Strang's composition
     # of it has order two. A map that the user wrote stays as it is.
+    if isinstance(system.H_D, Split):
+        return Splitting()
     return Strang() if is_first_order(system.H_D) else TypeII()
 
 

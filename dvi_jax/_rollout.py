@@ -1,5 +1,7 @@
 """The loop over the steps of a time grid, with status, saved states and observables."""
 
+import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -19,7 +21,7 @@ from ._types import Args, Bindable, Interval, Scalar, State
 from .engine.newton import no_residual, worse
 from .engine.pairs import rounded
 from .engine.reads import Reads
-from .lattices import Lattice, Place
+from .lattices import Lattice, Place, Uniform
 from .methods import Method
 from .observe import (
     Deviations,
@@ -33,7 +35,8 @@ from .observe import (
 from .observe._kept import Start, as_row, event
 
 Loop = Callable[[Callable, Any, None, int], tuple[Any, Any]]
-"""``(body, carry, None, count) -> (carry, ys)``: `lax.scan`, or one with another derivative."""
+"""``(body, carry, None, count, scan) -> (carry, ys)``, made of calls of `scan`: one with another
+derivative than that of `lax.scan`, or `one_loop`."""
 
 
 class Task(eqx.Module):
@@ -356,6 +359,44 @@ def _stop(
     return RESULTS.where(now, RESULTS.stopped, result), jnp.where(now, row, carry.stop)
 
 
+def one_loop(body: Callable, carry: Any, _: None, count: int, scan: Callable = lax.scan) -> Any:
+    """A loop without another derivative than its own."""
+    return scan(body, carry, None, count)
+
+
+def _scan(task: Task) -> Callable:
+    """`lax.scan` over steps of the body of `run`, with less work where the method can save some."""
+    plain = type(task.lattice) is Uniform and task.arithmetic.is_plain and task.stop is None
+    alone, reductions = task.observables()
+    # Reductions read each state of the method, not those of its kernel.
+    quick = task.method.in_loop() if plain and not reductions else None
+    if quick is None:
+        return lax.scan
+    inner = dataclasses.replace(task, method=quick.kernel)
+
+    def moved(carry, by, k):
+        q, p, info = by(task.equations, task.interval(k), carry.q, carry.p)
+        good = info.result == RESULTS.successful
+        state = _noted(carry, q, p, info.result, good, lax.stop_gradient(info.residual))
+        names = "q", "p", "result", "failed_step", "failed_residual"
+        return carry._replace(**dict(zip(names, state, strict=True)))
+
+    def kernel(carry, _):
+        return take_step(inner, carry)[0], None
+
+    def scan(body, state, _, count):
+        if count < 3:
+            return lax.scan(body, state, None, count)
+        carry, last = state
+        carry = moved(carry, quick.before, carry.k)
+        carry, _ = lax.scan(kernel, carry, None, count - bool(alone))
+        carry = moved(carry, quick.after, carry.k - 1)
+        # Functions at a save point read the state before the last step, which is then a whole one.
+        return body((carry, last), None) if alone else ((carry, last), None)
+
+    return scan
+
+
 def run(
     task: Task, plan: Plan, carry: Carry, loop: Loop, inner_loop: Loop | None = None
 ) -> tuple[Carry, Saved, Saved | None]:
@@ -363,7 +404,7 @@ def run(
 
     `loop` runs over the blocks, `inner_loop` (the same if None) over the steps of one block.
     """
-    inner_loop = loop if inner_loop is None else inner_loop
+    inner_loop = functools.partial(loop if inner_loop is None else inner_loop, scan=_scan(task))
     alone, _ = task.observables()
     has_memory = task.lattice.has_memory
 

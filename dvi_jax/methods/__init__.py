@@ -15,5 +15,7 @@ from ._published import (
     Yoshida as Yoshida,
 )
 from ._runge_kutta4 import RungeKutta4 as RungeKutta4
+from ._splitting import Splitting as Splitting
 from ._strang import Strang as Strang
 from ._type_ii import TypeII as TypeII
+from ._wisdom_holman import WisdomHolman as WisdomHolman

@@ -1,7 +1,8 @@
 """The base of all methods: a step, its inverse, and the properties that tests verify."""
 
 import abc
-from typing import Any, ClassVar
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,6 +12,17 @@ from .._checks import instance
 from .._step import Equations, StepInfo
 from .._system import System
 from .._types import Args, Interval, State
+
+
+class InLoop(NamedTuple):
+    """A method for steps of equal length that nobody observes: after ∘ kernelⁿ ∘ before is n steps.
+
+    `before` and `after` are functions as `Method.step`.
+    """
+
+    before: Callable
+    kernel: "Method"
+    after: Callable
 
 
 class Method(eqx.Module):
@@ -43,6 +55,13 @@ class Method(eqx.Module):
     @abc.abstractmethod
     def inverse_needs_no_solve(self, equations: Equations, interval: Interval, q: State) -> bool:
         """Whether `inverse` is explicit for these equations."""
+
+    def in_loop(self) -> InLoop | None:
+        """The same steps with less work, where they have some in common (None: nowhere)."""
+        return None
+
+    def check(self, equations: Equations, interval: Interval, q: State, p: State) -> None:
+        """**Raises** for a system or a state that this method cannot advance; before a run."""
 
     # Known without equations: a warning about substeps backwards comes before anything is compiled.
     def substeps(self) -> tuple[float, ...]:

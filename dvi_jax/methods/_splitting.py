@@ -1,0 +1,307 @@
+"""Compositions of the flows of the parts of a Hamiltonian."""
+
+import abc
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from lanewise.dependence import depends_on
+
+from .._split import Split
+from .._step import Equations, StepInfo, judge, no_solve, no_step_yet
+from .._system import System
+from .._types import Interval, State
+from ..flows import Flow
+from ._base import InLoop, Method
+from ._gauss_legendre import GaussLegendre
+from ._names import as_method
+from ._schemes import check_scheme, word_of
+from ._strang import Strang
+from ._type_ii import TypeII
+
+Moved = tuple[State, State, StepInfo]
+Part = Callable[[Interval, State, State], Moved]
+
+
+class _Letter(NamedTuple):
+    """One flow of a step: the part, the fractions of the step at its ends, and its length."""
+
+    part: int
+    start: float
+    end: float
+    length: float
+
+    def on(self, interval: Interval) -> Interval:
+        # The length is c h, not a difference of times, in which digits cancel.
+        return interval.part(self.start, self.end)._replace(h=self.length * interval.h)
+
+    def undone(self) -> "_Letter":
+        return _Letter(self.part, self.end, self.start, -self.length)
+
+
+def _letters(word: Sequence[tuple[int, float]], time: float = 0.0) -> list[_Letter]:
+    # The first part carries the time; the others act at a fixed time. A symmetric sum ends at 1 to
+    # the last digit only if its end is not summed up.
+    found, total = [], math.fsum(c for i, c in word if i == 0) + time
+    for i, c in word:
+        end = time + c if i == 0 else time
+        end = total if i == 0 and abs(end - total) < 1e-12 else end
+        found.append(_Letter(i, time, end, c))
+        time = end
+    return found
+
+
+class SplittingMethod(Method):
+    """Base of the methods that compose flows of parts: a step is a word of their letters.
+
+    A subclass gives the parts, in coordinates of its own if it has some.
+    """
+
+    scheme: eqx.AbstractVar[Any]
+
+    is_symplectic: ClassVar[bool] = True
+    is_invertible: ClassVar[bool] = True
+
+    @abc.abstractmethod
+    def parts(self, equations: Equations, interval: Interval, q: State) -> list[Part]:
+        """The flow of each part. **Raises** for a system that has no such parts."""
+
+    def enter(self, equations: Equations, interval: Interval, q: State, p: State) -> Moved:
+        """The state in the coordinates of the parts."""
+        return q, p, no_step_yet(q)
+
+    def leave(self, equations: Equations, interval: Interval, q: State, p: State) -> Moved:
+        """The inverse of `enter`."""
+        return q, p, no_step_yet(q)
+
+    @property
+    def order(self) -> int:
+        """The order; of a scheme for A + εB the order of its error that does not vanish with ε²."""
+        return self.scheme[-1] if isinstance(self.scheme, tuple) else self.scheme.order
+
+    @property
+    def is_symmetric(self) -> bool:
+        """Whether the map is its own adjoint."""
+        return isinstance(self.scheme, tuple) or self.scheme.is_symmetric
+
+    def substeps(self) -> tuple[float, ...]:
+        return tuple(c for i, c in word_of(self.scheme, 2) if i == 1)
+
+    def step(self, equations, interval, q0, p0):
+        letters = _letters(self._word(equations, interval, q0))
+        return self._around(equations, interval, letters, q0, p0)
+
+    def inverse(self, equations, interval, q1, p1):
+        letters = _letters(self._word(equations, interval, q1))
+        back = [letter.undone() for letter in reversed(letters)]
+        return self._around(equations, interval, back, q1, p1)
+
+    def _word(self, equations, interval, q):
+        return word_of(self.scheme, len(self.parts(equations, interval, q)))
+
+    def _around(self, equations, interval, letters, q, p) -> Moved:
+        q, p, first = self.enter(equations, interval, q, p)
+        q, p, info = self.composed(equations, interval, letters, q, p)
+        q, p, last = self.leave(equations, interval, q, p)
+        return q, p, first.then(info).then(last)
+
+    def composed(
+        self, equations: Equations, interval: Interval, letters: list[_Letter], q: State, p: State
+    ) -> Moved:
+        """One flow after another."""
+        parts = self.parts(equations, interval, q)
+
+        def advanced(state, pieces, which):
+            q, p, info = state
+            for i, piece in zip(which, pieces, strict=True):
+                q, p, now = parts[i](piece, q, p)
+                info = info.then(now)
+            return q, p, info
+
+        pieces = [letter.on(interval) for letter in letters]
+        which = [letter.part for letter in letters]
+        state = q, p, no_step_yet(q)
+        # Neighbours differ, so that letters repeat with this period, as in 0 1 2 1 0 1 2 1 0. A loop
+        # is compiled faster.
+        period = max(2 * len(parts) - 2, 1)
+        count = len(letters) // period if len(letters) > 2 * period else 0
+        if count:
+            rounds = [tuple(pieces[k * period : (k + 1) * period]) for k in range(count)]
+            stacked = jax.tree.map(lambda *xs: jnp.stack(xs), *rounds)
+            state, _ = lax.scan(lambda s, x: (advanced(s, x, which[:period]), None), state, stacked)
+        return advanced(state, pieces[count * period :], which[count * period :])
+
+    def in_loop(self):
+        word = word_of(self.scheme, 2)
+        is_alike = self.is_symmetric and word[0] == word[-1] and len(word) > 1
+        return _in_loop(self, word[0][1]) if is_alike else None
+
+    def needs_no_solve(self, equations, interval, q) -> bool:
+        return all(getattr(p, "is_explicit", True) for p in self.parts(equations, interval, q))
+
+    def inverse_needs_no_solve(self, equations, interval, q) -> bool:
+        return self.needs_no_solve(equations, interval, q)
+
+
+def _in_loop(method: SplittingMethod, a: float) -> InLoop:
+    """A(a) W A(a) repeated is A(a) [W A(2a)] … A(−a): one flow of the first part less a step."""
+
+    def before(equations, interval, q, p):
+        q, p, first = method.enter(equations, interval, q, p)
+        letters = [_Letter(0, 0.0, -a, -a)]
+        q, p, info = method.composed(equations, interval, letters, q, p)
+        return q, p, first.then(info)
+
+    def after(equations, interval, q, p):
+        letters = [_Letter(0, 1 - a, 1.0, a)]
+        q, p, info = method.composed(equations, interval, letters, q, p)
+        q, p, last = method.leave(equations, interval, q, p)
+        return q, p, info.then(last)
+
+    return InLoop(before, _Kernel(method, a), after)
+
+
+class _Kernel(Method):
+    """A step without its last flow of the first part, which joins the first one of the next step."""
+
+    outer: SplittingMethod
+    a: float = eqx.field(static=True)
+
+    is_symplectic: ClassVar[bool] = True
+    is_symmetric: ClassVar[bool] = False
+    is_invertible: ClassVar[bool] = False
+
+    @property
+    def order(self) -> int:
+        return self.outer.order
+
+    def step(self, equations, interval, q0, p0):
+        first, *middle, _ = self.outer._word(equations, interval, q0)
+        letters = _letters([(first[0], 2 * self.a), *middle], -self.a)
+        return self.outer.composed(equations, interval, letters, q0, p0)
+
+    def inverse(self, equations, interval, q1, p1):
+        raise NotImplementedError("Only whole steps have an inverse.")
+
+    def needs_no_solve(self, equations, interval, q) -> bool:
+        return self.outer.needs_no_solve(equations, interval, q)
+
+    def inverse_needs_no_solve(self, equations, interval, q) -> bool:
+        return False
+
+
+def _as_scheme(given: Any) -> Any:
+    return tuple(given) if isinstance(given, list) else as_method(given)
+
+
+class Splitting(SplittingMethod):
+    r"""A composition of the flows of the parts of `Split`; the default of such systems.
+
+        Ψ_h = … φ^B_{b₂h} ∘ φ^A_{a₂h} ∘ φ^B_{b₁h} ∘ φ^A_{a₁h}        (a₁ acts first)
+
+    **Arguments** `scheme`: one of
+
+    - a composition, such as `Strang`, `Yoshida`, `BlanesMoan` or `KahanLi`, for any number of parts:
+      its map is one part after the other, its adjoint the same in the opposite order. Neighbouring
+      flows of one part are joined, so that ``Strang()`` is A(h/2) B(h) A(h/2).
+    - generalised orders (n₁, n₂, …) for two parts A + εB, with an error O(ε h^n₁ + ε² h^n₂ + …):
+      (2, 2), (4, 2), … (10, 2) of Laskar & Robutel, (8, 4) of McLachlan, (10, 4), (8, 6, 4) and
+      (10, 6, 4) of Blanes et al. They need a small second part, not a small h.
+
+    A step is explicit where all flows are known or exact. Parts with both q0 and p1 are advanced by
+    `GaussLegendre`, of the order of the scheme.
+
+    **Raises** `TypeError` for another scheme and, in a run, for a system whose H_D is not a
+    `Split`; `ValueError` for unknown orders, and for generalised orders with more than two parts.
+
+    **Accuracy** order conditions hold to round-off.
+
+    **Source** McLachlan & Quispel 2002, *Acta Numerica* 11, 341; Laskar & Robutel 2001, *Celest.
+    Mech. Dyn. Astron.* 80, 39; McLachlan 1995, *BIT* 35, 258; Blanes et al. 2013, *Appl. Numer.
+    Math.* 68, 58, tables 3 and 4.
+
+    **Example**: see `Split`.
+    """
+
+    scheme: Any = eqx.field(static=True, default_factory=Strang, converter=_as_scheme)
+
+    def __check_init__(self):
+        check_scheme(self.scheme)
+
+    def parts(self, equations, interval, q):
+        system = equations.system
+        H = system.H_D
+        if not isinstance(H, Split):
+            raise TypeError(
+                "method=dvi.Splitting(...) requires a system with known parts: "
+                f"dvi.System(dvi.Split([H_A, H_B])). Its H_D is {H!r:.100}."
+            )
+        rest = (system.force, system.perturbation)
+        found = [
+            _part(equations, H_i, i, self.order, rest if i == H.perturbed else (None, None))
+            for i, H_i in enumerate(H.parts)
+        ]
+        if H.perturbed is None and rest != (None, None):
+            found.append(_part(equations, _no_energy, len(found), self.order, rest))
+        return [make(interval, q) for make in found]
+
+
+def _no_energy(t0, t1, q0, p1, args):
+    return jnp.zeros((), q0.dtype)
+
+
+def _part(equations: Equations, H: Any, i: int, order: int, rest: tuple[Any, Any]) -> Callable:
+    if isinstance(H, Flow):
+        return lambda interval, q: _known(equations, H)
+    system = System(H, *rest, slow_time=equations.system.slow_time)
+    own = dataclasses.replace(equations, system=system)
+
+    def made(interval, q):
+        if _is_exact(own, interval, q, timed=i == 0):
+            return lambda interval, q, p: TypeII().step(own, interval, q, p)
+        solved = GaussLegendre(-(-order // 2))
+
+        def part(interval, q, p):
+            return solved.step(own, interval, q, p)
+
+        part.is_explicit = False  # pyright: ignore[reportFunctionMemberAccess]
+        return part
+
+    return made
+
+
+def _known(equations: Equations, flow: Flow) -> Part:
+    def part(interval, q, p):
+        dq, dp, found = flow.change(interval.h, *equations.absolute(q, p), equations.args)
+        q, p = q + dq, p + dp
+        return q, p, judge(no_solve(q)._replace(converged=found), q, p)
+
+    return part
+
+
+def _is_exact(equations: Equations, interval: Interval, like: State, timed: bool) -> bool:
+    """Whether the map (12)–(13) of this part is its flow: a function of q0 or of p1 alone."""
+    t0, t1, _ = interval
+
+    def energy(t, q, p):
+        return equations.system.hamiltonian(t, t1, q, p, equations.epsilon, equations.args)
+
+    def rate(t, p):
+        return equations.momentum_rate(Interval(t, t1, t0), like, p)
+
+    # At a fixed time its value is that of a constant; the first part is advanced in time.
+    if timed and (
+        depends_on(lambda t: energy(t, like, like), 0, t0)
+        or depends_on(lambda t: rate(t, like), 0, t0)
+    ):
+        return False
+    of_p = depends_on(lambda p: energy(t0, like, p), 0, like)
+    if not of_p:
+        return not depends_on(lambda p: rate(t0, p), 0, like)
+    return equations.system.force is None and not depends_on(lambda q: energy(t0, q, like), 0, like)

@@ -1,0 +1,280 @@
+"""Splittings of N bodies around Kepler orbits: the method of Wisdom and Holman."""
+
+from typing import Any, ClassVar, Literal, NamedTuple, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from lanewise.dependence import depends_on
+
+from .. import _kepler
+from .._checks import one_of
+from .._step import Equations, judge, no_solve, no_step_yet
+from .._types import Args, Interval, Scalar, State
+from ..engine.newton import find_root
+from ._schemes import ORDERS_OF_CORRECTORS, check_scheme, corrector, joined
+from ._splitting import SplittingMethod, _as_scheme, _Letter
+from ._strang import Strang
+
+Coordinates = Literal["jacobi", "democratic"]
+
+
+class _Jacobi(NamedTuple):
+    """Row 0 is the centre of mass; row i is body i relative to that of the bodies before it."""
+
+    masses: Array  # (bodies,)
+
+    def of(self, x: Array) -> Array:
+        """Positions, velocities or accelerations of the bodies in these coordinates."""
+        eta = jnp.cumsum(self.masses)[:, None]
+        centres = jnp.cumsum(self.masses[:, None] * x, axis=0) / eta
+        return jnp.concatenate([centres[-1:], x[1:] - centres[:-1]])
+
+    def back(self, X: Array) -> Array:
+        """The inverse of `of`."""
+        part = (self.masses / jnp.cumsum(self.masses))[1:, None]
+        beyond = jnp.cumsum((part * X[1:])[::-1], axis=0)[::-1]
+        centres = X[:1] - jnp.concatenate([beyond, jnp.zeros_like(X[:1])])
+        return centres + jnp.concatenate([jnp.zeros_like(X[:1]), (1 - part) * X[1:]])
+
+    def central_mass(self) -> Array:
+        """The mass at the centre of the Kepler orbit of each row but the first."""
+        return jnp.cumsum(self.masses)[1:]
+
+    def velocities_of(self, v: Array) -> Array:
+        return self.of(v)
+
+    def velocities_back(self, V: Array) -> Array:
+        return self.back(V)
+
+    def drift(self, V: Array) -> Array:
+        """Q' of the part B."""
+        return jnp.zeros_like(V)
+
+
+class _Democratic(NamedTuple):
+    """Row 0 is the centre of mass; the others are heliocentric positions and barycentric
+    velocities."""
+
+    masses: Array
+
+    def _centre(self, x: Array) -> Array:
+        return jnp.sum(self.masses[:, None] * x, axis=0, keepdims=True) / jnp.sum(self.masses)
+
+    def of(self, x: Array) -> Array:
+        return jnp.concatenate([self._centre(x), x[1:] - x[:1]])
+
+    def back(self, X: Array) -> Array:
+        part = self.masses[1:, None] / jnp.sum(self.masses)
+        sun = X[:1] - jnp.sum(part * X[1:], axis=0, keepdims=True)
+        return jnp.concatenate([sun, sun + X[1:]])
+
+    def central_mass(self) -> Array:
+        return jnp.broadcast_to(self.masses[0], self.masses[1:].shape)
+
+    def velocities_of(self, v: Array) -> Array:
+        centre = self._centre(v)
+        return jnp.concatenate([centre, v[1:] - centre])
+
+    def velocities_back(self, V: Array) -> Array:
+        return jnp.concatenate([V[:1] - self._recoil(V), V[:1] + V[1:]])
+
+    def _recoil(self, V: Array) -> Array:
+        momentum = jnp.sum(self.masses[1:, None] * V[1:], axis=0, keepdims=True)
+        return momentum / self.masses[0]
+
+    def drift(self, V: Array) -> Array:
+        recoil = jnp.broadcast_to(self._recoil(V), V[1:].shape)
+        return jnp.concatenate([jnp.zeros_like(V[:1]), recoil])
+
+
+_COORDINATES = {"jacobi": _Jacobi, "democratic": _Democratic}
+
+
+class WisdomHolman(SplittingMethod):
+    r"""The method of Wisdom and Holman: N bodies as Kepler orbits and their weak interaction.
+
+        H_D = T(p) + V(q) = H_A + H_B,    H_A = Kepler orbits and the motion of the centre of mass
+
+    Any `System` with T = Σ |p_i|²/(2 m_i) and positions of shape (bodies, 2 or 3), the dominant body
+    first and the others from the inside to the outside, such as those of `systems.n_body` and
+    `interop.from_rebound`. The masses are read from T. V is not restricted: all that is not in H_A
+    is in H_B, also a perturbation, an oblateness and a force εW. Forces that depend on momenta are
+    solved for by the midpoint rule.
+
+    **Arguments**
+
+    - `coordinates`: "jacobi", or "democratic" (heliocentric positions, barycentric velocities),
+      for bodies whose order changes or that come close to one another.
+    - `corrector`: order 3, 5, 7, 11 or 17 of a symplectic corrector, 0: none; in Jacobi coordinates
+      and with the scheme `Strang`. It removes the terms ε h², ε h⁴, … of the error from saved states. It is
+      applied at save points and where states are observed, so save rarely: one output takes the
+      time of 2 to 16 further steps in both directions.
+    - `scheme`: as for `Splitting`, for example (10, 6, 4) for long steps at high accuracy.
+    - `G`: the gravitational constant in the Kepler part, a number or a function of args; None:
+      ``args["G"]`` if there is one, else 1. Another value changes the accuracy, not the limit.
+
+    Between save points, where nothing is observed, the two half flows at the ends of neighbouring
+    steps are one. An orbit may have any eccentricity. Bodies close to another body than the first
+    are not resolved: use `KahanLi` or `AdaptiveReversible` for close encounters.
+
+    **Raises** `ValueError` for another corrector or other coordinates and, in a run, for positions
+    of another shape, a system that is not T(p) + V(q), and a T of another form.
+
+    **Source** Wisdom & Holman 1991, *Astron. J.* 102, 1528; Duncan, Levison & Lee 1998, *Astron.
+    J.* 116, 2067 (democratic); Wisdom, Holman & Touma 1996, *Fields Inst. Commun.* 10, 217 and
+    Wisdom 2006, *Astron. J.* 131, 2294 (correctors; their coefficients follow here from the linear
+    conditions); Rein & Tamayo 2015, *MNRAS* 452, 376.
+
+    **Example**
+
+    ```python
+    planets = systems.solar_system("2000-01-01")
+    sol = dvi.integrate(planets, h=8.0, num_steps=1000, method=dvi.WisdomHolman(corrector=11),
+                        save=dvi.Save(final=True))
+    print(sol.status)
+    # successful
+    ```
+    """
+
+    coordinates: Coordinates = eqx.field(static=True, default="jacobi")
+    corrector: int = eqx.field(static=True, default=0)
+    scheme: Any = eqx.field(static=True, default_factory=Strang, converter=_as_scheme)
+    G: Any = None
+
+    float64_only: ClassVar[bool] = True
+
+    def __check_init__(self):
+        one_of("coordinates", self.coordinates, get_args(Coordinates))
+        one_of("corrector", self.corrector, (0, *ORDERS_OF_CORRECTORS))
+        check_scheme(self.scheme)
+        if self.corrector and (self.coordinates != "jacobi" or self.scheme != Strang()):
+            raise ValueError(
+                'corrector must be 0 unless coordinates="jacobi" and scheme=dvi.Strang(), for which '
+                f"its coefficients are derived; got corrector={self.corrector}, coordinates="
+                f"{self.coordinates!r}, scheme={self.scheme!r}. For a smaller error use a scheme "
+                "such as (10, 6, 4)."
+            )
+
+    def check(self, equations, interval, q, p):
+        masses = np.asarray(self._frame(equations, interval, q).masses)
+        v = np.asarray(equations.position_rate(interval, q, p))
+        if not (masses > 0).all() or not np.allclose(masses[:, None] * v, p, rtol=1e-10, atol=0):
+            raise ValueError(
+                "method=dvi.WisdomHolman(...) requires a kinetic energy Σ |p_i|²/(2 m_i) with "
+                f"positive masses, but ∂H_D/∂p1 at the initial state is not p/m with m = {masses}. "
+                "Use canonical momenta p = m v, or another method such as dvi.KahanLi(8)."
+            )
+
+    def _frame(self, equations: Equations, interval: Interval, q: State) -> Any:
+        if q.ndim != 2 or q.shape[0] < 2 or q.shape[1] not in (2, 3):
+            raise ValueError(
+                "method=dvi.WisdomHolman(...) requires positions of shape (bodies, 2) or "
+                f"(bodies, 3) with at least two bodies, got shape {q.shape}."
+            )
+
+        def velocity(q, p):
+            return equations.position_rate(interval, q, p)
+
+        def inverse_mass(p):
+            return jax.jvp(lambda p: velocity(q, p), (p,), (jnp.ones_like(p),))[1]
+
+        if depends_on(lambda q: velocity(q, q), 0, q) and depends_on(
+            lambda q: velocity(q, jnp.ones_like(q)), 0, q
+        ):
+            raise ValueError(
+                "method=dvi.WisdomHolman(...) requires H_D = T(p1) + V(q0), but q0 enters "
+                "∂H_D/∂p1. Use another method, such as dvi.GaussLegendre(2)."
+            )
+        if depends_on(inverse_mass, 0, q):
+            raise ValueError(
+                "method=dvi.WisdomHolman(...) requires a kinetic energy that is quadratic in the "
+                "momenta, Σ |p_i|²/(2 m_i). Use another method, such as dvi.KahanLi(8)."
+            )
+        return _COORDINATES[self.coordinates](1 / inverse_mass(q)[:, 0])
+
+    def parts(self, equations, interval, q):
+        frame = self._frame(equations, interval, q)
+        mu = _constant(self.G, equations.args, q) * frame.central_mass()
+        # With an origin states are relative to it, in these coordinates too: they are linear.
+        zero = jnp.zeros_like(q)
+        position, momentum = equations.absolute(zero, zero)
+        base = frame.of(position), frame.velocities_of(momentum / frame.masses[:, None])
+        implicit = not equations.step_is_explicit(interval, q)
+
+        def attraction(X):
+            """The accelerations of the Kepler part."""
+            inner = X[1:]
+            r = jnp.sqrt(jnp.sum(inner * inner, axis=1))
+            pull = -(mu / (r * r * r))[:, None] * inner
+            return jnp.concatenate([jnp.zeros_like(X[:1]), pull])
+
+        def kepler(interval, X, V):
+            h = interval.h
+            whole_X, whole_V = base[0] + X, base[1] + V
+            dX, dV, found = _kepler.change(h, whole_X[1:], whole_V[1:], mu)
+            X1 = X + jnp.concatenate([h * whole_V[:1], dX])
+            V1 = V + jnp.concatenate([jnp.zeros_like(V[:1]), dV])
+            return X1, V1, judge(no_solve(X)._replace(converged=found), X1, V1)
+
+        def rest(interval, X, V):
+            x, h = frame.back(X), interval.h
+            scale = frame.masses[:, None]
+
+            def kick(V):
+                p = scale * frame.velocities_back(V)
+                rate = equations.momentum_rate(interval, x, p) / scale
+                return frame.velocities_of(rate) - attraction(base[0] + X)
+
+            if not implicit:
+                return V + h * kick(V), no_solve(X)
+            start = V.ravel()
+
+            def residual(V1):
+                middle = (V1 + start).reshape(V.shape) / 2
+                return V1 - start - h * kick(middle).ravel()
+
+            guess = start + h * kick(V).ravel()
+            V1, info = find_root(residual, guess, start, equations.newton)
+            return V1.reshape(V.shape), info
+
+        def interaction(interval, X, V):
+            # The recoil of the first body is in this part: half before the kick, half after it.
+            X = X + interval.h / 2 * frame.drift(base[1] + V)
+            V, info = rest(interval, X, V)
+            X = X + interval.h / 2 * frame.drift(base[1] + V)
+            return X, V, judge(info, X, V)
+
+        interaction.is_explicit = not implicit  # pyright: ignore[reportFunctionMemberAccess]
+        return [kepler, interaction]
+
+    def enter(self, equations, interval, q, p):
+        frame = self._frame(equations, interval, q)
+        X, V = frame.of(q), frame.velocities_of(p / frame.masses[:, None])
+        return self._corrected(equations, interval, X, V, 1)
+
+    def leave(self, equations, interval, q, p):
+        X, V, info = self._corrected(equations, interval, q, p, -1)
+        frame = self._frame(equations, interval, X)
+        return frame.back(X), frame.masses[:, None] * frame.velocities_back(V), info
+
+    def _corrected(self, equations, interval, X, V, sign):
+        if not self.corrector:
+            return X, V, no_step_yet(X)
+        # The inverse of Z(a, b) is Z(−a, b), and a and −a are at opposite places: all b change sign.
+        word = joined(
+            letter
+            for a, b in corrector(self.corrector)
+            for letter in ((0, a), (1, sign * b), (0, -2 * a), (1, -sign * b), (0, a))
+        )
+        letters = [_Letter(part, 0.0, 0.0, c) for part, c in word]
+        return self.composed(equations, interval, letters, X, V)
+
+
+def _constant(G: Any, args: Args, like: Array) -> Scalar:
+    if G is None:
+        G = args.get("G", 1.0) if isinstance(args, dict) else 1.0
+    return jnp.asarray(G(args) if callable(G) else G, like.dtype)
