@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING
 
 from lanewise import Layout as Layout
 
+from . import flows as flows
 from ._adapters import (
     from_lagrangian as from_lagrangian,
     from_type_iii as from_type_iii,
     legendre as legendre,
     velocity_force as velocity_force,
 )
-from . import flows as flows
 from ._adjoints import (
     Checkpointed as Checkpointed,
     Direct as Direct,

@@ -299,7 +299,7 @@ def _piece(task: Task, plan: Plan, carry, layout: Layout):
     arrays, rest = eqx.partition(task, eqx.is_array)
 
     def piece(arrays, carry):
-        carry, saved, tail = run(eqx.combine(arrays, rest), plan, carry, lax.scan)
+        carry, saved, tail = run(eqx.combine(arrays, rest), plan, carry, one_loop)
         return carry, with_tail(plan, saved, tail)
 
     return lanewise.call(piece, arrays, carry, layout=layout)

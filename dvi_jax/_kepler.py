@@ -19,7 +19,7 @@ _MOST = 200
 """Maximum number of iterations; a bracket that is halved needs about 60."""
 
 _SHORT = 1e-4
-"""Square of the change of the eccentric anomaly up to which a step of order four may be the last."""
+"""Squared change of the eccentric anomaly up to which a step of order four may be the last one."""
 
 
 class _G(NamedTuple):
@@ -58,7 +58,7 @@ class _Orbit(NamedTuple):
         step = -past / (r + newton * slope / 2)
         step = -past / (r + step * (slope / 2 + step * curve / 6))
         # With ρ the part by which the higher orders change Newton's step, the error is about ρ³
-        # times that step. ρ may be small by chance where the step is long: see the second condition.
+        # times that step. Where the step is long ρ may be small by chance: the second condition.
         change = jnp.abs(step - newton)
         eps = float(jnp.finfo(X.dtype).eps)
         is_last = change * change * change <= eps / 4 * jnp.abs(X) * newton * newton

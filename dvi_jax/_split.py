@@ -21,8 +21,8 @@ class Split(eqx.Module):
     **Arguments**
 
     - `parts`: functions ``(t0, t1, q0, p1, args)`` → scalar [energy], or objects of `dvi.flows`
-      such as ``flows.Kepler()``. Of a part that depends on p1 alone or on q0 alone the map (12)–(13)
-      is the exact flow; of others it is computed by a Gauss–Legendre method of the same order.
+      such as ``flows.Kepler()``. The flow of a part that depends on p1 alone or on q0 alone is its
+      map (12)–(13). That of others is computed by a Gauss–Legendre method of the same order.
     - `flows`: for each part None or a function ``(h, q, p, args)`` → (q, p), its flow.
     - `perturbed`: number of the part to which the perturbing force and the perturbation of the
       `System` belong; its flow is then computed with them. None: they are a part of their own,
@@ -64,8 +64,8 @@ class Split(eqx.Module):
         given = [None] * len(parts) if flows is None else list(flows)
         if len(given) != len(parts):
             raise ValueError(
-                f"flows of Split must have one entry for each of the {len(parts)} parts, None where "
-                f"the flow is not known, got {len(given)} entries."
+                f"flows of Split must have one entry for each of the {len(parts)} parts, None for "
+                f"a flow that is not known, got {len(given)} entries."
             )
         for i, (H, flow) in enumerate(zip(parts, given, strict=True)):
             check_takes(f"part {i} of Split", H, "(t0, t1, q0, p1, args)")

@@ -81,9 +81,9 @@ def word_of(scheme: Any, parts: int) -> Word:
         assert found is not None
         if parts != 2:
             raise ValueError(
-                f"the scheme {scheme} requires two parts, A + εB, got {parts}. Join the parts of B, "
-                "or name the part that contains the perturbation in dvi.Split(..., perturbed=1), "
-                "or use a scheme for any number of parts, such as dvi.Strang()."
+                f"the scheme {scheme} requires two parts, A + εB, got {parts}. Join the parts of "
+                "B, or name the part that contains the perturbation in dvi.Split(..., "
+                "perturbed=1), or use a scheme for any number of parts, such as dvi.Strang()."
             )
         a, b = found
         pairs = itertools.zip_longest(a, b)
@@ -114,8 +114,8 @@ def check_scheme(scheme: Any) -> None:
     elif not isinstance(scheme, CompositionMethod) or scheme.base != TypeII():
         hint = "Its base must be dvi.TypeII()." if isinstance(scheme, Method) else known
         raise TypeError(
-            "scheme must be a composition, such as dvi.Strang() or dvi.BlanesMoan(6), or a tuple of "
-            f"generalised orders, such as (8, 4), got {scheme!r}. {hint}"
+            "scheme must be a composition, such as dvi.Strang() or dvi.BlanesMoan(6), or a tuple "
+            f"of generalised orders, such as (8, 4), got {scheme!r}. {hint}"
         )
 
 

@@ -127,8 +127,8 @@ class SplittingMethod(Method):
         pieces = [letter.on(interval) for letter in letters]
         which = [letter.part for letter in letters]
         state = q, p, no_step_yet(q)
-        # Neighbours differ, so that letters repeat with this period, as in 0 1 2 1 0 1 2 1 0. A loop
-        # is compiled faster.
+        # Neighbours differ, so that letters repeat with this period, as in 0 1 2 1 0 1 2 1 0. A
+        # loop over periods is compiled faster than all letters.
         period = max(2 * len(parts) - 2, 1)
         count = len(letters) // period if len(letters) > 2 * period else 0
         if count:
@@ -168,7 +168,7 @@ def _in_loop(method: SplittingMethod, a: float) -> InLoop:
 
 
 class _Kernel(Method):
-    """A step without its last flow of the first part, which joins the first one of the next step."""
+    """A step without its last flow of the first part, which joins that of the next step."""
 
     outer: SplittingMethod
     a: float = eqx.field(static=True)
@@ -207,8 +207,8 @@ class Splitting(SplittingMethod):
 
     **Arguments** `scheme`: one of
 
-    - a composition, such as `Strang`, `Yoshida`, `BlanesMoan` or `KahanLi`, for any number of parts:
-      its map is one part after the other, its adjoint the same in the opposite order. Neighbouring
+    - a composition, such as `Strang`, `Yoshida`, `BlanesMoan` or `KahanLi`, for any number of
+      parts: its map is one part after the other, its adjoint the opposite order. Neighbouring
       flows of one part are joined, so that ``Strang()`` is A(h/2) B(h) A(h/2).
     - generalised orders (n₁, n₂, …) for two parts A + εB, with an error O(ε h^n₁ + ε² h^n₂ + …):
       (2, 2), (4, 2), … (10, 2) of Laskar & Robutel, (8, 4) of McLachlan, (10, 4), (8, 6, 4) and

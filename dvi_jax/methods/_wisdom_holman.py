@@ -99,8 +99,8 @@ class WisdomHolman(SplittingMethod):
 
         H_D = T(p) + V(q) = H_A + H_B,    H_A = Kepler orbits and the motion of the centre of mass
 
-    Any `System` with T = Σ |p_i|²/(2 m_i) and positions of shape (bodies, 2 or 3), the dominant body
-    first and the others from the inside to the outside, such as those of `systems.n_body` and
+    Any `System` with T = Σ |p_i|²/(2 m_i) and positions of shape (bodies, 2 or 3), the dominant
+    body first and the others from the inside to the outside, such as those of `systems.n_body` and
     `interop.from_rebound`. The masses are read from T. V is not restricted: all that is not in H_A
     is in H_B, also a perturbation, an oblateness and a force εW. Forces that depend on momenta are
     solved for by the midpoint rule.
@@ -109,10 +109,10 @@ class WisdomHolman(SplittingMethod):
 
     - `coordinates`: "jacobi", or "democratic" (heliocentric positions, barycentric velocities),
       for bodies whose order changes or that come close to one another.
-    - `corrector`: order 3, 5, 7, 11 or 17 of a symplectic corrector, 0: none; in Jacobi coordinates
-      and with the scheme `Strang`. It removes the terms ε h², ε h⁴, … of the error from saved states. It is
-      applied at save points and where states are observed, so save rarely: one output takes the
-      time of 2 to 16 further steps in both directions.
+    - `corrector`: order 3, 5, 7, 11 or 17 of a symplectic corrector, 0: none; in Jacobi
+      coordinates and with the scheme `Strang`. It removes the terms ε h², ε h⁴, … of the error from
+      saved states. It is applied at save points and where states are observed, so save rarely: one
+      output takes the time of 8 (order 3) to 64 (order 17) further steps.
     - `scheme`: as for `Splitting`, for example (10, 6, 4) for long steps at high accuracy.
     - `G`: the gravitational constant in the Kepler part, a number or a function of args; None:
       ``args["G"]`` if there is one, else 1. Another value changes the accuracy, not the limit.
@@ -153,8 +153,8 @@ class WisdomHolman(SplittingMethod):
         check_scheme(self.scheme)
         if self.corrector and (self.coordinates != "jacobi" or self.scheme != Strang()):
             raise ValueError(
-                'corrector must be 0 unless coordinates="jacobi" and scheme=dvi.Strang(), for which '
-                f"its coefficients are derived; got corrector={self.corrector}, coordinates="
+                'corrector must be 0 unless coordinates="jacobi" and scheme=dvi.Strang(), for '
+                f"which its coefficients are derived; got corrector={self.corrector}, coordinates="
                 f"{self.coordinates!r}, scheme={self.scheme!r}. For a smaller error use a scheme "
                 "such as (10, 6, 4)."
             )
@@ -264,7 +264,7 @@ class WisdomHolman(SplittingMethod):
     def _corrected(self, equations, interval, X, V, sign):
         if not self.corrector:
             return X, V, no_step_yet(X)
-        # The inverse of Z(a, b) is Z(−a, b), and a and −a are at opposite places: all b change sign.
+        # The inverse of Z(a, b) is Z(−a, b), and a and −a are at opposite places: b changes sign.
         word = joined(
             letter
             for a, b in corrector(self.corrector)
