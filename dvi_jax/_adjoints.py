@@ -12,18 +12,7 @@ import lanewise
 from lanewise import Layout
 
 from ._checks import whole
-from ._rollout import (
-    Loop,
-    Outcome,
-    Plan,
-    Task,
-    adds_start_outside,
-    one_loop,
-    outcome,
-    run,
-    start,
-    with_start,
-)
+from ._rollout import Loop, Outcome, Plan, Task, adds_start_outside, outcome, run, start, with_start
 from ._types import State
 
 
@@ -65,7 +54,7 @@ class Direct(AbstractAdjoint):
     """
 
     def rollout(self, task, plan, q0, p0, layout=Layout()):
-        return _direct_rollout(task, plan, q0, p0, one_loop, layout)
+        return _direct_rollout(task, plan, q0, p0, lax.scan, layout)
 
 
 class Checkpointed(AbstractAdjoint):
@@ -86,16 +75,16 @@ class Checkpointed(AbstractAdjoint):
     def rollout(self, task, plan, q0, p0, layout=Layout()):
         return _direct_rollout(task, plan, q0, p0, self._loop, layout)
 
-    def _loop(self, body, carry, _, count, scan=lax.scan):
+    def _loop(self, body, carry, _, count):
         # √count segments of √count steps: the memory is that of the segment starts and of the
         # steps of one segment, whose sum is then smallest.
         segments = min(self.segments or math.isqrt(count), count)
         size = count // max(segments, 1)
         if size < 2:  # nothing would be recomputed
-            return scan(body, carry, None, count)
+            return lax.scan(body, carry, None, count)
 
         def segment(length):
-            return jax.checkpoint(lambda carry, _: scan(body, carry, None, length))
+            return jax.checkpoint(lambda carry, _: lax.scan(body, carry, None, length))
 
         carry, ys = lax.scan(segment(size), carry, None, segments)
         ys = jax.tree.map(lambda y: y.reshape(-1, *y.shape[2:]), ys)

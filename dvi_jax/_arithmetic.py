@@ -135,6 +135,12 @@ class DoubleDouble(Arithmetic):
                 'call jax.config.update("jax_enable_x64", True) first and convert them, or use '
                 "arithmetic=dvi.Compensated()."
             )
+        if method.is_double_only(equations):
+            raise ValueError(
+                f"arithmetic=dvi.DoubleDouble() cannot be used with method={method!r:.100}, whose "
+                "Kepler flow is accurate to float64 only. Use arithmetic=dvi.Compensated(), or "
+                "another method such as dvi.KahanLi(8)."
+            )
         return equations, q0, p0
 
     def start(self, q0, p0):

@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, PyTree
 
 import lanewise
@@ -33,7 +34,6 @@ from ._rollout import (
     StepTaken,
     Task,
     make_plan,
-    one_loop,
     reduce,
     run,
     start,
@@ -299,7 +299,7 @@ def _piece(task: Task, plan: Plan, carry, layout: Layout):
     arrays, rest = eqx.partition(task, eqx.is_array)
 
     def piece(arrays, carry):
-        carry, saved, tail = run(eqx.combine(arrays, rest), plan, carry, one_loop)
+        carry, saved, tail = run(eqx.combine(arrays, rest), plan, carry, lax.scan)
         return carry, with_tail(plan, saved, tail)
 
     return lanewise.call(piece, arrays, carry, layout=layout)

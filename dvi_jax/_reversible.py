@@ -20,7 +20,6 @@ from ._rollout import (
     Outcome,
     Task,
     adds_start_outside,
-    one_loop,
     outcome,
     piece_length,
     run,
@@ -86,7 +85,7 @@ class Reversible(AbstractAdjoint):
         def forward(inputs, whole):
             theta, q0, p0 = inputs
             task = eqx.combine(theta, whole, fixed)
-            ran = run(task, plan, start(task, q0, p0), one_loop, self._inner_loop)
+            ran = run(task, plan, start(task, q0, p0), lax.scan, self._inner_loop)
             out = outcome(task, plan, ran, q0, p0)
             kept, counts = eqx.partition(out.saved, eqx.is_inexact_array)
             return Smooth(out.carry.q, out.carry.p, kept, out.reduced), (*ran, counts)
@@ -179,22 +178,22 @@ class Reversible(AbstractAdjoint):
         # The differentiable outputs take the place of their copies in the carry, which have none.
         return Outcome(carry._replace(q=smooth.q, p=smooth.p), kept, smooth.reduced, rebuilt)
 
-    def _inner_loop(self, body, state, _, count, scan=lax.scan):
+    def _inner_loop(self, body, state, _, count, state_of):
         """A scan over the steps of a block that stores a state every `checkpoint_every` steps."""
         size = piece_length(count, self.checkpoint_every)
         segments = (count - 1) // size  # the end of the block is saved anyway
         if segments == 0:
-            return scan(body, state, None, count)
+            return lax.scan(body, state, None, count)
 
         def segment(state, _):
-            state, _ = scan(body, state, None, size)
-            return state, (state[0].q, state[0].p)
+            state, _ = lax.scan(body, state, None, size)
+            return state, state_of(state)
 
         if count % size == 0:  # one loop to compile instead of two
             state, ends = lax.scan(segment, state, None, segments + 1)
             return state, jax.tree.map(lambda x: x[:-1], ends)
         state, ends = lax.scan(segment, state, None, segments)
-        state, _ = scan(body, state, None, count - segments * size)
+        state, _ = lax.scan(body, state, None, count - segments * size)
         return state, ends
 
 

@@ -1,7 +1,6 @@
 """The loop over the steps of a time grid, with status, saved states and observables."""
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -35,8 +34,7 @@ from .observe import (
 from .observe._kept import Start, as_row, event
 
 Loop = Callable[[Callable, Any, None, int], tuple[Any, Any]]
-"""``(body, carry, None, count, scan) -> (carry, ys)``, made of calls of `scan`: one with another
-derivative than that of `lax.scan`, or `one_loop`."""
+"""``(body, carry, None, count) -> (carry, ys)``: `lax.scan`, or one with another derivative."""
 
 
 class Task(eqx.Module):
@@ -359,53 +357,23 @@ def _stop(
     return RESULTS.where(now, RESULTS.stopped, result), jnp.where(now, row, carry.stop)
 
 
-def one_loop(body: Callable, carry: Any, _: None, count: int, scan: Callable = lax.scan) -> Any:
-    """A loop without another derivative than its own."""
-    return scan(body, carry, None, count)
-
-
-def _scan(task: Task) -> Callable:
-    """`lax.scan` over steps of the body of `run`, with less work where the method can save some."""
-    plain = type(task.lattice) is Uniform and task.arithmetic.is_plain and task.stop is None
-    alone, reductions = task.observables()
-    # Reductions read each state of the method, not those of its kernel.
-    quick = task.method.in_loop() if plain and not reductions else None
-    if quick is None:
-        return lax.scan
-    inner = dataclasses.replace(task, method=quick.kernel)
-
-    def moved(carry, by, k):
-        q, p, info = by(task.equations, task.interval(k), carry.q, carry.p)
-        good = info.result == RESULTS.successful
-        state = _noted(carry, q, p, info.result, good, lax.stop_gradient(info.residual))
-        names = "q", "p", "result", "failed_step", "failed_residual"
-        return carry._replace(**dict(zip(names, state, strict=True)))
-
-    def kernel(carry, _):
-        return take_step(inner, carry)[0], None
-
-    def scan(body, state, _, count):
-        if count < 3:
-            return lax.scan(body, state, None, count)
-        carry, last = state
-        carry = moved(carry, quick.before, carry.k)
-        carry, _ = lax.scan(kernel, carry, None, count - bool(alone))
-        carry = moved(carry, quick.after, carry.k - 1)
-        # Functions at a save point read the state before the last step, which is then a whole one.
-        return body((carry, last), None) if alone else ((carry, last), None)
-
-    return scan
-
-
 def run(
-    task: Task, plan: Plan, carry: Carry, loop: Loop, inner_loop: Loop | None = None
+    task: Task, plan: Plan, carry: Carry, loop: Loop, inner_loop: Callable | None = None
 ) -> tuple[Carry, Saved, Saved | None]:
     """All steps of `plan`: the carry, the saved values of the blocks, those of the tail (or None).
 
-    `loop` runs over the blocks, `inner_loop` (the same if None) over the steps of one block.
+    `loop` runs over the blocks, `inner_loop` over the steps of one block: the same loop if None,
+    else it is given a function as well, the state of a carry.
     """
-    inner_loop = functools.partial(loop if inner_loop is None else inner_loop, scan=_scan(task))
     alone, _ = task.observables()
+    task, opened, closed = _in_loop(task)
+    carry = opened(carry)
+
+    def over_steps(body, state, count):
+        if inner_loop is None:
+            return loop(body, state, None, count)
+        return inner_loop(body, state, None, count, lambda state: closed(state[0])[1:3])
+
     has_memory = task.lattice.has_memory
 
     def last_of(carry, interval, taken):
@@ -424,19 +392,45 @@ def run(
             carry, interval, taken = take_step(task, carry)
         else:
             before = last_of(carry, interval, StepTaken(*interval[:2], *[carry.q, carry.p] * 2))
-            (carry, (now, before)), inner = inner_loop(body, (carry, before), None, count)
+            (carry, (now, before)), inner = over_steps(body, (carry, before), count)
             interval = now if has_memory else interval
             q0, p0 = before if alone else (carry.q, carry.p)
             taken = StepTaken(interval.t0, interval.t1, q0, p0, carry.q, carry.p)
+        end = closed(carry)
+        if end is not carry:
+            start = closed(carry._replace(k=carry.k - 1, q=taken.q0, p=taken.p0))
+            taken = StepTaken(*taken[:2], start.q, start.p, end.q, end.p)
         observed = task.at_save(carry, taken)
-        return carry, Saved(interval.t1, interval.h, carry.q, carry.p, observed, inner)
+        return carry, Saved(interval.t1, interval.h, end.q, end.p, observed, inner)
 
     carry, saved = loop(steps, carry, None, plan.num_blocks)
     # The tail is outside of the scan, whose rows all have the same number of steps.
     if not plan.tail:
-        return carry, saved, None
+        return closed(carry), saved, None
     carry, tail = steps(carry, None, plan.tail)
-    return carry, saved, tail
+    return closed(carry), saved, tail
+
+
+def _in_loop(task: Task) -> tuple[Task, Callable[[Carry], Carry], Callable[[Carry], Carry]]:
+    """The task of the loop, and the functions from a carry to that of the loop and back."""
+    equal = type(task.lattice) is Uniform and task.arithmetic.is_plain and task.stop is None
+    # Reductions read the states of all steps.
+    quick = task.method.in_loop() if equal and not task.observables()[1] else None
+    if quick is None:
+        return task, lambda carry: carry, lambda carry: carry
+
+    def moved(by, carry, k):
+        q, p, info = by(task.equations, task.interval(k), carry.q, carry.p)
+        good = info.result == RESULTS.successful
+        state = _noted(carry, q, p, info.result, good, lax.stop_gradient(info.residual))
+        names = "q", "p", "result", "failed_step", "failed_residual"
+        return carry._replace(**dict(zip(names, state, strict=True)))
+
+    return (
+        dataclasses.replace(task, method=quick.kernel),
+        lambda carry: moved(quick.before, carry, carry.k),
+        lambda carry: moved(quick.after, carry, carry.k - 1),
+    )
 
 
 def outcome(

@@ -63,6 +63,10 @@ class Method(eqx.Module):
     def check(self, equations: Equations, interval: Interval, q: State, p: State) -> None:
         """**Raises** for a system or a state that this method cannot advance; before a run."""
 
+    def is_double_only(self, equations: Equations) -> bool:
+        """Whether a step has the accuracy of float64 also where its operations have more digits."""
+        return False
+
     # Known without equations: a warning about substeps backwards comes before anything is compiled.
     def substeps(self) -> tuple[float, ...]:
         """The lengths of the substeps as fractions of h; negative ones go backwards in time."""

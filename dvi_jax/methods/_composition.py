@@ -61,6 +61,12 @@ class CompositionMethod(Method):
     def is_made_of_the_map(self) -> bool:
         return self.base.is_made_of_the_map()
 
+    def check(self, equations, interval, q, p):
+        self.base.check(equations, interval, q, p)
+
+    def is_double_only(self, equations) -> bool:
+        return self.base.is_double_only(equations)
+
     @property
     def has_negative_substeps(self) -> bool:
         """Whether a substep goes backwards in time, where a dissipative force increases motion."""

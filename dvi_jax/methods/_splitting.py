@@ -17,7 +17,7 @@ from .._split import Split
 from .._step import Equations, StepInfo, judge, no_solve, no_step_yet
 from .._system import System
 from .._types import Interval, State
-from ..flows import Flow
+from ..flows import Flow, Kepler
 from ._base import InLoop, Method
 from ._gauss_legendre import GaussLegendre
 from ._names import as_method
@@ -233,6 +233,9 @@ class Splitting(SplittingMethod):
 
     def __check_init__(self):
         check_scheme(self.scheme)
+
+    def is_double_only(self, equations) -> bool:
+        return any(isinstance(part, Kepler) for part in getattr(equations.system.H_D, "parts", ()))
 
     def parts(self, equations, interval, q):
         system = equations.system

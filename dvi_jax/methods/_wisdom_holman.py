@@ -1,6 +1,6 @@
 """Splittings of N bodies around Kepler orbits: the method of Wisdom and Holman."""
 
-from typing import Any, ClassVar, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import equinox as eqx
 import jax
@@ -145,8 +145,6 @@ class WisdomHolman(SplittingMethod):
     scheme: Any = eqx.field(static=True, default_factory=Strang, converter=_as_scheme)
     G: Any = None
 
-    float64_only: ClassVar[bool] = True
-
     def __check_init__(self):
         one_of("coordinates", self.coordinates, get_args(Coordinates))
         one_of("corrector", self.corrector, (0, *ORDERS_OF_CORRECTORS))
@@ -158,6 +156,9 @@ class WisdomHolman(SplittingMethod):
                 f"{self.coordinates!r}, scheme={self.scheme!r}. For a smaller error use a scheme "
                 "such as (10, 6, 4)."
             )
+
+    def is_double_only(self, equations) -> bool:
+        return True
 
     def check(self, equations, interval, q, p):
         masses = np.asarray(self._frame(equations, interval, q).masses)
