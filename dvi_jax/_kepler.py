@@ -4,6 +4,7 @@ import math
 from fractions import Fraction
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
@@ -78,6 +79,8 @@ class _Orbit(NamedTuple):
         return step, past, is_last & (jnp.abs(self.beta) * newton * newton <= _SHORT)
 
 
+# Jitted, so that all calls in a run share one trace, and one trace of the derivative.
+@jax.jit
 def change(h: Scalar, q: Array, v: Array, mu: Array) -> tuple[Array, Array, Array]:
     r"""The changes of position and velocity on Kepler orbits over the time h.
 

@@ -1,0 +1,420 @@
+"""Splitting methods: known flows, generalised orders, and the method of Wisdom and Holman."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import central_difference
+
+import dvi_jax as dvi
+from dvi_jax import flows, systems
+from dvi_jax._kepler import change
+from dvi_jax.methods._schemes import corrector, near_integrable, word_of
+from dvi_jax.systems.n_body import hamiltonian
+
+Q0, P0 = np.array([1.0, 0.0]), np.array([0.2, 1.1])
+
+
+def quartic(t0, t1, q0, p1, args):
+    return args["eps"] * jnp.sum(q0**4)
+
+
+SPLIT = dvi.System(dvi.Split([flows.Kepler(k=1.0), quartic]))
+
+
+def end(method, h, num_steps, system=SPLIT, eps=1e-3, **options):
+    sol = dvi.integrate(
+        system, Q0, P0, h=h, num_steps=num_steps, args={"eps": eps}, method=method,
+        save=dvi.Save(final=True), **options,
+    )  # fmt: skip
+    return np.concatenate([sol.qs[-1], sol.ps[-1]])
+
+
+# --- the Kepler flow -----------------------------------------------------------------------------
+
+
+def orbit(eccentricity):
+    """A state at the pericentre of an orbit with μ = 1, and the semi-latus rectum 1."""
+    q_min = 1 / (1 + eccentricity)
+    return np.array([q_min, 0.0, 0.0]), np.array([0.0, 1 / q_min, 0.0])
+
+
+@jax.jit
+def advanced(h, q, v):
+    def one(h, q, v):
+        dq, dv, found = change(h, q[None], v[None], jnp.ones(1))
+        return q + dq[0], v + dv[0], found
+
+    return jax.vmap(one)(h, q, v)
+
+
+def test_kepler_flow_conserves_the_orbit_for_all_eccentricities_and_long_steps():
+    eccentricities = np.repeat([0.0, 0.3, 0.9, 0.999, 1.0, 1.2, 10.0], 6)
+    hs = np.tile([1e-3, 0.3, -2.0, 20.0, -300.0, 4000.0], 7)
+    q, v = map(np.array, zip(*map(orbit, eccentricities), strict=True))
+    q1, v1, found = advanced(hs, q, v)
+    assert found.all()
+    eccentricity = np.cross(v1, np.cross(q1, v1)) - q1 / np.linalg.norm(q1, axis=1)[:, None]
+    # The energy is a difference of large terms: its error is relative to the kinetic energy.
+    scale = 1 + eccentricities**2 + (v1**2).sum(1)
+    momentum = np.linalg.norm(np.cross(q1, v1), axis=1)
+    assert np.abs(momentum - 1).max() < 3e-9  # |q| ≈ 4e4 at the end of the longest arcs
+    assert (np.abs(eccentricity[:, 0] - eccentricities) / scale).max() < 3e-9
+    # Back to the start by −h.
+    q2, v2, _ = advanced(-hs, q1, v1)
+    short = np.abs(hs) < 3
+    assert np.abs(q2 - q)[short].max() < 2e-13
+    assert np.abs(v2 - v)[short].max() < 2e-11  # the speed at the pericentre for e = 10 is 11
+
+
+def test_kepler_flow_agrees_with_kepler_equation():
+    # M = E − e sin E by a solver of our own here: bisection in the eccentric anomaly.
+    e, a = 0.7, 1 / (1 - 0.49)
+    q, v = orbit(e)
+    h = np.linspace(-20, 20, 9)
+    mean = h / a**1.5
+    low, high = mean - 1, mean + 1
+    for _ in range(60):
+        middle = (low + high) / 2
+        late = middle - e * np.sin(middle) > mean
+        low, high = np.where(late, low, middle), np.where(late, middle, high)
+    exact = a * np.stack([np.cos(low) - e, np.sqrt(1 - e * e) * np.sin(low)], 1)
+    found, _, _ = advanced(h, np.tile(q, (9, 1)), np.tile(v, (9, 1)))
+    assert np.abs(found[:, :2] - exact).max() < 1e-13
+
+
+def test_derivative_of_kepler_flow_on_both_sides_of_a_parabola():
+    def final(x):
+        dq, dv, _ = change(x[0], x[None, 1:3], x[None, 3:5], x[5:])
+        return jnp.concatenate([dq[0], dv[0]])
+
+    derivative = jax.jit(jax.jacfwd(final))
+    for speed in (0.9, np.sqrt(2.0), 1.9):
+        x = jnp.array([2.5, 1.0, 0.1, -0.2, speed, 1.0])
+        for i in range(6):
+            ours = derivative(x)[:, i]
+            other = central_difference(jax.jit(final), x, jnp.eye(6)[i], step=1e-4)
+            assert np.abs(ours - other).max() < 2e-10 * max(1, np.abs(ours).max())
+
+
+def test_a_body_at_the_centre_fails_and_does_not_affect_the_others():
+    def run(q0):
+        return dvi.integrate(
+            SPLIT, q0, P0, h=0.1, num_steps=5, args={"eps": 1e-3}, throw=False,
+            save=dvi.Save(final=True),
+        )  # fmt: skip
+
+    sol = jax.vmap(run)(jnp.array([[1.0, 0.0], [0.0, 0.0], [1.0, 0.0]]))
+    assert sol.status.tolist() == ["successful", "not_finite", "successful"]
+    np.testing.assert_array_equal(sol.qs[0], sol.qs[2])
+
+
+@pytest.mark.parametrize(
+    "flow",
+    [
+        flows.Kepler(k=1.3, mass=0.7),
+        flows.Harmonic(omega=np.array([0.0, 2.0]), mass=0.7),
+        flows.Rotation(rate=0.4),
+    ],
+    ids=lambda flow: type(flow).__name__,
+)
+def test_flows_belong_to_their_hamiltonians(flow):
+    # The derivative of the flow is the vector field of H, also after a finite time.
+    def state(h):
+        dq, dp, _ = flow.change(h, jnp.asarray(Q0), jnp.asarray(P0), None)
+        return Q0 + dq, P0 + dp
+
+    (q, p), (dq, dp) = jax.jvp(state, (0.3,), (1.0,))
+    of_q, of_p = jax.grad(lambda q, p: flow(0.0, 0.0, q, p, None), argnums=(0, 1))(q, p)
+    np.testing.assert_allclose([dq, dp], [of_p, -of_q], atol=1e-14)
+    assert np.abs(state(0.0)[0] - Q0).max() == 0
+
+
+# --- schemes -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("orders", [(2, 2), (8, 2), (8, 4), (10, 4), (8, 6, 4), (10, 6, 4)])
+def test_perturbation_is_integrated_by_a_quadrature_of_the_first_order(orders):
+    # To first order in ε a scheme is the quadrature Σ b_i f(c_i), with c_i = a_1 + … + a_i.
+    a, b = near_integrable(orders)
+    nodes = np.cumsum(a)[:-1]
+    moments = [abs(np.sum(b * nodes**k) - 1 / (k + 1)) for k in range(orders[0] + 1)]
+    assert max(moments[: orders[0]]) < 5e-16
+    assert moments[orders[0]] > 1e-7  # and not by a better one
+
+
+def test_words_join_neighbouring_flows():
+    assert word_of(dvi.Strang(), 3) == ((0, 0.5), (1, 0.5), (2, 1.0), (1, 0.5), (0, 0.5))
+    found = word_of(dvi.BlanesMoan(4), 2)
+    assert [i for i, _ in found] == [0, 1] * 6 + [0]
+    # The published coefficients of Blanes & Moan 2002, table 2, S₆.
+    assert found[0][1] == pytest.approx(0.0792036964311957, abs=1e-15)
+    assert found[1][1] == pytest.approx(0.209515106613362, abs=1e-15)
+
+
+def test_corrector_cancels_the_error_of_leapfrog_to_its_order():
+    def left(order, x):
+        error = x / (2 * np.sinh(x / 2)) - 1
+        return error - sum(2 * b * x * np.sinh(a * x) for a, b in corrector(order))
+
+    x = 0.5
+    assert abs(left(3, x)) > 1e-5
+    assert abs(left(3, x) / left(3, x / 2)) == pytest.approx(16, rel=0.1)
+    assert abs(left(7, x) / left(7, x / 2)) == pytest.approx(256, rel=0.1)
+    # The printed value of order 3, Wisdom, Holman & Touma 1996.
+    assert abs(corrector(3)[1][1]) == pytest.approx(0.0249005960278, abs=1e-12)
+
+
+def test_orders_in_h():
+    exact = end(dvi.Splitting(dvi.KahanLi(8)), 0.05, 160)
+    steps = np.array([20, 30, 40, 60])
+    for scheme, order in ((dvi.Strang(), 2), (dvi.BlanesMoan(6), 6)):
+        errors = [np.abs(end(dvi.Splitting(scheme), 8 / n, int(n)) - exact).max() for n in steps]
+        found = np.log(errors[0] / errors[-1]) / np.log(3)
+        assert found == pytest.approx(order, abs=0.35), (scheme, errors)
+
+
+def test_generalised_orders_in_epsilon_and_h():
+    """The error of (8, 4) is O(ε h⁸ + ε² h⁴): for small ε it falls as h⁸, for larger ones as h⁴."""
+
+    def errors(eps, steps):
+        exact = end(dvi.Splitting(dvi.KahanLi(8)), 0.05, 160, eps=eps)
+        return [np.abs(end(dvi.Splitting((8, 4)), 8 / n, n, eps=eps) - exact).max() for n in steps]
+
+    small, large = errors(1e-6, (8, 12)), errors(3e-2, (48, 96))
+    assert np.log(small[0] / small[1]) / np.log(1.5) > 6.5
+    assert np.log2(large[0] / large[1]) == pytest.approx(4, abs=0.35)
+    # The negative control: the error of leapfrog is proportional to ε, and falls as h².
+    exact = end(dvi.Splitting(dvi.KahanLi(8)), 0.05, 160, eps=1e-6)
+    strang = [np.abs(end(dvi.Splitting(), 8 / n, n, eps=1e-6) - exact).max() for n in (24, 36)]
+    assert np.log(strang[0] / strang[1]) / np.log(1.5) == pytest.approx(2, abs=0.5)
+
+
+def test_parts_that_are_not_exact_are_solved_to_the_order_of_the_scheme():
+    def coupled(t0, t1, q0, p1, args):
+        return args["eps"] * (q0 @ p1) ** 2
+
+    system = dvi.System(dvi.Split([flows.Harmonic(omega=1.3), coupled]))
+    exact = end(dvi.GaussLegendre(4), 0.02, 200, system, eps=0.1)
+    errors = [
+        np.abs(end(dvi.Splitting(dvi.BlanesMoan(4)), 4 / n, n, system, eps=0.1) - exact).max()
+        for n in (10, 20)
+    ]
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(4, abs=0.4)
+    assert not dvi.Splitting().is_explicit(system, Q0, {"eps": 0.1})
+    assert dvi.Splitting().is_explicit(SPLIT, Q0, {"eps": 0.1})
+
+
+@pytest.mark.parametrize("perturbed", [None, 1])
+def test_perturbing_force_and_time_enter_a_part(perturbed):
+    def force(t0, t1, q0, p1, args):
+        return -p1 + jnp.cos(t0)
+
+    def make(method):
+        parts = dvi.Split([flows.Kepler(), quartic], perturbed=perturbed)
+        return end(method, 0.1, 40, dvi.System(parts, force=force), epsilon=0.05)
+
+    def plain(t0, t1, q0, p1, args):
+        return p1 @ p1 / 2 - 1 / jnp.sqrt(q0 @ q0) + quartic(t0, t1, q0, p1, args)
+
+    exact = end(dvi.GaussLegendre(4), 0.02, 200, dvi.System(plain, force=force), epsilon=0.05)
+    assert np.abs(make(dvi.Splitting(dvi.BlanesMoan(6))) - exact).max() < 1e-7
+    assert 1e-7 < np.abs(make(dvi.Splitting()) - exact).max() < 1e-2
+
+
+def symplectic_defect(method, system, q, p, args=None, h=0.3):
+    """The defect of MᵀJM = J for the derivative M of one step, and that of an inverse step."""
+    n = q.size
+
+    def step(z):
+        sol = dvi.integrate(
+            system, z[:n].reshape(q.shape), z[n:].reshape(q.shape), h=h, num_steps=1, args=args,
+            method=method, save=dvi.Save(final=True), throw=False,
+            adjoint=dvi.Reversible(report_defect=True),
+        )  # fmt: skip
+        end = jnp.concatenate([sol.q_final.ravel(), sol.p_final.ravel()])
+        return end, sol.stats["round_trip_defect"]
+
+    z = jnp.concatenate([jnp.ravel(q), jnp.ravel(p)])
+    M, back = jax.jit(jax.jacfwd(step, has_aux=True))(z)
+    J = np.block([[np.zeros((n, n)), np.eye(n)], [-np.eye(n), np.zeros((n, n))]])
+    return np.abs(M.T @ J @ M - J).max(), float(back)
+
+
+def test_steps_are_symplectic_and_invertible():
+    for method in (dvi.Splitting((8, 4)), dvi.Yoshida(4, base=dvi.Splitting())):
+        defect, back = symplectic_defect(method, SPLIT, Q0, P0, {"eps": 0.1})
+        assert defect < 1e-13
+        assert back < 1e-13
+    # The negative control: a flow that belongs to another Hamiltonian than that of its part.
+    wrong = flows.Known(quartic, lambda h, q, p, args: (q, p - h * jnp.stack([q[1], -q[0]])))
+    system = dvi.System(dvi.Split([flows.Kepler(), wrong]))
+    assert symplectic_defect(dvi.Splitting(), system, Q0, P0, {"eps": 0.1})[0] > 0.1
+
+
+def test_saved_states_do_not_depend_on_how_often_they_are_saved():
+    method = dvi.Splitting()
+    options = {"h": 0.2, "num_steps": 120, "args": {"eps": 1e-3}, "method": method}
+    often = dvi.integrate(SPLIT, Q0, P0, **options)
+    once = dvi.integrate(SPLIT, Q0, P0, **options, save=dvi.Save(every=50, final=True))
+    np.testing.assert_array_equal(often.qs[np.array([50, 100, 120])], once.qs[1:])
+
+    # Reductions read every whole step; the states agree to round-off.
+    def energy(t0, t1, q0, p0, q1, p1, args):
+        return SPLIT.hamiltonian(t1, t1, q1, p1, 0.0, args)
+
+    seen = dvi.integrate(SPLIT, Q0, P0, **options, observe=dvi.MaxDrift(energy))
+    assert np.abs(seen.qs - often.qs).max() < 1e-12
+    alone = dvi.integrate(SPLIT, Q0, P0, **options, observe=energy, save=dvi.Save(every=40))
+    values = [
+        energy(0, 0, 0, 0, q, p, {"eps": 1e-3}) for q, p in zip(alone.qs, alone.ps, strict=True)
+    ]
+    np.testing.assert_allclose(alone.observed, values[1:], rtol=1e-14)
+
+
+def loss(x, adjoint):
+    sol = dvi.integrate(
+        SPLIT, x[:2], x[2:4], h=0.3, num_steps=12, args={"eps": x[4]}, method=dvi.Splitting(),
+        save=dvi.Save(final=True), adjoint=adjoint,
+    )  # fmt: skip
+    return sol.q_final @ jnp.array([1.0, -2.0])
+
+
+def test_gradient_by_reconstructed_states():
+    x = jnp.array([*Q0, *P0, 0.05])
+    found = jax.jit(jax.grad(loss), static_argnums=1)(x, dvi.Reversible(checkpoint_every=4))
+    f = jax.jit(lambda x: loss(x, dvi.Reversible()))
+    other = [central_difference(f, x, e, step=1e-4) for e in jnp.eye(5)]
+    np.testing.assert_allclose(found, other, rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_gradients_by_all_adjoints():
+    x = jnp.array([*Q0, *P0, 0.05])
+    found = [
+        jax.jit(jax.grad(loss), static_argnums=1)(x, adjoint)
+        for adjoint in (dvi.Reversible(), dvi.Checkpointed(), dvi.Direct())
+    ]
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-11)
+    np.testing.assert_allclose(found[0], found[2], rtol=1e-11)
+
+
+def test_bad_parts_and_schemes_are_refused():
+    with pytest.raises(ValueError, match="two or more"):
+        dvi.Split([quartic])
+    with pytest.raises(ValueError, match="one entry for each"):
+        dvi.Split([quartic, quartic], flows=[None])
+    with pytest.raises(ValueError, match="has a known flow"):
+        dvi.Split([flows.Kepler(), quartic], perturbed=0)
+    with pytest.raises(ValueError, match="t1 − t0"):
+        dvi.Split([dvi.discretise(lambda t, q, p, args: q @ q, order=2), quartic])
+    with pytest.raises(ValueError, match=r"unknown generalised orders \(7, 3\)"):
+        dvi.Splitting((7, 3))
+    with pytest.raises(TypeError, match="must be a composition"):
+        dvi.Splitting(dvi.GaussLegendre(2))
+    with pytest.raises(TypeError, match="requires a system with known parts"):
+        end(dvi.Splitting(), 0.1, 2, dvi.System(quartic))
+    forced = dvi.System(SPLIT.H_D, force=lambda t0, t1, q0, p1, args: -q0)
+    with pytest.raises(ValueError, match="requires two parts"):
+        end(dvi.Splitting((8, 4)), 0.1, 2, forced, epsilon=0.1)
+    with pytest.raises(ValueError, match="accurate to float64 only"):
+        end(dvi.Splitting(), 0.1, 2, arithmetic=dvi.DoubleDouble())
+
+
+# --- Wisdom and Holman ---------------------------------------------------------------------------
+
+THREE = systems.n_body(
+    masses=[1.0, 1e-3, 3e-4],
+    q0=[[0.0, 0.0], [1.0, 0.0], [-0.3, 1.8]],
+    p0=[[0.0, 0.0], [0.0, 1e-3], [-2.2e-4, -0.3e-4]],
+    h=0.3,
+)
+
+
+def energy_error(method, h, num_steps, problem=THREE):
+    sol = dvi.integrate(problem, h=h, num_steps=num_steps, method=method, save=dvi.Save(every=8))
+    H = jax.vmap(lambda q, p: hamiltonian(0.0, 0.0, q, p, problem.args))(sol.qs, sol.ps)
+    return float(jnp.abs(H / H[0] - 1).max())
+
+
+def test_wisdom_holman_converges_to_the_same_orbit():
+    def final(method, n):
+        sol = dvi.integrate(
+            THREE, h=12.0 / n, num_steps=n, method=method, save=dvi.Save(final=True)
+        )
+        return sol.q_final
+
+    exact = final(dvi.KahanLi(8), 480)
+    for method in (dvi.WisdomHolman(), dvi.WisdomHolman("democratic")):
+        errors = [np.abs(final(method, n) - exact).max() for n in (40, 80)]
+        assert np.log2(errors[0] / errors[1]) == pytest.approx(2, abs=0.2)
+    assert np.abs(final(dvi.WisdomHolman(scheme=(10, 6, 4)), 40) - exact).max() < 1e-8
+
+
+def test_corrector_and_generalised_orders_lower_the_energy_error():
+    plain = energy_error(dvi.WisdomHolman(), 0.2, 400)
+    assert energy_error(dvi.WisdomHolman(corrector=3), 0.2, 400) < plain / 10
+    assert energy_error(dvi.WisdomHolman(corrector=11), 0.2, 400) < plain / 100
+
+
+def test_wisdom_holman_is_symplectic_and_invertible():
+    p = np.array(THREE.p0)
+    for method in (dvi.WisdomHolman(corrector=3), dvi.WisdomHolman("democratic")):
+        defect, back = symplectic_defect(method, THREE.system, np.array(THREE.q0), p, THREE.args)
+        # Momenta are 1e-3 of the positions: entries of the derivative are up to 1e3.
+        assert defect < 1e-11
+        assert back < 1e-13
+
+
+def test_wisdom_holman_with_forces_and_a_perturbation():
+    def drag(t0, t1, q0, p1, args):
+        return -p1
+
+    def oblate(t0, t1, q0, p1, args):
+        return -1e-3 / jnp.sum((q0[1] - q0[0]) ** 2) ** 1.5
+
+    for change_ in ({"force": drag}, {"perturbation": oblate}):
+        system = dvi.System(hamiltonian, **change_)
+
+        def final(method, n, system=system):
+            sol = dvi.integrate(
+                system, THREE.q0, THREE.p0, args=THREE.args, h=6.0 / n, num_steps=n, epsilon=0.05,
+                method=method, save=dvi.Save(final=True),
+            )  # fmt: skip
+            return sol.q_final
+
+        exact = final(dvi.GaussLegendre(3), 120)
+        errors = [np.abs(final(dvi.WisdomHolman(), n) - exact).max() for n in (30, 60)]
+        assert np.log2(errors[0] / errors[1]) == pytest.approx(2, abs=0.25)
+
+
+def test_wisdom_holman_refuses_other_systems():
+    def bent(t0, t1, q0, p1, args):
+        return jnp.sum(jnp.sqrt(1 + p1**2)) + jnp.sum(q0**2)
+
+    def mixed(t0, t1, q0, p1, args):
+        return jnp.sum(p1**2 * (1 + q0**2))
+
+    def skew(t0, t1, q0, p1, args):
+        return jnp.sum(p1**2) + p1[0, 0] * p1[1, 1] + jnp.sum(q0**2)
+
+    q = np.ones((2, 2))
+    for H, match in ((bent, "quadratic"), (mixed, "q0 enters"), (skew, "is not p/m")):
+        with pytest.raises(ValueError, match=match):
+            dvi.integrate(dvi.System(H), q, q, h=0.1, num_steps=2, method=dvi.WisdomHolman())
+    with pytest.raises(ValueError, match=r"\(bodies, 2\)"):
+        dvi.integrate(systems.kepler(), h=0.1, num_steps=2, method=dvi.WisdomHolman())
+    with pytest.raises(ValueError, match="corrector must be 0 unless"):
+        dvi.WisdomHolman("democratic", corrector=3)
+    with pytest.raises(ValueError, match="coordinates must be one of"):
+        dvi.WisdomHolman("helio")
+
+
+def test_compensated_sums_and_a_start_in_motion():
+    def final(arithmetic):
+        return dvi.integrate(
+            THREE, h=0.25, num_steps=40, method=dvi.WisdomHolman(), arithmetic=arithmetic,
+            save=dvi.Save(final=True),
+        ).q_final  # fmt: skip
+
+    assert np.abs(final(dvi.Compensated()) - final(dvi.FloatingPoint())).max() < 1e-13
