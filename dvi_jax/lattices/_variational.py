@@ -154,7 +154,8 @@ class Variational(StepSizes):
             return interval, memory, None
         return interval, memory, RESULTS.where(found, RESULTS.successful, RESULTS.no_root)
 
-    def report(self, memory):
+    def report(self, memory, equations, place):
+        del equations, place
         return {
             "last_h": memory.h,
             "lattice_misses": memory.misses,
