@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -47,9 +46,9 @@ class AdaptiveReversible(StepSizes):
     `TimeTransformed`; |q|^{3/2} is a good choice for Kepler's problem. H is H_D at t1 = t0.
 
     The method must be symmetric, such as `Strang` or `KahanLi`. `integrate` interprets `h` as δ
-    [time / unit of g]. ``solution.stats`` has ``last_h`` [time] and ``resume_h``, the δ with which a
-    run from the final state continues this one, and −δ goes back. Gradients are those of the map;
-    `Reversible` works as `Checkpointed`, because a step depends on the one before it.
+    [time / unit of g]. ``solution.stats`` has ``last_h`` [time] and ``resume_h``, the δ with which
+    a run from the final state continues this one, and −δ goes back. Gradients are those of the
+    map; `Reversible` works as `Checkpointed`, because a step depends on the one before it.
 
     The status `step_control_failed` reports an h that has lost its sign, or differs from δ g by
     more than a factor of four: δ is then too large for the change of g in one step.
