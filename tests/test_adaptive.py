@@ -1,5 +1,8 @@
 """Adaptive steps of explicit methods: the controller, its reversibility, and what runs with it."""
 
+import importlib.util
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -202,3 +205,79 @@ def test_machine_code_for_the_whole_run():
 
     found = lanewise.explain(both, *start(0.6))
     assert "XLA" not in str(found), str(found)
+
+
+@pytest.fixture(scope="module")
+def bench():
+    """benchmarks/adaptive_steps.py, whose tables are in the documentation."""
+    path = Path(__file__).parents[1] / "benchmarks" / "adaptive_steps.py"
+    spec = importlib.util.spec_from_file_location("adaptive_steps", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "most"), [("Strang", 0.04), ("KahanLi(8)", 1e-5)])
+def test_energy_over_a_hundred_thousand_revolutions(bench, name, most):
+    """e = 0.99: no drift, and constant steps need more than 20 times the forces."""
+    method, n = bench.METHODS[name]
+    ranges = np.array(bench.tenths(method, n, 100_000))
+    assert ranges.max() < most
+    assert np.ptp(ranges) < 1e-4 * ranges.max()
+    constant = bench.run(method, 20 * n, 3, lattice=None)  # as many forces in each step
+    assert float(constant.observed) > 10 * ranges.max()
+
+
+@pytest.mark.slow
+def test_time_next_to_implicit_adaptive_steps(bench):
+    """At most half of the time, with the same number of steps and for equal errors."""
+    method, n = bench.METHODS["Strang"]
+    (ours, error), (theirs, wanted) = (
+        bench.measured(method, n, lattice) for lattice in (bench.EXPLICIT, bench.IMPLICIT)
+    )
+    assert error < wanted
+    assert ours < 0.5 * theirs
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["figure eight, 10 periods", "figure eight, half velocities"])
+def test_encounters_agree_with_ias15(bench, name):
+    """Periodic, and with distances down to 5e-5; IAS15 with two tolerances as its own control."""
+    pytest.importorskip("rebound")
+    make, times, h, arithmetic = bench.CASES[name]
+    found, _ = bench.encounters(make(), times, h, getattr(dvi, arithmetic)())
+    exact, other = (bench.ias15(make(), times, epsilon) for epsilon in (1e-9, 1e-11))
+    assert np.max(np.abs(exact - other)) < 1e-8
+    assert np.max(np.abs(found - exact)) < 1e-6
+    coarse, _ = bench.encounters(make(), times, 2.5 * h)
+    assert np.max(np.abs(coarse - exact)) > 1e-6  # the control
+
+
+@pytest.mark.slow
+def test_the_pythagorean_problem_until_the_escape(bench):
+    """Against Taylor series with 24 digits until t = 60, and IAS15 as long as it has six digits."""
+    pytest.importorskip("rebound")
+    pytest.importorskip("flint")
+    make, times, h, arithmetic = bench.CASES["Pythagorean"]
+    exact = bench.taylor(make(), times)
+    found, _ = bench.encounters(make(), times, h, getattr(dvi, arithmetic)())
+    assert np.max(np.abs(found - exact)) < 1e-6
+    ias15 = bench.ias15(make(), times)
+    np.testing.assert_allclose(found[:2], ias15[:2], rtol=0, atol=1e-6)  # t = 20 and 40
+    assert 1e-5 < np.max(np.abs(ias15[-1] - exact[-1])) < 1e-2  # rounding, magnified by the chaos
+    # The lightest body escapes: at t = 70 it is far away, and faster than the escape velocity.
+    problem = make()
+    end = dvi.integrate(
+        problem.system, problem.q0, problem.p0, args=problem.args, h=h, num_steps=20_000,
+        method=dvi.KahanLi(8), lattice=bench.ENCOUNTERS, arithmetic=dvi.DoubleDouble(),
+        save=dvi.Save(ts=[70.0]),
+    )  # fmt: skip
+    q, p = np.asarray(end.qs[0]), np.asarray(end.ps[0])
+    away = q[0] - (4 * q[1] + 5 * q[2]) / 9
+    speed = p[0] / 3 - (p[1] + p[2]) / 9
+    assert np.linalg.norm(away) > 25
+    assert away @ speed > 0
+    assert speed @ speed / 2 > 12 / np.linalg.norm(away)
