@@ -13,20 +13,27 @@ with g = r^{3/2} for Kepler's problem and the time scale of encounters for three
    differences from REBOUND's IAS15 and from a Taylor series of order 24 with 24 digits
    (python-flint), which is independent of both. IAS15 is run with two tolerances.
 
+4. Processor time of an adaptive step, divided by that of a constant one, for one trajectory and in
+   a batch of 512: Kepler's problem with eccentricity 0.5, and the figure eight.
+
 The picture has the error of the position after ten revolutions against the processor time, for
 this package, IAS15 and diffrax's Dopri8; and the error of the energy over 10⁵ revolutions.
 
 Times are processor times on one core, without compilation: that of a longer run minus that of a
-shorter one. Run: python benchmarks/adaptive_steps.py [--picture FILE]      (2 minutes)
+shorter one; the median of several, because the clock of a virtual machine can jump.
+
+Run: python benchmarks/adaptive_steps.py [--picture FILE]      (2 minutes)
 """
 
 import argparse
 import functools
+import statistics
 import time
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from _taylor import taylor
 from scipy.optimize import brentq
 
 import dvi_jax as dvi
@@ -43,7 +50,11 @@ APOCENTRE = (
     [-(1 + ECCENTRICITY), 0.0],
     [0.0, -float(np.sqrt((1 - ECCENTRICITY) / (1 + ECCENTRICITY)))],
 )
-"""The state half a revolution before the pericentre, with the semi-major axis 1."""
+PERICENTRE = (
+    [1 - ECCENTRICITY, 0.0],
+    [0.0, float(np.sqrt((1 + ECCENTRICITY) / (1 - ECCENTRICITY)))],
+)
+"""States of an orbit with the semi-major axis 1."""
 
 METHODS = {"Strang": (dvi.Strang(), 400), "McLachlan(4)": (dvi.McLachlan(4), 100)}
 METHODS |= {"KahanLi(8)": (dvi.KahanLi(8), 50)}
@@ -133,7 +144,7 @@ def long_runs(revolutions):
 
 def seconds(make, short, long, rounds=3):
     """Processor time of one revolution, from runs of two lengths."""
-    least = []
+    middle = []
     for revolutions in (short, long):
         make(revolutions)
         taken = []
@@ -141,17 +152,19 @@ def seconds(make, short, long, rounds=3):
             begin = time.process_time()
             make(revolutions)
             taken.append(time.process_time() - begin)
-        least.append(min(taken))
-    return (least[1] - least[0]) / (long - short)
+        middle.append(statistics.median(taken))
+    return (middle[1] - middle[0]) / (long - short)
 
 
-def measured(method, n, lattice):
+def measured(method, n, lattice, start=APOCENTRE):
     """Microseconds of a revolution, and the range of energy in 200 revolutions."""
-    found = float(run(method, n, 200, lattice).observed)
+    found = float(run(method, n, 200, lattice, start).observed)
     short, long = (500, 5000) if lattice is EXPLICIT else (100, 700)
-    return 1e6 * seconds(
-        lambda revolutions: run(method, n, revolutions, lattice), short, long
-    ), found
+
+    def make(revolutions):
+        return run(method, n, revolutions, lattice, start)
+
+    return 1e6 * seconds(make, short, long), found
 
 
 def against_implicit():
@@ -159,10 +172,15 @@ def against_implicit():
     print("\nExplicit and implicit adaptive steps: processor time [µs] of a revolution")
     print("| method | steps | explicit: time, range of E | implicit | ratio | for equal errors |")
     print("|---|---|---|---|---|---|")
-    for name, (method, n) in METHODS.items():
-        (ours, error), (theirs, wanted) = (measured(method, n, x) for x in (EXPLICIT, IMPLICIT))
+    rows = [(name, APOCENTRE) for name in METHODS] + [("Strang", PERICENTRE)]
+    for name, start in rows:
+        method, n = METHODS[name]
+        (ours, error), (theirs, wanted) = (
+            measured(method, n, lattice, start) for lattice in (EXPLICIT, IMPLICIT)
+        )
         equal = ours / theirs * (error / wanted) ** (1 / method.order)
         shown = f"{ours:.1f}, {error:.1e} | {theirs:.1f}, {wanted:.1e} | {ours / theirs:.2f}"
+        name += " from the pericentre" * (start is PERICENTRE)
         print(f"| {name} | {n} | {shown} | {equal:.2f} |", flush=True)
 
 
@@ -183,64 +201,6 @@ def ias15(problem, times, epsilon=1e-9):
     for t in times:
         simulation.integrate(t)
         found.append([[body.x, body.y] for body in simulation.particles])
-    return np.array(found)
-
-
-def taylor(problem, times, digits=24):
-    """The same by Taylor series of this order in arithmetic of so many digits."""
-    from flint import arb, arb_series, ctx
-
-    ctx.prec, order = int(3.33 * digits) + 20, digits
-    masses = [arb(m) for m in problem.args["masses"]]
-    q = [[arb(x) for x in row] for row in problem.q0]
-    v = [[arb(x) / m for x in row] for row, m in zip(problem.p0, masses, strict=True)]
-    pairs = [(i, j) for i in range(len(masses)) for j in range(i)]
-    t, found = arb(0), []
-
-    def series(q, v):
-        """Series of the positions: each pass through Newton's law gives two more coefficients."""
-        known = [[[q[i][c], v[i][c]] for c in (0, 1)] for i in range(len(masses))]
-        while len(known[0][0]) <= order:
-            ctx.cap = len(known[0][0])
-            x = [[arb_series(a) for a in row] for row in known]
-            sums = [[arb_series([0]) for _ in row] for row in known]
-            for i, j in pairs:
-                d = [a - b for a, b in zip(x[j], x[i], strict=True)]
-                square = d[0] * d[0] + d[1] * d[1]
-                weight = 1 / (square * square.sqrt())
-                for c in (0, 1):
-                    sums[i][c] += masses[j] * d[c] * weight
-                    sums[j][c] -= masses[i] * d[c] * weight
-            for row, total in zip(known, sums, strict=True):
-                for a, force in zip(row, total, strict=True):
-                    new = [force[k] / ((k + 1) * (k + 2)) for k in range(len(a))]
-                    a[2:] = new[: order - 1]
-        return known
-
-    while len(found) < len(times):
-        known = series(q, v)
-        # The last terms are 10^-digits of unit length: the radius of convergence estimated twice.
-        rate = max(
-            float(abs(a[k].mid())) ** (1 / k)
-            for row in known
-            for a in row
-            for k in (order - 1, order)
-        )
-        h, left = arb(10.0 ** (-digits / order) / rate), arb(times[len(found)]) - t
-        is_end = float(h - left) >= 0
-        h = (left if is_end else h).mid()
-
-        def at(a, derivative, h=h):
-            total = arb(0)
-            for k in range(order, derivative - 1, -1):
-                total = total * h + (k * a[k] if derivative else a[k])
-            return total.mid()
-
-        q, v = ([[at(a, d) for a in row] for row in known] for d in (0, 1))
-        t = (t + h).mid()
-        if is_end:
-            t = arb(times[len(found)])
-            found.append([[float(x) for x in row] for row in q])
     return np.array(found)
 
 
@@ -299,6 +259,57 @@ def close_encounters():
             shown = [f"{x[i]:.1e}" for x in off]
             shown[0] += f" ({arithmetic}, {steps})"
             print(f"| {name} | {times[i]:.4g} | {' | '.join(shown)} |", flush=True)
+
+
+# 4. The cost of a step
+
+SLOW_KEPLER = systems.Problem(
+    "kepler", KEPLER, np.array([0.5, 0.0]), np.array([0.0, np.sqrt(3.0)]), h=0.02
+)
+
+
+def cost(problem, method, lattice, batch, num_steps):
+    """Processor time of a step of one trajectory [ns]."""
+    scale = 1 + 1e-3 * jnp.arange(batch) / batch
+
+    def end(factor):
+        sol = dvi.integrate(
+            problem.system,
+            factor * problem.q0,
+            factor * problem.p0,
+            args=problem.args,
+            h=0.02,
+            num_steps=num_steps,
+            method=method,
+            lattice=lattice,
+            save=dvi.Save(final=True),
+            throw=False,
+        )
+        return sol.qs[-1], sol.result
+
+    every = jax.jit(jax.vmap(end)) if batch > 1 else jax.jit(lambda factors: end(factors[0]))
+    taken = []
+    for _ in range(6):  # the first one compiles
+        begin = time.process_time()
+        jax.block_until_ready(every(scale))
+        taken.append(time.process_time() - begin)
+    return 1e9 * statistics.median(taken[1:]) / batch / num_steps
+
+
+def costs():
+    """The fourth table."""
+    print("\nProcessor time [ns] of a step: adaptive, constant, ratio")
+    print("| problem | method | alone | in a batch of 512 |")
+    print("|---|---|---|---|")
+    cases = {"Kepler": (SLOW_KEPLER, EXPLICIT), "figure eight": (eight(1.0), ENCOUNTERS)}
+    for name, (problem, lattice) in cases.items():
+        for method in (dvi.Strang(), dvi.KahanLi(8)):
+            shown = []
+            for batch, num_steps in ((1, 300_000), (512, 3000)):
+                grids = (lattice, dvi.Uniform())
+                a, b = (cost(problem, method, grid, batch, num_steps) for grid in grids)
+                shown.append(f"{a:.1f}, {b:.1f}, {a / b:.2f}")
+            print(f"| {name} | {type(method).__name__} | {' | '.join(shown)} |", flush=True)
 
 
 # The picture
@@ -399,7 +410,9 @@ def points(make, sizes):
             prepared, begin = prepare(), time.process_time()
             go(prepared)
             taken.append(time.process_time() - begin)
-        found.append((1e3 * min(taken), np.linalg.norm(place - exact) / np.linalg.norm(exact)))
+        found.append(
+            (1e3 * statistics.median(taken), np.linalg.norm(place - exact) / np.linalg.norm(exact))
+        )
     return np.array(found).T
 
 
@@ -465,7 +478,7 @@ def main(words=None):
     parser = argparse.ArgumentParser(description="Explicit adaptive steps: error, time, drift.")
     parser.add_argument("--picture", help="file of the picture")
     parser.add_argument("--revolutions", type=int, default=100_000, help="default 100000")
-    parser.add_argument("--only", choices=["long", "implicit", "encounters", "picture"])
+    parser.add_argument("--only", choices=["long", "implicit", "encounters", "cost"])
     options = parser.parse_args(words)
     lanewise.set_threads(1)
     if options.only in (None, "long"):
@@ -474,6 +487,8 @@ def main(words=None):
         against_implicit()
     if options.only in (None, "encounters"):
         close_encounters()
+    if options.only in (None, "cost"):
+        costs()
     if options.picture:
         picture(options.picture, options.revolutions)
 

@@ -122,7 +122,7 @@ class StepSizes(Lattice):
 
 def check_speed(owner: str, speed: Callable[..., Any], run: Run) -> None:
     """**Raises** `ValueError` for a speed that is not a positive scalar at the start of a run."""
-    # At the start only: what happens later is seen in the status.
+    # At the start only: values at later states are checked by the status of the run.
     value = jnp.asarray(speed(run.t0, run.q0, run.p0, run.args))
     if value.shape != () or (not is_traced(value) and not float(value) > 0):
         raise ValueError(
