@@ -11,6 +11,8 @@ from scipy.integrate import solve_ivp
 
 import dvi_jax as dvi
 import lanewise
+from dvi_jax import systems
+from dvi_jax.systems.n_body import encounter_time
 
 KEPLER = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 - 1 / jnp.sqrt(q @ q))
 DRIVEN = dvi.System(
@@ -181,7 +183,7 @@ def test_steps_that_cannot_follow_are_reported():
     [
         ({"method": dvi.TypeII()}, "requires a symmetric method, got TypeII"),
         ({"method": dvi.RungeKutta4()}, "requires a symmetric method, got RungeKutta4"),
-        ({"arithmetic": dvi.FixedPoint(2.0**-40)}, "the step sizes are rounded"),
+        ({"arithmetic": dvi.FixedPoint(2.0**-40)}, "step sizes of AdaptiveReversible are rounded"),
         ({"observe": dvi.MEGNO()}, "does not depend on the state"),
         ({"lattice": dvi.AdaptiveReversible(lambda t, q, p, a: -1.0)}, "of AdaptiveRev.* -1"),
         ({"lattice": dvi.AdaptiveReversible(lambda t, q, p, a: q)}, "returns an array"),
@@ -205,6 +207,20 @@ def test_machine_code_for_the_whole_run():
 
     found = lanewise.explain(both, *start(0.6))
     assert "XLA" not in str(found), str(found)
+
+
+def test_the_pythagorean_problem_after_its_closest_encounter():
+    """At t = 20, with the speed of N bodies; the place is that of the Taylor series below."""
+    problem, lattice = systems.pythagorean(), dvi.AdaptiveReversible(encounter_time)
+    how = {"method": dvi.KahanLi(8), "save": dvi.Save(ts=[20.0]), "lattice": lattice}
+    observe = dvi.MaxDrift(problem.observables["angular_momentum"])
+    sol = dvi.integrate(problem, h=0.1, num_steps=1500, observe=observe, **how)
+    np.testing.assert_allclose(sol.qs[0, 0], [3.0042926367, 0.5119252350], atol=1e-6)
+    assert float(sol.observed) < 1e-11
+    assert float(sol.stats["resume_h"]) == pytest.approx(0.1, rel=0.1)
+    t, q, p = 0.0, np.array([[1.0, 0.0], [-1.0, 2.0]]), np.zeros((2, 2))
+    two = encounter_time(t, q, p, {"masses": [1.0, 3.0], "G": 2.0})
+    assert two == pytest.approx(8**0.75 / np.sqrt(2 * 4), rel=1e-14)  # r^{3/2}/√(GM) by hand
 
 
 @pytest.fixture(scope="module")

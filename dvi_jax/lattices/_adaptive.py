@@ -14,7 +14,7 @@ from .._step import Equations
 from .._types import Interval, Scalar, State
 from ..engine.rounding import one_by_one
 from ..engine.signature import check_takes
-from ._base import Place, StepSizes, check_speed
+from ._base import Place, StepSizes, check_rounding, check_speed
 
 _MOST = 4.0
 """Largest ratio between h and δ g. The controller deviates from δ g by half of the change of g in a
@@ -47,8 +47,9 @@ class AdaptiveReversible(StepSizes):
 
     The method must be symmetric, such as `Strang` or `KahanLi`. `integrate` interprets `h` as δ
     [time / unit of g]. ``solution.stats`` has ``last_h`` [time] and ``resume_h``, the δ with which
-    a run from the final state continues this one, and −δ goes back. Gradients are those of the
-    map; `Reversible` works as `Checkpointed`, because a step depends on the one before it.
+    a run from the final state continues this one, and −δ goes back (NaN after a failure or a
+    `Stop`). Gradients are those of the map; `Reversible` works as `Checkpointed`, because a step
+    depends on the one before it.
 
     The status `step_control_failed` reports an h that has lost its sign, or differs from δ g by
     more than a factor of four: δ is then too large for the change of g in one step.
@@ -71,7 +72,7 @@ class AdaptiveReversible(StepSizes):
     sol = dvi.integrate(kepler.system, kepler.q0, kepler.p0, args=kepler.args, h=0.1, num_steps=100,
                         lattice=close, method=dvi.Strang())
     print(round(float(sol.hs.min()), 3), round(float(sol.hs.max()), 3))
-    # 0.083 0.57
+    # 0.083 0.569
     ```
     """
 
@@ -89,12 +90,7 @@ class AdaptiveReversible(StepSizes):
                 "Otherwise the steps are not reversible, and energies drift. Use "
                 "method=dvi.Strang(), method=dvi.KahanLi(8) or another symmetric method."
             )
-        if arithmetic.undoes_steps:
-            raise ValueError(
-                f"arithmetic={arithmetic!r} cannot be used with lattice=dvi.AdaptiveReversible(...)"
-                ". This arithmetic undoes steps bit for bit, but the step sizes are rounded. Use "
-                "arithmetic=dvi.Compensated(), or lattice=dvi.Uniform()."
-            )
+        check_rounding(type(self).__name__, arithmetic)
 
     def transform(self, run):
         check_speed(type(self).__name__, self.speed, run)

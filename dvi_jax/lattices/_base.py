@@ -120,6 +120,17 @@ class StepSizes(Lattice):
         return jnp.isfinite(t0) & jnp.isfinite(h) & (h != 0)
 
 
+def check_rounding(owner: str, arithmetic: Any) -> None:
+    """**Raises** `ValueError` for an arithmetic that undoes steps bit for bit."""
+    if arithmetic.undoes_steps:
+        raise ValueError(
+            f"arithmetic={arithmetic!r} cannot be used with lattice=dvi.{owner}(...). This "
+            f"arithmetic undoes steps bit for bit, but the step sizes of {owner} are rounded, and "
+            "cannot be computed backwards bit for bit. Use arithmetic=dvi.Compensated(), or "
+            "lattice=dvi.Uniform()."
+        )
+
+
 def check_speed(owner: str, speed: Callable[..., Any], run: Run) -> None:
     """**Raises** `ValueError` for a speed that is not a positive scalar at the start of a run."""
     # At the start only: values at later states are checked by the status of the run.

@@ -18,6 +18,17 @@ def pythagorean() -> Problem:
     chaotic: an error of 1e-16 at the closest encounter is about 1e-4 at t = 60, so that states
     after t ≈ 45 need ``arithmetic=dvi.DoubleDouble()``.
 
+    **Example**
+
+    ```python
+    from dvi_jax.systems.n_body import encounter_time
+    problem, close = systems.pythagorean(), dvi.AdaptiveReversible(encounter_time)
+    sol = dvi.integrate(problem, h=0.1, num_steps=3000, method=dvi.KahanLi(8), lattice=close,
+                        save=dvi.Save(ts=[20.0]))
+    print(sol.qs[0, 0].round(5))
+    # [3.00429 0.51193]
+    ```
+
     **Source** Burrau 1913, *Astron. Nachr.* 195, 113; Szebehely & Peters 1967, *Astron. J.* 72,
     876 (the escape).
     """
