@@ -176,6 +176,14 @@ def test_steps_that_cannot_follow_are_reported():
     np.testing.assert_array_equal(hs[0], alone.hs)
     negative = dvi.AdaptiveReversible(lambda t, q, p, args: jnp.where(q[0] > -0.5, 1.0, -1.0))
     assert run(q, p, h=0.1, lattice=negative).status == "step_control_failed"
+    # On a limit cycle the errors of h have one sign: a long run loses g, and says so.
+    cycle = dvi.System(
+        lambda t0, t1, q, p, args: (p @ p + q @ q) / 2 + (q @ q) ** 2 / 4,
+        force=lambda t0, t1, q, p, args: (1 - q @ q) * p,
+    )
+    narrow = dvi.AdaptiveReversible(lambda t, q, p, args: 1 / (1 + q @ q))
+    how = {"system": cycle, "epsilon": 0.5, "lattice": narrow, "save": LAST, "num_steps": 10_000}
+    assert run([1.0], [0.0], **how).status == "step_control_failed"
 
 
 @pytest.mark.parametrize(

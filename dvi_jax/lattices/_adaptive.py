@@ -56,7 +56,8 @@ class AdaptiveReversible(StepSizes):
 
     **Limits** The error of h is of second order in δ. It does not reduce the order of the method,
     since every h is a step of it, but a large error of the state also makes steps other than δ g.
-    For a dissipative system, steps may slowly depart from δ g.
+    In dissipative motion, on a limit cycle for example, errors of h do not cancel: steps slowly
+    depart from δ g, until the run ends with this status. `TimeTransformed` has no such errors.
 
     **Raises** `TypeError` for a speed that is not a function, and in `integrate` `ValueError` for
     one that is not a positive scalar at the start, and for a method that is not symmetric.
