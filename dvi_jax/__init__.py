@@ -42,6 +42,7 @@ from .engine.picard import Picard as Picard, PicardThenNewton as PicardThenNewto
 from .engine.simplified import SimplifiedNewton as SimplifiedNewton
 from .engine.threads import over_threads as over_threads
 from .lattices import (
+    AdaptiveReversible as AdaptiveReversible,
     Given as Given,
     Lattice as Lattice,
     LatticeCondition as LatticeCondition,

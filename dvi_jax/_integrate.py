@@ -47,7 +47,7 @@ from ._types import Interval
 from .engine.newton import RootSolver, over
 from .engine.reads import reads
 from .engine.rounding import each
-from .lattices import Lattice, Run
+from .lattices import Lattice, Place, Run
 from .methods import Method, warn_of_dissipation
 from .observe import OfState, RequestedTimes, Section, Stop, is_observable, of_steps
 from .observe._kept import Start
@@ -104,8 +104,8 @@ def integrate(
       `Strang`, the compositions `Yoshida`, `Suzuki`, `BlanesMoan`, `McLachlan`, `KahanLi`,
       `Composition`; `GaussLegendre`, `LobattoIIIAIIIB`; `RungeKutta4`.
     - `lattice`: the time grid: `Uniform()`; `Given(ts)`, which replaces h, num_steps and t0;
-      `TimeTransformed(g)`, with adaptive steps and h in its fictitious time; or `Variational()`,
-      whose steps solve (14), and h is the first of them.
+      `AdaptiveReversible(g)` and `TimeTransformed(g)`, with adaptive steps of about h g, explicit
+      or implicit; or `Variational()`, whose steps solve (14), and h is the first of them.
     - `save`: the states to save, see `Save`.
     - `observe`: pytree of observables → array: functions ``(q, p)`` or ``(t, q, p, args)`` of the
       state, or ``(t0, t1, q0, p0, q1, p1, args)`` of a step. A function of the state is evaluated
@@ -352,6 +352,7 @@ def _as_solution(
     else:
         ts = jnp.concatenate([task.t0[None], saved.t])
         qs, ps, hs, alone = saved.q, saved.p, saved.h, saved.observed
+    place = Place(task.t0, task.h, carry.k, carry.q, carry.p)
     return Solution(
         ts=ts,
         qs=qs,
@@ -365,7 +366,7 @@ def _as_solution(
             "max_residual": over(*carry.residual),
             "failed_step": carry.failed_step,
             "failed_residual": over(*carry.failed_residual),
-            **task.lattice.report(carry.lattice),
+            **task.lattice.report(carry.lattice, task.equations, place),
             **({} if defect is None else {"round_trip_defect": defect}),
         },
         stop=None if task.stop is None else stopped(curve, task.stop, carry.stop, safe),

@@ -78,7 +78,8 @@ _FIELDS = {
     "method": (Method, "one such as dvi.Strang()"),
     "lattice": (
         Lattice,
-        "dvi.Uniform(), dvi.Given(ts), dvi.TimeTransformed(g) or dvi.Variational()",
+        "dvi.Uniform(), dvi.Given(ts), dvi.AdaptiveReversible(g), dvi.TimeTransformed(g) or "
+        "dvi.Variational()",
     ),
     "adjoint": (AbstractAdjoint, "dvi.Reversible(), dvi.Checkpointed() or dvi.Direct()"),
     "root_finder": (RootSolver, "dvi.Newton(), dvi.SimplifiedNewton() or dvi.Picard()"),

@@ -55,6 +55,13 @@ class RESULTS(eqx.Enumeration):
         "step; or a clock does not grow along the trajectory. Take more steps, or leave out those "
         "times."
     )
+    step_control_failed = (
+        "The step sizes of dvi.AdaptiveReversible(g) no longer follow g: a step has another sign "
+        "than h, or differs from h g by more than a factor of four. Likely causes: (a) h is too "
+        "large, so that g changes too much within one step; (b) g is zero, negative or not finite "
+        "at a state of the trajectory; (c) the motion is dissipative, or g depends on the sign of "
+        "p. Try a smaller h, or lattice=dvi.TimeTransformed(g)."
+    )
 
 
 # In the order of the class, which numbers them. A new status goes to the end: stores have numbers.
@@ -67,6 +74,7 @@ STATUS_NAMES = (
     "out_of_range",
     "stopped",
     "not_reached",
+    "step_control_failed",
 )
 
 

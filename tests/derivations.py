@@ -366,6 +366,7 @@ DERIVATIONS = {
     "hill": hill,
     "n_body": n_body,
     "figure_eight": n_body,
+    "pythagorean": n_body,
     "solar_system": n_body,
     "henon_heiles": henon_heiles,
     "toda": toda,

@@ -242,7 +242,8 @@ legendre from_lagrangian from_type_iii velocity_force Implicit
 Layout configure_cpu over_threads over_devices
 TypeII Adjoint Strang Yoshida Suzuki BlanesMoan McLachlan KahanLi Composition
 GaussLegendre LobattoIIIAIIIB RungeKutta4
-Uniform Given TimeTransformed Variational FloatingPoint Compensated DoubleDouble FixedPoint
+Uniform Given AdaptiveReversible TimeTransformed Variational
+FloatingPoint Compensated DoubleDouble FixedPoint
 Section Stop Crossings LatticeCondition
 Deviations TangentMap LyapunovSpectrum MEGNO GALI SALI Running
 MaxDrift Range Trend Mean Last Reversible Checkpointed Direct

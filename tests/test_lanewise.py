@@ -204,6 +204,8 @@ RUNS = {
         "num_steps": 12, "lattice": dvi.Variational()},
     "TimeTransformed": KEPLER | {"h": 0.05, "num_steps": 40,
         "lattice": dvi.TimeTransformed(lambda t, q, p, args: jnp.sqrt(q @ q))},
+    "AdaptiveReversible": KEPLER | {"h": 0.05, "num_steps": 40, "method": dvi.Strang(),
+        "lattice": dvi.AdaptiveReversible(lambda t, q, p, args: jnp.sqrt(q @ q))},
     # Trajectories that escape to infinity, each at a step of its own.
     "escape": {"system": dvi.System(cubic), "h": 0.1, "num_steps": 90, "save": dvi.Save(every=30)},
     "implicit escape": {"system": dvi.System(implicit_cubic), "h": 0.1, "num_steps": 90} | LAST,

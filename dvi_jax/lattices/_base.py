@@ -9,6 +9,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PyTree
 
+from lanewise.jaxapi import is_traced
+
 from .._checks import whole
 from .._results import RESULTS
 from .._solution import Save, Solution
@@ -92,7 +94,7 @@ class Lattice(eqx.Module):
         """The interval of the next step, the memory after it, and whether it exists (None: yes)."""
         return self.interval(place.t0, place.h, place.k), memory, None
 
-    def report(self, memory: Any) -> dict[str, Any]:
+    def report(self, memory: Any, equations: Equations, place: Place) -> dict[str, Any]:
         """Statistics of the lattice at the end, for ``solution.stats``."""
         return {}
 
@@ -116,6 +118,30 @@ class StepSizes(Lattice):
 
     def is_usable(self, t0, h):
         return jnp.isfinite(t0) & jnp.isfinite(h) & (h != 0)
+
+
+def check_rounding(owner: str, arithmetic: Any) -> None:
+    """**Raises** `ValueError` for an arithmetic that undoes steps bit for bit."""
+    if arithmetic.undoes_steps:
+        raise ValueError(
+            f"arithmetic={arithmetic!r} cannot be used with lattice=dvi.{owner}(...). This "
+            f"arithmetic undoes steps bit for bit, but the step sizes of {owner} are rounded, and "
+            "cannot be computed backwards bit for bit. Use arithmetic=dvi.Compensated(), or "
+            "lattice=dvi.Uniform()."
+        )
+
+
+def check_speed(owner: str, speed: Callable[..., Any], run: Run) -> None:
+    """**Raises** `ValueError` for a speed that is not a positive scalar at the start of a run."""
+    # At the start only: values at later states are checked by the status of the run.
+    value = jnp.asarray(speed(run.t0, run.q0, run.p0, run.args))
+    if value.shape != () or (not is_traced(value) and not float(value) > 0):
+        raise ValueError(
+            f"speed of {owner} must return one positive number for each state, but at the "
+            "initial state (t0, q0, p0) it returns "
+            f"{value if value.shape == () else f'an array of shape {value.shape}'}. An example is "
+            "lambda t, q, p, args: jnp.sqrt(q @ q) for an orbit around the origin."
+        )
 
 
 def check_num_steps(num_steps: object) -> int:

@@ -8,8 +8,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from lanewise.jaxapi import is_traced
-
 from .._inputs import start_state
 from .._solution import Save, Solution
 from .._system import System
@@ -28,7 +26,7 @@ from ..observe import (
     has_initial_value,
     is_observable,
 )
-from ._base import Lattice, Run
+from ._base import Lattice, Run, check_speed
 from ._uniform import Uniform
 
 
@@ -81,7 +79,7 @@ class TimeTransformed(Uniform):
         # K contains ε: for the extended problem it is a parameter like any other, which may be
         # traced and differentiated.
         extended = Extended(run.system, self.speed, run.epsilon, run.q0.shape)
-        _check_speed(self.speed, run.t0, run.q0, run.p0, run.args)
+        check_speed(type(self).__name__, self.speed, run)
         q0, p0 = start_state(*extended.start(run.t0, run.q0, run.p0, run.args))
         observe = jax.tree.map(extended.seen, run.observe, is_leaf=is_observable)
         save, stop = run.save, run.stop
@@ -228,15 +226,3 @@ def _own_time(t, q, p, args):
 
 def _time_gained(s0, s1, position0, momentum0, position1, momentum1, args):
     return position1[-1] - position0[-1]
-
-
-def _check_speed(speed, t0, q0, p0, args) -> None:
-    # At the start only: later on a speed that is not positive stops the time, and the run with it.
-    value = jnp.asarray(speed(t0, q0, p0, args))
-    if value.shape != () or (not is_traced(value) and not float(value) > 0):
-        raise ValueError(
-            "speed of TimeTransformed must return one positive number for each state, but at the "
-            "initial state (t0, q0, p0) it returns "
-            f"{value if value.shape == () else f'an array of shape {value.shape}'}. An example is "
-            "lambda t, q, p, args: jnp.sqrt(q @ q) for an orbit around the origin."
-        )

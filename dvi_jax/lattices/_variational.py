@@ -18,7 +18,7 @@ from .._step import Equations, step
 from .._system import System
 from .._types import Args, Interval, Scalar, State
 from ..engine.bracket import bracketed_root, divide
-from ._base import StepSizes
+from ._base import StepSizes, check_rounding
 
 Policy = Literal["stop", "hold", "minimise"]
 
@@ -111,13 +111,7 @@ class Variational(StepSizes):
                 "derived for TypeII only. For a higher order give the system a discrete "
                 "Hamiltonian of higher order: dvi.System(dvi.discretise(H, order=2))."
             )
-        if arithmetic.undoes_steps:
-            raise ValueError(
-                f"arithmetic={arithmetic!r} cannot be used with lattice=dvi.Variational(). This "
-                "arithmetic undoes steps bit for bit, but the step sizes of Variational are "
-                "solutions of an equation, and a solve cannot be undone bit for bit. Use "
-                "arithmetic=dvi.Compensated(), or lattice=dvi.Uniform()."
-            )
+        check_rounding(type(self).__name__, arithmetic)
 
     def interval(self, t0, h, k):
         return Interval(t0, t0 + h, h)
@@ -154,7 +148,8 @@ class Variational(StepSizes):
             return interval, memory, None
         return interval, memory, RESULTS.where(found, RESULTS.successful, RESULTS.no_root)
 
-    def report(self, memory):
+    def report(self, memory, equations, place):
+        del equations, place
         return {
             "last_h": memory.h,
             "lattice_misses": memory.misses,

@@ -38,6 +38,7 @@ _STATUS_COLOURS = {
     "out_of_range": COLOURS[6],
     "stopped": COLOURS[5],
     "not_reached": COLOURS[2],
+    "step_control_failed": "#F0E442",
 }
 """One colour for each status in all pictures, so that they can be compared."""
 

@@ -29,6 +29,7 @@ from .oscillator import oscillator as oscillator
 from .pendulum import pendulum as pendulum
 from .perturbed_pendulum import perturbed_pendulum as perturbed_pendulum
 from .polar_motion import polar_motion as polar_motion
+from .pythagorean import pythagorean as pythagorean
 from .relativistic_kepler import relativistic_kepler as relativistic_kepler
 from .restricted_three_body import restricted_three_body as restricted_three_body
 from .rigid_body import rigid_body as rigid_body
@@ -58,6 +59,7 @@ LIBRARY = {
     "hill": hill,
     "n_body": n_body,
     "figure_eight": figure_eight,
+    "pythagorean": pythagorean,
     "solar_system": solar_system,
     "henon_heiles": henon_heiles,
     "toda": toda,

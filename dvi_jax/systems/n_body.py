@@ -76,6 +76,21 @@ def angular_momentum(t0, t1, q0, p0, q1, p1, args):
     return jnp.sum(jnp.cross(q1, p1), axis=0)
 
 
+def encounter_time(t, q, p, args):
+    r"""Time scale of the closest encounter, a `speed` for adaptive steps.
+
+        g = 1/√(G Σ_{i<j} (m_i + m_j)/|q_i − q_j|³)   [time]
+
+    For two bodies it is r^{3/2}/√(G(m_1 + m_2)), 1/2π of the period of a circular orbit of radius
+    r. Arguments as of `hamiltonian`, with the momenta p, which have no effect.
+    """
+    masses = masses_of(q, args)
+    i, j = np.triu_indices(masses.shape[0], 1)
+    square = jnp.sum((q[i] - q[j]) ** 2, axis=-1)
+    rates = (masses[i] + masses[j]) / (square * jnp.sqrt(square))
+    return 1 / jnp.sqrt(args.get("G", 1.0) * jnp.sum(rates))
+
+
 OBSERVABLES: dict[str, Callable[..., Any]] = {
     "energy": energy,
     "linear_momentum": linear_momentum,

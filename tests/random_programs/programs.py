@@ -172,6 +172,7 @@ LATTICES = st.sampled_from(
     ["dvi.Uniform()"] * 48
     + ["dvi.Given(np.array([0.0, 0.05, 0.2, 0.25, 0.3]))"] * 5
     + ["dvi.TimeTransformed(lambda t, q, p, args: jnp.sqrt(0.1 + q @ q))"] * 3
+    + ["dvi.AdaptiveReversible(lambda t, q, p, args: jnp.sqrt(0.1 + q @ q))"] * 2
     + ["dvi.Variational()"]
 )
 ARITHMETICS = st.sampled_from(
@@ -204,6 +205,7 @@ def settings(draw):
     arithmetic = "dvi.FloatingPoint()" if "Uniform" not in lattice else draw(ARITHMETICS)
     explicit_only = "Variational" in lattice or "FixedPoint" in arithmetic
     method = "dvi.TypeII()" if explicit_only else draw(METHODS)
+    method = "dvi.Strang()" if "Adaptive" in lattice else method  # a symmetric one
     return (
         f"method={method}, save={save}, observe={observed}, lattice={lattice}, "
         f"arithmetic={arithmetic}, newton={draw(SOLVERS)}{steps}"
