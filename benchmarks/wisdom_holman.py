@@ -20,6 +20,7 @@ import dvi_jax as dvi
 import lanewise
 from dvi_jax import interop, systems
 from dvi_jax.systems.n_body import hamiltonian
+from dvi_jax.systems.solar_system import BODIES
 
 jax.config.update("jax_enable_x64", True)
 
@@ -33,7 +34,7 @@ def simulation(names, h, coordinates="jacobi", corrector=0):
     """REBOUND's simulation of the bodies at the centre of mass."""
     planets = systems.solar_system("2000-01-01")
     sim = rebound.Simulation()
-    for i in map(systems.solar_system.__globals__["BODIES"].index, names):
+    for i in map(BODIES.index, names):
         m = planets.args["masses"][i]
         position, velocity = planets.q0[i], planets.p0[i] / m
         kinds = ("x", "y", "z", "vx", "vy", "vz")
@@ -79,7 +80,8 @@ def energy_errors(names, h, years, corrector):
         problem, num_steps=every * SAMPLES, h=h, method=dvi.WisdomHolman(corrector=corrector),
         save=dvi.Save(every=every),
     )  # fmt: skip
-    ours = [float(hamiltonian(0.0, 0.0, q, p, problem.args)) for q, p in zip(sol.qs, sol.ps)]
+    states = zip(sol.qs, sol.ps, strict=True)
+    ours = [float(hamiltonian(0.0, 0.0, q, p, problem.args)) for q, p in states]
     theirs = [sim.energy()]
     for _ in range(SAMPLES):
         sim.steps(every)

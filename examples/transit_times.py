@@ -28,6 +28,7 @@ from dvi_jax import plot, systems
 jax.config.update("jax_enable_x64", True)
 mpl.use("Agg")
 
+EARTHS = 332946  # Earth masses of the star
 GM = 2.959122082855911e-4  # of the star [au³/day²]
 TRUTH = {
     "mass": np.array([5e-5, 1e-4]),  # over that of the star
@@ -48,7 +49,7 @@ def state(params):
     P, ec, es = params["period"], params["ecos"], params["esin"]
     masses = GM * jnp.concatenate([jnp.ones(1), params["mass"]])
     n = 2 * jnp.pi / P
-    a = ((GM + jnp.cumsum(masses)[1:] - GM) / n**2) ** (1 / 3)
+    a = (jnp.cumsum(masses)[1:] / n**2) ** (1 / 3)
     e, omega = jnp.hypot(ec, es), jnp.arctan2(es, ec)
     half = jnp.sqrt((1 - e) / (1 + e))
     at_transit = 2 * jnp.arctan(half * jnp.tan((jnp.pi / 2 - omega) / 2))
@@ -161,15 +162,15 @@ def picture(times, found, chains, path):
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
-    for i, (t, name) in enumerate(zip(times, ("inner planet", "outer planet"), strict=True)):
-        line = np.polyfit(np.arange(t.size), t, 1)
-        axes[0].errorbar(t, 1440 * (t - np.polyval(line, np.arange(t.size))), 1440 * SIGMA, fmt="o", ms=3, label=name, color=f"C{i}")
-    axes[0].set(xlabel="time [day]", ylabel="delay [min]", title="Transits against a constant period")
+    for t, name in zip(times, ("inner planet", "outer planet"), strict=True):
+        k = np.arange(t.size)
+        late = 1440 * (t - np.polyval(np.polyfit(k, t, 1), k))
+        axes[0].errorbar(t, late, 1440 * SIGMA, fmt="o", ms=3, label=name)
+    axes[0].set(xlabel="time [day]", ylabel="delay [min]", title="Transits and a constant period")
     axes[0].legend()
-    mass = chains.params["mass"].reshape(-1, 2) * 332946
-    axes[1].plot(*mass.T, ".", ms=2, alpha=0.4)
-    axes[1].plot(*(TRUTH["mass"] * 332946), "k+", ms=12, label="true value")
-    axes[1].set(xlabel="mass of the inner planet [Earth masses]", ylabel="outer planet", title="Draws of the posterior")
+    axes[1].plot(*(EARTHS * chains.params["mass"].reshape(-1, 2).T), ".", ms=2, alpha=0.4)
+    axes[1].plot(*(EARTHS * TRUTH["mass"]), "k+", ms=12, label="true value")
+    axes[1].set(xlabel="inner planet", ylabel="outer planet", title="Masses [Earth masses]")
     axes[1].legend()
     plot.save(figure, path)
 

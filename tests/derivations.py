@@ -367,6 +367,7 @@ DERIVATIONS = {
     "n_body": n_body,
     "figure_eight": n_body,
     "pythagorean": n_body,
+    "outer_solar_system": n_body,
     "solar_system": n_body,
     "henon_heiles": henon_heiles,
     "toda": toda,

@@ -31,8 +31,8 @@ from dvi_jax.systems.van_der_pol import amplitude
 NAMES = list(systems.LIBRARY)
 QUICK = {"duffing", "kepler"}
 """Those whose runs by `integrate` are in every run of the tests; the rest are marked slow."""
-ALIKE = {"figure_eight", "pythagorean", "solar_system", "perturbed_pendulum"}
-ALIKE |= {"lorentz_pendulum", "van_der_pol"}
+ALIKE = {"figure_eight", "pythagorean", "outer_solar_system", "solar_system"}
+ALIKE |= {"perturbed_pendulum", "lorentz_pendulum", "van_der_pol"}
 """Those with functions of another system."""
 MOST = set(NAMES) - ALIKE
 slow = pytest.mark.slow

@@ -26,6 +26,7 @@ from .n_body import n_body as n_body
 from .nls_lattice import nls_lattice as nls_lattice
 from .oblate_kepler import oblate_kepler as oblate_kepler
 from .oscillator import oscillator as oscillator
+from .outer_solar_system import outer_solar_system as outer_solar_system
 from .pendulum import pendulum as pendulum
 from .perturbed_pendulum import perturbed_pendulum as perturbed_pendulum
 from .polar_motion import polar_motion as polar_motion
@@ -60,6 +61,7 @@ LIBRARY = {
     "n_body": n_body,
     "figure_eight": figure_eight,
     "pythagorean": pythagorean,
+    "outer_solar_system": outer_solar_system,
     "solar_system": solar_system,
     "henon_heiles": henon_heiles,
     "toda": toda,
