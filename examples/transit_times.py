@@ -37,7 +37,7 @@ TRUTH = {
     "ecos": np.array([0.02, -0.03]),  # e cos ω
     "esin": np.array([0.03, 0.01]),  # e sin ω
 }
-SIGMA, COUNT, H = 1 / 1440, 40, 0.5  # [day], transits, [day]
+SIGMA, COUNT, H = 1 / 1440, 40, 1.0  # [day], transits, [day]
 NAMES = "mass", "period", "transit", "ecos", "esin"
 
 
@@ -78,7 +78,7 @@ def model(params):
     q0, p0, args = state(params)
     return {
         "system": SYSTEM, "q0": q0, "p0": p0, "args": args, "h": H,
-        "method": dvi.WisdomHolman(G=1.0),
+        "method": dvi.WisdomHolman(scheme=(8, 2)),
     }  # fmt: skip
 
 
@@ -142,7 +142,7 @@ def main(quick, directory):
     began = time.perf_counter()
     draws = 200 if quick else 1000
     chains = dvi.sample(
-        model, data, found.params, priors=priors, bounds=bounds, start=found, num_samples=draws,
+        model, data, found.params, priors=priors, bounds=bounds, start=found, num_samples=draws, target_accept=0.95,
         num_warmup=150 if quick else 500, chains=2, progress=False,
     )  # fmt: skip
     print(f"NUTS: {chains.status} in {time.perf_counter() - began:.1f} s")
