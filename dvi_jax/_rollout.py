@@ -366,7 +366,7 @@ def run(
     else it is given a function as well, the state of a carry.
     """
     alone, _ = task.observables()
-    task, opened, closed = _in_loop(task)
+    task, opened, closed = _in_loop(task, carry.q)
     carry = opened(carry)
 
     def over_steps(body, state, count):
@@ -411,11 +411,15 @@ def run(
     return closed(carry), saved, tail
 
 
-def _in_loop(task: Task) -> tuple[Task, Callable[[Carry], Carry], Callable[[Carry], Carry]]:
+def _in_loop(
+    task: Task, q: State
+) -> tuple[Task, Callable[[Carry], Carry], Callable[[Carry], Carry]]:
     """The task of the loop, and the functions from a carry to that of the loop and back."""
     equal = type(task.lattice) is Uniform and task.arithmetic.is_plain and task.stop is None
     # Reductions read the states of all steps.
-    quick = task.method.in_loop() if equal and not task.observables()[1] else None
+    quick = None
+    if equal and not task.observables()[1]:
+        quick = task.method.in_loop(task.equations, task.first_interval(), q)
     if quick is None:
         return task, lambda carry: carry, lambda carry: carry
 

@@ -418,3 +418,14 @@ def test_compensated_sums_and_a_start_in_motion():
         ).q_final  # fmt: skip
 
     assert np.abs(final(dvi.Compensated()) - final(dvi.FloatingPoint())).max() < 1e-13
+
+
+def test_flows_that_are_not_exact_are_not_joined():
+    def coupled(t0, t1, q0, p1, args):
+        return p1 @ p1 / 2 + (1 + q0[0] ** 2) * p1[1] ** 2 / 4
+
+    system = dvi.System(dvi.Split([coupled, lambda t0, t1, q0, p1, args: q0 @ q0]))
+    options = {"h": 0.3, "num_steps": 20}
+    often = dvi.integrate(system, Q0, P0, **options, observe=dvi.MaxDrift(lambda *step: step[4][0]))
+    once = dvi.integrate(system, Q0, P0, **options, save=dvi.Save(final=True))
+    assert np.abs(often.qs[-1] - once.q_final).max() < 1e-13

@@ -56,7 +56,7 @@ class Method(eqx.Module):
     def inverse_needs_no_solve(self, equations: Equations, interval: Interval, q: State) -> bool:
         """Whether `inverse` is explicit for these equations."""
 
-    def in_loop(self) -> InLoop | None:
+    def in_loop(self, equations: Equations, interval: Interval, q: State) -> InLoop | None:
         """The same steps with less work, where they have some in common (None: nowhere)."""
         return None
 

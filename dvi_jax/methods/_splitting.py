@@ -137,16 +137,22 @@ class SplittingMethod(Method):
             state, _ = lax.scan(lambda s, x: (advanced(s, x, which[:period]), None), state, stacked)
         return advanced(state, pieces[count * period :], which[count * period :])
 
-    def in_loop(self):
-        word = word_of(self.scheme, 2)
-        is_alike = self.is_symmetric and word[0] == word[-1] and len(word) > 1
+    def in_loop(self, equations, interval, q):
+        parts = self.parts(equations, interval, q)
+        word = word_of(self.scheme, len(parts))
+        # Two flows of the first part are one only if they are exact.
+        is_alike = self.is_symmetric and len(word) > 1 and _is_explicit(parts[0])
         return _in_loop(self, word[0][1]) if is_alike else None
 
     def needs_no_solve(self, equations, interval, q) -> bool:
-        return all(getattr(p, "is_explicit", True) for p in self.parts(equations, interval, q))
+        return all(map(_is_explicit, self.parts(equations, interval, q)))
 
     def inverse_needs_no_solve(self, equations, interval, q) -> bool:
         return self.needs_no_solve(equations, interval, q)
+
+
+def _is_explicit(part: Part) -> bool:
+    return getattr(part, "is_explicit", True)
 
 
 def _in_loop(method: SplittingMethod, a: float) -> InLoop:
