@@ -142,7 +142,7 @@ def main(quick, directory):
     began = time.perf_counter()
     draws = 200 if quick else 1000
     chains = dvi.sample(
-        model, data, found.params, priors=priors, bounds=bounds, start=found, num_samples=draws, target_accept=0.95,
+        model, data, found.params, priors=priors, bounds=bounds, start=found, num_samples=draws, target_accept=0.98,
         num_warmup=150 if quick else 500, chains=2, progress=False,
     )  # fmt: skip
     print(f"NUTS: {chains.status} in {time.perf_counter() - began:.1f} s")

@@ -625,7 +625,7 @@ REGIMES = {  # all q0, all p0
     # in one well, three times; over the barrier
     "duffing": (np.c_[[-1.2, 0.7, 1.2, 0.3, -1.6]], np.c_[[0.2, -0.3, 0, 1, -0.9]]),
     # an ellipse; a circle; perihelion of e = 0.85, backwards
-    "kepler": ([[0, 1.2], [1, 0], [0.1, 0]], [[-1, -0.6], [0, 1], [0, -4.3]]),
+    "kepler": ([[0, 1.2], [1, 0], [0.1, 0], [1, 0]], [[-1, -0.6], [0, 1], [0, -4.3], [0, 1.5]]),
     # near the middle axis; about the third axis, twice; about the first, twice
     "rigid_body": (
         [[0.1, 0, 0.4], [0.4, 0.2, 0], [0.4, 0.2, 0], [1.4, -2, 0], [-1.4, -2, 0]],
@@ -669,7 +669,7 @@ def test_exact_solutions_solve_the_equations_in_every_regime(name):
     [
         ("pendulum", [0.0], [2.0]),  # m = 1
         ("duffing", [0.0], [0.0]),  # E = 0
-        ("kepler", [1.0, 0.0], [0.0, 1.5]),  # it escapes
+        ("kepler", [0.0, 0.0], [0.0, 1.5]),  # at the centre
         ("spinning_top", [0.0, 0.6, 0.0], [2.5, 0.1, 2.5]),  # through the vertical, upright
         ("spinning_top", [0.0, 2.6, 0.0], [-0.5, 0.1, 0.5]),  # and hanging
         ("rigid_body", [0.0, 0.0, 0.0], [0.0, 1.0, 0.6]),  # about the middle axis
