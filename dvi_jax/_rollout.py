@@ -1,6 +1,5 @@
 """The loop over the steps of a time grid, with status, saved states and observables."""
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -230,13 +229,16 @@ def start(task: Task, q0: State, p0: State) -> Carry:
     )
 
 
-def take_step(task: Task, carry: Carry) -> tuple[Carry, Interval, StepTaken]:
-    """The next step of the trajectory, its status and its reductions."""
+def take_step(
+    task: Task, carry: Carry, step: Callable | None = None
+) -> tuple[Carry, Interval, StepTaken]:
+    """The next step of the trajectory, its status and its reductions; `step`: another one than that
+    of the method."""
     place = Place(task.t0, task.h, carry.k, carry.q, carry.p)
     interval, memory, exists = task.lattice.next(carry.lattice, task.equations, place)
     interval = task.in_precision(interval)
 
-    step = task.arithmetic.evaluated(task.method.step)
+    step = task.arithmetic.evaluated(step or task.method.step)
 
     def advance(q, p):
         here, *relative = task.arithmetic.enter(task.equations, q, p, carry.beside)
@@ -366,7 +368,7 @@ def run(
     else it is given a function as well, the state of a carry.
     """
     alone, _ = task.observables()
-    task, opened, closed = _in_loop(task, carry.q)
+    step, opened, closed = _in_loop(task, carry.q)
     carry = opened(carry)
 
     def over_steps(body, state, count):
@@ -382,14 +384,14 @@ def run(
         return interval if has_memory else None, (taken.q0, taken.p0) if alone else None
 
     def body(state, _):
-        carry, interval, taken = take_step(task, state[0])
+        carry, interval, taken = take_step(task, state[0], step)
         return (carry, last_of(carry, interval, taken)), None
 
     def steps(carry, _, count=plan.block):
         """The next `count` steps, and the saved values of the last of them."""
         inner, interval = None, task.interval(carry.k + (count - 1))
         if count == 1:  # a loop around one step would take time to compile
-            carry, interval, taken = take_step(task, carry)
+            carry, interval, taken = take_step(task, carry, step)
         else:
             before = last_of(carry, interval, StepTaken(*interval[:2], *[carry.q, carry.p] * 2))
             (carry, (now, before)), inner = over_steps(body, (carry, before), count)
@@ -411,17 +413,16 @@ def run(
     return closed(carry), saved, tail
 
 
-def _in_loop(
-    task: Task, q: State
-) -> tuple[Task, Callable[[Carry], Carry], Callable[[Carry], Carry]]:
-    """The task of the loop, and the functions from a carry to that of the loop and back."""
+def _in_loop(task: Task, q: State) -> tuple[Callable | None, Callable, Callable]:
+    """The step in the loop (None: that of the method), and the functions from a carry to that of
+    the loop and back."""
     equal = type(task.lattice) is Uniform and task.arithmetic.is_plain and task.stop is None
-    # Reductions read the states of all steps.
     quick = None
+    # Reductions read the states of all steps.
     if equal and not task.observables()[1]:
         quick = task.method.in_loop(task.equations, task.first_interval(), q)
     if quick is None:
-        return task, lambda carry: carry, lambda carry: carry
+        return None, lambda carry: carry, lambda carry: carry
 
     def moved(by, carry, k):
         q, p, info = by(task.equations, task.interval(k), carry.q, carry.p)
@@ -431,7 +432,7 @@ def _in_loop(
         return carry._replace(**dict(zip(names, state, strict=True)))
 
     return (
-        dataclasses.replace(task, method=quick.kernel),
+        quick.step,
         lambda carry: moved(quick.before, carry, carry.k),
         lambda carry: moved(quick.after, carry, carry.k - 1),
     )

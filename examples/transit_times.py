@@ -142,8 +142,8 @@ def main(quick, directory):
     began = time.perf_counter()
     draws = 200 if quick else 1000
     chains = dvi.sample(
-        model, data, found.params, priors=priors, bounds=bounds, start=found, num_samples=draws, target_accept=0.98,
-        num_warmup=150 if quick else 500, chains=2, progress=False,
+        model, data, found.params, priors=priors, bounds=bounds, start=found, num_samples=draws,
+        num_warmup=150 if quick else 500, chains=2, target_accept=0.98, progress=False,
     )  # fmt: skip
     print(f"NUTS: {chains.status} in {time.perf_counter() - began:.1f} s")
     print(f"{'':12}{'truth':>12}{'fit':>12}{'±':>10}{'NUTS':>12}{'±':>10}")

@@ -15,13 +15,10 @@ from .._types import Args, Interval, State
 
 
 class InLoop(NamedTuple):
-    """A method for steps of equal length that nobody observes: after ∘ kernelⁿ ∘ before is n steps.
-
-    `before` and `after` are functions as `Method.step`.
-    """
+    """Functions as `Method.step`: after ∘ stepⁿ ∘ before is n steps of equal length."""
 
     before: Callable
-    kernel: "Method"
+    step: Callable
     after: Callable
 
 

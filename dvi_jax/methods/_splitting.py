@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple
@@ -26,7 +27,13 @@ from ._strang import Strang
 from ._type_ii import TypeII
 
 Moved = tuple[State, State, StepInfo]
-Part = Callable[[Interval, State, State], Moved]
+
+
+class Part(NamedTuple):
+    """The motion of one part, ``advance(interval, q, p)``, and whether it is its exact flow."""
+
+    advance: Callable[[Interval, State, State], Moved]
+    is_exact: bool
 
 
 class _Letter(NamedTuple):
@@ -46,8 +53,8 @@ class _Letter(NamedTuple):
 
 
 def _letters(word: Sequence[tuple[int, float]], time: float = 0.0) -> list[_Letter]:
-    # The first part carries the time; the others act at a fixed time. A symmetric sum ends at 1 to
-    # the last digit only if its end is not summed up.
+    # The first part carries the time; the others act at a fixed time. Sums end at 1 only to the
+    # last digit.
     found, total = [], math.fsum(c for i, c in word if i == 0) + time
     for i, c in word:
         end = time + c if i == 0 else time
@@ -120,7 +127,7 @@ class SplittingMethod(Method):
         def advanced(state, pieces, which):
             q, p, info = state
             for i, piece in zip(which, pieces, strict=True):
-                q, p, now = parts[i](piece, q, p)
+                q, p, now = parts[i].advance(piece, q, p)
                 info = info.then(now)
             return q, p, info
 
@@ -141,18 +148,14 @@ class SplittingMethod(Method):
         parts = self.parts(equations, interval, q)
         word = word_of(self.scheme, len(parts))
         # Two flows of the first part are one only if they are exact.
-        is_alike = self.is_symmetric and len(word) > 1 and _is_explicit(parts[0])
+        is_alike = self.is_symmetric and len(word) > 1 and parts[0].is_exact
         return _in_loop(self, word[0][1]) if is_alike else None
 
     def needs_no_solve(self, equations, interval, q) -> bool:
-        return all(map(_is_explicit, self.parts(equations, interval, q)))
+        return all(part.is_exact for part in self.parts(equations, interval, q))
 
     def inverse_needs_no_solve(self, equations, interval, q) -> bool:
         return self.needs_no_solve(equations, interval, q)
-
-
-def _is_explicit(part: Part) -> bool:
-    return getattr(part, "is_explicit", True)
 
 
 def _in_loop(method: SplittingMethod, a: float) -> InLoop:
@@ -160,46 +163,19 @@ def _in_loop(method: SplittingMethod, a: float) -> InLoop:
 
     def before(equations, interval, q, p):
         q, p, first = method.enter(equations, interval, q, p)
-        letters = [_Letter(0, 0.0, -a, -a)]
-        q, p, info = method.composed(equations, interval, letters, q, p)
+        q, p, info = method.composed(equations, interval, [_Letter(0, 0.0, -a, -a)], q, p)
         return q, p, first.then(info)
 
+    def step(equations, interval, q, p):
+        _, *middle, _ = method._word(equations, interval, q)
+        return method.composed(equations, interval, _letters([(0, 2 * a), *middle], -a), q, p)
+
     def after(equations, interval, q, p):
-        letters = [_Letter(0, 1 - a, 1.0, a)]
-        q, p, info = method.composed(equations, interval, letters, q, p)
+        q, p, info = method.composed(equations, interval, [_Letter(0, 1 - a, 1.0, a)], q, p)
         q, p, last = method.leave(equations, interval, q, p)
         return q, p, info.then(last)
 
-    return InLoop(before, _Kernel(method, a), after)
-
-
-class _Kernel(Method):
-    """A step without its last flow of the first part, which joins that of the next step."""
-
-    outer: SplittingMethod
-    a: float = eqx.field(static=True)
-
-    is_symplectic: ClassVar[bool] = True
-    is_symmetric: ClassVar[bool] = False
-    is_invertible: ClassVar[bool] = False
-
-    @property
-    def order(self) -> int:
-        return self.outer.order
-
-    def step(self, equations, interval, q0, p0):
-        first, *middle, _ = self.outer._word(equations, interval, q0)
-        letters = _letters([(first[0], 2 * self.a), *middle], -self.a)
-        return self.outer.composed(equations, interval, letters, q0, p0)
-
-    def inverse(self, equations, interval, q1, p1):
-        raise NotImplementedError("Only whole steps have an inverse.")
-
-    def needs_no_solve(self, equations, interval, q) -> bool:
-        return self.outer.needs_no_solve(equations, interval, q)
-
-    def inverse_needs_no_solve(self, equations, interval, q) -> bool:
-        return False
+    return InLoop(before, step, after)
 
 
 def _as_scheme(given: Any) -> Any:
@@ -251,47 +227,35 @@ class Splitting(SplittingMethod):
                 "method=dvi.Splitting(...) requires a system with known parts: "
                 f"dvi.System(dvi.Split([H_A, H_B])). Its H_D is {H!r:.100}."
             )
-        rest = (system.force, system.perturbation)
-        found = [
-            _part(equations, H_i, i, self.order, rest if i == H.perturbed else (None, None))
-            for i, H_i in enumerate(H.parts)
-        ]
-        if H.perturbed is None and rest != (None, None):
-            found.append(_part(equations, _no_energy, len(found), self.order, rest))
-        return [make(interval, q) for make in found]
+        rest, parts = (system.force, system.perturbation), [(H_i, None, None) for H_i in H.parts]
+        if H.perturbed is not None:
+            parts[H.perturbed] = (H.parts[H.perturbed], *rest)
+        elif rest != (None, None):
+            parts.append((_no_energy, *rest))
+
+        def part(i, H_i, *rest):
+            if isinstance(H_i, Flow):
+                return _known(equations, H_i)
+            own = System(H_i, *rest, slow_time=system.slow_time)
+            own = dataclasses.replace(equations, system=own)
+            is_exact = _is_exact(own, interval, q, timed=i == 0)
+            method = TypeII() if is_exact else GaussLegendre(-(-self.order // 2))
+            return Part(functools.partial(method.step, own), is_exact)
+
+        return [part(i, *of) for i, of in enumerate(parts)]
 
 
 def _no_energy(t0, t1, q0, p1, args):
     return jnp.zeros((), q0.dtype)
 
 
-def _part(equations: Equations, H: Any, i: int, order: int, rest: tuple[Any, Any]) -> Callable:
-    if isinstance(H, Flow):
-        return lambda interval, q: _known(equations, H)
-    system = System(H, *rest, slow_time=equations.system.slow_time)
-    own = dataclasses.replace(equations, system=system)
-
-    def made(interval, q):
-        if _is_exact(own, interval, q, timed=i == 0):
-            return lambda interval, q, p: TypeII().step(own, interval, q, p)
-        solved = GaussLegendre(-(-order // 2))
-
-        def part(interval, q, p):
-            return solved.step(own, interval, q, p)
-
-        part.is_explicit = False  # pyright: ignore[reportFunctionMemberAccess]
-        return part
-
-    return made
-
-
 def _known(equations: Equations, flow: Flow) -> Part:
-    def part(interval, q, p):
+    def advance(interval, q, p):
         dq, dp, found = flow.change(interval.h, *equations.absolute(q, p), equations.args)
         q, p = q + dq, p + dp
         return q, p, judge(no_solve(q)._replace(converged=found), q, p)
 
-    return part
+    return Part(advance, True)
 
 
 def _is_exact(equations: Equations, interval: Interval, like: State, timed: bool) -> bool:

@@ -16,7 +16,7 @@ from .._step import Equations, judge, no_solve, no_step_yet
 from .._types import Args, Interval, Scalar, State
 from ..engine.newton import find_root
 from ._schemes import ORDERS_OF_CORRECTORS, check_scheme, corrector, joined
-from ._splitting import SplittingMethod, _as_scheme, _Letter
+from ._splitting import Part, SplittingMethod, _as_scheme, _Letter
 from ._strang import Strang
 
 Coordinates = Literal["jacobi", "democratic"]
@@ -249,8 +249,7 @@ class WisdomHolman(SplittingMethod):
             X = X + interval.h / 2 * frame.drift(base[1] + V)
             return X, V, judge(info, X, V)
 
-        interaction.is_explicit = not implicit  # pyright: ignore[reportFunctionMemberAccess]
-        return [kepler, interaction]
+        return [Part(kepler, True), Part(interaction, not implicit)]
 
     def enter(self, equations, interval, q, p):
         frame = self._frame(equations, interval, q)

@@ -29,8 +29,10 @@ def angular_momentum(t0, t1, q0, p0, q1, p1, args):
 
 @over_times((2,))
 def exact(t, q0, p0, args):
-    """The state at times t at ε = 0, on any orbit: see `dvi_jax._kepler.change`. Differentiable in t,
-    q0, p0 and K."""
+    """The state at times t at ε = 0, on an orbit of any eccentricity (`dvi_jax._kepler.change`).
+
+    Differentiable in t, q0, p0 and K.
+    """
     dq, dp, _ = change(t, q0, p0, args["K"] ** 2)
     return q0 + dq, p0 + dp
 
