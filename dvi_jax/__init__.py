@@ -49,6 +49,8 @@ from .lattices import (
     Variational as Variational,
 )
 from .methods import (
+    BAOAB as BAOAB,
+    OBABO as OBABO,
     Adjoint as Adjoint,
     BlanesMoan as BlanesMoan,
     Composition as Composition,
@@ -58,10 +60,18 @@ from .methods import (
     McLachlan as McLachlan,
     Method as Method,
     RungeKutta4 as RungeKutta4,
+    StochasticEuler as StochasticEuler,
+    StochasticMidpoint as StochasticMidpoint,
     Strang as Strang,
     Suzuki as Suzuki,
     TypeII as TypeII,
     Yoshida as Yoshida,
+)
+from .noise import (
+    Brownian as Brownian,
+    Increments as Increments,
+    Langevin as Langevin,
+    NoiseHamiltonians as NoiseHamiltonians,
 )
 from .observe import (
     GALI as GALI,

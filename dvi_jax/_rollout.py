@@ -1,5 +1,6 @@
 """The loop over the steps of a time grid, with status, saved states and observables."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -12,7 +13,12 @@ from jaxtyping import Array, Float, Int, PyTree
 import lanewise
 
 from ._arithmetic import Arithmetic, FloatingPoint
-from ._plan import Plan as Plan, make_plan as make_plan, piece_length as piece_length
+from ._plan import (
+    Plan as Plan,
+    adds_start_outside as adds_start_outside,
+    make_plan as make_plan,
+    piece_length as piece_length,
+)
 from ._results import RESULTS, first_failure
 from ._step import Equations
 from ._types import Args, Bindable, Interval, Scalar, State
@@ -21,6 +27,7 @@ from .engine.pairs import rounded
 from .engine.reads import Reads
 from .lattices import Lattice, Place
 from .methods import Method
+from .noise import NoisePath
 from .observe import (
     Deviations,
     Pushed,
@@ -48,6 +55,7 @@ class Task(eqx.Module):
     arithmetic: Arithmetic = FloatingPoint()
     stop: Stop | None = None
     reads: Reads = eqx.field(static=True, default=())
+    path: NoisePath | None = None
 
     @property
     def args(self) -> Args:
@@ -56,6 +64,12 @@ class Task(eqx.Module):
     def interval(self, k: Int[Array, ""]) -> Interval:
         """The interval of step k; of a lattice with a memory, of the first step only."""
         return self.in_precision(self.lattice.interval(self.t0, self.h, k))
+
+    def equations_at(self, k: Int[Array, ""], interval: Interval) -> Equations:
+        """The equations of step k, with the increments of its noise."""
+        if self.path is None:
+            return self.equations
+        return dataclasses.replace(self.equations, increments=self.path.at(k, interval))
 
     def first_interval(self) -> Interval:
         """The interval of step 0."""
@@ -234,11 +248,11 @@ def take_step(task: Task, carry: Carry) -> tuple[Carry, Interval, StepTaken]:
     place = Place(task.t0, task.h, carry.k, carry.q, carry.p)
     interval, memory, exists = task.lattice.next(carry.lattice, task.equations, place)
     interval = task.in_precision(interval)
-
+    equations = task.equations_at(carry.k, interval)
     step = task.arithmetic.evaluated(task.method.step)
 
     def advance(q, p):
-        here, *relative = task.arithmetic.enter(task.equations, q, p, carry.beside)
+        here, *relative = task.arithmetic.enter(equations, q, p, carry.beside)
         q1, p1, info = step(here, interval, *relative)
         q1, p1, beside = task.arithmetic.leave(q, p, q1, p1)
         return (q1, p1), (beside, rounded(info))
@@ -423,13 +437,6 @@ def with_tail(plan: Plan, saved: Saved, tail: Saved | None) -> Saved:
         return saved
     tail = tail._replace(inner=None)
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), saved, tail)
-
-
-def adds_start_outside(plan: Plan) -> bool:
-    """Whether the start is added to the saved states after the compiled run, not in it."""
-    # Among few states the start is a large fraction, which need not be written for a user who reads
-    # the last state only. Among many it is a small fraction, and adding it later copies them all.
-    return plan.num_blocks <= 4
 
 
 def with_start(saved: Saved, q0: State, p0: State) -> Saved:

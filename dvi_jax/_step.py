@@ -45,7 +45,8 @@ class Equations(eqx.Module):
     """The discrete equations of a system for one ε and one set of args.
 
     `newton` is the solver of their implicit part. With an `origin` positions and momenta are
-    relative to it; with a `quantum` an explicit step changes the state by integer multiples of it,
+    relative to it; `increments` are those of the noise in one step, shape (parts of the step, m).
+    With a `quantum` an explicit step changes the state by integer multiples of it,
     and a rate has the same bits in every evaluation.
     """
 
@@ -55,6 +56,7 @@ class Equations(eqx.Module):
     newton: RootSolver | Known = Newton()
     origin: tuple[State, State] | None = None
     quantum: float | None = eqx.field(static=True, default=None)
+    increments: Array | None = None
 
     def absolute(self, q: State, p: State) -> tuple[State, State]:
         """(q, p) in the coordinates of the system, the origin added."""

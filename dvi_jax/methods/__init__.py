@@ -15,5 +15,11 @@ from ._published import (
     Yoshida as Yoshida,
 )
 from ._runge_kutta4 import RungeKutta4 as RungeKutta4
+from ._stochastic import (
+    BAOAB as BAOAB,
+    OBABO as OBABO,
+    StochasticEuler as StochasticEuler,
+    StochasticMidpoint as StochasticMidpoint,
+)
 from ._strang import Strang as Strang
 from ._type_ii import TypeII as TypeII
