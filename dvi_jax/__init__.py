@@ -69,7 +69,7 @@ from .methods import (
 )
 from .noise import (
     Brownian as Brownian,
-    Increments as Increments,
+    BrownianPath as BrownianPath,
     Langevin as Langevin,
     NoiseHamiltonians as NoiseHamiltonians,
 )

@@ -191,7 +191,7 @@ class System(eqx.Module):
 
 
 def _read_by(system: System) -> Reads:
-    of_noise = [] if system.noise is None else system.noise.functions()
+    of_noise = [] if system.noise is None else system.noise.functions
     functions = (system.H_D, system.force, system.perturbation, *of_noise)
     # A counter of calls, for instance, changes with every trace, and no program depends on it.
     ignored = {name for f in functions for name in _changed_by_tracing(f)}

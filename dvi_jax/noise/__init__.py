@@ -2,15 +2,13 @@
 
 from ._models import (
     Langevin as Langevin,
-    MomentumNoise as MomentumNoise,
     Noise as Noise,
     NoiseHamiltonians as NoiseHamiltonians,
     as_noise as as_noise,
 )
 from ._paths import (
     Brownian as Brownian,
-    Increments as Increments,
+    BrownianPath as BrownianPath,
     NoisePath as NoisePath,
-    Path as Path,
     as_path as as_path,
 )

@@ -1,36 +1,34 @@
 """Brownian paths: the increments of a run, step by step."""
 
 import abc
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Int
 
-from lanewise.jaxapi import threefry2x32
+from lanewise.jaxapi import is_traced, threefry2x32
 
 from .._checks import whole
 from .._types import Interval
 
-_MOST_NUMBERED = 2**32
 
-
-class Path(eqx.Module):
-    """Base class of Brownian paths B(t)."""
+class BrownianPath(eqx.Module):
+    """Base class of the paths B(t) of m independent Brownian motions."""
 
     @abc.abstractmethod
     def increments(self, k: Int[Array, ""], interval: Interval, parts: int, count: int) -> Array:
-        """The increments of `count` independent motions over the `parts` equal parts of step k of
-        a run, shape (parts, count) [√time]. They must depend on nothing else."""
+        """The increments of `count` motions over the `parts` equal parts of step k of a run, shape
+        (parts, count) [√time]; a pure function of these arguments."""
 
-    def check(self, num_steps: int, parts: int) -> None:
-        """**Raises** `ValueError` if the path is too short for a run."""
+    def check(self, num_steps: int) -> None:
+        """**Raises** `ValueError` for a run of more steps than the path has."""
 
 
-class Brownian(Path):
+class Brownian(BrownianPath):
     r"""Brownian motions whose increments are made from a key and the number of the step.
 
         ΔB_k = √h z_k,     z_k = jax.random.normal(jax.random.fold_in(key, first_step + k), (m,))
@@ -43,30 +41,17 @@ class Brownian(Path):
 
     - `key`: a key of `jax.random`, or an integer, the seed of one. Under `vmap` over keys, and in a
       `sweep` over an axis of seeds, each trajectory has its own path.
-    - `substeps`: n, number of the equal parts of a step. ΔB_k is √(h/n) times the sum of the
+    - `substeps`: n, number of the equal parts of a step. ΔB_k is √(h/n) times the sum of the n
       numbers z with the indices n (first_step + k), …, so that runs with steps h, h/2, h/4 and
-      with 4, 2 and 1 substeps have the same path B(t). For convergence tests.
+      4, 2 and 1 substeps have the same path B(t), as tests of convergence require.
     - `first_step`: number of the first step. A run over N steps is continued by a run from its last
       state with ``first_step=N``.
 
-    A method that needs the increments of the halves of a step, such as `OBABO`, takes twice as many
-    parts.
+    A method that takes two increments per step, `OBABO`, doubles n.
 
-    **Raises** `ValueError` or `TypeError` for another key, or more than 2³² parts.
+    **Raises** `ValueError` or `TypeError` for another key; `ValueError` for more than 2³² parts.
 
     **Source** counter-based generators: Salmon, Moraes, Dror & Shaw 2011.
-
-    **Example**
-
-    ```python
-    free = dvi.System(lambda t0, t1, q0, p1, args: p1 @ p1 / 2,
-                      noise=lambda t, q, p, args: jnp.ones(1))
-    run = dict(method=dvi.StochasticEuler(), save=dvi.Save(final=True))
-    coarse = dvi.integrate(free, [0.0], [0.0], h=0.1, num_steps=8, path=dvi.Brownian(3, 2), **run)
-    fine = dvi.integrate(free, [0.0], [0.0], h=0.05, num_steps=16, path=dvi.Brownian(3), **run)
-    print(bool(jnp.allclose(coarse.ps[-1], fine.ps[-1])))
-    # True
-    ```
     """
 
     # Not converted here: in a sweep it is an axis of seeds.
@@ -75,126 +60,76 @@ class Brownian(Path):
     first_step: Any = 0
 
     def __check_init__(self):
-        whole("substeps", self.substeps, 1)
+        whole("substeps", self.substeps)
 
-    def check(self, num_steps, parts):
-        first = 0 if isinstance(self.first_step, jax.core.Tracer) else int(self.first_step)
-        numbers = (first + num_steps) * parts * self.substeps
-        if first < 0 or numbers > _MOST_NUMBERED:
-            raise ValueError(
-                f"first_step must not be negative, and (first_step + num_steps) × substeps × parts "
-                f"of a step must be at most 2³², got first_step={self.first_step}, "
-                f"num_steps={num_steps}, substeps={self.substeps} and {parts} parts. Use another "
-                "key for each piece of a longer run."
-            )
+    def check(self, num_steps):
+        if not is_traced(self.first_step):  # twice, for methods with two increments per step
+            most = 2**32 // (2 * self.substeps) - num_steps
+            hint = "A path has 2³² parts: continue a longer run with another key."
+            whole("first_step", int(self.first_step), 0, most, hint)
 
     def increments(self, k, interval, parts, count):
-        number = (jnp.asarray(self.first_step).astype(jnp.uint32) + k.astype(jnp.uint32)) * (
-            parts * self.substeps
-        )
-        dtype = interval.h.dtype
+        first = jnp.asarray(self.first_step).astype(jnp.uint32) + k.astype(jnp.uint32)
+        dtype, size = interval.h.dtype, self.substeps
 
-        def total(j):
-            """The sum of the numbers of part j."""
-            first = number + jnp.uint32(j * self.substeps)
-            if self.substeps == 1:
-                return _normal(self.key, first, count, dtype)
+        def total(part):
+            """The sum of the numbers of a part."""
 
             def add(i, x):
-                return x + _normal(self.key, first + i.astype(jnp.uint32), count, dtype)
+                number = (first * parts + part) * size + jnp.asarray(i).astype(jnp.uint32)
+                return x + _normal(self.key, number, count, dtype)
 
-            return lax.fori_loop(0, self.substeps, add, jnp.zeros(count, dtype))
+            zero = jnp.zeros(count, dtype)
+            return add(0, zero) if size == 1 else lax.fori_loop(0, size, add, zero)
 
-        root = jnp.sqrt(interval.h / (parts * self.substeps))  # NaN for time that runs backwards
-        return root * jnp.stack([total(j) for j in range(parts)])
-
-
-class Increments(Path):
-    r"""Brownian motions from a function of the ends of a step.
-
-    **Arguments**
-
-    - `function`: ``(t0, t1)`` → array of the shape (m,), B(t1) − B(t0) [√time], such as the method
-      ``evaluate`` of a `diffrax.VirtualBrownianTree`, whose path does not depend on the steps. It
-      must be a pure function. m is the number of noises of the system.
-
-    **Raises** `ValueError` if the function returns another shape.
-
-    **Example**
-
-    ```python
-    def B(t0, t1):                                              # a smooth path, for a test
-        return jnp.array([jnp.sin(t1) - jnp.sin(t0)])
-
-    free = dvi.System(lambda t0, t1, q0, p1, args: p1 @ p1 / 2,
-                      noise=lambda t, q, p, args: jnp.ones(1))
-    sol = dvi.integrate(free, [0.0], [0.0], h=0.1, num_steps=10, path=dvi.Increments(B),
-                        method=dvi.StochasticEuler())
-    print(round(float(sol.ps[-1, 0]), 6), round(float(np.sin(1.0)), 6))
-    # 0.841471 0.841471
-    ```
-    """
-
-    function: Callable[[Any, Any], Any]
-
-    def increments(self, k, interval, parts, count):
-        ends = [interval.part(j / parts, (j + 1) / parts) for j in range(parts)]
-        found = [jnp.asarray(self.function(*end[:2])) for end in ends]
-        if any(x.shape != (count,) for x in found):
-            raise ValueError(
-                "the function of dvi.Increments must return one number for each noise of the "
-                f"system, shape ({count},), got shape {found[0].shape}."
-            )
-        return jnp.stack(found).astype(interval.h.dtype)
+        root = jnp.sqrt(interval.h / (parts * size))  # NaN for time that runs backwards
+        return root * jnp.stack([total(np.uint32(part)) for part in range(parts)])
 
 
 class NoisePath(eqx.Module):
     """The path of a run: a step has `parts` parts, with the increments of `count` motions each."""
 
-    path: Path
+    path: BrownianPath
     parts: int = eqx.field(static=True)
     count: int = eqx.field(static=True)
 
     def at(self, k: Int[Array, ""], interval: Interval) -> Array:
         """The increments of step k, shape (parts, count)."""
-        return self.path.increments(k, interval, self.parts, self.count)
+        found = self.path.increments(k, interval, self.parts, self.count)
+        if found.shape != (self.parts, self.count):
+            raise ValueError(
+                f"the increments of {type(self.path).__name__} must have the shape (parts, number "
+                f"of noises) = {(self.parts, self.count)}, got {found.shape}."
+            )
+        return found.astype(interval.h.dtype)
 
 
-def as_path(path: Any) -> Path | None:
+def as_path(path: Any) -> BrownianPath | None:
     """The path of a run, its key as two words. **Raises** `TypeError` or `ValueError`."""
-    if path is None:
-        return None
-    if not isinstance(path, Path):
-        path = Brownian(path)
-    if not isinstance(path, Brownian):
+    if path is None or (not isinstance(path, Brownian) and isinstance(path, BrownianPath)):
         return path
-    first = jnp.asarray(path.first_step)
-    if first.shape != () or not jnp.issubdtype(first.dtype, jnp.integer):
-        raise TypeError(f"first_step must be an integer, got {path.first_step!r:.200}.")
-    return Brownian(_words(path.key), path.substeps, first)
+    path = path if isinstance(path, Brownian) else Brownian(path)
+    return Brownian(_words(path.key), path.substeps, jnp.asarray(path.first_step))
 
 
 def _words(key: Any) -> Array:
     try:
-        key = jnp.asarray(key)
+        found = jnp.asarray(key)
     except TypeError:
-        raise TypeError(_WRONG_KEY.format(f"{key!r:.200}")) from None
-    if jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
+        found = jnp.zeros(0)
+    if jnp.issubdtype(found.dtype, jax.dtypes.prng_key):
         # Another generator has keys of another length, or another meaning.
-        if key.shape == () and "fry" in str(key.dtype):
-            return jax.random.key_data(key)
-    elif key.shape == (2,) and key.dtype == jnp.uint32:  # an old key of JAX: its words
-        return key
-    elif key.shape == () and jnp.issubdtype(key.dtype, jnp.integer):
-        return jax.random.key_data(jax.random.key(key, impl="threefry2x32"))
-    raise ValueError(_WRONG_KEY.format(f"shape {key.shape}, dtype {key.dtype}"))
-
-
-_WRONG_KEY = (
-    "the key of a path must be one key of jax.random, such as jax.random.key(0), with the "
-    "generator threefry2x32, or an integer, got {}. For many paths use jax.vmap over keys, or "
-    'dvi.sweep(..., path=dvi.Axis("seed", range(1000))).'
-)
+        if found.shape == () and "fry" in str(found.dtype):
+            return jax.random.key_data(found)
+    elif found.shape == (2,) and found.dtype == jnp.uint32:  # an old key of JAX: its words
+        return found
+    elif found.shape == () and jnp.issubdtype(found.dtype, jnp.integer):
+        return jax.random.key_data(jax.random.key(found, impl="threefry2x32"))
+    raise ValueError(
+        "the key of a path must be one key of jax.random with the generator threefry2x32, such as "
+        f"jax.random.key(0), or an integer, got {key!r:.200}. For many paths use jax.vmap over "
+        'keys, or dvi.sweep(..., path=dvi.Axis("seed", range(1000))).'
+    )
 
 
 def _normal(key: Array, number: Array, count: int, dtype: Any) -> Array:
