@@ -186,7 +186,7 @@ def integrate(
     # From here on `system`, `q0`, … may be those of another problem with other variables, whose
     # solution `undo` transforms back.
     given = Run(system, t0, q0, p0, epsilon, args, observe, save, stop)
-    driven = noise_path(given, as_path(path), integrator, method, num_steps)
+    driven = noise_path(given, as_path(path), integrator, method, h, num_steps)
     asked, undo = kind.transform(lattice, given)
     kind.check(lattice, method, integrator.arithmetic)
     task, q0, p0 = _task(asked, integrator, method, h)

@@ -1,17 +1,20 @@
 """Which runs may have noise, and the path of such a run."""
 
 import jax
+from jaxtyping import Array
+
+from lanewise.jaxapi import is_traced
 
 from ._arithmetic import Compensated, FloatingPoint
 from ._integrator import Integrator
-from .lattices import Given, Run, Uniform
+from .lattices import Lattice, Run
 from .methods import Method
 from .noise import BrownianPath, NoisePath
 from .observe import Section, is_observable
 
 
 def noise_path(
-    run: Run, path: BrownianPath | None, how: Integrator, method: Method, num_steps: int
+    run: Run, path: BrownianPath | None, how: Integrator, method: Method, h: Array, num_steps: int
 ) -> NoisePath | None:
     """The path for a run, None without noise. **Raises** `ValueError` if they do not fit."""
     noise = run.system.noise
@@ -39,7 +42,7 @@ def noise_path(
             "dvi.StochasticMidpoint() for every kind of noise.",
         ),
         (
-            not isinstance(how.lattice, Uniform | Given),
+            how.lattice.has_memory or type(how.lattice).transform is not Lattice.transform,
             f"lattice={how.lattice!r:.200} cannot be used with noise, because its steps depend on "
             "the state. Use dvi.Uniform() or dvi.Given(ts).",
         ),
@@ -47,6 +50,10 @@ def noise_path(
             not isinstance(how.arithmetic, FloatingPoint | Compensated),
             f"arithmetic={how.arithmetic!r:.200} cannot be used with noise. Use "
             "dvi.FloatingPoint() or dvi.Compensated().",
+        ),
+        (
+            not is_traced(h) and not h > 0,
+            f"h must be positive for a system with noise, got h={h}.",
         ),
         (
             needs_states_within,

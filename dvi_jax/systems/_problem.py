@@ -14,6 +14,7 @@ from .._checks import finite as finite, positive as positive
 from .._system import System
 from ..discover.generators import Generator
 from ..discover.library import time_translation
+from ..noise import Langevin
 
 DIMENSIONLESS = {"q": "1", "p": "1", "t": "1", "energy": "1"}
 """Units of a dimensionless system."""
@@ -244,6 +245,7 @@ def library_problem(
     perturbation: Callable[..., Any] | None = None,
     autonomous: bool = True,
     slow_time: bool = False,
+    noise: Any = None,
     **fields: Any,
 ) -> Problem:
     """A `Problem` of the library.
@@ -261,7 +263,7 @@ def library_problem(
     if autonomous and not slow_time:
         fields["symmetries"] = {"time": time_translation(), **fields.get("symmetries", {})}
     return Problem(
-        system=System(hamiltonian, force, perturbation, slow_time),
+        system=System(hamiltonian, force, perturbation, slow_time, noise=noise),
         args={name: one.value for name, one in parameters.items()} or None,
         check=replace(start, parameters={name: one.check for name, one in parameters.items()}),
         parameters={name: one.meaning for name, one in parameters.items()},
@@ -340,3 +342,34 @@ def at_end(hamiltonian: Callable[..., Any]) -> Callable[..., Any]:
         return hamiltonian(t1, t1, q1, p1, args)
 
     return energy
+
+
+THERMAL = Langevin(lambda args: args["friction"], lambda args: args["temperature"])
+"""Friction and noise of a system with unit masses."""
+
+
+def thermal_parameters(temperature: float | None, friction: float) -> dict[str, Parameter]:
+    """Those of `THERMAL`; none for a temperature None."""
+    if temperature is None:
+        return {}
+    return {
+        "friction": Parameter(friction, "rate of friction γ [1/time]"),
+        "temperature": Parameter(temperature, "k_B T [energy]"),
+    }
+
+
+@functools.cache
+def configurational(hamiltonian: Callable[..., Any]) -> Callable[..., Any]:
+    """The observable `configurational`, from which a temperature follows."""
+
+    def configurational(t0, t1, q0, p0, q1, p1, args):
+        r"""(|∂V/∂q|², ∂²V/∂q·∂q) at t1, shape (2,): in the canonical distribution the ratio of the
+        means is T (Rugh 1997, *Phys. Rev. Lett.* 78, 772)."""
+
+        def V(q):
+            return hamiltonian(t1, t1, q, jnp.zeros_like(q), args)
+
+        slope = jax.grad(V)(q1)
+        return jnp.stack([jnp.sum(slope**2), jnp.trace(jax.hessian(V)(q1))])
+
+    return configurational

@@ -1,0 +1,230 @@
+"""Orders, distributions and gradients of the methods for noise.
+
+    python benchmarks/noise.py [--paths 100000] [strong weak canonical chain gradients invariant]
+
+prints each measure with its error, next to what it must be. One processor core and 10⁵ paths take
+some minutes; the slow tests in `tests/test_noise.py` call the same functions with fewer paths.
+"""
+
+import argparse
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import stats
+
+import dvi_jax as dvi
+from dvi_jax import systems
+
+jax.config.update("jax_enable_x64", True)
+
+
+# --- orders ---------------------------------------------------------------------------------------
+
+
+def H_D(t0, t1, q0, p1, args):
+    """A soft quartic well: no order is higher than it is in general."""
+    return jnp.sum(p1**2) / 2 + jnp.sum(q0**4) / 4 - jnp.sum(q0**2) / 2
+
+
+def bracket(t, q, p, args):
+    """One noise Hamiltonian that depends on q and p."""
+    return 0.3 * jnp.array([q[0] * p[0] + jnp.sin(q[0])])
+
+
+def pair(t, q, p, args):
+    """Two noise Hamiltonians that do not commute."""
+    return 0.3 * jnp.array([q[0] ** 2, p[0] ** 2 / 2 + jnp.sin(p[0])])
+
+
+KINDS = {
+    "Langevin": dvi.System(H_D, noise=dvi.Langevin(0.7, 0.5)),
+    "σ(q)": dvi.System(H_D, noise=lambda t, q, p, args: 0.5 * jnp.cos(q)),
+    "σ(q, p)": dvi.System(H_D, noise=lambda t, q, p, args: 0.5 * jnp.cos(q) * jnp.sqrt(1 + p**2)),
+    "h(q, p)": dvi.System(H_D, noise=dvi.NoiseHamiltonians(bracket)),
+    "h₁, h₂": dvi.System(H_D, noise=dvi.NoiseHamiltonians(pair)),
+}
+METHODS = {
+    "BAOAB": dvi.BAOAB(),
+    "OBABO": dvi.OBABO(),
+    "StochasticEuler": dvi.StochasticEuler(),
+    "StochasticMidpoint": dvi.StochasticMidpoint(),
+}
+ALL = ("StochasticEuler", "StochasticMidpoint")
+USED = {
+    "Langevin": METHODS,
+    "σ(q)": METHODS,
+    "σ(q, p)": ("StochasticMidpoint",),
+    "h(q, p)": ALL,
+    "h₁, h₂": ALL,
+}
+WEAK = {"BAOAB": 2, "OBABO": 2, "StochasticEuler": 1, "StochasticMidpoint": 2}
+"""Weak orders for Langevin's equation; of the midpoint rule they are 2 for additive noise."""
+
+
+def ends(system, method, steps, finest, keys, duration=1.0):
+    """(q, p) at the end of each path, shape (paths, 2), from one path for every number of steps."""
+
+    @jax.jit
+    def all_of(keys):
+        def one(key):
+            path = dvi.Brownian(key, substeps=finest // (steps * method.noises))
+            sol = dvi.integrate(
+                system, [1.0], [0.2], h=duration / steps, num_steps=steps, method=method,
+                path=path, save=dvi.Save(final=True),
+            )  # fmt: skip
+            return jnp.concatenate([sol.qs[-1], sol.ps[-1]])
+
+        return jax.vmap(one)(keys)
+
+    return np.asarray(all_of(keys))
+
+
+def slope(steps, errors, spread):
+    """Order by weighted regression of log error on log h, and its standard error."""
+    x, y, s = -np.log(steps), np.log(errors), spread / errors
+    w = 1 / s**2
+    mean = np.sum(w * x) / np.sum(w)
+    return np.sum(w * (x - mean) * y) / np.sum(w * (x - mean) ** 2), np.sum(
+        w * (x - mean) ** 2
+    ) ** -0.5
+
+
+def orders(kind, name, paths, steps=(8, 16, 32), finest=256, seed=0):
+    """(strong order, error, weak order, error) from the same paths.
+
+    The strong error is the rms distance from the finest solution, the weak one the difference of
+    the means of q² + p, whose noise is that of the difference.
+    """
+    keys = jax.random.split(jax.random.key(seed), paths)
+    system, method = KINDS[kind], METHODS[name]
+    # The finest solution by the midpoint rule: its error is that of a step 256/32 times smaller.
+    best = ends(system, METHODS["StochasticMidpoint"], finest, finest, keys)
+    strong, weak = [], []
+    for n in steps:
+        z = ends(system, method, n, finest, keys)
+        square = np.sum((z - best) ** 2, 1)
+        root = np.sqrt(square.mean())
+        strong.append((root, square.std() / (2 * root * np.sqrt(paths))))
+        moved = (z[:, 0] ** 2 + z[:, 1]) - (best[:, 0] ** 2 + best[:, 1])
+        weak.append((abs(moved.mean()), moved.std() / np.sqrt(paths)))
+    return *slope(np.array(steps), *np.array(strong).T), *slope(np.array(steps), *np.array(weak).T)
+
+
+# --- canonical distributions ----------------------------------------------------------------------
+
+
+def distribution(energy, temperature, low=-4.0, high=4.0, count=20_001):
+    """The cumulative distribution function of exp(−energy(x)/T) by quadrature."""
+    x = np.linspace(low, high, count)
+    weight = np.exp(-energy(x) / temperature)
+    total = np.concatenate([[0.0], np.cumsum((weight[1:] + weight[:-1]) / 2)])
+    return lambda y: np.interp(y, x, total / total[-1])
+
+
+class Mistaken(dvi.Langevin):
+    """Langevin's noise with the coefficient of Euler–Maruyama next to the exact friction."""
+
+    def kick(self, t, q, p, args, h, dB):
+        friction, temperature, mass = self._values(args, p)
+        noise = jnp.sqrt(2 * friction * temperature * mass) * dB.reshape(p.shape)
+        return jnp.expm1(-friction * h) * p + noise
+
+
+def samples(problem, system, method, paths, steps, h, seed=0):
+    """Final states of independent paths, and the means of |∂V/∂q|² and ∂²V/∂q·∂q of each."""
+
+    @jax.jit
+    def all_of(keys):
+        def one(key):
+            common = {"h": h, "method": method, "args": problem.args, "save": dvi.Save(final=True)}
+            burnt = dvi.integrate(system, problem.q0, problem.p0, num_steps=steps,
+                                  path=dvi.Brownian(key), **common)  # fmt: skip
+            sol = dvi.integrate(
+                system, burnt.qs[-1], burnt.ps[-1], num_steps=steps // 2,
+                path=dvi.Brownian(key, first_step=steps),
+                observe=dvi.Mean(problem.observables["configurational"]), **common,
+            )  # fmt: skip
+            return sol.qs[-1], sol.ps[-1], sol.observed
+
+        return jax.vmap(one)(keys)
+
+    return [np.asarray(x) for x in all_of(jax.random.split(jax.random.key(seed), paths))]
+
+
+def temperature(means):
+    """Configurational temperature from the means of each path, and its standard error."""
+    top, below = means.T
+    ratio = top.mean() / below.mean()
+    return ratio, np.std(top - ratio * below) / (below.mean() * np.sqrt(len(top)))
+
+
+def canonical(paths, method=None, mistaken=False, T=0.5, h=0.1, steps=2000):
+    """p-values of q and p of the double well by Kolmogorov and Smirnov; (T, error) of positions."""
+    problem = systems.double_well(T)
+    method = dvi.BAOAB() if method is None else method
+    system = problem.system
+    if mistaken:
+        system = dvi.System(system.H_D, noise=Mistaken(1.0, T))
+    q, p, means = samples(problem, system, method, paths, steps, h)
+    in_wells = distribution(lambda x: (x**2 - 1) ** 2, T)
+    return (
+        stats.kstest(q[:, 0], in_wells).pvalue,
+        stats.kstest(p[:, 0], stats.norm(scale=np.sqrt(T)).cdf).pvalue,
+        temperature(means),
+    )
+
+
+def chain(paths, mistaken=False, T=0.5, h=0.1, steps=4000):
+    """The same for all springs and all momenta of ten particles, which are independent."""
+    problem = systems.thermal_chain(10, T)
+    system = problem.system
+    if mistaken:
+        system = dvi.System(system.H_D, noise=Mistaken(1.0, T))
+    q, p, means = samples(problem, system, dvi.BAOAB(), paths, steps, h, seed=1)
+    springs = distribution(lambda d: d**2 / 2 + d**4 / 4, T)
+    return (
+        stats.kstest(np.diff(q, prepend=0).ravel(), springs).pvalue,
+        stats.kstest(p.ravel(), stats.norm(scale=np.sqrt(T)).cdf).pvalue,
+        temperature(means),
+    )
+
+
+# --- the table ------------------------------------------------------------------------------------
+
+
+def show_orders(paths, which):
+    print(f"{which} orders, {paths} paths")
+    for kind, names in USED.items():
+        for name in names:
+            found = orders(kind, name, paths)
+            order, error = found[:2] if which == "strong" else found[2:]
+            print(f"  {kind:9} {name:19} {order:6.3f} ± {error:.3f}", flush=True)
+
+
+def show_distribution(what, measure, paths):
+    print(f"{what}, {paths} independent paths, T = 0.5: p-values above 0.01")
+    for label, mistaken in (("BAOAB", False), ("wrong coefficient", True)):
+        of_q, of_p, (T, error) = measure(paths, mistaken=mistaken)
+        print(f"  {label:18} q {of_q:.3g}, p {of_p:.3g}, configurational T {T:.5f} ± {error:.5f}")
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--paths", type=int, default=100_000)
+    parser.add_argument("what", nargs="*", default=["strong", "weak", "canonical", "chain"])
+    given = parser.parse_args()
+    for what in given.what:
+        begin = time.process_time()
+        if what in ("strong", "weak"):
+            show_orders(given.paths, what)
+        elif what == "canonical":
+            show_distribution("Double well", canonical, given.paths)
+        elif what == "chain":
+            show_distribution("Chain of ten particles", chain, given.paths // 10)
+        print(f"  {time.process_time() - begin:.0f} s of processor time\n")
+
+
+if __name__ == "__main__":
+    main()
