@@ -35,6 +35,7 @@ HOMES = {
     "dynamics": (
         *("FREQUENCY_RESULTS", "SECTION_RESULTS", "Actions", "Frequencies", "FrequencyDiffusion"),
         *("FrequencyError", "FundamentalFrequencies", "PoincareSection", "Return", "ReturnMap"),
+        *("InvariantDiffusion", "invariant_diffusion"),
         *("SectionError", "actions", "bifurcation", "frequencies", "frequency_diffusion"),
         *("fundamental_frequencies", "poincare_section", "stroboscope", "tangent_map"),
     ),
