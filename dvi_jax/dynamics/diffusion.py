@@ -85,8 +85,8 @@ def invariant_diffusion(
     value = invariant if accepts(invariant, 4) else (lambda t, q, p, args: invariant(q, p))
     settings["epsilon"] = epsilon = system.strength(settings["epsilon"])
 
-    def coefficients(t, q, p, args):
-        """(b·∇I + ½ Σ_m g_m·∇(g_m·∇I), Σ_m (g_m·∇I)²) at a point."""
+    def coefficients(t0, t, q0, p0, q, p, args):
+        """(b·∇I + ½ Σ_m g_m·∇(g_m·∇I), Σ_m (g_m·∇I)²) at the end of a step."""
         s, _ = system.times(t, t, epsilon)
         none = jnp.zeros(noise.count(s, q, p, args), q.dtype)
 

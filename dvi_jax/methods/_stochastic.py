@@ -1,7 +1,7 @@
 """Methods for systems with noise."""
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -99,7 +99,7 @@ class _WithNoise(Method):
         # Arbitrarily large increments, which are arbitrarily rare, would have no solution.
         most = _LARGEST * jnp.sqrt(jnp.abs(interval.h))
         rates = jnp.clip(dB, -most, most) / interval.h
-        driven: Any = Driven(system, rates, interval.h, self.without.is_the_map)
+        driven = Driven(system, rates, interval.h, self.without.is_the_map)
         return dataclasses.replace(equations, system=driven, increments=None)
 
 

@@ -70,7 +70,7 @@ class MomentumNoise(Noise):
         sigma = jnp.asarray(self.sigma(t, q, p, args), p.dtype)
         if sigma.shape == q.shape:
             return sigma * rates.reshape(q.shape)
-        return jnp.sum(sigma * rates, -1)
+        return jnp.sum(sigma * jnp.broadcast_to(rates, sigma.shape), -1)
 
     def check_fixed_momentum(self, method, t, q, p, args):
         if depends_on(lambda p: self.sigma(t, q, p, args), 0, p):
@@ -108,15 +108,17 @@ class Langevin(Noise):
 
     def _values(self, args: Args, like: State) -> list[Array]:
         values = (self.friction, self.temperature, self.mass)
-        return [jnp.asarray(x(args) if callable(x) else x, like.dtype) for x in values]
+        found = [jnp.asarray(x(args) if callable(x) else x, like.dtype) for x in values]
+        return [jnp.broadcast_to(x, like.shape) if x.ndim else x for x in found]
 
     def count(self, t, q, p, args):
-        shapes = [x.shape for x in self._values(args, q)]
-        if jnp.broadcast_shapes(*shapes, q.shape) != q.shape:
+        try:
+            self._values(args, q)
+        except ValueError as error:
             raise ValueError(
                 "friction, temperature and mass of dvi.Langevin must broadcast with q0, shape "
-                f"{q.shape}, got the shapes {', '.join(map(str, shapes))}."
-            )
+                f"{q.shape}: {error}"
+            ) from None
         return q.size
 
     def force(self, t, q, p, args, rates):
