@@ -68,7 +68,7 @@ def ends(system, method, steps, finest, keys, duration=1.0):
     @jax.jit
     def all_of(keys):
         def one(key):
-            path = dvi.Brownian(key, substeps=finest // (steps * method.noises))
+            path = dvi.Brownian(key, substeps=finest // (steps * method.increments))
             sol = dvi.integrate(
                 system, [1.0], [0.2], h=duration / steps, num_steps=steps, method=method,
                 path=path, save=dvi.Save(final=True),
@@ -93,7 +93,7 @@ def slope(steps, errors, spread):
 def strong_order(kind, name, paths, seed=0):
     """Order, and its standard error, of the rms distance from the finest solution."""
     keys = jax.random.split(jax.random.key(seed), paths)
-    # For noises that do not commute the order 1/2 is seen at small steps only.
+    # Where noise terms do not commute, the order 1/2 is that of small steps.
     steps, finest = ((64, 128, 256), 2048) if kind == "h₁, h₂" else ((8, 16, 32), 256)
     best = ends(KINDS[kind], METHODS["StochasticMidpoint"], finest, finest, keys)
     found = []

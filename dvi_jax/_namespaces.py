@@ -10,7 +10,7 @@ NAMESPACES = {
     **{
         name: name
         for name in (
-            *("methods", "lattices", "observe", "discover", "dynamics", "proof"),
+            *("methods", "noise", "lattices", "observe", "discover", "dynamics", "proof"),
             *("systems", "plot", "interop", "testing", "paper", "certify", "run"),
         )
     },

@@ -48,7 +48,7 @@ def batch_size(values: Iterable[Any]) -> tuple[int, bool]:
 
 def threefry2x32(key: jax.Array, first: jax.Array, second: jax.Array) -> list[jax.Array]:
     """The generator of `jax.random` on words of 32 bits, for a key of two words."""
-    # The functions of `jax.random` take keys of a type of their own, which no code is made for.
+    # The functions of `jax.random` take keys of a type for which no code is generated.
     words = jnp.broadcast_arrays(key[0], key[1], jnp.uint32(first), jnp.uint32(second))
     return _threefry2x32.bind(*words)
 

@@ -178,13 +178,16 @@ def threefry2x32(*words: Array, **_) -> tuple[Array, Array]:
     SC11: Threefish with 20 rounds.
     """
     key0, key1, x, y = (w.astype(jnp.uint32) for w in jnp.broadcast_arrays(*words))
+    # The constant of Threefish, so that a key of zeros is not a fixed point.
     keys = (key0, key1, key0 ^ key1 ^ np.uint32(0x1BD11BDA))
     x, y = x + key0, y + key1
     for i in range(5):
         for bits in _ROTATIONS[i % 2]:
             x = x + y
+            # A rotation to the left, which LLVM recognises.
             left = lax.shift_left(y, jnp.full_like(y, bits))
             y = x ^ (left | lax.shift_right_logical(y, jnp.full_like(y, 32 - bits)))
+        # After every four rounds the next pair of the key, and the number of the pair.
         x = x + keys[(i + 1) % 3]
         y = y + keys[(i + 2) % 3] + np.uint32(i + 1)
     return x, y

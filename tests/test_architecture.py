@@ -262,6 +262,8 @@ tangent_map poincare_section PoincareSection SECTION_RESULTS SectionError Return
 bifurcation stroboscope frequencies Frequencies FREQUENCY_RESULTS FrequencyError
 fundamental_frequencies FundamentalFrequencies frequency_diffusion FrequencyDiffusion
 actions Actions
+Langevin NoiseHamiltonians Brownian BrownianPath
+BAOAB OBABO StochasticEuler StochasticMidpoint invariant_diffusion InvariantDiffusion
 ForceLibrary identify Identification NetworkForce
 """
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._step import Equations
+from .._step import Equations, StepInfo, no_step_yet
 from .._system import System
 from .._types import Args, Interval, Scalar, State
 from ._base import Method, check_invertible
@@ -45,6 +45,7 @@ class Driven(eqx.Module):
     def hamiltonian(
         self, t0: Scalar, t1: Scalar, q0: State, p1: State, epsilon: Scalar, args: Args
     ) -> Scalar:
+        # By this path derivatives of every method contain the noise, and the inverse exists.
         H, noise = self.system.hamiltonian(t0, t1, q0, p1, epsilon, args), self.system.noise
         if noise is None or noise.is_on_momenta:
             return H
@@ -57,6 +58,7 @@ class Driven(eqx.Module):
     def disturbing_force(
         self, t0: Scalar, t1: Scalar, q0: State, p1: State, epsilon: Scalar, args: Args
     ) -> State:
+        # Not multiplied by ε, as the force of the user is.
         force = self.system.disturbing_force(t0, t1, q0, p1, epsilon, args)
         s, _ = self.times(t0, t1, epsilon)
         return force + self.system.noise.force(s, q0, p1, args, self.rates)  # pyright: ignore
@@ -69,7 +71,7 @@ class _WithNoise(Method):
 
     is_symplectic: ClassVar[bool] = True
     is_invertible: ClassVar[bool] = True
-    noises: ClassVar[int] = 1
+    increments: ClassVar[int] = 1
 
     # Both with the rates of the step forwards, so that the inverse goes back along the same path.
     def step(self, equations, interval, q0, p0):
@@ -92,6 +94,7 @@ class _WithNoise(Method):
             return equations
         s, _ = system.times(*interval[:2], equations.epsilon)
         at = (s, *equations.absolute(q, p), equations.args)
+        # The midpoint rule needs no such test: it evaluates σ in the middle of the step.
         if self.without.is_the_map:
             noise.check_fixed_momentum(type(self).__name__, *at)
         # Without increments the equations are only examined, for whether they need a solve.
@@ -171,35 +174,34 @@ class _Splitting(Method):
         return self.needs_no_solve(equations, interval, q)
 
     def step(self, equations, interval, q0, p0):
-        first, second = interval.part(0.0, 0.5), interval.part(0.5, 1.0).reversed()
-        q, p, info, count = q0, p0, None, 0
-        for part in self.parts:
-            if part == "O":
-                p, count = self._kicked(equations, interval, count, q, p, 1), count + 1
-                continue
-            # The adjoint of the map is the inverse of the map by −h.
-            map_, over = (self.base.step, first) if part == "+" else (self.base.inverse, second)
-            q, p, found = map_(equations, over, q, p)
-            info = found if info is None else info.then(found)
-        return q, p, info
+        return self._moved(equations, interval, q0, p0, 1)
 
     def inverse(self, equations, interval, q1, p1):
-        first, second = interval.part(0.0, 0.5), interval.part(0.5, 1.0).reversed()
-        q, p, info, count = q1, p1, None, self.parts.count("O")
-        for part in reversed(self.parts):
+        return self._moved(equations, interval, q1, p1, -1)
+
+    def _moved(
+        self, equations: Equations, interval: Interval, q: State, p: State, sign: int
+    ) -> tuple[State, State, StepInfo]:
+        """The parts in their order, or (`sign` −1) their inverses in the opposite order."""
+        halves = {"+": interval.part(0.0, 0.5), "-": interval.part(0.5, 1.0).reversed()}
+        count, info = self.parts.count("O"), no_step_yet(q)
+        # The increments of the O, the last one first on the way back.
+        numbers = iter(range(count)[::sign])
+        for part in self.parts[::sign]:
             if part == "O":
-                p, count = self._kicked(equations, interval, count - 1, q, p, -1), count - 1
+                p = self._kicked(equations, interval, (next(numbers), count, sign), q, p)
                 continue
-            map_, over = (self.base.inverse, first) if part == "+" else (self.base.step, second)
-            q, p, found = map_(equations, over, q, p)
-            info = found if info is None else info.then(found)
+            # The adjoint of the map is the inverse of the map by −h.
+            moved = self.base.step if (part == "+") == (sign == 1) else self.base.inverse
+            q, p, found = moved(equations, halves[part], q, p)
+            info = info.then(found)
         return q, p, info
 
     def _kicked(
-        self, equations: Equations, interval: Interval, number: int, q: State, p: State, sign: int
+        self, equations: Equations, interval: Interval, which: tuple[int, int, int], q, p
     ) -> State:
-        """p after the flow of the O of this number at constant q, or (`sign` −1) its inverse."""
-        noise, dB, count = equations.system.noise, equations.increments, self.parts.count("O")
+        """p after one O (its number, their count, 1 or −1 for the inverse) at constant q."""
+        noise, dB, (number, count, sign) = equations.system.noise, equations.increments, which
         if noise is None or dB is None:
             return p
         # The middle of the part: a time that is the same forwards and backwards.
@@ -231,7 +233,7 @@ class BAOAB(_Splitting):
     symplectic maps: McLachlan & Perlmutter 2001, *J. Geom. Phys.* 39, 276.
     """
 
-    noises: ClassVar[int] = 1
+    increments: ClassVar[int] = 1
     parts: ClassVar[str] = "+O-"
 
 
@@ -250,5 +252,5 @@ class OBABO(_Splitting):
     Bou-Rabee & Owhadi 2010, *SIAM J. Numer. Anal.* 48, 278.
     """
 
-    noises: ClassVar[int] = 2
+    increments: ClassVar[int] = 2
     parts: ClassVar[str] = "O+-O"

@@ -58,17 +58,18 @@ class MomentumNoise(Noise):
         return [self.sigma]
 
     def count(self, t, q, p, args):
+        # Traced only: at the start σ may be singular.
         shape = jax.eval_shape(self.sigma, t, q, p, args).shape
         if shape != q.shape and (len(shape) != q.ndim + 1 or shape[:-1] != q.shape):
             raise ValueError(
                 f"noise{_NAMES} must return an array like q0, {q.shape}, for an independent noise "
-                f"in each momentum, or of the shape {(*q.shape, 'm')} for m noises; got {shape}."
+                f"in each momentum, or of the shape {(*q.shape, 'm')} for m motions; got {shape}."
             )
         return q.size if shape == q.shape else shape[-1]
 
     def force(self, t, q, p, args, rates):
         sigma = jnp.asarray(self.sigma(t, q, p, args), p.dtype)
-        if sigma.shape == q.shape:
+        if sigma.shape == q.shape:  # a diagonal matrix
             return sigma * rates.reshape(q.shape)
         return jnp.sum(sigma * jnp.broadcast_to(rates, sigma.shape), -1)
 
@@ -109,6 +110,7 @@ class Langevin(Noise):
     def _values(self, args: Args, like: State) -> list[Array]:
         values = (self.friction, self.temperature, self.mass)
         found = [jnp.asarray(x(args) if callable(x) else x, like.dtype) for x in values]
+        # Numbers stay numbers: e^{−γh} of a step is then computed once.
         return [jnp.broadcast_to(x, like.shape) if x.ndim else x for x in found]
 
     def count(self, t, q, p, args):
@@ -171,6 +173,7 @@ class NoiseHamiltonians(Noise):
     def energy(self, t, q, p, args, rates):
         return jnp.sum(jnp.asarray(self.h(t, q, p, args), p.dtype) * rates)
 
+    # Positions change as well: there is no exact flow at constant q.
     def kick(self, t, q, p, args, h, dB):
         raise ValueError(
             "dvi.BAOAB() and dvi.OBABO() require noise on the momenta, but the system has noise "

@@ -69,6 +69,7 @@ class Brownian(BrownianPath):
             whole("first_step", int(self.first_step), 0, most, hint)
 
     def increments(self, k, interval, parts, count):
+        # Modulo 2³², as the numbers of `fold_in` are; `check` excludes that they repeat.
         first = jnp.asarray(self.first_step).astype(jnp.uint32) + k.astype(jnp.uint32)
         dtype, size = interval.h.dtype, self.substeps
 
@@ -80,6 +81,7 @@ class Brownian(BrownianPath):
                 return x + _normal(self.key, number, count, dtype)
 
             zero = jnp.zeros(count, dtype)
+            # A loop, so that the code does not grow with the number of substeps.
             return add(0, zero) if size == 1 else lax.fori_loop(0, size, add, zero)
 
         root = jnp.sqrt(interval.h / (parts * size))  # NaN for time that runs backwards
@@ -95,11 +97,12 @@ class NoisePath(eqx.Module):
 
     def at(self, k: Int[Array, ""], interval: Interval) -> Array:
         """The increments of step k, shape (parts, count)."""
+        # A path of the user has the dtype of its own functions.
         found = self.path.increments(k, interval, self.parts, self.count)
         if found.shape != (self.parts, self.count):
             raise ValueError(
                 f"the increments of {type(self.path).__name__} must have the shape (parts, number "
-                f"of noises) = {(self.parts, self.count)}, got {found.shape}."
+                f"of motions) = {(self.parts, self.count)}, got {found.shape}."
             )
         return found.astype(interval.h.dtype)
 
@@ -108,6 +111,7 @@ def as_path(path: Any) -> BrownianPath | None:
     """The path of a run, its key as two words. **Raises** `TypeError` or `ValueError`."""
     if path is None or (not isinstance(path, Brownian) and isinstance(path, BrownianPath)):
         return path
+    # Here and not in `Brownian`: keys of JAX have a type that generated code does not take.
     path = path if isinstance(path, Brownian) else Brownian(path)
     return Brownian(_words(path.key), path.substeps, jnp.asarray(path.first_step))
 
@@ -134,7 +138,9 @@ def _words(key: Any) -> Array:
 
 def _normal(key: Array, number: Array, count: int, dtype: Any) -> Array:
     """``jax.random.normal(jax.random.fold_in(key, number), (count,), dtype)`` to round-off."""
+    # What `fold_in` does: the words of the number, encrypted with the key, are a new key.
     folded = jnp.stack(threefry2x32(key, jnp.uint32(0), number))
+    # What `random_bits` does: the index of each number in two words.
     words = threefry2x32(folded, jnp.uint32(0), jnp.arange(count, dtype=jnp.uint32))
     info = jnp.finfo(dtype)
     if info.bits == 64:

@@ -345,17 +345,7 @@ def at_end(hamiltonian: Callable[..., Any]) -> Callable[..., Any]:
 
 
 THERMAL = Langevin(lambda args: args["friction"], lambda args: args["temperature"])
-"""Friction and noise of a system with unit masses."""
-
-
-def thermal_parameters(temperature: float | None, friction: float) -> dict[str, Parameter]:
-    """Those of `THERMAL`; none for a temperature None."""
-    if temperature is None:
-        return {}
-    return {
-        "friction": Parameter(friction, "rate of friction γ [1/time]"),
-        "temperature": Parameter(temperature, "k_B T [energy]"),
-    }
+"""Friction and noise of unit masses."""
 
 
 @functools.cache
@@ -363,13 +353,11 @@ def configurational(hamiltonian: Callable[..., Any]) -> Callable[..., Any]:
     """The observable `configurational`, from which a temperature follows."""
 
     def configurational(t0, t1, q0, p0, q1, p1, args):
-        r"""(|∂V/∂q|², ∂²V/∂q·∂q) at t1, shape (2,): in the canonical distribution the ratio of the
-        means is T (Rugh 1997, *Phys. Rev. Lett.* 78, 772)."""
-
-        def V(q):
-            return hamiltonian(t1, t1, q, jnp.zeros_like(q), args)
-
-        slope = jax.grad(V)(q1)
-        return jnp.stack([jnp.sum(slope**2), jnp.trace(jax.hessian(V)(q1))])
+        """(|∂V/∂q|², ∂²V/∂q·∂q) at t1, shape (2,); the ratio of their canonical means is T."""
+        slope, curvature = (
+            d(lambda q: hamiltonian(t1, t1, q, jnp.zeros_like(q), args))(q1)
+            for d in (jax.grad, jax.hessian)
+        )
+        return jnp.stack([jnp.sum(slope**2), jnp.trace(curvature)])
 
     return configurational
