@@ -18,7 +18,7 @@ def noise_path(
 ) -> NoisePath | None:
     """The path for a run, None without noise. **Raises** `ValueError` if they do not fit."""
     noise = run.system.noise
-    if noise is None and path is None:  # nearly every run: nothing else is looked at
+    if noise is None and path is None:  # nearly every run
         return None
     observed = jax.tree.leaves(run.observe, is_leaf=is_observable)
     stops = run.save.ts is not None or run.stop is not None

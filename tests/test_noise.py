@@ -174,7 +174,11 @@ EACH = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("system", "name"), EACH)
+@pytest.mark.parametrize(
+    ("system", "name"),
+    [x if x.id == "Langevin BAOAB" else pytest.param(*x.values, id=x.id, marks=pytest.mark.slow)
+     for x in EACH],
+)  # fmt: skip
 def test_gradients_along_a_path(system, name):
     """Of states rebuilt backwards, and of differences with the same noise."""
     method, v, q0 = getattr(dvi, name)(), jnp.array([1.1, 0.3, 0.2, 0.05]), jnp.array([0.7])
