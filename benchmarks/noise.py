@@ -7,6 +7,7 @@ some minutes; the slow tests in `tests/test_noise.py` call the same functions wi
 """
 
 import argparse
+import dataclasses
 import itertools
 import time
 
@@ -39,6 +40,15 @@ def pair(t, q, p, args):
     return 0.3 * jnp.array([q[0] ** 2, p[0] ** 2 / 2 + jnp.sin(p[0])])
 
 
+class Uncorrected(dvi.StochasticEuler):
+    """Without the term of second order in the generating function: it converges to Itô's equation,
+    and not to Stratonovich's."""
+
+    def _driven(self, equations, interval, q, p):
+        driven = super()._driven(equations, interval, q, p)
+        return dataclasses.replace(driven, system=dataclasses.replace(driven.system, is_map=False))
+
+
 KINDS = {
     "Langevin": dvi.System(H_D, noise=dvi.Langevin(0.7, 0.5)),
     "σ(q)": dvi.System(H_D, noise=lambda t, q, p, args: 0.5 * jnp.cos(q)),
@@ -51,13 +61,15 @@ METHODS = {
     "OBABO": dvi.OBABO(),
     "StochasticEuler": dvi.StochasticEuler(),
     "StochasticMidpoint": dvi.StochasticMidpoint(),
+    "Uncorrected": Uncorrected(),
 }
-ALL = ("StochasticEuler", "StochasticMidpoint")
+FOUR = list(METHODS)[:4]
+ALL = FOUR[2:]
 USED = {
-    "Langevin": METHODS,
-    "σ(q)": METHODS,
+    "Langevin": FOUR,
+    "σ(q)": FOUR,
     "σ(q, p)": ("StochasticMidpoint",),
-    "h(q, p)": ALL,
+    "h(q, p)": [*ALL, "Uncorrected"],
     "h₁, h₂": ALL,
 }
 

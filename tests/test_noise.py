@@ -376,6 +376,12 @@ def test_strong_order(bench, kind, name, expected, within):
 
 
 @pytest.mark.slow
+def test_a_scheme_for_the_equation_of_ito_does_not_converge(bench):
+    order, _ = bench.strong_order("h(q, p)", "Uncorrected", 3000)
+    assert order < 0.3
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "name", "expected", "within"),
     [

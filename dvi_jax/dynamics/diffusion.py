@@ -14,6 +14,7 @@ from .._integrate import integrate
 from .._solution import Save
 from .._system import System, check_system, of_problem
 from ..engine.keywords import INTEGRATOR, with_keywords_of
+from ..engine.names import both_names
 from ..engine.signature import accepts
 from ..noise import Brownian
 from ..observe import Mean
@@ -38,6 +39,7 @@ class InvariantDiffusion(eqx.Module):
     changes: Any
 
 
+@both_names
 @with_keywords_of(integrate, f"h num_steps t0 epsilon args {INTEGRATOR}")
 def invariant_diffusion(
     system: System,
