@@ -33,7 +33,7 @@ class Brownian(BrownianPath):
 
         ΔB_k = √h z_k,     z_k = jax.random.normal(jax.random.fold_in(key, first_step + k), (m,))
 
-    to round-off, with the generator threefry2x32. Step k has these numbers whatever runs next to
+    to round-off, with the generator threefry2x32 (as JAX uses it by default). Step k has these numbers whatever runs next to
     it: alone, in a batch, backwards in the gradients of `Reversible`, with `progress`, after a
     resume.
 
