@@ -33,9 +33,9 @@ class Brownian(BrownianPath):
 
         ΔB_k = √h z_k,     z_k = jax.random.normal(jax.random.fold_in(key, first_step + k), (m,))
 
-    to round-off, with the generator threefry2x32 (as JAX uses it by default). Step k has these numbers whatever runs next to
-    it: alone, in a batch, backwards in the gradients of `Reversible`, with `progress`, after a
-    resume.
+    to round-off, for the generator threefry2x32 with the default settings of JAX. Step k has these
+    numbers in every run: alone, in a batch, backwards in the gradients of `Reversible`, with
+    `progress`, after a resume.
 
     **Arguments**
 
