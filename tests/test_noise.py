@@ -163,7 +163,7 @@ def test_equal_bits_alone_in_batches_and_after_a_resume():
     assert np.abs(thermal(dvi.Brownian(keys[2], first_step=1)).qs - alone.qs).max() > 0.01
 
 
-def test_equal_bits_with_progress_and_in_a_sweep(tmp_path):
+def test_equal_bits_with_progress_and_in_a_sweep():
     alone = thermal(4)
     pieces = thermal(4, progress=lambda done, total: None)
     np.testing.assert_array_equal(pieces.qs, alone.qs)
@@ -173,6 +173,11 @@ def test_equal_bits_with_progress_and_in_a_sweep(tmp_path):
         found = dvi.sweep(THERMAL, [1.0], [0.2], path=path, **final, lanes_per_task=8)
         assert dict(found.to_xarray().q.sizes)["seed"] == 20
         np.testing.assert_array_equal(found.to_xarray().q.sel(seed=4)[-1], alone.qs[-1])
+
+
+@pytest.mark.slow
+def test_a_sweep_resumes_with_its_own_seeds_only(tmp_path):
+    final, seeds = {**RUN, "save": dvi.Save(final=True)}, dvi.Axis("seed", np.arange(20))
     store = {"store": tmp_path / "paths", "lanes_per_task": 8, **final}
     first = dvi.sweep(THERMAL, [1.0], [0.2], path=seeds, **store)
     again = dvi.sweep(THERMAL, [1.0], [0.2], path=seeds, **store)
@@ -247,7 +252,7 @@ def one_step(system, method, back=False):
 def test_inverse_and_area_of_a_step(system, name):
     """Noise Hamiltonians conserve areas, and friction contracts them; splittings by e^{−γh}."""
     method, z = getattr(dvi, name)(), jnp.array([0.7, -0.4])
-    forwards = one_step(system, method)
+    forwards = jax.jit(one_step(system, method))
     np.testing.assert_allclose(one_step(system, method, back=True)(forwards(z)), z, atol=1e-13)
     area = jnp.linalg.det(jax.jacfwd(forwards)(z))
     if system is TWISTED:
@@ -259,6 +264,7 @@ def test_inverse_and_area_of_a_step(system, name):
         assert abs(float(area) - np.exp(-0.3 * 0.1)) > 1e-6
 
 
+@pytest.mark.slow
 def test_without_noise_the_methods_are_those_for_ordinary_systems():
     quiet = dvi.System(H_D)
     for noisy, plain in (
@@ -271,9 +277,8 @@ def test_without_noise_the_methods_are_those_for_ordinary_systems():
         np.testing.assert_allclose(*run, atol=1e-15)
 
 
-@pytest.mark.parametrize(
-    "name", ["StochasticEuler", pytest.param("StochasticMidpoint", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["StochasticEuler", "StochasticMidpoint"])
 def test_a_noisy_frequency(name):
     """Kubo's oscillator, H = E and h = sE, turns by the angle t + sB(t)."""
 

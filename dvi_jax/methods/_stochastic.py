@@ -11,7 +11,8 @@ from jaxtyping import Array
 from .._step import Equations, StepInfo, no_step_yet
 from .._system import System
 from .._types import Args, Interval, Scalar, State
-from ._base import Method, check_invertible
+from ._base import Method
+from ._composition import CompositionMethod
 from ._gauss_legendre import GaussLegendre
 from ._type_ii import TypeII
 
@@ -39,9 +40,6 @@ class Driven(eqx.Module):
     perturbation: ClassVar[None] = None
     force: ClassVar[str] = "that of noise"
 
-    def times(self, t0: Scalar, t1: Scalar, epsilon: Scalar) -> tuple[Scalar, Scalar]:
-        return self.system.times(t0, t1, epsilon)
-
     def hamiltonian(
         self, t0: Scalar, t1: Scalar, q0: State, p1: State, epsilon: Scalar, args: Args
     ) -> Scalar:
@@ -49,7 +47,7 @@ class Driven(eqx.Module):
         H, noise = self.system.hamiltonian(t0, t1, q0, p1, epsilon, args), self.system.noise
         if noise is None or noise.is_on_momenta:
             return H
-        s, _ = self.times(t0, t1, epsilon)
+        s, _ = self.system.times(t0, t1, epsilon)
         G, (along_q, along_p) = jax.value_and_grad(
             lambda q, p: noise.energy(s, q, p, args, self.rates), (0, 1)
         )(q0, p1)
@@ -60,7 +58,7 @@ class Driven(eqx.Module):
     ) -> State:
         # Not multiplied by ε, as the force of the user is.
         force = self.system.disturbing_force(t0, t1, q0, p1, epsilon, args)
-        s, _ = self.times(t0, t1, epsilon)
+        s, _ = self.system.times(t0, t1, epsilon)
         return force + self.system.noise.force(s, q0, p1, args, self.rates)  # pyright: ignore
 
 
@@ -150,8 +148,9 @@ class StochasticMidpoint(_WithNoise):
     without: ClassVar[Method] = GaussLegendre(1)
 
 
-class _Splitting(Method):
-    """Base of the splittings with an exact part O of friction and momentum noise."""
+class _Splitting(CompositionMethod):
+    """Base of the splittings with an exact part O of friction and momentum noise. Without noise
+    they are the composition of the map and its adjoint, `Strang`."""
 
     base: Method = eqx.field(default_factory=TypeII)
 
@@ -160,18 +159,9 @@ class _Splitting(Method):
 
     order: ClassVar[int] = 2
     is_symmetric: ClassVar[bool] = True
-    is_symplectic: ClassVar[bool] = True
-    is_invertible: ClassVar[bool] = True
 
-    def __check_init__(self):
-        check_invertible("base", self.base)
-
-    def needs_no_solve(self, equations, interval, q):
-        forwards = self.base.needs_no_solve(equations, interval, q)
-        return forwards and self.base.inverse_needs_no_solve(equations, interval, q)
-
-    def inverse_needs_no_solve(self, equations, interval, q):
-        return self.needs_no_solve(equations, interval, q)
+    def fractions(self):
+        return (0.5, 0.5)
 
     def step(self, equations, interval, q0, p0):
         return self._moved(equations, interval, q0, p0, 1)
