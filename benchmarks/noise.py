@@ -1,9 +1,10 @@
-"""Orders, distributions and gradients of the methods for noise.
+"""Orders, distributions and speed of the methods for noise.
 
-    python benchmarks/noise.py [--paths 100000] [strong weak canonical chain gradients invariant]
+    python benchmarks/noise.py [--paths 100000] [strong weak canonical chain speed]
 
-prints each measure with its error, next to what it must be. One processor core and 10⁵ paths take
-some minutes; the slow tests in `tests/test_noise.py` call the same functions with fewer paths.
+prints each measure with its error. The first four take three minutes of one processor core for 10⁵
+paths; the slow tests in `tests/test_noise.py` call the same functions. The last one, on one thread,
+also times diffrax, if it is installed.
 """
 
 import argparse
@@ -17,6 +18,7 @@ import numpy as np
 from scipy import stats
 
 import dvi_jax as dvi
+import lanewise
 from dvi_jax import systems
 
 jax.config.update("jax_enable_x64", True)
@@ -220,6 +222,73 @@ def chain(paths, mistaken=False, T=0.5, h=0.1, steps=4000):
     )
 
 
+# --- speed ----------------------------------------------------------------------------------------
+
+
+def nanoseconds(of_key, steps, paths=1024):
+    """Processor time of a step of one path in a batch."""
+    keys = jax.random.split(jax.random.key(0), paths)
+    run = jax.jit(jax.vmap(of_key))
+    jax.block_until_ready(run(keys))
+    taken = []
+    for _ in range(5):
+        begin = time.process_time()
+        jax.block_until_ready(run(keys))
+        taken.append(time.process_time() - begin)
+    return min(taken) / (paths * steps) * 1e9
+
+
+def show_speed(steps=1000):
+    lanewise.set_threads(1)
+    print("nanoseconds of a step of one path, 1024 paths of a double well on one thread")
+    quiet, well = systems.double_well(), systems.double_well(0.5)
+
+    def strang(key):
+        # From another start on each path, so that there is a batch.
+        q0 = jnp.array([1.2]) + 1e-12 * jax.random.uniform(key)
+        return dvi.integrate(quiet, q0, num_steps=steps, method=dvi.Strang(),
+                             save=dvi.Save(final=True)).qs[-1]  # fmt: skip
+
+    print(f"  {'Strang, without noise':34} {nanoseconds(strang, steps):8.1f}")
+    for name in FOUR:
+
+        def noisy(key, method=METHODS[name]):
+            return dvi.integrate(well, num_steps=steps, method=method, path=dvi.Brownian(key),
+                                 save=dvi.Save(final=True)).qs[-1]  # fmt: skip
+
+        print(f"  {name:34} {nanoseconds(noisy, steps):8.1f}")
+    try:
+        import diffrax
+    except ImportError:
+        return
+    span = 0.0, 0.1 * steps
+    drift = diffrax.ODETerm(lambda t, z, _: jnp.stack([z[1], -4 * z[0] * (z[0] ** 2 - 1) - z[1]]))
+
+    def heun(key, path):
+        along = diffrax.ControlTerm(lambda t, z, _: jnp.array([[0.0], [1.0]]), path(key))
+        terms = diffrax.MultiTerm(drift, along)
+        start = jnp.array([1.2, 0.2])
+        return diffrax.diffeqsolve(
+            terms,
+            diffrax.Heun(),
+            *span,
+            0.1,
+            start,
+            max_steps=steps + 1,
+            adjoint=diffrax.ForwardMode(),
+        ).ys
+
+    for name, path in (
+        ("UnsafeBrownianPath", lambda key: diffrax.UnsafeBrownianPath((1,), key)),
+        (
+            "VirtualBrownianTree",
+            lambda key: diffrax.VirtualBrownianTree(*span, tol=0.05, shape=(1,), key=key),
+        ),
+    ):
+        found = nanoseconds(lambda key, path=path: heun(key, path), steps)
+        print(f"  {'diffrax, Heun, ' + name:34} {found:8.1f}")
+
+
 # --- the table ------------------------------------------------------------------------------------
 
 
@@ -252,6 +321,8 @@ def main():
             show_distribution("Double well", canonical, given.paths)
         elif what == "chain":
             show_distribution("Chain of ten particles", chain, given.paths // 10)
+        elif what == "speed":
+            show_speed()
         print(f"  {time.process_time() - begin:.0f} s of processor time\n")
 
 
