@@ -52,6 +52,8 @@ from .lattices import (
     Variational as Variational,
 )
 from .methods import (
+    BAOAB as BAOAB,
+    OBABO as OBABO,
     Adjoint as Adjoint,
     BlanesMoan as BlanesMoan,
     Composition as Composition,
@@ -62,11 +64,19 @@ from .methods import (
     Method as Method,
     RungeKutta4 as RungeKutta4,
     Splitting as Splitting,
+    StochasticEuler as StochasticEuler,
+    StochasticMidpoint as StochasticMidpoint,
     Strang as Strang,
     Suzuki as Suzuki,
     TypeII as TypeII,
     WisdomHolman as WisdomHolman,
     Yoshida as Yoshida,
+)
+from .noise import (
+    Brownian as Brownian,
+    BrownianPath as BrownianPath,
+    Langevin as Langevin,
+    NoiseHamiltonians as NoiseHamiltonians,
 )
 from .observe import (
     GALI as GALI,
@@ -142,6 +152,7 @@ if TYPE_CHECKING:  # names that are imported at their first use (`_namespaces`)
         FrequencyDiffusion as FrequencyDiffusion,
         FrequencyError as FrequencyError,
         FundamentalFrequencies as FundamentalFrequencies,
+        InvariantDiffusion as InvariantDiffusion,
         PoincareSection as PoincareSection,
         Return as Return,
         ReturnMap as ReturnMap,
@@ -151,6 +162,7 @@ if TYPE_CHECKING:  # names that are imported at their first use (`_namespaces`)
         frequencies as frequencies,
         frequency_diffusion as frequency_diffusion,
         fundamental_frequencies as fundamental_frequencies,
+        invariant_diffusion as invariant_diffusion,
         poincare_section as poincare_section,
         stroboscope as stroboscope,
         tangent_map as tangent_map,

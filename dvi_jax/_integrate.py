@@ -15,8 +15,7 @@ from jaxtyping import Array, PyTree
 
 import lanewise
 from lanewise import Layout
-from lanewise.jaxapi import batch_size, is_traced, manual_axes
-from lanewise.primitive import generates
+from lanewise.jaxapi import is_traced, manual_axes
 
 from ._adjoints import AbstractAdjoint
 from ._arithmetic import Arithmetic
@@ -24,8 +23,9 @@ from ._checks import instance, refuse_unknown
 from ._dense import Curve, at_times, crossings, requested_times, stopped
 from ._inputs import as_parameter, as_scalar, start_state
 from ._integrator import Integrator, chosen
-from ._memory import results_memory
+from ._noisy import noise_path
 from ._observables import check_observe, observed, with_initial_values
+from ._plan import check_memory
 from ._progress import bar_of, told
 from ._results import RESULTS, IntegrationError, status_code, status_name
 from ._rollout import (
@@ -49,6 +49,7 @@ from .engine.reads import reads
 from .engine.rounding import each
 from .lattices import Lattice, Place, Run
 from .methods import Method, warn_of_dissipation
+from .noise import as_path
 from .observe import OfState, RequestedTimes, Section, Stop, is_observable, of_steps
 from .observe._kept import Start
 
@@ -79,6 +80,7 @@ def integrate(
     layout: Layout | None = None,
     integrator: Integrator | None = None,
     stop: Stop | None = None,
+    path: Any = None,
     throw: bool = True,
     progress: bool | Callable[[int, int], None] | None = None,
     **unknown: Never,
@@ -121,6 +123,8 @@ def integrate(
       or `FixedPoint`, whose explicit steps can be undone bit for bit; `DoubleDouble`, 31 digits.
     - `integrator`: an `Integrator` in place of method, lattice, adjoint, newton, arithmetic and
       layout.
+    - `path`: of a system with noise: a `Brownian` path, or an integer, the seed of one. The method
+      is one for noise: `BAOAB`, `OBABO`, `StochasticEuler`, `StochasticMidpoint`.
     - `throw`: raise an error if the trajectory fails; otherwise read ``solution.result``.
     - `progress`: True shows a progress bar. A function is called as
       ``progress(steps_done, num_steps)`` at save points, at most about a hundred times during the
@@ -155,7 +159,7 @@ def integrate(
     """
     refuse_unknown("integrate", integrate, unknown)
     system, q0, p0, default_h, args = of_problem(system, q0, p0, h, args)
-    check_system(system)
+    check_system(system, noise_allowed=True)
     options = {"method": method, "lattice": lattice, "adjoint": adjoint, "newton": newton}
     options |= {"root_finder": root_finder, "arithmetic": arithmetic, "layout": layout}
     integrator = chosen(integrator, **options)
@@ -182,13 +186,15 @@ def integrate(
     # From here on `system`, `q0`, … may be those of another problem with other variables, whose
     # solution `undo` transforms back.
     given = Run(system, t0, q0, p0, epsilon, args, observe, save, stop)
+    driven = noise_path(given, as_path(path), integrator, method, h, num_steps)
     asked, undo = kind.transform(lattice, given)
     kind.check(lattice, method, integrator.arithmetic)
     task, q0, p0 = _task(asked, integrator, method, h)
+    task = task if driven is None else dataclasses.replace(task, path=driven)
     plan = make_plan(save, num_steps)
     leaves = jax.tree.leaves((task, q0, p0))
     # An allocation that fails ends the process, or makes the machine swap.
-    _check_memory(save, plan, q0, check_observe(task, q0, p0), leaves, layout)
+    check_memory(save, plan, q0, check_observe(task, q0, p0), leaves, layout)
     traced = any(is_traced(x) for x in leaves)
     # The warning needs the damping as a number, which is not known of traced values.
     if not traced:
@@ -422,29 +428,4 @@ def _raise_on_failure(solution: Solution, task: Task) -> Solution:
         f"the trajectory failed at step {step} of {solution.stats['num_steps']} (the first step "
         f"has number 0), with {at}{how}. {RESULTS[result]} {kept}",
         solution,
-    )
-
-
-def _check_memory(
-    save: Save, plan: Plan, q0: Array, beside: int, leaves: list[Any], layout: Layout
-) -> None:
-    """**Raises** `ValueError` for results that no memory can hold; `beside`: bytes of observables
-    at a save point."""
-    memory = results_memory()
-    saved = plan.num_blocks + 1 + plan.save_tail if save.ts is None else save.ts.shape[0]
-    each = (2 * q0.size + 2) * q0.dtype.itemsize + beside  # q, p, t and h
-    count, is_compiled = batch_size(leaves)
-    if memory is None or count * saved * each <= memory:
-        return
-    # XLA does not compute results that the function around this one does not use.
-    if is_compiled and (layout.form == "arrays" or not generates()):
-        return
-    batch = f" of each of {count} trajectories" if count > 1 else ""
-    disk = ", run fewer trajectories at once, or write results to disk with dvi.sweep(store=...)"
-    raise ValueError(
-        f"the results need {count * saved * each / 2**30:.3g} GiB of memory ({saved} saved "
-        f"state{'s' * (saved > 1)}{batch}), but only {memory / 2**30:.3g} GiB are available. Save "
-        "fewer states with save=dvi.Save(every=m), dvi.Save(final=True) or dvi.Save(ts=times)"
-        f"{disk * (count > 1)}. A reduction such as dvi.MaxDrift(function) observes every step in "
-        "constant memory."
     )

@@ -32,10 +32,10 @@ class Integrator(eqx.Module):
     - `layout`: machine code or arrays. `adjoint`: the computation of reverse-mode gradients.
 
     `integrate`, `sweep`, `Model` (for `fit`), `poincare_section`, `bifurcation`, `ReturnMap`,
-    `tangent_map`, `drift_order`, `drift_surface`, `discover_invariants`, `find_symmetries` and
-    `solution_pairs` accept it as `integrator=`. The last three examine one step; they raise an
-    error for fields without an effect there that are not the defaults. `sweep` computes no
-    gradients and does not use `adjoint`.
+    `tangent_map`, `invariant_diffusion`, `drift_order`, `drift_surface`, `discover_invariants`,
+    `find_symmetries` and `solution_pairs` accept it as `integrator=`. The last three examine one
+    step; they raise an error for fields without an effect there that are not the defaults. `sweep`
+    computes no gradients and does not use `adjoint`.
 
     **Raises** `TypeError` for a field of another type.
 

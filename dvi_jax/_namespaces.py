@@ -10,7 +10,7 @@ NAMESPACES = {
     **{
         name: name
         for name in (
-            *("methods", "lattices", "observe", "discover", "dynamics", "proof"),
+            *("methods", "noise", "lattices", "observe", "discover", "dynamics", "proof"),
             *("systems", "plot", "interop", "testing", "paper", "certify", "run"),
         )
     },
@@ -35,6 +35,7 @@ HOMES = {
     "dynamics": (
         *("FREQUENCY_RESULTS", "SECTION_RESULTS", "Actions", "Frequencies", "FrequencyDiffusion"),
         *("FrequencyError", "FundamentalFrequencies", "PoincareSection", "Return", "ReturnMap"),
+        *("InvariantDiffusion", "invariant_diffusion"),
         *("SectionError", "actions", "bifurcation", "frequencies", "frequency_diffusion"),
         *("fundamental_frequencies", "poincare_section", "stroboscope", "tangent_map"),
     ),

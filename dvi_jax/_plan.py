@@ -1,7 +1,14 @@
 """The steps of a run in blocks with a save after each."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from jaxtyping import Array
+
+from lanewise import Layout
+from lanewise.jaxapi import batch_size
+from lanewise.primitive import generates
+
+from ._memory import results_memory
 from ._solution import Save
 
 
@@ -33,3 +40,35 @@ def piece_length(count: int, every: int) -> int:
     # A divisor of `count`, if there is one near: with pieces of one length one loop is compiled.
     lengths = range(min(3 * every // 2, count), every // 2, -1)
     return next((n for n in lengths if count % n == 0), every)
+
+
+def adds_start_outside(plan: Plan) -> bool:
+    """Whether the start is added to the saved states after the compiled run, not in it."""
+    # Among few states the start is a large fraction, which need not be written for a user who reads
+    # the last state only. Among many it is a small fraction, and adding it later copies them all.
+    return plan.num_blocks <= 4
+
+
+def check_memory(
+    save: Save, plan: Plan, q0: Array, beside: int, leaves: list[Any], layout: Layout
+) -> None:
+    """**Raises** `ValueError` for results that no memory can hold; `beside`: bytes of observables
+    at a save point."""
+    memory = results_memory()
+    saved = plan.num_blocks + 1 + plan.save_tail if save.ts is None else save.ts.shape[0]
+    each = (2 * q0.size + 2) * q0.dtype.itemsize + beside  # q, p, t and h
+    count, is_compiled = batch_size(leaves)
+    if memory is None or count * saved * each <= memory:
+        return
+    # XLA does not compute results that the function around this one does not use.
+    if is_compiled and (layout.form == "arrays" or not generates()):
+        return
+    batch = f" of each of {count} trajectories" if count > 1 else ""
+    disk = ", run fewer trajectories at once, or write results to disk with dvi.sweep(store=...)"
+    raise ValueError(
+        f"the results need {count * saved * each / 2**30:.3g} GiB of memory ({saved} saved "
+        f"state{'s' * (saved > 1)}{batch}), but only {memory / 2**30:.3g} GiB are available. Save "
+        "fewer states with save=dvi.Save(every=m), dvi.Save(final=True) or dvi.Save(ts=times)"
+        f"{disk * (count > 1)}. A reduction such as dvi.MaxDrift(function) observes every step in "
+        "constant memory."
+    )

@@ -114,7 +114,8 @@ def _rebuilt(
     def undo(state, _):
         k, after, sums, solved = state
         # Without the memory of the arithmetic, whose effect is below the accepted difference.
-        q, p, info = task.method.inverse(task.equations, task.interval(k), *after)
+        interval = task.interval(k)
+        q, p, info = task.method.inverse(task.equations_at(k, interval), interval, *after)
         if along is not None:
             sums = along(k, after, (q, p), sums)
         return (k - 1, (q, p), sums, solved & (info.result == RESULTS.successful)), None
@@ -182,7 +183,7 @@ def pull_back(
         # The unknown of (13) is the state after the step, which is known here: no solve.
         known_root = task.method.is_the_map and task.arithmetic.is_plain
         solver = Known(p1.ravel(), newton) if known_root else newton
-        equations = dataclasses.replace(task.equations, newton=solver)
+        equations = dataclasses.replace(task.equations_at(k, interval), newton=solver)
         q1, p1, _ = task.method.step(equations, interval, q0, p0)
         taken = StepTaken(interval.t0, interval.t1, q0, p0, q1, p1)
         values = [taken.value(f, task.args) for f in alone]
@@ -224,7 +225,8 @@ def pull_back(
         def stored(known_start, end, first, last, at_save, grad, cot):
             def forward(state, _):
                 k, before = state
-                q, p, _ = task.method.step(task.equations, task.interval(k), *before)
+                interval = task.interval(k)
+                q, p, _ = task.method.step(task.equations_at(k, interval), interval, *before)
                 return (k + 1, (q, p)), before
 
             _, states = lax.scan(forward, (first, known_start), None, count)

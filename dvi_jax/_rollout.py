@@ -1,182 +1,40 @@
 """The loop over the steps of a time grid, with status, saved states and observables."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Int
 
 import lanewise
 
-from ._arithmetic import Arithmetic, FloatingPoint
-from ._plan import Plan as Plan, make_plan as make_plan, piece_length as piece_length
+from ._plan import (
+    Plan as Plan,
+    adds_start_outside as adds_start_outside,
+    make_plan as make_plan,
+    piece_length as piece_length,
+)
 from ._results import RESULTS, first_failure
-from ._step import Equations
-from ._types import Args, Bindable, Interval, Scalar, State
+from ._task import (
+    Carry as Carry,
+    Outcome as Outcome,
+    Saved as Saved,
+    StepTaken as StepTaken,
+    Task as Task,
+    or_nan,
+)
+from ._types import Interval, Scalar, State
 from .engine.newton import no_residual, worse
 from .engine.pairs import rounded
-from .engine.reads import Reads
-from .lattices import Lattice, Place, Uniform
-from .methods import Method
-from .observe import (
-    Deviations,
-    Pushed,
-    Reduction,
-    Running,
-    Stop,
-    has_initial_value,
-    is_observable,
-)
+from .lattices import Place, Uniform
+from .observe import Deviations, Pushed, Reduction, has_initial_value
 from .observe._kept import Start, as_row, event
 
 Loop = Callable[[Callable, Any, None, int], tuple[Any, Any]]
 """``(body, carry, None, count) -> (carry, ys)``: `lax.scan`, or one with another derivative."""
-
-
-class Task(eqx.Module):
-    """The constants of a trajectory."""
-
-    equations: Equations
-    method: Method
-    lattice: Lattice
-    observe: PyTree
-    t0: Scalar
-    h: Scalar
-    arithmetic: Arithmetic = FloatingPoint()
-    stop: Stop | None = None
-    reads: Reads = eqx.field(static=True, default=())
-
-    @property
-    def args(self) -> Args:
-        return self.equations.args
-
-    def interval(self, k: Int[Array, ""]) -> Interval:
-        """The interval of step k; of a lattice with a memory, of the first step only."""
-        return self.in_precision(self.lattice.interval(self.t0, self.h, k))
-
-    def first_interval(self) -> Interval:
-        """The interval of step 0."""
-        return self.interval(jnp.asarray(0, jnp.int32))
-
-    def in_precision(self, interval: Interval) -> Interval:
-        # The times of a user may be float64 where the state is float32, which sets the precision.
-        return Interval(*(x.astype(self.h.dtype) for x in interval))
-
-    def observables(self) -> tuple[list[Callable], list[Reduction]]:
-        """The functions without a reduction, and the reductions, in tree order."""
-        alone = [self.bound(f) for f in self._leaves() if not isinstance(f, Reduction | Running)]
-        found = [f.reduction if isinstance(f, Running) else f for f in self._leaves()]
-        return alone, [f for f in found if isinstance(f, Reduction)]
-
-    def at_save(self, carry: "Carry", taken: "StepTaken | None") -> list[Any]:
-        """The values of functions without a reduction and the running values of reductions, in tree
-        order, at a save point after the step `taken`."""
-        # A running value is NaN after a failure: the reduction still has that of the steps before.
-        memories, values = iter(carry.reductions), []
-        for f in self._leaves():
-            if isinstance(f, Running):
-                value = self.finished(f.reduction, next(memories))
-                values.append(_or_nan(carry.result == RESULTS.successful, value))
-            elif isinstance(f, Reduction):
-                next(memories)
-            else:
-                assert taken is not None
-                values.append(taken.value(self.bound(f), self.args))
-        return values
-
-    def evaluate(self, reduction: Reduction, function: Callable, *args: Any) -> Any:
-        """``function(*args)``, a part of the reduction, in the arithmetic of the run."""
-        # Deviation vectors and recorded steps are values in floating point.
-        if isinstance(reduction, Deviations) or not reduction.has_running_value:
-            return function(*rounded(args))
-        return self.arithmetic.evaluated(function)(*args)
-
-    def finished(self, reduction: Reduction, memory: Any) -> Any:
-        """The reduced value of a memory."""
-        return rounded(self.evaluate(reduction, reduction.finish, memory))
-
-    def _leaves(self) -> list[Any]:
-        return jax.tree.leaves(self.observe, is_leaf=is_observable)
-
-    @property
-    def has_running_values(self) -> bool:
-        """Whether a reduction has a value at every save point."""
-        return any(isinstance(f, Running) for f in self._leaves())
-
-    @property
-    def has_deviations(self) -> bool:
-        """Whether a reduction follows deviation vectors, for which steps are differentiated."""
-        return any(isinstance(r, Deviations) for r in self.observables()[1])
-
-    def bound(self, observable: Callable) -> Callable:
-        """The observable, bound to the system and ε if it requires them."""
-        if isinstance(observable, Bindable):
-            return observable.bind(self.equations.system, self.equations.epsilon)
-        return observable
-
-
-class Carry(NamedTuple):
-    """State between steps; k is the number of the next one."""
-
-    k: Int[Array, ""]
-    q: State
-    p: State
-    lattice: Any
-    result: RESULTS
-    failed_step: Int[Array, ""]
-    failed_residual: Float[Array, "2"]
-    iterations: Int[Array, ""]
-    residual: Float[Array, "2"]
-    reductions: list[Any]
-    beside: Any = None  # memory of the arithmetic
-    stop: Any = None  # with a `Stop`: the last step, as a row
-
-
-class StepTaken(NamedTuple):
-    """One step, the arguments of an observable."""
-
-    t0: Scalar
-    t1: Scalar
-    q0: State
-    p0: State
-    q1: State
-    p1: State
-
-    def value(self, observable: Callable, args: Args) -> Array:
-        return jnp.asarray(observable(*self, args))
-
-    def number(self, observable: Callable, args: Args) -> Array:
-        """The value for a reduction, as real numbers also if it is integer or boolean."""
-        value = self.value(observable, args)
-        if not jnp.issubdtype(value.dtype, jnp.inexact):
-            value = value.astype(self.q1.dtype)
-        # The barrier keeps a product in the value from being contracted (FMA) with the difference
-        # in a reduction: equal values would then have a drift of one rounding error.
-        return lax.optimization_barrier(value)
-
-
-class Saved(NamedTuple):
-    """The saved values of a step."""
-
-    t: Array
-    h: Array
-    q: Array
-    p: Array
-    observed: list[Any]
-    inner: Any = None  # checkpoints since the save point before, for a reversible gradient
-
-
-class Outcome(NamedTuple):
-    """Result of the loop: last carry, saved states with the start in front, reduced observables,
-    and the largest error of a reconstructed state if it was requested."""
-
-    carry: Carry
-    saved: Saved
-    reduced: list[Any]
-    round_trip_defect: Array | None = None
 
 
 def start(task: Task, q0: State, p0: State) -> Carry:
@@ -215,8 +73,8 @@ def start(task: Task, q0: State, p0: State) -> Carry:
     zero = jnp.asarray(0, jnp.int32)
     return Carry(
         k=zero,
-        q=_or_nan(good, q0),
-        p=_or_nan(good, p0),
+        q=or_nan(good, q0),
+        p=or_nan(good, p0),
         lattice=task.lattice.begin(task.t0, task.h),
         result=result,
         failed_step=jnp.where(failed, zero, -1),
@@ -237,11 +95,11 @@ def take_step(
     place = Place(task.t0, task.h, carry.k, carry.q, carry.p)
     interval, memory, exists = task.lattice.next(carry.lattice, task.equations, place)
     interval = task.in_precision(interval)
-
+    equations = task.equations_at(carry.k, interval)
     step = task.arithmetic.evaluated(step or task.method.step)
 
     def advance(q, p):
-        here, *relative = task.arithmetic.enter(task.equations, q, p, carry.beside)
+        here, *relative = task.arithmetic.enter(equations, q, p, carry.beside)
         q1, p1, info = step(here, interval, *relative)
         q1, p1, beside = task.arithmetic.leave(q, p, q1, p1)
         return (q1, p1), (beside, rounded(info))
@@ -293,8 +151,8 @@ def _noted(
         fails = first & (result != RESULTS.stopped)
         return (
             # The state after a failed step is not a result: as NaN it cannot be mistaken for one.
-            _or_nan(good, q1),
-            _or_nan(good, p1),
+            or_nan(good, q1),
+            or_nan(good, p1),
             first_failure(carry.result, result),
             jnp.where(fails, carry.k, carry.failed_step),
             jnp.where(fails, residual, carry.failed_residual),
@@ -344,7 +202,7 @@ def _pushed(push: Callable, vectors: Array, taken: StepTaken, h: Scalar) -> Push
         return jnp.concatenate([x.ravel() for x in push(dq, dp)])
 
     good = jnp.all(jnp.isfinite(taken.q1)) & jnp.all(jnp.isfinite(taken.p1))
-    return Pushed(_or_nan(good, jax.vmap(of)(vectors)), h)
+    return Pushed(or_nan(good, jax.vmap(of)(vectors)), h)
 
 
 def _stop(
@@ -465,18 +323,7 @@ def with_tail(plan: Plan, saved: Saved, tail: Saved | None) -> Saved:
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), saved, tail)
 
 
-def adds_start_outside(plan: Plan) -> bool:
-    """Whether the start is added to the saved states after the compiled run, not in it."""
-    # Among few states the start is a large fraction, which need not be written for a user who reads
-    # the last state only. Among many it is a small fraction, and adding it later copies them all.
-    return plan.num_blocks <= 4
-
-
 def with_start(saved: Saved, q0: State, p0: State) -> Saved:
     """The saved values, the states with the start in front."""
     q, p = (jnp.concatenate([a[None], b]) for a, b in ((q0, saved.q), (p0, saved.p)))
     return saved._replace(q=q, p=p)
-
-
-def _or_nan(good, x):
-    return jax.tree.map(lambda x: jnp.where(good, x, jnp.full_like(x, jnp.nan)), x)

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -45,16 +45,18 @@ class Equations(eqx.Module):
     """The discrete equations of a system for one ε and one set of args.
 
     `newton` is the solver of their implicit part. With an `origin` positions and momenta are
-    relative to it; with a `quantum` an explicit step changes the state by integer multiples of it,
+    relative to it; `increments` are those of the noise in one step, shape (parts of the step, m).
+    With a `quantum` an explicit step changes the state by integer multiples of it,
     and a rate has the same bits in every evaluation.
     """
 
-    system: System
+    system: System | Any  # or what has its functions, such as a system with the noise of a step
     epsilon: Scalar
     args: Args = None
     newton: RootSolver | Known = Newton()
     origin: tuple[State, State] | None = None
     quantum: float | None = eqx.field(static=True, default=None)
+    increments: Array | None = None
 
     def absolute(self, q: State, p: State) -> tuple[State, State]:
         """(q, p) in the coordinates of the system, the origin added."""
@@ -105,7 +107,7 @@ class Equations(eqx.Module):
 
 
 @eqx.filter_jit
-def _momentum_rate(system: System, *at) -> State:
+def _momentum_rate(system: System | Any, *at) -> State:
     gradient = jax.grad(system.hamiltonian, argnums=2)(*at)
     if system.force is None:
         return -gradient
@@ -113,12 +115,12 @@ def _momentum_rate(system: System, *at) -> State:
 
 
 @eqx.filter_jit
-def _position_rate(system: System, *at) -> State:
+def _position_rate(system: System | Any, *at) -> State:
     return jax.grad(system.hamiltonian, argnums=3)(*at)
 
 
 @eqx.filter_jit
-def _rates(system: System, *at) -> tuple[State, State]:
+def _rates(system: System | Any, *at) -> tuple[State, State]:
     gradient, velocity = jax.grad(system.hamiltonian, argnums=(2, 3))(*at)
     if system.force is None:
         return velocity, -gradient

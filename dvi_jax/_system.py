@@ -13,6 +13,7 @@ from ._types import Args, ForceFn, HamiltonianFn, Scalar, State
 from .engine.indices import out_of_bounds
 from .engine.reads import Reads, changed, reads
 from .engine.signature import accepts, check_takes, tracing_note, warn_of_exchanged
+from .noise import Noise, as_noise
 
 _NAMES = "(t0, t1, q0, p1, args)"
 _CONTINUOUS = "Make a discrete Hamiltonian of a continuous H(t, q, p, args) by dvi.discretise(H)."
@@ -35,6 +36,10 @@ class System(eqx.Module):
       take ``epsilon`` as a sixth argument, for an energy that is not linear in ε.
     - `slow_time`: if True all three functions receive the slow times ``epsilon * t0`` and
       ``epsilon * t1`` in place of t0 and t1.
+    - `noise`: a function σ ``(t, q, p, args)`` → array like q0, or of the shape (*q0.shape, m), for
+      ``dp = … + σ ∘ dB`` [unit of p/√time]; a `Langevin`; or `NoiseHamiltonians`. Runs then need a
+      path and a method for noise. ε does not multiply noise; stochastic integrals are those of
+      Stratonovich.
     - `epsilon`: strength of the perturbation in runs without ``epsilon=``. None: each run of a
       system with a force, a perturbation or a slow time must give it. Systems of the library: 0.
 
@@ -68,9 +73,11 @@ class System(eqx.Module):
     perturbation: HamiltonianFn | None = None
     slow_time: bool = eqx.field(static=True, default=False)
     epsilon: float | None = eqx.field(static=True, default=None)
+    noise: Noise | None = None
     reads: Reads = eqx.field(static=True, init=False, repr=False)
 
     def __post_init__(self):
+        self.noise = as_noise(self.noise)
         self.reads = _read_by(self)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -184,7 +191,8 @@ class System(eqx.Module):
 
 
 def _read_by(system: System) -> Reads:
-    functions = (system.H_D, system.force, system.perturbation)
+    of_noise = [] if system.noise is None else system.noise.functions
+    functions = (system.H_D, system.force, system.perturbation, *of_noise)
     # A counter of calls, for instance, changes with every trace, and no program depends on it.
     ignored = {name for f in functions for name in _changed_by_tracing(f)}
     return tuple(item for item in reads(*functions) if item[0] not in ignored)
@@ -212,9 +220,9 @@ def of_problem(
     return system, q0, p0, h, args
 
 
-def check_system(system: Any) -> None:
+def check_system(system: Any, noise_allowed: bool = False) -> None:
     """**Raises** `TypeError` for an object that is not a `System`, `ValueError` for a system whose
-    functions read a value that has changed since it was made."""
+    functions read a value that has changed since it was made, or for one with noise."""
     if not isinstance(system, System):
         hint = "Wrap the discrete Hamiltonian H_D(t0, t1, q0, p1, args) in it: dvi.System(H_D)."
         if isinstance(getattr(system, "system", None), System):
@@ -226,6 +234,11 @@ def check_system(system: Any) -> None:
         kind = "class" if isinstance(system, type) else type(system).__name__
         seen = f"the {kind} {name}" if name else f"a value of type {kind}"
         raise TypeError(f"system must be a dvi.System, got {seen}. {hint}")
+    if system.noise is not None and not noise_allowed:
+        raise ValueError(
+            "the system has noise, which this function does not support: give it the same system "
+            "without noise=. dvi.integrate, dvi.sweep and dvi.invariant_diffusion support noise."
+        )
     # Programs that are compiled already would compute with the old value.
     now = _read_by(system)
     names = changed(system.reads, now) if now != system.reads else []

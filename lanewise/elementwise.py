@@ -147,7 +147,7 @@ def _reduced_precision(e: "Evaluator", params: dict, x: Num) -> Num:
 
 _FUNCTIONS = (
     "sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh "
-    "exp exp2 expm1 log log1p log2 cbrt erf erfc logistic"
+    "exp exp2 expm1 log log1p log2 cbrt erf erfc erf_inv logistic"
 )
 
 # Applied number by number; an operand without axes is combined with each number of the others.

@@ -15,6 +15,7 @@ from jax.extend.core import (
     jaxpr_as_fun as jaxpr_as_fun,
     jaxprs_in_params as jaxprs_in_params,
 )
+from jax.extend.random import threefry2x32_p as _threefry2x32
 from jax.interpreters import ad, batching, mlir, partial_eval
 from jax.sharding import NamedSharding, PartitionSpec
 
@@ -43,6 +44,13 @@ def batch_size(values: Iterable[Any]) -> tuple[int, bool]:
                 is_compiled = True
                 break
     return math.prod(sizes.values()), is_compiled
+
+
+def threefry2x32(key: jax.Array, first: jax.Array, second: jax.Array) -> list[jax.Array]:
+    """The generator of `jax.random` on words of 32 bits, for a key of two words."""
+    # The functions of `jax.random` take keys of a type for which no code is generated.
+    words = jnp.broadcast_arrays(key[0], key[1], jnp.uint32(first), jnp.uint32(second))
+    return _threefry2x32.bind(*words)
 
 
 def x64_enabled() -> bool:

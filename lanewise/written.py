@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 
 from .ir import Unsupported
@@ -170,6 +171,31 @@ def nextafter(x: Array, y: Array) -> Array:
     return lax.select((x != x) | (y != y), x + y, moved)
 
 
+def threefry2x32(*words: Array, **_) -> tuple[Array, Array]:
+    """Two words of 32 bits encrypted with a key of two: (key 0, key 1, word 0, word 1).
+
+    **Source** Salmon, Moraes, Dror & Shaw 2011, *Parallel random numbers: as easy as 1, 2, 3*,
+    SC11: Threefish with 20 rounds.
+    """
+    key0, key1, x, y = (w.astype(jnp.uint32) for w in jnp.broadcast_arrays(*words))
+    # The constant of Threefish, so that a key of zeros is not a fixed point.
+    keys = (key0, key1, key0 ^ key1 ^ np.uint32(0x1BD11BDA))
+    x, y = x + key0, y + key1
+    for i in range(5):
+        for bits in _ROTATIONS[i % 2]:
+            x = x + y
+            # A rotation to the left, which LLVM recognises.
+            left = lax.shift_left(y, jnp.full_like(y, bits))
+            y = x ^ (left | lax.shift_right_logical(y, jnp.full_like(y, 32 - bits)))
+        # After every four rounds the next pair of the key, and the number of the pair.
+        x = x + keys[(i + 1) % 3]
+        y = y + keys[(i + 2) % 3] + np.uint32(i + 1)
+    return x, y
+
+
+_ROTATIONS = (13, 15, 26, 6), (17, 29, 16, 24)
+
+
 def platform_index(*, platforms: Sequence, **_) -> Array:
     """The branch that is taken on a CPU."""
     names = [("cpu",) if p is None else p for p in platforms]
@@ -185,5 +211,6 @@ WRITTEN: dict[str, Callable] = {
     "nextafter": nextafter,
     "lt_to": lambda x, y: _ordered(x) < _ordered(y),
     "le_to": lambda x, y: _ordered(x) <= _ordered(y),
+    "threefry2x32": threefry2x32,
     "platform_index": platform_index,
 }

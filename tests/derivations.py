@@ -76,6 +76,10 @@ def slow_oscillator(t, q, depth, epsilon):
     return moving(q, t) - ((1 + depth * sp.sin(epsilon * t)) * q[0]) ** 2 / 2
 
 
+def double_well(t, q, barrier, **_):
+    return moving(q, t) - barrier * (1 - q[0] ** 2) ** 2
+
+
 def bob(angle, length=1):
     return [length * sp.sin(angle), -length * sp.cos(angle)]
 
@@ -188,6 +192,12 @@ def toda(t, q, p, args, epsilon):
 def fput(t, q, p, args, epsilon):
     d = np.diff([0.0, *q, 0.0])
     tension = d + args["alpha"] * d**2 + args["beta"] * d**3
+    return p, tension[1:] - tension[:-1]
+
+
+def thermal_chain(t, q, p, args, epsilon):
+    d = np.diff([0.0, *q])
+    tension = np.append(d + args["beta"] * d**3, 0.0)
     return p, tension[1:] - tension[:-1]
 
 
@@ -346,6 +356,7 @@ def lotka_volterra(t, q, p, args, epsilon):
 PENDULUM = lagrangian(1, pendulum, ("omega",))
 DERIVATIONS = {
     "oscillator": with_force(lagrangian(1, spring), lambda t, q, v, args: -q),
+    "double_well": lagrangian(1, double_well, ("barrier",)),
     "duffing": with_force(
         lagrangian(1, duffing, ("alpha", "beta")),
         lambda t, q, v, args: -args["delta"] * v + args["gamma"] * np.cos(args["omega"] * t),
@@ -372,6 +383,7 @@ DERIVATIONS = {
     "henon_heiles": henon_heiles,
     "toda": toda,
     "fput": fput,
+    "thermal_chain": thermal_chain,
     "stiff_fput": stiff_fput,
     "nls_lattice": nls,
     "uniform_field": lorentz(

@@ -18,15 +18,19 @@ FLOORS = [
     ["_types", "_results", "_checks"],
     ["_precision", "_progress", "_memory", "_files"],
     ["engine"],
-    ["_inputs"],
+    ["_inputs", "noise", "_kepler"],
+    ["flows"],
+    ["_split"],
     ["_system", "_solution"],
     ["_discretise", "_adapters", "_implicit", "_energies", "_step", "_plan", "observe"],
     ["methods", "lattices"],
     ["_arithmetic"],
+    ["_task"],
     ["_rollout"],
     ["_adjoints", "_dense", "_observables", "_rebuilding"],
     ["_reversible"],
     ["_integrator"],
+    ["_noisy"],
     ["_integrate"],
     ["discover"],
     ["sweep", "fit", "proof"],
@@ -241,7 +245,7 @@ RootSolver SimplifiedNewton Picard PicardThenNewton
 legendre from_lagrangian from_type_iii velocity_force Implicit
 Layout configure_cpu over_threads over_devices
 TypeII Adjoint Strang Yoshida Suzuki BlanesMoan McLachlan KahanLi Composition
-GaussLegendre LobattoIIIAIIIB RungeKutta4
+GaussLegendre LobattoIIIAIIIB RungeKutta4 Split Splitting WisdomHolman
 Uniform Given AdaptiveReversible TimeTransformed Variational
 FloatingPoint Compensated DoubleDouble FixedPoint
 Section Stop Crossings LatticeCondition
@@ -262,6 +266,8 @@ tangent_map poincare_section PoincareSection SECTION_RESULTS SectionError Return
 bifurcation stroboscope frequencies Frequencies FREQUENCY_RESULTS FrequencyError
 fundamental_frequencies FundamentalFrequencies frequency_diffusion FrequencyDiffusion
 actions Actions
+Langevin NoiseHamiltonians Brownian BrownianPath
+BAOAB OBABO StochasticEuler StochasticMidpoint invariant_diffusion InvariantDiffusion
 ForceLibrary identify Identification NetworkForce
 """
 

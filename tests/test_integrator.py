@@ -100,6 +100,14 @@ def implicit(t0, t1, q, p, args):
     return p @ p / 2 - jnp.sum(jnp.cos(q)) + 0.1 * p @ q
 
 
+def diffusion(**how):
+    noisy = dvi.System(implicit, noise=lambda t, q, p, args: 0.1 * jnp.ones(1))
+    run = {"h": 0.1, "num_steps": 5, "num_paths": 3, "method": dvi.StochasticEuler()}
+    return dvi.invariant_diffusion(
+        noisy, [0.5], [0.1], invariant=lambda q, p: q @ q, **run, **how
+    ).changes
+
+
 def lagrangian(t0, t1, q0, v, args):
     return jnp.sum(jnp.cosh(v)) - q0 @ q0 / 2
 
@@ -137,6 +145,7 @@ def type_iii(t0, t1, q1, p0, args):
 IMPLICIT = dvi.System(implicit)
 NAMED = {
     **CALLS,
+    "invariant_diffusion": diffusion,
     "Integrator": lambda **how: last(integrator=dvi.Integrator(**how)),
     "bifurcation": bifurcation,
     "drift_surface": drift_surface,

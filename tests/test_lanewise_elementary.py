@@ -92,6 +92,8 @@ def exact(name, *xs):
         return mpmath.power(*xs)
     if name == "cbrt":
         return mpmath.sign(xs[0]) * mpmath.cbrt(abs(xs[0]))
+    if name == "erf_inv":  # not at 0, where mpmath has no relative accuracy
+        return mpmath.erfinv(xs[0]) if abs(xs[0]) > 1e-30 else xs[0] * mpmath.sqrt(mpmath.pi) / 2
     return getattr(mpmath, name)(*xs)
 
 
@@ -112,7 +114,7 @@ BOUNDS = {
     "sin": 0.95, "cos": 0.95, "tan": 1.65, "asin": 1.65, "acos": 1.15, "atan": 1.45, "atan2": 1.65,
     "sinh": 1.75, "cosh": 0.9, "tanh": 1.5, "asinh": 1.3, "acosh": 1.8, "atanh": 1.65,
     "logistic": 1.2, "exp": 0.87, "exp2": 0.78, "expm1": 1.35, "log": 0.9, "log1p": 0.94,
-    "pow": 0.78, "cbrt": 0.52, "erf": 1.05, "erfc": 1.7,
+    "pow": 0.78, "cbrt": 0.52, "erf": 1.05, "erfc": 1.7, "erf_inv": 4.1,
 }  # fmt: skip
 """Largest error [ulp]; the docstring of the module has the largest one seen."""
 
@@ -140,7 +142,7 @@ def points(name, n=250, seed=0):
         ends = np.nextafter([2.0**21, 2.0**27], [[0.0], [np.inf]]).ravel()
         regions = spread(0, 8), spread(2**20, 2**28), near, np.array(NEAREST), ends
         return (of_both_signs(tiny, huge, *regions),)
-    if name in ("asin", "acos", "atanh"):
+    if name in ("asin", "acos", "atanh", "erf_inv"):
         ones = np.nextafter([1.0, 0.5], 0)
         xs = of_both_signs(spread(0, 1), tiny, 1 - 10 ** rng.uniform(-16, -1, n), ones)
         return (np.append(xs, around(0.5)),)
@@ -226,7 +228,7 @@ def test_sincos():
         np.testing.assert_array_equal(value, run(elementary.FUNCTIONS[name], xs))
 
 
-ODD = ["sin", "tan", "asin", "atan", "sinh", "tanh", "asinh", "atanh", "cbrt", "erf"]
+ODD = ["sin", "tan", "asin", "atan", "sinh", "tanh", "asinh", "atanh", "cbrt", "erf", "erf_inv"]
 
 
 @pytest.mark.parametrize("name", [*ODD, "cos", "cosh"])
@@ -254,7 +256,7 @@ def defect(monkeypatch):
 DEFECTS = """
     SIN sin, COS cos, ATAN atan, ATAN atan2, ASIN asin, EXP exp, EXP expm1, LOG log, LOG asinh,
     LOG2_5 pow, CBRT cbrt, ERF erf, ERFC erfc, HALF_PI_4 sin, HALF_PI_5 cos, LOG_2 exp,
-    LOG_2_HEAD exp2, LOG2_1 pow, LOG2_3 pow
+    LOG_2_HEAD exp2, LOG2_1 pow, LOG2_3 pow, ERF_INV erf_inv, ERF_INV_TAIL erf_inv
 """
 
 
@@ -298,6 +300,7 @@ SPECIAL = {
     "log1p": {0.0: 0.0, -1.0: -INF, -1.5: NAN, INF: INF, -INF: NAN, -TINY: -TINY},
     "cbrt": {0.0: 0.0, INF: INF} | {k**3: k for k in (1.0, 3.0, 1e5, 123457.0, 2.0**-358)},
     "erf": {0.0: 0.0, INF: 1.0, 7.0: 1.0, 1e300: 1.0, TINY: TINY},
+    "erf_inv": {0.0: 0.0, 1.0: INF, 1 + 2**-52: NAN, INF: NAN},
     "erfc": {0.0: 1.0, INF: 0.0, -INF: 2.0, 28.0: 0.0, 1e300: 0.0, -9.0: 2.0},
 }
 """As in C99, Annex F; those of odd functions for one sign, and of 0 for that of +0."""
@@ -424,6 +427,11 @@ def _erfc_factor(v):
     return (x + 3) * mpmath.exp(x * x) * mpmath.erfc(x)
 
 
+def _erf_inv_factor(w):
+    x = mpmath.sqrt(-mpmath.expm1(-w))
+    return mpmath.erfinv(x) / x
+
+
 def _exp_nodes(n):
     """Of both signs, and for g in r² g: a double zero at 0."""
     roots = [mpmath.sqrt(z) for z in one_sided(mpf("0.3475") ** 2, n // 2)]
@@ -462,6 +470,14 @@ DERIVATIONS = {
     "ERF": lambda: (
         lambda z: mpmath.erf(mpmath.sqrt(z)) / mpmath.sqrt(z) - 1,
         lambda n: chebyshev(mpf(0), mpf(9) / 16, n),
+    ),
+    "ERF_INV": lambda: (
+        lambda v: _erf_inv_factor(v + mpf(25) / 8),
+        lambda n: chebyshev(-mpf(25) / 8, mpf(25) / 8, n),
+    ),
+    "ERF_INV_TAIL": lambda: (
+        lambda v: _erf_inv_factor((6 / (1 - v) - 2) ** 2),
+        lambda n: chebyshev(1 - 6 / mpf("4.49"), 1 - 6 / mpf("8.02"), n),
     ),
     "ERFC": lambda: (_erfc_factor, lambda n: chebyshev(1 - 8 / mpf(3.75), 1 - 8 / mpf(31), n)),
 }

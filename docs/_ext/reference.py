@@ -31,6 +31,7 @@ from dvi_jax.paper.equations import EQUATIONS
 PAGES = {
     "integration": ("Systems and integration", "dvi_jax"),
     "methods": ("Methods", "dvi_jax.methods"),
+    "noise": ("Noise", "dvi_jax.noise"),
     "lattices": ("Time grids", "dvi_jax.lattices"),
     "solvers": ("Root solvers, layout, devices", "dvi_jax.engine"),
     "observables": ("Observables and reductions", "dvi_jax.observe"),

@@ -1,6 +1,10 @@
 """Tools of a dynamicist: what trajectories say of the motion."""
 
 from .actions import Actions as Actions, actions as actions
+from .diffusion import (
+    InvariantDiffusion as InvariantDiffusion,
+    invariant_diffusion as invariant_diffusion,
+)
 from .frequencies import (
     Frequencies as Frequencies,
     FrequencyDiffusion as FrequencyDiffusion,

@@ -16,6 +16,12 @@ from ._published import (
 )
 from ._runge_kutta4 import RungeKutta4 as RungeKutta4
 from ._splitting import Splitting as Splitting
+from ._stochastic import (
+    BAOAB as BAOAB,
+    OBABO as OBABO,
+    StochasticEuler as StochasticEuler,
+    StochasticMidpoint as StochasticMidpoint,
+)
 from ._strang import Strang as Strang
 from ._type_ii import TypeII as TypeII
 from ._wisdom_holman import WisdomHolman as WisdomHolman

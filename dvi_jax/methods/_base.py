@@ -30,6 +30,9 @@ class Method(eqx.Module):
     is_symplectic: eqx.AbstractVar[bool]
     is_invertible: eqx.AbstractVar[bool]
 
+    increments: ClassVar[int] = 0
+    """Increments of noise that a step takes; 0: no method for systems with noise."""
+
     is_the_map: ClassVar[bool] = False
     """Whether `step` is the map (12)–(13) itself, whose only unknown is p1."""
 

@@ -19,6 +19,7 @@ from ..engine.keywords import INTEGRATOR, taken, with_keywords_of
 from ..engine.names import both_names
 from ..lattices import Given, Lattice
 from ..methods import Method
+from ..noise import as_path
 from .axes import Axis, as_axis, axes_in, is_axis, lengths
 from .bar import shown
 from .cost import SweepCost, cost
@@ -48,7 +49,7 @@ class SweepInterrupted(KeyboardInterrupt):
 
 @both_names
 @with_keywords_of(
-    integrate, f"h num_steps t0 epsilon args {INTEGRATOR} observe stop", start=None, save=None
+    integrate, f"h num_steps t0 epsilon args {INTEGRATOR} observe stop path", start=None, save=None
 )
 def sweep(
     system: System,
@@ -207,12 +208,15 @@ def _make_sweep(system: Any, q0: Any, p0: Any, given: dict[str, Any]) -> Sweep:
     system, q0, p0, given["h"], given["args"] = of_problem(
         system, q0, p0, given["h"], given["args"], has_start
     )
-    check_system(system)
+    check_system(system, noise_allowed=True)
     given["epsilon"] = system.strength(given["epsilon"])
     # Integers would make a program of their own.
     numbers = {n: float(x) if type(x := given[n]) is int else x for n in ("epsilon", "h", "t0")}
     inputs = {name: as_axis(name, value) for name, value in numbers.items()}
     inputs |= {"args": given["args"], **_states(q0, p0, given["start"])}
+    # Only where there is one: stores of sweeps without noise are described without it.
+    if (path := given["path"]) is not None:
+        inputs["path"] = path if axes_in({"path": path}) else as_path(path)
     if all(given[name] is None for name in ("observe", "save", "stop")):
         raise ValueError(
             "there is nothing to store, because observe, save and stop are all missing: give "

@@ -13,6 +13,7 @@ from ._problem import (
 )
 from .dipole_field import dipole_field as dipole_field
 from .double_pendulum import double_pendulum as double_pendulum
+from .double_well import double_well as double_well
 from .duffing import duffing as duffing
 from .figure_eight import figure_eight as figure_eight
 from .fput import fput as fput
@@ -38,6 +39,7 @@ from .slow_oscillator import slow_oscillator as slow_oscillator
 from .solar_system import solar_system as solar_system
 from .spinning_top import spinning_top as spinning_top
 from .stiff_fput import stiff_fput as stiff_fput
+from .thermal_chain import thermal_chain as thermal_chain
 from .toda import toda as toda
 from .two_centres import two_centres as two_centres
 from .uniform_field import uniform_field as uniform_field
@@ -46,6 +48,7 @@ from .van_der_pol import van_der_pol as van_der_pol
 LIBRARY = {
     "oscillator": oscillator,
     "duffing": duffing,
+    "double_well": double_well,
     "van_der_pol": van_der_pol,
     "slow_oscillator": slow_oscillator,
     "pendulum": pendulum,
@@ -67,6 +70,7 @@ LIBRARY = {
     "toda": toda,
     "fput": fput,
     "stiff_fput": stiff_fput,
+    "thermal_chain": thermal_chain,
     "nls_lattice": nls_lattice,
     "uniform_field": uniform_field,
     "magnetic_mirror": magnetic_mirror,

@@ -14,6 +14,7 @@ from .._checks import finite as finite, positive as positive
 from .._system import System
 from ..discover.generators import Generator
 from ..discover.library import time_translation
+from ..noise import Langevin
 
 DIMENSIONLESS = {"q": "1", "p": "1", "t": "1", "energy": "1"}
 """Units of a dimensionless system."""
@@ -244,6 +245,7 @@ def library_problem(
     perturbation: Callable[..., Any] | None = None,
     autonomous: bool = True,
     slow_time: bool = False,
+    noise: Any = None,
     **fields: Any,
 ) -> Problem:
     """A `Problem` of the library.
@@ -261,7 +263,7 @@ def library_problem(
     if autonomous and not slow_time:
         fields["symmetries"] = {"time": time_translation(), **fields.get("symmetries", {})}
     return Problem(
-        system=System(hamiltonian, force, perturbation, slow_time),
+        system=System(hamiltonian, force, perturbation, slow_time, noise=noise),
         args={name: one.value for name, one in parameters.items()} or None,
         check=replace(start, parameters={name: one.check for name, one in parameters.items()}),
         parameters={name: one.meaning for name, one in parameters.items()},
@@ -340,3 +342,22 @@ def at_end(hamiltonian: Callable[..., Any]) -> Callable[..., Any]:
         return hamiltonian(t1, t1, q1, p1, args)
 
     return energy
+
+
+THERMAL = Langevin(lambda args: args["friction"], lambda args: args["temperature"])
+"""Friction and noise of unit masses."""
+
+
+@functools.cache
+def configurational(hamiltonian: Callable[..., Any]) -> Callable[..., Any]:
+    """The observable `configurational`, from which a temperature follows."""
+
+    def configurational(t0, t1, q0, p0, q1, p1, args):
+        """(|∂V/∂q|², ∂²V/∂q·∂q) at t1, shape (2,); the ratio of their canonical means is T."""
+        slope, curvature = (
+            d(lambda q: hamiltonian(t1, t1, q, jnp.zeros_like(q), args))(q1)
+            for d in (jax.grad, jax.hessian)
+        )
+        return jnp.stack([jnp.sum(slope**2), jnp.trace(curvature)])
+
+    return configurational

@@ -1,0 +1,246 @@
+"""Methods for systems with noise."""
+
+import dataclasses
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._step import Equations, StepInfo, no_step_yet
+from .._system import System
+from .._types import Args, Interval, Scalar, State
+from ._base import Method
+from ._composition import CompositionMethod
+from ._gauss_legendre import GaussLegendre
+from ._type_ii import TypeII
+
+_LARGEST = 6.0
+"""Largest increment of noise in a step that may be implicit, in standard deviations."""
+
+
+class Driven(eqx.Module):
+    r"""A system with the noise of one step as constant rates Ḃ = ΔB/h.
+
+    With G = Σ h_m Ḃ_m its Hamiltonian is H_D + G. That of the map (12)–(13) has one term more,
+
+        H_D + G + (h/2) ∂G/∂q0·∂G/∂p1,
+
+    the next one of the type II generating function p1·q0 + h H_D + ΔB h₁ + … of the flow of G.
+    """
+
+    system: System
+    rates: Array
+    h: Scalar
+    is_map: bool = eqx.field(static=True)
+
+    # What a method reads of a system to see its form: that of a system with noise is general.
+    H_D: ClassVar[None] = None
+    perturbation: ClassVar[None] = None
+    force: ClassVar[str] = "that of noise"
+
+    def hamiltonian(
+        self, t0: Scalar, t1: Scalar, q0: State, p1: State, epsilon: Scalar, args: Args
+    ) -> Scalar:
+        # By this path derivatives of every method contain the noise, and the inverse exists.
+        H, noise = self.system.hamiltonian(t0, t1, q0, p1, epsilon, args), self.system.noise
+        if noise is None or noise.is_on_momenta:
+            return H
+        s, _ = self.system.times(t0, t1, epsilon)
+        G, (along_q, along_p) = jax.value_and_grad(
+            lambda q, p: noise.energy(s, q, p, args, self.rates), (0, 1)
+        )(q0, p1)
+        return H + G + (self.h / 2 * jnp.sum(along_q * along_p) if self.is_map else 0)
+
+    def disturbing_force(
+        self, t0: Scalar, t1: Scalar, q0: State, p1: State, epsilon: Scalar, args: Args
+    ) -> State:
+        # Not multiplied by ε, as the force of the user is.
+        force = self.system.disturbing_force(t0, t1, q0, p1, epsilon, args)
+        s, _ = self.system.times(t0, t1, epsilon)
+        return force + self.system.noise.force(s, q0, p1, args, self.rates)  # pyright: ignore
+
+
+class _WithNoise(Method):
+    """Base of the methods that are those of a system without noise on `Driven` systems."""
+
+    without: ClassVar[Method]
+
+    is_symplectic: ClassVar[bool] = True
+    is_invertible: ClassVar[bool] = True
+    increments: ClassVar[int] = 1
+
+    # Both with the rates of the step forwards, so that the inverse goes back along the same path.
+    def step(self, equations, interval, q0, p0):
+        return self.without.step(self._driven(equations, interval, q0, p0), interval, q0, p0)
+
+    def inverse(self, equations, interval, q1, p1):
+        return self.without.inverse(self._driven(equations, interval, q1, p1), interval, q1, p1)
+
+    def needs_no_solve(self, equations, interval, q):
+        driven = self._driven(equations, interval, q, q)
+        return self.without.needs_no_solve(driven, interval, q)
+
+    def inverse_needs_no_solve(self, equations, interval, q):
+        driven = self._driven(equations, interval, q, q)
+        return self.without.inverse_needs_no_solve(driven, interval, q)
+
+    def _driven(self, equations: Equations, interval: Interval, q: State, p: State) -> Equations:
+        system, noise, dB = equations.system, equations.system.noise, equations.increments
+        if noise is None:
+            return equations
+        s, _ = system.times(*interval[:2], equations.epsilon)
+        at = (s, *equations.absolute(q, p), equations.args)
+        # The midpoint rule needs no such test: it evaluates σ in the middle of the step.
+        if self.without.is_the_map:
+            noise.check_fixed_momentum(type(self).__name__, *at)
+        # Without increments the equations are only examined, for whether they need a solve.
+        dB = jnp.zeros(noise.count(*at), q.dtype) if dB is None else dB[0]
+        # Arbitrarily large increments, which are arbitrarily rare, would have no solution.
+        most = _LARGEST * jnp.sqrt(jnp.abs(interval.h))
+        rates = jnp.clip(dB, -most, most) / interval.h
+        driven = Driven(system, rates, interval.h, self.without.is_the_map)
+        return dataclasses.replace(equations, system=driven, increments=None)
+
+
+class StochasticEuler(_WithNoise):
+    r"""The symplectic Euler method with noise: the map (12)–(13) of a noisy discrete Hamiltonian.
+
+        q1 = q0 + h ∂S/∂p1,    p1 = p0 − h ∂S/∂q0 + h εW + σ(t0, q0) ΔB
+        S  = H_D + G + (h/2) ∂G/∂q0·∂G/∂p1,    G = Σ_m h_m(t0, q0, p1) ΔB_m/h
+
+    Symplectic for each path for noise Hamiltonians and W = 0. Explicit for separable H_D and noise
+    that depends on t and q only.
+
+    **Accuracy** strong and weak order 1 for momentum noise, for one noise Hamiltonian and for
+    several whose Poisson brackets vanish; otherwise strong order 1/2. Increments are limited to six
+    standard deviations, which 2 of 10⁹ exceed.
+
+    **Raises** `ValueError` for momentum noise σ that depends on p.
+
+    **Source** Milstein, Repin & Tretyakov 2002, *SIAM J. Numer. Anal.* 39, 2066, and 40, 1583;
+    generating functions: Deng, Anton & Wong 2014, *Commun. Comput. Phys.* 16, 1.
+    """
+
+    order: ClassVar[int] = 1
+    is_symmetric: ClassVar[bool] = False
+    without: ClassVar[Method] = TypeII()
+
+
+class StochasticMidpoint(_WithNoise):
+    r"""The implicit midpoint rule with noise, for Stratonovich's equations of every form.
+
+        q1 = q0 + h ∂H/∂p + Σ_m ∂h_m/∂p ΔB_m,    p1 = p0 − h (∂H/∂q − εW) − Σ_m ∂h_m/∂q ΔB_m + σ ΔB
+
+    all at ((q0 + q1)/2, (p0 + p1)/2) and the time in the middle, with H(t, q, p) = H_D(t, t, q, p).
+    Symplectic for each path for noise Hamiltonians and W = 0; quadratic invariants of H and of all
+    h_m are conserved to round-off.
+
+    **Accuracy** weak order 1, and strong order 1 for one noise and for several that commute,
+    otherwise 1/2. Increments are limited to six standard deviations.
+
+    **Source** Milstein, Repin & Tretyakov 2002, *SIAM J. Numer. Anal.* 39, 2066, (4.15).
+    """
+
+    order: ClassVar[int] = 2
+    is_symmetric: ClassVar[bool] = True
+    without: ClassVar[Method] = GaussLegendre(1)
+
+
+class _Splitting(CompositionMethod):
+    """Base of the splittings with an exact part O of friction and momentum noise. Without noise
+    they are the composition of the map and its adjoint, `Strang`."""
+
+    base: Method = eqx.field(default_factory=TypeII)
+
+    parts: ClassVar[str]
+    """In their order: the map and its adjoint over h/2, "+" and "-", and "O" over an equal part."""
+
+    order: ClassVar[int] = 2
+    is_symmetric: ClassVar[bool] = True
+
+    def fractions(self):
+        return (0.5, 0.5)
+
+    def step(self, equations, interval, q0, p0):
+        return self._moved(equations, interval, q0, p0, 1)
+
+    def inverse(self, equations, interval, q1, p1):
+        return self._moved(equations, interval, q1, p1, -1)
+
+    def _moved(
+        self, equations: Equations, interval: Interval, q: State, p: State, sign: int
+    ) -> tuple[State, State, StepInfo]:
+        """The parts in their order, or (`sign` −1) their inverses in the opposite order."""
+        halves = {"+": interval.part(0.0, 0.5), "-": interval.part(0.5, 1.0).reversed()}
+        count, info = self.parts.count("O"), no_step_yet(q)
+        # The increments of the O, the last one first on the way back.
+        numbers = iter(range(count)[::sign])
+        for part in self.parts[::sign]:
+            if part == "O":
+                p = self._kicked(equations, interval, (next(numbers), count, sign), q, p)
+                continue
+            # The adjoint of the map is the inverse of the map by −h.
+            moved = self.base.step if (part == "+") == (sign == 1) else self.base.inverse
+            q, p, found = moved(equations, halves[part], q, p)
+            info = info.then(found)
+        return q, p, info
+
+    def _kicked(
+        self, equations: Equations, interval: Interval, which: tuple[int, int, int], q, p
+    ) -> State:
+        """p after one O (its number, their count, 1 or −1 for the inverse) at constant q."""
+        noise, dB, (number, count, sign) = equations.system.noise, equations.increments, which
+        if noise is None or dB is None:
+            return p
+        # The middle of the part: a time that is the same forwards and backwards.
+        t = interval.part((number + 0.5) / count, 1.0).t0
+        s, _ = equations.system.times(t, t, equations.epsilon)
+        at = (s, *equations.absolute(q, p), equations.args)
+        noise.check_fixed_momentum(type(self).__name__, *at)
+        # The flow by −h along −dB is the inverse.
+        return p + noise.kick(*at, sign * interval.h / count, sign * dB[number])
+
+
+class BAOAB(_Splitting):
+    r"""The splitting B(h/2) A(h/2) O(h) A(h/2) B(h/2) for Langevin's equation.
+
+        B: p ← p + (h/2)(−∂H_D/∂q + εW),    A: q ← q + (h/2) ∂H_D/∂p
+        O: p ← e^{−γh} p + √(T m (1 − e^{−2γh})) ΔB/√h          exact; or p ← p + σ(t, q) ΔB
+
+    B and A are together the map (12)–(13) over h/2, and after O its adjoint, also for H_D that are
+    not separable. At T = 0 areas shrink by e^{−γh} exactly: the step is conformally symplectic.
+
+    **Arguments** `base`: the map of the halves, any method with an inverse.
+
+    **Accuracy** weak order 2, strong order 1. For H_D = Σ p²/(2m) + V the error of averages of q is
+    O(h²); it vanishes for harmonic V, and is O(h⁴) for large γ.
+
+    **Raises** `ValueError` for noise that is not on the momenta, or whose factor depends on p.
+
+    **Source** Leimkuhler & Matthews 2013, *Appl. Math. Res. Express* 2013, 34; conformally
+    symplectic maps: McLachlan & Perlmutter 2001, *J. Geom. Phys.* 39, 276.
+    """
+
+    increments: ClassVar[int] = 1
+    parts: ClassVar[str] = "+O-"
+
+
+class OBABO(_Splitting):
+    r"""The splitting O(h/2) B(h/2) A(h) B(h/2) O(h/2), with the parts of `BAOAB`.
+
+    A step takes two increments: its path for a key is that of `BAOAB` with two substeps.
+
+    **Arguments** `base`: the map of the halves of the Verlet step, any method with an inverse.
+
+    **Accuracy** weak order 2, strong order 1. The error of averages of q is O(h²).
+
+    **Raises** `ValueError` as `BAOAB`.
+
+    **Source** Bussi & Parrinello 2007, *Phys. Rev. E* 75, 056707; from variational integrators:
+    Bou-Rabee & Owhadi 2010, *SIAM J. Numer. Anal.* 48, 278.
+    """
+
+    increments: ClassVar[int] = 2
+    parts: ClassVar[str] = "O+-O"

@@ -1,0 +1,55 @@
+"""A chain of particles with one free end, with friction and thermal noise."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from .._checks import whole
+from ._problem import THERMAL, Parameter, Problem, Start, configurational, library_problem
+
+
+def bonds(t0, t1, q0, p0, q1, p1, args):
+    """Extensions of the springs at t1, q_1 and q_i − q_{i−1}: shape (n,)."""
+    return jnp.diff(q1, prepend=0)
+
+
+def hamiltonian(t0, t1, q0, p1, args):
+    r"""Energy of unit masses on quartic springs, the first of which is fixed to a wall.
+
+    H_D = Σ_i p1_i²/2 + Σ_i (d_i²/2 + β d_i⁴/4),    d_1 = q0_1,  d_i = q0_i − q0_{i−1}
+    """
+    d = jnp.diff(q0, prepend=0)
+    return jnp.sum(p1**2) / 2 + jnp.sum(d**2 / 2 + args["beta"] * d**4 / 4)
+
+
+def thermal_chain(n: int = 10, temperature: float | None = None, friction: float = 1.0) -> Problem:
+    """A chain of n particles with one free end; with a temperature, Langevin's equation.
+
+    Dimensionless, β = 1. With friction and noise the stationary distribution is canonical: the
+    extensions d_i of the springs are independent, each with the density
+    exp(−(d²/2 + βd⁴/4)/T) / Z, and each p_i is normal with the variance T.
+
+    **Raises** `ValueError` for fewer than one particle, and for a temperature or a friction that is
+    not positive.
+
+    **Source** Lepri, Livi & Politi 2003, *Phys. Rep.* 377, 1 (chains in contact with heat baths).
+    """
+    n = whole("n", n, hint="The thermal chain is a row of particles.")
+    thermal = {
+        "friction": Parameter(friction, "rate of friction γ [1/time]"),
+        "temperature": Parameter(temperature, "k_B T [energy]"),
+    }
+    return library_problem(
+        hamiltonian,
+        Start("the thermal chain is a row of particles", (None,)),
+        name="thermal_chain",
+        q0=np.linspace(0.0, 0.5, n),
+        p0=np.linspace(0.3, -0.3, n),
+        h=0.1,
+        parameters={
+            "beta": Parameter(1.0, "quartic part of a spring [energy/length⁴]"),
+            **({} if temperature is None else thermal),
+        },
+        observables=[bonds, configurational(hamiltonian)],
+        noise=None if temperature is None else THERMAL,
+        source="Lepri, Livi & Politi 2003, Phys. Rep. 377, 1",
+    )
