@@ -15,8 +15,8 @@ from ._system import System
 from .engine.names import both_names
 from .engine.newton import RootSolver
 from .engine.picard import PicardThenNewton
-from .lattices import Lattice, Uniform
-from .methods import Method, Strang, TypeII, as_method
+from .lattices import Given, Lattice, Uniform
+from .methods import Method, Rattle, Strang, TypeII, as_method
 
 
 @both_names
@@ -24,7 +24,7 @@ class Integrator(eqx.Module):
     """The options of an integration: the keywords of `integrate` that are not the problem itself.
 
     - `method`: see `integrate`. None: the map that the user wrote, `TypeII()`; for a system with
-      `discretise(H, order=1)`, whose map has order one, `Strang()`.
+      `discretise(H, order=1)`, whose map has order one, `Strang()`; with a constraint `Rattle()`.
     - `root_finder`: the solver of implicit steps. Here, and in every function that takes one of the
       two names, `newton` is another name of it; both at once raise a `TypeError`.
     - `lattice`: the time grid. `arithmetic`: the representation of the state.
@@ -69,8 +69,26 @@ class Integrator(eqx.Module):
         return self.root_finder
 
     def method_for(self, system: System) -> Method:
-        """The method, or the default for this system."""
-        return default_method(system) if self.method is None else self.method
+        """The method, or the default for this system. **Raises** `ValueError` for options that do
+        not fit a constraint, or its absence."""
+        method = default_method(system) if self.method is None else self.method
+        if method.needs_constraint() != (system.constraint is not None):
+            raise ValueError(
+                "a system with a constraint needs method=dvi.Rattle(), or a composition of it such "
+                f"as dvi.Yoshida(4, base=dvi.Rattle()), got {method!r}."
+                if system.constraint is not None
+                else f"method={method!r} needs a constraint, but the system has none: use "
+                "dvi.System(H_D, constraint=g), or another method such as dvi.Strang()."
+            )
+        if system.constraint is not None:
+            for name, kinds in (("lattice", (Uniform, Given)), ("arithmetic", (FloatingPoint,))):
+                value = getattr(self, name)
+                if not isinstance(value, kinds):
+                    names = " or ".join(f"dvi.{kind.__name__}" for kind in kinds)
+                    raise ValueError(
+                        f"a system with a constraint needs {name}={names}, got {value!r:.200}."
+                    )
+        return method
 
 
 _FIELDS = {
@@ -94,6 +112,8 @@ _DEFAULT = Integrator()
 
 def default_method(system: System) -> Method:
     """The method of a run without `method`."""
+    if system.constraint is not None:
+        return Rattle()
     # A map of order one that `discretise` made was not chosen by the user, and Strang's composition
     # of it has order two. A map that the user wrote stays as it is.
     return Strang() if is_first_order(system.H_D) else TypeII()

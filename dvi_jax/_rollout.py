@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int, PyTree
 import lanewise
 
 from ._arithmetic import Arithmetic, FloatingPoint
+from ._constraint import start_status
 from ._plan import Plan as Plan, make_plan as make_plan, piece_length as piece_length
 from ._results import RESULTS, first_failure
 from ._step import Equations
@@ -186,6 +187,8 @@ def start(task: Task, q0: State, p0: State) -> Carry:
     result = RESULTS.where(finite, RESULTS.successful, RESULTS.not_finite)
     usable = task.lattice.is_usable(task.t0, task.h)
     result = RESULTS.where(usable, result, RESULTS.bad_step_size)
+    if task.equations.system.constraint is not None:
+        result = first_failure(result, start_status(task.equations, task.t0, q0, p0))
     interval = task.first_interval()
 
     def memory(reduction):

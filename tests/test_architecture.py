@@ -20,7 +20,9 @@ FLOORS = [
     ["engine"],
     ["_inputs"],
     ["_system", "_solution"],
-    ["_discretise", "_adapters", "_implicit", "_energies", "_step", "_plan", "observe"],
+    ["_discretise", "_adapters", "_implicit", "_energies", "_step", "_plan"],
+    ["_constraint"],
+    ["observe"],
     ["methods", "lattices"],
     ["_arithmetic"],
     ["_rollout"],
@@ -242,6 +244,7 @@ legendre from_lagrangian from_type_iii velocity_force Implicit
 Layout configure_cpu over_threads over_devices
 TypeII Adjoint Strang Yoshida Suzuki BlanesMoan McLachlan KahanLi Composition
 GaussLegendre LobattoIIIAIIIB RungeKutta4
+Rattle project Projection ConstraintForce
 Uniform Given TimeTransformed Variational FloatingPoint Compensated DoubleDouble FixedPoint
 Section Stop Crossings LatticeCondition
 Deviations TangentMap LyapunovSpectrum MEGNO GALI SALI Running

@@ -13,7 +13,7 @@ from ..engine.quantities import refuse_unit_or_mask
 from .extras import expect, needed
 
 _STATUSES = ("successful", "not_converged", "not_finite", "bad_step_size")
-_STATUSES += ("no_root", "out_of_range", "stopped", "not_reached")
+_STATUSES += ("no_root", "out_of_range", "stopped", "not_reached", "inconsistent", "redundant")
 """Names of `RESULTS`, by the number of each in a dataset, as in that of a sweep."""
 
 _TAKEN = ("t", "q", "p", "h", "status", "time", "save", "step")

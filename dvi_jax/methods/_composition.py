@@ -61,6 +61,9 @@ class CompositionMethod(Method):
     def is_made_of_the_map(self) -> bool:
         return self.base.is_made_of_the_map()
 
+    def needs_constraint(self) -> bool:
+        return self.base.needs_constraint()
+
     @property
     def has_negative_substeps(self) -> bool:
         """Whether a substep goes backwards in time, where a dissipative force increases motion."""

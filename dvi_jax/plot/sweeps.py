@@ -38,6 +38,8 @@ _STATUS_COLOURS = {
     "out_of_range": COLOURS[6],
     "stopped": COLOURS[5],
     "not_reached": COLOURS[2],
+    "inconsistent": "#7f7f7f",
+    "redundant": "#404040",
 }
 """One colour for each status in all pictures, so that they can be compared."""
 

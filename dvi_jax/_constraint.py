@@ -1,0 +1,230 @@
+"""Constraints g(q, args) = 0: derivative, velocities along them, and consistent initial states."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+import lanewise
+from lanewise.dependence import depends_on
+from lanewise.jaxapi import is_traced
+
+from ._inputs import as_parameter, as_scalar, start_state
+from ._results import RESULTS
+from ._step import Equations, no_solve
+from ._system import check_system, of_problem
+from ._types import Args, Interval, Scalar, State
+from .engine.newton import Found, Newton, RootSolver, find_root
+
+# A start is consistent up to so many times the round-off of the terms in g and in dg/dt, and of
+# the largest coordinate: a component such as q[2] = 0 has no size of its own.
+_OWN, _LARGEST = 4096, 64
+
+
+def gradient(equations: Equations, q: State) -> Array:
+    """G = ∂g/∂q, shape (m, n) for n components of q."""
+    value, pull = jax.vjp(equations.constraint, q)
+    return jax.vmap(lambda e: pull(e)[0].ravel())(lanewise.unit_vectors(value.size, q.dtype))
+
+
+def velocity_at(equations: Equations, t: Scalar, q: State) -> Callable[[State], State]:
+    """p → ∂H/∂p(t, q, p), the velocity."""
+    return partial(equations.position_rate, Interval(t, t, jnp.zeros_like(t)), q)
+
+
+def coupling(G: Array, velocity: Callable[[State], State], p: State) -> Array:
+    """G (∂²H/∂p²) Gᵀ, shape (m, m): how multipliers change the velocity across the constraint."""
+    push = jax.linearize(velocity, p)[1]
+    return G @ jax.vmap(lambda row: push(row.reshape(p.shape)).ravel())(G).T
+
+
+def tangent(equations: Equations, t: Scalar, q: State, p: State) -> tuple[State, Found]:
+    """p − Gᵀμ with the velocity along the constraint, G ∂H/∂p = 0."""
+    G, velocity = gradient(equations, q), velocity_at(equations, t, q)
+    A = coupling(G, velocity, p)
+
+    def moved(y):
+        return p - (lanewise.solve(A, y) @ G).reshape(p.shape)
+
+    across = G @ velocity(p).ravel()
+    # A velocity that is linear in p needs no iteration.
+    if not depends_on(lambda p, v: jax.jvp(velocity, (p,), (v,))[1], 0, p, p):
+        return moved(across), no_solve(p)
+    A = lax.stop_gradient(A)  # the root does not depend on the units of the unknowns
+    scale = jnp.abs(G) @ jnp.abs(velocity(p)).ravel()
+
+    def residual(y):
+        return -(G @ velocity(moved(y)).ravel())
+
+    y, info = find_root(residual, across, scale, equations.newton)
+    return moved(y), info
+
+
+class _Defects(NamedTuple):
+    """Of a state: g, dg/dt, and G with rows of length one; which components of the first two are
+    above round-off, and whether the rows of G are independent."""
+
+    g: Array
+    rate: Array
+    rows: Array
+    is_off: Array
+    is_moving_off: Array
+    is_independent: Array
+
+
+def _defects(equations: Equations, t: Scalar, q: State, p: State) -> _Defects:
+    G, g = gradient(equations, q), equations.constraint(q)
+    v = velocity_at(equations, t, q)(p).ravel()
+    eps = jnp.finfo(q.dtype).eps
+
+    def exceeds(defect, x):
+        size = jnp.abs(G) @ (_OWN * jnp.abs(x) + _LARGEST * jnp.max(jnp.abs(x)))
+        return ~(jnp.abs(defect) <= eps * size)
+
+    rows = G / jnp.sqrt(jnp.sum(G * G, axis=1, keepdims=True))
+    # The inverse of a Gram matrix of dependent rows is infinite, or as large as round-off allows.
+    inverse = jax.vmap(partial(lanewise.solve, rows @ rows.T))(
+        lanewise.unit_vectors(g.size, q.dtype)
+    )
+    independent = jnp.all(jnp.abs(inverse) * (64 * eps) < 1)
+    return _Defects(g, G @ v, rows, exceeds(g, q.ravel()), exceeds(G @ v, v), independent)
+
+
+def start_status(equations: Equations, t: Scalar, q: State, p: State) -> RESULTS:
+    """`successful` for a consistent state with independent constraints."""
+    found = _defects(equations, t, q, p)
+    consistent = ~jnp.any(found.is_off | found.is_moving_off)
+    status = RESULTS.where(consistent, RESULTS.successful, RESULTS.inconsistent)
+    return RESULTS.where(found.is_independent, status, RESULTS.redundant)
+
+
+_compiled_defects = eqx.filter_jit(_defects)
+
+
+def check_start(equations: Equations, t: Scalar, q: State, p: State) -> None:
+    """**Raises** `ValueError` for a start with constraints that are violated or redundant."""
+    found = _compiled_defects(equations, t, q, p)
+    _require_independent(found)
+    for off, value, what in (
+        (found.is_off, found.g, "the constraint"),
+        (found.is_moving_off, found.rate, "the rate of change (∂g/∂q) ∂H/∂p of the constraint"),
+    ):
+        if np.any(off):
+            i = int(np.argmax(np.where(off, np.abs(value), -1)))
+            raise ValueError(
+                f"the initial state is not consistent: {what} must be 0 to round-off, but "
+                f"component {i} is {float(value[i]):.3g}. dvi.project(system, q0, p0, args) "
+                "computes the nearest consistent state."
+            )
+
+
+def _require_independent(found: _Defects) -> None:
+    if not found.is_independent:
+        count, rows = len(found.g), np.nan_to_num(np.asarray(found.rows))
+        rank = np.linalg.matrix_rank(rows, tol=8 * np.sqrt(np.finfo(rows.dtype).eps))
+        raise ValueError(
+            f"the constraint has {count} components, but the rank of ∂g/∂q at the initial state is "
+            f"{rank}: {count - rank} of them are redundant, so that the forces of constraint are "
+            "not determined. Leave out the components that follow from the others."
+        )
+
+
+class Projection(NamedTuple):
+    """A consistent state (q, p), and how far it is from the one given.
+
+    `distance` = |q − q0| [unit of q], `kick` = |p − p0| [unit of p]; `violation`: the largest
+    component of g, and `rate` that of dg/dt, at the state given.
+    """
+
+    q: State
+    p: State
+    distance: Array
+    kick: Array
+    violation: Array
+    rate: Array
+
+
+def project(
+    system: Any,
+    q0: Any = None,
+    p0: Any = None,
+    args: Args = None,
+    *,
+    t0: Any = 0.0,
+    epsilon: Any = None,
+    root_finder: RootSolver = Newton(),
+) -> Projection:
+    r"""The nearest consistent initial state of a constrained system.
+
+        q = q0 − Gᵀ(q) ν,  g(q, args) = 0;      p = p0 − Gᵀ(q) μ,  G(q) ∂H/∂p(t0, q, p) = 0
+
+    with G = ∂g/∂q. q is the point of the manifold nearest to q0; p is for a kinetic energy pᵀM⁻¹p/2
+    the momentum nearest to p0 in the metric M⁻¹, so that forces of constraint alone change it.
+
+    **Arguments** `system`: a `System` with a constraint, or a problem of the library, whose q0, p0
+    and args are the defaults. `q0`, `p0`, `t0`, `epsilon`, `args`: as for `integrate`.
+
+    **Returns** a `Projection`: q, p and how far they were moved. Differentiable. Under jit, vmap
+    and grad it is NaN where the iteration does not converge.
+
+    **Raises** `ValueError` for a system without constraint, redundant constraints (with the rank
+    of G), and where no state is found near q0.
+
+    **Accuracy** round-off. **Source** Hairer & Wanner 1996, *Solving ODEs II*, VII.2 (4.14).
+
+    **Example**
+
+    ```python
+    rod = dvi.System(lambda t0, t1, q0, p1, args: p1 @ p1 / 2 + q0[1],
+                     constraint=lambda q, args: jnp.stack([q @ q - 1.0]))
+    start = dvi.project(rod, [0.9, -0.5], [0.3, 0.3])
+    sol = dvi.integrate(rod, start.q, start.p, h=0.05, num_steps=100)
+    print(sol.status, f"{start.distance:.4f}", f"{abs(sol.qs[-1] @ sol.qs[-1] - 1):.0e}"[:2])
+    # successful 0.0296 …
+    ```
+    """
+    system, q0, p0, _, args = of_problem(system, q0, p0, None, args)
+    check_system(system)
+    if system.constraint is None:
+        raise ValueError("project requires dvi.System(H_D, constraint=g): this system has none.")
+    q0, p0 = start_state(q0, p0)
+    t0, epsilon = (
+        as_scalar(name, x, q0.dtype) for name, x in (("t0", t0), ("epsilon", epsilon or 0.0))
+    )
+    args = jax.tree.map(as_parameter, args)
+    system.check_shapes(t0, q0, p0, epsilon, args)
+    equations = Equations(system, epsilon, args, root_finder)
+    found, defects, converged = _projected(equations, t0, q0, p0)
+    if not is_traced(converged) and not bool(converged):
+        _require_independent(defects)
+        raise ValueError(
+            "no state that satisfies the constraint was found near the one given, at which its "
+            f"largest component is {float(found.violation):.3g}. Start nearer to the manifold."
+        )
+    return found
+
+
+@eqx.filter_jit
+def _projected(equations: Equations, t: Scalar, q0: State, p0: State):
+    before, n = _defects(equations, t, q0, p0), q0.size
+
+    def residual(x):
+        q, nu = x[:n].reshape(q0.shape), x[n:]
+        moved = x[:n] - q0.ravel() + nu @ gradient(equations, q)
+        return jnp.concatenate([moved, equations.constraint(q)])
+
+    guess = jnp.concatenate([q0.ravel(), jnp.zeros_like(before.g)])
+    x, of_q = find_root(residual, guess, guess, equations.newton)
+    q = x[:n].reshape(q0.shape)
+    p, of_p = tangent(equations, t, q, p0)
+    converged = of_q.converged & of_p.converged & jnp.all(jnp.isfinite(p))
+    q, p = (x * jnp.where(converged, 1.0, jnp.nan).astype(x.dtype) for x in (q, p))
+    distances = (jnp.sqrt(jnp.sum(x * x)) for x in (q - q0, p - p0))
+    sizes = (jnp.max(jnp.abs(x)) for x in (before.g, before.rate))
+    return Projection(q, p, *distances, *sizes), before, converged
