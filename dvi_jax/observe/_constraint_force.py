@@ -16,7 +16,7 @@ from .._types import Interval
 class ConstraintForce(eqx.Module):
     r"""The force of constraint −Gᵀλ at the end of a step, shape of q [force]; or the multipliers λ.
 
-    λ(t, q, p) follows from the second derivative of the constraint, which vanishes with g and dg/dt:
+    λ(t, q, p) follows from the second derivative of the constraint, which is zero as well:
 
         q̇ = v = ∂H/∂p,   ṗ = −∂H/∂q + εW − Gᵀλ,   d²g/dt² = 0
         ⟹  (G ∂²H/∂p² Gᵀ) λ = d(G v)/dt at λ = 0,   G = ∂g/∂q
