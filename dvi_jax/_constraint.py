@@ -20,7 +20,8 @@ from ._results import RESULTS
 from ._step import Equations, no_solve
 from ._system import check_system, of_problem
 from ._types import Args, Interval, Scalar, State
-from .engine.newton import Found, Newton, RootSolver, find_root
+from .engine.newton import Found, Known, Newton, RootSolver, find_root
+from .engine.picard import PicardThenNewton
 
 # A start is consistent up to so many times the round-off of the terms in g and in dg/dt, and of
 # the largest coordinate: a component such as q[2] = 0 has no size of its own.
@@ -38,62 +39,94 @@ def velocity_at(equations: Equations, t: Scalar, q: State) -> Callable[[State], 
     return partial(equations.position_rate, Interval(t, t, jnp.zeros_like(t)), q)
 
 
-def coupling(G: Array, velocity: Callable[[State], State], p: State) -> Array:
-    """G (∂²H/∂p²) Gᵀ, shape (m, m): how multipliers change the velocity across the constraint."""
+class Linear(NamedTuple):
+    """The derivative G of g at a position, as functions: v → G v, and λ → Gᵀλ."""
+
+    across: Callable[[State], Array]
+    back: Callable[[Array], State]
+
+    @classmethod
+    def at(cls, equations: Equations, q: State) -> "Linear":
+        # Not products with the matrix G: each component of g contains few coordinates, and
+        # generated code leaves out the zeros of a chain for as long as it sees g itself.
+        pull = jax.vjp(equations.constraint, q)[1]
+        return cls(lambda v: jax.jvp(equations.constraint, (q,), (v,))[1], lambda y: pull(y)[0])
+
+    def coupling(self, velocity: Callable[[State], State], p: State, m: int) -> Array:
+        """G (∂v/∂p) Gᵀ, shape (m, m): how multipliers change the velocity across the constraint."""
+        push = jax.linearize(velocity, p)[1]
+
+        def column(e):
+            return self.across(push(self.back(e)))
+
+        return jax.vmap(column, out_axes=1)(lanewise.unit_vectors(m, p.dtype))
+
+
+def own_coupling(G: Array, velocity: Callable[[State], State], p: State) -> Array:
+    """The diagonal of G (∂v/∂p) Gᵀ, shape (m,)."""
     push = jax.linearize(velocity, p)[1]
-    return G @ jax.vmap(lambda row: push(row.reshape(p.shape)).ravel())(G).T
+    return jax.vmap(lambda row: row @ push(row.reshape(p.shape)).ravel())(G)
 
 
 def tangent(equations: Equations, t: Scalar, q: State, p: State) -> tuple[State, Found]:
     """p − Gᵀμ with the velocity along the constraint, G ∂H/∂p = 0."""
-    G, velocity = gradient(equations, q), velocity_at(equations, t, q)
-    A = coupling(G, velocity, p)
-
-    def moved(y):
-        return p - (lanewise.solve(A, y) @ G).reshape(p.shape)
-
-    across = G @ velocity(p).ravel()
+    linear, velocity = Linear.at(equations, q), velocity_at(equations, t, q)
+    across = linear.across(velocity(p))
+    A = linear.coupling(velocity, p, across.size)
     # A velocity that is linear in p needs no iteration.
     if not depends_on(lambda p, v: jax.jvp(velocity, (p,), (v,))[1], 0, p, p):
-        return moved(across), no_solve(p)
-    A = lax.stop_gradient(A)  # the root does not depend on the units of the unknowns
+        return p - linear.back(lanewise.solve(A, across)), no_solve(p)
+    G = lax.stop_gradient(gradient(equations, q))
+    units = lax.stop_gradient(jnp.diagonal(A))  # the unknowns are velocities: their scale is known
     scale = jnp.abs(G) @ jnp.abs(velocity(p)).ravel()
 
-    def residual(y):
-        return -(G @ velocity(moved(y)).ravel())
+    def moved(y):
+        return p - linear.back(y / units)
 
-    y, info = find_root(residual, across, scale, equations.newton)
+    def residual(y):
+        return -linear.across(velocity(moved(y)))
+
+    y, info = find_root(residual, across, scale, root_solver(equations))
     return moved(y), info
 
 
+def root_solver(equations: Equations) -> RootSolver | Known:
+    """The solver for multipliers: of the default, Newton's method for any number of them."""
+    # The Jacobian is that of masses that are coupled, not near the identity as for other methods:
+    # fixed points of a chain converge slowly. Newton's elimination is as cheap as it is banded.
+    solver = equations.newton
+    return solver.newton if isinstance(solver, PicardThenNewton) else solver
+
+
 class _Defects(NamedTuple):
-    """Of a state: g, dg/dt, and G with rows of length one; which components of the first two are
-    above round-off, and whether the rows of G are independent."""
+    """Of a state: g, dg/dt and G; which components of the first two are above round-off, and
+    whether the rows of G are independent."""
 
     g: Array
     rate: Array
-    rows: Array
+    G: Array
     is_off: Array
     is_moving_off: Array
     is_independent: Array
 
 
 def _defects(equations: Equations, t: Scalar, q: State, p: State) -> _Defects:
-    G, g = gradient(equations, q), equations.constraint(q)
-    v = velocity_at(equations, t, q)(p).ravel()
-    eps = jnp.finfo(q.dtype).eps
+    g, G, linear = equations.constraint(q), gradient(equations, q), Linear.at(equations, q)
+    v = velocity_at(equations, t, q)(p)
+    rate, sizes, eps = linear.across(v), jnp.abs(G), float(jnp.finfo(q.dtype).eps)
 
     def exceeds(defect, x):
-        size = jnp.abs(G) @ (_OWN * jnp.abs(x) + _LARGEST * jnp.max(jnp.abs(x)))
+        size = sizes @ (_OWN * jnp.abs(x) + _LARGEST * jnp.max(jnp.abs(x))).ravel()
         return ~(jnp.abs(defect) <= eps * size)
 
-    rows = G / jnp.sqrt(jnp.sum(G * G, axis=1, keepdims=True))
-    # The inverse of a Gram matrix of dependent rows is infinite, or as large as round-off allows.
-    inverse = jax.vmap(partial(lanewise.solve, rows @ rows.T))(
-        lanewise.unit_vectors(g.size, q.dtype)
-    )
-    independent = jnp.all(jnp.abs(inverse) * (64 * eps) < 1)
-    return _Defects(g, G @ v, rows, exceeds(g, q.ravel()), exceeds(G @ v, v), independent)
+    # For dependent rows of G the solution of G Gᵀ x = b, with rows of length one, is infinite, or
+    # as large as round-off allows, unless b is one of a few: a sequence without a pattern.
+    A = jax.vmap(lambda row: linear.across(row.reshape(q.shape)))(G)
+    length = jnp.sqrt(jnp.diagonal(A))
+    b = jnp.asarray(np.modf(0.618 * np.arange(1, g.size + 1))[0] - 0.5, q.dtype)
+    x = length * lanewise.solve(A, length * b)
+    independent = jnp.all(jnp.abs(x) * (64 * eps) < 1)
+    return _Defects(g, rate, G, exceeds(g, q), exceeds(rate, v), independent)
 
 
 def start_status(equations: Equations, t: Scalar, q: State, p: State) -> RESULTS:
@@ -126,7 +159,9 @@ def check_start(equations: Equations, t: Scalar, q: State, p: State) -> None:
 
 def _require_independent(found: _Defects) -> None:
     if not found.is_independent:
-        count, rows = len(found.g), np.nan_to_num(np.asarray(found.rows))
+        G, count = np.asarray(found.G), len(found.g)
+        lengths = np.linalg.norm(G, axis=1, keepdims=True)
+        rows = G / np.where(lengths > 0, lengths, 1)
         rank = np.linalg.matrix_rank(rows, tol=8 * np.sqrt(np.finfo(rows.dtype).eps))
         raise ValueError(
             f"the constraint has {count} components, but the rank of ∂g/∂q at the initial state is "

@@ -5,10 +5,9 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jax import lax
 
-import lanewise
 from lanewise.dependence import depends_on
 
-from .._constraint import coupling, gradient, tangent, velocity_at
+from .._constraint import Linear, gradient, own_coupling, root_solver, tangent, velocity_at
 from .._step import judge
 from ..engine.newton import find_root
 from ._base import Method
@@ -59,31 +58,35 @@ class Rattle(Method):
     def step(self, equations, interval, q0, p0):
         h, m = interval.h, equations.constraint(q0).size
         first, second = interval.part(0.0, 0.5), interval.part(0.5, 1.0).reversed()
-        G = gradient(equations, q0)
+        linear = Linear.at(equations, q0)
         velocity = velocity_at(equations, interval.t0, q0)
-        # With Λ = −A⁻¹z the unknown z is a velocity across the constraint: its scale is known, and
-        # the Jacobian of g(q1)/h in z is 1 + O(h). A is a choice of units, not differentiated.
-        A = lax.stop_gradient(coupling(G, velocity, p0))
+        # The unknown is z = −Λ·units, a velocity across the constraint: its scale is known. The
+        # result does not depend on the units, so that they are not differentiated.
+        G = lax.stop_gradient(gradient(equations, q0))
+        units = lax.stop_gradient(own_coupling(G, velocity, p0))
 
         def moved(z, p_half, q1):
             """p½ and (q1 − q0)/h for multipliers, and for p½ and q1 on the right sides."""
-            push = (lanewise.solve(A, z) @ G).reshape(p0.shape)
+            push = linear.back(z / units)
             p = p0 + h / 2 * equations.momentum_rate(first, q0, p_half) + push
             v = equations.position_rate(first, q0, p) + equations.position_rate(second, q1, p)
             return p, v / 2
 
-        still = h == 0  # as at the ends of the curve between two states
+        # As at the ends of the curve between two states, where z = 0 is the root.
+        still = h == 0
         divisor = jnp.where(still, 1, h)
 
-        def off(v):
-            """g(q1)/h, and its limit for h = 0."""
-            return jnp.where(still, G @ v.ravel(), equations.constraint(q0 + h * v) / divisor)
+        def off(z, v):
+            """g(q1)/h."""
+            return jnp.where(still, z, equations.constraint(q0 + h * v) / divisor)
 
         q, p = equations.absolute(q0, p0)
         reach = jnp.where(still, 0, jnp.abs(q / divisor)) + jnp.abs(velocity(p0))
         zero, scale = jnp.zeros(m, q0.dtype), jnp.abs(G) @ reach.ravel()
         if _is_separable(equations, first, second, q0, p0):
-            at, info = find_root(lambda z: off(moved(z, p0, q0)[1]), zero, scale, equations.newton)
+            at, info = find_root(
+                lambda z: off(z, moved(z, p0, q0)[1]), zero, scale, root_solver(equations)
+            )
             p_half, v = moved(at, p0, q0)
         else:
 
@@ -94,7 +97,7 @@ class Rattle(Method):
                 z, p_half, q1 = split(x)
                 p, v = moved(z, p_half, q1)
                 left = (p_half - p).ravel(), (q1 - q0 - h * v).ravel()
-                return jnp.concatenate([off(v), *left])
+                return jnp.concatenate([off(z, v), *left])
 
             p_half, v = moved(zero, p0, q0)
             guess = jnp.concatenate([zero, p_half.ravel(), (q0 + h * v).ravel()])

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 import lanewise
 
-from .._constraint import coupling, gradient, velocity_at
+from .._constraint import Linear, velocity_at
 from .._step import Equations
 from .._types import Interval
 
@@ -63,8 +63,8 @@ class ConstraintForce(eqx.Module):
         def rate(t, q, p):  # dg/dt
             return jax.jvp(equations.constraint, (q,), (velocity_at(equations, t, q)(p),))[1]
 
-        G, velocity = gradient(equations, q1), velocity_at(equations, t1, q1)
+        linear, velocity = Linear.at(equations, q1), velocity_at(equations, t1, q1)
         v, f = equations.rates(Interval(t1, t1, jnp.zeros_like(t1)), q1, p1)
         _, growth = jax.jvp(rate, (t1, q1, p1), (jnp.ones_like(t1), v, f))
-        found = lanewise.solve(coupling(G, velocity, p1), growth)
-        return found if self.multipliers else -(found @ G).reshape(q1.shape)
+        found = lanewise.solve(linear.coupling(velocity, p1, growth.size), growth)
+        return found if self.multipliers else -linear.back(found)

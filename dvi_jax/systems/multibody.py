@@ -89,7 +89,7 @@ def _chain_energy(t0, t1, q0, p1, args):
 
 def _links(q, args):
     """(|q_i − q_{i−1}|² − l²)/2 with q_0 = 0."""
-    ends = jnp.concatenate([q[:1], q[1:] - q[:-1]])
+    ends = q - jnp.pad(q[:-1], ((1, 0), (0, 0)))
     return (jnp.sum(ends**2, axis=1) - args["l"] ** 2) / 2
 
 
