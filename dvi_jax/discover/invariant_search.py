@@ -38,9 +38,11 @@ from .sampling import (
     Samples,
     as_samples,
     check_basis,
+    independent_on,
     map_of,
     middle,
     relative_step,
+    require_consistent,
     require_enough,
     require_time,
 )
@@ -86,7 +88,8 @@ def discover_invariants(
     - `order`: z ≥ 0. `h`: step size [time].
     - `samples`: (qs, ps) at t0, shapes (S, *q.shape), or (qs, ps, ts) with times of shape (S,):
       points of the domain of interest; a quarter is held out. At least twice as many as
-      functions in the basis.
+      functions in the basis. With a constraint: consistent states. Functions that depend there on
+      simpler ones (|γ|² γ₁ on γ₁, for a unit vector γ) are left out of the basis.
     - `tolerance`: for *approximate* invariants: singular values up to that share of the largest
       count as zero. What a method of order r conserves up to O(h^r), such as the energy, has
       singular values and residuals that shrink as h^r. None: only what is below 1e-11.
@@ -144,6 +147,9 @@ def discover_invariants(
     q, p, t = (jnp.asarray(x[0]) for x in samples)
     system.check_shapes(t, q, p, jnp.zeros(()), one_step.args)
     equations = Equations(system, jnp.zeros(()), one_step.args, one_step.root_finder)
+    if system.constraint is not None:
+        require_consistent(equations, samples)
+        bound = independent_on(bound, samples)
     at = middle(samples, max(bound.complexity))
     inner, to_basis = bound.about(at)
     stepped = Stepped(equations, np.asarray(h), one_step.method, inner)
@@ -237,7 +243,8 @@ def _at_larger(
 
     larger = at_larger_step(h, lambda step: relative_step(samples, moved(samples, step)), count)
     if order == 0:
-        larger += in_larger_box(samples, moved, lambda at: count(h, at))
+        constrained = stepped.equations.system.constraint is not None
+        larger += in_larger_box(samples, moved, lambda at: count(h, at), constrained)
     return larger
 
 
