@@ -83,7 +83,7 @@ class Integrator(eqx.Module):
         if system.constraint is not None:
             for name, kinds in (("lattice", (Uniform, Given)), ("arithmetic", (FloatingPoint,))):
                 value = getattr(self, name)
-                if not isinstance(value, kinds):
+                if type(value) not in kinds:  # `TimeTransformed` is a `Uniform` of other equations
                     names = " or ".join(f"dvi.{kind.__name__}" for kind in kinds)
                     raise ValueError(
                         f"a system with a constraint needs {name}={names}, got {value!r:.200}."
