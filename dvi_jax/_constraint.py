@@ -212,17 +212,6 @@ def project(
     of G), and where no state is found near q0.
 
     **Accuracy** round-off. **Source** Hairer & Wanner 1996, *Solving ODEs II*, VII.2 (4.14).
-
-    **Example**
-
-    ```python
-    rod = dvi.System(lambda t0, t1, q0, p1, args: p1 @ p1 / 2 + q0[1],
-                     constraint=lambda q, args: jnp.stack([q @ q - 1.0]))
-    start = dvi.project(rod, [0.9, -0.5], [0.3, 0.3])
-    sol = dvi.integrate(rod, start.q, start.p, h=0.05, num_steps=100)
-    print(sol.status, f"{start.distance:.4f}", f"{abs(sol.qs[-1] @ sol.qs[-1] - 1):.0e}"[:2])
-    # successful 0.0296 …
-    ```
     """
     system, q0, p0, _, args = of_problem(system, q0, p0, None, args)
     check_system(system)

@@ -7,7 +7,7 @@ import equinox as eqx
 from lanewise import Layout
 
 from ._adjoints import AbstractAdjoint
-from ._arithmetic import Arithmetic, FloatingPoint
+from ._arithmetic import Arithmetic, Compensated, FloatingPoint
 from ._checks import instance
 from ._discretise import is_first_order
 from ._reversible import Reversible
@@ -81,7 +81,10 @@ class Integrator(eqx.Module):
                 "dvi.System(H_D, constraint=g), or another method such as dvi.Strang()."
             )
         if system.constraint is not None:
-            for name, kinds in (("lattice", (Uniform, Given)), ("arithmetic", (FloatingPoint,))):
+            for name, kinds in (
+                ("lattice", (Uniform, Given)),
+                ("arithmetic", (FloatingPoint, Compensated)),
+            ):
                 value = getattr(self, name)
                 if type(value) not in kinds:  # `TimeTransformed` is a `Uniform` of other equations
                     names = " or ".join(f"dvi.{kind.__name__}" for kind in kinds)

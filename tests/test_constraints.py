@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import dvi_jax as dvi
 import lanewise
@@ -374,3 +375,133 @@ def test_steps_are_compiled_by_lanewise():
     parts = str(lanewise.explain(f, jnp.asarray(chain.q0), jnp.asarray(chain.p0)))
     assert "machine code" in parts
     assert "XLA" not in parts
+
+
+# Against solutions in minimal coordinates, and over long times
+
+
+def by_dop853(rates, y0, time):
+    """The end of a solution of y' = rates(y) by SciPy, with a tolerance of 1e-13."""
+    found = solve_ivp(lambda t, y: rates(y), (0, time), y0, "DOP853", rtol=1e-13, atol=1e-14)
+    assert found.success
+    return found.y[:, -1]
+
+
+def chain_in_angles(angles, time, args):
+    """Angles of the links from the downward vertical, from rest: Lagrange's equations."""
+    n, length, g = len(angles), args["l"], args["g"]
+    below = n - np.maximum.outer(np.arange(n), np.arange(n))  # masses that two links both move
+
+    def rates(y):
+        theta, turn = y[:n], y[n:]
+        apart = theta[:, None] - theta
+        pull = below * np.sin(apart) @ turn**2 + np.diag(below) * g / length * np.sin(theta)
+        return np.concatenate([turn, np.linalg.solve(below * np.cos(apart), -pull)])
+
+    y = by_dop853(rates, np.concatenate([angles, np.zeros(n)]), time)
+    return length * np.cumsum(np.stack([np.sin(y[:n]), -np.cos(y[:n])], axis=1), axis=0)
+
+
+@slow
+def test_a_chain_of_20_links_moves_as_in_angles():
+    made = systems.chain(20)
+    sol = run(made, 1000, h=1e-3, method=EIGHTH)
+    expected = chain_in_angles(np.full(20, 0.4), 1.0, made.args)
+    off = np.max(np.abs(sol.qs[-1] - expected))
+    print(f"chain of 20 links, 1 s: {off:.1e}")
+    assert np.max(np.abs(expected - made.q0)) > 0.3
+    assert off < 1e-9
+
+
+@slow
+def test_a_slider_crank_moves_as_in_its_angle():
+    made = systems.slider_crank()
+    a = made.args
+
+    def place(theta):
+        """(A, B), as complex numbers for derivatives in the direction i."""
+        y = a["l1"] * np.sin(theta)
+        x = a["l1"] * np.cos(theta)
+        return x, y, x + np.sqrt(a["l2"] ** 2 - y**2)
+
+    def inertia_and_height(theta):
+        """T = J(θ) θ'²/2 and V, from velocities of the points of uniform rods."""
+        step = 1e-30
+        y = place(theta)[1]
+        dx, dy, ds = (z.imag / step for z in place(theta.real + 1j * step))
+        crank = a["m1"] / 3 * (dx**2 + dy**2)
+        rod = a["m2"] / 3 * (dx**2 + dx * ds + ds**2 + dy**2)
+        return crank + rod + a["m3"] * ds**2, a["g"] * (a["m1"] + a["m2"]) / 2 * y
+
+    def rates(y):
+        theta, turn = y
+        d = 1e-4
+        J = [inertia_and_height(np.asarray(theta + k * d))[0] for k in (-2, -1, 0, 1, 2)]
+        V = [inertia_and_height(np.asarray(theta + k * d))[1] for k in (-2, -1, 0, 1, 2)]
+        dJ, dV = ((8 * (f[3] - f[1]) - f[4] + f[0]) / (12 * d) for f in (J, V))
+        return np.array([turn, (-dJ * turn**2 / 2 - dV) / J[2]])
+
+    theta, _ = by_dop853(rates, [np.pi / 3, 5.0], 2.0)
+    x, y, s = place(theta)
+    sol = run(made, 1000, h=2e-3, method=EIGHTH)
+    off = np.max(np.abs(sol.qs[-1] - np.array([[x, y], [s, 0.0]])))
+    print(f"slider-crank, 2 s: {off:.1e}, angle {theta:.2f}")
+    assert off < 1e-9
+
+
+@slow
+def test_a_spherical_pendulum_moves_as_in_angles():
+    g = SPHERE.args["g"]
+
+    def rates(y):  # θ from the upward vertical; p_φ = sin² θ φ'
+        theta, _, p, spin = y
+        s, c = np.sin(theta), np.cos(theta)
+        return np.array([p, spin / s**2, spin**2 * c / s**3 + g * s, 0.0])
+
+    s, c = np.array([0.8, -0.6])
+    p = np.asarray(P)
+    start = [np.arctan2(s, c), 0.0, p @ [c, 0, -s], s * p[1]]
+    theta, phi, _, _ = by_dop853(rates, start, 5.0)
+    expected = [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)]
+    off = np.max(np.abs(run(SPHERE, 1000, h=5e-3, method=EIGHTH).qs[-1] - np.array(expected)))
+    exact = np.max(np.abs(run(SPHERE, 1000, h=5e-3, method=EIGHTH).qs[-1] - exact_end(5.0)[:3]))
+    print(f"spherical pendulum, 5 s: {off:.1e} from DOP853, {exact:.1e} from elliptic functions")
+    assert off < 1e-9
+    assert exact < 1e-11
+
+
+def violation(made):
+    """max |g| of a state."""
+
+    def largest(t, q, p, args):
+        return jnp.max(jnp.abs(made.system.constraint(q, args)))
+
+    return largest
+
+
+@slow
+@pytest.mark.parametrize("name", ["spherical_pendulum", "slider_crank", "dumbbell", "heavy_top"])
+def test_a_million_steps_stay_on_the_manifold_without_drift(name):
+    made = systems.LIBRARY[name]()
+    watched = {key: made.observables[key] for key in made.invariants}
+    trends = {key: dvi.Trend(f) for key, f in watched.items()}
+    ranges = {key: dvi.Range(f) for key, f in watched.items()}
+    largest = dvi.MaxDrift(violation(made))
+    count, time = 10**6, 10**6 * made.h
+    sol = run(made, count, observe=(largest, trends, ranges))
+    assert sol.status == "successful"
+    q = jnp.asarray(made.q0)
+    away = float(sol.observed[0] + violation(made)(0.0, q, q, made.args))
+    print(f"{name}: |g| ≤ {away:.1e}", end="")
+    assert away < 1e-13
+    first = {key: f(0.0, 0.0, *[made.q0, made.p0] * 2, made.args) for key, f in watched.items()}
+    for key in watched:
+        size = np.max(np.abs(first[key]))
+        slope, width = (np.max(np.abs(x[key])) for x in sol.observed[1:])
+        drift = slope * time
+        print(f"; {key}: width {width / size:.1e}, drift {drift / size:.1e}", end="")
+        if key == "energy":
+            assert drift < 0.02 * width  # it oscillates with h²
+        else:
+            assert width < 1e-11 * size
+    print()

@@ -35,16 +35,6 @@ class Rattle(Method):
     **Source** Andersen 1983, *J. Comput. Phys.* 52, 24; general H: Jay 1996, *SIAM J. Numer. Anal.*
     33, 368; Hairer, Lubich & Wanner 2006, VII.1.4 (1.26); variational: Leyendecker, Marsden & Ortiz
     2008, *ZAMM* 88, 677.
-
-    **Example**
-
-    ```python
-    pendulum = dvi.System(lambda t0, t1, q0, p1, args: p1 @ p1 / 2 + q0[2],
-                          constraint=lambda q, args: jnp.stack([q @ q - 1.0]))
-    sol = dvi.integrate(pendulum, [0.6, 0.0, -0.8], [0.0, 1.0, 0.0], h=0.1, num_steps=1000)
-    print(sol.status, bool(abs(sol.qs[-1] @ sol.qs[-1] - 1) < 1e-14))
-    # successful True
-    ```
     """
 
     order: ClassVar[int] = 2

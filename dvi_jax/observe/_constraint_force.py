@@ -29,17 +29,6 @@ class ConstraintForce(eqx.Module):
     **Raises** `ValueError` for a system without constraint.
 
     **Source** Hairer, Lubich & Wanner 2006, *Geometric Numerical Integration*, VII.1.2 (1.12).
-
-    **Example**
-
-    ```python
-    weight = dvi.System(lambda t0, t1, q0, p1, args: p1 @ p1 / 2 + 9.81 * q0[1],
-                        constraint=lambda q, args: jnp.stack([q @ q - 1.0]))
-    sol = dvi.integrate(weight, [0.0, -1.0], [0.0, 0.0], h=0.1, num_steps=1,
-                        observe=dvi.ConstraintForce())       # a weight that hangs at rest
-    print(sol.observed[-1].round(12))
-    # [0.   9.81]
-    ```
     """
 
     multipliers: bool = eqx.field(static=True, default=False)

@@ -29,7 +29,7 @@ def second_moments(I: Any) -> Array:  # noqa: E741
 
 def rotational_energy(P: Array, I: Any) -> Array:  # noqa: E741
     """tr(P D⁻¹ Pᵀ)/2, the energy of rotation with P = (dR/dt) D."""
-    return jnp.sum(P[:3] ** 2 / second_moments(I)) / 2
+    return jnp.sum(P[:3] ** 2 / second_moments(I)[None]) / 2
 
 
 def body_momentum(R: Array, P: Array) -> Array:
@@ -42,7 +42,7 @@ def momentum(R: Array, pi: Any, I: Any) -> Array:  # noqa: E741
     """P = R Ω̂ D of a body with angular momentum π = I Ω on its axes."""
     x, y, z = jnp.asarray(pi) / jnp.asarray(I)
     spin = jnp.stack([0 * x, -z, y, z, 0 * x, -x, -y, x, 0 * x]).reshape(3, 3)
-    return R @ spin * second_moments(I)
+    return R @ spin * second_moments(I)[None]
 
 
 def rotation(phi: Any, theta: Any, psi: Any) -> Array:
