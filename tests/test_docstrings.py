@@ -157,9 +157,7 @@ def test_the_page_has_each_name_once_and_no_others(entries):
     assert set(listed) - set(entries) == {"systems", "plot"}
     for name, origin in PAGE.origins.items():
         assert inspect.isclass(entries[name]), name
-        found = re.findall(
-            r"`((?:dvi|interop|starts|lanewise|systems\.boozer|systems\.rigid)\.\w+)`", origin
-        )
+        found = re.findall(r"`((?:dvi|interop|starts|lanewise|systems\.boozer)\.\w+)`", origin)
         assert found or "all generated" in origin, name
         assert set(found) <= set(entries), name
 
