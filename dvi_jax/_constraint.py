@@ -20,7 +20,7 @@ from ._results import RESULTS
 from ._step import Equations, no_solve
 from ._system import check_system, of_problem
 from ._types import Args, Interval, Scalar, State
-from .engine.newton import Found, Known, Newton, RootSolver, find_root
+from .engine.newton import Found, Known, RootSolver, find_root
 from .engine.picard import PicardThenNewton
 
 # A start is consistent up to so many times the round-off of the terms in g and in dg/dt, and of
@@ -144,10 +144,9 @@ def check_start(equations: Equations, t: Scalar, q: State, p: State) -> None:
     """**Raises** `ValueError` for a start with constraints that are violated or redundant."""
     found = _compiled_defects(equations, t, q, p)
     _require_independent(found)
-    for off, value, what in (
-        (found.is_off, found.g, "the constraint"),
-        (found.is_moving_off, found.rate, "the rate of change (∂g/∂q) ∂H/∂p of the constraint"),
-    ):
+    rate = "the rate of change (∂g/∂q) ∂H/∂p of the constraint"
+    first = (found.is_off, found.g, "the constraint")
+    for off, value, what in (first, (found.is_moving_off, found.rate, rate)):
         if np.any(off):
             i = int(np.argmax(np.where(off, np.abs(value), -1)))
             raise ValueError(
@@ -171,18 +170,12 @@ def _require_independent(found: _Defects) -> None:
 
 
 class Projection(NamedTuple):
-    """A consistent state (q, p), and how far it is from the one given.
-
-    `distance` = |q − q0| [unit of q], `kick` = |p − p0| [unit of p]; `violation`: the largest
-    component of g, and `rate` that of dg/dt, at the state given.
-    """
+    """A consistent state (q, p), and how far it is from the one given: |q − q0| and |p − p0|."""
 
     q: State
     p: State
     distance: Array
     kick: Array
-    violation: Array
-    rate: Array
 
 
 def project(
@@ -192,8 +185,7 @@ def project(
     args: Args = None,
     *,
     t0: Any = 0.0,
-    epsilon: Any = None,
-    root_finder: RootSolver = Newton(),
+    epsilon: Any = 0,
 ) -> Projection:
     r"""The nearest consistent initial state of a constrained system.
 
@@ -218,18 +210,16 @@ def project(
     if system.constraint is None:
         raise ValueError("project requires dvi.System(H_D, constraint=g): this system has none.")
     q0, p0 = start_state(q0, p0)
-    t0, epsilon = (
-        as_scalar(name, x, q0.dtype) for name, x in (("t0", t0), ("epsilon", epsilon or 0.0))
-    )
+    t0, epsilon = as_scalar("t0", t0, q0.dtype), as_scalar("epsilon", epsilon, q0.dtype)
     args = jax.tree.map(as_parameter, args)
     system.check_shapes(t0, q0, p0, epsilon, args)
-    equations = Equations(system, epsilon, args, root_finder)
+    equations = Equations(system, epsilon, args)
     found, defects, converged = _projected(equations, t0, q0, p0)
     if not is_traced(converged) and not bool(converged):
         _require_independent(defects)
         raise ValueError(
-            "no state that satisfies the constraint was found near the one given, at which its "
-            f"largest component is {float(found.violation):.3g}. Start nearer to the manifold."
+            "no state that satisfies the constraint was found near the one given, at which it is "
+            f"{np.asarray(defects.g)!s:.80}. Start nearer to the manifold."
         )
     return found
 
@@ -250,5 +240,4 @@ def _projected(equations: Equations, t: Scalar, q0: State, p0: State):
     converged = of_q.converged & of_p.converged & jnp.all(jnp.isfinite(p))
     q, p = (x * jnp.where(converged, 1.0, jnp.nan).astype(x.dtype) for x in (q, p))
     distances = (jnp.sqrt(jnp.sum(x * x)) for x in (q - q0, p - p0))
-    sizes = (jnp.max(jnp.abs(x)) for x in (before.g, before.rate))
-    return Projection(q, p, *distances, *sizes), before, converged
+    return Projection(q, p, *distances), before, converged

@@ -56,6 +56,7 @@ OTHERS = {
     "nonlinear velocity": dvi.System(relativistic, constraint=unit_sphere),
     "H_D of order 2": dvi.System(dvi.discretise(curved, order=2), constraint=unit_sphere),
 }
+NAMED = ["not separable", "nonlinear velocity", pytest.param("H_D of order 2", marks=slow)]
 START = np.array([0.6, 0.0, -0.8]), np.array([0.4, 0.5, 0.3])
 
 
@@ -100,7 +101,7 @@ def test_it_converges_to_the_exact_solution_with_its_order(method, order):
     assert np.allclose(np.log2(errors[:-1]) - np.log2(errors[1:]), order, atol=0.15)
 
 
-@pytest.mark.parametrize("name", OTHERS)
+@pytest.mark.parametrize("name", NAMED)
 def test_other_hamiltonians_have_order_2_too(name):
     a, b, c = (flow(name, dvi.Rattle())(*map(jnp.asarray, START), 0.4 / n, n) for n in (4, 8, 16))
     ratio = np.max(np.abs(a - b)) / np.max(np.abs(b - c))
@@ -110,7 +111,7 @@ def test_other_hamiltonians_have_order_2_too(name):
     assert abs(q @ p) < 1e-15  # each velocity is parallel to p
 
 
-@pytest.mark.parametrize("name", ["sphere", *OTHERS])
+@pytest.mark.parametrize("name", ["sphere", *NAMED])
 def test_a_step_back_undoes_a_step(name):
     q, p = (Q, P) if name == "sphere" else map(jnp.asarray, START)
     step = one_step(name)
@@ -205,8 +206,6 @@ def test_a_projection_is_the_nearest_consistent_state():
     assert np.max(np.abs(found.q - nearest)) < 1e-15
     assert np.max(np.abs(found.p - (p0 - nearest * (nearest @ p0)))) < 1e-15
     assert abs(found.distance - abs(np.linalg.norm(q0) - 1)) < 1e-15
-    assert abs(found.violation - abs(q0 @ q0 - 1) / 2) < 1e-15
-    assert abs(found.rate - abs(q0 @ p0)) < 1e-15
     assert run(SPHERE, 1, q0=found.q, p0=found.p).status == "successful"
     slope = jax.jit(jax.jacfwd(lambda q: dvi.project(SPHERE, q, p0).q))(q0)
     length = np.linalg.norm(q0)
@@ -256,7 +255,7 @@ def test_a_traced_start_has_a_status():
             {"lattice": dvi.TimeTransformed(lambda t, q, p, args: 1.0)},
             r"needs lattice=dvi\.Uniform",
         ),
-        ({"arithmetic": dvi.Compensated()}, r"needs arithmetic=dvi\.FloatingPoint"),
+        ({"arithmetic": dvi.DoubleDouble()}, r"needs arithmetic=dvi\.FloatingPoint"),
     ],
 )
 def test_options_that_do_not_fit_a_constraint_are_refused(options, said):
@@ -308,15 +307,13 @@ def test_a_constraint_of_another_shape_is_refused(constraint, said):
 
 
 def test_forces_of_constraint_are_the_tension():
-    watched = {
-        "force": dvi.ConstraintForce(),
-        "multiplier": dvi.ConstraintForce(multipliers=True),
-        "tension": SPHERE.observables["tension"],
-    }
-    sol = run(SPHERE, 10, observe=watched, save=dvi.Save())
-    assert np.max(np.abs(sol.observed["multiplier"][:, 0] - sol.observed["tension"])) < 1e-13
-    force = -sol.qs[1:] * sol.observed["tension"][:, None]
-    assert np.max(np.abs(sol.observed["force"] - force)) < 1e-13
+    watched = {"force": dvi.ConstraintForce(), "λ": dvi.ConstraintForce(multipliers=True)}
+    sol = run(SPHERE, 10, h=0.05, observe=watched, save=dvi.Save())
+    q, p = sol.qs[1:], sol.ps[1:]
+    tension = np.sum(p**2, axis=1) - SPHERE.args["g"] * q[:, 2]  # for unit mass and length
+    assert np.ptp(tension) > 1
+    assert np.max(np.abs(sol.observed["λ"][:, 0] - tension)) < 1e-13
+    assert np.max(np.abs(sol.observed["force"] + q * tension[:, None])) < 1e-13
 
 
 def loss(x, adjoint):

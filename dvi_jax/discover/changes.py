@@ -45,6 +45,11 @@ class Stepped(NamedTuple):
     method: Method
     basis: BoundBasis
 
+    @property
+    def is_constrained(self) -> bool:
+        """Whether samples lie on the manifold of a constraint."""
+        return self.equations.system.constraint is not None
+
     def unnamed(self) -> "Stepped":
         """For compiled functions: see `BoundBasis.unnamed`."""
         return self._replace(basis=self.basis.unnamed())

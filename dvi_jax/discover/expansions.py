@@ -40,7 +40,7 @@ def powers_of_size(
     """
     if len(coefficients) == 0:
         return np.zeros(0)
-    at, which = enlarged(samples, stepped.equations.system.constraint is not None)
+    at, which = enlarged(samples, stepped.is_constrained)
     found = changes_at(stepped, 0, at)
 
     def changes(some):

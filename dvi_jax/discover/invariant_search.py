@@ -20,6 +20,7 @@ from .energy import unconserved_energy
 from .expansions import Larger, at_larger_step, in_larger_box, powers_of_size
 from .found import Discovery
 from .judging import CLEARLY, Fewest, Judge, cleaned, reach
+from .manifold import on_manifold
 from .motion import UNCLEAR, coefficient_errors, conserved, times, typical_sizes
 from .nullspace import (
     RANK,
@@ -38,11 +39,9 @@ from .sampling import (
     Samples,
     as_samples,
     check_basis,
-    independent_on,
     map_of,
     middle,
     relative_step,
-    require_consistent,
     require_enough,
     require_time,
 )
@@ -147,9 +146,7 @@ def discover_invariants(
     q, p, t = (jnp.asarray(x[0]) for x in samples)
     system.check_shapes(t, q, p, jnp.zeros(()), one_step.args)
     equations = Equations(system, jnp.zeros(()), one_step.args, one_step.root_finder)
-    if system.constraint is not None:
-        require_consistent(equations, samples)
-        bound = independent_on(bound, samples)
+    bound = on_manifold(equations, bound, samples)
     at = middle(samples, max(bound.complexity))
     inner, to_basis = bound.about(at)
     stepped = Stepped(equations, np.asarray(h), one_step.method, inner)
@@ -243,8 +240,7 @@ def _at_larger(
 
     larger = at_larger_step(h, lambda step: relative_step(samples, moved(samples, step)), count)
     if order == 0:
-        constrained = stepped.equations.system.constraint is not None
-        larger += in_larger_box(samples, moved, lambda at: count(h, at), constrained)
+        larger += in_larger_box(samples, moved, lambda at: count(h, at), stepped.is_constrained)
     return larger
 
 

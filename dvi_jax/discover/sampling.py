@@ -1,6 +1,5 @@
 """Sampled points, at which symmetries and invariants are tested."""
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -13,7 +12,6 @@ from lanewise.jaxapi import x64_enabled
 
 from .._arithmetic import Arithmetic
 from .._checks import finite as finite_number
-from .._constraint import start_status
 from .._integrate import integrate
 from .._integrator import Integrator, chosen, only
 from .._results import RESULTS
@@ -250,60 +248,6 @@ def require_finite(
 def check_finite(basis: BoundBasis, values: np.ndarray) -> None:
     """Reject functions that are not finite on the samples; `values`: (S, size)."""
     require_finite(values, lambda j: f"the basis function {basis.names[j]!r}")
-
-
-def require_consistent(equations: Equations, samples: Samples) -> None:
-    """Reject samples that do not satisfy the constraint of a system, with their velocities."""
-    good = np.asarray(_are_consistent(equations, samples))
-    if not good.all():
-        i = int(np.argmin(good))
-        raise ValueError(
-            f"samples must satisfy the constraint, and their velocities too, but {np.sum(~good)} "
-            f"of {len(good)} do not. The first of these has the index {i}: q = "
-            f"{samples.q[i].tolist()!s:.80}. Use dvi.project for each."
-        )
-
-
-@eqx.filter_jit
-def _are_consistent(equations, samples):
-    def at_point(q, p, t):
-        return start_status(equations, t, q, p) == RESULTS.successful
-
-    return jax.vmap(at_point)(*map(jnp.asarray, samples))
-
-
-_DEPENDENT = 1e-10  # A function that differs by less from a combination of others depends on them
-
-
-class _Some(eqx.Module):
-    basis: BoundBasis
-    which: np.ndarray
-
-    def __call__(self, q, p, t):
-        return self.basis(q, p, t)[self.which]
-
-
-def independent_on(basis: BoundBasis, samples: Samples) -> BoundBasis:
-    """The functions that are independent on samples of a manifold, the simpler ones first."""
-    values = np.asarray(jax.jit(jax.vmap(basis))(*map(jnp.asarray, samples)))
-    check_finite(basis, values)
-    kept, space = [], np.zeros((len(values), 0))
-    for j in np.argsort(basis.complexity, kind="stable"):
-        left = values[:, j] / max(np.linalg.norm(values[:, j]), 1e-300)
-        for _ in range(2):  # the second time removes the rounding of the first
-            left = left - space @ (space.T @ left)
-        size = np.linalg.norm(left)
-        if size > _DEPENDENT:
-            kept.append(j)
-            space = np.column_stack([space, left / size])
-    if len(kept) == basis.size:
-        return basis
-    kept = np.sort(kept)
-    names, complexity = ([x[j] for j in kept] for x in (basis.names, basis.complexity))
-    function = _Some(basis, kept)
-    return dataclasses.replace(
-        basis, function=function, names=tuple(names), complexity=tuple(complexity)
-    )
 
 
 def check_basis(basis: BoundBasis, values: np.ndarray) -> float:
