@@ -207,6 +207,12 @@ def test_a_projection_is_the_nearest_consistent_state():
     assert np.max(np.abs(found.p - (p0 - nearest * (nearest @ p0)))) < 1e-15
     assert abs(found.distance - abs(np.linalg.norm(q0) - 1)) < 1e-15
     assert run(SPHERE, 1, q0=found.q, p0=found.p).status == "successful"
+
+
+@slow
+def test_a_projection_is_differentiable():
+    q0, p0 = np.array([0.7, 0.1, -0.9]), np.array([0.1, 1.0, 0.3])
+    nearest = q0 / np.linalg.norm(q0)
     slope = jax.jit(jax.jacfwd(lambda q: dvi.project(SPHERE, q, p0).q))(q0)
     length = np.linalg.norm(q0)
     assert np.max(np.abs(slope - (np.eye(3) - np.outer(nearest, nearest)) / length)) < 1e-14
@@ -363,6 +369,7 @@ def test_states_between_steps_lie_on_the_manifold():
     assert np.array_equal(sol.qs[0], Q)
 
 
+@slow
 def test_steps_are_compiled_by_lanewise():
     chain = systems.chain(20)
 

@@ -220,9 +220,7 @@ def discover_invariants(
     )
 
 
-def _at_larger(
-    stepped: Stepped, changes: Changes, samples: Samples, order: int
-) -> tuple[Larger, ...]:
+def _at_larger(stepped: Stepped, changes, samples: Samples, order: int) -> tuple[Larger, ...]:
     """How many are conserved at a larger step and, at order 0, in a larger box."""
     h = float(stepped.h)
 
