@@ -31,11 +31,13 @@ _OWN, _LARGEST = 4096, 64
 def gradient(equations: Equations, q: State) -> Array:
     """G = ∂g/∂q, shape (m, n) for n components of q."""
     value, pull = jax.vjp(equations.constraint, q)
+    # Not jnp.eye: zeros of the structure stay zeros in generated code.
     return jax.vmap(lambda e: pull(e)[0].ravel())(lanewise.unit_vectors(value.size, q.dtype))
 
 
 def velocity_at(equations: Equations, t: Scalar, q: State) -> Callable[[State], State]:
     """p → ∂H/∂p(t, q, p), the velocity."""
+    # H is H_D on the diagonal t0 = t1, as for the methods of Gauss and Lobatto.
     return partial(equations.position_rate, Interval(t, t, jnp.zeros_like(t)), q)
 
 
@@ -64,6 +66,7 @@ class Linear(NamedTuple):
 
 def own_coupling(G: Array, velocity: Callable[[State], State], p: State) -> Array:
     """The diagonal of G (∂v/∂p) Gᵀ, shape (m,)."""
+    # Fewer operations than for the whole matrix, which no step needs at its start.
     push = jax.linearize(velocity, p)[1]
     return jax.vmap(lambda row: row @ push(row.reshape(p.shape)).ravel())(G)
 
@@ -158,6 +161,7 @@ def check_start(equations: Equations, t: Scalar, q: State, p: State) -> None:
 
 def _require_independent(found: _Defects) -> None:
     if not found.is_independent:
+        # In NumPy: a rank needs singular values, which generated code does not have.
         G, count = np.asarray(found.G), len(found.g)
         lengths = np.linalg.norm(G, axis=1, keepdims=True)
         rows = G / np.where(lengths > 0, lengths, 1)
@@ -230,6 +234,7 @@ def _projected(equations: Equations, t: Scalar, q0: State, p0: State):
 
     def residual(x):
         q, nu = x[:n].reshape(q0.shape), x[n:]
+        # Stationarity of |q − q0|²/2 + ν·g: q − q0 is normal to the manifold at q, not at q0.
         moved = x[:n] - q0.ravel() + nu @ gradient(equations, q)
         return jnp.concatenate([moved, equations.constraint(q)])
 
@@ -238,6 +243,7 @@ def _projected(equations: Equations, t: Scalar, q0: State, p0: State):
     q = x[:n].reshape(q0.shape)
     p, of_p = tangent(equations, t, q, p0)
     converged = of_q.converged & of_p.converged & jnp.all(jnp.isfinite(p))
+    # A factor and not jnp.where(…, x, nan), of which the derivative would be 0 and not NaN.
     q, p = (x * jnp.where(converged, 1.0, jnp.nan).astype(x.dtype) for x in (q, p))
     distances = (jnp.sqrt(jnp.sum(x * x)) for x in (q - q0, p - p0))
     return Projection(q, p, *distances), before, converged

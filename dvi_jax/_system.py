@@ -188,6 +188,7 @@ class System(eqx.Module):
                 f"array of shape {out.shape}, dtype {out.dtype}. {hint}".rstrip()
             )
         if self.constraint is not None:
+            # A scalar is refused too: one component needs an axis as several do.
             out = _traced_output(self.constraint, "constraint", kinds, (q, args))
             if len(out.shape) != 1 or 0 in out.shape or not jnp.issubdtype(out.dtype, jnp.floating):
                 raise ValueError(

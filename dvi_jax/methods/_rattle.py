@@ -27,7 +27,8 @@ class Rattle(Method):
     orders ``dvi.Yoshida(4, base=dvi.Rattle())`` and the other compositions. No other method takes a
     constrained system.
 
-    For a separable H_D the step solves for the m multipliers, otherwise for p½ and q1 too.
+    For a separable H_D the step solves for the m multipliers, otherwise for p½ and q1 too. H_D must
+    be defined for t1 = t0, where ∂H/∂p is taken; results of `from_lagrangian` are not.
 
     **Raises** `ValueError` (in `integrate`) for a system without constraint, an inconsistent start,
     redundant constraints. The status reports a step whose multipliers are not found.
@@ -46,6 +47,7 @@ class Rattle(Method):
         return True
 
     def step(self, equations, interval, q0, p0):
+        # Both halves as in `Strang`, the second one as the inverse of a step backwards.
         h, m = interval.h, equations.constraint(q0).size
         first, second = interval.part(0.0, 0.5), interval.part(0.5, 1.0).reversed()
         linear = Linear.at(equations, q0)
@@ -72,6 +74,7 @@ class Rattle(Method):
 
         q, p = equations.absolute(q0, p0)
         reach = jnp.where(still, 0, jnp.abs(q / divisor)) + jnp.abs(velocity(p0))
+        # Round-off of g(q1)/h: that of the terms of G q1, over h, and that of the velocity itself.
         zero, scale = jnp.zeros(m, q0.dtype), jnp.abs(G) @ reach.ravel()
         if _is_separable(equations, first, second, q0, p0):
             at, info = find_root(
@@ -79,7 +82,8 @@ class Rattle(Method):
             )
             p_half, v = moved(at, p0, q0)
         else:
-
+            # One iteration for everything. p½ is taken out of the equation for q1, and q1 out of
+            # that for z, so that the Jacobian in z is not singular.
             def split(x):
                 return x[:m], *(y.reshape(q0.shape) for y in jnp.split(x[m:], 2))
 
@@ -94,6 +98,7 @@ class Rattle(Method):
             known = jnp.concatenate([scale, p.ravel(), q.ravel()])
             at, info = find_root(residual, guess, known, equations.newton)
             p_half, v = moved(*split(at))
+        # The position after the last correction, for which g has been evaluated.
         q1 = q0 + h * v
         p1 = p_half + h / 2 * equations.momentum_rate(second, q1, p_half)
         p1, of_p = tangent(equations, interval.t1, q1, p1)
