@@ -570,7 +570,8 @@ def test_an_observable_in_slow_time_asks_for_epsilon():
 def test_a_run_file_names_it(name, tmp_path):
     made = problem(name)
     path = tmp_path / "run.toml"
-    text = f'system = "{name}"\nsteps = 5\n[output]\nplots = false\n'
+    method = "Yoshida(4, base=Rattle())" if name in CONSTRAINED else "TypeII"
+    text = f'system = "{name}"\nmethod = "{method}"\nsteps = 5\n[output]\nplots = false\n'
     path.write_text(text + f'dir = "{(tmp_path / "out").as_posix()}"\n', encoding="utf-8")
     report = json.loads((run_file(path).folder / "report.json").read_text(encoding="utf-8"))
     assert report["status"]["result"] == "successful"
