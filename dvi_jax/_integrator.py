@@ -72,25 +72,22 @@ class Integrator(eqx.Module):
         """The method, or the default for this system. **Raises** `ValueError` for options that do
         not fit a constraint, or its absence."""
         method = default_method(system) if self.method is None else self.method
-        if method.needs_constraint() != (system.constraint is not None):
+        constrained = system.constraint is not None
+        if method.needs_constraint() != constrained:
             raise ValueError(
                 "a system with a constraint needs method=dvi.Rattle(), or a composition of it such "
                 f"as dvi.Yoshida(4, base=dvi.Rattle()), got {method!r}."
-                if system.constraint is not None
+                if constrained
                 else f"method={method!r} needs a constraint, but the system has none: use "
                 "dvi.System(H_D, constraint=g), or another method such as dvi.Strang()."
             )
-        if system.constraint is not None:
-            for name, kinds in (
-                ("lattice", (Uniform, Given)),
-                ("arithmetic", (FloatingPoint, Compensated)),
-            ):
-                value = getattr(self, name)
-                if type(value) not in kinds:  # `TimeTransformed` is a `Uniform` of other equations
-                    names = " or ".join(f"dvi.{kind.__name__}" for kind in kinds)
-                    raise ValueError(
-                        f"a system with a constraint needs {name}={names}, got {value!r:.200}."
-                    )
+        # By type: `TimeTransformed` is a `Uniform` that takes other equations.
+        plain = {"lattice": (Uniform, Given), "arithmetic": (FloatingPoint, Compensated)}
+        for name, kinds in plain.items() if constrained else ():
+            if type(value := getattr(self, name)) not in kinds:
+                names = " or ".join(f"dvi.{kind.__name__}" for kind in kinds)
+                seen = f"{value!r:.200}"
+                raise ValueError(f"a system with a constraint needs {name}={names}, got {seen}.")
         return method
 
 

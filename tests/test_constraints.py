@@ -56,7 +56,7 @@ OTHERS = {
     "nonlinear velocity": dvi.System(relativistic, constraint=unit_sphere),
     "H_D of order 2": dvi.System(dvi.discretise(curved, order=2), constraint=unit_sphere),
 }
-NAMED = ["not separable", "nonlinear velocity", pytest.param("H_D of order 2", marks=slow)]
+NAMED = ["not separable", *(pytest.param(name, marks=slow) for name in list(OTHERS)[1:])]
 START = np.array([0.6, 0.0, -0.8]), np.array([0.4, 0.5, 0.3])
 
 

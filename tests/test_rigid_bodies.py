@@ -73,6 +73,7 @@ def free_body():
                       constraint=rigid.orthonormal)  # fmt: skip
 
 
+@slow
 def test_a_free_body_moves_as_in_the_variables_of_andoyer():
     known = systems.rigid_body()
     from dvi_jax.systems.rigid_body import body_momentum, orientation

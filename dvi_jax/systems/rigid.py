@@ -67,16 +67,16 @@ def euler_angles(R: Array) -> Array:
 def quaternion(R: Array) -> Array:
     """The unit quaternion (w, x, y, z), w ≥ 0, of rotation matrices of shape (…, 3, 3)."""
     R = jnp.moveaxis(jnp.asarray(R), (-2, -1), (0, 1))
-    K = [[None] * 4 for _ in range(4)]  # 4 a aᵀ of the quaternion a
+    K: list[list[Any]] = [[None] * 4 for _ in range(4)]  # 4 a aᵀ of the quaternion a
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
         K[0][i + 1] = K[i + 1][0] = R[k, j] - R[j, k]
         K[j + 1][k + 1] = K[k + 1][j + 1] = R[j, k] + R[k, j]
         K[i + 1][i + 1] = 1 + R[i, i] - R[j, j] - R[k, k]
     K[0][0] = 1 + R[0, 0] + R[1, 1] + R[2, 2]
-    K = jnp.stack([jnp.stack(row, -1) for row in K], -2)
+    rows = jnp.stack([jnp.stack(row, -1) for row in K], -2)
     # The row of the largest component, which is at least 1/2: no digits cancel.
-    largest = jnp.argmax(jnp.diagonal(K, axis1=-2, axis2=-1), axis=-1)
-    row = jnp.take_along_axis(K, largest[..., None, None], axis=-2)[..., 0, :]
+    largest = jnp.argmax(jnp.diagonal(rows, axis1=-2, axis2=-1), axis=-1)
+    row = jnp.take_along_axis(rows, largest[..., None, None], axis=-2)[..., 0, :]
     a = row / jnp.linalg.norm(row, axis=-1, keepdims=True)
     return jnp.where(a[..., :1] < 0, -a, a)

@@ -117,15 +117,10 @@ def heavy_top(kind: Literal["lagrange", "kovalevskaya"] = "lagrange") -> Problem
     )
 
 
-def pointing(t, q, args):
-    """u = Rᵀe_r(t), the direction from the centre of attraction on the body's axes."""
-    angle = args["omega"] * t
-    return jnp.cos(angle) * q[0] + jnp.sin(angle) * q[1]
-
-
 def _satellite_energy(t0, t1, q0, p1, args):
-    """H_D = tr(p1 D⁻¹ p1ᵀ)/2 − (3ω²/2) Σ d_k u_k², u of `pointing`."""
-    u, d = pointing(t0, q0, args), rigid.second_moments(args["I"])
+    """H_D = tr(p1 D⁻¹ p1ᵀ)/2 − (3ω²/2) Σ d_k u_k², u = Rᵀe_r(t0) from the centre of attraction."""
+    angle, d = args["omega"] * t0, rigid.second_moments(args["I"])
+    u = jnp.cos(angle) * q0[0] + jnp.sin(angle) * q0[1]
     return rigid.rotational_energy(p1, args["I"]) - 1.5 * args["omega"] ** 2 * jnp.sum(d * u**2)
 
 
@@ -133,11 +128,6 @@ def jacobi_integral(t0, t1, q0, p0, q1, p1, args):
     """H − ω (Rπ)_z at t1: the energy in the frame that turns with the orbit."""
     spin = rigid.body_momentum(q1, p1) @ q1[2]
     return _satellite_energy(t1, t1, q1, p1, args) - args["omega"] * spin
-
-
-def direction(t0, t1, q0, p0, q1, p1, args):
-    """u at t1: see `pointing`."""
-    return pointing(t1, q1, args)
 
 
 def satellite() -> Problem:
@@ -163,7 +153,7 @@ def satellite() -> Problem:
             "I": Parameter(I, "principal moments of inertia [mass length²]", _moments),
             "omega": Parameter(1.0, "angular velocity of the orbit [1/time]"),
         },
-        observables=[jacobi_integral, body_momentum, direction],
+        observables=[jacobi_integral, body_momentum],
         source="Hughes 1986, Spacecraft Attitude Dynamics, 9",
         invariants=("jacobi_integral",),
         autonomous=False,
