@@ -4,6 +4,7 @@ The long tests print what they measure: ``pytest tests/test_constraints.py -m sl
 """
 
 import functools
+import time
 
 import jax
 import jax.numpy as jnp
@@ -491,7 +492,7 @@ def test_a_million_steps_stay_on_the_manifold_without_drift(name):
     trends = {key: dvi.Trend(f) for key, f in watched.items()}
     ranges = {key: dvi.Range(f) for key, f in watched.items()}
     largest = dvi.MaxDrift(violation(made))
-    count, time = 10**6, 10**6 * made.h
+    count, duration = 10**6, 10**6 * made.h
     sol = run(made, count, observe=(largest, trends, ranges))
     assert sol.status == "successful"
     q = jnp.asarray(made.q0)
@@ -502,10 +503,33 @@ def test_a_million_steps_stay_on_the_manifold_without_drift(name):
     for key in watched:
         size = np.max(np.abs(first[key]))
         slope, width = (np.max(np.abs(x[key])) for x in sol.observed[1:])
-        drift = slope * time
+        drift = slope * duration
         print(f"; {key}: width {width / size:.1e}, drift {drift / size:.1e}", end="")
         if key == "energy":
             assert drift < 0.02 * width  # it oscillates with h²
         else:
             assert width < 1e-11 * size
     print()
+
+
+@slow
+def test_a_step_takes_microseconds():
+    """Processor time of one thread; one trajectory, and one of a batch of 256."""
+    lanewise.set_threads(1)
+    try:
+        for name in ("spherical_pendulum", "slider_crank", "heavy_top", "chain"):
+            made = systems.LIBRARY[name]()
+            q, p = (jnp.broadcast_to(x, (256, *x.shape)) for x in (made.q0, made.p0))
+            batch = jax.jit(jax.vmap(lambda q, p, made=made: run(made, 200, q0=q, p0=p).qs[-1]))
+            alone, together = [], []
+            for _ in range(3):  # the first time with compilation
+                began = time.process_time()
+                jax.block_until_ready(run(made, 20_000).qs)
+                middle = time.process_time()
+                jax.block_until_ready(batch(q, p))
+                alone.append((middle - began) / 20_000 * 1e6)
+                together.append((time.process_time() - middle) / 200 / 256 * 1e6)
+            print(f"{name}: {min(alone):.2f} µs per step, {min(together):.3f} µs in a batch")
+            assert min(together) < min(alone) < 20
+    finally:
+        lanewise.set_threads(0)
