@@ -23,6 +23,7 @@ from ._arithmetic import (
     FixedPoint as FixedPoint,
     FloatingPoint as FloatingPoint,
 )
+from ._constraint import Projection as Projection, project as project
 from ._discretise import discretise as discretise
 from ._energies import incoming_energy as incoming_energy, outgoing_energy as outgoing_energy
 from ._implicit import Implicit as Implicit
@@ -62,6 +63,7 @@ from .methods import (
     LobattoIIIAIIIB as LobattoIIIAIIIB,
     McLachlan as McLachlan,
     Method as Method,
+    Rattle as Rattle,
     RungeKutta4 as RungeKutta4,
     Splitting as Splitting,
     StochasticEuler as StochasticEuler,
@@ -82,6 +84,7 @@ from .observe import (
     GALI as GALI,
     MEGNO as MEGNO,
     SALI as SALI,
+    ConstraintForce as ConstraintForce,
     Crossings as Crossings,
     Deviations as Deviations,
     Last as Last,

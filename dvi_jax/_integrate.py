@@ -20,6 +20,7 @@ from lanewise.jaxapi import is_traced, manual_axes
 from ._adjoints import AbstractAdjoint
 from ._arithmetic import Arithmetic
 from ._checks import instance, refuse_unknown
+from ._constraint import check_start
 from ._dense import Curve, at_times, crossings, requested_times, stopped
 from ._inputs import as_parameter, as_scalar, start_state
 from ._integrator import Integrator, chosen
@@ -199,6 +200,8 @@ def integrate(
     # The warning needs the damping as a number, which is not known of traced values.
     if not traced:
         type(method).check(method, task.equations, task.first_interval(), q0, p0)
+    if not traced and asked.system.constraint is not None:
+        check_start(task.equations, task.t0, q0, p0)
     if not traced and asked.system.force is not None:
         warn_of_dissipation(method, task.equations, task.first_interval, q0, p0)
     if save.ts is not None:

@@ -7,7 +7,7 @@ import equinox as eqx
 from lanewise import Layout
 
 from ._adjoints import AbstractAdjoint
-from ._arithmetic import Arithmetic, FloatingPoint
+from ._arithmetic import Arithmetic, Compensated, FloatingPoint
 from ._checks import instance
 from ._discretise import is_first_order
 from ._reversible import Reversible
@@ -16,8 +16,8 @@ from ._system import System
 from .engine.names import both_names
 from .engine.newton import RootSolver
 from .engine.picard import PicardThenNewton
-from .lattices import Lattice, Uniform
-from .methods import Method, Splitting, Strang, TypeII, as_method
+from .lattices import Given, Lattice, Uniform
+from .methods import Method, Rattle, Splitting, Strang, TypeII, as_method
 
 
 @both_names
@@ -25,7 +25,8 @@ class Integrator(eqx.Module):
     """The options of an integration: the keywords of `integrate` that are not the problem itself.
 
     - `method`: see `integrate`. None: the map that the user wrote, `TypeII()`; for a system with
-      `discretise(H, order=1)`, whose map has order one, `Strang()`; with a `Split`, `Splitting()`.
+      `discretise(H, order=1)`, whose map has order one, `Strang()`; with a `Split`, `Splitting()`;
+      with a constraint, `Rattle()`.
     - `root_finder`: the solver of implicit steps. Here, and in every function that takes one of the
       two names, `newton` is another name of it; both at once raise a `TypeError`.
     - `lattice`: the time grid. `arithmetic`: the representation of the state.
@@ -70,8 +71,26 @@ class Integrator(eqx.Module):
         return self.root_finder
 
     def method_for(self, system: System) -> Method:
-        """The method, or the default for this system."""
-        return default_method(system) if self.method is None else self.method
+        """The method, or the default for this system. **Raises** `ValueError` for options that do
+        not fit a constraint, or its absence."""
+        method = default_method(system) if self.method is None else self.method
+        constrained = system.constraint is not None
+        if method.needs_constraint() != constrained:
+            raise ValueError(
+                "a system with a constraint needs method=dvi.Rattle(), or a composition of it such "
+                f"as dvi.Yoshida(4, base=dvi.Rattle()), got {method!r}."
+                if constrained
+                else f"method={method!r} needs a constraint, but the system has none: use "
+                "dvi.System(H_D, constraint=g), or another method such as dvi.Strang()."
+            )
+        # By type: `TimeTransformed` is a `Uniform` that takes other equations.
+        plain = {"lattice": (Uniform, Given), "arithmetic": (FloatingPoint, Compensated)}
+        for name, kinds in plain.items() if constrained else ():
+            if type(value := getattr(self, name)) not in kinds:
+                names = " or ".join(f"dvi.{kind.__name__}" for kind in kinds)
+                seen = f"{value!r:.200}"
+                raise ValueError(f"a system with a constraint needs {name}={names}, got {seen}.")
+        return method
 
 
 _FIELDS = {
@@ -96,6 +115,8 @@ _DEFAULT = Integrator()
 
 def default_method(system: System) -> Method:
     """The method of a run without `method`."""
+    if system.constraint is not None:
+        return Rattle()
     # A map of order one that `discretise` made was not chosen by the user, and Strang's composition
     # of it has order two. A map that the user wrote stays as it is.
     if isinstance(system.H_D, Split):

@@ -63,6 +63,17 @@ class RESULTS(eqx.Enumeration):
         "p. Try a smaller h, or lattice=dvi.TimeTransformed(g)."
     )
 
+    inconsistent = (
+        "The initial state does not satisfy the constraint g(q, args) = 0, or its velocity is not "
+        "along it, (∂g/∂q) ∂H/∂p = 0. dvi.project(system, q0, p0) computes the nearest state that "
+        "does."
+    )
+    redundant = (
+        "The components of the constraint are not independent at the initial state: the rank of "
+        "∂g/∂q is less than their number, so that the forces of constraint are not determined. "
+        "Leave out the components that follow from the others."
+    )
+
 
 # In the order of the class, which numbers them. A new status goes to the end: stores have numbers.
 STATUS_NAMES = (
@@ -75,6 +86,8 @@ STATUS_NAMES = (
     "stopped",
     "not_reached",
     "step_control_failed",
+    "inconsistent",
+    "redundant",
 )
 
 

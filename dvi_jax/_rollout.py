@@ -11,6 +11,7 @@ from jaxtyping import Array, Int
 
 import lanewise
 
+from ._constraint import start_status
 from ._plan import (
     Plan as Plan,
     adds_start_outside as adds_start_outside,
@@ -44,6 +45,9 @@ def start(task: Task, q0: State, p0: State) -> Carry:
     result = RESULTS.where(finite, RESULTS.successful, RESULTS.not_finite)
     usable = task.lattice.is_usable(task.t0, task.h)
     result = RESULTS.where(usable, result, RESULTS.bad_step_size)
+    # Known values have been checked with an error of their own; traced ones have a status only.
+    if task.equations.system.constraint is not None:
+        result = first_failure(result, start_status(task.equations, task.t0, q0, p0))
     interval = task.first_interval()
 
     def memory(reduction):

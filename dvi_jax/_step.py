@@ -92,6 +92,11 @@ class Equations(eqx.Module):
         at = (self.system, *interval[:2], *self.absolute(q, p), self.epsilon, self.args)
         return _rates(*at)
 
+    def constraint(self, q: State) -> Array:
+        """g(q, args) of a constrained system, shape (m,)."""
+        q, _ = self.absolute(q, jnp.zeros_like(q))
+        return self.system.constraint(q, self.args).astype(q.dtype)  # pyright: ignore
+
     def step_is_explicit(self, interval: Interval, like: State) -> bool:
         """Whether p1 enters neither ∂H_D/∂q0 nor W, so that (13) needs no solve."""
         # Read from the jaxpr: a value-dependent test could not run under jit.

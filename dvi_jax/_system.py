@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from ._checks import finite, instance
-from ._types import Args, ForceFn, HamiltonianFn, Scalar, State
+from ._types import Args, ConstraintFn, ForceFn, HamiltonianFn, Scalar, State
 from .engine.indices import out_of_bounds
 from .engine.reads import Reads, changed, reads
 from .engine.signature import accepts, check_takes, tracing_note, warn_of_exchanged
@@ -42,6 +42,9 @@ class System(eqx.Module):
       Stratonovich.
     - `epsilon`: strength of the perturbation in runs without ``epsilon=``. None: each run of a
       system with a force, a perturbation or a slow time must give it. Systems of the library: 0.
+    - `constraint`: g, function ``(q, args)`` → array of m numbers that are all zero for the
+      positions allowed; or None. `Rattle` and its compositions take such a system; see also
+      `project` for initial conditions and `ConstraintForce`.
 
     q0 and p1 are arrays of one shape, the one given to `integrate`. `args` is any pytree; its
     arrays and floats are differentiable.
@@ -74,6 +77,7 @@ class System(eqx.Module):
     slow_time: bool = eqx.field(static=True, default=False)
     epsilon: float | None = eqx.field(static=True, default=None)
     noise: Noise | None = None
+    constraint: ConstraintFn | None = None
     reads: Reads = eqx.field(static=True, init=False, repr=False)
 
     def __post_init__(self):
@@ -94,6 +98,8 @@ class System(eqx.Module):
                 check_takes(name, function, _NAMES, {4: _CONTINUOUS})
             if function is not None:
                 warn_of_exchanged(name, function, _NAMES)
+        if self.constraint is not None:
+            check_takes("constraint", self.constraint, "(q, args)")
         instance("slow_time", self.slow_time, bool, "True or False")
         if self.epsilon is not None:
             finite("epsilon of a System", self.epsilon)
@@ -188,11 +194,20 @@ class System(eqx.Module):
                 f"{name}{_NAMES} must return {expected}; for q0 of shape {q.shape} it returned an "
                 f"array of shape {out.shape}, dtype {out.dtype}. {hint}".rstrip()
             )
+        if self.constraint is not None:
+            # A scalar is refused too: one component needs an axis as several do.
+            out = _traced_output(self.constraint, "constraint", kinds, (q, args))
+            if len(out.shape) != 1 or 0 in out.shape or not jnp.issubdtype(out.dtype, jnp.floating):
+                raise ValueError(
+                    "constraint(q, args) must return a real array of shape (m,), one number for "
+                    f"each of its m ≥ 1 conditions; for q of shape {q.shape} it returned an array "
+                    f"of shape {out.shape}, dtype {out.dtype}. Use jnp.stack([...]) or jnp.ravel."
+                )
 
 
 def _read_by(system: System) -> Reads:
     of_noise = [] if system.noise is None else system.noise.functions
-    functions = (system.H_D, system.force, system.perturbation, *of_noise)
+    functions = (system.H_D, system.force, system.perturbation, system.constraint, *of_noise)
     # A counter of calls, for instance, changes with every trace, and no program depends on it.
     ignored = {name for f in functions for name in _changed_by_tracing(f)}
     return tuple(item for item in reads(*functions) if item[0] not in ignored)
@@ -220,9 +235,10 @@ def of_problem(
     return system, q0, p0, h, args
 
 
-def check_system(system: Any, noise_allowed: bool = False) -> None:
+def check_system(system: Any, of_map: str = "", noise_allowed: bool = False) -> None:
     """**Raises** `TypeError` for an object that is not a `System`, `ValueError` for a system whose
-    functions read a value that has changed since it was made, or for one with noise."""
+    functions read a value that has changed since it was made, for one with noise, and for a
+    constraint if `of_map` is the name of a function that examines the map (12)–(13) itself."""
     if not isinstance(system, System):
         hint = "Wrap the discrete Hamiltonian H_D(t0, t1, q0, p1, args) in it: dvi.System(H_D)."
         if isinstance(getattr(system, "system", None), System):
@@ -238,6 +254,12 @@ def check_system(system: Any, noise_allowed: bool = False) -> None:
         raise ValueError(
             "the system has noise, which this function does not support: give it the same system "
             "without noise=. dvi.integrate, dvi.sweep and dvi.invariant_diffusion support noise."
+        )
+    if of_map and system.constraint is not None:
+        raise ValueError(
+            f"{of_map} examines the map (12)–(13) of a system without constraint, but this system "
+            "has one. Use coordinates without constraint; dvi.discover_invariants and "
+            "dvi.drift_order take constrained systems."
         )
     # Programs that are compiled already would compute with the old value.
     now = _read_by(system)
@@ -267,7 +289,8 @@ def _changed_by_tracing(function: Callable | None) -> frozenset[str]:
 def _traced_output(
     function: Callable, name: str, kinds: tuple, at: tuple[Any, ...]
 ) -> jax.ShapeDtypeStruct:
-    q, args = at[2], at[4]
+    q, args = (at[2], at[4]) if len(at) > 2 else at
+    names = _NAMES if len(at) > 2 else "(q, args)"
     try:
         seen = _SEEN.setdefault(function, {})
         if kinds in seen:
@@ -279,7 +302,7 @@ def _traced_output(
     try:
         traced, *out = eqx.filter_make_jaxpr(function)(*at)
     except Exception as error:
-        error.add_note(f"(in {name}{_NAMES}, called with q0 of shape {q.shape} and args={args!r})")
+        error.add_note(f"(in {name}{names}, called with q0 of shape {q.shape} and args={args!r})")
         error.add_note(tracing_note(name, error))
         if q.ndim > 1:
             error.add_note(
@@ -290,7 +313,7 @@ def _traced_output(
     # JAX moves such an index to the end of the array, so that the result would be wrong silently.
     for index, size in out_of_bounds(traced):
         raise IndexError(
-            f"{name}{_NAMES} must use indices inside its arrays, but the index {index} is out of "
+            f"{name}{names} must use indices inside its arrays, but the index {index} is out of "
             f"bounds for an axis of length {size}. q0 and p1 have the shape {q.shape}. Correct the "
             "index, or the shape of the array."
         )
@@ -306,5 +329,5 @@ def _traced_output(
             return seen.setdefault(kinds, jax.ShapeDtypeStruct((), jnp.result_type(float)))
         got = "None (is a return missing?)" if out is None else f"type {type(out).__name__}"
         wanted = f"an array of shape {q.shape}, that of q0" if name == "force" else "a real scalar"
-        raise TypeError(f"{name}{_NAMES} must return {wanted}, got {got}.")
+        raise TypeError(f"{name}{names} must return {wanted}, got {got}.")
     return seen.setdefault(kinds, jax.ShapeDtypeStruct(out.shape, out.dtype))

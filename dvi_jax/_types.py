@@ -16,6 +16,10 @@ ForceFn: TypeAlias = Callable[..., Any]
 """``W(t0, t1, q0, p1, args)`` → like q0, units of force."""
 
 
+ConstraintFn: TypeAlias = Callable[..., Any]
+"""``g(q, args)`` → shape (m,), zero for the positions allowed."""
+
+
 class Interval(NamedTuple):
     """One interval of the time grid: its ends and its length."""
 

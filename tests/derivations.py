@@ -330,6 +330,67 @@ def spinning_top(t, q, A, C, w, **_):
     return (A * (one**2 + two**2) + C * three**2) / 2 - w * R[2, 2]
 
 
+# With constraints: without their forces, as H alone gives them
+
+
+def weights(t, q, p, args, epsilon):
+    """Free fall of equal masses along the last coordinate."""
+    fall = np.zeros_like(q)
+    fall[..., -1] = -args["m"] * args["g"]
+    return p / args["m"], fall
+
+
+def slider_crank(t, q, m1, m2, m3, g, **_):
+    """Uniform rods: integrals over their points."""
+    A, B = sp.Matrix(q[:2]), sp.Matrix(q[2:])
+    s = sp.Symbol("s")
+    L = m3 * (moving(B, t) - g * B[1])
+    for mass, point in ((m1, s * A), (m2, A + s * (B - A))):
+        density = moving(point, t) - g * point[1]
+        L += mass * sp.integrate(sp.expand(density), (s, 0, 1))
+    return L
+
+
+def in_shape(shape, rates):
+    """A derivation of vectors, for arrays."""
+
+    def shaped(t, q, p, args, epsilon):
+        return tuple(x.reshape(shape) for x in rates(t, q.ravel(), p.ravel(), args, epsilon))
+
+    return shaped
+
+
+def dumbbell(t, q, p, args, epsilon):
+    m = np.array([[args["m1"]], [args["m2"]]])
+    return p / m, -args["mu"] * m * q / np.linalg.norm(q, axis=1, keepdims=True) ** 3
+
+
+def body(pull):
+    """A body of six point masses on its axes with these moments; `pull`: force on a mass."""
+
+    def rates(t, q, p, args, epsilon):
+        I1, I2, I3 = args["I"]
+        d = np.array([I2 + I3 - I1, I3 + I1 - I2, I1 + I2 - I3]) / 2
+        force = np.zeros((3, 3))
+        for k, sign in ((k, s) for k in range(3) for s in (-1, 1)):
+            X = sign * np.eye(3)[k]  # unit distance: the mass is d_k/2
+            force += np.outer(d[k] / 2 * pull(t, q @ X, args), X)
+        return p / d, force
+
+    return rates
+
+
+def in_orbit(t, x, args):
+    """The part of the gravity gradient along the radius."""
+    e = np.array([np.cos(args["omega"] * t), np.sin(args["omega"] * t), 0])
+    return 3 * args["omega"] ** 2 * e * (e @ x)
+
+
+def heavy_top(t, q, p, args, epsilon):
+    rate, _ = body(lambda t, x, args: np.zeros(3))(t, q, p, args, epsilon)
+    return rate, np.outer([0.0, 0.0, -1.0], args["c"])  # a weight of one at the point c
+
+
 # Others
 
 
@@ -395,6 +456,12 @@ DERIVATIONS = {
     "dipole_field": lorentz(dipole_potential, dipole_field),
     "rigid_body": rigid_body,
     "spinning_top": lagrangian(3, spinning_top, ("A", "C", "w")),
+    "spherical_pendulum": weights,
+    "chain": weights,
+    "slider_crank": in_shape((2, 2), lagrangian(4, slider_crank, ("m1", "m2", "m3", "g"))),
+    "dumbbell": dumbbell,
+    "heavy_top": heavy_top,
+    "satellite": body(in_orbit),
     "polar_motion": polar_motion,
     "lotka_volterra": lotka_volterra,
 }

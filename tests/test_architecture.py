@@ -22,7 +22,9 @@ FLOORS = [
     ["flows"],
     ["_split"],
     ["_system", "_solution"],
-    ["_discretise", "_adapters", "_implicit", "_energies", "_step", "_plan", "observe"],
+    ["_discretise", "_adapters", "_implicit", "_energies", "_step", "_plan"],
+    ["_constraint"],
+    ["observe"],
     ["methods", "lattices"],
     ["_arithmetic"],
     ["_task"],
@@ -246,6 +248,7 @@ legendre from_lagrangian from_type_iii velocity_force Implicit
 Layout configure_cpu over_threads over_devices
 TypeII Adjoint Strang Yoshida Suzuki BlanesMoan McLachlan KahanLi Composition
 GaussLegendre LobattoIIIAIIIB RungeKutta4 Split Splitting WisdomHolman
+Rattle project Projection ConstraintForce
 Uniform Given AdaptiveReversible TimeTransformed Variational
 FloatingPoint Compensated DoubleDouble FixedPoint
 Section Stop Crossings LatticeCondition

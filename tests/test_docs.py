@@ -524,7 +524,7 @@ def test_what_is_wrong_with_a_page_is_seen(site, serve, page, tmp_path):
         ("plasma", "faq"),
         ("neural network", "faq"),
         ("cite", "faq"),
-        ("constraints", "faq"),
+        ("constraints", "constraints"),
         ("CUDA", "gpu"),
         ("friction", "which-method"),
         ("non-separable", "which-method"),

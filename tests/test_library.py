@@ -35,6 +35,8 @@ ALIKE = {"figure_eight", "pythagorean", "outer_solar_system", "solar_system"}
 ALIKE |= {"perturbed_pendulum", "lorentz_pendulum", "van_der_pol"}
 """Those with functions of another system."""
 MOST = set(NAMES) - ALIKE
+CONSTRAINED = {"spherical_pendulum", "chain", "slider_crank", "dumbbell", "heavy_top", "satellite"}
+"""Those with a constraint, whose forces are added to the flow, and whose method is `Rattle`."""
 slow = pytest.mark.slow
 
 
@@ -121,6 +123,14 @@ def flow(name):
     """Times and states of 200 steps of the default size by SciPy's DOP853, 1e-13 per step."""
     made, rates = problem(name), functions(name)
     q0, p0 = start(name)
+    if name in CONSTRAINED:
+        free, force = rates, dvi.ConstraintForce().bind(made.system, 0.0)
+
+        @jax.jit
+        def rates(t, q, p, epsilon, args):
+            q, p = jnp.asarray(q), jnp.asarray(p)
+            v, push = free(t, q, p, epsilon, args)
+            return v, push + force(t, jnp.asarray(t), q, p, q, p, args)
 
     def field(t, z):
         q, p = z.reshape(2, *q0.shape)
@@ -225,7 +235,8 @@ def two_runs(name):
 
     @jax.jit
     def run(h):
-        options = {"method": dvi.GaussLegendre(2), "observe": dict(made.observables)}
+        method = RATTLE4 if name in CONSTRAINED else dvi.GaussLegendre(2)
+        options = {"method": method, "observe": dict(made.observables)}
         options |= {"epsilon": made.exact_epsilon, "adjoint": dvi.Direct()}  # compiled soonest
         sol = run_problem(made, steps, h=h, **options)
         return sol.ts, sol.qs, sol.ps, sol.observed
@@ -239,6 +250,7 @@ def two_runs(name):
     return ts[: half + 1], first, second
 
 
+RATTLE4 = dvi.Yoshida(4, base=dvi.Rattle())
 STRETCH = {"rigid_body": 8.0, "solar_system": 32.0, "polar_motion": 30.0}
 """Steps that are large enough for an error to be seen, in default steps; 2 elsewhere."""
 
@@ -350,8 +362,9 @@ def test_declared_symmetries_solve_the_determining_equations(name):
 
 
 def test_a_system_without_a_declared_symmetry_has_a_reason():
-    """A slowly moved length or a pole that drifts: no shift of time; and no more to shift."""
-    assert set(NAMES) - set(SYMMETRIC) == {"lorentz_pendulum", "polar_motion"}
+    """A slowly moved length or a pole that drifts: no shift of time; and no more to shift. With a
+    constraint: symmetries are those of the type II map."""
+    assert set(NAMES) - set(SYMMETRIC) == {"lorentz_pendulum", "polar_motion", *CONSTRAINED}
 
 
 # 4. Defaults
@@ -443,6 +456,8 @@ POSITIVE, NO_GYRATION = "must be a positive.*got ", "must not be zero, got .* no
         ("dipole_field", {"B0": 0.0}, NO_GYRATION),
         ("rigid_body", {"I3": 4.0}, ""),
         ("spinning_top", {"A": math.inf}, POSITIVE + "inf"),
+        ("heavy_top", {"I": [1.0, 1.0, 2.0]}, "must be three positive moments.*smaller than"),
+        ("chain", {"l": 0.0}, POSITIVE + "0.0"),
         ("kepler", {"K": 0.0}, POSITIVE + "0.0"),
         ("magnetic_mirror", {"charge": 0.0}, NO_GYRATION),
         ("magnetic_mirror", {"B0": 0.0}, NO_GYRATION),
@@ -502,6 +517,8 @@ def test_every_parameter_must_be_there_and_be_a_number(name):
         ("magnetic_mirror", {"length": -1.0}, "length must be a positive.*got -1"),
         ("magnetic_mirror", {"distance": np.inf}, "distance must be a finite.*got inf"),
         ("dipole_field", {"radius": 0.0}, "radius must be a positive.*got 0"),
+        ("chain", {"links": 0}, "links must be an integer of at least 1, got 0"),
+        ("heavy_top", {"kind": "euler"}, "kind must be one of 'lagrange', 'kovalevskaya'"),
     ],
 )
 def test_invalid_arguments_of_systems_are_refused(make, options, said):
@@ -554,7 +571,8 @@ def test_an_observable_in_slow_time_asks_for_epsilon():
 def test_a_run_file_names_it(name, tmp_path):
     made = problem(name)
     path = tmp_path / "run.toml"
-    text = f'system = "{name}"\nsteps = 5\n[output]\nplots = false\n'
+    method = "Yoshida(4, base=Rattle())" if name in CONSTRAINED else "TypeII"
+    text = f'system = "{name}"\nmethod = "{method}"\nsteps = 5\n[output]\nplots = false\n'
     path.write_text(text + f'dir = "{(tmp_path / "out").as_posix()}"\n', encoding="utf-8")
     report = json.loads((run_file(path).folder / "report.json").read_text(encoding="utf-8"))
     assert report["status"]["result"] == "successful"

@@ -48,6 +48,7 @@ MODULES = {
     "starts": ("Initial conditions of a sweep", "starts"),
     "systems": ("Library of systems", "systems"),
     "boozer": ("Guiding centres in Boozer coordinates", "systems.boozer"),
+    "rigid": ("Rotations of rigid bodies", "systems.rigid"),
     "plot": ("Plots", "plot"),
     "interop": ("Other packages", "interop"),
 }

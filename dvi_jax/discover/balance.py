@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from lanewise.jaxapi import is_traced
 
 from .._solution import Solution
-from .._system import System
+from .._system import System, check_system
 from .._types import Args
 from .generators import Generator, LatticePoint
 from .noether import AdiabaticInvariant, Gauge, lattice_defect, noether_identity
@@ -82,6 +82,7 @@ def noether_balance(
     # True 0.03
     ```
     """
+    check_system(system, "noether_balance")
     steps = int(jnp.size(solution.ts)) - 1
     if jnp.ndim(solution.ts) != 1 or steps < 2:
         raise ValueError(

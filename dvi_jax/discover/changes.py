@@ -1,5 +1,6 @@
 """What functions change by in one step of a map, at sampled points, order by order in ε."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -13,7 +14,6 @@ from lanewise.dependence import depends_on
 
 from .._results import RESULTS
 from .._step import Equations
-from .._system import System
 from .._types import Interval
 from ..engine.in_pairs import at_points_in_pairs
 from ..engine.pairs import Pair
@@ -44,6 +44,11 @@ class Stepped(NamedTuple):
     h: Any
     method: Method
     basis: BoundBasis
+
+    @property
+    def is_constrained(self) -> bool:
+        """Whether samples lie on the manifold of a constraint."""
+        return self.equations.system.constraint is not None
 
     def unnamed(self) -> "Stepped":
         """For compiled functions: see `BoundBasis.unnamed`."""
@@ -143,7 +148,7 @@ def _map(stepped: Stepped, epsilon: Array) -> Any:
     """(q, p, t) → (q1, p1, t1) and the status, with t the slow time for a system that has one."""
     equations, h, method, _ = stepped
     system, slow = equations.system, equations.system.slow_time
-    plain = System(system.H_D, system.force, system.perturbation)
+    plain = dataclasses.replace(system, slow_time=False)
     here = Equations(plain, epsilon, equations.args, equations.newton)
 
     def step(q, p, t):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._step import Equations
-from .._system import System
+from .._system import System, check_system
 from .._types import Args, Interval, Scalar, State
 from .generators import Generator, LatticePoint, prolong
 
@@ -29,6 +29,7 @@ def discrete_equations(
 
     **Source** the paper, (16) and (23).
     """
+    check_system(system, "discrete_equations")
     (t0, q0, p0), (t1, q1, p1) = _as_points(first, second)
     h = t1 - t0
     interval = Interval(t0, t1, h)

@@ -40,7 +40,7 @@ def powers_of_size(
     """
     if len(coefficients) == 0:
         return np.zeros(0)
-    at, which = enlarged(samples)
+    at, which = enlarged(samples, stepped.is_constrained)
     found = changes_at(stepped, 0, at)
 
     def changes(some):
@@ -52,14 +52,18 @@ def powers_of_size(
     return growth(most, which, found.good, changes)
 
 
-def enlarged(samples: Samples) -> tuple[Samples, np.ndarray]:
+def enlarged(samples: Samples, constrained: bool = False) -> tuple[Samples, np.ndarray]:
     """The samples, each farther from their median, and which of the sizes `_LARGER` it has."""
     which = np.arange(len(samples.q)) % len(_LARGER)
-    return farther(samples, np.array(_LARGER)[which]), which
+    return farther(samples, np.array(_LARGER)[which], constrained), which
 
 
-def farther(samples: Samples, factors: np.ndarray | float) -> Samples:
-    """Samples so many times as far from their median."""
+def farther(samples: Samples, factors: np.ndarray | float, constrained: bool = False) -> Samples:
+    """Samples so many times as far from their median, or `constrained` ones so many times as fast:
+    positions stay on the manifold, and multiples of momenta along it are along it."""
+    if constrained:
+        factors = np.reshape(factors, (-1, *[1] * (samples.p.ndim - 1)))
+        return samples._replace(p=factors * samples.p)
 
     def moved(x):
         centre = np.median(x, axis=0)
@@ -159,6 +163,7 @@ def in_larger_box(
     samples: Samples,
     moved: Callable[[Samples], np.ndarray],
     count: Callable[[Samples], int | None],
+    constrained: bool = False,
 ) -> tuple[Larger, ...]:
     """How many are conserved on samples that spread wider; empty where a map is not nearly linear
     on those given, or linear on all. `moved`: z1 − z of samples."""
@@ -169,10 +174,10 @@ def in_larger_box(
     if near >= _LINEAR:
         factor = min(_CURVED / near, _WIDEST)
     else:
-        far = moved(farther(samples, factor)) / factor
+        far = moved(farther(samples, factor, constrained)) / factor
         if np.isfinite(far).all() and nonlinearity(samples, far) < _LINEAR:
             return ()
-    return (_larger("box", factor, lambda factor: count(farther(samples, factor))),)
+    return (_larger("box", factor, lambda factor: count(farther(samples, factor, constrained))),)
 
 
 def _larger(kind: str, factor: float, count: Callable[[float], int | None]) -> Larger:

@@ -132,7 +132,7 @@ def solve_gauge(
 
     **Source** our own; the identities: the paper, (25) and (28).
     """
-    check_system(system)
+    check_system(system, "solve_gauge")
     samples = as_samples(samples, t0)
     single = isinstance(generators, Generator)
     if single or len(generators) == 0:

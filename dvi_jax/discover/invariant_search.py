@@ -20,6 +20,7 @@ from .energy import unconserved_energy
 from .expansions import Larger, at_larger_step, in_larger_box, powers_of_size
 from .found import Discovery
 from .judging import CLEARLY, Fewest, Judge, cleaned, reach
+from .manifold import on_manifold
 from .motion import UNCLEAR, coefficient_errors, conserved, times, typical_sizes
 from .nullspace import (
     RANK,
@@ -86,7 +87,8 @@ def discover_invariants(
     - `order`: z ≥ 0. `h`: step size [time].
     - `samples`: (qs, ps) at t0, shapes (S, *q.shape), or (qs, ps, ts) with times of shape (S,):
       points of the domain of interest; a quarter is held out. At least twice as many as
-      functions in the basis.
+      functions in the basis. With a constraint: consistent states. Functions that depend there on
+      simpler ones (|γ|² γ₁ on γ₁, for a unit vector γ) are left out of the basis.
     - `tolerance`: for *approximate* invariants: singular values up to that share of the largest
       count as zero. What a method of order r conserves up to O(h^r), such as the energy, has
       singular values and residuals that shrink as h^r. None: only what is below 1e-11.
@@ -144,6 +146,7 @@ def discover_invariants(
     q, p, t = (jnp.asarray(x[0]) for x in samples)
     system.check_shapes(t, q, p, jnp.zeros(()), one_step.args)
     equations = Equations(system, jnp.zeros(()), one_step.args, one_step.root_finder)
+    bound = on_manifold(equations, bound, samples)
     at = middle(samples, max(bound.complexity))
     inner, to_basis = bound.about(at)
     stepped = Stepped(equations, np.asarray(h), one_step.method, inner)
@@ -217,9 +220,7 @@ def discover_invariants(
     )
 
 
-def _at_larger(
-    stepped: Stepped, changes: Changes, samples: Samples, order: int
-) -> tuple[Larger, ...]:
+def _at_larger(stepped: Stepped, changes, samples: Samples, order: int) -> tuple[Larger, ...]:
     """How many are conserved at a larger step and, at order 0, in a larger box."""
     h = float(stepped.h)
 
@@ -237,7 +238,7 @@ def _at_larger(
 
     larger = at_larger_step(h, lambda step: relative_step(samples, moved(samples, step)), count)
     if order == 0:
-        larger += in_larger_box(samples, moved, lambda at: count(h, at))
+        larger += in_larger_box(samples, moved, lambda at: count(h, at), stepped.is_constrained)
     return larger
 
 

@@ -296,7 +296,7 @@ def solution_pairs(
     **Returns** two points with a leading axis of length S. **Raises** `ValueError` for samples
     of unequal shapes or not finite, h = 0, or a step that fails on them.
     """
-    check_system(system)
+    check_system(system, "solution_pairs")
     one_step = map_of("solution_pairs", system, **how)
     samples, h = as_samples(samples, one_step.t0), check_step_size(h)
     equations = Equations(system, jnp.asarray(epsilon, float), one_step.args, one_step.root_finder)

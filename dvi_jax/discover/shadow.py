@@ -15,7 +15,7 @@ from lanewise.jaxapi import is_traced
 
 from .._checks import instance, whole
 from .._precision import refuse_double_without_x64
-from .._system import System
+from .._system import System, check_system
 from .._types import Args, Scalar, State
 from .taylor import taylor_coefficients
 
@@ -97,6 +97,7 @@ class ShadowHamiltonian(eqx.Module):
 
     def bind(self, system: System, epsilon: Any) -> "ShadowHamiltonian":
         """The same Hamiltonian for this system and ε, unless they were given before."""
+        check_system(system, "ShadowHamiltonian")
         return ShadowHamiltonian(
             self.order,
             system if self.system is None else self.system,

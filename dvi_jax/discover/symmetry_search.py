@@ -118,7 +118,7 @@ def find_symmetries(
     order = whole("order", order, least=0)
     if tolerance is not None:
         tolerance = fraction("tolerance", tolerance)
-    check_system(system)
+    check_system(system, "find_symmetries")
     one_step = map_of("find_symmetries", system, **how)
     samples, h = as_samples(samples, one_step.t0), check_step_size(h)
     shape = samples.q.shape[1:]

@@ -25,7 +25,7 @@ from .._types import Args, Scalar, State
 from ..engine.keywords import INTEGRATOR, taken, with_keywords_of
 from ..engine.names import both_names
 from ..engine.newton import RootSolver
-from ..methods import Method, Strang
+from ..methods import Method, TypeII
 from ..observe import Section
 from ..sweep import Axis
 from .results import AS_ATTRIBUTE, SECTION_RESULTS, SectionError, WithStatus, judge
@@ -81,7 +81,7 @@ def _settings(
 ) -> _Settings:
     """`level`: of the user's frame, for a warning; None: no warning."""
     integrator = chosen(**taken(keywords, INTEGRATOR))
-    has_default = integrator.method is None and not isinstance(default_method(system), Strang)
+    has_default = integrator.method is None and isinstance(default_method(system), TypeII)
     if has_default and level is not None:
         warnings.warn(
             "the default method of Poincaré sections has changed: it was Strang(), and for this "

@@ -40,7 +40,7 @@ def check_takes(
     )
 
 
-_WORDS = {4: "four", 5: "five"}
+_WORDS = {2: "two", 4: "four", 5: "five"}
 
 
 def signature_of(function: Callable[..., Any]) -> str:

@@ -14,6 +14,7 @@ from ._published import (
     Suzuki as Suzuki,
     Yoshida as Yoshida,
 )
+from ._rattle import Rattle as Rattle
 from ._runge_kutta4 import RungeKutta4 as RungeKutta4
 from ._splitting import Splitting as Splitting
 from ._stochastic import (

@@ -46,6 +46,9 @@ class Adjoint(Method):
     def is_made_of_the_map(self) -> bool:
         return self.method.is_made_of_the_map()
 
+    def needs_constraint(self) -> bool:
+        return self.method.needs_constraint()
+
     def step(self, equations, interval, q0, p0):
         # (Φ_{−h})⁻¹: the inverse of the step that goes from t1 to t0. H_D and W are evaluated at
         # (t1, t0, q1, p0), which matters where they depend on the times.

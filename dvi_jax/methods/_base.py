@@ -76,6 +76,10 @@ class Method(eqx.Module):
         """Whether a step consists of the map (12)–(13) and its adjoint alone."""
         return False
 
+    def needs_constraint(self) -> bool:
+        """Whether it is a method for systems with a constraint, and for no others."""
+        return False
+
     def is_explicit(self, system: System, q: State | None = None, args: Args = None) -> bool:
         """Whether a step of this method on `system` needs no solve; read from the jaxpr.
 

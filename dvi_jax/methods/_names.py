@@ -8,6 +8,7 @@ from ._adjoint import Adjoint
 from ._gauss_legendre import GaussLegendre
 from ._lobatto_pair import LobattoIIIAIIIB
 from ._published import BlanesMoan, KahanLi, McLachlan, Suzuki, Yoshida
+from ._rattle import Rattle
 from ._runge_kutta4 import RungeKutta4
 from ._strang import Strang
 from ._type_ii import TypeII
@@ -30,6 +31,7 @@ def as_method(given: Any) -> Any:
         "StormerVerlet": Strang,
         "Verlet": Strang,
         "Leapfrog": Strang,
+        "Rattle": Rattle,
         "RungeKutta4": RungeKutta4,
         "RK4": RungeKutta4,
         "ImplicitMidpoint": lambda: GaussLegendre(1),

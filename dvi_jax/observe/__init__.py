@@ -1,5 +1,6 @@
 """Quantities computed along a trajectory during the run."""
 
+from ._constraint_force import ConstraintForce as ConstraintForce
 from ._deviations import (
     GALI as GALI,
     MEGNO as MEGNO,

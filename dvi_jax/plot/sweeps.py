@@ -39,6 +39,8 @@ _STATUS_COLOURS = {
     "stopped": COLOURS[5],
     "not_reached": COLOURS[2],
     "step_control_failed": "#F0E442",
+    "inconsistent": "#7f7f7f",
+    "redundant": "#404040",
 }
 """One colour for each status in all pictures, so that they can be compared."""
 

@@ -125,7 +125,7 @@ def bound_drift(
     if not finite("ratio", ratio) > 1:
         raise ValueError(f"ratio must be larger than 1, got {ratio!r}.")
     system, _, _, h, args = of_problem(system, None, None, h, args, has_start=True)
-    check_system(system)
+    check_system(system, "bound_drift")
     given = chosen(integrator, method=method, arithmetic=arithmetic)
     how = only(given, "bound_drift", "method", "arithmetic")
     if not isinstance(how.arithmetic, FloatingPoint | DoubleDouble | FixedPoint):

@@ -104,7 +104,7 @@ def prove_noether(
             "q0 is missing: give an array with the shape of q, for example q0=jnp.zeros(2)."
         )
     system, *_, args = of_problem(system, None, None, None, args, has_start=True)
-    check_system(system)
+    check_system(system, "prove_noether")
     series = AdiabaticInvariant(generators, gauges)
     z, shape = series.order, start_state(q0, q0)[0].shape
 

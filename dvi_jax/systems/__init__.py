@@ -4,7 +4,7 @@ Each is a function without obligatory arguments that returns a `Problem`. Its en
 gives the name in run files; `tests/test_library.py` tests every entry.
 """
 
-from . import boozer as boozer
+from . import boozer as boozer, rigid as rigid
 from ._problem import (
     Adiabatic as Adiabatic,
     InSlowTime as InSlowTime,
@@ -23,6 +23,12 @@ from .kepler import kepler as kepler
 from .lorentz_pendulum import lorentz_pendulum as lorentz_pendulum
 from .lotka_volterra import lotka_volterra as lotka_volterra
 from .magnetic_mirror import magnetic_mirror as magnetic_mirror
+from .multibody import (
+    chain as chain,
+    dumbbell as dumbbell,
+    slider_crank as slider_crank,
+    spherical_pendulum as spherical_pendulum,
+)
 from .n_body import n_body as n_body
 from .nls_lattice import nls_lattice as nls_lattice
 from .oblate_kepler import oblate_kepler as oblate_kepler
@@ -35,6 +41,7 @@ from .pythagorean import pythagorean as pythagorean
 from .relativistic_kepler import relativistic_kepler as relativistic_kepler
 from .restricted_three_body import restricted_three_body as restricted_three_body
 from .rigid_body import rigid_body as rigid_body
+from .rotating_bodies import heavy_top as heavy_top, satellite as satellite
 from .slow_oscillator import slow_oscillator as slow_oscillator
 from .solar_system import solar_system as solar_system
 from .spinning_top import spinning_top as spinning_top
@@ -75,8 +82,14 @@ LIBRARY = {
     "uniform_field": uniform_field,
     "magnetic_mirror": magnetic_mirror,
     "dipole_field": dipole_field,
+    "spherical_pendulum": spherical_pendulum,
+    "chain": chain,
+    "slider_crank": slider_crank,
+    "dumbbell": dumbbell,
     "rigid_body": rigid_body,
     "spinning_top": spinning_top,
+    "heavy_top": heavy_top,
+    "satellite": satellite,
     "polar_motion": polar_motion,
     "lotka_volterra": lotka_volterra,
 }

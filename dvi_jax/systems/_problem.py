@@ -246,13 +246,15 @@ def library_problem(
     autonomous: bool = True,
     slow_time: bool = False,
     noise: Any = None,
+    constraint: Callable[..., Any] | None = None,
     **fields: Any,
 ) -> Problem:
     """A `Problem` of the library.
 
     - `start`: check of initial conditions; those of `parameters` are added to it.
     - `autonomous`: whether H is independent of time at ε = 0. The energy is then an observable and
-      an invariant, and the translation in time a symmetry, though not one of `slow_time`.
+      an invariant, and the translation in time a symmetry, though not one of `slow_time` or with
+      a `constraint`: symmetries are those of the type II map.
     - `slow_time`: whether the times of the Hamiltonian and of the observables are ε times t.
     - `fields`: the other fields of `Problem`.
     """
@@ -260,10 +262,12 @@ def library_problem(
     if autonomous:
         observables = (at_end(hamiltonian), *observables)
         fields["invariants"] = ("energy", *fields.get("invariants", ()))
-    if autonomous and not slow_time:
+    if autonomous and not slow_time and constraint is None:
         fields["symmetries"] = {"time": time_translation(), **fields.get("symmetries", {})}
     return Problem(
-        system=System(hamiltonian, force, perturbation, slow_time, noise=noise),
+        system=System(
+            hamiltonian, force, perturbation, slow_time, noise=noise, constraint=constraint
+        ),
         args={name: one.value for name, one in parameters.items()} or None,
         check=replace(start, parameters={name: one.check for name, one in parameters.items()}),
         parameters={name: one.meaning for name, one in parameters.items()},
