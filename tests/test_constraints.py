@@ -321,6 +321,12 @@ def test_forces_of_constraint_are_the_tension():
     assert np.ptp(tension) > 1
     assert np.max(np.abs(sol.observed["λ"][:, 0] - tension)) < 1e-13
     assert np.max(np.abs(sol.observed["force"] + q * tension[:, None])) < 1e-13
+    # also in the differential equations for other solvers
+    field = jax.jit(dvi.interop.vector_field(SPHERE))
+    velocity, force = field(0.0, (q[-1], p[-1]), SPHERE.args)
+    assert np.array_equal(velocity, p[-1])
+    fall = np.array([0.0, 0.0, -SPHERE.args["g"]])
+    assert np.max(np.abs(force - fall + q[-1] * tension[-1])) < 1e-13
 
 
 def loss(x, adjoint):

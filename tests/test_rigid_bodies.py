@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.linalg import polar
 from scipy.spatial.transform import Rotation
 from test_constraints import EIGHTH, FOURTH, defect_of_two_form, run
 
@@ -62,6 +63,16 @@ def test_momenta_and_energies_are_those_of_the_inertia_tensor():
     assert np.max(np.abs(rigid.orthonormal(2 * R) - np.array([3, 0, 0, 3, 0, 3]))) < 1e-14
     velocity = P / rigid.second_moments(MOMENTS)[None]
     assert np.max(np.abs(velocity.T @ R + R.T @ velocity)) < 1e-15
+
+
+@slow
+def test_the_nearest_rotation_is_the_polar_factor():
+    rng = np.random.default_rng(0)
+    q0 = LAGRANGE.q0 + 0.1 * rng.normal(size=(3, 3))
+    found = dvi.project(LAGRANGE, q0, LAGRANGE.p0)
+    assert found.distance > 0.1
+    assert np.max(np.abs(found.q - polar(q0)[0])) < 1e-14
+    assert run(LAGRANGE, 1, q0=found.q, p0=found.p).status == "successful"
 
 
 # Motion

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._energies import disturbing_work, incoming_energy, outgoing_energy
-from .._system import System
+from .._system import System, check_system
 from .._types import Args, Scalar
 from .generators import Generator, LatticePoint, prolong
 
@@ -30,6 +30,7 @@ def lattice_defect(
     **Source** the paper's (11) and (14) with corrected signs: (14) prints −H_{D,k−1} and
     differentiates it in t_{k−1}; stationarity in t_k gives the form above.
     """
+    check_system(system, "lattice_defect")
     (t_, q_, _), (t0, q0, p0), (t1, q1, p1) = points
     work = disturbing_work(system, t0, t1, q0, q1, p1, epsilon, args)
     leaving = outgoing_energy(system, t0, t1, q0, p1, epsilon, args)
@@ -59,6 +60,7 @@ def noether_identity(
 
     **Source** the paper, (25) and (28).
     """
+    check_system(system, "noether_identity")
     first = LatticePoint(*map(jnp.asarray, first))
     second = LatticePoint(*map(jnp.asarray, second))
     h = second.t - first.t

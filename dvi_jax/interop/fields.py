@@ -22,7 +22,8 @@ def vector_field(system: Any, epsilon: Any = None) -> Callable[[Any, Any, Any], 
     every H_D that is continuous at t1 = t0 tends to it. It is for comparisons, such as
     ``diffrax.ODETerm(interop.vector_field(system))``; the map itself comes from H_D.
 
-    - `system`: a `System`, or a problem of the library. `epsilon`: strength of the perturbation.
+    - `system`: a `System`, or a problem of the library. `epsilon`: strength of the perturbation. A
+      constraint adds its force (`dvi.ConstraintForce`); other solvers leave its manifold slowly.
 
     **Returns** a function of t [time], (q, p) and args, whose value (q̇, ṗ) has their shapes
     [unit of q / time, unit of p / time]. It can be compiled, batched and differentiated.
@@ -34,6 +35,7 @@ def vector_field(system: Any, epsilon: Any = None) -> Callable[[Any, Any, Any], 
     field is NaN everywhere. With ``slow_time=True`` t is the time itself, and H_D receives εt.
     """
     system, epsilon = checked(system, epsilon)
+    push = dvi.ConstraintForce().bind(system, epsilon)
 
     def field(t, y, args):
         q, p = as_pair(y)
@@ -41,6 +43,8 @@ def vector_field(system: Any, epsilon: Any = None) -> Callable[[Any, Any, Any], 
         at = t, t, q, p, strength, args
         position, momentum = jax.grad(system.hamiltonian, argnums=(2, 3))(*at)
         rates = momentum, -position + jnp.asarray(system.disturbing_force(*at), q.dtype)
+        if system.constraint is not None:
+            rates = momentum, rates[1] + push(t, t, q, p, q, p, args)
         return type(y)(rates) if isinstance(y, list) else rates
 
     return field
