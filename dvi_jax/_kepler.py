@@ -127,10 +127,10 @@ def _solved(orbit: _Orbit, h: Scalar) -> tuple[Array, Array]:
     u, w = orbit.eta / orbit.r0 * s, orbit.zeta / orbit.r0 * s * s
     X = s * (1 - u / 2 + u * u / 2 - w / 6)  # three terms of the series of X in h
     # Two corrections suffice for the steps of an integration; the loop is for long steps.
-    found = None
-    for _ in range(2):
-        step, _, found = orbit.correction(h, X)
-        X = X + step
+    step, *_ = orbit.correction(h, X)
+    X = X + step
+    step, _, found = orbit.correction(h, X)
+    X = X + step
 
     def search():
         # t(X) increases, because dt/dX = r > 0: its zero stays between the ends of a bracket. The

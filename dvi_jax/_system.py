@@ -289,7 +289,7 @@ def _changed_by_tracing(function: Callable | None) -> frozenset[str]:
 def _traced_output(
     function: Callable, name: str, kinds: tuple, at: tuple[Any, ...]
 ) -> jax.ShapeDtypeStruct:
-    q, args = (at[2], at[4]) if len(at) > 2 else at
+    q, args = (at[2], at[4]) if len(at) > 2 else (at[0], at[1])
     names = _NAMES if len(at) > 2 else "(q, args)"
     try:
         seen = _SEEN.setdefault(function, {})

@@ -52,7 +52,7 @@ def names() -> str:
 
 
 @functools.cache
-def near_integrable(orders: Orders) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
+def near_integrable(orders: Orders) -> tuple[tuple[float, ...], ...] | None:
     """All a and b of the symmetric scheme of generalised orders, for A + εB; None if unknown."""
     if len(orders) == 2 and orders[1] == 2 and orders[0] in range(2, _LARGEST + 2, 2):
         # Gauss's quadrature of the perturbation: nodes and weights.
@@ -66,12 +66,11 @@ def near_integrable(orders: Orders) -> tuple[tuple[float, ...], tuple[float, ...
 
 
 def _completed(a: Sequence[float], b: Sequence[float]) -> tuple[tuple[float, ...], ...]:
-    # A has one coefficient more than B: of one of them two are in the middle, of the other one.
-    if len(a) == len(b):
-        a, b = (*a, 0.5 - math.fsum(a)), (*b, 1 - 2 * math.fsum(b))
-        return (*a, *a[::-1]), (*b, *b[-2::-1])
-    a, b = (*a, 1 - 2 * math.fsum(a)), (*b, 0.5 - math.fsum(b))
-    return (*a, *a[-2::-1]), (*b, *b[::-1])
+    # A has one coefficient more than B: one of them has two in the middle, the other one.
+    twice, once = (a, b) if len(a) == len(b) else (b, a)
+    twice, once = (*twice, 0.5 - math.fsum(twice)), (*once, 1 - 2 * math.fsum(once))
+    found = (*twice, *twice[::-1]), (*once, *once[-2::-1])
+    return found if len(a) == len(b) else found[::-1]
 
 
 def word_of(scheme: Any, parts: int) -> Word:
@@ -88,15 +87,10 @@ def word_of(scheme: Any, parts: int) -> Word:
         a, b = found
         pairs = itertools.zip_longest(a, b)
         return tuple((i, c) for pair in pairs for i, c in enumerate(pair) if c is not None)
-    forwards = range(parts)
-    letters = [
-        (i, c)
-        for c, order in zip(
-            scheme.fractions(), itertools.cycle((forwards, forwards[::-1])), strict=False
-        )
-        for i in order
-    ]
-    return joined(letters)
+    # The map is one part after the other, the adjoint the opposite order.
+    orders = itertools.cycle((range(parts), range(parts)[::-1]))
+    pairs = zip(scheme.fractions(), orders, strict=False)
+    return joined((i, c) for c, order in pairs for i in order)
 
 
 def joined(letters: Iterable[tuple[int, float]]) -> Word:

@@ -148,8 +148,8 @@ class SplittingMethod(Method):
         parts = self.parts(equations, interval, q)
         word = word_of(self.scheme, len(parts))
         # Two flows of the first part are one only if they are exact.
-        is_alike = self.is_symmetric and len(word) > 1 and parts[0].is_exact
-        return _in_loop(self, word[0][1]) if is_alike else None
+        (_, a), *more = word
+        return _in_loop(self, a) if self.is_symmetric and more and parts[0].is_exact else None
 
     def needs_no_solve(self, equations, interval, q) -> bool:
         return all(part.is_exact for part in self.parts(equations, interval, q))
@@ -227,7 +227,8 @@ class Splitting(SplittingMethod):
                 "method=dvi.Splitting(...) requires a system with known parts: "
                 f"dvi.System(dvi.Split([H_A, H_B])). Its H_D is {H!r:.100}."
             )
-        rest, parts = (system.force, system.perturbation), [(H_i, None, None) for H_i in H.parts]
+        rest = system.force, system.perturbation
+        parts: list[Any] = [(H_i, None, None) for H_i in H.parts]
         if H.perturbed is not None:
             parts[H.perturbed] = (H.parts[H.perturbed], *rest)
         elif rest != (None, None):
