@@ -1,7 +1,7 @@
 """The problem of the user: a discrete Hamiltonian, a perturbing force, a perturbation."""
 
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -287,9 +287,9 @@ def _changed_by_tracing(function: Callable | None) -> frozenset[str]:
 
 
 def _traced_output(
-    function: Callable, name: str, kinds: tuple, at: tuple[Any, ...]
+    function: Callable, name: str, kinds: tuple, at: Sequence[Any]
 ) -> jax.ShapeDtypeStruct:
-    q, args = (at[2], at[4]) if len(at) > 2 else (at[0], at[1])
+    q, args = (at[2], at[4]) if len(at) > 2 else (at[0], at[-1])
     names = _NAMES if len(at) > 2 else "(q, args)"
     try:
         seen = _SEEN.setdefault(function, {})

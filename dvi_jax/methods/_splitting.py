@@ -5,7 +5,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -87,15 +87,21 @@ class SplittingMethod(Method):
         """The inverse of `enter`."""
         return q, p, no_step_yet(q)
 
-    @property
-    def order(self) -> int:
-        """The order; of a scheme for A + εB the order of its error that does not vanish with ε²."""
-        return self.scheme[-1] if isinstance(self.scheme, tuple) else self.scheme.order
+    # A type checker would require abstract variables as arguments of every subclass.
+    if TYPE_CHECKING:
+        order: ClassVar[int]
+        is_symmetric: ClassVar[bool]
+    else:
 
-    @property
-    def is_symmetric(self) -> bool:
-        """Whether the map is its own adjoint."""
-        return isinstance(self.scheme, tuple) or self.scheme.is_symmetric
+        @property
+        def order(self) -> int:
+            """The order; of a scheme for A + εB that of the terms with the highest power of ε."""
+            return self.scheme[-1] if isinstance(self.scheme, tuple) else self.scheme.order
+
+        @property
+        def is_symmetric(self) -> bool:
+            """Whether the map is its own adjoint."""
+            return isinstance(self.scheme, tuple) or self.scheme.is_symmetric
 
     def substeps(self) -> tuple[float, ...]:
         return tuple(c for i, c in word_of(self.scheme, 2) if i == 1)
