@@ -35,18 +35,6 @@ class Split(eqx.Module):
     that compute the step as t1 − t0.
 
     **Source** McLachlan & Quispel 2002, *Acta Numerica* 11, 341.
-
-    **Example**
-
-    ```python
-    H_A = dvi.flows.Kepler(k=1.0)                              # Kepler orbits, exactly
-    H_B = lambda t0, t1, q0, p1, args: 1e-3 * q0[0] ** 2
-    system = dvi.System(dvi.Split([H_A, H_B]))
-    sol = dvi.integrate(system, [1.0, 0.0], [0.0, 1.1], h=0.5, num_steps=100,
-                        method=dvi.Splitting((8, 4)))
-    print(sol.status)
-    # successful
-    ```
     """
 
     parts: tuple[HamiltonianFn, ...]

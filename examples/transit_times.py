@@ -1,6 +1,6 @@
 """Masses and orbits of two planets from the times of their transits, by a fit and by NUTS.
 
-Two planets near the 2:1 resonance of their periods disturb one another. Their transits in front of
+Two planets near the 2:1 resonance of their periods perturb one another. Their transits in front of
 the star come some minutes early or late, by amounts from which masses and eccentricities follow.
 The data are 40 transit times with a noise of one minute, computed with another integrator than the
 model: `KahanLi(8)` with short steps, and each transit by `Section`. The model uses

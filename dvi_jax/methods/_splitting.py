@@ -213,8 +213,6 @@ class Splitting(SplittingMethod):
     **Source** McLachlan & Quispel 2002, *Acta Numerica* 11, 341; Laskar & Robutel 2001, *Celest.
     Mech. Dyn. Astron.* 80, 39; McLachlan 1995, *BIT* 35, 258; Blanes et al. 2013, *Appl. Numer.
     Math.* 68, 58, tables 3 and 4.
-
-    **Example**: see `Split`.
     """
 
     scheme: Any = eqx.field(static=True, default_factory=Strang, converter=_as_scheme)

@@ -128,16 +128,6 @@ class WisdomHolman(SplittingMethod):
     J.* 116, 2067 (democratic); Wisdom, Holman & Touma 1996, *Fields Inst. Commun.* 10, 217 and
     Wisdom 2006, *Astron. J.* 131, 2294 (correctors; their coefficients follow here from the linear
     conditions); Rein & Tamayo 2015, *MNRAS* 452, 376.
-
-    **Example**
-
-    ```python
-    planets = systems.solar_system("2000-01-01")
-    sol = dvi.integrate(planets, h=8.0, num_steps=1000, method=dvi.WisdomHolman(corrector=11),
-                        save=dvi.Save(final=True))
-    print(sol.status)
-    # successful
-    ```
     """
 
     coordinates: Coordinates = eqx.field(static=True, default="jacobi")
