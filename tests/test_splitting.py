@@ -524,3 +524,24 @@ def test_energy_of_the_planets_does_not_drift_by_round_off():
     found = jax.jit(jax.vmap(error))(0.006 * (1 + 0.01 * jnp.linspace(-1, 1, 64)))
     assert abs(found.mean()) < 5 * found.std() / 8
     assert found.std() < 1e-12
+
+
+def test_discovery_and_drift_with_a_splitting_method():
+    def nothing(t0, t1, q0, p1, args):
+        return jnp.zeros((), q0.dtype)
+
+    parts = dvi.Split([flows.Harmonic(omega=1.0), nothing], perturbed=1)
+    system = dvi.System(parts, force=lambda t0, t1, q0, p1, args: -(q0**3))
+    options = {"h": 0.1, "integrator": dvi.Integrator(method=dvi.Splitting())}
+    samples = np.random.default_rng(0).uniform(-1, 1, (2, 200, 1))
+    found = dvi.discover_invariants(
+        system, dvi.Polynomials(4), order=1, samples=samples, representative="simplest", **options
+    )
+    # The flow of the oscillator is exact: its energy is the part without ε, without a term h q p.
+    q, p = jnp.array([0.7]), jnp.array([0.3])
+    assert float(found.invariants[0].evaluate(q, p, 0.0)) == pytest.approx(0.29, abs=1e-12)
+    law = dvi.drift_order(
+        system, found.invariants[0], [0.4], [0.3], num_steps=500, epsilons=[0.02, 0.05, 0.1],
+        **options,
+    )  # fmt: skip
+    assert law.slope == pytest.approx(2, abs=0.1)

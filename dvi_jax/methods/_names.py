@@ -10,8 +10,10 @@ from ._lobatto_pair import LobattoIIIAIIIB
 from ._published import BlanesMoan, KahanLi, McLachlan, Suzuki, Yoshida
 from ._rattle import Rattle
 from ._runge_kutta4 import RungeKutta4
+from ._splitting import Splitting
 from ._strang import Strang
 from ._type_ii import TypeII
+from ._wisdom_holman import WisdomHolman
 
 
 def as_method(given: Any) -> Any:
@@ -32,6 +34,8 @@ def as_method(given: Any) -> Any:
         "Verlet": Strang,
         "Leapfrog": Strang,
         "Rattle": Rattle,
+        "Splitting": Splitting,
+        "WisdomHolman": WisdomHolman,
         "RungeKutta4": RungeKutta4,
         "RK4": RungeKutta4,
         "ImplicitMidpoint": lambda: GaussLegendre(1),

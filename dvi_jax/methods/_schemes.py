@@ -99,6 +99,10 @@ def joined(letters: Iterable[tuple[int, float]]) -> Word:
     return tuple((i, math.fsum(c for _, c in group)) for i, group in groups)
 
 
+def as_scheme(given: Any) -> Any:
+    return tuple(given) if isinstance(given, list) else given
+
+
 def check_scheme(scheme: Any) -> None:
     """**Raises** `TypeError` or `ValueError` for a scheme that is not known."""
     known = f"The known generalised orders are {names()}."

@@ -21,8 +21,7 @@ from .._types import Interval, State
 from ..flows import Flow, Kepler
 from ._base import InLoop, Method
 from ._gauss_legendre import GaussLegendre
-from ._names import as_method
-from ._schemes import check_scheme, word_of
+from ._schemes import as_scheme, check_scheme, word_of
 from ._strang import Strang
 from ._type_ii import TypeII
 
@@ -184,10 +183,6 @@ def _in_loop(method: SplittingMethod, a: float) -> InLoop:
     return InLoop(before, step, after)
 
 
-def _as_scheme(given: Any) -> Any:
-    return tuple(given) if isinstance(given, list) else as_method(given)
-
-
 class Splitting(SplittingMethod):
     r"""A composition of the flows of the parts of `Split`; the default of such systems.
 
@@ -215,7 +210,7 @@ class Splitting(SplittingMethod):
     Math.* 68, 58, tables 3 and 4.
     """
 
-    scheme: Any = eqx.field(static=True, default_factory=Strang, converter=_as_scheme)
+    scheme: Any = eqx.field(static=True, default_factory=Strang, converter=as_scheme)
 
     def __check_init__(self):
         check_scheme(self.scheme)

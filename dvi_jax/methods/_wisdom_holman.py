@@ -15,8 +15,8 @@ from .._checks import one_of
 from .._step import Equations, judge, no_solve, no_step_yet
 from .._types import Args, Interval, Scalar, State
 from ..engine.newton import find_root
-from ._schemes import ORDERS_OF_CORRECTORS, check_scheme, corrector, joined
-from ._splitting import Part, SplittingMethod, _as_scheme, _Letter
+from ._schemes import ORDERS_OF_CORRECTORS, as_scheme, check_scheme, corrector, joined
+from ._splitting import Part, SplittingMethod, _Letter
 from ._strang import Strang
 
 Coordinates = Literal["jacobi", "democratic"]
@@ -132,7 +132,7 @@ class WisdomHolman(SplittingMethod):
 
     coordinates: Coordinates = eqx.field(static=True, default="jacobi")
     corrector: int = eqx.field(static=True, default=0)
-    scheme: Any = eqx.field(static=True, default_factory=Strang, converter=_as_scheme)
+    scheme: Any = eqx.field(static=True, default_factory=Strang, converter=as_scheme)
     G: Any = None
 
     def __check_init__(self):
