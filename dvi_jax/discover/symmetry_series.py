@@ -10,13 +10,7 @@ from .families import coordinate_names
 from .gauge import BasisGauge
 from .generators import Generator
 from .judging import CLEARLY
-from .motion import (
-    FieldMotion,
-    coefficient_errors,
-    conserved,
-    relative_changes,
-    typical_sizes,
-)
+from .motion import FieldMotion, coefficient_errors, conserved, relative_changes, typical_sizes
 from .nullspace import (
     HELD_OUT,
     NULL,

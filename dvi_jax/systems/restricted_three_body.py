@@ -108,7 +108,7 @@ def restricted_three_body() -> Problem:
                 EARTH_MOON,
                 "share of the small body in the mass of both, at most 1/2 [1]",
                 _mass_fraction,
-            ),
+            )
         },
         observables=[jacobi_constant, angular_momentum],
         units=DIMENSIONLESS | {"q": "distance of the bodies", "t": "period/2π"},

@@ -109,14 +109,7 @@ def _line(field: Field, s, theta, zeta, mu, energy) -> _Line:
 
 
 def well(
-    field: Field,
-    s: Any,
-    theta: Any,
-    zeta: Any,
-    mu: Any,
-    energy: Any = 0.5,
-    *,
-    turns: float = 10.0,
+    field: Field, s: Any, theta: Any, zeta: Any, mu: Any, energy: Any = 0.5, *, turns: float = 10.0
 ) -> Well:
     r"""Bounce points μB = E on the field line through a point, on both sides of it.
 
@@ -131,14 +124,7 @@ def well(
 
 
 def second_invariant(
-    field: Field,
-    s: Any,
-    theta: Any,
-    zeta: Any,
-    mu: Any,
-    energy: Any = 0.5,
-    *,
-    turns: float = 10.0,
+    field: Field, s: Any, theta: Any, zeta: Any, mu: Any, energy: Any = 0.5, *, turns: float = 10.0
 ) -> Array:
     r"""Second adiabatic invariant J∥ = 2 ∫ √(2(E − μB)) (G + ιI)/B dζ between bounce points [m].
 
