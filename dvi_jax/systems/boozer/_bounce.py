@@ -81,17 +81,14 @@ def _end(line: _Line, zeta: Array, direction: float, turns: float) -> tuple[Arra
     most = 2 * np.pi * turns / jnp.abs(step)
     fixed = lax.stop_gradient(line)
 
-    def proceed(state):
-        k, _, ahead = state
-        return (ahead > 0) & (k < most)
-
     def advance(state):
         k, _, ahead = state
         return k + 1, ahead, fixed.parallel(zeta + (k + 1) * step)
 
     # A point where the guiding centre bounces is inside of its well, up to rounding.
     begin = jnp.maximum(fixed.parallel(zeta), 0.0)
-    k, behind, ahead = lax.while_loop(proceed, advance, (0.0 * step, begin, 0.0 * step + 1.0))
+    state = 0.0 * step, begin, 0.0 * step + 1.0
+    k, behind, ahead = lax.while_loop(lambda x: (x[2] > 0) & (x[0] < most), advance, state)
     exists = ahead <= 0
     a, b = zeta + (k - 1) * step, zeta + k * step
     return bracketed_root(line.parallel, a, behind, b, ahead, exists), exists
