@@ -12,10 +12,7 @@ from ._adapters import (
     legendre as legendre,
     velocity_force as velocity_force,
 )
-from ._adjoints import (
-    Checkpointed as Checkpointed,
-    Direct as Direct,
-)
+from ._adjoints import Checkpointed as Checkpointed, Direct as Direct
 from ._arithmetic import (
     Arithmetic as Arithmetic,
     Compensated as Compensated,

@@ -1,7 +1,6 @@
 """From Lagrangians and other generating functions to a discrete Hamiltonian H_D(t0, t1, q0, p1)."""
 
 import functools
-import inspect
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -16,7 +15,7 @@ from lanewise.dependence import depends_on
 from ._types import Args, ForceFn, HamiltonianFn, Scalar, State
 from .engine.names import both_names
 from .engine.newton import Newton, Vector, find_root
-from .engine.signature import accepts, check_takes
+from .engine.signature import accepts, check_takes, signature_of
 
 _NEAR = 1e-4
 """Fraction of the initial defect at which the damped search ends and Newton's method begins."""
@@ -57,14 +56,11 @@ class _FromLagrangian(eqx.Module):
     step_is_from_times: ClassVar[bool] = True
 
     def __call__(self, t0: Scalar, t1: Scalar, q0: State, p1: State, args: Args) -> Scalar:
-        h = t1 - t0
-
+        h, name = t1 - t0, "L_d(t0, t1, q0, q1, args)"
         # The unknown is v, not q1: it stays of order one as h → 0.
-        def action_rate(v):
-            return self.L_d(t0, t1, q0, q0 + h * v, args) / h
-
-        name = "L_d(t0, t1, q0, q1, args)"
-        return _transformed(action_rate, p1, self.newton, name, scale=q0 / h)
+        return _transformed(
+            lambda v: self.L_d(t0, t1, q0, q0 + h * v, args) / h, p1, self.newton, name, q0 / h
+        )
 
 
 class _FromTypeIII(eqx.Module):
@@ -144,9 +140,10 @@ def legendre(L: Callable[..., Any], newton: Newton = Newton()) -> Callable[..., 
     # The number of arguments decides; a function that takes four and five cannot be classified.
     discrete, continuous = (callable(L) and accepts(L, count) for count in (5, 4))
     if discrete == continuous:
+        seen = signature_of(L) if callable(L) else repr(L)  # the value of a number, say
         raise TypeError(
             "L must be a function of (t, q, v, args) for a continuous Lagrangian, or of "
-            f"(t0, t1, q0, v, args) for a discrete Lagrangian, got {_described(L)}. This object "
+            f"(t0, t1, q0, v, args) for a discrete Lagrangian, got {seen}. This object "
             + (
                 "accepts both four and five arguments: wrap it in a lambda of four or of five."
                 if discrete
@@ -380,10 +377,3 @@ def _require_scalar(value: Any, name: str, shape: tuple[int, ...], what: str) ->
             "jnp.sum or one component of an array, and jnp.real of a complex value."
         )
     return value
-
-
-def _described(function: Any) -> str:
-    try:
-        return f"{function.__name__}{inspect.signature(function)}"
-    except (AttributeError, TypeError, ValueError):
-        return repr(function)

@@ -70,7 +70,7 @@ def publish_npz(
     written; an older file of that name is then unchanged.
     """
     path, content = Path(path), io.BytesIO()
-    header = {"format": form, "holds": sorted(arrays), **about}
+    header = {"format": form, "holds": sorted(arrays), **about}  # so that a lost array is noticed
     if not path.parent.is_dir():
         raise FileNotFoundError(
             f"the file '{path.name}' cannot be written: there is no directory '{path.parent}'. "

@@ -271,20 +271,13 @@ def _task(run: Run, integrator: Integrator, method: Method, h: Array) -> tuple[T
             stacklevel=3,
         )
     lattice, arithmetic = integrator.lattice, integrator.arithmetic
-    equations, q0, p0 = arithmetic.prepare(
-        method,
-        Equations(system, epsilon, run.args, integrator.root_finder),
-        Interval(run.t0, run.t0 + h, h),
-        run.q0,
-        run.p0,
-    )
+    equations = Equations(system, epsilon, run.args, integrator.root_finder)
+    first = Interval(run.t0, run.t0 + h, h)  # for checks of the first step
+    equations, q0, p0 = arithmetic.prepare(method, equations, first, run.q0, run.p0)
     # A part of the key of compiled programs: with another value one is compiled again.
     seen = reads(run.observe, run.stop, lattice)
-    return (
-        Task(equations, method, lattice, run.observe, run.t0, h, arithmetic, run.stop, seen),
-        q0,
-        p0,
-    )
+    task = Task(equations, method, lattice, run.observe, run.t0, h, arithmetic, run.stop, seen)
+    return task, q0, p0
 
 
 # Compiled here, not by the user: a call without jax.jit takes one program, that of its shapes.
@@ -362,24 +355,18 @@ def _as_solution(
         ts = jnp.concatenate([task.t0[None], saved.t])
         qs, ps, hs, alone = saved.q, saved.p, saved.h, saved.observed
     place = Place(task.t0, task.h, carry.k, carry.q, carry.p)
-    return Solution(
-        ts=ts,
-        qs=qs,
-        ps=ps,
-        hs=hs,
-        observed=observed(observe, alone, values),
-        result=result,
-        stats={
-            "num_steps": plan.num_steps,
-            "newton_iterations": carry.iterations,
-            "max_residual": over(*carry.residual),
-            "failed_step": carry.failed_step,
-            "failed_residual": over(*carry.failed_residual),
-            **task.lattice.report(carry.lattice, task.equations, place),
-            **({} if defect is None else {"round_trip_defect": defect}),
-        },
-        stop=None if task.stop is None else stopped(curve, task.stop, carry.stop, safe),
-    )
+    stats = {
+        "num_steps": plan.num_steps,
+        "newton_iterations": carry.iterations,
+        "max_residual": over(*carry.residual),
+        "failed_step": carry.failed_step,
+        "failed_residual": over(*carry.failed_residual),
+        **task.lattice.report(carry.lattice, task.equations, place),
+        **({} if defect is None else {"round_trip_defect": defect}),
+    }
+    found = observed(observe, alone, values)
+    end = None if task.stop is None else stopped(curve, task.stop, carry.stop, safe)
+    return Solution(ts, qs, ps, hs, found, result, stats, end)
 
 
 def _observed(given: tuple[Any, Any], step: StepTaken) -> list[PyTree]:

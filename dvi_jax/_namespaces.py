@@ -100,14 +100,9 @@ def names() -> list[str]:
 
 
 _MEANT = {
-    "discretize": "discretise",
-    "Verlet": "StormerVerlet",
-    "VelocityVerlet": "StormerVerlet",
-    "odeint": "integrate",
-    "solve": "integrate",
-    "simulate": "integrate",
-    "diffeqsolve": "integrate",
-    "TimeGrid": "Uniform",
+    **dict.fromkeys(("Verlet", "VelocityVerlet"), "StormerVerlet"),
+    **dict.fromkeys(("odeint", "solve", "simulate", "diffeqsolve"), "integrate"),
+    **{"discretize": "discretise", "TimeGrid": "Uniform"},
 }
 """Names in other packages → the name here."""
 

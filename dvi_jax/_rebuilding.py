@@ -13,15 +13,7 @@ from jaxtyping import Array
 import lanewise
 
 from ._results import RESULTS
-from ._rollout import (
-    Plan,
-    Saved,
-    StepTaken,
-    Task,
-    adds_start_outside,
-    number_of,
-    piece_length,
-)
+from ._rollout import Plan, Saved, StepTaken, Task, adds_start_outside, number_of, piece_length
 from ._types import State
 from .engine.newton import Known, RootSolver
 from .observe import has_initial_value

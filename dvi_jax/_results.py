@@ -77,17 +77,8 @@ class RESULTS(eqx.Enumeration):
 
 # In the order of the class, which numbers them. A new status goes to the end: stores have numbers.
 STATUS_NAMES = (
-    "successful",
-    "not_converged",
-    "not_finite",
-    "bad_step_size",
-    "no_root",
-    "out_of_range",
-    "stopped",
-    "not_reached",
-    "step_control_failed",
-    "inconsistent",
-    "redundant",
+    *("successful", "not_converged", "not_finite", "bad_step_size", "no_root", "out_of_range"),
+    *("stopped", "not_reached", "step_control_failed", "inconsistent", "redundant"),
 )
 
 
@@ -100,7 +91,7 @@ def status_name(result: RESULTS) -> Any:
 
 def status_code(result: RESULTS) -> Array:
     """The index of a status in `STATUS_NAMES`, for each trajectory of a batch."""
-    (code,) = jax.tree.leaves(result)
+    (code,) = jax.tree.leaves(result)  # an Enumeration has one leaf, its index
     return code
 
 

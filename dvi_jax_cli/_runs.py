@@ -145,11 +145,7 @@ def sweep_verify(session: Session, store: StorePath) -> None:
 
 @command(app, "fit", INVERSE)
 def fit(
-    session: Session,
-    config: Config,
-    out: Out = None,
-    force: Force = False,
-    resume: Resume = False,
+    session: Session, config: Config, out: Out = None, force: Force = False, resume: Resume = False
 ) -> None:
     """Find parameters of a system from observations in a CSV or npz file.
 

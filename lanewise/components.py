@@ -301,8 +301,7 @@ class Evaluator:
                 return
             rows = functools.partial(_row_of, self.b)
             self.count(
-                target.shape[0],
-                lambda i: one([rows(x, i) for x in places], target.row(self.b, i)),
+                target.shape[0], lambda i: one([rows(x, i) for x in places], target.row(self.b, i))
             )
 
         one(sources, place)

@@ -17,10 +17,6 @@ def _binary(method: str) -> Callable:
     return lambda e, _, a, b: getattr(e.b, method)(a, b)
 
 
-def _compared(op: str) -> Callable:
-    return lambda e, _, a, b: e.b.compare(op, a, b)
-
-
 def _equal(e: "Evaluator", _: Any, x: Num, y: Num) -> Num:
     """A loop's counter equals a given number in one round: taken for rare."""
     same = e.b.compare("eq", x, y)
@@ -181,7 +177,9 @@ ELEMENTWISE: dict[str, Callable] = {
     "rounded_product": exact.rounded,
     "lost_by_product": exact.lost,
     "eq": _equal,
-    **{op: _compared(op) for op in ("ne", "lt", "le", "gt", "ge")},
+    **{
+        op: (lambda e, _, a, b, o=op: e.b.compare(o, a, b)) for op in ("ne", "lt", "le", "gt", "ge")
+    },
     **{
         op: (lambda e, _, a, b, op=op: e.b.shift(op, a, b))
         for op in ("shift_left", "shift_right_logical", "shift_right_arithmetic")

@@ -30,10 +30,7 @@ def solve(A: Array, b: Array) -> Array:
         )
     # It makes the solution differentiable any number of times by solving with the same matrix.
     return lax.custom_linear_solve(
-        lambda x: A @ x,
-        b,
-        lambda _, b: _eliminate.bind(A, b),
-        lambda _, b: _eliminate.bind(A.T, b),
+        lambda x: A @ x, b, lambda _, b: _eliminate.bind(A, b), lambda _, b: _eliminate.bind(A.T, b)
     )
 
 

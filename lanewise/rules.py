@@ -28,7 +28,7 @@ def _unstack(x: np.ndarray, *, axis: int) -> tuple[np.ndarray, ...]:
 
 
 def _split(x, *, sizes, axis):
-    return tuple(np.split(x, np.cumsum(sizes)[:-1], axis))
+    return tuple(np.split(x, np.cumsum(sizes)[:-1], axis))  # NumPy takes the places of the cuts
 
 
 def _reshape(x, *, new_sizes, dimensions):
@@ -98,23 +98,11 @@ def moved(name: str, params: dict[str, Any], *arrays: np.ndarray) -> tuple[np.nd
 _ABOUT_DEVICES = frozenset(["sharding", "out_sharding"])
 
 # Calls of one jaxpr whose inputs and outputs are those of the equation.
-CALLS = frozenset(
-    [
-        "jit",
-        "pjit",
-        "closed_call",
-        "core_call",
-        "call_hi_primitive",
-        "eval_jaxpr",
-        "custom_jvp_call",
-        "custom_vjp_call",
-        "custom_vjp_call_jaxpr",
-        "implicit_root",
-        "checkpoint",
-        "remat",
-        "remat2",
-    ]
+_CALL_NAMES = (
+    "jit pjit closed_call core_call call_hi_primitive eval_jaxpr custom_jvp_call custom_vjp_call "
+    "custom_vjp_call_jaxpr implicit_root checkpoint remat remat2"
 )
+CALLS = frozenset(_CALL_NAMES.split())
 
 # Taken from the first entry to the last, by this operation of two.
 REDUCTIONS = {

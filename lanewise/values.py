@@ -28,7 +28,7 @@ class Value:
         self.shape, self.dtype = tuple(shape), str(dtype)
         self.entries: Entries | None = entries
         self.buffer = buffer
-        self.is_tangent = False
+        self.is_tangent = False  # linear in unit vectors: its zeros are zeros by structure
 
     @classmethod
     def in_memory(cls, buffer: Buffer) -> "Value":

@@ -79,14 +79,7 @@ def lu(a: Array, **_) -> tuple[Array, Array, Array]:
 
 
 def triangular_solve(
-    a: Array,
-    b: Array,
-    *,
-    left_side: bool,
-    lower: bool,
-    transpose_a: bool,
-    unit_diagonal: bool,
-    **_,
+    a: Array, b: Array, *, left_side: bool, lower: bool, transpose_a: bool, unit_diagonal: bool, **_
 ) -> Array:
     """X of A X = B, or of X A = B where the matrix is not on the left."""
     n = _square(a, "triangular_solve")

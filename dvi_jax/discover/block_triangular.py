@@ -91,11 +91,7 @@ class BlockTriangular:
     """
 
     def __init__(
-        self,
-        terms: np.ndarray,
-        cut: Cut,
-        free: np.ndarray | None = None,
-        unit: float | None = None,
+        self, terms: np.ndarray, cut: Cut, free: np.ndarray | None = None, unit: float | None = None
     ):
         orders, size = terms.shape[1:]
         self.blocks = np.ascontiguousarray(np.moveaxis(terms, 1, 0))

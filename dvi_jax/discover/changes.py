@@ -20,14 +20,7 @@ from ..engine.pairs import Pair
 from ..methods import Method
 from .basis import BoundBasis
 from .motion import Motion
-from .sampling import (
-    Samples,
-    check_finite,
-    later,
-    relative_step,
-    require_finite,
-    require_steps,
-)
+from .sampling import Samples, check_finite, later, relative_step, require_finite, require_steps
 from .taylor import taylor_coefficients
 
 # A series whose relative change at large ε is smaller is exact and not an expansion.

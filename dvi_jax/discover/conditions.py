@@ -86,18 +86,10 @@ def at_samples(equations, h, basis, gauge_basis, order, samples, later) -> Condi
         by_pair = jax.jacfwd(F)(pair)  # (2n, 2, C)
         noether, gauge = map(rows, identity(pair), jax.jacfwd(identity)(pair))
         shifted = jax.vmap(lambda shift: F(pair.at[:, 0].add(shift)))(later)
-        return (
-            jnp.einsum("rjc,jb->jrcb", by_pair, values[:, : basis.size]),
-            jnp.moveaxis(noether, 0, 1),
-            gauge,
-            by_pair[:, 1, 0],
-            shifted,
-            values[:, : basis.size],
-            slopes[0, : basis.size],
-            by_pair,
-            pair,
-            jnp.where(info.result == RESULTS.successful, 1.0, 0.0),
-        )
+        phi, good = values[:, : basis.size], jnp.where(info.result == RESULTS.successful, 1.0, 0.0)
+        determining = jnp.einsum("rjc,jb->jrcb", by_pair, phi)
+        closing, of_basis = (jnp.moveaxis(noether, 0, 1), gauge), (phi, slopes[0, : basis.size])
+        return determining, *closing, by_pair[:, 1, 0], shifted, *of_basis, by_pair, pair, good
 
     def at_point(q, p, t):
         shapes = []

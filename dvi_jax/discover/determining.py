@@ -15,11 +15,7 @@ from .generators import Generator, LatticePoint, prolong
 
 
 def discrete_equations(
-    system: System,
-    first: LatticePoint,
-    second: LatticePoint,
-    epsilon: Any = 0.0,
-    args: Args = None,
+    system: System, first: LatticePoint, second: LatticePoint, epsilon: Any = 0.0, args: Args = None
 ) -> tuple[State, State]:
     r"""The left sides (F^q, F^p) of the discrete equations between two lattice points.
 

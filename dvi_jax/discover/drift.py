@@ -253,20 +253,8 @@ def _order(epsilons: np.ndarray, lanes: _Lanes, kept: np.ndarray) -> DriftOrder:
     excluded[candidates & ~(drifts > ABOVE_FLOOR * level)] = "flat"
     used = excluded == ""
     fit = small_epsilon_exponent(epsilons[used], drifts[used], max(floor, level))
-    return DriftOrder(
-        epsilons=epsilons,
-        drifts=drifts,
-        floor=floor,
-        floor_cause=cause,
-        used=used,
-        excluded=excluded,
-        slope=fit.slope,
-        stderr=fit.stderr,
-        kept=kept,
-        start_drifts=lanes.drifts,
-        statuses=lanes.statuses,
-        fit=fit,
-    )
+    points = epsilons, drifts, floor, cause, used, excluded
+    return DriftOrder(*points, fit.slope, fit.stderr, kept, lanes.drifts, lanes.statuses, fit)
 
 
 def _check_observable(invariant: Any) -> None:
@@ -304,9 +292,5 @@ def _starts(q0: Any, p0: Any, batched: bool):
 
 def _settings(how: dict[str, Any]) -> dict[str, Any]:
     """What `integrate` receives of the keywords that both functions take from it."""
-    run = taken(how, "t0 args")
-    return {
-        "t0": run["t0"],
-        "args": jax.tree.map(as_parameter, run["args"]),
-        "integrator": chosen(**how),
-    }
+    run = taken(how, "t0 args")  # removes them from `how`
+    return run | {"args": jax.tree.map(as_parameter, run["args"]), "integrator": chosen(**how)}

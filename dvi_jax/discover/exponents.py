@@ -120,9 +120,7 @@ def small_epsilon_exponent(epsilons: Any, drifts: Any, floor: float = 0.0) -> Ex
     epsilons, drifts = np.asarray(epsilons, float), np.asarray(drifts, float)
     if len(epsilons) < ENOUGH:
         nan = np.nan
-        return Exponent(
-            nan, (nan, nan), nan, False, "", {}, nan, nan, nan, nan, len(epsilons), (nan, nan)
-        )
+        return Exponent(nan, (nan, nan), nan, False, "", {}, *[nan] * 4, len(epsilons), (nan, nan))
     x, y = np.log(epsilons), np.log(drifts)
     freedom = len(x) - 2
     fits = fits_of_laws(x, drifts, floor)
@@ -139,20 +137,11 @@ def small_epsilon_exponent(epsilons: Any, drifts: Any, floor: float = 0.0) -> Ex
     line_slope, line_stderr = line(x, y)
     slope = middle if resolved and model != "power" else line_slope
     low, high = min(low, slope), max(high, slope)
-    return Exponent(
-        slope=float(slope),
-        interval=(float(low), float(high)),
-        stderr=float((high - low) / 2 / student_t(freedom)),
-        resolved=resolved,
-        model=model,
-        probabilities=probabilities,
-        crossover=float(crossover),
-        line_slope=line_slope,
-        line_stderr=line_stderr,
-        curvature=2 * float(np.polyfit(x - x.mean(), y, 2)[0]) if len(x) > ENOUGH else np.nan,
-        points=len(x),
-        range=(float(epsilons.min()), float(epsilons.max())),
-    )
+    interval, stderr = (float(low), float(high)), float((high - low) / 2 / student_t(freedom))
+    curvature = 2 * float(np.polyfit(x - x.mean(), y, 2)[0]) if len(x) > ENOUGH else np.nan
+    order = float(slope), interval, stderr, resolved, model, probabilities, float(crossover)
+    ends = float(epsilons.min()), float(epsilons.max())
+    return Exponent(*order, line_slope, line_stderr, curvature, len(x), ends)
 
 
 def resolving_range(

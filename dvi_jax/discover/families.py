@@ -109,12 +109,9 @@ class Polynomials(AbstractBasis):
             for c in itertools.combinations_with_replacement(range(len(chosen)), d)
         ]
         names = tuple(_monomial([chosen[i] for i in c]) for c in exponents)
-        return BoundBasis(
-            _Monomials(places, tuple(exponents), chosen),
-            names,
-            tuple(len(c) for c in exponents),
-            any(v in TIME for v in chosen),
-        )
+        function = _Monomials(places, tuple(exponents), chosen)
+        timed = any(v in TIME for v in chosen)
+        return BoundBasis(function, names, tuple(map(len, exponents)), timed)
 
 
 def _monomial(factors: Sequence[str]) -> str:

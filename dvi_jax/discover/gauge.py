@@ -19,13 +19,7 @@ from .echelon import reduction
 from .generators import Generator, LatticePoint
 from .noether import noether_identity
 from .nullspace import series_changes, solve_series
-from .sampling import (
-    as_samples,
-    relative_step,
-    require_enough,
-    require_steps,
-    require_time,
-)
+from .sampling import as_samples, relative_step, require_enough, require_steps, require_time
 from .taylor import taylor_coefficients
 
 _ROUNDINGS = 64.0  # An identity below so many roundings of its terms is zero

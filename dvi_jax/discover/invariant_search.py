@@ -169,14 +169,9 @@ def discover_invariants(
     if order == 0 and tolerance is None:
         # Where fewer are conserved in a larger box, growth is not from errors of coefficients.
         doubted = any(x.kind == "box" and x.conserved < found.count for x in larger)
-        powers = powers_of_size(
-            stepped,
-            coefficients,
-            samples,
-            typical_residuals[:, 0, 1],
-            found.judge_fitted.sizes(coefficients),
-            found.orthonormal * (not doubted),
-        )
+        most, sizes = typical_residuals[:, 0, 1], found.judge_fitted.sizes(coefficients)
+        columns = found.orthonormal * (not doubted)
+        powers = powers_of_size(stepped, coefficients, samples, most, sizes, columns)
     everything = len(coefficients) == 2 * samples.q[0].size and not bound.uses_time
     everything = everything and not system.slow_time and bool(np.any(changes.motion.changes))
     # If so many are conserved each orbit is a finite set of points, or functions are periodic.
@@ -185,6 +180,7 @@ def discover_invariants(
         refused, exact = refused + len(coefficients) + len(dependent), ()
         coefficients, dependent, errors = coefficients[:0], dependent[:0], errors[:0]
         typical_residuals, powers = typical_residuals[:0], powers[:0]
+    volume = np.max(np.abs(in_units_of(found.scale, changes.volume)), axis=0)
     return Discovery(
         inner_coefficients=jnp.asarray(coefficients),
         inner_dependent=jnp.asarray(dependent),
@@ -203,7 +199,7 @@ def discover_invariants(
         larger=larger,
         powers=powers,
         reach=reach(coefficients, found.values),
-        obstructions=found.laws(changes.volume, system.slow_time, chosen.blur),
+        obstructions=drift_laws(found, volume, system.slow_time, chosen.blur),
         basis=bound,
         inner=inner,
         middle=at,
@@ -339,10 +335,7 @@ class Search:
         """One series for each leading-order term, in functions of the basis; `blur`: see `Span`."""
         span = Span(self.basis, self.rms, self.R, self.spaces[-1], blur, self.constant)
         found = span.representatives(self.fitted, self.slopes)
-        picked: list[tuple[np.ndarray, bool, bool]] = []
-        for series, independent in found:
-            c, at_every_epsilon = self._picked(span, series, representative)
-            picked.append((c, at_every_epsilon, independent))
+        picked = [(*self._picked(span, series, representative), free) for series, free in found]
         size = self.order + 1, self.basis.size
 
         def those(independent):
@@ -358,17 +351,15 @@ class Search:
             refused = len(lost)
             unclear = int(np.sum(self.judge.largest(lost) < UNCLEAR))
             coefficients, exact, dependent = coefficients[kept], exact[kept], dependent[others]
-        place = np.array(self._order_of_importance(coefficients, exact), int)
+        # Conserved to rounding before approximate, at every ε before to an order, few terms before
+        # many.
+        sure, terms = self.judge.keep(coefficients), np.count_nonzero(coefficients, (1, 2))
+        place = sorted(range(len(exact)), key=lambda i: (not sure[i], not exact[i], terms[i]))
+        place = np.array(place, int)
         coefficients, exact = coefficients[place], tuple(map(bool, exact[place]))
         errors = [self.conditions.errors(c * self.sizes, self.tolerance) for c in coefficients]
         errors = np.array(errors).reshape(coefficients.shape) / self.sizes
         return _Chosen(coefficients, dependent, errors, exact, refused, unclear, blur)
-
-    def _order_of_importance(self, coefficients: np.ndarray, exact: np.ndarray) -> list[int]:
-        """Conserved to rounding before approximate, at every ε before to an order, few terms
-        before many."""
-        rounding, terms = self.judge.keep(coefficients), np.count_nonzero(coefficients, (1, 2))
-        return sorted(range(len(exact)), key=lambda i: (not rounding[i], not exact[i], terms[i]))
 
     def _picked(
         self, span: Span, series: np.ndarray, representative: str
@@ -421,11 +412,6 @@ class Search:
         """Null vectors of which rounding decides whether they are series."""
         unclear = max(space.unclear for space in self.spaces) + self.undecided
         return unclear if self.tolerance is None else 0
-
-    def laws(self, volume: np.ndarray, slow_time: bool, blur: float):
-        """The `DriftLaw` of each leading-order term that is lost."""
-        volume = np.max(np.abs(in_units_of(self.scale, volume)), axis=0)
-        return drift_laws(self, volume, slow_time, blur)
 
 
 def _shares_of_constant(rms, values, calm, slopes) -> np.ndarray | None:

@@ -142,10 +142,10 @@ def fits_of_laws(x: np.ndarray, drifts: np.ndarray, floor: float) -> Fits:
 
     `x` = log ε and `drifts`: shape (n,); `floor`: the drift at ε = 0.
     """
-    found = [
-        _refined_fits(x, np.log(drifts - part * floor), np.log(prior))
-        for part, prior in _floor_parts(floor / drifts.min())
-    ]
+    # Which part of the floor is in the drifts, with its probability.
+    is_small = floor / drifts.min() < _LEAST_SCATTER
+    parts = [(0.0, 1.0)] if is_small else [(0.0, 0.4), (1.0, 0.5), (-1.0, 0.1)]
+    found = [_refined_fits(x, np.log(drifts - part * floor), np.log(p)) for part, p in parts]
     cells = _Cells(*map(np.concatenate, zip(*(f[0] for f in found), strict=True)))
     slopes, squares, logs = (np.concatenate([f[i] for f in found]) for i in (1, 2, 3))
     weights = np.exp(logs - logs.max())
@@ -154,13 +154,6 @@ def fits_of_laws(x: np.ndarray, drifts: np.ndarray, floor: float) -> Fits:
     stderrs = np.sqrt(squares / (len(x) - 2) / (dx @ dx))
     weights = weights[keep] / weights[keep].sum()
     return Fits(cells.laws[keep], cells.centres[keep], slopes[keep], stderrs[keep], weights)
-
-
-def _floor_parts(share: float) -> list[tuple[float, float]]:
-    """(which part of the floor is in the drifts, probability)."""
-    if share < _LEAST_SCATTER:
-        return [(0.0, 1.0)]
-    return [(0.0, 0.4), (1.0, 0.5), (-1.0, 0.1)]
 
 
 def _refined_fits(x: np.ndarray, y: np.ndarray, log_prior: float):

@@ -15,10 +15,7 @@ Gauge = Callable[..., Any]  # ``G(t, q, p, args)`` → scalar [action] at a latt
 
 
 def lattice_defect(
-    system: System,
-    points: Sequence[LatticePoint],
-    epsilon: Any = 0.0,
-    args: Args = None,
+    system: System, points: Sequence[LatticePoint], epsilon: Any = 0.0, args: Args = None
 ) -> Scalar:
     r"""The residual r of the lattice equation at the middle of three points [power].
 

@@ -10,13 +10,7 @@ from .families import coordinate_names
 from .gauge import BasisGauge
 from .generators import Generator
 from .judging import CLEARLY
-from .motion import (
-    FieldMotion,
-    coefficient_errors,
-    conserved,
-    relative_changes,
-    typical_sizes,
-)
+from .motion import FieldMotion, coefficient_errors, conserved, relative_changes, typical_sizes
 from .nullspace import (
     HELD_OUT,
     NULL,
@@ -352,12 +346,8 @@ class Search:
         good = (raw.good[:, 0] == 1) & np.all([np.isfinite(x).all(axis=1) for x in flat], axis=0)
 
         def changes(some):
-            left = [
-                self._residuals(
-                    s.coefficients / self.units[:, None], motion.at(some), determining[some]
-                )
-                for s in found
-            ]
+            at, terms = motion.at(some), determining[some]
+            left = [self._residuals(s.coefficients / self.units[:, None], at, terms) for s in found]
             return np.quantile(np.array(left)[:, :, 0], 0.95, axis=1)
 
         most = np.array([s.typical_residuals[0, 1] for s in found])

@@ -123,10 +123,8 @@ def actions(
     search = search_of(signal.shape[-2], num, guess, order, None, 1e-3)
     signal, scales, size = _balanced(signal)
     lines, raw = analyse(ts, signal, settings, eps, 1)
-    omega, A, resolution, every_A, code = map(
-        np.asarray,
-        (lines.frequencies, lines.amplitudes, lines.resolution, raw.amplitudes, raw.code),
-    )
+    known = lines.frequencies, lines.amplitudes, lines.resolution, raw.amplitudes, raw.code
+    omega, A, resolution, every_A, code = map(np.asarray, known)
     tori, codes = tori_of(omega, A, code, resolution, search, soft=False)
     _, combinations, _, matched, _ = tori
 

@@ -92,12 +92,6 @@ def _moments(grid: _Grid, weighted: Array, s: Array) -> Array:
     return jnp.stack([jnp.sum(m, axis=0) for m in moments])
 
 
-def _synthesis(grid: _Grid, s: Array, amplitudes: Array) -> Array:
-    """Σ_k A_k e^{is_k y} on the grid."""
-    outer = jnp.exp(1j * grid.rows[:, None] * s[None, :]) * amplitudes[None, :]
-    return outer @ jnp.exp(1j * s[:, None] * grid.columns[None, :])
-
-
 def _kernel(grid: _Grid, d: Array) -> tuple[Array, Array, Array]:
     r"""The window's transform W(d) = Σ χ e^{idy} / N with its first and second derivatives.
 
@@ -306,7 +300,8 @@ def _fitted(grid, blocks, s, A, there, with_frequencies: bool):
     """
 
     def of(s, A):
-        rest = blocks - _synthesis(grid, s, A)
+        outer = jnp.exp(1j * grid.rows[:, None] * s[None, :]) * A[None, :]
+        rest = blocks - outer @ jnp.exp(1j * s[:, None] * grid.columns[None, :])
         return rest, jnp.sum(grid.weights * jnp.abs(rest) ** 2)
 
     def step(_, now):

@@ -73,11 +73,7 @@ class _Settings(eqx.Module):
 
 
 def _settings(
-    system: System,
-    section: Section,
-    num_steps: Any,
-    keywords: dict[str, Any],
-    level: int | None = 5,
+    system: System, section: Section, num_steps, keywords: dict[str, Any], level: int | None = 5
 ) -> _Settings:
     """`level`: of the user's frame, for a warning; None: no warning."""
     integrator = chosen(**taken(keywords, INTEGRATOR))

@@ -12,6 +12,7 @@ from jax import Array, lax
 
 import lanewise
 from lanewise.jaxapi import ClosedJaxpr, Jaxpr, Literal, bodies, jaxpr_as_fun, scan_counts
+from lanewise.rules import CALLS
 from lanewise.traced import Traced
 
 from . import pair_functions as functions, pairs
@@ -116,7 +117,7 @@ def _equation(eqn: Any, values: list[Any]) -> list[Any]:
         return [_ELEMENTWISE[name](*values)]
     if name in _WITH_PARAMETERS:
         return [_WITH_PARAMETERS[name](eqn.params, *values)]
-    if name in _CALLS:
+    if name in CALLS:
         (body, *_) = bodies(eqn)
         return _evaluate(body.jaxpr, body.consts, values)
     raise NotImplementedError(
@@ -200,10 +201,6 @@ def _scatter_add(eqn: Any, values: list[Any]) -> list[Any]:
 # Powers, conversions
 
 
-def _integer_power(params: dict, x: Number) -> Number:
-    return pairs.power(x, params["y"])
-
-
 def _power(x: Number, y: Any) -> Number:
     if isinstance(y, np.floating | np.integer) and float(2 * y).is_integer() and abs(y) <= 64:
         return (
@@ -229,10 +226,6 @@ def _select(which: Array, *cases: Any) -> Any:
     if not any(map(is_pair, cases)):
         return upper
     return Pair(upper, lax.select_n(which, *(c.lo if is_pair(c) else _zero(c) for c in cases)))
-
-
-def _sign(x: Number) -> Array:
-    return jnp.sign(rounded(x))
 
 
 def _remainder(x: Number, y: Number) -> Number:
@@ -283,6 +276,7 @@ def _while(eqn: Any, values: list[Any]) -> list[Any]:
 
 def _cond(eqn: Any, values: list[Any]) -> list[Any]:
     index, *operands = values
+    # The results of all branches are pairs, so that their types agree.
     return lax.switch(index, [_closed(branch) for branch in eqn.params["branches"]], *operands)
 
 
@@ -351,12 +345,6 @@ _WHOLE: dict[str, Callable] = {
     "scatter-add": _scatter_add,
 }
 
-_CALL_NAMES = (
-    "jit pjit closed_call core_call call_hi_primitive eval_jaxpr custom_jvp_call custom_vjp_call "
-    "custom_vjp_call_jaxpr checkpoint remat remat2"
-)
-_CALLS = frozenset(_CALL_NAMES.split())
-
 _MOVE_NAMES = (
     "broadcast_in_dim reshape squeeze expand_dims transpose slice dynamic_slice concatenate pad "
     "dynamic_update_slice rev gather scatter split unstack stack copy copy_p stop_gradient real "
@@ -393,7 +381,7 @@ _ELEMENTWISE: dict[str, Callable] = {
     "clamp": _clamp,
     "floor": pairs.floor,
     "ceil": lambda x: pairs.negative(pairs.floor(pairs.negative(x))),
-    "sign": _sign,
+    "sign": lambda x: jnp.sign(rounded(x)),
     "rem": _remainder,
     "select_n": _select,
     "is_finite": lambda x: jnp.isfinite(x.hi),
@@ -404,7 +392,7 @@ _ELEMENTWISE: dict[str, Callable] = {
 }
 
 _WITH_PARAMETERS: dict[str, Callable] = {
-    "integer_pow": _integer_power,
+    "integer_pow": lambda params, x: pairs.power(x, params["y"]),
     "convert_element_type": _converted,
     "dot_general": _dot,
     "reduce_sum": _over_axes(add, 0.0),

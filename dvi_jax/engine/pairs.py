@@ -54,7 +54,8 @@ def fast_two_sum(a: Array, b: Array) -> Pair:
 
 # Compiled functions, so that each is traced once for each shape: a step has hundreds of them.
 @jax.jit
-def _sum(x: Number, y: Number) -> Pair:
+def add(x: Number, y: Number) -> Pair:
+    """x + y, relative error ≤ 3·2⁻¹⁰⁶."""
     if not isinstance(x, Pair):
         x, y = y, x
     if not isinstance(x, Pair):
@@ -85,7 +86,8 @@ def _product(x: Number, y: Number) -> Pair:
 
 
 @jax.jit
-def _quotient(x: Number, y: Number) -> Pair:
+def div(x: Number, y: Number) -> Pair:
+    """x/y, relative error ≤ 15·2⁻¹⁰⁶."""
     x, y = as_pair(x), as_pair(y)
     # Algorithm 17: the remainder of the quotient in float64, divided once more.
     first = x.hi / y.hi
@@ -105,11 +107,6 @@ def sqrt(x: Number) -> Pair:
     return fast_two_sum(root, jnp.where((root > 0) & (root < jnp.inf), lo, 0.0))
 
 
-def add(x: Number, y: Number) -> Pair:
-    """x + y, relative error ≤ 3·2⁻¹⁰⁶."""
-    return _sum(x, y)
-
-
 def negative(x: Number) -> Number:
     """−x."""
     return Pair(-x.hi, -x.lo) if isinstance(x, Pair) else -x
@@ -117,7 +114,7 @@ def negative(x: Number) -> Number:
 
 def sub(x: Number, y: Number) -> Pair:
     """x − y."""
-    return _sum(x, negative(y))
+    return add(x, negative(y))  # a change of sign is exact
 
 
 def mul(x: Number, y: Number) -> Number:
@@ -128,11 +125,6 @@ def mul(x: Number, y: Number) -> Number:
         if is_known and np.all(np.abs(np.frexp(np.asarray(a))[0]) == 0.5):
             return jax.tree.map(lambda part, a=a: part * a, b)
     return _product(x, y)
-
-
-def div(x: Number, y: Number) -> Pair:
-    """x/y, relative error ≤ 15·2⁻¹⁰⁶."""
-    return _quotient(x, y)
 
 
 def power(x: Number, n: int) -> Number:

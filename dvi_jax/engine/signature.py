@@ -32,11 +32,10 @@ def check_takes(
     if accepts(function, count):
         return
     signature = inspect.signature(function)
-    called = getattr(function, "__name__", type(function).__name__)
     hint = (hints or {}).get(len(signature.parameters), "")
     raise TypeError(
         f"{name} must take {_WORDS[count]} positional arguments {arguments}, got "
-        f"{called}{signature}. {hint}".rstrip()
+        f"{signature_of(function)}. {hint}".rstrip()
     )
 
 

@@ -120,12 +120,11 @@ class Samples:
         stats = {"diverging": self.diverging, "lp": -self.potential, "n_steps": self.steps}
         coords = {d: np.arange(n) for d, n in zip(dims, self.x.shape[:2], strict=True)}
         groups = {"posterior": self.samples, "sample_stats": stats}
-        return xr.DataTree.from_dict(
-            {
-                group: xr.Dataset({name: (dims, x) for name, x in of.items()}, coords=coords)
-                for group, of in groups.items()
-            }
-        )
+        found = {
+            group: xr.Dataset({name: (dims, x) for name, x in of.items()}, coords=coords)
+            for group, of in groups.items()
+        }
+        return xr.DataTree.from_dict(found)
 
     def to_arviz(self) -> Any:
         """Input for the functions of ArviZ: its `InferenceData`; from ArviZ 1.0 on `to_xarray`.

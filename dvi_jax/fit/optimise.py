@@ -164,12 +164,7 @@ class LeastSquaresStage:
         return self.evaluate(jnp.asarray(u), jnp.asarray(horizon), extra)
 
     def run(
-        self,
-        u: np.ndarray,
-        task: Task,
-        degrees: int,
-        first: Evaluation | None = None,
-        extra: Any = None,
+        self, u: np.ndarray, task: Task, degrees: int, first: Evaluation | None = None, extra=None
     ) -> tuple[np.ndarray, Evaluation, FIT_RESULTS]:
         """u at the minimum, the evaluation there, and the status.
 
@@ -198,23 +193,18 @@ class LeastSquaresStage:
         while not at.status and at.done < task.max_steps:
             if trial is None:
                 trial = self.at(base + scale * np.asarray(state.y_eval), horizon, extra)
-            z, state = _advance(
-                self._solver, z, (trial.residual, np.asarray(trial.jacobian) * scale), state
-            )
+            known = trial.residual, np.asarray(trial.jacobian) * scale
+            z, state = _advance(self._solver, z, known, state)
             accepted = int(state.num_steps_since_acceptance) == 0
             best, at.rejected = (trial, 0) if accepted else (best, at.rejected + 1)
             trial = None
             residual = np.asarray(best.residual)
             loss = float(residual @ residual) / 2
             spread = np.sqrt(2 * loss / max(degrees, 1))
-            moved = float(
-                np.linalg.norm(np.asarray(best.jacobian) @ (scale * np.subtract(state.y_eval, z)))
-            )
-            at.done, at.z, at.leaves, at.extra = (
-                at.done + 1,
-                np.asarray(z),
-                *map(_leaves, (state, extra)),
-            )
+            ahead = scale * np.subtract(state.y_eval, z)
+            moved = float(np.linalg.norm(np.asarray(best.jacobian) @ ahead))
+            at.done, at.z = at.done + 1, np.asarray(z)
+            at.leaves, at.extra = _leaves(state), _leaves(extra)
             u = at.u
             least = tolerance * spread
             if accepted:  # at a bound the free variable grows for ever, and nothing changes
@@ -237,10 +227,8 @@ class LeastSquaresStage:
         status = at.status or "max_steps_reached"
         if status == "stalled" and horizon == np.inf:  # of a part of the data it does not matter
             spread = float(np.linalg.norm(best.residual)) / np.sqrt(max(degrees, 1))
-            flat = _FLAT * spread
-            end = settle(
-                lambda u: self.at(u, horizon, extra), u, best, scale, flat, _SMALL * at.reach
-            )
+            flat, small = _FLAT * spread, _SMALL * at.reach
+            end = settle(lambda u: self.at(u, horizon, extra), u, best, scale, flat, small)
             if end is not None:
                 u, best, self.shifts = end
                 status = "converged"
@@ -264,9 +252,7 @@ def _scalar_function(core: Any, per: float) -> Callable[..., Any]:
         base, scale, horizon, choice = known
         return core.scalar(base + scale * z, horizon, choice) / per
 
-    @eqx.filter_custom_jvp
-    def function(z, known):
-        return value(z, known)
+    function = eqx.filter_custom_jvp(value)
 
     @function.def_jvp
     def _(primals, tangents):

@@ -79,18 +79,15 @@ class Posterior:
         free, count = int((~held).sum()), self._problem.count
         lost = not (self._problem.has_errors or self._has_density)
         if count < free + lost:
+            of_errors = ", and one for the size of the errors, because sigma is not given" * lost
             raise ValueError(
                 f"data must have at least {free + lost} observed values: one for each parameter "
-                f"that has neither a prior nor bounds on both sides (here {free})"
-                + (
-                    ", and one for the size of the errors, because sigma is not given"
-                    if lost
-                    else ""
-                )
-                + f". Got {count}: the posterior cannot be normalised. Give priors, bounds on both "
-                "sides, or more observations."
+                f"that has neither a prior nor bounds on both sides (here {free}){of_errors}. Got "
+                f"{count}: the posterior cannot be normalised. Give priors, bounds on both sides, "
+                "or more observations."
             )
-        self._slopes = self._forward if gradient == "forward" else self._reverse
+        reverse = jax.value_and_grad(self._value)
+        self._slopes = self._forward if gradient == "forward" else reverse
         self._potential = jax.jit(_guarded(self._value, self._slopes))
         self._local = jax.jit(self._exact if self._has_density else self._quadratic)
 
@@ -131,9 +128,6 @@ class Posterior:
             return self._core.scalar(u) + self._log_prior(u)
         r = self._core.residuals(u)
         return self._misfit(r @ r) + self._log_prior(u)
-
-    def _reverse(self, u: Array) -> tuple[Array, Array]:
-        return jax.value_and_grad(self._value)(u)
 
     def _forward(self, u: Array) -> tuple[Array, Array]:
         if self._has_density:

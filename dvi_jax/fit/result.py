@@ -262,12 +262,10 @@ def little_explained(found: FitResult) -> str:
     """The remark on a fit that is hardly better than a constant; empty for a better one."""
     if not found.explained < _LITTLE:
         return ""
-    than = (
-        "no better than constants do" if found.explained <= 0 else "little better than constants do"
-    )
+    how = "no better" if found.explained <= 0 else "little better"
     return (
-        f"the model describes the data {than}: this may be a local minimum, or the data are "
-        "constants and noise. Start from other parameters."
+        f"the model describes the data {how} than constants do: this may be a local minimum, or "
+        "the data are constants and noise. Start from other parameters."
     )
 
 

@@ -205,10 +205,8 @@ class Segments:
         own = self._nodes(w)[np.maximum(self.node_of, 0)]
 
         def one(node, segment):
-            def twice(x):
-                return (self._segment(x, segment),) * 2
-
-            return jax.jacfwd(twice, has_aux=True)(jnp.concatenate([w[: self.n], node]))
+            x = jnp.concatenate([w[: self.n], node])
+            return jax.jacfwd(lambda x: (self._segment(x, segment),) * 2, has_aux=True)(x)
 
         J, values = jax.vmap(one)(own, jax.tree.map(jnp.asarray, each))
         return values, J

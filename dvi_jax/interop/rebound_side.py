@@ -6,18 +6,19 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 import dvi_jax as dvi
 
 from ..engine.quantities import refuse_unit_or_mask
 from ..systems import Problem
+from ..systems._problem import at_end
 from ..systems.n_body import (
     INVARIANTS,
     PARAMETERS,
     angular_momentum,
     check_bodies,
+    energy_of,
     hamiltonian,
     linear_momentum,
     symmetries,
@@ -54,14 +55,7 @@ def softened_hamiltonian(t0, t1, q0, p1, args):
 
     `args` as in `dvi_jax.systems.n_body.hamiltonian`, and ``"softening"``: b [length].
     """
-    masses = jnp.asarray(args["masses"], q0.dtype)
-    kinetic = jnp.sum(jnp.sum(p1**2, axis=-1) / masses) / 2
-    itself = jnp.eye(masses.shape[0], dtype=bool)
-    difference = q0[:, None, :] - q0[None, :, :]
-    square = jnp.sum(difference**2, axis=-1) + args["softening"] ** 2
-    weight = jnp.where(itself, 0.0, masses[:, None] * masses[None, :])
-    distance = jnp.sqrt(jnp.where(itself, 1.0, square))
-    return kinetic - args["G"] * jnp.sum(weight / distance) / 2
+    return energy_of(q0, p1, args, args["softening"])
 
 
 @dataclass(frozen=True)
@@ -155,16 +149,12 @@ def from_rebound(
     if softening := numbers["softening"]:
         args["softening"] = softening
     function = softened_hamiltonian if softening else hamiltonian
-
-    def energy(t0, t1, q0, p0, q1, p1, args):
-        return function(t0, t1, q1, p1, args)
-
     units, parameters = _texts(_units(simulation))
     about: dict[str, Any] = {"units": units, "check": check_bodies}
     about |= {"source": "a simulation of REBOUND"}
     about |= {"parameters": {name: parameters.get(name, "b [length]") for name in args}}
     momenta = {"linear_momentum": linear_momentum, "angular_momentum": angular_momentum}
-    about |= {"observables": {"energy": energy, **momenta}}
+    about |= {"observables": {"energy": at_end(function), **momenta}}
     if not softening:
         about |= {"invariants": INVARIANTS, "symmetries": symmetries(3)}
     theirs = {"names": names, "velocities": v, "radii": rows[:, 7], "t0": numbers["t"]}

@@ -89,18 +89,12 @@ class TimeTransformed(Uniform):
         if stop is not None:
             stop = Stop(_SeenPoint(stop.g, extended))
         has_force = run.system.force is not None
-        return Run(
-            system=System(extended.hamiltonian, extended.force if has_force else None),
-            t0=jnp.zeros_like(run.t0),
-            q0=q0,
-            p0=p0,
-            # ε is inside of K and its force. Zero without a force: an ε that has no effect warns.
-            epsilon=(jnp.ones_like if has_force else jnp.zeros_like)(run.epsilon),
-            args=run.args,
-            observe=(observe, _time_gained),  # the second gives ``solution.hs``
-            save=save,
-            stop=stop,
-        ), extended.undo
+        system = System(extended.hamiltonian, extended.force if has_force else None)
+        # ε is inside of K and its force. Zero without a force: an ε that has no effect warns.
+        epsilon = (jnp.ones_like if has_force else jnp.zeros_like)(run.epsilon)
+        observe = (observe, _time_gained)  # the second gives ``solution.hs``
+        start = jnp.zeros_like(run.t0), q0, p0
+        return Run(system, *start, epsilon, run.args, observe, save, stop), extended.undo
 
 
 class Extended(eqx.Module):
@@ -220,6 +214,7 @@ class _SeenPoint(eqx.Module):
         return self.function(t, q, p, args)
 
 
+# Functions of the module, which are equal in every run: closures would be compiled again.
 def _own_time(t, q, p, args):
     return t
 

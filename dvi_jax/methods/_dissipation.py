@@ -35,7 +35,7 @@ def warn_of_dissipation(
     backwards = -min(method.substeps())
     if backwards <= 0:  # without a substep backwards not even the Jacobian is evaluated
         return
-    interval = first_interval()
+    interval = first_interval()  # made only here: most methods do not need it
     damping = float(_damping(equations, interval, q0, p0))
     growth = backwards * float(interval.h) * damping
     if growth > _STRONG and np.isfinite(growth):

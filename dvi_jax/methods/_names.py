@@ -26,29 +26,17 @@ def as_method(given: Any) -> Any:
         return given
     text = given
     plain = {
-        "TypeII": TypeII,
-        "SymplecticEuler": TypeII,
+        **dict.fromkeys(("TypeII", "SymplecticEuler"), TypeII),
         "Adjoint": Adjoint,
-        "Strang": Strang,
-        "StormerVerlet": Strang,
-        "Verlet": Strang,
-        "Leapfrog": Strang,
+        **dict.fromkeys(("Strang", "StormerVerlet", "Verlet", "Leapfrog"), Strang),
         "Rattle": Rattle,
         "Splitting": Splitting,
         "WisdomHolman": WisdomHolman,
-        "RungeKutta4": RungeKutta4,
-        "RK4": RungeKutta4,
+        **dict.fromkeys(("RungeKutta4", "RK4"), RungeKutta4),
         "ImplicitMidpoint": lambda: GaussLegendre(1),
     }
-    with_number = {
-        "Yoshida": Yoshida,
-        "Suzuki": Suzuki,
-        "BlanesMoan": BlanesMoan,
-        "McLachlan": McLachlan,
-        "KahanLi": KahanLi,
-        "GaussLegendre": GaussLegendre,
-        "LobattoIIIAIIIB": LobattoIIIAIIIB,
-    }
+    kinds = Yoshida, Suzuki, BlanesMoan, McLachlan, KahanLi, GaussLegendre, LobattoIIIAIIIB
+    with_number = {kind.__name__: kind for kind in kinds}
     key = re.sub(r"[\s_-]", "", text).lower().replace("ö", "o").removesuffix("()")
     for name, make in plain.items():
         if key == name.lower():

@@ -50,16 +50,10 @@ def _on_oscillator(rng, tick: Tick) -> dict[str, Any]:
     gauges = dvi.solve_gauge(spring.system, [SCALING] * 2, dvi.Polynomials(4), h=H, samples=line)
     tick(0.6)
     printed = series(*((order, name, 0.5) for order in (0, 1) for name in ("q²", "p²")))
-    order = dvi.drift_order(
-        spring.system,
-        dvi.InvariantSeries(found.basis, jnp.asarray(printed)),
-        spring.q0,
-        spring.p0,
-        epsilons=[1e-4, 2e-4, 1e-3, 1e-2, 1e-1],
-        h=0.01,
-        num_steps=20_000,
-        method=dvi.Yoshida(4),
-    )
+    printed = dvi.InvariantSeries(found.basis, jnp.asarray(printed))
+    how: Any = {"h": 0.01, "num_steps": 20_000, "method": dvi.Yoshida(4)}
+    how["epsilons"] = [1e-4, 2e-4, 1e-3, 1e-2, 1e-1]
+    order = dvi.drift_order(spring.system, printed, spring.q0, spring.p0, **how)
     tick(1.0)
     return {
         "oscillator": str(found.invariants[0]) if found.count else "",
@@ -88,12 +82,8 @@ def _on_kepler(rng, tick: Tick) -> dict[str, Any]:
     kept = dvi.discover_invariants(kepler.system, basis, 1, h=H, **samples)
     tick(0.6)
     hs = np.array([0.1, 0.05, 0.025])
-    left = [
-        dvi.solve_gauge(
-            kepler.system, clocked, dvi.Polynomials(4), h=float(h), **samples
-        ).residuals[1]
-        for h in hs
-    ]
+    given = kepler.system, clocked, dvi.Polynomials(4)
+    left = [dvi.solve_gauge(*given, h=float(h), **samples).residuals[1] for h in hs]
     tick(0.9)
     linear = dvi.Polynomials(1, constant=True)
     symmetries = dvi.find_symmetries(kepler.system, linear, h=H, **samples)
@@ -128,9 +118,8 @@ def _outside(found: dvi.Symmetries, samples) -> float:
 
     def at_samples(generator):
         def one(q, p):
-            return jnp.concatenate(
-                [jnp.ravel(x) for x in generator(dvi.LatticePoint(jnp.zeros(()), q, p))]
-            )
+            point = dvi.LatticePoint(jnp.zeros(()), q, p)
+            return jnp.concatenate([jnp.ravel(x) for x in generator(point)])
 
         return np.asarray(jax.vmap(one)(*samples)).ravel()
 

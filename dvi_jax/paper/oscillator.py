@@ -168,9 +168,5 @@ def small_step(tick: Tick) -> SmallStep:
         return run(problem, h, round(200 / h), **options).observed
 
     found, start = jax.vmap(ranges)(jnp.asarray(epsilons)), _start(problem)
-    return SmallStep(
-        h=h,
-        epsilons=epsilons,
-        printed=np.asarray(found["printed"]) / start,
-        corrected=np.asarray(found["corrected"]) / start,
-    )
+    both = (np.asarray(found[name]) / start for name in ("printed", "corrected"))
+    return SmallStep(h, epsilons, *both)

@@ -75,18 +75,9 @@ def _lattice_forms():
         return driven(t0, t1, q0, p1, None)
 
     def forms(h, start):
-        solution = dvi.integrate(
-            system,
-            jnp.cos(start)[None],
-            jnp.sin(2 * start)[None] + 0.5,
-            t0=start,
-            h=h,
-            num_steps=2,
-            epsilon=EPSILON,
-        )
-        points = [
-            dvi.LatticePoint(*x) for x in zip(solution.ts, solution.qs, solution.ps, strict=True)
-        ]
+        q0, p0 = jnp.cos(start)[None], jnp.sin(2 * start)[None] + 0.5
+        sol = dvi.integrate(system, q0, p0, t0=start, h=h, num_steps=2, epsilon=EPSILON)
+        points = [dvi.LatticePoint(*x) for x in zip(sol.ts, sol.qs, sol.ps, strict=True)]
         (t_, q_, _), (t0, q0, p0), (t1, q1, p1) = points
         before, after = (t_, t0, q_, p0), (t0, t1, q0, p1)
         work = EPSILON * jnp.sum(-q0 * (q1 - q0))
@@ -95,12 +86,8 @@ def _lattice_forms():
         slot = change + h * jax.grad(H, 0)(*before) + H(*before) + work
 
         def action(t):
-            return (
-                jnp.sum(p0 * (q0 - q_))
-                - (t - t_) * H(t_, t, q_, p0)
-                + jnp.sum(p1 * (q1 - q0))
-                - (t1 - t) * H(t, t1, q0, p1)
-            )
+            first = jnp.sum(p0 * (q0 - q_)) - (t - t_) * H(t_, t, q_, p0)
+            return first + jnp.sum(p1 * (q1 - q0)) - (t1 - t) * H(t, t1, q0, p1)
 
         still = jnp.zeros(())
         gap = jax.grad(action)(t0) / (t1 - t0) - dvi.lattice_defect(free, points, still)

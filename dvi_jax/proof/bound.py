@@ -136,10 +136,8 @@ def bound_drift(
         )
     h = check_step_size(h)
     shape, (lower, upper) = _domain(domain, found)
-    strengths, times = (
-        _interval("epsilon", epsilon),
-        None if time is None else _interval("time", time),
-    )
+    strengths = _interval("epsilon", epsilon)
+    times = None if time is None else _interval("time", time)
     functions = _functions(found, system, time is not None)
     stepped, programs = _step_of(system, how, shape, args, h, times)
     digits = "pairs of float64" if isinstance(how.arithmetic, DoubleDouble) else "float64"
@@ -164,8 +162,8 @@ def bound_drift(
         "spread": [(0.0).hex()] * n,
     }
     if certificate["implicit"]:
-        guess = _spread(stepped, shape, (lower, upper), strengths, times, h)
-        certificate["spread"] = guess
+        sides = lower, upper
+        certificate["spread"] = _spread(stepped, shape, sides, strengths, times, h)
     checker = exact.Checker(certificate)
     seen = search.estimate(checker)
     identities = frozenset(k for k, s in enumerate(seen) if s == 0 and checker.is_identity(k))

@@ -287,11 +287,10 @@ def subdivide(
             "inside(q, p) must be ≥ 0 for some states of the domain, but for each state it has a "
             "negative value: correct inside or domain"
         )
-    columns = (
+    bounds, rounding, moved = (
         [max(column) for column in zip(*(getattr(leaf, name) for leaf in inner), strict=True)]
         for name in ("bounds", "rounding", "moved")
     )
-    bounds, rounding, moved = columns
     seen = [0.0 if k in identities else s for k, s in enumerate(best)]
     return Found(_tree(root), count, bounds, seen, rounding, moved)
 

@@ -79,9 +79,7 @@ def description(
 def _example(sweep: Sweep) -> tuple[Any, Any, Any]:
     """(q0, args, t0) of the first trajectory; of q0 only shape and type matter."""
     first = jax.tree.map(
-        lambda x: jnp.asarray(x.values[0]) if is_axis(x) else x,
-        dict(sweep.inputs),
-        is_leaf=is_axis,
+        lambda x: jnp.asarray(x.values[0]) if is_axis(x) else x, dict(sweep.inputs), is_leaf=is_axis
     )
     if sweep.start is None:
         q0 = jnp.asarray(stacked(first["q0"]))

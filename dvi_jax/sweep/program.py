@@ -130,16 +130,10 @@ def lanes_of(sweep: Sweep, task_start: tuple[int, ...], values: Any) -> Lanes:
             return Rows(values(leaf), leaf.name)
         return leaf.values[task_start[list(sweep.dims).index(leaf.name)]]
 
-    return Lanes(
-        sweep.system,
-        jax.tree.map(known, dict(sweep.inputs), is_leaf=is_axis),
-        sweep.start,
-        sweep.value(sweep.method, task_start),
-        dict(sweep.options),
-        sweep.value(sweep.num_steps, task_start),
-        tuple(sweep.of_grid),
-        reads(*sweep.options.values()),
-    )
+    inputs = jax.tree.map(known, dict(sweep.inputs), is_leaf=is_axis)
+    method, steps = (sweep.value(x, task_start) for x in (sweep.method, sweep.num_steps))
+    rest = dict(sweep.options), steps, tuple(sweep.of_grid), reads(*sweep.options.values())
+    return Lanes(sweep.system, inputs, sweep.start, method, *rest)
 
 
 def _batch(lanes: Lanes, chunk: tuple[int, ...], begin: Any, last: Any) -> dict[str, Any]:

@@ -82,18 +82,11 @@ class Counter:
             return
         seconds = time.monotonic() - self.began
         todo = self.plan.lanes - self.lanes_before
-        self.report(
-            SweepProgress(
-                tasks_done=self.before + self.done,
-                num_tasks=self.plan.num_tasks,
-                lanes_done=self.lanes_before + self.lanes,
-                num_lanes=self.plan.lanes,
-                failed=self.failed,
-                rate=self.steps / seconds if seconds > 0 else 0.0,
-                seconds=seconds,
-                seconds_left=seconds * (todo / self.lanes - 1) if self.lanes else math.nan,
-            )
-        )
+        tasks = self.before + self.done, self.plan.num_tasks
+        lanes = self.lanes_before + self.lanes, self.plan.lanes
+        rate = self.steps / seconds if seconds > 0 else 0.0
+        left = seconds * (todo / self.lanes - 1) if self.lanes else math.nan
+        self.report(SweepProgress(*tasks, *lanes, self.failed, rate, seconds, left))
 
 
 def compute(

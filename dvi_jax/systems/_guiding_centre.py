@@ -33,10 +33,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 _HALVINGS = 54
 """Halvings of the interval that contains the mirror point, which give all its digits."""
 
-PARTICLE = {
-    "charge": Parameter(1.0, "e [charge]", gyrates),
-    "mass": Parameter(1.0, "m [mass]"),
-}
+PARTICLE = {"charge": Parameter(1.0, "e [charge]", gyrates), "mass": Parameter(1.0, "m [mass]")}
 
 
 def adiabatic(small: str, smaller: Callable[[float], Problem]) -> dict[str, Adiabatic]:

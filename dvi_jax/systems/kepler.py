@@ -51,7 +51,7 @@ def kepler() -> Problem:
         p0=[-1.0, -0.6],
         h=0.1,
         parameters={
-            "K": Parameter(1.0, "root of the strength of attraction, K² = GM [length^(3/2)/time]"),
+            "K": Parameter(1.0, "root of the strength of attraction, K² = GM [length^(3/2)/time]")
         },
         force=linear_force,
         observables=[mixed_energy, angular_momentum],

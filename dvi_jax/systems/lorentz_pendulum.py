@@ -4,15 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ._elliptic import swing
-from ._problem import (
-    Adiabatic,
-    Parameter,
-    Problem,
-    Start,
-    at_end,
-    between,
-    library_problem,
-)
+from ._problem import Adiabatic, Parameter, Problem, Start, at_end, between, library_problem
 from .pendulum import exact as of_pendulum
 
 

@@ -97,8 +97,7 @@ def magnetic_mirror(length: float = 20.0, distance: float = 2.0) -> Problem:
         source="our own choice of field; Northrop 1963, The Adiabatic Motion of Charged Particles",
         invariants=("canonical_angular_momentum",),
         adiabatic=guiding_centre.adiabatic(
-            "gyroradius over ℓ",
-            lambda factor: magnetic_mirror(length / factor, distance / factor),
+            "gyroradius over ℓ", lambda factor: magnetic_mirror(length / factor, distance / factor)
         ),
         symmetries={"rotation": rotation(0, 1)},
     )

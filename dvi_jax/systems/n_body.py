@@ -39,13 +39,20 @@ def hamiltonian(t0, t1, q0, p1, args):
 
     **Raises** `ValueError` when the shapes of q0 and masses do not agree.
     """
+    return energy_of(q0, p1, args)
+
+
+def energy_of(q0, p1, args, softening=None):
+    """`hamiltonian`, of Plummer's law where there is a `softening` [length]."""
     masses = masses_of(q0, args)
     kinetic = jnp.sum(jnp.sum(p1**2, axis=-1) / masses) / 2
     # Every pair twice, and a body with itself at distance 1 but with weight 0: dense arrays
     # that one kernel can run through, where a list of pairs would gather and scatter.
     itself = jnp.eye(masses.shape[0], dtype=bool)
     difference = q0[:, None, :] - q0[None, :, :]
-    distance = jnp.sqrt(jnp.where(itself, 1.0, jnp.sum(difference**2, axis=-1)))
+    square = jnp.sum(difference**2, axis=-1)
+    square = square if softening is None else square + softening**2
+    distance = jnp.sqrt(jnp.where(itself, 1.0, square))
     weight = jnp.where(itself, 0.0, masses[:, None] * masses[None, :])
     return kinetic - args.get("G", 1.0) * jnp.sum(weight / distance) / 2
 

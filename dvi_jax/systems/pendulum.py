@@ -88,9 +88,7 @@ def pendulum() -> Problem:
         q0=np.array([1.5]),
         p0=np.array([1.0]),
         h=0.1,
-        parameters={
-            "omega": Parameter(1.0, "frequency of small oscillations [1/time]"),
-        },
+        parameters={"omega": Parameter(1.0, "frequency of small oscillations [1/time]")},
         force=friction,
         observables=[action],
         units={"q": "rad", "p": "1", "t": "1", "energy": "1"},

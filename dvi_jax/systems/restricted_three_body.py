@@ -89,27 +89,19 @@ def restricted_three_body() -> Problem:
     **Source** Szebehely 1967, *Theory of Orbits*, 1 and 4.
     """
     q0 = lagrange_points(EARTH_MOON)[3] + [0.01, 0.0, 0.02]
+    bodies = {
+        "the large body": lambda args: (-args["mu"], 0.0, 0.0),
+        "the small body": lambda args: (1 - args["mu"], 0.0, 0.0),
+    }
+    meaning = "share of the small body in the mass of both, at most 1/2 [1]"
     return library_problem(
         hamiltonian,
-        Start(
-            "the restricted problem has one body in space",
-            (3,),
-            singular={
-                "the large body": lambda args: (-args["mu"], 0.0, 0.0),
-                "the small body": lambda args: (1 - args["mu"], 0.0, 0.0),
-            },
-        ),
+        Start("the restricted problem has one body in space", (3,), singular=bodies),
         name="restricted_three_body",
         q0=q0,
         p0=np.array([-q0[1], q0[0], 0.0]),
         h=0.02,
-        parameters={
-            "mu": Parameter(
-                EARTH_MOON,
-                "share of the small body in the mass of both, at most 1/2 [1]",
-                _mass_fraction,
-            ),
-        },
+        parameters={"mu": Parameter(EARTH_MOON, meaning, _mass_fraction)},
         observables=[jacobi_constant, angular_momentum],
         units=DIMENSIONLESS | {"q": "distance of the bodies", "t": "period/2π"},
         source="Szebehely 1967, Theory of Orbits, 1 and 4",

@@ -4,15 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..discover.library import scaling
-from ._problem import (
-    Adiabatic,
-    Parameter,
-    Problem,
-    Start,
-    at_end,
-    between,
-    library_problem,
-)
+from ._problem import Adiabatic, Parameter, Problem, Start, at_end, between, library_problem
 from .oscillator import exact as of_oscillator
 
 
@@ -56,7 +48,7 @@ def slow_oscillator() -> Problem:
         p0=np.array([0.3]),
         h=0.1,
         parameters={
-            "depth": Parameter(0.3, "relative change of the frequency [1]", between(-1, 1)),
+            "depth": Parameter(0.3, "relative change of the frequency [1]", between(-1, 1))
         },
         slow_time=True,
         observables=[action],

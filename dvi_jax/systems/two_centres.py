@@ -48,16 +48,13 @@ def two_centres() -> Problem:
     **Source** Euler 1760; Whittaker 1937, *Analytical Dynamics*, §53; Erikson & Hill 1949, *Phys.
     Rev.* 75, 29.
     """
+    centres = {
+        "the first centre": lambda args: (0.0, 0.0, args["d"]),
+        "the second centre": lambda args: (0.0, 0.0, -args["d"]),
+    }
     return library_problem(
         hamiltonian,
-        Start(
-            "the problem of two centres is in space",
-            (3,),
-            singular={
-                "the first centre": lambda args: (0.0, 0.0, args["d"]),
-                "the second centre": lambda args: (0.0, 0.0, -args["d"]),
-            },
-        ),
+        Start("the problem of two centres is in space", (3,), singular=centres),
         name="two_centres",
         q0=np.array([2.0, 0.0, 0.5]),
         p0=np.array([0.1, 0.6, 0.5]),

@@ -147,9 +147,7 @@ CONTROLS: tuple[Control, ...] = (
     Control("explicit Euler in place of TypeII", "symplecticity", altered(_FIRST, _explicit_euler)),
     Control("TypeII declared to be symmetric", "reversal", altered(_FIRST, is_symmetric=True)),
     Control(
-        "TypeII with the step −h as its inverse",
-        "adjoint",
-        altered(_FIRST, inverse=_backwards),
+        "TypeII with the step −h as its inverse", "adjoint", altered(_FIRST, inverse=_backwards)
     ),
     Control("RungeKutta4 declared to be symplectic", "energy", _RK4),
     Control("RungeKutta4 declared to be symplectic", "momentum", _RK4),

@@ -52,15 +52,11 @@ def _energy(t0, t1, q0, p1, args):
     return p1 @ p1 / 2 - 1 / jnp.sqrt(q0 @ q0)
 
 
-def _drag(t0, t1, q0, p1, args):
-    return -q0
-
-
 def _pendulum(t, q, p, args):
     return jnp.sum(p * p) / 2 - jnp.sum(jnp.cos(q))
 
 
-_KEPLER = dvi.System(_energy, force=_drag)
+_KEPLER = dvi.System(_energy, force=lambda t0, t1, q0, p1, args: -q0)
 _PENDULUM = dvi.System(dvi.discretise(_pendulum))
 
 

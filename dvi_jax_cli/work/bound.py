@@ -61,14 +61,9 @@ def _contents(bound: dvi.DriftBound) -> dict[str, Any]:
 
 
 def _tables(bound: dvi.DriftBound) -> list[Table]:
-    rows = [
-        [
-            f"I_{k}",
-            f"{b:.2e}",
-            f"{bound.rounding[k]:.2e}",
-            f"{bound.num_steps(bound.change, k):.3g}",
-        ]
-        for k, b in enumerate(bound.per_step)
-    ]
+    rows = []
+    for k, b in enumerate(bound.per_step):
+        steps = bound.num_steps(bound.change, k)
+        rows.append([f"I_{k}", f"{b:.2e}", f"{bound.rounding[k]:.2e}", f"{steps:.3g}"])
     columns = ["invariant", "change in a step ≤", "by rounding ≤", f"steps for {bound.change:g}"]
     return [Table("Proved bounds", columns, rows)]

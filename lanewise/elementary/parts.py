@@ -41,11 +41,7 @@ def where(condition: Array, x: Array | float, y: Array | float) -> Array:
 def unless(is_ordinary: Array, ordinary: Array, extreme: Callable[..., Array], *args: Array):
     """`ordinary`, and `extreme(*args)` in a branch for the other arguments, NaN among them."""
     return lax.cond(
-        is_ordinary,
-        lambda ordinary, *_: ordinary,
-        lambda _, *args: extreme(*args),
-        ordinary,
-        *args,
+        is_ordinary, lambda ordinary, *_: ordinary, lambda _, *args: extreme(*args), ordinary, *args
     )
 
 

@@ -81,17 +81,14 @@ def _end(line: _Line, zeta: Array, direction: float, turns: float) -> tuple[Arra
     most = 2 * np.pi * turns / jnp.abs(step)
     fixed = lax.stop_gradient(line)
 
-    def proceed(state):
-        k, _, ahead = state
-        return (ahead > 0) & (k < most)
-
     def advance(state):
         k, _, ahead = state
         return k + 1, ahead, fixed.parallel(zeta + (k + 1) * step)
 
     # A point where the guiding centre bounces is inside of its well, up to rounding.
     begin = jnp.maximum(fixed.parallel(zeta), 0.0)
-    k, behind, ahead = lax.while_loop(proceed, advance, (0.0 * step, begin, 0.0 * step + 1.0))
+    state = 0.0 * step, begin, 0.0 * step + 1.0
+    k, behind, ahead = lax.while_loop(lambda x: (x[2] > 0) & (x[0] < most), advance, state)
     exists = ahead <= 0
     a, b = zeta + (k - 1) * step, zeta + k * step
     return bracketed_root(line.parallel, a, behind, b, ahead, exists), exists
@@ -109,14 +106,7 @@ def _line(field: Field, s, theta, zeta, mu, energy) -> _Line:
 
 
 def well(
-    field: Field,
-    s: Any,
-    theta: Any,
-    zeta: Any,
-    mu: Any,
-    energy: Any = 0.5,
-    *,
-    turns: float = 10.0,
+    field: Field, s: Any, theta: Any, zeta: Any, mu: Any, energy: Any = 0.5, *, turns: float = 10.0
 ) -> Well:
     r"""Bounce points μB = E on the field line through a point, on both sides of it.
 
@@ -131,14 +121,7 @@ def well(
 
 
 def second_invariant(
-    field: Field,
-    s: Any,
-    theta: Any,
-    zeta: Any,
-    mu: Any,
-    energy: Any = 0.5,
-    *,
-    turns: float = 10.0,
+    field: Field, s: Any, theta: Any, zeta: Any, mu: Any, energy: Any = 0.5, *, turns: float = 10.0
 ) -> Array:
     r"""Second adiabatic invariant J∥ = 2 ∫ √(2(E − μB)) (G + ιI)/B dζ between bounce points [m].
 

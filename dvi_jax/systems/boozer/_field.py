@@ -79,16 +79,10 @@ class Field(eqx.Module):
         B, a = positive("B", B), positive("minor_radius", minor_radius)
         b = B / self.average
         length = a / jnp.sqrt(2 * self.psi_edge / self.average)
+        current = None if self.I is None else self.I * b * length
+        new = self.psi_edge * b * length**2, self.coefficients * b, self.G * b * length, current
         return eqx.tree_at(
-            lambda f: (f.psi_edge, f.coefficients, f.G, f.I),
-            self,
-            (
-                self.psi_edge * b * length**2,
-                self.coefficients * b,
-                self.G * b * length,
-                None if self.I is None else self.I * b * length,
-            ),
-            is_leaf=lambda x: x is None,
+            lambda f: (f.psi_edge, f.coefficients, f.G, f.I), self, new, is_leaf=lambda x: x is None
         )
 
     def split(self, helicity: int | None = None) -> "tuple[Field, Coefficients]":
@@ -189,14 +183,8 @@ def from_modes(
             "I must be zero on the axis (the toroidal current inside of a surface of no area), got "
             f"the constant {profiles[2][0]}. Give I as [0, ...]: the coefficients of s, s², …"
         )
-    field = Field(
-        jnp.asarray(float(psi_edge)),
-        jnp.asarray(table),
-        jnp.asarray(profiles[0]),
-        jnp.asarray(profiles[1]),
-        None if I is None else jnp.asarray(profiles[2]),
-        Shape(periods, h),
-    )
+    *arrays, current = (jnp.asarray(x) for x in (float(psi_edge), table, *profiles))
+    field = Field(*arrays, None if I is None else current, Shape(periods, h))
     _check_positive(field)
     return field
 

@@ -74,6 +74,15 @@ class _Weighted(eqx.Module):
         return 16 * jnp.pi / 3 * weight * flux(self.chart, q, p, args)
 
 
+def _run(particles: GuidingCentres, start: Any, num_steps: int, h: Any, more: dict, **how: Any):
+    """A run of one particle, of which the last state is saved; `more`: further args."""
+    q, p, args = particles.state(*start)
+    how |= {"h": h, "num_steps": num_steps, "args": args | more, "method": GaussLegendre(2)}
+    epsilon = None if particles.breaking is None else 1.0
+    save = Save(final=True)
+    return integrate(particles.system, q, p, epsilon=epsilon, save=save, throw=False, **how)
+
+
 def radial_drift(
     particles: GuidingCentres, start: Any, *, num_steps: int = 650, h: Any = 4.0
 ) -> tuple[Array, Array]:
@@ -101,21 +110,8 @@ def radial_drift(
     """
     instance("particles", particles, GuidingCentres, "such as boozer.GuidingCentres(field)")
     num_steps = whole("num_steps", num_steps)
-    q, p, args = particles.state(*start)
-    sol = integrate(
-        particles.system,
-        q,
-        p,
-        h=h,
-        num_steps=num_steps,
-        args={**args, "duration": num_steps * h},
-        epsilon=None if particles.breaking is None else 1.0,
-        method=GaussLegendre(2),
-        adjoint=Reversible(checkpoint_every=25),
-        observe=Mean(_Weighted(particles.chart)),
-        save=Save(final=True),
-        throw=False,
-    )
+    how = {"adjoint": Reversible(checkpoint_every=25), "observe": Mean(_Weighted(particles.chart))}
+    sol = _run(particles, start, num_steps, h, {"duration": num_steps * h}, **how)
     succeeded = sol.result == RESULTS.successful
     return -jnp.where(succeeded, sol.observed, 0.0), succeeded
 
@@ -158,20 +154,7 @@ def lost_at(particles: GuidingCentres, start: Any, *, num_steps: int, h: Any = 4
 
     Arguments as for `radial_drift`. It has no useful derivative.
     """
-    q, p, args = particles.state(*start)
-    sol = integrate(
-        particles.system,
-        q,
-        p,
-        h=h,
-        num_steps=whole("num_steps", num_steps),
-        args=args,
-        epsilon=None if particles.breaking is None else 1.0,
-        method=GaussLegendre(2),
-        stop=particles.loss,
-        save=Save(final=True),
-        throw=False,
-    )
+    sol = _run(particles, start, whole("num_steps", num_steps), h, {}, stop=particles.loss)
     seconds = particles.seconds(sol.stop.t)
     stays = sol.result == RESULTS.successful
     return lax.stop_gradient(jnp.where(stays, jnp.inf, seconds))

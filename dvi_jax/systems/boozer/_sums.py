@@ -91,8 +91,7 @@ def _over_k(c: Any, s: Any, phases: Complex, n: Any, order: int) -> tuple[Comple
             imaginary = _polynomials(c_k[1], s, order)
             terms = [_plus(x, _turned(y, e)) for x, y in zip(terms, imaginary, strict=True)]
         if order >= 1:
-            by_zeta = [_turned(n, x) for x in terms[:order]]
-            terms = [*terms, *by_zeta]
+            terms += [_turned(n, x) for x in terms[:order]]
         if order == 2:
             terms.append(_turned(n, terms[3]))
         return tuple(_plus(x, y) for x, y in zip(sums, terms, strict=True)), None
@@ -135,14 +134,8 @@ def derivatives(c: Coefficients, shape: Shape, x: Any, y: Any, zeta: Any, order:
         if order == 2:
             A_szeta, A_zetazeta = rest
             down_twice = _scaled(m * (m - 1), w2)
-            terms += [
-                _times(w0, A_ss)[0],
-                *_times(down, A_s),
-                *_times(down_twice, A),
-                _times(w0, A_szeta)[0],
-                *_times(down, A_zeta),
-                _times(w0, A_zetazeta)[0],
-            ]
+            terms += [_times(w0, A_ss)[0], *_times(down, A_s), *_times(down_twice, A)]
+            terms += [_times(w0, A_szeta)[0], *_times(down, A_zeta), _times(w0, A_zetazeta)[0]]
         return tuple(a + b for a, b in zip(sums, terms, strict=True)), None
 
     start = tuple(zero for _ in range((1, 5, 14)[order]))
@@ -156,15 +149,9 @@ def derivatives(c: Coefficients, shape: Shape, x: Any, y: Any, zeta: Any, order:
     if order == 1:
         return first
     SS, TSr, TSi, Ur, Ui, SZ, TZr, TZi, ZZ = rest
-    return (
-        *first,
-        2 * S + 4 * x * (x * SS + TSr) + Ur,
-        4 * x * y * SS + 2 * (y * TSr - x * TSi) - Ui,
-        2 * x * SZ + TZr,
-        2 * S + 4 * y * (y * SS - TSi) - Ur,
-        2 * y * SZ - TZi,
-        ZZ,
-    )
+    xx, xy = 2 * S + 4 * x * (x * SS + TSr) + Ur, 4 * x * y * SS + 2 * (y * TSr - x * TSi) - Ui
+    xz, yy = 2 * x * SZ + TZr, 2 * S + 4 * y * (y * SS - TSi) - Ur
+    return (*first, xx, xy, xz, yy, 2 * y * SZ - TZi, ZZ)
 
 
 # With derivatives by autodiff each order would be a new sum over all modes, and a step would have
