@@ -26,24 +26,14 @@ from ._inputs import as_parameter, as_scalar, start_state
 from ._integrator import Integrator, chosen
 from ._noisy import noise_path
 from ._observables import check_observe, observed, with_initial_values
-from ._plan import check_memory
+from ._plan import Plan, check_memory, make_plan
 from ._progress import bar_of, told
 from ._results import RESULTS, IntegrationError, status_code, status_name
-from ._rollout import (
-    Outcome,
-    Plan,
-    StepTaken,
-    Task,
-    make_plan,
-    reduce,
-    run,
-    start,
-    with_start,
-    with_tail,
-)
+from ._rollout import reduce, run, start, with_start, with_tail
 from ._solution import Save, Solution
 from ._step import Equations
 from ._system import System, check_system, of_problem
+from ._task import Outcome, StepTaken, Task
 from ._types import Interval
 from .engine.newton import RootSolver, over
 from .engine.reads import reads

@@ -1,7 +1,6 @@
 """Diffusion of an adiabatic invariant by noise, measured and predicted."""
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -92,24 +91,22 @@ def invariant_diffusion(
         s, _ = system.times(t, t, epsilon)
         none = jnp.zeros(noise.count(s, q, p, args), q.dtype)
 
-        def friction(q, p):
-            return jnp.zeros_like(q), noise.force(s, q, p, args, none)
+        def along(f):
+            """(Ḃ, q, p) → the derivative of f along b + Σ_m g_m Ḃ_m."""
 
-        def g(rates, q, p):
-            along_q, along_p = jax.grad(noise.energy, (1, 2))(s, q, p, args, rates)
-            force = noise.force(s, q, p, args, rates) - noise.force(s, q, p, args, none)
-            return along_p, force - along_q
+            def derivative(rates, *z):
+                by_q, by_p = jax.grad(noise.energy, (1, 2))(s, *z, args, rates)
+                return jax.jvp(f, z, (by_p, noise.force(s, *z, args, rates) - by_q))[1]
 
-        def along(f, field):
-            return lambda *z: jax.jvp(f, z, field(*z))[1]
+            return derivative
 
-        def of_one(rates):
-            first = along(lambda q, p: value(t, q, p, args), functools.partial(g, rates))
-            return along(first, functools.partial(g, rates))(q, p), first(q, p) ** 2
+        def by_noise(*z):
+            """g_m·∇I, shape (m,)."""
+            return jax.grad(rate)(none, *z)
 
-        second, square = jax.vmap(of_one)(jnp.diag(jnp.ones_like(none)))
-        by_friction = along(lambda q, p: value(t, q, p, args), friction)(q, p)
-        return jnp.stack([by_friction + jnp.sum(second) / 2, jnp.sum(square)])
+        rate = along(lambda q, p: value(t, q, p, args))
+        second = jnp.trace(jax.jacfwd(along(by_noise))(none, q, p))
+        return jnp.stack([rate(none, q, p) + second / 2, jnp.sum(by_noise(q, p) ** 2)])
 
     def end(system, **more):
         sol = integrate(system, q0, p0, save=Save(final=True), **settings, **more)

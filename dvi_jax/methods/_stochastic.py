@@ -1,16 +1,17 @@
 """Methods for systems with noise."""
 
 import dataclasses
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._step import Equations, StepInfo, no_step_yet
+from .._step import Equations
 from .._system import System
-from .._types import Args, Interval, Scalar, State
+from .._types import Interval, Scalar, State
+from ..noise import NoiseHamiltonians
 from ._base import Method
 from ._composition import CompositionMethod
 from ._gauss_legendre import GaussLegendre
@@ -40,32 +41,32 @@ class Driven(eqx.Module):
     perturbation: ClassVar[None] = None
     force: ClassVar[str] = "that of noise"
 
-    def hamiltonian(
-        self, t0: Scalar, t1: Scalar, q0: State, p1: State, epsilon: Scalar, args: Args
-    ) -> Scalar:
+    def hamiltonian(self, t0, t1, q0, p1, epsilon, args) -> Scalar:
         # By this path derivatives of every method contain the noise, and the inverse exists.
         H, noise = self.system.hamiltonian(t0, t1, q0, p1, epsilon, args), self.system.noise
-        if noise is None or noise.is_on_momenta:
+        if not isinstance(noise, NoiseHamiltonians):
             return H
         s, _ = self.system.times(t0, t1, epsilon)
-        G, (along_q, along_p) = jax.value_and_grad(
-            lambda q, p: noise.energy(s, q, p, args, self.rates), (0, 1)
-        )(q0, p1)
-        return H + G + (self.h / 2 * jnp.sum(along_q * along_p) if self.is_map else 0)
+        G, slopes = jax.value_and_grad(noise.energy, (1, 2))(s, q0, p1, args, self.rates)
+        return H + G + (self.h / 2 * jnp.sum(slopes[0] * slopes[1]) if self.is_map else 0)
 
-    def disturbing_force(
-        self, t0: Scalar, t1: Scalar, q0: State, p1: State, epsilon: Scalar, args: Args
-    ) -> State:
+    def disturbing_force(self, t0, t1, q0, p1, epsilon, args) -> State:
         # Not multiplied by ε, as the force of the user is.
         force = self.system.disturbing_force(t0, t1, q0, p1, epsilon, args)
         s, _ = self.system.times(t0, t1, epsilon)
         return force + self.system.noise.force(s, q0, p1, args, self.rates)  # pyright: ignore
 
 
+def _place(equations: Equations, t: Scalar, q: State, p: State) -> tuple[Any, ...]:
+    """(t, q, p, args), the arguments of the functions of noise."""
+    s, _ = equations.system.times(t, t, equations.epsilon)
+    return s, *equations.absolute(q, p), equations.args
+
+
 class _WithNoise(Method):
     """Base of the methods that are those of a system without noise on `Driven` systems."""
 
-    without: ClassVar[Method]
+    plain: ClassVar[Method]
 
     is_symplectic: ClassVar[bool] = True
     is_invertible: ClassVar[bool] = True
@@ -73,34 +74,32 @@ class _WithNoise(Method):
 
     # Both with the rates of the step forwards, so that the inverse goes back along the same path.
     def step(self, equations, interval, q0, p0):
-        return self.without.step(self._driven(equations, interval, q0, p0), interval, q0, p0)
+        return self.plain.step(self._driven(equations, interval, q0, p0), interval, q0, p0)
 
     def inverse(self, equations, interval, q1, p1):
-        return self.without.inverse(self._driven(equations, interval, q1, p1), interval, q1, p1)
+        return self.plain.inverse(self._driven(equations, interval, q1, p1), interval, q1, p1)
 
     def needs_no_solve(self, equations, interval, q):
-        driven = self._driven(equations, interval, q, q)
-        return self.without.needs_no_solve(driven, interval, q)
+        return self.plain.needs_no_solve(self._driven(equations, interval, q, q), interval, q)
 
     def inverse_needs_no_solve(self, equations, interval, q):
         driven = self._driven(equations, interval, q, q)
-        return self.without.inverse_needs_no_solve(driven, interval, q)
+        return self.plain.inverse_needs_no_solve(driven, interval, q)
 
     def _driven(self, equations: Equations, interval: Interval, q: State, p: State) -> Equations:
-        system, noise, dB = equations.system, equations.system.noise, equations.increments
+        noise, dB = equations.system.noise, equations.increments
         if noise is None:
             return equations
-        s, _ = system.times(*interval[:2], equations.epsilon)
-        at = (s, *equations.absolute(q, p), equations.args)
+        at, is_map = _place(equations, interval.t0, q, p), self.plain.is_the_map
         # The midpoint rule needs no such test: it evaluates σ in the middle of the step.
-        if self.without.is_the_map:
+        if is_map:
             noise.check_fixed_momentum(type(self).__name__, *at)
         # Without increments the equations are only examined, for whether they need a solve.
         dB = jnp.zeros(noise.count(*at), q.dtype) if dB is None else dB[0]
         # Arbitrarily large increments, which are arbitrarily rare, would have no solution.
         most = _LARGEST * jnp.sqrt(jnp.abs(interval.h))
         rates = jnp.clip(dB, -most, most) / interval.h
-        driven = Driven(system, rates, interval.h, self.without.is_the_map)
+        driven = Driven(equations.system, rates, interval.h, is_map)
         return dataclasses.replace(equations, system=driven, increments=None)
 
 
@@ -125,7 +124,7 @@ class StochasticEuler(_WithNoise):
 
     order: ClassVar[int] = 1
     is_symmetric: ClassVar[bool] = False
-    without: ClassVar[Method] = TypeII()
+    plain: ClassVar[Method] = TypeII()
 
 
 class StochasticMidpoint(_WithNoise):
@@ -145,17 +144,14 @@ class StochasticMidpoint(_WithNoise):
 
     order: ClassVar[int] = 2
     is_symmetric: ClassVar[bool] = True
-    without: ClassVar[Method] = GaussLegendre(1)
+    plain: ClassVar[Method] = GaussLegendre(1)
 
 
 class _Splitting(CompositionMethod):
-    """Base of the splittings with an exact part O of friction and momentum noise. Without noise
-    they are the composition of the map and its adjoint, `Strang`."""
+    """Base of the splittings with an exact part O of friction and momentum noise: one in the middle
+    of the step, or two over h/2 at its ends. Without noise they are `Strang`."""
 
     base: Method = eqx.field(default_factory=TypeII)
-
-    parts: ClassVar[str]
-    """In their order: the map and its adjoint over h/2, "+" and "-", and "O" over an equal part."""
 
     order: ClassVar[int] = 2
     is_symmetric: ClassVar[bool] = True
@@ -164,43 +160,28 @@ class _Splitting(CompositionMethod):
         return (0.5, 0.5)
 
     def step(self, equations, interval, q0, p0):
-        return self._moved(equations, interval, q0, p0, 1)
+        noise, dB, count = equations.system.noise, equations.increments, self.increments
+
+        def kicked(number, q, p):
+            """p after an O at constant q."""
+            if noise is None or dB is None:
+                return p
+            at = _place(equations, interval.part((number + 0.5) / count, 1.0).t0, q, p)
+            noise.check_fixed_momentum(type(self).__name__, *at)
+            return p + noise.kick(*at, interval.h / count, dB[number])
+
+        p = kicked(0, q0, p0) if count == 2 else p0
+        q, p, first = self.base.step(equations, interval.part(0.0, 0.5), q0, p)
+        p = kicked(0, q, p) if count == 1 else p
+        # The adjoint of the map is the inverse of the map by −h.
+        q, p, second = self.base.inverse(equations, interval.part(0.5, 1.0).reversed(), q, p)
+        return q, kicked(1, q, p) if count == 2 else p, first.then(second)
 
     def inverse(self, equations, interval, q1, p1):
-        return self._moved(equations, interval, q1, p1, -1)
-
-    def _moved(
-        self, equations: Equations, interval: Interval, q: State, p: State, sign: int
-    ) -> tuple[State, State, StepInfo]:
-        """The parts in their order, or (`sign` −1) their inverses in the opposite order."""
-        halves = {"+": interval.part(0.0, 0.5), "-": interval.part(0.5, 1.0).reversed()}
-        count, info = self.parts.count("O"), no_step_yet(q)
-        # The increments of the O, the last one first on the way back.
-        numbers = iter(range(count)[::sign])
-        for part in self.parts[::sign]:
-            if part == "O":
-                p = self._kicked(equations, interval, (next(numbers), count, sign), q, p)
-                continue
-            # The adjoint of the map is the inverse of the map by −h.
-            moved = self.base.step if (part == "+") == (sign == 1) else self.base.inverse
-            q, p, found = moved(equations, halves[part], q, p)
-            info = info.then(found)
-        return q, p, info
-
-    def _kicked(
-        self, equations: Equations, interval: Interval, which: tuple[int, int, int], q, p
-    ) -> State:
-        """p after one O (its number, their count, 1 or −1 for the inverse) at constant q."""
-        noise, dB, (number, count, sign) = equations.system.noise, equations.increments, which
-        if noise is None or dB is None:
-            return p
-        # The middle of the part: a time that is the same forwards and backwards.
-        t = interval.part((number + 0.5) / count, 1.0).t0
-        s, _ = equations.system.times(t, t, equations.epsilon)
-        at = (s, *equations.absolute(q, p), equations.args)
-        noise.check_fixed_momentum(type(self).__name__, *at)
-        # The flow by −h along −dB is the inverse.
-        return p + noise.kick(*at, sign * interval.h / count, sign * dB[number])
+        # The parts are symmetric: back along the path, they are the step by −h with −dB.
+        if (dB := equations.increments) is not None:
+            equations = dataclasses.replace(equations, increments=-dB[::-1])
+        return self.step(equations, interval.reversed(), q1, p1)
 
 
 class BAOAB(_Splitting):
@@ -224,7 +205,6 @@ class BAOAB(_Splitting):
     """
 
     increments: ClassVar[int] = 1
-    parts: ClassVar[str] = "+O-"
 
 
 class OBABO(_Splitting):
@@ -243,4 +223,3 @@ class OBABO(_Splitting):
     """
 
     increments: ClassVar[int] = 2
-    parts: ClassVar[str] = "O+-O"

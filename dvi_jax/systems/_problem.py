@@ -348,8 +348,16 @@ def at_end(hamiltonian: Callable[..., Any]) -> Callable[..., Any]:
     return energy
 
 
-THERMAL = Langevin(lambda args: args["friction"], lambda args: args["temperature"])
-"""Friction and noise of unit masses."""
+_THERMAL = Langevin(lambda args: args["friction"], lambda args: args["temperature"])
+
+
+def thermal(friction: float, temperature: float | None, **parameters: Parameter) -> dict[str, Any]:
+    """Parameters and noise of unit masses, both without noise if there is no temperature."""
+    if temperature is None:
+        return {"parameters": parameters}
+    parameters["friction"] = Parameter(friction, "rate of friction γ [1/time]")
+    parameters["temperature"] = Parameter(temperature, "k_B T [energy]")
+    return {"parameters": parameters, "noise": _THERMAL}
 
 
 @functools.cache

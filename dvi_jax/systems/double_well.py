@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from ._problem import THERMAL, Parameter, Problem, Start, configurational, library_problem
+from ._problem import Parameter, Problem, Start, configurational, library_problem, thermal
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -22,10 +22,7 @@ def double_well(temperature: float | None = None, friction: float = 1.0) -> Prob
 
     **Source** Kramers 1940, *Physica* 7, 284; Leimkuhler & Matthews 2015, *Molecular Dynamics*, 7.
     """
-    thermal = {
-        "friction": Parameter(friction, "rate of friction γ [1/time]"),
-        "temperature": Parameter(temperature, "k_B T [energy]"),
-    }
+    barrier = Parameter(1.0, "height of the barrier between the wells [energy]")
     return library_problem(
         hamiltonian,
         Start("the particle in a double well has one degree of freedom", (1,)),
@@ -33,11 +30,7 @@ def double_well(temperature: float | None = None, friction: float = 1.0) -> Prob
         q0=np.array([1.2]),
         p0=np.array([0.2]),
         h=0.1,
-        parameters={
-            "barrier": Parameter(1.0, "height of the barrier between the wells [energy]"),
-            **({} if temperature is None else thermal),
-        },
         observables=[configurational(hamiltonian)],
-        noise=None if temperature is None else THERMAL,
         source="Kramers 1940, Physica 7, 284",
+        **thermal(friction, temperature, barrier=barrier),
     )

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._checks import whole
-from ._problem import THERMAL, Parameter, Problem, Start, configurational, library_problem
+from ._problem import Parameter, Problem, Start, configurational, library_problem, thermal
 
 
 def bonds(t0, t1, q0, p0, q1, p1, args):
@@ -34,10 +34,7 @@ def thermal_chain(n: int = 10, temperature: float | None = None, friction: float
     **Source** Lepri, Livi & Politi 2003, *Phys. Rep.* 377, 1 (chains in contact with heat baths).
     """
     n = whole("n", n, hint="The thermal chain is a row of particles.")
-    thermal = {
-        "friction": Parameter(friction, "rate of friction γ [1/time]"),
-        "temperature": Parameter(temperature, "k_B T [energy]"),
-    }
+    beta = Parameter(1.0, "quartic part of a spring [energy/length⁴]")
     return library_problem(
         hamiltonian,
         Start("the thermal chain is a row of particles", (None,)),
@@ -45,11 +42,7 @@ def thermal_chain(n: int = 10, temperature: float | None = None, friction: float
         q0=np.linspace(0.0, 0.5, n),
         p0=np.linspace(0.3, -0.3, n),
         h=0.1,
-        parameters={
-            "beta": Parameter(1.0, "quartic part of a spring [energy/length⁴]"),
-            **({} if temperature is None else thermal),
-        },
         observables=[bonds, configurational(hamiltonian)],
-        noise=None if temperature is None else THERMAL,
         source="Lepri, Livi & Politi 2003, Phys. Rep. 377, 1",
+        **thermal(friction, temperature, beta=beta),
     )
