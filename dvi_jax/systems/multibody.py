@@ -23,8 +23,10 @@ def _weights(t0, t1, q0, p1, args):
     return jnp.sum(p1**2) / (2 * args["m"]) + args["m"] * args["g"] * jnp.sum(q0[..., -1])
 
 
-def _on_sphere(q, args):
-    return _excess(q[None], args["l"])
+def _links(q, args):
+    """Rods from the origin to the first mass, and on to the next ones."""
+    q = jnp.atleast_2d(q)
+    return _excess(q - jnp.pad(q[:-1], ((1, 0), (0, 0))), args["l"])
 
 
 def vertical_momentum(t0, t1, q0, p0, q1, p1, args):
@@ -36,18 +38,15 @@ def vertical_momentum(t0, t1, q0, p0, q1, p1, args):
 def _exact_on_sphere(t, q0, p0, args):
     """The state at times t, by `spinning_top` with p_ψ = 0: the axis of that top is a spherical
     pendulum. NaN for a motion through the vertical or on a horizontal circle."""
-    l = args["l"]  # noqa: E741
+    m, l, g = args["m"], args["l"], args["g"]  # noqa: E741
 
     def frame(phi, theta):  # the direction e = q/l, ∂e/∂φ and ∂e/∂θ
         (s, c), (u, v) = ((jnp.sin(x), jnp.cos(x)) for x in (theta, phi))
-        turn = jnp.stack([-u, v, 0 * v]) * s
-        return jnp.stack([s * v, s * u, c]), turn, jnp.stack([c * v, c * u, -s])
+        return jnp.array([[s * v, s * u, c], [-s * u, s * v, 0], [c * v, c * u, -s]])
 
     phi, theta = jnp.arctan2(q0[1], q0[0]), jnp.arctan2(jnp.hypot(q0[0], q0[1]), q0[2])
-    _, of_phi, of_theta = frame(phi, theta)
-    angles = jnp.stack([phi, theta, 0 * phi])
-    momenta = l * jnp.stack([p0 @ of_phi, p0 @ of_theta, 0 * phi])
-    top = {"A": args["m"] * l**2, "C": 1.0, "w": args["m"] * args["g"] * l}
+    angles, momenta = jnp.stack([phi, theta, 0]), jnp.append(l * frame(phi, theta)[1:] @ p0, 0)
+    top = {"A": m * l**2, "C": 1.0, "w": m * g * l}
     (phi, theta, _), (p_phi, p_theta, _) = exact_of_top(t, angles, momenta, top)
     e, of_phi, of_theta = frame(phi, theta)
     return l * e, (p_theta * of_theta + p_phi / jnp.sin(theta) ** 2 * of_phi) / l
@@ -59,28 +58,14 @@ def spherical_pendulum() -> Problem:
     **Source** Whittaker 1937, *Analytical Dynamics*, §55; Hairer, Lubich & Wanner 2006, VII.1.
     """
     return library_problem(
-        _weights,
-        Start("the spherical pendulum is a point in space", (3,)),
-        name="spherical_pendulum",
-        q0=np.array([0.8, 0.0, -0.6]),
-        p0=np.array([0.3, 1.0, 0.4]),
-        h=0.01,
-        parameters={
-            "m": Parameter(1.0, "mass [kg]"),
-            "l": Parameter(1.0, "length of the rod [m]"),
-            "g": _GRAVITY,
-        },
-        observables=[vertical_momentum],
-        units=_SI,
+        _weights, Start("the spherical pendulum is a point in space", (3,)),
+        {"m": Parameter(1.0, "mass [kg]"), "l": Parameter(1.0, "length of the rod [m]"),
+         "g": _GRAVITY},
+        [vertical_momentum], name="spherical_pendulum", invariants=("vertical_momentum",),
+        q0=np.array([0.8, 0.0, -0.6]), p0=np.array([0.3, 1.0, 0.4]), h=0.01, units=_SI,
+        constraint=_links, exact=_exact_on_sphere,
         source="Whittaker 1937, Analytical Dynamics, §55",
-        invariants=("vertical_momentum",),
-        constraint=_on_sphere,
-        exact=_exact_on_sphere,
-    )
-
-
-def _links(q, args):
-    return _excess(q - jnp.pad(q[:-1], ((1, 0), (0, 0))), args["l"])
+    )  # fmt: skip
 
 
 def chain(links: int = 20) -> Problem:
@@ -94,21 +79,13 @@ def chain(links: int = 20) -> Problem:
     """
     along = 0.1 * np.arange(1, whole("links", links) + 1)[:, None]
     return library_problem(
-        _weights,
-        Start("the chain has positions of n masses", (None, None)),
-        name="chain",
-        q0=along * np.array([np.sin(0.4), -np.cos(0.4)]),
-        p0=np.zeros((links, 2)),
-        h=0.002,
-        parameters={
-            "m": Parameter(1.0, "mass of each link [kg]"),
-            "l": Parameter(0.1, "length of each link [m]"),
-            "g": _GRAVITY,
-        },
-        units=_SI,
-        source="Leimkuhler & Reich 2004, Simulating Hamiltonian Dynamics, 7",
+        _weights, Start("the chain has positions of n masses", (None, None)),
+        {"m": Parameter(1.0, "mass of each link [kg]"),
+         "l": Parameter(0.1, "length of each link [m]"), "g": _GRAVITY},
+        name="chain", q0=along * np.array([np.sin(0.4), -np.cos(0.4)]), p0=np.zeros((links, 2)),
+        h=0.002, units=_SI, source="Leimkuhler & Reich 2004, Simulating Hamiltonian Dynamics, 7",
         constraint=_links,
-    )
+    )  # fmt: skip
 
 
 def _inertia(args):
@@ -139,30 +116,25 @@ def slider_crank() -> Problem:
     **Source** natural coordinates: García de Jalón & Bayo 1994, *Kinematic and Dynamic Simulation
     of Multibody Systems*, 2 and 4.
     """
-    (m1, m2, m3), l1, l2, rate = (1.0, 2.0, 1.5), 0.3, 0.8, 5.0
-    x, y = l1 / 2, l1 * np.sqrt(3) / 2
-    reach = np.sqrt(l2**2 - y**2)
+    parameters = {
+        "m1": Parameter(1.0, "mass of the crank [kg]"),
+        "m2": Parameter(2.0, "mass of the connecting rod [kg]"),
+        "m3": Parameter(1.5, "mass of the slider [kg]"),
+        "l1": Parameter(0.3, "length of the crank [m]"),
+        "l2": Parameter(0.8, "length of the connecting rod [m]"),
+        "g": _GRAVITY,
+    }
+    args = {name: one.value for name, one in parameters.items()}
+    (a, b, c), l1 = _inertia(args), args["l1"]
+    x, y, rate = l1 / 2, l1 * np.sqrt(3) / 2, 5.0
+    reach = np.sqrt(args["l2"] ** 2 - y**2)
     A, B = rate * np.array([[-y, x], [-y - x * y / reach, 0.0]])  # velocities
-    a, b, c = _inertia({"m1": m1, "m2": m2, "m3": m3})
     return library_problem(
-        _crank_energy,
-        Start("the slider-crank has positions (A, B) in the plane", (2, 2)),
-        name="slider_crank",
-        q0=np.array([[x, y], [x + reach, 0.0]]),
-        p0=np.array([a * A + b * B, b * A + c * B]),
-        h=0.002,
-        parameters={
-            "m1": Parameter(m1, "mass of the crank [kg]"),
-            "m2": Parameter(m2, "mass of the connecting rod [kg]"),
-            "m3": Parameter(m3, "mass of the slider [kg]"),
-            "l1": Parameter(l1, "length of the crank [m]"),
-            "l2": Parameter(l2, "length of the connecting rod [m]"),
-            "g": _GRAVITY,
-        },
-        units=_SI,
+        _crank_energy, Start("the slider-crank has positions (A, B) in the plane", (2, 2)),
+        parameters, name="slider_crank", q0=np.array([[x, y], [x + reach, 0.0]]),
+        p0=np.array([a * A + b * B, b * A + c * B]), h=0.002, units=_SI, constraint=_rods_and_rail,
         source="García de Jalón & Bayo 1994, Kinematic and Dynamic Simulation, 2 and 4",
-        constraint=_rods_and_rail,
-    )
+    )  # fmt: skip
 
 
 def _dumbbell_energy(t0, t1, q0, p1, args):
@@ -194,20 +166,12 @@ def dumbbell() -> Problem:
     sides = np.array([[-1 / 3], [2 / 3]])  # of the centre of mass, as parts of the rod
     turning = np.array([0.0, 1.05, 0.1]) + sides * np.array([-0.12 * s, 0.12 * c, 0.06])
     return library_problem(
-        _dumbbell_energy,
-        Start("the dumbbell has positions of two masses in space", (2, 3)),
-        name="dumbbell",
+        _dumbbell_energy, Start("the dumbbell has positions of two masses in space", (2, 3)),
+        {"m1": Parameter(1.0, "first mass [mass]"), "m2": Parameter(0.5, "second mass [mass]"),
+         "l": Parameter(0.1, "length of the rod [length]"),
+         "mu": Parameter(1.0, "strength of the centre [length³/time²]")},
+        [angular_momentum], name="dumbbell", invariants=("angular_momentum",),
         q0=np.array([1.0, 0.0, 0.0]) + sides * np.array([0.1 * c, 0.1 * s, 0.0]),
-        p0=np.array([[1.0], [0.5]]) * turning,
-        h=0.02,
-        parameters={
-            "m1": Parameter(1.0, "first mass [mass]"),
-            "m2": Parameter(0.5, "second mass [mass]"),
-            "l": Parameter(0.1, "length of the rod [length]"),
-            "mu": Parameter(1.0, "strength of the centre [length³/time²]"),
-        },
-        observables=[angular_momentum],
+        p0=np.array([[1.0], [0.5]]) * turning, h=0.02, constraint=_rod,
         source="Celletti & Sidorenko 2008, Celest. Mech. Dyn. Astr. 101, 105",
-        invariants=("angular_momentum",),
-        constraint=_rod,
-    )
+    )  # fmt: skip

@@ -8,6 +8,7 @@ second moments d_k = ∫ x_k² dm = (I1 + I2 + I3)/2 − I_k along the principal
 Reich 2004, *Simulating Hamiltonian Dynamics*, 8.
 """
 
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -17,9 +18,7 @@ from jaxtyping import Array
 
 def orthonormal(q: Array, args: Any = None) -> Array:
     """The constraint RᵀR = 1 of the first three rows of q: its six different components."""
-    R = q[:3]
-    excess = R.T @ R - jnp.eye(3, dtype=q.dtype)
-    return excess[np.triu_indices(3)]
+    return (q[:3].T @ q[:3] - jnp.eye(3, dtype=q.dtype))[np.triu_indices(3)]
 
 
 def second_moments(I: Any) -> Array:  # noqa: E741
@@ -41,7 +40,7 @@ def body_momentum(R: Array, P: Array) -> Array:
 def momentum(R: Array, pi: Any, I: Any) -> Array:  # noqa: E741
     """P = R Ω̂ D of a body with angular momentum π = I Ω on its axes."""
     x, y, z = jnp.asarray(pi) / jnp.asarray(I)
-    spin = jnp.stack([0 * x, -z, y, z, 0 * x, -x, -y, x, 0 * x]).reshape(3, 3)
+    spin = jnp.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return R @ spin * second_moments(I)[None]
 
 
@@ -50,8 +49,7 @@ def rotation(phi: Any, theta: Any, psi: Any) -> Array:
 
     def about_z(angle):
         c, s = jnp.cos(angle), jnp.sin(angle)
-        zero, one = jnp.zeros_like(c), jnp.ones_like(c)
-        return jnp.stack([c, -s, zero, s, c, zero, zero, zero, one]).reshape(3, 3)
+        return jnp.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
     about_x = jnp.roll(about_z(theta), (1, 1), (0, 1))
     return about_z(phi) @ about_x @ about_z(psi)
@@ -64,19 +62,16 @@ def euler_angles(R: Array) -> Array:
     return jnp.stack([phi, jnp.arctan2(across, R[2, 2]), psi])
 
 
+@partial(jnp.vectorize, signature="(n,n)->(m)")
 def quaternion(R: Array) -> Array:
     """The unit quaternion (w, x, y, z), w ≥ 0, of rotation matrices of shape (…, 3, 3)."""
-    R = jnp.moveaxis(jnp.asarray(R), (-2, -1), (0, 1))
-    K: list[list[Any]] = [[None] * 4 for _ in range(4)]  # 4 a aᵀ of the quaternion a
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        K[0][i + 1] = K[i + 1][0] = R[k, j] - R[j, k]
-        K[j + 1][k + 1] = K[k + 1][j + 1] = R[j, k] + R[k, j]
-        K[i + 1][i + 1] = 1 + R[i, i] - R[j, j] - R[k, k]
-    K[0][0] = 1 + R[0, 0] + R[1, 1] + R[2, 2]
-    rows = jnp.stack([jnp.stack(row, -1) for row in K], -2)
+    (a, b, c), (d, e, f), (g, h, i) = R
+    K = jnp.array([  # 4 u uᵀ of the quaternion u
+        [1 + a + e + i, h - f, c - g, d - b],
+        [h - f, 1 + a - e - i, b + d, c + g],
+        [c - g, b + d, 1 - a + e - i, f + h],
+        [d - b, c + g, f + h, 1 - a - e + i],
+    ])  # fmt: skip
     # The row of the largest component, which is at least 1/2: no digits cancel.
-    largest = jnp.argmax(jnp.diagonal(rows, axis1=-2, axis2=-1), axis=-1)
-    row = jnp.take_along_axis(rows, largest[..., None, None], axis=-2)[..., 0, :]
-    a = row / jnp.linalg.norm(row, axis=-1, keepdims=True)
-    return jnp.where(a[..., :1] < 0, -a, a)
+    row = K[jnp.argmax(jnp.diagonal(K))]
+    return jnp.where(row[0] < 0, -row, row) / jnp.linalg.norm(row)

@@ -21,11 +21,15 @@ def _moments(name, value):
         )
 
 
-def _start(angles, pi, I):  # noqa: E741
-    """R and P of Euler's angles and an angular momentum on the body's axes, as NumPy arrays."""
+def _body(name, energy, parameters, state, observables, source, **known) -> Problem:
+    """The problem of a rotation matrix; `state`: Euler's angles, π on the body's axes, and h."""
+    angles, pi, h = state
     with jax.ensure_compile_time_eval():  # also inside of jax.jit
         R = rigid.rotation(*angles)
-        return np.array(R), np.array(rigid.momentum(R, pi, I))
+        q0, p0 = np.array(R), np.array(rigid.momentum(R, pi, parameters["I"].value))
+    start = Start(f"the {name.replace('_', ' ')} has a rotation matrix", (3, 3))
+    known |= {"name": name, "q0": q0, "p0": p0, "h": h, "constraint": rigid.orthonormal}
+    return library_problem(energy, start, parameters, observables, source=source, **known)
 
 
 def _top_energy(t0, t1, q0, p1, args):
@@ -59,18 +63,16 @@ def kovalevskaya_integral(t0, t1, q0, p0, q1, p1, args):
 def _exact_top(t, q0, p0, args):
     """The state at times t of Lagrange's top, by `spinning_top`; NaN where that is, and for other
     moments or centres of mass."""
-    A, C, I = args["I"][1], args["I"][2], args["I"]  # noqa: E741
-    angles, pi = rigid.euler_angles(q0), rigid.body_momentum(q0, p0)
-    s, c = jnp.sin(angles[2]), jnp.cos(angles[2])
-    momenta = jnp.stack([pi @ q0[2], pi[0] * c - pi[1] * s, pi[2]])
-    top = {"A": A, "C": C, "w": args["c"][2]}
+    I, c, angles = args["I"], args["c"], rigid.euler_angles(q0)  # noqa: E741
+    # On axes that do not turn with ψ: π = (p_θ, (p_φ − p_ψ cos θ)/sin θ, p_ψ).
+    pi = rigid.body_momentum(q0, p0)
+    p_theta, _, p_psi = rigid.rotation(angles[2], 0.0, 0.0) @ pi
+    momenta, top = jnp.stack([pi @ q0[2], p_theta, p_psi]), {"A": I[1], "C": I[2], "w": c[2]}
     (phi, theta, psi), (p_phi, p_theta, p_psi) = exact_of_top(t, angles, momenta, top)
-    s, c, across = jnp.sin(psi), jnp.cos(psi), (p_phi - p_psi * jnp.cos(theta)) / jnp.sin(theta)
+    pi = jnp.stack([p_theta, (p_phi - p_psi * jnp.cos(theta)) / jnp.sin(theta), p_psi])
     R = rigid.rotation(phi, theta, psi)
-    pi = jnp.stack([across * s + p_theta * c, across * c - p_theta * s, p_psi])
-    is_symmetric = (args["I"][0] == A) & jnp.all(args["c"][:2] == 0)
-    one = jnp.where(is_symmetric, 1.0, jnp.nan)
-    return R * one, rigid.momentum(R, pi, I) * one
+    one = jnp.where((I[0] == I[1]) & jnp.all(c[:2] == 0), 1.0, jnp.nan)
+    return R * one, rigid.momentum(R, pi @ rigid.rotation(psi, 0.0, 0.0), I) * one
 
 
 def heavy_top(kind: Literal["lagrange", "kovalevskaya"] = "lagrange") -> Problem:
@@ -88,33 +90,21 @@ def heavy_top(kind: Literal["lagrange", "kovalevskaya"] = "lagrange") -> Problem
     """
     lagrange = one_of("kind", kind, ("lagrange", "kovalevskaya")) == "lagrange"
     I = np.array([1.0, 1.0, 0.5])  # noqa: E741
-    q0, p0 = _start((0.2, 0.6, 0.4), np.array([0.2, 0.3, 2.5 if lagrange else 0.6]), I)
-    integral, name = (
-        (axial_momentum, "axial_momentum")
+    centre, spin, integral = (
+        ([0.0, 0.0, 1.0], 2.5, axial_momentum)
         if lagrange
-        else (kovalevskaya_integral, "kovalevskaya_integral")
+        else ([1.0, 0.0, 0.0], 0.6, kovalevskaya_integral)
     )
-    return library_problem(
-        _top_energy,
-        Start("the heavy top has a rotation matrix", (3, 3)),
-        name="heavy_top",
-        q0=q0,
-        p0=p0,
-        h=0.01,
-        parameters={
-            "I": Parameter(I, "principal moments about the fixed point [mass length²]", _moments),
-            "c": Parameter(
-                np.array([0.0, 0.0, 1.0] if lagrange else [1.0, 0.0, 0.0]),
-                "weight times the centre of mass on the body's axes [energy]",
-                vector(3),
-            ),
-        },
-        observables=[body_momentum, vertical_momentum, integral],
-        source="Hairer, Lubich & Wanner 2006, Geometric Numerical Integration, VII.5",
-        invariants=("vertical_momentum", name),
-        constraint=rigid.orthonormal,
-        exact=_exact_top if lagrange else None,
-    )
+    weight = "weight times the centre of mass on the body's axes [energy]"
+    return _body(
+        "heavy_top", _top_energy,
+        {"I": Parameter(I, "principal moments about the fixed point [mass length²]", _moments),
+         "c": Parameter(np.array(centre), weight, vector(3))},
+        ((0.2, 0.6, 0.4), np.array([0.2, 0.3, spin]), 0.01),
+        [body_momentum, vertical_momentum, integral],
+        "Hairer, Lubich & Wanner 2006, Geometric Numerical Integration, VII.5",
+        invariants=("vertical_momentum", integral.__name__), exact=_exact_top if lagrange else None,
+    )  # fmt: skip
 
 
 def _satellite_energy(t0, t1, q0, p1, args):
@@ -141,21 +131,11 @@ def satellite() -> Problem:
     1986, *Spacecraft Attitude Dynamics*, 9.
     """
     I = np.array([1.0, 1.6, 2.0])  # noqa: E741
-    q0, p0 = _start((0.1, 0.2, 0.3), I * np.array([0.2, 0.1, 1.1]), I)
-    return library_problem(
-        _satellite_energy,
-        Start("the satellite has a rotation matrix", (3, 3)),
-        name="satellite",
-        q0=q0,
-        p0=p0,
-        h=0.02,
-        parameters={
-            "I": Parameter(I, "principal moments of inertia [mass length²]", _moments),
-            "omega": Parameter(1.0, "angular velocity of the orbit [1/time]"),
-        },
-        observables=[jacobi_integral, body_momentum],
-        source="Hughes 1986, Spacecraft Attitude Dynamics, 9",
-        invariants=("jacobi_integral",),
-        autonomous=False,
-        constraint=rigid.orthonormal,
-    )
+    return _body(
+        "satellite", _satellite_energy,
+        {"I": Parameter(I, "principal moments of inertia [mass length²]", _moments),
+         "omega": Parameter(1.0, "angular velocity of the orbit [1/time]")},
+        ((0.1, 0.2, 0.3), I * np.array([0.2, 0.1, 1.1]), 0.02), [jacobi_integral, body_momentum],
+        "Hughes 1986, Spacecraft Attitude Dynamics, 9",
+        invariants=("jacobi_integral",), autonomous=False,
+    )  # fmt: skip
