@@ -204,8 +204,8 @@ def draw_layers(path: Path) -> None:
 
 
 LIMITS = {
-    "lines": 56_260,
-    "raise statements": 701,
+    "lines": 59_260,
+    "raise statements": 736,
     COMMENTS: 5,
     f"files of more than {LONGEST_FILE} lines": 0,
     f"functions with more than {MOST_PARAMETERS} parameters": 8,

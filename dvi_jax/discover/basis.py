@@ -15,7 +15,6 @@ from jaxtyping import Array, Float
 
 from .._checks import function, instance
 from .._types import Scalar, State
-from ..engine.signature import accepts
 
 
 class AbstractBasis(eqx.Module):
@@ -165,14 +164,15 @@ class Basis(AbstractBasis):
         functions: Sequence[Callable[..., Any]] | dict[str, Callable[..., Any]],
         complexity: int = 1,
     ):
-        named = functions
-        if not isinstance(named, dict):
+        if isinstance(functions, dict):
+            named = dict(functions)
+        else:
             named = {_name(each, i): each for i, each in enumerate(tuple(functions))}
         if not named:
             raise ValueError("functions is empty: give at least one function (q, p) → scalar.")
         for name, each in named.items():
             function(f"basis function {name!r}", each, "(q, p) or (q, p, t)")
-            if not (accepts(each, 2) or accepts(each, 3)):
+            if not (_takes(each, 2) or _takes(each, 3)):
                 seen = inspect.signature(each)
                 raise TypeError(
                     f"the basis function {name!r} must take the arguments (q, p) or (q, p, t), got "
@@ -182,11 +182,21 @@ class Basis(AbstractBasis):
         self.complexity = complexity
 
     def for_shape(self, shape):
-        timed = tuple(not accepts(f, 2) for f in self.functions)
+        timed = tuple(not _takes(f, 2) for f in self.functions)
         for name, each, with_time in zip(self.names, self.functions, timed, strict=True):
             _require_real_scalar(name, each, with_time, shape)
         complexity = (self.complexity,) * len(self.names)
         return BoundBasis(_Values(self.functions, timed), self.names, complexity, any(timed))
+
+
+def _takes(function: Callable[..., Any], count: int) -> bool:
+    try:
+        inspect.signature(function).bind(*range(count))
+    except TypeError:
+        return False
+    except ValueError:  # a builtin without a signature
+        return count == 2
+    return True
 
 
 def _require_real_scalar(name, function, timed: bool, shape) -> None:

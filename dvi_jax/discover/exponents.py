@@ -120,7 +120,8 @@ def small_epsilon_exponent(epsilons: Any, drifts: Any, floor: float = 0.0) -> Ex
     epsilons, drifts = np.asarray(epsilons, float), np.asarray(drifts, float)
     if len(epsilons) < ENOUGH:
         nan = np.nan
-        return Exponent(nan, (nan, nan), nan, False, "", {}, *[nan] * 4, len(epsilons), (nan, nan))
+        pair, count = (nan, nan), len(epsilons)
+        return Exponent(nan, pair, nan, False, "", {}, nan, nan, nan, nan, count, pair)
     x, y = np.log(epsilons), np.log(drifts)
     freedom = len(x) - 2
     fits = fits_of_laws(x, drifts, floor)

@@ -95,8 +95,9 @@ def invariant_diffusion(
             """(Ḃ, q, p) → the derivative of f along b + Σ_m g_m Ḃ_m."""
 
             def derivative(rates, *z):
-                by_q, by_p = jax.grad(noise.energy, (1, 2))(s, *z, args, rates)
-                return jax.jvp(f, z, (by_p, noise.force(s, *z, args, rates) - by_q))[1]
+                q, p = z
+                by_q, by_p = jax.grad(noise.energy, (1, 2))(s, q, p, args, rates)
+                return jax.jvp(f, z, (by_p, noise.force(s, q, p, args, rates) - by_q))[1]
 
             return derivative
 

@@ -3,6 +3,7 @@
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Any
 
 import equinox as eqx
@@ -245,8 +246,7 @@ def library_problem(
     perturbation: Callable[..., Any] | None = None,
     autonomous: bool = True,
     slow_time: bool = False,
-    noise: Any = None,
-    constraint: Callable[..., Any] | None = None,
+    more: Mapping[str, Any] = MappingProxyType({}),
     **fields: Any,
 ) -> Problem:
     """A `Problem` of the library.
@@ -254,20 +254,19 @@ def library_problem(
     - `start`: check of initial conditions; those of `parameters` are added to it.
     - `autonomous`: whether H is independent of time at ε = 0. The energy is then an observable and
       an invariant, and the translation in time a symmetry, though not one of `slow_time` or with
-      a `constraint`: symmetries are those of the type II map.
+      a constraint: symmetries are those of the type II map.
     - `slow_time`: whether the times of the Hamiltonian and of the observables are ε times t.
+    - `more`: further arguments of `System`.
     - `fields`: the other fields of `Problem`.
     """
     parameters, fields = parameters or {}, {"units": DIMENSIONLESS, **fields}
     if autonomous:
         observables = (at_end(hamiltonian), *observables)
         fields["invariants"] = ("energy", *fields.get("invariants", ()))
-    if autonomous and not slow_time and constraint is None:
+    if autonomous and not slow_time and "constraint" not in more:
         fields["symmetries"] = {"time": time_translation(), **fields.get("symmetries", {})}
     return Problem(
-        system=System(
-            hamiltonian, force, perturbation, slow_time, noise=noise, constraint=constraint
-        ),
+        system=System(hamiltonian, force, perturbation, slow_time, **more),
         args={name: one.value for name, one in parameters.items()} or None,
         check=replace(start, parameters={name: one.check for name, one in parameters.items()}),
         parameters={name: one.meaning for name, one in parameters.items()},
@@ -357,7 +356,7 @@ def thermal(friction: float, temperature: float | None, **parameters: Parameter)
         return {"parameters": parameters}
     parameters["friction"] = Parameter(friction, "rate of friction γ [1/time]")
     parameters["temperature"] = Parameter(temperature, "k_B T [energy]")
-    return {"parameters": parameters, "noise": _THERMAL}
+    return {"parameters": parameters, "more": {"noise": _THERMAL}}
 
 
 @functools.cache

@@ -63,7 +63,7 @@ def spherical_pendulum() -> Problem:
          "g": _GRAVITY},
         [vertical_momentum], name="spherical_pendulum", invariants=("vertical_momentum",),
         q0=np.array([0.8, 0.0, -0.6]), p0=np.array([0.3, 1.0, 0.4]), h=0.01, units=_SI,
-        constraint=_links, exact=_exact_on_sphere,
+        more={"constraint": _links}, exact=_exact_on_sphere,
         source="Whittaker 1937, Analytical Dynamics, §55",
     )  # fmt: skip
 
@@ -84,7 +84,7 @@ def chain(links: int = 20) -> Problem:
          "l": Parameter(0.1, "length of each link [m]"), "g": _GRAVITY},
         name="chain", q0=along * np.array([np.sin(0.4), -np.cos(0.4)]), p0=np.zeros((links, 2)),
         h=0.002, units=_SI, source="Leimkuhler & Reich 2004, Simulating Hamiltonian Dynamics, 7",
-        constraint=_links,
+        more={"constraint": _links},
     )  # fmt: skip
 
 
@@ -132,7 +132,8 @@ def slider_crank() -> Problem:
     return library_problem(
         _crank_energy, Start("the slider-crank has positions (A, B) in the plane", (2, 2)),
         parameters, name="slider_crank", q0=np.array([[x, y], [x + reach, 0.0]]),
-        p0=np.array([a * A + b * B, b * A + c * B]), h=0.002, units=_SI, constraint=_rods_and_rail,
+        p0=np.array([a * A + b * B, b * A + c * B]), h=0.002, units=_SI,
+        more={"constraint": _rods_and_rail},
         source="García de Jalón & Bayo 1994, Kinematic and Dynamic Simulation, 2 and 4",
     )  # fmt: skip
 
@@ -172,6 +173,6 @@ def dumbbell() -> Problem:
          "mu": Parameter(1.0, "strength of the centre [length³/time²]")},
         [angular_momentum], name="dumbbell", invariants=("angular_momentum",),
         q0=np.array([1.0, 0.0, 0.0]) + sides * np.array([0.1 * c, 0.1 * s, 0.0]),
-        p0=np.array([[1.0], [0.5]]) * turning, h=0.02, constraint=_rod,
+        p0=np.array([[1.0], [0.5]]) * turning, h=0.02, more={"constraint": _rod},
         source="Celletti & Sidorenko 2008, Celest. Mech. Dyn. Astr. 101, 105",
     )  # fmt: skip

@@ -28,7 +28,7 @@ def _body(name, energy, parameters, state, observables, source, **known) -> Prob
         R = rigid.rotation(*angles)
         q0, p0 = np.array(R), np.array(rigid.momentum(R, pi, parameters["I"].value))
     start = Start(f"the {name.replace('_', ' ')} has a rotation matrix", (3, 3))
-    known |= {"name": name, "q0": q0, "p0": p0, "h": h, "constraint": rigid.orthonormal}
+    known |= {"name": name, "q0": q0, "p0": p0, "h": h, "more": {"constraint": rigid.orthonormal}}
     return library_problem(energy, start, parameters, observables, source=source, **known)
 
 

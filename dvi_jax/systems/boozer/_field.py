@@ -183,8 +183,9 @@ def from_modes(
             "I must be zero on the axis (the toroidal current inside of a surface of no area), got "
             f"the constant {profiles[2][0]}. Give I as [0, ...]: the coefficients of s, s², …"
         )
-    *arrays, current = (jnp.asarray(x) for x in (float(psi_edge), table, *profiles))
-    field = Field(*arrays, None if I is None else current, Shape(periods, h))
+    iota, G, current = map(jnp.asarray, profiles)
+    psi, current = jnp.asarray(float(psi_edge)), None if I is None else current
+    field = Field(psi, jnp.asarray(table), iota, G, current, Shape(periods, h))
     _check_positive(field)
     return field
 
