@@ -204,7 +204,7 @@ def draw_layers(path: Path) -> None:
 
 
 LIMITS = {
-    "lines": 59_260,
+    "lines": 59_300,
     "raise statements": 736,
     COMMENTS: 5,
     f"files of more than {LONGEST_FILE} lines": 0,
