@@ -12,7 +12,9 @@ import lanewise
 from lanewise import Layout
 
 from ._checks import whole
-from ._rollout import Loop, Outcome, Plan, Task, adds_start_outside, outcome, run, start, with_start
+from ._plan import Plan, adds_start_outside
+from ._rollout import Loop, outcome, run, start, with_start
+from ._task import Outcome, Task
 from ._types import State
 
 

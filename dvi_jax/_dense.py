@@ -12,9 +12,9 @@ from jaxtyping import Array, PyTree
 
 from lanewise import Layout
 
-from ._rollout import Task
 from ._solution import Save
 from ._step import Equations
+from ._task import Task
 from ._types import Interval, Scalar, State
 from .engine.bracket import bracketed_root
 from .engine.rounding import each, one_by_one

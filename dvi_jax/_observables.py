@@ -12,7 +12,7 @@ import lanewise
 from lanewise import Layout
 
 from ._checks import function as check_function
-from ._rollout import Task
+from ._task import Task
 from .engine.signature import tracing_note
 from .lattices import Run
 from .observe import FORMS, Deviations, OfState, Range, Reduction, Running, is_observable

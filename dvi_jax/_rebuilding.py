@@ -12,8 +12,10 @@ from jaxtyping import Array
 
 import lanewise
 
+from ._plan import Plan, adds_start_outside, piece_length
 from ._results import RESULTS
-from ._rollout import Plan, Saved, StepTaken, Task, adds_start_outside, number_of, piece_length
+from ._rollout import number_of
+from ._task import Saved, StepTaken, Task
 from ._types import State
 from .engine.newton import Known, RootSolver
 from .observe import has_initial_value

@@ -15,17 +15,10 @@ from lanewise.jaxapi import is_traced, linear_map, manual_axes
 
 from ._adjoints import AbstractAdjoint, Checkpointed
 from ._checks import instance, positive, whole as check_whole
+from ._plan import adds_start_outside, piece_length
 from ._rebuilding import Smooth, pull_back, round_trip_defect, states_of
-from ._rollout import (
-    Outcome,
-    Task,
-    adds_start_outside,
-    outcome,
-    piece_length,
-    run,
-    start,
-    with_start,
-)
+from ._rollout import outcome, run, start, with_start
+from ._task import Outcome, Task
 from .engine.pairs import rounded
 
 

@@ -12,21 +12,9 @@ from jaxtyping import Array, Int
 import lanewise
 
 from ._constraint import start_status
-from ._plan import (
-    Plan as Plan,
-    adds_start_outside as adds_start_outside,
-    make_plan as make_plan,
-    piece_length as piece_length,
-)
+from ._plan import Plan, adds_start_outside
 from ._results import RESULTS, first_failure
-from ._task import (
-    Carry as Carry,
-    Outcome as Outcome,
-    Saved as Saved,
-    StepTaken as StepTaken,
-    Task as Task,
-    or_nan,
-)
+from ._task import Carry, Outcome, Saved, StepTaken, Task, or_nan
 from ._types import Interval, Scalar, State
 from .engine.newton import no_residual, worse
 from .engine.pairs import rounded

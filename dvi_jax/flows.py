@@ -41,10 +41,10 @@ class Known(Flow):
     """A Hamiltonian with a flow that the user knows.
 
     **Arguments** `H`: function ``(t0, t1, q0, p1, args)`` → scalar [energy]. `flow`: function
-    ``(h, q, p, args)`` → (q, p) after the time h, which may be negative. That it is the flow of H
-    is not checked: compare ``dvi.Splitting()`` with another method on a short run.
+    ``(h, q, p, args)`` → (q, p) after the time h, which may be negative.
 
-    **Raises** `TypeError` for functions of other arguments.
+    **Raises** `TypeError` for functions of other arguments; `ValueError` (in `integrate`, for an
+    initial state that is not traced) if the derivative of the flow at h = 0 is not that of H.
     """
 
     H: HamiltonianFn

@@ -9,7 +9,7 @@ from helpers import central_difference
 import dvi_jax as dvi
 from dvi_jax import flows, systems
 from dvi_jax._kepler import change
-from dvi_jax.methods._schemes import corrector, near_integrable, word_of
+from dvi_jax.methods._schemes import corrector, near_integrable, sequence_of
 from dvi_jax.systems.n_body import hamiltonian
 
 Q0, P0 = np.array([1.0, 0.0]), np.array([0.2, 1.1])
@@ -144,8 +144,8 @@ def test_perturbation_is_integrated_by_a_quadrature_of_the_first_order(orders):
 
 
 def test_words_join_neighbouring_flows():
-    assert word_of(dvi.Strang(), 3) == ((0, 0.5), (1, 0.5), (2, 1.0), (1, 0.5), (0, 0.5))
-    found = word_of(dvi.BlanesMoan(4), 2)
+    assert sequence_of(dvi.Strang(), 3) == ((0, 0.5), (1, 0.5), (2, 1.0), (1, 0.5), (0, 0.5))
+    found = sequence_of(dvi.BlanesMoan(4), 2)
     assert [i for i, _ in found] == [0, 1] * 6 + [0]
     # The published coefficients of Blanes & Moan 2002, table 2, S₆.
     assert found[0][1] == pytest.approx(0.0792036964311957, abs=1e-15)
@@ -318,8 +318,24 @@ def test_bad_parts_and_schemes_are_refused():
     forced = dvi.System(SPLIT.H_D, force=lambda t0, t1, q0, p1, args: -q0)
     with pytest.raises(ValueError, match="requires two parts"):
         end(dvi.Splitting((8, 4)), 0.1, 2, forced, epsilon=0.1)
-    with pytest.raises(ValueError, match="accurate to float64 only"):
-        end(dvi.Splitting(), 0.1, 2, arithmetic=dvi.DoubleDouble())
+    for method in (dvi.Splitting(), dvi.Adjoint(dvi.Splitting())):
+        with pytest.raises(ValueError, match="accurate to float64 only"):
+            end(method, 0.1, 2, arithmetic=dvi.DoubleDouble())
+
+
+def test_a_flow_of_another_hamiltonian_is_refused():
+    def make(flow):
+        return dvi.System(dvi.Split([flows.Kepler(), quartic], flows=[None, flow]))
+
+    def right(h, q, p, args):
+        return q, p - 4 * h * args["eps"] * q**3
+
+    np.testing.assert_allclose(
+        end(dvi.Splitting(), 0.1, 5, make(right), eps=0.1), end(dvi.Splitting(), 0.1, 5, eps=0.1)
+    )
+    for wrong in (lambda h, q, p, a: (q, p + h * q**3), lambda h, q, p, a: (q, 2 * p)):
+        with pytest.raises(ValueError, match="flow of part 1 of Split is not that"):
+            end(dvi.Splitting(), 0.1, 5, make(wrong), eps=0.1)
 
 
 # --- Wisdom and Holman ---------------------------------------------------------------------------
@@ -406,12 +422,25 @@ def test_wisdom_holman_refuses_other_systems():
     for H, match in ((bent, "quadratic"), (mixed, "q0 enters"), (skew, "is not p/m")):
         with pytest.raises(ValueError, match=match):
             dvi.integrate(dvi.System(H), q, q, h=0.1, num_steps=2, method=dvi.WisdomHolman())
+    turned = systems.n_body(THREE.args["masses"][::-1], THREE.q0[::-1], THREE.p0[::-1])
+    with pytest.raises(ValueError, match="body 2 has the mass 1 and body 0 only"):
+        dvi.integrate(turned, num_steps=2, method=dvi.WisdomHolman())
     with pytest.raises(ValueError, match=r"\(bodies, 2\)"):
         dvi.integrate(systems.kepler(), h=0.1, num_steps=2, method=dvi.WisdomHolman())
     with pytest.raises(ValueError, match="corrector must be 0 unless"):
         dvi.WisdomHolman("democratic", corrector=3)
     with pytest.raises(ValueError, match="coordinates must be one of"):
         dvi.WisdomHolman("helio")
+
+
+def test_wisdom_holman_in_float32():
+    q, p = (np.asarray(x, np.float32) for x in (THREE.q0, THREE.p0))
+    args = jax.tree.map(np.float32, THREE.args)
+    run = {"h": 0.25, "num_steps": 40, "method": dvi.WisdomHolman(), "save": dvi.Save(final=True)}
+    sol = dvi.integrate(THREE.system, q, p, args=args, **run)
+    exact = dvi.integrate(THREE, **run)
+    assert sol.q_final.dtype == np.float32
+    assert 1e-9 < np.abs(sol.q_final - exact.q_final).max() < 1e-5
 
 
 def test_compensated_sums_and_a_start_in_motion():

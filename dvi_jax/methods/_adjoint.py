@@ -43,6 +43,12 @@ class Adjoint(Method):
     def substeps(self) -> tuple[float, ...]:
         return self.method.substeps()
 
+    def check(self, equations, interval, q, p):
+        self.method.check(equations, interval, q, p)
+
+    def is_double_only(self, equations) -> bool:
+        return self.method.is_double_only(equations)
+
     def is_made_of_the_map(self) -> bool:
         return self.method.is_made_of_the_map()
 

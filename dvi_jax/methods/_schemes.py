@@ -1,4 +1,4 @@
-"""Words of splitting methods: which part acts for which fraction of the step."""
+"""Coefficients of splitting methods: which part acts for which fraction of the step."""
 
 import functools
 import itertools
@@ -13,7 +13,7 @@ from ._base import Method
 from ._composition import CompositionMethod
 from ._type_ii import TypeII
 
-Word = tuple[tuple[int, float], ...]
+Flows = tuple[tuple[int, float], ...]
 """(part, fraction of h), the one that acts first in front."""
 
 Orders = tuple[int, ...]
@@ -46,7 +46,7 @@ _PUBLISHED: dict[Orders, tuple[tuple[float, ...], tuple[float, ...]]] = {
 }
 
 
-def names() -> str:
+def _names() -> str:
     gauss = [f"({n}, 2)" for n in range(2, _LARGEST + 2, 2)]
     return ", ".join([*gauss, *map(str, _PUBLISHED)])
 
@@ -66,15 +66,15 @@ def near_integrable(orders: Orders) -> tuple[tuple[float, ...], ...] | None:
 
 
 def _completed(a: Sequence[float], b: Sequence[float]) -> tuple[tuple[float, ...], ...]:
-    # A has one coefficient more than B: one of them has two in the middle, the other one.
+    # A has one coefficient more than B. The even number of the two has a pair in the middle.
     twice, once = (a, b) if len(a) == len(b) else (b, a)
     twice, once = (*twice, 0.5 - math.fsum(twice)), (*once, 1 - 2 * math.fsum(once))
     found = (*twice, *twice[::-1]), (*once, *once[-2::-1])
     return found if len(a) == len(b) else found[::-1]
 
 
-def word_of(scheme: Any, parts: int) -> Word:
-    """The word of a scheme for so many parts. **Raises** `ValueError` where it does not fit."""
+def sequence_of(scheme: Any, parts: int) -> Flows:
+    """The flows of a scheme. **Raises** `ValueError` if it is not for this number of parts."""
     if isinstance(scheme, tuple):
         found = near_integrable(scheme)
         assert found is not None
@@ -93,9 +93,9 @@ def word_of(scheme: Any, parts: int) -> Word:
     return joined((i, c) for c, order in pairs for i in order)
 
 
-def joined(letters: Iterable[tuple[int, float]]) -> Word:
-    """The word in which flows of one part after another are one flow."""
-    groups = itertools.groupby(letters, key=lambda letter: letter[0])
+def joined(stages: Iterable[tuple[int, float]]) -> Flows:
+    """The same flows, with neighbouring flows of one part as one flow."""
+    groups = itertools.groupby(stages, key=lambda stage: stage[0])
     return tuple((i, math.fsum(c for _, c in group)) for i, group in groups)
 
 
@@ -105,7 +105,7 @@ def as_scheme(given: Any) -> Any:
 
 def check_scheme(scheme: Any) -> None:
     """**Raises** `TypeError` or `ValueError` for a scheme that is not known."""
-    known = f"The known generalised orders are {names()}."
+    known = f"The known generalised orders are {_names()}."
     if isinstance(scheme, tuple):
         if near_integrable(scheme) is None:
             raise ValueError(f"scheme has unknown generalised orders {scheme}. {known}")

@@ -18,10 +18,10 @@ from .._split import Split
 from .._step import Equations, StepInfo, judge, no_solve, no_step_yet
 from .._system import System
 from .._types import Interval, State
-from ..flows import Flow, Kepler
+from ..flows import Flow, Kepler, Known
 from ._base import InLoop, Method
 from ._gauss_legendre import GaussLegendre
-from ._schemes import as_scheme, check_scheme, word_of
+from ._schemes import as_scheme, check_scheme, sequence_of
 from ._strang import Strang
 from ._type_ii import TypeII
 
@@ -35,7 +35,7 @@ class Part(NamedTuple):
     is_exact: bool
 
 
-class _Letter(NamedTuple):
+class Stage(NamedTuple):
     """One flow of a step: the part, the fractions of the step at its ends, and its length."""
 
     part: int
@@ -47,26 +47,26 @@ class _Letter(NamedTuple):
         # The length is c h, not a difference of times, in which digits cancel.
         return interval.part(self.start, self.end)._replace(h=self.length * interval.h)
 
-    def undone(self) -> "_Letter":
-        return _Letter(self.part, self.end, self.start, -self.length)
+    def undone(self) -> "Stage":
+        return Stage(self.part, self.end, self.start, -self.length)
 
 
-def _letters(word: Sequence[tuple[int, float]], time: float = 0.0) -> list[_Letter]:
-    # The first part carries the time; the others act at a fixed time. Sums end at 1 only to the
-    # last digit.
-    found, total = [], math.fsum(c for i, c in word if i == 0) + time
-    for i, c in word:
+def stages_of(sequence: Sequence[tuple[int, float]], time: float = 0.0) -> list[Stage]:
+    # The first part carries the time; the others act at a fixed time. The end is not a sum of all
+    # coefficients, which is 1 only up to rounding.
+    found, total = [], math.fsum(c for i, c in sequence if i == 0) + time
+    for i, c in sequence:
         end = time + c if i == 0 else time
         end = total if i == 0 and abs(end - total) < 1e-12 else end
-        found.append(_Letter(i, time, end, c))
+        found.append(Stage(i, time, end, c))
         time = end
     return found
 
 
 class SplittingMethod(Method):
-    """Base of the methods that compose flows of parts: a step is a word of their letters.
+    """Base of the methods that compose flows of parts.
 
-    A subclass gives the parts, in coordinates of its own if it has some.
+    A subclass returns the parts, and the coordinates in which they are computed.
     """
 
     scheme: eqx.AbstractVar[Any]
@@ -103,28 +103,28 @@ class SplittingMethod(Method):
             return isinstance(self.scheme, tuple) or self.scheme.is_symmetric
 
     def substeps(self) -> tuple[float, ...]:
-        return tuple(c for i, c in word_of(self.scheme, 2) if i == 1)
+        return tuple(c for i, c in sequence_of(self.scheme, 2) if i == 1)
 
     def step(self, equations, interval, q0, p0):
-        letters = _letters(self._word(equations, interval, q0))
-        return self._around(equations, interval, letters, q0, p0)
+        stages = stages_of(self._sequence(equations, interval, q0))
+        return self._around(equations, interval, stages, q0, p0)
 
     def inverse(self, equations, interval, q1, p1):
-        letters = _letters(self._word(equations, interval, q1))
-        back = [letter.undone() for letter in reversed(letters)]
+        stages = stages_of(self._sequence(equations, interval, q1))
+        back = [stage.undone() for stage in reversed(stages)]
         return self._around(equations, interval, back, q1, p1)
 
-    def _word(self, equations, interval, q):
-        return word_of(self.scheme, len(self.parts(equations, interval, q)))
+    def _sequence(self, equations, interval, q):
+        return sequence_of(self.scheme, len(self.parts(equations, interval, q)))
 
-    def _around(self, equations, interval, letters, q, p) -> Moved:
+    def _around(self, equations, interval, stages, q, p) -> Moved:
         q, p, first = self.enter(equations, interval, q, p)
-        q, p, info = self.composed(equations, interval, letters, q, p)
+        q, p, info = self.composed(equations, interval, stages, q, p)
         q, p, last = self.leave(equations, interval, q, p)
         return q, p, first.then(info).then(last)
 
     def composed(
-        self, equations: Equations, interval: Interval, letters: list[_Letter], q: State, p: State
+        self, equations: Equations, interval: Interval, stages: list[Stage], q: State, p: State
     ) -> Moved:
         """One flow after another."""
         parts = self.parts(equations, interval, q)
@@ -136,13 +136,13 @@ class SplittingMethod(Method):
                 info = info.then(now)
             return q, p, info
 
-        pieces = [letter.on(interval) for letter in letters]
-        which = [letter.part for letter in letters]
+        pieces = [stage.on(interval) for stage in stages]
+        which = [stage.part for stage in stages]
         state = q, p, no_step_yet(q)
-        # Neighbours differ, so that letters repeat with this period, as in 0 1 2 1 0 1 2 1 0. A
-        # loop over periods is compiled faster than all letters.
+        # Neighbours differ, so that stages repeat with this period, as in 0 1 2 1 0 1 2 1 0. A
+        # loop over periods is compiled faster than all stages.
         period = max(2 * len(parts) - 2, 1)
-        count = len(letters) // period if len(letters) > 2 * period else 0
+        count = len(stages) // period if len(stages) > 2 * period else 0
         if count:
             rounds = [tuple(pieces[k * period : (k + 1) * period]) for k in range(count)]
             stacked = jax.tree.map(lambda *xs: jnp.stack(xs), *rounds)
@@ -151,9 +151,9 @@ class SplittingMethod(Method):
 
     def in_loop(self, equations, interval, q):
         parts = self.parts(equations, interval, q)
-        word = word_of(self.scheme, len(parts))
+        sequence = sequence_of(self.scheme, len(parts))
         # Two flows of the first part are one only if they are exact.
-        (_, a), *more = word
+        (_, a), *more = sequence
         return _in_loop(self, a) if self.is_symmetric and more and parts[0].is_exact else None
 
     def needs_no_solve(self, equations, interval, q) -> bool:
@@ -164,19 +164,19 @@ class SplittingMethod(Method):
 
 
 def _in_loop(method: SplittingMethod, a: float) -> InLoop:
-    """A(a) W A(a) repeated is A(a) [W A(2a)] … A(−a): one flow of the first part less a step."""
+    """(A(a) W A(a))ⁿ is A(a) (W A(2a))ⁿ A(−a), which has one flow less per step."""
 
     def before(equations, interval, q, p):
         q, p, first = method.enter(equations, interval, q, p)
-        q, p, info = method.composed(equations, interval, [_Letter(0, 0.0, -a, -a)], q, p)
+        q, p, info = method.composed(equations, interval, [Stage(0, 0.0, -a, -a)], q, p)
         return q, p, first.then(info)
 
     def step(equations, interval, q, p):
-        _, *middle, _ = method._word(equations, interval, q)
-        return method.composed(equations, interval, _letters([(0, 2 * a), *middle], -a), q, p)
+        _, *middle, _ = method._sequence(equations, interval, q)
+        return method.composed(equations, interval, stages_of([(0, 2 * a), *middle], -a), q, p)
 
     def after(equations, interval, q, p):
-        q, p, info = method.composed(equations, interval, [_Letter(0, 1 - a, 1.0, a)], q, p)
+        q, p, info = method.composed(equations, interval, [Stage(0, 1 - a, 1.0, a)], q, p)
         q, p, last = method.leave(equations, interval, q, p)
         return q, p, info.then(last)
 
@@ -214,6 +214,25 @@ class Splitting(SplittingMethod):
 
     def __check_init__(self):
         check_scheme(self.scheme)
+
+    def check(self, equations, interval, q, p):
+        """**Raises** `ValueError` if a flow of the user is not that of its Hamiltonian there."""
+        t, zero = interval.t0, jnp.zeros_like(interval.h)
+        for i, H_i in enumerate(getattr(equations.system.H_D, "parts", ())):
+            if isinstance(H_i, Known):
+                flow = functools.partial(H_i.change, q=q, p=p, args=equations.args)
+                moved, found = (jnp.stack(x[:2]) for x in jax.jvp(flow, (zero,), (zero + 1,)))
+                own = dataclasses.replace(equations, system=System(H_i))
+                wanted = jnp.stack(own.rates(Interval(t, t, zero), q, p))
+                size = jnp.max(jnp.abs(jnp.stack([q, p, *wanted, *found])))
+                off = jnp.max(jnp.abs(jnp.stack([moved, found - wanted])))
+                if not off <= 1e-5 * size:
+                    raise ValueError(
+                        f"the flow of part {i} of Split is not that of its Hamiltonian. At the "
+                        "initial state the flow with h = 0 must not change (q, p), and its "
+                        f"derivative by h must be (∂H/∂p, −∂H/∂q); the difference is {off:.3g}. "
+                        "Correct the flow, or leave it out: the part is then solved numerically."
+                    )
 
     def is_double_only(self, equations) -> bool:
         return any(isinstance(part, Kepler) for part in getattr(equations.system.H_D, "parts", ()))

@@ -16,7 +16,7 @@ from .._step import Equations, judge, no_solve, no_step_yet
 from .._types import Args, Interval, Scalar, State
 from ..engine.newton import find_root
 from ._schemes import ORDERS_OF_CORRECTORS, as_scheme, check_scheme, corrector, joined
-from ._splitting import Part, SplittingMethod, _Letter
+from ._splitting import Part, SplittingMethod, Stage
 from ._strang import Strang
 
 Coordinates = Literal["jacobi", "democratic"]
@@ -153,11 +153,18 @@ class WisdomHolman(SplittingMethod):
     def check(self, equations, interval, q, p):
         masses = np.asarray(self._frame(equations, interval, q).masses)
         v = np.asarray(equations.position_rate(interval, q, p))
-        if not (masses > 0).all() or not np.allclose(masses[:, None] * v, p, rtol=1e-10, atol=0):
+        rtol = 1e5 * float(jnp.finfo(q.dtype).eps)
+        if not (masses > 0).all() or not np.allclose(masses[:, None] * v, p, rtol=rtol, atol=0):
             raise ValueError(
                 "method=dvi.WisdomHolman(...) requires a kinetic energy Σ |p_i|²/(2 m_i) with "
                 f"positive masses, but ∂H_D/∂p1 at the initial state is not p/m with m = {masses}. "
                 "Use canonical momenta p = m v, or another method such as dvi.KahanLi(8)."
+            )
+        if masses[0] < masses.max():
+            raise ValueError(
+                "method=dvi.WisdomHolman(...) requires the dominant body first, but body "
+                f"{masses.argmax()} has the mass {masses.max():g} and body 0 only {masses[0]:g}. "
+                "Change the order of the bodies, or use another method such as dvi.KahanLi(8)."
             )
 
     def _frame(self, equations: Equations, interval: Interval, q: State) -> Any:
@@ -250,13 +257,13 @@ class WisdomHolman(SplittingMethod):
         if not self.corrector:
             return X, V, no_step_yet(X)
         # The inverse of Z(a, b) is Z(−a, b), and a and −a are at opposite places: b changes sign.
-        word = joined(
-            letter
+        sequence = joined(
+            stage
             for a, b in corrector(self.corrector)
-            for letter in ((0, a), (1, sign * b), (0, -2 * a), (1, -sign * b), (0, a))
+            for stage in ((0, a), (1, sign * b), (0, -2 * a), (1, -sign * b), (0, a))
         )
-        letters = [_Letter(part, 0.0, 0.0, c) for part, c in word]
-        return self.composed(equations, interval, letters, X, V)
+        stages = [Stage(part, 0.0, 0.0, c) for part, c in sequence]
+        return self.composed(equations, interval, stages, X, V)
 
 
 def _constant(G: Any, args: Args, like: Array) -> Scalar:
