@@ -16,7 +16,8 @@ Parameter = Any
 """A number, an array, or a function of args that returns one."""
 
 
-def _value(parameter: Parameter, args: Args, like: Array) -> Array:
+def value_of(parameter: Parameter, args: Args, like: Array) -> Array:
+    """The value of a parameter, in the precision of another array."""
     value = parameter(args) if callable(parameter) else parameter
     return jnp.asarray(value, like.dtype)
 
@@ -79,13 +80,13 @@ class Kepler(Flow):
     mass: Parameter = 1.0
 
     def __call__(self, t0, t1, q0, p1, args):
-        k, mass = _value(self.k, args, q0), _value(self.mass, args, q0)
+        k, mass = value_of(self.k, args, q0), value_of(self.mass, args, q0)
         r = jnp.sqrt(jnp.sum(q0 * q0, -1))
         return jnp.sum(jnp.sum(p1 * p1, -1) / (2 * mass) - k / r)
 
     def change(self, h, q, p, args):
-        mass = jnp.broadcast_to(_value(self.mass, args, q), q.shape[:-1])
-        mu = jnp.broadcast_to(_value(self.k, args, q), q.shape[:-1]) / mass
+        mass = jnp.broadcast_to(value_of(self.mass, args, q), q.shape[:-1])
+        mu = jnp.broadcast_to(value_of(self.k, args, q), q.shape[:-1]) / mass
         mass = mass[..., None]
         dq, dv, found = _kepler.change(h, q, p / mass, mu)
         return dq, mass * dv, found
@@ -102,11 +103,11 @@ class Harmonic(Flow):
     mass: Parameter = 1.0
 
     def __call__(self, t0, t1, q0, p1, args):
-        omega, mass = _value(self.omega, args, q0), _value(self.mass, args, q0)
+        omega, mass = value_of(self.omega, args, q0), value_of(self.mass, args, q0)
         return jnp.sum(p1 * p1 / mass + mass * (omega * q0) ** 2) / 2
 
     def change(self, h, q, p, args):
-        omega, mass = _value(self.omega, args, q), _value(self.mass, args, q)
+        omega, mass = value_of(self.omega, args, q), value_of(self.mass, args, q)
         x = h * omega
         less, s = 2 * jnp.sin(x / 2) ** 2, jnp.sin(x)  # less: 1 − cos x, without cancellation
         over_omega = h * jnp.sinc(x / jnp.pi)  # sin(ω h)/ω, also for ω = 0
@@ -126,11 +127,11 @@ class Rotation(Flow):
     rate: Parameter = 1.0
 
     def __call__(self, t0, t1, q0, p1, args):
-        rate = _value(self.rate, args, q0)
+        rate = value_of(self.rate, args, q0)
         return rate * jnp.sum(q0[..., 0] * p1[..., 1] - q0[..., 1] * p1[..., 0])
 
     def change(self, h, q, p, args):
-        x = h * _value(self.rate, args, q)
+        x = h * value_of(self.rate, args, q)
         s, less = jnp.sin(x), 2 * jnp.sin(x / 2) ** 2
 
         def turned(u):

@@ -205,7 +205,7 @@ def draw_layers(path: Path) -> None:
 
 LIMITS = {
     "lines": 59_300,
-    "raise statements": 736,
+    "raise statements": 738,
     COMMENTS: 5,
     f"files of more than {LONGEST_FILE} lines": 0,
     f"functions with more than {MOST_PARAMETERS} parameters": 8,

@@ -175,6 +175,7 @@ def test_orders_in_h():
         assert found == pytest.approx(order, abs=0.35), (scheme, errors)
 
 
+@pytest.mark.slow
 def test_generalised_orders_in_epsilon_and_h():
     """The error of (8, 4) is O(ε h⁸ + ε² h⁴): for small ε it falls as h⁸, for larger ones as h⁴."""
 
@@ -354,6 +355,7 @@ def energy_error(method, h, num_steps, problem=THREE):
     return float(jnp.abs(H / H[0] - 1).max())
 
 
+@pytest.mark.slow
 def test_wisdom_holman_converges_to_the_same_orbit():
     def final(method, n):
         sol = dvi.integrate(
@@ -453,6 +455,7 @@ def test_compensated_sums_and_a_start_in_motion():
     assert np.abs(final(dvi.Compensated()) - final(dvi.FloatingPoint())).max() < 1e-13
 
 
+@pytest.mark.slow
 def test_flows_that_are_not_exact_are_not_joined():
     def coupled(t0, t1, q0, p1, args):
         return p1 @ p1 / 2 + (1 + q0[0] ** 2) * p1[1] ** 2 / 4
@@ -555,6 +558,7 @@ def test_energy_of_the_planets_does_not_drift_by_round_off():
     assert found.std() < 1e-12
 
 
+@pytest.mark.slow
 def test_discovery_and_drift_with_a_splitting_method():
     def nothing(t0, t1, q0, p1, args):
         return jnp.zeros((), q0.dtype)

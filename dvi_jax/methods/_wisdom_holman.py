@@ -13,8 +13,9 @@ from lanewise.dependence import depends_on
 from .. import _kepler
 from .._checks import one_of
 from .._step import Equations, judge, no_solve, no_step_yet
-from .._types import Args, Interval, Scalar, State
+from .._types import Args, Interval, State
 from ..engine.newton import find_root
+from ..flows import value_of
 from ._schemes import ORDERS_OF_CORRECTORS, as_scheme, check_scheme, corrector, joined
 from ._splitting import Part, SplittingMethod, Stage
 from ._strang import Strang
@@ -44,14 +45,10 @@ class _Jacobi(NamedTuple):
         """The mass at the centre of the Kepler orbit of each row but the first."""
         return jnp.cumsum(self.masses)[1:]
 
-    def velocities_of(self, v: Array) -> Array:
-        return self.of(v)
-
-    def velocities_back(self, V: Array) -> Array:
-        return self.back(V)
+    velocities_of, velocities_back = of, back
 
     def drift(self, V: Array) -> Array:
-        """Q' of the part B."""
+        """dQ/dt of the part B."""
         return jnp.zeros_like(V)
 
 
@@ -191,7 +188,8 @@ class WisdomHolman(SplittingMethod):
 
     def parts(self, equations, interval, q):
         frame = self._frame(equations, interval, q)
-        mu = _constant(self.G, equations.args, q) * frame.central_mass()
+        G = value_of(_gravity if self.G is None else self.G, equations.args, q)
+        mu = G * frame.central_mass()
         # With an origin states are relative to it, in these coordinates too: they are linear.
         zero = jnp.zeros_like(q)
         position, momentum = equations.absolute(zero, zero)
@@ -213,31 +211,28 @@ class WisdomHolman(SplittingMethod):
             V1 = V + jnp.concatenate([jnp.zeros_like(V[:1]), dV])
             return X1, V1, judge(no_solve(X)._replace(converged=found), X1, V1)
 
-        def rest(interval, X, V):
-            x, h = frame.back(X), interval.h
-            scale = frame.masses[:, None]
+        def kicked(interval, X, V):
+            h, x, scale = interval.h, frame.back(X), frame.masses[:, None]
 
-            def kick(V):
+            def rate(V):
                 p = scale * frame.velocities_back(V)
-                rate = equations.momentum_rate(interval, x, p) / scale
-                return frame.velocities_of(rate) - attraction(base[0] + X)
+                found = equations.momentum_rate(interval, x, p) / scale
+                return frame.velocities_of(found) - attraction(base[0] + X)
 
             if not implicit:
-                return V + h * kick(V), no_solve(X)
-            start = V.ravel()
+                return V + h * rate(V), no_solve(X)
 
             def residual(V1):
-                middle = (V1 + start).reshape(V.shape) / 2
-                return V1 - start - h * kick(middle).ravel()
+                return V1 - V.ravel() - h * rate((V1.reshape(V.shape) + V) / 2).ravel()
 
-            guess = start + h * kick(V).ravel()
-            V1, info = find_root(residual, guess, start, equations.newton)
+            guess = (V + h * rate(V)).ravel()
+            V1, info = find_root(residual, guess, V.ravel(), equations.newton)
             return V1.reshape(V.shape), info
 
         def interaction(interval, X, V):
             # The recoil of the first body is in this part: half before the kick, half after it.
             X = X + interval.h / 2 * frame.drift(base[1] + V)
-            V, info = rest(interval, X, V)
+            V, info = kicked(interval, X, V)
             X = X + interval.h / 2 * frame.drift(base[1] + V)
             return X, V, judge(info, X, V)
 
@@ -266,7 +261,5 @@ class WisdomHolman(SplittingMethod):
         return self.composed(equations, interval, stages, X, V)
 
 
-def _constant(G: Any, args: Args, like: Array) -> Scalar:
-    if G is None:
-        G = args.get("G", 1.0) if isinstance(args, dict) else 1.0
-    return jnp.asarray(G(args) if callable(G) else G, like.dtype)
+def _gravity(args: Args) -> Any:
+    return args.get("G", 1.0) if isinstance(args, dict) else 1.0

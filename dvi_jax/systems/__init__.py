@@ -13,7 +13,6 @@ from ._problem import (
 )
 from .dipole_field import dipole_field as dipole_field
 from .double_pendulum import double_pendulum as double_pendulum
-from .double_well import double_well as double_well
 from .duffing import duffing as duffing
 from .figure_eight import figure_eight as figure_eight
 from .fput import fput as fput
@@ -46,7 +45,7 @@ from .slow_oscillator import slow_oscillator as slow_oscillator
 from .solar_system import solar_system as solar_system
 from .spinning_top import spinning_top as spinning_top
 from .stiff_fput import stiff_fput as stiff_fput
-from .thermal_chain import thermal_chain as thermal_chain
+from .thermal import double_well as double_well, thermal_chain as thermal_chain
 from .toda import toda as toda
 from .two_centres import two_centres as two_centres
 from .uniform_field import uniform_field as uniform_field

@@ -1,4 +1,4 @@
-"""A chain of particles with one free end, with friction and thermal noise."""
+"""Systems with friction and thermal noise: a particle in a double well, a chain of particles."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -7,12 +7,42 @@ from .._checks import whole
 from ._problem import Parameter, Problem, Start, configurational, library_problem, thermal
 
 
+def well(t0, t1, q0, p1, args):
+    """H_D = p1²/2 + b (q0² − 1)²."""
+    return jnp.sum(p1**2 / 2 + args["barrier"] * (q0**2 - 1) ** 2)
+
+
+def double_well(temperature: float | None = None, friction: float = 1.0) -> Problem:
+    """H = p²/2 + b (q² − 1)², in the right of two wells; with a temperature, Langevin's equation.
+
+    Dimensionless, with b = 1, the height of the barrier. With friction and noise the stationary
+    distribution is canonical: q has the density exp(−b (q² − 1)²/T) / Z, p is normal with the
+    variance T.
+
+    **Raises** `ValueError` for a temperature or a friction that is not positive.
+
+    **Source** Kramers 1940, *Physica* 7, 284; Leimkuhler & Matthews 2015, *Molecular Dynamics*, 7.
+    """
+    barrier = Parameter(1.0, "height of the barrier between the wells [energy]")
+    return library_problem(
+        well,
+        Start("the particle in a double well has one degree of freedom", (1,)),
+        name="double_well",
+        q0=np.array([1.2]),
+        p0=np.array([0.2]),
+        h=0.1,
+        observables=[configurational(well)],
+        source="Kramers 1940, Physica 7, 284",
+        **thermal(friction, temperature, barrier=barrier),
+    )
+
+
 def bonds(t0, t1, q0, p0, q1, p1, args):
     """Extensions of the springs at t1, q_1 and q_i − q_{i−1}: shape (n,)."""
     return jnp.diff(q1, prepend=0)
 
 
-def hamiltonian(t0, t1, q0, p1, args):
+def chain(t0, t1, q0, p1, args):
     r"""Energy of unit masses on quartic springs, the first of which is fixed to a wall.
 
     H_D = Σ_i p1_i²/2 + Σ_i (d_i²/2 + β d_i⁴/4),    d_1 = q0_1,  d_i = q0_i − q0_{i−1}
@@ -36,13 +66,13 @@ def thermal_chain(n: int = 10, temperature: float | None = None, friction: float
     n = whole("n", n, hint="The thermal chain is a row of particles.")
     beta = Parameter(1.0, "quartic part of a spring [energy/length⁴]")
     return library_problem(
-        hamiltonian,
+        chain,
         Start("the thermal chain is a row of particles", (None,)),
         name="thermal_chain",
         q0=np.linspace(0.0, 0.5, n),
         p0=np.linspace(0.3, -0.3, n),
         h=0.1,
-        observables=[bonds, configurational(hamiltonian)],
+        observables=[bonds, configurational(chain)],
         source="Lepri, Livi & Politi 2003, Phys. Rep. 377, 1",
         **thermal(friction, temperature, beta=beta),
     )
