@@ -295,7 +295,8 @@ def test_without_rotational_transform():
     assert float(at.s) == pytest.approx(1, abs=1e-12)
 
 
-@pytest.mark.parametrize(("parts", "helicity"), [pytest.param(1, 0, marks=slow), (2, -1)])
+@pytest.mark.parametrize(("parts", "helicity"), [(1, 0), (2, -1)])
+@slow
 def test_sums_and_their_derivatives(parts, helicity):
     """Against the definition with powers, cosines and sines, to the third derivative."""
     c = np.random.default_rng(1).normal(size=(parts, 3, 3, 3))
@@ -521,6 +522,7 @@ def test_loss_fractions_have_wilsons_interval():
         boozer.loss_fraction([], [1.0])
 
 
+@pytest.mark.slow
 def test_a_sweep_over_births():
     """Each particle has its own μ; losses at the times of single runs."""
     field = boozer.from_modes(

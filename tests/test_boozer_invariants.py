@@ -165,6 +165,7 @@ def test_second_invariant_varies_where_the_symmetry_is_broken():
     assert spreads(6.0, 1.0) > 1e3 * spreads(6.0, 0.0)
 
 
+@pytest.mark.slow
 def test_classes_of_orbits():
     J, margins = seen(6.0, 0.0)
     assert boozer.classify(margins).tolist() == ["trapped", "transitional", "passing"]

@@ -56,7 +56,9 @@ def test_a_force_acts_in_the_solve_of_all_unknowns():
     assert np.abs(a.ps[-1] - free.ps[-1]).max() > 1e-3
 
 
-@pytest.mark.parametrize("method", [dvi.GaussLegendre(2), dvi.RungeKutta4()])
+@pytest.mark.parametrize(
+    "method", [dvi.GaussLegendre(2), pytest.param(dvi.RungeKutta4(), marks=pytest.mark.slow)]
+)
 def test_gradients(method):
     def last(H, k):
         return run(H, method, k, steps=5).qs[-1, 0]
