@@ -11,7 +11,7 @@ NAMESPACES = {
         name: name
         for name in (
             *("methods", "noise", "lattices", "observe", "discover", "dynamics", "proof"),
-            *("systems", "plot", "interop", "testing", "paper", "certify", "run"),
+            *("systems", "plot", "interop", "testing", "paper", "certify", "run", "rings"),
         )
     },
     # The functions `dvi.sweep` and `dvi.fit` have the names of their packages.

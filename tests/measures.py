@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = ("dvi_jax", "lanewise", "dvi_jax_cli")
 APPLICATIONS = {
     "discover", "sweep", "fit", "dynamics", "systems", "plot", "testing", "certify", "paper",
-    "interop", "run", "symmetry", "invariants", "proof",
+    "interop", "run", "symmetry", "invariants", "proof", "rings",
 }  # fmt: skip
 """What is no part of the core of `dvi_jax`."""
 

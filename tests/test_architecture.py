@@ -38,7 +38,7 @@ FLOORS = [
     ["sweep", "fit", "proof"],
     ["dynamics"],
     ["_namespaces"],
-    ["__init__", "systems", "plot", "symmetry", "invariants"],
+    ["__init__", "systems", "plot", "symmetry", "invariants", "rings"],
     ["testing"],
     ["paper", "certify"],
     ["interop"],

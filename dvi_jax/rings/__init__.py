@@ -1,0 +1,18 @@
+"""Storage rings: lattices of magnets as maps, with gradients and invariants."""
+
+from ._elements import (
+    Element as Element,
+    aperture as aperture,
+    bend as bend,
+    cavity as cavity,
+    corrector as corrector,
+    drift as drift,
+    marker as marker,
+    multipole as multipole,
+    octupole as octupole,
+    quadrupole as quadrupole,
+    sextupole as sextupole,
+    solenoid as solenoid,
+)
+from ._ring import Ring as Ring
+from ._track import Tracked as Tracked, track as track

@@ -1,0 +1,181 @@
+"""Maps of the exact Hamiltonian, and of bends to second order in the curvature."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from ._maps import KICKS, Parameters, Part, Particle, Piece, field, near_identity
+
+
+def pz_of(z: Particle, px: Any = None) -> Any:
+    px = z.px if px is None else px
+    return jnp.sqrt((1 + z.delta) ** 2 - px * px - z.py * z.py)
+
+
+def exact_drift(z: Particle, length: Any, par: Parameters) -> Particle:
+    """The flow of −√((1 + δ)² − px² − py²) over a length [m]."""
+    p, p2, pz = 1 + z.delta, z.px * z.px + z.py * z.py, pz_of(z)
+    each = length / pz
+    # The path of the reference particle is subtracted: (p − pz)/pz without cancellation.
+    return z.moved(x=each * z.px, y=each * z.py, zeta=-each * p2 / (p + pz))
+
+
+def _arc(z: Particle, px: Any) -> Any:
+    """The angle between the momenta px before and after a bend, in the plane of the bend."""
+    across = jnp.sqrt((1 + z.delta) ** 2 - z.py * z.py)
+    return jnp.arcsin(z.px / across) - jnp.arcsin(px / across)
+
+
+def exact_bend(z: Particle, length: Any, par: Parameters) -> Particle:
+    """The flow in a uniform field h in coordinates of curvature h. Forest 1998, (12.18)."""
+    h = par["h"]
+    rest = pz_of(z) - (1 + z.x * h)
+    c, s = jnp.cos(h * length), jnp.sin(h * length)
+    px = z.px * c + rest * s
+    path = length + _arc(z, px) / h
+    x = (pz_of(z, px) - rest * c + z.px * s - 1) / h
+    late = (1 + z.delta) * path - length
+    return z._replace(x=x, px=px, y=z.y + z.py * path, zeta=z.zeta - late)
+
+
+def rotated(z: Particle, angle: Any) -> Particle:
+    """Free motion to a plane that is rotated about the y-axis. Forest 1998, (10.26)."""
+    c, s, pz = jnp.cos(angle), jnp.sin(angle), pz_of(z)
+    p = c * pz - s * z.px
+    path = z.x * s / p
+    return z._replace(
+        x=z.x * pz / p,
+        px=s * pz + c * z.px,
+        y=z.y + z.py * path,
+        zeta=z.zeta - (1 + z.delta) * path,
+    )
+
+
+def wedge(z: Particle, angle: Any, h: Any) -> Particle:
+    """Motion in a uniform field h to a plane that is rotated about the y-axis. Forest (12.41)."""
+    c, s, pz = jnp.cos(angle), jnp.sin(angle), pz_of(z)
+    px = z.px * c + (pz - h * z.x) * s
+    path = (angle + _arc(z, px)) / h
+    above = z.x * (z.px * jnp.sin(2 * angle) + s * s * (2 * pz - h * z.x))
+    x = z.x * c + above / (pz_of(z, px) + pz * c - z.px * s)
+    return z._replace(x=x, px=px, y=z.y + z.py * path, zeta=z.zeta - (1 + z.delta) * path)
+
+
+def dipole_fringe(z: Particle, h: Any, gap: Any) -> Particle:
+    """The hard edge of a bend: a type-II generating function y² φ(px, py, δ)/2. Forest (13.13)."""
+
+    def phi(px, py, delta):
+        pz = jnp.sqrt((1 + delta) ** 2 - px * px - py * py)
+        u, v = px / pz, py / pz
+        inner = h * gap * (1 + u * u * (2 + v * v)) * pz - jnp.arctan(u / (1 + v * v))
+        return -h * jnp.tan(inner)
+
+    value, (of_px, of_py, of_delta) = jax.value_and_grad(phi, argnums=(0, 1, 2))(
+        z.px, z.py, z.delta
+    )
+    y = 2 * z.y / (1 + jnp.sqrt(1 - 2 * of_py * z.y))
+    half = y * y / 2
+    return z._replace(y=y).moved(x=of_px * half, py=-value * y, zeta=of_delta * half)
+
+
+def multipole_fringe(z: Particle, par: Parameters, side: int, order: int, skips_b0: bool):
+    """The hard edge of multipoles, to first order in the field. Forest 1998, (13.29)."""
+
+    def shift(at):
+        x, y = at
+        re, im, total = 1.0, 0.0, jnp.zeros_like(at)
+        for n in range(order + 1):
+            re, im = re * x - im * y, re * y + im * x
+            b = 0.0 if n == 0 and skips_b0 else par[f"b{n}"]
+            a, j = par[f"a{n}"], n + 1
+            u, v = b * re - a * im, b * im + a * re
+            c = (j + 2) / j
+            total = total - side / (4 * (j + 1)) * jnp.stack([u * x + c * v * y, u * y - c * v * x])
+        return total
+
+    at, p = jnp.stack([z.x, z.y]), 1 + z.delta
+    f = shift(at)
+    J = jax.jacfwd(shift)(at) / p
+    # (1 − Jᵀ) p' = p, two equations.
+    a, d, b, c = 1 - J[0, 0], 1 - J[1, 1], -J[1, 0], -J[0, 1]
+    det = a * d - b * c
+    px, py = (d * z.px - b * z.py) / det, (a * z.py - c * z.px) / det
+    late = -(px * f[0] + py * f[1]) / (p * p)
+    return z._replace(px=px, py=py).moved(x=-f[0] / p, y=-f[1] / p, zeta=-late)
+
+
+# --- bends to second order -----------------------------------------------------------------------
+
+
+def second_order_edge(side: str, sign: int) -> Piece:
+    """The edge of a bend to second order in the coordinates, as in TRANSPORT."""
+
+    def change(z, par):
+        h, e, k = par["h"], par[f"edge_{side}"], par["b1"]
+        tan, sec2 = jnp.tan(e), 1 / jnp.cos(e) ** 2
+        psi = h * par[f"fringe_{side}"] * (1 + jnp.sin(e) ** 2) / jnp.cos(e)
+        bar = jnp.tan(e - psi)
+        t, s = sign * h * tan * tan / 2, sign * h * sec2 / 2
+        # Terms of exit and entrance differ in those of third order in h.
+        if sign > 0:
+            xx, yy, xy = k * tan, -k * tan + h * h * tan * (bar * bar + sec2) / 2, -k * tan
+        else:
+            xx = k * tan - h * h * tan**3 / 2
+            yy = -k * tan - h * h * tan * bar * bar / 2
+            xy = -k * tan + h * h * tan * sec2 / 2
+        x, px, y, py = z.x, z.px, z.y, z.py
+        return {
+            "x": -t * x * x + s * y * y,
+            "px": h * tan * x + 2 * t * (x * px - y * py) + xx * x * x + yy * y * y,
+            "y": 2 * t * x * y,
+            "py": -h * bar * y - 2 * t * x * py + 2 * xy * x * y - 2 * s * px * y,
+        }
+
+    return near_identity(change)
+
+
+def _curved_drift(z: Particle, length: Any, par: Parameters) -> dict[str, Any]:
+    """(1 + h x)(px² + py²)/(2 (1 + δ)), to second order in h times the length."""
+    h, p = par["h"], 1 + z.delta
+    turn, u, v = h * length, z.px / p, z.py / p
+    wide = 1 + h * z.x
+    return {
+        "x": wide * u * length + turn * length * (u * u - v * v) / 4,
+        "px": -turn * (u * z.px + v * z.py) / 2,
+        "y": wide * v * length * (1 + z.px * turn / 2),
+        "zeta": -wide * length * (u * u + v * v) / 2,
+    }
+
+
+def _second_order_kick(z: Particle, length: Any, par: Parameters, order: int) -> Particle:
+    """The kick with the vector potential to order 4 in a bend; no skew fields."""
+    h, x, y = par["h"], z.x, z.y
+    b1, b2 = (par[f"b{n}"] if n <= order else 0.0 for n in (1, 2))
+    re, im = field(z, {**par, **{f"a{n}": 0.0 for n in range(order + 1)}}, order)
+    bent = h * x + b1 * (x * x - y * y / 2) + b2 * (x**3 - 4 / 3 * x * y * y)
+    up = b1 * x * y + 4 / 3 * b2 * x * x * y + (h / 6 * b1 - b2 / 3) * y**3
+    return z.moved(
+        px=-length * (re - h * z.delta + h * bent),
+        py=length * (im + h * up),
+        zeta=-length * h * x,
+    )
+
+
+def second_order_bend(of: Part) -> list[Piece]:
+    kicks, order = KICKS[of.scheme], of.order
+    coasts = [(a + b) / 2 for a, b in zip((0.0, *kicks), (*kicks, 0.0), strict=True)]
+
+    def one_slice(z, par, turn, sign):
+        part = par["length"] / of.slices
+        # Not a flow: two of these drifts are not one, and the inverse is solved for.
+        for i in range(len(coasts))[::sign]:
+            if sign < 0 and i < len(kicks):
+                z = _second_order_kick(z, -kicks[i] * part, par, order)
+            coast = near_identity(lambda z, par, c=coasts[i]: _curved_drift(z, c * part, par))
+            z = coast.apply(z, par, turn, sign)
+            if sign > 0 and i < len(kicks):
+                z = _second_order_kick(z, kicks[i] * part, par, order)
+        return z
+
+    return [Piece(one_slice, of.slices)]

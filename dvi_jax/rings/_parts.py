@@ -1,0 +1,105 @@
+"""The parts that elements are made of, by name."""
+
+import functools
+from collections.abc import Callable
+
+from ._exact import (
+    dipole_fringe,
+    exact_bend,
+    exact_drift,
+    multipole_fringe,
+    rotated,
+    second_order_bend,
+    second_order_edge,
+    wedge,
+)
+from ._maps import (
+    Part,
+    Piece,
+    affine,
+    cavity,
+    corrector,
+    curved_kick,
+    drift,
+    edge,
+    kick,
+    near_identity,
+    placed,
+    quadrupole_fringe,
+    sliced,
+    solenoid,
+    thin_kick,
+)
+
+
+def _flow(move: Callable) -> list[Piece]:
+    return [Piece(lambda z, par, turn, sign: move(z, sign * par["length"], par))]
+
+
+def _plain(move: Callable) -> list[Piece]:
+    return [Piece(lambda z, par, turn, sign: move(z, par, sign))]
+
+
+def _solved(move: Callable) -> list[Piece]:
+    """A map near the identity, given as a function from state to state."""
+
+    def change(z, par):
+        after = move(z, par)
+        return {n: getattr(after, n) - getattr(z, n) for n in z._fields}
+
+    return [near_identity(change)]
+
+
+def _exact_fringe(side: int, order: int, skips_b0: bool) -> list[Piece]:
+    return _solved(
+        lambda z, par: multipole_fringe(z, par, side, order, skips_b0),
+    )
+
+
+_MAPS: dict[str, Callable[[Part], list[Piece]]] = {
+    "drift": lambda p: _flow(drift),
+    "half_drift": lambda p: _flow(lambda z, length, par: drift(z, length / 2, par)),
+    "exact_drift": lambda p: _flow(exact_drift),
+    "straight": lambda p: sliced(drift, kick, p),
+    "bend": lambda p: sliced(drift, curved_kick, p),
+    "exact_straight": lambda p: sliced(exact_drift, kick, p),
+    "exact_bend": lambda p: sliced(exact_bend, kick, p),
+    "second_order_bend": second_order_bend,
+    "thin": lambda p: _plain(functools.partial(thin_kick, order=p.order)),
+    "edge_in": lambda p: [edge("in", True)],
+    "edge_out": lambda p: [edge("out", True)],
+    "at_edge_in": lambda p: [edge("in", False)],
+    "at_edge_out": lambda p: [edge("out", False)],
+    "second_order_edge_in": lambda p: [second_order_edge("in", 1)],
+    "second_order_edge_out": lambda p: [second_order_edge("out", -1)],
+    "fringe_in": lambda p: [quadrupole_fringe(1)],
+    "fringe_out": lambda p: [quadrupole_fringe(-1)],
+    "multipole_fringe_in": lambda p: _exact_fringe(1, p.order, False),
+    "multipole_fringe_out": lambda p: _exact_fringe(-1, p.order, False),
+    "gradient_fringe_in": lambda p: _exact_fringe(1, p.order, True),
+    "gradient_fringe_out": lambda p: _exact_fringe(-1, p.order, True),
+    "dipole_fringe_in": lambda p: _solved(
+        lambda z, par: dipole_fringe(z, par["h"], par["fringe_in"])
+    ),
+    "dipole_fringe_out": lambda p: _solved(
+        lambda z, par: dipole_fringe(z, -par["h"], par["fringe_out"])
+    ),
+    "rotation_in": lambda p: _plain(lambda z, par, sign: rotated(z, sign * par["edge_in"])),
+    "rotation_out": lambda p: _plain(lambda z, par, sign: rotated(z, sign * par["edge_out"])),
+    "wedge_in": lambda p: _plain(lambda z, par, sign: wedge(z, -sign * par["edge_in"], par["h"])),
+    "wedge_out": lambda p: _plain(lambda z, par, sign: wedge(z, -sign * par["edge_out"], par["h"])),
+    "cavity": lambda p: [Piece(cavity)],
+    "corrector": lambda p: [Piece(corrector)],
+    "solenoid": lambda p: [Piece(solenoid)],
+    "placed_in": lambda p: _plain(placed),
+    "placed_out": lambda p: _plain(lambda z, par, sign: placed(z, par, -sign)),
+    "affine_in": lambda p: [affine("in")],
+    "affine_out": lambda p: [affine("out")],
+}
+
+
+@functools.cache
+def pieces_of(part: Part) -> tuple[Piece, ...]:
+    """The maps of a part; none of an aperture, which does not move a particle."""
+    make = _MAPS.get(part.name)
+    return () if make is None else tuple(make(part))

@@ -1,0 +1,230 @@
+"""Particles over many turns, with losses and derivatives."""
+
+import functools
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array
+
+import lanewise
+from lanewise.jaxapi import linear_map
+
+from .._checks import instance, whole
+from ._maps import Particle
+from ._ring import Ring
+from ._turn import flown, pulled, rows_of, start
+
+
+class Tracked(NamedTuple):
+    """Particles after some turns.
+
+    - `z`: (x, px, y, py, ζ, δ) after the last turn, shape (…, 6), or after every m-th turn, shape
+      (…, turns/m, 6); NaN after a loss.
+    - `turn`, `element`: where a particle was lost, −1 if it was not, shape (…). `last`: its
+      coordinates behind that element, shape (…, 6), NaN if it was not lost.
+    """
+
+    z: Array
+    turn: Array
+    element: Array
+    last: Array
+
+    @property
+    def lost(self) -> Array:
+        """Whether a particle was lost, shape (…)."""
+        return self.turn >= 0
+
+
+def track(
+    ring: Ring,
+    z: Any,
+    turns: int = 1,
+    *,
+    every: int | None = None,
+    epsilon: Any = 0.0,
+    first_turn: int = 0,
+) -> Tracked:
+    r"""Particles over `turns` turns, all of a batch at once.
+
+    **Arguments** `z`: (x, px, y, py, ζ, δ), shape (…, 6): x, y [m], momenta over that of the
+    reference particle, ζ = −c Δt [m] (late particles have ζ < 0), δ = Δp/p. `every`: save after
+    each m-th turn, a divisor of `turns`; None: after the last one. `epsilon`: factor of what
+    `Ring.perturbed` set aside. `first_turn`: number of the first turn, for cavities with a slip.
+
+    A particle is lost at an aperture, or where |x|, |px|, |y|, |py| or |δ| exceeds 1.
+
+    The result can be differentiated by z, epsilon and the parameters of the ring. In reverse mode
+    particles are tracked backwards, so that the memory does not grow with `turns`. The derivative
+    is NaN where the start is missed by more than 1e-6, after very long or chaotic motion; that of a
+    lost particle is zero if the loss function does not use it.
+
+    **Raises** `ValueError` for z of another shape, an `every` that does not divide `turns`, and a
+    parameter that is not finite.
+
+    **Example**
+
+    ```python
+    z = jnp.zeros((1000, 6)).at[:, 0].set(jnp.linspace(0, 0.01, 1000))
+    out = rings.track(ring, z, 1000)
+    print(int(out.lost.sum()), "of 1000 particles lost")
+    ```
+    """
+    instance("ring", ring, Ring, "a rings.Ring")
+    ring.check()
+    whole("turns", turns)
+    every = turns if every is None else whole("every", every)
+    if turns % every:
+        raise ValueError(f"every must divide turns = {turns}, got every = {every}.")
+    z = jnp.asarray(z, float)
+    if z.shape[-1:] != (6,):
+        raise ValueError(
+            "z must have six coordinates (x, px, y, py, ζ, δ) on its last axis, got an array of "
+            f"shape {z.shape}."
+        )
+    shape = z.shape[:-1]
+    epsilon = jnp.broadcast_to(jnp.asarray(epsilon, float), shape).reshape(-1)
+    counts = turns // every, every, first_turn
+    saved, turn, element, last = _tracked(ring, z.reshape(-1, 6), epsilon, counts)
+    saved = saved[:, -1] if turns == every else saved
+    parts = saved, turn, element, last
+    return Tracked(*(x.reshape(*shape, *x.shape[1:]) for x in parts))
+
+
+def _batched(function, *on):
+    """`function` of one particle as machine code for many; `on`: which arguments have one each."""
+    one = functools.partial(lanewise.call, function)
+    return jax.vmap(one, [0 if o else None for o in on])
+
+
+@eqx.filter_jit
+def _tracked(ring: Ring, z: Array, epsilon: Array, counts: tuple[int, int, int]):
+    blocks, every, first = counts
+
+    def forward(ring, z, epsilon):
+        rows = rows_of(ring)
+
+        def turn(flight, k):
+            return flown(ring, rows, flight, k, epsilon), None
+
+        def block(state, _):
+            def one(state, _):
+                k, flight = state
+                return (k + 1, turn(flight, k)[0]), None
+
+            (k, flight), _ = lax.scan(one, state, None, every)
+            return (k, flight), jnp.stack(flight.z)
+
+        state = jnp.asarray(first, jnp.int32), start(Particle(*z))
+        (_, flight), saved = lax.scan(block, state, None, blocks)
+        return saved, (flight.turn, flight.element, jnp.stack(flight.last))
+
+    @jax.custom_jvp
+    def tracked(ring, z, epsilon):
+        return _batched(forward, False, True, True)(ring, z, epsilon)
+
+    @functools.partial(tracked.defjvp, symbolic_zeros=True)
+    def _(primals, tangents):
+        ring, z, epsilon = primals
+        saved, losses = tracked(*primals)
+        moves = jax.tree.map(lambda x: not isinstance(x, SymbolicZero), tangents)
+        change = jax.tree.map(
+            lambda t, x, m: t if m else jnp.zeros_like(x), tangents, primals, moves
+        )
+
+        def along(residuals, change):
+            of = jax.vmap(lambda r, z, e: forward(r, z, e)[0], (None, 0, 0))
+            return jax.jvp(of, residuals[0], change)[1]
+
+        def push(residuals, change):
+            def of(ring, z, epsilon, *change):
+                return jax.jvp(lambda *x: forward(*x)[0], (ring, z, epsilon), change)[1]
+
+            on = (False, True, True) * 2
+            return _batched(of, *on)(*residuals[0], *change)
+
+        def pull(residuals, cotangent):
+            return _pulled(*residuals, cotangent, counts, moves)
+
+        residuals = primals, saved
+        moved = linear_map(push, pull, along, residuals, change)
+        none = [np.zeros(x.shape, jax.dtypes.float0) for x in losses[:2]]
+        return (saved, losses), (moved, (*none, jnp.zeros_like(losses[2])))
+
+    saved, losses = tracked(ring, z, epsilon)
+    return saved, *losses
+
+
+_MISSED = 1e-6
+
+
+def _pulled(primals, saved, cotangent, counts, moves):
+    """The cotangents of ring, z and ε: all particles backwards, turn by turn."""
+    ring, z0, epsilon = primals
+    blocks, every, first = counts
+    of_columns = [n for n, m in moves[0].columns.items() if m]
+    of_extra = [n for n, m in moves[0].extra.items() if m]
+    of_epsilon = list(ring.extra) if moves[2] else []
+    moving = sorted({*of_columns, *of_extra, *of_epsilon})
+    rows = rows_of(ring)
+
+    def one_turn(ring, rows, z, c, k, epsilon):
+        z, c, found = pulled(ring, rows, moving, Particle(*z), Particle(*c), k, epsilon)
+        of = [jnp.sum(found[n] * rows[f"ε {n}"]) for n in of_epsilon]
+        columns = {n: found[n] for n in of_columns}
+        extra = {n: epsilon * found[n] for n in of_extra}
+        return jnp.stack(z), jnp.stack(c), columns, extra, sum(of, jnp.zeros(()))
+
+    turn_back = _batched(one_turn, False, False, True, True, False, True)
+    lost = jnp.isnan(saved[:, :, :1])
+    # A lost particle has no influence, unless its cotangent is not zero.
+    wrong = jnp.any(lost & (cotangent != 0), axis=(1, 2))
+    saved = jnp.where(lost, 0.0, saved)
+    starts = jnp.concatenate([z0[:, None], saved[:, :-1]], axis=1)
+    begin = (
+        jnp.asarray(first + blocks * every - 1, jnp.int32),
+        jnp.zeros_like(z0),
+        {n: jnp.zeros(rows[n].shape) for n in of_columns},
+        {n: jnp.zeros(rows[n].shape) for n in of_extra},
+        jnp.zeros(len(z0)),
+        jnp.zeros(len(z0)),
+    )
+
+    def block(state, x):
+        k, c, columns, extra, of_epsilon, worst = state
+        start, end, more = x
+
+        def undo(_, state):
+            k, z, c, *total = state
+            z, c, *found = turn_back(ring, rows, z, c, k, epsilon)
+            columns, extra = jax.tree.map(lambda x: jnp.sum(x, 0), found[:2])
+            total = jax.tree.map(jnp.add, total, [columns, extra, found[2]])
+            return (k - 1, z, c, *total)
+
+        begin = (k, end, c + more, columns, extra, of_epsilon)
+        k, z, *state = lax.fori_loop(0, every, undo, begin)
+        missed = jnp.max(jnp.abs(z - start), axis=1)
+        return (k, *state, jnp.maximum(worst, missed)), None
+
+    xs = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), (starts, saved, cotangent))
+    (_, c, columns, extra, of_epsilon, worst), _ = lax.scan(block, begin, xs, reverse=True)
+    # A particle that is lost later: its rows after the loss start from zero and carry no cotangent.
+    fine = ~wrong & ((worst < _MISSED) | jnp.any(lost, axis=(1, 2)))
+    all_fine = jnp.where(jnp.all(fine), 1.0, jnp.nan)
+    element = np.asarray([row[1] for row in ring.program.rows])
+
+    def gathered(values: dict, like: dict) -> dict:
+        zeros = jax.tree.map(jnp.zeros_like, like)
+        found = {n: zeros[n].at[element].add(all_fine * v) for n, v in values.items()}
+        return {**zeros, **found}
+
+    of_ring = jax.tree.unflatten(
+        jax.tree.structure(ring),
+        jax.tree.leaves((gathered(columns, ring.columns), gathered(extra, ring.extra))),
+    )
+    nan = jnp.where(fine, 1.0, jnp.nan)
+    return of_ring, nan[:, None] * c, nan * of_epsilon

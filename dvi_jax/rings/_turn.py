@@ -1,0 +1,130 @@
+"""One turn of one particle, its inverse, and its transposed derivative."""
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+import lanewise
+
+from ._maps import APERTURES, Particle, forward, pull_back
+from ._parts import pieces_of
+from ._ring import Ring
+
+LARGEST = 1.0
+"""A particle with a larger coordinate than this (x, px, y, py, δ) is lost, as in pyAT."""
+
+
+class Flight(NamedTuple):
+    """A particle, and where it was lost: element and turn (−1 if it was not) and coordinates."""
+
+    z: Particle
+    element: Array
+    turn: Array
+    last: Particle
+
+
+def start(z: Particle) -> Flight:
+    none = jnp.asarray(-1, jnp.int32)
+    return Flight(z, none, none, Particle(*[jnp.full((), jnp.nan)] * 6))
+
+
+def _noted(flight: Flight, z: Particle, passes: Any, element: Any, turn: Any) -> Flight:
+    """The flight with the particle after an element, or with its loss there."""
+    inside = functools.reduce(jnp.logical_and, [jnp.abs(z[i]) <= LARGEST for i in (0, 1, 2, 3, 5)])
+    # NaN in a coordinate fails the comparison.
+    passes = passes & inside & jnp.isfinite(z.zeta)
+    is_lost = ~passes & (flight.element < 0)
+
+    def note():
+        def chosen(new, old):
+            return jax.tree.map(lambda a, b: jnp.where(is_lost, a, b), new, old)
+
+        nan = Particle(*[jnp.full((), jnp.nan)] * 6)
+        return Flight(
+            chosen(nan, z),
+            chosen(element, flight.element),
+            chosen(jnp.asarray(turn, jnp.int32), flight.turn),
+            chosen(z, flight.last),
+        )
+
+    # The branch keeps this work out of parts in which no particle is lost, which is nearly all.
+    return lax.cond(lanewise.on_any(is_lost), note, lambda: flight._replace(z=z))
+
+
+def rows_of(ring: Ring, first: int = 0, last: int | None = None) -> dict[str, Any]:
+    """The parameters of each part of the elements `first` … `last` − 1, in the order of passage."""
+    last = len(ring) if last is None else last
+    rows = [row for row in ring.program.rows if first <= row[1] < last]
+    part, element = np.asarray(rows, np.int32).reshape(-1, 2).T
+    rows = {name: column[element] for name, column in ring.columns.items()}
+    rows |= {f"ε {name}": column[element] for name, column in ring.extra.items()}
+    for side in ("in", "out"):
+        matrix = rows.get(f"matrix_{side}")
+        if matrix is not None:
+            zero = jnp.all(matrix == 0, axis=(1, 2), keepdims=True)
+            rows[f"inverse_{side}"] = jnp.linalg.inv(jnp.where(zero, jnp.eye(6), matrix))
+    return {**rows, "part": part, "element": element}
+
+
+def _perturbed(par: dict[str, Any], epsilon: Any) -> dict[str, Any]:
+    """The parameters of a part, with what ε is multiplied by added."""
+    extra = {name[2:]: value for name, value in par.items() if name.startswith("ε ")}
+    return {**par, **{name: par[name] + epsilon * value for name, value in extra.items()}}
+
+
+def moved(ring: Ring, rows: dict, z: Particle, turn: Any, epsilon: Any, sign: int = 1) -> Particle:
+    """The particle after the parts in `rows`, or before them for sign −1; without apertures."""
+
+    def row(z, par):
+        par = _perturbed(par, epsilon)
+        maps = [
+            lambda z, pieces=pieces_of(part): forward(pieces, z, par, turn, sign)
+            for part in ring.program.parts
+        ]
+        return lax.switch(par["part"], maps, z), None
+
+    return lax.scan(row, z, rows, reverse=sign < 0)[0]
+
+
+def flown(ring: Ring, rows: dict, flight: Flight, turn: Any, epsilon: Any) -> Flight:
+    """The flight after the parts in `rows`, with losses. A particle that is lost becomes NaN."""
+
+    def row(flight, par):
+        par = _perturbed(par, epsilon)
+
+        def through(part):
+            inside = APERTURES.get(part.name)
+            if inside is not None:
+                return lambda z: (z, inside(z, par))
+            return lambda z: (forward(pieces_of(part), z, par, turn, 1), jnp.asarray(True))
+
+        z, passes = lax.switch(par["part"], [through(p) for p in ring.program.parts], flight.z)
+        return _noted(flight, z, passes, par["element"], turn), None
+
+    return lax.scan(row, flight, rows)[0]
+
+
+def pulled(
+    ring: Ring, rows: dict, moving: list[str], z: Particle, cotangent: Particle, turn: Any, eps: Any
+) -> tuple[Particle, Particle, dict[str, Array]]:
+    """The particle before the parts in `rows` and its cotangent, from those after them; and the
+    cotangents of the parameters `moving`, one for each part."""
+
+    def row(state, par):
+        z, cotangent = state
+        par = _perturbed(par, eps)
+        known = {name: par[name] for name in moving}
+        maps = [
+            lambda z, c, pieces=pieces_of(part): pull_back(pieces, z, c, par, known, turn)
+            for part in ring.program.parts
+        ]
+        z, cotangent, of_moving = lax.switch(par["part"], maps, z, cotangent)
+        return (z, cotangent), of_moving
+
+    (z, cotangent), of_moving = lax.scan(row, (z, cotangent), rows, reverse=True)
+    return z, cotangent, of_moving
