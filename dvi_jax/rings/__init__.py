@@ -14,5 +14,6 @@ from ._elements import (
     sextupole as sextupole,
     solenoid as solenoid,
 )
+from ._readers import from_at as from_at, load as load
 from ._ring import Ring as Ring
 from ._track import Tracked as Tracked, track as track

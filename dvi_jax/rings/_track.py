@@ -97,25 +97,21 @@ def track(
 
 def _batched(function, *on):
     """`function` of one particle as machine code for many; `on`: which arguments have one each."""
-    one = functools.partial(lanewise.call, function)
-    return jax.vmap(one, [0 if o else None for o in on])
+    return jax.vmap(functools.partial(lanewise.call, function), [0 if o else None for o in on])
 
 
 @eqx.filter_jit
 def _tracked(ring: Ring, z: Array, epsilon: Array, counts: tuple[int, int, int]):
     blocks, every, first = counts
+    rows, numbers = rows_of(ring)
+    parts = ring.program.parts
 
-    def forward(ring, z, epsilon):
-        rows = rows_of(ring)
-
-        def turn(flight, k):
-            return flown(ring, rows, flight, k, epsilon), None
+    def forward(numbers, rows, z, epsilon):
+        def one(state, _):
+            k, flight = state
+            return (k + 1, flown(parts, numbers, rows, flight, k, epsilon)), None
 
         def block(state, _):
-            def one(state, _):
-                k, flight = state
-                return (k + 1, turn(flight, k)[0]), None
-
             (k, flight), _ = lax.scan(one, state, None, every)
             return (k, flight), jnp.stack(flight.z)
 
@@ -124,60 +120,66 @@ def _tracked(ring: Ring, z: Array, epsilon: Array, counts: tuple[int, int, int])
         return saved, (flight.turn, flight.element, jnp.stack(flight.last))
 
     @jax.custom_jvp
-    def tracked(ring, z, epsilon):
-        return _batched(forward, False, True, True)(ring, z, epsilon)
+    def tracked(rows, z, epsilon):
+        return _batched(forward, False, False, True, True)(numbers, rows, z, epsilon)
 
     @functools.partial(tracked.defjvp, symbolic_zeros=True)
     def _(primals, tangents):
-        ring, z, epsilon = primals
         saved, losses = tracked(*primals)
         moves = jax.tree.map(lambda x: not isinstance(x, SymbolicZero), tangents)
         change = jax.tree.map(
             lambda t, x, m: t if m else jnp.zeros_like(x), tangents, primals, moves
         )
 
-        def along(residuals, change):
-            of = jax.vmap(lambda r, z, e: forward(r, z, e)[0], (None, 0, 0))
-            return jax.jvp(of, residuals[0], change)[1]
+        def pushed(of_batch):
+            def push(residuals, change):
+                def along(numbers, x, change):
+                    return jax.jvp(lambda *x: forward(numbers, *x)[0], x, change)[1]
 
-        def push(residuals, change):
-            def of(ring, z, epsilon, *change):
-                return jax.jvp(lambda *x: forward(*x)[0], (ring, z, epsilon), change)[1]
+                on = (False, True, True)
+                primals = residuals[0]
+                return of_batch(along, on)(numbers, primals, change)
 
-            on = (False, True, True) * 2
-            return _batched(of, *on)(*residuals[0], *change)
+            return push
+
+        def with_xla(along, on):
+            return jax.vmap(along, (None, (None, 0, 0), (None, 0, 0)))
+
+        def in_machine_code(along, on):
+            return jax.vmap(
+                functools.partial(lanewise.call, along), (None, (None, 0, 0), (None, 0, 0))
+            )
 
         def pull(residuals, cotangent):
-            return _pulled(*residuals, cotangent, counts, moves)
+            primals, saved = residuals
+            return _pulled(parts, numbers, primals, saved, cotangent, counts, moves)
 
-        residuals = primals, saved
-        moved = linear_map(push, pull, along, residuals, change)
+        moved = linear_map(
+            pushed(in_machine_code), pull, pushed(with_xla), (primals, saved), change
+        )
         none = [np.zeros(x.shape, jax.dtypes.float0) for x in losses[:2]]
         return (saved, losses), (moved, (*none, jnp.zeros_like(losses[2])))
 
-    saved, losses = tracked(ring, z, epsilon)
+    saved, losses = tracked(rows, z, epsilon)
     return saved, *losses
 
 
 _MISSED = 1e-6
 
 
-def _pulled(primals, saved, cotangent, counts, moves):
-    """The cotangents of ring, z and ε: all particles backwards, turn by turn."""
-    ring, z0, epsilon = primals
+def _pulled(parts, numbers, primals, saved, cotangent, counts, moves):
+    """The cotangents of rows, z and ε: all particles backwards, turn by turn."""
+    rows, z0, epsilon = primals
     blocks, every, first = counts
-    of_columns = [n for n, m in moves[0].columns.items() if m]
-    of_extra = [n for n, m in moves[0].extra.items() if m]
-    of_epsilon = list(ring.extra) if moves[2] else []
-    moving = sorted({*of_columns, *of_extra, *of_epsilon})
-    rows = rows_of(ring)
+    moved = [n for n, m in moves[0].items() if m]
+    by_epsilon = [n.removeprefix("ε ") for n in rows if n.startswith("ε ") and moves[2]]
+    moving = sorted({n.removeprefix("ε ") for n in moved} | set(by_epsilon))
 
-    def one_turn(ring, rows, z, c, k, epsilon):
-        z, c, found = pulled(ring, rows, moving, Particle(*z), Particle(*c), k, epsilon)
-        of = [jnp.sum(found[n] * rows[f"ε {n}"]) for n in of_epsilon]
-        columns = {n: found[n] for n in of_columns}
-        extra = {n: epsilon * found[n] for n in of_extra}
-        return jnp.stack(z), jnp.stack(c), columns, extra, sum(of, jnp.zeros(()))
+    def one_turn(numbers, rows, z, c, k, epsilon):
+        z, c, found = pulled(parts, numbers, rows, moving, Particle(*z), Particle(*c), k, epsilon)
+        of_rows = {n: epsilon * found[n[2:]] if n.startswith("ε ") else found[n] for n in moved}
+        of_epsilon = [jnp.sum(found[n] * rows[f"ε {n}"]) for n in by_epsilon]
+        return jnp.stack(z), jnp.stack(c), of_rows, sum(of_epsilon, jnp.zeros(()))
 
     turn_back = _batched(one_turn, False, False, True, True, False, True)
     lost = jnp.isnan(saved[:, :, :1])
@@ -185,46 +187,34 @@ def _pulled(primals, saved, cotangent, counts, moves):
     wrong = jnp.any(lost & (cotangent != 0), axis=(1, 2))
     saved = jnp.where(lost, 0.0, saved)
     starts = jnp.concatenate([z0[:, None], saved[:, :-1]], axis=1)
-    begin = (
-        jnp.asarray(first + blocks * every - 1, jnp.int32),
-        jnp.zeros_like(z0),
-        {n: jnp.zeros(rows[n].shape) for n in of_columns},
-        {n: jnp.zeros(rows[n].shape) for n in of_extra},
-        jnp.zeros(len(z0)),
-        jnp.zeros(len(z0)),
-    )
 
     def block(state, x):
-        k, c, columns, extra, of_epsilon, worst = state
+        k, c, of_rows, of_epsilon, worst = state
         start, end, more = x
 
         def undo(_, state):
-            k, z, c, *total = state
-            z, c, *found = turn_back(ring, rows, z, c, k, epsilon)
-            columns, extra = jax.tree.map(lambda x: jnp.sum(x, 0), found[:2])
-            total = jax.tree.map(jnp.add, total, [columns, extra, found[2]])
-            return (k - 1, z, c, *total)
+            k, z, c, of_rows, of_epsilon = state
+            z, c, found, by_epsilon = turn_back(numbers, rows, z, c, k, epsilon)
+            of_rows = jax.tree.map(lambda a, b: a + jnp.sum(b, 0), of_rows, found)
+            return k - 1, z, c, of_rows, of_epsilon + by_epsilon
 
-        begin = (k, end, c + more, columns, extra, of_epsilon)
+        begin = (k, end, c + more, of_rows, of_epsilon)
         k, z, *state = lax.fori_loop(0, every, undo, begin)
         missed = jnp.max(jnp.abs(z - start), axis=1)
         return (k, *state, jnp.maximum(worst, missed)), None
 
+    none = jnp.zeros(len(z0))
+    begin = (
+        jnp.asarray(first + blocks * every - 1, jnp.int32),
+        jnp.zeros_like(z0),
+        {n: jnp.zeros_like(rows[n]) for n in moved},
+        none,
+        none,
+    )
     xs = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), (starts, saved, cotangent))
-    (_, c, columns, extra, of_epsilon, worst), _ = lax.scan(block, begin, xs, reverse=True)
-    # A particle that is lost later: its rows after the loss start from zero and carry no cotangent.
+    (_, c, of_rows, of_epsilon, worst), _ = lax.scan(block, begin, xs, reverse=True)
     fine = ~wrong & ((worst < _MISSED) | jnp.any(lost, axis=(1, 2)))
     all_fine = jnp.where(jnp.all(fine), 1.0, jnp.nan)
-    element = np.asarray([row[1] for row in ring.program.rows])
-
-    def gathered(values: dict, like: dict) -> dict:
-        zeros = jax.tree.map(jnp.zeros_like, like)
-        found = {n: zeros[n].at[element].add(all_fine * v) for n, v in values.items()}
-        return {**zeros, **found}
-
-    of_ring = jax.tree.unflatten(
-        jax.tree.structure(ring),
-        jax.tree.leaves((gathered(columns, ring.columns), gathered(extra, ring.extra))),
-    )
     nan = jnp.where(fine, 1.0, jnp.nan)
-    return of_ring, nan[:, None] * c, nan * of_epsilon
+    of_rows = {n: all_fine * of_rows[n] if n in of_rows else jnp.zeros_like(rows[n]) for n in rows}
+    return of_rows, nan[:, None] * c, nan * of_epsilon

@@ -1,6 +1,7 @@
 """One turn of one particle, its inverse, and its transposed derivative."""
 
 import functools
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -11,7 +12,7 @@ from jaxtyping import Array
 
 import lanewise
 
-from ._maps import APERTURES, Particle, forward, pull_back
+from ._maps import APERTURES, Part, Particle, forward, pull_back
 from ._parts import pieces_of
 from ._ring import Ring
 
@@ -56,45 +57,57 @@ def _noted(flight: Flight, z: Particle, passes: Any, element: Any, turn: Any) ->
     return lax.cond(lanewise.on_any(is_lost), note, lambda: flight._replace(z=z))
 
 
-def rows_of(ring: Ring, first: int = 0, last: int | None = None) -> dict[str, Any]:
-    """The parameters of each part of the elements `first` … `last` − 1, in the order of passage."""
+Rows = dict[str, Any]
+"""Parameters of each part of the elements of a ring, in the order of passage."""
+
+
+def rows_of(ring: Ring, first: int = 0, last: int | None = None) -> tuple[Rows, Rows]:
+    """The parameters of the parts of the elements `first` … `last` − 1, and the numbers of the
+    parts and of the elements."""
     last = len(ring) if last is None else last
-    rows = [row for row in ring.program.rows if first <= row[1] < last]
-    part, element = np.asarray(rows, np.int32).reshape(-1, 2).T
+    which = [row for row in ring.program.rows if first <= row[1] < last]
+    part, element = np.asarray(which, np.int32).reshape(-1, 2).T
     rows = {name: column[element] for name, column in ring.columns.items()}
     rows |= {f"ε {name}": column[element] for name, column in ring.extra.items()}
     for side in ("in", "out"):
         matrix = rows.get(f"matrix_{side}")
         if matrix is not None:
-            zero = jnp.all(matrix == 0, axis=(1, 2), keepdims=True)
-            rows[f"inverse_{side}"] = jnp.linalg.inv(jnp.where(zero, jnp.eye(6), matrix))
-    return {**rows, "part": part, "element": element}
+            none = jnp.all(matrix == 0, axis=(1, 2), keepdims=True)
+            known = lax.stop_gradient(jnp.where(none, jnp.eye(6), matrix))
+            rows[f"inverse_{side}"] = jnp.linalg.inv(known)
+    return rows, {"part": part, "element": element}
 
 
-def _perturbed(par: dict[str, Any], epsilon: Any) -> dict[str, Any]:
+def _perturbed(par: Rows, epsilon: Any) -> Rows:
     """The parameters of a part, with what ε is multiplied by added."""
     extra = {name[2:]: value for name, value in par.items() if name.startswith("ε ")}
     return {**par, **{name: par[name] + epsilon * value for name, value in extra.items()}}
 
 
-def moved(ring: Ring, rows: dict, z: Particle, turn: Any, epsilon: Any, sign: int = 1) -> Particle:
+def moved(
+    parts: Sequence[Part], numbers: Rows, rows: Rows, z: Particle, turn: Any, epsilon: Any, sign=1
+) -> Particle:
     """The particle after the parts in `rows`, or before them for sign −1; without apertures."""
 
-    def row(z, par):
+    def row(z, x):
+        number, par = x
         par = _perturbed(par, epsilon)
-        maps = [
-            lambda z, pieces=pieces_of(part): forward(pieces, z, par, turn, sign)
-            for part in ring.program.parts
-        ]
-        return lax.switch(par["part"], maps, z), None
 
-    return lax.scan(row, z, rows, reverse=sign < 0)[0]
+        def through(part):
+            return lambda z: forward(pieces_of(part), z, par, turn, sign)
+
+        return lax.switch(number["part"], [through(p) for p in parts], z), None
+
+    return lax.scan(row, z, (numbers, rows), reverse=sign < 0)[0]
 
 
-def flown(ring: Ring, rows: dict, flight: Flight, turn: Any, epsilon: Any) -> Flight:
+def flown(
+    parts: Sequence[Part], numbers: Rows, rows: Rows, flight: Flight, turn: Any, epsilon: Any
+) -> Flight:
     """The flight after the parts in `rows`, with losses. A particle that is lost becomes NaN."""
 
-    def row(flight, par):
+    def row(flight, x):
+        number, par = x
         par = _perturbed(par, epsilon)
 
         def through(part):
@@ -103,28 +116,35 @@ def flown(ring: Ring, rows: dict, flight: Flight, turn: Any, epsilon: Any) -> Fl
                 return lambda z: (z, inside(z, par))
             return lambda z: (forward(pieces_of(part), z, par, turn, 1), jnp.asarray(True))
 
-        z, passes = lax.switch(par["part"], [through(p) for p in ring.program.parts], flight.z)
-        return _noted(flight, z, passes, par["element"], turn), None
+        z, passes = lax.switch(number["part"], [through(p) for p in parts], flight.z)
+        return _noted(flight, z, passes, number["element"], turn), None
 
-    return lax.scan(row, flight, rows)[0]
+    return lax.scan(row, flight, (numbers, rows))[0]
 
 
 def pulled(
-    ring: Ring, rows: dict, moving: list[str], z: Particle, cotangent: Particle, turn: Any, eps: Any
-) -> tuple[Particle, Particle, dict[str, Array]]:
+    parts: Sequence[Part],
+    numbers: Rows,
+    rows: Rows,
+    moving: Sequence[str],
+    z: Particle,
+    cotangent: Particle,
+    turn: Any,
+    epsilon: Any,
+) -> tuple[Particle, Particle, Rows]:
     """The particle before the parts in `rows` and its cotangent, from those after them; and the
     cotangents of the parameters `moving`, one for each part."""
 
-    def row(state, par):
-        z, cotangent = state
-        par = _perturbed(par, eps)
+    def row(state, x):
+        number, par = x
+        par = _perturbed(par, epsilon)
         known = {name: par[name] for name in moving}
-        maps = [
-            lambda z, c, pieces=pieces_of(part): pull_back(pieces, z, c, par, known, turn)
-            for part in ring.program.parts
-        ]
-        z, cotangent, of_moving = lax.switch(par["part"], maps, z, cotangent)
-        return (z, cotangent), of_moving
 
-    (z, cotangent), of_moving = lax.scan(row, (z, cotangent), rows, reverse=True)
-    return z, cotangent, of_moving
+        def back(part):
+            return lambda z, c: pull_back(pieces_of(part), z, c, par, known, turn)
+
+        z, cotangent, found = lax.switch(number["part"], [back(p) for p in parts], *state)
+        return (z, cotangent), found
+
+    (z, cotangent), found = lax.scan(row, (z, cotangent), (numbers, rows), reverse=True)
+    return z, cotangent, found
