@@ -14,6 +14,13 @@ from ._elements import (
     sextupole as sextupole,
     solenoid as solenoid,
 )
+from ._optics import (
+    Optics as Optics,
+    closed_orbit as closed_orbit,
+    matrix as matrix,
+    one_turn as one_turn,
+    optics as optics,
+)
 from ._readers import from_at as from_at, load as load
 from ._ring import Ring as Ring
 from ._track import Tracked as Tracked, track as track
