@@ -19,7 +19,7 @@ from ._parts import pieces_of
 from ._ring import Ring
 from ._turn import _perturbed, moved, rows_of
 
-_SLICED = "straight", "bend", "exact_straight", "exact_bend"
+SLICED = "straight", "bend", "exact_straight", "exact_bend"
 _MOST, _AFTER, _NEAR = 15, 3, 1e-9
 """Newton iterations at most, and after the first correction that is smaller than the last one."""
 _UNSTABLE = 1e-11
@@ -33,7 +33,7 @@ class Optics(NamedTuple):
     - `beta` [m], `alpha`: of mode 1 in x and mode 2 in y, shape (elements + 1, 2).
     - `mu`: phase advance from the start [rad], shape (elements + 1, modes).
     - `dispersion`: of x, px, y, py, shape (elements + 1, 4): the derivative of the closed orbit by
-      δ in 4D; in 6D that of the synchrotron mode, Re(v̄_δ v)/\|v_δ\|².
+      δ in 4D; in 6D that of the synchrotron mode, Re(v/v_δ).
     - `modes`: the vectors v of the normal modes, z = Re Σ_k √(2J_k) e^{iφ_k} v_k, shape
       (elements + 1, modes, 4 or 6): β_k = \|v_x\|², α_k = −Re v̄_x v_px.
     - `gamma`: γ of Edwards & Teng, shape (elements + 1,); their β and α are those here over γ².
@@ -168,6 +168,14 @@ def _analysed(
     return found
 
 
+def four(ring: Ring) -> Ring:
+    """The ring with its cavities off."""
+    if "voltage" not in ring.columns:
+        return ring
+    off = {**ring.columns, "voltage": jnp.zeros_like(ring.columns["voltage"])}
+    return eqx.tree_at(lambda r: r.columns, ring, off)
+
+
 def maps(ring: Ring, epsilon: Any) -> tuple[Callable, Any]:
     """``apply(z, x)``, the map of a part of an element, and x for all parts in a row.
 
@@ -178,7 +186,7 @@ def maps(ring: Ring, epsilon: Any) -> tuple[Callable, Any]:
     parts = ring.program.parts
     order = max(p.order for p in parts)
     kinds = [
-        p._replace(order=order, **({"scheme": 2, "slices": 1} if p.name in _SLICED else {}))
+        p._replace(order=order, **({"scheme": 2, "slices": 1} if p.name in SLICED else {}))
         for p in parts
     ]
     kicks = [np.divide([0.0, *KICKS.get(p.scheme, ()) * p.slices], p.slices) for p in parts]
@@ -198,7 +206,7 @@ def maps(ring: Ring, epsilon: Any) -> tuple[Callable, Any]:
                     z = piece.apply(z, {**par, "length": share * par["length"]}, 0, 1)
                 return z, None
 
-            if kind.name in _SLICED:
+            if kind.name in SLICED:
                 return lambda z: lax.scan(kick, z, jnp.stack([steps[:-1], steps[1:]], 1))[0]
             return lambda z: forward(pieces, z, par, 0, 1)
 
@@ -213,18 +221,16 @@ def analysis(
     ring: Ring, z: Array, epsilon: Array, six: bool, chromatic: bool, inside: bool = False
 ) -> tuple[Optics, Array]:
     """See `optics`; also the last correction of the closed orbit. `inside`: before each part of an
-    element and at the end, not at the elements."""
-    c = ring.columns
-    shift = 0.0
+    element and at the end, not at the elements (but for `s`)."""
+    c, shift = ring.columns, 0.0
     if six:
         # The change of ζ per turn of a particle that keeps its phase in the cavities.
         on = c["voltage"] != 0
         shift = (
             -jnp.sum(jnp.where(on, c["slip"] / jnp.where(on, c["wave_number"], 1), 0)) / on.sum()
         )
-    elif "voltage" in c:
-        off = {**c, "voltage": jnp.zeros_like(c["voltage"])}
-        ring = eqx.tree_at(lambda r: r.columns, ring, off)
+    else:
+        ring = four(ring)
     apply, xs = maps(ring, epsilon)
     n, (e_zeta, e_delta) = 6 if six else 4, np.eye(6)[4:]
 
@@ -256,31 +262,30 @@ def analysis(
     (*_, (zs, Ms, dM, D, slip, size), _), _ = lax.scan(
         lambda s, _: (lax.cond(s[3] > _AFTER, lambda s: s, iterate, s), None), begin, None, _MOST
     )
-    fails = jnp.where(size < _NEAR, 1.0, jnp.nan)
-    v, chromaticity = _modes(fails * Ms[-1, :n, :n], dM[:n, :n])
+    zs, Ms, slip = (jnp.where(size < _NEAR, x, jnp.nan) for x in (zs, Ms, slip))
+    v, chromaticity = _modes(Ms[-1, :n, :n], dM[:n, :n])
     vs = jnp.einsum("rij,kj->rki", Ms[:, :n, :n], v)
     x, px = (jnp.diagonal(vs[:, :, i::2], axis1=1, axis2=2) for i in (0, 1))
     mu = jnp.angle(x[1:] * jnp.conj(x[:-1]))
     mu = jnp.where(np.arange(n // 2) < 2, (mu + 0.5) % (2 * np.pi) - 0.5, mu)
     mu = jnp.concatenate([jnp.zeros((1, n // 2)), jnp.cumsum(mu, 0)])
-    Ds = jnp.real(jnp.conj(vs[:, 2, 5:]) * vs[:, 2]) if six else Ms @ D
-    Ds = Ds / jnp.abs(vs[:, 2, 5:]) ** 2 if six else Ds
-    elements = [element for _, element in ring.program.rows]
-    at = np.arange(rows) if inside else np.searchsorted(elements, np.arange(len(ring) + 1))
+    Ds = jnp.real(vs[:, 2] / vs[:, 2, 5:]) if six else Ms @ D
+    at = np.searchsorted([element for _, element in ring.program.rows], np.arange(len(ring) + 1))
+    at = np.arange(rows) if inside else at
     tune = mu[-1] / (2 * np.pi)
     found = Optics(
-        s=ring.places[np.append(elements, len(ring))[at] if inside else np.arange(len(ring) + 1)],
-        orbit=fails * zs[at],
+        s=ring.places,
+        orbit=zs[at],
         beta=jnp.abs(x[at, :2]) ** 2,
         alpha=-jnp.real(jnp.conj(x) * px)[at, :2],
         mu=mu[at],
-        dispersion=fails * Ds[at, :4],
+        dispersion=Ds[at, :4],
         modes=vs[at],
         gamma=jnp.sqrt(jnp.imag(jnp.conj(x) * px)[at, 0]),
-        matrix=fails * Ms[at],
+        matrix=Ms[at],
         tune=jnp.abs(tune),
         chromaticity=jnp.sign(tune) * chromaticity,
-        compaction=fails * slip / ring.places[-1],
+        compaction=slip / ring.places[-1],
     )
     return found, size
 

@@ -1,0 +1,276 @@
+"""Detuning with amplitude, driving terms, dynamic and momentum aperture, frequency maps."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+import lanewise
+
+from .._checks import finite, instance, positive, whole
+from .._progress import bar_of, told
+from ..dynamics.frequencies import frequencies, frequency_diffusion
+from ._maps import Particle
+from ._optics import SLICED, analysis, four, maps, optics
+from ._ring import Ring, Where
+from ._track import track
+from ._turn import flown, rows_of, start
+
+TERMS = (
+    "h21000", "h30000", "h10110", "h10020", "h10200", "h11001", "h00111", "h20001", "h00201",
+    "h10002",
+)  # fmt: skip
+_BATCH = 4096
+"""Particles tracked in one call: more do not become faster, and progress is reported between."""
+
+
+_XY = np.eye(6)[[0, 2]]
+
+
+class Progress(NamedTuple):
+    """How many particles have been tracked, of how many in this round."""
+
+    done: int
+    particles: int
+
+
+class FrequencyMap(NamedTuple):
+    """Tunes of particles: `tune`, the fractional parts in the first half of the turns, and `second`
+    in the second half, shape (…, 2); `diffusion`, log10 of the length of their difference, shape
+    (…). NaN for particles that were lost, and for motion without a leading frequency."""
+
+    tune: Array
+    second: Array
+    diffusion: Array
+
+
+def detuning(ring: Ring, dp: float = 0.0, action: float = 1e-9, turns: int = 1024) -> Array:
+    r"""Change of the tunes with the actions, ((dQx/dJx, dQx/dJy), (dQy/dJx, dQy/dJy)) [1/m].
+
+    Q(J) − Q(0) of 16 particles with actions from one to four times `action` [m] is a polynomial of
+    order 3 in the actions. Q and J are frequency and amplitude of the leading line (NAFF) of the
+    normal modes, so that the result has an error of order `action`³, and round-off of
+    10⁻¹³/action. In 4D. **Raises** as `optics`.
+    """
+    ring, o = four(ring), optics(ring, finite("dp", dp), chromatic=False)
+    size = np.sqrt(2 * positive("action", action) * np.mgrid[1:5, 1:5].reshape(2, 16).T)
+    z = o.orbit[0] + jnp.pad(jnp.real(size @ o.modes[0]), ((0, 0), (0, 2)))
+    found = frequencies(np.arange(turns), _signal(o, track(ring, z, turns, every=1).z), count=6)
+    J = jnp.abs(found.amplitudes[..., 0]) ** 2 / 2 / action
+    powers = [(i, n - i) for n in (1, 2, 3) for i in reversed(range(n + 1))]
+    change = found.frequencies[..., 0] / (2 * np.pi) - 0.25
+    terms = jnp.stack([J[:, 0] ** i * J[:, 1] ** j for i, j in powers], 1)
+    return jnp.linalg.lstsq(terms, change)[0][:2].T / action
+
+
+def _signal(o: Any, z: Array) -> Array:
+    """√(2J_k) e^{iφ_k} of the first two modes from z (…, turns, 6), shape (…, 2, turns), where the
+    linear motion has the tune 1/4: it is far from 0 and 1/2, where lines coincide."""
+    v, n = o.modes[0, :2], o.modes.shape[-1]
+    S = np.kron(np.eye(n // 2), [[0, 1], [-1, 0]])
+    signal = jnp.einsum("ki,ij,...tj->...kt", -1j * jnp.conj(v), S, (z - o.orbit[0])[..., :n])
+    back = 2j * np.pi * (0.25 - o.tune[:2, None])
+    return signal * jnp.exp(back * np.arange(z.shape[-2]))
+
+
+def resonance_driving_terms(
+    ring: Ring, terms: Sequence[str] = TERMS, dp: float = 0.0
+) -> dict[str, Array]:
+    r"""Driving terms of first order in the multipoles: coefficients of the perturbation
+
+        ∫ Re Σ_N (b_N + i a_N)(x + iy)^{N+1}/(N + 1) ds/(1 + δ) = Σ h_jkmnp A^j Ā^k B^m B̄^n δ^p
+
+    in A = √(2J_x) e^{iφ_x} and B = √(2J_y) e^{iφ_y} at the start, x = Re(v_x A) + D_x δ, and
+    y = Re(v_y B). Gauss quadrature inside each magnet, with the optics there, in 4D. The
+    perturbation includes quadrupoles in terms with δ; it does not include bends and their edges.
+
+    **Arguments** `terms`: names "hjkmnp", such as "h21000", or "h22000" of octupoles.
+
+    **Returns** name → complex number [m^{1−(j+k+m+n)/2}], differentiable by the parameters of the
+    ring. **Raises** `ValueError` for another name; as `optics`.
+
+    **Source** Bengtsson 1997, SLS note 9/97, with the signs of pyAT, whose magnets are thin.
+    """
+    for name in terms:
+        if len(name) != 6 or name[0] != "h" or not name[1:].isdigit():
+            raise ValueError(
+                f"terms must be names such as 'h21000', with five digits, got {name!r}."
+            )
+    optics(ring, finite("dp", dp), chromatic=False)
+    return _driving_terms(ring, jnp.zeros(6).at[5].set(dp), tuple(terms))
+
+
+@eqx.filter_jit
+def _driving_terms(ring: Ring, z: Array, terms: tuple[str, ...]) -> dict[str, Array]:
+    o, _ = analysis(ring, z, jnp.zeros(()), False, False, True)
+    apply, xs = maps(four(ring), 0.0)
+    names = [ring.program.parts[part].name for part, _ in ring.program.rows]
+    mine = np.flatnonzero([name in (*SLICED, "thin", "second_order_bend") for name in names])
+    points, weights = np.polynomial.legendre.leggauss(5)
+
+    def inside(x):
+        (par, *how), z, v, D, share = x
+
+        def to(z):
+            part = {**par, "length": share * par["length"]}
+            return jnp.stack(apply(Particle(*z), (part, *how)))
+
+        M = jax.jacfwd(to)(z)
+        return M[0, :4] @ v[0], M[2, :4] @ v[1], M[0, :4] @ D + M[0, 5]
+
+    every = jax.tree.map(lambda a: a[mine], (xs, o.orbit, o.modes, o.dispersion))
+    x, y, D = lax.map(lambda s: lax.map(lambda e: inside((*e, s)), every), (1 + points) / 2)
+    par, thin = every[0][0], np.asarray([names[i] == "thin" for i in mine])
+    length = weights[:, None] / 2 * jnp.where(thin, 1.0, par["length"])
+    found = {}
+    for name in terms:
+        j, k, m, n, p = map(int, name[1:])
+        total = jnp.zeros((), complex)
+        for q in range(p + 1):
+            N, ny = j + k + m + n + q, m + n
+            field = par.get(f"{'ab'[ny % 2 == 0]}{N - 1}")
+            if N > 1 and field is not None:
+                count = math.comb(N, ny) * math.comb(ny, m) * math.comb(N - ny, q)
+                count *= math.comb(j + k, j) * (-1) ** (p - q + (ny + 1) // 2)
+                at = x**j * jnp.conj(x) ** k * y**m * jnp.conj(y) ** n * D**q
+                total += count / N / 2 ** (j + k + ny) * jnp.sum(length * field * at)
+        found[name] = total
+    return found
+
+
+def dynamic_aperture(
+    ring: Ring,
+    turns: int = 1024,
+    *,
+    largest: tuple[float, float] = (0.05, 0.05),
+    angles: int | Any = 19,
+    steps: int = 16,
+    rounds: int = 2,
+    dp: float | None = None,
+    progress: bool | Callable[[Progress], None] | None = None,
+) -> Array:
+    """Largest stable amplitudes (x, y) along rays from the closed orbit [m], shape (angles, 2).
+
+    A ray is r (x_max cos θ, y_max sin θ), `largest` = (x_max, y_max), with θ from 0 to π or the
+    given `angles` [rad]. The result is the last r before the first lost particle, among `steps`
+    values up to 1; each further round divides the last interval by `steps`. `dp`: δ, in 4D. For a
+    grid: ``rings.track(ring, z, turns).lost``. **Raises** as `optics`; `ValueError`.
+    """
+    angles = np.linspace(0, np.pi, angles) if np.ndim(angles) == 0 else np.asarray(angles)
+    limits = [positive("largest", a) for a in largest]
+    rays = jnp.stack([limits[0] * np.cos(angles), limits[1] * np.sin(angles)], 1)
+    orbit = optics(ring, dp, chromatic=False).orbit[0]
+    ring = ring if dp is None else four(ring)
+
+    def survive(r):
+        z = orbit + (1e-6 + r[..., None] * rays[:, None]) @ _XY
+        return _pieces(lambda z: ~track(ring, z, turns).lost, progress, z)
+
+    return _first_loss(survive, len(rays), steps, rounds)[:, None] * rays
+
+
+def momentum_aperture(
+    ring: Ring,
+    turns: int = 1024,
+    where: Where | None = None,
+    *,
+    largest: float = 0.1,
+    steps: int = 16,
+    rounds: int = 2,
+    progress: bool | Callable[[Progress], None] | None = None,
+) -> Array:
+    """Largest stable changes of δ, negative and positive, of a particle on the closed orbit at the
+    entrance of elements, shape (elements, 2), as needed for the lifetime by Touschek scattering.
+
+    `where`: see `Ring.where`; None: all elements. Other arguments and errors as for
+    `dynamic_aperture`. The particle finishes its first turn, followed by `turns` turns.
+    """
+    instance("ring", ring, Ring, "a rings.Ring")
+    first = np.arange(len(ring)) if where is None else ring.where(where)
+    orbit = optics(ring, chromatic=False).orbit[first]
+    sides = positive("largest", largest) * np.array([-1.0, 1.0])
+    rows, numbers = rows_of(ring)
+
+    def one(numbers, rows, z, first):
+        def row(flight, x):
+            after = flown(ring.program.parts, *jax.tree.map(lambda a: a[None], x), flight, 0, 0.0)
+            skips = x[0]["element"] < first
+            return jax.tree.map(lambda a, b: jnp.where(skips, a, b), flight, after), None
+
+        return jnp.stack(lax.scan(row, start(Particle(*z)), (numbers, rows))[0].z)
+
+    def survive(r):
+        z = jnp.repeat(orbit + 1e-6 * _XY.sum(0), 2, 0)[:, None] + 0 * r[..., None]
+        z = z.at[..., 5].add(r * np.tile(sides, len(first))[:, None])
+        begin = jnp.repeat(first, 2 * steps).reshape(r.shape)
+        finish = jax.jit(jax.vmap(lambda *x: lanewise.call(one, numbers, rows, *x)))
+        return _pieces(lambda *x: ~track(ring, finish(*x), turns).lost, progress, z, begin)
+
+    return sides * _first_loss(survive, 2 * len(first), steps, rounds).reshape(-1, 2)
+
+
+def frequency_map(
+    ring: Ring,
+    x: Any,
+    y: Any,
+    turns: int = 1024,
+    *,
+    dp: float | None = None,
+    progress: bool | Callable[[Progress], None] | None = None,
+) -> FrequencyMap:
+    """Tunes of particles that start at x, y [m] from the closed orbit, and how much they change.
+
+    `x`, `y`: arrays of one shape (…), such as those of `np.meshgrid`; 1 nm is added to both. NAFF
+    of the normal modes in the two halves of `turns`, see `dvi.frequency_diffusion`. `dp`: δ, in 4D.
+    **Raises** `ValueError` for shapes that do not match; as `optics`. **Source** Laskar 2003.
+    """
+    x, y = np.broadcast_arrays(x, y)
+    o = optics(ring, dp, chromatic=False)
+    ring = ring if dp is None else four(ring)
+    z = o.orbit[0] + (1e-9 + np.stack([x, y], -1)) @ _XY
+
+    def found(z):
+        signal = _signal(o, track(ring, z, whole("turns", turns, 64), every=1).z)
+        halves = frequency_diffusion(np.arange(turns), signal, throw=False)
+        return jnp.stack([halves.first, halves.second])
+
+    both = _pieces(lambda z: jnp.moveaxis(found(z), 0, 1), progress, z) / (2 * np.pi) - 0.25
+    change = jnp.linalg.norm(both[..., 1, :] - both[..., 0, :], axis=-1)
+    tune = (both + o.tune[:2]) % 1
+    return FrequencyMap(tune[..., 0, :], tune[..., 1, :], jnp.log10(jnp.maximum(change, 1e-16)))
+
+
+def _first_loss(survive: Callable, rays: int, steps: int, rounds: int) -> Array:
+    """The last r of each ray before the first loss, in (0, 1]."""
+    whole("steps", steps, 2), whole("rounds", rounds)
+    low, width = jnp.zeros(rays), jnp.ones(rays)
+    for _ in range(rounds):
+        alive = survive(low[:, None] + width[:, None] * np.arange(1, steps + 1) / steps)
+        many = jnp.sum(jnp.cumprod(alive, axis=1), 1)
+        low = low + width * many / steps
+        width = jnp.where(many == steps, 0.0, width / steps)
+    return low
+
+
+def _pieces(function: Callable, progress: Any, *arrays: Array) -> Any:
+    """`function` of particles, arrays (…, 6) and (…), in batches of one size, with progress."""
+    shape = arrays[0].shape[:-1]
+    flat = [a.reshape(-1, *a.shape[len(shape) :]) for a in arrays]
+    N = len(flat[0])
+    each = -(-N // -(-N // _BATCH))
+    bar = bar_of("particles", (), lambda p: {"completed": p.done, "total": p.particles})
+    outs = []
+    with told(progress, bar) as report:
+        for i in range(0, N, each):
+            some = np.minimum(np.arange(i, i + each), N - 1)
+            outs.append(jax.block_until_ready(function(*(a[some] for a in flat))))
+            if report:
+                report(Progress(min(i + each, N), N))
+    out = jnp.concatenate(outs)[:N]
+    return out.reshape(*shape, *out.shape[1:])
