@@ -13,31 +13,22 @@ from jaxtyping import Array
 
 import lanewise
 
-from .._checks import finite, instance, positive, whole
+from .._checks import finite, positive, whole
 from .._progress import bar_of, told
 from ..dynamics.frequencies import frequencies, frequency_diffusion
 from ._maps import Particle
-from ._optics import SLICED, analysis, four, maps, optics
+from ._optics import SLICED, Optics, analysis, four, maps, optics
 from ._ring import Ring, Where
 from ._track import track
 from ._turn import flown, rows_of, start
 
-TERMS = (
-    "h21000", "h30000", "h10110", "h10020", "h10200", "h11001", "h00111", "h20001", "h00201",
-    "h10002",
-)  # fmt: skip
+Report = bool | Callable[[tuple[int, int]], None] | None
+"""A function of (particles done, all particles of this round), or as in `dvi.integrate`."""
+_GEOMETRIC = "h21000", "h30000", "h10110", "h10020", "h10200"
+_CHROMATIC = "h11001", "h00111", "h20001", "h00201", "h10002"
+_XY = np.eye(6)[[0, 2]]
 _BATCH = 4096
 """Particles tracked in one call: more do not become faster, and progress is reported between."""
-
-
-_XY = np.eye(6)[[0, 2]]
-
-
-class Progress(NamedTuple):
-    """How many particles have been tracked, of how many in this round."""
-
-    done: int
-    particles: int
 
 
 class FrequencyMap(NamedTuple):
@@ -58,29 +49,28 @@ def detuning(ring: Ring, dp: float = 0.0, action: float = 1e-9, turns: int = 102
     normal modes, so that the result has an error of order `action`³, and round-off of
     10⁻¹³/action. In 4D. **Raises** as `optics`.
     """
-    ring, o = four(ring), optics(ring, finite("dp", dp), chromatic=False)
+    o, ring = optics(ring, finite("dp", dp), chromatic=False), four(ring)
     size = np.sqrt(2 * positive("action", action) * np.mgrid[1:5, 1:5].reshape(2, 16).T)
-    z = o.orbit[0] + jnp.pad(jnp.real(size @ o.modes[0]), ((0, 0), (0, 2)))
-    found = frequencies(np.arange(turns), _signal(o, track(ring, z, turns, every=1).z), count=6)
-    J = jnp.abs(found.amplitudes[..., 0]) ** 2 / 2 / action
-    powers = [(i, n - i) for n in (1, 2, 3) for i in reversed(range(n + 1))]
+    z = o.orbit[:1] + jnp.pad(jnp.real(size @ o.modes[0]), ((0, 0), (0, 2)))
+    found = frequencies(np.arange(turns), _signal(o, track(ring, z, turns, every=1).z), count=2)
+    x, y = jnp.abs(found.amplitudes[..., 0].T) ** 2 / 2 / action
+    terms = jnp.stack([x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3], 1)
     change = found.frequencies[..., 0] / (2 * np.pi) - 0.25
-    terms = jnp.stack([J[:, 0] ** i * J[:, 1] ** j for i, j in powers], 1)
     return jnp.linalg.lstsq(terms, change)[0][:2].T / action
 
 
-def _signal(o: Any, z: Array) -> Array:
-    """√(2J_k) e^{iφ_k} of the first two modes from z (…, turns, 6), shape (…, 2, turns), where the
-    linear motion has the tune 1/4: it is far from 0 and 1/2, where lines coincide."""
+def _signal(o: Optics, z: Array) -> Array:
+    """√(2J_k) e^{iφ_k} of the first two modes from z (particles, turns, 6) as (particles, 2,
+    turns), where the linear motion has the tune 1/4: far from 0 and 1/2, where lines coincide."""
     v, n = o.modes[0, :2], o.modes.shape[-1]
     S = np.kron(np.eye(n // 2), [[0, 1], [-1, 0]])
-    signal = jnp.einsum("ki,ij,...tj->...kt", -1j * jnp.conj(v), S, (z - o.orbit[0])[..., :n])
-    back = 2j * np.pi * (0.25 - o.tune[:2, None])
-    return signal * jnp.exp(back * np.arange(z.shape[-2]))
+    w = -1j * jnp.conj(v) @ S
+    back = jnp.exp(2j * np.pi * jnp.outer(0.25 - o.tune[:2], np.arange(z.shape[1])))
+    return jnp.einsum("ki,pti,kt->pkt", w, z[..., :n] - o.orbit[:1, None, :n], back)
 
 
 def resonance_driving_terms(
-    ring: Ring, terms: Sequence[str] = TERMS, dp: float = 0.0
+    ring: Ring, terms: Sequence[str] = (*_GEOMETRIC, *_CHROMATIC), dp: float = 0.0
 ) -> dict[str, Array]:
     r"""Driving terms of first order in the multipoles: coefficients of the perturbation
 
@@ -95,14 +85,13 @@ def resonance_driving_terms(
     **Returns** name → complex number [m^{1−(j+k+m+n)/2}], differentiable by the parameters of the
     ring. **Raises** `ValueError` for another name; as `optics`.
 
-    **Source** Bengtsson 1997, SLS note 9/97, with the signs of pyAT, whose magnets are thin.
+    **Source** Bengtsson 1997, SLS note 9/97, with the signs of pyAT, where β of a magnet is its
+    mean and the phase that in its middle.
     """
     for name in terms:
         if len(name) != 6 or name[0] != "h" or not name[1:].isdigit():
-            raise ValueError(
-                f"terms must be names such as 'h21000', with five digits, got {name!r}."
-            )
-    optics(ring, finite("dp", dp), chromatic=False)
+            raise ValueError(f"terms must be names such as 'h21000', got {name!r}.")
+    optics(ring, dp, chromatic=False)
     return _driving_terms(ring, jnp.zeros(6).at[5].set(dp), tuple(terms))
 
 
@@ -110,28 +99,24 @@ def resonance_driving_terms(
 def _driving_terms(ring: Ring, z: Array, terms: tuple[str, ...]) -> dict[str, Array]:
     o, _ = analysis(ring, z, jnp.zeros(()), False, False, True)
     apply, xs = maps(four(ring), 0.0)
-    names = [ring.program.parts[part].name for part, _ in ring.program.rows]
-    mine = np.flatnonzero([name in (*SLICED, "thin", "second_order_bend") for name in names])
+    names = np.asarray([ring.program.parts[part].name for part, _ in ring.program.rows])
+    mine = np.flatnonzero(np.isin(names, (*SLICED, "thin", "second_order_bend")))
     points, weights = np.polynomial.legendre.leggauss(5)
 
-    def inside(x):
-        (par, *how), z, v, D, share = x
-
-        def to(z):
-            part = {**par, "length": share * par["length"]}
-            return jnp.stack(apply(Particle(*z), (part, *how)))
-
-        M = jax.jacfwd(to)(z)
+    def inside(x, share):
+        (par, *how), z, v, D = x
+        part = {**par, "length": share * par["length"]}
+        M = jax.jacfwd(lambda z: jnp.stack(apply(Particle(*z), (part, *how))))(z)
         return M[0, :4] @ v[0], M[2, :4] @ v[1], M[0, :4] @ D + M[0, 5]
 
     every = jax.tree.map(lambda a: a[mine], (xs, o.orbit, o.modes, o.dispersion))
-    x, y, D = lax.map(lambda s: lax.map(lambda e: inside((*e, s)), every), (1 + points) / 2)
-    par, thin = every[0][0], np.asarray([names[i] == "thin" for i in mine])
-    length = weights[:, None] / 2 * jnp.where(thin, 1.0, par["length"])
+    x, y, D = lax.map(lambda s: lax.map(lambda e: inside(e, s), every), (1 + points) / 2)
+    par = every[0][0]
+    length = np.outer(weights / 2, 1.0) * jnp.where(names[mine] == "thin", 1.0, par["length"])[None]
     found = {}
     for name in terms:
         j, k, m, n, p = map(int, name[1:])
-        total = jnp.zeros((), complex)
+        found[name] = jnp.zeros((), complex)
         for q in range(p + 1):
             N, ny = j + k + m + n + q, m + n
             field = par.get(f"{'ab'[ny % 2 == 0]}{N - 1}")
@@ -139,8 +124,7 @@ def _driving_terms(ring: Ring, z: Array, terms: tuple[str, ...]) -> dict[str, Ar
                 count = math.comb(N, ny) * math.comb(ny, m) * math.comb(N - ny, q)
                 count *= math.comb(j + k, j) * (-1) ** (p - q + (ny + 1) // 2)
                 at = x**j * jnp.conj(x) ** k * y**m * jnp.conj(y) ** n * D**q
-                total += count / N / 2 ** (j + k + ny) * jnp.sum(length * field * at)
-        found[name] = total
+                found[name] += count / N / 2 ** (j + k + ny) * jnp.sum(length * field[None] * at)
     return found
 
 
@@ -149,11 +133,11 @@ def dynamic_aperture(
     turns: int = 1024,
     *,
     largest: tuple[float, float] = (0.05, 0.05),
-    angles: int | Any = 19,
+    angles: Any = 19,
     steps: int = 16,
     rounds: int = 2,
     dp: float | None = None,
-    progress: bool | Callable[[Progress], None] | None = None,
+    progress: Report = None,
 ) -> Array:
     """Largest stable amplitudes (x, y) along rays from the closed orbit [m], shape (angles, 2).
 
@@ -165,11 +149,10 @@ def dynamic_aperture(
     angles = np.linspace(0, np.pi, angles) if np.ndim(angles) == 0 else np.asarray(angles)
     limits = [positive("largest", a) for a in largest]
     rays = jnp.stack([limits[0] * np.cos(angles), limits[1] * np.sin(angles)], 1)
-    orbit = optics(ring, dp, chromatic=False).orbit[0]
-    ring = ring if dp is None else four(ring)
+    o, ring = optics(ring, dp, chromatic=False), ring if dp is None else four(ring)
 
     def survive(r):
-        z = orbit + (1e-6 + r[..., None] * rays[:, None]) @ _XY
+        z = (1e-6 + r[..., None] * rays[:, None]) @ _XY + o.orbit[:1, None]
         return _pieces(lambda z: ~track(ring, z, turns).lost, progress, z)
 
     return _first_loss(survive, len(rays), steps, rounds)[:, None] * rays
@@ -183,7 +166,7 @@ def momentum_aperture(
     largest: float = 0.1,
     steps: int = 16,
     rounds: int = 2,
-    progress: bool | Callable[[Progress], None] | None = None,
+    progress: Report = None,
 ) -> Array:
     """Largest stable changes of δ, negative and positive, of a particle on the closed orbit at the
     entrance of elements, shape (elements, 2), as needed for the lifetime by Touschek scattering.
@@ -191,11 +174,10 @@ def momentum_aperture(
     `where`: see `Ring.where`; None: all elements. Other arguments and errors as for
     `dynamic_aperture`. The particle finishes its first turn, followed by `turns` turns.
     """
-    instance("ring", ring, Ring, "a rings.Ring")
-    first = np.arange(len(ring)) if where is None else ring.where(where)
-    orbit = optics(ring, chromatic=False).orbit[first]
-    sides = positive("largest", largest) * np.array([-1.0, 1.0])
-    rows, numbers = rows_of(ring)
+    orbit = optics(ring, chromatic=False).orbit
+    first = np.repeat(np.arange(len(ring)) if where is None else ring.where(where), 2)
+    side = positive("largest", largest) * np.resize([-1.0, 1.0], len(first))
+    begins, (rows, numbers) = orbit[first] + 1e-6 * _XY.sum(0)[None], rows_of(ring)
 
     def one(numbers, rows, z, first):
         def row(flight, x):
@@ -205,24 +187,18 @@ def momentum_aperture(
 
         return jnp.stack(lax.scan(row, start(Particle(*z)), (numbers, rows))[0].z)
 
-    def survive(r):
-        z = jnp.repeat(orbit + 1e-6 * _XY.sum(0), 2, 0)[:, None] + 0 * r[..., None]
-        z = z.at[..., 5].add(r * np.tile(sides, len(first))[:, None])
-        begin = jnp.repeat(first, 2 * steps).reshape(r.shape)
-        finish = jax.jit(jax.vmap(lambda *x: lanewise.call(one, numbers, rows, *x)))
-        return _pieces(lambda *x: ~track(ring, finish(*x), turns).lost, progress, z, begin)
+    finish = jax.jit(jax.vmap(lambda z, first: lanewise.call(one, numbers, rows, z, first)))
 
-    return sides * _first_loss(survive, 2 * len(first), steps, rounds).reshape(-1, 2)
+    def survive(r):
+        z = jnp.einsum("rs,i->rsi", r * side[:, None], np.eye(6)[5]) + begins[:, None]
+        begin = jnp.broadcast_to(first[:, None], r.shape)
+        return _pieces(lambda z, i: ~track(ring, finish(z, i), turns).lost, progress, z, begin)
+
+    return (side * _first_loss(survive, len(first), steps, rounds)).reshape(-1, 2)
 
 
 def frequency_map(
-    ring: Ring,
-    x: Any,
-    y: Any,
-    turns: int = 1024,
-    *,
-    dp: float | None = None,
-    progress: bool | Callable[[Progress], None] | None = None,
+    ring: Ring, x: Any, y: Any, turns: int = 1024, dp: float | None = None, progress: Report = None
 ) -> FrequencyMap:
     """Tunes of particles that start at x, y [m] from the closed orbit, and how much they change.
 
@@ -230,47 +206,44 @@ def frequency_map(
     of the normal modes in the two halves of `turns`, see `dvi.frequency_diffusion`. `dp`: δ, in 4D.
     **Raises** `ValueError` for shapes that do not match; as `optics`. **Source** Laskar 2003.
     """
-    x, y = np.broadcast_arrays(x, y)
-    o = optics(ring, dp, chromatic=False)
-    ring = ring if dp is None else four(ring)
-    z = o.orbit[0] + (1e-9 + np.stack([x, y], -1)) @ _XY
+    o, ring = optics(ring, dp, chromatic=False), ring if dp is None else four(ring)
+    xy = 1e-9 + np.stack(np.broadcast_arrays(x, y), -1).reshape(-1, 2)
+    whole("turns", turns, 64)
 
     def found(z):
-        signal = _signal(o, track(ring, z, whole("turns", turns, 64), every=1).z)
+        signal = _signal(o, track(ring, z, turns, every=1).z)
         halves = frequency_diffusion(np.arange(turns), signal, throw=False)
-        return jnp.stack([halves.first, halves.second])
+        return jnp.stack([halves.first, halves.second], 1)
 
-    both = _pieces(lambda z: jnp.moveaxis(found(z), 0, 1), progress, z) / (2 * np.pi) - 0.25
+    both = _pieces(found, progress, o.orbit[:1] + xy @ _XY) / (2 * np.pi) - 0.25
+    both = both.reshape(*np.broadcast_shapes(np.shape(x), np.shape(y)), 2, 2)
     change = jnp.linalg.norm(both[..., 1, :] - both[..., 0, :], axis=-1)
-    tune = (both + o.tune[:2]) % 1
+    tune = (both + o.tune[:2].reshape((1,) * (both.ndim - 1) + (2,))) % 1
     return FrequencyMap(tune[..., 0, :], tune[..., 1, :], jnp.log10(jnp.maximum(change, 1e-16)))
 
 
 def _first_loss(survive: Callable, rays: int, steps: int, rounds: int) -> Array:
     """The last r of each ray before the first loss, in (0, 1]."""
-    whole("steps", steps, 2), whole("rounds", rounds)
-    low, width = jnp.zeros(rays), jnp.ones(rays)
-    for _ in range(rounds):
-        alive = survive(low[:, None] + width[:, None] * np.arange(1, steps + 1) / steps)
-        many = jnp.sum(jnp.cumprod(alive, axis=1), 1)
-        low = low + width * many / steps
-        width = jnp.where(many == steps, 0.0, width / steps)
-    return low
+    low, width = jnp.zeros((rays, 1)), jnp.ones((rays, 1))
+    for _ in range(whole("rounds", rounds)):
+        shares = np.arange(1, whole("steps", steps, 2) + 1)[None] / steps
+        many = jnp.sum(jnp.cumprod(survive(low + width * shares), 1), 1, keepdims=True)
+        low, width = low + width * many / steps, jnp.where(many == steps, 0.0, width / steps)
+    return low[:, 0]
 
 
-def _pieces(function: Callable, progress: Any, *arrays: Array) -> Any:
+def _pieces(function: Callable, progress: Report, *arrays: Array) -> Array:
     """`function` of particles, arrays (…, 6) and (…), in batches of one size, with progress."""
     shape = arrays[0].shape[:-1]
     flat = [a.reshape(-1, *a.shape[len(shape) :]) for a in arrays]
-    N = len(flat[0])
-    each = -(-N // -(-N // _BATCH))
-    bar = bar_of("particles", (), lambda p: {"completed": p.done, "total": p.particles})
+    each = -(-len(flat[0]) // -(-len(flat[0]) // _BATCH))
+    bar = bar_of("particles", (), lambda p: {"completed": p[0], "total": p[1]})
     outs = []
     with told(progress, bar) as report:
-        for i in range(0, N, each):
+        for i in range(0, N := len(flat[0]), each):
             some = np.minimum(np.arange(i, i + each), N - 1)
             outs.append(jax.block_until_ready(function(*(a[some] for a in flat))))
             if report:
-                report(Progress(min(i + each, N), N))
+                report((min(i + each, N), N))
     out = jnp.concatenate(outs)[:N]
     return out.reshape(*shape, *out.shape[1:])

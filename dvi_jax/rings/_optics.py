@@ -27,19 +27,17 @@ _UNSTABLE = 1e-11
 
 
 class Optics(NamedTuple):
-    r"""Linear motion about the closed orbit, at the entrance of each element and at the end.
+    r"""Linear motion about the closed orbit, at n places: the entrance of each element and the end.
 
-    - `s`: place [m], shape (elements + 1,); `orbit`: closed orbit, shape (elements + 1, 6).
-    - `beta` [m], `alpha`: of mode 1 in x and mode 2 in y, shape (elements + 1, 2).
-    - `mu`: phase advance from the start [rad], shape (elements + 1, modes).
-    - `dispersion`: of x, px, y, py, shape (elements + 1, 4): the derivative of the closed orbit by
-      δ in 4D; in 6D that of the synchrotron mode, Re(v/v_δ).
+    - `s` [m], shape (n,); `orbit`, shape (n, 6). `matrix`: from the start, shape (n, 6, 6).
+    - `beta` [m], `alpha`: of mode 1 in x and mode 2 in y, shape (n, 2); `mu`: phase advances [rad].
+    - `dispersion` of x, px, y, py, shape (n, 4): the derivative of the closed orbit by δ in 4D; in
+      6D that of the synchrotron mode, Re(v/v_δ).
     - `modes`: the vectors v of the normal modes, z = Re Σ_k √(2J_k) e^{iφ_k} v_k, shape
-      (elements + 1, modes, 4 or 6): β_k = \|v_x\|², α_k = −Re v̄_x v_px.
-    - `gamma`: γ of Edwards & Teng, shape (elements + 1,); their β and α are those here over γ².
-    - `matrix`: from the start, shape (elements + 1, 6, 6); the last one is that of one turn.
-    - `tune`: with its whole part, shape (modes,); that of the synchrotron motion is positive.
-    - `chromaticity`: dQ/dδ, shape (modes,); in 6D the frequency of the cavities changes δ.
+      (n, modes, 4 or 6): β_k = \|v_x\|², α_k = −Re v̄_x v_px.
+    - `gamma`: γ of Edwards & Teng, shape (n,); their β and α are those here over γ².
+    - `tune`, with its whole part; that of the synchrotron motion is positive. `chromaticity`:
+      dQ/dδ; in 6D the frequency of the cavities changes δ. Shapes (modes,).
     - `compaction`: momentum compaction, the relative change of the length over δ.
     """
 
@@ -72,18 +70,14 @@ def one_turn(ring: Ring, z: Any, epsilon: Any = 0.0) -> Array:
     def of(z):
         return lanewise.call(one, numbers, rows, z, jnp.asarray(epsilon, float))
 
-    z = coordinates("z", z)
+    z = _coordinates("z", z)
     return jax.vmap(of)(z.reshape(-1, 6)).reshape(z.shape) if z.ndim > 1 else of(z)
 
 
-def coordinates(name: str, z: Any) -> Array:
-    """z as an array (…, 6). **Raises** `ValueError`."""
+def _coordinates(name: str, z: Any) -> Array:
     z = jnp.asarray(z, float)
     if z.shape[-1:] != (6,):
-        raise ValueError(
-            f"{name} must have six coordinates (x, px, y, py, ζ, δ) on its last axis, got an array "
-            f"of shape {z.shape}."
-        )
+        raise ValueError(f"{name} must have 6 coordinates on its last axis, got shape {z.shape}.")
     return z
 
 
@@ -129,21 +123,18 @@ def optics(
     def missed(k, _):
         found = rings.optics(cell.set("QF", b1=k[0]).set("QD", b1=k[1]), chromatic=False)
         return found.tune - jnp.array([0.22, 0.18])
-    k = optimistix.least_squares(
-        missed, optimistix.LevenbergMarquardt(1e-12, 1e-12), jnp.array([0.6, -0.6])).value
+    solver = optimistix.LevenbergMarquardt(1e-12, 1e-12)
+    k = optimistix.least_squares(missed, solver, jnp.array([0.6, -0.6])).value
     ```
     """
     return _analysed(ring, dp, guess, epsilon, chromatic, True)
 
 
-def _analysed(
-    ring: Ring, dp: Any, guess: Any, epsilon: Any, chromatic: bool, stable: bool
-) -> Optics:
-    instance("ring", ring, Ring, "a rings.Ring")
-    ring.check()
+def _analysed(ring: Ring, dp: Any, guess: Any, epsilon: Any, chromatic: bool, stable: bool):
+    instance("ring", ring, Ring, "a rings.Ring").check()
     voltage = ring.columns.get("voltage", np.zeros(1))
     six = dp is None and (is_traced(voltage) or bool(np.any(np.asarray(voltage) != 0)))
-    z = coordinates("guess", np.zeros(6) if guess is None else guess)
+    z = _coordinates("guess", np.zeros(6) if guess is None else guess)
     if not six:
         z = z.at[4].set(0.0).at[5].set(0.0 if dp is None else dp)
     found, change = analysis(ring, z, jnp.asarray(epsilon, float), six, chromatic)
@@ -158,7 +149,7 @@ def _analysed(
         )
     if stable and np.isnan(found.tune).any():
         M = np.asarray(found.matrix[-1])[: found.modes.shape[-1], : found.modes.shape[-1]]
-        half = [f"{np.trace(M[i : i + 2, i : i + 2]) / 2:.4g}" for i in range(0, len(M), 2)]
+        half = [round(float(np.trace(M[i : i + 2, i : i + 2])) / 2, 4) for i in range(0, len(M), 2)]
         raise ValueError(
             f"the motion is unstable: half of the trace of the one-turn matrix is {half} in x, y "
             f"(, ζ), between −1 and 1 if stable and uncoupled, and its eigenvalues have the moduli "
@@ -170,9 +161,7 @@ def _analysed(
 
 def four(ring: Ring) -> Ring:
     """The ring with its cavities off."""
-    if "voltage" not in ring.columns:
-        return ring
-    off = {**ring.columns, "voltage": jnp.zeros_like(ring.columns["voltage"])}
+    off = {n: jnp.zeros_like(c) if n == "voltage" else c for n, c in ring.columns.items()}
     return eqx.tree_at(lambda r: r.columns, ring, off)
 
 
@@ -183,12 +172,9 @@ def maps(ring: Ring, epsilon: Any) -> tuple[Callable, Any]:
     sequence of kicks, with drifts between them.
     """
     rows, numbers = rows_of(ring)
-    parts = ring.program.parts
+    parts, thick = ring.program.parts, {"scheme": 2, "slices": 1}
     order = max(p.order for p in parts)
-    kinds = [
-        p._replace(order=order, **({"scheme": 2, "slices": 1} if p.name in SLICED else {}))
-        for p in parts
-    ]
+    kinds = [p._replace(order=order, **(thick if p.name in SLICED else {})) for p in parts]
     kicks = [np.divide([0.0, *KICKS.get(p.scheme, ()) * p.slices], p.slices) for p in parts]
     steps = np.stack([np.pad(k, (0, max(map(len, kicks)) + 1 - len(k))) for k in kicks])
     which = np.asarray([sorted(set(kinds)).index(kind) for kind in kinds], np.int32)
@@ -222,17 +208,13 @@ def analysis(
 ) -> tuple[Optics, Array]:
     """See `optics`; also the last correction of the closed orbit. `inside`: before each part of an
     element and at the end, not at the elements (but for `s`)."""
-    c, shift = ring.columns, 0.0
+    c, shift, n, (e_zeta, e_delta) = ring.columns, 0.0, 6 if six else 4, np.eye(6)[4:]
     if six:
         # The change of ζ per turn of a particle that keeps its phase in the cavities.
         on = c["voltage"] != 0
-        shift = (
-            -jnp.sum(jnp.where(on, c["slip"] / jnp.where(on, c["wave_number"], 1), 0)) / on.sum()
-        )
-    else:
-        ring = four(ring)
-    apply, xs = maps(ring, epsilon)
-    n, (e_zeta, e_delta) = 6 if six else 4, np.eye(6)[4:]
+        slip = jnp.where(on, c["slip"] / jnp.where(on, c["wave_number"], 1.0), 0.0)
+        shift = -jnp.sum(slip) / jnp.sum(on)
+    apply, xs = maps(ring if six else four(ring), epsilon)
 
     def along(z):
         zs = lax.scan(lambda z, x: (apply(z, x),) * 2, Particle(*z), xs)[1]
@@ -267,12 +249,11 @@ def analysis(
     vs = jnp.einsum("rij,kj->rki", Ms[:, :n, :n], v)
     x, px = (jnp.diagonal(vs[:, :, i::2], axis1=1, axis2=2) for i in (0, 1))
     mu = jnp.angle(x[1:] * jnp.conj(x[:-1]))
-    mu = jnp.where(np.arange(n // 2) < 2, (mu + 0.5) % (2 * np.pi) - 0.5, mu)
+    mu = jnp.where(np.arange(n // 2)[None] < 2, (mu + 0.5) % (2 * np.pi) - 0.5, mu)
     mu = jnp.concatenate([jnp.zeros((1, n // 2)), jnp.cumsum(mu, 0)])
     Ds = jnp.real(vs[:, 2] / vs[:, 2, 5:]) if six else Ms @ D
     at = np.searchsorted([element for _, element in ring.program.rows], np.arange(len(ring) + 1))
-    at = np.arange(rows) if inside else at
-    tune = mu[-1] / (2 * np.pi)
+    at, tune = np.arange(rows) if inside else at, mu[-1] / (2 * np.pi)
     found = Optics(
         s=ring.places,
         orbit=zs[at],
@@ -293,8 +274,7 @@ def analysis(
 def _modes(M: Array, dM: Array) -> tuple[Array, Array]:
     """Vectors v_k of the normal modes of M, v_k† S v_k = 2i, in the order of the planes, with a
     real component in their own plane, and the derivative of their tunes by δ; NaN if unstable."""
-    n = len(M)
-    eye = np.eye(n)
+    n, eye = len(M), np.eye(len(M))
 
     def area(v):
         """Of x and px, y and py, …"""
@@ -303,20 +283,21 @@ def _modes(M: Array, dM: Array) -> tuple[Array, Array]:
     _, V = jnp.linalg.eig(lax.stop_gradient(M))
     areas, order = area(V), []
     taken = jnp.where(jnp.sum(areas, 0) > _UNSTABLE, 0.0, np.inf)
-    fails = jnp.where(jnp.sum(taken == 0) == n // 2, 1.0, jnp.nan)
+    stable = jnp.sum(taken == 0) == n // 2
     for plane in range(n // 2):
         order.append(jnp.argmax(areas[plane] - taken))
         taken = taken.at[order[-1]].set(np.inf)
-    V = fails * V[:, jnp.stack(order)]
+    V = jnp.where(stable, V[:, jnp.stack(order)], jnp.nan)
     V = jnp.concatenate([V, jnp.conj(V)], 1)
     W = jnp.linalg.inv(V)
     # Newton's method, W M V diagonal with W V = 1, for the derivatives, which `eig` does not have.
     for _ in range(2):
         R = W @ M @ V
-        r = jnp.diagonal(R) + np.zeros((n, n))
-        X = jnp.where(eye, 0.0, R / (r - r.T + eye))
+        r = jnp.diagonal(R)
+        X = jnp.where(eye, 0.0, R / (r[None] - r[:, None] + eye))
         V, W = V + V @ X, W - X @ W + X @ X @ W
     V, W = V[:, : n // 2], W[: n // 2]
     change = jnp.sum(W @ dM * V.T, 1) / jnp.sum(W @ M * V.T, 1)
     own = jnp.diagonal(V[::2])
-    return (V * jnp.abs(own) / own / jnp.sqrt(jnp.sum(area(V), 0))).T, change.imag / (2 * np.pi)
+    size = own / jnp.abs(own) * jnp.sqrt(jnp.sum(area(V), 0))
+    return (V / size[None]).T, change.imag / (2 * np.pi)
