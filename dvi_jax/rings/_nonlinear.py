@@ -65,7 +65,7 @@ def _signal(o: Optics, z: Array) -> Array:
     v, n = o.modes[0, :2], o.modes.shape[-1]
     S = np.kron(np.eye(n // 2), [[0, 1], [-1, 0]])
     w = -1j * jnp.conj(v) @ S
-    back = jnp.exp(2j * np.pi * jnp.outer(0.25 - o.tune[:2], np.arange(z.shape[1])))
+    back = jnp.exp(2j * np.pi * jnp.outer(0.25 - o.tune[:2], jnp.arange(z.shape[1])))
     return jnp.einsum("ki,pti,kt->pkt", w, z[..., :n] - o.orbit[:1, None, :n], back)
 
 
@@ -181,7 +181,8 @@ def momentum_aperture(
 
     def one(numbers, rows, z, first):
         def row(flight, x):
-            after = flown(ring.program.parts, *jax.tree.map(lambda a: a[None], x), flight, 0, 0.0)
+            number, par = jax.tree.map(lambda a: a[None], x)
+            after = flown(ring.program.parts, number, par, flight, 0, 0.0)
             skips = x[0]["element"] < first
             return jax.tree.map(lambda a, b: jnp.where(skips, a, b), flight, after), None
 
@@ -194,7 +195,7 @@ def momentum_aperture(
         begin = jnp.broadcast_to(first[:, None], r.shape)
         return _pieces(lambda z, i: ~track(ring, finish(z, i), turns).lost, progress, z, begin)
 
-    return (side * _first_loss(survive, len(first), steps, rounds)).reshape(-1, 2)
+    return (_first_loss(survive, len(first), steps, rounds) * side).reshape(-1, 2)
 
 
 def frequency_map(
@@ -237,9 +238,12 @@ def _pieces(function: Callable, progress: Report, *arrays: Array) -> Array:
     shape = arrays[0].shape[:-1]
     flat = [a.reshape(-1, *a.shape[len(shape) :]) for a in arrays]
     each = -(-len(flat[0]) // -(-len(flat[0]) // _BATCH))
-    bar = bar_of("particles", (), lambda p: {"completed": p[0], "total": p[1]})
     outs = []
-    with told(progress, bar) as report:
+
+    def columns(p: tuple[int, int]) -> dict[str, Any]:
+        return {"completed": p[0], "total": p[1]}
+
+    with told(progress, bar_of("particles", (), columns)) as report:
         for i in range(0, N := len(flat[0]), each):
             some = np.minimum(np.arange(i, i + each), N - 1)
             outs.append(jax.block_until_ready(function(*(a[some] for a in flat))))
