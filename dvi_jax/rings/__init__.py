@@ -14,6 +14,21 @@ from ._elements import (
     sextupole as sextupole,
     solenoid as solenoid,
 )
+from ._nonlinear import (
+    FrequencyMap as FrequencyMap,
+    detuning as detuning,
+    dynamic_aperture as dynamic_aperture,
+    frequency_map as frequency_map,
+    momentum_aperture as momentum_aperture,
+    resonance_driving_terms as resonance_driving_terms,
+)
+from ._optics import (
+    Optics as Optics,
+    closed_orbit as closed_orbit,
+    matrix as matrix,
+    one_turn as one_turn,
+    optics as optics,
+)
 from ._readers import from_at as from_at, load as load
 from ._ring import Ring as Ring
 from ._track import Tracked as Tracked, track as track

@@ -1,0 +1,306 @@
+"""Optics and nonlinear analysis of rings, against formulas, finite differences and pyAT."""
+
+import math
+import os
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dvi_jax import rings
+
+
+def cell(k=0.6, b2=0.0, b3=0.0, skew=0.0, angle=0.0, voltage=0.0):
+    """A FODO cell with a thin multipole; with bends and a cavity if they are not zero."""
+    bends = [rings.bend("B", 1.5, angle, edge_in=angle / 2, edge_out=angle / 2)] if angle else []
+    cavities = [rings.cavity("C", 0.0, voltage, 5e8)] if voltage else []
+    between = [rings.drift("D", 2.0 - 1.5 * len(bends)), *bends]
+    return rings.Ring(
+        [
+            rings.quadrupole("QF", 0.5, k, slices=8),
+            *between,
+            rings.multipole("M", 0.0, (0.0, 0.0, b2, b3), (0.0, skew)),
+            rings.quadrupole("QD", 0.5, -0.9 * k, slices=8),
+            *between,
+            *cavities,
+        ]
+    )
+
+
+def thick(k, length):
+    """The matrix of a quadrupole in x, px."""
+    w = np.sqrt(complex(k))
+    c, s = np.cos(w * length), np.sin(w * length)
+    return np.array([[c, s / w], [-w * s, c]]).real
+
+
+def close(a, b, error):
+    a, b = np.asarray(a), np.asarray(b)
+    assert np.max(np.abs(a - b)) <= error * np.max(np.abs(b)), (a, b)
+
+
+def test_fodo_cell_has_the_tunes_and_beta_functions_of_its_matrix():
+    found = rings.optics(cell())
+    for plane, sign in ((0, 1), (1, -1)):
+        drift = np.array([[1, 2], [0, 1]])
+        M = drift @ thick(-sign * 0.54, 0.5) @ drift @ thick(sign * 0.6, 0.5)
+        mu = math.acos(np.trace(M) / 2)
+        # The fourth-order slices of the magnets differ from the exact matrix.
+        close(found.tune[plane], mu / (2 * np.pi), 1e-6)
+        close(found.beta[0, plane], M[0, 1] / math.sin(mu), 1e-6)
+        close(found.beta[-1], found.beta[0], 1e-13)
+        close(found.alpha[0, plane], (M[0, 0] - M[1, 1]) / 2 / math.sin(mu), 1e-6)
+    assert not np.any(found.dispersion)
+    close(found.gamma, np.ones(6), 1e-13)
+
+
+def test_derivatives_are_those_of_finite_differences():
+    def numbers(k, dp=0.002, ring=None):
+        found = rings.optics(cell(b2=3.0, angle=0.2).set("QF", b1=k), dp)
+        return jnp.concatenate(
+            [found.tune, found.chromaticity, found.beta[2], found.orbit[2, :2], found.mu[3]]
+        )
+
+    def fourth_order(f, h):
+        return (8 * (f(h) - f(-h)) - f(2 * h) + f(-2 * h)) / (12 * h)
+
+    close(jax.jacfwd(numbers)(0.6), fourth_order(lambda h: numbers(0.6 + h), 3e-4), 1e-9)
+    by_dp = fourth_order(lambda h: numbers(0.6, 0.002 + h)[:2], 2e-5)
+    close(numbers(0.6)[2:4], by_dp, 1e-9)
+    # A control: the chromaticity of the ring without the sextupole is another one.
+    assert np.abs(rings.optics(cell(angle=0.2), 0.002).chromaticity - by_dp).max() > 1e-2
+
+
+@pytest.mark.slow
+def test_reverse_mode_and_second_derivatives():
+    def tune(k):
+        return rings.optics(cell(b2=3.0, angle=0.2).set("QF", b1=k), 0.002, chromatic=False).tune[0]
+
+    close(jax.grad(tune)(0.6), jax.jacfwd(tune)(0.6), 1e-12)
+    slope = jax.jacfwd(tune)
+    close(jax.jacfwd(slope)(0.6), (slope(0.6001) - slope(0.5999)) / 2e-4, 1e-5)
+
+
+def test_six_dimensions_synchrotron_tune_and_compaction():
+    voltage = 1e-4
+    ring = cell(angle=0.2, voltage=voltage)
+    four, six = rings.optics(ring, dp=0.0), rings.optics(ring)
+    k = float(ring.get("C", "wave_number")[0])
+    half = math.asin(math.sqrt(float(four.compaction) * float(ring.places[-1]) * voltage * k) / 2)
+    close(six.tune[2], half / np.pi, 5e-3)
+    close(six.compaction, four.compaction, 1e-3)
+    close(six.chromaticity[:2], four.chromaticity, 1e-2)
+    close(six.tune[:2], four.tune, 2e-3)
+    # The normal modes of the one-turn matrix are eigenvectors.
+    turned = np.asarray(six.matrix[-1] @ six.modes[0].T)
+    close(turned / np.exp(2j * np.pi * np.asarray(six.tune) * [1, 1, -1]), six.modes[0].T, 1e-10)
+
+
+def test_one_turn_agrees_with_tracking_and_with_the_matrix():
+    ring = cell(b2=3.0, angle=0.2)
+    z = jnp.asarray([[1e-3, 0, 1e-3, 0, 0, 1e-3], [0, 1e-4, 0, 1e-4, 0, 0]])
+    close(rings.one_turn(ring, z), rings.track(ring, z).z, 1e-14)
+    orbit = rings.closed_orbit(ring, 0.002)
+    close(rings.one_turn(ring, orbit)[:4], orbit[:4], 1e-13)
+    M = rings.matrix(ring, 0.002)
+    close(M, jax.jacfwd(lambda z: rings.one_turn(ring, z))(orbit), 1e-12)
+
+
+def test_unstable_motion_and_missing_orbits_are_errors():
+    ring = cell(k=2.5)
+    with pytest.raises(ValueError, match=r"unstable: half of the trace .* in x, y"):
+        rings.optics(ring)
+    assert abs(np.trace(rings.matrix(ring)[:2, :2])) > 2
+    assert np.isnan(jax.jit(lambda k: rings.optics(cell().set("Q*", b1=k)).tune)(2.5)).all()
+    with pytest.raises(ValueError, match="no closed orbit was found"):
+        rings.optics(cell(b2=-400.0, angle=0.2), dp=0.4)
+    with pytest.raises(ValueError, match="guess must have 6 coordinates"):
+        rings.optics(ring, guess=jnp.zeros(4))
+    with pytest.raises(TypeError, match=r"must be a rings\.Ring"):
+        rings.optics([rings.drift("D", 1.0)])
+
+
+def test_detuning_of_an_octupole_is_the_formula_and_scales_with_it():
+    b3 = 50.0
+    found = rings.detuning(cell(b3=b3), action=1e-9)
+    bx, by = rings.optics(cell(), chromatic=False).beta[2]
+    first = 3 * b3 / (8 * np.pi) * np.array([[bx**2, -2 * bx * by], [-2 * bx * by, by**2]])
+    close(found, first, 1e-4)
+    assert np.abs(found - rings.detuning(cell(b3=b3 / 2))).max() > 100
+
+
+def test_driving_terms_of_thin_multipoles_are_the_formulas():
+    ring = cell(b2=3.0, b3=7.0)
+    o = rings.optics(ring, chromatic=False)
+    (bx, by), (px, py) = np.asarray(o.beta[2]), np.exp(1j * np.asarray(o.mu[2]))
+    terms = ("h21000", "h30000", "h10110", "h10020", "h10200", "h22000", "h11110")
+    found = rings.resonance_driving_terms(ring, terms)
+    rx = np.sqrt(bx)
+    expected = {
+        "h21000": 3 / 8 * rx * bx * px,
+        "h30000": 3 / 24 * rx * bx * px**3,
+        "h10110": -3 / 4 * rx * by * px,
+        "h10020": -3 / 8 * rx * by * px / py**2,
+        "h10200": -3 / 8 * rx * by * px * py**2,
+        "h22000": 3 * 7 / 32 * bx**2,
+        "h11110": -3 * 7 / 8 * bx * by,
+    }
+    for name in terms:
+        close(found[name], expected[name], 1e-12)
+    with pytest.raises(ValueError, match="names such as 'h21000'"):
+        rings.resonance_driving_terms(ring, ("h2100",))
+
+
+def test_apertures_of_a_ring_with_limits():
+    limits = rings.aperture("A", rectangle=(-0.01, 0.02, -0.005, 0.005))
+    line = rings.Ring([limits, *_elements(angle=0.2)])
+    o = rings.optics(line, chromatic=False)
+    found = rings.dynamic_aperture(line, 200, largest=(0.03, 0.03), angles=3, steps=40, rounds=2)
+    # Without sextupoles an ellipse that fits between the limits is stable.
+    x, y = np.array([0.01, 0.005]) / np.sqrt(1 + np.asarray(o.alpha[0]) ** 2)
+    close(found, [[x, 0], [0, y], [-x, 0]], 2e-2)
+    reached = []
+    done = rings.momentum_aperture(line, 200, [0, 3], largest=0.004, progress=reached.append)
+    D, beta = np.asarray(o.dispersion), np.asarray(o.beta)
+    assert done.shape == (2, 2)
+    assert reached[-1][0] == reached[-1][1]
+    # It starts at x = 0, so that it oscillates about D δ and reaches D δ and the amplitude.
+    v = o.modes[0, 0, :2]
+    amplitude = np.abs(np.conj(v) @ np.array([[0, 1], [-1, 0]]) @ D[0, :2])
+    largest = D[0, 0] + np.sqrt(beta[0, 0]) * amplitude
+    close(done[0], np.array([-0.01, 0.02]) / largest, 5e-2)
+
+
+def _elements(angle):
+    bend = rings.bend("B", 1.5, angle, edge_in=angle / 2, edge_out=angle / 2)
+    return [
+        rings.quadrupole("QF", 0.5, 0.6, slices=8), rings.drift("D", 0.5), bend,
+        rings.quadrupole("QD", 0.5, -0.6, slices=8), rings.drift("D", 0.5), bend,
+    ]  # fmt: skip
+
+
+def test_frequency_map_has_the_linear_tunes_and_the_detuning():
+    x, y = np.meshgrid([1e-4, 1e-3, 0.5], [1e-4, 2e-4])
+    found = rings.frequency_map(cell(b3=50.0), x, y, 256)
+    assert found.tune.shape == (2, 3, 2)
+    assert np.isnan(found.diffusion[:, 2]).all()  # lost at x = 0.5 m
+    o, slope = rings.optics(cell(), chromatic=False), rings.detuning(cell(b3=50.0))
+    J = np.stack([x, y], -1)[:, :2] ** 2 / 2 * np.asarray((1 + o.alpha[0] ** 2) / o.beta[0])
+    close(np.asarray(found.tune[:, :2]) - np.asarray(o.tune), J @ np.asarray(slope).T, 2e-2)
+    assert (np.asarray(found.diffusion)[:, :2] < -8).all()
+
+
+# --- against pyAT ---------------------------------------------------------------------------------
+
+
+def lattice(name, six=False):
+    at = pytest.importorskip("at")
+    import machine_data
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = at.load_lattice(os.path.join(machine_data.__path__[0], name))
+    found.enable_6d() if six else found.disable_6d()
+    for e in found:
+        e.PassMethod = e.PassMethod.replace("RadPass", "Pass")
+    found.periodicity = 1
+    return at, found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "six"),
+    [
+        ("hmba.mat", False),
+        ("hmba.mat", True),
+        ("dba.mat", False),
+        ("esrf.m", False),
+        ("esrf.m", True),
+    ],
+)
+def test_optics_agree_with_pyat(name, six):
+    at, theirs = lattice(name, six)
+    ring = rings.from_at(theirs)
+    found = rings.optics(ring)
+    _, all_of, each = at.get_optics(
+        theirs, refpts=range(len(theirs) + 1), method=at.linopt6, get_chrom=True
+    )
+    close(found.s, each.s_pos, 1e-13)
+    close(found.beta, each.beta, 1e-8)
+    close(found.alpha, each.alpha, 1e-8)
+    close(found.mu[:, :2], each.mu[:, :2], 1e-10)
+    close(found.dispersion, each.dispersion, 1e-8)
+    close(found.tune % 1, all_of.tune, 1e-9)
+    close(found.chromaticity, all_of.chromaticity, 1e-7)  # theirs: differences of round-off 1e-8
+    assert np.abs(found.orbit[:, :4] - each.closed_orbit[:, :4]).max() < 1e-11
+    if not six:
+        close(found.compaction, at.get_mcf(theirs), 1e-8)
+
+
+@pytest.mark.slow
+def test_coupled_optics_and_chromaticity_off_momentum_agree_with_pyat():
+    at, theirs = lattice("hmba.mat")
+    for e in theirs:
+        if isinstance(e, at.Quadrupole):
+            e.PolynomA = np.array([0.0, 0.04])
+            break
+    ring = rings.from_at(theirs)
+    found = rings.optics(ring, 0.003)
+    assert np.abs(found.gamma - 1).max() > 1e-4
+    where = range(len(theirs) + 1)
+    *_, each = at.get_optics(theirs, dp=0.003, refpts=where, method=at.linopt6)
+    close(found.beta, each.beta, 1e-8)
+    *_, each = at.get_optics(theirs, dp=0.003, refpts=where, method=at.linopt4)
+    close(found.beta / found.gamma[:, None] ** 2, each.beta, 1e-8)
+    close(found.orbit[:, :4], each.closed_orbit[:, :4], 1e-10)
+
+    def slope(h):
+        up, down = (at.get_optics(theirs, dp=0.003 + d)[1].tune for d in (h, -h))
+        return (up - down) / (2 * h)
+
+    once, twice = ((4 * slope(h / 2) - slope(h)) / 3 for h in (2e-3, 1e-3))
+    close(found.chromaticity, (16 * twice - once) / 15, 1e-6)
+
+
+@pytest.mark.slow
+def test_nonlinear_quantities_agree_with_pyat():
+    at, theirs = lattice("hmba.mat")
+    ring = rings.from_at(theirs)
+    close(rings.detuning(ring).T, at.detuning(theirs, xm=1e-4, ym=1e-4, nturns=1024)[1], 1e-3)
+
+    # pyAT takes the mean β of a magnet and the phase at its middle; in slices it converges to ours.
+    names = ("h21000", "h30000", "h10110", "h10020", "h10200")
+    found, errors = rings.resonance_driving_terms(ring, names), []
+    for n in (8, 16):
+        sliced = [
+            part
+            for e in theirs
+            for part in (e.divide([1 / n] * n) if isinstance(e, at.Sextupole) else [e])
+        ]
+        sliced = at.Lattice(sliced, energy=theirs.energy, periodicity=1)
+        terms = at.get_rdts(sliced, 0, [at.RDTType.GEOMETRIC1])[0]
+        errors.append([abs(complex(found[k]) / terms[k][0] - 1) for k in names])
+    close(errors[1], np.asarray(errors[0]) / 4, 2e-2)
+    assert np.max(errors[1]) < 1e-4
+
+    turns, steps = 64, np.arange(1, 33) / 32
+    found = rings.momentum_aperture(ring, turns, [60], largest=0.2, steps=32, rounds=1)[0]
+    for side, limit in zip((-1, 1), found, strict=True):
+        r = np.zeros((6, 32))
+        r[[0, 2]], r[4] = 1e-6, side * 0.2 * steps
+        theirs.track(r, nturns=1, start_elem=60, in_place=True, refpts=None)
+        lost = theirs.track(r, nturns=turns, losses=True, in_place=True, refpts=None)[2]
+        assert limit == pytest.approx(side * 0.2 * np.argmax(lost["loss_map"].islost) / 32)
+
+    x, y = np.meshgrid([1e-4, 1e-3, 2e-3], [1e-4, 5e-4])
+    found = rings.frequency_map(ring, x, y, 1024)
+    r = np.zeros((6, 6), order="F")
+    r[0], r[2] = x.ravel() + 1e-9, y.ravel() + 1e-9
+    each = at.linopt4(theirs)[0]
+    out = np.squeeze(theirs.track(r, nturns=512)[0])
+    for k in (0, 1):
+        signal = out[2 * k] - 1j * (each.alpha[k] * out[2 * k] + each.beta[k] * out[2 * k + 1])
+        tunes = at.get_tunes_harmonic(signal - signal.mean(1, keepdims=True))
+        assert np.abs(found.tune[..., k].ravel() - tunes).max() < 1e-6
