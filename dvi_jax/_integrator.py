@@ -121,6 +121,9 @@ def default_method(system: System) -> Method:
     # of it has order two. A map that the user wrote stays as it is.
     if isinstance(system.H_D, Split):
         return Splitting()
+    own = getattr(system.H_D, "own_method", None)
+    if isinstance(own, Method):
+        return own
     return Strang() if is_first_order(system.H_D) else TypeII()
 
 

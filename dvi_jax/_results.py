@@ -73,12 +73,17 @@ class RESULTS(eqx.Enumeration):
         "∂g/∂q is less than their number, so that the forces of constraint are not determined. "
         "Leave out the components that follow from the others."
     )
+    lost = (
+        "The particle was lost in the ring: it hit an aperture, or a coordinate exceeded 1. "
+        "dvi.rings.track also reports the element."
+    )
 
 
 # In the order of the class, which numbers them. A new status goes to the end: stores have numbers.
 STATUS_NAMES = (
     *("successful", "not_converged", "not_finite", "bad_step_size", "no_root", "out_of_range"),
     *("stopped", "not_reached", "step_control_failed", "inconsistent", "redundant"),
+    "lost",
 )
 
 

@@ -14,7 +14,7 @@ from .extras import expect, needed
 
 _STATUSES = ("successful", "not_converged", "not_finite", "bad_step_size")
 _STATUSES += ("no_root", "out_of_range", "stopped", "not_reached", "step_control_failed")
-_STATUSES += ("inconsistent", "redundant")
+_STATUSES += ("inconsistent", "redundant", "lost")
 """Names of `RESULTS`, by the number of each in a dataset, as in that of a sweep."""
 
 _TAKEN = ("t", "q", "p", "h", "status", "time", "save", "step")

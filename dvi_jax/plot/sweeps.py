@@ -41,6 +41,7 @@ _STATUS_COLOURS = {
     "step_control_failed": "#F0E442",
     "inconsistent": "#7f7f7f",
     "redundant": "#404040",
+    "lost": "#8c564b",
 }
 """One colour for each status in all pictures, so that they can be compared."""
 

@@ -29,6 +29,7 @@ from ._optics import (
     one_turn as one_turn,
     optics as optics,
 )
+from ._problem import Turn as Turn, problem as problem
 from ._readers import from_at as from_at, load as load
 from ._ring import Ring as Ring
 from ._track import Tracked as Tracked, track as track

@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+import lanewise
+
 
 class Particle(NamedTuple):
     """Coordinates relative to the reference particle: lengths in m, momenta over p₀, ζ = −c Δt."""
@@ -165,18 +167,22 @@ def curved_kick(z: Particle, length: Any, par: Parameters, order: int) -> Partic
 # --- thin parts ----------------------------------------------------------------------------------
 
 
-def edge(side: str, symplectic: bool) -> Piece:
-    """The edge of a bend: px + h tan(e) x, py − h tan(e − ψ/(1 + δ)) y with the correction
-    ψ = h G (1 + sin² e)/cos e for a fringe field, G the gap [m] times its integral. `symplectic`:
-    with the change of ζ that belongs to the δ in it."""
+def edge(side: str, symplectic: bool, method: int) -> Piece:
+    """The edge of a bend: px + h tan(e) x, py − f y with f = h tan(e − ψ/(1 + δ)) and the
+    correction ψ = h G (1 + sin² e)/cos e for a fringe field, G the gap [m] times its integral;
+    f/(1 + δ) for method 2. `symplectic`: with the change of ζ that belongs to the δ in f."""
 
     def change(z, par):
-        h, e, p = par["h"], par[f"edge_{side}"], 1 + z.delta
-        psi = h * par[f"fringe_{side}"] * (1 + jnp.sin(e) ** 2) / jnp.cos(e) / p
-        tan = jnp.tan(e - psi)
-        changes = {"px": h * jnp.tan(e) * z.x, "py": -h * tan * z.y}
+        h, e = par["h"], par[f"edge_{side}"]
+        psi = h * par[f"fringe_{side}"] * (1 + jnp.sin(e) ** 2) / jnp.cos(e)
+
+        def f(delta):
+            f = h * jnp.tan(e - psi / (1 + delta))
+            return f / (1 + delta) if method == 2 else f
+
+        changes = {"px": h * jnp.tan(e) * z.x, "py": -f(z.delta) * z.y}
         if symplectic:
-            changes["zeta"] = h * (z.y * z.y / 2) * (1 + tan * tan) * psi / p
+            changes["zeta"] = z.y * z.y / 2 * jax.grad(f)(z.delta)
         return changes
 
     return near_identity(change)
@@ -255,13 +261,13 @@ def placed(z: Particle, par: Parameters, sign: int) -> Particle:
 
 
 def affine(side: str) -> Piece:
-    """M z + v, given as ``matrix_…`` and ``shift_…``; the inverse matrix is in ``inverse_…``."""
+    """M z + v, given as ``matrix_…`` and ``shift_…``."""
 
     def apply(z, par, turn, sign):
-        shift = par[f"shift_{side}"]
+        matrix, shift = par[f"matrix_{side}"], par[f"shift_{side}"]
         if sign > 0:
-            return Particle(*(par[f"matrix_{side}"] @ jnp.stack(z) + shift))
-        return Particle(*(par[f"inverse_{side}"] @ (jnp.stack(z) - shift)))
+            return Particle(*(matrix @ jnp.stack(z) + shift))
+        return Particle(*lanewise.solve(matrix, jnp.stack(z) - shift))
 
     return Piece(apply)
 

@@ -69,12 +69,6 @@ def rows_of(ring: Ring, first: int = 0, last: int | None = None) -> tuple[Rows, 
     part, element = np.asarray(which, np.int32).reshape(-1, 2).T
     rows = {name: column[element] for name, column in ring.columns.items()}
     rows |= {f"ε {name}": column[element] for name, column in ring.extra.items()}
-    for side in ("in", "out"):
-        matrix = rows.get(f"matrix_{side}")
-        if matrix is not None:
-            none = jnp.all(matrix == 0, axis=(1, 2), keepdims=True)
-            known = lax.stop_gradient(jnp.where(none, jnp.eye(6), matrix))
-            rows[f"inverse_{side}"] = jnp.linalg.inv(known)
     return rows, {"part": part, "element": element}
 
 

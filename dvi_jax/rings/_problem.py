@@ -1,0 +1,154 @@
+"""A ring as a system: one step of a run is one turn."""
+
+from typing import Any, ClassVar, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from .._checks import instance, one_of
+from .._results import RESULTS
+from .._step import judge, no_solve
+from .._system import System
+from ..methods import Method
+from ._maps import Part, Particle
+from ._ring import Ring
+from ._turn import flown, moved, rows_of, start
+
+Planes = Literal["x", "xy", "xyz"]
+
+
+class Packed(eqx.Module):
+    """The parameters of a ring in the order of passage, as `args` of a run."""
+
+    rows: dict[str, Array]
+    numbers: dict[str, Array]
+    delta: Array
+    parts: tuple[Part, ...] = eqx.field(static=True)
+
+    @property
+    def ends(self) -> Array:
+        """s behind each row [m]; a row of an element ends where the element does."""
+        first = jnp.diff(self.numbers["element"], prepend=-1) > 0
+        return jnp.cumsum(jnp.where(first, self.rows["length"], 0.0))
+
+    def particle(self, q: Array, p: Array) -> Particle:
+        """The particle of a state, of which some planes may be missing."""
+        n = q.shape[0]
+        x, y, zeta = [*q, *jnp.zeros(3 - n)]
+        px, py, delta = [*p, *jnp.zeros(2 - min(n, 2)), *[self.delta] * (n < 3)]
+        return Particle(x, px, y, py, zeta, delta)
+
+
+class Turn(Method):
+    """One turn of a ring, of a system of `problem` with h = 1.
+
+    A step is the map of `track`, exact up to round-off: the order says nothing about it. A particle
+    that is lost has the status `lost`. **Raises** `ValueError` for another system or step.
+    """
+
+    order: ClassVar[int] = 1
+    is_symmetric: ClassVar[bool] = False
+    is_symplectic: ClassVar[bool] = True
+    is_invertible: ClassVar[bool] = True
+
+    def step(self, equations, interval, q0, p0):
+        ring, epsilon = equations.args, equations.epsilon
+        begin = start(ring.particle(q0, p0))
+        turn = jnp.round(interval.t0)
+        flight = flown(ring.parts, ring.numbers, ring.rows, begin, turn, epsilon)
+        q, p, info = _state(flight.z, q0)
+        result = RESULTS.where(flight.element >= 0, RESULTS.lost, info.result)
+        return q, p, info._replace(result=result)
+
+    def inverse(self, equations, interval, q1, p1):
+        ring, epsilon = equations.args, equations.epsilon
+        turn, z = jnp.round(interval.t0), ring.particle(q1, p1)
+        return _state(moved(ring.parts, ring.numbers, ring.rows, z, turn, epsilon, -1), q1)
+
+    def needs_no_solve(self, equations, interval, q) -> bool:
+        return True
+
+    inverse_needs_no_solve = needs_no_solve
+
+    def check(self, equations, interval, q, p) -> None:
+        if not isinstance(equations.args, Packed) or q.shape not in ((1,), (2,), (3,)):
+            raise ValueError(
+                "method=rings.Turn() requires a system of rings.problem(ring), its args, and q0 "
+                f"and p0 of shape (1,), (2,) or (3,); got args of the type "
+                f"{type(equations.args).__name__} and shape {q.shape}."
+            )
+        if float(interval.h) != 1:
+            raise ValueError(f"h must be 1, one turn, for a ring; got h = {float(interval.h)}.")
+
+
+def _state(z: Particle, like: Array) -> tuple[Array, Array, Any]:
+    n = like.shape[0]
+    q, p = jnp.stack([z.x, z.y, z.zeta])[:n], jnp.stack([z.px, z.py, z.delta])[:n]
+    return q, p, judge(no_solve(q), q, p)
+
+
+class _Along(eqx.Module):
+    """The paraxial Hamiltonian at the place s = t C, over one turn of length C; `prefix` of the
+    parameters it contains."""
+
+    prefix: str = eqx.field(static=True, default="")
+    own_method: ClassVar[Method] = Turn()
+
+    def __call__(self, t0, t1, q0, p1, args):
+        ends = args.ends
+        z = args.particle(q0, p1)
+        row = jnp.searchsorted(ends, (t0 - jnp.floor(t0)) * ends[-1], side="right")
+        element = args.numbers["element"]
+        row = jnp.searchsorted(element, element[row], side="right") - 1
+        par = {n: lax.dynamic_index_in_dim(c, row, keepdims=False) for n, c in args.rows.items()}
+        free = (z.px**2 + z.py**2) / (2 * (1 + z.delta))
+        h = par.get("h", 0.0)
+        bent = h * z.x * (h * z.x / 2 - z.delta)
+        energy, power = 0.0, 1.0 + 0j
+        for n in range(12):
+            power = power * (z.x + 1j * z.y)
+            b, a = (par.get(f"{self.prefix}{k}{n}", 0.0) for k in "ba")
+            energy = energy + jnp.real((b + 1j * a) * power) / (n + 1)
+        return ends[-1] * (energy if self.prefix else free + bent + energy)
+
+
+class RingProblem(NamedTuple):
+    """A ring as a problem for `integrate`, `sweep` and others: one step is one turn."""
+
+    system: System
+    q0: Array
+    p0: Array
+    h: float
+    args: Packed
+
+
+def problem(ring: Ring, planes: Planes = "xyz", delta: Any = 0.0) -> RingProblem:
+    r"""The one-turn map of a ring as a system with q = (x, y, ζ), p = (px, py, δ) and h = 1.
+
+    Runs have the method `Turn`. ε multiplies what `Ring.perturbed` set aside. The Hamiltonian of
+    the system is that of the bodies of the elements at the place s = t C, which other methods can
+    integrate: (px² + py²)/(2 (1 + δ)) − h x δ + h² x²/2 + Re Σ (b_n + i a_n)(x + i y)^{n+1}/(n+1);
+    edges, thin elements and cavities are not in it.
+
+    **Arguments** `planes`: "x": q = (x,), p = (px,), with y = py = 0; "xy": q = (x, y); both with
+    ζ = 0 at the start of each turn and δ = `delta`.
+
+    **Example** Invariants of a cell, to order 1 in its sextupoles:
+
+    ```python
+    cell = rings.problem(ring.perturbed("S*", "b2"), planes="x")
+    found = dvi.discover_invariants(cell.system, dvi.Polynomials(3), order=1, h=1.0,
+                                    samples=samples, args=cell.args)
+    ```
+    """
+    instance("ring", ring, Ring, "a rings.Ring")
+    one_of("planes", planes, ("x", "xy", "xyz"))
+    rows, numbers = rows_of(ring)
+    numbers = jax.tree.map(jnp.asarray, numbers)
+    args = Packed(rows, numbers, jnp.asarray(delta, float), ring.program.parts)
+    perturbation = _Along("ε ") if ring.extra else None
+    zero = jnp.zeros(len(planes))
+    return RingProblem(System(_Along(), perturbation=perturbation), zero, zero, 1.0, args)
