@@ -17,7 +17,7 @@ from .._checks import instance
 from ._maps import KICKS, Particle, forward
 from ._parts import pieces_of
 from ._ring import Ring
-from ._turn import _perturbed, moved, rows_of
+from ._turn import moved, perturbed, rows_of
 
 SLICED = "straight", "bend", "exact_straight", "exact_bend"
 _MOST, _AFTER, _NEAR = 15, 3, 1e-9
@@ -181,7 +181,7 @@ def maps(ring: Ring, epsilon: Any) -> tuple[Callable, Any]:
 
     def apply(z, x):
         par, which, steps = x
-        par = _perturbed(par, epsilon)
+        par = perturbed(par, epsilon)
 
         def through(kind):
             pieces = pieces_of(kind)

@@ -239,7 +239,7 @@ _MAKERS = {
         e.FamName, 0.0, **_field(e, thin=True), kind=type(e).__name__.lower()
     ),
     "CorrectorPass": lambda e, *_: corrector(e.FamName, e.Length, *e.KickAngle),
-    "SolenoidLinearPass": lambda e, *_: solenoid(e.FamName, e.Length, e.ks),
+    "SolenoidLinearPass": lambda e, *_: solenoid(e.FamName, e.Length, e.K),
     "RFCavityPass": _cavity,
     "CavityPass": _cavity,
     "Matrix66Pass": _matrix,

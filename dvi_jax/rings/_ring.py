@@ -6,10 +6,11 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
+
+from lanewise.jaxapi import is_traced
 
 from .._checks import instance, positive, whole
 from ._elements import C, Element
@@ -115,7 +116,7 @@ class Ring(eqx.Module):
 
     def where(self, which: Where) -> np.ndarray:
         """The numbers of the elements whose name or kind matches a pattern such as "QF*", or
-        numbers as they are. **Raises** `ValueError` if there are none."""
+        the given numbers. **Raises** `ValueError` if no element matches."""
         if not isinstance(which, str):
             numbers = np.atleast_1d(np.asarray(which))
             if numbers.dtype.kind != "i" or (numbers >= len(self)).any() or (numbers < 0).any():
@@ -144,11 +145,11 @@ class Ring(eqx.Module):
         for each of them. **Raises** `ValueError` for a parameter that an element does not have."""
         columns = dict(self.columns)
         for name, value in values.items():
-            numbers = self._numbers(which, name)
-            if jnp.ndim(value) and jnp.shape(value)[0] != len(numbers):
+            numbers, value = self._numbers(which, name), jnp.asarray(value)
+            if value.ndim and len(value) != len(numbers):
                 raise ValueError(
                     f"{name} must be one number or {len(numbers)} numbers, one for each element "
-                    f"that matches {which!r}, got an array of shape {jnp.shape(value)}."
+                    f"that matches {which!r}, got an array of shape {value.shape}."
                 )
             columns[name] = columns[name].at[numbers].set(value)
         return eqx.tree_at(lambda ring: ring.columns, self, columns)
@@ -178,7 +179,7 @@ class Ring(eqx.Module):
     def check(self) -> None:
         """**Raises** `ValueError` for a parameter that is not finite, unless it is traced."""
         for name, column in {**self.columns, **self.extra}.items():
-            if not isinstance(column, jax.core.Tracer):
+            if not is_traced(column):
                 bad = np.argwhere(~np.isfinite(np.asarray(column)))
                 if len(bad):
                     i = bad[0][0]

@@ -131,32 +131,20 @@ def _tracked(ring: Ring, z: Array, epsilon: Array, counts: tuple[int, int, int])
             lambda t, x, m: t if m else jnp.zeros_like(x), tangents, primals, moves
         )
 
-        def pushed(of_batch):
-            def push(residuals, change):
-                def along(numbers, x, change):
-                    return jax.jvp(lambda *x: forward(numbers, *x)[0], x, change)[1]
+        def push(residuals, change):
+            def along(numbers, x, change):
+                return jax.jvp(lambda *x: forward(numbers, *x)[0], x, change)[1]
 
-                on = (False, True, True)
-                primals = residuals[0]
-                return of_batch(along, on)(numbers, primals, change)
-
-            return push
-
-        def with_xla(along, on):
-            return jax.vmap(along, (None, (None, 0, 0), (None, 0, 0)))
-
-        def in_machine_code(along, on):
-            return jax.vmap(
-                functools.partial(lanewise.call, along), (None, (None, 0, 0), (None, 0, 0))
+            axes = (None, (None, 0, 0), (None, 0, 0))
+            return jax.vmap(functools.partial(lanewise.call, along), axes)(
+                numbers, residuals[0], change
             )
 
         def pull(residuals, cotangent):
             primals, saved = residuals
             return _pulled(parts, numbers, primals, saved, cotangent, counts, moves)
 
-        moved = linear_map(
-            pushed(in_machine_code), pull, pushed(with_xla), (primals, saved), change
-        )
+        moved = linear_map(push, pull, push, (primals, saved), change)
         none = [np.zeros(x.shape, jax.dtypes.float0) for x in losses[:2]]
         return (saved, losses), (moved, (*none, jnp.zeros_like(losses[2])))
 

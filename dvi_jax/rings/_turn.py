@@ -20,6 +20,10 @@ LARGEST = 1.0
 """A particle with a larger coordinate than this (x, px, y, py, δ) is lost, as in pyAT."""
 
 
+Rows = dict[str, Any]
+"""Parameters of each part of the elements of a ring, in the order of passage."""
+
+
 class Flight(NamedTuple):
     """A particle, and where it was lost: element and turn (−1 if it was not) and coordinates."""
 
@@ -34,11 +38,11 @@ def start(z: Particle) -> Flight:
     return Flight(z, none, none, Particle(*[jnp.full((), jnp.nan)] * 6))
 
 
-def _noted(flight: Flight, z: Particle, passes: Any, element: Any, turn: Any) -> Flight:
-    """The flight with the particle after an element, or with its loss there."""
+def _noted(flight: Flight, z: Particle, passes: Any, number: Rows, turn: Any) -> Flight:
+    """The flight with the particle after a part of an element, or with its loss there."""
     inside = functools.reduce(jnp.logical_and, [jnp.abs(z[i]) <= LARGEST for i in (0, 1, 2, 3, 5)])
-    # NaN in a coordinate fails the comparison.
-    passes = passes & inside & jnp.isfinite(z.zeta)
+    # NaN in a coordinate fails the comparison. Within an element the limit does not hold.
+    passes = passes & ((inside & jnp.isfinite(z.zeta)) | ~number["ends"])
     is_lost = ~passes & (flight.element < 0)
 
     def note():
@@ -48,7 +52,7 @@ def _noted(flight: Flight, z: Particle, passes: Any, element: Any, turn: Any) ->
         nan = Particle(*[jnp.full((), jnp.nan)] * 6)
         return Flight(
             chosen(nan, z),
-            chosen(element, flight.element),
+            chosen(number["element"], flight.element),
             chosen(jnp.asarray(turn, jnp.int32), flight.turn),
             chosen(z, flight.last),
         )
@@ -57,22 +61,19 @@ def _noted(flight: Flight, z: Particle, passes: Any, element: Any, turn: Any) ->
     return lax.cond(lanewise.on_any(is_lost), note, lambda: flight._replace(z=z))
 
 
-Rows = dict[str, Any]
-"""Parameters of each part of the elements of a ring, in the order of passage."""
-
-
 def rows_of(ring: Ring, first: int = 0, last: int | None = None) -> tuple[Rows, Rows]:
     """The parameters of the parts of the elements `first` … `last` − 1, and the numbers of the
-    parts and of the elements."""
+    parts and of the elements, with whether an element ends there."""
     last = len(ring) if last is None else last
     which = [row for row in ring.program.rows if first <= row[1] < last]
     part, element = np.asarray(which, np.int32).reshape(-1, 2).T
     rows = {name: column[element] for name, column in ring.columns.items()}
     rows |= {f"ε {name}": column[element] for name, column in ring.extra.items()}
-    return rows, {"part": part, "element": element}
+    ends = np.append(element[1:] != element[:-1], True)
+    return rows, {"part": part, "element": element, "ends": ends}
 
 
-def _perturbed(par: Rows, epsilon: Any) -> Rows:
+def perturbed(par: Rows, epsilon: Any) -> Rows:
     """The parameters of a part, with what ε is multiplied by added."""
     extra = {name[2:]: value for name, value in par.items() if name.startswith("ε ")}
     return {**par, **{name: par[name] + epsilon * value for name, value in extra.items()}}
@@ -85,7 +86,7 @@ def moved(
 
     def row(z, x):
         number, par = x
-        par = _perturbed(par, epsilon)
+        par = perturbed(par, epsilon)
 
         def through(part):
             return lambda z: forward(pieces_of(part), z, par, turn, sign)
@@ -102,7 +103,7 @@ def flown(
 
     def row(flight, x):
         number, par = x
-        par = _perturbed(par, epsilon)
+        par = perturbed(par, epsilon)
 
         def through(part):
             inside = APERTURES.get(part.name)
@@ -111,7 +112,7 @@ def flown(
             return lambda z: (forward(pieces_of(part), z, par, turn, 1), jnp.asarray(True))
 
         z, passes = lax.switch(number["part"], [through(p) for p in parts], flight.z)
-        return _noted(flight, z, passes, number["element"], turn), None
+        return _noted(flight, z, passes, number, turn), None
 
     return lax.scan(row, flight, (numbers, rows))[0]
 
@@ -131,7 +132,7 @@ def pulled(
 
     def row(state, x):
         number, par = x
-        par = _perturbed(par, epsilon)
+        par = perturbed(par, epsilon)
         known = {name: par[name] for name in moving}
 
         def back(part):

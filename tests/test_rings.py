@@ -1,0 +1,398 @@
+"""Rings: elements and tracking against pyAT, symplecticity, losses, gradients, bad input."""
+
+import inspect
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dvi_jax as dvi
+from dvi_jax import rings
+from dvi_jax.rings._readers import from_at_coordinates, to_at
+
+SIZES = np.array([1e-3, 1e-4, 1e-3, 1e-4, 1e-2, 1e-3])
+S = np.kron(np.eye(3), [[0, 1], [-1, 0]])
+FIELD = {"b": (1e-3, 1.2, 8.0, 50.0), "a": (2e-3, 0.3, 3.0)}
+
+ELEMENTS = {
+    "drift": rings.drift("D", 1.3),
+    "exact drift": rings.drift("D", 1.3, model="exact"),
+    "multipole": rings.multipole("M", 0.4, **FIELD, slices=3),
+    "order 2": rings.multipole("M", 0.4, **FIELD, slices=3, scheme=2),
+    "order 6": rings.multipole("M", 0.4, **FIELD, slices=1, scheme=6),
+    "exact multipole": rings.multipole("M", 0.4, **FIELD, slices=3, model="exact"),
+    "thin": rings.multipole("M", 0.0, **FIELD),
+    "bend": rings.bend("B", 1.1, 0.2, (1e-3, -0.5, 2.0), edge_in=0.1, edge_out=0.07, slices=3),
+    "bend with fringe": rings.bend("B", 1.1, 0.2, edge_in=0.1, fringe_in=0.02, fringe_out=0.01),
+    "exact bend": rings.bend("B", 1.1, 0.2, (0, 0.4), edge_in=0.1, fringe=True, model="exact"),
+    "corrector": rings.corrector("C", 0.3, 1e-3, -2e-3),
+    "solenoid": rings.solenoid("S", 0.6, 0.8),
+    "cavity": rings.cavity("RF", 0.4, 1e-3, 5e8, lag=0.05),
+    "placed": rings.quadrupole("Q", 0.3, 1.1, slices=2).placed(1e-4, -2e-4, 0.05),
+}
+
+
+def ring_of(*elements):
+    return rings.Ring(elements)
+
+
+def particles(count=50, seed=0):
+    return np.random.default_rng(seed).normal(size=(count, 6)) * SIZES
+
+
+def asymmetry(ring, z):
+    """max |Jᵀ S J − S| of the map at z."""
+    J = np.asarray(jax.jacfwd(lambda z: rings.one_turn(ring, z))(z))
+    return np.abs(J.T @ S @ J - S).max()
+
+
+# One ring of all elements is one program; each of them is tested by its own matrix.
+@pytest.mark.parametrize("name", ["multipole", "bend", "exact bend", "solenoid", "placed"])
+def test_maps_are_symplectic(name):
+    assert asymmetry(ring_of(ELEMENTS[name]), particles()[0]) < 1e-13
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(ELEMENTS))
+def test_all_maps_are_symplectic(name):
+    assert asymmetry(ring_of(ELEMENTS[name]), particles()[0]) < 1e-13
+
+
+@pytest.mark.slow
+def test_inverse_and_derivative_backwards():
+    """The reverse pass goes through the inverse of every element."""
+    ring = ring_of(*ELEMENTS.values())
+    z, weights = particles()[0] / 10, np.arange(1.0, 7.0) / SIZES
+    forward = jax.jacfwd(lambda z: rings.one_turn(ring, z))(z).T @ weights
+    backward = jax.grad(lambda z: rings.track(ring, z).z @ weights)(z)
+    np.testing.assert_allclose(backward, forward, rtol=1e-9)
+
+
+def test_a_truncated_fringe_is_not_symplectic():
+    """The negative control of the tests above, whose error is of order 4 in x."""
+    ring = ring_of(rings.quadrupole("Q", 0.4, 1.2, slices=3, fringe=True))
+    small, large = (asymmetry(ring, np.array([x, 0, x, 0, 0, 0])) for x in (1e-3, 1e-2))
+    assert small < 1e-13 < 1e-11 < large < 1e-9
+
+
+def test_exact_and_paraxial_models_differ_by_the_cubes_of_the_angles():
+    z = np.array([1e-3, 2e-3, 0, 1e-3, 0, 0])
+    exact, paraxial = (rings.track(ring_of(ELEMENTS[n]), z).z for n in ("exact drift", "drift"))
+    p = np.array([2e-3, 1e-3])
+    wanted = 1.3 * p * (p @ p) / 2
+    np.testing.assert_allclose((exact - paraxial)[:3:2], wanted, rtol=1e-5)
+    many, few = (
+        rings.track(ring_of(rings.multipole("M", 0.4, b=(0, 9.0), slices=n, scheme=s)), z).z
+        for n, s in ((64, 6), (1, 2))
+    )
+    assert 1e-5 < np.abs(many - few).max() < 1e-2
+
+
+@pytest.mark.parametrize("scheme", [2, 4, 6])
+def test_order_of_the_slices(scheme):
+    z = np.array([0.01, 0.02, -0.02, 0.01, 0, 0.01])
+
+    def after(slices, scheme=scheme):
+        return rings.track(ring_of(rings.multipole("M", 1.0, (0, 3.0, 9.0), slices=slices,
+                                                   scheme=scheme)), z).z  # fmt: skip
+
+    reference = after(300, 6)
+    few = {2: 8, 4: 8, 6: 4}[scheme]
+    ratio = np.abs(after(few) - reference).max() / np.abs(after(2 * few) - reference).max()
+    assert np.log2(ratio) == pytest.approx(scheme, abs=0.35)
+
+
+# --- gradients -----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def cell():
+    return rings.Ring(
+        [
+            rings.quadrupole("QF", 0.5, 0.6, slices=3, fringe=True),
+            rings.drift("D1", 2.0),
+            rings.bend("B", 1.0, np.pi / 16, (0, 0.01), edge_in=0.1, edge_out=0.1, slices=2),
+            rings.sextupole("SF", 0.1, 3.0, slices=1),
+            rings.quadrupole("QD", 0.5, -0.6, slices=3).placed(1e-4, 0, 1e-3),
+            rings.solenoid("SOL", 0.2, 0.1),
+            rings.corrector("C", 0.1, 1e-4, 0.0),
+            rings.aperture("A", ellipse=(0.03, 0.03)),
+            rings.drift("D2", 2.0, model="exact"),
+            rings.cavity("RF", 0.0, 1e-3, 5e8),
+        ]
+    )
+
+
+def test_gradients_by_strengths_and_coordinates(cell):
+    """Reverse mode along states that are tracked backwards, against differences and forward mode;
+    a lost particle changes nothing."""
+    z = particles(4) / 3
+    z[3] = [0.02, 0.01, 0, 0, 0, 0]  # lost
+
+    def loss(k, z, turns=40):
+        ring = cell.set("Q*", b1=k[:2]).set("SF", b2=k[2]).set("B", h=k[3]).set("QD", dx=k[4])
+        ring = ring.set("RF", voltage=k[5]).set("SOL", ks=k[6]).set("C", kick_x=k[7])
+        out = rings.track(ring, z, turns, every=20).z
+        weights = jnp.arange(1.0, 7.0) / SIZES
+        out = jnp.where(jnp.isnan(out), 0.0, out)
+        return jnp.sum(out * jnp.broadcast_to(weights, out.shape))
+
+    k = jnp.array([0.6, -0.6, 3.0, np.pi / 16, 1e-4, 1e-3, 0.1, 1e-4])
+    assert np.asarray(rings.track(cell, z, 40).lost).tolist() == [False] * 3 + [True]
+    by_k, by_z = jax.grad(loss, (0, 1))(k, z)
+    v = jnp.array([1.0, -1, 5, 0.1, 1e-3, 1e-3, 0.1, 1e-3])
+    u = np.random.default_rng(1).normal(size=z.shape) * SIZES * 0.1
+    forward = jax.jvp(loss, (k, z), (v, u))[1]
+    assert by_k @ v + jnp.sum(by_z * u) == pytest.approx(float(forward), rel=1e-9)
+    assert not by_z[3].any()
+    steps = 1e-6 * np.asarray(v)
+    central = (loss(k + steps, z) - loss(k - steps, z)) / 2e-6
+    assert by_k @ v == pytest.approx(float(central), rel=1e-6)
+    without = jax.grad(loss, 0)(k, z[:3])
+    np.testing.assert_allclose(by_k, without, rtol=1e-12)
+
+
+def test_gradient_by_epsilon_and_of_the_perturbed_strength(cell):
+    ring, z = cell.perturbed("SF", "b2"), particles(3, seed=1) / 3
+
+    def loss(epsilon, b2):
+        changed = ring.extra["b2"].at[3].set(b2)
+        other = jax.tree_util.tree_map(lambda x: x, ring)
+        object.__setattr__(other, "extra", {"b2": changed})
+        return jnp.sum(rings.track(other, z, 20, epsilon=epsilon).z @ (1 / SIZES))
+
+    at, b2 = 0.7, 3.0
+    np.testing.assert_allclose(
+        rings.track(ring, z, 20, epsilon=at).z,
+        rings.track(cell.set("SF", b2=at * b2), z, 20).z,
+        rtol=1e-12, atol=1e-16,
+    )  # fmt: skip
+    d_epsilon, d_b2 = jax.grad(loss, (0, 1))(at, b2)
+    assert d_epsilon * at == pytest.approx(float(d_b2) * b2, rel=1e-9)
+    central = (loss(at + 1e-5, b2) - loss(at - 1e-5, b2)) / 2e-5
+    assert d_epsilon == pytest.approx(float(central), rel=1e-6)
+
+
+# --- as a system ---------------------------------------------------------------------------------
+
+
+def test_one_turn_is_a_step_of_a_run(cell):
+    problem = rings.problem(cell)
+    z = particles(1)[0] / 3
+    sol = dvi.integrate(problem, z[::2], z[1::2], num_steps=30, save=dvi.Save(every=10))
+    out = rings.track(cell, z, 30, every=10)
+    np.testing.assert_allclose(sol.qs[1:], out.z[:, ::2], rtol=0, atol=1e-17)
+    np.testing.assert_allclose(sol.ps[1:], out.z[:, 1::2], rtol=0, atol=1e-17)
+    lost = dvi.integrate(problem, [0.02, 0, 0], [0.01, 0, 0], num_steps=30, throw=False)
+    out = rings.track(cell, [0.02, 0.01, 0, 0, 0, 0], 30)
+    assert str(lost.status) == "lost"
+    assert int(lost.stats["failed_step"]) == int(out.turn) >= 0
+
+
+def test_the_hamiltonian_is_that_of_the_bodies():
+    """Gauss' method in the fields along the ring, with steps that end at the edges."""
+    ring = ring_of(
+        rings.drift("D", 0.5),
+        rings.multipole("M", 0.5, (0.01, 2.0, 5.0), (0.0, 0.3), slices=40, scheme=6),
+        rings.bend("B", 0.5, 0.1, (0.0, 0.5), slices=40, scheme=6),
+    )
+    problem = rings.problem(ring)
+    z = np.array([1e-2, 1e-3, 5e-3, -1e-3, 0, 2e-2])
+    sol = dvi.integrate(
+        problem, z[::2], z[1::2], h=1 / 48, num_steps=48, method=dvi.GaussLegendre(3)
+    )
+    out = rings.track(ring, z).z
+    np.testing.assert_allclose(sol.qs[-1], out[::2], atol=1e-9)
+    np.testing.assert_allclose(sol.ps[-1], out[1::2], atol=1e-9)
+
+
+# --- bad input -----------------------------------------------------------------------------------
+
+
+def test_errors(cell):
+    with pytest.raises(ValueError, match=r"no element matches 'QX\*'. Names are, for example"):
+        cell.set("QX*", b1=1.0)
+    with pytest.raises(ValueError, match=r"the quadrupole 'QF', has no parameter 'b2'"):
+        cell.set("QF", b2=1.0)
+    with pytest.raises(ValueError, match="one number or 2 numbers"):
+        cell.set("Q*", b1=[1.0, 2.0, 3.0])
+    with pytest.raises(ValueError, match="b1 of element 0, the quadrupole 'QF', must be finite"):
+        rings.track(cell.set("QF", b1=np.nan), np.zeros(6))
+    with pytest.raises(ValueError, match="six coordinates"):
+        rings.track(cell, np.zeros(4))
+    with pytest.raises(ValueError, match="every must divide"):
+        rings.track(cell, np.zeros(6), 10, every=3)
+    with pytest.raises(ValueError, match="length of a bend must be a positive"):
+        rings.bend("B", 0.0, 0.1)
+    with pytest.raises(TypeError, match=r"elements\[0\]"):
+        rings.Ring(["QF"])
+    with pytest.raises(ValueError, match="h must be 1"):
+        dvi.integrate(rings.problem(cell), np.zeros(3), np.zeros(3), num_steps=2, h=0.5,
+                      method=rings.Turn())  # fmt: skip
+
+
+# --- pyAT ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def at():
+    return pytest.importorskip("at")
+
+
+def lattice_of(at, name, six=False):
+    import machine_data
+
+    path = f"{next(iter(machine_data.__path__))}/{name}"
+    with warnings.catch_warnings(action="ignore"):
+        lattice = at.load_lattice(path)
+        lattice.enable_6d() if six else lattice.disable_6d()
+    for e in lattice:
+        e.PassMethod = e.PassMethod.replace("RadPass", "Pass")
+    return lattice
+
+
+def tracked_by_at(lattice, z, turns=1):
+    r = to_at(z).copy(order="F")
+    lattice.track(r, nturns=turns, refpts=None, in_place=True)
+    return from_at_coordinates(r)
+
+
+def at_elements(at):
+    e = at.elements
+    multi = {"poly_a": [2e-3, 0.3, 3.0], "poly_b": [1e-3, 1.2, 8.0]}
+    bend = {"EntranceAngle": 0.1, "ExitAngle": 0.07, "PolynomB": [1e-3, 0.4, 2.0]}
+    gap = {"FullGap": 0.04, "FringeInt1": 0.5, "FringeInt2": 0.4}
+    quads = {"FringeQuadEntrance": 1, "FringeQuadExit": 1}
+    exact = {"PassMethod": "ExactMultipolePass"}
+    R = np.eye(6) + 0.01 * np.diag([1, 0, 1, 0, 1], -1)
+    return {
+        "DriftPass": e.Drift("D", 1.3),
+        "ExactDriftPass": e.Drift("D", 1.3, PassMethod="ExactDriftPass"),
+        "StrMPoleSymplectic4Pass": e.Multipole("M", 0.4, **multi, KickAngle=[1e-3, 2e-3]),
+        "quadrupole with fringe": e.Quadrupole("Q", 0.4, 1.2, FringeQuadEntrance=1),
+        "ExactMultipolePass": e.Multipole("M", 0.4, **multi, **exact, **quads),
+        "ThinMPolePass": e.ThinMultipole("M", **multi),
+        "BndMPoleSymplectic4Pass": e.Dipole("B", 1.1, 0.2, **bend, **gap, **quads),
+        "edge of method 2": e.Dipole("B", 1.1, 0.2, **bend, **gap, FringeBendEntrance=2),
+        "BndMPoleSymplectic4E2Pass": e.Dipole(
+            "B", 1.1, 0.2, **bend, **gap, PassMethod="BndMPoleSymplectic4E2Pass"
+        ),
+        "ExactSectorBendPass": e.Dipole(
+            "B", 1.1, 0.2, **bend, **quads, gK=0.01, FringeBendEntrance=1, FringeBendExit=1,
+            PassMethod="ExactSectorBendPass",
+        ),
+        "CorrectorPass": e.Corrector("C", 0.3, [1e-3, -2e-3]),
+        "SolenoidLinearPass": e.Element("S", Length=0.6, K=0.8, PassMethod="SolenoidLinearPass"),
+        "RFCavityPass": e.RFCavity("RF", 0.4, 1e6, 5e8, 100, 1e9, PassMethod="RFCavityPass"),
+        "Matrix66Pass": e.M66("M", R),
+        "shifted and rolled": e.Quadrupole(
+            "Q", 0.4, 1.2, T1=1e-4 * np.arange(6.0), T2=-1e-4 * np.arange(6.0), R1=R,
+            R2=np.linalg.inv(R),
+        ),
+    }  # fmt: skip
+
+
+def check_elements(at, names):
+    """Each element of `names` in one ring, with a marker after it, against pyAT element by
+    element: one program for all."""
+    z = particles(1000)
+    elements = at_elements(at)
+    for name in names:
+        lattice = at.Lattice([elements[name]], energy=1e9)
+        ours = np.asarray(rings.track(rings.from_at(lattice), z).z)
+        wanted = tracked_by_at(lattice, z)
+        assert np.abs(ours - wanted).max() < 1e-12, name
+        assert np.abs(ours - z).max() > 1e-6, name
+
+
+def test_elements_agree_with_pyat(at):
+    check_elements(at, ["BndMPoleSymplectic4Pass", "StrMPoleSymplectic4Pass", "RFCavityPass"])
+
+
+@pytest.mark.slow
+def test_all_elements_agree_with_pyat(at):
+    check_elements(at, at_elements(at))
+
+
+def test_a_lattice_agrees_with_pyat(at):
+    lattice = lattice_of(at, "hmba.mat", six=True)
+    z = particles(1000) * 0.1
+    assert (
+        np.abs(rings.track(rings.from_at(lattice), z).z - tracked_by_at(lattice, z)).max() < 1e-14
+    )
+
+
+LATTICES = ["dba.mat", "esrf.m", "thomx.m", "soleil.m", "australian_synchrotron.m", "err.mat"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("six", [False, True])
+@pytest.mark.parametrize("name", LATTICES)
+def test_all_lattices_agree_with_pyat(at, name, six):
+    lattice = lattice_of(at, name, six)
+    z = particles(100 if name == "err.mat" else 1000) * 0.1
+    turns = 3
+    ours = np.asarray(rings.track(rings.from_at(lattice), z, turns).z)
+    wanted = tracked_by_at(lattice, z, turns)
+    assert np.isfinite(wanted).all()
+    assert np.abs(ours - wanted).max() < turns * 1e-12
+
+
+def losses(at, lattice, z, turns):
+    r = to_at(z).copy(order="F")
+    *_, info = lattice.track(r, nturns=turns, refpts=None, in_place=True, losses=True)
+    theirs = info["loss_map"]
+    ours = rings.track(rings.from_at(lattice), z, turns)
+    lost = theirs["islost"]
+    both = np.asarray(ours.lost) == lost
+    turn = np.where(lost, theirs["turn"], -1) == np.asarray(ours.turn)
+    element = np.where(lost, theirs["elem"], -1) == np.asarray(ours.element)
+    return lost.mean(), (both & turn & element).mean()
+
+
+@pytest.mark.slow
+def test_losses_agree_with_pyat(at):
+    """At the limit of 1 m, and at apertures in the elements; same turn, same element."""
+    lattice = lattice_of(at, "hmba.mat")
+    z = particles(2000) * np.array([10, 1, 5, 1, 1, 10])
+    share, same = losses(at, lattice, z, 100)
+    assert 0.1 < share < 0.95
+    assert same > 0.999
+    for e in lattice:
+        if e.Length > 0.3:
+            e.EApertures = np.array([0.008, 0.006])
+        elif e.Length > 0.2:
+            e.RApertures = np.array([-0.01, 0.008, -0.005, 0.006])
+    share, same = losses(at, lattice, z, 100)
+    assert 0.1 < share < 0.99
+    assert same > 0.999
+
+
+def test_what_cannot_be_read_is_listed(at):
+    e = at.elements
+    lattice = at.Lattice(
+        [
+            e.Drift("D", 1.0),
+            e.Quadrupole("QR", 0.3, 1.0, PassMethod="StrMPoleSymplectic4RadPass"),
+            e.Dipole("BX", 1.0, 0.1, FringeBendEntrance=3),
+        ],
+        energy=1e9,
+    )
+    with pytest.raises(ValueError, match="2 of 3 elements have no counterpart") as error:
+        rings.from_at(lattice)
+    assert "1: QR (Quadrupole, StrMPoleSymplectic4RadPass): this pass method" in str(error.value)
+    assert "2: BX (Dipole, BndMPoleSymplectic4Pass): FringeBendEntrance = 3" in str(error.value)
+    assert "at.Lattice" in inspect.getdoc(rings.from_at)
+
+
+def test_the_symplectic_edge_is(at):
+    """pyAT's edge with a fringe field is not: its kick depends on δ, and ζ does not change."""
+    lattice = at.Lattice(
+        [at.elements.Dipole("B", 1.0, 0.2, FullGap=0.04, FringeInt1=0.5, FringeInt2=0.5)],
+        energy=1e9,
+    )
+    z = np.array([1e-3, 0, 5e-3, 0, 0, 1e-2])
+    corrected, theirs = (asymmetry(rings.from_at(lattice, symplectic=s), z) for s in (True, False))
+    assert corrected < 1e-14 < 1e-6 < theirs
