@@ -2,7 +2,6 @@
 
 from typing import Literal
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -24,9 +23,12 @@ def _moments(name, value):
 def _body(name, energy, parameters, state, observables, source, **known) -> Problem:
     """The problem of a rotation matrix; `state`: Euler's angles, π on the body's axes, and h."""
     angles, pi, h = state
-    with jax.ensure_compile_time_eval():  # also inside of jax.jit
-        R = rigid.rotation(*angles)
-        q0, p0 = np.array(R), np.array(rigid.momentum(R, pi, parameters["I"].value))
+    # As `rigid.rotation` and `rigid.momentum`, but in NumPy: making a problem starts no device.
+    (a, b, c), (x, y, z), I = np.cos(angles), np.sin(angles), parameters["I"].value  # noqa: E741
+    q0 = np.array([[a * c - x * b * z, -a * z - x * b * c, x * y],
+                   [x * c + a * b * z, a * b * c - x * z, -a * y],
+                   [y * z, y * c, b]])  # fmt: skip
+    p0 = q0 @ np.cross(np.eye(3), pi / I) * (np.sum(I) / 2 - I)
     start = Start(f"the {name.replace('_', ' ')} has a rotation matrix", (3, 3))
     known |= {"name": name, "q0": q0, "p0": p0, "h": h, "more": {"constraint": rigid.orthonormal}}
     return library_problem(energy, start, parameters, observables, source=source, **known)
@@ -90,11 +92,9 @@ def heavy_top(kind: Literal["lagrange", "kovalevskaya"] = "lagrange") -> Problem
     """
     lagrange = one_of("kind", kind, ("lagrange", "kovalevskaya")) == "lagrange"
     I = np.array([1.0, 1.0, 0.5])  # noqa: E741
-    centre, spin, integral = (
-        ([0.0, 0.0, 1.0], 2.5, axial_momentum)
-        if lagrange
-        else ([1.0, 0.0, 0.0], 0.6, kovalevskaya_integral)
-    )
+    centre, spin, integral = [1.0, 0.0, 0.0], 0.6, kovalevskaya_integral
+    if lagrange:
+        centre, spin, integral = [0.0, 0.0, 1.0], 2.5, axial_momentum
     weight = "weight times the centre of mass on the body's axes [energy]"
     return _body(
         "heavy_top", _top_energy,
