@@ -26,7 +26,7 @@ class Tracked(NamedTuple):
     - `z`: (x, px, y, py, ζ, δ) after the last turn, shape (…, 6), or after every m-th turn, shape
       (…, turns/m, 6); NaN after a loss.
     - `turn`, `element`: where a particle was lost, −1 if it was not, shape (…). `last`: its
-      coordinates behind that element, shape (…, 6), NaN if it was not lost.
+      coordinates there, shape (…, 6), NaN if it was not lost.
     """
 
     z: Array
