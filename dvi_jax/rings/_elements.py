@@ -74,23 +74,18 @@ def multipole(
     b: Iterable[float] = (0.0,),
     a: Iterable[float] = (0.0,),
     *,
-    slices: int = 10,
-    scheme: int = 4,
-    fringe: bool = False,
-    model: Model = "paraxial",
     kind: str = "multipole",
+    **how: Any,
 ) -> Element:
     """A straight magnet with the field Σ (b_n + i a_n)(x + i y)^n = (B_y + i B_x)/(Bρ).
 
     **Arguments** `b`, `a`: from n = 0 (dipole) [1/m^{n+1}]; MAD-X's k_n is n! b_n. Length zero: b
-    and a are integrated over the length. `slices`, `scheme`: number of slices, and order 2, 4 or 6
-    of the composition in each. `fringe`: with the hard edges of the quadrupole, or of all
-    multipoles if `model` is "exact".
+    and a are integrated over the length. `how`: ``slices=10``; ``scheme=4``, the order 2, 4 or 6
+    of the composition in each slice; ``model="paraxial"`` or "exact"; ``fringe=False``, whether it
+    has the hard edges of the quadrupole, or those of all multipoles if exact.
     """
     order, values = _field(name, b, a)
-    whole("slices", slices)
-    one_of("scheme", scheme, KICKS)
-    one_of("model", model, ("paraxial", "exact"))
+    slices, scheme, fringe, model = _options(**how)
     values["length"] = finite("length", length)
     if length == 0:
         return Element(name, kind, (Part("thin", order),), values)
@@ -128,26 +123,21 @@ def bend(
     edge_out: float = 0.0,
     fringe_in: float = 0.0,
     fringe_out: float = 0.0,
-    slices: int = 10,
-    scheme: int = 4,
-    fringe: bool = False,
-    model: Model = "paraxial",
+    **how: Any,
 ) -> Element:
     """A bend by `angle` [rad] along an arc of `length` [m]; `edge_in` = `edge_out` = angle/2 for a
     rectangular one.
 
     **Arguments** `b`, `a`: further field, as for `multipole`; b_0 is an error of the main field.
     `edge_in`, `edge_out`: angles of the pole faces [rad]. `fringe_in`, `fringe_out`: gap times
-    fringe field integral [m]. `fringe`: with the hard edges of the gradient. `model`: "paraxial",
-    or "exact" for the exact Hamiltonian, with the hard edges of the main field.
+    fringe field integral [m]. `how`: as for `multipole`; the exact model has the hard edges of the
+    main field.
 
     **Raises** `ValueError` for a length that is not positive.
     """
     positive("length of a bend", length)
     order, values = _field(name, b, a)
-    whole("slices", slices)
-    one_of("scheme", scheme, KICKS)
-    one_of("model", model, ("paraxial", "exact"))
+    slices, scheme, fringe, model = _options(**how)
     values |= {
         "length": length,
         "h": finite("angle", angle) / length,
@@ -220,3 +210,12 @@ def _field(name: str, b: Iterable[float], a: Iterable[float]) -> tuple[int, dict
             value = given[n] if n < len(given) else 0.0
             found[f"{key}{n}"] = finite(f"{key}{n} of element {name!r}", value)
     return order, found
+
+
+def _options(
+    slices: int = 10, scheme: int = 4, fringe: bool = False, model: Model = "paraxial"
+) -> tuple[int, int, bool, Model]:
+    """The options of a magnet in slices. **Raises** `ValueError` for an invalid one."""
+    one_of("scheme", scheme, KICKS)
+    one_of("model", model, ("paraxial", "exact"))
+    return whole("slices", slices), scheme, fringe, model

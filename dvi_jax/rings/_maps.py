@@ -40,10 +40,10 @@ class Part(NamedTuple):
 
 
 class Piece(NamedTuple):
-    """A map ``apply(z, par, turn, sign)``, with its inverse for sign −1, `count` times."""
+    """A map ``apply(z, par, turn, sign)``, with its inverse for sign −1, `times` times."""
 
     apply: Callable[[Particle, Parameters, Any, int], Particle]
-    count: int = 1
+    times: int = 1
 
 
 def forward(
@@ -55,7 +55,7 @@ def forward(
         def once(z, _, piece=piece):
             return piece.apply(z, par, turn, sign), None
 
-        z, _ = once(z, None) if piece.count == 1 else lax.scan(once, z, None, piece.count)
+        z, _ = once(z, None) if piece.times == 1 else lax.scan(once, z, None, piece.times)
     return z
 
 
@@ -83,7 +83,7 @@ def pull_back(
             return (z, cotangent, jax.tree.map(jnp.add, total, more)), None
 
         state, _ = (
-            once(state, None) if piece.count == 1 else lax.scan(once, state, None, piece.count)
+            once(state, None) if piece.times == 1 else lax.scan(once, state, None, piece.times)
         )
     return state
 

@@ -1,5 +1,6 @@
 """Rings from pyAT, and from the files that it reads: .mat, .m, .json, also those of Xsuite."""
 
+import dataclasses
 import importlib
 import math
 import os
@@ -7,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ._elements import C, Element, bend, cavity, corrector, drift, marker, multipole, solenoid
+from ._elements import C, Element, bend, cavity, corrector, drift, multipole, solenoid
 from ._maps import Part
 from ._ring import Ring
 
@@ -26,7 +27,9 @@ _WITHOUT_EFFECT = {
     "FringeQuadEntrance": (0, 1),
     "FringeQuadExit": (0, 1),
 }
-_NO_FIELD = ("Drift", "Marker", "Monitor", "")
+_BARE = ("RFCavityPass", "CavityPass", "AperturePass", "Matrix66Pass")
+"""Pass methods without apertures; only that of a matrix may be misaligned."""
+_FIELD_FREE = ("", "Drift", "Marker")
 
 
 def to_at(z: Any) -> np.ndarray:
@@ -93,39 +96,33 @@ def _element(e: Any, energy: float, period: float, edge: str) -> Element:
         if value not in allowed:
             raise ValueError(f"{name} = {value} is not supported")
     origin = getattr(e, "origin", "")
-    if (
-        e.PassMethod in ("IdentityPass", "DriftPass")
-        and origin not in _NO_FIELD
-        and not (type(e).__name__ not in ("Marker", "Drift"))
-    ):
+    if type(e).__name__ in ("Marker", "Drift") and origin not in _FIELD_FREE:
         raise ValueError(f"pyAT has no element for Xsuite's {origin}")
     make = _MAKERS.get(e.PassMethod)
     if make is None:
         raise ValueError("this pass method is not supported")
     element = make(e, energy, period, edge)
-    if element.kind != "aperture":
-        rectangle, ellipse = (getattr(e, f"{k}Apertures", None) for k in "RE")
-        acts = e.PassMethod not in ("IdentityPass", "RFCavityPass", "CavityPass")
-        if e.PassMethod == "IdentityPass" or acts:
-            element = element.inside(rectangle=rectangle, ellipse=ellipse)
-    return _transformed(element, e)
+    if e.PassMethod in _BARE:
+        return element
+    rectangle, ellipse = (getattr(e, f"{k}Apertures", None) for k in "RE")
+    return _transformed(element.inside(rectangle=rectangle, ellipse=ellipse), e)
+
+
+def _placement(e: Any) -> tuple[np.ndarray, ...]:
+    """R1, R1 T1, R2 and T2 in our order of coordinates."""
+    R1, R2 = (_ORDER @ getattr(e, n, np.eye(6)) @ _ORDER.T for n in ("R1", "R2"))
+    T1, T2 = (_ORDER @ getattr(e, n, np.zeros(6)) for n in ("T1", "T2"))
+    return R1, R1 @ T1, R2, T2
 
 
 def _transformed(element: Element, e: Any) -> Element:
-    """The element with R1, T1 before and R2, T2 after it."""
-    if e.PassMethod in ("RFCavityPass", "CavityPass", "AperturePass"):
+    """The element between the maps of its placement, if they are not the identity."""
+    values = _placement(e)
+    if all(np.array_equal(x, y) for x, y in zip(values, _placement(None), strict=True)):
         return element
-    R1, R2 = (getattr(e, n, np.eye(6)) for n in ("R1", "R2"))
-    T1, T2 = (getattr(e, n, np.zeros(6)) for n in ("T1", "T2"))
-    if all((np.eye(6) == R).all() for R in (R1, R2)) and not (np.any(T1) or np.any(T2)):
-        return element
-    values = {
-        "matrix_in": _ORDER @ R1 @ _ORDER.T,
-        "shift_in": _ORDER @ R1 @ T1,
-        "matrix_out": _ORDER @ R2 @ _ORDER.T,
-        "shift_out": _ORDER @ T2,
-    }
-    return element.within(Part("affine_in"), Part("affine_out"), **values)
+    names = "matrix_in", "shift_in", "matrix_out", "shift_out"
+    ends = Part("affine_in"), Part("affine_out")
+    return element.within(*ends, **dict(zip(names, values, strict=True)))
 
 
 def _field(e: Any, thin: bool = False) -> dict[str, Any]:
@@ -143,87 +140,73 @@ def _drift(e, energy, period, edge):
 
 
 def _marker(e, energy, period, edge):
-    element = marker(e.FamName, type(e).__name__.lower())
-    return Element(e.FamName, element.kind, (), {"length": e.Length})
+    return Element(e.FamName, type(e).__name__.lower(), (), {"length": e.Length})
+
+
+def _fringes(e: Any, exact: bool, b: np.ndarray) -> list[bool]:
+    """Whether it has a quadrupole fringe at its ends; a paraxial one needs a gradient."""
+    ends = [bool(getattr(e, f"FringeQuad{side}", 0)) for side in ("Entrance", "Exit")]
+    return ends if exact or (len(b) > 1 and b[1] != 0) else [False, False]
+
+
+def _without(element: Element, name: str, has: list[bool]) -> Element:
+    """The element without the parts of the ends at which it has none."""
+    missing = [f"{name}{s}" for s, there in zip(("_in", "_out"), has, strict=True) if not there]
+    parts = [p for p in element.parts if not p.name.endswith(tuple(missing) or ("-",))]
+    return dataclasses.replace(element, parts=tuple(parts))
 
 
 def _straight(e, energy, period, edge):
     if e.Length == 0:
         return _marker(e, energy, period, edge)
-    model = "exact" if e.PassMethod.startswith("Exact") else "paraxial"
-    kind = type(e).__name__.lower()
-    field = _field(e)
-    has = [bool(getattr(e, f"FringeQuad{side}", 0)) for side in ("Entrance", "Exit")]
-    # pyAT has no paraxial fringe of a magnet without gradient.
-    if model == "paraxial" and (len(field["b"]) < 2 or field["b"][1] == 0):
-        has = [False, False]
+    exact, field = e.PassMethod.startswith("Exact"), _field(e)
+    has = _fringes(e, exact, field["b"])
     element = multipole(
-        e.FamName, e.Length, **field, slices=e.NumIntSteps, fringe=any(has), model=model, kind=kind
-    )
+        e.FamName, e.Length, **field, slices=e.NumIntSteps, fringe=any(has),
+        model="exact" if exact else "paraxial", kind=type(e).__name__.lower(),
+    )  # fmt: skip
     return _without(element, "fringe", has)
 
 
-def _without(element: Element, name: str, has: list[bool]) -> Element:
-    """The element without the parts of the ends at which it has none."""
-    ends = ("_in", "_out")
-    missing = [f"{name}{end}" for end, there in zip(ends, has, strict=True) if not there]
-    parts = [p for p in element.parts if not any(p.name.endswith(m) for m in missing)]
-    return Element(element.name, element.kind, tuple(parts), element.values)
-
-
 def _bend(e, energy, period, edge):
-    gap = [
-        getattr(e, "FullGap", 0.0) * getattr(e, f"FringeInt{i}", 0.0)
-        * (getattr(e, f"FringeBend{side}", 1) != 0)
-        for i, side in ((1, "Entrance"), (2, "Exit"))
-    ]  # fmt: skip
-    exact = e.PassMethod.startswith("Exact")
-    if exact:
-        gap = [getattr(e, "gK", 0.0)] * 2
-    second = "E2" in e.PassMethod
-    field = _field(e)
-    has = [bool(getattr(e, f"FringeQuad{side}", 0)) for side in ("Entrance", "Exit")]
-    if not exact and (second or len(field["b"]) < 2 or field["b"][1] == 0):
-        has = [False, False]
+    exact, second, field = e.PassMethod.startswith("Exact"), "E2" in e.PassMethod, _field(e)
+    sides = (1, "Entrance"), (2, "Exit")
+    method = [getattr(e, f"FringeBend{side}", 1) for _, side in sides]
+    gap = getattr(e, "FullGap", 0.0)
+    gaps = [gap * getattr(e, f"FringeInt{i}", 0.0) * (m != 0 or second)
+            for m, (i, _) in zip(method, sides, strict=True)]  # fmt: skip
+    gaps = [getattr(e, "gK", 0.0)] * 2 if exact else gaps
+    has = [False, False] if second else _fringes(e, exact, field["b"])
     element = bend(
         e.FamName, e.Length, e.BendingAngle, **field, edge_in=e.EntranceAngle,
-        edge_out=e.ExitAngle, fringe_in=gap[0], fringe_out=gap[1], slices=e.NumIntSteps,
+        edge_out=e.ExitAngle, fringe_in=gaps[0], fringe_out=gaps[1], slices=e.NumIntSteps,
         fringe=any(has), model="exact" if exact else "paraxial",
     )  # fmt: skip
-    element = _without(element, "fringe" if not exact else "gradient_fringe", has)
+    element = _without(element, "gradient_fringe" if exact else "fringe", has)
     if exact:
-        has = [bool(getattr(e, f"FringeBend{side}", 1)) for side in ("Entrance", "Exit")]
-        return _without(element, "dipole_fringe", has)
-    names = {"bend": "second_order_bend"} if second else {}
-    prefix = "second_order_edge" if second else edge
-    names |= {"edge_in": f"{prefix}_in", "edge_out": f"{prefix}_out"}
-    methods = {
-        "edge_in": getattr(e, "FringeBendEntrance", 1),
-        "edge_out": getattr(e, "FringeBendExit", 1),
+        return _without(element, "dipole_fringe", [m != 0 for m in method])
+    edge = "second_order_edge" if second else edge
+    changed = {
+        "edge_in": {"name": f"{edge}_in", "scheme": method[0]},
+        "edge_out": {"name": f"{edge}_out", "scheme": method[1]},
+        **({"bend": {"name": "second_order_bend"}} if second else {}),
     }
-    parts = [
-        p._replace(name=names.get(p.name, p.name), scheme=methods.get(p.name, p.scheme))
-        for p in element.parts
-    ]
-    return Element(element.name, element.kind, tuple(parts), element.values)
+    parts = tuple(p._replace(**changed.get(p.name, {})) for p in element.parts)
+    return dataclasses.replace(element, parts=parts)
 
 
 def _cavity(e, energy, period, edge):
-    frequency, waves = e.Frequency, getattr(e, "HarmNumber", 0)
-    slip = 0.0
-    if e.PassMethod == "RFCavityPass":
-        slip = 2 * math.pi * (waves - frequency * period)
-    phase = getattr(e, "PhaseLag", 0.0)
-    lag = getattr(e, "TimeLag", 0.0)
-    return cavity(e.FamName, e.Length, e.Voltage / energy, frequency, lag, phase, slip)
+    by_turn = e.PassMethod == "RFCavityPass"
+    slip = 2 * math.pi * (e.HarmNumber - e.Frequency * period) if by_turn else 0.0
+    lag, phase = (getattr(e, name, 0.0) for name in ("TimeLag", "PhaseLag"))
+    return cavity(e.FamName, e.Length, e.Voltage / energy, e.Frequency, lag, phase, slip)
 
 
 def _matrix(e, energy, period, edge):
-    values = {"length": e.Length, "matrix_in": _ORDER @ e.M66 @ _ORDER.T, "shift_in": np.zeros(6)}
-    element = Element(e.FamName, "matrix", (Part("affine_in"),), values)
-    if not all((getattr(e, n, np.eye(6)) == np.eye(6)).all() for n in ("R1", "R2")):
-        raise ValueError("a rotation of a matrix is not supported")
-    return element
+    R1, T1, R2, T2 = _placement(e)
+    M = R2 @ _ORDER @ e.M66 @ _ORDER.T
+    values = {"length": e.Length, "matrix_in": M @ R1, "shift_in": M @ T1 + T2}
+    return Element(e.FamName, "matrix", (Part("affine_in"),), values)
 
 
 _MAKERS = {
