@@ -1,6 +1,7 @@
 """Rings: elements and tracking against pyAT, symplecticity, losses, gradients, bad input."""
 
 import inspect
+import json
 import warnings
 
 import jax
@@ -224,6 +225,8 @@ def test_errors(cell):
         rings.track(cell, np.zeros(4))
     with pytest.raises(ValueError, match="every must divide"):
         rings.track(cell, np.zeros(6), 10, every=3)
+    with pytest.raises(ValueError, match=r"GiB of memory.*a larger every"):
+        rings.track(cell, np.zeros((1000, 6)), 10**9, every=1)
     with pytest.raises(ValueError, match="length of a bend must be a positive"):
         rings.bend("B", 0.0, 0.1)
     with pytest.raises(TypeError, match=r"elements\[0\]"):
@@ -398,3 +401,23 @@ def test_the_symplectic_edge_is(at):
     z = np.array([1e-3, 0, 5e-3, 0, 0, 1e-2])
     corrected, theirs = (asymmetry(rings.from_at(lattice, symplectic=s), z) for s in (True, False))
     assert corrected < 1e-14 < 1e-6 < theirs
+
+
+def test_files_of_xsuite(at, tmp_path):
+    """Written by pyAT; an element that pyAT does not know is refused, with its place."""
+    lattice = lattice_of(at, "hmba.mat")
+    path = tmp_path / "ring.json"
+    at.save_xsuite(lattice, str(path))
+    z = particles(5) * 0.1
+    with warnings.catch_warnings(action="ignore"):
+        ring = rings.load(path)
+    np.testing.assert_array_equal(rings.track(ring, z).z, rings.track(rings.from_at(lattice), z).z)
+    content = json.loads(path.read_text())
+    content["elements"]["limit"] = {"__class__": "LimitEllipse", "a": 0.01, "b": 0.01}
+    content["element_names"].insert(5, "limit")
+    path.write_text(json.dumps(content))
+    with warnings.catch_warnings(action="ignore"), pytest.raises(ValueError) as error:
+        rings.load(path)
+    assert "5: limit (Marker, IdentityPass): pyAT has no element for Xsuite's LimitEllipse" in str(
+        error.value
+    )

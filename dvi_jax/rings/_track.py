@@ -15,6 +15,7 @@ import lanewise
 from lanewise.jaxapi import linear_map
 
 from .._checks import instance, whole
+from .._memory import results_memory
 from ._maps import Particle
 from ._ring import Ring
 from ._turn import flown, pulled, rows_of, start
@@ -63,8 +64,8 @@ def track(
     is NaN where the start is missed by more than 1e-6, after very long or chaotic motion; that of a
     lost particle is zero if the loss function does not use it.
 
-    **Raises** `ValueError` for z of another shape, an `every` that does not divide `turns`, and a
-    parameter that is not finite.
+    **Raises** `ValueError` for z of another shape, an `every` that does not divide `turns`, a
+    parameter that is not finite, and results that do not fit into memory.
 
     **Example**
 
@@ -85,6 +86,12 @@ def track(
         raise ValueError(
             "z must have six coordinates (x, px, y, py, ζ, δ) on its last axis, got an array of "
             f"shape {z.shape}."
+        )
+    needed, there = z.size * z.itemsize * (turns // every), results_memory()
+    if there is not None and needed > there:
+        raise ValueError(
+            f"the results need {needed / 2**30:.3g} GiB of memory, but only {there / 2**30:.3g} "
+            "GiB are available. Save fewer turns with a larger every, or track fewer particles."
         )
     shape = z.shape[:-1]
     epsilon = jnp.broadcast_to(jnp.asarray(epsilon, float), shape).reshape(-1)
