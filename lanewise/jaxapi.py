@@ -146,6 +146,9 @@ def primitive(
     """
     new = Primitive(name)
     new.multiple_results = multiple
+    # jax 0.12 would refuse functions in the parameters that contain, say, jnp.searchsorted; here
+    # they are traced again when they are lowered.
+    new.is_high = lambda *avals, **params: False
     new.def_impl(function)
     new.def_abstract_eval(lambda *avals, **params: _abstract(function, avals, params))
     mlir.register_lowering(new, _lowered(function, multiple))
