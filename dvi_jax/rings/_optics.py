@@ -14,7 +14,7 @@ import lanewise
 from lanewise.jaxapi import is_traced
 
 from .._checks import instance
-from ._maps import KICKS, Particle, forward
+from ._maps import KICKS, Particle, distinct, forward
 from ._parts import pieces_of
 from ._ring import Ring
 from ._turn import _perturbed, moved, rows_of
@@ -177,7 +177,8 @@ def maps(ring: Ring, epsilon: Any) -> tuple[Callable, Any]:
     kinds = [p._replace(order=order, **(thick if p.name in SLICED else {})) for p in parts]
     kicks = [np.divide([0.0, *KICKS.get(p.scheme, ()) * p.slices], p.slices) for p in parts]
     steps = np.stack([np.pad(k, (0, max(map(len, kicks)) + 1 - len(k))) for k in kicks])
-    which = np.asarray([sorted(set(kinds)).index(kind) for kind in kinds], np.int32)
+    all_kinds = distinct(kinds)
+    which = np.asarray([all_kinds.index(kind) for kind in kinds], np.int32)
 
     def apply(z, x):
         par, which, steps = x
@@ -196,7 +197,7 @@ def maps(ring: Ring, epsilon: Any) -> tuple[Callable, Any]:
                 return lambda z: lax.scan(kick, z, jnp.stack([steps[:-1], steps[1:]], 1))[0]
             return lambda z: forward(pieces, z, par, 0, 1)
 
-        return lax.switch(which, [through(kind) for kind in sorted(set(kinds))], z)
+        return lax.switch(which, [through(kind) for kind in all_kinds], z)
 
     # Recomputed in reverse mode: otherwise each part stores what every kind of part would need.
     return jax.checkpoint(apply), (rows, which[numbers["part"]], steps[numbers["part"]])
