@@ -22,6 +22,8 @@ from ._turn import _perturbed, moved, rows_of
 SLICED = "straight", "bend", "exact_straight", "exact_bend"
 _MOST, _AFTER, _NEAR = 15, 3, 1e-9
 """Newton iterations at most, and after the first correction that is smaller than the last one."""
+_EQUAL = 1e-12
+"""Difference of two eigenvalues that is round-off."""
 _UNSTABLE = 1e-11
 """Area in phase space of an eigenvector of length 1, below which it is round-off."""
 
@@ -110,7 +112,8 @@ def optics(
     chromaticity (otherwise NaN), which takes nearly half of the first call.
 
     The result can be differentiated twice, in every mode, by the parameters of the ring, dp and
-    epsilon: iterations after convergence carry the derivatives. Modes of equal tune have none.
+    epsilon: iterations after convergence carry the derivatives. For planes of equal tune, those with
+    respect to a coupling of the planes do not exist, and are wrong.
 
     **Raises** `ValueError` if Newton's method finds no closed orbit, and if the motion about it is
     unstable; under a transformation of JAX the result is NaN instead.
@@ -275,7 +278,7 @@ def analysis(
 def _modes(M: Array, dM: Array) -> tuple[Array, Array]:
     """Vectors v_k of the normal modes of M, v_k† S v_k = 2i, in the order of the planes, with a
     real component in their own plane, and the derivative of their tunes by δ; NaN if unstable."""
-    n, eye = len(M), np.eye(len(M))
+    n = len(M)
 
     def area(v):
         """Of x and px, y and py, …"""
@@ -295,7 +298,9 @@ def _modes(M: Array, dM: Array) -> tuple[Array, Array]:
     for _ in range(2):
         R = W @ M @ V
         r = jnp.diagonal(R)
-        X = jnp.where(eye, 0.0, R / (r[None] - r[:, None] + eye))
+        apart = r[None] - r[:, None]
+        same = jnp.abs(apart) < _EQUAL  # itself, or a mode of equal tune in another plane
+        X = jnp.where(same, 0.0, R / jnp.where(same, 1.0, apart))
         V, W = V + V @ X, W - X @ W + X @ X @ W
     V, W = V[:, : n // 2], W[: n // 2]
     change = jnp.sum(W @ dM * V.T, 1) / jnp.sum(W @ M * V.T, 1)
