@@ -7,6 +7,7 @@ from ._elements import (
     cavity as cavity,
     corrector as corrector,
     drift as drift,
+    lens as lens,
     marker as marker,
     multipole as multipole,
     octupole as octupole,

@@ -2,10 +2,10 @@
 
 import dataclasses
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Literal
 
-from .._checks import finite, one_of, positive, whole
+from .._checks import finite, instance, one_of, positive, whole
 from ._maps import KICKS, Part
 
 Model = Literal["paraxial", "exact"]
@@ -161,6 +161,21 @@ def corrector(name: str, length: float, kick_x: float, kick_y: float) -> Element
     """A dipole corrector with kicks of px and py [rad]."""
     values = {"length": length, "kick_x": kick_x, "kick_y": kick_y}
     return Element(name, "corrector", (Part("corrector"),), values)
+
+
+def lens(name: str, potential: Callable[..., Any], **values: float) -> Element:
+    """A thin lens of any potential: px − ∂V/∂x, py − ∂V/∂y with V = potential(x, y, par) [m].
+
+    **Arguments** `potential`: a function of JAX; elements with the same function share compiled
+    code. `values`: parameters of the element, which it reads as ``par["name"]``, and by which
+    results can be differentiated.
+
+    **Example** The kick in x of a McMillan map: ``rings.lens("M", lambda x, y, par: -par["g"] *
+    jnp.log(1 + x * x) / 2, g=1.6)``
+    """
+    values = {key: finite(f"{key} of lens {name!r}", value) for key, value in values.items()}
+    part = Part("lens", potential=instance("potential", potential, Callable, "a function"))
+    return Element(name, "lens", (part,), {**values, "length": 0.0})
 
 
 def solenoid(name: str, length: float, ks: float) -> Element:

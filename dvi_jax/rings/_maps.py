@@ -1,6 +1,6 @@
 """Maps of the parts of an element: drifts, kicks, edges, cavities, and their inverses."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -31,12 +31,18 @@ Parameters = Mapping[str, Any]
 
 class Part(NamedTuple):
     """A part of an element: the name of its map, the order of its field, the order of the scheme
-    in each of its slices."""
+    in each of its slices, the potential of a lens."""
 
     name: str
     order: int = 0
     scheme: int = 4
     slices: int = 1
+    potential: Callable[..., Any] | None = None
+
+
+def distinct(parts: Iterable[Part]) -> list[Part]:
+    """The different parts, sorted; lenses in the order in which they are given."""
+    return sorted(dict.fromkeys(parts), key=lambda part: part[:4])
 
 
 class Piece(NamedTuple):
@@ -208,6 +214,12 @@ def quadrupole_fringe(side: int) -> Piece:
 
 def thin_kick(z: Particle, par: Parameters, sign: int, order: int) -> Particle:
     return kick(z, sign, par, order)
+
+
+def lens(z: Particle, par: Parameters, sign: int, potential: Callable) -> Particle:
+    """The kick −∇V of a potential V(x, y, par)."""
+    of_x, of_y = jax.grad(potential, argnums=(0, 1))(z.x, z.y, par)
+    return z.moved(px=-sign * of_x, py=-sign * of_y)
 
 
 def cavity(z: Particle, par: Parameters, turn: Any, sign: int) -> Particle:

@@ -14,7 +14,7 @@ import lanewise
 from lanewise.jaxapi import is_traced
 
 from .._checks import instance
-from ._maps import KICKS, Particle, forward
+from ._maps import KICKS, Particle, distinct, forward
 from ._parts import pieces_of
 from ._ring import Ring
 from ._turn import moved, perturbed, rows_of
@@ -22,6 +22,8 @@ from ._turn import moved, perturbed, rows_of
 SLICED = "straight", "bend", "exact_straight", "exact_bend"
 _MOST, _AFTER, _NEAR = 15, 3, 1e-9
 """Newton iterations at most, and after the first correction that is smaller than the last one."""
+_EQUAL = 1e-12
+"""Difference of two eigenvalues that is round-off."""
 _UNSTABLE = 1e-11
 """Area in phase space of an eigenvector of length 1, below which it is round-off."""
 
@@ -110,7 +112,8 @@ def optics(
     chromaticity (otherwise NaN), which takes nearly half of the first call.
 
     The result can be differentiated twice, in every mode, by the parameters of the ring, dp and
-    epsilon: iterations after convergence carry the derivatives. Modes of equal tune have none.
+    epsilon: iterations after convergence carry the derivatives. For planes of equal tune, those with
+    respect to a coupling of the planes do not exist, and are wrong.
 
     **Raises** `ValueError` if Newton's method finds no closed orbit, and if the motion about it is
     unstable; under a transformation of JAX the result is NaN instead.
@@ -177,7 +180,8 @@ def maps(ring: Ring, epsilon: Any) -> tuple[Callable, Any]:
     kinds = [p._replace(order=order, **(thick if p.name in SLICED else {})) for p in parts]
     kicks = [np.divide([0.0, *KICKS.get(p.scheme, ()) * p.slices], p.slices) for p in parts]
     steps = np.stack([np.pad(k, (0, max(map(len, kicks)) + 1 - len(k))) for k in kicks])
-    which = np.asarray([sorted(set(kinds)).index(kind) for kind in kinds], np.int32)
+    all_kinds = distinct(kinds)
+    which = np.asarray([all_kinds.index(kind) for kind in kinds], np.int32)
 
     def apply(z, x):
         par, which, steps = x
@@ -196,7 +200,7 @@ def maps(ring: Ring, epsilon: Any) -> tuple[Callable, Any]:
                 return lambda z: lax.scan(kick, z, jnp.stack([steps[:-1], steps[1:]], 1))[0]
             return lambda z: forward(pieces, z, par, 0, 1)
 
-        return lax.switch(which, [through(kind) for kind in sorted(set(kinds))], z)
+        return lax.switch(which, [through(kind) for kind in all_kinds], z)
 
     # Recomputed in reverse mode: otherwise each part stores what every kind of part would need.
     return jax.checkpoint(apply), (rows, which[numbers["part"]], steps[numbers["part"]])
@@ -274,7 +278,7 @@ def analysis(
 def _modes(M: Array, dM: Array) -> tuple[Array, Array]:
     """Vectors v_k of the normal modes of M, v_k† S v_k = 2i, in the order of the planes, with a
     real component in their own plane, and the derivative of their tunes by δ; NaN if unstable."""
-    n, eye = len(M), np.eye(len(M))
+    n = len(M)
 
     def area(v):
         """Of x and px, y and py, …"""
@@ -294,7 +298,9 @@ def _modes(M: Array, dM: Array) -> tuple[Array, Array]:
     for _ in range(2):
         R = W @ M @ V
         r = jnp.diagonal(R)
-        X = jnp.where(eye, 0.0, R / (r[None] - r[:, None] + eye))
+        apart = r[None] - r[:, None]
+        same = jnp.abs(apart) < _EQUAL  # itself, or a mode of equal tune in another plane
+        X = jnp.where(same, 0.0, R / jnp.where(same, 1.0, apart))
         V, W = V + V @ X, W - X @ W + X @ X @ W
     V, W = V[:, : n // 2], W[: n // 2]
     change = jnp.sum(W @ dM * V.T, 1) / jnp.sum(W @ M * V.T, 1)

@@ -46,8 +46,12 @@ class Turn(Method):
     """One turn of a ring, of a system of `problem` with h = 1.
 
     A step is the map of `track`, exact up to round-off: the order says nothing about it. A particle
-    that is lost has the status `lost`. **Raises** `ValueError` for another system or step.
+    that is lost has the status `lost`. `losses`: False for the map without apertures and limits of
+    the coordinates, of which `bound_drift` can prove a bound. **Raises** `ValueError` for another
+    system or step.
     """
+
+    losses: bool = True
 
     order: ClassVar[int] = 1
     is_symmetric: ClassVar[bool] = False
@@ -56,9 +60,10 @@ class Turn(Method):
 
     def step(self, equations, interval, q0, p0):
         ring, epsilon = equations.args, equations.epsilon
-        begin = start(ring.particle(q0, p0))
-        turn = jnp.round(interval.t0)
-        flight = flown(ring.parts, ring.numbers, ring.rows, begin, turn, epsilon)
+        z, turn = ring.particle(q0, p0), jnp.round(interval.t0)
+        if not self.losses:
+            return _state(moved(ring.parts, ring.numbers, ring.rows, z, turn, epsilon), q0)
+        flight = flown(ring.parts, ring.numbers, ring.rows, start(z), turn, epsilon)
         q, p, info = _state(flight.z, q0)
         result = RESULTS.where(flight.element >= 0, RESULTS.lost, info.result)
         return q, p, info._replace(result=result)

@@ -14,7 +14,7 @@ from lanewise.jaxapi import is_traced
 
 from .._checks import instance, positive, whole
 from ._elements import C, Element
-from ._maps import Part
+from ._maps import Part, distinct
 
 Where = str | int | Sequence[int]
 
@@ -70,7 +70,7 @@ class Ring(eqx.Module):
             raise ValueError("elements must contain an element that acts on a particle, got none.")
         self.energy = positive("energy", energy)
         self.periods = whole("periods", periods)
-        parts = tuple(sorted({part for e in elements for part in e.parts}))
+        parts = tuple(distinct(part for e in elements for part in e.parts))
         number = {part: i for i, part in enumerate(parts)}
         rows = [(number[part], i) for i, e in enumerate(elements) for part in e.parts]
         self.program = Program(
