@@ -20,7 +20,7 @@ from ._maps import Particle
 from ._optics import SLICED, Optics, analysis, four, maps, optics
 from ._ring import Ring, Where
 from ._track import track
-from ._turn import flown, rows_of, start
+from ._turn import Passage, start
 
 Report = bool | Callable[[tuple[int, int]], None] | None
 """A function of (particles done, all particles of this round), or as in `dvi.integrate`."""
@@ -177,18 +177,19 @@ def momentum_aperture(
     orbit = optics(ring, chromatic=False).orbit
     first = np.repeat(np.arange(len(ring)) if where is None else ring.where(where), 2)
     side = positive("largest", largest) * np.resize([-1.0, 1.0], len(first))
-    begins, (rows, numbers) = orbit[first] + 1e-6 * _XY.sum(0)[None], rows_of(ring)
+    begins, passage = orbit[first] + 1e-6 * _XY.sum(0)[None], Passage.of(ring)
 
-    def one(numbers, rows, z, first):
+    def one(passage, z, first):
         def row(flight, x):
             number, par = jax.tree.map(lambda a: a[None], x)
-            after = flown(ring.program.parts, number, par, flight, 0, 0.0)
+            after = Passage(par, number, passage.parts).flown(flight, 0, 0.0)
             skips = x[0]["element"] < first
             return jax.tree.map(lambda a, b: jnp.where(skips, a, b), flight, after), None
 
-        return jnp.stack(lax.scan(row, start(Particle(*z)), (numbers, rows))[0].z)
+        xs = passage.numbers, passage.rows
+        return jnp.stack(lax.scan(row, start(Particle(*z)), xs)[0].z)
 
-    finish = jax.jit(jax.vmap(lambda z, first: lanewise.call(one, numbers, rows, z, first)))
+    finish = jax.jit(jax.vmap(lambda z, first: lanewise.call(one, passage, z, first)))
 
     def survive(r):
         z = jnp.einsum("rs,i->rsi", r * side[:, None], np.eye(6)[5]) + begins[:, None]

@@ -17,7 +17,7 @@ from .._checks import instance
 from ._maps import KICKS, Particle, distinct, forward
 from ._parts import pieces_of
 from ._ring import Ring
-from ._turn import moved, perturbed, rows_of
+from ._turn import Passage, perturbed
 
 SLICED = "straight", "bend", "exact_straight", "exact_bend"
 _MOST, _AFTER, _NEAR = 15, 3, 1e-9
@@ -64,13 +64,13 @@ def one_turn(ring: Ring, z: Any, epsilon: Any = 0.0) -> Array:
     differentiated repeatedly in every mode. See `track` for the coordinates.
     """
     instance("ring", ring, Ring, "a rings.Ring")
-    rows, numbers = rows_of(ring)
+    passage = Passage.of(ring)
 
-    def one(numbers, rows, z, epsilon):
-        return jnp.stack(moved(ring.program.parts, numbers, rows, Particle(*z), 0, epsilon))
+    def one(passage, z, epsilon):
+        return jnp.stack(passage.moved(Particle(*z), 0, epsilon))
 
     def of(z):
-        return lanewise.call(one, numbers, rows, z, jnp.asarray(epsilon, float))
+        return lanewise.call(one, passage, z, jnp.asarray(epsilon, float))
 
     z = _coordinates("z", z)
     return jax.vmap(of)(z.reshape(-1, 6)).reshape(z.shape) if z.ndim > 1 else of(z)
@@ -112,8 +112,8 @@ def optics(
     chromaticity (otherwise NaN), which takes nearly half of the first call.
 
     The result can be differentiated twice, in every mode, by the parameters of the ring, dp and
-    epsilon: iterations after convergence carry the derivatives. For planes of equal tune, those with
-    respect to a coupling of the planes do not exist, and are wrong.
+    epsilon: iterations after convergence carry the derivatives. For planes of equal tune those by
+    a coupling of the planes do not exist: do not use them.
 
     **Raises** `ValueError` if Newton's method finds no closed orbit, and if the motion about it is
     unstable; under a transformation of JAX the result is NaN instead.
@@ -174,8 +174,8 @@ def maps(ring: Ring, epsilon: Any) -> tuple[Callable, Any]:
     Less code is compiled than for tracking: magnets in slices of any number and scheme are one
     sequence of kicks, with drifts between them.
     """
-    rows, numbers = rows_of(ring)
-    parts, thick = ring.program.parts, {"scheme": 2, "slices": 1}
+    passage = Passage.of(ring)
+    parts, thick = passage.parts, {"scheme": 2, "slices": 1}
     order = max(p.order for p in parts)
     kinds = [p._replace(order=order, **(thick if p.name in SLICED else {})) for p in parts]
     kicks = [np.divide([0.0, *KICKS.get(p.scheme, ()) * p.slices], p.slices) for p in parts]
@@ -202,8 +202,9 @@ def maps(ring: Ring, epsilon: Any) -> tuple[Callable, Any]:
 
         return lax.switch(which, [through(kind) for kind in all_kinds], z)
 
+    number = passage.numbers["part"]
     # Recomputed in reverse mode: otherwise each part stores what every kind of part would need.
-    return jax.checkpoint(apply), (rows, which[numbers["part"]], steps[numbers["part"]])
+    return jax.checkpoint(apply), (passage.rows, which[number], steps[number])
 
 
 @eqx.filter_jit

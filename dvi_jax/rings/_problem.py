@@ -13,26 +13,24 @@ from .._results import RESULTS
 from .._step import judge, no_solve
 from .._system import System
 from ..methods import Method
-from ._maps import Part, Particle
+from ._maps import Particle
 from ._ring import Ring
-from ._turn import flown, moved, rows_of, start
+from ._turn import Passage, start
 
 Planes = Literal["x", "xy", "xyz"]
 
 
 class Packed(eqx.Module):
-    """The parameters of a ring in the order of passage, as `args` of a run."""
+    """The parts of a ring in the order of passage, and δ where it does not change: `args`."""
 
-    rows: dict[str, Array]
-    numbers: dict[str, Array]
+    passage: Passage
     delta: Array
-    parts: tuple[Part, ...] = eqx.field(static=True)
 
     @property
     def ends(self) -> Array:
         """s behind each row [m]; a row of an element ends where the element does."""
-        first = jnp.diff(self.numbers["element"], prepend=-1) > 0
-        return jnp.cumsum(jnp.where(first, self.rows["length"], 0.0))
+        first = jnp.diff(self.passage.numbers["element"], prepend=-1) > 0
+        return jnp.cumsum(jnp.where(first, self.passage.rows["length"], 0.0))
 
     def particle(self, q: Array, p: Array) -> Particle:
         """The particle of a state, of which some planes may be missing."""
@@ -51,7 +49,7 @@ class Turn(Method):
     system or step.
     """
 
-    losses: bool = True
+    losses: bool = eqx.field(static=True, default=True)
 
     order: ClassVar[int] = 1
     is_symmetric: ClassVar[bool] = False
@@ -62,8 +60,8 @@ class Turn(Method):
         ring, epsilon = equations.args, equations.epsilon
         z, turn = ring.particle(q0, p0), jnp.round(interval.t0)
         if not self.losses:
-            return _state(moved(ring.parts, ring.numbers, ring.rows, z, turn, epsilon), q0)
-        flight = flown(ring.parts, ring.numbers, ring.rows, start(z), turn, epsilon)
+            return _state(ring.passage.moved(z, turn, epsilon), q0)
+        flight = ring.passage.flown(start(z), turn, epsilon)
         q, p, info = _state(flight.z, q0)
         result = RESULTS.where(flight.element >= 0, RESULTS.lost, info.result)
         return q, p, info._replace(result=result)
@@ -71,7 +69,7 @@ class Turn(Method):
     def inverse(self, equations, interval, q1, p1):
         ring, epsilon = equations.args, equations.epsilon
         turn, z = jnp.round(interval.t0), ring.particle(q1, p1)
-        return _state(moved(ring.parts, ring.numbers, ring.rows, z, turn, epsilon, -1), q1)
+        return _state(ring.passage.moved(z, turn, epsilon, -1), q1)
 
     def needs_no_solve(self, equations, interval, q) -> bool:
         return True
@@ -106,9 +104,12 @@ class _Along(eqx.Module):
         ends = args.ends
         z = args.particle(q0, p1)
         row = jnp.searchsorted(ends, (t0 - jnp.floor(t0)) * ends[-1], side="right")
-        element = args.numbers["element"]
+        element = args.passage.numbers["element"]
         row = jnp.searchsorted(element, element[row], side="right") - 1
-        par = {n: lax.dynamic_index_in_dim(c, row, keepdims=False) for n, c in args.rows.items()}
+        par = {
+            n: lax.dynamic_index_in_dim(c, row, keepdims=False)
+            for n, c in args.passage.rows.items()
+        }
         free = (z.px**2 + z.py**2) / (2 * (1 + z.delta))
         h = par.get("h", 0.0)
         bent = h * z.x * (h * z.x / 2 - z.delta)
@@ -151,9 +152,8 @@ def problem(ring: Ring, planes: Planes = "xyz", delta: Any = 0.0) -> RingProblem
     """
     instance("ring", ring, Ring, "a rings.Ring")
     one_of("planes", planes, ("x", "xy", "xyz"))
-    rows, numbers = rows_of(ring)
-    numbers = jax.tree.map(jnp.asarray, numbers)
-    args = Packed(rows, numbers, jnp.asarray(delta, float), ring.program.parts)
+    passage = jax.tree.map(jnp.asarray, Passage.of(ring))
+    args = Packed(passage, jnp.asarray(delta, float))
     perturbation = _Along("ε ") if ring.extra else None
     zero = jnp.zeros(len(planes))
     return RingProblem(System(_Along(), perturbation=perturbation), zero, zero, 1.0, args)

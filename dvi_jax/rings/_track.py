@@ -18,7 +18,7 @@ from .._checks import instance, whole
 from .._memory import results_memory
 from ._maps import Particle
 from ._ring import Ring
-from ._turn import flown, pulled, rows_of, start
+from ._turn import Passage, start
 
 
 class Tracked(NamedTuple):
@@ -110,13 +110,14 @@ def _batched(function, *on):
 @eqx.filter_jit
 def _tracked(ring: Ring, z: Array, epsilon: Array, counts: tuple[int, int, int]):
     blocks, every, first = counts
-    rows, numbers = rows_of(ring)
-    parts = ring.program.parts
+    passage = Passage.of(ring)
 
     def forward(numbers, rows, z, epsilon):
+        along = Passage(rows, numbers, passage.parts)
+
         def one(state, _):
             k, flight = state
-            return (k + 1, flown(parts, numbers, rows, flight, k, epsilon)), None
+            return (k + 1, along.flown(flight, k, epsilon)), None
 
         def block(state, _):
             (k, flight), _ = lax.scan(one, state, None, every)
@@ -128,7 +129,7 @@ def _tracked(ring: Ring, z: Array, epsilon: Array, counts: tuple[int, int, int])
 
     @jax.custom_jvp
     def tracked(rows, z, epsilon):
-        return _batched(forward, False, False, True, True)(numbers, rows, z, epsilon)
+        return _batched(forward, False, False, True, True)(passage.numbers, rows, z, epsilon)
 
     @functools.partial(tracked.defjvp, symbolic_zeros=True)
     def _(primals, tangents):
@@ -144,25 +145,25 @@ def _tracked(ring: Ring, z: Array, epsilon: Array, counts: tuple[int, int, int])
 
             axes = (None, (None, 0, 0), (None, 0, 0))
             return jax.vmap(functools.partial(lanewise.call, along), axes)(
-                numbers, residuals[0], change
+                passage.numbers, residuals[0], change
             )
 
         def pull(residuals, cotangent):
             primals, saved = residuals
-            return _pulled(parts, numbers, primals, saved, cotangent, counts, moves)
+            return _pulled(passage, primals, saved, cotangent, counts, moves)
 
         moved = linear_map(push, pull, push, (primals, saved), change)
         none = [np.zeros(x.shape, jax.dtypes.float0) for x in losses[:2]]
         return (saved, losses), (moved, (*none, jnp.zeros_like(losses[2])))
 
-    saved, losses = tracked(rows, z, epsilon)
+    saved, losses = tracked(passage.rows, z, epsilon)
     return saved, *losses
 
 
 _MISSED = 1e-6
 
 
-def _pulled(parts, numbers, primals, saved, cotangent, counts, moves):
+def _pulled(passage, primals, saved, cotangent, counts, moves):
     """The cotangents of rows, z and ε: all particles backwards, turn by turn."""
     rows, z0, epsilon = primals
     blocks, every, first = counts
@@ -171,7 +172,8 @@ def _pulled(parts, numbers, primals, saved, cotangent, counts, moves):
     moving = sorted({n.removeprefix("ε ") for n in moved} | set(by_epsilon))
 
     def one_turn(numbers, rows, z, c, k, epsilon):
-        z, c, found = pulled(parts, numbers, rows, moving, Particle(*z), Particle(*c), k, epsilon)
+        along = Passage(rows, numbers, passage.parts)
+        z, c, found = along.pulled(moving, Particle(*z), Particle(*c), k, epsilon)
         of_rows = {n: epsilon * found[n[2:]] if n.startswith("ε ") else found[n] for n in moved}
         of_epsilon = [jnp.sum(found[n] * rows[f"ε {n}"]) for n in by_epsilon]
         return jnp.stack(z), jnp.stack(c), of_rows, sum(of_epsilon, jnp.zeros(()))
@@ -189,7 +191,7 @@ def _pulled(parts, numbers, primals, saved, cotangent, counts, moves):
 
         def undo(_, state):
             k, z, c, of_rows, of_epsilon = state
-            z, c, found, by_epsilon = turn_back(numbers, rows, z, c, k, epsilon)
+            z, c, found, by_epsilon = turn_back(passage.numbers, rows, z, c, k, epsilon)
             of_rows = jax.tree.map(lambda a, b: a + jnp.sum(b, 0), of_rows, found)
             return k - 1, z, c, of_rows, of_epsilon + by_epsilon
 

@@ -4,6 +4,7 @@ import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -61,85 +62,81 @@ def _noted(flight: Flight, z: Particle, passes: Any, number: Rows, turn: Any) ->
     return lax.cond(lanewise.on_any(is_lost), note, lambda: flight._replace(z=z))
 
 
-def rows_of(ring: Ring, first: int = 0, last: int | None = None) -> tuple[Rows, Rows]:
-    """The parameters of the parts of the elements `first` … `last` − 1, and the numbers of the
-    parts and of the elements, with whether an element ends there."""
-    last = len(ring) if last is None else last
-    which = [row for row in ring.program.rows if first <= row[1] < last]
-    part, element = np.asarray(which, np.int32).reshape(-1, 2).T
-    rows = {name: column[element] for name, column in ring.columns.items()}
-    rows |= {f"ε {name}": column[element] for name, column in ring.extra.items()}
-    ends = np.append(element[1:] != element[:-1], True)
-    return rows, {"part": part, "element": element, "ends": ends}
+class Passage(eqx.Module):
+    """The parts of the elements of a ring in the order of passage.
+
+    - `rows`: the parameters of each part; ``"ε b1"`` is what ε times is added to ``"b1"``.
+    - `numbers`: of each part in `parts`, and of its element; whether the element ends there.
+    """
+
+    rows: Rows
+    numbers: Rows
+    parts: tuple[Part, ...] = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, ring: Ring) -> "Passage":
+        part, element = np.asarray(ring.program.rows, np.int32).T
+        rows = {name: column[element] for name, column in ring.columns.items()}
+        rows |= {f"ε {name}": column[element] for name, column in ring.extra.items()}
+        ends = np.append(element[1:] != element[:-1], True)
+        return cls(rows, {"part": part, "element": element, "ends": ends}, ring.program.parts)
+
+    def moved(self, z: Particle, turn: Any, epsilon: Any, sign: int = 1) -> Particle:
+        """The particle after all parts, or before them for sign −1; without apertures."""
+
+        def row(z, x):
+            number, par = x
+            par = perturbed(par, epsilon)
+
+            def through(part):
+                return lambda z: forward(pieces_of(part), z, par, turn, sign)
+
+            return lax.switch(number["part"], [through(p) for p in self.parts], z), None
+
+        return lax.scan(row, z, (self.numbers, self.rows), reverse=sign < 0)[0]
+
+    def flown(self, flight: Flight, turn: Any, epsilon: Any) -> Flight:
+        """The flight after all parts, with losses. A particle that is lost becomes NaN."""
+
+        def row(flight, x):
+            number, par = x
+            par = perturbed(par, epsilon)
+
+            def through(part):
+                inside = APERTURES.get(part.name)
+                if inside is not None:
+                    return lambda z: (z, inside(z, par))
+                return lambda z: (forward(pieces_of(part), z, par, turn, 1), jnp.asarray(True))
+
+            maps = [through(part) for part in self.parts]
+            z, passes = lax.switch(number["part"], maps, flight.z)
+            return _noted(flight, z, passes, number, turn), None
+
+        return lax.scan(row, flight, (self.numbers, self.rows))[0]
+
+    def pulled(
+        self, moving: Sequence[str], z: Particle, cotangent: Particle, turn: Any, epsilon: Any
+    ) -> tuple[Particle, Particle, Rows]:
+        """The particle before all parts and its cotangent, from those after them; and the
+        cotangents of the parameters `moving`, one for each part."""
+
+        def row(state, x):
+            number, par = x
+            par = perturbed(par, epsilon)
+            known = {name: par[name] for name in moving}
+
+            def back(part):
+                return lambda z, c: pull_back(pieces_of(part), z, c, par, known, turn)
+
+            z, cotangent, found = lax.switch(number["part"], [back(p) for p in self.parts], *state)
+            return (z, cotangent), found
+
+        begin, xs = (z, cotangent), (self.numbers, self.rows)
+        (z, cotangent), found = lax.scan(row, begin, xs, reverse=True)
+        return z, cotangent, found
 
 
 def perturbed(par: Rows, epsilon: Any) -> Rows:
     """The parameters of a part, with what ε is multiplied by added."""
     extra = {name[2:]: value for name, value in par.items() if name.startswith("ε ")}
     return {**par, **{name: par[name] + epsilon * value for name, value in extra.items()}}
-
-
-def moved(
-    parts: Sequence[Part], numbers: Rows, rows: Rows, z: Particle, turn: Any, epsilon: Any, sign=1
-) -> Particle:
-    """The particle after the parts in `rows`, or before them for sign −1; without apertures."""
-
-    def row(z, x):
-        number, par = x
-        par = perturbed(par, epsilon)
-
-        def through(part):
-            return lambda z: forward(pieces_of(part), z, par, turn, sign)
-
-        return lax.switch(number["part"], [through(p) for p in parts], z), None
-
-    return lax.scan(row, z, (numbers, rows), reverse=sign < 0)[0]
-
-
-def flown(
-    parts: Sequence[Part], numbers: Rows, rows: Rows, flight: Flight, turn: Any, epsilon: Any
-) -> Flight:
-    """The flight after the parts in `rows`, with losses. A particle that is lost becomes NaN."""
-
-    def row(flight, x):
-        number, par = x
-        par = perturbed(par, epsilon)
-
-        def through(part):
-            inside = APERTURES.get(part.name)
-            if inside is not None:
-                return lambda z: (z, inside(z, par))
-            return lambda z: (forward(pieces_of(part), z, par, turn, 1), jnp.asarray(True))
-
-        z, passes = lax.switch(number["part"], [through(p) for p in parts], flight.z)
-        return _noted(flight, z, passes, number, turn), None
-
-    return lax.scan(row, flight, (numbers, rows))[0]
-
-
-def pulled(
-    parts: Sequence[Part],
-    numbers: Rows,
-    rows: Rows,
-    moving: Sequence[str],
-    z: Particle,
-    cotangent: Particle,
-    turn: Any,
-    epsilon: Any,
-) -> tuple[Particle, Particle, Rows]:
-    """The particle before the parts in `rows` and its cotangent, from those after them; and the
-    cotangents of the parameters `moving`, one for each part."""
-
-    def row(state, x):
-        number, par = x
-        par = perturbed(par, epsilon)
-        known = {name: par[name] for name in moving}
-
-        def back(part):
-            return lambda z, c: pull_back(pieces_of(part), z, c, par, known, turn)
-
-        z, cotangent, found = lax.switch(number["part"], [back(p) for p in parts], *state)
-        return (z, cotangent), found
-
-    (z, cotangent), found = lax.scan(row, (z, cotangent), (numbers, rows), reverse=True)
-    return z, cotangent, found
