@@ -56,6 +56,7 @@ def test_fodo_cell_has_the_tunes_and_beta_functions_of_its_matrix():
     close(found.gamma, np.ones(6), 1e-13)
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_finite_differences():
     def numbers(k, dp=0.002, ring=None):
         found = rings.optics(cell(b2=3.0, angle=0.2).set("QF", b1=k), dp)
@@ -122,6 +123,7 @@ def test_unstable_motion_and_missing_orbits_are_errors():
         rings.optics([rings.drift("D", 1.0)])
 
 
+@pytest.mark.slow
 def test_detuning_of_an_octupole_is_the_formula_and_scales_with_it():
     b3 = 50.0
     found = rings.detuning(cell(b3=b3), action=1e-9)

@@ -67,7 +67,7 @@ _MAPS: dict[str, Callable[[Part], list[Piece]]] = {
     "exact_bend": lambda p: sliced(exact_bend, kick, p),
     "second_order_bend": second_order_bend,
     "thin": lambda p: _plain(functools.partial(thin_kick, order=p.order)),
-    "lens": lambda p: _plain(functools.partial(lens, potential=p.potential)),
+    "lens": lambda p: _plain(functools.partial(lens, potential=p.potential)),  # pyright: ignore[reportArgumentType]
     "edge_in": lambda p: [edge("in", True, p.scheme)],
     "edge_out": lambda p: [edge("out", True, p.scheme)],
     "at_edge_in": lambda p: [edge("in", False, p.scheme)],
