@@ -112,8 +112,8 @@ def optics(
     chromaticity (otherwise NaN), which takes nearly half of the first call.
 
     The result can be differentiated twice, in every mode, by the parameters of the ring, dp and
-    epsilon: iterations after convergence carry the derivatives. For planes of equal tune, those with
-    respect to a coupling of the planes do not exist, and are wrong.
+    epsilon: iterations after convergence carry the derivatives. For planes of equal tune those by
+    a coupling of the planes do not exist, and are wrong.
 
     **Raises** `ValueError` if Newton's method finds no closed orbit, and if the motion about it is
     unstable; under a transformation of JAX the result is NaN instead.
