@@ -95,8 +95,9 @@ def match(tunes=(0.78, 0.64), beta=8.0, chromaticity=(0.0, 0.0)):
     ring = with_strengths(one, found.value[:4], 100 * found.value[4:])
     o = rings.optics(ring)
     print(f"(a) {int(found.stats['num_steps'])} steps, {time.perf_counter() - began:.1f} s")
-    print("    strengths " + ", ".join(f"{n} {k:.4f}" for n, k in zip(FAMILIES, found.value)), end="")
-    print(f" 1/m², SF {100 * found.value[4]:.2f}, SD {100 * found.value[5]:.2f} 1/m³")
+    names = ", ".join(f"{n} {k:.4f}" for n, k in zip(FAMILIES, found.value[:4], strict=True))
+    sextupoles = 100 * found.value[4:]
+    print(f"    {names} 1/m², SF {sextupoles[0]:.2f}, SD {sextupoles[1]:.2f} 1/m³")
     print(f"    tunes {o.tune}, β_x {o.beta[0, 0]:.6f} m, D {o.dispersion[0, 0]:.1e} m, "
           f"chromaticities {o.chromaticity}")  # fmt: skip
     print(f"    largest residual: {jnp.max(jnp.abs(missed(found.value))):.1e}")
@@ -196,12 +197,26 @@ def loco(ring, out, realisations=20, kick=KICK):
     off = np.asarray([f.params["errors"] for f in fits]) - true["errors"]
     sigmas = np.asarray([f.sigma[: off.shape[1]] for f in fits])
     pulls, chi2 = off / sigmas, [f.reduced_chi2 for f in fits]
-    print(f"    relative errors of quadrupoles: rms {np.std(true['errors']):.1e}, after the fit "
-          f"{np.std(off):.1e}; standard errors {sigmas.min():.1e} to {sigmas.max():.1e}")  # fmt: skip
-    print(f"    reduced χ²: mean {np.mean(chi2):.4f}, expected 1 ± "
-          f"{np.sqrt(2 / (exact.size - 120) / realisations):.4f}")  # fmt: skip
-    print(f"    {pulls.size} pulls: mean {pulls.mean():+.3f}, standard deviation {pulls.std():.3f}, "
-          f"{100 * np.mean(np.abs(pulls) < 1):.1f} % within 1 (68.3 % expected)")  # fmt: skip
+    before, after = np.std(true["errors"]), np.std(off)
+    print(
+        f"    relative errors of quadrupoles: rms {before:.1e}, after the fit {after:.1e}; "
+        f"standard errors {sigmas.min():.1e} to {sigmas.max():.1e}"
+    )
+    spread = np.sqrt(2 / (exact.size - 120) / realisations)
+    print(f"    reduced χ²: mean {np.mean(chi2):.4f}, expected 1 ± {spread:.4f}")
+    print(
+        f"    {pulls.size} pulls: mean {pulls.mean():+.3f}, standard deviation {pulls.std():.3f}, "
+        f"{100 * np.mean(np.abs(pulls) < 1):.1f} % within 1 (68.3 % expected)"
+    )
+    # The pulls of one fit are correlated; these combinations of them are independent.
+    free = [
+        np.linalg.solve(np.linalg.cholesky(np.asarray(f.covariance)[: len(x), : len(x)]), x)
+        for f, x in zip(fits, off, strict=True)
+    ]
+    print(
+        f"    uncorrelated combinations: mean {np.mean(free):+.3f} ± {np.size(free) ** -0.5:.3f}, "
+        f"standard deviation {np.std(free):.3f} ± {(2 * np.size(free)) ** -0.5:.3f}"
+    )
     if out is not None:
         draw_loco(true["errors"], off[0] + true["errors"], sigmas[0], pulls, out)
     return pulls
@@ -230,10 +245,10 @@ def draw_loco(true, found, sigma, pulls, out):
 
 PASSAGES, TURNS = 128, 512
 """Passages of a cell in the proxy; turns of the ring for the dynamic aperture."""
-LARGEST = 0.04, 0.02
+LARGEST = 0.08, 0.04
 """Ends (x, y) of the rays of the dynamic aperture [m]."""
 ANGLES = np.linspace(0, np.pi, 13)
-SCALE = 50.0
+SCALE = 2.0
 
 
 def with_harmonic(ring, s):
@@ -272,8 +287,8 @@ def descend(one):
         )
         rms = [float(jnp.sqrt(jnp.mean(changes(x) ** 2) * PASSAGES)) for x in (s, found.value)]
         print(f"    amplitude {1e3 * amplitude * aperture[0, 0]:.1f}, "
-              f"{1e3 * amplitude * aperture[6, 1]:.1f} mm: rms change of J/(J_x + J_y) {rms[0]:.4f} → "
-              f"{rms[1]:.4f}, S1, S2 = {SCALE * found.value} 1/m³")  # fmt: skip
+              f"{1e3 * amplitude * aperture[6, 1]:.1f} mm: rms change of J/(J_x + J_y) "
+              f"{rms[0]:.4f} → {rms[1]:.4f}, S1, S2 = {SCALE * found.value} 1/m³")  # fmt: skip
         s = found.value
     return s
 
@@ -323,7 +338,9 @@ def aperture(one, ring, out, seeds=6):
         off = [round(area(reached(r, dp)), 1) for dp in (-0.02, 0.02)]
         print(f"    {name}: area {off} mm² at δ = −2 %, 2 % without errors")
     ratios = [area(b) / area(a) for a, b in zip(found["before"], found["after"], strict=True)]
-    print(f"    after/before: {ratios[0]:.2f} without errors, {np.round(ratios[1:], 2)} with errors")
+    print(
+        f"    after/before: {ratios[0]:.2f} without errors, {np.round(ratios[1:], 2)} with errors"
+    )
     print(f"    {time.perf_counter() - began:.1f} s in all")
     if out is not None:
         draw_aperture(found, out)
@@ -336,7 +353,9 @@ def draw_aperture(found, out):
         figure, axes = plt.subplots(figsize=(6.5, 4))
         for (name, many), colour in zip(found.items(), plot.COLOURS, strict=False):
             for i, xy in enumerate(many):
-                label = f"{name}, without errors" if i == 0 else f"{name}, errors" if i == 1 else None
+                label = (
+                    f"{name}, without errors" if i == 0 else f"{name}, errors" if i == 1 else None
+                )
                 axes.plot(*(1e3 * xy.T), color=colour, lw=2 if i == 0 else 0.7,
                           ls="-" if i == 0 else "--", label=label)  # fmt: skip
         axes.set(xlabel="x [mm]", ylabel="y [mm]", ylim=(0, None))
