@@ -30,8 +30,7 @@ def twiss(ring: Any, optics: Any, title: str = "", ax: Any = None) -> Any:
     s, orbit, beta, alpha, D = (
         np.asarray(getattr(optics, n)) for n in ("s", "orbit", "beta", "alpha", "dispersion")
     )
-    n = len(ring) + 1
-    check_shapes(len(s) == n, f"optics must be those of this ring, at {n} places", s=s)
+    check_shapes(len(s) == len(ring) + 1, "optics must be those of this ring", s=s)
     p = 1 + orbit[:, 5]
     layout, what = {"height_ratios": [5, 1], "sharex": True}, "for functions and for magnets"
     (upper, lower), new = stack(ax, [["functions"], ["magnets"]], what, (7.0, 4.4), **layout)
@@ -96,6 +95,7 @@ def tune_map(x: Any, y: Any, found: Any, order: int = 4, title: str = "", ax: An
     frequency_map(*at, names=("x [mm]", "y [mm]"), title=title, ax=axes[0], **words)
     lines = _resonances(Q[np.isfinite(D)], order)
     frequency_map(Q[..., 0], Q[..., 1], D, lines, names=names, ax=axes[1], **words)
+    axes[1].locator_params(axis="x", nbins=5)
     return np.asarray(axes, object)
 
 
