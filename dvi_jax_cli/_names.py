@@ -40,6 +40,7 @@ EXTRAS = {
     "proof": ("flint",),
     "ephemeris": ("jplephem", "skyfield_data"),
     "stellarator": ("qsc",),
+    "rings": ("at",),
     "interop": ("astropy", "diffrax", "rebound", "scipy"),
 }
 """Extra of the package → modules that it brings."""

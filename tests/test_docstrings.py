@@ -16,18 +16,31 @@ import numpy as np
 import pytest
 
 import dvi_jax as dvi
-from dvi_jax import _namespaces, plot, systems
+from dvi_jax import _namespaces, plot, rings, systems
 
 sys.path.append(str(Path(__file__).parents[1] / "docs/_ext"))
 import usage
 
-KNOWN = {"jax": jax, "jnp": jnp, "np": np, "dvi": dvi, "systems": systems, "plot": plot}
+KNOWN = {
+    "jax": jax,
+    "jnp": jnp,
+    "np": np,
+    "dvi": dvi,
+    "systems": systems,
+    "plot": plot,
+    "rings": rings,
+}
 PAGE = usage.page()
 
 DOCSTRINGS = {
     f"dvi.{name}": usage.BLOCK.findall(inspect.getdoc(getattr(dvi, name)) or "")
     for name in _namespaces.names()
     if inspect.isclass(getattr(dvi, name)) or inspect.isfunction(getattr(dvi, name))
+}
+DOCSTRINGS |= {
+    f"rings.{name}": usage.BLOCK.findall(inspect.getdoc(thing) or "")
+    for name, thing in vars(rings).items()
+    if inspect.isclass(thing) or inspect.isfunction(thing)
 }
 DOCSTRINGS = {name: blocks for name, blocks in DOCSTRINGS.items() if blocks}
 
@@ -157,7 +170,9 @@ def test_the_page_has_each_name_once_and_no_others(entries):
     assert set(listed) - set(entries) == {"systems", "plot"}
     for name, origin in PAGE.origins.items():
         assert inspect.isclass(entries[name]), name
-        found = re.findall(r"`((?:dvi|interop|starts|lanewise|systems\.boozer)\.\w+)`", origin)
+        found = re.findall(
+            r"`((?:dvi|rings|interop|starts|lanewise|systems\.boozer)\.\w+)`", origin
+        )
         assert found or "all generated" in origin, name
         assert set(found) <= set(entries), name
 

@@ -29,6 +29,7 @@ NAMES = [
     "magnetic_moment",
     "polar_motion",
     "quick_start",
+    "storage_ring",
     "sweeps",
     "the_paper",
     "your_own_system",

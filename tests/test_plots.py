@@ -21,7 +21,7 @@ from pictures import closed, legend, lies_within, lines, marked, refuses, texts 
 from PIL import Image
 
 import dvi_jax as dvi
-from dvi_jax import plot, systems
+from dvi_jax import plot, rings, systems
 from dvi_jax.plot import films
 from dvi_jax.plot.axes import envelope
 from dvi_jax.plot.style import MARKERS, SHADES
@@ -219,6 +219,12 @@ def pictures(single):
         epsilons=t, hs=t, drifts=np.ones((5, 5)), used=np.ones((5, 5), bool), slopes=t,
         intervals=np.stack([t, t], 1), orders=[order] * 5,
     )  # fmt: skip
+    magnets = [rings.quadrupole(f"Q{i}", 1.0, 0.5) for i in range(4)]
+    ring, tunes = rings.Ring(magnets), SimpleNamespace(diffusion=-t, tune=np.stack([t, t], 1) / 9)
+    optics = SimpleNamespace(
+        s=t, beta=np.ones((5, 2)), alpha=np.zeros((5, 2)), orbit=np.zeros((5, 6)),
+        dispersion=np.ones((5, 4)),
+    )  # fmt: skip
     planets = RNG.normal(size=(4, 9, 3)), list("abcdefghi")
     errors = t, RNG.uniform(1, 2, (5, 9)), list("abcdefghi"), t, 1.0, 0.0
     return {
@@ -235,6 +241,8 @@ def pictures(single):
         "work_precision": (1, lambda ax: plot.work_precision({"a": (t, 1 / t)}, ax=ax)),
         "spectrum": (1, lambda ax: plot.spectrum(t, t, ax=ax)),
         "frequency_map": (1, lambda ax: plot.frequency_map(t, t, ax=ax)),
+        "twiss": (2, lambda ax: plot.twiss(ring, optics, ax=ax)),
+        "tune_map": (2, lambda ax: plot.tune_map(t, t, tunes, ax=ax)),
         "drift_bound": (1, lambda ax: plot.drift_bound(proved, [0, 1, 2], [1, 1.1, 1.2], ax=ax)),
         "drift_orders": (1, lambda ax: plot.drift_orders([order], ax=ax)),
         "drift_surface": (2, lambda ax: plot.drift_surface(surface, ax=ax)),
@@ -255,7 +263,7 @@ def test_every_picture_draws_on_the_axes_it_is_given_and_on_nothing_else(single)
     drawing = pictures(single)
     functions = {name for name, f in vars(plot).items() if inspect.isfunction(f)}
     assert set(drawing) == functions - {"save", "style", "animate"}
-    assert len(drawing) == 25
+    assert len(drawing) == 27
     for name, (count, draw) in drawing.items():
         for nothing in (3, "axes", [3]):
             with pytest.raises(TypeError, match="must be the matplotlib Axes"):

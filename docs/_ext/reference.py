@@ -49,6 +49,7 @@ MODULES = {
     "systems": ("Library of systems", "systems"),
     "boozer": ("Guiding centres in Boozer coordinates", "systems.boozer"),
     "rigid": ("Rotations of rigid bodies", "systems.rigid"),
+    "rings": ("Storage rings", "rings"),
     "plot": ("Plots", "plot"),
     "interop": ("Other packages", "interop"),
 }

@@ -27,6 +27,7 @@ from .orders import (
     drift_surface as drift_surface,
     work_precision as work_precision,
 )
+from .rings import tune_map as tune_map, twiss as twiss
 from .sections import bifurcation as bifurcation, section as section
 from .series import (
     changes as changes,

@@ -76,7 +76,7 @@ def frequency_map(
     x: Any,
     y: Any,
     diffusion: Any = None,
-    resonances: Sequence[tuple[int, int]] = (),
+    resonances: Sequence[tuple[int, ...]] = (),
     limits: tuple[float, float] | None = None,
     names: tuple[str, str] | None = None,
     diffusion_label: str = "log₁₀ |Δω/ω|",
@@ -89,7 +89,8 @@ def frequency_map(
       of shape (len(x), len(y)), the coordinates of a grid of initial conditions, drawn as cells.
     - `diffusion`: log₁₀ of the relative change of a frequency from one window to the next (Laskar
       1993), as colours; low is regular. NaN is hatched or grey, and counted in the legend.
-    - `resonances`: (k₁, k₂) of lines k₁x + k₂y = 0, of frequencies against each other.
+    - `resonances`: (k₁, k₂) of lines k₁x + k₂y = 0, of frequencies against each other; (k₁, k₂, k)
+      of lines k₁x + k₂y = k, of tunes.
     - `limits`: (low, high) of the colours; None: from the 2nd to the 98th percentile.
     - `names`: labels of x and y; None: ω₁ and ω₂, of a grid x and y. `ax`: where to draw.
 
@@ -155,8 +156,8 @@ def _draw_points(axis: Any, x: Any, y: Any, D: Any, norm: Any) -> tuple[Any, lis
     return drawn, counted({f"of {there.size} orbits have no frequencies": np.sum(~there)})
 
 
-def _draw_resonances(axis: Any, resonances: Sequence[tuple[int, int]]) -> None:
-    """Lines ax + by = 0 with their numbers where they leave the picture.
+def _draw_resonances(axis: Any, resonances: Sequence[tuple[int, ...]]) -> None:
+    """Lines ax + by = c with their numbers where they leave the picture.
 
     That is at the top or at the right, else inside of the left, as the numbers of the axis are
     outside. A line leaves at two edges, so that one of the three is among them.
@@ -164,19 +165,24 @@ def _draw_resonances(axis: Any, resonances: Sequence[tuple[int, int]]) -> None:
     (left, right), (low, high) = axis.get_xlim(), axis.get_ylim()
     axis.autoscale(False)
     for k in resonances:
-        if tuple(k) == (0, 0) or len(k) != 2:
-            raise ValueError(f"resonances must be pairs of integers, not both 0, got {k!r}.")
-        a, b = k
-        axis.axline((0, 0), (b, -a), color=GREY, lw=0.8, ls="--", zorder=0.9)
-        places = [((-b * high / a, high), "center", "bottom", (0, 2))] if a else []
+        if len(k) not in (2, 3) or tuple(k[:2]) == (0, 0):
+            raise ValueError(
+                "resonances must be pairs of integers, not both 0, or these with the integer on "
+                f"the right-hand side, got {k!r}."
+            )
+        a, b, c = (*k, 0)[:3]
+        x, y = (i * c / (a * a + b * b) for i in (a, b))
+        axis.axline((x, y), (x + b, y - a), color=GREY, lw=0.8, ls="--", zorder=0.9)
+        places = [(((c - b * high) / a, high), "center", "bottom", (0, 2))] if a else []
         if b:
-            places += [((right, -a * right / b), "left", "center", (2, 0))]
-            places += [((left, -a * left / b), "left", "center", (3, 0))]
+            places += [((right, (c - a * right) / b), "left", "center", (2, 0))]
+            places += [((left, (c - a * left) / b), "left", "center", (3, 0))]
         for (at_x, at_y), horizontal, vertical, off in places:
             if not (left <= at_x <= right or right <= at_x <= left):
                 continue
             if low <= at_y <= high or high <= at_y <= low:
                 look = SMALL | {"ha": horizontal, "va": vertical, "textcoords": "offset points"}
-                text = f"({signed(a)}, {signed(b)})"
+                look["rotation"] = 90 if vertical == "bottom" and len(k) == 3 else 0
+                text = f"({', '.join(map(signed, k))})"
                 axis.annotate(text, (at_x, at_y), xytext=off, annotation_clip=False, **look)
                 break

@@ -123,11 +123,16 @@ def optics(
     **Example** Tunes of a FODO cell, matched by least squares:
 
     ```python
+    import optimistix
+    cell = rings.Ring([rings.quadrupole("QF", 0.5, k1=0.6), rings.drift("D", 2.0),
+                       rings.quadrupole("QD", 0.5, k1=-0.6), rings.drift("D", 2.0)])
     def missed(k, _):
         found = rings.optics(cell.set("QF", b1=k[0]).set("QD", b1=k[1]), chromatic=False)
         return found.tune - jnp.array([0.22, 0.18])
     solver = optimistix.LevenbergMarquardt(1e-12, 1e-12)
     k = optimistix.least_squares(missed, solver, jnp.array([0.6, -0.6])).value
+    print(rings.optics(cell.set("QF", b1=k[0]).set("QD", b1=k[1])).tune.round(6))
+    # [0.22 0.18]
     ```
     """
     return _analysed(ring, dp, guess, epsilon, chromatic, True)

@@ -145,9 +145,15 @@ def problem(ring: Ring, planes: Planes = "xyz", delta: Any = 0.0) -> RingProblem
     **Example** Invariants of a cell, to order 1 in its sextupoles:
 
     ```python
+    ring = rings.Ring([rings.quadrupole("QF", 0.5, k1=0.6), rings.drift("D", 2.0),
+                       rings.sextupole("SF", 0.1, b2=2.0),
+                       rings.quadrupole("QD", 0.5, k1=-0.6), rings.drift("D", 2.0)])
     cell = rings.problem(ring.perturbed("S*", "b2"), planes="x")
+    samples = 0.01 * np.random.default_rng(0).uniform(-1, 1, (2, 300, 1))
     found = dvi.discover_invariants(cell.system, dvi.Polynomials(3), order=1, h=1.0,
                                     samples=samples, args=cell.args)
+    print(len(found.invariants), "adiabatic invariant of order 1")
+    # 1 adiabatic invariant of order 1
     ```
     """
     instance("ring", ring, Ring, "a rings.Ring")

@@ -49,8 +49,9 @@ class Ring(eqx.Module):
 
     ```python
     cell = [rings.quadrupole("QF", 0.5, k1=0.6), rings.drift("D", 2.0),
-            rings.quadrupole("QD", 0.5, k1=-0.6), rings.drift("D", 2.0)]
+            rings.quadrupole("QD", 0.5, k1=-0.5), rings.drift("D", 2.0)]
     print(rings.optics(rings.Ring(cell, energy=1e9)).tune.round(4))
+    # [0.1325 0.0634]
     ```
     """
 

@@ -70,9 +70,13 @@ def track(
     **Example**
 
     ```python
+    ring = rings.Ring([rings.quadrupole("QF", 0.5, k1=0.6), rings.drift("D", 2.0),
+                       rings.quadrupole("QD", 0.5, k1=-0.5), rings.drift("D", 2.0),
+                       rings.aperture("A", ellipse=(0.008, 0.004))])
     z = jnp.zeros((1000, 6)).at[:, 0].set(jnp.linspace(0, 0.01, 1000))
     out = rings.track(ring, z, 1000)
     print(int(out.lost.sum()), "of 1000 particles lost")
+    # 495 of 1000 particles lost
     ```
     """
     instance("ring", ring, Ring, "a rings.Ring")

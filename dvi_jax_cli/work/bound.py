@@ -11,7 +11,6 @@ import dvi_jax as dvi
 from .._errors import InputError
 from .._show import Table
 from .discover import box_of
-from .expressions import parse_method
 from .output import Report, opened
 from .system import find_source
 
@@ -31,7 +30,7 @@ def bound_file(path: str | Path, out: str | Path | None = None, force: bool = Fa
     low, high = box_of(file.domain, "domain", source)
     found = source.loader.load("invariants", file.invariants)
     inside = file.domain.inside and source.loader.load("domain.inside", file.domain.inside)
-    given = {"h": float(source.h), "args": source.args, "method": parse_method(file.method)}
+    given = {"h": float(source.h), "args": source.args, "method": source.method(file.method)}
     given |= {"epsilon": tuple(file.epsilon), "time": file.domain.times, "inside": inside}
     given["domain"] = tuple(np.stack(pair) for pair in zip(low, high, strict=True))
     allowed = "invariants, a domain and a method that fit the system"

@@ -12,7 +12,7 @@ from dvi_jax import plot
 
 from .._errors import InputError, require, shown
 from .._show import Table
-from .expressions import parse_basis, parse_method
+from .expressions import parse_basis
 from .output import Report, opened
 from .schema import DiscoverFile
 from .system import Source, find_source
@@ -99,7 +99,7 @@ def _arguments(file: DiscoverFile, source: Source) -> tuple[dict[str, Any], Any]
     states, span = uniform(count), file.samples.times
     times = np.full(count, file.t0) if span is None else random.uniform(span[0], span[1], count)
     search = {"args": source.args, "h": float(source.h), "t0": file.t0, "basis": basis}
-    search |= {"method": parse_method(file.method), "samples": (*states, times)}
+    search |= {"method": source.method(file.method), "samples": (*states, times)}
     search |= {name: getattr(file, name) for name in ("order", "tolerance", "representative")}
     return search, uniform(file.drift.starts)
 

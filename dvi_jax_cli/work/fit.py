@@ -16,7 +16,6 @@ from dvi_jax.fit.result import little_explained, numbers_in_words
 from .._errors import InputError, known, one_of, require
 from .._show import Table
 from .columns import column, read_columns
-from .expressions import parse_method
 from .loader import Loader
 from .output import Report, opened, recorded
 from .schema import Data, FitFile
@@ -108,7 +107,7 @@ def fit_problem(file: FitFile, source: Source) -> tuple[dict[str, Any], list[str
     fitted = file.epsilon is None and "epsilon" in file.parameters
     start = {"epsilon": 0.0 if fitted else source.epsilon, "q0": q0, "p0": p0}
     params = _parameters(file.parameters, start, args)
-    h, method, options = float(source.h), parse_method(file.method), file.options
+    h, method, options = float(source.h), source.method(file.method), file.options
     data, columns = _observations(file.data, source.loader, np.shape(q0), file.t0)
     segments = options.segments
     arguments = {

@@ -15,7 +15,6 @@ from dvi_jax.systems.solar_system import check_covered
 from .._errors import InputError
 from .._show import Table
 from . import solar
-from .expressions import parse_method
 from .observables import Observed, observe, read_observables
 from .output import Report, opened
 from .schema import RunFile
@@ -79,7 +78,7 @@ def _arguments(file: RunFile, source: Source) -> dict[str, Any]:
     """The arguments of `dvi.integrate`, without observables."""
     q0, p0, args = source.array("q0"), source.array("p0"), source.args
     source.check_start(q0, p0, args)
-    method, save = parse_method(file.method), dvi.Save(every=file.output.every, final=True)
+    method, save = source.method(file.method), dvi.Save(every=file.output.every, final=True)
     run = {"system": source.system, "q0": q0, "p0": p0, "args": args, "method": method}
     run |= {"save": save, **source.times(file)}
     if source.jd is not None:  # a run that is compared with the ephemeris must not leave it

@@ -81,10 +81,20 @@ class State(Table):
         return self
 
 
+class RingFile(Table):
+    """A storage ring from a file that pyAT can read."""
+
+    file: Text = key(..., "the path of a lattice file, from the folder of this one")
+    planes: Literal["x", "xy", "xyz"] = key("xyz", '"x", "xy" or "xyz"')
+    delta: Number = key(0.0, f"{FINITE}: δ if planes is not xyz")
+    symplectic: bool = key(False, BOOLEAN)
+
+
 class SystemFile(Table):
     """The common keys of the files of run, fit, discover and bound."""
 
-    system: Text = key(..., f"the name of a system in the library, or {FILE}")
+    system: Text = key(..., f"the name of a system in the library, ring, or {FILE}")
+    ring: RingFile | None = key(None, "a table with file = …; for system = ring")
     state: State = State()
     args: dict[str, Parameter] | None = key(None, ARGS)
     t0: Number = key(0.0, FINITE)

@@ -168,7 +168,7 @@ def sweep_problem(file: SweepFile, folder: Path) -> tuple[Source, dict[str, Any]
         "system": source.system,
         "lattice": times.pop("lattice"),
         "args": _parameters(source.args),
-        "method": _methods(file.method),
+        "method": _methods(file.method, source),
         "save": None if file.save is None else save,
         "observe": _observe(file, source),
         "stop": _stop(file, source),
@@ -212,9 +212,9 @@ def _parameters(value: Any, key: str = "args") -> Any:
     return _axis(key, axes[0], np.stack(arrays))
 
 
-def _methods(given: Any) -> Any:
+def _methods(given: Any, source: Source) -> Any:
     if isinstance(given, str):
-        return parse_method(given)
+        return source.method(given)
     if isinstance(given, list):
         return dvi.Axis("method", [parse_method(text) for text in given])
     return _axis("method", given, [parse_method(text) for text in given.all])

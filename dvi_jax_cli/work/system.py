@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 
 import dvi_jax as dvi
-from dvi_jax import systems
+from dvi_jax import rings, systems
 from dvi_jax.engine.signature import accepts
 from dvi_jax.systems.solar_system import EphemerisMissing, julian_date
 
 from .._errors import InputError, known, require, shown
+from .expressions import parse_method
 from .loader import Loader, in_one_line
 from .schema import COUNT, RunFile, SweepFile, SystemFile, Times
 from .table import MISSING
@@ -57,6 +58,10 @@ class Source:
                 raise
             seen = f"{self.name} cannot be {what}: {self.reported(error)}"
             raise InputError(key, seen, allowed) from error
+
+    def method(self, text: str) -> dvi.Method:
+        """The method that a text of the file describes; for a ring one turn."""
+        return rings.Turn() if self.file.ring is not None else parse_method(text)
 
     def reported(self, error: BaseException) -> str:
         """An exception in one line, with its place in the user's files."""
@@ -135,6 +140,9 @@ def find_source(file: SystemFile, folder: Path) -> Source:
     loader, name, date = Loader(folder), file.system, file.state.date
     allowed = "q0 and p0; a date only with system = solar_system"
     require(date is None or name == "solar_system", "state.date", shown(date), allowed)
+    require(file.ring is None or name == "ring", "ring", "it is given", "only with system = ring")
+    if name == "ring":
+        return _of_a_ring(file, loader)
     if ":" not in name:
         return _of_the_library(file, loader)
     made, seen = loader.load("system", name), repr(name)
@@ -155,6 +163,21 @@ def find_source(file: SystemFile, folder: Path) -> Source:
     elif callable(made):
         kind = "a function or object with required arguments"
     raise InputError("system", f"{seen} is {kind}", allowed)
+
+
+def _of_a_ring(file: SystemFile, loader: Loader) -> Source:
+    require(file.ring is not None, "ring", MISSING, 'a table [ring] with file = "…"')
+    require(file.method in ("TypeII", "Turn"), "method", shown(file.method), "no method for a ring")
+    ring = file.ring
+    try:
+        read = rings.load(loader.folder / ring.file, symplectic=ring.symplectic)
+    except Exception as error:  # whatever the reader of a format raises
+        seen = f"{ring.file!r} cannot be read: {in_one_line(error)}"
+        raise InputError("ring.file", seen, "a lattice file that pyAT can read") from error
+    found = rings.problem(read, planes=ring.planes, delta=ring.delta)
+    units = {"q": "m", "t": "turns"}
+    problem = systems.Problem("ring", *found[:4], args=found.args, units=units)
+    return Source(file, loader, problem, problem.system)
 
 
 def _of_the_library(file: SystemFile, loader: Loader) -> Source:

@@ -1,0 +1,130 @@
+"""Pictures of storage rings: what is drawn, by numbers."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from pictures import closed, legend, refuses, texts  # noqa: F401
+
+from dvi_jax import plot, rings
+from dvi_jax.plot.rings import _resonances
+
+close = np.testing.assert_allclose
+
+
+def cell(pieces=1):
+    """A FODO cell with bends, a sextupole and a thin octupole, its elements in pieces."""
+
+    def parts(make, name, length, *args, **how):
+        return [make(f"{name}{i}", length / pieces, *args, **how) for i in range(pieces)]
+
+    return rings.Ring(
+        [
+            *parts(rings.quadrupole, "QF", 0.5, 0.6),
+            *parts(rings.drift, "D", 1.0),
+            *parts(rings.bend, "B", 1.5, 0.2 / pieces),
+            *parts(rings.quadrupole, "QD", 0.5, -0.6),
+            *parts(rings.sextupole, "SD", 0.1, -2.0),
+            rings.octupole("O", 0.0, 5.0),
+            *parts(rings.drift, "D", 2.4),
+        ]
+    )
+
+
+@pytest.fixture(scope="module")
+def optics():
+    return rings.optics(cell(), chromatic=False)
+
+
+def test_twiss_draws_the_functions_inside_of_the_elements(optics):
+    axes = plot.twiss(cell(), optics, title="cell")
+    figure = axes[0].figure
+    fine = rings.optics(cell(4), chromatic=False)
+    right = figure.axes[2]
+    drawn = [*axes[0].lines, *right.lines]
+    names = ["β$_x$", "β$_y$", "D$_x$"]
+    assert [line.get_label() for line in drawn] == names  # no vertical dispersion
+    for line, values in zip(drawn, (*fine.beta.T, fine.dispersion[:, 0]), strict=True):
+        s, curve = line.get_data()
+        inside = np.interp(fine.s, s, curve)
+        close(inside, values, atol=1e-3 * np.max(values))
+        # The polygon through the ends of the elements would be wrong.
+        ends = np.interp(fine.s, optics.s, np.interp(optics.s, s, curve))
+        assert np.max(np.abs(ends - values)) > 1e-2 * np.max(values)
+    kinds = ["bend", "quadrupole", "sextupole", "other multipole"]
+    assert legend(axes[0]) == names + kinds
+    assert axes[0].get_title(loc="left") == "cell"
+    assert axes[0].get_xlim() == axes[1].get_xlim() == (0.0, 6.0)
+
+
+def test_magnets_are_where_they_are_and_their_signs_are_seen(optics):
+    boxes = [
+        (b.get_x(), b.get_width(), b.get_y(), b.get_y() + b.get_height())
+        for b in plot.twiss(cell(), optics)[1].patches
+    ]
+    wanted = [
+        (0.0, 0.5, 0.0, 1.0),  # focusing in x
+        (1.5, 1.5, -0.45, 0.45),
+        (3.0, 0.5, -1.0, 0.0),
+        (3.5, 0.1, -0.75, 0.0),
+        (3.6, 0.0, 0.0, 0.55),
+    ]
+    close(boxes, wanted, atol=1e-12)
+    refuses(plot.twiss, ((cell(2), optics), {}, r"optics must be those of this ring; got s of shape \(8,\)"))
+
+
+def found():
+    """Tunes near (0.3, 0.4) on a grid of 4 × 3 initial conditions, one of them lost."""
+    x, y = np.meshgrid(np.linspace(1e-3, 4e-3, 4), np.linspace(0, 2e-3, 3))
+    D = np.arange(-12.0, 0.0).reshape(3, 4)
+    D[1, 2] = np.nan
+    tune = np.stack([0.295 + x**2 * 1e3, 0.4 + y], -1)
+    tune[1, 2] = np.nan
+    return x, y, SimpleNamespace(diffusion=D, tune=tune)
+
+
+def test_a_tune_map_draws_both_planes():
+    x, y, result = found()
+    axes = plot.tune_map(x, y, result, order=3)
+    mesh = axes[0].collections[0]
+    close(mesh.get_array().filled(np.nan), result.diffusion)
+    close(mesh.get_coordinates()[0, :, 0], [0.5, 1.5, 2.5, 3.5, 4.5])  # mm
+    close(axes[1].collections[0].get_offsets(), result.tune[np.isfinite(result.diffusion)])
+    assert axes[0].get_xlabel() == "x [mm]"
+    assert texts(axes[1]) == ["(2, 1, 1)"]
+    (line,) = axes[1].lines
+    for a, b in (line.get_xy1(), line.get_xy2()):
+        assert 2 * a + b == pytest.approx(1)
+    # Without a grid each initial condition is a point.
+    one = plot.tune_map(x.ravel(), y.ravel(), rings.FrequencyMap(
+        result.tune.reshape(-1, 2), None, result.diffusion.ravel()))  # fmt: skip
+    close(one[0].collections[0].get_offsets()[0], [1.0, 0.0])
+    refuses(plot.tune_map, ((x[:2], y[:2], result), {}, r"diffusion of shape \(3, 4\)"))
+
+
+def test_resonances_are_those_that_cross_the_tunes_each_once():
+    Q = np.array([[0.30, 0.40], [0.35, 0.52]])
+    lines = _resonances(Q, 4)
+    assert len(lines) == len(set(lines))
+    assert {(0, 2, 1), (3, 0, 1), (2, 1, 1), (1, 1, 1)} & set(lines) == {(0, 2, 1), (3, 0, 1),
+                                                                        (2, 1, 1)}  # fmt: skip
+    assert (0, 4, 2) not in lines
+    grid = np.stack(np.meshgrid(*(np.linspace(*q, 301) for q in Q.T)), -1)
+    for m in range(-4, 5):
+        for n in range(-4, 5):
+            for k in range(-4, 5):
+                if 0 < abs(m) + abs(n) <= 4 and np.gcd.reduce([m, n, k]) == 1:
+                    missed = grid @ [m, n] - k
+                    crosses = missed.min() <= 0 <= missed.max()
+                    assert crosses == (((m, n, k) in lines) or ((-m, -n, -k) in lines))
+
+
+def test_a_resonance_of_tunes_is_a_line_with_its_integer_on_the_right():
+    axis = plot.frequency_map(np.array([0.2, 0.4]), np.array([0.1, 0.5]), resonances=[(1, 2, 1)])
+    (label,) = axis.texts
+    assert label.get_text() == "(1, 2, 1)"
+    assert label.xy[0] + 2 * label.xy[1] == pytest.approx(1)
+    refuses(
+        plot.frequency_map,
+        ((np.ones(2), np.ones(2)), {"resonances": [(0, 0, 1)]}, "integer on the right-hand side"),
+    )
