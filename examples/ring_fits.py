@@ -74,7 +74,7 @@ def with_strengths(ring, k, sextupoles=None):
     return ring
 
 
-def match(tunes=(0.78, 0.64), beta=8.0, chromaticity=(0.0, 0.0)):
+def match(tunes=(0.76, 0.64), beta=8.0, chromaticity=(0.0, 0.0)):
     """A cell with these tunes, chromaticities and β_x [m] in the straight section."""
     one = rings.Ring(cell())
 
@@ -335,8 +335,8 @@ def aperture(one, ring, out, seeds=6):
         areas = [area(x) for x in found[name]]
         print(f"    {name}: area {areas[0]:.1f} mm² without errors; with errors "
               f"{np.round(areas[1:], 1)}, mean {np.mean(areas[1:]):.1f}")  # fmt: skip
-        off = [round(area(reached(r, dp)), 1) for dp in (-0.02, 0.02)]
-        print(f"    {name}: area {off} mm² at δ = −2 %, 2 % without errors")
+        off = [round(area(reached(r, dp)), 1) for dp in (-0.01, 0.01)]
+        print(f"    {name}: area {off} mm² at δ = −1 %, 1 % without errors")
     ratios = [area(b) / area(a) for a, b in zip(found["before"], found["after"], strict=True)]
     print(
         f"    after/before: {ratios[0]:.2f} without errors, {np.round(ratios[1:], 2)} with errors"

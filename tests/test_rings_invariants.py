@@ -78,6 +78,7 @@ def test_invariant_of_the_linear_map_is_that_of_courant_and_snyder():
 
 def test_drift_of_the_invariant_of_order_one():
     found = slope(series(1), np.geomspace(0.05, 1, 6))
+    print(found)
     assert found.resolved
     assert abs(found.slope - 2) < 0.1
     # A control: the invariant without its correction.
@@ -88,6 +89,7 @@ def test_drift_of_the_invariant_of_order_one():
 @pytest.mark.parametrize("order", [2, 3])
 def test_drift_of_higher_orders(order):
     found = slope(series(order), np.geomspace(0.2, 3, 7), turns=20_000)
+    print(found)
     assert found.resolved
     assert abs(found.slope - order - 1) < 0.15
 
@@ -308,6 +310,7 @@ def test_what_breaks_the_invariants_of_danilov_and_nagaitsev():
     phase = [changes(nagaitsev(32, phase=2 * np.pi * e)[0], beta) for e in (0.001, 0.002)]
     chromatic = [changes(ring, beta, delta=d) for d in (0.005, 0.01)]
     for small, large in (unequal, phase, chromatic):
+        print("changes of H and the second invariant:", right, small, large)
         assert (small > 10 * right).all()
         assert (large / small > 1.6).all()
         assert (large / small < 2.4).all()
