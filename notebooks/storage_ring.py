@@ -60,9 +60,9 @@ plt.show()
 # %% [markdown]
 # ## Tracking
 #
-# The cell of the ESRF-EBS is one of the lattices that pyAT contains. The points are the states after
-# each turn. Far from the closed orbit the sextupoles deform the ellipses, and the last particle is
-# lost.
+# The cell of the ESRF-EBS is one of the lattices that pyAT contains. The points are the states
+# after each turn. Far from the closed orbit the sextupoles deform the ellipses, and the last
+# particle is lost.
 
 # %%
 esrf = rings.load(files("machine_data") / "hmba.mat")
@@ -80,8 +80,8 @@ plt.show()
 # %% [markdown]
 # ## Tunes of a light source
 #
-# The diffusion, the change of the tunes from the first half of the turns to the second half, is large
-# where the motion is chaotic.
+# The diffusion, the change of the tunes from the first half of the turns to the second half, is
+# large where the motion is chaotic.
 
 # %%
 x, y = np.meshgrid(np.linspace(1e-3, 10e-3, 25), np.linspace(0.1e-3, 4e-3, 16))
