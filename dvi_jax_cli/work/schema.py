@@ -270,9 +270,8 @@ class SweepFile(SystemFile, Integration):
 def _flat(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Parameter → pair: ``[bounds] args.k`` is a table in TOML, ``"args.k"`` is not."""
     found: dict[str, Any] = {}
-    for name, inner in table.items():
-        is_table = isinstance(inner, dict)
-        found |= _flat(inner, f"{prefix}{name}.") if is_table else {prefix + name: inner}
+    for k, inner in table.items():
+        found |= _flat(inner, f"{prefix}{k}.") if isinstance(inner, dict) else {prefix + k: inner}
     return found
 
 
