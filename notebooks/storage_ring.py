@@ -60,13 +60,17 @@ plt.show()
 # %% [markdown]
 # ## Tracking
 #
-# Points after each turn. Far from the closed orbit the sextupoles deform the ellipses; the last
+# The cell of the ESRF-EBS is one of the lattices that pyAT contains. The points are the states
+# after each turn. Far from the closed orbit the sextupoles deform the ellipses, and the last
 # particle is lost.
 
 # %%
-z = jnp.zeros((7, 6)).at[:, 0].set(jnp.linspace(2e-3, 38e-3, 7))
-out = rings.track(ring, z, 600, every=1)
+esrf = rings.load(files("machine_data") / "hmba.mat")
+x = jnp.array([1.0, 2.5, 4.0, 5.5, 7.0, 8.5, 10.5, 13.0]) * 1e-3
+z = jnp.zeros((8, 6)).at[:, 0].set(x)
+out = rings.track(esrf, z, 600, every=1)
 print("lost in turn", np.asarray(out.turn), "(−1: not lost)")
+assert out.lost[-1]
 kept = np.flatnonzero(~out.lost)
 turns = np.broadcast_to(np.arange(1.0, 601.0), (len(kept), 600))
 axis = plot.phase_portrait((turns, out.z[kept][..., :1], out.z[kept][..., 1:2]), dots=True)
@@ -76,12 +80,10 @@ plt.show()
 # %% [markdown]
 # ## Tunes of a light source
 #
-# The cell of the ESRF-EBS is one of the lattices that pyAT contains. The diffusion, the change of
-# the tunes from the first half of the turns to the second half, is large where the motion is
-# chaotic.
+# The diffusion, the change of the tunes from the first half of the turns to the second half, is
+# large where the motion is chaotic.
 
 # %%
-esrf = rings.load(files("machine_data") / "hmba.mat")
 x, y = np.meshgrid(np.linspace(1e-3, 10e-3, 25), np.linspace(0.1e-3, 4e-3, 16))
 tunes = rings.frequency_map(esrf, x, y, turns=256)
 plot.tune_map(x, y, tunes, order=5)
@@ -90,8 +92,9 @@ plt.show()
 # %% [markdown]
 # ## An invariant of the map
 #
-# At ε = 0 the sextupoles of our cell are off, and the Courant–Snyder invariant is conserved exactly.
-# The discovery finds it, and its correction of order ε. The drift of the sum is then O(ε²).
+# At ε = 0 the sextupoles of our cell are off, and the Courant–Snyder invariant is conserved
+# exactly. The discovery finds it, and its correction of order ε. The drift of the sum is then
+# O(ε²).
 
 # %%
 turn = rings.problem(ring.perturbed("S*", "b2"), planes="x")

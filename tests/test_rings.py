@@ -387,7 +387,7 @@ def test_what_cannot_be_read_is_listed(at):
     )
     with pytest.raises(ValueError, match="2 of 3 elements have no counterpart") as error:
         rings.from_at(lattice)
-    assert "1: QR (Quadrupole, StrMPoleSymplectic4RadPass): this pass method" in str(error.value)
+    assert "1: QR (Quadrupole, StrMPoleSymplectic4RadPass): radiation is not" in str(error.value)
     assert "2: BX (Dipole, BndMPoleSymplectic4Pass): FringeBendEntrance = 3" in str(error.value)
     assert "at.Lattice" in inspect.getdoc(rings.from_at)
 
@@ -409,8 +409,10 @@ def test_files_of_xsuite(at, tmp_path):
     path = tmp_path / "ring.json"
     at.save_xsuite(lattice, str(path))
     z = particles(5) * 0.1
-    with warnings.catch_warnings(action="ignore"):
+    with pytest.warns(UserWarning, match="pyAT switches off the cavities of this file"):
         ring = rings.load(path)
+    with pytest.raises(FileNotFoundError, match="there is no file"):
+        rings.load(tmp_path / "missing.mat")
     np.testing.assert_array_equal(rings.track(ring, z).z, rings.track(rings.from_at(lattice), z).z)
     content = json.loads(path.read_text())
     content["elements"]["limit"] = {"__class__": "LimitEllipse", "a": 0.01, "b": 0.01}

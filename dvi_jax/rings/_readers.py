@@ -4,6 +4,8 @@ import dataclasses
 import importlib
 import math
 import os
+import warnings
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -55,7 +57,22 @@ def load(path: str | os.PathLike[str], *, symplectic: bool = False, **how: Any) 
             "rings.load requires the package accelerator-toolbox, which cannot be imported. "
             'Install it: pip install "dvi-jax[rings]".'
         ) from error
-    return from_at(at.load_lattice(os.fspath(path), **how), symplectic=symplectic)
+    if not Path(path).exists():
+        raise FileNotFoundError(f"there is no file {os.fspath(path)!r}.")
+    lattice = at.load_lattice(os.fspath(path), **how)
+    off = [e.FamName for e in lattice if isinstance(e, at.RFCavity) and _is_off(e)]
+    if off and Path(path).suffix not in (".mat", ".m", ".repr"):
+        warnings.warn(
+            f"pyAT switches off the cavities of this file and may ignore their phases: {off[:8]}. "
+            "For a ring in 6D read the lattice with pyAT, set TimeLag of the cavities, call "
+            "lattice.enable_6d(dipole_pass=None, quadrupole_pass=None) and then rings.from_at.",
+            stacklevel=2,
+        )
+    return from_at(lattice, symplectic=symplectic)
+
+
+def _is_off(e: Any) -> bool:
+    return e.PassMethod in ("IdentityPass", "DriftPass") and e.Voltage != 0
 
 
 def from_at(lattice: Any, *, symplectic: bool = False) -> Ring:
@@ -100,7 +117,10 @@ def _element(e: Any, energy: float, period: float, edge: str) -> Element:
         raise ValueError(f"pyAT has no element for Xsuite's {origin}")
     make = _MAKERS.get(e.PassMethod)
     if make is None:
-        raise ValueError("this pass method is not supported")
+        off = "; to switch it off: lattice.enable_6d(dipole_pass=None, quadrupole_pass=None)"
+        radiates = any(name in e.PassMethod for name in ("Rad", "Quant"))
+        why = f"radiation is not supported{off}" if radiates else "its map is not supported"
+        raise ValueError(why)
     element = make(e, energy, period, edge)
     if e.PassMethod in _BARE:
         return element

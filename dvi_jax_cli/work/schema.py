@@ -12,6 +12,7 @@ from typing_extensions import TypeAliasType
 
 from .._errors import require, shown
 from .._names import FILES as KINDS
+from .ring import RingFile
 from .table import (
     AN_AXIS,
     Array,
@@ -79,15 +80,6 @@ class State(Table):
         fits = self.date is None or (self.q0 is None and self.p0 is None)
         require(fits, "date", "it is given together with q0 or p0", "either date, or q0 and p0")
         return self
-
-
-class RingFile(Table):
-    """A storage ring from a file that pyAT can read."""
-
-    file: Text = key(..., "the path of a lattice file, from the folder of this one")
-    planes: Literal["x", "xy", "xyz"] = key("xyz", '"x", "xy" or "xyz"')
-    delta: Number = key(0.0, f"{FINITE}: δ if planes is not xyz")
-    symplectic: bool = key(False, BOOLEAN)
 
 
 class SystemFile(Table):
@@ -278,9 +270,8 @@ class SweepFile(SystemFile, Integration):
 def _flat(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Parameter → pair: ``[bounds] args.k`` is a table in TOML, ``"args.k"`` is not."""
     found: dict[str, Any] = {}
-    for name, inner in table.items():
-        is_table = isinstance(inner, dict)
-        found |= _flat(inner, f"{prefix}{name}.") if is_table else {prefix + name: inner}
+    for k, inner in table.items():
+        found |= _flat(inner, f"{prefix}{k}.") if isinstance(inner, dict) else {prefix + k: inner}
     return found
 
 
