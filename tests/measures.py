@@ -204,8 +204,8 @@ def draw_layers(path: Path) -> None:
 
 
 LIMITS = {
-    "lines": 59_300,
-    "raise statements": 738,
+    "lines": 61_900,
+    "raise statements": 761,
     COMMENTS: 5,
     f"files of more than {LONGEST_FILE} lines": 0,
     f"functions with more than {MOST_PARAMETERS} parameters": 8,

@@ -91,10 +91,12 @@ def tune_map(x: Any, y: Any, found: Any, order: int = 4, title: str = "", ax: An
     axes, _ = stack(ax, 2, "for initial conditions and for tunes", (10.0, 4.2), 2)
     is_grid = x.ndim == 2 and bool((x == x[:1]).all() and (y == y[:, :1]).all())
     at = (x[0], y[:, 0], D.T) if is_grid else (x, y, D)
-    words, names = {"diffusion_label": "log₁₀ |ΔQ|"}, ("Q$_x$", "Q$_y$")
-    frequency_map(*at, names=("x [mm]", "y [mm]"), title=title, ax=axes[0], **words)
+    label, names = "log₁₀ |ΔQ|", ("Q$_x$", "Q$_y$")
+    places = ("x [mm]", "y [mm]")
+    frequency_map(*at, names=places, title=title, ax=axes[0], diffusion_label=label)
     lines = _resonances(Q[np.isfinite(D)], order)
-    frequency_map(Q[..., 0], Q[..., 1], D, lines, names=names, ax=axes[1], **words)
+    tunes = Q[..., 0], Q[..., 1]
+    frequency_map(*tunes, D, lines, names=names, ax=axes[1], diffusion_label=label)
     axes[1].locator_params(axis="x", nbins=5)
     return np.asarray(axes, object)
 

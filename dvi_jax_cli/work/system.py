@@ -169,6 +169,7 @@ def _of_a_ring(file: SystemFile, loader: Loader) -> Source:
     require(file.ring is not None, "ring", MISSING, 'a table [ring] with file = "…"')
     require(file.method in ("TypeII", "Turn"), "method", shown(file.method), "no method for a ring")
     ring = file.ring
+    assert ring is not None
     try:
         read = rings.load(loader.folder / ring.file, symplectic=ring.symplectic)
     except Exception as error:  # whatever the reader of a format raises
