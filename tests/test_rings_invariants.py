@@ -338,6 +338,7 @@ def test_lens_is_symplectic_and_differentiable_by_its_parameters():
         rings.lens("N", 3.0)
 
 
+@pytest.mark.slow
 def test_optics_of_planes_with_equal_tunes():
     ring, beta = nagaitsev(4, t=0.0)
     o = rings.optics(ring, chromatic=False)

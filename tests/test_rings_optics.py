@@ -84,6 +84,7 @@ def test_reverse_mode_and_second_derivatives():
     close(jax.jacfwd(slope)(0.6), (slope(0.6001) - slope(0.5999)) / 2e-4, 1e-5)
 
 
+@pytest.mark.slow
 def test_six_dimensions_synchrotron_tune_and_compaction():
     voltage = 1e-4
     ring = cell(angle=0.2, voltage=voltage)

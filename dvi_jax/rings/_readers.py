@@ -1,7 +1,6 @@
 """Rings from pyAT, and from the files that it reads: .mat, .m, .json, also those of Xsuite."""
 
 import dataclasses
-import importlib
 import math
 import os
 import warnings
@@ -51,7 +50,7 @@ def load(path: str | os.PathLike[str], *, symplectic: bool = False, **how: Any) 
     Xsuite), .seq of MAD-X and others. See `from_at` for `symplectic` and what is refused.
     """
     try:
-        at = importlib.import_module("at")
+        import at
     except ImportError as error:
         raise ImportError(
             "rings.load requires the package accelerator-toolbox, which cannot be imported. "
