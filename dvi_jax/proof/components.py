@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lanewise.jaxapi import ClosedJaxpr, Literal
+from lanewise.jaxapi import ClosedJaxpr, Literal, scan_counts
 
 UNARY = ("exp", "log", "sin", "cos", "tan", "atan", "asin", "acos", "sqrt")
 _MOVES = (
@@ -378,7 +378,7 @@ def _linear(program: Program, equation: Any, values: list) -> np.ndarray:
 
 def _scan(program: Program, params: Any, values: list) -> list:
     """A loop of a fixed length, written out."""
-    nc, nk, length = params["num_consts"], params["num_carry"], params["length"]
+    (nc, nk), length = scan_counts(params), params["length"]
     body, consts, carry = params["jaxpr"], values[:nc], values[nc : nc + nk]
     rows: list[list] = []
     order = range(length)[:: -1 if params["reverse"] else 1]
