@@ -229,6 +229,16 @@ def test_errors(cell):
         rings.track(cell, np.zeros((1000, 6)), 10**9, every=1)
     with pytest.raises(ValueError, match="length of a bend must be a positive"):
         rings.bend("B", 0.0, 0.1)
+    with pytest.raises(TypeError, match="a magnet has no argument 'slice'"):
+        rings.quadrupole("Q", 0.3, 1.0, slice=4)
+    with pytest.raises(ValueError, match="aperture 'A' must have limits"):
+        rings.aperture("A")
+    with pytest.raises(ValueError, match="has no parameter 'k1'"):
+        cell.get("QF", "k1")
+    with pytest.raises(ValueError, match="shape of q0 must be one of"):
+        dvi.integrate(rings.problem(cell), np.zeros(4), np.zeros(4), num_steps=2)
+    with jax.enable_x64(False), pytest.raises(ValueError, match="a ring needs double precision"):
+        rings.Ring([rings.drift("D", 1.0)])
     with pytest.raises(TypeError, match=r"elements\[0\]"):
         rings.Ring(["QF"])
     with pytest.raises(ValueError, match="h must be 1"):
@@ -411,7 +421,7 @@ def test_files_of_xsuite(at, tmp_path):
     z = particles(5) * 0.1
     with pytest.warns(UserWarning, match="pyAT switches off the cavities of this file"):
         ring = rings.load(path)
-    with pytest.raises(FileNotFoundError, match="there is no file"):
+    with pytest.raises(FileNotFoundError, match="No such file"):
         rings.load(tmp_path / "missing.mat")
     np.testing.assert_array_equal(rings.track(ring, z).z, rings.track(rings.from_at(lattice), z).z)
     content = json.loads(path.read_text())

@@ -1,11 +1,12 @@
 """Elements of a ring: magnets, cavities, apertures."""
 
 import dataclasses
+import inspect
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
-from .._checks import finite, instance, one_of, positive, whole
+from .._checks import finite, instance, one_of, positive, refuse_unknown, whole
 from ._maps import KICKS, Part
 
 Model = Literal["paraxial", "exact"]
@@ -58,7 +59,7 @@ class Element:
 
 def drift(name: str, length: float, model: Model = "paraxial") -> Element:
     """A space without field."""
-    one_of("model", model, ("paraxial", "exact"))
+    one_of("model", model, get_args(Model))
     part = Part("drift" if model == "paraxial" else "exact_drift")
     return Element(name, "drift", (part,), {"length": finite("length", length)})
 
@@ -85,7 +86,7 @@ def multipole(
     has the hard edges of the quadrupole, or those of all multipoles if exact.
     """
     order, values = _field(name, b, a)
-    slices, scheme, fringe, model = _options(**how)
+    slices, scheme, fringe, model = _options(how)
     values["length"] = finite("length", length)
     if length == 0:
         return Element(name, kind, (Part("thin", order),), values)
@@ -137,7 +138,7 @@ def bend(
     """
     positive("length of a bend", length)
     order, values = _field(name, b, a)
-    slices, scheme, fringe, model = _options(**how)
+    slices, scheme, fringe, model = _options(how)
     values |= {
         "length": length,
         "h": finite("angle", angle) / length,
@@ -212,8 +213,14 @@ def cavity(
 
 
 def aperture(name: str, **limits: Any) -> Element:
-    """An aperture; arguments as for `Element.inside`."""
-    return Element(name, "aperture").inside(**limits)
+    """An aperture; arguments as for `Element.inside`, at least one of them."""
+    element = Element(name, "aperture").inside(**limits)
+    if not element.parts:
+        raise ValueError(
+            f"aperture {name!r} must have limits: rectangle=(x_min, x_max, y_min, y_max) or "
+            "ellipse=(x, y), got neither."
+        )
+    return element
 
 
 def _field(name: str, b: Iterable[float], a: Iterable[float]) -> tuple[int, dict[str, Any]]:
@@ -227,10 +234,14 @@ def _field(name: str, b: Iterable[float], a: Iterable[float]) -> tuple[int, dict
     return order, found
 
 
-def _options(
-    slices: int = 10, scheme: int = 4, fringe: bool = False, model: Model = "paraxial"
-) -> tuple[int, int, bool, Model]:
-    """The options of a magnet in slices. **Raises** `ValueError` for an invalid one."""
-    one_of("scheme", scheme, KICKS)
-    one_of("model", model, ("paraxial", "exact"))
-    return whole("slices", slices), scheme, fringe, model
+def _options(how: dict[str, Any]) -> tuple[int, int, bool, Model]:
+    """The options of a magnet in slices. **Raises** `TypeError` for an unknown one, `ValueError`
+    for an invalid one."""
+
+    def of(slices=10, scheme=4, fringe=False, model="paraxial"):
+        one_of("scheme", scheme, KICKS)
+        one_of("model", model, get_args(Model))
+        return whole("slices", slices), scheme, fringe, model
+
+    refuse_unknown("a magnet", of, set(how) - set(inspect.signature(of).parameters))
+    return of(**how)

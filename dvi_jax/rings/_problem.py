@@ -34,6 +34,7 @@ class Packed(eqx.Module):
 
     def particle(self, q: Array, p: Array) -> Particle:
         """The particle of a state, of which some planes may be missing."""
+        one_of("shape of q0", q.shape, ((1,), (2,), (3,)), "(x,), (x, y) or (x, y, ζ) of a ring.")
         n = q.shape[0]
         x, y, zeta = [*q, *jnp.zeros(3 - n)]
         px, py, delta = [*p, *jnp.zeros(2 - min(n, 2)), *[self.delta] * (n < 3)]
@@ -77,12 +78,8 @@ class Turn(Method):
     inverse_needs_no_solve = needs_no_solve
 
     def check(self, equations, interval, q, p) -> None:
-        if not isinstance(equations.args, Packed) or q.shape not in ((1,), (2,), (3,)):
-            raise ValueError(
-                "method=rings.Turn() requires a system of rings.problem(ring), its args, and q0 "
-                f"and p0 of shape (1,), (2,) or (3,); got args of the type "
-                f"{type(equations.args).__name__} and shape {q.shape}."
-            )
+        hint = "Use the system and the args of rings.problem(ring)."
+        instance("args of a run with rings.Turn()", equations.args, Packed, "those of a ring", hint)
         if float(interval.h) != 1:
             raise ValueError(f"h must be 1, one turn, for a ring; got h = {float(interval.h)}.")
 

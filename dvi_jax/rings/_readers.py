@@ -56,8 +56,7 @@ def load(path: str | os.PathLike[str], *, symplectic: bool = False, **how: Any) 
             "rings.load requires the package accelerator-toolbox, which cannot be imported. "
             'Install it: pip install "dvi-jax[rings]".'
         ) from error
-    if not Path(path).exists():
-        raise FileNotFoundError(f"there is no file {os.fspath(path)!r}.")
+    Path(path).stat()  # a missing file has a clear error here, and none in some of the readers
     lattice = at.load_lattice(os.fspath(path), **how)
     off = [e.FamName for e in lattice if isinstance(e, at.RFCavity) and _is_off(e)]
     if off and Path(path).suffix not in (".mat", ".m", ".repr"):

@@ -13,6 +13,7 @@ from jaxtyping import Array
 from lanewise.jaxapi import is_traced
 
 from .._checks import instance, positive, whole
+from .._precision import require_double
 from ._elements import C, Element
 from ._maps import Part, distinct
 
@@ -43,7 +44,8 @@ class Ring(eqx.Module):
     differentiated by them, or computed for a batch of rings: ``ring.set("QF*", b1=values)`` is the
     ring with other parameters.
 
-    **Raises** `TypeError` for what is not an element, `ValueError` for no element.
+    **Raises** `TypeError` for what is not an element, `ValueError` for no element, and in a process
+    that computes in float32.
 
     **Example**
 
@@ -64,6 +66,7 @@ class Ring(eqx.Module):
     periods: int = eqx.field(static=True)
 
     def __init__(self, elements: Iterable[Element], energy: float = 1e9, periods: int = 1):
+        require_double("a ring")
         elements = list(elements)
         for i, e in enumerate(elements):
             instance(f"elements[{i}]", e, Element, "an element such as rings.drift('D', 1.0)")
@@ -139,7 +142,8 @@ class Ring(eqx.Module):
 
     def get(self, which: Where, parameter: str) -> Array:
         """The values of a parameter, one for each element of `where(which)`."""
-        return self.columns[parameter][self._numbers(which, parameter)]
+        numbers = self._numbers(which, parameter)
+        return self.columns[parameter][numbers]
 
     def set(self, which: Where, **values: Any) -> "Ring":
         """The ring with other parameters: one number for all elements of `where(which)`, or one
