@@ -238,7 +238,7 @@ def _options(how: dict[str, Any]) -> tuple[int, int, bool, Model]:
     """The options of a magnet in slices. **Raises** `TypeError` for an unknown one, `ValueError`
     for an invalid one."""
 
-    def of(slices=10, scheme=4, fringe=False, model="paraxial"):
+    def of(slices: int = 10, scheme: int = 4, fringe: bool = False, model: Model = "paraxial"):
         one_of("scheme", scheme, KICKS)
         one_of("model", model, get_args(Model))
         return whole("slices", slices), scheme, fringe, model
