@@ -76,6 +76,7 @@ def test_invariant_of_the_linear_map_is_that_of_courant_and_snyder():
     np.testing.assert_allclose(ratios, np.array([2 * alpha, beta]) / gamma, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_drift_of_the_invariant_of_order_one():
     found = slope(series(1), np.geomspace(0.05, 1, 6))
     print(found)

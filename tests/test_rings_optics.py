@@ -156,6 +156,7 @@ def test_driving_terms_of_thin_multipoles_are_the_formulas():
         rings.resonance_driving_terms(ring, ("h2100",))
 
 
+@pytest.mark.slow
 def test_apertures_of_a_ring_with_limits():
     limits = rings.aperture("A", rectangle=(-0.01, 0.02, -0.005, 0.005))
     line = rings.Ring([limits, *_elements(angle=0.2)])
@@ -184,6 +185,7 @@ def _elements(angle):
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_frequency_map_has_the_linear_tunes_and_the_detuning():
     x, y = np.meshgrid([1e-4, 1e-3, 0.5], [1e-4, 2e-4])
     found = rings.frequency_map(cell(b3=50.0), x, y, 256)
