@@ -23,8 +23,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dvi_jax import rings
-from dvi_jax.rings._readers import to_at
+from dvi_jax.systems import rings
+from dvi_jax.systems.rings._readers import to_at
 
 jax.config.update("jax_enable_x64", True)
 warnings.simplefilter("ignore")

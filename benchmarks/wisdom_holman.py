@@ -20,7 +20,7 @@ import dvi_jax as dvi
 import lanewise
 from dvi_jax import interop, systems
 from dvi_jax.systems.n_body import hamiltonian
-from dvi_jax.systems.solar_system import BODIES
+from dvi_jax.systems.planets.solar_system import BODIES
 
 jax.config.update("jax_enable_x64", True)
 

@@ -5,40 +5,25 @@ from typing import TYPE_CHECKING
 
 from lanewise import Layout as Layout
 
-from . import flows as flows
-from ._adapters import (
-    from_lagrangian as from_lagrangian,
-    from_type_iii as from_type_iii,
-    legendre as legendre,
-    velocity_force as velocity_force,
-)
-from ._adjoints import Checkpointed as Checkpointed, Direct as Direct
-from ._arithmetic import (
+from .base.cpu import configure_cpu as configure_cpu
+from .base.devices import over_devices as over_devices
+from .base.results import RESULTS as RESULTS, IntegrationError as IntegrationError
+from .base.threads import over_threads as over_threads
+from .base.types import Interval as Interval
+from .engine.newton import Newton as Newton, RootSolver as RootSolver
+from .engine.picard import Picard as Picard, PicardThenNewton as PicardThenNewton
+from .engine.simplified import SimplifiedNewton as SimplifiedNewton
+from .integration.adjoints import Checkpointed as Checkpointed, Direct as Direct
+from .integration.arithmetic import (
     Arithmetic as Arithmetic,
     Compensated as Compensated,
     DoubleDouble as DoubleDouble,
     FixedPoint as FixedPoint,
     FloatingPoint as FloatingPoint,
 )
-from ._constraint import Projection as Projection, project as project
-from ._discretise import discretise as discretise
-from ._energies import incoming_energy as incoming_energy, outgoing_energy as outgoing_energy
-from ._implicit import Implicit as Implicit
-from ._integrate import integrate as integrate
-from ._integrator import Integrator as Integrator
-from ._results import RESULTS as RESULTS, IntegrationError as IntegrationError
-from ._reversible import Reversible as Reversible
-from ._solution import Save as Save, Solution as Solution
-from ._split import Split as Split
-from ._step import Equations as Equations, StepInfo as StepInfo
-from ._system import System as System
-from ._types import Interval as Interval
-from .engine.cpu import configure_cpu as configure_cpu
-from .engine.devices import over_devices as over_devices
-from .engine.newton import Newton as Newton, RootSolver as RootSolver
-from .engine.picard import Picard as Picard, PicardThenNewton as PicardThenNewton
-from .engine.simplified import SimplifiedNewton as SimplifiedNewton
-from .engine.threads import over_threads as over_threads
+from .integration.integrate import integrate as integrate
+from .integration.integrator import Integrator as Integrator
+from .integration.reversible import Reversible as Reversible
 from .lattices import (
     AdaptiveReversible as AdaptiveReversible,
     Given as Given,
@@ -71,12 +56,8 @@ from .methods import (
     WisdomHolman as WisdomHolman,
     Yoshida as Yoshida,
 )
-from .noise import (
-    Brownian as Brownian,
-    BrownianPath as BrownianPath,
-    Langevin as Langevin,
-    NoiseHamiltonians as NoiseHamiltonians,
-)
+from .methods.constraint import Projection as Projection, project as project
+from .methods.step import Equations as Equations, StepInfo as StepInfo
 from .observe import (
     GALI as GALI,
     MEGNO as MEGNO,
@@ -96,13 +77,30 @@ from .observe import (
     TangentMap as TangentMap,
     Trend as Trend,
 )
+from .observe.solution import Save as Save, Solution as Solution
+from .problem import flows as flows
+from .problem.discretise import discretise as discretise
+from .problem.energies import incoming_energy as incoming_energy, outgoing_energy as outgoing_energy
+from .problem.implicit import Implicit as Implicit
+from .problem.lagrangian import (
+    from_lagrangian as from_lagrangian,
+    from_type_iii as from_type_iii,
+    legendre as legendre,
+    velocity_force as velocity_force,
+)
+from .problem.noise import (
+    Brownian as Brownian,
+    BrownianPath as BrownianPath,
+    Langevin as Langevin,
+    NoiseHamiltonians as NoiseHamiltonians,
+)
+from .problem.split import Split as Split
+from .problem.system import System as System
 
 if TYPE_CHECKING:  # names that are imported at their first use (`_namespaces`)
     from . import (
-        certify as certify,
         fit as _fit,
         interop as interop,
-        paper as paper,
         plot as plot,
         proof as proof,
         run as run,
@@ -136,7 +134,6 @@ if TYPE_CHECKING:  # names that are imported at their first use (`_namespaces`)
         drift_surface as drift_surface,
         find_symmetries as find_symmetries,
         lattice_defect as lattice_defect,
-        library as _library,
         noether_balance as noether_balance,
         noether_identity as noether_identity,
         prolong as prolong,
@@ -144,6 +141,7 @@ if TYPE_CHECKING:  # names that are imported at their first use (`_namespaces`)
         solution_pairs as solution_pairs,
         solve_gauge as solve_gauge,
     )
+    from .discover.symmetries import library as _library
     from .dynamics import (
         FREQUENCY_RESULTS as FREQUENCY_RESULTS,
         SECTION_RESULTS as SECTION_RESULTS,
@@ -214,14 +212,16 @@ if TYPE_CHECKING:  # names that are imported at their first use (`_namespaces`)
         sweep as sweep,
         sweep_cost as sweep_cost,
     )
+    from .testing import paper as paper
 
     fitting, sweeps, generators = _fit, _sweep, _library
     SymplecticEuler, StormerVerlet, Leapfrog, RK4 = TypeII, Strang, Strang, RungeKutta4
     Chord, SaveAt, Event, naff = SimplifiedNewton, Save, Stop, frequencies
     LinearTrend, PeakToPeak = Trend, Range
 else:
-    from ._namespaces import Package as _Package
+    from ._namespaces import Folders as _Folders, Package as _Package
 
     sys.modules[__name__].__class__ = _Package
+    sys.meta_path.insert(0, _Folders())
 
 __version__ = "0.1.0"

@@ -3,6 +3,8 @@
 import difflib
 import importlib
 import sys
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
 from types import ModuleType
 
 # Together they import matplotlib, pydantic and other libraries, which most programs do not need.
@@ -10,14 +12,18 @@ NAMESPACES = {
     **{
         name: name
         for name in (
-            *("methods", "noise", "lattices", "observe", "discover", "dynamics", "proof"),
-            *("systems", "plot", "interop", "testing", "paper", "certify", "run", "rings"),
+            *("methods", "lattices", "observe", "discover", "dynamics", "proof"),
+            *("systems", "plot", "interop", "testing", "run"),
         )
     },
     # The functions `dvi.sweep` and `dvi.fit` have the names of their packages.
     "fitting": "fit",
     "sweeps": "sweep",
-    "generators": "discover.library",
+    "flows": "problem.flows",
+    "noise": "problem.noise",
+    "paper": "testing.paper",
+    "rings": "systems.rings",
+    "generators": "discover.symmetries.library",
     "starts": "sweep.starts",
 }
 """Attribute of `dvi_jax` → the package that it is."""
@@ -140,3 +146,26 @@ class Package(ModuleType):
 
     def __dir__(self) -> list[str]:
         return sorted({*SHORT, *NAMESPACES, "__version__", "__doc__", "__file__", "__path__"})
+
+
+class Folders(MetaPathFinder, Loader):
+    """Finder of `import dvi_jax.rings`: the folder that `NAMESPACES` names, not a second copy."""
+
+    def __init__(self) -> None:
+        self._specs: dict[str, ModuleSpec | None] = {}
+
+    def find_spec(self, fullname: str, path=None, target=None) -> ModuleSpec | None:
+        package, _, name = fullname.partition(".")
+        first, _, _ = name.partition(".")
+        moved = package == "dvi_jax" and NAMESPACES.get(first, first) != first
+        return ModuleSpec(fullname, self) if moved and first not in LAZY else None
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        package, first, *rest = spec.name.split(".")
+        module = importlib.import_module(".".join([package, NAMESPACES[first], *rest]))
+        self._specs[module.__name__] = module.__spec__
+        return module
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Nothing: the module has been executed. The import system has replaced its `__spec__`."""
+        module.__spec__ = self._specs.pop(module.__name__)

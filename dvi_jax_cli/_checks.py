@@ -109,7 +109,7 @@ def paper(
         dvi-jax paper                    figures, tables, verdicts in ./paper-out
         dvi-jax paper --out DIR --json   the verdicts on stdout as well
     """
-    from dvi_jax.paper import reproduce
+    from dvi_jax.testing.paper import reproduce
 
     try:
         done = reproduce(out, force, console(stderr=session.as_json))
@@ -149,7 +149,7 @@ def certify(
         dvi-jax certify --out docs/certificate.md
     """
     session.unwritten = "the certificate cannot be written"
-    from dvi_jax.certify import QUICK, certify, page_for
+    from dvi_jax.testing import QUICK, certify, page_for
 
     is_single = not (quick and method)
     require(is_single, "--quick", "it is given together with --method", "only one of the two")

@@ -20,7 +20,7 @@ import numpy as np
 
 import dvi_jax as dvi
 from dvi_jax import plot
-from dvi_jax.systems.relativity import (
+from dvi_jax.systems.planets.relativity import (
     SUN_J2,
     hamiltonian_with_oblateness,
     momenta_from_velocities,
@@ -28,7 +28,7 @@ from dvi_jax.systems.relativity import (
     post_newtonian_hamiltonian,
     velocities_from_momenta,
 )
-from dvi_jax.systems.solar_system import (
+from dvi_jax.systems.planets.solar_system import (
     AU_IN_KM,
     GM,
     ephemeris,

@@ -27,7 +27,8 @@ import numpy as np
 import optimistix
 
 import dvi_jax as dvi
-from dvi_jax import plot, rings
+from dvi_jax import plot
+from dvi_jax.systems import rings
 
 jax.config.update("jax_enable_x64", True)
 mpl.use("Agg")

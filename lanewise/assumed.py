@@ -9,10 +9,10 @@ numbers are the same to the bit in both.
 from collections.abc import Sequence
 from typing import Any
 
-from .builder import Builder
-from .extent import operation_count
-from .ir import Num
-from .jaxapi import Jaxpr, bodies
+from .jaxprs.extent import operation_count
+from .jaxprs.jaxapi import Jaxpr, bodies
+from .llvm.builder import Builder
+from .llvm.ir import Num
 
 
 class NotAssumable(Exception):

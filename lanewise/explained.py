@@ -8,12 +8,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from . import handler, machine
-from .extent import functions_in
-from .ir import Unsupported
-from .jaxapi import jaxprs_in_params
+from .jaxprs.extent import functions_in
+from .jaxprs.jaxapi import jaxprs_in_params
+from .jaxprs.traced import Traced
+from .llvm.ir import Unsupported
+from .native import handler, machine
 from .primitive import AUTO, Layout, Program, kernel_of, pieces_of
-from .traced import Traced
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import jax
 from jax import Array
 
-from .jaxapi import ClosedJaxpr, batch_in_front, has_derivative, jaxpr_as_fun, primitive
-from .traced import Traced
+from .jaxprs.jaxapi import ClosedJaxpr, batch_in_front, has_derivative, jaxpr_as_fun, primitive
+from .jaxprs.traced import Traced
 
 
 def implicit_root(

@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from . import elementary
-from .builder import Builder
-from .components import Evaluator
-from .elimination import with_exchanges
-from .ir import TYPES, Num, Unsupported, literal
-from .jaxapi import ClosedJaxpr
-from .memory import Buffer, contiguous, load, load_row, store, stored_type
-from .values import SMALL, Value, objects
+from .evaluator import Evaluator
+from .jaxprs.jaxapi import ClosedJaxpr
+from .llvm.builder import Builder
+from .llvm.ir import TYPES, Num, Unsupported, literal
+from .llvm.memory import Buffer, contiguous, load, load_row, store, stored_type
+from .llvm.values import SMALL, Value, objects
+from .rules.elimination import with_exchanges
 
 # Parameters in front of a kernel's own: trajectories, cost of a block; and for each result the
 # bytes of one trajectory.

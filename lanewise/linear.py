@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.typing import ArrayLike
 
-from .jaxapi import primitive
+from .jaxprs.jaxapi import primitive
 
 WRITTEN_OUT = 4  # systems up to this size are eliminated number by number in XLA too
 

@@ -6,11 +6,11 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from .elementwise import ELEMENTWISE
-from .ir import TYPES
-from .jaxapi import ClosedJaxpr, Literal, bodies
-from .rules import CALLS, MOVES
-from .values import MADE
+from .jaxprs.jaxapi import ClosedJaxpr, Literal, bodies
+from .llvm.ir import TYPES
+from .llvm.values import MADE
+from .rules.elementwise import ELEMENTWISE
+from .rules.moves import CALLS, MOVES
 
 
 @dataclasses.dataclass(frozen=True)

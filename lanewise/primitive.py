@@ -11,10 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from . import handler, machine
-from .extent import carried, most_operations, operation_count
-from .ir import Unsupported
-from .jaxapi import (
+from .jaxprs.extent import carried, most_operations, operation_count
+from .jaxprs.jaxapi import (
     ClosedJaxpr,
     batch_in_front,
     drops_outputs,
@@ -25,9 +23,11 @@ from .jaxapi import (
     primitive,
     with_equal_axes,
 )
+from .jaxprs.traced import Traced
 from .kernel import Module
+from .llvm.ir import Unsupported
+from .native import handler, machine
 from .pieces import Piece, in_pieces, pieces
-from .traced import Traced
 
 FORMS = ("auto", "components", "arrays", "kernel")
 

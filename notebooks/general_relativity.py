@@ -21,8 +21,12 @@ import numpy as np
 
 import dvi_jax as dvi
 from dvi_jax import plot
-from dvi_jax.systems.relativity import SUN_J2, hamiltonian_with_oblateness, post_newtonian_force
-from dvi_jax.systems.solar_system import AU_IN_KM, GM, ephemeris, julian_date
+from dvi_jax.systems.planets.relativity import (
+    SUN_J2,
+    hamiltonian_with_oblateness,
+    post_newtonian_force,
+)
+from dvi_jax.systems.planets.solar_system import AU_IN_KM, GM, ephemeris, julian_date
 
 jax.config.update("jax_enable_x64", True)
 
@@ -130,4 +134,5 @@ plt.show()
 #
 # - Fit 100 years and analyse the residuals: `python examples/general_relativity.py`;
 #   `docs/general-relativity.md` shows the results.
-# - Fit another body, or use the Hamiltonian form of relativity in `dvi_jax.systems.relativity`.
+# - Fit another body, or use the Hamiltonian form of relativity in
+#   `dvi_jax.systems.planets.relativity`.

@@ -18,7 +18,12 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 MAPS = 20_000
 
 # Modules that only the package itself calls. The public functions check their arguments themselves.
-_CHECKED = ["dvi_jax._step", "dvi_jax._rollout", "lanewise.linear", "lanewise.dependence"]
+_CHECKED = [
+    "dvi_jax.methods.step",
+    "dvi_jax.integration.loop",
+    "lanewise.linear",
+    "lanewise.jaxprs.dependence",
+]
 
 with install_import_hook(_CHECKED, "beartype.beartype"):
     import dvi_jax  # noqa: F401  (the hook works on the first import)

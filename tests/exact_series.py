@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import dvi_jax as dvi
-from dvi_jax.discover.basis import Product, Sum
-from dvi_jax.discover.families import coordinate_names
+from dvi_jax.discover.functions.basis import Product, Sum
+from dvi_jax.discover.functions.families import coordinate_names
 
 PRIME = 2**31 - 1
 """A rank modulo this prime is less than that of the rational numbers by chance of 1e-6 or so."""

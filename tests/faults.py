@@ -4,7 +4,7 @@ import builtins
 import errno
 from pathlib import Path
 
-from dvi_jax import _files
+from dvi_jax.base import files as _files
 
 
 class KilledError(BaseException):

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from dvi_jax._types import Args, Scalar, State
-from dvi_jax.discover.taylor import taylor_coefficients
+from dvi_jax.base.types import Args, Scalar, State
+from dvi_jax.discover.algebra.taylor import taylor_coefficients
 
 
 def generating_terms(

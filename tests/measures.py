@@ -19,8 +19,8 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("dvi_jax", "lanewise", "dvi_jax_cli")
 APPLICATIONS = {
-    "discover", "sweep", "fit", "dynamics", "systems", "plot", "testing", "certify", "paper",
-    "interop", "run", "symmetry", "invariants", "proof", "rings",
+    "discover", "sweep", "fit", "dynamics", "systems", "plot", "testing", "interop", "run",
+    "symmetry", "invariants", "proof",
 }  # fmt: skip
 """What is no part of the core of `dvi_jax`."""
 
@@ -204,7 +204,7 @@ def draw_layers(path: Path) -> None:
 
 
 LIMITS = {
-    "lines": 61_900,
+    "lines": 62_000,
     "raise statements": 761,
     COMMENTS: 5,
     f"files of more than {LONGEST_FILE} lines": 0,

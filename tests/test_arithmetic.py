@@ -11,9 +11,9 @@ from helpers import ADJOINTS, ARGS, METHODS as REGISTERED, SYSTEMS, covering, pe
 
 import dvi_jax as dvi
 from dvi_jax import systems
-from dvi_jax._step import Equations, _solved, to_grid
-from dvi_jax._types import Interval
-from lanewise.exact import two_sum
+from dvi_jax.base.types import Interval
+from dvi_jax.methods.step import Equations, _solved, to_grid
+from lanewise.rules.exact import two_sum
 
 METHODS = {
     **REGISTERED,

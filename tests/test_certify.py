@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 from typer.testing import CliRunner
 
 import dvi_jax as dvi
-from dvi_jax.certify import (
+from dvi_jax.testing import (
     CHECKS,
     CONTROLS,
     METHODS,
@@ -25,9 +25,9 @@ from dvi_jax.certify import (
     certificate as certificate_module,
     certify,
     page_for,
+    problems,
 )
-from dvi_jax.certify.page import GROUPS, TITLE
-from dvi_jax.testing import problems
+from dvi_jax.testing.page import GROUPS, TITLE
 from dvi_jax_cli import app
 
 PAGE = Path(__file__).parent.parent / "docs" / "certificate.md"

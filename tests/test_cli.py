@@ -18,7 +18,7 @@ from typer.main import get_command
 
 import dvi_jax as dvi
 import dvi_jax_cli._names as known
-from dvi_jax import certify, systems
+from dvi_jax import systems, testing
 from dvi_jax_cli import app
 from dvi_jax_cli._new import notebook
 from dvi_jax_cli._session import CODES, Session
@@ -143,8 +143,8 @@ def test_completion_without_jax(line, completed):
 
 def test_names_that_complete_are_those_of_the_package():
     assert tuple(systems.LIBRARY) == known.SYSTEMS
-    assert tuple(certify.METHODS) == known.METHODS
-    assert tuple(certify.CHECKS) == known.CHECKS
+    assert tuple(testing.METHODS) == known.METHODS
+    assert tuple(testing.CHECKS) == known.CHECKS
     assert tuple(import_module("dvi_jax_cli.work.bench").ROWS) == known.WORKLOADS
     assert tuple(import_module("dvi_jax_cli.work.schema").FILES) == known.FILES
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]

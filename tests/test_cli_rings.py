@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from cli import EXAMPLES, command, found, refuses, write
 
-from dvi_jax import rings
+from dvi_jax.systems import rings
 
 pytest.importorskip("at")
 RUN = """

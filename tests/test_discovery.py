@@ -13,10 +13,11 @@ import pytest
 
 import dvi_jax as dvi
 from dvi_jax import systems
-from dvi_jax._step import Equations
-from dvi_jax.discover import changes, conditions
-from dvi_jax.discover.basis import bind_basis
-from dvi_jax.discover.sampling import Samples, as_samples
+from dvi_jax.discover.functions.basis import bind_basis
+from dvi_jax.discover.functions.sampling import Samples, as_samples
+from dvi_jax.discover.invariants import changes
+from dvi_jax.discover.symmetries.found import conditions
+from dvi_jax.methods.step import Equations
 
 H_D = systems.oscillator().system.H_D
 OSCILLATOR = dvi.System(H_D)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import dvi_jax as dvi
-from dvi_jax.discover.digits import Conditions, closed_form, digits_of
+from dvi_jax.discover.invariants.digits import Conditions, closed_form, digits_of
 
 MAGNETIC = dvi.System(
     lambda t0, t1, q, p, args: (p[0] ** 2 + (p[1] - q[0]) ** 2) / 2,

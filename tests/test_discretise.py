@@ -10,7 +10,7 @@ from generating import generating_terms
 from helpers import symplectic_defect
 
 import dvi_jax as dvi
-from dvi_jax.discover.taylor import taylor_coefficients
+from dvi_jax.discover.algebra.taylor import taylor_coefficients
 
 
 def kepler(t, q, p, args):

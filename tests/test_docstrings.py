@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 
 import dvi_jax as dvi
-from dvi_jax import _namespaces, plot, rings, systems
+from dvi_jax import _namespaces, plot, systems
+from dvi_jax.systems import rings
 
 sys.path.append(str(Path(__file__).parents[1] / "docs/_ext"))
 import usage

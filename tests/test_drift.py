@@ -12,8 +12,8 @@ from truths import curves
 
 import dvi_jax as dvi
 from dvi_jax import plot, systems
-from dvi_jax.discover import drift, exponents, orders
-from dvi_jax.discover.exponents import small_epsilon_exponent
+from dvi_jax.discover.drift.drift import drift, exponents, orders
+from dvi_jax.discover.drift.exponents import small_epsilon_exponent
 
 OSCILLATOR = systems.oscillator()
 CUBIC = dvi.System(OSCILLATOR.system.H_D, force=lambda t0, t1, q, p, args: -(q**3))

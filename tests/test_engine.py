@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import lanewise
-from lanewise.dependence import depends_on
-from lanewise.jaxapi import linear_map
+from lanewise.jaxprs.dependence import depends_on
+from lanewise.jaxprs.jaxapi import linear_map
 from lanewise.linear import IN_A_LOOP
 
 SOLVE = {

@@ -45,7 +45,7 @@ def test_the_equation_is_few_frames_from_the_call(method, frames, files, call):
 def test_the_check_of_shapes_calls_first():
     """The count above is of the run, which begins with the second call of H_D."""
     found = frames_to_the_equation(1)
-    assert [Path(file).stem for file in found] == ["_integrate", "_system", "_system"]
+    assert [Path(file).stem for file in found] == ["integrate", "system", "system"]
 
 
 def test_more_frames_are_counted():

@@ -9,9 +9,9 @@ import pytest
 
 import dvi_jax as dvi
 import lanewise
-from dvi_jax.discover.block_triangular import BlockTriangular, above
-from dvi_jax.discover.nullspace import toeplitz
-from dvi_jax.discover.taylor import taylor_coefficients
+from dvi_jax.discover.algebra.block_triangular import BlockTriangular, above
+from dvi_jax.discover.algebra.nullspace import toeplitz
+from dvi_jax.discover.algebra.taylor import taylor_coefficients
 from dvi_jax.engine.newton import Newton, find_root
 
 X = jnp.array([0.3, 0.7, 1.1])

@@ -11,7 +11,8 @@ import pytest
 from helpers import SYSTEMS, non_separable
 
 import dvi_jax as dvi
-from dvi_jax import _integrate, _memory, _rollout
+from dvi_jax.base import machine as _memory
+from dvi_jax.integration import integrate as _integrate, loop as _rollout
 
 
 def H(t0, t1, q0, p1, args):

@@ -8,7 +8,7 @@ from helpers import measured_orders, non_separable
 
 import dvi_jax as dvi
 from dvi_jax import interop, systems
-from dvi_jax._results import STATUS_NAMES
+from dvi_jax.base.results import STATUS_NAMES
 
 diffrax = pytest.importorskip("diffrax")
 

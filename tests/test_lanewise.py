@@ -23,9 +23,12 @@ from jax import export, lax
 
 import dvi_jax as dvi
 import lanewise
-from lanewise import assumed, cache, components, extent, handler, machine, primitive, rules
+from lanewise import assumed, evaluator as components, primitive
+from lanewise.jaxprs import extent
+from lanewise.jaxprs.traced import Traced
 from lanewise.kernel import Module
-from lanewise.traced import Traced
+from lanewise.native import cache, handler, machine
+from lanewise.rules.moves import moves as rules
 
 RNG = np.random.default_rng(0)
 
@@ -852,7 +855,7 @@ def test_an_unknown_parameter_is_left_to_xla():
     np.testing.assert_array_equal(rules.moved("reshape", of, x)[0], [0, 1, 2, 3])
     of["dimensions"] = (1, 0)
     np.testing.assert_array_equal(rules.moved("reshape", of, x)[0], [0, 2, 1, 3])
-    with pytest.raises(lanewise.ir.Unsupported, match=r"reshape has parameters .*: order"):
+    with pytest.raises(lanewise.llvm.ir.Unsupported, match=r"reshape has parameters .*: order"):
         rules.moved("reshape", {**of, "order": "F"}, x)
 
 

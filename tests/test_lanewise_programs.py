@@ -20,7 +20,7 @@ import pytest
 from jax import lax
 
 import lanewise
-from lanewise import components, kernel, primitive
+from lanewise import evaluator as components, kernel, primitive
 
 LANES = 9
 ULPS = 16

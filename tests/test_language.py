@@ -23,6 +23,6 @@ def test_a_planted_sentence_is_found(tmp_path):
 
 def test_every_kind_of_file_is_searched():
     names = {str(path.relative_to(language.ROOT)) for path in language.files()}
-    pages = ("README.md", "docs/theory.md", "dvi_jax/paper/claims.toml")
-    for name in (*pages, "dvi_jax/_system.py", "lanewise/loops.py"):
+    pages = ("README.md", "docs/theory.md", "dvi_jax/testing/paper/claims.toml")
+    for name in (*pages, "dvi_jax/problem/system.py", "lanewise/rules/loops.py"):
         assert name in names

@@ -25,7 +25,7 @@ from dvi_jax import systems
 from dvi_jax.run import run_file
 from dvi_jax.systems._elliptic import complete, first_kind, jacobi, swing, third_kind
 from dvi_jax.systems.pendulum import action, period
-from dvi_jax.systems.solar_system import EphemerisMissing
+from dvi_jax.systems.planets.solar_system import EphemerisMissing
 from dvi_jax.systems.van_der_pol import amplitude
 
 NAMES = list(systems.LIBRARY)

@@ -70,4 +70,4 @@ def test_the_picture_of_the_layers_is_that_of_the_imports():
     assert drawn == [name for y, row in enumerate(layers) for name in (str(y), *row)]
     assert layers[0][-1] == "lanewise"
     heights = {name: y for y, row in enumerate(layers) for name in row}
-    assert heights["methods"] < heights["_integrate"] < heights["fit"] < heights["interop"]
+    assert heights["methods"] < heights["integration"] < heights["fit"] < heights["interop"]

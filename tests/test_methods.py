@@ -9,11 +9,11 @@ import pytest
 from helpers import ARGS, IN_EVERY_RUN, SYSTEMS, covering, flow, problem, state
 
 import dvi_jax as dvi
-from dvi_jax._step import Equations, inverse_step, step
-from dvi_jax._types import Interval
+from dvi_jax.base.types import Interval
 from dvi_jax.methods import warn_of_dissipation
 from dvi_jax.methods._composition import CompositionMethod, of_strang
 from dvi_jax.methods._order_conditions import order_defects
+from dvi_jax.methods.step import Equations, inverse_step, step
 from dvi_jax.testing import METHODS, check_inverse, check_reversible, check_symplectic, problems
 
 SYMPLECTIC = {k: m for k, m in METHODS.items() if m.is_symplectic}

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import dvi_jax as dvi
-from dvi_jax._step import Equations
-from dvi_jax.discover.block_triangular import BlockTriangular, above
-from dvi_jax.discover.changes import Stepped, terms_in_pairs
-from dvi_jax.discover.pair_series import staircase
-from dvi_jax.discover.sampling import as_samples
+from dvi_jax.discover.algebra.block_triangular import BlockTriangular, above
+from dvi_jax.discover.algebra.pair_series import staircase
+from dvi_jax.discover.functions.sampling import as_samples
+from dvi_jax.discover.invariants.changes import Stepped, terms_in_pairs
 from dvi_jax.engine.pair_matrices import Left, plus, zeros
 from dvi_jax.engine.pairs import Pair
+from dvi_jax.methods.step import Equations
 
 
 def exact(x, *index):

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from dvi_jax.paper import reproduce, values
-from dvi_jax.paper.claims import Check, Claim, Verdict, judge, pretty
-from dvi_jax.paper.equations import EQUATIONS, resolve
-from dvi_jax.paper.figures import FIGURES
-from dvi_jax.paper.numbers import crossing, relative_spread, slope
+from dvi_jax.testing.paper import reproduce, values
+from dvi_jax.testing.paper.claims import Check, Claim, Verdict, judge, pretty
+from dvi_jax.testing.paper.equations import EQUATIONS, resolve
+from dvi_jax.testing.paper.figures import FIGURES
+from dvi_jax.testing.paper.numbers import crossing, relative_spread, slope
 
 pytestmark = pytest.mark.slow  # all of the paper, once: a minute
 
@@ -229,7 +229,7 @@ def test_files_and_folders_that_are_not_empty_are_refused_before_any_work(tmp_pa
 
 
 def test_force_overwrites_its_own_files_only(run, m, tmp_path, monkeypatch):
-    monkeypatch.setattr("dvi_jax.paper._reproduce.measure", lambda console: m)
+    monkeypatch.setattr("dvi_jax.testing.paper._reproduce.measure", lambda console: m)
     (tmp_path / "mine.txt").write_text("keep")
     (tmp_path / "verdicts.md").write_text("old")
     reproduce(tmp_path, force=True, console=Console(file=io.StringIO()))

@@ -21,10 +21,11 @@ from pictures import closed, legend, lies_within, lines, marked, refuses, texts 
 from PIL import Image
 
 import dvi_jax as dvi
-from dvi_jax import plot, rings, systems
+from dvi_jax import plot, systems
 from dvi_jax.plot import films
 from dvi_jax.plot.axes import envelope
 from dvi_jax.plot.style import MARKERS, SHADES
+from dvi_jax.systems import rings
 
 ROOT = Path(__file__).parents[1]
 RNG = np.random.default_rng(0)

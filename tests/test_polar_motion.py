@@ -14,8 +14,8 @@ from helpers import run_problem
 from scipy.integrate import solve_ivp
 
 import dvi_jax as dvi
-from dvi_jax.systems import polar_motion
-from dvi_jax.systems.polar_motion import (
+from dvi_jax.systems.planets import polar_motion
+from dvi_jax.systems.planets.polar_motion import (
     REFERENCE,
     YEAR,
     annual,
@@ -25,7 +25,7 @@ from dvi_jax.systems.polar_motion import (
     rates,
     read_polar_motion,
 )
-from dvi_jax.systems.solar_system import EphemerisMissing
+from dvi_jax.systems.planets.solar_system import EphemerisMissing
 
 PROBLEM = polar_motion()
 ARGS = PROBLEM.args
@@ -122,7 +122,7 @@ def test_predictions_and_empty_lines_are_left_out_and_other_files_refused(tmp_pa
 
 
 def test_missing_extra_names_the_command(monkeypatch):
-    module = sys.modules["dvi_jax.systems.solar_system"]  # where files are looked for
+    module = sys.modules["dvi_jax.systems.planets.solar_system"]  # where files are looked for
     monkeypatch.setattr(module, "find_spec", lambda name: None)
     with pytest.raises(EphemerisMissing, match=r'pip install "dvi-jax\[ephemeris\]"'):
         read_polar_motion()

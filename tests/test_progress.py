@@ -5,7 +5,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from dvi_jax import _progress
+from dvi_jax.base import progress as _progress
 
 
 @contextmanager

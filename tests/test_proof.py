@@ -441,7 +441,7 @@ def test_noether_identities_of_the_paper():
 
 def test_a_wrong_balance_is_not_proved(monkeypatch):
     """With E⁻ in place of E⁺ the balance law is false if H_D depends on the time."""
-    from dvi_jax._energies import incoming_energy
+    from dvi_jax.problem.energies import incoming_energy
     from dvi_jax.proof import noether
 
     driven = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + jnp.cos(t0 + t1) * (q @ q))

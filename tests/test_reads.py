@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import dvi_jax as dvi
-from dvi_jax.engine.reads import reads
+from dvi_jax.base.reads import reads
 
 STIFFNESS = 1.0
 TABLE = np.array([1.0, 2.0])

@@ -11,10 +11,10 @@ from helpers import needs_ephemeris, run_problem
 from scipy.interpolate import CubicSpline
 
 import dvi_jax as dvi
-from dvi_jax.systems import solar_system
 from dvi_jax.systems.n_body import hamiltonian
 from dvi_jax.systems.oblate_kepler import elements
-from dvi_jax.systems.relativity import (
+from dvi_jax.systems.planets import solar_system
+from dvi_jax.systems.planets.relativity import (
     SPEED_OF_LIGHT,
     SUN_J2,
     SUN_POLE,
@@ -26,7 +26,7 @@ from dvi_jax.systems.relativity import (
     post_newtonian_hamiltonian,
     velocities_from_momenta,
 )
-from dvi_jax.systems.solar_system import BODIES, GM, to_ecliptic
+from dvi_jax.systems.planets.solar_system import BODIES, GM, to_ecliptic
 from dvi_jax_cli.work.solar import compare
 
 LIGHT = 1e-12  # mass of a planet here: effects of order m/M are then below the tolerances

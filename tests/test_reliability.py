@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import dvi_jax as dvi
-from dvi_jax._files import publish_npz, read_npz
+from dvi_jax.base.files import publish_npz, read_npz
 from dvi_jax.fit import run
 from dvi_jax.fit.optimise import Position, Record
 from dvi_jax.run import InputError

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import dvi_jax as dvi
-from dvi_jax import rings
-from dvi_jax.rings._readers import from_at_coordinates, to_at
+from dvi_jax.systems import rings
+from dvi_jax.systems.rings._readers import from_at_coordinates, to_at
 
 SIZES = np.array([1e-3, 1e-4, 1e-3, 1e-4, 1e-2, 1e-3])
 S = np.kron(np.eye(3), [[0, 1], [-1, 0]])

@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import quad
 
 import dvi_jax as dvi
-from dvi_jax import rings
+from dvi_jax.systems import rings
 
 AMPLITUDE = 0.01
 

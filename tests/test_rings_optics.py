@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dvi_jax import rings
+from dvi_jax.systems import rings
 
 
 def cell(k=0.6, b2=0.0, b3=0.0, skew=0.0, angle=0.0, voltage=0.0):

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from pictures import closed, legend, refuses, texts  # noqa: F401
 
-from dvi_jax import plot, rings
+from dvi_jax import plot
 from dvi_jax.plot.rings import _resonances
+from dvi_jax.systems import rings
 
 close = np.testing.assert_allclose
 

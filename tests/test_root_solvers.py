@@ -11,11 +11,11 @@ from helpers import double_pendulum, symplectic_defect
 import dvi_jax as dvi
 import lanewise
 from dvi_jax import systems
-from dvi_jax._step import Equations, no_step_yet
-from dvi_jax._types import Interval
+from dvi_jax.base.types import Interval
 from dvi_jax.engine.newton import Newton, find_root, over
 from dvi_jax.engine.picard import Picard, PicardThenNewton
 from dvi_jax.engine.simplified import _ELIMINATED, SimplifiedNewton, factorised
+from dvi_jax.methods.step import Equations, no_step_yet
 
 EPS = np.finfo(float).eps
 MANY = PicardThenNewton(newton_up_to=0)

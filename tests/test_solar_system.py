@@ -9,9 +9,10 @@ from helpers import needs_ephemeris, run_problem
 from scipy.spatial.transform import Rotation
 
 import dvi_jax as dvi
-from dvi_jax.systems import n_body, solar_system
+from dvi_jax.systems import n_body
 from dvi_jax.systems.n_body import OBSERVABLES, angular_momentum, check_bodies, hamiltonian
-from dvi_jax.systems.solar_system import (
+from dvi_jax.systems.planets import solar_system
+from dvi_jax.systems.planets.solar_system import (
     BODIES,
     GM,
     EphemerisMissing,
@@ -127,7 +128,7 @@ def test_earth_stays_on_the_ecliptic():
 
 
 def test_missing_extra_names_the_command(monkeypatch):
-    solar = sys.modules["dvi_jax.systems.solar_system"]
+    solar = sys.modules["dvi_jax.systems.planets.solar_system"]
     monkeypatch.setattr(solar, "find_spec", lambda name: None)
     solar._kernel.cache_clear()
     with pytest.raises(EphemerisMissing, match=r'pip install "dvi-jax\[ephemeris\]"'):

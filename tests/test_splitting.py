@@ -7,9 +7,10 @@ import pytest
 from helpers import central_difference
 
 import dvi_jax as dvi
-from dvi_jax import flows, systems
-from dvi_jax._kepler import change
+from dvi_jax import systems
 from dvi_jax.methods._schemes import corrector, near_integrable, sequence_of
+from dvi_jax.problem import flows
+from dvi_jax.problem.kepler import change
 from dvi_jax.systems.n_body import hamiltonian
 
 Q0, P0 = np.array([1.0, 0.0]), np.array([0.2, 1.1])

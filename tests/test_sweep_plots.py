@@ -13,7 +13,7 @@ from xarray.core import indexing
 
 import dvi_jax as dvi
 from dvi_jax import plot
-from dvi_jax._results import STATUS_NAMES
+from dvi_jax.base.results import STATUS_NAMES
 from dvi_jax.plot import blocks, grid
 from dvi_jax.plot.style import SHADES
 from dvi_jax.sweep import lazy

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import dvi_jax as dvi
-from dvi_jax import _checks
+from dvi_jax.base import checks as _checks
 
 
 def H(t0, t1, q0, p1, args):

@@ -26,22 +26,44 @@ from sphinx.util.docutils import SphinxDirective
 import dvi_jax
 import lanewise
 from dvi_jax._namespaces import SHORT, names
-from dvi_jax.paper.equations import EQUATIONS
+from dvi_jax.testing.paper.equations import EQUATIONS
 
 PAGES = {
-    "integration": ("Systems and integration", "dvi_jax"),
-    "methods": ("Methods", "dvi_jax.methods"),
-    "noise": ("Noise", "dvi_jax.noise"),
-    "lattices": ("Time grids", "dvi_jax.lattices"),
-    "solvers": ("Root solvers, layout, devices", "dvi_jax.engine"),
-    "observables": ("Observables and reductions", "dvi_jax.observe"),
-    "discovery": ("Symmetries and invariants", "dvi_jax.discover"),
-    "proof": ("Proved bounds", "dvi_jax.proof"),
-    "sweeps": ("Sweeps", "dvi_jax.sweep"),
-    "fitting": ("Fits", "dvi_jax.fit"),
-    "dynamics": ("Sections, frequencies, actions", "dvi_jax.dynamics"),
+    "integration": "Systems and integration",
+    "methods": "Methods",
+    "noise": "Noise",
+    "lattices": "Time grids",
+    "solvers": "Root solvers, layout, devices",
+    "observables": "Observables and reductions",
+    "discovery": "Symmetries and invariants",
+    "proof": "Proved bounds",
+    "sweeps": "Sweeps",
+    "fitting": "Fits",
+    "dynamics": "Sections, frequencies, actions",
 }
-"""Page → title, and the package whose public names are on it."""
+"""Page → title."""
+
+HOMES = {
+    "dvi_jax": "integration",
+    "dvi_jax.methods": "methods",
+    "dvi_jax.methods.step": "integration",
+    "dvi_jax.methods.constraint": "integration",
+    "dvi_jax.problem.noise": "noise",
+    "dvi_jax.lattices": "lattices",
+    "dvi_jax.engine": "solvers",
+    "dvi_jax.base.devices": "solvers",
+    "dvi_jax.base.threads": "solvers",
+    "dvi_jax.base.cpu": "solvers",
+    "lanewise": "solvers",
+    "dvi_jax.observe": "observables",
+    "dvi_jax.observe.solution": "integration",
+    "dvi_jax.discover": "discovery",
+    "dvi_jax.proof": "proof",
+    "dvi_jax.sweep": "sweeps",
+    "dvi_jax.fit": "fitting",
+    "dvi_jax.dynamics": "dynamics",
+}
+"""Package or module → the page of its public names; the longest name that fits decides."""
 
 MODULES = {
     "generators": ("Generators of common symmetries", "generators"),
@@ -58,8 +80,10 @@ MODULES = {
 GENERATOR = "lanewise"
 """The page of the package that makes machine code, and its name."""
 
-TITLES = {page: title for page, (title, _) in {**PAGES, **MODULES}.items()} | {
-    GENERATOR: "Machine code for batches"
+TITLES = {
+    **PAGES,
+    **{page: title for page, (title, _) in MODULES.items()},
+    GENERATOR: "Machine code for batches",
 }
 """Page → title, in the order of the index."""
 
@@ -82,12 +106,8 @@ def public(module: types.ModuleType) -> dict[str, Any]:
 
 def _room(thing: Any) -> str:
     """The page of a public name of `dvi_jax`, by the file where it is written."""
-    if thing.__module__.startswith(GENERATOR):
-        return "solvers"
-    for page, (_, room) in PAGES.items():
-        if room != "dvi_jax" and thing.__module__.startswith(room + "."):
-            return page
-    return "integration"
+    homes = [home for home in HOMES if f"{thing.__module__}.".startswith(f"{home}.")]
+    return HOMES[max(homes, key=len)]
 
 
 def entries() -> dict[str, dict[str, tuple[str, Any]]]:
@@ -348,7 +368,7 @@ class LinkNames(SphinxPostTransform):
 
 
 class EquationMap(SphinxDirective):
-    """The paper's numbered equations, as `dvi_jax.paper.equations` has them."""
+    """The paper's numbered equations, as `dvi_jax.testing.paper.equations` has them."""
 
     def run(self) -> list[nodes.Node]:
         rows = ["| equation | what it says | as printed? | code |", "| --- | --- | --- | --- |"]

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from lanewise.jaxapi import is_traced
+from lanewise.jaxprs.jaxapi import is_traced
 
-from .._checks import positive
+from ..base.checks import positive
 from .frequencies import Frequencies, analyse, check_count, settings_of, signals_of
 from .lines import EPS
 from .results import CODE, FREQUENCY_RESULTS, WITHOUT_NUMBERS, WithStatus, raise_on_failure

@@ -8,15 +8,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from .._checks import whole
-from .._integrate import integrate
-from .._solution import Save
-from .._system import System, check_system, of_problem
-from ..engine.keywords import INTEGRATOR, with_keywords_of
-from ..engine.names import both_names
-from ..engine.signature import accepts
-from ..noise import Brownian
+from ..base.checks import whole
+from ..base.keywords import INTEGRATOR, with_keywords_of
+from ..base.names import both_names
+from ..base.signature import accepts
+from ..integration.integrate import integrate
 from ..observe import Mean
+from ..observe.solution import Save
+from ..problem.noise import Brownian
+from ..problem.system import System, check_system, of_problem
 
 
 class InvariantDiffusion(eqx.Module):

@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from lanewise.jaxapi import is_traced, x64_enabled
+from lanewise.jaxprs.jaxapi import is_traced, x64_enabled
 
-from .._checks import one_of, whole
-from .._precision import refuse_double_without_x64
-from .._solution import Solution
-from ..engine.quantities import refuse_unit_or_mask
+from ..base.checks import one_of, whole
+from ..base.precision import refuse_double_without_x64
+from ..base.quantities import refuse_unit_or_mask
+from ..observe.solution import Solution
 from .lines import EPS, Lines, Settings, lines_of
 from .results import (
     CODE,

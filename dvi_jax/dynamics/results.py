@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._results import RESULTS, status_code
+from ..base.results import RESULTS, status_code
 
 
 class FREQUENCY_RESULTS(eqx.Enumeration):

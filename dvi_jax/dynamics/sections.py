@@ -12,21 +12,21 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from lanewise.jaxapi import is_traced
+from lanewise.jaxprs.jaxapi import is_traced
 
-from .._checks import finite, positive, whole
-from .._inputs import as_parameter, as_scalar, start_state
-from .._integrate import integrate
-from .._integrator import Integrator, chosen, default_method
-from .._results import RESULTS, status_name
-from .._solution import Save
-from .._system import System, check_system
-from .._types import Args, Scalar, State
-from ..engine.keywords import INTEGRATOR, taken, with_keywords_of
-from ..engine.names import both_names
+from ..base.checks import finite, positive, whole
+from ..base.inputs import as_parameter, as_scalar, start_state
+from ..base.keywords import INTEGRATOR, taken, with_keywords_of
+from ..base.names import both_names
+from ..base.results import RESULTS, status_name
+from ..base.types import Args, Scalar, State
 from ..engine.newton import RootSolver
+from ..integration.integrate import integrate
+from ..integration.integrator import Integrator, chosen, default_method
 from ..methods import Method, TypeII
 from ..observe import Section
+from ..observe.solution import Save
+from ..problem.system import System, check_system
 from ..sweep import Axis
 from .results import AS_ATTRIBUTE, SECTION_RESULTS, SectionError, WithStatus, judge
 

@@ -4,14 +4,14 @@ from typing import Any
 
 from jaxtyping import Array
 
-from .._integrate import integrate
-from .._integrator import chosen
-from .._solution import Save
-from .._system import System
-from ..engine.keywords import INTEGRATOR, taken, with_keywords_of
-from ..engine.names import both_names
+from ..base.keywords import INTEGRATOR, taken, with_keywords_of
+from ..base.names import both_names
+from ..integration.integrate import integrate
+from ..integration.integrator import chosen
 from ..lattices import Given
 from ..observe import TangentMap
+from ..observe.solution import Save
+from ..problem.system import System
 
 
 @both_names

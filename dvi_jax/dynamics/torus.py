@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lanewise.jaxapi import is_traced
+from lanewise.jaxprs.jaxapi import is_traced
 
-from .._checks import finite, instance, positive, whole
+from ..base.checks import finite, instance, positive, whole
 from .frequencies import Frequencies
 from .results import (
     CODE,

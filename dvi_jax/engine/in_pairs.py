@@ -11,9 +11,9 @@ import numpy as np
 from jax import Array, lax
 
 import lanewise
-from lanewise.jaxapi import ClosedJaxpr, Jaxpr, Literal, bodies, jaxpr_as_fun, scan_counts
-from lanewise.rules import CALLS
-from lanewise.traced import Traced
+from lanewise.jaxprs.jaxapi import ClosedJaxpr, Jaxpr, Literal, bodies, jaxpr_as_fun, scan_counts
+from lanewise.jaxprs.traced import Traced
+from lanewise.rules.moves import CALLS
 
 from . import pair_functions as functions, pairs
 from .pairs import Number, Pair, add, as_pair, is_pair, mul, rounded, sub

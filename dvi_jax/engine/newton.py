@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Inexact, Int
 
 import lanewise
 
-from .._checks import positive, whole
+from ..base.checks import positive, whole
 
 Vector = Inexact[Array, " n"]
 Function = Callable[[Vector], Vector]

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from lanewise.exact import exact_product, two_sum
-from lanewise.jaxapi import is_traced
+from lanewise.jaxprs.jaxapi import is_traced
+from lanewise.rules.exact import exact_product, two_sum
 
 
 class Pair(NamedTuple):

@@ -6,7 +6,7 @@ from jax import lax
 
 import lanewise
 
-from .._checks import instance, whole
+from ..base.checks import instance, whole
 from .contraction import Contraction, contract
 from .newton import Found, Function, Newton, RootSolver, Scales, Vector
 

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from .._checks import fraction, instance, one_of, whole
-from .._precision import require_double
+from ..base.checks import fraction, instance, one_of, whole
+from ..base.precision import require_double
 from .losses import LeastSquares, Likelihood, Loss
 from .observations import Data, as_arcs
 from .problem import Problem

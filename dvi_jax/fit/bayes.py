@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from .._checks import fraction, instance, whole
+from ..base.checks import fraction, instance, whole
 from ._fit import fit
 from .losses import LeastSquares, Likelihood, Loss
 from .observations import Data

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from .._checks import instance, positive
-from .._system import System
+from ..base.checks import instance, positive
+from ..problem.system import System
 from ._fit import fit
 from .elimination import Elimination, Removal, places
 from .library import KEY, ForceLibrary, with_force

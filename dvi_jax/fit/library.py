@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._checks import instance, one_of, whole
-from .._system import System
-from .._types import Args, Scalar, State
-from ..engine.signature import accepts, signature_of
+from ..base.checks import instance, one_of, whole
+from ..base.signature import accepts, signature_of
+from ..base.types import Args, Scalar, State
+from ..problem.system import System
 
 KEY = "coefficients"
 """Key of the coefficients in args and parameters."""

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._checks import positive
+from ..base.checks import positive
 
 
 class Loss(eqx.Module):

@@ -10,18 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from lanewise.jaxapi import is_traced
+from lanewise.jaxprs.jaxapi import is_traced
 
-from .._checks import instance
-from .._inputs import as_parameter, start_state
-from .._integrate import integrate
-from .._integrator import Integrator
-from .._results import RESULTS
-from .._solution import Save
-from .._system import System
-from ..discover.basis import check_step_size
-from ..engine.signature import accepts
+from ..base.checks import instance
+from ..base.inputs import as_parameter, start_state
+from ..base.results import RESULTS
+from ..base.signature import accepts
+from ..discover.functions.basis import check_step_size
+from ..integration.integrate import integrate
+from ..integration.integrator import Integrator
 from ..lattices import Uniform
+from ..observe.solution import Save
+from ..problem.system import System
 from .observations import Observations
 
 _WASTE = 2_000_000
@@ -287,7 +287,7 @@ def make_group(
 
     def stacked(of, **pad):
         arrays = [np.asarray(of(arc)) for arc in arcs]
-        widths = [[(0, rows - len(x))] + [(0, 0)] * (x.ndim - 1) for x in arrays]
+        widths = [np.array([(0, rows - len(x))] + [(0, 0)] * (x.ndim - 1)) for x in arrays]
         return np.stack([np.pad(x, w, **pad) for x, w in zip(arrays, widths, strict=True)])
 
     def flat(arc):

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._checks import function, one_of, positive, whole
-from .._types import Args, Scalar, State
+from ..base.checks import function, one_of, positive, whole
+from ..base.types import Args, Scalar, State
 
 
 def _momentum(q: Any, p: Any) -> Any:

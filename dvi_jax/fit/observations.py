@@ -7,9 +7,9 @@ from typing import Any, TypeAlias
 import jax.numpy as jnp
 import numpy as np
 
-from .._checks import finite, instance
-from ..engine.quantities import refuse_unit_or_mask
-from ..engine.signature import accepts, signature_of
+from ..base.checks import finite, instance
+from ..base.quantities import refuse_unit_or_mask
+from ..base.signature import accepts, signature_of
 
 _RANGE = (1e-140, 1e140)
 """Standard errors relative to the largest value for which a sum of squares can be computed."""

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from lanewise.jaxapi import is_traced
+from lanewise.jaxprs.jaxapi import is_traced
 
-from ..engine.quantities import refuse_unit_or_mask
+from ..base.quantities import refuse_unit_or_mask
 
 
 @dataclass(frozen=True)

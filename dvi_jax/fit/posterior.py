@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from .._checks import one_of
-from .._precision import require_double
+from ..base.checks import one_of
+from ..base.precision import require_double
 from .losses import LeastSquares, Likelihood, Loss
 from .observations import Data, as_arcs
 from .parameters import Space, make_space

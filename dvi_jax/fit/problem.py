@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from .._checks import instance
-from .._results import RESULTS, status_name
-from .._system import check_system
-from ..engine.reads import Reads, reads
+from ..base.checks import instance
+from ..base.reads import Reads, reads
+from ..base.results import RESULTS, status_name
+from ..problem.system import check_system
 from .evaluation import Evaluation
 from .losses import LeastSquares, Likelihood, Loss
 from .model import Group, Model, check_observable, make_groups, predict, specification, weighed

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from .._progress import bar_of, told
+from ..base.progress import bar_of, told
 
 
 @dataclass(frozen=True)

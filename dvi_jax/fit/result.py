@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from .._checks import one_of
-from .._files import publish_npz, read_npz
+from ..base.checks import one_of
+from ..base.files import publish_npz, read_npz
 from .parameters import make_space
 from .results import FIT_RESULTS, NAMES, name_of
 from .uncertainty import correlations

@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._files import publish_npz, read_npz
-from ..engine.reads import reads
+from ..base.files import publish_npz, read_npz
+from ..base.reads import reads
 from .optimise import Position, Record, Task
 from .problem import Problem
 from .progress import FitProgress

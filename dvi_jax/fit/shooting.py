@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._checks import fraction, whole
-from .._integrate import integrate
-from .._solution import Save
+from ..base.checks import fraction, whole
+from ..integration.integrate import integrate
+from ..observe.solution import Save
 from .evaluation import Evaluation
 from .model import make_group, predict, specification, weighed
 from .observations import Observations

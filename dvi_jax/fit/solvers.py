@@ -7,7 +7,7 @@ import the package, and most programs never need them.
 import functools
 from typing import Any
 
-from .._checks import instance
+from ..base.checks import instance
 
 
 @functools.cache

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 import dvi_jax as dvi
 
-from ..engine.names import both_names
+from ..base.names import both_names
 from .extras import expect, needed
 from .fields import checked
 

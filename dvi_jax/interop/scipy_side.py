@@ -11,8 +11,8 @@ import numpy as np
 
 import dvi_jax as dvi
 
-from ..engine.names import both_names
-from ..engine.quantities import refuse_unit_or_mask
+from ..base.names import both_names
+from ..base.quantities import refuse_unit_or_mask
 from ..systems import Problem
 from .extras import needed, system_of
 

@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from lanewise.exact import two_sum
+from lanewise.rules.exact import two_sum
 
-from .._results import RESULTS
-from .._step import Equations
-from .._types import Interval, Scalar, State
+from ..base.results import RESULTS
+from ..base.signature import check_takes
+from ..base.types import Interval, Scalar, State
 from ..engine.rounding import one_by_one
-from ..engine.signature import check_takes
+from ..methods.step import Equations
 from ._base import Place, StepSizes, check_rounding, check_speed
 
 _MOST = 4.0

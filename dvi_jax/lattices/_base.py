@@ -9,15 +9,15 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PyTree
 
-from lanewise.jaxapi import is_traced
+from lanewise.jaxprs.jaxapi import is_traced
 
-from .._checks import whole
-from .._results import RESULTS
-from .._solution import Save, Solution
-from .._step import Equations
-from .._system import System
-from .._types import Args, Interval, Scalar, State
+from ..base.checks import whole
+from ..base.results import RESULTS
+from ..base.types import Args, Interval, Scalar, State
+from ..methods.step import Equations
 from ..observe import Stop
+from ..observe.solution import Save, Solution
+from ..problem.system import System
 
 
 class Place(NamedTuple):

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lanewise.jaxapi import is_traced
+from lanewise.jaxprs.jaxapi import is_traced
 
-from .._inputs import as_times
-from .._types import Interval
+from ..base.inputs import as_times
+from ..base.types import Interval
 from ._base import Lattice, check_num_steps
 
 

@@ -8,12 +8,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._inputs import start_state
-from .._solution import Save, Solution
-from .._system import System
-from .._types import Args, Bindable, Scalar, State
+from ..base.inputs import start_state
+from ..base.signature import check_takes
+from ..base.types import Args, Bindable, Scalar, State
 from ..engine.rounding import one_by_one
-from ..engine.signature import check_takes
 from ..observe import (
     Crossings,
     Deviations,
@@ -26,6 +24,8 @@ from ..observe import (
     has_initial_value,
     is_observable,
 )
+from ..observe.solution import Save, Solution
+from ..problem.system import System
 from ._base import Lattice, Run, check_speed
 from ._uniform import Uniform
 

@@ -4,7 +4,7 @@ import math
 
 import jax.numpy as jnp
 
-from .._types import Interval
+from ..base.types import Interval
 from ._base import StepSizes
 
 

@@ -11,13 +11,13 @@ from jaxtyping import Array, Int
 
 import lanewise
 
-from .._checks import one_of
-from .._energies import disturbing_work, incoming_energy, outgoing_energy
-from .._results import RESULTS
-from .._step import Equations, step
-from .._system import System
-from .._types import Args, Interval, Scalar, State
+from ..base.checks import one_of
+from ..base.results import RESULTS
+from ..base.types import Args, Interval, Scalar, State
 from ..engine.bracket import bracketed_root, divide
+from ..methods.step import Equations, step
+from ..problem.energies import disturbing_work, incoming_energy, outgoing_energy
+from ..problem.system import System
 from ._base import StepSizes, check_rounding
 
 Policy = Literal["stop", "hold", "minimise"]

@@ -8,10 +8,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from .._checks import instance
-from .._step import Equations, StepInfo
-from .._system import System
-from .._types import Args, Interval, State
+from ..base.checks import instance
+from ..base.types import Args, Interval, State
+from ..problem.system import System
+from .step import Equations, StepInfo
 
 
 class InLoop(NamedTuple):

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._step import Equations
-from .._types import Interval, Scalar, State
+from ..base.types import Interval, Scalar, State
 from ._base import Method
+from .step import Equations
 
 
 class Collocation(Method):

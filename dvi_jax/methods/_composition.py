@@ -12,11 +12,11 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from .._checks import whole
-from .._step import no_step_yet
+from ..base.checks import whole
 from ._base import Method, check_invertible
 from ._order_conditions import order_defects
 from ._type_ii import TypeII
+from .step import no_step_yet
 
 # The conditions of order n have 2^(n − 1) words: above order 12 the check takes longer than a run.
 _MOST_CHECKED = 12

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._step import Equations
-from .._types import Interval, State
+from ..base.types import Interval, State
 from ._base import Method
+from .step import Equations
 
 # Measured on a damped oscillator: from here on `Strang` with the same work is as accurate as the
 # triple jump. At 1 the map is singular.

@@ -8,11 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._checks import whole
-from .._implicit import Implicit
-from .._step import Equations, judge
-from .._types import Interval
+from ..base.checks import whole
+from ..base.types import Interval
 from ..engine.newton import find_root
+from ..problem.implicit import Implicit
 from ._collocation import (
     Collocation,
     coefficients,
@@ -21,6 +20,7 @@ from ._collocation import (
     legendre,
     legendre_slope,
 )
+from .step import Equations, judge
 
 # Order 16: the order conditions are tested up to there.
 _MOST_STAGES = 8

@@ -11,8 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from .._checks import whole
-from .._step import judge, no_solve
+from ..base.checks import whole
 from ..engine.newton import find_root
 from ._collocation import (
     Collocation,
@@ -23,6 +22,7 @@ from ._collocation import (
     legendre,
     legendre_slope,
 )
+from .step import judge, no_solve
 
 # Order 10: the order conditions are tested up to there.
 _MOST_STAGES = 6

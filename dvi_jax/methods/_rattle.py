@@ -5,12 +5,12 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jax import lax
 
-from lanewise.dependence import depends_on
+from lanewise.jaxprs.dependence import depends_on
 
-from .._constraint import Linear, gradient, own_coupling, root_solver, tangent, velocity_at
-from .._step import judge
 from ..engine.newton import find_root
 from ._base import Method
+from .constraint import Linear, gradient, own_coupling, root_solver, tangent, velocity_at
+from .step import judge
 
 
 class Rattle(Method):

@@ -2,9 +2,9 @@
 
 from typing import ClassVar
 
-from .._step import judge, no_solve
 from ._base import Method
 from ._collocation import continuous_rates
+from .step import judge, no_solve
 
 
 class RungeKutta4(Method):

@@ -12,18 +12,18 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from lanewise.dependence import depends_on
+from lanewise.jaxprs.dependence import depends_on
 
-from .._split import Split
-from .._step import Equations, StepInfo, judge, no_solve, no_step_yet
-from .._system import System
-from .._types import Interval, State
-from ..flows import Flow, Kepler, Known
+from ..base.types import Interval, State
+from ..problem.flows import Flow, Kepler, Known
+from ..problem.split import Split
+from ..problem.system import System
 from ._base import InLoop, Method
 from ._gauss_legendre import GaussLegendre
 from ._schemes import as_scheme, check_scheme, sequence_of
 from ._strang import Strang
 from ._type_ii import TypeII
+from .step import Equations, StepInfo, judge, no_solve, no_step_yet
 
 Moved = tuple[State, State, StepInfo]
 

@@ -8,14 +8,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._step import Equations
-from .._system import System
-from .._types import Interval, Scalar, State
-from ..noise import NoiseHamiltonians
+from ..base.types import Interval, Scalar, State
+from ..problem.noise import NoiseHamiltonians
+from ..problem.system import System
 from ._base import Method
 from ._composition import CompositionMethod
 from ._gauss_legendre import GaussLegendre
 from ._type_ii import TypeII
+from .step import Equations
 
 _LARGEST = 6.0
 """Largest increment of noise in a step that may be implicit, in standard deviations."""

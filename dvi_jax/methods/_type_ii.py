@@ -2,8 +2,8 @@
 
 from typing import ClassVar
 
-from .._step import inverse_step, step
 from ._base import Method
+from .step import inverse_step, step
 
 
 class TypeII(Method):

@@ -8,17 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from lanewise.dependence import depends_on
+from lanewise.jaxprs.dependence import depends_on
 
-from .. import _kepler
-from .._checks import one_of
-from .._step import Equations, judge, no_solve, no_step_yet
-from .._types import Args, Interval, State
+from ..base.checks import one_of
+from ..base.types import Args, Interval, State
 from ..engine.newton import find_root
-from ..flows import value_of
+from ..problem import kepler as _kepler
+from ..problem.flows import value_of
 from ._schemes import ORDERS_OF_CORRECTORS, as_scheme, check_scheme, corrector, joined
 from ._splitting import Part, SplittingMethod, Stage
 from ._strang import Strang
+from .step import Equations, judge, no_solve, no_step_yet
 
 Coordinates = Literal["jacobi", "democratic"]
 

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 
 import lanewise
 
-from .._constraint import Linear, velocity_at
-from .._step import Equations
-from .._types import Interval
+from ..base.types import Interval
+from ..methods.constraint import Linear, velocity_at
+from ..methods.step import Equations
 
 
 class ConstraintForce(eqx.Module):

@@ -11,10 +11,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from lanewise.jaxapi import is_traced
+from lanewise.jaxprs.jaxapi import is_traced
 
-from .._checks import whole
-from .._types import Scalar
+from ..base.checks import whole
+from ..base.types import Scalar
 from ._reductions import Reduction
 
 _FEW = 12

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._checks import one_of, whole
-from .._types import Args, Scalar, State
-from ..engine.signature import check_takes
+from ..base.checks import one_of, whole
+from ..base.signature import check_takes
+from ..base.types import Args, Scalar, State
 from ._reductions import Reduction
 
 _UNLESS_FIRST = 2

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from .._types import Scalar
+from ..base.types import Scalar
 
 
 class Reduction(eqx.Module):

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 from jaxtyping import PyTree
 
-from ..engine.signature import accepts, signature_of
+from ..base.signature import accepts, signature_of
 from ._reductions import Reduction, Running, is_observable
 
 FORMS = "(q, p), (t, q, p, args) or (t0, t1, q0, p0, q1, p1, args)"

@@ -13,7 +13,7 @@ from matplotlib.colors import ListedColormap, LogNorm, Normalize
 from matplotlib.lines import Line2D
 from matplotlib.transforms import ScaledTranslation
 
-from .._checks import instance
+from ..base.checks import instance
 from .style import GUIDE, HATCH, PALE, SHADES, figure_of
 
 _PIECE = 20_000

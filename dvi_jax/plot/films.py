@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from PIL import Image
 
-from .._checks import one_of, positive
+from ..base.checks import one_of, positive
 from . import series
 from .axes import legend
 from .orbits import Plane, phase_portrait, view_of

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.patches import Ellipse
 
-from .._checks import instance
+from ..base.checks import instance
 from . import axes as draw
 from .axes import canvas, counted, entry, labels_of, legend, stack
 from .states import chosen

@@ -7,7 +7,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.ticker import LogFormatterMathtext, LogLocator
 
-from .._checks import instance
+from ..base.checks import instance
 from .axes import at_most, canvas, cell_edges, stack
 from .blocks import Bins, make_bins
 from .style import check_keywords, named

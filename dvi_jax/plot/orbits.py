@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
-from .._checks import positive, whole
+from ..base.checks import positive, whole
 from .axes import at_most, canvas, entry, labels_of, legend, path, stack
 from .states import Lane, Looks, chosen, indexed, lanes_of, looks_of, one_shape, place_in, troubles
 from .style import COLOURS, CROSS, DASHES, MARKS, STAR, START, in_style, look_of, named

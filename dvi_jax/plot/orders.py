@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.patches import Patch
 
-from .._checks import one_of
+from ..base.checks import one_of
 from ..discover import DriftOrder, DriftSurface
 from . import axes as draw
 from .axes import canvas, counted, entry, legend, stack

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.colors import to_rgba_array
 
-from .._checks import whole
-from .._results import status_name
+from ..base.checks import whole
+from ..base.results import status_name
 from .axes import at_edge, canvas, check_shapes, counted, labels_of, legend
 from .states import component, looks_of
 from .style import COLOURS, GREY, SMALL, in_style, look_of

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .._checks import one_of
+from ..base.checks import one_of
 from .axes import at_most, canvas, check_shapes, counted, envelope, guide, labels_of, legend, stack
 from .states import Lane, each_state, lanes_of, looks_of, troubles
 from .style import COLOURS, CROSS, DASHES, GREY, GUIDE, SMALL, in_style, look_of, named, signed

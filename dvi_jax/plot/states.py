@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from matplotlib.cm import ScalarMappable
 
-from .._checks import whole
+from ..base.checks import whole
 from .axes import check_shapes, counted, entry, labels_of, legend, scale_of
 from .style import COLOURS, CROSS, DASHES, PALE, SHADES, Look, named
 

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.colors import BoundaryNorm, CenteredNorm, ListedColormap, LogNorm
 from matplotlib.patches import Patch
 
-from .._checks import one_of
+from ..base.checks import one_of
 from .axes import at_edge, cells, entry, flat_cells, legend, scale_of
 from .blocks import REDUCTIONS, Lines, Picture, count_codes, reduced
 from .grid import Grid, arrange, checked_array, dim_of, label_of, names_of, two_numbers

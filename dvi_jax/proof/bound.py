@@ -8,17 +8,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._arithmetic import DoubleDouble, FixedPoint, FloatingPoint
-from .._checks import finite, positive, whole
-from .._integrator import Integrator, chosen, only
-from .._precision import refuse_double_without_x64
-from .._step import Equations
-from .._system import System, check_system, of_problem
-from .._types import Interval
-from ..discover.basis import check_step_size
-from ..discover.found import Discovery
-from ..discover.series import InvariantSeries
-from ..engine.threads import processors
+from ..base.checks import finite, positive, whole
+from ..base.precision import refuse_double_without_x64
+from ..base.threads import processors
+from ..base.types import Interval
+from ..discover.functions.basis import check_step_size
+from ..discover.invariants.found import Discovery
+from ..discover.invariants.series import InvariantSeries
+from ..integration.arithmetic import DoubleDouble, FixedPoint, FloatingPoint
+from ..integration.integrator import Integrator, chosen, only
+from ..methods.step import Equations
+from ..problem.system import System, check_system, of_problem
 from .components import Unsupported, program_of
 from .confinement import confine
 from .rational import ExactInvariant

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lanewise.jaxapi import ClosedJaxpr, Literal, scan_counts
+from lanewise.jaxprs.jaxapi import ClosedJaxpr, Literal, scan_counts
 
 UNARY = ("exp", "log", "sin", "cos", "tan", "atan", "asin", "acos", "sqrt")
 _MOVES = (

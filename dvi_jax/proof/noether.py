@@ -7,13 +7,13 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .._energies import disturbing_work, outgoing_energy
-from .._inputs import start_state
-from .._step import Equations
-from .._system import check_system, of_problem
-from .._types import Args, Interval
-from ..discover.generators import Generator, LatticePoint
-from ..discover.noether import AdiabaticInvariant, Gauge, noether_identity
+from ..base.inputs import start_state
+from ..base.types import Args, Interval
+from ..discover.functions.generators import Generator, LatticePoint
+from ..discover.symmetries.noether import AdiabaticInvariant, Gauge, noether_identity
+from ..methods.step import Equations
+from ..problem.energies import disturbing_work, outgoing_energy
+from ..problem.system import check_system, of_problem
 from .components import program_of
 from .tools import tools
 

@@ -6,10 +6,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .._checks import finite, instance
-from .._types import Scalar, State
-from ..discover.basis import BoundBasis
-from ..discover.series import InvariantSeries
+from ..base.checks import finite, instance
+from ..base.types import Scalar, State
+from ..discover.functions.basis import BoundBasis
+from ..discover.invariants.series import InvariantSeries
 from .tools import tools
 
 _DROP = 1e-9  # Coefficients below this share of the largest are rounding

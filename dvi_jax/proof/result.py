@@ -10,8 +10,8 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from .._checks import finite
-from .._files import publish
+from ..base.checks import finite
+from ..base.files import publish
 from .tools import combination, tools
 
 

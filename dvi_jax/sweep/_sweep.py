@@ -8,18 +8,18 @@ from typing import Any
 import jax
 import numpy as np
 
-from lanewise.jaxapi import x64_enabled
+from lanewise.jaxprs.jaxapi import x64_enabled
 
-from .._checks import instance, whole
-from .._integrate import integrate
-from .._integrator import chosen
-from .._memory import machine_memory
-from .._system import System, check_system, of_problem
-from ..engine.keywords import INTEGRATOR, taken, with_keywords_of
-from ..engine.names import both_names
+from ..base.checks import instance, whole
+from ..base.keywords import INTEGRATOR, taken, with_keywords_of
+from ..base.machine import machine_memory
+from ..base.names import both_names
+from ..integration.integrate import integrate
+from ..integration.integrator import chosen
 from ..lattices import Given, Lattice
 from ..methods import Method
-from ..noise import as_path
+from ..problem.noise import as_path
+from ..problem.system import System, check_system, of_problem
 from .axes import Axis, as_axis, axes_in, is_axis, lengths
 from .bar import shown
 from .cost import SweepCost, cost

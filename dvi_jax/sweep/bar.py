@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from .._progress import bar_of, told
+from ..base.progress import bar_of, told
 from .cost import span
 from .workers import SweepProgress
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import jax
 
-from lanewise.jaxapi import backends_are_initialized, x64_enabled
+from lanewise.jaxprs.jaxapi import backends_are_initialized, x64_enabled
 
 from .plan import Plan
 from .program import Program, Sweep

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from .._results import STATUS_NAMES
+from ..base.results import STATUS_NAMES
 
 
 @contextlib.contextmanager

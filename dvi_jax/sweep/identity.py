@@ -19,10 +19,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lanewise.extent import functions_in
-from lanewise.jaxapi import ClosedJaxpr, bodies, is_traced
+from lanewise.jaxprs.extent import functions_in
+from lanewise.jaxprs.jaxapi import ClosedJaxpr, bodies, is_traced
 
-from ..engine.signature import accepts
+from ..base.signature import accepts
 from .axes import axes_in, is_axis
 from .plan import Plan
 from .program import Sweep, stacked

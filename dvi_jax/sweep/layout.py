@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from .._files import TEMPORARY, sync
-from .._results import STATUS_NAMES
+from ..base.files import TEMPORARY, sync
+from ..base.results import STATUS_NAMES
 from .identity import FORMAT, digest
 from .plan import Plan, Task
 from .variables import ARRAY_NAMES, Variable, is_array_name

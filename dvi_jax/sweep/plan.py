@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .._checks import whole
+from ..base.checks import whole
 
 WORK, SMALLEST_WORK = 2**28, 2**22
 """Trajectory steps of one task: some tenths of a second of work; and the least number for which a

@@ -13,13 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lanewise.jaxapi import ClosedJaxpr, x64_enabled
+from lanewise.jaxprs.jaxapi import ClosedJaxpr, x64_enabled
 
-from .._integrate import integrate
-from .._results import status_code
-from .._solution import Save
-from ..engine.reads import Reads, reads
+from ..base.reads import Reads, reads
+from ..base.results import status_code
+from ..integration.integrate import integrate
 from ..lattices import Given
+from ..observe.solution import Save
 from .axes import is_axis, place
 from .plan import Plan, Task
 from .starts import Starts

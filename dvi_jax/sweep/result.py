@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .._results import STATUS_NAMES
+from ..base.results import STATUS_NAMES
 from .layout import STATUS, about_variable
 from .store import Memory, Store, StoreError, Verification
 

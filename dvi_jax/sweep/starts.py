@@ -13,8 +13,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from .._checks import finite, function, whole
-from .._types import Args, Scalar
+from ..base.checks import finite, function, whole
+from ..base.types import Args, Scalar
 from ..engine.bracket import bracketed_root
 
 _TRIES = 64

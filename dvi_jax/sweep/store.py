@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .._files import TEMPORARY, publish
-from .._results import STATUS_NAMES
+from ..base.files import TEMPORARY, publish
+from ..base.results import STATUS_NAMES
 from .claims import claim
 from .identity import FORMAT, differences, digest
 from .layout import STATUS, TASKS, StoreError as StoreError, as_store_error, make, shard, storable

@@ -16,10 +16,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from lanewise.jaxapi import x64_enabled
+from lanewise.jaxprs.jaxapi import x64_enabled
 
-from .._results import STATUS_NAMES
-from ..engine.threads import processors
+from ..base.results import STATUS_NAMES
+from ..base.threads import processors
 from .layout import STATUS
 from .plan import Task
 from .program import Program

@@ -32,17 +32,17 @@ from .n_body import n_body as n_body
 from .nls_lattice import nls_lattice as nls_lattice
 from .oblate_kepler import oblate_kepler as oblate_kepler
 from .oscillator import oscillator as oscillator
-from .outer_solar_system import outer_solar_system as outer_solar_system
 from .pendulum import pendulum as pendulum
 from .perturbed_pendulum import perturbed_pendulum as perturbed_pendulum
-from .polar_motion import polar_motion as polar_motion
+from .planets.outer_solar_system import outer_solar_system as outer_solar_system
+from .planets.polar_motion import polar_motion as polar_motion
+from .planets.solar_system import solar_system as solar_system
 from .pythagorean import pythagorean as pythagorean
 from .relativistic_kepler import relativistic_kepler as relativistic_kepler
 from .restricted_three_body import restricted_three_body as restricted_three_body
 from .rigid_body import rigid_body as rigid_body
 from .rotating_bodies import heavy_top as heavy_top, satellite as satellite
 from .slow_oscillator import slow_oscillator as slow_oscillator
-from .solar_system import solar_system as solar_system
 from .spinning_top import spinning_top as spinning_top
 from .stiff_fput import stiff_fput as stiff_fput
 from .thermal import double_well as double_well, thermal_chain as thermal_chain

@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._checks import finite as finite, positive as positive
-from .._system import System
-from ..discover.generators import Generator
-from ..discover.library import time_translation
-from ..noise import Langevin
+from ..base.checks import finite as finite, positive as positive
+from ..discover.functions.generators import Generator
+from ..discover.symmetries.library import time_translation
+from ..problem.noise import Langevin
+from ..problem.system import System
 
 DIMENSIONLESS = {"q": "1", "p": "1", "t": "1", "energy": "1"}
 """Units of a dimensionless system."""

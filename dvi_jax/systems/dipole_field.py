@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from ..discover.library import rotation
+from ..discover.symmetries.library import rotation
 from . import _guiding_centre as guiding_centre
 from ._problem import Parameter, Problem, Start, gyrates, library_problem, positive
 

@@ -2,8 +2,8 @@
 
 import jax.numpy as jnp
 
-from .._kepler import change
-from ..discover.library import rotation, scaling
+from ..discover.symmetries.library import rotation, scaling
+from ..problem.kepler import change
 from ._problem import Parameter, Problem, Start, library_problem, over_times
 
 
@@ -29,7 +29,8 @@ def angular_momentum(t0, t1, q0, p0, q1, p1, args):
 
 @over_times((2,))
 def exact(t, q0, p0, args):
-    """The state at times t at ε = 0, on an orbit of any eccentricity (`dvi_jax._kepler.change`).
+    """The state at times t at ε = 0, on an orbit of any eccentricity
+    (`dvi_jax.problem.kepler.change`).
 
     Differentiable in t, q0, p0 and K.
     """

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from ..discover.library import rotation
+from ..discover.symmetries.library import rotation
 from . import _guiding_centre as guiding_centre
 from ._problem import Parameter, Problem, Start, at_end, finite, gyrates, library_problem, positive
 

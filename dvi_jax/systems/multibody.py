@@ -6,7 +6,7 @@ Positions are Cartesian. A rod of the vector a and the length l is the constrain
 import jax.numpy as jnp
 import numpy as np
 
-from .._checks import whole
+from ..base.checks import whole
 from ._problem import Parameter, Problem, Start, finite, library_problem, over_times
 from .spinning_top import exact as exact_of_top
 

@@ -6,9 +6,9 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from .._system import System
-from ..discover.generators import Generator
-from ..discover.library import rotation, scaling, space_translation, time_translation
+from ..discover.functions.generators import Generator
+from ..discover.symmetries.library import rotation, scaling, space_translation, time_translation
+from ..problem.system import System
 from ._problem import (
     DIMENSIONLESS,
     Problem,

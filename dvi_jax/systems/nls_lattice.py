@@ -9,7 +9,7 @@ canonical in another bracket only.)
 import jax.numpy as jnp
 import numpy as np
 
-from .._checks import whole
+from ..base.checks import whole
 from ._problem import Parameter, Problem, Start, finite, library_problem
 from .oscillator import PHASE
 

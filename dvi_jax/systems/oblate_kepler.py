@@ -5,7 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ..discover.library import rotation
+from ..discover.symmetries.library import rotation
 from ._problem import Parameter, Problem, Start, finite, library_problem
 
 

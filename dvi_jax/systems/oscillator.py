@@ -2,8 +2,8 @@
 
 import jax.numpy as jnp
 
-from ..discover.generators import Generator
-from ..discover.library import scaling
+from ..discover.functions.generators import Generator
+from ..discover.symmetries.library import scaling
 from ._problem import Problem, Start, at_end, library_problem, over_times
 
 PHASE = Generator(xi=lambda t, q, p, args: p, eta=lambda t, q, p, args: -q)

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from ..discover.library import rotation
+from ..discover.symmetries.library import rotation
 from ._problem import Parameter, Problem, Start, at_end, library_problem
 from .kepler import angular_momentum
 

@@ -16,8 +16,8 @@ at L = ±G (and k is undefined at K = ±G).
 import jax.numpy as jnp
 import numpy as np
 
-from ..discover.generators import Generator
-from ..discover.library import scaling, space_translation
+from ..discover.functions.generators import Generator
+from ..discover.symmetries.library import scaling, space_translation
 from ._elliptic import first_kind, jacobi, third_kind
 from ._problem import Parameter, Problem, Start, library_problem, over_times
 

@@ -5,7 +5,7 @@ from typing import Literal
 import jax.numpy as jnp
 import numpy as np
 
-from .._checks import one_of
+from ..base.checks import one_of
 from . import rigid
 from ._problem import Parameter, Problem, Start, library_problem, over_times, vector
 from .spinning_top import exact as exact_of_top

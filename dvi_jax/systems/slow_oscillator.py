@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from ..discover.library import scaling
+from ..discover.symmetries.library import scaling
 from ._problem import Adiabatic, Parameter, Problem, Start, at_end, between, library_problem
 from .oscillator import exact as of_oscillator
 

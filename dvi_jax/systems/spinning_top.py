@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from ..discover.library import space_translation
+from ..discover.symmetries.library import space_translation
 from ._elliptic import first_kind, jacobi, third_kind
 from ._problem import Parameter, Problem, Start, library_problem, over_times
 

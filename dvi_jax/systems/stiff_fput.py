@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from .._checks import whole
+from ..base.checks import whole
 from ._problem import Adiabatic, Parameter, Problem, Start, library_problem, positive
 
 

@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 
-from .._checks import whole
-from ..discover.library import space_translation
+from ..base.checks import whole
+from ..discover.symmetries.library import space_translation
 from ._problem import Problem, Start, library_problem
 
 

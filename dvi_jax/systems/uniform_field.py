@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from ..discover.generators import Generator
+from ..discover.functions.generators import Generator
 from ._problem import Parameter, Problem, Start, gyrates, library_problem, over_times, vector
 
 

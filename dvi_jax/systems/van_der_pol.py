@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from ..discover.library import scaling
+from ..discover.symmetries.library import scaling
 from ._problem import Problem, Start, library_problem
 from .oscillator import PHASE, exact, hamiltonian
 

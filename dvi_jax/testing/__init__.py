@@ -21,6 +21,7 @@ Each check is itself tested: `CONTROLS` are methods with one defect, which it mu
 """
 
 from .candidate import Candidate as Candidate
+from .certificate import Certificate as Certificate, certify as certify
 from .check import (
     CHECKS as CHECKS,
     Check as Check,
@@ -44,4 +45,5 @@ from .checks import (
     symplectic_defect as symplectic_defect,
 )
 from .controls import CONTROLS as CONTROLS, Control as Control, altered as altered
+from .page import page_for as page_for
 from .registry import METHODS as METHODS, QUICK as QUICK

@@ -15,9 +15,9 @@ from .loader import Loader
 
 def public(base: type, *without: type) -> dict[str, type]:
     """The public classes of the package that are subclasses of `base`, by name."""
-    # In the package of `base`: `dvi_jax` itself has some of its names after their first use only.
-    package = sys.modules[base.__module__.rpartition(".")[0]]
-    classes = {n: c for n, c in vars(package).items() if isinstance(c, type)}
+    # `dvi_jax` has some of its names after their first use only: the folder of `base` has them.
+    folder = sys.modules[".".join(base.__module__.split(".")[:2])]
+    classes = {n: c for n, c in {**vars(dvi), **vars(folder)}.items() if isinstance(c, type)}
     return {
         n: c
         for n, c in classes.items()

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import dvi_jax as dvi
-from dvi_jax.engine.signature import accepts
+from dvi_jax.base.signature import accepts
 from dvi_jax.systems.n_body import linear_momentum
 
 from .._errors import InputError, known, require

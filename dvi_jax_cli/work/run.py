@@ -10,7 +10,7 @@ import numpy as np
 
 import dvi_jax as dvi
 from dvi_jax import plot
-from dvi_jax.systems.solar_system import check_covered
+from dvi_jax.systems.planets.solar_system import check_covered
 
 from .._errors import InputError
 from .._show import Table

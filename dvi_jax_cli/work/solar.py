@@ -8,7 +8,7 @@ import numpy as np
 import dvi_jax as dvi
 from dvi_jax import plot
 from dvi_jax.systems.n_body import OBSERVABLES
-from dvi_jax.systems.solar_system import (
+from dvi_jax.systems.planets.solar_system import (
     AU_IN_KM,
     BODIES,
     GM,

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 import dvi_jax as dvi
-from dvi_jax import rings, systems
-from dvi_jax.engine.signature import accepts
-from dvi_jax.systems.solar_system import EphemerisMissing, julian_date
+from dvi_jax import systems
+from dvi_jax.base.signature import accepts
+from dvi_jax.systems import rings
+from dvi_jax.systems.planets.solar_system import EphemerisMissing, julian_date
 
 from .._errors import InputError, known, require, shown
 from .expressions import parse_method

@@ -12,6 +12,7 @@ from jax.extend.core import jaxpr_as_fun
 
 import dvi_jax as dvi
 import lanewise
+from dvi_jax.base.results import status_code
 
 COPIES = 6
 """Perturbed copies of each start, which show how much round-off grows along the trajectory."""
@@ -38,7 +39,7 @@ def _numbers(solution: Any) -> dict[str, Any]:
     stop = () if solution.stop is None else tuple(solution.stop)
     return {
         "states": (solution.ts, solution.qs, solution.ps, solution.observed, stop),
-        "status": dvi._results.status_code(solution.result),
+        "status": status_code(solution.result),
         "failed_step": solution.stats["failed_step"],
     }
 
@@ -230,7 +231,7 @@ def _loss(numbers: dict[str, Any], xp: Any) -> Any:
     """Of one trajectory; NaN if it fails, though it may be after all that is saved."""
     _, qs, ps, observed, _ = numbers["states"]
     total = sum(xp.sum(xp.tanh(x)) for x in [qs, ps, *jax.tree.leaves(observed)])
-    fine = [numbers["status"] == dvi._results.status_code(kind)
+    fine = [numbers["status"] == status_code(kind)
             for kind in (dvi.RESULTS.successful, dvi.RESULTS.stopped)]  # fmt: skip
     return xp.where(fine[0] | fine[1], total, xp.nan)
 

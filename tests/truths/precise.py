@@ -35,7 +35,7 @@ from jax.interpreters import partial_eval  # noqa: E402
 
 import dvi_jax as dvi  # noqa: E402
 import truths  # noqa: E402
-from dvi_jax.discover.basis import bind_basis  # noqa: E402
+from dvi_jax.discover.functions.basis import bind_basis  # noqa: E402
 
 mpmath.mp.dps = 60
 mpf = mpmath.mpf

@@ -8,7 +8,7 @@ rotations.
 # ruff: noqa: F403, F405 (the vocabulary of the tables is `maps`)
 
 import dvi_jax as dvi
-from dvi_jax.discover.library import rotation, space_translation
+from dvi_jax.discover.symmetries.library import rotation, space_translation
 
 from . import case, gauge, named, symmetry
 from .maps import *

@@ -11,8 +11,8 @@ the weight of the action: a scaling is variational if it leaves p·dq and H dt a
 import numpy as np
 from exact_series import vector
 
-from dvi_jax.discover.generators import Generator
-from dvi_jax.discover.library import (
+from dvi_jax.discover.functions.generators import Generator
+from dvi_jax.discover.symmetries.library import (
     boost,
     hamiltonian_flow,
     rotation,

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ..._checks import function, instance
+from ...base.checks import function, instance
 from ...sweep.starts import Seeded
 from ._field import Field, polynomial
 from ._particles import GuidingCentres, check_range

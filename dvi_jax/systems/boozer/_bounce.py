@@ -18,7 +18,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..._checks import instance, positive
+from ...base.checks import instance, positive
 from ...engine.bracket import bracketed_root
 from ._field import Field, polynomial
 from ._motion import Angles, Regular, flux, speed_along

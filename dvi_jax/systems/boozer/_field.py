@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..._checks import finite, positive, whole
+from ...base.checks import finite, positive, whole
 from ._sums import Coefficients, Shape, total
 
 Profile = Float[Array, " d"]

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..._checks import positive
+from ...base.checks import positive
 from ._field import Field, fitted_modes, from_modes, from_surfaces
 from ._sums import Coefficients, Shape, total
 

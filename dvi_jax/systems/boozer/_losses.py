@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..._checks import positive
+from ...base.checks import positive
 
 
 class LossFraction(NamedTuple):

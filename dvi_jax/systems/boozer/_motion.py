@@ -21,7 +21,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..._implicit import Implicit
+from ...problem.implicit import Implicit
 from ._field import Field, polynomial
 from ._sums import total
 

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..._checks import finite, instance, one_of, positive
-from ..._discretise import discretise
-from ..._system import System
+from ...base.checks import finite, instance, one_of, positive
 from ...observe import Crossings, Section, Stop
+from ...problem.discretise import discretise
+from ...problem.system import System
 from ._bounce import Pitch, SecondInvariant, at_crossings, complete
 from ._classes import Trapping, largest_strength
 from ._field import Field, polynomial

@@ -11,13 +11,13 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from ..._checks import instance, positive, whole
-from ..._integrate import integrate
-from ..._results import RESULTS
-from ..._reversible import Reversible
-from ..._solution import Save
+from ...base.checks import instance, positive, whole
+from ...base.results import RESULTS
+from ...integration.integrate import integrate
+from ...integration.reversible import Reversible
 from ...methods import GaussLegendre
 from ...observe import Mean
+from ...observe.solution import Save
 from ._field import Field
 from ._motion import flux
 from ._particles import GuidingCentres

@@ -4,9 +4,9 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from ..._checks import instance, whole
-from ...discover.basis import AbstractBasis, Basis, BoundBasis
-from ...discover.families import Polynomials
+from ...base.checks import instance, whole
+from ...discover.functions.basis import AbstractBasis, Basis, BoundBasis
+from ...discover.functions.families import Polynomials
 from ._field import Field
 
 

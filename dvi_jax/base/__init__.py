@@ -1,0 +1,1 @@
+"""What every other part uses, without mechanics: types, statuses, checks, files."""

@@ -1,0 +1,87 @@
+"""A batch as one array program over several devices, on one host or on many."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jax.sharding import AxisType, PartitionSpec
+
+from .checks import function as check_function, instance, whole
+
+LANES = "lanes"
+"""The name of the axis of devices."""
+
+
+def over_devices(
+    function: Callable[..., Any],
+    devices: Sequence[Any] | None = None,
+    in_axes: int | Sequence[int | None] | None = 0,
+    out_axes: int = 0,
+) -> Callable[..., Any]:
+    """The batched `function` with its batch divided between devices, as one array program.
+
+    ``jax.jit(dvi.over_devices(jax.vmap(one)))(q0, p0)`` returns the same as
+    ``jax.jit(jax.vmap(one))(q0, p0)``; each device computes its part of the batch. It can be
+    differentiated and compiled like any function: for a mean over all trajectories and its
+    gradient, for instance. Under `jax.distributed.initialize` the devices are those of all hosts,
+    which run the same program. For independent trajectories use `sweep`, which loses nothing when a
+    host fails.
+
+    **Arguments**
+
+    - `function`: batched, with elements that do not depend on each other.
+    - `devices`: None means all of `jax.devices()`.
+    - `in_axes`: the batch axis of all arguments, or of each; None for an argument without one.
+    - `out_axes`: the batch axis of every output array.
+
+    **Raises** `ValueError` for a batch that the number of devices does not divide; `TypeError` for
+    an object that is not a function.
+    """
+    check_function("the argument of over_devices", function, hint="Give jax.vmap(f), for example.")
+    chosen = np.asarray(jax.devices() if devices is None else list(devices))
+    if chosen.size == 0:
+        raise ValueError("devices is empty: give at least one, or leave devices out to use all.")
+    whole("out_axes", out_axes, least=0)
+    # Auto: shardings of arguments outside are left to JAX, and need not be declared.
+    mesh = jax.sharding.Mesh(chosen, (LANES,), axis_types=(AxisType.Auto,))
+
+    def call(*args: Any) -> Any:
+        given: Any = in_axes
+        each = list(given) if isinstance(given, list | tuple) else [given] * len(args)
+        if len(each) != len(args):
+            raise ValueError(
+                "in_axes must be an integer, None, or a list with one entry for each argument. The "
+                f"function was called with {len(args)} arguments, but in_axes is {in_axes!r}, of "
+                f"length {len(each)}."
+            )
+        for axis in each:
+            instance("each entry of in_axes", axis, int | None, "a whole number or None")
+        specs = tuple(
+            jax.tree.map(lambda x, i=i: _spec(x, i, each[i], chosen.size), argument)
+            for i, argument in enumerate(args)
+        )
+        out = PartitionSpec(*(None,) * out_axes, LANES)
+        # With check_vma=True there would be no reversible gradient: `integration/reversible.py`.
+        mapped = jax.shard_map(function, mesh=mesh, in_specs=specs, out_specs=out, check_vma=False)
+        return mapped(*args)
+
+    return call
+
+
+def _spec(x: Any, i: int, axis: int | None, count: int) -> PartitionSpec:
+    if axis is None:
+        return PartitionSpec()
+    shape = np.shape(x)
+    if not -len(shape) <= axis < len(shape):
+        raise ValueError(
+            f"in_axes must give an axis of each array, got axis {axis} for an array of shape "
+            f"{shape} in argument {i}, counted from 0. Use None for an argument without batch axis."
+        )
+    if shape[axis] % count:
+        raise ValueError(
+            f"the length of the batch axis must be a multiple of {count}, the number of devices, "
+            f"got {shape[axis]} (axis {axis} of shape {shape} in argument {i}, counted from 0). "
+            "Change the batch, or give fewer devices: devices=jax.devices()[:n]."
+        )
+    return PartitionSpec(*(None,) * (axis % len(shape)), LANES)

@@ -1,0 +1,151 @@
+"""The arguments of `integrate` as arrays of one precision."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from lanewise.jaxprs.jaxapi import is_traced
+
+from .precision import refuse_double_without_x64
+from .quantities import refuse_unit_or_mask
+
+
+def start_state(q0: Any, p0: Any) -> tuple[Array, Array]:
+    """Initial conditions as real arrays of one shape and precision. **Raises** `ValueError` or
+    `TypeError`."""
+    q, p = _real_array("q0", q0), _real_array("p0", p0)
+    if q.shape != p.shape:
+        raise ValueError(
+            f"q0 and p0 must have the same shape, got {q.shape} for q0 and {p.shape} for p0: give "
+            "one momentum for each position."
+        )
+    if q.size == 0:
+        raise ValueError(f"q0 must not be empty, got shape {q.shape}: give at least one position.")
+    if q.dtype != p.dtype:
+        dtype = jnp.result_type(q.dtype, p.dtype)
+        q, p = q.astype(dtype), p.astype(dtype)
+    # Half precision has at most three digits: neither a solve nor an invariant can be checked.
+    if q.dtype.itemsize < 4:
+        raise TypeError(f"q0 and p0 must be float32 or float64, got {q.dtype}: convert them.")
+    return q, p
+
+
+def as_times(of: str, ts: Any) -> Array:
+    """Times as an array of real numbers; `of`: the name of the call in messages."""
+    ts = _joined(ts)
+    if not is_traced(ts):
+        ts = _as_numpy("ts", ts)
+        refuse_double_without_x64("ts", ts.dtype)
+    if jnp.issubdtype(ts.dtype, jnp.integer):
+        ts = ts.astype(jnp.result_type(float))
+    if not jnp.issubdtype(ts.dtype, jnp.floating):
+        raise TypeError(f"ts in {of} must be real numbers, got dtype {ts.dtype}: use floats.")
+    return jnp.asarray(ts)
+
+
+def _joined(value: Any) -> Any:
+    """A list with traced numbers as one array, which NumPy cannot make."""
+    traced = isinstance(value, list | tuple) and any(is_traced(x) for x in jax.tree.leaves(value))
+    return jnp.asarray(value) if traced else value
+
+
+def _real_array(name: str, value: Any) -> Array:
+    value = _joined(value)
+    if isinstance(value, jax.Array) and is_traced(value):
+        kind = value.dtype
+    else:
+        # In NumPy: under jit, jax.numpy would give tracers even for values that are known.
+        value = _as_numpy(name, value)
+        kind = value.dtype
+        refuse_double_without_x64(name, kind)
+    if kind.kind == "c":
+        raise TypeError(
+            f"{name} must be real, got dtype {kind}. If its imaginary part is zero, take jnp.real. "
+            "Otherwise use real and imaginary parts as positions and momenta: for "
+            "ψ = (q0 + i p0)/√2 give q0 = √2 Re ψ and p0 = √2 Im ψ."
+        )
+    if not _is_real(kind):
+        seen = f": {value!s:.80}" if isinstance(value, np.ndarray) else ""
+        raise TypeError(f"{name} must be an array of real numbers, got dtype {kind}{seen}.")
+    # A traced value that is not finite becomes the status of its trajectory.
+    if isinstance(value, np.ndarray) and not np.isfinite(value).all():
+        where = tuple(np.argwhere(~np.isfinite(value))[0].tolist())
+        at = f" at index {list(where)}" if where else ""
+        raise ValueError(
+            f"{name} has a value that is not finite{at}: {value[where]}. "
+            "Every component of the initial conditions must be a finite number."
+        )
+    array = jnp.asarray(value)
+    return array.astype(jnp.result_type(float)) if kind.kind in "iu" else array
+
+
+def _is_real(dtype: Any) -> bool:
+    return dtype.kind in "fiu" or jnp.issubdtype(dtype, jnp.floating)  # bfloat16 has the kind "V"
+
+
+def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> Array:
+    """A number of this precision. **Raises** `ValueError` or `TypeError` with its name."""
+    value = _joined(value)
+    known = None if is_traced(value) else _as_numpy(name, value)
+    # Not for a Python float, which has no precision of its own and takes that of the state.
+    if isinstance(value, np.ndarray | np.generic) and value.dtype == np.float64:
+        refuse_double_without_x64(name, value.dtype)
+    kind, shape = (value.dtype, value.shape) if known is None else (known.dtype, known.shape)
+    if not _is_real(kind):
+        kind = type(value).__name__
+        raise TypeError(
+            f"{name} must be an integer or a floating-point number, got {value!r:.200} of type "
+            f"{kind}. Convert a real number x with float(x), or with x.real if its type is complex."
+        )
+    if shape != ():
+        raise ValueError(
+            f"{name} must be one number, got an array of shape {shape}. Call the function once for "
+            f"each value. For dvi.integrate you can use jax.vmap over {name}."
+            + (" Steps of different sizes need lattice=dvi.Given(ts)." if name == "h" else "")
+        )
+    if known is not None and not np.isfinite(known):
+        raise ValueError(f"{name} must be finite, got {known}.")
+    if known is not None and not zero_allowed and known == 0:
+        raise ValueError(
+            f"{name} must not be zero: no step would advance time. Give a positive h (forward) "
+            "or a negative h (backward)."
+        )
+    # Cast in NumPy: each operation of JAX on a known number would cost some ten microseconds.
+    return jnp.asarray(value, dtype) if known is None else jnp.asarray(known.astype(dtype))
+
+
+def _as_numpy(name: str, value: Any) -> np.ndarray:
+    refuse_unit_or_mask(name, value)
+    try:
+        return np.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise TypeError(
+            f"{name} must be a real number or an array of real numbers, got {value!r:.200}. Rows "
+            f"of nested lists must have the same length. NumPy reports: {error}"
+        ) from None
+
+
+def as_parameter(leaf: Any) -> Any:
+    """A leaf of args as an argument of a compiled program."""
+    if isinstance(leaf, np.ndarray | np.generic):
+        refuse_unit_or_mask("args", leaf)
+        leaf = np.asarray(leaf)
+        refuse_double_without_x64("args", leaf.dtype)
+        if leaf.dtype.kind in "OMm":
+            seen = f"dtype {leaf.dtype}: {leaf!s:.80}"
+            raise TypeError(f"args must contain arrays of numbers, got {seen}. Convert this array.")
+        return jnp.asarray(leaf)
+    if not isinstance(leaf, jax.Array):
+        # Everything but arrays is static: compiled programs are looked up by its hash.
+        try:
+            hash(leaf)
+        except TypeError:
+            raise TypeError(
+                "args must contain arrays, numbers or hashable objects, in dicts, lists and "
+                f"tuples, got {leaf!r:.80} of type {type(leaf).__name__}. Use an array or tuple."
+            ) from None
+    # A float becomes an array: a new value needs no new compilation, and has a derivative.
+    return jnp.asarray(leaf) if isinstance(leaf, float) else leaf

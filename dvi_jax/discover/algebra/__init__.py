@@ -1,0 +1,1 @@
+"""Null spaces of series, Taylor coefficients, changes above rounding."""

@@ -1,0 +1,153 @@
+"""Series that satisfy linear conditions Σ_{m≤k} A_{k−m} c_m = r_k, one order k after the other.
+
+The matrix is block-Toeplitz and lower triangular, so that one singular value decomposition of A_0
+serves all orders: its range is what c_k can correct. The matrix of all orders together has (z + 1)
+times as many rows and columns, and singular values that decrease as a power of those of A_0.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+Cut = Callable[[np.ndarray], int]
+"""How many singular values, descending and in units of a given one, are not zero."""
+
+
+def above(share: float) -> Cut:
+    """Those above a share of the unit."""
+    return lambda relative: int(np.sum(relative > share))
+
+
+class Split(NamedTuple):
+    """M = left · diag(singular) · right up to singular values that count as zero; `null`:
+    orthonormal columns that M takes to zero. `every`: all singular values, one for each column."""
+
+    left: np.ndarray
+    singular: np.ndarray
+    right: np.ndarray
+    null: np.ndarray
+    every: np.ndarray
+
+    @classmethod
+    def of(cls, matrix: np.ndarray, cut: Cut, unit: float | None = None) -> "Split":
+        """`unit`: of the singular values; the largest of them if left out."""
+        rows, columns = matrix.shape
+        if matrix.size == 0:
+            none = np.zeros((rows, 0)), np.zeros(0), np.zeros((0, columns))
+            return cls(*none, np.eye(columns), np.zeros(columns))
+        U, singular, V = np.linalg.svd(matrix, full_matrices=rows < columns)
+        every = np.append(singular, np.zeros(columns - len(singular)))
+        unit = max(every[0] if unit is None else unit, np.finfo(float).tiny)
+        kept = min(cut(every / unit), len(singular))
+        return cls(U[:, :kept], singular[:kept], V[:kept], V[kept:].T, every)
+
+    def outside(self, x: np.ndarray) -> np.ndarray:
+        """The part of columns that is orthogonal to the range."""
+        x = x - self.left @ (self.left.T @ x)
+        return x - self.left @ (self.left.T @ x)  # once more, for the rounding of the first time
+
+    def solved(self, x: np.ndarray) -> np.ndarray:
+        """The smallest y with M y = x, up to what is outside of the range."""
+        return self.right.T @ ((self.left.T @ x) / self.singular[:, None])
+
+
+class Secular(NamedTuple):
+    """The conditions that remain of the orders up to k, once c_m has corrected what it can at each
+    order m: on coefficients a of the series that begin with a null vector of A_0 at order 0, which
+    are the `first`, and later. `later`: the split of the conditions on those that begin later;
+    `rest`: of those on the first, outside of the range of the others."""
+
+    conditions: np.ndarray
+    first: int
+    later: Split
+    rest: Split
+
+    @classmethod
+    def of(cls, conditions: np.ndarray, first: int, cut: Cut, unit: float) -> "Secular":
+        later = Split.of(conditions[:, first:], cut, unit)
+        rest = Split.of(later.outside(conditions[:, :first]), cut, unit)
+        return cls(conditions, first, later, rest)
+
+    def solved(self, right: np.ndarray, leading: bool = True) -> np.ndarray:
+        """a by least squares; without `leading` by the series that begin later alone."""
+        a = self.rest.solved(self.later.outside(right))
+        a = a if leading else np.zeros_like(a)
+        return np.concatenate([a, self.later.solved(right - self.conditions[:, : self.first] @ a)])
+
+    def null(self) -> tuple[np.ndarray, np.ndarray]:
+        """a without a secular term, as columns: with an orthonormal first part, and without one."""
+        a, shifts = self.rest.null, self.later.null
+        later = -self.later.solved(self.conditions[:, : self.first] @ a)
+        return np.vstack([a, later]), np.vstack([np.zeros((self.first, shifts.shape[1])), shifts])
+
+
+class BlockTriangular:
+    """The conditions of all orders.
+
+    - `terms`: A_0 … A_z, shape (rows, z + 1, size). `cut`: see `Cut`.
+    - `free`: the coefficients that may differ from zero, shape (z + 1, size); all if left out.
+    - `unit`: of singular values; the largest of A_0 if left out.
+    """
+
+    def __init__(
+        self, terms: np.ndarray, cut: Cut, free: np.ndarray | None = None, unit: float | None = None
+    ):
+        orders, size = terms.shape[1:]
+        self.blocks = np.ascontiguousarray(np.moveaxis(terms, 1, 0))
+        self.free = np.ones((orders, size), bool) if free is None else free
+        self.steps: list[Split] = []
+        self.orders: list[Secular] = []
+        self.series = np.zeros((0, size, 0))
+        conditions, splits = np.zeros((0, 0)), {}
+        for k, some in enumerate(self.free):
+            key = some.tobytes()
+            if key not in splits:
+                splits[key] = Split.of(self.blocks[0][:, some], cut, unit)
+            step = splits[key]
+            unit = float(step.every.max(initial=0.0)) if unit is None else unit
+            defects = self.defects(self.series)
+            conditions = np.vstack([conditions, step.outside(defects)])
+            # At each order there begins a series with each null vector of A_0.
+            corrections = np.hstack([-step.solved(defects), step.null])
+            self.series = np.pad(self.series, np.array([(0, 1), (0, 0), (0, step.null.shape[1])]))
+            self.series[k, some] = corrections
+            conditions = np.pad(conditions, np.array([(0, 0), (0, step.null.shape[1])]))
+            self.steps.append(step)
+            first = self.steps[0].null.shape[1]
+            self.orders.append(Secular.of(conditions, first, cut, unit))
+
+    def defects(self, series: np.ndarray) -> np.ndarray:
+        """A_k c_0 + … + A_1 c_{k−1} of series of the orders below k, shape (k, size, count)."""
+        total = np.zeros((self.blocks.shape[1], series.shape[2]))
+        for m, c in enumerate(series):
+            total += self.blocks[len(series) - m] @ c
+        return total
+
+    def left_sides(self, series: np.ndarray) -> np.ndarray:
+        """A_k c_0 + … + A_0 c_k for each order of series, shape (orders, rows, count)."""
+        each = enumerate(series)
+        return np.stack([self.defects(series[:k]) + self.blocks[0] @ c for k, c in each])
+
+    def solved(self, right: np.ndarray, leading: bool = True) -> np.ndarray:
+        """A solution c, shape (orders, size, count), of the conditions of the first orders, with r
+        of shape (orders, rows, count); without `leading` one with c_0 = 0."""
+        found, secular = np.zeros((0, self.blocks.shape[2], right.shape[2])), []
+        for step, some, r in zip(self.steps, self.free, right, strict=False):
+            rest = r - self.defects(found)
+            secular.append(step.outside(rest))
+            found = np.pad(found, np.array([(0, 1), (0, 0), (0, 0)]))
+            found[-1, some] = step.solved(rest)
+        order = self.orders[len(right) - 1]
+        a = order.solved(np.concatenate(secular), leading)
+        return found + self.series[: len(right), :, : len(a)] @ a
+
+    def null(self, k: int) -> tuple[np.ndarray, np.ndarray]:
+        """Series that satisfy the conditions up to order k, shape (k + 1, size, count): those with
+        orthonormal c_0, and those with c_0 = 0."""
+        found = []
+        for a, leading in zip(self.orders[k].null(), (True, False), strict=True):
+            c = self.series[: k + 1, :, : len(a)] @ a
+            # Without a correction, rounding grows with each order.
+            found.append(c - self.solved(self.left_sides(c), leading) if k else c)
+        return found[0], found[1]

@@ -1,0 +1,1 @@
+"""Orders to which something is conserved, measured along trajectories."""

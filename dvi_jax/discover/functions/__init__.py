@@ -1,0 +1,1 @@
+"""Bases of functions, and points at which they are compared."""

@@ -1,0 +1,1 @@
+"""The search for conserved quantities, and its result."""

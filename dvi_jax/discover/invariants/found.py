@@ -1,0 +1,280 @@
+"""What discovery returns: the invariants, what is lost, and a report; saved and loaded."""
+
+import dataclasses
+import os
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ...base.files import publish_npz, read_npz
+from ...base.precision import refuse_double_without_x64
+from ...base.types import State
+from ..algebra.nullspace import CLEAR
+from ..functions.basis import AbstractBasis, BoundBasis, bind_basis
+from ..functions.sampling import Samples
+from .energy import Energy
+from .expansions import Larger
+from .obstructions import DriftLaw
+from .report import report
+from .series import InvariantSeries
+
+_ILL = 1e8  # Condition number of a basis from which on formulas have lost half of their digits
+
+
+class Discovery(eqx.Module):
+    """Result of `discover_invariants`.
+
+    The invariants:
+
+    - `coefficients`: shape (count, order + 1, basis size), of the independent invariants: those
+      that are conserved to rounding before approximate ones, and those with few terms before
+      others; count may be 0. `dependent`: the same for the others in the span, which are functions
+      of them (on the samples, as far as differentials show).
+    - `errors`: estimated errors of `inner_coefficients`, from the residual and the singular values
+      of the conditions; coefficients that are only rounding are exactly zero.
+    - `exact`: for each independent invariant, whether it is conserved at ε that are not small, to
+      round-off over many steps; not tried (False) at order 0.
+    - `leading_parts`: shape (families, basis size): a basis, orthonormal on the samples, of the
+      order-0 parts of *all* invariants in the span.
+    - `survivors`: for m = 0 … order, how many leading-order terms have an invariant of order m
+      (a constant does not count).
+    - `reach`: shape (count,): the ε at which corrections are as large as the leading-order term;
+      the series is of use far below it. Infinite without corrections.
+    - `obstructions`: a `DriftLaw` for each leading-order term that is lost at order 1, 2, …
+
+    How reliable they are:
+
+    - `singular_values`: of the system (for more than 1000 coefficients those of A_0 and of the
+      secular terms), descending, relative to the changes that the slopes of the functions predict
+      (with a tolerance, to the largest value); `gap`: the ratio at which they were cut (large is
+      clear, below 1e3 is not). `refused`: null vectors of the training
+      samples that change by more than rounding by their own measure, or that a lower order
+      rejects.
+    - `residuals`: shape (count, order + 1), on held-out points: the largest change over one
+      step at each order in ε · `scale`, relative to what the slopes of the leading-order term
+      predict, |∇I|·|Δz|, or to its spread over the samples where that is less.
+      `typical_residuals`: their median and 95 % quantile, shape (count, order + 1, 2).
+      `dependent_residuals`: as `residuals`.
+    - `undecided`: how many combinations of the functions change in the steps by less than 1000
+      times their rounding, or are null and change by more than rounding and less than 1e-6 of what
+      their slopes predict: whether they are conserved cannot be decided. `impossible`: whether as
+      many independent invariants were found as there are coordinates, with a tolerance or as
+      expansions, though the map moves; none is then reported.
+    - `larger`: how many are conserved at a larger step or on samples that spread wider, where those
+      given are so small that expansions are conserved as well; see `Larger`.
+    - `powers`: shape (count,), at order 0: the power of the size of the samples by which the
+      changes in a step grow. 0 is an exact invariant; an expansion about the middle of the
+      samples, cut off, has another power. NaN where it was not tried.
+    - `condition`: of `inner` on the samples, each function scaled to one size.
+
+    The functions:
+
+    - `basis`: φ, with `names`. `middle`: m, of z = (q, p, t), shape (2n + 1,). Where it is not
+      zero, the samples lie so far from the origin that polynomials lose digits there; they are
+      then taken about m: functions `inner` = `to_basis` @ φ + constants, with
+      `inner_coefficients` and `inner_dependent`. Formulas, values and laws are of those; values
+      differ from those of `coefficients` by a constant.
+    - `sizes`: shape (order + 1, basis size): size of a term with coefficient 1 on the samples, of
+      `inner`. `scale`: 1 over the ε at which the perturbation changes a step as much as H_D does.
+    - `slow_time`: of the system. `tolerance`: None, or that of approximate invariants.
+    - `energy`: how far the map conserves the energy, where no invariant found represents it, see
+      `Energy`; else None. `seconds`: time of the search.
+
+    On resonant or integrable systems the null space is large; on chaotic ones spurious near-null
+    vectors appear. Held-out residuals and `drift_order` on a long run decide.
+    """
+
+    inner_coefficients: Array
+    inner_dependent: Array
+    errors: np.ndarray
+    exact: tuple[bool, ...] = eqx.field(static=True)
+    leading_parts: np.ndarray
+    survivors: tuple[int, ...] = eqx.field(static=True)
+    singular_values: np.ndarray
+    gap: float = eqx.field(static=True)
+    refused: int = eqx.field(static=True)
+    residuals: np.ndarray
+    typical_residuals: np.ndarray
+    dependent_residuals: np.ndarray
+    undecided: int = eqx.field(static=True)
+    impossible: bool = eqx.field(static=True)
+    larger: tuple[Larger, ...] = eqx.field(static=True)
+    powers: np.ndarray
+    reach: np.ndarray
+    obstructions: tuple[DriftLaw, ...]
+    basis: BoundBasis
+    inner: BoundBasis
+    middle: np.ndarray
+    to_basis: np.ndarray
+    sizes: np.ndarray
+    condition: float = eqx.field(static=True)
+    scale: float = eqx.field(static=True)
+    probe: Samples
+    shape: tuple[int, ...] = eqx.field(static=True)
+    slow_time: bool = eqx.field(static=True)
+    tolerance: float | None = eqx.field(static=True)
+    energy: Energy | None = eqx.field(static=True, default=None)
+    seconds: float = eqx.field(static=True, default=float("nan"))
+
+    @property
+    def count(self) -> int:
+        """Number of independent invariants found."""
+        return self.inner_coefficients.shape[0]
+
+    @property
+    def coefficients(self) -> Array:
+        """Of the functions of `basis`, shape (count, order + 1, basis size)."""
+        return self._of_basis(self.inner_coefficients)
+
+    @property
+    def dependent(self) -> Array:
+        """The same for the invariants that are functions of those."""
+        return self._of_basis(self.inner_dependent)
+
+    def _of_basis(self, coefficients: Array) -> Array:
+        return coefficients @ self.to_basis if self.middle.any() else coefficients
+
+    @property
+    def order(self) -> int:
+        """z, the requested order."""
+        return len(self.survivors) - 1
+
+    @property
+    def invariants(self) -> list[InvariantSeries]:
+        """The independent invariants as observables."""
+        return self._series(self.inner_coefficients, self.errors)
+
+    @property
+    def dependent_invariants(self) -> list[InvariantSeries]:
+        """Those in the span that are functions of the independent ones."""
+        return self._series(self.inner_dependent, [None] * len(self.inner_dependent))
+
+    def _series(self, coefficients: Array, errors: Any) -> list[InvariantSeries]:
+        return [
+            InvariantSeries(self.inner, c, self.slow_time, sizes=self.sizes, errors=error)
+            for c, error in zip(coefficients, errors, strict=True)
+        ]
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Reasons why the result is not reliable, each with a remedy; empty if it is reliable."""
+        reasons = []
+        if self.survivors[0] and self.gap < CLEAR:
+            reasons.append("the gap is not clear: let drift_order on a long run decide")
+        if self.impossible:
+            reasons.append(
+                "as many independent invariants as coordinates were found, which is impossible "
+                "for a map that moves: none is reported; take a smaller tolerance, or samples "
+                "where functions change clearly in a step"
+            )
+        if self.undecided > 0:
+            reasons.append(
+                f"{self.undecided} combinations of the functions change in a step by less than "
+                "1000 times their rounding, or by hardly more than it: whether they are conserved "
+                "cannot be decided in this arithmetic; take another h, samples that spread wider, "
+                "or an origin among them"
+            )
+        reasons += filter(None, (other.warning(self.survivors[0]) for other in self.larger))
+        if self.condition > _ILL:
+            reasons.append(
+                f"the basis is ill-conditioned on the samples ({self.condition:.0e}): formulas "
+                "are not reliable; shift and scale the coordinates"
+            )
+        return tuple(reasons)
+
+    def evaluate(self, q: State, p: State, epsilon: Any, t: Any = 0.0) -> Array:
+        """The values of the independent invariants at a point, shape (count,)."""
+        powers = jnp.asarray(epsilon) ** jnp.arange(self.order + 1)
+        return jnp.einsum("m,kmb,b->k", powers, self.inner_coefficients, self.inner(q, p, t))
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write everything but the basis functions themselves to a file (NumPy's npz)."""
+        laws = [
+            {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in law._asdict().items()}
+            for law in self.obstructions
+        ]
+        plain, names = _fields()
+        about = {name: getattr(self, name) for name in plain}
+        about |= {"names": self.basis.names, "obstructions": laws}
+        arrays: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in names}
+        arrays |= {f"probe_{name}": x for name, x in self.probe._asdict().items()}
+        arrays["probe_values"] = _probed(self.basis, self.probe)
+        publish_npz(path, _FORMAT, about, arrays)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], basis: AbstractBasis) -> "Discovery":
+        """Read what `save` wrote; `basis` is the one that was searched (its names are compared).
+
+        **Raises** `FileNotFoundError` where there is no such file, `ValueError` for a file of
+        something else, or another basis.
+        """
+        refuse_double_without_x64("a saved Discovery", np.float64)
+        about, found = read_npz(path, _FORMAT, "discovery")
+        plain, names = _fields()
+        try:
+            # Files of earlier versions have no errors.
+            unknown = np.full_like(found["inner_coefficients"], np.nan)
+            arrays: dict[str, Any] = {"errors": unknown} | {
+                name: found[name] for name in names if name != "errors" or name in found
+            }
+            probe = Samples(*(found[f"probe_{name}"] for name in Samples._fields))
+            values = found["probe_values"]
+        except KeyError as error:
+            raise ValueError(
+                f"path must be a file of Discovery.save, but {os.fspath(path)} has no array "
+                f"{error}. Check the path, or repeat the search and save it."
+            ) from error
+        bound = bind_basis(basis, tuple(about["shape"]))
+        inner, to_basis = bound.about(arrays["middle"])
+        own, saved = list(bound.names), about["names"]
+        if own != saved:
+            pairs = enumerate(zip(own, saved, strict=False))
+            i = next((i for i, (a, b) in pairs if a != b), min(len(own), len(saved)))
+            there, here = (repr(x[i]) if i < len(x) else "missing" for x in (saved, own))
+            raise ValueError(
+                f"basis must be the basis of the search saved in {os.fspath(path)}. The number of "
+                f"functions is {len(saved)} in the file and {len(own)} in basis. The function with "
+                f"index {i} is {there} in the file and {here} in basis."
+            )
+        differs = ~np.isclose(_probed(bound, probe), values, rtol=1e-9)
+        if differs.any():
+            raise ValueError(
+                f"basis must be the basis of the search saved in {os.fspath(path)}, but the values "
+                f"of {bound.names[int(np.argmax(differs.any(axis=0)))]!r} differ from those saved. "
+                "Define this function as in the search."
+            )
+        for name in ("inner_coefficients", "inner_dependent"):
+            arrays[name] = jnp.asarray(arrays[name])
+        given = {k: tuple(v) if isinstance(v, list) else v for k, v in about.items() if k in plain}
+        if about.get("energy"):
+            given["energy"] = Energy(*about["energy"])
+        given["larger"] = tuple(Larger(*x) for x in about.get("larger", ()))
+        laws: list[dict[str, Any]] = [
+            {k: np.array(v) if isinstance(v, list) else v for k, v in law.items()}
+            for law in about["obstructions"]
+        ]
+        given["obstructions"] = tuple(DriftLaw(**law) for law in laws)
+        return cls(basis=bound, inner=inner, to_basis=to_basis, probe=probe, **given, **arrays)
+
+    def __str__(self) -> str:
+        return report(self)
+
+
+def _fields() -> tuple[list[str], list[str]]:
+    """Names of the fields that are plain values in a file, and of those that are arrays."""
+    apart = ("obstructions", "basis", "inner", "to_basis", "probe")
+    fields = [f for f in dataclasses.fields(Discovery) if f.name not in apart]
+    plain = [f.name for f in fields if f.metadata.get("static")]
+    return plain, [f.name for f in fields if f.name not in plain]
+
+
+_FORMAT = 2
+
+
+def _probed(basis: BoundBasis, probe: Samples) -> np.ndarray:
+    """The functions at some points, shape (points, size)."""
+    return np.asarray(jax.vmap(basis)(*map(jnp.asarray, probe)))

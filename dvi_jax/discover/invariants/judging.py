@@ -1,0 +1,123 @@
+"""How well what was found is conserved: sample by sample, by size, and in how few functions."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..algebra.motion import Motion, relative_changes
+from ..algebra.nullspace import RANK, null_space, triangle
+from .changes import Changes
+
+CLEARLY = 1e-9  # Changes of an invariant, by the measure of `Motion`, for nearly all samples
+# Two functions whose difference is this share of them are one, with and without errors.
+_SAME = 1e-3
+_ROUND_OFF = 1e-13  # Shares below this of the largest are not there
+
+
+class Judge(NamedTuple):
+    """Changes of the functions at some samples in units of ε · `scale`, their weights, (S,), and
+    `coefficient_errors` of functions of size one, (S,); whether the search has a tolerance."""
+
+    changes: Changes
+    calm: np.ndarray
+    scale: float = 1.0
+    digits: np.ndarray | float = 0.0
+    approximately: bool = False
+
+    def quantiles(self, coefficients: np.ndarray, share: float, sizes=None) -> np.ndarray:
+        """The change that the given share of the samples stays below, shape (count, z + 1).
+
+        `sizes`: of the leading-order terms on the samples that were fitted, if these are others.
+        """
+        out = np.zeros(coefficients.shape[:2])
+        sizes = self.sizes(coefficients) if sizes is None else sizes
+        for i, c in enumerate(coefficients):
+            series = c / self.scale ** np.arange(len(c))[:, None]
+            terms, motion, spread = self.changes.terms, self.changes.motion, self._spread(c[0])
+            digits = sizes[i] * self.digits
+            found = relative_changes(terms, series, motion, spread, digits, self.approximately)
+            out[i] = np.quantile(found, share, axis=0)
+        return out
+
+    def sizes(self, coefficients: np.ndarray) -> np.ndarray:
+        """Root mean squares of the leading-order terms, shape (count,)."""
+        calm = self.calm**2 / np.sum(self.calm**2)
+        return np.sqrt(calm @ (self.changes.values @ coefficients[:, 0].T) ** 2)
+
+    def _spread(self, leading: np.ndarray) -> float:
+        calm = self.calm**2 / np.sum(self.calm**2)
+        values = self.changes.values @ leading
+        spread = np.sqrt(calm @ (values - calm @ values) ** 2)
+        size = self.sizes(leading[None, None])[0]
+        return float(max(spread, 1e-6 * size, np.finfo(float).tiny))
+
+    def own_rows(self, leading: np.ndarray) -> np.ndarray:
+        """What functions change by at order 0, weighted by what the slopes of one of their
+        combinations predict, shape (S, size)."""
+        own = self.changes.motion.of(leading[:, None]).at_most(self._spread(leading))
+        return own.weights()[:, None] * self.changes.terms[:, 0]
+
+    def largest(self, coefficients: np.ndarray) -> np.ndarray:
+        """The change of nearly all samples, the largest of all orders, shape (count,)."""
+        return np.max(self.quantiles(coefficients, 0.95), axis=1, initial=0.0)
+
+    def keep(self, coefficients: np.ndarray) -> np.ndarray:
+        """Which series change by no more than rounding, shape (count,)."""
+        return self.largest(coefficients) <= CLEARLY
+
+
+class Fewest:
+    """Invariants of order 0 found again, to more digits, in the functions up to the lowest
+    complexity that represent them: coefficients of all others are only errors."""
+
+    def __init__(self, complexity, rms, changes, motion, values):
+        self.complexity, self.rms = np.array(complexity), rms
+        self.changes, self.motion, self.values = changes, motion, values
+        self.kept: dict[int, tuple[np.ndarray, np.ndarray] | None] = {}
+
+    def up_to(self, level: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """Invariants in the functions up to a complexity: columns of coefficients, and values."""
+        some = self.complexity <= level
+        R = triangle(self.values[:, some] / self.rms[some]) / np.sqrt(len(self.values))
+        if len(R) < np.sum(some) or np.linalg.cond(R) > 1 / RANK**2:
+            return None
+        orthonormal = np.linalg.inv(R) / self.rms[some][:, None]
+        motion = Motion(self.motion.changes[..., some], self.motion.rounding[:, some])
+        rows = self.changes[:, some] @ orthonormal
+        rows = motion.of(orthonormal).weights()[:, None] * rows / np.sqrt(len(rows))
+        columns = orthonormal @ null_space(rows, unit=1.0).columns
+        return columns, self.values[:, some] @ columns
+
+    def again(self, shares: np.ndarray) -> np.ndarray:
+        """The shares of an invariant, in as few functions as can be."""
+        target = self.values @ (shares / self.rms)
+        for level in sorted(set(self.complexity)):
+            if level not in self.kept:
+                self.kept[level] = self.up_to(level)
+            kept = self.kept[level]
+            if kept is None or kept[0].shape[1] == 0:
+                continue
+            found = np.linalg.lstsq(kept[1], target)[0]
+            if np.linalg.norm(kept[1] @ found - target) <= _SAME * np.linalg.norm(target):
+                out = np.zeros(len(shares))
+                some = self.complexity <= level
+                out[some] = (kept[0] @ found) * self.rms[some]
+                return cleaned(out)
+        return shares
+
+
+def cleaned(shares: np.ndarray, blur: float = RANK) -> np.ndarray:
+    """The shares without what is round-off of the others."""
+    above = _ROUND_OFF if blur <= RANK else blur
+    return np.where(np.abs(shares) > above * np.max(np.abs(shares)), shares, 0.0)
+
+
+def reach(coefficients: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """The smallest ε with a correction as large as the leading-order term, shape (count,)."""
+    out = np.full(len(coefficients), np.inf)
+    for i, c in enumerate(coefficients):
+        sizes = np.sqrt(np.mean((values @ c.T) ** 2, axis=0))
+        for m in range(1, len(c)):
+            if sizes[m] > 0:
+                out[i] = min(out[i], (sizes[0] / sizes[m]) ** (1 / m))
+    return out

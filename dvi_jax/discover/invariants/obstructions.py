@@ -1,0 +1,153 @@
+"""Averaged drift laws of leading-order terms that have no invariant of higher order."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..algebra.block_triangular import Split, above
+from ..algebra.echelon import reduced
+from ..algebra.nullspace import RANK, orthonormal_range
+from ..functions.basis import linear_text
+from ..functions.families import raised
+from .series import shortened
+
+# A drift law is reported when it leaves less than this share of the drift unexplained.
+EXPLAINED = 1e-6
+_SHOWN = 12  # Terms of a formula in a law
+_DEGREE = 4  # A law is sought as a polynomial of the leading-order term up to this degree
+_POWERS = ("1", *(raised("I", k) for k in range(1, _DEGREE + 1)))
+
+
+class DriftLaw(NamedTuple):
+    """The averaged drift of a leading-order invariant I without a correction at some order.
+
+    D(I) per step is ε^order times ``formula``, a function of what order 0 conserves.
+
+    - `leading`: I as text; `leading_coefficients`, `coefficients`: of I and of the law.
+    - `residual`: the share of the drift that the law does not explain.
+    - `kind`: "dissipation" (the perturbation changes phase volume, as fast as I to 1e-4 or more),
+      "slow time" (it does not, and the system changes with the slow time), "resonance" (neither,
+      and the average over the unperturbed motion is not zero), or "unexplained": the drift is not
+      a function of what order 0 conserves in this basis, which may be too small.
+    - `powers`: a where the law is Σ_k a_k I^k, k from 0, when it is one; else empty.
+    - `rest`: the fixed points I > 0 of that law (limit cycles).
+    """
+
+    order: int
+    leading: str
+    formula: str
+    leading_coefficients: np.ndarray
+    coefficients: np.ndarray
+    residual: float
+    kind: str
+    powers: np.ndarray
+    rest: np.ndarray
+
+    def __str__(self) -> str:
+        cause = "resonance or secular drift" if self.kind == "resonance" else self.kind
+        head = f"lost at order {self.order} ({cause}): I = {self.leading}"
+        if self.kind == "unexplained":
+            drift = "its drift is not a function of what order 0 conserves in this basis"
+            return f"{head}\n      {drift}"
+        power = "ε" if self.order == 1 else f"ε^{self.order}"
+        text = f"{head}\n      on average it changes by {power} ({self.formula}) in a step"
+        if len(self.powers):
+            text += f"\n      = {power} ({linear_text(self.powers, _POWERS[: len(self.powers)])})"
+        if len(self.rest):
+            text += f", at rest at I = {', '.join(f'{x:.4g}' for x in self.rest)}"
+        return text
+
+
+def drift_laws(
+    search: Any, volume: np.ndarray, slow_time: bool, blur: float
+) -> tuple[DriftLaw, ...]:
+    """The laws of all leading-order terms that are lost at order 1, 2, ….
+
+    For a series c that is invariant up to order m − 1 the condition of order m,
+    Σ_k A_{m−k} c_k + A_0 c_m = 0, has no solution c_m; with a function of what order 0 conserves
+    on the right it may: = φ·K d, K the null space of A_0. That is the averaged law.
+
+    - `search`: a `Search` of invariants. `volume`: how much phase volume changes at each order in
+      ε · scale. `slow_time`: of the system. `blur`: see `Span`.
+    """
+    basis, rms, R = search.basis, search.rms, search.R
+    spaces, values, terms = search.spaces, search.fitted_values, search.rows
+    kept, size, allowed = spaces[0].leading, basis.size, max(EXPLAINED, blur)
+    if kept.shape[1] == 0:
+        return ()
+    orthonormal = np.linalg.solve(R.T, (values / rms).T).T
+    system = np.concatenate([-terms[:, 0], search.weights[:, None] * orthonormal @ kept], axis=1)
+    solver = Split.of(system, above(1e-10))
+
+    def text(coefficients, shares):
+        return shortened(basis, coefficients, np.abs(shares), _SHOWN, max(0.1 * EXPLAINED, blur**2))
+
+    laws = []
+    for m in range(1, len(spaces)):
+        before = np.concatenate([spaces[m - 1].leading, spaces[m - 1].shifts], axis=1)
+        alive, through = spaces[m - 1].leading[:size], spaces[m].leading[:size]
+        drifts = terms[:, m:0:-1].reshape(len(terms), m * size) @ before
+        for shares in _lost(basis, R, alive, orthonormal_range(through), blur):
+            c = shares / rms
+            normal = 1 / (2 * c[np.argmax(np.abs(shares))])
+            shares, c = shares * normal, c * normal
+            series = np.linalg.lstsq(before[:size], R @ shares, rcond=blur)[0]
+            drift = drifts @ series
+            solution = solver.solved(drift[:, None])[:, 0]
+            rate = max(np.linalg.norm(drift), np.finfo(float).tiny)
+            left = float(np.linalg.norm(system @ solution - drift) / rate)
+            law = np.linalg.solve(R, kept @ solution[size:]) / rms * search.scale**m
+            explained = left < allowed
+            powers = _own_powers(values @ c, values @ law) if explained else np.zeros(0)
+            dissipates = np.max(volume[1 : m + 1]) * np.linalg.norm(values @ c) > 1e-4 * rate
+            kind = "dissipation" if dissipates else "slow time" if slow_time else "resonance"
+            laws.append(
+                DriftLaw(
+                    order=m,
+                    leading=text(c, shares),
+                    formula=text(law, law * rms),
+                    leading_coefficients=c,
+                    coefficients=law,
+                    residual=left,
+                    kind=kind if explained else "unexplained",
+                    powers=powers,
+                    rest=_zeros(powers, np.max(np.abs(values @ c))),
+                )
+            )
+    return tuple(laws)
+
+
+def _lost(basis, R, alive, through, blur) -> list[np.ndarray]:
+    """The simplest of the leading-order terms `alive` that are outside of `through`."""
+    count = alive.shape[1] - through.shape[1]
+    candidates = reduced(np.linalg.solve(R, alive), np.array(basis.complexity), blur).T
+    taken, lost = through, []
+    for clear in (max(blur, 1e-4), RANK):  # what is clearly outside before what hardly is
+        for c in candidates:
+            leading = R @ c / np.linalg.norm(R @ c)
+            rest = leading - taken @ (taken.T @ leading)
+            if len(lost) < count and np.linalg.norm(rest) > clear:
+                taken = np.column_stack([taken, rest / np.linalg.norm(rest)])
+                lost.append(c)
+    return lost
+
+
+def _own_powers(leading: np.ndarray, law: np.ndarray) -> np.ndarray:
+    """a with law = Σ_k a_k I^k on the samples, of the lowest degree; empty without such a law."""
+    scale = np.max(np.abs(leading))
+    for degree in range(1, _DEGREE + 1):
+        columns = (leading[:, None] / scale) ** np.arange(degree + 1)
+        a = np.linalg.lstsq(columns, law, rcond=None)[0]
+        if np.linalg.norm(columns @ a - law) <= EXPLAINED * np.linalg.norm(law):
+            a[np.abs(a) < EXPLAINED * np.max(np.abs(a))] = 0.0
+            return a / scale ** np.arange(degree + 1)
+    return np.zeros(0)
+
+
+def _zeros(powers: np.ndarray, largest: float) -> np.ndarray:
+    """Positive zeros of the polynomial, not far outside what was sampled."""
+    if len(powers) < 2:
+        return np.zeros(0)
+    roots = np.roots(powers[::-1])
+    real = roots[np.abs(roots.imag) < 1e-9 * np.maximum(np.abs(roots), 1)].real
+    return np.sort(real[(real > 1e-9 * largest) & (real < 100 * largest)])

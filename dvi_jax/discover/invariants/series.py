@@ -1,0 +1,153 @@
+"""A series in ε of combinations of basis functions: what discovery returns, as an observable."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ...base.types import Scalar, State
+from ...problem.system import System
+from ..functions.basis import BoundBasis
+from ..functions.families import raised
+from ..functions.generators import Generator
+from .digits import closed_form, digits_of
+
+_DROP = 1e-9  # Formulas leave out terms below this share of the largest
+
+
+class InvariantSeries(eqx.Module):
+    r"""An invariant Σ_m ε^m c_m·φ(q, p, t), as an observable.
+
+    - `coefficients`: c, shape (order + 1, basis size). `basis`: φ.
+    - `slow_time`: whether φ is a function of the slow time τ = εt in place of t.
+    - `sizes`: shape of `coefficients`: size of a term with coefficient 1 on the samples of the
+      search, by which terms of a formula are left out; None: all have the same size.
+    - `errors`: shape of `coefficients`: their estimated errors, by which digits of a formula are
+      left out; None: unknown.
+
+    Give it to `integrate` as it is: the run binds it to its ε. As a formula: `str`.
+    """
+
+    basis: BoundBasis
+    coefficients: Float[Array, "orders functions"]
+    slow_time: bool = eqx.field(static=True, default=False)
+    epsilon: Any = None
+    sizes: Any = None
+    errors: Any = None
+
+    @property
+    def order(self) -> int:
+        """z, the order up to which the series goes."""
+        return self.coefficients.shape[0] - 1
+
+    def bind(self, system: System, epsilon: Any) -> "InvariantSeries":
+        """The same series at this ε."""
+        del system
+        return replace(self, epsilon=epsilon)
+
+    def evaluate(self, q: State, p: State, epsilon: Any, t: Any = 0.0) -> Scalar:
+        """The value at a point, a scalar; t is the slow time τ when `slow_time` is set."""
+        powers = jnp.asarray(epsilon) ** jnp.arange(self.order + 1)
+        return powers @ self.coefficients @ self.basis(q, p, t)
+
+    def __call__(self, t0, t1, q0, p0, q1, p1, args):
+        if self.epsilon is None:
+            raise ValueError(
+                "this InvariantSeries has no value of ε. Give it to dvi.integrate(observe=...), or "
+                "set ε before the call: invariant = invariant.bind(system, epsilon)."
+            )
+        time = self.epsilon * t1 if self.slow_time else t1
+        return self.evaluate(q1, p1, self.epsilon, time)
+
+    @property
+    def generators(self) -> list[Generator]:
+        r"""The symplectic gradient, one generator for each order: ξ_m = ∂I_m/∂p, η_m = −∂I_m/∂q.
+
+        The converse of Noether's theorem. Where the map is symplectic (no force but a gradient),
+        the series of an invariant satisfies the determining equations (24) on the solutions, to
+        the order of the invariant: see `determining_residual`. **Raises** `ValueError` for
+        functions of the slow time.
+        """
+        if self.slow_time and self.basis.uses_time:
+            raise ValueError(
+                "`generators` requires a basis without functions of time, but the basis of this "
+                "invariant has functions of the slow time εt. Search again without them."
+            )
+        return [_symplectic_gradient(self.basis, c) for c in self.coefficients]
+
+    def __str__(self) -> str:
+        return self.formula()
+
+    @property
+    def recognised(self) -> dict[str, str]:
+        """Coefficients that agree to all their digits with a small fraction, or with such a
+        multiple of √2, √3, √5, π or 1/π: printed number → closed form. Empty without `errors`.
+
+        A random number is recognised with a probability below 1e-3.
+        """
+        if self.errors is None:
+            return {}
+        c, errors = np.asarray(self.coefficients), np.asarray(self.errors)
+        found = {}
+        for m, j in np.argwhere(self._shares() > _DROP * np.max(self._shares())):
+            value, error = float(abs(c[m, j])), float(errors[m, j])
+            if error > 0 and (text := closed_form(value, error)):
+                found[f"{value:.{digits_of(c[m, j], errors[m, j])}g}"] = text
+        return found
+
+    def _shares(self) -> np.ndarray:
+        c = np.asarray(self.coefficients)
+        return np.abs(c if self.sizes is None else c * np.asarray(self.sizes))
+
+    def formula(self, terms: int | None = None, drop: float = _DROP, digits: int = 6) -> str:
+        """The series as text: at each order at most so many terms, all above a fraction `drop`,
+        with at most so many digits, and no more than their errors leave.
+
+        The number of terms left out is printed, unless they are round-off.
+        """
+        c, shares = np.asarray(self.coefficients), self._shares()
+        known = digits_of(c, None if self.errors is None else np.asarray(self.errors), digits)
+        return in_powers_of_epsilon(
+            shortened(self.basis, block, share, terms, drop, some)
+            if m == 0 or np.max(share) > _DROP * np.max(shares)
+            else ""
+            for m, (block, share, some) in enumerate(zip(c, shares, known, strict=True))
+        )
+
+
+def in_powers_of_epsilon(texts: Iterable[str]) -> str:
+    """c_0 + ε (c_1) + … from the texts of the orders; empty ones are left out."""
+    parts = [f"{raised('ε', m)} ({text})" if m else text for m, text in enumerate(texts) if text]
+    return " + ".join(parts) or "0"
+
+
+def shortened(
+    basis: BoundBasis,
+    c: np.ndarray,
+    shares: np.ndarray,
+    terms: int | None = None,
+    drop: float = _DROP,
+    digits: int | np.ndarray = 6,
+) -> str:
+    """The combination as text: at most so many terms, all above the share `drop` of the largest."""
+    shown = np.where(shares > drop * np.max(shares), c, 0.0)
+    if terms is not None:
+        shown[np.argsort(-shares, kind="stable")[terms:]] = 0.0
+    text = basis.formula(shown, digits, drop=0.0)
+    hidden = np.sum(shares > drop * np.max(shares)) - np.count_nonzero(shown)
+    return f"{text} + … ({hidden} smaller terms)" if hidden else text
+
+
+def _symplectic_gradient(basis: BoundBasis, coefficients: Array) -> Generator:
+    def value(t, q, p):
+        return coefficients @ basis(q, p, t)
+
+    return Generator(
+        xi=lambda t, q, p, args: jax.grad(value, argnums=2)(t, q, p),
+        eta=lambda t, q, p, args: -jax.grad(value, argnums=1)(t, q, p),
+    )

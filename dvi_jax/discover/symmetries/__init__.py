@@ -1,0 +1,1 @@
+"""Symmetries: conditions, search, gauges, Noether's identity."""

@@ -1,0 +1,188 @@
+"""Common generators: shifts, rotations, scalings, boosts, Hamiltonian flows.
+
+They add, subtract, and multiply with numbers: ``rotation(0, 1) + 2 * time_translation()``.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ...base import checks as _checks
+from ...base.types import State
+from ..functions.generators import Generator, LatticePoint
+
+
+def time_translation() -> Generator:
+    """X = ∂/∂t: ξ0 = 1. Conserves the energy, on the variational lattice."""
+    return Generator(xi0=_one)
+
+
+def space_translation(direction: Any) -> Generator:
+    """X = a·∂/∂q: ξ = a, the same for all bodies. Conserves a·Σp.
+
+    - `direction`: a [unit of q], of the shape of q or of its last axes: (dim,) for states of
+      shape (bodies, dim).
+
+    **Raises** `ValueError` for a direction that is zero or not finite, and at the point for one
+    that does not fit q. **Source** Hydon 2014, *Difference Equations by Differential Equation
+    Methods*.
+    """
+    return Generator(xi=eqx.Partial(_constant, _direction(direction)))
+
+
+def rotation(i: int = 0, j: int = 1) -> Generator:
+    """The rotation of axis i towards axis j: ξ = e_j q_i − e_i q_j, and η the same of p.
+
+    Axes of the last axis of q: the components of a vector, or of every body's position for
+    states of shape (bodies, dim). Conserves the angular momentum q_i p_j − q_j p_i, summed.
+
+    **Raises** `ValueError` for axes that are equal or negative, and at the point for axes that q
+    does not have. **Source** the paper, (40).
+    """
+    axes = (i, j)
+    if any(isinstance(a, bool) or not isinstance(a, int) or a < 0 for a in axes) or i == j:
+        raise ValueError(
+            "i and j must be the numbers of two different axes of q, of type int and ≥ 0; got "
+            f"i = {i!r} and j = {j!r}."
+        )
+    return Generator(xi=eqx.Partial(_turned, 1, i, j), eta=eqx.Partial(_turned, 2, i, j))
+
+
+def scaling(q: Any = 1.0, p: Any = 1.0, t: float = 0.0) -> Generator:
+    """X = a t ∂/∂t + b q·∂/∂q + c p·∂/∂p: powers of one factor for t, q and p.
+
+    - `q`, `p`: weights b and c, numbers or arrays of the shape of q. `t`: weight a, a number.
+      (Kepler's third law: q = 1, p = −1/2, t = 3/2.)
+
+    **Raises** `ValueError` for weights that are not finite or all zero, or a `t` that is no
+    number. **Source** Olver 1993, *Applications of Lie Groups to Differential Equations*.
+    """
+    a, b, c = (_finite(name, x) for name, x in (("t", t), ("q", q), ("p", p)))
+    if a.shape != ():
+        raise ValueError(f"the weight t must be one number, got an array of shape {a.shape}.")
+    if not (a.any() or b.any() or c.any()):
+        raise ValueError("at least one of the weights q, p, t must not be 0, but they are all 0.")
+    weights = enumerate((a, b, c))
+    return Generator(*(eqx.Partial(_scaled, i, w) if w.any() else None for i, w in weights))
+
+
+def boost(direction: Any, mass: Any = 1.0) -> Generator:
+    """Galilei's boost: ξ = t v, η = m v. Conserves v·Σ(t p − m q), with the gauge −m v·q.
+
+    - `direction`: v [unit of q / unit of t], of the shape of q or of its last axes.
+    - `mass`: m [mass]: a number; one for each body, shape (bodies,), for states of shape
+      (bodies, dim); or an array of the shape of q.
+
+    **Raises** `ValueError` for a direction that is zero or not finite, masses that are not
+    positive, and at the point for what does not fit q. **Source** Olver 1993, Chapter 4.
+    """
+    masses = _finite("mass", mass)
+    if not (masses > 0).all():
+        raise ValueError(f"mass must be positive for every body, got {mass!r:.200}.")
+    v = _direction(direction)
+    return Generator(xi=eqx.Partial(_boosted, v, None), eta=eqx.Partial(_boosted, v, masses))
+
+
+def hamiltonian_flow(function: Callable[..., Any]) -> Generator:
+    """The Hamiltonian vector field of a function K: ξ = ∂K/∂p, η = −∂K/∂q.
+
+    - `function`: K, function ``(t, q, p, args)`` → scalar [action]. With an invariant of the
+      map it is a symmetry of a symplectic map, and K what it conserves (gauge K − ξ·p).
+
+    **Raises** `TypeError` for what is not callable. **Source** Olver 1993, Chapter 6.
+    """
+    _checks.function("the argument of hamiltonian_flow", function, "(t, q, p, args) → scalar")
+    return Generator(
+        xi=eqx.Partial(_slope, function, 2, 1.0), eta=eqx.Partial(_slope, function, 1, -1.0)
+    )
+
+
+def bracket(first: Generator, second: Generator) -> Generator:
+    """The Lie bracket [X, Y] = XY − YX, a symmetry when both are.
+
+        [X, Y]^c = X(Y^c) − Y(X^c)    for each component c of (ξ0, ξ, η)
+
+    **Raises** `TypeError` for anything but a `Generator`. **Source** Olver 1993, Section 1.3.
+    """
+    for name, generator in (("first", first), ("second", second)):
+        _checks.instance(name, generator, Generator, "a Generator")
+    return Generator(*(eqx.Partial(_bracket, first, second, place) for place in range(3)))
+
+
+def _one(t, q, p, args):
+    return 1.0
+
+
+def _constant(value, t, q, p, args):
+    return _fitted("direction", value, q)
+
+
+def _turned(place, i, j, t, q, p, args):
+    """The vector at `place` of (t, q, p), turned by a right angle in the plane of two axes."""
+    v = (t, q, p)[place]
+    if v.ndim == 0 or v.shape[-1] <= max(i, j):
+        raise ValueError(
+            f"q must have at least {max(i, j) + 1} components along its last axis for "
+            f"rotation({i}, {j}), got q of shape {q.shape}. Correct i and j, or the shape of q."
+        )
+    return jnp.zeros_like(v).at[..., i].set(-v[..., j]).at[..., j].set(v[..., i])
+
+
+def _scaled(place, weight, t, q, p, args):
+    value = (t, q, p)[place]
+    return value * _fitted(f"the weight {'tqp'[place]}", weight, value)
+
+
+def _boosted(direction, mass, t, q, p, args):
+    v = _fitted("direction", direction, q)
+    if mass is None:
+        return t * v
+    if mass.ndim == 1 and q.ndim == 2 and len(mass) == len(q):
+        mass = mass[:, None]  # one for each body
+    return _fitted("mass", mass, q) * v
+
+
+def _slope(function, argnum, sign, t, q, p, args):
+    return sign * jax.grad(function, argnums=argnum)(t, q, p, args)
+
+
+def _bracket(first, second, place, t, q, p, args):
+    point = LatticePoint(t, q, p)
+
+    def derivative(along, of):
+        return jax.jvp(lambda at: of(at, args)[place], (point,), (along(point, args),))[1]
+
+    return derivative(first, second) - derivative(second, first)
+
+
+def _finite(name: str, value: Any) -> np.ndarray:
+    """As an array of NumPy: a generator can be made before JAX has started its devices."""
+    array = np.asarray(value, float)
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} must be finite, got {value!r}.")
+    return array
+
+
+def _direction(value: Any) -> np.ndarray:
+    direction = _finite("direction", value)
+    if not direction.any():
+        raise ValueError(f"direction must have a component that is not zero, got {value!r}.")
+    return direction
+
+
+def _fitted(name: str, value: np.ndarray, q: State) -> Array:
+    """The value with the shape of q, if that can be."""
+    try:
+        return jnp.broadcast_to(value, q.shape).astype(q.dtype)
+    except ValueError:
+        shapes = [q.shape[i:] for i in range(q.ndim)] + [q.shape[:1]] * (name == "mass")
+        allowed = " or ".join(map(str, dict.fromkeys(shapes))) if q.ndim else "()"
+        raise ValueError(
+            f"{name} must be a number, or an array of shape {allowed}, since q has shape "
+            f"{q.shape}; got shape {value.shape}."
+        ) from None

@@ -1,0 +1,1 @@
+"""One trajectory: the loop over steps, its gradients, `integrate`."""

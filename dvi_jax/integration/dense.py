@@ -1,0 +1,196 @@
+"""The trajectory between the points of its time grid: crossings, requested times, end points."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, PyTree
+
+from lanewise import Layout
+
+from ..base.types import Interval, Scalar, State
+from ..engine.bracket import bracketed_root
+from ..engine.rounding import each, one_by_one
+from ..methods import Method
+from ..methods.step import Equations
+from ..observe import Crossings, Reduction, Section, Stop, Stopped, is_observable
+from ..observe._kept import RequestedTimes, Start, event, from_rows, shown
+from ..observe.solution import Save
+from .task import Task
+
+Point = tuple[Scalar, State, State]
+"""(t, q, p)."""
+
+
+class Curve(eqx.Module):
+    """The curve Φ_{θh}(q0, p0), 0 ≤ θ ≤ 1, of a method between the ends of a step."""
+
+    # A substep of the method itself, not an interpolation: it has the order of the method, and its
+    # end is the end of the step.
+
+    method: Method
+    equations: Equations
+    layout: Layout = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, method: Method, equations: Equations, layout: Layout) -> "Curve":
+        # In fixed point the curve would be a staircase, on which no root can be found.
+        return cls(method, dataclasses.replace(equations, quantum=None), layout)
+
+    def point(self, start: Start, theta: Scalar) -> Point:
+        """(t, q, p) at the fraction θ of the step."""
+        h = theta * (start.t1 - start.t0)
+        t = start.t0 + h
+        q, p, _ = self.method.step(self.equations, Interval(start.t0, t, h), start.q0, start.p0)
+        return t, q, p
+
+    def where(self, g: Callable[..., Any], start: Start, exists: Array) -> Point:
+        """The point of the step where g(t, q, p, args) = 0, or its end if none `exists`."""
+        args = self.equations.args
+
+        def at(theta):
+            return event(g, *self.point(start, theta), args)
+
+        zero, one = jnp.zeros_like(start.t0), jnp.ones_like(start.t0)
+        at_zero = event(g, start.t0, start.q0, start.p0, args)
+        theta = bracketed_root(at, zero, at_zero, one, at(one), exists)
+        return self.point(start, theta)
+
+
+def requested_times(save: Save, task: Task, num_steps: int) -> tuple[RequestedTimes, PyTree]:
+    """The observables of a run that saves states at requested times: the steps of those times, and
+    all reductions."""
+    if task.has_running_values:
+        raise ValueError(
+            "dvi.Running in observe cannot be combined with save=dvi.Save(ts=...), because its "
+            "values exist at grid points only. Use save=dvi.Save(every=m), or remove dvi.Running."
+        )
+    # Functions that are not reductions are evaluated at the requested times, after the run.
+    kept = jax.tree.map(
+        lambda f: f if isinstance(f, Reduction) else None, task.observe, is_leaf=is_observable
+    )
+    ts = jnp.asarray(save.ts, task.t0.dtype)
+    due = lax.stop_gradient(ts)
+    if save.clock is None and not task.lattice.has_memory and num_steps > 0:
+        eps = jnp.finfo(ts.dtype).eps
+        end = task.interval(jnp.asarray(num_steps - 1, jnp.int32)).t1
+        # N·(T/N) may differ from T in the last digit: a request at an end of the run is moved to
+        # it, so that it is not outside. The derivative is that of the requested time.
+        for known in (task.t0, end):
+            size = jnp.maximum(jnp.abs(task.t0), jnp.abs(known))
+            near = jnp.abs(ts - known) <= 16 * eps * size
+            ts = jnp.where(near, ts + lax.stop_gradient(known - ts), ts)
+        # Also t0 + k h, compiled in a loop, may differ in the last digit from its value here.
+        slack = 4 * eps * (jnp.abs(task.t0) + jnp.abs(ts))
+        due = lax.stop_gradient(ts - jnp.where(end >= task.t0, slack, -slack))
+    return RequestedTimes(ts=ts, due=due, ordered=jnp.sort(due), clock=save.clock), kept
+
+
+def crossings(curve: Curve, section: Section, kept: tuple[Array, Array], safe: Start) -> Crossings:
+    """The crossings in the steps that a section has stored. `safe` is any step that exists."""
+    rows, count = kept
+    exists, starts = _steps(rows, safe)
+    found = each(_crossing, (curve, section.g), starts, exists, layout=curve.layout)
+    ts, qs, ps = _or_nan(exists, found)
+    return Crossings(ts, qs, ps, count.astype(jnp.int32))
+
+
+def _crossing(given: tuple[Curve, Callable], start: Start, exists: Array) -> Point:
+    curve, g = given
+    return curve.where(g, start, exists)
+
+
+def at_times(
+    curve: Curve, requested: RequestedTimes, kept: tuple[Array, Array], safe: Start
+) -> tuple[Array, Start, Point]:
+    """For each requested time: is it reached, the step that contains it, and the point there."""
+    exists, starts = _steps(kept[0], safe)
+    given = (curve, requested.clock)
+    began = each(_shown, given, starts, layout=curve.layout)
+    first = one_by_one(_shown, given, safe, layout=curve.layout)
+    sense = jnp.where(starts.until[0] >= began[0], 1, -1)  # −1: time runs backwards
+    # In ascending order, as bisection requires: empty rows, which are last, are at infinity.
+    ends = jnp.where(exists, sense * starts.until, jnp.inf)
+
+    def one(time, due):
+        i = jnp.minimum(jnp.searchsorted(ends, sense * due), ends.size - 1)
+        reached = exists[i] & (sense * began[i] < sense * due) & (sense * due <= ends[i])
+        start = jax.tree.map(lambda x, y: jnp.where(reached, x[i], y), starts, safe)
+        is_start = time == first
+        if requested.clock is None:
+            time = jnp.where(is_start, _just_after(time, start), time)
+        point, is_shown = one_by_one(_within, given, start, time, reached, layout=curve.layout)
+        known = (safe.t0, safe.q0, safe.p0)
+        if requested.clock is None:  # the value of the start to the bit, the slope of the curve
+            known = jax.tree.map(lambda a, b: a + lax.stop_gradient(b - a), point, known)
+        point = jax.tree.map(lambda a, b: jnp.where(is_start, b, a), point, known)
+        found = (reached & is_shown) | is_start
+        return found, start, _or_nan(found, point)
+
+    return jax.vmap(one)(requested.ts, requested.due)
+
+
+def _shown(given, start: Start) -> Scalar:
+    """The value of the clock at the start of a step."""
+    curve, clock = given
+    return shown(clock, start.t0, start.q0, start.p0, curve.equations.args)
+
+
+def _within(given, start: Start, time: Scalar, reached: Array) -> tuple[Point, Array]:
+    """The point of the step at a requested time, and whether the clock shows that time there."""
+    curve, clock = given
+    if clock is None:
+        theta = (time - start.t0) / (start.t1 - start.t0)
+        return curve.point(start, theta), jnp.asarray(True)
+    args = curve.equations.args
+
+    def late(t, q, p, args):
+        return shown(clock, t, q, p, args) - time
+
+    t, q, p = curve.where(late, start, reached)
+    # A clock that jumps has passed the value without showing it; so has one that is not monotonic.
+    missed = jnp.abs(shown(clock, t, q, p, args) - time)
+    span = jnp.abs(start.until - _shown(given, start))
+    close = jnp.sqrt(jnp.finfo(start.q0.dtype).eps)
+    return (t, q, p), missed <= close * (span + jnp.abs(time))
+
+
+def _just_after(time: Scalar, start: Start) -> Scalar:
+    """A time slightly later than `time`, with the same derivative."""
+    # At the start of the run the substep would have h = 0, and an H_D may divide by t1 − t0.
+    part = jnp.finfo(start.q0.dtype).eps ** 0.4
+    return time + lax.stop_gradient(part * (start.t1 - start.t0))
+
+
+def stopped(curve: Curve, stop: Stop, row: Array, safe: Start) -> Stopped:
+    """The point g = 0 in the last step of a run; the start of that step if g ≥ 0 there already."""
+    exists, start = _steps(row, safe)
+    began = (start.t0, start.q0, start.p0)
+    at_start = one_by_one(event, stop.g, *began, curve.equations.args, layout=curve.layout) >= 0
+    given = (curve, stop.g)
+    point = one_by_one(_crossing, given, start, exists & ~at_start, layout=curve.layout)
+    point = jax.tree.map(lambda a, b: jnp.where(at_start, b, a), point, began)
+    return Stopped(*_or_nan(exists, point))
+
+
+def _steps(rows: Array, safe: Start) -> tuple[Array, Start]:
+    """The steps in the rows, and the safe one for an empty row."""
+    # Points are computed for empty rows as well, in a batch: from NaN the derivative would be NaN.
+    exists, starts = from_rows(rows, safe.q0.shape)
+
+    def filled(x, substitute):
+        return jnp.where(_beside(exists, x), x, substitute)
+
+    return exists, jax.tree.map(filled, starts, safe)
+
+
+def _or_nan(exists: Array, points: Any) -> Any:
+    return jax.tree.map(lambda x: jnp.where(_beside(exists, x), x, jnp.nan), points)
+
+
+def _beside(exists: Array, x: Array) -> Array:
+    return exists.reshape(exists.shape + (1,) * (x.ndim - exists.ndim))

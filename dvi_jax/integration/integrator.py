@@ -1,0 +1,159 @@
+"""The options of an integration as one object, for every function that runs trajectories."""
+
+from typing import Any
+
+import equinox as eqx
+
+from lanewise import Layout
+
+from ..base.checks import instance
+from ..base.names import both_names
+from ..engine.newton import RootSolver
+from ..engine.picard import PicardThenNewton
+from ..lattices import Given, Lattice, Uniform
+from ..methods import Method, Rattle, Splitting, Strang, TypeII, as_method
+from ..problem.discretise import is_first_order
+from ..problem.split import Split
+from ..problem.system import System
+from .adjoints import AbstractAdjoint
+from .arithmetic import Arithmetic, Compensated, FloatingPoint
+from .reversible import Reversible
+
+
+@both_names
+class Integrator(eqx.Module):
+    """The options of an integration: the keywords of `integrate` that are not the problem itself.
+
+    - `method`: see `integrate`. None: the map that the user wrote, `TypeII()`; for a system with
+      `discretise(H, order=1)`, whose map has order one, `Strang()`; with a `Split`, `Splitting()`;
+      with a constraint, `Rattle()`.
+    - `root_finder`: the solver of implicit steps. Here, and in every function that takes one of the
+      two names, `newton` is another name of it; both at once raise a `TypeError`.
+    - `lattice`: the time grid. `arithmetic`: the representation of the state.
+    - `layout`: machine code or arrays. `adjoint`: the computation of reverse-mode gradients.
+
+    `integrate`, `sweep`, `Model` (for `fit`), `poincare_section`, `bifurcation`, `ReturnMap`,
+    `tangent_map`, `invariant_diffusion`, `drift_order`, `drift_surface`, `discover_invariants`,
+    `find_symmetries` and `solution_pairs` accept it as `integrator=`. The last three examine one
+    step; they raise an error for fields without an effect there that are not the defaults. `sweep`
+    computes no gradients and does not use `adjoint`.
+
+    **Raises** `TypeError` for a field of another type.
+
+    **Example**
+
+    ```python
+    accurate = dvi.Integrator(method=dvi.KahanLi(8), arithmetic=dvi.Compensated())
+    kepler = systems.kepler()
+    sol = dvi.integrate(kepler.system, kepler.q0, kepler.p0, args=kepler.args, h=0.1, num_steps=100,
+                        integrator=accurate)
+    print(sol.status)
+    # successful
+    ```
+    """
+
+    method: Method | None = eqx.field(default=None, converter=as_method)
+    root_finder: RootSolver = PicardThenNewton()
+    lattice: Lattice = Uniform()
+    arithmetic: Arithmetic = FloatingPoint()
+    layout: Layout = Layout()
+    adjoint: AbstractAdjoint = Reversible()
+
+    def __check_init__(self):
+        for name, (kind, hint) in _FIELDS.items():
+            value = getattr(self, name)
+            if name != "method" or value is not None:
+                instance(name, value, kind, f"an instance of dvi.{kind.__name__}", f"Take {hint}.")
+
+    @property
+    def newton(self) -> RootSolver:
+        """Another name of `root_finder`."""
+        return self.root_finder
+
+    def method_for(self, system: System) -> Method:
+        """The method, or the default for this system. **Raises** `ValueError` for options that do
+        not fit a constraint, or its absence."""
+        method = default_method(system) if self.method is None else self.method
+        constrained = system.constraint is not None
+        if method.needs_constraint() != constrained:
+            raise ValueError(
+                "a system with a constraint needs method=dvi.Rattle(), or a composition of it such "
+                f"as dvi.Yoshida(4, base=dvi.Rattle()), got {method!r}."
+                if constrained
+                else f"method={method!r} needs a constraint, but the system has none: use "
+                "dvi.System(H_D, constraint=g), or another method such as dvi.Strang()."
+            )
+        # By type: `TimeTransformed` is a `Uniform` that takes other equations.
+        plain = {"lattice": (Uniform, Given), "arithmetic": (FloatingPoint, Compensated)}
+        for name, kinds in plain.items() if constrained else ():
+            if type(value := getattr(self, name)) not in kinds:
+                names = " or ".join(f"dvi.{kind.__name__}" for kind in kinds)
+                seen = f"{value!r:.200}"
+                raise ValueError(f"a system with a constraint needs {name}={names}, got {seen}.")
+        return method
+
+
+_FIELDS = {
+    "method": (Method, "one such as dvi.Strang()"),
+    "lattice": (
+        Lattice,
+        "dvi.Uniform(), dvi.Given(ts), dvi.AdaptiveReversible(g), dvi.TimeTransformed(g) or "
+        "dvi.Variational()",
+    ),
+    "adjoint": (AbstractAdjoint, "dvi.Reversible(), dvi.Checkpointed() or dvi.Direct()"),
+    "root_finder": (RootSolver, "dvi.Newton(), dvi.SimplifiedNewton() or dvi.Picard()"),
+    "arithmetic": (
+        Arithmetic,
+        "dvi.FloatingPoint(), dvi.Compensated(), dvi.DoubleDouble() or dvi.FixedPoint(quantum)",
+    ),
+    "layout": (Layout, 'dvi.Layout() or dvi.Layout(form="arrays")'),
+}
+
+# Made once: a new one in every call would take some microseconds for its checks.
+_DEFAULT = Integrator()
+
+
+def default_method(system: System) -> Method:
+    """The method of a run without `method`."""
+    if system.constraint is not None:
+        return Rattle()
+    # A map of order one that `discretise` made was not chosen by the user, and Strang's composition
+    # of it has order two. A map that the user wrote stays as it is.
+    if isinstance(system.H_D, Split):
+        return Splitting()
+    own = getattr(system.H_D, "own_method", None)
+    if isinstance(own, Method):
+        return own
+    return Strang() if is_first_order(system.H_D) else TypeII()
+
+
+def chosen(integrator: Integrator | None, **given: Any) -> Integrator:
+    """The integrator of a call: the object, or one made of single keywords (None: not given).
+
+    **Raises** `TypeError` for another object, `ValueError` for both.
+    """
+    given = {name: value for name, value in given.items() if value is not None}
+    if integrator is None:
+        return Integrator(**given) if given else _DEFAULT
+    instance("integrator", integrator, Integrator, "a dvi.Integrator(...)")
+    if given:
+        names = ", ".join(given).replace("root_finder", "root_finder (or newton)")
+        raise ValueError(
+            f"{names} and integrator cannot be given together: set {names} in "
+            "dvi.Integrator(...), or leave integrator out."
+        )
+    return integrator
+
+
+def only(integrator: Integrator, function: str, *used: str) -> Integrator:
+    """The integrator. **Raises** `ValueError` for a field that the function does not use and that
+    differs from the default."""
+    # Otherwise an option without effect would be ignored without a word.
+    for name in _FIELDS:
+        value, default = getattr(integrator, name), getattr(_DEFAULT, name)
+        if name not in used and not eqx.tree_equal(value, default):
+            raise ValueError(
+                f"{function} does not use {name}, but integrator has {name}={value!r:.200}: leave "
+                f"{name} out of dvi.Integrator(...). {function} uses only {' and '.join(used)}."
+            )
+    return integrator

@@ -1,0 +1,214 @@
+"""One step of the map (12)–(13), and its inverse."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from lanewise.jaxprs.dependence import depends_on
+
+from ..base.results import RESULTS, first_failure
+from ..base.types import Args, Interval, Scalar, State
+from ..engine.newton import Found, Known, Newton, RootSolver, find_root, no_residual, worse
+from ..engine.rounding import one_by_one
+from ..problem.system import System
+
+
+class StepInfo(NamedTuple):
+    """Status of a step, number of iterations, and (largest last correction, its scale)."""
+
+    result: RESULTS
+    iterations: Int[Array, ""]
+    residual: Float[Array, "2"]
+
+    def then(self, later: "StepInfo") -> "StepInfo":
+        """This step followed by another: first failure, total work, worst residual."""
+        return StepInfo(
+            first_failure(self.result, later.result),
+            self.iterations + later.iterations,
+            worse(self.residual, later.residual),
+        )
+
+
+def no_step_yet(like: State) -> StepInfo:
+    """The neutral element of `StepInfo.then`."""
+    # A status that is an array, as in the carry of a scan; `RESULTS.successful` itself is static.
+    good = RESULTS.where(jnp.asarray(True), RESULTS.successful, RESULTS.not_finite)
+    return StepInfo(good, *no_solve(like)[1:3])
+
+
+class Equations(eqx.Module):
+    """The discrete equations of a system for one ε and one set of args.
+
+    `newton` is the solver of their implicit part. With an `origin` positions and momenta are
+    relative to it; `increments` are those of the noise in one step, shape (parts of the step, m).
+    With a `quantum` an explicit step changes the state by integer multiples of it,
+    and a rate has the same bits in every evaluation.
+    """
+
+    system: System | Any  # or what has its functions, such as a system with the noise of a step
+    epsilon: Scalar
+    args: Args = None
+    newton: RootSolver | Known = Newton()
+    origin: tuple[State, State] | None = None
+    quantum: float | None = eqx.field(static=True, default=None)
+    increments: Array | None = None
+
+    def absolute(self, q: State, p: State) -> tuple[State, State]:
+        """(q, p) in the coordinates of the system, the origin added."""
+        if self.origin is None:
+            return q, p
+        return self.origin[0] + q, self.origin[1] + p
+
+    def increment(self, h: Scalar, rate: State) -> State:
+        """h·rate, rounded to a multiple of the quantum where there is one."""
+        return h * rate if self.quantum is None else to_grid(h * rate, self.quantum)
+
+    def momentum_rate(self, interval: Interval, q0: State, p1: State) -> State:
+        """−∂H_D/∂q0 + εW at (t0, t1, q0, p1): the right side of (13)."""
+        at = (self.system, *interval[:2], *self.absolute(q0, p1), self.epsilon, self.args)
+        # With a quantum the last bits decide where a rate is rounded to: compiled separately they
+        # are the same forwards and backwards.
+        if self.quantum is None:
+            return _momentum_rate(*at)
+        return one_by_one(_momentum_rate, *at)
+
+    def position_rate(self, interval: Interval, q0: State, p1: State) -> State:
+        """∂H_D/∂p1 at (t0, t1, q0, p1): the right side of (12)."""
+        at = (self.system, *interval[:2], *self.absolute(q0, p1), self.epsilon, self.args)
+        if self.quantum is None:
+            return _position_rate(*at)
+        return one_by_one(_position_rate, *at)
+
+    def rates(self, interval: Interval, q: State, p: State) -> tuple[State, State]:
+        """(`position_rate`, `momentum_rate`) at one point, from one gradient of H_D."""
+        # The two functions would evaluate H_D twice where XLA or `lanewise` sees no common part.
+        if self.quantum is not None:
+            return self.position_rate(interval, q, p), self.momentum_rate(interval, q, p)
+        at = (self.system, *interval[:2], *self.absolute(q, p), self.epsilon, self.args)
+        return _rates(*at)
+
+    def constraint(self, q: State) -> Array:
+        """g(q, args) of a constrained system, shape (m,)."""
+        q, _ = self.absolute(q, jnp.zeros_like(q))
+        return self.system.constraint(q, self.args).astype(q.dtype)  # pyright: ignore
+
+    def step_is_explicit(self, interval: Interval, like: State) -> bool:
+        """Whether p1 enters neither ∂H_D/∂q0 nor W, so that (13) needs no solve."""
+        # Read from the jaxpr: a value-dependent test could not run under jit.
+        return not depends_on(lambda p1: self.momentum_rate(interval, like, p1), 0, like)
+
+    def inverse_is_explicit(self, interval: Interval, like: State) -> bool:
+        """Whether q0 does not enter ∂H_D/∂p1, so that inverse and adjoint need no solve."""
+        return not depends_on(lambda q0: self.position_rate(interval, q0, like), 0, like)
+
+
+# Jitted, so that all calls in a rollout share one trace of the user's functions and of their
+# derivatives.
+
+
+@eqx.filter_jit
+def _momentum_rate(system: System | Any, *at) -> State:
+    gradient = jax.grad(system.hamiltonian, argnums=2)(*at)
+    if system.force is None:
+        return -gradient
+    return -gradient + system.disturbing_force(*at).astype(gradient.dtype)
+
+
+@eqx.filter_jit
+def _position_rate(system: System | Any, *at) -> State:
+    return jax.grad(system.hamiltonian, argnums=3)(*at)
+
+
+@eqx.filter_jit
+def _rates(system: System | Any, *at) -> tuple[State, State]:
+    gradient, velocity = jax.grad(system.hamiltonian, argnums=(2, 3))(*at)
+    if system.force is None:
+        return velocity, -gradient
+    return velocity, -gradient + system.disturbing_force(*at).astype(gradient.dtype)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
+def to_grid(x: State, quantum: float) -> State:
+    """The multiple of `quantum`, a power of two, nearest to x (half to even)."""
+    return jnp.round(x * (1 / quantum)) * quantum
+
+
+@to_grid.defjvp
+def _(quantum, primals, tangents):
+    # Slope 1, that of the map without rounding; the slope of a staircase is zero.
+    return to_grid(*primals, quantum), tangents[0]
+
+
+def step(
+    equations: Equations, interval: Interval, q0: State, p0: State
+) -> tuple[State, State, StepInfo]:
+    """The map Φ_h of (12)–(13): (q0, p0) at t0 → (q1, p1) at t1.
+
+    p1 = p0 + h (−∂H_D/∂q0 + εW)(t0, t1, q0, p1)      solved for p1 where p1 enters
+    q1 = q0 + h ∂H_D/∂p1 (t0, t1, q0, p1)
+    """
+    h, force = interval.h, functools.partial(equations.momentum_rate, interval, q0)
+    # The result where p1 does not enter, and otherwise the guess, with an error O(h²).
+    p1 = p0 + equations.increment(h, force(p0))
+    p1, info = _solved(force, h, p0, p1, equations, equations.absolute(q0, p0)[1])
+    q1 = q0 + equations.increment(h, equations.position_rate(interval, q0, p1))
+    return q1, p1, judge(info, q1, p1, equations.quantum)
+
+
+def inverse_step(
+    equations: Equations, interval: Interval, q1: State, p1: State
+) -> tuple[State, State, StepInfo]:
+    """The inverse Φ_h⁻¹ of `step`: (q1, p1) at t1 → (q0, p0) at t0.
+
+    q0 = q1 − h ∂H_D/∂p1 (t0, t1, q0, p1)             solved for q0 where q0 enters
+    p0 = p1 − h (−∂H_D/∂q0 + εW)(t0, t1, q0, p1)
+    """
+    h, velocity = -interval.h, functools.partial(equations.position_rate, interval, p1=p1)
+    q0 = q1 + equations.increment(h, velocity(q1))
+    q0, info = _solved(velocity, h, q1, q0, equations, equations.absolute(q1, p1)[0])
+    p0 = p1 - equations.increment(interval.h, equations.momentum_rate(interval, q0, p1))
+    return q0, p0, judge(info, q0, p0, equations.quantum)
+
+
+def no_solve(x: State) -> Found:
+    """The information on x where no solve is needed."""
+    real = jnp.finfo(x.dtype).dtype
+    return Found(x, jnp.asarray(0, jnp.int32), no_residual(real), jnp.asarray(True))
+
+
+def _solved(
+    rate: Callable, h: Scalar, x0: State, guess: State, equations: Equations, known: State
+) -> tuple[State, Found]:
+    """x1 = x0 + h rate(x1) near `guess`, which is x1 if `rate` does not depend on x1; `known` is x0
+    with the origin, the scale of the accuracy."""
+    if not depends_on(rate, 0, x0):
+        return guess, no_solve(x0)
+    start = x0.ravel()
+
+    def residual(x1):
+        return x1 - start - h * rate(x1.reshape(x0.shape)).ravel()
+
+    # A small increment next to an origin has its own round-off, smaller than that of the whole
+    # coordinate in `known`: both ends of the step as they are represented.
+    represented = jnp.maximum(jnp.abs(x0), jnp.abs(guess)).ravel()
+    x1, info = find_root(residual, guess.ravel(), known.ravel(), equations.newton, represented)
+    return x1.reshape(x0.shape), info
+
+
+def judge(info: Found, q: State, p: State, quantum: float | None = None) -> StepInfo:
+    """The status of a step, from its solve and from the state after it."""
+    finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(p))
+    result = RESULTS.where(info.converged, RESULTS.successful, RESULTS.not_converged)
+    if quantum is not None:
+        # Larger multiples of the quantum are not all representable: sums would round.
+        largest = quantum * 2.0 ** (jnp.finfo(q.dtype).nmant + 1)
+        fits = jnp.all(jnp.abs(q) <= largest) & jnp.all(jnp.abs(p) <= largest)
+        result = RESULTS.where(fits, result, RESULTS.out_of_range)
+    # Last, because NaN makes a solve fail as well, and is the reason that helps the user.
+    result = RESULTS.where(finite, result, RESULTS.not_finite)
+    return StepInfo(result, info.iterations, info.residual)

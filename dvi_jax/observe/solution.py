@@ -1,0 +1,191 @@
+"""The result of `integrate`, and the choice of the states that it saves."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from lanewise.jaxprs.jaxapi import is_traced
+
+from ..base.checks import whole
+from ..base.inputs import as_times
+from ..base.results import RESULTS, status_name
+from ..base.signature import check_takes
+from ..base.types import State
+
+
+# The times are an array, not static: they may be traced, and new times need no new compilation.
+def _times(ts: Any) -> Any:
+    return None if ts is None else as_times("Save(ts=...)", ts)
+
+
+class Save(eqx.Module):
+    """The states that a run saves. The start is always one of them, except with `ts`.
+
+    - ``Save(every=m)``: the states after m, 2m, 3m, … steps.
+    - ``Save(final=True)``: the state after the last step; together with `every`, also when
+      num_steps is not a multiple of it.
+    - ``Save()``: every state.
+    - ``Save(ts=times)``: the states at these times and no others, in the order of the run. Between
+      grid points it is a shorter step of the method to that time, which has the order of the
+      method. Times outside of the run give NaN and the status `not_reached`. Invariants of the map
+      at step h are conserved at grid points only, not at the end of a shorter step.
+      With ``clock=f``, a function ``(t, q, p, args)`` → scalar that grows along the trajectory, an
+      angle for instance, `ts` are values of it.
+
+    **Raises** `ValueError` for an `every` that is not a positive integer, for `ts` together with
+    another choice, and for times that are not one-dimensional, finite, in ascending or descending
+    order.
+
+    **Example**
+
+    ```python
+    orbit = systems.kepler()
+    run = {"q0": orbit.q0, "p0": orbit.p0, "args": orbit.args, "h": 0.1, "num_steps": 1000}
+    for save in (dvi.Save(every=300), dvi.Save(every=300, final=True), dvi.Save(ts=[0.25, 99.0])):
+        print(np.round(dvi.integrate(orbit.system, **run, save=save).ts, 6))
+    # [ 0. 30. 60. 90.]
+    # [  0.  30.  60.  90. 100.]
+    # [ 0.25 99.  ]
+    ```
+    """
+
+    every: int | None = eqx.field(static=True, default=None)
+    final: bool = eqx.field(static=True, default=False)
+    ts: Float[Array, " times"] | None = eqx.field(default=None, converter=_times)
+    clock: Callable[..., Any] | None = None
+
+    def __check_init__(self):
+        if self.every is not None:
+            whole("every in Save(every=...)", self.every)
+        if self.clock is not None:
+            check_takes("the clock of Save", self.clock, "(t, q, p, args)")
+        if self.ts is None:
+            if self.clock is not None:
+                raise ValueError(
+                    "clock requires ts: write Save(ts=values, clock=...) with the values of the "
+                    "clock at which states are saved."
+                )
+            return
+        if self.every is not None or self.final:
+            raise ValueError(
+                f"Save(ts=...) saves at the times ts only, got also every={self.every} and "
+                f"final={self.final}: leave out every and final. Add their times to ts if needed."
+            )
+        if self.ts.ndim != 1 or self.ts.shape[0] == 0:
+            raise ValueError(
+                "ts in Save(ts=...) must be a one-dimensional array with at least one time, such "
+                f"as [0.5], got shape {self.ts.shape}."
+            )
+        if not is_traced(self.ts):
+            steps = np.diff(np.asarray(self.ts))
+            # In order, since a step finds its times by bisection. Traced ones are sorted in a run.
+            ordered = bool((steps >= 0).all() or (steps <= 0).all())
+            if not (ordered and np.isfinite(np.asarray(self.ts)).all()):
+                seen = np.array2string(np.asarray(self.ts), threshold=20)
+                raise ValueError(
+                    "ts in Save(ts=...) must be finite and in ascending order, or for h < 0 in "
+                    f"descending order, got {seen}. Remove NaN and infinity, and use np.sort(ts)."
+                )
+
+
+class Solution(eqx.Module):
+    """A computed trajectory.
+
+    - `ts`: saved times, shape (S,); ``ts[0]`` is t0, except with ``Save(ts=...)``.
+    - `qs`, `ps`: saved positions and momenta, shape (S, *q0.shape).
+    - `hs`: size of the step that ended at each saved time except the first, shape (S − 1,).
+      With ``Save(ts=...)`` the first time is like the others: `hs` and the values of functions in
+      `observed` have shape (S, …), and belong to the shorter step that ends at each time (of size
+      zero at t0).
+    - `observed`: the pytree given as `observe`; a function of the state is replaced by its values
+      at ``ts``, shape (S, …), one of a step by its values on the steps that ended at ``ts[1:]``,
+      shape (S − 1, …), a reduction by one value over all steps.
+    - `result`: the status, one of `RESULTS`. From the failing step on states and observables are
+      NaN.
+    - `stop`: the end (t, q, p) of a run with a `Stop`, a `Stopped`, NaN if it did not stop; else
+      None.
+    - `stats`: `num_steps`; `newton_iterations` (total); `max_residual` (largest last correction of
+      a solve relative to its scale); `failed_step` (number of the failing step from 0, or −1) and
+      `failed_residual` (its last correction, likewise, or 0).
+
+    Under `vmap` the first axis of every field is the batch.
+    """
+
+    ts: Float[Array, "..."]
+    qs: State
+    ps: State
+    hs: Float[Array, "..."]
+    observed: Any
+    result: RESULTS
+    stats: dict[str, Any]
+    stop: Any = None
+
+    @property
+    def status(self) -> Any:
+        """The name of `result`, such as "successful"; an array of names for a batch."""
+        return status_name(self.result)
+
+    @property
+    def t_final(self) -> Array:
+        """The last saved time, shape (*batch,)."""
+        return self.ts[..., -1]
+
+    @property
+    def q_final(self) -> Array:
+        """The last saved positions, shape (*batch, *q0.shape)."""
+        # Axes of the batch come first, those of a state last: the saved states are in between.
+        return jnp.take(self.qs, -1, axis=self.ts.ndim - 1)
+
+    @property
+    def p_final(self) -> Array:
+        """The last saved momenta, shape (*batch, *q0.shape)."""
+        return jnp.take(self.ps, -1, axis=self.ts.ndim - 1)
+
+    def __getattr__(self, name: str) -> Any:
+        # Called for names that do not exist only.
+        meant = _OTHER_NAMES.get(name)
+        meant = meant or "attributes are " + ", ".join([*self.__dataclass_fields__, "status"])
+        text = f"a Solution has no attribute {name!r}. The {meant}."
+        raise AttributeError(text, name=name, obj=self)
+
+    def __repr__(self) -> str:
+        """Status, size and last state in words; the shapes under jit."""
+        if any(is_traced(x) for x in jax.tree.leaves((self.ts, self.qs, self.result))):
+            return f"Solution(ts={eqx.tree_pformat(self.ts)}, qs={eqx.tree_pformat(self.qs)}, …)"
+        *batch, saved = self.ts.shape
+        names = np.atleast_1d(np.asarray(self.status, dtype=str))
+        counts = {str(name): int((names == name).sum()) for name in np.unique(names)}
+        status = ", ".join(f"{n} {s}" for s, n in counts.items()) if batch else str(self.status)
+        many = f"{' × '.join(map(str, batch))} trajectories, " if batch else ""
+        shape = self.qs.shape[len(batch) + 1 :]
+        # The times of the first trajectory; those of others in the batch may differ.
+        t = np.asarray(self.ts).reshape(-1, saved)[0]
+        lines = [
+            f"Solution: {many}{status}; {self.stats['num_steps']} steps, {saved} saved states of "
+            f"shape {shape}, t = {t[0]:g} … {t[-1]:g}"
+        ]
+        if not batch:
+            short = {"precision": 6, "threshold": 12, "separator": ", "}
+            lines.append(f"  q_final = {np.array2string(np.asarray(self.q_final), **short)}")
+            lines.append(f"  p_final = {np.array2string(np.asarray(self.p_final), **short)}")
+        if self.observed is not None:
+            lines.append(f"  observed = {eqx.tree_pformat(self.observed)}")
+        return "\n".join(lines)
+
+
+_OTHER_NAMES = {
+    **dict.fromkeys(
+        ("q", "x", "positions", "coordinates"), "positions are in qs, the last ones in q_final"
+    ),
+    **dict.fromkeys(("p", "v", "momenta"), "momenta are in ps, the last ones in p_final"),
+    **dict.fromkeys(("t", "times", "time"), "times are in ts"),
+    **dict.fromkeys(("y", "ys", "states", "state"), "states are in qs and ps"),
+    **dict.fromkeys(("success", "converged"), 'status is "successful" for a run without a failure'),
+    **dict.fromkeys(("observables", "observe"), "values of observables are in observed"),
+}
+"""Names in other packages → where it is here."""

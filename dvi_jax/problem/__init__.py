@@ -1,0 +1,1 @@
+"""The problem of the user: systems, and what makes a discrete Hamiltonian."""

@@ -1,0 +1,308 @@
+"""Noise: what it does to a system, and the Brownian paths that drive it."""
+
+import abc
+import math
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Int
+
+from lanewise.jaxprs.dependence import depends_on
+from lanewise.jaxprs.jaxapi import is_traced, threefry2x32
+
+from ..base.checks import whole
+from ..base.signature import check_takes, warn_of_exchanged
+from ..base.types import Args, Interval, Scalar, State
+
+_NAMES = "(t, q, p, args)"
+
+
+class Noise(eqx.Module):
+    """Base class of noise by m independent Brownian motions B, in the sense of Stratonovich."""
+
+    @property
+    def functions(self) -> list[Callable[..., Any]]:
+        """The functions of the user."""
+        return [x for x in vars(self).values() if callable(x)]
+
+    @abc.abstractmethod
+    def count(self, t: Scalar, q: State, p: State, args: Args) -> int:
+        """m. **Raises** `ValueError` for functions that return a wrong shape."""
+
+    def energy(self, t: Scalar, q: State, p: State, args: Args, rates: Array) -> Any:
+        """Σ_m h_m Ḃ_m for noise Hamiltonians h_m, with Ḃ = `rates`, shape (m,) [√time/time]."""
+        return jnp.zeros((), p.dtype)
+
+    def force(self, t: Scalar, q: State, p: State, args: Args, rates: Array) -> Any:
+        """The rate of change of p that does not derive from `energy`."""
+        return jnp.zeros_like(p)
+
+    def kick(self, t: Scalar, q: State, p: State, args: Args, h: Scalar, dB: Array) -> State:
+        """The change of p over a time h by `force` alone at constant q, exactly."""
+        return h * self.force(t, q, p, args, dB / h)
+
+    def check_fixed_momentum(self, method: str, t: Scalar, q: State, p: State, args: Args) -> None:
+        """**Raises** `ValueError` if a method cannot take the factor of dB at a known momentum."""
+
+
+class MomentumNoise(Noise):
+    """dp = … + σ(t, q, p) ∘ dB, the noise of ``System(H_D, noise=sigma)``."""
+
+    sigma: Callable[..., Any]
+
+    def count(self, t, q, p, args):
+        # Traced only: at the start σ may be singular.
+        shape = jax.eval_shape(self.sigma, t, q, p, args).shape
+        if shape not in (q.shape, (*q.shape, *shape[-1:])):
+            raise ValueError(
+                f"noise{_NAMES} must return an array like q0, {q.shape}, for an independent noise "
+                f"in each momentum, or of the shape {(*q.shape, 'm')} for m motions; got {shape}."
+            )
+        return q.size if shape == q.shape else shape[-1]
+
+    def force(self, t, q, p, args, rates):
+        sigma = jnp.asarray(self.sigma(t, q, p, args), p.dtype)
+        # Of the shape of q it is a diagonal matrix.
+        return sigma * rates.reshape(q.shape) if sigma.shape == q.shape else sigma @ rates
+
+    def check_fixed_momentum(self, method, t, q, p, args):
+        if depends_on(lambda p: self.sigma(t, q, p, args), 0, p):
+            raise ValueError(
+                f"the noise of the system depends on p, which dvi.{method}() cannot integrate in "
+                "the sense of Stratonovich. Use method=dvi.StochasticMidpoint()."
+            )
+
+
+class Langevin(Noise):
+    r"""Friction and thermal noise: Langevin's equation.
+
+        dp = (−∂H/∂q + εW) dt − γ p dt + √(2 γ T m) dB
+
+    With H = Σ p²/(2m) + V(q) and W = 0 the canonical distribution exp(−H/T) is stationary. At T = 0
+    the flow is conformally symplectic: areas shrink as e^{−γt}. ε multiplies neither term.
+
+    **Arguments** numbers, arrays that broadcast with q, or functions of args that return them:
+    `friction` is γ [1/time], `temperature` is T, which means k_B T [energy], and `mass` is m, that
+    of H [energy·time²/(unit of q)²].
+
+    **Raises** `ValueError` for values that do not broadcast with q0.
+
+    **Source** Langevin 1908; Leimkuhler & Matthews 2015, *Molecular Dynamics*, 6.
+    """
+
+    friction: Any
+    temperature: Any = 0.0
+    mass: Any = 1.0
+
+    def _values(self, args: Args, like: State) -> list[Array]:
+        values = (self.friction, self.temperature, self.mass)
+        found = [jnp.asarray(x(args) if callable(x) else x, like.dtype) for x in values]
+        # Numbers stay numbers: e^{−γh} of a step is then computed once.
+        return [jnp.broadcast_to(x, like.shape) if x.ndim else x for x in found]
+
+    def count(self, t, q, p, args):
+        try:
+            self._values(args, q)
+        except ValueError as error:
+            what = "friction, temperature and mass of dvi.Langevin must broadcast with q0, shape "
+            raise ValueError(f"{what}{q.shape}: {error}") from None
+        return q.size
+
+    def force(self, t, q, p, args, rates):
+        friction, temperature, mass = self._values(args, p)
+        return -friction * p + _root(2 * friction * temperature * mass) * rates.reshape(p.shape)
+
+    def kick(self, t, q, p, args, h, dB):
+        # The Ornstein–Uhlenbeck process, exact in distribution: its noise is normal with this
+        # variance, and the increment takes the place of its integral.
+        friction, temperature, mass = self._values(args, p)
+        variance = -jnp.expm1(-2 * friction * h) * temperature * mass
+        return jnp.expm1(-friction * h) * p + _root(variance / h) * dB.reshape(p.shape)
+
+
+class NoiseHamiltonians(Noise):
+    r"""Noise by Hamiltonians, a stochastic Hamiltonian system in the sense of Stratonovich:
+
+        dq = ∂H/∂p dt + Σ_m ∂h_m/∂p ∘ dB_m,    dp = (−∂H/∂q + εW) dt − Σ_m ∂h_m/∂q ∘ dB_m
+
+    Its flow is symplectic for each path if W = 0. ε does not multiply the noise.
+
+    **Arguments** `h`: function ``(t, q, p, args)`` → array of shape (m,) [energy·√time].
+
+    **Raises** `TypeError` for another function, `ValueError` if it returns another shape.
+
+    **Source** Bismut 1981, *Mécanique aléatoire*; Milstein, Repin & Tretyakov 2002, *SIAM J. Numer.
+    Anal.* 39, 2066.
+    """
+
+    h: Callable[..., Any]
+
+    def __check_init__(self):
+        check_takes("h of dvi.NoiseHamiltonians", self.h, _NAMES)
+
+    def count(self, t, q, p, args):
+        shape = jax.eval_shape(self.h, t, q, p, args).shape
+        if len(shape) != 1:
+            raise ValueError(
+                "the function of dvi.NoiseHamiltonians must return an array of shape (m,), got "
+                f"shape {shape}. For one noise return jnp.array([energy])."
+            )
+        return shape[0]
+
+    def energy(self, t, q, p, args, rates):
+        return jnp.sum(jnp.asarray(self.h(t, q, p, args), p.dtype) * rates)
+
+    # Positions change as well: there is no exact flow at constant q.
+    def kick(self, t, q, p, args, h, dB):
+        raise ValueError(
+            "dvi.BAOAB() and dvi.OBABO() require noise on the momenta, but the system has noise "
+            "Hamiltonians. Use method=dvi.StochasticMidpoint() or dvi.StochasticEuler()."
+        )
+
+
+def _root(x: Array) -> Array:
+    """√x with a derivative of 0 at x = 0."""
+    # At a temperature of 0 that of √x would be infinite, and the gradients of all else NaN.
+    return jnp.where(x > 0, jnp.sqrt(jnp.where(x > 0, x, 1)), 0)
+
+
+def as_noise(noise: Any) -> Noise | None:
+    """The noise of a system: an object, or σ as a function. **Raises** `TypeError`."""
+    if noise is None or isinstance(noise, Noise):
+        return noise
+    check_takes("noise", noise, _NAMES)
+    warn_of_exchanged("noise", noise, _NAMES)
+    return MomentumNoise(noise)
+
+
+class BrownianPath(eqx.Module):
+    """Base class of the paths B(t) of m independent Brownian motions."""
+
+    @abc.abstractmethod
+    def increments(self, k: Int[Array, ""], interval: Interval, parts: int, count: int) -> Array:
+        """The increments of `count` motions over the `parts` equal parts of step k of a run, shape
+        (parts, count) [√time]; a pure function of these arguments."""
+
+    def check(self, num_steps: int) -> None:
+        """**Raises** `ValueError` for a run of more steps than the path has."""
+
+
+class Brownian(BrownianPath):
+    r"""Brownian motions whose increments are made from a key and the number of the step.
+
+        ΔB_k = √h z_k,     z_k = jax.random.normal(jax.random.fold_in(key, first_step + k), (m,))
+
+    to round-off, for the generator threefry2x32 with the default settings of JAX. Step k has these
+    numbers in every run: alone, in a batch, backwards in the gradients of `Reversible`, with
+    `progress`, after a resume.
+
+    **Arguments**
+
+    - `key`: a key of `jax.random`, or an integer, the seed of one. Under `vmap` over keys, and in a
+      `sweep` over an axis of seeds, each trajectory has its own path.
+    - `substeps`: n, number of the equal parts of a step. ΔB_k is √(h/n) times the sum of the n
+      numbers z with the indices n (first_step + k), …. Steps h, h/2, h/4 with n = 4, 2, 1 have the
+      same path B(t), as tests of convergence require. `OBABO`, with two increments, doubles n.
+    - `first_step`: number of the first step; N continues a run over N steps from its last state.
+
+    **Raises** `ValueError` or `TypeError` for another key; `ValueError` for more than 2³² parts.
+
+    **Source** counter-based generators: Salmon, Moraes, Dror & Shaw 2011.
+    """
+
+    # Not converted here: in a sweep it is an axis of seeds.
+    key: Any
+    substeps: int = eqx.field(static=True, default=1)
+    first_step: Any = 0
+
+    def __check_init__(self):
+        whole("substeps", self.substeps)
+
+    def check(self, num_steps):
+        if not is_traced(self.first_step):  # twice, for methods with two increments per step
+            most = 2**32 // (2 * self.substeps) - num_steps
+            hint = "A path has 2³² parts: continue a longer run with another key."
+            whole("first_step", int(self.first_step), 0, most, hint)
+
+    def increments(self, k, interval, parts, count):
+        # Modulo 2³², as the numbers of `fold_in` are; `check` excludes that they repeat.
+        step = jnp.asarray(self.first_step).astype(jnp.uint32) + k.astype(jnp.uint32)
+        dtype, size = interval.h.dtype, self.substeps
+
+        def add(i, sums):
+            numbers = [(step * parts + part) * size + jnp.uint32(i) for part in range(parts)]
+            return sums + jnp.stack([_normal(self.key, x, count, dtype) for x in numbers])
+
+        zero = jnp.zeros((parts, count), dtype)
+        # A loop, so that the code does not grow with the number of substeps.
+        sums = add(0, zero) if size == 1 else lax.fori_loop(0, size, add, zero)
+        return jnp.sqrt(interval.h / (parts * size)) * sums  # NaN for time that runs backwards
+
+
+class NoisePath(eqx.Module):
+    """The path of a run: a step has `parts` parts, with the increments of `count` motions each."""
+
+    path: BrownianPath
+    parts: int = eqx.field(static=True)
+    count: int = eqx.field(static=True)
+
+    def at(self, k: Int[Array, ""], interval: Interval) -> Array:
+        """The increments of step k, shape (parts, count)."""
+        found = self.path.increments(k, interval, self.parts, self.count)
+        if found.shape != (self.parts, self.count):
+            raise ValueError(
+                f"the increments of {type(self.path).__name__} must have the shape (parts, number "
+                f"of motions) = {(self.parts, self.count)}, got {found.shape}."
+            )
+        return found.astype(interval.h.dtype)  # a path of the user has that of its own functions
+
+
+def as_path(path: Any) -> BrownianPath | None:
+    """The path of a run, its key as two words. **Raises** `TypeError` or `ValueError`."""
+    if path is None or (not isinstance(path, Brownian) and isinstance(path, BrownianPath)):
+        return path
+    # Here and not in `Brownian`: keys of JAX have a type that generated code does not take.
+    path = path if isinstance(path, Brownian) else Brownian(path)
+    return Brownian(_words(path.key), path.substeps, jnp.asarray(path.first_step))
+
+
+def _words(key: Any) -> Array:
+    try:
+        found = jnp.asarray(key)
+    except TypeError:
+        found = jnp.zeros(0)
+    if found.shape == () and jnp.issubdtype(found.dtype, jnp.integer):
+        found = jax.random.key(found, impl="threefry2x32")
+    # Another generator has keys of another length, or another meaning.
+    if found.shape == () and "fry" in str(found.dtype):
+        return jax.random.key_data(found)
+    if found.shape == (2,) and found.dtype == jnp.uint32:  # an old key of JAX: its words
+        return found
+    raise ValueError(
+        "the key of a path must be one key of jax.random with the generator threefry2x32, such as "
+        f"jax.random.key(0), or an integer, got {key!r:.200}. For many paths use jax.vmap over "
+        'keys, or dvi.sweep(..., path=dvi.Axis("seed", range(1000))).'
+    )
+
+
+def _normal(key: Array, number: Array, count: int, dtype: Any) -> Array:
+    """``jax.random.normal(jax.random.fold_in(key, number), (count,), dtype)`` to round-off."""
+    # What `fold_in` does: the words of the number, encrypted with the key, are a new key.
+    folded = jnp.stack(threefry2x32(key, jnp.uint32(0), number))
+    # What `random_bits` does: the index of each number in two words.
+    words = threefry2x32(folded, jnp.uint32(0), jnp.arange(count, dtype=jnp.uint32))
+    info, bits = jnp.finfo(dtype), words[0] ^ words[1]
+    if info.bits == 64:
+        bits = words[0].astype(jnp.uint64) << 32 | words[1].astype(jnp.uint64)
+    # The fraction of a float in [1, 2).
+    one = jnp.ones((), dtype).view(bits.dtype)
+    uniform = (bits >> (info.bits - info.nmant) | one).view(dtype) - 1
+    # Between the numbers next to −1 and 1, as in JAX, so that no result is infinite.
+    least = np.nextafter(dtype.type(-1), dtype.type(0))
+    uniform = jnp.maximum(least, uniform * (1 - least) + least)
+    return math.sqrt(2) * lax.erf_inv(uniform)

@@ -1,0 +1,333 @@
+"""The problem of the user: a discrete Hamiltonian, a perturbing force, a perturbation."""
+
+import weakref
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from ..base.checks import finite, instance
+from ..base.indices import out_of_bounds
+from ..base.reads import Reads, changed, reads
+from ..base.signature import accepts, check_takes, tracing_note, warn_of_exchanged
+from ..base.types import Args, ConstraintFn, ForceFn, HamiltonianFn, Scalar, State
+from .noise import Noise, as_noise
+
+_NAMES = "(t0, t1, q0, p1, args)"
+_CONTINUOUS = "Make a discrete Hamiltonian of a continuous H(t, q, p, args) by dvi.discretise(H)."
+
+
+class System(eqx.Module):
+    r"""A perturbed discrete Hamiltonian system (*disturbed* in the paper).
+
+    The discrete Hamiltonian is ``H_D + epsilon * perturbation`` and the perturbing force
+    ``epsilon * force``; the map they define is (12)–(13) of the paper:
+
+        q1 = q0 + h ∂H_D/∂p1,        p1 = p0 − h ∂H_D/∂q0 + h ε W(t0, t1, q0, p1).
+
+    **Arguments**
+
+    - `H_D`: function ``(t0, t1, q0, p1, args)`` → scalar [energy].
+    - `force`: W, function of the same arguments → array like q0 [energy / unit of q]; or None.
+    - `perturbation`: H1_D, function of the same arguments → scalar [energy]; or None.
+      ``epsilon * H1_D`` is added to H_D: a perturbation that derives from a Hamiltonian. It may
+      take ``epsilon`` as a sixth argument, for an energy that is not linear in ε.
+    - `slow_time`: if True all three functions receive the slow times ``epsilon * t0`` and
+      ``epsilon * t1`` in place of t0 and t1.
+    - `noise`: a function σ ``(t, q, p, args)`` → array like q0, or of the shape (*q0.shape, m), for
+      ``dp = … + σ ∘ dB`` [unit of p/√time]; a `Langevin`; or `NoiseHamiltonians`. Runs then need a
+      path and a method for noise. ε does not multiply noise; stochastic integrals are those of
+      Stratonovich.
+    - `epsilon`: strength of the perturbation in runs without ``epsilon=``. None: each run of a
+      system with a force, a perturbation or a slow time must give it. Systems of the library: 0.
+    - `constraint`: g, function ``(q, args)`` → array of m numbers that are all zero for the
+      positions allowed; or None. `Rattle` and its compositions take such a system; see also
+      `project` for initial conditions and `ConstraintForce`.
+
+    q0 and p1 are arrays of one shape, the one given to `integrate`. `args` is any pytree; its
+    arrays and floats are differentiable.
+
+    Values that the functions read from outside (globals, closures, ``self.k``) are those at the
+    time when the system is made. If they change, runs of this system raise `ValueError`: make a new
+    system, or pass such values in `args`.
+
+    **Raises** `TypeError` when a function is not callable or does not take the five arguments.
+    **Warns** when the names of the arguments suggest that p and q are exchanged.
+
+    **Source** H_D: type II generating function S = p1·q0 + h H_D (Marsden & West 2001,
+    *Discrete mechanics and variational integrators*; Leok & Zhang 2011). Perturbations: the paper,
+    (6)–(13).
+
+    **Example**
+
+    ```python
+    system = dvi.System(lambda t0, t1, q0, p1, args: p1 @ p1 / 2 + args["k"] * (q0 @ q0) / 2,
+                        force=lambda t0, t1, q0, p1, args: -p1)          # friction
+    sol = dvi.integrate(system, [1.0], [0.0], h=0.1, num_steps=100, epsilon=0.2, args={"k": 4.0})
+    print(sol.status, round(float(sol.qs[-1, 0]), 3))
+    # successful 0.165
+    ```
+    """
+
+    H_D: HamiltonianFn
+    force: ForceFn | None = None
+    perturbation: HamiltonianFn | None = None
+    slow_time: bool = eqx.field(static=True, default=False)
+    epsilon: float | None = eqx.field(static=True, default=None)
+    noise: Noise | None = None
+    constraint: ConstraintFn | None = None
+    reads: Reads = eqx.field(static=True, init=False, repr=False)
+
+    def __post_init__(self):
+        self.noise = as_noise(self.noise)
+        self.reads = _read_by(self)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)  # a module is frozen
+        # A copy or an unpickled system has other objects: marks by identity would all differ.
+        vars(self)["reads"] = _read_by(self)
+
+    def __check_init__(self):
+        for name in ("H_D", "force", "perturbation"):
+            function = getattr(self, name)
+            if name == "perturbation" and self._is_nonlinear:
+                continue
+            if function is not None or name == "H_D":
+                check_takes(name, function, _NAMES, {4: _CONTINUOUS})
+            if function is not None:
+                warn_of_exchanged(name, function, _NAMES)
+        if self.constraint is not None:
+            check_takes("constraint", self.constraint, "(q, args)")
+        instance("slow_time", self.slow_time, bool, "True or False")
+        if self.epsilon is not None:
+            finite("epsilon of a System", self.epsilon)
+        functions = {"H_D": self.H_D, "perturbation": self.perturbation}
+        timed = [n for n, f in functions.items() if getattr(f, "step_is_from_times", False)]
+        if self.slow_time and timed:
+            raise ValueError(
+                f"{timed[0]} must not compute the step as t1 − t0 if slow_time=True, because then "
+                "t1 − t0 is ε h. The results of dvi.discretise(H, order) with order ≥ 2, of "
+                "dvi.from_lagrangian and of dvi.from_type_iii do so. Use dvi.discretise(H, "
+                "order=1), or dvi.legendre(L) for a Lagrangian. For a higher order pass "
+                "method=dvi.Strang() or dvi.Yoshida(4) to dvi.integrate."
+            )
+
+    @property
+    def _is_nonlinear(self) -> bool:
+        """Whether the perturbation takes ε."""
+        f = self.perturbation
+        return callable(f) and accepts(f, 6) and not accepts(f, 5)
+
+    def strength(self, epsilon: Any) -> Any:
+        """ε of a run: the one given, else the default of the system, else 0 for a system that does
+        not depend on it. **Raises** `ValueError` if a perturbed system has none."""
+        if epsilon is not None:
+            return epsilon
+        if self.epsilon is not None:
+            return self.epsilon
+        parts = {
+            "a force": self.force is not None,
+            "a perturbation": self.perturbation is not None,
+            "slow_time=True": self.slow_time,
+        }
+        if any(parts.values()):
+            has = " and ".join(name for name, is_there in parts.items() if is_there)
+            raise ValueError(
+                f"epsilon must be given for a system with {has}. epsilon is the factor of the "
+                "force, of the perturbation and of the slow time ε t. Pass a value such as 0.01, "
+                "or epsilon=1.0 to use the functions as they are."
+            )
+        return 0.0
+
+    def hamiltonian(
+        self, t0: Scalar, t1: Scalar, q0: State, p1: State, epsilon: Scalar, args: Args
+    ) -> Scalar:
+        """H_D(t0, t1, q0, p1) + ε H1_D(t0, t1, q0, p1): a scalar [energy]."""
+        s0, s1 = self.times(t0, t1, epsilon)
+        H = self.H_D(s0, s1, q0, p1, args)
+        if self.perturbation is not None:
+            extra = (epsilon,) if self._is_nonlinear else ()
+            H = H + epsilon * self.perturbation(s0, s1, q0, p1, args, *extra)
+        return jnp.asarray(H, p1.dtype)  # also where args are in double and the state is not
+
+    def disturbing_force(
+        self, t0: Scalar, t1: Scalar, q0: State, p1: State, epsilon: Scalar, args: Args
+    ) -> State:
+        """ε W(t0, t1, q0, p1): an array like q0 [energy / unit of q]; zero without a force."""
+        if self.force is None:
+            return jnp.zeros_like(q0)
+        s0, s1 = self.times(t0, t1, epsilon)
+        return epsilon * self.force(s0, s1, q0, p1, args)
+
+    def times(self, t0: Scalar, t1: Scalar, epsilon: Scalar) -> tuple[Scalar, Scalar]:
+        """The times that the user's functions receive: slow ones if `slow_time` is set."""
+        return (epsilon * t0, epsilon * t1) if self.slow_time else (t0, t1)
+
+    def check_shapes(self, t: Scalar, q: State, p: State, epsilon: Scalar, args: Args) -> None:
+        """**Raises** `ValueError` or `TypeError` for functions whose values have the wrong shape or
+        type."""
+        leaves, tree = jax.tree.flatten((t, q, p, args))
+        # A function is traced once for each combination of shapes, types and values that it reads.
+        kinds = (
+            self.reads,
+            tree,
+            *((x.shape, x.dtype) if eqx.is_array(x) else (type(x), x) for x in leaves),
+        )
+        scalar = "a real scalar (an energy)"
+        for name, function, shape, expected in (
+            ("H_D", self.H_D, (), scalar),
+            ("perturbation", self.perturbation, (), scalar),
+            ("force", self.force, q.shape, f"a real array shaped like q0, {q.shape}"),
+        ):
+            if function is None:
+                continue
+            extra = (t,) if name == "perturbation" and self._is_nonlinear else ()
+            out = _traced_output(function, name, kinds, (t, t, q, p, args, *extra))
+            if out.shape == shape and jnp.issubdtype(out.dtype, jnp.floating):
+                continue
+            hint = "" if shape else "Return a floating-point number."
+            if out.shape and not shape:
+                hint = "Sum its entries with jnp.sum, or take one component."
+            raise ValueError(
+                f"{name}{_NAMES} must return {expected}; for q0 of shape {q.shape} it returned an "
+                f"array of shape {out.shape}, dtype {out.dtype}. {hint}".rstrip()
+            )
+        if self.constraint is not None:
+            # A scalar is refused too: one component needs an axis as several do.
+            out = _traced_output(self.constraint, "constraint", kinds, (q, args))
+            if len(out.shape) != 1 or 0 in out.shape or not jnp.issubdtype(out.dtype, jnp.floating):
+                raise ValueError(
+                    "constraint(q, args) must return a real array of shape (m,), one number for "
+                    f"each of its m ≥ 1 conditions; for q of shape {q.shape} it returned an array "
+                    f"of shape {out.shape}, dtype {out.dtype}. Use jnp.stack([...]) or jnp.ravel."
+                )
+
+
+def _read_by(system: System) -> Reads:
+    of_noise = [] if system.noise is None else system.noise.functions
+    functions = (system.H_D, system.force, system.perturbation, system.constraint, *of_noise)
+    # A counter of calls, for instance, changes with every trace, and no program depends on it.
+    ignored = {name for f in functions for name in _changed_by_tracing(f)}
+    return tuple(item for item in reads(*functions) if item[0] not in ignored)
+
+
+def of_problem(
+    system: Any, q0: Any, p0: Any, h: Any, args: Any, has_start: bool = False
+) -> tuple[Any, ...]:
+    """System, initial state, step and args of a call that may have a problem of the library, which
+    has defaults. **Raises** `TypeError` for a system without an initial state.
+
+    `has_start`: the call has its initial states in another argument.
+    """
+    # Recognised by its attribute, since the class `Problem` is in a layer above this one.
+    if isinstance(getattr(system, "system", None), System):
+        problem, system = system, system.system
+        defaults = (("q0", q0), ("p0", p0), ("h", h), ("args", args))
+        given = (getattr(problem, n) if x is None else x for n, x in defaults)
+        q0, p0, h, args = (None, None, *tuple(given)[2:]) if has_start else given
+    elif isinstance(system, System) and not has_start and (q0 is None or p0 is None):
+        raise TypeError(
+            f"q0 and p0 must both be given for a dvi.System, but {'q0' if q0 is None else 'p0'} is "
+            "missing. Call integrate(system, q0, p0, ...)."
+        )
+    return system, q0, p0, h, args
+
+
+def check_system(system: Any, of_map: str = "", noise_allowed: bool = False) -> None:
+    """**Raises** `TypeError` for an object that is not a `System`, `ValueError` for a system whose
+    functions read a value that has changed since it was made, for one with noise, and for a
+    constraint if `of_map` is the name of a function that examines the map (12)–(13) itself."""
+    if not isinstance(system, System):
+        hint = "Wrap the discrete Hamiltonian H_D(t0, t1, q0, p1, args) in it: dvi.System(H_D)."
+        if isinstance(getattr(system, "system", None), System):
+            hint = "Take the system of a problem of the library: problem.system."
+        name = getattr(system, "__name__", "")
+        of_library = str(getattr(system, "__module__", "")).startswith("dvi_jax.systems.")
+        if of_library and accepts(system, 0):
+            hint = f"Call the function: {name}()."
+        kind = "class" if isinstance(system, type) else type(system).__name__
+        seen = f"the {kind} {name}" if name else f"a value of type {kind}"
+        raise TypeError(f"system must be a dvi.System, got {seen}. {hint}")
+    if system.noise is not None and not noise_allowed:
+        raise ValueError(
+            "the system has noise, which this function does not support: give it the same system "
+            "without noise=. dvi.integrate, dvi.sweep and dvi.invariant_diffusion support noise."
+        )
+    if of_map and system.constraint is not None:
+        raise ValueError(
+            f"{of_map} examines the map (12)–(13) of a system without constraint, but this system "
+            "has one. Use coordinates without constraint; dvi.discover_invariants and "
+            "dvi.drift_order take constrained systems."
+        )
+    # Programs that are compiled already would compute with the old value.
+    now = _read_by(system)
+    names = changed(system.reads, now) if now != system.reads else []
+    if names:
+        raise ValueError(
+            "the functions of the system read values that have changed since dvi.System(...) was "
+            f"called: {', '.join(names)}. Make a new System, or pass such values in args."
+        )
+
+
+# Weak, so that functions and the arrays in their closures can be deleted.
+_SEEN: weakref.WeakKeyDictionary[Callable, dict] = weakref.WeakKeyDictionary()
+"""Function → kinds of arguments → output."""
+
+_CHANGED_BY_TRACING: weakref.WeakKeyDictionary[Callable, frozenset] = weakref.WeakKeyDictionary()
+"""Function → names of the values that it changes itself."""
+
+
+def _changed_by_tracing(function: Callable | None) -> frozenset[str]:
+    try:
+        return _CHANGED_BY_TRACING.get(function, frozenset()) if function else frozenset()
+    except TypeError:  # a function without a hash or a weak reference
+        return frozenset()
+
+
+def _traced_output(
+    function: Callable, name: str, kinds: tuple, at: Sequence[Any]
+) -> jax.ShapeDtypeStruct:
+    q, args = (at[2], at[4]) if len(at) > 2 else (at[0], at[-1])
+    names = _NAMES if len(at) > 2 else "(q, args)"
+    try:
+        seen = _SEEN.setdefault(function, {})
+        if kinds in seen:
+            return seen[kinds]
+    except TypeError:  # a function or an argument without a hash: it is traced in every call
+        seen = {}
+    # Traced, not called: at a start in a singularity a value would be NaN, its shape is the same.
+    before = reads(function)
+    try:
+        traced, *out = eqx.filter_make_jaxpr(function)(*at)
+    except Exception as error:
+        error.add_note(f"(in {name}{names}, called with q0 of shape {q.shape} and args={args!r})")
+        error.add_note(tracing_note(name, error))
+        if q.ndim > 1:
+            error.add_note(
+                f"{name} receives the whole q0. If its first axis is a batch of initial states, "
+                "write the function of one state and use jax.vmap."
+            )
+        raise
+    # JAX moves such an index to the end of the array, so that the result would be wrong silently.
+    for index, size in out_of_bounds(traced):
+        raise IndexError(
+            f"{name}{names} must use indices inside its arrays, but the index {index} is out of "
+            f"bounds for an axis of length {size}. q0 and p1 have the shape {q.shape}. Correct the "
+            "index, or the shape of the array."
+        )
+    out = eqx.combine(*out)
+    after = reads(function)
+    if after != before:  # such as a counter of calls
+        marks = dict(before)
+        _CHANGED_BY_TRACING[function] = _changed_by_tracing(function) | {
+            name for name, mark in after if marks.get(name) != mark
+        }
+    if out is None or not hasattr(out, "shape"):
+        if isinstance(out, int | float):
+            return seen.setdefault(kinds, jax.ShapeDtypeStruct((), jnp.result_type(float)))
+        got = "None (is a return missing?)" if out is None else f"type {type(out).__name__}"
+        wanted = f"an array of shape {q.shape}, that of q0" if name == "force" else "a real scalar"
+        raise TypeError(f"{name}{names} must return {wanted}, got {got}.")
+    return seen.setdefault(kinds, jax.ShapeDtypeStruct(out.shape, out.dtype))

@@ -1,0 +1,1 @@
+"""The solar system: planets, relativity, polar motion."""

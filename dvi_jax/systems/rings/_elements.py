@@ -1,0 +1,247 @@
+"""Elements of a ring: magnets, cavities, apertures."""
+
+import dataclasses
+import inspect
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Literal, get_args
+
+from ...base.checks import finite, instance, one_of, positive, refuse_unknown, whole
+from ._maps import KICKS, Part
+
+Model = Literal["paraxial", "exact"]
+C = 299792458.0
+"""Speed of light [m/s]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Element:
+    """One element: its name and kind, its parts in order, and its parameters by name."""
+
+    name: str
+    kind: str
+    parts: tuple[Part, ...] = ()
+    values: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+    def placed(self, dx: float = 0.0, dy: float = 0.0, roll: float = 0.0) -> "Element":
+        """The element shifted by (dx, dy) [m], then rolled about its axis [rad]."""
+        values = {"dx": dx, "dy": dy, "roll": roll}
+        return self.within(Part("placed_in"), Part("placed_out"), **values)
+
+    def inside(
+        self, *, rectangle: Sequence[float] | None = None, ellipse: Sequence[float] | None = None
+    ) -> "Element":
+        """The element with an aperture at both ends: a rectangle (x_min, x_max, y_min, y_max), or
+        an ellipse with the half axes (x, y) [m]."""
+        element = self
+        for name, limits, keys in (
+            ("rectangle", rectangle, ("x_min", "x_max", "y_min", "y_max")),
+            ("ellipse", ellipse, ("radius_x", "radius_y")),
+        ):
+            if limits is not None:
+                if len(limits) != len(keys):
+                    raise ValueError(
+                        f"{name} of element {self.name!r} must be ({', '.join(keys)}), got "
+                        f"{limits!r}."
+                    )
+                ends = Part(name), Part(name)
+                element = element.within(*ends, **dict(zip(keys, limits, strict=True)))
+        return element
+
+    def within(self, before: Part, after: Part, **values: Any) -> "Element":
+        """The element between two parts with parameters of their own."""
+        return dataclasses.replace(
+            self,
+            parts=(before, *self.parts, after) if self.parts else (before, after),
+            values={**self.values, **values},
+        )
+
+
+def drift(name: str, length: float, model: Model = "paraxial") -> Element:
+    """A space without field."""
+    one_of("model", model, get_args(Model))
+    part = Part("drift" if model == "paraxial" else "exact_drift")
+    return Element(name, "drift", (part,), {"length": finite("length", length)})
+
+
+def marker(name: str, kind: str = "marker") -> Element:
+    """A place with a name, such as a beam position monitor."""
+    return Element(name, kind)
+
+
+def multipole(
+    name: str,
+    length: float,
+    b: Iterable[float] = (0.0,),
+    a: Iterable[float] = (0.0,),
+    *,
+    kind: str = "multipole",
+    **how: Any,
+) -> Element:
+    """A straight magnet with the field Σ (b_n + i a_n)(x + i y)^n = (B_y + i B_x)/(Bρ).
+
+    **Arguments** `b`, `a`: from n = 0 (dipole) [1/m^{n+1}]; MAD-X's k_n is n! b_n. Length zero: b
+    and a are integrated over the length. `how`: ``slices=10``; ``scheme=4``, the order 2, 4 or 6
+    of the composition in each slice; ``model="paraxial"`` or "exact"; ``fringe=False``, whether it
+    has the hard edges of the quadrupole, or those of all multipoles if exact.
+    """
+    order, values = _field(name, b, a)
+    slices, scheme, fringe, model = _options(how)
+    values["length"] = finite("length", length)
+    if length == 0:
+        return Element(name, kind, (Part("thin", order),), values)
+    body = Part("straight" if model == "paraxial" else "exact_straight", order, scheme, slices)
+    edge = "fringe" if model == "paraxial" else "multipole_fringe"
+    has_edges = fringe and (model == "exact" or order > 0)
+    parts = (Part(f"{edge}_in", order), body, Part(f"{edge}_out", order))
+    return Element(name, kind, parts if has_edges else (body,), values)
+
+
+def quadrupole(name: str, length: float, k1: float, **how: Any) -> Element:
+    """A quadrupole: b = (0, k1) [1/m²]; other arguments as for `multipole`."""
+    return multipole(name, length, (0.0, k1), kind="quadrupole", **how)
+
+
+def sextupole(name: str, length: float, b2: float, **how: Any) -> Element:
+    """A sextupole: b = (0, 0, b2) [1/m³], b2 half of MAD-X's k2; others as for `multipole`."""
+    return multipole(name, length, (0.0, 0.0, b2), kind="sextupole", **how)
+
+
+def octupole(name: str, length: float, b3: float, **how: Any) -> Element:
+    """An octupole: b = (0, 0, 0, b3) [1/m⁴], b3 a sixth of MAD-X's k3; others as for
+    `multipole`."""
+    return multipole(name, length, (0.0, 0.0, 0.0, b3), kind="octupole", **how)
+
+
+def bend(
+    name: str,
+    length: float,
+    angle: float,
+    b: Iterable[float] = (0.0, 0.0),
+    a: Iterable[float] = (0.0,),
+    *,
+    edge_in: float = 0.0,
+    edge_out: float = 0.0,
+    fringe_in: float = 0.0,
+    fringe_out: float = 0.0,
+    **how: Any,
+) -> Element:
+    """A bend by `angle` [rad] along an arc of `length` [m]; `edge_in` = `edge_out` = angle/2 for a
+    rectangular one.
+
+    **Arguments** `b`, `a`: further field, as for `multipole`; b_0 is an error of the main field.
+    `edge_in`, `edge_out`: angles of the pole faces [rad]. `fringe_in`, `fringe_out`: gap times
+    fringe field integral [m]. `how`: as for `multipole`; the exact model has the hard edges of the
+    main field.
+
+    **Raises** `ValueError` for a length that is not positive.
+    """
+    positive("length of a bend", length)
+    order, values = _field(name, b, a)
+    slices, scheme, fringe, model = _options(how)
+    values |= {
+        "length": length,
+        "h": finite("angle", angle) / length,
+        "edge_in": finite("edge_in", edge_in),
+        "edge_out": finite("edge_out", edge_out),
+        "fringe_in": finite("fringe_in", fringe_in),
+        "fringe_out": finite("fringe_out", fringe_out),
+    }
+    if model == "exact" and angle != 0:
+        ends = ["rotation", "dipole_fringe", *["gradient_fringe"] * fringe, "wedge"]
+        body = Part("exact_bend", order, scheme, slices)
+    else:
+        ends = ["edge", *["fringe"] * (fringe and order > 0)]
+        body = Part("bend" if model == "paraxial" else "exact_straight", order, scheme, slices)
+    first = [Part(f"{end}_in", order) for end in ends]
+    last = [Part(f"{end}_out", order) for end in reversed(ends)]
+    return Element(name, "bend", (*first, body, *last), values)
+
+
+def corrector(name: str, length: float, kick_x: float, kick_y: float) -> Element:
+    """A dipole corrector with kicks of px and py [rad]."""
+    values = {"length": length, "kick_x": kick_x, "kick_y": kick_y}
+    return Element(name, "corrector", (Part("corrector"),), values)
+
+
+def lens(name: str, potential: Callable[..., Any], **values: float) -> Element:
+    """A thin lens of any potential: px − ∂V/∂x, py − ∂V/∂y with V = potential(x, y, par) [m].
+
+    **Arguments** `potential`: a function of JAX; elements with the same function share compiled
+    code. `values`: parameters of the element, which it reads as ``par["name"]``, and by which
+    results can be differentiated.
+
+    **Example** The kick in x of a McMillan map: ``rings.lens("M", lambda x, y, par: -par["g"] *
+    jnp.log(1 + x * x) / 2, g=1.6)``
+    """
+    values = {key: finite(f"{key} of lens {name!r}", value) for key, value in values.items()}
+    part = Part("lens", potential=instance("potential", potential, Callable, "a function"))
+    return Element(name, "lens", (part,), {**values, "length": 0.0})
+
+
+def solenoid(name: str, length: float, ks: float) -> Element:
+    """A solenoid with hard edges, ks = B/(Bρ) [1/m]."""
+    return Element(name, "solenoid", (Part("solenoid"),), {"length": length, "ks": ks})
+
+
+def cavity(
+    name: str,
+    length: float,
+    voltage: float,
+    frequency: float,
+    lag: float = 0.0,
+    phase: float = 0.0,
+    slip: float = 0.0,
+) -> Element:
+    """A cavity between two half drifts: δ changes by −V sin(2π f (−ζ − lag)/c − phase).
+
+    **Arguments** `voltage`: V over the energy. `frequency`: f [Hz]. `lag` [m]. `phase` [rad].
+    `slip`: change of phase per turn [rad], 2π (f T − number of periods) for a frequency that is not
+    a multiple of 1/T.
+    """
+    values = {
+        "length": length,
+        "voltage": voltage,
+        "wave_number": 2 * math.pi * frequency / C,
+        "lag": lag,
+        "phase": phase,
+        "slip": slip,
+    }
+    half = Part("half_drift")
+    parts = (half, Part("cavity"), half) if length else (Part("cavity"),)
+    return Element(name, "cavity", parts, values)
+
+
+def aperture(name: str, **limits: Any) -> Element:
+    """An aperture; arguments as for `Element.inside`, at least one of them."""
+    element = Element(name, "aperture").inside(**limits)
+    if not element.parts:
+        raise ValueError(
+            f"aperture {name!r} must have limits: rectangle=(x_min, x_max, y_min, y_max) or "
+            "ellipse=(x, y), got neither."
+        )
+    return element
+
+
+def _field(name: str, b: Iterable[float], a: Iterable[float]) -> tuple[int, dict[str, Any]]:
+    b, a = tuple(b), tuple(a)
+    order = max(len(b), len(a), 1) - 1
+    found = {}
+    for key, given in (("b", b), ("a", a)):
+        for n in range(order + 1):
+            value = given[n] if n < len(given) else 0.0
+            found[f"{key}{n}"] = finite(f"{key}{n} of element {name!r}", value)
+    return order, found
+
+
+def _options(how: dict[str, Any]) -> tuple[int, int, bool, Model]:
+    """The options of a magnet in slices. **Raises** `TypeError` for an unknown one, `ValueError`
+    for an invalid one."""
+
+    def of(slices: int = 10, scheme: int = 4, fringe: bool = False, model: Model = "paraxial"):
+        one_of("scheme", scheme, KICKS)
+        one_of("model", model, get_args(Model))
+        return whole("slices", slices), scheme, fringe, model
+
+    refuse_unknown("a magnet", of, set(how) - set(inspect.signature(of).parameters))
+    return of(**how)

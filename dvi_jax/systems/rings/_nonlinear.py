@@ -1,0 +1,254 @@
+"""Detuning with amplitude, driving terms, dynamic and momentum aperture, frequency maps."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+import lanewise
+
+from ...base.checks import finite, positive, whole
+from ...base.progress import bar_of, told
+from ...dynamics.frequencies import frequencies, frequency_diffusion
+from ._maps import Particle
+from ._optics import SLICED, Optics, analysis, four, maps, optics
+from ._ring import Ring, Where
+from ._track import track
+from ._turn import Passage, start
+
+Report = bool | Callable[[tuple[int, int]], None] | None
+"""A function of (particles done, all particles of this round), or as in `dvi.integrate`."""
+_GEOMETRIC = "h21000", "h30000", "h10110", "h10020", "h10200"
+_CHROMATIC = "h11001", "h00111", "h20001", "h00201", "h10002"
+_XY = np.eye(6)[[0, 2]]
+_BATCH = 4096
+"""Particles tracked in one call: more do not become faster, and progress is reported between."""
+
+
+class FrequencyMap(NamedTuple):
+    """Tunes of particles: `tune`, the fractional parts in the first half of the turns, and `second`
+    in the second half, shape (…, 2); `diffusion`, log10 of the length of their difference, shape
+    (…). NaN for particles that were lost, and for motion without a leading frequency."""
+
+    tune: Array
+    second: Array
+    diffusion: Array
+
+
+def detuning(ring: Ring, dp: float = 0.0, action: float = 1e-9, turns: int = 1024) -> Array:
+    r"""Change of the tunes with the actions, ((dQx/dJx, dQx/dJy), (dQy/dJx, dQy/dJy)) [1/m].
+
+    Q(J) − Q(0) of 16 particles with actions from one to four times `action` [m] is a polynomial of
+    order 3 in the actions. Q and J are frequency and amplitude of the leading line (NAFF) of the
+    normal modes, so that the result has an error of order `action`³, and round-off of
+    10⁻¹³/action. In 4D. **Raises** as `optics`.
+    """
+    o, ring = optics(ring, finite("dp", dp), chromatic=False), four(ring)
+    size = np.sqrt(2 * positive("action", action) * np.mgrid[1:5, 1:5].reshape(2, 16).T)
+    z = o.orbit[:1] + jnp.pad(jnp.real(size @ o.modes[0]), ((0, 0), (0, 2)))
+    found = frequencies(np.arange(turns), _signal(o, track(ring, z, turns, every=1).z), count=2)
+    x, y = jnp.abs(found.amplitudes[..., 0].T) ** 2 / 2 / action
+    terms = jnp.stack([x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3], 1)
+    change = found.frequencies[..., 0] / (2 * np.pi) - 0.25
+    return jnp.linalg.lstsq(terms, change)[0][:2].T / action
+
+
+def _signal(o: Optics, z: Array) -> Array:
+    """√(2J_k) e^{iφ_k} of the first two modes from z (particles, turns, 6) as (particles, 2,
+    turns), where the linear motion has the tune 1/4: far from 0 and 1/2, where lines coincide."""
+    v, n = o.modes[0, :2], o.modes.shape[-1]
+    S = np.kron(np.eye(n // 2), [[0, 1], [-1, 0]])
+    w = -1j * jnp.conj(v) @ S
+    back = jnp.exp(2j * np.pi * jnp.outer(0.25 - o.tune[:2], jnp.arange(z.shape[1])))
+    return jnp.einsum("ki,pti,kt->pkt", w, z[..., :n] - o.orbit[:1, None, :n], back)
+
+
+def resonance_driving_terms(
+    ring: Ring, terms: Sequence[str] = (*_GEOMETRIC, *_CHROMATIC), dp: float = 0.0
+) -> dict[str, Array]:
+    r"""Driving terms of first order in the multipoles: coefficients of the perturbation
+
+        ∫ Re Σ_N (b_N + i a_N)(x + iy)^{N+1}/(N + 1) ds/(1 + δ) = Σ h_jkmnp A^j Ā^k B^m B̄^n δ^p
+
+    in A = √(2J_x) e^{iφ_x} and B = √(2J_y) e^{iφ_y} at the start, x = Re(v_x A) + D_x δ, and
+    y = Re(v_y B). Gauss quadrature inside each magnet, with the optics there, in 4D. The
+    perturbation includes quadrupoles in terms with δ; it does not include bends and their edges.
+
+    **Arguments** `terms`: names "hjkmnp", such as "h21000", or "h22000" of octupoles.
+
+    **Returns** name → complex number [m^{1−(j+k+m+n)/2}], differentiable by the parameters of the
+    ring. **Raises** `ValueError` for another name; as `optics`.
+
+    **Source** Bengtsson 1997, SLS note 9/97, with the signs of pyAT, where β of a magnet is its
+    mean and the phase that in its middle.
+    """
+    for name in terms:
+        if len(name) != 6 or name[0] != "h" or not name[1:].isdigit():
+            raise ValueError(f"terms must be names such as 'h21000', got {name!r}.")
+    optics(ring, dp, chromatic=False)
+    return _driving_terms(ring, jnp.zeros(6).at[5].set(dp), tuple(terms))
+
+
+@eqx.filter_jit
+def _driving_terms(ring: Ring, z: Array, terms: tuple[str, ...]) -> dict[str, Array]:
+    o, _ = analysis(ring, z, jnp.zeros(()), False, False, True)
+    apply, xs = maps(four(ring), 0.0)
+    names = np.asarray([ring.program.parts[part].name for part, _ in ring.program.rows])
+    mine = np.flatnonzero(np.isin(names, (*SLICED, "thin", "second_order_bend")))
+    points, weights = np.polynomial.legendre.leggauss(5)
+
+    def inside(x, share):
+        (par, *how), z, v, D = x
+        part = {**par, "length": share * par["length"]}
+        M = jax.jacfwd(lambda z: jnp.stack(apply(Particle(*z), (part, *how))))(z)
+        return M[0, :4] @ v[0], M[2, :4] @ v[1], M[0, :4] @ D + M[0, 5]
+
+    every = jax.tree.map(lambda a: a[mine], (xs, o.orbit, o.modes, o.dispersion))
+    x, y, D = lax.map(lambda s: lax.map(lambda e: inside(e, s), every), (1 + points) / 2)
+    par = every[0][0]
+    length = np.outer(weights / 2, 1.0) * jnp.where(names[mine] == "thin", 1.0, par["length"])[None]
+    found = {}
+    for name in terms:
+        j, k, m, n, p = map(int, name[1:])
+        found[name] = jnp.zeros((), complex)
+        for q in range(p + 1):
+            N, ny = j + k + m + n + q, m + n
+            field = par.get(f"{'ab'[ny % 2 == 0]}{N - 1}")
+            if N > 1 and field is not None:
+                count = math.comb(N, ny) * math.comb(ny, m) * math.comb(N - ny, q)
+                count *= math.comb(j + k, j) * (-1) ** (p - q + (ny + 1) // 2)
+                at = x**j * jnp.conj(x) ** k * y**m * jnp.conj(y) ** n * D**q
+                found[name] += count / N / 2 ** (j + k + ny) * jnp.sum(length * field[None] * at)
+    return found
+
+
+def dynamic_aperture(
+    ring: Ring,
+    turns: int = 1024,
+    *,
+    largest: tuple[float, float] = (0.05, 0.05),
+    angles: Any = 19,
+    steps: int = 16,
+    rounds: int = 2,
+    dp: float | None = None,
+    progress: Report = None,
+) -> Array:
+    """Largest stable amplitudes (x, y) along rays from the closed orbit [m], shape (angles, 2).
+
+    A ray is r (x_max cos θ, y_max sin θ), `largest` = (x_max, y_max), with θ from 0 to π or the
+    given `angles` [rad]. The result is the last r before the first lost particle, among `steps`
+    values up to 1; each further round divides the last interval by `steps`. `dp`: δ, in 4D. For a
+    grid: ``rings.track(ring, z, turns).lost``. **Raises** as `optics`; `ValueError`.
+    """
+    angles = np.linspace(0, np.pi, angles) if np.ndim(angles) == 0 else np.asarray(angles)
+    limits = [positive("largest", a) for a in largest]
+    rays = jnp.stack([limits[0] * np.cos(angles), limits[1] * np.sin(angles)], 1)
+    o, ring = optics(ring, dp, chromatic=False), ring if dp is None else four(ring)
+
+    def survive(r):
+        z = (1e-6 + r[..., None] * rays[:, None]) @ _XY + o.orbit[:1, None]
+        return _pieces(lambda z: ~track(ring, z, turns).lost, progress, z)
+
+    return _first_loss(survive, len(rays), steps, rounds)[:, None] * rays
+
+
+def momentum_aperture(
+    ring: Ring,
+    turns: int = 1024,
+    where: Where | None = None,
+    *,
+    largest: float = 0.1,
+    steps: int = 16,
+    rounds: int = 2,
+    progress: Report = None,
+) -> Array:
+    """Largest stable changes of δ, negative and positive, of a particle on the closed orbit at the
+    entrance of elements, shape (elements, 2), as needed for the lifetime by Touschek scattering.
+
+    `where`: see `Ring.where`; None: all elements. Other arguments and errors as for
+    `dynamic_aperture`. The particle finishes its first turn, followed by `turns` turns.
+    """
+    orbit = optics(ring, chromatic=False).orbit
+    first = np.repeat(np.arange(len(ring)) if where is None else ring.where(where), 2)
+    side = positive("largest", largest) * np.resize([-1.0, 1.0], len(first))
+    begins, passage = orbit[first] + 1e-6 * _XY.sum(0)[None], Passage.of(ring)
+
+    def one(passage, z, first):
+        def row(flight, x):
+            number, par = jax.tree.map(lambda a: a[None], x)
+            after = Passage(par, number, passage.parts).flown(flight, 0, 0.0)
+            skips = x[0]["element"] < first
+            return jax.tree.map(lambda a, b: jnp.where(skips, a, b), flight, after), None
+
+        xs = passage.numbers, passage.rows
+        return jnp.stack(lax.scan(row, start(Particle(*z)), xs)[0].z)
+
+    finish = jax.jit(jax.vmap(lambda z, first: lanewise.call(one, passage, z, first)))
+
+    def survive(r):
+        z = jnp.einsum("rs,i->rsi", r * side[:, None], np.eye(6)[5]) + begins[:, None]
+        begin = jnp.broadcast_to(first[:, None], r.shape)
+        return _pieces(lambda z, i: ~track(ring, finish(z, i), turns).lost, progress, z, begin)
+
+    return (_first_loss(survive, len(first), steps, rounds) * side).reshape(-1, 2)
+
+
+def frequency_map(
+    ring: Ring, x: Any, y: Any, turns: int = 1024, dp: float | None = None, progress: Report = None
+) -> FrequencyMap:
+    """Tunes of particles that start at x, y [m] from the closed orbit, and how much they change.
+
+    `x`, `y`: arrays of one shape (…), such as those of `np.meshgrid`; 1 nm is added to both. NAFF
+    of the normal modes in the two halves of `turns`, see `dvi.frequency_diffusion`. `dp`: δ, in 4D.
+    **Raises** `ValueError` for shapes that do not match; as `optics`. **Source** Laskar 2003.
+    """
+    o, ring = optics(ring, dp, chromatic=False), ring if dp is None else four(ring)
+    xy = 1e-9 + np.stack(np.broadcast_arrays(x, y), -1).reshape(-1, 2)
+    whole("turns", turns, 64)
+
+    def found(z):
+        signal = _signal(o, track(ring, z, turns, every=1).z)
+        halves = frequency_diffusion(np.arange(turns), signal, throw=False)
+        return jnp.stack([halves.first, halves.second], 1)
+
+    both = _pieces(found, progress, o.orbit[:1] + xy @ _XY) / (2 * np.pi) - 0.25
+    both = both.reshape(*np.broadcast_shapes(np.shape(x), np.shape(y)), 2, 2)
+    change = jnp.linalg.norm(both[..., 1, :] - both[..., 0, :], axis=-1)
+    tune = (both + o.tune[:2].reshape((1,) * (both.ndim - 1) + (2,))) % 1
+    return FrequencyMap(tune[..., 0, :], tune[..., 1, :], jnp.log10(jnp.maximum(change, 1e-16)))
+
+
+def _first_loss(survive: Callable, rays: int, steps: int, rounds: int) -> Array:
+    """The last r of each ray before the first loss, in (0, 1]."""
+    low, width = jnp.zeros((rays, 1)), jnp.ones((rays, 1))
+    for _ in range(whole("rounds", rounds)):
+        shares = np.arange(1, whole("steps", steps, 2) + 1)[None] / steps
+        many = jnp.sum(jnp.cumprod(survive(low + width * shares), 1), 1, keepdims=True)
+        low, width = low + width * many / steps, jnp.where(many == steps, 0.0, width / steps)
+    return low[:, 0]
+
+
+def _pieces(function: Callable, progress: Report, *arrays: Array) -> Array:
+    """`function` of particles, arrays (…, 6) and (…), in batches of one size, with progress."""
+    shape = arrays[0].shape[:-1]
+    flat = [a.reshape(-1, *a.shape[len(shape) :]) for a in arrays]
+    each = -(-len(flat[0]) // -(-len(flat[0]) // _BATCH))
+    outs = []
+
+    def columns(p: tuple[int, int]) -> dict[str, Any]:
+        return {"completed": p[0], "total": p[1]}
+
+    with told(progress, bar_of("particles", (), columns)) as report:
+        for i in range(0, N := len(flat[0]), each):
+            some = np.minimum(np.arange(i, i + each), N - 1)
+            outs.append(jax.block_until_ready(function(*(a[some] for a in flat))))
+            if report:
+                report((min(i + each, N), N))
+    out = jnp.concatenate(outs)[:N]
+    return out.reshape(*shape, *out.shape[1:])

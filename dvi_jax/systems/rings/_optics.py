@@ -1,0 +1,315 @@
+"""Closed orbit, one-turn matrix, tunes, Twiss functions and dispersion of a ring."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+import lanewise
+from lanewise.jaxprs.jaxapi import is_traced
+
+from ...base.checks import instance
+from ._maps import KICKS, Particle, distinct, forward
+from ._parts import pieces_of
+from ._ring import Ring
+from ._turn import Passage, perturbed
+
+SLICED = "straight", "bend", "exact_straight", "exact_bend"
+_MOST, _AFTER, _NEAR = 15, 3, 1e-9
+"""Newton iterations at most, and after the first correction that is smaller than the last one."""
+_EQUAL = 1e-12
+"""Difference of two eigenvalues that is round-off."""
+_UNSTABLE = 1e-11
+"""Area in phase space of an eigenvector of length 1, below which it is round-off."""
+
+
+class Optics(NamedTuple):
+    r"""Linear motion about the closed orbit, at n places: the entrance of each element and the end.
+
+    - `s` [m], shape (n,); `orbit`, shape (n, 6). `matrix`: from the start, shape (n, 6, 6).
+    - `beta` [m], `alpha`: of mode 1 in x and mode 2 in y, shape (n, 2); `mu`: phase advances [rad].
+    - `dispersion` of x, px, y, py, shape (n, 4): the derivative of the closed orbit by δ in 4D; in
+      6D that of the synchrotron mode, Re(v/v_δ).
+    - `modes`: the vectors v of the normal modes, z = Re Σ_k √(2J_k) e^{iφ_k} v_k, shape
+      (n, modes, 4 or 6): β_k = \|v_x\|², α_k = −Re v̄_x v_px.
+    - `gamma`: γ of Edwards & Teng, shape (n,); their β and α are those here over γ².
+    - `tune`, with its whole part; that of the synchrotron motion is positive. `chromaticity`:
+      dQ/dδ; in 6D the frequency of the cavities changes δ. Shapes (modes,).
+    - `compaction`: momentum compaction, the relative change of the length over δ.
+    """
+
+    s: Array
+    orbit: Array
+    beta: Array
+    alpha: Array
+    mu: Array
+    dispersion: Array
+    modes: Array
+    gamma: Array
+    matrix: Array
+    tune: Array
+    chromaticity: Array
+    compaction: Array
+
+
+def one_turn(ring: Ring, z: Any, epsilon: Any = 0.0) -> Array:
+    """The particle after one turn, without apertures: z and the result have the shape (…, 6).
+
+    `epsilon`: factor of what `Ring.perturbed` set aside. It can be compiled, batched, and
+    differentiated repeatedly in every mode. See `track` for the coordinates.
+    """
+    instance("ring", ring, Ring, "a rings.Ring")
+    passage = Passage.of(ring)
+
+    def one(passage, z, epsilon):
+        return jnp.stack(passage.moved(Particle(*z), 0, epsilon))
+
+    def of(z):
+        return lanewise.call(one, passage, z, jnp.asarray(epsilon, float))
+
+    z = _coordinates("z", z)
+    return jax.vmap(of)(z.reshape(-1, 6)).reshape(z.shape) if z.ndim > 1 else of(z)
+
+
+def _coordinates(name: str, z: Any) -> Array:
+    z = jnp.asarray(z, float)
+    if z.shape[-1:] != (6,):
+        raise ValueError(f"{name} must have 6 coordinates on its last axis, got shape {z.shape}.")
+    return z
+
+
+def closed_orbit(ring: Ring, dp: Any = None, guess: Any = None, epsilon: Any = 0.0) -> Array:
+    """Closed orbit at the start, shape (6,); see `optics`. The motion may be unstable."""
+    return _analysed(ring, dp, guess, epsilon, False, False).orbit[0]
+
+
+def matrix(ring: Ring, dp: Any = None, guess: Any = None, epsilon: Any = 0.0) -> Array:
+    """One-turn matrix of (x, px, y, py, ζ, δ) about the closed orbit, shape (6, 6); see `optics`.
+    The motion may be unstable."""
+    return _analysed(ring, dp, guess, epsilon, False, False).matrix[-1]
+
+
+def optics(
+    ring: Ring, dp: Any = None, guess: Any = None, epsilon: Any = 0.0, chromatic: bool = True
+) -> Optics:
+    r"""Closed orbit, Twiss functions, tunes, dispersion and chromaticity.
+
+    The closed orbit F(z) = z is the limit of Newton's method with the exact derivative M of the
+    one-turn map F. The normal modes are M v_k = e^{2πi Q_k} v_k, v_k† S v_k = 2i, and
+
+        dQ_k/dδ = Im(e^{−2πi Q_k} w_k (dM/dδ) v_k) / 2π,   w_k M = e^{2πi Q_k} w_k, w_k v_k = 1,
+
+    where dM/dδ is the exact derivative along the dispersion.
+
+    **Arguments** `dp`: δ of a 4D analysis, in which the cavities are off and ζ is ignored; None: 6D
+    if a cavity has a voltage, otherwise 4D with δ = 0. `guess`: of the closed orbit, shape (6,).
+    `epsilon`: factor of what `Ring.perturbed` set aside. `chromatic`: whether to compute the
+    chromaticity (otherwise NaN), which takes nearly half of the first call.
+
+    The result can be differentiated twice, in every mode, by the parameters of the ring, dp and
+    epsilon: iterations after convergence carry the derivatives. For planes of equal tune those by
+    a coupling of the planes do not exist: do not use them.
+
+    **Raises** `ValueError` if Newton's method finds no closed orbit, and if the motion about it is
+    unstable; under a transformation of JAX the result is NaN instead.
+
+    **Source** Courant & Snyder 1958; Edwards & Teng 1973; Wolski 2006, *PRSTAB* 9, 024001.
+
+    **Example** Tunes of a FODO cell, matched by least squares:
+
+    ```python
+    import optimistix
+    cell = rings.Ring([rings.quadrupole("QF", 0.5, k1=0.6), rings.drift("D", 2.0),
+                       rings.quadrupole("QD", 0.5, k1=-0.6), rings.drift("D", 2.0)])
+    def missed(k, _):
+        found = rings.optics(cell.set("QF", b1=k[0]).set("QD", b1=k[1]), chromatic=False)
+        return found.tune - jnp.array([0.22, 0.18])
+    solver = optimistix.LevenbergMarquardt(1e-12, 1e-12)
+    k = optimistix.least_squares(missed, solver, jnp.array([0.6, -0.6])).value
+    print(rings.optics(cell.set("QF", b1=k[0]).set("QD", b1=k[1])).tune.round(6))
+    # [0.22 0.18]
+    ```
+    """
+    return _analysed(ring, dp, guess, epsilon, chromatic, True)
+
+
+def _analysed(ring: Ring, dp: Any, guess: Any, epsilon: Any, chromatic: bool, stable: bool):
+    instance("ring", ring, Ring, "a rings.Ring").check()
+    voltage = ring.columns.get("voltage", np.zeros(1))
+    six = dp is None and (is_traced(voltage) or bool(np.any(np.asarray(voltage) != 0)))
+    z = _coordinates("guess", np.zeros(6) if guess is None else guess)
+    if not six:
+        z = z.at[4].set(0.0).at[5].set(0.0 if dp is None else dp)
+    found, change = analysis(ring, z, jnp.asarray(epsilon, float), six, chromatic)
+    if is_traced(change):
+        return found
+    if not change < _NEAR:
+        raise ValueError(
+            f"no closed orbit was found: after {_MOST} iterations of Newton's method the last "
+            f"correction is {change:.2g}. Likely causes: (a) δ is beyond the momentum acceptance; "
+            "(b) errors of magnets that are too large: give a guess, for example the orbit with "
+            "half of the errors; (c) a tune at a whole number."
+        )
+    if stable and np.isnan(found.tune).any():
+        M = np.asarray(found.matrix[-1])[: found.modes.shape[-1], : found.modes.shape[-1]]
+        half = [round(float(np.trace(M[i : i + 2, i : i + 2])) / 2, 4) for i in range(0, len(M), 2)]
+        raise ValueError(
+            f"the motion is unstable: half of the trace of the one-turn matrix is {half} in x, y "
+            f"(, ζ), between −1 and 1 if stable and uncoupled, and its eigenvalues have the moduli "
+            f"{np.sort(np.abs(np.linalg.eigvals(M))).round(6).tolist()}. Change the strengths of "
+            "the quadrupoles, or the phase of the cavities if the plane is ζ."
+        )
+    return found
+
+
+def four(ring: Ring) -> Ring:
+    """The ring with its cavities off."""
+    off = {n: jnp.zeros_like(c) if n == "voltage" else c for n, c in ring.columns.items()}
+    return eqx.tree_at(lambda r: r.columns, ring, off)
+
+
+def maps(ring: Ring, epsilon: Any) -> tuple[Callable, Any]:
+    """``apply(z, x)``, the map of a part of an element, and x for all parts in a row.
+
+    Less code is compiled than for tracking: magnets in slices of any number and scheme are one
+    sequence of kicks, with drifts between them.
+    """
+    passage = Passage.of(ring)
+    parts, thick = passage.parts, {"scheme": 2, "slices": 1}
+    order = max(p.order for p in parts)
+    kinds = [p._replace(order=order, **(thick if p.name in SLICED else {})) for p in parts]
+    kicks = [np.divide([0.0, *KICKS.get(p.scheme, ()) * p.slices], p.slices) for p in parts]
+    steps = np.stack([np.pad(k, (0, max(map(len, kicks)) + 1 - len(k))) for k in kicks])
+    all_kinds = distinct(kinds)
+    which = np.asarray([all_kinds.index(kind) for kind in kinds], np.int32)
+
+    def apply(z, x):
+        par, which, steps = x
+        par = perturbed(par, epsilon)
+
+        def through(kind):
+            pieces = pieces_of(kind)
+
+            def kick(z, step):
+                # The kick and its own drift, then half of the difference to the next one's.
+                for piece, share in ((pieces[1], step[0]), (pieces[0], step[1] - step[0])):
+                    z = piece.apply(z, {**par, "length": share * par["length"]}, 0, 1)
+                return z, None
+
+            if kind.name in SLICED:
+                return lambda z: lax.scan(kick, z, jnp.stack([steps[:-1], steps[1:]], 1))[0]
+            return lambda z: forward(pieces, z, par, 0, 1)
+
+        return lax.switch(which, [through(kind) for kind in all_kinds], z)
+
+    number = passage.numbers["part"]
+    # Recomputed in reverse mode: otherwise each part stores what every kind of part would need.
+    return jax.checkpoint(apply), (passage.rows, which[number], steps[number])
+
+
+@eqx.filter_jit
+def analysis(
+    ring: Ring, z: Array, epsilon: Array, six: bool, chromatic: bool, inside: bool = False
+) -> tuple[Optics, Array]:
+    """See `optics`; also the last correction of the closed orbit. `inside`: before each part of an
+    element and at the end, not at the elements (but for `s`)."""
+    c, shift, n, (e_zeta, e_delta) = ring.columns, 0.0, 6 if six else 4, np.eye(6)[4:]
+    if six:
+        # The change of ζ per turn of a particle that keeps its phase in the cavities.
+        on = c["voltage"] != 0
+        slip = jnp.where(on, c["slip"] / jnp.where(on, c["wave_number"], 1.0), 0.0)
+        shift = -jnp.sum(slip) / jnp.sum(on)
+    apply, xs = maps(ring if six else four(ring), epsilon)
+
+    def along(z):
+        zs = lax.scan(lambda z, x: (apply(z, x),) * 2, Particle(*z), xs)[1]
+        zs = jnp.concatenate([z[None], jnp.stack(zs, 1)])
+        return zs, zs
+
+    linear = jax.jacfwd(along, has_aux=True)
+
+    def iterate(state):
+        z, D, _, count = state
+        if chromatic:
+            (Ms, zs), (dMs, _) = jax.jvp(linear, (z,), (D,))
+        else:
+            (Ms, zs), dMs = linear(z), jnp.full((1, 6, 6), jnp.nan)
+        M = Ms[-1]
+        # D: change of the orbit if each turn is longer by the slip, so that δ changes by 1.
+        right = jnp.stack([zs[-1] - z - shift * e_zeta, e_zeta if six else M[:, 5]], 1)[:n]
+        change, D = jnp.pad(jnp.linalg.solve(np.eye(n) - M[:n, :n], right), ((0, 6 - n), (0, 0))).T
+        slip = 1 / D[5] if six else -(M @ (D + e_delta))[4]
+        D = D * slip if six else D + e_delta
+        size = jnp.max(jnp.abs(change))
+        count = jnp.where((count > 0) | (size < _NEAR), count + 1, 0)
+        return z + change, D, (zs, Ms, dMs[-1], D, slip, size), count
+
+    shapes = (rows := len(xs[1]) + 1, 6), (rows, 6, 6), (6, 6), (6,), (), ()
+    begin = z, jnp.asarray(e_delta), tuple(jnp.full(x, jnp.nan) for x in shapes), jnp.asarray(0)
+    (*_, (zs, Ms, dM, D, slip, size), _), _ = lax.scan(
+        lambda s, _: (lax.cond(s[3] > _AFTER, lambda s: s, iterate, s), None), begin, None, _MOST
+    )
+    zs, Ms, slip = (jnp.where(size < _NEAR, x, jnp.nan) for x in (zs, Ms, slip))
+    v, chromaticity = _modes(Ms[-1, :n, :n], dM[:n, :n])
+    vs = jnp.einsum("rij,kj->rki", Ms[:, :n, :n], v)
+    x, px = (jnp.diagonal(vs[:, :, i::2], axis1=1, axis2=2) for i in (0, 1))
+    mu = jnp.angle(x[1:] * jnp.conj(x[:-1]))
+    mu = jnp.where(np.arange(n // 2)[None] < 2, (mu + 0.5) % (2 * np.pi) - 0.5, mu)
+    mu = jnp.concatenate([jnp.zeros((1, n // 2)), jnp.cumsum(mu, 0)])
+    Ds = jnp.real(vs[:, 2] / vs[:, 2, 5:]) if six else Ms @ D
+    at = np.searchsorted([element for _, element in ring.program.rows], np.arange(len(ring) + 1))
+    at, tune = np.arange(rows) if inside else at, mu[-1] / (2 * np.pi)
+    found = Optics(
+        s=ring.places,
+        orbit=zs[at],
+        beta=jnp.abs(x[at, :2]) ** 2,
+        alpha=-jnp.real(jnp.conj(x) * px)[at, :2],
+        mu=mu[at],
+        dispersion=Ds[at, :4],
+        modes=vs[at],
+        gamma=jnp.sqrt(jnp.imag(jnp.conj(x) * px)[at, 0]),
+        matrix=Ms[at],
+        tune=jnp.abs(tune),
+        chromaticity=jnp.sign(tune) * chromaticity,
+        compaction=slip / ring.places[-1],
+    )
+    return found, size
+
+
+def _modes(M: Array, dM: Array) -> tuple[Array, Array]:
+    """Vectors v_k of the normal modes of M, v_k† S v_k = 2i, in the order of the planes, with a
+    real component in their own plane, and the derivative of their tunes by δ; NaN if unstable."""
+    n = len(M)
+
+    def area(v):
+        """Of x and px, y and py, …"""
+        return jnp.imag(jnp.conj(v[::2]) * v[1::2])
+
+    _, V = jnp.linalg.eig(lax.stop_gradient(M))
+    areas, order = area(V), []
+    taken = jnp.where(jnp.sum(areas, 0) > _UNSTABLE, 0.0, np.inf)
+    stable = jnp.sum(taken == 0) == n // 2
+    for plane in range(n // 2):
+        order.append(jnp.argmax(areas[plane] - taken))
+        taken = taken.at[order[-1]].set(np.inf)
+    V = jnp.where(stable, V[:, jnp.stack(order)], jnp.nan)
+    V = jnp.concatenate([V, jnp.conj(V)], 1)
+    W = jnp.linalg.inv(V)
+    # Newton's method, W M V diagonal with W V = 1, for the derivatives, which `eig` does not have.
+    for _ in range(2):
+        R = W @ M @ V
+        r = jnp.diagonal(R)
+        apart = r[None] - r[:, None]
+        same = jnp.abs(apart) < _EQUAL  # itself, or a mode of equal tune in another plane
+        X = jnp.where(same, 0.0, R / jnp.where(same, 1.0, apart))
+        V, W = V + V @ X, W - X @ W + X @ X @ W
+    V, W = V[:, : n // 2], W[: n // 2]
+    change = jnp.sum(W @ dM * V.T, 1) / jnp.sum(W @ M * V.T, 1)
+    own = jnp.diagonal(V[::2])
+    size = own / jnp.abs(own) * jnp.sqrt(jnp.sum(area(V), 0))
+    return (V / size[None]).T, change.imag / (2 * np.pi)

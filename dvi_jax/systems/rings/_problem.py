@@ -1,0 +1,162 @@
+"""A ring as a system: one step of a run is one turn."""
+
+from typing import Any, ClassVar, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from ...base.checks import instance, one_of
+from ...base.results import RESULTS
+from ...methods import Method
+from ...methods.step import judge, no_solve
+from ...problem.system import System
+from ._maps import Particle
+from ._ring import Ring
+from ._turn import Passage, start
+
+Planes = Literal["x", "xy", "xyz"]
+
+
+class Packed(eqx.Module):
+    """The parts of a ring in the order of passage, and δ where it does not change: `args`."""
+
+    passage: Passage
+    delta: Array
+
+    @property
+    def ends(self) -> Array:
+        """s behind each row [m]; a row of an element ends where the element does."""
+        first = jnp.diff(self.passage.numbers["element"], prepend=-1) > 0
+        return jnp.cumsum(jnp.where(first, self.passage.rows["length"], 0.0))
+
+    def particle(self, q: Array, p: Array) -> Particle:
+        """The particle of a state, of which some planes may be missing."""
+        one_of("shape of q0", q.shape, ((1,), (2,), (3,)), "(x,), (x, y) or (x, y, ζ) of a ring.")
+        n = q.shape[0]
+        x, y, zeta = [*q, *jnp.zeros(3 - n)]
+        px, py, delta = [*p, *jnp.zeros(2 - min(n, 2)), *[self.delta] * (n < 3)]
+        return Particle(x, px, y, py, zeta, delta)
+
+
+class Turn(Method):
+    """One turn of a ring, of a system of `problem` with h = 1.
+
+    A step is the map of `track`, exact up to round-off: the order says nothing about it. A particle
+    that is lost has the status `lost`. `losses`: False for the map without apertures and limits of
+    the coordinates, of which `bound_drift` can prove a bound. **Raises** `ValueError` for another
+    system or step.
+    """
+
+    losses: bool = eqx.field(static=True, default=True)
+
+    order: ClassVar[int] = 1
+    is_symmetric: ClassVar[bool] = False
+    is_symplectic: ClassVar[bool] = True
+    is_invertible: ClassVar[bool] = True
+
+    def step(self, equations, interval, q0, p0):
+        ring, epsilon = equations.args, equations.epsilon
+        z, turn = ring.particle(q0, p0), jnp.round(interval.t0)
+        if not self.losses:
+            return _state(ring.passage.moved(z, turn, epsilon), q0)
+        flight = ring.passage.flown(start(z), turn, epsilon)
+        q, p, info = _state(flight.z, q0)
+        result = RESULTS.where(flight.element >= 0, RESULTS.lost, info.result)
+        return q, p, info._replace(result=result)
+
+    def inverse(self, equations, interval, q1, p1):
+        ring, epsilon = equations.args, equations.epsilon
+        turn, z = jnp.round(interval.t0), ring.particle(q1, p1)
+        return _state(ring.passage.moved(z, turn, epsilon, -1), q1)
+
+    def needs_no_solve(self, equations, interval, q) -> bool:
+        return True
+
+    inverse_needs_no_solve = needs_no_solve
+
+    def check(self, equations, interval, q, p) -> None:
+        hint = "Use the system and the args of rings.problem(ring)."
+        instance("args of a run with rings.Turn()", equations.args, Packed, "those of a ring", hint)
+        if float(interval.h) != 1:
+            raise ValueError(f"h must be 1, one turn, for a ring; got h = {float(interval.h)}.")
+
+
+def _state(z: Particle, like: Array) -> tuple[Array, Array, Any]:
+    n = like.shape[0]
+    q, p = jnp.stack([z.x, z.y, z.zeta])[:n], jnp.stack([z.px, z.py, z.delta])[:n]
+    return q, p, judge(no_solve(q), q, p)
+
+
+class _Along(eqx.Module):
+    """The paraxial Hamiltonian at the place s = t C, over one turn of length C; `prefix` of the
+    parameters it contains."""
+
+    prefix: str = eqx.field(static=True, default="")
+    own_method: ClassVar[Method] = Turn()
+
+    def __call__(self, t0, t1, q0, p1, args):
+        ends = args.ends
+        z = args.particle(q0, p1)
+        row = jnp.searchsorted(ends, (t0 - jnp.floor(t0)) * ends[-1], side="right")
+        element = args.passage.numbers["element"]
+        row = jnp.searchsorted(element, element[row], side="right") - 1
+        par = {
+            n: lax.dynamic_index_in_dim(c, row, keepdims=False)
+            for n, c in args.passage.rows.items()
+        }
+        free = (z.px**2 + z.py**2) / (2 * (1 + z.delta))
+        h = par.get("h", 0.0)
+        bent = h * z.x * (h * z.x / 2 - z.delta)
+        energy, power = 0.0, 1.0 + 0j
+        for n in range(12):
+            power = power * (z.x + 1j * z.y)
+            b, a = (par.get(f"{self.prefix}{k}{n}", 0.0) for k in "ba")
+            energy = energy + jnp.real((b + 1j * a) * power) / (n + 1)
+        return ends[-1] * (energy if self.prefix else free + bent + energy)
+
+
+class RingProblem(NamedTuple):
+    """A ring as a problem for `integrate`, `sweep` and others: one step is one turn."""
+
+    system: System
+    q0: Array
+    p0: Array
+    h: float
+    args: Packed
+
+
+def problem(ring: Ring, planes: Planes = "xyz", delta: Any = 0.0) -> RingProblem:
+    r"""The one-turn map of a ring as a system with q = (x, y, ζ), p = (px, py, δ) and h = 1.
+
+    Runs have the method `Turn`. ε multiplies what `Ring.perturbed` set aside. The Hamiltonian of
+    the system is that of the bodies of the elements at the place s = t C, which other methods can
+    integrate: (px² + py²)/(2 (1 + δ)) − h x δ + h² x²/2 + Re Σ (b_n + i a_n)(x + i y)^{n+1}/(n+1);
+    edges, thin elements and cavities are not in it.
+
+    **Arguments** `planes`: "x": q = (x,), p = (px,), with y = py = 0; "xy": q = (x, y); both with
+    ζ = 0 at the start of each turn and δ = `delta`.
+
+    **Example** Invariants of a cell, to order 1 in its sextupoles:
+
+    ```python
+    ring = rings.Ring([rings.quadrupole("QF", 0.5, k1=0.6), rings.drift("D", 2.0),
+                       rings.sextupole("SF", 0.1, b2=2.0),
+                       rings.quadrupole("QD", 0.5, k1=-0.6), rings.drift("D", 2.0)])
+    cell = rings.problem(ring.perturbed("S*", "b2"), planes="x")
+    samples = 0.01 * np.random.default_rng(0).uniform(-1, 1, (2, 300, 1))
+    found = dvi.discover_invariants(cell.system, dvi.Polynomials(3), order=1, h=1.0,
+                                    samples=samples, args=cell.args)
+    print(len(found.invariants), "adiabatic invariant of order 1")
+    # 1 adiabatic invariant of order 1
+    ```
+    """
+    instance("ring", ring, Ring, "a rings.Ring")
+    one_of("planes", planes, ("x", "xy", "xyz"))
+    passage = jax.tree.map(jnp.asarray, Passage.of(ring))
+    args = Packed(passage, jnp.asarray(delta, float))
+    perturbation = _Along("ε ") if ring.extra else None
+    zero = jnp.zeros(len(planes))
+    return RingProblem(System(_Along(), perturbation=perturbation), zero, zero, 1.0, args)

@@ -1,0 +1,146 @@
+"""Every method under every check, and whether every check can fail."""
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from typing import Any
+
+import dvi_jax as dvi
+
+from .candidate import Candidate
+from .check import CHECKS, Measured, chosen, require_double_precision
+from .controls import CONTROLS, Control
+from .page import Table, markdown, tables
+from .problems import COUPLED, FORCED, reference
+from .registry import METHODS
+
+_WORKERS = 2
+"""Methods at a time: while one compiles another is traced."""
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """The measurements of `certify`.
+
+    - `methods`: name → method. `rows`: name → check → `Measured`.
+    - `controls`: the broken methods, each with the result of the check that must find its defect.
+    """
+
+    methods: Mapping[str, dvi.Method]
+    rows: Mapping[str, Mapping[str, Measured]]
+    controls: tuple[tuple[Control, Measured], ...]
+
+    @property
+    def failures(self) -> list[tuple[str, str, Measured]]:
+        """(method, check, measured) wherever a method lacks a property that it claims."""
+        return [(m, c, x) for m, row in self.rows.items() for c, x in row.items() if not x.ok]
+
+    @property
+    def missed(self) -> list[Control]:
+        """The controls without a measured number that fails (an exception is not one)."""
+        return [control for control, measured in self.controls if measured.verdict != "FAIL"]
+
+    @property
+    def ok(self) -> bool:
+        """Whether there are no `failures`, and no control is `missed`."""
+        return not self.failures and not self.missed
+
+    @property
+    def summary(self) -> str:
+        """Two lines: the methods, the controls."""
+        good = len(self.rows) - len({method for method, _, _ in self.failures})
+        caught = len(self.controls) - len(self.missed)
+        return (
+            f"methods: {good} of {len(self.rows)} have the properties that they claim\n"
+            f"controls: {caught} of {len(self.controls)} caught"
+        )
+
+    def tables(self) -> list[Table]:
+        """The tables, as text."""
+        return tables(self.methods, self.rows, self.controls)
+
+    def __str__(self) -> str:
+        return markdown(self.tables(), self.summary, self.failures)
+
+    markdown = __str__
+
+
+def certify(
+    methods: Mapping[str, dvi.Method] | Iterable[str] | None = None,
+    checks: Iterable[str] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Certificate:
+    """The properties that methods claim, measured, with a control for each check.
+
+    **Arguments**
+
+    - `methods`: name → `Method`, such as your own; or names of `METHODS`; None for all of these.
+    - `checks`: names of `CHECKS`; None for all.
+    - `progress`: called as ``progress(done, total)`` after each method and each control.
+
+    **Returns** a `Certificate`; ``print`` it, or read `ok`, `failures`, `rows`.
+
+    **Raises** `ValueError` for an unknown name, for no name at all, and where x64 is off;
+    `TypeError` for an object that is not a method. An exception of a method is a failure of the
+    check that called it.
+
+    **Accuracy** the bounds are those of double precision. All methods of the package take about
+    ten minutes of processor time, nearly all of it compilation, and 2 GB of memory or more; one
+    method takes 15 to 35 seconds.
+    """
+    require_double_precision()
+    named = _named(methods)
+    names = chosen("check", checks, CHECKS)
+    controls = [control for control in CONTROLS if control.check in names]
+    if {"order", "forced-order"} & set(names):
+        for epsilon in (0.0, FORCED):
+            reference(COUPLED, epsilon)  # here, not in each worker at once
+
+    def row(method: dvi.Method, names: list[str]) -> dict[str, Measured]:
+        candidate = Candidate(method)
+        return {name: CHECKS[name](candidate) for name in names}
+
+    pool = ThreadPoolExecutor(_WORKERS)
+    try:
+        rows = {name: pool.submit(row, method, names) for name, method in named.items()}
+        tried = [(c, pool.submit(row, c.method, [c.check])) for c in controls]
+        futures = [*rows.values(), *(future for _, future in tried)]
+        for done, future in enumerate(as_completed(futures), 1):
+            future.result()
+            if progress is not None:
+                progress(done, len(futures))
+    finally:
+        pool.shutdown(cancel_futures=True)
+    measured = {name: future.result() for name, future in rows.items()}
+    outcomes = tuple((c, future.result()[c.check]) for c, future in tried)
+    return Certificate(named, measured, outcomes)
+
+
+def _named(methods: Any) -> dict[str, dvi.Method]:
+    """Name → method, checked."""
+    if isinstance(methods, dvi.Method):
+        raise TypeError(
+            "methods must have names as keys of a dict, got one method without a name. Write "
+            f'certify({{"mine": {methods!r}}}).'
+        )
+    if not isinstance(methods, Mapping):
+        own = " For your own method call certify({name: method})."
+        return {name: METHODS[name] for name in chosen("method", methods, METHODS, own)}
+    for name, method in methods.items():
+        if not isinstance(method, dvi.Method):
+            seen = (
+                f"the class {method.__name__}" if isinstance(method, type) else f"{method!r:.200}"
+            )
+            raise TypeError(f"methods[{name!r}] must be a method such as dvi.TypeII(), got {seen}.")
+        order = method.order
+        if isinstance(order, bool) or not isinstance(order, int | float):
+            raise TypeError(f"methods[{name!r}].order must be an int or a float, got {order!r}.")
+        if not (math.isfinite(order) and order > 0):
+            raise ValueError(f"methods[{name!r}].order must be positive and finite, got {order!r}.")
+    if not methods:
+        raise ValueError(
+            'methods is empty: give at least one method with its name, such as {"mine": '
+            "dvi.TypeII()}, or None for all methods of the package."
+        )
+    return {str(name): method for name, method in methods.items()}

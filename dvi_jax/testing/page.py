@@ -1,0 +1,124 @@
+"""The certificate as text: tables for the terminal, a Markdown page."""
+
+import math
+import platform
+import string
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import NamedTuple
+
+import dvi_jax as dvi
+
+from .check import CHECKS, Measured
+from .controls import Control
+
+TITLE = "# Certificate of the methods"
+"""First line of the page, by which a page is recognised."""
+
+GROUPS = {
+    "Order and structure": ("order", "forced-order", "symplecticity", "reversal", "adjoint"),
+    "Long runs and derivatives": ("energy", "momentum", "gradient", "modes"),
+    "Programs": ("jit", "vmap", "failure", "traces"),
+}
+"""The checks as tables show them together."""
+
+
+def page_for(out: Path) -> Path:
+    """The file that the page is written to: `out`, or ``certificate.md`` in it.
+
+    **Raises** `ValueError` for a file that exists and is not a certificate.
+    """
+    out = Path(out)
+    page = out if out.suffix == ".md" and not out.is_dir() else out / "certificate.md"
+    fault = ""
+    if out.exists() and not out.is_dir() and page != out:
+        fault = f"{out} is neither a directory nor a .md file"
+    elif page.exists():
+        try:
+            first = page.read_text(encoding="utf-8").partition("\n")[0]
+            fault = "" if first == TITLE else f"{page} exists and is not a certificate"
+        except (OSError, UnicodeDecodeError) as error:
+            fault = f"{page} cannot be read: {error}"
+    if fault:
+        allowed = "a new .md file, an earlier certificate, or a directory for the certificate."
+        raise ValueError(f"--out: {fault}\n  allowed: {allowed}")
+    return page
+
+
+class Table(NamedTuple):
+    """A title, names of columns, rows of text."""
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+def tables(
+    methods: Mapping[str, dvi.Method],
+    rows: Mapping[str, Mapping[str, Measured]],
+    controls: Sequence[tuple[Control, Measured]],
+) -> list[Table]:
+    """The methods under each group of checks, then the controls."""
+    made = []
+    for title, group in GROUPS.items():
+        names = [n for n in group if all(n in row for row in rows.values())]
+        columns = {"method": list(rows)}
+        if "order" in names:
+            columns["claims"] = [claims(methods[name]) for name in rows]
+        columns |= {n: [cell(n, row[n]) for row in rows.values()] for n in names}
+        if names:
+            made.append(Table(title, list(columns), list(zip(*columns.values(), strict=True))))
+    if controls:
+        caught = {True: "caught", False: "MISSED"}
+        body = [
+            [c.check, c.name, cell(c.check, x), x.allowed, caught[x.verdict == "FAIL"]]
+            for c, x in controls
+        ]
+        columns = ["check", "broken method", "measured", "allowed", "verdict"]
+        made.append(Table("Controls", columns, body))
+    return made
+
+
+def claims(method: dvi.Method) -> str:
+    """The properties that a method claims."""
+    names = ("symmetric", "symplectic", "invertible")
+    return ", ".join([f"order {method.order}", *(n for n in names if getattr(method, f"is_{n}"))])
+
+
+def cell(check: str, measured: Measured) -> str:
+    """The verdict in words and the number."""
+    if math.isnan(measured.value):
+        return measured.verdict
+    number = "0" if measured.value == 0 else f"{measured.value:{CHECKS[check].digits}}"
+    if measured.verdict == "not claimed":
+        return f"not claimed ({number})"
+    return f"{measured.verdict} {number}"
+
+
+def markdown(
+    made: Sequence[Table], summary: str, failures: Sequence[tuple[str, str, Measured]]
+) -> str:
+    """The page, from the template `page.md`."""
+    versions = ", ".join(f"{n} {version(n)}" for n in ("dvi-jax", "jax", "jaxlib", "numpy"))
+    python = ".".join(platform.python_version_tuple()[:2])
+    shown = {name for table in made for name in table.columns} & set(CHECKS)
+    parts = [f"## {table.title}\n\n{_as_markdown(table)}" for table in made]
+    if failures:
+        said = [f"- {m}, {c}: {x.verdict}, allowed {x.allowed}. {x.detail}" for m, c, x in failures]
+        parts.append("\n".join(["## Failures\n", *said]))
+    template = Path(__file__).with_name("page.md").read_text(encoding="utf-8")
+    return string.Template(template).substitute(
+        title=TITLE,
+        summary="\n".join(f"- {line}" for line in summary.splitlines()),
+        versions=f"{versions}, Python {python}",
+        tables="\n\n".join(parts),
+        legend="\n".join(f"- **{n}**: {c.says}" for n, c in CHECKS.items() if n in shown),
+    )
+
+
+def _as_markdown(table: Table) -> str:
+    rows = [table.columns, ["---"] * len(table.columns), *table.rows]
+    return "\n".join(
+        "| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows
+    )

@@ -1,0 +1,1 @@
+"""Jaxprs: what JAX traced, and what depends on what."""

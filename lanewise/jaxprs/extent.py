@@ -1,0 +1,82 @@
+"""How large a function is: operations, and numbers that its loops carry."""
+
+from typing import Any
+
+import numpy as np
+
+from ..llvm.ir import MOST_OPERATIONS
+from .jaxapi import ClosedJaxpr, bodies, scan_counts
+
+
+def functions_in(eqn: Any) -> list[ClosedJaxpr]:
+    """The jaxpr of what `call` was given, if an equation of a jaxpr is such a call: it is not
+    among those that the equation shows."""
+    is_call = eqn.primitive.name == "lanewise"
+    return [eqn.params["program"].traced.closed] if is_call else []
+
+
+def carried(jaxpr: Any) -> int:
+    """Numbers that the innermost loop with most of them carries from step to step."""
+    most = 0
+    for eqn in jaxpr.eqns:
+        for body in bodies(eqn):
+            most = max(most, carried(body.jaxpr))
+        if eqn.primitive.name == "scan":
+            _, count = scan_counts(eqn.params)
+            state = [v.aval for v in eqn.outvars[:count]]
+            # Large arrays stay in memory and take no register; integers are few.
+            most = max(most, sum(a.size for a in state if a.size <= 64 and a.dtype.kind == "f"))
+    return most
+
+
+MOST_IN_PAIRS = 150_000
+"""The same for functions with exact products, whose long chains of sums XLA compiles to code that
+takes minutes to run."""
+
+
+def most_operations(jaxpr: Any) -> int:
+    """The largest number of operations of a function for which code is generated."""
+    return MOST_IN_PAIRS if _has_exact_products(jaxpr) else MOST_OPERATIONS
+
+
+def _has_exact_products(jaxpr: Any) -> bool:
+    return any(
+        eqn.primitive.name == "lost_by_product"
+        or any(_has_exact_products(body.jaxpr) for body in (*bodies(eqn), *functions_in(eqn)))
+        for eqn in jaxpr.eqns
+    )
+
+
+def operation_count(jaxpr: Any) -> int:
+    """How many operations on numbers the evaluation is made of, loops counted once; roughly."""
+    count = 0
+    for eqn in jaxpr.eqns:
+        inside = (*bodies(eqn), *functions_in(eqn))
+        if eqn.primitive.name == "custom_linear_solve":
+            # Only this one of its four functions is run.
+            inside = (eqn.params["jaxprs"].solve,)
+        inner = [operation_count(b.jaxpr) for b in inside]
+        if inner:
+            count += sum(inner)
+            continue
+        size = max((v.aval.size for v in eqn.outvars), default=0)
+        if eqn.primitive.name == "dot_general":
+            (contracted, _), _ = eqn.params["dimension_numbers"]
+            # One fused multiply-add for each term.
+            size *= int(np.prod([eqn.invars[0].aval.shape[i] for i in contracted]))
+        elif eqn.primitive.name.startswith("reduce_"):
+            size = eqn.invars[0].aval.size
+        elif eqn.primitive.name == "eliminate":
+            n, matrices = eqn.invars[0].aval.shape[-1], eqn.invars[0].aval.size
+            size = matrices * n // 3 + size * n - matrices  # more columns of one matrix
+        elif eqn.primitive.name in _FREE:
+            size = 0
+        count += size
+    return count
+
+
+_MOVES = (
+    "broadcast_in_dim reshape squeeze expand_dims transpose slice concatenate stack split "
+    "unstack pad rev copy convert_element_type stop_gradient"
+)
+_FREE = frozenset(_MOVES.split())

@@ -1,0 +1,1 @@
+"""Machine code: compilation, cache, calls from XLA."""

@@ -1,0 +1,1 @@
+"""How the primitives of JAX are written in LLVM IR."""

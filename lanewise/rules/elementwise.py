@@ -1,0 +1,188 @@
+"""Elementwise primitives: rule(evaluator, parameters of the equation, *numbers) → number."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..assumed import taken_for, taken_value
+from ..llvm.ir import Num, Unsupported
+from . import exact
+
+if TYPE_CHECKING:
+    from ..evaluator import Evaluator
+
+
+def _binary(method: str) -> Callable:
+    return lambda e, _, a, b: getattr(e.b, method)(a, b)
+
+
+def _equal(e: "Evaluator", _: Any, x: Num, y: Num) -> Num:
+    """A loop's counter equals a given number in one round: taken for rare."""
+    same = e.b.compare("eq", x, y)
+    # A number that changes and is the same on all trajectories of a batch is a counter.
+    is_count = e.b.W > 1 and taken_value(same) is None and not same.vec and not x.is_float
+    if e.assumed is not None and is_count and (x.known is not None or y.known is not None):
+        e.assumed.never(same)
+        return taken_for(e.b, 0, "bool")
+    return same
+
+
+def _select(e: "Evaluator", _: Any, which: Num, *cases: Num) -> Num:
+    b = e.b
+    if which.dtype == "bool":
+        taken = None if which.known is not None else taken_value(which)
+        if taken is not None:
+            return b.unrelated(cases[int(taken)])
+        return b.select(which, cases[1], cases[0])
+    # Indices outside select the first or the last case, as in XLA.
+    result = cases[-1]
+    for i in reversed(range(len(cases) - 1)):
+        result = b.select(b.compare("le", which, b.known(i, which.dtype)), cases[i], result)
+    return result
+
+
+def _clamp(e: "Evaluator", _: Any, low: Num, x: Num, high: Num) -> Num:
+    return e.b.maximum(e.b.maximum(x, low), high, "lt")
+
+
+def _sign(e: "Evaluator", _: Any, x: Num) -> Num:
+    b, zero = e.b, e.b.known(0, x.dtype)
+    if x.dtype.startswith("u"):
+        return b.select(b.compare("eq", x, zero), zero, b.known(1, x.dtype))
+    # x itself where it is neither: NaN stays NaN and −0 stays −0.
+    one = b.select(b.compare("gt", x, zero), b.known(1, x.dtype), x)
+    return b.select(b.compare("lt", x, zero), b.known(-1, x.dtype), one)
+
+
+def _integral(name: str, function: Callable | None) -> Callable:
+    """Rounding to an integer by a function of NumPy, if it has one, and LLVM's of that name."""
+
+    def rule(e: "Evaluator", _: Any, x: Num) -> Num:
+        if not x.is_float:
+            return x
+        if x.known is not None and function is not None:
+            return e.b.known(function(x.known), x.dtype)
+        return e.b.intrinsic(name, (x,))
+
+    return rule
+
+
+def _rounded(e: "Evaluator", params: dict, x: Num) -> Num:
+    # NumPy has no function that rounds halves away from zero.
+    away = int(params["rounding_method"]) == 0
+    rule = _integral("round", None) if away else _integral("roundeven", np.rint)
+    return rule(e, params, x)
+
+
+def _pow(e: "Evaluator", _: Any, x: Num, y: Num) -> Num:
+    if y.known is not None and x.is_float:
+        if not y.is_float or float(y.known).is_integer():
+            n = int(y.known)
+            # More products would have larger errors than the function.
+            if abs(n) <= 64:
+                return e.b.power(x, n)
+        # A root and few products: 1/r³ of a force takes a small part of the operations of pow.
+        elif abs(2 * float(y.known)) <= 7 and float(2 * y.known).is_integer():
+            name = f"half_integer_power {int(2 * float(y.known))}"
+            return _elementary(name)(e, {}, x)
+    if not y.is_float:
+        y = e.b.convert(y, x.dtype)
+    return _elementary("pow")(e, {}, x, y)
+
+
+def _elementary(name: str) -> Callable:
+    def rule(e: "Evaluator", _: Any, *xs: Num) -> Num:
+        if not xs[0].is_float:
+            raise Unsupported(
+                f"{name} is compiled for floating-point numbers only, got {xs[0].dtype}: convert "
+                "them with .astype(float)"
+            )
+        if xs[0].dtype == "float32":
+            # Own functions for float32 would be faster, and one more set to test.
+            wide = e.kernel.elementary(name, [e.b.convert(x, "float64") for x in xs])
+            return e.b.convert(wide, "float32")
+        return e.kernel.elementary(name, xs)
+
+    return rule
+
+
+def _one(e: "Evaluator", like: Num) -> Num:
+    return e.b.known(1, like.dtype)
+
+
+def _bitcast(e: "Evaluator", params: dict, x: Num) -> Num:
+    new = np.dtype(params["new_dtype"])
+    # Other sizes change the shape of the array, which a rule for one number cannot.
+    if new.itemsize != np.dtype(x.dtype).itemsize or "bool" in (x.dtype, str(new)):
+        raise Unsupported(
+            "bitcast_convert_type is compiled for two types of equal size other than bool, got "
+            f"{x.dtype} and {new}"
+        )
+    return e.b.bitcast(x, str(new))
+
+
+def _combined(op: str) -> Callable:
+    return lambda e, _, a, b: e.combine(op, a, b)
+
+
+def _same(e: "Evaluator", _: Any, x: Num) -> Num:
+    return x
+
+
+def _reduced_precision(e: "Evaluator", params: dict, x: Num) -> Num:
+    wide = {"float64": (11, 52), "float32": (8, 23)}.get(x.dtype)
+    if wide is None or params["exponent_bits"] < wide[0] or params["mantissa_bits"] < wide[1]:
+        got = params["exponent_bits"], params["mantissa_bits"]
+        raise Unsupported(
+            f"reduce_precision is compiled only if it does not reduce the precision of {x.dtype}: "
+            f"(exponent_bits, mantissa_bits) must be at least {wide}, got {got}"
+        )
+    return x
+
+
+_FUNCTIONS = (
+    "sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh "
+    "exp exp2 expm1 log log1p log2 cbrt erf erfc erf_inv logistic"
+)
+
+# Applied number by number; an operand without axes is combined with each number of the others.
+ELEMENTWISE: dict[str, Callable] = {
+    **{op: _combined(op) for op in ("add", "mul", "max", "min")},
+    "add_any": _combined("add"),
+    "sub": _binary("sub"),
+    "div": _binary("div"),
+    "rem": _binary("rem"),
+    "neg": lambda e, _, x: e.b.neg(x),
+    "abs": lambda e, _, x: e.b.abs(x),
+    "sign": _sign,
+    "clamp": _clamp,
+    "select_n": _select,
+    "sqrt": lambda e, _, x: e.b.sqrt(x),
+    "rsqrt": lambda e, _, x: e.b.div(_one(e, x), e.b.sqrt(x)),
+    "square": lambda e, _, x: e.b.mul(x, x),
+    "one_minus_square": lambda e, _, x: e.b.sub(_one(e, x), e.b.mul(x, x)),
+    "integer_pow": lambda e, params, x: e.b.power(x, params["y"]),
+    "pow": _pow,
+    "floor": _integral("floor", np.floor),
+    "ceil": _integral("ceil", np.ceil),
+    "round": _rounded,
+    "is_finite": lambda e, _, x: e.b.is_finite(x),
+    "convert_element_type": lambda e, params, x: e.b.convert(x, str(np.dtype(params["new_dtype"]))),
+    "bitcast_convert_type": _bitcast,
+    "reduce_precision": _reduced_precision,
+    **dict.fromkeys(["copy", "copy_p", "stop_gradient", "real", "conj"], _same),
+    **{op: (lambda e, _, a, b, op=op: e.b.logic(op, a, b)) for op in ("and", "or", "xor")},
+    "not": lambda e, _, x: e.b.invert(x),
+    "rounded_product": exact.rounded,
+    "lost_by_product": exact.lost,
+    "eq": _equal,
+    **{
+        op: (lambda e, _, a, b, o=op: e.b.compare(o, a, b)) for op in ("ne", "lt", "le", "gt", "ge")
+    },
+    **{
+        op: (lambda e, _, a, b, op=op: e.b.shift(op, a, b))
+        for op in ("shift_left", "shift_right_logical", "shift_right_arithmetic")
+    },
+    **{name: _elementary(name) for name in _FUNCTIONS.split()},
+}

@@ -1,0 +1,228 @@
+"""Loops and branches: scan, while, cond."""
+
+import functools
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..assumed import taken_value
+from ..jaxprs.dependence import fixed_point, reached_outputs
+from ..jaxprs.jaxapi import ClosedJaxpr, scan_counts
+from ..llvm.ir import Num
+from ..llvm.values import Value, objects
+from .rounds import Rounds, Waiting
+
+if TYPE_CHECKING:
+    from ..evaluator import Evaluator
+
+
+# Primitives whose result is the same on all trajectories, even if the operands differ.
+AGREED = frozenset(["least_over_lanes"])
+
+
+def _carried(e: "Evaluator", carry: Sequence[Value], on: Sequence[bool]):
+    """The numbers of a carry in a row, which of them are vectors, and the way back."""
+    numbers = _numbers_of(e, carry)
+    vec = [lanes for value, lanes in zip(carry, on, strict=True) for _ in range(value.size)]
+    return numbers, vec, functools.partial(_values_of, carry)
+
+
+def _numbers_of(e: "Evaluator", values: Sequence[Value]) -> list[Num]:
+    return [x for value in values for x in e.entries(value).flat]
+
+
+def _values_of(like: Sequence[Any], numbers: Sequence[Num]) -> list[Value]:
+    """Values with the shapes and types of `like`, of numbers in a row."""
+    values, rest = [], iter(numbers)
+    for x in like:
+        entries = objects([next(rest) for _ in range(x.size)], x.shape)
+        values.append(Value(x.shape, x.dtype, entries))
+    return values
+
+
+def scan(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:
+    params, b = eqn.params, e.b
+    body: ClosedJaxpr = params["jaxpr"]
+    num_consts, num_carry = scan_counts(params)
+    length, reverse = params["length"], params["reverse"]
+    consts, carry, xs = _cut(values, num_consts, num_carry)
+    jaxpr, row_avals = body.jaxpr, [v.aval for v in eqn.outvars[num_carry:]]
+    if length == 0:
+        return [*carry, *(Value(a.shape, a.dtype, np.empty(a.shape, object)) for a in row_avals)]
+    # A carry that no round changes is not carried: it stays a constant, or a scalar.
+    carry_in = jaxpr.invars[num_consts : num_consts + num_carry]
+    moves = [o is not i for o, i in zip(jaxpr.outvars[:num_carry], carry_in, strict=True)]
+
+    # Which values differ between trajectories, in some round of the loop.
+    lanes_of_consts, lanes_of_xs = ([v.has_lanes() for v in some] for some in (consts, xs))
+
+    def outputs(on: list[bool]) -> list[bool]:
+        return reached_outputs(jaxpr, [*lanes_of_consts, *on, *lanes_of_xs], AGREED)
+
+    on = fixed_point(lambda on: outputs(on)[:num_carry], [v.has_lanes() for v in carry])
+    on_rows = outputs(on)[num_carry:]
+    moving = [(c, o) for c, o, m in zip(carry, on, moves, strict=True) if m]
+    numbers, vec, back = _carried(e, [c for c, _ in moving], [o for _, o in moving])
+    sources = [e.in_memory(x) for x in xs]
+    rows = [
+        place or e.kernel.scratch(aval.shape, str(aval.dtype), o)
+        for aval, place, o in zip(row_avals, places[num_carry:], on_rows, strict=True)
+    ]
+    end = e.kernel.parameter(length)
+    waiting = None if reverse else Waiting.of(e, rows, length)
+
+    def merged(numbers: Sequence[Num]) -> list[Value]:
+        of = iter(back(numbers))
+        return [next(of) if m else c for c, m in zip(carry, moves, strict=True)]
+
+    def round_of(numbers: Sequence[Num], k: Num, start: Num) -> list[Num]:
+        if reverse:
+            k = b.sub(b.sub(end, b.known(1, "int64")), k)
+        slices = [Value.in_memory(source.row(b, k)) for source in sources]
+        targets = [r.row(b, k) for r in rows] if waiting is None else waiting.rows(k, start)
+        outs = e.jaxpr(
+            jaxpr,
+            [e.constant(c) for c in body.consts],
+            [*consts, *merged(numbers), *slices],
+            [*[None] * num_carry, *targets],
+        )
+        for y, target in zip(outs[num_carry:], targets, strict=True):
+            e.write(y, target)
+        return _numbers_of(e, [y for y, m in zip(outs[:num_carry], moves, strict=True) if m])
+
+    rounds = Rounds(e, vec, length, end, round_of, waiting)
+    return [*merged(rounds.all(jaxpr, numbers)), *map(Value.in_memory, rows)]
+
+
+def while_loop(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:
+    """`while`; a condition that is an array says of each of its entries whether that entry of the
+    carry, by its leading axes, goes on."""
+    params = eqn.params
+    test, body = params["cond_jaxpr"], params["body_jaxpr"]
+    of_test, of_body, carry = _cut(values, params["cond_nconsts"], params["body_nconsts"])
+    shape = test.jaxpr.outvars[0].aval.shape
+    lanes_of_test = [v.has_lanes() for v in of_test]
+    lanes_of_body = [v.has_lanes() for v in of_body]
+
+    def after(on):
+        (goes_on,) = reached_outputs(test.jaxpr, [*lanes_of_test, *on], AGREED)
+        outs = reached_outputs(body.jaxpr, [*lanes_of_body, *on], AGREED)
+        return [goes_on or x for x in outs]
+
+    on = fixed_point(after, [v.has_lanes() for v in carry])
+    (per_lane,) = reached_outputs(test.jaxpr, [*lanes_of_test, *on], AGREED)
+    numbers, vec, back = _carried(e, carry, on)
+    parts = math.prod(shape)
+    # The condition has the leading axes of each array of the carry.
+    part = [i * parts // v.size for v in carry for i in range(v.size)]  # of which a number is
+
+    def goes_on(numbers: Sequence[Num]) -> list[Num]:
+        return _numbers_of(e, e.closed(test, [*of_test, *back(numbers)]))
+
+    def step(numbers: Sequence[Num]) -> list[Num]:
+        return _numbers_of(e, e.closed(body, [*of_body, *back(numbers)]))
+
+    # In a round on assumptions: a loop that starts at all is the rare case.
+    if per_lane and e.assumed is not None:
+        for going in goes_on(numbers):
+            e.assumed.never(going)
+        return back([e.b.unrelated(x) for x in numbers])
+    with e.assuming(None):
+        # Trajectories that have finished keep their values, and the block goes on.
+        if per_lane or shape:
+            return back(_masked(e, numbers, vec, per_lane, part, goes_on, step))
+
+        def proceeds(state, _):
+            return e.b.ref(goes_on(state)[0], 0, False)
+
+        return back(e.b.loop(numbers, vec, proceeds, lambda state, _: step(state)))
+
+
+def _masked(e: "Evaluator", numbers, vec, per_lane, part, goes_on, step) -> list[Num]:
+    """A loop of which every trajectory, or every part of the carry, stops by itself; the block goes
+    on while one of them does. `part[i]` is the condition of number i."""
+    b = e.b
+    first = goes_on(numbers)
+    count = len(first)
+
+    def any_goes_on(state, _):
+        one = functools.reduce(lambda x, y: b.logic("or", x, y), state[:count])
+        return b.any(one) if per_lane else b.ref(one, 0, False)
+
+    def masked(state, _):
+        active, numbers = state[:count], state[count:]
+        news = step(numbers)
+        kept = [
+            b.select(active[i], new, old) for i, new, old in zip(part, news, numbers, strict=True)
+        ]
+        # A trajectory or a part that has stopped has no influence on whether the loop continues.
+        of = kept if count > 1 else news
+        going = [b.logic("and", x, y) for x, y in zip(active, goes_on(of), strict=True)]
+        return [*going, *kept]
+
+    end = b.loop([*first, *numbers], [*[per_lane] * count, *vec], any_goes_on, masked)
+    return end[count:]
+
+
+def cond(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:
+    branches = eqn.params["branches"]
+    index, operands = values[0], values[1:]
+    which = e.entries(index)[()]
+    if which.known is not None:
+        return e.closed(branches[int(np.clip(which.known, 0, len(branches) - 1))], operands)
+    taken = taken_value(which)
+    if taken is not None:
+        chosen = branches[int(np.clip(taken, 0, len(branches) - 1))]
+        return [e.unrelated(v) for v in e.closed(chosen, operands)]
+    with e.assuming(None):
+        return _branches(e, eqn, which, operands)
+
+
+def _branches(e: "Evaluator", eqn: Any, which: Num, operands: list[Value]) -> list[Value]:
+    branches, b = eqn.params["branches"], e.b
+    if which.dtype == "bool":
+        which = b.convert(which, "int32")
+    flags = [v.has_lanes() for v in operands]
+    # A result varies if the choice does, or if it does in one of the branches.
+    per_branch = [reached_outputs(x.jaxpr, flags, AGREED) for x in branches]
+    on = [which.vec or any(x) for x in zip(*per_branch, strict=True)]
+    avals = [v.aval for v in eqn.outvars]
+    vec = [o for o, a in zip(on, avals, strict=True) for _ in range(a.size)]
+    dtypes = [str(a.dtype) for a in avals for _ in range(a.size)]
+
+    def run(branch):
+        return lambda: _numbers_of(e, e.closed(branch, operands))
+
+    # XLA clamps the index to the branches that exist.
+    last = len(branches) - 1
+    takes = []  # whether a branch is taken; the first and the last beyond their index too
+    for i in range(len(branches)):
+        op = "le" if i == 0 else "ge" if i == last else "eq"
+        takes.append(b.compare(op, which, b.known(i, which.dtype)))
+    # The same branch on all trajectories: jump. Otherwise run all branches that some trajectory
+    # takes, and let each trajectory select its own result.
+    if not which.vec:
+        results = _one_of(e, takes, [run(x) for x in branches], vec, dtypes)
+    else:
+        results: Any = None
+        for take, branch in zip(takes, branches, strict=True):
+            zeros = [b.known(0, d) for d in dtypes]
+            mine = b.branch(b.any(take), run(branch), lambda z=zeros: z, vec, dtypes)
+            if results is not None:
+                mine = [b.select(take, x, y) for x, y in zip(mine, results, strict=True)]
+            results = mine
+    return _values_of(avals, results)
+
+
+def _one_of(e: "Evaluator", takes, runs, vec, dtypes) -> list[Num]:
+    if len(runs) == 1:
+        return runs[0]()
+    b = e.b
+    rest = functools.partial(_one_of, e, takes[1:], runs[1:], vec, dtypes)
+    return b.branch(b.ref(takes[0], 0, False), runs[0], rest, vec, dtypes)
+
+
+def _cut(values: list[Value], first: int, second: int) -> tuple[list, list, list]:
+    return values[:first], values[first : first + second], values[first + second :]

@@ -1,0 +1,119 @@
+"""Where the entries of an array go: primitives of JAX that move numbers and compute nothing."""
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ..llvm.ir import Unsupported
+
+
+def _broadcast_in_dim(x, *, shape, broadcast_dimensions):
+    x = np.transpose(x, np.argsort(broadcast_dimensions))  # they may come in any order
+    places = [1] * len(shape)
+    for axis, dimension in enumerate(sorted(broadcast_dimensions)):
+        places[dimension] = x.shape[axis]
+    return np.broadcast_to(x.reshape(places), shape)
+
+
+def _slice(x, *, start_indices, limit_indices, strides):
+    strides = strides or (1,) * x.ndim
+    return x[tuple(map(slice, start_indices, limit_indices, strides))]
+
+
+def _unstack(x: np.ndarray, *, axis: int) -> tuple[np.ndarray, ...]:
+    rows = np.moveaxis(x, axis, 0)
+    return tuple(rows[i, ...] for i in range(len(rows)))  # "...": an array, of one entry too
+
+
+def _split(x, *, sizes, axis):
+    return tuple(np.split(x, np.cumsum(sizes)[:-1], axis))  # NumPy takes the places of the cuts
+
+
+def _reshape(x, *, new_sizes, dimensions):
+    return (x if dimensions is None else np.transpose(x, dimensions)).reshape(new_sizes)
+
+
+# One array seen with other axes or strides; an array in memory stays where it is.
+VIEWS: dict[str, Callable] = {
+    "broadcast_in_dim": _broadcast_in_dim,
+    "squeeze": lambda x, *, dimensions: np.squeeze(x, tuple(dimensions)),
+    "expand_dims": lambda x, *, dimensions: np.expand_dims(x, tuple(dimensions)),
+    "transpose": lambda x, *, permutation: np.transpose(x, permutation),
+    "rev": lambda x, *, dimensions: np.flip(x, tuple(dimensions)),
+    "slice": _slice,
+    "split": _split,
+    "unstack": _unstack,
+}
+
+
+def _pad(x, fill, *, padding_config):
+    shape = [
+        low + high + max(size + (size - 1) * inner, 0)
+        for size, (low, high, inner) in zip(x.shape, padding_config, strict=True)
+    ]
+    # Negative padding crops: place the entries on a larger canvas, and cut.
+    crops = [(max(-low, 0), max(-high, 0)) for low, high, _ in padding_config]
+    canvas = np.empty([s + a + b for s, (a, b) in zip(shape, crops, strict=True)], object)
+    for i in np.ndindex(canvas.shape):
+        canvas[i] = fill.flat[0]
+    places = []
+    for size, (low, _high, inner) in zip(x.shape, padding_config, strict=True):
+        start = max(low, 0)
+        places.append(slice(start, start + max(size + (size - 1) * inner, 0), inner + 1))
+    canvas[tuple(places)] = x
+    cut = [slice(a, a + s) for s, (a, _) in zip(shape, crops, strict=True)]
+    return canvas[tuple(cut)]
+
+
+# The same on arrays of entries, and those that make a new array.
+MOVES: dict[str, Callable] = {
+    **VIEWS,
+    "reshape": _reshape,
+    "stack": lambda *xs, axis: np.stack(xs, axis),
+    "tile": lambda x, *, reps: np.tile(x, tuple(reps)),
+    "concatenate": lambda *xs, dimension: np.concatenate(xs, axis=dimension),
+    "pad": _pad,
+}
+
+
+def moved(name: str, params: dict[str, Any], *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The outputs of a primitive that moves numbers.
+
+    **Raises** `Unsupported` for a parameter that its rule does not know, which might move them
+    elsewhere.
+    """
+    rule, params = MOVES[name], {k: v for k, v in params.items() if k not in _ABOUT_DEVICES}
+    # A later release of JAX may add a parameter: better no code than wrong code.
+    unknown = params.keys() - inspect.signature(rule).parameters.keys()
+    if unknown:
+        names = ", ".join(sorted(unknown))
+        raise Unsupported(f"{name} has parameters that this version cannot compile: {names}")
+    out = rule(*arrays, **params)
+    return out if isinstance(out, tuple) else (out,)
+
+
+# They say where an array is, not which number is where.
+_ABOUT_DEVICES = frozenset(["sharding", "out_sharding"])
+
+# Calls of one jaxpr whose inputs and outputs are those of the equation.
+_CALL_NAMES = (
+    "jit pjit closed_call core_call call_hi_primitive eval_jaxpr custom_jvp_call custom_vjp_call "
+    "custom_vjp_call_jaxpr implicit_root checkpoint remat remat2"
+)
+CALLS = frozenset(_CALL_NAMES.split())
+
+# Taken from the first entry to the last, by this operation of two.
+REDUCTIONS = {
+    "reduce_sum": "add",
+    "reduce_prod": "mul",
+    "reduce_max": "max",
+    "reduce_min": "min",
+    "reduce_and": "and",
+    "reduce_or": "or",
+    "reduce_xor": "xor",
+}
+
+# Running reductions along one axis.
+CUMULATIVE = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}

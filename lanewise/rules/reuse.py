@@ -1,0 +1,95 @@
+"""Numbers at the end of a round that the next round computes again at its beginning.
+
+A step ends with the energy, of the new state; the next one begins with the force, of the same
+state, and both need 1/r. A loop of rounds without branches carries such a number over instead.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+from ..llvm.ir import Num
+
+# Operations worth carrying; calls of elementary functions are too.
+_COSTLY = frozenset(["sqrt", "div"])
+
+_MOST = 8  # numbers that are carried over
+
+
+def carried_over(before: Sequence[Num], after: Sequence[Num]) -> list[tuple[Num, Num]]:
+    """Pairs (x, y): x follows from the numbers `before` a round as y does from those `after` it, so
+    that y is the next round's x."""
+    place = {x.serial: i for i, x in enumerate(before)}
+    new_place = {x.serial: i for i, x in enumerate(after) if x.known is None and x.op}
+    names: dict[Any, int] = {}
+    # The same names for both, so that equal forms have equal keys.
+    first, second = _Forms(place, min(place), names), _Forms(new_place, min(place), names)
+    seen = _all_of(after)
+    ends = {}
+    for y in seen:
+        form = second.of(y)
+        if form is not None and _is_costly(y):
+            ends.setdefault(form, y)
+    pairs, found = [], set()
+    for x in seen:
+        form = first.of(x)
+        # A number that is the same on all trajectories is cheap.
+        if form in ends and _is_costly(x) and x.vec and x.write and ends[form].vec:
+            pairs.append((x, ends[form]))
+            found.add(x.serial)
+    # A number that only other carried numbers need does not have to be carried.
+    needed = {a.serial for z in seen if z.serial not in found for a in z.args}
+    pairs = [(x, y) for x, y in pairs if x.serial in needed]
+    # More of them would need more registers than the state leaves.
+    return pairs if len(pairs) <= _MOST else []
+
+
+def _is_costly(x: Num) -> bool:
+    return x.op in _COSTLY or x.op.startswith("call ")
+
+
+def _all_of(numbers: Sequence[Num]) -> list[Num]:
+    """The numbers and all that they are made of."""
+    seen, open_ = {}, list(numbers)
+    while open_:
+        x = open_.pop()
+        if x.known is None and x.serial not in seen:
+            seen[x.serial] = x
+            open_ += x.args
+    return list(seen.values())
+
+
+class _Forms:
+    """How numbers are made from a state, as keys: equal keys are equal numbers of equal states.
+
+    A key is a short name of an operation and the keys of its operands. Written out, an expression
+    in which one number occurs twice, again and again, is as long as a power of two.
+    """
+
+    def __init__(self, place: dict[int, int], inside: int, names: dict[Any, int]):
+        """`place` has the numbers of the state; those from the serial `inside` on belong to the
+        round, and the others are the same in all rounds. `names`: keys given so far."""
+        self.place, self.inside, self.names = place, inside, names
+        self.forms: dict[int, int | None] = {}
+
+    def _named(self, *form: Any) -> int:
+        return self.names.setdefault(form, len(self.names))
+
+    def of(self, x: Num) -> int | None:
+        """The key, None for a number that does not follow from this state alone."""
+        if x.known is not None:
+            return self._named("known", x.key)
+        if x.serial in self.place:
+            return self._named("state", self.place[x.serial])
+        if x.serial < self.inside:
+            return self._named("outside", x.serial)
+        # A result of a loop or a branch: nothing is known of how it was made.
+        if x.write is None and x.op != "same":
+            return None
+        if x.serial not in self.forms:
+            self.forms[x.serial] = None
+            parts = [self.of(a) for a in x.args]
+            if x.op == "same":
+                self.forms[x.serial] = parts[0]
+            elif all(part is not None for part in parts):
+                self.forms[x.serial] = self._named(x.op, x.dtype, *parts)
+        return self.forms[x.serial]

@@ -1,0 +1,209 @@
+"""Primitives of JAX written out in simpler ones, for small arrays of one trajectory."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from ..llvm.ir import Unsupported
+
+# Larger matrices are left to XLA, which calls LAPACK; so are stacks that cost more operations than
+# one matrix of this size.
+MOST_UNKNOWNS = 12
+
+MOST_SORTED = 16  # longer arrays are sorted by XLA
+
+
+def _square(x: Array, name: str) -> int:
+    if x.shape[0] > MOST_UNKNOWNS:
+        raise Unsupported(
+            f"{name} is compiled for at most {MOST_UNKNOWNS} rows, got shape {x.shape}"
+        )
+    return x.shape[0]
+
+
+def _of_each_matrix(one: Callable) -> Callable:
+    """A function of matrices, for stacks of them."""
+
+    def of_stacks(*arrays: Array, **parameters: Any) -> Any:
+        *front, n, _ = arrays[0].shape
+        if not front:
+            return one(*arrays, **parameters)
+        count = math.prod(front)
+        if not 0 < count * n**3 <= MOST_UNKNOWNS**3:
+            raise Unsupported(
+                f"number of matrices × rows³ must be from 1 to {MOST_UNKNOWNS**3} for "
+                f"{one.__name__}, got shape {arrays[0].shape}"
+            )
+        flat = [x.reshape(count, *x.shape[len(front) :]) for x in arrays]
+        found = [one(*(x[i] for x in flat), **parameters) for i in range(count)]
+        return jax.tree.map(lambda *x: jnp.stack(x).reshape(*front, *x[0].shape), *found)
+
+    return of_stacks
+
+
+def lu(a: Array, **_) -> tuple[Array, Array, Array]:
+    """L and U in one matrix, the row that each row was exchanged with, and the permutation."""
+    n = _square(a, "lu")
+    if a.shape[1] != n:
+        raise Unsupported(f"lu is compiled for square matrices only, got shape {a.shape}")
+    rows = [[a[i, j] for j in range(n)] for i in range(n)]
+    order, pivots = [jnp.int32(i) for i in range(n)], []
+    for c in range(n):
+        # Exchanges are selections: the pivot differs between trajectories.
+        best, pivot = jnp.abs(rows[c][c]), jnp.int32(c)
+        for i in range(c + 1, n):
+            larger = jnp.abs(rows[i][c]) > best
+            best = lax.select(larger, jnp.abs(rows[i][c]), best)
+            pivot = lax.select(larger, jnp.int32(i), pivot)
+        pivots.append(pivot)
+        for i in range(c + 1, n):
+            here = pivot == i
+            for j in range(n):
+                upper, lower = rows[c][j], rows[i][j]
+                rows[c][j] = lax.select(here, lower, upper)
+                rows[i][j] = lax.select(here, upper, lower)
+            first, second = order[c], order[i]
+            order[c], order[i] = lax.select(here, second, first), lax.select(here, first, second)
+        for i in range(c + 1, n):
+            factor = rows[i][c] / rows[c][c]
+            # As LAPACK: a column of zeros is left as it is.
+            rows[i][c] = lax.select(rows[c][c] == 0, rows[i][c], factor)
+            for j in range(c + 1, n):
+                rows[i][j] = rows[i][j] - rows[i][c] * rows[c][j]
+    return jnp.stack([jnp.stack(r) for r in rows]), jnp.stack(pivots), jnp.stack(order)
+
+
+def triangular_solve(
+    a: Array, b: Array, *, left_side: bool, lower: bool, transpose_a: bool, unit_diagonal: bool, **_
+) -> Array:
+    """X of A X = B, or of X A = B where the matrix is not on the left."""
+    n = _square(a, "triangular_solve")
+    if transpose_a:
+        a, lower = a.T, not lower
+    if not left_side:
+        a, b, lower = a.T, b.T, not lower
+    x: list = [None] * n
+    for i in range(n) if lower else reversed(range(n)):
+        total = b[i]
+        for j in range(i) if lower else range(i + 1, n):
+            total = total - a[i, j] * x[j]
+        x[i] = total if unit_diagonal else total / a[i, i]
+    solution = jnp.stack(x)
+    return solution if left_side else solution.T
+
+
+def cholesky(a: Array, **_) -> Array:
+    """The lower triangle of a symmetric positive definite matrix; NaN where it is not definite."""
+    n = _square(a, "cholesky")
+    rows: list[list] = [[jnp.zeros_like(a[0, 0])] * n for _ in range(n)]
+    for j in range(n):
+        rest = a[j, j] - sum((rows[j][k] ** 2 for k in range(j)), start=jnp.zeros_like(a[0, 0]))
+        rows[j][j] = jnp.sqrt(lax.select(rest > 0, rest, jnp.full_like(rest, jnp.nan)))
+        for i in range(j + 1, n):
+            total = a[i, j]
+            for k in range(j):
+                total = total - rows[i][k] * rows[j][k]
+            rows[i][j] = total / rows[j][j]
+    # One pivot that is not positive makes the whole factor NaN, as LAPACK's caller in JAX does.
+    nothing = sum(rows[j][j] * 0 for j in range(n))
+    return jnp.stack([jnp.stack([x + nothing for x in r]) for r in rows])
+
+
+def sort(*arrays: Array, dimension: int, num_keys: int, **_) -> list[Array]:
+    """Arrays in the order of the first `num_keys` of them, by exchanges of neighbours."""
+    n = arrays[0].shape[dimension]
+    if n > MOST_SORTED:
+        raise Unsupported(f"sort is compiled for an axis of at most {MOST_SORTED} numbers, got {n}")
+    items = [[lax.index_in_dim(x, i, dimension, False) for x in arrays] for i in range(n)]
+    # Exchanges at fixed places, whatever the numbers are: odd and even neighbours in turn.
+    for turn in range(n):
+        for i in range(turn % 2, n - 1, 2):
+            a, b = items[i], items[i + 1]
+            swap = _before(b[:num_keys], a[:num_keys])
+            items[i] = [lax.select(swap, y, x) for x, y in zip(a, b, strict=True)]
+            items[i + 1] = [lax.select(swap, x, y) for x, y in zip(a, b, strict=True)]
+    return [jnp.stack([item[k] for item in items], dimension) for k in range(len(arrays))]
+
+
+def _before(x: Sequence[Array], y: Sequence[Array]) -> Array:
+    """Whether x comes before y and not at one place with it; −0 equals 0, NaN is last."""
+    # From the last key to the first, which decides unless it is equal.
+    before = jnp.zeros(x[0].shape, bool)
+    for a, b in reversed(list(zip(x, y, strict=True))):
+        both_nan = (a != a) & (b != b)
+        before = (a < b) | ((a == a) & (b != b)) | (((a == b) | both_nan) & before)
+    return before
+
+
+def _ordered(x: Array) -> Array:
+    """Integers in the order of numbers, −NaN < −∞ < … < −0 < 0 < … < ∞ < NaN."""
+    if not jnp.issubdtype(x.dtype, jnp.floating):
+        return x
+    kind = jnp.dtype(f"int{8 * x.dtype.itemsize}")
+    bits = lax.bitcast_convert_type(x, kind)
+    most = jnp.asarray(jnp.iinfo(kind).max, kind)
+    return lax.select(bits < 0, bits ^ most, bits)
+
+
+def nextafter(x: Array, y: Array) -> Array:
+    """The number next to x in the direction of y."""
+    kind = jnp.dtype(f"int{8 * x.dtype.itemsize}")
+    bits = lax.bitcast_convert_type(x, kind)
+    away = (x < y) == (x > 0)
+    # Neighbouring floats have neighbouring bits, in order of their size.
+    moved = lax.bitcast_convert_type(bits + lax.select(away, kind.type(1), kind.type(-1)), x.dtype)
+    least = lax.bitcast_convert_type(jnp.ones((), kind), x.dtype)
+    # 0 and −0 are one number with two patterns of bits.
+    moved = lax.select(x == 0, lax.select(y > 0, least, -least), moved)
+    moved = lax.select(x == y, y, moved)
+    return lax.select((x != x) | (y != y), x + y, moved)
+
+
+def threefry2x32(*words: Array, **_) -> tuple[Array, Array]:
+    """Two words of 32 bits encrypted with a key of two: (key 0, key 1, word 0, word 1).
+
+    **Source** Salmon, Moraes, Dror & Shaw 2011, *Parallel random numbers: as easy as 1, 2, 3*,
+    SC11: Threefish with 20 rounds.
+    """
+    key0, key1, x, y = (w.astype(jnp.uint32) for w in jnp.broadcast_arrays(*words))
+    # The constant of Threefish, so that a key of zeros is not a fixed point.
+    keys = (key0, key1, key0 ^ key1 ^ np.uint32(0x1BD11BDA))
+    x, y = x + key0, y + key1
+    for i in range(5):
+        for bits in _ROTATIONS[i % 2]:
+            x = x + y
+            # A rotation to the left, which LLVM recognises.
+            left = lax.shift_left(y, jnp.full_like(y, bits))
+            y = x ^ (left | lax.shift_right_logical(y, jnp.full_like(y, 32 - bits)))
+        # After every four rounds the next pair of the key, and the number of the pair.
+        x = x + keys[(i + 1) % 3]
+        y = y + keys[(i + 2) % 3] + np.uint32(i + 1)
+    return x, y
+
+
+_ROTATIONS = (13, 15, 26, 6), (17, 29, 16, 24)
+
+
+def platform_index(*, platforms: Sequence, **_) -> Array:
+    """The branch that is taken on a CPU."""
+    names = [("cpu",) if p is None else p for p in platforms]
+    return jnp.int32(next(i for i, p in enumerate(names) if "cpu" in p))
+
+
+# function(*arrays, **parameters of the equation) → the equation's results.
+WRITTEN: dict[str, Callable] = {
+    "lu": _of_each_matrix(lu),
+    "triangular_solve": _of_each_matrix(triangular_solve),
+    "cholesky": _of_each_matrix(cholesky),
+    "sort": sort,
+    "nextafter": nextafter,
+    "lt_to": lambda x, y: _ordered(x) < _ordered(y),
+    "le_to": lambda x, y: _ordered(x) <= _ordered(y),
+    "threefry2x32": threefry2x32,
+    "platform_index": platform_index,
+}
