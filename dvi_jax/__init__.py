@@ -97,126 +97,28 @@ from .problem.noise import (
 from .problem.split import Split as Split
 from .problem.system import System as System
 
-if TYPE_CHECKING:  # names that are imported at their first use (`_namespaces`)
-    from . import (
-        fit as _fit,
-        interop as interop,
-        plot as plot,
-        proof as proof,
-        run as run,
-        sweep as _sweep,
-        systems as systems,
-        testing as testing,
-    )
-    from .discover import (
-        AdiabaticInvariant as AdiabaticInvariant,
-        Balance as Balance,
-        Basis as Basis,
-        Chebyshev as Chebyshev,
-        Discovery as Discovery,
-        DriftLaw as DriftLaw,
-        DriftOrder as DriftOrder,
-        DriftSurface as DriftSurface,
-        Generator as Generator,
-        InvariantSeries as InvariantSeries,
-        LatticePoint as LatticePoint,
-        Polynomials as Polynomials,
-        Radial as Radial,
-        ShadowHamiltonian as ShadowHamiltonian,
-        Symmetries as Symmetries,
-        Symmetry as Symmetry,
-        Trigonometric as Trigonometric,
-        conformal_factor as conformal_factor,
-        determining_residual as determining_residual,
-        discover_invariants as discover_invariants,
-        discrete_equations as discrete_equations,
-        drift_order as drift_order,
-        drift_surface as drift_surface,
-        find_symmetries as find_symmetries,
-        lattice_defect as lattice_defect,
-        noether_balance as noether_balance,
-        noether_identity as noether_identity,
-        prolong as prolong,
-        random_pairs as random_pairs,
-        solution_pairs as solution_pairs,
-        solve_gauge as solve_gauge,
-    )
+if TYPE_CHECKING:  # names that are imported at their first use: `_namespaces` has their list
+    from types import ModuleType
+
+    from . import fit as _fit, plot as plot, proof as proof, sweep as _sweep, systems as systems
+    from .discover import *  # noqa: F403
     from .discover.symmetries import library as _library
-    from .dynamics import (
-        FREQUENCY_RESULTS as FREQUENCY_RESULTS,
-        SECTION_RESULTS as SECTION_RESULTS,
-        Actions as Actions,
-        Frequencies as Frequencies,
-        FrequencyDiffusion as FrequencyDiffusion,
-        FrequencyError as FrequencyError,
-        FundamentalFrequencies as FundamentalFrequencies,
-        InvariantDiffusion as InvariantDiffusion,
-        PoincareSection as PoincareSection,
-        Return as Return,
-        ReturnMap as ReturnMap,
-        SectionError as SectionError,
-        actions as actions,
-        bifurcation as bifurcation,
-        frequencies as frequencies,
-        frequency_diffusion as frequency_diffusion,
-        fundamental_frequencies as fundamental_frequencies,
-        invariant_diffusion as invariant_diffusion,
-        poincare_section as poincare_section,
-        stroboscope as stroboscope,
-        tangent_map as tangent_map,
-    )
-    from .fit import (
-        FIT_RESULTS as FIT_RESULTS,
-        Bounds as Bounds,
-        Cauchy as Cauchy,
-        FitError as FitError,
-        FitProgress as FitProgress,
-        FitResult as FitResult,
-        ForceLibrary as ForceLibrary,
-        Identification as Identification,
-        LeastSquares as LeastSquares,
-        Likelihood as Likelihood,
-        Model as Model,
-        MultipleShooting as MultipleShooting,
-        NetworkForce as NetworkForce,
-        Observations as Observations,
-        Posterior as Posterior,
-        Prior as Prior,
-        Samples as Samples,
-        SingleShooting as SingleShooting,
-        SoftL1 as SoftL1,
-        fit as fit,
-        identify as identify,
-        sample as sample,
-    )
-    from .proof import (
-        DriftBound as DriftBound,
-        ExactInvariant as ExactInvariant,
-        NoetherProof as NoetherProof,
-        ProofError as ProofError,
-        bound_drift as bound_drift,
-        exact_coefficients as exact_coefficients,
-        prove_noether as prove_noether,
-    )
-    from .sweep import (
-        Axis as Axis,
-        ClusterError as ClusterError,
-        StoreError as StoreError,
-        StoreMismatch as StoreMismatch,
-        SweepCost as SweepCost,
-        SweepInterrupted as SweepInterrupted,
-        SweepProgress as SweepProgress,
-        SweepResult as SweepResult,
-        open_sweep as open_sweep,
-        starts as starts,
-        sweep as sweep,
-        sweep_cost as sweep_cost,
-    )
-    from .testing import paper as paper
+    from .dynamics import *  # noqa: F403
+    from .dynamics import frequencies as _frequencies
+    from .fit import *  # noqa: F403
+    from .proof import *  # noqa: F403
+    from .sweep import *  # noqa: F403
+    from .systems import rings as rings
+
+    # These use the names of this file, so that it does not import them.
+    interop: ModuleType
+    paper: ModuleType
+    run: ModuleType
+    testing: ModuleType
 
     fitting, sweeps, generators = _fit, _sweep, _library
     SymplecticEuler, StormerVerlet, Leapfrog, RK4 = TypeII, Strang, Strang, RungeKutta4
-    Chord, SaveAt, Event, naff = SimplifiedNewton, Save, Stop, frequencies
+    Chord, SaveAt, Event, naff = SimplifiedNewton, Save, Stop, _frequencies
     LinearTrend, PeakToPeak = Trend, Range
 else:
     from ._namespaces import Folders as _Folders, Package as _Package

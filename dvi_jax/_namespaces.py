@@ -10,23 +10,24 @@ from types import ModuleType
 # Together they import matplotlib, pydantic and other libraries, which most programs do not need.
 NAMESPACES = {
     **{
-        name: name
+        name: f"dvi_jax.{name}"
         for name in (
             *("methods", "lattices", "observe", "discover", "dynamics", "proof"),
-            *("systems", "plot", "interop", "testing", "run"),
+            *("systems", "plot", "interop", "testing"),
         )
     },
-    # The functions `dvi.sweep` and `dvi.fit` have the names of their packages.
-    "fitting": "fit",
-    "sweeps": "sweep",
-    "flows": "problem.flows",
-    "noise": "problem.noise",
-    "paper": "testing.paper",
-    "rings": "systems.rings",
-    "generators": "discover.symmetries.library",
-    "starts": "sweep.starts",
+    # The functions `dvi.sweep` and `dvi.fit` have the names of their folders.
+    "fitting": "dvi_jax.fit",
+    "sweeps": "dvi_jax.sweep",
+    "flows": "dvi_jax.problem.flows",
+    "noise": "dvi_jax.problem.noise",
+    "paper": "dvi_jax.testing.paper",
+    "rings": "dvi_jax.systems.rings",
+    "generators": "dvi_jax.discover.symmetries.library",
+    "starts": "dvi_jax.sweep.starts",
+    "run": "dvi_jax_cli.run",
 }
-"""Attribute of `dvi_jax` → the package that it is."""
+"""Attribute of `dvi_jax` → the module that it is."""
 
 HOMES = {
     "discover": (
@@ -126,7 +127,7 @@ class Package(ModuleType):
 
     def __getattr__(self, name: str):
         if name in NAMESPACES:
-            return importlib.import_module(f"{self.__name__}.{NAMESPACES[name]}")
+            return importlib.import_module(NAMESPACES[name])
         if name in ALIASES:
             found = getattr(self, ALIASES[name])
         elif name in LAZY:
@@ -141,7 +142,7 @@ class Package(ModuleType):
 
     def __setattr__(self, name: str, value: object) -> None:
         # An import of the package `dvi_jax.fit` would hide the function `dvi_jax.fit`.
-        if not (isinstance(value, ModuleType) and name in NAMESPACES.values() and name in LAZY):
+        if not (isinstance(value, ModuleType) and name in LAZY):
             super().__setattr__(name, value)
 
     def __dir__(self) -> list[str]:
@@ -149,7 +150,7 @@ class Package(ModuleType):
 
 
 class Folders(MetaPathFinder, Loader):
-    """Finder of `import dvi_jax.rings`: the folder that `NAMESPACES` names, not a second copy."""
+    """Finder of `import dvi_jax.rings`: the module that `NAMESPACES` names, not a second copy."""
 
     def __init__(self) -> None:
         self._specs: dict[str, ModuleSpec | None] = {}
@@ -157,12 +158,12 @@ class Folders(MetaPathFinder, Loader):
     def find_spec(self, fullname: str, path=None, target=None) -> ModuleSpec | None:
         package, _, name = fullname.partition(".")
         first, _, _ = name.partition(".")
-        moved = package == "dvi_jax" and NAMESPACES.get(first, first) != first
-        return ModuleSpec(fullname, self) if moved and first not in LAZY else None
+        elsewhere = NAMESPACES.get(first, f"dvi_jax.{first}") != f"dvi_jax.{first}"
+        return ModuleSpec(fullname, self) if package == "dvi_jax" and elsewhere else None
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
-        package, first, *rest = spec.name.split(".")
-        module = importlib.import_module(".".join([package, NAMESPACES[first], *rest]))
+        _, first, *inner = spec.name.split(".")
+        module = importlib.import_module(".".join([NAMESPACES[first], *inner]))
         self._specs[module.__name__] = module.__spec__
         return module
 

@@ -1,156 +1,129 @@
-"""Imports run downward only, and the public names are there."""
+"""Imports run downward only, and the public names exist."""
 
 import ast
+import inspect
 import json
 import subprocess
 import sys
+import types
+from collections.abc import Iterator
 from pathlib import Path
 
 import conftest
-import measures
 import pytest
 
 import dvi_jax as dvi
 from dvi_jax import _namespaces
 
 ROOT = Path(dvi.__file__).parent
-FLOORS = [
-    ["base"],
-    ["engine"],
-    ["problem"],
-    ["methods"],
-    ["observe"],
-    ["lattices"],
-    ["integration"],
-    ["discover"],
-    ["sweep", "fit", "proof"],
-    ["dynamics"],
-    ["_namespaces"],
-    ["__init__", "systems", "plot", "symmetry", "invariants"],
-    ["testing"],
-    ["interop"],
-    ["run", "__main__"],
+STAIR = [
+    *(["base"], ["engine"], ["problem"], ["methods"], ["observe"], ["lattices"], ["integration"]),
+    *(["discover"], ["sweep", "fit", "proof"], ["dynamics"]),
+    *(["systems", "plot"], ["_namespaces"], ["__init__"], ["testing"], ["interop"], ["__main__"]),
 ]
-FLOOR = {room: i for i, rooms in enumerate(FLOORS) for room in rooms}
-DOOR_ONLY = {"testing", "interop"}
-"""Leaves: of the package they use the public door and other leaves, no private room."""
+"""Folders and files of `dvi_jax`, each with imports from those before it only."""
 
-
-def room_of(path: Path) -> str:
-    parts = path.relative_to(ROOT).with_suffix("").parts
-    return parts[0]
-
-
-def imported_rooms(path: Path):
-    """(room, name of what is imported) for every import of the package by the file."""
-    package = ("dvi_jax", *path.relative_to(ROOT).with_suffix("").parts[:-1])
-    for node in measures.run_nodes(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom):
-            base = package[: len(package) - node.level + 1] if node.level else ()
-            target = [*base, *(node.module or "").split(".")] if node.module else list(base)
-            if target[:1] != ["dvi_jax"]:
-                continue
-            for alias in node.names:
-                full = [*target, alias.name]
-                yield (full[1] if full[1] in FLOOR else "__init__"), ".".join(full)
-        elif isinstance(node, ast.Import):
-            for alias in node.names:
-                parts = alias.name.split(".")
-                if parts[0] == "dvi_jax":
-                    yield (parts[1] if len(parts) > 1 else "__init__"), alias.name
-
-
+STEP = {folder: i for i, folders in enumerate(STAIR) for folder in folders}
 FILES = sorted(ROOT.rglob("*.py"))
-
-
-def test_every_file_has_a_floor():
-    assert {room_of(f) for f in FILES} <= set(FLOOR)
-    assert len(FILES) > 20
-
-
-@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
-def test_imports_run_downward(path):
-    here = room_of(path)
-    for room, name in imported_rooms(path):
-        if room == here:
-            continue
-        assert FLOOR[room] < FLOOR[here], f"{path.name} (floor {FLOOR[here]}) imports {name}"
-        if here in DOOR_ONLY:
-            assert not room.startswith("_") or room == "__init__", f"{path.name} imports {name}"
-
-
-@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
-def test_first_line_says_what_the_file_is(path):
-    docstring = ast.get_docstring(ast.parse(path.read_text()))
-    assert docstring
-    assert docstring.splitlines()[0].endswith(".")
-
-
+LANEWISE = sorted((ROOT.parent / "lanewise").rglob("*.py"))
 COMMAND_LINE = sorted(
-    p for p in (ROOT.parent / "dvi_jax_cli").rglob("*.py") if "templates" not in p.parts
+    path for path in (ROOT.parent / "dvi_jax_cli").rglob("*.py") if "templates" not in path.parts
 )
 HEAVY = {"dvi_jax", "jax", "numpy", "matplotlib", "equinox", "pydantic"}
 WORK = "work"
 """Folder of the command line with the files that a command imports when it runs."""
 
-
-@pytest.mark.parametrize("path", COMMAND_LINE, ids=lambda p: p.name)
-def test_command_line_imports_the_package_within_its_commands_alone(path):
-    """And of it public modules only. The files in `work` are imported by a command that runs."""
-    tree = ast.parse(path.read_text())
-    assert ast.get_docstring(tree).splitlines()[0].endswith(".")
-    for node in ast.walk(tree):
-        of_work = str(getattr(node, "module", "")).split(".")[0] == WORK
-        if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom) and (of_work or not node.level):
-            names = [node.module]
-        else:
-            continue
-        for name in names:
-            assert not any(part.startswith("_") for part in name.split(".")[1:]), name
-            if name.split(".")[0] in {*HEAVY, WORK} and path.parent.name != WORK:
-                assert node not in tree.body, f"{path.name} imports {name} before it runs"
-
-
-LANEWISE = sorted((ROOT.parent / "lanewise").rglob("*.py"))
 MOVING = ("jax._src", "jax.interpreters", "jax.extend", "jax.core")
 """Names of JAX that change between releases."""
 
 
-def imported_modules(path: Path):
-    """The full name of all that a file imports from other packages."""
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom) and not node.level:
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
+def imported_modules(path: Path) -> Iterator[str]:
+    """The full name of all that a file imports, also for type checkers."""
+    package = (*path.relative_to(ROOT.parent).with_suffix("").parts[:-1],)
+    for node in ast.walk(parsed(path)):
+        if isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else ()
+            start = [*base, *([node.module] if node.module else [])]
+            yield from (".".join([*start, alias.name]) for alias in node.names)
         elif isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
 
 
-@pytest.mark.parametrize("path", LANEWISE, ids=lambda p: p.name)
-def test_lanewise_imports_nothing_of_this_package(path):
-    names = [name.split(".")[0] for name in imported_modules(path)]
-    assert not {"dvi_jax", "dvi_jax_cli"} & set(names)
-    docstring = ast.get_docstring(ast.parse(path.read_text()))
-    assert docstring
-    assert docstring.splitlines()[0].endswith(".")
+def step_of(module: str) -> str:
+    """Folder or file of `dvi_jax` that an imported name is in."""
+    parts = module.split(".")
+    return parts[1] if len(parts) > 1 and parts[1] in STEP else "__init__"
 
 
-def names_that_move(path: Path) -> list[str]:
-    return [
-        name
-        for name in imported_modules(path)
-        if any(f"{name}.".startswith(f"{moving}.") for moving in MOVING)
-    ]
+def upward(path: Path) -> Iterator[str]:
+    """Imports of a file of `dvi_jax` that do not run downward."""
+    here = path.relative_to(ROOT).with_suffix("").parts[0]
+    for module in imported_modules(path):
+        there = step_of(module)
+        if module.split(".")[0] == "dvi_jax" and there != here and STEP[there] >= STEP[here]:
+            yield f"{path.relative_to(ROOT)} imports {module}"
+
+
+def test_imports_run_downward():
+    assert {path.relative_to(ROOT).with_suffix("").parts[0] for path in FILES} == set(STEP)
+    assert [line for path in FILES for line in upward(path)] == []
+
+
+def test_an_import_that_runs_upward_is_seen(monkeypatch):
+    monkeypatch.setitem(STEP, "base", STEP["integration"])
+    assert any("base" in line for path in FILES for line in upward(path))
+
+
+def test_first_line_says_what_a_file_is():
+    docstrings = {
+        path: (ast.get_docstring(parsed(path)) or "").split("\n")[0]
+        for path in (*FILES, *LANEWISE, *COMMAND_LINE)
+    }
+    assert [path for path, line in docstrings.items() if not line.endswith(".")] == []
+
+
+def test_command_line_imports_the_package_within_its_commands_alone():
+    """And of it public modules only. The files in `work` are imported by a command that runs."""
+    early, private = [], []
+    for path in COMMAND_LINE:
+        tree = parsed(path)
+        for node in ast.walk(tree):
+            in_work = str(getattr(node, "module", "")).split(".")[0] == WORK
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom) and (in_work or not node.level):
+                names = [str(node.module)]
+            else:
+                continue
+            for name in names:
+                first, *inner = name.split(".")
+                private += [(path.name, name) for part in inner if part.startswith("_")]
+                at_work = path.parent.name == WORK or path.name == "run.py"
+                if first in {*HEAVY, WORK} and not at_work and node in tree.body:
+                    early.append((path.name, name))
+    assert (early, private) == ([], [])
+
+
+def test_lanewise_imports_nothing_of_this_package():
+    names = {name.split(".")[0] for path in LANEWISE for name in imported_modules(path)}
+    assert not {"dvi_jax", "dvi_jax_cli"} & names
 
 
 def test_names_of_jax_that_move_are_imported_in_one_file():
-    users = [path for path in (*LANEWISE, *FILES) if names_that_move(path)]
-    assert users == [ROOT.parent / "lanewise" / "jaxprs" / "jaxapi.py"]
+    def moves(name: str) -> bool:
+        return any(f"{name}.".startswith(f"{moving}.") for moving in MOVING)
+
+    files = (*LANEWISE, *FILES)
+    users = {path for path in files if any(map(moves, imported_modules(path)))}
+    assert users == {ROOT.parent / "lanewise" / "jaxprs" / "jaxapi.py"}
     attributes = [
         (path.name, ast.unparse(node))
-        for path in (*LANEWISE, *FILES)
-        for node in ast.walk(ast.parse(path.read_text()))
+        for path in files
+        for node in ast.walk(parsed(path))
         if isinstance(node, ast.Attribute) and ast.unparse(node) in MOVING
     ]
     assert attributes == []
@@ -202,9 +175,8 @@ def test_importing_changes_no_rule_of_a_primitive_of_jax():
 
 
 def test_nothing_imports_the_command_line():
-    for path in FILES:
-        if path.relative_to(ROOT).as_posix() not in ("__main__.py", "run.py"):
-            assert "dvi_jax_cli" not in path.read_text(), path
+    users = [path for path in FILES if any("dvi_jax_cli" in m for m in imported_modules(path))]
+    assert users == [ROOT / "__main__.py"]
 
 
 def test_importing_the_package_does_not_import_pydantic():
@@ -216,55 +188,26 @@ def test_importing_the_package_does_not_import_pydantic():
     assert "imported" in out.stderr  # the control: it would be found
 
 
-def test_door_has_no_logic():
-    tree = ast.parse((ROOT / "__init__.py").read_text())
-    nodes = [
-        inner
-        for node in tree.body
-        for inner in (node.body + node.orelse if isinstance(node, ast.If) else [node])
-    ]
-    assert all(isinstance(n, ast.Import | ast.ImportFrom | ast.Expr | ast.Assign) for n in nodes)
-    tests = [ast.unparse(node.test) for node in tree.body if isinstance(node, ast.If)]
-    assert tests == ["TYPE_CHECKING"]
+def test_public_names_exist_and_are_documented():
+    undocumented = [name for name in _namespaces.names() if not getattr(dvi, name).__doc__]
+    assert undocumented == []
+    assert {"System", "integrate", "discover_invariants", "sweep"} <= {*_namespaces.names()}
+    short = [name for name in dir(dvi) if name in {*_namespaces.names(), *_namespaces.ALIASES}]
+    assert sorted(_namespaces.SHORT) == short
+    assert len(short) <= 50
 
 
-PUBLIC = """
-System discretise integrate Save Solution RESULTS IntegrationError Newton
-RootSolver SimplifiedNewton Picard PicardThenNewton
-legendre from_lagrangian from_type_iii velocity_force Implicit
-Layout configure_cpu over_threads over_devices
-TypeII Adjoint Strang Yoshida Suzuki BlanesMoan McLachlan KahanLi Composition
-GaussLegendre LobattoIIIAIIIB RungeKutta4 Split Splitting WisdomHolman
-Rattle project Projection ConstraintForce
-Uniform Given AdaptiveReversible TimeTransformed Variational
-FloatingPoint Compensated DoubleDouble FixedPoint
-Section Stop Crossings LatticeCondition
-Deviations TangentMap LyapunovSpectrum MEGNO GALI SALI Running
-MaxDrift Range Trend Mean Last Reversible Checkpointed Direct
-Generator prolong determining_residual conformal_factor noether_identity AdiabaticInvariant
-generators random_pairs solution_pairs find_symmetries Symmetries Symmetry
-Polynomials Basis Chebyshev Radial Trigonometric
-discover_invariants InvariantSeries ShadowHamiltonian drift_order drift_surface
-noether_balance solve_gauge
-bound_drift DriftBound ProofError ExactInvariant exact_coefficients prove_noether NoetherProof
-sweep Axis starts open_sweep SweepResult SweepProgress SweepInterrupted StoreError StoreMismatch
-ClusterError sweep_cost SweepCost
-fit Model Observations Bounds Prior LeastSquares SoftL1 Cauchy Likelihood
-SingleShooting MultipleShooting FitResult FitProgress FIT_RESULTS FitError
-Posterior Samples sample
-tangent_map poincare_section PoincareSection SECTION_RESULTS SectionError ReturnMap Return
-bifurcation stroboscope frequencies Frequencies FREQUENCY_RESULTS FrequencyError
-fundamental_frequencies FundamentalFrequencies frequency_diffusion FrequencyDiffusion
-actions Actions
-Langevin NoiseHamiltonians Brownian BrownianPath
-BAOAB OBABO StochasticEuler StochasticMidpoint invariant_diffusion InvariantDiffusion
-ForceLibrary identify Identification NetworkForce
-"""
-
-
-@pytest.mark.parametrize("name", PUBLIC.split())
-def test_public_name_is_documented(name):
-    assert getattr(dvi, name).__doc__
+def test_type_checkers_and_programs_see_the_same_names():
+    """Type checkers read `from .discover import *`, programs the list of `_namespaces`."""
+    for folder, names in _namespaces.HOMES.items():
+        package = getattr(dvi, {"fit": "fitting", "sweep": "sweeps"}.get(folder, folder))
+        public = {
+            name
+            for name, thing in vars(package).items()
+            if not name.startswith("_") and not isinstance(thing, types.ModuleType)
+        }
+        assert set(names) <= public
+        assert all(inspect.isclass(getattr(package, name)) for name in public - set(names))
 
 
 def test_packages_are_attributes_in_a_fresh_process():
@@ -275,7 +218,11 @@ from dvi_jax import _namespaces
 assert not any(f"dvi_jax.{n}" in sys.modules for n in ("plot", "systems", "interop", "testing"))
 for name, package in _namespaces.NAMESPACES.items():
     assert name in dir(dvi), name
-    assert getattr(dvi, name) is sys.modules[f"dvi_jax.{package}"], name
+    assert getattr(dvi, name) is sys.modules[package], name
+import dvi_jax.rings, dvi_jax.run
+from dvi_jax.noise import Langevin
+assert dvi_jax.rings is dvi.systems.rings and Langevin is dvi.Langevin
+assert dvi_jax.rings.__spec__.name == dvi_jax.rings.__name__ == "dvi_jax.systems.rings"
 from dvi_jax.fit import Model  # the package has the name of the function
 assert dvi.fitting.Prior is dvi.Prior and callable(dvi.fit) and callable(dvi.sweep)
 try:
@@ -286,27 +233,6 @@ else:
     raise AssertionError
 """
     subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def test_type_checkers_and_programs_see_the_same_names():
-    """`__init__.py` lists for type checkers what `_namespaces` imports at the first use."""
-    tree = ast.parse((ROOT / "__init__.py").read_text())
-    block = next(node for node in tree.body if isinstance(node, ast.If))
-    listed = {
-        node.module: {alias.asname for alias in node.names}
-        for node in block.body
-        if isinstance(node, ast.ImportFrom) and node.module
-    }
-    namespaces = {"_library", "starts", "paper"}
-    objects = {home: names - namespaces for home, names in listed.items()}
-    assert {home: names for home, names in objects.items() if names} == {
-        home: set(names) for home, names in _namespaces.HOMES.items()
-    }
-    for name in _namespaces.names():
-        assert getattr(dvi, name) is not None
-    short = [name for name in dir(dvi) if name in {*_namespaces.names(), *_namespaces.ALIASES}]
-    assert sorted(_namespaces.SHORT) == short
-    assert len(short) <= 50
 
 
 def test_an_invalid_part_is_refused():

@@ -43,7 +43,7 @@ PAGES = {
 }
 """Page → title."""
 
-HOMES = {
+FOLDERS = {
     "dvi_jax": "integration",
     "dvi_jax.methods": "methods",
     "dvi_jax.methods.step": "integration",
@@ -106,8 +106,8 @@ def public(module: types.ModuleType) -> dict[str, Any]:
 
 def _room(thing: Any) -> str:
     """The page of a public name of `dvi_jax`, by the file where it is written."""
-    homes = [home for home in HOMES if f"{thing.__module__}.".startswith(f"{home}.")]
-    return HOMES[max(homes, key=len)]
+    folders = [name for name in FOLDERS if f"{thing.__module__}.".startswith(f"{name}.")]
+    return FOLDERS[max(folders, key=len)]
 
 
 def entries() -> dict[str, dict[str, tuple[str, Any]]]:
