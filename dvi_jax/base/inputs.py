@@ -53,7 +53,7 @@ def _joined(value: Any) -> Any:
 
 
 def _real_array(name: str, value: Any) -> Array:
-    value = _joined(value)
+    value = original = _joined(value)
     if isinstance(value, jax.Array) and is_traced(value):
         kind = value.dtype
     else:
@@ -78,8 +78,13 @@ def _real_array(name: str, value: Any) -> Array:
             f"{name} has a value that is not finite{at}: {value[where]}. "
             "Every component of the initial conditions must be a finite number."
         )
-    array = jnp.asarray(value)
+    array = original if _is_strong(original, kind) else jnp.asarray(value)
     return array.astype(jnp.result_type(float)) if kind.kind in "iu" else array
+
+
+def _is_strong(value: Any, dtype: Any) -> bool:
+    """Whether a value is an array of JAX of this type, which needs no copy."""
+    return isinstance(value, jax.Array) and value.dtype == dtype and not value.weak_type
 
 
 def _is_real(dtype: Any) -> bool:
@@ -114,7 +119,9 @@ def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> A
             "or a negative h (backward)."
         )
     # Cast in NumPy: each operation of JAX on a known number would cost some ten microseconds.
-    return jnp.asarray(value, dtype) if known is None else jnp.asarray(known.astype(dtype))
+    if known is None:
+        return jnp.asarray(value, dtype)
+    return value if _is_strong(value, dtype) else jnp.asarray(known.astype(dtype))
 
 
 def _as_numpy(name: str, value: Any) -> np.ndarray:

@@ -29,7 +29,12 @@ class Arithmetic(eqx.Module):
     """Whether a step of the method begins and ends with the state itself."""
 
     def prepare(
-        self, method: Method, equations: Equations, interval: Interval, q0: State, p0: State
+        self,
+        method: Method,
+        equations: Equations,
+        first_interval: Callable[[], Interval],
+        q0: State,
+        p0: State,
     ) -> tuple[Equations, State, State]:
         """The equations and the start in this representation, once per run. **Raises**
         `ValueError` for a method or equations that it does not support."""
@@ -128,7 +133,7 @@ class DoubleDouble(Arithmetic):
     15.
     """
 
-    def prepare(self, method, equations, interval, q0, p0):
+    def prepare(self, method, equations, first_interval, q0, p0):
         if q0.dtype != jnp.float64:
             raise ValueError(
                 f"arithmetic=dvi.DoubleDouble() requires q0 and p0 in float64, got {q0.dtype}: "
@@ -214,13 +219,14 @@ class FixedPoint(Arithmetic):
                 f"2.0**{exponent - 1} and 2.0**{exponent}: use one of these."
             )
 
-    def prepare(self, method, equations, interval, q0, p0):
+    def prepare(self, method, equations, first_interval, q0, p0):
         if not method.is_made_of_the_map():
             raise ValueError(
                 "arithmetic=dvi.FixedPoint(...) requires a method composed of dvi.TypeII() and its "
                 f"adjoint, got {method!r}. Use dvi.Strang(), dvi.Yoshida(4) or another "
                 "composition, or arithmetic=dvi.Compensated(), which works with every method."
             )
+        interval = first_interval()
         if not (
             method.needs_no_solve(equations, interval, q0)
             and method.inverse_needs_no_solve(equations, interval, q0)

@@ -1,6 +1,7 @@
 """`integrate`, the function that computes one trajectory."""
 
 import dataclasses
+import functools
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -155,7 +156,8 @@ def integrate(
     options |= {"root_finder": root_finder, "arithmetic": arithmetic, "layout": layout}
     integrator = chosen(integrator, **options)
     # Here and not in `Integrator`: the default method depends on the system.
-    method, lattice, layout = integrator.method_for(system), integrator.lattice, integrator.layout
+    method = Integrator.method_for(integrator, system)
+    lattice, layout = integrator.lattice, integrator.layout
     instance("save", save, Save, "a dvi.Save(...)", _save_hint(save))
     instance("stop", stop, Stop | None, "a dvi.Stop(g)")
     q0, p0 = start_state(q0, p0)
@@ -188,12 +190,13 @@ def integrate(
     check_memory(save, plan, q0, check_observe(task, q0, p0), leaves, layout)
     traced = any(is_traced(x) for x in leaves)
     # The warning needs the damping as a number, which is not known of traced values.
+    first_interval = functools.partial(Task.first_interval, task)
     if not traced:
-        type(method).check(method, task.equations, task.first_interval(), q0, p0)
+        type(method).check(method, task.equations, first_interval, q0, p0)
     if not traced and asked.system.constraint is not None:
         check_start(task.equations, task.t0, q0, p0)
     if not traced and asked.system.force is not None:
-        warn_of_dissipation(method, task.equations, task.first_interval, q0, p0)
+        warn_of_dissipation(method, task.equations, first_interval, q0, p0)
     if save.ts is not None:
         # The run itself saves nothing at these times: it stores the steps that contain them, and
         # `_as_solution` evaluates the method between their ends.
@@ -262,8 +265,12 @@ def _task(run: Run, integrator: Integrator, method: Method, h: Array) -> tuple[T
         )
     lattice, arithmetic = integrator.lattice, integrator.arithmetic
     equations = Equations(system, epsilon, run.args, integrator.root_finder)
-    first = Interval(run.t0, run.t0 + h, h)  # for checks of the first step
-    equations, q0, p0 = arithmetic.prepare(method, equations, first, run.q0, run.p0)
+
+    def first_interval() -> Interval:
+        return Interval(run.t0, run.t0 + h, h)
+
+    kind = type(arithmetic)
+    equations, q0, p0 = kind.prepare(arithmetic, method, equations, first_interval, run.q0, run.p0)
     # A part of the key of compiled programs: with another value one is compiled again.
     seen = reads(run.observe, run.stop, lattice)
     task = Task(equations, method, lattice, run.observe, run.t0, h, arithmetic, run.stop, seen)

@@ -109,8 +109,8 @@ _FIELDS = {
     "layout": (Layout, 'dvi.Layout() or dvi.Layout(form="arrays")'),
 }
 
-# Made once: a new one in every call would take some microseconds for its checks.
-_DEFAULT = Integrator()
+# Made once: a new one in every call would take some ten microseconds.
+_DEFAULT, _STRANG, _TYPE_II = Integrator(), Strang(), TypeII()
 
 
 def default_method(system: System) -> Method:
@@ -124,7 +124,7 @@ def default_method(system: System) -> Method:
     own = getattr(system.H_D, "own_method", None)
     if isinstance(own, Method):
         return own
-    return Strang() if is_first_order(system.H_D) else TypeII()
+    return _STRANG if is_first_order(system.H_D) else _TYPE_II
 
 
 def chosen(integrator: Integrator | None, **given: Any) -> Integrator:

@@ -43,8 +43,8 @@ class Adjoint(Method):
     def substeps(self) -> tuple[float, ...]:
         return self.method.substeps()
 
-    def check(self, equations, interval, q, p):
-        self.method.check(equations, interval, q, p)
+    def check(self, equations, first_interval, q, p):
+        self.method.check(equations, first_interval, q, p)
 
     def is_double_only(self, equations) -> bool:
         return self.method.is_double_only(equations)

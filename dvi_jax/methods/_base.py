@@ -60,8 +60,14 @@ class Method(eqx.Module):
         """The same steps with less work, where they have some in common (None: nowhere)."""
         return None
 
-    def check(self, equations: Equations, interval: Interval, q: State, p: State) -> None:
-        """**Raises** for a system or a state that this method cannot advance; before a run."""
+    def check(
+        self, equations: Equations, first_interval: Callable[[], Interval], q: State, p: State
+    ) -> None:
+        """**Raises** for a system or a state that this method cannot advance; before a run.
+
+        `first_interval()` is the interval of the first step: most methods do not need it, and its
+        evaluation takes a third of a short run.
+        """
 
     def is_double_only(self, equations: Equations) -> bool:
         """Whether a step has the accuracy of float64 also where its operations have more digits."""

@@ -61,8 +61,8 @@ class CompositionMethod(Method):
     def is_made_of_the_map(self) -> bool:
         return self.base.is_made_of_the_map()
 
-    def check(self, equations, interval, q, p):
-        self.base.check(equations, interval, q, p)
+    def check(self, equations, first_interval, q, p):
+        self.base.check(equations, first_interval, q, p)
 
     def is_double_only(self, equations) -> bool:
         return self.base.is_double_only(equations)

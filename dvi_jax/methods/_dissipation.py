@@ -32,7 +32,7 @@ def warn_of_dissipation(
 
     All values must be known, not traced, and the system must have a force.
     """
-    backwards = -min(method.substeps())
+    backwards = -min(type(method).substeps(method))
     if backwards <= 0:  # without a substep backwards not even the Jacobian is evaluated
         return
     interval = first_interval()  # made only here: most methods do not need it

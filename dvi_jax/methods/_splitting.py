@@ -215,8 +215,9 @@ class Splitting(SplittingMethod):
     def __check_init__(self):
         check_scheme(self.scheme)
 
-    def check(self, equations, interval, q, p):
+    def check(self, equations, first_interval, q, p):
         """**Raises** `ValueError` if a flow of the user is not that of its Hamiltonian there."""
+        interval = first_interval()
         t, zero = interval.t0, jnp.zeros_like(interval.h)
         for i, H_i in enumerate(getattr(equations.system.H_D, "parts", ())):
             if isinstance(H_i, Known):

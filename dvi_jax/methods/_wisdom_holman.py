@@ -147,7 +147,8 @@ class WisdomHolman(SplittingMethod):
     def is_double_only(self, equations) -> bool:
         return True
 
-    def check(self, equations, interval, q, p):
+    def check(self, equations, first_interval, q, p):
+        interval = first_interval()
         masses = np.asarray(self._frame(equations, interval, q).masses)
         v = np.asarray(equations.position_rate(interval, q, p))
         rtol = 1e5 * float(jnp.finfo(q.dtype).eps)

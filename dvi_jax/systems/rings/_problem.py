@@ -77,11 +77,12 @@ class Turn(Method):
 
     inverse_needs_no_solve = needs_no_solve
 
-    def check(self, equations, interval, q, p) -> None:
+    def check(self, equations, first_interval, q, p) -> None:
         hint = "Use the system and the args of rings.problem(ring)."
         instance("args of a run with rings.Turn()", equations.args, Packed, "those of a ring", hint)
-        if float(interval.h) != 1:
-            raise ValueError(f"h must be 1, one turn, for a ring; got h = {float(interval.h)}.")
+        h = float(first_interval().h)
+        if h != 1:
+            raise ValueError(f"h must be 1, one turn, for a ring; got h = {h}.")
 
 
 def _state(z: Particle, like: Array) -> tuple[Array, Array, Any]:
