@@ -1,6 +1,6 @@
 """The arguments of `integrate` as arrays of one precision."""
 
-from typing import Any
+from typing import Any, TypeGuard
 
 import jax
 import jax.numpy as jnp
@@ -82,7 +82,7 @@ def _real_array(name: str, value: Any) -> Array:
     return array.astype(jnp.result_type(float)) if kind.kind in "iu" else array
 
 
-def _is_strong(value: Any, dtype: Any) -> bool:
+def _is_strong(value: Any, dtype: Any) -> TypeGuard[Array]:
     """Whether a value is an array of JAX of this type, which needs no copy."""
     return isinstance(value, jax.Array) and value.dtype == dtype and not value.weak_type
 

@@ -229,8 +229,8 @@ def _step_of(
         )
     plain = System(system.H_D, system.force, system.perturbation)
     start, number = jnp.full(shape, 0.1), jnp.asarray(0.1)
-    at = Interval(0 * number, number, number)
-    how.arithmetic.prepare(method, Equations(plain, number, args), lambda: at, start, start)
+    interval = Interval(0 * number, number, number)
+    how.arithmetic.prepare(method, Equations(plain, number, args), lambda: interval, start, start)
     quantum = getattr(how.arithmetic, "quantum", 0.0)
 
     def stepped(q, p, t, epsilon, h, error=0.0):
