@@ -31,21 +31,6 @@ class Builder(Arithmetic):
         bits = self.new(f"bitcast {t} {total} to i{self.W}")
         return self.new(f"icmp ne i{self.W} {bits}, 0")
 
-    # Numbers that wait in memory while a loop runs. Without "volatile" the optimiser would keep
-    # them in registers, which the loop needs.
-
-    def set_aside(self, x: Num, to: Sequence[str], vec: bool) -> list[str]:
-        """The lines that write a number of a carry to one pointer for each vector."""
-        t = self.type(x.dtype, vec)
-        return [
-            f"  store volatile {t} {name}, ptr {at}" for name, at in zip(x.names, to, strict=True)
-        ]
-
-    def taken_back(self, x: Num, at: Sequence[str], vec: bool) -> Num:
-        """The number that was set aside there."""
-        t = self.type(x.dtype, vec)
-        return self.made([self.new(f"load volatile {t}, ptr {p}") for p in at], x.dtype, vec)
-
     def loop(
         self,
         carry: Sequence[Num],
