@@ -77,13 +77,11 @@ class Module:
     # Numbers that wait in memory while a loop runs. Without "volatile" the optimiser would keep
     # them in registers, which the loop needs.
 
-    def set_aside(self, x: Num, pointers: Sequence[str], vec: bool) -> list[str]:
-        """The lines that write a number of a carry to one pointer for each vector."""
+    def set_aside(self, x: Num, pointers: Sequence[str], vec: bool) -> None:
+        """Write a number of a carry to one pointer for each vector."""
         t = self.b.type(x.dtype, vec)
-        return [
-            f"  store volatile {t} {name}, ptr {pointer}"
-            for name, pointer in zip(x.names, pointers, strict=True)
-        ]
+        for name, pointer in zip(x.names, pointers, strict=True):
+            self.b.emit(f"store volatile {t} {name}, ptr {pointer}")
 
     def taken_back(self, x: Num, pointers: Sequence[str], vec: bool) -> Num:
         """The number that was set aside there."""

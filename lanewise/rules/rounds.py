@@ -171,7 +171,7 @@ class Rounds:
         def portion(start: Num, stop: Num, state: Sequence[Num]) -> list[Num]:
             until, wait, *numbers = state
             tried = b.compare("ge", start, until)
-            before_all = len(b.lines)
+            copies = b.reserved()
             dtypes = [x.dtype for x in numbers]
             failed, *found = b.branch(
                 b.ref(tried, 0, False),
@@ -183,9 +183,10 @@ class Rounds:
             # Which numbers change is known only after the round is written. They are stored in
             # memory before it, so that the rounds have all registers.
             kept = list(zip(changed, numbers, aside, vec, strict=True))
-            b.lines[before_all:before_all] = [
-                line for c, x, to, v in kept if c for line in e.module.set_aside(x, to, v)
-            ]
+            with b.writing(copies):
+                for is_changed, x, pointers, v in kept:
+                    if is_changed:
+                        e.module.set_aside(x, pointers, v)
 
             def again() -> list[Num]:
                 old = [e.module.taken_back(x, at, v) if c else x for c, x, at, v in kept]
