@@ -1,34 +1,31 @@
 """A jaxpr evaluated number by number into LLVM IR, for a block of trajectories."""
 
 import contextlib
-import functools
-import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import jax
 import numpy as np
 
-from .assumed import Assumed, taken_for
-from .jaxprs.jaxapi import ClosedJaxpr, Jaxpr, Literal, bodies
-from .llvm.builder import Builder
+from .assumed import Assumed
+from .jaxprs.jaxapi import ClosedJaxpr, Jaxpr, Literal
 from .llvm.ir import TYPES, Num, Unsupported
 from .llvm.memory import Buffer, load, load_row, store, store_row
 from .llvm.values import MADE, SMALL, Entries, Value, objects
-from .rules import elimination, indexing, loops, reductions
-from .rules.elementwise import ELEMENTWISE
-from .rules.moves import CALLS, CUMULATIVE, MOVES, REDUCTIONS, VIEWS, moved
-from .rules.written import WRITTEN
+from .module import Module
 
-if TYPE_CHECKING:
-    from .kernel import Module
+RULES: dict[str, Callable] = {}
+"""Name of a primitive → rule(evaluator, equation, values of its operands, places of its results) →
+values of its results. The files of `rules` fill this table."""
+
+SINE_AND_COSINE = "sine and cosine"
+"""The name of the rule for sin x or cos x if both are needed. No primitive has this name."""
 
 
 class Evaluator:
-    """One evaluation: numbers go through `b`, memory comes from `kernel`."""
+    """One evaluation: numbers go through `b`, memory comes from `module`. It knows no rule."""
 
-    def __init__(self, b: Builder, kernel: "Module"):
-        self.b, self.kernel = b, kernel
+    def __init__(self, module: Module):
+        self.b, self.module = module.b, module
         self.assumed: Assumed | None = None
 
     # --- jaxprs ------------------------------------------------------------------------------
@@ -42,7 +39,7 @@ class Evaluator:
         if dtype not in TYPES:
             raise Unsupported(f"numbers of type {dtype} are not compiled")
         if array.size > SMALL:
-            return Value(array.shape, dtype, buffer=self.kernel.constant(array))
+            return Value(array.shape, dtype, buffer=self.module.constant(array))
         entries = [self.b.known(x, dtype) for x in array.reshape(-1)]
         return Value(array.shape, dtype, objects(entries, array.shape))
 
@@ -70,7 +67,7 @@ class Evaluator:
         for eqn in jaxpr.eqns:
             inputs = [read(v) for v in eqn.invars]
             if id(eqn) in both:
-                known[eqn.outvars[0]] = self.sine_or_cosine(eqn, inputs[0])
+                (known[eqn.outvars[0]],) = RULES[SINE_AND_COSINE](self, eqn, inputs, [None])
                 continue
             outputs = self.equation(eqn, inputs, [places.get(v) for v in eqn.outvars])
             # A number that is linear in unit vectors is a derivative: its zeros stay zeros, also
@@ -82,62 +79,12 @@ class Evaluator:
             raise Unsupported(f"the function has more than {self.b.most} operations")
         return [read(v) for v in jaxpr.outvars]
 
-    def sine_or_cosine(self, eqn: Any, value: Value) -> Value:
-        """sin x or cos x of an x of which both are needed."""
-        which = 0 if eqn.primitive.name == "sin" else 1
-        (out,) = eqn.outvars
-        if not value.is_small or value.dtype != "float64":
-            return self._elementwise(eqn, [value], ELEMENTWISE[eqn.primitive.name])
-        found = [self.kernel.sincos(x)[which] for x in self.entries(value).flat]
-        return self.value(found, out.aval)
-
     def equation(self, eqn: Any, values: list[Value], places: list) -> list[Value]:
-        name = eqn.primitive.name
-        special = _SPECIAL.get(name)
-        if special is not None:
-            return special(self, eqn, values, places)
-        if name in CALLS:
-            (body,) = bodies(eqn)
-            return self.closed(body, values, places)
-        if name == "lanewise":
-            return self.by_itself(eqn, values)
-        for v in eqn.outvars:
-            if str(v.aval.dtype) not in TYPES:
-                types = "float64, float32, bool or integers of 8 to 64 bits"
-                raise Unsupported(f"{name} must return {types}, got {v.aval.dtype}")
-        if name == "reshape" or name in VIEWS:
-            seen = self._viewed(eqn, values)
-            if seen is not None:
-                return seen
-        if name == "concatenate" and any(v.entries is None for v in values):
-            return [self._joined(eqn, values, places[0])]
-        if name in MOVES:
-            entries = moved(name, eqn.params, *(self.entries(v) for v in values))
-            return [
-                Value(v.aval.shape, v.aval.dtype, np.asarray(x, object))
-                for v, x in zip(eqn.outvars, entries, strict=True)
-            ]
-        rule = ELEMENTWISE.get(name)
-        if rule is not None:
-            return [self._elementwise(eqn, values, rule)]
-        # Last, because tracing takes longer than the tables above.
-        written = WRITTEN.get(name)
-        if written is not None:
-            body = jax.make_jaxpr(functools.partial(written, **eqn.params))
-            return self.closed(body(*(v.aval for v in eqn.invars)), values)
-        raise Unsupported(f"no rule compiles the primitive {name}")
-
-    def by_itself(self, eqn: Any, values: list[Value]) -> list[Value]:
-        """A call within a call: no product in it is contracted with a sum outside, nor the other
-        way round, so that its numbers have the same bits wherever it is called."""
-        program = eqn.params["program"]
-        if eqn.params["lanes"] is not None:
-            raise Unsupported(
-                "the function contains a batch of another lanewise function, made by "
-                "lanewise.batched or jax.vmap: make a batch of the outer function only"
-            )
-        outs = self.closed(program.traced.all_inputs, [self.closed_off(v) for v in values])
-        return [self.closed_off(v) for v in outs]
+        """The results of one equation, by the rule of its primitive."""
+        rule = RULES.get(eqn.primitive.name)
+        if rule is None:
+            raise Unsupported(f"no rule compiles the primitive {eqn.primitive.name}")
+        return rule(self, eqn, values, places)
 
     def unrelated(self, value: Value) -> Value:
         """The same numbers, treated as results of a loop or a branch."""
@@ -174,8 +121,8 @@ class Evaluator:
         # Known numbers go into the module once, and no instruction writes them.
         known = value.known()
         if known is not None:
-            return self.kernel.constant(known)
-        place = self.kernel.scratch(value.shape, value.dtype, value.has_lanes())
+            return self.module.constant(known)
+        place = self.module.scratch(value.shape, value.dtype, value.has_lanes())
         self.write(value, place)
         return place
 
@@ -184,7 +131,7 @@ class Evaluator:
         seen = self.in_memory(value).reshaped(shape)
         if seen is not None:
             return seen
-        place = self.kernel.scratch(value.shape, value.dtype, value.has_lanes())
+        place = self.module.scratch(value.shape, value.dtype, value.has_lanes())
         self.write(value, place)
         copied = place.reshaped(shape)
         assert copied is not None
@@ -213,7 +160,7 @@ class Evaluator:
 
     def count(self, length: int, body: Callable[[Num], None]) -> None:
         """``body(i)`` for i = 0, …, length − 1."""
-        b, end = self.b, self.kernel.parameter(length)
+        b, end = self.b, self.module.parameter(length)
 
         def test(_, i):
             return b.new(f"icmp slt i64 {i}, {end.names[0]}")
@@ -240,72 +187,7 @@ class Evaluator:
         out.is_tangent = True
         return out
 
-    def _viewed(self, eqn: Any, values: list[Value]) -> list[Value] | None:
-        """The outputs as other views of an array in memory, if it is there."""
-        (value, *_) = values
-        if value.entries is not None or value.size <= SMALL:
-            return None
-        assert value.buffer is not None
-        name, params = eqn.primitive.name, eqn.params
-        if name == "reshape" and params["dimensions"] is None:
-            buffers = [self.reshaped(value, params["new_sizes"])]
-        else:
-            buffers = [
-                value.buffer.seen(lambda x, i=i: moved(name, params, x)[i])
-                for i in range(len(eqn.outvars))
-            ]
-        found = [Value.in_memory(x) for x in buffers if x is not None]
-        if len(found) < len(buffers):
-            rule = f"{name} with a copy is compiled for at most {SMALL} elements"
-            raise Unsupported(f"{rule}, got an array of shape {value.shape}")
-        return found
-
-    def _joined(self, eqn: Any, values: list[Value], place: Buffer | None) -> Value:
-        """Arrays one after the other, in memory."""
-        (out,) = eqn.outvars
-        axis = eqn.params["dimension"]
-        if place is None:
-            on = any(v.has_lanes() for v in values)
-            place = self.kernel.scratch(out.aval.shape, str(out.aval.dtype), on)
-        for value, part in zip(values, _parts(place, axis, [v.shape for v in values]), strict=True):
-            self.write(value, part)
-        return Value.in_memory(place)
-
     # --- arithmetic ------------------------------------------------------------------------------
-
-    def _elementwise(self, eqn: Any, values: list[Value], rule: Callable) -> Value:
-        (out,) = eqn.outvars
-        shape, params = out.aval.shape, eqn.params
-        # Long arrays in a loop over their elements: otherwise the code would be as long as the
-        # array.
-        if not all(v.is_small for v in values) or math.prod(shape) > MADE:
-            return self._in_a_loop(eqn, values, rule)
-        operands = [np.broadcast_to(self.entries(v), shape) for v in values]
-        results = [rule(self, params, *(x[i] for x in operands)) for i in np.ndindex(*shape)]
-        return self.value(results, out.aval)
-
-    def _in_a_loop(self, eqn: Any, values: list[Value], rule: Callable) -> Value:
-        """An elementwise primitive on arrays that stay in memory."""
-        (out,) = eqn.outvars
-        shape = out.aval.shape
-        on = any(v.has_lanes() for v in values)
-        place = self.kernel.scratch(shape, str(out.aval.dtype), on)
-        sources = [v if v.shape == () else self.in_memory(v) for v in values]
-
-        def one(places: list, target: Buffer) -> None:
-            if not target.shape:
-                numbers = [
-                    self.entries(x)[()] if isinstance(x, Value) else load(self.b, x) for x in places
-                ]
-                store(self.b, target, rule(self, eqn.params, *numbers))
-                return
-            rows = functools.partial(_row_of, self.b)
-            self.count(
-                target.shape[0], lambda i: one([rows(x, i) for x in places], target.row(self.b, i))
-            )
-
-        one(sources, place)
-        return Value.in_memory(place)
 
     def combine(self, op: str, a: Num, b: Num) -> Num:
         """An operation of two, by name."""
@@ -329,46 +211,8 @@ class Evaluator:
         finally:
             self.assumed = before
 
-    def agreed(self, eqn: Any, values: list[Value], places: list) -> list[Value]:
-        """The least of an integer over the trajectories of a block."""
-        b, x = self.b, self.entries(values[0])[()]
-        # Not reduced over the block: the assumption is checked after some rounds.
-        if self.assumed is not None and eqn.params["rare"]:
-            return [self.value([self.assumed.least(x)], eqn.outvars[0].aval)]
-        if not x.vec:
-            return values
-        # The block runs a branch that some trajectory nearly always needs. Results do not depend on
-        # it, because each trajectory selects its own.
-        if not eqn.params["rare"]:  # one of several trajectories nearly always needs it
-            return [self.value([taken_for(b, 0, x.dtype)], eqn.outvars[0].aval)]
-        t, full = b.type(x.dtype, True), b.suffix(x.dtype, True)
-        total = x.names[0]
-        for other in x.names[1:]:
-            less = b.new(f"icmp slt {t} {total}, {other}")
-            bits = b.type("bool", True)
-            total = b.new(f"select {bits} {less}, {t} {total}, {t} {other}")
-        if b.W > 1:
-            b.declare(f"{TYPES[x.dtype]} @llvm.vector.reduce.smin.{full}({t})")
-            total = b.new(f"call {TYPES[x.dtype]} @llvm.vector.reduce.smin.{full}({t} {total})")
-        return [self.value([b.made([total], x.dtype, False)], eqn.outvars[0].aval)]
 
-    def rounded(self, eqn: Any, values: list[Value], places: list) -> list[Value]:
-        """The values as they are, in no operation that is contracted with those after them."""
-        return [self.closed_off(v) for v in values]
-
-    def same(self, eqn: Any, values: list[Value], places: list) -> list[Value]:
-        return values
-
-
-def _row_of(b: Builder, x: Any, index: Num) -> Any:
-    if isinstance(x, Value):  # one number for all elements
-        return x
-    if x.shape[0] == 1:
-        index = b.known(0, "int64")
-    return x.row(b, index)
-
-
-def _parts(place: Buffer, axis: int, shapes: Sequence[tuple[int, ...]]) -> list[Buffer]:
+def parts_along(place: Buffer, axis: int, shapes: Sequence[tuple[int, ...]]) -> list[Buffer]:
     """The parts of a place along one axis."""
     parts, start = [], 0
     for shape in shapes:
@@ -397,8 +241,9 @@ def _places(jaxpr: Jaxpr, wanted: Sequence[Buffer | None]) -> dict[Any, Buffer]:
         name = eqn.primitive.name
         if name == "concatenate":
             shapes = [v.aval.shape for v in eqn.invars]  # pyright: ignore[reportAttributeAccessIssue]
-            parts = _parts(place, eqn.params["dimension"], shapes)
-            for v, part in zip(eqn.invars, parts, strict=True):
+            for v, part in zip(
+                eqn.invars, parts_along(place, eqn.params["dimension"], shapes), strict=True
+            ):
                 if not isinstance(v, Literal):
                     places.setdefault(v, part)
         elif name in ("reshape", "squeeze", "expand_dims"):
@@ -425,25 +270,15 @@ def _sines_and_cosines(jaxpr: Jaxpr) -> set[int]:
 # Linear solves: the result of one is a change of the state and not a derivative any more.
 _ENDS = frozenset(["custom_linear_solve", "eliminate"])
 
-_SPECIAL: dict[str, Callable] = {
-    "scan": loops.scan,
-    "while": loops.while_loop,
-    "cond": loops.cond,
-    "custom_linear_solve": elimination.linear_solve,
-    "unit_vectors": elimination.unit_vectors,
-    "least_over_lanes": Evaluator.agreed,
-    "eliminate": elimination.eliminate,
-    "dot_general": reductions.dot,
-    **dict.fromkeys(REDUCTIONS, reductions.reduced),
-    **dict.fromkeys(CUMULATIVE, reductions.accumulated),
-    "iota": indexing.iota,
-    **dict.fromkeys(["empty", "empty2"], indexing.empty),
-    "optimization_barrier": Evaluator.rounded,
-    **dict.fromkeys(["reshard", "sharding_constraint", "mesh_cast"], Evaluator.same),
-    "argmax": indexing.argument_of,
-    "argmin": indexing.argument_of,
-    "dynamic_slice": indexing.dynamic_slice,
-    "dynamic_update_slice": indexing.dynamic_update_slice,
-    "gather": indexing.gather,
-    **dict.fromkeys(indexing.SCATTERS, indexing.scatter),
-}
+
+def typed(rule: Callable) -> Callable:
+    """A rule for results of the types that are compiled."""
+
+    def checked(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+        for v in eqn.outvars:
+            if str(v.aval.dtype) not in TYPES:
+                types = "float64, float32, bool or integers of 8 to 64 bits"
+                raise Unsupported(f"{eqn.primitive.name} must return {types}, got {v.aval.dtype}")
+        return rule(e, eqn, values, places)
+
+    return checked

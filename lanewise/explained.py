@@ -13,7 +13,8 @@ from .jaxprs.jaxapi import jaxprs_in_params
 from .jaxprs.traced import Traced
 from .llvm.ir import Unsupported
 from .native import handler, machine
-from .primitive import AUTO, Layout, Program, kernel_of, pieces_of
+from .primitive import AUTO, Layout, Program, pieces_of
+from .targets import compiled
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,18 +114,19 @@ def _parts(program: Any, batch: int) -> list[Part]:
     """How a program is compiled; its pieces if it is not compiled as a whole."""
     count = len(program.traced.all_inputs.jaxpr.invars)
     try:
-        module, text = kernel_of(program, [True] * count, batch)
+        result = compiled(program, [True] * count, batch, "cpu")
     except Unsupported as reason:
         parts = []
-        for piece in pieces_of(program, batch):
+        for piece in pieces_of(program, batch, "cpu"):
             if piece.is_left_to_xla:
                 parts.append(Part(piece.reason))
             else:
                 parts += _parts(Program(Traced(piece.closed), program.layout), batch)
         return parts or [Part(str(reason))]
-    ir = handler.module_text(text, module.W * module.U)
+    code = result.code
     # Registers that do not suffice show in moves to and from the stack; their number says whether a
     # block has too many vectors.
-    assembly = machine.assembly(ir)
+    assembly = result.target.assembly(code)
     spills = len(re.findall(r"\bv?mov[a-z0-9]*\s+.*\((?:%rsp|sp)\)", assembly))
-    return [Part(None, module.b.operations, module.W, module.U, module.scratch_bytes, spills, ir)]
+    ir = handler.module_text(code.text, code.block)
+    return [Part(None, code.operations, code.width, code.vectors, code.scratch, spills, ir)]

@@ -4,14 +4,12 @@ import dataclasses
 import functools
 import os
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from .jaxprs.extent import carried, most_operations, operation_count
 from .jaxprs.jaxapi import (
     ClosedJaxpr,
     batch_in_front,
@@ -24,10 +22,10 @@ from .jaxprs.jaxapi import (
     with_equal_axes,
 )
 from .jaxprs.traced import Traced
-from .kernel import Module
 from .llvm.ir import Unsupported
 from .native import handler, machine
 from .pieces import Piece, in_pieces, pieces
+from .targets import TARGETS, compiled
 
 FORMS = ("auto", "components", "arrays", "kernel")
 
@@ -186,15 +184,22 @@ def _through_xla(*operands, program: Program, lanes: int | None, on: tuple[bool,
     return _in_jax(program, lanes, on)(*operands)
 
 
-def _on_cpu(*operands, program: Program, lanes: int | None, on: tuple[bool, ...]):
+def _lowered(*operands, program: Program, lanes: int | None, on: tuple[bool, ...], platform: str):
     """The program as machine code, through XLA where none can be generated."""
     try:
-        name, params = compiled(program, on, lanes)
+        if not generates():
+            raise Unsupported(
+                "no machine code is generated in this process: the environment variable "
+                f"{SWITCH} switches it off, or a warning reported the reason"
+            )
+        if lanes == 0:
+            raise Unsupported("the batch has no trajectories")
+        return compiled(program, on, lanes, platform).call(operands, program, lanes)
     except Unsupported as reason:
         # This is for developers of the compiler; users have `explain`.
         if os.environ.get("LANEWISE_LOG"):
             print("left to XLA:", reason, flush=True)
-        found = pieces_of(program, lanes or 1) if lanes != 0 else []
+        found = pieces_of(program, lanes or 1, platform) if lanes != 0 else []
         if not found:
             return _through_xla(*operands, program=program, lanes=lanes, on=on)
 
@@ -204,11 +209,9 @@ def _on_cpu(*operands, program: Program, lanes: int | None, on: tuple[bool, ...]
             return compute(*arrays, program=part, lanes=lanes, on=on)
 
         return in_pieces(found, program.traced.all_inputs, operands, lanes, on, run)
-    call_handler = jax.ffi.ffi_call(name, program.shape_of(lanes))
-    return list(call_handler(*operands, params=params))
 
 
-def pieces_of(program: Program, lanes: int) -> list[Piece]:
+def pieces_of(program: Program, lanes: int, platform: str) -> list[Piece]:
     """The pieces of a program that is not compiled as a whole; none if XLA computes all of it."""
     if program.layout.form == "arrays" or not generates():
         return []
@@ -216,7 +219,7 @@ def pieces_of(program: Program, lanes: int) -> list[Piece]:
     def reason(closed: ClosedJaxpr) -> str | None:
         try:
             part = Program(Traced(closed), program.layout)
-            kernel_of(part, [True] * len(closed.jaxpr.invars), lanes)
+            compiled(part, [True] * len(closed.jaxpr.invars), lanes, platform)
         except Unsupported as why:
             return str(why)
         return None
@@ -225,87 +228,6 @@ def pieces_of(program: Program, lanes: int) -> list[Piece]:
     # One piece is all of it, and too large as a whole: it cannot be cut any further.
     is_whole = len(found) == 1 and not found[0].is_call
     return [] if is_whole or all(piece.is_left_to_xla for piece in found) else found
-
-
-def compiled(
-    program: Program, on: Sequence[bool], lanes: int | None, vectors: int | None = None
-) -> tuple[str, np.ndarray]:
-    """The name of the handler that computes a program for a batch, and its parameters.
-
-    **Raises** `Unsupported` where no code is generated, with the reason.
-    """
-    if not generates():
-        raise Unsupported(
-            "no machine code is generated in this process: the environment variable "
-            f"{SWITCH} switches it off, or a warning reported the reason"
-        )
-    if lanes == 0:
-        raise Unsupported("the batch has no trajectories")
-    module, text = kernel_of(program, on, 1 if lanes is None else lanes, vectors)
-    name = handler.registered(handler.module_text(text, module.W * module.U))
-    # The operations of a block, times the rounds of its longest loop: with few of them the threads
-    # of XLA's pool would take longer to start than to work.
-    cost = max(module.b.operations * max([1, *module.values]), 1)
-    outs = program.traced.closed.out_avals
-    sizes = [a.size * a.dtype.itemsize for a in outs]
-    return name, np.asarray([lanes or 1, cost, *sizes, *module.values], np.int64)
-
-
-def kernel_of(
-    program: Program, on: Sequence[bool], lanes: int, vectors: int | None = None
-) -> tuple[Module, str]:
-    """The module of a program for so many trajectories, and its text."""
-    if program.layout.form == "arrays":
-        raise Unsupported('the layout has form="arrays"')
-    closed = program.traced.all_inputs
-    # Counted before code is written, which would take minutes for the largest functions.
-    count = operation_count(closed.jaxpr)
-    most = most_operations(closed.jaxpr)
-    if count > most:
-        raise Unsupported(
-            f"the function has {count} operations, more than {most} (a loop counts once)"
-        )
-    if vectors is None and program.layout.width is not None:
-        vectors = max(program.layout.width // machine.width(), 1)
-    if vectors is None:
-        # Every number of an argument or a result is moved trajectory by trajectory: most work
-        # where there is no loop.
-        state = carried(closed.jaxpr)
-        ends = [v.aval.size for v in (*closed.jaxpr.invars, *closed.jaxpr.outvars)]
-        moved = sum(n for n in ends if n <= 128)
-        vectors = vectors_for(state, count) if state or moved <= 24 else 1
-    module = Module(*variant(lanes, vectors))
-    module.b.most = most
-    return module, module.kernel(closed, on)
-
-
-def variant(lanes: int, most: int, width: int | None = None) -> tuple[int, int]:
-    """(W, U): numbers in a vector, vectors in a block, for so many trajectories."""
-    width = machine.width() if width is None else width
-    # A block has no more trajectories than the batch: the last block could not end with the last
-    # one.
-    while width > lanes:
-        width //= 2
-    vectors = 1
-    if lanes >= most * width:
-        return width, most
-    # A power of two here, so that batches of different small sizes share code.
-    while 2 * vectors <= most and 2 * vectors * width <= lanes:
-        vectors *= 2
-    return width, vectors
-
-
-def vectors_for(carried: int, operations: int) -> int:
-    """Vectors in a block: enough to hide latency, few enough that the state stays in registers."""
-    # A short step has few independent operations: several vectors hide the latency of its
-    # divisions. A long one has many, and more vectors would need more registers than there are.
-    if operations < 150:
-        return max(1, min(8, 32 // max(carried, 1)))
-    if operations < 800 and carried <= 12:
-        return 4
-    if operations < 1500:
-        return 3 if carried <= 12 else 2
-    return 2 if operations < 4000 and carried <= 12 else 1
 
 
 def _shape_of(*operands, program: Program, lanes: int | None, on: tuple[bool, ...]) -> list[Any]:
@@ -332,7 +254,8 @@ def _batched(operands, axes, *, program: Program, lanes: int | None, on: tuple[b
 
 
 _lanewise = primitive("lanewise", _through_xla, _batched, multiple=True)
-lower_on("cpu", _lanewise, _on_cpu)
+for _platform in TARGETS:
+    lower_on(_platform, _lanewise, functools.partial(_lowered, platform=_platform))
 
 
 def _derivative(primals, changes: dict[int, Any], **params):

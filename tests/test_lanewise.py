@@ -26,9 +26,12 @@ import lanewise
 from lanewise import assumed, evaluator as components, primitive
 from lanewise.jaxprs import extent
 from lanewise.jaxprs.traced import Traced
-from lanewise.kernel import Module
+from lanewise.module import Module
 from lanewise.native import cache, handler, machine
-from lanewise.rules.moves import moves as rules
+from lanewise.rules import moves
+from lanewise.targets import TARGETS, Code, compiled
+from lanewise.targets.numbers import kernel_text
+from lanewise.targets.target import compiled_by
 
 RNG = np.random.default_rng(0)
 
@@ -779,7 +782,7 @@ def test_no_warning_from_constants():
 def test_code_stays_short_for_arrays():
     leaves, tree = jax.tree.flatten((1.0,))
     program = primitive.Program(Traced.of(lambda x: jnp.full((128,), x), leaves, tree))
-    _, text = primitive.kernel_of(program, [True], 64)
+    text = compiled(program, [True], 64, "cpu").code.text
     blocks = text.split(":\n")
     assert max(b.count("\n") for b in blocks) < 3000
 
@@ -852,18 +855,53 @@ def test_an_unknown_parameter_is_left_to_xla():
     """Of a primitive that moves numbers: a rule that does not know it might move them wrongly."""
     of = {"new_sizes": (4,), "dimensions": None, "sharding": None}
     x = np.arange(4.0).reshape(2, 2)
-    np.testing.assert_array_equal(rules.moved("reshape", of, x)[0], [0, 1, 2, 3])
+    np.testing.assert_array_equal(moves.moved("reshape", of, x)[0], [0, 1, 2, 3])
     of["dimensions"] = (1, 0)
-    np.testing.assert_array_equal(rules.moved("reshape", of, x)[0], [0, 2, 1, 3])
+    np.testing.assert_array_equal(moves.moved("reshape", of, x)[0], [0, 2, 1, 3])
     with pytest.raises(lanewise.llvm.ir.Unsupported, match=r"reshape has parameters .*: order"):
-        rules.moved("reshape", {**of, "order": "F"}, x)
+        moves.moved("reshape", {**of, "order": "F"}, x)
 
 
 def operations(function, *args):
     leaves, tree = jax.tree.flatten(args)
     program = primitive.Program(Traced.of(function, leaves, tree))
-    module, _ = primitive.kernel_of(program, [True] * len(leaves), 64, 1)
-    return module.b.operations
+    return compiled(program, [True] * len(leaves), 64, "cpu").code.operations
+
+
+class Refusing:
+    """A target that has no code for anything."""
+
+    def __init__(self, name, is_suited=True):
+        self.name, self.is_suited = name, is_suited
+
+    def suits(self, closed):
+        return self.is_suited
+
+    def write(self, closed, on, lanes, width):
+        raise lanewise.llvm.ir.Unsupported(f"refused by {self.name}")
+
+    def registered(self, code):
+        raise AssertionError
+
+    assembly = registered
+
+
+def test_first_target_with_code_is_used_and_reasons_of_others_are_collected():
+    program = primitive.Program(Traced.of(jnp.sin, [1.0], jax.tree.structure((1.0,))))
+    targets = [Refusing("unsuited", False), Refusing("first"), *TARGETS["cpu"], Refusing("last")]
+    result = compiled_by(targets, program, [True], 8)
+    assert result.target is TARGETS["cpu"][0]
+    assert result.reasons == {"first": "refused by first"}
+    assert result.code == compiled(program, [True], 8, "cpu").code
+    with pytest.raises(lanewise.llvm.ir.Unsupported, match="refused by a; refused by b"):
+        compiled_by([Refusing("a"), Refusing("b")], program, [True], 8)
+
+
+def test_parameters_of_a_call():
+    code = Code("", 8, values=(100, 7), operations=5)
+    outs = [jax.ShapeDtypeStruct((3,), np.float64), jax.ShapeDtypeStruct((), np.int32)]
+    # Trajectories, operations × longest loop, bytes of each result, values.
+    np.testing.assert_array_equal(code.params(16, outs), [16, 500, 24, 4, 100, 7])
 
 
 def newton(residual):
@@ -1226,7 +1264,7 @@ def test_code_for_other_processors(width):
     x, k = np.float64(1), np.int32(3)
     traced = Traced.of(function, [x, k], jax.tree.structure((x, k)))
     module = Module(width, 2)
-    text = handler.module_text(module.kernel(traced.all_inputs, [True, True]), 2 * width)
+    text = handler.module_text(kernel_text(module, traced.all_inputs, [True, True]), 2 * width)
     for kind, cpu, features, code in PROCESSORS:
         target = machine.target_machine(f"{kind}-unknown-linux-gnu", cpu, features)
         made = machine.object_code(text, target)

@@ -31,21 +31,6 @@ class Builder(Arithmetic):
         bits = self.new(f"bitcast {t} {total} to i{self.W}")
         return self.new(f"icmp ne i{self.W} {bits}, 0")
 
-    # Numbers that wait in memory while a loop runs. Without "volatile" the optimiser would keep
-    # them in registers, which the loop needs.
-
-    def set_aside(self, x: Num, to: Sequence[str], vec: bool) -> list[str]:
-        """The lines that write a number of a carry to one pointer for each vector."""
-        t = self.type(x.dtype, vec)
-        return [
-            f"  store volatile {t} {name}, ptr {at}" for name, at in zip(x.names, to, strict=True)
-        ]
-
-    def taken_back(self, x: Num, at: Sequence[str], vec: bool) -> Num:
-        """The number that was set aside there."""
-        t = self.type(x.dtype, vec)
-        return self.made([self.new(f"load volatile {t}, ptr {p}") for p in at], x.dtype, vec)
-
     def loop(
         self,
         carry: Sequence[Num],
@@ -61,13 +46,15 @@ class Builder(Arithmetic):
         will be in the next round; x is then not computed but carried.
         """
         before = [self.refs(c, v) for c, v in zip(carry, vec, strict=True)]
-        entered_from, front = self.block, len(self.lines)
+        # The preheader is the end of the block from which the loop is entered.
+        entered_from, preheader = self.block, self.reserved()
         # head: phis and the test; inner: a round, which goes back to head; end: after the last
         # round.
         head, inner, end = self.label(), self.label(), self.label()
         self.emit(f"br label %{head}")
+        first_block = len(self.blocks)
         self.begin(head)
-        phis, place = [], len(self.lines)
+        phis, phi_section = [], self.reserved()
         for c, v in zip(carry, vec, strict=True):
             names = [self.name() for _ in range(self.U if v else 1)]
             phis.append(self.made(names, c.dtype, v))
@@ -88,38 +75,29 @@ class Builder(Arithmetic):
         left_from = self.block
         self.emit(f"br label %{head}")
 
-        def phi(name: str, t: str, old: str, new: str) -> str:
-            return f"  {name} = phi {t} [{old}, %{entered_from}], [{new}, %{left_from}]"
+        # The value of a number after a round is known only now.
+        def write_phi(name: str, t: str, old: str, new: str) -> None:
+            phi_section.append((name, f"phi {t} [{old}, %{entered_from}], [{new}, %{left_from}]"))
 
-        # The value of a number after a round is known only now: its line is inserted above.
-        lines = [
-            phi(name, self.type(p.dtype, v), old, new)
-            for p, olds, news, v in zip(phis, before, again, vec, strict=True)
-            for name, old, new in zip(p.names, olds, news, strict=True)
-        ]
+        for p, olds, news, v in zip(phis, before, again, vec, strict=True):
+            for name, old, new in zip(p.names, olds, news, strict=True):
+                write_phi(name, self.type(p.dtype, v), old, new)
         if count:
-            lines.append(phi(counter, "i64", "0", following))
-        first_lines = []
+            write_phi(counter, "i64", "0", following)
         if carried_over is not None:
-            pairs = carried_over(phis, after)
             # The number of the first round is computed before the loop, from the numbers that enter
             # it.
-            instead = {
+            entering = {
                 p.serial: self.made(old, p.dtype, v)
                 for p, old, v in zip(phis, before, vec, strict=True)
             }
-            count_before = len(self.lines)
-            firsts = [self.made_again(x, instead) for x, _ in pairs]
-            first_lines = self.lines[count_before:]
-            del self.lines[count_before:]
-            for (x, y), first in zip(pairs, firsts, strict=True):
-                for u, name in enumerate(x.names):
-                    own = (line.startswith(f"  {name} = ") for line in self.lines[place:])
-                    del self.lines[place + list(own).index(True)]
-                    old = self.ref(first, u, True)
-                    lines.append(phi(name, self.type(x.dtype, True), old, y.names[u]))
-        self.lines[place:place] = lines
-        self.lines[front:front] = first_lines
+            pairs = carried_over(phis, after)
+            with self.writing(preheader):
+                firsts = [self.refs(self.made_again(x, entering), True) for x, _ in pairs]
+            for (x, y), olds in zip(pairs, firsts, strict=True):
+                for name, old, new in zip(x.names, olds, y.names, strict=True):
+                    self.remove(name, first_block)
+                    write_phi(name, self.type(x.dtype, True), old, new)
         self.begin(end)
         return phis
 

@@ -5,10 +5,11 @@ vectors of `W` elements). The operations do not depend on `W` and `U`: `Arithmet
 numbers which products and sums become fused multiply-adds, and LLVM may not change an operation.
 """
 
+import contextlib
 import dataclasses
 import itertools
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -77,13 +78,22 @@ def literal(value: Any, dtype: str) -> str:
     return str(int(value))
 
 
+Section = list[Any]
+"""Instructions of a block: pairs (name of the result or "", text), and sections among them."""
+
+
 class Writer:
-    """The body of one function, written line by line."""
+    """The body of one function: blocks, each with a label and a section of instructions.
+
+    Instructions that belong to an earlier place than the current one, such as a loop's preheader,
+    are written to a section that was reserved there.
+    """
 
     def __init__(self, width: int, vectors: int):
         self.W, self.U = width, vectors
-        self.lines: list[str] = []
         self.block = "entry"
+        self.section: Section = []  # where instructions are written
+        self.blocks: list[tuple[str, Section]] = [(self.block, self.section)]
         self.operations, self.most = 0, MOST_OPERATIONS
         # A number that was made in a loop or a branch is not known outside of it: each has a scope.
         self.scopes: list[dict] = [{}]
@@ -93,14 +103,14 @@ class Writer:
     # --- text --------------------------------------------------------------------------------
 
     def emit(self, line: str) -> None:
-        self.lines.append("  " + line)
+        self.section.append(("", line))
 
     def name(self) -> str:
         return f"%v{next(self._names)}"
 
     def new(self, instruction: str) -> str:
         name = f"%v{next(self._names)}"
-        self.lines.append(f"  {name} = {instruction}")
+        self.section.append((name, instruction))
         return name
 
     def pointer(self, item: str, base: str, by: str | int) -> str:
@@ -111,8 +121,41 @@ class Writer:
         return f"L{next(self._names)}"
 
     def begin(self, label: str) -> None:
-        self.lines.append(f"{label}:")
-        self.block = label
+        self.block, self.section = label, []
+        self.blocks.append((label, self.section))
+
+    def reserved(self) -> Section:
+        """A section at the current place, to be written later."""
+        section: Section = []
+        self.section.append(section)
+        return section
+
+    @contextlib.contextmanager
+    def writing(self, section: Section) -> Iterator[None]:
+        """Write instructions to a section that was reserved."""
+        current, self.section = self.section, section
+        try:
+            yield
+        finally:
+            self.section = current
+
+    def remove(self, name: str, block_index: int) -> None:
+        """Remove the instruction whose result is `name` from the blocks from `block_index` on."""
+        for _, section in self.blocks[block_index:]:
+            for i, item in enumerate(section):
+                if isinstance(item, tuple) and item[0] == name:
+                    del section[i]
+                    return
+        raise AssertionError(f"no instruction makes {name}")
+
+    @property
+    def lines(self) -> list[str]:
+        """The text, without the label of the first block."""
+        (_, entry), *blocks = self.blocks
+        lines = list(_text(entry))
+        for label, section in blocks:
+            lines += [f"{label}:", *_text(section)]
+        return lines
 
     def declare(self, line: str) -> None:
         self.declared.add("declare " + line)
@@ -127,12 +170,15 @@ class Writer:
 
     def mark(self) -> tuple:
         """The state of the text, for `back_to`."""
-        return len(self.lines), self.block, self.operations, len(self.scopes), dict(self.scopes[-1])
+        scope = dict(self.scopes[-1])
+        return len(self.blocks), len(self.section), self.operations, len(self.scopes), scope
 
     def back_to(self, mark: tuple) -> None:
         """Forget what was written since the mark, which was made in the same function."""
-        count, self.block, self.operations, depth, scope = mark
-        del self.lines[count:], self.scopes[depth:]
+        count, length, self.operations, depth, scope = mark
+        del self.blocks[count:], self.scopes[depth:]
+        self.block, self.section = self.blocks[-1]
+        del self.section[length:]
         self.scopes[-1] = scope
 
     def find(self, key: Any) -> Any:
@@ -243,3 +289,12 @@ class Writer:
             return f"call {t} @{full}({', '.join(f'{t} {x}' for x in names)})"
 
         return self.op(name, args, dtype, write)
+
+
+def _text(section: Section) -> Iterator[str]:
+    for item in section:
+        if isinstance(item, list):
+            yield from _text(item)
+        else:
+            name, instruction = item
+            yield f"  {name} = {instruction}" if name else f"  {instruction}"

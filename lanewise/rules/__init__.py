@@ -1,1 +1,12 @@
-"""How the primitives of JAX are written in LLVM IR."""
+"""How the primitives of JAX are written in LLVM IR: each file registers its rules in `RULES`."""
+
+from . import (
+    elementary as elementary,
+    elementwise as elementwise,
+    elimination as elimination,
+    indexing as indexing,
+    loops as loops,
+    moves as moves,
+    reductions as reductions,
+    written as written,
+)

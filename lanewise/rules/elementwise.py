@@ -1,23 +1,27 @@
 """Elementwise primitives: rule(evaluator, parameters of the equation, *numbers) → number."""
 
+import functools
+import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ..assumed import taken_for, taken_value
+from ..evaluator import RULES, Evaluator, typed
+from ..llvm.builder import Builder
 from ..llvm.ir import Num, Unsupported
+from ..llvm.memory import Buffer, load, store
+from ..llvm.values import MADE, Value
 from . import exact
-
-if TYPE_CHECKING:
-    from ..evaluator import Evaluator
+from .elementary import elementary
 
 
 def _binary(method: str) -> Callable:
     return lambda e, _, a, b: getattr(e.b, method)(a, b)
 
 
-def _equal(e: "Evaluator", _: Any, x: Num, y: Num) -> Num:
+def _equal(e: Evaluator, _: Any, x: Num, y: Num) -> Num:
     """A loop's counter equals a given number in one round: taken for rare."""
     same = e.b.compare("eq", x, y)
     # A number that changes and is the same on all trajectories of a batch is a counter.
@@ -28,7 +32,7 @@ def _equal(e: "Evaluator", _: Any, x: Num, y: Num) -> Num:
     return same
 
 
-def _select(e: "Evaluator", _: Any, which: Num, *cases: Num) -> Num:
+def _select(e: Evaluator, _: Any, which: Num, *cases: Num) -> Num:
     b = e.b
     if which.dtype == "bool":
         taken = None if which.known is not None else taken_value(which)
@@ -42,11 +46,11 @@ def _select(e: "Evaluator", _: Any, which: Num, *cases: Num) -> Num:
     return result
 
 
-def _clamp(e: "Evaluator", _: Any, low: Num, x: Num, high: Num) -> Num:
+def _clamp(e: Evaluator, _: Any, low: Num, x: Num, high: Num) -> Num:
     return e.b.maximum(e.b.maximum(x, low), high, "lt")
 
 
-def _sign(e: "Evaluator", _: Any, x: Num) -> Num:
+def _sign(e: Evaluator, _: Any, x: Num) -> Num:
     b, zero = e.b, e.b.known(0, x.dtype)
     if x.dtype.startswith("u"):
         return b.select(b.compare("eq", x, zero), zero, b.known(1, x.dtype))
@@ -58,7 +62,7 @@ def _sign(e: "Evaluator", _: Any, x: Num) -> Num:
 def _integral(name: str, function: Callable | None) -> Callable:
     """Rounding to an integer by a function of NumPy, if it has one, and LLVM's of that name."""
 
-    def rule(e: "Evaluator", _: Any, x: Num) -> Num:
+    def rule(e: Evaluator, _: Any, x: Num) -> Num:
         if not x.is_float:
             return x
         if x.known is not None and function is not None:
@@ -68,14 +72,14 @@ def _integral(name: str, function: Callable | None) -> Callable:
     return rule
 
 
-def _rounded(e: "Evaluator", params: dict, x: Num) -> Num:
+def _rounded(e: Evaluator, params: dict, x: Num) -> Num:
     # NumPy has no function that rounds halves away from zero.
     away = int(params["rounding_method"]) == 0
     rule = _integral("round", None) if away else _integral("roundeven", np.rint)
     return rule(e, params, x)
 
 
-def _pow(e: "Evaluator", _: Any, x: Num, y: Num) -> Num:
+def _pow(e: Evaluator, _: Any, x: Num, y: Num) -> Num:
     if y.known is not None and x.is_float:
         if not y.is_float or float(y.known).is_integer():
             n = int(y.known)
@@ -92,7 +96,7 @@ def _pow(e: "Evaluator", _: Any, x: Num, y: Num) -> Num:
 
 
 def _elementary(name: str) -> Callable:
-    def rule(e: "Evaluator", _: Any, *xs: Num) -> Num:
+    def rule(e: Evaluator, _: Any, *xs: Num) -> Num:
         if not xs[0].is_float:
             raise Unsupported(
                 f"{name} is compiled for floating-point numbers only, got {xs[0].dtype}: convert "
@@ -100,18 +104,18 @@ def _elementary(name: str) -> Callable:
             )
         if xs[0].dtype == "float32":
             # Own functions for float32 would be faster, and one more set to test.
-            wide = e.kernel.elementary(name, [e.b.convert(x, "float64") for x in xs])
+            wide = elementary(e, name, [e.b.convert(x, "float64") for x in xs])
             return e.b.convert(wide, "float32")
-        return e.kernel.elementary(name, xs)
+        return elementary(e, name, xs)
 
     return rule
 
 
-def _one(e: "Evaluator", like: Num) -> Num:
+def _one(e: Evaluator, like: Num) -> Num:
     return e.b.known(1, like.dtype)
 
 
-def _bitcast(e: "Evaluator", params: dict, x: Num) -> Num:
+def _bitcast(e: Evaluator, params: dict, x: Num) -> Num:
     new = np.dtype(params["new_dtype"])
     # Other sizes change the shape of the array, which a rule for one number cannot.
     if new.itemsize != np.dtype(x.dtype).itemsize or "bool" in (x.dtype, str(new)):
@@ -126,11 +130,11 @@ def _combined(op: str) -> Callable:
     return lambda e, _, a, b: e.combine(op, a, b)
 
 
-def _same(e: "Evaluator", _: Any, x: Num) -> Num:
+def _same(e: Evaluator, _: Any, x: Num) -> Num:
     return x
 
 
-def _reduced_precision(e: "Evaluator", params: dict, x: Num) -> Num:
+def _reduced_precision(e: Evaluator, params: dict, x: Num) -> Num:
     wide = {"float64": (11, 52), "float32": (8, 23)}.get(x.dtype)
     if wide is None or params["exponent_bits"] < wide[0] or params["mantissa_bits"] < wide[1]:
         got = params["exponent_bits"], params["mantissa_bits"]
@@ -186,3 +190,55 @@ ELEMENTWISE: dict[str, Callable] = {
     },
     **{name: _elementary(name) for name in _FUNCTIONS.split()},
 }
+
+
+def _elementwise(e: Evaluator, eqn: Any, values: list[Value], rule: Callable) -> Value:
+    (out,) = eqn.outvars
+    shape, params = out.aval.shape, eqn.params
+    # Long arrays in a loop over their elements: otherwise the code would be as long as the
+    # array.
+    if not all(v.is_small for v in values) or math.prod(shape) > MADE:
+        return _in_a_loop(e, eqn, values, rule)
+    operands = [np.broadcast_to(e.entries(v), shape) for v in values]
+    results = [rule(e, params, *(x[i] for x in operands)) for i in np.ndindex(*shape)]
+    return e.value(results, out.aval)
+
+
+def _in_a_loop(e: Evaluator, eqn: Any, values: list[Value], rule: Callable) -> Value:
+    """An elementwise primitive on arrays that stay in memory."""
+    (out,) = eqn.outvars
+    shape = out.aval.shape
+    on = any(v.has_lanes() for v in values)
+    place = e.module.scratch(shape, str(out.aval.dtype), on)
+    sources = [v if v.shape == () else e.in_memory(v) for v in values]
+
+    def one(places: list, target: Buffer) -> None:
+        if not target.shape:
+            numbers = [e.entries(x)[()] if isinstance(x, Value) else load(e.b, x) for x in places]
+            store(e.b, target, rule(e, eqn.params, *numbers))
+            return
+        rows = functools.partial(_row_of, e.b)
+        e.count(target.shape[0], lambda i: one([rows(x, i) for x in places], target.row(e.b, i)))
+
+    one(sources, place)
+    return Value.in_memory(place)
+
+
+def _row_of(b: Builder, x: Any, index: Num) -> Any:
+    if isinstance(x, Value):  # one number for all elements
+        return x
+    if x.shape[0] == 1:
+        index = b.known(0, "int64")
+    return x.row(b, index)
+
+
+def _on_arrays(number_rule: Callable) -> Callable:
+    """The rule for arrays of a rule for numbers."""
+
+    def rule(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+        return [_elementwise(e, eqn, values, number_rule)]
+
+    return typed(rule)
+
+
+RULES |= {name: _on_arrays(number_rule) for name, number_rule in ELEMENTWISE.items()}

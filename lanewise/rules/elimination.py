@@ -1,25 +1,25 @@
 """Small dense linear systems, number by number."""
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
+from ..evaluator import RULES, Evaluator
 from ..llvm.builder import Builder
-from ..llvm.ir import Num, Unsupported
+from ..llvm.ir import TYPES, Num, Unsupported
 from ..llvm.memory import Buffer, load, store
 from ..llvm.values import MADE, Entries, Value
-
-if TYPE_CHECKING:
-    from ..evaluator import Evaluator
-
+from ..module import Module
 
 # Rows are exchanged if a factor is larger: without exchanges errors grow with the factors, and each
 # exchange costs a branch.
 _LARGEST_FACTOR = 8.0  # of a row that is subtracted from another without an exchange
 
 
-def linear_solve(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:
+def linear_solve(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     """custom_linear_solve: what it solves with."""
     lengths, jaxprs = eqn.params["const_lengths"], eqn.params["jaxprs"]
     start = lengths.matvec + lengths.vecmat
@@ -28,7 +28,7 @@ def linear_solve(e: "Evaluator", eqn: Any, values: list[Value], places: list) ->
     return e.closed(jaxprs.solve, [*consts, *b])
 
 
-def eliminate(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:
+def eliminate(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     """Dense systems, by elimination; rows are exchanged on trajectories that need it."""
     matrices, vectors = values
     if matrices.size > MADE // 4:
@@ -43,7 +43,7 @@ def eliminate(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> li
     return [e.value([x for i in np.ndindex(front) for x in _one(e, A[i], b[i])], out.aval)]
 
 
-def _one(e: "Evaluator", matrix: Entries, vector: Entries) -> list[Num]:
+def _one(e: Evaluator, matrix: Entries, vector: Entries) -> list[Num]:
     b = e.b
     rows = [[*row, x] for row, x in zip(matrix, vector, strict=True)]
     numbers = [x for row in rows for x in row]
@@ -57,13 +57,52 @@ def _one(e: "Evaluator", matrix: Entries, vector: Entries) -> list[Num]:
         # As results of a branch, so that the bits are those of the version with branches.
         return [b.unrelated(x) for x in found]
 
-    def exchanged() -> list[Num]:
+    def selected() -> list[Num]:
         # Only where it is needed: other trajectories of the block keep their numbers to the bit.
-        others = e.kernel.exchanged(numbers, vec)
+        others = exchanged(e, numbers, vec)
         return [b.select(weak, x, y) for x, y in zip(others, found, strict=True)]
 
     n = len(found)
-    return b.branch(b.any(weak), exchanged, lambda: found, [vec] * n, [numbers[0].dtype] * n)
+    return b.branch(b.any(weak), selected, lambda: found, [vec] * n, [numbers[0].dtype] * n)
+
+
+def exchanged(e: Evaluator, numbers: Sequence[Num], vec: bool) -> list[Num]:
+    """The solution of a linear system with exchanges of rows, of its numbers row by row (A, b).
+
+    It is needed rarely and takes many operations: a function of the module, by way of memory.
+    """
+    module, b, dtype = e.module, e.b, numbers[0].dtype
+    n = math.isqrt(len(numbers))
+    block, calls = (b.W, b.U) if vec else (1, 1)
+    called = f"@exchanged_{n}_{TYPES[dtype]}_{'v' if block > 1 else 's'}"
+    if (called, block) not in module.functions:
+        text, declared = _exchange_text(n, dtype, block, called)
+        module.functions[called, block] = text
+        module.declared |= declared
+    count = len(numbers) + n
+    # One trajectory's vector after the other: each call has a piece of memory of its own.
+    whole = module.scratch((count * calls,), dtype, False, block)
+    item = np.dtype(dtype).itemsize * block * count
+    pieces = [b.new(f"getelementptr i8, ptr {whole.base[0]}, i64 {u * item}") for u in range(calls)]
+    place = Buffer(tuple(pieces), dtype, (count,), (block,), 1 if vec else None)
+    for i, x in enumerate(numbers):
+        store(b, place, x, i * block)
+    for piece in pieces:
+        b.emit(f"call void {called}(ptr {piece})")
+    return [load(b, place, (len(numbers) + i) * block) for i in range(n)]
+
+
+@functools.cache
+def _exchange_text(n: int, dtype: str, width: int, called: str) -> tuple[str, frozenset[str]]:
+    """A function that solves the system at a pointer, n rows (A, b), and puts x after it."""
+    inner = Module(width, 1)
+    b = inner.b
+    system = Buffer(("%p",), dtype, (n, n + 1), ((n + 1) * width, width), 1)
+    solution = Buffer(("%p",), dtype, (n,), (width,), 1, (n * (n + 1) * width,))
+    with_exchanges(b, system, solution)
+    lines = "\n".join(b.lines)
+    text = f"define internal void {called}(ptr %p) noinline {{\nentry:\n{lines}\n  ret void\n}}\n"
+    return text, frozenset(b.declared)
 
 
 def solved(b: Builder, rows: list[list[Num]]) -> tuple[list[Num], Num]:
@@ -157,9 +196,12 @@ def with_exchanges(b: Builder, system: Buffer, solution: Buffer) -> None:
     each(zero, size, unknown)
 
 
-def unit_vectors(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:
+def unit_vectors(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     n, dtype = eqn.params["n"], str(eqn.params["dtype"])
     numbers = [e.b.known(int(i == j), dtype, structural=True) for i in range(n) for j in range(n)]
     value = e.value(numbers, eqn.outvars[0].aval)
     value.is_tangent = True
     return [value]
+
+
+RULES |= {"custom_linear_solve": linear_solve, "eliminate": eliminate, "unit_vectors": unit_vectors}

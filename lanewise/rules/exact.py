@@ -1,17 +1,15 @@
 """Products without rounding: a·b as the sum of two floating-point numbers."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax.numpy as jnp
 from jax import Array, lax
 from jax.typing import ArrayLike
 
+from ..evaluator import Evaluator
 from ..jaxprs.jaxapi import batch_in_front, primitive
 from ..llvm.arithmetic import is_power_of_two
 from ..llvm.ir import Num
-
-if TYPE_CHECKING:
-    from ..evaluator import Evaluator
 
 
 def exact_product(a: ArrayLike, b: ArrayLike) -> tuple[Array, Array]:
@@ -75,13 +73,13 @@ _rounded = primitive(
 _lost = primitive("lost_by_product", lambda a, b: _by_halves(a, b)[1], _in_batches(lambda: _lost))
 
 
-def rounded(e: "Evaluator", _: Any, a: Num, b: Num) -> Num:
+def rounded(e: Evaluator, _: Any, a: Num, b: Num) -> Num:
     """The rule of the rounded product in machine code."""
     # Opaque: it is not contracted with a sum after it.
     return e.b.opaque(e.b.mul(a, b))
 
 
-def lost(e: "Evaluator", _: Any, a: Num, b: Num) -> Num:
+def lost(e: Evaluator, _: Any, a: Num, b: Num) -> Num:
     """The rule of the error of the rounded product in machine code."""
     if any(x.known is not None and (x.known == 0 or is_power_of_two(x.known)) for x in (a, b)):
         return e.b.known(0, a.dtype)

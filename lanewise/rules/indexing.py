@@ -1,18 +1,15 @@
 """Indices, known and traced: slices, gather, scatter, argmax."""
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from ..evaluator import RULES, Evaluator
 from ..llvm.builder import Builder
 from ..llvm.ir import Num, Unsupported
 from ..llvm.memory import contiguous, load
 from ..llvm.values import MADE, Value
-
-if TYPE_CHECKING:
-    from ..evaluator import Evaluator
-
 
 # Name of a primitive → operation on an element and its update; releases of JAX differ in names.
 SCATTERS = {
@@ -21,7 +18,7 @@ SCATTERS = {
 }
 
 
-def iota(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:
+def iota(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     params = eqn.params
     shape, axis = params["shape"], params["dimension"]
     line = np.arange(shape[axis], dtype=params["dtype"])
@@ -30,13 +27,13 @@ def iota(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Va
     return [e.constant(np.broadcast_to(line.reshape(other), shape))]
 
 
-def empty(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:
+def empty(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     """An array that is written before it is read."""
     (out,) = eqn.outvars
     return [e.constant(np.zeros(out.aval.shape, out.aval.dtype))]
 
 
-def argument_of(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:
+def argument_of(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     """argmax, argmin: the first of the largest, or the first NaN."""
     (value,), b = values, e.b
     (out,) = eqn.outvars
@@ -63,14 +60,14 @@ def _clipped(b: Builder, x: Num, most: int) -> Num:
     return b.maximum(low, b.known(most, "int64"), "lt")
 
 
-def _starts(e: "Evaluator", starts: list[Value], shape: Any, sizes: Any) -> list[Num]:
+def _starts(e: Evaluator, starts: list[Value], shape: Any, sizes: Any) -> list[Num]:
     """Where a part of `sizes` begins in an array of `shape`, inside of it."""
     return [
         _clipped(e.b, e.entries(s)[()], n - m) for s, n, m in zip(starts, shape, sizes, strict=True)
     ]
 
 
-def _pick(e: "Evaluator", value: Value, index: Num) -> Num:
+def _pick(e: Evaluator, value: Value, index: Num) -> Num:
     """The element at a row-major index that lies inside of the array."""
     b = e.b
     if index.known is not None and value.entries is not None:
@@ -86,7 +83,7 @@ def _pick(e: "Evaluator", value: Value, index: Num) -> Num:
     return load(b, flat, b.mul(index, b.known(flat.strides[0], "int64")))
 
 
-def dynamic_slice(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:
+def dynamic_slice(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     value, *starts = values
     (out,) = eqn.outvars
     b, sizes = e.b, eqn.params["slice_sizes"]
@@ -111,9 +108,7 @@ def dynamic_slice(e: "Evaluator", eqn: Any, values: list[Value], places: list) -
     return [e.value(results, out.aval)]
 
 
-def dynamic_update_slice(
-    e: "Evaluator", eqn: Any, values: list[Value], places: list
-) -> list[Value]:
+def dynamic_update_slice(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     value, update, *starts = values
     b = e.b
     at = _starts(e, starts, value.shape, update.shape)
@@ -139,7 +134,7 @@ def dynamic_update_slice(
     return [Value(value.shape, value.dtype, entries)]
 
 
-def gather(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:
+def gather(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     value, indices = values
     (out,) = eqn.outvars
     b, params = e.b, eqn.params
@@ -186,7 +181,7 @@ def _default_fill(dtype: str) -> Any:
     return np.iinfo(dtype).min if np.issubdtype(dtype, np.signedinteger) else np.iinfo(dtype).max
 
 
-def scatter(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:
+def scatter(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     value, indices, updates = values
     b, params = e.b, eqn.params
     dims, mode = params["dimension_numbers"], str(params["mode"]).lower()
@@ -240,3 +235,14 @@ def scatter(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list
             else:
                 entries[i] = b.select(here, updated(entries[i], news[k]), entries[i])
     return [Value(value.shape, value.dtype, entries)]
+
+
+RULES |= {
+    "iota": iota,
+    "empty": empty,
+    "empty2": empty,
+    "argmax": argument_of,
+    "argmin": argument_of,
+}
+RULES |= {"dynamic_slice": dynamic_slice, "dynamic_update_slice": dynamic_update_slice}
+RULES |= {"gather": gather, **dict.fromkeys(SCATTERS, scatter)}

@@ -3,33 +3,30 @@
 import functools
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from ..assumed import taken_value
+from ..assumed import taken_for, taken_value
+from ..evaluator import RULES, Evaluator
 from ..jaxprs.dependence import fixed_point, reached_outputs
 from ..jaxprs.jaxapi import ClosedJaxpr, scan_counts
-from ..llvm.ir import Num
+from ..llvm.ir import TYPES, Num, Unsupported
 from ..llvm.values import Value, objects
 from .rounds import Rounds, Waiting
-
-if TYPE_CHECKING:
-    from ..evaluator import Evaluator
-
 
 # Primitives whose result is the same on all trajectories, even if the operands differ.
 AGREED = frozenset(["least_over_lanes"])
 
 
-def _carried(e: "Evaluator", carry: Sequence[Value], on: Sequence[bool]):
+def _carried(e: Evaluator, carry: Sequence[Value], on: Sequence[bool]):
     """The numbers of a carry in a row, which of them are vectors, and the way back."""
     numbers = _numbers_of(e, carry)
     vec = [lanes for value, lanes in zip(carry, on, strict=True) for _ in range(value.size)]
     return numbers, vec, functools.partial(_values_of, carry)
 
 
-def _numbers_of(e: "Evaluator", values: Sequence[Value]) -> list[Num]:
+def _numbers_of(e: Evaluator, values: Sequence[Value]) -> list[Num]:
     return [x for value in values for x in e.entries(value).flat]
 
 
@@ -42,7 +39,7 @@ def _values_of(like: Sequence[Any], numbers: Sequence[Num]) -> list[Value]:
     return values
 
 
-def scan(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:
+def scan(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     params, b = eqn.params, e.b
     body: ClosedJaxpr = params["jaxpr"]
     num_consts, num_carry = scan_counts(params)
@@ -67,10 +64,10 @@ def scan(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Va
     numbers, vec, back = _carried(e, [c for c, _ in moving], [o for _, o in moving])
     sources = [e.in_memory(x) for x in xs]
     rows = [
-        place or e.kernel.scratch(aval.shape, str(aval.dtype), o)
+        place or e.module.scratch(aval.shape, str(aval.dtype), o)
         for aval, place, o in zip(row_avals, places[num_carry:], on_rows, strict=True)
     ]
-    end = e.kernel.parameter(length)
+    end = e.module.parameter(length)
     waiting = None if reverse else Waiting.of(e, rows, length)
 
     def merged(numbers: Sequence[Num]) -> list[Value]:
@@ -96,7 +93,7 @@ def scan(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Va
     return [*merged(rounds.all(jaxpr, numbers)), *map(Value.in_memory, rows)]
 
 
-def while_loop(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:
+def while_loop(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     """`while`; a condition that is an array says of each of its entries whether that entry of the
     carry, by its leading axes, goes on."""
     params = eqn.params
@@ -140,7 +137,7 @@ def while_loop(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> l
         return back(e.b.loop(numbers, vec, proceeds, lambda state, _: step(state)))
 
 
-def _masked(e: "Evaluator", numbers, vec, per_lane, part, goes_on, step) -> list[Num]:
+def _masked(e: Evaluator, numbers, vec, per_lane, part, goes_on, step) -> list[Num]:
     """A loop of which every trajectory, or every part of the carry, stops by itself; the block goes
     on while one of them does. `part[i]` is the condition of number i."""
     b = e.b
@@ -166,7 +163,7 @@ def _masked(e: "Evaluator", numbers, vec, per_lane, part, goes_on, step) -> list
     return end[count:]
 
 
-def cond(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:
+def cond(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     branches = eqn.params["branches"]
     index, operands = values[0], values[1:]
     which = e.entries(index)[()]
@@ -180,7 +177,7 @@ def cond(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Va
         return _branches(e, eqn, which, operands)
 
 
-def _branches(e: "Evaluator", eqn: Any, which: Num, operands: list[Value]) -> list[Value]:
+def _branches(e: Evaluator, eqn: Any, which: Num, operands: list[Value]) -> list[Value]:
     branches, b = eqn.params["branches"], e.b
     if which.dtype == "bool":
         which = b.convert(which, "int32")
@@ -216,7 +213,7 @@ def _branches(e: "Evaluator", eqn: Any, which: Num, operands: list[Value]) -> li
     return _values_of(avals, results)
 
 
-def _one_of(e: "Evaluator", takes, runs, vec, dtypes) -> list[Num]:
+def _one_of(e: Evaluator, takes, runs, vec, dtypes) -> list[Num]:
     if len(runs) == 1:
         return runs[0]()
     b = e.b
@@ -226,3 +223,49 @@ def _one_of(e: "Evaluator", takes, runs, vec, dtypes) -> list[Num]:
 
 def _cut(values: list[Value], first: int, second: int) -> tuple[list, list, list]:
     return values[:first], values[first : first + second], values[first + second :]
+
+
+def agreed(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+    """The least of an integer over the trajectories of a block."""
+    b, x = e.b, e.entries(values[0])[()]
+    # Not reduced over the block: the assumption is checked after some rounds.
+    if e.assumed is not None and eqn.params["rare"]:
+        return [e.value([e.assumed.least(x)], eqn.outvars[0].aval)]
+    if not x.vec:
+        return values
+    # The block runs a branch that some trajectory nearly always needs. Results do not depend on
+    # it, because each trajectory selects its own.
+    if not eqn.params["rare"]:  # one of several trajectories nearly always needs it
+        return [e.value([taken_for(b, 0, x.dtype)], eqn.outvars[0].aval)]
+    t, full = b.type(x.dtype, True), b.suffix(x.dtype, True)
+    total = x.names[0]
+    for other in x.names[1:]:
+        less = b.new(f"icmp slt {t} {total}, {other}")
+        bits = b.type("bool", True)
+        total = b.new(f"select {bits} {less}, {t} {total}, {t} {other}")
+    if b.W > 1:
+        b.declare(f"{TYPES[x.dtype]} @llvm.vector.reduce.smin.{full}({t})")
+        total = b.new(f"call {TYPES[x.dtype]} @llvm.vector.reduce.smin.{full}({t} {total})")
+    return [e.value([b.made([total], x.dtype, False)], eqn.outvars[0].aval)]
+
+
+def by_itself(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+    """A call within a call: no product in it is contracted with a sum outside, nor the other
+    way round, so that its numbers have the same bits wherever it is called."""
+    program = eqn.params["program"]
+    if eqn.params["lanes"] is not None:
+        raise Unsupported(
+            "the function contains a batch of another lanewise function, made by "
+            "lanewise.batched or jax.vmap: make a batch of the outer function only"
+        )
+    outs = e.closed(program.traced.all_inputs, [e.closed_off(v) for v in values])
+    return [e.closed_off(v) for v in outs]
+
+
+def rounded(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+    """The values as they are, in no operation that is contracted with those after them."""
+    return [e.closed_off(v) for v in values]
+
+
+RULES |= {"scan": scan, "while": while_loop, "cond": cond, "lanewise": by_itself}
+RULES |= {"least_over_lanes": agreed, "optimization_barrier": rounded}

@@ -6,7 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from ..evaluator import RULES, Evaluator, parts_along, typed
+from ..jaxprs.jaxapi import bodies
 from ..llvm.ir import Unsupported
+from ..llvm.memory import Buffer
+from ..llvm.values import SMALL, Value
 
 
 def _broadcast_in_dim(x, *, shape, broadcast_dimensions):
@@ -117,3 +121,67 @@ REDUCTIONS = {
 
 # Running reductions along one axis.
 CUMULATIVE = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}
+
+
+def _viewed(e: Evaluator, eqn: Any, values: list[Value]) -> list[Value] | None:
+    """The outputs as other views of an array in memory, if it is there."""
+    (value, *_) = values
+    if value.entries is not None or value.size <= SMALL:
+        return None
+    assert value.buffer is not None
+    name, params = eqn.primitive.name, eqn.params
+    if name == "reshape" and params["dimensions"] is None:
+        buffers = [e.reshaped(value, params["new_sizes"])]
+    else:
+        buffers = [
+            value.buffer.seen(lambda x, i=i: moved(name, params, x)[i])
+            for i in range(len(eqn.outvars))
+        ]
+    found = [Value.in_memory(x) for x in buffers if x is not None]
+    if len(found) < len(buffers):
+        rule = f"{name} with a copy is compiled for at most {SMALL} elements"
+        raise Unsupported(f"{rule}, got an array of shape {value.shape}")
+    return found
+
+
+def _joined(e: Evaluator, eqn: Any, values: list[Value], place: Buffer | None) -> Value:
+    """Arrays one after the other, in memory."""
+    (out,) = eqn.outvars
+    axis = eqn.params["dimension"]
+    if place is None:
+        on = any(v.has_lanes() for v in values)
+        place = e.module.scratch(out.aval.shape, str(out.aval.dtype), on)
+    for value, part in zip(
+        values, parts_along(place, axis, [v.shape for v in values]), strict=True
+    ):
+        e.write(value, part)
+    return Value.in_memory(place)
+
+
+def _move(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+    name = eqn.primitive.name
+    if name == "reshape" or name in VIEWS:
+        seen = _viewed(e, eqn, values)
+        if seen is not None:
+            return seen
+    if name == "concatenate" and any(v.entries is None for v in values):
+        return [_joined(e, eqn, values, places[0])]
+    entries = moved(name, eqn.params, *(e.entries(v) for v in values))
+    return [
+        Value(v.aval.shape, v.aval.dtype, np.asarray(x, object))
+        for v, x in zip(eqn.outvars, entries, strict=True)
+    ]
+
+
+def _call(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+    (body,) = bodies(eqn)
+    return e.closed(body, values, places)
+
+
+def _same(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+    return values
+
+
+RULES |= dict.fromkeys(MOVES, typed(_move))
+RULES |= dict.fromkeys(CALLS, _call)
+RULES |= dict.fromkeys(["reshard", "sharding_constraint", "mesh_cast"], _same)

@@ -2,19 +2,17 @@
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from ..evaluator import RULES, Evaluator
 from ..llvm.ir import Unsupported
 from ..llvm.values import MADE, Value, objects
 from .moves import CUMULATIVE, REDUCTIONS
 
-if TYPE_CHECKING:
-    from ..evaluator import Evaluator
 
-
-def reduced(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:
+def reduced(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     (value,), (out,) = values, eqn.outvars
     op, axes = REDUCTIONS[eqn.primitive.name], tuple(eqn.params["axes"])
     if value.size == 0:
@@ -41,7 +39,7 @@ def _neutral(op: str, dtype: str) -> Any:
     return 1 if op == "mul" else 0
 
 
-def accumulated(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:
+def accumulated(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     (value,), (out,) = values, eqn.outvars
     axis, reverse = eqn.params["axis"], eqn.params["reverse"]
     if value.size == 0:
@@ -58,7 +56,7 @@ def accumulated(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> 
     return [Value(out.aval.shape, out.aval.dtype, entries)]
 
 
-def dot(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:
+def dot(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     (a, c), (out,) = values, eqn.outvars
     (of_a, of_c), (batch_a, batch_c) = eqn.params["dimension_numbers"]
     dtype = str(out.aval.dtype)
@@ -98,3 +96,10 @@ def _as_stack_of_matrices(x, batch: Sequence[int], contracted: Sequence[int]) ->
     free = [i for i in range(x.ndim) if i not in (*batch, *contracted)]
     sizes = [math.prod(x.shape[i] for i in axes) for axes in (batch, free, contracted)]
     return np.transpose(x, (*batch, *free, *contracted)).reshape(sizes)
+
+
+RULES |= {
+    "dot_general": dot,
+    **dict.fromkeys(REDUCTIONS, reduced),
+    **dict.fromkeys(CUMULATIVE, accumulated),
+}

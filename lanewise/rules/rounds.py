@@ -3,17 +3,14 @@
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
 from ..assumed import Assumed, NotAssumable, may_assume
+from ..evaluator import Evaluator
 from ..jaxprs.jaxapi import Jaxpr
 from ..llvm.ir import Num
 from ..llvm.memory import Buffer, contiguous, transposed
 from ..llvm.values import Value
 from .reuse import carried_over
-
-if TYPE_CHECKING:
-    from ..evaluator import Evaluator
 
 # Rounds that are run on assumptions before these are checked: a check costs little then, and few
 # rounds are repeated if one fails.
@@ -27,14 +24,14 @@ class Waiting:
     whole cache lines.
     """
 
-    def __init__(self, evaluator: "Evaluator", results: Sequence[Buffer], count: int):
+    def __init__(self, evaluator: Evaluator, results: Sequence[Buffer], count: int):
         self.b, self.evaluator, self.results, self.count = evaluator.b, evaluator, results, count
         self.stages = [
-            evaluator.kernel.scratch((count, *r.shape[1:]), r.dtype, True) for r in results
+            evaluator.module.scratch((count, *r.shape[1:]), r.dtype, True) for r in results
         ]
 
     @classmethod
-    def of(cls, evaluator: "Evaluator", results: Sequence[Buffer], length: int) -> "Waiting | None":
+    def of(cls, evaluator: Evaluator, results: Sequence[Buffer], length: int) -> "Waiting | None":
         """For results of a loop with `length` rounds, None where waiting saves no time."""
         apart = all(r.lane not in (None, 1) and r.dtype != "bool" for r in results)
         in_order = all(r.strides == contiguous(r.shape) for r in results)
@@ -81,7 +78,7 @@ class Rounds:
     differ between trajectories. ``round_of(numbers, k, start)`` is round k of a portion that begins
     with round `start`."""
 
-    e: "Evaluator"
+    e: Evaluator
     vec: list[bool]
     length: int
     end: Num
@@ -146,9 +143,9 @@ class Rounds:
         else:
             # Portions of equal length: a last one of few rounds would be checked as often as a full
             # one.
-            size = e.kernel.parameter(-(-self.length // -(-self.length // _PORTION)))
+            size = e.module.parameter(-(-self.length // -(-self.length // _PORTION)))
         # Memory for a copy of the state, from which a portion is repeated.
-        aside = [e.kernel.scratch((), x.dtype, v).base for x, v in zip(numbers, vec, strict=True)]
+        aside = [e.module.scratch((), x.dtype, v).base for x, v in zip(numbers, vec, strict=True)]
         changed: list[bool] = []
 
         def without_branches(start: Num, stop: Num, numbers: Sequence[Num]) -> list[Num]:
@@ -174,7 +171,7 @@ class Rounds:
         def portion(start: Num, stop: Num, state: Sequence[Num]) -> list[Num]:
             until, wait, *numbers = state
             tried = b.compare("ge", start, until)
-            before_all = len(b.lines)
+            copies = b.reserved()
             dtypes = [x.dtype for x in numbers]
             failed, *found = b.branch(
                 b.ref(tried, 0, False),
@@ -186,12 +183,13 @@ class Rounds:
             # Which numbers change is known only after the round is written. They are stored in
             # memory before it, so that the rounds have all registers.
             kept = list(zip(changed, numbers, aside, vec, strict=True))
-            b.lines[before_all:before_all] = [
-                line for c, x, to, v in kept if c for line in b.set_aside(x, to, v)
-            ]
+            with b.writing(copies):
+                for is_changed, x, pointers, v in kept:
+                    if is_changed:
+                        e.module.set_aside(x, pointers, v)
 
             def again() -> list[Num]:
-                old = [b.taken_back(x, at, v) if c else x for c, x, at, v in kept]
+                old = [e.module.taken_back(x, at, v) if c else x for c, x, at, v in kept]
                 return self._some(start, stop, old)
 
             found = b.branch(b.ref(failed, 0, False), again, lambda: found, vec, dtypes)

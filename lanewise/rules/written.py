@@ -1,5 +1,6 @@
 """Primitives of JAX written out in simpler ones, for small arrays of one trajectory."""
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -9,7 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from ..evaluator import RULES, Evaluator, typed
 from ..llvm.ir import Unsupported
+from ..llvm.values import Value
 
 # Larger matrices are left to XLA, which calls LAPACK; so are stacks that cost more operations than
 # one matrix of this size.
@@ -207,3 +210,14 @@ WRITTEN: dict[str, Callable] = {
     "threefry2x32": threefry2x32,
     "platform_index": platform_index,
 }
+
+
+def _rule(name: str) -> Callable:
+    def rule(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+        body = jax.make_jaxpr(functools.partial(WRITTEN[name], **eqn.params))
+        return e.closed(body(*(v.aval for v in eqn.invars)), values)
+
+    return typed(rule)
+
+
+RULES |= {name: _rule(name) for name in WRITTEN if name not in RULES}

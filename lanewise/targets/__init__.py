@@ -1,0 +1,17 @@
+"""The ways of compiling: for each platform of JAX, in the order in which they are tried.
+
+XLA is no target: it compiles what all targets refuse.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+from .numbers import Numbers
+from .target import Code as Code, Compiled as Compiled, Target as Target, compiled_by
+
+TARGETS: dict[str, tuple[Target, ...]] = {"cpu": (Numbers(),)}
+
+
+def compiled(program: Any, on: Sequence[bool], lanes: int | None, platform: str) -> Compiled:
+    """A program as code for a platform. **Raises** `Unsupported` with the reason."""
+    return compiled_by(TARGETS[platform], program, on, lanes)

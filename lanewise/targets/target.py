@@ -1,0 +1,103 @@
+"""What a way of compiling must do, and which one compiles a program."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+import jax
+import numpy as np
+
+from ..jaxprs.jaxapi import ClosedJaxpr
+from ..llvm.ir import Unsupported
+
+
+@dataclasses.dataclass(frozen=True)
+class Code:
+    """The kernel of a program, and what a call hands to it.
+
+    - `text`: LLVM IR before optimisation.
+    - `block`: trajectories that are computed at once.
+    - `values`: whole numbers that are inputs of the code.
+    - `operands`: constants that follow the operands of the call.
+    - `operations`, `scratch`, `width`, `vectors`: see `Part`.
+    """
+
+    text: str
+    block: int
+    values: tuple[int, ...] = ()
+    operands: tuple[np.ndarray, ...] = ()
+    operations: int = 0
+    scratch: int = 0
+    width: int = 1
+    vectors: int = 1
+
+    def params(self, lanes: int | None, outs: Sequence[Any]) -> np.ndarray:
+        """What the kernel reads: trajectories, cost of a block, bytes of a trajectory in each
+        result, values (`HEAD` of them come before the results)."""
+        # The operations of a block, times the rounds of its longest loop: with few of them the
+        # threads of XLA's pool would take longer to start than to work.
+        cost = max(self.operations * max([1, *self.values]), 1)
+        sizes = [a.size * a.dtype.itemsize for a in outs]
+        return np.asarray([lanes or 1, cost, *sizes, *self.values], np.int64)
+
+
+class Target(Protocol):
+    """A way of compiling a function of one trajectory for a batch of them."""
+
+    @property
+    def name(self) -> str:
+        """Its name in reports."""
+        ...
+
+    def suits(self, closed: ClosedJaxpr) -> bool:
+        """Whether it is tried for a program. The answer must not depend on the batch."""
+        ...
+
+    def write(self, closed: ClosedJaxpr, on: Sequence[bool], lanes: int, width: int | None) -> Code:
+        """The kernel for a batch of `lanes` trajectories; `on` says which inputs differ between
+        them. `width`: see `Layout`.
+
+        **Raises** `Unsupported` with the reason if no code can be generated.
+        """
+        ...
+
+    def registered(self, code: Code) -> str:
+        """The name by which XLA calls the code, compiled and registered at the first call."""
+        ...
+
+    def assembly(self, code: Code) -> str:
+        """The machine code in the assembler's language."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Compiled:
+    """A program's code, and why the targets that were tried before have none."""
+
+    target: Target
+    code: Code
+    reasons: Mapping[str, str]
+
+    def call(self, operands: Sequence[Any], program: Any, lanes: int | None) -> list[Any]:
+        """The results of the program, as an operation of XLA."""
+        params = self.code.params(lanes, program.traced.closed.out_avals)
+        run = jax.ffi.ffi_call(self.target.registered(self.code), program.shape_of(lanes))
+        return list(run(*operands, *self.code.operands, params=params))
+
+
+def compiled_by(
+    targets: Sequence[Target], program: Any, on: Sequence[bool], lanes: int | None
+) -> Compiled:
+    """The code of the first target that has some. **Raises** `Unsupported` with all reasons."""
+    if program.layout.form == "arrays":
+        raise Unsupported('the layout has form="arrays"')
+    closed, reasons = program.traced.all_inputs, {}
+    for target in targets:
+        if not target.suits(closed):
+            continue
+        try:
+            code = target.write(closed, on, lanes or 1, program.layout.width)
+            return Compiled(target, code, reasons)
+        except Unsupported as why:
+            reasons[target.name] = str(why)
+    raise Unsupported("; ".join(dict.fromkeys(reasons.values())))
