@@ -91,6 +91,7 @@ SYNONYMS = {
     "event": "stop",
     "events": "stop",
     "grid": "lattice",
+    "newton": "root_finder",
 }
 """Names of arguments in other packages → the name here."""
 

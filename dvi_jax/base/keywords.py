@@ -8,8 +8,9 @@ from typing import Any, TypeVar
 from .checks import refuse_unknown
 
 F = TypeVar("F", bound=Callable[..., Any])
+T = TypeVar("T")
 
-INTEGRATOR = "method lattice newton arithmetic layout integrator"
+INTEGRATOR = "method lattice root_finder arithmetic layout integrator"
 """Keywords of functions that run trajectories which `chosen` turns into one `Integrator`."""
 
 
@@ -56,3 +57,21 @@ def with_keywords_of(source: Callable[..., Any], names: str = "", **more: Any) -
         return call  # pyright: ignore[reportReturnType]
 
     return decorate
+
+
+def accept_newton(cls: type[T]) -> type[T]:
+    """Decorator of a class whose keyword `root_finder` has `newton` as a second name; both at once
+    **raise** `TypeError`."""
+    construct = cls.__init__
+
+    @functools.wraps(construct)
+    def init(self: T, *args: Any, **options: Any) -> None:
+        if "newton" in options:
+            if "root_finder" in options:
+                raise TypeError("newton and root_finder are two names of one argument: give one.")
+            options["root_finder"] = options.pop("newton")
+        construct(self, *args, **options)
+
+    # In place: `isinstance` and pickles refer to this class, not to a subclass of it.
+    cls.__init__ = init
+    return cls

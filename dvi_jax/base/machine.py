@@ -1,4 +1,5 @@
-"""The memory available for results: larger ones are rejected before they are computed."""
+"""The processors of this process, and its memory: larger results are rejected before they are
+computed."""
 
 import contextlib
 import functools
@@ -50,3 +51,11 @@ def _devices_memory() -> int | None:
     known = [n for n in limits if n is not None]
     # A sum over some of the devices would reject results that all of them can hold.
     return sum(known) if known and len(known) == len(limits) else None
+
+
+def processors() -> int:
+    """The number of processors that this process may use."""
+    # A container or `taskset` may allow fewer than the machine has; only Linux reports that.
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

@@ -5,7 +5,6 @@ from typing import Any
 from jaxtyping import Array
 
 from ..base.keywords import INTEGRATOR, taken, with_keywords_of
-from ..base.names import both_names
 from ..integration.integrate import integrate
 from ..integration.integrator import chosen
 from ..lattices import Given
@@ -14,7 +13,6 @@ from ..observe.solution import Save
 from ..problem.system import System
 
 
-@both_names
 @with_keywords_of(integrate, f"h num_steps t0 epsilon args {INTEGRATOR} throw")
 def tangent_map(system: System, q0: Any, p0: Any, **keywords: Any) -> Array:
     """M = ∂(q_K, p_K)/∂(q_0, p_0) of K steps, shape (2N, 2N), by the chain rule along the orbit.

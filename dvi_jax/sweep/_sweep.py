@@ -13,7 +13,6 @@ from lanewise.jaxprs.jaxapi import x64_enabled
 from ..base.checks import instance, whole
 from ..base.keywords import INTEGRATOR, taken, with_keywords_of
 from ..base.machine import machine_memory
-from ..base.names import both_names
 from ..integration.integrate import integrate
 from ..integration.integrator import chosen
 from ..lattices import Given, Lattice
@@ -47,7 +46,6 @@ class SweepInterrupted(KeyboardInterrupt):
         self.result = result
 
 
-@both_names
 @with_keywords_of(
     integrate, f"h num_steps t0 epsilon args {INTEGRATOR} observe stop path", start=None, save=None
 )
@@ -162,7 +160,6 @@ def sweep(
     return result
 
 
-@both_names
 @with_keywords_of(sweep)
 def sweep_cost(system: System, q0: Any = None, p0: Any = None, **settings: Any) -> SweepCost:
     """Estimate the cost of a `sweep` with these arguments: tasks, bytes, seconds; with tables for
