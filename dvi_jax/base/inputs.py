@@ -32,27 +32,29 @@ def start_state(q0: Any, p0: Any) -> tuple[Array, Array]:
     return q, p
 
 
-def as_times(of: str, ts: Any) -> Array:
+def as_times(call: str, ts: Any) -> Array:
     """Times as an array of real numbers; `of`: the name of the call in messages."""
-    ts = _joined(ts)
+    ts = _join(ts)
     if not is_traced(ts):
         ts = _as_numpy("ts", ts)
         refuse_double_without_x64("ts", ts.dtype)
     if jnp.issubdtype(ts.dtype, jnp.integer):
         ts = ts.astype(jnp.result_type(float))
     if not jnp.issubdtype(ts.dtype, jnp.floating):
-        raise TypeError(f"ts in {of} must be real numbers, got dtype {ts.dtype}: use floats.")
+        raise TypeError(f"ts in {call} must be real numbers, got dtype {ts.dtype}: use floats.")
     return jnp.asarray(ts)
 
 
-def _joined(value: Any) -> Any:
+def _join(value: Any) -> Any:
     """A list with traced numbers as one array, which NumPy cannot make."""
-    traced = isinstance(value, list | tuple) and any(is_traced(x) for x in jax.tree.leaves(value))
-    return jnp.asarray(value) if traced else value
+    has_tracer = isinstance(value, list | tuple) and any(
+        is_traced(x) for x in jax.tree.leaves(value)
+    )
+    return jnp.asarray(value) if has_tracer else value
 
 
 def _real_array(name: str, value: Any) -> Array:
-    value = _joined(value)
+    value = _join(value)
     if isinstance(value, jax.Array) and is_traced(value):
         kind = value.dtype
     else:
@@ -67,14 +69,14 @@ def _real_array(name: str, value: Any) -> Array:
             "ψ = (q0 + i p0)/√2 give q0 = √2 Re ψ and p0 = √2 Im ψ."
         )
     if not _is_real(kind):
-        seen = f": {value!s:.80}" if isinstance(value, np.ndarray) else ""
-        raise TypeError(f"{name} must be an array of real numbers, got dtype {kind}{seen}.")
+        text = f": {value!s:.80}" if isinstance(value, np.ndarray) else ""
+        raise TypeError(f"{name} must be an array of real numbers, got dtype {kind}{text}.")
     # A traced value that is not finite becomes the status of its trajectory.
     if isinstance(value, np.ndarray) and not np.isfinite(value).all():
         where = tuple(np.argwhere(~np.isfinite(value))[0].tolist())
-        at = f" at index {list(where)}" if where else ""
+        place = f" at index {list(where)}" if where else ""
         raise ValueError(
-            f"{name} has a value that is not finite{at}: {value[where]}. "
+            f"{name} has a value that is not finite{place}: {value[where]}. "
             "Every component of the initial conditions must be a finite number."
         )
     array = jnp.asarray(value)
@@ -87,12 +89,12 @@ def _is_real(dtype: Any) -> bool:
 
 def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> Array:
     """A number of this precision. **Raises** `ValueError` or `TypeError` with its name."""
-    value = _joined(value)
-    known = None if is_traced(value) else _as_numpy(name, value)
+    value = _join(value)
+    number = None if is_traced(value) else _as_numpy(name, value)
     # Not for a Python float, which has no precision of its own and takes that of the state.
     if isinstance(value, np.ndarray | np.generic) and value.dtype == np.float64:
         refuse_double_without_x64(name, value.dtype)
-    kind, shape = (value.dtype, value.shape) if known is None else (known.dtype, known.shape)
+    kind, shape = (value.dtype, value.shape) if number is None else (number.dtype, number.shape)
     if not _is_real(kind):
         kind = type(value).__name__
         raise TypeError(
@@ -105,15 +107,15 @@ def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> A
             f"each value. For dvi.integrate you can use jax.vmap over {name}."
             + (" Steps of different sizes need lattice=dvi.Given(ts)." if name == "h" else "")
         )
-    if known is not None and not np.isfinite(known):
-        raise ValueError(f"{name} must be finite, got {known}.")
-    if known is not None and not zero_allowed and known == 0:
+    if number is not None and not np.isfinite(number):
+        raise ValueError(f"{name} must be finite, got {number}.")
+    if number is not None and not zero_allowed and number == 0:
         raise ValueError(
             f"{name} must not be zero: no step would advance time. Give a positive h (forward) "
             "or a negative h (backward)."
         )
     # Cast in NumPy: each operation of JAX on a known number would cost some ten microseconds.
-    return jnp.asarray(value, dtype) if known is None else jnp.asarray(known.astype(dtype))
+    return jnp.asarray(value, dtype) if number is None else jnp.asarray(number.astype(dtype))
 
 
 def _as_numpy(name: str, value: Any) -> np.ndarray:
@@ -134,8 +136,8 @@ def as_parameter(leaf: Any) -> Any:
         leaf = np.asarray(leaf)
         refuse_double_without_x64("args", leaf.dtype)
         if leaf.dtype.kind in "OMm":
-            seen = f"dtype {leaf.dtype}: {leaf!s:.80}"
-            raise TypeError(f"args must contain arrays of numbers, got {seen}. Convert this array.")
+            text = f"dtype {leaf.dtype}: {leaf!s:.80}"
+            raise TypeError(f"args must contain arrays of numbers, got {text}. Convert this array.")
         return jnp.asarray(leaf)
     if not isinstance(leaf, jax.Array):
         # Everything but arrays is static: compiled programs are looked up by its hash.

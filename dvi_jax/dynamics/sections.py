@@ -16,7 +16,7 @@ from lanewise.jaxprs.jaxapi import is_traced
 
 from ..base.checks import finite, positive, whole
 from ..base.inputs import as_parameter, as_scalar, start_state
-from ..base.keywords import INTEGRATOR, taken, with_keywords_of
+from ..base.keywords import INTEGRATOR, take, with_keywords_of
 from ..base.results import RESULTS, status_name
 from ..base.types import Args, Scalar, State
 from ..engine.newton import RootSolver
@@ -75,7 +75,7 @@ def _settings(
     system: System, section: Section, num_steps, keywords: dict[str, Any], level: int | None = 5
 ) -> _Settings:
     """`level`: of the user's frame, for a warning; None: no warning."""
-    integrator = chosen(**taken(keywords, INTEGRATOR))
+    integrator = chosen(**take(keywords, INTEGRATOR))
     has_default = integrator.method is None and isinstance(default_method(system), TypeII)
     if has_default and level is not None:
         warnings.warn(

@@ -107,11 +107,11 @@ class StepSizes(Lattice):
     """Base of the lattices with a given step size, at least of the first step, and their number."""
 
     def prepare(self, t0, h, num_steps):
-        missing = [name for name, x in (("h", h), ("num_steps", num_steps)) if x is None]
-        if missing:
+        absent = [name for name, x in (("h", h), ("num_steps", num_steps)) if x is None]
+        if absent:
             hint = " The lattice dvi.Uniform() also accepts t1 or duration in place of num_steps."
             raise TypeError(
-                f"{' and '.join(missing)} must be given, because lattice={self!r} requires h and "
+                f"{' and '.join(absent)} must be given, because lattice={self!r} requires h and "
                 f"num_steps.{hint if num_steps is None else ''}"
             )
         return t0, h, check_num_steps(num_steps)

@@ -85,11 +85,11 @@ class CompositionMethod(Method):
             q, p, second = self.base.inverse(equations, parts[1].reversed(), q, p)
             return q, p, info.then(first).then(second)
 
-        pairs, rest = self._parts(interval)
+        pairs, single = self._parts(interval)
         q, p, info = _in_turn(pair, pairs)((q0, p0, no_step_yet(q0)))
-        if rest is None:
+        if single is None:
             return q, p, info
-        q, p, last = self.base.step(equations, rest, q, p)
+        q, p, last = self.base.step(equations, single, q, p)
         return q, p, info.then(last)
 
     def inverse(self, equations, interval, q1, p1):
@@ -101,10 +101,10 @@ class CompositionMethod(Method):
             q, p, first = self.base.inverse(equations, parts[0], q, p)
             return q, p, info.then(second).then(first)
 
-        pairs, rest = self._parts(interval)
+        pairs, single = self._parts(interval)
         q, p, info = q1, p1, no_step_yet(q1)
-        if rest is not None:
-            q, p, last = self.base.inverse(equations, rest, q, p)
+        if single is not None:
+            q, p, last = self.base.inverse(equations, single, q, p)
             info = info.then(last)
         return _in_turn(pair, pairs[::-1])((q, p, info))
 
@@ -142,8 +142,8 @@ def _in_turn(body: Callable, pairs: list) -> Callable:
         return functools.partial(body, parts=pairs[0])
     if not pairs:
         return lambda state: state
-    stacked = jax.tree.map(lambda *xs: jnp.stack(xs), *pairs)
-    return lambda state: lax.scan(lambda s, parts: (body(s, parts), None), state, stacked)[0]
+    stack = jax.tree.map(lambda *xs: jnp.stack(xs), *pairs)
+    return lambda state: lax.scan(lambda s, parts: (body(s, parts), None), state, stack)[0]
 
 
 def of_strang(*outer: float) -> tuple[float, ...]:
@@ -214,12 +214,12 @@ class Composition(CompositionMethod):
         hint = "Conditions of higher orders cannot be checked."
         whole("order", order, most=_MOST_CHECKED, hint=hint)
         defects = order_defects(c, order, base.order, base.is_symmetric)
-        found = next((n for n, defect in enumerate(defects) if defect > _DEFECT), order)
-        if found < order:
+        actual = next((n for n, defect in enumerate(defects) if defect > _DEFECT), order)
+        if actual < order:
             raise ValueError(
-                f"order={order} is too high: the coefficients have order {found}, not {order}. "
-                f"They violate the conditions of order {found + 1} by {defects[found]:.1e}; at "
-                f"most {_DEFECT} is allowed. Set order={found}, or give correct coefficients with "
+                f"order={order} is too high: the coefficients have order {actual}, not {order}. "
+                f"They violate the conditions of order {actual + 1} by {defects[actual]:.1e}; at "
+                f"most {_DEFECT} is allowed. Set order={actual}, or give correct coefficients with "
                 "16 digits."
             )
 

@@ -16,7 +16,7 @@ from ..base.signature import accepts, check_takes, signature_of
 from ..base.types import Args, ForceFn, HamiltonianFn, Scalar, State
 from ..engine.newton import Newton, Vector, find_root
 
-_NEAR = 1e-4
+_DEFECT = 1e-4
 """Fraction of the initial defect at which the damped search ends and Newton's method begins."""
 
 _MOST_TRIALS = 100
@@ -32,7 +32,7 @@ class _LegendreTransform(eqx.Module):
     root_finder: Newton
 
     def __call__(self, t: Scalar, q: State, p: State, args: Args) -> Scalar:
-        return _transformed(
+        return _legendre_transform(
             lambda v: self.L(t, q, v, args), p, self.root_finder, "L(t, q, v, args)"
         )
 
@@ -45,7 +45,9 @@ class _DiscreteLegendreTransform(eqx.Module):
 
     def __call__(self, t0: Scalar, t1: Scalar, q0: State, p1: State, args: Args) -> Scalar:
         name = "L_D(t0, t1, q0, v, args)"
-        return _transformed(lambda v: self.L_D(t0, t1, q0, v, args), p1, self.root_finder, name)
+        return _legendre_transform(
+            lambda v: self.L_D(t0, t1, q0, v, args), p1, self.root_finder, name
+        )
 
 
 class _FromLagrangian(eqx.Module):
@@ -59,7 +61,7 @@ class _FromLagrangian(eqx.Module):
     def __call__(self, t0: Scalar, t1: Scalar, q0: State, p1: State, args: Args) -> Scalar:
         h, name = t1 - t0, "L_d(t0, t1, q0, q1, args)"
         # The unknown is v, not q1: it stays of order one as h → 0.
-        return _transformed(
+        return _legendre_transform(
             lambda v: self.L_d(t0, t1, q0, q0 + h * v, args) / h, p1, self.root_finder, name, q0 / h
         )
 
@@ -140,15 +142,11 @@ def legendre(L: Callable[..., Any], root_finder: Newton = Newton()) -> Callable[
     # The number of arguments decides; a function that takes four and five cannot be classified.
     discrete, continuous = (callable(L) and accepts(L, count) for count in (5, 4))
     if discrete == continuous:
-        seen = signature_of(L) if callable(L) else repr(L)  # the value of a number, say
+        text = signature_of(L) if callable(L) else repr(L)  # the value of a number, say
         raise TypeError(
-            "L must be a function of (t, q, v, args) for a continuous Lagrangian, or of "
-            f"(t0, t1, q0, v, args) for a discrete Lagrangian, got {seen}. This object "
-            + (
-                "accepts both four and five arguments: wrap it in a lambda of four or of five."
-                if discrete
-                else "accepts neither four nor five arguments."
-            )
+            "L must be a function of (t, q, v, args), continuous, or of (t0, t1, q0, v, args), "
+            f"discrete, got {text}, which accepts "
+            + ("both: wrap it in a lambda of four or of five." if discrete else "neither.")
         )
     return (
         _DiscreteLegendreTransform(L, root_finder)
@@ -275,21 +273,21 @@ def velocity_force(H_D: HamiltonianFn, F: Callable[..., Any]) -> ForceFn:
     return _VelocityForce(H_D, F)
 
 
-def _transformed(
+def _legendre_transform(
     L: Callable[[State], Any], p: State, root_finder: Newton, name: str, scale: State | None = None
 ) -> Scalar:
     """p·v − L(v) at the v with ∂L/∂v = p; NaN where none is found. `scale`: a scale of the
     round-off of v, q0/h where v is a difference of positions."""
-    what = "an action" if name.startswith("L_d") else "an energy"
+    quantity = "an action" if name.startswith("L_d") else "an energy"
 
     def lagrangian(v):
-        return _require_scalar(L(v.reshape(p.shape)), name, p.shape, what)
+        return _require_scalar(L(v.reshape(p.shape)), name, p.shape, quantity)
 
-    known = p.ravel()
+    momentum = p.ravel()
     # A custom derivative may not close over traced values: they become arguments.
-    free, closed_over = jax.closure_convert(lagrangian, known)
-    scale = jnp.zeros_like(known) if scale is None else scale.ravel()
-    return _stationary(free, root_finder, known, closed_over, scale)
+    free, closed_over = jax.closure_convert(lagrangian, momentum)
+    scale = jnp.zeros_like(momentum) if scale is None else scale.ravel()
+    return _stationary(free, root_finder, momentum, closed_over, scale)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
@@ -322,10 +320,10 @@ def _velocity(
 
     # The matrix ∂²L/∂v² of a Lagrangian that is quadratic in v does not depend on v. This is
     # decided from the jaxpr, so that ∂H_D/∂p1 of a separable system is independent of q0 too.
-    rest = jnp.zeros_like(p)
-    if not depends_on(jax.jacfwd(slope), 0, rest):
-        return lanewise.solve(jax.jacfwd(slope)(rest), p - slope(rest))
-    start = _start(slope, p, rest)
+    zero = jnp.zeros_like(p)
+    if not depends_on(jax.jacfwd(slope), 0, zero):
+        return lanewise.solve(jax.jacfwd(slope)(zero), p - slope(zero))
+    start = _start(slope, p, zero)
     # Where v is small next to terms of p that cancel, its scale is that of their round-off.
     of_terms = lanewise.solve(jax.jacfwd(slope)(start), p)
     scale = jnp.maximum(jnp.abs(scale), jnp.abs(start) + jnp.abs(of_terms))
@@ -340,10 +338,10 @@ def _root(
     return jnp.where(info.converged, x, jnp.nan)
 
 
-def _start(slope: Callable[[Vector], Vector], p: Vector, rest: Vector) -> Vector:
+def _start(slope: Callable[[Vector], Vector], p: Vector, zero: Vector) -> Vector:
     """A v with slope(v) near p, by Newton's method with step halving, from rest."""
     # Without derivatives: a root does not depend on the start of the search.
-    free, closed_over = jax.closure_convert(slope, rest)
+    free, closed_over = jax.closure_convert(slope, zero)
     closed_over, p = lax.stop_gradient((closed_over, p))
 
     def defect(v):
@@ -355,27 +353,26 @@ def _start(slope: Callable[[Vector], Vector], p: Vector, rest: Vector) -> Vector
     def far(state):
         _, left, _, trials = state
         # Relative to the defect at rest, since an absolute limit would depend on the units.
-        return (left > _NEAR * size(rest)) & (trials < _MOST_TRIALS)
+        return (left > _DEFECT * size(zero)) & (trials < _MOST_TRIALS)
 
     def closer(state):
         v, left, part, trials = state
-        tried = v - part * lanewise.solve(jax.jacfwd(defect)(v), defect(v))
-        new = size(tried)
+        trial = v - part * lanewise.solve(jax.jacfwd(defect)(v), defect(v))
+        new = size(trial)
         gain = new < left  # false for NaN, beyond the domain of L
         # Doubled after a success, so that the search ends with full Newton steps.
         part = jnp.where(gain, jnp.minimum(2 * part, 1), part / 2)
-        return jnp.where(gain, tried, v), jnp.where(gain, new, left), part, trials + 1
+        return jnp.where(gain, trial, v), jnp.where(gain, new, left), part, trials + 1
 
-    start = (rest, size(rest), jnp.ones((), rest.dtype), 0)
+    start = (zero, size(zero), jnp.ones((), zero.dtype), 0)
     return lax.while_loop(far, closer, start)[0]
 
 
-def _require_scalar(value: Any, name: str, shape: tuple[int, ...], what: str) -> Scalar:
+def _require_scalar(value: Any, name: str, shape: tuple[int, ...], quantity: str) -> Scalar:
     value = jnp.asarray(value)
     if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
         raise ValueError(
-            f"{name} must return a real scalar ({what}), got an array of shape {value.shape} and "
-            f"dtype {value.dtype} for q0 of shape {shape}. Return one floating-point number: use "
-            "jnp.sum or one component of an array, and jnp.real of a complex value."
+            f"{name} must return a real scalar ({quantity}), got shape {value.shape} and dtype "
+            f"{value.dtype} for q0 of shape {shape}. Use jnp.sum, one component or jnp.real."
         )
     return value

@@ -11,7 +11,7 @@ import numpy as np
 from lanewise.jaxprs.jaxapi import x64_enabled
 
 from ..base.checks import instance, whole
-from ..base.keywords import INTEGRATOR, taken, with_keywords_of
+from ..base.keywords import INTEGRATOR, take, with_keywords_of
 from ..base.machine import machine_memory
 from ..integration.integrate import integrate
 from ..integration.integrator import chosen
@@ -219,7 +219,7 @@ def _make_sweep(system: Any, q0: Any, p0: Any, given: dict[str, Any]) -> Sweep:
             "there is nothing to store, because observe, save and stop are all missing: give "
             "observe={...}, or save=dvi.Save(final=True) to store the final states."
         )
-    start, of_integrator = given["start"], taken(dict(given), INTEGRATOR)
+    start, of_integrator = given["start"], take(dict(given), INTEGRATOR)
     # The name of the axis is not "method", which has another meaning in xarray's sel.
     method: Any = _as_axis_of_list("integrator", of_integrator.pop("method"))
     num_steps = _as_axis_of_list("num_steps", given["num_steps"])

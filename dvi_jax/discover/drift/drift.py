@@ -10,7 +10,7 @@ import numpy as np
 
 from ...base.checks import function
 from ...base.inputs import as_parameter, as_scalar, start_state
-from ...base.keywords import taken, with_keywords_of
+from ...base.keywords import take, with_keywords_of
 from ...base.reads import Reads, reads
 from ...base.results import status_name
 from ...integration.integrate import integrate
@@ -289,5 +289,5 @@ def _starts(q0: Any, p0: Any, batched: bool):
 
 def _settings(how: dict[str, Any]) -> dict[str, Any]:
     """What `integrate` receives of the keywords that both functions take from it."""
-    run = taken(how, "t0 args")  # removes them from `how`
+    run = take(how, "t0 args")  # removes them from `how`
     return run | {"args": jax.tree.map(as_parameter, run["args"]), "integrator": chosen(**how)}
