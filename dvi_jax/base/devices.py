@@ -51,9 +51,8 @@ def over_devices(
         entries = list(axes) if isinstance(axes, list | tuple) else [axes] * len(args)
         if len(entries) != len(args):
             raise ValueError(
-                "in_axes must be an integer, None, or a list with one entry for each argument. The "
-                f"function was called with {len(args)} arguments, but in_axes is {in_axes!r}, of "
-                f"length {len(entries)}."
+                "in_axes must be an integer, None, or a list with one entry for each argument. It "
+                f"is {in_axes!r}, of length {len(entries)}, for {len(args)} arguments."
             )
         for axis in entries:
             instance("each entry of in_axes", axis, int | None, "a whole number or None")
@@ -84,6 +83,6 @@ def _spec(x: Any, i: int, axis: int | None, count: int) -> PartitionSpec:
         raise ValueError(
             f"the length of the batch axis must be a multiple of {count}, the number of devices, "
             f"got {shape[axis]} (axis {axis} of shape {shape} in argument {i}, counted from 0). "
-            "Change the batch, or give fewer devices: devices=jax.devices()[:n]."
+            "Change the batch, or give devices=jax.devices()[:n]."
         )
     return PartitionSpec(*(None,) * (axis % len(shape)), LANES)

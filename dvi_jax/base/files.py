@@ -110,12 +110,12 @@ def read_npz(
     except Exception as error:  # zipfile and NumPy raise many types for damaged bytes
         raise ValueError(
             f"'{path}' is not the file of a {kind} of this package, or it is damaged "
-            f"({type(error).__name__}: {str(error).split('. ')[0]}). Check the path. If the path "
-            "is correct, restore the file from a backup, or remove it and repeat the computation."
+            f"({type(error).__name__}: {str(error).split('. ')[0]}). Check the path, or "
+            "remove the file and compute again."
         ) from None
     if number != form:
         raise ValueError(
             f"the file '{path}' has the format {number!r}, but this version of dvi_jax reads only "
-            f"{form!r}: use the version that wrote the file, or remove the file and compute again."
+            f"{form!r}: use the version that wrote it, or compute again."
         )
     return header, arrays

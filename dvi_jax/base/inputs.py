@@ -64,9 +64,8 @@ def _real_array(name: str, value: Any) -> Array:
         refuse_double_without_x64(name, kind)
     if kind.kind == "c":
         raise TypeError(
-            f"{name} must be real, got dtype {kind}. If its imaginary part is zero, take jnp.real. "
-            "Otherwise use real and imaginary parts as positions and momenta: for "
-            "ψ = (q0 + i p0)/√2 give q0 = √2 Re ψ and p0 = √2 Im ψ."
+            f"{name} must be real, got dtype {kind}. If its imaginary part is zero, take jnp.real; "
+            "for ψ = (q0 + i p0)/√2 give q0 = √2 Re ψ and p0 = √2 Im ψ."
         )
     if not _is_real(kind):
         text = f": {value!s:.80}" if isinstance(value, np.ndarray) else ""
@@ -103,8 +102,8 @@ def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> A
         )
     if shape != ():
         raise ValueError(
-            f"{name} must be one number, got an array of shape {shape}. Call the function once for "
-            f"each value. For dvi.integrate you can use jax.vmap over {name}."
+            f"{name} must be one number, got an array of shape {shape}. For several "
+            f"values use jax.vmap over {name}."
             + (" Steps of different sizes need lattice=dvi.Given(ts)." if name == "h" else "")
         )
     if number is not None and not np.isfinite(number):
@@ -171,7 +170,6 @@ def refuse_unit_or_mask(name: str, value: Any) -> None:
     if unit is not None:
         raise TypeError(
             f"{name} has the unit {str(unit) or '1'!r}, but numbers without units are required "
-            "here. Convert all quantities to one system of units and give plain numbers: "
-            "x.to_value(unit) of astropy, x.m_as(unit) of pint. For trajectories, "
+            "here: x.to_value(unit) of astropy, x.m_as(unit) of pint. "
             "dvi_jax.interop.integrate(..., units=...) accepts quantities of astropy."
         )

@@ -122,10 +122,9 @@ def _equation(eqn: Any, values: list[Any]) -> list[Any]:
         (body, *_) = bodies(eqn)
         return _evaluate(body.jaxpr, body.consts, values)
     raise NotImplementedError(
-        f"arithmetic=dvi.DoubleDouble() has no rule for the operation {name} of JAX, but a "
-        "function of this run uses it. Write this function with elementary functions, sums, "
-        "products, lanewise.solve(A, b) or loops. Or use arithmetic=dvi.Compensated(), and in a "
-        "search dvi.FloatingPoint()."
+        f"arithmetic=dvi.DoubleDouble() has no rule for the operation {name} of JAX in a "
+        "function of this run. Write it with elementary functions, sums, products, "
+        "lanewise.solve(A, b) or loops, or use arithmetic=dvi.Compensated()."
     )
 
 
@@ -329,8 +328,7 @@ def _call(eqn: Any, values: list[Any]) -> list[Any]:
     if eqn.params["lanes"] is not None:
         raise NotImplementedError(
             "arithmetic=dvi.DoubleDouble() has no rule for lanewise.batched, nor for jax.vmap of "
-            "lanewise.call, but a function of this run uses one of them. Use jax.vmap without "
-            "lanewise in this function, or use arithmetic=dvi.Compensated()."
+            "lanewise.call. Use jax.vmap without lanewise, or arithmetic=dvi.Compensated()."
         )
     inner = program.traced.all_inputs
     return _evaluate(inner.jaxpr, inner.consts, values)

@@ -145,15 +145,13 @@ class ExtendedSpace(eqx.Module):
         if isinstance(observable, Trend):
             raise ValueError(
                 "observe must not contain a dvi.Trend with lattice=TimeTransformed(...): its slope "
-                "would be the change per unit of fictitious time, not of t. Use observe=f instead "
-                "of dvi.Trend(f), and fit a line to its values against solution.ts, or "
-                "solution.ts[1:] if f is a function of a step."
+                "would be the change per unit of fictitious time, not of t. Use observe=f, "
+                "and fit a line to its values against solution.ts."
             )
         if isinstance(observable, Deviations):
             raise ValueError(
                 f"{type(observable).__name__} requires steps whose size does not depend on the "
-                "state. The step size of TimeTransformed depends on the state: use "
-                "lattice=dvi.Uniform() or lattice=dvi.Given(ts)."
+                "state: use lattice=dvi.Uniform() or lattice=dvi.Given(ts)."
             )
         if isinstance(observable, Section):
             return eqx.tree_at(lambda s: s.g, observable, _PointFunction(observable.g, self))

@@ -27,8 +27,8 @@ class Uniform(StepSizes):
             steps = length / (float(h) or 1.0)
         except TypeError:
             raise TypeError(
-                f"{span} and h must be numbers that are not traced, got {arguments}: they determine "
-                f"the number of steps. Under jax.jit or jax.vmap give num_steps."
+                f"{span} and h must be numbers that are not traced, got {arguments}. Under "
+                "jax.jit or jax.vmap give num_steps."
             ) from None
         count = round(steps) if math.isfinite(steps) else -1
         if count < 0:

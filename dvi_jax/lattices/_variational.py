@@ -99,8 +99,8 @@ class Variational(StepSizes):
         if not 0 < smallest <= 1 <= largest < float("inf"):
             raise ValueError(
                 "bounds of Variational must be a pair (smallest, largest) of finite numbers with "
-                f"0 < smallest ≤ 1 ≤ largest, got {self.bounds!r}. They limit the ratio of each "
-                "step size to the first step size h."
+                f"0 < smallest ≤ 1 ≤ largest, got {self.bounds!r}. They are "
+                "ratios to the first step size h."
             )
 
     def check(self, method, arithmetic):
@@ -220,8 +220,8 @@ class LatticeCondition(eqx.Module):
     ) -> Scalar:
         if self.system is None:
             raise ValueError(
-                "LatticeCondition requires the system and ε when it is called directly: make it by "
-                "dvi.LatticeCondition(system, epsilon). In dvi.integrate(observe=...) both are set."
+                "LatticeCondition requires the system and ε when it is called directly: "
+                "dvi.LatticeCondition(system, epsilon)."
             )
         equations = Equations(self.system, self.epsilon, args)
 

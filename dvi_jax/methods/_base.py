@@ -103,8 +103,7 @@ class Method(eqx.Module):
             raise ValueError(
                 "the functions of the system cannot be evaluated or differentiated for q of shape "
                 f"{q.shape} and args={args!r:.200}. {type(error).__name__}: {error}. Give the q "
-                "and the args that the system requires. If they are right, correct the functions: "
-                "H_D must return a scalar, and the force an array like q."
+                "and the args that the system requires."
             ) from error
         return answers[0]
 

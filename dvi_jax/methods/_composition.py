@@ -159,7 +159,7 @@ def _as_coefficients(values: Sequence[float]) -> tuple[float, ...]:
     except (TypeError, ValueError):
         raise TypeError(
             "coefficients of Composition must be a sequence of numbers, such as (0.2, 0.3, 0.3, "
-            f"0.2), got {values!r:.200}. Numbers traced by JAX are not possible: make the "
+            f"0.2), got {values!r:.200}. Make the "
             "Composition outside of jax.jit, jax.grad and jax.vmap."
         ) from None
 
@@ -208,8 +208,7 @@ class Composition(CompositionMethod):
         if not c or not all(math.isfinite(x) for x in c) or abs(math.fsum(c) - 1) > 1e-12:
             raise ValueError(
                 f"coefficients of Composition must be finite and sum to 1 up to 1e-12, got {c} "
-                f"with the sum {sum(c)!r}. If the coefficients of a table have too few digits, "
-                "compute one of them as 1 minus the sum of the others."
+                f"with the sum {sum(c)!r}. Compute one of them as 1 minus the sum of the others."
             )
         hint = "Conditions of higher orders cannot be checked."
         whole("order", order, most=_MOST_CHECKED, hint=hint)
@@ -219,8 +218,7 @@ class Composition(CompositionMethod):
             raise ValueError(
                 f"order={order} is too high: the coefficients have order {actual}, not {order}. "
                 f"They violate the conditions of order {actual + 1} by {defects[actual]:.1e}; at "
-                f"most {_DEFECT} is allowed. Set order={actual}, or give correct coefficients with "
-                "16 digits."
+                f"most {_DEFECT} is allowed."
             )
 
     def fractions(self):

@@ -81,8 +81,7 @@ def sequence_of(scheme: Any, parts: int) -> Flows:
         if parts != 2:
             raise ValueError(
                 f"the scheme {scheme} requires two parts, A + εB, got {parts}. Join the parts of "
-                "B, or name the part that contains the perturbation in dvi.Split(..., "
-                "perturbed=1), or use a scheme for any number of parts, such as dvi.Strang()."
+                "B, or use dvi.Split(..., perturbed=1) or a scheme such as dvi.Strang()."
             )
         a, b = coefficients
         pairs = itertools.zip_longest(a, b)

@@ -140,8 +140,7 @@ class WisdomHolman(SplittingMethod):
             raise ValueError(
                 'corrector must be 0 unless coordinates="jacobi" and scheme=dvi.Strang(), for '
                 f"which its coefficients are derived; got corrector={self.corrector}, coordinates="
-                f"{self.coordinates!r}, scheme={self.scheme!r}. For a smaller error use a scheme "
-                "such as (10, 6, 4)."
+                f"{self.coordinates!r}, scheme={self.scheme!r}."
             )
 
     def is_double_only(self, equations) -> bool:

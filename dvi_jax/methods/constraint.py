@@ -158,8 +158,8 @@ def check_start(equations: Equations, t: Scalar, q: State, p: State) -> None:
             i = int(np.argmax(np.where(flags, np.abs(value), -1)))
             raise ValueError(
                 f"the initial state is not consistent: {quantity} must be 0 to round-off, but "
-                f"component {i} is {float(value[i]):.3g}. dvi.project(system, q0, p0, args) "
-                "computes the nearest consistent state."
+                f"component {i} is {float(value[i]):.3g}. Use "
+                "dvi.project(system, q0, p0, args)."
             )
 
 
@@ -172,8 +172,8 @@ def _require_independent(defects: _Defects) -> None:
         rank = np.linalg.matrix_rank(rows, tol=8 * np.sqrt(np.finfo(rows.dtype).eps))
         raise ValueError(
             f"the constraint has {count} components, but the rank of ∂g/∂q at the initial state is "
-            f"{rank}: {count - rank} of them are redundant, so that the forces of constraint are "
-            "not determined. Leave out the components that follow from the others."
+            f"{rank}: {count - rank} of them are redundant. Leave out components that follow from "
+            "the others."
         )
 
 

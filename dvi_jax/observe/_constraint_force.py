@@ -45,7 +45,7 @@ class ConstraintForce(eqx.Module):
         if getattr(self.system, "constraint", None) is None:
             raise ValueError(
                 "ConstraintForce needs a system with a constraint: dvi.System(H_D, constraint=g). "
-                "Outside of dvi.integrate call observable.bind(system, epsilon) first."
+                "Outside of dvi.integrate call bind(system, epsilon) first."
             )
         equations = Equations(self.system, jnp.asarray(self.epsilon, q1.dtype), args)
 

@@ -46,8 +46,7 @@ class Reduction(eqx.Module):
         """
         raise NotImplementedError(
             f"{type(self).__name__} cannot be differentiated with adjoint=dvi.Reversible(): it has "
-            "no method combine(memory, k, t, value). Define this method in the class, or use "
-            "adjoint=dvi.Checkpointed()."
+            "no method combine(memory, k, t, value). Define it, or use adjoint=dvi.Checkpointed()."
         )
 
     @staticmethod
@@ -245,8 +244,7 @@ class Running(eqx.Module):
             text = getattr(self.reduction, "__name__", f"{self.reduction!r:.200}")
             raise TypeError(
                 "reduction of Running must be an object such as dvi.Mean(f) or dvi.MEGNO(), got "
-                f"{text}. A function, a class without parentheses and dvi.Section(...) are not "
-                "allowed: a Section has no value at every step."
+                f"{text}. A function and dvi.Section(...) are not allowed."
             )
 
 

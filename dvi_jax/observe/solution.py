@@ -66,15 +66,12 @@ class Save(eqx.Module):
             check_takes("the clock of Save", self.clock, "(t, q, p, args)")
         if self.ts is None:
             if self.clock is not None:
-                raise ValueError(
-                    "clock requires ts: write Save(ts=values, clock=...) with the values of the "
-                    "clock at which states are saved."
-                )
+                raise ValueError("clock requires ts: write Save(ts=values, clock=...).")
             return
         if self.every is not None or self.final:
             raise ValueError(
                 f"Save(ts=...) saves at the times ts only, got also every={self.every} and "
-                f"final={self.final}: leave out every and final. Add their times to ts if needed."
+                f"final={self.final}: leave out every and final."
             )
         if self.ts.ndim != 1 or self.ts.shape[0] == 0:
             raise ValueError(
@@ -89,7 +86,7 @@ class Save(eqx.Module):
                 text = np.array2string(np.asarray(self.ts), threshold=20)
                 raise ValueError(
                     "ts in Save(ts=...) must be finite and in ascending order, or for h < 0 in "
-                    f"descending order, got {text}. Remove NaN and infinity, and use np.sort(ts)."
+                    f"descending order, got {text}: use np.sort(ts)."
                 )
 
 

@@ -289,8 +289,7 @@ def _words(key: Any) -> Array:
         return array
     raise ValueError(
         "the key of a path must be one key of jax.random with the generator threefry2x32, such as "
-        f"jax.random.key(0), or an integer, got {key!r:.200}. For many paths use jax.vmap over "
-        'keys, or dvi.sweep(..., path=dvi.Axis("seed", range(1000))).'
+        f"jax.random.key(0), or an integer, got {key!r:.200}. For many paths use jax.vmap."
     )
 
 

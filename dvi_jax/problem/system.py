@@ -107,8 +107,8 @@ class System(eqx.Module):
         offenders = [n for n, f in functions.items() if getattr(f, "step_is_from_times", False)]
         if self.slow_time and offenders:
             raise ValueError(
-                f"{offenders[0]} must not compute the step as t1 − t0 if slow_time=True, where it is "
-                "ε h, as results of dvi.discretise(H, order) with order ≥ 2, dvi.from_lagrangian and "
+                f"{offenders[0]} must not compute the step as t1 − t0 if slow_time=True, where it "
+                "is ε h, as dvi.discretise(H, order) with order ≥ 2, dvi.from_lagrangian and "
                 "dvi.from_type_iii do. Use dvi.discretise(H, order=1) or dvi.legendre(L)."
             )
 
@@ -196,8 +196,8 @@ class System(eqx.Module):
             out = _traced_output(self.constraint, "constraint", kinds, (q, args))
             if len(out.shape) != 1 or 0 in out.shape or not jnp.issubdtype(out.dtype, jnp.floating):
                 raise ValueError(
-                    "constraint(q, args) must return a real array of shape (m,), m ≥ 1; for q of shape "
-                    f"{q.shape} it returned shape {out.shape}, dtype {out.dtype}. Use jnp.ravel."
+                    "constraint(q, args) must return a real array of shape (m,), m ≥ 1; for q of "
+                    f"shape {q.shape} it returned {out.shape}, dtype {out.dtype}. Use jnp.ravel."
                 )
 
 
