@@ -5,10 +5,8 @@ from typing import TYPE_CHECKING
 
 from lanewise import Layout as Layout
 
-from .base.cpu import configure_cpu as configure_cpu
 from .base.devices import over_devices as over_devices
 from .base.results import RESULTS as RESULTS, IntegrationError as IntegrationError
-from .base.threads import over_threads as over_threads
 from .base.types import Interval as Interval
 from .engine.newton import Newton as Newton, RootSolver as RootSolver
 from .engine.picard import Picard as Picard, PicardThenNewton as PicardThenNewton

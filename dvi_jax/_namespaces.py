@@ -93,7 +93,7 @@ SHORT = (
     *("Polynomials", "ShadowHamiltonian"),
     *("sweep", "Axis", "open_sweep", "fit", "Observations"),
     *("poincare_section", "frequencies", "tangent_map"),
-    *("over_threads", "over_devices"),
+    "over_devices",
 )
 """Names that `dir(dvi_jax)` lists next to the namespaces. All other names are listed in their
 namespace; each is also an attribute of `dvi_jax`."""

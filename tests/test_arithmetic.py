@@ -12,7 +12,7 @@ from helpers import ADJOINTS, ARGS, METHODS as REGISTERED, SYSTEMS, covering, pe
 import dvi_jax as dvi
 from dvi_jax import systems
 from dvi_jax.base.types import Interval
-from dvi_jax.methods.step import Equations, _solved, to_grid
+from dvi_jax.methods.step import Equations, _solve, to_grid
 from lanewise.rules.exact import two_sum
 
 METHODS = {
@@ -151,7 +151,7 @@ def test_an_equilibrium_is_solved_for_in_its_own_size():
     def solved(start, known):
         rate = functools.partial(equations.momentum_rate, interval, 0 * q)
         guess = start + h * rate(start)
-        _, info = _solved(rate, h, start, guess, equations, known)
+        _, info = _solve(rate, h, start, guess, equations, known)
         return info.iterations, info.converged
 
     starts = np.linspace(-2e-15, 2e-15, 50)[:, None]

@@ -574,7 +574,7 @@ INVALID = [
     (lambda: dvi.GALI(2, scale=("a", 1.0)), ValueError, "scale of q in GALI .* 'a'"),
     (lambda: dvi.SALI(scale=(1j, 1.0)), ValueError, "scale of q in SALI .* 1j"),
     (lambda: dvi.Running(HENON.observables["energy"]), TypeError, "reduction of Running must"),
-    (lambda: dvi.Running(dvi.Section(lambda t, q, p, a: q[0])), TypeError, "value at every step"),
+    (lambda: dvi.Running(dvi.Section(lambda t, q, p, a: q[0])), TypeError, "dvi.Section"),
 ]
 
 

@@ -595,7 +595,7 @@ def test_arguments_of_the_wrong_kind_are_refused():
         with pytest.raises(TypeError, match="Wrap the discrete"):
             search(H_D, two, **given)
         with pytest.raises(TypeError, match="root_finder must be"):
-            search(SPRING, two, newton=5, **given)
+            search(SPRING, two, root_finder=5, **given)
     with pytest.raises(ValueError, match=r"the shape \(1,\) for .* got q of shape \(2,\)"):
         found("spring", 4, 2).evaluate([0.1, 0.2], [0.3, 0.4], 0.1)
     with pytest.raises(TypeError, match=r"method must be an instance of dvi.Method"):

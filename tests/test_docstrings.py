@@ -5,7 +5,6 @@ import contextlib
 import inspect
 import io
 import re
-import subprocess
 import sys
 from pathlib import Path
 
@@ -46,8 +45,6 @@ DOCSTRINGS |= {
 DOCSTRINGS = {name: blocks for name, blocks in DOCSTRINGS.items() if blocks}
 
 FAST = ("dvi.Given", "generators.rotation", "plot.orbit")
-OWN_PROCESS = ("dvi.configure_cpu",)
-"""Examples that have to run before JAX starts."""
 
 
 def wanted(code):
@@ -111,11 +108,7 @@ def test_the_example_of_the_page_prints_what_it_says(name, known, tmp_path, monk
         pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)
     plt.switch_backend("Agg")
-    if name in OWN_PROCESS:
-        alone = [sys.executable, "-c", PAGE.imports + code]
-        printed = subprocess.run(alone, capture_output=True, text=True, check=True).stdout.rstrip()
-    else:
-        printed = run(code, known(code))
+    printed = run(code, known(code))
     figures = [plt.figure(number) for number in plt.get_fignums()]
     plt.close("all")
     assert wanted(code) or any(axis.has_data() for f in figures for axis in f.axes)
@@ -195,7 +188,7 @@ def test_what_people_call_first_has_an_example_in_its_docstring():
     first = {
         "System", "discretise", "integrate", "Save", "MaxDrift", "Section", "Stop", "MEGNO",
         "find_symmetries", "discover_invariants", "drift_order", "noether_balance", "sweep", "fit",
-        "poincare_section", "frequencies", "over_threads",
+        "poincare_section", "frequencies",
     }  # fmt: skip
     assert {f"dvi.{name}" for name in first} <= set(DOCSTRINGS)
 

@@ -143,7 +143,7 @@ def type_iii(t0, t1, q1, p0, args):
 
 
 IMPLICIT = dvi.System(implicit)
-NAMED = {
+ROOT_FINDERS = {
     **CALLS,
     "invariant_diffusion": diffusion,
     "Integrator": lambda **how: last(integrator=dvi.Integrator(**how)),
@@ -156,42 +156,43 @@ NAMED = {
     "from_type_iii": lambda **how: value_of(dvi.from_type_iii(type_iii, **how)),
     "solve_ivp": lambda **how: interop.solve_ivp(IMPLICIT, (0, 1.0), [0.5, 0.1], h=0.1, **how).y,
 }
-"""Every public function with the keyword `newton`; `diffrax_solver` needs diffrax."""
+"""Public functions with the keyword `root_finder`; three of them also take `newton`."""
 
 
-@pytest.mark.parametrize("name", NAMED)
-def test_root_finder_and_newton_are_one_keyword(name):
-    call, solver = NAMED[name], dvi.Newton(max_steps=30)
-    one, other = (np.asarray(call(**{key: solver})) for key in ("root_finder", "newton"))
-    np.testing.assert_array_equal(one, other)
-    with pytest.raises(TypeError, match="are two names of one argument: leave one out"):
-        call(root_finder=solver, newton=solver)
+@pytest.mark.parametrize("name", ROOT_FINDERS)
+def test_a_root_finder_is_used(name):
+    """`newton` is another name of it for `integrate` and `Integrator` only."""
+    call, solver = ROOT_FINDERS[name], dvi.Newton(max_steps=30)
+    expected = np.asarray(call(root_finder=solver))
+    assert np.isfinite(expected).all()
+    if name in ("integrate", "Integrator", "Model"):
+        np.testing.assert_array_equal(call(newton=solver), expected)
+        with pytest.raises(TypeError, match="two names of one argument"):
+            call(root_finder=solver, newton=solver)
+    else:
+        with pytest.raises(TypeError, match="argument 'newton'"):
+            call(newton=solver)
     with pytest.raises((TypeError, AttributeError)):
         call(root_finder="a word")
 
 
-def test_diffrax_solver_takes_both_names():
-    pytest.importorskip("diffrax")
-    solver = dvi.Newton(max_steps=30)
-    assert interop.diffrax_solver(root_finder=solver) == interop.diffrax_solver(newton=solver)
+def test_no_function_with_a_root_finder_is_missing_here():
+    public = [getattr(dvi, name) for name in _namespaces.names()] + [interop.solve_ivp]
+    excepted = (dvi.Implicit, dvi.sweep_cost)  # the last as `sweep`
+    found = {
+        f.__name__ for f in public if callable(f) and _has_root_finder(f) and f not in excepted
+    }
+    assert found | {"Model"} == {*ROOT_FINDERS}
 
 
-def test_no_function_with_newton_is_missing_here():
-    public = [getattr(dvi, name) for name in _namespaces.names()]
-    public += [interop.solve_ivp, interop.diffrax_solver]
-    excepted = (dvi.Equations, dvi.PicardThenNewton, dvi.sweep_cost)  # the last as `sweep`
-    found = {f.__name__ for f in public if callable(f) and _has_newton(f) and f not in excepted}
-    assert found | {"Integrator", "Model", "diffrax_solver"} == {*NAMED, "diffrax_solver"}
-
-
-def _has_newton(f) -> bool:
+def _has_root_finder(f) -> bool:
     try:
-        return "newton" in inspect.signature(f).parameters
+        return "root_finder" in inspect.signature(f).parameters
     except (TypeError, ValueError):
         return False
 
 
-OF_A_RUN = {"t0", "args", "newton", "integrator"}
+OF_A_RUN = {"t0", "args", "root_finder", "integrator"}
 SEARCHES = {
     dvi.discover_invariants: {"method"},
     dvi.drift_order: {"method"},

@@ -121,7 +121,7 @@ def wrong_digits():
 )  # fmt: skip
 def test_an_order_that_coefficients_do_not_have_is_rejected(coefficients, claimed, found):
     assert dvi.Composition(coefficients, order=found).order == found
-    with pytest.raises(ValueError, match=f"have order {found}, not {claimed}.*Set order={found}"):
+    with pytest.raises(ValueError, match=f"have order {found}, not {claimed}"):
         dvi.Composition(coefficients, order=claimed)
 
 
@@ -130,7 +130,7 @@ def test_printed_digits_are_enough_for_a_claim():
     good, poor = ([round(x, n) for x in (0.784513610477557, 0.235573213359358)] for n in (12, 6))
     third = -1.177679984178871
     assert dvi.Composition(of_strang(*good, third), order=6).is_symmetric
-    with pytest.raises(ValueError, match="with 16 digits"):
+    with pytest.raises(ValueError, match="violate the conditions"):
         dvi.Composition(of_strang(*poor, third), order=6)
 
 

@@ -14,7 +14,7 @@ def bar(console):
 
 
 def shown(progress):
-    with _progress.told(progress, bar) as show:
+    with _progress.reporter(progress, bar) as show:
         return show
 
 

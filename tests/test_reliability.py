@@ -204,7 +204,7 @@ def test_a_damaged_checkpoint_is_refused_and_stays(tmp_path, monkeypatch):
     take_step(a_run(file), 3.0)
     damaged = file.read_bytes()[:-30]
     file.write_bytes(damaged)
-    with pytest.raises(ValueError, match=r"checkpoint\.npz' is not the file of .*or remove it"):
+    with pytest.raises(ValueError, match=r"checkpoint\.npz' is not the file of .*or remove the"):
         a_run(file)
     assert file.read_bytes() == damaged
 

@@ -242,7 +242,8 @@ def test_the_error_for_a_single_initial_condition_says_how_to_give_it():
 
 
 def test_signatures_list_the_keywords_that_are_passed_on():
-    of_all = {"h", "num_steps", "t0", "epsilon", "args", "method", "newton", "integrator", "throw"}
+    of_all = {"h", "num_steps", "t0", "epsilon", "args", "method", "root_finder"}
+    of_all |= {"integrator", "throw"}
     for function in (dvi.poincare_section, dvi.bifurcation, dvi.tangent_map):
         assert of_all <= set(inspect.signature(function).parameters)
     listed = inspect.signature(dvi.bifurcation).parameters

@@ -121,7 +121,7 @@ DIFFERENT = {
     ],
     "one number of an axis": [{"epsilon": dvi.Axis("e", x), "t0": 0.0} for x in TABLE],
     "the start": [{"q0": Q}, {"q0": Q * 2}],
-    "the tolerance": [{"newton": dvi.Newton(rtol=r)} for r in (1e-12, 1e-13)],
+    "the tolerance": [{"root_finder": dvi.Newton(rtol=r)} for r in (1e-12, 1e-13)],
     "the method": [{"method": dvi.Yoshida(4)}, {"method": dvi.Suzuki(4)}],
     "a box of starts": [
         {"q0": None, "p0": None, "start": dvi.starts.Random(4, ([0.0], [0.0]), ([b], [1.0]))}

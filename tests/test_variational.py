@@ -292,7 +292,7 @@ def test_progress_changes_nothing():
         (
             lambda: kepler(0.1, 3, arithmetic=dvi.FixedPoint(2.0**-40)),
             ValueError,
-            "cannot be computed backwards bit for bit",
+            "cannot be undone bit for bit",
         ),
         (lambda: kepler(None, 3), TypeError, r"^h must be given, .* requires h and"),
         (

@@ -52,8 +52,6 @@ FOLDERS = {
     "dvi_jax.lattices": "lattices",
     "dvi_jax.engine": "solvers",
     "dvi_jax.base.devices": "solvers",
-    "dvi_jax.base.threads": "solvers",
-    "dvi_jax.base.cpu": "solvers",
     "lanewise": "solvers",
     "dvi_jax.observe": "observables",
     "dvi_jax.observe.solution": "integration",

@@ -16,8 +16,8 @@ def whole(name: str, value: Any, least: int = 1, most: int | None = None, hint: 
     fits = isinstance(value, int | np.integer) and not isinstance(value, bool)
     if not fits or value < least or (most is not None and value > most):
         span = f"of at least {least}" if most is None else f"from {least} to {most}"
-        seen = f"{value!r:.200}" + ("" if fits else f" (type {type(value).__name__})")
-        raise ValueError(f"{name} must be an integer {span}, got {seen}.{_more(hint)}")
+        text = f"{value!r:.200}" + ("" if fits else f" (type {type(value).__name__})")
+        raise ValueError(f"{name} must be an integer {span}, got {text}.{_sentence(hint)}")
     return int(value)
 
 
@@ -26,7 +26,7 @@ def positive(name: str, value: Any, zero: bool = False, hint: str = "") -> float
     fits = _is_number(value) and math.isfinite(value)
     if not fits or value < 0 or (value == 0 and not zero):
         kind = "zero or a positive finite number" if zero else "a positive and finite number"
-        raise ValueError(f"{name} must be {kind}, got {value!r}.{_more(hint)}")
+        raise ValueError(f"{name} must be {kind}, got {value!r}.{_sentence(hint)}")
     return float(value)
 
 
@@ -40,42 +40,46 @@ def fraction(name: str, value: Any) -> float:
 def finite(name: str, value: Any, hint: str = "") -> float:
     """A finite number. **Raises** `ValueError`."""
     if not _is_number(value) or not math.isfinite(value):
-        raise ValueError(f"{name} must be a finite number, got {value!r}.{_more(hint)}")
+        raise ValueError(f"{name} must be a finite number, got {value!r}.{_sentence(hint)}")
     return float(value)
 
 
-def one_of(name: str, value: Any, known: Iterable[Any], hint: str = "") -> Any:
+def one_of(name: str, value: Any, choices: Iterable[Any], hint: str = "") -> Any:
     """One of the known values. **Raises** `ValueError`."""
-    known = list(known)
+    choices = list(choices)
     # The types are compared as well: True == 1, and an array has no truth value.
-    if not any(value is one or (type(value) is type(one) and value == one) for one in known):
-        these = ("one of " if len(known) > 1 else "") + ", ".join(map(repr, known))
+    if not any(
+        value is choice or (type(value) is type(choice) and value == choice) for choice in choices
+    ):
+        names = ("one of " if len(choices) > 1 else "") + ", ".join(map(repr, choices))
         kind = f" (type {type(value).__name__})" if isinstance(value, bool | float) else ""
-        raise ValueError(f"{name} must be {these}, got {value!r:.200}{kind}.{_more(hint)}")
+        raise ValueError(f"{name} must be {names}, got {value!r:.200}{kind}.{_sentence(hint)}")
     return value
 
 
-def instance(name: str, value: Any, kind: Any, called: str, hint: str = "") -> Any:
+def instance(name: str, value: Any, kind: Any, description: str, hint: str = "") -> Any:
     """An instance of a class (or of one of several); `called` is its name in the message.
 
     **Raises** `TypeError`.
     """
     if not isinstance(value, kind):
-        seen = f"{value!r:.200}"
+        text = f"{value!r:.200}"
         # The class in place of an object is the usual mistake: dvi.Strang for dvi.Strang().
         if isinstance(value, type):
-            seen = f"the class {value.__name__} (is a pair of parentheses missing?)"
+            text = f"the class {value.__name__} (is a pair of parentheses missing?)"
         elif inspect.isfunction(value):  # its repr has an address
-            seen = f"the function {value.__name__}"
-        raise TypeError(f"{name} must be {called}, got {seen}.{_more(hint)}")
+            text = f"the function {value.__name__}"
+        raise TypeError(f"{name} must be {description}, got {text}.{_sentence(hint)}")
     return value
 
 
 def function(name: str, value: Any, arguments: str = "", hint: str = "") -> Callable[..., Any]:
     """A function; `arguments`: of what, such as "(t, q, p, args)". **Raises** `TypeError`."""
     if not callable(value):
-        of = f" of {arguments}" if arguments else ""
-        raise TypeError(f"{name} must be a function{of}, got {value!r:.200}.{_more(hint)}")
+        signature = f" of {arguments}" if arguments else ""
+        raise TypeError(
+            f"{name} must be a function{signature}, got {value!r:.200}.{_sentence(hint)}"
+        )
     return value
 
 
@@ -91,21 +95,26 @@ SYNONYMS = {
     "event": "stop",
     "events": "stop",
     "grid": "lattice",
+    "newton": "root_finder",
 }
 """Names of arguments in other packages → the name here."""
 
 
-def refuse_unknown(name: str, function: Callable[..., Any], unknown: Iterable[str]) -> None:
+def refuse_unknown(name: str, function: Callable[..., Any], keywords: Iterable[str]) -> None:
     """**Raises** `TypeError` for keywords that the function does not have, with the one meant."""
-    for keyword in unknown:
-        known = [
+    for keyword in keywords:
+        names = [
             k for k, p in inspect.signature(function).parameters.items() if p.kind != p.VAR_KEYWORD
         ]
-        close = difflib.get_close_matches(keyword, known, 1, 0.6)
+        close = difflib.get_close_matches(keyword, names, 1, 0.6)
         # Synonyms first: by spelling alone the nearest name to dt0 would be t0.
-        meant = SYNONYMS.get(keyword) if SYNONYMS.get(keyword) in known else None
-        meant = meant or (close[0] if close else None)
-        hint = f" Did you mean {meant!r}?" if meant else f" Its arguments are {', '.join(known)}."
+        suggestion = SYNONYMS.get(keyword) if SYNONYMS.get(keyword) in names else None
+        suggestion = suggestion or (close[0] if close else None)
+        hint = (
+            f" Did you mean {suggestion!r}?"
+            if suggestion
+            else f" Its arguments are {', '.join(names)}."
+        )
         if keyword in ("rtol", "atol", "tolerance"):
             hint = " No tolerance controls the size of the steps: choose h."
         raise TypeError(f"{name} has no argument {keyword!r}.{hint}")
@@ -120,5 +129,5 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, numbers.Real | np.number) and not isinstance(value, bool)
 
 
-def _more(hint: str) -> str:
+def _sentence(hint: str) -> str:
     return f" {hint}" if hint else ""

@@ -39,32 +39,33 @@ def over_devices(
     an object that is not a function.
     """
     check_function("the argument of over_devices", function, hint="Give jax.vmap(f), for example.")
-    chosen = np.asarray(jax.devices() if devices is None else list(devices))
-    if chosen.size == 0:
+    array = np.asarray(jax.devices() if devices is None else list(devices))
+    if array.size == 0:
         raise ValueError("devices is empty: give at least one, or leave devices out to use all.")
     whole("out_axes", out_axes, least=0)
     # Auto: shardings of arguments outside are left to JAX, and need not be declared.
-    mesh = jax.sharding.Mesh(chosen, (LANES,), axis_types=(AxisType.Auto,))
+    mesh = jax.sharding.Mesh(array, (LANES,), axis_types=(AxisType.Auto,))
 
     def call(*args: Any) -> Any:
-        given: Any = in_axes
-        each = list(given) if isinstance(given, list | tuple) else [given] * len(args)
-        if len(each) != len(args):
+        axes: Any = in_axes
+        entries = list(axes) if isinstance(axes, list | tuple) else [axes] * len(args)
+        if len(entries) != len(args):
             raise ValueError(
-                "in_axes must be an integer, None, or a list with one entry for each argument. The "
-                f"function was called with {len(args)} arguments, but in_axes is {in_axes!r}, of "
-                f"length {len(each)}."
+                "in_axes must be an integer, None, or a list with one entry for each argument. It "
+                f"is {in_axes!r}, of length {len(entries)}, for {len(args)} arguments."
             )
-        for axis in each:
+        for axis in entries:
             instance("each entry of in_axes", axis, int | None, "a whole number or None")
         specs = tuple(
-            jax.tree.map(lambda x, i=i: _spec(x, i, each[i], chosen.size), argument)
+            jax.tree.map(lambda x, i=i: _spec(x, i, entries[i], array.size), argument)
             for i, argument in enumerate(args)
         )
         out = PartitionSpec(*(None,) * out_axes, LANES)
         # With check_vma=True there would be no reversible gradient: `integration/reversible.py`.
-        mapped = jax.shard_map(function, mesh=mesh, in_specs=specs, out_specs=out, check_vma=False)
-        return mapped(*args)
+        sharded_call = jax.shard_map(
+            function, mesh=mesh, in_specs=specs, out_specs=out, check_vma=False
+        )
+        return sharded_call(*args)
 
     return call
 
@@ -82,6 +83,6 @@ def _spec(x: Any, i: int, axis: int | None, count: int) -> PartitionSpec:
         raise ValueError(
             f"the length of the batch axis must be a multiple of {count}, the number of devices, "
             f"got {shape[axis]} (axis {axis} of shape {shape} in argument {i}, counted from 0). "
-            "Change the batch, or give fewer devices: devices=jax.devices()[:n]."
+            "Change the batch, or give devices=jax.devices()[:n]."
         )
     return PartitionSpec(*(None,) * (axis % len(shape)), LANES)

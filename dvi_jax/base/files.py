@@ -20,7 +20,7 @@ def publish(path: Path, content: bytes) -> None:
     # Under another name in the same folder, then renamed: only within one file system is a rename
     # atomic. The name is unique, because several processes may write one file.
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}{TEMPORARY}")
-    made = _make_folders(path.parent)
+    parents = _make_folders(path.parent)
     try:
         with open(temporary, "wb") as file:
             file.write(content)
@@ -33,19 +33,19 @@ def publish(path: Path, content: bytes) -> None:
         with contextlib.suppress(OSError):
             temporary.unlink()
         raise
-    for folder in (path.parent, *made):
+    for folder in (path.parent, *parents):
         sync(folder)
 
 
 def _make_folders(folder: Path) -> list[Path]:
     """Make a folder and its parents; the folders that have new entries, to be synced."""
-    missing = []
+    folders = []
     while not folder.exists():
-        missing.append(folder)
+        folders.append(folder)
         folder = folder.parent
-    for new in reversed(missing):
+    for new in reversed(folders):
         new.mkdir(exist_ok=True)  # another process may have been faster
-    return [new.parent for new in missing]
+    return [new.parent for new in folders]
 
 
 def sync(folder: Path) -> None:
@@ -80,12 +80,12 @@ def publish_npz(
     try:
         publish(path, content.getvalue())
     except OSError as error:
-        why = f"{error.strerror or error}: give another path, or permit writing to this one"
-        raise OSError(error.errno, why, str(path)) from error
+        message = f"{error.strerror or error}: give another path, or permit writing to this one"
+        raise OSError(error.errno, message, str(path)) from error
 
 
 def read_npz(
-    path: str | os.PathLike[str], form: int, what: str
+    path: str | os.PathLike[str], form: int, kind: str
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Header and arrays of a file of `publish_npz`; `what` names its content in messages.
 
@@ -94,28 +94,28 @@ def read_npz(
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(
-            f"the file of a {what} does not exist: there is no file '{path}'. Check the path."
+            f"the file of a {kind} does not exist: there is no file '{path}'. Check the path."
         )
     try:
         # Without pickles: loading one would execute code from the file.
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-        about = json.loads(str(arrays.pop("about")))
-        found = about["format"]
+        header = json.loads(str(arrays.pop("about")))
+        number = header["format"]
         # The directory of a zip file has no checksum: a flipped bit there can hide an array.
-        if set(about.get("holds", arrays)) != set(arrays):
+        if set(header.get("holds", arrays)) != set(arrays):
             raise ValueError("an array is missing in it")
     except PermissionError:
         raise
     except Exception as error:  # zipfile and NumPy raise many types for damaged bytes
         raise ValueError(
-            f"'{path}' is not the file of a {what} of this package, or it is damaged "
-            f"({type(error).__name__}: {str(error).split('. ')[0]}). Check the path. If the path "
-            "is correct, restore the file from a backup, or remove it and repeat the computation."
+            f"'{path}' is not the file of a {kind} of this package, or it is damaged "
+            f"({type(error).__name__}: {str(error).split('. ')[0]}). Check the path, or "
+            "remove the file and compute again."
         ) from None
-    if found != form:
+    if number != form:
         raise ValueError(
-            f"the file '{path}' has the format {found!r}, but this version of dvi_jax reads only "
-            f"{form!r}: use the version that wrote the file, or remove the file and compute again."
+            f"the file '{path}' has the format {number!r}, but this version of dvi_jax reads only "
+            f"{form!r}: use the version that wrote it, or compute again."
         )
-    return about, arrays
+    return header, arrays

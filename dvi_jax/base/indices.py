@@ -14,29 +14,31 @@ _OPERATIONS: dict[str, Any] = {
     "lt": np.less,
     "add": np.add,
     "sub": np.subtract,
-    "select_n": lambda which, no, yes: np.where(which, yes, no),
+    "select_n": lambda condition, no, yes: np.where(condition, yes, no),
     "convert_element_type": lambda x: x,
     "squeeze": np.squeeze,
 }
 """Operations that JAX applies to an index before it is used."""
 
 
-def out_of_bounds(traced: ClosedJaxpr) -> Iterator[tuple[int, int]]:
+def out_of_bounds(program: ClosedJaxpr) -> Iterator[tuple[int, int]]:
     """(index, size of the axis) of each constant index that is not in its array.
 
     JAX moves such an index to the end of the array without an error.
     """
-    known: dict[Any, np.ndarray] = dict(zip(traced.jaxpr.constvars, traced.consts, strict=True))
+    constants: dict[Any, np.ndarray] = dict(
+        zip(program.jaxpr.constvars, program.consts, strict=True)
+    )
 
     def value(x: Any) -> np.ndarray | None:
-        found = x.val if isinstance(x, Literal) else known.get(x)
+        constant = x.val if isinstance(x, Literal) else constants.get(x)
         try:
-            array = None if found is None else np.asarray(found)
+            array = None if constant is None else np.asarray(constant)
         except Exception:  # a traced constant has no value
             return None
         return array if array is not None and array.size <= SMALL else None
 
-    for equation in traced.jaxpr.eqns:
+    for equation in program.jaxpr.eqns:
         name, inputs = equation.primitive.name, [value(x) for x in equation.invars]
         if name in ("pjit", "jit") and "jaxpr" in equation.params:
             yield from out_of_bounds(equation.params["jaxpr"])
@@ -51,15 +53,15 @@ def out_of_bounds(traced: ClosedJaxpr) -> Iterator[tuple[int, int]]:
             axes = equation.params["dimension_numbers"].start_index_map
             shape = equation.invars[0].aval.shape
             for axis, column in zip(axes, np.moveaxis(inputs[1], -1, 0), strict=True):
-                outside = column[(column < 0) | (column >= shape[axis])]
+                violations = column[(column < 0) | (column >= shape[axis])]
                 # One wrong index of an array is enough for a message.
-                yield from ((int(i), shape[axis]) for i in outside.ravel()[:1])
+                yield from ((int(i), shape[axis]) for i in violations.ravel()[:1])
         elif name == "broadcast_in_dim" and inputs[0] is not None:
             shape, axes = equation.params["shape"], equation.params["broadcast_dimensions"]
             if np.prod(shape) <= SMALL:
-                ones = [
+                lengths = [
                     inputs[0].shape[axes.index(i)] if i in axes else 1 for i in range(len(shape))
                 ]
-                known[equation.outvars[0]] = np.broadcast_to(inputs[0].reshape(ones), shape)
+                constants[equation.outvars[0]] = np.broadcast_to(inputs[0].reshape(lengths), shape)
         elif name in _OPERATIONS and all(x is not None for x in inputs):
-            known[equation.outvars[0]] = _OPERATIONS[name](*inputs)
+            constants[equation.outvars[0]] = _OPERATIONS[name](*inputs)

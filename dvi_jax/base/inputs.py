@@ -10,7 +10,6 @@ from jaxtyping import Array
 from lanewise.jaxprs.jaxapi import is_traced
 
 from .precision import refuse_double_without_x64
-from .quantities import refuse_unit_or_mask
 
 
 def start_state(q0: Any, p0: Any) -> tuple[Array, Array]:
@@ -33,27 +32,29 @@ def start_state(q0: Any, p0: Any) -> tuple[Array, Array]:
     return q, p
 
 
-def as_times(of: str, ts: Any) -> Array:
+def as_times(call: str, ts: Any) -> Array:
     """Times as an array of real numbers; `of`: the name of the call in messages."""
-    ts = _joined(ts)
+    ts = _join(ts)
     if not is_traced(ts):
         ts = _as_numpy("ts", ts)
         refuse_double_without_x64("ts", ts.dtype)
     if jnp.issubdtype(ts.dtype, jnp.integer):
         ts = ts.astype(jnp.result_type(float))
     if not jnp.issubdtype(ts.dtype, jnp.floating):
-        raise TypeError(f"ts in {of} must be real numbers, got dtype {ts.dtype}: use floats.")
+        raise TypeError(f"ts in {call} must be real numbers, got dtype {ts.dtype}: use floats.")
     return jnp.asarray(ts)
 
 
-def _joined(value: Any) -> Any:
+def _join(value: Any) -> Any:
     """A list with traced numbers as one array, which NumPy cannot make."""
-    traced = isinstance(value, list | tuple) and any(is_traced(x) for x in jax.tree.leaves(value))
-    return jnp.asarray(value) if traced else value
+    has_tracer = isinstance(value, list | tuple) and any(
+        is_traced(x) for x in jax.tree.leaves(value)
+    )
+    return jnp.asarray(value) if has_tracer else value
 
 
 def _real_array(name: str, value: Any) -> Array:
-    value = original = _joined(value)
+    value = original = _join(value)
     if isinstance(value, jax.Array) and is_traced(value):
         kind = value.dtype
     else:
@@ -63,19 +64,18 @@ def _real_array(name: str, value: Any) -> Array:
         refuse_double_without_x64(name, kind)
     if kind.kind == "c":
         raise TypeError(
-            f"{name} must be real, got dtype {kind}. If its imaginary part is zero, take jnp.real. "
-            "Otherwise use real and imaginary parts as positions and momenta: for "
-            "ψ = (q0 + i p0)/√2 give q0 = √2 Re ψ and p0 = √2 Im ψ."
+            f"{name} must be real, got dtype {kind}. If its imaginary part is zero, take jnp.real; "
+            "for ψ = (q0 + i p0)/√2 give q0 = √2 Re ψ and p0 = √2 Im ψ."
         )
     if not _is_real(kind):
-        seen = f": {value!s:.80}" if isinstance(value, np.ndarray) else ""
-        raise TypeError(f"{name} must be an array of real numbers, got dtype {kind}{seen}.")
+        text = f": {value!s:.80}" if isinstance(value, np.ndarray) else ""
+        raise TypeError(f"{name} must be an array of real numbers, got dtype {kind}{text}.")
     # A traced value that is not finite becomes the status of its trajectory.
     if isinstance(value, np.ndarray) and not np.isfinite(value).all():
         where = tuple(np.argwhere(~np.isfinite(value))[0].tolist())
-        at = f" at index {list(where)}" if where else ""
+        place = f" at index {list(where)}" if where else ""
         raise ValueError(
-            f"{name} has a value that is not finite{at}: {value[where]}. "
+            f"{name} has a value that is not finite{place}: {value[where]}. "
             "Every component of the initial conditions must be a finite number."
         )
     array = original if _is_strong(original, kind) else jnp.asarray(value)
@@ -93,12 +93,12 @@ def _is_real(dtype: Any) -> bool:
 
 def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> Array:
     """A number of this precision. **Raises** `ValueError` or `TypeError` with its name."""
-    value = _joined(value)
-    known = None if is_traced(value) else _as_numpy(name, value)
+    value = _join(value)
+    number = None if is_traced(value) else _as_numpy(name, value)
     # Not for a Python float, which has no precision of its own and takes that of the state.
     if isinstance(value, np.ndarray | np.generic) and value.dtype == np.float64:
         refuse_double_without_x64(name, value.dtype)
-    kind, shape = (value.dtype, value.shape) if known is None else (known.dtype, known.shape)
+    kind, shape = (value.dtype, value.shape) if number is None else (number.dtype, number.shape)
     if not _is_real(kind):
         kind = type(value).__name__
         raise TypeError(
@@ -107,21 +107,21 @@ def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> A
         )
     if shape != ():
         raise ValueError(
-            f"{name} must be one number, got an array of shape {shape}. Call the function once for "
-            f"each value. For dvi.integrate you can use jax.vmap over {name}."
+            f"{name} must be one number, got an array of shape {shape}. For several "
+            f"values use jax.vmap over {name}."
             + (" Steps of different sizes need lattice=dvi.Given(ts)." if name == "h" else "")
         )
-    if known is not None and not np.isfinite(known):
-        raise ValueError(f"{name} must be finite, got {known}.")
-    if known is not None and not zero_allowed and known == 0:
+    if number is not None and not np.isfinite(number):
+        raise ValueError(f"{name} must be finite, got {number}.")
+    if number is not None and not zero_allowed and number == 0:
         raise ValueError(
             f"{name} must not be zero: no step would advance time. Give a positive h (forward) "
             "or a negative h (backward)."
         )
     # Cast in NumPy: each operation of JAX on a known number would cost some ten microseconds.
-    if known is None:
+    if number is None:
         return jnp.asarray(value, dtype)
-    return value if _is_strong(value, dtype) else jnp.asarray(known.astype(dtype))
+    return value if _is_strong(value, dtype) else jnp.asarray(number.astype(dtype))
 
 
 def _as_numpy(name: str, value: Any) -> np.ndarray:
@@ -142,8 +142,8 @@ def as_parameter(leaf: Any) -> Any:
         leaf = np.asarray(leaf)
         refuse_double_without_x64("args", leaf.dtype)
         if leaf.dtype.kind in "OMm":
-            seen = f"dtype {leaf.dtype}: {leaf!s:.80}"
-            raise TypeError(f"args must contain arrays of numbers, got {seen}. Convert this array.")
+            text = f"dtype {leaf.dtype}: {leaf!s:.80}"
+            raise TypeError(f"args must contain arrays of numbers, got {text}. Convert this array.")
         return jnp.asarray(leaf)
     if not isinstance(leaf, jax.Array):
         # Everything but arrays is static: compiled programs are looked up by its hash.
@@ -156,3 +156,27 @@ def as_parameter(leaf: Any) -> Any:
             ) from None
     # A float becomes an array: a new value needs no new compilation, and has a derivative.
     return jnp.asarray(leaf) if isinstance(leaf, float) else leaf
+
+
+def refuse_unit_or_mask(name: str, value: Any) -> None:
+    """**Raises** `TypeError` for a quantity of astropy or pint, `ValueError` for an array with
+    masked numbers."""
+    # Both are accepted by np.asarray, which drops the unit or the mask without a warning.
+    if np.ma.is_masked(value):
+        where = np.argwhere(np.ma.getmaskarray(value))[0].tolist()
+        raise ValueError(
+            f"{name} is a masked array with a masked number"
+            + (f" at index {where}" if where else "")
+            + ". The mask would be ignored: remove the masked numbers, or replace them."
+        )
+    unit = None
+    if hasattr(value, "to_value"):
+        unit = getattr(value, "unit", None)
+    elif hasattr(value, "magnitude"):
+        unit = getattr(value, "units", None)
+    if unit is not None:
+        raise TypeError(
+            f"{name} has the unit {str(unit) or '1'!r}, but numbers without units are required "
+            "here: x.to_value(unit) of astropy, x.m_as(unit) of pint. "
+            "dvi_jax.interop.integrate(..., units=...) accepts quantities of astropy."
+        )

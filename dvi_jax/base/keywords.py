@@ -8,17 +8,18 @@ from typing import Any, TypeVar
 from .checks import refuse_unknown
 
 F = TypeVar("F", bound=Callable[..., Any])
+T = TypeVar("T")
 
-INTEGRATOR = "method lattice newton arithmetic layout integrator"
+INTEGRATOR = "method lattice root_finder arithmetic layout integrator"
 """Keywords of functions that run trajectories which `chosen` turns into one `Integrator`."""
 
 
-def taken(keywords: dict[str, Any], names: str) -> dict[str, Any]:
+def take(keywords: dict[str, Any], names: str) -> dict[str, Any]:
     """Remove these keywords, separated by blanks, from those of a call, and return them."""
     return {name: keywords.pop(name) for name in names.split()}
 
 
-def with_keywords_of(source: Callable[..., Any], names: str = "", **more: Any) -> Callable[[F], F]:
+def with_keywords_of(source: Callable[..., Any], names: str = "", **extra: Any) -> Callable[[F], F]:
     """Decorator of a function that ends with ``**keywords``: these are the keywords of `source`.
 
     - `names`: those of `source` that are taken, separated by blanks; by default all.
@@ -29,30 +30,50 @@ def with_keywords_of(source: Callable[..., Any], names: str = "", **more: Any) -
 
     **Raises** `TypeError` when it is called with an unknown keyword or without a necessary one.
     """
-    known = inspect.signature(source).parameters
+    parameters = inspect.signature(source).parameters
     kind, empty = inspect.Parameter.KEYWORD_ONLY, inspect.Parameter.empty
-    listed = [known[n] for n in names.split()] or [p for p in known.values() if p.kind == kind]
-    listed += [inspect.Parameter(name, kind, default=value) for name, value in more.items()]
+    keywords = [parameters[n] for n in names.split()] or [
+        p for p in parameters.values() if p.kind == kind
+    ]
+    keywords += [inspect.Parameter(name, kind, default=value) for name, value in extra.items()]
 
     def decorate(function: F) -> F:
         signature = inspect.signature(function)
-        *own, _ = signature.parameters.values()  # without **keywords
-        passed = [p for p in listed if p.name not in signature.parameters]
-        defaults = {p.name: p.default for p in passed}
+        *positional, _ = signature.parameters.values()  # without **keywords
+        additional = [p for p in keywords if p.name not in signature.parameters]
+        defaults = {p.name: p.default for p in additional}
         # `inspect` requires positional parameters before keyword-only ones.
-        shown = sorted([*passed, *own], key=lambda p: p.kind)
+        ordering = sorted([*additional, *positional], key=lambda p: p.kind)
 
         @functools.wraps(function)
-        def call(*args: Any, **given: Any) -> Any:
-            known = call.__dict__["__signature__"].parameters
-            if unknown := [name for name in given if name not in known]:
-                refuse_unknown(function.__name__, call, unknown)
-            given = {**defaults, **given}
-            if missing := [name for name, value in given.items() if value is empty]:
-                raise TypeError(f"{function.__name__} requires {missing[0]}=...: give a value.")
-            return function(*args, **given)
+        def call(*args: Any, **options: Any) -> Any:
+            names = call.__dict__["__signature__"].parameters
+            if strangers := [name for name in options if name not in names]:
+                refuse_unknown(function.__name__, call, strangers)
+            options = {**defaults, **options}
+            if gaps := [name for name, value in options.items() if value is empty]:
+                raise TypeError(f"{function.__name__} requires {gaps[0]}=...: give a value.")
+            return function(*args, **options)
 
-        call.__dict__["__signature__"] = signature.replace(parameters=shown)
+        call.__dict__["__signature__"] = signature.replace(parameters=ordering)
         return call  # pyright: ignore[reportReturnType]
 
     return decorate
+
+
+def accept_newton(cls: type[T]) -> type[T]:
+    """Decorator of a class whose keyword `root_finder` has `newton` as a second name; both at once
+    **raise** `TypeError`."""
+    construct = cls.__init__
+
+    @functools.wraps(construct)
+    def init(self: T, *args: Any, **options: Any) -> None:
+        if "newton" in options:
+            if "root_finder" in options:
+                raise TypeError("newton and root_finder are two names of one argument: give one.")
+            options["root_finder"] = options.pop("newton")
+        construct(self, *args, **options)
+
+    # In place: `isinstance` and pickles refer to this class, not to a subclass of it.
+    cls.__init__ = init
+    return cls

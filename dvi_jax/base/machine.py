@@ -1,4 +1,5 @@
-"""The memory available for results: larger ones are rejected before they are computed."""
+"""The processors of this process, and its memory: larger results are rejected before they are
+computed."""
 
 import contextlib
 import functools
@@ -23,16 +24,16 @@ def results_memory() -> int | None:
 def machine_memory() -> int | None:
     """Bytes of memory that this process may use: the memory of the machine, or the limit of a
     container or of a queueing system; None: not known."""
-    found = _limits()
+    sizes = _limits()
     with contextlib.suppress(AttributeError, ValueError, OSError):  # Windows has no sysconf
-        found.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    return min(found, default=None)
+        sizes.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    return min(sizes, default=None)
 
 
 def _limits() -> list[int]:
     """The limits of the control groups of this process (Linux): its own and those above it."""
     files = [_CGROUPS / "memory/memory.limit_in_bytes"]  # version 1
-    found: list[int] = []
+    limits: list[int] = []
     with contextlib.suppress(OSError):
         for line in Path("/proc/self/cgroup").read_text().splitlines():
             if line.startswith("0::/"):  # version 2
@@ -40,13 +41,21 @@ def _limits() -> list[int]:
                 files += [folder / "memory.max" for folder in (own, *own.parents)]
         for file in files:
             with contextlib.suppress(OSError, ValueError):  # no such limit, or the word "max"
-                found.append(int(file.read_text()))
-    return found
+                limits.append(int(file.read_text()))
+    return limits
 
 
 @functools.cache
 def _devices_memory() -> int | None:
     limits = [(device.memory_stats() or {}).get("bytes_limit") for device in jax.devices()]
-    known = [n for n in limits if n is not None]
+    sizes = [n for n in limits if n is not None]
     # A sum over some of the devices would reject results that all of them can hold.
-    return sum(known) if known and len(known) == len(limits) else None
+    return sum(sizes) if sizes and len(sizes) == len(limits) else None
+
+
+def processors() -> int:
+    """The number of processors that this process may use."""
+    # A container or `taskset` may allow fewer than the machine has; only Linux reports that.
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

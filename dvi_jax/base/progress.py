@@ -10,7 +10,7 @@ from .checks import instance
 T = TypeVar("T")
 
 
-def told(
+def reporter(
     progress: bool | Callable[[T], None] | None,
     bar: Callable[[Any], AbstractContextManager[Callable[[T], None]]],
 ) -> AbstractContextManager[Callable[[T], None] | None]:
@@ -41,18 +41,18 @@ def told(
 def bar_of(
     name: str, texts: Sequence[str], columns: Callable[[T], dict[str, Any]]
 ) -> Callable[[Any], AbstractContextManager[Callable[[T], None]]]:
-    """A bar for `told`, followed by texts. `columns`: progress → keywords of rich's
+    """A bar for `reporter`, followed by texts. `columns`: progress → keywords of rich's
     ``Progress.update``, `texts` among them."""
 
     @contextmanager
     def bar(console: Any) -> Iterator[Callable[[T], None]]:
         from rich.progress import BarColumn, Progress, TextColumn
 
-        behind = (TextColumn(f"{{task.fields[{text}]}}") for text in texts)
+        fields = (TextColumn(f"{{task.fields[{text}]}}") for text in texts)
         first = TextColumn("{task.description}"), BarColumn()
-        with Progress(*first, *behind, console=console) as shown:
+        with Progress(*first, *fields, console=console) as display:
             empty: dict[str, Any] = dict.fromkeys(texts, "")
-            task = shown.add_task(name, total=None, **empty)
-            yield lambda progress: shown.update(task, **columns(progress))
+            task = display.add_task(name, total=None, **empty)
+            yield lambda progress: display.update(task, **columns(progress))
 
     return bar

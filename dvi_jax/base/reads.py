@@ -27,7 +27,7 @@ _LIBRARIES = frozenset(["jax", "jaxlib", "numpy", "scipy", "equinox", "lanewise"
 _SIMPLE = (bool, int, float, complex, str, bytes, type(None), np.generic)
 
 
-class _Same:
+class _Identity:
     """An object that is compared by identity."""
 
     # It holds the object, since the id of one that is deleted may be given to another.
@@ -36,12 +36,12 @@ class _Same:
         self.value = value
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and other.value is self.value
+        return isinstance(other, _Identity) and other.value is self.value
 
     def __hash__(self) -> int:
         return id(self.value)
 
-    def __deepcopy__(self, memo: Any) -> "_Same":
+    def __deepcopy__(self, memo: Any) -> "_Identity":
         return self
 
 
@@ -58,23 +58,23 @@ def reads(*values: Any) -> Reads:
     for value in values:
         for function in _functions(value):
             reader.follow(function)
-    return tuple(reader.found.items())
+    return tuple(reader.values.items())
 
 
-def changed(before: Reads, now: Reads) -> list[str]:
+def differences(earlier: Reads, later: Reads) -> list[str]:
     """The names in both whose values differ, with the values where they can be printed."""
-    old = dict(before)
+    old = dict(earlier)
     return [
-        f"{name} ({_shown(old[name], mark)})"
-        for name, mark in now
+        f"{name} ({_difference(old[name], mark)})"
+        for name, mark in later
         if name in old and old[name] != mark
     ]
 
 
-def _shown(old: Any, now: Any) -> str:
-    if old[0] == now[0] and old[0] in ("value", "length"):
-        return f"{old[0]} {old[1]}, now {now[1]}"
-    return "an array whose values have changed" if old[0] == now[0] == "array" else "replaced"
+def _difference(old: Any, new: Any) -> str:
+    if old[0] == new[0] and old[0] in ("value", "length"):
+        return f"{old[0]} {old[1]}, now {new[1]}"
+    return "an array whose values have changed" if old[0] == new[0] == "array" else "replaced"
 
 
 def _functions(value: Any) -> Iterator[Callable]:
@@ -96,17 +96,17 @@ def _functions(value: Any) -> Iterator[Callable]:
 
 
 class _Reader:
-    """Collects in `found` the values that functions read."""
+    """Collects in `values` the values that functions read."""
 
     def __init__(self):
-        self.found: dict[str, Any] = {}
-        self.visited: dict[Any, Any] = {}
+        self.values: dict[str, Any] = {}
+        self.objects: dict[Any, Any] = {}
 
     def is_new(self, thing: Any, names: tuple[str, ...] = ()) -> bool:
         """Whether this is the first visit."""
         key = id(thing), names
-        new = key not in self.visited
-        self.visited[key] = thing  # held, so that no other object gets its id
+        new = key not in self.objects
+        self.objects[key] = thing  # held, so that no other object gets its id
         return new
 
     def follow(self, function: Any) -> None:
@@ -140,10 +140,10 @@ class _Reader:
             if value:
                 self.note(f"the defaults of {function.__name__}", value, names)
         if not _is_of_a_library(function.__module__):
-            outside = function.__globals__
+            globals_ = function.__globals__
             for name in names:
-                if name in outside:
-                    self.note(name, outside[name], names)
+                if name in globals_:
+                    self.note(name, globals_[name], names)
 
     def note(self, name: str, value: Any, names: tuple[str, ...]) -> None:
         """Collect one value and what it refers to; `names` are those in the code that reads it."""
@@ -164,7 +164,7 @@ class _Reader:
                 self.note(f"{name}[{key!r}]", value[key], names)
         else:
             if isinstance(value, jax.Array) or not _is_of_a_library(type(value).__module__):
-                self.add(name, ("object", _Same(value)))
+                self.add(name, ("object", _Identity(value)))
             if isinstance(value, type):
                 return
             self.note_attributes(name, value, names)
@@ -173,10 +173,10 @@ class _Reader:
 
     def note_attributes(self, name: str, value: Any, names: tuple[str, ...]) -> None:
         """Collect attributes of an object or of its class, and what methods and properties read."""
-        own = getattr(value, "__dict__", {})
+        fields = getattr(value, "__dict__", {})
         for attribute in names if self.is_new(value, names) else ():
-            if attribute in own:
-                self.note(f"{name}.{attribute}", own[attribute], names)
+            if attribute in fields:
+                self.note(f"{name}.{attribute}", fields[attribute], names)
                 continue
             # Statically: the property of a user may compute for long, or raise.
             of_class = inspect.getattr_static(type(value), attribute, None)
@@ -188,14 +188,14 @@ class _Reader:
                 self.note(f"{name}.{attribute}", of_class, names)
 
     def add(self, name: str, mark: Any) -> None:
-        while name in self.found:  # the same name in another function
+        while name in self.values:  # the same name in another function
             name += "′"
-        self.found[name] = mark
+        self.values[name] = mark
 
 
 def _digest(array: np.ndarray) -> Any:
     if array.dtype.hasobject:  # its bytes are addresses
-        return _Same(array)
+        return _Identity(array)
     if array.nbytes > _MOST_BYTES:
         array = array.reshape(-1)[:: array.nbytes // _MOST_BYTES + 1]
     return hash(array.tobytes())

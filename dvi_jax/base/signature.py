@@ -54,15 +54,15 @@ def signature_of(function: Callable[..., Any]) -> str:
 def warn_of_exchanged(name: str, function: Callable[..., Any], arguments: str) -> None:
     """Warn if the names of the arguments suggest that the function takes p before q."""
     try:
-        taken = list(inspect.signature(function).parameters)
+        names = list(inspect.signature(function).parameters)
     except (TypeError, ValueError):
         return
-    expected = arguments.strip("()").split(", ")
-    q, p = (next(i for i, x in enumerate(expected) if x[0] == letter) for letter in "qp")
-    if p < len(taken) and taken[q][:1].lower() == "p" and taken[p][:1].lower() == "q":
+    order = arguments.strip("()").split(", ")
+    q, p = (next(i for i, x in enumerate(order) if x[0] == letter) for letter in "qp")
+    if p < len(names) and names[q][:1].lower() == "p" and names[p][:1].lower() == "q":
         warnings.warn(
             f"{name} is called with {arguments}, but its definition has the arguments "
-            f"({', '.join(taken)}). If it takes p before q, exchange them in the definition. If "
+            f"({', '.join(names)}). If it takes p before q, exchange them in the definition. If "
             "only the names are exchanged, rename them.",
             stacklevel=5,
         )

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 
 from ..base.checks import whole
 from ..base.keywords import INTEGRATOR, with_keywords_of
-from ..base.names import both_names
 from ..base.signature import accepts
 from ..integration.integrate import integrate
 from ..observe import Mean
@@ -38,7 +37,6 @@ class InvariantDiffusion(eqx.Module):
     changes: Any
 
 
-@both_names
 @with_keywords_of(integrate, f"h num_steps t0 epsilon args {INTEGRATOR}")
 def invariant_diffusion(
     system: System,

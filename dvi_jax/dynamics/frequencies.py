@@ -13,8 +13,8 @@ from jaxtyping import Array, Complex, Float
 from lanewise.jaxprs.jaxapi import is_traced, x64_enabled
 
 from ..base.checks import one_of, whole
+from ..base.inputs import refuse_unit_or_mask
 from ..base.precision import refuse_double_without_x64
-from ..base.quantities import refuse_unit_or_mask
 from ..observe.solution import Solution
 from .lines import EPS, Lines, Settings, lines_of
 from .results import (

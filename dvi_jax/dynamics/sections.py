@@ -16,8 +16,7 @@ from lanewise.jaxprs.jaxapi import is_traced
 
 from ..base.checks import finite, positive, whole
 from ..base.inputs import as_parameter, as_scalar, start_state
-from ..base.keywords import INTEGRATOR, taken, with_keywords_of
-from ..base.names import both_names
+from ..base.keywords import INTEGRATOR, take, with_keywords_of
 from ..base.results import RESULTS, status_name
 from ..base.types import Args, Scalar, State
 from ..engine.newton import RootSolver
@@ -76,7 +75,7 @@ def _settings(
     system: System, section: Section, num_steps, keywords: dict[str, Any], level: int | None = 5
 ) -> _Settings:
     """`level`: of the user's frame, for a warning; None: no warning."""
-    integrator = chosen(**taken(keywords, INTEGRATOR))
+    integrator = chosen(**take(keywords, INTEGRATOR))
     has_default = integrator.method is None and isinstance(default_method(system), TypeII)
     if has_default and level is not None:
         warnings.warn(
@@ -123,7 +122,6 @@ def _one_after_another(settings: _Settings, start, h, epsilon, args, count: int)
     return lax.scan(one, start, jnp.arange(count))[1]
 
 
-@both_names
 @with_keywords_of(integrate, f"t0 epsilon args {INTEGRATOR} stop throw")
 def poincare_section(
     system: System,
@@ -202,7 +200,6 @@ def poincare_section(
     return _raise_on_failure(found, settings) if keywords["throw"] else found
 
 
-@both_names
 @with_keywords_of(poincare_section)
 def bifurcation(
     system: System,
@@ -278,7 +275,6 @@ class Return(WithStatus):
     result: SECTION_RESULTS
 
 
-@both_names
 class ReturnMap(eqx.Module):
     r"""Poincaré map: the map of a section g(t, q, p, args) = 0 onto itself.
 
@@ -288,7 +284,7 @@ class ReturnMap(eqx.Module):
     the change of the return time, `vmap` takes many points, `lax.scan` iterates. A point on the
     section is not its own return.
 
-    **Arguments** `system`, `g`, `direction`, `method`, `newton` and `integrator` as for
+    **Arguments** `system`, `g`, `direction`, `method`, `root_finder` and `integrator` as for
     `poincare_section`;
 
     - `h`, `num_steps`: size and number of the steps, which are always all computed.
@@ -305,7 +301,7 @@ class ReturnMap(eqx.Module):
     direction: int = eqx.field(static=True, default=1)
     returns: int = eqx.field(static=True, default=1)
     method: Method | None = None
-    newton: RootSolver | None = None
+    root_finder: RootSolver | None = None
     integrator: Integrator | None = None
 
     def __check_init__(self):
@@ -315,7 +311,7 @@ class ReturnMap(eqx.Module):
     def _settings(self, level: int | None) -> _Settings:
         section = Section(self.g, self.direction, whole("returns", self.returns))
         given = dict.fromkeys(INTEGRATOR.split()) | {
-            name: getattr(self, name) for name in ("method", "newton", "integrator")
+            name: getattr(self, name) for name in ("method", "root_finder", "integrator")
         }
         return _settings(self.system, section, self.num_steps, given, level)
 

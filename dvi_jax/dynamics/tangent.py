@@ -4,8 +4,7 @@ from typing import Any
 
 from jaxtyping import Array
 
-from ..base.keywords import INTEGRATOR, taken, with_keywords_of
-from ..base.names import both_names
+from ..base.keywords import INTEGRATOR, take, with_keywords_of
 from ..integration.integrate import integrate
 from ..integration.integrator import chosen
 from ..lattices import Given
@@ -14,7 +13,6 @@ from ..observe.solution import Save
 from ..problem.system import System
 
 
-@both_names
 @with_keywords_of(integrate, f"h num_steps t0 epsilon args {INTEGRATOR} throw")
 def tangent_map(system: System, q0: Any, p0: Any, **keywords: Any) -> Array:
     """M = ∂(q_K, p_K)/∂(q_0, p_0) of K steps, shape (2N, 2N), by the chain rule along the orbit.
@@ -26,7 +24,7 @@ def tangent_map(system: System, q0: Any, p0: Any, **keywords: Any) -> Array:
     **Arguments** as for `integrate`; num_steps is 1 by default, or that of a lattice `Given`.
     **Raises** as `integrate` does; with ``throw=False`` M of a run that failed is NaN.
     """
-    integrator = chosen(**taken(keywords, INTEGRATOR))
+    integrator = chosen(**take(keywords, INTEGRATOR))
     if keywords["num_steps"] is None and not isinstance(integrator.lattice, Given):
         keywords["num_steps"] = 1
     keywords |= {"integrator": integrator, "observe": TangentMap(), "save": Save(final=True)}

@@ -11,7 +11,7 @@ import lanewise
 Number = Float[Array, ""]
 Function = Callable[[Number], Number]
 
-_MOST = 100
+_EVALUATIONS = 100
 """Maximum number of evaluations of a search."""
 
 
@@ -44,18 +44,18 @@ def divide(linear: Function, rhs: Number) -> Number:
     return rhs / linear(jnp.ones_like(rhs))
 
 
-def _false_position(f: Function, a, fa, b, fb, wanted) -> Number:
+def _false_position(f: Function, a, fa, b, fb, exists) -> Number:
     # The values at the ends may come from another program, and have another sign where they are
     # round-off: without a change of sign the root is the end where the function is smaller.
     apart_in_sign = jnp.sign(fa) * jnp.sign(fb) <= 0
     is_at_a = ~apart_in_sign & (jnp.abs(fa) < jnp.abs(fb))
     b, fb = jnp.where(is_at_a, a, b), jnp.where(is_at_a, fa, fb)
-    wanted = wanted & apart_in_sign
+    exists = exists & apart_in_sign
 
     def proceed(state):
         a, _, b, fb, n = state
         apart = jnp.abs(b - a) > 2 * jnp.finfo(a.dtype).eps * jnp.maximum(jnp.abs(a), jnp.abs(b))
-        return wanted & apart & (fb != 0) & (n < _MOST)
+        return exists & apart & (fb != 0) & (n < _EVALUATIONS)
 
     def narrow(state):
         a, fa, b, fb, n = state

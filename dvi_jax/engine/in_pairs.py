@@ -35,27 +35,28 @@ def in_pairs(function: Callable, *args: Any) -> Any:
     def of_arrays(*leaves: Array) -> Any:
         return function(*eqx.combine(jax.tree.unflatten(tree, leaves), static))
 
-    traced = Traced.of(of_arrays, rounded(leaves), jax.tree.structure(tuple(rounded(leaves))))
-    closed = traced.all_inputs
+    trace = Traced.of(of_arrays, rounded(leaves), jax.tree.structure(tuple(rounded(leaves))))
+    program = trace.all_inputs
 
     # Values of an outer trace that the function closes over are operands too, so that they have a
     # derivative.
     @jax.custom_jvp
-    def evaluated(operands: list[Any]) -> list[Any]:
+    def evaluate(operands: list[Any]) -> list[Any]:
         # Machine code also within a derivative, which XLA computes: it compiles pairs slowly.
-        return lanewise.call(_closed(closed), *operands)
+        return lanewise.call(_as_function(program), *operands)
 
-    @evaluated.defjvp
+    @evaluate.defjvp
     def _(primals, tangents):
-        out = evaluated(*primals)
+        out = evaluate(*primals)
         # In float64: the lower parts would change derivatives by round-off only.
-        plain = jaxpr_as_fun(closed)
-        _, moved = jax.jvp(plain, rounded(*primals), rounded(*tangents))
+        plain = jaxpr_as_fun(program)
+        _, change = jax.jvp(plain, rounded(*primals), rounded(*tangents))
         return out, [
-            Pair(t, jnp.zeros_like(t)) if is_pair(x) else t for x, t in zip(out, moved, strict=True)
+            Pair(t, jnp.zeros_like(t)) if is_pair(x) else t
+            for x, t in zip(out, change, strict=True)
         ]
 
-    return jax.tree.unflatten(traced.out_tree, evaluated([*traced.outer, *leaves]))
+    return jax.tree.unflatten(trace.out_tree, evaluate([*trace.outer, *leaves]))
 
 
 def at_points_in_pairs(function: Callable, *points: Array) -> list[Any]:
@@ -66,43 +67,43 @@ def at_points_in_pairs(function: Callable, *points: Array) -> list[Any]:
     computed for many points before the next one.
     """
     # The shapes of one point are those of all.
-    closed = jax.make_jaxpr(function)(*(x[0] for x in points))
-    if sum(aval.size for aval in closed.out_avals) <= _FEW:
-        found = jax.jit(jax.vmap(lambda *point: in_pairs(function, *point)))(*points)
-        return jax.tree.map(np.asarray, jax.tree.leaves(found, is_leaf=is_pair))
-    evaluated = jax.vmap(_closed(closed))
+    program = jax.make_jaxpr(function)(*(x[0] for x in points))
+    if sum(aval.size for aval in program.out_avals) <= _RESULTS_AT_ONCE:
+        values = jax.jit(jax.vmap(lambda *point: in_pairs(function, *point)))(*points)
+        return jax.tree.map(np.asarray, jax.tree.leaves(values, is_leaf=is_pair))
+    evaluate = jax.vmap(_as_function(program))
     count, blocks = len(points[0]), []
     for first in range(0, count, _BLOCK):
         # All blocks have one size, so that each operation is compiled once.
-        some = np.minimum(np.arange(first, first + _BLOCK), count - 1)
-        blocks.append(evaluated(*(x[some] for x in points)))
+        rows = np.minimum(np.arange(first, first + _BLOCK), count - 1)
+        blocks.append(evaluate(*(x[rows] for x in points)))
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *blocks)
 
 
-_FEW = 100
+_RESULTS_AT_ONCE = 100
 _BLOCK = 128
 """Points at once: intermediate results of them fit into memory."""
 
 
 def _evaluate(jaxpr: Jaxpr, consts: Sequence[Any], values: Sequence[Any]) -> list[Any]:
-    known: dict[Any, Any] = dict(zip(jaxpr.constvars, consts, strict=True))
-    known.update(zip(jaxpr.invars, values, strict=True))
+    environment: dict[Any, Any] = dict(zip(jaxpr.constvars, consts, strict=True))
+    environment.update(zip(jaxpr.invars, values, strict=True))
 
     def read(atom: Any) -> Any:
         if isinstance(atom, Literal):
             return np.asarray(atom.val, atom.aval.dtype)[()]  # pyright: ignore[reportAttributeAccessIssue]
-        return known[atom]
+        return environment[atom]
 
     for eqn in jaxpr.eqns:
         out = _equation(eqn, [read(v) for v in eqn.invars])
-        known.update(zip(eqn.outvars, out, strict=True))
+        environment.update(zip(eqn.outvars, out, strict=True))
     return [read(v) for v in jaxpr.outvars]
 
 
 def _equation(eqn: Any, values: list[Any]) -> list[Any]:
     name = eqn.primitive.name
-    if name in _WHOLE:
-        return _WHOLE[name](eqn, values)
+    if name in _EQUATIONS:
+        return _EQUATIONS[name](eqn, values)
     # Integers, truth values, and what moves or rounds exact numbers: as JAX does it.
     in_float64 = any(v.aval.dtype == jnp.float64 for v in eqn.outvars)
     has_pairs = any(map(is_pair, values))
@@ -121,10 +122,9 @@ def _equation(eqn: Any, values: list[Any]) -> list[Any]:
         (body, *_) = bodies(eqn)
         return _evaluate(body.jaxpr, body.consts, values)
     raise NotImplementedError(
-        f"arithmetic=dvi.DoubleDouble() has no rule for the operation {name} of JAX, but a "
-        "function of this run uses it. Write this function with elementary functions, sums, "
-        "products, lanewise.solve(A, b) or loops. Or use arithmetic=dvi.Compensated(), and in a "
-        "search dvi.FloatingPoint()."
+        f"arithmetic=dvi.DoubleDouble() has no rule for the operation {name} of JAX in a "
+        "function of this run. Write it with elementary functions, sums, products, "
+        "lanewise.solve(A, b) or loops, or use arithmetic=dvi.Compensated()."
     )
 
 
@@ -145,34 +145,34 @@ def _over_axes(operation: Callable, neutral: float) -> Callable:
 
 
 def _running(operation: Callable) -> Callable:
-    def accumulated(params: dict, x: Number) -> Number:
-        how = {"axis": params["axis"], "reverse": params["reverse"]}
-        return lax.associative_scan(operation, as_pair(x), **how)
+    def accumulate(params: dict, x: Number) -> Number:
+        options = {"axis": params["axis"], "reverse": params["reverse"]}
+        return lax.associative_scan(operation, as_pair(x), **options)
 
-    return accumulated
+    return accumulate
 
 
 def _dot(params: dict, x: Number, y: Number) -> Pair:
     (of_x, of_y), (with_x, with_y) = params["dimension_numbers"]
 
-    def arranged(x: Number, together: Sequence[int], summed: Sequence[int]) -> tuple[Number, list]:
+    def arrange(x: Number, batch: Sequence[int], contraction: Sequence[int]) -> tuple[Number, list]:
         shape = np.shape(rounded(x))
-        free = [i for i in range(len(shape)) if i not in (*together, *summed)]
-        groups = [[shape[i] for i in axes] for axes in (together, free, summed)]
+        free = [i for i in range(len(shape)) if i not in (*batch, *contraction)]
+        groups = [[shape[i] for i in axes] for axes in (batch, free, contraction)]
         sizes = [int(np.prod(g, dtype=int)) for g in groups]
         return jax.tree.map(
-            lambda a: jnp.transpose(a, (*together, *free, *summed)).reshape(sizes), x
+            lambda a: jnp.transpose(a, (*batch, *free, *contraction)).reshape(sizes), x
         ), groups
 
     # All products first, then their sum: arrays of a step are small.
-    x, (front, rows, _) = arranged(x, with_x, of_x)
-    y, (_, columns, _) = arranged(y, with_y, of_y)
+    x, (front, rows, _) = arrange(x, with_x, of_x)
+    y, (_, columns, _) = arrange(y, with_y, of_y)
     x, y = jax.tree.map(lambda a: a[:, :, None], x), jax.tree.map(lambda a: a[:, None], y)
-    total = pairs.reduced(add, as_pair(_shaped(mul, x, y)), [3], 0.0)
+    total = pairs.reduced(add, as_pair(_broadcast(mul, x, y)), [3], 0.0)
     return jax.tree.map(lambda a: a.reshape(*front, *rows, *columns), total)
 
 
-def _shaped(operation: Callable, x: Number, y: Number) -> Number:
+def _broadcast(operation: Callable, x: Number, y: Number) -> Number:
     """The operation on numbers that are first repeated to one shape."""
     shape = np.broadcast_shapes(np.shape(rounded(x)), np.shape(rounded(y)))
     return operation(*(jax.tree.map(lambda a: jnp.broadcast_to(a, shape), z) for z in (x, y)))
@@ -190,12 +190,12 @@ def _scatter_add(eqn: Any, values: list[Any]) -> list[Any]:
     number = jnp.broadcast_to(jnp.arange(np.prod(rows, dtype=int)).reshape(rows), shape)
 
     def row(k: Array, part: Array) -> Array:
-        chosen = jnp.where(number == k, part, 0.0)
-        return _bound(eqn, [jnp.zeros_like(rounded(operand)), indices, chosen])[0]
+        update = jnp.where(number == k, part, 0.0)
+        return _bound(eqn, [jnp.zeros_like(rounded(operand)), indices, update])[0]
 
-    every = jnp.arange(np.prod(rows, dtype=int))
-    added = jax.tree.map(lambda x: jax.vmap(row, (0, None))(every, x), as_pair(updates))
-    return [add(operand, pairs.reduced(add, added, [0], 0.0))]
+    numbers = jnp.arange(np.prod(rows, dtype=int))
+    terms = jax.tree.map(lambda x: jax.vmap(row, (0, None))(numbers, x), as_pair(updates))
+    return [add(operand, pairs.reduced(add, terms, [0], 0.0))]
 
 
 # Powers, conversions
@@ -206,26 +206,26 @@ def _power(x: Number, y: Any) -> Number:
         return (
             pairs.power(x, int(y)) if float(y).is_integer() else functions.root_power(x, int(2 * y))
         )
-    return functions.raised(x, y if is_pair(y) else jnp.asarray(y, jnp.float64))
+    return functions.general_power(x, y if is_pair(y) else jnp.asarray(y, jnp.float64))
 
 
-def _converted(params: dict, x: Any) -> Any:
+def _convert(params: dict, x: Any) -> Any:
     new = np.dtype(params["new_dtype"])
     if not is_pair(x) or new == np.float64:
         return x if is_pair(x) else lax.convert_element_type(x, new)
     if new == np.bool_:
         return (x.hi != 0) | (x.lo != 0)
     if jnp.issubdtype(new, jnp.integer):  # towards zero, whatever the sign of lo is
-        whole = pairs.floor(pairs.magnitude(x))
-        return jnp.where(x.hi < 0, -rounded(whole), rounded(whole)).astype(new)
+        integer = pairs.floor(pairs.magnitude(x))
+        return jnp.where(x.hi < 0, -rounded(integer), rounded(integer)).astype(new)
     return x.hi.astype(new)
 
 
-def _select(which: Array, *cases: Any) -> Any:
-    upper = lax.select_n(which, *(jnp.asarray(rounded(c)) for c in cases))
+def _select(index: Array, *cases: Any) -> Any:
+    upper = lax.select_n(index, *(jnp.asarray(rounded(c)) for c in cases))
     if not any(map(is_pair, cases)):
         return upper
-    return Pair(upper, lax.select_n(which, *(c.lo if is_pair(c) else _zero(c) for c in cases)))
+    return Pair(upper, lax.select_n(index, *(c.lo if is_pair(c) else _zero(c) for c in cases)))
 
 
 def _remainder(x: Number, y: Number) -> Number:
@@ -239,35 +239,35 @@ def _remainder(x: Number, y: Number) -> Number:
 
 
 def _clamp(low: Number, x: Number, high: Number) -> Number:
-    return _shaped(pairs.smaller, _shaped(pairs.larger, x, low), high)
+    return _broadcast(pairs.smaller, _broadcast(pairs.larger, x, low), high)
 
 
 # Loops and branches: all float64 numbers that they carry are pairs
 
 
-def _closed(closed: ClosedJaxpr) -> Callable:
-    return lambda *values: [as_pair(x) for x in _evaluate(closed.jaxpr, closed.consts, values)]
+def _as_function(program: ClosedJaxpr) -> Callable:
+    return lambda *values: [as_pair(x) for x in _evaluate(program.jaxpr, program.consts, values)]
 
 
 def _scan(eqn: Any, values: list[Any]) -> list[Any]:
     params = eqn.params
     n, m = scan_counts(params)
     consts, carry, xs = values[:n], [as_pair(x) for x in values[n : n + m]], values[n + m :]
-    body = _closed(params["jaxpr"])
+    body = _as_function(params["jaxpr"])
 
     def step(carry: list, x: list) -> tuple[list, list]:
         out = body(*consts, *carry, *x)
         return out[:m], out[m:]
 
-    how = {name: params[name] for name in ("length", "reverse", "unroll")}
+    options = {name: params[name] for name in ("length", "reverse", "unroll")}
     # The type of a carry must not change, although it may begin exact.
-    carry, ys = lax.scan(step, carry, xs, **how)
+    carry, ys = lax.scan(step, carry, xs, **options)
     return [*carry, *ys]
 
 
-def _while(eqn: Any, values: list[Any]) -> list[Any]:
+def _loop(eqn: Any, values: list[Any]) -> list[Any]:
     n, m = eqn.params["cond_nconsts"], eqn.params["body_nconsts"]
-    test, body = _closed(eqn.params["cond_jaxpr"]), _closed(eqn.params["body_jaxpr"])
+    test, body = _as_function(eqn.params["cond_jaxpr"]), _as_function(eqn.params["body_jaxpr"])
     begin = [as_pair(x) for x in values[n + m :]]
     return lax.while_loop(
         lambda x: test(*values[:n], *x)[0], lambda x: body(*values[n : n + m], *x), begin
@@ -277,7 +277,7 @@ def _while(eqn: Any, values: list[Any]) -> list[Any]:
 def _cond(eqn: Any, values: list[Any]) -> list[Any]:
     index, *operands = values
     # The results of all branches are pairs, so that their types agree.
-    return lax.switch(index, [_closed(branch) for branch in eqn.params["branches"]], *operands)
+    return lax.switch(index, [_as_function(branch) for branch in eqn.params["branches"]], *operands)
 
 
 # Equations that are solved: the solution in float64, then corrections of it by residuals in pairs
@@ -288,35 +288,35 @@ _CORRECTIONS = 2
 
 def _linear_solve(eqn: Any, values: list[Any]) -> list[Any]:
     lengths, jaxprs = eqn.params["const_lengths"], eqn.params["jaxprs"]
-    matvec, count = _closed(jaxprs.matvec), sum(lengths)
+    matvec, count = _as_function(jaxprs.matvec), sum(lengths)
     # The matrix in pairs for residuals; its factors in float64 for corrections.
-    own = values[: lengths.matvec]
+    matrix = values[: lengths.matvec]
     consts, b = rounded(values[:count]), values[count:]
     x = [as_pair(y) for y in _bound(eqn, rounded(values))]
     for _ in range(_CORRECTIONS):
-        defect = [sub(a, y) for a, y in zip(b, matvec(*own, *x), strict=True)]
+        defect = [sub(a, y) for a, y in zip(b, matvec(*matrix, *x), strict=True)]
         x = [add(a, d) for a, d in zip(x, _bound(eqn, [*consts, *rounded(defect)]), strict=True)]
     return x
 
 
 def _root(eqn: Any, values: list[Any]) -> list[Any]:
-    rest, plain = eqn.params["rest"], rounded(values)
-    x, *how = _bound(eqn, plain)
-    own, consts = values[rest.own : -1], plain[rest.own : -1]
+    problem, plain = eqn.params["rest"], rounded(values)
+    x, *statistics = _bound(eqn, plain)
+    parameters, consts = values[problem.own : -1], plain[problem.own : -1]
     # The iteration itself stays in float64, with its status; a Jacobian of float64 is enough to
     # continue from its root.
-    equation = jax.make_jaxpr(rest.equation)(*consts, x)
-    at, scale = x, jnp.max(jnp.abs(x), initial=0.0)
+    equation = jax.make_jaxpr(problem.equation)(*consts, x)
+    point, scale = x, jnp.max(jnp.abs(x), initial=0.0)
 
     def correct(x: Pair, _: None) -> tuple[Pair, Array]:
-        (defect,) = _evaluate(equation.jaxpr, equation.consts, [*own, x])
-        change = rest.divide(*consts, at, rounded(defect))
+        (defect,) = _evaluate(equation.jaxpr, equation.consts, [*parameters, x])
+        change = problem.divide(*consts, point, rounded(defect))
         return sub(x, change), jnp.max(jnp.abs(change), initial=0.0)
 
     x, (first, last) = lax.scan(correct, as_pair(x), None, _CORRECTIONS)
     # The next correction would be last²/first.
     small = last * last <= _NEXT_CORRECTION * scale * first
-    return [x, *(h & small if h.dtype == bool else h for h in how)]
+    return [x, *(h & small if h.dtype == bool else h for h in statistics)]
 
 
 _NEXT_CORRECTION = 2.0**-96
@@ -328,16 +328,15 @@ def _call(eqn: Any, values: list[Any]) -> list[Any]:
     if eqn.params["lanes"] is not None:
         raise NotImplementedError(
             "arithmetic=dvi.DoubleDouble() has no rule for lanewise.batched, nor for jax.vmap of "
-            "lanewise.call, but a function of this run uses one of them. Use jax.vmap without "
-            "lanewise in this function, or use arithmetic=dvi.Compensated()."
+            "lanewise.call. Use jax.vmap without lanewise, or arithmetic=dvi.Compensated()."
         )
     inner = program.traced.all_inputs
     return _evaluate(inner.jaxpr, inner.consts, values)
 
 
-_WHOLE: dict[str, Callable] = {
+_EQUATIONS: dict[str, Callable] = {
     "scan": _scan,
-    "while": _while,
+    "while": _loop,
     "cond": _cond,
     "custom_linear_solve": _linear_solve,
     "implicit_root": _root,
@@ -393,7 +392,7 @@ _ELEMENTWISE: dict[str, Callable] = {
 
 _WITH_PARAMETERS: dict[str, Callable] = {
     "integer_pow": lambda params, x: pairs.power(x, params["y"]),
-    "convert_element_type": _converted,
+    "convert_element_type": _convert,
     "dot_general": _dot,
     "reduce_sum": _over_axes(add, 0.0),
     "reduce_prod": _over_axes(mul, 1.0),

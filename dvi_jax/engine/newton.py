@@ -30,7 +30,7 @@ class Scales(NamedTuple):
     start: Vector
 
 
-class Found(NamedTuple):
+class RootInfo(NamedTuple):
     """Result of a solver: x, iterations, (largest component of the last correction, its scale), and
     whether the iteration has converged."""
 
@@ -50,7 +50,7 @@ class RootSolver(eqx.Module):
     """
 
     @abc.abstractmethod
-    def solve(self, F: Function, x0: Vector, scales: Scales) -> Found:
+    def solve(self, F: Function, x0: Vector, scales: Scales) -> RootInfo:
         """The root near x0."""
 
     @abc.abstractmethod
@@ -102,76 +102,78 @@ class Newton(RootSolver):
         check_settings(self.rtol, self.atol, self.max_steps)
 
     def solve(self, F, x0, scales):
-        known, eps = scales.known, float(jnp.finfo(x0.dtype).eps)
+        magnitude, eps = scales.known, float(jnp.finfo(x0.dtype).eps)
         tiny = float(jnp.finfo(x0.dtype).tiny)
 
         def proceed(state: _Iterate):
             return ~state.converged & state.finite & (state.iterations < self.max_steps)
 
-        def corrected(x):
+        def correct(x):
             """(x, |last correction| and its scale per component, maxima of the last two
             corrections) after two corrections with one Jacobian, or three."""
             value, jacobian = value_and_jacobian(F, x)
             first = lanewise.solve(jacobian, value)
             x = x - first
             second = lanewise.solve(jacobian, F(x))
-            before, worst = _largest_of(jnp.abs(first)), _largest_of(jnp.abs(second))
-            scale = _larger(known, jnp.abs(x))
-            shrinks = worst < before
+            previous, worst = _largest_of(jnp.abs(first)), _largest_of(jnp.abs(second))
+            scale = _larger(magnitude, jnp.abs(x))
+            shrinks = worst < previous
             # worst²/before is the next correction. Only where it would be above round-off is a
             # third evaluation of F worth its time.
-            left = shrinks & (worst * worst > eps / 16 * before * _least_of(scale))
+            is_large = shrinks & (worst * worst > eps / 16 * previous * _least_of(scale))
 
-            def another():
-                nearer = jnp.where(left, x - second, x)
-                last = jnp.where(left, lanewise.solve(jacobian, F(nearer)), second)
-                return nearer, last, jnp.where(left, worst, before)
+            def third_correction():
+                nearer = jnp.where(is_large, x - second, x)
+                last = jnp.where(is_large, lanewise.solve(jacobian, F(nearer)), second)
+                return nearer, last, jnp.where(is_large, worst, previous)
 
             last = second
             if x0.size <= _THIRD_UP_TO:
-                asked = lanewise.on_any(left, rare=x0.size > _FIRST_APART)
-                x, last, before = lax.cond(asked, another, lambda: (x, second, before))
+                is_needed = lanewise.on_any(is_large, rare=x0.size > _FIRST_APART)
+                x, last, previous = lax.cond(
+                    is_needed, third_correction, lambda: (x, second, previous)
+                )
             worst = _largest_of(jnp.abs(last))
             # A last correction that is larger than the one before is round-off, or divergence.
-            x = jnp.where(worst > before, x, x - last)
-            return x, jnp.abs(last), _larger(known, jnp.abs(x)), before, worst
+            x = jnp.where(worst > previous, x, x - last)
+            return x, jnp.abs(last), _larger(magnitude, jnp.abs(x)), previous, worst
 
-        def is_root(second, scale, before, worst):
+        def is_root(second, scale, previous, worst):
             if by_rate:
                 # With one Jacobian corrections shrink linearly, here by worst/before: the error
                 # is that fraction of the last one. Written as products, since a division by
                 # `before` may be one by zero.
-                bound = (eps / 16 * before) * scale
+                bound = (eps / 16 * previous) * scale
                 # Beyond the range of normal numbers the comparison of products is meaningless.
                 in_range = (bound > tiny) & (bound < jnp.inf)
-                left = in_range & (second * worst <= bound)
-                return jnp.all(left | (second <= 4 * eps * scale))
+                is_small = in_range & (second * worst <= bound)
+                return jnp.all(is_small | (second <= 4 * eps * scale))
             return jnp.all(second <= (self.rtol or 0.0) * scale + self.atol)
 
         def improve(state: _Iterate):
-            x, second, scale, before, worst = corrected(state.x)
-            settled, size = is_root(second, scale, before, worst), _largest_of(scale)
+            x, second, scale, previous, worst = correct(state.x)
+            is_accurate, size = is_root(second, scale, previous, worst), _largest_of(scale)
             # A component that is only round-off of the others never settles relative to its own
             # size: it is enough that it is small next to them and no longer shrinks.
             rtol = 4096 * eps if by_rate else self.rtol or 0.0
             small = worst <= rtol * size + self.atol
-            stalled = small & ((worst >= 0.5 * before) | (worst >= 0.5 * state.error[0]))
+            is_round_off = small & ((worst >= 0.5 * previous) | (worst >= 0.5 * state.error[0]))
             finite = jnp.all(jnp.isfinite(second))
             error = jnp.stack([worst, size])
-            return _Iterate(x, error, finite, settled | stalled, state.iterations + 1)
+            return _Iterate(x, error, finite, is_accurate | is_round_off, state.iterations + 1)
 
         by_rate = self.rtol is None and self.atol == 0
-        yes, unknown = jnp.asarray(True), jnp.full((2,), jnp.nan, x0.dtype)
-        start = _Iterate(x0, unknown, yes, ~yes, jnp.asarray(0, jnp.int32))
+        yes, nans = jnp.asarray(True), jnp.full((2,), jnp.nan, x0.dtype)
+        start = _Iterate(x0, nans, yes, ~yes, jnp.asarray(0, jnp.int32))
         if x0.size <= _FIRST_APART:
             # Nearly all steps need one Jacobian: the first iteration is in front of the loop, where
             # no trajectory of a batch waits for another.
-            x, second, scale, before, worst = corrected(x0)
+            x, second, scale, previous_first, worst = correct(x0)
             error = jnp.stack([worst, _largest_of(scale)])
-            settled = is_root(second, scale, before, worst)
-            start = _Iterate(x, error, yes, settled, jnp.asarray(1, jnp.int32))
+            is_accurate = is_root(second, scale, previous_first, worst)
+            start = _Iterate(x, error, yes, is_accurate, jnp.asarray(1, jnp.int32))
         end = lax.while_loop(proceed, improve, start)
-        return Found(end.x, end.iterations, end.error, end.converged & end.finite)
+        return RootInfo(end.x, end.iterations, end.error, end.converged & end.finite)
 
     def solve_tangent(self, linear, rhs):
         _, matrix = value_and_jacobian(linear, jnp.zeros_like(rhs))
@@ -186,7 +188,7 @@ _THIRD_UP_TO = 16
 """Unknowns up to which a third correction is made; larger systems rarely need a second Jacobian."""
 
 
-class Known(eqx.Module):
+class KnownRoot(eqx.Module):
     """A root that is already known: only its derivative is solved for, by `solver`."""
 
     root: Vector
@@ -194,7 +196,7 @@ class Known(eqx.Module):
 
 
 class _Iterate(NamedTuple):
-    """The state of Newton's loop; `error` is as `Found.residual`."""
+    """The state of Newton's loop; `error` is as `RootInfo.residual`."""
 
     x: Vector
     error: Float[Array, "2"]
@@ -207,9 +209,9 @@ def find_root(
     function: Function,
     guess: Vector,
     known: Vector,
-    solver: RootSolver | Known,
+    solver: RootSolver | KnownRoot,
     start: Vector | None = None,
-) -> tuple[Vector, Found]:
+) -> tuple[Vector, RootInfo]:
     """Root x of function(x) = 0 near `guess`, and how it was found.
 
     The derivative of x with respect to values that `function` closes over is that of the implicit
@@ -220,16 +222,16 @@ def find_root(
     known = lax.stop_gradient(jnp.abs(known))
     start = known if start is None else lax.stop_gradient(jnp.abs(start))
     scales = Scales(known, start)
-    used = solver.solver if isinstance(solver, Known) else solver
+    method = solver.solver if isinstance(solver, KnownRoot) else solver
 
     def solve(F, x0):
-        if isinstance(solver, Known):
+        if isinstance(solver, KnownRoot):
             return solver.root, (jnp.int32(1), jnp.zeros(2, x0.dtype), jnp.asarray(True))
-        x, *how = used.solve(F, x0, scales)
-        return x, how
+        x, *statistics = method.solve(F, x0, scales)
+        return x, statistics
 
-    root, how = lanewise.implicit_root(function, guess, solve, used.solve_tangent)
-    return root, Found(root, *how)
+    root, statistics = lanewise.implicit_root(function, guess, solve, method.solve_tangent)
+    return root, RootInfo(root, *statistics)
 
 
 def value_and_jacobian(F: Function, x: Vector) -> tuple[Vector, Array]:
@@ -273,7 +275,7 @@ def no_residual(dtype) -> Float[Array, "2"]:
     return jnp.asarray([0.0, 1.0], dtype)
 
 
-def over(size: Float[Array, ""], scale: Float[Array, ""]) -> Float[Array, ""]:
+def relative_size(size: Float[Array, ""], scale: Float[Array, ""]) -> Float[Array, ""]:
     """size / scale, or size itself where the scale is zero."""
     # The inner `where` keeps the derivative finite: 0/0 in the branch not taken would give NaN.
     return jnp.where(scale > 0, size / jnp.where(scale > 0, scale, 1), size)

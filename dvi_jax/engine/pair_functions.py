@@ -28,7 +28,7 @@ from .pairs import (
     where,
 )
 
-_ONE, _TWO, _HALF = np.float64(1), np.float64(2), np.float64(0.5)
+_UNIT, _TWO, _HALF = np.float64(1), np.float64(2), np.float64(0.5)
 
 _PER_TURN, _PER_OCTAVE = 128, 64
 """Entries of the tables: sin and cos in 2π, 2^x from 0 to 1."""
@@ -37,11 +37,11 @@ _PER_TURN, _PER_OCTAVE = 128, 64
 def parts(x: Decimal | Fraction, count: int = 2) -> tuple[float, ...]:
     """A number as the sum of `count` float64 numbers, each of which is the remainder rounded."""
     # Fractions are exact; a difference of decimals would be rounded to the context's digits.
-    rest, found = Fraction(x), []
+    remainder, terms = Fraction(x), []
     for _ in range(count):
-        found.append(float(rest))
-        rest -= Fraction(found[-1])
-    return tuple(found)
+        terms.append(float(remainder))
+        remainder -= Fraction(terms[-1])
+    return tuple(terms)
 
 
 @functools.cache
@@ -80,7 +80,7 @@ def _constant(x: Decimal | Fraction) -> Number:
     return Pair(hi, lo) if lo else hi  # pyright: ignore[reportArgumentType]
 
 
-def _reduced(x: Pair, step: Sequence[float]) -> tuple[Array, Pair]:
+def _reduce(x: Pair, step: Sequence[float]) -> tuple[Array, Pair]:
     """k and x − k·step, with the integer k nearest to x/step."""
     # The multiple is subtracted part by part: 159 bits of the step are enough for |k| < 2⁴⁵.
     k = jnp.round(x.hi * (1 / step[0]))
@@ -92,8 +92,8 @@ def _reduced(x: Pair, step: Sequence[float]) -> tuple[Array, Pair]:
 def _row(table: np.ndarray, k: Array) -> Array:
     """The row number k modulo their count."""
     # In floating point, because k may be larger than an integer of 32 bits.
-    at = (k - len(table) * jnp.floor(k * (1 / len(table)))).astype(jnp.int32)
-    return jnp.asarray(table).at[at].get(mode="clip")
+    index = (k - len(table) * jnp.floor(k * (1 / len(table)))).astype(jnp.int32)
+    return jnp.asarray(table).at[index].get(mode="clip")
 
 
 def _series(x: Pair, coefficients: Sequence[Fraction], in_pairs: int) -> Number:
@@ -115,22 +115,22 @@ _EXPONENTIAL = [Fraction(1, math.factorial(n)) for n in range(2, 13)]
 def sin_cos(x: Number) -> tuple[Pair, Pair]:
     """sin x and cos x, for |x| < 2⁴⁰."""
     step, circle, *_ = _tables()
-    k, r = _reduced(as_pair(x), step)
+    k, r = _reduce(as_pair(x), step)
     row = _row(circle, k)
     s, c = Pair(row[..., 0], row[..., 1]), Pair(row[..., 2], row[..., 3])
     square = mul(r, r)
     sine = add(r, mul(mul(r, square), _series(square, _SINE, 3)))
-    less = mul(square, _series(square, _COSINE, 3))  # cos r − 1, whose digits do not cancel
+    cosine_less_one = mul(square, _series(square, _COSINE, 3))  # its digits do not cancel
     # The addition theorems. Small terms are added first: their sum has few digits in common with
     # the entry of the table.
-    sum_of_sines = add(s, add(mul(c, sine), mul(s, less)))
-    return sum_of_sines, add(c, sub(mul(c, less), mul(s, sine)))
+    sum_of_sines = add(s, add(mul(c, sine), mul(s, cosine_less_one)))
+    return sum_of_sines, add(c, sub(mul(c, cosine_less_one), mul(s, sine)))
 
 
 def _exponential(x: Number) -> tuple[Pair, Pair]:
     """(2^(k/64), e^r − 1) with x = k ln2/64 + r."""
     *_, step, powers = _tables()
-    k, r = _reduced(as_pair(x), step)
+    k, r = _reduce(as_pair(x), step)
     row = _row(powers, k)
     octave = jnp.floor(k * (1 / _PER_OCTAVE))
     half = jnp.floor(octave * 0.5)
@@ -141,52 +141,52 @@ def _exponential(x: Number) -> tuple[Pair, Pair]:
 
 
 def _power_of_two(n: Array) -> Array:
-    biased = jnp.clip(n + 1023, 0, 2047).astype(jnp.int64)
+    exponent = jnp.clip(n + 1023, 0, 2047).astype(jnp.int64)
     # The bits of the exponent: jnp.exp2 need not be exact.
-    return lax.bitcast_convert_type(biased << 52, jnp.float64)
+    return lax.bitcast_convert_type(exponent << 52, jnp.float64)
 
 
 def exp(x: Number) -> Pair:
     """eˣ."""
-    power, less = _exponential(x)
-    return _in_range(x, add(power, mul(power, less)), jnp.exp(as_pair(x).hi))
+    power, change = _exponential(x)
+    return _in_range(x, add(power, mul(power, change)), jnp.exp(as_pair(x).hi))
 
 
 def expm1(x: Number) -> Pair:
     """eˣ − 1."""
-    power, less = _exponential(x)
-    found = add(sub(power, _ONE), mul(power, less))
-    return _in_range(x, found, jnp.expm1(as_pair(x).hi))
+    power, change = _exponential(x)
+    value = add(sub(power, _UNIT), mul(power, change))
+    return _in_range(x, value, jnp.expm1(as_pair(x).hi))
 
 
-def _in_range(x: Number, found: Pair, plain: Array) -> Pair:
+def _in_range(x: Number, value: Pair, plain: Array) -> Pair:
     """The pair, or the value in float64 where that is 0 or infinite, or x is."""
     good = jnp.isfinite(as_pair(x).hi) & jnp.isfinite(plain) & (plain != 0)
-    return Pair(jnp.where(good, found.hi, plain), jnp.where(good, found.lo, 0.0))
+    return Pair(jnp.where(good, value.hi, plain), jnp.where(good, value.lo, 0.0))
 
 
-def _logarithm(x: Number, less: Number, guess: Array) -> Pair:
+def _logarithm(x: Number, excess: Number, guess: Array) -> Pair:
     """log x near a guess y, from x and `less`, x − 1: y + log(1 + δ) with δ = x e⁻ʸ − 1."""
     power, change = _exponential(-guess)
-    shrunk = add(sub(power, _ONE), mul(power, change))  # e⁻ʸ − 1
-    near = add(less, mul(x, shrunk))  # near x = 1 the digits of x e⁻ʸ − 1 would cancel
-    far = sub(mul(x, add(power, mul(power, change))), _ONE)
-    delta = where(jnp.abs(guess) < 0.5, near, far)
+    shrunk = add(sub(power, _UNIT), mul(power, change))  # e⁻ʸ − 1
+    small = add(excess, mul(x, shrunk))  # near x = 1 the digits of x e⁻ʸ − 1 would cancel
+    large = sub(mul(x, add(power, mul(power, change))), _UNIT)
+    delta = where(jnp.abs(guess) < 0.5, small, large)
     d = delta.hi  # pyright: ignore[reportAttributeAccessIssue]
     # log(1 + δ) to third order: δ is the error of the guess, and may be 1e-16.
-    found = add(guess, add(delta, d * d * (d * (1 / 3) - 0.5)))
+    value = add(guess, add(delta, d * d * (d * (1 / 3) - 0.5)))
     good = jnp.isfinite(guess)
-    return Pair(jnp.where(good, found.hi, guess), jnp.where(good, found.lo, 0.0))
+    return Pair(jnp.where(good, value.hi, guess), jnp.where(good, value.lo, 0.0))
 
 
 def log(x: Number) -> Pair:
     """log x."""
-    return _logarithm(x, sub(x, _ONE), jnp.log(as_pair(x).hi))
+    return _logarithm(x, sub(x, _UNIT), jnp.log(as_pair(x).hi))
 
 
 def log1p(x: Number) -> Pair:
     """log(1 + x)."""
-    return _logarithm(add(x, _ONE), x, jnp.log1p(as_pair(x).hi))
+    return _logarithm(add(x, _UNIT), x, jnp.log1p(as_pair(x).hi))
 
 
 def exp2(x: Number) -> Pair:
@@ -199,11 +199,11 @@ def log2(x: Number) -> Pair:
     return div(log(x), log(_TWO))
 
 
-def raised(x: Number, y: Number) -> Pair:
+def general_power(x: Number, y: Number) -> Pair:
     """xʸ = exp(y log x); where x is not positive, the value in float64."""
     plain, base = jnp.power(as_pair(x).hi, as_pair(y).hi), as_pair(x).hi
-    found = _in_range(x, exp(mul(y, log(x))), plain)
-    return Pair(jnp.where(base > 0, found.hi, plain), jnp.where(base > 0, found.lo, 0.0))
+    value = _in_range(x, exp(mul(y, log(x))), plain)
+    return Pair(jnp.where(base > 0, value.hi, plain), jnp.where(base > 0, value.lo, 0.0))
 
 
 def root_power(x: Number, n: int) -> Number:
@@ -229,14 +229,14 @@ def atan2(y: Number, x: Number) -> Pair:
     guess = jnp.arctan2(as_pair(y).hi, as_pair(x).hi)
     s, c = sin_cos(guess)
     # The remaining angle is across/along, with the point turned by −guess.
-    across, along = sub(mul(y, c), mul(x, s)), add(mul(x, c), mul(y, s)).hi
-    return add(guess, jnp.where(along > 0, across.hi / along, 0.0))
+    sine, cosine = sub(mul(y, c), mul(x, s)), add(mul(x, c), mul(y, s)).hi
+    return add(guess, jnp.where(cosine > 0, sine.hi / cosine, 0.0))
 
 
 def _leg(x: Number) -> Pair:
     """√(1 − x²)."""
-    one = _ONE
-    return sqrt(mul(sub(one, x), add(one, x)))
+    unit = _UNIT
+    return sqrt(mul(sub(unit, x), add(unit, x)))
 
 
 def asin(x: Number) -> Pair:
@@ -251,7 +251,7 @@ def acos(x: Number) -> Pair:
 
 def atan(x: Number) -> Pair:
     """arctan x."""
-    return atan2(x, _ONE)
+    return atan2(x, _UNIT)
 
 
 def _odd(of_magnitude: Number, x: Number) -> Number:
@@ -263,13 +263,13 @@ def sinh(x: Number) -> Number:
     """sinh x."""
     # (e + e/(e + 1))/2 with e = e^|x| − 1, whose digits do not cancel near x = 0.
     e = expm1(magnitude(x))
-    return _odd(mul(add(e, div(e, add(e, _ONE))), _HALF), x)
+    return _odd(mul(add(e, div(e, add(e, _UNIT))), _HALF), x)
 
 
 def cosh(x: Number) -> Number:
     """cosh x."""
     e = exp(magnitude(x))
-    return mul(add(e, div(_ONE, e)), _HALF)
+    return mul(add(e, div(_UNIT, e)), _HALF)
 
 
 def tanh(x: Number) -> Number:
@@ -282,24 +282,24 @@ def tanh(x: Number) -> Number:
 
 def asinh(x: Number) -> Number:
     """arsinh x = log(x + √(1 + x²))."""
-    size, one = magnitude(x), _ONE
+    size, unit = magnitude(x), _UNIT
     square = mul(size, size)
-    return _odd(log1p(add(size, div(square, add(one, sqrt(add(square, one)))))), x)
+    return _odd(log1p(add(size, div(square, add(unit, sqrt(add(square, unit)))))), x)
 
 
 def acosh(x: Number) -> Pair:
     """arcosh x = log(x + √(x² − 1))."""
-    less = sub(x, _ONE)
-    return log1p(add(less, sqrt(mul(less, add(x, _ONE)))))
+    excess = sub(x, _UNIT)
+    return log1p(add(excess, sqrt(mul(excess, add(x, _UNIT)))))
 
 
 def atanh(x: Number) -> Number:
     """artanh x = log((1 + x)/(1 − x))/2."""
     size = magnitude(x)
-    ratio = div(mul(size, _TWO), sub(_ONE, size))
+    ratio = div(mul(size, _TWO), sub(_UNIT, size))
     return _odd(mul(log1p(ratio), _HALF), x)
 
 
 def logistic(x: Number) -> Pair:
     """1/(1 + e⁻ˣ)."""
-    return div(_ONE, add(exp(negative(x)), _ONE))
+    return div(_UNIT, add(exp(negative(x)), _UNIT))

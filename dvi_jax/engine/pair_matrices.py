@@ -25,10 +25,10 @@ def plus(x: Any, y: Any) -> Pair:
     # The rounding of a + b is known exactly, whichever of the two is larger; that of the sum of the
     # three small parts is in the last digits of the pair.
     s = a + b
-    seen = s - a
-    rest = ((a - (s - seen)) + (b - seen)) + (c + d)
-    total = s + rest
-    return Pair(total, rest - (total - s))
+    addend = s - a
+    remainder = ((a - (s - addend)) + (b - addend)) + (c + d)
+    total = s + remainder
+    return Pair(total, remainder - (total - s))
 
 
 class Left:
@@ -50,11 +50,11 @@ class Left:
         # Products of late slices are below the last digit of the result: they are left out.
         x = exact(x)
         columns, right = x.hi.shape[1], _slices(x, 0, self.bits)
-        total, most = zeros(len(self.slices[0]), columns), _most(self.bits)
+        total, count = zeros(len(self.slices[0]), columns), _count(self.bits)
         for i, part in reversed(list(enumerate(self.slices))):
-            some = right[: most - i]
-            found = np.split(part @ np.hstack(some), len(some), axis=1)
-            for term in reversed(found):  # the smallest first
+            factors = right[: count - i]
+            terms = np.split(part @ np.hstack(factors), len(factors), axis=1)
+            for term in reversed(terms):  # the smallest first
                 total = plus(total, term)
         return total
 
@@ -65,21 +65,21 @@ def _bits(x: Any) -> int:
     return (53 - int(np.ceil(np.log2(columns)))) // 2
 
 
-def _most(bits: int) -> int:
+def _count(bits: int) -> int:
     return -(-_DIGITS // (bits + 1))
 
 
 def _slices(x: Pair, axis: int, bits: int) -> list[np.ndarray]:
     """x as a sum of arrays of integers of so many bits, each in units of a power of two for each
     row (`axis` 1) or column (0)."""
-    (hi, lo), found = x, []
-    for _ in range(_most(bits)):
+    (hi, lo), parts = x, []
+    for _ in range(_count(bits)):
         largest = np.max(np.abs(hi), axis=axis, keepdims=True, initial=0.0)
-        if found and not largest.any():
+        if parts and not largest.any():
             break
         # Adding a large number and subtracting it rounds to a multiple of its last digit.
         large = np.where(largest > 0, 0.75 * 2.0 ** (np.frexp(largest)[1] + 53 - bits), 0.0)
         part = (hi + large) - large
-        found.append(part)
+        parts.append(part)
         hi, lo = plus(hi - part, lo)
-    return found
+    return parts

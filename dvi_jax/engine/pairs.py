@@ -140,20 +140,20 @@ def power(x: Number, n: int) -> Number:
     return jnp.ones_like(rounded(x)) if result is None else result
 
 
-def compare(of: Callable) -> Callable:
+def compare(operation: Callable) -> Callable:
     """The comparison of pairs by one of numbers, such as `operator.lt`."""
 
-    def compared(x: Number, y: Number) -> Array:
+    def comparison(x: Number, y: Number) -> Array:
         if not (isinstance(x, Pair) or isinstance(y, Pair)):
-            return of(x, y)
+            return operation(x, y)
         x, y = as_pair(x), as_pair(y)
-        if of is operator.ne:
+        if operation is operator.ne:
             return (x.hi != y.hi) | (x.lo != y.lo)
         # Upper parts decide, and lower ones where those are equal: pairs are normalised.
-        strictly = of(x.hi, y.hi) & (x.hi != y.hi)
-        return strictly | ((x.hi == y.hi) & of(x.lo, y.lo))
+        strictly = operation(x.hi, y.hi) & (x.hi != y.hi)
+        return strictly | ((x.hi == y.hi) & operation(x.lo, y.lo))
 
-    return compared
+    return comparison
 
 
 def where(condition: Array, x: Number, y: Number) -> Number:
@@ -184,18 +184,18 @@ def floor(x: Number) -> Number:
     """The largest integer that is not above x."""
     if not isinstance(x, Pair):
         return jnp.floor(x)
-    whole = jnp.floor(x.hi)
+    integer = jnp.floor(x.hi)
     # The digits of lo decide only where hi is an integer itself.
-    return fast_two_sum(whole, jnp.where(whole == x.hi, jnp.floor(x.lo), 0.0))
+    return fast_two_sum(integer, jnp.where(integer == x.hi, jnp.floor(x.lo), 0.0))
 
 
 def reduced(operation: Callable, x: Pair, axes: Sequence[int], neutral: float) -> Pair:
     """Elements along axes combined by an operation of two, by halves."""
-    kept = [i for i in range(x.hi.ndim) if i not in axes]
-    shape = [x.hi.shape[i] for i in kept]
+    free = [i for i in range(x.hi.ndim) if i not in axes]
+    shape = [x.hi.shape[i] for i in free]
 
     def first(part: Array) -> Array:
-        return jnp.transpose(part, (*axes, *kept)).reshape(-1, *shape)
+        return jnp.transpose(part, (*axes, *free)).reshape(-1, *shape)
 
     x = Pair(first(x.hi), first(x.lo))
     count = x.hi.shape[0]
@@ -205,7 +205,7 @@ def reduced(operation: Callable, x: Pair, axes: Sequence[int], neutral: float) -
     while count > 1:
         half = count // 2
         ends = (slice(half), slice(half, 2 * half), slice(2 * half, None))
-        a, b, rest = (Pair(x.hi[end], x.lo[end]) for end in ends)
-        x = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), operation(a, b), rest)
+        a, b, odd = (Pair(x.hi[end], x.lo[end]) for end in ends)
+        x = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), operation(a, b), odd)
         count -= half
     return jax.tree.map(lambda a: a[0], x)

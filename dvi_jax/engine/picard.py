@@ -8,7 +8,7 @@ import lanewise
 
 from ..base.checks import instance, whole
 from .contraction import Contraction, contract
-from .newton import Found, Function, Newton, RootSolver, Scales, Vector
+from .newton import Function, Newton, RootInfo, RootSolver, Scales, Vector
 
 
 class Picard(Contraction):
@@ -76,20 +76,22 @@ class PicardThenNewton(RootSolver):
         instance("newton", self.newton, Newton, "a dvi.Newton(...)")
 
     def _is_few(self, n: int) -> bool:
-        return n <= (_FEW if self.newton_up_to is None else self.newton_up_to)
+        return n <= (_NEWTON_UP_TO if self.newton_up_to is None else self.newton_up_to)
 
     def solve(self, F, x0, scales):
         if self._is_few(x0.size):
             return self.newton.solve(F, x0, scales)
-        of = self.picard
-        first = contract(F, x0, scales, of.rtol, of.atol, of.max_steps, slowest=0.5)
+        settings = self.picard
+        first = contract(
+            F, x0, scales, settings.rtol, settings.atol, settings.max_steps, slowest=0.5
+        )
 
         # From x0, not from where Picard's iteration stopped: it may have diverged. The branch runs
         # for the whole batch, so that the trajectories that have converged keep their numbers.
-        def with_newton(first: Found) -> Found:
+        def with_newton(first: RootInfo) -> RootInfo:
             second = self.newton.solve(F, x0, scales)
             second = second._replace(iterations=first.iterations + second.iterations)
-            return Found(
+            return RootInfo(
                 *(jnp.where(first.converged, a, b) for a, b in zip(first, second, strict=True))
             )
 
@@ -102,7 +104,7 @@ class PicardThenNewton(RootSolver):
 
 
 # Measured: up to here the elimination of a banded Jacobian is faster than Picard's iteration.
-_FEW = 16
+_NEWTON_UP_TO = 16
 
 
 def _without_matrix(solver: RootSolver, linear: Function, rhs: Vector) -> Vector:

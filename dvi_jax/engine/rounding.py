@@ -18,15 +18,17 @@ def one_by_one(
 ) -> Any:
     """``function(*args)`` of pytrees, compiled separately, so that no operation in it is joined
     with one outside. It must return a pytree of arrays."""
-    arrays, rest = eqx.partition(args, eqx.is_array)
-    return lanewise.call(lambda arrays: function(*eqx.combine(arrays, rest)), arrays, layout=layout)
+    arrays, constants = eqx.partition(args, eqx.is_array)
+    return lanewise.call(
+        lambda arrays: function(*eqx.combine(arrays, constants)), arrays, layout=layout
+    )
 
 
 def each(
     function: Callable[..., Any],
-    given: Any,
+    shared: Any,
     *rows: Any,
     layout: lanewise.Layout = lanewise.Layout(),
 ) -> Any:
     """``function(given, *row)`` for every row, with the bits of a call for one row alone."""
-    return jax.vmap(lambda *row: one_by_one(function, given, *row, layout=layout))(*rows)
+    return jax.vmap(lambda *row: one_by_one(function, shared, *row, layout=layout))(*rows)

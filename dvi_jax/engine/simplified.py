@@ -27,7 +27,7 @@ class SimplifiedNewton(Contraction):
     """
 
     def correction(self, F, x0):
-        solve = factorised(value_and_jacobian(F, x0)[1])
+        solve = factorise(value_and_jacobian(F, x0)[1])
         return lambda x: solve(F(x))
 
     def solve_tangent(self, linear, rhs):
@@ -35,9 +35,9 @@ class SimplifiedNewton(Contraction):
         return lanewise.solve(matrix, rhs)
 
 
-def factorised(A: Inexact[Array, "n n"]) -> Callable[[Vector], Vector]:
+def factorise(A: Inexact[Array, "n n"]) -> Callable[[Vector], Vector]:
     """b → the solution of A x = b. A large A is factorised once, here."""
-    if A.shape[0] > _ELIMINATED:
+    if A.shape[0] > _ELIMINATION_UP_TO:
         from jax.scipy.linalg import lu_factor, lu_solve  # few runs need it: a part of import time
 
         factors = lu_factor(A)
@@ -47,4 +47,4 @@ def factorised(A: Inexact[Array, "n n"]) -> Callable[[Vector], Vector]:
 
 # Smaller systems are eliminated again for each b: generated code needs fewer operations for that
 # than for finding the inverse once.
-_ELIMINATED = 64
+_ELIMINATION_UP_TO = 64

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..base.checks import finite, instance
-from ..base.quantities import refuse_unit_or_mask
+from ..base.inputs import refuse_unit_or_mask
 from ..base.signature import accepts, signature_of
 
 _RANGE = (1e-140, 1e140)

@@ -13,7 +13,7 @@ from jaxtyping import Array, PyTree
 
 from lanewise.jaxprs.jaxapi import is_traced
 
-from ..base.quantities import refuse_unit_or_mask
+from ..base.inputs import refuse_unit_or_mask
 
 
 @dataclass(frozen=True)

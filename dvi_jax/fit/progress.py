@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ..base.progress import bar_of, told
+from ..base.progress import bar_of, reporter
 
 
 @dataclass(frozen=True)
@@ -37,4 +37,4 @@ def _columns(p: FitProgress) -> dict[str, Any]:
 
 def shown(progress: Any) -> Any:
     """A context whose value takes a `FitProgress`: the user's function, a bar's, or None."""
-    return told(progress, bar_of("fit", ("steps", "loss", "params"), _columns))
+    return reporter(progress, bar_of("fit", ("steps", "loss", "params"), _columns))

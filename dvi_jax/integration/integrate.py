@@ -20,11 +20,11 @@ from lanewise.jaxprs.jaxapi import is_traced, manual_axes
 
 from ..base.checks import instance, refuse_unknown
 from ..base.inputs import as_parameter, as_scalar, start_state
-from ..base.progress import bar_of, told
+from ..base.progress import bar_of, reporter
 from ..base.reads import reads
 from ..base.results import RESULTS, IntegrationError, status_code, status_name
 from ..base.types import Interval
-from ..engine.newton import RootSolver, over
+from ..engine.newton import RootSolver, relative_size
 from ..engine.rounding import each
 from ..lattices import Lattice, Place, Run
 from ..methods import Method, warn_of_dissipation
@@ -242,7 +242,7 @@ def _reported(progress: Any) -> Iterator[Callable[[int, int], Any]]:
     if callable(progress):
         yield progress
         return
-    with told(progress, bar_of("integrate", ("steps",), _columns)) as report:
+    with reporter(progress, bar_of("integrate", ("steps",), _columns)) as report:
         assert report is not None  # `progress` is True here
         yield lambda *done: report(done)
 
@@ -355,9 +355,9 @@ def _as_solution(
     stats = {
         "num_steps": plan.num_steps,
         "newton_iterations": carry.iterations,
-        "max_residual": over(*carry.residual),
+        "max_residual": relative_size(*carry.residual),
         "failed_step": carry.failed_step,
-        "failed_residual": over(*carry.failed_residual),
+        "failed_residual": relative_size(*carry.failed_residual),
         **task.lattice.report(carry.lattice, task.equations, place),
         **({} if defect is None else {"round_trip_defect": defect}),
     }

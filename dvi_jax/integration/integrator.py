@@ -7,7 +7,7 @@ import equinox as eqx
 from lanewise import Layout
 
 from ..base.checks import instance
-from ..base.names import both_names
+from ..base.keywords import accept_newton
 from ..engine.newton import RootSolver
 from ..engine.picard import PicardThenNewton
 from ..lattices import Given, Lattice, Uniform
@@ -20,15 +20,15 @@ from .arithmetic import Arithmetic, Compensated, FloatingPoint
 from .reversible import Reversible
 
 
-@both_names
+@accept_newton
 class Integrator(eqx.Module):
     """The options of an integration: the keywords of `integrate` that are not the problem itself.
 
     - `method`: see `integrate`. None: the map that the user wrote, `TypeII()`; for a system with
       `discretise(H, order=1)`, whose map has order one, `Strang()`; with a `Split`, `Splitting()`;
       with a constraint, `Rattle()`.
-    - `root_finder`: the solver of implicit steps. Here, and in every function that takes one of the
-      two names, `newton` is another name of it; both at once raise a `TypeError`.
+    - `root_finder`: the solver of implicit steps. Here and in `integrate` `newton` is another name
+      of it; both at once raise a `TypeError`.
     - `lattice`: the time grid. `arithmetic`: the representation of the state.
     - `layout`: machine code or arrays. `adjoint`: the computation of reverse-mode gradients.
 

@@ -14,7 +14,7 @@ import lanewise
 
 from ..base.results import RESULTS
 from ..base.types import State
-from ..engine.newton import Known, RootSolver
+from ..engine.newton import KnownRoot, RootSolver
 from ..observe import has_initial_value
 from .loop import number_of
 from .plan import Plan, adds_start_outside, piece_length
@@ -176,7 +176,7 @@ def pull_back(
         interval = task.interval(k)
         # The unknown of (13) is the state after the step, which is known here: no solve.
         known_root = task.method.is_the_map and task.arithmetic.is_plain
-        solver = Known(p1.ravel(), newton) if known_root else newton
+        solver = KnownRoot(p1.ravel(), newton) if known_root else newton
         equations = dataclasses.replace(task.equations_at(k, interval), newton=solver)
         q1, p1, _ = task.method.step(equations, interval, q0, p0)
         taken = StepTaken(interval.t0, interval.t1, q0, p0, q1, p1)

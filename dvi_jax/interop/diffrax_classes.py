@@ -31,7 +31,7 @@ class DiscreteMap(diffrax.AbstractSolver):
     """A method of the package as a solver of diffrax; see `diffrax_solver`."""
 
     method: dvi.Method
-    newton: dvi.RootSolver
+    root_finder: dvi.RootSolver
 
     term_structure: ClassVar[Any] = DiscreteTerm
     interpolation_cls: ClassVar[Any] = diffrax.ThirdOrderHermitePolynomialInterpolation
@@ -51,7 +51,7 @@ class DiscreteMap(diffrax.AbstractSolver):
         term, direction = unwrapped(terms)
         # One step of `integrate`, so that its arithmetic and its status are the same.
         step = {"t0": direction * t0, "h": direction * (t1 - t0), "num_steps": 1, "args": args}
-        how: Any = {"method": self.method, "newton": self.newton, "adjoint": dvi.Direct()}
+        how: Any = {"method": self.method, "root_finder": self.root_finder, "adjoint": dvi.Direct()}
         how |= {"epsilon": term.epsilon, "save": dvi.Save(final=True), "throw": False}
         taken = dvi.integrate(term.system, q0, p0, **step, **how)
         y1 = type(y0)((taken.qs[-1], taken.ps[-1]))  # a pair, of diffrax's kind: tuple or list

@@ -6,7 +6,6 @@ import jax.numpy as jnp
 
 import dvi_jax as dvi
 
-from ..base.names import both_names
 from .extras import expect, needed
 from .fields import checked
 
@@ -32,9 +31,8 @@ def diffrax_term(system: Any, epsilon: Any = None) -> "DiscreteTerm":
     return DiscreteTerm(system, jnp.asarray(epsilon, float))
 
 
-@both_names
 def diffrax_solver(
-    method: dvi.Method = dvi.TypeII(), newton: dvi.RootSolver = dvi.PicardThenNewton()
+    method: dvi.Method = dvi.TypeII(), root_finder: dvi.RootSolver = dvi.PicardThenNewton()
 ) -> "DiscreteMap":
     r"""A discrete map as a solver of `diffrax.diffeqsolve`.
 
@@ -44,7 +42,7 @@ def diffrax_solver(
     Each step is one step of `method` by ``dvi.integrate``. The states are those of `integrate` up
     to the round-off in diffrax's times t0 + h + h + ….
 
-    - `method`: any `Method`. `newton`: how implicit steps are solved.
+    - `method`: any `Method`. `root_finder`: how implicit steps are solved.
 
     **Terms**: `diffrax_term` alone; diffrax rejects a `diffrax.ODETerm`, which has no H_D.
 
@@ -65,8 +63,8 @@ def diffrax_solver(
     **Raises** `ImportError` without diffrax; `TypeError` for another method or root solver.
     """
     expect("method", method, dvi.Method, "a method such as dvi.Strang()")
-    expect("newton", newton, dvi.RootSolver, "a root solver such as dvi.Newton()")
+    expect("root_finder", root_finder, dvi.RootSolver, "a root solver such as dvi.Newton()")
     needed("diffrax", "interop.diffrax_solver")
     from .diffrax_classes import DiscreteMap
 
-    return DiscreteMap(method, newton)
+    return DiscreteMap(method, root_finder)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 import dvi_jax as dvi
 
-from ..base.quantities import refuse_unit_or_mask
+from ..base.inputs import refuse_unit_or_mask
 from .extras import system_of
 
 

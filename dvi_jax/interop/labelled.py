@@ -9,7 +9,7 @@ import numpy as np
 
 import dvi_jax as dvi
 
-from ..base.quantities import refuse_unit_or_mask
+from ..base.inputs import refuse_unit_or_mask
 from .extras import expect, needed
 
 _STATUSES = ("successful", "not_converged", "not_finite", "bad_step_size")

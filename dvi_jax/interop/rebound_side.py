@@ -10,7 +10,7 @@ import numpy as np
 
 import dvi_jax as dvi
 
-from ..base.quantities import refuse_unit_or_mask
+from ..base.inputs import refuse_unit_or_mask
 from ..systems import Problem
 from ..systems._problem import at_end
 from ..systems.n_body import (

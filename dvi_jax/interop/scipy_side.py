@@ -11,8 +11,7 @@ import numpy as np
 
 import dvi_jax as dvi
 
-from ..base.names import both_names
-from ..base.quantities import refuse_unit_or_mask
+from ..base.inputs import refuse_unit_or_mask
 from ..systems import Problem
 from .extras import needed, system_of
 
@@ -52,7 +51,6 @@ class _Event(eqx.Module):
         return self.event(t, y, args) if self.with_args else self.event(t, y)
 
 
-@both_names
 def solve_ivp(
     system: Any,
     t_span: Any,
@@ -65,7 +63,7 @@ def solve_ivp(
     epsilon: Any = None,
     events: Any = None,
     shape: tuple[int, ...] | None = None,
-    newton: dvi.RootSolver | None = None,
+    root_finder: dvi.RootSolver | None = None,
     **unsupported: Any,
 ) -> Any:
     r"""One trajectory with the arguments and the results of `scipy.integrate.solve_ivp`.
@@ -81,7 +79,7 @@ def solve_ivp(
     - `method`: a `Method`, or its name in ``testing.METHODS``, such as ``"KahanLi8"``.
     - `t_eval`: times of the output, in order and within t_span; all lattice points where left out.
       Between lattice points it is the step of the method to that time.
-    - `h`: the longest step [time]. `epsilon`, `args`, `newton`: as for ``dvi.integrate``.
+    - `h`: the longest step [time]. `epsilon`, `args`, `root_finder`: as for ``dvi.integrate``.
     - `events`: one function or several, ``event(t, y)`` or ``event(t, y, args)`` → scalar, written
       with jax.numpy, with SciPy's attributes `terminal` (False, True, or a number of crossings) and
       `direction` (positive, negative, 0). Two crossings within one step are not seen, and a zero at
@@ -126,7 +124,7 @@ def solve_ivp(
         save = dvi.Save(ts=inside)
     how: dict[str, Any] = {"h": (t1 - t0) / num_steps, "num_steps": num_steps, "t0": t0}
     how |= {"epsilon": epsilon, "args": args, "method": _method(method), "save": save}
-    how |= {} if newton is None else {"newton": newton}
+    how |= {} if root_finder is None else {"root_finder": root_finder}
 
     def run(crossings: int) -> dvi.Solution:
         watch = [dvi.Section(e, ahead * e.direction, crossings) for e in found]

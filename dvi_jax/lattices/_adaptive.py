@@ -16,7 +16,7 @@ from ..engine.rounding import one_by_one
 from ..methods.step import Equations
 from ._base import Place, StepSizes, check_rounding, check_speed
 
-_MOST = 4.0
+_LARGEST_RATIO = 4.0
 """Largest ratio between h and δ g. The controller deviates from δ g by half of the change of g in a
 step, which is a factor below two for every h that resolves g."""
 
@@ -25,7 +25,7 @@ class Memory(NamedTuple):
     """State of the controller between steps."""
 
     t: Scalar  # where the next step begins
-    lost: Scalar  # rounding error of t
+    error: Scalar  # rounding error of t
     h: Scalar  # size of the last step
 
 
@@ -107,23 +107,23 @@ class AdaptiveReversible(StepSizes):
         g, slope = self._along_the_motion(equations, memory.t, place.q, place.p)
         first = place.k == 0
         # As one quotient: 1/h + G = (g − h dg/dt)/(h g), half of it for the first step.
-        before = jnp.where(first, place.h * g, memory.h)
-        h = before * g / (g - jnp.where(first, 0.5, 1.0) * before * slope)
+        inverse_rate = jnp.where(first, place.h * g, memory.h)
+        h = inverse_rate * g / (g - jnp.where(first, 0.5, 1.0) * inverse_rate * slope)
         ratio = h / (place.h * g)
         # NaN, from a g that is not finite, is outside as well; so is a g that is not positive.
-        follows = (g > 0) & (ratio < _MOST) & (ratio > 1 / _MOST)
+        follows = (g > 0) & (ratio < _LARGEST_RATIO) & (ratio > 1 / _LARGEST_RATIO)
         # Times carry no accumulated round-off: over many steps it would exceed the smallest h.
-        t1, lost = two_sum(memory.t, h + memory.lost)
+        t1, error = two_sum(memory.t, h + memory.error)
         status = RESULTS.where(follows, RESULTS.successful, RESULTS.step_control_failed)
-        return Interval(memory.t, t1, h), Memory(t1, lax.stop_gradient(lost), h), status
+        return Interval(memory.t, t1, h), Memory(t1, lax.stop_gradient(error), h), status
 
     def report(self, memory, equations, place):
         return {
             "last_h": memory.h,
-            "resume_h": one_by_one(AdaptiveReversible._resumed, self, memory, equations, place),
+            "resume_h": one_by_one(AdaptiveReversible._resume_step, self, memory, equations, place),
         }
 
-    def _resumed(self, memory: Memory, equations: Equations, place: Place) -> Scalar:
+    def _resume_step(self, memory: Memory, equations: Equations, place: Place) -> Scalar:
         """The δ for which δ g is half a change after the last step, as it is at the start."""
         g, slope = self._along_the_motion(equations, memory.t, place.q, place.p)
         return jnp.where(place.k == 0, place.h, 2 * memory.h / (2 * g - memory.h * slope))

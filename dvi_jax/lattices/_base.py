@@ -107,11 +107,11 @@ class StepSizes(Lattice):
     """Base of the lattices with a given step size, at least of the first step, and their number."""
 
     def prepare(self, t0, h, num_steps):
-        missing = [name for name, x in (("h", h), ("num_steps", num_steps)) if x is None]
-        if missing:
+        absent = [name for name, x in (("h", h), ("num_steps", num_steps)) if x is None]
+        if absent:
             hint = " The lattice dvi.Uniform() also accepts t1 or duration in place of num_steps."
             raise TypeError(
-                f"{' and '.join(missing)} must be given, because lattice={self!r} requires h and "
+                f"{' and '.join(absent)} must be given, because lattice={self!r} requires h and "
                 f"num_steps.{hint if num_steps is None else ''}"
             )
         return t0, h, check_num_steps(num_steps)
@@ -124,10 +124,9 @@ def check_rounding(owner: str, arithmetic: Any) -> None:
     """**Raises** `ValueError` for an arithmetic that undoes steps bit for bit."""
     if arithmetic.undoes_steps:
         raise ValueError(
-            f"arithmetic={arithmetic!r} cannot be used with lattice=dvi.{owner}(...). This "
-            f"arithmetic undoes steps bit for bit, but the step sizes of {owner} are rounded, and "
-            "cannot be computed backwards bit for bit. Use arithmetic=dvi.Compensated(), or "
-            "lattice=dvi.Uniform()."
+            f"arithmetic={arithmetic!r} cannot be used with lattice=dvi.{owner}(...), whose "
+            "step sizes are rounded: steps cannot be undone bit for bit. Use "
+            "arithmetic=dvi.Compensated(), or lattice=dvi.Uniform()."
         )
 
 
@@ -139,8 +138,7 @@ def check_speed(owner: str, speed: Callable[..., Any], run: Run) -> None:
         raise ValueError(
             f"speed of {owner} must return one positive number for each state, but at the "
             "initial state (t0, q0, p0) it returns "
-            f"{value if value.shape == () else f'an array of shape {value.shape}'}. An example is "
-            "lambda t, q, p, args: jnp.sqrt(q @ q) for an orbit around the origin."
+            f"{value if value.shape == () else f'an array of shape {value.shape}'}."
         )
 
 
@@ -155,8 +153,7 @@ def check_num_steps(num_steps: object) -> int:
     if count is None:
         raise TypeError(
             "num_steps must be a Python integer, because it determines array shapes; got "
-            f"{num_steps!r}. If it is an argument of a function under jax.jit, mark it as static: "
-            'jax.jit(function, static_argnames="num_steps").'
+            f"{num_steps!r}. Under jax.jit mark it as static: static_argnames."
         )
     hint = "To go backwards in time give a negative h; divide a longer run into several runs, each "
     hint += "from the end of the one before."

@@ -78,26 +78,26 @@ class TimeTransformed(Uniform):
         """The run in extended phase space, in the time σ from 0 on."""
         # K contains ε: for the extended problem it is a parameter like any other, which may be
         # traced and differentiated.
-        extended = Extended(run.system, self.speed, run.epsilon, run.q0.shape)
+        problem = ExtendedSpace(run.system, self.speed, run.epsilon, run.q0.shape)
         check_speed(type(self).__name__, self.speed, run)
-        q0, p0 = start_state(*extended.start(run.t0, run.q0, run.p0, run.args))
-        observe = jax.tree.map(extended.seen, run.observe, is_leaf=is_observable)
+        q0, p0 = start_state(*problem.start(run.t0, run.q0, run.p0, run.args))
+        observe = jax.tree.map(problem.on_steps, run.observe, is_leaf=is_observable)
         save, stop = run.save, run.stop
         # Requested times are those of t, which here is a coordinate: a clock reads it.
         if save.ts is not None:
-            save = Save(ts=save.ts, clock=_SeenPoint(save.clock or _own_time, extended))
+            save = Save(ts=save.ts, clock=_PointFunction(save.clock or _own_time, problem))
         if stop is not None:
-            stop = Stop(_SeenPoint(stop.g, extended))
+            stop = Stop(_PointFunction(stop.g, problem))
         has_force = run.system.force is not None
-        system = System(extended.hamiltonian, extended.force if has_force else None)
+        system = System(problem.hamiltonian, problem.force if has_force else None)
         # ε is inside of K and its force. Zero without a force: an ε that has no effect warns.
         epsilon = (jnp.ones_like if has_force else jnp.zeros_like)(run.epsilon)
         observe = (observe, _time_gained)  # the second gives ``solution.hs``
         start = jnp.zeros_like(run.t0), q0, p0
-        return Run(system, *start, epsilon, run.args, observe, save, stop), extended.undo
+        return Run(system, *start, epsilon, run.args, observe, save, stop), problem.undo
 
 
-class Extended(eqx.Module):
+class ExtendedSpace(eqx.Module):
     """The transformed problem of `TimeTransformed`: positions (q, t) and momenta (p, p_t), each
     flattened to shape (n + 1,)."""
 
@@ -130,56 +130,54 @@ class Extended(eqx.Module):
         """(g εW, −g εW·∂H/∂p)."""
         del s0, s1
         q, p, t, _ = self.parts(position, momentum)
-        at = (t, t, q, p, self.epsilon, args)
-        W = self.system.disturbing_force(*at)
+        point = (t, t, q, p, self.epsilon, args)
+        W = self.system.disturbing_force(*point)
         # p_t balances the power of the force, so that K stays 0 although the energy changes.
-        power = jnp.sum(W * jax.grad(self.system.hamiltonian, argnums=3)(*at))
+        power = jnp.sum(W * jax.grad(self.system.hamiltonian, argnums=3)(*point))
         return self.speed(t, q, p, args) * jnp.append(W.ravel(), -power)
 
-    def seen(self, observable: Any) -> Any:
+    def on_steps(self, observable: Any) -> Any:
         """An observable of the user, evaluated on steps of the extended problem."""
         if not is_observable(observable):
             return observable  # `check_observe` raises for it, and names it
         if isinstance(observable, Running):
-            return Running(self.seen(observable.reduction))
+            return Running(self.on_steps(observable.reduction))
         if isinstance(observable, Trend):
             raise ValueError(
                 "observe must not contain a dvi.Trend with lattice=TimeTransformed(...): its slope "
-                "would be the change per unit of fictitious time, not of t. Use observe=f instead "
-                "of dvi.Trend(f), and fit a line to its values against solution.ts, or "
-                "solution.ts[1:] if f is a function of a step."
+                "would be the change per unit of fictitious time, not of t. Use observe=f, "
+                "and fit a line to its values against solution.ts."
             )
         if isinstance(observable, Deviations):
             raise ValueError(
                 f"{type(observable).__name__} requires steps whose size does not depend on the "
-                "state. The step size of TimeTransformed depends on the state: use "
-                "lattice=dvi.Uniform() or lattice=dvi.Given(ts)."
+                "state: use lattice=dvi.Uniform() or lattice=dvi.Given(ts)."
             )
         if isinstance(observable, Section):
-            return eqx.tree_at(lambda s: s.g, observable, _SeenPoint(observable.g, self))
+            return eqx.tree_at(lambda s: s.g, observable, _PointFunction(observable.g, self))
         if isinstance(observable, Reduction):
-            return eqx.tree_at(lambda r: r.function, observable, self.seen(observable.function))
+            return eqx.tree_at(lambda r: r.function, observable, self.on_steps(observable.function))
         # Bound here: later it would be bound to the extended system, which the user does not know.
         if isinstance(observable, Bindable):
             observable = observable.bind(self.system, self.epsilon)
-        return _Seen(observable, self)
+        return _Observable(observable, self)
 
     def undo(self, solution: Solution) -> Solution:
         """A solution of the extended problem as one of the original problem."""
 
-        def original(found):
-            if isinstance(found, Crossings):
-                q, p, t, _ = self.parts(found.qs, found.ps)
-                return Crossings(t, q, p, found.count)
-            return found
+        def original(value):
+            if isinstance(value, Crossings):
+                q, p, t, _ = self.parts(value.qs, value.ps)
+                return Crossings(t, q, p, value.count)
+            return value
 
         q, p, t, _ = self.parts(solution.qs, solution.ps)
         observed, hs = solution.observed
         observed = jax.tree.map(original, observed, is_leaf=lambda x: isinstance(x, Crossings))
         stop = solution.stop
         if stop is not None:
-            own = self.parts(stop.q, stop.p)
-            stop = Stopped(own[2], *own[:2])
+            end = self.parts(stop.q, stop.p)
+            stop = Stopped(end[2], *end[:2])
         return Solution(t, q, p, hs, observed, solution.result, solution.stats, stop)
 
 
@@ -187,30 +185,30 @@ def _energy(system: System, t: Scalar, q: State, p: State, epsilon: Scalar, args
     return system.hamiltonian(t, t, q, p, epsilon, args)
 
 
-class _Seen(eqx.Module):
+class _Observable(eqx.Module):
     """An observable of the user on steps of the extended problem."""
 
     function: Callable[..., Any]
-    extended: Extended
+    space: ExtendedSpace
 
     @property
     def is_of_state(self) -> bool:
         return has_initial_value(self.function)
 
     def __call__(self, s0, s1, position0, momentum0, position1, momentum1, args):
-        q0, p0, t0, _ = self.extended.parts(position0, momentum0)
-        q1, p1, t1, _ = self.extended.parts(position1, momentum1)
+        q0, p0, t0, _ = self.space.parts(position0, momentum0)
+        q1, p1, t1, _ = self.space.parts(position1, momentum1)
         return self.function(t0, t1, q0, p0, q1, p1, args)
 
 
-class _SeenPoint(eqx.Module):
+class _PointFunction(eqx.Module):
     """A function ``(t, q, p, args)`` of the user at points of the extended problem."""
 
     function: Callable[..., Any]
-    extended: Extended
+    space: ExtendedSpace
 
     def __call__(self, s, position, momentum, args):
-        q, p, t, _ = self.extended.parts(position, momentum)
+        q, p, t, _ = self.space.parts(position, momentum)
         return self.function(t, q, p, args)
 
 

@@ -99,8 +99,8 @@ class Variational(StepSizes):
         if not 0 < smallest <= 1 <= largest < float("inf"):
             raise ValueError(
                 "bounds of Variational must be a pair (smallest, largest) of finite numbers with "
-                f"0 < smallest ≤ 1 ≤ largest, got {self.bounds!r}. They limit the ratio of each "
-                "step size to the first step size h."
+                f"0 < smallest ≤ 1 ≤ largest, got {self.bounds!r}. They are "
+                "ratios to the first step size h."
             )
 
     def check(self, method, arithmetic):
@@ -132,21 +132,21 @@ class Variational(StepSizes):
         first = place.k == 0
         scale = jnp.abs(memory.energy) + energies(memory.h).size
         candidates = memory.h * self._factors(memory.h / place.h)
-        h, found = self._choose(residual, candidates, lax.stop_gradient(scale))
-        h, found = jnp.where(first, place.h, h), first | found
-        taken = energies(h)
-        defect = jnp.where(first, 0.0, jnp.abs(taken.imbalance(memory.energy)))
+        h, is_root = self._choose(residual, candidates, lax.stop_gradient(scale))
+        h, is_root = jnp.where(first, place.h, h), first | is_root
+        balance = energies(h)
+        defect = jnp.where(first, 0.0, jnp.abs(balance.imbalance(memory.energy)))
         interval = Interval(memory.t, memory.t + h, h)
         memory = Memory(
             interval.t1,
             h,
-            taken.arriving,
-            memory.misses + jnp.where(found, 0, 1),
+            balance.incoming,
+            memory.misses + jnp.where(is_root, 0, 1),
             jnp.maximum(memory.defect, lax.stop_gradient(defect)),
         )
         if self.on_no_root != "stop":
             return interval, memory, None
-        return interval, memory, RESULTS.where(found, RESULTS.successful, RESULTS.no_root)
+        return interval, memory, RESULTS.where(is_root, RESULTS.successful, RESULTS.no_root)
 
     def report(self, memory, equations, place):
         del equations, place
@@ -156,14 +156,14 @@ class Variational(StepSizes):
             "lattice_defect": memory.defect,
         }
 
-    def _factors(self, grown: Scalar) -> Array:
+    def _factors(self, growth: Scalar) -> Array:
         """Candidate ratios to the last step, which is `grown` times the first; 1 in the middle."""
-        smallest, largest = (jnp.asarray(b, grown.dtype) / grown for b in self.bounds)
+        smallest, largest = (jnp.asarray(b, growth.dtype) / growth for b in self.bounds)
         # The last step stays in the range, also if rounding has moved it beyond a bound.
         low = jnp.clip(smallest, 1 / self.reach, 1)
         high = jnp.clip(largest, 1, self.reach)
         # A geometric grid: cells are narrow near the last step, where the root usually is.
-        powers = jnp.linspace(0.0, 1.0, _CELLS + 1, dtype=grown.dtype)
+        powers = jnp.linspace(0.0, 1.0, _CELLS + 1, dtype=growth.dtype)
         factors = jnp.concatenate([(low**powers)[:0:-1], high**powers])
         return lax.stop_gradient(factors)
 
@@ -188,12 +188,12 @@ class Variational(StepSizes):
         root = bracketed_root(residual, *left, *right, has_root)
         h = jnp.where(has_root, root, last)
         if self.on_no_root == "minimise":
-            wanted = ~flat & ~has_root
-            h = jnp.where(wanted, _least(residual, hs, values, wanted), h)
-        found = has_root | flat
+            is_minimum = ~flat & ~has_root
+            h = jnp.where(is_minimum, _minimum(residual, hs, values, is_minimum), h)
+        is_root = has_root | flat
         # A step of NaN ends the run, also with a policy that would go on.
-        lost = jnp.all(jnp.isnan(values)) | (~found & (self.on_no_root == "stop"))
-        return jnp.where(lost, jnp.nan, h), found
+        is_invalid = jnp.all(jnp.isnan(values)) | (~is_root & (self.on_no_root == "stop"))
+        return jnp.where(is_invalid, jnp.nan, h), is_root
 
 
 class LatticeCondition(eqx.Module):
@@ -220,14 +220,14 @@ class LatticeCondition(eqx.Module):
     ) -> Scalar:
         if self.system is None:
             raise ValueError(
-                "LatticeCondition requires the system and ε when it is called directly: make it by "
-                "dvi.LatticeCondition(system, epsilon). In dvi.integrate(observe=...) both are set."
+                "LatticeCondition requires the system and ε when it is called directly: "
+                "dvi.LatticeCondition(system, epsilon)."
             )
         equations = Equations(self.system, self.epsilon, args)
 
         def balance(h):
             energies = _energies(equations, t0, h, q0, p0)
-            return energies.leaving - energies.work, energies.size
+            return energies.outgoing - energies.work, energies.size
 
         h = t1 - t0
         slope, size = jax.grad(balance, has_aux=True)(h)
@@ -237,14 +237,14 @@ class LatticeCondition(eqx.Module):
 class _Energies(NamedTuple):
     """E⁺, E⁻ and εW·Δq of one step, and the sum of their magnitudes [energy]."""
 
-    leaving: Scalar
-    arriving: Scalar
+    outgoing: Scalar
+    incoming: Scalar
     work: Scalar
     size: Scalar
 
     def imbalance(self, energy: Scalar) -> Scalar:
         """E⁺ − E⁻ − εW·Δq with E⁻ = `energy` of the step before."""
-        return self.leaving - energy - self.work
+        return self.outgoing - energy - self.work
 
 
 def _energies(equations: Equations, t: Scalar, h: Scalar, q: State, p: State) -> _Energies:
@@ -253,25 +253,33 @@ def _energies(equations: Equations, t: Scalar, h: Scalar, q: State, p: State) ->
     q1, p1, info = step(equations, interval, q, p)
     # The energy of a p1 that does not solve (13) could change sign where there is no root.
     p1 = jnp.where(info.result == RESULTS.successful, p1, jnp.nan)
-    at, more = (equations.system, *interval[:2], q), (p1, equations.epsilon, equations.args)
-    leaving, arriving = outgoing_energy(*at, *more, h), incoming_energy(*at, *more, h)
-    work = disturbing_work(*at, q1, *more)
-    return _Energies(leaving, arriving, work, jnp.abs(leaving) + jnp.abs(arriving) + jnp.abs(work))
+    start, parameters = (
+        (equations.system, *interval[:2], q),
+        (p1, equations.epsilon, equations.args),
+    )
+    outgoing, incoming = (
+        outgoing_energy(*start, *parameters, h),
+        incoming_energy(*start, *parameters, h),
+    )
+    work = disturbing_work(*start, q1, *parameters)
+    return _Energies(
+        outgoing, incoming, work, jnp.abs(outgoing) + jnp.abs(incoming) + jnp.abs(work)
+    )
 
 
-def _least(residual: Callable, hs: Array, values: Array, wanted: Array) -> Scalar:
+def _minimum(residual: Callable, hs: Array, values: Array, is_minimum: Array) -> Scalar:
     """The h with the smallest |residual| near the best of `hs`; an end of `hs` if that is it."""
     fixed = lax.stop_gradient(hs)
     best = jnp.argmin(jnp.where(jnp.isnan(values), jnp.inf, jnp.abs(values)))
-    inside = wanted & (best > 0) & (best + 1 < hs.size)
+    in_interior = is_minimum & (best > 0) & (best + 1 < hs.size)
 
     def search(_, h):
         a, b = fixed[jnp.maximum(best - 1, 0)], fixed[jnp.minimum(best + 1, hs.size - 1)]
-        return jnp.where(inside, _golden_section(lambda h: jnp.abs(residual(h)), a, b), h), ()
+        return jnp.where(in_interior, _golden_section(lambda h: jnp.abs(residual(h)), a, b), h), ()
 
     # The derivative of a minimum is that of the root of the slope; of an end, that of the end.
     def stationary(h):
-        return jnp.where(inside, jax.grad(residual)(h), h - hs[best])
+        return jnp.where(in_interior, jax.grad(residual)(h), h - hs[best])
 
     return lanewise.implicit_root(stationary, fixed[best], search, divide)[0]
 

@@ -94,12 +94,12 @@ class Method(eqx.Module):
         """
         q = jnp.zeros(2) if q is None else q
         scalar = jax.ShapeDtypeStruct((), q.dtype)
-        found: list[bool] = []
+        answers: list[bool] = []
 
         # Traced, not evaluated: at zeros a potential may be singular, and nothing is compiled.
         def probe(t0, t1, q, epsilon):
             equations = Equations(system, epsilon, args)
-            found.append(self.needs_no_solve(equations, Interval(t0, t1, t1), q))
+            answers.append(self.needs_no_solve(equations, Interval(t0, t1, t1), q))
             return t0
 
         try:
@@ -109,10 +109,9 @@ class Method(eqx.Module):
             raise ValueError(
                 "the functions of the system cannot be evaluated or differentiated for q of shape "
                 f"{q.shape} and args={args!r:.200}. {type(error).__name__}: {error}. Give the q "
-                "and the args that the system requires. If they are right, correct the functions: "
-                "H_D must return a scalar, and the force an array like q."
+                "and the args that the system requires."
             ) from error
-        return found[0]
+        return answers[0]
 
 
 def check_invertible(name: str, method: Any) -> None:

@@ -33,15 +33,15 @@ class Collocation(Method):
 
 def exact_nodes(guesses: Iterable[float], slope: Callable) -> list[Fraction]:
     """Zeros x near floating-point numbers, to 48 digits; ``slope(x)`` → (f(x), f'(x))."""
-    found = []
+    nodes = []
     for guess in guesses:
         x = Fraction(float(guess))
         for _ in range(3):  # Newton's steps double the digits
             value, derivative = slope(x)
             x = Fraction(round((x - value / derivative) * 2**160), 2**160)
-        found.append(x)
+        nodes.append(x)
     # Symmetric, because the reversal of a step depends on it.
-    return [(x - y) / 2 for x, y in zip(found, reversed(found), strict=True)]
+    return [(x - y) / 2 for x, y in zip(nodes, reversed(nodes), strict=True)]
 
 
 def legendre(x: Fraction, degree: int) -> list[Fraction]:
@@ -54,8 +54,8 @@ def legendre(x: Fraction, degree: int) -> list[Fraction]:
 
 def legendre_slope(x: Fraction, degree: int) -> Fraction:
     """P'_degree(x) at an inner x."""
-    *_, before, last = legendre(x, degree)
-    return degree * (x * last - before) / (x * x - 1)
+    *_, previous, last = legendre(x, degree)
+    return degree * (x * last - previous) / (x * x - 1)
 
 
 def integrals(x: Sequence[Fraction], b: Sequence[Any], degree: int) -> np.ndarray:
@@ -71,8 +71,8 @@ def integrals(x: Sequence[Fraction], b: Sequence[Any], degree: int) -> np.ndarra
     # for s Gauss nodes, and s − 1 for s Lobatto nodes, where the integral of the last term, a
     # multiple of (1 − x²) P'_{s−1}, vanishes at every node.
     P = np.array([legendre(y, degree) for y in x], object)  # (s, degree + 1)
-    before = np.concatenate([np.full((len(x), 1), -1), P[:, : degree - 1]], axis=1)
-    return np.array(b, object) * ((P[:, 1:] - before) / 2 @ P[:, :degree].T)
+    lower = np.concatenate([np.full((len(x), 1), -1), P[:, : degree - 1]], axis=1)
+    return np.array(b, object) * ((P[:, 1:] - lower) / 2 @ P[:, :degree].T)
 
 
 def coefficients(exact: np.ndarray, dtype: Any) -> Array:
@@ -87,13 +87,13 @@ def continuous_rates(equations: Equations, like: Scalar) -> tuple[Callable, Call
     """∂H/∂p and −∂H/∂q + εW as functions of (t, q, p), with H(t, q, p) = H_D(t, t, q, p)."""
 
     # Both times of H_D are t. The rates do not use the h of the interval, which is therefore 0.
-    def at(t: Scalar) -> Interval:
+    def instant(t: Scalar) -> Interval:
         return Interval(t, t, jnp.zeros_like(like))
 
     def position_rate(t: Scalar, q: State, p: State) -> State:
-        return equations.position_rate(at(t), q, p)
+        return equations.position_rate(instant(t), q, p)
 
     def momentum_rate(t: Scalar, q: State, p: State) -> State:
-        return equations.momentum_rate(at(t), q, p)
+        return equations.momentum_rate(instant(t), q, p)
 
     return position_rate, momentum_rate

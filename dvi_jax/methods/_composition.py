@@ -85,11 +85,11 @@ class CompositionMethod(Method):
             q, p, second = self.base.inverse(equations, parts[1].reversed(), q, p)
             return q, p, info.then(first).then(second)
 
-        pairs, rest = self._parts(interval)
+        pairs, single = self._parts(interval)
         q, p, info = _in_turn(pair, pairs)((q0, p0, no_step_yet(q0)))
-        if rest is None:
+        if single is None:
             return q, p, info
-        q, p, last = self.base.step(equations, rest, q, p)
+        q, p, last = self.base.step(equations, single, q, p)
         return q, p, info.then(last)
 
     def inverse(self, equations, interval, q1, p1):
@@ -101,10 +101,10 @@ class CompositionMethod(Method):
             q, p, first = self.base.inverse(equations, parts[0], q, p)
             return q, p, info.then(second).then(first)
 
-        pairs, rest = self._parts(interval)
+        pairs, single = self._parts(interval)
         q, p, info = q1, p1, no_step_yet(q1)
-        if rest is not None:
-            q, p, last = self.base.inverse(equations, rest, q, p)
+        if single is not None:
+            q, p, last = self.base.inverse(equations, single, q, p)
             info = info.then(last)
         return _in_turn(pair, pairs[::-1])((q, p, info))
 
@@ -142,8 +142,8 @@ def _in_turn(body: Callable, pairs: list) -> Callable:
         return functools.partial(body, parts=pairs[0])
     if not pairs:
         return lambda state: state
-    stacked = jax.tree.map(lambda *xs: jnp.stack(xs), *pairs)
-    return lambda state: lax.scan(lambda s, parts: (body(s, parts), None), state, stacked)[0]
+    stack = jax.tree.map(lambda *xs: jnp.stack(xs), *pairs)
+    return lambda state: lax.scan(lambda s, parts: (body(s, parts), None), state, stack)[0]
 
 
 def of_strang(*outer: float) -> tuple[float, ...]:
@@ -159,7 +159,7 @@ def _as_coefficients(values: Sequence[float]) -> tuple[float, ...]:
     except (TypeError, ValueError):
         raise TypeError(
             "coefficients of Composition must be a sequence of numbers, such as (0.2, 0.3, 0.3, "
-            f"0.2), got {values!r:.200}. Numbers traced by JAX are not possible: make the "
+            f"0.2), got {values!r:.200}. Make the "
             "Composition outside of jax.jit, jax.grad and jax.vmap."
         ) from None
 
@@ -208,19 +208,17 @@ class Composition(CompositionMethod):
         if not c or not all(math.isfinite(x) for x in c) or abs(math.fsum(c) - 1) > 1e-12:
             raise ValueError(
                 f"coefficients of Composition must be finite and sum to 1 up to 1e-12, got {c} "
-                f"with the sum {sum(c)!r}. If the coefficients of a table have too few digits, "
-                "compute one of them as 1 minus the sum of the others."
+                f"with the sum {sum(c)!r}. Compute one of them as 1 minus the sum of the others."
             )
         hint = "Conditions of higher orders cannot be checked."
         whole("order", order, most=_MOST_CHECKED, hint=hint)
         defects = order_defects(c, order, base.order, base.is_symmetric)
-        found = next((n for n, defect in enumerate(defects) if defect > _DEFECT), order)
-        if found < order:
+        actual = next((n for n, defect in enumerate(defects) if defect > _DEFECT), order)
+        if actual < order:
             raise ValueError(
-                f"order={order} is too high: the coefficients have order {found}, not {order}. "
-                f"They violate the conditions of order {found + 1} by {defects[found]:.1e}; at "
-                f"most {_DEFECT} is allowed. Set order={found}, or give correct coefficients with "
-                "16 digits."
+                f"order={order} is too high: the coefficients have order {actual}, not {order}. "
+                f"They violate the conditions of order {actual + 1} by {defects[actual]:.1e}; at "
+                f"most {_DEFECT} is allowed."
             )
 
     def fractions(self):

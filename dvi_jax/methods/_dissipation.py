@@ -56,7 +56,7 @@ def _damping(equations: Equations, interval: Interval, q0: State, p0: State):
     """The largest −∂(εW_i)/∂p_i over the components i."""
 
     def force(p):
-        at = (interval.t0, interval.t1, q0, p.reshape(p0.shape), equations.epsilon)
-        return equations.system.disturbing_force(*at, equations.args).ravel()
+        point = (interval.t0, interval.t1, q0, p.reshape(p0.shape), equations.epsilon)
+        return equations.system.disturbing_force(*point, equations.args).ravel()
 
     return -jnp.min(jnp.diagonal(jax.jacfwd(force)(p0.ravel())))

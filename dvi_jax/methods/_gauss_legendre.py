@@ -48,8 +48,8 @@ class _Inner(NamedTuple):
     def rates(self, interval: Interval, z: Any, y: Any) -> tuple[Any, Any]:
         """(q̇, ṗ) at z = (q, p) and y."""
         e = self.equations
-        at = (*interval[:2], *e.absolute(*z), y, e.epsilon, e.args)
-        return _inner_rates(e.system, self.implicit, *at)
+        point = (*interval[:2], *e.absolute(*z), y, e.epsilon, e.args)
+        return _inner_rates(e.system, self.implicit, *point)
 
     def defect(self, t: Any, z: Any, y: Any) -> Any:
         e = self.equations
@@ -137,10 +137,12 @@ class GaussLegendre(Collocation):
 
         def rates(t, z, y):
             # Both times of H_D are t. The rates do not use the h of the interval.
-            at = Interval(t, t, jnp.zeros_like(h))
-            return jnp.stack(equations.rates(at, *z) if inner is None else inner.rates(at, z, y))
+            instant = Interval(t, t, jnp.zeros_like(h))
+            return jnp.stack(
+                equations.rates(instant, *z) if inner is None else inner.rates(instant, z, y)
+            )
 
-        def advanced(weights, stages, y):
+        def advance(weights, stages, y):
             """z0 + h Σ_j weights_j (q̇, ṗ)_j: shape (2, *q0.shape), with weights' rows in front."""
             change = jnp.tensordot(weights, jax.vmap(rates)(times, stages, y), 1)
             return jnp.broadcast_to(z0, change.shape) + h * change
@@ -154,7 +156,7 @@ class GaussLegendre(Collocation):
 
         def residual(x):
             stages, y = split(x)
-            implicit = (stages - advanced(a, stages, y)).ravel()
+            implicit = (stages - advance(a, stages, y)).ravel()
             if inner is None:
                 return implicit
             return jnp.concatenate([implicit, jax.vmap(inner.defect)(times, stages, y).ravel()])
@@ -165,17 +167,17 @@ class GaussLegendre(Collocation):
             if inner is None
             else inner.start(t0, z0, self.stages)
         )
-        guess = advanced(a, all_at_start, y0)
+        guess = advance(a, all_at_start, y0)
         # The accuracy of a solve is relative to the whole state, also where increments relative to
         # an origin are solved for, as in compensated summation.
-        known = jnp.broadcast_to(jnp.stack(equations.absolute(q0, p0)), all_at_start.shape)
-        represented = jnp.maximum(jnp.abs(all_at_start), jnp.abs(guess))
-        guess, known, represented = (
-            jnp.concatenate([u.ravel(), y0.ravel()]) for u in (guess, known, represented)
+        size = jnp.broadcast_to(jnp.stack(equations.absolute(q0, p0)), all_at_start.shape)
+        start = jnp.maximum(jnp.abs(all_at_start), jnp.abs(guess))
+        guess, size, start = (
+            jnp.concatenate([u.ravel(), y0.ravel()]) for u in (guess, size, start)
         )
-        x, info = find_root(residual, guess, known, equations.newton, represented)
+        x, info = find_root(residual, guess, size, equations.newton, start)
         z, y = split(x)
-        q1, p1 = advanced(b, z, y)
+        q1, p1 = advance(b, z, y)
         return q1, p1, judge(info, q1, p1)
 
     def needs_no_solve(self, equations, interval, q) -> bool:

@@ -66,8 +66,8 @@ def _table(stages: int) -> _Table:
     a, ratio = integrals(x, b, n), integrals(x, [1] * stages, n)
     # The P_i lie on a polynomial of degree s − 2, so that P_s = Σ_{i<s} last_i P_i: one unknown
     # less to solve for.
-    known = x[:-1]
-    last = [math.prod((1 - z) / (y - z) for z in known if z != y) for y in known]
+    inner = x[:-1]
+    last = [math.prod((1 - z) / (y - z) for z in inner if z != y) for y in inner]
     c, b, last = (np.array(part, object) for part in (x, b, last))
     return _Table((c + 1) / 2, b, a, b * (1 - ratio.T), last)
 
@@ -140,8 +140,8 @@ class LobattoIIIAIIIB(Collocation):
             return q0[None] + h * jnp.tensordot(a, velocities(times, Q, P), 1)
 
         def momenta(Q, P):
-            known = forces(times[:-1], Q[:-1], P[:-1])  # the last column of â is zero
-            return p0[None] + h * jnp.tensordot(a_hat[:, :-1], known, 1)
+            rates = forces(times[:-1], Q[:-1], P[:-1])  # the last column of â is zero
+            return p0[None] + h * jnp.tensordot(a_hat[:, :-1], rates, 1)
 
         def unknowns(Q, P):
             """P_1, …, P_{s−1}, and Q_2, …, Q_s unless they follow from the P."""
@@ -158,9 +158,9 @@ class LobattoIIIAIIIB(Collocation):
             Q, P = at_stages(x)
             return x - unknowns(positions(Q, P), momenta(Q, P))
 
-        def sweep(_, known):
-            Q = positions(*known)
-            return Q, momenta(Q, known[1])
+        def sweep(_, stages):
+            Q = positions(*stages)
+            return Q, momenta(Q, stages[1])
 
         start = tuple(jnp.broadcast_to(z, (s, *z.shape)) for z in (q0, p0))
         if self.needs_no_solve(equations, interval, q0):  # one sweep finds P_1 = P_2
@@ -168,10 +168,10 @@ class LobattoIIIAIIIB(Collocation):
             info = no_solve(q0)
         else:
             guess = lax.fori_loop(0, _SWEEPS, sweep, lax.stop_gradient(start))
-            known = (jnp.broadcast_to(z, (s, *z.shape)) for z in equations.absolute(q0, p0))
+            size = (jnp.broadcast_to(z, (s, *z.shape)) for z in equations.absolute(q0, p0))
             x0 = unknowns(*guess)
-            represented = jnp.maximum(jnp.abs(unknowns(*start)), jnp.abs(x0))
-            x, info = find_root(residual, x0, unknowns(*known), equations.newton, represented)
+            represented_size = jnp.maximum(jnp.abs(unknowns(*start)), jnp.abs(x0))
+            x, info = find_root(residual, x0, unknowns(*size), equations.newton, represented_size)
         Q, P = at_stages(x)
         q1, p1 = Q[-1], p0 + h * jnp.tensordot(b, forces(times, Q, P), 1)
         return q1, p1, judge(info, q1, p1)

@@ -16,15 +16,15 @@ from ._type_ii import TypeII
 from ._wisdom_holman import WisdomHolman
 
 
-def as_method(given: Any) -> Any:
+def as_method(method: Any) -> Any:
     """The method with a name: "strang", "leapfrog", "rk4", "KahanLi8", "yoshida(4)".
 
     Capital letters, spaces, hyphens and underscores make no difference. Any other object is
     returned. **Raises** `ValueError`.
     """
-    if not isinstance(given, str):
-        return given
-    text = given
+    if not isinstance(method, str):
+        return method
+    text = method
     plain = {
         **dict.fromkeys(("TypeII", "SymplecticEuler"), TypeII),
         "Adjoint": Adjoint,
@@ -41,18 +41,17 @@ def as_method(given: Any) -> Any:
     for name, make in plain.items():
         if key == name.lower():
             return make()
-    found = re.fullmatch(r"([a-z]+?)\(?(?:order=|stages=)?(\d+)\)?", key)
+    match = re.fullmatch(r"([a-z]+?)\(?(?:order=|stages=)?(\d+)\)?", key)
     for name, kind in with_number.items():
-        if found and found[1] == name.lower():
-            return kind(int(found[2]))
-    number = found[2] if found else ""
-    known = {name.lower(): name for name in plain}
-    known |= {f"{n}{number}".lower(): f"{n}{number or '(...)'}" for n in with_number}
-    close = difflib.get_close_matches(key, known, 1, 0.5)
-    meant = f" Did you mean {known[close[0]]!r}?" if close else ""
+        if match and match[1] == name.lower():
+            return kind(int(match[2]))
+    number = match[2] if match else ""
+    spellings = {name.lower(): name for name in plain}
+    spellings |= {f"{n}{number}".lower(): f"{n}{number or '(...)'}" for n in with_number}
+    close = difflib.get_close_matches(key, spellings, 1, 0.5)
+    suggestion = f" Did you mean {spellings[close[0]]!r}?" if close else ""
     raise ValueError(
-        f"method must be a known name or an object such as dvi.Strang(), got {text!r}.{meant} The "
-        f"names without a number are {', '.join(plain)}. The names with a number, as in "
-        f"'Yoshida4', are {', '.join(with_number)}. The number is the order; for the last two it "
-        "is the number of stages."
+        f"method must be an object such as dvi.Strang() or a known name, got {text!r}.{suggestion} "
+        f"Names are {', '.join(plain)}; with an order, or a number of stages, as in 'Yoshida4': "
+        f"{', '.join(with_number)}."
     )

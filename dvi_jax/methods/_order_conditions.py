@@ -60,10 +60,10 @@ def order_defects(
 def _words(degree: int, letters: list[int]) -> list[Word]:
     """All words of letters whose sum is at most `degree`, the empty one included."""
     longer = [
-        (first, *rest)
+        (first, *tail)
         for first in letters
         if first <= degree
-        for rest in _words(degree - first, letters)
+        for tail in _words(degree - first, letters)
     ]
     return [(), *longer]
 

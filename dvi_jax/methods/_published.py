@@ -26,12 +26,11 @@ class Published(CompositionMethod):
 
     def __check_init__(self):
         if self.order not in self.tables:
-            *most, last = self.tables
-            which = f"{', '.join(map(str, most))} or {last}" if most else f"{last}"
+            *others, last = self.tables
+            orders = f"{', '.join(map(str, others))} or {last}" if others else f"{last}"
             raise ValueError(
-                f"order of {type(self).__name__} must be {which}, got {self.order!r}. For order 2 "
-                "use dvi.Strang(); for coefficients of your own use "
-                "dvi.Composition(coefficients, order=...)."
+                f"order of {type(self).__name__} must be {orders}, got {self.order!r}. For "
+                "others use dvi.Strang() or dvi.Composition(coefficients, order=...)."
             )
 
     def fractions(self):

@@ -50,37 +50,37 @@ class Rattle(Method):
         # Both halves as in `Strang`, the second one as the inverse of a step backwards.
         h, m = interval.h, equations.constraint(q0).size
         first, second = interval.part(0.0, 0.5), interval.part(0.5, 1.0).reversed()
-        linear = Linear.at(equations, q0)
+        linear = Linear.of_constraint(equations, q0)
         velocity = velocity_at(equations, interval.t0, q0)
         # The unknown is z = −Λ·units, a velocity across the constraint: its scale is known. The
         # result does not depend on the units, so that they are not differentiated.
         G = lax.stop_gradient(gradient(equations, q0))
         units = lax.stop_gradient(own_coupling(G, velocity, p0))
 
-        def moved(z, p_half, q1):
+        def half_step(z, p_half, q1):
             """p½ and (q1 − q0)/h for multipliers, and for p½ and q1 on the right sides."""
-            push = linear.back(z / units)
+            push = linear.transpose(z / units)
             p = p0 + h / 2 * equations.momentum_rate(first, q0, p_half) + push
             v = equations.position_rate(first, q0, p) + equations.position_rate(second, q1, p)
             return p, v / 2
 
         # As at the ends of the curve between two states, where z = 0 is the root.
-        still = h == 0
-        divisor = jnp.where(still, 1, h)
+        is_zero = h == 0
+        divisor = jnp.where(is_zero, 1, h)
 
-        def off(z, v):
+        def violation(z, v):
             """g(q1)/h."""
-            return jnp.where(still, z, equations.constraint(q0 + h * v) / divisor)
+            return jnp.where(is_zero, z, equations.constraint(q0 + h * v) / divisor)
 
         q, p = equations.absolute(q0, p0)
-        reach = jnp.where(still, 0, jnp.abs(q / divisor)) + jnp.abs(velocity(p0))
+        reach = jnp.where(is_zero, 0, jnp.abs(q / divisor)) + jnp.abs(velocity(p0))
         # Round-off of g(q1)/h: that of the terms of G q1, over h, and that of the velocity itself.
         zero, scale = jnp.zeros(m, q0.dtype), jnp.abs(G) @ reach.ravel()
         if _is_separable(equations, first, second, q0, p0):
-            at, info = find_root(
-                lambda z: off(z, moved(z, p0, q0)[1]), zero, scale, root_solver(equations)
+            root, info = find_root(
+                lambda z: violation(z, half_step(z, p0, q0)[1]), zero, scale, root_solver(equations)
             )
-            p_half, v = moved(at, p0, q0)
+            p_half, v = half_step(root, p0, q0)
         else:
             # One iteration for everything. p½ is taken out of the equation for q1, and q1 out of
             # that for z, so that the Jacobian in z is not singular.
@@ -89,15 +89,15 @@ class Rattle(Method):
 
             def residual(x):
                 z, p_half, q1 = split(x)
-                p, v = moved(z, p_half, q1)
+                p, v = half_step(z, p_half, q1)
                 left = (p_half - p).ravel(), (q1 - q0 - h * v).ravel()
-                return jnp.concatenate([off(z, v), *left])
+                return jnp.concatenate([violation(z, v), *left])
 
-            p_half, v = moved(zero, p0, q0)
+            p_half, v = half_step(zero, p0, q0)
             guess = jnp.concatenate([zero, p_half.ravel(), (q0 + h * v).ravel()])
-            known = jnp.concatenate([scale, p.ravel(), q.ravel()])
-            at, info = find_root(residual, guess, known, equations.newton)
-            p_half, v = moved(*split(at))
+            size = jnp.concatenate([scale, p.ravel(), q.ravel()])
+            root, info = find_root(residual, guess, size, equations.newton)
+            p_half, v = half_step(*split(root))
         # The position after the last correction, for which g has been evaluated.
         q1 = q0 + h * v
         p1 = p_half + h / 2 * equations.momentum_rate(second, q1, p_half)

@@ -43,9 +43,8 @@ class RungeKutta4(Method):
     def inverse(self, equations, interval, q1, p1):
         # Callers check `is_invertible` first; only code of a user gets here.
         raise TypeError(
-            "RungeKutta4 has no inverse step: its inverse has no closed form. Use another method, "
-            "such as dvi.Strang(). For gradients without inverse steps use "
-            "adjoint=dvi.Checkpointed()."
+            "RungeKutta4 has no inverse step. Use another method, such as dvi.Strang(), or "
+            "adjoint=dvi.Checkpointed() for gradients."
         )
 
     def needs_no_solve(self, equations, interval, q):

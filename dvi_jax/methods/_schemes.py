@@ -24,7 +24,7 @@ _LARGEST = 10
 
 # The first halves of a₁, a₂, … and of b₁, b₂, …, as in A(a₁h) B(b₁h) A(a₂h) B(b₂h) … A(a₁h). The
 # middle coefficient is computed, so that the sums are 1 to the last digit.
-_PUBLISHED: dict[Orders, tuple[tuple[float, ...], tuple[float, ...]]] = {
+_COEFFICIENTS: dict[Orders, tuple[tuple[float, ...], tuple[float, ...]]] = {
     (8, 4): ((0.0753469602698929, 0.5179168546882568), (0.1902259393736766, 0.8465240704435263)),
     (10, 4): (
         (0.04706710064597250613, 0.1847569354170881069, 0.2827060056798362053),
@@ -48,7 +48,7 @@ _PUBLISHED: dict[Orders, tuple[tuple[float, ...], tuple[float, ...]]] = {
 
 def _names() -> str:
     gauss = [f"({n}, 2)" for n in range(2, _LARGEST + 2, 2)]
-    return ", ".join([*gauss, *map(str, _PUBLISHED)])
+    return ", ".join([*gauss, *map(str, _COEFFICIENTS)])
 
 
 @functools.cache
@@ -60,31 +60,30 @@ def near_integrable(orders: Orders) -> tuple[tuple[float, ...], ...] | None:
         a, b = np.diff([0.0, *((x + 1) / 2), 1.0]), w / 2
         # Symmetric to the last bit, because the reversal of a step depends on it.
         return tuple(((a + a[::-1]) / 2).tolist()), tuple(((b + b[::-1]) / 2).tolist())
-    if orders not in _PUBLISHED:
+    if orders not in _COEFFICIENTS:
         return None
-    return _completed(*_PUBLISHED[orders])
+    return _complete(*_COEFFICIENTS[orders])
 
 
-def _completed(a: Sequence[float], b: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+def _complete(a: Sequence[float], b: Sequence[float]) -> tuple[tuple[float, ...], ...]:
     # A has one coefficient more than B. The even number of the two has a pair in the middle.
-    twice, once = (a, b) if len(a) == len(b) else (b, a)
-    twice, once = (*twice, 0.5 - math.fsum(twice)), (*once, 1 - 2 * math.fsum(once))
-    found = (*twice, *twice[::-1]), (*once, *once[-2::-1])
-    return found if len(a) == len(b) else found[::-1]
+    even, odd = (a, b) if len(a) == len(b) else (b, a)
+    even, odd = (*even, 0.5 - math.fsum(even)), (*odd, 1 - 2 * math.fsum(odd))
+    sequences = (*even, *even[::-1]), (*odd, *odd[-2::-1])
+    return sequences if len(a) == len(b) else sequences[::-1]
 
 
 def sequence_of(scheme: Any, parts: int) -> Flows:
     """The flows of a scheme. **Raises** `ValueError` if it is not for this number of parts."""
     if isinstance(scheme, tuple):
-        found = near_integrable(scheme)
-        assert found is not None
+        coefficients = near_integrable(scheme)
+        assert coefficients is not None
         if parts != 2:
             raise ValueError(
                 f"the scheme {scheme} requires two parts, A + εB, got {parts}. Join the parts of "
-                "B, or name the part that contains the perturbation in dvi.Split(..., "
-                "perturbed=1), or use a scheme for any number of parts, such as dvi.Strang()."
+                "B, or use dvi.Split(..., perturbed=1) or a scheme such as dvi.Strang()."
             )
-        a, b = found
+        a, b = coefficients
         pairs = itertools.zip_longest(a, b)
         return tuple((i, c) for pair in pairs for i, c in enumerate(pair) if c is not None)
     # The map is one part after the other, the adjoint the opposite order.
@@ -99,18 +98,18 @@ def joined(stages: Iterable[tuple[int, float]]) -> Flows:
     return tuple((i, math.fsum(c for _, c in group)) for i, group in groups)
 
 
-def as_scheme(given: Any) -> Any:
-    return tuple(given) if isinstance(given, list) else given
+def as_scheme(scheme: Any) -> Any:
+    return tuple(scheme) if isinstance(scheme, list) else scheme
 
 
 def check_scheme(scheme: Any) -> None:
     """**Raises** `TypeError` or `ValueError` for a scheme that is not known."""
-    known = f"The known generalised orders are {_names()}."
+    names = f"The known generalised orders are {_names()}."
     if isinstance(scheme, tuple):
         if near_integrable(scheme) is None:
-            raise ValueError(f"scheme has unknown generalised orders {scheme}. {known}")
+            raise ValueError(f"scheme has unknown generalised orders {scheme}. {names}")
     elif not isinstance(scheme, CompositionMethod) or scheme.base != TypeII():
-        hint = "Its base must be dvi.TypeII()." if isinstance(scheme, Method) else known
+        hint = "Its base must be dvi.TypeII()." if isinstance(scheme, Method) else names
         raise TypeError(
             "scheme must be a composition, such as dvi.Strang() or dvi.BlanesMoan(6), or a tuple "
             f"of generalised orders, such as (8, 4), got {scheme!r}. {hint}"

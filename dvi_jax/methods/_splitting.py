@@ -25,13 +25,13 @@ from ._strang import Strang
 from ._type_ii import TypeII
 from .step import Equations, StepInfo, judge, no_solve, no_step_yet
 
-Moved = tuple[State, State, StepInfo]
+StateAndInfo = tuple[State, State, StepInfo]
 
 
 class Part(NamedTuple):
     """The motion of one part, ``advance(interval, q, p)``, and whether it is its exact flow."""
 
-    advance: Callable[[Interval, State, State], Moved]
+    advance: Callable[[Interval, State, State], StateAndInfo]
     is_exact: bool
 
 
@@ -43,24 +43,24 @@ class Stage(NamedTuple):
     end: float
     length: float
 
-    def on(self, interval: Interval) -> Interval:
+    def interval_in(self, interval: Interval) -> Interval:
         # The length is c h, not a difference of times, in which digits cancel.
         return interval.part(self.start, self.end)._replace(h=self.length * interval.h)
 
-    def undone(self) -> "Stage":
+    def inverse(self) -> "Stage":
         return Stage(self.part, self.end, self.start, -self.length)
 
 
 def stages_of(sequence: Sequence[tuple[int, float]], time: float = 0.0) -> list[Stage]:
     # The first part carries the time; the others act at a fixed time. The end is not a sum of all
     # coefficients, which is 1 only up to rounding.
-    found, total = [], math.fsum(c for i, c in sequence if i == 0) + time
+    stages, total = [], math.fsum(c for i, c in sequence if i == 0) + time
     for i, c in sequence:
         end = time + c if i == 0 else time
         end = total if i == 0 and abs(end - total) < 1e-12 else end
-        found.append(Stage(i, time, end, c))
+        stages.append(Stage(i, time, end, c))
         time = end
-    return found
+    return stages
 
 
 class SplittingMethod(Method):
@@ -78,11 +78,11 @@ class SplittingMethod(Method):
     def parts(self, equations: Equations, interval: Interval, q: State) -> list[Part]:
         """The flow of each part. **Raises** for a system that has no such parts."""
 
-    def enter(self, equations: Equations, interval: Interval, q: State, p: State) -> Moved:
+    def enter(self, equations: Equations, interval: Interval, q: State, p: State) -> StateAndInfo:
         """The state in the coordinates of the parts."""
         return q, p, no_step_yet(q)
 
-    def leave(self, equations: Equations, interval: Interval, q: State, p: State) -> Moved:
+    def leave(self, equations: Equations, interval: Interval, q: State, p: State) -> StateAndInfo:
         """The inverse of `enter`."""
         return q, p, no_step_yet(q)
 
@@ -107,37 +107,37 @@ class SplittingMethod(Method):
 
     def step(self, equations, interval, q0, p0):
         stages = stages_of(self._sequence(equations, interval, q0))
-        return self._around(equations, interval, stages, q0, p0)
+        return self._in_coordinates(equations, interval, stages, q0, p0)
 
     def inverse(self, equations, interval, q1, p1):
         stages = stages_of(self._sequence(equations, interval, q1))
-        back = [stage.undone() for stage in reversed(stages)]
-        return self._around(equations, interval, back, q1, p1)
+        reverse = [stage.inverse() for stage in reversed(stages)]
+        return self._in_coordinates(equations, interval, reverse, q1, p1)
 
     def _sequence(self, equations, interval, q):
         return sequence_of(self.scheme, len(self.parts(equations, interval, q)))
 
-    def _around(self, equations, interval, stages, q, p) -> Moved:
+    def _in_coordinates(self, equations, interval, stages, q, p) -> StateAndInfo:
         q, p, first = self.enter(equations, interval, q, p)
-        q, p, info = self.composed(equations, interval, stages, q, p)
+        q, p, info = self.compose(equations, interval, stages, q, p)
         q, p, last = self.leave(equations, interval, q, p)
         return q, p, first.then(info).then(last)
 
-    def composed(
+    def compose(
         self, equations: Equations, interval: Interval, stages: list[Stage], q: State, p: State
-    ) -> Moved:
+    ) -> StateAndInfo:
         """One flow after another."""
         parts = self.parts(equations, interval, q)
 
-        def advanced(state, pieces, which):
+        def advance_all(state, pieces, numbers):
             q, p, info = state
-            for i, piece in zip(which, pieces, strict=True):
-                q, p, now = parts[i].advance(piece, q, p)
-                info = info.then(now)
+            for i, piece in zip(numbers, pieces, strict=True):
+                q, p, part_info = parts[i].advance(piece, q, p)
+                info = info.then(part_info)
             return q, p, info
 
-        pieces = [stage.on(interval) for stage in stages]
-        which = [stage.part for stage in stages]
+        pieces = [stage.interval_in(interval) for stage in stages]
+        part_numbers = [stage.part for stage in stages]
         state = q, p, no_step_yet(q)
         # Neighbours differ, so that stages repeat with this period, as in 0 1 2 1 0 1 2 1 0. A
         # loop over periods is compiled faster than all stages.
@@ -145,16 +145,18 @@ class SplittingMethod(Method):
         count = len(stages) // period if len(stages) > 2 * period else 0
         if count:
             rounds = [tuple(pieces[k * period : (k + 1) * period]) for k in range(count)]
-            stacked = jax.tree.map(lambda *xs: jnp.stack(xs), *rounds)
-            state, _ = lax.scan(lambda s, x: (advanced(s, x, which[:period]), None), state, stacked)
-        return advanced(state, pieces[count * period :], which[count * period :])
+            stack = jax.tree.map(lambda *xs: jnp.stack(xs), *rounds)
+            state, _ = lax.scan(
+                lambda s, x: (advance_all(s, x, part_numbers[:period]), None), state, stack
+            )
+        return advance_all(state, pieces[count * period :], part_numbers[count * period :])
 
     def in_loop(self, equations, interval, q):
         parts = self.parts(equations, interval, q)
         sequence = sequence_of(self.scheme, len(parts))
         # Two flows of the first part are one only if they are exact.
-        (_, a), *more = sequence
-        return _in_loop(self, a) if self.is_symmetric and more and parts[0].is_exact else None
+        (_, a), *others = sequence
+        return _in_loop(self, a) if self.is_symmetric and others and parts[0].is_exact else None
 
     def needs_no_solve(self, equations, interval, q) -> bool:
         return all(part.is_exact for part in self.parts(equations, interval, q))
@@ -166,21 +168,21 @@ class SplittingMethod(Method):
 def _in_loop(method: SplittingMethod, a: float) -> InLoop:
     """(A(a) W A(a))ⁿ is A(a) (W A(2a))ⁿ A(−a), which has one flow less per step."""
 
-    def before(equations, interval, q, p):
+    def first_part(equations, interval, q, p):
         q, p, first = method.enter(equations, interval, q, p)
-        q, p, info = method.composed(equations, interval, [Stage(0, 0.0, -a, -a)], q, p)
+        q, p, info = method.compose(equations, interval, [Stage(0, 0.0, -a, -a)], q, p)
         return q, p, first.then(info)
 
     def step(equations, interval, q, p):
         _, *middle, _ = method._sequence(equations, interval, q)
-        return method.composed(equations, interval, stages_of([(0, 2 * a), *middle], -a), q, p)
+        return method.compose(equations, interval, stages_of([(0, 2 * a), *middle], -a), q, p)
 
-    def after(equations, interval, q, p):
-        q, p, info = method.composed(equations, interval, [Stage(0, 1 - a, 1.0, a)], q, p)
+    def last_part(equations, interval, q, p):
+        q, p, info = method.compose(equations, interval, [Stage(0, 1 - a, 1.0, a)], q, p)
         q, p, last = method.leave(equations, interval, q, p)
         return q, p, info.then(last)
 
-    return InLoop(before, step, after)
+    return InLoop(first_part, step, last_part)
 
 
 class Splitting(SplittingMethod):
@@ -246,39 +248,39 @@ class Splitting(SplittingMethod):
                 "method=dvi.Splitting(...) requires a system with known parts: "
                 f"dvi.System(dvi.Split([H_A, H_B])). Its H_D is {H!r:.100}."
             )
-        rest = system.force, system.perturbation
+        perturbations = system.force, system.perturbation
         parts: list[Any] = [(H_i, None, None) for H_i in H.parts]
         if H.perturbed is not None:
-            parts[H.perturbed] = (H.parts[H.perturbed], *rest)
-        elif rest != (None, None):
-            parts.append((_no_energy, *rest))
+            parts[H.perturbed] = (H.parts[H.perturbed], *perturbations)
+        elif perturbations != (None, None):
+            parts.append((_no_energy, *perturbations))
 
-        def part(i, H_i, *rest):
+        def part(i, H_i, *terms):
             if isinstance(H_i, Flow):
-                return _known(equations, H_i)
-            own = System(H_i, *rest, slow_time=system.slow_time)
-            own = dataclasses.replace(equations, system=own)
-            is_exact = _is_exact(own, interval, q, timed=i == 0)
+                return _flow_part(equations, H_i)
+            part_equations = System(H_i, *terms, slow_time=system.slow_time)
+            part_equations = dataclasses.replace(equations, system=part_equations)
+            is_exact = _is_exact(part_equations, interval, q, has_time=i == 0)
             method = TypeII() if is_exact else GaussLegendre(-(-self.order // 2))
-            return Part(functools.partial(method.step, own), is_exact)
+            return Part(functools.partial(method.step, part_equations), is_exact)
 
-        return [part(i, *of) for i, of in enumerate(parts)]
+        return [part(i, *arguments) for i, arguments in enumerate(parts)]
 
 
 def _no_energy(t0, t1, q0, p1, args):
     return jnp.zeros((), q0.dtype)
 
 
-def _known(equations: Equations, flow: Flow) -> Part:
+def _flow_part(equations: Equations, flow: Flow) -> Part:
     def advance(interval, q, p):
-        dq, dp, found = flow.change(interval.h, *equations.absolute(q, p), equations.args)
+        dq, dp, converged = flow.change(interval.h, *equations.absolute(q, p), equations.args)
         q, p = q + dq, p + dp
-        return q, p, judge(no_solve(q)._replace(converged=found), q, p)
+        return q, p, judge(no_solve(q)._replace(converged=converged), q, p)
 
     return Part(advance, True)
 
 
-def _is_exact(equations: Equations, interval: Interval, like: State, timed: bool) -> bool:
+def _is_exact(equations: Equations, interval: Interval, like: State, has_time: bool) -> bool:
     """Whether the map (12)–(13) of this part is its flow: a function of q0 or of p1 alone."""
     t0, t1, _ = interval
 
@@ -289,7 +291,7 @@ def _is_exact(equations: Equations, interval: Interval, like: State, timed: bool
         return equations.momentum_rate(Interval(t, t1, t0), like, p)
 
     # At a fixed time its value is that of a constant; the first part is advanced in time.
-    if timed and (
+    if has_time and (
         depends_on(lambda t: energy(t, like, like), 0, t0)
         or depends_on(lambda t: rate(t, like), 0, t0)
     ):

@@ -21,7 +21,7 @@ _LARGEST = 6.0
 """Largest increment of noise in a step that may be implicit, in standard deviations."""
 
 
-class Driven(eqx.Module):
+class NoisySystem(eqx.Module):
     r"""A system with the noise of one step as constant rates Ḃ = ΔB/h.
 
     With G = Σ h_m Ḃ_m its Hamiltonian is H_D + G. That of the map (12)–(13) has one term more,
@@ -64,7 +64,7 @@ def _place(equations: Equations, t: Scalar, q: State, p: State) -> tuple[Any, ..
 
 
 class _WithNoise(Method):
-    """Base of the methods that are those of a system without noise on `Driven` systems."""
+    """Base of the methods that are those of a system without noise with a `NoisySystem`."""
 
     plain: ClassVar[Method]
 
@@ -74,33 +74,35 @@ class _WithNoise(Method):
 
     # Both with the rates of the step forwards, so that the inverse goes back along the same path.
     def step(self, equations, interval, q0, p0):
-        return self.plain.step(self._driven(equations, interval, q0, p0), interval, q0, p0)
+        return self.plain.step(self._with_noise(equations, interval, q0, p0), interval, q0, p0)
 
     def inverse(self, equations, interval, q1, p1):
-        return self.plain.inverse(self._driven(equations, interval, q1, p1), interval, q1, p1)
+        return self.plain.inverse(self._with_noise(equations, interval, q1, p1), interval, q1, p1)
 
     def needs_no_solve(self, equations, interval, q):
-        return self.plain.needs_no_solve(self._driven(equations, interval, q, q), interval, q)
+        return self.plain.needs_no_solve(self._with_noise(equations, interval, q, q), interval, q)
 
     def inverse_needs_no_solve(self, equations, interval, q):
-        driven = self._driven(equations, interval, q, q)
-        return self.plain.inverse_needs_no_solve(driven, interval, q)
+        noisy = self._with_noise(equations, interval, q, q)
+        return self.plain.inverse_needs_no_solve(noisy, interval, q)
 
-    def _driven(self, equations: Equations, interval: Interval, q: State, p: State) -> Equations:
+    def _with_noise(
+        self, equations: Equations, interval: Interval, q: State, p: State
+    ) -> Equations:
         noise, dB = equations.system.noise, equations.increments
         if noise is None:
             return equations
-        at, is_map = _place(equations, interval.t0, q, p), self.plain.is_the_map
+        place, is_map = _place(equations, interval.t0, q, p), self.plain.is_the_map
         # The midpoint rule needs no such test: it evaluates σ in the middle of the step.
         if is_map:
-            noise.check_fixed_momentum(type(self).__name__, *at)
+            noise.check_fixed_momentum(type(self).__name__, *place)
         # Without increments the equations are only examined, for whether they need a solve.
-        dB = jnp.zeros(noise.count(*at), q.dtype) if dB is None else dB[0]
+        dB = jnp.zeros(noise.count(*place), q.dtype) if dB is None else dB[0]
         # Arbitrarily large increments, which are arbitrarily rare, would have no solution.
-        most = _LARGEST * jnp.sqrt(jnp.abs(interval.h))
-        rates = jnp.clip(dB, -most, most) / interval.h
-        driven = Driven(equations.system, rates, interval.h, is_map)
-        return dataclasses.replace(equations, system=driven, increments=None)
+        largest = _LARGEST * jnp.sqrt(jnp.abs(interval.h))
+        rates = jnp.clip(dB, -largest, largest) / interval.h
+        system = NoisySystem(equations.system, rates, interval.h, is_map)
+        return dataclasses.replace(equations, system=system, increments=None)
 
 
 class StochasticEuler(_WithNoise):
@@ -162,20 +164,20 @@ class _Splitting(CompositionMethod):
     def step(self, equations, interval, q0, p0):
         noise, dB, count = equations.system.noise, equations.increments, self.increments
 
-        def kicked(number, q, p):
+        def kick(number, q, p):
             """p after an O at constant q."""
             if noise is None or dB is None:
                 return p
-            at = _place(equations, interval.part((number + 0.5) / count, 1.0).t0, q, p)
-            noise.check_fixed_momentum(type(self).__name__, *at)
-            return p + noise.kick(*at, interval.h / count, dB[number])
+            place = _place(equations, interval.part((number + 0.5) / count, 1.0).t0, q, p)
+            noise.check_fixed_momentum(type(self).__name__, *place)
+            return p + noise.kick(*place, interval.h / count, dB[number])
 
-        p = kicked(0, q0, p0) if count == 2 else p0
+        p = kick(0, q0, p0) if count == 2 else p0
         q, p, first = self.base.step(equations, interval.part(0.0, 0.5), q0, p)
-        p = kicked(0, q, p) if count == 1 else p
+        p = kick(0, q, p) if count == 1 else p
         # The adjoint of the map is the inverse of the map by −h.
         q, p, second = self.base.inverse(equations, interval.part(0.5, 1.0).reversed(), q, p)
-        return q, kicked(1, q, p) if count == 2 else p, first.then(second)
+        return q, kick(1, q, p) if count == 2 else p, first.then(second)
 
     def inverse(self, equations, interval, q1, p1):
         # The parts are symmetric: back along the path, they are the step by −h with −dB.

@@ -28,24 +28,24 @@ class _Jacobi(NamedTuple):
 
     masses: Array  # (bodies,)
 
-    def of(self, x: Array) -> Array:
+    def from_bodies(self, x: Array) -> Array:
         """Positions, velocities or accelerations of the bodies in these coordinates."""
         eta = jnp.cumsum(self.masses)[:, None]
         centres = jnp.cumsum(self.masses[:, None] * x, axis=0) / eta
         return jnp.concatenate([centres[-1:], x[1:] - centres[:-1]])
 
-    def back(self, X: Array) -> Array:
-        """The inverse of `of`."""
+    def to_bodies(self, X: Array) -> Array:
+        """The inverse of `from_bodies`."""
         part = (self.masses / jnp.cumsum(self.masses))[1:, None]
-        beyond = jnp.cumsum((part * X[1:])[::-1], axis=0)[::-1]
-        centres = X[:1] - jnp.concatenate([beyond, jnp.zeros_like(X[:1])])
+        outer = jnp.cumsum((part * X[1:])[::-1], axis=0)[::-1]
+        centres = X[:1] - jnp.concatenate([outer, jnp.zeros_like(X[:1])])
         return centres + jnp.concatenate([jnp.zeros_like(X[:1]), (1 - part) * X[1:]])
 
     def central_mass(self) -> Array:
         """The mass at the centre of the Kepler orbit of each row but the first."""
         return jnp.cumsum(self.masses)[1:]
 
-    velocities_of, velocities_back = of, back
+    velocities_of, velocities_back = from_bodies, to_bodies
 
     def drift(self, V: Array) -> Array:
         """dQ/dt of the part B."""
@@ -61,10 +61,10 @@ class _Democratic(NamedTuple):
     def _centre(self, x: Array) -> Array:
         return jnp.sum(self.masses[:, None] * x, axis=0, keepdims=True) / jnp.sum(self.masses)
 
-    def of(self, x: Array) -> Array:
+    def from_bodies(self, x: Array) -> Array:
         return jnp.concatenate([self._centre(x), x[1:] - x[:1]])
 
-    def back(self, X: Array) -> Array:
+    def to_bodies(self, X: Array) -> Array:
         part = self.masses[1:, None] / jnp.sum(self.masses)
         sun = X[:1] - jnp.sum(part * X[1:], axis=0, keepdims=True)
         return jnp.concatenate([sun, sun + X[1:]])
@@ -140,8 +140,7 @@ class WisdomHolman(SplittingMethod):
             raise ValueError(
                 'corrector must be 0 unless coordinates="jacobi" and scheme=dvi.Strang(), for '
                 f"which its coefficients are derived; got corrector={self.corrector}, coordinates="
-                f"{self.coordinates!r}, scheme={self.scheme!r}. For a smaller error use a scheme "
-                "such as (10, 6, 4)."
+                f"{self.coordinates!r}, scheme={self.scheme!r}."
             )
 
     def is_double_only(self, equations) -> bool:
@@ -178,12 +177,12 @@ class WisdomHolman(SplittingMethod):
         def inverse_mass(p):
             return jax.jvp(lambda p: velocity(q, p), (p,), (jnp.ones_like(p),))[1]
 
-        mixed = depends_on(lambda q: velocity(q, jnp.ones_like(q)), 0, q)
-        if mixed or depends_on(inverse_mass, 0, q):
-            seen = "q0 enters ∂H_D/∂p1" if mixed else "T is not quadratic in the momenta"
+        is_coupled = depends_on(lambda q: velocity(q, jnp.ones_like(q)), 0, q)
+        if is_coupled or depends_on(inverse_mass, 0, q):
+            reason = "q0 enters ∂H_D/∂p1" if is_coupled else "T is not quadratic in the momenta"
             raise ValueError(
                 "method=dvi.WisdomHolman(...) requires H_D = T(p1) + V(q0) with T = Σ |p_i|²/"
-                f"(2 m_i), but {seen}. Use another method, such as dvi.GaussLegendre(2)."
+                f"(2 m_i), but {reason}. Use another method, such as dvi.GaussLegendre(2)."
             )
         return _COORDINATES[self.coordinates](1 / inverse_mass(q)[:, 0])
 
@@ -194,7 +193,7 @@ class WisdomHolman(SplittingMethod):
         # With an origin states are relative to it, in these coordinates too: they are linear.
         zero = jnp.zeros_like(q)
         position, momentum = equations.absolute(zero, zero)
-        base = frame.of(position), frame.velocities_of(momentum / frame.masses[:, None])
+        base = frame.from_bodies(position), frame.velocities_of(momentum / frame.masses[:, None])
         implicit = not equations.step_is_explicit(interval, q)
 
         def attraction(X):
@@ -207,18 +206,18 @@ class WisdomHolman(SplittingMethod):
         def kepler(interval, X, V):
             h = interval.h
             whole_X, whole_V = base[0] + X, base[1] + V
-            dX, dV, found = _kepler.change(h, whole_X[1:], whole_V[1:], mu)
+            dX, dV, is_root = _kepler.change(h, whole_X[1:], whole_V[1:], mu)
             X1 = X + jnp.concatenate([h * whole_V[:1], dX])
             V1 = V + jnp.concatenate([jnp.zeros_like(V[:1]), dV])
-            return X1, V1, judge(no_solve(X)._replace(converged=found), X1, V1)
+            return X1, V1, judge(no_solve(X)._replace(converged=is_root), X1, V1)
 
-        def kicked(interval, X, V):
-            h, x, scale = interval.h, frame.back(X), frame.masses[:, None]
+        def kick(interval, X, V):
+            h, x, scale = interval.h, frame.to_bodies(X), frame.masses[:, None]
 
             def rate(V):
                 p = scale * frame.velocities_back(V)
-                found = equations.momentum_rate(interval, x, p) / scale
-                return frame.velocities_of(found) - attraction(base[0] + X)
+                acceleration = equations.momentum_rate(interval, x, p) / scale
+                return frame.velocities_of(acceleration) - attraction(base[0] + X)
 
             if not implicit:
                 return V + h * rate(V), no_solve(X)
@@ -233,7 +232,7 @@ class WisdomHolman(SplittingMethod):
         def interaction(interval, X, V):
             # The recoil of the first body is in this part: half before the kick, half after it.
             X = X + interval.h / 2 * frame.drift(base[1] + V)
-            V, info = kicked(interval, X, V)
+            V, info = kick(interval, X, V)
             X = X + interval.h / 2 * frame.drift(base[1] + V)
             return X, V, judge(info, X, V)
 
@@ -241,15 +240,15 @@ class WisdomHolman(SplittingMethod):
 
     def enter(self, equations, interval, q, p):
         frame = self._frame(equations, interval, q)
-        X, V = frame.of(q), frame.velocities_of(p / frame.masses[:, None])
-        return self._corrected(equations, interval, X, V, 1)
+        X, V = frame.from_bodies(q), frame.velocities_of(p / frame.masses[:, None])
+        return self._correct(equations, interval, X, V, 1)
 
     def leave(self, equations, interval, q, p):
-        X, V, info = self._corrected(equations, interval, q, p, -1)
+        X, V, info = self._correct(equations, interval, q, p, -1)
         frame = self._frame(equations, interval, X)
-        return frame.back(X), frame.masses[:, None] * frame.velocities_back(V), info
+        return frame.to_bodies(X), frame.masses[:, None] * frame.velocities_back(V), info
 
-    def _corrected(self, equations, interval, X, V, sign):
+    def _correct(self, equations, interval, X, V, sign):
         if not self.corrector:
             return X, V, no_step_yet(X)
         # The inverse of Z(a, b) is Z(−a, b), and a and −a are at opposite places: b changes sign.
@@ -259,7 +258,7 @@ class WisdomHolman(SplittingMethod):
             for stage in ((0, a), (1, sign * b), (0, -2 * a), (1, -sign * b), (0, a))
         )
         stages = [Stage(part, 0.0, 0.0, c) for part, c in sequence]
-        return self.composed(equations, interval, stages, X, V)
+        return self.compose(equations, interval, stages, X, V)
 
 
 def _gravity(args: Args) -> Any:

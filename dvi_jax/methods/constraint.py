@@ -18,14 +18,14 @@ from lanewise.jaxprs.jaxapi import is_traced
 from ..base.inputs import as_parameter, as_scalar, start_state
 from ..base.results import RESULTS
 from ..base.types import Args, Interval, Scalar, State
-from ..engine.newton import Found, Known, RootSolver, find_root
+from ..engine.newton import KnownRoot, RootInfo, RootSolver, find_root
 from ..engine.picard import PicardThenNewton
 from ..problem.system import check_system, of_problem
 from .step import Equations, no_solve
 
 # A start is consistent up to so many times the round-off of the terms in g and in dg/dt, and of
 # the largest coordinate: a component such as q[2] = 0 has no size of its own.
-_OWN, _LARGEST = 4096, 64
+_COMPONENT, _LARGEST = 4096, 64
 
 
 def gradient(equations: Equations, q: State) -> Array:
@@ -44,11 +44,11 @@ def velocity_at(equations: Equations, t: Scalar, q: State) -> Callable[[State], 
 class Linear(NamedTuple):
     """The derivative G of g at a position, as functions: v → G v, and λ → Gᵀλ."""
 
-    across: Callable[[State], Array]
-    back: Callable[[Array], State]
+    product: Callable[[State], Array]
+    transpose: Callable[[Array], State]
 
     @classmethod
-    def at(cls, equations: Equations, q: State) -> "Linear":
+    def of_constraint(cls, equations: Equations, q: State) -> "Linear":
         # Not products with the matrix G: each component of g contains few coordinates, and
         # generated code leaves out the zeros of a chain for as long as it sees g itself.
         pull = jax.vjp(equations.constraint, q)[1]
@@ -59,7 +59,7 @@ class Linear(NamedTuple):
         push = jax.linearize(velocity, p)[1]
 
         def column(e):
-            return self.across(push(self.back(e)))
+            return self.product(push(self.transpose(e)))
 
         return jax.vmap(column, out_axes=1)(lanewise.unit_vectors(m, p.dtype))
 
@@ -71,29 +71,29 @@ def own_coupling(G: Array, velocity: Callable[[State], State], p: State) -> Arra
     return jax.vmap(lambda row: row @ push(row.reshape(p.shape)).ravel())(G)
 
 
-def tangent(equations: Equations, t: Scalar, q: State, p: State) -> tuple[State, Found]:
+def tangent(equations: Equations, t: Scalar, q: State, p: State) -> tuple[State, RootInfo]:
     """p − Gᵀμ with the velocity along the constraint, G ∂H/∂p = 0."""
-    linear, velocity = Linear.at(equations, q), velocity_at(equations, t, q)
-    across = linear.across(velocity(p))
-    A = linear.coupling(velocity, p, across.size)
+    linear, velocity = Linear.of_constraint(equations, q), velocity_at(equations, t, q)
+    normal_velocity = linear.product(velocity(p))
+    A = linear.coupling(velocity, p, normal_velocity.size)
     # A velocity that is linear in p needs no iteration.
     if not depends_on(lambda p, v: jax.jvp(velocity, (p,), (v,))[1], 0, p, p):
-        return p - linear.back(lanewise.solve(A, across)), no_solve(p)
+        return p - linear.transpose(lanewise.solve(A, normal_velocity)), no_solve(p)
     G = lax.stop_gradient(gradient(equations, q))
     units = lax.stop_gradient(jnp.diagonal(A))  # the unknowns are velocities: their scale is known
     scale = jnp.abs(G) @ jnp.abs(velocity(p)).ravel()
 
-    def moved(y):
-        return p - linear.back(y / units)
+    def momentum(y):
+        return p - linear.transpose(y / units)
 
     def residual(y):
-        return -linear.across(velocity(moved(y)))
+        return -linear.product(velocity(momentum(y)))
 
-    y, info = find_root(residual, across, scale, root_solver(equations))
-    return moved(y), info
+    y, info = find_root(residual, normal_velocity, scale, root_solver(equations))
+    return momentum(y), info
 
 
-def root_solver(equations: Equations) -> RootSolver | Known:
+def root_solver(equations: Equations) -> RootSolver | KnownRoot:
     """The solver for multipliers: of the default, Newton's method for any number of them."""
     # The Jacobian is that of masses that are coupled, not near the identity as for other methods:
     # fixed points of a chain converge slowly. Newton's elimination is as cheap as it is banded.
@@ -114,17 +114,21 @@ class _Defects(NamedTuple):
 
 
 def _defects(equations: Equations, t: Scalar, q: State, p: State) -> _Defects:
-    g, G, linear = equations.constraint(q), gradient(equations, q), Linear.at(equations, q)
+    g, G, linear = (
+        equations.constraint(q),
+        gradient(equations, q),
+        Linear.of_constraint(equations, q),
+    )
     v = velocity_at(equations, t, q)(p)
-    rate, sizes, eps = linear.across(v), jnp.abs(G), float(jnp.finfo(q.dtype).eps)
+    rate, sizes, eps = linear.product(v), jnp.abs(G), float(jnp.finfo(q.dtype).eps)
 
     def exceeds(defect, x):
-        size = sizes @ (_OWN * jnp.abs(x) + _LARGEST * jnp.max(jnp.abs(x))).ravel()
+        size = sizes @ (_COMPONENT * jnp.abs(x) + _LARGEST * jnp.max(jnp.abs(x))).ravel()
         return ~(jnp.abs(defect) <= eps * size)
 
     # For dependent rows of G the solution of G Gᵀ x = b, with rows of length one, is infinite, or
     # as large as round-off allows, unless b is one of a few: a sequence without a pattern.
-    A = jax.vmap(lambda row: linear.across(row.reshape(q.shape)))(G)
+    A = jax.vmap(lambda row: linear.product(row.reshape(q.shape)))(G)
     length = jnp.sqrt(jnp.diagonal(A))
     b = jnp.asarray(np.modf(0.618 * np.arange(1, g.size + 1))[0] - 0.5, q.dtype)
     x = length * lanewise.solve(A, length * b)
@@ -134,10 +138,10 @@ def _defects(equations: Equations, t: Scalar, q: State, p: State) -> _Defects:
 
 def start_status(equations: Equations, t: Scalar, q: State, p: State) -> RESULTS:
     """`successful` for a consistent state with independent constraints."""
-    found = _defects(equations, t, q, p)
-    consistent = ~jnp.any(found.is_off | found.is_moving_off)
+    defects = _defects(equations, t, q, p)
+    consistent = ~jnp.any(defects.is_off | defects.is_moving_off)
     status = RESULTS.where(consistent, RESULTS.successful, RESULTS.inconsistent)
-    return RESULTS.where(found.is_independent, status, RESULTS.redundant)
+    return RESULTS.where(defects.is_independent, status, RESULTS.redundant)
 
 
 _compiled_defects = eqx.filter_jit(_defects)
@@ -145,31 +149,31 @@ _compiled_defects = eqx.filter_jit(_defects)
 
 def check_start(equations: Equations, t: Scalar, q: State, p: State) -> None:
     """**Raises** `ValueError` for a start with constraints that are violated or redundant."""
-    found = _compiled_defects(equations, t, q, p)
-    _require_independent(found)
+    defects = _compiled_defects(equations, t, q, p)
+    _require_independent(defects)
     rate = "the rate of change (∂g/∂q) ∂H/∂p of the constraint"
-    first = (found.is_off, found.g, "the constraint")
-    for off, value, what in (first, (found.is_moving_off, found.rate, rate)):
-        if np.any(off):
-            i = int(np.argmax(np.where(off, np.abs(value), -1)))
+    first = (defects.is_off, defects.g, "the constraint")
+    for flags, value, quantity in (first, (defects.is_moving_off, defects.rate, rate)):
+        if np.any(flags):
+            i = int(np.argmax(np.where(flags, np.abs(value), -1)))
             raise ValueError(
-                f"the initial state is not consistent: {what} must be 0 to round-off, but "
-                f"component {i} is {float(value[i]):.3g}. dvi.project(system, q0, p0, args) "
-                "computes the nearest consistent state."
+                f"the initial state is not consistent: {quantity} must be 0 to round-off, but "
+                f"component {i} is {float(value[i]):.3g}. Use "
+                "dvi.project(system, q0, p0, args)."
             )
 
 
-def _require_independent(found: _Defects) -> None:
-    if not found.is_independent:
+def _require_independent(defects: _Defects) -> None:
+    if not defects.is_independent:
         # In NumPy: a rank needs singular values, which generated code does not have.
-        G, count = np.asarray(found.G), len(found.g)
+        G, count = np.asarray(defects.G), len(defects.g)
         lengths = np.linalg.norm(G, axis=1, keepdims=True)
         rows = G / np.where(lengths > 0, lengths, 1)
         rank = np.linalg.matrix_rank(rows, tol=8 * np.sqrt(np.finfo(rows.dtype).eps))
         raise ValueError(
             f"the constraint has {count} components, but the rank of ∂g/∂q at the initial state is "
-            f"{rank}: {count - rank} of them are redundant, so that the forces of constraint are "
-            "not determined. Leave out the components that follow from the others."
+            f"{rank}: {count - rank} of them are redundant. Leave out components that follow from "
+            "the others."
         )
 
 
@@ -218,32 +222,32 @@ def project(
     args = jax.tree.map(as_parameter, args)
     system.check_shapes(t0, q0, p0, epsilon, args)
     equations = Equations(system, epsilon, args)
-    found, defects, converged = _projected(equations, t0, q0, p0)
-    if not is_traced(converged) and not bool(converged):
+    projection, defects, is_projection = _projection(equations, t0, q0, p0)
+    if not is_traced(is_projection) and not bool(is_projection):
         _require_independent(defects)
         raise ValueError(
             "no state that satisfies the constraint was found near the one given, at which it is "
             f"{np.asarray(defects.g)!s:.80}. Start nearer to the manifold."
         )
-    return found
+    return projection
 
 
 @eqx.filter_jit
-def _projected(equations: Equations, t: Scalar, q0: State, p0: State):
-    before, n = _defects(equations, t, q0, p0), q0.size
+def _projection(equations: Equations, t: Scalar, q0: State, p0: State):
+    start, n = _defects(equations, t, q0, p0), q0.size
 
     def residual(x):
         q, nu = x[:n].reshape(q0.shape), x[n:]
         # Stationarity of |q − q0|²/2 + ν·g: q − q0 is normal to the manifold at q, not at q0.
-        moved = x[:n] - q0.ravel() + nu @ gradient(equations, q)
-        return jnp.concatenate([moved, equations.constraint(q)])
+        stationarity = x[:n] - q0.ravel() + nu @ gradient(equations, q)
+        return jnp.concatenate([stationarity, equations.constraint(q)])
 
-    guess = jnp.concatenate([q0.ravel(), jnp.zeros_like(before.g)])
+    guess = jnp.concatenate([q0.ravel(), jnp.zeros_like(start.g)])
     x, of_q = find_root(residual, guess, guess, equations.newton)
     q = x[:n].reshape(q0.shape)
     p, of_p = tangent(equations, t, q, p0)
-    converged = of_q.converged & of_p.converged & jnp.all(jnp.isfinite(p))
+    is_root = of_q.converged & of_p.converged & jnp.all(jnp.isfinite(p))
     # A factor and not jnp.where(…, x, nan), of which the derivative would be 0 and not NaN.
-    q, p = (x * jnp.where(converged, 1.0, jnp.nan).astype(x.dtype) for x in (q, p))
+    q, p = (x * jnp.where(is_root, 1.0, jnp.nan).astype(x.dtype) for x in (q, p))
     distances = (jnp.sqrt(jnp.sum(x * x)) for x in (q - q0, p - p0))
-    return Projection(q, p, *distances), before, converged
+    return Projection(q, p, *distances), start, is_root

@@ -13,7 +13,7 @@ from lanewise.jaxprs.dependence import depends_on
 
 from ..base.results import RESULTS, first_failure
 from ..base.types import Args, Interval, Scalar, State
-from ..engine.newton import Found, Known, Newton, RootSolver, find_root, no_residual, worse
+from ..engine.newton import KnownRoot, Newton, RootInfo, RootSolver, find_root, no_residual, worse
 from ..engine.rounding import one_by_one
 from ..problem.system import System
 
@@ -53,7 +53,7 @@ class Equations(eqx.Module):
     system: System | Any  # or what has its functions, such as a system with the noise of a step
     epsilon: Scalar
     args: Args = None
-    newton: RootSolver | Known = Newton()
+    newton: RootSolver | KnownRoot = Newton()
     origin: tuple[State, State] | None = None
     quantum: float | None = eqx.field(static=True, default=None)
     increments: Array | None = None
@@ -70,27 +70,27 @@ class Equations(eqx.Module):
 
     def momentum_rate(self, interval: Interval, q0: State, p1: State) -> State:
         """−∂H_D/∂q0 + εW at (t0, t1, q0, p1): the right side of (13)."""
-        at = (self.system, *interval[:2], *self.absolute(q0, p1), self.epsilon, self.args)
+        point = (self.system, *interval[:2], *self.absolute(q0, p1), self.epsilon, self.args)
         # With a quantum the last bits decide where a rate is rounded to: compiled separately they
         # are the same forwards and backwards.
         if self.quantum is None:
-            return _momentum_rate(*at)
-        return one_by_one(_momentum_rate, *at)
+            return _momentum_rate(*point)
+        return one_by_one(_momentum_rate, *point)
 
     def position_rate(self, interval: Interval, q0: State, p1: State) -> State:
         """∂H_D/∂p1 at (t0, t1, q0, p1): the right side of (12)."""
-        at = (self.system, *interval[:2], *self.absolute(q0, p1), self.epsilon, self.args)
+        point = (self.system, *interval[:2], *self.absolute(q0, p1), self.epsilon, self.args)
         if self.quantum is None:
-            return _position_rate(*at)
-        return one_by_one(_position_rate, *at)
+            return _position_rate(*point)
+        return one_by_one(_position_rate, *point)
 
     def rates(self, interval: Interval, q: State, p: State) -> tuple[State, State]:
         """(`position_rate`, `momentum_rate`) at one point, from one gradient of H_D."""
         # The two functions would evaluate H_D twice where XLA or `lanewise` sees no common part.
         if self.quantum is not None:
             return self.position_rate(interval, q, p), self.momentum_rate(interval, q, p)
-        at = (self.system, *interval[:2], *self.absolute(q, p), self.epsilon, self.args)
-        return _rates(*at)
+        point = (self.system, *interval[:2], *self.absolute(q, p), self.epsilon, self.args)
+        return _rates(*point)
 
     def constraint(self, q: State) -> Array:
         """g(q, args) of a constrained system, shape (m,)."""
@@ -112,24 +112,24 @@ class Equations(eqx.Module):
 
 
 @eqx.filter_jit
-def _momentum_rate(system: System | Any, *at) -> State:
-    gradient = jax.grad(system.hamiltonian, argnums=2)(*at)
+def _momentum_rate(system: System | Any, *point) -> State:
+    gradient = jax.grad(system.hamiltonian, argnums=2)(*point)
     if system.force is None:
         return -gradient
-    return -gradient + system.disturbing_force(*at).astype(gradient.dtype)
+    return -gradient + system.disturbing_force(*point).astype(gradient.dtype)
 
 
 @eqx.filter_jit
-def _position_rate(system: System | Any, *at) -> State:
-    return jax.grad(system.hamiltonian, argnums=3)(*at)
+def _position_rate(system: System | Any, *point) -> State:
+    return jax.grad(system.hamiltonian, argnums=3)(*point)
 
 
 @eqx.filter_jit
-def _rates(system: System | Any, *at) -> tuple[State, State]:
-    gradient, velocity = jax.grad(system.hamiltonian, argnums=(2, 3))(*at)
+def _rates(system: System | Any, *point) -> tuple[State, State]:
+    gradient, velocity = jax.grad(system.hamiltonian, argnums=(2, 3))(*point)
     if system.force is None:
         return velocity, -gradient
-    return velocity, -gradient + system.disturbing_force(*at).astype(gradient.dtype)
+    return velocity, -gradient + system.disturbing_force(*point).astype(gradient.dtype)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
@@ -155,7 +155,7 @@ def step(
     h, force = interval.h, functools.partial(equations.momentum_rate, interval, q0)
     # The result where p1 does not enter, and otherwise the guess, with an error O(h²).
     p1 = p0 + equations.increment(h, force(p0))
-    p1, info = _solved(force, h, p0, p1, equations, equations.absolute(q0, p0)[1])
+    p1, info = _solve(force, h, p0, p1, equations, equations.absolute(q0, p0)[1])
     q1 = q0 + equations.increment(h, equations.position_rate(interval, q0, p1))
     return q1, p1, judge(info, q1, p1, equations.quantum)
 
@@ -170,20 +170,20 @@ def inverse_step(
     """
     h, velocity = -interval.h, functools.partial(equations.position_rate, interval, p1=p1)
     q0 = q1 + equations.increment(h, velocity(q1))
-    q0, info = _solved(velocity, h, q1, q0, equations, equations.absolute(q1, p1)[0])
+    q0, info = _solve(velocity, h, q1, q0, equations, equations.absolute(q1, p1)[0])
     p0 = p1 - equations.increment(interval.h, equations.momentum_rate(interval, q0, p1))
     return q0, p0, judge(info, q0, p0, equations.quantum)
 
 
-def no_solve(x: State) -> Found:
+def no_solve(x: State) -> RootInfo:
     """The information on x where no solve is needed."""
     real = jnp.finfo(x.dtype).dtype
-    return Found(x, jnp.asarray(0, jnp.int32), no_residual(real), jnp.asarray(True))
+    return RootInfo(x, jnp.asarray(0, jnp.int32), no_residual(real), jnp.asarray(True))
 
 
-def _solved(
-    rate: Callable, h: Scalar, x0: State, guess: State, equations: Equations, known: State
-) -> tuple[State, Found]:
+def _solve(
+    rate: Callable, h: Scalar, x0: State, guess: State, equations: Equations, size: State
+) -> tuple[State, RootInfo]:
     """x1 = x0 + h rate(x1) near `guess`, which is x1 if `rate` does not depend on x1; `known` is x0
     with the origin, the scale of the accuracy."""
     if not depends_on(rate, 0, x0):
@@ -195,12 +195,12 @@ def _solved(
 
     # A small increment next to an origin has its own round-off, smaller than that of the whole
     # coordinate in `known`: both ends of the step as they are represented.
-    represented = jnp.maximum(jnp.abs(x0), jnp.abs(guess)).ravel()
-    x1, info = find_root(residual, guess.ravel(), known.ravel(), equations.newton, represented)
+    represented_size = jnp.maximum(jnp.abs(x0), jnp.abs(guess)).ravel()
+    x1, info = find_root(residual, guess.ravel(), size.ravel(), equations.newton, represented_size)
     return x1.reshape(x0.shape), info
 
 
-def judge(info: Found, q: State, p: State, quantum: float | None = None) -> StepInfo:
+def judge(info: RootInfo, q: State, p: State, quantum: float | None = None) -> StepInfo:
     """The status of a step, from its solve and from the state after it."""
     finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(p))
     result = RESULTS.where(info.converged, RESULTS.successful, RESULTS.not_converged)

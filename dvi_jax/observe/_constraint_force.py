@@ -45,7 +45,7 @@ class ConstraintForce(eqx.Module):
         if getattr(self.system, "constraint", None) is None:
             raise ValueError(
                 "ConstraintForce needs a system with a constraint: dvi.System(H_D, constraint=g). "
-                "Outside of dvi.integrate call observable.bind(system, epsilon) first."
+                "Outside of dvi.integrate call bind(system, epsilon) first."
             )
         equations = Equations(self.system, jnp.asarray(self.epsilon, q1.dtype), args)
 
@@ -53,9 +53,9 @@ class ConstraintForce(eqx.Module):
         def rate(t, q, p):  # dg/dt
             return jax.jvp(equations.constraint, (q,), (velocity_at(equations, t, q)(p),))[1]
 
-        linear, velocity = Linear.at(equations, q1), velocity_at(equations, t1, q1)
+        linear, velocity = Linear.of_constraint(equations, q1), velocity_at(equations, t1, q1)
         # The unconstrained motion, of which H is taken on the diagonal t0 = t1.
         v, f = equations.rates(Interval(t1, t1, jnp.zeros_like(t1)), q1, p1)
         _, growth = jax.jvp(rate, (t1, q1, p1), (jnp.ones_like(t1), v, f))
-        found = lanewise.solve(linear.coupling(velocity, p1, growth.size), growth)
-        return found if self.multipliers else -linear.back(found)
+        multipliers = lanewise.solve(linear.coupling(velocity, p1, growth.size), growth)
+        return multipliers if self.multipliers else -linear.transpose(multipliers)

@@ -17,7 +17,7 @@ from ..base.checks import whole
 from ..base.types import Scalar
 from ._reductions import Reduction
 
-_FEW = 12
+_UNROLLED = 12
 """Vectors up to which the Gram–Schmidt process is unrolled: a loop compiles faster for many."""
 
 
@@ -82,12 +82,12 @@ def _no_sum(shape: tuple[int, ...], dtype: Any) -> _Sum:
     return _Sum(jnp.zeros(shape, dtype), jnp.zeros(shape, dtype))
 
 
-def _whole(value: Any) -> Any:
+def _as_python_integer(value: Any) -> Any:
     """An integer of NumPy as one of Python, which can be hashed; anything else as it is."""
     return int(value) if isinstance(value, np.integer) else value
 
 
-class _Framed(Deviations):
+class _FrameIndicator(Deviations):
     """Base of indicators with an orthonormal frame, the first part of their memory.
 
     A subclass has the fields `seed`, of the first frame, and `scale`, a pair of units.
@@ -100,7 +100,7 @@ class _Framed(Deviations):
                 f"scale of {type(self).__name__} must be a pair (unit of q, unit of p), as a tuple "
                 f"or a list of two entries; got {self.scale!r:.200}."
             )
-        for which, unit in zip("qp", self.scale, strict=True):
+        for letter, unit in zip("qp", self.scale, strict=True):
             if any(is_traced(x) for x in jax.tree.leaves(unit)):
                 continue  # the value of a tracer is unknown
             try:
@@ -109,8 +109,8 @@ class _Framed(Deviations):
                 good = False
             if not good:
                 raise ValueError(
-                    f"the scale of {which} in {type(self).__name__} must be a positive and finite "
-                    f"number, or an array of such numbers with the shape of {which}; got "
+                    f"the scale of {letter} in {type(self).__name__} must be a positive and finite "
+                    f"number, or an array of such numbers with the shape of {letter}; got "
                     f"{unit!r:.200}."
                 )
 
@@ -118,7 +118,7 @@ class _Framed(Deviations):
         units = self._units(memory[0])
         return memory[0] if units is None else memory[0] * units
 
-    def _measured(self, vectors: Array) -> Array:
+    def _in_units(self, vectors: Array) -> Array:
         """Vectors of the state in the units of `scale`."""
         units = self._units(vectors)
         return vectors if units is None else vectors / units
@@ -143,12 +143,12 @@ class _Framed(Deviations):
             return None
         size = like.shape[-1] // 2
         parts = []
-        for which, unit in zip("qp", self.scale, strict=True):
+        for letter, unit in zip("qp", self.scale, strict=True):
             unit = jnp.asarray(unit, like.dtype).ravel()
             if unit.size not in (1, size):
                 raise ValueError(
-                    f"the scale of {which} in {type(self).__name__} must be one number, or an "
-                    f"array with the size of {which} ({size}); got {unit.size} numbers."
+                    f"the scale of {letter} in {type(self).__name__} must be one number, or an "
+                    f"array with the size of {letter} ({size}); got {unit.size} numbers."
                 )
             parts.append(jnp.broadcast_to(unit, (size,)))
         return jnp.concatenate(parts)[None, :]
@@ -178,7 +178,7 @@ class TangentMap(Deviations):
         return memory.T
 
 
-class LyapunovSpectrum(_Framed):
+class LyapunovSpectrum(_FrameIndicator):
     r"""Observable: the Lyapunov exponents λ_1, λ_2, … [1/time], shape (count,).
 
         λ_i = (1/|t|) Σ_k ln R_ii^(k),        M_k Q_{k−1} = Q_k R^(k)
@@ -200,7 +200,7 @@ class LyapunovSpectrum(_Framed):
     Nagashima 1979.
     """
 
-    count: int | None = eqx.field(static=True, default=None, converter=_whole)
+    count: int | None = eqx.field(static=True, default=None, converter=_as_python_integer)
     seed: int = eqx.field(static=True, default=0)
     scale: Any = (1.0, 1.0)
 
@@ -215,7 +215,7 @@ class LyapunovSpectrum(_Framed):
     def update(self, memory, k, t, value):
         # Logarithms are summed, since the growth itself would overflow.
         _, sums, time = memory
-        frame, R = _gram_schmidt(self._measured(value.vectors))
+        frame, R = _gram_schmidt(self._in_units(value.vectors))
         return frame, sums.plus(jnp.log(_diagonal(R))), time.plus(value.h)
 
     def finish(self, memory):
@@ -223,7 +223,7 @@ class LyapunovSpectrum(_Framed):
         return sums.value / jnp.abs(time.value)
 
 
-class MEGNO(_Framed):
+class MEGNO(_FrameIndicator):
     r"""Observable: the mean exponential growth of nearby orbits ⟨Y⟩, a number.
 
         Y(t) = (2/t) ∫ (|ẇ|/|w|) s ds,        ⟨Y⟩(t) = (1/t) ∫ Y ds
@@ -258,27 +258,27 @@ class MEGNO(_Framed):
     def start(self, value):
         # ∫ (|ẇ|/|w|) s ds is a sum of growths of ln |w| times the midpoint of the step.
         zero = jnp.zeros((), value.dtype)
-        weighted, area, time = (_no_sum((), value.dtype) for _ in range(3))
-        return self._first_frame(value, 1), weighted, zero, area, time
+        growth, area, time = (_no_sum((), value.dtype) for _ in range(3))
+        return self._first_frame(value, 1), growth, zero, area, time
 
     def update(self, memory, k, t, value):
-        _, weighted, before, area, time = memory
-        vector = self._measured(value.vectors)
+        _, growth, previous, area, time = memory
+        vector = self._in_units(value.vectors)
         square = jnp.sum(vector**2)
         # The vector had length 1 before the step. ln |w|² is 2 ln |w|: the factor 2 of Y is in it.
-        weighted = weighted.plus(jnp.log(square) * (time.value + value.h / 2))
+        growth = growth.plus(jnp.log(square) * (time.value + value.h / 2))
         time = time.plus(value.h)
-        now = weighted.value / time.value
+        current = growth.value / time.value
         # Trapezoidal rule, with Y(0) = 0 as the first `before`.
-        area = area.plus(value.h * (before + now) / 2)
-        return vector * lax.rsqrt(square), weighted, now, area, time
+        area = area.plus(value.h * (previous + current) / 2)
+        return vector * lax.rsqrt(square), growth, current, area, time
 
     def finish(self, memory):
         *_, area, time = memory
         return area.value / time.value
 
 
-class GALI(_Framed):
+class GALI(_FrameIndicator):
     r"""Observable: the generalised alignment indices GALI_2, …, GALI_k, shape (k − 1,).
 
         GALI_j = |ŵ_1 ∧ … ∧ ŵ_j|
@@ -296,7 +296,7 @@ class GALI(_Framed):
     own.
     """
 
-    k: int = eqx.field(static=True, default=2, converter=_whole)
+    k: int = eqx.field(static=True, default=2, converter=_as_python_integer)
     seed: int = eqx.field(static=True, default=0)
     scale: Any = (1.0, 1.0)
     log10: bool = eqx.field(static=True, default=False)
@@ -312,7 +312,7 @@ class GALI(_Framed):
         # The unit vectors are Q·(columns of C). Their part outside of the first j − 1 directions is
         # C_jj = exp(logs_j), which soon is negligible relative to the others but must not be lost.
         _, columns, logs = memory
-        frame, R = _gram_schmidt(self._measured(value.vectors))
+        frame, R = _gram_schmidt(self._in_units(value.vectors))
         columns = jnp.sum(R[:, :, None] * columns[None, :, :], axis=1)
         shrink = lax.rsqrt(jnp.sum(columns**2, axis=0))
         return frame, columns * shrink[None, :], logs.plus(jnp.log(_diagonal(R) * shrink))
@@ -324,7 +324,7 @@ class GALI(_Framed):
         return logs / math.log(10) if self.log10 else jnp.exp(logs)
 
 
-class SALI(_Framed):
+class SALI(_FrameIndicator):
     r"""Observable: the smaller alignment index, a number.
 
         SALI = min(|ŵ_1 + ŵ_2|, |ŵ_1 − ŵ_2|)
@@ -356,8 +356,8 @@ class SALI(_Framed):
         # |ŵ_1 ∧ ŵ_2| = sin θ, and |ŵ_1 − ŵ_2| = 2 sin(θ/2) = sin θ √(2/(1 + |cos θ|)).
         log_sine = self._pair.finish(memory)[0]
         cosine = jnp.sqrt(jnp.maximum(1 - jnp.exp(2 * math.log(10) * log_sine), 0))
-        found = log_sine + jnp.log10(2 / (1 + cosine)) / 2
-        return found if self.log10 else jnp.exp(math.log(10) * found)
+        log_sali = log_sine + jnp.log10(2 / (1 + cosine)) / 2
+        return log_sali if self.log10 else jnp.exp(math.log(10) * log_sali)
 
 
 def _gram_schmidt(vectors: Array) -> tuple[Array, Array]:
@@ -367,7 +367,7 @@ def _gram_schmidt(vectors: Array) -> tuple[Array, Array]:
     """
     # Once is enough: the vectors are an orthonormal frame after one step, far from dependent.
     count = vectors.shape[0]
-    if count > _FEW:
+    if count > _UNROLLED:
         return _gram_schmidt_in_a_loop(vectors)
     frame, rows = [], []
     for i in range(count):
@@ -375,10 +375,10 @@ def _gram_schmidt(vectors: Array) -> tuple[Array, Array]:
         square = jnp.sum(v**2)
         shrink = lax.rsqrt(square)
         unit = v * shrink
-        along = jnp.sum(vectors[1:] * unit[None, :], axis=1)
-        rows.append(jnp.concatenate([jnp.zeros(i, v.dtype), (square * shrink)[None], along]))
+        projections = jnp.sum(vectors[1:] * unit[None, :], axis=1)
+        rows.append(jnp.concatenate([jnp.zeros(i, v.dtype), (square * shrink)[None], projections]))
         frame.append(unit)
-        vectors = vectors[1:] - along[:, None] * unit[None, :]
+        vectors = vectors[1:] - projections[:, None] * unit[None, :]
     return jnp.stack(frame), jnp.stack(rows)
 
 
@@ -392,9 +392,9 @@ def _gram_schmidt_in_a_loop(vectors: Array) -> tuple[Array, Array]:
         square = jnp.sum(V[i] ** 2)
         shrink = lax.rsqrt(square)
         unit = V[i] * shrink
-        along = jnp.where(place > i, V @ unit, 0)
-        V = (V - along[:, None] * unit[None, :]).at[i].set(unit)
-        return V, R.at[i].set(along.at[i].set(square * shrink))
+        projections = jnp.where(place > i, V @ unit, 0)
+        V = (V - projections[:, None] * unit[None, :]).at[i].set(unit)
+        return V, R.at[i].set(projections.at[i].set(square * shrink))
 
     return lax.fori_loop(0, count, row, (vectors, jnp.zeros((count, count), vectors.dtype)))
 
@@ -402,4 +402,4 @@ def _gram_schmidt_in_a_loop(vectors: Array) -> tuple[Array, Array]:
 def _diagonal(R: Array) -> Array:
     # Single elements of a small matrix stay in registers of the machine code.
     count = R.shape[0]
-    return jnp.stack([R[i, i] for i in range(count)]) if count <= _FEW else jnp.diagonal(R)
+    return jnp.stack([R[i, i] for i in range(count)]) if count <= _UNROLLED else jnp.diagonal(R)

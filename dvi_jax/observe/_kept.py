@@ -163,17 +163,21 @@ class Section(KeptSteps):
         one_of("direction", self.direction, (1, -1, 0), hint)
 
     def _row(self, t0, t1, q0, p0, q1, p1, args):
-        before, after = event(self.g, t0, q0, p0, args), event(self.g, t1, q1, p1, args)
+        g0, g1 = event(self.g, t0, q0, p0, args), event(self.g, t1, q1, p1, args)
         # A zero belongs to the step that ends there: a crossing at a grid point is counted once.
-        up, down = (before < 0) & (after >= 0), (before > 0) & (after <= 0)
+        rises, falls = (g0 < 0) & (g1 >= 0), (g0 > 0) & (g1 <= 0)
         ahead = t1 > t0
-        hit = up | down
+        hit = rises | falls
         # `direction` refers to increasing time: for h < 0 a step passes the surface the other way.
         if self.direction != 0:
-            hit = jnp.where(ahead, up, down) if self.direction == 1 else jnp.where(ahead, down, up)
+            hit = (
+                jnp.where(ahead, rises, falls)
+                if self.direction == 1
+                else jnp.where(ahead, falls, rises)
+            )
         # A run that continues from a crossing starts on the surface only up to rounding.
-        near = jnp.finfo(before.dtype).eps ** 0.4
-        begins_on_it = jnp.abs(before) <= near * jnp.abs(after - before)
+        tolerance = jnp.finfo(g0.dtype).eps ** 0.4
+        begins_on_it = jnp.abs(g0) <= tolerance * jnp.abs(g1 - g0)
         hit = jnp.where(hit & begins_on_it, _UNLESS_FIRST, hit.astype(jnp.int32))
         return as_row(hit, Start(t0, t1, t1, q0, p0))
 
@@ -196,11 +200,20 @@ class RequestedTimes(KeptSteps):
         return self.ts.shape[0]
 
     def _row(self, t0, t1, q0, p0, q1, p1, args):
-        start, end = shown(self.clock, t0, q0, p0, args), shown(self.clock, t1, q1, p1, args)
+        start, end = (
+            shown(self.clock, t0, q0, p0, args),
+            shown(self.clock, t1, q1, p1, args),
+        )
         # Bisection: a comparison with every requested time would be made in each step.
-        passed, inside = (jnp.searchsorted(self.ordered, x, side="right") for x in (start, end))
-        ahead, behind = (jnp.searchsorted(self.ordered, x, side="left") for x in (start, end))
-        hit = jnp.where(end >= start, inside > passed, ahead > behind)  # (start, end], [end, start)
+        count_start, count_end = (
+            jnp.searchsorted(self.ordered, x, side="right") for x in (start, end)
+        )
+        below_start, below_end = (
+            jnp.searchsorted(self.ordered, x, side="left") for x in (start, end)
+        )
+        hit = jnp.where(
+            end >= start, count_end > count_start, below_start > below_end
+        )  # (start, end], [end, start)
         # A failed step has no curve on which a state could be computed.
         return as_row(hit & jnp.all(jnp.isfinite(q1)), Start(t0, t1, end, q0, p0))
 
@@ -225,6 +238,6 @@ def event(
     return value.astype(q.dtype)
 
 
-def check_event(g: Any, of: str) -> None:
+def check_event(g: Any, owner: str) -> None:
     """Refuse a g that cannot be called as ``g(t, q, p, args)``."""
-    check_takes(f"g of {of}", g, "(t, q, p, args)")
+    check_takes(f"g of {owner}", g, "(t, q, p, args)")

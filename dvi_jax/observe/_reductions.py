@@ -46,15 +46,14 @@ class Reduction(eqx.Module):
         """
         raise NotImplementedError(
             f"{type(self).__name__} cannot be differentiated with adjoint=dvi.Reversible(): it has "
-            "no method combine(memory, k, t, value). Define this method in the class, or use "
-            "adjoint=dvi.Checkpointed()."
+            "no method combine(memory, k, t, value). Define it, or use adjoint=dvi.Checkpointed()."
         )
 
     @staticmethod
     def change(x: Array, where: Array | None = None) -> Array:
         """Zero with the derivative of x, for `combine`; a constant zero where `where` is false."""
-        moved = x - lax.stop_gradient(x)
-        return moved if where is None else jnp.where(where, moved, 0)
+        difference = x - lax.stop_gradient(x)
+        return difference if where is None else jnp.where(where, difference, 0)
 
     def pull(
         self, memory: Any, cotangent: Any, k: Array, t: Scalar, value: Array
@@ -63,10 +62,10 @@ class Reduction(eqx.Module):
 
         # The reversible adjoint visits the steps in another order and rebuilds their values with
         # rounding, so that `update` cannot be differentiated: a maximum would be found elsewhere.
-        def reduced(t, value):
+        def value_of_all(t, value):
             return self.finish(self.combine(memory, k, t, value))
 
-        return jax.vjp(reduced, t, value)[1](cotangent)
+        return jax.vjp(value_of_all, t, value)[1](cotangent)
 
 
 class _OfFunction(Reduction):
@@ -101,22 +100,22 @@ class MaxDrift(_OfFunction):
         return value, jnp.full_like(value, jnp.nan), jnp.zeros(value.shape, jnp.int32)
 
     def update(self, memory, k, t, value):
-        first, farthest, at = memory
+        first, farthest, step = memory
         first = jnp.where(k == 0, value, first)
         far = value - first
         # A comparison with NaN is false: NaN, once stored, stays.
         larger = (jnp.abs(far) > jnp.abs(farthest)) | jnp.isnan(far) | (k == 0)
-        return first, jnp.where(larger, far, farthest), jnp.where(larger, k, at)
+        return first, jnp.where(larger, far, farthest), jnp.where(larger, k, step)
 
     def finish(self, memory):
         first, farthest, _ = memory
         return jnp.abs(farthest / first) if self.relative else jnp.abs(farthest)
 
     def combine(self, memory, k, t, value):
-        first, farthest, at = memory
+        first, farthest, step = memory
         # The number of the step decides: a rebuilt value is the largest one only up to rounding.
         of_first = self.change(value, k == 0)
-        return first + of_first, farthest + self.change(value, k == at) - of_first, at
+        return first + of_first, farthest + self.change(value, k == step) - of_first, step
 
 
 class Range(_OfFunction):
@@ -126,15 +125,15 @@ class Range(_OfFunction):
     """
 
     def start(self, value):
-        nan, at = jnp.full_like(value, jnp.nan), jnp.zeros(value.shape, jnp.int32)
-        return nan, nan, at, at
+        nan, step = jnp.full_like(value, jnp.nan), jnp.zeros(value.shape, jnp.int32)
+        return nan, nan, step, step
 
     def update(self, memory, k, t, value):
         low, high, at_low, at_high = memory
-        failed = jnp.isnan(low) & (k > 0)
+        is_nan = jnp.isnan(low) & (k > 0)
         # The negations are true for a NaN value, which is stored in this way and then stays.
-        lower = ((k == 0) | ~(value >= low)) & ~failed
-        higher = ((k == 0) | ~(value <= high)) & ~failed
+        lower = ((k == 0) | ~(value >= low)) & ~is_nan
+        higher = ((k == 0) | ~(value <= high)) & ~is_nan
         low, high = jnp.where(lower, value, low), jnp.where(higher, value, high)
         return low, high, jnp.where(lower, k, at_low), jnp.where(higher, k, at_high)
 
@@ -142,9 +141,9 @@ class Range(_OfFunction):
         return memory[1] - memory[0]
 
     def combine(self, memory, k, t, value):
-        low, high, *at = memory
-        low = low + self.change(value, k == at[0])
-        return low, high + self.change(value, k == at[1]), *at
+        low, high, *steps = memory
+        low = low + self.change(value, k == steps[0])
+        return low, high + self.change(value, k == steps[1]), *steps
 
 
 class Trend(_OfFunction):
@@ -165,11 +164,11 @@ class Trend(_OfFunction):
     def update(self, memory, k, t, value):
         mean_t, mean_f, t_t, t_f = memory
         weight = 1 / jnp.asarray(k + 1, value.dtype)
-        before = t - mean_t
-        mean_t = mean_t + before * weight
+        deviation = t - mean_t
+        mean_t = mean_t + deviation * weight
         mean_f = mean_f + (value - mean_f) * weight
         # One factor with the old mean and one with the new: exact for the sums about the new mean.
-        return mean_t, mean_f, t_t + before * (t - mean_t), t_f + before * (value - mean_f)
+        return mean_t, mean_f, t_t + deviation * (t - mean_t), t_f + deviation * (value - mean_f)
 
     def finish(self, memory):
         _, _, t_t, t_f = memory
@@ -223,8 +222,8 @@ class Last(_OfFunction):
         return memory[0]
 
     def combine(self, memory, k, t, value):
-        last, at = memory
-        return last + self.change(value, k == at), at
+        last, step = memory
+        return last + self.change(value, k == step), step
 
 
 class Running(eqx.Module):
@@ -242,11 +241,10 @@ class Running(eqx.Module):
 
     def __check_init__(self):
         if not (isinstance(self.reduction, Reduction) and self.reduction.has_running_value):
-            seen = getattr(self.reduction, "__name__", f"{self.reduction!r:.200}")
+            text = getattr(self.reduction, "__name__", f"{self.reduction!r:.200}")
             raise TypeError(
                 "reduction of Running must be an object such as dvi.Mean(f) or dvi.MEGNO(), got "
-                f"{seen}. A function, a class without parentheses and dvi.Section(...) are not "
-                "allowed: a Section has no value at every step."
+                f"{text}. A function and dvi.Section(...) are not allowed."
             )
 
 

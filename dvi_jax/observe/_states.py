@@ -47,10 +47,10 @@ def _of_step(leaf: Any) -> Any:
         return Running(_of_step(leaf.reduction))
     if isinstance(leaf, Reduction):
         function = getattr(leaf, "function", None)
-        converted = _of_step(function)
-        if converted is function or not isinstance(converted, OfState):
+        observable = _of_step(function)
+        if observable is function or not isinstance(observable, OfState):
             return leaf
-        return eqx.tree_at(lambda r: r.function, leaf, converted)
+        return eqx.tree_at(lambda r: r.function, leaf, observable)
     # The longest form first: a function with defaults or *rest accepts several of them.
     if not callable(leaf) or isinstance(leaf, type) or accepts(leaf, 7):
         return leaf

@@ -66,15 +66,12 @@ class Save(eqx.Module):
             check_takes("the clock of Save", self.clock, "(t, q, p, args)")
         if self.ts is None:
             if self.clock is not None:
-                raise ValueError(
-                    "clock requires ts: write Save(ts=values, clock=...) with the values of the "
-                    "clock at which states are saved."
-                )
+                raise ValueError("clock requires ts: write Save(ts=values, clock=...).")
             return
         if self.every is not None or self.final:
             raise ValueError(
                 f"Save(ts=...) saves at the times ts only, got also every={self.every} and "
-                f"final={self.final}: leave out every and final. Add their times to ts if needed."
+                f"final={self.final}: leave out every and final."
             )
         if self.ts.ndim != 1 or self.ts.shape[0] == 0:
             raise ValueError(
@@ -84,12 +81,12 @@ class Save(eqx.Module):
         if not is_traced(self.ts):
             steps = np.diff(np.asarray(self.ts))
             # In order, since a step finds its times by bisection. Traced ones are sorted in a run.
-            ordered = bool((steps >= 0).all() or (steps <= 0).all())
-            if not (ordered and np.isfinite(np.asarray(self.ts)).all()):
-                seen = np.array2string(np.asarray(self.ts), threshold=20)
+            is_sorted = bool((steps >= 0).all() or (steps <= 0).all())
+            if not (is_sorted and np.isfinite(np.asarray(self.ts)).all()):
+                text = np.array2string(np.asarray(self.ts), threshold=20)
                 raise ValueError(
                     "ts in Save(ts=...) must be finite and in ascending order, or for h < 0 in "
-                    f"descending order, got {seen}. Remove NaN and infinity, and use np.sort(ts)."
+                    f"descending order, got {text}: use np.sort(ts)."
                 )
 
 
@@ -148,25 +145,25 @@ class Solution(eqx.Module):
 
     def __getattr__(self, name: str) -> Any:
         # Called for names that do not exist only.
-        meant = _OTHER_NAMES.get(name)
-        meant = meant or "attributes are " + ", ".join([*self.__dataclass_fields__, "status"])
-        text = f"a Solution has no attribute {name!r}. The {meant}."
+        hint = _OTHER_NAMES.get(name)
+        hint = hint or "attributes are " + ", ".join([*self.__dataclass_fields__, "status"])
+        text = f"a Solution has no attribute {name!r}. The {hint}."
         raise AttributeError(text, name=name, obj=self)
 
     def __repr__(self) -> str:
         """Status, size and last state in words; the shapes under jit."""
         if any(is_traced(x) for x in jax.tree.leaves((self.ts, self.qs, self.result))):
             return f"Solution(ts={eqx.tree_pformat(self.ts)}, qs={eqx.tree_pformat(self.qs)}, …)"
-        *batch, saved = self.ts.shape
+        *batch, states = self.ts.shape
         names = np.atleast_1d(np.asarray(self.status, dtype=str))
         counts = {str(name): int((names == name).sum()) for name in np.unique(names)}
         status = ", ".join(f"{n} {s}" for s, n in counts.items()) if batch else str(self.status)
-        many = f"{' × '.join(map(str, batch))} trajectories, " if batch else ""
+        size = f"{' × '.join(map(str, batch))} trajectories, " if batch else ""
         shape = self.qs.shape[len(batch) + 1 :]
         # The times of the first trajectory; those of others in the batch may differ.
-        t = np.asarray(self.ts).reshape(-1, saved)[0]
+        t = np.asarray(self.ts).reshape(-1, states)[0]
         lines = [
-            f"Solution: {many}{status}; {self.stats['num_steps']} steps, {saved} saved states of "
+            f"Solution: {size}{status}; {self.stats['num_steps']} steps, {states} saved states of "
             f"shape {shape}, t = {t[0]:g} … {t[-1]:g}"
         ]
         if not batch:

@@ -129,7 +129,7 @@ def discretise(H: Callable[..., Any], order: int = 1) -> HamiltonianFn:
     warn_of_exchanged("H", H, "(t, q, p, args)")
     if isinstance(order, bool) or order not in (1, *_RULES):
         raise ValueError(
-            f"order must be 1, 2, 3 or 4, got {order!r}. For a higher order use a composition in "
-            "dvi.integrate, such as method=dvi.Yoshida(6) or dvi.KahanLi(8)."
+            f"order must be 1, 2, 3 or 4, got {order!r}. For a higher order use a composition, "
+            "such as method=dvi.Yoshida(6)."
         )
     return _LeftRule(H) if order == 1 else _ActionRule(H, order)

@@ -43,10 +43,10 @@ def incoming_energy(
     return _energy(1, system, h, (t0, t1, q0, p1, epsilon, args))
 
 
-def _energy(end: int, system: System, h: Any, at: tuple[Any, ...]) -> Scalar:
+def _energy(end: int, system: System, h: Any, point: tuple[Any, ...]) -> Scalar:
     # Value and slope from one evaluation: an H_D may contain a solve.
-    value, slope = jax.value_and_grad(system.hamiltonian, argnums=end)(*at)
-    h = at[1] - at[0] if h is None else h
+    value, slope = jax.value_and_grad(system.hamiltonian, argnums=end)(*point)
+    h = point[1] - point[0] if h is None else h
     return value + h * slope if end else value - h * slope
 
 

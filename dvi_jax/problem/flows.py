@@ -88,8 +88,8 @@ class Kepler(Flow):
         mass = jnp.broadcast_to(value_of(self.mass, args, q), q.shape[:-1])
         mu = jnp.broadcast_to(value_of(self.k, args, q), q.shape[:-1]) / mass
         mass = mass[..., None]
-        dq, dv, found = _kepler.change(h, q, p / mass, mu)
-        return dq, mass * dv, found
+        dq, dv, converged = _kepler.change(h, q, p / mass, mu)
+        return dq, mass * dv, converged
 
 
 class Harmonic(Flow):
@@ -109,10 +109,10 @@ class Harmonic(Flow):
     def change(self, h, q, p, args):
         omega, mass = value_of(self.omega, args, q), value_of(self.mass, args, q)
         x = h * omega
-        less, s = 2 * jnp.sin(x / 2) ** 2, jnp.sin(x)  # less: 1 − cos x, without cancellation
+        versine, s = 2 * jnp.sin(x / 2) ** 2, jnp.sin(x)  # less: 1 − cos x, without cancellation
         over_omega = h * jnp.sinc(x / jnp.pi)  # sin(ω h)/ω, also for ω = 0
-        dq = over_omega * (p / mass) - less * q
-        return dq, -mass * omega * s * q - less * p, jnp.asarray(True)
+        dq = over_omega * (p / mass) - versine * q
+        return dq, -mass * omega * s * q - versine * p, jnp.asarray(True)
 
 
 class Rotation(Flow):
@@ -132,12 +132,12 @@ class Rotation(Flow):
 
     def change(self, h, q, p, args):
         x = h * value_of(self.rate, args, q)
-        s, less = jnp.sin(x), 2 * jnp.sin(x / 2) ** 2
+        s, versine = jnp.sin(x), 2 * jnp.sin(x / 2) ** 2
 
-        def turned(u):
+        def rotate(u):
             plane = jnp.stack(
-                [-less * u[..., 0] - s * u[..., 1], s * u[..., 0] - less * u[..., 1]], -1
+                [-versine * u[..., 0] - s * u[..., 1], s * u[..., 0] - versine * u[..., 1]], -1
             )
             return jnp.concatenate([plane, jnp.zeros_like(u[..., 2:])], -1)
 
-        return turned(q), turned(p), jnp.asarray(True)
+        return rotate(q), rotate(p), jnp.asarray(True)

@@ -55,11 +55,11 @@ class Implicit(eqx.Module):
     def solved(self, t: Scalar, q: State, p: State, args: Args) -> Vector:
         """y at (t, q, p); NaN where it is not found. Differentiable to any order."""
         guess = self.guess(t, q, p, args)
-        y, how = find_root(
+        y, info = find_root(
             lambda y: self.relation(t, q, p, y, args), guess, guess, self.root_finder
         )
         # A factor and not jnp.where(…, y, nan), of which the derivative would be 0 and not NaN.
-        return y * jnp.where(how.converged, 1.0, jnp.nan).astype(y.dtype)
+        return y * jnp.where(info.converged, 1.0, jnp.nan).astype(y.dtype)
 
     def __call__(self, t: Scalar, q: State, p: State, args: Args) -> Scalar:
         return self.energy(t, q, p, self.solved(t, q, p, args), args)

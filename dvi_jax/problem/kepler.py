@@ -22,7 +22,7 @@ _C2, _C3 = ([1 / math.factorial(2 * k + n) for k in range(_TERMS)] for n in (2, 
 # The rounding of 1/6, 1/24 and 1/120 is the same in each step, and a drift of the energy of 3e-19
 # in each. It is added to the sums.
 _LOW4, _LOW6, _LOW120 = (float(Fraction(1, n) - Fraction(1 / n)) for n in (24, 6, 120))
-_MOST = 200
+_ITERATIONS = 200
 """Maximum number of iterations; a bracket that is halved needs about 60."""
 
 _SHORT = 1e-4
@@ -104,8 +104,8 @@ def change(h: Scalar, q: Array, v: Array, mu: Array) -> tuple[Array, Array, Arra
     def equation(X):
         return orbit.time(X, _universal(X, beta)) - h
 
-    X, found = lanewise.implicit_root(
-        equation, jnp.zeros_like(r0), lambda _, __: _solved(orbit, h), _divide
+    X, is_root = lanewise.implicit_root(
+        equation, jnp.zeros_like(r0), lambda _, __: _solve(orbit, h), _divide
     )
     g = orbit.on_time(h, X, _universal(X, beta))
     # Increments, not the new state: a small change keeps its digits next to a large coordinate.
@@ -113,7 +113,7 @@ def change(h: Scalar, q: Array, v: Array, mu: Array) -> tuple[Array, Array, Arra
     r, r0 = orbit.radius(g)[..., None], r0[..., None]
     dq = (h - mu * g.three)[..., None] * v - a / r0 * q
     dv = -(mu * g.one)[..., None] / (r0 * r) * q - a / r * v
-    return dq, dv, found
+    return dq, dv, is_root
 
 
 def _divide(linear, rhs):
@@ -121,7 +121,7 @@ def _divide(linear, rhs):
     return rhs / linear(jnp.ones_like(rhs))
 
 
-def _solved(orbit: _Orbit, h: Scalar) -> tuple[Array, Array]:
+def _solve(orbit: _Orbit, h: Scalar) -> tuple[Array, Array]:
     """The X of every orbit with t(X) = h, and whether all were found."""
     s = h / orbit.r0
     u, w = orbit.eta / orbit.r0 * s, orbit.zeta / orbit.r0 * s * s
@@ -129,7 +129,7 @@ def _solved(orbit: _Orbit, h: Scalar) -> tuple[Array, Array]:
     # Two corrections suffice for the steps of an integration; the loop is for long steps.
     step, *_ = orbit.correction(h, X)
     X = X + step
-    step, _, found = orbit.correction(h, X)
+    step, _, is_root_already = orbit.correction(h, X)
     X = X + step
 
     def search():
@@ -140,29 +140,31 @@ def _solved(orbit: _Orbit, h: Scalar) -> tuple[Array, Array]:
         start = jnp.where(jnp.isfinite(X) & (sign * X > 0), X, s)
 
         def improve(state):
-            x, inner, outer, done, n = state
-            step, past, now = orbit.correction(h, x)
+            x, inner, outer, is_root, n = state
+            step, past, is_last = orbit.correction(h, x)
             # NaN is ∞ − ∞, far outside.
             late = ~(sign * past <= 0)
             inner, outer = jnp.where(late, inner, x), jnp.where(late, x, outer)
             new = x + step
-            inside = (sign * new > sign * inner) & (sign * new < sign * outer)
+            in_bracket = (sign * new > sign * inner) & (sign * new < sign * outer)
             middle = jnp.where(jnp.isinf(outer), 2 * inner, (inner + outer) / 2)
             # Far from the zero the steps may be short: every third one halves the bracket.
-            taken = now | (inside & (n % 3 != 2))
-            x = jnp.where(done, x, jnp.where(taken, new, middle))
-            return x, inner, outer, done | now, n + 1
+            accept = is_last | (in_bracket & (n % 3 != 2))
+            x = jnp.where(is_root, x, jnp.where(accept, new, middle))
+            return x, inner, outer, is_root | is_last, n + 1
 
         def proceed(state):
-            return jnp.any(~state[3]) & (state[4] < _MOST)
+            return jnp.any(~state[3]) & (state[4] < _ITERATIONS)
 
         # An orbit without numbers is never found, and must not keep the others waiting.
-        lost = ~jnp.isfinite(orbit.zeta + s)
-        begin = (start, inner, sign * jnp.full_like(s, jnp.inf), lost, jnp.int32(0))
-        x, _, _, done, _ = lax.while_loop(proceed, improve, begin)
-        return jnp.where(found, X, x), jnp.all(found | (done & ~lost))
+        is_nan = ~jnp.isfinite(orbit.zeta + s)
+        begin = (start, inner, sign * jnp.full_like(s, jnp.inf), is_nan, jnp.int32(0))
+        x, _, _, is_root_at_end, _ = lax.while_loop(proceed, improve, begin)
+        return jnp.where(is_root_already, X, x), jnp.all(
+            is_root_already | (is_root_at_end & ~is_nan)
+        )
 
-    good = jnp.all(found)
+    good = jnp.all(is_root_already)
     return lax.cond(lanewise.on_any(~good), search, lambda: (X, good))
 
 
@@ -171,9 +173,9 @@ def _universal(X: Array, beta: Array) -> _G:
     z = beta * X * X
     small = jnp.abs(z) <= _SERIES_UP_TO
     c2 = c3 = jnp.zeros_like(z)
-    near = jnp.where(small, z, 0.0)
+    small_z = jnp.where(small, z, 0.0)
     for a, b in zip(_C2[::-1], _C3[::-1], strict=True):
-        c2, c3 = a - near * c2, b - near * c3
+        c2, c3 = a - small_z * c2, b - small_z * c3
 
     def far():
         # Away from z = 0 no digits cancel here. Substitutes keep the values, and with them the
@@ -186,7 +188,7 @@ def _universal(X: Array, beta: Array) -> _G:
         return new2, jnp.where(bound, e3, jnp.where(free, f3, c3))
 
     c2, c3 = lax.cond(lanewise.on_any(~jnp.all(small)), far, lambda: (c2, c3))
-    square, low = X * X, jnp.where(small, _LOW6 - near * _LOW120, 0.0)
-    two = square * c2 - square * (near * _LOW4)
+    square, low = X * X, jnp.where(small, _LOW6 - small_z * _LOW120, 0.0)
+    two = square * c2 - square * (small_z * _LOW4)
     three = square * X * c3 + square * X * low
     return _G(1 - beta * two, X - beta * three, two, three)

@@ -12,12 +12,11 @@ from jax import lax
 import lanewise
 from lanewise.jaxprs.dependence import depends_on
 
-from ..base.names import both_names
 from ..base.signature import accepts, check_takes, signature_of
 from ..base.types import Args, ForceFn, HamiltonianFn, Scalar, State
 from ..engine.newton import Newton, Vector, find_root
 
-_NEAR = 1e-4
+_DEFECT = 1e-4
 """Fraction of the initial defect at which the damped search ends and Newton's method begins."""
 
 _MOST_TRIALS = 100
@@ -30,36 +29,40 @@ class _LegendreTransform(eqx.Module):
     """H(t, q, p, args) = p·v − L(t, q, v, args), for `discretise`."""
 
     L: Callable[..., Any]
-    newton: Newton
+    root_finder: Newton
 
     def __call__(self, t: Scalar, q: State, p: State, args: Args) -> Scalar:
-        return _transformed(lambda v: self.L(t, q, v, args), p, self.newton, "L(t, q, v, args)")
+        return _legendre_transform(
+            lambda v: self.L(t, q, v, args), p, self.root_finder, "L(t, q, v, args)"
+        )
 
 
 class _DiscreteLegendreTransform(eqx.Module):
     """H_D(t0, t1, q0, p1, args) = p1·v − L_D(t0, t1, q0, v, args), for `System`."""
 
     L_D: Callable[..., Any]
-    newton: Newton
+    root_finder: Newton
 
     def __call__(self, t0: Scalar, t1: Scalar, q0: State, p1: State, args: Args) -> Scalar:
         name = "L_D(t0, t1, q0, v, args)"
-        return _transformed(lambda v: self.L_D(t0, t1, q0, v, args), p1, self.newton, name)
+        return _legendre_transform(
+            lambda v: self.L_D(t0, t1, q0, v, args), p1, self.root_finder, name
+        )
 
 
 class _FromLagrangian(eqx.Module):
     """The Legendre transform in v = (q1 − q0)/h of L_d(t0, t1, q0, q0 + hv, args)/h."""
 
     L_d: Callable[..., Any]
-    newton: Newton
+    root_finder: Newton
 
     step_is_from_times: ClassVar[bool] = True
 
     def __call__(self, t0: Scalar, t1: Scalar, q0: State, p1: State, args: Args) -> Scalar:
         h, name = t1 - t0, "L_d(t0, t1, q0, q1, args)"
         # The unknown is v, not q1: it stays of order one as h → 0.
-        return _transformed(
-            lambda v: self.L_d(t0, t1, q0, q0 + h * v, args) / h, p1, self.newton, name, q0 / h
+        return _legendre_transform(
+            lambda v: self.L_d(t0, t1, q0, q0 + h * v, args) / h, p1, self.root_finder, name, q0 / h
         )
 
 
@@ -67,7 +70,7 @@ class _FromTypeIII(eqx.Module):
     """H⁻(t0, t1, q0 + hv, p1 − hf) + h f·v where it is stationary in v and f."""
 
     H_minus: Callable[..., Any]
-    newton: Newton
+    root_finder: Newton
 
     step_is_from_times: ClassVar[bool] = True
 
@@ -91,7 +94,7 @@ class _FromTypeIII(eqx.Module):
             return x - rates(*ends(*x.reshape(shape))).ravel()
 
         guess = rates(q0, p1).ravel()
-        v, f = _root(residual, guess, guess, self.newton).reshape(shape)
+        v, f = _root(residual, guess, guess, self.root_finder).reshape(shape)
         return energy(*ends(v, f)) + h * jnp.sum(f * v)
 
 
@@ -106,8 +109,7 @@ class _VelocityForce(eqx.Module):
         return self.F(t0, t1, q0, v, args)
 
 
-@both_names
-def legendre(L: Callable[..., Any], newton: Newton = Newton()) -> Callable[..., Any]:
+def legendre(L: Callable[..., Any], root_finder: Newton = Newton()) -> Callable[..., Any]:
     r"""The Hamiltonian of a Lagrangian, discrete or continuous, by the Legendre transform.
 
         p1 = ∂L_D/∂v (t0, t1, q0, v),    H_D(t0, t1, q0, p1) = p1·v − L_D,    v = (q1 − q0)/h
@@ -119,7 +121,7 @@ def legendre(L: Callable[..., Any], newton: Newton = Newton()) -> Callable[..., 
 
     - `L`: L_D, function ``(t0, t1, q0, v, args)`` → scalar [energy]; or L, function
       ``(t, q, v, args)`` → scalar [energy]. v is an array like q0.
-    - `newton`: settings of the inner solve.
+    - `root_finder`: settings of the inner solve.
 
     **Returns** for five arguments a function ``(t0, t1, q0, p1, args)`` → scalar for `System`, for
     four a function ``(t, q, p, args)`` → scalar for `discretise`; [energy].
@@ -140,21 +142,20 @@ def legendre(L: Callable[..., Any], newton: Newton = Newton()) -> Callable[..., 
     # The number of arguments decides; a function that takes four and five cannot be classified.
     discrete, continuous = (callable(L) and accepts(L, count) for count in (5, 4))
     if discrete == continuous:
-        seen = signature_of(L) if callable(L) else repr(L)  # the value of a number, say
+        text = signature_of(L) if callable(L) else repr(L)  # the value of a number, say
         raise TypeError(
-            "L must be a function of (t, q, v, args) for a continuous Lagrangian, or of "
-            f"(t0, t1, q0, v, args) for a discrete Lagrangian, got {seen}. This object "
-            + (
-                "accepts both four and five arguments: wrap it in a lambda of four or of five."
-                if discrete
-                else "accepts neither four nor five arguments."
-            )
+            "L must be a function of (t, q, v, args), continuous, or of (t0, t1, q0, v, args), "
+            f"discrete, got {text}, which accepts "
+            + ("both: wrap it in a lambda of four or of five." if discrete else "neither.")
         )
-    return _DiscreteLegendreTransform(L, newton) if discrete else _LegendreTransform(L, newton)
+    return (
+        _DiscreteLegendreTransform(L, root_finder)
+        if discrete
+        else _LegendreTransform(L, root_finder)
+    )
 
 
-@both_names
-def from_lagrangian(L_d: Callable[..., Any], newton: Newton = Newton()) -> HamiltonianFn:
+def from_lagrangian(L_d: Callable[..., Any], root_finder: Newton = Newton()) -> HamiltonianFn:
     r"""The discrete Hamiltonian of a discrete Lagrangian, the type I generating function.
 
         p0 = −∂L_d/∂q0 (t0, t1, q0, q1),    p1 = ∂L_d/∂q1 (t0, t1, q0, q1)
@@ -178,7 +179,7 @@ def from_lagrangian(L_d: Callable[..., Any], newton: Newton = Newton()) -> Hamil
 
     - `L_d`: function ``(t0, t1, q0, q1, args)`` → scalar [action = energy · time], about h L.
       Adjoint steps call it with t1 < t0; it should then be −L_d(t1, t0, q1, q0) or close to it.
-    - `newton`: settings of the inner solve.
+    - `root_finder`: settings of the inner solve.
 
     **Returns** a function ``(t0, t1, q0, p1, args)`` → scalar [energy], for `System`.
 
@@ -206,11 +207,10 @@ def from_lagrangian(L_d: Callable[..., Any], newton: Newton = Newton()) -> Hamil
     ```
     """
     check_takes("L_d", L_d, "(t0, t1, q0, q1, args)")
-    return _FromLagrangian(L_d, newton)
+    return _FromLagrangian(L_d, root_finder)
 
 
-@both_names
-def from_type_iii(H_minus: Callable[..., Any], newton: Newton = Newton()) -> HamiltonianFn:
+def from_type_iii(H_minus: Callable[..., Any], root_finder: Newton = Newton()) -> HamiltonianFn:
     r"""The discrete Hamiltonian, type II, of a type III one.
 
     The type III generating function is S(p0, q1) = −p0·q1 + h H⁻(t0, t1, q1, p0), with
@@ -230,7 +230,7 @@ def from_type_iii(H_minus: Callable[..., Any], newton: Newton = Newton()) -> Ham
     **Arguments**
 
     - `H_minus`: H⁻, function ``(t0, t1, q1, p0, args)`` → scalar [energy].
-    - `newton`: settings of the inner solve.
+    - `root_finder`: settings of the inner solve.
 
     **Returns** a function ``(t0, t1, q0, p1, args)`` → scalar [energy], for `System`.
 
@@ -245,7 +245,7 @@ def from_type_iii(H_minus: Callable[..., Any], newton: Newton = Newton()) -> Ham
     H_D: our own, from L_d = p0·(q1 − q0) − h H⁻ = p1·(q1 − q0) − h H_D.
     """
     check_takes("H_minus", H_minus, "(t0, t1, q1, p0, args)")
-    return _FromTypeIII(H_minus, newton)
+    return _FromTypeIII(H_minus, root_finder)
 
 
 def velocity_force(H_D: HamiltonianFn, F: Callable[..., Any]) -> ForceFn:
@@ -273,37 +273,37 @@ def velocity_force(H_D: HamiltonianFn, F: Callable[..., Any]) -> ForceFn:
     return _VelocityForce(H_D, F)
 
 
-def _transformed(
-    L: Callable[[State], Any], p: State, newton: Newton, name: str, scale: State | None = None
+def _legendre_transform(
+    L: Callable[[State], Any], p: State, root_finder: Newton, name: str, scale: State | None = None
 ) -> Scalar:
     """p·v − L(v) at the v with ∂L/∂v = p; NaN where none is found. `scale`: a scale of the
     round-off of v, q0/h where v is a difference of positions."""
-    what = "an action" if name.startswith("L_d") else "an energy"
+    quantity = "an action" if name.startswith("L_d") else "an energy"
 
     def lagrangian(v):
-        return _require_scalar(L(v.reshape(p.shape)), name, p.shape, what)
+        return _require_scalar(L(v.reshape(p.shape)), name, p.shape, quantity)
 
-    known = p.ravel()
+    momentum = p.ravel()
     # A custom derivative may not close over traced values: they become arguments.
-    free, closed_over = jax.closure_convert(lagrangian, known)
-    scale = jnp.zeros_like(known) if scale is None else scale.ravel()
-    return _stationary(free, newton, known, closed_over, scale)
+    free, closed_over = jax.closure_convert(lagrangian, momentum)
+    scale = jnp.zeros_like(momentum) if scale is None else scale.ravel()
+    return _stationary(free, root_finder, momentum, closed_over, scale)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _stationary(
-    L: Callable[..., Scalar], newton: Newton, p: Vector, parameters: list, scale: Vector
+    L: Callable[..., Scalar], root_finder: Newton, p: Vector, parameters: list, scale: Vector
 ) -> Scalar:
     """p·v − L(v, *parameters) where it is stationary in v."""
-    v = _velocity(L, newton, p, parameters, scale)
+    v = _velocity(L, root_finder, p, parameters, scale)
     return jnp.sum(p * v) - L(v, *parameters)
 
 
 @_stationary.defjvp
-def _(L, newton, inputs, changes):
+def _(L, root_finder, inputs, changes):
     # The value is stationary in v: its first derivative is that at constant v. Higher ones follow,
     # since v itself has derivatives by the implicit function theorem.
-    v = _velocity(L, newton, *inputs)
+    v = _velocity(L, root_finder, *inputs)
 
     def value(p, parameters):
         return jnp.sum(p * v) - L(v, *parameters)
@@ -312,7 +312,7 @@ def _(L, newton, inputs, changes):
 
 
 def _velocity(
-    L: Callable[..., Scalar], newton: Newton, p: Vector, parameters: list, scale: Vector
+    L: Callable[..., Scalar], root_finder: Newton, p: Vector, parameters: list, scale: Vector
 ) -> Vector:
 
     def slope(v):
@@ -320,28 +320,28 @@ def _velocity(
 
     # The matrix ∂²L/∂v² of a Lagrangian that is quadratic in v does not depend on v. This is
     # decided from the jaxpr, so that ∂H_D/∂p1 of a separable system is independent of q0 too.
-    rest = jnp.zeros_like(p)
-    if not depends_on(jax.jacfwd(slope), 0, rest):
-        return lanewise.solve(jax.jacfwd(slope)(rest), p - slope(rest))
-    start = _start(slope, p, rest)
+    zero = jnp.zeros_like(p)
+    if not depends_on(jax.jacfwd(slope), 0, zero):
+        return lanewise.solve(jax.jacfwd(slope)(zero), p - slope(zero))
+    start = _start(slope, p, zero)
     # Where v is small next to terms of p that cancel, its scale is that of their round-off.
     of_terms = lanewise.solve(jax.jacfwd(slope)(start), p)
     scale = jnp.maximum(jnp.abs(scale), jnp.abs(start) + jnp.abs(of_terms))
-    return _root(lambda v: slope(v) - p, start, scale, newton)
+    return _root(lambda v: slope(v) - p, start, scale, root_finder)
 
 
 def _root(
-    residual: Callable[[Vector], Vector], guess: Vector, scale: Vector, newton: Newton
+    residual: Callable[[Vector], Vector], guess: Vector, scale: Vector, root_finder: Newton
 ) -> Vector:
-    x, info = find_root(residual, guess, scale, newton)
+    x, info = find_root(residual, guess, scale, root_finder)
     # An H_D has no status: NaN reports a failure, from which the step gets its status.
     return jnp.where(info.converged, x, jnp.nan)
 
 
-def _start(slope: Callable[[Vector], Vector], p: Vector, rest: Vector) -> Vector:
+def _start(slope: Callable[[Vector], Vector], p: Vector, zero: Vector) -> Vector:
     """A v with slope(v) near p, by Newton's method with step halving, from rest."""
     # Without derivatives: a root does not depend on the start of the search.
-    free, closed_over = jax.closure_convert(slope, rest)
+    free, closed_over = jax.closure_convert(slope, zero)
     closed_over, p = lax.stop_gradient((closed_over, p))
 
     def defect(v):
@@ -353,27 +353,26 @@ def _start(slope: Callable[[Vector], Vector], p: Vector, rest: Vector) -> Vector
     def far(state):
         _, left, _, trials = state
         # Relative to the defect at rest, since an absolute limit would depend on the units.
-        return (left > _NEAR * size(rest)) & (trials < _MOST_TRIALS)
+        return (left > _DEFECT * size(zero)) & (trials < _MOST_TRIALS)
 
     def closer(state):
         v, left, part, trials = state
-        tried = v - part * lanewise.solve(jax.jacfwd(defect)(v), defect(v))
-        new = size(tried)
+        trial = v - part * lanewise.solve(jax.jacfwd(defect)(v), defect(v))
+        new = size(trial)
         gain = new < left  # false for NaN, beyond the domain of L
         # Doubled after a success, so that the search ends with full Newton steps.
         part = jnp.where(gain, jnp.minimum(2 * part, 1), part / 2)
-        return jnp.where(gain, tried, v), jnp.where(gain, new, left), part, trials + 1
+        return jnp.where(gain, trial, v), jnp.where(gain, new, left), part, trials + 1
 
-    start = (rest, size(rest), jnp.ones((), rest.dtype), 0)
+    start = (zero, size(zero), jnp.ones((), zero.dtype), 0)
     return lax.while_loop(far, closer, start)[0]
 
 
-def _require_scalar(value: Any, name: str, shape: tuple[int, ...], what: str) -> Scalar:
+def _require_scalar(value: Any, name: str, shape: tuple[int, ...], quantity: str) -> Scalar:
     value = jnp.asarray(value)
     if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
         raise ValueError(
-            f"{name} must return a real scalar ({what}), got an array of shape {value.shape} and "
-            f"dtype {value.dtype} for q0 of shape {shape}. Return one floating-point number: use "
-            "jnp.sum or one component of an array, and jnp.real of a complex value."
+            f"{name} must return a real scalar ({quantity}), got shape {value.shape} and dtype "
+            f"{value.dtype} for q0 of shape {shape}. Use jnp.sum, one component or jnp.real."
         )
     return value

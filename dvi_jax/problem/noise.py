@@ -101,16 +101,18 @@ class Langevin(Noise):
 
     def _values(self, args: Args, like: State) -> list[Array]:
         values = (self.friction, self.temperature, self.mass)
-        found = [jnp.asarray(x(args) if callable(x) else x, like.dtype) for x in values]
+        arrays = [jnp.asarray(x(args) if callable(x) else x, like.dtype) for x in values]
         # Numbers stay numbers: e^{−γh} of a step is then computed once.
-        return [jnp.broadcast_to(x, like.shape) if x.ndim else x for x in found]
+        return [jnp.broadcast_to(x, like.shape) if x.ndim else x for x in arrays]
 
     def count(self, t, q, p, args):
         try:
             self._values(args, q)
         except ValueError as error:
-            what = "friction, temperature and mass of dvi.Langevin must broadcast with q0, shape "
-            raise ValueError(f"{what}{q.shape}: {error}") from None
+            condition = (
+                "friction, temperature and mass of dvi.Langevin must broadcast with q0, shape "
+            )
+            raise ValueError(f"{condition}{q.shape}: {error}") from None
         return q.size
 
     def force(self, t, q, p, args, rates):
@@ -225,9 +227,9 @@ class Brownian(BrownianPath):
 
     def check(self, num_steps):
         if not is_traced(self.first_step):  # twice, for methods with two increments per step
-            most = 2**32 // (2 * self.substeps) - num_steps
+            largest = 2**32 // (2 * self.substeps) - num_steps
             hint = "A path has 2³² parts: continue a longer run with another key."
-            whole("first_step", int(self.first_step), 0, most, hint)
+            whole("first_step", int(self.first_step), 0, largest, hint)
 
     def increments(self, k, interval, parts, count):
         # Modulo 2³², as the numbers of `fold_in` are; `check` excludes that they repeat.
@@ -253,13 +255,15 @@ class NoisePath(eqx.Module):
 
     def at(self, k: Int[Array, ""], interval: Interval) -> Array:
         """The increments of step k, shape (parts, count)."""
-        found = self.path.increments(k, interval, self.parts, self.count)
-        if found.shape != (self.parts, self.count):
+        increments = self.path.increments(k, interval, self.parts, self.count)
+        if increments.shape != (self.parts, self.count):
             raise ValueError(
                 f"the increments of {type(self.path).__name__} must have the shape (parts, number "
-                f"of motions) = {(self.parts, self.count)}, got {found.shape}."
+                f"of motions) = {(self.parts, self.count)}, got {increments.shape}."
             )
-        return found.astype(interval.h.dtype)  # a path of the user has that of its own functions
+        return increments.astype(
+            interval.h.dtype
+        )  # a path of the user has that of its own functions
 
 
 def as_path(path: Any) -> BrownianPath | None:
@@ -273,36 +277,35 @@ def as_path(path: Any) -> BrownianPath | None:
 
 def _words(key: Any) -> Array:
     try:
-        found = jnp.asarray(key)
+        array = jnp.asarray(key)
     except TypeError:
-        found = jnp.zeros(0)
-    if found.shape == () and jnp.issubdtype(found.dtype, jnp.integer):
-        found = jax.random.key(found, impl="threefry2x32")
+        array = jnp.zeros(0)
+    if array.shape == () and jnp.issubdtype(array.dtype, jnp.integer):
+        array = jax.random.key(array, impl="threefry2x32")
     # Another generator has keys of another length, or another meaning.
-    if found.shape == () and "fry" in str(found.dtype):
-        return jax.random.key_data(found)
-    if found.shape == (2,) and found.dtype == jnp.uint32:  # an old key of JAX: its words
-        return found
+    if array.shape == () and "fry" in str(array.dtype):
+        return jax.random.key_data(array)
+    if array.shape == (2,) and array.dtype == jnp.uint32:  # an old key of JAX: its words
+        return array
     raise ValueError(
         "the key of a path must be one key of jax.random with the generator threefry2x32, such as "
-        f"jax.random.key(0), or an integer, got {key!r:.200}. For many paths use jax.vmap over "
-        'keys, or dvi.sweep(..., path=dvi.Axis("seed", range(1000))).'
+        f"jax.random.key(0), or an integer, got {key!r:.200}. For many paths use jax.vmap."
     )
 
 
 def _normal(key: Array, number: Array, count: int, dtype: Any) -> Array:
     """``jax.random.normal(jax.random.fold_in(key, number), (count,), dtype)`` to round-off."""
     # What `fold_in` does: the words of the number, encrypted with the key, are a new key.
-    folded = jnp.stack(threefry2x32(key, jnp.uint32(0), number))
+    step_key = jnp.stack(threefry2x32(key, jnp.uint32(0), number))
     # What `random_bits` does: the index of each number in two words.
-    words = threefry2x32(folded, jnp.uint32(0), jnp.arange(count, dtype=jnp.uint32))
+    words = threefry2x32(step_key, jnp.uint32(0), jnp.arange(count, dtype=jnp.uint32))
     info, bits = jnp.finfo(dtype), words[0] ^ words[1]
     if info.bits == 64:
         bits = words[0].astype(jnp.uint64) << 32 | words[1].astype(jnp.uint64)
     # The fraction of a float in [1, 2).
-    one = jnp.ones((), dtype).view(bits.dtype)
-    uniform = (bits >> (info.bits - info.nmant) | one).view(dtype) - 1
+    unit = jnp.ones((), dtype).view(bits.dtype)
+    uniform = (bits >> (info.bits - info.nmant) | unit).view(dtype) - 1
     # Between the numbers next to −1 and 1, as in JAX, so that no result is infinite.
-    least = np.nextafter(dtype.type(-1), dtype.type(0))
-    uniform = jnp.maximum(least, uniform * (1 - least) + least)
+    smallest = np.nextafter(dtype.type(-1), dtype.type(0))
+    uniform = jnp.maximum(smallest, uniform * (1 - smallest) + smallest)
     return math.sqrt(2) * lax.erf_inv(uniform)

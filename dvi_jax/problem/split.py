@@ -49,13 +49,13 @@ class Split(eqx.Module):
         parts = list(parts)
         if len(parts) < 2:
             raise ValueError(f"parts of Split must be two or more functions, got {len(parts)}.")
-        given = [None] * len(parts) if flows is None else list(flows)
-        if len(given) != len(parts):
+        all_flows = [None] * len(parts) if flows is None else list(flows)
+        if len(all_flows) != len(parts):
             raise ValueError(
                 f"flows of Split must have one entry for each of the {len(parts)} parts, None for "
-                f"a flow that is not known, got {len(given)} entries."
+                f"a flow that is not known, got {len(all_flows)} entries."
             )
-        for i, (H, flow) in enumerate(zip(parts, given, strict=True)):
+        for i, (H, flow) in enumerate(zip(parts, all_flows, strict=True)):
             check_takes(f"part {i} of Split", H, "(t0, t1, q0, p1, args)")
             if getattr(H, "step_is_from_times", False):
                 raise ValueError(

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from ..base.checks import finite, instance
 from ..base.indices import out_of_bounds
-from ..base.reads import Reads, changed, reads
+from ..base.reads import Reads, differences, reads
 from ..base.signature import accepts, check_takes, tracing_note, warn_of_exchanged
 from ..base.types import Args, ConstraintFn, ForceFn, HamiltonianFn, Scalar, State
 from .noise import Noise, as_noise
@@ -104,14 +104,12 @@ class System(eqx.Module):
         if self.epsilon is not None:
             finite("epsilon of a System", self.epsilon)
         functions = {"H_D": self.H_D, "perturbation": self.perturbation}
-        timed = [n for n, f in functions.items() if getattr(f, "step_is_from_times", False)]
-        if self.slow_time and timed:
+        offenders = [n for n, f in functions.items() if getattr(f, "step_is_from_times", False)]
+        if self.slow_time and offenders:
             raise ValueError(
-                f"{timed[0]} must not compute the step as t1 − t0 if slow_time=True, because then "
-                "t1 − t0 is ε h. The results of dvi.discretise(H, order) with order ≥ 2, of "
-                "dvi.from_lagrangian and of dvi.from_type_iii do so. Use dvi.discretise(H, "
-                "order=1), or dvi.legendre(L) for a Lagrangian. For a higher order pass "
-                "method=dvi.Strang() or dvi.Yoshida(4) to dvi.integrate."
+                f"{offenders[0]} must not compute the step as t1 − t0 if slow_time=True, where it "
+                "is ε h, as dvi.discretise(H, order) with order ≥ 2, dvi.from_lagrangian and "
+                "dvi.from_type_iii do. Use dvi.discretise(H, order=1) or dvi.legendre(L)."
             )
 
     @property
@@ -133,11 +131,10 @@ class System(eqx.Module):
             "slow_time=True": self.slow_time,
         }
         if any(parts.values()):
-            has = " and ".join(name for name, is_there in parts.items() if is_there)
+            names = " and ".join(name for name, is_there in parts.items() if is_there)
             raise ValueError(
-                f"epsilon must be given for a system with {has}. epsilon is the factor of the "
-                "force, of the perturbation and of the slow time ε t. Pass a value such as 0.01, "
-                "or epsilon=1.0 to use the functions as they are."
+                f"epsilon must be given for a system with {names}. It is their factor: "
+                "epsilon=1.0 uses the functions as they are."
             )
         return 0.0
 
@@ -176,7 +173,7 @@ class System(eqx.Module):
             *((x.shape, x.dtype) if eqx.is_array(x) else (type(x), x) for x in leaves),
         )
         scalar = "a real scalar (an energy)"
-        for name, function, shape, expected in (
+        for name, function, shape, description in (
             ("H_D", self.H_D, (), scalar),
             ("perturbation", self.perturbation, (), scalar),
             ("force", self.force, q.shape, f"a real array shaped like q0, {q.shape}"),
@@ -191,17 +188,16 @@ class System(eqx.Module):
             if out.shape and not shape:
                 hint = "Sum its entries with jnp.sum, or take one component."
             raise ValueError(
-                f"{name}{_NAMES} must return {expected}; for q0 of shape {q.shape} it returned an "
-                f"array of shape {out.shape}, dtype {out.dtype}. {hint}".rstrip()
+                f"{name}{_NAMES} must return {description}; for q0 of shape {q.shape} it returned "
+                f"shape {out.shape}, dtype {out.dtype}. {hint}".rstrip()
             )
         if self.constraint is not None:
             # A scalar is refused too: one component needs an axis as several do.
             out = _traced_output(self.constraint, "constraint", kinds, (q, args))
             if len(out.shape) != 1 or 0 in out.shape or not jnp.issubdtype(out.dtype, jnp.floating):
                 raise ValueError(
-                    "constraint(q, args) must return a real array of shape (m,), one number for "
-                    f"each of its m ≥ 1 conditions; for q of shape {q.shape} it returned an array "
-                    f"of shape {out.shape}, dtype {out.dtype}. Use jnp.stack([...]) or jnp.ravel."
+                    "constraint(q, args) must return a real array of shape (m,), m ≥ 1; for q of "
+                    f"shape {q.shape} it returned {out.shape}, dtype {out.dtype}. Use jnp.ravel."
                 )
 
 
@@ -209,8 +205,8 @@ def _read_by(system: System) -> Reads:
     of_noise = [] if system.noise is None else system.noise.functions
     functions = (system.H_D, system.force, system.perturbation, system.constraint, *of_noise)
     # A counter of calls, for instance, changes with every trace, and no program depends on it.
-    ignored = {name for f in functions for name in _changed_by_tracing(f)}
-    return tuple(item for item in reads(*functions) if item[0] not in ignored)
+    counters = {name for f in functions for name in _changed_by_tracing(f)}
+    return tuple(item for item in reads(*functions) if item[0] not in counters)
 
 
 def of_problem(
@@ -225,12 +221,12 @@ def of_problem(
     if isinstance(getattr(system, "system", None), System):
         problem, system = system, system.system
         defaults = (("q0", q0), ("p0", p0), ("h", h), ("args", args))
-        given = (getattr(problem, n) if x is None else x for n, x in defaults)
-        q0, p0, h, args = (None, None, *tuple(given)[2:]) if has_start else given
+        values = (getattr(problem, n) if x is None else x for n, x in defaults)
+        q0, p0, h, args = (None, None, *tuple(values)[2:]) if has_start else values
     elif isinstance(system, System) and not has_start and (q0 is None or p0 is None):
         raise TypeError(
             f"q0 and p0 must both be given for a dvi.System, but {'q0' if q0 is None else 'p0'} is "
-            "missing. Call integrate(system, q0, p0, ...)."
+            "missing."
         )
     return system, q0, p0, h, args
 
@@ -248,31 +244,30 @@ def check_system(system: Any, of_map: str = "", noise_allowed: bool = False) -> 
         if of_library and accepts(system, 0):
             hint = f"Call the function: {name}()."
         kind = "class" if isinstance(system, type) else type(system).__name__
-        seen = f"the {kind} {name}" if name else f"a value of type {kind}"
-        raise TypeError(f"system must be a dvi.System, got {seen}. {hint}")
+        text = f"the {kind} {name}" if name else f"a value of type {kind}"
+        raise TypeError(f"system must be a dvi.System, got {text}. {hint}")
     if system.noise is not None and not noise_allowed:
         raise ValueError(
-            "the system has noise, which this function does not support: give it the same system "
-            "without noise=. dvi.integrate, dvi.sweep and dvi.invariant_diffusion support noise."
+            "the system has noise, which only dvi.integrate, dvi.sweep and dvi.invariant_diffusion "
+            "support: give the same system without noise=."
         )
     if of_map and system.constraint is not None:
         raise ValueError(
-            f"{of_map} examines the map (12)–(13) of a system without constraint, but this system "
-            "has one. Use coordinates without constraint; dvi.discover_invariants and "
-            "dvi.drift_order take constrained systems."
+            f"{of_map} requires a system without constraint. Use other coordinates, or "
+            "dvi.discover_invariants or dvi.drift_order."
         )
     # Programs that are compiled already would compute with the old value.
-    now = _read_by(system)
-    names = changed(system.reads, now) if now != system.reads else []
+    current = _read_by(system)
+    names = differences(system.reads, current) if current != system.reads else []
     if names:
         raise ValueError(
-            "the functions of the system read values that have changed since dvi.System(...) was "
-            f"called: {', '.join(names)}. Make a new System, or pass such values in args."
+            "the functions of the system read values that have changed since it was made: "
+            f"{', '.join(names)}. Make a new System, or pass such values in args."
         )
 
 
 # Weak, so that functions and the arrays in their closures can be deleted.
-_SEEN: weakref.WeakKeyDictionary[Callable, dict] = weakref.WeakKeyDictionary()
+_OUTPUTS: weakref.WeakKeyDictionary[Callable, dict] = weakref.WeakKeyDictionary()
 """Function → kinds of arguments → output."""
 
 _CHANGED_BY_TRACING: weakref.WeakKeyDictionary[Callable, frozenset] = weakref.WeakKeyDictionary()
@@ -287,20 +282,20 @@ def _changed_by_tracing(function: Callable | None) -> frozenset[str]:
 
 
 def _traced_output(
-    function: Callable, name: str, kinds: tuple, at: Sequence[Any]
+    function: Callable, name: str, kinds: tuple, arguments: Sequence[Any]
 ) -> jax.ShapeDtypeStruct:
-    q, args = (at[2], at[4]) if len(at) > 2 else (at[0], at[-1])
-    names = _NAMES if len(at) > 2 else "(q, args)"
+    q, args = (arguments[2], arguments[4]) if len(arguments) > 2 else (arguments[0], arguments[-1])
+    names = _NAMES if len(arguments) > 2 else "(q, args)"
     try:
-        seen = _SEEN.setdefault(function, {})
-        if kinds in seen:
-            return seen[kinds]
+        outputs = _OUTPUTS.setdefault(function, {})
+        if kinds in outputs:
+            return outputs[kinds]
     except TypeError:  # a function or an argument without a hash: it is traced in every call
-        seen = {}
+        outputs = {}
     # Traced, not called: at a start in a singularity a value would be NaN, its shape is the same.
-    before = reads(function)
+    values = reads(function)
     try:
-        traced, *out = eqx.filter_make_jaxpr(function)(*at)
+        program, *out = eqx.filter_make_jaxpr(function)(*arguments)
     except Exception as error:
         error.add_note(f"(in {name}{names}, called with q0 of shape {q.shape} and args={args!r})")
         error.add_note(tracing_note(name, error))
@@ -311,23 +306,24 @@ def _traced_output(
             )
         raise
     # JAX moves such an index to the end of the array, so that the result would be wrong silently.
-    for index, size in out_of_bounds(traced):
+    for index, size in out_of_bounds(program):
         raise IndexError(
             f"{name}{names} must use indices inside its arrays, but the index {index} is out of "
-            f"bounds for an axis of length {size}. q0 and p1 have the shape {q.shape}. Correct the "
-            "index, or the shape of the array."
+            f"bounds for an axis of length {size}. q0 and p1 have the shape {q.shape}."
         )
     out = eqx.combine(*out)
-    after = reads(function)
-    if after != before:  # such as a counter of calls
-        marks = dict(before)
+    new_values = reads(function)
+    if new_values != values:  # such as a counter of calls
+        marks = dict(values)
         _CHANGED_BY_TRACING[function] = _changed_by_tracing(function) | {
-            name for name, mark in after if marks.get(name) != mark
+            name for name, mark in new_values if marks.get(name) != mark
         }
     if out is None or not hasattr(out, "shape"):
         if isinstance(out, int | float):
-            return seen.setdefault(kinds, jax.ShapeDtypeStruct((), jnp.result_type(float)))
-        got = "None (is a return missing?)" if out is None else f"type {type(out).__name__}"
-        wanted = f"an array of shape {q.shape}, that of q0" if name == "force" else "a real scalar"
-        raise TypeError(f"{name}{names} must return {wanted}, got {got}.")
-    return seen.setdefault(kinds, jax.ShapeDtypeStruct(out.shape, out.dtype))
+            return outputs.setdefault(kinds, jax.ShapeDtypeStruct((), jnp.result_type(float)))
+        text = "None (is a return missing?)" if out is None else f"type {type(out).__name__}"
+        description = (
+            f"an array of shape {q.shape}, that of q0" if name == "force" else "a real scalar"
+        )
+        raise TypeError(f"{name}{names} must return {description}, got {text}.")
+    return outputs.setdefault(kinds, jax.ShapeDtypeStruct(out.shape, out.dtype))

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..base.checks import finite, positive, whole
+from ..base.machine import processors
 from ..base.precision import refuse_double_without_x64
-from ..base.threads import processors
 from ..base.types import Interval
 from ..discover.functions.basis import check_step_size
 from ..discover.invariants.found import Discovery

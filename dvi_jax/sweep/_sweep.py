@@ -11,9 +11,8 @@ import numpy as np
 from lanewise.jaxprs.jaxapi import x64_enabled
 
 from ..base.checks import instance, whole
-from ..base.keywords import INTEGRATOR, taken, with_keywords_of
+from ..base.keywords import INTEGRATOR, take, with_keywords_of
 from ..base.machine import machine_memory
-from ..base.names import both_names
 from ..integration.integrate import integrate
 from ..integration.integrator import chosen
 from ..lattices import Given, Lattice
@@ -47,7 +46,6 @@ class SweepInterrupted(KeyboardInterrupt):
         self.result = result
 
 
-@both_names
 @with_keywords_of(
     integrate, f"h num_steps t0 epsilon args {INTEGRATOR} observe stop path", start=None, save=None
 )
@@ -162,7 +160,6 @@ def sweep(
     return result
 
 
-@both_names
 @with_keywords_of(sweep)
 def sweep_cost(system: System, q0: Any = None, p0: Any = None, **settings: Any) -> SweepCost:
     """Estimate the cost of a `sweep` with these arguments: tasks, bytes, seconds; with tables for
@@ -222,7 +219,7 @@ def _make_sweep(system: Any, q0: Any, p0: Any, given: dict[str, Any]) -> Sweep:
             "there is nothing to store, because observe, save and stop are all missing: give "
             "observe={...}, or save=dvi.Save(final=True) to store the final states."
         )
-    start, of_integrator = given["start"], taken(dict(given), INTEGRATOR)
+    start, of_integrator = given["start"], take(dict(given), INTEGRATOR)
     # The name of the axis is not "method", which has another meaning in xarray's sel.
     method: Any = _as_axis_of_list("integrator", of_integrator.pop("method"))
     num_steps = _as_axis_of_list("num_steps", given["num_steps"])

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..base.checks import instance
+from ..base.inputs import refuse_unit_or_mask
 from ..base.precision import refuse_double_without_x64
-from ..base.quantities import refuse_unit_or_mask
 
 
 @dataclass(frozen=True, init=False, eq=False)

@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from ..base.progress import bar_of, told
+from ..base.progress import bar_of, reporter
 from .cost import span
 from .workers import SweepProgress
 
@@ -21,4 +21,4 @@ def _columns(p: SweepProgress) -> dict[str, Any]:
 
 def shown(progress: Any) -> Any:
     """A context whose value is called with a `SweepProgress`, or is None."""
-    return told(progress, bar_of("sweep", ("done", "rate", "failed", "left"), _columns))
+    return reporter(progress, bar_of("sweep", ("done", "rate", "failed", "left"), _columns))

@@ -18,8 +18,8 @@ import numpy as np
 
 from lanewise.jaxprs.jaxapi import x64_enabled
 
+from ..base.machine import processors
 from ..base.results import STATUS_NAMES
-from ..base.threads import processors
 from .layout import STATUS
 from .plan import Task
 from .program import Program

@@ -10,8 +10,7 @@ import numpy as np
 
 from ...base.checks import function
 from ...base.inputs import as_parameter, as_scalar, start_state
-from ...base.keywords import taken, with_keywords_of
-from ...base.names import both_names
+from ...base.keywords import take, with_keywords_of
 from ...base.reads import Reads, reads
 from ...base.results import status_name
 from ...integration.integrate import integrate
@@ -26,7 +25,6 @@ from .orders import ABOVE_FLOOR, DriftOrder, DriftSurface
 _TAKEN = f"{TYPE_2} method"
 
 
-@both_names
 @with_keywords_of(integrate, _TAKEN)
 def drift_order(
     system: System,
@@ -64,7 +62,7 @@ def drift_order(
       `AdiabaticInvariant`.
     - `q0`, `p0`: one state; with ``batched=True`` many, along the first axis: (S, *state).
     - `epsilons`: strengths, shape (E,), positive, no two the same, in any order.
-    - `h`, `num_steps`, and the keywords `t0`, `args`, `method`, `root_finder` (or `newton`),
+    - `h`, `num_steps`, and the keywords `t0`, `args`, `method`, `root_finder`,
       `integrator`: as for `integrate`.
 
     **Returns** a `DriftOrder`; its slope is NaN when fewer than three points can be used.
@@ -98,7 +96,6 @@ def drift_order(
     return _order(epsilons, lanes, _kept(lanes.good))
 
 
-@both_names
 @with_keywords_of(integrate, _TAKEN)
 def drift_surface(
     system: System,
@@ -128,7 +125,7 @@ def drift_surface(
     - `epsilons`: strengths, shape (E,); `hs`: step sizes [time], shape (H,); both positive and
       increasing.
     - `duration`: of each trajectory [time], at least two of the longest steps.
-    - the keywords `t0`, `args`, `method`, `root_finder` (or `newton`), `integrator`: as for
+    - the keywords `t0`, `args`, `method`, `root_finder`, `integrator`: as for
       `integrate`.
 
     **Returns** a `DriftSurface`.
@@ -292,5 +289,5 @@ def _starts(q0: Any, p0: Any, batched: bool):
 
 def _settings(how: dict[str, Any]) -> dict[str, Any]:
     """What `integrate` receives of the keywords that both functions take from it."""
-    run = taken(how, "t0 args")  # removes them from `how`
+    run = take(how, "t0 args")  # removes them from `how`
     return run | {"args": jax.tree.map(as_parameter, run["args"]), "integrator": chosen(**how)}

@@ -12,7 +12,6 @@ from lanewise.jaxprs.jaxapi import x64_enabled
 
 from ...base.checks import finite as finite_number
 from ...base.keywords import with_keywords_of
-from ...base.names import both_names
 from ...base.results import RESULTS
 from ...base.types import Args, Interval
 from ...engine.newton import Newton, RootSolver
@@ -172,7 +171,7 @@ class Map(NamedTuple):
     arithmetic: Arithmetic
 
 
-TYPE_2 = "t0 args newton integrator"
+TYPE_2 = "t0 args root_finder integrator"
 """Keywords of searches that examine the paper's map, of `TypeII()`."""
 
 
@@ -181,7 +180,7 @@ def map_of(
     system: System,
     t0: Any,
     args: Args,
-    newton: RootSolver | None,
+    root_finder: RootSolver | None,
     integrator: Integrator | None,
     **more: Any,
 ) -> Map:
@@ -189,9 +188,9 @@ def map_of(
 
     By default by Newton's iteration, through which Taylor coefficients in ε are exact.
     """
-    if integrator is None and newton is None:
-        newton = Newton()
-    integrator = chosen(integrator, root_finder=newton, **more)
+    if integrator is None and root_finder is None:
+        root_finder = Newton()
+    integrator = chosen(integrator, root_finder=root_finder, **more)
     found = only(integrator, function, *more, "root_finder")
     return Map(t0, args, found.method_for(system), found.root_finder, found.arithmetic)
 
@@ -280,7 +279,6 @@ def check_basis(basis: BoundBasis, values: np.ndarray) -> float:
     return float(singular[0] / singular[-1])
 
 
-@both_names
 @with_keywords_of(integrate, TYPE_2)
 def solution_pairs(
     system: System, *, h: float, samples: Any, epsilon: Any = 0.0, **how: Any
@@ -291,7 +289,7 @@ def solution_pairs(
 
     **Arguments** `samples`: (qs, ps) at t0, shapes (S, *q.shape), or (qs, ps, ts) with their
     times, shape (S,); `h`: step size [time]; `epsilon`, and the keywords `t0`, `args`,
-    `root_finder` (or `newton`), `integrator`: as for `integrate`.
+    `root_finder`, `integrator`: as for `integrate`.
 
     **Returns** two points with a leading axis of length S. **Raises** `ValueError` for samples
     of unequal shapes or not finite, h = 0, or a step that fails on them.

@@ -9,7 +9,6 @@ import numpy as np
 
 from ...base.checks import fraction, one_of, whole
 from ...base.keywords import with_keywords_of
-from ...base.names import both_names
 from ...integration.integrate import integrate
 from ...methods.step import Equations
 from ...problem.system import System, check_system
@@ -54,7 +53,6 @@ _ROUND_OFF = 1e-12  # Changes below this need not be smaller
 _RELIABLE = 6  # The largest order that float64 decides reliably
 
 
-@both_names
 @with_keywords_of(integrate, f"{TYPE_2} method arithmetic")
 def discover_invariants(
     system: System,
@@ -96,7 +94,7 @@ def discover_invariants(
       "least" takes the corrections that are smallest on the samples (the convention of averaging:
       no component along what order 0 conserves), unless the simplest ones are exact; "simplest"
       takes those of simple functions, which tend to drift less and are easier to read.
-    - the keywords `t0`, `args`, `method`, `root_finder` (or `newton`), `integrator`: as for
+    - the keywords `t0`, `args`, `method`, `root_finder`, `integrator`: as for
       `integrate`; only the map of one step is used. `arithmetic`: ``dvi.DoubleDouble()`` decides
       the null space with 30 digits (orders above 6); the default is ``dvi.FloatingPoint()``.
 

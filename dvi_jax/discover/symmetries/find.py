@@ -9,7 +9,6 @@ import numpy as np
 
 from ...base.checks import fraction, whole
 from ...base.keywords import with_keywords_of
-from ...base.names import both_names
 from ...integration.integrate import integrate
 from ...methods.step import Equations
 from ...problem.system import System, check_system
@@ -50,7 +49,6 @@ from .search import Search, rows_of
 _NO_STEP = 1e-13
 
 
-@both_names
 @with_keywords_of(integrate, TYPE_2)
 def find_symmetries(
     system: System,
@@ -94,7 +92,7 @@ def find_symmetries(
     - `time`: whether ξ0 is sought too. Where it depends on the point it changes h.
     - `tolerance`: relative singular value below which a vector is null; None for those below the
       widest gap, at most 1e-11 of the typical residual of vector fields, or rounding.
-    - the keywords `t0`, `args`, `root_finder` (or `newton`), `integrator`: as for `integrate`; the
+    - the keywords `t0`, `args`, `root_finder`, `integrator`: as for `integrate`; the
       map is that of `TypeII()`.
 
     **Returns** `Symmetries`; print it for a report. t in the basis is the time, also of a system

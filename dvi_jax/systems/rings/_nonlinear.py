@@ -14,7 +14,7 @@ from jaxtyping import Array
 import lanewise
 
 from ...base.checks import finite, positive, whole
-from ...base.progress import bar_of, told
+from ...base.progress import bar_of, reporter
 from ...dynamics.frequencies import frequencies, frequency_diffusion
 from ._maps import Particle
 from ._optics import SLICED, Optics, analysis, four, maps, optics
@@ -244,7 +244,7 @@ def _pieces(function: Callable, progress: Report, *arrays: Array) -> Array:
     def columns(p: tuple[int, int]) -> dict[str, Any]:
         return {"completed": p[0], "total": p[1]}
 
-    with told(progress, bar_of("particles", (), columns)) as report:
+    with reporter(progress, bar_of("particles", (), columns)) as report:
         for i in range(0, N := len(flat[0]), each):
             some = np.minimum(np.arange(i, i + each), N - 1)
             outs.append(jax.block_until_ready(function(*(a[some] for a in flat))))
