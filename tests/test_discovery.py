@@ -16,7 +16,7 @@ from dvi_jax import systems
 from dvi_jax.discover.functions.basis import bind_basis
 from dvi_jax.discover.functions.sampling import Samples, as_samples
 from dvi_jax.discover.invariants import changes
-from dvi_jax.discover.symmetries.found import conditions
+from dvi_jax.discover.symmetries import conditions
 from dvi_jax.methods.step import Equations
 
 H_D = systems.oscillator().system.H_D

@@ -48,9 +48,13 @@ class Motion(NamedTuple):
         """Of some of the samples."""
         return Motion(*(x[some] for x in self))
 
-    def of(self, combinations: np.ndarray) -> "Motion":
+    def in_functions(self, combinations: np.ndarray) -> "Motion":
         """Of combinations of the functions, columns of shape (size, count)."""
         return Motion(times(self.changes, combinations), self.rounding @ np.abs(combinations))
+
+    def candidates(self, combinations: np.ndarray) -> "Motion":
+        """The same as `in_functions`."""
+        return self.in_functions(combinations)
 
     def with_perturbation(self, terms: np.ndarray, combinations: np.ndarray) -> "Motion":
         """The same, and what the perturbation changes the combinations by, order by order: the
@@ -111,7 +115,7 @@ class FieldMotion(NamedTuple):
         """Of some of the samples."""
         return FieldMotion(*(x[some] for x in self))
 
-    def of_functions(self, combinations: np.ndarray) -> "FieldMotion":
+    def in_functions(self, combinations: np.ndarray) -> "FieldMotion":
         """For combinations of the functions φ, columns of shape (B, count)."""
         return self._replace(
             values=self.values @ combinations,
@@ -119,7 +123,7 @@ class FieldMotion(NamedTuple):
             rounding=self.rounding @ np.abs(combinations),
         )
 
-    def of(self, fields: np.ndarray) -> Motion:
+    def candidates(self, fields: np.ndarray) -> Motion:
         """Of fields, columns of shape (C · B, count)."""
         X = fields.reshape(self.second.shape[1], self.values.shape[1], -1)
         changes = np.einsum("sdb,cbk->scdk", self.changes, X) * self.second[:, :, None, None]
@@ -154,7 +158,7 @@ class FieldMotion(NamedTuple):
         """How many fields change in the steps by hardly more than rounding."""
         size = self.rounding[0].size
         rows = self.second.shape[1] * (self.changes.shape[1] + 1)
-        return self.at(_enough(len(self.second), rows, size)).of(np.eye(size)).undecided()
+        return self.at(_enough(len(self.second), rows, size)).candidates(np.eye(size)).undecided()
 
 
 def _enough(samples: int, rows: int, size: int) -> slice:
@@ -184,7 +188,7 @@ def conserved(
     count, size = leading.shape[1], terms.shape[-1]
     if count == 0:
         return leading, 0
-    own = motion.of(leading[:size])
+    own = motion.candidates(leading[:size])
     digits = coefficient_errors(terms)[:, None]
     if tolerance is not None:
         own = own.with_perturbation(terms, leading[:size])
@@ -214,7 +218,7 @@ def relative_changes(
     """The change of one series, shape (z + 1, size), at each order, by the measure of `conserved`:
     shape (S, z + 1). `spread`: of its leading-order term; `digits`: see
     `coefficient_errors`; `approximately`: see `Motion.with_perturbation`."""
-    own = motion.of(series[:1].T)
+    own = motion.candidates(series[:1].T)
     if approximately:
         own = own.with_perturbation(terms, series[:1].T)
     own = own._replace(rounding=own.rounding + np.reshape(digits, (-1, 1))).at_most(spread)

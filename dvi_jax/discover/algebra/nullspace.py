@@ -150,6 +150,7 @@ def toeplitz(terms: np.ndarray, order: int) -> np.ndarray:
 
 def epsilon_scale(terms: np.ndarray) -> float:
     """s such that A_m s^−m, m ≥ 1, are not larger than A_0 and one is as large; 1 if all vanish.
+    `terms`: shape (rows, z + 1, columns).
 
     With ε in units of 1/s a weak and a strong perturbation are one problem.
     """

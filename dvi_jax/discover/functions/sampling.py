@@ -76,22 +76,29 @@ def spreads(samples: Samples) -> np.ndarray:
     return np.repeat([spread(samples.q), spread(samples.p)], samples.q[0].size)
 
 
-def relative_step(samples: Samples, moved: np.ndarray) -> float:
-    """Median distance by which a step moves the samples, as a share of their spread; `moved`:
-    z1 − z of (q, p), shape (S, 2n)."""
-    return float(np.median(np.max(np.abs(moved) / spreads(samples), axis=1)))
+class Displacements(NamedTuple):
+    """Samples, and z1 − z of z = (q, p) in a step of a map from each, shape (S, 2n)."""
 
+    samples: Samples
+    values: np.ndarray
 
-def nonlinearity(samples: Samples, moved: np.ndarray) -> float:
-    """Median distance of a map from a linear one, as a share of how much it varies on the samples;
-    `moved`: as for `relative_step`."""
-    sizes = spreads(samples)
-    z = np.concatenate([x.reshape(len(x), -1) for x in samples[:2]], axis=1)
-    z = np.column_stack([(z - np.median(z, axis=0)) / sizes, np.ones(len(z))])
-    moved = moved / sizes
-    left = np.linalg.norm(moved - z @ np.linalg.lstsq(z, moved, rcond=None)[0], axis=1)
-    varies = np.linalg.norm(moved - np.median(moved, axis=0), axis=1)
-    return float(np.median(left) / max(np.median(varies), 1e-300))
+    @property
+    def relative_step(self) -> float:
+        """Median distance by which a step moves the samples, as a share of their spread."""
+        sizes = spreads(self.samples)
+        return float(np.median(np.max(np.abs(self.values) / sizes, axis=1)))
+
+    @property
+    def nonlinearity(self) -> float:
+        """Median distance of the map from a linear one, as a share of how much it varies on the
+        samples."""
+        sizes = spreads(self.samples)
+        z = np.concatenate([x.reshape(len(x), -1) for x in self.samples[:2]], axis=1)
+        z = np.column_stack([(z - np.median(z, axis=0)) / sizes, np.ones(len(z))])
+        values = self.values / sizes
+        left = np.linalg.norm(values - z @ np.linalg.lstsq(z, values, rcond=None)[0], axis=1)
+        varies = np.linalg.norm(values - np.median(values, axis=0), axis=1)
+        return float(np.median(left) / max(np.median(varies), 1e-300))
 
 
 def later(h: float, relative: float = 1.0) -> np.ndarray:

@@ -22,10 +22,10 @@ from ..algebra.motion import Motion
 from ..algebra.taylor import taylor_coefficients
 from ..functions.basis import BoundBasis
 from ..functions.sampling import (
+    Displacements,
     Samples,
     check_finite,
     later,
-    relative_step,
     require_finite,
     require_steps,
 )
@@ -56,8 +56,9 @@ class Stepped(NamedTuple):
 
 
 class Changes(NamedTuple):
-    """At S samples, for B functions.
+    """S samples, and what B functions change by in one step from each.
 
+    - `stepped`, `samples`: the map with its functions, and where it was applied.
     - `values`: φ, (S, B). `terms`: A_0 … A_z, (S, z + 1, B): Taylor coefficients in ε of
       φ(Φ_ε(z), t + h) − φ(z, t). `volume`: those of log |det DΦ_ε| from order 1, (S, z + 1).
     - `motion`: what slopes predict for A_0, and its rounding.
@@ -65,6 +66,8 @@ class Changes(NamedTuple):
     - `good`: where the step succeeds and all is finite, (S,).
     """
 
+    stepped: Stepped
+    samples: Samples
     values: np.ndarray
     terms: np.ndarray
     volume: np.ndarray
@@ -75,8 +78,20 @@ class Changes(NamedTuple):
 
     def at(self, some: np.ndarray) -> "Changes":
         """Of some of the samples."""
-        arrays = {name: x[some] for name, x in self._asdict().items() if name != "motion"}
-        return Changes(motion=self.motion.at(some), **arrays)
+        parts = self.samples.at(some), self.motion.at(some)
+        names = "values", "terms", "volume", "slopes", "moved", "good"
+        arrays = {name: getattr(self, name)[some] for name in names}
+        return self._replace(samples=parts[0], motion=parts[1], **arrays)
+
+    @property
+    def displacements(self) -> Displacements:
+        """What the step changes (q, p) by."""
+        return Displacements(self.samples, self.moved[:, :-1])
+
+    def elsewhere(self, samples: Samples | None = None, h: Any = None) -> "Changes":
+        """Of order 0 at other samples or with another step, unchecked."""
+        stepped = self.stepped if h is None else self.stepped._replace(h=np.asarray(h))
+        return changes_at(stepped, 0, self.samples if samples is None else samples)
 
 
 def changes_at(stepped: Stepped, order: int, samples: Samples) -> Changes:
@@ -90,7 +105,7 @@ def changes_at(stepped: Stepped, order: int, samples: Samples) -> Changes:
         predicted = (slopes * move[:, None]).swapaxes(1, 2)
     motion = Motion(predicted, np.finfo(float).eps * rounding)
     good = good & np.all(finite, axis=0)
-    return Changes(values, terms, volume, motion, slopes, move, good)
+    return Changes(stepped, samples, values, terms, volume, motion, slopes, move, good)
 
 
 def checked_changes(stepped: Stepped, order: int, samples: Samples) -> Changes:
@@ -111,16 +126,16 @@ def checked_changes(stepped: Stepped, order: int, samples: Samples) -> Changes:
     hint = "keep the samples away from singularities of H_D and the force"
     require_finite(np.where(found.good, 0, np.nan), lambda: "the derivative of the map", hint)
     if np.ptp(samples.t) == 0 and _may_depend_on_time(stepped.equations, samples):
-        _require_no_time(stepped, order, samples, found)
+        _require_no_time(found, order)
     return found
 
 
-def _require_no_time(stepped, order, samples, found) -> None:
+def _require_no_time(found: Changes, order: int) -> None:
+    stepped, samples = found.stepped, found.samples
     allowed = 1e-8 * np.max(np.abs(found.terms), axis=0, keepdims=True)
     allowed = np.broadcast_to(allowed, found.terms.shape).copy()
     predicted = np.sum(np.abs(found.motion.changes), axis=1)
-    relative = relative_step(samples, found.moved[:, :-1])
-    for shift in later(float(stepped.h), relative):
+    for shift in later(float(stepped.h), found.displacements.relative_step):
         # t1 − t0 loses digits at a later time, and a step is in proportion to it.
         lost = 4 * np.finfo(float).eps * (np.max(np.abs(samples.t)) + shift) / abs(stepped.h)
         other = changes_at(stepped, order, samples._replace(t=samples.t + shift)).terms

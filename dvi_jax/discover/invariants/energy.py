@@ -1,6 +1,6 @@
 """How far a map conserves the energy: why a search for invariants does not find it."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,9 +13,9 @@ from ...methods import TypeII
 from ...methods.step import Equations
 from ..functions.basis import BoundBasis
 from ..functions.families import raised
-from ..functions.sampling import Samples
-from .changes import Stepped, changes_at
+from .changes import changes_at
 from .judging import CLEARLY
+from .search import NullSpaces
 
 _FOUND = 0.05  # Energy differs by so little from an invariant that was found
 _EXPRESSED = 1e-6  # … or from a combination of the basis functions
@@ -65,22 +65,22 @@ def _values(energy, q, p, t):
     return jax.vmap(energy)(q, p, t)
 
 
-def unconserved_energy(stepped: Stepped, samples: Samples, search: Any) -> Energy | None:
-    """The energy, if it is neither among the invariants of the `search` at order 0 nor conserved
+def unconserved_energy(null: NullSpaces) -> Energy | None:
+    """The energy, if it is neither among the invariants found at order 0 nor conserved
     to rounding by the map, and its change in a step is a power of h."""
+    changes, stepped = null.changes, null.changes.stepped
     energy = _OfEnergy(stepped.equations)
-    q, p, t = (jnp.asarray(x[0]) for x in samples)
+    q, p, t = (jnp.asarray(x[0]) for x in changes.samples)
     system = stepped.equations.system
     if system.slow_time or depends_on(lambda t: energy(q, p, t), 0, t):
         return None
-    fit = search.fitted
-    values = np.asarray(_values(energy, *map(jnp.asarray, fit)))[:, 0]
+    values = np.asarray(_values(energy, *map(jnp.asarray, null.samples)))[:, 0]
     if not np.isfinite(values).all():
         return None
-    calm = search.calm
+    calm = null.calm
     spread = np.linalg.norm(calm * (values - np.average(values, weights=calm**2)))
-    functions = search.values @ search.orthonormal
-    leading = search.spaces[0].leading[: functions.shape[1]]
+    functions = null.values @ null.weighed.orthonormal
+    leading = null.spaces[0].leading[: functions.shape[1]]
 
     def missing(columns):
         columns = np.column_stack([columns, calm])
@@ -92,7 +92,7 @@ def unconserved_energy(stepped: Stepped, samples: Samples, search: Any) -> Energ
     basis = BoundBasis(energy, ("energy",), (1,))
 
     def change(h):
-        found = changes_at(stepped._replace(basis=basis, h=np.asarray(h)), 0, samples)
+        found = changes_at(stepped._replace(basis=basis, h=np.asarray(h)), 0, changes.samples)
         predicted = np.linalg.norm(found.motion.changes[..., 0], axis=1)[found.good]
         ratio = np.abs(found.terms[found.good, 0, 0]) / np.maximum(predicted, 1e-300)
         return float(np.median(ratio)) if len(ratio) else np.nan

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..algebra.motion import ROUNDING, coefficient_errors
-from ..functions.sampling import SMALL, UNSEEN, Samples, nonlinearity
-from .changes import Stepped, changes_at
+from ..functions.sampling import SMALL, UNSEEN, Displacements, Samples
+from .changes import Changes
 from .judging import CLEARLY, Judge
 
 # Sizes of the samples, about their middle, on which an exact invariant is conserved too.
@@ -24,9 +24,8 @@ _HARDLY = 2.0  # A step, or samples, larger by a smaller factor say nothing new
 
 
 def powers_of_size(
-    stepped: Stepped,
+    fitted: Changes,
     coefficients: np.ndarray,
-    samples: Samples,
     most: np.ndarray,
     sizes: np.ndarray,
     orthonormal: np.ndarray,
@@ -35,13 +34,14 @@ def powers_of_size(
     is conserved on samples several times as large (an expansion about their middle is not); NaN
     where the map or a function is not defined there.
 
-    `most`: the changes on the samples themselves; `sizes`: of the functions there, (count,);
-    `orthonormal`: orthonormal combinations of them, as columns, or 0 if coefficients are exact.
+    `fitted`: changes on the samples; `most`: those of the invariants; `sizes`: of the functions
+    there, (count,); `orthonormal`: orthonormal combinations of them, as columns, or 0 if
+    coefficients are exact.
     """
     if len(coefficients) == 0:
         return np.zeros(0)
-    at, which = enlarged(samples, stepped.is_constrained)
-    found = changes_at(stepped, 0, at)
+    at, which = enlarged(fitted.samples, fitted.stepped.is_constrained)
+    found = fitted.elsewhere(at)
 
     def changes(some):
         there = found.at(some)
@@ -139,43 +139,43 @@ def grown(what: str, power: float) -> list[str]:
 
 
 def at_larger_step(
-    h: float, relative: Callable[[float], float], count: Callable[[float], int | None]
+    h: float, step: Callable[[float], Displacements], count: Callable[[float], int | None]
 ) -> tuple[Larger, ...]:
     """How many are conserved at a larger step; empty where the step is not small, so that an
     expansion in h would be seen.
 
-    `relative`: `relative_step` at a step; `count`: how many are conserved, None where the map is
-    not defined there.
+    `step`: displacements of the samples for an h; `count`: how many are conserved, None where the
+    map is not defined there.
     """
-    seen, moved = 1.0, relative(h)
-    while moved < UNSEEN:  # or the map moves nothing at any step
-        seen *= 1e3
-        if seen > _LAST:
+    ratio, relative = 1.0, step(h).relative_step
+    while relative < UNSEEN:  # or the map moves nothing at any step
+        ratio *= 1e3
+        if ratio > _LAST:
             return ()
-        moved = relative(seen * h)
-    if seen == 1 and not moved < SMALL:
+        relative = step(ratio * h).relative_step
+    if ratio == 1 and not relative < SMALL:
         return ()
-    factor = seen * _MODERATE / moved if np.isfinite(moved) else seen
+    factor = ratio * _MODERATE / relative if np.isfinite(relative) else ratio
     return (_larger("step", factor, lambda factor: count(factor * h)),)
 
 
 def in_larger_box(
-    samples: Samples,
-    moved: Callable[[Samples], np.ndarray],
+    displacements: Displacements,
+    step: Callable[[Samples], Displacements],
     count: Callable[[Samples], int | None],
     constrained: bool = False,
 ) -> tuple[Larger, ...]:
     """How many are conserved on samples that spread wider; empty where a map is not nearly linear
-    on those given, or linear on all. `moved`: z1 − z of samples."""
-    near = nonlinearity(samples, moved(samples))
+    on those given, or linear on all. `step`: displacements of other samples."""
+    samples, near = displacements.samples, displacements.nonlinearity
     if near >= SMALL:
         return ()
     factor = _WIDEST
     if near >= _LINEAR:
         factor = min(_CURVED / near, _WIDEST)
     else:
-        far = moved(farther(samples, factor, constrained)) / factor
-        if np.isfinite(far).all() and nonlinearity(samples, far) < _LINEAR:
+        values = step(farther(samples, factor, constrained)).values / factor
+        if np.isfinite(values).all() and Displacements(samples, values).nonlinearity < _LINEAR:
             return ()
     return (_larger("box", factor, lambda factor: count(farther(samples, factor, constrained))),)
 

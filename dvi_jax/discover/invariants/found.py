@@ -216,11 +216,7 @@ class Discovery(eqx.Module):
         about, found = read_npz(path, _FORMAT, "discovery")
         plain, names = _fields()
         try:
-            # Files of earlier versions have no errors.
-            unknown = np.full_like(found["inner_coefficients"], np.nan)
-            arrays: dict[str, Any] = {"errors": unknown} | {
-                name: found[name] for name in names if name != "errors" or name in found
-            }
+            arrays: dict[str, Any] = {name: found[name] for name in names}
             probe = Samples(*(found[f"probe_{name}"] for name in Samples._fields))
             values = found["probe_values"]
         except KeyError as error:
@@ -250,9 +246,9 @@ class Discovery(eqx.Module):
         for name in ("inner_coefficients", "inner_dependent"):
             arrays[name] = jnp.asarray(arrays[name])
         given = {k: tuple(v) if isinstance(v, list) else v for k, v in about.items() if k in plain}
-        if about.get("energy"):
+        if about["energy"]:
             given["energy"] = Energy(*about["energy"])
-        given["larger"] = tuple(Larger(*x) for x in about.get("larger", ()))
+        given["larger"] = tuple(Larger(*x) for x in about["larger"])
         laws: list[dict[str, Any]] = [
             {k: np.array(v) if isinstance(v, list) else v for k, v in law.items()}
             for law in about["obstructions"]

@@ -54,7 +54,7 @@ class Judge(NamedTuple):
     def own_rows(self, leading: np.ndarray) -> np.ndarray:
         """What functions change by at order 0, weighted by what the slopes of one of their
         combinations predict, shape (S, size)."""
-        own = self.changes.motion.of(leading[:, None]).at_most(self._spread(leading))
+        own = self.changes.motion.in_functions(leading[:, None]).at_most(self._spread(leading))
         return own.weights()[:, None] * self.changes.terms[:, 0]
 
     def largest(self, coefficients: np.ndarray) -> np.ndarray:
@@ -84,7 +84,7 @@ class Fewest:
         orthonormal = np.linalg.inv(R) / self.rms[some][:, None]
         motion = Motion(self.motion.changes[..., some], self.motion.rounding[:, some])
         rows = self.changes[:, some] @ orthonormal
-        rows = motion.of(orthonormal).weights()[:, None] * rows / np.sqrt(len(rows))
+        rows = motion.in_functions(orthonormal).weights()[:, None] * rows / np.sqrt(len(rows))
         columns = orthonormal @ null_space(rows, unit=1.0).columns
         return columns, self.values[:, some] @ columns
 

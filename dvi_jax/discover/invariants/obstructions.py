@@ -1,6 +1,6 @@
 """Averaged drift laws of leading-order terms that have no invariant of higher order."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,6 +9,7 @@ from ..algebra.echelon import reduced
 from ..algebra.nullspace import RANK, orthonormal_range
 from ..functions.basis import linear_text
 from ..functions.families import raised
+from .search import NullSpaces
 from .series import shortened
 
 # A drift law is reported when it leaves less than this share of the drift unexplained.
@@ -59,7 +60,7 @@ class DriftLaw(NamedTuple):
 
 
 def drift_laws(
-    search: Any, volume: np.ndarray, slow_time: bool, blur: float
+    null: NullSpaces, volume: np.ndarray, slow_time: bool, blur: float
 ) -> tuple[DriftLaw, ...]:
     """The laws of all leading-order terms that are lost at order 1, 2, ….
 
@@ -67,16 +68,16 @@ def drift_laws(
     Σ_k A_{m−k} c_k + A_0 c_m = 0, has no solution c_m; with a function of what order 0 conserves
     on the right it may: = φ·K d, K the null space of A_0. That is the averaged law.
 
-    - `search`: a `Search` of invariants. `volume`: how much phase volume changes at each order in
+    - `null`: what was found. `volume`: how much phase volume changes at each order in
       ε · scale. `slow_time`: of the system. `blur`: see `Span`.
     """
-    basis, rms, R = search.basis, search.rms, search.R
-    spaces, values, terms = search.spaces, search.fitted_values, search.rows
+    basis, rms, R = null.basis, null.weighed.rms, null.weighed.R
+    spaces, values, terms = null.spaces, null.changes.values[null.fit], null.rows
     kept, size, allowed = spaces[0].leading, basis.size, max(EXPLAINED, blur)
     if kept.shape[1] == 0:
         return ()
     orthonormal = np.linalg.solve(R.T, (values / rms).T).T
-    system = np.concatenate([-terms[:, 0], search.weights[:, None] * orthonormal @ kept], axis=1)
+    system = np.concatenate([-terms[:, 0], null.weights[:, None] * orthonormal @ kept], axis=1)
     solver = Split.of(system, above(1e-10))
 
     def text(coefficients, shares):
@@ -96,7 +97,7 @@ def drift_laws(
             solution = solver.solved(drift[:, None])[:, 0]
             rate = max(np.linalg.norm(drift), np.finfo(float).tiny)
             left = float(np.linalg.norm(system @ solution - drift) / rate)
-            law = np.linalg.solve(R, kept @ solution[size:]) / rms * search.scale**m
+            law = np.linalg.solve(R, kept @ solution[size:]) / rms * null.weighed.scale**m
             explained = left < allowed
             powers = _own_powers(values @ c, values @ law) if explained else np.zeros(0)
             dissipates = np.max(volume[1 : m + 1]) * np.linalg.norm(values @ c) > 1e-4 * rate

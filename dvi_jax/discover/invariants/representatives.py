@@ -1,32 +1,44 @@
 """The series that represents an invariant: independent leading-order terms and corrections."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from ..algebra.echelon import reduced, reduction
+from ..algebra.motion import Motion
 from ..algebra.nullspace import SeriesSpace, orthonormal_range, singular_vectors
+from ..algebra.weighing import Weighed
 from ..functions.basis import BoundBasis
 from ..functions.sampling import Samples, spreads
+from .search import NullSpaces
 
 
-class Span:
+class Span(NamedTuple):
     """All invariants found, as series in a basis that is orthonormal on the samples.
 
-    Coefficients are compared as shares: those of functions scaled to one size on the samples,
-    `basis` · 1/`rms`. `R`: shares are R⁻¹ times the coefficients of `space`. `blur`: size
-    below which shares count as none. `constant`: the shares of a constant, None without one.
+    Coefficients are compared as shares: those of functions scaled to one size on the samples, see
+    `Weighed.shares`. `space`: what was found at the highest order. `blur`: size below which shares
+    count as none. `constant`: the shares of a constant, None without one.
     """
 
-    def __init__(self, basis: BoundBasis, rms, R, space: SeriesSpace, blur: float, constant):
-        self.basis, self.rms, self.R, self.space, self.blur = basis, rms, R, space, blur
-        self.constant = constant
-        self.size = basis.size
-        self.orders = space.leading.shape[0] // basis.size
+    basis: BoundBasis
+    weighed: Weighed[Motion]
+    space: SeriesSpace
+    blur: float
+    constant: np.ndarray | None
 
-    def shares(self, columns: np.ndarray) -> np.ndarray:
-        """Shares from coefficients of the orthonormal functions."""
-        blocks = np.moveaxis(columns.reshape(self.orders, self.size, -1), 1, 0)
-        solved = np.linalg.solve(self.R, blocks.reshape(self.size, -1)).reshape(blocks.shape)
-        return np.moveaxis(solved, 1, 0).reshape(columns.shape)
+    @classmethod
+    def of(cls, null: NullSpaces, blur: float) -> "Span":
+        """From what was found."""
+        return cls(null.basis, null.weighed, null.spaces[-1], blur, null.constant)
+
+    @property
+    def size(self) -> int:
+        return self.basis.size
+
+    @property
+    def orders(self) -> int:
+        return self.space.leading.shape[0] // self.size
 
     def representatives(
         self, samples: Samples, slopes: np.ndarray
@@ -42,11 +54,11 @@ class Span:
             return found
         some = slice(None, None, max(1, len(samples.q) // 40))
         # in units of the spread of (q, p), so that their own units do not matter
-        gradients = slopes[some] * spreads(samples) / self.rms[:, None]
+        gradients = slopes[some] * spreads(samples) / self.weighed.rms[:, None]
         complexity = np.array(self.basis.complexity)
         taken: list[np.ndarray] = []
         done = np.zeros((self.size, 0))
-        shares = self.shares(self.space.leading)
+        shares = self.weighed.shares(self.space.leading)
         for level in sorted(set(self.basis.complexity)):
             candidates = self._up_to(level, shares)
             for vector in reduced(candidates, complexity, self.blur).T:
@@ -57,7 +69,7 @@ class Span:
                 done = orthonormal_range(np.column_stack([done, rest / np.linalg.norm(rest)]))
                 d = np.einsum("sbn,b->sn", gradients, leading)
                 length = np.linalg.norm(d)
-                if length < self.blur * np.linalg.norm(self.R @ leading):
+                if length < self.blur * np.linalg.norm(self.weighed.R @ leading):
                     continue  # a constant
                 grown = self._rank_of([*taken, d / length]) == len(taken) + 1
                 if grown:
@@ -83,15 +95,17 @@ class Span:
     def simplest(self, series: np.ndarray) -> np.ndarray:
         """The corrections that use complex functions as little as can be."""
         complexity = np.tile(self.basis.complexity, self.orders)
-        simplify = reduction(self.shares(self.space.shifts), complexity, self.size, self.blur)
+        simplify = reduction(
+            self.weighed.shares(self.space.shifts), complexity, self.size, self.blur
+        )
         return simplify(series.reshape(-1)).reshape(series.shape)
 
     def least(self, series: np.ndarray) -> np.ndarray:
         """The corrections that are smallest on the samples: orthogonal to what may be added."""
-        columns = (self.R @ series[..., None])[..., 0].reshape(-1)
+        columns = (self.weighed.R @ series[..., None])[..., 0].reshape(-1)
         basis = orthonormal_range(self.space.shifts)
         columns = columns - basis @ (basis.T @ columns)
-        return self._without_constants(self.shares(columns[:, None]).reshape(series.shape))
+        return self._without_constants(self.weighed.shares(columns[:, None]).reshape(series.shape))
 
     def _without_constants(self, series: np.ndarray) -> np.ndarray:
         """The series less the multiple of the constant at each order that makes it simplest."""

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from ...base.results import RESULTS
 from ...base.types import Interval
@@ -13,7 +14,7 @@ from ...methods.step import Equations, step
 from ..algebra.taylor import taylor_coefficients
 from ..functions.basis import BoundBasis
 from ..functions.generators import LatticePoint
-from ..functions.sampling import Samples, require_finite
+from ..functions.sampling import Displacements, Samples, require_finite
 from .determining import discrete_equations
 
 
@@ -34,6 +35,10 @@ class Conditions(NamedTuple):
     jacobian: Any  # (S, z + 1, 2n, 2, C): ∂F/∂(t, q, p) of both points
     points: Any  # (S, z + 1, 2, 1 + 2n): both points (t, q, p)
     good: Any  # (S, z + 1): at z = 0, 1 where the step succeeds
+
+    def displacements(self, samples: Samples) -> Displacements:
+        """What the step changes (q, p) by at the samples."""
+        return Displacements(samples, np.diff(self.points[:, 0, :, 1:], axis=1)[:, 0])
 
 
 @eqx.filter_jit
@@ -87,22 +92,28 @@ def at_samples(equations, h, basis, gauge_basis, order, samples, later) -> Condi
         noether, gauge = map(rows, identity(pair), jax.jacfwd(identity)(pair))
         shifted = jax.vmap(lambda shift: F(pair.at[:, 0].add(shift)))(later)
         phi, good = values[:, : basis.size], jnp.where(info.result == RESULTS.successful, 1.0, 0.0)
-        determining = jnp.einsum("rjc,jb->jrcb", by_pair, phi)
-        closing, of_basis = (jnp.moveaxis(noether, 0, 1), gauge), (phi, slopes[0, : basis.size])
-        return determining, *closing, by_pair[:, 1, 0], shifted, *of_basis, by_pair, pair, good
+        return Conditions(
+            determining=jnp.einsum("rjc,jb->jrcb", by_pair, phi),
+            identity=jnp.moveaxis(noether, 0, 1),
+            gauge=gauge,
+            clock=by_pair[:, 1, 0],
+            later=shifted,
+            values=phi,
+            slopes=slopes[0, : basis.size],
+            jacobian=by_pair,
+            points=pair,
+            good=good,
+        )
 
     def at_point(q, p, t):
-        shapes = []
+        shapes = jax.eval_shape(lambda epsilon: conditions(epsilon, q, p, t), jnp.zeros(()))
+        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        as_conditions = ravel_pytree(zeros)[1]
 
         def flattened(epsilon):
-            parts = conditions(epsilon, q, p, t)
-            shapes[:] = [x.shape for x in parts]
-            return flat(parts)
+            return ravel_pytree(conditions(epsilon, q, p, t))[0]
 
-        terms = taylor_coefficients(flattened, jnp.zeros(()), order)
-        ends = np.cumsum([int(np.prod(s, dtype=int)) for s in shapes])[:-1]
-        pieces = zip(jnp.split(terms, ends, axis=1), shapes, strict=True)
-        return Conditions(*(x.reshape(order + 1, *s) for x, s in pieces))
+        return jax.vmap(as_conditions)(taylor_coefficients(flattened, jnp.zeros(()), order))
 
     return jax.vmap(at_point)(*map(jnp.asarray, samples))
 

@@ -34,7 +34,6 @@ from ..functions.sampling import (
     later,
     map_of,
     middle,
-    relative_step,
     require_enough,
     require_steps,
     require_time,
@@ -43,7 +42,7 @@ from ..functions.sampling import (
 from ..invariants.expansions import at_larger_step, enlarged, in_larger_box
 from .conditions import Conditions, at_samples, require_finite_conditions, require_times, values_at
 from .found import Symmetries
-from .search import Search, rows_of
+from .search import rows_of, weigh_conditions
 
 # A step that moves the samples by less than this share of their spread is rounding.
 _NO_STEP = 1e-13
@@ -157,7 +156,7 @@ def find_symmetries(
     raw = conditions(shifts)
     require_steps(raw.good[:, 0] == 1, samples)
     require_finite_conditions(raw)
-    relative = relative_step(samples, _moved(raw))
+    relative = raw.displacements(samples).relative_step
     if relative < _NO_STEP:
         raise ValueError(
             f"one step must change the samples by at least {_NO_STEP:g} times their spread, got "
@@ -171,7 +170,7 @@ def find_symmetries(
     independent, places = _independent_gauges(gauge_basis, raw, samples, h)
     raw = raw._replace(gauge=raw.gauge[..., places])
     kind = bool(time), bound, independent, tolerance
-    search = Search(raw, samples, h, *kind)
+    search = weigh_conditions(raw, samples, h, *kind)
     found = search.result()
     if not found.count or tolerance is not None:
         return found
@@ -181,26 +180,23 @@ def find_symmetries(
         raw = raw._replace(gauge=raw.gauge[..., places])
         if not all(np.isfinite(x).all() for x in raw) or not raw.good[:, 0].all():
             return None
-        return Search(raw, at, step, *kind).spaces()[0].leading.shape[1]
+        return weigh_conditions(raw, at, step, *kind).spaces()[0].leading.shape[1]
 
-    def moved(at):
-        return _moved(raw if at is samples else conditions(shifts, at))
+    displacements = raw.displacements(samples)
 
-    def relative_at(step):
-        moved = _moved(raw if step == h else conditions(shifts, step=step))
-        return relative_step(samples, moved)
+    def steps(step):
+        return displacements if step == h else conditions(shifts, step=step).displacements(samples)
 
-    powers, larger = found.powers, at_larger_step(h, relative_at, count)
+    powers, larger = found.powers, at_larger_step(h, steps, count)
     if order == 0:
         at, which = enlarged(samples)
         powers = search.powers(found, conditions(shifts, at), which)
-        larger += in_larger_box(samples, moved, lambda at: count(h, at))
+        larger += in_larger_box(
+            displacements,
+            lambda samples: conditions(shifts, samples).displacements(samples),
+            lambda samples: count(h, samples),
+        )
     return replace(found, powers=powers, larger=larger)
-
-
-def _moved(raw: Conditions) -> np.ndarray:
-    """z1 − z of (q, p), shape (S, 2n)."""
-    return np.diff(raw.points[:, 0, :, 1:], axis=1)[:, 0]
 
 
 def _enlarged(basis: AbstractBasis, shape: tuple[int, ...]) -> AbstractBasis:

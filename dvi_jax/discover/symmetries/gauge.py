@@ -20,8 +20,8 @@ from ..algebra.taylor import taylor_coefficients
 from ..functions.basis import AbstractBasis, BoundBasis, bind_basis, check_step_size
 from ..functions.generators import Generator, LatticePoint
 from ..functions.sampling import (
+    Displacements,
     as_samples,
-    relative_step,
     require_enough,
     require_steps,
     require_time,
@@ -155,7 +155,7 @@ def solve_gauge(
     # An identity that does not close is at least this fraction of its terms.
     relative = np.maximum(largest / np.maximum(sizes, np.finfo(float).tiny), 1e-300)
     relative = np.where(relative > _ROUNDINGS * np.finfo(float).eps, relative, 1e-300)
-    relative = np.maximum(relative, relative_step(samples, moved))
+    relative = np.maximum(relative, Displacements(samples, moved).relative_step)
 
     rows = changes / scale[:, None, None]
     g, free = solve_series(rows[~held], -n[~held] / scale[~held, None])

@@ -1,0 +1,148 @@
+"""The null space of a search for invariants."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...engine.pairs import Pair
+from ..algebra.motion import Motion, conserved, typical_sizes
+from ..algebra.nullspace import SeriesSpace, compress, series_spaces
+from ..algebra.pair_series import ROUNDING, spaces_in_pairs
+from ..algebra.weighing import Weighed, weigh, weighted
+from ..functions.basis import BoundBasis
+from ..functions.sampling import Samples, check_basis
+from .changes import Changes
+
+
+@dataclass(frozen=True)
+class NullSpaces:
+    """The series that samples show to be conserved, order by order.
+
+    - `changes`, `tolerance`: what was searched, and how.
+    - `weighed`: the conditions; `spaces`: their null spaces of order 0 … z.
+    - `undecided`: how many singular values are, in pairs of numbers.
+    - `constant`: the shares of a constant, None without one. `condition`: of the basis.
+    """
+
+    changes: Changes
+    tolerance: float | None
+    weighed: Weighed[Motion]
+    spaces: list[SeriesSpace]
+    undecided: int
+    constant: np.ndarray | None
+    condition: float
+
+    @property
+    def basis(self) -> BoundBasis:
+        return self.changes.stepped.basis
+
+    @property
+    def order(self) -> int:
+        return len(self.spaces) - 1
+
+    @property
+    def fit(self) -> np.ndarray:
+        """Which samples are fitted."""
+        return ~self.changes.samples.held_out
+
+    @property
+    def samples(self) -> Samples:
+        """Those that are fitted; so of all that follow."""
+        return self.changes.samples.at(self.fit)
+
+    @property
+    def calm(self) -> np.ndarray:
+        return self.weighed.calm[self.fit]
+
+    @property
+    def values(self) -> np.ndarray:
+        """The functions, times the weights `calm`."""
+        return self.calm[:, None] * self.changes.values[self.fit]
+
+    @property
+    def slopes(self) -> np.ndarray:
+        """∂φ/∂(q, p), shape (samples, size, 2n)."""
+        return self.changes.slopes[self.fit, :, :-1]
+
+    @property
+    def weights(self) -> np.ndarray:
+        return self.weighed.weights[self.fit]
+
+    @property
+    def rows(self) -> np.ndarray:
+        """The weighed conditions, shape (samples, z + 1, size)."""
+        return weighted(self.weighed.terms[self.fit], self.weights)
+
+    @property
+    def sizes(self) -> np.ndarray:
+        """Of a term with coefficient 1, shape (z + 1, size)."""
+        return self.weighed.rms / self.weighed.scale ** np.arange(self.order + 1)[:, None]
+
+    @property
+    def count(self) -> int:
+        """How many are conserved at order 0."""
+        return self.spaces[0].leading.shape[1]
+
+    @property
+    def gap(self) -> float:
+        return self.spaces[-1].gap
+
+    @property
+    def leading_parts(self) -> np.ndarray:
+        """Order 0 of everything in the null space, in functions of the basis, (count, size)."""
+        leading = self.spaces[-1].leading[: self.basis.size]
+        return (self.weighed.shares(leading) / self.weighed.rms[:, None]).T
+
+    @property
+    def unclear(self) -> int:
+        """Null vectors of which rounding decides whether they are series."""
+        unclear = max(space.unclear for space in self.spaces) + self.undecided
+        return unclear if self.tolerance is None else 0
+
+
+def null_spaces(
+    changes: Changes, tolerance: float | None = None, pairs: Pair | None = None
+) -> NullSpaces:
+    """The null spaces of all orders; `pairs`: the terms in pairs of numbers, to decide by them."""
+    fit = ~changes.samples.held_out
+    calm = typical_sizes(changes.values)[1][fit]
+    values = calm[:, None] * changes.values[fit]
+    condition = check_basis(changes.stepped.basis, values)
+    weighed = weigh(changes.values, changes.terms, changes.motion, fit)
+    constant = _shares_of_constant(weighed.rms, values, calm, changes.slopes[fit, :, :-1])
+    trivial = None if constant is None else weighed.R @ constant
+    if pairs is None:
+
+        def judge(leading, shifts):
+            leading, unclear = conserved(leading, weighed.terms, weighed.motion, tolerance)
+            return leading, shifts, unclear
+
+        rows = compress(weighted(weighed.terms, weighed.weights)[fit])
+        spaces, undecided = series_spaces(rows, judge, tolerance, trivial), 0
+    else:
+        rounding = ROUNDING / np.finfo(float).eps
+        motion = weighed.motion
+        motion = motion._replace(rounding=rounding * motion.rounding)
+        weighed = weighed._replace(motion=motion)
+        errors = rounding * changes.motion.rounding
+        spaces, undecided = spaces_in_pairs(
+            pairs, weighed.scale, weighed.orthonormal, motion.weights(), ~fit, errors, trivial
+        )
+    return NullSpaces(changes, tolerance, weighed, spaces, undecided, constant, condition)
+
+
+def _shares_of_constant(rms, values, calm, slopes) -> np.ndarray | None:
+    """The combination that is 1 everywhere (and not only on these samples), if there is one.
+
+    `values`: of the functions, times the weights `calm` of the samples.
+    """
+    shares = np.linalg.lstsq(values / rms, calm, rcond=None)[0]
+    shares = np.where(np.abs(shares) > 1e-9 * np.max(np.abs(shares)), shares, 0.0)
+    terms = np.abs(values / rms) @ np.abs(shares)
+    terms = np.maximum(terms, np.finfo(float).tiny)
+    if np.max(np.abs(values / rms @ shares - calm) / terms) > 1e4 * np.finfo(float).eps:
+        return None
+    slopes = slopes / rms[:, None]
+    terms = np.abs(slopes) * np.abs(shares)[:, None]
+    sums = np.einsum("sbn,b->sn", slopes, shares)
+    return shares if np.max(np.abs(sums)) <= 1e-9 * np.max(terms, initial=1.0) else None
