@@ -14,11 +14,10 @@ from ..base.checks import fraction, instance, one_of, whole
 from ..base.precision import require_double
 from .losses import LeastSquares, Likelihood, Loss
 from .observations import Data, as_arcs
+from .optimise import FIT_RESULTS, FitError
 from .problem import Problem
-from .progress import FitProgress, shown
 from .result import FitResult
-from .results import FIT_RESULTS, FitError
-from .run import Run, identity
+from .run import FitProgress, Run, identity, shown
 from .shooting import MultipleShooting, Segments, SingleShooting
 from .solvers import is_gauss_newton, is_optax, solver_for
 from .stages import MANY, Minimum, by_gradient, in_segments, least_squares

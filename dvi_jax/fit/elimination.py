@@ -8,9 +8,8 @@ import numpy as np
 from jaxtyping import Array
 
 from .library import KEY, ForceLibrary
-from .optimise import Evaluation, LeastSquaresStage, Task
+from .optimise import FIT_RESULTS, Evaluation, LeastSquaresStage, Task
 from .problem import Problem
-from .results import FIT_RESULTS
 from .solvers import levenberg_marquardt
 from .uncertainty import Uncertainty, in_words, inverse_or, uncertainty
 

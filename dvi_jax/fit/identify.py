@@ -17,10 +17,10 @@ from .library import KEY, ForceLibrary, with_force
 from .losses import LeastSquares, Loss
 from .model import specification
 from .observations import Data, Observations, as_arcs
+from .optimise import FIT_RESULTS, FitError
 from .parameters import Prior
 from .problem import Problem
 from .result import FitResult, with_error
-from .results import FIT_RESULTS, FitError
 
 _GUARD = 3.0
 """Width of a prior: the change of the predictions by the candidate alone, to first order, in

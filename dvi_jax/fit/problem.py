@@ -14,11 +14,11 @@ from ..base.checks import instance
 from ..base.reads import Reads, reads
 from ..base.results import RESULTS, status_name
 from ..problem.system import check_system
-from .evaluation import Evaluation
 from .losses import LeastSquares, Likelihood, Loss
 from .model import Group, Model, check_observable, make_groups, predict, specification, weighed
 from .observations import Observations
 from .parameters import Space, make_space
+from .roundoff import Evaluation
 
 _UNITS = 1e3
 """Factor by which data and model may differ in size at the start of a fit: beyond it the units

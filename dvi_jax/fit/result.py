@@ -12,8 +12,8 @@ from jaxtyping import PyTree
 
 from ..base.checks import one_of
 from ..base.files import publish_npz, read_npz
+from .optimise import FIT_RESULTS, NAMES, name_of
 from .parameters import make_space
-from .results import FIT_RESULTS, NAMES, name_of
 from .uncertainty import correlations
 
 _FORMAT = 1

@@ -16,10 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..base.files import publish_npz, read_npz
+from ..base.progress import bar_of, told
 from ..base.reads import reads
 from .optimise import Position, Record, Task
 from .problem import Problem
-from .progress import FitProgress
 
 _EVERY = 5.0
 """Seconds between checkpoints."""
@@ -29,6 +29,38 @@ _FORMAT = 3
 _VECTORS = ("base", "scale", "z")
 _LISTS = ("leaves", "extra")
 """Fields of `Position` that a checkpoint has as arrays; the others are in its header."""
+
+
+@dataclass(frozen=True)
+class FitProgress:
+    """Progress of a fit: `step` of the optimiser of at most `max_steps`, the `stage` and its
+    `horizon`, the `loss`, the parameters `x` with their `names`, `seconds` since the start."""
+
+    step: int
+    max_steps: int
+    stage: int
+    horizon: float
+    loss: float
+    x: np.ndarray
+    names: list[str]
+    seconds: float
+
+
+def _bar_columns(p: FitProgress) -> dict[str, Any]:
+    first = [f"{n} {v:.7g}" for n, v in zip(p.names[:3], p.x[:3], strict=True)]
+    return {
+        "description": f"fit, stage {p.stage + 1}",
+        "total": p.max_steps,
+        "completed": p.step,
+        "steps": f"{p.step}/{p.max_steps}",
+        "loss": f"loss {p.loss:.5g}",
+        "params": ", ".join(first + ["…"] * (len(p.names) > 3)),
+    }
+
+
+def shown(progress: Any) -> Any:
+    """A context whose value takes a `FitProgress`: the user's function, a bar's, or None."""
+    return told(progress, bar_of("fit", ("steps", "loss", "params"), _bar_columns))
 
 
 @dataclass

@@ -13,10 +13,10 @@ from jaxtyping import Array
 from ..base.checks import fraction, whole
 from ..integration.integrate import integrate
 from ..observe.solution import Save
-from .evaluation import Evaluation
 from .model import make_group, predict, specification, weighed
 from .observations import Observations
 from .problem import Problem
+from .roundoff import Evaluation
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,11 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .evaluation import Evaluation
 from .losses import Likelihood
 from .model import Group, weighed
-from .optimise import LeastSquaresStage, ScalarStage
+from .optimise import FIT_RESULTS, LeastSquaresStage, ScalarStage
 from .problem import Problem
-from .results import FIT_RESULTS
+from .roundoff import Evaluation
 from .run import Run
 from .shooting import Segments
 from .solvers import is_optax

@@ -22,8 +22,7 @@ from ..problem.system import System, check_system, of_problem
 from .components import Unsupported, program_of
 from .confinement import confine
 from .rational import ExactInvariant
-from .result import DriftBound
-from .tools import tools
+from .result import DriftBound, tools
 from .workers import Workers
 
 _ACCEPTED = {"float64": 2.0**-49, "pairs of float64": 2.0**-94}

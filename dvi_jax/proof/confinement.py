@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import linprog
 
-from .tools import combination, tools
+from .result import combination, tools
 
 _LEVELS = (0.97, 0.9, 0.75, 0.5)
 """Fractions of the range between the least value in the domain and that at its border that are

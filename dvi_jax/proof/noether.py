@@ -15,7 +15,7 @@ from ..methods.step import Equations
 from ..problem.energies import disturbing_work, outgoing_energy
 from ..problem.system import check_system, of_problem
 from .components import program_of
-from .tools import tools
+from .result import tools
 
 
 class NoetherProof(eqx.Module):

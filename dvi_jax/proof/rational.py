@@ -10,7 +10,7 @@ from ..base.checks import finite, instance
 from ..base.types import Scalar, State
 from ..discover.functions.basis import BoundBasis
 from ..discover.invariants.series import InvariantSeries
-from .tools import tools
+from .result import tools
 
 _DROP = 1e-9  # Coefficients below this share of the largest are rounding
 _ERROR = 1e-12  # Least relative error of a coefficient

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,6 @@ import numpy as np
 
 from ..base.checks import finite
 from ..base.files import publish
-from .tools import combination, tools
 
 
 class DriftBound(eqx.Module):
@@ -152,3 +152,23 @@ class DriftBound(eqx.Module):
             lines.append(text)
         lines.extend(f"I_{k} = {text}" for k, text in enumerate(self.formulas))
         return "\n".join(lines)
+
+
+def tools() -> tuple[Any, Any]:
+    try:
+        from . import checker, search
+    except ImportError as error:
+        raise ImportError(
+            f"proofs need the package python-flint, but the import failed ({error}). Install it "
+            'with pip install "dvi-jax[proof]" or pip install python-flint.'
+        ) from error
+    return checker, search
+
+
+def combination(weights: Sequence[float]) -> str:
+    """Σ w_k I_k as text."""
+    terms = [
+        (w, f"{abs(w):.4g} ".removeprefix("1 ") + f"I_{k}") for k, w in enumerate(weights) if w
+    ]
+    text = "".join(f" {'−' if w < 0 else '+'} {term}" for w, term in terms)
+    return text.removeprefix(" + ").replace(" − ", "−", int(terms[0][0] < 0))

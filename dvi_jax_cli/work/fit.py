@@ -10,8 +10,8 @@ import numpy as np
 
 import dvi_jax as dvi
 from dvi_jax import plot
-from dvi_jax.fit.progress import shown as shown_bar
 from dvi_jax.fit.result import little_explained, numbers_in_words
+from dvi_jax.fit.run import shown as shown_bar
 
 from .._errors import InputError, known, one_of, require
 from .._show import Table
