@@ -140,7 +140,7 @@ def test_the_example(folder):
 @pytest.mark.slow
 def test_a_fit_that_does_not_converge_is_written_and_resumes(folder, monkeypatch):
     """To the same bits as without the interruption, and only for the same fit."""
-    monkeypatch.setattr(import_module("dvi_jax.fit.run"), "_EVERY", -1.0)  # at every step
+    monkeypatch.setattr(import_module("dvi_jax.fit.run"), "_INTERVAL", -1.0)  # at every step
     short = write(folder, SMALL.replace("[options]", "[options]\nmax_steps = 1"))
     result = command("fit", short)
     assert result.exit_code == 1, result.output

@@ -103,10 +103,10 @@ def _relation(ratio: float, h: float, error: float) -> tuple[int, ...]:
 
     columns = [round(x / error) for x in (ratio, -1.0, -h, -h * h)]
     rows = [[int(i == j) for j in range(4)] + [columns[i]] for i in range(4)]
-    d, *n, rest = (int(x) for x in fmpz_mat(rows).lll().tolist()[0])
+    d, *n, remainder = (int(x) for x in fmpz_mat(rows).lll().tolist()[0])
     # A random number has a form with integers of the size s with a probability of about s⁴ error.
     size = max(map(abs, (d, *n)))
-    if not d or abs(rest) > 4 * size or size**4 * error > _CHANCE:
+    if not d or abs(remainder) > 4 * size or size**4 * error > _CHANCE:
         return 0, 0, 0, 0
     sign = 1 if d > 0 else -1
     return sign * d, *(sign * x for x in n)

@@ -48,8 +48,8 @@ class DriftBound(eqx.Module):
     def num_steps(self, change: float, invariant: int = 0) -> int | float:
         """The number of computed steps within which I_k changes by at most `change`, as long as
         the trajectory is in the domain; inf if it is conserved exactly, without rounding."""
-        each = self.per_step[invariant] + self.rounding[invariant]
-        return math.floor(change / each) if each else math.inf
+        rate = self.per_step[invariant] + self.rounding[invariant]
+        return math.floor(change / rate) if rate else math.inf
 
     def steps_inside(self, q0: Any, p0: Any, epsilon: float) -> int:
         """The number of steps, exact or computed, within which the trajectory from this start is
@@ -92,12 +92,12 @@ class DriftBound(eqx.Module):
             return 0
         weights, level = exact.exact(self.certificate["level"])
         per_step, rounding = (exact.exact(self.certificate[n]) for n in ("per_step", "rounding"))
-        each = sum(abs(w) * (b + r) for w, b, r in zip(weights, per_step, rounding, strict=True))
+        rate = sum(abs(w) * (b + r) for w, b, r in zip(weights, per_step, rounding, strict=True))
         state.append(algebra.constant(checker.h))
         values = [exact.run(f, state, algebra)[0][0] for f in checker.invariants]
-        here = sum(exact.ball(w) * v for w, v in zip(weights, values, strict=True))
-        left = level + self.steps * each - Fraction(exact.up(here))
-        steps = max(0, math.floor(left / each)) if each else (2**62 if left >= 0 else 0)
+        value = sum(exact.ball(w) * v for w, v in zip(weights, values, strict=True))
+        margin = level + self.steps * rate - Fraction(exact.up(value))
+        steps = max(0, math.floor(margin / rate)) if rate else (2**62 if margin >= 0 else 0)
         last = checker.h * (Fraction(float(epsilon)) if checker.slow else 1)
         times = checker.time[1] - checker.time[0]
         return min(steps, math.floor(times / last)) if self.certificate["timed"] and last else steps
