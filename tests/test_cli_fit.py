@@ -254,7 +254,7 @@ BAD_DATA = [
     ),
     ("time,x\n0.3,1\n", "data.time: the file has no column 't'", "a column of the file: time, x"),
     ("t\n0.3\n0.6\n", "no column is left", "one or more of t"),
-    (HEAD + "-0.3,1\n0.6,2\n", "data: t0 = 0.0, the start of the arc, lies between", "in order"),
+    (HEAD + "-0.3,1\n0.6,2\n", "data: all times must be on one side of t0 = 0.0", "in order"),
     (HEAD + "-0.3,1\n-0.6,2\n", AWAY, "data that fit"),
     (HEAD + "-0.6,1\n-0.3,2\n", AWAY, "data that fit"),
 ]

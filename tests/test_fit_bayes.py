@@ -391,8 +391,8 @@ RESTING = dvi.Model(dvi.System(free), h=H, q0=jnp.zeros(1))
 OUTSIDE = {"bounds": {"q0": dvi.Bounds(0, 1)}, "start": {"q0": np.ones(1) * 2, "p0": np.ones(1)}}
 OTHERS = r"Missing in start: p0\[0\]\. Unknown in start: none\."
 INVALID_POSTERIORS = [
-    (ONE, {}, ValueError, r"at least 2 observed values.* Got 1:"),
-    (on_a_line(None, 2), {}, ValueError, r"size of the errors, .*Got 2:"),
+    (ONE, {}, ValueError, r"at least 2 observed values.* Got 1"),
+    (on_a_line(None, 2), {}, ValueError, r"size of the errors, .*Got 2"),
     (ONE, {"gradient": "both"}, ValueError, "'forward', got"),
     (np.ones(3), {}, TypeError, "dvi.Observations"),
     (on_a_line(None), {"loss": dvi.SoftL1()}, ValueError, "a robust loss .*sigma or covariance"),

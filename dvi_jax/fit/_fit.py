@@ -129,15 +129,13 @@ def fit(
         whole("batch", batch)
         if not uses_optax:
             raise ValueError(
-                f"batch requires an optimiser of optax, but this fit uses {type(solver).__name__}. "
-                "Give, for example, optimiser=optax.adam(1e-3), or leave batch out."
+                f"batch requires an optimiser of optax, got {type(solver).__name__}: give, for "
+                "example, optimiser=optax.adam(1e-3)."
             )
     if isinstance(shooting, MultipleShooting) and not is_vector:
         raise ValueError(
-            "MultipleShooting requires a loss of residuals, such as dvi.LeastSquares(), and a "
-            "least-squares optimiser, such as optimistix.LevenbergMarquardt(rtol=1e-10, "
-            f"atol=1e-10). This fit uses the loss {type(problem.loss).__name__} and the optimiser "
-            f"{type(solver).__name__}. Change loss or optimiser, or use dvi.SingleShooting()."
+            "dvi.MultipleShooting requires a loss of residuals and a least-squares optimiser, got "
+            f"the loss {type(problem.loss).__name__} and the optimiser {type(solver).__name__}."
         )
     stage_horizons = _horizons(horizons)
     u = problem.space.to_u(problem.start)
@@ -158,8 +156,8 @@ def fit(
         return estimate
     raise FitError(
         f"the fit did not converge (status: {estimate.status}, steps: {len(run.records)}, loss: "
-        f"{estimate.loss:.6g}). {FIT_RESULTS[status]} The result is in the attribute `fit` "
-        "of this error. With throw=False it is returned without an error.",
+        f"{estimate.loss:.6g}). {FIT_RESULTS[status]} The result is in the attribute `fit` of this "
+        "error; throw=False returns it.",
         estimate,
     )
 

@@ -135,8 +135,7 @@ class Samples:
             import arviz  # pyright: ignore[reportMissingImports]
         except ImportError as error:
             raise ImportError(
-                f"to_arviz requires arviz, but its import failed ({error}): pip install arviz. "
-                "Without arviz, print(samples) shows a summary and to_xarray() returns the draws."
+                f"to_arviz requires arviz, but its import failed ({error}): pip install arviz"
             ) from None
         tree = self.to_xarray()
         if int(arviz.__version__.split(".")[0]) >= 1:
@@ -243,7 +242,7 @@ def _numpyro() -> Any:
     except ImportError as error:
         raise ImportError(
             f"dvi.sample requires numpyro, but its import failed ({error}): pip install "
-            '"dvi-jax[bayes]". Without numpyro, use dvi.Posterior with your own sampler.'
+            f'"dvi-jax[bayes]"'
         ) from None
     return numpyro
 

@@ -175,8 +175,8 @@ def identify(
             break
     else:
         raise FitError(
-            "dvi.identify fits all terms of library first, and this fit failed. "
-            f"{FIT_RESULTS[full.result]} Its result is in the attribute `fit` of this error.",
+            "the first fit of dvi.identify, with all terms of library, failed (see the attribute "
+            f"`fit`). {FIT_RESULTS[full.result]}",
             full,
         )
     problem = Problem(full_model, arcs_with_errors, is_list, full.params, **setting)
@@ -231,8 +231,8 @@ def _check_input(
         instance(name, {} if value is None else value, Mapping, "a dict or None")
         if value is not None and KEY in value:
             raise ValueError(
-                f"{name} must not contain the key {KEY!r}: remove or rename this key. dvi.identify "
-                "adds the coefficients of library to the parameters under this key."
+                f"{name} must not contain the key {KEY!r}, to which dvi.identify adds the "
+                "coefficients."
             )
     if penalty is not None:
         positive("penalty", penalty)
@@ -273,22 +273,19 @@ def _with_library(
     args, system, epsilon = spec.get("args"), spec["system"], spec.get("epsilon", 0.0)
     if not (args is None or (isinstance(args, Mapping) and KEY not in args)):
         raise TypeError(
-            f"args of the model must be None or a dict without the key {KEY!r}, got {args!r:.200}. "
-            "Use a dict with other keys: dvi.identify adds the coefficients under this key."
+            f"args of the model must be None or a dict without the key {KEY!r}, got {args!r:.200}."
         )
     is_perturbed = system.force is not None or system.perturbation is not None
     if "epsilon" in params and not is_perturbed:
         raise ValueError(
-            "epsilon and the coefficients of library cannot both be fitted, since the system of "
-            "the model has no force and no perturbation: only their product is determined by the "
-            "data. Remove epsilon from params."
+            "epsilon and the coefficients of library cannot both be fitted, since the system has "
+            "no other force: only their product is determined. Remove epsilon from params."
         )
     is_alone = not np.any(np.asarray(epsilon)) and "epsilon" not in params
     if is_alone and is_perturbed:
         raise ValueError(
-            "the model must have an epsilon other than 0, since its system has a force or a "
-            "perturbation: epsilon = 0 (the default) would remove this term and the library. Let "
-            "the model return another epsilon, or add epsilon to params."
+            "the model must have an epsilon other than 0, got epsilon = 0 (the default), which "
+            "removes the force of its system and the library."
         )
     return _ModelWithLibrary(model, library, is_list, is_alone)
 

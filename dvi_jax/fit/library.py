@@ -114,9 +114,9 @@ class ForceLibrary(eqx.Module):
                 f"a dict with the keys {list(args)}" if isinstance(args, Mapping) else other
             )
             raise ValueError(
-                f'args["{KEY}"] is missing: it must contain the coefficients of a dvi.ForceLibrary '
-                f'that was made without coefficients. Got {description}. Give args={{"{KEY}": c}} with an '
-                f"array c of shape ({len(self.names)},), or use library.with_coefficients(c)."
+                f'args["{KEY}"] must contain the coefficients of a dvi.ForceLibrary, an array of '
+                "shape "
+                f"({len(self.names)},), got {description}."
             )
         c = jnp.asarray(args[KEY])
         self._check_shape(c, f'args["{KEY}"]')
@@ -139,14 +139,13 @@ class ForceLibrary(eqx.Module):
         duplicates = sorted(set(self.names) & set(other.names))
         if duplicates:
             raise ValueError(
-                f"a sum cannot have two candidates {duplicates[0]!r}, but both libraries have it. Rename "
-                "it in one library, or select the other candidates there with library.only(names)."
+                f"both libraries of the sum have a candidate {duplicates[0]!r}: rename one, or "
+                "select the others with library.only(names)."
             )
         if (self.coefficients is None) != (other.coefficients is None):
             raise ValueError(
-                "either both libraries of a sum must have coefficients, or neither. Here only the "
-                f"{'second' if self.coefficients is None else 'first'} library has them: give "
-                "coefficients to the other one with library.with_coefficients(c)."
+                f"only the {'second' if self.coefficients is None else 'first'} library of the "
+                "sum has coefficients: both must have them, or neither."
             )
         c = None
         if self.coefficients is not None and other.coefficients is not None:
@@ -198,9 +197,8 @@ class _Monomial(eqx.Module):
         del t0, t1, args
         if q0.shape != (self.n,):
             raise ValueError(
-                f"q0 must have shape ({self.n},), because the library was made by "
-                f"dvi.ForceLibrary.monomials(degree, n) with n = {self.n}, got shape {q0.shape}. "
-                "Set n to the length of q0; q0 must have exactly one axis."
+                f"q0 must have shape ({self.n},), as in dvi.ForceLibrary.monomials(degree, n) "
+                f"with n = {self.n}, got shape {q0.shape}."
             )
         value = jnp.ones((), q0.dtype)
         for (v, i), power in self.powers:

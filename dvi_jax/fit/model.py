@@ -95,17 +95,15 @@ class Model(eqx.Module):
             kind = f"an object of type {type(params).__name__}"
             raise TypeError(
                 f"params of a dvi.Model must be a dict with keys among {keys}, got "
-                f"{'a number or an array' if hasattr(params, 'shape') else kind}. For other "
-                "parameters write the model as a function of params that returns the arguments of "
-                "dvi.integrate as a dict."
+                f"{'a number or an array' if hasattr(params, 'shape') else kind}. For others write "
+                "the model as a function of params."
             )
         values = dict(self.fixed)
         for name, value in params.items():
             if name not in _MAY_BE_FITTED:
                 raise TypeError(
                     f"params of a dvi.Model must be a dict with keys among {keys}, got the key "
-                    f"{name!r}. If it is a parameter of the system, put it into args: "
-                    f"{{'args': {{{name!r}: ...}}}}."
+                    f"{name!r}. For a parameter of the system give {{'args': {{{name!r}: ...}}}}."
                 )
             old = values[name]
             mergeable = isinstance(old, Mapping) and isinstance(value, Mapping)
@@ -113,8 +111,8 @@ class Model(eqx.Module):
         for name in ("q0", "p0"):
             if values[name] is None:
                 raise TypeError(
-                    f"{name} is missing: give dvi.Model(..., {name}=...), or an initial value in "
-                    f"params to fit it, {{{name!r}: ...}}."
+                    f"{name} is missing: give dvi.Model(..., {name}=...), or {{{name!r}: ...}} in "
+                    "params."
                 )
             if arc is not None:
                 values[name] = _row(name, values[name], arc)
@@ -128,7 +126,7 @@ class Model(eqx.Module):
                 hint = " For a single arc give data without the list." if arcs == 1 else ""
                 raise ValueError(
                     f"the first axis of {name} must have length {arcs}, one row for each arc in "
-                    f"data, got shape {shape}. Give the initial state of every arc.{hint}"
+                    f"data, got shape {shape}.{hint}"
                 )
 
 
@@ -143,8 +141,8 @@ def _row(name: str, rows: Any, arc: Any) -> Array:
     # JAX takes the last row for a number that is too large, without an error.
     if rows.ndim == 0 or (not is_traced(arc) and arc >= len(rows)):
         raise ValueError(
-            f"{name} must have one row for each arc along its first axis, got shape {rows.shape}. "
-            "Give the initial state of every arc, or, for a single arc, data without the list."
+            f"{name} must have one row for each arc, got shape {rows.shape}. For a single arc give "
+            "data without the list."
         )
     return rows[arc]
 
@@ -166,17 +164,16 @@ def specification(model: Callable[..., Any], params: PyTree, arc: Any, is_list: 
     for name in ("system", "q0", "p0", "h"):
         if spec.get(name) is None:
             raise ValueError(
-                f"the model does not return {name!r}, or returns None for it. It must return a "
-                f"dict with values of system, q0, p0 and h. Got the keys {list(spec)}."
+                f"the model must return a dict with system, q0, p0 and h; {name!r} is missing or "
+                f"None. Got the keys {list(spec)}."
             )
     for name in _REASONS:
         if name in spec and not (name == "num_steps" and not _is_uniform(spec)):
             raise ValueError(f"the model must not set {name!r}: {_REASONS[name]}.")
     if isinstance(spec["h"], jax.Array):
         raise ValueError(
-            "the step size h of the model must be a Python number such as 0.1, not a parameter or "
-            "another JAX array, because h determines the number of steps. It cannot be fitted; if "
-            "it is a constant, give float(h)."
+            "h of the model must be a Python number such as 0.1, not a parameter or another JAX "
+            "array: it determines the number of steps, and cannot be fitted."
         )
     return spec
 
@@ -231,9 +228,8 @@ def make_groups(arcs: list[Observations], specs: list[dict[str, Any]]) -> list[G
     longest, h = max((abs((arc.ts[-1] - arc.t0) / spec["h"]), spec["h"]) for arc, spec in pairs)
     if _is_uniform(specs[0]) and 0 < longest < 0.5:
         raise ValueError(
-            "the last observation must be at least half a step from t0. With h = "
-            f"{h:g} its distance from t0 is only {longest:.3g} steps. Give a smaller |h|, or give "
-            "h and the times of the data in the same unit."
+            f"the last observation must be at least half a step from t0, got {longest:.3g} steps "
+            f"of h = {h:g}. Give a smaller |h|, or give h and times in one unit."
         )
     # Compiling takes seconds for each program; some millions of steps too many do not.
     separate = len(arcs) * max(steps) - sum(steps) > _WASTE
@@ -262,25 +258,22 @@ def _steps(i: int, arc: Observations, spec: Mapping[str, Any]) -> int:
     if span * h < 0:
         side, direction = ("before", "later") if span < 0 else ("after", "earlier")
         raise ValueError(
-            f"arc {i}: the observations (t = {arc.ts.min():g} to {arc.ts.max():g}) lie {side} t0 "
-            f"= {arc.t0:g}, but h = {h:g} leads to {direction} times. Give h = {-h:g}; or, if q0 "
-            "and p0 belong to another time, give this time as dvi.Observations(..., t0=...). "
-            "The default of t0 is ts[0]."
+            f"arc {i}: the observations (t = {arc.ts.min():g} to {arc.ts.max():g}) lie {side} t0 = "
+            f"{arc.t0:g}, but h = {h:g} leads to {direction} times. Give "
+            f"h = {-h:g}, or dvi.Observations(..., t0=...); t0 is ts[0] by default."
         )
     if not _is_uniform(spec):
         if not isinstance(spec.get("num_steps"), int):
             raise ValueError(
-                "num_steps of the model must be an int, since its lattice is not dvi.Uniform(), "
-                f"got {spec.get('num_steps')!r}. Give the number of steps to the last observation "
-                "in dvi.Model(..., num_steps=...), or in the dict that the model returns."
+                "num_steps of the model must be an int for a lattice other than dvi.Uniform(), "
+                f"got {spec.get('num_steps')!r}."
             )
         return spec["num_steps"]
     steps = span / h
     if steps > 2e9:
         raise ValueError(
-            f"arc {i}: at most 2e9 steps are possible from t0 to the last observation, but h = "
-            f"{h:g} requires {steps:.3g} steps for the time {span:g} between them. Give a larger "
-            "|h|, or give h and the times of the data in the same unit."
+            f"arc {i}: h = {h:g} requires {steps:.3g} steps to the last observation, at most 2e9 "
+            "are possible. Give a larger |h|, or give h and times in one unit."
         )
     return max(1, math.ceil(steps - 1e-9))
 
@@ -400,7 +393,6 @@ def check_observable(i: int, arc: Observations, spec: Mapping[str, Any]) -> bool
         result = f"an object of type {type(out).__name__}" if shape is None else f"shape {shape}"
         raise ValueError(
             f"arc {i}: values has shape {arc.values.shape}, so observe must return an array of "
-            f"shape {row_shape} at each time. Got {result} from {name}, for q of shape {q.shape}: "
-            "change values or observe."
+            f"shape {row_shape} at each time. Got {result} from {name}, for q of shape {q.shape}."
         )
     return False

@@ -158,8 +158,7 @@ class NetworkForce(eqx.Module):
         if x.shape != (self.n,):
             raise ValueError(
                 "q and p of a dvi.NetworkForce(n, ...) must have shape (n,), here with n = "
-                f"{self.n}, got shape {x.shape}. Set n to the length of q; q and p must have "
-                "exactly one axis."
+                f"{self.n}, got shape {x.shape}."
             )
         return x
 

@@ -91,10 +91,8 @@ class Observations:
         t0 = finite("t0", ts[0] if self.t0 is None else self.t0)
         if ts.min() < t0 < ts.max():
             raise ValueError(
-                f"t0 = {t0}, the start of the arc, lies between the times {ts.min()} and "
-                f"{ts.max()} of the observations, but all times must be on one side of t0. Give "
-                f"t0 <= {ts.min()} with h > 0 or t0 >= {ts.max()} with h < 0; q0 and p0 must "
-                "belong to this t0. Alternatively, leave out the observations on one side of t0."
+                f"all times must be on one side of t0 = {t0}, got times from {ts.min()} to "
+                f"{ts.max()}."
             )
         fields: dict[str, Any] = {"ts": ts, "values": values, "t0": t0}
         if self.sigma is not None:
@@ -181,8 +179,7 @@ def as_arcs(data: Any) -> tuple[list[Observations], bool]:
     if any(with_error_flags) and not all(with_error_flags):
         raise ValueError(
             f"data[{with_error_flags.index(False)}] has neither sigma nor covariance, but "
-            f"data[{with_error_flags.index(True)}] has one of them. Give sigma or covariance for all arcs or "
-            "for none: otherwise the relative weights of the arcs are unknown."
+            f"data[{with_error_flags.index(True)}] has one of them: give them for all arcs or none."
         )
     return list(data), True
 
@@ -193,8 +190,8 @@ def _real(name: str, value: Any) -> np.ndarray:
         array = np.asarray(value)
     except (TypeError, ValueError) as error:
         raise TypeError(
-            f"{name} must be an array of real numbers with rows of equal length. NumPy cannot "
-            f"convert this {type(value).__name__}: {str(error).partition(chr(10))[0]}"
+            f"{name} must be an array of real numbers with rows of equal length, got "
+            f"{type(value).__name__}: {str(error).partition(chr(10))[0]}"
         ) from None
     if array.dtype.kind not in "fiu":
         raise TypeError(f"{name} must be an array of real numbers, got dtype {array.dtype}.")
@@ -209,25 +206,20 @@ def _first(where: np.ndarray) -> list[int]:
 def _check_times(ts: np.ndarray) -> None:
     if index := _first(~np.isfinite(ts)):
         [i] = index
-        raise ValueError(
-            f"ts[{i}] is {ts[i]}: every time must be finite. Leave out observations without a time."
-        )
+        raise ValueError(f"ts[{i}] is {ts[i]}: every time must be finite.")
     steps = np.diff(ts)
     if index := _first(steps == 0):
         [i] = index
         raise ValueError(
-            f"ts[{i}] and ts[{i + 1}] are the same time, {ts[i]}: give one row for each time. If "
-            "the two rows are different components, use a function observe that returns all of "
-            "them. If they repeat a measurement, give the mean, with its standard error as sigma."
+            f"ts[{i}] and ts[{i + 1}] are the same time, {ts[i]}: give one row for each time, "
+            "with all components, or the mean of repeated measurements."
         )
     is_up = (steps > 0).sum() >= (steps < 0).sum()
     if index := _first(steps < 0 if is_up else steps > 0):
         [i] = index
         raise ValueError(
             f"ts is not in order: ts[{i}] = {ts[i]} is followed by ts[{i + 1}] = {ts[i + 1]}. "
-            "Times must all increase or all decrease. Sort the rows by time: with "
-            "order = np.argsort(ts) give np.array(ts)[order] and np.array(values)[order]. Sort "
-            "sigma or covariance in the same way if it has one entry for each time."
+            "Times must all increase or all decrease: sort the rows by np.argsort(ts)."
         )
 
 
@@ -238,24 +230,21 @@ def _sigma(sigma: Any, values: np.ndarray) -> np.ndarray:
     except ValueError:
         raise ValueError(
             f"sigma must be one number or an array that broadcasts to the shape {values.shape} of "
-            f"values, got shape {sigma.shape}. For one standard error at each time give shape "
-            f"{(len(values), *[1] * (values.ndim - 1))}."
+            f"values, got shape {sigma.shape}."
         ) from None
     is_observed = ~np.isnan(values)
     if index := _first(~(np.isfinite(full) & (full > 0)) & is_observed):
         raise ValueError(
-            f"sigma is {full[tuple(index)]} for the value at index {index}: standard errors must be "
-            "positive and finite. To ignore a value, set it to NaN. If an initial value is known "
-            "exactly, give it to the model in q0 or p0 instead."
+            f"sigma is {full[tuple(index)]} for the value at index {index}: standard errors must "
+            "be positive and finite. To ignore a value, set it to NaN."
         )
     largest = np.nanmax(np.abs(values))
     size = largest or 1.0
     if index := _first(~((full > _RANGE[0] * size) & (full < _RANGE[1] * size)) & is_observed):
         raise ValueError(
-            f"sigma is {full[tuple(index)]:g} for the value at index {index}, but the values are up to "
-            f"{largest:.3g}. Here sigma must lie between {_RANGE[0] * size:.3g} and "
-            f"{_RANGE[1] * size:.3g}, the range in which squares of values / sigma can be computed "
-            "in double precision. Give the standard errors in the units of the values."
+            f"sigma is {full[tuple(index)]:g} at index {index}, but values are up to "
+            f"{largest:.3g}: squares "
+            "of their ratio exceed double precision. Give sigma in the units of the values."
         )
     return full
 
@@ -297,8 +286,7 @@ def _covariance(covariance: Any, values: np.ndarray) -> np.ndarray:
         if not good[i]:  # then the correlation matrix is not defined
             description = f"variances on its diagonal must be positive, got {variance[i].min():.3g}"
         raise ValueError(
-            f"the covariance of observation {i} is not positive definite: the {description}. Correct the "
-            "matrix. If a value or a combination of values is known exactly, leave it out of the "
-            "observations, and write the model so that it has this value."
+            f"the covariance of observation {i} is not positive definite: the {description}. "
+            "Leave out values or combinations that are known exactly."
         )
     return full

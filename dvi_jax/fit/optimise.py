@@ -353,8 +353,8 @@ class ScalarStage:
         if not (hasattr(state, "f") or hasattr(state, "f_info")):
             raise TypeError(
                 f"optimiser={type(self.solver).__name__} cannot be used: its state has no "
-                "attribute f or f_info with the loss of a step. Leave optimiser out, or use, for "
-                "example, optimistix.BFGS(rtol=1e-10, atol=1e-10)."
+                "attribute f or "
+                "f_info with the loss. Use, for example, optimistix.BFGS(rtol=1e-10, atol=1e-10)."
             )
         if task.resume is not None:
             state = _with_leaves(state, position.leaves)
@@ -399,9 +399,8 @@ def _check_same(residual: Any, reference: Any) -> None:
     ):
         difference = np.abs(np.subtract(residual, reference)).max()
         raise ValueError(
-            "the checkpoint is of another model: at the same parameters its residuals differ from "
-            f"those of this model by up to {difference:.3g}. Use the model "
-            "of the checkpoint, give another path in checkpoint, or remove the file to start again."
+            "the checkpoint is of another model: at the same parameters residuals differ by up to "
+            f"{difference:.3g}. Use its model, or another path in checkpoint."
         )
 
 
@@ -415,9 +414,8 @@ def _with_leaves(state: Any, leaves: list[np.ndarray]) -> Any:
     old, tree = jax.tree.flatten(arrays)
     if [np.shape(x) for x in old] != [np.shape(x) for x in leaves]:
         raise ValueError(
-            "the checkpoint is of a fit with another optimiser, or another version of it: the "
-            "arrays of its state have other shapes. Use that optimiser, give another path in "
-            "checkpoint, or remove the file to start again."
+            "the checkpoint is of a fit with another optimiser, or another version of it: use that "
+            "optimiser, or another path in checkpoint."
         )
     new = [jnp.asarray(x, o.dtype) for x, o in zip(leaves, old, strict=True)]
     return eqx.combine(jax.tree.unflatten(tree, new), functions)

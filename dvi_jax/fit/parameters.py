@@ -170,18 +170,14 @@ def make_space(
     paths, tree = jax.tree_util.tree_flatten_with_path(numbers)
     if not paths:
         raise ValueError(
-            "params has no number that can be fitted. Give initial values as floats or "
-            f"floating-point arrays, got {params!r:.200}."
+            f"params has no float or floating-point array that can be fitted, got {params!r:.200}."
         )
     names, places = [], {}
     for path, leaf in paths:
         name, shape = _name(path), np.shape(leaf)
         refuse_unit_or_mask(f"the parameter {name}", leaf)
         if np.iscomplexobj(leaf):
-            raise TypeError(
-                f"the parameter {name} is complex: give its real and imaginary parts as two "
-                "parameters."
-            )
+            raise TypeError(f"the parameter {name} is complex: give its real and imaginary parts.")
         places[name] = len(names) + np.arange(math.prod(shape)).reshape(shape)
         indices = np.ndindex(shape)
         names += [f"{name}[{', '.join(map(str, i))}]" for i in indices] if shape else [name]
@@ -246,16 +242,14 @@ def _entries(
             label = f"dvi.{kind.__name__}"
             raise TypeError(
                 f"{noun} must have the structure of params, with {label}(...) or None in place of "
-                f"each number or array. Got {entry!r:.200} at {name}. Write a pair (a, b) as "
-                f"{label}(a, b)."
+                f"numbers and arrays, got {entry!r:.200} at {name}."
             )
         prefixes = tuple(name + end for end in ("[", "."))
         leaves = [k for k in places if not path or k == name or k.startswith(prefixes)]
         if not leaves:
             raise ValueError(
-                f"{noun} are given for {name!r}, but params has no fitted parameter of this "
-                f"name. The fitted parameters are {', '.join(map(repr, places))}. For an array "
-                f"give one dvi.{kind.__name__} for the whole array."
+                f"{noun} are given for {name!r}, but the fitted parameters are "
+                f"{', '.join(map(repr, places))}."
             )
         where = np.concatenate([places[k].ravel() for k in leaves])
         mask[where] = True

@@ -83,10 +83,8 @@ class Posterior:
                 ", and one for the size of the errors, because sigma is not given" * unknown_scale
             )
             raise ValueError(
-                f"data must have at least {free + unknown_scale} observed values: one for each parameter "
-                f"that has neither a prior nor bounds on both sides (here {free}){of_errors}. Got "
-                f"{count}: the posterior cannot be normalised. Give priors, bounds on both sides, "
-                "or more observations."
+                f"data must have at least {free + unknown_scale} observed values: one for each of "
+                f"{free} parameters without a prior or two bounds{of_errors}. Got {count}."
             )
         reverse = jax.value_and_grad(self._value)
         self._slopes = self._forward if gradient == "forward" else reverse
@@ -181,9 +179,8 @@ class Posterior:
         if spectrum.null_directions.size:
             words = "; ".join(in_words(d, self.names) for d in spectrum.null_directions.T)
             raise ValueError(
-                f"neither the data nor priors determine {words} (linear combinations of scaled "
-                "parameters): the posterior cannot be normalised. Give a prior or bounds on both "
-                "sides for these parameters, or sample fewer parameters."
+                f"neither the data nor priors determine {words} (combinations of scaled "
+                "parameters): give a prior or bounds on both sides."
             )
         return u, spectrum.directions / spectrum.singular_values
 
@@ -192,8 +189,7 @@ class Posterior:
             x = np.asarray(self.to_x(jnp.asarray(u)))
             raise ValueError(
                 f"the posterior density is 0 at the start ({self._space.in_words(x)}): the "
-                "trajectory of the model fails there, or the log likelihood is not finite. Start "
-                "from other parameters, or use a smaller h."
+                "trajectory fails there, or the log likelihood is not finite."
             )
 
     def _descend(self, u: np.ndarray, max_steps: int) -> tuple[np.ndarray, np.ndarray]:

@@ -116,8 +116,8 @@ class Core(eqx.Module):
     def _likelihood(self, group: Group, predictions: Array, horizon: Any, params: PyTree) -> Array:
         if group.whiten.ndim == 4:
             raise ValueError(
-                "loss=dvi.Likelihood(...) accepts sigma in dvi.Observations, but got covariance. "
-                "Give sigma instead, or use dvi.LeastSquares(), which accepts covariance."
+                "loss=dvi.Likelihood(...) accepts sigma of dvi.Observations, got covariance: use "
+                "dvi.LeastSquares()."
             )
         keep, values = horizon_mask(group, horizon), jnp.asarray(group.values)
         sigma = 1 / jnp.where(keep, jnp.asarray(group.whiten), 1.0)
@@ -127,9 +127,8 @@ class Core(eqx.Module):
         )
         if jnp.shape(densities) != jnp.shape(predictions):
             raise ValueError(
-                "the function of dvi.Likelihood must return −log of the density of each value, in "
-                f"an array of the shape of its first argument, {predictions.shape[1:]}. Got shape "
-                f"{jnp.shape(densities)[1:]}. Do not sum over the values."
+                "the function of dvi.Likelihood must return −log density of each value, an array "
+                f"of shape {predictions.shape[1:]}, got shape {jnp.shape(densities)[1:]}."
             )
         return jnp.sum(jnp.where(keep, densities, 0.0))
 
@@ -221,8 +220,8 @@ class Problem:
                     f"a robust loss ({type(loss).__name__})" if robust else "a fit with priors"
                 )
                 raise ValueError(
-                    f"{subject} requires standard errors of the data, but dvi.Observations has none: "
-                    "give sigma or covariance there."
+                    f"{subject} requires standard errors of the data, but dvi.Observations has "
+                    "none: give sigma or covariance there."
                 )
         if isinstance(model, Model):
             check_system(model.settings["system"])
@@ -259,7 +258,8 @@ class Problem:
             moment += " (the first observation)"
         roots = {name.split("[")[0] for name in self.space.names}
         sources = [
-            f"{n} {'fitted' if n in roots and isinstance(self.core.model, Model) else 'of the model'}"
+            f"{n} "
+            f"{'fitted' if n in roots and isinstance(self.core.model, Model) else 'of the model'}"
             for n in ("q0", "p0")
         ]
         return f"initial state at {moment}: {', '.join(sources)}"
@@ -269,8 +269,7 @@ class Problem:
         if self.degrees_of_freedom < 0:
             raise ValueError(
                 f"{self.size} parameters cannot be determined from {self.count} observed "
-                f"value{'s' * (self.count != 1)} (number of priors: {self.space.count_of_priors}). "
-                "Fit fewer parameters, or give priors or more observations."
+                f"value{'s' * (self.count != 1)} and {self.space.count_of_priors} priors."
             )
 
     # ---- the functions of `core`, compiled
@@ -358,8 +357,7 @@ class Problem:
         if largest < data:
             raise ValueError(
                 f"{where}values of at most {largest:.3g}, but the largest observed value is "
-                f"{data:.3g} (absolute values). Give the model and the data in the same units, or "
-                f"start from other parameters. {hint}"
+                f"{data:.3g}. Use the same units, or start from other parameters. {hint}"
             )
         large, pairs_of_sizes = _UNITS * data, zip(self.groups, sizes, strict=True)
         group, size = next((g, s) for g, s in pairs_of_sizes if (s >= large).any())
@@ -371,9 +369,8 @@ class Problem:
             jnp.max(jnp.abs(observations.function(observations.t0, q0, p0, spec.get("args"))))
         )
         raise ValueError(
-            f"{where}{size[a, row]:.3g} for arc {arc} at t = {group.ts[a, row]:g}, but the "
-            f"largest observed value is {data:.3g} (absolute values). For this arc the model gives "
-            f"{first:.3g} at the start, t = {group.t0[a]:g}, and at most {size[a].max():.3g} "
-            "later. If the trajectory diverges, start from other parameters, give bounds, or use a "
-            f"smaller h. Otherwise give the model and the data in the same units. {hint}"
+            f"{where}{size[a, row]:.3g} for arc {arc} at t = {group.ts[a, row]:g}, but the largest "
+            f"observed value is {data:.3g}; at the start, t = {group.t0[a]:g}, the model gives "
+            f"{first:.3g}, later at most {size[a].max():.3g}. Use the same units; if the "
+            f"trajectory diverges, other parameters or a smaller h. {hint}"
         )

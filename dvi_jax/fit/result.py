@@ -223,8 +223,7 @@ class FitResult:
             if header["shape"] is None:
                 raise ValueError(
                     f"params is required to load {path}, because not all fitted parameters are "
-                    "numbers or arrays in dicts with text as keys. Call FitResult.load(path, "
-                    "params) with params of the same structure as in dvi.fit."
+                    "numbers or arrays in dicts: give params as in dvi.fit."
                 )
             params = jax.tree.map(np.array, header["shape"], is_leaf=lambda x: isinstance(x, list))
         space, _ = make_space(params)
@@ -233,9 +232,9 @@ class FitResult:
             pairs = enumerate(zip(names, stored_names, strict=False))
             i = next((i for i, (a, b) in pairs if a != b), min(len(names), len(stored_names)))
             raise ValueError(
-                f"params must have the same parameters as the fit in {path}. The first difference "
-                f"is number {i + 1}: {''.join(stored_names[i : i + 1]) or 'no parameter'} in the "
-                f"file, {''.join(names[i : i + 1]) or 'no parameter'} in params. Give params as in dvi.fit."
+                f"params must have the same parameters as the fit in {path}. Number {i + 1} is "
+                f"{''.join(stored_names[i : i + 1]) or 'no parameter'} in the file, "
+                f"{''.join(names[i : i + 1]) or 'no parameter'} in params."
             )
         by_arc: dict[str, Any] = {
             n: [arrays[f"{n}.{i}"] for i in range(header["arcs"])] for n in _BY_ARC
@@ -268,8 +267,8 @@ def little_explained(fit: FitResult) -> str:
         return ""
     comparison = "no better" if fit.explained <= 0 else "little better"
     return (
-        f"the model describes the data {comparison} than constants do: this may be a local minimum, "
-        "or the data are constants and noise. Start from other parameters."
+        f"the model describes the data {comparison} than constants do: this may be a local "
+        "minimum, or the data are constants and noise. Start from other parameters."
     )
 
 

@@ -88,13 +88,12 @@ class Run:
             file = Path(self.checkpoint)
             if not file.parent.is_dir():
                 raise FileNotFoundError(
-                    f"there is no directory {str(file.parent)!r} for checkpoint={str(file)!r}. "
-                    "Create this directory, or give another path."
+                    f"there is no directory {str(file.parent)!r} for checkpoint={str(file)!r}: "
+                    "create it."
                 )
             if file.is_dir():
                 raise IsADirectoryError(
-                    f"checkpoint must be the path of a file, but {str(file)!r} is a directory. Add "
-                    "a file name, such as fit.npz."
+                    f"checkpoint must be the path of a file, but {str(file)!r} is a directory."
                 )
             if file.exists():
                 self.resume, self.records = _read_checkpoint(file, self.identity)
@@ -174,9 +173,8 @@ def _read_checkpoint(path: Any, identity: str) -> tuple[Position, list[Record]]:
     header, arrays = read_npz(path, _FORMAT, "checkpoint of a fit")
     if header.get("identity") != identity:
         raise ValueError(
-            f"the checkpoint {path} is of another fit: the data, the model, the parameters, their "
-            "starting values or the settings differ. To continue the earlier fit, repeat its call "
-            "unchanged. To start a new fit, give another path in checkpoint, or remove this file."
+            f"the checkpoint {path} is of another fit: data, model, parameters, start or settings "
+            "differ. Repeat its call unchanged, or give another path in checkpoint."
         )
     fields = {name: header[name] for name in Position.__dataclass_fields__ if name in header}
     fields |= {name: arrays[name] for name in _VECTORS}

@@ -96,7 +96,7 @@ class Segments:
             )
             raise ValueError(
                 "dvi.MultipleShooting requires lattice=dvi.Uniform() and the same h for all arcs, "
-                f"got {description}. Change the model, or use dvi.SingleShooting()."
+                f"got {description}."
             )
         kinds = [(a.function, a.values.shape[1:], a.covariance is None) for a in arcs]
         if differing := [i for i, kind in enumerate(kinds) if kind != kinds[0]]:
@@ -113,7 +113,7 @@ class Segments:
         if self.steps < 1 or steps < S:
             raise ValueError(
                 "segments of dvi.MultipleShooting must be at most the number of steps of the "
-                f"longest arc, {steps}, got {S}. Give fewer segments or a smaller h."
+                f"longest arc, {steps}, got {S}."
             )
         self.cuts = np.array([[arc.t0 + s * self.steps * h for s in range(S)] for arc in arcs])
         parts = []
@@ -178,9 +178,9 @@ class Segments:
             if callable(guess):
                 source, hint = "the function guess", "Correct this function."
             raise ValueError(
-                "the initial states of the segments of dvi.MultipleShooting must be finite, but "
-                f"{source} gives NaN or inf for arc {i} at t = "
-                f"{times[np.argmin(np.isfinite(states_of_cuts).all(axis=1))]:g}. {hint}"
+                f"the guess of dvi.MultipleShooting must be finite, but {source} gives NaN or inf "
+                f"for arc {i} "
+                f"at t = {times[np.argmin(np.isfinite(states_of_cuts).all(axis=1))]:g}. {hint}"
             )
         return states_of_cuts
 
@@ -262,9 +262,9 @@ def from_data(arc: Observations, spec: dict[str, Any], times: np.ndarray) -> np.
     """
     if arc.observe not in ("positions", "state"):
         raise ValueError(
-            'guess="data" of dvi.MultipleShooting requires observe="positions" or observe="state", '
-            f"got {repr(arc.observe) if isinstance(arc.observe, str) else 'a function'}. Use "
-            'guess="model", or give a function (t) that returns (q, p) as guess.'
+            'guess="data" of dvi.MultipleShooting requires observe="positions" or '
+            'observe="state", got '
+            f"{repr(arc.observe) if isinstance(arc.observe, str) else 'a function'}."
         )
     flat = arc.values.reshape(len(arc.ts), -1)
     good = np.isfinite(flat).all(axis=1)

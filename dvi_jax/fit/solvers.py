@@ -61,9 +61,9 @@ def solver_for(optimiser: Any, residuals: bool, is_large: bool, steps: int) -> A
         return optx.OptaxMinimiser(optimiser, rtol=0.0, atol=0.0)
     if is_gauss_newton(optimiser) and not residuals:
         raise ValueError(
-            "optimiser must be a minimiser if the loss is a dvi.Likelihood, got the least-squares "
-            f"solver {type(optimiser).__name__}. A likelihood has no residuals. Use "
-            "optimistix.BFGS(rtol=1e-10, atol=1e-10), or leave optimiser out."
+            "optimiser must be a minimiser if the loss is a dvi.Likelihood, got "
+            f"{type(optimiser).__name__}. Use, for example, optimistix.BFGS(rtol=1e-10, "
+            "atol=1e-10)."
         )
     minimisers = optx.OptaxMinimiser, optx.AbstractQuasiNewton, optx.AbstractLBFGS
     classes = optx.AbstractGaussNewton, optx.AbstractGradientDescent, *minimisers

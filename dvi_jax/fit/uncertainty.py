@@ -14,7 +14,7 @@ class Uncertainty(NamedTuple):
 
     - `covariance`: (n, n); infinite for parameters that are not determined.
     - `directions`: columns in u, best determined first; `singular_values`: theirs.
-    - `null_directions`: those directions that the data do not determine, in scaled variables with unit
+    - `null_directions`: directions that the data do not determine, in scaled variables with unit
       length, shape (n, count).
     """
 

@@ -130,8 +130,9 @@ def bound_drift(
     if not isinstance(integrator_used.arithmetic, FloatingPoint | DoubleDouble | FixedPoint):
         raise ValueError(
             "arithmetic must be dvi.FloatingPoint(), dvi.DoubleDouble() or "
-            f"dvi.FixedPoint(quantum), got {integrator_used.arithmetic!r}: bound_drift does not bound the "
-            "rounding of other kinds of arithmetic."
+            "dvi.FixedPoint(quantum), "
+            f"got {integrator_used.arithmetic!r}: bound_drift does not bound the rounding of "
+            "others."
         )
     h = check_step_size(h)
     shape, (lower, upper) = _domain(domain, found)
@@ -225,8 +226,8 @@ def _step_of(
     explicit = method.is_explicit(system, jnp.zeros(shape), args)
     if not (explicit or method.is_the_map):
         raise ValueError(
-            "method must be dvi.TypeII(), or another method that is explicit for this system. "
-            f"{method!r} is implicit for this system: use method=dvi.TypeII()."
+            f"method must be explicit for this system or dvi.TypeII(), but {method!r} is implicit "
+            "for this system."
         )
     plain = System(system.H_D, system.force, system.perturbation)
     start, number = jnp.full(shape, 0.1), jnp.asarray(0.1)
@@ -282,8 +283,8 @@ def _functions(invariants: Any, system: System, with_time: bool) -> list[tuple[C
     if isinstance(invariants, Discovery):
         if not invariants.count:
             raise ValueError(
-                "found must contain at least one invariant, but this Discovery has none: call "
-                "dvi.discover_invariants with more functions in the basis, or with a lower order."
+                "found must contain at least one invariant, but this Discovery has none: discover "
+                "with more functions in the basis, or a lower order."
             )
         return _functions(list(invariants.invariants), system, with_time)
     if isinstance(invariants, InvariantSeries):
@@ -294,7 +295,7 @@ def _functions(invariants: Any, system: System, with_time: bool) -> list[tuple[C
         if invariants.basis.uses_time and invariants.slow_time != system.slow_time:
             raise ValueError(
                 f"the invariant was found with slow_time={invariants.slow_time}, but system has "
-                f"slow_time={system.slow_time}: give the system for which the invariant was found."
+                f"slow_time={system.slow_time}."
             )
         return [
             (lambda q, p, t, e, h: invariants.evaluate(q, p, e, t), invariants.formula(terms=8))
@@ -304,8 +305,7 @@ def _functions(invariants: Any, system: System, with_time: bool) -> list[tuple[C
     if isinstance(invariants, str) or not (callable(invariants) or np.iterable(invariants)):
         raise TypeError(
             "found must be a Discovery, an InvariantSeries, an ExactInvariant, a function (q, p, "
-            "epsilon) or (q, p, epsilon, t), or a list that contains only these, got "
-            f"{invariants!r:.200}."
+            f"epsilon) or (q, p, epsilon, t), or a list of these, got {invariants!r:.200}."
         )
     if callable(invariants):
         name = getattr(invariants, "__name__", type(invariants).__name__)
@@ -350,9 +350,8 @@ def _domain(
     parts = domain if isinstance(domain, tuple) else (domain, domain)
     if len(parts) != 2:
         raise ValueError(
-            "domain must be a half-width, an array of half-widths, or a pair (domain of q, domain "
-            f"of p), got a tuple of length {len(parts)}: {domain!r:.200}. Give half-widths of "
-            "several coordinates as an array."
+            "domain must be half-widths, or a pair (domain of q, domain of p), got a tuple of "
+            f"length {len(parts)}: {domain!r:.200}."
         )
     shapes = [np.shape(x)[1:] if np.ndim(x) > 1 else np.shape(x) for x in parts]
     discovery = invariants if isinstance(invariants, Discovery) else None
@@ -360,8 +359,7 @@ def _domain(
     if not shape:
         raise ValueError(
             "domain must be an array with the shape of q, unless found is a Discovery, got "
-            f"{domain!r}: give one half-width for each coordinate, such as "
-            "domain=np.full(2, 0.5) for two coordinates."
+            f"{domain!r}."
         )
     lower, upper = [], []
     for name, x in zip("qp", parts, strict=True):
@@ -376,7 +374,7 @@ def _domain(
         if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
             raise ValueError(
                 f"domain of {name} must have finite lower bounds below finite upper bounds, got "
-                f"{low.tolist()} and {high.tolist()}. Half-widths must be positive."
+                f"{low.tolist()} and {high.tolist()}."
             )
         lower.extend(low.tolist())
         upper.extend(high.tolist())

@@ -100,9 +100,7 @@ def prove_noether(
     exact, _ = tools()
     q0 = getattr(system, "q0", None) if q0 is None else q0
     if q0 is None:
-        raise TypeError(
-            "q0 is missing: give an array with the shape of q, for example q0=jnp.zeros(2)."
-        )
+        raise TypeError("q0 is missing: give an array with the shape of q.")
     system, *_, args = of_problem(system, None, None, None, args, has_start=True)
     check_system(system, "prove_noether")
     series = AdiabaticInvariant(generators, gauges)

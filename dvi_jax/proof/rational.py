@@ -89,10 +89,10 @@ def exact_coefficients(invariant: InvariantSeries, h: float) -> ExactInvariant:
         numbers[place] = _relation(ratio, h, error) if ratio else (1, 0, 0, 0)
         if not numbers[place][0]:
             raise ValueError(
-                f"the coefficient of ε^{place[0]} {invariant.basis.names[place[1]]}, divided by "
-                f"the largest one, is {ratio:.10g}. It has no form (n_0 + n_1 h + n_2 h²)/d "
-                "with small integers n_0, n_1, n_2 and d. Check that the invariant was found with "
-                f"h={h!r}. If it was, no exact form of this invariant can be given."
+                f"the coefficient of ε^{place[0]} {invariant.basis.names[place[1]]} over the "
+                "largest one, "
+                f"{ratio:.10g}, has no form (n_0 + n_1 h + n_2 h²)/d with small integers at "
+                f"h={h!r}."
             )
     return ExactInvariant(invariant.basis, numbers)
 

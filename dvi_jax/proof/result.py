@@ -76,8 +76,7 @@ class DriftBound(eqx.Module):
             raise ValueError(f"q0 and p0 must be finite numbers, got {q0!r} and {p0!r}.")
         if not low <= epsilon <= high:
             raise ValueError(
-                f"epsilon={epsilon!r} is not in the interval [{low!r}, {high!r}] of the proof: "
-                "call bound_drift with an interval that contains this epsilon."
+                f"epsilon={epsilon!r} is not in the interval [{low!r}, {high!r}] of the proof."
             )
         if self.level is None:
             return 0
@@ -159,8 +158,8 @@ def tools() -> tuple[Any, Any]:
         from . import checker, search
     except ImportError as error:
         raise ImportError(
-            f"proofs need the package python-flint, but the import failed ({error}). Install it "
-            'with pip install "dvi-jax[proof]" or pip install python-flint.'
+            f"proofs require python-flint, but the import failed ({error}): "
+            'pip install "dvi-jax[proof]"'
         ) from error
     return checker, search
 
