@@ -67,7 +67,8 @@ class Program:
             names = ", ".join(sorted(primitives)).replace("select_n", "select_n (jnp.where)")
             raise Unsupported(
                 f"operations of JAX that a proof does not allow: {names}. Allowed are sums, "
-                "products, quotients, powers with constant exponents, sinh, cosh, tanh, {', '.join(UNARY)}."
+                "products, quotients, powers with constant exponents, sinh, cosh, tanh, "
+                f"{', '.join(UNARY)}."
             )
         numbers = {old: i for i, old in enumerate(order)}
         operations = []
