@@ -224,7 +224,7 @@ def test_bounds_priors_and_options(folder):
 # Rejected input: the key, what was seen, what is allowed
 
 HEAD = "t,x\n"
-AWAY = "but h = 0.1 leads to later times. Give h = -0.1; or, if q0"
+AWAY = "but h = 0.1 leads to later times. Give h = -0.1, or"
 BAD_DATA = [
     ("", "data.file: ", "a line of names"),
     (HEAD, "has names but no numbers", "at least one line"),

@@ -58,7 +58,9 @@ LIMITS = {"epsilon": dvi.Bounds(0.0, 0.2), "args": {"k": dvi.Bounds(lower=0.5)}}
 
 def swinging(sigma=0.01, steps=40, seed=0):
     given = {"h": H, "num_steps": steps, "epsilon": 0.05, "args": {"k": 1.0}}
-    sol = dvi.integrate(OSCILLATOR.settings["system"], [0.8], [0.3], save=dvi.Save(every=4), **given)
+    sol = dvi.integrate(
+        OSCILLATOR.settings["system"], [0.8], [0.3], save=dvi.Save(every=4), **given
+    )
     noise = 0.01 * np.random.default_rng(seed).normal(size=sol.qs.shape)
     return dvi.Observations(sol.ts, np.asarray(sol.qs) + noise, sigma=sigma)
 
