@@ -140,7 +140,7 @@ def test_the_example(folder):
 @pytest.mark.slow
 def test_a_fit_that_does_not_converge_is_written_and_resumes(folder, monkeypatch):
     """To the same bits as without the interruption, and only for the same fit."""
-    monkeypatch.setattr(import_module("dvi_jax.fit.run"), "_EVERY", -1.0)  # at every step
+    monkeypatch.setattr(import_module("dvi_jax.fit.run"), "_INTERVAL", -1.0)  # at every step
     short = write(folder, SMALL.replace("[options]", "[options]\nmax_steps = 1"))
     result = command("fit", short)
     assert result.exit_code == 1, result.output
@@ -224,7 +224,7 @@ def test_bounds_priors_and_options(folder):
 # Rejected input: the key, what was seen, what is allowed
 
 HEAD = "t,x\n"
-AWAY = "but h = 0.1 leads to later times. Give h = -0.1; or, if q0"
+AWAY = "but h = 0.1 leads to later times. Give h = -0.1, or"
 BAD_DATA = [
     ("", "data.file: ", "a line of names"),
     (HEAD, "has names but no numbers", "at least one line"),
@@ -254,7 +254,7 @@ BAD_DATA = [
     ),
     ("time,x\n0.3,1\n", "data.time: the file has no column 't'", "a column of the file: time, x"),
     ("t\n0.3\n0.6\n", "no column is left", "one or more of t"),
-    (HEAD + "-0.3,1\n0.6,2\n", "data: t0 = 0.0, the start of the arc, lies between", "in order"),
+    (HEAD + "-0.3,1\n0.6,2\n", "data: all times must be on one side of t0 = 0.0", "in order"),
     (HEAD + "-0.3,1\n-0.6,2\n", AWAY, "data that fit"),
     (HEAD + "-0.6,1\n-0.3,2\n", AWAY, "data that fit"),
 ]

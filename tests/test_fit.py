@@ -618,7 +618,7 @@ KINDS = {
     "kind", ["least squares", *(pytest.param(k, marks=pytest.mark.slow) for k in list(KINDS)[1:])]
 )
 def test_resumed_with_the_same_bits(kind, tmp_path, monkeypatch):
-    monkeypatch.setattr(run, "_EVERY", 0.0)
+    monkeypatch.setattr(run, "_INTERVAL", 0.0)
     data, options, start = seen(11), KINDS[kind], {**START, "args": {"k": 0.9}}
     whole = dvi.fit(MODEL, data, start, **options)
     file, steps = tmp_path / "fit.npz", len(whole.history["loss"])
@@ -640,7 +640,7 @@ def stiffer(t0, t1, q0, p1, args):
 
 
 def test_a_checkpoint_of_another_fit_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(run, "_EVERY", 0.0)
+    monkeypatch.setattr(run, "_INTERVAL", 0.0)
     data, file = seen(11), tmp_path / "fit.npz"
     with pytest.raises(Interrupted):
         dvi.fit(MODEL, data, START, checkpoint=file, progress=interrupt(1))
@@ -661,7 +661,7 @@ def test_a_checkpoint_of_another_fit_is_refused(tmp_path, monkeypatch):
 
 
 def test_more_steps_continue_from_the_checkpoint(regular, tmp_path, monkeypatch):
-    monkeypatch.setattr(run, "_EVERY", 0.0)
+    monkeypatch.setattr(run, "_INTERVAL", 0.0)
     data, found = regular
     file = tmp_path / "fit.npz"
     with pytest.raises(dvi.FitError):

@@ -7,8 +7,7 @@ import pytest
 
 import dvi_jax as dvi
 from dvi_jax.fit import _fit as fits
-from dvi_jax.fit.evaluation import STIFFNESS, Evaluation
-from dvi_jax.fit.roundoff import settle
+from dvi_jax.fit.roundoff import STIFFNESS, Evaluation, settle
 
 STEP, STEPS, COUNT = 0.05, 4000, 40
 TS = STEP * STEPS / COUNT * np.arange(1, COUNT + 1)

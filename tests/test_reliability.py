@@ -185,7 +185,7 @@ def take_step(of, value):
 
 @pytest.mark.parametrize("how", ["full", "permission"])
 def test_a_fit_goes_on_where_its_checkpoint_cannot_be_written(tmp_path, monkeypatch, how):
-    monkeypatch.setattr(run, "_EVERY", 0.0)
+    monkeypatch.setattr(run, "_INTERVAL", 0.0)
     file = tmp_path / "checkpoint.npz"
     fit = a_run(file)
     take_step(fit, 3.0)
@@ -199,7 +199,7 @@ def test_a_fit_goes_on_where_its_checkpoint_cannot_be_written(tmp_path, monkeypa
 
 
 def test_a_damaged_checkpoint_is_refused_and_stays(tmp_path, monkeypatch):
-    monkeypatch.setattr(run, "_EVERY", 0.0)
+    monkeypatch.setattr(run, "_INTERVAL", 0.0)
     file = tmp_path / "checkpoint.npz"
     take_step(a_run(file), 3.0)
     damaged = file.read_bytes()[:-30]

@@ -13,9 +13,9 @@ from .losses import (
 from .model import Model as Model
 from .network import NetworkForce as NetworkForce
 from .observations import Observations as Observations
+from .optimise import FIT_RESULTS as FIT_RESULTS, FitError as FitError
 from .parameters import Bounds as Bounds, Prior as Prior
 from .posterior import Posterior as Posterior
-from .progress import FitProgress as FitProgress
 from .result import FitResult as FitResult
-from .results import FIT_RESULTS as FIT_RESULTS, FitError as FitError
+from .run import FitProgress as FitProgress
 from .shooting import MultipleShooting as MultipleShooting, SingleShooting as SingleShooting

@@ -14,17 +14,16 @@ from ..base.checks import fraction, instance, one_of, whole
 from ..base.precision import require_double
 from .losses import LeastSquares, Likelihood, Loss
 from .observations import Data, as_arcs
+from .optimise import FIT_RESULTS, FitError
 from .problem import Problem
-from .progress import FitProgress, shown
 from .result import FitResult
-from .results import FIT_RESULTS, FitError
-from .run import Run, identity
+from .run import FitProgress, Run, identity, progress_display
 from .shooting import MultipleShooting, Segments, SingleShooting
 from .solvers import is_gauss_newton, is_optax, solver_for
-from .stages import MANY, Minimum, by_gradient, in_segments, least_squares
+from .stages import JACOBIAN_LIMIT, Minimum, by_gradient, in_segments, least_squares
 from .uncertainty import Uncertainty, in_words, uncertainty
 
-_FEW = 50
+_CURVATURE_LIMIT = 50
 """Parameters up to which second derivatives are computed."""
 
 _SMALL = 1_000_000
@@ -113,55 +112,53 @@ def fit(
     """
     began = time.monotonic()
     require_double("a fit")
-    arcs, many = as_arcs(data)
-    problem = Problem(model, arcs, many, params, bounds=bounds, priors=priors, loss=loss)
+    arcs, is_list = as_arcs(data)
+    problem = Problem(model, arcs, is_list, params, bounds=bounds, priors=priors, loss=loss)
     kinds = SingleShooting | MultipleShooting
     instance("shooting", shooting, kinds, "a dvi.SingleShooting() or a dvi.MultipleShooting(n)")
     if max_steps is not None:
         whole("max_steps", max_steps)
     fraction("tolerance", tolerance)
     has_residuals = isinstance(problem.loss, Loss)
-    solver = solver_for(optimiser, has_residuals, problem.size > MANY, max_steps or 2000)
-    by_optax, is_vector = is_optax(solver), is_gauss_newton(solver)
-    if not by_optax:
+    solver = solver_for(optimiser, has_residuals, problem.size > JACOBIAN_LIMIT, max_steps or 2000)
+    uses_optax, is_vector = is_optax(solver), is_gauss_newton(solver)
+    if not uses_optax:
         problem.check_count()
-    max_steps = max_steps or (2000 if by_optax else 200)
+    max_steps = max_steps or (2000 if uses_optax else 200)
     if batch is not None:
         whole("batch", batch)
-        if not by_optax:
+        if not uses_optax:
             raise ValueError(
-                f"batch requires an optimiser of optax, but this fit uses {type(solver).__name__}. "
-                "Give, for example, optimiser=optax.adam(1e-3), or leave batch out."
+                f"batch requires an optimiser of optax, got {type(solver).__name__}: give, for "
+                "example, optimiser=optax.adam(1e-3)."
             )
     if isinstance(shooting, MultipleShooting) and not is_vector:
         raise ValueError(
-            "MultipleShooting requires a loss of residuals, such as dvi.LeastSquares(), and a "
-            "least-squares optimiser, such as optimistix.LevenbergMarquardt(rtol=1e-10, "
-            f"atol=1e-10). This fit uses the loss {type(problem.loss).__name__} and the optimiser "
-            f"{type(solver).__name__}. Change loss or optimiser, or use dvi.SingleShooting()."
+            "dvi.MultipleShooting requires a loss of residuals and a least-squares optimiser, got "
+            f"the loss {type(problem.loss).__name__} and the optimiser {type(solver).__name__}."
         )
-    wanted = _horizons(horizons)
+    stage_horizons = _horizons(horizons)
     u = problem.space.to_u(problem.start)
-    name = identity(problem, u, solver, shooting, wanted, batch, seed, tolerance)
-    with shown(progress) as show:
+    name = identity(problem, u, solver, shooting, stage_horizons, batch, seed, tolerance)
+    with progress_display(progress) as show:
         run = Run(problem, max_steps, tolerance, show, began, checkpoint, name)
         if isinstance(shooting, MultipleShooting):
             minimum = in_segments(run, Segments(problem, shooting), u, solver)
         elif is_vector:
-            minimum = least_squares(run, u, solver, wanted, check_units)
+            minimum = least_squares(run, u, solver, stage_horizons, check_units)
         else:
-            minimum = by_gradient(run, u, solver, wanted, check_units, batch, seed)
-    found, status = _result(run, minimum, check_curvature), minimum.status
+            minimum = by_gradient(run, u, solver, stage_horizons, check_units, batch, seed)
+    estimate, status = _result(run, minimum, check_curvature), minimum.status
     fine = bool((status == FIT_RESULTS.converged) | (status == FIT_RESULTS.steps_done))
     if checkpoint is not None and fine:
         Path(checkpoint).unlink(missing_ok=True)
     if fine or not throw:
-        return found
+        return estimate
     raise FitError(
-        f"the fit did not converge (status: {found.status}, steps: {len(run.records)}, loss: "
-        f"{found.loss:.6g}). {FIT_RESULTS[status]} The result is in the attribute `fit` "
-        "of this error. With throw=False it is returned without an error.",
-        found,
+        f"the fit did not converge (status: {estimate.status}, steps: {len(run.records)}, loss: "
+        f"{estimate.loss:.6g}). {FIT_RESULTS[status]} The result is in the attribute `fit` of this "
+        "error; throw=False returns it.",
+        estimate,
     )
 
 
@@ -172,46 +169,50 @@ def _horizons(horizons: Any) -> list[float] | None:
         return None
     if horizons is None:
         return [np.inf]
-    found = np.asarray(horizons, float)
-    if found.ndim != 1 or not (np.diff(found) > 0).all() or not (found > 0).all():
+    times = np.asarray(horizons, float)
+    if times.ndim != 1 or not (np.diff(times) > 0).all() or not (times > 0).all():
         raise ValueError(
             "horizons must be 'auto', None or a list of increasing positive times, got "
             f"{horizons!r:.200}."
         )
-    return [*found.tolist(), np.inf]
+    return [*times.tolist(), np.inf]
 
 
 def _result(run: Run, minimum: Minimum, check_curvature: bool) -> FitResult:
     """Errors, undetermined directions and residuals at a minimum."""
     problem, n = run.problem, run.problem.size
     space, u, has_residuals = problem.space, jnp.asarray(minimum.u), isinstance(problem.loss, Loss)
-    rows, known = minimum.aux or problem.whitened(u)
-    predicted, whitened, trajectories = problem.by_arc(rows, known)
+    rows, predictions = minimum.aux or problem.whitened(u)
+    predictions_by_arc, residuals_in_sigma, trajectories = problem.by_arc(rows, predictions)
     x = np.asarray(space.to_x(u))
     r = problem.root_rows(u, rows)
     loss = float(np.sum(r**2) / 2) if has_residuals else float(problem.core.scalar(u))
     degrees, variance = problem.degrees_of_freedom, 1.0
-    covariance, curvature, lost, values = np.full((n, n), np.nan), None, [], np.zeros(0)
+    covariance, curvature, free_directions, values = np.full((n, n), np.nan), None, [], np.zeros(0)
     rounding = np.zeros(n)
     if minimum.jacobian is not None and np.isfinite(minimum.jacobian).all():
         J = np.asarray(minimum.jacobian)
-        about = uncertainty(J, 1.0, minimum.free)
-        degrees += about.undetermined.shape[1]  # undetermined directions take no degree
+        spectrum = uncertainty(J, 1.0, minimum.free)
+        degrees += spectrum.null_directions.shape[1]  # undetermined directions take no degree
         if has_residuals and not problem.has_errors:
             variance = 2 * loss / degrees if degrees > 0 else np.nan
-        slope, values = space.slope(u), about.singular_values
+        slope, values = space.slope(u), spectrum.singular_values
         with np.errstate(invalid="ignore"):  # infinite variance of a parameter without effect
-            covariance = variance * about.covariance[:n, :n] * np.outer(slope, slope)
+            covariance = variance * spectrum.covariance[:n, :n] * np.outer(slope, slope)
         if minimum.shifts is not None and len(minimum.shifts):
             by_rounding = slope * minimum.shifts
             covariance = covariance + by_rounding.T @ by_rounding / (2 * len(by_rounding))
             rounding = np.sqrt(np.mean(by_rounding**2, axis=0) / 2)
-        lost = about.undetermined[:n].T
-        if check_curvature and minimum.free is None and has_residuals and n <= _FEW:
-            curvature = _curvature_ratio(problem, u, r, J, about)
+        free_directions = spectrum.null_directions[:n].T
+        if check_curvature and minimum.free is None and has_residuals and n <= _CURVATURE_LIMIT:
+            curvature = _curvature_ratio(problem, u, r, J, spectrum)
     at_bounds = space.at_bounds(x, np.sqrt(np.diag(covariance)))
     free = ~np.isin(space.names, at_bounds)  # a parameter at its bound is known: it is there
-    words = [in_words(d, list(space.names)) for d in lost if np.abs(d[free]).max(initial=0) > 1e-6]
+    words = [
+        in_words(d, list(space.names))
+        for d in free_directions
+        if np.abs(d[free]).max(initial=0) > 1e-6
+    ]
     return FitResult(
         params=space.to_params(jnp.asarray(x)),
         x=x,
@@ -219,11 +220,11 @@ def _result(run: Run, minimum: Minimum, check_curvature: bool) -> FitResult:
         covariance=covariance,
         history=run.history(),
         result=minimum.status,
-        ts=[arc.ts for arc in problem.given],
-        observed=[arc.values for arc in problem.given],
-        predicted=predicted,
-        whitened=whitened,
-        errors=[arc.errors for arc in problem.given],
+        ts=[arc.ts for arc in problem.data],
+        observed=[arc.values for arc in problem.data],
+        predicted=predictions_by_arc,
+        whitened=residuals_in_sigma,
+        errors=[arc.errors for arc in problem.data],
         loss=loss,
         degrees_of_freedom=degrees,
         num_observed=problem.count,
@@ -241,7 +242,7 @@ def _result(run: Run, minimum: Minimum, check_curvature: bool) -> FitResult:
 
 
 def _curvature_ratio(
-    problem: Problem, u: Any, r: np.ndarray, J: np.ndarray, about: Uncertainty
+    problem: Problem, u: Any, r: np.ndarray, J: np.ndarray, spectrum: Uncertainty
 ) -> np.ndarray:
     """Second derivative of the loss along each principal direction over Gauss–Newton's, which
     lacks r · r''.
@@ -249,14 +250,18 @@ def _curvature_ratio(
     In a small problem r'' is a difference of Jacobians, whose program exists already; compiling
     one for exact second derivatives takes as long as all else.
     """
-    D = about.directions[:, : about.directions.shape[1] - about.undetermined.shape[1]]
+    D = spectrum.directions[:, : spectrum.directions.shape[1] - spectrum.null_directions.shape[1]]
     squares = np.sum((J @ D) ** 2, axis=0)
     if 2 * problem.size * (problem.size + 1) * problem.steps > _SMALL:
         exact = np.asarray(problem.curvature(u, D.T)) if D.shape[1] else np.zeros(0)
         return exact / squares
     t = _PART * np.linalg.norm(r) / np.sqrt(squares * max(problem.degrees_of_freedom, 1))
-    found = []
+    ratios = []
     for d, step, square in zip(D.T, t, squares, strict=True):
-        ahead, back = (np.asarray(problem.evaluate(u + s * step * d).jacobian) for s in (1, -1))
-        found.append(1 + (r @ ((ahead - back) @ d) / (2 * step * square) if step > 0 else 0.0))
-    return np.array(found)
+        forward, backward = (
+            np.asarray(problem.evaluate(u + s * step * d).jacobian) for s in (1, -1)
+        )
+        ratios.append(
+            1 + (r @ ((forward - backward) @ d) / (2 * step * square) if step > 0 else 0.0)
+        )
+    return np.array(ratios)

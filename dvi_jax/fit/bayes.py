@@ -24,7 +24,7 @@ from .uncertainty import correlations
 _R_HAT = 1.01
 """Largest R̂ of chains that count as mixed (Vehtari et al. 2021)."""
 
-_SATURATED = 0.01
+_TRUNCATION_LIMIT = 0.01
 """Fraction of draws with a truncated path above which a warning is given."""
 
 
@@ -97,9 +97,9 @@ class Samples:
 
     def __str__(self) -> str:
         chains, draws, _ = self.x.shape
-        shown, width = self.names[:40], max(len(n) for n in self.names[:40])
+        names, width = self.names[:40], max(len(n) for n in self.names[:40])
         lines = [f"{self.status}: {chains} chains of {draws} draws, {self.divergences} diverging"]
-        for name, mean, sigma in zip(shown, self.mean, self.sigma, strict=False):
+        for name, mean, sigma in zip(names, self.mean, self.sigma, strict=False):
             low, high = self.quantiles((0.05, 0.95))[name]
             lines.append(
                 f"  {name:{width}}  {with_error(mean, sigma)}  90 % in [{low:.8g}, {high:.8g}]  "
@@ -120,11 +120,11 @@ class Samples:
         stats = {"diverging": self.diverging, "lp": -self.potential, "n_steps": self.steps}
         coords = {d: np.arange(n) for d, n in zip(dims, self.x.shape[:2], strict=True)}
         groups = {"posterior": self.samples, "sample_stats": stats}
-        found = {
-            group: xr.Dataset({name: (dims, x) for name, x in of.items()}, coords=coords)
-            for group, of in groups.items()
+        datasets = {
+            group: xr.Dataset({name: (dims, x) for name, x in columns.items()}, coords=coords)
+            for group, columns in groups.items()
         }
-        return xr.DataTree.from_dict(found)
+        return xr.DataTree.from_dict(datasets)
 
     def to_arviz(self) -> Any:
         """Input for the functions of ArviZ: its `InferenceData`; from ArviZ 1.0 on `to_xarray`.
@@ -135,8 +135,7 @@ class Samples:
             import arviz  # pyright: ignore[reportMissingImports]
         except ImportError as error:
             raise ImportError(
-                f"to_arviz requires arviz, but its import failed ({error}): pip install arviz. "
-                "Without arviz, print(samples) shows a summary and to_xarray() returns the draws."
+                f"to_arviz requires arviz, but its import failed ({error}): pip install arviz"
             ) from None
         tree = self.to_xarray()
         if int(arviz.__version__.split(".")[0]) >= 1:
@@ -203,8 +202,8 @@ def sample(
     )
     notes: list[str] = []
     if start is None:
-        known = posterior._problem.has_errors or isinstance(loss, Likelihood)
-        of_fit = {"bounds": bounds, "priors": priors if known else None, "loss": loss}
+        has_errors = posterior._problem.has_errors or isinstance(loss, Likelihood)
+        of_fit = {"bounds": bounds, "priors": priors if has_errors else None, "loss": loss}
         quiet: dict[str, Any] = {"check_curvature": False, "progress": False, "throw": False}
         start = fit(model, data, params, **of_fit, **quiet)
     if isinstance(start, FitResult) and start.status != "converged":
@@ -229,11 +228,11 @@ def sample(
         )
     z = mcmc.get_samples(group_by_chain=True)
     x = jax.jit(jax.vmap(jax.vmap(lambda z: posterior.to_x(centre + L @ z))))(z)
-    about = mcmc.get_extra_fields(group_by_chain=True)
-    found = _collect(numpyro, posterior, x, about, notes, 2**max_tree_depth - 1)
-    for text in found.warnings:
+    statistics = mcmc.get_extra_fields(group_by_chain=True)
+    samples = _collect(numpyro, posterior, x, statistics, notes, 2**max_tree_depth - 1)
+    for text in samples.warnings:
         warnings.warn(text, UserWarning, stacklevel=2)
-    return found
+    return samples
 
 
 def _numpyro() -> Any:
@@ -243,7 +242,7 @@ def _numpyro() -> Any:
     except ImportError as error:
         raise ImportError(
             f"dvi.sample requires numpyro, but its import failed ({error}): pip install "
-            '"dvi-jax[bayes]". Without numpyro, use dvi.Posterior with your own sampler.'
+            f'"dvi-jax[bayes]"'
         ) from None
     return numpyro
 
@@ -256,16 +255,16 @@ def _start_of(posterior: Posterior, start: Any, bounds: PyTree, priors: PyTree) 
     **Raises** `ValueError` for one of other parameters, or a pytree outside of the bounds.
     """
     is_fit = isinstance(start, FitResult)
-    given = (start.params,) if is_fit else (start, bounds, priors)
-    space, x = make_space(*given)
+    arguments = (start.params,) if is_fit else (start, bounds, priors)
+    space, x = make_space(*arguments)
     if list(space.names) != posterior.names:
-        missing, unknown = (
+        lacking, surplus = (
             ", ".join([name for name in a if name not in b][:8]) or "none"
             for a, b in ((posterior.names, space.names), (space.names, posterior.names))
         )
         raise ValueError(
             "start must have the same parameters as params. Missing in start: "
-            f"{missing}. Unknown in start: {unknown}."
+            f"{lacking}. Unknown in start: {surplus}."
         )
     if is_fit:
         at_bounds = np.isin(posterior.names, posterior._space.at_bounds(x, start.sigma))
@@ -286,7 +285,7 @@ def _starts(potential: Callable[[Array], Array], chains: int, size: int, seed: i
 
 
 def _collect(
-    numpyro: Any, posterior: Posterior, x: Any, about: Any, notes: list[str], longest: int
+    numpyro: Any, posterior: Posterior, x: Any, statistics: Any, notes: list[str], longest: int
 ) -> Samples:
     """Draws with their diagnostics."""
     x = np.asarray(x)
@@ -294,40 +293,40 @@ def _collect(
     with np.errstate(invalid="ignore", divide="ignore"):
         r_hat = {n: float(numpyro.diagnostics.split_gelman_rubin(c)) for n, c in columns.items()}
         ess = {n: float(numpyro.diagnostics.effective_sample_size(c)) for n, c in columns.items()}
-    found = Samples(
+    samples = Samples(
         names=posterior.names,
         x=x,
-        params=_batched(posterior, x),
-        potential=np.asarray(about["potential_energy"]),
-        diverging=np.asarray(about["diverging"]),
-        steps=np.asarray(about["num_steps"]),
-        acceptance=np.asarray(about["mean_accept_prob"])[:, -1],
+        params=_batch_of_params(posterior, x),
+        potential=np.asarray(statistics["potential_energy"]),
+        diverging=np.asarray(statistics["diverging"]),
+        steps=np.asarray(statistics["num_steps"]),
+        acceptance=np.asarray(statistics["mean_accept_prob"])[:, -1],
         r_hat=r_hat,
         ess=ess,
         warnings=notes,
     )
-    notes += _doubts(found, longest)
-    return found
+    notes += _doubts(samples, longest)
+    return samples
 
 
-def _doubts(found: Samples, longest: int) -> list[str]:
+def _doubts(samples: Samples, longest: int) -> list[str]:
     notes = []
-    off = {n: np.nan_to_num(r, nan=np.inf) for n, r in found.r_hat.items() if not r <= _R_HAT}
-    if worst := sorted(off, key=lambda n: -off[n]):
-        shown = ", ".join(f"{n} {found.r_hat[n]:.3f}" for n in worst[:4])
+    excess = {n: np.nan_to_num(r, nan=np.inf) for n, r in samples.r_hat.items() if not r <= _R_HAT}
+    if worst := sorted(excess, key=lambda n: -excess[n]):
+        examples = ", ".join(f"{n} {samples.r_hat[n]:.3f}" for n in worst[:4])
         notes.append(
             f"the chains do not agree: R̂ is above {_R_HAT} for {len(worst)} of "
-            f"{len(found.names)} parameters ({shown}). Draw more samples after more warm-up; if "
-            "R̂ stays large, give priors: the density has several maxima or is not determined."
+            f"{len(samples.names)} parameters ({examples}). Draw more samples after more warm-up; "
+            "if R̂ stays large, give priors: the density has several maxima or is not determined."
         )
-    if found.divergences:
+    if samples.divergences:
         notes.append(
-            f"{found.divergences} of {found.diverging.size} draws diverged: a narrow part of the "
-            "density, or one next to failing trajectories, may be missing. Use a target_accept "
+            f"{samples.divergences} of {samples.diverging.size} draws diverged: a narrow part of "
+            "the density, or one next to failing trajectories, may be missing. Use a target_accept "
             "nearer to 1, a smaller h, or bounds that exclude failing trajectories."
         )
-    cut = float((found.steps >= longest).mean())
-    if cut > _SATURATED:
+    cut = float((samples.steps >= longest).mean())
+    if cut > _TRUNCATION_LIMIT:
         notes.append(
             f"{100 * cut:.0f} % of the paths were truncated at {longest} steps: the draws are "
             "valid, but correlated. Use more warm-up, or a larger max_tree_depth."
@@ -335,10 +334,10 @@ def _doubts(found: Samples, longest: int) -> list[str]:
     return notes
 
 
-def _batched(posterior: Posterior, x: np.ndarray) -> PyTree:
+def _batch_of_params(posterior: Posterior, x: np.ndarray) -> PyTree:
     """The pytree of parameters with (chains, draws) in front of its numbers."""
     space = posterior._space
-    whole = posterior.to_params(jnp.asarray(posterior.start))
-    rest = eqx.filter(whole, eqx.is_inexact_array, inverse=True)
-    only = jax.vmap(jax.vmap(lambda x: eqx.filter(space.to_params(x), eqx.is_inexact_array)))
-    return eqx.combine(jax.tree.map(np.asarray, only(jnp.asarray(x))), rest)
+    example = posterior.to_params(jnp.asarray(posterior.start))
+    constants = eqx.filter(example, eqx.is_inexact_array, inverse=True)
+    batch = jax.vmap(jax.vmap(lambda x: eqx.filter(space.to_params(x), eqx.is_inexact_array)))
+    return eqx.combine(jax.tree.map(np.asarray, batch(jnp.asarray(x))), constants)

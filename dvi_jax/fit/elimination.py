@@ -8,9 +8,8 @@ import numpy as np
 from jaxtyping import Array
 
 from .library import KEY, ForceLibrary
-from .optimise import Evaluation, LeastSquaresStage, Task
+from .optimise import FIT_RESULTS, Evaluation, LeastSquaresStage, Task
 from .problem import Problem
-from .results import FIT_RESULTS
 from .solvers import levenberg_marquardt
 from .uncertainty import Uncertainty, in_words, inverse_or, uncertainty
 
@@ -20,7 +19,7 @@ _REFIT = 30
 _PRECISE = 1e-4
 """Tolerance of a refit in standard errors: 1e-8 in chi²."""
 
-_BEYOND = 3.0
+_MARGIN = 3.0
 """Penalties by which the criterion may exceed the best before the elimination ends."""
 
 _ROUNDING = 1e-11
@@ -78,58 +77,61 @@ class Elimination:
     @property
     def terms(self) -> tuple[str, ...]:
         """Candidates of the best set."""
-        return self._kept(self.keep)
+        return self._terms_of(self.keep)
 
-    def _kept(self, keep: np.ndarray) -> tuple[str, ...]:
+    def _terms_of(self, keep: np.ndarray) -> tuple[str, ...]:
         return tuple(n for n, k in zip(self.library.names, keep[self.where], strict=True) if k)
 
     def eliminate(self) -> None:
         """Remove terms until the criterion exceeds its minimum by a few penalties, or none is
         left."""
-        u, keep, removed = self.best, self.keep, None
-        least = np.inf
+        u, keep, name = self.best, self.keep, None
+        minimum = np.inf
         while True:
-            u, found, status = self._refit(u, keep)
-            r = np.asarray(found.residual)
+            u, evaluation, status = self._refit(u, keep)
+            r = np.asarray(evaluation.residual)
             chi2 = float(r @ r)
             value = np.inf
             if np.isfinite(chi2):
                 value = self._misfit(chi2) + self.penalty * int(keep[self.where].sum())
-            self.path.append(Removal(removed, self._kept(keep), chi2, value, status))
-            if value < least:
-                least, self.best, self.keep = value, u, keep
-            is_worse = not np.isfinite(value) or value > least + _BEYOND * self.penalty
+            self.path.append(Removal(name, self._terms_of(keep), chi2, value, status))
+            if value < minimum:
+                minimum, self.best, self.keep = value, u, keep
+            is_worse = not np.isfinite(value) or value > minimum + _MARGIN * self.penalty
             if is_worse or not keep[self.where].any():
                 return
-            J = self._of_data(found)
-            about = uncertainty(J[:, keep], 1.0)
-            if removed is None:
+            J = self._of_data(evaluation)
+            spectrum = uncertainty(J[:, keep], 1.0)
+            if name is None:
                 names = [n.removeprefix(f"{KEY}.") for n in self.problem.space.names]
-                self.undetermined = [in_words(d, names) for d in about.undetermined.T]
-            i = self._weakest(u, J, keep, about)
-            rest = keep & (np.arange(len(u)) != self.where[i])
-            u, keep = _without(u, np.asarray(found.jacobian), self.where[i], rest), rest
-            removed = self.library.names[i]
+                self.undetermined = [in_words(d, names) for d in spectrum.null_directions.T]
+            i = self._weakest(u, J, keep, spectrum)
+            remainder = keep & (np.arange(len(u)) != self.where[i])
+            u, keep = (
+                _eliminate(u, np.asarray(evaluation.jacobian), self.where[i], remainder),
+                remainder,
+            )
+            name = self.library.names[i]
 
     def _refit(self, u: np.ndarray, keep: np.ndarray) -> tuple[Any, Evaluation, FIT_RESULTS]:
         """The minimum near u; where it is worse than no force at all, the minimum near that."""
         u = np.where(keep, u, 0.0)
         if not keep.any():
-            return u, self.stage.at(u, np.inf, jnp.asarray(keep)), FIT_RESULTS.converged
+            return u, self.stage.values_at(u, np.inf, jnp.asarray(keep)), FIT_RESULTS.converged
         task = Task(0, np.inf, _REFIT, _PRECISE)
         degrees, extra = self.problem.count - int(keep.sum()), jnp.asarray(keep)
         outcome = self.stage.run(u, task, degrees, extra=extra)
         zero = u.copy()
         zero[self.where] = 0.0
-        bare = np.asarray(self.stage.at(zero, np.inf, extra).residual)
+        bare = np.asarray(self.stage.values_at(zero, np.inf, extra).residual)
         r = np.asarray(outcome[1].residual)
         if np.isfinite(bare).all() and not r @ r <= bare @ bare:
             outcome = self.stage.run(zero, task, degrees, extra=extra)
         return outcome
 
-    def _of_data(self, found: Evaluation) -> np.ndarray:
+    def _of_data(self, evaluation: Evaluation) -> np.ndarray:
         """The Jacobian without the priors of the coefficients."""
-        J = np.array(found.jacobian)
+        J = np.array(evaluation.jacobian)
         J[len(J) - self.problem.size + self.where] = 0.0
         return J
 
@@ -141,11 +143,13 @@ class Elimination:
         size = max(float(np.abs(g.values * g.whiten).max()) for g in self.problem.groups)
         return count * float(np.log(chi2 / count + (_ROUNDING * size) ** 2 + 1e-300))
 
-    def _weakest(self, u: np.ndarray, J: np.ndarray, keep: np.ndarray, about: Uncertainty) -> int:
+    def _weakest(
+        self, u: np.ndarray, J: np.ndarray, keep: np.ndarray, spectrum: Uncertainty
+    ) -> int:
         """The number of the term with the least |c|/sigma; of those without an error (in a
         combination that is not determined) the one of least effect."""
         sigma = np.full(len(u), np.inf)
-        sigma[keep] = np.sqrt(np.diag(about.covariance))
+        sigma[keep] = np.sqrt(np.diag(spectrum.covariance))
         strength = np.where(np.isfinite(sigma), np.abs(u) / sigma, 0.0)
         effect = np.abs(u) * np.linalg.norm(J, axis=0)
         terms = [i for i in range(len(self.library)) if keep[self.where[i]]]
@@ -157,40 +161,40 @@ class Elimination:
         By the derivatives at the minimum: exact for candidates with the same effect, and those
         with another effect are far off in any case.
         """
-        every = self.stage.at(self.best, np.inf, jnp.ones(self.problem.size, bool))
-        r, J = np.asarray(every.residual), self._of_data(every)
-        found: dict[str, list[tuple[str, float]]] = {}
+        evaluation = self.stage.values_at(self.best, np.inf, jnp.ones(self.problem.size, bool))
+        r, J = np.asarray(evaluation.residual), self._of_data(evaluation)
+        replacements: dict[str, list[tuple[str, float]]] = {}
         if not (np.isfinite(r).all() and np.isfinite(J).all()):
-            return found
-        now, kept = self._misfit(float(r @ r)), self.keep[self.where]
-        for i in np.flatnonzero(kept):
+            return replacements
+        criterion, selection = self._misfit(float(r @ r)), self.keep[self.where]
+        for i in np.flatnonzero(selection):
             s = self.where[i]
-            rest = self.keep & (np.arange(len(self.keep)) != s)
+            remainder = self.keep & (np.arange(len(self.keep)) != s)
             # Without the term: its part of the prediction is removed, the rest adapts.
-            bare, (Q, _) = r - J[:, s] * self.best[s], np.linalg.qr(J[:, rest])
+            bare, (Q, _) = r - J[:, s] * self.best[s], np.linalg.qr(J[:, remainder])
             bare = bare - Q @ (Q.T @ bare)
-            others = []
-            for k in np.flatnonzero(~kept):
-                other = J[:, self.where[k]]
-                own = other - Q @ (Q.T @ other)
-                if own @ own <= 1e-18 * (other @ other):
+            candidates = []
+            for k in np.flatnonzero(~selection):
+                column = J[:, self.where[k]]
+                component = column - Q @ (Q.T @ column)
+                if component @ component <= 1e-18 * (column @ column):
                     continue
-                left = bare - own * (own @ bare) / (own @ own)
-                rise = self._misfit(float(left @ left)) - now
+                residual = bare - component * (component @ bare) / (component @ component)
+                rise = self._misfit(float(residual @ residual)) - criterion
                 if rise < self.penalty:
-                    others.append((self.library.names[k], rise))
-            if others:
-                found[self.library.names[i]] = sorted(others, key=lambda pair: pair[1])
-        return found
+                    candidates.append((self.library.names[k], rise))
+            if candidates:
+                replacements[self.library.names[i]] = sorted(candidates, key=lambda pair: pair[1])
+        return replacements
 
 
-def _without(u: np.ndarray, J: np.ndarray, s: int, rest: np.ndarray) -> np.ndarray:
+def _eliminate(u: np.ndarray, J: np.ndarray, s: int, remainder: np.ndarray) -> np.ndarray:
     """Variables without number s, the rest moved so that predictions change least, to first
     order."""
-    moved = u.copy()
-    moved[s] = 0.0
-    if rest.any():
-        scale = inverse_or(np.linalg.norm(J[:, rest], axis=0), 0.0)
-        shift = np.linalg.lstsq(J[:, rest] * scale, J[:, s] * u[s], rcond=1e-10)[0]
-        moved[rest] += shift * scale
-    return moved
+    variables = u.copy()
+    variables[s] = 0.0
+    if remainder.any():
+        scale = inverse_or(np.linalg.norm(J[:, remainder], axis=0), 0.0)
+        shift = np.linalg.lstsq(J[:, remainder] * scale, J[:, s] * u[s], rcond=1e-10)[0]
+        variables[remainder] += shift * scale
+    return variables

@@ -17,17 +17,17 @@ from .library import KEY, ForceLibrary, with_force
 from .losses import LeastSquares, Loss
 from .model import specification
 from .observations import Data, Observations, as_arcs
+from .optimise import FIT_RESULTS, FitError
 from .parameters import Prior
 from .problem import Problem
 from .result import FitResult, with_error
-from .results import FIT_RESULTS, FitError
 
 _GUARD = 3.0
 """Width of a prior: the change of the predictions by the candidate alone, to first order, in
 scatters of the data. It hardly affects terms that the data determine, and holds combinations that
 they do not."""
 
-_UNKNOWN = 1e-3
+_PROVISIONAL_ERROR = 1e-3
 """Provisional errors of data without any, in scatters of the data."""
 
 
@@ -81,14 +81,14 @@ class Identification:
         for name, c, s in zip(self.terms, self.coefficients, self.sigma, strict=True):
             lines.append(f"  {name:{width}}  {with_error(float(c), float(s))}")
         # Where the criterion is least, and what the next removal costs.
-        at = next(i for i, step in enumerate(self.path) if step.terms == self.terms)
-        here, *after = self.path[at : at + 2]
-        words = f"criterion {all_terms.criterion:.6g} with all, {here.criterion:.6g} here"
-        words += "".join(f", {a.criterion:.6g} without {a.removed}" for a in after)
+        index = next(i for i, step in enumerate(self.path) if step.terms == self.terms)
+        stage, *removals = self.path[index : index + 2]
+        words = f"criterion {all_terms.criterion:.6g} with all, {stage.criterion:.6g} here"
+        words += "".join(f", {a.criterion:.6g} without {a.removed}" for a in removals)
         lines.append(words)
-        for name, others in self.alternatives.items():
-            these = ", ".join(f"{other} (criterion {rise:+.2g})" for other, rise in others)
-            lines.append(f"not unique: in place of {name} the data allow {these}")
+        for name, replacements in self.alternatives.items():
+            listing = ", ".join(f"{other} (criterion {rise:+.2g})" for other, rise in replacements)
+            lines.append(f"not unique: in place of {name} the data allow {listing}")
         lines += [f"not determined among all {count}: {words}" for words in self.undetermined]
         if self.fit is not None:
             chi2 = f", reduced chi² {self.fit.reduced_chi2:.4g}" if self.fit.has_errors else ""
@@ -151,43 +151,50 @@ def identify(
     """
     params = {} if params is None else params
     _check_input(library, params, bounds, priors, loss, penalty, options)
-    arcs, many = as_arcs(data)
-    whole = _extended(model, library, many, params)
+    arcs, is_list = as_arcs(data)
+    full_model = _with_library(model, library, is_list, params)
     start = {**params, KEY: dict.fromkeys(library.names, 0.0)}
-    weighed = [_with_errors(arc) for arc in arcs]
-    guard = _guard(Problem(whole, weighed, many, start, bounds=bounds, loss=loss), library)
-    held = {"bounds": bounds, "priors": {**(priors or {}), KEY: guard}, "loss": loss}
+    arcs_with_errors = [_with_errors(arc) for arc in arcs]
+    guard = _guard(
+        Problem(full_model, arcs_with_errors, is_list, start, bounds=bounds, loss=loss), library
+    )
+    setting = {"bounds": bounds, "priors": {**(priors or {}), KEY: guard}, "loss": loss}
     common = {name: options[name] for name in _OPTIONS if name in options}
     first = {name: options[name] for name in _OF_FIRST if name in options}
-    first |= {**common, **held, "check_curvature": False, "throw": False}
+    first |= {**common, **setting, "check_curvature": False, "throw": False}
     full: Any = None
-    for again in ({}, {"horizons": None}):
+    for change in ({}, {"horizons": None}):
         # A fit of the beginning may diverge later; without a force nothing does.
-        full = fit(whole, weighed if many else weighed[0], start, **{**first, **again})
+        full = fit(
+            full_model,
+            arcs_with_errors if is_list else arcs_with_errors[0],
+            start,
+            **{**first, **change},
+        )
         if full.status != "not_finite":
             break
     else:
         raise FitError(
-            "dvi.identify fits all terms of library first, and this fit failed. "
-            f"{FIT_RESULTS[full.result]} Its result is in the attribute `fit` of this error.",
+            "the first fit of dvi.identify, with all terms of library, failed (see the attribute "
+            f"`fit`). {FIT_RESULTS[full.result]}",
             full,
         )
-    problem = Problem(whole, weighed, many, full.params, **held)
+    problem = Problem(full_model, arcs_with_errors, is_list, full.params, **setting)
     search = Elimination(problem, library, penalty, arcs[0].has_errors)
     search.eliminate()
     terms = search.terms
     best: Any = problem.space.to_params(problem.space.to_x(jnp.asarray(search.best)))
-    given: Any = {**best, KEY: {name: best[KEY][name] for name in terms}}
-    found, c, sigma = None, np.zeros(0), np.zeros(0)
-    if terms or set(given) != {KEY}:
+    values: Any = {**best, KEY: {name: best[KEY][name] for name in terms}}
+    final, c, sigma = None, np.zeros(0), np.zeros(0)
+    if terms or set(values) != {KEY}:
         # The remaining terms by `fit` itself: errors, residuals, statuses.
         common |= {"bounds": bounds, "priors": priors, "loss": loss, "horizons": None}
         common |= {"check_curvature": options.get("check_curvature", False), "throw": throw}
-        found = fit(whole, data, given, **common)
-        given = found.params
-        at = [found.names.index(f"{KEY}.{name}") for name in terms]
-        c, sigma = found.x[at], found.sigma[at]
-    spec = whole.known({k: v for k, v in given.items() if k != KEY}, 0)
+        final = fit(full_model, data, values, **common)
+        values = final.params
+        indices = [final.names.index(f"{KEY}.{name}") for name in terms]
+        c, sigma = final.x[indices], final.sigma[indices]
+    spec = full_model.base_specification({k: v for k, v in values.items() if k != KEY}, 0)
     system = spec["system"]
     if terms:
         system = with_force(system, library.only(terms).with_coefficients(c))
@@ -201,7 +208,7 @@ def identify(
         penalty=search.penalty,
         alternatives=search.alternatives(),
         undetermined=search.undetermined,
-        fit=found,
+        fit=final,
         full=full,
     )
 
@@ -209,27 +216,29 @@ def identify(
 def _check_input(
     library: Any, params: Any, bounds: Any, priors: Any, loss: Any, penalty: Any, options: Any
 ) -> None:
-    known = (*_OPTIONS, *_OF_FIRST, "check_curvature")
+    option_names = (*_OPTIONS, *_OF_FIRST, "check_curvature")
     for name in options:
-        if name not in known:
-            raise TypeError(f"dvi.identify has no option {name!r}: use one of {', '.join(known)}.")
+        if name not in option_names:
+            raise TypeError(
+                f"dvi.identify has no option {name!r}: use one of {', '.join(option_names)}."
+            )
     instance("library", library, ForceLibrary, "a dvi.ForceLibrary")
     if library.coefficients is not None:
         raise ValueError("library already has coefficients: make a dvi.ForceLibrary without them.")
     losses = "dvi.LeastSquares(), dvi.SoftL1() or dvi.Cauchy()"
     instance("loss", loss, Loss, losses, "Terms are distinguished from noise by residuals.")
-    for name, given in (("params", params), ("bounds", bounds), ("priors", priors)):
-        instance(name, {} if given is None else given, Mapping, "a dict or None")
-        if given is not None and KEY in given:
+    for name, value in (("params", params), ("bounds", bounds), ("priors", priors)):
+        instance(name, {} if value is None else value, Mapping, "a dict or None")
+        if value is not None and KEY in value:
             raise ValueError(
-                f"{name} must not contain the key {KEY!r}: remove or rename this key. dvi.identify "
-                "adds the coefficients of library to the parameters under this key."
+                f"{name} must not contain the key {KEY!r}, to which dvi.identify adds the "
+                "coefficients."
             )
     if penalty is not None:
         positive("penalty", penalty)
 
 
-class _Extended(eqx.Module):
+class _ModelWithLibrary(eqx.Module):
     """The user's model with the library's force, for parameters with coefficients.
 
     - `alone`: whether the model leaves ε out, which is then 1. Decided beforehand: inside of
@@ -238,17 +247,17 @@ class _Extended(eqx.Module):
 
     model: Any
     library: ForceLibrary
-    many: bool = eqx.field(static=True)
+    is_list: bool = eqx.field(static=True)
     alone: bool = eqx.field(static=True)
 
-    def known(self, params: Mapping[str, Any], arc: Any) -> dict[str, Any]:
+    def base_specification(self, params: Mapping[str, Any], arc: Any) -> dict[str, Any]:
         """The specification of the user's model, its ε included."""
-        spec = specification(self.model, params, arc, self.many)
+        spec = specification(self.model, params, arc, self.is_list)
         return {**spec, "epsilon": 1.0} if self.alone else spec
 
     def __call__(self, params: Mapping[str, Any], arc: Any) -> dict[str, Any]:
         c = params[KEY]
-        spec = self.known({k: v for k, v in params.items() if k != KEY}, arc)
+        spec = self.base_specification({k: v for k, v in params.items() if k != KEY}, arc)
         if not c:
             return spec
         library = self.library.only(c)
@@ -256,32 +265,29 @@ class _Extended(eqx.Module):
         return {**spec, "system": with_force(spec["system"], library), "args": args}
 
 
-def _extended(
-    model: Callable[..., Any], library: ForceLibrary, many: bool, params: Mapping[str, Any]
-) -> _Extended:
+def _with_library(
+    model: Callable[..., Any], library: ForceLibrary, is_list: bool, params: Mapping[str, Any]
+) -> _ModelWithLibrary:
     """The model with the library; refuses one to which it cannot be added."""
-    spec = specification(model, params, 0, many)
+    spec = specification(model, params, 0, is_list)
     args, system, epsilon = spec.get("args"), spec["system"], spec.get("epsilon", 0.0)
     if not (args is None or (isinstance(args, Mapping) and KEY not in args)):
         raise TypeError(
-            f"args of the model must be None or a dict without the key {KEY!r}, got {args!r:.200}. "
-            "Use a dict with other keys: dvi.identify adds the coefficients under this key."
+            f"args of the model must be None or a dict without the key {KEY!r}, got {args!r:.200}."
         )
     is_perturbed = system.force is not None or system.perturbation is not None
     if "epsilon" in params and not is_perturbed:
         raise ValueError(
-            "epsilon and the coefficients of library cannot both be fitted, since the system of "
-            "the model has no force and no perturbation: only their product is determined by the "
-            "data. Remove epsilon from params."
+            "epsilon and the coefficients of library cannot both be fitted, since the system has "
+            "no other force: only their product is determined. Remove epsilon from params."
         )
-    alone = not np.any(np.asarray(epsilon)) and "epsilon" not in params
-    if alone and is_perturbed:
+    is_alone = not np.any(np.asarray(epsilon)) and "epsilon" not in params
+    if is_alone and is_perturbed:
         raise ValueError(
-            "the model must have an epsilon other than 0, since its system has a force or a "
-            "perturbation: epsilon = 0 (the default) would remove this term and the library. Let "
-            "the model return another epsilon, or add epsilon to params."
+            "the model must have an epsilon other than 0, got epsilon = 0 (the default), which "
+            "removes the force of its system and the library."
         )
-    return _Extended(model, library, many, alone)
+    return _ModelWithLibrary(model, library, is_list, is_alone)
 
 
 def _with_errors(arc: Observations) -> Observations:
@@ -289,7 +295,7 @@ def _with_errors(arc: Observations) -> Observations:
     if arc.has_errors:
         return arc
     scatter = float(np.nanstd(arc.values)) or float(np.nanmax(np.abs(arc.values))) or 1.0
-    return replace(arc, sigma=_UNKNOWN * scatter)
+    return replace(arc, sigma=_PROVISIONAL_ERROR * scatter)
 
 
 def _guard(problem: Problem, library: ForceLibrary) -> dict[str, Prior]:

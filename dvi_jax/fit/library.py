@@ -19,7 +19,7 @@ from ..problem.system import System
 KEY = "coefficients"
 """Key of the coefficients in args and parameters."""
 
-_RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+_SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 class ForceLibrary(eqx.Module):
@@ -53,10 +53,10 @@ class ForceLibrary(eqx.Module):
         for name, function in candidates.items():
             instance("the name of a candidate", name, str, "a string")
             if not (callable(function) and accepts(function, 5)):
-                seen = signature_of(function) if callable(function) else f"{function!r:.200}"
+                description = signature_of(function) if callable(function) else f"{function!r:.200}"
                 raise TypeError(
                     f"the candidate {name!r} must be a function with the five arguments "
-                    f"(t0, t1, q0, p1, args), got {seen}."
+                    f"(t0, t1, q0, p1, args), got {description}."
                 )
         self.functions, self.names = tuple(candidates.values()), tuple(candidates)
         if coefficients is not None:
@@ -110,11 +110,13 @@ class ForceLibrary(eqx.Module):
             return self.coefficients
         if not (isinstance(args, Mapping) and KEY in args):
             other = "None" if args is None else "an object that is not a dict"
-            seen = f"a dict with the keys {list(args)}" if isinstance(args, Mapping) else other
+            description = (
+                f"a dict with the keys {list(args)}" if isinstance(args, Mapping) else other
+            )
             raise ValueError(
-                f'args["{KEY}"] is missing: it must contain the coefficients of a dvi.ForceLibrary '
-                f'that was made without coefficients. Got {seen}. Give args={{"{KEY}": c}} with an '
-                f"array c of shape ({len(self.names)},), or use library.with_coefficients(c)."
+                f'args["{KEY}"] must contain the coefficients of a dvi.ForceLibrary, an array of '
+                "shape "
+                f"({len(self.names)},), got {description}."
             )
         c = jnp.asarray(args[KEY])
         self._check_shape(c, f'args["{KEY}"]')
@@ -134,17 +136,16 @@ class ForceLibrary(eqx.Module):
     def __add__(self, other: "ForceLibrary") -> "ForceLibrary":
         if not isinstance(other, ForceLibrary):
             return NotImplemented
-        both = sorted(set(self.names) & set(other.names))
-        if both:
+        duplicates = sorted(set(self.names) & set(other.names))
+        if duplicates:
             raise ValueError(
-                f"a sum cannot have two candidates {both[0]!r}, but both libraries have it. Rename "
-                "it in one library, or select the other candidates there with library.only(names)."
+                f"both libraries of the sum have a candidate {duplicates[0]!r}: rename one, or "
+                "select the others with library.only(names)."
             )
         if (self.coefficients is None) != (other.coefficients is None):
             raise ValueError(
-                "either both libraries of a sum must have coefficients, or neither. Here only the "
-                f"{'second' if self.coefficients is None else 'first'} library has them: give "
-                "coefficients to the other one with library.with_coefficients(c)."
+                f"only the {'second' if self.coefficients is None else 'first'} library of the "
+                "sum has coefficients: both must have them, or neither."
             )
         c = None
         if self.coefficients is not None and other.coefficients is not None:
@@ -156,20 +157,20 @@ class ForceLibrary(eqx.Module):
 
         **Raises** `ValueError` for an unknown name.
         """
-        names = self._known(names)
-        at = np.array([i for i, name in enumerate(self.names) if name in names], int)
-        c = None if self.coefficients is None else self.coefficients[at]
-        return ForceLibrary({self.names[i]: self.functions[i] for i in at}, c)
+        names = self._require(names)
+        indices = np.array([i for i, name in enumerate(self.names) if name in names], int)
+        c = None if self.coefficients is None else self.coefficients[indices]
+        return ForceLibrary({self.names[i]: self.functions[i] for i in indices}, c)
 
     def with_coefficients(self, coefficients: Any) -> "ForceLibrary":
         """The same with coefficients: an array in the order of names, or a dict of the nonzero
         ones."""
         if isinstance(coefficients, Mapping):
-            self._known(coefficients)
+            self._require(coefficients)
             coefficients = [coefficients.get(name, 0.0) for name in self.names]
         return ForceLibrary(self._candidates(), coefficients)
 
-    def _known(self, names: Iterable[str]) -> tuple[str, ...]:
+    def _require(self, names: Iterable[str]) -> tuple[str, ...]:
         hint = " Give a list of names, not one string." if isinstance(names, str) else ""
         names = tuple(names)
         for name in names:
@@ -196,9 +197,8 @@ class _Monomial(eqx.Module):
         del t0, t1, args
         if q0.shape != (self.n,):
             raise ValueError(
-                f"q0 must have shape ({self.n},), because the library was made by "
-                f"dvi.ForceLibrary.monomials(degree, n) with n = {self.n}, got shape {q0.shape}. "
-                "Set n to the length of q0; q0 must have exactly one axis."
+                f"q0 must have shape ({self.n},), as in dvi.ForceLibrary.monomials(degree, n) "
+                f"with n = {self.n}, got shape {q0.shape}."
             )
         value = jnp.ones((), q0.dtype)
         for (v, i), power in self.powers:
@@ -211,18 +211,18 @@ class _Monomial(eqx.Module):
         parts = []
         for (v, i), power in self.powers:
             base = v if self.n == 1 else f"{v}{i + 1}"
-            parts.append(base if power == 1 else base + str(power).translate(_RAISED))
+            parts.append(base if power == 1 else base + str(power).translate(_SUPERSCRIPTS))
         return " ".join([*(parts or ["1"]), *([] if self.n == 1 else [f"e{self.k + 1}"])])
 
 
 class _Sum(eqx.Module):
     """A known force and an unknown one."""
 
-    known: Callable[..., Any]
+    force: Callable[..., Any]
     library: ForceLibrary
 
     def __call__(self, t0, t1, q0, p1, args):
-        return self.known(t0, t1, q0, p1, args) + self.library(t0, t1, q0, p1, args)
+        return self.force(t0, t1, q0, p1, args) + self.library(t0, t1, q0, p1, args)
 
 
 def with_force(system: System, library: ForceLibrary) -> System:

@@ -32,7 +32,7 @@ _OPTIONS = (
     *("integrator", "num_steps"),
 )
 _MAY_BE_FITTED = ("q0", "p0", "epsilon", "args")
-_OWN = {
+_REASONS = {
     "num_steps": "it follows from h and the times of the data",
     "save": "the times of the data determine which states are saved",
     "stop": "each run must reach the last time of the data",
@@ -64,7 +64,7 @@ class Model(eqx.Module):
     """
 
     fixed: dict[str, Any]
-    rest: dict[str, Any]
+    settings: dict[str, Any]
 
     def __init__(
         self,
@@ -80,45 +80,43 @@ class Model(eqx.Module):
         instance("system", system, System, "a dvi.System")
         for name in options:
             if name not in _OPTIONS:
-                known = ", ".join(("system", "h", *_MAY_BE_FITTED, *_OPTIONS))
-                hint = _OWN.get(name, f"its arguments are {known}")
+                arguments = ", ".join(("system", "h", *_MAY_BE_FITTED, *_OPTIONS))
+                hint = _REASONS.get(name, f"its arguments are {arguments}")
                 raise TypeError(f"dvi.Model has no argument {name!r}: {hint}.")
         # Arrays, so that another value needs no other compilation.
         fixed = {"q0": q0, "p0": p0, "epsilon": epsilon, "args": args}
         self.fixed = jax.tree.map(_as_array, fixed)
-        self.rest = {"system": system, "h": check_step_size(h), **options}
+        self.settings = {"system": system, "h": check_step_size(h), **options}
 
     def __call__(self, params: Mapping[str, Any], arc: Any = None) -> dict[str, Any]:
         """The arguments of `integrate` for an arc (None: there is one, without rows)."""
-        allowed = ", ".join(_MAY_BE_FITTED)
+        keys = ", ".join(_MAY_BE_FITTED)
         if not isinstance(params, Mapping):
             kind = f"an object of type {type(params).__name__}"
             raise TypeError(
-                f"params of a dvi.Model must be a dict with keys among {allowed}, got "
-                f"{'a number or an array' if hasattr(params, 'shape') else kind}. For other "
-                "parameters write the model as a function of params that returns the arguments of "
-                "dvi.integrate as a dict."
+                f"params of a dvi.Model must be a dict with keys among {keys}, got "
+                f"{'a number or an array' if hasattr(params, 'shape') else kind}. For others write "
+                "the model as a function of params."
             )
-        found = dict(self.fixed)
+        values = dict(self.fixed)
         for name, value in params.items():
             if name not in _MAY_BE_FITTED:
                 raise TypeError(
-                    f"params of a dvi.Model must be a dict with keys among {allowed}, got the key "
-                    f"{name!r}. If it is a parameter of the system, put it into args: "
-                    f"{{'args': {{{name!r}: ...}}}}."
+                    f"params of a dvi.Model must be a dict with keys among {keys}, got the key "
+                    f"{name!r}. For a parameter of the system give {{'args': {{{name!r}: ...}}}}."
                 )
-            old = found[name]
-            both = isinstance(old, Mapping) and isinstance(value, Mapping)
-            found[name] = {**old, **value} if both else value
+            old = values[name]
+            mergeable = isinstance(old, Mapping) and isinstance(value, Mapping)
+            values[name] = {**old, **value} if mergeable else value
         for name in ("q0", "p0"):
-            if found[name] is None:
+            if values[name] is None:
                 raise TypeError(
-                    f"{name} is missing: give dvi.Model(..., {name}=...), or an initial value in "
-                    f"params to fit it, {{{name!r}: ...}}."
+                    f"{name} is missing: give dvi.Model(..., {name}=...), or {{{name!r}: ...}} in "
+                    "params."
                 )
             if arc is not None:
-                found[name] = _row(name, found[name], arc)
-        return {**self.rest, **found}
+                values[name] = _row(name, values[name], arc)
+        return {**self.settings, **values}
 
     def check_rows(self, params: Mapping[str, Any], arcs: int) -> None:
         """Reject q0 and p0 with more rows than there are arcs."""
@@ -128,7 +126,7 @@ class Model(eqx.Module):
                 hint = " For a single arc give data without the list." if arcs == 1 else ""
                 raise ValueError(
                     f"the first axis of {name} must have length {arcs}, one row for each arc in "
-                    f"data, got shape {shape}. Give the initial state of every arc.{hint}"
+                    f"data, got shape {shape}.{hint}"
                 )
 
 
@@ -143,42 +141,41 @@ def _row(name: str, rows: Any, arc: Any) -> Array:
     # JAX takes the last row for a number that is too large, without an error.
     if rows.ndim == 0 or (not is_traced(arc) and arc >= len(rows)):
         raise ValueError(
-            f"{name} must have one row for each arc along its first axis, got shape {rows.shape}. "
-            "Give the initial state of every arc, or, for a single arc, data without the list."
+            f"{name} must have one row for each arc, got shape {rows.shape}. For a single arc give "
+            "data without the list."
         )
     return rows[arc]
 
 
-def specification(model: Callable[..., Any], params: PyTree, arc: Any, many: bool) -> dict:
+def specification(model: Callable[..., Any], params: PyTree, arc: Any, is_list: bool) -> dict:
     """The arguments of `integrate` that the model returns for an arc, checked.
 
     **Raises** `TypeError` or `ValueError` for a model that returns something else.
     """
-    called = "a dvi.Model or a function of the parameters that returns the arguments of integrate"
-    instance("model", model, Callable, called)
+    kind = "a dvi.Model or a function of the parameters that returns the arguments of integrate"
+    instance("model", model, Callable, kind)
     if isinstance(model, Model):
-        found = model(params, arc if many else None)
+        spec = model(params, arc if is_list else None)
     else:
-        found = model(params, arc) if accepts(model, 2) else model(params)
+        spec = model(params, arc) if accepts(model, 2) else model(params)
     example = 'dict(system=..., q0=..., p0=..., h=..., epsilon=params["epsilon"])'
-    called = f"a dict of the arguments of dvi.integrate, such as {example}"
-    found = dict(instance("the return value of the model", found, Mapping, called))
+    kind = f"a dict of the arguments of dvi.integrate, such as {example}"
+    spec = dict(instance("the return value of the model", spec, Mapping, kind))
     for name in ("system", "q0", "p0", "h"):
-        if found.get(name) is None:
+        if spec.get(name) is None:
             raise ValueError(
-                f"the model does not return {name!r}, or returns None for it. It must return a "
-                f"dict with values of system, q0, p0 and h. Got the keys {list(found)}."
+                f"the model must return a dict with system, q0, p0 and h; {name!r} is missing or "
+                f"None. Got the keys {list(spec)}."
             )
-    for name in _OWN:
-        if name in found and not (name == "num_steps" and not _is_uniform(found)):
-            raise ValueError(f"the model must not set {name!r}: {_OWN[name]}.")
-    if isinstance(found["h"], jax.Array):
+    for name in _REASONS:
+        if name in spec and not (name == "num_steps" and not _is_uniform(spec)):
+            raise ValueError(f"the model must not set {name!r}: {_REASONS[name]}.")
+    if isinstance(spec["h"], jax.Array):
         raise ValueError(
-            "the step size h of the model must be a Python number such as 0.1, not a parameter or "
-            "another JAX array, because h determines the number of steps. It cannot be fitted; if "
-            "it is a constant, give float(h)."
+            "h of the model must be a Python number such as 0.1, not a parameter or another JAX "
+            "array: it determines the number of steps, and cannot be fitted."
         )
-    return found
+    return spec
 
 
 def _lattice(spec: Mapping[str, Any]) -> Any:
@@ -195,7 +192,7 @@ class Group(eqx.Module):
     """Arcs that are computed together: same observable, about the same number of steps.
 
     Arrays have the arcs in front and are padded to one number of observations N of K components:
-    `arcs` (A,), `t0` (A,), `ts` (A, N), `values` and `seen` (A, N, K), `whiten` (A, N, K) or
+    `arcs` (A,), `t0` (A,), `ts` (A, N), `values` and `mask` (A, N, K), `whiten` (A, N, K) or
     (A, N, K, K). Padding is not seen, and has the time of the last observation. `block` and
     `pick` say how observations are found on the time grid, see `predict`.
     """
@@ -204,7 +201,7 @@ class Group(eqx.Module):
     t0: np.ndarray
     ts: np.ndarray
     values: np.ndarray
-    seen: np.ndarray
+    mask: np.ndarray
     whiten: np.ndarray
     pick: np.ndarray | None
     observe: Callable[..., Any] = eqx.field(static=True)
@@ -212,9 +209,13 @@ class Group(eqx.Module):
     block: int = eqx.field(static=True)
 
 
-def weighed(off: Any, whiten: Any) -> Any:
+def weigh(residual: Any, whiten: Any) -> Any:
     """Residuals in standard errors: by those, or by matrices L⁻¹ of covariances L Lᵀ."""
-    return off * whiten if whiten.ndim == off.ndim else jnp.einsum("...ij,...j->...i", whiten, off)
+    return (
+        residual * whiten
+        if whiten.ndim == residual.ndim
+        else jnp.einsum("...ij,...j->...i", whiten, residual)
+    )
 
 
 def make_groups(arcs: list[Observations], specs: list[dict[str, Any]]) -> list[Group]:
@@ -227,20 +228,21 @@ def make_groups(arcs: list[Observations], specs: list[dict[str, Any]]) -> list[G
     longest, h = max((abs((arc.ts[-1] - arc.t0) / spec["h"]), spec["h"]) for arc, spec in pairs)
     if _is_uniform(specs[0]) and 0 < longest < 0.5:
         raise ValueError(
-            "the last observation must be at least half a step from t0. With h = "
-            f"{h:g} its distance from t0 is only {longest:.3g} steps. Give a smaller |h|, or give "
-            "h and the times of the data in the same unit."
+            f"the last observation must be at least half a step from t0, got {longest:.3g} steps "
+            f"of h = {h:g}. Give a smaller |h|, or give h and times in one unit."
         )
     # Compiling takes seconds for each program; some millions of steps too many do not.
-    apart = len(arcs) * max(steps) - sum(steps) > _WASTE
+    separate = len(arcs) * max(steps) - sum(steps) > _WASTE
     kinds: dict[Any, list[int]] = {}
     for i, (arc, spec) in enumerate(pairs):
-        size = math.ceil(math.log2(steps[i])) if apart else 0
+        size = math.ceil(math.log2(steps[i])) if separate else 0
         key = (arc.function, arc.values.shape[1:], arc.covariance is not None, size, spec["h"])
         kinds.setdefault(key, []).append(i)
     return [
-        make_group(those, [arcs[i] for i in those], specs[those[0]], max(steps[i] for i in those))
-        for those in kinds.values()
+        make_group(
+            members, [arcs[i] for i in members], specs[members[0]], max(steps[i] for i in members)
+        )
+        for members in kinds.values()
     ]
 
 
@@ -256,25 +258,22 @@ def _steps(i: int, arc: Observations, spec: Mapping[str, Any]) -> int:
     if span * h < 0:
         side, direction = ("before", "later") if span < 0 else ("after", "earlier")
         raise ValueError(
-            f"arc {i}: the observations (t = {arc.ts.min():g} to {arc.ts.max():g}) lie {side} t0 "
-            f"= {arc.t0:g}, but h = {h:g} leads to {direction} times. Give h = {-h:g}; or, if q0 "
-            "and p0 belong to another time, give this time as dvi.Observations(..., t0=...). "
-            "The default of t0 is ts[0]."
+            f"arc {i}: the observations (t = {arc.ts.min():g} to {arc.ts.max():g}) lie {side} t0 = "
+            f"{arc.t0:g}, but h = {h:g} leads to {direction} times. Give "
+            f"h = {-h:g}, or dvi.Observations(..., t0=...); t0 is ts[0] by default."
         )
     if not _is_uniform(spec):
         if not isinstance(spec.get("num_steps"), int):
             raise ValueError(
-                "num_steps of the model must be an int, since its lattice is not dvi.Uniform(), "
-                f"got {spec.get('num_steps')!r}. Give the number of steps to the last observation "
-                "in dvi.Model(..., num_steps=...), or in the dict that the model returns."
+                "num_steps of the model must be an int for a lattice other than dvi.Uniform(), "
+                f"got {spec.get('num_steps')!r}."
             )
         return spec["num_steps"]
     steps = span / h
     if steps > 2e9:
         raise ValueError(
-            f"arc {i}: at most 2e9 steps are possible from t0 to the last observation, but h = "
-            f"{h:g} requires {steps:.3g} steps for the time {span:g} between them. Give a larger "
-            "|h|, or give h and the times of the data in the same unit."
+            f"arc {i}: h = {h:g} requires {steps:.3g} steps to the last observation, at most 2e9 "
+            "are possible. Give a larger |h|, or give h and times in one unit."
         )
     return max(1, math.ceil(steps - 1e-9))
 
@@ -285,15 +284,15 @@ def make_group(
     """One group of arcs (`Observations` or parts of them) with `num_steps` steps each."""
     rows = max(len(arc.ts) for arc in arcs)
 
-    def stacked(of, **pad):
-        arrays = [np.asarray(of(arc)) for arc in arcs]
+    def stack(quantity, **pad):
+        arrays = [np.asarray(quantity(arc)) for arc in arcs]
         widths = [np.array([(0, rows - len(x))] + [(0, 0)] * (x.ndim - 1)) for x in arrays]
         return np.stack([np.pad(x, w, **pad) for x, w in zip(arrays, widths, strict=True)])
 
     def flat(arc):
         return arc.values.reshape(len(arc.ts), -1)
 
-    ts, t0 = stacked(lambda arc: arc.ts, mode="edge"), np.array([arc.t0 for arc in arcs])
+    ts, t0 = stack(lambda arc: arc.ts, mode="edge"), np.array([arc.t0 for arc in arcs])
     block, pick = 0, None
     if _is_uniform(spec):
         block, pick = _blocks((ts - t0[:, None]) / float(spec["h"]), num_steps)
@@ -301,9 +300,9 @@ def make_group(
         arcs=np.array(numbers),
         t0=t0,
         ts=ts,
-        values=stacked(lambda arc: np.nan_to_num(flat(arc))),
-        seen=stacked(lambda arc: ~np.isnan(flat(arc))),
-        whiten=stacked(lambda arc: arc.whitening()),
+        values=stack(lambda arc: np.nan_to_num(flat(arc))),
+        mask=stack(lambda arc: ~np.isnan(flat(arc))),
+        whiten=stack(lambda arc: arc.whitening()),
         observe=arcs[0].function,
         num_steps=num_steps,
         block=block,
@@ -318,11 +317,11 @@ def _blocks(places: np.ndarray, num_steps: int) -> tuple[int, np.ndarray | None]
     `places` are times in steps from the start, shape (A, N).
     """
     count = places.shape[1]
-    whole = np.rint(places)
-    if (np.abs(places - whole) <= 1e-9 * np.maximum(1, np.abs(places))).all():
-        block = max(1, int(np.gcd.reduce(whole.astype(np.int64), axis=None)))
+    nodes = np.rint(places)
+    if (np.abs(places - nodes) <= 1e-9 * np.maximum(1, np.abs(places))).all():
+        block = max(1, int(np.gcd.reduce(nodes.astype(np.int64), axis=None)))
         if num_steps / block <= max(64, 16 * count):
-            return min(block, num_steps), (whole / block).astype(np.int64)
+            return min(block, num_steps), (nodes / block).astype(np.int64)
     return max(1, num_steps // (4 * count)), None
 
 
@@ -344,32 +343,32 @@ def predict(
         spec["num_steps"] = group.num_steps
         sol = integrate(**spec, save=Save(every=group.block, final=True))
         if pick is None:
-            qs, ps = _between(spec, t0, ts, sol, group)
+            qs, ps = _states_off_grid(spec, t0, ts, sol, group)
         else:
             qs, ps = sol.qs[pick], sol.ps[pick]
     args = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, spec.get("args"))
-    found = jax.vmap(lambda t, q, p: group.observe(t, q, p, args))(ts, qs, ps)
-    return jnp.reshape(found, (len(ts), -1)), (sol.qs[-1], sol.ps[-1]), sol.result
+    values = jax.vmap(lambda t, q, p: group.observe(t, q, p, args))(ts, qs, ps)
+    return jnp.reshape(values, (len(ts), -1)), (sol.qs[-1], sol.ps[-1]), sol.result
 
 
-def _between(
+def _states_off_grid(
     spec: dict[str, Any], t0: Array, ts: Array, sol: Any, group: Group
 ) -> tuple[Array, Array]:
     """States at times between grid points."""
     stride = group.block * float(spec["h"])
-    before = jnp.ceil((ts - t0) / stride - 1e-9).astype(int) - 1
-    before = jnp.clip(before, 0, group.num_steps // group.block)
-    at = sol.ts[before]
-    none = ts == t0  # no step leads there
-    h = jnp.where(none, stride, ts - at) / group.block
+    index = jnp.ceil((ts - t0) / stride - 1e-9).astype(int) - 1
+    index = jnp.clip(index, 0, group.num_steps // group.block)
+    nodes = sol.ts[index]
+    is_start = ts == t0  # no step leads there
+    h = jnp.where(is_start, stride, ts - nodes) / group.block
 
     def reach(t, q, p, h):
-        own = {**spec, "t0": t, "q0": q, "p0": p, "h": h, "num_steps": group.block}
-        end = integrate(**own, save=Save(final=True))
+        arguments = {**spec, "t0": t, "q0": q, "p0": p, "h": h, "num_steps": group.block}
+        end = integrate(**arguments, save=Save(final=True))
         return end.qs[-1], end.ps[-1]
 
-    qs, ps = jax.vmap(reach)(at, sol.qs[before], sol.ps[before], h)
-    wide = none.reshape(-1, *[1] * (qs.ndim - 1))
+    qs, ps = jax.vmap(reach)(nodes, sol.qs[index], sol.ps[index], h)
+    wide = is_start.reshape(-1, *[1] * (qs.ndim - 1))
     return jnp.where(wide, sol.qs[0], qs), jnp.where(wide, sol.ps[0], ps)
 
 
@@ -386,15 +385,14 @@ def check_observable(i: int, arc: Observations, spec: Mapping[str, Any]) -> bool
     except Exception as error:
         error.add_note(f"(in the observe of arc {i}, called with (t, q, p, args))")
         raise
-    shape, of_one = getattr(out, "shape", None), arc.values.shape[1:]
-    if of_one == () and shape == (1,) and arc.covariance is None:
+    shape, row_shape = getattr(out, "shape", None), arc.values.shape[1:]
+    if row_shape == () and shape == (1,) and arc.covariance is None:
         return True
-    if shape != of_one:
+    if shape != row_shape:
         name = f"observe={arc.observe!r}" if isinstance(arc.observe, str) else "observe"
-        seen = f"an object of type {type(out).__name__}" if shape is None else f"shape {shape}"
+        result = f"an object of type {type(out).__name__}" if shape is None else f"shape {shape}"
         raise ValueError(
             f"arc {i}: values has shape {arc.values.shape}, so observe must return an array of "
-            f"shape {of_one} at each time. Got {seen} from {name}, for q of shape {q.shape}: "
-            "change values or observe."
+            f"shape {row_shape} at each time. Got {result} from {name}, for q of shape {q.shape}."
         )
     return False

@@ -86,15 +86,15 @@ class NetworkForce(eqx.Module):
         self.velocity = function("velocity", _momentum if velocity is None else velocity)
         shape = whole("width", width), whole("depth", depth), function("activation", activation)
         initial = positive("initial", initial)
-        one, two = jax.random.split(key)
+        potential_key, damping_key = jax.random.split(key)
         self.potential_net = self.damping_net = None
         if conservative:
             # A constant of φ is no force: a bias there would be a parameter without effect.
-            net = eqx.nn.MLP(n, 1, *shape, use_final_bias=False, key=one)
+            net = eqx.nn.MLP(n, 1, *shape, use_final_bias=False, key=potential_key)
             self.potential_net = _with_last_layer(net, initial)
         if dissipative:
             inputs = n if damping_of == "q" else 2 * n
-            net = eqx.nn.MLP(inputs, n * (n + 1) // 2, *shape, key=two)
+            net = eqx.nn.MLP(inputs, n * (n + 1) // 2, *shape, key=damping_key)
             # D is quadratic in L and has no slope at L = 0: it begins at initial² on the diagonal.
             start = jnp.asarray(initial * np.eye(n)[np.tril_indices(n)])
             net = _with_last_layer(net, initial)
@@ -107,12 +107,12 @@ class NetworkForce(eqx.Module):
 
     def potential(self, q: State) -> Scalar:
         """φ(q) − φ(0), a scalar [energy]; zero without this part."""
-        q = self._checked(q)
+        q = self._vector(q)
         return self._phi(q) - self._phi(jnp.zeros_like(q))
 
     def conservative(self, q: State) -> State:
         """−∇φ(q), shape (n,)."""
-        return -jax.grad(self._phi)(self._checked(q))
+        return -jax.grad(self._phi)(self._vector(q))
 
     def damping(self, q: State, p: State) -> Array:
         """D = L Lᵀ, symmetric and positive semidefinite, shape (n, n)."""
@@ -122,7 +122,7 @@ class NetworkForce(eqx.Module):
     def dissipation(self, q: State, p: State) -> State:
         """−D v, shape (n,)."""
         if self.damping_net is None:
-            return jnp.zeros_like(self._checked(q))
+            return jnp.zeros_like(self._vector(q))
         L = self._factor(q, p)
         return -L @ (L.T @ self.velocity(q, p))
 
@@ -142,24 +142,23 @@ class NetworkForce(eqx.Module):
 
     def _factor(self, q: Array, p: Array) -> Array:
         """L, lower triangular."""
-        q, p = self._checked(q), self._checked(p)
+        q, p = self._vector(q), self._vector(p)
         if self.damping_net is None:
             return jnp.zeros((self.n, self.n), q.dtype)
         x = q / self.scale_q
         if self.damping_of == "qp":
             x = jnp.concatenate([x, p / self.scale_p])
-        found = self.damping_net(x)
+        entries = self.damping_net(x)
         place = np.zeros((self.n, self.n), int)
-        place[np.tril_indices(self.n)] = np.arange(len(found))
-        return jnp.where(np.tri(self.n, dtype=bool), found[place], 0.0)
+        place[np.tril_indices(self.n)] = np.arange(len(entries))
+        return jnp.where(np.tri(self.n, dtype=bool), entries[place], 0.0)
 
-    def _checked(self, x: Any) -> Array:
+    def _vector(self, x: Any) -> Array:
         x = jnp.asarray(x)
         if x.shape != (self.n,):
             raise ValueError(
                 "q and p of a dvi.NetworkForce(n, ...) must have shape (n,), here with n = "
-                f"{self.n}, got shape {x.shape}. Set n to the length of q; q and p must have "
-                "exactly one axis."
+                f"{self.n}, got shape {x.shape}."
             )
         return x
 

@@ -14,7 +14,7 @@ from ..base.signature import accepts, signature_of
 _RANGE = (1e-140, 1e140)
 """Standard errors relative to the largest value for which a sum of squares can be computed."""
 
-NAMED: dict[str, Callable[..., Any]] = {
+OBSERVABLES: dict[str, Callable[..., Any]] = {
     "positions": lambda t, q, p, args: q,
     "momenta": lambda t, q, p, args: p,
     "state": lambda t, q, p, args: jnp.concatenate([jnp.ravel(q), jnp.ravel(p)]),
@@ -62,12 +62,12 @@ class Observations:
         if np.ma.is_masked(values):
             values = np.ma.filled(values.astype(float), np.nan)
         ts, values = _real("ts", self.ts), _real("values", values)
-        by_name, of = isinstance(self.observe, str), self.observe
-        if not (of in NAMED if by_name else callable(of) and accepts(of, 4)):
-            seen = signature_of(of) if callable(of) else f"{of!r:.200}"
+        is_name, observe = isinstance(self.observe, str), self.observe
+        if not (observe in OBSERVABLES if is_name else callable(observe) and accepts(observe, 4)):
+            description = signature_of(observe) if callable(observe) else f"{observe!r:.200}"
             raise TypeError(
                 'observe must be "positions", "momenta", "state" or a function with the four '
-                f"arguments (t, q, p, args), got {seen}."
+                f"arguments (t, q, p, args), got {description}."
             )
         if ts.ndim != 1 or ts.size == 0:
             raise ValueError(
@@ -83,26 +83,26 @@ class Observations:
         if where := _first(np.isinf(values)):
             raise ValueError(f"values is infinite at index {where}: give NaN for a missing value.")
         if np.isnan(values).all():
-            seen = "all values are NaN" if values.size else f"values has shape {values.shape}"
-            raise ValueError(f"{seen}: give at least one number. NaN means a missing value.")
+            description = (
+                "all values are NaN" if values.size else f"values has shape {values.shape}"
+            )
+            raise ValueError(f"{description}: give at least one number. NaN means a missing value.")
         refuse_unit_or_mask("t0", self.t0)
         t0 = finite("t0", ts[0] if self.t0 is None else self.t0)
         if ts.min() < t0 < ts.max():
             raise ValueError(
-                f"t0 = {t0}, the start of the arc, lies between the times {ts.min()} and "
-                f"{ts.max()} of the observations, but all times must be on one side of t0. Give "
-                f"t0 <= {ts.min()} with h > 0 or t0 >= {ts.max()} with h < 0; q0 and p0 must "
-                "belong to this t0. Alternatively, leave out the observations on one side of t0."
+                f"all times must be on one side of t0 = {t0}, got times from {ts.min()} to "
+                f"{ts.max()}."
             )
-        checked: dict[str, Any] = {"ts": ts, "values": values, "t0": t0}
+        fields: dict[str, Any] = {"ts": ts, "values": values, "t0": t0}
         if self.sigma is not None:
-            checked["sigma"] = _sigma(self.sigma, values)
+            fields["sigma"] = _sigma(self.sigma, values)
         if self.covariance is not None:
             if self.sigma is not None:
                 raise ValueError("sigma and covariance are both given: give only one of them.")
-            checked["covariance"] = _covariance(self.covariance, values)
-        checked["t0_is_given"] = self.t0 is not None
-        for name, value in checked.items():
+            fields["covariance"] = _covariance(self.covariance, values)
+        fields["t0_is_given"] = self.t0 is not None
+        for name, value in fields.items():
             object.__setattr__(self, name, value)
 
     def in_columns(self) -> "Observations":
@@ -113,14 +113,14 @@ class Observations:
     @property
     def function(self) -> Callable[..., Any]:
         """`observe` as a function (t, q, p, args)."""
-        return NAMED[self.observe] if isinstance(self.observe, str) else self.observe
+        return OBSERVABLES[self.observe] if isinstance(self.observe, str) else self.observe
 
-    def ordered(self) -> "Observations":
+    def in_time_order(self) -> "Observations":
         """The same observations in the order in which a run from t0 reaches them."""
         if abs(self.ts[0] - self.t0) <= abs(self.ts[-1] - self.t0):
             return self
-        given = {name: getattr(self, name) for name in ("ts", "values", "sigma", "covariance")}
-        return replace(self, **{n: None if x is None else x[::-1] for n, x in given.items()})
+        fields = {name: getattr(self, name) for name in ("ts", "values", "sigma", "covariance")}
+        return replace(self, **{n: None if x is None else x[::-1] for n, x in fields.items()})
 
     @property
     def components(self) -> int:
@@ -146,16 +146,16 @@ class Observations:
         rows and columns of missing ones are zero.
         """
         flat = self.values.reshape(len(self.ts), -1)
-        seen = ~np.isnan(flat)
+        is_observed = ~np.isnan(flat)
         if self.covariance is None:
             sigma = 1.0 if self.sigma is None else self.sigma.reshape(flat.shape)
-            return np.where(seen, 1 / np.where(seen, sigma, 1.0), 0.0)
-        found = np.zeros((*flat.shape, flat.shape[1]))
-        for i, (C, good) in enumerate(zip(self.covariance, seen, strict=True)):
+            return np.where(is_observed, 1 / np.where(is_observed, sigma, 1.0), 0.0)
+        factors = np.zeros((*flat.shape, flat.shape[1]))
+        for i, (C, good) in enumerate(zip(self.covariance, is_observed, strict=True)):
             if good.any():
                 L = np.linalg.cholesky(C[np.ix_(good, good)])
-                found[i][np.ix_(good, good)] = np.linalg.solve(L, np.eye(len(L)))
-        return found
+                factors[i][np.ix_(good, good)] = np.linalg.solve(L, np.eye(len(L)))
+        return factors
 
 
 Data: TypeAlias = Observations | list[Observations] | tuple[Observations, ...]
@@ -175,12 +175,11 @@ def as_arcs(data: Any) -> tuple[list[Observations], bool]:
         raise ValueError("data is empty: give at least one dvi.Observations.")
     for i, arc in enumerate(data):
         instance(f"data[{i}]", arc, Observations, "a dvi.Observations")
-    known = [arc.has_errors for arc in data]
-    if any(known) and not all(known):
+    with_error_flags = [arc.has_errors for arc in data]
+    if any(with_error_flags) and not all(with_error_flags):
         raise ValueError(
-            f"data[{known.index(False)}] has neither sigma nor covariance, but "
-            f"data[{known.index(True)}] has one of them. Give sigma or covariance for all arcs or "
-            "for none: otherwise the relative weights of the arcs are unknown."
+            f"data[{with_error_flags.index(False)}] has neither sigma nor covariance, but "
+            f"data[{with_error_flags.index(True)}] has one of them: give them for all arcs or none."
         )
     return list(data), True
 
@@ -188,15 +187,15 @@ def as_arcs(data: Any) -> tuple[list[Observations], bool]:
 def _real(name: str, value: Any) -> np.ndarray:
     refuse_unit_or_mask(name, value)
     try:
-        found = np.asarray(value)
+        array = np.asarray(value)
     except (TypeError, ValueError) as error:
         raise TypeError(
-            f"{name} must be an array of real numbers with rows of equal length. NumPy cannot "
-            f"convert this {type(value).__name__}: {str(error).partition(chr(10))[0]}"
+            f"{name} must be an array of real numbers with rows of equal length, got "
+            f"{type(value).__name__}: {str(error).partition(chr(10))[0]}"
         ) from None
-    if found.dtype.kind not in "fiu":
-        raise TypeError(f"{name} must be an array of real numbers, got dtype {found.dtype}.")
-    return found.astype(float)
+    if array.dtype.kind not in "fiu":
+        raise TypeError(f"{name} must be an array of real numbers, got dtype {array.dtype}.")
+    return array.astype(float)
 
 
 def _first(where: np.ndarray) -> list[int]:
@@ -205,27 +204,22 @@ def _first(where: np.ndarray) -> list[int]:
 
 
 def _check_times(ts: np.ndarray) -> None:
-    if at := _first(~np.isfinite(ts)):
-        [i] = at
-        raise ValueError(
-            f"ts[{i}] is {ts[i]}: every time must be finite. Leave out observations without a time."
-        )
+    if index := _first(~np.isfinite(ts)):
+        [i] = index
+        raise ValueError(f"ts[{i}] is {ts[i]}: every time must be finite.")
     steps = np.diff(ts)
-    if at := _first(steps == 0):
-        [i] = at
+    if index := _first(steps == 0):
+        [i] = index
         raise ValueError(
-            f"ts[{i}] and ts[{i + 1}] are the same time, {ts[i]}: give one row for each time. If "
-            "the two rows are different components, use a function observe that returns all of "
-            "them. If they repeat a measurement, give the mean, with its standard error as sigma."
+            f"ts[{i}] and ts[{i + 1}] are the same time, {ts[i]}: give one row for each time, "
+            "with all components, or the mean of repeated measurements."
         )
     is_up = (steps > 0).sum() >= (steps < 0).sum()
-    if at := _first(steps < 0 if is_up else steps > 0):
-        [i] = at
+    if index := _first(steps < 0 if is_up else steps > 0):
+        [i] = index
         raise ValueError(
             f"ts is not in order: ts[{i}] = {ts[i]} is followed by ts[{i + 1}] = {ts[i + 1]}. "
-            "Times must all increase or all decrease. Sort the rows by time: with "
-            "order = np.argsort(ts) give np.array(ts)[order] and np.array(values)[order]. Sort "
-            "sigma or covariance in the same way if it has one entry for each time."
+            "Times must all increase or all decrease: sort the rows by np.argsort(ts)."
         )
 
 
@@ -236,24 +230,21 @@ def _sigma(sigma: Any, values: np.ndarray) -> np.ndarray:
     except ValueError:
         raise ValueError(
             f"sigma must be one number or an array that broadcasts to the shape {values.shape} of "
-            f"values, got shape {sigma.shape}. For one standard error at each time give shape "
-            f"{(len(values), *[1] * (values.ndim - 1))}."
+            f"values, got shape {sigma.shape}."
         ) from None
-    seen = ~np.isnan(values)
-    if at := _first(~(np.isfinite(full) & (full > 0)) & seen):
+    is_observed = ~np.isnan(values)
+    if index := _first(~(np.isfinite(full) & (full > 0)) & is_observed):
         raise ValueError(
-            f"sigma is {full[tuple(at)]} for the value at index {at}: standard errors must be "
-            "positive and finite. To ignore a value, set it to NaN. If an initial value is known "
-            "exactly, give it to the model in q0 or p0 instead."
+            f"sigma is {full[tuple(index)]} for the value at index {index}: standard errors must "
+            "be positive and finite. To ignore a value, set it to NaN."
         )
     largest = np.nanmax(np.abs(values))
     size = largest or 1.0
-    if at := _first(~((full > _RANGE[0] * size) & (full < _RANGE[1] * size)) & seen):
+    if index := _first(~((full > _RANGE[0] * size) & (full < _RANGE[1] * size)) & is_observed):
         raise ValueError(
-            f"sigma is {full[tuple(at)]:g} for the value at index {at}, but the values are up to "
-            f"{largest:.3g}. Here sigma must lie between {_RANGE[0] * size:.3g} and "
-            f"{_RANGE[1] * size:.3g}, the range in which squares of values / sigma can be computed "
-            "in double precision. Give the standard errors in the units of the values."
+            f"sigma is {full[tuple(index)]:g} at index {index}, but values are up to "
+            f"{largest:.3g}: squares "
+            "of their ratio exceed double precision. Give sigma in the units of the values."
         )
     return full
 
@@ -271,12 +262,12 @@ def _covariance(covariance: Any, values: np.ndarray) -> np.ndarray:
     scale = np.sqrt(np.abs(variance))
     skew = np.abs(full - full.swapaxes(1, 2)).max(axis=(1, 2))
     # The comparison is written so that NaN is refused.
-    if at := _first(~(skew <= 1e-10 * (scale.max(axis=1) ** 2 + np.finfo(float).tiny))):
-        [i] = at
-        off = np.nan_to_num(np.abs(full[i] - full[i].T), nan=np.inf, posinf=np.inf)
-        a, b = np.unravel_index(np.argmax(off), off.shape)
+    if index := _first(~(skew <= 1e-10 * (scale.max(axis=1) ** 2 + np.finfo(float).tiny))):
+        [i] = index
+        asymmetry = np.nan_to_num(np.abs(full[i] - full[i].T), nan=np.inf, posinf=np.inf)
+        a, b = np.unravel_index(np.argmax(asymmetry), asymmetry.shape)
         hint = "If these differ only by round-off, give (C + C.T) / 2 for each covariance matrix C."
-        if not np.isfinite(off[a, b]):
+        if not np.isfinite(asymmetry[a, b]):
             hint = "Mark a missing value by NaN in values only, not in covariance."
         raise ValueError(
             f"the covariance of observation {i} must be symmetric and finite, got {full[i, a, b]} "
@@ -286,15 +277,16 @@ def _covariance(covariance: Any, values: np.ndarray) -> np.ndarray:
         unit = full / (scale[:, :, None] * scale[:, None, :])
     good = np.isfinite(unit).all(axis=(1, 2)) & (variance > 0).all(axis=1)
     smallest = np.linalg.eigvalsh(np.where(good[:, None, None], unit, np.eye(k)))[:, 0]
-    if at := _first(~good | (smallest <= 1e-14)):
-        [i] = at
-        seen = "smallest eigenvalue of its correlation matrix must be greater than 1e-14, got "
-        seen += f"{smallest[i]:.3g}"
+    if index := _first(~good | (smallest <= 1e-14)):
+        [i] = index
+        description = (
+            "smallest eigenvalue of its correlation matrix must be greater than 1e-14, got "
+        )
+        description += f"{smallest[i]:.3g}"
         if not good[i]:  # then the correlation matrix is not defined
-            seen = f"variances on its diagonal must be positive, got {variance[i].min():.3g}"
+            description = f"variances on its diagonal must be positive, got {variance[i].min():.3g}"
         raise ValueError(
-            f"the covariance of observation {i} is not positive definite: the {seen}. Correct the "
-            "matrix. If a value or a combination of values is known exactly, leave it out of the "
-            "observations, and write the model so that it has this value."
+            f"the covariance of observation {i} is not positive definite: the {description}. "
+            "Leave out values or combinations that are known exactly."
         )
     return full

@@ -1,4 +1,4 @@
-"""One stage of a fit: an optimiser run step by step, so that it can be watched and resumed."""
+"""One stage of a fit and its status: an optimiser run step by step, watched and resumed."""
 
 import functools
 from collections.abc import Callable
@@ -11,16 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .evaluation import STIFFNESS, Evaluation, undamped
-from .results import FIT_RESULTS
-from .roundoff import settle
+from .roundoff import STIFFNESS, Evaluation, settle, undamped_step
 from .solvers import is_optax
 from .uncertainty import inverse_or
 
-_REJECTED = 12
+_REJECTIONS = 12
 """Rejected steps in a row after which no further step is expected to help."""
 
-_NEAR = 1.0
+_SHORT_STEP = 1.0
 """Length of an undamped step in standard errors up to which a third of them are enough."""
 
 _SMALL = 1e-13
@@ -33,6 +31,50 @@ _REJECTED_ON_LINE = 40
 _FLAT = 1e-3
 """Length of an undamped step in standard errors below which a loss that no longer decreases is at
 its minimum, up to rounding."""
+
+
+class FIT_RESULTS(eqx.Enumeration):
+    """Status of a fit; ``dvi.FIT_RESULTS[fit.result]`` is the text."""
+
+    converged = ""
+    steps_done = "The given number of steps was taken; a stochastic optimiser has no other end."
+    max_steps_reached = (
+        "The optimiser did not converge within max_steps. Likely causes: (a) it needs more steps; "
+        "(b) the data do not determine a direction of the parameters: see the singular values of "
+        "the result; (c) the start is far away: give a better one, or shorter horizons."
+    )
+    stalled = (
+        "No step along the descent makes the loss smaller, though its gradient is not zero. Likely "
+        "causes: (a) the loss is not smooth at this scale: an implicit solve with a loose "
+        "tolerance, a trajectory that is chaotic over the arc (take dvi.MultipleShooting(...)); "
+        "(b) a trajectory that fails for nearby parameters."
+    )
+    not_finite = (
+        "The residuals, the sum of their squares or their derivatives are not finite. Likely "
+        "causes: (a) a trajectory fails at these parameters; (b) a function of the model has no "
+        "derivative there; (c) predictions are larger than the standard errors by more than "
+        "10¹⁵⁰: the trajectory diverges, or sigma is in other units."
+    )
+    discontinuous = (
+        "The segments of multiple shooting do not meet within the tolerance. Likely causes: (a) "
+        "too few steps; (b) segments that are too long for a chaotic trajectory: take more."
+    )
+
+
+NAMES = ("converged", "steps_done", "max_steps_reached", "stalled", "not_finite", "discontinuous")
+
+
+def name_of(result: FIT_RESULTS) -> str:
+    """The short name of a status."""
+    return next(name for name in NAMES if bool(result == getattr(FIT_RESULTS, name)))
+
+
+class FitError(RuntimeError):
+    """Raised by `fit` with ``throw=True`` when it did not converge; `fit` is the `FitResult`."""
+
+    def __init__(self, message: str, fit: object = None):
+        super().__init__(message)
+        self.fit = fit
 
 
 class Record(NamedTuple):
@@ -103,8 +145,8 @@ class Task:
 # Optimistix differentiates the residual function itself. Here it gets a function whose value and
 # derivative are inputs, so that the one large program, that of both, is called outside of its step.
 @eqx.filter_custom_jvp
-def _residual(z, known):
-    return known[0]
+def _residual(z, linearisation):
+    return linearisation[0]
 
 
 @_residual.def_jvp
@@ -113,32 +155,34 @@ def _(primals, tangents):
     return residual, jacobian @ tangents[0]
 
 
-def _function(z, known):
-    return _residual(z, known), None
+def _function(z, linearisation):
+    return _residual(z, linearisation), None
 
 
 def _begin(solver: Any, rows: int, size: int) -> Any:
     """The state of a solver before its first step."""
     try:
-        return _kept(solver, rows, size)
+        return _cached_state(solver, rows, size)
     except TypeError:  # a solver that holds arrays has no hash
         return _state(solver, rows, size)
 
 
 def _state(solver: Any, rows: int, size: int) -> Any:
-    z, known = jnp.zeros(size), (jnp.zeros(rows), jnp.zeros((rows, size)))
-    shape = jax.ShapeDtypeStruct((rows,), known[0].dtype)
-    return solver.init(_function, z, known, {}, shape, None, frozenset())
+    z, linearisation = jnp.zeros(size), (jnp.zeros(rows), jnp.zeros((rows, size)))
+    shape = jax.ShapeDtypeStruct((rows,), linearisation[0].dtype)
+    return solver.init(_function, z, linearisation, {}, shape, None, frozenset())
 
 
 # One object for each solver and shape: a state holds functions, and another one would make the
 # step compile again.
-_kept = functools.lru_cache(maxsize=64)(_state)
+_cached_state = functools.lru_cache(maxsize=64)(_state)
 
 
 @eqx.filter_jit
-def _advance(solver: Any, z: Array, known: tuple[Any, Any], state: Any) -> tuple[Array, Any]:
-    z, state, _ = solver.step(_function, z, known, {}, state, frozenset())
+def _advance(
+    solver: Any, z: Array, linearisation: tuple[Any, Any], state: Any
+) -> tuple[Array, Any]:
+    z, state, _ = solver.step(_function, z, linearisation, {}, state, frozenset())
     return z, state
 
 
@@ -159,7 +203,7 @@ class LeastSquaresStage:
         self.evaluate, self._solver = evaluate, solver
         self.shifts: np.ndarray | None = None
 
-    def at(self, u: np.ndarray, horizon: float = np.inf, extra: Any = None) -> Evaluation:
+    def values_at(self, u: np.ndarray, horizon: float = np.inf, extra: Any = None) -> Evaluation:
         """Residual, Jacobian and the rest at u."""
         return self.evaluate(jnp.asarray(u), jnp.asarray(horizon), extra)
 
@@ -178,7 +222,7 @@ class LeastSquaresStage:
         """
         horizon, tolerance, self.shifts = task.horizon, task.tolerance, None
         u = u if task.resume is None else task.resume.u
-        best = self.at(u, horizon, extra) if first is None else first
+        best = self.values_at(u, horizon, extra) if first is None else first
         trial, state = best, _begin(self._solver, *best.jacobian.shape)
         if task.resume is None:
             square = np.sum(np.square(best.residual))
@@ -188,69 +232,71 @@ class LeastSquaresStage:
             trial, state = None, _with_leaves(state, task.resume.leaves)
             _check_same(best.residual, state.f_info.residual)
         length = np.linalg.norm(np.asarray(best.jacobian), axis=0)
-        at = task.begin(u, inverse_or(length, 1.0, STIFFNESS))
-        base, scale, z = at.base, at.scale, jnp.asarray(at.z)
-        while not at.status and at.done < task.max_steps:
+        position = task.begin(u, inverse_or(length, 1.0, STIFFNESS))
+        base, scale, z = position.base, position.scale, jnp.asarray(position.z)
+        while not position.status and position.done < task.max_steps:
             if trial is None:
-                trial = self.at(base + scale * np.asarray(state.y_eval), horizon, extra)
-            known = trial.residual, np.asarray(trial.jacobian) * scale
-            z, state = _advance(self._solver, z, known, state)
+                trial = self.values_at(base + scale * np.asarray(state.y_eval), horizon, extra)
+            linearisation = trial.residual, np.asarray(trial.jacobian) * scale
+            z, state = _advance(self._solver, z, linearisation, state)
             accepted = int(state.num_steps_since_acceptance) == 0
-            best, at.rejected = (trial, 0) if accepted else (best, at.rejected + 1)
+            best, position.rejected = (trial, 0) if accepted else (best, position.rejected + 1)
             trial = None
             residual = np.asarray(best.residual)
             loss = float(residual @ residual) / 2
             spread = np.sqrt(2 * loss / max(degrees, 1))
-            ahead = scale * np.subtract(state.y_eval, z)
-            moved = float(np.linalg.norm(np.asarray(best.jacobian) @ ahead))
-            at.done, at.z = at.done + 1, np.asarray(z)
-            at.leaves, at.extra = _leaves(state), _leaves(extra)
-            u = at.u
-            least = tolerance * spread
+            displacement = scale * np.subtract(state.y_eval, z)
+            change = float(np.linalg.norm(np.asarray(best.jacobian) @ displacement))
+            position.done, position.z = position.done + 1, np.asarray(z)
+            position.leaves, position.extra = _leaves(state), _leaves(extra)
+            u = position.u
+            threshold = tolerance * spread
             if accepted:  # at a bound the free variable grows for ever, and nothing changes
-                at.still = at.still + 1 if at.last - loss <= (tolerance * spread) ** 2 else 0
-                at.last = loss
-            ended = at.still >= 3 or (moved <= least and at.rejected < 3)
-            if not np.isfinite(moved):
-                at.status = "stalled"
-            elif ended and undamped(best, scale)[1] <= least:
+                position.still = (
+                    position.still + 1 if position.last - loss <= (tolerance * spread) ** 2 else 0
+                )
+                position.last = loss
+            is_end = position.still >= 3 or (change <= threshold and position.rejected < 3)
+            if not np.isfinite(change):
+                position.status = "stalled"
+            elif is_end and undamped_step(best, scale)[1] <= threshold:
                 # A step may be small because of its damping: the undamped one decides.
-                at.status = "converged"
+                position.status = "converged"
             elif (
-                at.rejected >= _REJECTED
-                or (at.rejected >= 3 and moved <= least)
-                or (at.rejected and _is_near(at, undamped(best, scale)[1], spread))
+                position.rejected >= _REJECTIONS
+                or (position.rejected >= 3 and change <= threshold)
+                or (position.rejected and _is_near(position, undamped_step(best, scale)[1], spread))
             ):
-                at.status = "stalled"
-            in_sigma = moved / spread if spread else 0.0
-            task.watch(Record(task.stage, horizon, loss, in_sigma, accepted, u), at)
-        status = at.status or "max_steps_reached"
+                position.status = "stalled"
+            in_sigma = change / spread if spread else 0.0
+            task.watch(Record(task.stage, horizon, loss, in_sigma, accepted, u), position)
+        status = position.status or "max_steps_reached"
         if status == "stalled" and horizon == np.inf:  # of a part of the data it does not matter
             spread = float(np.linalg.norm(best.residual)) / np.sqrt(max(degrees, 1))
-            flat, small = _FLAT * spread, _SMALL * at.reach
-            end = settle(lambda u: self.at(u, horizon, extra), u, best, scale, flat, small)
+            flat, small = _FLAT * spread, _SMALL * position.reach
+            end = settle(lambda u: self.values_at(u, horizon, extra), u, best, scale, flat, small)
             if end is not None:
                 u, best, self.shifts = end
                 status = "converged"
         return u, best, getattr(FIT_RESULTS, status)
 
 
-def _is_near(at: Position, size: float, spread: float) -> bool:
+def _is_near(position: Position, size: float, spread: float) -> bool:
     """Whether the undamped step is small enough for round-off to be why steps are rejected."""
-    few = at.rejected >= _REJECTED // 3
-    return size <= max(_NEAR * spread * few, _SMALL * at.reach)
+    has_rejections = position.rejected >= _REJECTIONS // 3
+    return size <= max(_SHORT_STEP * spread * has_rejections, _SMALL * position.reach)
 
 
-def _scalar_function(core: Any, per: float) -> Callable[..., Any]:
+def _scalar_function(core: Any, divisor: float) -> Callable[..., Any]:
     """The scalar loss over `per` for optimistix, a function of z and (base, scale, horizon, arcs).
 
     Its derivative is by reverse mode, whichever mode the solver uses: memory does not grow with the
     number of steps.
     """
 
-    def value(z, known):
-        base, scale, horizon, choice = known
-        return core.scalar(base + scale * z, horizon, choice) / per
+    def value(z, setting):
+        base, scale, horizon, choice = setting
+        return core.scalar(base + scale * z, horizon, choice) / divisor
 
     function = eqx.filter_custom_jvp(value)
 
@@ -259,27 +305,27 @@ def _scalar_function(core: Any, per: float) -> Callable[..., Any]:
         loss, slope = jax.value_and_grad(value)(*primals)
         return loss, slope @ tangents[0]
 
-    return lambda z, known: (function(z, known), None)
+    return lambda z, setting: (function(z, setting), None)
 
 
 @eqx.filter_jit
 def _descend(
-    solver: Any, core: Any, per: float, z: Array, known: tuple, state: Any
+    solver: Any, core: Any, divisor: float, z: Array, setting: tuple, state: Any
 ) -> tuple[Array, Any, Array]:
-    function = _scalar_function(core, per)
-    new, state, _ = solver.step(function, z, known, {}, state, frozenset())
-    ended, _ = solver.terminate(function, new, known, {}, state, frozenset())
-    return new, state, ended
+    function = _scalar_function(core, divisor)
+    new, state, _ = solver.step(function, z, setting, {}, state, frozenset())
+    is_end, _ = solver.terminate(function, new, setting, {}, state, frozenset())
+    return new, state, is_end
 
 
 class ScalarStage:
     """A minimiser of optimistix, or one of optax, on the scalar loss, in u = base + scale z.
 
-    - `core`: has ``scalar(u, horizon, choice)``, the loss. `per`: what it is divided by.
+    - `core`: has ``scalar(u, horizon, choice)``, the loss. `divisor`: what it is divided by.
     """
 
-    def __init__(self, core: Any, per: float, solver: Any):
-        self.core, self.per, self.solver = core, per, solver
+    def __init__(self, core: Any, divisor: float, solver: Any):
+        self.core, self.divisor, self.solver = core, divisor, solver
 
     def run(
         self,
@@ -294,58 +340,67 @@ class ScalarStage:
         `max_steps`; else when the loss (−log likelihood) changed by less than tolerance² in each
         of three steps.
         """
-        at = task.begin(u, scale)
-        base, size, z = (jnp.asarray(x) for x in (at.base, at.scale, at.z))
+        position = task.begin(u, scale)
+        base, size, z = (jnp.asarray(x) for x in (position.base, position.scale, position.z))
 
-        def known():
-            return base, size, jnp.asarray(task.horizon), choose and choose(at.done)
+        def setting():
+            return base, size, jnp.asarray(task.horizon), choose and choose(position.done)
 
         struct = jax.ShapeDtypeStruct((), jnp.result_type(float))
-        function = _scalar_function(self.core, self.per)
+        function = _scalar_function(self.core, self.divisor)
         zero = jnp.zeros(len(u))
-        state = self.solver.init(function, zero, known(), {}, struct, None, frozenset())
+        state = self.solver.init(function, zero, setting(), {}, struct, None, frozenset())
         if not (hasattr(state, "f") or hasattr(state, "f_info")):
             raise TypeError(
                 f"optimiser={type(self.solver).__name__} cannot be used: its state has no "
-                "attribute f or f_info with the loss of a step. Leave optimiser out, or use, for "
-                "example, optimistix.BFGS(rtol=1e-10, atol=1e-10)."
+                "attribute f or "
+                "f_info with the loss. Use, for example, optimistix.BFGS(rtol=1e-10, atol=1e-10)."
             )
         if task.resume is not None:
-            state = _with_leaves(state, at.leaves)
+            state = _with_leaves(state, position.leaves)
         fixed_steps = is_optax(self.solver)
-        while not at.status and at.done < task.max_steps:
+        while not position.status and position.done < task.max_steps:
             old = z
-            z, state, ended = _descend(self.solver, self.core, self.per, z, known(), state)
-            at.done, at.z, at.leaves = at.done + 1, np.asarray(z), _leaves(state)
+            z, state, is_end = _descend(self.solver, self.core, self.divisor, z, setting(), state)
+            position.done, position.z, position.leaves = (
+                position.done + 1,
+                np.asarray(z),
+                _leaves(state),
+            )
             loss = float(state.f if fixed_steps else state.f_info.f)
-            if not np.isfinite(loss) and at.done == 1:
+            if not np.isfinite(loss) and position.done == 1:
                 return u, FIT_RESULTS.not_finite
-            x, moved = np.asarray(base + size * z), float(np.linalg.norm(z - old))
+            x, length = np.asarray(base + size * z), float(np.linalg.norm(z - old))
             if not np.isfinite(x).all():
                 return np.asarray(base + size * old), FIT_RESULTS.not_finite
             if choose is None and not fixed_steps:
-                at.rejected = 0 if moved > 0 else at.rejected + 1
-                if moved > 0:
-                    at.still = at.still + 1 if abs(at.last - loss) <= task.tolerance**2 else 0
-                    at.last = loss
-                if bool(ended) or at.still >= 3:
-                    at.status = "converged"
-                elif at.rejected >= _REJECTED_ON_LINE:
-                    at.status = "stalled"
-            loss *= self.per
-            task.watch(Record(task.stage, task.horizon, loss, moved, bool(moved > 0), x), at)
+                position.rejected = 0 if length > 0 else position.rejected + 1
+                if length > 0:
+                    position.still = (
+                        position.still + 1 if abs(position.last - loss) <= task.tolerance**2 else 0
+                    )
+                    position.last = loss
+                if bool(is_end) or position.still >= 3:
+                    position.status = "converged"
+                elif position.rejected >= _REJECTED_ON_LINE:
+                    position.status = "stalled"
+            loss *= self.divisor
+            task.watch(
+                Record(task.stage, task.horizon, loss, length, bool(length > 0), x), position
+            )
         usual = "steps_done" if fixed_steps else "max_steps_reached"
-        return np.asarray(base + size * z), getattr(FIT_RESULTS, at.status or usual)
+        return np.asarray(base + size * z), getattr(FIT_RESULTS, position.status or usual)
 
 
-def _check_same(now: Any, then: Any) -> None:
+def _check_same(residual: Any, reference: Any) -> None:
     """Refuse a checkpoint whose residuals are not those of this model."""
-    if not np.allclose(now, then, rtol=1e-6, atol=1e-6 * float(np.abs(then).max(initial=0.0))):
-        off = np.abs(np.subtract(now, then)).max()
+    if not np.allclose(
+        residual, reference, rtol=1e-6, atol=1e-6 * float(np.abs(reference).max(initial=0.0))
+    ):
+        difference = np.abs(np.subtract(residual, reference)).max()
         raise ValueError(
-            "the checkpoint is of another model: at the same parameters its residuals differ from "
-            f"those of this model by up to {off:.3g}. Use the model "
-            "of the checkpoint, give another path in checkpoint, or remove the file to start again."
+            "the checkpoint is of another model: at the same parameters residuals differ by up to "
+            f"{difference:.3g}. Use its model, or another path in checkpoint."
         )
 
 
@@ -355,13 +410,12 @@ def _leaves(state: Any) -> list[np.ndarray]:
 
 def _with_leaves(state: Any, leaves: list[np.ndarray]) -> Any:
     """The same state with other numbers."""
-    arrays, rest = eqx.partition(state, eqx.is_array)
+    arrays, functions = eqx.partition(state, eqx.is_array)
     old, tree = jax.tree.flatten(arrays)
     if [np.shape(x) for x in old] != [np.shape(x) for x in leaves]:
         raise ValueError(
-            "the checkpoint is of a fit with another optimiser, or another version of it: the "
-            "arrays of its state have other shapes. Use that optimiser, give another path in "
-            "checkpoint, or remove the file to start again."
+            "the checkpoint is of a fit with another optimiser, or another version of it: use that "
+            "optimiser, or another path in checkpoint."
         )
     new = [jnp.asarray(x, o.dtype) for x, o in zip(leaves, old, strict=True)]
-    return eqx.combine(jax.tree.unflatten(tree, new), rest)
+    return eqx.combine(jax.tree.unflatten(tree, new), functions)

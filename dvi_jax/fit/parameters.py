@@ -63,21 +63,21 @@ class Space(eqx.Module):
     x obeys the bounds, u has none.
 
     - `names`: one for each number, such as ``q0[1]``. `lower`, `upper`: bounds of x, infinite
-      for no bound; `below`, `above`: whether there is a bound.
+      for no bound; `has_lower`, `has_upper`: whether there is a bound.
     - `prior_mean`, `prior_weight`: of x; the weight is 1/sigma, 0 without a prior.
-    - `rest`: the leaves that are not fitted.
+    - `constants`: the leaves that are not fitted.
     """
 
     lower: Array
     upper: Array
     prior_mean: Array
     prior_weight: Array
-    rest: PyTree
+    constants: PyTree
     names: tuple[str, ...] = eqx.field(static=True)
     shapes: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     tree: Any = eqx.field(static=True)
-    below: tuple[bool, ...] = eqx.field(static=True)
-    above: tuple[bool, ...] = eqx.field(static=True)
+    has_lower: tuple[bool, ...] = eqx.field(static=True)
+    has_upper: tuple[bool, ...] = eqx.field(static=True)
 
     @property
     def size(self) -> int:
@@ -96,11 +96,11 @@ class Space(eqx.Module):
         split = jnp.split if is_traced(x) else np.split
         parts = zip(split(x if is_traced(x) else np.asarray(x), ends), self.shapes, strict=True)
         leaves = [jnp.asarray(part.reshape(shape)) for part, shape in parts]
-        return eqx.combine(jax.tree.unflatten(self.tree, leaves), self.rest)
+        return eqx.combine(jax.tree.unflatten(self.tree, leaves), self.constants)
 
     def to_x(self, u: Array) -> Array:
         """x within its bounds from the free vector u."""
-        return _to_x(u, self.lower, self.upper, self.below, self.above)
+        return _to_x(u, self.lower, self.upper, self.has_lower, self.has_upper)
 
     def to_u(self, x: Any) -> np.ndarray:
         """The free vector of x."""
@@ -108,12 +108,12 @@ class Space(eqx.Module):
         with np.errstate(divide="ignore", invalid="ignore"):  # in branches that are not taken
             part = (x - lower) / (upper - lower)
             ways = [np.log(part) - np.log1p(-part), np.log(x - lower), np.log(upper - x)]
-        return np.select(_sides(self.below, self.above), ways, x)
+        return np.select(_sides(self.has_lower, self.has_upper), ways, x)
 
-    def in_words(self, x: np.ndarray, most: int = 8) -> str:
+    def in_words(self, x: np.ndarray, count: int = 8) -> str:
         """``args.k = 1.2, epsilon = 0``, the first few numbers."""
-        pairs = [f"{n} = {v:.6g}" for n, v in zip(self.names[:most], x, strict=False)]
-        return ", ".join(pairs) + (", …" if self.size > most else "")
+        pairs = [f"{n} = {v:.6g}" for n, v in zip(self.names[:count], x, strict=False)]
+        return ", ".join(pairs) + (", …" if self.size > count else "")
 
     def slope(self, u: Any) -> np.ndarray:
         """dx/du, component by component."""
@@ -123,39 +123,39 @@ class Space(eqx.Module):
     def at_bounds(self, x: np.ndarray, sigma: np.ndarray) -> list[str]:
         """Names of the numbers within a tenth of their standard error from a bound, or, without a
         finite error, on it up to rounding."""
-        off = np.minimum(x - np.asarray(self.lower), np.asarray(self.upper) - x)
+        distance = np.minimum(x - np.asarray(self.lower), np.asarray(self.upper) - x)
         reach = np.where(np.isfinite(sigma), 0.1 * sigma, 1e-12 * np.abs(x) + _UNDERFLOW)
-        near = np.isfinite(off) & (off <= reach)
-        return [name for name, is_near in zip(self.names, near, strict=True) if is_near]
+        mask = np.isfinite(distance) & (distance <= reach)
+        return [name for name, is_near in zip(self.names, mask, strict=True) if is_near]
 
 
-def _sides(below: Any, above: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _sides(has_lower: Any, has_upper: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Which numbers have both bounds, a lower one only, and an upper one only."""
-    below, above = np.array(below), np.array(above)
-    return below & above, below & ~above, above & ~below
+    has_lower, has_upper = np.array(has_lower), np.array(has_upper)
+    return has_lower & has_upper, has_lower & ~has_upper, has_upper & ~has_lower
 
 
 # One program in place of one for each operation where a fit calls it outside of its own.
-@functools.partial(jax.jit, static_argnames=("below", "above"))
-def _to_x(u: Array, lower: Array, upper: Array, below: Any, above: Any) -> Array:
-    both, low, high = _sides(below, above)
+@functools.partial(jax.jit, static_argnames=("has_lower", "has_upper"))
+def _to_x(u: Array, lower: Array, upper: Array, has_lower: Any, has_upper: Any) -> Array:
+    two_sided, low, high = _sides(has_lower, has_upper)
     # Infinite limits and large u must not reach a branch that is not taken: 0·inf is NaN.
-    lower = jnp.where(both | low, lower, 0.0)
-    upper = jnp.where(both | high, upper, 0.0)
-    one = jnp.exp(jnp.where(low | high, u, 0.0))
-    x = jnp.where(both, lower + (upper - lower) * jax.nn.sigmoid(u), u)
-    x = jnp.where(low, lower + one, x)
-    x = jnp.where(high, upper - one, x)
+    lower = jnp.where(two_sided | low, lower, 0.0)
+    upper = jnp.where(two_sided | high, upper, 0.0)
+    exponential = jnp.exp(jnp.where(low | high, u, 0.0))
+    x = jnp.where(two_sided, lower + (upper - lower) * jax.nn.sigmoid(u), u)
+    x = jnp.where(low, lower + exponential, x)
+    x = jnp.where(high, upper - exponential, x)
     # Rounding must not put x on a bound: there u is infinite. Derivatives stay those of exp.
-    least = jnp.where(both | low, lower + _gap(lower), -jnp.inf)
-    most = jnp.where(both | high, upper - _gap(upper), jnp.inf)
-    return x + jax.lax.stop_gradient(jnp.clip(x, least, most) - x)
+    smallest = jnp.where(two_sided | low, lower + _gap(lower), -jnp.inf)
+    largest = jnp.where(two_sided | high, upper - _gap(upper), jnp.inf)
+    return x + jax.lax.stop_gradient(jnp.clip(x, smallest, largest) - x)
 
 
 def _gap(bound: Array) -> Array:
     """Distance of a number next to a bound from it, at least one unit of its round-off."""
-    about = np.finfo(float)
-    return jnp.maximum(about.eps * jnp.abs(bound), about.tiny)
+    precision = np.finfo(float)
+    return jnp.maximum(precision.eps * jnp.abs(bound), precision.tiny)
 
 
 def make_space(
@@ -166,31 +166,29 @@ def make_space(
     **Raises** `TypeError` or `ValueError` for a pytree without numbers, values that are not finite,
     starts outside of bounds, and bounds or priors that do not fit the pytree.
     """
-    numbers, rest = eqx.partition(params, jax.tree_util.tree_map_with_path(_is_number, params))
+    numbers, constants = eqx.partition(params, jax.tree_util.tree_map_with_path(_is_number, params))
     paths, tree = jax.tree_util.tree_flatten_with_path(numbers)
     if not paths:
         raise ValueError(
-            "params has no number that can be fitted. Give initial values as floats or "
-            f"floating-point arrays, got {params!r:.200}."
+            f"params has no float or floating-point array that can be fitted, got {params!r:.200}."
         )
     names, places = [], {}
     for path, leaf in paths:
         name, shape = _name(path), np.shape(leaf)
         refuse_unit_or_mask(f"the parameter {name}", leaf)
         if np.iscomplexobj(leaf):
-            raise TypeError(
-                f"the parameter {name} is complex: give its real and imaginary parts as two "
-                "parameters."
-            )
+            raise TypeError(f"the parameter {name} is complex: give its real and imaginary parts.")
         places[name] = len(names) + np.arange(math.prod(shape)).reshape(shape)
-        each = np.ndindex(shape)
-        names += [f"{name}[{', '.join(map(str, i))}]" for i in each] if shape else [name]
+        indices = np.ndindex(shape)
+        names += [f"{name}[{', '.join(map(str, i))}]" for i in indices] if shape else [name]
     if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"params has two parameters named {twice}: rename one of their keys.")
+        duplicate = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"params has two parameters named {duplicate}: rename one of their keys.")
     x = np.concatenate([np.ravel(np.asarray(leaf, float)) for _, leaf in paths])
-    limits, _ = _given(bounds, Bounds, {"lower": -np.inf, "upper": np.inf}, places, len(x))
-    (mean, sigma), has = _given(priors, Prior, {"mean": np.nan, "sigma": np.nan}, places, len(x))
+    limits, _ = _entries(bounds, Bounds, {"lower": -np.inf, "upper": np.inf}, places, len(x))
+    (mean, sigma), has_prior = _entries(
+        priors, Prior, {"mean": np.nan, "sigma": np.nan}, places, len(x)
+    )
     lower, upper = limits
     for bad, text in (
         (~np.isfinite(x), "the parameter {0} starts at {1}: every start must be a finite number."),
@@ -200,7 +198,7 @@ def make_space(
             "the parameter {0} starts at {1}, which is not between its bounds {2} and {3}.",
         ),
         (
-            has & ~(np.isfinite(mean) & np.isfinite(sigma) & (sigma > 0)),
+            has_prior & ~(np.isfinite(mean) & np.isfinite(sigma) & (sigma > 0)),
             "the prior of {0} needs a finite mean and a positive sigma, got {4} and {5}.",
         ),
     ):
@@ -210,14 +208,14 @@ def make_space(
     space = Space(
         lower=jnp.asarray(lower),
         upper=jnp.asarray(upper),
-        prior_mean=jnp.asarray(np.where(has, mean, 0.0)),
-        prior_weight=jnp.asarray(np.where(has, 1 / np.where(has, sigma, 1.0), 0.0)),
-        rest=rest,
+        prior_mean=jnp.asarray(np.where(has_prior, mean, 0.0)),
+        prior_weight=jnp.asarray(np.where(has_prior, 1 / np.where(has_prior, sigma, 1.0), 0.0)),
+        constants=constants,
         names=tuple(names),
         shapes=tuple(place.shape for place in places.values()),
         tree=tree,
-        below=tuple(np.isfinite(lower).tolist()),
-        above=tuple(np.isfinite(upper).tolist()),
+        has_lower=tuple(np.isfinite(lower).tolist()),
+        has_upper=tuple(np.isfinite(upper).tolist()),
     )
     return space, x
 
@@ -229,51 +227,49 @@ def _is_number(path: Any, x: Any) -> bool:
     return bool(eqx.is_inexact_array_like(x))
 
 
-def _given(
+def _entries(
     tree: PyTree, kind: type, fields: dict[str, float], places: dict[str, np.ndarray], size: int
 ) -> tuple[list[np.ndarray], np.ndarray]:
     """The fields of the bounds or priors of all numbers, and which numbers have some.
 
     - `fields`: names with defaults. `places`: where the numbers of each leaf are in x.
     """
-    found = {name: np.full(size, default) for name, default in fields.items()}
-    has, called = np.zeros(size, bool), {Bounds: "bounds", Prior: "priors"}[kind]
-    for path, given in jax.tree_util.tree_leaves_with_path(tree):
+    columns = {name: np.full(size, default) for name, default in fields.items()}
+    mask, noun = np.zeros(size, bool), {Bounds: "bounds", Prior: "priors"}[kind]
+    for path, entry in jax.tree_util.tree_leaves_with_path(tree):
         name = _name(path)
-        if not isinstance(given, kind):
-            of = f"dvi.{kind.__name__}"
+        if not isinstance(entry, kind):
+            label = f"dvi.{kind.__name__}"
             raise TypeError(
-                f"{called} must have the structure of params, with {of}(...) or None in place of "
-                f"each number or array. Got {given!r:.200} at {name}. Write a pair (a, b) as "
-                f"{of}(a, b)."
+                f"{noun} must have the structure of params, with {label}(...) or None in place of "
+                f"numbers and arrays, got {entry!r:.200} at {name}."
             )
-        under = tuple(name + end for end in ("[", "."))
-        below = [k for k in places if not path or k == name or k.startswith(under)]
-        if not below:
+        prefixes = tuple(name + end for end in ("[", "."))
+        leaves = [k for k in places if not path or k == name or k.startswith(prefixes)]
+        if not leaves:
             raise ValueError(
-                f"{called} are given for {name!r}, but params has no fitted parameter of this "
-                f"name. The fitted parameters are {', '.join(map(repr, places))}. For an array "
-                f"give one dvi.{kind.__name__} for the whole array."
+                f"{noun} are given for {name!r}, but the fitted parameters are "
+                f"{', '.join(map(repr, places))}."
             )
-        where = np.concatenate([places[k].ravel() for k in below])
-        has[where] = True
-        for of, numbers in found.items():
-            if (value := getattr(given, of)) is not None:
+        where = np.concatenate([places[k].ravel() for k in leaves])
+        mask[where] = True
+        for label, numbers in columns.items():
+            if (value := getattr(entry, label)) is not None:
                 shape = places[name].shape if name in places else ()
-                numbers[where] = _spread(value, len(where), shape, f"{of} of {name}")
-    return list(found.values()), has
+                numbers[where] = _spread(value, len(where), shape, f"{label} of {name}")
+    return list(columns.values()), mask
 
 
-def _spread(value: Any, size: int, shape: tuple[int, ...], called: str) -> np.ndarray:
-    refuse_unit_or_mask(called, value)
+def _spread(value: Any, size: int, shape: tuple[int, ...], label: str) -> np.ndarray:
+    refuse_unit_or_mask(label, value)
     try:
         value = np.asarray(value, float)
     except (TypeError, ValueError):
-        known = "a real number or an array of real numbers"
-        raise TypeError(f"{called} must be {known}, got {value!r:.200}.") from None
+        kind = "a real number or an array of real numbers"
+        raise TypeError(f"{label} must be {kind}, got {value!r:.200}.") from None
     if value.ndim and value.shape != shape:
-        known = f"a number or an array of shape {shape}" if shape else "a single number"
-        raise ValueError(f"{called} must be {known}, got shape {value.shape}.")
+        kind = f"a number or an array of shape {shape}" if shape else "a single number"
+        raise ValueError(f"{label} must be {kind}, got shape {value.shape}.")
     return value.ravel() if value.ndim else np.full(size, float(value))
 
 

@@ -14,7 +14,7 @@ from .losses import LeastSquares, Likelihood, Loss
 from .observations import Data, as_arcs
 from .parameters import Space, make_space
 from .problem import Problem
-from .stages import MANY
+from .stages import JACOBIAN_LIMIT
 from .uncertainty import in_words, uncertainty
 
 
@@ -66,29 +66,29 @@ class Posterior:
     ):
         require_double("a posterior")
         one_of("gradient", gradient, ("reverse", "forward"))
-        arcs, many = as_arcs(data)
+        arcs, is_list = as_arcs(data)
         # Priors are added here, so that they also work with errors of unknown size.
-        self._problem = Problem(model, arcs, many, params, bounds=bounds, loss=loss)
+        self._problem = Problem(model, arcs, is_list, params, bounds=bounds, loss=loss)
         self._core = self._problem.core
         self._space, x = make_space(params, bounds, priors)
         self.names, self.size = list(self._space.names), self._space.size
         self.start = self._space.to_u(x)
         self._has_density = isinstance(loss, Likelihood)
-        held = np.asarray(self._space.prior_weight) > 0
-        held |= np.array(self._space.below) & self._space.above
-        free, count = int((~held).sum()), self._problem.count
-        lost = not (self._problem.has_errors or self._has_density)
-        if count < free + lost:
-            of_errors = ", and one for the size of the errors, because sigma is not given" * lost
+        is_proper = np.asarray(self._space.prior_weight) > 0
+        is_proper |= np.array(self._space.has_lower) & self._space.has_upper
+        free, count = int((~is_proper).sum()), self._problem.count
+        unknown_scale = not (self._problem.has_errors or self._has_density)
+        if count < free + unknown_scale:
+            of_errors = (
+                ", and one for the size of the errors, because sigma is not given" * unknown_scale
+            )
             raise ValueError(
-                f"data must have at least {free + lost} observed values: one for each parameter "
-                f"that has neither a prior nor bounds on both sides (here {free}){of_errors}. Got "
-                f"{count}: the posterior cannot be normalised. Give priors, bounds on both sides, "
-                "or more observations."
+                f"data must have at least {free + unknown_scale} observed values: one for each of "
+                f"{free} parameters without a prior or two bounds{of_errors}. Got {count}."
             )
         reverse = jax.value_and_grad(self._value)
         self._slopes = self._forward if gradient == "forward" else reverse
-        self._potential = jax.jit(_guarded(self._value, self._slopes))
+        self._potential = jax.jit(_finite_potential(self._value, self._slopes))
         self._local = jax.jit(self._exact if self._has_density else self._quadratic)
 
     # ---- the density
@@ -116,8 +116,8 @@ class Posterior:
     def _log_prior(self, u: Array) -> Array:
         """−log of prior and Jacobian."""
         space = self._space
-        off = (space.to_x(u) - space.prior_mean) * space.prior_weight
-        return jnp.sum(off**2) / 2 - jnp.sum(log_slope(space, u))
+        deviation = (space.to_x(u) - space.prior_mean) * space.prior_weight
+        return jnp.sum(deviation**2) / 2 - jnp.sum(log_slope(space, u))
 
     def _misfit(self, square: Array) -> Array:
         """−log likelihood from Σ of the squared residuals."""
@@ -147,10 +147,10 @@ class Posterior:
 
     def _quadratic(self, u: Array) -> tuple[Array, Array, Array]:
         """Potential, its slope, and A with AᵀA its Gauss–Newton Hessian, priors last."""
-        space, ones = self._space, jnp.ones_like(u)
+        space, unit_vector = self._space, jnp.ones_like(u)
         value, slope, J = self._with_jacobian(u)
-        stretch = jax.jvp(space.to_x, (u,), (ones,))[1]
-        bend = jax.jvp(jax.grad(lambda u: -jnp.sum(log_slope(space, u))), (u,), (ones,))[1]
+        stretch = jax.jvp(space.to_x, (u,), (unit_vector,))[1]
+        bend = jax.jvp(jax.grad(lambda u: -jnp.sum(log_slope(space, u))), (u,), (unit_vector,))[1]
         rows = [jnp.diag(space.prior_weight * stretch), jnp.diag(jnp.sqrt(bend))]
         return value, slope, jnp.concatenate([J, *rows])
 
@@ -171,27 +171,25 @@ class Posterior:
         determined by neither data nor priors.
         """
         u = np.array(self.start if u is None else u, float)
-        if self.size > MANY:
+        if self.size > JACOBIAN_LIMIT:
             self._check_value(u, float(self._potential(jnp.asarray(u))))
             return u, np.eye(self.size)
         u, A = self._descend(u, max_steps)
-        about = uncertainty(A, 1.0)
-        if about.undetermined.size:
-            words = "; ".join(in_words(d, self.names) for d in about.undetermined.T)
+        spectrum = uncertainty(A, 1.0)
+        if spectrum.null_directions.size:
+            words = "; ".join(in_words(d, self.names) for d in spectrum.null_directions.T)
             raise ValueError(
-                f"neither the data nor priors determine {words} (linear combinations of scaled "
-                "parameters): the posterior cannot be normalised. Give a prior or bounds on both "
-                "sides for these parameters, or sample fewer parameters."
+                f"neither the data nor priors determine {words} (combinations of scaled "
+                "parameters): give a prior or bounds on both sides."
             )
-        return u, about.directions / about.singular_values
+        return u, spectrum.directions / spectrum.singular_values
 
     def _check_value(self, u: np.ndarray, value: float) -> None:
         if not np.isfinite(value):
             x = np.asarray(self.to_x(jnp.asarray(u)))
             raise ValueError(
                 f"the posterior density is 0 at the start ({self._space.in_words(x)}): the "
-                "trajectory of the model fails there, or the log likelihood is not finite. Start "
-                "from other parameters, or use a smaller h."
+                "trajectory fails there, or the log likelihood is not finite."
             )
 
     def _descend(self, u: np.ndarray, max_steps: int) -> tuple[np.ndarray, np.ndarray]:
@@ -203,13 +201,13 @@ class Posterior:
             length = np.linalg.norm(A, axis=0)
             length = np.where(length > 0, length, 1.0)
             unit = A / length
-            left = unit.T @ unit + (damping + 1e-14) * np.eye(len(u))
-            step = -np.linalg.solve(left, g / length) / length
+            matrix = unit.T @ unit + (damping + 1e-14) * np.eye(len(u))
+            step = -np.linalg.solve(matrix, g / length) / length
             if not -g @ step > 1e-8:
                 break
-            new, *rest = self._look(u + step)
-            if new < value and all(np.isfinite(x).all() for x in rest):
-                u, value, (g, A), damping = u + step, new, rest, damping / 10
+            new, *derivatives = self._look(u + step)
+            if new < value and all(np.isfinite(x).all() for x in derivatives):
+                u, value, (g, A), damping = u + step, new, derivatives, damping / 10
             else:
                 damping *= 10
         return u, A
@@ -221,25 +219,27 @@ class Posterior:
 
 def log_slope(space: Space, u: Array) -> Array:
     """log |dx/du| of each parameter."""
-    below, above = np.array(space.below), np.array(space.above)
-    both = below & above
-    width = jnp.log(jnp.where(both, space.upper - space.lower, 1.0))
-    inside = width + jax.nn.log_sigmoid(u) + jax.nn.log_sigmoid(-u)
-    return jnp.where(both, inside, jnp.where(below ^ above, u, 0.0))
+    has_lower, has_upper = np.array(space.has_lower), np.array(space.has_upper)
+    two_sided = has_lower & has_upper
+    width = jnp.log(jnp.where(two_sided, space.upper - space.lower, 1.0))
+    interior = width + jax.nn.log_sigmoid(u) + jax.nn.log_sigmoid(-u)
+    return jnp.where(two_sided, interior, jnp.where(has_lower ^ has_upper, u, 0.0))
 
 
-def _guarded(value: Callable[[Array], Array], slopes: Callable[[Array], tuple[Array, Array]]):
+def _finite_potential(
+    value: Callable[[Array], Array], slopes: Callable[[Array], tuple[Array, Array]]
+):
     """The potential, +inf with slope 0 where it is not finite, with its derivative by `slopes`."""
 
     @jax.custom_jvp
     def potential(u):
-        found = value(u)
-        return jnp.where(jnp.isfinite(found), found, jnp.inf)
+        result = value(u)
+        return jnp.where(jnp.isfinite(result), result, jnp.inf)
 
     @potential.defjvp
     def _(primals, tangents):
-        found, slope = slopes(*primals)
-        good = jnp.isfinite(found)
-        return jnp.where(good, found, jnp.inf), jnp.where(good, slope, 0.0) @ tangents[0]
+        result, slope = slopes(*primals)
+        good = jnp.isfinite(result)
+        return jnp.where(good, result, jnp.inf), jnp.where(good, slope, 0.0) @ tangents[0]
 
     return potential

@@ -14,11 +14,11 @@ from ..base.checks import instance
 from ..base.reads import Reads, reads
 from ..base.results import RESULTS, status_name
 from ..problem.system import check_system
-from .evaluation import Evaluation
 from .losses import LeastSquares, Likelihood, Loss
-from .model import Group, Model, check_observable, make_groups, predict, specification, weighed
+from .model import Group, Model, check_observable, make_groups, predict, specification, weigh
 from .observations import Observations
 from .parameters import Space, make_space
+from .roundoff import Evaluation
 
 _UNITS = 1e3
 """Factor by which data and model may differ in size at the start of a fit: beyond it the units
@@ -29,7 +29,7 @@ class Core(eqx.Module):
     """The functions of a fit with their data as arrays, which are compiled once for all fits of one
     model with data of one shape.
 
-    - `many`: whether arcs were given as a list. `reads`: values that functions of the user read
+    - `is_list`: whether arcs were given as a list. `reads`: values that functions of the user read
       from outside.
     """
 
@@ -37,29 +37,31 @@ class Core(eqx.Module):
     groups: tuple[Group, ...]
     space: Space
     loss: Any
-    many: bool = eqx.field(static=True)
+    is_list: bool = eqx.field(static=True)
     reads: Reads = eqx.field(static=True)
 
     def predict(self, params: PyTree, group: Group) -> tuple[Array, RESULTS]:
         """Predictions (A, N, K) and a status for each arc of a group."""
 
-        def one(arc, t0, ts, pick):
-            spec = specification(self.model, params, arc, self.many)
-            found, _, result = predict(spec, t0, ts, pick, group)
-            return found, result
+        def predict_arc(arc, t0, ts, pick):
+            spec = specification(self.model, params, arc, self.is_list)
+            values, _, result = predict(spec, t0, ts, pick, group)
+            return values, result
 
         arrays = jax.tree.map(jnp.asarray, (group.arcs, group.t0, group.ts, group.pick))
         if len(group.arcs) == 1:  # a batch of one takes twice the time of a single trajectory
-            return jax.tree.map(lambda x: x[None], one(*jax.tree.map(lambda x: x[0], arrays)))
-        return jax.vmap(one)(*arrays)
+            return jax.tree.map(
+                lambda x: x[None], predict_arc(*jax.tree.map(lambda x: x[0], arrays))
+            )
+        return jax.vmap(predict_arc)(*arrays)
 
     def whitened(self, u: Array, horizon: Any = np.inf) -> tuple[list[Array], list[Any]]:
         """Residuals predicted − observed in standard errors, (A, N, K) for each group, zero for
         missing values and those later than `horizon` after the start; predictions and statuses."""
         params = self.space.to_params(self.space.to_x(u))
-        known = [self.predict(params, group) for group in self.groups]
-        pairs = zip(self.groups, known, strict=True)
-        return [_whiten(group, found, horizon) for group, (found, _) in pairs], known
+        predictions = [self.predict(params, group) for group in self.groups]
+        pairs = zip(self.groups, predictions, strict=True)
+        return [_whiten(group, values, horizon) for group, (values, _) in pairs], predictions
 
     def residuals(self, u: Array, horizon: Any = np.inf) -> Array:
         """The vector whose half square is the loss, priors last."""
@@ -83,13 +85,13 @@ class Core(eqx.Module):
         By forward mode: memory does not grow with the number of steps.
         """
 
-        def twice(u):
-            rows, known = self.whitened(u, horizon)
+        def residual_and_aux(u):
+            rows, predictions = self.whitened(u, horizon)
             r = self.root_rows(u, rows)
-            return r, (r, rows, known)
+            return r, (r, rows, predictions)
 
-        J, (r, rows, known) = jax.jacfwd(twice, has_aux=True)(u)
-        return Evaluation(r, J, (rows, known))
+        J, (r, rows, predictions) = jax.jacfwd(residual_and_aux, has_aux=True)(u)
+        return Evaluation(r, J, (rows, predictions))
 
     def scalar(self, u: Array, horizon: Any = np.inf, choice: Any = None) -> Array:
         """The loss: ½ Σ ρ(r²), or −log likelihood; −log prior is added.
@@ -98,38 +100,37 @@ class Core(eqx.Module):
         """
         params = self.space.to_params(self.space.to_x(u))
         total = jnp.sum(self.prior_rows(u) ** 2) / 2
-        for i, whole in enumerate(self.groups):
-            group, weight = whole, 1.0
+        for i, full_group in enumerate(self.groups):
+            group, weight = full_group, 1.0
             if choice is not None:
-                group = jax.tree.map(lambda x, i=i: jnp.asarray(x)[choice[i]], whole)
-                weight = len(whole.arcs) / len(choice[i])
-            found, _ = self.predict(params, group)
+                group = jax.tree.map(lambda x, i=i: jnp.asarray(x)[choice[i]], full_group)
+                weight = len(full_group.arcs) / len(choice[i])
+            predictions, _ = self.predict(params, group)
             if isinstance(self.loss, Likelihood):
-                part = self._likelihood(group, found, horizon, params)
+                part = self._likelihood(group, predictions, horizon, params)
             else:
-                part = jnp.sum(self.loss.root(_whiten(group, found, horizon)) ** 2) / 2
+                part = jnp.sum(self.loss.root(_whiten(group, predictions, horizon)) ** 2) / 2
             total = total + weight * part
         return total
 
-    def _likelihood(self, group: Group, found: Array, horizon: Any, params: PyTree) -> Array:
+    def _likelihood(self, group: Group, predictions: Array, horizon: Any, params: PyTree) -> Array:
         if group.whiten.ndim == 4:
             raise ValueError(
-                "loss=dvi.Likelihood(...) accepts sigma in dvi.Observations, but got covariance. "
-                "Give sigma instead, or use dvi.LeastSquares(), which accepts covariance."
+                "loss=dvi.Likelihood(...) accepts sigma of dvi.Observations, got covariance: use "
+                "dvi.LeastSquares()."
             )
-        keep, values = within(group, horizon), jnp.asarray(group.values)
+        keep, values = horizon_mask(group, horizon), jnp.asarray(group.values)
         sigma = 1 / jnp.where(keep, jnp.asarray(group.whiten), 1.0)
         # Missing values get the observed ones as predictions, so that no NaN reaches the density.
-        each = jax.vmap(self.loss.negative_log_density, in_axes=(0, 0, 0, None))(
-            jnp.where(keep, found, values), values, sigma, params
+        densities = jax.vmap(self.loss.negative_log_density, in_axes=(0, 0, 0, None))(
+            jnp.where(keep, predictions, values), values, sigma, params
         )
-        if jnp.shape(each) != jnp.shape(found):
+        if jnp.shape(densities) != jnp.shape(predictions):
             raise ValueError(
-                "the function of dvi.Likelihood must return −log of the density of each value, in "
-                f"an array of the shape of its first argument, {found.shape[1:]}. Got shape "
-                f"{jnp.shape(each)[1:]}. Do not sum over the values."
+                "the function of dvi.Likelihood must return −log density of each value, an array "
+                f"of shape {predictions.shape[1:]}, got shape {jnp.shape(densities)[1:]}."
             )
-        return jnp.sum(jnp.where(keep, each, 0.0))
+        return jnp.sum(jnp.where(keep, densities, 0.0))
 
     def hessian(self, u: Array) -> Array:
         """Exact second derivatives of the loss, (n, n), forward over reverse."""
@@ -164,16 +165,18 @@ def _warn_of_times(model: Model, params: Any, arcs: list[Observations]) -> None:
             )
 
 
-def within(group: Group, horizon: Any) -> Array:
+def horizon_mask(group: Group, horizon: Any) -> Array:
     """Which values were observed within the horizon, shape (A, N, K)."""
-    since = abs(group.ts - group.t0[:, None])
-    return group.seen & (since <= horizon)[..., None]
+    times_since_start = abs(group.ts - group.t0[:, None])
+    return group.mask & (times_since_start <= horizon)[..., None]
 
 
-def _whiten(group: Group, found: Array, horizon: Any) -> Array:
+def _whiten(group: Group, predictions: Array, horizon: Any) -> Array:
     # First where, then subtract: a trajectory that fails after the horizon leaves no NaN behind.
-    off = jnp.where(within(group, horizon), found - jnp.asarray(group.values), 0.0)
-    return weighed(off, jnp.asarray(group.whiten))
+    difference = jnp.where(
+        horizon_mask(group, horizon), predictions - jnp.asarray(group.values), 0.0
+    )
+    return weigh(difference, jnp.asarray(group.whiten))
 
 
 # Functions of the module: a method of an instance would be compiled again for each fit.
@@ -187,7 +190,7 @@ _curvature = eqx.filter_jit(Core.curvature)
 class Problem:
     """A fit in free variables u.
 
-    - `core`: its functions. `space`: the parameters, `start` their x. `given`: the data as given,
+    - `core`: its functions. `space`: the parameters, `start` their x. `data`: the data as given,
       `arcs`: in the order of time, `specs`: the arguments of `integrate` for each at the start.
     - `count`: number of observed values.
     """
@@ -196,44 +199,46 @@ class Problem:
         self,
         model: Callable[..., Any],
         arcs: list[Observations],
-        many: bool,
+        is_list: bool,
         params: PyTree,
         *,
         bounds: PyTree = None,
         priors: PyTree = None,
         loss: Loss | Likelihood = LeastSquares(),
     ):
-        known = "a dvi.LeastSquares(), dvi.SoftL1(), dvi.Cauchy() or dvi.Likelihood(f)"
-        instance("loss", loss, Loss | Likelihood, known)
-        self.given, self.loss = list(arcs), loss
-        self.arcs = arcs = [arc.ordered() for arc in arcs]
+        losses = "a dvi.LeastSquares(), dvi.SoftL1(), dvi.Cauchy() or dvi.Likelihood(f)"
+        instance("loss", loss, Loss | Likelihood, losses)
+        self.data, self.loss = list(arcs), loss
+        self.arcs = arcs = [arc.in_time_order() for arc in arcs]
         self.space, self.start = make_space(params, bounds, priors)
         self.size = self.space.size
         self.has_errors = arcs[0].has_errors
         if not self.has_errors and not isinstance(loss, Likelihood):
             robust = not isinstance(loss, LeastSquares)
             if self.space.count_of_priors or robust:
-                by = f"a robust loss ({type(loss).__name__})" if robust else "a fit with priors"
+                subject = (
+                    f"a robust loss ({type(loss).__name__})" if robust else "a fit with priors"
+                )
                 raise ValueError(
-                    f"{by} requires standard errors of the data, but dvi.Observations has none: "
-                    "give sigma or covariance there."
+                    f"{subject} requires standard errors of the data, but dvi.Observations has "
+                    "none: give sigma or covariance there."
                 )
         if isinstance(model, Model):
-            check_system(model.rest["system"])
+            check_system(model.settings["system"])
         arrays = self.space.to_params(jnp.asarray(self.start))
-        if many and isinstance(model, Model):
-            specification(model, arrays, 0, many)  # which reports what is missing
+        if is_list and isinstance(model, Model):
+            specification(model, arrays, 0, is_list)  # which reports what is missing
             model.check_rows(arrays, len(arcs))
-        self.specs = [specification(model, arrays, i, many) for i in range(len(arcs))]
+        self.specs = [specification(model, arrays, i, is_list) for i in range(len(arcs))]
         if isinstance(model, Model):
-            _warn_of_times(model, params, self.given)
+            _warn_of_times(model, params, self.data)
         for i, arc in enumerate(arcs):
             if check_observable(i, arc, self.specs[i]):
-                arcs[i], self.given[i] = arc.in_columns(), self.given[i].in_columns()
+                arcs[i], self.data[i] = arc.in_columns(), self.data[i].in_columns()
         self.groups = make_groups(arcs, self.specs)
-        seen = reads(model, loss, [arc.function for arc in arcs])
-        self.core = Core(model, tuple(self.groups), self.space, loss, many, seen)
-        self.count = int(sum(group.seen.sum() for group in self.groups))
+        values_read = reads(model, loss, [arc.function for arc in arcs])
+        self.core = Core(model, tuple(self.groups), self.space, loss, is_list, values_read)
+        self.count = int(sum(group.mask.sum() for group in self.groups))
 
     @property
     def steps(self) -> int:
@@ -247,24 +252,24 @@ class Problem:
 
     def start_in_words(self) -> str:
         """``initial state at t0 = 0: q0 fitted, p0 of the model``."""
-        times = np.array([arc.t0 for arc in self.given])
-        when = f"t0 = {times.min():g}" + (f" to {times.max():g}" if np.ptp(times) else "")
-        if all(arc.t0 == arc.ts[0] for arc in self.given):
-            when += " (the first observation)"
-        own = {name.split("[")[0] for name in self.space.names}
-        by = [
-            f"{n} {'fitted' if n in own and isinstance(self.core.model, Model) else 'of the model'}"
+        times = np.array([arc.t0 for arc in self.data])
+        moment = f"t0 = {times.min():g}" + (f" to {times.max():g}" if np.ptp(times) else "")
+        if all(arc.t0 == arc.ts[0] for arc in self.data):
+            moment += " (the first observation)"
+        roots = {name.split("[")[0] for name in self.space.names}
+        sources = [
+            f"{n} "
+            f"{'fitted' if n in roots and isinstance(self.core.model, Model) else 'of the model'}"
             for n in ("q0", "p0")
         ]
-        return f"initial state at {when}: {', '.join(by)}"
+        return f"initial state at {moment}: {', '.join(sources)}"
 
     def check_count(self) -> None:
         """**Raises** `ValueError` for fewer observed values than parameters."""
         if self.degrees_of_freedom < 0:
             raise ValueError(
                 f"{self.size} parameters cannot be determined from {self.count} observed "
-                f"value{'s' * (self.count != 1)} (number of priors: {self.space.count_of_priors}). "
-                "Fit fewer parameters, or give priors or more observations."
+                f"value{'s' * (self.count != 1)} and {self.space.count_of_priors} priors."
             )
 
     # ---- the functions of `core`, compiled
@@ -289,40 +294,44 @@ class Problem:
         """`Core.curvature`."""
         return _curvature(self.core, jnp.asarray(u), jnp.asarray(directions))
 
-    def by_arc(self, rows: list[Any], known: list[Any]) -> tuple[list, list, list[str]]:
+    def by_arc(self, rows: list[Any], predictions: list[Any]) -> tuple[list, list, list[str]]:
         """For each arc predictions (N, ...), observed minus predicted in standard errors (N, K),
-        and the status; rows in the order of `given`."""
-        found: list[Any] = [None] * len(self.arcs)
-        for group, r, (values, result) in zip(self.groups, rows, known, strict=True):
+        and the status; rows in the order of `data`."""
+        rows_of_arcs: list[Any] = [None] * len(self.arcs)
+        for group, r, (values, result) in zip(self.groups, rows, predictions, strict=True):
             status = np.atleast_1d(status_name(result))
             for a, i in enumerate(group.arcs):
                 arc, n = self.arcs[i], len(self.arcs[i].ts)
-                order = slice(None, None, 1 if arc is self.given[i] else -1)
-                predicted = np.asarray(values[a, :n]).reshape(arc.values.shape)[order]
-                whitened = np.where(group.seen[a, :n], -np.asarray(r[a, :n]), np.nan)[order]
-                found[i] = predicted, whitened, str(status[a])
-        predicted, whitened, names = (list(column) for column in zip(*found, strict=True))
-        return predicted, whitened, names
+                order = slice(None, None, 1 if arc is self.data[i] else -1)
+                values_of_arc = np.asarray(values[a, :n]).reshape(arc.values.shape)[order]
+                residuals_in_sigma = np.where(group.mask[a, :n], -np.asarray(r[a, :n]), np.nan)[
+                    order
+                ]
+                rows_of_arcs[i] = values_of_arc, residuals_in_sigma, str(status[a])
+        values_of_arc, residuals_in_sigma, names = (
+            list(column) for column in zip(*rows_of_arcs, strict=True)
+        )
+        return values_of_arc, residuals_in_sigma, names
 
     def rows_within(self, horizon: float) -> np.ndarray:
         """Which entries of the residual vector lie within a horizon; priors do."""
-        inside = [np.asarray(within(g, horizon)).ravel() for g in self.groups]
-        return np.concatenate([*inside, np.ones(self.size, bool)])
+        masks = [np.asarray(horizon_mask(g, horizon)).ravel() for g in self.groups]
+        return np.concatenate([*masks, np.ones(self.size, bool)])
 
     # ---- checks of the start
 
-    def check_start(self, known: list[Any], check_units: bool = True) -> None:
+    def check_start(self, predictions: list[Any], check_units: bool = True) -> None:
         """Refuse a start at which the model fails from the first observation on, or whose
         predictions differ in size from the data.
 
         - `known`: predictions and statuses of each group.
         """
         where = f"at the starting parameters ({self.space.in_words(self.start)}) the model gives "
-        for group, (found, result) in zip(self.groups, known, strict=True):
+        for group, (values_of_group, result) in zip(self.groups, predictions, strict=True):
             names = np.atleast_1d(status_name(result))
             for a, arc in enumerate(group.arcs):
-                first = group.seen[a].any(axis=1).argmax()
-                values = np.asarray(found)[a, first][group.seen[a, first]]
+                first = group.mask[a].any(axis=1).argmax()
+                values = np.asarray(values_of_group)[a, first][group.mask[a, first]]
                 if not np.isfinite(values).all():
                     hint = f"The status of the trajectory is {str(names[a])!r}: use a smaller h"
                     if str(names[a]) == "successful":
@@ -333,33 +342,35 @@ class Problem:
                         "parameters."
                     )
         if check_units:
-            self._check_sizes([np.asarray(found) for found, _ in known], where)
+            self._check_sizes(
+                [np.asarray(values_of_group) for values_of_group, _ in predictions], where
+            )
 
-    def _check_sizes(self, found: list[np.ndarray], where: str) -> None:
-        pairs = list(zip(self.groups, found, strict=True))
-        data = max(float(np.abs(g.values[g.seen]).max()) for g, _ in pairs)
-        own = [np.where(g.seen & np.isfinite(f), np.abs(f), 0.0).max(axis=2) for g, f in pairs]
-        largest = max(float(size.max()) for size in own)
+    def _check_sizes(self, predictions: list[np.ndarray], where: str) -> None:
+        pairs = list(zip(self.groups, predictions, strict=True))
+        data = max(float(np.abs(g.values[g.mask]).max()) for g, _ in pairs)
+        sizes = [np.where(g.mask & np.isfinite(f), np.abs(f), 0.0).max(axis=2) for g, f in pairs]
+        largest = max(float(size.max()) for size in sizes)
         if data == 0 or largest == 0 or 1 / _UNITS < data / largest < _UNITS:
             return
-        intended = "If the difference is intended, use check_units=False."
+        hint = "If the difference is intended, use check_units=False."
         if largest < data:
             raise ValueError(
                 f"{where}values of at most {largest:.3g}, but the largest observed value is "
-                f"{data:.3g} (absolute values). Give the model and the data in the same units, or "
-                f"start from other parameters. {intended}"
+                f"{data:.3g}. Use the same units, or start from other parameters. {hint}"
             )
-        large, each = _UNITS * data, zip(self.groups, own, strict=True)
-        group, size = next((g, s) for g, s in each if (s >= large).any())
+        large, pairs_of_sizes = _UNITS * data, zip(self.groups, sizes, strict=True)
+        group, size = next((g, s) for g, s in pairs_of_sizes if (s >= large).any())
         a, row = np.argwhere(size >= large)[0]
         arc = int(group.arcs[a])
-        spec, seen = self.specs[arc], self.arcs[arc]
+        spec, observations = self.specs[arc], self.arcs[arc]
         q0, p0 = (jnp.asarray(spec[name], float) for name in ("q0", "p0"))
-        first = float(jnp.max(jnp.abs(seen.function(seen.t0, q0, p0, spec.get("args")))))
+        first = float(
+            jnp.max(jnp.abs(observations.function(observations.t0, q0, p0, spec.get("args"))))
+        )
         raise ValueError(
-            f"{where}{size[a, row]:.3g} for arc {arc} at t = {group.ts[a, row]:g}, but the "
-            f"largest observed value is {data:.3g} (absolute values). For this arc the model gives "
-            f"{first:.3g} at the start, t = {group.t0[a]:g}, and at most {size[a].max():.3g} "
-            "later. If the trajectory diverges, start from other parameters, give bounds, or use a "
-            f"smaller h. Otherwise give the model and the data in the same units. {intended}"
+            f"{where}{size[a, row]:.3g} for arc {arc} at t = {group.ts[a, row]:g}, but the largest "
+            f"observed value is {data:.3g}; at the start, t = {group.t0[a]:g}, the model gives "
+            f"{first:.3g}, later at most {size[a].max():.3g}. Use the same units; if the "
+            f"trajectory diverges, other parameters or a smaller h. {hint}"
         )

@@ -12,8 +12,8 @@ from jaxtyping import PyTree
 
 from ..base.checks import one_of
 from ..base.files import publish_npz, read_npz
+from .optimise import FIT_RESULTS, NAMES, name_of
 from .parameters import make_space
-from .results import FIT_RESULTS, NAMES, name_of
 from .uncertainty import correlations
 
 _FORMAT = 1
@@ -124,16 +124,18 @@ class FitResult:
         is 1 for a perfect fit, 0 for a model that is as good as these constants, and negative for
         a worse one. NaN for data that are constant.
         """
-        left = total = 0.0
-        for seen, model, errors in zip(self.observed, self.predicted, self.errors, strict=True):
-            known = np.isfinite(seen)
-            sigma = np.where(known, errors if self.has_errors else 1.0, np.inf)
-            weight, values = 1 / sigma**2, np.where(known, seen, 0.0)
-            total_weight = np.where(known.any(axis=0), weight.sum(axis=0), 1.0)
+        residual_sum = total = 0.0
+        for values_of_arc, model, errors in zip(
+            self.observed, self.predicted, self.errors, strict=True
+        ):
+            is_observed = np.isfinite(values_of_arc)
+            sigma = np.where(is_observed, errors if self.has_errors else 1.0, np.inf)
+            weight, values = 1 / sigma**2, np.where(is_observed, values_of_arc, 0.0)
+            total_weight = np.where(is_observed.any(axis=0), weight.sum(axis=0), 1.0)
             mean = (weight * values).sum(axis=0) / total_weight
-            left += np.sum(weight * np.where(known, values - model, 0.0) ** 2)
+            residual_sum += np.sum(weight * np.where(is_observed, values - model, 0.0) ** 2)
             total += np.sum(weight * (values - mean) ** 2)
-        return float(1 - left / total) if total > 0 else np.nan
+        return float(1 - residual_sum / total) if total > 0 else np.nan
 
     @property
     def chi2(self) -> float:
@@ -155,7 +157,7 @@ class FitResult:
         safe = spread if spread > 0 else 1.0
         pairs = [(w[:-1], w[1:]) for w in self.whitened]
         a, b = (np.concatenate([pair[i].ravel() for pair in pairs]) for i in (0, 1))
-        both = np.isfinite(a) & np.isfinite(b)
+        is_pair = np.isfinite(a) & np.isfinite(b)
         total = (r**2).mean()
         return {
             "rms": float(np.sqrt(total)),
@@ -163,7 +165,9 @@ class FitResult:
             "largest": float(np.abs(r).max()),
             "skewness": float((((r - mean) / safe) ** 3).mean()),
             "excess": float((((r - mean) / safe) ** 4).mean() - 3),
-            "lag_one": float((a[both] * b[both]).mean() / total) if both.any() and total else 0.0,
+            "lag_one": float((a[is_pair] * b[is_pair]).mean() / total)
+            if is_pair.any() and total
+            else 0.0,
         }
 
     def __str__(self) -> str:
@@ -177,13 +181,13 @@ class FitResult:
             lines.append(f"  … and {len(self.names) - 40} more")
         errors = f"reduced chi² {self.reduced_chi2:.4g}, " if self.has_errors else ""
         part = max(self.explained, 0.0)
-        explained = f"{100 * part:.4g} % of the variance explained, " if part == part else ""
+        explanation = f"{100 * part:.4g} % of the variance explained, " if part == part else ""
         lines.append(
-            f"{errors}rms {self.rms:.4g}, {explained}{self.num_observed} values, "
+            f"{errors}rms {self.rms:.4g}, {explanation}{self.num_observed} values, "
             f"{self.degrees_of_freedom} degrees of freedom"
         )
         lines += [self.start] if self.start else []
-        lines += [words for words in [little_explained(self), rounded(self)] if words]
+        lines += [words for words in [little_explained(self), rounding_remark(self)] if words]
         lines += [f"not determined: {words}" for words in self.undetermined]
         if self.result != FIT_RESULTS.converged and str(FIT_RESULTS[self.result]):
             lines.append(str(FIT_RESULTS[self.result]))
@@ -193,8 +197,8 @@ class FitResult:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write everything but functions into one file (.npz), atomically."""
-        about = {name: getattr(self, name) for name in _PLAIN}
-        about |= {"result": self.status, "arcs": len(self.ts), "shape": _shape_of(self.params)}
+        header = {name: getattr(self, name) for name in _PLAIN}
+        header |= {"result": self.status, "arcs": len(self.ts), "shape": _shape_of(self.params)}
         arrays = {"x": self.x, "covariance": self.covariance, "values": self.singular_values}
         arrays |= {f"history.{name}": value for name, value in self.history.items()}
         for name in _BY_ARC:
@@ -202,7 +206,7 @@ class FitResult:
         arrays["rounding"] = self.rounding
         if self.curvature is not None:
             arrays["curvature"] = self.curvature
-        publish_npz(path, _FORMAT, about, arrays)
+        publish_npz(path, _FORMAT, header, arrays)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], params: PyTree = None) -> "FitResult":
@@ -214,67 +218,66 @@ class FitResult:
         **Raises** `FileNotFoundError`, and `ValueError` for a file that is not a fit or has another
         format, or params of other names.
         """
-        about, arrays = read_npz(path, _FORMAT, "fit")
+        header, arrays = read_npz(path, _FORMAT, "fit")
         if params is None:
-            if about["shape"] is None:
+            if header["shape"] is None:
                 raise ValueError(
                     f"params is required to load {path}, because not all fitted parameters are "
-                    "numbers or arrays in dicts with text as keys. Call FitResult.load(path, "
-                    "params) with params of the same structure as in dvi.fit."
+                    "numbers or arrays in dicts: give params as in dvi.fit."
                 )
-            params = jax.tree.map(np.array, about["shape"], is_leaf=lambda x: isinstance(x, list))
+            params = jax.tree.map(np.array, header["shape"], is_leaf=lambda x: isinstance(x, list))
         space, _ = make_space(params)
-        own, wanted = list(space.names), about["names"]
-        if own != wanted:
-            pairs = enumerate(zip(own, wanted, strict=False))
-            i = next((i for i, (a, b) in pairs if a != b), min(len(own), len(wanted)))
+        names, stored_names = list(space.names), header["names"]
+        if names != stored_names:
+            pairs = enumerate(zip(names, stored_names, strict=False))
+            i = next((i for i, (a, b) in pairs if a != b), min(len(names), len(stored_names)))
             raise ValueError(
-                f"params must have the same parameters as the fit in {path}. The first difference "
-                f"is number {i + 1}: {''.join(wanted[i : i + 1]) or 'no parameter'} in the file, "
-                f"{''.join(own[i : i + 1]) or 'no parameter'} in params. Give params as in dvi.fit."
+                f"params must have the same parameters as the fit in {path}. Number {i + 1} is "
+                f"{''.join(stored_names[i : i + 1]) or 'no parameter'} in the file, "
+                f"{''.join(names[i : i + 1]) or 'no parameter'} in params."
             )
         by_arc: dict[str, Any] = {
-            n: [arrays[f"{n}.{i}"] for i in range(about["arcs"])] for n in _BY_ARC
+            n: [arrays[f"{n}.{i}"] for i in range(header["arcs"])] for n in _BY_ARC
         }
         return cls(
             params=space.to_params(jnp.asarray(arrays["x"])),
             x=arrays["x"],
             covariance=arrays["covariance"],
             history={k[8:]: v for k, v in arrays.items() if k.startswith("history.")},
-            result=getattr(FIT_RESULTS, one_of(f"the status in {path}", about["result"], NAMES)),
+            result=getattr(FIT_RESULTS, one_of(f"the status in {path}", header["result"], NAMES)),
             singular_values=arrays["values"],
             curvature=arrays.get("curvature"),
             rounding=arrays.get("rounding", np.zeros(len(arrays["x"]))),
-            **{name: about[name] for name in _PLAIN if name in about},
+            **{name: header[name] for name in _PLAIN if name in header},
             **by_arc,
         )
 
 
-def numbers_in_words(found: FitResult) -> list[str]:
+def numbers_in_words(fit: FitResult) -> list[str]:
     """Each fitted number with its standard error, or as one at its bound."""
     return [
-        f"{x:.8g} at its bound: no symmetric error" if name in found.at_bounds else with_error(x, s)
-        for name, x, s in zip(found.names, found.x, found.sigma, strict=True)
+        f"{x:.8g} at its bound: no symmetric error" if name in fit.at_bounds else with_error(x, s)
+        for name, x, s in zip(fit.names, fit.x, fit.sigma, strict=True)
     ]
 
 
-def little_explained(found: FitResult) -> str:
+def little_explained(fit: FitResult) -> str:
     """The remark on a fit that is hardly better than a constant; empty for a better one."""
-    if not found.explained < _LITTLE:
+    if not fit.explained < _LITTLE:
         return ""
-    how = "no better" if found.explained <= 0 else "little better"
+    comparison = "no better" if fit.explained <= 0 else "little better"
     return (
-        f"the model describes the data {how} than constants do: this may be a local minimum, or "
-        "the data are constants and noise. Start from other parameters."
+        f"the model describes the data {comparison} than constants do: this may be a local "
+        "minimum, or the data are constants and noise. Start from other parameters."
     )
 
 
-def rounded(found: FitResult) -> str:
+def rounding_remark(fit: FitResult) -> str:
     """The remark on a fit whose accuracy is bounded by rounding; empty for another one."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        part = found.rounding / found.sigma
+        part = fit.rounding / fit.sigma
     part = part[np.isfinite(part)].max(initial=0.0)
-    if found.result != FIT_RESULTS.converged or part < _NOTABLE:
+    if fit.result != FIT_RESULTS.converged or part < _NOTABLE:
         return ""
     return (
         "converged at the level of rounding: the round-off of the predictions changes parameters "

@@ -16,12 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..base.files import publish_npz, read_npz
+from ..base.progress import bar_of, reporter
 from ..base.reads import reads
 from .optimise import Position, Record, Task
 from .problem import Problem
-from .progress import FitProgress
 
-_EVERY = 5.0
+_INTERVAL = 5.0
 """Seconds between checkpoints."""
 
 _FORMAT = 3
@@ -29,6 +29,38 @@ _FORMAT = 3
 _VECTORS = ("base", "scale", "z")
 _LISTS = ("leaves", "extra")
 """Fields of `Position` that a checkpoint has as arrays; the others are in its header."""
+
+
+@dataclass(frozen=True)
+class FitProgress:
+    """Progress of a fit: `step` of the optimiser of at most `max_steps`, the `stage` and its
+    `horizon`, the `loss`, the parameters `x` with their `names`, `seconds` since the start."""
+
+    step: int
+    max_steps: int
+    stage: int
+    horizon: float
+    loss: float
+    x: np.ndarray
+    names: list[str]
+    seconds: float
+
+
+def _bar_columns(p: FitProgress) -> dict[str, Any]:
+    first = [f"{n} {v:.7g}" for n, v in zip(p.names[:3], p.x[:3], strict=True)]
+    return {
+        "description": f"fit, stage {p.stage + 1}",
+        "total": p.max_steps,
+        "completed": p.step,
+        "steps": f"{p.step}/{p.max_steps}",
+        "loss": f"loss {p.loss:.5g}",
+        "params": ", ".join(first + ["…"] * (len(p.names) > 3)),
+    }
+
+
+def progress_display(progress: Any) -> Any:
+    """A context whose value takes a `FitProgress`: the user's function, a bar's, or None."""
+    return reporter(progress, bar_of("fit", ("steps", "loss", "params"), _bar_columns))
 
 
 @dataclass
@@ -49,20 +81,19 @@ class Run:
     identity: str
     records: list[Record] = field(default_factory=list)
     resume: Position | None = None
-    saved: float = field(default_factory=time.monotonic)
+    save_time: float = field(default_factory=time.monotonic)
 
     def __post_init__(self):
         if self.checkpoint is not None:
             file = Path(self.checkpoint)
             if not file.parent.is_dir():
                 raise FileNotFoundError(
-                    f"there is no directory {str(file.parent)!r} for checkpoint={str(file)!r}. "
-                    "Create this directory, or give another path."
+                    f"there is no directory {str(file.parent)!r} for checkpoint={str(file)!r}: "
+                    "create it."
                 )
             if file.is_dir():
                 raise IsADirectoryError(
-                    f"checkpoint must be the path of a file, but {str(file)!r} is a directory. Add "
-                    "a file name, such as fit.npz."
+                    f"checkpoint must be the path of a file, but {str(file)!r} is a directory."
                 )
             if file.exists():
                 self.resume, self.records = _read_checkpoint(file, self.identity)
@@ -72,20 +103,20 @@ class Run:
         """How many steps remain."""
         return self.max_steps - len(self.records)
 
-    def task(self, stage: int, horizon: float, tolerance: float, most: int | None) -> Task:
+    def task(self, stage: int, horizon: float, tolerance: float, limit: int | None) -> Task:
         """The next stage, of at most `most` steps, which continues from the checkpoint once."""
         resume, self.resume = self.resume, None
-        done = 0 if resume is None else resume.done
-        steps = done + self.left
-        if most is not None:
-            steps = min(max(most, done), steps)
+        count = 0 if resume is None else resume.done
+        steps = count + self.left
+        if limit is not None:
+            steps = min(max(limit, count), steps)
         return Task(stage, horizon, steps, tolerance, self.watch, resume)
 
     def watch(self, record: Record, position: Position) -> None:
         """A step was taken."""
         x = np.asarray(self.problem.space.to_x(jnp.asarray(record.x[: self.problem.size])))
         self.records.append(record._replace(x=x))
-        if self.checkpoint is not None and time.monotonic() - self.saved > _EVERY:
+        if self.checkpoint is not None and time.monotonic() - self.save_time > _INTERVAL:
             try:
                 _write_checkpoint(self.checkpoint, self.identity, position, self.records)
             except OSError as error:  # no reason to lose the fit as well
@@ -95,59 +126,60 @@ class Run:
                     f"{error}.",
                     stacklevel=2,
                 )
-            self.saved = time.monotonic()
+            self.save_time = time.monotonic()
         if self.show is not None:
-            of_step = len(self.records), self.max_steps, record.stage, record.horizon, record.loss
+            numbers = len(self.records), self.max_steps, record.stage, record.horizon, record.loss
             names, seconds = list(self.problem.space.names), time.monotonic() - self.began
-            self.show(FitProgress(*of_step, x, names, seconds))
+            self.show(FitProgress(*numbers, x, names, seconds))
 
     def history(self) -> dict[str, np.ndarray]:
         """The records as arrays."""
-        found = _columns(self.records)
-        return {**found, "x": found["x"].reshape(-1, self.problem.size)}
+        columns = _columns(self.records)
+        return {**columns, "x": columns["x"].reshape(-1, self.problem.size)}
 
 
 def _columns(records: list[Record]) -> dict[str, np.ndarray]:
     return {name: np.array([getattr(r, name) for r in records]) for name in Record._fields}
 
 
-def identity(problem: Problem, u: np.ndarray, *of: Any) -> str:
+def identity(problem: Problem, u: np.ndarray, *settings_of_call: Any) -> str:
     """Hash by which a checkpoint is recognised: data, names, start and settings."""
     # The repr of an optax optimiser does not contain its numbers: its functions read them.
-    read = [(n, mark) for n, mark in reads(problem.core.model, *of) if mark[0] == "value"]
-    settings = repr((problem.space.names, problem.loss, *of, read))
+    read = [
+        (n, mark) for n, mark in reads(problem.core.model, *settings_of_call) if mark[0] == "value"
+    ]
+    settings = repr((problem.space.names, problem.loss, *settings_of_call, read))
     settings = re.sub(r" at 0x[0-9a-f]+", "", settings)
-    groups = [(g.ts, g.values, g.seen, g.whiten, g.t0) for g in problem.groups]
+    groups = [(g.ts, g.values, g.mask, g.whiten, g.t0) for g in problem.groups]
     steps = [(group.num_steps, group.block) for group in problem.groups]
-    known = eqx.filter((u, problem.space, problem.core.model, groups), eqx.is_array_like)
+    arrays = eqx.filter((u, problem.space, problem.core.model, groups), eqx.is_array_like)
     digest = hashlib.sha256((settings + repr(steps)).encode())
-    for leaf in jax.tree.leaves(known):
+    for leaf in jax.tree.leaves(arrays):
         digest.update(np.ascontiguousarray(leaf).tobytes())
     return digest.hexdigest()
 
 
-def _write_checkpoint(path: Any, identity: str, at: Position, records: list[Record]) -> None:
-    about = {"identity": identity, **vars(at)}
-    arrays = {name: about.pop(name) for name in _VECTORS}
+def _write_checkpoint(path: Any, identity: str, position: Position, records: list[Record]) -> None:
+    header = {"identity": identity, **vars(position)}
+    arrays = {name: header.pop(name) for name in _VECTORS}
     for name in _LISTS:
-        arrays |= {f"{name}.{i}": np.asarray(x) for i, x in enumerate(about[name])}
-        about[name] = len(about[name])
+        arrays |= {f"{name}.{i}": np.asarray(x) for i, x in enumerate(header[name])}
+        header[name] = len(header[name])
     arrays |= {f"record.{name}": column for name, column in _columns(records).items()}
-    publish_npz(path, _FORMAT, about, arrays)
+    publish_npz(path, _FORMAT, header, arrays)
 
 
 def _read_checkpoint(path: Any, identity: str) -> tuple[Position, list[Record]]:
-    about, arrays = read_npz(path, _FORMAT, "checkpoint of a fit")
-    if about.get("identity") != identity:
+    header, arrays = read_npz(path, _FORMAT, "checkpoint of a fit")
+    if header.get("identity") != identity:
         raise ValueError(
-            f"the checkpoint {path} is of another fit: the data, the model, the parameters, their "
-            "starting values or the settings differ. To continue the earlier fit, repeat its call "
-            "unchanged. To start a new fit, give another path in checkpoint, or remove this file."
+            f"the checkpoint {path} is of another fit: data, model, parameters, start or settings "
+            "differ. Repeat its call unchanged, or give another path in checkpoint."
         )
-    known = {name: about[name] for name in Position.__dataclass_fields__ if name in about}
-    known |= {name: arrays[name] for name in _VECTORS}
-    known |= {name: [arrays[f"{name}.{i}"] for i in range(about[name])] for name in _LISTS}
+    fields = {name: header[name] for name in Position.__dataclass_fields__ if name in header}
+    fields |= {name: arrays[name] for name in _VECTORS}
+    fields |= {name: [arrays[f"{name}.{i}"] for i in range(header[name])] for name in _LISTS}
     # As numbers of Python: records of a continued fit go into the next checkpoint with new ones.
     *plain, xs = (arrays[f"record.{name}"] for name in Record._fields)
     rows = zip(*(column.tolist() for column in plain), xs, strict=True)
-    return Position(**known), [Record(*row) for row in rows]
+    return Position(**fields), [Record(*row) for row in rows]

@@ -13,10 +13,10 @@ from jaxtyping import Array
 from ..base.checks import fraction, whole
 from ..integration.integrate import integrate
 from ..observe.solution import Save
-from .evaluation import Evaluation
-from .model import make_group, predict, specification, weighed
+from .model import make_group, predict, specification, weigh
 from .observations import Observations
 from .problem import Problem
+from .roundoff import Evaluation
 
 
 @dataclass(frozen=True)
@@ -50,10 +50,10 @@ class MultipleShooting:
     def __post_init__(self):
         whole("segments", self.segments, 2)
         fraction("tolerance", self.tolerance)
-        named = self.guess is None or (
+        is_name = self.guess is None or (
             isinstance(self.guess, str) and self.guess in ("data", "model")
         )
-        if not (named or callable(self.guess)):
+        if not (is_name or callable(self.guess)):
             raise TypeError(
                 'guess must be "data", "model", None or a function (t) that returns (q, p), got '
                 f"{self.guess!r}."
@@ -90,19 +90,21 @@ class Segments:
         spec, arcs, S = problem.specs[0], problem.arcs, shooting.segments
         other = next((s["h"] for s in problem.specs if s["h"] != spec["h"]), None)
         if other is not None or problem.groups[0].block == 0:
-            own = spec.get("lattice", getattr(spec.get("integrator"), "lattice", None))
-            got = type(own).__name__ if other is None else f"h = {spec['h']} and h = {other}"
+            lattice = spec.get("lattice", getattr(spec.get("integrator"), "lattice", None))
+            description = (
+                type(lattice).__name__ if other is None else f"h = {spec['h']} and h = {other}"
+            )
             raise ValueError(
                 "dvi.MultipleShooting requires lattice=dvi.Uniform() and the same h for all arcs, "
-                f"got {got}. Change the model, or use dvi.SingleShooting()."
+                f"got {description}."
             )
         kinds = [(a.function, a.values.shape[1:], a.covariance is None) for a in arcs]
-        if unlike := [i for i, kind in enumerate(kinds) if kind != kinds[0]]:
+        if differing := [i for i, kind in enumerate(kinds) if kind != kinds[0]]:
             names = "observe", "the shape of one observation", "the use of covariance"
-            pairs = zip(names, kinds[0], kinds[unlike[0]], strict=True)
+            pairs = zip(names, kinds[0], kinds[differing[0]], strict=True)
             raise ValueError(
                 f"dvi.MultipleShooting requires that all arcs agree in {', '.join(names[:2])} and "
-                f"{names[2]}, but arcs 0 and {unlike[0]} differ in "
+                f"{names[2]}, but arcs 0 and {differing[0]} differ in "
                 f"{' and '.join(name for name, a, b in pairs if a != b)}."
             )
         h = float(spec["h"])
@@ -111,15 +113,17 @@ class Segments:
         if self.steps < 1 or steps < S:
             raise ValueError(
                 "segments of dvi.MultipleShooting must be at most the number of steps of the "
-                f"longest arc, {steps}, got {S}. Give fewer segments or a smaller h."
+                f"longest arc, {steps}, got {S}."
             )
         self.cuts = np.array([[arc.t0 + s * self.steps * h for s in range(S)] for arc in arcs])
         parts = []
         for arc, cuts in zip(arcs, self.cuts, strict=True):
             whitening = arc.whitening()
             place = (arc.ts - arc.t0) / (self.steps * h)
-            which = np.clip(np.ceil(place - 1e-9).astype(int) - 1, 0, S - 1)
-            parts += [_Part(arc, which == s, float(cuts[s]), whitening) for s in range(S)]
+            numbers_of_segments = np.clip(np.ceil(place - 1e-9).astype(int) - 1, 0, S - 1)
+            parts += [
+                _Part(arc, numbers_of_segments == s, float(cuts[s]), whitening) for s in range(S)
+            ]
         numbers = np.repeat(np.arange(len(arcs)), S)
         self.group = make_group(numbers.tolist(), parts, spec, self.steps)
         self.shape = np.shape(spec["q0"])
@@ -137,8 +141,8 @@ class Segments:
 
     def begin(self, u: np.ndarray) -> np.ndarray:
         """w with the guesses of the segments' starts; sets the size of the orbit."""
-        each = range(len(self.problem.arcs))
-        states = np.stack([self._guess(i, u) for i in each])  # (A, S, 2 half)
+        indices = range(len(self.problem.arcs))
+        states = np.stack([self._guess(i, u) for i in indices])  # (A, S, 2 half)
         flat = states.reshape(-1, 2, self.half)
         size = np.maximum(np.abs(flat).max(axis=(0, 2)), np.finfo(float).tiny)
         self.orbit = np.repeat(size, self.half)
@@ -148,67 +152,69 @@ class Segments:
         guess, arc, times = self.shooting.guess, self.problem.arcs[i], self.cuts[i]
         spec = self._specification(jnp.asarray(u), i)
         if guess is None:
-            named = arc.observe in ("positions", "state")
-            enough = np.isfinite(arc.values.reshape(len(arc.ts), -1)).all(axis=1).sum() >= 4
-            guess = "data" if named and enough else "model"
+            is_state = arc.observe in ("positions", "state")
+            is_dense = np.isfinite(arc.values.reshape(len(arc.ts), -1)).all(axis=1).sum() >= 4
+            guess = "data" if is_state and is_dense else "model"
         if callable(guess):
             pairs = [guess(t) for t in times]
-            found = np.array([np.concatenate([np.ravel(q), np.ravel(p)]) for q, p in pairs], float)
-            if found.shape != (len(times), 2 * self.half):
+            states_of_cuts = np.array(
+                [np.concatenate([np.ravel(q), np.ravel(p)]) for q, p in pairs], float
+            )
+            if states_of_cuts.shape != (len(times), 2 * self.half):
                 raise ValueError(
                     "the function guess of dvi.MultipleShooting must return (q, p), each of shape "
                     f"{self.shape}, got shapes {' and '.join(str(np.shape(x)) for x in pairs[0])}."
                 )
         elif guess == "data":
-            found = from_data(arc, spec, times)
+            states_of_cuts = from_data(arc, spec, times)
         else:
             steps = {"num_steps": self.steps * len(times), "save": Save(every=self.steps)}
             sol = integrate(**{**spec, **steps, "t0": arc.t0, "throw": False})
             flat = [np.asarray(x[:-1]).reshape(len(times), -1) for x in (sol.qs, sol.ps)]
-            found = np.concatenate(flat, axis=1)
-        if not np.isfinite(found).all():
-            by = f"guess={guess!r}"
+            states_of_cuts = np.concatenate(flat, axis=1)
+        if not np.isfinite(states_of_cuts).all():
+            source = f"guess={guess!r}"
             hint = "Start from other parameters, or give a function (t) → (q, p) as guess."
             if callable(guess):
-                by, hint = "the function guess", "Correct this function."
+                source, hint = "the function guess", "Correct this function."
             raise ValueError(
-                "the initial states of the segments of dvi.MultipleShooting must be finite, but "
-                f"{by} gives NaN or inf for arc {i} at t = "
-                f"{times[np.argmin(np.isfinite(found).all(axis=1))]:g}. {hint}"
+                f"the guess of dvi.MultipleShooting must be finite, but {source} gives NaN or inf "
+                f"for arc {i} "
+                f"at t = {times[np.argmin(np.isfinite(states_of_cuts).all(axis=1))]:g}. {hint}"
             )
-        return found
+        return states_of_cuts
 
     def _specification(self, u: Array, arc: Any) -> dict[str, Any]:
         space = self.problem.space
         core = self.problem.core
-        return specification(core.model, space.to_params(space.to_x(u)), arc, core.many)
+        return specification(core.model, space.to_params(space.to_x(u)), arc, core.is_list)
 
     def _segment(self, x: Array, segment: dict[str, Any]) -> tuple[Array, Array]:
         """Residuals of one segment and its end, relative to the orbit, from x = (u, own start)."""
-        problem, own = self.problem, x[self.n :]
+        problem, node_state = self.problem, x[self.n :]
         spec = self._specification(x[: self.n], segment["arc"])
-        for name, of_node in (("q0", own[: self.half]), ("p0", own[self.half :])):
+        for name, of_node in (("q0", node_state[: self.half]), ("p0", node_state[self.half :])):
             # The first segment of an arc starts where the model says.
             start = jnp.asarray(spec[name], float)
             spec[name] = jnp.where(segment["first"], start, of_node.reshape(self.shape))
         times = segment["t0"], segment["ts"], segment["pick"]
-        found, (q1, p1), _ = predict(spec, *times, self.group)
-        off = jnp.where(segment["seen"], found - segment["values"], 0.0)
-        r = problem.core.root(weighed(off, segment["whiten"])).ravel()
+        predictions, (q1, p1), _ = predict(spec, *times, self.group)
+        difference = jnp.where(segment["mask"], predictions - segment["values"], 0.0)
+        r = problem.core.root(weigh(difference, segment["whiten"])).ravel()
         return r, jnp.concatenate([q1.ravel(), p1.ravel()]) / self.orbit
 
-    def _all(self, w: Array) -> Any:
+    def _all_segments(self, w: Array) -> Any:
         """Residuals and ends of all segments, and their derivatives in (u, own start)."""
-        names = ("t0", "ts", "pick", "values", "seen", "whiten")
-        each = {name: getattr(self.group, name) for name in names}
-        each |= {"arc": self.group.arcs, "first": self.first}
-        own = self._nodes(w)[np.maximum(self.node_of, 0)]
+        names = ("t0", "ts", "pick", "values", "mask", "whiten")
+        segments = {name: getattr(self.group, name) for name in names}
+        segments |= {"arc": self.group.arcs, "first": self.first}
+        nodes = self._nodes(w)[np.maximum(self.node_of, 0)]
 
-        def one(node, segment):
+        def with_derivative(node, segment):
             x = jnp.concatenate([w[: self.n], node])
             return jax.jacfwd(lambda x: (self._segment(x, segment),) * 2, has_aux=True)(x)
 
-        J, values = jax.vmap(one)(own, jax.tree.map(jnp.asarray, each))
+        J, values = jax.vmap(with_derivative)(nodes, jax.tree.map(jnp.asarray, segments))
         return values, J
 
     def _nodes(self, w: Array) -> Array:
@@ -218,17 +224,17 @@ class Segments:
         """The residual vector, its derivative assembled from those of the segments, and c."""
         del horizon
         root, multipliers = extra  # √ρ, λ
-        (r, ends), (Jr, Je) = self._all(w)
+        (r, ends), (Jr, Je) = self._all_segments(w)
         n, u = self.n, w[: self.n]
         gaps = ends[self.inner] - self._nodes(w)[self.next_of] / self.orbit[None]
         prior = self.problem.core.prior_rows
-        tied = root * gaps + multipliers.reshape(gaps.shape) / root
-        residual = jnp.concatenate([r.ravel(), prior(u), tied.ravel()])
+        weighted_gaps = root * gaps + multipliers.reshape(gaps.shape) / root
+        residual = jnp.concatenate([r.ravel(), prior(u), weighted_gaps.ravel()])
         # The end of a segment depends on its own start, a gap on the next start as well.
         J_tied = root * self._in_place(Je[self.inner], self.inner)
         gap, part = np.arange(len(self.inner))[:, None], np.arange(2 * self.half)
-        to = n + self.next_of[:, None] * 2 * self.half + part
-        J_tied = J_tied.at[gap, part, to].add(-root / self.orbit[None])
+        columns = n + self.next_of[:, None] * 2 * self.half + part
+        J_tied = J_tied.at[gap, part, columns].add(-root / self.orbit[None])
         J_prior = jnp.zeros((n, self.size)).at[:, :n].set(jax.jacfwd(prior)(u))
         J_data = self._in_place(Jr, np.arange(len(r)))
         blocks = (J_data, J_prior, J_tied)
@@ -240,8 +246,8 @@ class Segments:
         width = 2 * self.half
         # The start of an arc's first segment is not an unknown: its columns go behind w, and off.
         node = np.where(self.node_of < 0, self.num_nodes, self.node_of)[segments]
-        own = self.n + node[:, None] * width + np.arange(width)
-        columns = np.hstack([np.tile(np.arange(self.n), (len(own), 1)), own])
+        node_columns = self.n + node[:, None] * width + np.arange(width)
+        columns = np.hstack([np.tile(np.arange(self.n), (len(node_columns), 1)), node_columns])
         s, rows = np.arange(J.shape[0])[:, None, None], np.arange(J.shape[1])[:, None]
         wide = jnp.zeros((*J.shape[:2], self.size + width))
         return wide.at[s, rows, columns[:, None, :]].set(J)[..., : self.size]
@@ -256,33 +262,33 @@ def from_data(arc: Observations, spec: dict[str, Any], times: np.ndarray) -> np.
     """
     if arc.observe not in ("positions", "state"):
         raise ValueError(
-            'guess="data" of dvi.MultipleShooting requires observe="positions" or observe="state", '
-            f"got {repr(arc.observe) if isinstance(arc.observe, str) else 'a function'}. Use "
-            'guess="model", or give a function (t) that returns (q, p) as guess.'
+            'guess="data" of dvi.MultipleShooting requires observe="positions" or '
+            'observe="state", got '
+            f"{repr(arc.observe) if isinstance(arc.observe, str) else 'a function'}."
         )
     flat = arc.values.reshape(len(arc.ts), -1)
     good = np.isfinite(flat).all(axis=1)
     ts, flat = arc.ts[good], flat[good]
     order = np.argsort(ts)
 
-    def along(x):
+    def interpolate(x):
         return np.stack([np.interp(times, ts[order], column[order]) for column in x.T], axis=1)
 
     if arc.observe == "state":
-        return along(flat)
+        return interpolate(flat)
     import optimistix as optx  # here, so that importing the package does not import it
 
-    q, v = along(flat), along(np.gradient(flat, ts, axis=0))
+    q, v = interpolate(flat), interpolate(np.gradient(flat, ts, axis=0))
     shape = np.shape(spec["q0"])
     system, args, epsilon = spec["system"], spec.get("args"), spec.get("epsilon", 0.0)
     start = jnp.ravel(jnp.asarray(spec["p0"], float))
 
     def momentum(t, q, v):
-        def off(p, _):
+        def mismatch(p, _):
             slope = jax.grad(lambda p: system.hamiltonian(t, t, q, p.reshape(shape), epsilon, args))
             return slope(p) - v
 
-        return optx.root_find(off, optx.Newton(1e-8, 1e-8), start, throw=False).value
+        return optx.root_find(mismatch, optx.Newton(1e-8, 1e-8), start, throw=False).value
 
     p = jax.vmap(momentum)(jnp.asarray(times), jnp.asarray(q.reshape(-1, *shape)), jnp.asarray(v))
     return np.concatenate([q, np.asarray(p)], axis=1)

@@ -43,7 +43,7 @@ def is_gauss_newton(solver: Any) -> bool:
     return isinstance(solver, optx.AbstractGaussNewton)
 
 
-def solver_for(optimiser: Any, residuals: bool, many: bool, steps: int) -> Any:
+def solver_for(optimiser: Any, residuals: bool, is_large: bool, steps: int) -> Any:
     """The optimistix solver for the user's choice.
 
     - `residuals`: whether the loss has a residual vector. `many`: whether there are too many
@@ -53,7 +53,7 @@ def solver_for(optimiser: Any, residuals: bool, many: bool, steps: int) -> Any:
     import optimistix as optx
 
     if optimiser is None:
-        if not many:
+        if not is_large:
             return levenberg_marquardt() if residuals else bfgs()
         rate = optax.warmup_cosine_decay_schedule(1e-5, 3e-3, max(steps // 20, 1), steps, 1e-5)
         optimiser = optax.adam(rate)
@@ -61,12 +61,12 @@ def solver_for(optimiser: Any, residuals: bool, many: bool, steps: int) -> Any:
         return optx.OptaxMinimiser(optimiser, rtol=0.0, atol=0.0)
     if is_gauss_newton(optimiser) and not residuals:
         raise ValueError(
-            "optimiser must be a minimiser if the loss is a dvi.Likelihood, got the least-squares "
-            f"solver {type(optimiser).__name__}. A likelihood has no residuals. Use "
-            "optimistix.BFGS(rtol=1e-10, atol=1e-10), or leave optimiser out."
+            "optimiser must be a minimiser if the loss is a dvi.Likelihood, got "
+            f"{type(optimiser).__name__}. Use, for example, optimistix.BFGS(rtol=1e-10, "
+            "atol=1e-10)."
         )
     minimisers = optx.OptaxMinimiser, optx.AbstractQuasiNewton, optx.AbstractLBFGS
-    known = optx.AbstractGaussNewton, optx.AbstractGradientDescent, *minimisers
+    classes = optx.AbstractGaussNewton, optx.AbstractGradientDescent, *minimisers
     of_optimistix = "None, a least-squares solver or minimiser of optimistix"
-    called = f"{of_optimistix}, or a gradient transformation of optax"
-    return instance("optimiser", optimiser, known, called)
+    description = f"{of_optimistix}, or a gradient transformation of optax"
+    return instance("optimiser", optimiser, classes, description)

@@ -10,18 +10,17 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .evaluation import Evaluation
 from .losses import Likelihood
-from .model import Group, weighed
-from .optimise import LeastSquaresStage, ScalarStage
+from .model import Group, weigh
+from .optimise import FIT_RESULTS, LeastSquaresStage, ScalarStage
 from .problem import Problem
-from .results import FIT_RESULTS
+from .roundoff import Evaluation
 from .run import Run
 from .shooting import Segments
 from .solvers import is_optax
 from .uncertainty import inverse_or, null_space
 
-MANY = 400
+JACOBIAN_LIMIT = 400
 """Parameters beyond which the default is a gradient method without a covariance: each column of a
 Jacobian costs a trajectory."""
 
@@ -31,10 +30,10 @@ _BEFORE_LAST = 15
 _IN_SEGMENTS = 40
 """Steps of a stage of multiple shooting."""
 
-_FURTHER = 1.02
+_LEAST_GROWTH = 1.02
 """Least factor between horizons where trajectories that fail do not let them double."""
 
-_OFF = 0.5
+_MISFIT_LIMIT = 0.5
 """Misfit, relative to the scatter of the data, up to which a fit of all data is expected to find
 the nearest minimum: half of it is a sixth of a period's phase."""
 
@@ -55,29 +54,31 @@ class Minimum(NamedTuple):
     shifts: np.ndarray | None = None
 
 
-def least_squares(run: Run, u: np.ndarray, solver: Any, wanted: Any, check_units: bool) -> Minimum:
+def least_squares(
+    run: Run, u: np.ndarray, solver: Any, horizons: Any, check_units: bool
+) -> Minimum:
     """Stages of growing horizon with a solver for the residual vector."""
     problem = run.problem
     stage = LeastSquaresStage(problem.evaluate, solver)
 
-    def solve(u, task, whole):
+    def solve(u, task, evaluation):
         # All data were evaluated at u; a shorter horizon takes the rows that it needs.
-        if whole is not None:
+        if evaluation is not None:
             keep = problem.rows_within(task.horizon)
-            r, J, aux = whole
-            whole = Evaluation(np.where(keep, r, 0.0), np.where(keep[:, None], J, 0.0), aux)
-        return stage.run(u, task, problem.degrees_of_freedom, whole)
+            r, J, aux = evaluation
+            evaluation = Evaluation(np.where(keep, r, 0.0), np.where(keep[:, None], J, 0.0), aux)
+        return stage.run(u, task, problem.degrees_of_freedom, evaluation)
 
     cut = FIT_RESULTS.max_steps_reached
     tolerance = max(1e-2, run.tolerance)
-    u, found, status = _stages(
-        run, u, wanted, check_units, stage.at, solve, (_BEFORE_LAST, tolerance, cut)
+    u, end, status = _stages(
+        run, u, horizons, check_units, stage.values_at, solve, (_BEFORE_LAST, tolerance, cut)
     )
-    return Minimum(u, status, found.jacobian, None, found.aux, stage.shifts)
+    return Minimum(u, status, end.jacobian, None, end.aux, stage.shifts)
 
 
 def by_gradient(
-    run: Run, u: np.ndarray, solver: Any, wanted: Any, check_units: bool, batch: Any, seed: int
+    run: Run, u: np.ndarray, solver: Any, horizons: Any, check_units: bool, batch: Any, seed: int
 ) -> Minimum:
     """The same with a minimiser of the scalar loss."""
     problem, optax = run.problem, is_optax(solver)
@@ -94,28 +95,28 @@ def by_gradient(
     def look(u):
         return Evaluation(jnp.zeros(0), jnp.zeros(0), problem.whitened(u))
 
-    def solve(u, task, whole):
+    def solve(u, task, evaluation):
         u, status = stage.run(u, task, scale, choose)
         return u, look(u), status
 
     cut = FIT_RESULTS.steps_done if optax else FIT_RESULTS.max_steps_reached
     short = run.max_steps // 8 if optax else _BEFORE_LAST
-    u, found, status = _stages(
-        run, u, wanted, check_units, look, solve, (short, run.tolerance, cut)
+    u, end, status = _stages(
+        run, u, horizons, check_units, look, solve, (short, run.tolerance, cut)
     )
-    if problem.size > MANY or status == FIT_RESULTS.not_finite:
+    if problem.size > JACOBIAN_LIMIT or status == FIT_RESULTS.not_finite:
         J = None
     elif isinstance(problem.loss, Likelihood):
         J = _root_of_hessian(problem, u)
     else:
         J = problem.evaluate(u).jacobian
-    return Minimum(u, status, J, aux=found.aux)
+    return Minimum(u, status, J, aux=end.aux)
 
 
 def _stages(
     run: Run,
     u: np.ndarray,
-    wanted: list[float] | None,
+    horizons: list[float] | None,
     check_units: bool,
     look: Callable[..., Evaluation],
     solve: Callable[..., tuple[np.ndarray, Evaluation, FIT_RESULTS]],
@@ -128,72 +129,77 @@ def _stages(
     - `before_last`: steps and tolerance of a stage that is not the last, and the status of a fit
       whose steps end there: a piece may have converged, the whole has not.
     """
-    problem, whole = run.problem, None
-    most, tolerance, cut = before_last
+    problem, evaluation = run.problem, None
+    step_limit, tolerance, cut = before_last
     if run.resume is None:
-        number, whole = 0, look(u)
-        problem.check_start(whole.aux[1], check_units)
-        horizon = _horizon(problem, wanted, 0, whole.aux[0], 0.0)
+        number, evaluation = 0, look(u)
+        problem.check_start(evaluation.aux[1], check_units)
+        horizon = _horizon(problem, horizons, 0, evaluation.aux[0], 0.0)
     else:
         number, horizon = run.resume.stage, run.resume.horizon
     while horizon < np.inf:
-        task = run.task(number, horizon, tolerance, most)
-        u, found, status = solve(u, task, whole)
+        task = run.task(number, horizon, tolerance, step_limit)
+        u, end, status = solve(u, task, evaluation)
         if status == FIT_RESULTS.not_finite:
-            return u, found._replace(aux=None), status
-        number, whole = number + 1, look(u)
+            return u, end._replace(aux=None), status
+        number, evaluation = number + 1, look(u)
         if run.left <= 0:
-            return u, whole, cut
-        horizon = _horizon(problem, wanted, number, whole.aux[0], 2 * horizon * (1 - 1e-9))
-    return solve(u, run.task(number, horizon, run.tolerance, None), whole)
+            return u, evaluation, cut
+        horizon = _horizon(problem, horizons, number, evaluation.aux[0], 2 * horizon * (1 - 1e-9))
+    return solve(u, run.task(number, horizon, run.tolerance, None), evaluation)
 
 
 # ---- horizons
 
 
 def _horizon(
-    problem: Problem, wanted: list[float] | None, number: int, rows: list[Any], at_least: float
+    problem: Problem, horizons: list[float] | None, number: int, rows: list[Any], at_least: float
 ) -> float:
     """The horizon of a stage; infinite for all data.
 
-    Where none are `wanted`: the longest of full, full/2, full/4, … over which the misfit is small
+    Where none are `horizons`: the longest of full, full/2, full/4, … over which the misfit is small
     compared with the scatter of the data; without such a horizon, the shortest with enough data for
     the parameters, but not beyond the first prediction that is not finite.
 
     - `rows`: whitened residuals (A, N, K) of each group. `at_least`: a horizon to exceed.
     """
-    if wanted is not None:
-        return wanted[min(number, len(wanted) - 1)]
+    if horizons is not None:
+        return horizons[min(number, len(horizons) - 1)]
 
-    def seen(of_groups):
+    def observed_entries(of_groups):
         pairs = zip(of_groups, problem.groups, strict=True)
-        return np.concatenate([np.broadcast_to(x, g.seen.shape)[g.seen] for x, g in pairs])
+        return np.concatenate([np.broadcast_to(x, g.mask.shape)[g.mask] for x, g in pairs])
 
     spans = [np.abs(g.ts - g.t0[:, None]) for g in problem.groups]
     full, shortest = max(float(span.max()) for span in spans), np.inf
-    allowed = _OFF * np.sqrt(np.mean(seen(map(_scatter, problem.groups)) ** 2))
-    since, misfit = seen(span[..., None] for span in spans), seen(map(np.asarray, rows))
-    enough = 2 * max(problem.size - problem.space.count_of_priors, 1)
+    threshold = _MISFIT_LIMIT * np.sqrt(
+        np.mean(observed_entries(map(_scatter, problem.groups)) ** 2)
+    )
+    times_since_start, misfit = (
+        observed_entries(span[..., None] for span in spans),
+        observed_entries(map(np.asarray, rows)),
+    )
+    minimum_count = 2 * max(problem.size - problem.space.count_of_priors, 1)
     horizon = full
     while horizon > at_least:
-        inside = since <= horizon * (1 + 1e-12)
-        if inside.sum() < enough:
+        mask = times_since_start <= horizon * (1 + 1e-12)
+        if mask.sum() < minimum_count:
             break
-        if np.isfinite(misfit[inside]).all() and np.sqrt(np.mean(misfit[inside] ** 2)) <= allowed:
+        if np.isfinite(misfit[mask]).all() and np.sqrt(np.mean(misfit[mask] ** 2)) <= threshold:
             return np.inf if horizon == full else horizon
         shortest = horizon
         horizon /= 2
-    lost = since[~np.isfinite(misfit)].min(initial=np.inf)
-    if shortest >= lost > _FURTHER * at_least / 2:
-        return lost * (1 - 1e-9)
+    first_failure = times_since_start[~np.isfinite(misfit)].min(initial=np.inf)
+    if shortest >= first_failure > _LEAST_GROWTH * at_least / 2:
+        return first_failure * (1 - 1e-9)
     return np.inf if shortest >= full else shortest
 
 
 def _scatter(group: Group) -> np.ndarray:
     """Observed values minus their mean over the arc, in standard errors, (A, N, K)."""
-    count = np.maximum(group.seen.sum(axis=1, keepdims=True), 1)
-    mean = np.where(group.seen, group.values, 0).sum(axis=1, keepdims=True) / count
-    return weighed(np.where(group.seen, group.values - mean, 0.0), group.whiten)
+    count = np.maximum(group.mask.sum(axis=1, keepdims=True), 1)
+    mean = np.where(group.mask, group.values, 0).sum(axis=1, keepdims=True) / count
+    return weigh(np.where(group.mask, group.values - mean, 0.0), group.whiten)
 
 
 # ---- what gradient methods need
@@ -232,7 +238,7 @@ def in_segments(run: Run, segments: Segments, u: np.ndarray, solver: Any) -> Min
     w = segments.begin(u)
     if resume is None:
         number, multipliers = 0, np.zeros(gaps)
-        r, _, c = stage.at(w, np.inf, (jnp.asarray(1.0), jnp.asarray(multipliers)))
+        r, _, c = stage.values_at(w, np.inf, (jnp.asarray(1.0), jnp.asarray(multipliers)))
         # Continuity weighs as much as the data to begin with.
         misfit, size = float(np.linalg.norm(r[: len(r) - gaps])), float(np.linalg.norm(c))
         root = max(misfit / max(size, 1e-2), np.sqrt(len(r)))
@@ -242,19 +248,19 @@ def in_segments(run: Run, segments: Segments, u: np.ndarray, solver: Any) -> Min
     while True:
         task = run.task(number, np.inf, run.tolerance, _IN_SEGMENTS)
         extra = jnp.asarray(root), jnp.asarray(multipliers)
-        w, found, status = stage.run(w, task, degrees, extra=extra)
+        w, end, status = stage.run(w, task, degrees, extra=extra)
         if status == FIT_RESULTS.not_finite:
             break
-        c = np.asarray(found.aux)
-        met = float(np.abs(c).max()) <= segments.shooting.tolerance
-        if (met and status == FIT_RESULTS.converged) or run.left <= 0:
-            status = status if met else FIT_RESULTS.discontinuous
+        c = np.asarray(end.aux)
+        is_continuous = float(np.abs(c).max()) <= segments.shooting.tolerance
+        if (is_continuous and status == FIT_RESULTS.converged) or run.left <= 0:
+            status = status if is_continuous else FIT_RESULTS.discontinuous
             break
         multipliers = multipliers + root**2 * c
         root = root * 10 if number < 3 else root
         number += 1
-    J = np.asarray(found.jacobian)
-    data, tied = J[: len(J) - gaps], J[len(J) - gaps :]
-    free = null_space(tied / root) if np.isfinite(J).all() else None
+    J = np.asarray(end.jacobian)
+    data, constraint_rows = J[: len(J) - gaps], J[len(J) - gaps :]
+    free = null_space(constraint_rows / root) if np.isfinite(J).all() else None
     shifts = None if stage.shifts is None else stage.shifts[:, :n]
     return Minimum(w[:n], status, data, free, shifts=shifts)

@@ -22,11 +22,10 @@ from ..problem.system import System, check_system, of_problem
 from .components import Unsupported, program_of
 from .confinement import confine
 from .rational import ExactInvariant
-from .result import DriftBound
-from .tools import tools
+from .result import DriftBound, tools
 from .workers import Workers
 
-_ACCEPTED = {"float64": 2.0**-49, "pairs of float64": 2.0**-94}
+_RESIDUAL = {"float64": 2.0**-49, "pairs of float64": 2.0**-94}
 """Residual of an implicit equation that a solver accepts, relative to the largest momentum: eight
 units of round-off, and twice what `DoubleDouble` leaves out."""
 
@@ -126,23 +125,26 @@ def bound_drift(
         raise ValueError(f"ratio must be larger than 1, got {ratio!r}.")
     system, _, _, h, args = of_problem(system, None, None, h, args, has_start=True)
     check_system(system, "bound_drift")
-    given = chosen(integrator, method=method, arithmetic=arithmetic)
-    how = only(given, "bound_drift", "method", "arithmetic")
-    if not isinstance(how.arithmetic, FloatingPoint | DoubleDouble | FixedPoint):
+    options = chosen(integrator, method=method, arithmetic=arithmetic)
+    integrator_used = only(options, "bound_drift", "method", "arithmetic")
+    if not isinstance(integrator_used.arithmetic, FloatingPoint | DoubleDouble | FixedPoint):
         raise ValueError(
             "arithmetic must be dvi.FloatingPoint(), dvi.DoubleDouble() or "
-            f"dvi.FixedPoint(quantum), got {how.arithmetic!r}: bound_drift does not bound the "
-            "rounding of other kinds of arithmetic."
+            "dvi.FixedPoint(quantum), "
+            f"got {integrator_used.arithmetic!r}: bound_drift does not bound the rounding of "
+            "others."
         )
     h = check_step_size(h)
     shape, (lower, upper) = _domain(domain, found)
     strengths = _interval("epsilon", epsilon)
     times = None if time is None else _interval("time", time)
     functions = _functions(found, system, time is not None)
-    stepped, programs = _step_of(system, how, shape, args, h, times)
-    digits = "pairs of float64" if isinstance(how.arithmetic, DoubleDouble) else "float64"
+    step_map, programs = _step_of(system, integrator_used, shape, args, h, times)
+    digits = (
+        "pairs of float64" if isinstance(integrator_used.arithmetic, DoubleDouble) else "float64"
+    )
     numbers = [shape, shape, (), (), ()]
-    invariants = [_listed(f"the invariant {name}", f, numbers, 0) for f, name in functions]
+    invariants = [_program(f"the invariant {name}", f, numbers, 0) for f, name in functions]
     n, t = len(lower) // 2, ["input", len(lower)]
     certificate = {
         "format": exact.FORMAT,
@@ -153,34 +155,34 @@ def bound_drift(
         "slow": system.slow_time,
         "timed": any(t in p["operations"] for p in (programs["step"], *invariants)),
         "domain": [[x.hex() for x in side] for side in (lower, upper)],
-        "inside": _listed("inside", inside or (lambda q, p: jnp.zeros(0)), [shape, shape], None),
+        "inside": _program("inside", inside or (lambda q, p: jnp.zeros(0)), [shape, shape], None),
         "invariants": invariants,
         "arithmetic": digits,
         "bits": 100,
         "orders": 24 if n < 2 else 10 if n < 3 else 8,  # of the expansion of a function
-        "accepted": (_ACCEPTED[digits] * max(map(abs, (*lower[n:], *upper[n:])))).hex(),
+        "accepted": (_RESIDUAL[digits] * max(map(abs, (*lower[n:], *upper[n:])))).hex(),
         "spread": [(0.0).hex()] * n,
     }
     if certificate["implicit"]:
         sides = lower, upper
-        certificate["spread"] = _spread(stepped, shape, sides, strengths, times, h)
+        certificate["spread"] = _spread(step_map, shape, sides, strengths, times, h)
     checker = exact.Checker(certificate)
-    seen = search.estimate(checker)
-    identities = frozenset(k for k, s in enumerate(seen) if s == 0 and checker.is_identity(k))
-    search.resolve(checker, seen, ratio)
+    estimates = search.estimate(checker)
+    identities = frozenset(k for k, s in enumerate(estimates) if s == 0 and checker.is_identity(k))
+    search.resolve(checker, estimates, ratio)
     certificate["bits"] = checker.bits
     checker = exact.Checker(certificate)
     with Workers(processors()) as workers:
         limits = {"max_boxes": max_boxes, "max_seconds": max_seconds, "workers": workers}
         try:
-            result = search.subdivide(checker, identities, seen, ratio=ratio, **limits)
+            result = search.subdivide(checker, identities, estimates, ratio=ratio, **limits)
         except exact.Failed as error:
             raise ProofError(f"{error}.") from None
         per_step = [exact.up(b) for b in result.bounds]
         certificate |= {
             "per_step": [b.hex() for b in per_step],
             "rounding": [r.hex() for r in result.rounding],
-            "reach": [m.hex() for m in result.moved],
+            "reach": [m.hex() for m in result.displacement],
             "boxes": result.tree,
             "steps": 0,
             "level": None,
@@ -215,25 +217,27 @@ class _WithErrors(Equations):
 
 
 def _step_of(
-    system: System, how: Integrator, shape: Any, args: Any, h: float, times: tuple | None
+    system: System, integrator: Integrator, shape: Any, args: Any, h: float, times: tuple | None
 ) -> tuple[Callable, dict[str, Any]]:
     """The step, a function of (q, p, t, ε, h), and what the certificate has about it: the list of
     operations, of (q0, p0), or of (q0, p1) if it is implicit. Without `times` it is that at t = 0.
     """
-    method = how.method_for(system)
+    method = integrator.method_for(system)
     explicit = method.is_explicit(system, jnp.zeros(shape), args)
     if not (explicit or method.is_the_map):
         raise ValueError(
-            "method must be dvi.TypeII(), or another method that is explicit for this system. "
-            f"{method!r} is implicit for this system: use method=dvi.TypeII()."
+            f"method must be explicit for this system or dvi.TypeII(), but {method!r} is implicit "
+            "for this system."
         )
     plain = System(system.H_D, system.force, system.perturbation)
     start, number = jnp.full(shape, 0.1), jnp.asarray(0.1)
-    interval = Interval(0 * number, number, number)
-    how.arithmetic.prepare(method, Equations(plain, number, args), lambda: interval, start, start)
-    quantum = getattr(how.arithmetic, "quantum", 0.0)
+    first = Interval(0 * number, number, number)
+    integrator.arithmetic.prepare(
+        method, Equations(plain, number, args), lambda: first, start, start
+    )
+    quantum = getattr(integrator.arithmetic, "quantum", 0.0)
 
-    def stepped(q, p, t, epsilon, h, error=0.0):
+    def step_map(q, p, t, epsilon, h, error=0.0):
         equations = _WithErrors(plain, epsilon, args, error=error)
         interval = Interval(t, t + (epsilon * h if system.slow_time else h), h)
         if explicit:
@@ -241,84 +245,93 @@ def _step_of(
         rate = h * equations.momentum_rate(interval, q, p)
         return rate, q + h * equations.position_rate(interval, q, p)
 
-    batched = jax.vmap(stepped, (0, 0, 0, 0, None))
+    step_of_states = jax.vmap(step_map, (0, 0, 0, 0, None))
     if times is None:
         q, p = np.random.default_rng(0).uniform(0.1, 0.2, (2, 8, *shape))
         first, later = (
-            batched(q, p, np.full(8, t), np.full(8, 0.1), jnp.asarray(h)) for t in (0.0, 1.0)
+            step_of_states(q, p, np.full(8, t), np.full(8, 0.1), jnp.asarray(h)) for t in (0.0, 1.0)
         )
         if not np.allclose(first, later, rtol=1e-12, atol=1e-12, equal_nan=True):
             raise ValueError(f"time is missing, but the map depends on the time: {_GIVE_TIME}")
     zero = jnp.zeros(())
-    at = stepped if times else lambda q, p, t, *rest: stepped(q, p, zero, *rest)
+    interval_or_map = (
+        step_map if times else lambda q, p, t, *numbers: step_map(q, p, zero, *numbers)
+    )
     shapes = [shape, shape, *[()] * (4 if quantum else 3)]
-    program = _listed("the step of the system", at, shapes, None)
-    return batched, {"step": program, "implicit": not explicit, "quantum": float(quantum).hex()}
+    program = _program("the step of the system", interval_or_map, shapes, None)
+    return step_of_states, {
+        "step": program,
+        "implicit": not explicit,
+        "quantum": float(quantum).hex(),
+    }
 
 
 def _spread(
-    stepped: Callable, shape: Any, sides: tuple, strengths: tuple, times: tuple | None, h: float
+    step_map: Callable, shape: Any, sides: tuple, strengths: tuple, times: tuple | None, h: float
 ) -> list[str]:
     """A guess of how far p1 is from p0 in an implicit step; the checker decides."""
     rng, size = np.random.default_rng(0), int(np.prod(shape))
     low, high = sides
     z = rng.uniform(low, high, (4000, 2 * size)).reshape(4000, 2, *shape)
     t, epsilon = rng.choice(times or (0.0, 0.0), 4000), rng.choice(strengths, 4000)
-    moves = np.abs(stepped(z[:, 0], z[:, 1], t, epsilon, jnp.asarray(h))[0])
+    moves = np.abs(step_map(z[:, 0], z[:, 1], t, epsilon, jnp.asarray(h))[0])
     return [float(m).hex() for m in 1.3 * np.nanmax(moves, axis=0).ravel() + 1e-12]
 
 
-def _functions(found: Any, system: System, timed: bool) -> list[tuple[Callable, str]]:
+def _functions(invariants: Any, system: System, with_time: bool) -> list[tuple[Callable, str]]:
     """(function of (q, p, t, ε, h), formula) for each invariant."""
-    if isinstance(found, Discovery):
-        if not found.count:
+    if isinstance(invariants, Discovery):
+        if not invariants.count:
             raise ValueError(
-                "found must contain at least one invariant, but this Discovery has none: call "
-                "dvi.discover_invariants with more functions in the basis, or with a lower order."
+                "found must contain at least one invariant, but this Discovery has none: discover "
+                "with more functions in the basis, or a lower order."
             )
-        return _functions(list(found.invariants), system, timed)
-    if isinstance(found, InvariantSeries):
-        if found.basis.uses_time and not timed:
+        return _functions(list(invariants.invariants), system, with_time)
+    if isinstance(invariants, InvariantSeries):
+        if invariants.basis.uses_time and not with_time:
             raise ValueError(
                 f"time is missing, but the invariant depends on the time: {_GIVE_TIME}"
             )
-        if found.basis.uses_time and found.slow_time != system.slow_time:
+        if invariants.basis.uses_time and invariants.slow_time != system.slow_time:
             raise ValueError(
-                f"the invariant was found with slow_time={found.slow_time}, but system has "
-                f"slow_time={system.slow_time}: give the system for which the invariant was found."
+                f"the invariant was found with slow_time={invariants.slow_time}, but system has "
+                f"slow_time={system.slow_time}."
             )
-        return [(lambda q, p, t, e, h: found.evaluate(q, p, e, t), found.formula(terms=8))]
-    if isinstance(found, ExactInvariant):
-        return [(lambda q, p, t, e, h: found.evaluate(q, p, e, h, t), str(found))]
-    if isinstance(found, str) or not (callable(found) or np.iterable(found)):
+        return [
+            (lambda q, p, t, e, h: invariants.evaluate(q, p, e, t), invariants.formula(terms=8))
+        ]
+    if isinstance(invariants, ExactInvariant):
+        return [(lambda q, p, t, e, h: invariants.evaluate(q, p, e, h, t), str(invariants))]
+    if isinstance(invariants, str) or not (callable(invariants) or np.iterable(invariants)):
         raise TypeError(
             "found must be a Discovery, an InvariantSeries, an ExactInvariant, a function (q, p, "
-            "epsilon) or (q, p, epsilon, t), or a list that contains only these, got "
-            f"{found!r:.200}."
+            f"epsilon) or (q, p, epsilon, t), or a list of these, got {invariants!r:.200}."
         )
-    if callable(found):
-        name = getattr(found, "__name__", type(found).__name__)
-        if _takes(found, 4) and (timed or not _takes(found, 3)):
-            return [(lambda q, p, t, e, h: found(q, p, e, t), name)]
-        return [(lambda q, p, t, e, h: found(q, p, e), name)]
-    pairs = [pair for one in found for pair in _functions(one, system, timed)]
+    if callable(invariants):
+        name = getattr(invariants, "__name__", type(invariants).__name__)
+        if _takes(invariants, 4) and (with_time or not _takes(invariants, 3)):
+            return [(lambda q, p, t, e, h: invariants(q, p, e, t), name)]
+        return [(lambda q, p, t, e, h: invariants(q, p, e), name)]
+    pairs = [pair for item in invariants for pair in _functions(item, system, with_time)]
     if not pairs:
-        raise ValueError(f"found must contain at least one invariant, got {found!r:.200}.")
+        raise ValueError(f"found must contain at least one invariant, got {invariants!r:.200}.")
     return pairs
 
 
-def _listed(what: str, function: Callable, shapes: list, ndim: int | None) -> dict[str, Any]:
+def _program(subject: str, function: Callable, shapes: list, ndim: int | None) -> dict[str, Any]:
     """The operations of a function, whose result must have so many axes (None: any)."""
     structs = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes]
     result = jax.eval_shape(function, *structs)
     if ndim is not None and getattr(result, "ndim", None) != ndim:
         kind = type(result).__name__
-        seen = f"an array of shape {result.shape}" if hasattr(result, "shape") else f"a {kind}"
-        raise ValueError(f"{what} must return one number, got {seen}.")
+        description = (
+            f"an array of shape {result.shape}" if hasattr(result, "shape") else f"a {kind}"
+        )
+        raise ValueError(f"{subject} must return one number, got {description}.")
     try:
         return program_of(function, *shapes)
     except Unsupported as error:
-        raise Unsupported(f"{what}: {error}") from None
+        raise Unsupported(f"{subject}: {error}") from None
 
 
 def _takes(function: Callable, count: int) -> bool:
@@ -330,23 +343,23 @@ def _takes(function: Callable, count: int) -> bool:
     return True
 
 
-def _domain(domain: Any, found: Any) -> tuple[tuple[int, ...], tuple[list[float], list[float]]]:
+def _domain(
+    domain: Any, invariants: Any
+) -> tuple[tuple[int, ...], tuple[list[float], list[float]]]:
     """Shape of a state, and the lower and upper bounds of the raveled (q, p)."""
     parts = domain if isinstance(domain, tuple) else (domain, domain)
     if len(parts) != 2:
         raise ValueError(
-            "domain must be a half-width, an array of half-widths, or a pair (domain of q, domain "
-            f"of p), got a tuple of length {len(parts)}: {domain!r:.200}. Give half-widths of "
-            "several coordinates as an array."
+            "domain must be half-widths, or a pair (domain of q, domain of p), got a tuple of "
+            f"length {len(parts)}: {domain!r:.200}."
         )
     shapes = [np.shape(x)[1:] if np.ndim(x) > 1 else np.shape(x) for x in parts]
-    one = found if isinstance(found, Discovery) else None
-    shape = one.shape if one is not None else max(shapes, key=len)
+    discovery = invariants if isinstance(invariants, Discovery) else None
+    shape = discovery.shape if discovery is not None else max(shapes, key=len)
     if not shape:
         raise ValueError(
             "domain must be an array with the shape of q, unless found is a Discovery, got "
-            f"{domain!r}: give one half-width for each coordinate, such as "
-            "domain=np.full(2, 0.5) for two coordinates."
+            f"{domain!r}."
         )
     lower, upper = [], []
     for name, x in zip("qp", parts, strict=True):
@@ -361,7 +374,7 @@ def _domain(domain: Any, found: Any) -> tuple[tuple[int, ...], tuple[list[float]
         if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
             raise ValueError(
                 f"domain of {name} must have finite lower bounds below finite upper bounds, got "
-                f"{low.tolist()} and {high.tolist()}. Half-widths must be positive."
+                f"{low.tolist()} and {high.tolist()}."
             )
         lower.extend(low.tolist())
         upper.extend(high.tolist())
@@ -369,11 +382,11 @@ def _domain(domain: Any, found: Any) -> tuple[tuple[int, ...], tuple[list[float]
 
 
 def _interval(name: str, ends: Any) -> tuple[float, float]:
-    given, ends = ends, [finite(name, x) for x in (ends if np.ndim(ends) else (0.0, ends))]
+    value, ends = ends, [finite(name, x) for x in (ends if np.ndim(ends) else (0.0, ends))]
     if len(ends) != 2 or not ends[0] < ends[1]:
         raise ValueError(
             f"{name} must be a pair (least, largest) with least < largest, or one positive number "
-            f"x for the pair (0, x); got {given!r}."
+            f"x for the pair (0, x); got {value!r}."
         )
     low, high = ends
     return low, high

@@ -35,17 +35,17 @@ ULPS = {"sqrt": 1, "inverse": 1}  # errors of functions in units of round-off; 8
 MALFORMED = (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RecursionError)
 UNITS = {"float64": Fraction(1, 2**53), "pairs of float64": Fraction(1, 2**103)}  # round-off
 LEVEL = 30  # bits for levels, where nothing cancels
-LEAST = 2.0**-1000  # added to each error, for results below the normal numbers
+SMALLEST = 2.0**-1000  # added to each error, for results below the normal numbers
 
 
 class Failed(Exception):
     """What could not be shown, and where."""
 
 
-def require(condition, what, box=()):
+def require(condition, message, box=()):
     if not condition:
         where = " × ".join(f"[{float(a):.6g}, {float(b):.6g}]" for a, b in box)
-        raise Failed(f"{what} on the box {where}" if box else what)
+        raise Failed(f"{message} on the box {where}" if box else message)
 
 
 def digest(certificate):
@@ -73,10 +73,10 @@ def ball(value, radius=0):
     return arb(value.numerator) / value.denominator + arb(0, up(Fraction(radius)))
 
 
-def series(name, at, length):
+def series(name, point, length):
     """The Taylor coefficients of a function at a point, or balls of them on a ball."""
     ctx.cap = length
-    x = arb_series([at, 1], length)
+    x = arb_series([point, 1], length)
     return 1 / x if name == "inverse" else getattr(x, name)()
 
 
@@ -111,8 +111,8 @@ class Models:
         self.ring = fmpz_mpoly_ctx.get([f"s{i}" for i in range(size)], "lex")
 
     def constant(self, value, error=0):  # exact arithmetic has no error
-        scaled = value * self.one
-        return self.ring.constant(math.floor(scaled)), int(scaled.denominator != 1)
+        multiple = value * self.one
+        return self.ring.constant(math.floor(multiple)), int(multiple.denominator != 1)
 
     def sum(self, *terms):
         return sum((t[0] for t in terms[1:]), terms[0][0]), sum(t[1] for t in terms)
@@ -122,9 +122,9 @@ class Models:
         error = norm[0] * b[1] + norm[1] * a[1] + a[1] * b[1]
         product = a[0] * b[0]
         signs = product // (norm[0] * norm[1] + 1)  # rounded down: −1 where a coefficient is < 0
-        whole = (product - (self.one - 1) * signs) // self.one
-        error += int(sum(map(abs, (product - self.one * whole).coeffs())))
-        return whole, (error >> self.bits) + 1
+        integers = (product - (self.one - 1) * signs) // self.one
+        error += int(sum(map(abs, (product - self.one * integers).coeffs())))
+        return integers, (error >> self.bits) + 1
 
     def range(self, a):
         """A lower and an upper bound of the value; an even power of s is not negative."""
@@ -142,20 +142,22 @@ class Models:
         """f(c + r) = Σ f⁽ᵏ⁾(c)/k! rᵏ, with Lagrange's remainder on the range of c + r."""
         low, high = (value * self.one for value in self.range(a))
         middle = int(low + high) // 2
-        ahead = series(name, arb(int(low)).union(arb(int(high))) / self.one, len(self.orders) + 1)
+        expansion = series(
+            name, arb(int(low)).union(arb(int(high))) / self.one, len(self.orders) + 1
+        )
         radius = arb(int(max(high - middle, middle - low))) / self.one
-        left = [abs(ahead[k + 1]) * radius ** (k + 1) * self.one for k in self.orders]
-        require(all(x.is_finite() for x in left), f"{name} is singular, or varies too much")
-        small = (k for k in self.orders if left[k] < 1)
-        order = next(small, min(self.orders, key=lambda k: up(left[k])))
+        remainders = [abs(expansion[k + 1]) * radius ** (k + 1) * self.one for k in self.orders]
+        require(all(x.is_finite() for x in remainders), f"{name} is singular, or varies too much")
+        small = (k for k in self.orders if remainders[k] < 1)
+        order = next(small, min(self.orders, key=lambda k: up(remainders[k])))
         terms = series(name, arb(middle) / self.one, order + 1)
-        rest, result = (a[0] - middle, a[1]), self.constant(Fraction(0))
+        deviation, result = (a[0] - middle, a[1]), self.constant(Fraction(0))
         for k in range(order, -1, -1):
-            scaled = terms[k] * self.one
-            whole = int(scaled.mid().floor().unique_fmpz() or 0)
-            coefficient = self.ring.constant(whole), math.ceil(up(abs(scaled - whole)))
-            result = self.sum(self.multiply(result, rest), coefficient)
-        return result[0], result[1] + math.ceil(up(left[order]))
+            multiple = terms[k] * self.one
+            integer = int(multiple.mid().floor().unique_fmpz() or 0)
+            coefficient = self.ring.constant(integer), math.ceil(up(abs(multiple - integer)))
+            result = self.sum(self.multiply(result, deviation), coefficient)
+        return result[0], result[1] + math.ceil(up(remainders[order]))
 
 
 class Rounding:
@@ -169,22 +171,22 @@ class Rounding:
     def constant(self, value, error=0):
         return ball(value), ball(Fraction(error))
 
-    def rounded(self, value, error, units=1):
-        return value, arb((error + units * self.unit * (abs(value) + error) + LEAST).upper())
+    def with_error(self, value, error, units=1):
+        return value, arb((error + units * self.unit * (abs(value) + error) + SMALLEST).upper())
 
     def sum(self, *terms):
         error, size = sum(t[1] for t in terms), sum(abs(t[0]) + t[1] for t in terms)
-        made = len(terms) * self.unit * size + LEAST
-        return sum(t[0] for t in terms), arb((error + made).upper())
+        roundoff = len(terms) * self.unit * size + SMALLEST
+        return sum(t[0] for t in terms), arb((error + roundoff).upper())
 
     def multiply(self, a, b):
         error = abs(a[0]) * b[1] + abs(b[0]) * a[1] + a[1] * b[1]
-        return self.rounded(a[0] * b[0], error)
+        return self.with_error(a[0] * b[0], error)
 
     def apply(self, name, a):
-        near = series(name, a[0] + arb(0, up(a[1])), 2)
-        require(near[1].is_finite(), f"{name} is singular")
-        return self.rounded(near[0], abs(near[1]) * a[1], ULPS.get(name, 8))
+        derivatives = series(name, a[0] + arb(0, up(a[1])), 2)
+        require(derivatives[1].is_finite(), f"{name} is singular")
+        return self.with_error(derivatives[0], abs(derivatives[1]) * a[1], ULPS.get(name, 8))
 
 
 class Identities:
@@ -200,8 +202,8 @@ class Identities:
         return self.ring.constant(fmpq(value.numerator, value.denominator)), self.one
 
     def sum(self, *terms):
-        (a, b), *others = terms
-        for c, d in others:
+        (a, b), *addends = terms
+        for c, d in addends:
             a, b = (a + c, b) if b == d else (a * d + c * b, b * d)
         return a, b
 
@@ -229,8 +231,8 @@ class Checker:
         self.h, self.quantum, self.accepted, self.spread = numbers
         self.bits, self.orders = certificate["bits"], certificate["orders"]
         self.arithmetic, self.unit = certificate["arithmetic"], UNITS[certificate["arithmetic"]]
-        used = ["input", 2 * self.n + 3] in self.step["operations"]
-        require(used == (self.quantum > 0), "a grid is used or stated, but not both")
+        has_grid = ["input", 2 * self.n + 3] in self.step["operations"]
+        require(has_grid == (self.quantum > 0), "a grid is used or stated, but not both")
         ctx.prec = self.bits + 60
 
     def root(self):
@@ -252,14 +254,14 @@ class Checker:
     def is_outside(self, algebra, x):
         """Whether no state of these models is in the domain."""
         sides = zip(map(algebra.range, x), self.lower, self.upper, strict=False)
-        beside = any(high < lower or low > upper for (low, high), lower, upper in sides)
-        return beside or any(algebra.range(g)[1] < 0 for g in run(self.inside, x, algebra))
+        is_separate = any(high < lower or low > upper for (low, high), lower, upper in sides)
+        return is_separate or any(algebra.range(g)[1] < 0 for g in run(self.inside, x, algebra))
 
-    def stepped(self, x, algebra):
+    def states_of_step(self, x, algebra):
         """(q, p, t, ε, h) before and after a step, from the coordinates of a box."""
         q0, p0, (t0, epsilon) = x[: self.n], x[self.n : -2], x[-2:]
-        h, off = algebra.constant(self.h), algebra.constant(Fraction(0), self.quantum / 2)
-        end = run(self.step, [*x, h, off], algebra)
+        h, error = algebra.constant(self.h), algebra.constant(Fraction(0), self.quantum / 2)
+        end = run(self.step, [*x, h, error], algebra)
         if self.implicit:  # (q0, p1) → (h·rate, q1)
             end, moves, p1 = [*end[self.n :], *p0], end[: self.n], p0
             p0 = [difference(p, m, algebra) for p, m in zip(p1, moves, strict=True)]
@@ -268,10 +270,10 @@ class Checker:
 
     def change(self, k, step, algebra):
         """I_k(Φ(x)) − I_k(x), from x before and after a step."""
-        before, after = (run(self.invariants[k], x, algebra)[0] for x in step)
-        return difference(after, before, algebra)
+        start_value, end_value = (run(self.invariants[k], x, algebra)[0] for x in step)
+        return difference(end_value, start_value, algebra)
 
-    def moved(self, step, algebra):
+    def displacement(self, step, algebra):
         """How far a step moves each coordinate, in exact arithmetic."""
         pairs = list(zip(*step, strict=True))[: 2 * self.n]
         return [algebra.bound(difference(b, a, algebra)) for a, b in pairs]
@@ -279,7 +281,7 @@ class Checker:
     def is_identity(self, k):
         """Whether I_k is conserved exactly, for all x, t and ε."""
         algebra = Identities(2 * self.n + 2)
-        step = self.stepped([(x, algebra.one) for x in algebra.x], algebra)
+        step = self.states_of_step([(x, algebra.one) for x in algebra.x], algebra)
         numerator, denominator = self.change(k, step, algebra)
         return numerator == 0 and denominator != 0
 
@@ -289,16 +291,16 @@ class Checker:
         algebra, exactly, n = Rounding(self.unit), Rounding(0), self.n
         x = [(ball((a + b) / 2, (b - a) / 2), arb(0)) for a, b in box]
         x[-2] = x[-2][0], 2 * ball(UNITS["float64"]) * abs(x[-2][0])  # t = t0 + kh in float64
-        start, end = self.stepped(x, algebra)
+        start, end = self.states_of_step(x, algebra)
         if self.implicit:
             # A Lipschitz constant of p1 → h·rate(q0, p1) in the maximum norm: the effect of errors.
-            near = [(p1, arb(2) ** -60) for p1, _ in x[n:-2]]
-            inputs = [*x[:n], *near, *x[-2:], exactly.constant(self.h)]
+            momenta = [(p1, arb(2) ** -60) for p1, _ in x[n:-2]]
+            inputs = [*x[:n], *momenta, *x[-2:], exactly.constant(self.h)]
             lipschitz = max(up(e) * 2.0**60 for _, e in run(self.step, inputs, exactly)[:n])
             require(lipschitz < 1 / 3, "the implicit step is not shown to be a contraction", box)
             error = max((e + arb(up(self.accepted)) for _, e in start[n : 2 * n]), key=up)
-            x[n:-2] = [(p1, error / (1 - arb(lipschitz))) for p1, _ in near]
-            end = self.stepped(x, algebra)[1]
+            x[n:-2] = [(p1, error / (1 - arb(lipschitz))) for p1, _ in momenta]
+            end = self.states_of_step(x, algebra)[1]
         changes = [run(function, end, exactly)[0][1] for function in self.invariants]
         return list(map(up, changes)), [up(error) for _, error in end[: 2 * n]]
 
@@ -315,26 +317,26 @@ def leaves(box, node):
         yield from leaves([*box[:axis], side, *box[axis + 1 :]], part)
 
 
-def check_step(checker, box, claim, stated):
+def check_step(checker, box, claim, limits):
     """Statements 1 and 2 on one box; `stated`: the numbers per_step, rounding and reach."""
     algebra, x = checker.models(box)
     if claim == "outside" and not checker.implicit:  # the step may be singular there
         return require(checker.is_outside(algebra, x), "not shown to be outside", box)
-    step, (rounded, errors) = checker.stepped(x, algebra), checker.rounding(box)
-    moved = checker.moved(step, algebra)
-    near = zip(moved[checker.n :], checker.spread, strict=True)
-    require(not checker.implicit or all(m <= s for m, s in near), "p1 is far from p0", box)
+    step, (roundings, errors) = checker.states_of_step(x, algebra), checker.rounding(box)
+    moves = checker.displacement(step, algebra)
+    pairs = zip(moves[checker.n :], checker.spread, strict=True)
+    require(not checker.implicit or all(m <= s for m, s in pairs), "p1 is far from p0", box)
     if claim == "outside":
         return require(checker.is_outside(algebra, step[0]), "not shown to be outside", box)
-    found = [checker.change(k, step, algebra) for k in range(len(checker.invariants))]
-    found = map(algebra.bound, found)
-    found = [0 if stated[k] == 0 and checker.is_identity(k) else b for k, b in enumerate(found)]
-    moved = [m + Fraction(e) for m, e in zip(moved, errors, strict=True)]
-    fits = [a <= b for a, b in zip([*found, *rounded, *moved], stated, strict=True)]
+    changes = [checker.change(k, step, algebra) for k in range(len(checker.invariants))]
+    changes = map(algebra.bound, changes)
+    changes = [0 if limits[k] == 0 and checker.is_identity(k) else b for k, b in enumerate(changes)]
+    moves = [m + Fraction(e) for m, e in zip(moves, errors, strict=True)]
+    fits = [a <= b for a, b in zip([*changes, *roundings, *moves], limits, strict=True)]
     return require(all(fits), "a change, a rounding or a move is larger than stated", box)
 
 
-def combined(checker, weights, box):
+def combination_model(checker, weights, box):
     """Σ w_k I_k as a model on a box."""
     algebra, x = checker.models(box)
     x, pairs = [*x, algebra.constant(checker.h)], zip(weights, checker.invariants, strict=True)
@@ -346,16 +348,16 @@ def check_confined(checker, box, claim, weights, limit, reach):
     """Statement 3 on one box: no trajectory gets there, or it is in the domain there."""
     if claim == "unreachable":
         wide = [(a - w, b + w) for (a, b), w in zip(box[:-2], reach, strict=True)]
-        shown = checker.is_outside(*checker.models([*wide, *box[-2:]]))
+        is_shown = checker.is_outside(*checker.models([*wide, *box[-2:]]))
     elif claim == "inside":
         sides = zip(box, checker.lower, checker.upper, strict=False)
-        shown = all(low <= a and b <= high for (a, b), low, high in sides)
+        is_shown = all(low <= a and b <= high for (a, b), low, high in sides)
         algebra, x = checker.models(box)
-        shown &= all(algebra.range(g)[0] >= 0 for g in run(checker.inside, x, algebra))
+        is_shown &= all(algebra.range(g)[0] >= 0 for g in run(checker.inside, x, algebra))
     else:
-        algebra, value = combined(checker, weights, box)
-        shown = algebra.range(value)[0] > limit
-    require(shown, f"{claim} is not shown", box)
+        algebra, value = combination_model(checker, weights, box)
+        is_shown = algebra.range(value)[0] > limit
+    require(is_shown, f"{claim} is not shown", box)
 
 
 def check(certificate):
@@ -374,15 +376,17 @@ def check(certificate):
     if certificate["level"] is None:
         return text
     (weights, value), steps = exact(certificate["level"]), certificate["steps"]
-    each = [abs(w) * (b + r) for w, b, r in zip(weights, per_step, rounding, strict=True)]
-    *around, time, epsilon = checker.root()
-    around = [(a - w, b + w) for (a, b), w in zip(around, reach, strict=True)]
+    rates = [abs(w) * (b + r) for w, b, r in zip(weights, per_step, rounding, strict=True)]
+    *sides, time, epsilon = checker.root()
+    sides = [(a - w, b + w) for (a, b), w in zip(sides, reach, strict=True)]
     t, lasts = ["input", 2 * checker.n], steps * checker.h * (epsilon[1] if checker.slow else 1)
-    timed = any(t in program["operations"] for program in [checker.step, *checker.invariants])
-    require(not timed or lasts <= time[1] - time[0], "the steps last longer than the time", [time])
+    is_timed = any(t in program["operations"] for program in [checker.step, *checker.invariants])
+    require(
+        not is_timed or lasts <= time[1] - time[0], "the steps last longer than the time", [time]
+    )
     checker.bits = LEVEL
-    for box, claim in leaves([*around, time, epsilon], certificate["shell"]):
-        check_confined(checker, box, claim, weights, value + steps * sum(each), reach)
+    for box, claim in leaves([*sides, time, epsilon], certificate["shell"]):
+        check_confined(checker, box, claim, weights, value + steps * sum(rates), reach)
     return text + f"; from Σ w_k I_k ≤ {float(value):.6g} the domain is not left in {steps} steps"
 
 

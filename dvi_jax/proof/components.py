@@ -37,51 +37,51 @@ class Program:
 
     def __init__(self):
         self.operations: list[list[Any]] = []
-        self._known: dict[tuple, int] = {}
+        self._numbers: dict[tuple, int] = {}
         self.constants: dict[int, float] = {}
 
     def write(self, name: str, *operands: Any) -> "Scalar":
         key = (name, *operands)
-        if key not in self._known:
-            self._known[key] = len(self.operations)
+        if key not in self._numbers:
+            self._numbers[key] = len(self.operations)
             self.operations.append([name, *operands])
-        return Scalar(self, self._known[key])
+        return Scalar(self, self._numbers[key])
 
     def constant(self, value: float) -> "Scalar":
-        made = self.write("constant", float(value).hex())
-        self.constants[made.index] = float(value)
-        return made
+        scalar = self.write("constant", float(value).hex())
+        self.constants[scalar.index] = float(value)
+        return scalar
 
     def as_json(self, outputs: Sequence["Scalar"]) -> dict[str, Any]:
         """With the operations that the outputs need only."""
-        needed = set()
+        indices = set()
         stack = [out.index for out in outputs]
         while stack:
             i = stack.pop()
-            if i not in needed:
-                needed.add(i)
+            if i not in indices:
+                indices.add(i)
                 stack.extend(_operands(self.operations[i]))
-        order = sorted(needed)
-        unknown = {self.operations[i][1] for i in order if self.operations[i][0] == "unknown"}
-        if unknown:
-            names = ", ".join(sorted(unknown)).replace("select_n", "select_n (jnp.where)")
+        order = sorted(indices)
+        primitives = {self.operations[i][1] for i in order if self.operations[i][0] == "unknown"}
+        if primitives:
+            names = ", ".join(sorted(primitives)).replace("select_n", "select_n (jnp.where)")
             raise Unsupported(
-                f"the function uses operations of JAX that a proof does not allow: {names}. "
-                "Allowed are sums, products, quotients, powers with constant exponents, sinh, "
-                f"cosh, tanh, {', '.join(UNARY)}. Remove all other operations."
+                f"operations of JAX that a proof does not allow: {names}. Allowed are sums, "
+                "products, quotients, powers with constant exponents, sinh, cosh, tanh, "
+                f"{', '.join(UNARY)}."
             )
-        new = {old: i for i, old in enumerate(order)}
+        numbers = {old: i for i, old in enumerate(order)}
         operations = []
         for i in order:
-            name, *rest = self.operations[i]
+            name, *arguments = self.operations[i]
             count = len(_operands(self.operations[i]))
-            operations.append([name, *(new[j] for j in rest[:count]), *rest[count:]])
-        return {"operations": operations, "outputs": [new[out.index] for out in outputs]}
+            operations.append([name, *(numbers[j] for j in arguments[:count]), *arguments[count:]])
+        return {"operations": operations, "outputs": [numbers[out.index] for out in outputs]}
 
 
 def _operands(operation: list[Any]) -> list[int]:
-    name, *rest = operation
-    return [] if name in ("input", "constant", "unknown") else rest
+    name, *arguments = operation
+    return [] if name in ("input", "constant", "unknown") else arguments
 
 
 class Scalar:
@@ -93,66 +93,66 @@ class Scalar:
         self.program, self.index = program, index
 
     @property
-    def known(self) -> float | None:
+    def value(self) -> float | None:
         return self.program.constants.get(self.index)
 
-    def _of(self, other: Any) -> "Scalar":
+    def _scalar(self, other: Any) -> "Scalar":
         return other if isinstance(other, Scalar) else self.program.constant(other)
 
     def _constant(self, operation: Callable, other: "Scalar") -> "Scalar | None":
         """The result for two constants, if it is a number of float64."""
-        if self.known is None or other.known is None:
+        if self.value is None or other.value is None:
             return None
-        value = operation(Fraction(self.known), Fraction(other.known))
+        value = operation(Fraction(self.value), Fraction(other.value))
         is_exact = abs(value) < 2**1000 and Fraction(float(value)) == value
         return self.program.constant(float(value)) if is_exact else None
 
     def __add__(self, other: Any) -> "Scalar":
-        other = self._of(other)
-        if self.known == 0:
+        other = self._scalar(other)
+        if self.value == 0:
             return other
-        if other.known == 0:
+        if other.value == 0:
             return self
         constant = self._constant(operator.add, other)
         return constant or self.program.write("sum", self.index, other.index)
 
     def __neg__(self) -> "Scalar":
-        if self.known is not None:
-            return self.program.constant(-self.known)
+        if self.value is not None:
+            return self.program.constant(-self.value)
         return self * -1.0
 
     def __sub__(self, other: Any) -> "Scalar":
-        return self + -self._of(other)
+        return self + -self._scalar(other)
 
     def __mul__(self, other: Any) -> "Scalar":
-        other = self._of(other)
+        other = self._scalar(other)
         for a, b in ((self, other), (other, self)):
-            if a.known == 0 or b.known == 1:
+            if a.value == 0 or b.value == 1:
                 return a
         constant = self._constant(operator.mul, other)
         return constant or self.program.write("multiply", self.index, other.index)
 
     def __truediv__(self, other: Any) -> "Scalar":
-        other = self._of(other)
-        if self.known == 0 or other.known == 1:
+        other = self._scalar(other)
+        if self.value == 0 or other.value == 1:
             return self
-        if other.known and math.frexp(other.known)[0] in (0.5, -0.5):
-            return self * (1 / other.known)  # exact
+        if other.value and math.frexp(other.value)[0] in (0.5, -0.5):
+            return self * (1 / other.value)  # exact
         return self * other.apply("inverse")
 
     __radd__, __rmul__ = __add__, __mul__
 
     def __rsub__(self, other: Any) -> "Scalar":
-        return self._of(other) - self
+        return self._scalar(other) - self
 
     def __rtruediv__(self, other: Any) -> "Scalar":
-        return self._of(other) / self
+        return self._scalar(other) / self
 
     def power(self, n: int) -> "Scalar":
         """selfⁿ: n − 1 products."""
         if n < 1:
-            one = self.program.constant(1.0)
-            return one / self.power(-n) if n else one
+            unit = self.program.constant(1.0)
+            return unit / self.power(-n) if n else unit
         if n == 1:
             return self
         square = (self * self).power(n // 2)
@@ -164,7 +164,7 @@ class Scalar:
 
 def total(scalars: Sequence[Any]) -> Any:
     """The sum of several numbers as one operation, whose order is open."""
-    parts = [s for s in scalars if not (isinstance(s, Scalar) and s.known == 0)]
+    parts = [s for s in scalars if not (isinstance(s, Scalar) and s.value == 0)]
     if len(parts) < 2:
         return parts[0] if parts else scalars[0]
     return parts[0].program.write("sum", *(part.index for part in parts))
@@ -179,22 +179,22 @@ def program_of(function: Callable, *shapes: tuple[int, ...]) -> dict[str, Any]:
     **Raises** `Unsupported` for operations that are not analytic, or that depend on the values.
     """
     structs = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes]
-    closed = jax.make_jaxpr(function)(*structs)
-    program, inputs, at = Program(), [], 0
+    closed_jaxpr = jax.make_jaxpr(function)(*structs)
+    program, inputs, offset = Program(), [], 0
     for shape in shapes:
         size = int(np.prod(shape))
-        numbers = [program.write("input", at + i) for i in range(size)]
+        numbers = [program.write("input", offset + i) for i in range(size)]
         inputs.append(_array(numbers, shape))
-        at += size
-    outputs = _evaluate(program, closed.jaxpr, closed.consts, inputs)
+        offset += size
+    outputs = _evaluate(program, closed_jaxpr.jaxpr, closed_jaxpr.consts, inputs)
     scalars = [x for out in outputs for x in _symbolic(program, out).ravel()]
     return program.as_json(scalars)
 
 
 def _array(scalars: Sequence[Scalar], shape: tuple[int, ...]) -> np.ndarray:
-    made = np.empty(len(scalars), object)
-    made[:] = scalars
-    return made.reshape(shape)
+    array = np.empty(len(scalars), object)
+    array[:] = scalars
+    return array.reshape(shape)
 
 
 def _is_symbolic(x: Any) -> bool:
@@ -203,9 +203,9 @@ def _is_symbolic(x: Any) -> bool:
 
 def _concrete(x: Any) -> Any:
     """The numbers of an array, if all of them are constants."""
-    if not _is_symbolic(x) or any(scalar.known is None for scalar in x.ravel()):
+    if not _is_symbolic(x) or any(scalar.value is None for scalar in x.ravel()):
         return x
-    return np.array([scalar.known for scalar in x.ravel()]).reshape(x.shape)
+    return np.array([scalar.value for scalar in x.ravel()]).reshape(x.shape)
 
 
 def _symbolic(program: Program, x: Any) -> np.ndarray:
@@ -216,15 +216,15 @@ def _symbolic(program: Program, x: Any) -> np.ndarray:
 
 
 def _evaluate(program: Program, jaxpr: Any, consts: Sequence[Any], inputs: Sequence[Any]) -> list:
-    known: dict[Any, Any] = dict(zip(jaxpr.constvars, consts, strict=True))
-    known.update(zip(jaxpr.invars, inputs, strict=True))
+    environment: dict[Any, Any] = dict(zip(jaxpr.constvars, consts, strict=True))
+    environment.update(zip(jaxpr.invars, inputs, strict=True))
 
     def read(atom):
-        return atom.val if isinstance(atom, Literal) else known[atom]
+        return atom.val if isinstance(atom, Literal) else environment[atom]
 
     for equation in jaxpr.eqns:
-        made = _apply(program, equation, [read(v) for v in equation.invars])
-        known.update(zip(equation.outvars, made, strict=True))
+        results = _apply(program, equation, [read(v) for v in equation.invars])
+        environment.update(zip(equation.outvars, results, strict=True))
     return [read(v) for v in jaxpr.outvars]
 
 
@@ -241,30 +241,32 @@ def _apply(program: Program, equation: Any, values: list) -> list:
         branch = params["branches"][int(values[0])]
         return _evaluate(program, branch.jaxpr, branch.consts, values[1:])
     values = [_concrete(v) for v in values]
-    rounds = name in _ROUNDED and equation.outvars[0].aval.dtype == jnp.float64
+    rounds = name in _ROUNDING_OPERATIONS and equation.outvars[0].aval.dtype == jnp.float64
     if not (rounds or any(map(_is_symbolic, values))):
         out = equation.primitive.bind(*map(jnp.asarray, values), **params)
         return list(out) if equation.primitive.multiple_results else [out]
     if name in _MOVES and not (name == "select_n" and _is_symbolic(values[0])):
-        return _moved(program, equation, values)
+        return _rearrange(program, equation, values)
     if name == "convert_element_type":
         return [values[0]]
-    made = _arithmetic(program, equation, [_symbolic(program, v) for v in values], values)
-    if made is None:  # which is an error only if an output needs it: a status does not
-        unknown = program.write("unknown", name)
+    array = _arithmetic(program, equation, [_symbolic(program, v) for v in values], values)
+    if array is None:  # which is an error only if an output needs it: a status does not
+        placeholder = program.write("unknown", name)
         shapes = [v.aval.shape for v in equation.outvars]
-        return [_array([unknown] * int(np.prod(shape)), shape) for shape in shapes]
-    return [made]
+        return [_array([placeholder] * int(np.prod(shape)), shape) for shape in shapes]
+    return [array]
 
 
 def _arithmetic(program: Program, equation: Any, arrays: list, values: list) -> np.ndarray | None:
     """The output of an operation; None for one that has no list of operations."""
     name, params = equation.primitive.name, equation.params
     shape = equation.outvars[0].aval.shape
-    each = _ELEMENTWISE.get(name)
-    if each is not None:
+    scalar_rule = _ELEMENTWISE.get(name)
+    if scalar_rule is not None:
         spread = [np.broadcast_to(a, shape) for a in arrays]
-        return _array([each(*xs) for xs in zip(*(a.ravel() for a in spread), strict=True)], shape)
+        return _array(
+            [scalar_rule(*xs) for xs in zip(*(a.ravel() for a in spread), strict=True)], shape
+        )
     if name in UNARY:
         return _array([x.apply(name) for x in arrays[0].ravel()], shape)
     if name == "integer_pow":
@@ -274,8 +276,8 @@ def _arithmetic(program: Program, equation: Any, arrays: list, values: list) -> 
         pairs = zip(np.broadcast_to(arrays[0], shape).ravel(), exponent, strict=True)
         return _array([_real_power(x, float(y)) for x, y in pairs], shape)
     if name in ("reduce_sum", "reduce_prod"):
-        moved = np.moveaxis(arrays[0], params["axes"], range(len(params["axes"])))
-        flat = moved.reshape(-1, int(np.prod(shape)))
+        columns = np.moveaxis(arrays[0], params["axes"], range(len(params["axes"])))
+        flat = columns.reshape(-1, int(np.prod(shape)))
         combine: Any = total if name == "reduce_sum" else math.prod
         return _array([combine(column) for column in flat.T], shape)
     if name == "dot_general":
@@ -311,7 +313,7 @@ _ELEMENTWISE: dict[str, Callable] = {
 }
 
 
-_ROUNDED = {
+_ROUNDING_OPERATIONS = {
     *_ELEMENTWISE, *UNARY, "pow", "integer_pow", "reduce_sum", "reduce_prod", "dot_general",
     "cumsum",
 } - {"neg"}  # fmt: skip
@@ -322,11 +324,11 @@ def _dot(dimensions: Any, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Σ a b over the contracted axes; batch axes first, then those of a, then those of b."""
     (ca, cb), (ba, bb) = dimensions
     parts = []
-    for x, contracted, batch in ((a, ca, ba), (b, cb, bb)):
-        free = [i for i in range(x.ndim) if i not in (*contracted, *batch)]
-        moved = np.transpose(x, (*batch, *free, *contracted))
+    for x, axes, batch in ((a, ca, ba), (b, cb, bb)):
+        free = [i for i in range(x.ndim) if i not in (*axes, *batch)]
+        matrix = np.transpose(x, (*batch, *free, *axes))
         sizes = [x.shape[i] for i in batch], [x.shape[i] for i in free]
-        parts.append(moved.reshape(*(int(np.prod(s)) for s in sizes), -1))
+        parts.append(matrix.reshape(*(int(np.prod(s)) for s in sizes), -1))
     left, right = parts
     out = np.empty((left.shape[0], left.shape[1], right.shape[1]), object)
     for index in np.ndindex(out.shape):
@@ -335,7 +337,7 @@ def _dot(dimensions: Any, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return out
 
 
-def _moved(program: Program, equation: Any, values: list) -> list:
+def _rearrange(program: Program, equation: Any, values: list) -> list:
     """Apply an operation that only moves numbers to their places in a list."""
     table: list[Any] = [program.constant(0.0)]
     arguments = []
@@ -389,8 +391,8 @@ def _scan(program: Program, params: Any, values: list) -> list:
         rows.append(out[nk:])
     if params["reverse"]:
         rows.reverse()
-    stacked = [
+    stacks = [
         np.stack([_symbolic(program, np.asarray(y) if not _is_symbolic(y) else y) for y in ys])
         for ys in zip(*rows, strict=True)
     ]
-    return [*carry, *stacked]
+    return [*carry, *stacks]

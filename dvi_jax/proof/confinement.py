@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import linprog
 
-from .tools import combination, tools
+from .result import combination, tools
 
 _LEVELS = (0.97, 0.9, 0.75, 0.5)
 """Fractions of the range between the least value in the domain and that at its border that are
@@ -36,10 +36,10 @@ def confine(
         exact.exact(certificate[name]) for name in ("per_step", "rounding", "reach")
     )
     reason = "no combination of the invariants is larger all around the domain than inside"
-    for weights, least, border in _candidates(checker, functions, inside, shape, reach):
+    for weights, minimum, border in _candidates(checker, functions, inside, shape, reach):
         w = [Fraction(x) for x in weights]
-        each = sum(abs(x) * (b + r) for x, b, r in zip(w, per_step, rounding, strict=True))
-        steps = math.floor(Fraction(change) / each) if each else 2**62
+        rate = sum(abs(x) * (b + r) for x, b, r in zip(w, per_step, rounding, strict=True))
+        steps = math.floor(Fraction(change) / rate) if rate else 2**62
         if certificate["timed"]:
             last = checker.h * (checker.epsilon[1] if checker.slow else 1)
             steps = min(steps, math.floor((checker.time[1] - checker.time[0]) / last))
@@ -47,15 +47,15 @@ def confine(
             reason = f"{combination(weights)} may change by more than change={change:g} in one step"
             continue
         for part in _LEVELS:
-            level = least + part * (border - least) - change
-            if level <= least:
+            level = minimum + part * (border - minimum) - change
+            if level <= minimum:
                 reason = f"change={change:g} is larger than the range of {combination(weights)}"
                 continue
             value = Fraction(level)
             quick = _value(functions, weights, shape, float(checker.h))
             try:
                 shell, count = search.enclose(
-                    checker, w, value + steps * each, reach, quick, **limits
+                    checker, w, value + steps * rate, reach, quick, **limits
                 )
             except exact.Failed as error:
                 reason = str(error)
@@ -68,9 +68,9 @@ def confine(
 
 def _value(functions: list, weights: list[float], shape: Any, h: float) -> Any:
     """Σ w_k I_k of an array of points (q, p, t, ε)."""
-    used = [(w, f) for w, (f, _) in zip(weights, functions, strict=True) if w]
+    terms = [(w, f) for w, (f, _) in zip(weights, functions, strict=True) if w]
     return jax.jit(
-        jax.vmap(lambda x: sum(w * f(*_state(x[:-2], shape), x[-2], x[-1], h) for w, f in used))
+        jax.vmap(lambda x: sum(w * f(*_state(x[:-2], shape), x[-2], x[-1], h) for w, f in terms))
     )
 
 
@@ -84,36 +84,36 @@ def _candidates(checker: Any, functions: list, inside: Any, shape: Any, reach: l
     h = float(checker.h)
 
     def values(z):
-        one = jax.jit(
+        evaluate = jax.jit(
             jax.vmap(
                 lambda z, t, e: jnp.stack([f(*_state(z, shape), t, e, h) for f, _ in functions]),
                 (0, None, None),
             )
         )
-        rows = np.concatenate([np.asarray(one(z, t, e)) for t in spans[0] for e in spans[1]])
+        rows = np.concatenate([np.asarray(evaluate(z, t, e)) for t in spans[0] for e in spans[1]])
         return np.where(np.isfinite(rows), rows, 0.0)  # candidates only: the checker decides
 
-    within, around, center = values(inner), values(outer), values(middle)[0]
+    inner_values, outer_values, center = values(inner), values(outer), values(middle)[0]
     weights = [sign * unit for unit in np.eye(len(functions)) for sign in (1, -1)]
     if len(functions) > 1:
-        weights[:0] = _best_combination(within - center, around - center)
-    found = []
+        weights[:0] = _best_combination(inner_values - center, outer_values - center)
+    candidates = []
     for w in weights:
-        border, least = float(np.min(around @ w)), float(np.min(within @ w))
-        if border > least:
-            share = float(np.mean(within @ w < border))
-            found.append((share, (w.tolist(), least, border)))
-    return [item for _, item in sorted(found, key=lambda pair: -pair[0])]
+        border, minimum = float(np.min(outer_values @ w)), float(np.min(inner_values @ w))
+        if border > minimum:
+            share = float(np.mean(inner_values @ w < border))
+            candidates.append((share, (w.tolist(), minimum, border)))
+    return [item for _, item in sorted(candidates, key=lambda pair: -pair[0])]
 
 
-def _best_combination(within: np.ndarray, around: np.ndarray) -> list[np.ndarray]:
+def _best_combination(inner_values: np.ndarray, outer_values: np.ndarray) -> list[np.ndarray]:
     """The w whose least w·I around the domain is largest next to its mean inside: a linear program.
     Empty if no w·I is larger around the domain than at its middle, where I is 0 here."""
-    mean = np.mean(within, axis=0)
+    mean = np.mean(inner_values, axis=0)
     n = len(mean)
-    size = np.std(within, axis=0) + 1e-300
+    size = np.std(inner_values, axis=0) + 1e-300
     # max m  with  w·I(border) ≥ m  and  w·mean = 1.
-    border = around[:: max(1, len(around) // 20000)]
+    border = outer_values[:: max(1, len(outer_values) // 20000)]
     rows = np.column_stack([-border / size, np.ones(len(border))])
     solution = linprog(
         [*np.zeros(n), -1.0],
@@ -135,22 +135,24 @@ def _points(checker: Any, inside: Any, shape: Any, reach: list) -> tuple[np.ndar
     rng, wide = np.random.default_rng(0), np.array(reach)
     low, high = (np.array([float(x) for x in side]) for side in (checker.lower, checker.upper))
     inner = rng.uniform(low, high, (4000, len(low)))
-    near = rng.uniform(low, high, (40000, len(low)))
-    axis = rng.integers(0, len(low), len(near))
-    rows = np.arange(len(near))
-    side = rng.random(len(near)) < 0.5
-    near[rows, axis] = np.where(side, low[axis], high[axis])
-    outer = near + rng.uniform(0, 1, near.shape) * wide * np.where(near >= high, 1, -1) * (
-        (near <= low) | (near >= high)
-    )
+    border_points = rng.uniform(low, high, (40000, len(low)))
+    axis = rng.integers(0, len(low), len(border_points))
+    rows = np.arange(len(border_points))
+    side = rng.random(len(border_points)) < 0.5
+    border_points[rows, axis] = np.where(side, low[axis], high[axis])
+    outer = border_points + rng.uniform(0, 1, border_points.shape) * wide * np.where(
+        border_points >= high, 1, -1
+    ) * ((border_points <= low) | (border_points >= high))
     if inside is None:
         return inner, outer
     keep = jax.jit(jax.vmap(lambda z: jnp.all(inside(*_state(z, shape)) >= 0)))
-    near = rng.uniform(low, high, (200000, len(low)))
-    near = near[np.asarray(keep(near))]
-    moved = near + rng.choice([-1.0, 1.0], near.shape) * wide
-    off = ~np.asarray(keep(moved)) | (moved < low).any(1) | (moved > high).any(1)
-    return near[:4000], moved[off][:40000]
+    border_points = rng.uniform(low, high, (200000, len(low)))
+    border_points = border_points[np.asarray(keep(border_points))]
+    neighbours = border_points + rng.choice([-1.0, 1.0], border_points.shape) * wide
+    is_outside = (
+        ~np.asarray(keep(neighbours)) | (neighbours < low).any(1) | (neighbours > high).any(1)
+    )
+    return border_points[:4000], neighbours[is_outside][:40000]
 
 
 def _state(z: Any, shape: Any) -> tuple[Any, Any]:
@@ -170,7 +172,9 @@ def _scale(checker: Any, weights: list, level: Fraction) -> float:
         i = (good + bad) // 2
         box = [((a + b) / 2 - i * (b - a) / 200, (a + b) / 2 + i * (b - a) / 200) for a, b in sides]
         try:
-            parts = [exact.combined(checker, weights, [*box, span, epsilon]) for span in spans]
+            parts = [
+                exact.combination_model(checker, weights, [*box, span, epsilon]) for span in spans
+            ]
             fits = all(algebra.range(value)[1] <= level for algebra, value in parts)
         except search.SINGULAR:
             fits = False

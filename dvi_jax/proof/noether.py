@@ -15,7 +15,7 @@ from ..methods.step import Equations
 from ..problem.energies import disturbing_work, outgoing_energy
 from ..problem.system import check_system, of_problem
 from .components import program_of
-from .tools import tools
+from .result import tools
 
 
 class NoetherProof(eqx.Module):
@@ -100,9 +100,7 @@ def prove_noether(
     exact, _ = tools()
     q0 = getattr(system, "q0", None) if q0 is None else q0
     if q0 is None:
-        raise TypeError(
-            "q0 is missing: give an array with the shape of q, for example q0=jnp.zeros(2)."
-        )
+        raise TypeError("q0 is missing: give an array with the shape of q.")
     system, *_, args = of_problem(system, None, None, None, args, has_start=True)
     check_system(system, "prove_noether")
     series = AdiabaticInvariant(generators, gauges)
@@ -112,30 +110,37 @@ def prove_noether(
         """The differences that have to be zero; `energy`: E⁻ at the first point, any number."""
         t1 = t0 + h
         moves = Equations(system, epsilon, args)
-        at = Interval(t0, t1, h)
-        p0 = p1 - h * moves.momentum_rate(at, q0, p1)
-        q1 = q0 + h * moves.position_rate(at, q0, p1)
+        interval = Interval(t0, t1, h)
+        p0 = p1 - h * moves.momentum_rate(interval, q0, p1)
+        q1 = q0 + h * moves.position_rate(interval, q0, p1)
         first, second = LatticePoint(t0, q0, p0), LatticePoint(t1, q1, p1)
         noether = [
             noether_identity(system, generators, gauges, m, first, second, epsilon, args)
             for m in range(z + 1)
         ]
-        here = [generator(first, args) for generator in generators]
+        points_of_generators = [generator(first, args) for generator in generators]
         work = jnp.zeros(())
         if system.force is not None:
             W = system.force(*system.times(t0, t1, epsilon), q0, p1, args)
-            work = jnp.sum(W * (here[-1].q - (q1 - q0) / h * here[-1].t))
-        after = series.bind(system, epsilon)(t0, t1, q0, p0, q1, p1, args)
-        before, clock = jnp.zeros(()), jnp.zeros(())
-        for m, (x, gauge) in enumerate(zip(here, gauges, strict=True)):
+            work = jnp.sum(
+                W * (points_of_generators[-1].q - (q1 - q0) / h * points_of_generators[-1].t)
+            )
+        end_value = series.bind(system, epsilon)(t0, t1, q0, p0, q1, p1, args)
+        start_value, clock = jnp.zeros(()), jnp.zeros(())
+        for m, (x, gauge) in enumerate(zip(points_of_generators, gauges, strict=True)):
             term = jnp.sum(x.q * p0) - x.t * energy
-            before += epsilon**m * (term if gauge is None else term + gauge(*first, args))
+            start_value += epsilon**m * (term if gauge is None else term + gauge(*first, args))
             clock += epsilon**m * x.t
-        gained = disturbing_work(system, t0, t1, q0, q1, p1, epsilon, args)
-        residual = outgoing_energy(system, t0, t1, q0, p1, epsilon, args) - energy - gained
+        work_done = disturbing_work(system, t0, t1, q0, q1, p1, epsilon, args)
+        residual = outgoing_energy(system, t0, t1, q0, p1, epsilon, args) - energy - work_done
         right = h * sum(epsilon**m * N for m, N in enumerate(noether))
         right += h * epsilon ** (z + 1) * work - clock * residual
-        return *noether, work, after - before - right, jnp.stack([x.t for x in here])
+        return (
+            *noether,
+            work,
+            end_value - start_value - right,
+            jnp.stack([x.t for x in points_of_generators]),
+        )
 
     program = program_of(statements, (), (), shape, shape, (), ())
     algebra = exact.Identities(2 * int(np.prod(shape)) + 4)

@@ -10,7 +10,7 @@ from ..base.checks import finite, instance
 from ..base.types import Scalar, State
 from ..discover.functions.basis import BoundBasis
 from ..discover.invariants.series import InvariantSeries
-from .tools import tools
+from .result import tools
 
 _DROP = 1e-9  # Coefficients below this share of the largest are rounding
 _ERROR = 1e-12  # Least relative error of a coefficient
@@ -89,10 +89,10 @@ def exact_coefficients(invariant: InvariantSeries, h: float) -> ExactInvariant:
         numbers[place] = _relation(ratio, h, error) if ratio else (1, 0, 0, 0)
         if not numbers[place][0]:
             raise ValueError(
-                f"the coefficient of ε^{place[0]} {invariant.basis.names[place[1]]}, divided by "
-                f"the largest one, is {ratio:.10g}. It has no form (n_0 + n_1 h + n_2 h²)/d "
-                "with small integers n_0, n_1, n_2 and d. Check that the invariant was found with "
-                f"h={h!r}. If it was, no exact form of this invariant can be given."
+                f"the coefficient of ε^{place[0]} {invariant.basis.names[place[1]]} over the "
+                "largest one, "
+                f"{ratio:.10g}, has no form (n_0 + n_1 h + n_2 h²)/d with small integers at "
+                f"h={h!r}."
             )
     return ExactInvariant(invariant.basis, numbers)
 
@@ -103,10 +103,10 @@ def _relation(ratio: float, h: float, error: float) -> tuple[int, ...]:
 
     columns = [round(x / error) for x in (ratio, -1.0, -h, -h * h)]
     rows = [[int(i == j) for j in range(4)] + [columns[i]] for i in range(4)]
-    d, *n, rest = (int(x) for x in fmpz_mat(rows).lll().tolist()[0])
+    d, *n, remainder = (int(x) for x in fmpz_mat(rows).lll().tolist()[0])
     # A random number has a form with integers of the size s with a probability of about s⁴ error.
     size = max(map(abs, (d, *n)))
-    if not d or abs(rest) > 4 * size or size**4 * error > _CHANCE:
+    if not d or abs(remainder) > 4 * size or size**4 * error > _CHANCE:
         return 0, 0, 0, 0
     sign = 1 if d > 0 else -1
     return sign * d, *(sign * x for x in n)

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,6 @@ import numpy as np
 
 from ..base.checks import finite
 from ..base.files import publish
-from .tools import combination, tools
 
 
 class DriftBound(eqx.Module):
@@ -48,8 +48,8 @@ class DriftBound(eqx.Module):
     def num_steps(self, change: float, invariant: int = 0) -> int | float:
         """The number of computed steps within which I_k changes by at most `change`, as long as
         the trajectory is in the domain; inf if it is conserved exactly, without rounding."""
-        each = self.per_step[invariant] + self.rounding[invariant]
-        return math.floor(change / each) if each else math.inf
+        rate = self.per_step[invariant] + self.rounding[invariant]
+        return math.floor(change / rate) if rate else math.inf
 
     def steps_inside(self, q0: Any, p0: Any, epsilon: float) -> int:
         """The number of steps, exact or computed, within which the trajectory from this start is
@@ -76,8 +76,7 @@ class DriftBound(eqx.Module):
             raise ValueError(f"q0 and p0 must be finite numbers, got {q0!r} and {p0!r}.")
         if not low <= epsilon <= high:
             raise ValueError(
-                f"epsilon={epsilon!r} is not in the interval [{low!r}, {high!r}] of the proof: "
-                "call bound_drift with an interval that contains this epsilon."
+                f"epsilon={epsilon!r} is not in the interval [{low!r}, {high!r}] of the proof."
             )
         if self.level is None:
             return 0
@@ -92,12 +91,12 @@ class DriftBound(eqx.Module):
             return 0
         weights, level = exact.exact(self.certificate["level"])
         per_step, rounding = (exact.exact(self.certificate[n]) for n in ("per_step", "rounding"))
-        each = sum(abs(w) * (b + r) for w, b, r in zip(weights, per_step, rounding, strict=True))
+        rate = sum(abs(w) * (b + r) for w, b, r in zip(weights, per_step, rounding, strict=True))
         state.append(algebra.constant(checker.h))
         values = [exact.run(f, state, algebra)[0][0] for f in checker.invariants]
-        here = sum(exact.ball(w) * v for w, v in zip(weights, values, strict=True))
-        left = level + self.steps * each - Fraction(exact.up(here))
-        steps = max(0, math.floor(left / each)) if each else (2**62 if left >= 0 else 0)
+        value = sum(exact.ball(w) * v for w, v in zip(weights, values, strict=True))
+        margin = level + self.steps * rate - Fraction(exact.up(value))
+        steps = max(0, math.floor(margin / rate)) if rate else (2**62 if margin >= 0 else 0)
         last = checker.h * (Fraction(float(epsilon)) if checker.slow else 1)
         times = checker.time[1] - checker.time[0]
         return min(steps, math.floor(times / last)) if self.certificate["timed"] and last else steps
@@ -152,3 +151,23 @@ class DriftBound(eqx.Module):
             lines.append(text)
         lines.extend(f"I_{k} = {text}" for k, text in enumerate(self.formulas))
         return "\n".join(lines)
+
+
+def tools() -> tuple[Any, Any]:
+    try:
+        from . import checker, search
+    except ImportError as error:
+        raise ImportError(
+            f"proofs require python-flint, but the import failed ({error}): "
+            'pip install "dvi-jax[proof]"'
+        ) from error
+    return checker, search
+
+
+def combination(weights: Sequence[float]) -> str:
+    """Σ w_k I_k as text."""
+    terms = [
+        (w, f"{abs(w):.4g} ".removeprefix("1 ") + f"I_{k}") for k, w in enumerate(weights) if w
+    ]
+    text = "".join(f" {'−' if w < 0 else '+'} {term}" for w, term in terms)
+    return text.removeprefix(" + ").replace(" − ", "−", int(terms[0][0] < 0))

@@ -32,9 +32,9 @@ _BATCH = 32
 class Leaf:
     """A box and what was found there.
 
-    - `failed`: why nothing is bounded there.
+    - `failure`: why nothing is bounded there.
     - `bounds`, `seen`: for each invariant an upper bound of the change, and the largest one seen.
-    - `rounding`, `moved`: changes by rounding, and how far a step moves each coordinate.
+    - `rounding`, `displacement`: changes by rounding, and how far a step moves each coordinate.
     - `remainders`: of the models of the changes. `shares`: for each invariant and coordinate, by
       how much the bound would decrease if the coordinate were cut.
     - `axis`, `parts`: of the cut, if there is one. `number`: of the box in the tree; its halves
@@ -43,12 +43,12 @@ class Leaf:
 
     box: list
     number: int = 1
-    failed: str = ""
-    outside: bool = False
+    failure: str = ""
+    is_outside: bool = False
     bounds: list = field(default_factory=list)
     seen: list = field(default_factory=list)
     rounding: list = field(default_factory=list)
-    moved: list = field(default_factory=list)
+    displacement: list = field(default_factory=list)
     remainders: list = field(default_factory=list)
     shares: list = field(default_factory=list)
     axis: int = 0
@@ -61,33 +61,33 @@ def examine(checker: Any, box: list, rng: Any, identities: frozenset = frozenset
     try:
         algebra, x = checker.models(box)
         if not checker.implicit and checker.is_outside(algebra, x):
-            leaf.outside = True
+            leaf.is_outside = True
             return leaf
         leaf.rounding, errors = checker.rounding(box)  # first: it takes little time, and may fail
-        step = checker.stepped(x, algebra)
-        moved = checker.moved(step, algebra)
+        step = checker.states_of_step(x, algebra)
+        moves = checker.displacement(step, algebra)
         if checker.implicit:
-            near = zip(moved[checker.n :], checker.spread, strict=True)
-            exact.require(all(m <= s for m, s in near), "p1 is further from p0 than `spread`")
+            pairs = zip(moves[checker.n :], checker.spread, strict=True)
+            exact.require(all(m <= s for m, s in pairs), "p1 is further from p0 than `spread`")
             if checker.is_outside(algebra, step[0]):
-                leaf.outside = True
+                leaf.is_outside = True
                 return leaf
         changes = [checker.change(k, step, algebra) for k in range(len(checker.invariants))]
         rows = enumerate(changes)
         leaf.bounds = [Fraction(0) if k in identities else algebra.bound(x) for k, x in rows]
         leaf.remainders = [change[1] / algebra.one for change in changes]
-        at = _points(box, rng)
-        counts = _is_inside(checker, algebra, step[0], at)
-        leaf.seen = [_largest(algebra, change, at[counts]) for change in changes]
+        points = _points(box, rng)
+        counts = _is_inside(checker, algebra, step[0], points)
+        leaf.seen = [_largest(algebra, change, points[counts]) for change in changes]
         corner = [(x := side[rng.integers(2)], x) for side in box]
         for k in identities:  # boxes are cut until the bound of the rounding is near that of points
             leaf.seen[k] = checker.rounding(corner)[0][k]
         leaf.shares = [_shares(change, len(box)) for change in changes]
-        leaf.moved = [exact.up(m + Fraction(e)) for m, e in zip(moved, errors, strict=True)]
-        finite = all(map(math.isfinite, (*leaf.rounding, *leaf.moved)))
+        leaf.displacement = [exact.up(m + Fraction(e)) for m, e in zip(moves, errors, strict=True)]
+        finite = all(map(math.isfinite, (*leaf.rounding, *leaf.displacement)))
         exact.require(finite, "a value is not bounded")
     except SINGULAR as error:
-        leaf.failed = str(error) if isinstance(error, exact.Failed) else "a function is singular"
+        leaf.failure = str(error) if isinstance(error, exact.Failed) else "a function is singular"
     return leaf
 
 
@@ -98,40 +98,40 @@ def _part(checker: Any, identities: frozenset, part: tuple[list, int]) -> Leaf:
     return leaf
 
 
-def curved(checker: Any) -> set[int]:
+def curved_axes(checker: Any) -> set[int]:
     """The coordinates on which the arguments of elementary functions in the step depend."""
     operations = checker.step["operations"]
-    needed, used = set(), set()
+    indices, inputs = set(), set()
     for i in reversed(range(len(operations))):
         name, *operands = operations[i]
-        if name == "input" and i in needed:
-            used.add(operands[0])
-        elif name in exact.FUNCTIONS or (i in needed and name != "constant"):
-            needed.update(operands)
-    return used & {*range(2 * checker.n + 2)}
+        if name == "input" and i in indices:
+            inputs.add(operands[0])
+        elif name in exact.FUNCTIONS or (i in indices and name != "constant"):
+            indices.update(operands)
+    return inputs & {*range(2 * checker.n + 2)}
 
 
 def estimate(checker: Any) -> list[float]:
     """The largest change of each I_k at random points of the domain; 0 where all contain 0."""
     rng, algebra = np.random.default_rng(1), exact.Rounding(0)
-    seen = [0.0] * len(checker.invariants)
+    maxima = [0.0] * len(checker.invariants)
     for _ in range(_POINTS):
         x = [(exact.ball(a + (b - a) * Fraction(rng.random())), arb(0)) for a, b in checker.root()]
         x[-1] = (exact.ball(checker.epsilon[1]), arb(0))
         try:
-            step = checker.stepped(x, algebra)
+            step = checker.states_of_step(x, algebra)
             sides = zip(step[0], checker.lower, checker.upper, strict=False)
-            beside = any(not float(a) <= float(x[0]) <= float(b) for x, a, b in sides)
-            if beside or any(g[0] < 0 for g in exact.run(checker.inside, step[0], algebra)):
+            is_outside = any(not float(a) <= float(x[0]) <= float(b) for x, a, b in sides)
+            if is_outside or any(g[0] < 0 for g in exact.run(checker.inside, step[0], algebra)):
                 continue
-            changes = [checker.change(k, step, algebra)[0] for k in range(len(seen))]
+            changes = [checker.change(k, step, algebra)[0] for k in range(len(maxima))]
         except SINGULAR:
             continue
-        seen = [max(s, float(abs(c).lower())) for s, c in zip(seen, changes, strict=True)]
-    return seen
+        maxima = [max(s, float(abs(c).lower())) for s, c in zip(maxima, changes, strict=True)]
+    return maxima
 
 
-def resolve(checker: Any, seen: list[float], ratio: float) -> None:
+def resolve(checker: Any, changes: list[float], ratio: float) -> None:
     """Choose the number of bits: remainders shall be small next to the changes.
 
     Few bits are faster; a change that nearly cancels needs many.
@@ -140,29 +140,29 @@ def resolve(checker: Any, seen: list[float], ratio: float) -> None:
     checker.bits = bits.pop(0)
     leaf = _bounded_part(checker, rng, checker.root())
     while leaf is not None and bits:  # or nothing is bounded there: `subdivide` says where
-        rows = enumerate(zip(leaf.remainders, seen, strict=True))
-        left = [k for k, (r, s) in rows if s and r > s * min(ratio - 1, 4) / 5]
-        if not left:
+        rows = enumerate(zip(leaf.remainders, changes, strict=True))
+        open_invariants = [k for k, (r, s) in rows if s and r > s * min(ratio - 1, 4) / 5]
+        if not open_invariants:
             return
-        before, checker.bits = checker.bits, bits[0]
+        bits_before, checker.bits = checker.bits, bits[0]
         finer = examine(checker, leaf.box, rng)
-        if any(finer.remainders[k] > leaf.remainders[k] / 4 for k in left):
+        if any(finer.remainders[k] > leaf.remainders[k] / 4 for k in open_invariants):
             # More bits do not help much: the box is too large.
-            checker.bits = before
+            checker.bits = bits_before
             leaf = _bounded_part(checker, rng, [half(s, rng.random() < 0.5) for s in leaf.box])
         else:
             leaf = finer
             bits.pop(0)
 
 
-def _bounded_part(checker: Any, rng: Any, whole: list) -> Leaf | None:
+def _bounded_part(checker: Any, rng: Any, root: list) -> Leaf | None:
     """A box or a part of it on which something is bounded; None if 60 parts have failed."""
-    box = whole
+    box = root
     for _ in range(60):
         leaf = examine(checker, box, rng)
-        if not (leaf.failed or leaf.outside):
+        if not (leaf.failure or leaf.is_outside):
             return leaf
-        box = whole if leaf.outside else box
+        box = root if leaf.is_outside else box
         box = [half(side, rng.random() < 0.5) for side in box]
     return None
 
@@ -220,7 +220,7 @@ class TooMany(exact.Failed):
 
 
 @dataclass
-class Found:
+class Subdivision:
     """A subdivision: its tree of cuts, the number of its boxes, and the largest bounds."""
 
     tree: Any
@@ -228,7 +228,7 @@ class Found:
     bounds: list
     seen: list
     rounding: list
-    moved: list
+    displacement: list
 
 
 def subdivide(
@@ -240,7 +240,7 @@ def subdivide(
     max_boxes: int,
     max_seconds: float,
     workers: Any,
-) -> Found:
+) -> Subdivision:
     """Cut the domain until no bound exceeds `ratio` times the largest change seen, at least `best`.
 
     The boxes with the worst bounds are cut first. **Raises** `TooMany` where boxes on which nothing
@@ -261,11 +261,11 @@ def subdivide(
             for leaf in worst
             for i, half in enumerate(halves(leaf.box, leaf.axis))
         ]
-        examined = workers.map(ctx.prec, partial(_part, checker, identities), parts)
+        leaves = workers.map(ctx.prec, partial(_part, checker, identities), parts)
         old = best
         for leaf in worst:
             if time.monotonic() < end:
-                leaf.parts = [next(examined), next(examined)]
+                leaf.parts = [next(leaves), next(leaves)]
                 count += 1
             for part in leaf.parts or [leaf]:
                 best = [max(b, s) for b, s in itertools.zip_longest(best, part.seen, fillvalue=0.0)]
@@ -273,39 +273,37 @@ def subdivide(
         if best != old:
             heap = [(_rank(item[2], best), *item[1:]) for item in heap]
             heapq.heapify(heap)
-    inner = [leaf for _, _, leaf in heap if not leaf.outside]
-    failed = [leaf for leaf in inner if leaf.failed]
-    if failed:
+    inner = [leaf for _, _, leaf in heap if not leaf.is_outside]
+    failures = [leaf for leaf in inner if leaf.failure]
+    if failures:
         raise TooMany(
-            f"no bound was found on {len(failed)} of {count} boxes of the domain. The first is "
-            f"{place(checker, failed[0].box)}: {failed[0].failed}. If the domain has singular "
-            "states, exclude them with domain or inside. Otherwise use a smaller domain, epsilon "
-            "or h, or larger max_boxes and max_seconds"
+            f"no bound was found on {len(failures)} of {count} boxes of the domain. The first is "
+            f"{place(checker, failures[0].box)}: {failures[0].failure}. Exclude singular states by "
+            "domain or inside, or use a smaller domain, epsilon or h, or larger limits"
         )
     if not inner:
         raise exact.Failed(
-            "inside(q, p) must be ≥ 0 for some states of the domain, but for each state it has a "
-            "negative value: correct inside or domain"
+            "inside(q, p) must be ≥ 0 for some states of the domain, but is negative for all"
         )
-    bounds, rounding, moved = (
+    bounds, rounding, moves = (
         [max(column) for column in zip(*(getattr(leaf, name) for leaf in inner), strict=True)]
-        for name in ("bounds", "rounding", "moved")
+        for name in ("bounds", "rounding", "displacement")
     )
-    seen = [0.0 if k in identities else s for k, s in enumerate(best)]
-    return Found(_tree(root), count, bounds, seen, rounding, moved)
+    changes = [0.0 if k in identities else s for k, s in enumerate(best)]
+    return Subdivision(_tree(root), count, bounds, changes, rounding, moves)
 
 
 def _tree(leaf: Leaf) -> Any:
     if leaf.parts:
         where = float(leaf.parts[0].box[leaf.axis][1]).hex()
         return ["cut", leaf.axis, where, *map(_tree, leaf.parts)]
-    return "outside" if leaf.outside else "bounded"
+    return "outside" if leaf.is_outside else "bounded"
 
 
 def _rank(leaf: Leaf, best: list) -> float:
     """Minus the largest bound over the change seen: the smallest is cut first."""
-    if leaf.failed or leaf.outside:
-        return 0.0 if leaf.outside else -math.inf
+    if leaf.failure or leaf.is_outside:
+        return 0.0 if leaf.is_outside else -math.inf
     return -max(_excesses(leaf, best))
 
 
@@ -317,14 +315,14 @@ def _excesses(leaf: Leaf, best: list) -> list[float]:
 def _axis(checker: Any, leaf: Leaf, best: list) -> int:
     """The coordinate along which a box is cut: where the bound decreases most, but not far narrower
     than the others."""
-    if leaf.failed:
-        return _widest(leaf.box, checker.root(), curved(checker))
+    if leaf.failure:
+        return _widest(leaf.box, checker.root(), curved_axes(checker))
     excesses = _excesses(leaf, best)
     k = max(range(len(excesses)), key=excesses.__getitem__)
     if not leaf.bounds[k]:
         return _widest(leaf.box, checker.root())
     if leaf.remainders[k] > 0.5 * float(leaf.bounds[k]):
-        return _widest(leaf.box, checker.root(), curved(checker))
+        return _widest(leaf.box, checker.root(), curved_axes(checker))
     return max(range(len(leaf.box)), key=leaf.shares[k].__getitem__)
 
 
@@ -352,9 +350,9 @@ def enclose(
     with a box on which Σ w_k I_k does not exclude a trajectory.
     """
     end, count = time.monotonic() + max_seconds, 0
-    *around, span, epsilon = checker.root()
-    around = [(a - w, b + w) for (a, b), w in zip(around, reach, strict=True)]
-    whole, sides = [*around, span, epsilon], [*zip(checker.lower, checker.upper, strict=True)]
+    *ranges, span, epsilon = checker.root()
+    ranges = [(a - w, b + w) for (a, b), w in zip(ranges, reach, strict=True)]
+    root, sides = [*ranges, span, epsilon], [*zip(checker.lower, checker.upper, strict=True)]
     domain = np.array(sides, float).T
     top: list = [None]
     heap: list = []
@@ -364,17 +362,17 @@ def enclose(
         The boxes with small values around the domain come first: there a failure is found soon."""
         points = _corners(box, np.random.default_rng(number))
         values = np.nan_to_num(value(points), nan=-math.inf, posinf=math.inf, neginf=-math.inf)
-        beside = ((points[:, :-2] < domain[0]) | (points[:, :-2] > domain[1])).any(1)
-        least, low = np.min(values[beside], initial=math.inf), values.min() <= float(limit)
-        heapq.heappush(heap, (float(least), number, box, borders, bool(low), *home))
+        is_outside = ((points[:, :-2] < domain[0]) | (points[:, :-2] > domain[1])).any(1)
+        minimum, low = np.min(values[is_outside], initial=math.inf), values.min() <= float(limit)
+        heapq.heappush(heap, (float(minimum), number, box, borders, bool(low), *home))
 
-    add(whole, 1, [(i, side) for i, pair in enumerate(sides) for side in pair], top, 0)
-    claim_on = partial(_claim, checker, (weights, limit, reach), whole)
+    add(root, 1, [(i, side) for i, pair in enumerate(sides) for side in pair], top, 0)
+    claim_on = partial(_claim, checker, (weights, limit, reach), root)
     while heap:
         batch = [heapq.heappop(heap) for _ in range(min(_BATCH, len(heap)))]
-        found = workers.map(ctx.prec, claim_on, [(row[2], row[4]) for row in batch])
-        for (least, number, box, borders, _, *home), (claim, axis) in zip(
-            batch, found, strict=True
+        claims = workers.map(ctx.prec, claim_on, [(row[2], row[4]) for row in batch])
+        for (minimum, number, box, borders, _, *home), (claim, axis) in zip(
+            batch, claims, strict=True
         ):
             tree, i = home
             if claim:
@@ -382,18 +380,20 @@ def enclose(
                 count += 1
                 continue
             late = count > max_boxes or time.monotonic() > end
-            narrow = all(b - a <= (d - c) / 4096 for (a, b), (c, d) in zip(box, whole, strict=True))
-            if late or narrow or (least <= float(limit) and not checker.inside["outputs"]):
+            narrow = all(b - a <= (d - c) / 4096 for (a, b), (c, d) in zip(box, root, strict=True))
+            if late or narrow or (minimum <= float(limit) and not checker.inside["outputs"]):
                 raise TooMany(
-                    "the invariants do not exclude that a trajectory leaves the domain and reaches "
-                    f"the box {place(checker, box)}. Try a smaller epsilon or h, or larger "
-                    "max_boxes and max_seconds"
+                    "the invariants do not exclude that a trajectory leaves the domain and "
+                    "reaches the box "
+                    f"{place(checker, box)}. Try a smaller epsilon or h, or larger limits"
                 )
             left, right, where = [], [], None
             if borders:  # first the domain itself is cut out
-                (axis, where), *others = borders
+                (axis, where), *borders_left = borders
                 # The part outside of a border has no further ones.
-                left, right = ([], others) if where == checker.lower[axis] else (others, [])
+                left, right = (
+                    ([], borders_left) if where == checker.lower[axis] else (borders_left, [])
+                )
             first, second = halves(box, axis, where)
             tree[i] = ["cut", axis, float(first[axis][1]).hex(), None, None]
             add(first, 2 * number, left, tree[i], 3)
@@ -401,7 +401,7 @@ def enclose(
     return top[0], count
 
 
-def _claim(checker: Any, level: tuple, whole: list, task: tuple[list, bool]) -> tuple[str, int]:
+def _claim(checker: Any, level: tuple, root: list, task: tuple[list, bool]) -> tuple[str, int]:
     """What is shown on a box, if anything, and the coordinate along which it would be cut. `task`:
     the box, and whether Σ w_k I_k is known to be too small at a point of it."""
     (box, low), (weights, limit, _) = task, level
@@ -409,8 +409,8 @@ def _claim(checker: Any, level: tuple, whole: list, task: tuple[list, bool]) -> 
         if _is_shown(checker, box, claim, *level):
             return claim, 0
     if low:
-        return "", _widest(box, whole)
-    algebra, value = exact.combined(checker, weights, box)
+        return "", _widest(box, root)
+    algebra, value = exact.combination_model(checker, weights, box)
     return "above" * (algebra.range(value)[0] > limit), int(np.argmax(_shares(value, len(box))))
 
 
@@ -437,12 +437,12 @@ def place(checker: Any, box: list) -> str:
     return ", ".join(f"{n} in [{float(a):.4g}, {float(b):.4g}]" for n, (a, b) in sides if a < b)
 
 
-def _widest(box: list, whole: list, of: Any = ()) -> int:
+def _widest(box: list, root: list, axes: Any = ()) -> int:
     """The widest coordinate, or the widest one `of` some, relative to the box `whole`; t and ε
     count less."""
     widths = [
         float((b - a) / (high - low)) if high > low else 0.0
-        for (a, b), (low, high) in zip(box, whole, strict=True)
+        for (a, b), (low, high) in zip(box, root, strict=True)
     ]
     widths[-2:] = [w / 8 for w in widths[-2:]]
-    return max(of or range(len(box)), key=widths.__getitem__)
+    return max(axes or range(len(box)), key=widths.__getitem__)

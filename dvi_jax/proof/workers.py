@@ -31,7 +31,7 @@ class Workers:
     """
 
     def __init__(self, count: int) -> None:
-        self.count, self.spent, self.processes = count, 0.0, []
+        self.count, self.seconds, self.processes = count, 0.0, []
         self.free: queue.SimpleQueue = queue.SimpleQueue()
         self.threads = ThreadPoolExecutor(count)  # each waits for one process
         if not sys.executable or getattr(sys, "frozen", False):  # there is no Python to start
@@ -52,13 +52,13 @@ class Workers:
 
     def map(self, precision: int, function: Callable, items: list) -> Iterator[Any]:
         """The results of a function of the search for all items, in order, with so many bits."""
-        if self.spent > _SECONDS:
+        if self.seconds > _SECONDS:
             self._start(min(self.count, len(items)))
         if not self.processes or len(items) == 1:
             for item in items:
                 began = time.monotonic()
                 result = function(item)
-                self.spent += time.monotonic() - began
+                self.seconds += time.monotonic() - began
                 yield result
             return
         task = pickle.dumps((precision, function))
@@ -66,9 +66,9 @@ class Workers:
         for item, result in zip(items, results, strict=True):
             # A function that has failed there fails here again, with its error.
             yield function(item) if result is None else result
-        ended = [process.poll() for process in self.processes]
-        if any(status is not None for status in ended):
-            self._continue_alone(f"ended early (exit statuses {ended})")
+        statuses = [process.poll() for process in self.processes]
+        if any(status is not None for status in statuses):
+            self._continue_alone(f"ended early (exit statuses {statuses})")
 
     def _start(self, count: int) -> None:
         while 1 < count > len(self.processes):
@@ -97,11 +97,11 @@ class Workers:
         finally:
             self.free.put(process)
 
-    def _continue_alone(self, what: str) -> None:
+    def _continue_alone(self, event: str) -> None:
         self.__exit__()
         self.count, self.processes = 1, []
         warnings.warn(
-            f"a process of bound_drift {what}. The search continues in one process: this takes "
+            f"a process of bound_drift {event}. The search continues in one process: this takes "
             "longer, the result is the same. If memory is the cause, allow fewer processors.",
             RuntimeWarning,
             stacklevel=2,
@@ -116,17 +116,17 @@ def _send(pipe: Any, message: Any) -> None:
 def _serve() -> None:
     """The program of a process: read a function and an item, write the result, until the end."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that is interrupted ends this one
-    given, results = sys.stdin.buffer, sys.stdout.buffer
-    sys.stdout, known, function = sys.stderr, b"", len
-    sys.path[:] = pickle.load(given)
+    requests, results = sys.stdin.buffer, sys.stdout.buffer
+    sys.stdout, current_task, function = sys.stderr, b"", len
+    sys.path[:] = pickle.load(requests)
     for name in ("dvi_jax", "dvi_jax.proof"):  # without their __init__.py, which import JAX
         sys.modules[name] = types.ModuleType(name)
     sys.modules["dvi_jax.proof"].__path__ = [str(Path(__file__).parent)]
     flint = importlib.import_module("flint")
     while True:
-        task, item = pickle.load(given)
-        if task != known:
-            known, (flint.ctx.prec, function) = task, pickle.loads(task)
+        task, item = pickle.load(requests)
+        if task != current_task:
+            current_task, (flint.ctx.prec, function) = task, pickle.loads(task)
         try:
             result = function(item)
         except Exception:

@@ -10,8 +10,8 @@ import numpy as np
 
 import dvi_jax as dvi
 from dvi_jax import plot
-from dvi_jax.fit.progress import shown as shown_bar
 from dvi_jax.fit.result import little_explained, numbers_in_words
+from dvi_jax.fit.run import progress_display as shown_bar
 
 from .._errors import InputError, known, one_of, require
 from .._show import Table
@@ -73,7 +73,7 @@ def fit_file(
             found = dvi.fit(**arguments, **options, progress=recorded(last, show))
     with report.writing(keep=CHECKPOINT):
         found.save(report.path("fit.npz"))
-        trajectory, status = _trajectory(arguments["model"], arguments["data"].ordered(), found)
+        trajectory, status = _trajectory(arguments["model"], arguments["data"].in_time_order(), found)
         report.write_arrays("trajectory.npz", trajectory)
         report.contents |= _contents(arguments, found)
         report.contents |= {"columns": columns, "trajectory": status}
