@@ -1,9 +1,10 @@
 """`sweep` and `sweep_cost`: from arguments to a grid, its tasks and its result."""
 
+import dataclasses
 import json
 import os
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Unpack
 
 import jax
 import numpy as np
@@ -11,10 +12,8 @@ import numpy as np
 from lanewise.jaxprs.jaxapi import ClosedJaxpr
 
 from ..base.checks import instance, whole
-from ..base.keywords import INTEGRATOR, with_keywords_of
+from ..base.keywords import checked_keywords
 from ..base.machine import machine_memory
-from ..base.names import both_names
-from ..integration.integrate import integrate
 from ..problem.system import System
 from .axes import axes_in, is_axis
 from .bar import shown
@@ -22,7 +21,7 @@ from .cost import SweepCost, cost
 from .identity import description, digest, provenance
 from .plan import make_plan
 from .program import Program, Sweep, traced
-from .request import Request
+from .request import Request, SweepCostSettings, SweepSettings
 from .result import SweepResult
 from .store import Memory, Store
 from .variables import Variable, check_names, own_dims, variables
@@ -43,10 +42,7 @@ class SweepInterrupted(KeyboardInterrupt):
         self.result = result
 
 
-@both_names
-@with_keywords_of(
-    integrate, f"h num_steps t0 epsilon args {INTEGRATOR} observe stop path", start=None, save=None
-)
+@checked_keywords
 def sweep(
     system: System,
     q0: Any = None,
@@ -56,9 +52,8 @@ def sweep(
     store: str | os.PathLike | None = None,
     client: Any = None,
     threads: int | None = None,
-    lanes_per_task: int | None = None,
     progress: bool | Callable[[SweepProgress], None] | None = None,
-    **settings: Any,
+    **settings: Unpack[SweepSettings],
 ) -> SweepResult:
     """Trajectories over a grid of ε, initial conditions, parameters, steps and methods.
 
@@ -109,7 +104,7 @@ def sweep(
     # {'epsilon': 3, 'p_x': 2} {'successful': 6}
     ```
     """
-    program, found, programs = prepare(Request(system, q0, p0, **settings), lanes_per_task)
+    program, found, programs = prepare(Request(system, q0, p0, **settings))
     made, coordinates = program.sweep, coordinates_of(program.sweep)
     check_names(made.dims, found, coordinates)
     about: dict[str, Any] = provenance()
@@ -158,9 +153,10 @@ def sweep(
     return result
 
 
-@both_names
-@with_keywords_of(sweep)
-def sweep_cost(system: System, q0: Any = None, p0: Any = None, **settings: Any) -> SweepCost:
+@checked_keywords
+def sweep_cost(
+    system: System, q0: Any = None, p0: Any = None, **settings: Unpack[SweepCostSettings]
+) -> SweepCost:
     """Estimate the cost of a `sweep` with these arguments: tasks, bytes, seconds; with tables for
     larger ones. One task for each method and number of steps is computed for it and timed.
 
@@ -169,10 +165,9 @@ def sweep_cost(system: System, q0: Any = None, p0: Any = None, **settings: Any) 
 
     **Returns** a `SweepCost`. **Raises** as `sweep` for invalid input.
     """
-    lanes_per_task = settings["lanes_per_task"]
-    for name in ("units", "store", "client", "threads", "lanes_per_task", "progress"):
-        del settings[name]
-    program, found, _ = prepare(Request(system, q0, p0, **settings), lanes_per_task)
+    names = [field.name for field in dataclasses.fields(Request)]
+    options: dict[str, Any] = {name: x for name, x in settings.items() if name in names}
+    program, found, _ = prepare(Request(system, q0, p0, **options))
     return cost(program.sweep, program.plan, found)
 
 
@@ -190,7 +185,7 @@ def _check_units(units: Any, found: Mapping[str, Any]) -> None:
 
 
 def prepare(
-    request: Request, lanes_per_task: int | None = None
+    request: Request,
 ) -> tuple[Program, dict[str, Variable], list[ClosedJaxpr]]:
     """The program of the sweep that is requested, divided into tasks, the variables of its result,
     and the jaxprs."""
@@ -199,7 +194,7 @@ def prepare(
     arrays = variables(definition, shapes)
     size = sum(variable.bytes for variable in arrays.values())
     plan = make_plan(
-        definition.dims, definition.compiled, definition.most_steps, size, lanes_per_task
+        definition.dims, definition.compiled, definition.most_steps, size, request.lanes_per_task
     )
     return Program(definition, plan), arrays, programs
 

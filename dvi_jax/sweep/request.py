@@ -1,21 +1,61 @@
 """The arguments of `sweep` as one object, and the definition of the sweep that they make."""
 
 import dataclasses
+import os
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypedDict
 
+from lanewise import Layout
 from lanewise.jaxprs.jaxapi import x64_enabled
 
 from ..base.checks import instance, whole
+from ..engine.newton import RootSolver
+from ..integration.arithmetic import Arithmetic
 from ..integration.integrator import Integrator, chosen
 from ..lattices import Given, Lattice
 from ..methods import Method
+from ..observe import Stop
+from ..observe.solution import Save
 from ..problem.noise import as_path
 from ..problem.system import System, check_system, of_problem
 from .axes import Axis, as_axis, axes_in, is_axis, lengths
 from .program import Sweep
 from .starts import Starts
 from .variables import RESERVED
+
+
+class SweepSettings(TypedDict, total=False):
+    """Keywords of `integrate` that `sweep` accepts, some of which may be an `Axis` or a list; and
+    `start`, which generates initial conditions."""
+
+    h: Any
+    num_steps: Any
+    t0: Any
+    epsilon: Any
+    args: Any
+    method: Any
+    lattice: Lattice | None
+    root_finder: RootSolver | None
+    newton: RootSolver | None
+    arithmetic: Arithmetic | None
+    layout: Layout | None
+    integrator: Integrator | None
+    observe: Any
+    stop: Stop | None
+    path: Any
+    start: Starts | None
+    save: Save | None
+    lanes_per_task: int | None
+
+
+class SweepCostSettings(SweepSettings, total=False):
+    """Keywords of `sweep`, those included that have no effect on its cost."""
+
+    units: Mapping[str, str] | None
+    store: str | os.PathLike | None
+    client: Any
+    threads: int | None
+    progress: Any
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +73,7 @@ class Request:
     method: Any = None
     lattice: Any = None
     newton: Any = None
+    root_finder: Any = None
     arithmetic: Any = None
     layout: Any = None
     integrator: Any = None
@@ -41,6 +82,7 @@ class Request:
     path: Any = None
     start: Any = None
     save: Any = None
+    lanes_per_task: int | None = None
 
     def sweep(self) -> Sweep:
         """The definition of the sweep. **Raises** `ValueError` or `TypeError` for arguments that
@@ -141,6 +183,7 @@ class Request:
             method=None if is_axis(method) else method,
             lattice=self.lattice,
             newton=self.newton,
+            root_finder=self.root_finder,
             arithmetic=self.arithmetic,
             layout=self.layout,
         )
