@@ -109,7 +109,7 @@ class Request:
                 "observe={...}, or save=dvi.Save(final=True) to store the final states."
             )
         # The name of the axis is not "method", which has another meaning in xarray's sel.
-        method = _as_axis_of_list("integrator", self.method)
+        method: Any = _as_axis_of_list("integrator", self.method)
         num_steps = _as_axis_of_list("num_steps", self.num_steps)
         integrator = self._integrator(method)
         method = method if is_axis(method) else integrator.method_for(self.system)
