@@ -16,13 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivations import DERIVATIONS, EPSILON
+from dvi_jax.run import run_file
 from helpers import run_problem
 from scipy.integrate import solve_ivp
 from scipy.special import ellipe, ellipj, ellipk, ellipkinc, elliprf, elliprj
 
 import dvi_jax as dvi
 from dvi_jax import systems
-from dvi_jax.run import run_file
 from dvi_jax.systems._elliptic import complete, first_kind, jacobi, swing, third_kind
 from dvi_jax.systems.pendulum import action, period
 from dvi_jax.systems.planets.solar_system import EphemerisMissing

@@ -1,7 +1,6 @@
 """The description of a sweep: every difference that changes numbers changes it, and no other."""
 
 import errno
-import inspect
 
 import equinox as eqx
 import jax
@@ -13,9 +12,9 @@ import dvi_jax as dvi
 from dvi_jax.sweep import claims, layout
 from dvi_jax.sweep._sweep import prepare
 from dvi_jax.sweep.identity import description, differences, digest
+from dvi_jax.sweep.request import Request
 
 Q = np.asarray([0.5])
-DEFAULTS = {name: p.default for name, p in inspect.signature(dvi.sweep).parameters.items()}
 
 
 def oscillator(k=1.0):
@@ -24,7 +23,7 @@ def oscillator(k=1.0):
 
 def identity(system=None, q0=Q, p0=Q, **kw):
     kw = {"h": 0.1, "num_steps": 5, "t0": [0.0, 1.0], "save": dvi.Save(final=True)} | kw
-    program, found, programs = prepare(system or oscillator(), q0, p0, DEFAULTS | kw)
+    program, found, programs = prepare(Request(system or oscillator(), q0, p0, **kw))
     return description(program.sweep, program.plan, found, programs)
 
 

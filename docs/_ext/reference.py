@@ -14,7 +14,7 @@ import types
 from collections.abc import Iterable, Iterator
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 import usage
@@ -26,6 +26,7 @@ from sphinx.util.docutils import SphinxDirective
 import dvi_jax
 import lanewise
 from dvi_jax._namespaces import SHORT, names
+from dvi_jax.base.checks import unpacked
 from dvi_jax.testing.paper.equations import EQUATIONS
 
 PAGES = {
@@ -152,10 +153,25 @@ def signature(thing: Any) -> str:
         for name, p in found.parameters.items()
         if name not in ("self", "cls") and not name.startswith("_")
     ]
+    if (settings := unpacked(thing)) is not None:
+        plain[-1:] = _keywords(settings)
     try:
         return str(found.replace(parameters=plain, return_annotation=found.empty))
     except ValueError:
         return "(...)"
+
+
+def _keywords(settings: Any) -> Iterator[inspect.Parameter]:
+    """The keywords of a `TypedDict`, with the defaults that they have in `integrate`."""
+    defaults = inspect.signature(dvi_jax.integrate).parameters
+    for name, kind in get_type_hints(settings).items():
+        default = inspect.Parameter.empty
+        if name not in settings.__required_keys__:
+            has_default = name in defaults and name != "save"
+            default = _default(defaults[name].default if has_default else None)
+        yield inspect.Parameter(
+            name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=_type(kind)
+        )
 
 
 def _made_defaults(thing: Any) -> dict[str, Any]:

@@ -5,7 +5,7 @@ import inspect
 import math
 import numbers
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, Unpack, get_args, get_origin
 
 import numpy as np
 
@@ -100,12 +100,25 @@ SYNONYMS = {
 """Names of arguments in other packages → the name here."""
 
 
+def unpacked(function: Callable[..., Any]) -> Any:
+    """The `TypedDict` of a function with ``**settings: Unpack[...]``; None for others."""
+    for parameter in inspect.signature(function).parameters.values():
+        if parameter.kind == parameter.VAR_KEYWORD and get_origin(parameter.annotation) is Unpack:
+            return get_args(parameter.annotation)[0]
+    return None
+
+
+def argument_names(function: Callable[..., Any]) -> list[str]:
+    """The arguments that a function accepts, those of an unpacked `TypedDict` included."""
+    parameters = inspect.signature(function).parameters.values()
+    own = [x.name for x in parameters if x.kind != x.VAR_KEYWORD]
+    return [*own, *getattr(unpacked(function), "__annotations__", ())]
+
+
 def refuse_unknown(name: str, function: Callable[..., Any], keywords: Iterable[str]) -> None:
     """**Raises** `TypeError` for keywords that the function does not have, with the one meant."""
     for keyword in keywords:
-        names = [
-            k for k, p in inspect.signature(function).parameters.items() if p.kind != p.VAR_KEYWORD
-        ]
+        names = argument_names(function)
         close = difflib.get_close_matches(keyword, names, 1, 0.6)
         # Synonyms first: by spelling alone the nearest name to dt0 would be t0.
         suggestion = SYNONYMS.get(keyword) if SYNONYMS.get(keyword) in names else None

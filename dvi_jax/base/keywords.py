@@ -1,17 +1,37 @@
-"""Keywords that a function passes on to another one, and need not repeat one by one."""
+"""Keywords that a function declares as ``**settings: Unpack[...]`` of a `TypedDict`."""
 
 import functools
 import inspect
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from .checks import refuse_unknown
+from .checks import argument_names, refuse_unknown, unpacked
 
 F = TypeVar("F", bound=Callable[..., Any])
 T = TypeVar("T")
 
 INTEGRATOR = "method lattice root_finder arithmetic layout integrator"
 """Keywords of functions that run trajectories which `chosen` turns into one `Integrator`."""
+
+def checked_keywords(function: F) -> F:
+    """Decorator of a function with ``**settings: Unpack[...]``, which Python itself does not check.
+
+    **Raises** `TypeError` when it is called with an unknown keyword or without a necessary one.
+    """
+    names = frozenset(argument_names(function))
+    required = sorted(getattr(unpacked(function), "__required_keys__", ()))
+
+    @functools.wraps(function)
+    def call(*args: Any, **keywords: Any) -> Any:
+        refuse_unknown(
+            function.__name__, function, [name for name in keywords if name not in names]
+        )
+        for name in required:
+            if name not in keywords:
+                raise TypeError(f"{function.__name__} requires {name}=...: give a value.")
+        return function(*args, **keywords)
+
+    return call  # pyright: ignore[reportReturnType]
 
 
 def take(keywords: dict[str, Any], names: str) -> dict[str, Any]:

@@ -2,16 +2,17 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Unpack
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from ..base.checks import whole
-from ..base.keywords import INTEGRATOR, with_keywords_of
+from ..base.keywords import checked_keywords
 from ..base.signature import accepts
 from ..integration.integrate import integrate
+from ..integration.keywords import IntegrationSettings
 from ..observe import Mean
 from ..observe.solution import Save
 from ..problem.noise import Brownian
@@ -37,7 +38,7 @@ class InvariantDiffusion(eqx.Module):
     changes: Any
 
 
-@with_keywords_of(integrate, f"h num_steps t0 epsilon args {INTEGRATOR}")
+@checked_keywords
 def invariant_diffusion(
     system: System,
     q0: Any = None,
@@ -46,7 +47,7 @@ def invariant_diffusion(
     invariant: Callable[..., Any],
     num_paths: int = 1000,
     seed: int = 0,
-    **settings: Any,
+    **settings: Unpack[IntegrationSettings],
 ) -> InvariantDiffusion:
     r"""Drift and diffusion of an adiabatic invariant I by noise, over many paths, next to the
     averaged coefficients of Fokker and Planck.
@@ -73,16 +74,15 @@ def invariant_diffusion(
     **Source** averaging: Khasminskii 1968, *Kybernetika* 4, 260; Freidlin & Wentzell 2012, *Random
     Perturbations of Dynamical Systems*, 8.
     """
-    system, q0, p0, settings["h"], settings["args"] = of_problem(
-        system, q0, p0, settings["h"], settings["args"]
-    )
+    system, q0, p0, h, args = of_problem(system, q0, p0, settings.get("h"), settings.get("args"))
     check_system(system, noise_allowed=True)
     whole("num_paths", num_paths, 2)
     noise = system.noise
     if noise is None:
         raise ValueError("system must have noise, such as dvi.System(H_D, noise=...).")
     value = invariant if accepts(invariant, 4) else (lambda t, q, p, args: invariant(q, p))
-    settings["epsilon"] = epsilon = system.strength(settings["epsilon"])
+    epsilon = system.strength(settings.get("epsilon"))
+    options: dict[str, Any] = {**settings, "h": h, "args": args, "epsilon": epsilon}
 
     def coefficients(t0, t, q0, p0, q, p, args):
         """(b·∇I + ½ Σ_m g_m·∇(g_m·∇I), Σ_m (g_m·∇I)²) at the end of a step."""
@@ -108,8 +108,8 @@ def invariant_diffusion(
         return jnp.stack([rate(none, q, p) + second / 2, jnp.sum(by_noise(q, p) ** 2)])
 
     def end(system, **more):
-        sol = integrate(system, q0, p0, save=Save(final=True), **settings, **more)
-        return value(sol.ts[-1], sol.qs[-1], sol.ps[-1], settings["args"]), sol
+        sol = integrate(system, q0, p0, save=Save(final=True), **options, **more)
+        return value(sol.ts[-1], sol.qs[-1], sol.ps[-1], args), sol
 
     # Without noise the same methods are deterministic ones.
     rest, orbit = end(dataclasses.replace(system, noise=None), observe=Mean(coefficients))

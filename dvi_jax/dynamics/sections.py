@@ -1,9 +1,8 @@
 """Poincaré sections, return maps, bifurcation diagrams."""
 
 import math
-import warnings
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, Unpack
 
 import equinox as eqx
 import jax
@@ -16,13 +15,14 @@ from lanewise.jaxprs.jaxapi import is_traced
 
 from ..base.checks import finite, positive, whole
 from ..base.inputs import as_parameter, as_scalar, start_state
-from ..base.keywords import INTEGRATOR, take, with_keywords_of
+from ..base.keywords import checked_keywords
 from ..base.results import RESULTS, status_name
 from ..base.types import Args, Scalar, State
 from ..engine.newton import RootSolver
 from ..integration.integrate import integrate
-from ..integration.integrator import Integrator, chosen, default_method
-from ..methods import Method, TypeII
+from ..integration.integrator import Integrator
+from ..integration.keywords import SectionSettings, integrator_of
+from ..methods import Method
 from ..observe import Section
 from ..observe.solution import Save
 from ..problem.system import System, check_system
@@ -71,22 +71,11 @@ class _Settings(eqx.Module):
         return found, (sol.ts[-1], sol.qs[-1], sol.ps[-1])
 
 
-def _settings(
-    system: System, section: Section, num_steps, keywords: dict[str, Any], level: int | None = 5
-) -> _Settings:
-    """`level`: of the user's frame, for a warning; None: no warning."""
-    integrator = chosen(**take(keywords, INTEGRATOR))
-    has_default = integrator.method is None and isinstance(default_method(system), TypeII)
-    if has_default and level is not None:
-        warnings.warn(
-            "the default method of Poincaré sections has changed: it was Strang(), and for this "
-            "system it is now TypeII(), as in integrate. Give method=dvi.Strang() for the results "
-            "of earlier versions, or method=dvi.TypeII() to keep the present results.",
-            FutureWarning,
-            stacklevel=level,
-        )
-    options = {"integrator": integrator, "num_steps": whole("num_steps", num_steps)}
-    return _Settings(system, section, options | {"stop": keywords.pop("stop", None)})
+def _settings(system: System, section: Section, keywords: Mapping[str, Any]) -> _Settings:
+    integrator, others = integrator_of(keywords)
+    num_steps = whole("num_steps", others["num_steps"])
+    options = {"integrator": integrator, "num_steps": num_steps, "stop": others.get("stop")}
+    return _Settings(system, section, options)
 
 
 class _Varied(eqx.Module):
@@ -122,19 +111,17 @@ def _one_after_another(settings: _Settings, start, h, epsilon, args, count: int)
     return lax.scan(one, start, jnp.arange(count))[1]
 
 
-@with_keywords_of(integrate, f"t0 epsilon args {INTEGRATOR} stop throw")
+@checked_keywords
 def poincare_section(
     system: System,
     q0: Any,
     p0: Any,
     g: Callable[..., Any],
     *,
-    h: Any,
-    num_steps: int,
     crossings: int = 1000,
     direction: int = 1,
     skip: int = 0,
-    **keywords: Any,
+    **settings: Unpack[SectionSettings],
 ) -> PoincareSection:
     r"""Poincaré section: crossings of the surface g(t, q, p, args) = 0 by many orbits.
 
@@ -177,18 +164,18 @@ def poincare_section(
             "orbit give [q0] and [p0]."
         )
     section = Section(g, direction, whole("crossings", crossings), skip)
-    settings = _settings(system, section, num_steps, keywords)
-    epsilon, args, varied = _varied(system.strength(keywords["epsilon"]), keywords["args"])
+    orbits = _settings(system, section, settings)
+    epsilon, args, varied = _of_orbits(system, settings)
     for name, length in varied.items():
         if length != q.shape[0]:
             raise ValueError(
                 f"{name} must be a single number, or have one number for each orbit in q0 "
                 f"(in all {q.shape[0]}), got length {length}."
             )
-    start = (as_scalar("t0", keywords["t0"], q.dtype), _Varied(q), _Varied(p))
-    h = as_scalar("h", h, q.dtype, zero_allowed=False)
+    start = (as_scalar("t0", settings.get("t0", 0.0), q.dtype), _Varied(q), _Varied(p))
+    h = as_scalar("h", settings["h"], q.dtype, zero_allowed=False)
     try:
-        found = _orbits(settings, start, h, epsilon, args, q.shape[0])
+        found = _orbits(orbits, start, h, epsilon, args, q.shape[0])
     except Exception as error:
         if any("called with q0 of shape" in note for note in getattr(error, "__notes__", ())):
             error.add_note(
@@ -197,10 +184,10 @@ def poincare_section(
                 "condition as q0[None], p0[None].)"
             )
         raise
-    return _raise_on_failure(found, settings) if keywords["throw"] else found
+    return _raise_on_failure(found, orbits) if settings.get("throw", True) else found
 
 
-@with_keywords_of(poincare_section)
+@checked_keywords
 def bifurcation(
     system: System,
     q0: Any,
@@ -208,9 +195,10 @@ def bifurcation(
     g: Callable[..., Any],
     *,
     crossings: int = 100,
+    direction: int = 1,
     skip: int = 100,
     follow: bool = False,
-    **keywords: Any,
+    **settings: Unpack[SectionSettings],
 ) -> PoincareSection:
     """Bifurcation diagram: section points after a transient, for many values of ε.
 
@@ -230,9 +218,9 @@ def bifurcation(
     """
     check_system(system)
     q, p = start_state(q0, p0)
-    section = Section(g, keywords["direction"], whole("crossings", crossings), skip)
-    settings = _settings(system, section, keywords["num_steps"], keywords)
-    epsilon, args, varied = _varied(system.strength(keywords["epsilon"]), keywords["args"])
+    section = Section(g, direction, whole("crossings", crossings), skip)
+    orbits = _settings(system, section, settings)
+    epsilon, args, varied = _of_orbits(system, settings)
     lengths = set(varied.values())
     if len(lengths) != 1 or 0 in lengths:
         seen = " and ".join(f"{name} of length {n}" for name, n in varied.items())
@@ -243,11 +231,11 @@ def bifurcation(
         if len(lengths) > 1:
             rule = "all parameters of bifurcation that vary must have the same length"
         raise ValueError(f"{rule}, got {seen or 'only single numbers'}.")
-    start = (as_scalar("t0", keywords["t0"], q.dtype), q, p)
-    h = as_scalar("h", keywords["h"], q.dtype, zero_allowed=False)
+    start = (as_scalar("t0", settings.get("t0", 0.0), q.dtype), q, p)
+    h = as_scalar("h", settings["h"], q.dtype, zero_allowed=False)
     compute = _one_after_another if follow else _orbits
-    found = compute(settings, start, h, epsilon, args, lengths.pop())
-    return _raise_on_failure(found, settings) if keywords["throw"] else found
+    found = compute(orbits, start, h, epsilon, args, lengths.pop())
+    return _raise_on_failure(found, orbits) if settings.get("throw", True) else found
 
 
 def stroboscope(period: float, phase: float = 0.0) -> Callable[..., Any]:
@@ -306,26 +294,26 @@ class ReturnMap(eqx.Module):
 
     def __check_init__(self):
         check_system(self.system)
-        self._settings(6)
+        self._settings()
 
-    def _settings(self, level: int | None) -> _Settings:
+    def _settings(self) -> _Settings:
         section = Section(self.g, self.direction, whole("returns", self.returns))
-        given = dict.fromkeys(INTEGRATOR.split()) | {
-            name: getattr(self, name) for name in ("method", "root_finder", "integrator")
-        }
-        return _settings(self.system, section, self.num_steps, given, level)
+        names = ("method", "root_finder", "integrator", "num_steps")
+        return _settings(self.system, section, {name: getattr(self, name) for name in names})
 
     def __call__(
         self, q: Any, p: Any, t0: Any = 0.0, epsilon: Any = None, args: Args = None
     ) -> Return:
-        found, _ = self._settings(None).orbit(
-            (t0, q, p), self.h, self.system.strength(epsilon), args
-        )
+        found, _ = self._settings().orbit((t0, q, p), self.h, self.system.strength(epsilon), args)
         return Return(found.ts[-1], found.qs[-1], found.ps[-1], found.result)
 
 
 def _is_axis(x: Any) -> bool:
     return isinstance(x, Axis)
+
+
+def _of_orbits(system: System, settings: SectionSettings) -> tuple[Any, Any, dict[str, int]]:
+    return _varied(system.strength(settings.get("epsilon")), settings.get("args"))
 
 
 def _varied(epsilon: Any, args: Any) -> tuple[Any, Any, dict[str, int]]:

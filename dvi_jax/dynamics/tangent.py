@@ -1,20 +1,20 @@
 """The derivative of an iterated map along an orbit."""
 
-from typing import Any
+from typing import Any, Unpack
 
 from jaxtyping import Array
 
-from ..base.keywords import INTEGRATOR, take, with_keywords_of
+from ..base.keywords import checked_keywords
 from ..integration.integrate import integrate
-from ..integration.integrator import chosen
+from ..integration.keywords import TangentSettings, integrator_of
 from ..lattices import Given
 from ..observe import TangentMap
 from ..observe.solution import Save
 from ..problem.system import System
 
 
-@with_keywords_of(integrate, f"h num_steps t0 epsilon args {INTEGRATOR} throw")
-def tangent_map(system: System, q0: Any, p0: Any, **keywords: Any) -> Array:
+@checked_keywords
+def tangent_map(system: System, q0: Any, p0: Any, **settings: Unpack[TangentSettings]) -> Array:
     """M = ∂(q_K, p_K)/∂(q_0, p_0) of K steps, shape (2N, 2N), by the chain rule along the orbit.
 
     The perturbing force is included; with ε = 0, or a perturbation that derives from a Hamiltonian,
@@ -24,8 +24,8 @@ def tangent_map(system: System, q0: Any, p0: Any, **keywords: Any) -> Array:
     **Arguments** as for `integrate`; num_steps is 1 by default, or that of a lattice `Given`.
     **Raises** as `integrate` does; with ``throw=False`` M of a run that failed is NaN.
     """
-    integrator = chosen(**take(keywords, INTEGRATOR))
-    if keywords["num_steps"] is None and not isinstance(integrator.lattice, Given):
-        keywords["num_steps"] = 1
-    keywords |= {"integrator": integrator, "observe": TangentMap(), "save": Save(final=True)}
-    return integrate(system, q0, p0, **keywords).observed
+    integrator, options = integrator_of(settings)
+    if options.get("num_steps") is None and not isinstance(integrator.lattice, Given):
+        options["num_steps"] = 1
+    options |= {"integrator": integrator, "observe": TangentMap(), "save": Save(final=True)}
+    return integrate(system, q0, p0, **options).observed

@@ -127,7 +127,7 @@ def default_method(system: System) -> Method:
     return _STRANG if is_first_order(system.H_D) else _TYPE_II
 
 
-def chosen(integrator: Integrator | None, **given: Any) -> Integrator:
+def chosen(integrator: Integrator | None = None, **given: Any) -> Integrator:
     """The integrator of a call: the object, or one made of single keywords (None: not given).
 
     **Raises** `TypeError` for another object, `ValueError` for both.

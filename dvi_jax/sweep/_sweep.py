@@ -1,34 +1,30 @@
 """`sweep` and `sweep_cost`: from arguments to a grid, its tasks and its result."""
 
+import dataclasses
 import json
 import os
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Unpack
 
 import jax
 import numpy as np
 
-from lanewise.jaxprs.jaxapi import x64_enabled
+from lanewise.jaxprs.jaxapi import ClosedJaxpr
 
 from ..base.checks import instance, whole
-from ..base.keywords import INTEGRATOR, take, with_keywords_of
+from ..base.keywords import checked_keywords
 from ..base.machine import machine_memory
-from ..integration.integrate import integrate
-from ..integration.integrator import chosen
-from ..lattices import Given, Lattice
-from ..methods import Method
-from ..problem.noise import as_path
-from ..problem.system import System, check_system, of_problem
-from .axes import Axis, as_axis, axes_in, is_axis, lengths
+from ..problem.system import System
+from .axes import axes_in, is_axis
 from .bar import shown
 from .cost import SweepCost, cost
 from .identity import description, digest, provenance
 from .plan import make_plan
 from .program import Program, Sweep, traced
+from .request import Request, SweepCostSettings, SweepSettings
 from .result import SweepResult
-from .starts import Starts
 from .store import Memory, Store
-from .variables import RESERVED, check_names, own_dims, variables
+from .variables import Variable, check_names, own_dims, variables
 from .workers import SweepProgress, run_here
 
 _SHARE = 0.5
@@ -46,9 +42,7 @@ class SweepInterrupted(KeyboardInterrupt):
         self.result = result
 
 
-@with_keywords_of(
-    integrate, f"h num_steps t0 epsilon args {INTEGRATOR} observe stop path", start=None, save=None
-)
+@checked_keywords
 def sweep(
     system: System,
     q0: Any = None,
@@ -58,9 +52,8 @@ def sweep(
     store: str | os.PathLike | None = None,
     client: Any = None,
     threads: int | None = None,
-    lanes_per_task: int | None = None,
     progress: bool | Callable[[SweepProgress], None] | None = None,
-    **settings: Any,
+    **settings: Unpack[SweepSettings],
 ) -> SweepResult:
     """Trajectories over a grid of ε, initial conditions, parameters, steps and methods.
 
@@ -111,7 +104,7 @@ def sweep(
     # {'epsilon': 3, 'p_x': 2} {'successful': 6}
     ```
     """
-    program, found, programs = prepare(system, q0, p0, settings, lanes_per_task)
+    program, found, programs = prepare(Request(system, q0, p0, **settings))
     made, coordinates = program.sweep, coordinates_of(program.sweep)
     check_names(made.dims, found, coordinates)
     about: dict[str, Any] = provenance()
@@ -160,8 +153,10 @@ def sweep(
     return result
 
 
-@with_keywords_of(sweep)
-def sweep_cost(system: System, q0: Any = None, p0: Any = None, **settings: Any) -> SweepCost:
+@checked_keywords
+def sweep_cost(
+    system: System, q0: Any = None, p0: Any = None, **settings: Unpack[SweepCostSettings]
+) -> SweepCost:
     """Estimate the cost of a `sweep` with these arguments: tasks, bytes, seconds; with tables for
     larger ones. One task for each method and number of steps is computed for it and timed.
 
@@ -170,7 +165,9 @@ def sweep_cost(system: System, q0: Any = None, p0: Any = None, **settings: Any) 
 
     **Returns** a `SweepCost`. **Raises** as `sweep` for invalid input.
     """
-    program, found, _ = prepare(system, q0, p0, settings, settings["lanes_per_task"])
+    names = [field.name for field in dataclasses.fields(Request)]
+    options: dict[str, Any] = {name: x for name, x in settings.items() if name in names}
+    program, found, _ = prepare(Request(system, q0, p0, **options))
     return cost(program.sweep, program.plan, found)
 
 
@@ -188,126 +185,18 @@ def _check_units(units: Any, found: Mapping[str, Any]) -> None:
 
 
 def prepare(
-    system: Any, q0: Any, p0: Any, settings: dict[str, Any], lanes_per_task: int | None = None
-) -> tuple[Program, dict[str, Any], list[Any]]:
-    """The program of the sweep that these arguments describe, divided into tasks, the variables of
-    its result, and the jaxprs."""
-    made = _make_sweep(system, q0, p0, settings)
-    shapes, programs = traced(made)
-    found = variables(made, shapes)
-    size = sum(v.bytes for v in found.values())
-    plan = make_plan(made.dims, made.compiled, made.most_steps, size, lanes_per_task)
-    return Program(made, plan), found, programs
-
-
-def _make_sweep(system: Any, q0: Any, p0: Any, given: dict[str, Any]) -> Sweep:
-    has_start = given["start"] is not None or isinstance(system, System)
-    system, q0, p0, given["h"], given["args"] = of_problem(
-        system, q0, p0, given["h"], given["args"], has_start
+    request: Request,
+) -> tuple[Program, dict[str, Variable], list[ClosedJaxpr]]:
+    """The program of the sweep that is requested, divided into tasks, the variables of its result,
+    and the jaxprs."""
+    definition = request.sweep()
+    shapes, programs = traced(definition)
+    arrays = variables(definition, shapes)
+    size = sum(variable.bytes for variable in arrays.values())
+    plan = make_plan(
+        definition.dims, definition.compiled, definition.most_steps, size, request.lanes_per_task
     )
-    check_system(system, noise_allowed=True)
-    given["epsilon"] = system.strength(given["epsilon"])
-    # Integers would make a program of their own.
-    numbers = {n: float(x) if type(x := given[n]) is int else x for n in ("epsilon", "h", "t0")}
-    inputs = {name: as_axis(name, value) for name, value in numbers.items()}
-    inputs |= {"args": given["args"], **_states(q0, p0, given["start"])}
-    # Only where there is one: stores of sweeps without noise are described without it.
-    if (path := given["path"]) is not None:
-        inputs["path"] = path if axes_in({"path": path}) else as_path(path)
-    if all(given[name] is None for name in ("observe", "save", "stop")):
-        raise ValueError(
-            "there is nothing to store, because observe, save and stop are all missing: give "
-            "observe={...}, or save=dvi.Save(final=True) to store the final states."
-        )
-    start, of_integrator = given["start"], take(dict(given), INTEGRATOR)
-    # The name of the axis is not "method", which has another meaning in xarray's sel.
-    method: Any = _as_axis_of_list("integrator", of_integrator.pop("method"))
-    num_steps = _as_axis_of_list("num_steps", given["num_steps"])
-    integrator = chosen(**of_integrator, method=None if is_axis(method) else method)
-    for x in method.values if is_axis(method) else ():
-        instance(f"each value of the axis {method.name!r} of method", x, Method, "a dvi.Method")
-    method = method if is_axis(method) else integrator.method_for(system)
-    compiled = [
-        (x.name, len(x), where)
-        for where, x in (("method", method), ("num_steps", num_steps))
-        if is_axis(x)
-    ]
-    axes = [*compiled, *((x.name, len(x), where) for where, x in axes_in(inputs))]
-    if start is not None:
-        Axis(start.name, [0])  # raises for a name that is not an identifier
-        if start.name in (name for name, *_ in axes):
-            raise ValueError(
-                f"start={type(start).__name__}(...) and an axis have the same name, "
-                f"{start.name!r}: give start another name=..."
-            )
-        axes.append((start.name, start.count, "start"))
-    dims = lengths(axes)
-    _check_dims(dims)
-    _check_steps(num_steps, integrator.lattice, inputs)
-    options = {name: given[name] for name in ("save", "observe", "stop")} | {
-        "lattice": integrator.lattice,
-        "newton": integrator.root_finder,
-        "arithmetic": integrator.arithmetic,
-        "layout": integrator.layout,
-    }
-    separate = len({name for name, *_ in compiled})
-    return Sweep(system, inputs, start, method, num_steps, options, dims, separate)
-
-
-def _states(q0: Any, p0: Any, start: Any) -> dict[str, Any]:
-    """q0 and p0, unless they come from a `start`."""
-    if start is not None:
-        hint = 'For your own states use q0=dvi.Axis("start", ...), p0=dvi.Axis("start", ...).'
-        instance("start", start, Starts, "one of dvi.starts, such as Random(...)", hint)
-        if q0 is None and p0 is None:
-            return {}
-    elif q0 is not None and p0 is not None:
-        return {"q0": q0, "p0": p0}
-    given = {"q0": q0, "p0": p0, "start": start}
-    seen = ", ".join(name for name, x in given.items() if x is not None) or "none of them"
-    raise ValueError(
-        f"give both q0 and p0, or only start=..., such as dvi.starts.Random(...), got {seen}."
-    )
-
-
-def _check_dims(dims: Mapping[str, int]) -> None:
-    if bad := [name for name in dims if name in RESERVED]:
-        raise ValueError(
-            f"the axis {bad[0]!r} has a reserved name: choose another name. Reserved are "
-            f"{', '.join(RESERVED)}."
-        )
-    if not dims:
-        raise ValueError(
-            "nothing varies in this sweep: give an array for epsilon, h or t0, or a "
-            'dvi.Axis("name", values) in place of another number, or '
-            "start=dvi.starts.Random(...). For one trajectory use dvi.integrate."
-        )
-    longest = max(dims, key=dims.__getitem__)
-    if not x64_enabled() and dims[longest] >= 2**31:
-        raise ValueError(
-            f"the axis {longest!r} must have fewer than 2³¹ values if jax_enable_x64 is not set, "
-            f"got {dims[longest]}: put the line\n"
-            '    jax.config.update("jax_enable_x64", True)\nbefore the first array is made.'
-        )
-
-
-def _check_steps(num_steps: Any, lattice: Lattice, inputs: Mapping[str, Any]) -> None:
-    if isinstance(lattice, Given):
-        given = [] if num_steps is None else ["num_steps"]
-        if given := [*given, *(f"the axis of {n}" for n in ("h", "t0") if is_axis(inputs[n]))]:
-            raise ValueError(
-                "the lattice dvi.Given(ts) determines num_steps, h and t0: leave out "
-                f"{' and '.join(given)}."
-            )
-    elif num_steps is None:
-        raise ValueError("num_steps is missing: give the number of steps of each trajectory.")
-    else:
-        for n in num_steps.values if is_axis(num_steps) else [num_steps]:
-            whole("num_steps", n)
-
-
-def _as_axis_of_list(name: str, value: Any) -> Any:
-    return Axis(name, value) if isinstance(value, list | tuple) else value
+    return Program(definition, plan), arrays, programs
 
 
 def coordinates_of(made: Sweep) -> dict[str, Any]:

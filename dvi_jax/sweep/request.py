@@ -1,0 +1,226 @@
+"""The arguments of `sweep` as one object, and the definition of the sweep that they make."""
+
+import dataclasses
+import os
+from collections.abc import Mapping
+from typing import Any, TypedDict
+
+from lanewise import Layout
+from lanewise.jaxprs.jaxapi import x64_enabled
+
+from ..base.checks import instance, whole
+from ..engine.newton import RootSolver
+from ..integration.arithmetic import Arithmetic
+from ..integration.integrator import Integrator, chosen
+from ..lattices import Given, Lattice
+from ..methods import Method
+from ..observe import Stop
+from ..observe.solution import Save
+from ..problem.noise import as_path
+from ..problem.system import System, check_system, of_problem
+from .axes import Axis, as_axis, axes_in, is_axis, lengths
+from .program import Sweep
+from .starts import Starts
+from .variables import RESERVED
+
+
+class SweepSettings(TypedDict, total=False):
+    """Keywords of `integrate` that `sweep` accepts, some of which may be an `Axis` or a list; and
+    `start`, which generates initial conditions."""
+
+    h: Any
+    num_steps: Any
+    t0: Any
+    epsilon: Any
+    args: Any
+    method: Any
+    lattice: Lattice | None
+    root_finder: RootSolver | None
+    arithmetic: Arithmetic | None
+    layout: Layout | None
+    integrator: Integrator | None
+    observe: Any
+    stop: Stop | None
+    path: Any
+    start: Starts | None
+    save: Save | None
+    lanes_per_task: int | None
+
+
+class SweepCostSettings(SweepSettings, total=False):
+    """Keywords of `sweep`, those included that have no effect on its cost."""
+
+    units: Mapping[str, str] | None
+    store: str | os.PathLike | None
+    client: Any
+    threads: int | None
+    progress: Any
+
+
+@dataclasses.dataclass(frozen=True)
+class Request:
+    """What a sweep computes: arguments as in the call of `sweep`, with their defaults."""
+
+    system: Any
+    q0: Any = None
+    p0: Any = None
+    h: Any = None
+    num_steps: Any = None
+    t0: Any = 0.0
+    epsilon: Any = None
+    args: Any = None
+    method: Any = None
+    lattice: Any = None
+    root_finder: Any = None
+    arithmetic: Any = None
+    layout: Any = None
+    integrator: Any = None
+    observe: Any = None
+    stop: Any = None
+    path: Any = None
+    start: Any = None
+    save: Any = None
+    lanes_per_task: int | None = None
+
+    def sweep(self) -> Sweep:
+        """The definition of the sweep. **Raises** `ValueError` or `TypeError` for arguments that
+        define none."""
+        return self._with_defaults()._sweep()
+
+    def _with_defaults(self) -> "Request":
+        """The same, with the defaults of a problem of the library."""
+        has_start = self.start is not None or isinstance(self.system, System)
+        system, q0, p0, h, args = of_problem(
+            self.system, self.q0, self.p0, self.h, self.args, has_start
+        )
+        check_system(system, noise_allowed=True)
+        epsilon = system.strength(self.epsilon)
+        return dataclasses.replace(
+            self, system=system, q0=q0, p0=p0, h=h, args=args, epsilon=epsilon
+        )
+
+    def _sweep(self) -> Sweep:
+        inputs = self._inputs()
+        if self.observe is None and self.save is None and self.stop is None:
+            raise ValueError(
+                "there is nothing to store, because observe, save and stop are all missing: give "
+                "observe={...}, or save=dvi.Save(final=True) to store the final states."
+            )
+        # The name of the axis is not "method", which has another meaning in xarray's sel.
+        method: Any = _as_axis_of_list("integrator", self.method)
+        num_steps = _as_axis_of_list("num_steps", self.num_steps)
+        integrator = self._integrator(method)
+        method = method if is_axis(method) else integrator.method_for(self.system)
+        compiled = [
+            (axis.name, len(axis), argument)
+            for argument, axis in (("method", method), ("num_steps", num_steps))
+            if is_axis(axis)
+        ]
+        axes = [*compiled, *((axis.name, len(axis), place) for place, axis in axes_in(inputs))]
+        if (start := self.start) is not None:
+            Axis(start.name, [0])  # raises for a name that is not an identifier
+            if start.name in (name for name, *_ in axes):
+                raise ValueError(
+                    f"start={type(start).__name__}(...) and an axis have the same name, "
+                    f"{start.name!r}: give start another name=..."
+                )
+            axes.append((start.name, start.count, "start"))
+        dims = lengths(axes)
+        _check_dims(dims)
+        _check_steps(num_steps, integrator.lattice, inputs)
+        options = {
+            "save": self.save,
+            "observe": self.observe,
+            "stop": self.stop,
+            "lattice": integrator.lattice,
+            "newton": integrator.root_finder,
+            "arithmetic": integrator.arithmetic,
+            "layout": integrator.layout,
+        }
+        separate = len({name for name, *_ in compiled})
+        return Sweep(self.system, inputs, start, method, num_steps, options, dims, separate)
+
+    def _inputs(self) -> dict[str, Any]:
+        """The arguments that may have axes."""
+        # Integers would make a program of their own.
+        numbers = {
+            name: as_axis(name, float(value) if type(value) is int else value)
+            for name, value in (("epsilon", self.epsilon), ("h", self.h), ("t0", self.t0))
+        }
+        inputs = numbers | {"args": self.args, **self._states()}
+        # Only where there is one: stores of sweeps without noise are described without it.
+        if self.path is not None:
+            has_axis = bool(axes_in({"path": self.path}))
+            inputs["path"] = self.path if has_axis else as_path(self.path)
+        return inputs
+
+    def _states(self) -> dict[str, Any]:
+        """q0 and p0, unless they come from a `start`."""
+        states = {"q0": self.q0, "p0": self.p0}
+        if self.start is not None:
+            hint = 'For your own states use q0=dvi.Axis("start", ...), p0=dvi.Axis("start", ...).'
+            instance("start", self.start, Starts, "one of dvi.starts, such as Random(...)", hint)
+            if self.q0 is None and self.p0 is None:
+                return {}
+        elif self.q0 is not None and self.p0 is not None:
+            return states
+        arguments = states | {"start": self.start}
+        names = [name for name, value in arguments.items() if value is not None]
+        raise ValueError(
+            "give both q0 and p0, or only start=..., such as dvi.starts.Random(...), got "
+            f"{', '.join(names) or 'none of them'}."
+        )
+
+    def _integrator(self, method: Any) -> Integrator:
+        for value in method.values if is_axis(method) else ():
+            instance(
+                f"each value of the axis {method.name!r} of method", value, Method, "a dvi.Method"
+            )
+        return chosen(
+            self.integrator,
+            method=None if is_axis(method) else method,
+            lattice=self.lattice,
+            root_finder=self.root_finder,
+            arithmetic=self.arithmetic,
+            layout=self.layout,
+        )
+
+
+def _check_dims(dims: Mapping[str, int]) -> None:
+    if bad := [name for name in dims if name in RESERVED]:
+        raise ValueError(
+            f"the axis {bad[0]!r} has a reserved name: choose another name. Reserved are "
+            f"{', '.join(RESERVED)}."
+        )
+    if not dims:
+        raise ValueError(
+            "nothing varies in this sweep: give an array for epsilon, h or t0, or a "
+            'dvi.Axis("name", values) in place of another number, or '
+            "start=dvi.starts.Random(...). For one trajectory use dvi.integrate."
+        )
+    longest = max(dims, key=dims.__getitem__)
+    if not x64_enabled() and dims[longest] >= 2**31:
+        raise ValueError(
+            f"the axis {longest!r} must have fewer than 2³¹ values if jax_enable_x64 is not set, "
+            f"got {dims[longest]}: put the line\n"
+            '    jax.config.update("jax_enable_x64", True)\nbefore the first array is made.'
+        )
+
+
+def _check_steps(num_steps: Any, lattice: Lattice, inputs: Mapping[str, Any]) -> None:
+    if isinstance(lattice, Given):
+        given = [] if num_steps is None else ["num_steps"]
+        if given := [*given, *(f"the axis of {n}" for n in ("h", "t0") if is_axis(inputs[n]))]:
+            raise ValueError(
+                "the lattice dvi.Given(ts) determines num_steps, h and t0: leave out "
+                f"{' and '.join(given)}."
+            )
+    elif num_steps is None:
+        raise ValueError("num_steps is missing: give the number of steps of each trajectory.")
+    else:
+        for n in num_steps.values if is_axis(num_steps) else [num_steps]:
+            whole("num_steps", n)
+
+
+def _as_axis_of_list(name: str, value: Any) -> Any:
+    return Axis(name, value) if isinstance(value, list | tuple) else value
