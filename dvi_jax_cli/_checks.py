@@ -1,4 +1,4 @@
-"""Commands that look things up, check and measure: systems, schema, paper, certify, bench, info."""
+"""Commands that look things up and check: systems, schema, verify, paper, certify, info."""
 
 import json
 from pathlib import Path
@@ -8,7 +8,7 @@ import typer
 
 from ._errors import InputError, known, require
 from ._group import CHECKING, START, app
-from ._names import CHECKS, FILES, METHODS, SYSTEMS, WORKLOADS, completer
+from ._names import CHECKS, FILES, METHODS, SYSTEMS, completer
 from ._runs import Force
 from ._session import FAILED, Session, command
 from ._show import console, print_json, progress_bar
@@ -183,45 +183,6 @@ def certify(
         session.finish(contents, "" if certificate.ok else certificate.summary)
     else:  # the summary is on the screen already
         raise typer.Exit(FAILED)
-
-
-@command(app, "bench", CHECKING)
-def bench(
-    session: Session,
-    row: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="A row: single, batch, implicit, gradient; may be repeated. All if none.",
-            **completer(WORKLOADS),
-        ),
-    ] = None,
-    rounds: Annotated[int, typer.Option(min=3, help="How often each side is timed.")] = 7,
-) -> None:
-    """Benchmark this machine against reference implementations.
-
-    Each workload and its references take the same steps, one after the other in each round, in
-    random order. The ratio is steps per second over those of the reference: median and quartiles
-    over the rounds. Compilation is listed separately.
-
-    Exit code 0: done. 1: a reference and the package do not agree. 2: bad input.
-
-    Examples
-        dvi-jax bench                            under a minute
-        dvi-jax bench --row batch --json
-    """
-    wanted = list(row or WORKLOADS)
-    for name in wanted:
-        known("--row", name, WORKLOADS)
-    from .work.bench import measure, tables
-
-    with progress_bar("timing") as bar:
-        found = measure(wanted, rounds, bar, session.note)
-    about, speeds = tables(found)
-    session.tables([about], words=True)
-    session.tables([speeds])
-    session.line(f"{found['machine']}; {found['setting']}")
-    wrong = [r["row"] for r in found["rows"] if not r["agrees"]]
-    session.finish(found, f"the two results differ: {', '.join(wrong)}" if wrong else "")
 
 
 @command(app, "info", CHECKING, jax=False)

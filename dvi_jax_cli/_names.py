@@ -28,9 +28,6 @@ CHECKS = _found("testing/checks.py", r'^@check\(\s*"([\w-]+)"')
 FILES = ("run", "sweep", "fit", "discover", "bound")
 """Kinds of TOML files."""
 
-WORKLOADS = ("single", "batch", "implicit", "gradient")
-"""Rows of `dvi-jax bench`."""
-
 EXTRAS = {
     "cuda12": ("jax_cuda12_plugin",),
     "cuda13": ("jax_cuda13_plugin",),

@@ -5,9 +5,9 @@ import shutil
 import numpy as np
 import pytest
 from cli import EXAMPLES, command, found, keys_not_in, names, read, refuses, write
+from dvi_jax.run import InputError
 
 import dvi_jax as dvi
-from dvi_jax.run import InputError
 from dvi_jax_cli.work.expressions import parse_basis
 from dvi_jax_cli.work.loader import Loader
 from dvi_jax_cli.work.schema import DiscoverFile

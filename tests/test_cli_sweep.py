@@ -11,10 +11,10 @@ import jax
 import numpy as np
 import pytest
 from cli import EXAMPLES, MAIN, command, found, keys_not_in, refuses, write
+from dvi_jax.run import InputError, sweep_file, sweep_status
 from jax._src import pretty_printer
 
 import dvi_jax as dvi
-from dvi_jax.run import InputError, sweep_file, sweep_status
 from dvi_jax.sweep import store
 from dvi_jax_cli.work.loader import Loader
 from dvi_jax_cli.work.schema import SweepFile

@@ -9,12 +9,12 @@ from types import SimpleNamespace
 import faults
 import numpy as np
 import pytest
+from dvi_jax.run import InputError
 
 import dvi_jax as dvi
 from dvi_jax.base.files import publish_npz, read_npz
 from dvi_jax.fit import run
 from dvi_jax.fit.optimise import Position, Record
-from dvi_jax.run import InputError
 from dvi_jax_cli.work.columns import read_columns
 from dvi_jax_cli.work.loader import Loader
 

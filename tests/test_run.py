@@ -6,10 +6,10 @@ import shutil
 import numpy as np
 import pytest
 from cli import EXAMPLES, command, found, keys_not_in, names, read, refuses, write
+from dvi_jax.run import InputError, library_tables, run_file
 
 import dvi_jax as dvi
 from dvi_jax import systems
-from dvi_jax.run import InputError, library_tables, run_file
 from dvi_jax_cli.work.expressions import parse_method
 from dvi_jax_cli.work.output import Output
 from dvi_jax_cli.work.schema import RunFile
