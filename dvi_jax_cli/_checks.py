@@ -6,11 +6,11 @@ from typing import Annotated
 
 import typer
 
-from ._errors import InputError, known, require
+from ._errors import InputError, require, require_name
 from ._group import CHECKING, START, app
 from ._names import CHECKS, FILES, METHODS, SYSTEMS, completer
 from ._runs import Force
-from ._session import FAILED, Session, command
+from ._session import FAILURE, Session, command
 from ._show import console, print_json, progress_bar
 
 
@@ -62,7 +62,7 @@ def schema(
         dvi-jax schema run > run.schema.json    for an editor
     """
     if kind is not None:
-        known("KIND", kind, FILES)
+        require_name("KIND", kind, FILES)
     from .work.schema import json_schema
 
     print_json(json_schema(kind))
@@ -83,8 +83,8 @@ def verify(
     Examples
         dvi-jax verify bound.json
     """
-    found = f"there is no file {certificate}"
-    require(certificate.is_file(), "CERTIFICATE", found, "a file that DriftBound.save wrote")
+    defect = f"there is no file {certificate}"
+    require(certificate.is_file(), "CERTIFICATE", defect, "a file that DriftBound.save wrote")
     from .work.verify import verify_certificate
 
     contents, message = verify_certificate(certificate)
@@ -112,11 +112,11 @@ def paper(
     from dvi_jax.testing.paper import reproduce
 
     try:
-        done = reproduce(out, force, console(stderr=session.as_json))
+        reproduction = reproduce(out, force, console(stderr=session.as_json))
     except (FileExistsError, NotADirectoryError, PermissionError) as error:
         raise InputError("--out", str(error), "a new directory, or --force") from None
-    verdicts = json.loads((done.out / "verdicts.json").read_text(encoding="utf-8"))
-    session.finish({"folder": str(done.out), **verdicts})
+    verdicts = json.loads((reproduction.out / "verdicts.json").read_text(encoding="utf-8"))
+    session.finish({"folder": str(reproduction.out), **verdicts})
 
 
 @command(app, "certify", CHECKING)
@@ -158,11 +158,11 @@ def certify(
         with progress_bar("certifying") as bar:
             certificate = certify(QUICK if quick else method or None, check or None, bar)
     except (ValueError, TypeError) as error:
-        allowed = "names as in dvi-jax certify --help, and a page that can be written"
-        raise InputError("certify", str(error), allowed) from error
+        rule = "names as in dvi-jax certify --help, and a page that can be written"
+        raise InputError("certify", str(error), rule) from error
     failures = [
-        f"{name}, {tried}: {measured.verdict}, allowed {measured.allowed}. {measured.detail}"
-        for name, tried, measured in certificate.failures
+        f"{name}, {quantity}: {result.verdict}, allowed {result.allowed}. {result.detail}"
+        for name, quantity, result in certificate.failures
     ]
     tables = certificate.tables()
     session.tables(tables)
@@ -182,7 +182,7 @@ def certify(
     if certificate.ok or session.as_json:
         session.finish(contents, "" if certificate.ok else certificate.summary)
     else:  # the summary is on the screen already
-        raise typer.Exit(FAILED)
+        raise typer.Exit(FAILURE)
 
 
 @command(app, "info", CHECKING, jax=False)
@@ -197,6 +197,6 @@ def info(session: Session) -> None:
     """
     from ._info import gather, tables
 
-    found = gather()
-    session.tables(tables(found), words=True)
-    session.finish(found, found["failed"])
+    information = gather()
+    session.tables(tables(information), words=True)
+    session.finish(information, information["failed"])
