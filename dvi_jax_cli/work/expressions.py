@@ -53,7 +53,7 @@ class Expressions:
     def require_kind(self, instance: Any, text: str) -> Any:
         """The object that was made, an instance of `kind`."""
         if not isinstance(instance, self.kind):
-            raise self.error(f"{text!r} is not one of the allowed objects")
+            raise self.error(f"{text!r} is another object")
         return instance
 
     def error(self, defect: str, name: str = "") -> InputError:
@@ -72,32 +72,28 @@ class Expressions:
             case ast.BinOp(left=left, op=ast.Add() | ast.Mult() as op, right=right):
                 left, right = self._evaluate(left), self._evaluate(right)
                 if not (isinstance(left, self.kind) and isinstance(right, self.kind)):
-                    is_mixed = isinstance(left, self.kind) or isinstance(right, self.kind)
-                    remedy = (
-                        "Leave the number, text or list out" if is_mixed else "Write the result"
+                    raise ValueError(
+                        f"+ and * do not apply to numbers, texts or lists, got {ast.unparse(node)}"
                     )
-                    defect = f"got {ast.unparse(node)}. {remedy}"
-                    raise ValueError(f"+ and * do not apply to numbers, texts or lists, {defect}")
                 return left + right if isinstance(op, ast.Add) else left * right
             case ast.Name(id=name):
                 try:
                     return self._instantiate(name, [], [])
                 except TypeError:
-                    defect = f"{name!r} requires arguments in parentheses: write {name}(...)"
-                    raise self.error(defect) from None
+                    raise self.error(f"{name!r} requires arguments: {name}(...)") from None
             case ast.Call(func=ast.Name(id=name), args=arguments, keywords=keywords):
                 return self._instantiate(name, arguments, keywords)
         name = next(iter(self.classes))
         raise ValueError(
-            f"{ast.unparse(node)!r} is not one of these: an allowed name ({name}, not dvi.{name}), "
-            "a number (0.5, not 1/2), a text or a list"
+            f"{ast.unparse(node)!r} is not a name ({name}, not dvi.{name}), a number (0.5, not "
+            "1/2), a text or a list"
         )
 
     def _instantiate(self, name: str, arguments: list[Any], keywords: list[ast.keyword]) -> Any:
         if name not in self.classes:
             raise self.error(f"{name!r} is not a known name", name)
         if any(k.arg is None for k in keywords):
-            raise self.error(f"{name!r} has an argument with **: write each argument as name=value")
+            raise self.error(f"{name!r} has an argument with **, not name=value")
         options = {str(k.arg): self._evaluate(k.value) for k in keywords}
         return self.classes[name](*(self._evaluate(a) for a in arguments), **options)
 

@@ -88,8 +88,8 @@ class Output(Report):
         new = [] if self.force else sorted({p.name for p in self.folder.iterdir()} - {keep})
         if new:
             raise FileExistsError(
-                f"another process has written to {self.folder} since this command began (file "
-                f"{new[0]}). Repeat the command with another {self.key}, or with --force"
+                f"another process has written {new[0]} to {self.folder} meanwhile. Repeat with "
+                f"another {self.key}, or with --force"
             )
         for name in self.names:
             if name != keep:
@@ -100,8 +100,8 @@ class Output(Report):
             names = ", ".join(sorted(file.name for file in self.folder.iterdir())) or "nothing"
             last = f" {self.files[-1]} may be incomplete." if self.files else ""
             raise KeyboardInterrupt(
-                f"by Ctrl-C while results were written. {self.folder} now contains: {names}."
-                f"{last} To write all files again, repeat the command with --force"
+                f"by Ctrl-C while results were written. {self.folder} contains: {names}.{last} "
+                "--force writes all files again"
             ) from None
 
     def path(self, name: str) -> Path:
