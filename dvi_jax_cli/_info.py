@@ -55,14 +55,11 @@ def _version(name: str) -> str | None:
 
 
 def _device(device: Any) -> dict[str, Any]:
-    properties = {"id": device.id, "kind": device.device_kind, "platform": device.platform}
+    entry = {"id": device.id, "kind": device.device_kind, "platform": device.platform}
     stats: dict[str, Any] = {}
     with suppress(Exception):  # not every backend counts
         stats = device.memory_stats() or {}
-    return properties | {
-        "bytes": stats.get("bytes_limit"),
-        "bytes_in_use": stats.get("bytes_in_use"),
-    }
+    return entry | {"bytes": stats.get("bytes_limit"), "bytes_in_use": stats.get("bytes_in_use")}
 
 
 def _extra(name: str) -> dict[str, Any]:

@@ -28,7 +28,7 @@ def bound_file(path: str | Path, out: str | Path | None = None, force: bool = Fa
     file, report = open_report("bound", Path(path), out, RESULT_FILES, force)
     source = find_source(file, Path(path).parent)
     low, high = box_of(file.domain, "domain", source)
-    invariants = source.loader.load("invariants", file.invariants)
+    functions = source.loader.load("invariants", file.invariants)
     condition = file.domain.inside and source.loader.load("domain.inside", file.domain.inside)
     options = {"h": float(source.h), "args": source.args, "method": source.method(file.method)}
     options |= {"epsilon": tuple(file.epsilon), "time": file.domain.times, "inside": condition}
@@ -39,9 +39,7 @@ def bound_file(path: str | Path, out: str | Path | None = None, force: bool = Fa
         try:
             with source.at_work("invariants", "bounded", rule):
                 try:
-                    bound = dvi.bound_drift(
-                        invariants, source.system, **options, **dict(file.bound)
-                    )
+                    bound = dvi.bound_drift(functions, source.system, **options, **dict(file.bound))
                 except dvi.ProofError as error:
                     report.message = f"nothing is proved: {error}"
         except ImportError as error:

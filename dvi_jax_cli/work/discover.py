@@ -135,24 +135,22 @@ def box_of(table: Any, key: str, source: Source) -> list[tuple[np.ndarray, ...]]
 # Results
 
 
-def _contents(
-    discovery: dvi.Discovery, orders: list[dvi.DriftOrder], samples: int
-) -> dict[str, Any]:
+def _contents(result: dvi.Discovery, orders: list[dvi.DriftOrder], samples: int) -> dict[str, Any]:
     names = ("order", "survivors", "gap", "refused", "condition")
     return {
-        "functions": list(discovery.basis.names),
-        **{name: getattr(discovery, name) for name in names},
+        "functions": list(result.basis.names),
+        **{name: getattr(result, name) for name in names},
         "samples": samples,
-        "invariants": [_invariant(discovery, orders, i) for i in range(discovery.count)],
-        "dependent": [str(series) for series in discovery.dependent_invariants],
-        "lost": [str(law) for law in discovery.obstructions],
+        "invariants": [_invariant(result, orders, i) for i in range(result.count)],
+        "dependent": [str(series) for series in result.dependent_invariants],
+        "lost": [str(law) for law in result.obstructions],
     }
 
 
-def _invariant(discovery: dvi.Discovery, orders: list[dvi.DriftOrder], i: int) -> dict[str, Any]:
+def _invariant(result: dvi.Discovery, orders: list[dvi.DriftOrder], i: int) -> dict[str, Any]:
     names = ("coefficients", "residuals", "exact", "reach")
-    invariant = {"formula": str(discovery.invariants[i])}
-    invariant |= {name: getattr(discovery, name)[i] for name in names}
+    invariant = {"formula": str(result.invariants[i])}
+    invariant |= {name: getattr(result, name)[i] for name in names}
     if not orders:
         return invariant
     names = ("epsilons", "drifts", "used", "excluded", "floor", "floor_cause", "slope", "interval")

@@ -114,7 +114,7 @@ def parse_basis(text: str, loader: Loader) -> Any:
     reader = Expressions("basis", AbstractBasis, public(AbstractBasis, dvi.Basis), rule)
     if ".py:" not in text:
         return reader.read(text)
-    definition = loader.load("basis", text)
+    target = loader.load("basis", text)
     return reader.require_kind(
-        dvi.Basis(definition) if isinstance(definition, list | dict) else definition, text
+        dvi.Basis(target) if isinstance(target, list | dict) else target, text
     )

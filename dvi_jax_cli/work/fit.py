@@ -258,7 +258,7 @@ def _tables(result: dvi.FitResult, contents: dict[str, Any]) -> list[Table]:
     tables = [Table("Parameters, ± standard error", ["name", "value", "start"], rows)]
     if len(result.names) > 1:
         tables.append(_correlation_table(result.names, result.correlations))
-    has_errors, residuals = result.has_errors, contents["residuals"]
+    has_errors, prior, residuals = result.has_errors, result.prior_chi2, contents["residuals"]
     rows = [
         ["values", str(result.num_observed)],
         ["values missing", str(contents["missing"])],
@@ -266,10 +266,7 @@ def _tables(result: dvi.FitResult, contents: dict[str, Any]) -> list[Table]:
         ["rms [units of the data]", f"{result.rms:.4g}"],
         ["variance explained [%]", f"{100 * result.explained:.4g}"],
         ["chi²", f"{result.chi2:.6g}" if has_errors else ""],
-        [
-            "chi² of the priors",
-            f"{result.prior_chi2:.4g}" if has_errors and result.prior_chi2 else "",
-        ],
+        ["chi² of the priors", f"{prior:.4g}" if has_errors and prior else ""],
         ["reduced chi²", f"{result.reduced_chi2:.4g}" if has_errors else ""],
         ["largest [standard errors]", f"{residuals['largest']:.3g}" if has_errors else ""],
         ["correlation of neighbours", f"{residuals['lag_one']:.3f}"],

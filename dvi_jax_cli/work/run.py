@@ -54,18 +54,16 @@ def run_file(
         began = time.perf_counter()
         rule = "functions, state and args that fit one another"
         with source.at_work("system", "integrated", rule):
-            solution = dvi.integrate(**run, observe=observables, throw=False, progress=progress)
-            jax.block_until_ready(solution)
+            result = dvi.integrate(**run, observe=observables, throw=False, progress=progress)
+            jax.block_until_ready(result)
         seconds = time.perf_counter() - began
     with report.writing():
         observed, conservation = (
-            observe(run, observables[x], solution.observed[x]) for x in ("own", "always")
+            observe(run, observables[x], result.observed[x]) for x in ("own", "always")
         )
-        _describe(report, solution, observed, seconds)
-        arrays = {name: np.asarray(getattr(solution, name)) for name in ("ts", "qs", "ps", "hs")}
-        values = {
-            f"observed/{name}": np.asarray(solution.observed["own"][name]) for name in observed
-        }
+        _describe(report, result, observed, seconds)
+        arrays = {name: np.asarray(getattr(result, name)) for name in ("ts", "qs", "ps", "hs")}
+        values = {f"observed/{name}": np.asarray(result.observed["own"][name]) for name in observed}
         report.write_arrays("trajectory.npz", arrays | values)
         ts, qs, ps, _ = arrays.values()
         if source.jd is None:

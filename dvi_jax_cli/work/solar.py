@@ -108,11 +108,11 @@ def own_share(run: dict[str, Any], qs: np.ndarray, ps: np.ndarray) -> float:
     if count < 3:
         return np.nan
     finer = {"h": run["h"] / 2, "num_steps": 2 * stride * count, "save": dvi.Save(every=2 * stride)}
-    refinement = dvi.integrate(**run | finer, throw=False)
+    half_step = dvi.integrate(**run | finer, throw=False)
     masses, longitudes = np.asarray(run["args"]["masses"])[:, None], []
     for q, p in (
         (qs[: count + 1], ps[: count + 1]),
-        (np.asarray(refinement.qs), np.asarray(refinement.ps)),
+        (np.asarray(half_step.qs), np.asarray(half_step.ps)),
     ):
         q, v = (to_ecliptic(x[:, _MERCURY] - x[:, 0]) for x in (q, p / masses))
         mu = float(masses[0, 0] + masses[_MERCURY, 0])

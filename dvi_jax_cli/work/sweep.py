@@ -115,10 +115,7 @@ def _report(result: dvi.SweepResult, last: dvi.SweepProgress) -> Report:
     )
     if observed:
         report.contents["observed"] = observed
-        rows = [
-            [name, *(f"{x:.6g}" for x in statistics.values())]
-            for name, statistics in observed.items()
-        ]
+        rows = [[name, *(f"{x:.6g}" for x in values.values())] for name, values in observed.items()]
         title = "Observables of the successful trajectories"
         report.tables.append(Table(title, ["name", "min", "median", "max"], rows))
     speed = f"{last.seconds:.1f} s (compilation included), {last.rate:.3g} steps/s"
@@ -333,16 +330,13 @@ def sweep_status(store: str | Path) -> Report:
         "bytes": _size(Path(store)),
         "provenance": {k: v for k, v in result.attributes.items() if k not in _NOT_OURS},
     }
-    provenance = [[name, str(value)] for name, value in contents["provenance"].items()]
+    origin = [[name, str(value)] for name, value in contents["provenance"].items()]
     grid = " × ".join(f"{name} {n}" for name, n in result.dims.items())
     remainder = f", {result.num_tasks - tasks_done} left" if tasks_done < result.num_tasks else ""
     remainder += f" (about {left / rate:.3g} s)" if left and rate else ""
     return Report(
         contents,
-        [
-            _status_table(contents["trajectories"]),
-            Table("Provenance", ["what", "value"], provenance),
-        ],
+        [_status_table(contents["trajectories"]), Table("Provenance", ["what", "value"], origin)],
         summary=f"{result.path}: {grid}; {tasks_done} of {result.num_tasks} tasks done{remainder}; "
         f"{rate:.3g} trajectories/s{'' if speed is None else f', {speed:.3g} steps/s'}; "
         f"{contents['bytes'] / 1e6:.3g} MB",

@@ -76,12 +76,12 @@ class Source:
         if values is None or problem is None:
             return names if values is None else values
         if not isinstance(names, dict):
-            reason = (
+            cause = (
                 f"args of the type {type(names).__name__}, not dict: set them in its Python code"
             )
-            reason = "no parameters" if names is None else reason
+            cause = "no parameters" if names is None else cause
             raise InputError(
-                "args", describe(values), f"no key args, because {problem.name} has {reason}"
+                "args", describe(values), f"no key args, because {problem.name} has {cause}"
             )
         for name, value in values.items():
             require_name(f"args.{name}", name, names, defect="there is no such parameter")
@@ -150,26 +150,22 @@ def find_source(file: SystemFile, folder: Path) -> Source:
         return _of_a_ring(file, loader)
     if ":" not in name:
         return _of_the_library(file, loader)
-    definition, defect = loader.load("system", name), repr(name)
-    if (
-        callable(definition)
-        and not isinstance(definition, type | dvi.System)
-        and accepts(definition, 0)
-    ):
+    target, defect = loader.load("system", name), repr(name)
+    if callable(target) and not isinstance(target, type | dvi.System) and accepts(target, 0):
         try:
-            definition, defect = definition(), f"the result of {name!r}"
+            target, defect = target(), f"the result of {name!r}"
         except (Exception, SystemExit) as error:
             defect = f"{name!r} failed: {in_one_line(error, *loader.modules)}"
             raise InputError("system", defect, "a function that returns a system") from error
-    if isinstance(definition, systems.Problem):
-        return Source(file, loader, definition, definition.system)
-    if isinstance(definition, dvi.System):
-        return Source(file, loader, None, definition)
+    if isinstance(target, systems.Problem):
+        return Source(file, loader, target, target.system)
+    if isinstance(target, dvi.System):
+        return Source(file, loader, None, target)
     rule = "a dvi.System, a systems.Problem, or a function without arguments that returns one"
-    kind = f"an object of type {type(definition).__name__}"
-    if isinstance(definition, type):
-        kind = f"the class {definition.__name__}, not an object"
-    elif callable(definition):
+    kind = f"an object of type {type(target).__name__}"
+    if isinstance(target, type):
+        kind = f"the class {target.__name__}, not an object"
+    elif callable(target):
         kind = "a function or object with required arguments"
     raise InputError("system", f"{defect} is {kind}", rule)
 
