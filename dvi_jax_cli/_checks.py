@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from ._errors import InputError, require, require_name
+from ._errors import InputError, require, require_file, require_name
 from ._group import CHECKING, START, app
 from ._names import CHECKS, FILES, METHODS, SYSTEMS, completer
 from ._runs import Force
@@ -83,8 +83,7 @@ def verify(
     Examples
         dvi-jax verify bound.json
     """
-    defect = f"there is no file {certificate}"
-    require(certificate.is_file(), "CERTIFICATE", defect, "a file that DriftBound.save wrote")
+    require_file("CERTIFICATE", certificate, "a file that DriftBound.save wrote")
     from .work.verify import verify_certificate
 
     contents, message = verify_certificate(certificate)

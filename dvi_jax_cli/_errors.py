@@ -3,6 +3,7 @@
 import difflib
 import reprlib
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 _SHORT = reprlib.Repr()
@@ -41,6 +42,17 @@ def require_name(
     """**Raises** `InputError` unless a name is among `names`, which `rule` shows for {}."""
     names = list(names)
     require(name in names, key, defect or describe(name), rule.format(one_of(names, name)))
+
+
+def require_file(key: str, path: Path, rule: str) -> Path:
+    """The absolute path of a file. **Raises** `InputError` if there is none."""
+    try:
+        path = path.resolve()
+        is_file = path.is_file()
+    except (OSError, ValueError) as error:  # a name that no file can have
+        raise InputError(key, f"{path} cannot be opened: {reason(error)}", rule) from None
+    require(is_file, key, f"there is no file {path}", rule)
+    return path
 
 
 def reason(error: BaseException) -> str:

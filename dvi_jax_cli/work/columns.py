@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .._errors import InputError, reason, require, require_name
+from .._errors import InputError, require, require_file, require_name
 
 _EMPTY = ("", "nan", "na", "null", "none", "-", "--")
 """Cells in which nothing was observed."""
@@ -20,11 +20,7 @@ def read_columns(path: Path, key: str = "data.file") -> dict[str, np.ndarray]:
 
     **Raises** `InputError` with the key, and the line and column of a cell that is not a number.
     """
-    try:
-        is_file = path.is_file()
-    except (OSError, ValueError) as error:  # a name that no file can have
-        raise InputError(key, reason(error), "the path of a CSV or npz file") from None
-    require(is_file, key, f"there is no file {path}", "the path of a CSV or npz file")
+    require_file(key, path, "the path of a CSV or npz file")
     try:
         return _npz(path) if path.suffix == ".npz" else _csv(path, key)
     except InputError:

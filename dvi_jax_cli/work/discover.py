@@ -119,9 +119,8 @@ def box_of(table: Any, key: str, source: Source) -> list[tuple[np.ndarray, ...]]
     corners = []
     for name, corner in tables.items():
         try:
-            corners.append(
-                tuple(np.broadcast_to(np.asarray(x, float), shape) for x in (corner.q, corner.p))
-            )
+            pair = [np.asarray(x, float) for x in (corner.q, corner.p)]
+            corners.append(tuple(np.broadcast_to(x, shape) for x in pair))
         except ValueError:
             defect = f"q has shape {np.shape(corner.q)} and p has shape {np.shape(corner.p)}"
             rule = f"numbers, or arrays of the shape of q, {shape}"

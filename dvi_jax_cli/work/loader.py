@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 
-from .._errors import InputError, one_of, reason, require
+from .._errors import InputError, one_of, require, require_file
 
 _RULE = '"file.py:name", a Python file in the folder of the TOML file and a name in it'
 
@@ -30,12 +30,7 @@ class Loader:
         file, _, name = text.rpartition(":")
         leaves = os.path.isabs(file) or ".." in Path(file).parts
         require(not leaves, key, f"{text!r} is not in the folder of the TOML file", _RULE)
-        try:
-            path = (self.folder / file).resolve()
-            is_file = path.is_file()
-        except (OSError, ValueError) as error:  # a name that no file can have
-            raise InputError(key, f"{text!r} cannot be opened: {reason(error)}", _RULE) from None
-        require(is_file, key, f"{text!r}: there is no file {path}", _RULE)
+        path = require_file(key, self.folder / file, _RULE)
         if path not in self.modules:
             self.modules[path] = self._run(key, text, path)
         module = self.modules[path]
