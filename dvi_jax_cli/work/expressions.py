@@ -115,6 +115,5 @@ def parse_basis(text: str, loader: Loader) -> Any:
     if ".py:" not in text:
         return reader.read(text)
     target = loader.load("basis", text)
-    return reader.require_kind(
-        dvi.Basis(target) if isinstance(target, list | dict) else target, text
-    )
+    basis = dvi.Basis(target) if isinstance(target, list | dict) else target
+    return reader.require_kind(basis, text)

@@ -110,11 +110,9 @@ def own_share(run: dict[str, Any], qs: np.ndarray, ps: np.ndarray) -> float:
     finer = {"h": run["h"] / 2, "num_steps": 2 * stride * count, "save": dvi.Save(every=2 * stride)}
     half_step = dvi.integrate(**run | finer, throw=False)
     masses, longitudes = np.asarray(run["args"]["masses"])[:, None], []
-    for q, p in (
-        (qs[: count + 1], ps[: count + 1]),
-        (np.asarray(half_step.qs), np.asarray(half_step.ps)),
-    ):
-        q, v = (to_ecliptic(x[:, _MERCURY] - x[:, 0]) for x in (q, p / masses))
+    for q, p in ((qs[: count + 1], ps[: count + 1]), (half_step.qs, half_step.ps)):
+        pair = (np.asarray(q), np.asarray(p) / masses)
+        q, v = (to_ecliptic(x[:, _MERCURY] - x[:, 0]) for x in pair)
         mu = float(masses[0, 0] + masses[_MERCURY, 0])
         longitudes.append(perihelion_longitude(q, v, mu))
     full, half = longitudes
