@@ -1,4 +1,4 @@
-"""Commands that look things up, check and measure: systems, schema, paper, certify, bench, info."""
+"""Commands that look things up and check: systems, schema, verify, paper, certify, info."""
 
 import json
 from pathlib import Path
@@ -6,11 +6,11 @@ from typing import Annotated
 
 import typer
 
-from ._errors import InputError, known, require
+from ._errors import InputError, require, require_file, require_name
 from ._group import CHECKING, START, app
-from ._names import CHECKS, FILES, METHODS, SYSTEMS, WORKLOADS, completer
+from ._names import CHECKS, FILES, METHODS, SYSTEMS, completer
 from ._runs import Force
-from ._session import FAILED, Session, command
+from ._session import FAILURE, Session, command
 from ._show import console, print_json, progress_bar
 
 
@@ -62,7 +62,7 @@ def schema(
         dvi-jax schema run > run.schema.json    for an editor
     """
     if kind is not None:
-        known("KIND", kind, FILES)
+        require_name("KIND", kind, FILES)
     from .work.schema import json_schema
 
     print_json(json_schema(kind))
@@ -83,8 +83,7 @@ def verify(
     Examples
         dvi-jax verify bound.json
     """
-    found = f"there is no file {certificate}"
-    require(certificate.is_file(), "CERTIFICATE", found, "a file that DriftBound.save wrote")
+    require_file("CERTIFICATE", certificate, "a file that DriftBound.save wrote")
     from .work.verify import verify_certificate
 
     contents, message = verify_certificate(certificate)
@@ -112,11 +111,11 @@ def paper(
     from dvi_jax.testing.paper import reproduce
 
     try:
-        done = reproduce(out, force, console(stderr=session.as_json))
+        reproduction = reproduce(out, force, console(stderr=session.as_json))
     except (FileExistsError, NotADirectoryError, PermissionError) as error:
         raise InputError("--out", str(error), "a new directory, or --force") from None
-    verdicts = json.loads((done.out / "verdicts.json").read_text(encoding="utf-8"))
-    session.finish({"folder": str(done.out), **verdicts})
+    verdicts = json.loads((reproduction.out / "verdicts.json").read_text(encoding="utf-8"))
+    session.finish({"folder": str(reproduction.out), **verdicts})
 
 
 @command(app, "certify", CHECKING)
@@ -158,11 +157,11 @@ def certify(
         with progress_bar("certifying") as bar:
             certificate = certify(QUICK if quick else method or None, check or None, bar)
     except (ValueError, TypeError) as error:
-        allowed = "names as in dvi-jax certify --help, and a page that can be written"
-        raise InputError("certify", str(error), allowed) from error
+        rule = "names as in dvi-jax certify --help, and a page that can be written"
+        raise InputError("certify", str(error), rule) from error
     failures = [
-        f"{name}, {tried}: {measured.verdict}, allowed {measured.allowed}. {measured.detail}"
-        for name, tried, measured in certificate.failures
+        f"{name}, {quantity}: {result.verdict}, allowed {result.allowed}. {result.detail}"
+        for name, quantity, result in certificate.failures
     ]
     tables = certificate.tables()
     session.tables(tables)
@@ -182,46 +181,7 @@ def certify(
     if certificate.ok or session.as_json:
         session.finish(contents, "" if certificate.ok else certificate.summary)
     else:  # the summary is on the screen already
-        raise typer.Exit(FAILED)
-
-
-@command(app, "bench", CHECKING)
-def bench(
-    session: Session,
-    row: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="A row: single, batch, implicit, gradient; may be repeated. All if none.",
-            **completer(WORKLOADS),
-        ),
-    ] = None,
-    rounds: Annotated[int, typer.Option(min=3, help="How often each side is timed.")] = 7,
-) -> None:
-    """Benchmark this machine against reference implementations.
-
-    Each workload and its references take the same steps, one after the other in each round, in
-    random order. The ratio is steps per second over those of the reference: median and quartiles
-    over the rounds. Compilation is listed separately.
-
-    Exit code 0: done. 1: a reference and the package do not agree. 2: bad input.
-
-    Examples
-        dvi-jax bench                            under a minute
-        dvi-jax bench --row batch --json
-    """
-    wanted = list(row or WORKLOADS)
-    for name in wanted:
-        known("--row", name, WORKLOADS)
-    from .work.bench import measure, tables
-
-    with progress_bar("timing") as bar:
-        found = measure(wanted, rounds, bar, session.note)
-    about, speeds = tables(found)
-    session.tables([about], words=True)
-    session.tables([speeds])
-    session.line(f"{found['machine']}; {found['setting']}")
-    wrong = [r["row"] for r in found["rows"] if not r["agrees"]]
-    session.finish(found, f"the two results differ: {', '.join(wrong)}" if wrong else "")
+        raise typer.Exit(FAILURE)
 
 
 @command(app, "info", CHECKING, jax=False)
@@ -236,6 +196,6 @@ def info(session: Session) -> None:
     """
     from ._info import gather, tables
 
-    found = gather()
-    session.tables(tables(found), words=True)
-    session.finish(found, found["failed"])
+    information = gather()
+    session.tables(tables(information), words=True)
+    session.finish(information, information["failed"])

@@ -3,42 +3,56 @@
 import difflib
 import reprlib
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxother = 60
-_MOST = 8
+_MAX_ERRORS = 8
 """Errors of one file that are shown."""
 
 
 class InputError(ValueError):
     """Bad input: the key (or the option), what was seen, what is allowed.
 
-    `found`: this error, and after it all others of the same file.
+    `errors`: this error, and after it all others of the same file.
     """
 
-    def __init__(self, key: str, seen: str, allowed: str, more: Sequence["InputError"] = ()):
-        super().__init__(f"{key}: {seen}\n  allowed: {allowed}")
-        self.key, self.seen, self.allowed = key, seen, allowed
-        self.found = [self, *more]
+    def __init__(self, key: str, defect: str, rule: str, successors: Sequence["InputError"] = ()):
+        super().__init__(f"{key}: {defect}\n  allowed: {rule}")
+        self.key, self.seen, self.allowed = key, defect, rule
+        self.errors = [self, *successors]
 
     def __str__(self) -> str:
-        texts = [str(error.args[0]) for error in self.found[:_MOST]]
-        if len(self.found) > _MOST:
-            texts.append(f"… and {len(self.found) - _MOST} more")
+        texts = [str(error.args[0]) for error in self.errors[:_MAX_ERRORS]]
+        if len(self.errors) > _MAX_ERRORS:
+            texts.append(f"… and {len(self.errors) - _MAX_ERRORS} more")
         return "\n".join(texts)
 
 
-def require(fits: Any, key: str, seen: str, allowed: str) -> None:
+def require(fits: Any, key: str, defect: str, rule: str) -> None:
     """**Raises** `InputError` unless something `fits`."""
     if not fits:
-        raise InputError(key, seen, allowed)
+        raise InputError(key, defect, rule)
 
 
-def known(key: str, name: str, names: Iterable[str], allowed: str = "{}", seen: str = "") -> None:
-    """**Raises** `InputError` unless a name is among `names`, which `allowed` shows for {}."""
+def require_name(
+    key: str, name: str, names: Iterable[str], rule: str = "{}", defect: str = ""
+) -> None:
+    """**Raises** `InputError` unless a name is among `names`, which `rule` shows for {}."""
     names = list(names)
-    require(name in names, key, seen or shown(name), allowed.format(one_of(names, name)))
+    require(name in names, key, defect or describe(name), rule.format(one_of(names, name)))
+
+
+def require_file(key: str, path: Path, rule: str) -> Path:
+    """The absolute path of a file. **Raises** `InputError` if there is none."""
+    try:
+        path = path.resolve()
+        is_file = path.is_file()
+    except (OSError, ValueError) as error:  # a name that no file can have
+        raise InputError(key, f"{path} cannot be opened: {reason(error)}", rule) from None
+    require(is_file, key, f"there is no file {path}", rule)
+    return path
 
 
 def reason(error: BaseException) -> str:
@@ -53,7 +67,7 @@ def toml_type(value: Any) -> str:
     return types.get(type(value), type(value).__name__)
 
 
-def shown(value: Any) -> str:
+def describe(value: Any) -> str:
     """As "the value is 3 (a whole number)": a value, shortened, and its type."""
     text = str(value).lower() if isinstance(value, bool) else _SHORT.repr(value)
     kind = toml_type(value)
@@ -61,14 +75,14 @@ def shown(value: Any) -> str:
     return f"the value is {text} ({article}{kind})"
 
 
-def nearest(seen: str, names: Iterable[str]) -> str:
+def nearest(word: str, names: Iterable[str]) -> str:
     """The name that a mistyped one may have been, as " (did you mean …?)", or nothing."""
-    lowered = {name.lower(): name for name in names}
-    near = difflib.get_close_matches(seen.lower(), lowered, n=1)
-    return f" (did you mean {lowered[near[0]]}?)" if near else ""
+    originals = {name.lower(): name for name in names}
+    matches = difflib.get_close_matches(word.lower(), originals, n=1)
+    return f" (did you mean {originals[matches[0]]}?)" if matches else ""
 
 
-def one_of(names: Iterable[str], seen: str = "") -> str:
+def one_of(names: Iterable[str], word: str = "") -> str:
     """A list of names, and the nearest of them to what was seen."""
     names = list(names)
-    return (", ".join(names) or "none") + nearest(seen, names)
+    return (", ".join(names) or "none") + nearest(word, names)

@@ -9,7 +9,7 @@ from typer.core import TyperGroup
 
 from ._errors import nearest
 from ._names import VERSION
-from ._session import BAD_INPUT, INTERRUPTED, WithExamples, shown_examples
+from ._session import BAD_INPUT, INTERRUPTION, WithExamples, shown_examples
 from ._show import print_error
 
 _USAGE: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "UsageError")
@@ -19,10 +19,12 @@ _USAGE: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "Usage
 class Commands(WithExamples, TyperGroup):
     """All commands. Errors in the arguments are shown like every other error."""
 
-    def main(self, args: Any = None, *rest: Any, standalone_mode: bool = True, **more: Any) -> Any:
+    def main(
+        self, args: Any = None, *values: Any, standalone_mode: bool = True, **options: Any
+    ) -> Any:
         words = list(sys.argv[1:] if args is None else args)
         try:
-            code = super().main(args, *rest, standalone_mode=False, **more)
+            code = super().main(args, *values, standalone_mode=False, **options)
         except _USAGE as error:
             if not standalone_mode:
                 raise
@@ -30,7 +32,7 @@ class Commands(WithExamples, TyperGroup):
             if type(error).__name__ != "NoArgsIsHelpError":  # then the help has been shown
                 _refuse(error, "--json" in words)
         except typer.Abort:
-            code = INTERRUPTED
+            code = INTERRUPTION
         if standalone_mode:
             sys.exit(code if isinstance(code, int) else 0)
         return code
@@ -43,8 +45,8 @@ def _refuse(error: Any, as_json: bool) -> None:
     if error.ctx is not None:
         command = error.ctx.command
         names = [o for p in command.params for o in p.opts] + list(getattr(command, "commands", ()))
-        if seen := re.search(r"No such (?:command|option):? '?([^'\s]+)'?", message):
-            message += nearest(seen[1], names)
+        if match := re.search(r"No such (?:command|option):? '?([^'\s]+)'?", message):
+            message += nearest(match[1], names)
         message += f"\n  {error.ctx.command_path} --help lists the commands and options"
     print_error("bad input", message, as_json)
 
@@ -75,8 +77,8 @@ app = typer.Typer(
 RUNS, INVERSE, CHECKING, START = "Trajectories", "From data", "Checks", "Getting started"
 
 
-def _show_version(wanted: bool) -> None:
-    if wanted:
+def _show_version(is_requested: bool) -> None:
+    if is_requested:
         typer.echo(f"dvi-jax {VERSION}")
         raise typer.Exit
 

@@ -22,7 +22,7 @@ _FLAGS = ("JAX_", "XLA_", "CUDA_VISIBLE", "NVIDIA_VISIBLE", "OMP_", "TF_CPP")
 def gather() -> dict[str, Any]:
     """Everything, for `tables` and for programs; `failed` says why JAX cannot be started, or ""."""
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
-    found: dict[str, Any] = {
+    information: dict[str, Any] = {
         "versions": {"dvi-jax": VERSION, **{name: _version(name) for name in PACKAGES}},
         "python": platform.python_version(),
         "executable": sys.executable,
@@ -36,15 +36,15 @@ def gather() -> dict[str, Any]:
         import jax
         import jax.numpy as jnp
 
-        found |= {
+        information |= {
             "backend": jax.default_backend(),
             "devices": [_device(d) for d in jax.local_devices()],
             "x64_of_this_process": jnp.result_type(float) == jnp.float64,
             "x64_of_commands": True,
         }
     except Exception as error:  # a driver that does not fit, a flag that XLA does not know
-        found["failed"] = f"JAX cannot be started: {type(error).__name__}: {error}"
-    return found
+        information["failed"] = f"JAX cannot be started: {type(error).__name__}: {error}"
+    return information
 
 
 def _version(name: str) -> str | None:
@@ -55,44 +55,44 @@ def _version(name: str) -> str | None:
 
 
 def _device(device: Any) -> dict[str, Any]:
-    about = {"id": device.id, "kind": device.device_kind, "platform": device.platform}
+    entry = {"id": device.id, "kind": device.device_kind, "platform": device.platform}
     stats: dict[str, Any] = {}
     with suppress(Exception):  # not every backend counts
         stats = device.memory_stats() or {}
-    return about | {"bytes": stats.get("bytes_limit"), "bytes_in_use": stats.get("bytes_in_use")}
+    return entry | {"bytes": stats.get("bytes_limit"), "bytes_in_use": stats.get("bytes_in_use")}
 
 
 def _extra(name: str) -> dict[str, Any]:
-    missing = [m for m in EXTRAS[name] if importlib.util.find_spec(m) is None]
-    return {"missing": missing, "install": f'pip install "dvi-jax[{name}]"' if missing else None}
+    modules = [m for m in EXTRAS[name] if importlib.util.find_spec(m) is None]
+    return {"missing": modules, "install": f'pip install "dvi-jax[{name}]"' if modules else None}
 
 
-def tables(found: dict[str, Any]) -> list[Table]:
+def tables(information: dict[str, Any]) -> list[Table]:
     """The collected information as tables."""
-    versions = [[name, v or "not installed"] for name, v in found["versions"].items()]
-    versions.append(["python", f"{found['python']} ({found['executable']})"])
-    processors = f"{found['processors']['machine']}"
-    if found["processors"]["usable"] is not None:
-        processors += f", {found['processors']['usable']} usable"
-    about = [["platform", found["platform"]], ["processors", processors]]
-    if not found["failed"]:
-        on = "on" if found["x64_of_this_process"] else "off, to be turned on"
-        about.append(["backend of JAX", found["backend"]])
-        about.append(["double precision", f"commands turn it on; in a script: {on}"])
+    versions = [[name, v or "not installed"] for name, v in information["versions"].items()]
+    versions.append(["python", f"{information['python']} ({information['executable']})"])
+    processors = f"{information['processors']['machine']}"
+    if information["processors"]["usable"] is not None:
+        processors += f", {information['processors']['usable']} usable"
+    machine = [["platform", information["platform"]], ["processors", processors]]
+    if not information["failed"]:
+        state = "on" if information["x64_of_this_process"] else "off, to be turned on"
+        machine.append(["backend of JAX", information["backend"]])
+        machine.append(["double precision", f"commands turn it on; in a script: {state}"])
     devices = []
-    for d in found.get("devices", []):
+    for d in information.get("devices", []):
         size = d["bytes"]
         memory = "that of the machine" if size is None else f"{size / 2**30:.1f} GiB"
         devices.append([str(d["id"]), d["kind"], d["platform"], memory])
     extras = []
-    for name, extra in found["extras"].items():
-        missing = f"missing: {', '.join(extra['missing'])}" if extra["missing"] else "installed"
-        extras.append([name, missing, extra["install"] or ""])
-    every = [
+    for name, extra in information["extras"].items():
+        status = f"missing: {', '.join(extra['missing'])}" if extra["missing"] else "installed"
+        extras.append([name, status, extra["install"] or ""])
+    candidates = [
         Table("Versions", ["package", "version"], versions),
-        Table("Machine", ["", ""], about),
+        Table("Machine", ["", ""], machine),
         Table("Devices", ["number", "kind", "platform", "memory"], devices),
-        Table("Environment", ["name", "value"], [[k, v] for k, v in found["flags"].items()]),
+        Table("Environment", ["name", "value"], [[k, v] for k, v in information["flags"].items()]),
         Table("Extras", ["name", "", "to install it"], extras),
     ]
-    return [table for table in every if table.rows]
+    return [table for table in candidates if table.rows]

@@ -52,15 +52,15 @@ def interrupts_guarded() -> Iterator[None]:
         nonlocal began
         began = time.monotonic() if began < 0 else began
         if _is_importing(frame) and time.monotonic() - began < _PATIENCE:
-            _again()
+            _retry()
         else:
             signal.default_int_handler(number, frame)
 
-    def report(lost: Any) -> None:
-        if issubclass(lost.exc_type, KeyboardInterrupt):
-            _again()
+    def report(event: Any) -> None:
+        if issubclass(event.exc_type, KeyboardInterrupt):
+            _retry()
         else:
-            hook(lost)
+            hook(event)
 
     signal.signal(signal.SIGINT, handle)
     sys.unraisablehook = report
@@ -71,7 +71,7 @@ def interrupts_guarded() -> Iterator[None]:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def _again() -> None:
+def _retry() -> None:
     """Have Ctrl-C handled again, a little later."""
     timer = threading.Timer(_LATER, interrupt_main)
     timer.daemon = True

@@ -9,27 +9,24 @@ from pathlib import Path
 from typing import Any
 
 
-def _found(file: str, pattern: str) -> tuple[str, ...]:
+def _names_in(file: str, pattern: str) -> tuple[str, ...]:
     source = Path(__file__).parent.parent / "dvi_jax" / file
     return tuple(re.findall(pattern, source.read_text(encoding="utf-8"), re.MULTILINE))
 
 
-VERSION = _found("__init__.py", r'^__version__ = "(.*)"')[0]
+VERSION = _names_in("__init__.py", r'^__version__ = "(.*)"')[0]
 
-SYSTEMS = _found("systems/__init__.py", r'^    "(\w+)": \w+,$')
+SYSTEMS = _names_in("systems/__init__.py", r'^    "(\w+)": \w+,$')
 """Systems of the library."""
 
-METHODS = _found("testing/registry.py", r'^    "(\w+)": ')
+METHODS = _names_in("testing/registry.py", r'^    "(\w+)": ')
 """Methods that are certified, as `dvi-jax certify --method` takes them."""
 
-CHECKS = _found("testing/checks.py", r'^@check\(\s*"([\w-]+)"')
+CHECKS = _names_in("testing/checks.py", r'^@check\(\s*"([\w-]+)"')
 """Checks of a certificate, as `dvi-jax certify --check` takes them."""
 
 FILES = ("run", "sweep", "fit", "discover", "bound")
 """Kinds of TOML files."""
-
-WORKLOADS = ("single", "batch", "implicit", "gradient")
-"""Rows of `dvi-jax bench`."""
 
 EXTRAS = {
     "cuda12": ("jax_cuda12_plugin",),

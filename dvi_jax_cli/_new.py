@@ -10,13 +10,13 @@ from typing import Annotated, Any
 
 import typer
 
-from ._errors import known, require
+from ._errors import require, require_name
 from ._group import START, app
 from ._names import SYSTEMS, completer
 from ._session import Session, command
 
 _NAME = re.compile(r"[^\W_][\w. -]{0,99}")
-_RESERVED = {"con", "prn", "aux", "nul", *(f"{x}{i}" for x in ("com", "lpt") for i in range(1, 10))}
+_DEVICES = {"con", "prn", "aux", "nul", *(f"{x}{i}" for x in ("com", "lpt") for i in range(1, 10))}
 """Names of devices on Windows."""
 
 
@@ -63,13 +63,13 @@ def new(
 
 def _check(name: Path, system: str | None) -> None:
     last = name.name
-    fits = _NAME.fullmatch(last) and last.split(".")[0].lower() not in _RESERVED
-    allowed = "letters and digits first, then also . _ - and spaces"
-    require(fits and last[-1] not in " .", "NAME", f"{str(name)!r} is not a valid name", allowed)
+    fits = _NAME.fullmatch(last) and last.split(".")[0].lower() not in _DEVICES
+    rule = "letters and digits first, then also . _ - and spaces"
+    require(fits and last[-1] not in " .", "NAME", f"{str(name)!r} is not a valid name", rule)
     is_new = not (name.exists() or name.is_symlink())
     require(is_new, "NAME", f"{name} exists already", "a new directory")
     if system is not None:
-        known("--system", system, SYSTEMS)
+        require_name("--system", system, SYSTEMS)
 
 
 def notebook(script: str) -> dict[str, Any]:
@@ -85,5 +85,5 @@ def notebook(script: str) -> dict[str, Any]:
         cells.append({"id": f"cell-{i}", "metadata": {}, **kind, "source": source})
     kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
     language = {"name": "python", "version": sys.version.split()[0]}
-    about = {"kernelspec": kernel, "language_info": language}
-    return {"cells": cells, "metadata": about, "nbformat": 4, "nbformat_minor": 5}
+    metadata = {"kernelspec": kernel, "language_info": language}
+    return {"cells": cells, "metadata": metadata, "nbformat": 4, "nbformat_minor": 5}

@@ -7,7 +7,7 @@ import typer
 from typer.core import TyperGroup
 
 from ._group import INVERSE, RUNS, app
-from ._session import AGAIN, Session, command
+from ._session import RESUME_HINT, Session, command
 from ._show import progress_bar
 
 Config = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML file.")]
@@ -98,7 +98,7 @@ def sweep_run(
         dvi-jax sweep sweep.toml
         dvi-jax sweep sweep.toml --resume       continues, or begins
     """
-    session.stopped, session.hint = "before anything was done", AGAIN
+    session.interruption, session.hint = "before anything was done", RESUME_HINT
     from .work.sweep import sweep_cost, sweep_file
 
     session.note(f"reading {config}")
@@ -160,8 +160,8 @@ def fit(
         dvi-jax fit fit.toml --resume      continues from its checkpoint, or begins
         dvi-jax fit fit.toml --json | jq .parameters
     """
-    session.stopped = "by Ctrl-C; there is a checkpoint if the fit had run for some seconds"
-    session.hint = AGAIN
+    session.interruption = "by Ctrl-C; there is a checkpoint if the fit had run for some seconds"
+    session.hint = RESUME_HINT
     from .work.fit import fit_file
 
     session.note(f"reading {config}")

@@ -15,11 +15,11 @@ from ._errors import InputError
 from ._names import VERSION
 from ._show import console, print_error, print_json, print_tables
 
-FAILED = 1
+FAILURE = 1
 BAD_INPUT = 2
-INTERRUPTED = 130
-AGAIN = "On the command line: the same with --resume continues from what is done."
-CODES = {"bad input": BAD_INPUT, "failed": FAILED, "interrupted": INTERRUPTED, "fault": FAILED}
+INTERRUPTION = 130
+RESUME_HINT = "On the command line: the same with --resume continues from what is done."
+CODES = {"bad input": BAD_INPUT, "failed": FAILURE, "interrupted": INTERRUPTION, "fault": FAILURE}
 """Kind of an error → exit code."""
 
 
@@ -37,18 +37,18 @@ _COMMON = {
 class Session:
     """One call of a command: its output, its notes and how it ends.
 
-    - `unwritten`: text before an `OSError`; `stopped`: text for a Ctrl-C without one; `hint`: a
-      line after both, for work that can be continued.
+    - `unwritten`: text before an `OSError`; `interruption`: text for a Ctrl-C without one;
+      `hint`: a line after both, for work that can be continued.
     """
 
     unwritten = "the results cannot be written"
-    stopped = "by Ctrl-C; nothing has been written"
+    interruption = "by Ctrl-C; nothing has been written"
     hint = ""
 
     def __init__(self, as_json: bool, verbose: bool, debug: bool):
         self.as_json, self.verbose, self.debug = as_json, verbose, debug
         self._began = time.perf_counter()
-        self._compiled: list[float] = []
+        self._compile_seconds: list[float] = []
 
     def start_jax(self) -> None:
         """Set double precision and pictures without a window; with --verbose, show what JAX has."""
@@ -59,16 +59,16 @@ class Session:
         mpl.use("Agg")  # pictures go to files: no window, no display needed
         if not self.verbose:
             return
-        jax.monitoring.register_event_duration_secs_listener(self._heard)
+        jax.monitoring.register_event_duration_secs_listener(self._record_compilation)
         devices = jax.local_devices()
         self.note(
             f"dvi-jax {VERSION}, jax {jax.__version__}, Python {sys.version.split()[0]}; "
             f"{len(devices)} × {devices[0].device_kind} ({devices[0].platform}); double precision"
         )
 
-    def _heard(self, event: str, duration_secs: float, **kwargs: Any) -> None:
+    def _record_compilation(self, event: str, duration_secs: float, **kwargs: Any) -> None:
         if event.endswith("backend_compile_duration"):
-            self._compiled.append(duration_secs)
+            self._compile_seconds.append(duration_secs)
 
     def note(self, text: str) -> None:
         """A line on stderr, with --verbose."""
@@ -85,20 +85,24 @@ class Session:
         if not self.as_json:
             print_tables(tables, words)
 
-    def finish(self, contents: Mapping[str, Any], failed: str = "") -> None:
-        """End a command: with --json its object, with `failed` an error."""
+    def finish(self, contents: Mapping[str, Any], failure: str = "") -> None:
+        """End a command: with --json its object, with `failure` an error."""
         if place := contents.get("folder") or contents.get("store"):
             self.note(f"written to {place}")
-        seconds, count = time.perf_counter() - self._began, len(self._compiled)
-        part = f"; XLA compiled {count} programs in {sum(self._compiled):.1f} s" if count else ""
+        seconds, count = time.perf_counter() - self._began, len(self._compile_seconds)
+        part = (
+            f"; XLA compiled {count} programs in {sum(self._compile_seconds):.1f} s"
+            if count
+            else ""
+        )
         self.note(f"{seconds:.1f} s in all{part}")
         if self.as_json:
-            error = {"error": {"kind": "failed", "message": failed}} if failed else {}
+            error = {"error": {"kind": "failed", "message": failure}} if failure else {}
             print_json({**contents, **error})
-        elif failed:
-            print_error("failed", failed)
-        if failed:
-            raise typer.Exit(FAILED)
+        elif failure:
+            print_error("failed", failure)
+        if failure:
+            raise typer.Exit(FAILURE)
 
     def finish_report(self, report: Any) -> None:
         """End a command with the report of its work."""
@@ -117,8 +121,8 @@ class Session:
         # Those of dvi_jax are found by name, because a command without JAX must not import it.
         names = {kind.__name__ for kind in type(error).__mro__}
         if isinstance(error, KeyboardInterrupt):
-            what = str(error).removeprefix("interrupted: ") or self.stopped
-            return "interrupted", "\n".join(filter(None, (what, self.hint)))
+            text = str(error).removeprefix("interrupted: ") or self.interruption
+            return "interrupted", "\n".join(filter(None, (text, self.hint)))
         if isinstance(error, InputError) or "StoreMismatch" in names:
             return "bad input", str(error)
         if isinstance(error, OSError) or "StoreError" in names:
@@ -128,11 +132,13 @@ class Session:
         lines = str(error).strip().splitlines() or ["(without a message)"]
         if len(lines) > 12:
             lines[12:] = [f"… ({len(lines) - 12} more lines)"]
-        how = "The same command with --debug shows where it comes from; please report it with that."
+        remedy = (
+            "The same command with --debug shows where it comes from; please report it with that."
+        )
         if self.debug:
-            how = "Please report it, with the traceback above."
-        text = "\n".join([f"{type(error).__name__}: {lines[0]}", *lines[1:], how])
-        return "fault", f"this is a fault of dvi_jax, not of your input.\n{text}"
+            remedy = "Please report it, with the traceback above."
+        cause = "\n".join([f"{type(error).__name__}: {lines[0]}", *lines[1:], remedy])
+        return "fault", f"this is a fault of dvi_jax, not of your input.\n{cause}"
 
 
 def command(
@@ -147,24 +153,24 @@ def command(
 
     def register(function: Callable[..., None]) -> Callable[..., None]:
         kind = inspect.Parameter.KEYWORD_ONLY
-        own = list(inspect.signature(function).parameters.values())[1:]
+        options = list(inspect.signature(function).parameters.values())[1:]
         common = [
             inspect.Parameter(n, kind, default=False, annotation=a) for n, a in _COMMON.items()
         ]
 
         @functools.wraps(function)
-        def call(as_json: bool, verbose: bool, debug: bool, **given: Any) -> None:
+        def call(as_json: bool, verbose: bool, debug: bool, **values: Any) -> None:
             session = Session(as_json, verbose, debug)
             try:
                 if jax:
                     session.start_jax()
-                function(session, **given)
+                function(session, **values)
                 sys.stdout.flush()  # so that a closed pipe raises here
             except (typer.Exit, typer.Abort):
                 raise
             except BrokenPipeError:
                 quiet()
-                raise typer.Exit(FAILED) from None
+                raise typer.Exit(FAILURE) from None
             except (Exception, KeyboardInterrupt) as error:
                 kind, message = session.kind_and_message(error)
                 is_raised = debug and kind != "interrupted"  # the entry point shows it in full
@@ -175,7 +181,7 @@ def command(
                 raise typer.Exit(CODES[kind]) from None
 
         del call.__dict__["__wrapped__"]  # its signature is not this one's
-        parameters = [*(p.replace(kind=kind) for p in own), *common]
+        parameters = [*(p.replace(kind=kind) for p in options), *common]
         call.__dict__["__signature__"] = inspect.Signature(parameters)
         call.__annotations__ = {p.name: p.annotation for p in parameters}
         text, _, examples = (inspect.getdoc(function) or "").partition("\n\nExamples\n")

@@ -24,7 +24,7 @@ from dvi_jax_cli._new import notebook
 from dvi_jax_cli._session import CODES, Session
 
 COMMANDS = ["new", "systems", "schema", "run", "sweep", "fit", "discover", "bound", "paper"]
-COMMANDS += ["certify", "verify", "bench", "info"]
+COMMANDS += ["certify", "verify", "info"]
 
 WITHOUT_JAX = """
 import sys
@@ -110,8 +110,6 @@ def test_every_command_has_help_with_examples(name):
         (["sweeep"], "No such command 'sweeep' (did you mean sweep?)"),
         (["run", "x.toml", "--forse"], "No such option: --forse (did you mean --force?)"),
         (["run"], "Missing argument"),
-        (["bench", "--rounds", "1"], "--rounds"),
-        (["bench", "--row", "doubel"], "allowed: single, batch"),
         (["schema", "swep"], "did you mean sweep?"),
         (["systems", "keppler"], "did you mean kepler?"),
     ],
@@ -145,7 +143,6 @@ def test_names_that_complete_are_those_of_the_package():
     assert tuple(systems.LIBRARY) == known.SYSTEMS
     assert tuple(testing.METHODS) == known.METHODS
     assert tuple(testing.CHECKS) == known.CHECKS
-    assert tuple(import_module("dvi_jax_cli.work.bench").ROWS) == known.WORKLOADS
     assert tuple(import_module("dvi_jax_cli.work.schema").FILES) == known.FILES
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = set(project["optional-dependencies"]) - {"test", "docs", "peers"}
@@ -254,7 +251,7 @@ def test_too_little_memory_is_a_failure_with_its_size():
     assert "does not have the memory for this: Unable to allocate 7.28 TiB" in message
 
 
-# info, bench
+# info
 
 
 def test_info(monkeypatch):
@@ -271,27 +268,6 @@ def test_info(monkeypatch):
     assert info["extras"]["export"] == missing
     assert info["extras"]["bayes"] == {"missing": [], "install": None}
     assert install in command("info").output
-
-
-@pytest.mark.slow
-def test_bench_agrees_with_its_references():
-    rows = found("bench", "--rounds", "3")["rows"]
-    assert {r["row"] for r in rows} == set(known.WORKLOADS)
-    for row in rows:
-        assert row["quartiles"][0] <= row["ratio"] <= row["quartiles"][1]
-        assert row["largest_difference"] is None or row["largest_difference"] < 1e-6
-        assert row["compilation_seconds"] > 0
-
-
-def test_bench_fails_where_the_two_sides_differ(monkeypatch):
-    bench = import_module("dvi_jax_cli.work.bench")
-    references = {"same": lambda q, p: (q, p), "other": lambda q, p: (q, p * np.nan)}
-    start = np.zeros(2), np.ones(2)
-    row = bench.Row("nothing", start, 10, lambda q, p: (q, p), references, 1e-6)
-    monkeypatch.setitem(bench.ROWS, "single", lambda: row)
-    result = found("bench", "--row", "single", code=1)
-    assert [r["agrees"] for r in result["rows"]] == [True, False]
-    assert "differ: single" in result["error"]["message"]
 
 
 # new

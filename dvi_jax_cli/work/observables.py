@@ -13,47 +13,49 @@ import dvi_jax as dvi
 from dvi_jax.base.signature import accepts
 from dvi_jax.systems.n_body import linear_momentum
 
-from .._errors import InputError, known, require
+from .._errors import InputError, require, require_name
 from .expressions import Expressions, public
 from .system import Source
 
 _A_FUNCTION = "a function (t0, t1, q0, p0, q1, p1, args)"
 
 
-def read_observables(given: dict[str, str] | None, source: Source) -> dict[str, Any]:
+def read_observables(texts: dict[str, str] | None, source: Source) -> dict[str, Any]:
     """The observables by name; without a table all that the system knows, and their drifts.
 
     **Raises** `InputError`.
     """
-    own = dict(source.problem.observables) if source.problem is not None else {}
-    if given is None:
-        return {**own, **{f"{name}_drift": dvi.MaxDrift(f) for name, f in own.items()}}
-    return {n: _observable(f"observables.{n}", text, own, source) for n, text in given.items()}
+    defaults = dict(source.problem.observables) if source.problem is not None else {}
+    if texts is None:
+        return {**defaults, **{f"{name}_drift": dvi.MaxDrift(f) for name, f in defaults.items()}}
+    return {n: _observable(f"observables.{n}", text, defaults, source) for n, text in texts.items()}
 
 
 def _observable(key: str, text: str, names: dict[str, Callable], source: Source) -> Any:
     indicators = public(dvi.Deviations)
     reductions = public(dvi.Reduction, dvi.Deviations, *indicators.values())
     inner, wrap = text.strip(), lambda function: function
-    if found := re.fullmatch(r"(\w+)\((.*)\)", inner):
-        if found[1] in indicators:  # as it is written in Python, such as GALI(4, log10=True)
+    if match := re.fullmatch(r"(\w+)\((.*)\)", inner):
+        if match[1] in indicators:  # as it is written in Python, such as GALI(4, log10=True)
             example = "; with numbers alone, as in LyapunovSpectrum(2) or MEGNO()"
             return Expressions(key, dvi.Deviations, indicators, example).read(inner)
         kinds = [*reductions, *indicators]
-        known(key, found[1], kinds, "a reduction: {}", f"{found[1]!r} is not a reduction")
-        wrap, inner = reductions[found[1]], found[2].strip()
+        require_name(key, match[1], kinds, "a reduction: {}", f"{match[1]!r} is not a reduction")
+        wrap, inner = reductions[match[1]], match[2].strip()
     if ":" in inner:
         function = source.loader.load(key, inner)
-        seen = f"{inner!r} has the type {type(function).__name__}"
-        require(callable(function), key, seen, _A_FUNCTION)
+        defect = f"{inner!r} has the type {type(function).__name__}"
+        require(callable(function), key, defect, _A_FUNCTION)
         # An energy has `bind` and is called with the system.
         if not hasattr(function, "bind") and not accepts(function, 7):
-            seen = f"{inner!r} takes {inspect.signature(function)}, but is called with 7 arguments"
-            raise InputError(key, seen, _A_FUNCTION)
+            defect = (
+                f"{inner!r} takes {inspect.signature(function)}, but is called with 7 arguments"
+            )
+            raise InputError(key, defect, _A_FUNCTION)
         return wrap(function)
     calls = ", ".join(f"{name}()" for name in indicators)
-    allowed = f'{{}}; or "file.py:name"; alone or in {", ".join(reductions)}; or {calls}'
-    known(key, inner, names, allowed, f"{inner!r} is unknown")
+    rule = f'{{}}; or "file.py:name"; alone or in {", ".join(reductions)}; or {calls}'
+    require_name(key, inner, names, rule, f"{inner!r} is unknown")
     return wrap(names[inner])
 
 
@@ -87,15 +89,15 @@ class Observed:
     def summary(self) -> dict[str, Any]:
         """The entry of the report."""
         if self.reduction:
-            found = {"reduction": self.reduction, "value": self.values}
+            entry = {"reduction": self.reduction, "value": self.values}
             if self.reduction in ("MaxDrift", "Range"):
-                found["relative"] = float(np.linalg.norm(self.values)) / self.scale
+                entry["relative"] = float(np.linalg.norm(self.values)) / self.scale
         else:
             change = np.abs(self.change())
             largest = np.max(change, where=np.isfinite(change), initial=-np.inf)
-            found = {"start": self.start, "end": self.values[-1]}
-            found["largest_saved_change"] = float(largest) if largest >= 0 else np.nan
-        return found | {"scale": self.scale}
+            entry = {"start": self.start, "end": self.values[-1]}
+            entry["largest_saved_change"] = float(largest) if largest >= 0 else np.nan
+        return entry | {"scale": self.scale}
 
 
 def observe(
@@ -108,7 +110,7 @@ def observe(
     """
     q0, p0 = jnp.asarray(run["q0"]), jnp.asarray(run["p0"])
     t0 = jnp.asarray(run["t0"], q0.dtype)
-    found = {}
+    results = {}
     for name, observable in observables.items():
         reduction = type(observable).__name__ if isinstance(observable, dvi.Reduction) else ""
         function: Any = observable.function if reduction else observable
@@ -119,7 +121,7 @@ def observe(
         if function is linear_momentum:
             scale = float(np.linalg.norm(run["p0"], axis=-1).sum())
         scale = scale if np.isfinite(scale) and scale else 1.0
-        saved = np.asarray(values[name])
-        saved = saved if reduction else np.concatenate([start[None], saved])
-        found[name] = Observed(start, saved, scale, reduction)
-    return found
+        series = np.asarray(values[name])
+        series = series if reduction else np.concatenate([start[None], series])
+        results[name] = Observed(start, series, scale, reduction)
+    return results

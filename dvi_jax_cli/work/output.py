@@ -55,12 +55,12 @@ class Output(Report):
     force: bool = False
 
     @contextmanager
-    def reserved(self) -> Iterator[None]:
+    def reservation(self) -> Iterator[None]:
         """Make the directory before the work, and remove it if the work fails and leaves it empty.
 
         **Raises** `InputError` where it cannot be made, or has files.
         """
-        allowed = "a directory that does not exist or is empty; with --force, one to write into"
+        rule = "a directory that does not exist or is empty; with --force, one to write into"
         folder, is_new = self.folder, False
         try:
             try:
@@ -69,9 +69,9 @@ class Output(Report):
                     folder.mkdir(parents=True)
                 is_free = not folder.is_dir() or self.force or not any(folder.iterdir())
             except (OSError, ValueError) as error:
-                raise InputError(self.key, f"{folder}: {reason(error)}", allowed) from None
-            require(folder.is_dir(), self.key, f"{folder} is not a directory", allowed)
-            require(is_free, self.key, f"{folder} exists and is not empty", allowed)
+                raise InputError(self.key, f"{folder}: {reason(error)}", rule) from None
+            require(folder.is_dir(), self.key, f"{folder} is not a directory", rule)
+            require(is_free, self.key, f"{folder} exists and is not empty", rule)
             yield
         except BaseException:  # Ctrl-C may come on any line, also right after mkdir
             if is_new and folder.is_dir() and not any(folder.iterdir()):
@@ -88,8 +88,8 @@ class Output(Report):
         new = [] if self.force else sorted({p.name for p in self.folder.iterdir()} - {keep})
         if new:
             raise FileExistsError(
-                f"another process has written to {self.folder} since this command began (file "
-                f"{new[0]}). Repeat the command with another {self.key}, or with --force"
+                f"another process has written {new[0]} to {self.folder} meanwhile. Repeat with "
+                f"another {self.key}, or with --force"
             )
         for name in self.names:
             if name != keep:
@@ -97,11 +97,11 @@ class Output(Report):
         try:
             yield
         except KeyboardInterrupt:
-            there = ", ".join(sorted(file.name for file in self.folder.iterdir())) or "nothing"
+            names = ", ".join(sorted(file.name for file in self.folder.iterdir())) or "nothing"
             last = f" {self.files[-1]} may be incomplete." if self.files else ""
             raise KeyboardInterrupt(
-                f"by Ctrl-C while results were written. {self.folder} now contains: {there}."
-                f"{last} To write all files again, repeat the command with --force"
+                f"by Ctrl-C while results were written. {self.folder} contains: {names}.{last} "
+                "--force writes all files again"
             ) from None
 
     def path(self, name: str) -> Path:
@@ -127,7 +127,7 @@ class Output(Report):
                 plot.save(draw(), self.path(name))
 
 
-def opened(
+def open_report(
     kind: str, path: Path, out: str | Path | None, names: tuple[str, ...], force: bool
 ) -> tuple[Any, Output]:
     """The values of a TOML file, and the directory of the results: of the option --out, or of the
@@ -139,18 +139,18 @@ def opened(
     file, raw = read_file(path, model)
     versions = {name: version(name) for name in ("dvi-jax", "jax", "jaxlib", "numpy")}
     versions["python"] = platform.python_version()
-    about = {kind: str(path), "config": raw, "versions": versions}
+    contents = {kind: str(path), "config": raw, "versions": versions}
     key = "--out" if out is not None else "output.dir"
     folder = Path(out or file.output.dir or f"results/{path.stem}")
-    return file, Output(about, folder=folder, key=key, names=names, force=force)
+    return file, Output(contents, folder=folder, key=key, names=names, force=force)
 
 
-def recorded(last: list[Any], show: Callable[[Any], None] | None) -> Callable[[Any], None]:
+def recorder(last: list[Any], show: Callable[[Any], None] | None) -> Callable[[Any], None]:
     """A function that takes the progress of work: it is stored in `last`, and shown."""
 
-    def record(now: Any) -> None:
-        last[:] = [now]
+    def record(progress: Any) -> None:
+        last[:] = [progress]
         if show is not None:
-            show(now)
+            show(progress)
 
     return record

@@ -16,12 +16,12 @@ from .._errors import InputError
 from .._show import Table
 from . import solar
 from .observables import Observed, observe, read_observables
-from .output import Report, opened
+from .output import Report, open_report
 from .schema import RunFile
 from .system import Source, find_source
 
 _IMAGES = ("invariants.png", "trajectory.png", "orbits.png", "ephemeris.png")
-WRITTEN = ("trajectory.npz", "report.json", *_IMAGES)
+RESULT_FILES = ("trajectory.npz", "report.json", *_IMAGES)
 """Every file that a run may write; with `force` these are replaced and nothing else."""
 
 
@@ -44,30 +44,32 @@ def run_file(
 
     **Raises** `InputError` for bad input; nothing is written then.
     """
-    file, report = opened("run", Path(path), out, WRITTEN, force)
-    with report.reserved():
+    file, report = open_report("run", Path(path), out, RESULT_FILES, force)
+    with report.reservation():
         source = find_source(file, Path(path).parent)
         run = _arguments(file, source)
         # Those of the file come in the report; the ephemeris is compared with the same in each run.
-        wanted = {"own": read_observables(file.observables, source)}
-        wanted["always"] = {} if source.jd is None else solar.conserved()
+        observables = {"own": read_observables(file.observables, source)}
+        observables["always"] = {} if source.jd is None else solar.conserved_observables()
         began = time.perf_counter()
-        allowed = "functions, state and args that fit one another"
-        with source.at_work("system", "integrated", allowed):
-            found = dvi.integrate(**run, observe=wanted, throw=False, progress=progress)
-            jax.block_until_ready(found)
+        rule = "functions, state and args that fit one another"
+        with source.at_work("system", "integrated", rule):
+            result = dvi.integrate(**run, observe=observables, throw=False, progress=progress)
+            jax.block_until_ready(result)
         seconds = time.perf_counter() - began
     with report.writing():
-        own, always = (observe(run, wanted[x], found.observed[x]) for x in ("own", "always"))
-        _describe(report, found, own, seconds)
-        arrays = {name: np.asarray(getattr(found, name)) for name in ("ts", "qs", "ps", "hs")}
-        values = {f"observed/{name}": np.asarray(found.observed["own"][name]) for name in own}
+        observed, conservation = (
+            observe(run, observables[x], result.observed[x]) for x in ("own", "always")
+        )
+        _describe(report, result, observed, seconds)
+        arrays = {name: np.asarray(getattr(result, name)) for name in ("ts", "qs", "ps", "hs")}
+        values = {f"observed/{name}": np.asarray(result.observed["own"][name]) for name in observed}
         report.write_arrays("trajectory.npz", arrays | values)
         ts, qs, ps, _ = arrays.values()
         if source.jd is None:
-            pictures = _pictures(source, ts, qs, ps, own)
+            pictures = _pictures(source, ts, qs, ps, observed)
         else:
-            pictures = solar.report(report, source.jd + (ts - ts[0]), qs, ps, run, always)
+            pictures = solar.report(report, source.jd + (ts - ts[0]), qs, ps, run, conservation)
         report.write_contents("report.json")
         if file.output.plots:
             report.draw(pictures)
@@ -87,57 +89,57 @@ def _arguments(file: RunFile, source: Source) -> dict[str, Any]:
         try:
             check_covered(source.jd + span)
         except ValueError as error:
-            seen = f"the run ends {span:g} days after its start: {error}"
-            allowed = "a shorter run (fewer steps, a smaller h, earlier times), or another date"
-            raise InputError("steps", seen, allowed) from None
+            defect = f"the run ends {span:g} days after its start: {error}"
+            rule = "a shorter run (fewer steps, a smaller h, earlier times), or another date"
+            raise InputError("steps", defect, rule) from None
     return run
 
 
 def _describe(
-    report: Report, found: dvi.Solution, own: dict[str, Observed], seconds: float
+    report: Report, solution: dvi.Solution, observed: dict[str, Observed], seconds: float
 ) -> None:
     """Add status, statistics and observables to the report."""
-    stats = {name: np.asarray(value) for name, value in found.stats.items()}
+    stats = {name: np.asarray(value) for name, value in solution.stats.items()}
     step, steps = int(stats["failed_step"]), int(stats["num_steps"])
-    residual, message = float(stats["failed_residual"]), dvi.RESULTS[found.result]
+    residual, message = float(stats["failed_residual"]), dvi.RESULTS[solution.result]
     report.contents |= {
         "status": {
-            "result": found.status,
+            "result": solution.status,
             "message": message,
             "failed_step": step,
             "failed_residual": residual,
             "num_steps": steps,
         },
-        "stats": stats | {"seconds": seconds, "saved": len(found.ts)},
-        "results": {name: observed.summary() for name, observed in own.items()},
+        "stats": stats | {"seconds": seconds, "saved": len(solution.ts)},
+        "results": {name: entry.summary() for name, entry in observed.items()},
     }
-    if own:
+    if observed:
         title = "Observables (changes: relative, where the start is not zero)"
         columns = ["name", "reduction", "start", "end or value", "change"]
-        report.tables.append(Table(title, columns, [_row(*item) for item in own.items()]))
+        report.tables.append(Table(title, columns, [_row(*item) for item in observed.items()]))
     report.summary = f"{steps} steps in {seconds:.1f} s (compilation included)"
-    if found.status != "successful":
+    if solution.status != "successful":
         report.message = (
-            f"the trajectory failed at step {step} of {steps} with {found.status} (relative "
+            f"the trajectory failed at step {step} of {steps} with {solution.status} (relative "
             f"residual {residual:.3g}).\n{message}\nThe results up to that step have been written."
         )
 
 
-def _row(name: str, found: Observed) -> list[str]:
-    s = found.summary()
-    if found.reduction:
-        relative = f"{s['relative']:.2e}" if "relative" in s and found.is_relative else ""
-        return [name, found.reduction, "", _number(s["value"], 4), relative]
+def _row(name: str, observable: Observed) -> list[str]:
+    s = observable.summary()
+    if observable.reduction:
+        relative = f"{s['relative']:.2e}" if "relative" in s and observable.is_relative else ""
+        return [name, observable.reduction, "", _number(s["value"], 4), relative]
     change = f"{s['largest_saved_change']:.2e}"
     return [name, "", _number(s["start"]), _number(s["end"]), change]
 
 
-def _number(value: Any, most: int = 0) -> str:
+def _number(value: Any, limit: int = 0) -> str:
     """A number, up to `most` of them one by one, or the size of an array."""
     value = np.asarray(value)
     if value.ndim == 0:
         return f"{float(value):.8g}"
-    if value.ndim == 1 and value.size <= most:
+    if value.ndim == 1 and value.size <= limit:
         return ", ".join(f"{x:.3g}" for x in value)
     return f"|…| = {np.linalg.norm(value):.3g}"
 
@@ -150,13 +152,13 @@ def _pictures(
     unit, title = units.get("t", ""), source.name.replace("_", " ")
     time = "t" if unit in ("", "1") else f"t [{unit}]"
     of_state = units.get("q"), units.get("p")
-    drawn = {"trajectory.png": lambda: plot.trajectory(ts, qs, ps, time, *of_state, title)}
+    pictures = {"trajectory.png": lambda: plot.trajectory(ts, qs, ps, time, *of_state, title)}
     series = {}
-    for name, found in observed.items():
-        if not found.reduction:
-            size = "" if found.values.ndim == 1 else "size of "
-            kind = "relative change" if found.is_relative else "change"
-            series[f"{name.replace('_', ' ')}\n{size}{kind}"] = found.change()
+    for name, observable in observed.items():
+        if not observable.reduction:
+            size = "" if observable.values.ndim == 1 else "size of "
+            kind = "relative change" if observable.is_relative else "change"
+            series[f"{name.replace('_', ' ')}\n{size}{kind}"] = observable.change()
     if series:
-        drawn["invariants.png"] = lambda: plot.changes(ts, series, time, f"{title}: observables")
-    return drawn
+        pictures["invariants.png"] = lambda: plot.changes(ts, series, time, f"{title}: observables")
+    return pictures

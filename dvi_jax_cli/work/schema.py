@@ -10,7 +10,7 @@ from pydantic import AfterValidator, BeforeValidator, WithJsonSchema, model_vali
 from pydantic.json_schema import models_json_schema
 from typing_extensions import TypeAliasType
 
-from .._errors import require, shown
+from .._errors import describe, require
 from .._names import FILES as KINDS
 from .ring import RingFile
 from .table import (
@@ -22,7 +22,8 @@ from .table import (
     Fraction,
     JsonSchema,
     Limit,
-    Many,
+    NonEmpty,
+    NonNegative,
     Number,
     NumberOrArray,
     Scalar,
@@ -32,7 +33,6 @@ from .table import (
     Table,
     Text,
     Two,
-    Whole,
     check,
     key,
     number_or_axis,
@@ -116,9 +116,9 @@ class Times(Table):
 
 
 def _check_names(observables: dict[str, str]) -> dict[str, str]:
-    allowed = "a name without / and \\, because it becomes the name of a file in an archive"
+    rule = "a name without / and \\, because it becomes the name of a file in an archive"
     for name in observables:
-        require(not re.search(r"[/\\\x00-\x1f]", name), "", f"the name is {name!r}", allowed)
+        require(not re.search(r"[/\\\x00-\x1f]", name), "", f"the name is {name!r}", rule)
     return observables
 
 
@@ -134,13 +134,13 @@ class Integration(Table):
 
     @model_validator(mode="after")
     def _times_or_steps(self) -> Any:
-        given: Any = self  # of a run or of a sweep, with h, steps and t0
+        file: Any = self  # of a run or of a sweep, with h, steps and t0
         if isinstance(self.lattice, Times):
             for name in ("h", "steps"):
-                value, allowed = getattr(given, name), "no value: lattice.times gives the steps"
-                require(value is None, name, shown(value), allowed)
-            fits = given.t0 in (0.0, self.lattice.times[0])
-            require(fits, "t0", shown(given.t0), "no value: the run begins at lattice.times[0]")
+                value, rule = getattr(file, name), "no value: lattice.times gives the steps"
+                require(value is None, name, describe(value), rule)
+            fits = file.t0 in (0.0, self.lattice.times[0])
+            require(fits, "t0", describe(file.t0), "no value: the run begins at lattice.times[0]")
         return self
 
 
@@ -177,7 +177,7 @@ class Pair(Table):
 
 class _Start(Table):
     count: Count = key(..., COUNT)
-    seed: Whole = key(0, SEED)
+    seed: NonNegative = key(0, SEED)
     name: AxisName = key("start", "a name such as start")
 
 
@@ -231,7 +231,7 @@ class SweepOutput(Table):
     lanes_per_task: Count | None = key(None, f"{COUNT}: trajectories of one task")
 
 
-def _whole(value: Any) -> Any:  # linspace makes 100.0
+def _to_integer(value: Any) -> Any:  # linspace makes 100.0
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
@@ -246,11 +246,11 @@ class SweepFile(SystemFile, Integration):
     stop: Text | None = key(None, f"{FILE}, a dvi.Stop that ends trajectories")
     t0: number_or_axis(Number) = key(0.0, FINITE + OR_AXIS)
     h: number_or_axis(StepSize) | None = key(None, STEP_SIZE + OR_AXIS)
-    steps: number_or_axis(Count, Annotated[Count, BeforeValidator(_whole)]) | None = key(
+    steps: number_or_axis(Count, Annotated[Count, BeforeValidator(_to_integer)]) | None = key(
         None, f"{COUNT}{OR_AXIS} of such numbers"
     )
     epsilon: number_or_axis(Number) | None = key(None, FINITE + OR_AXIS)
-    method: union(text=Text, array=Many[Text], table=Axis[Text]) = key(
+    method: union(text=Text, array=NonEmpty[Text], table=Axis[Text]) = key(
         "TypeII", f"{METHOD}; or an array of such texts"
     )
     save: union(text=Literal["final"], table=SaveEvery) | None = key(None, '"final", {every = n}')
@@ -269,10 +269,10 @@ class SweepFile(SystemFile, Integration):
 
 def _flat(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Parameter → pair: ``[bounds] args.k`` is a table in TOML, ``"args.k"`` is not."""
-    found: dict[str, Any] = {}
+    pairs: dict[str, Any] = {}
     for k, inner in table.items():
-        found |= _flat(inner, f"{prefix}{k}.") if isinstance(inner, dict) else {prefix + k: inner}
-    return found
+        pairs |= _flat(inner, f"{prefix}{k}.") if isinstance(inner, dict) else {prefix + k: inner}
+    return pairs
 
 
 Limits = TypeAliasType("Limits", union(number=Limit, array=list["Limits"]))
@@ -299,7 +299,7 @@ class Data(Table):
 
     file: Text = key(..., "the path of a CSV or npz file, from the folder of this one")
     time: Text = key("t", "the name of the column with the times")
-    columns: Many[Text] | None = key(
+    columns: NonEmpty[Text] | None = key(
         None, "an array of names of columns; all but time and sigma if not given"
     )
     observe: Text = key(
@@ -334,7 +334,7 @@ class FitFile(SystemFile):
         None, f"{FINITE}: the time of [state]; that of the first observation if not given"
     )
     epsilon: Number | None = key(None, FINITE)
-    parameters: Many[Text] = key(..., 'an array of names: "epsilon", "q0", "p0", "args.NAME"')
+    parameters: NonEmpty[Text] = key(..., 'an array of names: "epsilon", "q0", "p0", "args.NAME"')
     bounds: Annotated[dict[str, Bounds], AfterValidator(_flat)] = key(
         {}, "[lower, upper], numbers or arrays; -inf, inf for none"
     )
@@ -358,14 +358,14 @@ class Samples(Table):
     times: Annotated[Two[Number], check(lambda span: span[0] < span[1])] | None = key(
         None, "[first, last]: times of the samples, all at t0 if not given"
     )
-    seed: Whole = key(0, SEED)
+    seed: NonNegative = key(0, SEED)
 
 
-def _strengths(given: Any) -> list[float]:
-    found = given.all if isinstance(given, Axis) else given
-    if len(found) < 3 or min(found) <= 0 or len(set(found)) < len(found):
+def _strengths(value: Any) -> list[float]:
+    strengths = value.elements if isinstance(value, Axis) else value
+    if len(strengths) < 3 or min(strengths) <= 0 or len(set(strengths)) < len(strengths):
         raise ValueError
-    return found
+    return strengths
 
 
 class Drift(Table):
@@ -389,7 +389,7 @@ class DiscoverFile(SystemFile):
         ...,
         f'text such as "Polynomials(4)", "Polynomials(2) + Radial((-1,))", or {FILE} of a basis',
     )
-    order: Whole = key(1, SEED)
+    order: NonNegative = key(1, SEED)
     tolerance: Fraction | None = key(None, f"{FRACTION}; not given: exact invariants alone")
     representative: Literal["least", "simplest"] = key("least", '"least" or "simplest"')
     samples: Samples = key(..., "[samples], a table with the box of the samples")
@@ -443,8 +443,11 @@ FILES: dict[str, type[Table]] = dict(zip(KINDS, _MODELS, strict=True))
 def json_schema(kind: str | None = None) -> dict[str, Any]:
     """The JSON schema of the files of one kind, or of a file of any kind."""
     models = [FILES[kind]] if kind else list(FILES.values())
-    refs, found = models_json_schema(
+    refs, definitions = models_json_schema(
         [(model, "validation") for model in models], schema_generator=JsonSchema
     )
-    found["anyOf"] = [refs[model, "validation"] for model in models]
-    return {"$schema": JsonSchema.schema_dialect, "title": f"dvi-jax {kind or 'TOML'} file"} | found
+    definitions["anyOf"] = [refs[model, "validation"] for model in models]
+    return {
+        "$schema": JsonSchema.schema_dialect,
+        "title": f"dvi-jax {kind or 'TOML'} file",
+    } | definitions

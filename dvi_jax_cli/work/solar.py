@@ -26,7 +26,7 @@ CENTURY = 36525.0
 
 _ARCSEC = 180 * 3600 / np.pi
 _LIGHT = 299792.458 * 86400 / AU_IN_KM  # speed of light [au/day]
-_AGAIN = 4 * 365.25  # stretch that is repeated to find the integrator's error [day]
+_STRETCH = 4 * 365.25  # stretch that is repeated to find the integrator's error [day]
 _MERCURY = BODIES.index("Mercury")
 
 
@@ -76,9 +76,9 @@ def compare(jd: np.ndarray, qs: np.ndarray, ps: np.ndarray, masses: np.ndarray) 
     radius = np.maximum(np.linalg.norm(q_tab, axis=-1), np.finfo(float).tiny)
 
     m, mu = _MERCURY, GM[0] + GM[_MERCURY]
-    tabulated = perihelion_longitude(q_tab[:, m], v_tab[:, m], mu)
-    integrated = perihelion_longitude(q[:, m], v[:, m], masses[0] + masses[m])
-    difference = (tabulated - integrated) * _ARCSEC
+    longitude = perihelion_longitude(q_tab[:, m], v_tab[:, m], mu)
+    own_longitude = perihelion_longitude(q[:, m], v[:, m], masses[0] + masses[m])
+    difference = (longitude - own_longitude) * _ARCSEC
     years = (jd - jd[0]) / 365.25
 
     L = np.linalg.norm(np.cross(q_tab[0, m], v_tab[0, m]))
@@ -102,20 +102,21 @@ def own_share(run: dict[str, Any], qs: np.ndarray, ps: np.ndarray) -> float:
     """
     if run["h"] is None:
         return np.nan
-    every = run["save"].every
-    span = run["h"] * every  # from one saved state to the next
-    count = min(int(_AGAIN / abs(span)), run["num_steps"] // every)
+    stride = run["save"].every
+    span = run["h"] * stride  # from one saved state to the next
+    count = min(int(_STRETCH / abs(span)), run["num_steps"] // stride)
     if count < 3:
         return np.nan
-    finer = {"h": run["h"] / 2, "num_steps": 2 * every * count, "save": dvi.Save(every=2 * every)}
-    again = dvi.integrate(**run | finer, throw=False)
+    finer = {"h": run["h"] / 2, "num_steps": 2 * stride * count, "save": dvi.Save(every=2 * stride)}
+    half_step = dvi.integrate(**run | finer, throw=False)
     masses, longitudes = np.asarray(run["args"]["masses"])[:, None], []
-    for q, p in ((qs[: count + 1], ps[: count + 1]), (np.asarray(again.qs), np.asarray(again.ps))):
-        q, v = (to_ecliptic(x[:, _MERCURY] - x[:, 0]) for x in (q, p / masses))
+    for q, p in ((qs[: count + 1], ps[: count + 1]), (half_step.qs, half_step.ps)):
+        pair = (np.asarray(q), np.asarray(p) / masses)
+        q, v = (to_ecliptic(x[:, _MERCURY] - x[:, 0]) for x in pair)
         mu = float(masses[0, 0] + masses[_MERCURY, 0])
         longitudes.append(perihelion_longitude(q, v, mu))
-    whole, half = longitudes
-    slope, _, _ = _line(span * np.arange(count + 1) / CENTURY, (half - whole) * _ARCSEC)
+    full, half = longitudes
+    slope, _, _ = _line(span * np.arange(count + 1) / CENTURY, (half - full) * _ARCSEC)
     return slope / (1 - 0.5 ** run["method"].order)
 
 
@@ -129,7 +130,7 @@ def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
     return float(slope), float(intercept), float(np.sqrt(np.mean(residual**2)))
 
 
-def conserved() -> dict[str, Any]:
+def conserved_observables() -> dict[str, Any]:
     """Observables of every run of the solar system: all that is conserved, and its drift."""
     return {**OBSERVABLES, **{f"{name}_drift": dvi.MaxDrift(f) for name, f in OBSERVABLES.items()}}
 
@@ -145,7 +146,7 @@ def report(
     """Add the comparison to a report: contents, tables, notes.
 
     - `jd`, `qs`, `ps`: the saved states, as for `compare`. `run`: the arguments of `dvi.integrate`.
-    - `observed`: those of `conserved`.
+    - `observed`: those of `conserved_observables`.
 
     **Returns** file name → function that draws: orbits, the comparison, conserved quantities.
     """
@@ -173,8 +174,8 @@ def report(
         },
     }
     changes = {name.replace("_", " "): np.abs(observed[name].change()) for name in OBSERVABLES}
-    along = np.unique(np.linspace(0, len(c.years) - 1, 11).round().astype(int))
-    rows = [[f"{c.years[k]:.1f}", *(f"{x[k]:.1e}" for x in changes.values())] for k in along]
+    indices = np.unique(np.linspace(0, len(c.years) - 1, 11).round().astype(int))
+    rows = [[f"{c.years[k]:.1f}", *(f"{x[k]:.1e}" for x in changes.values())] for k in indices]
     rows.append(["largest, every step", *(f"{x:.1e}" for x in largest.values())])
     title = "Conserved: relative change (linear momentum: of Σ|p|)"
     report.tables.append(Table(title, ["years", *changes], rows))
@@ -194,9 +195,9 @@ def report(
         report.notes.append(note)
     title = f"Ten bodies with {type(run['method']).__name__}"
     title += f", h = {run['h']:g} day" if run["h"] is not None else ""
-    compared = (c.years, c.errors[:, 1:], BODIES[1:], c.perihelion, c.slope, c.intercept)
+    curves = (c.years, c.errors[:, 1:], BODIES[1:], c.perihelion, c.slope, c.intercept)
     return {
         "orbits.png": lambda: plot.planet_orbits(c.heliocentric[:, 1:], BODIES[1:]),
-        "ephemeris.png": lambda: plot.ephemeris_comparison(*compared),
+        "ephemeris.png": lambda: plot.ephemeris_comparison(*curves),
         "invariants.png": lambda: plot.conserved(c.years, changes, "years since the start", title),
     }

@@ -18,16 +18,16 @@ import dvi_jax as dvi
 from dvi_jax.sweep.bar import shown as shown_bar
 from dvi_jax.sweep.variables import RESERVED
 
-from .._errors import InputError, require, shown
+from .._errors import InputError, describe, require
 from .._show import Table
 from .expressions import parse_method
 from .observables import read_observables
-from .output import Report, recorded
+from .output import Report, recorder
 from .schema import ARRAY, Pair, SweepFile
 from .system import Source, find_source
-from .table import AN_AXIS, MISSING, Axis, at, axes_in, read_file
+from .table import AN_AXIS, NO_KEY, Axis, axes_in, read_file, select
 
-_MOST = 10_000_000
+_MAX_NUMBERS = 10_000_000
 """Numbers up to which results are read again for the table at the end."""
 
 _NOT_OURS = ("config", "config_sha256", "Conventions", "coordinates", "dvi_jax_sweep")
@@ -36,7 +36,7 @@ _NOT_OURS = ("config", "config_sha256", "Conventions", "coordinates", "dvi_jax_s
 _KEYS = {"num_steps": "steps"}
 """Argument of `dvi.sweep` → key of the file, where they differ."""
 
-_ALLOWED = "axes, functions, state and args that fit one another"
+_RULE = "axes, functions, state and args that fit one another"
 
 
 def sweep_file(
@@ -64,10 +64,10 @@ def sweep_file(
     _check_folder(folder, "--store" if store is not None else "output.store", resume)
     source, arguments = sweep_problem(file, path.parent)
     last: list[dvi.SweepProgress] = []
-    with shown_bar(progress) as show, source.at_work(str(path), "swept", _ALLOWED, last):
-        arguments |= {"store": folder, "threads": threads, "progress": recorded(last, show)}
+    with shown_bar(progress) as show, source.at_work(str(path), "swept", _RULE, last):
+        arguments |= {"store": folder, "threads": threads, "progress": recorder(last, show)}
         result = dvi.sweep(**arguments)
-    return _finished(result, last[0])
+    return _report(result, last[0])
 
 
 def sweep_cost(path: str | Path) -> Report:
@@ -78,7 +78,7 @@ def sweep_cost(path: str | Path) -> Report:
     """
     file, _ = read_file(Path(path), SweepFile)
     source, arguments = sweep_problem(file, Path(path).parent)
-    with source.at_work(str(path), "swept", _ALLOWED):
+    with source.at_work(str(path), "swept", _RULE):
         cost = dvi.sweep_cost(**arguments)
     contents = dataclasses.asdict(cost) | {"seconds": cost.seconds()}
     return Report(contents, summary=f"{cost}\n\n{cost.table()}")
@@ -91,17 +91,17 @@ def _check_folder(folder: Path, key: str, resume: bool) -> None:
             return
         result = dvi.open_sweep(folder)
     except (dvi.StoreError, OSError) as error:
-        seen = f"{folder} exists, but is not the store of a sweep ({error})"
-        raise InputError(key, seen, "a new directory") from None
+        defect = f"{folder} exists, but is not the store of a sweep ({error})"
+        raise InputError(key, defect, "a new directory") from None
     except ValueError as error:  # a name that no directory can have
         raise InputError(key, f"{folder} cannot be used: {error}", "a new directory") from None
-    done = f"{result.tasks_done} of {result.num_tasks} tasks are done"
-    allowed = "--resume to continue it, or another directory, with --store PATH"
-    require(resume, key, f"{folder} exists already: {done}", allowed)
+    progress = f"{result.tasks_done} of {result.num_tasks} tasks are done"
+    rule = "--resume to continue it, or another directory, with --store PATH"
+    require(resume, key, f"{folder} exists already: {progress}", rule)
 
 
-def _finished(result: dvi.SweepResult, last: dvi.SweepProgress) -> Report:
-    counts, observed = result.status_counts(), _observed(result)
+def _report(result: dvi.SweepResult, last: dvi.SweepProgress) -> Report:
+    counts, observed = result.status_counts(), _statistics(result)
     report = Report(
         {
             "store": str(result.path),
@@ -115,7 +115,7 @@ def _finished(result: dvi.SweepResult, last: dvi.SweepProgress) -> Report:
     )
     if observed:
         report.contents["observed"] = observed
-        rows = [[name, *(f"{x:.6g}" for x in of.values())] for name, of in observed.items()]
+        rows = [[name, *(f"{x:.6g}" for x in values.values())] for name, values in observed.items()]
         title = "Observables of the successful trajectories"
         report.tables.append(Table(title, ["name", "min", "median", "max"], rows))
     speed = f"{last.seconds:.1f} s (compilation included), {last.rate:.3g} steps/s"
@@ -126,24 +126,24 @@ def _finished(result: dvi.SweepResult, last: dvi.SweepProgress) -> Report:
     return report
 
 
-def _observed(result: dvi.SweepResult) -> dict[str, dict[str, float]]:
+def _statistics(result: dvi.SweepResult) -> dict[str, dict[str, float]]:
     """Name → least, median and largest over the successful trajectories. Empty without observables,
     and where there is too much to read."""
     data = result.to_xarray()
     names = [str(n) for n in data.data_vars if str(n).split(".")[0] not in RESERVED]
-    if not names or sum(data[name].size for name in names) > _MOST:
+    if not names or sum(data[name].size for name in names) > _MAX_NUMBERS:
         return {}
     good = result["status"] == 0
-    found = {}
+    statistics = {}
     for name in names:
         values = data[name].values[good]
         if np.iscomplexobj(values):
             name, values = f"|{name}|", np.abs(values)
         values = values[np.isfinite(values)]
         if values.size:
-            of = {"min": np.min, "median": np.median, "max": np.max}
-            found[name] = {word: float(f(values)) for word, f in of.items()}
-    return found
+            functions = {"min": np.min, "median": np.median, "max": np.max}
+            statistics[name] = {word: float(f(values)) for word, f in functions.items()}
+    return statistics
 
 
 def _status_table(counts: dict[str, int]) -> Table:
@@ -162,8 +162,8 @@ def sweep_problem(file: SweepFile, folder: Path) -> tuple[Source, dict[str, Any]
     """
     source = find_source(file, folder)
     times = source.times(file)
-    every = getattr(file.save, "every", None)  # None of "final"
-    save = dvi.Save(every=every) if every else dvi.Save(final=True)
+    stride = getattr(file.save, "every", None)  # None of "final"
+    save = dvi.Save(every=stride) if stride else dvi.Save(final=True)
     arguments = {
         "system": source.system,
         "lattice": times.pop("lattice"),
@@ -178,9 +178,9 @@ def sweep_problem(file: SweepFile, folder: Path) -> tuple[Source, dict[str, Any]
     arguments |= _initial_conditions(file, source)
     kinds = (dvi.Axis, dvi.starts.Starts)
     leaves = jax.tree.leaves(arguments, is_leaf=lambda x: isinstance(x, kinds))
-    seen = "neither epsilon nor another number varies"
-    allowed = "an axis for some number, or [start]; for one trajectory use dvi-jax run"
-    require(any(isinstance(x, kinds) for x in leaves), "epsilon", seen, allowed)
+    defect = "neither epsilon nor another number varies"
+    rule = "an axis for some number, or [start]; for one trajectory use dvi-jax run"
+    require(any(isinstance(x, kinds) for x in leaves), "epsilon", defect, rule)
     return source, arguments
 
 
@@ -188,14 +188,14 @@ def _for_sweep(key: str, value: Any) -> Any:
     """A value with its axes as those of `dvi.sweep`; one without a name has that of the key."""
     if isinstance(value, list):
         return [_for_sweep(f"{key}[{i}]", part) for i, part in enumerate(value)]
-    return _axis(key, value, value.all) if isinstance(value, Axis) else value
+    return _axis(key, value, value.elements) if isinstance(value, Axis) else value
 
 
-def _axis(key: str, given: Axis, values: Any) -> dvi.Axis:
+def _axis(key: str, axis: Axis, values: Any) -> dvi.Axis:
     try:
-        return dvi.Axis(given.axis or key.rpartition(".")[2], values, given.units)
+        return dvi.Axis(axis.axis or key.rpartition(".")[2], values, axis.units)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{key}.{given.kind}", str(error), AN_AXIS) from None
+        raise InputError(f"{key}.{axis.kind}", str(error), AN_AXIS) from None
 
 
 def _parameters(value: Any, key: str = "args") -> Any:
@@ -205,36 +205,38 @@ def _parameters(value: Any, key: str = "args") -> Any:
     axes = axes_in(value) if isinstance(value, list) else []
     if not axes:
         return _for_sweep(key, value)
-    seen = [f"{axis.axis} with {len(axis.all)} values" for axis in axes]
-    allowed = "axes of the same name and length"
-    require(len({*seen}) == 1, key, f"one array contains the axes {', '.join(seen)}", allowed)
-    arrays = [np.asarray(at(value, k), float) for k in range(len(axes[0].all))]
+    defect = [f"{axis.axis} with {len(axis.elements)} values" for axis in axes]
+    rule = "axes of the same name and length"
+    require(len({*defect}) == 1, key, f"one array contains the axes {', '.join(defect)}", rule)
+    arrays = [np.asarray(select(value, k), float) for k in range(len(axes[0].elements))]
     return _axis(key, axes[0], np.stack(arrays))
 
 
-def _methods(given: Any, source: Source) -> Any:
-    if isinstance(given, str):
-        return source.method(given)
-    if isinstance(given, list):
-        return dvi.Axis("method", [parse_method(text) for text in given])
-    return _axis("method", given, [parse_method(text) for text in given.all])
+def _methods(methods: Any, source: Source) -> Any:
+    if isinstance(methods, str):
+        return source.method(methods)
+    if isinstance(methods, list):
+        return dvi.Axis("method", [parse_method(text) for text in methods])
+    return _axis("method", methods, [parse_method(text) for text in methods.elements])
 
 
 def _observe(file: SweepFile, source: Source) -> dict[str, Any] | None:
     """The observables; one without a reduction is that of the last step."""
-    found = read_observables(file.observables, source)
-    fits, allowed = found or file.save is not None, 'at least one observable, or save = "final"'
-    require(fits, "observables", "nothing would be saved", allowed)
-    reduced = {n: f if isinstance(f, dvi.Reduction) else dvi.Last(f) for n, f in found.items()}
-    return reduced or None
+    observables = read_observables(file.observables, source)
+    fits, rule = observables or file.save is not None, 'at least one observable, or save = "final"'
+    require(fits, "observables", "nothing would be saved", rule)
+    reductions = {
+        n: f if isinstance(f, dvi.Reduction) else dvi.Last(f) for n, f in observables.items()
+    }
+    return reductions or None
 
 
 def _stop(file: SweepFile, source: Source) -> dvi.Stop | None:
     if file.stop is None:
         return None
-    made = source.loader.load("stop", file.stop)
-    require(isinstance(made, dvi.Stop), "stop", shown(made), "a dvi.Stop")
-    return made
+    stop = source.loader.load("stop", file.stop)
+    require(isinstance(stop, dvi.Stop), "stop", describe(stop), "a dvi.Stop")
+    return stop
 
 
 def _initial_conditions(file: SweepFile, source: Source) -> dict[str, Any]:
@@ -247,51 +249,51 @@ def _initial_conditions(file: SweepFile, source: Source) -> dict[str, Any]:
             _check(source, q0, p0, -1)
         return {"q0": _for_sweep("state.q0", q0), "p0": _for_sweep("state.p0", p0)}
     start = _start(file.start, source)
-    t0, args = at(file.t0, 0), at(source.args, 0)
+    t0, args = select(file.t0, 0), select(source.args, 0)
     try:
-        q0, p0, *own = start.at(jnp.zeros((), jnp.int32), t0, args)
+        q0, p0, *start_args = start.at(jnp.zeros((), jnp.int32), t0, args)
     except Exception as error:  # whatever a user's H raises
-        allowed = "an H (t, q, p, args) that fits the box and args"
-        raise InputError("start", source.reported(error), allowed) from error
-    source.check_start(np.asarray(q0), np.asarray(p0), own[0] if own else args)
+        rule = "an H (t, q, p, args) that fits the box and args"
+        raise InputError("start", source.error_line(error), rule) from error
+    source.check_start(np.asarray(q0), np.asarray(p0), start_args[0] if start_args else args)
     return {"start": start}
 
 
-def _check(source: Source, q0: Any, p0: Any, which: int) -> None:
+def _check(source: Source, q0: Any, p0: Any, index: int) -> None:
     """Reject a state of which the first trajectory, or the last, cannot start."""
-    q0, p0 = (np.asarray(at(x, which), float) for x in (q0, p0))
-    source.check_start(q0, p0, at(source.args, which))
+    q0, p0 = (np.asarray(select(x, index), float) for x in (q0, p0))
+    source.check_start(q0, p0, select(source.args, index))
 
 
-def _start(given: Any, source: Source) -> dvi.starts.Starts:
+def _start(table: Any, source: Source) -> dvi.starts.Starts:
     """Generated initial conditions; normally distributed ones are by default about the system's."""
-    if given.kind == "own":
-        made = source.loader.load("start.starts", given.starts)
-        allowed = "a dvi.starts.Starts, such as boozer.Births(...)"
-        require(isinstance(made, dvi.starts.Starts), "start.starts", shown(made), allowed)
-        return made
-    options = {name: getattr(given, name) for name in given.model_fields_set - {"kind"}}
+    if table.kind == "own":
+        starts = source.loader.load("start.starts", table.starts)
+        rule = "a dvi.starts.Starts, such as boozer.Births(...)"
+        require(isinstance(starts, dvi.starts.Starts), "start.starts", describe(starts), rule)
+        return starts
+    options = {name: getattr(table, name) for name in table.model_fields_set - {"kind"}}
     for name, value in options.items():
         if isinstance(value, Pair):
             options[name] = (value.q, value.p)
-    for name in ("q0", "p0") if given.kind == "normal" else ():
+    for name in ("q0", "p0") if table.kind == "normal" else ():
         if name not in options:
-            require(source.problem, f"start.{name}", MISSING, ARRAY)
+            require(source.problem, f"start.{name}", NO_KEY, ARRAY)
             options[name] = np.asarray(getattr(source.problem, name), float)
     if "H" in options:
         options["H"] = source.loader.load("start.H", options["H"])
-    made = getattr(dvi.starts, given.kind.title().replace("_", ""))  # energy_shell → EnergyShell
+    starts = getattr(dvi.starts, table.kind.title().replace("_", ""))  # energy_shell → EnergyShell
     try:
-        return made(**options)
+        return starts(**options)
     except (TypeError, ValueError) as error:
-        allowed = f'arguments of dvi.starts.{made.__name__}, because kind = "{given.kind}"'
-        raise InputError("start", str(error), allowed) from None
+        rule = f'arguments of dvi.starts.{starts.__name__}, because kind = "{table.kind}"'
+        raise InputError("start", str(error), rule) from None
 
 
 # Stores
 
 
-def _opened(store: str | Path) -> dvi.SweepResult:
+def _open_store(store: str | Path) -> dvi.SweepResult:
     try:
         return dvi.open_sweep(store)
     except dvi.StoreError as error:
@@ -303,19 +305,23 @@ def sweep_status(store: str | Path) -> Report:
 
     **Raises** `InputError` where there is no store.
     """
-    result = _opened(store)
+    result = _open_store(store)
     steps, records = _steps(result), list(result.records())
     statuses = sum((Counter(record["statuses"]) for record in records), Counter())
     sizes = [math.prod(record["size"]) for record in records]
     work = sum(n * steps(record["start"]) for n, record in zip(sizes, records, strict=True))
-    seconds = _covered([(r["finished"] - r["seconds"], r["finished"]) for r in records])
-    done, lanes, whole = len(records), sum(sizes), math.prod(result.dims.values())
-    left, rate = whole - lanes, lanes / seconds if seconds else 0.0
+    seconds = _busy_seconds([(r["finished"] - r["seconds"], r["finished"]) for r in records])
+    tasks_done, lanes, total = len(records), sum(sizes), math.prod(result.dims.values())
+    left, rate = total - lanes, lanes / seconds if seconds else 0.0
     speed = None if math.isnan(work) else work / seconds if seconds else 0.0
     contents = {
         "store": str(result.path),
         "dims": result.dims,
-        "tasks": {"done": done, "left": result.num_tasks - done, "all": result.num_tasks},
+        "tasks": {
+            "done": tasks_done,
+            "left": result.num_tasks - tasks_done,
+            "all": result.num_tasks,
+        },
         "trajectories": ({"not_computed": left} if left else {}) | dict(statuses),
         "seconds": seconds,
         "trajectories_per_second": rate,
@@ -324,14 +330,14 @@ def sweep_status(store: str | Path) -> Report:
         "bytes": _size(Path(store)),
         "provenance": {k: v for k, v in result.attributes.items() if k not in _NOT_OURS},
     }
-    about = [[name, str(value)] for name, value in contents["provenance"].items()]
+    origin = [[name, str(value)] for name, value in contents["provenance"].items()]
     grid = " × ".join(f"{name} {n}" for name, n in result.dims.items())
-    more = f", {result.num_tasks - done} left" if done < result.num_tasks else ""
-    more += f" (about {left / rate:.3g} s)" if left and rate else ""
+    remainder = f", {result.num_tasks - tasks_done} left" if tasks_done < result.num_tasks else ""
+    remainder += f" (about {left / rate:.3g} s)" if left and rate else ""
     return Report(
         contents,
-        [_status_table(contents["trajectories"]), Table("Provenance", ["what", "value"], about)],
-        summary=f"{result.path}: {grid}; {done} of {result.num_tasks} tasks done{more}; "
+        [_status_table(contents["trajectories"]), Table("Provenance", ["what", "value"], origin)],
+        summary=f"{result.path}: {grid}; {tasks_done} of {result.num_tasks} tasks done{remainder}; "
         f"{rate:.3g} trajectories/s{'' if speed is None else f', {speed:.3g} steps/s'}; "
         f"{contents['bytes'] / 1e6:.3g} MB",
     )
@@ -349,12 +355,12 @@ def _steps(result: dvi.SweepResult) -> Callable[[list[int]], float]:
     return lambda start: values[start[place]]
 
 
-def _covered(spans: list[tuple[float, float]]) -> float:
+def _busy_seconds(spans: list[tuple[float, float]]) -> float:
     """Seconds in which some task was being done: pauses between runs do not count."""
-    total, until = 0.0, -math.inf
+    total, latest = 0.0, -math.inf
     for begin, end in sorted(spans):
-        total += max(0.0, end - max(begin, until))
-        until = max(until, end)
+        total += max(0.0, end - max(begin, latest))
+        latest = max(latest, end)
     return total
 
 
@@ -373,12 +379,13 @@ def verify_store(store: str | Path, progress: Callable[[int, int], None] | None 
 
     **Raises** `InputError` where there is no store, `OSError` where it cannot be changed.
     """
-    found = _opened(store).verify(progress)
-    contents = {"store": str(store), **found._asdict()}
-    summary = f"{store}: {found.sound} tasks are correct, {len(found.bad)} bad, {found.todo} to do"
+    verification = _open_store(store).verify(progress)
+    contents = {"store": str(store), **verification._asdict()}
+    counts = f"{verification.sound} tasks are correct, {len(verification.bad)} bad"
+    summary = f"{store}: {counts}, {verification.todo} to do"
     report = Report(contents, summary=summary)
-    if found.bad:
-        rows = [[str(number), wrong] for number, wrong in found.bad.items()]
+    if verification.bad:
+        rows = [[str(number), wrong] for number, wrong in verification.bad.items()]
         report.tables.append(Table("Bad tasks", ["task", "error"], rows))
         report.message = (
             "bad tasks were found; they will be computed again. To repair the store, run the sweep "

@@ -15,11 +15,11 @@ from dvi_jax.base.signature import accepts
 from dvi_jax.systems import rings
 from dvi_jax.systems.planets.solar_system import EphemerisMissing, julian_date
 
-from .._errors import InputError, known, require, shown
+from .._errors import InputError, describe, require, require_name
 from .expressions import parse_method
 from .loader import Loader, in_one_line
 from .schema import COUNT, RunFile, SweepFile, SystemFile, Times
-from .table import MISSING
+from .table import NO_KEY
 
 
 @dataclass(frozen=True)
@@ -43,60 +43,61 @@ class Source:
 
     @contextmanager
     def at_work(
-        self, key: str, what: str, allowed: str, begun: Sequence[Any] | None = None
+        self, key: str, action: str, rule: str, progress: Sequence[Any] | None = None
     ) -> Iterator[None]:
         """Within this an exception means that the input does not fit: an `InputError`, such as
         "kepler cannot be integrated: …", whatever a user's function raises while it is traced.
 
-        - `begun`: of work that writes files as it goes on: has an item once the input is known to
-          fit. Errors of files, and all errors after that, are raised as they are.
+        - `progress`: of work that writes files as it goes on: has an item once the input is known
+          to fit. Errors of files, and all errors after that, are raised as they are.
         """
         try:
             yield
         except Exception as error:
-            writes = begun is not None and isinstance(error, dvi.StoreError | OSError)
-            if begun or writes:
+            writes = progress is not None and isinstance(error, dvi.StoreError | OSError)
+            if progress or writes:
                 raise
-            seen = f"{self.name} cannot be {what}: {self.reported(error)}"
-            raise InputError(key, seen, allowed) from error
+            defect = f"{self.name} cannot be {action}: {self.error_line(error)}"
+            raise InputError(key, defect, rule) from error
 
     def method(self, text: str) -> dvi.Method:
         """The method that a text of the file describes; for a ring one turn."""
         return rings.Turn() if self.file.ring is not None else parse_method(text)
 
-    def reported(self, error: BaseException) -> str:
+    def error_line(self, error: BaseException) -> str:
         """An exception in one line, with its place in the user's files."""
         return in_one_line(error, *self.loader.modules)
 
     @cached_property
     def args(self) -> Any:
         """The parameters of the system, with those of the file in their place."""
-        given, problem = self.file.args, self.problem
+        values, problem = self.file.args, self.problem
         names = problem.args if problem is not None else None
-        if given is None or problem is None:
-            return names if given is None else given
+        if values is None or problem is None:
+            return names if values is None else values
         if not isinstance(names, dict):
-            why = f"args of the type {type(names).__name__}, not dict: set them in its Python code"
-            why = "no parameters" if names is None else why
-            raise InputError("args", shown(given), f"no key args, because {problem.name} has {why}")
-        for name, value in given.items():
-            known(f"args.{name}", name, names, seen="there is no such parameter")
+            cause = f"args of the type {type(names).__name__}: set them in its Python code"
+            cause = "no parameters" if names is None else cause
+            rule = f"no key args, because {problem.name} has {cause}"
+            raise InputError("args", describe(values), rule)
+        for name, value in values.items():
+            require_name(f"args.{name}", name, names, defect="there is no such parameter")
             fits = isinstance(names[name], dict) or not isinstance(value, dict)
-            allowed = "a number or an array; in a sweep also an axis"
-            require(fits, f"args.{name}", shown(value), allowed)
-        return {**names, **given}
+            rule = "a number or an array; in a sweep also an axis"
+            require(fits, f"args.{name}", describe(value), rule)
+        return {**names, **values}
 
     def array(self, name: str) -> Any:
         """q0 or p0 of the file, or else of the system."""
-        given, own = getattr(self.file.state, name), getattr(self.problem, name, None)
-        fits = given is not None or own is not None
-        require(fits, f"state.{name}", MISSING, "an array of numbers (the system has no default)")
-        return given if given is not None else np.asarray(own, float)
+        value, default = getattr(self.file.state, name), getattr(self.problem, name, None)
+        fits = value is not None or default is not None
+        require(fits, f"state.{name}", NO_KEY, "an array of numbers (the system has no default)")
+        return value if value is not None else np.asarray(default, float)
 
     def check_start(self, q0: Any, p0: Any, args: Any) -> None:
         """Reject an initial condition that the system cannot start from."""
-        allowed = f"the shape of q0, {np.shape(q0)}: a momentum for each q"
-        require(np.shape(q0) == np.shape(p0), "state.p0", f"p0 has shape {np.shape(p0)}", allowed)
+        rule = f"the shape of q0, {np.shape(q0)}: a momentum for each q"
+        require(np.shape(q0) == np.shape(p0), "state.p0", f"p0 has shape {np.shape(p0)}", rule)
         if self.problem is None or self.problem.check is None:
             return
         try:
@@ -104,14 +105,14 @@ class Source:
         except systems.ParameterError as error:
             raise InputError("args", str(error), "args that fit the system") from None
         except ValueError as error:
-            allowed = "initial conditions from which the system can start"
-            raise InputError("state", str(error), allowed) from None
+            rule = "initial conditions from which the system can start"
+            raise InputError("state", str(error), rule) from None
 
     @property
     def h(self) -> Any:
         """The step size of the file, or else of the system."""
         h = self.file.h if self.file.h is not None else getattr(self.problem, "h", None)
-        require(h is not None, "h", MISSING, "a number (the system has no default)")
+        require(h is not None, "h", NO_KEY, "a number (the system has no default)")
         return h
 
     def times(self, file: RunFile | SweepFile) -> dict[str, Any]:
@@ -120,7 +121,7 @@ class Source:
             grid = {"lattice": dvi.Given(file.lattice.times), "h": None, "num_steps": None}
         else:
             grid = {"lattice": dvi.Uniform(), "h": self.h, "num_steps": file.steps}
-            require(file.steps is not None, "steps", MISSING, COUNT)
+            require(file.steps is not None, "steps", NO_KEY, COUNT)
         return grid | {"t0": file.t0, "epsilon": self.epsilon}
 
     @property
@@ -129,8 +130,8 @@ class Source:
         try:
             return self.system.strength(getattr(self.file, "epsilon", None))
         except ValueError:
-            allowed = "a number: the system has a force or a perturbation (0.0: unperturbed)"
-            raise InputError("epsilon", MISSING, allowed) from None
+            rule = "a number: the system has a force or a perturbation (0.0: unperturbed)"
+            raise InputError("epsilon", NO_KEY, rule) from None
 
 
 def find_source(file: SystemFile, folder: Path) -> Source:
@@ -139,52 +140,54 @@ def find_source(file: SystemFile, folder: Path) -> Source:
     **Raises** `InputError`.
     """
     loader, name, date = Loader(folder), file.system, file.state.date
-    allowed = "q0 and p0; a date only with system = solar_system"
-    require(date is None or name == "solar_system", "state.date", shown(date), allowed)
+    rule = "q0 and p0; a date only with system = solar_system"
+    require(date is None or name == "solar_system", "state.date", describe(date), rule)
     require(file.ring is None or name == "ring", "ring", "it is given", "only with system = ring")
     if name == "ring":
         return _of_a_ring(file, loader)
     if ":" not in name:
         return _of_the_library(file, loader)
-    made, seen = loader.load("system", name), repr(name)
-    if callable(made) and not isinstance(made, type | dvi.System) and accepts(made, 0):
+    target, defect = loader.load("system", name), repr(name)
+    if callable(target) and not isinstance(target, type | dvi.System) and accepts(target, 0):
         try:
-            made, seen = made(), f"the result of {name!r}"
+            target, defect = target(), f"the result of {name!r}"
         except (Exception, SystemExit) as error:
-            seen = f"{name!r} failed: {in_one_line(error, *loader.modules)}"
-            raise InputError("system", seen, "a function that returns a system") from error
-    if isinstance(made, systems.Problem):
-        return Source(file, loader, made, made.system)
-    if isinstance(made, dvi.System):
-        return Source(file, loader, None, made)
-    allowed = "a dvi.System, a systems.Problem, or a function without arguments that returns one"
-    kind = f"an object of type {type(made).__name__}"
-    if isinstance(made, type):
-        kind = f"the class {made.__name__}, not an object"
-    elif callable(made):
+            defect = f"{name!r} failed: {in_one_line(error, *loader.modules)}"
+            raise InputError("system", defect, "a function that returns a system") from error
+    if isinstance(target, systems.Problem):
+        return Source(file, loader, target, target.system)
+    if isinstance(target, dvi.System):
+        return Source(file, loader, None, target)
+    rule = "a dvi.System, a systems.Problem, or a function without arguments that returns one"
+    kind = f"an object of type {type(target).__name__}"
+    if isinstance(target, type):
+        kind = f"the class {target.__name__}, not an object"
+    elif callable(target):
         kind = "a function or object with required arguments"
-    raise InputError("system", f"{seen} is {kind}", allowed)
+    raise InputError("system", f"{defect} is {kind}", rule)
 
 
 def _of_a_ring(file: SystemFile, loader: Loader) -> Source:
-    require(file.ring is not None, "ring", MISSING, 'a table [ring] with file = "…"')
-    require(file.method in ("TypeII", "Turn"), "method", shown(file.method), "no method for a ring")
+    require(file.ring is not None, "ring", NO_KEY, 'a table [ring] with file = "…"')
+    require(
+        file.method in ("TypeII", "Turn"), "method", describe(file.method), "no method for a ring"
+    )
     ring = file.ring
     assert ring is not None
     try:
         read = rings.load(loader.folder / ring.file, symplectic=ring.symplectic)
     except Exception as error:  # whatever the reader of a format raises
-        seen = f"{ring.file!r} cannot be read: {in_one_line(error)}"
-        raise InputError("ring.file", seen, "a lattice file that pyAT can read") from error
-    found = rings.problem(read, planes=ring.planes, delta=ring.delta)
+        defect = f"{ring.file!r} cannot be read: {in_one_line(error)}"
+        raise InputError("ring.file", defect, "a lattice file that pyAT can read") from error
+    record = rings.problem(read, planes=ring.planes, delta=ring.delta)
     units = {"q": "m", "t": "turns"}
-    problem = systems.Problem("ring", *found[:4], args=found.args, units=units)
+    problem = systems.Problem("ring", *record[:4], args=record.args, units=units)
     return Source(file, loader, problem, problem.system)
 
 
 def _of_the_library(file: SystemFile, loader: Loader) -> Source:
     name, date, jd = file.system, file.state.date, None
-    known("system", name, systems.LIBRARY, '{}; or "file.py:name"')
+    require_name("system", name, systems.LIBRARY, '{}; or "file.py:name"')
     try:
         if name == "solar_system" and file.state.q0 is None:
             jd = julian_date("1900-01-01" if date is None else date)
@@ -194,6 +197,6 @@ def _of_the_library(file: SystemFile, loader: Loader) -> Source:
     except EphemerisMissing as error:
         raise InputError("system", f"{name!r}: {error}", "an installed ephemeris") from None
     except ValueError as error:
-        allowed = 'a day that the ephemeris covers, such as "1900-01-01"'
-        raise InputError("state.date", str(error), allowed) from None
+        rule = 'a day that the ephemeris covers, such as "1900-01-01"'
+        raise InputError("state.date", str(error), rule) from None
     return Source(file, loader, problem, problem.system, jd)

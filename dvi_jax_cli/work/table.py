@@ -26,14 +26,14 @@ from pydantic import (
 from pydantic.json_schema import GenerateJsonSchema
 from typing_extensions import TypeAliasType
 
-from .._errors import InputError, nearest, one_of, require, shown, toml_type
+from .._errors import InputError, describe, nearest, one_of, require, toml_type
 
-MISSING = "the key is missing"
+NO_KEY = "the key is missing"
 
 
-def key(default: Any, allowed: str) -> Any:
+def key(default: Any, rule: str) -> Any:
     """A key with its default (``...``: the key is required) and its allowed values."""
-    return Field(default, description=allowed)
+    return Field(default, description=rule)
 
 
 class Table(BaseModel):
@@ -47,31 +47,35 @@ class Table(BaseModel):
     # known; the table around it then puts its key in front.
     @model_validator(mode="wrap")
     @classmethod
-    def _name_the_keys(cls, given: Any, read: Callable[[Any], Any]) -> Any:
+    def _name_the_keys(cls, value: Any, read: Callable[[Any], Any]) -> Any:
         try:
-            return read(given)
+            return read(value)
         except ValidationError as error:
-            first, *more = [e for one in error.errors() for e in cls._errors(one)]
-            raise InputError(first.key, first.seen, first.allowed, more) from None
+            first, *successors = [e for entry in error.errors() for e in cls._errors(entry)]
+            raise InputError(first.key, first.seen, first.allowed, successors) from None
 
     @classmethod
-    def _errors(cls, found: Any) -> list[InputError]:
+    def _errors(cls, entry: Any) -> list[InputError]:
         """An error of pydantic as errors with the key, relative to this table."""
-        place, kind, context = found["loc"], found["type"], found.get("ctx", {})
-        inner, seen = context.get("error"), shown(found["input"])
+        place, kind, context = entry["loc"], entry["type"], entry.get("ctx", {})
+        inner, defect = context.get("error"), describe(entry["input"])
         if isinstance(inner, InputError):  # of a table within this one, or of a validator
-            return [InputError(path(place, e.key), e.seen, e.allowed) for e in inner.found]
+            return [InputError(path(place, e.key), e.seen, e.allowed) for e in inner.errors]
         if not place:
-            return [InputError("", seen, f"a table with the keys {one_of(cls.model_fields)}")]
+            return [InputError("", defect, f"a table with the keys {one_of(cls.model_fields)}")]
         if kind == "extra_forbidden":
             names = one_of(cls.model_fields, str(place[-1]))
             return [InputError(path(place), "there is no such key", names)]
-        allowed = cls.model_fields[str(place[0])].description or ""
+        rule = cls.model_fields[str(place[0])].description or ""
         if context.get("discriminator") == "'kind'":  # the key that selects a table of a union
-            tag, kinds = context.get("tag", ""), context.get("expected_tags", allowed)
-            near = nearest(tag, re.findall(r"\w+", kinds))
-            return [InputError(path(place, "kind"), shown(tag) if tag else MISSING, kinds + near)]
-        return [InputError(path(place), MISSING if kind == "missing" else seen, allowed)]
+            tag, kinds = context.get("tag", ""), context.get("expected_tags", rule)
+            suggestion = nearest(tag, re.findall(r"\w+", kinds))
+            return [
+                InputError(
+                    path(place, "kind"), describe(tag) if tag else NO_KEY, kinds + suggestion
+                )
+            ]
+        return [InputError(path(place), NO_KEY if kind == "missing" else defect, rule)]
 
 
 _TAGS = {""}
@@ -80,13 +84,13 @@ _TAGS = {""}
 
 def path(place: tuple[int | str, ...], inner: str = "") -> str:
     """A key with its path, such as ``state.q0[1].axis``, without the tags of a `union`."""
-    whole = ""
+    text = ""
     for part in (*place, inner):
         if isinstance(part, int):
-            whole += f"[{part}]"
+            text += f"[{part}]"
         elif part not in _TAGS:
-            whole += part if not whole or part.startswith("[") else f".{part}"
-    return whole
+            text += part if not text or part.startswith("[") else f".{part}"
+    return text
 
 
 T = TypeVar("T", bound=Table)
@@ -122,10 +126,10 @@ class JsonSchema(GenerateJsonSchema):
 
     def default_schema(self, schema: Any) -> Any:
         """The schema; null and tables are not shown as defaults."""
-        found = super().default_schema(schema)
-        if isinstance(found.get("default"), dict | NoneType):
-            found.pop("default", None)
-        return found
+        definition = super().default_schema(schema)
+        if isinstance(definition.get("default"), dict | NoneType):
+            definition.pop("default", None)
+        return definition
 
     def field_title_should_be_set(self, schema: Any) -> bool:
         """False: the names of the keys are enough."""
@@ -142,9 +146,9 @@ def type_tag(value: Any) -> str:
 
 def union(tag_of: Callable[[Any], str] = type_tag, **kinds: Any) -> Any:
     """The union of types: type of a value in TOML, or what `tag_of` returns → type."""
-    tagged = [Annotated[kind, Tag(f"<{name}>")] for name, kind in kinds.items()]
+    members = [Annotated[kind, Tag(f"<{name}>")] for name, kind in kinds.items()]
     _TAGS.update(f"<{name}>" for name in kinds)
-    return Annotated[Union[tuple(tagged)], Discriminator(tag_of)]  # noqa: UP007
+    return Annotated[Union[tuple(members)], Discriminator(tag_of)]  # noqa: UP007
 
 
 def union_by_kind(*tables: type[Table]) -> Any:
@@ -157,12 +161,12 @@ def union_by_kind(*tables: type[Table]) -> Any:
 def check(is_allowed: Callable[[Any], Any]) -> AfterValidator:
     """Reject a value of the right type that is not allowed."""
 
-    def checked(value: Any) -> Any:
+    def validate(value: Any) -> Any:
         if not is_allowed(value):
             raise ValueError
         return value
 
-    return AfterValidator(checked)
+    return AfterValidator(validate)
 
 
 def _is_finite(value: int | float) -> bool:
@@ -174,7 +178,7 @@ def _is_finite(value: int | float) -> bool:
 
 Text = Annotated[str, StringConstraints(pattern=r"\S")]
 Count = Annotated[int, Field(ge=1)]
-Whole = Annotated[int, Field(ge=0)]
+NonNegative = Annotated[int, Field(ge=0)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Fraction = Annotated[Number, Field(gt=0, lt=1)]
 StepSize = Annotated[Number, check(lambda h: h != 0)]
@@ -183,14 +187,14 @@ Scalar = Annotated[int | float, check(_is_finite)]
 """A number; whole ones stay whole."""
 
 V = TypeVar("V")
-Many = Annotated[list[V], Field(min_length=1)]
+NonEmpty = Annotated[list[V], Field(min_length=1)]
 Two = Annotated[list[V], Field(min_length=2, max_length=2)]
 
-Rows = TypeAliasType("Rows", union(number=Number, array=Many["Rows"]))
+Rows = TypeAliasType("Rows", union(number=Number, array=NonEmpty["Rows"]))
 if TYPE_CHECKING:
     Array = np.ndarray
 else:
-    Array = Annotated[Many[Rows], AfterValidator(lambda rows: np.asarray(rows, float))]
+    Array = Annotated[NonEmpty[Rows], AfterValidator(lambda rows: np.asarray(rows, float))]
 """Nested arrays of finite numbers, all rows of one length, as an array of NumPy."""
 
 NumberOrArray = union(number=Number, array=Array)
@@ -200,34 +204,34 @@ NumberOrArray = union(number=Number, array=Array)
 
 AN_AXIS = "{linspace = [a, b, n]}, {geomspace = [a, b, n]} or {values = […]}"
 KINDS = ("linspace", "geomspace", "values")
-_SPACED = "[first, last, how many]"
-_EACH = "each of which is a value that this key takes without an axis"
-_MOST = 10_000_000
+_RANGE = "[first, last, how many]"
+_VALUE = "each of which is a value that this key takes without an axis"
+_MAX_VALUES = 10_000_000
 """Values of an axis, which are all in memory."""
 
 
-def _spaced(kind: str) -> Callable[[Any], list[float]]:
+def _range_reader(kind: str) -> Callable[[Any], list[float]]:
     """A reader of ``[first, last, how many]``: the values that this describes."""
 
-    def spaced(given: Any) -> list[float]:
-        types = [type_tag(x) for x in given] if isinstance(given, list) else []
-        fits = types == ["<number>"] * 3 and isinstance(given[2], int) and given[2] >= 1
-        require(fits, "", shown(given), f"{_SPACED}: two numbers and a positive whole number")
-        a, b, n = given
-        most = f"at most {_MOST} values; more are generated by [start]"
-        require(n <= _MOST, "[2]", shown(n), most)
+    def read(value: Any) -> list[float]:
+        types = [type_tag(x) for x in value] if isinstance(value, list) else []
+        fits = types == ["<number>"] * 3 and isinstance(value[2], int) and value[2] >= 1
+        require(fits, "", describe(value), f"{_RANGE}: two numbers and a positive whole number")
+        a, b, n = value
+        limit = f"at most {_MAX_VALUES} values; more are generated by [start]"
+        require(n <= _MAX_VALUES, "[2]", describe(n), limit)
         fits = kind == "linspace" or a * b > 0
-        require(fits, "", shown(given), f"{_SPACED}, both ends above zero or both below")
+        require(fits, "", describe(value), f"{_RANGE}, both ends above zero or both below")
         return getattr(np, kind)(a, b, n).tolist()
 
-    return spaced
+    return read
 
 
 def _axis_name(name: str) -> str:
     from dvi_jax.sweep.variables import RESERVED
 
-    allowed = f"a name such as x1, except {', '.join(RESERVED)}"
-    require(name.isidentifier() and name not in RESERVED, "", shown(name), allowed)
+    rule = f"a name such as x1, except {', '.join(RESERVED)}"
+    require(name.isidentifier() and name not in RESERVED, "", describe(name), rule)
     return name
 
 
@@ -240,22 +244,24 @@ _THREE = WithJsonSchema(
 class Axis(Table, Generic[V]):
     """An axis of a sweep: the values that a number takes."""
 
-    linspace: Annotated[list[V], BeforeValidator(_spaced("linspace")), _THREE] | None = key(
-        None, f"{_SPACED}, evenly spaced values, {_EACH}"
+    linspace: Annotated[list[V], BeforeValidator(_range_reader("linspace")), _THREE] | None = key(
+        None, f"{_RANGE}, evenly spaced values, {_VALUE}"
     )
-    geomspace: Annotated[list[V], BeforeValidator(_spaced("geomspace")), _THREE] | None = key(
-        None, f"{_SPACED}, values with one ratio, {_EACH}"
+    geomspace: Annotated[list[V], BeforeValidator(_range_reader("geomspace")), _THREE] | None = key(
+        None, f"{_RANGE}, values with one ratio, {_VALUE}"
     )
-    values: Annotated[Many[V], check(lambda all: len({*map(np.shape, all)}) == 1)] | None = key(
-        None, f"an array of at least one value, values of one shape, {_EACH}"
+    values: Annotated[NonEmpty[V], check(lambda rows: len({*map(np.shape, rows)}) == 1)] | None = (
+        key(None, f"an array of at least one value, values of one shape, {_VALUE}")
     )
     axis: AxisName | None = key(None, "a name for this axis, by default the key")
     units: str = key("", 'text such as "m/s"')
 
     @model_validator(mode="after")
     def _one_kind(self) -> Any:
-        given = {name: getattr(self, name) for name in self.model_fields_set}
-        require(len(given.keys() & {*KINDS}) == 1, "", shown(given), f"exactly one of {AN_AXIS}")
+        fields = {name: getattr(self, name) for name in self.model_fields_set}
+        require(
+            len(fields.keys() & {*KINDS}) == 1, "", describe(fields), f"exactly one of {AN_AXIS}"
+        )
         return self
 
     @classmethod
@@ -269,7 +275,7 @@ class Axis(Table, Generic[V]):
         return next(kind for kind in KINDS if getattr(self, kind) is not None)
 
     @property
-    def all(self) -> list[Any]:
+    def elements(self) -> list[Any]:
         """The values."""
         return getattr(self, self.kind)
 
@@ -285,13 +291,13 @@ def number_or_axis(number: Any, of_axis: Any = None) -> Any:
     return union(number=number, table=Axis[of_axis or number])
 
 
-def at(value: Any, which: int) -> Any:
+def select(value: Any, index: int) -> Any:
     """An argument with every axis in it at one of its values."""
     if isinstance(value, Axis):
-        return value.all[which]
+        return value.elements[index]
     if isinstance(value, dict):
-        return {name: at(v, which) for name, v in value.items()}
-    return [at(v, which) for v in value] if isinstance(value, list) else value
+        return {name: select(v, index) for name, v in value.items()}
+    return [select(v, index) for v in value] if isinstance(value, list) else value
 
 
 def axes_in(value: Any) -> list[Axis]:
@@ -307,14 +313,14 @@ def axes_in(value: Any) -> list[Axis]:
 
 def _array_or_axes(components: list[Any]) -> Any:
     """An array, or nested lists with axes in them; `ValueError` for rows of unequal length."""
-    array = np.asarray(at(components, 0), float)
+    array = np.asarray(select(components, 0), float)
     return components if axes_in(components) else array
 
 
 Component = TypeAliasType(
-    "Component", union(number=Number, table=NamedAxis[Number], array=Many["Component"])
+    "Component", union(number=Number, table=NamedAxis[Number], array=NonEmpty["Component"])
 )
-Components = Annotated[Many[Component], AfterValidator(_array_or_axes)]
+Components = Annotated[NonEmpty[Component], AfterValidator(_array_or_axes)]
 StateOrAxis = union(array=Components, table=NamedAxis[Array])
 
 

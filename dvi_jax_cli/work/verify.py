@@ -15,7 +15,7 @@ def verify_certificate(path: Path) -> tuple[dict[str, Any], str]:
     """
     exact = runpy.run_path(str(CHECKER))  # as a file: the package itself would import JAX
     try:
-        proved = exact["check"](json.loads(path.read_text(encoding="utf-8")))
+        statement = exact["check"](json.loads(path.read_text(encoding="utf-8")))
     except (exact["Failed"], *exact["MALFORMED"]) as error:
         return {"certificate": str(path), "proved": None}, f"not proved: {error}"
-    return {"certificate": str(path), "proved": proved}, ""
+    return {"certificate": str(path), "proved": statement}, ""
