@@ -13,6 +13,7 @@ T = TypeVar("T")
 INTEGRATOR = "method lattice root_finder arithmetic layout integrator"
 """Keywords of functions that run trajectories which `chosen` turns into one `Integrator`."""
 
+
 def checked_keywords(function: F) -> F:
     """Decorator of a function with ``**settings: Unpack[...]``, which Python itself does not check.
 

@@ -51,15 +51,19 @@ class DiscreteMap(diffrax.AbstractSolver):
         term, direction = unwrapped(terms)
         # One step of `integrate`, so that its arithmetic and its status are the same.
         step = {"t0": direction * t0, "h": direction * (t1 - t0), "num_steps": 1, "args": args}
-        how: Any = {"method": self.method, "root_finder": self.root_finder, "adjoint": dvi.Direct()}
-        how |= {"epsilon": term.epsilon, "save": dvi.Save(final=True), "throw": False}
-        taken = dvi.integrate(term.system, q0, p0, **step, **how)
-        y1 = type(y0)((taken.qs[-1], taken.ps[-1]))  # a pair, of diffrax's kind: tuple or list
+        options: Any = {
+            "method": self.method,
+            "root_finder": self.root_finder,
+            "adjoint": dvi.Direct(),
+        }
+        options |= {"epsilon": term.epsilon, "save": dvi.Save(final=True), "throw": False}
+        solution = dvi.integrate(term.system, q0, p0, **step, **options)
+        y1 = type(y0)((solution.qs[-1], solution.ps[-1]))  # a pair of diffrax's kind
         slopes = {
             name: terms.prod(terms.vf(t, y, args), terms.contr(t0, t1))
             for name, t, y in (("k0", t0, y0), ("k1", t1, y1))
         }
-        return y1, None, {"y0": y0, "y1": y1, **slopes}, None, promoted(taken.result)
+        return y1, None, {"y0": y0, "y1": y1, **slopes}, None, promoted(solution.result)
 
     def func(self, terms, t0, y0, args):
         return terms.vf(t0, y0, args)
@@ -76,12 +80,12 @@ def unwrapped(terms: Any) -> tuple[DiscreteTerm, Any]:
 def promoted(result: dvi.RESULTS) -> Any:
     """The status of diffrax for one of ours."""
     theirs: Any = diffrax.RESULTS
-    found: Any = theirs.nonlinear_divergence
-    of = {
+    status: Any = theirs.nonlinear_divergence
+    pairs = {
         "successful": theirs.successful,
         "not_converged": theirs.nonlinear_max_steps_reached,
         "not_finite": getattr(theirs, "nonfinite", theirs.nonlinear_divergence),
     }
-    for name, other in of.items():
-        found = theirs.where(result == getattr(dvi.RESULTS, name), other, found)
-    return found
+    for name, other in pairs.items():
+        status = theirs.where(result == getattr(dvi.RESULTS, name), other, status)
+    return status

@@ -40,9 +40,9 @@ def vector_field(system: Any, epsilon: Any = None) -> Callable[[Any, Any, Any], 
     def field(t, y, args):
         q, p = as_pair(y)
         t, strength = (jnp.asarray(x, q.dtype) for x in (t, epsilon))
-        at = t, t, q, p, strength, args
-        position, momentum = jax.grad(system.hamiltonian, argnums=(2, 3))(*at)
-        rates = momentum, -position + jnp.asarray(system.disturbing_force(*at), q.dtype)
+        point = t, t, q, p, strength, args
+        position, momentum = jax.grad(system.hamiltonian, argnums=(2, 3))(*point)
+        rates = momentum, -position + jnp.asarray(system.disturbing_force(*point), q.dtype)
         if system.constraint is not None:
             rates = momentum, rates[1] + push(t, t, q, p, q, p, args)
         return type(y)(rates) if isinstance(y, list) else rates
@@ -74,8 +74,8 @@ def checked(system: Any, epsilon: Any) -> tuple[dvi.System, Any]:
         value = float(epsilon)
     except (TypeError, jax.errors.ConcretizationTypeError):  # traced: its value is not known
         value = 0.0
-    used = system.force is not None or system.perturbation is not None or system.slow_time
-    if value != 0 and not used:
+    has_effect = system.force is not None or system.perturbation is not None or system.slow_time
+    if value != 0 and not has_effect:
         text = f"epsilon = {value:g} has no effect without a force or a perturbation: leave it out."
         warnings.warn(text, stacklevel=3)
     return system, epsilon

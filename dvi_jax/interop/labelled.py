@@ -72,42 +72,42 @@ def to_xarray(
     ts, hs = np.asarray(solution.ts), np.asarray(solution.hs)
     *batch, count = ts.shape
     if len(dims) != len(batch):
-        known = f"one name for each batch dimension of solution, of sizes {tuple(batch)}, with the "
-        known += "name for the outermost vmap first"
-        known = known if batch else "solution is a single trajectory, without batch dimensions"
-        raise ValueError(f"the length of dims must be {len(batch)}: {known}. Got dims={dims}.")
+        alias = f"one name for each batch dimension of solution, of sizes {tuple(batch)}, with the "
+        alias += "name for the outermost vmap first"
+        alias = alias if batch else "solution is a single trajectory, without batch dimensions"
+        raise ValueError(f"the length of dims must be {len(batch)}: {alias}. Got dims={dims}.")
     for name in dims:
         _check_free("dims", name, name in _TAKEN or dims.count(name) > 1)
     rows = ts.reshape(-1, count)
     alike = bool(np.isfinite(rows).all() and (rows == rows[:1]).all())
-    at, index = ("time", rows[0]) if alike else ("save", np.arange(count))
-    step = at if hs.shape[-1] == count else "step"
+    axis, index = ("time", rows[0]) if alike else ("save", np.arange(count))
+    step = axis if hs.shape[-1] == count else "step"
     of_state, labels = _components(components, np.shape(solution.qs)[len(dims) + 1 :])
-    found: dict[str, Any] = {} if alike else {"t": ((*dims, at), ts)}
+    variables: dict[str, Any] = {} if alike else {"t": ((*dims, axis), ts)}
     state = ("q", solution.qs), ("p", solution.ps)
-    found |= {name: ((*dims, at, *of_state), np.asarray(x)) for name, x in state}
-    found["h"] = ((*dims, step), hs)
+    variables |= {name: ((*dims, axis, *of_state), np.asarray(x)) for name, x in state}
+    variables["h"] = ((*dims, step), hs)
 
     def add(name: str, axes: Sequence[str], value: Any) -> None:
         first = name.partition(".")[0]
         name_in_use = first if first in _TAKEN else name
-        _check_free("observe of dvi.integrate", name_in_use, first in _TAKEN or name in found)
-        found[name] = ((*dims, *axes), np.asarray(value))
+        _check_free("observe of dvi.integrate", name_in_use, first in _TAKEN or name in variables)
+        variables[name] = ((*dims, *axes), np.asarray(value))
 
     for name, value, per_step in _observed(solution.observed, observe):
-        own = value.shape[len(dims) :]
-        if per_step and own[:1] != hs.shape[-1:]:
+        own_shape = value.shape[len(dims) :]
+        if per_step and own_shape[:1] != hs.shape[-1:]:
             raise ValueError(
                 "observe must be the same as for integrate. With this observe, "
                 f"{name!r} has one value per step, so the first axis of its values has length "
-                f"{hs.shape[-1]}, but in solution its values have shape {own}."
+                f"{hs.shape[-1]}, but in solution its values have shape {own_shape}."
             )
         front = [step] * per_step
-        add(name, [*front, *_own(name, own[len(front) :])], value)
+        add(name, [*front, *_own(name, own_shape[len(front) :])], value)
     flags: dict[str, Any] = {"flag_values": np.arange(len(_STATUSES), dtype=np.int8)}
     flags |= {"flag_meanings": " ".join(_STATUSES)}
-    each = [np.asarray(solution.result == getattr(dvi.RESULTS, name)) for name in _STATUSES]
-    found["status"] = (dims, np.argmax(each, axis=0).astype(np.int8), flags)
+    matches = [np.asarray(solution.result == getattr(dvi.RESULTS, name)) for name in _STATUSES]
+    variables["status"] = (dims, np.argmax(matches, axis=0).astype(np.int8), flags)
     for name, value in solution.stats.items():
         if name != "num_steps":
             add(name, _own(name, np.shape(value)[len(batch) :]), value)
@@ -115,18 +115,18 @@ def to_xarray(
         add(f"stop_{name}", [] if name == "t" else of_state, value)
     for name, values in (coords or {}).items():
         refuse_unit_or_mask(f"coords {name}", values)
-    along = {at: index, **labels, **(coords or {})}
+    coordinates = {axis: index, **labels, **(coords or {})}
     if step == "step":
-        along["step"] = np.arange(1, count)
-    about: dict[str, Any] = {"software": f"dvi_jax {dvi.__version__}"}
-    about |= {"num_steps": int(np.ravel(solution.stats["num_steps"])[0])}
-    about |= {name: _attribute(value) for name, value in (attrs or {}).items()}
-    data = xr.Dataset(found, along, about)
+        coordinates["step"] = np.arange(1, count)
+    attributes: dict[str, Any] = {"software": f"dvi_jax {dvi.__version__}"}
+    attributes |= {"num_steps": int(np.ravel(solution.stats["num_steps"])[0])}
+    attributes |= {name: _attribute(value) for name, value in (attrs or {}).items()}
+    data = xr.Dataset(variables, coordinates, attributes)
     alike_in = {"t": ("t", "time", "h", "stop_t"), "q": ("q", "stop_q"), "p": ("p", "stop_p")}
     for name, text in (units or {}).items():
-        for known in alike_in.get(name, (name,)):
-            if known in data.variables:
-                data[known].attrs["units"] = text
+        for alias in alike_in.get(name, (name,)):
+            if alias in data.variables:
+                data[alias].attrs["units"] = text
     return data
 
 
@@ -163,15 +163,15 @@ def to_inference_data(samples: dvi.Samples, observed: Any = None) -> Any:
         acceptance_rate=(("chain",), np.asarray(samples.acceptance)),
     )
     if observed is not None:
-        many = list(observed) if isinstance(observed, list | tuple) else [observed]
-        seen, where = {}, {}
-        for i, arc in enumerate(many):
+        arcs = list(observed) if isinstance(observed, list | tuple) else [observed]
+        arrays, where = {}, {}
+        for i, arc in enumerate(arcs):
             expect("observed", arc, dvi.Observations, "dvi.Observations, or a list of these")
-            end = "" if len(many) == 1 else f"_{i}"
-            values, own = np.asarray(arc.values), f"values{end}"
-            seen[own] = ((f"ts{end}", *_own(own, values.shape[1:])), values)
+            end = "" if len(arcs) == 1 else f"_{i}"
+            values, name_of_values = np.asarray(arc.values), f"values{end}"
+            arrays[name_of_values] = ((f"ts{end}", *_own(name_of_values, values.shape[1:])), values)
             where[f"ts{end}"] = np.asarray(arc.ts)
-        groups["observed_data"] = xr.Dataset(seen, where)
+        groups["observed_data"] = xr.Dataset(arrays, where)
     about = {"inference_library": "dvi_jax", "inference_library_version": dvi.__version__}
     about |= {"sampler": "NUTS of numpyro", "status": samples.status}
     for group in groups.values():

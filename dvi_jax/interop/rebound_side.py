@@ -131,9 +131,9 @@ def from_rebound(
             "snapshot can only be used if simulation is the path of a Simulationarchive, got "
             f"snapshot={snapshot} with a rebound.Simulation: leave snapshot out."
         )
-    called = "a rebound.Simulation, or the path of a Simulationarchive"
+    description = "a rebound.Simulation, or the path of a Simulationarchive"
     hint = "For snapshot i of an open archive give archive[i]."
-    expect("simulation", simulation, rebound.Simulation, called, hint)
+    expect("simulation", simulation, rebound.Simulation, description, hint)
     _check_convertible(simulation)
     numbers = _finite("the simulation", simulation, ("t", "dt", "G", "softening"))
     names = tuple(_name(b) for b in simulation.particles)
@@ -150,17 +150,17 @@ def from_rebound(
         args["softening"] = softening
     function = softened_hamiltonian if softening else hamiltonian
     units, parameters = _texts(_units(simulation))
-    about: dict[str, Any] = {"units": units, "check": check_bodies}
-    about |= {"source": "a simulation of REBOUND"}
-    about |= {"parameters": {name: parameters.get(name, "b [length]") for name in args}}
+    texts_of: dict[str, Any] = {"units": units, "check": check_bodies}
+    texts_of |= {"source": "a simulation of REBOUND"}
+    texts_of |= {"parameters": {name: parameters.get(name, "b [length]") for name in args}}
     momenta = {"linear_momentum": linear_momentum, "angular_momentum": angular_momentum}
-    about |= {"observables": {"energy": at_end(function), **momenta}}
+    texts_of |= {"observables": {"energy": at_end(function), **momenta}}
     if not softening:
-        about |= {"invariants": INVARIANTS, "symmetries": symmetries(3)}
+        texts_of |= {"invariants": INVARIANTS, "symmetries": symmetries(3)}
     theirs = {"names": names, "velocities": v, "radii": rows[:, 7], "t0": numbers["t"]}
     theirs |= {"integrator": str(simulation.integrator), "rebound_units": _units(simulation)}
     state = {"q0": q, "p0": p, "h": numbers["dt"], "args": args}
-    return ReboundProblem("rebound", dvi.System(function), **state, **about, **theirs)
+    return ReboundProblem("rebound", dvi.System(function), **state, **texts_of, **theirs)
 
 
 def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) -> Any:
@@ -182,16 +182,16 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
     rebound = needed("rebound", "interop.to_rebound")
     expect("problem", problem, Problem, "a problem of dvi_jax.systems or of from_rebound")
     system, args = problem.system, problem.args
-    unlike = {
+    differences = {
         "another Hamiltonian": system.H_D not in (hamiltonian, softened_hamiltonian),
         "args that are not a dict": not isinstance(args, Mapping),
         "a force": system.force is not None,
         "a perturbation": system.perturbation is not None,
     }
-    if any(unlike.values()):
+    if any(differences.values()):
         raise ValueError(
             "problem must be N bodies under Newton's law, such as systems.n_body(), but "
-            f"{problem.name} has {' and '.join(name for name in unlike if unlike[name])}."
+            f"{problem.name} has {' and '.join(name for name in differences if differences[name])}."
         )
     if (q is None) != (p is None):
         raise TypeError(
@@ -236,20 +236,20 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
 def _check_convertible(sim: Any) -> None:
     """Raise an error that names all that a problem of N bodies cannot represent."""
     of_bodies = {"_N_odes": 1} if str(sim.integrator) == "bs" else {}  # its own equations
-    found = [
+    features = [
         text
         for field, text in _TURNED_ON.items()
         if (getattr(sim, field, None) or 0) != of_bodies.get(field, 0)
     ]
     settings = (("boundary", ("none",)), ("collision", ("none",)), ("gravity", _NEWTONIAN))
-    for field, allowed in settings:
-        if (value := getattr(sim, field)) not in allowed:
-            found.append(f"{field} = {value!r} (allowed: {', '.join(map(repr, allowed))})")
+    for field, choices in settings:
+        if (value := getattr(sim, field)) not in choices:
+            features.append(f"{field} = {value!r} (allowed: {', '.join(map(repr, choices))})")
     if str(sim.integrator) == "sei":
-        found.append("the shearing sheet, integrator sei (see the system hill)")
-    if found:
+        features.append("the shearing sheet, integrator sei (see the system hill)")
+    if features:
         raise ValueError(
-            f"from_rebound cannot convert these features of the simulation: {'; '.join(found)}. "
+            f"from_rebound cannot convert these features of the simulation: {'; '.join(features)}. "
             "Remove them in REBOUND, and convert again. A copy made by sim.copy() has no "
             "callbacks, such as additional_forces or heartbeat."
         )
@@ -259,13 +259,13 @@ def _check_convertible(sim: Any) -> None:
         raise ValueError("the simulation has no bodies: add some with sim.add(...).")
 
 
-def _finite(whose: str, what: Any, fields: Sequence[str]) -> dict[str, float]:
+def _finite(owner: str, source: Any, fields: Sequence[str]) -> dict[str, float]:
     """Numbers of a simulation or a body, which must be finite."""
-    numbers = {name: float(getattr(what, name)) for name in fields}
+    numbers = {name: float(getattr(source, name)) for name in fields}
     for name, value in numbers.items():
         if not np.isfinite(value):
             raise ValueError(
-                f"{name} of {whose} is {value}, but must be a finite number. If the simulation "
+                f"{name} of {owner} is {value}, but must be a finite number. If the simulation "
                 "failed, use a snapshot from before the failure. Otherwise correct the number."
             )
     return numbers

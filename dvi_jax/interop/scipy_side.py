@@ -102,8 +102,8 @@ def solve_ivp(
     for name in unsupported:
         reason = _REJECTED.get(name, "Check its name: SciPy's solve_ivp does not have it either")
         raise TypeError(f"interop.solve_ivp has no argument {name!r}. {reason}.")
-    for name, given in (("t_span", t_span), ("y0", y0), ("t_eval", t_eval), ("h", h)):
-        refuse_unit_or_mask(name, given)
+    for name, value in (("t_span", t_span), ("y0", y0), ("t_eval", t_eval), ("h", h)):
+        refuse_unit_or_mask(name, value)
     bunch = needed("scipy.optimize", "interop.solve_ivp").OptimizeResult
     if isinstance(system, Problem):
         args = system.args if args is None else args
@@ -112,31 +112,33 @@ def solve_ivp(
     t0, t1, num_steps = _span(t_span, h)
     q0, p0 = _halves(y0, shape)
     times = _times(t_eval, t0, t1)
-    several = events if isinstance(events, list | tuple) else [] if events is None else [events]
-    found = [_event(e) for e in several]
+    functions = events if isinstance(events, list | tuple) else [] if events is None else [events]
+    conditions = [_event(e) for e in functions]
     ahead = 1 if t1 > t0 else -1  # SciPy's direction is along the run, that of `Section` in time
     # The last point of the lattice, t0 + N h', differs from t1 by round-off: its state is that at
     # t1.
-    near = 16 * float(np.spacing(max(abs(t0), abs(t1))))
-    inside = None if times is None else times[np.abs(times - t1) > near]
-    save = dvi.Save() if inside is None else dvi.Save(final=True)
-    if inside is not None and inside.size:
-        save = dvi.Save(ts=inside)
-    how: dict[str, Any] = {"h": (t1 - t0) / num_steps, "num_steps": num_steps, "t0": t0}
-    how |= {"epsilon": epsilon, "args": args, "method": _method(method), "save": save}
-    how |= {} if root_finder is None else {"root_finder": root_finder}
+    tolerance = 16 * float(np.spacing(max(abs(t0), abs(t1))))
+    inner_times = None if times is None else times[np.abs(times - t1) > tolerance]
+    save = dvi.Save() if inner_times is None else dvi.Save(final=True)
+    if inner_times is not None and inner_times.size:
+        save = dvi.Save(ts=inner_times)
+    options: dict[str, Any] = {"h": (t1 - t0) / num_steps, "num_steps": num_steps, "t0": t0}
+    options |= {"epsilon": epsilon, "args": args, "method": _method(method), "save": save}
+    options |= {} if root_finder is None else {"root_finder": root_finder}
 
     def run(crossings: int) -> dvi.Solution:
-        watch = [dvi.Section(e, ahead * e.direction, crossings) for e in found]
-        return dvi.integrate(system, q0, p0, observe=[*watch, dvi.Last(_end)], throw=False, **how)
+        watch = [dvi.Section(e, ahead * e.direction, crossings) for e in conditions]
+        return dvi.integrate(
+            system, q0, p0, observe=[*watch, dvi.Last(_end)], throw=False, **options
+        )
 
     sol = run(_ROOM)
-    most = max((int(c.count) for c in sol.observed[:-1]), default=0)
-    if most > _ROOM:
-        sol = run(most)
-    about = {"sol": None, "h": how["h"], "num_steps": num_steps, "solution": sol}
-    about["newton_iterations"] = int(sol.stats["newton_iterations"])
-    return bunch(about | _output(sol, found, ahead, t1, times, inside))
+    count = max((int(c.count) for c in sol.observed[:-1]), default=0)
+    if count > _ROOM:
+        sol = run(count)
+    output = {"sol": None, "h": options["h"], "num_steps": num_steps, "solution": sol}
+    output["newton_iterations"] = int(sol.stats["newton_iterations"])
+    return bunch(output | _output(sol, conditions, ahead, t1, times, inner_times))
 
 
 def _end(t0, t1, q0, p0, q1, p1, args):
@@ -144,18 +146,18 @@ def _end(t0, t1, q0, p0, q1, p1, args):
 
 
 def _output(
-    sol: Any, events: list[_Event], sign: int, t1: float, times: Any, inside: Any
+    sol: Any, events: list[_Event], sign: int, t1: float, times: Any, inner_times: Any
 ) -> dict[str, Any]:
     """The output in SciPy's form, truncated at a terminal event, or before a failure."""
     *sections, last = sol.observed
-    failed = not bool(sol.result == dvi.RESULTS.successful)
+    has_failed = not bool(sol.result == dvi.RESULTS.successful)
     t, y = np.array(sol.ts), _rows(sol.qs, sol.ps)
     if times is None:
         t[-1] = t1
     else:  # the times that were requested, in their precision
-        end = np.where(failed, np.nan, np.asarray(last))
-        y = np.concatenate([y[: inside.size], end[None]])
-        t, y = times, y[np.minimum(np.arange(times.size), inside.size)]
+        end = np.where(has_failed, np.nan, np.asarray(last))
+        y = np.concatenate([y[: inner_times.size], end[None]])
+        t, y = times, y[np.minimum(np.arange(times.size), inner_times.size)]
     crossings = [(np.asarray(c.ts), _rows(c.qs, c.ps)) for c in sections]
     crossings = [(ts[np.isfinite(ts)], ys[np.isfinite(ts)]) for ts, ys in crossings]
     ends = [
@@ -166,15 +168,18 @@ def _output(
     good = np.isfinite(y).all(axis=1)
     status, message = 0, "The solver successfully reached the end of the integration interval."
     if ends:
-        end, y_end = min(ends, key=lambda found: sign * found[0])
+        end, y_end = min(ends, key=lambda pair: sign * pair[0])
         status, message = 1, "A termination event occurred."
         at_end = np.asarray([end]) if times is None else times[np.asarray(times) == end]
-        before = good & (sign * t < sign * end)
-        t, y = np.append(t[before], at_end), np.concatenate([y[before], y_end[None][: at_end.size]])
+        early = good & (sign * t < sign * end)
+        t, y = (
+            np.append(t[early], at_end),
+            np.concatenate([y[early], y_end[None][: at_end.size]]),
+        )
         crossings = [
             (ts[sign * ts <= sign * end], ys[sign * ts <= sign * end]) for ts, ys in crossings
         ]
-    elif failed:
+    elif has_failed:
         status, message = -1, str(dvi.RESULTS[sol.result])
         t, y = t[good], y[good]
     return {
@@ -212,12 +217,12 @@ def _span(t_span: Any, h: Any) -> tuple[float, float, int]:
 
 def _halves(y0: Any, shape: Any) -> tuple[np.ndarray, np.ndarray]:
     y0 = np.asarray(y0)
-    known = "even" if shape is None else f"twice the size of q of shape {shape}"
+    size = "even" if shape is None else f"twice the size of q of shape {shape}"
     shape = (y0.size // 2,) if shape is None else tuple(np.ravel(shape).tolist())
     if y0.ndim != 1 or y0.size == 0 or y0.size != 2 * math.prod(shape):
         raise ValueError(
             "y0 must be a one-dimensional array with all of q0 and then all of p0. Its length must "
-            f"be positive and {known}, got shape {y0.shape}."
+            f"be positive and {size}, got shape {y0.shape}."
         )
     q0, p0 = np.split(y0, 2)
     return q0.reshape(shape), p0.reshape(shape)
@@ -228,10 +233,10 @@ def _times(t_eval: Any, t0: float, t1: float) -> np.ndarray | None:
         return None
     times, low, high = np.asarray(t_eval, float), min(t0, t1), max(t0, t1)
     if times.ndim != 1 or not ((times >= low) & (times <= high)).all():
-        seen = f"{times.min()} to {times.max()}" if times.ndim == 1 else f"shape {times.shape}"
+        text = f"{times.min()} to {times.max()}" if times.ndim == 1 else f"shape {times.shape}"
         raise ValueError(
             f"t_eval must be a one-dimensional array of times within t_span, from {low} to {high}, "
-            f"got {seen}."
+            f"got {text}."
         )
     if not (rises := np.diff(times) * np.sign(t1 - t0) > 0).all():
         order, i = "increasing" if t1 > t0 else "decreasing", int(np.argmin(rises))

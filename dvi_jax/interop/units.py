@@ -48,9 +48,9 @@ class UnitSystem:
         args: Mapping[str, Any] | None = None,
     ):
         u = needed("astropy.units", "interop.UnitSystem")
-        given = {"length": length, "time": time, "mass": mass}
-        bases = L, T, M = [_unit(u, kind, what) for kind, what in given.items()]
-        for kind, unit, like in zip(given, bases, (u.m, u.s, u.kg), strict=True):
+        base_units = {"length": length, "time": time, "mass": mass}
+        bases = L, T, M = [_unit(u, kind, word) for kind, word in base_units.items()]
+        for kind, unit, like in zip(base_units, bases, (u.m, u.s, u.kg), strict=True):
             if not unit.is_equivalent(like):
                 raise ValueError(
                     f"{kind} must be a unit of {kind} such as {like}, got {unit} "
@@ -59,13 +59,13 @@ class UnitSystem:
         words = {"length": L, "angle": u.rad, "momentum": M * L / T, "velocity": L / T}
         words |= {"angular momentum": M * L**2 / T, "specific angular momentum": L**2 / T}
         words["dimensionless"] = u.dimensionless_unscaled
-        others = [u.rad, u.A, u.K, u.mol, u.cd]
+        other_units = [u.rad, u.A, u.K, u.mol, u.cd]
 
-        def coherent(name: str, what: Any) -> Any:
-            unit = words.get(what) if isinstance(what, str) else None
-            unit = _unit(u, name, what) if unit is None else unit
+        def coherent(name: str, word: Any) -> Any:
+            unit = words.get(word) if isinstance(word, str) else None
+            unit = _unit(u, name, word) if unit is None else unit
             try:
-                parts = unit.decompose(bases=[L, T, M, *others])
+                parts = unit.decompose(bases=[L, T, M, *other_units])
                 return u.CompositeUnit(1.0, parts.bases, parts.powers)
             except (AttributeError, u.UnitConversionError):  # °C, magnitudes, photons
                 raise ValueError(
@@ -74,8 +74,8 @@ class UnitSystem:
                     f"values of {name} to it."
                 ) from None
 
-        named = {name: coherent(name, unit) for name, unit in (args or {}).items()}
-        self._set(coherent("q", q), coherent("p", p), T, named)
+        units = {name: coherent(name, unit) for name, unit in (args or {}).items()}
+        self._set(coherent("q", q), coherent("p", p), T, units)
 
     def _set(self, q: Any, p: Any, t: Any, args: dict[str, Any]) -> None:
         self.q, self.p, self.t, self.args = q, p, t, args
@@ -98,9 +98,9 @@ class UnitSystem:
                 "p0, args and units=interop.UnitSystem(length, time, mass)."
             )
         brackets = {n: re.search(r"\[([^\]]*)\]\s*$", m) for n, m in problem.parameters.items()}
-        args = {name: _read(u, found[1]) for name, found in brackets.items() if found}
-        one = u.dimensionless_unscaled
-        args = {name: unit for name, unit in args.items() if unit is not None and unit != one}
+        args = {name: _read(u, match[1]) for name, match in brackets.items() if match}
+        plain = u.dimensionless_unscaled
+        args = {name: unit for name, unit in args.items() if unit is not None and unit != plain}
         system = cls.__new__(cls)
         system._set(read["q"], read["p"], read["t"], args)
         return system
@@ -183,12 +183,12 @@ def integrate(
     u = needed("astropy.units", "interop.integrate")
     problem = system if isinstance(system, Problem) else None
     system = system_of(system)
-    own = None
+    own_units = None
     if problem is not None:  # units that are words will do where others are given
         with suppress(*[] if units is None else [ValueError]):
-            own = UnitSystem.of(problem)
-    called = "interop.UnitSystem(length=u.au, time=u.day, mass=u.Msun, args={...})"
-    taken: UnitSystem = expect("units", own if units is None else units, UnitSystem, called)
+            own_units = UnitSystem.of(problem)
+    example = "interop.UnitSystem(length=u.au, time=u.day, mass=u.Msun, args={...})"
+    target: UnitSystem = expect("units", own_units if units is None else units, UnitSystem, example)
     save, lattice = options.get("save"), options.get("lattice")
     if isinstance(lattice, dvi.Given):
         raise TypeError(
@@ -205,76 +205,81 @@ def integrate(
             "The states are saved at the times ts."
         )
     if ts is not None:
-        options["save"] = dvi.Save(ts=_number(u, "ts", ts, taken.t))
-    q0, p0, args = _filled(u, problem, own, q0, p0, args)
-    given = ("q0", q0, taken.q), ("p0", p0, taken.p), ("h", h, taken.t)
-    given += (("epsilon", epsilon, u.dimensionless_unscaled),)
-    given += () if t0 is None else (("t0", t0, taken.t),)
-    numbers = {name: _number(u, name, x, unit) for name, x, unit in given}
-    numbers |= {"args": _arguments(u, args, taken), "num_steps": num_steps}
+        options["save"] = dvi.Save(ts=_number(u, "ts", ts, target.t))
+    q0, p0, args = _filled(u, problem, own_units, q0, p0, args)
+    inputs = ("q0", q0, target.q), ("p0", p0, target.p), ("h", h, target.t)
+    inputs += (("epsilon", epsilon, u.dimensionless_unscaled),)
+    inputs += () if t0 is None else (("t0", t0, target.t),)
+    numbers = {name: _number(u, name, x, unit) for name, x, unit in inputs}
+    numbers |= {"args": _arguments(u, args, target), "num_steps": num_steps}
     sol = dvi.integrate(system, **numbers, **options)
-    arrays = (sol.ts, taken.t), (sol.qs, taken.q), (sol.ps, taken.p), (sol.hs, taken.t)
+    arrays = (
+        (sol.ts, target.t),
+        (sol.qs, target.q),
+        (sol.ps, target.p),
+        (sol.hs, target.t),
+    )
     with_unit = [u.Quantity(np.asarray(x), unit) for x, unit in arrays]
-    return UnitSolution(*with_unit, observed=sol.observed, units=taken, solution=sol)
+    return UnitSolution(*with_unit, observed=sol.observed, units=target, solution=sol)
 
 
 def _filled(
-    u: Any, problem: Problem | None, own: UnitSystem | None, q0: Any, p0: Any, args: Any
+    u: Any, problem: Problem | None, basis: UnitSystem | None, q0: Any, p0: Any, args: Any
 ) -> tuple[Any, Any, Any]:
     """q0, p0 and args, in which quantities of the problem replace what was left out."""
     if problem is None:
         return q0, p0, args
-    known = problem.args
-    if args is not None and known is not None:
+    defaults = problem.args
+    if args is not None and defaults is not None:
         expect(f"args of {problem.name}", args, Mapping, "a mapping from name to value")
-        if unknown := [name for name in args if name not in known]:
+        if extra := [name for name in args if name not in defaults]:
             raise ValueError(
-                f"args has {unknown[0]!r}, but {problem.name} has no such parameter: use only the "
-                f"names {', '.join(known)}."
+                f"args has {extra[0]!r}, but {problem.name} has no such parameter: use only the "
+                f"names {', '.join(defaults)}."
             )
-    if own is None:  # the units of its numbers are not known
+    if basis is None:  # the units of its numbers are not known
         return q0, p0, args
-    q0 = u.Quantity(problem.q0, own.q) if q0 is None else q0
-    p0 = u.Quantity(problem.p0, own.p) if p0 is None else p0
-    if isinstance(known, Mapping):
-        of_args = {n: u.Quantity(v, own.args[n]) if n in own.args else v for n, v in known.items()}
+    q0 = u.Quantity(problem.q0, basis.q) if q0 is None else q0
+    p0 = u.Quantity(problem.p0, basis.p) if p0 is None else p0
+    if isinstance(defaults, Mapping):
+        of_args = {
+            n: u.Quantity(v, basis.args[n]) if n in basis.args else v for n, v in defaults.items()
+        }
         args = of_args | dict(args or {})
     return q0, p0, args
 
 
 def _arguments(u: Any, args: Any, units: UnitSystem) -> Any:
     """The same pytree with every quantity as a number."""
-    seen, bare = set(), []
+    met, bare = set(), []
 
     def number(path: Any, leaf: Any) -> Any:
         words = [str(getattr(k, "key", getattr(k, "idx", k))) for k in path]
         # A unit goes for all that is below its name: "masses" for each of a list of masses.
-        above = [".".join(words[:i]) for i in range(len(words), 0, -1)]
-        name = above[0] if above else "args"
-        if declared := next((x for x in above if x in units.args), None):
-            seen.add(declared)
-            return _number(u, f"args {name}", leaf, units.args[declared])
+        paths = [".".join(words[:i]) for i in range(len(words), 0, -1)]
+        name = paths[0] if paths else "args"
+        if path_of_unit := next((x for x in paths if x in units.args), None):
+            met.add(path_of_unit)
+            return _number(u, f"args {name}", leaf, units.args[path_of_unit])
         if isinstance(leaf, u.Quantity) and leaf.unit != u.dimensionless_unscaled:
-            key, of = (name, f"{name} in args") if path else ("name", "args")
-            more = f'add the unit: UnitSystem(..., args={{"{key}": u.Unit("{leaf.unit}")}})'
+            key, subject = (name, f"{name} in args") if path else ("name", "args")
+            advice = f'add the unit: UnitSystem(..., args={{"{key}": u.Unit("{leaf.unit}")}})'
             as_dict = "" if path else 'give args as a dict {"name": value} and '
             raise TypeError(
-                f"{of} has the unit {leaf.unit}, but units has no unit for {name}. Give a number "
-                f"without a unit, or {as_dict}{more}."
+                f"{subject} has the unit {leaf.unit}, but units has no unit for {name}. Give a "
+                f"number without a unit, or {as_dict}{advice}."
             )
         bare.append(name)
         return _number(u, f"args {name}", leaf, u.dimensionless_unscaled)
 
     numbers = jax.tree.map_with_path(number, args)
-    unmet = [name for name in units.args if name not in seen]
+    unmet = [name for name in units.args if name not in met]
     if unmet and bare:  # a mistyped name would let a bare number through
-        names, others = (", ".join(map(repr, some)) for some in (unmet, bare))
+        names, bare_names = (", ".join(map(repr, group)) for group in (unmet, bare))
         kind = f"args is of type {type(args).__name__}, whose entries have no names: give a dict."
         if isinstance(args, Mapping):
-            kind = (
-                f"Entries of args without a unit: {others}. Use the same names in both, or remove "
-            )
-            kind += f"{names} from UnitSystem(args=...)."
+            kind = f"Entries of args without a unit: {bare_names}. Use the same names in both, or "
+            kind += f"remove {names} from UnitSystem(args=...)."
         raise ValueError(
             f"UnitSystem(args=...) has units for {names}, but args has no entries of these names. "
             + kind
@@ -282,16 +287,16 @@ def _arguments(u: Any, args: Any, units: UnitSystem) -> Any:
     return numbers
 
 
-def _number(u: Any, name: str, given: Any, unit: Any) -> Any:
+def _number(u: Any, name: str, entry: Any, unit: Any) -> Any:
     """The value in this unit."""
-    value = given
-    if isinstance(given, list | tuple) and any(isinstance(x, u.Quantity) for x in given):
+    value = entry
+    if isinstance(entry, list | tuple) and any(isinstance(x, u.Quantity) for x in entry):
         try:
-            value = u.Quantity(given)
+            value = u.Quantity(entry)
         except (TypeError, u.UnitsError) as error:
             raise TypeError(
                 f"all entries of {name} must be quantities that can be converted to one unit, got "
-                f"{given!r:.100}. Give one array with a unit, such as [1.0, 2.0] * "
+                f"{entry!r:.100}. Give one array with a unit, such as [1.0, 2.0] * "
                 f"u.Unit({str(unit)!r}). Cause: {error}."
             ) from None
     if np.any(getattr(value, "mask", False)):
@@ -302,9 +307,9 @@ def _number(u: Any, name: str, given: Any, unit: Any) -> Any:
     if not isinstance(value, u.Quantity):
         if unit == u.dimensionless_unscaled:
             return value
-        seen = "is missing" if value is None else f"= {value!r:.100} has no unit"
+        fault = "is missing" if value is None else f"= {value!r:.100} has no unit"
         raise TypeError(
-            f"{name} {seen}. Give a quantity, such as {name.split()[-1]} * u.Unit({str(unit)!r}). "
+            f"{name} {fault}. Give a quantity, such as {name.split()[-1]} * u.Unit({str(unit)!r}). "
             "Other units are allowed if they can be converted to this unit."
         )
     try:
@@ -318,12 +323,12 @@ def _number(u: Any, name: str, given: Any, unit: Any) -> Any:
         ) from None
 
 
-def _unit(u: Any, name: str, what: Any) -> Any:
+def _unit(u: Any, name: str, text_or_unit: Any) -> Any:
     try:
-        return u.Unit(what)
+        return u.Unit(text_or_unit)
     except (ValueError, TypeError) as error:
-        more = "" if name in ("length", "time", "mass") else ", or a word such as 'momentum'"
-        text = f"{name} must be a unit of astropy or its name{more}, got {what!r:.100}."
+        words = "" if name in ("length", "time", "mass") else ", or a word such as 'momentum'"
+        text = f"{name} must be a unit of astropy or its name{words}, got {text_or_unit!r:.100}."
         raise ValueError(f"{text} Cause: {error}") from None
 
 

@@ -45,12 +45,12 @@ def canvas(ax: Any, size: Any = None, space: bool = False) -> tuple[Any, bool]:
 
 
 def stack(
-    ax: Any, places: Any, what: str, size: tuple[float, float], ncols: int = 1, **layout: Any
+    ax: Any, places: Any, purpose: str, size: tuple[float, float], ncols: int = 1, **layout: Any
 ) -> tuple[list[Any], bool]:
     """(several axes, whether they are new): `ax`, or those of a new figure.
 
     `places`: number of axes, which fill rows of `ncols`; or rows of their names, as
-    `Figure.subplot_mosaic` takes them. `what`: what they are for, in the error message.
+    `Figure.subplot_mosaic` takes them. `purpose`: what they are for, in the error message.
     """
     if isinstance(places, int):
         cells = [*range(places), *["."] * (-places % ncols)]
@@ -58,47 +58,47 @@ def stack(
     if ax is None:
         figure = plt.figure(figsize=size, layout="constrained")
         return list(figure.subplot_mosaic(places, **layout).values()), True
-    found = [canvas(axis)[0] for axis in np.ravel(np.asarray(ax, object))]
+    axes = [canvas(axis)[0] for axis in np.ravel(np.asarray(ax, object))]
     count = len({name for row in places for name in row} - {"."})
-    if len(found) != count:
+    if len(axes) != count:
         raise ValueError(
-            f"this picture needs {count} Axes to draw on, {what}; got {len(found)}. Give this "
+            f"this picture needs {count} Axes to draw on, {purpose}; got {len(axes)}. Give this "
             "number of Axes, or none: then a new figure is made."
         )
-    return found, False
+    return axes, False
 
 
-def check_shapes(fits: Any, wanted: str, **arrays: np.ndarray) -> None:
+def check_shapes(fits: Any, rule: str, **arrays: np.ndarray) -> None:
     """**Raises** `ValueError` with what is wanted and with the shapes, unless they fit."""
     if not fits:
-        got = ", ".join(f"{name} of shape {x.shape}" for name, x in arrays.items())
-        raise ValueError(f"{wanted}; got {got}.")
+        shapes = ", ".join(f"{name} of shape {x.shape}" for name, x in arrays.items())
+        raise ValueError(f"{rule}; got {shapes}.")
 
 
-def at_most(most: int, count: int, what: str, choice: str) -> None:
+def at_most(limit: int, count: int, things: str, choice: str) -> None:
     """**Raises** `ValueError` for too many things in one picture, with a way to choose some."""
-    if count > most:
-        raise ValueError(f"{count} {what} are too many: choose at most {most}, such as {choice}.")
+    if count > limit:
+        raise ValueError(f"{count} {things} are too many: choose at most {limit}, e.g. {choice}.")
 
 
-def check_attributes(thing: Any, names: Sequence[str], wanted: str) -> None:
+def check_attributes(thing: Any, names: Sequence[str], rule: str) -> None:
     """**Raises** `TypeError` for an object without these attributes."""
     if lacking := ", ".join(name for name in names if not hasattr(thing, name)):
         kind = type(thing).__name__
-        raise TypeError(f"{wanted}; got an object of type {kind} without the attributes {lacking}.")
+        raise TypeError(f"{rule}; got an object of type {kind} without the attributes {lacking}.")
 
 
-def labels_of(labels: Any, count: int, what: str, name: str = "labels") -> list[str]:
+def labels_of(labels: Any, count: int, things: str, name: str = "labels") -> list[str]:
     """`count` labels, empty ones for None. **Raises** `ValueError` for another number of them."""
     if labels is None:
         return [""] * count
-    found = [labels] if isinstance(labels, str) else labels
-    if len(found) != count or isinstance(labels, str):
+    texts = [labels] if isinstance(labels, str) else labels
+    if len(texts) != count or isinstance(labels, str):
         raise ValueError(
-            f"{name} must be a list of names, one for each of the {what} ({count} in total), got "
+            f"{name} must be a list of names, one for each of the {things} ({count} in total), got "
             f"{labels!r:.200}."
         )
-    return [str(label) for label in found]
+    return [str(label) for label in texts]
 
 
 def entry(label: str, **look: Any) -> Line2D:
@@ -106,24 +106,24 @@ def entry(label: str, **look: Any) -> Line2D:
     return Line2D([], [], label=label, **normalize_kwargs(look, Line2D))
 
 
-def legend(axis: Any, new: bool, extra: Iterable[Any] = (), labelled: bool = True) -> Any:
+def legend(axis: Any, new: bool, extra: Iterable[Any] = (), artists: bool = True) -> Any:
     """A legend below a new figure in as many columns as fit, or inside axes that were given; below
     them if they hold a map, which fills them, and the figure has a layout that makes space.
 
     `extra`: entries after those of the labelled artists: artists, or texts without a mark.
     """
-    handles = axis.get_legend_handles_labels()[0] if labelled else []
-    handles += [entry(one, ls="none") if isinstance(one, str) else one for one in extra]
+    handles = axis.get_legend_handles_labels()[0] if artists else []
+    handles += [entry(item, ls="none") if isinstance(item, str) else item for item in extra]
     if not handles:
         return None
     figure = figure_of(axis)
     if not new:  # below axes without a layout it would cover their labels, or other axes
         look = {"frameon": True, "framealpha": 0.6, "edgecolor": "none"}
-        is_map = any(isinstance(drawn, QuadMesh) for drawn in axis.collections)
+        is_map = any(isinstance(collection, QuadMesh) for collection in axis.collections)
         if is_map and figure.get_layout_engine() is not None:
-            under = ScaledTranslation(0, -_LABELS / 72, figure.dpi_scale_trans)
+            below_axes = ScaledTranslation(0, -_LABELS / 72, figure.dpi_scale_trans)
             look = {"loc": "upper center", "bbox_to_anchor": (0.5, 0.0), "borderaxespad": 0.0}
-            look["bbox_transform"] = axis.transAxes + under
+            look["bbox_transform"] = axis.transAxes + below_axes
         return axis.legend(handles=handles, fontsize=8, **look)
     if axis.name == "3d":  # the labels of its axes need the space below
         return figure.legend(handles=handles, loc="upper right")
@@ -133,7 +133,7 @@ def legend(axis: Any, new: bool, extra: Iterable[Any] = (), labelled: bool = Tru
     return figure.legend(handles=handles, loc="outside lower center", ncols=columns)
 
 
-def counted(counts: dict[str, Any]) -> list[str]:
+def counts_text(counts: dict[str, Any]) -> list[str]:
     """Legend texts ``"{count} {text}"`` of the counts that are not 0."""
     return [f"{int(count)} {text}" for text, count in counts.items() if count]
 
@@ -145,11 +145,11 @@ def scale_of(
 
     `limits`: (low, high); None: these percentiles of the finite values, for `log` positive ones.
     """
-    known = values[np.isfinite(values) & ((values > 0) | (not log))]
+    finite = values[np.isfinite(values) & ((values > 0) | (not log))]
     if limits is None:
-        limits = np.percentile(known, percentiles) if known.size else (0.1 if log else 0.0, 1.0)
+        limits = np.percentile(finite, percentiles) if finite.size else (0.1 if log else 0.0, 1.0)
     low, high = (float(v) for v in limits)
-    ends = _EXTEND[int((known < low).any()), int((known > high).any())]
+    ends = _EXTEND[int((finite < low).any()), int((finite > high).any())]
     if high <= low and log:
         low, high = low / 2, high * 2
     elif high <= low:
@@ -175,20 +175,20 @@ def path(
         label = None
 
 
-def envelope(x: np.ndarray, y: np.ndarray, most: int = 8000) -> tuple[np.ndarray, np.ndarray]:
-    """About `most` points of a function of x that look like all: extremes, gaps of each piece."""
-    if len(x) <= most:
+def envelope(x: np.ndarray, y: np.ndarray, limit: int = 8000) -> tuple[np.ndarray, np.ndarray]:
+    """About `limit` points of a function of x that look like all: extremes, gaps of each piece."""
+    if len(x) <= limit:
         return x, y
     keep = {0, len(x) - 1}
-    for first, last in itertools.pairwise(np.linspace(0, len(x), most // 4 + 1).astype(int)):
+    for first, last in itertools.pairwise(np.linspace(0, len(x), limit // 4 + 1).astype(int)):
         finite = np.isfinite(y[first:last])
         if finite.any():
             keep.add(first + int(np.argmin(np.where(finite, y[first:last], np.inf))))
             keep.add(first + int(np.argmax(np.where(finite, y[first:last], -np.inf))))
         if not finite.all():
             keep.add(first + int(np.argmin(finite)))
-    chosen = np.array(sorted(keep))
-    return x[chosen], y[chosen]
+    numbers = np.array(sorted(keep))
+    return x[numbers], y[numbers]
 
 
 def at_edge(axis: Any, x: np.ndarray, marker: str, height: float = 0.015, **look: Any) -> None:
@@ -204,15 +204,15 @@ def without_place(axis: Any, x: np.ndarray, y: np.ndarray, colour: Any) -> np.nd
 
     Neither has a place on a logarithmic axis.
     """
-    failed, zero = ~np.isfinite(y), y == 0
-    at_edge(axis, x[failed], "x", 0.985, color=colour)
+    invalid, zero = ~np.isfinite(y), y == 0
+    at_edge(axis, x[invalid], "x", 0.985, color=colour)
     at_edge(axis, x[zero], "v", color=colour)
-    return np.array([failed.sum(), zero.sum()])
+    return np.array([invalid.sum(), zero.sum()])
 
 
-def without_place_entries(counts: Any, total: int, failed: str, zero: str) -> list[Any]:
+def without_place_entries(counts: Any, total: int, invalid: str, zero: str) -> list[Any]:
     """Legend entries of the marks that `without_place` draws."""
-    marks = zip(counts, "xv", (failed, zero), strict=True)
+    marks = zip(counts, "xv", (invalid, zero), strict=True)
     look: Any = {"color": PALE, "ls": "none"}
     return [entry(f"{n} of {total} {text}", marker=m, **look) for n, m, text in marks if n]
 
@@ -239,12 +239,12 @@ def cells(axis: Any, x: np.ndarray, y: np.ndarray, values: np.ndarray, norm: Any
     """A map of values, shape (y, x), between edges `x` and `y`; cells without one are hatched."""
     axis.grid(False)
     axis.patch.set(**HATCH)
-    shown = np.ma.masked_invalid(values)
-    return axis.pcolormesh(x, y, shown, norm=norm, cmap=cmap or SHADES, rasterized=True)
+    masked_values = np.ma.masked_invalid(values)
+    return axis.pcolormesh(x, y, masked_values, norm=norm, cmap=cmap or SHADES, rasterized=True)
 
 
 def flat_cells(axis: Any, x: np.ndarray, y: np.ndarray, where: np.ndarray, colour: str) -> None:
     """Cells of one colour over a map, where a mask of shape (y, x) is true."""
     if where.any():
-        shown = np.ma.masked_where(~where, np.ones(where.shape))
-        axis.pcolormesh(x, y, shown, cmap=ListedColormap([colour]), rasterized=True)
+        mask = np.ma.masked_where(~where, np.ones(where.shape))
+        axis.pcolormesh(x, y, mask, cmap=ListedColormap([colour]), rasterized=True)

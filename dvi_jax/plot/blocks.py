@@ -35,9 +35,11 @@ class Bins(NamedTuple):
         a, b = (int(x) for x in self.ends[[first, last]])
         return slice(a, b) if self.order is None else np.sort(self.order[a:b])
 
-    def pixels(self, chosen: Any) -> np.ndarray:
+    def pixels(self, selection: Any) -> np.ndarray:
         """The pixel of each point of a selection."""
-        points = np.arange(*chosen.indices(self.size)) if isinstance(chosen, slice) else chosen
+        points = selection
+        if isinstance(selection, slice):
+            points = np.arange(*selection.indices(self.size))
         if self.order is not None:
             points = np.argsort(self.order)[points]
         return np.searchsorted(self.starts, points, side="right") - 1
@@ -63,14 +65,14 @@ class Picture(NamedTuple):
     """One number for each pixel, NaN without any; how many points have none, and of how many."""
 
     values: np.ndarray
-    missing: int
+    absent: int
     points: int
 
 
 _COMBINE: dict[str, Any] = {"max": np.fmax, "min": np.fmin, "mean": np.add}
 
 
-def reduced(
+def reduce_to_pixels(
     data: Any, bins: Mapping[str, Bins], reduce: str, lines: Lines | None = None
 ) -> Picture:
     """The values of a `xarray.DataArray`, reduced to pixels; one block is read at a time.
@@ -81,18 +83,18 @@ def reduced(
     shape, points = tuple(len(b.starts) for b in bins.values()), 0
     values = np.full(math.prod(shape), 0.0 if reduce == "mean" else np.nan)
     counts = np.zeros(values.size, np.int64)
-    for pixels, block in blocks(data, bins, lines, whole=reduce == "median"):
+    for pixels, block in blocks(data, bins, lines, whole_pixels=reduce == "median"):
         finite = np.isfinite(block)
         points += block.size
-        where, found = pixels[finite], block[finite]
+        where, numbers = pixels[finite], block[finite]
         counts += np.bincount(where, minlength=counts.size)
         if reduce == "median":  # every pixel lies in one block
-            order = np.lexsort((found, where))
-            there, first, n = np.unique(where[order], return_index=True, return_counts=True)
+            order = np.lexsort((numbers, where))
+            places, first, n = np.unique(where[order], return_index=True, return_counts=True)
             middles = order[first + (n - 1) // 2], order[first + n // 2]
-            values[there] = sum(found[middle] for middle in middles) / 2
+            values[places] = sum(numbers[middle] for middle in middles) / 2
         else:
-            _COMBINE[reduce].at(values, where, found)
+            _COMBINE[reduce].at(values, where, numbers)
     if reduce == "mean":
         values = values / np.where(counts, counts, np.nan)
     return Picture(values.reshape(shape), points - int(counts.sum()), points)
@@ -109,29 +111,29 @@ def count_codes(data: Any, bins: Mapping[str, Bins], codes: Sequence[int]) -> np
 
 
 def blocks(
-    data: Any, bins: Mapping[str, Bins], lines: Lines | None = None, whole: bool = False
+    data: Any, bins: Mapping[str, Bins], lines: Lines | None = None, whole_pixels: bool = False
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """(number of the pixel of each point, the points), both of shape (rest, *points).
 
     `whole`: every pixel lies in one block, as a median needs it.
     """
     shape = [len(b.starts) for b in bins.values()]
-    for selection in selections(data, bins, None if lines is None else lines.dim, whole):
+    for selection in selections(data, bins, None if lines is None else lines.dim, whole_pixels):
         block = data.variable.isel(selection).values
         names = list(data.dims)
         if lines is not None:
             block = lines.function(np.moveaxis(block, names.index(lines.dim), 0))
             names = [lines.dim, *(d for d in names if d != lines.dim)]
             selection = selection | {lines.dim: slice(None)}
-        rest = [i for i, d in enumerate(names) if d not in bins]
-        block = block.transpose(*rest, *(names.index(d) for d in bins))
-        block = block.reshape(-1, *block.shape[len(rest) :])
+        outer = [i for i, d in enumerate(names) if d not in bins]
+        block = block.transpose(*outer, *(names.index(d) for d in bins))
+        block = block.reshape(-1, *block.shape[len(outer) :])
         places = np.ix_(*(b.pixels(selection[d]) for d, b in bins.items()))
         yield np.broadcast_to(np.ravel_multi_index(places, shape), block.shape), block
 
 
 def selections(
-    data: Any, bins: Mapping[str, Bins], line: str | None = None, whole: bool = False
+    data: Any, bins: Mapping[str, Bins], line: str | None = None, whole_pixels: bool = False
 ) -> Iterator[dict[str, Any]]:
     """Selections of at most a block, last dimension first, that hold whole lines along `line`.
 
@@ -139,8 +141,8 @@ def selections(
     numbers of a pixel. **Raises** `ValueError` if a pixel is larger than a block.
     """
     sizes = dict(zip(data.dims, data.shape, strict=True))
-    unit = {d: n if d == line or (whole and d not in bins) else 1 for d, n in sizes.items()}
-    if whole:
+    unit = {d: n if d == line or (whole_pixels and d not in bins) else 1 for d, n in sizes.items()}
+    if whole_pixels:
         unit |= {d: int(np.diff(b.ends).max()) for d, b in bins.items() if d != line}
         if math.prod(unit.values()) > BLOCK:
             raise ValueError(
@@ -149,15 +151,15 @@ def selections(
                 "pixels=(width, height), or select a part of the data by data.isel(...)."
             )
     else:
-        known = data.encoding.get("preferred_chunks") or {}
-        chunks = {d: min(known[d], n) for d, n in sizes.items() if isinstance(known.get(d), int)}
+        stored = data.encoding.get("preferred_chunks") or {}
+        chunks = {d: min(stored[d], n) for d, n in sizes.items() if isinstance(stored.get(d), int)}
         chunks |= {line: sizes[line]} if line is not None else {}
         if len(chunks) == len(sizes) and math.prod(chunks.values()) <= BLOCK:
             unit = chunks
     room, parts = max(1, BLOCK // math.prod(unit.values())), {}
     for d in reversed(data.dims):
         size, step = sizes[d], unit[d]
-        pixels = bins[d] if whole and d in bins and d != line else None
+        pixels = bins[d] if whole_pixels and d in bins and d != line else None
         total = -(-size // step) if pixels is None else len(pixels.starts)
         count = min(total, max(room, 1))
         room //= count
@@ -166,5 +168,5 @@ def selections(
             parts[d] = [slice(i * step, min((i + count) * step, size)) for i in starts]
         else:
             parts[d] = [pixels.points(i, min(i + count, total)) for i in starts]
-    for chosen in itertools.product(*(parts[d] for d in data.dims)):
-        yield dict(zip(data.dims, chosen, strict=True))
+    for ranges in itertools.product(*(parts[d] for d in data.dims)):
+        yield dict(zip(data.dims, ranges, strict=True))

@@ -34,7 +34,7 @@ _DOT: dict[str, Any] = {"marker": "o", "ls": "none", "ms": 6}
 _DOT |= {"mec": "black", "mew": 0.6}
 
 _VIEW = ("coordinates", "bodies", "centre", "names")
-_BESIDE = {None: (), "phase_portrait": ("dof",), "invariants": ("values", "change", "log")}
+_SECOND = {None: (), "phase_portrait": ("dof",), "invariants": ("values", "change", "log")}
 """Keywords of `orbit`, and of the second picture."""
 
 
@@ -75,15 +75,19 @@ def animate(
     path = Path(path)
     suffix = path.suffix.lower()
     _check_film(path, suffix, seconds, fps, tail, beside)
-    own = {name for names in (_VIEW, *_BESIDE.values()) for name in names}
-    known = {name: options.pop(name) for name in own & options.keys()}
+    extra_names = {name for names in (_VIEW, *_SECOND.values()) for name in names}
+    extra = {name: options.pop(name) for name in extra_names & options.keys()}
     look = look_of(options, "colour", "colour_label", "ax")
     lanes = lanes_of(orbits, look.labels, momenta=False)
-    chosen, shape = {name: known[name] for name in _VIEW if name in known}, one_shape(lanes)
-    if math.prod(shape) == 1 and chosen.get("coordinates") is chosen.get("names") is None:
+    view_options = {name: extra[name] for name in _VIEW if name in extra}
+    shape = one_shape(lanes)
+    if (
+        math.prod(shape) == 1
+        and view_options.get("coordinates") is view_options.get("names") is None
+    ):
         view: Any = Plane((0,) * len(shape), (1,))
     else:
-        view = view_of(lanes, **chosen)
+        view = view_of(lanes, **view_options)
     times = _moments(lanes, seconds * fps)
     width, height = size or ((9.6, 4.6) if beside else (5.0, 4.8))
     pixels = round(width * dpi) * round(height * dpi)
@@ -104,7 +108,7 @@ def animate(
     view.name_axes(axis, look.units)
     legend(axis, True, troubles(lanes))
     axis.set_title(look.title)
-    second = {name: known[name] for name in _BESIDE[beside] if name in known}
+    second = {name: extra[name] for name in _SECOND[beside] if name in extra}
     if beside == "phase_portrait":
         scene.mark_phase(figure.add_subplot(grid[1]), orbits, second.get("dof"), look.units)
     elif beside == "invariants":
@@ -129,7 +133,7 @@ def _check_film(path: Path, suffix: str, seconds: Any, fps: Any, tail: Any, besi
         raise ValueError(f"path must lie in an existing folder, got {str(path)!r}: {folder}.")
     positive("seconds", seconds)
     positive("fps", fps)
-    one_of("beside", beside, _BESIDE)
+    one_of("beside", beside, _SECOND)
     if not 0 <= tail <= 1:
         raise ValueError(f"tail must be a fraction from 0 to 1, got {tail!r}.")
     if suffix == ".gif" and fps > _FASTEST_GIF:
@@ -146,14 +150,14 @@ def _check_film(path: Path, suffix: str, seconds: Any, fps: Any, tail: Any, besi
 
 def _moments(lanes: Sequence[Lane], frames: float) -> np.ndarray:
     """Times of the frames, evenly from the first to the last finite state."""
-    known = [lane.ts[lane.there] for lane in lanes if lane.there.any()]
-    if not known:
+    finite = [lane.ts[lane.finite] for lane in lanes if lane.finite.any()]
+    if not finite:
         raise ValueError(
             "orbits must have at least one finite state, but each saved state contains NaN "
             "or inf in ts, qs or ps. Check the arrays, or the status of the Solution."
         )
-    count = max(2, min(round(frames), max(len(t) for t in known)))
-    ends = np.array([[t[0], t[-1]] for t in known])
+    count = max(2, min(round(frames), max(len(t) for t in finite)))
+    ends = np.array([[t[0], t[-1]] for t in finite])
     times = np.linspace(ends.min(), ends.max(), count)
     return times if (ends[:, 1] >= ends[:, 0]).all() else times[::-1]
 
@@ -166,7 +170,7 @@ class _Scene:
         self.sign = 1.0 if times[-1] >= times[0] else -1.0
         self.moving: list[Callable[[float], None]] = []
         # The times of each orbit up to its last finite state.
-        counts = [np.max(np.flatnonzero(lane.there) + 1, initial=0) for lane in lanes]
+        counts = [np.max(np.flatnonzero(lane.finite) + 1, initial=0) for lane in lanes]
         self.clocks = [self.sign * x.ts[:n] for x, n in zip(lanes, counts, strict=True)]
         step = abs(times[-1] - times[0]) / len(times)
         digits = int(np.clip(np.ceil(-np.log10(step)), 0, 12)) if step > 0 else 0
@@ -179,7 +183,7 @@ class _Scene:
             move(t)
         self.axis.set_title(self.text.format(t), loc="right", fontweight="normal")
 
-    def now(self, lane: int, t: float) -> int:
+    def place_of(self, lane: int, t: float) -> int:
         """Number of the state that an orbit shows at a time, −1 before the first."""
         return int(np.searchsorted(self.clocks[lane], self.sign * t, side="right")) - 1
 
@@ -192,7 +196,7 @@ class _Scene:
         pale = {"color": "#cccccc", "lw": 0.6, "zorder": 0.8}
         pale["alpha"] = 1.0 if len(lines) <= _GHOSTS else 0.0
         for i, k, number, name in lines:
-            xs = view.of(self.lanes[i], k)
+            xs = view.coordinates_of(self.lanes[i], k)
             self.axis.plot(*xs, **pale)
             look = {"color": colours[number], "label": name or None, "zorder": 4}
             self.moving.append(self._moving_body(i, xs, look, length, stride))
@@ -200,21 +204,21 @@ class _Scene:
     def _moving_body(self, lane: int, xs: Any, look: Any, length: float, stride: int) -> Any:
         axis, clock = self.axis, self.clocks[lane]
         start = [[float(x[0])] for x in xs]
-        nothing = [np.tile(np.ravel(start), (2, 1))]
+        start_segment = [np.tile(np.ravel(start), (2, 1))]
         if axis.name == "3d":
-            tail: Any = axis.add_collection3d(Line3DCollection(nothing, linewidths=1.6))
+            tail: Any = axis.add_collection3d(Line3DCollection(start_segment, linewidths=1.6))
         else:
-            tail = axis.add_collection(LineCollection(nothing, linewidths=1.6), autolim=False)
+            tail = axis.add_collection(LineCollection(start_segment, linewidths=1.6), autolim=False)
         (head,) = axis.plot(*start, **_DOT, **look)
         (cross,) = axis.plot(*start, ls="none", zorder=5, **CROSS)
-        last, failed = len(clock) - 1, bool(self.lanes[lane].trouble)
+        last, ends_early = len(clock) - 1, bool(self.lanes[lane].trouble)
 
         def move(t: float) -> None:
-            now = self.now(lane, t)
+            place = self.place_of(lane, t)
             first = int(np.searchsorted(clock, self.sign * t - length)) if len(clock) else 0
             # The same states in every frame, so that a tail of few does not flicker.
-            places = np.arange(first, now + 1)
-            places = places[(places % stride == 0) | (places == now)]
+            places = np.arange(first, place + 1)
+            places = places[(places % stride == 0) | (places == place)]
             points = np.stack([x[places] for x in xs], 1)
             if len(points) < 2:  # matplotlib cannot draw a tail without points
                 points = np.full((2, len(xs)), np.nan)
@@ -222,9 +226,9 @@ class _Scene:
             fade = np.linspace(0, 1, len(segments) + 1)[1:]
             tail.set_segments(list(segments))
             tail.set_color(np.c_[np.tile(to_rgb(look["color"]), (len(segments), 1)), fade])
-            over = failed and now >= last
-            _put(head, xs, [] if now < 0 or over else [now])
-            _put(cross, xs, [last] if over and last >= 0 else [])
+            has_ended = ends_early and place >= last
+            _put(head, xs, [] if place < 0 or has_ended else [place])
+            _put(cross, xs, [last] if has_ended and last >= 0 else [])
 
         return move
 
@@ -237,8 +241,8 @@ class _Scene:
             (dot,) = axis.plot([], [], color=colour, zorder=5, **_DOT)
 
             def move(t: float, i: int = i, dot: Any = dot) -> None:
-                now = self.now(i, t)
-                _put(dot, plane.of(self.lanes[i]), [now] if now >= 0 else [])
+                place = self.place_of(i, t)
+                _put(dot, plane.coordinates_of(self.lanes[i]), [place] if place >= 0 else [])
 
             self.moving.append(move)
 
@@ -279,13 +283,13 @@ def write_gif(scene: _Scene, path: Path, seconds: float, progress: Any) -> None:
     """
     count, plain, canvas = len(scene.times), Image.Dither.NONE, scene.axis.figure.canvas
 
-    def drawn(frame: int) -> Any:
+    def image_of(frame: int) -> Any:
         scene.show(frame)
         canvas.draw()
         return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
 
     # The palette is that of four frames, which together have all colours.
-    samples = [np.asarray(drawn(k)) for k in np.unique(np.linspace(0, count - 1, 4).astype(int))]
+    samples = [np.asarray(image_of(k)) for k in np.unique(np.linspace(0, count - 1, 4).astype(int))]
     palette = Image.fromarray(np.concatenate(samples)).quantize(256, dither=plain)
     colours = np.asarray(palette.getpalette()).reshape(-1, 3)
     colours[colours.min(1) >= 248] = 255  # paper stays white
@@ -293,7 +297,7 @@ def write_gif(scene: _Scene, path: Path, seconds: float, progress: Any) -> None:
     palette.load()
     frames = []
     for frame in range(count):
-        frames.append(drawn(frame).quantize(palette=palette, dither=plain))
+        frames.append(image_of(frame).quantize(palette=palette, dither=plain))
         if progress is not None:
             progress(frame + 1, count)
     delays = 10 * np.diff(np.round(100 * seconds * np.arange(count + 1) / count))

@@ -11,9 +11,9 @@ from matplotlib.patches import Ellipse
 
 from ..base.checks import instance
 from . import axes as draw
-from .axes import canvas, counted, entry, labels_of, legend, stack
-from .states import chosen
-from .style import COLOURS, GREY, MARKERS, in_style, signed
+from .axes import canvas, counts_text, entry, labels_of, legend, stack
+from .states import selected_numbers
+from .style import COLOURS, GREY, MARKERS, in_style, sign_text
 
 _PANELS, _PARAMETERS, _WIDE = 6, 12, 3.2
 """Arcs up to which each has a panel of its own; parameters that are drawn without a selection;
@@ -55,59 +55,62 @@ def fit_residuals(
     exist, and another number of axes or names.
     """
     _check(fit, "whitened", "ts", "chi2", "degrees_of_freedom")
-    numbers = chosen("arcs", arcs, len(fit.whitened))
+    numbers = selected_numbers("arcs", arcs, len(fit.whitened))
     size = 1.0 if fit.has_errors else math.sqrt(fit.chi2 / max(fit.degrees_of_freedom, 1))
     rows = {i: np.asarray(fit.whitened[i]) / (size or 1.0) for i in numbers}
     components = max(r.shape[1] for r in rows.values())
-    kept = chosen("component", component, components)
-    named = labels_of(names, components, "components", "names")
+    columns = selected_numbers("component", component, components)
+    texts = labels_of(names, components, "components", "names")
     panels = [[i] for i in numbers] if len(numbers) <= _PANELS else [numbers]
     count, new = len(panels), axes is None
-    height, what = 2.6 + 0.9 * (count - 1) + 0.6, "one for each panel and one for the distribution"
+    height, purpose = (
+        2.6 + 0.9 * (count - 1) + 0.6,
+        "one for each panel and one for the distribution",
+    )
     places = [[f"panel {i}", "distribution"] for i in range(count)]
-    found, _ = stack(axes, places, what, (7.4, height), width_ratios=(5, 1))
+    drawn_axes, _ = stack(axes, places, purpose, (7.4, height), width_ratios=(5, 1))
     if new:  # a mosaic lists the distribution after the first panel
-        found.append(found.pop(1))
-        for axis in found[:count]:
+        drawn_axes.append(drawn_axes.pop(1))
+        for axis in drawn_axes[:count]:
             axis.grid(axis="y", visible=False)
-        for axis in found[1:count]:
-            axis.sharey(found[0])
-        found[-1].tick_params(labelleft=count > 1)
-    every = [rows[i][:, k] for i in numbers for k in kept if k < rows[i].shape[1]]
-    every = np.concatenate(every)
-    known = every[np.isfinite(every)]
-    furthest = 1.08 * max(3.5, np.abs(known).max(initial=0.0))
-    for axis, those in zip(found, panels, strict=False):
-        for i, k in itertools.product(those, kept):
+        for axis in drawn_axes[1:count]:
+            axis.sharey(drawn_axes[0])
+        drawn_axes[-1].tick_params(labelleft=count > 1)
+    residuals = [rows[i][:, k] for i in numbers for k in columns if k < rows[i].shape[1]]
+    residuals = np.concatenate(residuals)
+    finite = residuals[np.isfinite(residuals)]
+    furthest = 1.08 * max(3.5, np.abs(finite).max(initial=0.0))
+    for axis, panel in zip(drawn_axes, panels, strict=False):
+        for i, k in itertools.product(panel, columns):
             if k < rows[i].shape[1]:
-                look = _dot(k if len(those) == 1 else i, 3.5 if len(fit.ts[i]) < 400 else 1.8)
+                look = _dot(k if len(panel) == 1 else i, 3.5 if len(fit.ts[i]) < 400 else 1.8)
                 axis.plot(fit.ts[i], rows[i][:, k], **look, mew=0, alpha=0.85)
         if count > 1:
-            axis.set_title(f"arc {those[0]}", fontsize=9.5)
+            axis.set_title(f"arc {panel[0]}", fontsize=9.5)
         _lines(axis, furthest)
         if furthest < 5:
             axis.set_yticks([-3, -1, 1, 3])
-    _draw_distribution(found[-1], known, furthest)
-    if lost := every.size - known.size:
-        found[-1].set_xlabel(f"count\n{lost} of {every.size}\nnot finite")
+    _draw_distribution(drawn_axes[-1], finite, furthest)
+    if invalid := residuals.size - finite.size:
+        drawn_axes[-1].set_xlabel(f"count\n{invalid} of {residuals.size}\nnot finite")
     unit = "standard errors" if fit.has_errors else f"s = {size:.3g}"
-    found[(count - 1) // 2].set_ylabel(f"observed − predicted\n[{unit}]")
-    found[count - 1].set_xlabel("time t")
-    if len(panels[0]) == 1 and 1 < len(kept) <= len(COLOURS):
-        handles = [entry(named[k] or f"component {k}", mew=0, **_dot(k)) for k in kept]
+    drawn_axes[(count - 1) // 2].set_ylabel(f"observed − predicted\n[{unit}]")
+    drawn_axes[count - 1].set_xlabel("time t")
+    if len(panels[0]) == 1 and 1 < len(columns) <= len(COLOURS):
+        handles = [entry(texts[k] or f"component {k}", mew=0, **_dot(k)) for k in columns]
         if new:
             look = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "columnspacing": 1.0}
-            look |= {"handletextpad": 0.1, "borderaxespad": 0.1, "ncols": min(len(kept), 4)}
-            found[0].legend(handles=handles, **look)
+            look |= {"handletextpad": 0.1, "borderaxespad": 0.1, "ncols": min(len(columns), 4)}
+            drawn_axes[0].legend(handles=handles, **look)
         else:
-            legend(found[0], new, handles, labelled=False)
-    return np.asarray(found)
+            legend(drawn_axes[0], new, handles, artists=False)
+    return np.asarray(drawn_axes)
 
 
 def _lines(axis: Any, furthest: float) -> None:
     """Lines at 0, ±1 and ±3 standard errors."""
-    for at, dash in ((0, "-"), (-1, "--"), (1, "--"), (-3, ":"), (3, ":")):
-        axis.axhline(at, c=GREY, lw=0.8, ls=dash)
+    for height, dash in ((0, "-"), (-1, "--"), (1, "--"), (-3, ":"), (3, ":")):
+        axis.axhline(height, c=GREY, lw=0.8, ls=dash)
     axis.set_ylim(-furthest, furthest)
 
 
@@ -148,25 +151,27 @@ def fit_against_data(
     or a component that does not exist, a curve of another shape, or another number of names.
     """
     _check(fit, "ts", "observed", "predicted", "errors")
-    (arc,) = chosen("arc", arc, len(fit.ts))
+    (arc,) = selected_numbers("arc", arc, len(fit.ts))
     ts = np.asarray(fit.ts[arc])
-    seen, model = (np.asarray(x[arc]).reshape(len(ts), -1) for x in (fit.observed, fit.predicted))
-    components = seen.shape[1]
-    kept = chosen("component", component, components)
-    named = labels_of(names, components, "components", "names")
+    observations, model = (
+        np.asarray(x[arc]).reshape(len(ts), -1) for x in (fit.observed, fit.predicted)
+    )
+    components = observations.shape[1]
+    columns = selected_numbers("component", component, components)
+    texts = labels_of(names, components, "components", "names")
     if component is None:
-        draw.at_most(len(COLOURS), len(kept), "components", f"component={kept[:3]}")
+        draw.at_most(len(COLOURS), len(columns), "components", f"component={columns[:3]}")
     fine, curves = (np.asarray(x, float) for x in ((ts, model) if curve is None else curve))
     shapes = f"shapes (T,) and (T, ...), with {components} components"
     fits = fine.ndim == 1 and curves.shape[:1] == fine.shape and curves[:1].size == components
     draw.check_shapes(fits, f"curve must be (times, values), {shapes}", times=fine, values=curves)
-    found = math.sqrt(fit.chi2 / max(fit.degrees_of_freedom, 1))
-    errors = np.asarray(fit.errors[arc]).reshape(seen.shape) if fit.has_errors else found
-    errors = np.broadcast_to(errors, seen.shape)
+    estimate = math.sqrt(fit.chi2 / max(fit.degrees_of_freedom, 1))
+    errors = np.asarray(fit.errors[arc]).reshape(observations.shape) if fit.has_errors else estimate
+    errors = np.broadcast_to(errors, observations.shape)
     ax, new = canvas(ax, (7.0, 4.0))
     order, curves = np.argsort(fine), curves.reshape(len(fine), -1)
-    for k in kept:
-        name = named[k] or (f"component {k}" if components > 1 else "")
+    for k in columns:
+        name = texts[k] or (f"component {k}" if components > 1 else "")
         name += ": " if name else ""
         look = _dot(k, 4 if len(ts) < 200 else 2) | {"mfc": "white", "capsize": 0}
         x, y = fine[order], curves[order, k]
@@ -175,7 +180,7 @@ def fit_against_data(
             line |= {"ls": "none", "marker": "x", "ms": 5, "zorder": 3}
         ax.plot(x, y, **line)
         look |= {"elinewidth": 0.9, "label": f"{name}observed"}
-        ax.errorbar(ts, seen[:, k], yerr=errors[:, k], **look)
+        ax.errorbar(ts, observations[:, k], yerr=errors[:, k], **look)
     title = f"arc {arc}" if len(fit.ts) > 1 else ""
     ax.set(xlabel="time t", ylabel="observed value", title=title)
     legend(ax, new)
@@ -209,31 +214,37 @@ def learning_curve(fit: Any, ax: Any = None) -> Any:
     """
     _check(fit, "history")
     columns = ("stage", "loss", "accepted", "horizon")
-    stage, loss, accepted, horizon = (np.asarray(fit.history[name]) for name in columns)
+    stage, loss, is_accepted, horizon = (np.asarray(fit.history[name]) for name in columns)
     if loss.size == 0:
         raise ValueError(
             "fit.history must have at least one step, but the fit took no step: see fit.status."
         )
     ax, new = canvas(ax)
-    steps, accepted, finite = np.arange(1, len(loss) + 1), accepted.astype(bool), np.isfinite(loss)
+    steps, is_accepted, finite = (
+        np.arange(1, len(loss) + 1),
+        is_accepted.astype(bool),
+        np.isfinite(loss),
+    )
     looks = zip(np.unique(stage), itertools.cycle(COLOURS[:-1]), itertools.cycle(MARKERS))
     for number, colour, marker in looks:
-        here = stage == number
-        until = horizon[here][0]
-        what = "all data" if np.isinf(until) else f"up to {until:.3g} after the start"
-        look = {"c": colour, "label": f"stage {int(number) + 1}: {what}"}
-        if here.sum() <= 100:
-            every = np.flatnonzero(accepted[here]).tolist()
-            look |= {"marker": marker, "ms": 4, "markevery": every}
-        ax.plot(steps[here], loss[here], **look)
+        rows = stage == number
+        end = horizon[rows][0]
+        data = "all data" if np.isinf(end) else f"up to {end:.3g} after the start"
+        look = {"c": colour, "label": f"stage {int(number) + 1}: {data}"}
+        if rows.sum() <= 100:
+            places = np.flatnonzero(is_accepted[rows]).tolist()
+            look |= {"marker": marker, "ms": 4, "markevery": places}
+        ax.plot(steps[rows], loss[rows], **look)
         if number > stage[0]:
-            ax.axvline(steps[here][0] - 0.5, c=GREY, lw=0.8, ls=":")
-    rejected: dict[str, Any] = {"c": "#000000", "ms": 6, "mew": 1.3, "zorder": 4}
-    if not accepted.all():
-        here = ~accepted & finite
-        ax.plot(steps[here], loss[here], "x", label="step rejected", **rejected)
-    for text in counted({f"of {len(loss)} losses are not finite (at the top)": np.sum(~finite)}):
-        draw.at_edge(ax, steps[~finite], "x", 0.985, label=text, **rejected)
+            ax.axvline(steps[rows][0] - 0.5, c=GREY, lw=0.8, ls=":")
+    cross: dict[str, Any] = {"c": "#000000", "ms": 6, "mew": 1.3, "zorder": 4}
+    if not is_accepted.all():
+        rows = ~is_accepted & finite
+        ax.plot(steps[rows], loss[rows], "x", label="step rejected", **cross)
+    for text in counts_text(
+        {f"of {len(loss)} losses are not finite (at the top)": np.sum(~finite)}
+    ):
+        draw.at_edge(ax, steps[~finite], "x", 0.985, label=text, **cross)
     ax.set_yscale("log" if finite.any() and loss[finite].min() > 0 else "linear")
     ax.set(xlabel="step", ylabel="loss")
     ax.xaxis.get_major_locator().set_params(integer=True)
@@ -283,18 +294,18 @@ def fit_corner(
     `ValueError` for one without a covariance, parameters that the data do not determine, and names
     that do not exist.
     """
-    wanted = "fit must be a FitResult, as dvi.fit returns it, or a dvi.Samples"
-    draw.check_attributes(fit, ("names", "x", "covariance"), wanted)
+    rule = "fit must be a FitResult, as dvi.fit returns it, or a dvi.Samples"
+    draw.check_attributes(fit, ("names", "x", "covariance"), rule)
     numbers, values = _of_parameters(fit, params)
     C, n = np.asarray(fit.covariance)[np.ix_(numbers, numbers)], len(numbers)
-    about = zip(numbers, np.sqrt(np.diag(C)).tolist(), strict=True)
-    scales = [_scale(fit.names[i], float(values[i]), sigma) for i, sigma in about]
+    errors = zip(numbers, np.sqrt(np.diag(C)).tolist(), strict=True)
+    scales = [_scale(fit.names[i], float(values[i]), sigma) for i, sigma in errors]
     draws = [None] * n if samples is None else _draws(samples, [scale.name for scale in scales])
     side = 1.3 + max(1.7, 1.9 - 0.05 * n) * n
-    what = f"in an array of shape {(n, n)} for {n} parameters"
-    found: Any = np.asarray(stack(axes, n * n, what, (side, side), ncols=n)[0]).reshape(n, n)
+    purpose = f"in an array of shape {(n, n)} for {n} parameters"
+    panels: Any = np.asarray(stack(axes, n * n, purpose, (side, side), ncols=n)[0]).reshape(n, n)
     for i, j in np.ndindex(n, n):
-        axis, x, y = found[i, j], scales[j], scales[i]
+        axis, x, y = panels[i, j], scales[j], scales[i]
         axis.grid(visible=False)
         if i < j:
             _draw_correlation(axis, C[i, j] / (x.sigma * y.sigma))
@@ -311,15 +322,15 @@ def fit_corner(
         axis.locator_params(axis="x", nbins=4)
         axis.tick_params(axis="x", labelbottom=i == n - 1)
         axis.set_xlabel(x.label if i == n - 1 else "")
-    found[0, 0].figure.align_labels()
-    return found
+    panels[0, 0].figure.align_labels()
+    return panels
 
 
 def _of_parameters(fit: Any, params: Sequence[str] | None) -> tuple[list[int], np.ndarray]:
     """(numbers of the parameters that are drawn, values of all), checked."""
     names, variances = list(fit.names), np.diag(np.asarray(fit.covariance))
-    known = [n for n, v in zip(names, variances, strict=True) if np.isfinite(v) and v > 0]
-    if not known:
+    determinate = [n for n, v in zip(names, variances, strict=True) if np.isfinite(v) and v > 0]
+    if not determinate:
         raise ValueError(
             "fit.covariance must have at least one positive and finite variance on its diagonal; "
             f"the first variances are {variances[:3].tolist()}. Possible causes: the fit failed, "
@@ -331,11 +342,11 @@ def _of_parameters(fit: Any, params: Sequence[str] | None) -> tuple[list[int], n
     params = names if params is None else [params] if isinstance(params, str) else [*params]
     if len(set(params)) < len(params) or not params or not {*params} <= {*names}:
         raise ValueError(f"params must be one or more different names from {names}, got {params}.")
-    if unknown := [name for name in params if name not in known]:
-        seen = f"{variances[names.index(unknown[0])]} for {unknown[0]!r}"
+    if indeterminate := [name for name in params if name not in determinate]:
+        variance = f"{variances[names.index(indeterminate[0])]} for {indeterminate[0]!r}"
         raise ValueError(
-            f"params must have positive and finite variances, got {seen}. The data do not "
-            f"determine it, or it is at a bound: choose params from {known}."
+            f"params must have positive and finite variances, got {variance}. The data do not "
+            f"determine it, or it is at a bound: choose params from {determinate}."
         )
     values = np.asarray(fit.x if np.ndim(fit.x) == 1 else fit.mean)
     return [names.index(n) for n in params], values
@@ -343,14 +354,14 @@ def _of_parameters(fit: Any, params: Sequence[str] | None) -> tuple[list[int], n
 
 def _draws(samples: Any, names: list[str]) -> list[np.ndarray]:
     """Draws of each of the names, flat."""
-    found = getattr(samples, "samples", samples)
-    instance("samples", found, Mapping, "a dvi.Samples or a dict of names with arrays of draws")
-    if missing := [name for name in names if name not in found]:
+    arrays = getattr(samples, "samples", samples)
+    instance("samples", arrays, Mapping, "a dvi.Samples or a dict of names with arrays of draws")
+    if absent := [name for name in names if name not in arrays]:
         raise ValueError(
-            f"samples must have draws of each of params, {names}, got only the names {[*found]}: "
-            f"add draws of {missing[0]!r}, or choose params without it."
+            f"samples must have draws of each of params, {names}, got only the names {[*arrays]}: "
+            f"add draws of {absent[0]!r}, or choose params without it."
         )
-    flat = [np.ravel(np.asarray(found[n], float)) for n in names]
+    flat = [np.ravel(np.asarray(arrays[n], float)) for n in names]
     if len({len(f) for f in flat}) > 1:
         raise ValueError(
             "samples must have the same number of draws for each of params, got "
@@ -361,11 +372,11 @@ def _draws(samples: Any, names: list[str]) -> list[np.ndarray]:
 
 def _scale(name: str, value: float, sigma: float) -> _Scale:
     """Ticks of few digits: counted from the value where it has many more than its error."""
-    near = abs(value) < 30 * sigma
-    exponent = math.floor(math.log10(_WIDE * sigma + (abs(value) if near else 0.0)))
+    has_few_digits = abs(value) < 30 * sigma
+    exponent = math.floor(math.log10(_WIDE * sigma + (abs(value) if has_few_digits else 0.0)))
     exponent = 0 if -2 <= exponent <= 2 else exponent
     zero, label = 0.0, name
-    if not near:
+    if not has_few_digits:
         place = math.floor(math.log10(sigma)) - 1  # that of the last significant digit
         zero, size = round(value, -place), math.floor(math.log10(abs(value)))
         form = f".{max(0, -place)}f" if -4 <= size <= 6 else f".{max(0, size - place)}e"
@@ -391,7 +402,7 @@ def _draw_marginal(axis: Any, scale: _Scale, draws: np.ndarray | None) -> None:
     size = math.floor(math.log10(abs(scale.value))) if scale.value else 0
     fixed = 0 <= digits <= 7 and size <= 6
     forms = (f".{digits}f",) * 2 if fixed else (f".{max(size + digits, 1)}e", ".1e")
-    text = f"{signed(scale.value, forms[0])} ± {signed(scale.sigma, forms[1])}"
+    text = f"{sign_text(scale.value, forms[0])} ± {sign_text(scale.sigma, forms[1])}"
     axis.set_title(f"{scale.name}\n{text}", fontsize=9, loc="center")
 
 
@@ -418,6 +429,6 @@ def _draw_correlation(axis: Any, value: float) -> None:
     axis.set(xticks=[], yticks=[])
     axis.spines[:].set_visible(False)
     digits = 2 if abs(value) < 0.995 else 4
-    text = signed(value, f"+.{digits}f") if abs(value) >= 0.005 else "0.00"
+    text = sign_text(value, f"+.{digits}f") if abs(value) >= 0.005 else "0.00"
     look: Any = {"ha": "center", "va": "center", "fontsize": 9 + 4 * abs(value)}
     axis.text(0.5, 0.5, text, transform=axis.transAxes, **look)

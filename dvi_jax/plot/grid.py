@@ -10,7 +10,7 @@ from matplotlib.ticker import LogFormatterMathtext, LogLocator
 from ..base.checks import instance
 from .axes import at_most, canvas, cell_edges, stack
 from .blocks import Bins, make_bins
-from .style import check_keywords, named
+from .style import check_keywords, with_unit
 
 _WHERE: dict[str, Any] = {"facet": None, "over": (), "pixels": (480, 320)}
 """Keywords of all maps; the largest number of pixels in x and y."""
@@ -36,15 +36,15 @@ class Place(NamedTuple):
     zero: float | None = None
     names: tuple[np.ndarray, list[str]] | None = None
 
-    def dress(self, axis: Any, which: str) -> None:
+    def dress(self, axis: Any, letter: str) -> None:
         """Set the scale, the limits, the label and the ticks of the x or y axis."""
-        ticks = getattr(axis, f"set_{which}ticks")
+        ticks = getattr(axis, f"set_{letter}ticks")
         if self.log:
-            axis.set(**{f"{which}scale": "log"})
-        axis.set(**{f"{which}lim": tuple(self.edges[[0, -1]]), f"{which}label": self.label})
+            axis.set(**{f"{letter}scale": "log"})
+        axis.set(**{f"{letter}lim": tuple(self.edges[[0, -1]]), f"{letter}label": self.label})
         if self.names is not None:
             positions, texts = self.names
-            long = which == "x" and sum(map(len, texts)) > 60
+            long = letter == "x" and sum(map(len, texts)) > 60
             turn = {"rotation": 30, "ha": "right", "rotation_mode": "anchor"} if long else {}
             ticks(positions, texts, **turn)
         if self.zero is not None:
@@ -71,10 +71,10 @@ def find_place(data: Any, name: str, pixels: int) -> Place:
         values, label = data.coords[name].values, label_of(data.coords[name], name)
     numbers = values is not None and values.dtype.kind in "iuf" and np.isfinite(values).all()
     if values is None or not numbers or len(np.unique(values)) < size:
-        bins, every = make_bins(size, pixels), -(-size // _MOST_NAMES)
+        bins, stride = make_bins(size, pixels), -(-size // _MOST_NAMES)
         edges = bins.ends - 0.5
-        texts = None if values is None else [_short(v) for v in values[::every]]
-        names = None if texts is None else (np.arange(0, size, every), texts)
+        texts = None if values is None else [_short(v) for v in values[::stride]]
+        names = None if texts is None else (np.arange(0, size, stride), texts)
         return Place(dim, label, bins, edges, (edges[1:] + edges[:-1]) / 2, names=names)
     rising = bool((np.diff(values) > 0).all())
     order = None if rising else np.argsort(values, kind="stable")
@@ -109,15 +109,17 @@ def dim_of(data: Any, name: str, role: str = "each of x, y, facet, over and alon
 def names_of(data: Any) -> str:
     """Names that can be an axis, for an error message."""
     sizes = ", ".join(f"{d} ({n})" for d, n in data.sizes.items())
-    others = [str(c) for c in data.coords if c not in data.dims and data.coords[c].ndim == 1]
-    return (sizes or "none") + (f", with the coordinates {', '.join(others)}" if others else "")
+    coordinates = [str(c) for c in data.coords if c not in data.dims and data.coords[c].ndim == 1]
+    return (sizes or "none") + (
+        f", with the coordinates {', '.join(coordinates)}" if coordinates else ""
+    )
 
 
 def label_of(variable: Any, name: Any) -> str:
     """The long name of a variable, or its name as it is usually written, with its units."""
     attributes = variable.attrs if variable is not None else {}
     text = attributes.get("long_name") or _GREEK.get(str(name)) or str(name).replace("_", " ")
-    return named(text, attributes.get("units"))
+    return with_unit(text, attributes.get("units"))
 
 
 def _is_log(x: np.ndarray) -> bool:
@@ -189,16 +191,16 @@ class Grid(NamedTuple):
 
 
 def arrange(
-    data: Any, x: str | None, y: str | None, where: Mapping[str, Any], made: Any = None
+    data: Any, x: str | None, y: str | None, where: Mapping[str, Any], replacements: Any = None
 ) -> Grid:
     """Assign dimensions to x, y and facets; those that are not named become x and y in turn.
 
-    `made`: name → array that replaces that of the data for the search of its axis; None for a
+    `replacements`: name → array that replaces that of the data for its axis; None for a
     dimension that does not appear. **Raises** `ValueError` for a dimension that does not exist, is
     named twice, or is in excess.
     """
     check_keywords(where, *_WHERE)
-    facet, over, pixels = (where.get(k, v) for k, v in _WHERE.items())
+    facet, reduced_names, pixels = (where.get(k, v) for k, v in _WHERE.items())
     width, height = two_numbers(pixels)
     if not (width >= 1 and height >= 1):
         raise ValueError(f"pixels must be (width, height), both at least 1, got {pixels!r}.")
@@ -207,20 +209,20 @@ def arrange(
             "data must have at least one value along each dimension, got size 0 along "
             f"{', '.join(map(repr, empty))}. Change the selection, so that it is not empty."
         )
-    over = (over,) if isinstance(over, str) else tuple(over)
-    roles = {"x": x, "y": y, "facet": facet, **{f"over={name!r}": name for name in over}}
-    taken: dict[str, str] = {}
+    reduced_names = (reduced_names,) if isinstance(reduced_names, str) else tuple(reduced_names)
+    roles = {"x": x, "y": y, "facet": facet, **{f"over={name!r}": name for name in reduced_names}}
+    roles_of: dict[str, str] = {}
     for role, name in roles.items():
         dim = None if name is None else dim_of(data, name, role.partition("=")[0])
-        if dim in taken:
+        if dim in roles_of:
             raise ValueError(
-                f"{role} and {taken[dim]} must use different dimensions of the data, but both use "
+                f"{role} and {roles_of[dim]} must use different dimensions, but both use "
                 f"{dim!r}: change one of them."
             )
-        taken |= {} if dim is None else {dim: role}
-    made = made or {}
-    gone = [dim_of(data, name) for name, array in made.items() if array is None]
-    left = [str(d) for d in data.dims if d not in taken and d not in gone]
+        roles_of |= {} if dim is None else {dim: role}
+    replacements = replacements or {}
+    absent = [dim_of(data, name) for name, array in replacements.items() if array is None]
+    left = [str(d) for d in data.dims if d not in roles_of and d not in absent]
     free = [d for d in left if data.sizes[d] > 1]
     if x is None:
         x, y = (free.pop(0), y) if free else (y, None)
@@ -230,7 +232,7 @@ def arrange(
         raise ValueError(
             "data must have a dimension of size 2 or more for x that is not used otherwise. The "
             f"dimensions (with their sizes) are {names_of(data)}; used: "
-            f"{[*taken, *gone] or 'none'}. Remove a dimension from facet or over, or use data "
+            f"{[*roles_of, *absent] or 'none'}. Remove a dimension from facet or over, or use data "
             "with one more dimension."
         )
     if free:
@@ -238,13 +240,13 @@ def arrange(
             f"a map has two dimensions, here {x!r} and {y!r}, but data also has "
             f"{', '.join(map(repr, free))}. Select one value with "
             f"data.isel({', '.join(f'{d}=0' for d in free)}), or reduce all values with "
-            f"over={[*over, *free]}. With facet, each value of one dimension has its own map."
+            f"over={[*reduced_names, *free]}. With facet, each value has its own map."
         )
     data = data.isel({d: 0 for d in left if data.sizes[d] == 1})
-    along: dict[Any, Any] = dict.fromkeys((x, y), data) | made
-    along_x = find_place(along[x], x, int(width))
-    along_y = None if y is None else find_place(along[y], y, int(height))
-    dims = tuple(dim_of(data, name) for name in over)
+    arrays: dict[Any, Any] = dict.fromkeys((x, y), data) | replacements
+    along_x = find_place(arrays[x], x, int(width))
+    along_y = None if y is None else find_place(arrays[y], y, int(height))
+    dims = tuple(dim_of(data, name) for name in reduced_names)
     return Grid(_panels(data, facet), along_x, along_y, dims, facet)
 
 
@@ -262,8 +264,8 @@ def _panels(data: Any, facet: str | None) -> list[tuple[str, Any]]:
         return [("", data)]
     dim = dim_of(data, facet)
     count = data.sizes[dim]
-    some = f"data.isel({dim}=slice(None, None, {-(-count // _MOST_PANELS)}))"
-    at_most(_MOST_PANELS, count, f"values of facet={facet!r}", some)
+    selection = f"data.isel({dim}=slice(None, None, {-(-count // _MOST_PANELS)}))"
+    at_most(_MOST_PANELS, count, f"values of facet={facet!r}", selection)
     coordinate = data.coords.get(facet)
     name, _, units = label_of(coordinate, facet).partition(" [")
     values = np.arange(count) if coordinate is None else coordinate.values

@@ -11,8 +11,18 @@ from matplotlib.ticker import MaxNLocator
 
 from ..base.checks import positive, whole
 from .axes import at_most, canvas, entry, labels_of, legend, path, stack
-from .states import Lane, Looks, chosen, indexed, lanes_of, looks_of, one_shape, place_in, troubles
-from .style import COLOURS, CROSS, DASHES, MARKS, STAR, START, in_style, look_of, named
+from .states import (
+    Lane,
+    Looks,
+    index_label,
+    lanes_of,
+    looks_of,
+    one_shape,
+    place_in,
+    selected_numbers,
+    troubles,
+)
+from .style import COLOURS, CROSS, DASHES, MARKS, STAR, START, in_style, look_of, with_unit
 
 _PANELS, _MARKS, _MESH, _NARROW = 6, 9, 161, 0.45
 """Largest number of panels without a selection; markers along a line; points of a side of the mesh
@@ -61,8 +71,8 @@ def phase_portrait(
     axes, new = stack(look.ax, count, "one for each degree of freedom", size, columns)
     for axis, plane in zip(axes, planes, strict=True):
         for i, lane in enumerate(lanes):
-            q, p = plane.of(lane)
-            _draw_orbit(axis, lane, _folded(q, p, period), looks, i, dots)
+            q, p = plane.coordinates_of(lane)
+            _draw_orbit(axis, lane, _fold(q, p, period), looks, i, dots)
         plane.name_axes(axis, look.units)
         if period is not None:
             axis.set_xlim(-period / 2, period / 2)
@@ -81,17 +91,19 @@ def phase_portrait(
 def _planes(shape: tuple[int, ...], dof: Any) -> list["Plane"]:
     places = list(np.ndindex(shape))
     if dof is not None:
-        places = [place_in("dof", shape, one) for one in (dof if isinstance(dof, list) else [dof])]
+        places = [
+            place_in("dof", shape, index) for index in (dof if isinstance(dof, list) else [dof])
+        ]
     else:
-        some = "0, 1" if len(shape) == 1 else "(0, 0), (0, 1)"
-        at_most(_PANELS, len(places), "degrees of freedom", f"dof=[{some}]")
+        example = "0, 1" if len(shape) == 1 else "(0, 0), (0, 1)"
+        at_most(_PANELS, len(places), "degrees of freedom", f"dof=[{example}]")
     if not places:
         first = 0 if len(shape) == 1 else (0,) * len(shape)
         raise ValueError(f"dof is empty: choose a degree of freedom, such as dof=[{first}].")
     return [Plane(place, shape) for place in places]
 
 
-def _folded(q: np.ndarray, p: np.ndarray, period: float | None) -> tuple[np.ndarray, np.ndarray]:
+def _fold(q: np.ndarray, p: np.ndarray, period: float | None) -> tuple[np.ndarray, np.ndarray]:
     """An angle within one period, with a gap where it goes round."""
     if period is None:
         return q, p
@@ -105,7 +117,7 @@ def _draw_orbit(
     axis: Any, lane: Lane, xy: Sequence[np.ndarray], looks: Looks, i: int, dots: bool
 ) -> None:
     """A line with a circle at its start, and a cross at its end if that came too early."""
-    look, n, many = looks.line(i, 1.0), len(xy[0]), len(looks.colours)
+    look, n, count = looks.line(i, 1.0), len(xy[0]), len(looks.colours)
     look["label"] = lane.label or None
     if dots:
         look |= {"ls": "none", "marker": "o", "mew": 0}
@@ -113,11 +125,11 @@ def _draw_orbit(
     else:
         # Where an orbit retraces itself its dashes overlap to a full line, and only markers
         # distinguish it in a print without colours.
-        if 1 < many <= len(COLOURS) and looks.scale is None:
-            marks = _spread(xy, n // _MARKS * (2 * i + 1) // (2 * many))
+        if 1 < count <= len(COLOURS) and looks.scale is None:
+            marks = _spread(xy, n // _MARKS * (2 * i + 1) // (2 * count))
             look |= {"marker": MARKS[i], "marks": marks, "ms": 4.5}
         path(axis, *xy, **look)
-    if many <= len(COLOURS):
+    if count <= len(COLOURS):
         axis.plot(*(x[:1] for x in xy), color=looks.colours[i], zorder=3, **START)
     if lane.trouble:
         finite = np.flatnonzero(np.logical_and.reduce([np.isfinite(x) for x in xy]))[-1:]
@@ -130,19 +142,19 @@ def _spread(xy: Sequence[np.ndarray], first: int) -> list[int]:
     Equal steps in time would put them on top of one another where an orbit retraces itself.
     """
     points = np.stack(xy)
-    known = np.flatnonzero(np.isfinite(points).all(axis=0))
-    known = known[:: max(1, len(known) // 2000)]
-    if not known.size:
+    finite = np.flatnonzero(np.isfinite(points).all(axis=0))
+    finite = finite[:: max(1, len(finite) // 2000)]
+    if not finite.size:
         return []
-    size = np.ptp(points[:, known], axis=1, keepdims=True)
-    points = points[:, known] / np.where(size > 0, size, 1.0)
-    found = [min(int(np.searchsorted(known, first)), len(known) - 1)]
-    distance = np.full(len(known), np.inf)
-    while len(found) < min(_MARKS, len(known)):
-        away = np.linalg.norm(points - points[:, found[-1:]], axis=0)
-        distance = np.minimum(distance, away)
-        found.append(int(np.argmax(distance)))
-    return known[found].tolist()
+    size = np.ptp(points[:, finite], axis=1, keepdims=True)
+    points = points[:, finite] / np.where(size > 0, size, 1.0)
+    places = [min(int(np.searchsorted(finite, first)), len(finite) - 1)]
+    distance = np.full(len(finite), np.inf)
+    while len(places) < min(_MARKS, len(finite)):
+        gaps = np.linalg.norm(points - points[:, places[-1:]], axis=0)
+        distance = np.minimum(distance, gaps)
+        places.append(int(np.argmax(distance)))
+    return finite[places].tolist()
 
 
 def _entries(lanes: Sequence[Lane], looks: Looks) -> list[Any]:
@@ -210,7 +222,7 @@ def orbit(
     axis, new = canvas(look.ax, (5.4, 5.0), len(view.coordinates) == 3)
     for i, k, number, name in view.lines(lanes):
         lane = lanes[i]._replace(label=name)
-        _draw_orbit(axis, lane, view.of(lane, k), looks, number, dots)
+        _draw_orbit(axis, lane, view.coordinates_of(lane, k), looks, number, dots)
     if view.mark is not None:
         axis.plot(*([x] for x in view.mark), label=view.mark_name, **STAR)
     view.name_axes(axis, look.units)
@@ -226,7 +238,7 @@ class Plane(NamedTuple):
     coordinates: tuple[int, ...] = (0, 1)
     mark: None = None
 
-    def of(self, lane: Lane, k: int = 0) -> Any:
+    def coordinates_of(self, lane: Lane, k: int = 0) -> Any:
         """(q, p) along an orbit, shape (S,) each."""
         if lane.ps is None:
             raise TypeError(
@@ -240,46 +252,46 @@ class Plane(NamedTuple):
         return ((i, 0, i, lane.label) for i, lane in enumerate(lanes))
 
     def name_axes(self, axis: Any, units: Mapping[str, str]) -> None:
-        for which, name in (("x", "q"), ("y", "p")):
-            label = named(indexed(name, self.place, self.shape), units.get(name))
-            axis.set(**{f"{which}label": label})
+        for letter, name in (("x", "q"), ("y", "p")):
+            label = with_unit(index_label(name, self.place, self.shape), units.get(name))
+            axis.set(**{f"{letter}label": label})
 
 
 class View(NamedTuple):
     """Which coordinates of which bodies are drawn, relative to which point.
 
-    `many`: whether a state has bodies; `about`: number of the body at the origin, or None; `mark`:
-    the point that has a star, or None.
+    `has_bodies`: whether a state has bodies; `origin`: number of the body at the origin, or None;
+    `mark`: the point that has a star, or None.
     """
 
     coordinates: tuple[int, ...]
     bodies: list[int]
     names: list[str]
-    many: bool
-    about: int | None = None
+    has_bodies: bool
+    origin: int | None = None
     mark: np.ndarray | None = None
     mark_name: str = "centre"
 
-    def of(self, lane: Lane, k: int) -> list[np.ndarray]:
+    def coordinates_of(self, lane: Lane, k: int) -> list[np.ndarray]:
         """Coordinates of drawn body number k, shape (S,) each."""
-        x = lane.qs[:, self.bodies[k]] if self.many else lane.qs
-        if self.about is not None:
-            x = x - lane.qs[:, self.about]
+        x = lane.qs[:, self.bodies[k]] if self.has_bodies else lane.qs
+        if self.origin is not None:
+            x = x - lane.qs[:, self.origin]
         return [x[:, c] for c in self.coordinates]
 
     def lines(self, lanes: Sequence[Lane]) -> Iterator[tuple[int, int, int, str]]:
         """(number of the orbit, of the drawn body, of the colour; name) of every line."""
-        several = len(lanes) > 1  # then a colour is an orbit, else a body
+        is_batch = len(lanes) > 1  # then a colour is an orbit, else a body
         for i, k in np.ndindex(len(lanes), len(self.bodies)):
-            yield i, k, i if several else k, self.names[k] or (lanes[i].label if k == 0 else "")
+            yield i, k, i if is_batch else k, self.names[k] or (lanes[i].label if k == 0 else "")
 
     def name_axes(self, axis: Any, units: Mapping[str, str]) -> None:
         """Set the names of the axes, and one scale for all."""
-        for which, c in zip("xyz", self.coordinates, strict=False):
-            name = "xyz"[c] if self.many else indexed("q", (c,), (2,))
-            if self.about is not None:
-                name += f" − {name}$_{{{self.about + 1}}}$"
-            axis.set(**{f"{which}label": named(name, units.get("q"))})
+        for letter, c in zip("xyz", self.coordinates, strict=False):
+            name = "xyz"[c] if self.has_bodies else index_label("q", (c,), (2,))
+            if self.origin is not None:
+                name += f" − {name}$_{{{self.origin + 1}}}$"
+            axis.set(**{f"{letter}label": with_unit(name, units.get("q"))})
         if len(self.coordinates) == 2:
             axis.set_aspect("equal", adjustable="datalim")
             return
@@ -287,10 +299,10 @@ class View(NamedTuple):
         limits = np.asarray([axis.get_xlim(), axis.get_ylim(), axis.get_zlim()])
         wide = np.ptp(limits, axis=1)
         sides = np.maximum(wide, _NARROW * wide.max())
-        for which, middle, side in zip("xyz", limits.mean(1), sides, strict=True):
-            axis.set(**{f"{which}lim": (middle - side / 2, middle + side / 2)})
+        for letter, middle, side in zip("xyz", limits.mean(1), sides, strict=True):
+            axis.set(**{f"{letter}lim": (middle - side / 2, middle + side / 2)})
             bins = int(np.clip(round(6 * side / wide.max()), 3, 6))
-            getattr(axis, f"{which}axis").set_major_locator(MaxNLocator(bins))
+            getattr(axis, f"{letter}axis").set_major_locator(MaxNLocator(bins))
         # A smaller box, so that the labels fit into the figure.
         axis.set_box_aspect(sides, zoom=0.84)
         axis.zaxis.labelpad = 9
@@ -302,34 +314,36 @@ def view_of(
     """The checked choice of what is drawn of orbits."""
     shape = one_shape(lanes)
     if names is not None and (len(lanes) > 1 or math.prod(shape) == 1):
-        seen = f"{len(lanes)} orbits" if len(lanes) > 1 else f"states of shape {shape}"
+        cause = f"{len(lanes)} orbits" if len(lanes) > 1 else f"states of shape {shape}"
         raise ValueError(
-            f"names requires a single orbit with states of at least two numbers, got {seen}: use "
+            f"names requires a single orbit with states of at least two numbers, got {cause}: use "
             "labels=[...] to name orbits."
         )
     if len(shape) not in (1, 2):
         raise ValueError(f"orbits must have states of shape (n,) or (bodies, dim), got {shape}.")
-    many, dim, count = len(shape) == 2, shape[-1], shape[0] if len(shape) == 2 else 1
-    axes = tuple(chosen("coordinates", coordinates, dim))
+    has_bodies, dim, count = len(shape) == 2, shape[-1], shape[0] if len(shape) == 2 else 1
+    axes = tuple(selected_numbers("coordinates", coordinates, dim))
     if len(axes) not in (2, 3):
-        one = "For a single coordinate use phase_portrait, which requires momenta."
+        advice = "For a single coordinate use phase_portrait, which requires momenta."
         raise ValueError(
             f"coordinates must select two or three coordinates, got {len(axes)} for states of "
-            f"shape {shape}. {'Choose for example coordinates=(0, 1).' if dim > 1 else one}"
+            f"shape {shape}. {'Choose for example coordinates=(0, 1).' if dim > 1 else advice}"
         )
-    drawn = chosen("bodies", bodies, count)
-    view = View(axes, drawn, [], many)
-    if isinstance(centre, int | np.integer) and many:
-        about = whole("centre", centre, 0, count - 1)
-        view = view._replace(about=about, mark=np.zeros(len(axes)), mark_name=f"body {about + 1}")
-        drawn = [b for b in drawn if b != about] if bodies is None else drawn
+    numbers = selected_numbers("bodies", bodies, count)
+    view = View(axes, numbers, [], has_bodies)
+    if isinstance(centre, int | np.integer) and has_bodies:
+        origin = whole("centre", centre, 0, count - 1)
+        view = view._replace(
+            origin=origin, mark=np.zeros(len(axes)), mark_name=f"body {origin + 1}"
+        )
+        numbers = [b for b in numbers if b != origin] if bodies is None else numbers
     elif centre is not None:
         point = np.asarray(centre, float)
         if point.shape != (dim,):
-            body = f"the number of a body (0 to {count - 1}) or " if many else ""
+            body = f"the number of a body (0 to {count - 1}) or " if has_bodies else ""
             raise ValueError(f"centre must be {body}a point of shape {(dim,)}, got {centre!r}.")
         view = view._replace(mark=point[list(axes)])
-    return view._replace(bodies=drawn, names=labels_of(names, len(drawn), "bodies", "names"))
+    return view._replace(bodies=numbers, names=labels_of(names, len(numbers), "bodies", "names"))
 
 
 @in_style
@@ -364,8 +378,8 @@ def trajectory(
     assert p is not None
     units, shape = {"q": position or "", "p": momentum or ""}, q.shape[1:]
     if math.prod(shape) == 1:
-        one = t, q.reshape(-1, 1), p.reshape(-1, 1)
-        return phase_portrait(one, dots=True, units=units, title=title, ax=ax)
+        arrays = t, q.reshape(-1, 1), p.reshape(-1, 1)
+        return phase_portrait(arrays, dots=True, units=units, title=title, ax=ax)
     if shape == (2,) or (len(shape) == 2 and shape[-1] in (2, 3)):
         return orbit((t, q), (0, 1), units=units, title=title, ax=ax)
     axis, new = canvas(ax, (6.4, 4.2))
@@ -374,6 +388,6 @@ def trajectory(
         look: Any = {"color": COLOURS[i % len(COLOURS)], "ls": DASHES[i % len(DASHES)]}
         label = f"q$_{{{i + 1}}}$" if flat.shape[1] <= 12 else None
         path(axis, t, values, lw=1, label=label, **look)
-    axis.set(xlabel=time, ylabel=named("q", position), title=title)
+    axis.set(xlabel=time, ylabel=with_unit("q", position), title=title)
     legend(axis, new, troubles(lanes))
     return axis

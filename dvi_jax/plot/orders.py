@@ -11,8 +11,8 @@ from matplotlib.patches import Patch
 from ..base.checks import one_of
 from ..discover import DriftOrder, DriftSurface
 from . import axes as draw
-from .axes import canvas, counted, entry, legend, stack
-from .style import COLOURS, DASHES, MARKERS, SMALL, ZERO, in_style, named, signed
+from .axes import canvas, counts_text, entry, legend, stack
+from .style import COLOURS, DASHES, MARKERS, SMALL, ZERO, in_style, sign_text, with_unit
 
 _HATCHES = ("", "////", "....", "\\\\\\\\", "xxxx", "++++")
 _CAUSES = ("symmetry", "work", "lattice")
@@ -50,35 +50,35 @@ def balance(
         causes = {name: getattr(ts, name) for name in _CAUSES} if causes is None else causes
         ts, drift = ts.ts, ts.drift if drift is None else drift
     if drift is None or not causes:
-        name, seen = ("drift", drift) if drift is None else ("causes", causes)
+        name, value = ("drift", drift) if drift is None else ("causes", causes)
         raise TypeError(
-            f"{name} must be given if ts is an array of times, got {name}={seen!r}. A result of "
+            f"{name} must be given if ts is an array of times, got {name}={value!r}. A result of "
             "dvi.noether_balance as ts requires neither drift nor causes."
         )
-    given = {"ts": ts, "drift": drift, **causes}
-    arrays = {name: np.asarray(x, float) for name, x in given.items()}
+    inputs = {"ts": ts, "drift": drift, **causes}
+    arrays = {name: np.asarray(x, float) for name, x in inputs.items()}
     fits = np.shape(ts) == (np.size(ts),) and len({x.shape for x in arrays.values()}) == 1
     draw.check_shapes(fits, "ts, drift and causes must have the same shape (S,)", **arrays)
     t = arrays.pop("ts")
     if cumulative:
         arrays = {k: np.append(0.0, np.cumsum(x[:-1] * np.diff(t))) for k, x in arrays.items()}
     rate = arrays.pop("drift")
-    ratios, what = (3, 1), "the stack and the residual"
-    (top, bottom), new = stack(ax, 2, what, (6.4, 4.6), sharex=True, height_ratios=ratios)
-    up = down = np.zeros(len(t))
+    ratios, purpose = (3, 1), "the stack and the residual"
+    (top, bottom), new = stack(ax, 2, purpose, (6.4, 4.6), sharex=True, height_ratios=ratios)
+    top_edge = bottom_edge = np.zeros(len(t))
     # Hatches distinguish the areas in print without colours.
     looks = itertools.cycle(zip(COLOURS[:-1], _HATCHES, strict=True))
     for (label, values), (colour, hatch) in zip(arrays.items(), looks, strict=False):
         look = {"facecolor": colour, "hatch": hatch, "edgecolor": "#ffffff", "lw": 0}
-        higher, lower = up + np.maximum(values, 0), down + np.minimum(values, 0)
-        top.fill_between(t, up, higher, label=label, **look)
-        top.fill_between(t, lower, down, **look)
-        up, down = higher, lower
+        higher, lower = top_edge + np.maximum(values, 0), bottom_edge + np.minimum(values, 0)
+        top.fill_between(t, top_edge, higher, label=label, **look)
+        top.fill_between(t, lower, bottom_edge, **look)
+        top_edge, bottom_edge = higher, lower
     top.plot(t, rate, color="#000000", lw=0.9, label="drift")
     residual = rate - sum(arrays.values(), np.zeros(len(t)))
     bottom.plot(t, residual, color="#000000", lw=0.7)
     top.axhline(0, color="#000000", lw=0.5)
-    top.set(ylabel=named("change" if cumulative else "rate of change", unit), title=title)
+    top.set(ylabel=with_unit("change" if cumulative else "rate of change", unit), title=title)
     bottom.set(xlabel=time, ylabel="drift − sum")
     legend(top, new)
     top.figure.align_ylabels([top, bottom])
@@ -113,8 +113,8 @@ def drift_orders(
     elif not isinstance(results, Mapping):
         results = {f"observable {i}": order for i, order in enumerate(results, 1)}
     for order in results.values():
-        wanted = "results must be one dvi.DriftOrder, or a dict or a sequence of them"
-        draw.check_attributes(order, ("drifts", "epsilons"), wanted)
+        rule = "results must be one dvi.DriftOrder, or a dict or a sequence of them"
+        draw.check_attributes(order, ("drifts", "epsilons"), rule)
     slopes = [*promised] if isinstance(promised, Sequence) else [promised] * len(results)
     if len(slopes) != len(results):
         raise ValueError(
@@ -124,31 +124,31 @@ def drift_orders(
     axis, new = canvas(ax, (6.4, 4.8))
     left = 0.7 * min(order.epsilons.min() for order in results.values())
     looks = zip(results.items(), slopes, itertools.cycle(COLOURS), itertools.cycle(MARKERS))
-    lost, total, excluded = np.zeros(2, int), 0, False
+    outliers, total, has_excluded = np.zeros(2, int), 0, False
     for (label, order), slope, colour, marker in looks:
-        x, y, used = order.epsilons, np.asarray(order.drifts), order.used
-        out = np.isfinite(y) & (y > 0) & ~used
-        excluded |= bool(out.any())
+        x, y, in_fit = order.epsilons, np.asarray(order.drifts), order.used
+        out = np.isfinite(y) & (y > 0) & ~in_fit
+        has_excluded |= bool(out.any())
         look = {"ls": "none", "color": colour, "marker": marker}
-        axis.loglog(x[used], y[used], **look)
+        axis.loglog(x[in_fit], y[in_fit], **look)
         axis.loglog(x[out], y[out], mfc="white", **look)
         text = f"{label}: {_slope_text(order)}" + ("" if slope is None else f", expected {slope:g}")
-        axis.plot([], [], mfc=colour if used.any() else "white", label=text, **look)
+        axis.plot([], [], mfc=colour if in_fit.any() else "white", label=text, **look)
         # The drift at ε = 0 is a bar at the left end of the axis.
         if np.isfinite(order.floor) and order.floor > 0:
             axis.plot(left, order.floor, color=colour, **_BAR)
-        if slope is not None and used.any():
-            first = np.argmin(np.where(used, x, np.inf))
+        if slope is not None and in_fit.any():
+            first = np.argmin(np.where(in_fit, x, np.inf))
             draw.guide(axis, (x[first], x.max()), y[first], slope, zorder=1)
-        lost += draw.without_place(axis, np.append(x, left), np.append(y, order.floor), colour)
+        outliers += draw.without_place(axis, np.append(x, left), np.append(y, order.floor), colour)
         total += len(y) + 1
     axis.set(xscale="log", yscale="log", xlabel=_EPSILON, ylabel="largest drift", title=title)
     marks: Any = {"color": "#444444", "ls": "none"}
     hollow = marks | {"marker": "o", "mfc": "white"}
     extra = [entry("expected slope", **draw.GUIDE)] if promised is not None else []
-    extra += [entry("excluded from the fit", **hollow)] if excluded else []
+    extra += [entry("excluded from the fit", **hollow)] if has_excluded else []
     extra.append(entry("at ε = 0", **marks | _BAR))
-    extra += draw.without_place_entries(lost, total, "drifts failed", "drifts are exactly 0")
+    extra += draw.without_place_entries(outliers, total, "drifts failed", "drifts are exactly 0")
     legend(axis, new, extra)
     return axis
 
@@ -179,8 +179,8 @@ def drift_surface(
     are black. Those that failed are hatched; the legend counts both. **Returns** the `Axes`, shape
     (2,).
     """
-    ratios, what = (5, 4), "the drifts and their orders"
-    (left, right), new = stack(ax, 2, what, (9.6, 4.2), ncols=2, width_ratios=ratios)
+    ratios, purpose = (5, 4), "the drifts and their orders"
+    (left, right), new = stack(ax, 2, purpose, (9.6, 4.2), ncols=2, width_ratios=ratios)
     edges = draw.cell_edges(surface.epsilons, log=True), draw.cell_edges(surface.hs, log=True)
     entries = _draw_drifts(left, surface, edges)
     left.set(xscale="log", yscale="log", xlabel=_EPSILON, ylabel="step size h", title=title)
@@ -188,7 +188,7 @@ def drift_surface(
     right.set(xscale="log", xlabel="step size h", ylabel="order in ε", title="Order in ε")
     right.set_xlim(*edges[1][[0, -1]])
     orders = right.get_legend_handles_labels()[0]
-    legend(left, new, entries + (orders if new else []), labelled=False)
+    legend(left, new, entries + (orders if new else []), artists=False)
     if not new:
         legend(right, new)
     return np.asarray([left, right])
@@ -197,51 +197,51 @@ def drift_surface(
 def _draw_drifts(axis: Any, surface: DriftSurface, edges: Any) -> list[Any]:
     """A map of the drifts, with dots where they are excluded from the fits; its legend entries."""
     drifts = np.asarray(surface.drifts)
-    zero, failed = drifts == 0, ~np.isfinite(drifts)
-    norm = None if (zero | failed).all() else LogNorm()
+    zero, invalid = drifts == 0, ~np.isfinite(drifts)
+    norm = None if (zero | invalid).all() else LogNorm()
     x, y = edges
     image = draw.cells(axis, x, y, np.where(zero, np.nan, drifts).T, norm, draw.SHADES)
     axis.figure.colorbar(image, ax=axis, label="largest drift")
     draw.flat_cells(axis, x, y, zero.T, ZERO)
     entries: list[Any] = []
-    i, j = np.nonzero(~surface.used & ~failed)
+    i, j = np.nonzero(~surface.used & ~invalid)
     if len(i):
         look: Any = {"color": "black", "mfc": "white", "ms": 4}
         look |= {"mew": 0.8, "label": "excluded from the fit"}
         entries += axis.plot(surface.epsilons[i], surface.hs[j], "o", **look)
     black: dict[str, Any] = {"color": ZERO}
-    for where, text, look in ((zero, "exactly 0", black), (failed, "failed", draw.HATCH)):
-        counts = counted({f"of {drifts.size} {text}": where.sum()})
+    for where, text, look in ((zero, "exactly 0", black), (invalid, "failed", draw.HATCH)):
+        counts = counts_text({f"of {drifts.size} {text}": where.sum()})
         entries += [Patch(label=label, **look) for label in counts]
     return entries
 
 
-def _draw_orders_in_epsilon(axis: Any, surface: DriftSurface, promised: float | None) -> None:
+def _draw_orders_in_epsilon(axis: Any, surface: DriftSurface, order_line: float | None) -> None:
     """The orders in ε at each h with their 95 % intervals."""
-    measured = np.isfinite(surface.slopes)
-    resolved = np.array([order.resolved for order in surface.orders])
+    is_finite = np.isfinite(surface.slopes)
+    is_resolved = np.array([order.resolved for order in surface.orders])
     low, high = surface.intervals.T
-    for here, face, label in (
-        (measured & resolved, COLOURS[0], "order for ε → 0, 95 % interval"),
-        (measured & ~resolved, "white", "not resolved: slope of the straight line"),
+    for rows, face, label in (
+        (is_finite & is_resolved, COLOURS[0], "order for ε → 0, 95 % interval"),
+        (is_finite & ~is_resolved, "white", "not resolved: slope of the straight line"),
     ):
-        if here.any():
-            y = surface.slopes[here]
+        if rows.any():
+            y = surface.slopes[rows]
             look = {"color": COLOURS[0], "mfc": face, "capsize": 3, "label": label}
-            bars = [y - low[here], high[here] - y]
-            axis.errorbar(surface.hs[here], y, yerr=bars, fmt="o", **look)
-    if promised is not None:
-        axis.axhline(promised, label="expected", **draw.GUIDE)
+            bars = [y - low[rows], high[rows] - y]
+            axis.errorbar(surface.hs[rows], y, yerr=bars, fmt="o", **look)
+    if order_line is not None:
+        axis.axhline(order_line, label="expected", **draw.GUIDE)
         axis.set_ylim(
-            np.min(low[measured] - 0.05, initial=promised - 0.1),
-            np.max(high[measured] + 0.05, initial=promised + 0.1),
+            np.min(low[is_finite] - 0.05, initial=order_line - 0.1),
+            np.max(high[is_finite] + 0.05, initial=order_line + 0.1),
         )
     look = SMALL | {"rotation": 90, "ha": "center", "va": "bottom"}
-    for value in surface.hs[~measured]:
+    for value in surface.hs[~is_finite]:
         axis.annotate("no order", (value, 0.02), xycoords=("data", "axes fraction"), **look)
 
 
-_FLATTER, _SETTLED, _LAST = 0.6, 0.1, 3
+_FLATTER, _STEADY, _LAST = 0.6, 0.1, 3
 """A line whose slope is below this fraction of the slope before has reached round-off; largest
 relative change of a settled slope from one pair of runs to the next; number of runs that determine
 a slope, as earlier ones have too long steps."""
@@ -283,12 +283,12 @@ def drift_bound(
         axis.axvline(bound.steps, **draw.GUIDE)
     axis.set(xscale="log", yscale="log", xlabel="number of steps N", title=title)
     axis.set_ylabel(f"largest |I$_{{{invariant}}}$(N) − I$_{{{invariant}}}$(0)|")
-    lost = {
+    marks = {
         "changes are not finite": (~np.isfinite(changes)).sum(),
         "changes are exactly 0": (changes == 0).sum(),
     }
     look = entry(f"computed, {len(changes)} trajectories", color=COLOURS[0], lw=1)
-    legend(axis, new, [look, *counted(lost)])
+    legend(axis, new, [look, *counts_text(marks)])
     return axis
 
 
@@ -323,8 +323,8 @@ def work_precision(
             f"{results!r}."
         )
     axis, new = canvas(ax, (6.4, 4.8))
-    runs = {name: _checked(name, pair) for name, pair in results.items()}
-    points, lost = np.hstack(list(runs.values())), np.zeros(2, int)
+    runs = {name: _costs_and_errors(name, pair) for name, pair in results.items()}
+    points, marks = np.hstack(list(runs.values())), np.zeros(2, int)
     for i, (name, (costs, errors)) in enumerate(runs.items()):
         colour = COLOURS[i % len(COLOURS)]
         # The same marker occurs again with another colour: 9 and 7 have no common factor.
@@ -333,23 +333,23 @@ def work_precision(
         label = f"{name}: {_slope(costs[good], errors[good])}" if slopes else name
         look = {"color": colour, "marker": marker, "ls": dash, "lw": 1.2}
         axis.loglog(costs[good], errors[good], label=label, **look)
-        lost += draw.without_place(axis, costs, errors, colour)
+        marks += draw.without_place(axis, costs, errors, colour)
     axis.set(xscale="log", yscale="log", xlabel=cost, ylabel=error, title=title)
     extra, total = [], points.shape[1]
     # In the order of cost, a run is in front if its error is below those of all before it.
-    known = points[:, np.isfinite(points[1]) & (points[1] > 0)]
-    known = known[:, np.lexsort(known[::-1])]
-    line = known[:, known[1] < np.minimum.accumulate(np.append(np.inf, known[1]))[:-1]]
+    finite = points[:, np.isfinite(points[1]) & (points[1] > 0)]
+    finite = finite[:, np.lexsort(finite[::-1])]
+    line = finite[:, finite[1] < np.minimum.accumulate(np.append(np.inf, finite[1]))[:-1]]
     if front and line.size:
         look = {"color": "#dcdcdc", "lw": 9, "zorder": 0.5}
         axis.plot(*line, **look, solid_capstyle="round", solid_joinstyle="round")
         extra.append(entry("front", color="#dcdcdc", lw=7))
-    extra += draw.without_place_entries(lost, total, "runs failed", "runs without error")
+    extra += draw.without_place_entries(marks, total, "runs failed", "runs without error")
     legend(axis, new, extra)
     return axis
 
 
-def _checked(name: str, pair: Any) -> tuple[np.ndarray, np.ndarray]:
+def _costs_and_errors(name: str, pair: Any) -> tuple[np.ndarray, np.ndarray]:
     """(costs, sizes of errors), in the order of cost."""
     try:
         costs, errors = (np.asarray(x, float) for x in pair)
@@ -381,6 +381,6 @@ def _slope(costs: np.ndarray, errors: np.ndarray) -> str:
         return "no slope"
     part = slice(max(0, n - _LAST), n)
     last = local[part.start : n - 1]
-    settled = len(last) > 1 and np.ptp(last) <= _SETTLED * np.abs(last).max()
-    about = "" if settled else ", not settled" if len(last) > 1 else " of two runs"
-    return f"slope {signed(np.polyfit(x[part], y[part], 1)[0], '.1f')}{about}"
+    is_steady = len(last) > 1 and np.ptp(last) <= _STEADY * np.abs(last).max()
+    remark = "" if is_steady else ", not settled" if len(last) > 1 else " of two runs"
+    return f"slope {sign_text(np.polyfit(x[part], y[part], 1)[0], '.1f')}{remark}"

@@ -32,8 +32,8 @@ def twiss(ring: Any, optics: Any, title: str = "", ax: Any = None) -> Any:
     )
     check_shapes(len(s) == len(ring) + 1, "optics must be those of this ring", s=s)
     p = 1 + orbit[:, 5]
-    layout, what = {"height_ratios": [5, 1], "sharex": True}, "for functions and for magnets"
-    (upper, lower), new = stack(ax, [["functions"], ["magnets"]], what, (7.0, 4.4), **layout)
+    layout, purpose = {"height_ratios": [5, 1], "sharex": True}, "for functions and for magnets"
+    (upper, lower), new = stack(ax, [["functions"], ["magnets"]], purpose, (7.0, 4.4), **layout)
     right = upper.twinx()
     right.grid(False)
     lines = [(upper, f"β$_{'xy'[i]}$", beta[:, i], -2 * alpha[:, i] / p) for i in (0, 1)]
@@ -54,24 +54,24 @@ def _cubic(s: np.ndarray, values: np.ndarray, slopes: np.ndarray) -> list[np.nda
     """Points of the cubic polynomials between the places `s` (Hermite interpolation)."""
     t, L = np.linspace(0, 1, 17)[None], np.diff(s)[:, None]
     (a, b), (da, db) = ((x[:-1, None], x[1:, None]) for x in (values, slopes))
-    inside = a + (b - a) * t * t * (3 - 2 * t) + L * t * (1 - t) * (da * (1 - t) - db * t)
-    return [(s[:-1, None] + L * t).ravel(), inside.ravel()]
+    cubic = a + (b - a) * t * t * (3 - 2 * t) + L * t * (1 - t) * (da * (1 - t) - db * t)
+    return [(s[:-1, None] + L * t).ravel(), cubic.ravel()]
 
 
 def _draw_magnets(axis: Any, ring: Any, s: np.ndarray) -> list[Any]:
     """Boxes of the magnets, by their kind or by the lowest multipole; legend entries."""
     h, *b = (np.asarray(ring.columns.get(name, 0 * s)) for name in _COLUMNS)
-    found = set()
+    groups = set()
     for i, kind in enumerate(ring.kinds):
         n = next((n for n in range(11) if b[n][i]), -1)
         n = {"quadrupole": 0, "sextupole": 1, "octupole": 2}.get(kind, n)
         if h[i] or n >= 0:
-            found.add(what := 0 if h[i] else min(n + 1, 3))
-            colour, height = _BOXES[what]
-            low, high = -height * (what == 0 or b[n][i] < 0), height * (what == 0 or b[n][i] >= 0)
+            groups.add(group := 0 if h[i] else min(n + 1, 3))
+            colour, height = _BOXES[group]
+            low, high = -height * (group == 0 or b[n][i] < 0), height * (group == 0 or b[n][i] >= 0)
             look = {"align": "edge", "color": colour, "edgecolor": GREY, "lw": 0.6}
             axis.bar(s[i], high - low, s[i + 1] - s[i], low, **look)
-    return [entry(_KINDS[what], color=_BOXES[what][0], lw=6) for what in sorted(found)]
+    return [entry(_KINDS[group], color=_BOXES[group][0], lw=6) for group in sorted(groups)]
 
 
 @in_style
@@ -86,14 +86,14 @@ def tune_map(x: Any, y: Any, found: Any, order: int = 4, title: str = "", ax: An
     """
     D, Q = np.asarray(found.diffusion), np.asarray(found.tune)
     x, y = (np.asarray(a, float) * 1e3 for a in np.broadcast_arrays(x, y))
-    wanted = "x and y must have the shape of the diffusion"
-    check_shapes(x.shape == D.shape, wanted, x=x, diffusion=D)
+    rule = "x and y must have the shape of the diffusion"
+    check_shapes(x.shape == D.shape, rule, x=x, diffusion=D)
     axes, _ = stack(ax, 2, "for initial conditions and for tunes", (10.0, 4.2), 2)
     is_grid = x.ndim == 2 and bool((x == x[:1]).all() and (y == y[:, :1]).all())
-    at = (x[0], y[:, 0], D.T) if is_grid else (x, y, D)
+    data = (x[0], y[:, 0], D.T) if is_grid else (x, y, D)
     label, names = "log₁₀ |ΔQ|", ("Q$_x$", "Q$_y$")
     places = ("x [mm]", "y [mm]")
-    frequency_map(*at, names=places, title=title, ax=axes[0], diffusion_label=label)
+    frequency_map(*data, names=places, title=title, ax=axes[0], diffusion_label=label)
     lines = _resonances(Q[np.isfinite(D)], order)
     tunes = Q[..., 0], Q[..., 1]
     frequency_map(*tunes, D, lines, names=names, ax=axes[1], diffusion_label=label)

@@ -10,11 +10,11 @@ from matplotlib.colors import to_rgba_array
 
 from ..base.checks import whole
 from ..base.results import status_name
-from .axes import at_edge, canvas, check_shapes, counted, labels_of, legend
+from .axes import at_edge, canvas, check_shapes, counts_text, labels_of, legend
 from .states import component, looks_of
 from .style import COLOURS, GREY, SMALL, in_style, look_of
 
-_MANY = 3000
+_PIXEL_COUNT = 3000
 """Number of points above which they are pixels in a vector file."""
 
 _GOOD = ("", "successful", "stopped", "never_crossed", "too_few_crossings")
@@ -34,36 +34,36 @@ class _Points(NamedTuple):
     reasons: np.ndarray
 
     @property
-    def there(self) -> np.ndarray:
+    def finite(self) -> np.ndarray:
         return np.all(np.isfinite(self.qs), axis=tuple(range(2, self.qs.ndim)))
 
     @property
-    def failed(self) -> np.ndarray:
+    def has_failed(self) -> np.ndarray:
         return np.isin(self.statuses, _GOOD, invert=True)
 
-    def along(self, which: Any, units: Mapping[str, str]) -> tuple[np.ndarray, str]:
+    def values_of(self, coordinate: Any, units: Mapping[str, str]) -> tuple[np.ndarray, str]:
         """A coordinate of every row, shape (orbits, room), NaN behind the last; its label."""
-        get, label = component(which, self.qs.shape[2:], units)
+        get, label = component(coordinate, self.qs.shape[2:], units)
         flat = (x.reshape(-1, *x.shape[2:]) for x in (self.qs, self.ps))
         values = np.asarray(get(*flat), float).reshape(self.qs.shape[:2])
-        return np.where(self.there, values, np.nan), label
+        return np.where(self.finite, values, np.nan), label
 
     def notes(self) -> list[str]:
         """Legend texts on orbits with too many, too few or no crossings, and on failed ones."""
-        counts, statuses, failed = self.counts, self.statuses, self.failed
+        counts, statuses, has_failed = self.counts, self.statuses, self.has_failed
         total, room = self.qs.shape[:2]
-        none = int(np.sum((counts == 0) & ~failed & (statuses != "stopped")))
-        reasons = np.where(np.isin(self.reasons, _GOOD), "", self.reasons)[failed].tolist()
-        why = {f": {r.replace('_', ' ')}" if r else "": n for r, n in Counter(reasons).items()}
+        none = int(np.sum((counts == 0) & ~has_failed & (statuses != "stopped")))
+        reasons = np.where(np.isin(self.reasons, _GOOD), "", self.reasons)[has_failed].tolist()
+        causes = {f": {r.replace('_', ' ')}" if r else "": n for r, n in Counter(reasons).items()}
         texts = {
             f"crossed less than the required {room} times": statuses == "too_few_crossings",
             "stopped": statuses == "stopped",
-            **{f"failed{reason}": n for reason, n in why.items()},
+            **{f"failed{reason}": n for reason, n in causes.items()},
             f"crossed more than the {room} times stored": counts > room,
             "did not cross": none if none < total else 0,
-            "have no count of crossings": ~np.isfinite(counts) & ~failed,
+            "have no count of crossings": ~np.isfinite(counts) & ~has_failed,
         }
-        return counted({f"of {total} orbits {text}": np.sum(n) for text, n in texts.items()})
+        return counts_text({f"of {total} orbits {text}": np.sum(n) for text, n in texts.items()})
 
     def draw(
         self, axis: Any, x: Any, y: Any, colours: Any, size: float | None, names: Any = None, skip=0
@@ -73,31 +73,33 @@ class _Points(NamedTuple):
         Points of failed orbits do not set the limits of the axes, unless there are no others;
         returns the legend text that counts those outside.
         """
-        there = self.there[:, skip:]
-        if not there.any():
+        valid = self.finite[:, skip:]
+        if not valid.any():
             where = {"ha": "center", "va": "center", "transform": axis.transAxes}
             axis.text(0.5, 0.5, "no orbit crossed the section", color=SMALL["color"], **where)
             axis.set(xticks=[], yticks=[])
             return []
-        failed = self.failed & (there.any(1) & ~self.failed).any()
-        total = int(there.sum())
-        across = float(np.clip(150 / math.sqrt(total), 0.5, 2.5)) if size is None else size
-        look: Any = {"s": across**2, "linewidths": 0, "rasterized": total > _MANY}
-        for k, group in enumerate(np.eye(len(x), dtype=bool) if names else (~failed, failed)):
-            rows = there & group[:, None]
+        has_failed = self.has_failed & (valid.any(1) & ~self.has_failed).any()
+        total = int(valid.sum())
+        diameter = float(np.clip(150 / math.sqrt(total), 0.5, 2.5)) if size is None else size
+        look: Any = {"s": diameter**2, "linewidths": 0, "rasterized": total > _PIXEL_COUNT}
+        for k, group in enumerate(
+            np.eye(len(x), dtype=bool) if names else (~has_failed, has_failed)
+        ):
+            rows = valid & group[:, None]
             if names or rows.any():
-                label, each = (names[k] or None, 1) if names else (None, rows.sum(1)[group])
-                before = axis.dataLim.get_points().copy()
-                shown = np.repeat(colours[group], each, axis=0)
-                axis.scatter(x[rows], y[rows], color=shown, label=label, **look)
-                if failed[group].any():
-                    axis.dataLim.set_points(before)
+                label, repeats = (names[k] or None, 1) if names else (None, rows.sum(1)[group])
+                limits = axis.dataLim.get_points().copy()
+                point_colours = np.repeat(colours[group], repeats, axis=0)
+                axis.scatter(x[rows], y[rows], color=point_colours, label=label, **look)
+                if has_failed[group].any():
+                    axis.dataLim.set_points(limits)
                     axis.autoscale_view()
         (left, right), (low, high) = sorted(axis.get_xlim()), sorted(axis.get_ylim())
-        inside = (x >= left) & (x <= right) & (y >= low) & (y <= high)
-        beyond = ~inside[there & failed[:, None]]
-        text = f"of {len(beyond)} crossings of failed orbits lie outside the picture"
-        return counted({text: beyond.sum()})
+        in_view = (x >= left) & (x <= right) & (y >= low) & (y <= high)
+        outliers = ~in_view[valid & has_failed[:, None]]
+        text = f"of {len(outliers)} crossings of failed orbits lie outside the picture"
+        return counts_text({text: outliers.sum()})
 
 
 @in_style
@@ -130,8 +132,8 @@ def section(
     components that do not exist, and another number of colours or names.
     """
     look, points = look_of(options), _points_of(crossings)
-    xs, x_label = points.along(x, look.units)
-    ys, y_label = points.along(y, look.units)
+    xs, x_label = points.values_of(x, look.units)
+    ys, y_label = points.values_of(y, look.units)
     count = len(xs)
     looks = looks_of(count, look.colour, limits)
     names = labels_of(look.labels, count, "orbits")
@@ -141,33 +143,36 @@ def section(
     colours = to_rgba_array(looks.colours)
     single = names if look.colour is None and count <= len(COLOURS) else None
     far = points.draw(axis, xs, ys, colours, size, single)
-    found = looks.finish([axis], look, new, [*looks.entries, *points.notes(), *far])
-    for handle in found.legend_handles if found else ():
+    box = looks.finish([axis], look, new, [*looks.entries, *points.notes(), *far])
+    for handle in box.legend_handles if box else ():
         if hasattr(handle, "set_sizes"):
             handle.set_sizes([25])
     return axis
 
 
 def _points_of(crossings: Any) -> _Points:
-    found = _crossings_in(crossings)
-    if len(found) != 1:
+    pairs = _crossings_in(crossings)
+    if len(pairs) != 1:
         kind = type(crossings).__name__
-        many = f"{len(found)} results: choose one, such as solution.observed['name']"
+        plural = f"{len(pairs)} results: choose one, such as solution.observed['name']"
         none = f"no such result in {kind}: integrate with observe=dvi.Section(...)"
         raise TypeError(
-            f"crossings must have the result of one dvi.Section, got {many if found else none}."
+            f"crossings must have the result of one dvi.Section, got {plural if pairs else none}."
         )
-    ((one, status),) = found
-    qs, ps, ts = (np.asarray(v) for v in (one.qs, one.ps, one.ts))
+    ((crossing, status),) = pairs
+    qs, ps, ts = (np.asarray(v) for v in (crossing.qs, crossing.ps, crossing.ts))
     fits = ts.ndim and qs.shape[: ts.ndim] == ts.shape and qs.shape == ps.shape
-    wanted = "crossings must have ts of shape (..., n), and qs and ps of shape (..., n, *state)"
-    check_shapes(fits, wanted, ts=ts, qs=qs, ps=ps)
+    rule = "crossings must have ts of shape (..., n), and qs and ps of shape (..., n, *state)"
+    check_shapes(fits, rule, ts=ts, qs=qs, ps=ps)
     *lead, room = ts.shape
     shape = (math.prod(lead), room, *(qs.shape[ts.ndim :] or (1,)))
-    counts, reasons = np.ravel(np.asarray(one.count)), status
-    if hasattr(one, "status"):  # a PoincareSection, which stops at this number
+    counts, reasons = np.ravel(np.asarray(crossing.count)), status
+    if hasattr(crossing, "status"):  # a PoincareSection, which stops at this number
         counts = np.minimum(counts, room)
-        status, reasons = one.status, status_name(one.run) if hasattr(one, "run") else ""
+        status, reasons = (
+            crossing.status,
+            status_name(crossing.run) if hasattr(crossing, "run") else "",
+        )
     texts = (np.broadcast_to(np.asarray(x, object), lead).ravel() for x in (status, reasons))
     return _Points(qs.reshape(shape), ps.reshape(shape), counts, *(t.astype(str) for t in texts))
 
@@ -218,16 +223,16 @@ def bifurcation(
         crossings, Mapping | tuple
     ):
         points = _points_of(crossings)
-        values, label = points.along(y, look.units)
+        values, label = points.values_of(y, look.units)
     else:
         values = np.asarray(crossings, float)
-        unknown = np.full(len(values), "")
+        blank = np.full(len(values), "")
         counts = np.isfinite(values).reshape(len(values), -1).sum(1)
-        points = _Points(values[..., None], values[..., None], counts, unknown, unknown)
+        points = _Points(values[..., None], values[..., None], counts, blank, blank)
         label = y if isinstance(y, str) and y != "q[-1]" else ""
-    wanted = "parameter must have shape (runs,), and crossings shape (runs, n)"
+    rule = "parameter must have shape (runs,), and crossings shape (runs, n)"
     fits = parameter.ndim == 1 and values.ndim == 2 and len(values) == len(parameter)
-    check_shapes(fits, wanted, parameter=parameter, crossings=values)
+    check_shapes(fits, rule, parameter=parameter, crossings=values)
     skip = whole("skip", skip, 0)
     if log and not (parameter > 0).all():
         raise ValueError(

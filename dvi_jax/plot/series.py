@@ -9,9 +9,30 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..base.checks import one_of
-from .axes import at_most, canvas, check_shapes, counted, envelope, guide, labels_of, legend, stack
+from .axes import (
+    at_most,
+    canvas,
+    check_shapes,
+    counts_text,
+    envelope,
+    guide,
+    labels_of,
+    legend,
+    stack,
+)
 from .states import Lane, each_state, lanes_of, looks_of, troubles
-from .style import COLOURS, CROSS, DASHES, GREY, GUIDE, SMALL, in_style, look_of, named, signed
+from .style import (
+    COLOURS,
+    CROSS,
+    DASHES,
+    GREY,
+    GUIDE,
+    SMALL,
+    in_style,
+    look_of,
+    sign_text,
+    with_unit,
+)
 
 _CHANGES = {
     "relative": ("relative change", "|ΔI/I$_0$|"), "absolute": ("change", "|ΔI|"),
@@ -31,12 +52,12 @@ def draw_series(
 
     Long series are drawn by the extremes of each piece.
     """
-    lost = {"are not finite": ~np.isfinite(v)}
+    masks = {"are not finite": ~np.isfinite(v)}
     if log:
-        lost |= {"are exactly 0": v == 0, "are below 0": v < 0}
-    shown = np.where(np.logical_or.reduce(list(lost.values())), np.nan, v)
-    axis.plot(*envelope(t, shown), label=label or None, **look)
-    return {text: int(here.sum()) for text, here in lost.items()}
+        masks |= {"are exactly 0": v == 0, "are below 0": v < 0}
+    numbers = np.where(np.logical_or.reduce(list(masks.values())), np.nan, v)
+    axis.plot(*envelope(t, numbers), label=label or None, **look)
+    return {text: int(mask.sum()) for text, mask in masks.items()}
 
 
 @in_style
@@ -71,29 +92,29 @@ def invariants(
     """
     look = look_of(options)
     one_of("change", change, _CHANGES)
-    ts, names, lanes, watched = _read(orbits, values, look.labels)
-    changed = {k: [_changed(k, v, change, log) for v in rows] for k, rows in watched.items()}
-    if zero := [name for name, rows in changed.items() if all(v is None for v in rows)]:
+    ts, names, lanes, quantities = _read(orbits, values, look.labels)
+    rows_of = {k: [_change_of(k, v, change, log) for v in rows] for k, rows in quantities.items()}
+    if zero := [name for name, rows in rows_of.items() if all(v is None for v in rows)]:
         raise ValueError(
             f"{zero[0]!r} is 0 at the start of every orbit, so that relative changes are not "
             "defined: use change='absolute'."
         )
-    together = log and len(ts) == 1 < len(watched)
-    count = 1 if together else len(watched)
+    on_one_axis = log and len(ts) == 1 < len(quantities)
+    count = 1 if on_one_axis else len(quantities)
     at_most(_PANELS, count, "quantities", "values={...}")
     size = (6.4, 4.2) if count == 1 else (6.4, 1.4 + 1.45 * count)
     axes, new = stack(look.ax, count, "one for each quantity", size, sharex=True)
-    looks = looks_of(len(watched)) if together else looks_of(len(ts), look.colour)
+    looks = looks_of(len(quantities)) if on_one_axis else looks_of(len(ts), look.colour)
     zeros, from_zero = 0, []
-    for i, (quantity, rows) in enumerate(watched.items()):
-        axis = axes[0 if together else i]
-        lost = {f"of {len(ts)} orbits start at 0": sum(v is None for v in changed[quantity])}
-        from_zero += [f"{quantity}: {text}" for text in counted(lost)]
+    for i, (quantity, rows) in enumerate(quantities.items()):
+        axis = axes[0 if on_one_axis else i]
+        counts = {f"of {len(ts)} orbits start at 0": sum(v is None for v in rows_of[quantity])}
+        from_zero += [f"{quantity}: {text}" for text in counts_text(counts)]
         title = quantity.replace("_", " ")
-        for k, (t, v, old) in enumerate(zip(ts, changed[quantity], rows, strict=True)):
+        for k, (t, v, old) in enumerate(zip(ts, rows_of[quantity], rows, strict=True)):
             v, t = np.full(len(old), np.nan) if v is None else v, t[len(t) - len(old) :]
-            name = title if together else names[k] if i == 0 else ""
-            draw_series(axis, t, v, name, log, **looks.line(i if together else k, 1.1))
+            name = title if on_one_axis else names[k] if i == 0 else ""
+            draw_series(axis, t, v, name, log, **looks.line(i if on_one_axis else k, 1.1))
             last = np.flatnonzero(np.isfinite(v))[-1:]
             if last.size and last[0] < len(v) - 1 and not (log and v[last[0]] == 0):
                 axis.plot(t[last], v[last], ls="none", zorder=4, **CROSS)
@@ -101,24 +122,28 @@ def invariants(
             zeros += int(np.sum(v[1:] == 0)) if log else 0
         kind, size = _CHANGES[change]
         if log or any(v[:1].size > 1 for v in rows):
-            kind = f"{kind} {size}".lstrip() if together else size
-        unit = look.units.get(quantity) if change != "relative" and not together else None
-        title = "" if together else textwrap.fill(title, 20) if kind else title
-        label = f"{title}\n{named(kind, unit)}" if kind and title else named(title or kind, unit)
+            kind = f"{kind} {size}".lstrip() if on_one_axis else size
+        unit = look.units.get(quantity) if change != "relative" and not on_one_axis else None
+        title = "" if on_one_axis else textwrap.fill(title, 20) if kind else title
+        label = (
+            f"{title}\n{with_unit(kind, unit)}"
+            if kind and title
+            else with_unit(title or kind, unit)
+        )
         axis.set_ylabel(label, fontsize=9 if count > 1 else None)
         if log:
             axis.set_yscale("log")
     for axis in axes:
         if log and change == "relative" and axis.get_ylim()[0] < _NEAR_ROUNDING:
             _rounding(axis)
-    axes[-1].set_xlabel(named("time t", look.units.get("t")))
+    axes[-1].set_xlabel(with_unit("time t", look.units.get("t")))
     axes[0].figure.align_ylabels(axes)
-    notes = [*looks.entries, *counted({"values exactly 0": zeros}), *from_zero]
+    notes = [*looks.entries, *counts_text({"values exactly 0": zeros}), *from_zero]
     looks.finish(axes, look, new, [*notes, *troubles(lanes)])
     return axes[0] if count == 1 else np.asarray(axes)
 
 
-def _changed(name: str, v: np.ndarray, change: str, log: bool) -> np.ndarray | None:
+def _change_of(name: str, v: np.ndarray, change: str, log: bool) -> np.ndarray | None:
     """Changes since the first finite value, shape (S,); None if they are relative to 0."""
     if v.dtype.kind not in "biuf":
         raise TypeError(f"the values of {name!r} must be real numbers, got dtype {v.dtype}.")
@@ -136,8 +161,8 @@ def _changed(name: str, v: np.ndarray, change: str, log: bool) -> np.ndarray | N
 
 def panels_of(orbits: Any, values: Mapping[str, Any] | None, log: bool) -> int:
     """How many panels `invariants` draws."""
-    ts, *_, watched = _read(orbits, values, None)
-    return 1 if log and len(ts) == 1 else len(watched)
+    ts, *_, quantities = _read(orbits, values, None)
+    return 1 if log and len(ts) == 1 else len(quantities)
 
 
 def _read(
@@ -156,14 +181,16 @@ def _read(
             )
         ts = list(times.reshape(-1, times.shape[-1]))
         names = labels_of(labels, len(ts), "orbits")
-    watched: dict[str, list[np.ndarray]] = {}
+    quantities: dict[str, list[np.ndarray]] = {}
     if values is None:
         parts = orbits if isinstance(orbits, list) else [orbits]
-        seen = [_observed(one) for one in parts]
-        for name in seen[0]:
-            if all(name in one for one in seen):
-                pairs = zip(parts, seen, strict=True)
-                watched[name] = [row for one, found in pairs for row in _rows(name, found, one)]
+        tables = [_observed(part) for part in parts]
+        for name in tables[0]:
+            if all(name in part for part in tables):
+                pairs = zip(parts, tables, strict=True)
+                quantities[name] = [
+                    row for part, table in pairs for row in _rows(name, table, part)
+                ]
     for name, v in (values or {}).items():
         if callable(v):
             if any(lane.ps is None for lane in lanes) or not lanes:
@@ -171,36 +198,36 @@ def _read(
                     f"the function {name!r} in values requires positions and momenta, but orbits "
                     "does not contain both: give a Solution or (ts, qs, ps) as orbits."
                 )
-            watched[name] = [each_state(v, lane.qs, lane.ps) for lane in lanes]
+            quantities[name] = [each_state(v, lane.qs, lane.ps) for lane in lanes]
         elif not isinstance(orbits, list):
-            watched[name] = _rows(name, {name: v}, orbits)
+            quantities[name] = _rows(name, {name: v}, orbits)
         elif isinstance(v, list) and len(v) == len(lanes):
-            watched[name] = [np.asarray(x) for x in v]
+            quantities[name] = [np.asarray(x) for x in v]
         else:
             kind = f"list of length {len(v)}" if isinstance(v, list) else type(v).__name__
             raise ValueError(
                 f"values[{name!r}] must be a function (q, p), or a list of length {len(lanes)} "
                 f"with one array for each orbit, got {kind}."
             )
-    if not watched:
-        what = "no observable has, in all orbits, one value for each saved state or each step"
+    if not quantities:
+        cause = "no observable has, in all orbits, one value for each saved state or each step"
         raise ValueError(
-            f"{what if values is None else 'values is empty'}: give values={{'energy': f}}, "
+            f"{cause if values is None else 'values is empty'}: give values={{'energy': f}}, "
             "where f is a function (q, p) or an array (for a list of orbits, a list of arrays)."
         )
-    return ts, names, lanes, watched
+    return ts, names, lanes, quantities
 
 
-def _observed(one: Any) -> dict[str, Any]:
+def _observed(solution: Any) -> dict[str, Any]:
     """The observables of a solution that have a value per step."""
-    observed = getattr(one, "observed", None)
+    observed = getattr(solution, "observed", None)
     if not isinstance(observed, Mapping):
-        seen = "no observables" if observed is None else type(observed).__name__
+        kind = "no observables" if observed is None else type(observed).__name__
         raise TypeError(
-            f"without values, orbits must have a dict of observables, got {seen}. Give values, or "
+            f"without values, orbits must have a dict of observables, got {kind}. Give values, or "
             "integrate(...) with observe={'energy': f}."
         )
-    *lead, n = np.shape(one.ts)
+    *lead, n = np.shape(solution.ts)
     shapes, front = ((*lead, n), (*lead, n - 1)), len(lead) + 1
     return {k: v for k, v in observed.items() if hasattr(v, "shape") and v.shape[:front] in shapes}
 
@@ -210,9 +237,9 @@ def _rows(name: str, values: Mapping[str, Any], orbits: Any) -> list[np.ndarray]
     ts = np.asarray(orbits[0] if isinstance(orbits, tuple) else getattr(orbits, "ts", orbits))
     v, (*lead, n) = np.asarray(values[name]), ts.shape
     shapes = (*lead, n), (*lead, n - 1)
-    wanted = f"{name!r} must have one value for each time, shape {shapes[0]}, or for each step, "
-    wanted += f"shape {shapes[1]} (more axes may follow)"
-    check_shapes(v.shape[: ts.ndim] in shapes, wanted, values=v)
+    rule = f"{name!r} must have one value for each time, shape {shapes[0]}, or for each step, "
+    rule += f"shape {shapes[1]} (more axes may follow)"
+    check_shapes(v.shape[: ts.ndim] in shapes, rule, values=v)
     return list(v.reshape(-1, *v.shape[len(lead) :]))
 
 
@@ -239,9 +266,9 @@ def changes(ts: Any, series: Mapping[str, Any], time: str, title: str, ax: Any =
     colours = itertools.cycle(COLOURS)
     for axis, colour, (label, values) in zip(axes, colours, series.items(), strict=False):
         t, v = _pair(ts, values, label)
-        lost = draw_series(axis, t, v, "", color=colour, lw=1.1)
+        counts = draw_series(axis, t, v, "", color=colour, lw=1.1)
         axis.set_ylabel(label, fontsize=9)
-        for text in counted({f"of {len(v)} {what}": n for what, n in lost.items()}):
+        for text in counts_text({f"of {len(v)} {cause}": n for cause, n in counts.items()}):
             where = {"ha": "right", "va": "top", "transform": axis.transAxes}
             axis.text(0.99, 0.95, text, **SMALL, **where)
     axes[0].set_title(title)
@@ -266,21 +293,21 @@ def conserved(ts: Any, series: Mapping[str, Any], time: str, title: str, ax: Any
     for (label, values), (colour, dash) in zip(series.items(), looks, strict=False):
         # The change at the start is 0 by definition and is left out.
         t, v = (x[1:] for x in _pair(ts, values, label))
-        lost = draw_series(axis, t, v, label, True, color=colour, ls=dash, lw=0.9)
-        texts = counted({f"of {len(v)} {what}": n for what, n in lost.items()})
+        counts = draw_series(axis, t, v, label, True, color=colour, ls=dash, lw=0.9)
+        texts = counts_text({f"of {len(v)} {cause}": n for cause, n in counts.items()})
         notes += [f"{label}: {text}" for text in texts]
     _rounding(axis)
     axis.set(xlabel=time, ylabel="relative change since the start |ΔI/I$_0$|", title=title)
-    found = legend(axis, new, notes)
-    for line in found.get_lines() if found else ():
+    box = legend(axis, new, notes)
+    for line in box.get_lines() if box else ():
         line.set_linewidth(2.0)
     return axis
 
 
 def _pair(ts: Any, values: Any, label: str) -> tuple[np.ndarray, np.ndarray]:
     t, v = np.asarray(ts), np.asarray(values)
-    wanted = f"{label!r} must have one number for each time, shape (S,)"
-    check_shapes(t.ndim == 1 and v.shape == t.shape, wanted, ts=t, values=v)
+    rule = f"{label!r} must have one number for each time, shape (S,)"
+    check_shapes(t.ndim == 1 and v.shape == t.shape, rule, ts=t, values=v)
     return t, v
 
 
@@ -333,40 +360,42 @@ def indicator(
     **Returns** the `Axes`. **Raises** `ValueError` for an unknown kind and for shapes that do not
     fit.
     """
-    look, about = look_of(options), _KINDS[one_of("kind", kind, _KINDS)]
+    look, traits = look_of(options), _KINDS[one_of("kind", kind, _KINDS)]
     if slope is not None:
-        about = about._replace(log="xy", slope=slope)
+        traits = traits._replace(log="xy", slope=slope)
     lines, names = _lines_of(ts, values)
     names = labels_of(look.labels or names or None, len(lines), "lines")
     looks = looks_of(len(lines), look.colour)
     axis, new = canvas(look.ax)
-    xlog, ylog = ("x" in about.log), ("y" in about.log)
-    lost: Counter[str] = Counter()
-    drawn, shifted = [], False
+    xlog, ylog = ("x" in traits.log), ("y" in traits.log)
+    counter: Counter[str] = Counter()
+    points, from_start = [], False
     for i, (t, v, start) in enumerate(lines):
         start = start if t0 is None else float(t0)
-        shifted |= xlog and (start != 0 or bool((t < 0).any()))
+        from_start |= xlog and (start != 0 or bool((t < 0).any()))
         t = np.abs(t - start) if xlog else t
         at_start = (t == 0) & np.isfinite(v) & xlog
         t, v = t[~at_start], v[~at_start]
         v = np.where(np.isfinite(t), v, np.nan)
         counts = draw_series(axis, t, v, names[i], ylog, **looks.line(i, 1.2))
-        lost["are not finite"] += counts["are not finite"]
-        lost["at the start, t = t$_0$"] += int(at_start.sum())
-        lost["are not positive"] += counts.get("are exactly 0", 0) + counts.get("are below 0", 0)
+        counter["are not finite"] += counts["are not finite"]
+        counter["at the start, t = t$_0$"] += int(at_start.sum())
+        counter["are not positive"] += counts.get("are exactly 0", 0) + counts.get("are below 0", 0)
         positive = (t > 0) & (v > 0) & np.isfinite(v)
-        drawn += [(t[positive], v[positive])] if positive.any() else []
+        points += [(t[positive], v[positive])] if positive.any() else []
     axis.set(xscale="log" if xlog else "linear", yscale="log" if ylog else "linear")
-    if about.level is not None:
-        axis.axhline(about.level, label=f"regular: {about.level:g}", **GUIDE)
-    if about.slope is not None and drawn:
+    if traits.level is not None:
+        axis.axhline(traits.level, label=f"regular: {traits.level:g}", **GUIDE)
+    if traits.slope is not None and points:
         # Over all times, through the largest of the first values.
-        value, first = max((v[0], t[0]) for t, v in drawn)
-        ends = first, max(t[-1] for t, _ in drawn)
-        guide(axis, ends, value, about.slope, label=f"slope {signed(about.slope)}")
-    time, units = "time since the start |t − t$_0$|" if shifted else "time t", look.units
-    axis.set(xlabel=named(time, units.get("t")), ylabel=named(about.label, units.get("value")))
-    notes = counted({f"values {text}": n for text, n in lost.items()})
+        value, first = max((v[0], t[0]) for t, v in points)
+        ends = first, max(t[-1] for t, _ in points)
+        guide(axis, ends, value, traits.slope, label=f"slope {sign_text(traits.slope)}")
+    time, units = "time since the start |t − t$_0$|" if from_start else "time t", look.units
+    axis.set(
+        xlabel=with_unit(time, units.get("t")), ylabel=with_unit(traits.label, units.get("value"))
+    )
+    notes = counts_text({f"values {text}": n for text, n in counter.items()})
     looks.finish([axis], look, new, [*looks.entries, *notes])
     return axis
 
@@ -377,21 +406,19 @@ def _lines_of(ts: Any, values: Any) -> tuple[list[tuple[np.ndarray, np.ndarray, 
     The start is the time before the values where `ts` have one more than there are values, else 0.
     """
     if isinstance(values, Mapping):
-        found = {name: _lines_of(ts, v)[0] for name, v in values.items()}
-        named = [(k, n, line) for k, some in found.items() for n, line in enumerate(some, 1)]
-        names = [name if len(found[name]) == 1 else f"{name} {n}" for name, n, _ in named]
-        return [line for *_, line in named], names
+        groups = {name: _lines_of(ts, v)[0] for name, v in values.items()}
+        entries = [(k, n, line) for k, group in groups.items() for n, line in enumerate(group, 1)]
+        names = [name if len(groups[name]) == 1 else f"{name} {n}" for name, n, _ in entries]
+        return [line for *_, line in entries], names
     t, v = np.asarray(getattr(ts, "ts", ts)), np.asarray(values)
-    n, several = t.shape[-1] if t.ndim else 0, t.ndim > 1
+    n, is_batch = t.shape[-1] if t.ndim else 0, t.ndim > 1
     numbers = v.dtype.kind in "iuf" and v.ndim and n and v.shape[-1] in (n, n - 1)
-    fits = numbers and not (several and t.shape[:-1] != v.shape[: t.ndim - 1])
-    wanted = (
-        f"values must have one number for each time or step, shape (..., {n}) or (..., {n - 1})"
-    )
-    check_shapes(fits, wanted, ts=t, values=v)
+    fits = numbers and not (is_batch and t.shape[:-1] != v.shape[: t.ndim - 1])
+    rule = f"values must have one number for each time or step, shape (..., {n}) or (..., {n - 1})"
+    check_shapes(fits, rule, ts=t, values=v)
     start = t[..., 0] if n > v.shape[-1] else np.zeros(t.shape[:-1])
     t = t[..., n - v.shape[-1] :]
-    if several:  # the axes of a batch come first, those of the lines of one orbit behind
+    if is_batch:  # the axes of a batch come first, those of the lines of one orbit behind
         inner = (1,) * (v.ndim - t.ndim)
         start, t = start.reshape(*start.shape, *inner), t.reshape(*t.shape[:-1], *inner, -1)
     start = np.broadcast_to(start, v.shape[:-1]).ravel().tolist()

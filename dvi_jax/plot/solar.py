@@ -19,9 +19,9 @@ def planet_orbits(positions: Any, names: Sequence[str], ax: Any = None) -> Any:
     **Returns** the `Axes`, shape (2,).
     """
     positions = np.asarray(positions)
-    wanted = f"positions must have shape (times, {len(names)}, 3), a planet for each of names"
+    rule = f"positions must have shape (times, {len(names)}, 3), a planet for each of names"
     fits = positions.ndim == 3 and positions.shape[1:] == (len(names), 3)
-    check_shapes(fits, wanted, positions=positions)
+    check_shapes(fits, rule, positions=positions)
     axes, new = stack(ax, 2, "inner and outer planets", (9.6, 5.4), ncols=2)
     groups = range(len(names))[:4], range(len(names))[4:]
     mark: Any = {"ms": 7, "mec": "black", "mew": 0.7}
@@ -65,11 +65,11 @@ def ephemeris_comparison(
     **Returns** the `Axes`, shape (3,).
     """
     years, errors, perihelion = np.asarray(years), np.asarray(errors), np.asarray(perihelion)
-    places, what = [[0, 1], [0, 2]], "for the errors, the perihelion and its residual"
-    axes, new = stack(ax, places, what, (10.4, 5.2), height_ratios=(3, 1))
-    left, right, below = axes
+    places, purpose = [[0, 1], [0, 2]], "for the errors, the perihelion and its residual"
+    axes, new = stack(ax, places, purpose, (10.4, 5.2), height_ratios=(3, 1))
+    left, right, bottom = axes
     if new:
-        below.sharex(right)
+        bottom.sharex(right)
     for i, name in enumerate(names):
         # The largest value of each of about a hundred pieces is a readable line.
         pieces = 100 if len(years) > 200 else len(years) - 1
@@ -89,12 +89,12 @@ def ephemeris_comparison(
     if np.isfinite(slope):
         look = {"color": COLOURS[1], "lw": 1.2, "ls": "--"}
         right.plot(years, line, label=f"line: {slope:.2f}″ per century", **look)
-        below.plot(years, perihelion - line, color=COLOURS[0], lw=0.5)
-        below.axhline(0, **look)
+        bottom.plot(years, perihelion - line, color=COLOURS[0], lw=0.5)
+        bottom.axhline(0, **look)
     right.set_title("Mercury's perihelion, DE421 − integration")
     right.set_ylabel("ϖ(DE421) − ϖ(integration) [″]")
     right.legend(loc="best", markerscale=3)
     right.tick_params(labelbottom=False)
-    below.set(xlabel="years since the start", ylabel="residual [″]")
-    left.figure.align_ylabels([right, below])
+    bottom.set(xlabel="years since the start", ylabel="residual [″]")
+    left.figure.align_ylabels([right, bottom])
     return np.asarray(axes)

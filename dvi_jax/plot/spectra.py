@@ -8,9 +8,9 @@ import numpy as np
 from matplotlib.patches import Patch
 
 from . import axes as draw
-from .axes import canvas, check_shapes, counted, labels_of, legend
+from .axes import canvas, check_shapes, counts_text, labels_of, legend
 from .states import looks_of
-from .style import COLOURS, DASHES, GREY, MARKERS, SMALL, in_style, named, signed
+from .style import COLOURS, DASHES, GREY, MARKERS, SMALL, in_style, sign_text, with_unit
 
 _PERCENTILES = (2, 98)
 """Range of the colours, so that a few extreme values do not determine it."""
@@ -41,33 +41,33 @@ def spectrum(
     do not fit.
     """
     if amplitudes is None:
-        wanted = "amplitudes must be given, or frequencies must be an object that has both"
-        draw.check_attributes(frequencies, ("frequencies", "amplitudes"), wanted)
+        rule = "amplitudes must be given, or frequencies must be an object that has both"
+        draw.check_attributes(frequencies, ("frequencies", "amplitudes"), rule)
         frequencies, amplitudes = frequencies.frequencies, frequencies.amplitudes
     w, A = np.asarray(frequencies), np.abs(np.asarray(amplitudes))
-    wanted = f"frequencies ({w.dtype}) must be real, of the same shape (..., count) as amplitudes"
+    rule = f"frequencies ({w.dtype}) must be real, of the same shape (..., count) as amplitudes"
     fits = w.shape == A.shape and w.ndim and w.size and w.dtype.kind in "iuf"
-    check_shapes(fits, wanted, frequencies=w, amplitudes=A)
+    check_shapes(fits, rule, frequencies=w, amplitudes=A)
     w, A = w.reshape(-1, w.shape[-1]), A.reshape(-1, A.shape[-1])
     names, colours = labels_of(labels, len(w), "signals"), looks_of(len(w)).colours
     units, markers = units or {}, itertools.cycle(MARKERS)
-    there = np.isfinite(w) & np.isfinite(A) & ((A > 0) | (not log))
+    valid = np.isfinite(w) & np.isfinite(A) & ((A > 0) | (not log))
     axis, new = canvas(ax)
-    floor = A[there].min() / 3 if log and there.any() else 0.0
-    rows = zip(w, A, there, colours, markers, names, strict=False)
+    floor = A[valid].min() / 3 if log and valid.any() else 0.0
+    rows = zip(w, A, valid, colours, markers, names, strict=False)
     for x, y, good, colour, marker, name in rows:
         axis.vlines(x[good], floor, y[good], color=colour, lw=1.3)
         axis.plot(x[good], y[good], marker, color=colour, label=name or None)
     if log:
         axis.set_yscale("log")
-    if there.any():
+    if valid.any():
         axis.set_ylim(bottom=floor)
-    for (name, at), dash in zip((fundamental or {}).items(), itertools.cycle(DASHES[1:])):
-        axis.axvline(at, color=GREY, lw=1, ls=dash, label=name, zorder=0.8)
-    axis.set(xlabel=named("frequency", units.get("frequency", "rad per unit of time")))
-    axis.set(ylabel=named("amplitude", units.get("amplitude")), title=title)
-    lost = f"of {there.size} lines have no frequency or amplitude"
-    legend(axis, new, counted({lost: np.sum(~there)}))
+    for (name, frequency), dash in zip((fundamental or {}).items(), itertools.cycle(DASHES[1:])):
+        axis.axvline(frequency, color=GREY, lw=1, ls=dash, label=name, zorder=0.8)
+    axis.set(xlabel=with_unit("frequency", units.get("frequency", "rad per unit of time")))
+    axis.set(ylabel=with_unit("amplitude", units.get("amplitude")), title=title)
+    cause = f"of {valid.size} lines have no frequency or amplitude"
+    legend(axis, new, counts_text({cause: np.sum(~valid)}))
     return axis
 
 
@@ -101,8 +101,8 @@ def frequency_map(
     D = None if diffusion is None else np.asarray(diffusion, float)
     arrays = {"x": x, "y": y} | ({} if D is None else {"diffusion": D})
     on_grid = D is not None and x.ndim == y.ndim == 1 and D.shape == (len(x), len(y))
-    wanted = "x, y and diffusion must have one shape, or diffusion the shape (len(x), len(y))"
-    check_shapes(on_grid or len({a.shape for a in arrays.values()}) == 1, wanted, **arrays)
+    rule = "x, y and diffusion must have one shape, or diffusion the shape (len(x), len(y))"
+    check_shapes(on_grid or len({a.shape for a in arrays.values()}) == 1, rule, **arrays)
     if on_grid and len(resonances):
         raise ValueError(
             "resonances can be drawn only if x and y are frequencies, but here they are a grid of "
@@ -110,13 +110,13 @@ def frequency_map(
             f"and y, both of shape {(len(x), len(y))}."
         )
     axis, new = canvas(ax, (6.0, 4.8))
-    shown = D if on_grid or D is None else D[np.isfinite(x) & np.isfinite(y)]
-    norm, beyond = (
-        (None, "") if shown is None else draw.scale_of(shown, limits, False, _PERCENTILES)
+    numbers = D if on_grid or D is None else D[np.isfinite(x) & np.isfinite(y)]
+    norm, ends = (
+        (None, "") if numbers is None else draw.scale_of(numbers, limits, False, _PERCENTILES)
     )
-    drawn, extra = (_draw_plane if on_grid else _draw_points)(axis, x, y, D, norm)
+    artist, extra = (_draw_plane if on_grid else _draw_points)(axis, x, y, D, norm)
     if D is not None:
-        axis.figure.colorbar(drawn, ax=axis, label=diffusion_label, extend=beyond)
+        axis.figure.colorbar(artist, ax=axis, label=diffusion_label, extend=ends)
     _draw_resonances(axis, resonances)
     names = names or (("x", "y") if on_grid else ("ω$_1$", "ω$_2$"))
     axis.set(xlabel=names[0], ylabel=names[1], title=title)
@@ -135,25 +135,27 @@ def _draw_plane(axis: Any, x: Any, y: Any, D: Any, norm: Any) -> tuple[Any, list
                 + (f" after {values[i - 1]}." if i else ".")
             )
     mesh = draw.cells(axis, draw.cell_edges(x), draw.cell_edges(y), D.T, norm, draw.SHADES)
-    texts = counted({f"of {D.size} orbits have no value": np.sum(~np.isfinite(D))})
+    texts = counts_text({f"of {D.size} orbits have no value": np.sum(~np.isfinite(D))})
     return mesh, [Patch(label=text, **draw.HATCH) for text in texts]
 
 
 def _draw_points(axis: Any, x: Any, y: Any, D: Any, norm: Any) -> tuple[Any, list[Any]]:
     """(a point for each orbit, legend entries)."""
-    there = np.isfinite(x) & np.isfinite(y)
-    known = there if D is None else there & np.isfinite(D)
-    grey, count = there & ~known, int(there.sum())
+    valid = np.isfinite(x) & np.isfinite(y)
+    has_value = valid if D is None else valid & np.isfinite(D)
+    grey, count = valid & ~has_value, int(valid.sum())
     look: Any = {"s": float(np.clip(3000 / max(count, 1), 2, 16)), "linewidths": 0}
     look["rasterized"] = count > 3000
-    shown = (
-        {"color": COLOURS[0]} if D is None else {"c": D[known], "norm": norm, "cmap": draw.SHADES}
+    palette = (
+        {"color": COLOURS[0]}
+        if D is None
+        else {"c": D[has_value], "norm": norm, "cmap": draw.SHADES}
     )
-    drawn = axis.scatter(x[known], y[known], **shown, **look)
+    artist = axis.scatter(x[has_value], y[has_value], **palette, **look)
     if grey.any():
         label = f"{grey.sum()} orbits without a diffusion"
         axis.scatter(x[grey], y[grey], color=draw.PALE, label=label, **look)
-    return drawn, counted({f"of {there.size} orbits have no frequencies": np.sum(~there)})
+    return artist, counts_text({f"of {valid.size} orbits have no frequencies": np.sum(~valid)})
 
 
 def _draw_resonances(axis: Any, resonances: Sequence[tuple[int, ...]]) -> None:
@@ -177,12 +179,12 @@ def _draw_resonances(axis: Any, resonances: Sequence[tuple[int, ...]]) -> None:
         if b:
             places += [((right, (c - a * right) / b), "left", "center", (2, 0))]
             places += [((left, (c - a * left) / b), "left", "center", (3, 0))]
-        for (at_x, at_y), horizontal, vertical, off in places:
+        for (at_x, at_y), horizontal, vertical, offset in places:
             if not (left <= at_x <= right or right <= at_x <= left):
                 continue
             if low <= at_y <= high or high <= at_y <= low:
                 look = SMALL | {"ha": horizontal, "va": vertical, "textcoords": "offset points"}
                 look["rotation"] = 90 if vertical == "bottom" and len(k) == 3 else 0
-                text = f"({', '.join(map(signed, k))})"
-                axis.annotate(text, (at_x, at_y), xytext=off, annotation_clip=False, **look)
+                text = f"({', '.join(map(sign_text, k))})"
+                axis.annotate(text, (at_x, at_y), xytext=offset, annotation_clip=False, **look)
                 break

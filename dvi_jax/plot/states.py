@@ -12,8 +12,8 @@ import numpy as np
 from matplotlib.cm import ScalarMappable
 
 from ..base.checks import whole
-from .axes import check_shapes, counted, entry, labels_of, legend, scale_of
-from .style import COLOURS, CROSS, DASHES, PALE, SHADES, Look, named
+from .axes import check_shapes, counts_text, entry, labels_of, legend, scale_of
+from .style import COLOURS, CROSS, DASHES, PALE, SHADES, Look, with_unit
 
 _GOOD = ("", "successful", "stopped")
 
@@ -28,7 +28,7 @@ class Lane(NamedTuple):
     label: str = ""
 
     @property
-    def there(self) -> np.ndarray:
+    def finite(self) -> np.ndarray:
         """Where there is a state, shape (S,)."""
         parts = [x.reshape(len(x), -1) for x in (self.ts, self.qs, self.ps) if x is not None]
         return np.all(np.isfinite(np.hstack(parts)), axis=1)
@@ -36,9 +36,9 @@ class Lane(NamedTuple):
     @property
     def trouble(self) -> str:
         """Why it has no states to the end, "" if it has."""
-        if self.status in ("", "successful") and not self.there.all():
+        if self.status in ("", "successful") and not self.finite.all():
             return "not finite"
-        return "" if self.status in _GOOD and self.there.all() else self.status
+        return "" if self.status in _GOOD and self.finite.all() else self.status
 
 
 def lanes_of(orbits: Any, labels: Sequence[str] | None = None, momenta: bool = True) -> list[Lane]:
@@ -48,8 +48,8 @@ def lanes_of(orbits: Any, labels: Sequence[str] | None = None, momenta: bool = T
     **Raises** `TypeError` for anything else and for missing momenta; `ValueError` for shapes that
     do not fit one another and another number of `labels`.
     """
-    several = orbits if isinstance(orbits, list) else [orbits]
-    lanes = [lane for one in several for lane in _lanes_of_one(one)]
+    parts = orbits if isinstance(orbits, list) else [orbits]
+    lanes = [lane for part in parts for lane in _lanes_of_one(part)]
     if not lanes:
         raise ValueError("orbits is empty: give at least one orbit.")
     if momenta and any(lane.ps is None for lane in lanes):
@@ -61,32 +61,32 @@ def lanes_of(orbits: Any, labels: Sequence[str] | None = None, momenta: bool = T
     return [lane._replace(label=name) for lane, name in zip(lanes, names, strict=True)]
 
 
-def _lanes_of_one(one: Any) -> list[Lane]:
-    if hasattr(one, "ts") and hasattr(one, "qs"):
-        given = [one.ts, one.qs, getattr(one, "ps", None)]
-    elif isinstance(one, tuple) and len(one) in (2, 3):
-        given = list(one)
+def _lanes_of_one(part: Any) -> list[Lane]:
+    if hasattr(part, "ts") and hasattr(part, "qs"):
+        arrays = [part.ts, part.qs, getattr(part, "ps", None)]
+    elif isinstance(part, tuple) and len(part) in (2, 3):
+        arrays = list(part)
     else:
-        seen = type(one).__name__ + (f" of length {len(one)}" if isinstance(one, tuple) else "")
+        kind = type(part).__name__ + (f" of length {len(part)}" if isinstance(part, tuple) else "")
         raise TypeError(
-            f"each orbit must be a Solution or a tuple of arrays (ts, qs, ps), got {seen}."
+            f"each orbit must be a Solution or a tuple of arrays (ts, qs, ps), got {kind}."
         )
-    ts, *states = (np.asarray(x) for x in given if x is not None)
+    ts, *states = (np.asarray(x) for x in arrays if x is not None)
     for name, x in zip(("ts", "qs", "ps"), (ts, *states), strict=False):
         if x.dtype.kind not in "iuf":
             raise TypeError(f"{name} of an orbit must be real numbers, got dtype {x.dtype}.")
     if ts.ndim and states[0].shape == ts.shape:  # a state that is one number
         states = [x[..., None] for x in states]
     fits = all(x.shape[: ts.ndim] == ts.shape and x.ndim > ts.ndim for x in states)
-    wanted = (
+    rule = (
         "orbits must have ts of shape (..., S), and qs and ps of shape (..., S, n) or (..., S, "
         "bodies, dim), with the same leading axes (for times that a batch shares: "
         "np.broadcast_to(ts, (batch, S)))"
     )
     fits = fits and ts.ndim and ts.shape[-1] and len({x.shape for x in states}) == 1
-    check_shapes(fits, wanted, ts=ts, **dict(zip(("qs", "ps"), states, strict=False)))
+    check_shapes(fits, rule, ts=ts, **dict(zip(("qs", "ps"), states, strict=False)))
     lead = ts.shape[:-1]
-    names = np.broadcast_to(np.asarray(getattr(one, "status", ""), object), lead)
+    names = np.broadcast_to(np.asarray(getattr(part, "status", ""), object), lead)
     qs, *ps = states
     return [Lane(ts[i], qs[i], ps[0][i] if ps else None, str(names[i])) for i in np.ndindex(lead)]
 
@@ -99,9 +99,9 @@ def one_shape(lanes: Sequence[Lane]) -> tuple[int, ...]:
     return shapes[0]
 
 
-def chosen(name: str, which: Any, count: int) -> list[int]:
+def selected_numbers(name: str, selection: Any, count: int) -> list[int]:
     """Numbers below `count`: all of them for None."""
-    numbers = range(count) if which is None else np.ravel(which).tolist()
+    numbers = range(count) if selection is None else np.ravel(selection).tolist()
     if not len(numbers):
         raise ValueError(f"{name} is empty: choose at least one number from 0 to {count - 1}.")
     return [whole(name, i, 0, count - 1) for i in numbers]
@@ -112,15 +112,15 @@ def place_in(name: str, shape: tuple[int, ...], index: Any) -> tuple[int, ...]:
     place = index if isinstance(index, tuple) else (index,)
     fits = len(place) == len(shape) and all(isinstance(i, int | np.integer) for i in place)
     if not fits or not all(-n <= i < n for i, n in zip(place, shape, strict=True)):
-        most = tuple(n - 1 for n in shape)
-        wanted = f"a number from 0 to {most[0]}"
+        last = tuple(n - 1 for n in shape)
+        rule = f"a number from 0 to {last[0]}"
         if len(shape) != 1:
-            wanted = f"a tuple of {len(shape)} numbers from {(0,) * len(shape)} to {most}"
-        raise ValueError(f"{name} must be {wanted} for states of shape {shape}, got {index!r}.")
+            rule = f"a tuple of {len(shape)} numbers from {(0,) * len(shape)} to {last}"
+        raise ValueError(f"{name} must be {rule} for states of shape {shape}, got {index!r}.")
     return tuple(int(i) % n for i, n in zip(place, shape, strict=True))
 
 
-def indexed(letter: str, place: tuple[int, ...], shape: tuple[int, ...]) -> str:
+def index_label(letter: str, place: tuple[int, ...], shape: tuple[int, ...]) -> str:
     """A component as the field writes it: counted from 1, without a number if there is only one."""
     if shape == (1,):
         return letter
@@ -131,25 +131,25 @@ _NAME = re.compile(r"([qp])(?:\[\s*(-?\d+(?:\s*,\s*-?\d+)*)\s*\])?")
 
 
 def component(
-    which: Any, shape: tuple[int, ...], units: Mapping[str, str]
+    coordinate: Any, shape: tuple[int, ...], units: Mapping[str, str]
 ) -> tuple[Callable[[np.ndarray, np.ndarray], np.ndarray], str]:
     """(function of (qs, ps), shape (N, *shape) → numbers, shape (N,); label with units) of
     "q[0]", "q[0, 2]", "q" if there is only one; or of a function ``(q, p)`` of one state.
     """
-    if callable(which):
-        name = getattr(which, "__name__", "")
-        return partial(each_state, which), "" if name == "<lambda>" else name.replace("_", " ")
-    found = _NAME.fullmatch(which) if isinstance(which, str) else None
-    if found is None or (found[2] is None and math.prod(shape) != 1):
+    if callable(coordinate):
+        name = getattr(coordinate, "__name__", "")
+        return partial(each_state, coordinate), "" if name == "<lambda>" else name.replace("_", " ")
+    match = _NAME.fullmatch(coordinate) if isinstance(coordinate, str) else None
+    if match is None or (match[2] is None and math.prod(shape) != 1):
         example = f"q[{', '.join('0' * len(shape))}]"
         raise ValueError(
             f'x or y must be a component of the state, such as "{example}", or a function (q, p) '
-            f"that returns a number. The states have shape {shape}; got {which!r}."
+            f"that returns a number. The states have shape {shape}; got {coordinate!r}."
         )
-    letter, inside = found.groups()
-    index = tuple(map(int, inside.split(","))) if inside else (0,) * len(shape)
-    place = place_in(f"the index in {which!r}", shape, index[0] if len(index) == 1 else index)
-    label = named(indexed(letter, place, shape), units.get(letter))
+    letter, indices = match.groups()
+    index = tuple(map(int, indices.split(","))) if indices else (0,) * len(shape)
+    place = place_in(f"the index in {coordinate!r}", shape, index[0] if len(index) == 1 else index)
+    label = with_unit(index_label(letter, place, shape), units.get(letter))
     return lambda qs, ps: (qs if letter == "q" else ps)[(slice(None), *place)], label
 
 
@@ -170,7 +170,7 @@ class Looks(NamedTuple):
     colours: list[Any]
     dashes: list[Any]
     scale: ScalarMappable | None = None
-    unknown: int = 0
+    without_value: int = 0
 
     def line(self, i: int, width: float) -> dict[str, Any]:
         """How line number i is drawn."""
@@ -179,7 +179,7 @@ class Looks(NamedTuple):
     @property
     def entries(self) -> list[Any]:
         """Legend entry of the orbits without a value."""
-        texts = counted({f"of {len(self.colours)} orbits have no value": self.unknown})
+        texts = counts_text({f"of {len(self.colours)} orbits have no value": self.without_value})
         return [entry(text, color=PALE) for text in texts]
 
     def finish(self, axes: Sequence[Any], look: Look, new: bool, entries: Sequence[Any]) -> Any:
@@ -202,16 +202,18 @@ def looks_of(count: int, values: Any = None, limits: tuple[float, float] | None 
             f"colour must have length {count}, one value for each orbit or line, got length "
             f"{len(values)}."
         )
-    known = np.isfinite(values)
+    finite = np.isfinite(values)
     scale = ScalarMappable(scale_of(values, limits)[0], SHADES)
-    shades = [tuple(scale.to_rgba(v)) if k else PALE for v, k in zip(values, known, strict=True)]
-    return Looks(shades, ["-"] * count, scale, int(np.sum(~known)))
+    shades = [tuple(scale.to_rgba(v)) if k else PALE for v, k in zip(values, finite, strict=True)]
+    return Looks(shades, ["-"] * count, scale, int(np.sum(~finite)))
 
 
 def troubles(lanes: Sequence[Lane]) -> list[Any]:
     """Legend entries of orbits without states to the end, a cross for each reason."""
     texts = []
     for reason, count in Counter(lane.trouble for lane in lanes if lane.trouble).items():
-        who = "" if len(lanes) == 1 else f"{count} of {len(lanes)} orbits "
-        texts.append(f"{who}{'' if reason == 'stopped' else 'failed: '}{reason.replace('_', ' ')}")
+        orbits = "" if len(lanes) == 1 else f"{count} of {len(lanes)} orbits "
+        texts.append(
+            f"{orbits}{'' if reason == 'stopped' else 'failed: '}{reason.replace('_', ' ')}"
+        )
     return [entry(text, ls="none", **CROSS) for text in texts]

@@ -49,7 +49,7 @@ STAR["mec"] = "black"
 GUIDE: dict[str, Any] = {"color": GREY, "lw": 1, "ls": "--"}
 SMALL: dict[str, Any] = {"fontsize": 8, "color": "#555555"}
 
-_chosen: ContextVar[bool] = ContextVar("chosen", default=False)
+_in_use: ContextVar[bool] = ContextVar("in_use", default=False)
 
 
 @contextmanager
@@ -59,7 +59,7 @@ def style() -> Iterator[None]:
     The functions of `dvi_jax.plot` use it anyway. A block serves figures of your own and changes
     of the style: settings made inside it by ``matplotlib.rc_context`` take effect.
     """
-    token = _chosen.set(True)
+    token = _in_use.set(True)
     try:
         with mpl.rc_context(_SETTINGS):
             try:
@@ -67,7 +67,7 @@ def style() -> Iterator[None]:
             finally:
                 interactive = mpl.is_interactive()
     finally:
-        _chosen.reset(token)
+        _in_use.reset(token)
     # The first figure of a notebook selects an interactive backend. That choice must survive.
     mpl.interactive(interactive)
 
@@ -76,11 +76,11 @@ def in_style(function: Callable[P, R]) -> Callable[P, R]:
     """The function, drawing in this style unless its caller is inside a `style()` block."""
 
     @wraps(function)
-    def drawn(*args: P.args, **kwargs: P.kwargs) -> R:
-        with nullcontext() if _chosen.get() else style():
+    def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
+        with nullcontext() if _in_use.get() else style():
             return function(*args, **kwargs)
 
-    return drawn
+    return wrapper
 
 
 class Look(NamedTuple):
@@ -94,17 +94,17 @@ class Look(NamedTuple):
     ax: Any = None
 
 
-def look_of(options: Mapping[str, Any], *but: str) -> Look:
-    """The options that were given, with defaults for the others; a picture has none of `but`."""
-    check_keywords(options, *(name for name in Look._fields if name not in but))
+def look_of(options: Mapping[str, Any], *exceptions: str) -> Look:
+    """The options that were given, with defaults for the others, without `exceptions`."""
+    check_keywords(options, *(name for name in Look._fields if name not in exceptions))
     return Look(**{name: x for name, x in options.items() if x is not None})
 
 
-def check_keywords(given: Mapping[str, Any], *known: str) -> None:
-    """**Raises** `TypeError` for a keyword that is not one of those known."""
-    if unknown := [name for name in given if name not in known]:
+def check_keywords(keywords: Mapping[str, Any], *names: str) -> None:
+    """**Raises** `TypeError` for a keyword that is not one of `names`."""
+    if excess := [name for name in keywords if name not in names]:
         raise TypeError(
-            f"unknown keyword {unknown[0]!r}. Allowed are {', '.join(known)}, and those that the "
+            f"unknown keyword {excess[0]!r}. Allowed are {', '.join(names)}, and those that the "
             "docstring of the function describes."
         )
 
@@ -143,11 +143,11 @@ def figure_of(axis: Any) -> Any:
     return figure
 
 
-def signed(value: float, form: str = "g") -> str:
+def sign_text(value: float, form: str = "g") -> str:
     """A number with a minus sign as wide as a plus sign."""
     return f"{value:{form}}".replace("-", "−")
 
 
-def named(name: str, unit: str | None) -> str:
+def with_unit(name: str, unit: str | None) -> str:
     """A label with its unit, if it has one."""
     return name if unit in (None, "", "1") else f"{name} [{unit}]"

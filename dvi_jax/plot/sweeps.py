@@ -14,7 +14,7 @@ from matplotlib.patches import Patch
 
 from ..base.checks import one_of
 from .axes import at_edge, cells, entry, flat_cells, legend, scale_of
-from .blocks import REDUCTIONS, Lines, Picture, count_codes, reduced
+from .blocks import REDUCTIONS, Lines, Picture, count_codes, reduce_to_pixels
 from .grid import Grid, arrange, checked_array, dim_of, label_of, names_of, two_numbers
 from .style import COLOURS, GREY, HATCH, NO_NUMBER, SHADES, ZERO, in_style
 
@@ -85,9 +85,9 @@ def sweep_map(
     fewer = any(len(place.centres) < place.bins.size for place in grid.places)
     if fewer or any(data.sizes[d] > 1 for d in grid.over):
         label = f"{REDUCTIONS[reduce]} {label}"
-    pictures = [reduced(panel, grid.bins, reduce) for _, panel in grid.panels]
-    found = None if status is None else _count_beside(status, grid)
-    return _draw(grid, pictures, label, "no number", ax, _scale(pictures, log, limits), found)
+    pictures = [reduce_to_pixels(panel, grid.bins, reduce) for _, panel in grid.panels]
+    counts = None if status is None else _count_beside(status, grid)
+    return _draw(grid, pictures, label, "no number", ax, _scale(pictures, log, limits), counts)
 
 
 @in_style
@@ -123,16 +123,16 @@ def slope_map(
     one_of("reduce", reduce, REDUCTIONS)
     dim = dim_of(data, along, "along")
     values, order = _positive(data, along)
-    others, facet = where.get("over", ()), where.get("facet")
-    others = [*([others] if isinstance(others, str) else others), *([facet] if facet else [])]
-    if wrong := [name for name in others if dim_of(data, name) == dim]:
+    names, facet = where.get("over", ()), where.get("facet")
+    names = [*([names] if isinstance(names, str) else names), *([facet] if facet else [])]
+    if wrong := [name for name in names if dim_of(data, name) == dim]:
         raise ValueError(
             f"facet and over must not use the dimension {dim!r}, got {wrong[0]!r}: the slopes are "
             "computed along this dimension. Choose another dimension for facet or over."
         )
     x, y = (along if name is not None and dim_of(data, name) == dim else name for name in (x, y))
     local = local or along in (x, y)
-    made: dict[str, Any] = {along: None}
+    replacements: dict[str, Any] = {along: None}
     if local:
         if along not in (x, y) and None not in (x, y):
             raise ValueError(
@@ -142,11 +142,13 @@ def slope_map(
         if along not in (x, y):
             x, y = (along, y) if x is None else (x, along)
         middle = np.sqrt(values[1:] * values[:-1])
-        about = data.coords[along].attrs
-        made = {along: xr.DataArray(middle, dims=[dim], coords={along: (dim, middle, about)})}
-    grid = arrange(data, x, y, where, made)
+        attributes = data.coords[along].attrs
+        replacements = {
+            along: xr.DataArray(middle, dims=[dim], coords={along: (dim, middle, attributes)})
+        }
+    grid = arrange(data, x, y, where, replacements)
     lines = Lines(dim, partial(_slopes, np.log(values), order, floor, local))
-    pictures = [reduced(panel, grid.bins, reduce, lines) for _, panel in grid.panels]
+    pictures = [reduce_to_pixels(panel, grid.bins, reduce, lines) for _, panel in grid.panels]
     name = str(data.name or "data").replace("_", " ")
     over_what = label_of(data.coords[along], along).partition(" [")[0]
     label = f"{'local slope' if local else 'slope'} of log {name} over log {over_what}"
@@ -178,111 +180,111 @@ def failure_map(
     status = _status_of("data", data)
     one_of("reduce", reduce, ("any", "fraction"))
     grid = arrange(status, x, y, where)
-    found = _count("data", status, grid, (panel for _, panel in grid.panels))
-    codes, names = found.codes, found.names
+    statuses = _count("data", status, grid, (panel for _, panel in grid.panels))
+    codes, names = statuses.codes, statuses.names
     if reduce == "fraction":
         pictures = []
-        for c in found.counts:
-            computed = c[~found.open].sum(0)
-            values = c[found.bad].sum(0) / np.where(computed, computed, np.nan)
-            pictures.append(Picture(values, int(c[found.open].sum()), int(c.sum())))
+        for c in statuses.counts:
+            total_computed = c[~statuses.open].sum(0)
+            values = c[statuses.bad].sum(0) / np.where(total_computed, total_computed, np.nan)
+            pictures.append(Picture(values, int(c[statuses.open].sum()), int(c.sum())))
         label = "fraction of trajectories that failed"
         return _draw(grid, pictures, label, "not computed", ax, _scale(pictures, False, (0, 1)))
     axes = grid.axes(ax, 1.9 if grid.y is None else None)
     colours = [_STATUS_COLOURS.get(n, COLOURS[i % len(COLOURS)]) for i, n in enumerate(names)]
     norm = BoundaryNorm([*(c - 0.5 for c in codes), codes[-1] + 0.5], len(codes))
-    for axis, c in zip(axes, found.counts, strict=True):
+    for axis, c in zip(axes, statuses.counts, strict=True):
         # Its most frequent failure, else its most frequent status.
-        failures = c * found.bad.reshape(-1, *(1,) * (c.ndim - 1))
+        failures = c * statuses.bad.reshape(-1, *(1,) * (c.ndim - 1))
         commonest = np.where(failures.any(0), failures.argmax(0), c.argmax(0))
-        shown, edges = np.asarray(codes)[commonest], [place.edges for place in grid.places]
+        status_codes, edges = np.asarray(codes)[commonest], [place.edges for place in grid.places]
         if grid.y is None:  # a strip
-            shown, edges = shown[None], [np.asarray([0.0, 1.0]), *edges]
+            status_codes, edges = status_codes[None], [np.asarray([0.0, 1.0]), *edges]
             axis.set_yticks([])
         _frame(axis)
         look: Any = {"cmap": ListedColormap(colours), "norm": norm, "rasterized": True}
-        axis.pcolormesh(edges[1], edges[0], shown, **look)
-    total = np.sum([c.reshape(len(codes), -1).sum(1) for c in found.counts], axis=0)
+        axis.pcolormesh(edges[1], edges[0], status_codes, **look)
+    total = np.sum([c.reshape(len(codes), -1).sum(1) for c in statuses.counts], axis=0)
     entries = [
         _flag(colour, f"{name.replace('_', ' ')}: {_share(int(n), int(total.sum()))}")
         for colour, name, n in zip(colours, names, total, strict=True)
         if n
     ]
-    drawn = grid.dress(axes)
-    legend(axes[0], ax is None, entries, labelled=False)
-    return drawn
+    dressed_axes = grid.dress(axes)
+    legend(axes[0], ax is None, entries, artists=False)
+    return dressed_axes
 
 
 def _scale(pictures: Sequence[Picture], log: bool | None, limits: Any) -> tuple[Any, str]:
     """(norm, `extend`) for all panels: logarithmic for positive numbers over decades, with a
     middle for numbers of both signs. **Raises** `ValueError` for a scale that is impossible.
     """
-    found = np.concatenate([np.ravel(p.values) for p in pictures])
-    found = found[np.isfinite(found)]
-    positive = found[found > 0]
+    numbers = np.concatenate([np.ravel(p.values) for p in pictures])
+    numbers = numbers[np.isfinite(numbers)]
+    positive = numbers[numbers > 0]
     if log is None:
-        log = positive.size > 0 and bool((found >= 0).all())
+        log = positive.size > 0 and bool((numbers >= 0).all())
         log = log and bool(positive.max() > 10**_DECADES * positive.min())
-    if log and (found < 0).any():
+    if log and (numbers < 0).any():
         raise ValueError(
             "log=True is not allowed for negative values, and the smallest value of a pixel is "
-            f"{found.min():.3g}: leave out log=True, or draw abs(data)."
+            f"{numbers.min():.3g}: leave out log=True, or draw abs(data)."
         )
     if limits is not None:
         low, high = two_numbers(limits)
         if not low < high or (log and low <= 0):
-            wanted = "two increasing positive numbers" if log else "two increasing numbers"
-            raise ValueError(f"limits must be {wanted}, got {limits!r}.")
-    elif not log and found.size:
-        below, above = -found.min(), found.max()
-        if min(below, above) > _BOTH_SIGNS * max(below, above):
-            return CenteredNorm(0, max(below, above)), "neither"
-    return scale_of(found, limits, log)
+            rule = "two increasing positive numbers" if log else "two increasing numbers"
+            raise ValueError(f"limits must be {rule}, got {limits!r}.")
+    elif not log and numbers.size:
+        negative, largest = -numbers.min(), numbers.max()
+        if min(negative, largest) > _BOTH_SIGNS * max(negative, largest):
+            return CenteredNorm(0, max(negative, largest)), "neither"
+    return scale_of(numbers, limits, log)
 
 
 def _draw(
     grid: Grid,
     pictures: list[Picture],
     label: str,
-    what: str,
+    cause: str,
     ax: Any,
     scale: tuple[Any, str],
-    found: "_Statuses | None" = None,
+    statuses: "_Statuses | None" = None,
 ) -> Any:
     """Numbers in their colours, with a bar and a legend of cells without a number."""
-    norm, beyond = scale
+    norm, ends = scale
     log, signs = isinstance(norm, LogNorm), isinstance(norm, CenteredNorm)
     axes, mesh, line = grid.axes(ax), None, grid.y is None
     for i, (axis, picture) in enumerate(zip(axes, pictures, strict=True)):
         values = picture.values
-        zero, missing = (values == 0) & log, ~np.isfinite(values)
-        shown = np.where(zero | missing, np.nan, values)
+        zero, invalid = (values == 0) & log, ~np.isfinite(values)
+        numbers = np.where(zero | invalid, np.nan, values)
         if grid.y is None:
             # A line, over marks at the bottom where there is no number.
             centres, mark = grid.x.centres, "o" if values.size <= 60 else ""
-            axis.plot(centres, shown, marker=mark, color=COLOURS[0])
+            axis.plot(centres, numbers, marker=mark, color=COLOURS[0])
             axis.set(yscale="log" if log else "linear", ylabel=label)
-            for here, kind in ((zero, ZERO), (missing, NO_NUMBER)):
+            for mask, kind in ((zero, ZERO), (invalid, NO_NUMBER)):
                 marker, colour = _MARKS[kind]
-                at_edge(axis, centres[here], marker, 0.025, color=colour, ms=4.5)
+                at_edge(axis, centres[mask], marker, 0.025, color=colour, ms=4.5)
             continue
         _frame(axis)
         edges = grid.x.edges, grid.y.edges
-        mesh = cells(axis, *edges, shown, norm, "PuOr_r" if signs else SHADES)
+        mesh = cells(axis, *edges, numbers, norm, "PuOr_r" if signs else SHADES)
         flat_cells(axis, *edges, zero, ZERO)
-        if found is not None:
-            nothing = found.counts[i][~found.open].sum(0) == 0
-            flat_cells(axis, *edges, nothing & np.isnan(values), _NOT_COMPUTED)
-    drawn = grid.dress(axes)
+        if statuses is not None:
+            is_open = statuses.counts[i][~statuses.open].sum(0) == 0
+            flat_cells(axis, *edges, is_open & np.isnan(values), _NOT_COMPUTED)
+    dressed_axes = grid.dress(axes)
     if mesh is not None:
-        axes[0].figure.colorbar(mesh, ax=list(axes), label=label, extend=beyond)
-    points, missing = sum(p.points for p in pictures), sum(p.missing for p in pictures)
+        axes[0].figure.colorbar(mesh, ax=list(axes), label=label, extend=ends)
+    points, invalid = sum(p.points for p in pictures), sum(p.absent for p in pictures)
     open_points = 0
-    if found is not None:
-        share_open = sum(c[found.open].sum() for c in found.counts) / np.sum(found.counts)
+    if statuses is not None:
+        share_open = sum(c[statuses.open].sum() for c in statuses.counts) / np.sum(statuses.counts)
         open_points = round(share_open * points)
     counts = {
-        (NO_NUMBER, what): missing - open_points,
+        (NO_NUMBER, cause): invalid - open_points,
         (_NOT_COMPUTED, "not computed"): open_points,
     }
     entries = [
@@ -292,8 +294,8 @@ def _draw(
     ]
     if log and any((p.values == 0).any() for p in pictures):
         entries.append(_flag(ZERO, "exactly 0", line))
-    legend(axes[0], ax is None, entries, labelled=False)
-    return drawn
+    legend(axes[0], ax is None, entries, artists=False)
+    return dressed_axes
 
 
 def _frame(axis: Any) -> None:
@@ -305,8 +307,8 @@ def _frame(axis: Any) -> None:
 def _flag(colour: str, label: str, line: bool = False) -> Any:
     """An entry of a legend, of a map or of a line."""
     if line and colour in _MARKS:
-        marker, shown = _MARKS[colour]
-        return entry(label, marker=marker, color=shown, ls="none")
+        marker, colour_of_mark = _MARKS[colour]
+        return entry(label, marker=marker, color=colour_of_mark, ls="none")
     plain = {"facecolor": colour, "edgecolor": "#8c8c8c", "lw": 0.6}
     return Patch(label=label, **(HATCH if colour == NO_NUMBER else plain))
 
@@ -318,24 +320,25 @@ def _share(count: int, total: int) -> str:
     return f"{count} of {total} ({text} %)"
 
 
-def _positive(data: Any, along: str) -> tuple[np.ndarray, np.ndarray]:
+def _positive(data: Any, coordinate: str) -> tuple[np.ndarray, np.ndarray]:
     """(positive values of a coordinate, rising; their places along the dimension)."""
-    kind = data.coords[along].dtype if along in data.coords else None
+    kind = data.coords[coordinate].dtype if coordinate in data.coords else None
     if kind is None or kind.kind not in "iuf":
-        seen = "has no coordinate values" if kind is None else f"has values of dtype {kind}"
+        kind_text = "has no coordinate values" if kind is None else f"has values of dtype {kind}"
         raise ValueError(
-            f"along={along!r} must have numbers as coordinate values, but it {seen}: add "
+            f"along={coordinate!r} must have numbers as coordinate values, but it {kind_text}: add "
             "numbers with data.assign_coords, or choose another dimension or coordinate. The "
             f"dimensions are {names_of(data)}."
         )
-    values = data.coords[along].values
+    values = data.coords[coordinate].values
     order = np.argsort(values, kind="stable")
     order = order[np.isfinite(values[order]) & (values[order] > 0)]
     equal = np.flatnonzero(np.diff(values[order]) == 0)
     if len(order) < 2 or len(equal):
-        found = f"{values[order[equal[0]]]} more than once" if len(equal) else f"only {len(order)}"
+        cause = f"{values[order[equal[0]]]} more than once" if len(equal) else f"only {len(order)}"
         raise ValueError(
-            f"along={along!r} must have at least two positive values, all different, got {found}. "
+            f"along={coordinate!r} must have at least two positive values, all different, got "
+            f"{cause}. "
             "Select other values, or choose another coordinate."
         )
     return np.asarray(values[order], float), order
@@ -349,14 +352,14 @@ def _slopes(
     Not `local`: Σ (x − x̄) y / Σ (x − x̄)² over these numbers, shape (1, ...).
     """
     lines = np.asarray(lines[order], float)
-    there = np.isfinite(lines) & (lines > max(floor, 0.0))
-    y, x = np.log(np.where(there, lines, np.nan)), x.reshape(-1, *(1,) * (lines.ndim - 1))
+    valid = np.isfinite(lines) & (lines > max(floor, 0.0))
+    y, x = np.log(np.where(valid, lines, np.nan)), x.reshape(-1, *(1,) * (lines.ndim - 1))
     if local:
         return np.diff(y, axis=0) / np.diff(x, axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        from_mean = np.where(there, x - (there * x).sum(0) / there.sum(0), 0.0)
-        slopes = (from_mean * np.where(there, y, 0.0)).sum(0) / (from_mean**2).sum(0)
-    return np.where(there.sum(0) > 1, slopes, np.nan)[None]
+        from_mean = np.where(valid, x - (valid * x).sum(0) / valid.sum(0), 0.0)
+        slopes = (from_mean * np.where(valid, y, 0.0)).sum(0) / (from_mean**2).sum(0)
+    return np.where(valid.sum(0) > 1, slopes, np.nan)[None]
 
 
 class _Statuses(NamedTuple):
@@ -376,9 +379,9 @@ def _status_of(name: str, data: Any) -> Any:
 
     if isinstance(data, xr.Dataset):
         if "status" not in data:
-            held = ", ".join(map(str, data.data_vars)) or "no variables"
+            names = ", ".join(map(str, data.data_vars)) or "no variables"
             raise ValueError(
-                f"{name} must contain the variable status, got a Dataset with {held}: give "
+                f"{name} must contain the variable status, got a Dataset with {names}: give "
                 "result.to_xarray(), where result is the result of dvi.sweep."
             )
         data = data["status"]
@@ -396,22 +399,22 @@ def _count(name: str, status: Any, grid: Grid, panels: Iterable[Any]) -> _Status
         )
     codes, names = zip(*sorted(zip(map(int, values), meanings.split(), strict=True)), strict=True)
     counts = [count_codes(panel, grid.bins, codes) for panel in panels]
-    unknown = np.asarray([name == _OPEN for name in names])
+    is_open = np.asarray([name == _OPEN for name in names])
     bad = np.asarray([name not in (*_GOOD, _OPEN) for name in names])
-    return _Statuses(list(codes), list(names), unknown, bad, counts)
+    return _Statuses(list(codes), list(names), is_open, bad, counts)
 
 
 def _count_beside(status: Any, grid: Grid) -> _Statuses:
     """The statuses in the pixels of a map of other numbers."""
     status = _status_of("status", status)
-    along = [] if grid.facet is None else [dim_of(status, grid.facet)]
-    wanted = [*grid.bins, *along]
-    others = [d for d in status.dims if d not in (*wanted, *grid.over) and status.sizes[d] > 1]
-    if others or any(d not in status.dims for d in wanted):
+    facets = [] if grid.facet is None else [dim_of(status, grid.facet)]
+    dims = [*grid.bins, *facets]
+    excess = [d for d in status.dims if d not in (*dims, *grid.over) and status.sizes[d] > 1]
+    if excess or any(d not in status.dims for d in dims):
         raise ValueError(
-            f"status must have the dimensions {', '.join(wanted)} of the map and no others, got "
+            f"status must have the dimensions {', '.join(dims)} of the map and no others, got "
             f"{names_of(status)}: use the status of the same sweep as data, and select the same "
             "values in both before the plot."
         )
-    selections = (dict.fromkeys(along, i) for i in range(len(grid.panels)))
-    return _count("status", status, grid, (status.isel(one) for one in selections))
+    selections = (dict.fromkeys(facets, i) for i in range(len(grid.panels)))
+    return _count("status", status, grid, (status.isel(selection) for selection in selections))

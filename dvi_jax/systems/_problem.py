@@ -93,16 +93,16 @@ class Problem:
                 array = np.asarray(value, jnp.result_type(float))
                 object.__setattr__(self, name, array)
         args = self.args if isinstance(self.args, Mapping) else {}
-        for what, known, kind in (
+        for field_name, names, kind in (
             ("invariants", self.observables, "observables"),
             ("adiabatic", self.observables, "observables"),
             ("parameters", args, "the dict args"),
         ):
-            for name in set(getattr(self, what)) - set(known):
+            for name in set(getattr(self, field_name)) - set(names):
                 raise ValueError(
-                    f"{what} of the problem {self.name!r} contains {name!r}, but must contain only "
-                    f"names in {kind} ({', '.join(sorted(known)) or 'it has no names'}). Correct "
-                    f"the name, or add {name!r} to {kind}."
+                    f"{field_name} of the problem {self.name!r} contains {name!r}, but must have "
+                    f"only names in {kind} ({', '.join(sorted(names)) or 'it has no names'}). "
+                    f"Correct the name, or add {name!r} to {kind}."
                 )
 
 
@@ -141,19 +141,21 @@ class Start:
         if not (self.singular or self.also):
             return
         q, p = np.asarray(q0, float), np.asarray(p0, float)
-        for what, at in self.singular.items():
-            point: Any = at(args) if callable(at) else at
+        for name_of_point, place in self.singular.items():
+            point: Any = place(args) if callable(place) else place
             if (q == point).all():
-                seen = np.asarray(point, float).tolist()
-                raise ValueError(f"q0 must not be at {what} {seen}: the system is singular there.")
+                values = np.asarray(point, float).tolist()
+                raise ValueError(
+                    f"q0 must not be at {name_of_point} {values}: the system is singular there."
+                )
         if self.also is not None:
             self.also(q, p, args)
 
-    def _fits(self, seen: tuple[int, ...]) -> bool:
+    def _fits(self, state_shape: tuple[int, ...]) -> bool:
         if self.shape is None:
             return True
-        pairs = zip(seen, self.shape, strict=False)
-        return len(seen) == len(self.shape) and all(
+        pairs = zip(state_shape, self.shape, strict=False)
+        return len(state_shape) == len(self.shape) and all(
             n >= self.least if m is None else n == m for n, m in pairs
         )
 
@@ -165,20 +167,20 @@ class Start:
         return f"shape {self.shape}{range_of_n}".replace("None", "n")
 
 
-def check_shape(q0: Any, p0: Any, fits: Callable[[tuple[int, ...]], bool], wanted: str) -> None:
-    """Require q0 and p0 of one shape for which `fits` holds; `wanted`: these shapes, a sentence."""
+def check_shape(q0: Any, p0: Any, fits: Callable[[tuple[int, ...]], bool], rule: str) -> None:
+    """Require q0 and p0 of one shape for which `fits` holds; `rule`: these shapes, a sentence."""
     q, p = np.shape(q0), np.shape(p0)
     if q != p or not fits(q):
-        raise ValueError(f"{wanted}, got q0 of shape {q} and p0 of shape {p}.")
+        raise ValueError(f"{rule}, got q0 of shape {q} and p0 of shape {p}.")
 
 
 def parameter(args: Any, name: str) -> Any:
     """The parameter of this name. **Raises** `ParameterError`, with the names that args has."""
     if not isinstance(args, Mapping) or name not in args:
-        there = ", ".join(map(str, args)) if isinstance(args, Mapping) else ""
+        keys = ", ".join(map(str, args)) if isinstance(args, Mapping) else ""
         raise ParameterError(
             f"the parameter {name} is missing: args must be a dict with the key {name!r}, got "
-            + (f"the keys {there}." if there else f"{args!r:.200}.")
+            + (f"the keys {keys}." if keys else f"{args!r:.200}.")
         )
     return args[name]
 
@@ -213,12 +215,12 @@ def between(low: float, high: float) -> Check:
 def vector(size: int) -> Check:
     """A check for `size` finite numbers."""
 
-    def check(name: str, given: Any) -> None:
+    def check(name: str, array_like: Any) -> None:
         try:
-            value = np.asarray(given, float)
+            value = np.asarray(array_like, float)
         except (TypeError, ValueError) as error:
             raise ValueError(
-                f"{name} must be an array of {size} numbers, got {given!r:.200} ({error})."
+                f"{name} must be an array of {size} numbers, got {array_like!r:.200} ({error})."
             ) from None
         if value.shape != (size,):
             raise ValueError(f"{name} must have shape ({size},), got shape {value.shape}.")
@@ -267,9 +269,9 @@ def library_problem(
         fields["symmetries"] = {"time": time_translation(), **fields.get("symmetries", {})}
     return Problem(
         system=System(hamiltonian, force, perturbation, slow_time, **more),
-        args={name: one.value for name, one in parameters.items()} or None,
-        check=replace(start, parameters={name: one.check for name, one in parameters.items()}),
-        parameters={name: one.meaning for name, one in parameters.items()},
+        args={name: entry.value for name, entry in parameters.items()} or None,
+        check=replace(start, parameters={name: entry.check for name, entry in parameters.items()}),
+        parameters={name: entry.meaning for name, entry in parameters.items()},
         observables={f.__name__: InSlowTime(f) if slow_time else f for f in observables},
         **fields,
     )
@@ -313,7 +315,7 @@ def over_times(
     shape t.shape + q0.shape and the dtype of the initial conditions. It **raises** `ValueError` for
     initial conditions of another shape.
     """
-    wanted = "the same shape" if shape is None else f"shape {shape}"
+    shapes = "the same shape" if shape is None else f"shape {shape}"
 
     def decorate(at_time):
         @functools.wraps(at_time)
@@ -322,9 +324,9 @@ def over_times(
             check_shape(
                 q0,
                 p0,
-                lambda seen: shape is None or seen == shape,
+                lambda state_shape: shape is None or state_shape == shape,
                 "exact requires one initial condition (for several use jax.vmap(exact, (None, 0, "
-                f"0, None))): q0 and p0 must have {wanted}",
+                f"0, None))): q0 and p0 must have {shapes}",
             )
             dtype = jnp.result_type(q0, p0, float)
             q0, p0 = q0.astype(dtype), p0.astype(dtype)

@@ -110,11 +110,11 @@ def exact(t, q0, p0, args):
         return jnp.where(about_third, sign * (jnp.pi / 2 - turning), jnp.arctan2(M1, M2))
 
     at_start = body_angle(begin, jnp.where(about_third, M0[0], M0[2]), M0[1])
-    whole = 2 * jnp.pi * jnp.round((q0[0] - at_start) / (2 * jnp.pi))
+    turns = 2 * jnp.pi * jnp.round((q0[0] - at_start) / (2 * jnp.pi))
     complement = jnp.where(about_third, middle * wide / (first * low), G2 / c**2)
-    passed = (third_kind(end, complement, m) - third_kind(begin, complement, m)) / rate
-    g = q0[1] + p0[1] * (t / I[2] + (1 / I[0] - 1 / I[2]) * passed)
-    angle = body_angle(end, M1, two) + whole
+    time = (third_kind(end, complement, m) - third_kind(begin, complement, m)) / rate
+    g = q0[1] + p0[1] * (t / I[2] + (1 / I[0] - 1 / I[2]) * time)
+    angle = body_angle(end, M1, two) + turns
     q, p = jnp.stack([angle, g, q0[2]]), jnp.stack([M3, p0[1], p0[2]])
     return q + 0 * m, p + 0 * m  # NaN in all components if in one
 

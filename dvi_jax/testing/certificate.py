@@ -39,7 +39,7 @@ class Certificate:
     @property
     def missed(self) -> list[Control]:
         """The controls without a measured number that fails (an exception is not one)."""
-        return [control for control, measured in self.controls if measured.verdict != "FAIL"]
+        return [control for control, result in self.controls if result.verdict != "FAIL"]
 
     @property
     def ok(self) -> bool:
@@ -50,10 +50,10 @@ class Certificate:
     def summary(self) -> str:
         """Two lines: the methods, the controls."""
         good = len(self.rows) - len({method for method, _, _ in self.failures})
-        caught = len(self.controls) - len(self.missed)
+        detections = len(self.controls) - len(self.missed)
         return (
             f"methods: {good} of {len(self.rows)} have the properties that they claim\n"
-            f"controls: {caught} of {len(self.controls)} caught"
+            f"controls: {detections} of {len(self.controls)} caught"
         )
 
     def tables(self) -> list[Table]:
@@ -90,7 +90,7 @@ def certify(
     method takes 15 to 35 seconds.
     """
     require_double_precision()
-    named = _named(methods)
+    by_name = _named(methods)
     names = chosen("check", checks, CHECKS)
     controls = [control for control in CONTROLS if control.check in names]
     if {"order", "forced-order"} & set(names):
@@ -103,18 +103,18 @@ def certify(
 
     pool = ThreadPoolExecutor(_WORKERS)
     try:
-        rows = {name: pool.submit(row, method, names) for name, method in named.items()}
-        tried = [(c, pool.submit(row, c.method, [c.check])) for c in controls]
-        futures = [*rows.values(), *(future for _, future in tried)]
-        for done, future in enumerate(as_completed(futures), 1):
+        rows = {name: pool.submit(row, method, names) for name, method in by_name.items()}
+        trials = [(c, pool.submit(row, c.method, [c.check])) for c in controls]
+        futures = [*rows.values(), *(future for _, future in trials)]
+        for count, future in enumerate(as_completed(futures), 1):
             future.result()
             if progress is not None:
-                progress(done, len(futures))
+                progress(count, len(futures))
     finally:
         pool.shutdown(cancel_futures=True)
-    measured = {name: future.result() for name, future in rows.items()}
-    outcomes = tuple((c, future.result()[c.check]) for c, future in tried)
-    return Certificate(named, measured, outcomes)
+    outcomes_of = {name: future.result() for name, future in rows.items()}
+    outcomes = tuple((c, future.result()[c.check]) for c, future in trials)
+    return Certificate(by_name, outcomes_of, outcomes)
 
 
 def _named(methods: Any) -> dict[str, dvi.Method]:
@@ -125,14 +125,14 @@ def _named(methods: Any) -> dict[str, dvi.Method]:
             f'certify({{"mine": {methods!r}}}).'
         )
     if not isinstance(methods, Mapping):
-        own = " For your own method call certify({name: method})."
-        return {name: METHODS[name] for name in chosen("method", methods, METHODS, own)}
+        hint = " For your own method call certify({name: method})."
+        return {name: METHODS[name] for name in chosen("method", methods, METHODS, hint)}
     for name, method in methods.items():
         if not isinstance(method, dvi.Method):
-            seen = (
+            kind = (
                 f"the class {method.__name__}" if isinstance(method, type) else f"{method!r:.200}"
             )
-            raise TypeError(f"methods[{name!r}] must be a method such as dvi.TypeII(), got {seen}.")
+            raise TypeError(f"methods[{name!r}] must be a method such as dvi.TypeII(), got {kind}.")
         order = method.order
         if isinstance(order, bool) or not isinstance(order, int | float):
             raise TypeError(f"methods[{name!r}].order must be an int or a float, got {order!r}.")

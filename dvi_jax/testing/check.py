@@ -55,8 +55,8 @@ class Measured:
 
 def at_most(value: float, bound: float, claimed: bool = True, detail: str = "") -> Measured:
     """value ≤ bound."""
-    passed = math.isfinite(value) and value <= bound
-    return Measured(float(value), f"≤ {bound:g}", passed, claimed, detail)
+    holds = math.isfinite(value) and value <= bound
+    return Measured(float(value), f"≤ {bound:g}", holds, claimed, detail)
 
 
 def not_measured(allowed: str, detail: str, claimed: bool = True) -> Measured:
@@ -80,8 +80,8 @@ class Check:
         try:
             return self.measure(candidate)
         except Exception as error:  # whatever the user's method raises
-            said = str(error).strip().splitlines() or [""]
-            return not_measured("no error", f"{type(error).__name__}: {said[0][:200]}")
+            lines = str(error).strip().splitlines() or [""]
+            return not_measured("no error", f"{type(error).__name__}: {lines[0][:200]}")
 
 
 CHECKS: dict[str, Check] = {}
@@ -98,18 +98,18 @@ def check(name: str, remedy: str, digits: str = ".0e", any_problem: bool = False
         says = " ".join((measure.__doc__ or "").split())
         CHECKS[name] = Check(name, says, measure, remedy, digits, any_problem)
 
-        def required(method: dvi.Method, problem: Problem | None = None) -> Measured:
+        def requirement(method: dvi.Method, problem: Problem | None = None) -> Measured:
             if problem is not None and not any_problem:
                 raise ValueError(
                     f"problem must be None, because {name} is measured on a fixed problem. Call "
-                    f"{required.__name__}(method)."
+                    f"{requirement.__name__}(method)."
                 )
             return _require(Candidate(method, problem), [name])[name]
 
         # Not functools.wraps: the signature shown must be that of `required`.
         for attribute in ("__name__", "__qualname__", "__module__", "__doc__"):
-            setattr(required, attribute, getattr(measure, attribute))
-        return required
+            setattr(requirement, attribute, getattr(measure, attribute))
+        return requirement
 
     return register
 
@@ -129,17 +129,17 @@ def check_method(method: dvi.Method, checks: Iterable[str] | None = None) -> dic
 
 def _require(candidate: Candidate, checks: Iterable[str] | None) -> dict[str, Measured]:
     require_double_precision()
-    found = {name: CHECKS[name](candidate) for name in chosen("check", checks, CHECKS)}
-    failed = [
-        f"{name}: measured {measured.value:.3g}, required {measured.allowed}. {measured.detail}\n"
+    results = {name: CHECKS[name](candidate) for name in chosen("check", checks, CHECKS)}
+    faults = [
+        f"{name}: measured {result.value:.3g}, required {result.allowed}. {result.detail}\n"
         f"  What is measured: {CHECKS[name].says}\n  What to do: {CHECKS[name].remedy}"
-        for name, measured in found.items()
-        if not measured.ok
+        for name, result in results.items()
+        if not result.ok
     ]
-    if failed:
+    if faults:
         claims = f"{type(candidate.method).__name__} does not have all properties that it claims:"
-        raise AssertionError("\n".join([claims, *failed]))
-    return found
+        raise AssertionError("\n".join([claims, *faults]))
+    return results
 
 
 def require_double_precision() -> None:
@@ -151,30 +151,30 @@ def require_double_precision() -> None:
         )
 
 
-def chosen(kind: str, names: Any, known: Iterable[str], hint: str = "") -> list[str]:
+def chosen(kind: str, names: Any, choices: Iterable[str], hint: str = "") -> list[str]:
     """`names` without repetitions, or all that are known for None.
 
     **Raises** `ValueError` for an unknown name and for none at all, `TypeError` for no list.
     """
-    known = list(known)
+    choices = list(choices)
     if names is None:
-        return known
+        return choices
     if isinstance(names, str) or not isinstance(names, Iterable):
         raise TypeError(
-            f"{kind}s must be a list of names such as [{known[0]!r}], got {names!r:.200}.{hint}"
+            f"{kind}s must be a list of names such as [{choices[0]!r}], got {names!r:.200}.{hint}"
         )
     names = list(dict.fromkeys(names))
     if not names:
         raise ValueError(
-            f"{kind}s is empty: name at least one of {', '.join(known)}; or give None for all."
+            f"{kind}s is empty: name at least one of {', '.join(choices)}; or give None for all."
         )
-    lowered = {name.lower(): name for name in known}
+    lower_case = {name.lower(): name for name in choices}
     for name in names:
-        if name not in known:
-            near = difflib.get_close_matches(str(name).lower(), lowered, n=1)
-            meant = f" (did you mean {lowered[near[0]]}?)" if near else ""
+        if name not in choices:
+            matches = difflib.get_close_matches(str(name).lower(), lower_case, n=1)
+            proposal = f" (did you mean {lower_case[matches[0]]}?)" if matches else ""
             raise ValueError(
-                f"{kind}s must be known names, got {name!r:.200}{meant}. The known names are "
-                f"{', '.join(known)}.{hint}"
+                f"{kind}s must be known names, got {name!r:.200}{proposal}. The known names are "
+                f"{', '.join(choices)}.{hint}"
             )
     return names

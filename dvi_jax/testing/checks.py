@@ -54,17 +54,17 @@ def _measured_order(candidate: Candidate, epsilon: float) -> Measured:
 
     For McLachlan8 it is 8.2, and 8.04 with the next term of the error.
     """
-    claimed = candidate.method.order
-    steps, errors, ended = errors_at(candidate, epsilon)
-    allowed = f"{claimed:g} ± {TOLERANCE:g}"
+    order_claim = candidate.method.order
+    steps, errors, end = errors_at(candidate, epsilon)
+    bound = f"{order_claim:g} ± {TOLERANCE:g}"
     if len(errors) < POINTS or not np.all(np.isfinite(errors)):
         points = f"{len(errors)} points above round-off, at least {POINTS} needed"
-        return not_measured(allowed, f"{points}; {ended}")
+        return not_measured(bound, f"{points}; {end}")
     h, e = np.array(steps[-POINTS:]), np.array(errors[-POINTS:])
     terms = np.stack([np.ones_like(h), np.log(h), h**2], axis=1)
     order = float(np.linalg.lstsq(terms, np.log(e), rcond=None)[0][1])
-    seen = f"errors {e[0]:.1e} to {e[-1]:.1e} for h = {h[0]:.3g} to {h[-1]:.3g}; {ended}"
-    return Measured(order, allowed, abs(order - claimed) <= TOLERANCE, True, seen)
+    detail = f"errors {e[0]:.1e} to {e[-1]:.1e} for h = {h[0]:.3g} to {h[-1]:.3g}; {end}"
+    return Measured(order, bound, abs(order - order_claim) <= TOLERANCE, True, detail)
 
 
 def errors_at(candidate: Candidate, epsilon: float) -> tuple[list[float], list[float], str]:
@@ -130,8 +130,8 @@ def check_reversible(candidate: Candidate) -> Measured:
     problem with its force. At most 1e-12. Claimed by symmetric methods."""
     n, x = 10, inputs(candidate.problem, 0.0)
     q, p = candidate.flow(x, n)
-    back = candidate.flow(x | {"q0": q, "p0": p, "t0": n * x["h"], "h": -x["h"]}, n)
-    defect = np.max(np.abs(back - np.stack([x["q0"], x["p0"]])))
+    final = candidate.flow(x | {"q0": q, "p0": p, "t0": n * x["h"], "h": -x["h"]}, n)
+    defect = np.max(np.abs(final - np.stack([x["q0"], x["p0"]])))
     return at_most(float(defect), ROUND_OFF, candidate.method.is_symmetric)
 
 
@@ -144,22 +144,22 @@ def check_reversible(candidate: Candidate) -> Measured:
 def check_inverse(candidate: Candidate) -> Measured:
     """max |z − z0| after four steps h = 0.1 of the method and four steps −h of its adjoint; coupled
     problem with its force. At most 1e-12. Claimed by invertible methods."""
-    allowed, method = f"≤ {ROUND_OFF:g}", candidate.method
+    bound, method = f"≤ {ROUND_OFF:g}", candidate.method
     if not method.is_invertible:
-        return not_measured(allowed, "the method has no inverse", claimed=False)
+        return not_measured(bound, "the method has no inverse", claimed=False)
     adjoint = dvi.Adjoint(method)  # pyright: ignore[reportCallIssue]
     x = inputs(candidate.small)
-    z, there = candidate.compiled(x)
+    z, success = candidate.compiled(x)
     q, p = (part.reshape(x["q0"].shape) for part in jnp.split(z, 2))
     end = {"q0": q, "p0": p, "t0": x["t0"] + STEPS * x["h"], "h": -x["h"]}
-    back, again = jax.jit(lambda x: candidate.run(x, method=adjoint))(x | end)
-    if not (there and again):
-        return not_measured(allowed, "a step or its inverse failed")
+    final, success_of_inverse = jax.jit(lambda x: candidate.run(x, method=adjoint))(x | end)
+    if not (success and success_of_inverse):
+        return not_measured(bound, "a step or its inverse failed")
     start = np.concatenate([x["q0"].ravel(), x["p0"].ravel()])
-    moved, defect = (float(np.max(np.abs(a - start))) for a in (z, back))
-    if moved < 1e-3:  # the identity is its own inverse, and shows nothing
-        return not_measured(allowed, f"the steps moved the state by {moved:.2g} only")
-    return at_most(defect, ROUND_OFF, detail=f"the steps moved the state by {moved:.2g}")
+    distance, defect = (float(np.max(np.abs(a - start))) for a in (z, final))
+    if distance < 1e-3:  # the identity is its own inverse, and shows nothing
+        return not_measured(bound, f"the steps moved the state by {distance:.2g} only")
+    return at_most(defect, ROUND_OFF, detail=f"the steps moved the state by {distance:.2g}")
 
 
 # --- long runs
@@ -190,13 +190,13 @@ def check_momentum(candidate: Candidate) -> Measured:
 
 
 def _of_long_run(candidate, value: float, bound: float, detail: str = "") -> Measured:
-    run, claimed = candidate.long_run, candidate.method.is_symplectic
+    run, claim = candidate.long_run, candidate.method.is_symplectic
     if run.status != "successful":
         step = int(run.stats["failed_step"])
         return not_measured(
-            f"≤ {bound:g}", f"the trajectory failed at step {step}: {run.status}", claimed
+            f"≤ {bound:g}", f"the trajectory failed at step {step}: {run.status}", claim
         )
-    return at_most(value, bound, claimed, detail)
+    return at_most(value, bound, claim, detail)
 
 
 # --- derivatives
@@ -237,11 +237,11 @@ def _quotient(candidate: Candidate, name: str) -> float:
     """Central differences with steps of 1e-3 and 2e-3, extrapolated: errors of about 1e-11."""
     x = inputs(candidate.small)
 
-    def lost(shift):
+    def loss_of(shift):
         return float(loss(np.asarray(candidate.compiled(x | {name: x[name] + shift})[0])))
 
     def slope(s):
-        return (lost(s) - lost(-s)) / (2 * s)
+        return (loss_of(s) - loss_of(-s)) / (2 * s)
 
     return (4 * slope(1e-3) - slope(2e-3)) / 3
 
@@ -257,9 +257,9 @@ def _quotient(candidate: Candidate, name: str) -> float:
 def check_jit(candidate: Candidate) -> Measured:
     """Relative difference between a step that is compiled (`jax.jit`) and the same step without
     compilation; central problem with its force. At most 1e-14."""
-    compiled = candidate.one_step()
+    reference = candidate.one_step()
     with jax.disable_jit():
-        return at_most(_relative(compiled, candidate.one_step()), 1e-14)
+        return at_most(_relative(reference, candidate.one_step()), 1e-14)
 
 
 @check("vmap", "Look for operations that mix the elements of a batch, such as a custom_vmap.")
@@ -267,9 +267,9 @@ def check_batch(candidate: Candidate) -> Measured:
     """Relative difference between four trajectories in a batch (`jax.vmap`), different in every
     input, and the same four computed one by one; coupled problem with its force. At most 1e-12."""
     xs = _batch(candidate)
-    together = candidate.batch(_stacked(xs))[0]
+    batch = candidate.batch(_stacked(xs))[0]
     alone = [candidate.compiled(x)[0] for x in xs]
-    return at_most(_relative(together, alone), ROUND_OFF, detail=f"{len(xs)} trajectories")
+    return at_most(_relative(batch, alone), ROUND_OFF, detail=f"{len(xs)} trajectories")
 
 
 @check("failure", "Return the status of every solve in `info`, and never replace NaN by a number.")
@@ -278,13 +278,13 @@ def check_failure(candidate: Candidate) -> Measured:
     and be NaN, and the others must agree to 1e-12 with those computed alone."""
     xs, bad = _batch(candidate), 1
     xs[bad] |= {"q0": jnp.full_like(xs[bad]["q0"], 1e200)}
-    together, good = candidate.batch(_stacked(xs))
-    if good[bad] or np.isfinite(together[bad]).any():
-        said = "as a success" if good[bad] else "as a failure, but its state is a number"
-        detail = f"the trajectory that overflows is reported {said}"
+    batch, good = candidate.batch(_stacked(xs))
+    if good[bad] or np.isfinite(batch[bad]).any():
+        report = "as a success" if good[bad] else "as a failure, but its state is a number"
+        detail = f"the trajectory that overflows is reported {report}"
         return Measured(np.inf, f"≤ {ROUND_OFF:g}", False, detail=detail)
     alone = [candidate.compiled(x)[0] for i, x in enumerate(xs) if i != bad]
-    return at_most(_relative(np.delete(together, bad, 0), alone), ROUND_OFF)
+    return at_most(_relative(np.delete(batch, bad, 0), alone), ROUND_OFF)
 
 
 @check(
@@ -296,22 +296,22 @@ def check_failure(candidate: Candidate) -> Measured:
 def check_traces(candidate: Candidate) -> Measured:
     """Number of times that a run is traced again if q0, p0, t0, h, ε and args change and the method
     is a new instance that is equal. It must be 0."""
-    calls, seen = 0, []
+    calls, counts = 0, []
 
-    def counted(t0, t1, q0, p0, q1, p1, args):
+    def count_calls(t0, t1, q0, p0, q1, p1, args):
         nonlocal calls
         calls += 1
         return q1
 
     for scale in (1.0, 1.1, 1.2):
         calls = 0  # a function with other values in its closure is another function
-        candidate.one_step(scale, counted)
+        candidate.one_step(scale, count_calls)
         # One call is the check of shapes that `integrate` makes before it has a program.
-        seen.append(calls - 1)
-    first, *further = seen
+        counts.append(calls - 1)
+    first, *repeats = counts
     if first < 1:
         return not_measured("≤ 0", "the run was not traced")
-    return at_most(float(max(further)), 0.0, detail=f"{first} calls while it is compiled")
+    return at_most(float(max(repeats)), 0.0, detail=f"{first} calls while it is compiled")
 
 
 def _batch(candidate: Candidate) -> list[dict[str, jax.Array]]:

@@ -62,8 +62,8 @@ def altered(
 ) -> Altered:
     """`method` with another step or inverse, ``(method, equations, interval, q, p)``, or claims."""
     names = ("order", "is_symmetric", "is_symplectic", "is_invertible")
-    claimed: Any = {name: getattr(method, name) for name in names} | claims
-    return Altered(method=method, **claimed, own_step=step, own_inverse=inverse)
+    properties: Any = {name: getattr(method, name) for name in names} | claims
+    return Altered(method=method, **properties, own_step=step, own_inverse=inverse)
 
 
 def _explicit_euler(method, equations, interval, q, p):

@@ -41,8 +41,8 @@ def page_for(out: Path) -> Path:
         except (OSError, UnicodeDecodeError) as error:
             fault = f"{page} cannot be read: {error}"
     if fault:
-        allowed = "a new .md file, an earlier certificate, or a directory for the certificate."
-        raise ValueError(f"--out: {fault}\n  allowed: {allowed}")
+        advice = "a new .md file, an earlier certificate, or a directory for the certificate."
+        raise ValueError(f"--out: {fault}\n  allowed: {advice}")
     return page
 
 
@@ -60,7 +60,7 @@ def tables(
     controls: Sequence[tuple[Control, Measured]],
 ) -> list[Table]:
     """The methods under each group of checks, then the controls."""
-    made = []
+    sheets = []
     for title, group in GROUPS.items():
         names = [n for n in group if all(n in row for row in rows.values())]
         columns = {"method": list(rows)}
@@ -68,16 +68,16 @@ def tables(
             columns["claims"] = [claims(methods[name]) for name in rows]
         columns |= {n: [cell(n, row[n]) for row in rows.values()] for n in names}
         if names:
-            made.append(Table(title, list(columns), list(zip(*columns.values(), strict=True))))
+            sheets.append(Table(title, list(columns), list(zip(*columns.values(), strict=True))))
     if controls:
-        caught = {True: "caught", False: "MISSED"}
+        words = {True: "caught", False: "MISSED"}
         body = [
-            [c.check, c.name, cell(c.check, x), x.allowed, caught[x.verdict == "FAIL"]]
+            [c.check, c.name, cell(c.check, x), x.allowed, words[x.verdict == "FAIL"]]
             for c, x in controls
         ]
         columns = ["check", "broken method", "measured", "allowed", "verdict"]
-        made.append(Table("Controls", columns, body))
-    return made
+        sheets.append(Table("Controls", columns, body))
+    return sheets
 
 
 def claims(method: dvi.Method) -> str:
@@ -86,34 +86,36 @@ def claims(method: dvi.Method) -> str:
     return ", ".join([f"order {method.order}", *(n for n in names if getattr(method, f"is_{n}"))])
 
 
-def cell(check: str, measured: Measured) -> str:
+def cell(check: str, result: Measured) -> str:
     """The verdict in words and the number."""
-    if math.isnan(measured.value):
-        return measured.verdict
-    number = "0" if measured.value == 0 else f"{measured.value:{CHECKS[check].digits}}"
-    if measured.verdict == "not claimed":
+    if math.isnan(result.value):
+        return result.verdict
+    number = "0" if result.value == 0 else f"{result.value:{CHECKS[check].digits}}"
+    if result.verdict == "not claimed":
         return f"not claimed ({number})"
-    return f"{measured.verdict} {number}"
+    return f"{result.verdict} {number}"
 
 
 def markdown(
-    made: Sequence[Table], summary: str, failures: Sequence[tuple[str, str, Measured]]
+    sheets: Sequence[Table], summary: str, failures: Sequence[tuple[str, str, Measured]]
 ) -> str:
     """The page, from the template `page.md`."""
     versions = ", ".join(f"{n} {version(n)}" for n in ("dvi-jax", "jax", "jaxlib", "numpy"))
     python = ".".join(platform.python_version_tuple()[:2])
-    shown = {name for table in made for name in table.columns} & set(CHECKS)
-    parts = [f"## {table.title}\n\n{_as_markdown(table)}" for table in made]
+    checks = {name for table in sheets for name in table.columns} & set(CHECKS)
+    parts = [f"## {table.title}\n\n{_as_markdown(table)}" for table in sheets]
     if failures:
-        said = [f"- {m}, {c}: {x.verdict}, allowed {x.allowed}. {x.detail}" for m, c, x in failures]
-        parts.append("\n".join(["## Failures\n", *said]))
+        faults = [
+            f"- {m}, {c}: {x.verdict}, allowed {x.allowed}. {x.detail}" for m, c, x in failures
+        ]
+        parts.append("\n".join(["## Failures\n", *faults]))
     template = Path(__file__).with_name("page.md").read_text(encoding="utf-8")
     return string.Template(template).substitute(
         title=TITLE,
         summary="\n".join(f"- {line}" for line in summary.splitlines()),
         versions=f"{versions}, Python {python}",
         tables="\n\n".join(parts),
-        legend="\n".join(f"- **{n}**: {c.says}" for n, c in CHECKS.items() if n in shown),
+        legend="\n".join(f"- **{n}**: {c.says}" for n, c in CHECKS.items() if n in checks),
     )
 
 

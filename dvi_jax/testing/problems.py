@@ -108,8 +108,8 @@ SPAN = 40
 def reference(problem: Problem, epsilon: float) -> tuple[np.ndarray, float]:
     """(q, p) after `SPAN`, and an estimate of its error: the change from half the steps."""
     x = inputs(problem, 0.0) | {"epsilon": epsilon}
-    few, many = (most_accurate(problem)(x | {"h": SPAN * problem.h / n}, n) for n in (40, 80))
-    return many, float(np.max(np.abs(many - few)))
+    coarse, fine = (most_accurate(problem)(x | {"h": SPAN * problem.h / n}, n) for n in (40, 80))
+    return fine, float(np.max(np.abs(fine - coarse)))
 
 
 @functools.cache

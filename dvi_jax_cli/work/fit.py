@@ -73,7 +73,9 @@ def fit_file(
             result = dvi.fit(**arguments, **options, progress=recorder(last, show))
     with report.writing(keep=CHECKPOINT):
         result.save(report.path("fit.npz"))
-        trajectory, status = _trajectory(arguments["model"], arguments["data"].in_time_order(), result)
+        trajectory, status = _trajectory(
+            arguments["model"], arguments["data"].in_time_order(), result
+        )
         report.write_arrays("trajectory.npz", trajectory)
         report.contents |= _contents(arguments, result)
         report.contents |= {"columns": columns, "trajectory": status}

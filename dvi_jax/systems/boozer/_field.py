@@ -116,15 +116,15 @@ def polynomial(c: Profile, s: Any) -> Array:
 
 def _array(name: str, values: Any, ndim: int) -> np.ndarray:
     try:
-        found = np.asarray(values, float)
+        array = np.asarray(values, float)
     except (TypeError, ValueError) as error:
         raise TypeError(f"{name} must be an array of numbers, got {values!r:.200}.") from error
-    if found.ndim != ndim or not np.isfinite(found).all():
+    if array.ndim != ndim or not np.isfinite(array).all():
         raise ValueError(
             f"{name} must be an array of {ndim} dimensions with finite numbers, got shape "
-            f"{found.shape}; {np.count_nonzero(~np.isfinite(found))} values are not finite."
+            f"{array.shape}; {np.count_nonzero(~np.isfinite(array))} values are not finite."
         )
-    return found
+    return array
 
 
 def from_modes(
@@ -191,10 +191,10 @@ def from_modes(
 
 
 def _integers(name: str, values: Any) -> np.ndarray:
-    found = _array(name, values, 1)
-    if wrong := found[found != np.round(found)].tolist():
+    numbers = _array(name, values, 1)
+    if wrong := numbers[numbers != np.round(numbers)].tolist():
         raise ValueError(f"{name} must be integers (mode numbers), got {wrong[0]}.")
-    return found.astype(int)
+    return numbers.astype(int)
 
 
 def _parts(B: Any) -> list[np.ndarray]:
@@ -212,10 +212,10 @@ def _check_positive(field: Field) -> None:
         np.linspace(0, 2 * np.pi, 32, endpoint=False),
         np.linspace(0, 2 * np.pi / field.shape.periods, 32, endpoint=False),
     )
-    least = jnp.min(field.strength(s, theta, zeta))
-    if not least > 0:
+    low = jnp.min(field.strength(s, theta, zeta))
+    if not low > 0:
         raise ValueError(
-            f"|B| must be positive for 0 ≤ s ≤ 1, but its least value on a grid is {least:.3g} T. "
+            f"|B| must be positive for 0 ≤ s ≤ 1, but its least value on a grid is {low:.3g} T. "
             "Check signs and units of the modes."
         )
     G = polynomial(field.G, jnp.linspace(0, 1, 65))
@@ -285,8 +285,8 @@ def from_surfaces(
         if not isinstance(box, tuple | list) or len(box) != 2:
             raise TypeError(f"box must be a pair (M, K), such as (6, 4), got {box!r}.")
         M, K = (whole(f"entry {i} of box", x, 0) for i, x in enumerate(box))
-        chosen = (ms <= M) & (np.abs(ns / periods - helicity * ms) <= K)
-        ms, ns, values = ms[chosen], ns[chosen], [x[:, chosen] for x in values]
+        in_box = (ms <= M) & (np.abs(ns / periods - helicity * ms) <= K)
+        ms, ns, values = ms[in_box], ns[in_box], [x[:, in_box] for x in values]
     fits = [
         np.stack([_fit(s, x[:, i], degree, power / 2) for i, power in enumerate(ms)])
         for x in values

@@ -34,8 +34,8 @@ class Geometry(eqx.Module):
         """(R, φ, Z) [m, rad, m] for arrays of one shape."""
         s, theta, zeta = jnp.broadcast_arrays(*map(jnp.asarray, (s, theta, zeta)))
         r = jnp.sqrt(s)
-        at = (self.shape, r * jnp.cos(theta), r * jnp.sin(theta), zeta)
-        R, Z, nu = (total(c, *at) for c in (self.R, self.Z, self.nu))
+        point = (self.shape, r * jnp.cos(theta), r * jnp.sin(theta), zeta)
+        R, Z, nu = (total(c, *point) for c in (self.R, self.Z, self.nu))
         return R, self.direction * (zeta - nu), Z
 
     def cartesian(self, s: Any, theta: Any, zeta: Any) -> Array:
@@ -117,8 +117,8 @@ def from_near_axis(stellarator: Any, minor_radius: float) -> Field:
         columns = np.hstack([np.cos(np.outer(zeta, n)), -np.sin(np.outer(zeta, n[1:]))])
         c, *_ = np.linalg.lstsq(columns, np.asarray(q.B20), rcond=None)
         even, odd = c[: count + 1], np.concatenate([[0.0], c[count + 1 :]])
-        kept = (np.abs(even) + np.abs(odd)) > 1e-9 * np.abs(c).max()
-        for i in np.flatnonzero(kept):
+        is_large = (np.abs(even) + np.abs(odd)) > 1e-9 * np.abs(c).max()
+        for i in np.flatnonzero(is_large):
             row = modes.setdefault((0, int(n[i])), [0.0, 0.0, 0.0])
             row[1], row[2] = a**2 * even[i], a**2 * odd[i]
         modes[2, 2 * N] = [a**2 * q.B2c, 0.0, 0.0]
@@ -167,45 +167,45 @@ def _surfaces(
 
     try:
         with netcdf_file(str(path), "r", mmap=False) as file:
-            found = {k: np.array(v.data) for k, v in file.variables.items()}
+            variables = {k: np.array(v.data) for k, v in file.variables.items()}
     except TypeError as error:  # of a file in another format
         raise ValueError(
             f"{path} is not a file of netCDF version 3, the format of booz_xform and of "
             f"desc.vmec_utils.make_boozmn_output ({error})."
         ) from None
-    wanted = ["nfp_b", "ns_b", "jlist", "ixm_b", "ixn_b", "iota_b", "bvco_b", "buco_b", "phi_b"]
-    missing = [name for name in (*wanted, *even) if name not in found]
-    if missing:
-        raise ValueError(f"{path} is not a file of booz_xform: it has no {', '.join(missing)}.")
+    names = ["nfp_b", "ns_b", "jlist", "ixm_b", "ixn_b", "iota_b", "bvco_b", "buco_b", "phi_b"]
+    absent = [name for name in (*names, *even) if name not in variables]
+    if absent:
+        raise ValueError(f"{path} is not a file of booz_xform: it has no {', '.join(absent)}.")
     # Surfaces are in the middle between those of VMEC, and entry 0 of profiles is not used.
-    rows = found["jlist"].astype(int) - 1
-    s = (rows - 0.5) / (int(found["ns_b"]) - 1)
-    flux = float(found["phi_b"][-1]) / (2 * np.pi) if psi_edge is None else psi_edge
+    rows = variables["jlist"].astype(int) - 1
+    s = (rows - 0.5) / (int(variables["ns_b"]) - 1)
+    flux = float(variables["phi_b"][-1]) / (2 * np.pi) if psi_edge is None else psi_edge
     if flux == 0:
         raise ValueError(
             f"{path}: the toroidal flux phi_b at the edge is 0. Give psi_edge= (its value/2π, with "
             "its sign), or make the file again: booz_xform writes phi_b if its read_wout is called "
             "as read_wout(path, True)."
         )
-    m, n = found["ixm_b"].astype(int), -found["ixn_b"].astype(int)
-    G, I = found["bvco_b"][rows], found["buco_b"][rows]  # noqa: E741
+    m, n = variables["ixm_b"].astype(int), -variables["ixn_b"].astype(int)
+    G, I = variables["bvco_b"][rows], variables["buco_b"][rows]  # noqa: E741
     # The angles of the file are left-handed with R, φ, Z. Of θ → −θ and ζ → −ζ, the one that
     # makes ψ positive; mode (m, n) becomes (m, −n) in both, and an odd function changes its sign
     # with θ.
     by_theta = flux > 0
     sign = -1 if by_theta else 1
     # A negative n of m = 0 is the same mode as the positive one.
-    turned = (m == 0) & (n < 0)
-    odd_sign = np.where(turned, -1, 1)
-    evens = {k: np.asarray(found[k], float) for k in even}
+    mirror = (m == 0) & (n < 0)
+    odd_sign = np.where(mirror, -1, 1)
+    evens = {k: np.asarray(variables[k], float) for k in even}
     odds = {}
-    for k in (k for k in odd if k in found):
+    for k in (k for k in odd if k in variables):
         # ν = ζ − direction·φ has the sign of pmns_b for both reversals.
-        own = 1 if k == "pmns_b" else sign
-        odds[k] = own * odd_sign * np.asarray(found[k], float)
+        factor = 1 if k == "pmns_b" else sign
+        odds[k] = factor * odd_sign * np.asarray(variables[k], float)
     return _Surfaces(
-        int(found["nfp_b"]), abs(flux), 1 if by_theta else -1, s, m, np.where(turned, -n, n),
-        -found["iota_b"][rows], G if by_theta else -G, -I if by_theta else I, evens, odds,
+        int(variables["nfp_b"]), abs(flux), 1 if by_theta else -1, s, m, np.where(mirror, -n, n),
+        -variables["iota_b"][rows], G if by_theta else -G, -I if by_theta else I, evens, odds,
     )  # fmt: skip
 
 
@@ -234,13 +234,13 @@ def save_field(field: Field, path: Any, source: str = "") -> None:
 def load_field(path: Any) -> Field:
     """A field that `save_field` has written. **Raises** `ValueError` for another file."""
     try:
-        found = json.loads(Path(path).read_text())
-        rows = found["modes"]
+        contents = json.loads(Path(path).read_text())
+        rows = contents["modes"]
         return from_modes(
             [row[0] for row in rows],
             [row[1] for row in rows],
             np.moveaxis(np.array([row[2:] for row in rows], float), 1, 0),
-            **{k: found[k] for k in ("psi_edge", "iota", "G", "I", "periods", "helicity")},
+            **{k: contents[k] for k in ("psi_edge", "iota", "G", "I", "periods", "helicity")},
         )
     except (KeyError, IndexError, TypeError, json.JSONDecodeError) as error:
         raise ValueError(

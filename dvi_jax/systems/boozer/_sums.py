@@ -67,8 +67,8 @@ def _polynomials(c: Float[Array, " d"], s: Any, order: int) -> list[Any]:
 
 def _powers(first: Complex, factor: Complex, count: int) -> Complex:
     """first · factor^k for k = 0 … count − 1, in arrays with k first."""
-    _, found = lax.scan(lambda a, _: (_times(a, factor), a), first, None, length=count)
-    return found
+    _, powers = lax.scan(lambda a, _: (_times(a, factor), a), first, None, length=count)
+    return powers
 
 
 def _shifted(a: Complex) -> Complex:
@@ -110,45 +110,45 @@ def derivatives(c: Coefficients, shape: Shape, x: Any, y: Any, zeta: Any, order:
     B_yζ, B_ζζ."""
     s, w, (N, h) = x * x + y * y, (x, y), shape
     _, M, K2, _ = c.shape  # M + 1, 2K + 1
-    one, zero = jnp.ones_like(s), jnp.zeros_like(s)
+    unit, zero = jnp.ones_like(s), jnp.zeros_like(s)
     k = jnp.arange(K2, dtype=s.dtype) - K2 // 2
     phases = _powers(_phase(-N * (K2 // 2) * zeta), _phase(N * zeta), K2)
-    power = _powers((one, zero), w, M)
+    power = _powers((unit, zero), w, M)
     down_one = _shifted(power)
-    of_m = _powers((one, zero), _phase(N * h * zeta), M) if h else None
+    of_m = _powers((unit, zero), _phase(N * h * zeta), M) if h else None
 
     def add(sums, row):
         c_m, m, w0, w1, w2, turn = row
-        A, *rest = _over_k(c_m, s, phases, N * (k + h * m), order)
+        A, *tail = _over_k(c_m, s, phases, N * (k + h * m), order)
         if h:
-            A, *rest = (_times(turn, a) for a in (A, *rest))
+            A, *tail = (_times(turn, a) for a in (A, *tail))
         terms = [_times(w0, A)[0]]
-        A_s = A_ss = A_zeta = down = A  # replaced below, where they are used
+        A_s = A_ss = A_zeta = lower = A  # replaced below, where they are used
         if order >= 1:
-            A_s, *rest = rest
+            A_s, *tail = tail
             if order == 2:
-                A_ss, *rest = rest
-            A_zeta, *rest = rest
-            down = _scaled(m, w1)  # m w^{m−1}
-            terms += [_times(w0, A_s)[0], *_times(down, A), _times(w0, A_zeta)[0]]
+                A_ss, *tail = tail
+            A_zeta, *tail = tail
+            lower = _scaled(m, w1)  # m w^{m−1}
+            terms += [_times(w0, A_s)[0], *_times(lower, A), _times(w0, A_zeta)[0]]
         if order == 2:
-            A_szeta, A_zetazeta = rest
+            A_szeta, A_zetazeta = tail
             down_twice = _scaled(m * (m - 1), w2)
-            terms += [_times(w0, A_ss)[0], *_times(down, A_s), *_times(down_twice, A)]
-            terms += [_times(w0, A_szeta)[0], *_times(down, A_zeta), _times(w0, A_zetazeta)[0]]
+            terms += [_times(w0, A_ss)[0], *_times(lower, A_s), *_times(down_twice, A)]
+            terms += [_times(w0, A_szeta)[0], *_times(lower, A_zeta), _times(w0, A_zetazeta)[0]]
         return tuple(a + b for a, b in zip(sums, terms, strict=True)), None
 
     start = tuple(zero for _ in range((1, 5, 14)[order]))
     rows = jnp.arange(M, dtype=s.dtype), power, down_one, _shifted(down_one), of_m
-    B, *rest = lax.scan(add, start, (jnp.swapaxes(c, 0, 1), *rows))[0]
+    B, *tail = lax.scan(add, start, (jnp.swapaxes(c, 0, 1), *rows))[0]
     if order == 0:
         return (B,)
-    S, Tr, Ti, Z, *rest = rest
+    S, Tr, Ti, Z, *tail = tail
     # ∂x Re(w^m A) = Re(m w^{m−1} A) + 2x Re(w^m A_s), ∂y the same with i w^{m−1} and 2y.
     first = (B, 2 * x * S + Tr, 2 * y * S - Ti, Z)
     if order == 1:
         return first
-    SS, TSr, TSi, Ur, Ui, SZ, TZr, TZi, ZZ = rest
+    SS, TSr, TSi, Ur, Ui, SZ, TZr, TZi, ZZ = tail
     xx, xy = 2 * S + 4 * x * (x * SS + TSr) + Ur, 4 * x * y * SS + 2 * (y * TSr - x * TSi) - Ui
     xz, yy = 2 * x * SZ + TZr, 2 * S + 4 * y * (y * SS - TSi) - Ur
     return (*first, xx, xy, xz, yy, 2 * y * SZ - TZi, ZZ)
@@ -195,8 +195,8 @@ def _with_gradient_jvp(shape, primals, changes):
     rows = ((bx, by, bz), (xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
     out = tuple(_sum_of_products(row, tuple(of_point)) for row in rows)
     if of_c is not None:
-        more = _with_gradient(of_c, shape, x, y, zeta)
-        out = tuple(a + b for a, b in zip(out, more, strict=True))
+        extra = _with_gradient(of_c, shape, x, y, zeta)
+        out = tuple(a + b for a, b in zip(out, extra, strict=True))
     return (B, bx, by, bz), out
 
 

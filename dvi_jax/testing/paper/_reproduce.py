@@ -84,9 +84,9 @@ def reproduce(out: Path | str, force: bool = False, console: Console | None = No
 
     console.print(_summary(claims))
     console.print(f"{counts(claims)}; {time.perf_counter() - began:.0f} s.")
-    unexpected = [claim.key for claim in claims if not claim.is_expected]
-    if unexpected:
-        console.print(f"[bold]Other verdicts than on record:[/bold] {', '.join(unexpected)}.")
+    surprises = [claim.key for claim in claims if not claim.is_expected]
+    if surprises:
+        console.print(f"[bold]Other verdicts than on record:[/bold] {', '.join(surprises)}.")
     console.print(f"Written to {out}: open verdicts.html.", soft_wrap=True)
     return Reproduction(out, measurements, claims)
 
@@ -102,9 +102,9 @@ def _summary(claims: list[Claim]) -> Table:
         verdict = claim.verdict
         # The decisive check: the failing one of the printed claim, or its first if none fails.
         check = next((c for c in claim.printed if not c.passes), claim.printed[0])
-        measured = f"{check.what}: {pretty(check.value)}"
-        judged = f"[{_COLOUR[verdict]}]{MARKS[verdict]} {verdict.value}[/]"
-        table.add_row(claim.where, claim.says, measured, judged)
+        number = f"{check.what}: {pretty(check.value)}"
+        text = f"[{_COLOUR[verdict]}]{MARKS[verdict]} {verdict.value}[/]"
+        table.add_row(claim.where, claim.says, number, text)
     return table
 
 

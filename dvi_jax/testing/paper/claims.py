@@ -101,8 +101,8 @@ def judge(measurements: Measurements) -> list[Claim]:
     def claim(row: dict[str, Any]) -> Claim:
         checks = {
             part: tuple(
-                Check(what, values[name], *map(float, bounds))
-                for what, name, *bounds in row.get(part, ())
+                Check(quantity, values[name], *map(float, bounds))
+                for quantity, name, *bounds in row.get(part, ())
             )
             for part in ("printed", "corrected", "also")
         }

@@ -19,8 +19,8 @@ H = 0.1
 def discoveries(tick: Tick) -> dict[str, Any]:
     """Results of discovery, gauge solving and drift measurement, without prior knowledge."""
     rng = np.random.default_rng(0)
-    found = _on_oscillator(rng, lambda part: tick(0.5 * part))
-    return found | _on_kepler(rng, lambda part: tick(0.5 + 0.5 * part))
+    numbers = _on_oscillator(rng, lambda part: tick(0.5 * part))
+    return numbers | _on_kepler(rng, lambda part: tick(0.5 + 0.5 * part))
 
 
 def _on_oscillator(rng, tick: Tick) -> dict[str, Any]:
@@ -34,8 +34,8 @@ def _on_oscillator(rng, tick: Tick) -> dict[str, Any]:
     """
     spring = systems.oscillator()
     line = tuple(rng.uniform(-1, 1, (2, 200, 1)))
-    found = dvi.discover_invariants(spring.system, dvi.Polynomials(2), 1, h=H, samples=line)
-    names = list(found.basis.names)
+    invariants = dvi.discover_invariants(spring.system, dvi.Polynomials(2), 1, h=H, samples=line)
+    names = list(invariants.basis.names)
 
     def series(*coefficients):
         rows = np.zeros((2, len(names)))
@@ -45,21 +45,23 @@ def _on_oscillator(rng, tick: Tick) -> dict[str, Any]:
 
     exact = series((0, "q²", 0.5), (1, "q²", 0.5), (0, "q p", -H / 2), (1, "q p", -H / 2))
     exact += series((0, "p²", 0.5))
-    off = largest(np.asarray(found.coefficients[0]) - exact) if found.count == 1 else np.inf
+    distance = (
+        largest(np.asarray(invariants.coefficients[0]) - exact) if invariants.count == 1 else np.inf
+    )
     tick(0.4)
     gauges = dvi.solve_gauge(spring.system, [SCALING] * 2, dvi.Polynomials(4), h=H, samples=line)
     tick(0.6)
     printed = series(*((order, name, 0.5) for order in (0, 1) for name in ("q²", "p²")))
-    printed = dvi.InvariantSeries(found.basis, jnp.asarray(printed))
-    how: Any = {"h": 0.01, "num_steps": 20_000, "method": dvi.Yoshida(4)}
-    how["epsilons"] = [1e-4, 2e-4, 1e-3, 1e-2, 1e-1]
-    order = dvi.drift_order(spring.system, printed, spring.q0, spring.p0, **how)
+    printed = dvi.InvariantSeries(invariants.basis, jnp.asarray(printed))
+    options: Any = {"h": 0.01, "num_steps": 20_000, "method": dvi.Yoshida(4)}
+    options["epsilons"] = [1e-4, 2e-4, 1e-3, 1e-2, 1e-1]
+    order = dvi.drift_order(spring.system, printed, spring.q0, spring.p0, **options)
     tick(1.0)
     return {
-        "oscillator": str(found.invariants[0]) if found.count else "",
-        "oscillator_off": off,
-        "oscillator_residual": float(np.max(found.residuals, initial=0.0)),
-        "oscillator_exact": float(all(found.exact) and found.count == 1),
+        "oscillator": str(invariants.invariants[0]) if invariants.count else "",
+        "oscillator_off": distance,
+        "oscillator_residual": float(np.max(invariants.residuals, initial=0.0)),
+        "oscillator_exact": float(all(invariants.exact) and invariants.count == 1),
         "gauge_34_left_0": float(gauges.residuals[0]),
         "gauge_34_left_1": float(gauges.residuals[1]),
         "drift_34_exponent": order.slope,
@@ -76,28 +78,28 @@ def _on_kepler(rng, tick: Tick) -> dict[str, Any]:
     distance of (40) from the span of all; `found_residual`, of the determining equations, held-out.
     """
     kepler = systems.kepler()
-    clocked = [CLOCKED_ROTATION] * 2
+    rotations = [CLOCKED_ROTATION] * 2
     samples: Any = {"samples": _ring(rng, 400), "args": kepler.args}
     basis = dvi.Polynomials(3) + dvi.Radial()
-    kept = dvi.discover_invariants(kepler.system, basis, 1, h=H, **samples)
+    invariants = dvi.discover_invariants(kepler.system, basis, 1, h=H, **samples)
     tick(0.6)
     hs = np.array([0.1, 0.05, 0.025])
-    given = kepler.system, clocked, dvi.Polynomials(4)
-    left = [dvi.solve_gauge(*given, h=float(h), **samples).residuals[1] for h in hs]
+    inputs = kepler.system, rotations, dvi.Polynomials(4)
+    left = [dvi.solve_gauge(*inputs, h=float(h), **samples).residuals[1] for h in hs]
     tick(0.9)
     linear = dvi.Polynomials(1, constant=True)
     symmetries = dvi.find_symmetries(kepler.system, linear, h=H, **samples)
     orbit = run(kepler, H, 200, epsilon=0.01)
     causes = dvi.noether_balance(
-        kepler.system, clocked, [None, gauge], orbit, epsilon=0.01, args=kepler.args
+        kepler.system, rotations, [None, gauge], orbit, epsilon=0.01, args=kepler.args
     )
     tick(1.0)
     scale = max(largest(c) for c in (causes.symmetry, causes.work, causes.lattice))
     return {
-        "kepler": str(kept.invariants[0]) if kept.count else "",
-        "kepler_count": float(kept.count),
-        "kepler_residual": float(np.max(kept.residuals, initial=0.0)),
-        "kepler_exact": float(all(kept.exact) and kept.count == 1),
+        "kepler": str(invariants.invariants[0]) if invariants.count else "",
+        "kepler_count": float(invariants.count),
+        "kepler_residual": float(np.max(invariants.residuals, initial=0.0)),
+        "kepler_exact": float(all(invariants.exact) and invariants.count == 1),
         "gauge_50_left": float(left[0]),
         "gauge_50_exponent": slope(hs, np.array(left)),
         "balance_gap_by_tool": largest(causes.defect) / scale,
@@ -113,7 +115,7 @@ def _ring(rng, count):
     return np.stack([r * np.cos(angle), r * np.sin(angle)], 1), rng.uniform(-1, 1, (count, 2))
 
 
-def _outside(found: dvi.Symmetries, samples) -> float:
+def _outside(fields: dvi.Symmetries, samples) -> float:
     """How far the rotation (40) is outside of the span of what was found, relative."""
 
     def at_samples(generator):
@@ -123,9 +125,9 @@ def _outside(found: dvi.Symmetries, samples) -> float:
 
         return np.asarray(jax.vmap(one)(*samples)).ravel()
 
-    wanted = at_samples(ROTATION)
-    if not found.count:
+    target = at_samples(ROTATION)
+    if not fields.count:
         return np.inf
-    columns = np.stack([at_samples(s.generators[0]) for s in found], axis=1)
-    rest = wanted - columns @ np.linalg.lstsq(columns, wanted, rcond=None)[0]
-    return float(np.linalg.norm(rest) / np.linalg.norm(wanted))
+    columns = np.stack([at_samples(s.generators[0]) for s in fields], axis=1)
+    residual = target - columns @ np.linalg.lstsq(columns, target, rcond=None)[0]
+    return float(np.linalg.norm(residual) / np.linalg.norm(target))

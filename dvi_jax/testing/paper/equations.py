@@ -24,7 +24,7 @@ def _read() -> tuple[Equation, ...]:
         Equation(
             row["number"],
             row["what"],
-            tuple(f"dvi_jax.{one}" for name in row["code"] for one in short.get(name, [name])),
+            tuple(f"dvi_jax.{part}" for name in row["code"] for part in short.get(name, [name])),
             row.get("note", ""),
         )
         for row in table["equation"]

@@ -57,10 +57,10 @@ def measure(console) -> Measurements:
             for key, (name, _) in EXPERIMENTS.items()
         }
 
-        def done(key):
+        def run(key):
             progress.start_task(tasks[key])
-            found = EXPERIMENTS[key][1](lambda part: progress.update(tasks[key], completed=part))
+            numbers = EXPERIMENTS[key][1](lambda part: progress.update(tasks[key], completed=part))
             progress.update(tasks[key], completed=1.0)
-            return found
+            return numbers
 
-        return Measurements(**{key: done(key) for key in EXPERIMENTS})
+        return Measurements(**{key: run(key) for key in EXPERIMENTS})

@@ -25,13 +25,13 @@ def _figure(name: str, caption: str, heading: str, size: tuple[float, float], **
     """Register a function that draws on new axes: two panels, or as `grid` says."""
 
     def register(draw_on: Callable[[Measurements, Any, Any], None]):
-        def made(m: Measurements) -> Any:
+        def figure_of(m: Measurements) -> Any:
             figure, axes = plt.subplots(figsize=size, **{"ncols": 2, **grid})
             draw_on(m, figure, axes)
             figure.suptitle(heading, x=0.01, ha="left", fontsize=11.5, fontweight="bold")
             return figure
 
-        FIGURES[name] = (made, caption)
+        FIGURES[name] = (figure_of, caption)
         return draw_on
 
     return register
@@ -46,16 +46,16 @@ def _figure(name: str, caption: str, heading: str, size: tuple[float, float], **
     width_ratios=(1, 1.2),
 )
 def energy_error(m: Measurements, figure: Any, axes: Any) -> None:
-    run, (whole, close) = m.fixed_mesh, axes
+    run, (full, close) = m.fixed_mesh, axes
     error = (run.mixed[0] - run.mixed[0, 0]) / 1e-6
     exact = (run.exact[0] - run.exact[0, 0]) / 1e-6
     t, low, high = _bands(run.ts, error, run.h)
-    whole.plot(t, high, color=BLUE)
-    whole.plot(t, low, color=BLUE, dashes=(5, 2))
+    full.plot(t, high, color=BLUE)
+    full.plot(t, low, color=BLUE, dashes=(5, 2))
     for values, text in ((high, "largest in each period"), (low, "smallest in each period")):
-        whole.text(500, np.mean(values) + 0.5, text, color=BLUE, ha="center")
+        full.text(500, np.mean(values) + 0.5, text, color=BLUE, ha="center")
     ylabel = "error in the energy  (10⁻⁶)"
-    whole.set(title="all 10 000 steps", xlabel=TIME, ylim=(-4.5, 14), ylabel=ylabel)
+    full.set(title="all 10 000 steps", xlabel=TIME, ylim=(-4.5, 14), ylabel=ylabel)
     part = run.ts < 3 * 2 * np.pi
     close.plot(run.ts[part], error[part], color=BLUE, marker="o", markersize=2.5, linewidth=0.8)
     close.plot(run.ts[part], exact[part], color=ORANGE, dashes=(5, 2))
@@ -98,8 +98,8 @@ def adiabatic_34(m: Measurements, figure: Any, axes: Any) -> None:
     part, step = run.ts < 4 * np.pi, slice(0, None, 97)
     for i in range(1, len(run.epsilons)):  # without ε = 0
         look = _look(i - 1) | {"marker": MARKERS[i - 1], "label": f"ε = {run.epsilons[i]:g}"}
-        printed, exact = (values[i] / values[i, 0] - 1 for values in (run.printed, run.exact))
-        left.plot(run.ts[part], printed[part] * 100, markevery=(3 * i, 14), **look)
+        of_print, exact = (values[i] / values[i, 0] - 1 for values in (run.printed, run.exact))
+        left.plot(run.ts[part], of_print[part] * 100, markevery=(3 * i, 14), **look)
         look |= {"markevery": (2 * i, 14), "linewidth": 0.9}
         right.plot(run.ts[step], exact[step] / 1e-14, **look)
     left.set(title="(34): the first two periods", xlabel=TIME, ylim=(-3, 20))
@@ -117,13 +117,13 @@ def adiabatic_34(m: Measurements, figure: Any, axes: Any) -> None:
     sharey=True,
 )
 def phase_diagrams(m: Measurements, figure: Any, axes: Any) -> None:
-    shown = [m.long_runs[k] for k in ("RK4", "variational (order 1)")]
+    runs = [m.long_runs[k] for k in ("RK4", "variational (order 1)")]
     names = ("a   RK4", "b   variational (the paper's map)")
-    points = np.concatenate([run.qs for run in shown])
+    points = np.concatenate([run.qs for run in runs])
     low, high = points.min(0) - 0.6, points.max(0) + 0.6
     look: Any = {"cmap": "viridis", "linewidths": 0, "rasterized": True}
     colours: Any = None
-    for run, name, axis in zip(shown, names, axes, strict=True):
+    for run, name, axis in zip(runs, names, axes, strict=True):
         colours = axis.scatter(*run.qs.T, c=run.ts / 1000, s=0.15, **look)
         axis.plot(0, 0, "k+", markersize=8)
         axis.set(title=name, aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1] + 1.6))
@@ -136,14 +136,14 @@ def phase_diagrams(m: Measurements, figure: Any, axes: Any) -> None:
         axis.text(0.03, 0.97, text, transform=axis.transAxes, va="top", fontsize=8.5)
     axes[0].set_ylabel("q₂")
     # The width of RK4's loop is not visible at full size: a window around the apocentre shows it.
-    rk4 = shown[0]
+    rk4 = runs[0]
     half_way = rk4.qs[len(rk4.qs) // 2 :][:500]  # more than one revolution
     far = half_way[np.argmax(np.linalg.norm(half_way, axis=1))]
     window = axes[0].inset_axes((0.06, 0.04, 0.34, 0.32))
     half = 1.2 * rk4.width
-    near = np.max(np.abs(rk4.qs - far), axis=1) < half
+    in_window = np.max(np.abs(rk4.qs - far), axis=1) < half
     limits = {"vmin": 0, "vmax": rk4.ts[-1] / 1000}
-    window.scatter(*rk4.qs[near].T, c=rk4.ts[near] / 1000, s=2.5, **limits, **look)
+    window.scatter(*rk4.qs[in_window].T, c=rk4.ts[in_window] / 1000, s=2.5, **limits, **look)
     window.set(xlim=far[0] + half * np.array([-1, 1]), ylim=far[1] + half * np.array([-1, 1]))
     window.set(xticks=[], yticks=[], aspect="equal")
     window.set_title(f"apocentre, {2 * half:.2g} across", fontsize=8, fontweight="normal")
@@ -228,8 +228,8 @@ def rk4_crossover(m: Measurements, figure: Any, axes: Any) -> None:
     start = m.fixed_mesh.energy
     right.loglog(cross.hs, cross.steps, "o", color=BLUE, markersize=6, label="measured")
     bands = np.interp(fine, cross.hs, cross.bands)
-    predicted = np.log1p(-bands / start) / np.log1p(-(fine**6) / 72)
-    right.loglog(fine, predicted, color=GREY, dashes=(4, 2), label="loss of h⁶/72 per step")
+    prediction = np.log1p(-bands / start) / np.log1p(-(fine**6) / 72)
+    right.loglog(fine, prediction, color=GREY, dashes=(4, 2), label="loss of h⁶/72 per step")
     right.set(title="crossover against h", xlabel="step size h", ylabel="steps to the crossover")
     right.set_xticks(cross.hs, [f"{h:g}" for h in cross.hs])
     right.minorticks_off()
@@ -245,9 +245,9 @@ def rk4_crossover(m: Measurements, figure: Any, axes: Any) -> None:
 )
 def sweep_34(m: Measurements, figure: Any, axes: Any) -> None:
     small, mesh = m.small_step, m.fixed_mesh
-    printed, exact = (relative_spread(values)[1:] for values in (mesh.printed, mesh.exact))
+    of_print, exact = (relative_spread(values)[1:] for values in (mesh.printed, mesh.exact))
     rows = (
-        (mesh.epsilons[1:], printed, "(34) as printed, h = 0.1"),
+        (mesh.epsilons[1:], of_print, "(34) as printed, h = 0.1"),
         (small.epsilons, small.printed, "(34) as printed, h → 0"),
         (small.epsilons, small.corrected, "(p² + (1+ε)q²)/2, h → 0"),
         (mesh.epsilons[1:], exact, "(p² + (1+ε)q² − h(1+ε)qp)/2, h = 0.1"),

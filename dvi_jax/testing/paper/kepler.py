@@ -121,8 +121,8 @@ def mesh_sweep(tick: Tick) -> MeshSweep:
     observe = {"49": INVARIANT_49, "50": INVARIANT_50}
     runs = []
     for i, h in enumerate(hs):
-        one = functools.partial(run, problem, h, round(DURATION / h), observe=observe)
-        runs.append(jax.vmap(lambda e, one=one: one(epsilon=e))(jnp.asarray(epsilons)))
+        run_of = functools.partial(run, problem, h, round(DURATION / h), observe=observe)
+        runs.append(jax.vmap(lambda e, run_of=run_of: run_of(epsilon=e))(jnp.asarray(epsilons)))
         tick((i + 1) / len(hs))
     return MeshSweep(
         hs=hs,
@@ -141,7 +141,7 @@ def small_step_sweep(tick: Tick) -> SmallStepSweep:
     momentum, energy = problem.observables["angular_momentum"], problem.observables["energy"]
 
     # The energy is the continuous one: H_{k−1} over a step of six parts has an error O(h).
-    def printed(*step):
+    def of_print(*step):
         epsilon, q1 = step[-1]["epsilon"], step[4]
         return (1 + epsilon) * (momentum(*step) - energy(*step)) - epsilon * jnp.sum(q1**2) / 2
 
@@ -149,15 +149,15 @@ def small_step_sweep(tick: Tick) -> SmallStepSweep:
         epsilon, q1 = step[-1]["epsilon"], step[4]
         return (1 + epsilon) * momentum(*step) - energy(*step) - epsilon * jnp.sum(q1**2) / 2
 
-    def orbit(signed, epsilon):
-        drifts = {"printed": dvi.MaxDrift(printed), "literal": dvi.MaxDrift(literal)}
-        options = {"epsilon": signed, "args": {**problem.args, "epsilon": epsilon}}
-        options |= {"observe": {"values": printed, **drifts}, "save": dvi.Save(every=10)}
+    def orbit(strength, epsilon):
+        drifts = {"printed": dvi.MaxDrift(of_print), "literal": dvi.MaxDrift(literal)}
+        options = {"epsilon": strength, "args": {**problem.args, "epsilon": epsilon}}
+        options |= {"observe": {"values": of_print, **drifts}, "save": dvi.Save(every=10)}
         return run(problem, h, round(DURATION / h), method=dvi.Yoshida(4), **options)
 
     # W = −q: a negative ε is the force +|ε|q, while the formulas have |ε|.
-    both = np.concatenate([epsilons, -epsilons])
-    runs = jax.vmap(orbit)(jnp.asarray(both), jnp.asarray(np.abs(both)))
+    strengths = np.concatenate([epsilons, -epsilons])
+    runs = jax.vmap(orbit)(jnp.asarray(strengths), jnp.asarray(np.abs(strengths)))
     drifts = np.asarray(runs.observed["printed"])
     repelling = drifts[len(epsilons) :]
     farthest = np.max(np.linalg.norm(np.asarray(runs.qs), axis=-1), axis=-1)[len(epsilons) :]
@@ -223,16 +223,18 @@ def repulsion(tick: Tick) -> dict[str, float]:
     """Largest distance from the centre for the sign of K²/r in (37), and for the opposite one."""
     problem = systems.kepler()
 
-    def printed(t0, t1, q0, p1, args):
+    def hamiltonian(t0, t1, q0, p1, args):
         return jnp.sum(p1**2) / 2 + args["K"] ** 2 / jnp.sqrt(jnp.sum(q0**2))
 
-    found = {}
-    for key, system in {"printed": dvi.System(printed), "corrected": problem.system}.items():
-        one = dataclasses.replace(problem, system=system)
-        solution = run(one, problem.h, round(DURATION / problem.h))
-        found[f"distance_{key}"] = float(np.max(np.linalg.norm(np.asarray(solution.qs), axis=1)))
-        tick(len(found) / 2)
-    return found
+    distances = {}
+    for key, system in {"printed": dvi.System(hamiltonian), "corrected": problem.system}.items():
+        variant = dataclasses.replace(problem, system=system)
+        solution = run(variant, problem.h, round(DURATION / problem.h))
+        distances[f"distance_{key}"] = float(
+            np.max(np.linalg.norm(np.asarray(solution.qs), axis=1))
+        )
+        tick(len(distances) / 2)
+    return distances
 
 
 def variational_mesh(tick: Tick) -> dict[str, float]:

@@ -120,23 +120,23 @@ def crossover(tick: Tick) -> Crossover:
         observe = dvi.Range(problem.observables["mixed_energy"])
         return run(problem, h, STEPS, save=dvi.Save(final=True), observe=observe).observed
 
-    def rk4(h, num_steps, every, progress=None):
-        options = {"save": dvi.Save(every=every), "observe": problem.observables["energy"]}
+    def rk4(h, num_steps, stride, progress=None):
+        options = {"save": dvi.Save(every=stride), "observe": problem.observables["energy"]}
         return run(
             problem, h, num_steps, method=dvi.RungeKutta4(), progress=progress, **options
         ).observed
 
     bands = np.asarray(jax.vmap(band)(jnp.asarray(hs)))
-    long, every = 7_500_000, 2500
-    first = rk4(hs[0], long, every, lambda done, total: tick(0.9 * done / total))
-    short, often = 300_000, 20
-    others = jax.vmap(lambda h: rk4(h, short, often))(jnp.asarray(hs[1:]))
+    long, stride = 7_500_000, 2500
+    first = rk4(hs[0], long, stride, lambda count, total: tick(0.9 * count / total))
+    short, short_stride = 300_000, 20
+    later = jax.vmap(lambda h: rk4(h, short, short_stride))(jnp.asarray(hs[1:]))
 
-    def history(values, every):
+    def history(values, stride):
         values = np.asarray(values)
-        return every * np.arange(1, len(values) + 1), np.abs(values - start)
+        return stride * np.arange(1, len(values) + 1), np.abs(values - start)
 
-    runs = [history(first, every), *(history(values, often) for values in others)]
+    runs = [history(first, stride), *(history(values, short_stride) for values in later)]
     return Crossover(
         hs=hs,
         bands=bands,
@@ -155,18 +155,18 @@ def small_step(tick: Tick) -> SmallStep:
     problem = systems.oscillator()
     h, epsilons = 0.01, np.array([1e-4, 2e-4, 1e-3, 1e-2, 1e-1])
 
-    def printed(t0, t1, q0, p0, q1, p1, args):
+    def of_print(t0, t1, q0, p0, q1, p1, args):
         return (1 + args["epsilon"]) * (jnp.sum(p1**2) + jnp.sum(q1**2)) / 2
 
-    def corrected(t0, t1, q0, p0, q1, p1, args):
+    def correction(t0, t1, q0, p0, q1, p1, args):
         return (jnp.sum(p1**2) + (1 + args["epsilon"]) * jnp.sum(q1**2)) / 2
 
     def ranges(epsilon):
-        observe = {"printed": dvi.Range(printed), "corrected": dvi.Range(corrected)}
+        observe = {"printed": dvi.Range(of_print), "corrected": dvi.Range(correction)}
         options = {"epsilon": epsilon, "args": {"epsilon": epsilon}, "observe": observe}
         options |= {"method": dvi.Yoshida(4), "save": dvi.Save(final=True)}
         return run(problem, h, round(200 / h), **options).observed
 
-    found, start = jax.vmap(ranges)(jnp.asarray(epsilons)), _start(problem)
-    both = (np.asarray(found[name]) / start for name in ("printed", "corrected"))
-    return SmallStep(h, epsilons, *both)
+    spreads, start = jax.vmap(ranges)(jnp.asarray(epsilons)), _start(problem)
+    pair = (np.asarray(spreads[name]) / start for name in ("printed", "corrected"))
+    return SmallStep(h, epsilons, *pair)

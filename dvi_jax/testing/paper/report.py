@@ -72,7 +72,7 @@ def write_markdown(claims: Sequence[Claim], setting: dict[str, Any], path: Path)
         lines = [header, ["---"] * len(header), *body]
         return ["| " + " | ".join(cells) + " |" for cells in lines]
 
-    def judged(claim: Claim) -> Sequence[str]:
+    def cells_of(claim: Claim) -> Sequence[str]:
         checks = "<br>".join(f"*{kind}*: {text}" for kind, text in _check_texts(claim))
         verdict = f"{MARKS[claim.verdict]} **{claim.verdict.value}**"
         return claim.where, claim.says, checks, verdict, claim.reason
@@ -86,7 +86,7 @@ def write_markdown(claims: Sequence[Claim], setting: dict[str, Any], path: Path)
         "",
         f"{counts(claims)}. {_setting_line(setting)}",
         "",
-        *table(columns, *map(judged, claims)),
+        *table(columns, *map(cells_of, claims)),
         "",
         "## Figures",
         "",
@@ -105,7 +105,7 @@ def write_html(claims: Sequence[Claim], setting: dict[str, Any], figures: Path, 
     def row(cells: Iterable[str]) -> str:
         return "<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
 
-    def judged(claim: Claim) -> str:
+    def claim_row(claim: Claim) -> str:
         kind = claim.verdict.name.lower()
         checks = "".join(f"<li><i>{k}:</i> {_math(text)}</li>" for k, text in _check_texts(claim))
         verdict = f"{MARKS[claim.verdict]} {claim.verdict.value}"
@@ -120,7 +120,7 @@ def write_html(claims: Sequence[Claim], setting: dict[str, Any], figures: Path, 
             f"<figcaption>{_math(caption)}</figcaption></figure>"
         )
 
-    def listed(e: Equation) -> str:
+    def equation_row(e: Equation) -> str:
         code = " ".join(f"<code>{html.escape(c)}</code>" for c in e.code)
         return row((f"({e.number})", _math(e.what), code, _math(e.note)))
 
@@ -128,9 +128,9 @@ def write_html(claims: Sequence[Claim], setting: dict[str, Any], figures: Path, 
     page = string.Template(template).substitute(
         summary=html.escape(counts(claims)),
         setting=html.escape(_setting_line(setting)),
-        claims="\n".join(map(judged, claims)),
+        claims="\n".join(map(claim_row, claims)),
         figures="\n".join(picture(name, caption) for name, (_, caption) in FIGURES.items()),
-        equations="\n".join(map(listed, EQUATIONS)),
+        equations="\n".join(map(equation_row, EQUATIONS)),
     )
     path.write_text(page, encoding="utf-8")
 

@@ -36,24 +36,24 @@ def limits(tick: Tick) -> dict[str, float]:
     tick(0.2)
 
     def flight(method, parts):
-        def one(h, q, p):
+        def end_of(h, q, p):
             start = dataclasses.replace(problem, q0=q, p0=p)
             options = {"epsilon": EPSILON, "method": method, "save": dvi.Save(final=True)}
             solution = run(start, h / parts, parts, **options)
             return jnp.concatenate([solution.qs[-1], solution.ps[-1]])
 
-        over_starts = jax.vmap(one, in_axes=(None, 0, 0))
+        over_starts = jax.vmap(end_of, in_axes=(None, 0, 0))
         return jax.vmap(over_starts, in_axes=(0, None, None))(
             jnp.asarray(STEP_SIZES), orbit.qs, orbit.ps
         )
 
     gap = np.abs(np.asarray(flight(dvi.TypeII(), 1) - flight(dvi.Yoshida(4), 32)))
     tick(0.6)
-    corrected, sign, slot, stationarity = (np.asarray(x) for x in _lattice_forms())
+    right_form, sign, slot, stationarity = (np.asarray(x) for x in _lattice_forms())
     tick(1.0)
     return {
         "local_error_exponent": slope(STEP_SIZES, np.max(gap, axis=(1, 2))),
-        "lattice_corrected_exponent": slope(STEP_SIZES, corrected),
+        "lattice_corrected_exponent": slope(STEP_SIZES, right_form),
         "lattice_sign_exponent": slope(STEP_SIZES, sign),
         "lattice_slot_exponent": slope(STEP_SIZES, slot),
         "stationarity": float(stationarity),
@@ -65,39 +65,39 @@ def _lattice_forms():
     """Residuals of the three forms of (14), (H,) each, and the largest gap to ∂S/∂t_k."""
 
     # In the autonomous examples of the paper derivatives by t0 and by t1 agree; this one is driven.
-    def driven(t0, t1, q0, p1, args):
+    def hamiltonian(t0, t1, q0, p1, args):
         return jnp.sum(p1**2) / 2 + (1 + 0.3 * jnp.cos(t0)) * jnp.sum(q0**2) / 2
 
-    system = dvi.System(driven, force=lambda t0, t1, q0, p1, args: -q0)
-    free = dvi.System(driven)
+    system = dvi.System(hamiltonian, force=lambda t0, t1, q0, p1, args: -q0)
+    free = dvi.System(hamiltonian)
 
     def H(t0, t1, q0, p1):
-        return driven(t0, t1, q0, p1, None)
+        return hamiltonian(t0, t1, q0, p1, None)
 
     def forms(h, start):
         q0, p0 = jnp.cos(start)[None], jnp.sin(2 * start)[None] + 0.5
         sol = dvi.integrate(system, q0, p0, t0=start, h=h, num_steps=2, epsilon=EPSILON)
         points = [dvi.LatticePoint(*x) for x in zip(sol.ts, sol.qs, sol.ps, strict=True)]
         (t_, q_, _), (t0, q0, p0), (t1, q1, p1) = points
-        before, after = (t_, t0, q_, p0), (t0, t1, q0, p1)
+        previous, interval = (t_, t0, q_, p0), (t0, t1, q0, p1)
         work = EPSILON * jnp.sum(-q0 * (q1 - q0))
-        change = h * jax.grad(H, 0)(*after) - H(*after)
-        sign = change + h * jax.grad(H, 0)(*before) - H(*before) + work
-        slot = change + h * jax.grad(H, 0)(*before) + H(*before) + work
+        change = h * jax.grad(H, 0)(*interval) - H(*interval)
+        sign = change + h * jax.grad(H, 0)(*previous) - H(*previous) + work
+        slot = change + h * jax.grad(H, 0)(*previous) + H(*previous) + work
 
         def action(t):
             first = jnp.sum(p0 * (q0 - q_)) - (t - t_) * H(t_, t, q_, p0)
             return first + jnp.sum(p1 * (q1 - q0)) - (t1 - t) * H(t, t1, q0, p1)
 
-        still = jnp.zeros(())
-        gap = jax.grad(action)(t0) / (t1 - t0) - dvi.lattice_defect(free, points, still)
-        corrected = dvi.lattice_defect(system, points, jnp.asarray(EPSILON))
-        return jnp.abs(jnp.stack([corrected, sign / h, slot / h, gap]))
+        zero = jnp.zeros(())
+        gap = jax.grad(action)(t0) / (t1 - t0) - dvi.lattice_defect(free, points, zero)
+        right_form = dvi.lattice_defect(system, points, jnp.asarray(EPSILON))
+        return jnp.abs(jnp.stack([right_form, sign / h, slot / h, gap]))
 
     starts = jnp.linspace(0.0, 12.0, 48)
-    each = jax.vmap(jax.vmap(forms, (None, 0)), (0, None))(jnp.asarray(STEP_SIZES), starts)
-    corrected, sign, slot, gap = jnp.moveaxis(jnp.max(each, axis=1), 1, 0)
-    return corrected, sign, slot, jnp.max(gap)
+    residuals = jax.vmap(jax.vmap(forms, (None, 0)), (0, None))(jnp.asarray(STEP_SIZES), starts)
+    right_form, sign, slot, gap = jnp.moveaxis(jnp.max(residuals, axis=1), 1, 0)
+    return right_form, sign, slot, jnp.max(gap)
 
 
 def symmetries(tick: Tick) -> dict[str, float]:
@@ -108,10 +108,10 @@ def symmetries(tick: Tick) -> dict[str, float]:
     and with its momentum part. `display_off_…`: distance of the equation of motion displayed after
     (32) from (13) with W = q (printed) and with W = −q (corrected).
     """
-    found = {k: float(v) for k, v in _conformal_factors().items()}
-    factor = found.pop("scaling_factor")
+    numbers = {k: float(v) for k, v in _conformal_factors().items()}
+    factor = numbers.pop("scaling_factor")
     tick(1.0)
-    return found | {
+    return numbers | {
         "scaling_factor_off_1": abs(factor - 1),
         "scaling_factor_off_corrected": abs(factor - 1 - EPSILON),
     }
@@ -133,8 +133,8 @@ def _conformal_factors():
             kepler.system, generators, *pairs(2), epsilon=jnp.asarray(epsilon), args=kepler.args
         )
 
-    printed = jnp.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 0, -1], [0, 0, 1, 0]])
-    disturbed = kepler_factor([ROTATION, ROTATION], EPSILON)
+    matrix = jnp.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 0, -1], [0, 0, 1, 0]])
+    factors = kepler_factor([ROTATION, ROTATION], EPSILON)
 
     def scaling(eta):
         generator = dvi.Generator(xi=lambda t, q, p, args: q, eta=eta)
@@ -142,7 +142,7 @@ def _conformal_factors():
             oscillator.system, [generator, generator], *pairs(1), epsilon=jnp.asarray(EPSILON)
         )
 
-    without, with_momenta = scaling(None), scaling(lambda t, q, p, args: p)
+    positions_only, with_momenta = scaling(None), scaling(lambda t, q, p, args: p)
 
     def display(sign):
         """Distance of (p1 − p0)/h + q0 + εq0 = 0 from (13) with W = sign·q."""
@@ -150,18 +150,18 @@ def _conformal_factors():
 
         def gap(first, second):
             F_p = dvi.discrete_equations(system, first, second, jnp.asarray(EPSILON))[1]
-            shown = (second.p - first.p) / (second.t - first.t) + (1 + EPSILON) * first.q
-            return jnp.max(jnp.abs(F_p - shown))
+            equation = (second.p - first.p) / (second.t - first.t) + (1 + EPSILON) * first.q
+            return jnp.max(jnp.abs(F_p - equation))
 
         return jnp.max(jax.vmap(gap)(*pairs(1)))
 
     return {
         "rotation_residual": kepler_factor(ROTATION, 0.0).residual,
         "clocked_residual": kepler_factor(CLOCKED_ROTATION, 0.0).residual,
-        "kepler_factor_residual": disturbed.residual,
-        "kepler_factor_off_printed": jnp.max(jnp.abs(disturbed.factor - printed)),
-        "kepler_factor_off_corrected": jnp.max(jnp.abs(disturbed.factor - (1 + EPSILON) * printed)),
-        "scaling_residual_printed": without.residual,
+        "kepler_factor_residual": factors.residual,
+        "kepler_factor_off_printed": jnp.max(jnp.abs(factors.factor - matrix)),
+        "kepler_factor_off_corrected": jnp.max(jnp.abs(factors.factor - (1 + EPSILON) * matrix)),
+        "scaling_residual_printed": positions_only.residual,
         "scaling_residual_corrected": with_momenta.residual,
         "scaling_factor": with_momenta.factor[0, 0],
         "display_off_printed": display(1.0),
@@ -240,11 +240,11 @@ def _oscillator_identities():
         return jax.vmap(one)(first, second), q0 * (p1 - q0) + epsilon * q0**2
 
     order_0, _ = identity(0, 0.0)
-    order_1, known = identity(1, EPSILON)
+    order_1, reference = identity(1, EPSILON)
     return {
         "oscillator_identity_0": jnp.max(jnp.abs(order_0)),
         "oscillator_identity_1": jnp.max(jnp.abs(order_1)),
-        "oscillator_identity_1_rest": jnp.max(jnp.abs(order_1 - known)),
+        "oscillator_identity_1_rest": jnp.max(jnp.abs(order_1 - reference)),
     }
 
 
@@ -260,25 +260,34 @@ def _kepler_balance(triples, gain):
     series, gauges = [CLOCKED_ROTATION, CLOCKED_ROTATION], [None, gauge]
     epsilon = jnp.asarray(EPSILON)
 
-    def one(before, here, after, gain):
+    def terms(previous, current, second, gain):
         def identity(order):
             return dvi.noether_identity(
-                problem.system, series, gauges, order, here, after, epsilon, problem.args
+                problem.system,
+                series,
+                gauges,
+                order,
+                current,
+                second,
+                epsilon,
+                problem.args,
             )
 
-        velocity = (after.q - here.q) / (after.t - here.t)
+        velocity = (second.q - current.q) / (second.t - current.t)
         zeroth, first = identity(0), identity(1)
-        _, xi, _ = CLOCKED_ROTATION(here, problem.args)
-        work = EPSILON**2 * jnp.sum(-here.q * (xi - velocity))
-        defect = dvi.lattice_defect(problem.system, (before, here, after), epsilon, problem.args)
+        _, xi, _ = CLOCKED_ROTATION(current, problem.args)
+        work = EPSILON**2 * jnp.sum(-current.q * (xi - velocity))
+        defect = dvi.lattice_defect(
+            problem.system, (previous, current, second), epsilon, problem.args
+        )
         symmetry = zeroth + EPSILON * first
         return {
             "identity": first,
-            "rest": first + (after.t - here.t) / 2 * jnp.sum(velocity**2),
+            "rest": first + (second.t - current.t) / 2 * jnp.sum(velocity**2),
             "law_31": gain - work,
             "balance": gain - symmetry - work + (1 + EPSILON) * defect,
         }
 
-    before, here, after = triples
-    each = jax.vmap(one)(before, here, after, gain)
-    return jax.tree.map(lambda x: jnp.max(jnp.abs(x)), each)
+    previous, current, second = triples
+    gaps = jax.vmap(terms)(previous, current, second, gain)
+    return jax.tree.map(lambda x: jnp.max(jnp.abs(x)), gaps)

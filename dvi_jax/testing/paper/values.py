@@ -80,8 +80,8 @@ PARTS = (_oscillator, _kepler_orbits, _kepler_sweeps)
 
 def numbers(m: Measurements) -> dict[str, Any]:
     """Name → number, from the measurements alone."""
-    named = m.repulsion | m.variational_mesh
-    named |= m.limits | m.symmetries | m.identities | m.discoveries
+    values = m.repulsion | m.variational_mesh
+    values |= m.limits | m.symmetries | m.identities | m.discoveries
     for part in PARTS:
-        named |= part(m)
-    return named
+        values |= part(m)
+    return values
