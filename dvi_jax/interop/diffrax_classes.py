@@ -56,7 +56,8 @@ class DiscreteMap(diffrax.AbstractSolver):
             "root_finder": self.root_finder,
             "adjoint": dvi.Direct(),
         }
-        options |= {"epsilon": term.epsilon, "save": dvi.Save(final=True), "throw": False}
+        options |= {"epsilon": term.epsilon, "throw": False}
+        options |= {"save": dvi.Save(final=True)}
         solution = dvi.integrate(term.system, q0, p0, **step, **options)
         y1 = type(y0)((solution.qs[-1], solution.ps[-1]))  # a pair of diffrax's kind
         slopes = {

@@ -1,5 +1,6 @@
 """`bound_drift`: a proved bound of how much invariants change, for all starts of a domain."""
 
+import functools
 import inspect
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -231,10 +232,9 @@ def _step_of(
         )
     plain = System(system.H_D, system.force, system.perturbation)
     start, number = jnp.full(shape, 0.1), jnp.asarray(0.1)
-    first = Interval(0 * number, number, number)
-    integrator.arithmetic.prepare(
-        method, Equations(plain, number, args), lambda: first, start, start
-    )
+    equations = Equations(plain, number, args)
+    first_interval = functools.partial(Interval, 0 * number, number, number)
+    integrator.arithmetic.prepare(method, equations, first_interval, start, start)
     quantum = getattr(integrator.arithmetic, "quantum", 0.0)
 
     def step_map(q, p, t, epsilon, h, error=0.0):
