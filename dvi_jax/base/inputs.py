@@ -78,6 +78,7 @@ def _real_array(name: str, value: Any) -> Array:
             f"{name} has a value that is not finite{place}: {value[where]}. "
             "Every component of the initial conditions must be a finite number."
         )
+    # A copy would take some ten microseconds, and the transfer of a long array longer.
     array = original if _is_strong(original, kind) else jnp.asarray(value)
     return array.astype(jnp.result_type(float)) if kind.kind in "iu" else array
 

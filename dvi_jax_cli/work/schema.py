@@ -14,32 +14,10 @@ from .._errors import describe, require
 from .._names import FILES as KINDS
 from .ring import RingFile
 from .table import (
-    AN_AXIS,
-    Array,
-    Axis,
-    AxisName,
-    Count,
-    Fraction,
-    JsonSchema,
-    Limit,
-    NonEmpty,
-    NonNegative,
-    Number,
-    NumberOrArray,
-    Scalar,
-    StateOrAxis,
-    StepSize,
-    SweepParameter,
-    Table,
-    Text,
-    Two,
-    check,
-    key,
-    number_or_axis,
-    type_tag,
-    union,
-    union_by_kind,
-)
+    AN_AXIS, Array, Axis, AxisName, Count, Fraction, JsonSchema, Limit, NonEmpty, NonNegative,
+    Number, NumberOrArray, Scalar, StateOrAxis, StepSize, SweepParameter, Table, Text, Two,
+    check, key, number_or_axis, type_tag, union, union_by_kind,
+)  # fmt: skip
 
 ARRAY = "an array of finite numbers, or of such arrays with rows of one length"
 COUNT = "a positive whole number"

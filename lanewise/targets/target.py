@@ -81,6 +81,7 @@ class Compiled:
     def call(self, operands: Sequence[Any], program: Any, lanes: int | None) -> list[Any]:
         """The results of the program, as an operation of XLA."""
         params = self.code.params(lanes, program.traced.closed.out_avals)
+        # Constants follow the operands, so that their text is not part of the code.
         run = jax.ffi.ffi_call(self.target.registered(self.code), program.shape_of(lanes))
         return list(run(*operands, *self.code.operands, params=params))
 
@@ -95,9 +96,12 @@ def compiled_by(
     for target in targets:
         if not target.suits(closed):
             continue
+        # Only `write` decides, by what it cannot express: a second list of what a target supports
+        # would have to be kept equal to its rules.
         try:
             code = target.write(closed, on, lanes or 1, program.layout.width)
             return Compiled(target, code, reasons)
         except Unsupported as why:
             reasons[target.name] = str(why)
+    # Targets share rules, and give the same reason where a rule is missing.
     raise Unsupported("; ".join(dict.fromkeys(reasons.values())))
