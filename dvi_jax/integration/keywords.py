@@ -82,6 +82,7 @@ class SectionSettings(OrbitSettings, total=False):
     throw: bool
 
 
+# Those of `Integrator`, and the object itself: a call gives either the object or single options.
 _FIELDS = ("method", "lattice", "root_finder", "arithmetic", "layout", "integrator")
 
 

@@ -13,7 +13,7 @@ from typing_extensions import TypeAliasType
 from .._errors import describe, require
 from .._names import FILES as KINDS
 from .ring import RingFile
-from .table import (
+from .table import (  # noqa: I001
     AN_AXIS, Array, Axis, AxisName, Count, Fraction, JsonSchema, Limit, NonEmpty, NonNegative,
     Number, NumberOrArray, Scalar, StateOrAxis, StepSize, SweepParameter, Table, Text, Two,
     check, key, number_or_axis, type_tag, union, union_by_kind,
