@@ -156,8 +156,8 @@ class Folders(MetaPathFinder, Loader):
         self._specs: dict[str, ModuleSpec | None] = {}
 
     def find_spec(self, fullname: str, path=None, target=None) -> ModuleSpec | None:
-        # Submodules as well: Python would load `dvi_jax.rings._track` a second time from the path of
-        # `dvi_jax.rings`, and its classes would differ from those of `dvi_jax.systems.rings._track`.
+        # Submodules as well: Python would load `dvi_jax.rings._track` a second time from the path
+        # of `dvi_jax.rings`, with classes that differ from those of the first.
         package, _, name = fullname.partition(".")
         first, _, _ = name.partition(".")
         elsewhere = NAMESPACES.get(first, f"dvi_jax.{first}") != f"dvi_jax.{first}"

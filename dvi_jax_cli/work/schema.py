@@ -13,11 +13,33 @@ from typing_extensions import TypeAliasType
 from .._errors import describe, require
 from .._names import FILES as KINDS
 from .ring import RingFile
-from .table import (  # noqa: I001
-    AN_AXIS, Array, Axis, AxisName, Count, Fraction, JsonSchema, Limit, NonEmpty, NonNegative,
-    Number, NumberOrArray, Scalar, StateOrAxis, StepSize, SweepParameter, Table, Text, Two,
-    check, key, number_or_axis, type_tag, union, union_by_kind,
-)  # fmt: skip
+from .table import (
+    AN_AXIS,
+    Array,
+    Axis,
+    AxisName,
+    Count,
+    Fraction,
+    JsonSchema,
+    Limit,
+    NonEmpty,
+    NonNegative,
+    Number,
+    NumberOrArray,
+    Scalar,
+    StateOrAxis,
+    StepSize,
+    SweepParameter,
+    Table,
+    Text,
+    Two,
+    check,
+    key,
+    number_or_axis,
+    type_tag,
+    union,
+    union_by_kind,
+)
 
 ARRAY = "an array of finite numbers, or of such arrays with rows of one length"
 COUNT = "a positive whole number"
@@ -421,11 +443,8 @@ FILES: dict[str, type[Table]] = dict(zip(KINDS, _MODELS, strict=True))
 def json_schema(kind: str | None = None) -> dict[str, Any]:
     """The JSON schema of the files of one kind, or of a file of any kind."""
     models = [FILES[kind]] if kind else list(FILES.values())
-    refs, definitions = models_json_schema(
-        [(model, "validation") for model in models], schema_generator=JsonSchema
-    )
+    inputs: Any = [(model, "validation") for model in models]
+    refs, definitions = models_json_schema(inputs, schema_generator=JsonSchema)
     definitions["anyOf"] = [refs[model, "validation"] for model in models]
-    return {
-        "$schema": JsonSchema.schema_dialect,
-        "title": f"dvi-jax {kind or 'TOML'} file",
-    } | definitions
+    title = f"dvi-jax {kind or 'TOML'} file"
+    return {"$schema": JsonSchema.schema_dialect, "title": title} | definitions
