@@ -45,7 +45,7 @@ def require_name(
 
 
 def require_file(key: str, path: Path, rule: str) -> Path:
-    """The absolute path of a file. **Raises** `InputError` if there is none."""
+    """The absolute path of a file. **Raises** `InputError` if it does not exist."""
     try:
         path = path.resolve()
         is_file = path.is_file()

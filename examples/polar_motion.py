@@ -18,7 +18,7 @@ import numpy as np
 
 import dvi_jax as dvi
 from dvi_jax import plot
-from dvi_jax.systems.planets import polar_motion
+from dvi_jax.systems import polar_motion
 from dvi_jax.systems.planets.polar_motion import REFERENCE, YEAR, read_polar_motion
 
 STARTS = (42778, 45700, 48622, 51544)  # MJD: 1976-01-01, 1984-01-01, 1992-01-01, 2000-01-01

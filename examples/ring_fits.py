@@ -27,8 +27,7 @@ import numpy as np
 import optimistix
 
 import dvi_jax as dvi
-from dvi_jax import plot
-from dvi_jax.systems import rings
+from dvi_jax import plot, rings
 
 jax.config.update("jax_enable_x64", True)
 mpl.use("Agg")

@@ -20,7 +20,7 @@ import numpy as np
 
 import dvi_jax as dvi
 from dvi_jax import plot
-from dvi_jax.systems.planets import polar_motion
+from dvi_jax.systems import polar_motion
 from dvi_jax.systems.planets.polar_motion import REFERENCE, YEAR, read_polar_motion
 
 jax.config.update("jax_enable_x64", True)

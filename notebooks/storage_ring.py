@@ -16,8 +16,7 @@ import numpy as np
 import optimistix
 
 import dvi_jax as dvi
-from dvi_jax import plot
-from dvi_jax.systems import rings
+from dvi_jax import plot, rings
 
 jax.config.update("jax_enable_x64", True)
 bend = rings.bend("B", 1.5, angle=np.pi / 16, edge_in=np.pi / 32, edge_out=np.pi / 32)

@@ -142,7 +142,7 @@ def test_one_device_and_what_is_refused():
         dvi.over_devices(3)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="devices is empty: give at least one"):
         dvi.over_devices(jnp.sin, devices=[])
-    with pytest.raises(ValueError, match=r"with 2 arguments, but in_axes is \[0\]"):
+    with pytest.raises(ValueError, match=r"is \[0\], of length 1, for 2 arguments"):
         dvi.over_devices(jnp.add, in_axes=[0])(x, x)
     with pytest.raises(ValueError, match=r"shape \(\)"):
         dvi.over_devices(jnp.add)(x, c)

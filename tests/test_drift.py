@@ -12,7 +12,7 @@ from truths import curves
 
 import dvi_jax as dvi
 from dvi_jax import plot, systems
-from dvi_jax.discover.drift.drift import drift, exponents, orders
+from dvi_jax.discover.drift import drift, exponents, orders
 from dvi_jax.discover.drift.exponents import small_epsilon_exponent
 
 OSCILLATOR = systems.oscillator()

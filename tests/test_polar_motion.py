@@ -14,7 +14,7 @@ from helpers import run_problem
 from scipy.integrate import solve_ivp
 
 import dvi_jax as dvi
-from dvi_jax.systems.planets import polar_motion
+from dvi_jax.systems import polar_motion
 from dvi_jax.systems.planets.polar_motion import (
     REFERENCE,
     YEAR,

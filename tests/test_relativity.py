@@ -11,9 +11,9 @@ from helpers import needs_ephemeris, run_problem
 from scipy.interpolate import CubicSpline
 
 import dvi_jax as dvi
+from dvi_jax.systems import solar_system
 from dvi_jax.systems.n_body import hamiltonian
 from dvi_jax.systems.oblate_kepler import elements
-from dvi_jax.systems.planets import solar_system
 from dvi_jax.systems.planets.relativity import (
     SPEED_OF_LIGHT,
     SUN_J2,

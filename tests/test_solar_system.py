@@ -9,9 +9,8 @@ from helpers import needs_ephemeris, run_problem
 from scipy.spatial.transform import Rotation
 
 import dvi_jax as dvi
-from dvi_jax.systems import n_body
+from dvi_jax.systems import n_body, solar_system
 from dvi_jax.systems.n_body import OBSERVABLES, angular_momentum, check_bodies, hamiltonian
-from dvi_jax.systems.planets import solar_system
 from dvi_jax.systems.planets.solar_system import (
     BODIES,
     GM,

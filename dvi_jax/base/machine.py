@@ -1,5 +1,4 @@
-"""The processors of this process, and its memory: larger results are rejected before they are
-computed."""
+"""The processors and the memory of this process, which limits the size of results."""
 
 import contextlib
 import functools

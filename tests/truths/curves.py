@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dvi_jax.discover.drift.drift import exponents
+from dvi_jax.discover.drift import exponents
 
 
 class Curve(NamedTuple):
