@@ -179,10 +179,7 @@ def test_hosts_are_killed_and_the_fit_is_the_same(tmp_path):
     assert a == b
 
 
-def test_the_removed_kernel_is_a_deprecated_name_of_auto():
-    with pytest.warns(DeprecationWarning, match="XLA compiles the batch") as seen:
-        layout = dvi.Layout(form="kernel", width=4)  # pyright: ignore[reportArgumentType]
-    assert [w.filename for w in seen] == [__file__]  # the warning names the line of the caller
-    assert layout == dvi.Layout(form="auto", width=4)
-    with pytest.raises(ValueError, match='"auto", "components" or "arrays"'):
-        dvi.Layout(form="gpu")  # pyright: ignore[reportArgumentType]
+def test_layout_rejects_unknown_forms():
+    for form in ("gpu", "components", "kernel"):
+        with pytest.raises(ValueError, match='"auto" or "arrays"'):
+            dvi.Layout(form=form)  # pyright: ignore[reportArgumentType]
