@@ -140,9 +140,9 @@ def test_one_device_and_what_is_refused():
     np.testing.assert_array_equal(doubled(x, c), 2 * x)
     with pytest.raises(TypeError, match="argument of over_devices must be a function"):
         dvi.over_devices(3)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ValueError, match="devices is empty: give at least one"):
+    with pytest.raises(ValueError, match="devices must have at least one"):
         dvi.over_devices(jnp.sin, devices=[])
-    with pytest.raises(ValueError, match=r"is \[0\], of length 1, for 2 arguments"):
+    with pytest.raises(ValueError, match=r"each of the 2 arguments, got \[0\]"):
         dvi.over_devices(jnp.add, in_axes=[0])(x, x)
     with pytest.raises(ValueError, match=r"shape \(\)"):
         dvi.over_devices(jnp.add)(x, c)

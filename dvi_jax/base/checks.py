@@ -4,18 +4,21 @@ import difflib
 import inspect
 import math
 import numbers
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Unpack, get_args, get_origin
 
 import numpy as np
 
+Dimension = int | str
+"""The length of an axis: a number, or the name of a length that may have any positive value."""
 
-def whole(name: str, value: Any, least: int = 1, most: int | None = None, hint: str = "") -> int:
-    """A whole number from `least` to `most` (None: any), not a bool. **Raises** `ValueError`."""
+
+def whole(name: str, value: Any, low: int = 1, high: int | None = None, hint: str = "") -> int:
+    """A whole number from `low` to `high` (None: any), not a bool. **Raises** `ValueError`."""
     # True is an integer in Python, but as a number it is nearly always a mistake.
     fits = isinstance(value, int | np.integer) and not isinstance(value, bool)
-    if not fits or value < least or (most is not None and value > most):
-        span = f"of at least {least}" if most is None else f"from {least} to {most}"
+    if not fits or value < low or (high is not None and value > high):
+        span = f"of at least {low}" if high is None else f"from {low} to {high}"
         text = f"{value!r:.200}" + ("" if fits else f" (type {type(value).__name__})")
         raise ValueError(f"{name} must be an integer {span}, got {text}.{_sentence(hint)}")
     return int(value)
@@ -44,6 +47,75 @@ def finite(name: str, value: Any, hint: str = "") -> float:
     return float(value)
 
 
+def array(
+    name: str,
+    value: Any,
+    *shapes: tuple[Dimension, ...],
+    verb: str = "be",
+    integers: bool = False,
+    hint: str = "",
+) -> Any:
+    """A real array, or anything else with a shape and a dtype, of one of the shapes.
+
+    - `shapes`: such as (), a scalar, or (3, "m"), m arrays of length 3, m ≥ 1.
+    - `verb`: "return" for the value of a function.
+    - `integers`: whether they are allowed, next to floating-point numbers.
+
+    **Raises** `ValueError`.
+    """
+    # By name: bfloat16, which NumPy does not know, has no kind.
+    is_real = "float" in str(value.dtype) or (integers and value.dtype.kind in "iu")
+    if not is_real or not any(_has_shape(value.shape, shape) for shape in shapes):
+        kinds = (f"array of shape {_shape_text(shape)}" if shape else "scalar" for shape in shapes)
+        raise ValueError(
+            f"{name} must {verb} a real {' or '.join(kinds)}, got shape {value.shape} and dtype "
+            f"{value.dtype}.{_sentence(hint)}"
+        )
+    return value
+
+
+def all_finite(name: str, values: Any, positive: bool = False, hint: str = "") -> None:
+    """**Raises** `ValueError` for an array with a number that is not finite, or not `positive`."""
+    numbers = np.asarray(values)
+    is_wrong = ~np.isfinite(numbers) | (positive & (numbers <= 0))
+    if is_wrong.any():
+        index = tuple(np.argwhere(is_wrong)[0].tolist())
+        place = f" at index {list(index)}" if index else ""
+        raise ValueError(
+            f"{name} must be {'positive and ' * positive}finite, got {numbers[index]}{place}."
+            f"{_sentence(hint)}"
+        )
+
+
+def ordered(name: str, values: Any, strictly: bool = False, hint: str = "") -> None:
+    """**Raises** `ValueError` unless the values are finite, in ascending or descending order;
+    `strictly`: without equal neighbours."""
+    numbers = np.asarray(values)
+    steps = np.diff(numbers)
+    rises = steps * (np.sign(steps[steps != 0][:1]).sum() or 1)
+    is_good = np.isfinite(steps) & (rises > 0 if strictly else rises >= 0)
+    if not np.isfinite(numbers).all() or not is_good.all():
+        k = 0 if is_good.all() else int(np.argmin(is_good))  # one place, since the list may be long
+        raise ValueError(
+            f"{name} must be finite and in {'strictly ' if strictly else ''}ascending or descending"
+            f" order, got {numbers[k : k + 2].tolist()} at index {k}.{_sentence(hint)}"
+        )
+
+
+def only_one(kind: type[Exception] = ValueError, /, **values: Any) -> None:
+    """**Raises** an error of this `kind` if more than one of the arguments is not None."""
+    texts = [f"{name}={value!r:.100}" for name, value in values.items() if value is not None]
+    if len(texts) > 1:
+        raise kind(f"only one of {_listed(values)} can be given, got {_listed(texts)}.")
+
+
+def required(owner: str, values: Mapping[str, Any], absent: Any = None, hint: str = "") -> None:
+    """**Raises** `TypeError` for arguments with the value `absent`, which `owner` requires."""
+    names = [name for name, value in values.items() if value is absent]
+    if names:
+        raise TypeError(f"{owner} requires {_listed(names)}.{_sentence(hint)}")
+
+
 def one_of(name: str, value: Any, choices: Iterable[Any], hint: str = "") -> Any:
     """One of the known values. **Raises** `ValueError`."""
     choices = list(choices)
@@ -58,10 +130,7 @@ def one_of(name: str, value: Any, choices: Iterable[Any], hint: str = "") -> Any
 
 
 def instance(name: str, value: Any, kind: Any, description: str, hint: str = "") -> Any:
-    """An instance of a class (or of one of several); `called` is its name in the message.
-
-    **Raises** `TypeError`.
-    """
+    """An instance of a class, or of one of several. **Raises** `TypeError`."""
     if not isinstance(value, kind):
         text = f"{value!r:.200}"
         # The class in place of an object is the usual mistake: dvi.Strang for dvi.Strang().
@@ -100,7 +169,7 @@ SYNONYMS = {
 """Names of arguments in other packages → the name here."""
 
 
-def unpacked(function: Callable[..., Any]) -> Any:
+def settings_type(function: Callable[..., Any]) -> Any:
     """The `TypedDict` of a function with ``**settings: Unpack[...]``; None for others."""
     for parameter in inspect.signature(function).parameters.values():
         if parameter.kind == parameter.VAR_KEYWORD and get_origin(parameter.annotation) is Unpack:
@@ -111,8 +180,8 @@ def unpacked(function: Callable[..., Any]) -> Any:
 def argument_names(function: Callable[..., Any]) -> list[str]:
     """The arguments that a function accepts, those of an unpacked `TypedDict` included."""
     parameters = inspect.signature(function).parameters.values()
-    own = [x.name for x in parameters if x.kind != x.VAR_KEYWORD]
-    return [*own, *getattr(unpacked(function), "__annotations__", ())]
+    names = [x.name for x in parameters if x.kind != x.VAR_KEYWORD]
+    return [*names, *getattr(settings_type(function), "__annotations__", ())]
 
 
 def refuse_unknown(name: str, function: Callable[..., Any], keywords: Iterable[str]) -> None:
@@ -123,11 +192,9 @@ def refuse_unknown(name: str, function: Callable[..., Any], keywords: Iterable[s
         # Synonyms first: by spelling alone the nearest name to dt0 would be t0.
         suggestion = SYNONYMS.get(keyword) if SYNONYMS.get(keyword) in names else None
         suggestion = suggestion or (close[0] if close else None)
-        hint = (
-            f" Did you mean {suggestion!r}?"
-            if suggestion
-            else f" Its arguments are {', '.join(names)}."
-        )
+        hint = f" Its arguments are {', '.join(names)}."
+        if suggestion:
+            hint = f" Did you mean {suggestion!r}?"
         if keyword in ("rtol", "atol", "tolerance"):
             hint = " No tolerance controls the size of the steps: choose h."
         raise TypeError(f"{name} has no argument {keyword!r}.{hint}")
@@ -138,8 +205,25 @@ def _is_number(value: Any) -> bool:
     # Arrays of JAX, traced or not, by their attributes: this file does not import JAX.
     if isinstance(value, np.ndarray) or hasattr(value, "__jax_array__") or hasattr(value, "aval"):
         value = np.asarray(value)
-        return value.ndim == 0 and value.dtype.kind in "iuf"
+        return value.ndim == 0 and (value.dtype.kind in "iu" or "float" in str(value.dtype))
     return isinstance(value, numbers.Real | np.number) and not isinstance(value, bool)
+
+
+def _has_shape(shape: tuple[int, ...], pattern: tuple[Dimension, ...]) -> bool:
+    return len(shape) == len(pattern) and all(
+        n > 0 if isinstance(length, str) else n == length
+        for n, length in zip(shape, pattern, strict=True)
+    )
+
+
+def _shape_text(pattern: tuple[Dimension, ...]) -> str:
+    return f"({', '.join(map(str, pattern))}{',' * (len(pattern) == 1)})"
+
+
+def _listed(texts: Iterable[str]) -> str:
+    """Such as "a, b and c"."""
+    *first, last = texts
+    return f"{', '.join(first)} and {last}" if first else last
 
 
 def _sentence(hint: str) -> str:

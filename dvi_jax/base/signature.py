@@ -34,12 +34,8 @@ def check_takes(
     signature = inspect.signature(function)
     hint = (hints or {}).get(len(signature.parameters), "")
     raise TypeError(
-        f"{name} must take {_WORDS[count]} positional arguments {arguments}, got "
-        f"{signature_of(function)}. {hint}".rstrip()
+        f"{name} must take the arguments {arguments}, got {signature_of(function)}. {hint}".rstrip()
     )
-
-
-_WORDS = {2: "two", 4: "four", 5: "five"}
 
 
 def signature_of(function: Callable[..., Any]) -> str:

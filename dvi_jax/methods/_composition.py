@@ -211,7 +211,7 @@ class Composition(CompositionMethod):
                 f"with the sum {sum(c)!r}. Compute one of them as 1 minus the sum of the others."
             )
         hint = "Conditions of higher orders cannot be checked."
-        whole("order", order, most=_MOST_CHECKED, hint=hint)
+        whole("order", order, high=_MOST_CHECKED, hint=hint)
         defects = order_defects(c, order, base.order, base.is_symmetric)
         actual = next((n for n, defect in enumerate(defects) if defect > _DEFECT), order)
         if actual < order:
