@@ -53,22 +53,24 @@ def array(
     *shapes: tuple[Dimension, ...],
     verb: str = "be",
     integers: bool = False,
+    empty: bool = False,
     hint: str = "",
 ) -> Any:
     """A real array, or anything else with a shape and a dtype, of one of the shapes.
 
-    - `shapes`: such as (), a scalar, or (3, "m"), m arrays of length 3, m ≥ 1.
+    - `shapes`: such as (), a scalar, or (3, "m"), for any m ≥ 1; `empty`: also m = 0.
     - `verb`: "return" for the value of a function.
     - `integers`: whether they are allowed, next to floating-point numbers.
 
     **Raises** `ValueError`.
     """
     # By name: bfloat16, which NumPy does not know, has no kind.
-    is_real = "float" in str(value.dtype) or (integers and value.dtype.kind in "iu")
-    if not is_real or not any(_has_shape(value.shape, shape) for shape in shapes):
+    is_real = "float" in str(value.dtype) or (integers and value.dtype.kind in "iub")
+    if not is_real or not any(_has_shape(value.shape, shape, empty) for shape in shapes):
         kinds = (f"array of shape {_shape_text(shape)}" if shape else "scalar" for shape in shapes)
         raise ValueError(
-            f"{name} must {verb} a real {' or '.join(kinds)}, got shape {value.shape} and dtype "
+            f"{name} must {verb} a real {' or '.join(kinds)}"
+            f"{'' if integers else ' of a floating-point type'}, got shape {value.shape} and dtype "
             f"{value.dtype}.{_sentence(hint)}"
         )
     return value
@@ -76,29 +78,34 @@ def array(
 
 def all_finite(name: str, values: Any, positive: bool = False, hint: str = "") -> None:
     """**Raises** `ValueError` for an array with a number that is not finite, or not `positive`."""
-    numbers = np.asarray(values)
-    is_wrong = ~np.isfinite(numbers) | (positive & (numbers <= 0))
-    if is_wrong.any():
-        index = tuple(np.argwhere(is_wrong)[0].tolist())
+    entries = np.asarray(values)
+    is_real = entries.dtype.kind in "iub" or "float" in str(entries.dtype)
+    is_good = (
+        np.isfinite(entries) & ((entries > 0) | (not positive))
+        if is_real
+        else np.zeros(entries.shape)
+    )
+    if not np.all(is_good):
+        index = tuple(np.argwhere(is_good == 0)[0].tolist())
         place = f" at index {list(index)}" if index else ""
         raise ValueError(
-            f"{name} must be {'positive and ' * positive}finite, got {numbers[index]}{place}."
+            f"{name} must be {'positive and ' * positive}finite, got {entries[index]}{place}."
             f"{_sentence(hint)}"
         )
 
 
-def ordered(name: str, values: Any, strictly: bool = False, hint: str = "") -> None:
+def in_order(name: str, values: Any, strictly: bool = False, hint: str = "") -> None:
     """**Raises** `ValueError` unless the values are finite, in ascending or descending order;
     `strictly`: without equal neighbours."""
-    numbers = np.asarray(values)
-    steps = np.diff(numbers)
+    entries = np.asarray(values)
+    steps = np.diff(entries)
     rises = steps * (np.sign(steps[steps != 0][:1]).sum() or 1)
     is_good = np.isfinite(steps) & (rises > 0 if strictly else rises >= 0)
-    if not np.isfinite(numbers).all() or not is_good.all():
+    if not np.isfinite(entries).all() or not is_good.all():
         k = 0 if is_good.all() else int(np.argmin(is_good))  # one place, since the list may be long
         raise ValueError(
             f"{name} must be finite and in {'strictly ' if strictly else ''}ascending or descending"
-            f" order, got {numbers[k : k + 2].tolist()} at index {k}.{_sentence(hint)}"
+            f" order, got {entries[k : k + 2].tolist()} at index {k}.{_sentence(hint)}"
         )
 
 
@@ -109,16 +116,26 @@ def only_one(kind: type[Exception] = ValueError, /, **values: Any) -> None:
         raise kind(f"only one of {_listed(values)} can be given, got {_listed(texts)}.")
 
 
-def required(owner: str, values: Mapping[str, Any], absent: Any = None, hint: str = "") -> None:
+def require(owner: str, values: Mapping[str, Any], absent: Any = None, hint: str = "") -> None:
     """**Raises** `TypeError` for arguments with the value `absent`, which `owner` requires."""
     names = [name for name, value in values.items() if value is absent]
     if names:
         raise TypeError(f"{owner} requires {_listed(names)}.{_sentence(hint)}")
 
 
+def require_system(name: str, system: Any) -> None:
+    """**Raises** `ValueError` for an observable without a system, which `bind` gives it."""
+    if system is None:
+        raise ValueError(
+            f"{name} has no system: give it to dvi.integrate(observe=...), or call its method "
+            "bind(system, epsilon)."
+        )
+
+
 def one_of(name: str, value: Any, choices: Iterable[Any], hint: str = "") -> Any:
     """One of the known values. **Raises** `ValueError`."""
     choices = list(choices)
+    value = value.item() if isinstance(value, np.integer) else value
     # The types are compared as well: True == 1, and an array has no truth value.
     if not any(
         value is choice or (type(value) is type(choice) and value == choice) for choice in choices
@@ -209,9 +226,9 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, numbers.Real | np.number) and not isinstance(value, bool)
 
 
-def _has_shape(shape: tuple[int, ...], pattern: tuple[Dimension, ...]) -> bool:
+def _has_shape(shape: tuple[int, ...], pattern: tuple[Dimension, ...], empty: bool) -> bool:
     return len(shape) == len(pattern) and all(
-        n > 0 if isinstance(length, str) else n == length
+        n > 0 or empty if isinstance(length, str) else n == length
         for n, length in zip(shape, pattern, strict=True)
     )
 

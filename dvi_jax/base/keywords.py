@@ -5,7 +5,7 @@ import inspect
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from .checks import argument_names, only_one, refuse_unknown, required, settings_type
+from .checks import argument_names, only_one, refuse_unknown, require, settings_type
 
 F = TypeVar("F", bound=Callable[..., Any])
 T = TypeVar("T")
@@ -29,7 +29,7 @@ def checked_keywords(function: F) -> F:
         refuse_unknown(
             function.__name__, function, [name for name in keywords if name not in names]
         )
-        required(
+        require(
             function.__name__, {name: keywords.get(name, _ABSENT) for name in necessary}, _ABSENT
         )
         return function(*args, **keywords)
@@ -74,7 +74,7 @@ def with_keywords_of(source: Callable[..., Any], names: str = "", **extra: Any) 
             if strangers := [name for name in options if name not in names]:
                 refuse_unknown(function.__name__, call, strangers)
             options = {**defaults, **options}
-            required(function.__name__, options, _ABSENT)
+            require(function.__name__, options, _ABSENT)
             return function(*args, **options)
 
         call.__dict__["__signature__"] = signature.replace(parameters=ordering)
