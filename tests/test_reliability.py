@@ -80,7 +80,7 @@ def test_a_pickle_in_a_file_of_arrays_is_refused_and_not_run(tmp_path):
     np.savez(file, about=np.array(Payload(trace), dtype=object))
     for read in (lambda p: read_npz(p, 1, "fit"), dvi.FitResult.load, read_columns,
                  lambda p: dvi.Discovery.load(p, dvi.Polynomials(2))):  # fmt: skip
-        with pytest.raises(ValueError, match="damaged|cannot be read"):
+        with pytest.raises(ValueError, match=r"damaged|cannot be read"):
             read(file)
     assert not trace.exists()
 

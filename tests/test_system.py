@@ -39,7 +39,7 @@ def test_the_number_of_arguments_decides_about_discretise():
          r"H_D.*real scalar.*shape \(2,\).*jnp.sum"),
         ({"H_D": lambda t0, t1, q0, p1, args: None}, TypeError, "return missing"),
         ({"H_D": H, "force": lambda t0, t1, q0, p1, args: q0[0]}, ValueError,
-         r"force.*shaped like q0, \(2,\).*shape \(\)"),
+         r"force.*array of shape \(2,\).*shape \(\)"),
     ],
 )  # fmt: skip
 def test_values_of_another_shape_are_rejected(functions, error, message):

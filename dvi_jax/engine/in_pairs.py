@@ -122,9 +122,8 @@ def _equation(eqn: Any, values: list[Any]) -> list[Any]:
         (body, *_) = bodies(eqn)
         return _evaluate(body.jaxpr, body.consts, values)
     raise NotImplementedError(
-        f"arithmetic=dvi.DoubleDouble() has no rule for the operation {name} of JAX in a "
-        "function of this run. Write it with elementary functions, sums, products, "
-        "lanewise.solve(A, b) or loops, or use arithmetic=dvi.Compensated()."
+        f"arithmetic=dvi.DoubleDouble() has no rule for the operation {name} of JAX. Use others, "
+        "such as lanewise.solve(A, b), or arithmetic=dvi.Compensated()."
     )
 
 
@@ -327,8 +326,7 @@ def _call(eqn: Any, values: list[Any]) -> list[Any]:
     program = eqn.params["program"]
     if eqn.params["lanes"] is not None:
         raise NotImplementedError(
-            "arithmetic=dvi.DoubleDouble() has no rule for lanewise.batched, nor for jax.vmap of "
-            "lanewise.call. Use jax.vmap without lanewise, or arithmetic=dvi.Compensated()."
+            "arithmetic=dvi.DoubleDouble() has no rule for lanewise.batched: use jax.vmap alone."
         )
     inner = program.traced.all_inputs
     return _evaluate(inner.jaxpr, inner.consts, values)

@@ -66,7 +66,7 @@ def check_settings(rtol: float | None, atol: float, max_steps: int) -> None:
         if value is not None:
             positive(name, value, zero=True)
     if rtol == 0 and atol == 0:
-        raise ValueError("rtol and atol are both 0, so no iteration would stop: make one positive.")
+        raise ValueError("rtol and atol are both 0: one must be positive.")
 
 
 class Newton(RootSolver):

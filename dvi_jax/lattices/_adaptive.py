@@ -87,9 +87,8 @@ class AdaptiveReversible(StepSizes):
     def check(self, method, arithmetic):
         if not method.is_symmetric:
             raise ValueError(
-                f"lattice=dvi.AdaptiveReversible(...) requires a symmetric method, got {method!r}. "
-                "Otherwise the steps are not reversible, and energies drift. Use "
-                "method=dvi.Strang(), method=dvi.KahanLi(8) or another symmetric method."
+                "lattice=dvi.AdaptiveReversible(...) requires a symmetric method, such as "
+                f"dvi.Strang(), got {method!r}."
             )
         check_rounding(type(self).__name__, arithmetic)
 

@@ -158,9 +158,8 @@ def _as_coefficients(values: Sequence[float]) -> tuple[float, ...]:
         return tuple(float(c) for c in values)
     except (TypeError, ValueError):
         raise TypeError(
-            "coefficients of Composition must be a sequence of numbers, such as (0.2, 0.3, 0.3, "
-            f"0.2), got {values!r:.200}. Make the "
-            "Composition outside of jax.jit, jax.grad and jax.vmap."
+            "coefficients of Composition must be a sequence of numbers that are not traced, got "
+            f"{values!r:.200}."
         ) from None
 
 
@@ -208,7 +207,7 @@ class Composition(CompositionMethod):
         if not c or not all(math.isfinite(x) for x in c) or abs(math.fsum(c) - 1) > 1e-12:
             raise ValueError(
                 f"coefficients of Composition must be finite and sum to 1 up to 1e-12, got {c} "
-                f"with the sum {sum(c)!r}. Compute one of them as 1 minus the sum of the others."
+                f"with the sum {sum(c)!r}."
             )
         hint = "Conditions of higher orders cannot be checked."
         whole("order", order, high=_MOST_CHECKED, hint=hint)
@@ -216,9 +215,9 @@ class Composition(CompositionMethod):
         actual = next((n for n, defect in enumerate(defects) if defect > _DEFECT), order)
         if actual < order:
             raise ValueError(
-                f"order={order} is too high: the coefficients have order {actual}, not {order}. "
-                f"They violate the conditions of order {actual + 1} by {defects[actual]:.1e}; at "
-                f"most {_DEFECT} is allowed."
+                f"order must be at most {actual}, that of the coefficients, got {order}: the "
+                f"conditions of order {actual + 1} have the defect {defects[actual]:.1e}, above "
+                f"{_DEFECT}."
             )
 
     def fractions(self):

@@ -5,6 +5,7 @@ from typing import ClassVar
 
 import equinox as eqx
 
+from ..base.checks import one_of
 from ._base import Method
 from ._composition import CompositionMethod, of_strang
 from ._type_ii import TypeII
@@ -25,13 +26,7 @@ class Published(CompositionMethod):
     is_symmetric: ClassVar[bool] = True
 
     def __check_init__(self):
-        if self.order not in self.tables:
-            *others, last = self.tables
-            orders = f"{', '.join(map(str, others))} or {last}" if others else f"{last}"
-            raise ValueError(
-                f"order of {type(self).__name__} must be {orders}, got {self.order!r}. For "
-                "others use dvi.Strang() or dvi.Composition(coefficients, order=...)."
-            )
+        one_of(f"order of {type(self).__name__}", self.order, self.tables)
 
     def fractions(self):
         return self.tables[self.order]

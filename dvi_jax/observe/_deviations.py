@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from lanewise.jaxprs.jaxapi import is_traced
 
-from ..base.checks import whole
+from ..base.checks import all_finite, array, whole
 from ..base.types import Scalar
 from ._reductions import Reduction
 
@@ -97,22 +97,12 @@ class _FrameIndicator(Deviations):
         whole(f"seed of {type(self).__name__}", self.seed, 0)
         if not isinstance(self.scale, tuple | list) or len(self.scale) != 2:
             raise TypeError(
-                f"scale of {type(self).__name__} must be a pair (unit of q, unit of p), as a tuple "
-                f"or a list of two entries; got {self.scale!r:.200}."
+                f"scale of {type(self).__name__} must be a pair (unit of q, unit of p), got "
+                f"{self.scale!r:.200}."
             )
         for letter, unit in zip("qp", self.scale, strict=True):
-            if any(is_traced(x) for x in jax.tree.leaves(unit)):
-                continue  # the value of a tracer is unknown
-            try:
-                good = np.isrealobj(unit) and np.all(np.isfinite(unit) & (np.asarray(unit) > 0))
-            except TypeError:
-                good = False
-            if not good:
-                raise ValueError(
-                    f"the scale of {letter} in {type(self).__name__} must be a positive and finite "
-                    f"number, or an array of such numbers with the shape of {letter}; got "
-                    f"{unit!r:.200}."
-                )
+            if not any(is_traced(x) for x in jax.tree.leaves(unit)):  # their values are unknown
+                all_finite(f"the scale of {letter} in {type(self).__name__}", unit, positive=True)
 
     def vectors(self, memory):
         units = self._units(memory[0])
@@ -126,11 +116,8 @@ class _FrameIndicator(Deviations):
     def _first_frame(self: Any, value: Array, count: int | None) -> Array:
         """Random orthonormal vectors, the same for every trajectory, shape (count, 2N)."""
         size = value.shape[0]
-        if count is not None and count > size:
-            raise ValueError(
-                f"{type(self).__name__} can have at most {size} deviation vectors, one for each "
-                f"component of q and p; got {count}. Choose a smaller number."
-            )
+        if count is not None:
+            whole(f"the number of vectors of {type(self).__name__}", count, high=size)
         # All `size` vectors are drawn, so that the first ones do not depend on the count.
         random = np.random.default_rng(self.seed).standard_normal((size, size))
         # In NumPy the frame is a constant of the program, and costs nothing in a run.
@@ -145,11 +132,7 @@ class _FrameIndicator(Deviations):
         parts = []
         for letter, unit in zip("qp", self.scale, strict=True):
             unit = jnp.asarray(unit, like.dtype).ravel()
-            if unit.size not in (1, size):
-                raise ValueError(
-                    f"the scale of {letter} in {type(self).__name__} must be one number, or an "
-                    f"array with the size of {letter} ({size}); got {unit.size} numbers."
-                )
+            array(f"the scale of {letter} in {type(self).__name__}", unit, (1,), (size,))
             parts.append(jnp.broadcast_to(unit, (size,)))
         return jnp.concatenate(parts)[None, :]
 
