@@ -113,14 +113,14 @@ def only_one(kind: type[Exception] = ValueError, /, **values: Any) -> None:
     """**Raises** an error of this `kind` if more than one of the arguments is not None."""
     texts = [f"{name}={value!r:.100}" for name, value in values.items() if value is not None]
     if len(texts) > 1:
-        raise kind(f"only one of {_listed(values)} can be given, got {_listed(texts)}.")
+        raise kind(f"only one of {_enumeration(values)} can be given, got {_enumeration(texts)}.")
 
 
 def require(owner: str, values: Mapping[str, Any], absent: Any = None, hint: str = "") -> None:
     """**Raises** `TypeError` for arguments with the value `absent`, which `owner` requires."""
     names = [name for name, value in values.items() if value is absent]
     if names:
-        raise TypeError(f"{owner} requires {_listed(names)}.{_sentence(hint)}")
+        raise TypeError(f"{owner} requires {_enumeration(names)}.{_sentence(hint)}")
 
 
 def require_system(name: str, system: Any) -> None:
@@ -149,13 +149,13 @@ def one_of(name: str, value: Any, choices: Iterable[Any], hint: str = "") -> Any
 def instance(name: str, value: Any, kind: Any, description: str, hint: str = "") -> Any:
     """An instance of a class, or of one of several. **Raises** `TypeError`."""
     if not isinstance(value, kind):
-        text = f"{value!r:.200}"
+        value_text = f"{value!r:.200}"
         # The class in place of an object is the usual mistake: dvi.Strang for dvi.Strang().
         if isinstance(value, type):
-            text = f"the class {value.__name__} (is a pair of parentheses missing?)"
+            value_text = f"the class {value.__name__} (is a pair of parentheses missing?)"
         elif inspect.isfunction(value):  # its repr has an address
-            text = f"the function {value.__name__}"
-        raise TypeError(f"{name} must be {description}, got {text}.{_sentence(hint)}")
+            value_text = f"the function {value.__name__}"
+        raise TypeError(f"{name} must be {description}, got {value_text}.{_sentence(hint)}")
     return value
 
 
@@ -197,7 +197,7 @@ def settings_type(function: Callable[..., Any]) -> Any:
 def argument_names(function: Callable[..., Any]) -> list[str]:
     """The arguments that a function accepts, those of an unpacked `TypedDict` included."""
     parameters = inspect.signature(function).parameters.values()
-    names = [x.name for x in parameters if x.kind != x.VAR_KEYWORD]
+    names = [entry.name for entry in parameters if entry.kind != entry.VAR_KEYWORD]
     return [*names, *getattr(settings_type(function), "__annotations__", ())]
 
 
@@ -228,8 +228,8 @@ def _is_number(value: Any) -> bool:
 
 def _has_shape(shape: tuple[int, ...], pattern: tuple[Dimension, ...], empty: bool) -> bool:
     return len(shape) == len(pattern) and all(
-        n > 0 or empty if isinstance(length, str) else n == length
-        for n, length in zip(shape, pattern, strict=True)
+        size > 0 or empty if isinstance(length, str) else size == length
+        for size, length in zip(shape, pattern, strict=True)
     )
 
 
@@ -237,7 +237,7 @@ def _shape_text(pattern: tuple[Dimension, ...]) -> str:
     return f"({', '.join(map(str, pattern))}{',' * (len(pattern) == 1)})"
 
 
-def _listed(texts: Iterable[str]) -> str:
+def _enumeration(texts: Iterable[str]) -> str:
     """Such as "a, b and c"."""
     *first, last = texts
     return f"{', '.join(first)} and {last}" if first else last

@@ -48,7 +48,7 @@ def as_times(call: str, ts: Any) -> Array:
 def _join(value: Any) -> Any:
     """A list with traced numbers as one array, which NumPy cannot make."""
     has_tracer = isinstance(value, list | tuple) and any(
-        is_traced(x) for x in jax.tree.leaves(value)
+        is_traced(leaf) for leaf in jax.tree.leaves(value)
     )
     return jnp.asarray(value) if has_tracer else value
 
@@ -68,8 +68,8 @@ def _real_array(name: str, value: Any) -> Array:
             "p0 = √2 Im ψ."
         )
     if not _is_real(kind):
-        text = f": {value!s:.80}" if isinstance(value, np.ndarray) else ""
-        raise TypeError(f"{name} must be an array of real numbers, got dtype {kind}{text}.")
+        excerpt = f": {value!s:.80}" if isinstance(value, np.ndarray) else ""
+        raise TypeError(f"{name} must be an array of real numbers, got dtype {kind}{excerpt}.")
     # A traced value that is not finite becomes the status of its trajectory.
     if isinstance(value, np.ndarray):
         all_finite(name, value)

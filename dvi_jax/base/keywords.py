@@ -55,18 +55,18 @@ def with_keywords_of(source: Callable[..., Any], names: str = "", **extra: Any) 
     """
     parameters = inspect.signature(source).parameters
     kind = inspect.Parameter.KEYWORD_ONLY
-    keywords = [parameters[n] for n in names.split()] or [
-        p for p in parameters.values() if p.kind == kind
+    keywords = [parameters[name] for name in names.split()] or [
+        parameter for parameter in parameters.values() if parameter.kind == kind
     ]
     keywords += [inspect.Parameter(name, kind, default=value) for name, value in extra.items()]
 
     def decorate(function: F) -> F:
         signature = inspect.signature(function)
         *positional, _ = signature.parameters.values()  # without **keywords
-        additional = [p for p in keywords if p.name not in signature.parameters]
-        defaults = {p.name: p.default for p in additional}
+        additional = [entry for entry in keywords if entry.name not in signature.parameters]
+        defaults = {entry.name: entry.default for entry in additional}
         # `inspect` requires positional parameters before keyword-only ones.
-        ordering = sorted([*additional, *positional], key=lambda p: p.kind)
+        ordering = sorted([*additional, *positional], key=lambda parameter: parameter.kind)
 
         @functools.wraps(function)
         def call(*args: Any, **options: Any) -> Any:

@@ -31,7 +31,7 @@ _GOLDEN = 0.6180339887498949
 _GOLDEN_STEPS = 40
 
 
-class Memory(NamedTuple):
+class BalanceState(NamedTuple):
     """State of the lattice equation between steps."""
 
     t: Scalar  # where the next step begins
@@ -114,7 +114,7 @@ class Variational(StepSizes):
 
     def begin(self, t0, h):
         zero = jnp.zeros_like(h)
-        return Memory(t0, h, zero, jnp.asarray(0, jnp.int32), zero)
+        return BalanceState(t0, h, zero, jnp.asarray(0, jnp.int32), zero)
 
     def next(self, memory, equations, place):
         def energies(h):
@@ -133,7 +133,7 @@ class Variational(StepSizes):
         balance = energies(h)
         defect = jnp.where(first, 0.0, jnp.abs(balance.imbalance(memory.energy)))
         interval = Interval(memory.t, memory.t + h, h)
-        memory = Memory(
+        memory = BalanceState(
             interval.t1,
             h,
             balance.incoming,

@@ -15,11 +15,11 @@ from .step import Equations, StepInfo
 
 
 class InLoop(NamedTuple):
-    """Functions as `Method.step`: after ∘ stepⁿ ∘ before is n steps of equal length."""
+    """Functions as `Method.step`: last ∘ stepⁿ ∘ first is n steps of equal length."""
 
-    before: Callable
+    first: Callable
     step: Callable
-    after: Callable
+    last: Callable
 
 
 class Method(eqx.Module):

@@ -143,7 +143,7 @@ def _in_turn(body: Callable, pairs: list) -> Callable:
     if not pairs:
         return lambda state: state
     stack = jax.tree.map(lambda *xs: jnp.stack(xs), *pairs)
-    return lambda state: lax.scan(lambda s, parts: (body(s, parts), None), state, stack)[0]
+    return lambda state: lax.scan(lambda carry, parts: (body(carry, parts), None), state, stack)[0]
 
 
 def of_strang(*outer: float) -> tuple[float, ...]:
@@ -155,7 +155,7 @@ def of_strang(*outer: float) -> tuple[float, ...]:
 
 def _as_coefficients(values: Sequence[float]) -> tuple[float, ...]:
     try:
-        return tuple(float(c) for c in values)
+        return tuple(float(value) for value in values)
     except (TypeError, ValueError):
         raise TypeError(
             "coefficients of Composition must be a sequence of numbers that are not traced, got "
@@ -226,6 +226,7 @@ class Composition(CompositionMethod):
     @property
     def is_symmetric(self) -> bool:
         """Whether the map is its own adjoint."""
-        c = self.coefficients
         # An odd number has one step of the base in the middle, which has to be symmetric itself.
-        return c == c[::-1] and (len(c) % 2 == 0 or self.base.is_symmetric)
+        is_even = len(self.coefficients) % 2 == 0
+        is_palindrome = self.coefficients == self.coefficients[::-1]
+        return is_palindrome and (is_even or self.base.is_symmetric)

@@ -46,7 +46,7 @@ def as_method(method: Any) -> Any:
             return kind(int(match[2]))
     number = match[2] if match else ""
     spellings = {name.lower(): name for name in plain}
-    spellings |= {f"{n}{number}".lower(): f"{n}{number or '(...)'}" for n in with_number}
+    spellings |= {f"{name}{number}".lower(): f"{name}{number or '(...)'}" for name in with_number}
     close = difflib.get_close_matches(key, spellings, 1, 0.5)
     suggestion = f" Did you mean {spellings[close[0]]!r}?" if close else ""
     raise ValueError(

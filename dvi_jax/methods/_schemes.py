@@ -88,10 +88,10 @@ def sequence_of(scheme: Any, parts: int) -> Flows:
     # The map is one part after the other, the adjoint the opposite order.
     orders = itertools.cycle((range(parts), range(parts)[::-1]))
     pairs = zip(scheme.fractions(), orders, strict=False)
-    return joined((i, c) for c, order in pairs for i in order)
+    return join_neighbours((i, c) for c, order in pairs for i in order)
 
 
-def joined(stages: Iterable[tuple[int, float]]) -> Flows:
+def join_neighbours(stages: Iterable[tuple[int, float]]) -> Flows:
     """The same flows, with neighbouring flows of one part as one flow."""
     groups = itertools.groupby(stages, key=lambda stage: stage[0])
     return tuple((i, math.fsum(c for _, c in group)) for i, group in groups)

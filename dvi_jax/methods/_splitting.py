@@ -28,7 +28,7 @@ from .step import Equations, StepInfo, judge, no_solve, no_step_yet
 StateAndInfo = tuple[State, State, StepInfo]
 
 
-class Part(NamedTuple):
+class PartFlow(NamedTuple):
     """The motion of one part, ``advance(interval, q, p)``, and whether it is its exact flow."""
 
     advance: Callable[[Interval, State, State], StateAndInfo]
@@ -75,7 +75,7 @@ class SplittingMethod(Method):
     is_invertible: ClassVar[bool] = True
 
     @abc.abstractmethod
-    def parts(self, equations: Equations, interval: Interval, q: State) -> list[Part]:
+    def parts(self, equations: Equations, interval: Interval, q: State) -> list[PartFlow]:
         """The flow of each part. **Raises** for a system that has no such parts."""
 
     def enter(self, equations: Equations, interval: Interval, q: State, p: State) -> StateAndInfo:
@@ -155,8 +155,8 @@ class SplittingMethod(Method):
         parts = self.parts(equations, interval, q)
         sequence = sequence_of(self.scheme, len(parts))
         # Two flows of the first part are one only if they are exact.
-        (_, a), *others = sequence
-        return _in_loop(self, a) if self.is_symmetric and others and parts[0].is_exact else None
+        (_, a), *flows = sequence
+        return _in_loop(self, a) if self.is_symmetric and flows and parts[0].is_exact else None
 
     def needs_no_solve(self, equations, interval, q) -> bool:
         return all(part.is_exact for part in self.parts(equations, interval, q))
@@ -261,7 +261,7 @@ class Splitting(SplittingMethod):
             part_equations = dataclasses.replace(equations, system=part_equations)
             is_exact = _is_exact(part_equations, interval, q, has_time=i == 0)
             method = TypeII() if is_exact else GaussLegendre(-(-self.order // 2))
-            return Part(functools.partial(method.step, part_equations), is_exact)
+            return PartFlow(functools.partial(method.step, part_equations), is_exact)
 
         return [part(i, *arguments) for i, arguments in enumerate(parts)]
 
@@ -270,13 +270,13 @@ def _no_energy(t0, t1, q0, p1, args):
     return jnp.zeros((), q0.dtype)
 
 
-def _flow_part(equations: Equations, flow: Flow) -> Part:
+def _flow_part(equations: Equations, flow: Flow) -> PartFlow:
     def advance(interval, q, p):
         dq, dp, converged = flow.change(interval.h, *equations.absolute(q, p), equations.args)
         q, p = q + dq, p + dp
         return q, p, judge(no_solve(q)._replace(converged=converged), q, p)
 
-    return Part(advance, True)
+    return PartFlow(advance, True)
 
 
 def _is_exact(equations: Equations, interval: Interval, like: State, has_time: bool) -> bool:

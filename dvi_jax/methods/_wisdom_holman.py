@@ -15,8 +15,8 @@ from ..base.types import Args, Interval, State
 from ..engine.newton import find_root
 from ..problem import kepler as _kepler
 from ..problem.flows import value_of
-from ._schemes import ORDERS_OF_CORRECTORS, as_scheme, check_scheme, corrector, joined
-from ._splitting import Part, SplittingMethod, Stage
+from ._schemes import ORDERS_OF_CORRECTORS, as_scheme, check_scheme, corrector, join_neighbours
+from ._splitting import PartFlow, SplittingMethod, Stage
 from ._strang import Strang
 from .step import Equations, judge, no_solve, no_step_yet
 
@@ -200,9 +200,9 @@ class WisdomHolman(SplittingMethod):
 
         def kepler(interval, X, V):
             h = interval.h
-            whole_X, whole_V = base[0] + X, base[1] + V
-            dX, dV, is_root = _kepler.change(h, whole_X[1:], whole_V[1:], mu)
-            X1 = X + jnp.concatenate([h * whole_V[:1], dX])
+            full_X, full_V = base[0] + X, base[1] + V
+            dX, dV, is_root = _kepler.change(h, full_X[1:], full_V[1:], mu)
+            X1 = X + jnp.concatenate([h * full_V[:1], dX])
             V1 = V + jnp.concatenate([jnp.zeros_like(V[:1]), dV])
             return X1, V1, judge(no_solve(X)._replace(converged=is_root), X1, V1)
 
@@ -231,7 +231,7 @@ class WisdomHolman(SplittingMethod):
             X = X + interval.h / 2 * frame.drift(base[1] + V)
             return X, V, judge(info, X, V)
 
-        return [Part(kepler, True), Part(interaction, not implicit)]
+        return [PartFlow(kepler, True), PartFlow(interaction, not implicit)]
 
     def enter(self, equations, interval, q, p):
         frame = self._frame(equations, interval, q)
@@ -247,7 +247,7 @@ class WisdomHolman(SplittingMethod):
         if not self.corrector:
             return X, V, no_step_yet(X)
         # The inverse of Z(a, b) is Z(−a, b), and a and −a are at opposite places: b changes sign.
-        sequence = joined(
+        sequence = join_neighbours(
             stage
             for a, b in corrector(self.corrector)
             for stage in ((0, a), (1, sign * b), (0, -2 * a), (1, -sign * b), (0, a))

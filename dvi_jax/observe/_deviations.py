@@ -17,7 +17,7 @@ from ..base.checks import all_finite, array, whole
 from ..base.types import Scalar
 from ._reductions import Reduction
 
-_UNROLLED = 12
+_UNROLL_UP_TO = 12
 """Vectors up to which the Gram–Schmidt process is unrolled: a loop compiles faster for many."""
 
 
@@ -101,7 +101,7 @@ class _FrameIndicator(Deviations):
                 f"{self.scale!r:.200}."
             )
         for letter, unit in zip("qp", self.scale, strict=True):
-            if not any(is_traced(x) for x in jax.tree.leaves(unit)):  # their values are unknown
+            if not any(map(is_traced, jax.tree.leaves(unit))):  # their values are not known
                 all_finite(f"the scale of {letter} in {type(self).__name__}", unit, positive=True)
 
     def vectors(self, memory):
@@ -252,7 +252,7 @@ class MEGNO(_FrameIndicator):
         growth = growth.plus(jnp.log(square) * (time.value + value.h / 2))
         time = time.plus(value.h)
         current = growth.value / time.value
-        # Trapezoidal rule, with Y(0) = 0 as the first `before`.
+        # Trapezoidal rule, with Y(0) = 0 as the first `previous`.
         area = area.plus(value.h * (previous + current) / 2)
         return vector * lax.rsqrt(square), growth, current, area, time
 
@@ -350,7 +350,7 @@ def _gram_schmidt(vectors: Array) -> tuple[Array, Array]:
     """
     # Once is enough: the vectors are an orthonormal frame after one step, far from dependent.
     count = vectors.shape[0]
-    if count > _UNROLLED:
+    if count > _UNROLL_UP_TO:
         return _gram_schmidt_in_a_loop(vectors)
     frame, rows = [], []
     for i in range(count):
@@ -368,14 +368,14 @@ def _gram_schmidt(vectors: Array) -> tuple[Array, Array]:
 def _gram_schmidt_in_a_loop(vectors: Array) -> tuple[Array, Array]:
     """The same for many vectors: one program whatever their number."""
     count = vectors.shape[0]
-    place = jnp.arange(count)
+    index = jnp.arange(count)
 
     def row(i, state):
         V, R = state
         square = jnp.sum(V[i] ** 2)
         shrink = lax.rsqrt(square)
         unit = V[i] * shrink
-        projections = jnp.where(place > i, V @ unit, 0)
+        projections = jnp.where(index > i, V @ unit, 0)
         V = (V - projections[:, None] * unit[None, :]).at[i].set(unit)
         return V, R.at[i].set(projections.at[i].set(square * shrink))
 
@@ -385,4 +385,4 @@ def _gram_schmidt_in_a_loop(vectors: Array) -> tuple[Array, Array]:
 def _diagonal(R: Array) -> Array:
     # Single elements of a small matrix stay in registers of the machine code.
     count = R.shape[0]
-    return jnp.stack([R[i, i] for i in range(count)]) if count <= _UNROLLED else jnp.diagonal(R)
+    return jnp.stack([R[i, i] for i in range(count)]) if count <= _UNROLL_UP_TO else jnp.diagonal(R)

@@ -241,13 +241,13 @@ class Running(eqx.Module):
 
     def __check_init__(self):
         if not (isinstance(self.reduction, Reduction) and self.reduction.has_running_value):
-            text = getattr(self.reduction, "__name__", f"{self.reduction!r:.200}")
+            description = getattr(self.reduction, "__name__", f"{self.reduction!r:.200}")
             raise TypeError(
                 "reduction of Running must be an object such as dvi.Mean(f), not a function or a "
-                f"dvi.Section, got {text}."
+                f"dvi.Section, got {description}."
             )
 
 
-def is_observable(x: Any) -> bool:
+def is_observable(leaf: Any) -> bool:
     """Whether x is a leaf of `observe`: a reduction, or a function."""
-    return isinstance(x, Reduction | Running) or callable(x)
+    return isinstance(leaf, Reduction | Running) or callable(leaf)

@@ -143,10 +143,10 @@ def legendre(L: Callable[..., Any], root_finder: Newton = Newton()) -> Callable[
     # The number of arguments decides; a function that takes four and five cannot be classified.
     discrete, continuous = (callable(L) and accepts(L, count) for count in (5, 4))
     if discrete == continuous:
-        text = signature_of(L) if callable(L) else repr(L)  # the value of a number, say
+        description = signature_of(L) if callable(L) else repr(L)  # the value of a number, say
         raise TypeError(
-            f"L must be a function of (t, q, v, args) or of (t0, t1, q0, v, args), got {text}, "
-            f"which accepts {'both' if discrete else 'neither'}."
+            f"L must be a function of (t, q, v, args) or of (t0, t1, q0, v, args), got "
+            f"{description}, which accepts {'both' if discrete else 'neither'}."
         )
     return (
         _DiscreteLegendreTransform(L, root_finder)

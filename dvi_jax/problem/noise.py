@@ -18,6 +18,7 @@ from lanewise.jaxprs.jaxapi import is_traced, threefry2x32
 from ..base.checks import array, whole
 from ..base.signature import check_takes, warn_of_exchanged
 from ..base.types import Args, Interval, Scalar, State
+from .flows import value_of
 
 _NAMES = "(t, q, p, args)"
 
@@ -28,7 +29,7 @@ class Noise(eqx.Module):
     @property
     def functions(self) -> list[Callable[..., Any]]:
         """The functions of the user."""
-        return [x for x in vars(self).values() if callable(x)]
+        return [value for value in vars(self).values() if callable(value)]
 
     @abc.abstractmethod
     def count(self, t: Scalar, q: State, p: State, args: Args) -> int:
@@ -97,10 +98,10 @@ class Langevin(Noise):
     mass: Any = 1.0
 
     def _values(self, args: Args, like: State) -> list[Array]:
-        values = (self.friction, self.temperature, self.mass)
-        arrays = [jnp.asarray(x(args) if callable(x) else x, like.dtype) for x in values]
+        parameters = (self.friction, self.temperature, self.mass)
+        values = [value_of(parameter, args, like) for parameter in parameters]
         # Numbers stay numbers: e^{−γh} of a step is then computed once.
-        return [jnp.broadcast_to(x, like.shape) if x.ndim else x for x in arrays]
+        return [jnp.broadcast_to(value, like.shape) if value.ndim else value for value in values]
 
     def count(self, t, q, p, args):
         try:
@@ -248,7 +249,7 @@ class NoisePath(eqx.Module):
     parts: int = eqx.field(static=True)
     count: int = eqx.field(static=True)
 
-    def at(self, k: Int[Array, ""], interval: Interval) -> Array:
+    def increments_of(self, k: Int[Array, ""], interval: Interval) -> Array:
         """The increments of step k, shape (parts, count)."""
         increments = self.path.increments(k, interval, self.parts, self.count)
         name = f"the increments (parts, motions) of {type(self.path).__name__}"

@@ -111,8 +111,8 @@ class System(eqx.Module):
     @property
     def _is_nonlinear(self) -> bool:
         """Whether the perturbation takes ε."""
-        f = self.perturbation
-        return callable(f) and accepts(f, 6) and not accepts(f, 5)
+        function = self.perturbation
+        return callable(function) and accepts(function, 6) and not accepts(function, 5)
 
     def strength(self, epsilon: Any) -> Any:
         """ε of a run: the one given, else the default of the system, else 0 for a system that does
@@ -184,7 +184,7 @@ def _read_by(system: System) -> Reads:
     of_noise = [] if system.noise is None else system.noise.functions
     functions = (system.H_D, system.force, system.perturbation, system.constraint, *of_noise)
     # A counter of calls, for instance, changes with every trace, and no program depends on it.
-    counters = {name for f in functions for name in _changed_by_tracing(f)}
+    counters = {name for function in functions for name in _changed_by_tracing(function)}
     return tuple(item for item in reads(*functions) if item[0] not in counters)
 
 
@@ -200,7 +200,7 @@ def of_problem(
     if isinstance(getattr(system, "system", None), System):
         problem, system = system, system.system
         defaults = (("q0", q0), ("p0", p0), ("h", h), ("args", args))
-        values = (getattr(problem, n) if x is None else x for n, x in defaults)
+        values = (getattr(problem, name) if value is None else value for name, value in defaults)
         q0, p0, h, args = (None, None, *tuple(values)[2:]) if has_start else values
     elif isinstance(system, System) and not has_start:
         require("a call with a dvi.System", {"q0": q0, "p0": p0})
@@ -220,8 +220,8 @@ def check_system(system: Any, of_map: str = "", noise_allowed: bool = False) -> 
         if of_library and accepts(system, 0):
             hint = f"Call the function: {name}()."
         kind = "class" if isinstance(system, type) else type(system).__name__
-        text = f"the {kind} {name}" if name else f"a value of type {kind}"
-        raise TypeError(f"system must be a dvi.System, got {text}. {hint}")
+        description = f"the {kind} {name}" if name else f"a value of type {kind}"
+        raise TypeError(f"system must be a dvi.System, got {description}. {hint}")
     if system.noise is not None and not noise_allowed:
         raise ValueError(
             "the system must not have noise, except in dvi.integrate, dvi.sweep and "
@@ -301,6 +301,6 @@ def _traced_output(
     if out is None or not hasattr(out, "shape"):
         if isinstance(out, int | float):
             return outputs.setdefault(kinds, jax.ShapeDtypeStruct((), jnp.result_type(float)))
-        text = "None (is a return missing?)" if out is None else f"type {type(out).__name__}"
-        raise TypeError(f"{name}{names} must return an array, got {text}.")
+        description = "None (is a return missing?)" if out is None else f"type {type(out).__name__}"
+        raise TypeError(f"{name}{names} must return an array, got {description}.")
     return outputs.setdefault(kinds, jax.ShapeDtypeStruct(out.shape, out.dtype))
