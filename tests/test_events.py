@@ -313,7 +313,7 @@ INVALID = [
     (
         lambda: dvi.Section(lambda q: q),
         TypeError,
-        r"g of Section must take four .* \(t, q, p, args\), got <lambda>\(q\)",
+        r"g of Section must take the arguments \(t, q, p, args\), got <lambda>\(q\)",
     ),
     (lambda: dvi.Stop(3.0), TypeError, r"g of Stop must be a function of \(t, q, p, args\)"),
     (lambda: dvi.Section(on_axis, 2), ValueError, "direction must be one of 1, -1, 0"),

@@ -26,24 +26,25 @@ def whole(name: str, value: Any, low: int = 1, high: int | None = None, hint: st
 
 def positive(name: str, value: Any, zero: bool = False, hint: str = "") -> float:
     """A positive and finite number; `zero`: or 0. **Raises** `ValueError`."""
-    fits = _is_number(value) and math.isfinite(value)
-    if not fits or value < 0 or (value == 0 and not zero):
-        kind = "zero or a positive finite number" if zero else "a positive and finite number"
-        raise ValueError(f"{name} must be {kind}, got {value!r}.{_sentence(hint)}")
-    return float(value)
+    kind = "zero or a positive finite number" if zero else "a positive and finite number"
+    return _number(name, value, kind, lambda x: x > 0 or (zero and x == 0), hint)
 
 
 def fraction(name: str, value: Any) -> float:
     """A number between 0 and 1, both excluded. **Raises** `ValueError`."""
-    if not _is_number(value) or not 0 < value < 1:
-        raise ValueError(f"{name} must be a number between 0 and 1 (both excluded), got {value!r}.")
-    return float(value)
+    return _number(name, value, "between 0 and 1 (both excluded)", lambda x: 0 < x < 1)
 
 
 def finite(name: str, value: Any, hint: str = "") -> float:
     """A finite number. **Raises** `ValueError`."""
-    if not _is_number(value) or not math.isfinite(value):
-        raise ValueError(f"{name} must be a finite number, got {value!r}.{_sentence(hint)}")
+    return _number(name, value, "a finite number", lambda x: True, hint)
+
+
+def _number(
+    name: str, value: Any, kind: str, is_allowed: Callable[[Any], bool], hint: str = ""
+) -> float:
+    if not _is_number(value) or not math.isfinite(value) or not is_allowed(value):
+        raise ValueError(f"{name} must be {kind}, got {value!r}.{_sentence(hint)}")
     return float(value)
 
 
@@ -69,7 +70,7 @@ def array(
     if not is_real or not any(_has_shape(value.shape, shape, empty) for shape in shapes):
         kinds = (f"array of shape {_shape_text(shape)}" if shape else "scalar" for shape in shapes)
         raise ValueError(
-            f"{name} must {verb} a real {' or '.join(kinds)}"
+            f"{name} must {verb} a real {' or '.join(kinds).replace('or array of shape', 'or')}"
             f"{'' if integers else ' of a floating-point type'}, got shape {value.shape} and dtype "
             f"{value.dtype}.{_sentence(hint)}"
         )
@@ -80,13 +81,11 @@ def all_finite(name: str, values: Any, positive: bool = False, hint: str = "") -
     """**Raises** `ValueError` for an array with a number that is not finite, or not `positive`."""
     entries = np.asarray(values)
     is_real = entries.dtype.kind in "iub" or "float" in str(entries.dtype)
-    is_good = (
-        np.isfinite(entries) & ((entries > 0) | (not positive))
-        if is_real
-        else np.zeros(entries.shape)
-    )
-    if not np.all(is_good):
-        index = tuple(np.argwhere(is_good == 0)[0].tolist())
+    is_wrong = np.ones(entries.shape, bool)
+    if is_real:
+        is_wrong = ~np.isfinite(entries) | (positive & (entries <= 0))
+    if is_wrong.any():
+        index = tuple(np.argwhere(is_wrong)[0].tolist())
         place = f" at index {list(index)}" if index else ""
         raise ValueError(
             f"{name} must be {'positive and ' * positive}finite, got {entries[index]}{place}."

@@ -62,10 +62,8 @@ def over_devices(
         )
         out = PartitionSpec(*(None,) * out_axes, LANES)
         # With check_vma=True there would be no reversible gradient: `integration/reversible.py`.
-        sharded_call = jax.shard_map(
-            function, mesh=mesh, in_specs=specs, out_specs=out, check_vma=False
-        )
-        return sharded_call(*args)
+        options: Any = {"in_specs": specs, "out_specs": out, "check_vma": False}
+        return jax.shard_map(function, mesh=mesh, **options)(*args)
 
     return call
 

@@ -47,21 +47,17 @@ def as_times(call: str, ts: Any) -> Array:
 
 def _join(value: Any) -> Any:
     """A list with traced numbers as one array, which NumPy cannot make."""
-    has_tracer = isinstance(value, list | tuple) and any(
-        is_traced(leaf) for leaf in jax.tree.leaves(value)
-    )
-    return jnp.asarray(value) if has_tracer else value
+    is_list = isinstance(value, list | tuple)
+    return jnp.asarray(value) if is_list and any(map(is_traced, jax.tree.leaves(value))) else value
 
 
 def _real_array(name: str, value: Any) -> Array:
     value = original = _join(value)
-    if isinstance(value, jax.Array) and is_traced(value):
-        kind = value.dtype
-    else:
+    if not (isinstance(value, jax.Array) and is_traced(value)):
         # In NumPy: under jit, jax.numpy would give tracers even for values that are known.
         value = _as_numpy(name, value)
-        kind = value.dtype
-        refuse_double_without_x64(name, kind)
+        refuse_double_without_x64(name, value.dtype)
+    kind = value.dtype
     if kind.kind == "c":
         raise TypeError(
             f"{name} must be real, got dtype {kind}: for ψ = (q0 + i p0)/√2 give q0 = √2 Re ψ and "
@@ -165,6 +161,6 @@ def refuse_unit_or_mask(name: str, value: Any) -> None:
         unit = getattr(value, "units", None)
     if unit is not None:
         raise TypeError(
-            f"{name} must be numbers without a unit, got the unit {str(unit) or '1'!r}: use "
+            f"{name} has the unit {str(unit) or '1'!r}, but must be without one: use "
             "x.to_value(unit), x.m_as(unit), or dvi_jax.interop.integrate(..., units=...)."
         )

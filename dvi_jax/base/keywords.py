@@ -26,12 +26,10 @@ def checked_keywords(function: F) -> F:
 
     @functools.wraps(function)
     def call(*args: Any, **keywords: Any) -> Any:
-        refuse_unknown(
-            function.__name__, function, [name for name in keywords if name not in names]
-        )
-        require(
-            function.__name__, {name: keywords.get(name, _ABSENT) for name in necessary}, _ABSENT
-        )
+        unknown = [name for name in keywords if name not in names]
+        refuse_unknown(function.__name__, function, unknown)
+        values: dict[str, Any] = {name: keywords.get(name, _ABSENT) for name in necessary}
+        require(function.__name__, values, _ABSENT)
         return function(*args, **keywords)
 
     return call  # pyright: ignore[reportReturnType]
@@ -71,8 +69,7 @@ def with_keywords_of(source: Callable[..., Any], names: str = "", **extra: Any) 
         @functools.wraps(function)
         def call(*args: Any, **options: Any) -> Any:
             names = call.__dict__["__signature__"].parameters
-            if strangers := [name for name in options if name not in names]:
-                refuse_unknown(function.__name__, call, strangers)
+            refuse_unknown(function.__name__, call, [x for x in options if x not in names])
             options = {**defaults, **options}
             require(function.__name__, options, _ABSENT)
             return function(*args, **options)

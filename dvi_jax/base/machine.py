@@ -46,10 +46,9 @@ def _limits() -> list[int]:
 
 @functools.cache
 def _devices_memory() -> int | None:
-    limits = [(device.memory_stats() or {}).get("bytes_limit") for device in jax.devices()]
-    sizes = [size for size in limits if size is not None]
+    sizes = [(device.memory_stats() or {}).get("bytes_limit") for device in jax.devices()]
     # A sum over some of the devices would reject results that all of them can hold.
-    return sum(sizes) if sizes and len(sizes) == len(limits) else None
+    return None if None in sizes else sum(filter(None, sizes))
 
 
 def processors() -> int:

@@ -18,7 +18,7 @@ def refuse_double_without_x64(name: str, dtype: Any) -> None:
     if np.issubdtype(dtype, np.inexact) and np.finfo(dtype).eps < np.finfo(np.float64).eps:
         double = "complex128" if np.dtype(dtype).kind == "c" else "float64"
         raise TypeError(
-            f"{name} must have at most double precision, got {np.dtype(dtype)}: use "
+            f"{name} has the type {np.dtype(dtype)}, but JAX has at most double precision: use "
             f"np.asarray(x, np.{double})."
         )
     if np.dtype(dtype) in (np.dtype(np.float64), np.dtype(np.complex128)) and not x64_enabled():

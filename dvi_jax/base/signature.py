@@ -18,7 +18,7 @@ def accepts(function: Callable[..., Any], count: int) -> bool:
     except TypeError:
         return False
     except ValueError:  # a builtin without a signature: the call itself raises if it does not
-        return True
+        pass
     return True
 
 
@@ -72,9 +72,8 @@ def tracing_note(name: str, error: Exception) -> str:
             f"{name} is traced by JAX: its values are not known yet, so if and while cannot depend "
             "on them. Use jnp.where(condition, a, b), jax.lax.cond or jax.lax.while_loop."
         )
-    if isinstance(
-        error, jax.errors.ConcretizationTypeError | jax.errors.TracerArrayConversionError
-    ):
+    errors = jax.errors
+    if isinstance(error, errors.ConcretizationTypeError | errors.TracerArrayConversionError):
         return (
             f"{name} is traced by JAX: use jnp.cos, jnp.sqrt, … in place of np.cos, math.cos, "
             "float() or int()."

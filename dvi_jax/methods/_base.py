@@ -52,9 +52,9 @@ class Method(eqx.Module):
     def needs_no_solve(self, equations: Equations, interval: Interval, q: State) -> bool:
         """Whether `step` is explicit for these equations; see `Equations.step_is_explicit`."""
 
-    @abc.abstractmethod
     def inverse_needs_no_solve(self, equations: Equations, interval: Interval, q: State) -> bool:
-        """Whether `inverse` is explicit for these equations."""
+        """Whether `inverse` is explicit for these equations; by default where `step` is."""
+        return self.needs_no_solve(equations, interval, q)
 
     def in_loop(self, equations: Equations, interval: Interval, q: State) -> InLoop | None:
         """The same steps with less work, where they have some in common (None: nowhere)."""

@@ -129,9 +129,6 @@ class CompositionMethod(Method):
         forwards = self.base.needs_no_solve(equations, interval, q)
         return forwards and self.base.inverse_needs_no_solve(equations, interval, q)
 
-    def inverse_needs_no_solve(self, equations, interval, q) -> bool:
-        return self.needs_no_solve(equations, interval, q)
-
 
 def _in_turn(body: Callable, pairs: list) -> Callable:
     """state → state after `body` on each pair in turn."""

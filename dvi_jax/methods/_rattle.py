@@ -110,9 +110,6 @@ class Rattle(Method):
     def needs_no_solve(self, equations, interval, q):
         return False
 
-    def inverse_needs_no_solve(self, equations, interval, q):
-        return False
-
 
 def _is_separable(equations, first, second, q, p) -> bool:
     """Whether p½ and q1 enter no right side of their own."""

@@ -25,9 +25,7 @@ class RungeKutta4(Method):
 
     def step(self, equations, interval, q0, p0):
         t0, t1, h = interval
-        middle = t0 + h / 2
-
-        velocity, force = continuous_rates(equations, h)
+        middle, (velocity, force) = t0 + h / 2, continuous_rates(equations, h)
 
         def field(t, q, p):
             return velocity(t, q, p), force(t, q, p)

@@ -161,9 +161,6 @@ class SplittingMethod(Method):
     def needs_no_solve(self, equations, interval, q) -> bool:
         return all(part.is_exact for part in self.parts(equations, interval, q))
 
-    def inverse_needs_no_solve(self, equations, interval, q) -> bool:
-        return self.needs_no_solve(equations, interval, q)
-
 
 def _in_loop(method: SplittingMethod, a: float) -> InLoop:
     """(A(a) W A(a))ⁿ is A(a) (W A(2a))ⁿ A(−a), which has one flow less per step."""

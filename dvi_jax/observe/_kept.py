@@ -200,10 +200,7 @@ class RequestedTimes(KeptSteps):
         return self.ts.shape[0]
 
     def _row(self, t0, t1, q0, p0, q1, p1, args):
-        start, end = (
-            shown(self.clock, t0, q0, p0, args),
-            shown(self.clock, t1, q1, p1, args),
-        )
+        start, end = (shown(self.clock, t0, q0, p0, args), shown(self.clock, t1, q1, p1, args))
         # Bisection: a comparison with every requested time would be made in each step.
         count_start, count_end = (
             jnp.searchsorted(self.ordered, x, side="right") for x in (start, end)

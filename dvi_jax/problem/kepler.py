@@ -12,6 +12,7 @@ from jaxtyping import Array
 import lanewise
 
 from ..base.types import Scalar
+from ..engine.bracket import divide
 
 _SERIES_UP_TO = 1.0
 """|β X²| up to which nine terms of the series are exact to round-off: 6 steps per revolution."""
@@ -104,8 +105,9 @@ def change(h: Scalar, q: Array, v: Array, mu: Array) -> tuple[Array, Array, Arra
     def equation(X):
         return orbit.time(X, _universal(X, beta)) - h
 
+    # The equations of different orbits do not depend on one another: `divide` solves all of them.
     X, is_root = lanewise.implicit_root(
-        equation, jnp.zeros_like(r0), lambda _, __: _solve(orbit, h), _divide
+        equation, jnp.zeros_like(r0), lambda _, __: _solve(orbit, h), divide
     )
     g = orbit.on_time(h, X, _universal(X, beta))
     # Increments, not the new state: a small change keeps its digits next to a large coordinate.
@@ -114,11 +116,6 @@ def change(h: Scalar, q: Array, v: Array, mu: Array) -> tuple[Array, Array, Arra
     dq = (h - mu * g.g3)[..., None] * v - a / r0 * q
     dv = -(mu * g.g1)[..., None] / (r0 * r) * q - a / r * v
     return dq, dv, is_root
-
-
-def _divide(linear, rhs):
-    # The equations of different orbits do not depend on one another.
-    return rhs / linear(jnp.ones_like(rhs))
 
 
 def _solve(orbit: _Orbit, h: Scalar) -> tuple[Array, Array]:

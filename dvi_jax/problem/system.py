@@ -129,7 +129,7 @@ class System(eqx.Module):
         if any(parts.values()):
             names = " and ".join(name for name, is_there in parts.items() if is_there)
             raise ValueError(
-                f"epsilon must be given for a system with {names}: it is their factor."
+                f"epsilon=... must be given for a system with {names}: it is their factor."
             )
         return 0.0
 
