@@ -202,9 +202,8 @@ def _scatter_add(eqn: Any, values: list[Any]) -> list[Any]:
 
 def _power(x: Number, y: Any) -> Number:
     if isinstance(y, np.floating | np.integer) and float(2 * y).is_integer() and abs(y) <= 64:
-        return (
-            pairs.power(x, int(y)) if float(y).is_integer() else functions.root_power(x, int(2 * y))
-        )
+        is_whole = float(y).is_integer()
+        return pairs.power(x, int(y)) if is_whole else functions.root_power(x, int(2 * y))
     return functions.general_power(x, y if is_pair(y) else jnp.asarray(y, jnp.float64))
 
 

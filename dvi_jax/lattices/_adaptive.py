@@ -117,10 +117,8 @@ class AdaptiveReversible(StepSizes):
         return Interval(memory.t, t1, h), ControllerState(t1, lax.stop_gradient(error), h), status
 
     def report(self, memory, equations, place):
-        return {
-            "last_h": memory.h,
-            "resume_h": one_by_one(AdaptiveReversible._resume_step, self, memory, equations, place),
-        }
+        resume = one_by_one(AdaptiveReversible._resume_step, self, memory, equations, place)
+        return {"last_h": memory.h, "resume_h": resume}
 
     def _resume_step(self, memory: ControllerState, equations: Equations, place: Place) -> Scalar:
         """The δ for which δ g is half a change after the last step, as it is at the start."""

@@ -133,27 +133,19 @@ class Variational(StepSizes):
         balance = energies(h)
         defect = jnp.where(first, 0.0, jnp.abs(balance.imbalance(memory.energy)))
         interval = Interval(memory.t, memory.t + h, h)
-        memory = BalanceState(
-            interval.t1,
-            h,
-            balance.incoming,
-            memory.misses + jnp.where(is_root, 0, 1),
-            jnp.maximum(memory.defect, lax.stop_gradient(defect)),
-        )
+        misses = memory.misses + jnp.where(is_root, 0, 1)
+        defect = jnp.maximum(memory.defect, lax.stop_gradient(defect))
+        memory = BalanceState(interval.t1, h, balance.incoming, misses, defect)
         if self.on_no_root != "stop":
             return interval, memory, None
         return interval, memory, RESULTS.where(is_root, RESULTS.successful, RESULTS.no_root)
 
     def report(self, memory, equations, place):
-        del equations, place
-        return {
-            "last_h": memory.h,
-            "lattice_misses": memory.misses,
-            "lattice_defect": memory.defect,
-        }
+        misses, defect = memory.misses, memory.defect
+        return {"last_h": memory.h, "lattice_misses": misses, "lattice_defect": defect}
 
     def _factors(self, growth: Scalar) -> Array:
-        """Candidate ratios to the last step, which is `grown` times the first; 1 in the middle."""
+        """Candidate ratios to the last step, which is `growth` times the first; 1 in the middle."""
         smallest, largest = (jnp.asarray(b, growth.dtype) / growth for b in self.bounds)
         # The last step stays in the range, also if rounding has moved it beyond a bound.
         low = jnp.clip(smallest, 1 / self.reach, 1)
@@ -245,18 +237,13 @@ def _energies(equations: Equations, t: Scalar, h: Scalar, q: State, p: State) ->
     q1, p1, info = step(equations, interval, q, p)
     # The energy of a p1 that does not solve (13) could change sign where there is no root.
     p1 = jnp.where(info.result == RESULTS.successful, p1, jnp.nan)
-    start, parameters = (
-        (equations.system, *interval[:2], q),
-        (p1, equations.epsilon, equations.args),
-    )
-    outgoing, incoming = (
-        outgoing_energy(*start, *parameters, h),
-        incoming_energy(*start, *parameters, h),
-    )
+    start = equations.system, *interval[:2], q
+    parameters = p1, equations.epsilon, equations.args
+    outgoing = outgoing_energy(*start, *parameters, h)
+    incoming = incoming_energy(*start, *parameters, h)
     work = disturbing_work(*start, q1, *parameters)
-    return _Energies(
-        outgoing, incoming, work, jnp.abs(outgoing) + jnp.abs(incoming) + jnp.abs(work)
-    )
+    size = jnp.abs(outgoing) + jnp.abs(incoming) + jnp.abs(work)
+    return _Energies(outgoing, incoming, work, size)
 
 
 def _minimum(residual: Callable, hs: Array, values: Array, is_minimum: Array) -> Scalar:

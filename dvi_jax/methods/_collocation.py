@@ -64,9 +64,8 @@ def integrals(x: Sequence[Fraction], b: Sequence[Any], degree: int) -> np.ndarra
 
     **Source** Hairer & Wanner 1996, *Solving ODEs II*, IV.5 (the W-transformation).
     """
-    # This is the expansion of ℓ_j in Legendre polynomials, integrated term by term. `degree` is s
-    # for s Gauss nodes, and s − 1 for s Lobatto nodes, where the integral of the last term, a
-    # multiple of (1 − x²) P'_{s−1}, vanishes at every node.
+    # The expansion of ℓ_j in Legendre polynomials, integrated term by term. `degree` is s for s
+    # Gauss nodes, and s − 1 for s Lobatto nodes, where the integral of the last term vanishes.
     P = np.array([legendre(y, degree) for y in x], object)  # (s, degree + 1)
     lower = np.concatenate([np.full((len(x), 1), -1), P[:, : degree - 1]], axis=1)
     return np.array(b, object) * ((P[:, 1:] - lower) / 2 @ P[:, :degree].T)

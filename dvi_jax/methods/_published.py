@@ -42,9 +42,7 @@ class Yoshida(TabulatedComposition):
     accuracy: `BlanesMoan`, `McLachlan` and `KahanLi` have smaller errors for the same work. None of
     the orders suits strong dissipation.
 
-    **Arguments** `order`: 4, 6 or 8. `base`: the map that `Strang` is made of, any with an inverse.
-
-    **Raises** `ValueError` for another order.
+    **Arguments** `order`: 4, 6 or 8, `ValueError` for others. `base`: as for `Strang`.
 
     **Accuracy** the order conditions hold to round-off, 4e-16.
 
@@ -77,9 +75,7 @@ class Suzuki(TabulatedComposition):
     One substep goes backwards, by 0.66 h: less than in the triple jump of `Yoshida` (1.70 h), with
     an error some seventy times smaller in the same condition.
 
-    **Arguments** `order`: 4. `base`: the map that `Strang` is made of, any with an inverse.
-
-    **Raises** `ValueError` for an order other than 4.
+    **Arguments** `order`: 4, `ValueError` for others. `base`: as for `Strang`.
 
     **Source** Suzuki 1990, *Phys. Lett. A* 146, 319; Hairer, Lubich & Wanner 2006, II.4 (4.5).
     """
@@ -96,9 +92,7 @@ class McLachlan(TabulatedComposition):
     Order 4 has five pairs of the map with its adjoint of unequal length, coefficients in √19;
     orders 6 and 8 are symmetric compositions of 9 and 15 `Strang`.
 
-    **Arguments** `order`: 4, 6 or 8. `base`: Φ, any method with an inverse.
-
-    **Raises** `ValueError` for another order.
+    **Arguments** `order`: 4, 6 or 8, `ValueError` for others. `base`: as for `Strang`.
 
     **Accuracy** the order conditions hold to round-off, 2e-16.
 
@@ -135,9 +129,7 @@ class KahanLi(TabulatedComposition):
     Try these first when a high order is needed: no substep is longer than 0.8 h, and Σ|γ| is
     3.8 and 5.4.
 
-    **Arguments** `order`: 6 or 8. `base`: the map that `Strang` is made of, any with an inverse.
-
-    **Raises** `ValueError` for an order other than 6 or 8.
+    **Arguments** `order`: 6 or 8, `ValueError` for others. `base`: as for `Strang`.
 
     **Accuracy** the order conditions hold to round-off, 4e-16.
 
@@ -149,10 +141,8 @@ class KahanLi(TabulatedComposition):
 
     tables: ClassVar[Tables] = {
         6: of_strang(
-            0.39216144400731413927925056,
-            0.33259913678935943859974864,
-            -0.70624617255763935980996482,
-            0.08221359629355080023149045,
+            *(0.39216144400731413927925056, 0.33259913678935943859974864),
+            *(-0.70624617255763935980996482, 0.08221359629355080023149045),
         ),
         8: of_strang(
             *(0.13020248308889008087881763, 0.56116298177510838456196441),
@@ -185,9 +175,7 @@ class BlanesMoan(TabulatedComposition):
     and has, for any map Φ with its adjoint, the order of the splitting: 12 and 20 coefficients,
     six and ten pairs.
 
-    **Arguments** `order`: 4 or 6. `base`: Φ, any method with an inverse.
-
-    **Raises** `ValueError` for an order other than 4 or 6.
+    **Arguments** `order`: 4 or 6, `ValueError` for others. `base`: as for `Strang`.
 
     **Accuracy** the order conditions hold to round-off, 2e-16, with the 15 printed digits.
 
@@ -202,11 +190,8 @@ class BlanesMoan(TabulatedComposition):
         ),
         6: _of_splitting(
             a=(
-                0.0502627644003922,
-                0.413514300428344,
-                0.0450798897943977,
-                -0.188054853819569,
-                0.541960678450780,
+                *(0.0502627644003922, 0.413514300428344, 0.0450798897943977),
+                *(-0.188054853819569, 0.541960678450780),
             ),
             b=(0.148816447901042, -0.132385865767784, 0.067307604692185, 0.432666402578175),
         ),

@@ -52,8 +52,7 @@ class Stage(NamedTuple):
 
 
 def stages_of(sequence: Sequence[tuple[int, float]], time: float = 0.0) -> list[Stage]:
-    # The first part carries the time; the others act at a fixed time. The end is not a sum of all
-    # coefficients, which is 1 only up to rounding.
+    # The first part carries the time. The end is no sum of all coefficients, 1 only up to rounding.
     stages, total = [], math.fsum(c for i, c in sequence if i == 0) + time
     for i, c in sequence:
         end = time + c if i == 0 else time
@@ -146,9 +145,8 @@ class SplittingMethod(Method):
         if count:
             rounds = [tuple(pieces[k * period : (k + 1) * period]) for k in range(count)]
             stack = jax.tree.map(lambda *xs: jnp.stack(xs), *rounds)
-            state, _ = lax.scan(
-                lambda s, x: (advance_all(s, x, part_numbers[:period]), None), state, stack
-            )
+            numbers = part_numbers[:period]
+            state, _ = lax.scan(lambda s, x: (advance_all(s, x, numbers), None), state, stack)
         return advance_all(state, pieces[count * period :], part_numbers[count * period :])
 
     def in_loop(self, equations, interval, q):

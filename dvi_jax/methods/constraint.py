@@ -114,11 +114,8 @@ class _Defects(NamedTuple):
 
 
 def _defects(equations: Equations, t: Scalar, q: State, p: State) -> _Defects:
-    g, G, linear = (
-        equations.constraint(q),
-        gradient(equations, q),
-        Linear.of_constraint(equations, q),
-    )
+    g, G = equations.constraint(q), gradient(equations, q)
+    linear = Linear.of_constraint(equations, q)
     v = velocity_at(equations, t, q)(p)
     rate, sizes, eps = linear.product(v), jnp.abs(G), float(jnp.finfo(q.dtype).eps)
 

@@ -89,11 +89,11 @@ def change(h: Scalar, q: Array, v: Array, mu: Array) -> tuple[Array, Array, Arra
 
         f − 1 = −μ G₂/r₀,   g = h − μ G₃,   ḟ = −μ G₁/(r₀ r),   ġ − 1 = −μ G₂/r
 
-    - `q`, `v`: shape (…, dim), one orbit a row. `mu`: μ [length³/time²], of the shape of the rows.
+    `q`, `v` of shape (…, dim) have one orbit a row, and `mu` one μ for each [length³/time²].
 
-    **Returns** q(h) − q, v(h) − v, and whether the solution of Kepler's equation was found for all
-    rows. Elliptic, parabolic and hyperbolic orbits, of any h; derivatives are those of the implicit
-    function theorem, to any order. A body that starts at the centre gives NaN.
+    **Returns** q(h) − q, v(h) − v, and whether Kepler's equation was solved for all rows. Orbits of
+    any eccentricity, any h; derivatives to any order are those of the implicit function theorem. A
+    body that starts at the centre gives NaN.
 
     **Source** Stumpff 1959, *Himmelsmechanik* I; Danby 1988, *Fundamentals of Celestial Mechanics*,
     6.9; Wisdom & Hernandez 2015, *MNRAS* 453, 3015; Rein & Tamayo 2015, *MNRAS* 452, 376.
@@ -157,9 +157,8 @@ def _solve(orbit: _Orbit, h: Scalar) -> tuple[Array, Array]:
         is_nan = ~jnp.isfinite(orbit.zeta + s)
         begin = (start, inner, sign * jnp.full_like(s, jnp.inf), is_nan, jnp.int32(0))
         x, _, _, is_root_at_end, _ = lax.while_loop(proceed, improve, begin)
-        return jnp.where(is_root_already, X, x), jnp.all(
-            is_root_already | (is_root_at_end & ~is_nan)
-        )
+        good = is_root_already | (is_root_at_end & ~is_nan)
+        return jnp.where(is_root_already, X, x), jnp.all(good)
 
     good = jnp.all(is_root_already)
     return lax.cond(lanewise.on_any(~good), search, lambda: (X, good))

@@ -33,9 +33,8 @@ class _LegendreTransform(eqx.Module):
     root_finder: Newton
 
     def __call__(self, t: Scalar, q: State, p: State, args: Args) -> Scalar:
-        return _legendre_transform(
-            lambda v: self.L(t, q, v, args), p, self.root_finder, "L(t, q, v, args)"
-        )
+        name = "L(t, q, v, args)"
+        return _legendre_transform(lambda v: self.L(t, q, v, args), p, self.root_finder, name)
 
 
 class _DiscreteLegendreTransform(eqx.Module):
@@ -45,10 +44,8 @@ class _DiscreteLegendreTransform(eqx.Module):
     root_finder: Newton
 
     def __call__(self, t0: Scalar, t1: Scalar, q0: State, p1: State, args: Args) -> Scalar:
-        name = "L_D(t0, t1, q0, v, args)"
-        return _legendre_transform(
-            lambda v: self.L_D(t0, t1, q0, v, args), p1, self.root_finder, name
-        )
+        L, name = (lambda v: self.L_D(t0, t1, q0, v, args)), "L_D(t0, t1, q0, v, args)"
+        return _legendre_transform(L, p1, self.root_finder, name)
 
 
 class _FromLagrangian(eqx.Module):
@@ -148,11 +145,8 @@ def legendre(L: Callable[..., Any], root_finder: Newton = Newton()) -> Callable[
             f"L must be a function of (t, q, v, args) or of (t0, t1, q0, v, args), got "
             f"{description}, which accepts {'both' if discrete else 'neither'}."
         )
-    return (
-        _DiscreteLegendreTransform(L, root_finder)
-        if discrete
-        else _LegendreTransform(L, root_finder)
-    )
+    kind = _DiscreteLegendreTransform if discrete else _LegendreTransform
+    return kind(L, root_finder)
 
 
 def from_lagrangian(L_d: Callable[..., Any], root_finder: Newton = Newton()) -> HamiltonianFn:
@@ -313,7 +307,6 @@ def _(L, root_finder, inputs, changes):
 def _velocity(
     L: Callable[..., Scalar], root_finder: Newton, p: Vector, parameters: list, scale: Vector
 ) -> Vector:
-
     def slope(v):
         return jax.grad(L)(v, *parameters)
 
@@ -329,9 +322,7 @@ def _velocity(
     return _root(lambda v: slope(v) - p, start, scale, root_finder)
 
 
-def _root(
-    residual: Callable[[Vector], Vector], guess: Vector, scale: Vector, root_finder: Newton
-) -> Vector:
+def _root(residual: Callable, guess: Vector, scale: Vector, root_finder: Newton) -> Vector:
     x, info = find_root(residual, guess, scale, root_finder)
     # An H_D has no status: NaN reports a failure, from which the step gets its status.
     return jnp.where(info.converged, x, jnp.nan)

@@ -93,11 +93,9 @@ class System(eqx.Module):
     def __check_init__(self):
         for name in ("H_D", "force", "perturbation"):
             function = getattr(self, name)
-            if name == "perturbation" and self._is_nonlinear:
-                continue
-            if function is not None or name == "H_D":
+            is_absent = function is None and name != "H_D"
+            if not is_absent and not (name == "perturbation" and self._is_nonlinear):
                 check_takes(name, function, _NAMES, {4: _CONTINUOUS})
-            if function is not None:
                 warn_of_exchanged(name, function, _NAMES)
         if self.constraint is not None:
             check_takes("constraint", self.constraint, "(q, args)")
@@ -121,15 +119,13 @@ class System(eqx.Module):
             return epsilon
         if self.epsilon is not None:
             return self.epsilon
-        parts = {
-            "a force": self.force is not None,
-            "a perturbation": self.perturbation is not None,
-            "slow_time=True": self.slow_time,
-        }
-        if any(parts.values()):
-            names = " and ".join(name for name, is_there in parts.items() if is_there)
+        names = ["a force"] * (self.force is not None)
+        names += ["a perturbation"] * (self.perturbation is not None)
+        names += ["slow_time=True"] * self.slow_time
+        if names:
             raise ValueError(
-                f"epsilon=... must be given for a system with {names}: it is their factor."
+                f"epsilon=... must be given for a system with {' and '.join(names)}: it is their "
+                "factor."
             )
         return 0.0
 
