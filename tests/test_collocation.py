@@ -10,15 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import (
-    ARGS,
-    SYSTEMS,
-    flow,
-    non_separable,
-    pendulum,
-    state,
-    symplectic_defect,
-)
+from helpers import ARGS, SYSTEMS, flow, non_separable, pendulum, state, symplectic_defect
 from scipy.integrate import solve_ivp
 
 import dvi_jax as dvi

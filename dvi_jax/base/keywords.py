@@ -53,9 +53,8 @@ def with_keywords_of(source: Callable[..., Any], names: str = "", **extra: Any) 
     """
     parameters = inspect.signature(source).parameters
     kind = inspect.Parameter.KEYWORD_ONLY
-    keywords = [parameters[name] for name in names.split()] or [
-        parameter for parameter in parameters.values() if parameter.kind == kind
-    ]
+    keywords = [parameters[name] for name in names.split()]
+    keywords = keywords or [entry for entry in parameters.values() if entry.kind == kind]
     keywords += [inspect.Parameter(name, kind, default=value) for name, value in extra.items()]
 
     def decorate(function: F) -> F:

@@ -268,9 +268,8 @@ def _loop(eqn: Any, values: list[Any]) -> list[Any]:
     n, m = eqn.params["cond_nconsts"], eqn.params["body_nconsts"]
     test, body = _as_function(eqn.params["cond_jaxpr"]), _as_function(eqn.params["body_jaxpr"])
     begin = [as_pair(x) for x in values[n + m :]]
-    return lax.while_loop(
-        lambda x: test(*values[:n], *x)[0], lambda x: body(*values[n : n + m], *x), begin
-    )
+    consts = values[n : n + m]
+    return lax.while_loop(lambda x: test(*values[:n], *x)[0], lambda x: body(*consts, *x), begin)
 
 
 def _cond(eqn: Any, values: list[Any]) -> list[Any]:

@@ -139,8 +139,9 @@ class GaussLegendre(Collocation):
         def rates(t, z, y):
             # Both times of H_D are t. The rates do not use the h of the interval.
             instant = Interval(t, t, jnp.zeros_like(h))
-            plain = inner is None
-            return jnp.stack(equations.rates(instant, *z) if plain else inner.rates(instant, z, y))
+            if inner is None:
+                return jnp.stack(equations.rates(instant, *z))
+            return jnp.stack(inner.rates(instant, z, y))
 
         def advance(weights, stages, y):
             """z0 + h Σ_j weights_j (q̇, ṗ)_j: shape (2, *q0.shape), with weights' rows in front."""

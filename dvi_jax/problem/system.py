@@ -92,11 +92,10 @@ class System(eqx.Module):
 
     def __check_init__(self):
         for name in ("H_D", "force", "perturbation"):
-            function = getattr(self, name)
-            is_absent = function is None and name != "H_D"
+            is_absent = getattr(self, name) is None and name != "H_D"
             if not is_absent and not (name == "perturbation" and self._is_nonlinear):
-                check_takes(name, function, _NAMES, {4: _CONTINUOUS})
-                warn_of_exchanged(name, function, _NAMES)
+                check_takes(name, getattr(self, name), _NAMES, {4: _CONTINUOUS})
+                warn_of_exchanged(name, getattr(self, name), _NAMES)
         if self.constraint is not None:
             check_takes("constraint", self.constraint, "(q, args)")
         instance("slow_time", self.slow_time, bool, "True or False")
@@ -277,9 +276,7 @@ def _traced_output(
         error.add_note(f"(in {name}{names}, called with q0 of shape {q.shape} and args={args!r})")
         error.add_note(tracing_note(name, error))
         if q.ndim > 1:
-            error.add_note(
-                f"{name} receives the whole q0. For a batch of initial states use jax.vmap."
-            )
+            error.add_note(f"{name} receives the whole q0. For a batch of states use jax.vmap.")
         raise
     # JAX moves such an index to the end of the array, so that the result would be wrong silently.
     for index, size in out_of_bounds(program):
@@ -291,9 +288,8 @@ def _traced_output(
     new_values = reads(function)
     if new_values != values:  # such as a counter of calls
         marks = dict(values)
-        _CHANGED_BY_TRACING[function] = _changed_by_tracing(function) | {
-            name for name, mark in new_values if marks.get(name) != mark
-        }
+        changes = {name for name, mark in new_values if marks.get(name) != mark}
+        _CHANGED_BY_TRACING[function] = _changed_by_tracing(function) | changes
     if out is None or not hasattr(out, "shape"):
         if isinstance(out, int | float):
             return outputs.setdefault(kinds, jax.ShapeDtypeStruct((), jnp.result_type(float)))
