@@ -358,10 +358,8 @@ def energy_error(method, h, num_steps, problem=THREE):
 @pytest.mark.slow
 def test_wisdom_holman_converges_to_the_same_orbit():
     def final(method, n):
-        sol = dvi.integrate(
-            THREE, h=12.0 / n, num_steps=n, method=method, save=dvi.Save(final=True)
-        )
-        return sol.q_final
+        how = {"h": 12.0 / n, "num_steps": n, "save": dvi.Save(final=True)}
+        return dvi.integrate(THREE, method=method, **how).q_final
 
     exact = final(dvi.KahanLi(8), 480)
     for method in (dvi.WisdomHolman(), dvi.WisdomHolman("democratic")):
@@ -443,10 +441,8 @@ def test_wisdom_holman_in_float32():
 
 def test_compensated_sums_and_a_start_in_motion():
     def final(arithmetic):
-        return dvi.integrate(
-            THREE, h=0.25, num_steps=40, method=dvi.WisdomHolman(), arithmetic=arithmetic,
-            save=dvi.Save(final=True),
-        ).q_final  # fmt: skip
+        how = {"h": 0.25, "num_steps": 40, "method": dvi.WisdomHolman(), "arithmetic": arithmetic}
+        return dvi.integrate(THREE, save=dvi.Save(final=True), **how).q_final
 
     assert np.abs(final(dvi.Compensated()) - final(dvi.FloatingPoint())).max() < 1e-13
 

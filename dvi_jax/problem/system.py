@@ -223,9 +223,7 @@ def check_system(system: Any, of_map: str = "", noise_allowed: bool = False) -> 
             "dvi.invariant_diffusion."
         )
     if of_map and system.constraint is not None:
-        raise ValueError(
-            f"{of_map} requires a system without constraint, as other coordinates give."
-        )
+        raise ValueError(f"{of_map} requires a system without constraint: use other coordinates.")
     # Programs that are compiled already would compute with the old value.
     current = _read_by(system)
     names = differences(system.reads, current) if current != system.reads else []
