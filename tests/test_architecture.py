@@ -1,8 +1,9 @@
-"""Imports run downward only, and the public names exist."""
+"""Imports run downward only and cost little, and the public names exist."""
 
 import ast
 import inspect
 import json
+import re
 import subprocess
 import sys
 import types
@@ -35,6 +36,22 @@ WORK = "work"
 
 MOVING = ("jax._src", "jax.interpreters", "jax.extend", "jax.core")
 """Names of JAX that change between releases."""
+
+
+LATER = (
+    "optax", "optimistix", "lineax", "matplotlib", "scipy", "xarray", "zarr", "rich", "typer",
+    "numpyro", "distributed", "diffrax", "rebound", "astropy", "arviz", "jplephem", "sympy",
+    "pydantic",
+)  # fmt: skip
+"""Each of these is imported by the function that needs it."""
+
+
+def process(code: str) -> str:
+    """What a new process prints."""
+    command = [sys.executable, "-c", code]
+    out = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert out.returncode == 0, out.stderr
+    return out.stdout
 
 
 def parsed(path: Path) -> ast.Module:
@@ -162,16 +179,24 @@ print(json.dumps(new))
 
 def test_importing_changes_no_rule_of_a_primitive_of_jax():
     """Rules are added for primitives of lanewise only, and no setting is changed."""
-    out = subprocess.run(
-        [sys.executable, "-c", GLOBALS], capture_output=True, text=True, check=False, timeout=120
-    )
-    assert out.returncode == 0, out.stderr
-    new = json.loads(out.stdout)
+    new = json.loads(process(GLOBALS))
     own = {"lanewise", "eliminate", "unit_vectors", "least_over_lanes"}
     own |= {"linear_map", "implicit_root", "rounded_product", "lost_by_product"}
     assert new["dead code"] == ["lanewise"]  # none for a loop of JAX
     assert "lanewise" in new["batching"]  # what is looked for can be found
     assert {name for names in new.values() for name in names} <= own
+
+
+def imported(code: str) -> list[str]:
+    return process(
+        f"{code}; import sys; print(*[m for m in {LATER!r} if m in sys.modules])"
+    ).split()
+
+
+def test_importing_takes_only_what_every_program_needs():
+    assert imported("import dvi_jax, dvi_jax.systems") == []
+    assert imported("import dvi_jax.plot") == ["matplotlib"]  # and so it would be seen
+    assert "pydantic" in imported("import dvi_jax.run")
 
 
 def test_nothing_imports_the_command_line():
@@ -188,6 +213,20 @@ def test_public_names_exist_and_are_documented():
     assert len(short) <= 50
 
 
+def test_every_alias_is_listed_and_means_its_name():
+    page = (ROOT.parent / "docs" / "migration.md").read_text(encoding="utf-8")
+    table = page.split("## Aliases")[1].split("##")[0]
+    rows = [line.split("|")[1:3] for line in table.splitlines() if line.startswith("| `")]
+    listed = {
+        alias: re.findall(r"`dvi\.(\w+)`", meant)[0]
+        for aliases, meant in rows
+        for alias in re.findall(r"`dvi\.(\w+)`", aliases)
+    }
+    assert listed == _namespaces.ALIASES
+    for alias, name in _namespaces.ALIASES.items():
+        assert getattr(dvi, alias) is getattr(dvi, name)
+
+
 def test_type_checkers_and_programs_see_the_same_names():
     """Type checkers read `from .discover import *`, programs the list of `_namespaces`."""
     for folder, names in _namespaces.HOMES.items():
@@ -202,7 +241,7 @@ def test_type_checkers_and_programs_see_the_same_names():
 
 
 def test_packages_are_attributes_in_a_fresh_process():
-    """They are imported when they are used, and not before."""
+    """They are imported when they are used, and not before; the command line knows their names."""
     code = """
 import sys, dvi_jax as dvi
 from dvi_jax import _namespaces
@@ -222,8 +261,11 @@ except AttributeError as error:
     assert "no attribute 'plots'" in str(error), error
 else:
     raise AssertionError
+from dvi_jax_cli.work.expressions import public
+from dvi_jax.discover import AbstractBasis
+assert {"Polynomials", "Radial"} <= public(AbstractBasis).keys()
 """
-    subprocess.run([sys.executable, "-c", code], check=True)
+    process(code)
 
 
 def test_an_invalid_part_is_refused():
