@@ -186,15 +186,15 @@ def test_the_map_is_symplectic_on_the_manifold():
     def rattle(q, p):
         return step(q, p, jnp.asarray(0.1))[:2]
 
-    given = SPHERE.system, SPHERE.args
-    assert defect_of_two_form(*given, rattle, Q, P) < 1e-13
-    assert defect_of_two_form(*given, not_symplectic, Q, P) > 1e-6  # the control
-    other = one_step("not separable")
-    q, p = map(jnp.asarray, START)
-    defect = defect_of_two_form(
-        OTHERS["not separable"], 1.3, lambda q, p: other(q, p, jnp.asarray(0.1))[:2], q, p
-    )
-    assert defect < 1e-13
+    sphere = SPHERE.system, SPHERE.args
+    assert defect_of_two_form(*sphere, rattle, Q, P) < 1e-13
+    assert defect_of_two_form(*sphere, not_symplectic, Q, P) > 1e-6  # the control
+    other, start = one_step("not separable"), map(jnp.asarray, START)
+
+    def mapped(q, p):
+        return other(q, p, jnp.asarray(0.1))[:2]
+
+    assert defect_of_two_form(OTHERS["not separable"], 1.3, mapped, *start) < 1e-13
 
 
 # Initial states, and what is refused

@@ -558,9 +558,7 @@ def test_settings_that_cannot_work_are_rejected():
     with pytest.raises(TypeError, match="picard must be a dvi"):
         PicardThenNewton(picard=Newton())
     start = {"q0": [0.1, 0.1], "p0": [0.1, 0.1], "h": 0.1, "num_steps": 1}
-    with pytest.raises(
-        TypeError, match=r"must be an instance of dvi.RootSolver, got 'picard'. Take .*Picard"
-    ):
+    with pytest.raises(TypeError, match=r"instance of dvi.RootSolver, got 'picard'. .*Picard"):
         dvi.integrate(CHAIN, **start, newton="picard")
     with pytest.raises(TypeError, match="is a pair of parentheses missing"):
         dvi.integrate(CHAIN, **start, newton=dvi.Picard)
