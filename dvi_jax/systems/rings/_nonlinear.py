@@ -181,13 +181,12 @@ def momentum_aperture(
 
     def one(passage, z, first):
         def row(flight, x):
-            number, par = jax.tree.map(lambda a: a[None], x)
-            after = Passage(par, number, passage.parts).flown(flight, 0, 0.0)
+            numbers, rows, slopes = jax.tree.map(lambda a: a[None], x)
+            after = Passage(rows, slopes, numbers, passage.parts).flown(flight, 0, 0.0)
             skips = x[0]["element"] < first
             return jax.tree.map(lambda a, b: jnp.where(skips, a, b), flight, after), None
 
-        xs = passage.numbers, passage.rows
-        return jnp.stack(lax.scan(row, start(Particle(*z)), xs)[0].z)
+        return jnp.stack(lax.scan(row, start(Particle(*z)), passage.tables)[0].z)
 
     finish = jax.jit(jax.vmap(lambda z, first: lanewise.call(one, passage, z, first)))
 

@@ -189,8 +189,8 @@ def maps(ring: Ring, epsilon: Any) -> tuple[Callable, Any]:
     which = np.asarray([all_kinds.index(kind) for kind in kinds], np.int32)
 
     def apply(z, x):
-        par, which, steps = x
-        par = perturbed(par, epsilon)
+        values, slopes, which, steps = x
+        par = perturbed(values, slopes, epsilon)
 
         def through(kind):
             pieces = pieces_of(kind)
@@ -209,7 +209,8 @@ def maps(ring: Ring, epsilon: Any) -> tuple[Callable, Any]:
 
     number = passage.numbers["part"]
     # Recomputed in reverse mode: otherwise each part stores what every kind of part would need.
-    return jax.checkpoint(apply), (passage.rows, which[number], steps[number])
+    rows, slopes = passage.rows, passage.slopes
+    return jax.checkpoint(apply), (rows, slopes, which[number], steps[number])
 
 
 @eqx.filter_jit
@@ -249,7 +250,7 @@ def analysis(
         count = jnp.where((count > 0) | (size < _NEAR), count + 1, 0)
         return z + change, D, (zs, Ms, dMs[-1], D, slip, size), count
 
-    shapes = (rows := len(xs[1]) + 1, 6), (rows, 6, 6), (6, 6), (6,), (), ()
+    shapes = (rows := len(xs[-1]) + 1, 6), (rows, 6, 6), (6, 6), (6,), (), ()
     begin = z, jnp.asarray(e_delta), tuple(jnp.full(x, jnp.nan) for x in shapes), jnp.asarray(0)
     (*_, (zs, Ms, dM, D, slip, size), _), _ = lax.scan(
         lambda s, _: (lax.cond(s[3] > _AFTER, lambda s: s, iterate, s), None), begin, None, _MOST

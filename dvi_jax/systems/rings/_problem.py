@@ -91,11 +91,11 @@ def _state(z: Particle, like: Array) -> tuple[Array, Array, Any]:
     return q, p, judge(no_solve(q), q, p)
 
 
-class _Along(eqx.Module):
-    """The paraxial Hamiltonian at the place s = t C, over one turn of length C; `prefix` of the
-    parameters it contains."""
+class _PlaceHamiltonian(eqx.Module):
+    """The paraxial Hamiltonian at the place s = t C, over one turn of length C, or its derivative
+    by ε, with b' in place of b."""
 
-    prefix: str = eqx.field(static=True, default="")
+    is_slope: bool = eqx.field(static=True, default=False)
     own_method: ClassVar[Method] = Turn()
 
     def __call__(self, t0, t1, q0, p1, args):
@@ -104,19 +104,19 @@ class _Along(eqx.Module):
         row = jnp.searchsorted(ends, (t0 - jnp.floor(t0)) * ends[-1], side="right")
         element = args.passage.numbers["element"]
         row = jnp.searchsorted(element, element[row], side="right") - 1
-        par = {
-            n: lax.dynamic_index_in_dim(c, row, keepdims=False)
-            for n, c in args.passage.rows.items()
-        }
+        rows, slopes = (
+            {n: lax.dynamic_index_in_dim(c, row, keepdims=False) for n, c in table.items()}
+            for table in (args.passage.rows, args.passage.slopes)
+        )
         free = (z.px**2 + z.py**2) / (2 * (1 + z.delta))
-        h = par.get("h", 0.0)
+        h = rows.get("h", 0.0)
         bent = h * z.x * (h * z.x / 2 - z.delta)
         energy, power = 0.0, 1.0 + 0j
         for n in range(12):
             power = power * (z.x + 1j * z.y)
-            b, a = (par.get(f"{self.prefix}{k}{n}", 0.0) for k in "ba")
+            b, a = ((slopes if self.is_slope else rows).get(f"{k}{n}", 0.0) for k in "ba")
             energy = energy + jnp.real((b + 1j * a) * power) / (n + 1)
-        return ends[-1] * (energy if self.prefix else free + bent + energy)
+        return ends[-1] * (energy if self.is_slope else free + bent + energy)
 
 
 class RingProblem(NamedTuple):
@@ -158,6 +158,8 @@ def problem(ring: Ring, planes: Planes = "xyz", delta: Any = 0.0) -> RingProblem
     one_of("planes", planes, ("x", "xy", "xyz"))
     passage = jax.tree.map(jnp.asarray, Passage.of(ring))
     args = Packed(passage, jnp.asarray(delta, float))
-    perturbation = _Along("ε ") if ring.extra else None
+    perturbation = _PlaceHamiltonian(is_slope=True) if ring.extra else None
     zero = jnp.zeros(len(planes))
-    return RingProblem(System(_Along(), perturbation=perturbation), zero, zero, 1.0, args)
+    return RingProblem(
+        System(_PlaceHamiltonian(), perturbation=perturbation), zero, zero, 1.0, args
+    )

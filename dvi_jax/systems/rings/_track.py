@@ -116,12 +116,13 @@ def _tracked(ring: Ring, z: Array, epsilon: Array, counts: tuple[int, int, int])
     blocks, every, first = counts
     passage = Passage.of(ring)
 
-    def forward(numbers, rows, z, epsilon):
-        along = Passage(rows, numbers, passage.parts)
+    def forward(numbers, tables, z, epsilon):
+        rows, slopes = tables
+        line = Passage(rows, slopes, numbers, passage.parts)
 
         def one(state, _):
             k, flight = state
-            return (k + 1, along.flown(flight, k, epsilon)), None
+            return (k + 1, line.flown(flight, k, epsilon)), None
 
         def block(state, _):
             (k, flight), _ = lax.scan(one, state, None, every)
@@ -132,8 +133,8 @@ def _tracked(ring: Ring, z: Array, epsilon: Array, counts: tuple[int, int, int])
         return saved, (flight.turn, flight.element, jnp.stack(flight.last))
 
     @jax.custom_jvp
-    def tracked(rows, z, epsilon):
-        return _batched(forward, False, False, True, True)(passage.numbers, rows, z, epsilon)
+    def tracked(tables, z, epsilon):
+        return _batched(forward, False, False, True, True)(passage.numbers, tables, z, epsilon)
 
     @functools.partial(tracked.defjvp, symbolic_zeros=True)
     def _(primals, tangents):
@@ -160,7 +161,7 @@ def _tracked(ring: Ring, z: Array, epsilon: Array, counts: tuple[int, int, int])
         none = [np.zeros(x.shape, jax.dtypes.float0) for x in losses[:2]]
         return (saved, losses), (moved, (*none, jnp.zeros_like(losses[2])))
 
-    saved, losses = tracked(passage.rows, z, epsilon)
+    saved, losses = tracked((passage.rows, passage.slopes), z, epsilon)
     return saved, *losses
 
 
@@ -168,19 +169,22 @@ _MISSED = 1e-6
 
 
 def _pulled(passage, primals, saved, cotangent, counts, moves):
-    """The cotangents of rows, z and ε: all particles backwards, turn by turn."""
-    rows, z0, epsilon = primals
+    """The cotangents of rows and slopes, z and ε: all particles backwards, turn by turn."""
+    tables, z0, epsilon = primals
     blocks, every, first = counts
-    moved = [n for n, m in moves[0].items() if m]
-    by_epsilon = [n.removeprefix("ε ") for n in rows if n.startswith("ε ") and moves[2]]
-    moving = sorted({n.removeprefix("ε ") for n in moved} | set(by_epsilon))
+    moved = [[n for n, m in table.items() if m] for table in moves[0]]
+    by_epsilon = list(tables[1]) if moves[2] else []
+    moving = sorted({*moved[0], *moved[1], *by_epsilon})
 
-    def one_turn(numbers, rows, z, c, k, epsilon):
-        along = Passage(rows, numbers, passage.parts)
+    def one_turn(numbers, tables, z, c, k, epsilon):
+        rows, slopes = tables
+        along = Passage(rows, slopes, numbers, passage.parts)
         z, c, found = along.pulled(moving, Particle(*z), Particle(*c), k, epsilon)
-        of_rows = {n: epsilon * found[n[2:]] if n.startswith("ε ") else found[n] for n in moved}
-        of_epsilon = [jnp.sum(found[n] * rows[f"ε {n}"]) for n in by_epsilon]
-        return jnp.stack(z), jnp.stack(c), of_rows, sum(of_epsilon, jnp.zeros(()))
+        # Of b(ε) = b + ε b' by b, b' and ε.
+        of_rows = {n: found[n] for n in moved[0]}
+        of_slopes = {n: epsilon * found[n] for n in moved[1]}
+        of_epsilon = sum((jnp.sum(found[n] * slopes[n]) for n in by_epsilon), jnp.zeros(()))
+        return jnp.stack(z), jnp.stack(c), (of_rows, of_slopes), of_epsilon
 
     turn_back = _batched(one_turn, False, False, True, True, False, True)
     lost = jnp.isnan(saved[:, :, :1])
@@ -195,7 +199,7 @@ def _pulled(passage, primals, saved, cotangent, counts, moves):
 
         def undo(_, state):
             k, z, c, of_rows, of_epsilon = state
-            z, c, found, by_epsilon = turn_back(passage.numbers, rows, z, c, k, epsilon)
+            z, c, found, by_epsilon = turn_back(passage.numbers, tables, z, c, k, epsilon)
             of_rows = jax.tree.map(lambda a, b: a + jnp.sum(b, 0), of_rows, found)
             return k - 1, z, c, of_rows, of_epsilon + by_epsilon
 
@@ -208,7 +212,10 @@ def _pulled(passage, primals, saved, cotangent, counts, moves):
     begin = (
         jnp.asarray(first + blocks * every - 1, jnp.int32),
         jnp.zeros_like(z0),
-        {n: jnp.zeros_like(rows[n]) for n in moved},
+        tuple(
+            {n: jnp.zeros_like(table[n]) for n in names}
+            for table, names in zip(tables, moved, strict=True)
+        ),
         none,
         none,
     )
@@ -217,5 +224,8 @@ def _pulled(passage, primals, saved, cotangent, counts, moves):
     fine = ~wrong & ((worst < _MISSED) | jnp.any(lost, axis=(1, 2)))
     all_fine = jnp.where(jnp.all(fine), 1.0, jnp.nan)
     nan = jnp.where(fine, 1.0, jnp.nan)
-    of_rows = {n: all_fine * of_rows[n] if n in of_rows else jnp.zeros_like(rows[n]) for n in rows}
+    of_rows = tuple(
+        {n: all_fine * slope[n] if n in slope else jnp.zeros_like(table[n]) for n in table}
+        for table, slope in zip(tables, of_rows, strict=True)
+    )
     return of_rows, nan[:, None] * c, nan * of_epsilon

@@ -22,7 +22,7 @@ LARGEST = 1.0
 
 
 Rows = dict[str, Any]
-"""Parameters of each part of the elements of a ring, in the order of passage."""
+"""Name of a parameter → its values, one for each part of the elements in the order of passage."""
 
 
 class Flight(NamedTuple):
@@ -65,42 +65,52 @@ def _noted(flight: Flight, z: Particle, passes: Any, number: Rows, turn: Any) ->
 class Passage(eqx.Module):
     """The parts of the elements of a ring in the order of passage.
 
-    - `rows`: the parameters of each part; ``"ε b1"`` is what ε times is added to ``"b1"``.
+    - `rows`: the parameters b of each part at ε = 0. `slopes`: their derivatives b' by ε, of the
+      parameters that depend on it; see `perturbed`.
     - `numbers`: of each part in `parts`, and of its element; whether the element ends there.
     """
 
     rows: Rows
+    slopes: Rows
     numbers: Rows
     parts: tuple[Part, ...] = eqx.field(static=True)
 
     @classmethod
     def of(cls, ring: Ring) -> "Passage":
         part, element = np.asarray(ring.program.rows, np.int32).T
-        rows = {name: column[element] for name, column in ring.columns.items()}
-        rows |= {f"ε {name}": column[element] for name, column in ring.extra.items()}
+        rows, slopes = (
+            {name: column[element] for name, column in columns.items()}
+            for columns in (ring.columns, ring.extra)
+        )
         ends = np.append(element[1:] != element[:-1], True)
-        return cls(rows, {"part": part, "element": element, "ends": ends}, ring.program.parts)
+        numbers = {"part": part, "element": element, "ends": ends}
+        return cls(rows, slopes, numbers, ring.program.parts)
+
+    @property
+    def tables(self) -> tuple[Rows, Rows, Rows]:
+        """Numbers, rows and slopes, for a loop over the parts."""
+        return self.numbers, self.rows, self.slopes
 
     def moved(self, z: Particle, turn: Any, epsilon: Any, sign: int = 1) -> Particle:
         """The particle after all parts, or before them for sign −1; without apertures."""
 
         def row(z, x):
-            number, par = x
-            par = perturbed(par, epsilon)
+            number, values, slopes = x
+            par = perturbed(values, slopes, epsilon)
 
             def through(part):
                 return lambda z: forward(pieces_of(part), z, par, turn, sign)
 
             return lax.switch(number["part"], [through(p) for p in self.parts], z), None
 
-        return lax.scan(row, z, (self.numbers, self.rows), reverse=sign < 0)[0]
+        return lax.scan(row, z, self.tables, reverse=sign < 0)[0]
 
     def flown(self, flight: Flight, turn: Any, epsilon: Any) -> Flight:
         """The flight after all parts, with losses. A particle that is lost becomes NaN."""
 
         def row(flight, x):
-            number, par = x
-            par = perturbed(par, epsilon)
+            number, values, slopes = x
+            par = perturbed(values, slopes, epsilon)
 
             def through(part):
                 inside = APERTURES.get(part.name)
@@ -112,7 +122,7 @@ class Passage(eqx.Module):
             z, passes = lax.switch(number["part"], maps, flight.z)
             return _noted(flight, z, passes, number, turn), None
 
-        return lax.scan(row, flight, (self.numbers, self.rows))[0]
+        return lax.scan(row, flight, self.tables)[0]
 
     def pulled(
         self, moving: Sequence[str], z: Particle, cotangent: Particle, turn: Any, epsilon: Any
@@ -121,8 +131,8 @@ class Passage(eqx.Module):
         cotangents of the parameters `moving`, one for each part."""
 
         def row(state, x):
-            number, par = x
-            par = perturbed(par, epsilon)
+            number, values, slopes = x
+            par = perturbed(values, slopes, epsilon)
             known = {name: par[name] for name in moving}
 
             def back(part):
@@ -131,12 +141,10 @@ class Passage(eqx.Module):
             z, cotangent, found = lax.switch(number["part"], [back(p) for p in self.parts], *state)
             return (z, cotangent), found
 
-        begin, xs = (z, cotangent), (self.numbers, self.rows)
-        (z, cotangent), found = lax.scan(row, begin, xs, reverse=True)
+        (z, cotangent), found = lax.scan(row, (z, cotangent), self.tables, reverse=True)
         return z, cotangent, found
 
 
-def perturbed(par: Rows, epsilon: Any) -> Rows:
-    """The parameters of a part, with what ε is multiplied by added."""
-    extra = {name[2:]: value for name, value in par.items() if name.startswith("ε ")}
-    return {**par, **{name: par[name] + epsilon * value for name, value in extra.items()}}
+def perturbed(values: Rows, slopes: Rows, epsilon: Any) -> Rows:
+    """The parameters of a part at ε: b(ε) = b + ε b'."""
+    return {**values, **{name: values[name] + epsilon * slopes[name] for name in slopes}}
