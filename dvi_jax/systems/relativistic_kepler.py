@@ -78,7 +78,7 @@ def relativistic_kepler() -> Problem:
             "the relativistic Kepler problem is in the plane",
             (2,),
             singular={"the centre": (0, 0)},
-            also=_misses_the_centre,
+            check=_misses_the_centre,
         ),
         name="relativistic_kepler",
         q0=np.array([0.6, 0.0]),

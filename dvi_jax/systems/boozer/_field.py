@@ -197,13 +197,13 @@ def _integers(name: str, values: Any) -> np.ndarray:
     return numbers.astype(int)
 
 
-def _parts(B: Any) -> list[np.ndarray]:
+def _parts(values: Any) -> list[np.ndarray]:
     """The cosine part of B and, if it has three dimensions, the sine part."""
-    if np.ndim(B) != 3:
-        return [_array("B", B, 2)]
-    if len(B) not in (1, 2):
-        raise ValueError(f"the first of three dimensions of B must be 1 or 2, got {len(B)}.")
-    return list(_array("B", B, 3))
+    if np.ndim(values) != 3:
+        return [_array("B", values, 2)]
+    if len(values) not in (1, 2):
+        raise ValueError(f"the first of three dimensions of B must be 1 or 2, got {len(values)}.")
+    return list(_array("B", values, 3))
 
 
 def _check_positive(field: Field) -> None:

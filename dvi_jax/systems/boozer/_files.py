@@ -38,11 +38,6 @@ class Geometry(eqx.Module):
         R, Z, nu = (total(c, *point) for c in (self.R, self.Z, self.nu))
         return R, self.direction * (zeta - nu), Z
 
-    def cartesian(self, s: Any, theta: Any, zeta: Any) -> Array:
-        """(x, y, z) [m], shape (…, 3)."""
-        R, phi, Z = self.cylindrical(s, theta, zeta)
-        return jnp.stack([R * jnp.cos(phi), R * jnp.sin(phi), Z], axis=-1)
-
 
 class _Surfaces(NamedTuple):
     """What a file holds, in right-handed coordinates with ψ ≥ 0."""
@@ -83,11 +78,12 @@ def read_booz_xform(
 
     **Source** Sanchez et al. 2000, *J. Comput. Phys.* 161, 576 (booz_xform).
     """
-    f = _surfaces(path, ["bmnc_b"], ["bmns_b"], psi_edge)
-    B = [f.even["bmnc_b"], *f.odd.values()]
+    data = _surfaces(path, ["bmnc_b"], ["bmns_b"], psi_edge)
+    parts = [data.even["bmnc_b"], *data.odd.values()]
     return from_surfaces(
-        f.s, f.m, f.n, np.stack(B) if len(B) > 1 else B[0], psi_edge=f.psi_edge, iota=f.iota, G=f.G,
-        I=f.I, periods=f.periods, helicity=helicity, degree=degree, box=box, tolerance=tolerance,
+        data.s, data.m, data.n, np.stack(parts) if len(parts) > 1 else parts[0],
+        psi_edge=data.psi_edge, iota=data.iota, G=data.G, I=data.I, periods=data.periods,
+        helicity=helicity, degree=degree, box=box, tolerance=tolerance,
     )  # fmt: skip
 
 

@@ -24,7 +24,16 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from .._problem import Parameter, Problem, Start, finite, library_problem, over_times, vector
+from .._problem import (
+    Parameter,
+    Problem,
+    Start,
+    System,
+    finite,
+    library_problem,
+    over_times,
+    vector,
+)
 from .solar_system import installed_file
 
 REFERENCE = 51544.0
@@ -217,7 +226,7 @@ def polar_motion() -> Problem:
     fit to 1976–2008. Review: Gross 2015, *Treatise on Geophysics*, 2nd ed., 3.09.
     """
     return library_problem(
-        hamiltonian,
+        System(hamiltonian, damping, disturbance),
         Start("the pole has one x, in q0, and one y, in p0", (1,)),
         name="polar_motion",
         q0=[0.043301],
@@ -235,8 +244,6 @@ def polar_motion() -> Problem:
                 0.001677, 0.003460, "of the mean pole (x, y) in a year [arcsec/365.25 day]"
             ),
         },
-        force=damping,
-        perturbation=disturbance,
         observables=[amplitude, free_amplitude],
         autonomous=False,
         units={"q": "arcsec", "p": "arcsec", "t": "day", "energy": "arcsec²/day"},

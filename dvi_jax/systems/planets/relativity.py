@@ -79,8 +79,8 @@ def post_newtonian_hamiltonian(t0, t1, q0, p1, args):
     masses, mu = _masses(q0, args)
     r, v = _length(_from_sun(q0)), _from_sun(p1 / masses[:, None])
     v2 = jnp.sum(v**2, axis=-1, keepdims=True)
-    added = v2**2 / 8 + 1.5 * mu * v2 / r - mu**2 / (2 * r**2)
-    return -jnp.sum(masses[1:, None] * added) / _c2(args)
+    terms = v2**2 / 8 + 1.5 * mu * v2 / r - mu**2 / (2 * r**2)
+    return -jnp.sum(masses[1:, None] * terms) / _c2(args)
 
 
 def momenta_from_velocities(q: Any, v: Any, args: Any):
@@ -106,8 +106,8 @@ def velocities_from_momenta(q: Any, p: Any, args: Any):
     """
     q, p = jnp.asarray(q), jnp.asarray(p)
     masses, _ = _masses(q, args)
-    rest = p / masses[:, None]
-    return rest - _added_momenta(q, rest, args) / masses[:, None]
+    ratios = p / masses[:, None]
+    return ratios - _added_momenta(q, ratios, args) / masses[:, None]
 
 
 def oblateness(q, args):
@@ -140,9 +140,9 @@ def oblateness(q, args):
         )
     r = _from_sun(q)
     r2 = jnp.sum(r**2, axis=-1)
-    along = jnp.sum(r * pole[None, :], axis=-1) ** 2 / (r2 * jnp.sum(pole**2))
+    sine_squared = jnp.sum(r * pole[None, :], axis=-1) ** 2 / (r2 * jnp.sum(pole**2))
     size = mu * args["J2"] * args.get("R", SUN_RADIUS) ** 2
-    return size / 2 * jnp.sum(masses[1:] * (3 * along - 1) / r2**1.5)
+    return size / 2 * jnp.sum(masses[1:] * (3 * sine_squared - 1) / r2**1.5)
 
 
 def hamiltonian_with_oblateness(t0, t1, q0, p1, args):
@@ -173,5 +173,5 @@ def _added_momenta(q, v, args):
     masses, mu = _masses(q, args)
     u = _from_sun(v)
     w = (_length(u) ** 2 / 2 + 3 * mu / _length(_from_sun(q))) / _c2(args) * u
-    added = masses[1:, None] * w
-    return jnp.concatenate([-jnp.sum(added, axis=0, keepdims=True), added])
+    corrections = masses[1:, None] * w
+    return jnp.concatenate([-jnp.sum(corrections, axis=0, keepdims=True), corrections])

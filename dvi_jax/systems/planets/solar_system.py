@@ -53,7 +53,7 @@ class EphemerisMissing(ImportError):
     """The ephemeris or its reader is not installed; the message has the command."""
 
 
-def installed_file(name: str, what: str) -> Path:
+def installed_file(name: str, contents: str) -> Path:
     """A file of the package skyfield-data; `what`: its contents, for the message.
 
     Nothing is downloaded. **Raises** `EphemerisMissing` where it is not installed.
@@ -62,7 +62,7 @@ def installed_file(name: str, what: str) -> Path:
     package = find_spec("skyfield_data")
     if package is None or package.origin is None:
         raise EphemerisMissing(
-            f"{what} requires the package skyfield-data. It is not installed: run {_EXTRA}"
+            f"{contents} requires the package skyfield-data. It is not installed: run {_EXTRA}"
         )
     path = Path(package.origin).parent / "data" / name
     if not path.is_file():
@@ -108,11 +108,11 @@ def check_covered(jd: Any, day: str = "") -> None:
     """
     first, last = COVERAGE
     jd = np.atleast_1d(jd)
-    outside = jd[~((jd >= first) & (jd <= last))]  # NaN is outside
-    if outside.size:
+    invalid = jd[~((jd >= first) & (jd <= last))]  # NaN is outside
+    if invalid.size:
         raise ValueError(
             "dates must be in the range of the ephemeris DE421, 1899-07-29 to 2053-10-09 (Julian "
-            f"dates {first} to {last}), got the Julian date {outside[0]}{day}."
+            f"dates {first} to {last}), got the Julian date {invalid[0]}{day}."
         )
 
 
@@ -159,8 +159,8 @@ def perihelion_longitude(q: Any, v: Any, mu: float) -> np.ndarray:
 
     Returns shape (times,), continuous in time (unwrapped).
     """
-    of = elements(np.asarray(q, float), np.asarray(v, float), mu, np)
-    return np.unwrap(of[..., 3] + of[..., 4])
+    orbit = elements(np.asarray(q, float), np.asarray(v, float), mu, np)
+    return np.unwrap(orbit[..., 3] + orbit[..., 4])
 
 
 def check_start(q0: Any, p0: Any, args: Any) -> None:

@@ -18,7 +18,7 @@ from ...base.checks import instance, whole
 from ...base.machine import results_memory
 from ._maps import Particle
 from ._ring import Ring
-from ._turn import Passage, start
+from ._turn import Passage, coordinates, start
 
 
 class Tracked(NamedTuple):
@@ -85,84 +85,80 @@ def track(
     every = turns if every is None else whole("every", every)
     if turns % every:
         raise ValueError(f"every must divide turns = {turns}, got every = {every}.")
-    z = jnp.asarray(z, float)
-    if z.shape[-1:] != (6,):
+    z = coordinates("z", z)
+    size, memory = z.size * z.itemsize * (turns // every), results_memory()
+    if memory is not None and size > memory:
         raise ValueError(
-            "z must have six coordinates (x, px, y, py, ζ, δ) on its last axis, got an array of "
-            f"shape {z.shape}."
-        )
-    needed, there = z.size * z.itemsize * (turns // every), results_memory()
-    if there is not None and needed > there:
-        raise ValueError(
-            f"the results need {needed / 2**30:.3g} GiB of memory, but only {there / 2**30:.3g} "
-            "GiB are available. Save fewer turns with a larger every, or track fewer particles."
+            f"the results need {size / 2**30:.3g} GiB of memory, got {memory / 2**30:.3g} GiB. Use "
+            "a larger every, or fewer particles."
         )
     shape = z.shape[:-1]
     epsilon = jnp.broadcast_to(jnp.asarray(epsilon, float), shape).reshape(-1)
     counts = turns // every, every, first_turn
-    saved, turn, element, last = _tracked(ring, z.reshape(-1, 6), epsilon, counts)
-    saved = saved[:, -1] if turns == every else saved
-    parts = saved, turn, element, last
+    states, turn, element, last = _track(ring, z.reshape(-1, 6), epsilon, counts)
+    states = states[:, -1] if turns == every else states
+    parts = states, turn, element, last
     return Tracked(*(x.reshape(*shape, *x.shape[1:]) for x in parts))
 
 
-def _batched(function, *on):
-    """`function` of one particle as machine code for many; `on`: which arguments have one each."""
-    return jax.vmap(functools.partial(lanewise.call, function), [0 if o else None for o in on])
+def _batched(function, *flags):
+    """`function` of one particle as machine code for many; `flags`: which arguments are batches."""
+    axes = [0 if flag else None for flag in flags]
+    return jax.vmap(functools.partial(lanewise.call, function), axes)
 
 
 @eqx.filter_jit
-def _tracked(ring: Ring, z: Array, epsilon: Array, counts: tuple[int, int, int]):
+def _track(ring: Ring, z: Array, epsilon: Array, counts: tuple[int, int, int]):
     blocks, every, first = counts
-    passage = Passage.of(ring)
+    passage = Passage.from_ring(ring)
 
     def forward(numbers, tables, z, epsilon):
         rows, slopes = tables
         line = Passage(rows, slopes, numbers, passage.parts)
 
-        def one(state, _):
+        def one_turn(state, _):
             k, flight = state
-            return (k + 1, line.flown(flight, k, epsilon)), None
+            return (k + 1, line.fly(flight, k, epsilon)), None
 
         def block(state, _):
-            (k, flight), _ = lax.scan(one, state, None, every)
+            (k, flight), _ = lax.scan(one_turn, state, None, every)
             return (k, flight), jnp.stack(flight.z)
 
         state = jnp.asarray(first, jnp.int32), start(Particle(*z))
-        (_, flight), saved = lax.scan(block, state, None, blocks)
-        return saved, (flight.turn, flight.element, jnp.stack(flight.last))
+        (_, flight), states = lax.scan(block, state, None, blocks)
+        return states, (flight.turn, flight.element, jnp.stack(flight.last))
 
     @jax.custom_jvp
-    def tracked(tables, z, epsilon):
+    def states_and_losses(tables, z, epsilon):
         return _batched(forward, False, False, True, True)(passage.numbers, tables, z, epsilon)
 
-    @functools.partial(tracked.defjvp, symbolic_zeros=True)
+    @functools.partial(states_and_losses.defjvp, symbolic_zeros=True)
     def _(primals, tangents):
-        saved, losses = tracked(*primals)
+        states, losses = states_and_losses(*primals)
         moves = jax.tree.map(lambda x: not isinstance(x, SymbolicZero), tangents)
         change = jax.tree.map(
             lambda t, x, m: t if m else jnp.zeros_like(x), tangents, primals, moves
         )
 
         def push(residuals, change):
-            def along(numbers, x, change):
+            def derivative(numbers, x, change):
                 return jax.jvp(lambda *x: forward(numbers, *x)[0], x, change)[1]
 
             axes = (None, (None, 0, 0), (None, 0, 0))
-            return jax.vmap(functools.partial(lanewise.call, along), axes)(
+            return jax.vmap(functools.partial(lanewise.call, derivative), axes)(
                 passage.numbers, residuals[0], change
             )
 
         def pull(residuals, cotangent):
-            primals, saved = residuals
-            return _pulled(passage, primals, saved, cotangent, counts, moves)
+            primals, states = residuals
+            return _pulled(passage, primals, states, cotangent, counts, moves)
 
-        moved = linear_map(push, pull, push, (primals, saved), change)
+        slopes_of_states = linear_map(push, pull, push, (primals, states), change)
         none = [np.zeros(x.shape, jax.dtypes.float0) for x in losses[:2]]
-        return (saved, losses), (moved, (*none, jnp.zeros_like(losses[2])))
+        return (states, losses), (slopes_of_states, (*none, jnp.zeros_like(losses[2])))
 
-    saved, losses = tracked((passage.rows, passage.slopes), z, epsilon)
-    return saved, *losses
+    states, losses = states_and_losses((passage.rows, passage.slopes), z, epsilon)
+    return states, *losses
 
 
 _MISSED = 1e-6
