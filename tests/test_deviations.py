@@ -462,7 +462,7 @@ def test_batches_and_layouts():
                 HENON.system, q, p, kinds, num_steps=500, layout=dvi.Layout(form)
             )
         )(q, p)
-        for form in ("arrays", "components")
+        for form in ("arrays", "auto")
     ]
     for i, start in enumerate((REGULAR, CHAOTIC)):
         alone = seen(HENON.system, *start, kinds, num_steps=500)

@@ -121,7 +121,7 @@ def wrong_digits():
 )  # fmt: skip
 def test_an_order_that_coefficients_do_not_have_is_rejected(coefficients, claimed, found):
     assert dvi.Composition(coefficients, order=found).order == found
-    with pytest.raises(ValueError, match=f"have order {found}, not {claimed}"):
+    with pytest.raises(ValueError, match=f"at most {found}, .* got {claimed}"):
         dvi.Composition(coefficients, order=claimed)
 
 
@@ -130,7 +130,7 @@ def test_printed_digits_are_enough_for_a_claim():
     good, poor = ([round(x, n) for x in (0.784513610477557, 0.235573213359358)] for n in (12, 6))
     third = -1.177679984178871
     assert dvi.Composition(of_strang(*good, third), order=6).is_symmetric
-    with pytest.raises(ValueError, match="violate the conditions"):
+    with pytest.raises(ValueError, match="conditions of order"):
         dvi.Composition(of_strang(*poor, third), order=6)
 
 
@@ -196,7 +196,7 @@ def test_explicitness_is_read_from_the_system():
     ):
         assert [method.is_explicit(s, q, 1.0) for s in (spring, damped)] == explicit
     assert dvi.TypeII().is_explicit(dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + q @ q))
-    with pytest.raises(ValueError, match="that the system requires"):
+    with pytest.raises(ValueError, match="cannot be evaluated"):
         dvi.TypeII().is_explicit(spring)
 
 
@@ -242,17 +242,17 @@ PAIR = (0.5, 0.5)
           for c in ((), (0.5, 0.6), (np.nan, 1.0))),
         *((lambda c=c: dvi.Composition(c), TypeError, "sequence of numbers")
           for c in (0.5, "half", [None])),
-        (lambda: dvi.Yoshida(5), ValueError, "4, 6 or 8, got 5"),
+        (lambda: dvi.Yoshida(5), ValueError, "4, 6, 8, got 5"),
         (lambda: dvi.Suzuki(6), ValueError, "must be 4, got 6"),
-        (lambda: dvi.BlanesMoan(8), ValueError, "must be 4 or 6, got 8"),
-        (lambda: dvi.McLachlan(2), ValueError, "4, 6 or 8, got 2"),
-        (lambda: dvi.KahanLi(4), ValueError, "6 or 8, got 4"),
+        (lambda: dvi.BlanesMoan(8), ValueError, "4, 6, got 8"),
+        (lambda: dvi.McLachlan(2), ValueError, "4, 6, 8, got 2"),
+        (lambda: dvi.KahanLi(4), ValueError, "6, 8, got 4"),
         (lambda: dvi.Composition(PAIR, order=13), ValueError, "from 1 to 12"),
-        (lambda: dvi.Composition(PAIR, base=dvi.RungeKutta4()), ValueError, "have an inverse step"),
+        (lambda: dvi.Composition(PAIR, base=dvi.RungeKutta4()), ValueError, "with an inverse step"),
         (lambda: dvi.Composition(PAIR, base=dvi.TypeII), TypeError, "base must be a method"),
         (lambda: dvi.Yoshida(4, base=4), TypeError, "base must be a method"),
-        (lambda: dvi.Strang(base=dvi.RungeKutta4()), ValueError, "have an inverse step"),
-        (lambda: dvi.Adjoint(dvi.RungeKutta4()), ValueError, "have an inverse step"),
+        (lambda: dvi.Strang(base=dvi.RungeKutta4()), ValueError, "with an inverse step"),
+        (lambda: dvi.Adjoint(dvi.RungeKutta4()), ValueError, "with an inverse step"),
         (lambda: dvi.Adjoint(dvi.TypeII), TypeError, "method must be a method"),
     ],
 )  # fmt: skip

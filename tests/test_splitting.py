@@ -305,17 +305,17 @@ def test_gradients_by_all_adjoints():
 def test_bad_parts_and_schemes_are_refused():
     with pytest.raises(ValueError, match="two or more"):
         dvi.Split([quartic])
-    with pytest.raises(ValueError, match="one entry for each"):
+    with pytest.raises(ValueError, match="one entry, a function or None"):
         dvi.Split([quartic, quartic], flows=[None])
-    with pytest.raises(ValueError, match="has a known flow"):
+    with pytest.raises(ValueError, match="without a known flow"):
         dvi.Split([flows.Kepler(), quartic], perturbed=0)
     with pytest.raises(ValueError, match="t1 − t0"):
         dvi.Split([dvi.discretise(lambda t, q, p, args: q @ q, order=2), quartic])
-    with pytest.raises(ValueError, match=r"unknown generalised orders \(7, 3\)"):
+    with pytest.raises(ValueError, match=r"generalised orders.*got \(7, 3\)"):
         dvi.Splitting((7, 3))
     with pytest.raises(TypeError, match="must be a composition"):
         dvi.Splitting(dvi.GaussLegendre(2))
-    with pytest.raises(TypeError, match="requires a system with known parts"):
+    with pytest.raises(TypeError, match=r"requires dvi.System\(dvi.Split"):
         end(dvi.Splitting(), 0.1, 2, dvi.System(quartic))
     forced = dvi.System(SPLIT.H_D, force=lambda t0, t1, q0, p1, args: -q0)
     with pytest.raises(ValueError, match="requires two parts"):
@@ -336,7 +336,7 @@ def test_a_flow_of_another_hamiltonian_is_refused():
         end(dvi.Splitting(), 0.1, 5, make(right), eps=0.1), end(dvi.Splitting(), 0.1, 5, eps=0.1)
     )
     for wrong in (lambda h, q, p, a: (q, p + h * q**3), lambda h, q, p, a: (q, 2 * p)):
-        with pytest.raises(ValueError, match="flow of part 1 of Split is not that"):
+        with pytest.raises(ValueError, match="flow of part 1 of Split must be that"):
             end(dvi.Splitting(), 0.1, 5, make(wrong), eps=0.1)
 
 

@@ -30,8 +30,8 @@ def out_of_bounds(program: ClosedJaxpr) -> Iterator[tuple[int, int]]:
         zip(program.jaxpr.constvars, program.consts, strict=True)
     )
 
-    def value(x: Any) -> np.ndarray | None:
-        constant = x.val if isinstance(x, Literal) else constants.get(x)
+    def value(atom: Any) -> np.ndarray | None:
+        constant = atom.val if isinstance(atom, Literal) else constants.get(atom)
         try:
             array = None if constant is None else np.asarray(constant)
         except Exception:  # a traced constant has no value

@@ -71,7 +71,7 @@ class PicardThenNewton(RootSolver):
 
     def __check_init__(self):
         if self.newton_up_to is not None:
-            whole("newton_up_to", self.newton_up_to, least=0)
+            whole("newton_up_to", self.newton_up_to, low=0)
         instance("picard", self.picard, Picard, "a dvi.Picard(...)")
         instance("newton", self.newton, Newton, "a dvi.Newton(...)")
 

@@ -5,6 +5,7 @@ from typing import ClassVar
 
 import equinox as eqx
 
+from ..base.checks import one_of
 from ._base import Method
 from ._composition import CompositionMethod, of_strang
 from ._type_ii import TypeII
@@ -15,7 +16,7 @@ from ._type_ii import TypeII
 Tables = Mapping[int, tuple[float, ...]]
 
 
-class Published(CompositionMethod):
+class TabulatedComposition(CompositionMethod):
     """Base of the symmetric compositions whose coefficients are in a table, by order."""
 
     order: int = eqx.field(static=True, default=4)
@@ -25,19 +26,13 @@ class Published(CompositionMethod):
     is_symmetric: ClassVar[bool] = True
 
     def __check_init__(self):
-        if self.order not in self.tables:
-            *others, last = self.tables
-            orders = f"{', '.join(map(str, others))} or {last}" if others else f"{last}"
-            raise ValueError(
-                f"order of {type(self).__name__} must be {orders}, got {self.order!r}. For "
-                "others use dvi.Strang() or dvi.Composition(coefficients, order=...)."
-            )
+        one_of(f"order of {type(self).__name__}", self.order, self.tables)
 
     def fractions(self):
         return self.tables[self.order]
 
 
-class Yoshida(Published):
+class Yoshida(TabulatedComposition):
     r"""Yoshida's compositions of `Strang`, of order 4, 6 and 8.
 
         Ψ_h = S_{γ₁h} ∘ S_{γ₂h} ∘ … ∘ S_{γ₂h} ∘ S_{γ₁h}    of 3, 7 and 15 S
@@ -74,7 +69,7 @@ class Yoshida(Published):
 _GAMMA = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
 
 
-class Suzuki(Published):
+class Suzuki(TabulatedComposition):
     r"""Suzuki's composition of five steps of `Strang`, of order 4.
 
         Ψ_h = S_{γh} ∘ S_{γh} ∘ S_{(1−4γ)h} ∘ S_{γh} ∘ S_{γh},    γ = 1/(4 − 4^{1/3}) ≈ 0.41
@@ -95,7 +90,7 @@ class Suzuki(Published):
 _ROOT = 19.0**0.5
 
 
-class McLachlan(Published):
+class McLachlan(TabulatedComposition):
     r"""McLachlan's optimised compositions, of order 4, 6 and 8.
 
     Order 4 has five pairs of the map with its adjoint of unequal length, coefficients in √19;
@@ -132,7 +127,7 @@ class McLachlan(Published):
     }
 
 
-class KahanLi(Published):
+class KahanLi(TabulatedComposition):
     r"""Kahan and Li's compositions of `Strang`, of order 6 and 8.
 
         Ψ_h = S_{γ₁h} ∘ S_{γ₂h} ∘ … ∘ S_{γ₂h} ∘ S_{γ₁h}    of 9 and 17 S
@@ -179,7 +174,7 @@ def _of_splitting(a: Sequence[float], b: Sequence[float]) -> tuple[float, ...]:
     return (*c, *c[::-1])
 
 
-class BlanesMoan(Published):
+class BlanesMoan(TabulatedComposition):
     r"""Blanes and Moan's optimised compositions, S₆ of order 4 and S₁₀ of order 6.
 
     They were published as splittings, symmetric, with parts e^{a₁hA} e^{b₁hB} e^{a₂hA} …. A

@@ -43,8 +43,7 @@ class RungeKutta4(Method):
     def inverse(self, equations, interval, q1, p1):
         # Callers check `is_invertible` first; only code of a user gets here.
         raise TypeError(
-            "RungeKutta4 has no inverse step. Use another method, such as dvi.Strang(), or "
-            "adjoint=dvi.Checkpointed() for gradients."
+            "RungeKutta4 has no inverse step: use another method, or adjoint=dvi.Checkpointed()."
         )
 
     def needs_no_solve(self, equations, interval, q):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..base.checks import one_of, whole
+from ..base.checks import array, one_of, whole
 from ..base.signature import check_takes
 from ..base.types import Args, Scalar, State
 from ._reductions import Reduction
@@ -158,7 +158,7 @@ class Section(KeptSteps):
         self.skip = whole("skip", skip, 0, hint="It is a number of crossings.")
 
     def __check_init__(self):
-        check_event(self.g, "Section")
+        check_takes("g of Section", self.g, "(t, q, p, args)")
         hint = "1 selects the crossings where g increases, -1 where it decreases, 0 both."
         one_of("direction", self.direction, (1, -1, 0), hint)
 
@@ -228,16 +228,6 @@ def event(
 ) -> Scalar:
     """g at a point, refused unless it is a real scalar that can pass through a value."""
     value = jnp.asarray(g(t, q, p, args))
-    if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
-        hint = "For a condition such as |q| > 2 take the difference |q| − 2."
-        raise ValueError(
-            f"{name} (t, q, p, args) must return a real scalar of a floating-point type, got a "
-            f"value of shape {value.shape} and dtype {value.dtype}. "
-            + (hint if value.shape == () else "Return for example one component of the array.")
-        )
+    hint = "For a condition such as |q| > 2 take the difference |q| − 2."
+    array(f"{name}(t, q, p, args)", value, (), verb="return", hint=hint)
     return value.astype(q.dtype)
-
-
-def check_event(g: Any, owner: str) -> None:
-    """Refuse a g that cannot be called as ``g(t, q, p, args)``."""
-    check_takes(f"g of {owner}", g, "(t, q, p, args)")

@@ -45,8 +45,8 @@ class Reduction(eqx.Module):
         ``memory + self.change(value, k == at)``.
         """
         raise NotImplementedError(
-            f"{type(self).__name__} cannot be differentiated with adjoint=dvi.Reversible(): it has "
-            "no method combine(memory, k, t, value). Define it, or use adjoint=dvi.Checkpointed()."
+            f"{type(self).__name__} has no method combine(memory, k, t, value), as required for "
+            "adjoint=dvi.Reversible(): use adjoint=dvi.Checkpointed()."
         )
 
     @staticmethod
@@ -241,13 +241,13 @@ class Running(eqx.Module):
 
     def __check_init__(self):
         if not (isinstance(self.reduction, Reduction) and self.reduction.has_running_value):
-            text = getattr(self.reduction, "__name__", f"{self.reduction!r:.200}")
+            description = getattr(self.reduction, "__name__", f"{self.reduction!r:.200}")
             raise TypeError(
-                "reduction of Running must be an object such as dvi.Mean(f) or dvi.MEGNO(), got "
-                f"{text}. A function and dvi.Section(...) are not allowed."
+                "reduction of Running must be an object such as dvi.Mean(f), not a function or a "
+                f"dvi.Section, got {description}."
             )
 
 
-def is_observable(x: Any) -> bool:
+def is_observable(leaf: Any) -> bool:
     """Whether x is a leaf of `observe`: a reduction, or a function."""
-    return isinstance(x, Reduction | Running) or callable(x)
+    return isinstance(leaf, Reduction | Running) or callable(leaf)

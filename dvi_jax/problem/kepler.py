@@ -32,10 +32,10 @@ _SHORT = 1e-4
 class _G(NamedTuple):
     """G_n = Xⁿ c_n(β X²) for n = 0, 1, 2, 3, with c_n the functions of Stumpff."""
 
-    zero: Array
-    one: Array
-    two: Array
-    three: Array
+    g0: Array
+    g1: Array
+    g2: Array
+    g3: Array
 
 
 class _Orbit(NamedTuple):
@@ -48,26 +48,26 @@ class _Orbit(NamedTuple):
 
     def time(self, X: Array, g: _G) -> Array:
         """t(X) = r₀ X + η G₂ + ζ G₃, the time at which the universal variable is X."""
-        return self.r0 * X + self.eta * g.two + self.zeta * g.three
+        return self.r0 * X + self.eta * g.g2 + self.zeta * g.g3
 
     def radius(self, g: _G) -> Array:
         """r(X) = dt/dX = r₀ + η G₁ + ζ G₂."""
-        return self.r0 + self.eta * g.one + self.zeta * g.two
+        return self.r0 + self.eta * g.g1 + self.zeta * g.g2
 
     def on_time(self, h: Scalar, X: Array, g: _G) -> _G:
         """The functions at the X where t(X) = h in their own rounding, which differs from the root
         by round-off."""
         # Without it the energy drifts by 3e-19 in each step, since f and g are not of one orbit.
         d = (h - self.time(X, g)) / self.radius(g)
-        return _G(g.zero, g.one + g.zero * d, g.two + g.one * d, g.three + g.two * d)
+        return _G(g.g0, g.g1 + g.g0 * d, g.g2 + g.g1 * d, g.g3 + g.g2 * d)
 
     def correction(self, h: Scalar, X: Array) -> tuple[Array, Array, Array]:
         """The step towards t(X) = h of a method of order four, t(X) − h, and whether the next step
         would be below round-off."""
         g = _universal(X, self.beta)
         past, r = self.time(X, g) - h, self.radius(g)
-        slope = self.eta * g.zero + self.zeta * g.one
-        curve = self.zeta * g.zero - self.beta * self.eta * g.one
+        slope = self.eta * g.g0 + self.zeta * g.g1
+        curve = self.zeta * g.g0 - self.beta * self.eta * g.g1
         newton = -past / r
         step = -past / (r + newton * slope / 2)
         step = -past / (r + step * (slope / 2 + step * curve / 6))
@@ -109,10 +109,10 @@ def change(h: Scalar, q: Array, v: Array, mu: Array) -> tuple[Array, Array, Arra
     )
     g = orbit.on_time(h, X, _universal(X, beta))
     # Increments, not the new state: a small change keeps its digits next to a large coordinate.
-    a = (mu * g.two)[..., None]
+    a = (mu * g.g2)[..., None]
     r, r0 = orbit.radius(g)[..., None], r0[..., None]
-    dq = (h - mu * g.three)[..., None] * v - a / r0 * q
-    dv = -(mu * g.one)[..., None] / (r0 * r) * q - a / r * v
+    dq = (h - mu * g.g3)[..., None] * v - a / r0 * q
+    dv = -(mu * g.g1)[..., None] / (r0 * r) * q - a / r * v
     return dq, dv, is_root
 
 
