@@ -27,13 +27,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ._problem import Adiabatic, Parameter, Problem, gyrates
+from ._problem import Adiabatic, Parameter, Problem, nonzero
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 _HALVINGS = 54
 """Halvings of the interval that contains the mirror point, which give all its digits."""
 
-PARTICLE = {"charge": Parameter(1.0, "e [charge]", gyrates), "mass": Parameter(1.0, "m [mass]")}
+PARTICLE = {"charge": Parameter(1.0, "e [charge]", nonzero), "mass": Parameter(1.0, "m [mass]")}
 
 
 def adiabatic(small: str, smaller: Callable[[float], Problem]) -> dict[str, Adiabatic]:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..base.checks import finite as finite, positive as positive
+from ..base.checks import all_finite, array, finite as finite, positive as positive
 from ..discover.functions.generators import Generator
 from ..discover.symmetries.library import time_translation
 from ..problem.noise import Langevin
@@ -100,9 +100,8 @@ class Problem:
         ):
             for name in set(getattr(self, field_name)) - set(names):
                 raise ValueError(
-                    f"{field_name} of the problem {self.name!r} contains {name!r}, but must have "
-                    f"only names in {kind} ({', '.join(sorted(names)) or 'it has no names'}). "
-                    f"Correct the name, or add {name!r} to {kind}."
+                    f"{field_name} of {self.name!r} must be names in {kind}, {sorted(names)}, got "
+                    f"{name!r}."
                 )
 
 
@@ -177,10 +176,9 @@ def check_shape(q0: Any, p0: Any, fits: Callable[[tuple[int, ...]], bool], rule:
 def parameter(args: Any, name: str) -> Any:
     """The parameter of this name. **Raises** `ParameterError`, with the names that args has."""
     if not isinstance(args, Mapping) or name not in args:
-        keys = ", ".join(map(str, args)) if isinstance(args, Mapping) else ""
+        keys = list(args) if isinstance(args, Mapping) else args
         raise ParameterError(
-            f"the parameter {name} is missing: args must be a dict with the key {name!r}, got "
-            + (f"the keys {keys}." if keys else f"{args!r:.200}.")
+            f"the parameter {name} is missing: args must be a dict with it, got {keys!r:.200}."
         )
     return args[name]
 
@@ -194,10 +192,10 @@ def check_parameter(args: Any, name: str, check: Check) -> None:
         raise ParameterError(str(error)) from None
 
 
-def gyrates(name: str, value: Any) -> None:
-    """A check for the charge of a particle or the strength of a magnetic field."""
+def nonzero(name: str, value: Any) -> None:
+    """A check such as for a charge or a magnetic field, by which a particle gyrates."""
     if finite(name, value) == 0:
-        raise ValueError(f"{name} must not be zero, got {value}: the particle would not gyrate.")
+        raise ValueError(f"{name} must not be zero, got {value}.")
 
 
 def interval(low: float, high: float) -> Check:
@@ -215,17 +213,12 @@ def interval(low: float, high: float) -> Check:
 def vector(size: int) -> Check:
     """A check for `size` finite numbers."""
 
-    def check(name: str, array_like: Any) -> None:
+    def check(name: str, value: Any) -> None:
         try:
-            value = np.asarray(array_like, float)
-        except (TypeError, ValueError) as error:
-            raise ValueError(
-                f"{name} must be an array of {size} numbers, got {array_like!r:.200} ({error})."
-            ) from None
-        if value.shape != (size,):
-            raise ValueError(f"{name} must have shape ({size},), got shape {value.shape}.")
-        if not np.isfinite(value).all():
-            raise ValueError(f"{name} must be finite, got {value}.")
+            array(name, np.asarray(value, float), (size,), integers=True)
+        except TypeError as error:
+            raise ValueError(f"{name}: {error}.") from None
+        all_finite(name, value)
 
     return check
 
@@ -293,9 +286,8 @@ class InSlowTime(eqx.Module):
     def __call__(self, t0, t1, q0, p0, q1, p1, args):
         if self.epsilon is None:
             raise ValueError(
-                f"the observable {getattr(self.function, '__name__', 'f')} needs the value of "
-                "epsilon, because its system has slow_time=True. Call observable.bind(system, "
-                "epsilon)(t0, t1, ...), or give the observable in dvi.integrate(observe=...)."
+                f"{getattr(self.function, '__name__', 'f')} needs the value of epsilon, since its "
+                "system has slow_time=True: call its method bind(system, epsilon)."
             )
         return self.function(self.epsilon * t0, self.epsilon * t1, q0, p0, q1, p1, args)
 

@@ -6,6 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from ..base.checks import array, require
 from ..discover.functions.generators import Generator
 from ..discover.symmetries.library import rotation, scaling, space_translation, time_translation
 from ..problem.system import System
@@ -60,12 +61,8 @@ def energy_of(q0, p1, args, softening=None):
 def masses_of(q, args):
     """The masses as an array. **Raises** `ValueError` where q has not as many bodies."""
     masses = jnp.asarray(args["masses"], q.dtype)
-    if q.ndim != 2 or masses.shape != q.shape[:1]:
-        raise ValueError(
-            "the N-body system needs positions of shape (bodies, dim) and masses of shape (bodies,)"
-            f", got positions of shape {q.shape} and masses of shape {masses.shape}."
-        )
-    return masses
+    array("positions", q, ("bodies", "dim"), integers=True, empty=True)
+    return array("masses", masses, q.shape[:1], integers=True)
 
 
 energy = at_end(hamiltonian)
@@ -121,11 +118,7 @@ def check_bodies(q0: Any, p0: Any, args: Any, names: Sequence[str] | None = None
         check_parameter(args, "G", finite)
     rule = "q0 and p0 of N bodies must both have shape (bodies, 2) or (bodies, 3)"
     check_shape(q, p, lambda shape: len(shape) == 2 and shape[1] in (2, 3), rule)
-    if masses.shape != q.shape[:1]:
-        raise ValueError(
-            f"masses must have one number for each body in q0, shape {q.shape[:1]}, got shape "
-            f"{masses.shape}."
-        )
+    array("masses", masses, q.shape[:1], integers=True)
 
     def label(i: int) -> str:
         return names[i] if names is not None and len(names) == len(masses) else f"body {i}"
@@ -134,8 +127,8 @@ def check_bodies(q0: Any, p0: Any, args: Any, names: Sequence[str] | None = None
     if bad.any():
         i = int(np.argmax(bad))
         raise ValueError(
-            f"the mass of {label(i)} is {masses[i]}: every mass must be positive and finite. For "
-            "a test particle give a very small mass, such as 1e-20 of the largest."
+            f"the mass of {label(i)} must be positive and finite, got {masses[i]}. For a test "
+            "particle give a very small one."
         )
     separation = np.linalg.norm(q[:, None, :] - q[None, :, :], axis=-1)
     size = np.linalg.norm(q, axis=-1)
@@ -144,8 +137,8 @@ def check_bodies(q0: Any, p0: Any, args: Any, names: Sequence[str] | None = None
     if i.size:
         a, b = int(i[0]), int(j[0])
         raise ValueError(
-            f"{label(a)} and {label(b)} are at the same position {q[a].tolist()} up to "
-            "rounding: their attraction would be infinite. Give them different positions."
+            f"{label(a)} and {label(b)} must have different positions, got {q[a].tolist()} for "
+            "both, up to rounding."
         )
 
 
@@ -192,11 +185,8 @@ def n_body(
     """
     if masses is None and q0 is None and p0 is None:
         masses, q0, p0 = np.ones(3), EIGHT_POSITIONS, EIGHT_MOMENTA
-    state = {"masses": masses, "q0": q0, "p0": p0}
-    if absent := [name for name, x in state.items() if x is None]:
-        raise TypeError(
-            "give all of masses, q0 and p0, or none of them. Missing: " + ", ".join(absent) + "."
-        )
+    hint = "Give all of masses, q0 and p0, or none."
+    require("n_body", {"masses": masses, "q0": q0, "p0": p0}, hint=hint)
     args = {"masses": np.asarray(masses, float), "G": finite("G", G)}
     check_bodies(q0, p0, args)
     return Problem(

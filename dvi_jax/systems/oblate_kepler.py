@@ -77,9 +77,7 @@ def secular_rates(a, e, i, args):
 
 def _above_surface(q, p, args):
     if (r := float(np.linalg.norm(q))) < args["R"]:
-        raise ValueError(
-            f"|q0| must be at least R = {args['R']}, got {r}. This point is inside the planet."
-        )
+        raise ValueError(f"|q0| must be at least R = {args['R']}, of the planet, got {r}.")
 
 
 def oblate_kepler() -> Problem:

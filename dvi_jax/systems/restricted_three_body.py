@@ -47,10 +47,7 @@ def momentum(q, v):
 
 def _mass_fraction(name, mu):
     if not 0 < finite(name, mu) <= 0.5:
-        raise ValueError(
-            f"{name} must satisfy 0 < mu ≤ 1/2, got {mu}. It is the mass of the smaller body "
-            "divided by the total mass."
-        )
+        raise ValueError(f"{name} must satisfy 0 < mu ≤ 1/2, got {mu}.")
 
 
 def lagrange_points(mu):

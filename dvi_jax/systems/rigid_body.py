@@ -123,15 +123,13 @@ def _possible(q, p, args):
     moments = [args["I1"], args["I2"], args["I3"]]
     if 2 * max(moments) > sum(moments):
         raise ValueError(
-            "each moment of inertia must be at most the sum of the other two, got "
-            "I1 = {}, I2 = {}, I3 = {}.".format(*moments)
+            f"I1, I2 and I3 must each be at most the sum of the other two, got {moments}."
         )
     L, G, K = p
     if not (abs(L) < G and abs(K) <= G):
         raise ValueError(
-            f"p0 = (L, G, K) must satisfy |L| < G and |K| ≤ G, got L = {L}, G = {G}, K = {K}. G is "
-            "the magnitude of the angular momentum. L is its component along the third axis of the "
-            "body, and K along the fixed z axis."
+            f"p0 = (L, G, K) must satisfy |L| < G and |K| ≤ G, got {p.tolist()}. G is the magnitude"
+            " of the angular momentum, L and K are components."
         )
 
 

@@ -15,8 +15,8 @@ def _moments(name, value):
     vector(3)(name, value)
     if not 2 * np.max(value) < np.sum(value) or np.min(value) <= 0:
         raise ValueError(
-            f"{name} must be three positive moments of inertia, each smaller than the sum of the "
-            f"other two, got {value}."
+            f"{name} must be three positive moments, each smaller than the sum of the others, got "
+            f"{value}."
         )
 
 

@@ -5,7 +5,7 @@ import numpy as np
 
 from ..discover.symmetries.library import space_translation
 from ._elliptic import first_kind, jacobi, third_kind
-from ._problem import Parameter, Problem, Start, library_problem, over_times
+from ._problem import Parameter, Problem, Start, interval, library_problem, over_times
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -143,10 +143,7 @@ def exact(t, q0, p0, args):
 
 
 def _leans(q, p, args):
-    if not 0 < q[1] < np.pi:
-        raise ValueError(
-            f"θ = q0[1] must satisfy 0 < θ < π, got {q[1]}. Euler's angles are singular at 0 and π."
-        )
+    interval(0.0, np.pi)("q0[1], the angle θ,", q[1])  # Euler's angles are singular at 0 and π
 
 
 def spinning_top() -> Problem:

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..discover.functions.generators import Generator
-from ._problem import Parameter, Problem, Start, gyrates, library_problem, over_times, vector
+from ._problem import Parameter, Problem, Start, library_problem, nonzero, over_times, vector
 
 
 def vector_potential(q, args):
@@ -97,9 +97,9 @@ def uniform_field() -> Problem:
         p0=np.array([0.0, -0.5, 0.2]),
         h=0.1,
         parameters={
-            "charge": Parameter(1.0, "e [charge]", gyrates),
+            "charge": Parameter(1.0, "e [charge]", nonzero),
             "mass": Parameter(1.0, "m [mass]"),
-            "B": Parameter(1.0, "magnetic field along z [mass/(charge time)]", gyrates),
+            "B": Parameter(1.0, "magnetic field along z [mass/(charge time)]", nonzero),
             "E": Parameter(
                 np.array([0.1, 0.0, 0.0]), "electric field [mass length/(charge time²)]", vector(3)
             ),

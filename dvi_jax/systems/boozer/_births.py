@@ -93,8 +93,8 @@ class Births(Seeded):
         density = np.asarray(rate(jnp.asarray(s)) * jnp.ones_like(s)) * mean
         if not np.isfinite(density).all() or (density < 0).any() or not density.any():
             raise ValueError(
-                "rate(s) must be finite and not negative for 0 ≤ s ≤ 1, and positive somewhere, "
-                f"got values from {np.min(density / mean):.3g} to {np.max(density / mean):.3g}."
+                "rate(s) must be finite, not negative and not zero everywhere for 0 ≤ s ≤ 1, got "
+                f"{np.min(density / mean):.3g} to {np.max(density / mean):.3g}."
             )
         midpoints = (density[1:] + density[:-1]) / 2
         fractions = np.concatenate([[0.0], np.cumsum(midpoints) / np.sum(midpoints)])

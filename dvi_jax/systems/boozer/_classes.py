@@ -131,8 +131,8 @@ def classify(extremes: Any) -> np.ndarray:
     margins = np.asarray(extremes, float)
     if margins.ndim == 0 or margins.shape[-1] != 2:
         raise ValueError(
-            "extremes must have the smallest and the largest margin on its last axis, shape "
-            f"(…, 2), got {margins.shape}. Observe boozer.Extremes(centres.trapping)."
+            "extremes must be those of boozer.Extremes(centres.trapping), of shape (…, 2), got "
+            f"shape {margins.shape}."
         )
     low, high = margins[..., 0], margins[..., 1]
     labels = np.full(low.shape, "transitional")

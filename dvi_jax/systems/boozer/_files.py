@@ -141,8 +141,7 @@ def read_geometry(
     f = _surfaces(path, ["bmnc_b", "rmnc_b"], ["zmns_b", "pmns_b", "bmns_b"])
     if "bmns_b" in f.odd:
         raise ValueError(
-            f"{path}: the field is not symmetric under (θ, ζ) → (−θ, −ζ). read_geometry requires "
-            "this symmetry."
+            f"{path}: read_geometry requires the symmetry (θ, ζ) → (−θ, −ζ), got bmns_b."
         )
     tables = {}
     for name, values, factor in (
@@ -166,8 +165,7 @@ def _surfaces(
             variables = {k: np.array(v.data) for k, v in file.variables.items()}
     except TypeError as error:  # of a file in another format
         raise ValueError(
-            f"{path} is not a file of netCDF version 3, the format of booz_xform and of "
-            f"desc.vmec_utils.make_boozmn_output ({error})."
+            f"{path} is not a file of netCDF version 3, as of booz_xform ({error})."
         ) from None
     names = ["nfp_b", "ns_b", "jlist", "ixm_b", "ixn_b", "iota_b", "bvco_b", "buco_b", "phi_b"]
     absent = [name for name in (*names, *even) if name not in variables]
@@ -179,9 +177,8 @@ def _surfaces(
     flux = float(variables["phi_b"][-1]) / (2 * np.pi) if psi_edge is None else psi_edge
     if flux == 0:
         raise ValueError(
-            f"{path}: the toroidal flux phi_b at the edge is 0. Give psi_edge= (its value/2π, with "
-            "its sign), or make the file again: booz_xform writes phi_b if its read_wout is called "
-            "as read_wout(path, True)."
+            f"{path}: the toroidal flux phi_b at the edge is 0. Give psi_edge= (flux/2π, with its "
+            "sign), or call read_wout(path, True) of booz_xform."
         )
     m, n = variables["ixm_b"].astype(int), -variables["ixn_b"].astype(int)
     G, I = variables["bvco_b"][rows], variables["buco_b"][rows]  # noqa: E741

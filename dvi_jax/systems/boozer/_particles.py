@@ -9,13 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ...base.checks import finite, instance, one_of, positive
+from ...base.checks import array, instance, one_of, positive
 from ...observe import Crossings, Section, Stop
 from ...problem.discretise import discretise
 from ...problem.system import System
+from .._problem import nonzero
 from ._bounce import Pitch, SecondInvariant, at_crossings, complete
 from ._classes import Trapping, largest_strength
-from ._field import Field, polynomial
+from ._field import Field, as_numbers, polynomial
 from ._motion import Angles, Breaking, Regular, continuous_hamiltonian, flux, speed_along
 
 # CODATA 2018: e and the electronvolt exactly, and the mass of the alpha particle.
@@ -74,15 +75,11 @@ class GuidingCentres(eqx.Module):
         instance("field", self.field, Field, "a Field, such as boozer.precise_qa()")
         for name in ("energy", "mass"):
             positive(name, getattr(self, name))
-        if finite("charge", self.charge) == 0:
-            raise ValueError("charge must not be zero: neutral particles do not follow the field.")
+        nonzero("charge", self.charge)
         one_of("coordinates", self.coordinates, _CHARTS)
-        shape = self.field.coefficients.shape
-        if self.breaking is not None and np.shape(self.breaking) != shape:
-            raise ValueError(
-                f"breaking must have the shape of field.coefficients, {shape}, got "
-                f"{np.shape(self.breaking)}. Field.split returns such coefficients."
-            )
+        if self.breaking is not None:
+            shape, hint = self.field.coefficients.shape, "Take the result of Field.split."
+            array("breaking", jnp.asarray(self.breaking), shape, integers=True, hint=hint)
 
     @property
     def speed(self) -> float:
@@ -218,9 +215,8 @@ class GuidingCentres(eqx.Module):
         """
         if self.breaking is not None:
             raise ValueError(
-                "trapping requires a complete field, but these GuidingCentres have modes "
-                "`breaking`, whose strength ε is not known here. Use centres.at_epsilon(ε), its "
-                "trapping and its system."
+                "trapping requires a complete field, got one with `breaking` of unknown ε. Use "
+                "centres.at_epsilon(ε)."
             )
         return Trapping(self.chart, largest_strength(self.field))
 
@@ -243,11 +239,6 @@ class _Edge(eqx.Module):
 
 
 def check_range(name: str, value: Any, low: float) -> None:
-    try:
-        numbers = np.asarray(value, float)
-    except (TypeError, ValueError):
-        raise TypeError(
-            f"{name} must be a number or an array of them, got {value!r:.200}."
-        ) from None
+    numbers = as_numbers(name, value)
     if wrong := numbers[~((numbers >= low) & (numbers <= 1))].ravel().tolist():
         raise ValueError(f"{name} must be between {low:g} and 1, got {wrong[0]}.")

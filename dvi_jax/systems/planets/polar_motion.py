@@ -86,8 +86,8 @@ def read_polar_motion(path: str | Path | None = None) -> PolarMotion:
         lines = [(i, line) for i, line in enumerate(file, 1) if line[_FLAG : _FLAG + 1] == "I"]
     if not lines:
         raise ValueError(
-            f"{path.name} has no measured pole positions, because no line has the letter I in "
-            "column 17. Give a file in the format finals2000A that has measured positions."
+            f"{path.name} has no measured pole positions: no line with I in column 17, as in the "
+            "format finals2000A."
         )
     table = np.empty((len(lines), 5))
     for row, (number, line) in zip(table, lines, strict=True):
@@ -95,8 +95,8 @@ def read_polar_motion(path: str | Path | None = None) -> PolarMotion:
             row[:] = [float(line[column]) for column in _COLUMNS]
         except ValueError:
             raise ValueError(
-                f"line {number} of {path.name} is not in the format of finals2000A: "
-                f"{line[:55].rstrip()!r}. Correct or remove this line."
+                f"line {number} of {path.name} is not in the format finals2000A: "
+                f"{line[:55].rstrip()!r}."
             ) from None
     return PolarMotion(*table.T)
 

@@ -16,6 +16,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from ...base.checks import array
 from ..n_body import hamiltonian, masses_of
 from .solar_system import AU_IN_KM
 
@@ -132,12 +133,7 @@ def oblateness(q, args):
     """
     masses, mu = _masses(q, args)
     pole = jnp.asarray(args.get("pole", SUN_POLE), q.dtype)
-    if pole.shape != q.shape[1:]:
-        raise ValueError(
-            f'args["pole"], the axis of the Sun, must have shape {q.shape[1:]} for q of shape '
-            f"{q.shape}, got shape {pole.shape}. The default pole has shape (3,): in the plane, "
-            'add a "pole" of shape (2,) to args.'
-        )
+    array('args["pole"]', pole, q.shape[1:], hint="In the plane it must be given.")
     r = _from_sun(q)
     r2 = jnp.sum(r**2, axis=-1)
     sine_squared = jnp.sum(r * pole[None, :], axis=-1) ** 2 / (r2 * jnp.sum(pole**2))

@@ -38,11 +38,6 @@ def to_at(z: Any) -> np.ndarray:
     return np.asfortranarray(np.moveaxis(np.asarray(z) @ _ORDER, -1, 0))
 
 
-def from_at_coordinates(r: Any) -> np.ndarray:
-    """(x, px, y, py, ζ, δ), shape (…, 6), from pyAT's (x, px, y, py, δ, ct), shape (6, …)."""
-    return np.moveaxis(np.asarray(r), 0, -1) @ _ORDER.T
-
-
 def load(path: str | os.PathLike[str], *, symplectic: bool = False, **options: Any) -> Ring:
     """The ring in a file that pyAT can read; `options` goes to its ``load_lattice``.
 
