@@ -118,10 +118,14 @@ def centres():
     return boozer.GuidingCentres(symmetric, 1e6, breaking=breaking)
 
 
-@jax.jit
 def seen(h, epsilon):
     """Of a trapped, a transitional and a passing orbit: J∥ at their bounces, and margins."""
-    alphas = centres().at_epsilon(epsilon)
+    return _seen(centres(), jnp.asarray(h), jnp.asarray(epsilon))
+
+
+@eqx.filter_jit
+def _seen(alphas, h, epsilon):
+    alphas = alphas.at_epsilon(epsilon)
     q, p, args = alphas.state(*map(jnp.asarray, ([0.4] * 3, [0.0] * 3, [0.1] * 3, PITCH)))
 
     def one(q, p, mu):
