@@ -202,7 +202,8 @@ def test_the_hamiltonian_is_that_of_the_bodies():
 
 
 def turns(ring, size, **options):
-    return dvi.integrate(rings.problem(ring), np.zeros(size), np.zeros(size), 2, **options)
+    zeros = np.zeros(size)
+    return dvi.integrate(rings.problem(ring), zeros, zeros, num_steps=2, **options)
 
 
 ERRORS = [
