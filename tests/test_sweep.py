@@ -17,9 +17,9 @@ from dvi_jax import starts
 from dvi_jax.base.checks import argument_names
 from dvi_jax.sweep import _sweep
 from dvi_jax.sweep.cost import span
-from dvi_jax.sweep.plan import Plan, make_plan
+from dvi_jax.sweep.plan import SweepPlan, make_plan
 from dvi_jax.sweep.starts import _radical_inverse
-from dvi_jax.sweep.store import Memory
+from dvi_jax.sweep.store import MemorySink
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -159,7 +159,7 @@ def test_threads_compute_in_the_precision_of_the_caller():
     assert 0 < np.abs(one["drift"] - double["drift"]).max() < 1e-5
 
 
-class Busy(Memory):
+class Busy(MemorySink):
     """Another process has claimed every third task, and finishes one of them."""
 
     def __init__(self, plan, variables):
@@ -167,17 +167,17 @@ class Busy(Memory):
         self.claims: list[int] = []
 
     @contextlib.contextmanager
-    def claimed(self, task):
+    def claim(self, task):
         first = task.number not in self.claims
         self.claims.append(task.number)
         if first and task.number == 6:
-            self.arrays["status"][task.box], self._done = 0, {*self._done, 6}
+            self.arrays["status"][task.box], self._done_tasks = 0, {*self._done_tasks, 6}
         yield not (first and task.number % 3 == 0)
 
 
 @pytest.mark.slow
 def test_tasks_that_others_leave_unfinished_are_computed(monkeypatch):
-    monkeypatch.setattr(_sweep, "Memory", Busy)
+    monkeypatch.setattr(_sweep, "MemorySink", Busy)
     seen = []
     found = sweep(epsilon=np.linspace(0, 0.1, 100), lanes_per_task=10, progress=seen.append)
     assert found.is_complete
@@ -231,8 +231,8 @@ def test_the_first_report_does_not_wait_for_a_list_of_tasks(in_store, tmp_path, 
         seen.append(progress)
         raise FirstReportError
 
-    seen, made, make = [], [], Plan.task
-    monkeypatch.setattr(Plan, "task", lambda self, i: made.append(i) or make(self, i))
+    seen, made, make = [], [], SweepPlan.task
+    monkeypatch.setattr(SweepPlan, "task", lambda self, i: made.append(i) or make(self, i))
     store = tmp_path / "s.zarr" if in_store else None
     with pytest.raises(FirstReportError):
         sweep(start=starts.Random(100_000, (Q, P), (Q, P)), num_steps=3, lanes_per_task=1,
@@ -425,19 +425,19 @@ E = {"epsilon": [0.1]}
     [
         ({}, ValueError, "nothing varies"),
         ({"epsilon": [0.1, np.nan]}, ValueError, r"got nan at index \[1\]"),
-        ({"epsilon": ["a"]}, TypeError, "epsilon must be numbers"),
+        ({"epsilon": ["a"]}, TypeError, "each value of epsilon"),
         ({"epsilon": []}, ValueError, "no values"),
         ({"epsilon": np.zeros((2, 2))}, ValueError, r"epsilon must be .* shape \(2, 2\)"),
         ({"epsilon": dvi.Axis("save", [0.1])}, ValueError, "the axis 'save' has a reserved name"),
-        (E | {"observe": None}, ValueError, "nothing to store"),
-        (E | {"num_steps": None}, ValueError, "num_steps is missing"),
+        (E | {"observe": None}, ValueError, "observe, save and stop"),
+        (E | {"num_steps": None}, ValueError, "num_steps must be"),
         (E | {"store": 3}, TypeError, "path of a directory"),
         (E | {"observe": {"status": energy}}, ValueError, "'status' has a reserved name"),
-        (E | {"observe": {"epsilon": energy}}, ValueError, "'epsilon' has a reserved name"),
+        (E | {"observe": {"epsilon": energy}}, ValueError, "'epsilon' has the name of an axis"),
         (E | {"threads": 0}, ValueError, "threads must be"),
         (E | {"lanes_per_task": 1.5}, ValueError, "lanes_per_task must be"),
         (E | {"progress": 3}, TypeError, "progress must be"),
-        (E | {"units": {"drft": "J"}}, ValueError, "units has the unknown name 'drft'"),
+        (E | {"units": {"drft": "J"}}, ValueError, "each name in units must be"),
         (E | {"units": "J"}, TypeError, "units must be a dict"),
         ({"method": [dvi.TypeII(), "Strang"]}, TypeError, "of method must be a dvi.Method, got 'S"),
         (E | {"start": 3}, TypeError, "one of dvi.starts"),
@@ -454,12 +454,12 @@ E = {"epsilon": [0.1]}
         (
             {"epsilon": dvi.Axis("a", [0.1]), "h": dvi.Axis("a", [0.1, 0.2])},
             ValueError,
-            "length 1 in epsilon, but 2 in h",
+            "1 values in epsilon and 2 in h",
         ),
         (
             {"num_steps": dvi.Axis("n", [2, 3]), "save": dvi.Save(every=1)},
             ValueError,
-            "must have the same shape",
+            "must have one shape and dtype",
         ),
         ({"start": starts.Random(10**12, LOW, HIGH)}, ValueError, r"GiB of memory.*give store="),
     ],
@@ -481,14 +481,14 @@ def test_sweep_and_sweep_cost_list_their_keywords():
     ("make", "error", "message"),
     [
         (lambda: dvi.Axis("no name", [1.0]), ValueError, "identifier"),
-        (lambda: dvi.Axis("a", 3.0), TypeError, "requires a list or array"),
-        (lambda: dvi.Axis("a", np.asarray(3.0)), ValueError, "sequence"),
+        (lambda: dvi.Axis("a", 3.0), TypeError, "must be a list or array"),
+        (lambda: dvi.Axis("a", np.asarray(3.0)), ValueError, "must be a list"),
         (lambda: starts.Random(0, LOW, HIGH), ValueError, "count"),
-        (lambda: starts.Random(3, HIGH, LOW), ValueError, "low of Random must not be greater"),
+        (lambda: starts.Random(3, HIGH, LOW), ValueError, "low of Random must not exceed"),
         (lambda: starts.Random(3, [0.0], HIGH), TypeError, "a pair"),
-        (lambda: starts.Random(3, LOW, ([1.0], [0.0])), ValueError, "must have the same shape"),
+        (lambda: starts.Random(3, LOW, ([1.0], [0.0])), ValueError, "must have one shape"),
         (lambda: starts.Halton(3, LOW, HIGH, seed=-1), ValueError, "seed"),
-        (lambda: starts.Normal(3, [0.0], [0.0], (-1.0, 0.0)), ValueError, "not be negative"),
+        (lambda: starts.Normal(3, [0.0], [0.0], (-1.0, 0.0)), ValueError, "sigma of Normal"),
         (lambda: starts.Normal(3, [0.0], [0.0], 1.0), TypeError, "sigma of Normal must be a pair"),
         (lambda: starts.EnergyShell(3, 1.0, 1.0, [0.0], [1.0]), TypeError, "H of EnergyShell"),
         (lambda: starts.EnergyShell(3, energy, np.inf, [0.0], [1.0]), ValueError, "finite"),

@@ -125,7 +125,7 @@ def test_the_scheduler_is_lost(tmp_path):
             process.wait()
     done = dvi.open_sweep(path).tasks_done
     assert 8 <= done < 60
-    files = [Store.open(path).record_path(i) for i in Store.open(path).done()]
+    files = [Store.open(path).record_path(i) for i in Store.open(path).done_tasks()]
     before = [file.stat().st_mtime_ns for file in files]
     same(sweep(path, 60), sweep(None, 60))
     assert [file.stat().st_mtime_ns for file in files] == before

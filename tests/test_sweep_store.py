@@ -284,7 +284,7 @@ def test_a_missing_file_is_not_read_as_results(copy, tmp_path, expected):
         (tmp_path / "gone").rename(file)
     assert not refused.keys() & set(of_task)
     assert {f.relative_to(copy).parts[0] for f in refused} == {"epsilon", "start", "zarr.json"}
-    assert all(re.search("Restore the file|writes them again", said) for said in refused.values())
+    assert all(re.search("restore it from|writes it again", said) for said in refused.values())
 
 
 @pytest.mark.parametrize("damage", ["removed", "cut", "flipped"])
@@ -297,7 +297,7 @@ def test_a_damaged_coordinate_is_an_error_and_written_again(copy, finished, dama
         file.unlink()
         if damage == "cut":
             file.write_bytes(content)
-    with pytest.raises(dvi.StoreError, match=r"the coordinate 'epsilon' .*Call dvi.sweep again"):
+    with pytest.raises(dvi.StoreError, match=r"the coordinate 'epsilon' .*The same call"):
         dvi.open_sweep(copy)
     sweep(copy)
     assert file.read_bytes() == (finished / "epsilon" / "c" / "0").read_bytes()
@@ -331,12 +331,12 @@ def test_an_edited_description_is_an_error_and_loses_nothing(copy):
         meta.write_text(json.dumps(content))
         with pytest.raises(dvi.StoreError) as error:
             dvi.open_sweep(copy)
-        assert re.search(r"zarr\.json .*edited.* Restore the file", str(error.value)), what
+        assert re.search(r"zarr\.json .* restore it from a backup", str(error.value)), what
     content = json.loads(sound)
     content["attributes"]["dvi_jax_sweep"] = 99
     for text, message in (
-        (json.dumps(content), "format 99, but this version .* only format 1"),
-        (sound.replace('\\"k\\"', '\\"K\\"', 1), "damaged or was edited"),
+        (json.dumps(content), "format 99, but must have 1"),
+        (sound.replace('\\"k\\"', '\\"K\\"', 1), "config does not match config_sha256"),
         (sound[:100], "does not describe a sweep"),
     ):
         meta.write_text(text)
@@ -349,7 +349,7 @@ def test_an_edited_description_is_an_error_and_loses_nothing(copy):
 def test_a_lost_description_comes_from_a_new_store_of_the_same_call(copy, tmp_path, expected):
     (copy / "zarr.json").unlink()
     for use in (dvi.open_sweep, sweep):
-        with pytest.raises(dvi.StoreError, match=r"was lost\. Restore the file .*copy it from"):
+        with pytest.raises(dvi.StoreError, match=r"lost, .* copy it from a new store"):
             use(copy)
 
     def stop(progress):
@@ -458,16 +458,14 @@ def test_paths_that_are_not_a_store(tmp_path):
         sweep(tmp_path)
     assert (tmp_path / "thesis.txt").read_text() == "all of it"
     for path, use in itertools.product(("a\0b", "x" * 300, "y/" * 3000), (dvi.open_sweep, sweep)):
-        with pytest.raises(
-            dvi.StoreError, match=r"cannot be the path of a store .*Give a valid path"
-        ):
+        with pytest.raises(dvi.StoreError, match=r"cannot be the path of a store"):
             use(f"{tmp_path}/{path}")
 
 
 @pytest.mark.parametrize("key", ["../../x", "a/b"])
 def test_keys_of_args_that_cannot_be_file_names(key, tmp_path):
     axes = {name: dvi.Axis("x", [1.0, 2.0]) for name in (key, "k")}
-    with pytest.raises(ValueError, match="cannot be the name of an array in a store"):
+    with pytest.raises(ValueError, match="cannot be the name of an array"):
         dvi.sweep(sweep_child.SYSTEM, [0.0], [1.0], args=axes, h=0.1, num_steps=2, epsilon=0.0,
                   save=dvi.Save(final=True), store=tmp_path / "s.zarr")  # fmt: skip
     assert not list(tmp_path.iterdir())
