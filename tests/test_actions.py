@@ -340,18 +340,22 @@ def of_one_line(**options):
 @pytest.mark.parametrize(
     ("give", "error", "words"),
     [
-        (lambda: actions(TS, np.cos(TS)), TypeError, "the complex signal q − i p"),
+        (lambda: actions(TS, np.cos(TS)), TypeError, "must be complex"),
         (lambda: actions(TS, np.exp(1j * TS), leftover=0), ValueError, "finite number, got 0"),
         (lambda: actions(TS, np.exp(1j * TS), num=0), ValueError, "at least 1, got 0"),
         (lambda: fundamental_frequencies(TS), TypeError, "a result of dvi.frequencies"),
         (lambda: of_one_line(order=0), ValueError, "at least 1"),
         (lambda: of_one_line(guess=[np.nan]), ValueError, "finite"),
         (lambda: of_one_line(tolerance=0), ValueError, "positive"),
-        (lambda: of_one_line(threshold=2), ValueError, "a fraction"),
+        (lambda: of_one_line(threshold=2), ValueError, "at most 1"),
         (lambda: of_one_line(tolerance="a"), ValueError, "got 'a'"),
         (lambda: of_one_line(guess="a"), ValueError, "finite.*'a'"),
         (lambda: actions(TS, np.exp(1j * TS), leftover="a"), ValueError, "finite number, got 'a"),
-        (lambda: actions(TS, np.zeros((0, 256), complex), count=4), ValueError, "at least one deg"),
+        (
+            lambda: actions(TS, np.zeros((0, 256), complex), count=4),
+            ValueError,
+            "degrees of freedom",
+        ),
         (lambda: jax.jit(lambda z: actions(TS, z))(TS + 0j), ValueError, "outside of jit"),
     ],
 )

@@ -159,7 +159,7 @@ def test_epsilon_that_is_traced():
     [
         ({"g": lambda t, q, p, args: q[0] - 9}, "never_crossed", "g.*has one sign"),
         ({"skip": 100}, "never_crossed", "a smaller skip"),
-        ({"crossings": 50}, "too_few_crossings", "with [0-9]+ of 50 crossings.*Take more steps"),
+        ({"crossings": 50}, "too_few_crossings", "50 times .* [0-9]+ crossings, .*Take more steps"),
     ],
 )
 @pytest.mark.slow
@@ -186,7 +186,7 @@ def test_an_orbit_that_escapes_does_not_change_others():
     stopped = section(q, p, throw=False, stop=escape)
     assert list(stopped.status) == ["successful", "stopped", "successful"]
     with pytest.raises(
-        dvi.SectionError, match=r"1 of 3 orbits .* orbit 1, .* failed; .* its run is not_fi"
+        dvi.SectionError, match=r"1 of 3 orbits .* orbit 1: .* failed, .* run not_fi"
     ):
         section(q, p)
 
@@ -207,7 +207,7 @@ def diagram(q, p, **options):
         (lambda q, p: section(q, p, num_steps=0), "num_steps must be an integer of at least 1"),
         (
             lambda q, p: section(q, p, epsilon=[0.0, 0.1]),
-            "one number for each orbit in q0.*got length 2",
+            "orbits in q0, got length 2",
         ),
         (lambda q, p: section(q, p, skip=-1), "skip must be an integer"),
         (lambda q, p: section(q, p, crossings=0), "crossings must be an integer of at least 1"),
@@ -218,7 +218,7 @@ def diagram(q, p, **options):
         (lambda q, p: section(0.0, 0.0), r"orbits along the first axis.*got shape \(\)"),
         (lambda q, p: section(q, p, crosings=3), "argument 'crosings'. Did you mean 'crossings'"),
         (lambda q, p: dvi.poincare_section(HENON.system, q, p, plane, h=1), "num_steps"),
-        (lambda q, p: diagram(q, p, epsilon=0.1), "requires a parameter that varies"),
+        (lambda q, p: diagram(q, p, epsilon=0.1), "requires an array for epsilon"),
         (lambda q, p: diagram(q, p, epsilon=[0.0, np.nan]), "epsilon must be finite, got .*nan"),
         (lambda q, p: diagram(q, p, epsilon=[[0.0]]), "1-D array, got shape"),
         (lambda q, p: diagram(q, p, folow=True), "has no argument 'folow'. Did you mean 'follow'"),
