@@ -9,26 +9,19 @@ from typing import Any, Unpack
 import jax
 import numpy as np
 
-from lanewise.jaxprs.jaxapi import ClosedJaxpr
-
 from ..base.checks import instance, one_of, whole
 from ..base.keywords import checked_keywords
-from ..base.machine import machine_memory
 from ..problem.system import System
 from .axes import axes_in, is_axis
 from .bar import progress_display
 from .cost import SweepCost, cost
 from .identity import description, digest, provenance
-from .plan import make_plan
-from .program import Sweep, SweepProgram, trace
+from .program import Sweep
 from .request import Request, SweepCostSettings, SweepSettings
 from .result import SweepResult
 from .store import MemorySink, Store
-from .variables import Variable, check_names, own_dims, variables
+from .variables import check_names, own_dims
 from .workers import SweepProgress, run_here
-
-_SHARE = 0.5
-"""Fraction of the memory of the machine that results in memory may take."""
 
 _MANY_STARTS = 100_000
 """Number of initial conditions up to which they are written into the result."""
@@ -104,7 +97,7 @@ def sweep(
     # {'epsilon': 3, 'p_x': 2} {'successful': 6}
     ```
     """
-    program, arrays, programs = prepare(Request(system, q0, p0, **settings))
+    program, arrays, programs = Request(system, q0, p0, **settings).prepare()
     definition, coordinates = program.sweep, coordinates_of(program.sweep)
     check_names(definition.dims, arrays, coordinates)
     attributes: dict[str, Any] = provenance()
@@ -120,7 +113,6 @@ def sweep(
             raise ValueError(f"threads={threads} has no effect with client: leave it out.")
     config = description(definition, program.plan, arrays, programs)
     if store is None:
-        _check_memory(program.plan.lanes * sum(array.bytes for array in arrays.values()))
         sink = MemorySink(program.plan, arrays)
         attributes |= {"config": json.dumps(config), "config_sha256": digest(config)}
     else:
@@ -159,7 +151,7 @@ def sweep_cost(
     """
     names = [field.name for field in dataclasses.fields(Request)]
     options: dict[str, Any] = {name: x for name, x in settings.items() if name in names}
-    program, arrays, _ = prepare(Request(system, q0, p0, **options))
+    program, arrays, _ = Request(system, q0, p0, **options).prepare()
     return cost(program.sweep, program.plan, arrays)
 
 
@@ -169,30 +161,6 @@ def _checked_units(units: Any, names: Iterable[str]) -> dict[str, str]:
         instance(f"the unit of {name!r}", unit, str, 'text, such as "J"')
         one_of("each name in units", name, names)
     return dict(units)
-
-
-def _check_memory(size: int) -> None:
-    """**Raises** `ValueError` if the results are too large for the memory of the machine."""
-    memory = machine_memory()
-    available = memory or 8 * 2**30
-    if size > _SHARE * available:
-        raise ValueError(
-            f"the results need {size / 2**30:.2f} GiB, more than {_SHARE:.0%} of the "
-            f"{available / 2**30:.2f} GiB of memory{'' if memory else ' (assumed)'}: give "
-            "store=..., a directory."
-        )
-
-
-def prepare(request: Request) -> tuple[SweepProgram, dict[str, Variable], list[ClosedJaxpr]]:
-    """The program of the sweep that is requested, divided into tasks, the variables of its result,
-    and the jaxprs."""
-    definition = request.sweep()
-    shapes, programs = trace(definition)
-    arrays = variables(definition, shapes)
-    size = sum(variable.bytes for variable in arrays.values())
-    grid = definition.dims, definition.compiled_dims, definition.most_steps
-    plan = make_plan(*grid, size, request.lanes_per_task)
-    return SweepProgram(definition, plan), arrays, programs
 
 
 def coordinates_of(definition: Sweep) -> dict[str, Any]:

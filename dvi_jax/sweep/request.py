@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any, TypedDict
 
 from lanewise import Layout
+from lanewise.jaxprs.jaxapi import ClosedJaxpr
 
 from ..base.checks import instance, whole
 from ..base.precision import require_double
@@ -19,9 +20,10 @@ from ..observe.solution import Save
 from ..problem.noise import as_path
 from ..problem.system import System, check_system, of_problem
 from .axes import Axis, as_axis, axes_in, is_axis, lengths
-from .program import Sweep
+from .plan import make_plan
+from .program import Sweep, SweepProgram, trace
 from .starts import Starts
-from .variables import refuse_reserved_name
+from .variables import Variable, refuse_reserved_name, variables
 
 
 class SweepSettings(TypedDict, total=False):
@@ -82,10 +84,16 @@ class Request:
     save: Any = None
     lanes_per_task: int | None = None
 
-    def sweep(self) -> Sweep:
-        """The definition of the sweep. **Raises** `ValueError` or `TypeError` for arguments that
-        define none."""
-        return self._with_defaults()._sweep()
+    def prepare(self) -> tuple[SweepProgram, dict[str, Variable], list[ClosedJaxpr]]:
+        """The program of the sweep, divided into tasks, the variables of its result, and the
+        jaxprs. **Raises** `ValueError` or `TypeError` for arguments that define no sweep."""
+        definition = self._with_defaults()._sweep()
+        shapes, programs = trace(definition)
+        arrays = variables(definition, shapes)
+        size = sum(variable.bytes for variable in arrays.values())
+        grid = definition.dims, definition.compiled_dims, definition.most_steps
+        plan = make_plan(*grid, size, self.lanes_per_task)
+        return SweepProgram(definition, plan), arrays, programs
 
     def _with_defaults(self) -> "Request":
         """The same, with the defaults of a problem of the library."""

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..base.files import TEMPORARY, publish
+from ..base.machine import machine_memory
 from ..base.results import STATUS_NAMES
 from .claims import claim
 from .identity import FORMAT, differences, digest
@@ -28,6 +29,10 @@ from .plan import SweepPlan, SweepTask
 from .variables import Variable
 
 CLAIMS = ".claims"
+
+_SHARE = 0.5
+"""Fraction of the memory of the machine that results in memory may take."""
+
 _RESTORE = (
     "If this is a store, its zarr.json was damaged or lost, but the results are in other files: "
     "restore it from a backup, or copy it from a new store (the same call with another path, "
@@ -53,9 +58,10 @@ class Verification(NamedTuple):
 
 
 class MemorySink:
-    """Results as arrays of the whole grid in memory."""
+    """Results as arrays in memory. **Raises** `ValueError` if they are too large for it."""
 
     def __init__(self, plan: SweepPlan, variables: Mapping[str, Variable]):
+        _check_memory(plan.lanes * sum(variable.bytes for variable in variables.values()))
         self.plan, self.variables = plan, dict(variables)
         self.arrays = {
             name: np.full((*plan.shape, *v.shape), v.fill, v.dtype) for name, v in variables.items()
@@ -352,6 +358,18 @@ class Store:
                     file.unlink()
         sound = len(files) - len(bad)
         return Verification(sound, bad, self.plan.num_tasks - sound)
+
+
+def _check_memory(size: int) -> None:
+    """**Raises** `ValueError` if the results are too large for the memory of the machine."""
+    memory = machine_memory()
+    available = memory or 8 * 2**30
+    if size > _SHARE * available:
+        raise ValueError(
+            f"the results need {size / 2**30:.2f} GiB, more than {_SHARE:.0%} of the "
+            f"{available / 2**30:.2f} GiB of memory{'' if memory else ' (assumed)'}: give "
+            "store=..., a directory."
+        )
 
 
 def _store_path(path: str | os.PathLike) -> Path:
