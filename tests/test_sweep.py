@@ -219,9 +219,9 @@ def test_the_first_report_does_not_wait_for_a_list_of_tasks(in_store, tmp_path, 
     monkeypatch.setattr(SweepPlan, "task", lambda self, i: made.append(i) or make(self, i))
     store = tmp_path / "s.zarr" if in_store else None
     with pytest.raises(FirstReportError):
-        sweep(start=starts.Random(100_000, (Q, P), (Q, P)), num_steps=3, lanes_per_task=1,
+        sweep(start=starts.Random(200_000, (Q, P), (Q, P)), num_steps=3, lanes_per_task=1,
               progress=first, store=store)  # fmt: skip
-    assert seen[0].num_tasks == 100_000
+    assert seen[0].num_tasks == 200_000
     assert len(made) < 10
 
 

@@ -137,12 +137,20 @@ def test_what_changes_numbers_changes_the_description(what):
 
 
 def test_the_code_of_generated_initial_conditions_is_part_of_it(monkeypatch):
+    """And a program that was compiled with another value is not used again."""
+
+    def run():
+        return dvi.sweep(oscillator(), start=Constant(), h=1e-9, num_steps=1, save=FINAL)
+
     kw = {"q0": None, "p0": None, "start": Constant()}
-    before = identity(**kw)
+    before, one = identity(**kw), run()
     monkeypatch.setitem(SCALE, "of starts", 2.0)
     assert differences(before, identity(**kw)) == [
         "program: a function, or a part of the packages, computes something else"
     ]
+    two = run()
+    np.testing.assert_allclose(two["q"] - one["q"], 1.0)
+    np.testing.assert_allclose(two["q0"] - one["q0"], 1.0)
 
 
 SAME = {

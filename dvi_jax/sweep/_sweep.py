@@ -11,12 +11,13 @@ import numpy as np
 
 from ..base.checks import instance, one_of, whole
 from ..base.keywords import checked_keywords
+from ..base.reads import reads
 from ..problem.system import System
 from .axes import axes_in, is_axis
 from .bar import progress_display
 from .cost import SweepCost, cost
 from .identity import description, digest, provenance
-from .program import Sweep
+from .program import Sweep, functions_of, states_of
 from .request import Request, SweepCostSettings, SweepSettings
 from .result import SweepResult
 from .store import MemorySink, Store
@@ -188,8 +189,8 @@ def coordinates_of(definition: Sweep) -> dict[str, Any]:
     start, inputs = definition.start, (definition.inputs["t0"], definition.inputs["args"])
     vary = any(map(is_axis, jax.tree.leaves(inputs, is_leaf=is_axis)))  # with another axis
     if start is not None and start.count <= _MANY_STARTS and not vary:
-        states = jax.jit(jax.vmap(lambda i: start.at(i, *inputs)))(np.arange(start.count))
-        for name, values in zip(("q0", "p0"), map(np.asarray, states[:2]), strict=True):
+        states = states_of(start, *inputs, reads(*functions_of(start)))
+        for name, values in zip(("q0", "p0"), map(np.asarray, states), strict=True):
             all_dims = (start.name, *own_dims("component", values.shape[1:]))
             coordinates[name] = (all_dims, values, {})
     return coordinates

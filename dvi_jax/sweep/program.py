@@ -134,8 +134,20 @@ def lanes_of(sweep: Sweep, task_start: tuple[int, ...], values: Any) -> Lanes:
 
     inputs = jax.tree.map(value_of, dict(sweep.inputs), is_leaf=is_axis)
     method, steps = (sweep.value(x, task_start) for x in (sweep.method, sweep.num_steps))
-    fields = dict(sweep.options), steps, tuple(sweep.of_grid), reads(*sweep.options.values())
+    values_read = reads(*sweep.options.values(), *functions_of(sweep.start))
+    fields = dict(sweep.options), steps, tuple(sweep.of_grid), values_read
     return Lanes(sweep.system, inputs, sweep.start, method, *fields)
+
+
+def functions_of(start: Starts | None) -> tuple[Any, ...]:
+    """What `reads` has to follow for generated initial conditions."""
+    return () if start is None else (start, type(start).at)
+
+
+@eqx.filter_jit
+def states_of(start: Starts, t0: Any, args: Any, values_read: Reads) -> tuple[Any, Any]:
+    """All q0 and p0 of generated initial conditions; compiled again if `values_read` change."""
+    return jax.vmap(lambda i: start.at(i, t0, args))(jnp.arange(start.count))[:2]
 
 
 def _batch(lanes: Lanes, chunk: tuple[int, ...], begin: Any, last: Any) -> dict[str, Any]:
