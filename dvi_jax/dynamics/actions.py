@@ -14,8 +14,8 @@ from .lines import EPS
 from .results import (
     CODE,
     FREQUENCY_RESULTS,
-    WITHOUT_NUMBERS,
     WithStatus,
+    lacks_numbers,
     refuse_traced,
     require_success,
 )
@@ -137,7 +137,7 @@ def actions(
     J, errors = (np.full((len(codes), search.num), np.nan) for _ in range(2))
     residual = np.full(len(codes), np.nan)
     for i in range(len(codes)):
-        if codes[i] in range(1, len(WITHOUT_NUMBERS) + 1):
+        if lacks_numbers(codes[i]):
             continue
         residual[i], action, error, is_accurate = _of_torus(
             combinations[i], is_combination[i], power[i], doubt[i], fraction[i], size[i]

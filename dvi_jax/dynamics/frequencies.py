@@ -20,9 +20,9 @@ from .lines import EPS, LineSettings, SpectralLines, lines_of
 from .results import (
     CODE,
     FREQUENCY_RESULTS,
-    WITHOUT_NUMBERS,
     WithStatus,
     code_of,
+    lacks_numbers,
     require_success,
     with_code,
 )
@@ -199,7 +199,7 @@ def frequency_diffusion(
     best = jnp.where(jnp.any(strong, axis=-1)[..., None], best, 0)
     second = jnp.take_along_axis(omega[1], best, axis=-1)[..., 0]
     rate = jnp.log10(jnp.maximum(jnp.abs((second - first) / first), EPS))
-    code = jnp.where(raw.code < len(WITHOUT_NUMBERS) + 1, raw.code, 0)
+    code = jnp.where(lacks_numbers(raw.code), raw.code, 0)
     code = jnp.where(code[0] != 0, code[0], code[1])
     first, second, rate = (jnp.where(code == 0, x, jnp.nan) for x in (first, second, rate))
     return require_success(FrequencyDiffusion(first, second, rate, with_code(code)), throw)
@@ -223,8 +223,7 @@ def check_count(settings: LineSettings, signal: Array, where: str = "") -> None:
 def _check_samples(signal: Array, fewest: int) -> None:
     if signal.shape[-1] < fewest:
         raise ValueError(
-            f"signal must have at least {fewest} samples, got {signal.shape[-1]}: save more often, "
-            "or run longer."
+            f"signal must have at least {fewest} samples, got {signal.shape[-1]}: save more often."
         )
 
 
@@ -255,17 +254,20 @@ def signals_of(ts: Any, signal: Any) -> tuple[Array, Array, float, int]:
         )
     _check_samples(signal, _FEWEST)
     if not is_traced(ts):
-        rows = np.asarray(ts).reshape(-1, ts.shape[-1])
-        rows = rows[np.isfinite(rows).all(axis=1)]  # other rows get a status
-        uneven = np.asarray(_unevenness(jnp.asarray(rows), eps)) if len(rows) else np.zeros(1)
-        if not (uneven <= 1).all():
-            steps = np.diff(rows[uneven.argmax()])
-            hint = f" ts has dtype {dtype}: give the times in float64." if eps > EPS else ""
-            raise ValueError(
-                f"ts must have equal steps, other than zero, got steps from {steps.min():.17g} to "
-                f"{steps.max():.17g}. Use dvi.Save(every=m) with dvi.Uniform().{hint}"
-            )
+        hint = f" ts has dtype {dtype}: give the times in float64." if eps > EPS else ""
+        _check_steps(np.asarray(ts).reshape(-1, ts.shape[-1]), eps, hint)
     return ts, signal, eps, min(signal.ndim - 1, 1) if state_axes is None else state_axes
+
+
+def _check_steps(ts: np.ndarray, eps: float, hint: str) -> None:
+    ts = ts[np.isfinite(ts).all(axis=1)]  # other rows get a status
+    unevenness = np.asarray(_unevenness(jnp.asarray(ts), eps)) if len(ts) else np.zeros(1)
+    if not (unevenness <= 1).all():
+        steps = np.diff(ts[unevenness.argmax()])
+        raise ValueError(
+            f"ts must have equal steps, other than zero, got steps from {steps.min():.17g} to "
+            f"{steps.max():.17g}. Use dvi.Save(every=m) with dvi.Uniform().{hint}"
+        )
 
 
 def _real_times(name: str, value: Any) -> Array:
@@ -346,7 +348,7 @@ def _analyse_rows(
     if not jnp.iscomplexobj(signal):
         reverse = (h < 0)[..., None]  # Re A e^{iωt} = Re Ā e^{−iωt}
         omega, A = jnp.where(reverse, -omega, omega), 2 * jnp.where(reverse, jnp.conj(A), A)
-    has_no_numbers = (code > 0) & (code <= len(WITHOUT_NUMBERS))
+    has_no_numbers = lacks_numbers(code)
     sure = lines.sure & ~has_no_numbers[..., None]
     frequencies = Frequencies(
         frequencies=jnp.where(sure, omega, jnp.nan),

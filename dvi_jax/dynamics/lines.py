@@ -122,16 +122,12 @@ def _sinc(x: Array) -> tuple[Array, Array, Array]:
     terms = [1.0]
     for j in range(1, 10):
         terms.append(-terms[-1] / ((2 * j) * (2 * j + 1)))
-    series = jnp.polyval(jnp.array(terms[::-1]), z)
-    first = jnp.polyval(jnp.array([2 * j * c for j, c in enumerate(terms)][:0:-1]), z)
-    second = jnp.polyval(
-        jnp.array([2 * j * (2 * j - 1) * c for j, c in enumerate(terms)][:0:-1]), z
-    )
-    return (
-        jnp.where(is_small, series, S),
-        jnp.where(is_small, first * jnp.where(is_small, x, 0.0), S1),
-        jnp.where(is_small, second, S2),
-    )
+    c, k = np.array(terms), 2 * np.arange(10)
+    derivatives = c, (k * c)[1:], (k * (k - 1) * c)[1:]
+    series, first, second = (jnp.polyval(jnp.array(a[::-1]), z) for a in derivatives)
+    first = first * jnp.where(is_small, x, 0.0)
+    pairs = (series, S), (first, S1), (second, S2)
+    return tuple(jnp.where(is_small, a, b) for a, b in pairs)  # pyright: ignore[reportReturnType]
 
 
 def lines_of(z: Array, settings: LineSettings) -> SpectralLines:
@@ -178,22 +174,27 @@ def lines_of(z: Array, settings: LineSettings) -> SpectralLines:
     s, A, is_line, change = (x[1::per_line] for x in (s, A, is_line, change))
     order = jnp.argsort(jnp.where(is_line, -jnp.abs(A), jnp.inf))
     s, A, is_line, change = s[order], A[order] * largest, is_line[order], change[order]
+    sure, code = _reliability(grid, s, is_line, change)
+    code = jnp.where(is_line[0] & (spread > (64 * EPS) ** 2), code, CODE["no_signal"])
+    code = jnp.where(finite, code, CODE["not_finite"])
+    return SpectralLines(s, A, sure, constant, residual, code)
+
+
+def _reliability(grid: _Grid, s: Array, is_line: Array, change: Array) -> tuple[Array, Array]:
+    """Which lines have converged and are resolved, and the code of the status of the signal."""
     is_inaccurate = is_line & ~(jnp.abs(change) <= _CONVERGENCE * np.pi)
-    is_pair = is_line[:, None] & is_line[None, :] & ~np.eye(count, dtype=bool)
+    is_pair = is_line[:, None] & is_line[None, :] & ~np.eye(len(s), dtype=bool)
     is_close = is_pair & (jnp.abs(s[:, None] - s[None, :]) < np.pi)
     is_ambiguous = jnp.any(is_close, axis=1) | (is_line & (jnp.abs(s) < np.pi))  # from the constant
     code = jnp.asarray(0)
     for name, applies in (
         ("not_converged", jnp.any(is_inaccurate)),
         ("unresolved", jnp.any(is_ambiguous)),
-        ("aliased", jnp.abs(s[0]) > 0.9 * N * np.pi / 2),
-        ("window_too_short", ~(jnp.abs(s[0]) > (settings.window + 1) * np.pi)),
-        ("no_signal", ~is_line[0] | ~(spread > (64 * EPS) ** 2)),
-        ("not_finite", ~finite),
+        ("aliased", jnp.abs(s[0]) > 0.9 * grid.N * np.pi / 2),
+        ("window_too_short", ~(jnp.abs(s[0]) > (grid.window + 1) * np.pi)),
     ):
         code = jnp.where(applies, CODE[name], code)
-    sure = is_line & ~is_inaccurate & ~is_ambiguous
-    return SpectralLines(s, A, sure, constant, residual, code)
+    return is_line & ~is_inaccurate & ~is_ambiguous, code
 
 
 def _strongest(grid: _Grid, r: Array, is_real: bool) -> tuple[Array, Array]:

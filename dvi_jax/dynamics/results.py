@@ -104,11 +104,13 @@ NAMES, SECTION_NAMES = (
 CODE = {name: i for i, name in enumerate(NAMES)}
 """The index of a status in `NAMES`."""
 
-WITHOUT_NUMBERS = NAMES[1:6]
-"""Statuses that leave no line."""
-
 code_of: Callable[[Any], Array] = status_code
 """The index of a status in `NAMES`, for each signal of a batch."""
+
+
+def lacks_numbers(code: Any) -> Any:
+    """Whether a status, by its index in `NAMES`, leaves no line: from `not_finite` to `aliased`."""
+    return (code > 0) & (code <= CODE["aliased"])
 
 
 class WithStatus(eqx.Module):

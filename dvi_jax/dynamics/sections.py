@@ -178,7 +178,7 @@ def poincare_section(
                 "condition as q0[None], p0[None].)"
             )
         raise
-    return _require_crossings(orbits, run, settings.get("throw", True))
+    return _require_crossings(orbits, run, settings)
 
 
 @checked_keywords
@@ -220,9 +220,7 @@ def bifurcation(
             f"got {text or 'only numbers'}."
         )
     compute = _one_after_another if follow else _orbits
-    return _require_crossings(
-        compute(run, start, *inputs, counts.pop()), run, settings.get("throw", True)
-    )
+    return _require_crossings(compute(run, start, *inputs, counts.pop()), run, settings)
 
 
 def stroboscope(period: float, phase: float = 0.0) -> Callable[..., Any]:
@@ -329,9 +327,9 @@ def _prepare(
     return run, (t0, q, p), (h, epsilon, args), lengths
 
 
-def _require_crossings(orbits: PoincareSection, run: _SectionRun, throw: bool) -> PoincareSection:
+def _require_crossings(orbits: PoincareSection, run: _SectionRun, settings: SectionSettings) -> Any:
     """The orbits. **Raises** `SectionError` for those with too few crossings, if `throw`."""
-    if not throw:
+    if not settings.get("throw", True):
         return orbits
     is_good = orbits.result == SECTION_RESULTS.successful
     if is_traced(is_good):

@@ -12,9 +12,9 @@ from .frequencies import Frequencies
 from .results import (
     CODE,
     FREQUENCY_RESULTS,
-    WITHOUT_NUMBERS,
     WithStatus,
     code_of,
+    lacks_numbers,
     refuse_traced,
     require_success,
     with_code,
@@ -160,7 +160,7 @@ def tori_of(
     tori, codes = [], []
     for nu, a, status, width in zip(*lines, *signals, strict=True):
         silent = status == CODE["no_signal"]
-        is_hard = (status > 0) & (status <= len(WITHOUT_NUMBERS)) & ~silent
+        is_hard = lacks_numbers(status) & ~silent
         if is_hard.any() or silent.all():
             tori.append(_no_torus(n, count, search.num))
             codes.append(status[is_hard][0] if is_hard.any() else CODE["no_signal"])
