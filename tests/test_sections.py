@@ -55,7 +55,7 @@ def test_ten_thousand_crossings_of_64_orbits():
 @pytest.mark.slow
 def test_crossings_of_many_orbits():
     """They lie in the plane to round-off, upwards, on their energy shell; each orbit is that of
-    `integrate`; `skip` leaves out the first ones; all are drawn."""
+    `integrate`; `skip` leaves out the first ones."""
     q, p = starts(8)
     found = section(q, p, num_steps=8000, crossings=50)
     assert found.qs.shape == (8, 50, 2)
@@ -73,11 +73,6 @@ def test_crossings_of_many_orbits():
     later = section(q, p, num_steps=8000, crossings=20, skip=30)
     assert largest(later.qs - found.qs[:, 30:]) < 1e-9
     assert np.array_equal(later.count, found.count - 30)
-    plot = pytest.importorskip("dvi_jax.plot")
-    for axis in (plot.section(found), plot.bifurcation(np.arange(8.0), found)):
-        assert sum(len(c.get_offsets()) for c in axis.collections) == 8 * 50
-        assert "more often" not in str([t.get_text() for t in axis.figure.findobj(plot.plt.Text)])
-    plot.plt.close("all")
 
 
 def test_crossings_are_those_of_the_flow():
@@ -159,7 +154,7 @@ def test_epsilon_that_is_traced():
     [
         ({"g": lambda t, q, p, args: q[0] - 9}, "never_crossed", "g.*has one sign"),
         ({"skip": 100}, "never_crossed", "a smaller skip"),
-        ({"crossings": 50}, "too_few_crossings", "with [0-9]+ of 50 crossings.*Take more steps"),
+        ({"crossings": 50}, "too_few_crossings", "50 times .* [0-9]+ crossings, .*Take more steps"),
     ],
 )
 @pytest.mark.slow
@@ -186,7 +181,7 @@ def test_an_orbit_that_escapes_does_not_change_others():
     stopped = section(q, p, throw=False, stop=escape)
     assert list(stopped.status) == ["successful", "stopped", "successful"]
     with pytest.raises(
-        dvi.SectionError, match=r"1 of 3 orbits .* orbit 1, .* failed; .* its run is not_fi"
+        dvi.SectionError, match=r"1 of 3 orbits .* orbit 1: .* failed, .* run not_fi"
     ):
         section(q, p)
 
@@ -200,37 +195,32 @@ def diagram(q, p, **options):
     return dvi.bifurcation(HENON.system, q[0], p[0], plane, **options)
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda q, p: section(q, p[:2]), r"the same shape, got \(3, 2\) for q0 and \(2, 2\)"),
-        (lambda q, p: section(q, p, num_steps=0), "num_steps must be an integer of at least 1"),
-        (
-            lambda q, p: section(q, p, epsilon=[0.0, 0.1]),
-            "one number for each orbit in q0.*got length 2",
-        ),
-        (lambda q, p: section(q, p, skip=-1), "skip must be an integer"),
-        (lambda q, p: section(q, p, crossings=0), "crossings must be an integer of at least 1"),
-        (
-            lambda q, p: section(q, p, system=HENON),
-            "be a dvi.System, got .*Problem.*problem.system",
-        ),
-        (lambda q, p: section(0.0, 0.0), r"orbits along the first axis.*got shape \(\)"),
-        (lambda q, p: section(q, p, crosings=3), "argument 'crosings'. Did you mean 'crossings'"),
-        (lambda q, p: dvi.poincare_section(HENON.system, q, p, plane, h=1), "num_steps"),
-        (lambda q, p: diagram(q, p, epsilon=0.1), "requires a parameter that varies"),
-        (lambda q, p: diagram(q, p, epsilon=[0.0, np.nan]), "epsilon must be finite, got .*nan"),
-        (lambda q, p: diagram(q, p, epsilon=[[0.0]]), "1-D array, got shape"),
-        (lambda q, p: diagram(q, p, folow=True), "has no argument 'folow'. Did you mean 'follow'"),
-        (lambda q, p: return_map(HENON), "problem.system"),
-        (lambda q, p: return_map(returns=0), "returns must be an integer"),
-        (lambda q, p: dvi.stroboscope(1.0, np.nan), "phase of a stroboscope must be a finite"),
-        (lambda q, p: dvi.stroboscope(0.0), "period of a stroboscope must be a positive"),
-    ],
-)
-def test_invalid_arguments(make, message):
+BAD = {
+    r"the same shape, got \(3, 2\) for q0 and \(2, 2\)": lambda q, p: section(q, p[:2]),
+    r"first axis.*got shape \(\)": lambda q, p: section(0.0, 0.0),
+    "num_steps must be an integer of at least 1": lambda q, p: section(q, p, num_steps=0),
+    "orbits in q0, got length 2": lambda q, p: section(q, p, epsilon=[0.0, 0.1]),
+    "skip must be an integer": lambda q, p: section(q, p, skip=-1),
+    "crossings must be an integer of at least 1": lambda q, p: section(q, p, crossings=0),
+    "be a dvi.System, got .*Problem.*problem.system": lambda q, p: section(q, p, system=HENON),
+    "'crosings'. Did you mean 'crossings'": lambda q, p: section(q, p, crosings=3),
+    "section requires num_steps": lambda q, p: dvi.poincare_section(HENON.system, q, p, plane, h=1),
+    "bifurcation requires num_steps": lambda q, p: dvi.bifurcation(HENON.system, q, p, plane, h=1),
+    "requires an array for epsilon": lambda q, p: diagram(q, p, epsilon=0.1),
+    "epsilon must be finite, got .*nan": lambda q, p: diagram(q, p, epsilon=[0.0, np.nan]),
+    "1-D array, got shape": lambda q, p: diagram(q, p, epsilon=[[0.0]]),
+    "'folow'. Did you mean 'follow'": lambda q, p: diagram(q, p, folow=True),
+    "system must be .* Problem": lambda q, p: return_map(HENON),
+    "returns must be an integer": lambda q, p: return_map(returns=0),
+    "phase of a stroboscope must be a finite": lambda q, p: dvi.stroboscope(1.0, np.nan),
+    "period of a stroboscope must be a positive": lambda q, p: dvi.stroboscope(0.0),
+}
+
+
+@pytest.mark.parametrize("message", BAD)
+def test_invalid_arguments(message):
     with pytest.raises((ValueError, TypeError), match=message):
-        make(*starts(3))
+        BAD[message](*starts(3))
 
 
 def test_the_error_for_a_single_initial_condition_says_how_to_give_it():
@@ -240,14 +230,11 @@ def test_the_error_for_a_single_initial_condition_says_how_to_give_it():
 
 
 def test_the_keywords_that_are_passed_on_are_known():
-    of_all = {"h", "num_steps", "t0", "epsilon", "args", "method", "root_finder"}
-    of_all |= {"integrator", "throw"}
+    names = {"h", "num_steps", "t0", "epsilon", "args", "method", "root_finder", "integrator"}
     for function in (dvi.poincare_section, dvi.bifurcation, dvi.tangent_map):
-        assert of_all <= set(argument_names(function))
+        assert names | {"throw"} <= set(argument_names(function))
         with pytest.raises(TypeError, match="Did you mean 'method'"):
             function(HENON.system, HENON.q0, HENON.p0, methd=None)
-    with pytest.raises(TypeError, match="requires num_steps="):
-        dvi.bifurcation(HENON.system, HENON.q0, HENON.p0, plane, h=0.1)
 
 
 # --- return maps ------------------------------------------------------------------------------

@@ -11,28 +11,14 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
+from sweep_child import energy, friction, hamiltonian
 
 import dvi_jax as dvi
 from dvi_jax import starts
 from dvi_jax.base.checks import argument_names
-from dvi_jax.sweep import _sweep
+from dvi_jax.sweep import store as stores
 from dvi_jax.sweep.cost import span
-from dvi_jax.sweep.plan import Plan, make_plan
-from dvi_jax.sweep.starts import _radical_inverse
-from dvi_jax.sweep.store import Memory
-
-
-def hamiltonian(t0, t1, q0, p1, args):
-    return 0.5 * p1 @ p1 + args["k"] * (0.5 * q0 @ q0 + 0.25 * jnp.sum(q0**4))
-
-
-def friction(t0, t1, q0, p1, args):
-    return -p1
-
-
-def energy(t0, t1, q0, p0, q1, p1, args):
-    return hamiltonian(t0, t1, q1, p1, args)
-
+from dvi_jax.sweep.plan import SweepPlan, make_plan
 
 SYSTEM = dvi.System(hamiltonian, force=friction, epsilon=0.0)
 OBSERVE = {"drift": dvi.MaxDrift(energy), "mean": dvi.Mean(energy)}
@@ -43,9 +29,7 @@ DEFAULTS = {"h": 0.1, "num_steps": 20, "args": {"k": 1.0}, "observe": OBSERVE, "
 
 
 def sweep(**kw):
-    kw = DEFAULTS | kw
-    if "start" in kw:
-        kw["q0"] = kw["p0"] = None
+    kw = DEFAULTS | ({"q0": None, "p0": None} if "start" in kw else {}) | kw
     return dvi.sweep(SYSTEM, kw.pop("q0"), kw.pop("p0"), **kw)
 
 
@@ -106,12 +90,8 @@ def test_a_sweep_has_the_numbers_of_single_runs(case):
     assert (found.failed_step == -1).all()
     for index, given in checks.items():
         here, one = found.isel(dict(zip(dims, index, strict=True))), single(**given)
-        for ours, theirs in (
-            (here.drift, one.observed["drift"]),
-            (here["mean"], one.observed["mean"]),
-            (here.q, one.qs),
-            (here.t, one.ts),
-        ):
+        for ours, theirs in zip((here.drift, here["mean"], here.q, here.t),
+                                (*one.observed.values(), one.qs, one.ts), strict=True):  # fmt: skip
             near(ours, theirs)
 
 
@@ -139,13 +119,12 @@ def test_observables_without_a_reduction_have_the_saved_steps():
 
 @pytest.mark.slow
 def test_the_bits_do_not_depend_on_the_number_of_threads():
-    results = [
-        sweep(epsilon=np.linspace(0, 0.3, 1000), threads=n, lanes_per_task=128) for n in (1, 2, 3)
-    ]
-    assert results[0].num_tasks == 8
-    for other in results[1:]:
+    grid = {"epsilon": np.linspace(0, 0.3, 1000), "lanes_per_task": 128}
+    one, *others = (sweep(**grid, threads=n) for n in (1, 2, 3))
+    assert one.num_tasks == 8
+    for other in others:
         for name in ("drift", "mean", "status"):
-            np.testing.assert_array_equal(results[0][name], other[name])
+            np.testing.assert_array_equal(one[name], other[name])
 
 
 @pytest.mark.slow
@@ -159,50 +138,43 @@ def test_threads_compute_in_the_precision_of_the_caller():
     assert 0 < np.abs(one["drift"] - double["drift"]).max() < 1e-5
 
 
-class Busy(Memory):
-    """Another process has claimed every third task, and finishes one of them."""
-
-    def __init__(self, plan, variables):
-        super().__init__(plan, variables)
-        self.claims: list[int] = []
-
-    @contextlib.contextmanager
-    def claimed(self, task):
-        first = task.number not in self.claims
-        self.claims.append(task.number)
-        if first and task.number == 6:
-            self.arrays["status"][task.box], self._done = 0, {*self._done, 6}
-        yield not (first and task.number % 3 == 0)
-
-
 @pytest.mark.slow
 def test_tasks_that_others_leave_unfinished_are_computed(monkeypatch):
-    monkeypatch.setattr(_sweep, "Memory", Busy)
-    seen = []
+    """Another process has claimed every third task, and finishes one of them."""
+    claims, seen = [], []
+
+    @contextlib.contextmanager
+    def claim(self, task):
+        first = task.number not in claims
+        claims.append(task.number)
+        if first and task.number == 6:
+            self.commit(task, {"status": 0}, {})
+        yield not (first and task.number % 3 == 0)
+
+    monkeypatch.setattr(stores.MemorySink, "claim", claim)
     found = sweep(epsilon=np.linspace(0, 0.1, 100), lanes_per_task=10, progress=seen.append)
     assert found.is_complete
     assert seen[-1].tasks_done == 10
     assert (np.isnan(found["drift"]) == (np.arange(100) // 10 == 6)).all()
 
 
+DEFAULTS_OF_RUN = {name: DEFAULTS[name] for name in ("h", "num_steps", "args", "observe")}
+
+
 @pytest.mark.slow
 def test_other_numbers_need_no_other_program():
-    traced, counts = [], []
+    traces, counts = [], []
 
-    def watched(t0, t1, q0, p1, args):
-        traced.append(1)
+    def counting(t0, t1, q0, p1, args):
+        traces.append(1)
         return friction(t0, t1, q0, p1, args)
 
-    system = dvi.System(hamiltonian, force=watched, epsilon=0.0)
+    system = dvi.System(hamiltonian, force=counting, epsilon=0.0)
     for h in (0.1, 0.05, 0.02):
-        before = len(traced)
-        args = {"k": 1 + h}
-        dvi.sweep(system, Q, P, **DEFAULTS_OF_RUN | {"h": h, "args": args}, epsilon=[0, h, h / 2])
-        counts.append(len(traced) - before)
+        before, options = len(traces), DEFAULTS_OF_RUN | {"h": h, "args": {"k": 1 + h}}
+        dvi.sweep(system, Q, P, **options, epsilon=[0, h, h / 2])
+        counts.append(len(traces) - before)
     assert counts[1] == counts[2] < counts[0] / 1.5  # those for shapes and the identity
-
-
-DEFAULTS_OF_RUN = {name: DEFAULTS[name] for name in ("h", "num_steps", "args", "observe")}
 
 
 def test_a_failed_trajectory_does_not_change_others():
@@ -231,13 +203,13 @@ def test_the_first_report_does_not_wait_for_a_list_of_tasks(in_store, tmp_path, 
         seen.append(progress)
         raise FirstReportError
 
-    seen, made, make = [], [], Plan.task
-    monkeypatch.setattr(Plan, "task", lambda self, i: made.append(i) or make(self, i))
+    seen, made, make = [], [], SweepPlan.task
+    monkeypatch.setattr(SweepPlan, "task", lambda self, i: made.append(i) or make(self, i))
     store = tmp_path / "s.zarr" if in_store else None
     with pytest.raises(FirstReportError):
-        sweep(start=starts.Random(100_000, (Q, P), (Q, P)), num_steps=3, lanes_per_task=1,
+        sweep(start=starts.Random(200_000, (Q, P), (Q, P)), num_steps=3, lanes_per_task=1,
               progress=first, store=store)  # fmt: skip
-    assert seen[0].num_tasks == 100_000
+    assert seen[0].num_tasks == 200_000
     assert len(made) < 10
 
 
@@ -287,12 +259,9 @@ def test_the_cost_of_a_sweep():
     assert "20 tasks of 10 trajectories" in str(cost)
 
 
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [(0.004, "0.004 s"), (70, "70 s"), (200, "3.33 min"), (1e4, "2.78 h"), (1e9, "31.7 years")],
-)
-def test_times_as_text(seconds, text):
-    assert span(seconds) == text
+def test_times_as_text():
+    texts = ["0.004 s", "70 s", "3.33 min", "2.78 h", "31.7 years"]
+    assert [span(seconds) for seconds in (0.004, 70, 200, 1e4, 1e9)] == texts
 
 
 @pytest.fixture(scope="module", params=["memory", "store"])
@@ -334,39 +303,40 @@ def test_parquet_has_a_row_for_each_trajectory(result, tmp_path):
 # --- generated initial conditions -------------------------------------------------------------
 
 
-def generated(start, count):
-    q, p = jax.vmap(lambda i: start.at(i, 0.0, None))(jnp.arange(count))
+def generated(start, indices):
+    q, p = jax.vmap(lambda i: start.at(i, 0.0, None))(jnp.asarray(indices))
     return np.concatenate([q, p], axis=1)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "error"), [(starts.Random, 0.03), (starts.Halton, 0.002)])
 def test_generated_states_fill_their_box(kind, error):
-    x = generated(kind(4096, LOW, HIGH, seed=3), 4096)
+    x = generated(kind(4096, LOW, HIGH, seed=3), np.arange(4096))
     low, high = np.concatenate(LOW), np.concatenate(HIGH)
     assert ((x >= low) & (x <= high)).all()
     assert (np.abs(x.mean(0) - (low + high) / 2) / np.maximum(high - low, 1)).max() < error
     assert len(np.unique(x[:, 0])) == 4096
-    near(generated(kind(10, LOW, HIGH, seed=3), 10)[7], x[7])
-    assert np.abs(generated(kind(10, LOW, HIGH, seed=4), 10)[7] - x[7]).max() > 1e-3
+    near(generated(kind(10, LOW, HIGH, seed=3), [7])[0], x[7])
+    assert np.abs(generated(kind(10, LOW, HIGH, seed=4), [7])[0] - x[7]).max() > 1e-3
 
 
-def test_radical_inverse_has_the_digits_in_reverse():
-    for base in (2, 3, 7):
-        for n in (1, 5, 48, 12345):
-            digits = [int(d) for d in np.base_repr(n, base)[::-1]]
-            expected = sum(d * base ** -(k + 1.0) for k, d in enumerate(digits))
-            near(_radical_inverse(jnp.asarray(n), base, 12345, jnp.float64), expected)
+def test_halton_points_have_the_digits_in_reverse():
+    """Point i − 1 is the radical inverse of i in the bases 2 and 3, plus a random shift."""
+    indices = np.array([1, 5, 48, 12345])
+    start = starts.Halton(12345, ([0.0], [0.0]), ([1.0], [1.0]))
+    for points, base in zip(generated(start, indices - 1).T, (2, 3), strict=True):
+        digits = [np.base_repr(i, base)[::-1] for i in indices]
+        shifts = (points - [int(text, base) / base ** len(text) for text in digits]) % 1
+        np.testing.assert_allclose(shifts, shifts[0], rtol=0, atol=1e-14)
 
 
 def test_random_states_differ_beyond_32_bits():
-    start = starts.Random(2**40, LOW, HIGH)
-    a, b = (start.at(jnp.asarray(i), 0.0, None)[0] for i in (5, 5 + 2**35))
-    assert np.abs(np.asarray(a - b)).max() > 1e-6
+    a, b = generated(starts.Random(2**40, LOW, HIGH), [5, 5 + 2**35])
+    assert np.abs(a - b).max() > 1e-6
 
 
 def test_normal_states_have_their_spread():
-    x = generated(starts.Normal(20000, [1.0, 2.0], [0.0, 0.0], ([0.1, 0.0], 0.3)), 20000)
+    x = generated(starts.Normal(20000, [1.0, 2.0], [0.0, 0.0], ([0.1, 0.0], 0.3)), range(20000))
     near(x[:, 1], 2.0)
     np.testing.assert_allclose(np.std(x[:, [0, 2, 3]], axis=0), [0.1, 0.3, 0.3], rtol=0.03)
 
@@ -400,106 +370,93 @@ def test_tasks_cover_the_grid_once():
     assert plan.chunk[0] == 1
 
 
-@pytest.mark.parametrize(
-    ("count", "steps", "size", "least", "most"),
-    [
+def test_the_size_of_a_task_depends_on_steps_and_bytes():
+    for count, steps, size, least, most in (
         (10**6, 10_000, 32, 8192, 32768),
         (10**12, 10, 8, 1, 2**17),
         (10**9, 10**9, 8, 256, 256),
         (11, 1000, 8, 11, 11),
         (10**6, 100, 2**20, 1, 64),
-    ],
-)
-def test_the_size_of_a_task_depends_on_steps_and_bytes(count, steps, size, least, most):
-    assert least <= make_plan({"start": count}, 0, steps, size).lanes_per_task <= most
+    ):
+        assert least <= make_plan({"start": count}, 0, steps, size).lanes_per_task <= most
 
 
 # --- errors -----------------------------------------------------------------------------------
 
 
-E = {"epsilon": [0.1]}
+# Others are in `test_mistakes`.
+E, BOX = {"epsilon": [0.1]}, ([0.0], [1.0])
+STEPS = {"h": dvi.Axis("step", [0.1, 0.05]), "num_steps": dvi.Axis("step", [4, 8])}
+GIVEN = {"lattice": dvi.Given([0.0, 0.1]), "h": None}
+VALUE_ERRORS = {
+    "nothing varies": {},
+    r"got nan at index \[1\]": {"epsilon": [0.1, np.nan]},
+    "the axis 'save' has a reserved name": {"epsilon": dvi.Axis("save", [0.1])},
+    "'a b'": lambda: dvi.Axis("a b", [1.0]),
+    "must be a list": lambda: dvi.Axis("a", np.asarray(3.0)),
+    "'status' has a reserved name": E | {"observe": {"status": energy}},
+    "'epsilon' has the name of an axis": E | {"observe": {"epsilon": energy}},
+    "two observables": E | {"observe": {"a.b": energy, "a": {"b": energy}}},
+    "'a/b' cannot be the name": E | {"observe": {"a/b": energy}},
+    r"'\.\./x' cannot be the name": E | {"observe": {"../x": energy}},
+    "'component' has the name of another": {"t0": dvi.Axis("component", X), "save": FINAL},
+    "'h' has the name of another": STEPS | {"observe": {"h": dvi.Last(energy)}},
+    "num_steps must be .* got None": E | {"num_steps": None},
+    "at least 1, got 0": E | {"num_steps": 0},
+    "one shape and dtype": {"num_steps": [2, 3], "save": dvi.Save(every=1)},
+    "leave out the axis of t0": GIVEN | {"t0": [0.0, 1.0], "num_steps": None},
+    "leave out num_steps": GIVEN | E,
+    "threads must be": E | {"threads": 0},
+    "lanes_per_task must be": E | {"lanes_per_task": 1.5},
+    "each name in units must be": E | {"units": {"drft": "J"}},
+    "be given together": E | {"method": METHODS[1], "integrator": dvi.Integrator()},
+    "give both q0 and p0, .* got q0": E | {"p0": None},
+    "give both q0 and p0, .* start": E | {"start": START, "q0": Q, "p0": P},
+    "start has the name of an axis": E | {"start": starts.Random(4, LOW, HIGH, name="epsilon")},
+    "identifier .* 'a/b'": E | {"start": starts.Random(4, LOW, HIGH, name="a/b")},
+    "GiB of memory.*give store=": {"start": starts.Random(10**12, LOW, HIGH)},
+    "count": lambda: starts.Random(0, LOW, HIGH),
+    "low of Random must not exceed": lambda: starts.Random(3, HIGH, LOW),
+    "must have one shape": lambda: starts.Random(3, LOW, ([1.0], [0.0])),
+    "seed": lambda: starts.Halton(3, LOW, HIGH, seed=-1),
+    "sigma of Normal must be zero": lambda: starts.Normal(3, [0.0], [0.0], (-1.0, 0.0)),
+    "energy of EnergyShell": lambda: starts.EnergyShell(3, energy, np.inf, *BOX),
+}
+TYPE_ERRORS = {
+    "must be a list or array": lambda: dvi.Axis("a", 3.0),
+    "path of a directory": E | {"store": 3},
+    "progress must be": E | {"progress": 3},
+    "units must be a dict": E | {"units": "J"},
+    "of method must be a dvi.Method, got 'S": {"method": [dvi.TypeII(), "Strang"]},
+    "one of dvi.starts": E | {"start": 3},
+    "h must be": E | {"h": "x"},
+    r"distributed\.Client": E | {"client": 3},
+    "sweep has no argument 'epsilom'. Did you mean 'epsilon'": E | {"epsilom": 1},
+    "no argument 'newton'. Did you mean 'root_finder'": E | {"newton": None},
+    "high of Random must be a pair": lambda: starts.Random(3, LOW, [0.0]),
+    "sigma of Normal must be a pair": lambda: starts.Normal(3, [0.0], [0.0], 1.0),
+    "H of EnergyShell": lambda: starts.EnergyShell(3, 1.0, 1.0, *BOX),
+}
 
 
 @pytest.mark.parametrize(
-    ("settings", "error", "message"),
-    [
-        ({}, ValueError, "nothing varies"),
-        ({"epsilon": [0.1, np.nan]}, ValueError, r"got nan at index \[1\]"),
-        ({"epsilon": ["a"]}, TypeError, "epsilon must be numbers"),
-        ({"epsilon": []}, ValueError, "no values"),
-        ({"epsilon": np.zeros((2, 2))}, ValueError, r"epsilon must be .* shape \(2, 2\)"),
-        ({"epsilon": dvi.Axis("save", [0.1])}, ValueError, "the axis 'save' has a reserved name"),
-        (E | {"observe": None}, ValueError, "nothing to store"),
-        (E | {"num_steps": None}, ValueError, "num_steps is missing"),
-        (E | {"store": 3}, TypeError, "path of a directory"),
-        (E | {"observe": {"status": energy}}, ValueError, "'status' has a reserved name"),
-        (E | {"observe": {"epsilon": energy}}, ValueError, "'epsilon' has a reserved name"),
-        (E | {"threads": 0}, ValueError, "threads must be"),
-        (E | {"lanes_per_task": 1.5}, ValueError, "lanes_per_task must be"),
-        (E | {"progress": 3}, TypeError, "progress must be"),
-        (E | {"units": {"drft": "J"}}, ValueError, "units has the unknown name 'drft'"),
-        (E | {"units": "J"}, TypeError, "units must be a dict"),
-        ({"method": [dvi.TypeII(), "Strang"]}, TypeError, "of method must be a dvi.Method, got 'S"),
-        (E | {"start": 3}, TypeError, "one of dvi.starts"),
-        (E | {"p0": None}, ValueError, "give both q0 and p0, or only start"),
-        (E | {"h": "x"}, TypeError, "h must be"),
-        (E | {"client": 3}, TypeError, r"distributed\.Client"),
-        (E | {"epsilom": 1}, TypeError, r"sweep has no argument 'epsilom'. Did you mean 'epsilon'"),
-        (E | {"newton": None}, TypeError, "no argument 'newton'. Did you mean 'root_finder'"),
-        (
-            E | {"method": dvi.Strang(), "integrator": dvi.Integrator()},
-            ValueError,
-            "cannot be given together",
-        ),
-        (
-            {"epsilon": dvi.Axis("a", [0.1]), "h": dvi.Axis("a", [0.1, 0.2])},
-            ValueError,
-            "length 1 in epsilon, but 2 in h",
-        ),
-        (
-            {"num_steps": dvi.Axis("n", [2, 3]), "save": dvi.Save(every=1)},
-            ValueError,
-            "must have the same shape",
-        ),
-        ({"start": starts.Random(10**12, LOW, HIGH)}, ValueError, r"GiB of memory.*give store="),
-    ],
+    ("errors", "error"), [(VALUE_ERRORS, ValueError), (TYPE_ERRORS, TypeError)]
 )
-def test_invalid_arguments(settings, error, message):
-    with pytest.raises(error, match=message):
-        sweep(**settings)
+def test_invalid_arguments(errors, error):
+    for message, arguments in errors.items():
+        with pytest.raises(error, match=message):
+            sweep(**arguments) if isinstance(arguments, dict) else arguments()
 
 
 def test_sweep_and_sweep_cost_list_their_keywords():
     for function in (dvi.sweep, dvi.sweep_cost):
-        listed = argument_names(function)
-        assert {*DEFAULTS, "epsilon", "lattice", "start", "save", "store", "units"} <= set(listed)
+        names = set(argument_names(function))
+        assert {*DEFAULTS, "epsilon", "lattice", "start", "save", "store", "units"} <= names
         with pytest.raises(TypeError, match="has no argument 'stor'"):
             function(SYSTEM, Q, P, stor=3)
 
 
-@pytest.mark.parametrize(
-    ("make", "error", "message"),
-    [
-        (lambda: dvi.Axis("no name", [1.0]), ValueError, "identifier"),
-        (lambda: dvi.Axis("a", 3.0), TypeError, "requires a list or array"),
-        (lambda: dvi.Axis("a", np.asarray(3.0)), ValueError, "sequence"),
-        (lambda: starts.Random(0, LOW, HIGH), ValueError, "count"),
-        (lambda: starts.Random(3, HIGH, LOW), ValueError, "low of Random must not be greater"),
-        (lambda: starts.Random(3, [0.0], HIGH), TypeError, "a pair"),
-        (lambda: starts.Random(3, LOW, ([1.0], [0.0])), ValueError, "must have the same shape"),
-        (lambda: starts.Halton(3, LOW, HIGH, seed=-1), ValueError, "seed"),
-        (lambda: starts.Normal(3, [0.0], [0.0], (-1.0, 0.0)), ValueError, "not be negative"),
-        (lambda: starts.Normal(3, [0.0], [0.0], 1.0), TypeError, "sigma of Normal must be a pair"),
-        (lambda: starts.EnergyShell(3, 1.0, 1.0, [0.0], [1.0]), TypeError, "H of EnergyShell"),
-        (lambda: starts.EnergyShell(3, energy, np.inf, [0.0], [1.0]), ValueError, "finite"),
-    ],
-)
-def test_invalid_axes_and_starts(make, error, message):
-    with pytest.raises(error, match=message):
-        make()
-
-
 def test_the_memory_for_results_is_that_of_the_process(monkeypatch):
-    monkeypatch.setattr(_sweep, "machine_memory", lambda: 1000)  # the limit of a container, say
+    monkeypatch.setattr(stores, "machine_memory", lambda: 1000)  # the limit of a container, say
     with pytest.raises(ValueError, match=r"GiB of memory.*give store="):
         sweep(start=starts.Random(100, LOW, HIGH))

@@ -24,9 +24,8 @@ TASKS = 30
 
 @pytest.fixture
 def cluster():
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
-    ) as cluster:
+    options = {"threads_per_worker": 1, "host": "127.0.0.1", "dashboard_address": None}
+    with distributed.LocalCluster(n_workers=2, **options) as cluster:
         yield cluster
 
 
@@ -96,21 +95,17 @@ def test_the_error_of_a_task_is_raised(client, tmp_path):
 
 
 def test_the_scheduler_is_lost(tmp_path):
-    command = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
-    scheduler_file = tmp_path / "scheduler.json"
-    options = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file"]
-    scheduler = subprocess.Popen([*command, *options, str(scheduler_file)])
-    workers = [
-        subprocess.Popen(
-            [sys.executable, "-m", "distributed.cli.dask_worker", "--nthreads", "1", "--no-nanny",
-             "--no-dashboard", "--death-timeout", "5", "--scheduler-file", str(scheduler_file)],
-            env={**os.environ, "PYTHONPATH": os.path.dirname(__file__)},
-        )
-        for _ in range(2)
-    ]  # fmt: skip
-    path = tmp_path / "s.zarr"
+    path, file = tmp_path / "s.zarr", str(tmp_path / "scheduler.json")
+
+    def start(program, options):
+        words = [f"distributed.cli.{program}", *options.split(), "--scheduler-file", file]
+        env = {**os.environ, "PYTHONPATH": os.path.dirname(__file__)}
+        return subprocess.Popen([sys.executable, "-m", *words, "--no-dashboard"], env=env)
+
+    scheduler = start("dask_scheduler", "--host 127.0.0.1 --port 0")
+    workers = [start("dask_worker", "--nthreads 1 --no-nanny --death-timeout 5") for _ in (1, 2)]
     try:
-        with distributed.Client(scheduler_file=str(scheduler_file), timeout=30) as client:
+        with distributed.Client(scheduler_file=file, timeout=30) as client:
             client.wait_for_workers(2, timeout=60)
 
             def kill(p):
@@ -125,7 +120,7 @@ def test_the_scheduler_is_lost(tmp_path):
             process.wait()
     done = dvi.open_sweep(path).tasks_done
     assert 8 <= done < 60
-    files = [Store.open(path).record_path(i) for i in Store.open(path).done()]
+    files = [Store.open(path).record_path(i) for i in Store.open(path).done_tasks()]
     before = [file.stat().st_mtime_ns for file in files]
     same(sweep(path, 60), sweep(None, 60))
     assert [file.stat().st_mtime_ns for file in files] == before

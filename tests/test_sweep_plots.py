@@ -418,9 +418,9 @@ def test_a_store_is_read_in_blocks(tmp_path, monkeypatch):
     small_sweep(epsilon=eps, store=tmp_path / "s", lanes_per_task=100)
     whole = dvi.open_sweep(tmp_path / "s")["drift"]
     read = []
-    get = lazy._Masked._get
+    get = lazy._StoreArray._get
     monkeypatch.setattr(
-        lazy._Masked, "_get", lambda self, key: read.append(get(self, key)) or read[-1]
+        lazy._StoreArray, "_get", lambda self, key: read.append(get(self, key)) or read[-1]
     )
     monkeypatch.setattr(blocks, "BLOCK", 60)
     data = dvi.open_sweep(tmp_path / "s").to_xarray()

@@ -67,11 +67,6 @@ def flip(path: Path, where: int):
     path.write_bytes(content)
 
 
-def write_record(path, task, content):
-    body = json.dumps(content).encode()
-    record(path, task).write_bytes(body + f"\n{zlib.crc32(body):08x}\n".encode())
-
-
 # --- contents ---------------------------------------------------------------------------------
 
 
@@ -198,7 +193,13 @@ def with_record(change):
 
 
 def edited_record(change):
-    return lambda path, task: write_record(path, task, change(Store.open(path).record(task)))
+    """The checksum of the record is right."""
+
+    def damage(path, task):
+        body = json.dumps(change(Store.open(path).record(task))).encode()
+        record(path, task).write_bytes(body + f"\n{zlib.crc32(body):08x}\n".encode())
+
+    return damage, "the record is damaged"
 
 
 OF_SHARDS = (
@@ -212,15 +213,13 @@ OF_RECORDS = (
     with_record(lambda text: b"{}\n0\n"),
     with_record(lambda text: text.replace(b"successful", b"successfuk")),
 )
-EDITED = [(edited_record(change), "the record is damaged") for change in (
-    lambda found: {},
-    lambda found: [],
-    lambda found: found | {"shards": {}},
-    lambda found: found | {"shards": [1]},
-    lambda found: found | {"statuses": {"wonderful": 100}},
-    lambda found: found | {"size": [-3, 25]},
-    lambda found: found | {"task": 4},
-)]  # fmt: skip
+CHANGES = ({"shards": {}}, {"shards": [1]}, {"statuses": {"wonderful": 100}}, {"size": [-3, 25]},
+           {"task": 4})  # fmt: skip
+EDITED = (
+    edited_record(lambda entries: {}),
+    edited_record(lambda entries: []),
+    *(edited_record(lambda entries, change=change: entries | change) for change in CHANGES),
+)
 
 
 @pytest.mark.parametrize("damages", [(*OF_SHARDS, *OF_RECORDS), EDITED], ids=["files", "edits"])
@@ -250,16 +249,13 @@ def test_damage_is_not_read_as_numbers_without_verification(copy, expected):
     file.unlink()
     record(copy, 5).write_bytes(b"")
     found = dvi.open_sweep(copy)
-    with pytest.warns(UserWarning, match=r"for 1 of 11 finished tasks, a file .*drift"):
-        assert found.tasks_done == 10
-    with pytest.warns(UserWarning, match="the same arguments"):
+    with pytest.warns(UserWarning, match=r"for 1 of 11 finished tasks, a file .*drift.*same arg"):
         assert found.status_counts()["not_computed"] == 200
     assert (found["status"][12:16] == -1).all()
     assert np.isnan(found["end"][12:16]).all()
     assert (found["status"][:12] != -1).all()
     with pytest.warns(UserWarning, match="computes them again"):
         same(sweep(copy), expected)
-    assert dvi.open_sweep(copy).is_complete
 
 
 def test_a_missing_file_is_not_read_as_results(copy, tmp_path, expected):
@@ -276,15 +272,14 @@ def test_a_missing_file_is_not_read_as_results(copy, tmp_path, expected):
                 found = dvi.open_sweep(copy)
                 computed = found["status"] >= 0
                 assert computed.sum() == (1100 if file in of_task else 1200)
-                for name in ("drift", "failed_step"):
-                    np.testing.assert_array_equal(found[name][computed], expected[name][computed])
+                np.testing.assert_array_equal(found["drift"][computed], expected["drift"][computed])
                 np.testing.assert_array_equal(found["epsilon"], expected["epsilon"])
         except dvi.StoreError as error:
             refused[file] = str(error)
         (tmp_path / "gone").rename(file)
     assert not refused.keys() & set(of_task)
     assert {f.relative_to(copy).parts[0] for f in refused} == {"epsilon", "start", "zarr.json"}
-    assert all(re.search("Restore the file|writes them again", said) for said in refused.values())
+    assert all(re.search("restore it from|writes it again", said) for said in refused.values())
 
 
 @pytest.mark.parametrize("damage", ["removed", "cut", "flipped"])
@@ -292,12 +287,11 @@ def test_a_damaged_coordinate_is_an_error_and_written_again(copy, finished, dama
     file = copy / "epsilon" / "c" / "0"
     if damage == "flipped":
         flip(file, 12)
+    elif damage == "cut":
+        file.write_bytes(file.read_bytes()[:20])
     else:
-        content = file.read_bytes()[:20]
         file.unlink()
-        if damage == "cut":
-            file.write_bytes(content)
-    with pytest.raises(dvi.StoreError, match=r"the coordinate 'epsilon' .*Call dvi.sweep again"):
+    with pytest.raises(dvi.StoreError, match=r"the coordinate 'epsilon' .*The same call"):
         dvi.open_sweep(copy)
     sweep(copy)
     assert file.read_bytes() == (finished / "epsilon" / "c" / "0").read_bytes()
@@ -323,20 +317,17 @@ def test_an_edited_description_is_an_error_and_loses_nothing(copy):
     """The checksum of the configuration is right each time."""
     meta = copy / "zarr.json"
     sound = meta.read_text()
-    for what, change in EDITS.items():
+    for change in EDITS.values():
         content = json.loads(sound)
         config = json.loads(content["attributes"]["config"])
         change(config, content)
         content["attributes"] |= {"config": json.dumps(config), "config_sha256": digest(config)}
         meta.write_text(json.dumps(content))
-        with pytest.raises(dvi.StoreError) as error:
+        with pytest.raises(dvi.StoreError, match=r"zarr\.json .* restore it from a backup"):
             dvi.open_sweep(copy)
-        assert re.search(r"zarr\.json .*edited.* Restore the file", str(error.value)), what
-    content = json.loads(sound)
-    content["attributes"]["dvi_jax_sweep"] = 99
     for text, message in (
-        (json.dumps(content), "format 99, but this version .* only format 1"),
-        (sound.replace('\\"k\\"', '\\"K\\"', 1), "damaged or was edited"),
+        (sound.replace('"dvi_jax_sweep": 1', '"dvi_jax_sweep": 99'), "format 99, but must have 1"),
+        (sound.replace('\\"k\\"', '\\"K\\"', 1), "config does not match config_sha256"),
         (sound[:100], "does not describe a sweep"),
     ):
         meta.write_text(text)
@@ -349,7 +340,7 @@ def test_an_edited_description_is_an_error_and_loses_nothing(copy):
 def test_a_lost_description_comes_from_a_new_store_of_the_same_call(copy, tmp_path, expected):
     (copy / "zarr.json").unlink()
     for use in (dvi.open_sweep, sweep):
-        with pytest.raises(dvi.StoreError, match=r"was lost\. Restore the file .*copy it from"):
+        with pytest.raises(dvi.StoreError, match=r"lost, .* copy it from a new store"):
             use(copy)
 
     def stop(progress):
@@ -405,10 +396,9 @@ def test_a_task_that_ends_at_any_byte_is_computed_again(
 @pytest.mark.parametrize("how", ["full", "killed"])
 def test_a_store_that_is_not_completely_made_does_not_exist(tmp_path, monkeypatch, how):
     path = tmp_path / "s.zarr"
-    errors = {"full": OSError(28, "No space left on device"), "killed": faults.KilledError()}
 
     def fail(*_):
-        raise errors[how]
+        raise faults.KilledError if how == "killed" else OSError(28, "No space left on device")
 
     with monkeypatch.context() as patched:
         patched.setattr(os, "rename", fail)
@@ -457,17 +447,14 @@ def test_paths_that_are_not_a_store(tmp_path):
     with pytest.raises(dvi.StoreError, match="is not the store of a sweep"):
         sweep(tmp_path)
     assert (tmp_path / "thesis.txt").read_text() == "all of it"
-    for path, use in itertools.product(("a\0b", "x" * 300, "y/" * 3000), (dvi.open_sweep, sweep)):
-        with pytest.raises(
-            dvi.StoreError, match=r"cannot be the path of a store .*Give a valid path"
-        ):
+    for use, path in ((dvi.open_sweep, "a\0b"), (dvi.open_sweep, "x" * 300), (sweep, "y/" * 3000)):
+        with pytest.raises(dvi.StoreError, match=r"cannot be the path of a store"):
             use(f"{tmp_path}/{path}")
 
 
-@pytest.mark.parametrize("key", ["../../x", "a/b"])
-def test_keys_of_args_that_cannot_be_file_names(key, tmp_path):
-    axes = {name: dvi.Axis("x", [1.0, 2.0]) for name in (key, "k")}
-    with pytest.raises(ValueError, match="cannot be the name of an array in a store"):
+def test_keys_of_args_that_cannot_be_file_names(tmp_path):
+    axes = {name: dvi.Axis("x", [1.0, 2.0]) for name in ("../../x", "k")}
+    with pytest.raises(ValueError, match="cannot be the name of an array"):
         dvi.sweep(sweep_child.SYSTEM, [0.0], [1.0], args=axes, h=0.1, num_steps=2, epsilon=0.0,
                   save=dvi.Save(final=True), store=tmp_path / "s.zarr")  # fmt: skip
     assert not list(tmp_path.iterdir())
@@ -484,15 +471,11 @@ def test_claims_exclude_threads_and_end_with_the_context(tmp_path):
 # --- several processes ------------------------------------------------------------------------
 
 
-def child(path, tasks, pause=0.01, cache=None):
-    """A process that computes the sweep; with `cache`, programs are read from there."""
-    env = dict(os.environ)
-    if cache is not None:
-        env |= {
-            "JAX_COMPILATION_CACHE_DIR": str(cache),
-            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-            "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
-        }
+def child(path, tasks, pause, cache):
+    """A process that computes the sweep, with programs that are read from `cache`."""
+    limits = {"COMPILE_TIME_SECS": "0", "ENTRY_SIZE_BYTES": "-1"}
+    env = {f"JAX_PERSISTENT_CACHE_MIN_{name}": value for name, value in limits.items()}
+    env |= {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(cache)}
     command = [sys.executable, str(HERE / "sweep_child.py"), str(path), str(tasks), str(pause)]
     return subprocess.Popen(command, env=env)
 

@@ -8,15 +8,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from lanewise.jaxprs.jaxapi import is_traced
-
 from ..base.checks import positive
 from .frequencies import Frequencies, analyse, check_count, settings_of, signals_of
 from .lines import EPS
-from .results import CODE, FREQUENCY_RESULTS, WITHOUT_NUMBERS, WithStatus, raise_on_failure
-from .torus import FundamentalFrequencies, batched, search_of, tori_of
+from .results import (
+    CODE,
+    FREQUENCY_RESULTS,
+    WithStatus,
+    lacks_numbers,
+    refuse_traced,
+    require_success,
+)
+from .torus import FundamentalFrequencies, as_batch, search_of, tori_of
 
-_STILL = 64 * EPS
+_CONSTANT = 64 * EPS
 """A q or p of which the spread is below this fraction of its size is constant to round-off."""
 
 
@@ -104,14 +109,9 @@ def actions(
     ts, signal, eps, axes = signals_of(ts, signal)
     if not jnp.iscomplexobj(signal):
         raise TypeError(
-            f"signal must be complex, got a real array of shape {signal.shape}. Give the complex "
-            "signal q − i p, of shape (degrees of freedom, times), or only a Solution."
+            f"signal must be complex, q − i p, got a real array of shape {signal.shape}."
         )
-    if is_traced(signal) or is_traced(ts):
-        raise ValueError(
-            "actions must be called outside of jit, vmap and grad, since it uses NumPy, but its "
-            "input is traced by JAX. Call it once, with the whole batch."
-        )
+    refuse_traced("actions", ts, signal)
     # One axis for all degrees of freedom of a trajectory.
     lead, N = signal.shape[: signal.ndim - 1 - axes], signal.shape[-1]
     signal = signal.reshape(*lead, math.prod(signal.shape[len(lead) : -1]), N)
@@ -121,44 +121,34 @@ def actions(
     if leftover != math.inf:
         leftover = positive("leftover", leftover)
     search = search_of(signal.shape[-2], num, guess, order, None, 1e-3)
-    signal, scales, size = _balanced(signal)
+    signal, scales, size = _in_canonical_units(signal)
     lines, raw = analyse(ts, signal, settings, eps, 1)
-    known = lines.frequencies, lines.amplitudes, lines.resolution, raw.amplitudes, raw.code
-    omega, A, resolution, every_A, code = map(np.asarray, known)
+    arrays = lines.frequencies, lines.amplitudes, lines.resolution, raw.amplitudes, raw.code
+    omega, A, resolution, raw_A, code = map(np.asarray, arrays)
     tori, codes = tori_of(omega, A, code, resolution, search, soft=False)
-    _, combinations, _, matched, _ = tori
+    _, combinations, _, is_combination, _ = tori
 
     n = omega.shape[-2]
     power = np.where(np.isfinite(omega), np.abs(A) ** 2, 0.0).reshape(len(codes), n, count)
-    in_doubt = np.abs(every_A.reshape(power.shape)) ** 2
-    in_doubt = np.where(power > 0, 0.0, np.where(np.isfinite(in_doubt), in_doubt, 0.0))
+    doubt = np.abs(raw_A.reshape(power.shape)) ** 2
+    doubt = np.where((power == 0) & np.isfinite(doubt), doubt, 0.0)
     size = np.asarray(size).reshape(len(codes), n)
-    left = np.nan_to_num(np.asarray(lines.residual)).reshape(len(codes), n) ** 2
+    fraction = np.nan_to_num(np.asarray(lines.residual)).reshape(len(codes), n) ** 2
     J, errors = (np.full((len(codes), search.num), np.nan) for _ in range(2))
     residual = np.full(len(codes), np.nan)
     for i in range(len(codes)):
-        if codes[i] in range(1, len(WITHOUT_NUMBERS) + 1):
+        if lacks_numbers(codes[i]):
             continue
-        used = power[i] * matched[i]
-        lost = power[i] - used + in_doubt[i]
-        total = (power[i] + in_doubt[i]).sum(axis=1) / np.maximum(1 - left[i], EPS)
-        rest = left[i] * total + lost.sum(axis=1)
-        over = np.where(size[i] > 0, size[i], np.where(total > 0, total, 1.0))
-        residual[i] = np.sqrt(np.max(rest / over))
+        residual[i], action, error, is_accurate = _of_torus(
+            combinations[i], is_combination[i], power[i], doubt[i], fraction[i], size[i]
+        )
         if codes[i] in (0, CODE["not_quasi_periodic"]):
-            codes[i] = 0 if residual[i] <= leftover else CODE["not_quasi_periodic"]
+            is_quasi_periodic = is_accurate and residual[i] <= leftover
+            codes[i] = 0 if is_quasi_periodic else CODE["not_quasi_periodic"]
         if codes[i] == 0:
-            k = combinations[i]
-            of_lines = np.einsum("jk,jka->a", used, k) / 2
-            gross = np.einsum("jk,jka->a", used, np.abs(k)) / 2
-            largest = np.abs(k * matched[i][..., None]).max(axis=(0, 1)) + 1
-            estimate = largest * rest.sum() / 2 + 1e-14 * gross
-            if (estimate < np.minimum(gross, np.abs(of_lines).max())).all():
-                J[i], errors[i] = of_lines, estimate
-            else:
-                codes[i] = CODE["not_quasi_periodic"]
-    torus = batched(tori, codes, lead)
-    found = Actions(
+            J[i], errors[i] = action, error
+    torus = as_batch(tori, codes, lead)
+    result = Actions(
         actions=J.reshape(*lead, search.num),
         frequencies=np.where(np.isfinite(J.reshape(*lead, search.num)), torus.frequencies, np.nan),
         errors=errors.reshape(*lead, search.num),
@@ -168,24 +158,41 @@ def actions(
         lines=lines,
         result=torus.result,
     )
-    return raise_on_failure(found) if throw else found
+    return require_success(result, throw)
+
+
+def _of_torus(k, is_combination, power, doubt, fraction, size):
+    """The residual, the actions with their errors, and whether these are smaller than the actions.
+
+    - `k`, `is_combination`, `power`: of the lines of each degree of freedom; `doubt`: power of
+      unresolved lines; `fraction`: of the power outside of all lines.
+    """
+    combination_power = power * is_combination
+    total = (power + doubt).sum(axis=1) / np.maximum(1 - fraction, EPS)
+    rest_power = fraction * total + (power - combination_power + doubt).sum(axis=1)
+    scale = np.where(size > 0, size, np.where(total > 0, total, 1.0))
+    action, gross = (np.einsum("jk,jka->a", combination_power, x) / 2 for x in (k, np.abs(k)))
+    largest = np.abs(k * is_combination[..., None]).max(axis=(0, 1)) + 1
+    error = largest * rest_power.sum() / 2 + 1e-14 * gross
+    is_accurate = bool((error < np.minimum(gross, np.abs(action).max())).all())
+    return np.sqrt(np.max(rest_power / scale)), action, error, is_accurate
 
 
 @eqx.filter_jit
-def _balanced(signal: Array) -> tuple[Array, Array, Array]:
+def _in_canonical_units(signal: Array) -> tuple[Array, Array, Array]:
     """q/s − i s p for each q − i p, with s, and 2 rms q rms p, or 0 if one of them is constant."""
 
     def sizes(x):
         largest = jnp.max(jnp.abs(x), axis=-1)
         unit = x / jnp.where(largest > 0, largest, 1.0)[..., None]  # squares cannot overflow
         spread, bend = jnp.std(unit, axis=-1), jnp.std(jnp.diff(unit, 2, axis=-1), axis=-1)
-        return largest, spread, bend, (spread > _STILL) & (bend > 0) & (largest < jnp.inf)
+        return largest, spread, bend, (spread > _CONSTANT) & (bend > 0) & (largest < jnp.inf)
 
-    (top_q, of_q, bend_q, moves_q), (top_p, of_p, bend_p, moves_p) = (
+    (largest_q, spread_q, bend_q, moves_q), (largest_p, spread_p, bend_p, moves_p) = (
         sizes(x) for x in (signal.real, signal.imag)
     )
-    both = moves_q & moves_p
-    s = jnp.where(both, top_q, 1.0) ** 0.5 / jnp.where(both, top_p, 1.0) ** 0.5
-    s = s * jnp.sqrt(jnp.where(both, bend_q, 1.0) / jnp.where(both, bend_p, 1.0))
-    size = jnp.where(both, 2 * (top_q * of_q) * (top_p * of_p), 0.0)
+    is_moving = moves_q & moves_p
+    s = jnp.where(is_moving, largest_q, 1.0) ** 0.5 / jnp.where(is_moving, largest_p, 1.0) ** 0.5
+    s = s * jnp.sqrt(jnp.where(is_moving, bend_q, 1.0) / jnp.where(is_moving, bend_p, 1.0))
+    size = jnp.where(is_moving, 2 * (largest_q * spread_q) * (largest_p * spread_p), 0.0)
     return signal.real / s[..., None] + 1j * s[..., None] * signal.imag, s, size

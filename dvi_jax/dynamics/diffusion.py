@@ -89,7 +89,7 @@ def invariant_diffusion(
         s, _ = system.times(t, t, epsilon)
         none = jnp.zeros(noise.count(s, q, p, args), q.dtype)
 
-        def along(f):
+        def derivative_along(f):
             """(Ḃ, q, p) → the derivative of f along b + Σ_m g_m Ḃ_m."""
 
             def derivative(rates, *z):
@@ -103,18 +103,18 @@ def invariant_diffusion(
             """g_m·∇I, shape (m,)."""
             return jax.grad(rate)(none, *z)
 
-        rate = along(lambda q, p: value(t, q, p, args))
-        second = jnp.trace(jax.jacfwd(along(by_noise))(none, q, p))
+        rate = derivative_along(lambda q, p: value(t, q, p, args))
+        second = jnp.trace(jax.jacfwd(derivative_along(by_noise))(none, q, p))
         return jnp.stack([rate(none, q, p) + second / 2, jnp.sum(by_noise(q, p) ** 2)])
 
-    def end(system, **more):
-        sol = integrate(system, q0, p0, save=Save(final=True), **options, **more)
-        return value(sol.ts[-1], sol.qs[-1], sol.ps[-1], args), sol
+    def end(system, **keywords):
+        solution = integrate(system, q0, p0, save=Save(final=True), **options, **keywords)
+        return value(solution.ts[-1], solution.qs[-1], solution.ps[-1], args), solution
 
     # Without noise the same methods are deterministic ones.
-    rest, orbit = end(dataclasses.replace(system, noise=None), observe=Mean(coefficients))
+    reference, orbit = end(dataclasses.replace(system, noise=None), observe=Mean(coefficients))
     keys = jax.random.split(jax.random.key(seed, impl="threefry2x32"), num_paths)
-    changes = jax.jit(jax.vmap(lambda key: end(system, path=Brownian(key))[0]))(keys) - rest
+    changes = jax.jit(jax.vmap(lambda key: end(system, path=Brownian(key))[0]))(keys) - reference
     duration = orbit.ts[-1] - orbit.ts[0]
     variance = jnp.var(changes, ddof=1)
     spread = (changes - jnp.mean(changes)) ** 2

@@ -16,14 +16,14 @@ from ..base.checks import one_of, whole
 from ..base.inputs import refuse_unit_or_mask
 from ..base.precision import refuse_double_without_x64
 from ..observe.solution import Solution
-from .lines import EPS, Lines, Settings, lines_of
+from .lines import EPS, LineSettings, SpectralLines, lines_of
 from .results import (
     CODE,
     FREQUENCY_RESULTS,
-    WITHOUT_NUMBERS,
     WithStatus,
     code_of,
-    raise_on_failure,
+    lacks_numbers,
+    require_success,
     with_code,
 )
 
@@ -68,13 +68,16 @@ class Frequencies(WithStatus):
         """
         ts = _real_times("ts", ts)
         times, batch = ts.reshape(-1), self.constant.shape
-        there = jnp.isfinite(self.frequencies)
-        omega, A = jnp.where(there, self.frequencies, 0.0), jnp.where(there, self.amplitudes, 0.0)
+        is_line = jnp.isfinite(self.frequencies)
+        omega, A = (
+            jnp.where(is_line, self.frequencies, 0.0),
+            jnp.where(is_line, self.amplitudes, 0.0),
+        )
         phases = omega[..., :, None] * jnp.expand_dims(times, tuple(range(omega.ndim)))
         z = self.constant[..., None] + jnp.sum(A[..., :, None] * jnp.exp(1j * phases), axis=-2)
         code = code_of(self.result)
-        known = (code == CODE["successful"]) | (code == CODE["no_signal"])
-        z = jnp.where(known[..., None], z, jnp.nan).reshape(*batch, *ts.shape)
+        has_numbers = (code == CODE["successful"]) | (code == CODE["no_signal"])
+        z = jnp.where(has_numbers[..., None], z, jnp.nan).reshape(*batch, *ts.shape)
         return z.real if self.is_real else z
 
 
@@ -155,8 +158,7 @@ def frequencies(
     settings = settings_of(count, window, refine)
     ts, signal, eps, state_axes = signals_of(ts, signal)
     check_count(settings, signal)
-    found, _ = analyse(ts, signal, settings, eps, state_axes)
-    return raise_on_failure(found) if throw else found
+    return require_success(analyse(ts, signal, settings, eps, state_axes)[0], throw)
 
 
 def frequency_diffusion(
@@ -184,11 +186,7 @@ def frequency_diffusion(
     ts, signal, eps, _ = signals_of(ts, signal)
     half = signal.shape[-1] // 2
     halves = jnp.stack([signal[..., :half], signal[..., half : 2 * half]])
-    if half < _FEWEST:
-        raise ValueError(
-            f"signal must have at least {2 * _FEWEST} samples ({_FEWEST} in each half), got "
-            f"{signal.shape[-1]}: save more often, or run longer."
-        )
+    _check_samples(signal, 2 * _FEWEST)
     times = jnp.stack([ts[..., :half], ts[..., half : 2 * half]])
     times = times.reshape(2, *(1,) * (halves.ndim - times.ndim), *times.shape[1:])
     check_count(settings, halves, " in each half")
@@ -196,33 +194,36 @@ def frequency_diffusion(
     omega, first = raw.s, raw.s[0, ..., 0]
     size = jnp.abs(raw.amplitudes)
     strong = size[1] >= 0.5 * size[0, ..., :1]
-    away = jnp.where(strong, jnp.abs(omega[1] - first[..., None]), jnp.inf)
-    best = jnp.argmin(away, axis=-1)[..., None]
+    distance = jnp.where(strong, jnp.abs(omega[1] - first[..., None]), jnp.inf)
+    best = jnp.argmin(distance, axis=-1)[..., None]
     best = jnp.where(jnp.any(strong, axis=-1)[..., None], best, 0)
     second = jnp.take_along_axis(omega[1], best, axis=-1)[..., 0]
     rate = jnp.log10(jnp.maximum(jnp.abs((second - first) / first), EPS))
-    code = jnp.where(raw.code < len(WITHOUT_NUMBERS) + 1, raw.code, 0)
+    code = jnp.where(lacks_numbers(raw.code), raw.code, 0)
     code = jnp.where(code[0] != 0, code[0], code[1])
     first, second, rate = (jnp.where(code == 0, x, jnp.nan) for x in (first, second, rate))
-    of = FrequencyDiffusion(first, second, rate, with_code(code))
-    return raise_on_failure(of) if throw else of
+    return require_success(FrequencyDiffusion(first, second, rate, with_code(code)), throw)
 
 
-def settings_of(count: Any, window: Any, refine: Any) -> Settings:
+def settings_of(count: Any, window: Any, refine: Any) -> LineSettings:
     refine = refine.item() if isinstance(refine, np.bool_) else refine
-    return Settings(
+    return LineSettings(
         whole("count", count, hint="It is the number of lines."),
         whole("window", window, 0, 5, hint="It is the power of Hann's window."),
         one_of("refine", refine, (True, False)),
     )
 
 
-def check_count(settings: Settings, signal: Array, where: str = "") -> None:
+def check_count(settings: LineSettings, signal: Array, where: str = "") -> None:
     unknowns, N = 3 if jnp.iscomplexobj(signal) else 6, signal.shape[-1]
-    if unknowns * settings.lines >= N:
+    hint = f"There are {N} samples{where}, and each line has {unknowns} unknowns."
+    whole("count", settings.lines, 1, (N - 1) // unknowns, hint)
+
+
+def _check_samples(signal: Array, fewest: int) -> None:
+    if signal.shape[-1] < fewest:
         raise ValueError(
-            f"count must be at most {(N - 1) // unknowns} for {N} samples{where}, since each line "
-            f"has {unknowns} unknowns, got {settings.lines}. Decrease count, or give more samples."
+            f"signal must have at least {fewest} samples, got {signal.shape[-1]}: save more often."
         )
 
 
@@ -232,11 +233,9 @@ def signals_of(ts: Any, signal: Any) -> tuple[Array, Array, float, int]:
     signals of a `Solution` are q − i p."""
     state_axes = None
     if isinstance(ts, Solution) == (signal is not None):
-        kind = type(ts).__name__
-        seen = f"ts of type {kind} without signal" if signal is None else "a Solution and signal"
+        text = f"only {type(ts).__name__}" if signal is None else "a Solution and a signal"
         raise ValueError(
-            "the arguments must be times and a signal, (ts, signal), or only a Solution, got "
-            f"{seen}. The signal of a Solution is q − i p."
+            f"give (ts, signal), or only a Solution, got {text}. Its signal is q − i p."
         )
     if isinstance(ts, Solution):
         qs, ps = (_double("the solution", x) for x in (ts.qs, ts.ps))
@@ -246,49 +245,35 @@ def signals_of(ts: Any, signal: Any) -> tuple[Array, Array, float, int]:
     dtype: Any = getattr(ts, "dtype", np.dtype(float))
     eps = float(np.finfo(dtype).eps) if dtype.kind == "f" else EPS
     ts, signal = _real_times("ts", ts), _double("signal", signal)
-    if signal.ndim == 0 or ts.ndim == 0 or ts.shape[-1] != signal.shape[-1]:
-        raise ValueError(
-            f"ts and signal must have the same length along their last axis, got shapes {ts.shape} "
-            f"and {signal.shape}. If the first axis of signal is the time, give signal.T."
-        )
+    have_times = 0 not in (ts.ndim, signal.ndim) and ts.shape[-1] == signal.shape[-1]
     sizes = zip(ts.shape[::-1], signal.shape[::-1], strict=False)
-    if ts.ndim > signal.ndim or any(n not in (1, size) for n, size in sizes):
-        both = (
-            f"{ts.shape[-1:]} if all signals have the same times, or of shape {signal.shape} if "
-            "each signal has its own times. Axes of length 1 are broadcast"
-        )
+    if not have_times or ts.ndim > signal.ndim or any(n not in (1, size) for n, size in sizes):
         raise ValueError(
-            f"ts of shape {ts.shape} does not match a signal of shape {signal.shape}. Give ts of "
-            f"shape {both if signal.ndim > 1 else signal.shape}."
+            f"signal must have the time along its last axis, and ts its shape {signal.shape} or "
+            f"{signal.shape[-1:]}, got ts of shape {ts.shape} and signal of shape {signal.shape}."
         )
-    if signal.shape[-1] < _FEWEST:
-        raise ValueError(
-            f"signal must have at least {_FEWEST} samples, got {signal.shape[-1]}: save more "
-            "often, or run longer."
-        )
+    _check_samples(signal, _FEWEST)
     if not is_traced(ts):
-        rows = np.asarray(ts).reshape(-1, ts.shape[-1])
-        rows = rows[np.isfinite(rows).all(axis=1)]  # other rows get a status
-        uneven = np.asarray(_unevenness(jnp.asarray(rows), eps)) if len(rows) else np.zeros(1)
-        if not (uneven <= 1).all():
-            steps = np.diff(rows[uneven.argmax()])
-            coarse = f" ts has dtype {dtype}: give the times in float64." if eps > EPS else ""
-            raise ValueError(
-                "the times ts must have equal steps, other than zero, got steps from "
-                f"{steps.min():.17g} to {steps.max():.17g}. To obtain such times from "
-                "dvi.integrate, use dvi.Save(every=m) without final=True, and the lattice "
-                f"dvi.Uniform().{coarse}"
-            )
+        hint = f" ts has dtype {dtype}: give the times in float64." if eps > EPS else ""
+        _check_steps(np.asarray(ts).reshape(-1, ts.shape[-1]), eps, hint)
     return ts, signal, eps, min(signal.ndim - 1, 1) if state_axes is None else state_axes
+
+
+def _check_steps(ts: np.ndarray, eps: float, hint: str) -> None:
+    ts = ts[np.isfinite(ts).all(axis=1)]  # other rows get a status
+    unevenness = np.asarray(_unevenness(jnp.asarray(ts), eps)) if len(ts) else np.zeros(1)
+    if not (unevenness <= 1).all():
+        steps = np.diff(ts[unevenness.argmax()])
+        raise ValueError(
+            f"ts must have equal steps, other than zero, got steps from {steps.min():.17g} to "
+            f"{steps.max():.17g}. Use dvi.Save(every=m) with dvi.Uniform().{hint}"
+        )
 
 
 def _real_times(name: str, value: Any) -> Array:
     value = _double(name, value)
     if jnp.iscomplexobj(value):
-        raise TypeError(
-            f"{name} must be real, got dtype {value.dtype}. In a call with times and signal, give "
-            "the times as the first argument."
-        )
+        raise TypeError(f"{name} must be real, got dtype {value.dtype}: give the times first.")
     return value
 
 
@@ -301,8 +286,8 @@ def _double(name: str, value: Any) -> Array:
         raise TypeError(f"{name} must be an array of numbers, got dtype {value.dtype}.")
     if not x64_enabled():
         raise TypeError(
-            "frequency analysis requires double precision, but JAX computes in float32: put this "
-            'line\n    jax.config.update("jax_enable_x64", True)\nbefore any array is made.'
+            "frequency analysis requires double precision: first call "
+            'jax.config.update("jax_enable_x64", True).'
         )
     return jnp.asarray(value, jnp.complex128 if value.dtype.kind == "c" else jnp.float64)
 
@@ -313,11 +298,11 @@ def _lattice(ts: Array) -> tuple[Array, Array, Array]:
     n = np.arange(N).reshape((1,) * (ts.ndim - 1) + (N,)) - (N - 1) / 2
     h = (ts[..., -1:] - ts[..., :1]) / (N - 1)
     centre = (ts[..., -1:] + ts[..., :1]) / 2
-    off = ts - centre - h * n  # small, so that the corrections have all digits
-    change = jnp.sum(off * n, axis=-1, keepdims=True) * (12 / (N * (N**2 - 1)))
-    shift = jnp.mean(off, axis=-1, keepdims=True)
-    away = jnp.max(jnp.abs(off - shift - change * n), axis=-1)
-    return (h + change)[..., 0], (centre + shift)[..., 0], away
+    deviation = ts - centre - h * n  # small, so that the corrections have all digits
+    change = jnp.sum(deviation * n, axis=-1, keepdims=True) * (12 / (N * (N**2 - 1)))
+    shift = jnp.mean(deviation, axis=-1, keepdims=True)
+    largest_deviation = jnp.max(jnp.abs(deviation - shift - change * n), axis=-1)
+    return (h + change)[..., 0], (centre + shift)[..., 0], largest_deviation
 
 
 def _unevenness(ts: Array, eps: Any) -> Array:
@@ -326,28 +311,28 @@ def _unevenness(ts: Array, eps: Any) -> Array:
     The tolerance covers running sums in double precision and the rounding of each time to numbers
     of spacing `eps`; it is at most an eighth of a step.
     """
-    h, _, away = _lattice(ts)
+    h, _, largest_deviation = _lattice(ts)
     size = jnp.max(jnp.abs(ts), axis=-1)
-    allowed = 1e-9 * jnp.abs(h) + (4 * ts.shape[-1] * EPS + 2 * eps) * size
-    return jnp.where(h != 0, away / jnp.minimum(allowed, jnp.abs(h) / 8), jnp.nan)
+    tolerance = 1e-9 * jnp.abs(h) + (4 * ts.shape[-1] * EPS + 2 * eps) * size
+    return jnp.where(h != 0, largest_deviation / jnp.minimum(tolerance, jnp.abs(h) / 8), jnp.nan)
 
 
 def analyse(
-    ts: Array, signal: Array, settings: Settings, eps: float = EPS, state_axes: int = 0
-) -> tuple[Frequencies, Lines]:
+    ts: Array, signal: Array, settings: LineSettings, eps: float = EPS, state_axes: int = 0
+) -> tuple[Frequencies, SpectralLines]:
     """The resolved lines of every signal; and all lines, with frequencies in place of s."""
     lead, N = signal.shape[:-1], signal.shape[-1]
     flat = (math.prod(lead), N)  # so that all shapes of a batch share one program
     ts = jnp.broadcast_to(ts, signal.shape).reshape(flat)
-    of = _analysed(ts, signal.reshape(flat), settings, jnp.asarray(eps))
-    found, raw = jax.tree.map(lambda x: x.reshape(*lead, *x.shape[1:]), of)
-    return dataclasses.replace(found, state_axes=state_axes), raw
+    results = _analyse_rows(ts, signal.reshape(flat), settings, jnp.asarray(eps))
+    frequencies, raw = jax.tree.map(lambda x: x.reshape(*lead, *x.shape[1:]), results)
+    return dataclasses.replace(frequencies, state_axes=state_axes), raw
 
 
 @eqx.filter_jit
-def _analysed(
-    ts: Array, signal: Array, settings: Settings, eps: Array
-) -> tuple[Frequencies, Lines]:
+def _analyse_rows(
+    ts: Array, signal: Array, settings: LineSettings, eps: Array
+) -> tuple[Frequencies, SpectralLines]:
     """`analyse` for signals (M, N) at times (M, N)."""
     h, centre, _ = _lattice(ts)
     N = signal.shape[-1]
@@ -361,17 +346,17 @@ def _analysed(
     omega = lines.s * scale[..., None]
     A = lines.amplitudes * jnp.exp(-1j * omega * centre[..., None])
     if not jnp.iscomplexobj(signal):
-        back = (h < 0)[..., None]  # Re A e^{iωt} = Re Ā e^{−iωt}
-        omega, A = jnp.where(back, -omega, omega), 2 * jnp.where(back, jnp.conj(A), A)
-    hard = (code > 0) & (code <= len(WITHOUT_NUMBERS))
-    sure = lines.sure & ~hard[..., None]
-    found = Frequencies(
+        reverse = (h < 0)[..., None]  # Re A e^{iωt} = Re Ā e^{−iωt}
+        omega, A = jnp.where(reverse, -omega, omega), 2 * jnp.where(reverse, jnp.conj(A), A)
+    has_no_numbers = lacks_numbers(code)
+    sure = lines.sure & ~has_no_numbers[..., None]
+    frequencies = Frequencies(
         frequencies=jnp.where(sure, omega, jnp.nan),
         amplitudes=jnp.where(sure, A, jnp.nan),
-        constant=jnp.where(hard & (code != CODE["no_signal"]), jnp.nan, lines.constant),
-        residual=jnp.where(hard, jnp.nan, lines.residual),
+        constant=jnp.where(has_no_numbers & (code != CODE["no_signal"]), jnp.nan, lines.constant),
+        residual=jnp.where(has_no_numbers, jnp.nan, lines.residual),
         resolution=2 * jnp.pi / jnp.abs(N * h),
         result=with_code(code),
         is_real=not jnp.iscomplexobj(signal),
     )
-    return found, lines._replace(s=omega, amplitudes=A, code=code)
+    return frequencies, lines._replace(s=omega, amplitudes=A, code=code)

@@ -12,7 +12,7 @@ from .results import CODE
 
 EPS = float(np.finfo(np.float64).eps)
 
-_ASCENT, _EACH, _LAST = 4, 3, 4
+_ASCENT, _FIT_STEPS, _FINAL_ROUNDS = 4, 3, 4
 """Newton steps to the maximum of an amplitude; Gauss–Newton steps after each line, and rounds of
 them after the last. Both converge quadratically below some hundredths of the resolution."""
 
@@ -25,11 +25,11 @@ _ECHO = 1e-9
 _RIDGE = 1e-13
 """Added to a diagonal of ones, so that lines which coincide do not give a negative pivot."""
 
-_SETTLED = 1e-2
+_CONVERGENCE = 1e-2
 """Last correction to a frequency, over the resolution, up to which it counts as converged."""
 
 
-class Settings(NamedTuple):
+class LineSettings(NamedTuple):
     """The static arguments of an analysis."""
 
     lines: int
@@ -37,7 +37,7 @@ class Settings(NamedTuple):
     refine: bool
 
 
-class Lines(NamedTuple):
+class SpectralLines(NamedTuple):
     """The lines of one signal in the variable s = ω T/2, amplitudes at the centre."""
 
     s: Array
@@ -67,10 +67,10 @@ def _grid(N: int, window: int) -> _Grid:
     y = (2 * np.arange(N) + 1 - N) / N
     k = np.arange(-window, window + 1)
     weights = np.cos(np.pi * np.outer(y, k)) @ _hann(window)
-    padded = np.concatenate([weights / N, np.zeros(A * B - N)]).reshape(A, B)
+    blocks = np.concatenate([weights / N, np.zeros(A * B - N)]).reshape(A, B)
     rows = (2 * B * np.arange(A) + B - N) / N
     columns = (2 * np.arange(B) + 1 - B) / N
-    return _Grid(rows, columns, padded, window, N)
+    return _Grid(rows, columns, blocks, window, N)
 
 
 def _hann(window: int) -> np.ndarray:
@@ -79,12 +79,12 @@ def _hann(window: int) -> np.ndarray:
     return binomials / binomials[window]
 
 
-def _moments(grid: _Grid, weighted: Array, s: Array) -> Array:
-    """Σ χ z y^m e^{−isy} / N for m = 0, 1, 2: s (K,) to (3, K); `weighted` is χz/N."""
+def _moments(grid: _Grid, samples: Array, s: Array) -> Array:
+    """Σ χ z y^m e^{−isy} / N for m = 0, 1, 2: s (K,) to (3, K); `samples` are χz/N."""
     a, b = grid.rows, grid.columns
     inner = jnp.exp(-1j * b[:, None] * s[None, :])
     powers = jnp.concatenate([inner, b[:, None] * inner, b[:, None] ** 2 * inner], axis=1)
-    sums = (weighted @ powers).reshape(a.shape[0], 3, s.shape[0])
+    sums = (samples @ powers).reshape(a.shape[0], 3, s.shape[0])
     outer = jnp.exp(-1j * a[:, None] * s[None, :])[:, None, :]
     x = a[:, None]
     m0, m1, m2 = (sums * outer).transpose(1, 0, 2)
@@ -113,34 +113,30 @@ def _kernel(grid: _Grid, d: Array) -> tuple[Array, Array, Array]:
 
 def _sinc(x: Array) -> tuple[Array, Array, Array]:
     """sin x / x and its first two derivatives, by a series where the closed forms cancel."""
-    near = jnp.abs(x) < 1.0
-    far = jnp.where(near, 1.0, x)
-    S = jnp.sin(far) / far
-    S1 = (jnp.cos(far) - S) / far
-    S2 = -S - 2 * S1 / far
-    z = jnp.where(near, x, 0.0) ** 2
+    is_small = jnp.abs(x) < 1.0
+    large = jnp.where(is_small, 1.0, x)
+    S = jnp.sin(large) / large
+    S1 = (jnp.cos(large) - S) / large
+    S2 = -S - 2 * S1 / large
+    z = jnp.where(is_small, x, 0.0) ** 2
     terms = [1.0]
     for j in range(1, 10):
         terms.append(-terms[-1] / ((2 * j) * (2 * j + 1)))
-    series = jnp.polyval(jnp.array(terms[::-1]), z)
-    first = jnp.polyval(jnp.array([2 * j * c for j, c in enumerate(terms)][:0:-1]), z)
-    second = jnp.polyval(
-        jnp.array([2 * j * (2 * j - 1) * c for j, c in enumerate(terms)][:0:-1]), z
-    )
-    return (
-        jnp.where(near, series, S),
-        jnp.where(near, first * jnp.where(near, x, 0.0), S1),
-        jnp.where(near, second, S2),
-    )
+    c, k = np.array(terms), 2 * np.arange(10)
+    derivatives = c, (k * c)[1:], (k * (k - 1) * c)[1:]
+    series, first, second = (jnp.polyval(jnp.array(a[::-1]), z) for a in derivatives)
+    first = first * jnp.where(is_small, x, 0.0)
+    pairs = (series, S), (first, S1), (second, S2)
+    return tuple(jnp.where(is_small, a, b) for a, b in pairs)  # pyright: ignore[reportReturnType]
 
 
-def lines_of(z: Array, settings: Settings) -> Lines:
+def lines_of(z: Array, settings: LineSettings) -> SpectralLines:
     """The lines of one signal.
 
     Slot 0 is the constant; a line of a real signal has a second slot, of −ω.
     """
     is_real, count, N = not jnp.iscomplexobj(z), settings.lines, z.shape[-1]
-    grid, mirrored = _grid(N, settings.window), 2 if is_real else 1
+    grid, per_line = _grid(N, settings.window), 2 if is_real else 1
     finite = jnp.all(jnp.isfinite(z))
     z = jnp.where(finite, z, 0.0).astype(complex)
     largest = jnp.max(jnp.abs(z))
@@ -148,72 +144,77 @@ def lines_of(z: Array, settings: Settings) -> Lines:
     pad = grid.weights.size - N
     blocks = jnp.pad(z, (0, pad)).reshape(grid.weights.shape)
 
-    slots = 1 + count * mirrored
+    slots = 1 + count * per_line
     s, A = jnp.zeros(slots), jnp.zeros(slots, complex).at[0].set(jnp.sum(grid.weights * blocks))
-    there = jnp.zeros(slots, bool).at[0].set(True)
+    is_line = jnp.zeros(slots, bool).at[0].set(True)
     spread = jnp.sum(grid.weights * jnp.abs(blocks - A[0]) ** 2)
 
     def advance(i, state):
-        s, A, there, r, _ = state
-        new, size = _strongest(grid, r, is_real)
-        real = (i < count) & _is_line(grid, r, new, size, s, A, there)
-        new, size = jnp.where(real, new, 0.0), jnp.where(real, size, 0.0)
-        fresh = 1 + mirrored * i + np.arange(mirrored)  # after the last line beyond the end
-        s = s.at[fresh].set(jnp.stack([new, -new])[:mirrored], mode="drop")
-        A = A.at[fresh].set(jnp.stack([size, jnp.conj(size)])[:mirrored], mode="drop")
-        there = there.at[fresh].set(real, mode="drop")
-        s, A, r, moved = _fitted(grid, blocks, s, A, there, settings.refine)
-        keep = ~there | (jnp.abs(A) > _least(s, s, A, there))
-        keep = jnp.repeat(keep[1::mirrored], mirrored)  # a pair goes together
+        s, A, is_line, r, _ = state
+        position, size = _strongest(grid, r, is_real)
+        is_new = (i < count) & _exceeds_noise(grid, r, position, size, s, A, is_line)
+        position, size = jnp.where(is_new, position, 0.0), jnp.where(is_new, size, 0.0)
+        indices = 1 + per_line * i + np.arange(per_line)  # after the last line beyond the end
+        s = s.at[indices].set(jnp.stack([position, -position])[:per_line], mode="drop")
+        A = A.at[indices].set(jnp.stack([size, jnp.conj(size)])[:per_line], mode="drop")
+        is_line = is_line.at[indices].set(is_new, mode="drop")
+        s, A, r, change = _fit(grid, blocks, s, A, is_line, settings.refine)
+        keep = ~is_line | (jnp.abs(A) > _least_amplitude(s, s, A, is_line))
+        keep = jnp.repeat(keep[1::per_line], per_line)  # a pair goes together
         keep = jnp.concatenate([np.ones(1, bool), keep])
-        return jnp.where(keep, s, 0.0), jnp.where(keep, A, 0.0), there & keep, r, moved
+        return jnp.where(keep, s, 0.0), jnp.where(keep, A, 0.0), is_line & keep, r, change
 
-    rounds = count + (_LAST if settings.refine else 0)
-    begin = (s, A, there, blocks - A[0], jnp.zeros(slots))
-    s, A, there, rest, moved = lax.fori_loop(0, rounds, advance, begin)
+    rounds = count + (_FINAL_ROUNDS if settings.refine else 0)
+    begin = (s, A, is_line, blocks - A[0], jnp.zeros(slots))
+    s, A, is_line, remainder, change = lax.fori_loop(0, rounds, advance, begin)
     residual = jnp.sqrt(
-        jnp.sum(grid.weights * jnp.abs(rest) ** 2) / jnp.where(spread > 0, spread, 1.0)
+        jnp.sum(grid.weights * jnp.abs(remainder) ** 2) / jnp.where(spread > 0, spread, 1.0)
     )
     constant = A[0] * largest
-    s, A, there, moved = (x[1::mirrored] for x in (s, A, there, moved))
-    order = jnp.argsort(jnp.where(there, -jnp.abs(A), jnp.inf))
-    s, A, there, moved = s[order], A[order] * largest, there[order], moved[order]
-    unsettled = there & ~(jnp.abs(moved) <= _SETTLED * np.pi)
-    both = there[:, None] & there[None, :] & ~np.eye(count, dtype=bool)
-    near = both & (jnp.abs(s[:, None] - s[None, :]) < np.pi)
-    unresolved = jnp.any(near, axis=1) | (there & (jnp.abs(s) < np.pi))  # from the constant
+    s, A, is_line, change = (x[1::per_line] for x in (s, A, is_line, change))
+    order = jnp.argsort(jnp.where(is_line, -jnp.abs(A), jnp.inf))
+    s, A, is_line, change = s[order], A[order] * largest, is_line[order], change[order]
+    sure, code = _reliability(grid, s, is_line, change)
+    code = jnp.where(is_line[0] & (spread > (64 * EPS) ** 2), code, CODE["no_signal"])
+    code = jnp.where(finite, code, CODE["not_finite"])
+    return SpectralLines(s, A, sure, constant, residual, code)
+
+
+def _reliability(grid: _Grid, s: Array, is_line: Array, change: Array) -> tuple[Array, Array]:
+    """Which lines have converged and are resolved, and the code of the status of the signal."""
+    is_inaccurate = is_line & ~(jnp.abs(change) <= _CONVERGENCE * np.pi)
+    is_pair = is_line[:, None] & is_line[None, :] & ~np.eye(len(s), dtype=bool)
+    is_close = is_pair & (jnp.abs(s[:, None] - s[None, :]) < np.pi)
+    is_ambiguous = jnp.any(is_close, axis=1) | (is_line & (jnp.abs(s) < np.pi))  # from the constant
     code = jnp.asarray(0)
     for name, applies in (
-        ("not_converged", jnp.any(unsettled)),
-        ("unresolved", jnp.any(unresolved)),
-        ("aliased", jnp.abs(s[0]) > 0.9 * N * np.pi / 2),
-        ("window_too_short", ~(jnp.abs(s[0]) > (settings.window + 1) * np.pi)),
-        ("no_signal", ~there[0] | ~(spread > (64 * EPS) ** 2)),
-        ("not_finite", ~finite),
+        ("not_converged", jnp.any(is_inaccurate)),
+        ("unresolved", jnp.any(is_ambiguous)),
+        ("aliased", jnp.abs(s[0]) > 0.9 * grid.N * np.pi / 2),
+        ("window_too_short", ~(jnp.abs(s[0]) > (grid.window + 1) * np.pi)),
     ):
         code = jnp.where(applies, CODE[name], code)
-    sure = there & ~unsettled & ~unresolved
-    return Lines(s, A, sure, constant, residual, code)
+    return is_line & ~is_inaccurate & ~is_ambiguous, code
 
 
 def _strongest(grid: _Grid, r: Array, is_real: bool) -> tuple[Array, Array]:
     """Position and amplitude of the largest maximum of |⟨r, e^{isy}⟩|."""
     N, p = grid.N, grid.window
-    weighted = jnp.asarray(grid.weights * r)
-    size = jnp.abs(jnp.fft.fft(weighted.reshape(-1)[:N]))
+    samples = jnp.asarray(grid.weights * r)
+    size = jnp.abs(jnp.fft.fft(samples.reshape(-1)[:N]))
     if is_real:
         size = jnp.where(np.arange(N) <= N // 2, size, 0.0)
     m = jnp.argmax(size)
-    before, at, after = size[m - 1], size[m], size[(m + 1) % N]
-    ratio = jnp.maximum(before, after) / jnp.where(at > 0, at, 1.0)
+    lower, peak, upper = size[m - 1], size[m], size[(m + 1) % N]
+    ratio = jnp.maximum(lower, upper) / jnp.where(peak > 0, peak, 1.0)
     offset = ((p + 1) * ratio - p) / (1 + ratio)  # exact for one line and many samples
-    offset = jnp.where(after > before, offset, -offset)
+    offset = jnp.where(upper > lower, offset, -offset)
     m = jnp.where(m >= (N + 1) // 2, m - N, m)
     s = np.pi * (m + jnp.clip(offset, -0.6, 0.6))
 
     def climb(_, state):
         s = state[0]
-        m0, m1, m2 = _moments(grid, weighted, s[None])[:, 0]
+        m0, m1, m2 = _moments(grid, samples, s[None])[:, 0]
         slope = 2 * jnp.imag(jnp.conj(m0) * m1)
         bend = 2 * (jnp.abs(m1) ** 2 - jnp.real(jnp.conj(m0) * m2))
         step = jnp.where(bend < 0, -slope / jnp.where(bend < 0, bend, 1.0), 0.0)
@@ -223,7 +224,9 @@ def _strongest(grid: _Grid, r: Array, is_real: bool) -> tuple[Array, Array]:
     return s, amplitude
 
 
-def _is_line(grid: _Grid, r: Array, new: Array, size: Array, s: Array, A: Array, there: Array):
+def _exceeds_noise(
+    grid: _Grid, r: Array, position: Array, size: Array, s: Array, A: Array, is_line: Array
+) -> Array:
     """Whether a maximum exceeds white noise and round-off.
 
     The largest |⟨r, e^{isy}⟩|² of N values of noise is about ln N times its mean, which is the
@@ -231,25 +234,26 @@ def _is_line(grid: _Grid, r: Array, new: Array, size: Array, s: Array, A: Array,
     """
     variance = jnp.sum(grid.weights * jnp.abs(r) ** 2)
     noise = 2 * np.log(grid.N) * np.sum(grid.weights**2) * variance
-    return (jnp.abs(size) ** 2 > noise) & (jnp.abs(size) > _least(new[None], s, A, there)[0])
+    floor = _least_amplitude(position[None], s, A, is_line)[0]
+    return (jnp.abs(size) ** 2 > noise) & (jnp.abs(size) > floor)
 
 
-def _least(at: Array, s: Array, A: Array, there: Array) -> Array:
-    """The least amplitude at `at` that is not round-off of near lines.
+def _least_amplitude(position: Array, s: Array, A: Array, is_line: Array) -> Array:
+    """The least amplitude at a position that is not round-off of near lines.
 
     A line that was fitted before a near one had converged ends below this, and is removed.
     """
-    near = there[None, :] & (jnp.abs(s[None, :] - at[:, None]) < np.pi)
-    stronger = jnp.where(near, jnp.abs(A)[None, :], 0.0)
+    is_near = is_line[None, :] & (jnp.abs(s[None, :] - position[:, None]) < np.pi)
+    stronger = jnp.where(is_near, jnp.abs(A)[None, :], 0.0)
     return jnp.maximum(_ECHO * jnp.max(stronger, axis=1), _FLOOR)
 
 
-def _correction(grid, s, A, rest, there, with_frequencies: bool, damping):
+def _correction(grid, s, A, remainder, is_line, with_frequencies: bool, damping):
     r"""The Gauss–Newton step on Σ χ |z − Σ_k A_k e^{is_k y}|² in all A_k and s_k.
 
     With e_k = e^{is_k y} A_k/|A_k| the model changes by c_k e_k + i g_k y e_k, complex c, real g;
     then A_k changes by c_k A_k/|A_k| and s_k by g_k/|A_k|. With G_m = ⟨e_k, y^m e_j⟩, which are the
-    window's transform and its derivatives, and r_m = ⟨rest, y^m e_j⟩, the normal equations
+    window's transform and its derivatives, and r_m = ⟨remainder, y^m e_j⟩, the normal equations
 
         G_0 c + i G_1 g = r_0,      Im(G_1 c) + Re(G_2) g = Im r_1
 
@@ -257,28 +261,28 @@ def _correction(grid, s, A, rest, there, with_frequencies: bool, damping):
     """
     length, K = jnp.abs(A), s.shape[0]
     unit = jnp.where(length > 0, A / jnp.where(length > 0, length, 1.0), 1.0)
-    both = there[:, None] & there[None, :]
+    is_pair = is_line[:, None] & is_line[None, :]
     r = jnp.where(
-        there[None, :], jnp.conj(unit)[None, :] * _moments(grid, grid.weights * rest, s), 0.0
+        is_line[None, :], jnp.conj(unit)[None, :] * _moments(grid, grid.weights * remainder, s), 0.0
     )
     W, W1, W2 = _kernel(grid, s[None, :] - s[:, None])
-    turn = jnp.where(both, jnp.conj(unit)[:, None] * unit[None, :], 0.0)
-    G0 = turn * W + jnp.diag(jnp.where(there, _RIDGE, 1.0))
+    turn = jnp.where(is_pair, jnp.conj(unit)[:, None] * unit[None, :], 0.0)
+    G0 = turn * W + jnp.diag(jnp.where(is_line, _RIDGE, 1.0))
     if not with_frequencies:
-        return unit * _solved(G0, r[0][:, None])[:, 0], jnp.zeros(K)
+        return unit * _solve(G0, r[0][:, None])[:, 0], jnp.zeros(K)
     G1, G2 = turn * (-1j * W1), turn * (-W2)
-    solved = _solved(G0, jnp.concatenate([G1, r[0][:, None]], axis=1))
-    against = G1 @ solved
-    free = there.at[0].set(False)  # the constant stays one
-    S = jnp.where(free[:, None] & free[None, :], jnp.real(G2 - against[:, :K]), 0.0)
+    solution = _solve(G0, jnp.concatenate([G1, r[0][:, None]], axis=1))
+    product = G1 @ solution
+    free = is_line.at[0].set(False)  # the constant stays one
+    S = jnp.where(free[:, None] & free[None, :], jnp.real(G2 - product[:, :K]), 0.0)
     S = S + jnp.diag(jnp.where(free, _RIDGE + damping, 1.0))
-    rhs = jnp.where(free, jnp.imag(r[1] - against[:, K]), 0.0)
-    g = _solved(S, rhs[:, None])[:, 0]
-    c = solved[:, K] - 1j * (solved[:, :K] @ g.astype(complex))
+    rhs = jnp.where(free, jnp.imag(r[1] - product[:, K]), 0.0)
+    g = _solve(S, rhs[:, None])[:, 0]
+    c = solution[:, K] - 1j * (solution[:, :K] @ g.astype(complex))
     return unit * c, g / jnp.where(length > 0, length, 1.0)
 
 
-def _solved(M: Array, B: Array) -> Array:
+def _solve(M: Array, B: Array) -> Array:
     """M⁻¹ B of a positive definite M, by elimination without pivots.
 
     A batch of small systems is solved together. LAPACK solves them one by one with several threads
@@ -293,28 +297,28 @@ def _solved(M: Array, B: Array) -> Array:
     return lax.fori_loop(0, K, eliminate, jnp.concatenate([M, B], axis=1))[:, K:]
 
 
-def _fitted(grid, blocks, s, A, there, with_frequencies: bool):
+def _fit(grid, blocks, s, A, is_line, with_frequencies: bool):
     """A few steps of least squares, with more damping if a step does not reduce the residual.
 
     Returns s, A, the residual, and the last undamped step in s.
     """
 
-    def of(s, A):
+    def remainder_of(s, A):
         outer = jnp.exp(1j * grid.rows[:, None] * s[None, :]) * A[None, :]
-        rest = blocks - outer @ jnp.exp(1j * s[:, None] * grid.columns[None, :])
-        return rest, jnp.sum(grid.weights * jnp.abs(rest) ** 2)
+        remainder = blocks - outer @ jnp.exp(1j * s[:, None] * grid.columns[None, :])
+        return remainder, jnp.sum(grid.weights * jnp.abs(remainder) ** 2)
 
-    def step(_, now):
-        *place, damping, last = now
-        s, A, rest, cost = place
-        change, moved = _correction(grid, s, A, rest, there, with_frequencies, damping)
-        s, A = s + jnp.clip(moved, -np.pi / 4, np.pi / 4), A + change
-        new = (s, A, *of(s, A), jnp.zeros(()))
+    def step(_, state):
+        *place, damping, last = state
+        s, A, remainder, cost = place
+        A_step, s_step = _correction(grid, s, A, remainder, is_line, with_frequencies, damping)
+        s, A = s + jnp.clip(s_step, -np.pi / 4, np.pi / 4), A + A_step
+        new = (s, A, *remainder_of(s, A), jnp.zeros(()))
         better = new[3] <= cost * (1 + 1e-9) + EPS**2
         old = (*place, jnp.maximum(10 * damping, 1e-2))
-        last = jnp.where(damping == 0, moved, last)
+        last = jnp.where(damping == 0, s_step, last)
         return *(jnp.where(better, x, y) for x, y in zip(new, old, strict=True)), last
 
-    begin = (s, A, *of(s, A), jnp.zeros(()), jnp.zeros_like(s))
-    s, A, rest, _, _, last = lax.fori_loop(0, _EACH, step, begin)
-    return s, A, rest, last
+    begin = (s, A, *remainder_of(s, A), jnp.zeros(()), jnp.zeros_like(s))
+    s, A, remainder, _, _, last = lax.fori_loop(0, _FIT_STEPS, step, begin)
+    return s, A, remainder, last

@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from lanewise.jaxprs.jaxapi import is_traced
+
 from ..base.results import RESULTS, status_code
 
 
@@ -102,11 +104,13 @@ NAMES, SECTION_NAMES = (
 CODE = {name: i for i, name in enumerate(NAMES)}
 """The index of a status in `NAMES`."""
 
-WITHOUT_NUMBERS = NAMES[1:6]
-"""Statuses that leave no line."""
-
 code_of: Callable[[Any], Array] = status_code
 """The index of a status in `NAMES`, for each signal of a batch."""
+
+
+def lacks_numbers(code: Any) -> Any:
+    """Whether a status, by its index in `NAMES`, leaves no line: from `not_finite` to `aliased`."""
+    return (code > 0) & (code <= CODE["aliased"])
 
 
 class WithStatus(eqx.Module):
@@ -115,8 +119,8 @@ class WithStatus(eqx.Module):
     @property
     def status(self: Any) -> Any:
         """The name of `result`, such as "successful"; an array of names for a batch."""
-        known = NAMES if isinstance(self.result, FREQUENCY_RESULTS) else SECTION_NAMES
-        names = np.array(known)[np.asarray(code_of(self.result))]
+        all_names = NAMES if isinstance(self.result, FREQUENCY_RESULTS) else SECTION_NAMES
+        names = np.array(all_names)[np.asarray(code_of(self.result))]
         return str(names) if names.ndim == 0 else names
 
 
@@ -126,15 +130,15 @@ def with_code(code: Any) -> FREQUENCY_RESULTS:
     return jax.tree.unflatten(structure, [jnp.asarray(code, jnp.int32)])
 
 
-def judge(count: Array, wanted: int, run: RESULTS) -> SECTION_RESULTS:
-    """The status of an orbit with `count` of the `wanted` crossings."""
+def judge(count: Array, capacity: int, run: RESULTS) -> SECTION_RESULTS:
+    """The status of an orbit with `count` of `capacity` crossings."""
     result = SECTION_RESULTS.where(
         count == 0, SECTION_RESULTS.never_crossed, SECTION_RESULTS.too_few_crossings
     )
     result = SECTION_RESULTS.where(run == RESULTS.stopped, SECTION_RESULTS.stopped, result)
     ended_well = (run == RESULTS.successful) | (run == RESULTS.stopped)
     result = SECTION_RESULTS.where(ended_well, result, SECTION_RESULTS.failed)
-    return SECTION_RESULTS.where(count >= wanted, SECTION_RESULTS.successful, result)
+    return SECTION_RESULTS.where(count >= capacity, SECTION_RESULTS.successful, result)
 
 
 class _WithFound(RuntimeError):
@@ -163,17 +167,30 @@ AS_ATTRIBUTE = (
 )
 
 
-def raise_on_failure(found: Any) -> Any:
-    """`found`, or a `FrequencyError` that names the first signal with another status."""
-    if found.result.is_traced():
-        return found.result.error_if(found, found.result != FREQUENCY_RESULTS.successful)
-    bad = np.asarray(found.result != FREQUENCY_RESULTS.successful)
-    if not bad.any():
-        return found
-    where = tuple(int(i) for i in np.argwhere(bad)[0])
-    which = "The status of the signal"
-    if where:
-        which = f"{bad.sum()} of {bad.size} signals failed. The status of the first, index {where},"
-    name = str(np.asarray(found.status)[where])
+def require_success(signals: Any, throw: bool) -> Any:
+    """The result for some signals. **Raises** a `FrequencyError` that names the first signal with
+    another status than `successful`, if `throw`."""
+    if not throw:
+        return signals
+    is_bad = signals.result != FREQUENCY_RESULTS.successful
+    if signals.result.is_traced():
+        return signals.result.error_if(signals, is_bad)
+    is_bad = np.asarray(is_bad)
+    if not is_bad.any():
+        return signals
+    index = tuple(int(i) for i in np.argwhere(is_bad)[0])
+    subject = "The status of the signal"
+    if index:
+        count = f"{is_bad.sum()} of {is_bad.size}"
+        subject = f"{count} signals failed. The status of the first, index {index},"
+    name = str(np.asarray(signals.status)[index])
     text = FREQUENCY_RESULTS[getattr(FREQUENCY_RESULTS, name)]
-    raise FrequencyError(f"{which} is {name}. {text} {AS_ATTRIBUTE}", found)
+    raise FrequencyError(f"{subject} is {name}. {text} {AS_ATTRIBUTE}", signals)
+
+
+def refuse_traced(name: str, *arrays: Any) -> None:
+    """**Raises** `ValueError` for inputs of a function in NumPy that are traced by JAX."""
+    if any(map(is_traced, arrays)):
+        raise ValueError(
+            f"{name} uses NumPy: call it once with the whole batch, outside of jit, vmap and grad."
+        )

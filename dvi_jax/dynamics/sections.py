@@ -26,7 +26,7 @@ from ..methods import Method
 from ..observe import Section
 from ..observe.solution import Save
 from ..problem.system import System, check_system
-from ..sweep import Axis
+from ..sweep.axes import is_axis, refuse_non_finite
 from .results import AS_ATTRIBUTE, SECTION_RESULTS, SectionError, WithStatus, judge
 
 
@@ -50,7 +50,7 @@ class PoincareSection(WithStatus):
     epsilon: Array
 
 
-class _Settings(eqx.Module):
+class _SectionRun(eqx.Module):
     """The settings that all orbits of a section share; `options` are keywords of `integrate`."""
 
     system: System
@@ -62,23 +62,22 @@ class _Settings(eqx.Module):
         t0, q0, p0 = start
         options = {"observe": self.section, "save": Save(final=True), "throw": False}
         options |= {"t0": t0, "h": h, "epsilon": epsilon, "args": args, **self.options}
-        sol = integrate(self.system, q0, p0, **options)
-        crossed: Any = sol.observed
-        result = judge(crossed.count, self.section.capacity, sol.result)
-        found = PoincareSection(
-            crossed.ts, crossed.qs, crossed.ps, crossed.count, result, sol.result, epsilon
-        )
-        return found, (sol.ts[-1], sol.qs[-1], sol.ps[-1])
+        solution = integrate(self.system, q0, p0, **options)
+        crossings: Any = solution.observed
+        result = judge(crossings.count, self.section.capacity, solution.result)
+        states = crossings.ts, crossings.qs, crossings.ps
+        section = PoincareSection(*states, crossings.count, result, solution.result, epsilon)
+        return section, (solution.ts[-1], solution.qs[-1], solution.ps[-1])
 
 
-def _settings(system: System, section: Section, keywords: Mapping[str, Any]) -> _Settings:
-    integrator, others = integrator_of(keywords)
-    num_steps = whole("num_steps", others["num_steps"])
-    options = {"integrator": integrator, "num_steps": num_steps, "stop": others.get("stop")}
-    return _Settings(system, section, options)
+def _section_run(system: System, section: Section, keywords: Mapping[str, Any]) -> _SectionRun:
+    integrator, settings = integrator_of(keywords)
+    num_steps = whole("num_steps", settings["num_steps"])
+    options = {"integrator": integrator, "num_steps": num_steps, "stop": settings.get("stop")}
+    return _SectionRun(system, section, options)
 
 
-class _Varied(eqx.Module):
+class _PerOrbit(eqx.Module):
     """One value for each orbit."""
 
     values: Array
@@ -87,28 +86,28 @@ class _Varied(eqx.Module):
 def _of_orbit(tree: Any, i: Array) -> Any:
     """The values of orbit i."""
 
-    def is_varied(x):
-        return isinstance(x, _Varied)
+    def is_per_orbit(x):
+        return isinstance(x, _PerOrbit)
 
-    return jax.tree.map(lambda x: x.values[i] if is_varied(x) else x, tree, is_leaf=is_varied)
-
-
-@eqx.filter_jit
-def _orbits(settings: _Settings, start, h, epsilon, args, count: int) -> PoincareSection:
-    given = (start, h, epsilon, args)
-    return jax.vmap(lambda i: settings.orbit(*_of_orbit(given, i))[0])(jnp.arange(count))
+    return jax.tree.map(lambda x: x.values[i] if is_per_orbit(x) else x, tree, is_leaf=is_per_orbit)
 
 
 @eqx.filter_jit
-def _one_after_another(settings: _Settings, start, h, epsilon, args, count: int) -> PoincareSection:
+def _orbits(run: _SectionRun, start, h, epsilon, args, count: int) -> PoincareSection:
+    inputs = (start, h, epsilon, args)
+    return jax.vmap(lambda i: run.orbit(*_of_orbit(inputs, i))[0])(jnp.arange(count))
+
+
+@eqx.filter_jit
+def _one_after_another(run: _SectionRun, start, h, epsilon, args, count: int) -> PoincareSection:
     """Each orbit from the final state of the one before; from the start if that one failed."""
 
-    def one(state, i):
-        found, end = settings.orbit(state, *_of_orbit((h, epsilon, args), i))
-        good = found.run == RESULTS.successful
-        return jax.tree.map(lambda a, b: jnp.where(good, a, b), end, start), found
+    def advance(state, i):
+        section, end = run.orbit(state, *_of_orbit((h, epsilon, args), i))
+        good = section.run == RESULTS.successful
+        return jax.tree.map(lambda a, b: jnp.where(good, a, b), end, start), section
 
-    return lax.scan(one, start, jnp.arange(count))[1]
+    return lax.scan(advance, start, jnp.arange(count))[1]
 
 
 @checked_keywords
@@ -156,26 +155,21 @@ def poincare_section(
     # (2, 25, 2) True
     ```
     """
-    check_system(system)
-    q, p = start_state(q0, p0)
+    section = Section(g, direction, whole("crossings", crossings), skip)
+    run, (t0, q, p), inputs, lengths = _prepare(system, q0, p0, section, settings)
     if q.ndim == 0 or q.shape[0] == 0:
         raise ValueError(
-            f"q0 and p0 must have the orbits along the first axis, got shape {q.shape}. For one "
-            "orbit give [q0] and [p0]."
+            f"q0 and p0 must have the orbits along the first axis, got shape {q.shape}: give [q0] "
+            "and [p0] for one orbit."
         )
-    section = Section(g, direction, whole("crossings", crossings), skip)
-    orbits = _settings(system, section, settings)
-    epsilon, args, varied = _of_orbits(system, settings)
-    for name, length in varied.items():
+    for name, length in lengths.items():
         if length != q.shape[0]:
             raise ValueError(
-                f"{name} must be a single number, or have one number for each orbit in q0 "
-                f"(in all {q.shape[0]}), got length {length}."
+                f"{name} must be a number or one for each of the {q.shape[0]} orbits in q0, got "
+                f"length {length}."
             )
-    start = (as_scalar("t0", settings.get("t0", 0.0), q.dtype), _Varied(q), _Varied(p))
-    h = as_scalar("h", settings["h"], q.dtype, zero_allowed=False)
     try:
-        found = _orbits(orbits, start, h, epsilon, args, q.shape[0])
+        orbits = _orbits(run, (t0, _PerOrbit(q), _PerOrbit(p)), *inputs, q.shape[0])
     except Exception as error:
         if any("called with q0 of shape" in note for note in getattr(error, "__notes__", ())):
             error.add_note(
@@ -184,7 +178,7 @@ def poincare_section(
                 "condition as q0[None], p0[None].)"
             )
         raise
-    return _raise_on_failure(found, orbits) if settings.get("throw", True) else found
+    return _require_crossings(orbits, run, settings)
 
 
 @checked_keywords
@@ -216,26 +210,17 @@ def bifurcation(
 
     **Raises** as `poincare_section`.
     """
-    check_system(system)
-    q, p = start_state(q0, p0)
     section = Section(g, direction, whole("crossings", crossings), skip)
-    orbits = _settings(system, section, settings)
-    epsilon, args, varied = _of_orbits(system, settings)
-    lengths = set(varied.values())
-    if len(lengths) != 1 or 0 in lengths:
-        seen = " and ".join(f"{name} of length {n}" for name, n in varied.items())
-        rule = (
-            "bifurcation requires a parameter that varies: give epsilon as a 1-D array of at least "
-            "one value, or a dvi.Axis in args"
+    run, start, inputs, lengths = _prepare(system, q0, p0, section, settings)
+    counts = set(lengths.values())
+    if len(counts) != 1 or 0 in counts:
+        text = " and ".join(f"{name} of length {length}" for name, length in lengths.items())
+        raise ValueError(
+            "bifurcation requires an array for epsilon or a dvi.Axis in args, all of one length, "
+            f"got {text or 'only numbers'}."
         )
-        if len(lengths) > 1:
-            rule = "all parameters of bifurcation that vary must have the same length"
-        raise ValueError(f"{rule}, got {seen or 'only single numbers'}.")
-    start = (as_scalar("t0", settings.get("t0", 0.0), q.dtype), q, p)
-    h = as_scalar("h", settings["h"], q.dtype, zero_allowed=False)
     compute = _one_after_another if follow else _orbits
-    found = compute(orbits, start, h, epsilon, args, lengths.pop())
-    return _raise_on_failure(found, orbits) if settings.get("throw", True) else found
+    return _require_crossings(compute(run, start, *inputs, counts.pop()), run, settings)
 
 
 def stroboscope(period: float, phase: float = 0.0) -> Callable[..., Any]:
@@ -294,67 +279,72 @@ class ReturnMap(eqx.Module):
 
     def __check_init__(self):
         check_system(self.system)
-        self._settings()
+        self._section_run()
 
-    def _settings(self) -> _Settings:
+    def _section_run(self) -> _SectionRun:
         section = Section(self.g, self.direction, whole("returns", self.returns))
         names = ("method", "root_finder", "integrator", "num_steps")
-        return _settings(self.system, section, {name: getattr(self, name) for name in names})
+        return _section_run(self.system, section, {name: getattr(self, name) for name in names})
 
     def __call__(
         self, q: Any, p: Any, t0: Any = 0.0, epsilon: Any = None, args: Args = None
     ) -> Return:
-        found, _ = self._settings().orbit((t0, q, p), self.h, self.system.strength(epsilon), args)
-        return Return(found.ts[-1], found.qs[-1], found.ps[-1], found.result)
+        epsilon = self.system.strength(epsilon)
+        section, _ = self._section_run().orbit((t0, q, p), self.h, epsilon, args)
+        return Return(section.ts[-1], section.qs[-1], section.ps[-1], section.result)
 
 
-def _is_axis(x: Any) -> bool:
-    return isinstance(x, Axis)
+def _prepare(
+    system: System, q0: Any, p0: Any, section: Section, settings: SectionSettings
+) -> tuple[_SectionRun, tuple[Any, Any, Any], tuple[Any, Any, Any], dict[str, int]]:
+    """The settings of all orbits, (t0, q0, p0), and (h, ε, args) with a `_PerOrbit` for what
+    differs between orbits; and the lengths of those by name."""
+    check_system(system)
+    q, p = start_state(q0, p0)
+    run = _section_run(system, section, settings)
+    lengths: dict[str, int] = {}
 
+    def value_of(name: str, values: Any) -> Any:
+        if np.ndim(values) == 0:
+            return as_parameter(values)
+        if np.ndim(values) != 1:
+            shape = np.shape(values)
+            raise ValueError(f"{name} must be a number or a 1-D array, got shape {shape}.")
+        if not is_traced(values):
+            refuse_non_finite(name, np.asarray(values))
+        lengths[name] = len(values)
+        return _PerOrbit(jnp.asarray(values))
 
-def _of_orbits(system: System, settings: SectionSettings) -> tuple[Any, Any, dict[str, int]]:
-    return _varied(system.strength(settings.get("epsilon")), settings.get("args"))
-
-
-def _varied(epsilon: Any, args: Any) -> tuple[Any, Any, dict[str, int]]:
-    """ε and args with a `_Varied` for what differs between orbits, and the lengths of those."""
-    found = {}
-
-    def known(name: str, x: Any) -> Any:
-        if np.ndim(x) == 0:
-            return as_parameter(x)
-        if np.ndim(x) != 1:
-            raise ValueError(f"{name} must be a number or a 1-D array, got shape {np.shape(x)}.")
-        if not is_traced(x) and not np.isfinite(x).all():
-            raise ValueError(f"{name} must be finite, got {x}.")
-        found[name] = len(x)
-        return _Varied(jnp.asarray(x))
-
-    epsilon = known("epsilon", epsilon.values if _is_axis(epsilon) else epsilon)
+    epsilon = system.strength(settings.get("epsilon"))
+    epsilon = value_of("epsilon", epsilon.values if is_axis(epsilon) else epsilon)
     args = jax.tree.map(
-        lambda x: known(x.name, x.values) if _is_axis(x) else as_parameter(x),
-        args,
-        is_leaf=_is_axis,
+        lambda leaf: value_of(leaf.name, leaf.values) if is_axis(leaf) else as_parameter(leaf),
+        settings.get("args"),
+        is_leaf=is_axis,
     )
-    return epsilon, args, found
+    t0 = as_scalar("t0", settings.get("t0", 0.0), q.dtype)
+    h = as_scalar("h", settings["h"], q.dtype, zero_allowed=False)
+    return run, (t0, q, p), (h, epsilon, args), lengths
 
 
-def _raise_on_failure(found: PoincareSection, settings: _Settings) -> PoincareSection:
-    fine = found.result == SECTION_RESULTS.successful
-    if is_traced(fine):
+def _require_crossings(orbits: PoincareSection, run: _SectionRun, settings: SectionSettings) -> Any:
+    """The orbits. **Raises** `SectionError` for those with too few crossings, if `throw`."""
+    if not settings.get("throw", True):
+        return orbits
+    is_good = orbits.result == SECTION_RESULTS.successful
+    if is_traced(is_good):
         message = "an orbit has too few crossings: give throw=False and read each orbit's status."
-        return eqx.error_if(found, ~jnp.all(fine), message)
-    bad = np.flatnonzero(~np.asarray(fine))
+        return eqx.error_if(orbits, ~jnp.all(is_good), message)
+    bad = np.flatnonzero(~np.asarray(is_good))
     if not bad.size:
-        return found
-    i, names = int(bad[0]), np.atleast_1d(found.status)
+        return orbits
+    i, names = int(bad[0]), np.atleast_1d(orbits.status)
     text = SECTION_RESULTS[getattr(SECTION_RESULTS, str(names[i]))]
-    own = str(np.atleast_1d(status_name(found.run))[i])
-    wanted, num_steps = settings.section.capacity, settings.options["num_steps"]
+    run_status = str(np.atleast_1d(status_name(orbits.run))[i])
     raise SectionError(
-        f"{bad.size} of {len(names)} orbits did not cross the section {wanted} times (after skip = "
-        f"{settings.section.skip} crossings) in {num_steps} steps. The first is orbit {i}, with "
-        f"{int(found.count[i])} of {wanted} crossings. Its status is {names[i]}; the status of its "
-        f"run is {own}. {text} {AS_ATTRIBUTE}",
-        found,
+        f"{bad.size} of {len(names)} orbits did not cross the section {run.section.capacity} times "
+        f"(after skip = {run.section.skip}) in {run.options['num_steps']} steps. The first is "
+        f"orbit {i}: {int(orbits.count[i])} crossings, status {names[i]}, status of the run "
+        f"{run_status}. {text} {AS_ATTRIBUTE}",
+        orbits,
     )

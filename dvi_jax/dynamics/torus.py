@@ -7,17 +7,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lanewise.jaxprs.jaxapi import is_traced
-
 from ..base.checks import finite, instance, positive, whole
 from .frequencies import Frequencies
 from .results import (
     CODE,
     FREQUENCY_RESULTS,
-    WITHOUT_NUMBERS,
     WithStatus,
     code_of,
-    raise_on_failure,
+    lacks_numbers,
+    refuse_traced,
+    require_success,
     with_code,
 )
 
@@ -103,11 +102,7 @@ def fundamental_frequencies(
     """
     hint = "Write dvi.fundamental_frequencies(dvi.frequencies(solution))."
     instance("lines", lines, Frequencies, "a result of dvi.frequencies", hint)
-    if is_traced(lines.frequencies):
-        raise ValueError(
-            "fundamental_frequencies must be called outside of jit, vmap and grad, since it uses "
-            "NumPy, but lines is traced by JAX. Call it once, with the whole batch."
-        )
+    refuse_traced("fundamental_frequencies", lines.frequencies)
     omega, A = np.asarray(lines.frequencies), np.asarray(lines.amplitudes)
     code, resolution = np.asarray(code_of(lines.result)), np.asarray(lines.resolution)
     axes = min(lines.state_axes, omega.ndim - 1)  # fewer if one degree of freedom was selected
@@ -117,11 +112,10 @@ def fundamental_frequencies(
     code, resolution = code.reshape(shape), resolution.reshape(shape)
     search = search_of(omega.shape[-2], num, guess, order, tolerance, threshold)
     tori, codes = tori_of(omega, A, code, resolution, search, soft=True)
-    found = batched(tori, codes, lead)
-    return raise_on_failure(found) if throw else found
+    return require_success(as_batch(tori, codes, lead), throw)
 
 
-class Search(NamedTuple):
+class BasisSearch(NamedTuple):
     """Number of frequencies and limits of the search."""
 
     num: int
@@ -131,26 +125,28 @@ class Search(NamedTuple):
     guess: np.ndarray | None
 
 
-def search_of(n: int, num: Any, guess: Any, order: Any, tolerance: Any, threshold: Any) -> Search:
+def search_of(
+    n: int, num: Any, guess: Any, order: Any, tolerance: Any, threshold: Any
+) -> BasisSearch:
     if n == 0:
-        raise ValueError("signal (or lines) must have at least one degree of freedom, got 0.")
+        raise ValueError("signal or lines must have degrees of freedom, got 0.")
     if guess is not None:
         guess = np.array([finite("each frequency of guess", x) for x in np.atleast_1d(guess)])
     if num is None:
         num = n if guess is None else len(guess)
     num = whole("num", num, hint="It is the number of frequencies.")
     if guess is not None and len(guess) != num:
-        raise ValueError(f"guess must have the length num = {num}, got {len(guess)}: {guess}.")
+        raise ValueError(f"guess must have the length num = {num}, got {len(guess)}.")
     order = _ORDERS.get(num, 5) if order is None else whole("order", order, hint="It limits Σ|k|.")
     tolerance = None if tolerance is None else positive("tolerance", tolerance)
     fraction = "It is a fraction of the leading amplitude."
     if positive("threshold", threshold, hint=fraction) > 1:
-        raise ValueError(f"threshold must be at most 1, got {threshold!r}. {fraction}")
-    return Search(num, order, tolerance, float(threshold), guess)
+        raise ValueError(f"threshold must be at most 1, got {threshold!r}.")
+    return BasisSearch(num, order, tolerance, float(threshold), guess)
 
 
 def tori_of(
-    omega, A, code, resolution, search: Search, soft: bool
+    omega, A, code, resolution, search: BasisSearch, soft: bool
 ) -> tuple[list[np.ndarray], np.ndarray]:
     """The arrays of `FundamentalFrequencies`, each with the trajectories along its first axis, and
     the codes of their statuses.
@@ -164,10 +160,10 @@ def tori_of(
     tori, codes = [], []
     for nu, a, status, width in zip(*lines, *signals, strict=True):
         silent = status == CODE["no_signal"]
-        hard = (status > 0) & (status <= len(WITHOUT_NUMBERS)) & ~silent
-        if hard.any() or silent.all():
-            tori.append(_nothing(n, count, search.num))
-            codes.append(status[hard][0] if hard.any() else CODE["no_signal"])
+        is_hard = lacks_numbers(status) & ~silent
+        if is_hard.any() or silent.all():
+            tori.append(_no_torus(n, count, search.num))
+            codes.append(status[is_hard][0] if is_hard.any() else CODE["no_signal"])
             continue
         tolerance = _TOLERANCE * width.max() if search.tolerance is None else search.tolerance
         torus, problem = _torus(nu, np.abs(a), width.max(), tolerance, search)
@@ -175,72 +171,73 @@ def tori_of(
         tori.append(torus)
         codes.append(doubt[0] if soft and len(doubt) else CODE[problem])
     # An empty batch has shapes and types too.
-    some = tori or [_nothing(n, count, search.num)]
-    arrays = [np.stack(x)[: len(tori)] for x in zip(*some, strict=True)]
+    templates = tori or [_no_torus(n, count, search.num)]
+    arrays = [np.stack(x)[: len(tori)] for x in zip(*templates, strict=True)]
     return arrays, np.array(codes, int)
 
 
-def batched(arrays, codes: np.ndarray, lead: tuple[int, ...]) -> FundamentalFrequencies:
+def as_batch(arrays, codes: np.ndarray, lead: tuple[int, ...]) -> FundamentalFrequencies:
     """The result of `tori_of` with the axes `lead` of a batch."""
     parts = (x.reshape((*lead, *x.shape[1:])) for x in arrays)
     return FundamentalFrequencies(*parts, result=with_code(codes.reshape(lead)))
 
 
-def _nothing(n: int, count: int, num: int) -> tuple[Any, ...]:
-    none = np.full((n, count), np.nan)
-    no = np.zeros((n, count), bool)
-    return np.full(num, np.nan), np.zeros((n, count, num), int), none, no, np.nan
+def _no_torus(n: int, count: int, num: int) -> tuple[Any, ...]:
+    no_lines = np.full((n, count), np.nan)
+    no_match = np.zeros((n, count), bool)
+    return np.full(num, np.nan), np.zeros((n, count, num), int), no_lines, no_match, np.nan
 
 
-def _torus(nu, size, resolution, tolerance, search: Search) -> tuple[tuple[Any, ...], str]:
+def _torus(nu, size, resolution, tolerance, search: BasisSearch) -> tuple[tuple[Any, ...], str]:
     """The torus with the best basis, and the name of its status."""
     n, count = nu.shape
-    there = np.isfinite(nu)
-    lead = np.nanmax(np.where(there, size, 0.0), axis=1, keepdims=True)
-    share = np.where(there, size, 0.0) / np.where(lead > 0, lead, 1.0)
+    is_line = np.isfinite(nu)
+    lead = np.nanmax(np.where(is_line, size, 0.0), axis=1, keepdims=True)
+    share = np.where(is_line, size, 0.0) / np.where(lead > 0, lead, 1.0)
     order = np.argsort(-share, axis=None, kind="stable")
     flat, weight = nu.ravel()[order], share.ravel()[order]
-    strong = weight >= search.threshold
+    strong, weight = flat[weight >= search.threshold], weight[weight >= search.threshold]
     best, best_score = np.zeros(0), (np.inf, np.inf)
-    for basis in _bases(nu, flat[strong], resolution, tolerance, search):
-        basis, k, _, matched = _fitted(basis, flat[strong], weight[strong], tolerance, search.order)
-        score = (np.sum(~matched), float(np.sum(np.abs(k).sum(axis=1) * weight[strong] * matched)))
+    for basis in _bases(nu, strong, resolution, tolerance, search):
+        basis, k, _, is_combination = _fit(basis, strong, weight, tolerance, search.order)
+        complexity = float(np.sum(np.abs(k).sum(axis=1) * weight * is_combination))
+        score = (np.sum(~is_combination), complexity)
         if score[0] < best_score[0] or (
             score[0] == best_score[0] and score[1] < 0.8 * best_score[1]
         ):
             best, best_score = basis, score
         if best_score[0] == 0 and len(basis) < search.num:
             break  # fewer frequencies explain all lines
-    known = np.where(there, nu, np.inf)
+    lines = np.where(is_line, nu, np.inf)
     lattice = combinations_up_to(len(best), search.order)
-    k, misfit, matched = _match(best, known.ravel(), tolerance, lattice)
+    k, misfit, is_combination = _match(best, lines.ravel(), tolerance, lattice)
     pad = search.num - len(best)
-    power = np.where(there, size, 0.0) ** 2
-    ours = matched.reshape(n, count) & there
+    power = np.where(is_line, size, 0.0) ** 2
+    explains = is_combination.reshape(n, count) & is_line
     total = np.where(power.sum(axis=1) > 0, power.sum(axis=1), 1.0)
     combinations = np.zeros((len(k), search.num), int)
-    combinations[:, : len(best)] = np.where(matched[:, None], k, 0)
+    combinations[:, : len(best)] = np.where(is_combination[:, None], k, 0)
     torus = (
         np.append(best, np.full(pad, np.nan)),
         combinations.reshape(n, count, search.num),
-        np.where(there, misfit.reshape(n, count), np.nan),
-        ours,
-        float(np.max(np.sum(power * ~ours, axis=1) / total)),
+        np.where(is_line, misfit.reshape(n, count), np.nan),
+        explains,
+        float(np.max(np.sum(power * ~explains, axis=1) / total)),
     )
     if best_score[0] > 0:
         return torus, "not_quasi_periodic"
     return torus, "resonant" if pad else "successful"
 
 
-def _bases(nu, strong, resolution, tolerance, search: Search):
+def _bases(nu, strong, resolution, tolerance, search: BasisSearch):
     """Sets of frequencies that may be a basis, the most natural first."""
     num, order = search.num, search.order
     if search.guess is not None:
         low = combinations_up_to(num, 4)
         k, _, close = _match(search.guess, strong, resolution / 2, low)
-        used = close & (np.abs(k).sum(axis=1) > 0)
-        if np.linalg.matrix_rank(k[used]) == num:
-            yield np.linalg.lstsq(k[used].astype(float), strong[used], rcond=None)[0]
+        close &= np.abs(k).sum(axis=1) > 0
+        if np.linalg.matrix_rank(k[close]) == num:
+            yield np.linalg.lstsq(k[close].astype(float), strong[close], rcond=None)[0]
         else:
             yield search.guess
         return
@@ -267,27 +264,27 @@ def _independent(basis: np.ndarray, tolerance: float, order: int) -> bool:
     )
 
 
-def _fitted(basis, lines, weight, tolerance, order):
+def _fit(basis, lines, weight, tolerance, order):
     """Fit the basis to the lines that are its combinations, by least squares, twice."""
     lattice = combinations_up_to(len(basis), order)
     for _ in range(2):
-        k, _, matched = _match(basis, lines, tolerance, lattice)
-        rows = (k * weight[:, None])[matched]
+        k, _, is_combination = _match(basis, lines, tolerance, lattice)
+        rows = (k * weight[:, None])[is_combination]
         if len(basis) and np.linalg.matrix_rank(rows) == len(basis):
-            basis = np.linalg.lstsq(rows, (lines * weight)[matched], rcond=None)[0]
+            basis = np.linalg.lstsq(rows, (lines * weight)[is_combination], rcond=None)[0]
     return basis, *_match(basis, lines, tolerance, lattice)
 
 
 def _match(basis, lines, tolerance, lattice):
     """The simplest combination within the tolerance of each line, else the nearest."""
     if not len(basis):
-        none = np.zeros(len(lines), bool)
-        return np.zeros((len(lines), 0), int), np.where(np.isfinite(lines), lines, np.nan), none
-    off = lines[:, None] - (lattice @ basis)[None, :]
-    close = np.abs(off) <= tolerance
-    matched = close.any(axis=1)
-    at = np.where(matched, close.argmax(axis=1), np.abs(off).argmin(axis=1))
-    return lattice[at], off[np.arange(len(lines)), at], matched
+        no_match = np.zeros(len(lines), bool)
+        return np.zeros((len(lines), 0), int), np.where(np.isfinite(lines), lines, np.nan), no_match
+    misfit = lines[:, None] - (lattice @ basis)[None, :]
+    close = np.abs(misfit) <= tolerance
+    is_combination = close.any(axis=1)
+    index = np.where(is_combination, close.argmax(axis=1), np.abs(misfit).argmin(axis=1))
+    return lattice[index], misfit[np.arange(len(lines)), index], is_combination
 
 
 @functools.lru_cache(maxsize=32)

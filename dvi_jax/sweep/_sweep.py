@@ -3,32 +3,26 @@
 import dataclasses
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Unpack
 
 import jax
 import numpy as np
 
-from lanewise.jaxprs.jaxapi import ClosedJaxpr
-
-from ..base.checks import instance, whole
+from ..base.checks import instance, one_of, whole
 from ..base.keywords import checked_keywords
-from ..base.machine import machine_memory
+from ..base.reads import reads
 from ..problem.system import System
 from .axes import axes_in, is_axis
-from .bar import shown
+from .bar import progress_display
 from .cost import SweepCost, cost
 from .identity import description, digest, provenance
-from .plan import make_plan
-from .program import Program, Sweep, traced
+from .program import Sweep, functions_of, states_of
 from .request import Request, SweepCostSettings, SweepSettings
 from .result import SweepResult
-from .store import Memory, Store
-from .variables import Variable, check_names, own_dims, variables
+from .store import MemorySink, Store
+from .variables import check_names, own_dims
 from .workers import SweepProgress, run_here
-
-_SHARE = 0.5
-"""Fraction of the memory of the machine that results in memory may take."""
 
 _MANY_STARTS = 100_000
 """Number of initial conditions up to which they are written into the result."""
@@ -104,52 +98,43 @@ def sweep(
     # {'epsilon': 3, 'p_x': 2} {'successful': 6}
     ```
     """
-    program, found, programs = prepare(Request(system, q0, p0, **settings))
-    made, coordinates = program.sweep, coordinates_of(program.sweep)
-    check_names(made.dims, found, coordinates)
-    about: dict[str, Any] = provenance()
-    if auxiliary := [name for name in coordinates if name not in made.dims]:
-        about["coordinates"] = " ".join(auxiliary)  # the attribute of the CF conventions
+    program, arrays, programs = Request(system, q0, p0, **settings).prepare()
+    definition, coordinates = program.sweep, coordinates_of(program.sweep)
+    check_names(definition.dims, arrays, coordinates)
+    attributes: dict[str, Any] = provenance()
+    if auxiliary := [name for name in coordinates if name not in definition.dims]:
+        attributes["coordinates"] = " ".join(auxiliary)  # the attribute of the CF conventions
     if units is not None:
-        _check_units(units, found)
-        about["units"] = json.dumps(dict(units))
+        attributes["units"] = json.dumps(_checked_units(units, arrays))
     if client is not None and not hasattr(client, "submit"):
         raise TypeError(f"client must be a distributed.Client, got {client!r:.200}.")
     if threads is not None:
         whole("threads", threads)
         if client is not None:
-            raise ValueError(f"threads={threads} has no effect with client: leave threads out.")
-    config = description(made, program.plan, found, programs)
+            raise ValueError(f"threads={threads} has no effect with client: leave it out.")
+    config = description(definition, program.plan, arrays, programs)
     if store is None:
-        needed = program.plan.lanes * sum(v.bytes for v in found.values())
-        memory = machine_memory()
-        there = memory or 8 * 2**30
-        if needed > _SHARE * there:
-            raise ValueError(
-                f"the results need {needed / 2**30:.2f} GiB, but may use only {_SHARE:.0%} of the "
-                f"{there / 2**30:.2f} GiB of memory{'' if memory else ' (an assumed size)'}: give "
-                "store=..., a directory to which the results of each task are written."
-            )
-        sink = Memory(program.plan, found)
-        about |= {"config": json.dumps(config), "config_sha256": digest(config)}
+        sink = MemorySink(program.plan, arrays)
+        attributes |= {"config": json.dumps(config), "config_sha256": digest(config)}
     else:
         instance("store", store, str | os.PathLike, "the path of a directory or None")
-        sink = Store.open_or_make(store, config, found, coordinates, about)
-        about = dict(sink.attributes)
-    result = SweepResult(sink, coordinates, about)
-    with shown(progress) as report:
+        sink = Store.open_or_make(store, config, arrays, coordinates, attributes)
+        attributes = dict(sink.attributes)
+    result = SweepResult(sink, coordinates, attributes)
+    with progress_display(progress) as report:
         if client is not None:
             from .cluster import run_on
 
-            is_whole = run_on(client, made, program.plan, sink, report)
+            is_complete = run_on(client, definition, program.plan, sink, report)
         else:
-            is_whole = run_here(program, sink, threads, report)
-    if not is_whole:
-        done = f"{result.tasks_done} of {result.num_tasks} tasks are done"
-        where = "; their results are the attribute `result` of this exception."
-        if store is not None:
-            where = f" and stored in {result.path}; the same call continues from there."
-        raise SweepInterrupted(f"interrupted: {done}{where}", result)
+            is_complete = run_here(program, sink, threads, report)
+    if not is_complete:
+        message = f"interrupted: {result.tasks_done} of {result.num_tasks} tasks are done"
+        if store is None:
+            message += "; their results are the attribute `result` of this exception."
+        else:
+            message += f" and stored in {result.path}; the same call continues from there."
+        raise SweepInterrupted(message, result)
     return result
 
 
@@ -167,63 +152,45 @@ def sweep_cost(
     """
     names = [field.name for field in dataclasses.fields(Request)]
     options: dict[str, Any] = {name: x for name, x in settings.items() if name in names}
-    program, found, _ = prepare(Request(system, q0, p0, **options))
-    return cost(program.sweep, program.plan, found)
+    program, arrays, _ = Request(system, q0, p0, **options).prepare()
+    return cost(program.sweep, program.plan, arrays)
 
 
-def _check_units(units: Any, found: Mapping[str, Any]) -> None:
-    if not isinstance(units, Mapping) or not all(isinstance(u, str) for u in units.values()):
-        example = '{"drift": "J"}'
-        raise TypeError(
-            f"units must be a dict from names to text, such as {example}, got {units!r}."
-        )
-    if unknown := [name for name in units if name not in found]:
-        raise ValueError(
-            f"units has the unknown name {unknown[0]!r}: use the names of results. These are "
-            f"{', '.join(found)}."
-        )
+def _checked_units(units: Any, names: Iterable[str]) -> dict[str, str]:
+    instance("units", units, Mapping, 'a dict from names to text, such as {"drift": "J"}')
+    for name, unit in units.items():
+        instance(f"the unit of {name!r}", unit, str, 'text, such as "J"')
+        one_of("each name in units", name, names)
+    return dict(units)
 
 
-def prepare(
-    request: Request,
-) -> tuple[Program, dict[str, Variable], list[ClosedJaxpr]]:
-    """The program of the sweep that is requested, divided into tasks, the variables of its result,
-    and the jaxprs."""
-    definition = request.sweep()
-    shapes, programs = traced(definition)
-    arrays = variables(definition, shapes)
-    size = sum(variable.bytes for variable in arrays.values())
-    plan = make_plan(
-        definition.dims, definition.compiled, definition.most_steps, size, request.lanes_per_task
-    )
-    return Program(definition, plan), arrays, programs
-
-
-def coordinates_of(made: Sweep) -> dict[str, Any]:
+def coordinates_of(definition: Sweep) -> dict[str, Any]:
     """name → (dims, values, attributes). If only one argument varies along a dimension, its values
     are those of the dimension; otherwise each argument is a coordinate of its own name."""
-    found: dict[str, Any] = {}
-    along: dict[str, dict[str, tuple[np.ndarray, str]]] = {dim: {} for dim in made.dims}
-    if is_axis(made.method):
-        names = np.asarray([repr(m) for m in made.method.values])
-        along[made.method.name]["method"] = names, ""
-    if is_axis(made.num_steps):
-        along[made.num_steps.name]["num_steps"] = np.asarray(made.num_steps.values), "steps"
-    for where, axis in axes_in(made.inputs):
-        along[axis.name][where] = axis.values, axis.units
-    for dim, arguments in along.items():
+    dims, method, num_steps = definition.dims, definition.method, definition.num_steps
+    coordinates: dict[str, Any] = {}
+    arguments_of: dict[str, dict[str, tuple[np.ndarray, str]]] = {dim: {} for dim in dims}
+    if is_axis(method):
+        arguments_of[method.name]["method"] = np.asarray([*map(repr, method.values)]), ""
+    if is_axis(num_steps):
+        arguments_of[num_steps.name]["num_steps"] = np.asarray(num_steps.values), "steps"
+    for argument, axis in axes_in(definition.inputs):
+        arguments_of[axis.name][argument] = axis.values, axis.units
+    for dim, arguments in arguments_of.items():
         rows = [name for name, (values, _) in arguments.items() if values.ndim == 1]
         main = dim if dim in rows else rows[0] if len(rows) == 1 else None
-        if main is None and made.dims[dim] <= _MANY_STARTS:
-            found[dim] = ((dim,), np.arange(made.dims[dim]), {})
+        if main is None and dims[dim] <= _MANY_STARTS:
+            coordinates[dim] = ((dim,), np.arange(dims[dim]), {})
         for name, (values, units) in arguments.items():
-            own = own_dims("component" if name in ("q0", "p0") else f"{name}_dim", values.shape[1:])
-            about = {"units": units} if units else {}
-            found[dim if name == main else name] = ((dim, *own), values, about)
-    start, of = made.start, (made.inputs["t0"], made.inputs["args"])
-    vary = any(map(is_axis, jax.tree.leaves(of, is_leaf=is_axis)))  # with another axis
+            label = "component" if name in ("q0", "p0") else f"{name}_dim"
+            all_dims = (dim, *own_dims(label, values.shape[1:]))
+            attributes = {"units": units} if units else {}
+            coordinates[dim if name == main else name] = (all_dims, values, attributes)
+    start, inputs = definition.start, (definition.inputs["t0"], definition.inputs["args"])
+    vary = any(map(is_axis, jax.tree.leaves(inputs, is_leaf=is_axis)))  # with another axis
     if start is not None and start.count <= _MANY_STARTS and not vary:
-        states = jax.jit(jax.vmap(lambda i: start.at(i, *of)))(np.arange(start.count))
-        for name, x in zip(("q0", "p0"), map(np.asarray, states[:2]), strict=True):
-            found[name] = ((start.name, *own_dims("component", x.shape[1:])), x, {})
-    return found
+        states = states_of(start, *inputs, reads(*functions_of(start)))
+        for name, values in zip(("q0", "p0"), map(np.asarray, states), strict=True):
+            all_dims = (start.name, *own_dims("component", values.shape[1:]))
+            coordinates[name] = (all_dims, values, {})
+    return coordinates

@@ -1,6 +1,6 @@
 """Axes: what a sweep varies, and its place in the arguments."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,20 +37,17 @@ class Axis:
     def __init__(self, name: str, values: Any, units: str = ""):
         if not isinstance(name, str) or not (name.isascii() and name.isidentifier()):
             raise ValueError(
-                'the name of a dvi.Axis, or of start, must be an identifier such as "epsilon": '
-                f"only ASCII letters, digits and _, and no digit at the beginning. Got {name!r}."
+                "the name of an axis or start must be an identifier of ASCII letters, digits and "
+                f"_, got {name!r}."
             )
-        of = f"the axis {name!r}"
-        instance(f"the units of {of}", units, str, "text")
-        refuse_unit_or_mask(of, values)
+        label = f"the axis {name!r}"
+        instance(f"the units of {label}", units, str, "text")
+        refuse_unit_or_mask(label, values)
         if isinstance(values, jax.Array):
             values = np.asarray(values)
         if not isinstance(values, np.ndarray):
-            try:
-                values = list(values)
-            except TypeError:
-                raise TypeError(f"{of} requires a list or array, got {values!r:.200}.") from None
-            if values and all(isinstance(v, _NUMBERS) for v in values):
+            values = list(instance(label, values, Iterable, "a list or array"))
+            if values and all(isinstance(value, _NUMBERS) for value in values):
                 array = np.asarray(values)
                 # Numbers of Python have the precision of the process, as in JAX.
                 leaves = jax.tree.leaves(values)
@@ -58,9 +55,13 @@ class Axis:
                     array = array.astype(jnp.result_type(float))
                 values = array
         if isinstance(values, np.ndarray):
-            _check(of, values)
+            if values.ndim == 0:
+                raise ValueError(f"{label} must be a list or array, got {values}: give [{values}].")
+            if values.dtype.kind not in "iuf":
+                raise TypeError(f"{label} must have real numbers, got dtype {values.dtype}.")
+            refuse_non_finite(label, values)
         if len(values) == 0:
-            raise ValueError(f"{of} has no values: give at least one.")
+            raise ValueError(f"{label} has no values: give at least one.")
         for field, value in (("name", name), ("values", values), ("units", units)):
             object.__setattr__(self, field, value)
 
@@ -74,15 +75,11 @@ class Axis:
 _NUMBERS = (int, float, np.ndarray, np.generic, jax.Array, list, tuple)
 
 
-def _check(of: str, values: np.ndarray) -> None:
-    if values.ndim == 0:
-        raise ValueError(f"{of} requires a sequence of values, got only {values}: give [{values}].")
-    if values.dtype.kind not in "iuf":
-        raise TypeError(f"{of} must have real numbers as values, got dtype {values.dtype}.")
+def refuse_non_finite(label: str, values: np.ndarray) -> None:
+    """**Raises** `ValueError` for an array with an infinite number or NaN."""
     if not np.isfinite(values).all():
-        where = tuple(np.argwhere(~np.isfinite(values))[0].tolist())
-        seen = f"{values[where]} at index {list(where)}"
-        raise ValueError(f"{of} must have finite values, got {seen}.")
+        index = np.argwhere(~np.isfinite(values))[0].tolist()
+        raise ValueError(f"{label} must be finite, got {values[*index]} at index {index}.")
 
 
 def is_axis(x: Any) -> bool:
@@ -96,29 +93,26 @@ def as_axis(name: str, value: Any) -> Any:
     if np.ndim(value) > 1:
         raise ValueError(
             f"{name} must be a number or a one-dimensional array, got shape {np.shape(value)}. "
-            "For a grid, give a one-dimensional array for each argument. For arguments that vary "
-            'together, give each argument as dvi.Axis("name", values) with the same name.'
+            "Arguments vary together if each is a dvi.Axis of the same name."
         )
     return Axis(name, value)
 
 
 def axes_in(arguments: Mapping[str, Any]) -> list[tuple[str, Axis]]:
     """Every axis in the arguments with the name of its place: ``epsilon``, ``args.K``, ``q0.1``."""
-    found = []
+    axes = []
     for name, argument in arguments.items():
         for path, axis in jax.tree.leaves_with_path(argument, is_leaf=is_axis):
             if not is_axis(axis):
                 continue
-            where = ".".join(filter(None, (name, place(path))))
+            location = ".".join(filter(None, (name, place(path))))
             if not isinstance(axis.values, np.ndarray):
-                wrong = next(x for x in axis.values if not isinstance(x, _NUMBERS))
-                raise TypeError(
-                    f"all values of {where} must be numbers, but its axis {axis.name!r} contains "
-                    f"{wrong!r:.200} of type {type(wrong).__name__}. Replace or remove this value."
-                )
+                for value in axis.values:
+                    label = f"each value of {location}, axis {axis.name!r},"
+                    instance(label, value, _NUMBERS, "a number")
             refuse_double_without_x64(f"the axis {axis.name!r}", axis.values.dtype)
-            found.append((where, axis))
-    return found
+            axes.append((location, axis))
+    return axes
 
 
 def place(path: Sequence[Any]) -> str:
@@ -130,12 +124,11 @@ def place(path: Sequence[Any]) -> str:
 def lengths(axes: Sequence[tuple[str, int, str]]) -> dict[str, int]:
     """The dimensions of a grid from (name, length, place) of its axes."""
     dims: dict[str, tuple[int, str]] = {}
-    for name, length, where in axes:
-        known, first = dims.setdefault(name, (length, where))
-        if known != length:
+    for name, length, location in axes:
+        first_length, first_place = dims.setdefault(name, (length, location))
+        if first_length != length:
             raise ValueError(
-                "axes of the same name vary together and must have equal lengths. The axis "
-                f"{name!r} has the length {known} in {first}, but {length} in {where}. For a grid, "
-                "give the axes different names."
+                f"axes of one name must have equal lengths, but {name!r} has {first_length} values "
+                f"in {first_place} and {length} in {location}. For a grid use different names."
             )
     return {name: length for name, (length, _) in dims.items()}

@@ -18,9 +18,9 @@ import jax
 
 from lanewise.jaxprs.jaxapi import backends_are_initialized, x64_enabled
 
-from .plan import Plan
-from .program import Program, Sweep
-from .store import Memory, Store, StoreError
+from .plan import SweepPlan
+from .program import Sweep, SweepProgram
+from .store import MemorySink, Store, StoreError
 from .workers import Counter, SweepProgress, compute
 
 _AHEAD = 4
@@ -41,8 +41,8 @@ class ClusterError(RuntimeError):
 def run_on(
     client: Any,
     sweep: Sweep,
-    plan: Plan,
-    sink: Memory | Store,
+    plan: SweepPlan,
+    sink: MemorySink | Store,
     report: Callable[[SweepProgress], None] | None,
 ) -> bool:
     """Compute the tasks that `sink` lacks on the workers of a `distributed.Client`. False: it was
@@ -50,43 +50,42 @@ def run_on(
     import cloudpickle
     from distributed import CancelledError, KilledWorker, as_completed
 
-    before = set(sink.done())
-    todo, again = plan.todo(before), deque[int]()
-    counter = Counter(Program(sweep, plan), before, report)
-    where = (str(sink.path.resolve()), sink.sha) if isinstance(sink, Store) else (None, None)
-    job: Any = cloudpickle.dumps((sweep, plan, *where, x64_enabled()))
-    lost, running, run = Counts(), {}, uuid.uuid4().hex[:12]
-    done = as_completed()
+    done_tasks = set(sink.done_tasks())
+    todo, retries = plan.todo(done_tasks), deque[int]()
+    counter = Counter(SweepProgram(sweep, plan), done_tasks, report)
+    location = (str(sink.path.resolve()), sink.sha) if isinstance(sink, Store) else (None, None)
+    job: Any = cloudpickle.dumps((sweep, plan, *location, x64_enabled()))
+    losses, running, run = Counts(), {}, uuid.uuid4().hex[:12]
+    completions = as_completed()
     if len(job) > _LARGE:  # an axis of many values: once to each worker
         job = client.scatter(job, broadcast=True, hash=False)
 
     def submit() -> None:
         threads = max(sum(client.nthreads().values()), 1)
         while len(running) < _AHEAD * threads:
-            number = again.popleft() if again else next(todo, None)
+            number = retries.popleft() if retries else next(todo, None)
             if number is None:
                 return
             key = f"dvi-task-{run}-{number}-{uuid.uuid4().hex[:12]}"
             future = client.submit(_task, job, number, pure=False, key=key)
             running[key] = number, future
-            done.add(future)
+            completions.add(future)
 
     try:
         submit()
         while running:
-            number, future = running.pop(next(done).key)
+            number, future = running.pop(next(completions).key)
             try:
                 results, statuses = future.result()
             except KilledWorker as error:
-                lost[number] += 1
-                if lost[number] >= _ATTEMPTS:
+                losses[number] += 1
+                if losses[number] >= _ATTEMPTS:
                     raise ClusterError(
-                        f"the workers of task {number} stopped in all of {_ATTEMPTS} attempts, "
-                        "probably for lack of memory. Give the workers more memory, or use a "
-                        "smaller lanes_per_task (with store=..., this needs a new path for the "
-                        f"store). The last error was: {error}"
+                        f"task {number} lost its workers {_ATTEMPTS} times, probably for lack of "
+                        "memory: use a smaller lanes_per_task and a new store. The last error was: "
+                        f"{error}"
                     ) from error
-                again.append(number)
+                retries.append(number)
             except CancelledError as error:
                 raise OSError(f"task {number} was cancelled") from error
             except (OSError, TimeoutError) as error:
@@ -105,9 +104,8 @@ def run_on(
         raise error.args[0] from None
     except (OSError, TimeoutError) as error:
         raise ClusterError(
-            f"the connection to the Dask cluster was lost ({error!r}). Start a new cluster and "
-            "repeat the call with its client. With store=..., the same call continues after the "
-            "finished tasks; otherwise all tasks are computed again."
+            f"the connection to the Dask cluster was lost ({error!r}): start a new one. With "
+            "store=... the same call continues."
         ) from error
     finally:
         with contextlib.suppress(OSError, TimeoutError):
@@ -141,21 +139,21 @@ def _start_jax() -> None:
 
 
 @functools.lru_cache(maxsize=1)
-def _job(pickled: bytes) -> tuple[Program, str | None, str | None, bool]:
+def _job(job: bytes) -> tuple[SweepProgram, str | None, str | None, bool]:
     """The last sweep of a worker: its program, the path and hash of its store, and x64."""
     _start_jax()
-    sweep, plan, *others = pickle.loads(pickled)
-    return Program(sweep, plan), *others
+    sweep, plan, *store_and_precision = pickle.loads(job)
+    return SweepProgram(sweep, plan), *store_and_precision
 
 
 _lock = threading.Lock()
 
 
-def _task(pickled: bytes, number: int) -> tuple[Any, dict[str, int]]:
+def _task(job: bytes, number: int) -> tuple[Any, dict[str, int]]:
     """On a worker: compute a task and commit it if there is a store. Its results, if there is no
     store, and its statuses."""
     with _lock:  # threads of a worker share one job
-        program, path, sha, x64 = _job(pickled)
+        program, path, sha, x64 = _job(job)
     task, device = program.plan.task(number), jax.local_devices()[0]
     with jax.enable_x64(x64):
         if path is None:
@@ -164,11 +162,11 @@ def _task(pickled: bytes, number: int) -> tuple[Any, dict[str, int]]:
         store = Store.open(path)
         if store.sha != sha:
             raise StoreError(
-                f"store must be the same directory on every worker, but on one worker {path!r} "
-                "contains another sweep. Use a directory that all workers share."
+                f"store={path!r} must be one directory, shared by all workers, but on one of them "
+                "it contains another sweep."
             )
-        known = store.record(number)
-        if known is None:
-            results, known = compute(program, task, device)
-            store.commit(task, results, known)
-        return None, known["statuses"]
+        record = store.record(number)
+        if record is None:
+            results, record = compute(program, task, device)
+            store.commit(task, results, record)
+        return None, record["statuses"]

@@ -6,8 +6,8 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from .plan import Plan
-from .program import Program, Sweep
+from .plan import SweepPlan
+from .program import Sweep, SweepProgram
 from .variables import Variable
 from .workers import default_threads
 
@@ -50,16 +50,16 @@ class SweepCost:
         The time of ⌈tasks/workers⌉ tasks, one after the other, and of one compilation.
         """
         workers = workers or self.cores
-        each = max(self.steps * self.seconds_per_step / self.tasks, SECONDS_TO_COMMIT)
-        return self.compilation + -(-self.tasks // workers) * each
+        task_seconds = max(self.steps * self.seconds_per_step / self.tasks, SECONDS_TO_COMMIT)
+        return self.compilation + -(-self.tasks // workers) * task_seconds
 
     def scaled(self, lanes: float) -> "SweepCost":
         """The cost of another number of trajectories, in tasks of the same size."""
         factor = lanes / self.lanes
         tasks = max(1, -(-int(lanes) // self.lanes_per_task))
-        changed = {"steps": int(self.steps * factor), "bytes": int(self.bytes * factor)}
-        changed |= {"lanes": int(lanes), "tasks": tasks, "files": tasks * (self.variables + 1)}
-        return dataclasses.replace(self, dims={}, **changed)
+        numbers = {"steps": int(self.steps * factor), "bytes": int(self.bytes * factor)}
+        numbers |= {"lanes": int(lanes), "tasks": tasks, "files": tasks * (self.variables + 1)}
+        return dataclasses.replace(self, dims={}, **numbers)
 
     def table(
         self, lanes: Sequence[float] = (1e6, 1e9, 1e12), workers: Sequence[int] = (1, 64, 4096)
@@ -67,9 +67,9 @@ class SweepCost:
         """Time and disk space for other numbers of trajectories and workers, as Markdown."""
         cores = ["1 worker" if n == 1 else f"{n} workers" for n in workers]
         lines = [["trajectories", "tasks", "results", *cores], ["---"] * (3 + len(cores))]
-        for c in (self, *(self.scaled(n) for n in lanes if n != self.lanes)):
-            times = (span(c.seconds(n)) for n in workers)
-            lines.append([f"{c.lanes:.3g}", f"{c.tasks:.3g}", size(c.bytes), *times])
+        for cost in (self, *(self.scaled(n) for n in lanes if n != self.lanes)):
+            times = (span(cost.seconds(n)) for n in workers)
+            lines.append([f"{cost.lanes:.3g}", f"{cost.tasks:.3g}", size(cost.bytes), *times])
         return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
     def __str__(self) -> str:
@@ -84,38 +84,38 @@ class SweepCost:
         )
 
 
-def cost(sweep: Sweep, plan: Plan, variables: Mapping[str, Variable]) -> SweepCost:
+def cost(sweep: Sweep, plan: SweepPlan, variables: Mapping[str, Variable]) -> SweepCost:
     """Compute the first task of each method and number of steps twice or more, and extrapolate."""
-    program = Program(sweep, plan)
-    per_value = plan.num_tasks // math.prod(plan.counts[: sweep.compiled])
-    firsts, again, steps = [], [], 0
+    program = SweepProgram(sweep, plan)
+    per_value = plan.num_tasks // math.prod(plan.counts[: sweep.compiled_dims])
+    firsts, repeats, steps = [], [], 0
     for number in range(0, plan.num_tasks, per_value):
         task = plan.task(number)
         firsts.append(_seconds(program, task))
-        again.append(_seconds(program, task))
-        if again[-1] < LONG:
-            again[-1] = min(again[-1], _seconds(program, task))
+        repeats.append(_seconds(program, task))
+        if repeats[-1] < LONG:
+            repeats[-1] = min(repeats[-1], _seconds(program, task))
         steps += program.steps(task)
     return SweepCost(
         dims=dict(plan.dims),
         lanes=plan.lanes,
-        steps=plan.lanes // len(again) * steps,
+        steps=plan.lanes // len(repeats) * steps,
         tasks=plan.num_tasks,
         lanes_per_task=plan.lanes_per_task,
         bytes=plan.lanes * sum(v.bytes for v in variables.values()),
         files=plan.num_tasks * (len(variables) + 1),
         variables=len(variables),
-        seconds_per_step=sum(again) / (plan.lanes_per_task * steps),
-        seconds_per_task=sum(again) / len(again),
-        compilation=max(0.0, sum(firsts) - sum(again)),
+        seconds_per_step=sum(repeats) / (plan.lanes_per_task * steps),
+        seconds_per_task=sum(repeats) / len(repeats),
+        compilation=max(0.0, sum(firsts) - sum(repeats)),
         cores=default_threads(),
     )
 
 
-def _seconds(program: Program, task: Any) -> float:
-    began = time.perf_counter()
+def _seconds(program: SweepProgram, task: Any) -> float:
+    start = time.perf_counter()
     program(task)
-    return time.perf_counter() - began
+    return time.perf_counter() - start
 
 
 def size(number: float) -> str:
@@ -133,7 +133,7 @@ _UNITS = (("years", 365.25 * 86400, 2), ("days", 86400, 2), ("h", 3600, 1.5), ("
 
 def span(seconds: float) -> str:
     """A time in words."""
-    for unit, length, least in _UNITS:
-        if seconds >= least * length:
+    for unit, length, fewest in _UNITS:
+        if seconds >= fewest * length:
             return f"{seconds / length:.3g} {unit}"
     return f"{seconds:.2g} s"

@@ -18,13 +18,13 @@ def _whole_or_not(path: Any, force: bool, package: str) -> Iterator[Path]:
     path = Path(path)
     if path.exists() and not force:
         raise FileExistsError(
-            f"'{path}' already exists. Give another path. To replace a file, set force=True."
+            f"'{path}' already exists: give another path, or force=True to replace it."
         )
     try:
         __import__(package)
     except ImportError:
         raise ImportError(
-            f'the export requires the package {package}. Install it: pip install "dvi-jax[export]".'
+            f'the export requires {package}: pip install "dvi-jax[export]".'
         ) from None
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
     try:
@@ -53,8 +53,8 @@ def to_netcdf(dataset: Any, boxes: Iterator[dict[str, slice]], path: Any, force:
                     array[...] = variable.values.astype(object) if is_text else variable.values
                 elif auxiliary:
                     dims = set(variable.dims)
-                    its = " ".join(n for n in auxiliary if set(dataset[n].dims) <= dims)
-                    array.attrs["coordinates"] = its or " "
+                    coordinates = " ".join(n for n in auxiliary if set(dataset[n].dims) <= dims)
+                    array.attrs["coordinates"] = coordinates or " "
             for box in boxes:
                 for name in dataset.data_vars:
                     part = dataset[name].isel(box)
@@ -75,8 +75,8 @@ def to_parquet(dataset: Any, boxes: Iterator[dict[str, slice]], path: Any, force
         for box in boxes:
             table = pa.table(_columns(dataset.isel(box), list(box)))
             if writer is None:
-                about = {k: str(v) for k, v in dataset.attrs.items()}
-                schema = table.schema.with_metadata(about)
+                metadata = {k: str(v) for k, v in dataset.attrs.items()}
+                schema = table.schema.with_metadata(metadata)
                 writer = stack.enter_context(pq.ParquetWriter(temporary, schema))
             writer.write_table(table.replace_schema_metadata(writer.schema.metadata))
 
@@ -86,21 +86,21 @@ def _columns(part: Any, grid: list[str]) -> dict[str, np.ndarray]:
     columns: dict[str, np.ndarray] = {}
     for name in (*part.coords, *part.data_vars):
         variable = part[name].variable.to_base_variable()
-        own = [d for d in variable.dims if d not in grid]
-        sizes = {d: part.sizes[d] for d in (*grid, *own)}
+        other_dims = [dim for dim in variable.dims if dim not in grid]
+        sizes = {dim: part.sizes[dim] for dim in (*grid, *other_dims)}
         values = variable.set_dims(sizes).transpose(*sizes).values
-        values = np.ascontiguousarray(values).reshape(np.prod([part.sizes[d] for d in grid]), -1)
+        values = np.ascontiguousarray(values).reshape(np.prod([sizes[dim] for dim in grid]), -1)
         # np.ndindex() without dimensions of its own: the name alone
-        for index, entries in zip(np.ndindex(*(part.sizes[d] for d in own)), values.T, strict=True):
+        indices = np.ndindex(*(sizes[dim] for dim in other_dims))
+        for index, entries in zip(indices, values.T, strict=True):
             column = "_".join((name, *map(str, index)))
             parts = {column: entries}
             if np.iscomplexobj(entries):
                 parts = {f"{column}_re": np.real(entries), f"{column}_im": np.imag(entries)}
-            if taken := [c for c in parts if c in columns]:
+            if repeats := [c for c in parts if c in columns]:
                 raise ValueError(
-                    f"each column of a table needs its own name, but {name!r} and an earlier "
-                    f"variable both give the column {taken[0]!r}. (An array gives the columns "
-                    "NAME_0, NAME_1, ….) Use to_netcdf, or rename the observable or axis."
+                    f"{name!r} and an earlier variable both give the column {repeats[0]!r}: rename "
+                    "the observable or axis, or use to_netcdf."
                 )
             columns.update(parts)
     names = np.asarray(("not_computed", *STATUS_NAMES))

@@ -24,8 +24,8 @@ from lanewise.jaxprs.jaxapi import ClosedJaxpr, bodies, is_traced
 
 from ..base.signature import accepts
 from .axes import axes_in, is_axis
-from .plan import Plan
-from .program import Sweep, stacked
+from .plan import SweepPlan
+from .program import Sweep, state_of
 from .variables import Variable
 
 FORMAT = 1
@@ -47,7 +47,10 @@ _SIGNATURES = {
 
 
 def description(
-    sweep: Sweep, plan: Plan, variables: Mapping[str, Variable], programs: Sequence[ClosedJaxpr]
+    sweep: Sweep,
+    plan: SweepPlan,
+    variables: Mapping[str, Variable],
+    programs: Sequence[ClosedJaxpr],
 ) -> dict[str, Any]:
     """Everything that the numbers depend on, as JSON.
 
@@ -57,16 +60,16 @@ def description(
     The computation of a callback to Python is not seen.
     """
     q0, args, t0 = _example(sweep)
-    known = Describer(jnp.asarray(t0, q0.dtype), q0, args)
-    axes = {where: axis.name for where, axis in axes_in(sweep.inputs)}
+    describe = Describer(jnp.asarray(t0, q0.dtype), q0, args)
+    axes = {location: axis.name for location, axis in axes_in(sweep.inputs)}
     return {
         "format": FORMAT,
-        "system": known(sweep.system),
-        **{name: known(value) for name, value in sweep.inputs.items()},
-        "start": known(sweep.start),
-        "method": known(sweep.method),
-        "num_steps": known(sweep.num_steps),
-        **{name: known(value) for name, value in sweep.options.items()},
+        "system": describe(sweep.system),
+        **{name: describe(value) for name, value in sweep.inputs.items()},
+        "start": describe(sweep.start),
+        "method": describe(sweep.method),
+        "num_steps": describe(sweep.num_steps),
+        **{name: describe(value) for name, value in sweep.options.items()},
         "precision": str(q0.dtype),
         PROGRAM: [_hash(program) for program in programs],
         "dims": dict(plan.dims),
@@ -79,10 +82,12 @@ def description(
 def _example(sweep: Sweep) -> tuple[Any, Any, Any]:
     """(q0, args, t0) of the first trajectory; of q0 only shape and type matter."""
     first = jax.tree.map(
-        lambda x: jnp.asarray(x.values[0]) if is_axis(x) else x, dict(sweep.inputs), is_leaf=is_axis
+        lambda leaf: jnp.asarray(leaf.values[0]) if is_axis(leaf) else leaf,
+        dict(sweep.inputs),
+        is_leaf=is_axis,
     )
     if sweep.start is None:
-        q0 = jnp.asarray(stacked(first["q0"]))
+        q0 = jnp.asarray(state_of(first["q0"]))
     else:
         start, t0, args = sweep.start, first["t0"], first["args"]
         shape = jax.eval_shape(lambda i: start.at(i, t0, args), np.zeros((), np.int32))[0]
@@ -100,20 +105,20 @@ def digest(description: Mapping[str, Any]) -> str:
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     """The entries in which two descriptions differ, with both values."""
-    a, b = _flat(old), _flat(new)
-    keys = [key for key in sorted({*a, *b}) if a.get(key) != b.get(key)]
+    old, new = _flat(old), _flat(new)
+    keys = [key for key in sorted({*old, *new}) if old.get(key) != new.get(key)]
     if keys == [PROGRAM]:
         return [f"{PROGRAM}: a function, or a part of the packages, computes something else"]
-    pairs = {key: (_short(a.get(key)), _short(b.get(key))) for key in keys if key != PROGRAM}
-    return [f"{key}: {there} there, {now} now" for key, (there, now) in pairs.items()]
+    keys = [key for key in keys if key != PROGRAM]
+    return [f"{key}: {_short(old.get(key))} there, {_short(new.get(key))} now" for key in keys]
 
 
 def _flat(tree: Any, prefix: str = "") -> dict[str, Any]:
     if isinstance(tree, Mapping) and tree:
-        found: dict[str, Any] = {}
+        entries: dict[str, Any] = {}
         for key, value in tree.items():
-            found |= _flat(value, f"{prefix}.{key}" if prefix else str(key))
-        return found
+            entries |= _flat(value, f"{prefix}.{key}" if prefix else str(key))
+        return entries
     return {prefix: tree}
 
 
@@ -156,17 +161,17 @@ class Describer:
 
     def function(self, f: Callable[..., Any]) -> str:
         """The hash of what a function computes, or of its code where it cannot be traced alone."""
-        required = _required(f)
-        for count in sorted(_SIGNATURES, key=lambda n: n != required):
+        number_required = _arity(f)
+        for count in sorted(_SIGNATURES, key=lambda n: n != number_required):
             if not accepts(f, count):
                 continue
             try:
-                given = _SIGNATURES[count](self.t, self.state, self.args)
-                dynamic, static = eqx.partition(given, eqx.is_array)
-                traced = jax.make_jaxpr(lambda d, s=static: f(*eqx.combine(d, s)))(dynamic)
+                arguments = _SIGNATURES[count](self.t, self.state, self.args)
+                dynamic, static = eqx.partition(arguments, eqx.is_array)
+                jaxpr = jax.make_jaxpr(lambda d, s=static: f(*eqx.combine(d, s)))(dynamic)
             except Exception:  # another kind of function; `integrate` reports errors in it
                 continue
-            return f"computes {_hash(traced)}"
+            return f"computes {_hash(jaxpr)}"
         try:
             code = inspect.getsource(f)
         except (OSError, TypeError):
@@ -174,7 +179,7 @@ class Describer:
         return f"code {hashlib.sha256(code.encode()).hexdigest()[:16]}"
 
 
-def _required(f: Callable[..., Any]) -> int:
+def _arity(f: Callable[..., Any]) -> int:
     """Number of arguments without default; constants of a function are often defaults."""
     try:
         parameters = inspect.signature(f).parameters.values()
@@ -183,35 +188,35 @@ def _required(f: Callable[..., Any]) -> int:
     return sum(p.kind <= p.POSITIONAL_OR_KEYWORD and p.default is p.empty for p in parameters)
 
 
-def _hash(closed: ClosedJaxpr) -> str:
-    hashed = hashlib.sha256()
-    for part in _parts(closed):
-        hashed.update(_VOLATILE.sub("", str(part.jaxpr)).encode())
+def _hash(jaxpr: ClosedJaxpr) -> str:
+    sha256 = hashlib.sha256()
+    for part in _parts(jaxpr):
+        sha256.update(_VOLATILE.sub("", str(part.jaxpr)).encode())
         for constant in part.consts:
             if not is_traced(constant):
-                hashed.update(json.dumps(_of_array(np.asarray(constant))).encode())
-    return hashed.hexdigest()[:16]
+                sha256.update(json.dumps(_of_array(np.asarray(constant))).encode())
+    return sha256.hexdigest()[:16]
 
 
-def _parts(closed: ClosedJaxpr) -> Iterator[ClosedJaxpr]:
+def _parts(jaxpr: ClosedJaxpr) -> Iterator[ClosedJaxpr]:
     """A jaxpr and those inside its loops and calls."""
-    yield closed
-    for eqn in closed.jaxpr.eqns:
+    yield jaxpr
+    for eqn in jaxpr.jaxpr.eqns:
         for body in (*bodies(eqn), *functions_in(eqn)):
             yield from _parts(body)
 
 
-def _of_array(x: np.ndarray) -> Any:
-    if x.size <= 8 and x.dtype.kind in "iufb":
-        return {"dtype": x.dtype.name, "values": json.loads(json.dumps(x.tolist()))}
-    hashed = hashlib.sha256(np.ascontiguousarray(x).tobytes()).hexdigest()
-    return {"dtype": x.dtype.name, "shape": list(x.shape), "sha256": hashed}
+def _of_array(array: np.ndarray) -> Any:
+    if array.size <= 8 and array.dtype.kind in "iufb":
+        return {"dtype": array.dtype.name, "values": json.loads(json.dumps(array.tolist()))}
+    sha256 = hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
+    return {"dtype": array.dtype.name, "shape": list(array.shape), "sha256": sha256}
 
 
 def provenance() -> dict[str, Any]:
     """Time, machine and versions, for the attributes of a result."""
     devices = jax.local_devices()
-    found = {
+    attributes = {
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "command": " ".join(sys.argv),
         "host": platform.node(),
@@ -222,10 +227,10 @@ def provenance() -> dict[str, Any]:
     }
     for package in ("dvi-jax", "jax", "jaxlib", "numpy", "zarr", "xarray"):
         try:
-            found[package] = version(package)
+            attributes[package] = version(package)
         except PackageNotFoundError:
-            found[package] = "not installed"
-    return found | {"git_revision": _git_revision()}
+            attributes[package] = "not installed"
+    return attributes | {"git_revision": _git_revision()}
 
 
 def _git_revision() -> str:

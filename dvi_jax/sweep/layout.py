@@ -16,8 +16,8 @@ import numpy as np
 from ..base.files import TEMPORARY, sync
 from ..base.results import STATUS_NAMES
 from .identity import FORMAT, digest
-from .plan import Plan, Task
-from .variables import ARRAY_NAMES, Variable, is_array_name
+from .plan import SweepPlan, SweepTask
+from .variables import Variable, check_array_name
 
 TASKS = ".tasks"
 """The directory of the records of tasks."""
@@ -34,14 +34,14 @@ class StoreError(Exception):
 
 
 @contextlib.contextmanager
-def as_store_error(path: Path, what: str, then: str = "") -> Iterator[None]:
-    """Turn an error of the operating system into a `StoreError`: `what` failed, `then` do this."""
+def as_store_error(path: Path, failure: str, remedy: str = "") -> Iterator[None]:
+    """Turn an error of the operating system into a `StoreError` with this remedy."""
     try:
         yield
     except OSError as error:
         raise StoreError(
-            f"{path}: {what} ({error.strerror or error}). Check the path, its permissions and the "
-            f"free disk space.{then}"
+            f"{path}: {failure} ({error.strerror or error}). Check the path, its permissions and "
+            f"the disk space.{remedy}"
         ) from error
 
 
@@ -72,7 +72,7 @@ def layout(chunk: tuple[int, ...], variable: Variable) -> dict[str, Any]:
     }
 
 
-def shard(plan: Plan, variable: Variable, task: Task, values: np.ndarray) -> bytes:
+def shard(plan: SweepPlan, variable: Variable, task: SweepTask, values: np.ndarray) -> bytes:
     """The bytes of one shard, made in memory so that they can be written in one piece."""
     import zarr
     from zarr.storage import MemoryStore
@@ -93,19 +93,21 @@ def make(
     attributes: Mapping[str, Any],
 ) -> None:
     """Make a store under another name and rename it: it appears as a whole or not at all."""
-    if bad := [name for name in (*coordinates, *variables) if not is_array_name(name)]:
-        raise ValueError(
-            f"{bad[0]!r} cannot be the name of an array in a store: {ARRAY_NAMES}. Rename this key "
-            "of args."
-        )
-    plan = Plan(dict(config["dims"]), tuple(config["chunk"]))
-    about = {"Conventions": "CF-1.11", "dvi_jax_sweep": FORMAT, "config": json.dumps(config)}
-    about |= {"config_sha256": digest(config), **attributes}
+    for name in (*coordinates, *variables):
+        check_array_name("the argument or result", name)
+    plan = SweepPlan(dict(config["dims"]), tuple(config["chunk"]))
+    attributes = {
+        "Conventions": "CF-1.11",
+        "dvi_jax_sweep": FORMAT,
+        "config": json.dumps(config),
+        "config_sha256": digest(config),
+        **attributes,
+    }
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}{TEMPORARY}")
     try:
         with as_store_error(path, "the store cannot be made"):
             path.parent.mkdir(parents=True, exist_ok=True)
-            _write_arrays(temporary, plan, variables, coordinates, about)
+            _write_arrays(temporary, plan, variables, coordinates, attributes)
             (temporary / TASKS).mkdir()
             for file in filter(Path.is_file, temporary.rglob("*")):
                 sync(file)
@@ -120,30 +122,30 @@ def make(
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def _write_arrays(folder: Path, plan: Plan, variables, coordinates, attributes) -> None:
+def _write_arrays(folder: Path, plan: SweepPlan, variables, coordinates, attributes) -> None:
     """The coordinates with their values, the variables without values."""
     import zarr
     from zarr import codecs
 
     units = json.loads(attributes.get("units", "{}"))
     group = zarr.create_group(folder, attributes=attributes)
-    for name, (dims, values, about) in coordinates.items():
+    for name, (dims, values, labels) in coordinates.items():
         group.create_array(
             name,
             data=storable(values),
             chunks=values.shape,
             dimension_names=dims,
-            attributes=about,
+            attributes=labels,
             compressors=[codecs.ZstdCodec(), codecs.Crc32cCodec()],
             config={"write_empty_chunks": True},
         )
-    for name, v in variables.items():
+    for name, variable in variables.items():
         group.create_array(
             name,
-            shape=(*plan.shape, *v.shape),
-            dimension_names=(*plan.dims, *v.dims),
+            shape=(*plan.shape, *variable.shape),
+            dimension_names=(*plan.dims, *variable.dims),
             attributes=about_variable(name, units),
-            **layout(plan.chunk, v),
+            **layout(plan.chunk, variable),
         )
     with warnings.catch_warnings():  # zarr warns that this is not yet a part of the format
         warnings.simplefilter("ignore")
@@ -155,7 +157,7 @@ def storable(values: np.ndarray) -> np.ndarray:
     return values.astype(np.dtypes.StringDType()) if values.dtype.kind == "U" else values
 
 
-_ABOUT = {
+_ATTRIBUTES = {
     STATUS: {
         "long_name": "how each trajectory ended",
         "flag_values": [-1, *range(len(STATUS_NAMES))],
@@ -169,4 +171,4 @@ _ABOUT = {
 
 def about_variable(name: str, units: Mapping[str, str]) -> dict[str, Any]:
     """The attributes of a variable; `units`: those of all variables that have units."""
-    return _ABOUT.get(name, {}) | ({"units": units[name]} if name in units else {})
+    return _ATTRIBUTES.get(name, {}) | ({"units": units[name]} if name in units else {})

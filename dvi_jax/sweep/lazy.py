@@ -10,12 +10,12 @@ from xarray.core import indexing
 from .store import Store
 
 
-def masked(store: Store, name: str) -> Any:
+def lazy_array(store: Store, name: str) -> Any:
     """One variable of a store for xarray, read part by part."""
-    return indexing.LazilyIndexedArray(_Masked(store, name))
+    return indexing.LazilyIndexedArray(_StoreArray(store, name))
 
 
-class _Masked(BackendArray):
+class _StoreArray(BackendArray):
     """An array of which shards without a record count as not computed.
 
     Such a shard belongs to a task that was interrupted while its results were being written.
@@ -33,19 +33,19 @@ class _Masked(BackendArray):
 
     def _get(self, key: tuple[Any, ...]) -> np.ndarray:
         plan, fill = self.store.plan, self.store.variables[self.name].fill
-        wanted = [
-            np.arange(*k.indices(n)) if isinstance(k, slice) else np.atleast_1d(k)
-            for k, n in zip(key, self.shape, strict=True)
+        indices = [
+            np.arange(*entry.indices(length)) if isinstance(entry, slice) else np.atleast_1d(entry)
+            for entry, length in zip(key, self.shape, strict=True)
         ]
-        rows, own = wanted[: len(plan.shape)], wanted[len(plan.shape) :]
-        found = np.full([len(w) for w in wanted], fill, self.dtype)
-        boxes = [w // c for w, c in zip(rows, plan.chunk, strict=True)]
+        rows, columns = indices[: len(plan.shape)], indices[len(plan.shape) :]
+        values = np.full([*map(len, indices)], fill, self.dtype)
+        boxes = [row // size for row, size in zip(rows, plan.chunk, strict=True)]
         for place in itertools.product(*map(np.unique, boxes)):
             number = plan.number(place)
             if self.store.record(number) is None:
                 continue
-            inside = [np.flatnonzero(b == k) for b, k in zip(boxes, place, strict=True)]
-            box = (w[i] for w, i in zip(rows, inside, strict=True))
-            to = np.ix_(*inside, *(np.arange(len(w)) for w in own))
-            found[to] = self.store.read(self.name, number, (*box, *own))
-        return found[tuple(0 if isinstance(k, int | np.integer) else slice(None) for k in key)]
+            positions = [np.flatnonzero(b == k) for b, k in zip(boxes, place, strict=True)]
+            box = (row[position] for row, position in zip(rows, positions, strict=True))
+            target = np.ix_(*positions, *(np.arange(len(column)) for column in columns))
+            values[target] = self.store.read(self.name, number, (*box, *columns))
+        return values[tuple(0 if isinstance(x, int | np.integer) else slice(None) for x in key)]

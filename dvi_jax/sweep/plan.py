@@ -13,14 +13,14 @@ WORK, SMALLEST_WORK = 2**28, 2**22
 """Trajectory steps of one task: some tenths of a second of work; and the least number for which a
 task is made smaller so that there are more of them."""
 
-FEWEST, MOST, MANY = 256, 2**17, 32
+FEWEST_LANES, MOST_LANES, FEWEST_TASKS = 256, 2**17, 32
 """Trajectories of one task, at least and at most; tasks of a sweep, at least."""
 
 BYTES = 2**26
 """Results of one task, at most (one trajectory may have more)."""
 
 
-class Task(NamedTuple):
+class SweepTask(NamedTuple):
     """A box of the grid: its number and, for each dimension, where it begins and how long it is."""
 
     number: int
@@ -37,7 +37,7 @@ class Task(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Plan:
+class SweepPlan:
     """A grid with named dimensions in boxes of one shape, `chunk`; each is one task.
 
     The last box along a dimension may be smaller. Programs are nevertheless compiled for a full
@@ -51,9 +51,7 @@ class Plan:
         for name, n in (*self.dims.items(), *(("chunk", n) for n in self.chunk)):
             whole(name, n)
         if len(self.dims) != len(self.chunk):
-            raise ValueError(
-                f"chunk must have one size for each dimension {[*self.dims]}, got {self.chunk}."
-            )
+            raise ValueError(f"chunk must have one size for each of {[*self.dims]}: {self.chunk}.")
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -77,10 +75,10 @@ class Plan:
     def num_tasks(self) -> int:
         return math.prod(self.counts)
 
-    def task(self, number: int) -> Task:
+    def task(self, number: int) -> SweepTask:
         start = tuple(k * c for k, c in zip(self.place(number), self.chunk, strict=True))
         size = tuple(min(c, n - a) for c, n, a in zip(self.chunk, self.shape, start, strict=True))
-        return Task(number, start, size)
+        return SweepTask(number, start, size)
 
     def place(self, number: int) -> tuple[int, ...]:
         """The box of a task, counted along each dimension."""
@@ -90,36 +88,37 @@ class Plan:
         """The task in a box, the inverse of `place`."""
         return int(np.ravel_multi_index(tuple(place), self.counts))
 
-    def todo(self, done: Container[int]) -> Iterator[int]:
+    def todo(self, done_tasks: Container[int]) -> Iterator[int]:
         """The numbers of the other tasks, as an iterator: there may be 10⁹ of them."""
-        return (i for i in range(self.num_tasks) if i not in done)
+        return (i for i in range(self.num_tasks) if i not in done_tasks)
 
-    def tasks(self) -> Iterator[Task]:
+    def tasks(self) -> Iterator[SweepTask]:
         return (self.task(i) for i in range(self.num_tasks))
 
 
 def make_plan(
     dims: Mapping[str, int],
-    compiled: int,
+    compiled_dims: int,
     steps: int,
     bytes_per_lane: int,
     lanes: int | None = None,
-) -> Plan:
+) -> SweepPlan:
     """A plan for a grid.
 
-    - `compiled`: number of leading dimensions of which each value is compiled separately.
+    - `compiled_dims`: number of leading dimensions of which each value is compiled separately.
     - `steps`: of one trajectory. `bytes_per_lane`: of its results.
     - `lanes`: trajectories of one task at most; None: chosen from `steps` and `bytes_per_lane`.
     """
     separate, grid = (
-        list(dims.values())[part] for part in (slice(compiled), slice(compiled, None))
+        list(dims.values())[part] for part in (slice(compiled_dims), slice(compiled_dims, None))
     )
     if lanes is None:
         steps = max(steps, 1)
         power_of_two = 1 << max((WORK // steps).bit_length() - 1, 0)
-        many = -(-MANY // math.prod(separate))
-        fewest = max(FEWEST, SMALLEST_WORK // steps)
-        lanes = min(max(power_of_two, FEWEST), MOST, max(fewest, -(-math.prod(grid) // many)))
+        tasks_per_value = -(-FEWEST_TASKS // math.prod(separate))
+        fewest = max(FEWEST_LANES, SMALLEST_WORK // steps)
+        share = -(-math.prod(grid) // tasks_per_value)
+        lanes = min(max(power_of_two, FEWEST_LANES), MOST_LANES, max(fewest, share))
         lanes = max(1, min(lanes, BYTES // max(bytes_per_lane, 1)))
     free = whole("lanes_per_task", lanes)
     chunk: list[int] = []
@@ -130,4 +129,4 @@ def make_plan(
             size = min(-(-size // 64) * 64, n, free)  # whole vectors of the processor
         chunk.append(size)
         free = free // size if boxes == 1 else 1
-    return Plan(dict(dims), (*(1 for _ in separate), *reversed(chunk)))
+    return SweepPlan(dict(dims), (*(1 for _ in separate), *reversed(chunk)))

@@ -21,7 +21,7 @@ from ..integration.integrate import integrate
 from ..lattices import Given
 from ..observe.solution import Save
 from .axes import is_axis, place
-from .plan import Plan, Task
+from .plan import SweepPlan, SweepTask
 from .starts import Starts
 
 
@@ -40,26 +40,26 @@ class Sweep:
     num_steps: Any
     options: Mapping[str, Any]
     dims: Mapping[str, int]
-    compiled: int
+    compiled_dims: int
 
     @property
     def of_grid(self) -> list[str]:
         """The dimensions of which the values are not compiled separately."""
-        return list(self.dims)[self.compiled :]
+        return list(self.dims)[self.compiled_dims :]
 
-    def value(self, which: Any, start: tuple[int, ...]) -> Any:
+    def value(self, setting: Any, start: tuple[int, ...]) -> Any:
         """The method, or the number of steps, of the task that begins at this index."""
-        if not is_axis(which):
-            return which
-        value = which.values[start[list(self.dims).index(which.name)]]
+        if not is_axis(setting):
+            return setting
+        value = setting.values[start[list(self.dims).index(setting.name)]]
         return int(value) if isinstance(value, np.integer) else value
 
     @property
     def most_steps(self) -> int:
-        n = self.num_steps
-        if n is None:
+        num_steps = self.num_steps
+        if num_steps is None:
             return len(self.options["lattice"].ts) - 1
-        return max(int(v) for v in n.values) if is_axis(n) else n
+        return max(int(v) for v in num_steps.values) if is_axis(num_steps) else num_steps
 
 
 class Rows(eqx.Module):
@@ -88,32 +88,34 @@ class Lanes(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     reads: Reads = eqx.field(static=True)
 
-    def one(self, inside: tuple[Any, ...], index: tuple[Any, ...]) -> dict[str, Any]:
-        """The variables of one trajectory. `inside`: its index along each dimension of the task;
-        `index`: that in the whole sweep."""
-        where = dict(zip(self.names, inside, strict=True))
+    def one_trajectory(
+        self, task_index: tuple[Any, ...], grid_index: tuple[Any, ...]
+    ) -> dict[str, Any]:
+        """The variables of one trajectory, from its index along each dimension of the task, and of
+        the whole sweep."""
+        index = dict(zip(self.names, task_index, strict=True))
         inputs = jax.tree.map(
-            lambda x: x.values[where[x.name]] if _is_rows(x) else x, self.inputs, is_leaf=_is_rows
+            lambda x: x.values[index[x.name]] if _is_rows(x) else x, self.inputs, is_leaf=_is_rows
         )
         if self.start is None:
-            q0, p0 = (stacked(inputs.pop(name)) for name in ("q0", "p0"))
+            q0, p0 = (state_of(inputs.pop(name)) for name in ("q0", "p0"))
         else:
-            number = index[self.names.index(self.start.name)]
+            number = grid_index[self.names.index(self.start.name)]
             lattice = self.options["lattice"]
             t0 = lattice.ts[0] if isinstance(lattice, Given) else inputs["t0"]
-            q0, p0, *own = self.start.at(number, t0, inputs["args"])
-            inputs["args"] = own[0] if own else inputs["args"]
+            q0, p0, *start_args = self.start.at(number, t0, inputs["args"])
+            inputs["args"] = start_args[0] if start_args else inputs["args"]
         save = self.options["save"]
         options = {**self.options, "save": save or Save(final=True)}
         options |= {"method": self.method, "num_steps": self.num_steps, "throw": False}
         solution = integrate(self.system, q0, p0, **inputs, **options)
         leaves = jax.tree.leaves_with_path(solution.observed)
-        found = {place(path) or "observed": value for path, value in leaves}
+        results = {place(path) or "observed": value for path, value in leaves}
         if save is not None:
-            found |= {"t": solution.ts, "q": solution.qs, "p": solution.ps}
+            results |= {"t": solution.ts, "q": solution.qs, "p": solution.ps}
         if solution.stop is not None:
-            found["stop_t"] = solution.stop.t
-        return found | {
+            results["stop_t"] = solution.stop.t
+        return results | {
             "status": status_code(solution.result).astype(jnp.int8),
             "failed_step": solution.stats["failed_step"],
             "residual": solution.stats["max_residual"],
@@ -123,61 +125,73 @@ class Lanes(eqx.Module):
 def lanes_of(sweep: Sweep, task_start: tuple[int, ...], values: Any) -> Lanes:
     """The trajectories of the task that begins at this index; `values`: the rows of an axis."""
 
-    def known(leaf: Any) -> Any:
+    def value_of(leaf: Any) -> Any:
         if not is_axis(leaf):
             return leaf
         if leaf.name in sweep.of_grid:
             return Rows(values(leaf), leaf.name)
         return leaf.values[task_start[list(sweep.dims).index(leaf.name)]]
 
-    inputs = jax.tree.map(known, dict(sweep.inputs), is_leaf=is_axis)
+    inputs = jax.tree.map(value_of, dict(sweep.inputs), is_leaf=is_axis)
     method, steps = (sweep.value(x, task_start) for x in (sweep.method, sweep.num_steps))
-    rest = dict(sweep.options), steps, tuple(sweep.of_grid), reads(*sweep.options.values())
-    return Lanes(sweep.system, inputs, sweep.start, method, *rest)
+    values_read = reads(*sweep.options.values(), *functions_of(sweep.start))
+    fields = dict(sweep.options), steps, tuple(sweep.of_grid), values_read
+    return Lanes(sweep.system, inputs, sweep.start, method, *fields)
+
+
+def functions_of(start: Starts | None) -> tuple[Any, ...]:
+    """What `reads` has to follow for generated initial conditions."""
+    return () if start is None else (start, type(start).at)
+
+
+@eqx.filter_jit
+def states_of(start: Starts, t0: Any, args: Any, values_read: Reads) -> tuple[Any, Any]:
+    """All q0 and p0 of generated initial conditions; compiled again if `values_read` change."""
+    return jax.vmap(lambda i: start.at(i, t0, args))(jnp.arange(start.count))[:2]
 
 
 def _batch(lanes: Lanes, chunk: tuple[int, ...], begin: Any, last: Any) -> dict[str, Any]:
     """All trajectories of a task, in the order of its box. Those beyond the end of the grid repeat
     the last one, so that every task has the shape for which the program is compiled."""
     if not chunk:
-        return jax.tree.map(lambda x: x[None], lanes.one((), ()))
+        return jax.tree.map(lambda x: x[None], lanes.one_trajectory((), ()))
     count = stride = int(np.prod(chunk, dtype=int))
-    inside = []
+    task_index = []
     for c in chunk:
         stride //= c
-        inside.append((np.arange(count, dtype=np.int32) // stride) % c)
-    index = [jnp.minimum(i + b, e) for i, b, e in zip(inside, begin, last, strict=True)]
-    return jax.vmap(lanes.one)(tuple(inside), tuple(index))
+        task_index.append((np.arange(count, dtype=np.int32) // stride) % c)
+    grid_index = [jnp.minimum(i + b, e) for i, b, e in zip(task_index, begin, last, strict=True)]
+    return jax.vmap(lanes.one_trajectory)(tuple(task_index), tuple(grid_index))
 
 
-_compiled: Any = eqx.filter_jit(_batch)
+_compute: Any = eqx.filter_jit(_batch)
 
 
-def stacked(state: Any) -> Any:
+def state_of(state: Any) -> Any:
     """A state given component by component."""
     if not isinstance(state, list | tuple):
         return state
-    return jnp.stack([jnp.asarray(stacked(x), jnp.result_type(float)) for x in state])
+    return jnp.stack([jnp.asarray(state_of(x), jnp.result_type(float)) for x in state])
 
 
-class Program:
+class SweepProgram:
     """Computes tasks of a sweep."""
 
-    def __init__(self, sweep: Sweep, plan: Plan):
+    def __init__(self, sweep: Sweep, plan: SweepPlan):
         self.sweep, self.plan = sweep, plan
         self._locks: dict[Any, threading.Lock] = collections.defaultdict(threading.Lock)
-        self._compiled: set[Any] = set()
+        self._compiled_programs: set[Any] = set()
 
-    def __call__(self, task: Task, device: Any = None) -> dict[str, np.ndarray]:
+    def __call__(self, task: SweepTask, device: Any = None) -> dict[str, np.ndarray]:
         """The variables of a task, each of shape (*task.size, …), computed on a device."""
-        sweep, first = self.sweep, self.sweep.compiled
+        sweep, first = self.sweep, self.sweep.compiled_dims
         chunk, size = self.plan.chunk[first:], task.size[first:]
 
         def rows(axis: Any) -> Any:
-            k = sweep.of_grid.index(axis.name)
-            begin = task.start[first + k]
-            values = np.asarray(axis.values[begin : begin + size[k]])
-            return np.concatenate([values, *[values[-1:]] * (chunk[k] - size[k])])
+            dim = sweep.of_grid.index(axis.name)
+            begin = task.start[first + dim]
+            values = np.asarray(axis.values[begin : begin + size[dim]])
+            return np.concatenate([values, *[values[-1:]] * (chunk[dim] - size[dim])])
 
         lanes = lanes_of(sweep, task.start, rows)
         numbers = jax.tree.map(  # as arrays: another h then needs no other program
@@ -188,41 +202,38 @@ class Program:
         last = begin + np.asarray(size, begin.dtype) - 1
         program = (task.start[:first], device)
         # One thread compiles; the others wait for it, and compile nothing.
-        free = program in self._compiled
+        free = program in self._compiled_programs
         with jax.default_device(device), contextlib.nullcontext() if free else self._locks[program]:
-            found = jax.block_until_ready(_compiled(lanes, chunk, begin, last))
-        self._compiled.add(program)
+            results = jax.block_until_ready(_compute(lanes, chunk, begin, last))
+        self._compiled_programs.add(program)
         cut = tuple(slice(n) for n in size)
-        boxes = {n: np.asarray(x).reshape((*chunk, *x.shape[1:]))[cut] for n, x in found.items()}
+        boxes = {n: np.asarray(x).reshape((*chunk, *x.shape[1:]))[cut] for n, x in results.items()}
         return {n: x.reshape((*task.size, *x.shape[len(size) :])) for n, x in boxes.items()}
 
-    def steps(self, task: Task) -> int:
+    def steps(self, task: SweepTask) -> int:
         """The number of steps of each trajectory of a task."""
         steps = self.sweep.value(self.sweep.num_steps, task.start)
         return self.sweep.most_steps if steps is None else steps
 
 
-def traced(sweep: Sweep) -> tuple[dict[str, Any], list[ClosedJaxpr]]:
+def trace(sweep: Sweep) -> tuple[dict[str, Any], list[ClosedJaxpr]]:
     """Shape and dtype of the variables of one trajectory, by tracing; and its program for each
     method and number of steps."""
-    found: dict[str, Any] = {}
+    shapes: dict[str, Any] = {}
     programs, kinds = [], set()
     zeros = tuple(np.zeros((), np.int32) for _ in sweep.of_grid)
-    for which in np.ndindex(*list(sweep.dims.values())[: sweep.compiled]):
-        start = (*(int(k) for k in which), *(0 for _ in sweep.of_grid))
+    for indices in np.ndindex(*list(sweep.dims.values())[: sweep.compiled_dims]):
+        start = (*(int(k) for k in indices), *(0 for _ in sweep.of_grid))
         lanes = lanes_of(sweep, start, lambda axis: jnp.asarray(axis.values[:1]))
-        one = functools.partial(Lanes.one, lanes)
-        program, out = jax.make_jaxpr(one, return_shape=True)(zeros, zeros)
+        trajectory = functools.partial(Lanes.one_trajectory, lanes)
+        program, shapes = jax.make_jaxpr(trajectory, return_shape=True)(zeros, zeros)
         programs.append(program)
-        kinds.add(tuple((name, x.shape, x.dtype) for name, x in out.items()))
+        kinds.add(tuple((name, str(x.shape), str(x.dtype)) for name, x in shapes.items()))
         if len(kinds) > 1:
-            differing = min(set.symmetric_difference(*map(set, kinds)))[0]
-            seen = [f"shape {s} ({d})" for kind in kinds for n, s, d in kind if n == differing]
+            name, *_ = min(set.symmetric_difference(*map(set, kinds)))
+            texts = sorted(" ".join(x[1:]) for kind in kinds for x in kind if x[0] == name)
             raise ValueError(
-                "each result must have the same shape and dtype for all values of method and "
-                f"num_steps, but {differing!r} has {' and '.join(sorted(seen))}. For several "
-                "values of num_steps use save=dvi.Save(final=True) or save=dvi.Save(ts=...). "
-                "Otherwise call dvi.sweep separately for each value."
+                f"{name!r} must have one shape and dtype for all values of method and num_steps, "
+                f"got {' and '.join(texts)}: use dvi.Save(final=True) or dvi.Save(ts=...)."
             )
-        found = out
-    return found, programs
+    return shapes, programs

@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from typing import Any, TypedDict
 
 from lanewise import Layout
-from lanewise.jaxprs.jaxapi import x64_enabled
+from lanewise.jaxprs.jaxapi import ClosedJaxpr
 
 from ..base.checks import instance, whole
+from ..base.precision import require_double
 from ..engine.newton import RootSolver
 from ..integration.arithmetic import Arithmetic
 from ..integration.integrator import Integrator, chosen
@@ -19,9 +20,10 @@ from ..observe.solution import Save
 from ..problem.noise import as_path
 from ..problem.system import System, check_system, of_problem
 from .axes import Axis, as_axis, axes_in, is_axis, lengths
-from .program import Sweep
+from .plan import make_plan
+from .program import Sweep, SweepProgram, trace
 from .starts import Starts
-from .variables import RESERVED
+from .variables import Variable, refuse_reserved_name, variables
 
 
 class SweepSettings(TypedDict, total=False):
@@ -82,10 +84,16 @@ class Request:
     save: Any = None
     lanes_per_task: int | None = None
 
-    def sweep(self) -> Sweep:
-        """The definition of the sweep. **Raises** `ValueError` or `TypeError` for arguments that
-        define none."""
-        return self._with_defaults()._sweep()
+    def prepare(self) -> tuple[SweepProgram, dict[str, Variable], list[ClosedJaxpr]]:
+        """The program of the sweep, divided into tasks, the variables of its result, and the
+        jaxprs. **Raises** `ValueError` or `TypeError` for arguments that define no sweep."""
+        definition = self._with_defaults()._sweep()
+        shapes, programs = trace(definition)
+        arrays = variables(definition, shapes)
+        size = sum(variable.bytes for variable in arrays.values())
+        grid = definition.dims, definition.compiled_dims, definition.most_steps
+        plan = make_plan(*grid, size, self.lanes_per_task)
+        return SweepProgram(definition, plan), arrays, programs
 
     def _with_defaults(self) -> "Request":
         """The same, with the defaults of a problem of the library."""
@@ -103,26 +111,25 @@ class Request:
         inputs = self._inputs()
         if self.observe is None and self.save is None and self.stop is None:
             raise ValueError(
-                "there is nothing to store, because observe, save and stop are all missing: give "
-                "observe={...}, or save=dvi.Save(final=True) to store the final states."
+                "observe, save and stop are all missing: give observe={...} or "
+                "save=dvi.Save(final=True)."
             )
         # The name of the axis is not "method", which has another meaning in xarray's sel.
         method: Any = _as_axis_of_list("integrator", self.method)
         num_steps = _as_axis_of_list("num_steps", self.num_steps)
         integrator = self._integrator(method)
         method = method if is_axis(method) else integrator.method_for(self.system)
-        compiled = [
+        list_axes = [
             (axis.name, len(axis), argument)
             for argument, axis in (("method", method), ("num_steps", num_steps))
             if is_axis(axis)
         ]
-        axes = [*compiled, *((axis.name, len(axis), place) for place, axis in axes_in(inputs))]
+        axes = [*list_axes, *((axis.name, len(axis), place) for place, axis in axes_in(inputs))]
         if (start := self.start) is not None:
             Axis(start.name, [0])  # raises for a name that is not an identifier
             if start.name in (name for name, *_ in axes):
                 raise ValueError(
-                    f"start={type(start).__name__}(...) and an axis have the same name, "
-                    f"{start.name!r}: give start another name=..."
+                    f"start has the name of an axis, {start.name!r}: give it another name=..."
                 )
             axes.append((start.name, start.count, "start"))
         dims = lengths(axes)
@@ -137,7 +144,7 @@ class Request:
             "arithmetic": integrator.arithmetic,
             "layout": integrator.layout,
         }
-        separate = len({name for name, *_ in compiled})
+        separate = len({name for name, *_ in list_axes})
         return Sweep(self.system, inputs, start, method, num_steps, options, dims, separate)
 
     def _inputs(self) -> dict[str, Any]:
@@ -167,8 +174,8 @@ class Request:
         arguments = states | {"start": self.start}
         names = [name for name, value in arguments.items() if value is not None]
         raise ValueError(
-            "give both q0 and p0, or only start=..., such as dvi.starts.Random(...), got "
-            f"{', '.join(names) or 'none of them'}."
+            "give both q0 and p0, or only start=dvi.starts.Random(...) or similar, got "
+            f"{', '.join(names) or 'neither'}."
         )
 
     def _integrator(self, method: Any) -> Integrator:
@@ -187,39 +194,28 @@ class Request:
 
 
 def _check_dims(dims: Mapping[str, int]) -> None:
-    if bad := [name for name in dims if name in RESERVED]:
-        raise ValueError(
-            f"the axis {bad[0]!r} has a reserved name: choose another name. Reserved are "
-            f"{', '.join(RESERVED)}."
-        )
     if not dims:
         raise ValueError(
-            "nothing varies in this sweep: give an array for epsilon, h or t0, or a "
-            'dvi.Axis("name", values) in place of another number, or '
-            "start=dvi.starts.Random(...). For one trajectory use dvi.integrate."
+            "nothing varies in this sweep: give start, an array for epsilon, h or t0, or a "
+            "dvi.Axis for another number. For one trajectory use dvi.integrate."
         )
-    longest = max(dims, key=dims.__getitem__)
-    if not x64_enabled() and dims[longest] >= 2**31:
-        raise ValueError(
-            f"the axis {longest!r} must have fewer than 2³¹ values if jax_enable_x64 is not set, "
-            f"got {dims[longest]}: put the line\n"
-            '    jax.config.update("jax_enable_x64", True)\nbefore the first array is made.'
-        )
+    for name, length in dims.items():
+        refuse_reserved_name("axis", name)
+        if length >= 2**31:
+            require_double(f"the axis {name!r} of 2³¹ values or more, {length},")
 
 
 def _check_steps(num_steps: Any, lattice: Lattice, inputs: Mapping[str, Any]) -> None:
     if isinstance(lattice, Given):
-        given = [] if num_steps is None else ["num_steps"]
-        if given := [*given, *(f"the axis of {n}" for n in ("h", "t0") if is_axis(inputs[n]))]:
+        superfluous = [f"the axis of {name}" for name in ("h", "t0") if is_axis(inputs[name])]
+        superfluous += ["num_steps"] if num_steps is not None else []
+        if superfluous:
             raise ValueError(
-                "the lattice dvi.Given(ts) determines num_steps, h and t0: leave out "
-                f"{' and '.join(given)}."
+                f"leave out {' and '.join(superfluous)}: dvi.Given(ts) determines the steps."
             )
-    elif num_steps is None:
-        raise ValueError("num_steps is missing: give the number of steps of each trajectory.")
-    else:
-        for n in num_steps.values if is_axis(num_steps) else [num_steps]:
-            whole("num_steps", n)
+        return
+    for count in num_steps.values if is_axis(num_steps) else [num_steps]:
+        whole("num_steps", count, hint="It is the number of steps of each trajectory.")
 
 
 def _as_axis_of_list(name: str, value: Any) -> Any:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..base.results import STATUS_NAMES
 from .layout import STATUS, about_variable
-from .store import Memory, Store, StoreError, Verification
+from .store import MemorySink, Store, StoreError, Verification
 
 
 class SweepResult:
@@ -24,7 +24,7 @@ class SweepResult:
     Entries that have not been computed are NaN (−1 in whole numbers) and have the status −1.
     """
 
-    def __init__(self, source: Memory | Store, coordinates: Mapping[str, Any], attributes: Any):
+    def __init__(self, source: MemorySink | Store, coordinates: Mapping[str, Any], attributes: Any):
         self._source, self._coordinates = source, dict(coordinates)
         self._plan = source.plan
         self.attributes = dict(attributes)
@@ -47,7 +47,7 @@ class SweepResult:
     @property
     def tasks_done(self) -> int:
         """Number of finished tasks; all records of a store are read for it."""
-        return len(self._source.done())
+        return len(self._source.done_tasks())
 
     @property
     def is_complete(self) -> bool:
@@ -58,9 +58,9 @@ class SweepResult:
         if name in self._coordinates:
             return self._coordinates[name][1]
         if name not in self._source.variables:
-            known = ", ".join((*self._source.variables, *self._coordinates))
-            raise KeyError(f"the sweep has no variable {name!r}: use one of {known}.")
-        if isinstance(self._source, Memory):
+            names = ", ".join((*self._source.variables, *self._coordinates))
+            raise KeyError(f"the sweep has no variable {name!r}: use one of {names}.")
+        if isinstance(self._source, MemorySink):
             return self._source.arrays[name]
         return self.to_xarray()[name].values
 
@@ -68,7 +68,7 @@ class SweepResult:
         """Number of trajectories with each status, counted task by task."""
         names = ("not_computed", *STATUS_NAMES)
         counts = dict.fromkeys(names, 0)
-        if isinstance(self._source, Memory):
+        if isinstance(self._source, MemorySink):
             codes, numbers = np.unique(self._source.arrays[STATUS], return_counts=True)
             counts |= {names[c + 1]: int(n) for c, n in zip(codes, numbers, strict=True)}
         else:
@@ -83,7 +83,7 @@ class SweepResult:
         `statuses`, the `seconds` of its computation, when it was `finished`, `host`, `pid`,
         `device`."""
         if isinstance(self._source, Store):
-            yield from filter(None, map(self._source.record, self._source.done()))
+            yield from filter(None, map(self._source.record, self._source.done_tasks()))
 
     def verify(self, progress: Callable[[int, int], None] | None = None) -> Verification:
         """Read the whole store again and compare it with the checksums in its records.
@@ -95,8 +95,7 @@ class SweepResult:
         """
         if not isinstance(self._source, Store):
             raise StoreError(
-                "verify() requires results in a store, because only a store has checksums. These "
-                "results are in memory. To make a store, call dvi.sweep with store=PATH."
+                "verify() requires results in a store, but these are in memory: give store=PATH."
             )
         return self._source.verify(progress)
 
@@ -105,20 +104,20 @@ class SweepResult:
         attributes how it was made. A store is read on demand; unfinished tasks are masked."""
         import xarray as xr
 
-        from .lazy import masked
+        from .lazy import lazy_array
 
         data, units = {}, json.loads(self.attributes.get("units", "{}"))
-        for name, v in self._source.variables.items():
-            dims, about = (*self.dims, *v.dims), about_variable(name, units)
-            if isinstance(self._source, Memory):
-                data[name] = xr.Variable(dims, self._source.arrays[name], about)
+        for name, variable in self._source.variables.items():
+            dims, attributes = (*self.dims, *variable.dims), about_variable(name, units)
+            if isinstance(self._source, MemorySink):
+                data[name] = xr.Variable(dims, self._source.arrays[name], attributes)
             else:
-                chunks = dict(zip(dims, (*self._plan.chunk, *v.shape), strict=True))
-                array = masked(self._source, name)
-                data[name] = xr.Variable(dims, array, about, {"preferred_chunks": chunks})
+                chunks = dict(zip(dims, (*self._plan.chunk, *variable.shape), strict=True))
+                array = lazy_array(self._source, name)
+                data[name] = xr.Variable(dims, array, attributes, {"preferred_chunks": chunks})
         coords = {name: xr.Variable(*c) for name, c in self._coordinates.items()}
-        about = {k: v for k, v in self.attributes.items() if k != "coordinates"}
-        return xr.Dataset(data, coords, about)
+        attributes = {k: variable for k, variable in self.attributes.items() if k != "coordinates"}
+        return xr.Dataset(data, coords, attributes)
 
     def to_netcdf(self, path: Any, force: bool = False) -> None:
         """Write a NetCDF 4 file, task by task, so that only one task is in memory.
@@ -145,10 +144,10 @@ class SweepResult:
 
     def __repr__(self) -> str:
         grid = " × ".join(f"{name} {n}" for name, n in self.dims.items())
-        done = f"{self.tasks_done} of {self.num_tasks} tasks done"
+        tasks = f"{self.tasks_done} of {self.num_tasks} tasks done"
         names = ", ".join(self._source.variables)
         where = f", in {self.path}" if self.path is not None else ""
-        return f"SweepResult({grid}: {names}; {done}{where})"
+        return f"SweepResult({grid}: {names}; {tasks}{where})"
 
 
 def open_sweep(path: Any) -> SweepResult:

@@ -13,9 +13,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..base.checks import finite, function, whole
+from ..base.checks import finite, function, positive, whole
 from ..base.types import Args, Scalar
 from ..engine.bracket import bracketed_root
+from .axes import refuse_non_finite
 
 _TRIES = 64
 """Points that are tried for one initial condition on an energy shell."""
@@ -39,30 +40,25 @@ class Starts(eqx.Module):
         the system belong to it. It is traced: a function of JAX arrays."""
 
 
-def _box(of: str, **ends: Any) -> tuple[list[tuple[float, ...]], tuple[int, ...]]:
+def _box(owner: str, **ends: Any) -> tuple[list[tuple[float, ...]], tuple[int, ...]]:
     """Pairs (q, p) as flat tuples of numbers, and the shape of q. The first must not exceed the
     last."""
     arrays = []
-    for which, pair in ends.items():
+    for name, pair in ends.items():
         if not isinstance(pair, tuple | list) or len(pair) != 2:
-            raise TypeError(
-                f"{which} of {of} must be a pair: a tuple (values for q, values for p), got "
-                f"{pair!r:.200}."
-            )
-        arrays += [np.asarray(x, float) for x in pair]
-        if bad := [x for array in arrays for x in array.flat if not np.isfinite(x)]:
-            raise ValueError(f"all components of {which} of {of} must be finite, got {bad[0]}.")
-    shapes = [x.shape for x in arrays]
+            raise TypeError(f"{name} of {owner} must be a pair (q, p), got {pair!r:.200}.")
+        for array in (np.asarray(x, float) for x in pair):
+            refuse_non_finite(f"{name} of {owner}", array)
+            arrays.append(array)
+    shapes = [array.shape for array in arrays]
     if len(set(shapes)) > 1:
-        names, seen = " and ".join(ends), " and ".join(map(str, dict.fromkeys(shapes)))
-        raise ValueError(
-            f"all arrays in {names} of {of} must have the same shape, got the shapes {seen}."
-        )
+        names, text = " and ".join(ends), " and ".join(map(str, dict.fromkeys(shapes)))
+        raise ValueError(f"all arrays in {names} of {owner} must have one shape, got {text}.")
     flat = [np.ravel(arrays[i : i + 2]) for i in range(0, len(arrays), 2)]
-    if (above := flat[0] > flat[-1]).any():
+    if (too_low := flat[0] > flat[-1]).any():
         raise ValueError(
-            f"low of {of} must not be greater than high in any component, got low = "
-            f"{flat[0][above][0]} and high = {flat[-1][above][0]} in one component."
+            f"low of {owner} must not exceed high in any component, got {flat[0][too_low][0]} and "
+            f"{flat[-1][too_low][0]}."
         )
     return [tuple(x.tolist()) for x in flat], shapes[0]
 
@@ -76,9 +72,9 @@ class Seeded(Starts):
     name: str = eqx.field(static=True)
 
     def __init__(self, count: int, shape: tuple[int, ...], seed: int, name: str):
-        of = type(self).__name__
-        self.count, self.shape = whole(f"count of {of}", count), shape
-        self.seed, self.name = whole(f"seed of {of}", seed, 0, 2**32 - 1), name
+        owner = type(self).__name__
+        self.count, self.shape = whole(f"count of {owner}", count), shape
+        self.seed, self.name = whole(f"seed of {owner}", seed, 0, 2**32 - 1), name
 
     def key(self, index: Array) -> Array:
         """A random key for each index, also above 2³²."""
@@ -168,8 +164,8 @@ class Normal(Seeded):
         if isinstance(sigma, tuple | list) and len(sigma) == 2:
             sigma = [np.broadcast_to(np.asarray(s, float), shape) for s in sigma]
         (self.sigma,), _ = _box("Normal", sigma=sigma)
-        if min(self.sigma, default=0) < 0:
-            raise ValueError(f"sigma of Normal must not be negative, got {min(self.sigma)}.")
+        for number in self.sigma:
+            positive("sigma of Normal", number, zero=True)
         super().__init__(count, shape, seed, name)
 
     def at(self, index, t0, args):
@@ -189,10 +185,10 @@ def _radical_inverse(index: Array, base: int, largest: int, dtype: Any) -> Array
 
 
 def _primes(count: int) -> list[int]:
-    found: list[int] = []
-    while len(found) < count:
-        found.append(next(n for n in itertools.count(2) if all(n % p for p in found)))
-    return found
+    primes: list[int] = []
+    while len(primes) < count:
+        primes.append(next(n for n in itertools.count(2) if all(n % p for p in primes)))
+    return primes
 
 
 class EnergyShell(Seeded):
@@ -235,9 +231,9 @@ class EnergyShell(Seeded):
         key = self.key(index)
 
         def draw(k):
-            of_q, of_p = jax.random.split(jax.random.fold_in(key, k))
-            q = low + (high - low) * jax.random.uniform(of_q, low.shape, low.dtype)
-            return q, jax.random.normal(of_p, low.shape, low.dtype)
+            q_key, p_key = jax.random.split(jax.random.fold_in(key, k))
+            q = low + (high - low) * jax.random.uniform(q_key, low.shape, low.dtype)
+            return q, jax.random.normal(p_key, low.shape, low.dtype)
 
         def excess(q, p):
             return self.H(t0, q.reshape(self.shape), p.reshape(self.shape), args) - self.energy
@@ -250,16 +246,17 @@ class EnergyShell(Seeded):
         q, d = draw(k)
         d = d / jnp.linalg.norm(d)
 
-        def along(x):
+        def excess_on_ray(x):
             return excess(q, x * d)
 
         def is_below(state):
             x, n = state
-            return (along(x) < 0) & (n < _DOUBLINGS)
+            return (excess_on_ray(x) < 0) & (n < _DOUBLINGS)
 
-        one = jnp.ones((), low.dtype)
-        x, _ = lax.while_loop(is_below, lambda s: (2 * s[0], s[1] + 1), (one, jnp.int32(0)))
-        found = (k < _TRIES) & (along(x) >= 0)
-        size = bracketed_root(along, 0 * one, along(0 * one), x, along(x), found)
-        size = jnp.where(found, size, jnp.nan)
+        unit = jnp.ones((), low.dtype)
+        x, _ = lax.while_loop(is_below, lambda s: (2 * s[0], s[1] + 1), (unit, jnp.int32(0)))
+        is_bracket = (k < _TRIES) & (excess_on_ray(x) >= 0)
+        ends = 0 * unit, excess_on_ray(0 * unit), x, excess_on_ray(x)
+        size = bracketed_root(excess_on_ray, *ends, is_bracket)
+        size = jnp.where(is_bracket, size, jnp.nan)
         return q.reshape(self.shape), (size * d).reshape(self.shape)

@@ -20,18 +20,23 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..base.files import TEMPORARY, publish
+from ..base.machine import machine_memory
 from ..base.results import STATUS_NAMES
 from .claims import claim
 from .identity import FORMAT, differences, digest
 from .layout import STATUS, TASKS, StoreError as StoreError, as_store_error, make, shard, storable
-from .plan import Plan, Task
+from .plan import SweepPlan, SweepTask
 from .variables import Variable
 
 CLAIMS = ".claims"
+
+_SHARE = 0.5
+"""Fraction of the memory of the machine that results in memory may take."""
+
 _RESTORE = (
-    "Restore the file from a backup, or copy it from a new store. To make the new store, call "
-    "dvi.sweep with the same arguments, but with another path as store. Stop this call when its "
-    "first task is done. The computed results are in other files: do not delete them."
+    "If this is a store, its zarr.json was damaged or lost, but the results are in other files: "
+    "restore it from a backup, or copy it from a new store (the same call with another path, "
+    "stopped after its first task)."
 )
 
 
@@ -52,29 +57,30 @@ class Verification(NamedTuple):
     todo: int
 
 
-class Memory:
-    """Results as arrays of the whole grid in memory."""
+class MemorySink:
+    """Results as arrays in memory. **Raises** `ValueError` if they are too large for it."""
 
-    def __init__(self, plan: Plan, variables: Mapping[str, Variable]):
+    def __init__(self, plan: SweepPlan, variables: Mapping[str, Variable]):
+        _check_memory(plan.lanes * sum(variable.bytes for variable in variables.values()))
         self.plan, self.variables = plan, dict(variables)
         self.arrays = {
             name: np.full((*plan.shape, *v.shape), v.fill, v.dtype) for name, v in variables.items()
         }
-        self._done: set[int] = set()
+        self._done_tasks: set[int] = set()
 
-    def done(self):
-        return set(self._done)
+    def done_tasks(self):
+        return set(self._done_tasks)
 
     def is_done(self, number: int) -> bool:
-        return number in self._done
+        return number in self._done_tasks
 
-    def claimed(self, task: Task) -> contextlib.AbstractContextManager[bool]:
+    def claim(self, task: SweepTask) -> contextlib.AbstractContextManager[bool]:
         return contextlib.nullcontext(True)
 
-    def commit(self, task: Task, results: Mapping[str, np.ndarray], facts: Mapping) -> None:
+    def commit(self, task: SweepTask, results: Mapping[str, np.ndarray], facts: Mapping) -> None:
         for name, x in results.items():
             self.arrays[name][task.box] = x
-        self._done.add(task.number)
+        self._done_tasks.add(task.number)
 
 
 class Store:
@@ -85,9 +91,9 @@ class Store:
         self.config = json.loads(attributes["config"])
         self.sha = attributes["config_sha256"]
         if digest(self.config) != self.sha:
-            raise ValueError("the attribute config does not match its checksum config_sha256")
+            raise ValueError("config does not match config_sha256")
         dict(json.loads(attributes.get("units", "{}")))  # raises what is wrong with the units
-        self.plan = Plan(dict(self.config["dims"]), tuple(self.config["chunk"]))
+        self.plan = SweepPlan(dict(self.config["dims"]), tuple(self.config["chunk"]))
         self.variables = {
             name: Variable(dtype, tuple(shape), tuple(dims))
             for name, (dtype, shape, dims) in self.config["variables"].items()
@@ -99,37 +105,30 @@ class Store:
     @classmethod
     def open(cls, path: str | os.PathLike) -> "Store":
         """The store in a directory. **Raises** `StoreError`."""
-        path = _resolved(path)
+        path = _store_path(path)
+        with as_store_error(path, "zarr.json cannot be read"):
+            has_tasks = (path / TASKS).is_dir()
+            if not (path / "zarr.json").exists():
+                remedy = _RESTORE if has_tasks else "Check the path: there is no sweep here."
+                raise StoreError(f"{path}: the file zarr.json does not exist. {remedy}")
+            text = (path / "zarr.json").read_text()
+        if not has_tasks:
+            raise StoreError(
+                f"{path} has no directory {TASKS}, which a store must have: copy also the files "
+                "whose names begin with a dot."
+            )
         try:
-            attributes = json.loads((path / "zarr.json").read_text())["attributes"]
-            if not (path / TASKS).is_dir():
+            attributes = json.loads(text)["attributes"]
+            if (file_format := attributes["dvi_jax_sweep"]) != FORMAT:
                 raise StoreError(
-                    f"{path} must contain the directory {TASKS} (the records of finished tasks), "
-                    "but it is missing. If this is a copy of a store, copy it again with hidden "
-                    "files (their names begin with a dot). If it is not a store, give another path."
-                )
-            if (found := attributes["dvi_jax_sweep"]) != FORMAT:
-                raise StoreError(
-                    f"{path}: the store has format {found!r}, but this version of dvi-jax reads "
-                    f"only format {FORMAT}. Use the version of dvi-jax that made the store: "
-                    f"{attributes.get('dvi-jax', 'unknown')}."
+                    f"{path}: the store has format {file_format!r}, but must have {FORMAT}. Use "
+                    f"dvi-jax {attributes.get('dvi-jax', '(unknown version)')}, which made it."
                 )
             store = cls(path, attributes)
-        except FileNotFoundError:
-            is_lost = (path / TASKS).is_dir()
-            lost = f"The directory {TASKS} of a store exists: zarr.json was lost. {_RESTORE}"
-            then = lost if is_lost else "Check the path: there is no sweep here."
-            raise StoreError(f"{path}: the file zarr.json does not exist. {then}") from None
-        except OSError as error:
-            raise StoreError(
-                f"{path}: zarr.json cannot be read ({error.strerror or error}). Check the "
-                "permissions and the disk, and that the path is a directory."
-            ) from None
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise StoreError(
                 f"{path}: zarr.json does not describe a sweep ({type(error).__name__}: {error}). "
-                "If this is not the store of a sweep, give another path. Otherwise the file is "
-                f"damaged or was edited. {_RESTORE}"
+                f"{_RESTORE}"
             ) from None
         for name in store.variables:
             store.array(name)
@@ -145,26 +144,25 @@ class Store:
         attributes: Mapping[str, Any],
     ) -> "Store":
         """The store of exactly this sweep, made if nothing is there. **Raises** `StoreError`."""
-        path = _resolved(path)
+        path = _store_path(path)
         if not path.exists() or (path.is_dir() and not any(path.iterdir())):
             make(path, config, variables, coordinates, attributes)
         elif not any((path / name).exists() for name in ("zarr.json", TASKS)):
             raise StoreError(f"{path} exists but is not the store of a sweep: choose a new path.")
         store = cls.open(path)
         if store.sha != digest(config):
-            made, differing = store.attributes, differences(store.config, config)
+            source, differing = store.attributes, differences(store.config, config)
             raise StoreMismatch(
-                f"{path} holds another sweep, made {made.get('created')} with dvi-jax "
-                f"{made.get('dvi-jax')} and jax {made.get('jax')}. Differences (there: in the "
+                f"{path} holds another sweep ({source.get('created')}, dvi-jax "
+                f"{source.get('dvi-jax')}, jax {source.get('jax')}). Differences (there: in the "
                 "store; now: in this call):" + "".join(f"\n  {line}" for line in differing) + "\n"
-                "Use another path as store. To continue the stored sweep, use its arguments, "
-                "functions and package versions.",
+                "Use another path, or the arguments, functions and versions of that sweep.",
                 differing,
             )
         if not os.access(path / TASKS, os.W_OK):
             raise StoreError(
-                f"{path} cannot be written by this user. Change the permissions of this directory "
-                "and its files, or give another path. To read the store, call dvi.open_sweep(path)."
+                f"{path} cannot be written by this user: change its permissions. To read it call "
+                "dvi.open_sweep."
             )
         store._restore(coordinates)
         return store
@@ -176,33 +174,28 @@ class Store:
         if name in self._arrays:
             return self._arrays[name]
         variable = self.variables[name]
-        expected = (*self.plan.shape, *variable.shape), np.dtype(variable.dtype)
-        wanted = "shape {} and dtype {}".format(*expected)
+        shape, dtype = (*self.plan.shape, *variable.shape), np.dtype(variable.dtype)
         try:
-            found = self._group()[name]
-            seen: Any = found.shape, found.dtype
-            what = "has shape {} and dtype {}, but must have {}".format(*seen, wanted)
+            array = self._group()[name]
+            if (array.shape, array.dtype) != (shape, dtype):
+                raise ValueError(f"shape {array.shape} and dtype {array.dtype}")
         except Exception as error:  # zarr has many errors for damaged metadata
-            found, seen = None, None
-            what = f"cannot be opened ({type(error).__name__}: {error})"
-        if seen != expected:
             raise StoreError(
-                f"{self.path}: the array {name!r} {what}. The description of the arrays in "
-                f"zarr.json is damaged or was edited. {_RESTORE}"
-            )
-        self._arrays[name] = found
-        return found
+                f"{self.path}: zarr.json must describe the array {name!r} with shape {shape} and "
+                f"dtype {dtype} ({type(error).__name__}: {error}). {_RESTORE}"
+            ) from None
+        self._arrays[name] = array
+        return array
 
-    def read(self, name: str, number: int, where: tuple[Any, ...]) -> np.ndarray:
+    def read(self, name: str, number: int, box: tuple[Any, ...]) -> np.ndarray:
         """A part of a variable that lies in one task. **Raises** `StoreError` if it is damaged."""
         array = self.array(name)
         try:
-            return array.get_orthogonal_selection(where)
+            return array.get_orthogonal_selection(box)
         except Exception as error:  # codecs have many errors for bytes that they cannot decode
             raise StoreError(
-                f"{self.shard_path(name, number)} is damaged or cannot be read ({error}). First "
-                f"call dvi.open_sweep({str(self.path)!r}).verify(). Then call dvi.sweep with the "
-                "same arguments: it computes the damaged tasks again."
+                f"{self.shard_path(name, number)} is damaged or cannot be read ({error}). Call "
+                f"dvi.open_sweep({str(self.path)!r}).verify(), then repeat the sweep."
             ) from error
 
     def coordinates(self) -> dict[str, Any]:
@@ -225,8 +218,8 @@ class Store:
             values = array[:]
         except Exception as error:  # codecs have many errors for bytes that they cannot decode
             raise StoreError(
-                f"{self.path}: the values of the coordinate {name!r} cannot be read ({error}). "
-                "Call dvi.sweep again with the same arguments and store: it writes them again."
+                f"{self.path}: the coordinate {name!r} cannot be read ({error}). The same call of "
+                "dvi.sweep writes it again."
             ) from error
         if values.dtype.kind == "T":
             values = np.asarray(values.tolist())
@@ -257,10 +250,10 @@ class Store:
 
     def record(self, number: int) -> dict[str, Any] | None:
         """The record of a task that is done, else None."""
-        found = self._written(number)
-        return None if found is None or self._damage(number, found, size_only=True) else found
+        record = self._read_record(number)
+        return None if record is None or self._damage(number, record, size_only=True) else record
 
-    def _written(self, number: int) -> dict[str, Any] | None:
+    def _read_record(self, number: int) -> dict[str, Any] | None:
         """The record of a task as it was written; None if it is missing or damaged."""
         try:
             text = self.record_path(number).read_bytes()
@@ -270,73 +263,73 @@ class Store:
         if checksum != _crc32(body).encode():
             return None
         try:  # it may have been edited, together with its checksum
-            found, task = json.loads(body), self.plan.task(number)
-            expected = self._head(task)
-            counts, shards = found["statuses"], found["shards"]
+            record, task = json.loads(body), self.plan.task(number)
+            head = self._head(task)
+            counts, shards = record["statuses"], record["shards"]
             is_of_task = (
-                {key: found[key] for key in expected} == expected
+                {key: record[key] for key in head} == head
                 and all(shards[name].keys() >= {"bytes", "crc32"} for name in self.variables)
                 and counts.keys() <= set(STATUS_NAMES)
                 and sum(counts.values()) == task.lanes
             )
         except (AttributeError, KeyError, TypeError, ValueError):
             return None
-        return found if is_of_task else None
+        return record if is_of_task else None
 
-    def _head(self, task: Task) -> dict[str, Any]:
+    def _head(self, task: SweepTask) -> dict[str, Any]:
         start, size = list(task.start), list(task.size)
         return {"task": task.number, "start": start, "size": size, "config_sha256": self.sha}
 
     def _damage(self, number: int, record: Mapping, size_only: bool) -> tuple[Path, str] | None:
         """The first shard of a task that differs from its record, and how."""
         for name in self.variables:
-            file, known = self.shard_path(name, number), record["shards"][name]
+            file, facts = self.shard_path(name, number), record["shards"][name]
             try:
                 size = file.stat().st_size
                 content = b"" if size_only else file.read_bytes()
             except OSError as error:
                 return file, f"the shard of {name} cannot be read ({error.strerror})"
-            if size != known["bytes"]:
+            if size != facts["bytes"]:
                 return file, f"the shard of {name} has {size} bytes"
             # The checksum of the whole file: the codecs would accept the shard of another task.
-            if not size_only and _crc32(content) != known["crc32"]:
+            if not size_only and _crc32(content) != facts["crc32"]:
                 return file, f"the shard of {name} has another checksum"
         return None
 
     def _records(self) -> dict[int, Path]:
         """Number of a task → the file of its record. Other files, such as those that macOS creates
         next to each file, are ignored."""
-        named = (f for f in (self.path / TASKS).glob("*/*.json") if f.stem.isdecimal())
-        found = sorted((int(f.stem), f) for f in named)
-        return {i: f for i, f in found if i < self.plan.num_tasks and f == self.record_path(i)}
+        files = (f for f in (self.path / TASKS).glob("*/*.json") if f.stem.isdecimal())
+        numbers = sorted((int(f.stem), f) for f in files)
+        return {i: f for i, f in numbers if i < self.plan.num_tasks and f == self.record_path(i)}
 
-    def done(self):
+    def done_tasks(self):
         """The numbers of finished tasks, in order. Warns of those that have lost a file."""
-        written = {i: self._written(i) for i in self._records()}
-        found = {i: self._damage(i, x, size_only=True) for i, x in written.items() if x is not None}
-        if lost := [damage[0] for damage in found.values() if damage]:
+        records = {i: self._read_record(i) for i in self._records()}
+        damages = {i: self._damage(i, x, size_only=True) for i, x in records.items() if x}
+        if files := [damage[0] for damage in damages.values() if damage]:
             warnings.warn(
-                f"{self.path}: for {len(lost)} of {len(found)} finished tasks, a file is missing, "
-                f"unreadable or of the wrong size. The first such file is {lost[0]}. These tasks "
-                "count as not computed. dvi.sweep with the same arguments computes them again.",
+                f"{self.path}: for {len(files)} of {len(damages)} finished tasks, a file is "
+                f"missing, unreadable or of the wrong size; the first is {files[0]}. These tasks "
+                "count as not computed: dvi.sweep with the same arguments computes them again.",
                 stacklevel=2,
             )
-        return [i for i, damage in found.items() if not damage]
+        return [i for i, damage in damages.items() if not damage]
 
     def is_done(self, number: int) -> bool:
         return self.record(number) is not None
 
     @contextlib.contextmanager
-    def claimed(self, task: Task) -> Iterator[bool]:
+    def claim(self, task: SweepTask) -> Iterator[bool]:
         with claim(self.path / CLAIMS, task.number) as mine:
             yield mine and not self.is_done(task.number)
 
-    def commit(self, task: Task, results: Mapping[str, np.ndarray], facts: Mapping) -> None:
+    def commit(self, task: SweepTask, results: Mapping[str, np.ndarray], facts: Mapping) -> None:
         """Write the results of a task; it is done once this returns."""
-        what = f"task {task.number} cannot be written"
-        then = " Then repeat the call: it continues after the finished tasks."
+        failure = f"task {task.number} cannot be written"
+        remedy = " Then repeat the call: it continues after the finished tasks."
         shards = {}
-        with as_store_error(self.path, what, then):
+        with as_store_error(self.path, failure, remedy):
             for name in sorted(results, key=lambda n: n == STATUS):
                 content = shard(self.plan, self.variables[name], task, results[name])
                 publish(self.shard_path(name, task.number), content)
@@ -350,7 +343,7 @@ class Store:
         bad: dict[int, str] = {}
         files = self._records()
         for n, (number, file) in enumerate(files.items()):
-            record = self._written(number)
+            record = self._read_record(number)
             damage = None if record is None else self._damage(number, record, size_only=False)
             if record is None or damage:
                 bad[number] = damage[1] if damage else "the record is damaged"
@@ -358,26 +351,37 @@ class Store:
             if progress is not None:
                 progress(n + 1, len(files))
         # Files that processes which died had begun to write; no write takes an hour.
-        before = time.time() - 3600
+        latest = time.time() - 3600
         for file in self.path.rglob(f"*{TEMPORARY}"):
             with contextlib.suppress(OSError):
-                if file.stat().st_mtime < before:
+                if file.stat().st_mtime < latest:
                     file.unlink()
         sound = len(files) - len(bad)
         return Verification(sound, bad, self.plan.num_tasks - sound)
 
 
-def _resolved(path: str | os.PathLike) -> Path:
+def _check_memory(size: int) -> None:
+    """**Raises** `ValueError` if the results are too large for the memory of the machine."""
+    memory = machine_memory()
+    available = memory or 8 * 2**30
+    if size > _SHARE * available:
+        raise ValueError(
+            f"the results need {size / 2**30:.2f} GiB, more than {_SHARE:.0%} of the "
+            f"{available / 2**30:.2f} GiB of memory{'' if memory else ' (assumed)'}: give "
+            "store=..., a directory."
+        )
+
+
+def _store_path(path: str | os.PathLike) -> Path:
     try:
-        found = Path(path).resolve()
-        found.exists()
+        absolute = Path(path).resolve()
+        absolute.exists()
     except (OSError, ValueError, RuntimeError) as error:
         raise StoreError(
             f"{os.fspath(path)!r:.80} cannot be the path of a store "
-            f"({getattr(error, 'strerror', None) or error}). Give a valid path, in a directory "
-            "that you have permission to access."
+            f"({getattr(error, 'strerror', None) or error}): give a path that you may access."
         ) from None
-    return found
+    return absolute
 
 
 def _crc32(content: bytes) -> str:

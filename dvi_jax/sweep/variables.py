@@ -14,12 +14,7 @@ from .program import Sweep
 
 _NAME = re.compile(r"[\w +-]+(\.[\w +-]+)*")
 
-ARRAY_NAMES = (
-    "a name may contain letters, digits, spaces, _, - and +. It may have single dots, but not at "
-    "the beginning or end. The name zarr.json is reserved for a file of the store"
-)
-
-RESERVED = ("status", "failed_step", "residual", "stop_t", "t", "q", "p", "save", "q0", "p0")
+RESERVED_NAMES = ("status", "failed_step", "residual", "stop_t", "t", "q", "p", "save", "q0", "p0")
 """Names that the result itself uses."""
 
 
@@ -49,65 +44,74 @@ def variables(sweep: Sweep, shapes: Mapping[str, Any]) -> dict[str, Variable]:
     """The arrays of a result, with names for their own dimensions."""
     leaves = jax.tree.leaves_with_path(sweep.options["observe"], is_leaf=is_observable)
     observables = [(place(path) or "observed", f) for path, f in leaves]
-    given = [name for name, _ in observables]
-    taken = (*RESERVED, *(d for d in sweep.dims if d not in RESERVED))
-    for name in given:
-        if given.count(name) > 1:
+    names = [name for name, _ in observables]
+    for name in names:
+        check_array_name("the observable", name)
+        if names.count(name) > 1:
             raise ValueError(
-                f"two observables have the name {name!r}, but each must have its own. The keys of "
-                "nested dicts are joined with dots: {'a': {'b': f}} gives 'a.b'. Rename one."
+                f"two observables have the name {name!r} (keys of nested dicts are joined with "
+                "dots): rename one."
             )
-        if not is_array_name(name):
-            raise ValueError(f"the observable {name!r} cannot have this name: {ARRAY_NAMES}.")
-        if name in taken or name.split(".")[0] in RESERVED:
-            raise ValueError(
-                f"the observable {name!r} has a reserved name: rename it. It must not have the "
-                f"name of an axis ({', '.join(sweep.dims)}). Its name, or the part of it before "
-                f"the first dot, must not be one of {', '.join(RESERVED)}."
-            )
+        if name in sweep.dims:
+            raise ValueError(f"the observable {name!r} has the name of an axis: rename it.")
+        refuse_reserved_name("observable", name)
     # Observables that are not reduced have a row for each step that ends at a save point: one less
     # than states, except for `Save(ts=...)`.
     save = sweep.options["save"]
     rows = "save" if save is not None and save.ts is not None else "saved_step"
     first = {name: rows for name, f in observables if not isinstance(f, Reduction)}
     first |= dict.fromkeys("tqp", "save")
-    found = {}
-    for name, x in shapes.items():
-        own = x.shape[1:] if name in first else x.shape
-        dims = own_dims("component" if name in ("q", "p") else f"{name}_dim", own)
+    arrays = {}
+    for name, array in shapes.items():
+        shape = array.shape[1:] if name in first else array.shape
+        dims = own_dims("component" if name in ("q", "p") else f"{name}_dim", shape)
         if name in first:
             dims.insert(0, first[name])
-        dtype = np.dtype(x.dtype)
+        dtype = np.dtype(array.dtype)
         if dtype.kind not in "iufbc":
             raise TypeError(
-                f"{name!r} must have a dtype of NumPy (bool, integer, float or complex), got dtype "
-                f"{dtype}. If it is an observable, convert its result with .astype(float)."
+                f"{name!r} must have a dtype of NumPy, got {dtype}: convert it by .astype(float)."
             )
-        found[name] = Variable("int8" if dtype.kind == "b" else dtype.name, x.shape, tuple(dims))
-    return found
+        kind = "int8" if dtype.kind == "b" else dtype.name
+        arrays[name] = Variable(kind, array.shape, tuple(dims))
+    return arrays
 
 
-def is_array_name(name: str) -> bool:
-    """Whether an array in a store, or in another archive, may have this name."""
-    return bool(_NAME.fullmatch(name)) and name.lower() != "zarr.json"
+def check_array_name(label: str, name: str) -> None:
+    """**Raises** `ValueError` for a name that an array in a store or table cannot have."""
+    if not _NAME.fullmatch(name) or name.lower() == "zarr.json":
+        raise ValueError(
+            f"{label} {name!r} cannot be the name of an array: use letters, digits, spaces, _, -, "
+            "+ and single dots inside, but not zarr.json."
+        )
+
+
+def refuse_reserved_name(label: str, name: str) -> None:
+    """**Raises** `ValueError` for a name whose first part the result itself uses."""
+    if name.split(".")[0] in RESERVED_NAMES:
+        raise ValueError(
+            f"the {label} {name!r} has a reserved name (or first part): rename it. Reserved are "
+            f"{', '.join(RESERVED_NAMES)}."
+        )
 
 
 def check_names(
     dims: Mapping[str, int], variables: Mapping[str, Variable], coordinates: Mapping[str, Any]
 ) -> None:
     """Refuse names that would mean two things in one result."""
-    own = {d for v in variables.values() for d in v.dims}
-    own |= {d for of, *_ in coordinates.values() for d in of if d not in dims}
-    for what, names, taken in (
-        ("the axis {!r} has the name of a dimension of the results", dims, own),
-        (
-            "the observable {!r} has the name of an axis or argument",
-            variables,
-            {*own, *coordinates},
-        ),
+    dims_of_results = {dim for variable in variables.values() for dim in variable.dims}
+    for dims_of_coordinate, *_ in coordinates.values():
+        dims_of_results |= {dim for dim in dims_of_coordinate if dim not in dims}
+    for label, names, others in (
+        ("axis", dims, dims_of_results),
+        ("observable", variables, {*dims_of_results, *coordinates}),
     ):
-        if both := [name for name in names if name in taken]:
-            raise ValueError(f"{what.format(both[0])}: rename it.")
+        for name in names:
+            if name in others:
+                raise ValueError(
+                    f"the {label} {name!r} has the name of another axis, argument or dimension: "
+                    "rename it."
+                )
 
 
 def own_dims(name: str, shape: tuple[int, ...]) -> list[str]:

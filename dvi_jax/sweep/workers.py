@@ -21,14 +21,14 @@ from lanewise.jaxprs.jaxapi import x64_enabled
 from ..base.machine import processors
 from ..base.results import STATUS_NAMES
 from .layout import STATUS
-from .plan import Task
-from .program import Program
-from .store import Memory, Store
+from .plan import SweepTask
+from .program import SweepProgram
+from .store import MemorySink, Store
 
 _PAUSE = 0.2
 """Seconds between two checks of tasks that another process computes."""
 
-_BEHIND = 2
+_WRITES = 2
 """Tasks for each thread that may wait to be written."""
 
 GOOD = ("successful", "stopped")
@@ -56,25 +56,25 @@ class SweepProgress:
 
 
 class Counter:
-    """Counts tasks and calls `report`. `before`: the tasks that were finished earlier."""
+    """Counts tasks and calls `report`. `done_tasks`: those that were finished earlier."""
 
     def __init__(
-        self, program: Program, before: Collection[int], report: Callable[..., None] | None
+        self, program: SweepProgram, done_tasks: Collection[int], report: Callable[..., None] | None
     ):
         self.program, self.report = program, report
         self.plan, self.began = program.plan, time.monotonic()
-        self.before = len(before)
-        self.lanes_before = sum(self.plan.task(i).lanes for i in before)
-        self.done, self.lanes, self.steps, self.failed = 0, 0, 0, 0
+        self.tasks_before = len(done_tasks)
+        self.lanes_before = sum(self.plan.task(i).lanes for i in done_tasks)
+        self.tasks, self.lanes, self.steps, self.failures = 0, 0, 0, 0
         self._lock = threading.Lock()
         self._report()
 
-    def add(self, task: Task, statuses: dict[str, int]) -> None:
+    def add(self, task: SweepTask, statuses: dict[str, int]) -> None:
         with self._lock:
-            self.done += 1
+            self.tasks += 1
             self.lanes += task.lanes
             self.steps += task.lanes * self.program.steps(task)
-            self.failed += sum(n for name, n in statuses.items() if name not in GOOD)
+            self.failures += sum(n for name, n in statuses.items() if name not in GOOD)
             self._report()
 
     def _report(self) -> None:
@@ -82,15 +82,15 @@ class Counter:
             return
         seconds = time.monotonic() - self.began
         todo = self.plan.lanes - self.lanes_before
-        tasks = self.before + self.done, self.plan.num_tasks
+        tasks = self.tasks_before + self.tasks, self.plan.num_tasks
         lanes = self.lanes_before + self.lanes, self.plan.lanes
         rate = self.steps / seconds if seconds > 0 else 0.0
         left = seconds * (todo / self.lanes - 1) if self.lanes else math.nan
-        self.report(SweepProgress(*tasks, *lanes, self.failed, rate, seconds, left))
+        self.report(SweepProgress(*tasks, *lanes, self.failures, rate, seconds, left))
 
 
 def compute(
-    program: Program, task: Task, device: Any
+    program: SweepProgram, task: SweepTask, device: Any
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The results of a task and the facts for its record."""
     began = time.monotonic()  # not time.time(): the clock of the machine may be set back meanwhile
@@ -114,23 +114,23 @@ def default_threads() -> int:
 
 
 def run_here(
-    program: Program,
-    sink: Memory | Store,
+    program: SweepProgram,
+    sink: MemorySink | Store,
     threads: int | None,
     report: Callable[[SweepProgress], None] | None,
 ) -> bool:
     """Compute the tasks that `sink` lacks, on all local devices. False: it was interrupted by
     Ctrl-C; the tasks that were being computed then have been stored. **Raises** the first error of
     a task or of its writing, once the other threads have ended."""
-    plan, before = program.plan, set(sink.done())
-    counter = Counter(program, before, report)
+    plan, done_tasks = program.plan, set(sink.done_tasks())
+    counter = Counter(program, done_tasks, report)
     devices, x64 = jax.local_devices(), x64_enabled()
     count = threads or default_threads()
     free: queue.SimpleQueue[Any] = queue.SimpleQueue()
     for i in range(count):
         free.put(devices[i % len(devices)])
-    places = threading.Semaphore(_BEHIND * count)
-    stop, interrupted = threading.Event(), threading.Event()
+    places = threading.Semaphore(_WRITES * count)
+    stop, interrupt = threading.Event(), threading.Event()
     errors: list[BaseException] = []
 
     @contextlib.contextmanager
@@ -141,7 +141,7 @@ def run_here(
             stop.set()
             errors.append(error)
 
-    def compute_one(task: Task, device: Any, claim: contextlib.ExitStack) -> None:
+    def compute_one(task: SweepTask, device: Any, claim: contextlib.ExitStack) -> None:
         try:
             # enable_x64 may be a context of the caller, which threads do not inherit.
             with stopping_on_errors(), claim, jax.enable_x64(x64):
@@ -151,7 +151,7 @@ def run_here(
         finally:
             free.put(device)
 
-    def write(task: Task, results: Any, facts: Any, claim: contextlib.ExitStack) -> None:
+    def write(task: SweepTask, results: Any, facts: Any, claim: contextlib.ExitStack) -> None:
         with stopping_on_errors():
             try:
                 with claim:
@@ -167,7 +167,7 @@ def run_here(
             task, device, claim = plan.task(number), free.get(), contextlib.ExitStack()
             if stop.is_set():
                 break
-            if claim.enter_context(sink.claimed(task)):
+            if claim.enter_context(sink.claim(task)):
                 pool.submit(compute_one, task, device, claim)
                 continue
             claim.close()
@@ -179,19 +179,19 @@ def run_here(
         return theirs
 
     with (
-        _instead_of_interrupt(interrupted, stop),
+        _instead_of_interrupt(interrupt, stop),
         ThreadPoolExecutor(2, "write") as writer,
         ThreadPoolExecutor(count, "sweep") as pool,
     ):
         try:
-            theirs = submit(plan.todo(before))
+            theirs = submit(plan.todo(done_tasks))
             while theirs and not stop.wait(_PAUSE):
                 theirs = submit(theirs)
         except KeyboardInterrupt:  # raised by another handler than Python's
-            interrupted.set()
+            interrupt.set()
     if errors:
         raise errors[0]
-    return not interrupted.is_set()
+    return not interrupt.is_set()
 
 
 @contextlib.contextmanager
@@ -199,14 +199,14 @@ def _instead_of_interrupt(*events: threading.Event) -> Iterator[None]:
     """The first Ctrl-C sets these events. The exception that Python raises instead can occur at any
     line, and is lost in some, such as a callback of the garbage collector."""
     in_main = threading.current_thread() is threading.main_thread()
-    before: Any = signal.getsignal(signal.SIGINT)
+    handler: Any = signal.getsignal(signal.SIGINT)
     # Python's handler, or one that wraps it.
-    if not in_main or getattr(before, "__wrapped__", before) is not signal.default_int_handler:
+    if not in_main or getattr(handler, "__wrapped__", handler) is not signal.default_int_handler:
         yield
         return
 
     def handle(number: int, frame: Any) -> None:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, handler)
         for event in events:
             event.set()
 
@@ -214,4 +214,4 @@ def _instead_of_interrupt(*events: threading.Event) -> Iterator[None]:
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, handler)

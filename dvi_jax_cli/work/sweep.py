@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import dvi_jax as dvi
-from dvi_jax.sweep.bar import shown as shown_bar
-from dvi_jax.sweep.variables import RESERVED
+from dvi_jax.sweep.bar import progress_display as shown_bar
+from dvi_jax.sweep.variables import RESERVED_NAMES
 
 from .._errors import InputError, describe, require
 from .._show import Table
@@ -130,7 +130,7 @@ def _statistics(result: dvi.SweepResult) -> dict[str, dict[str, float]]:
     """Name → least, median and largest over the successful trajectories. Empty without observables,
     and where there is too much to read."""
     data = result.to_xarray()
-    names = [str(n) for n in data.data_vars if str(n).split(".")[0] not in RESERVED]
+    names = [str(n) for n in data.data_vars if str(n).split(".")[0] not in RESERVED_NAMES]
     if not names or sum(data[name].size for name in names) > _MAX_NUMBERS:
         return {}
     good = result["status"] == 0

@@ -228,10 +228,10 @@ def _range_reader(kind: str) -> Callable[[Any], list[float]]:
 
 
 def _axis_name(name: str) -> str:
-    from dvi_jax.sweep.variables import RESERVED
+    from dvi_jax.sweep.variables import RESERVED_NAMES
 
-    rule = f"a name such as x1, except {', '.join(RESERVED)}"
-    require(name.isidentifier() and name not in RESERVED, "", describe(name), rule)
+    rule = f"a name such as x1, except {', '.join(RESERVED_NAMES)}"
+    require(name.isidentifier() and name not in RESERVED_NAMES, "", describe(name), rule)
     return name
 
 
