@@ -178,7 +178,7 @@ def test_what_is_not_determined_is_named():
     lost[1, :] = lost[:, 1] = np.nan
     lost[1, 1] = np.inf
     fit = made(covariance=lost)
-    with pytest.raises(ValueError, match=r"got inf for 'epsilon'.*'args.mu', 'q0\[0\]'"):
+    with pytest.raises(ValueError, match=r"of 'epsilon', got inf.*'args.mu', 'q0\[0\]'"):
         plot.fit_corner(fit)
     assert plot.fit_corner(fit, ["args.mu", "q0[0]"]).shape == (2, 2)
 
@@ -280,26 +280,26 @@ def test_invalid_input_is_rejected():
         ((bare,), {}, "must be a FitResult.*whitened", TypeError),
         ((fit,), {"arcs": 1}, "arcs must be .* 0 to 0, got 1"),
         ((fit,), {"component": "q"}, "component must be .*'q'"),
-        ((fit,), {"names": ["x"]}, r"one for each .*2 in total.*got \['x'\]"),
-        ((fit,), {"arcs": []}, "arcs is empty: .*at least one"),
-        ((fit,), {"axes": three}, r"needs 2 Axes .*one for each panel.*got 3"),
+        ((fit,), {"names": ["x"]}, r"2 names of the components, got \['x'\]"),
+        ((fit,), {"arcs": []}, "arcs is empty: choose"),
+        ((fit,), {"axes": three}, r"needs 2 Axes, one for each panel.*got 3"),
     )
     refuses(
         plot.fit_corner,
         ((bare,), {}, "a FitResult.* names, covariance", TypeError),
-        ((made(covariance=none),), {}, r"diagonal; the first variances are \[nan, "),
+        ((made(covariance=none),), {}, "positive and finite variance of 'args.mu', got nan"),
         ((fit, ["mu"]), {}, names),
         ((fit, ["epsilon"] * 2), {}, "different names"),
         ((fit, []), {}, "one or more"),
         ((many,), {}, r"13 parameters are too many.*params=\['a0'"),
-        ((fit,), {"samples": {"mu": X}}, "add draws of 'args.mu'"),
+        ((fit,), {"samples": {"mu": X}}, "draws of 'args.mu'"),
         ((fit,), {"samples": 3}, "a dvi.Samples or a dict", TypeError),
         ((fit,), {"axes": four}, r"shape \(3, 3\) for 3 parameters"),
     )
     refuses(
         plot.fit_against_data,
         ((bare,), {}, "must be a FitResult", TypeError),
-        ((fit,), {"names": "xy"}, "one for each .*2 in total.*got 'xy'"),
+        ((fit,), {"names": "xy"}, "2 names of the components, got 'xy'"),
         ((fit,), {"arc": 2}, "arc must be .*got 2"),
         ((fit,), {"component": -1}, "component must be .*got -1"),
         ((fit,), {"curve": (X, X)}, "with 2 components"),

@@ -148,7 +148,7 @@ def test_every_number_has_one_name_and_every_claim_a_bound(m, run):
     parts += (m.discoveries, m.repulsion, m.variational_mesh)
     assert len(values.numbers(m)) == sum(map(len, parts))
     assert all(check.decides for c in run[0].claims for check in (*c.printed, *c.corrected))
-    assert not any(check.decides for c in run[0].claims for check in c.also)
+    assert not any(check.decides for c in run[0].claims for check in c.context)
 
 
 def test_nan_passes_no_check():

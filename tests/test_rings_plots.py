@@ -127,5 +127,5 @@ def test_a_resonance_of_tunes_is_a_line_with_its_integer_on_the_right():
     assert label.xy[0] + 2 * label.xy[1] == pytest.approx(1)
     refuses(
         plot.frequency_map,
-        ((np.ones(2), np.ones(2)), {"resonances": [(0, 0, 1)]}, "integer on the right-hand side"),
+        ((np.ones(2), np.ones(2)), {"resonances": [(0, 0, 1)]}, "not both 0"),
     )

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 
 import dvi_jax as dvi
 
-from .extras import expect, needed
-from .fields import checked
+from .extras import expect, require
+from .fields import system_and_strength
 
 if TYPE_CHECKING:
     from .diffrax_classes import DiscreteMap, DiscreteTerm
@@ -24,10 +24,10 @@ def diffrax_term(system: Any, epsilon: Any = None) -> "DiscreteTerm":
 
     **Raises** `ImportError` without diffrax, `TypeError` for another object than a system.
     """
-    needed("diffrax", "interop.diffrax_term")
+    require("diffrax", "interop.diffrax_term")
     from .diffrax_classes import DiscreteTerm
 
-    system, epsilon = checked(system, epsilon)
+    system, epsilon = system_and_strength(system, epsilon)
     return DiscreteTerm(system, jnp.asarray(epsilon, float))
 
 
@@ -64,7 +64,7 @@ def diffrax_solver(
     """
     expect("method", method, dvi.Method, "a method such as dvi.Strang()")
     expect("root_finder", root_finder, dvi.RootSolver, "a root solver such as dvi.Newton()")
-    needed("diffrax", "interop.diffrax_solver")
+    require("diffrax", "interop.diffrax_solver")
     from .diffrax_classes import DiscreteMap
 
     return DiscreteMap(method, root_finder)

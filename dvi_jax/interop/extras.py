@@ -8,7 +8,7 @@ import dvi_jax as dvi
 from ..systems import Problem
 
 
-def needed(package: str, user: str) -> Any:
+def require(package: str, user: str) -> Any:
     """The module `package`. **Raises** `ImportError` with the line that installs it."""
     try:
         return importlib.import_module(package)

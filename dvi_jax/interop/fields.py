@@ -34,7 +34,7 @@ def vector_field(system: Any, epsilon: Any = None) -> Callable[[Any, Any, Any], 
     **Accuracy** round-off. ``dvi.from_lagrangian`` divides by t1 − t0 and has no H_D(t, t, …): its
     field is NaN everywhere. With ``slow_time=True`` t is the time itself, and H_D receives εt.
     """
-    system, epsilon = checked(system, epsilon)
+    system, epsilon = system_and_strength(system, epsilon)
     push = dvi.ConstraintForce().bind(system, epsilon)
 
     def field(t, y, args):
@@ -65,7 +65,7 @@ def as_pair(y: Any) -> tuple[Any, Any]:
     return q, p
 
 
-def checked(system: Any, epsilon: Any) -> tuple[dvi.System, Any]:
+def system_and_strength(system: Any, epsilon: Any) -> tuple[dvi.System, Any]:
     """The system and ε. Warns, as `integrate` does, if ε is known to have no effect."""
     system = system_of(system)
     epsilon = system.strength(epsilon)

@@ -23,7 +23,7 @@ from ..systems.n_body import (
     linear_momentum,
     symmetries,
 )
-from .extras import expect, needed
+from .extras import expect, require
 
 _NEWTONIAN = ("basic", "compensated", "jacobi", "mercurius", "trace")
 """Modules for gravity that evaluate Newton's law in full, whichever way they order the sums."""
@@ -110,7 +110,7 @@ def from_rebound(
 
     **Source** Rein & Liu 2012, *Astron. Astrophys.* 537, A128.
     """
-    rebound = needed("rebound", "interop.from_rebound")
+    rebound = require("rebound", "interop.from_rebound")
     if isinstance(simulation, str | PathLike):
         if not Path(simulation).is_file():
             raise FileNotFoundError(
@@ -179,7 +179,7 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
     `ValueError` for another system than Newton's N bodies or one with a force or a perturbation,
     for shapes that do not agree and for values that are not finite; `ImportError` without rebound.
     """
-    rebound = needed("rebound", "interop.to_rebound")
+    rebound = require("rebound", "interop.to_rebound")
     expect("problem", problem, Problem, "a problem of dvi_jax.systems or of from_rebound")
     system, args = problem.system, problem.args
     differences = {

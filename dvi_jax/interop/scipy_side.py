@@ -13,14 +13,14 @@ import dvi_jax as dvi
 
 from ..base.inputs import refuse_unit_or_mask
 from ..systems import Problem
-from .extras import needed, system_of
+from .extras import require, system_of
 
 _JACOBIAN = "Jacobians of implicit steps are computed by autodiff. Leave this argument out"
 _ESTIMATE = (
     "The size of the steps is fixed, so that the invariants are conserved. Leave this argument "
     "out, choose h, and compare the results for h and h/2 to estimate the error"
 )
-_REJECTED = {
+_REASONS = {
     **dict.fromkeys(("rtol", "atol"), _ESTIMATE),
     **dict.fromkeys(("max_step", "min_step", "first_step"), "Give the largest step size as h"),
     **dict.fromkeys(("jac", "jac_sparsity", "lband", "uband"), _JACOBIAN),
@@ -64,7 +64,7 @@ def solve_ivp(
     events: Any = None,
     shape: tuple[int, ...] | None = None,
     root_finder: dvi.RootSolver | None = None,
-    **unsupported: Any,
+    **excess: Any,
 ) -> Any:
     r"""One trajectory with the arguments and the results of `scipy.integrate.solve_ivp`.
 
@@ -99,12 +99,12 @@ def solve_ivp(
     **Accuracy** the order of the method in h. Values are NumPy's: nothing can be differentiated
     through it; take ``dvi.integrate`` for that.
     """
-    for name in unsupported:
-        reason = _REJECTED.get(name, "Check its name: SciPy's solve_ivp does not have it either")
+    for name in excess:
+        reason = _REASONS.get(name, "Check its name: SciPy's solve_ivp does not have it either")
         raise TypeError(f"interop.solve_ivp has no argument {name!r}. {reason}.")
     for name, value in (("t_span", t_span), ("y0", y0), ("t_eval", t_eval), ("h", h)):
         refuse_unit_or_mask(name, value)
-    bunch = needed("scipy.optimize", "interop.solve_ivp").OptimizeResult
+    bunch = require("scipy.optimize", "interop.solve_ivp").OptimizeResult
     if isinstance(system, Problem):
         args = system.args if args is None else args
         shape = np.shape(system.q0) if shape is None else shape

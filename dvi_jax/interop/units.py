@@ -12,7 +12,7 @@ import numpy as np
 import dvi_jax as dvi
 
 from ..systems import Problem
-from .extras import expect, needed, system_of
+from .extras import expect, require, system_of
 
 _POWERS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
 
@@ -47,7 +47,7 @@ class UnitSystem:
         p: Any = "momentum",
         args: Mapping[str, Any] | None = None,
     ):
-        u = needed("astropy.units", "interop.UnitSystem")
+        u = require("astropy.units", "interop.UnitSystem")
         base_units = {"length": length, "time": time, "mass": mass}
         bases = L, T, M = [_unit(u, kind, word) for kind, word in base_units.items()]
         for kind, unit, like in zip(base_units, bases, (u.m, u.s, u.kg), strict=True):
@@ -87,7 +87,7 @@ class UnitSystem:
 
         **Raises** `ValueError` for a problem whose units are words, such as "period/2π".
         """
-        u = needed("astropy.units", "interop.UnitSystem")
+        u = require("astropy.units", "interop.UnitSystem")
         expect("problem", problem, Problem, "a problem of dvi_jax.systems")
         texts = {name: problem.units.get(name, "unknown units") for name in ("q", "p", "t")}
         read = {name: _read(u, text) for name, text in texts.items()}
@@ -180,7 +180,7 @@ def integrate(
     units agrees to round-off. Quantities are values that cannot be traced: for `jax.grad`,
     `jax.jit` and `jax.vmap` call ``dvi.integrate`` on numbers in one system of units.
     """
-    u = needed("astropy.units", "interop.integrate")
+    u = require("astropy.units", "interop.integrate")
     problem = system if isinstance(system, Problem) else None
     system = system_of(system)
     own_units = None
@@ -206,7 +206,7 @@ def integrate(
         )
     if ts is not None:
         options["save"] = dvi.Save(ts=_number(u, "ts", ts, target.t))
-    q0, p0, args = _filled(u, problem, own_units, q0, p0, args)
+    q0, p0, args = _with_defaults(u, problem, own_units, q0, p0, args)
     inputs = ("q0", q0, target.q), ("p0", p0, target.p), ("h", h, target.t)
     inputs += (("epsilon", epsilon, u.dimensionless_unscaled),)
     inputs += () if t0 is None else (("t0", t0, target.t),)
@@ -223,7 +223,7 @@ def integrate(
     return UnitSolution(*with_unit, observed=sol.observed, units=target, solution=sol)
 
 
-def _filled(
+def _with_defaults(
     u: Any, problem: Problem | None, basis: UnitSystem | None, q0: Any, p0: Any, args: Any
 ) -> tuple[Any, Any, Any]:
     """q0, p0 and args, in which quantities of the problem replace what was left out."""
@@ -251,7 +251,7 @@ def _filled(
 
 def _arguments(u: Any, args: Any, units: UnitSystem) -> Any:
     """The same pytree with every quantity as a number."""
-    met, bare = set(), []
+    used, bare = set(), []
 
     def number(path: Any, leaf: Any) -> Any:
         words = [str(getattr(k, "key", getattr(k, "idx", k))) for k in path]
@@ -259,7 +259,7 @@ def _arguments(u: Any, args: Any, units: UnitSystem) -> Any:
         paths = [".".join(words[:i]) for i in range(len(words), 0, -1)]
         name = paths[0] if paths else "args"
         if path_of_unit := next((x for x in paths if x in units.args), None):
-            met.add(path_of_unit)
+            used.add(path_of_unit)
             return _number(u, f"args {name}", leaf, units.args[path_of_unit])
         if isinstance(leaf, u.Quantity) and leaf.unit != u.dimensionless_unscaled:
             key, subject = (name, f"{name} in args") if path else ("name", "args")
@@ -273,7 +273,7 @@ def _arguments(u: Any, args: Any, units: UnitSystem) -> Any:
         return _number(u, f"args {name}", leaf, u.dimensionless_unscaled)
 
     numbers = jax.tree.map_with_path(number, args)
-    unmet = [name for name in units.args if name not in met]
+    unmet = [name for name in units.args if name not in used]
     if unmet and bare:  # a mistyped name would let a bare number through
         names, bare_names = (", ".join(map(repr, group)) for group in (unmet, bare))
         kind = f"args is of type {type(args).__name__}, whose entries have no names: give a dict."

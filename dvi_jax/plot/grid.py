@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.ticker import LogFormatterMathtext, LogLocator
 
 from ..base.checks import instance
-from .axes import at_most, canvas, cell_edges, stack
+from .axes import at_most, canvas, cell_edges, check_not_empty, check_real, stack
 from .blocks import Bins, make_bins
 from .style import check_keywords, with_unit
 
@@ -100,10 +100,7 @@ def dim_of(data: Any, name: str, role: str = "each of x, y, facet, over and alon
         return name
     if name in data.coords and data.coords[name].ndim == 1:
         return str(data.coords[name].dims[0])
-    raise ValueError(
-        f"{role} must be a dimension of the data, got {name!r}. The dimensions (with their sizes) "
-        f"are {names_of(data)}."
-    )
+    raise ValueError(f"{role} must be one of the dimensions {names_of(data)}, got {name!r}.")
 
 
 def names_of(data: Any) -> str:
@@ -138,13 +135,13 @@ def _short(value: Any) -> str:
 class Grid(NamedTuple):
     """(title, array) of each panel, and the axes that all panels share; no `y` for a line.
 
-    `over`: dimensions of which the numbers meet in a pixel.
+    `reduced_dims`: dimensions of which the numbers meet in a pixel.
     """
 
     panels: list[tuple[str, Any]]
     x: Place
     y: Place | None
-    over: tuple[str, ...]
+    reduced_dims: tuple[str, ...]
     facet: str | None
 
     @property
@@ -162,8 +159,7 @@ class Grid(NamedTuple):
         if ax is not None:
             if count > 1:
                 raise ValueError(
-                    f"ax is for one map, but facet={self.facet!r} makes a new figure of {count} "
-                    "maps: leave out ax or facet."
+                    f"facet={self.facet!r} makes a new figure of {count} maps: leave out ax."
                 )
             return [canvas(ax)[0]]
         if count == 1:
@@ -204,25 +200,21 @@ def arrange(
     width, height = two_numbers(pixels)
     if not (width >= 1 and height >= 1):
         raise ValueError(f"pixels must be (width, height), both at least 1, got {pixels!r}.")
-    if empty := [str(d) for d, n in data.sizes.items() if n == 0]:
-        raise ValueError(
-            "data must have at least one value along each dimension, got size 0 along "
-            f"{', '.join(map(repr, empty))}. Change the selection, so that it is not empty."
-        )
+    for dimension, size in data.sizes.items():
+        check_not_empty(f"data along {dimension!r}", range(size), "change the selection")
     reduced_names = (reduced_names,) if isinstance(reduced_names, str) else tuple(reduced_names)
+    replacements = replacements or {}
     roles = {"x": x, "y": y, "facet": facet, **{f"over={name!r}": name for name in reduced_names}}
+    roles |= {f"along={name!r}": name for name, array in replacements.items() if array is None}
     roles_of: dict[str, str] = {}
     for role, name in roles.items():
         dim = None if name is None else dim_of(data, name, role.partition("=")[0])
         if dim in roles_of:
             raise ValueError(
-                f"{role} and {roles_of[dim]} must use different dimensions, but both use "
-                f"{dim!r}: change one of them."
+                f"{role} and {roles_of[dim]} must use different dimensions, got {dim!r} for both."
             )
         roles_of |= {} if dim is None else {dim: role}
-    replacements = replacements or {}
-    absent = [dim_of(data, name) for name, array in replacements.items() if array is None]
-    left = [str(d) for d in data.dims if d not in roles_of and d not in absent]
+    left = [str(d) for d in data.dims if d not in roles_of]
     free = [d for d in left if data.sizes[d] > 1]
     if x is None:
         x, y = (free.pop(0), y) if free else (y, None)
@@ -230,17 +222,14 @@ def arrange(
         y = free.pop(0)
     if x is None:
         raise ValueError(
-            "data must have a dimension of size 2 or more for x that is not used otherwise. The "
-            f"dimensions (with their sizes) are {names_of(data)}; used: "
-            f"{[*roles_of, *absent] or 'none'}. Remove a dimension from facet or over, or use data "
-            "with one more dimension."
+            "data must have a dimension of size 2 or more for x that is not used otherwise, got "
+            f"{names_of(data)}; used: {[*roles_of] or 'none'}."
         )
     if free:
         raise ValueError(
             f"a map has two dimensions, here {x!r} and {y!r}, but data also has "
-            f"{', '.join(map(repr, free))}. Select one value with "
-            f"data.isel({', '.join(f'{d}=0' for d in free)}), or reduce all values with "
-            f"over={[*reduced_names, *free]}. With facet, each value has its own map."
+            f"{', '.join(map(repr, free))}: select data.isel({', '.join(f'{d}=0' for d in free)}), "
+            f"reduce with over={[*reduced_names, *free]}, or use facet."
         )
     data = data.isel({d: 0 for d in left if data.sizes[d] == 1})
     arrays: dict[Any, Any] = dict.fromkeys((x, y), data) | replacements
@@ -282,6 +271,5 @@ def checked_array(data: Any) -> Any:
     if isinstance(data, xr.Dataset):
         hint += f" There are {', '.join(map(str, data.data_vars))}."
     instance("data", data, xr.DataArray, "an xarray.DataArray", hint)
-    if data.dtype.kind not in "biuf":
-        raise TypeError(f"data must be an array of real numbers, got dtype {data.dtype}.")
+    check_real("data", data)
     return data

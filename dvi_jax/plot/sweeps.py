@@ -83,7 +83,7 @@ def sweep_map(
     grid = arrange(data, x, y, where)
     label = label_of(data, data.name or "value")
     fewer = any(len(place.centres) < place.bins.size for place in grid.places)
-    if fewer or any(data.sizes[d] > 1 for d in grid.over):
+    if fewer or any(data.sizes[d] > 1 for d in grid.reduced_dims):
         label = f"{REDUCTIONS[reduce]} {label}"
     pictures = [reduce_to_pixels(panel, grid.bins, reduce) for _, panel in grid.panels]
     counts = None if status is None else _count_beside(status, grid)
@@ -123,22 +123,12 @@ def slope_map(
     one_of("reduce", reduce, REDUCTIONS)
     dim = dim_of(data, along, "along")
     values, order = _positive(data, along)
-    names, facet = where.get("over", ()), where.get("facet")
-    names = [*([names] if isinstance(names, str) else names), *([facet] if facet else [])]
-    if wrong := [name for name in names if dim_of(data, name) == dim]:
-        raise ValueError(
-            f"facet and over must not use the dimension {dim!r}, got {wrong[0]!r}: the slopes are "
-            "computed along this dimension. Choose another dimension for facet or over."
-        )
     x, y = (along if name is not None and dim_of(data, name) == dim else name for name in (x, y))
     local = local or along in (x, y)
     replacements: dict[str, Any] = {along: None}
     if local:
         if along not in (x, y) and None not in (x, y):
-            raise ValueError(
-                f"local=True needs {along!r} as x or y, got x={x!r} and y={y!r}: set x or y to "
-                f"{along!r}, or leave one of them out."
-            )
+            raise ValueError(f"local=True needs {along!r} as x or y, got x={x!r}, y={y!r}.")
         if along not in (x, y):
             x, y = (along, y) if x is None else (x, along)
         middle = np.sqrt(values[1:] * values[:-1])
@@ -227,8 +217,7 @@ def _scale(pictures: Sequence[Picture], log: bool | None, limits: Any) -> tuple[
         log = log and bool(positive.max() > 10**_DECADES * positive.min())
     if log and (numbers < 0).any():
         raise ValueError(
-            "log=True is not allowed for negative values, and the smallest value of a pixel is "
-            f"{numbers.min():.3g}: leave out log=True, or draw abs(data)."
+            f"log=True requires values of at least 0, got {numbers.min():.3g}: draw abs(data)."
         )
     if limits is not None:
         low, high = two_numbers(limits)
@@ -322,24 +311,15 @@ def _share(count: int, total: int) -> str:
 
 def _positive(data: Any, coordinate: str) -> tuple[np.ndarray, np.ndarray]:
     """(positive values of a coordinate, rising; their places along the dimension)."""
-    kind = data.coords[coordinate].dtype if coordinate in data.coords else None
-    if kind is None or kind.kind not in "iuf":
-        kind_text = "has no coordinate values" if kind is None else f"has values of dtype {kind}"
+    values = data.coords[coordinate].values if coordinate in data.coords else np.zeros(0)
+    order = np.zeros(0, int)
+    if values.dtype.kind in "iuf":
+        order = np.argsort(values, kind="stable")
+        order = order[np.isfinite(values[order]) & (values[order] > 0)]
+    if len(order) < 2 or (np.diff(values[order]) == 0).any():
         raise ValueError(
-            f"along={coordinate!r} must have numbers as coordinate values, but it {kind_text}: add "
-            "numbers with data.assign_coords, or choose another dimension or coordinate. The "
-            f"dimensions are {names_of(data)}."
-        )
-    values = data.coords[coordinate].values
-    order = np.argsort(values, kind="stable")
-    order = order[np.isfinite(values[order]) & (values[order] > 0)]
-    equal = np.flatnonzero(np.diff(values[order]) == 0)
-    if len(order) < 2 or len(equal):
-        cause = f"{values[order[equal[0]]]} more than once" if len(equal) else f"only {len(order)}"
-        raise ValueError(
-            f"along={coordinate!r} must have at least two positive values, all different, got "
-            f"{cause}. "
-            "Select other values, or choose another coordinate."
+            f"along={coordinate!r} must have as coordinate two or more positive numbers, all "
+            f"different, got {values!r:.100}: choose one of {names_of(data)}."
         )
     return np.asarray(values[order], float), order
 
@@ -380,10 +360,7 @@ def _status_of(name: str, data: Any) -> Any:
     if isinstance(data, xr.Dataset):
         if "status" not in data:
             names = ", ".join(map(str, data.data_vars)) or "no variables"
-            raise ValueError(
-                f"{name} must contain the variable status, got a Dataset with {names}: give "
-                "result.to_xarray(), where result is the result of dvi.sweep."
-            )
+            raise ValueError(f"{name} must contain the variable status, got a Dataset of {names}.")
         data = data["status"]
     return checked_array(data)
 
@@ -393,9 +370,8 @@ def _count(name: str, status: Any, grid: Grid, panels: Iterable[Any]) -> _Status
     values, meanings = map(status.attrs.get, ("flag_values", "flag_meanings"))
     if values is None or meanings is None or len(values) != len(meanings.split()):
         raise ValueError(
-            f"{name} must have the attributes flag_values and flag_meanings, with one word in "
-            f"flag_meanings for each value, got {values!r} and {meanings!r}: give "
-            "result.to_xarray().status, where result is the result of dvi.sweep."
+            f"{name} must have attributes flag_values and flag_meanings, a word for each value, "
+            f"got {values!r} and {meanings!r}: give the status of dvi.sweep(...).to_xarray()."
         )
     codes, names = zip(*sorted(zip(map(int, values), meanings.split(), strict=True)), strict=True)
     counts = [count_codes(panel, grid.bins, codes) for panel in panels]
@@ -409,12 +385,15 @@ def _count_beside(status: Any, grid: Grid) -> _Statuses:
     status = _status_of("status", status)
     facets = [] if grid.facet is None else [dim_of(status, grid.facet)]
     dims = [*grid.bins, *facets]
-    excess = [d for d in status.dims if d not in (*dims, *grid.over) and status.sizes[d] > 1]
-    if excess or any(d not in status.dims for d in dims):
+    excess = [
+        dim
+        for dim in status.dims
+        if dim not in (*dims, *grid.reduced_dims) and status.sizes[dim] > 1
+    ]
+    if excess or any(dim not in status.dims for dim in dims):
         raise ValueError(
             f"status must have the dimensions {', '.join(dims)} of the map and no others, got "
-            f"{names_of(status)}: use the status of the same sweep as data, and select the same "
-            "values in both before the plot."
+            f"{names_of(status)}: give that of the same sweep and selection."
         )
     selections = (dict.fromkeys(facets, i) for i in range(len(grid.panels)))
     return _count("status", status, grid, (status.isel(selection) for selection in selections))

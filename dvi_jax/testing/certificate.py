@@ -9,10 +9,10 @@ from typing import Any
 import dvi_jax as dvi
 
 from .candidate import Candidate
-from .check import CHECKS, Measured, chosen, require_double_precision
+from .check import CHECKS, Measured, require_double_precision, selected_names
 from .controls import CONTROLS, Control
 from .page import Table, markdown, tables
-from .problems import COUPLED, FORCED, reference
+from .problems import COUPLED, STRENGTH, reference
 from .registry import METHODS
 
 _WORKERS = 2
@@ -34,7 +34,12 @@ class Certificate:
     @property
     def failures(self) -> list[tuple[str, str, Measured]]:
         """(method, check, measured) wherever a method lacks a property that it claims."""
-        return [(m, c, x) for m, row in self.rows.items() for c, x in row.items() if not x.ok]
+        return [
+            (method, check, result)
+            for method, row in self.rows.items()
+            for check, result in row.items()
+            if not result.ok
+        ]
 
     @property
     def missed(self) -> list[Control]:
@@ -90,11 +95,11 @@ def certify(
     method takes 15 to 35 seconds.
     """
     require_double_precision()
-    by_name = _named(methods)
-    names = chosen("check", checks, CHECKS)
+    by_name = _methods_by_name(methods)
+    names = selected_names("check", checks, CHECKS)
     controls = [control for control in CONTROLS if control.check in names]
     if {"order", "forced-order"} & set(names):
-        for epsilon in (0.0, FORCED):
+        for epsilon in (0.0, STRENGTH):
             reference(COUPLED, epsilon)  # here, not in each worker at once
 
     def row(method: dvi.Method, names: list[str]) -> dict[str, Measured]:
@@ -117,7 +122,7 @@ def certify(
     return Certificate(by_name, outcomes_of, outcomes)
 
 
-def _named(methods: Any) -> dict[str, dvi.Method]:
+def _methods_by_name(methods: Any) -> dict[str, dvi.Method]:
     """Name → method, checked."""
     if isinstance(methods, dvi.Method):
         raise TypeError(
@@ -126,7 +131,7 @@ def _named(methods: Any) -> dict[str, dvi.Method]:
         )
     if not isinstance(methods, Mapping):
         hint = " For your own method call certify({name: method})."
-        return {name: METHODS[name] for name in chosen("method", methods, METHODS, hint)}
+        return {name: METHODS[name] for name in selected_names("method", methods, METHODS, hint)}
     for name, method in methods.items():
         if not isinstance(method, dvi.Method):
             kind = (

@@ -129,7 +129,7 @@ def check_method(method: dvi.Method, checks: Iterable[str] | None = None) -> dic
 
 def _require(candidate: Candidate, checks: Iterable[str] | None) -> dict[str, Measured]:
     require_double_precision()
-    results = {name: CHECKS[name](candidate) for name in chosen("check", checks, CHECKS)}
+    results = {name: CHECKS[name](candidate) for name in selected_names("check", checks, CHECKS)}
     faults = [
         f"{name}: measured {result.value:.3g}, required {result.allowed}. {result.detail}\n"
         f"  What is measured: {CHECKS[name].says}\n  What to do: {CHECKS[name].remedy}"
@@ -151,7 +151,7 @@ def require_double_precision() -> None:
         )
 
 
-def chosen(kind: str, names: Any, choices: Iterable[str], hint: str = "") -> list[str]:
+def selected_names(kind: str, names: Any, choices: Iterable[str], hint: str = "") -> list[str]:
     """`names` without repetitions, or all that are known for None.
 
     **Raises** `ValueError` for an unknown name and for none at all, `TypeError` for no list.

@@ -72,8 +72,14 @@ def tables(
     if controls:
         words = {True: "caught", False: "MISSED"}
         body = [
-            [c.check, c.name, cell(c.check, x), x.allowed, words[x.verdict == "FAIL"]]
-            for c, x in controls
+            [
+                control.check,
+                control.name,
+                cell(control.check, result),
+                result.allowed,
+                words[result.verdict == "FAIL"],
+            ]
+            for control, result in controls
         ]
         columns = ["check", "broken method", "measured", "allowed", "verdict"]
         sheets.append(Table("Controls", columns, body))
@@ -106,7 +112,8 @@ def markdown(
     parts = [f"## {table.title}\n\n{_as_markdown(table)}" for table in sheets]
     if failures:
         faults = [
-            f"- {m}, {c}: {x.verdict}, allowed {x.allowed}. {x.detail}" for m, c, x in failures
+            f"- {method}, {c}: {result.verdict}, allowed {result.allowed}. {result.detail}"
+            for method, c, result in failures
         ]
         parts.append("\n".join(["## Failures\n", *faults]))
     template = Path(__file__).with_name("page.md").read_text(encoding="utf-8")

@@ -102,7 +102,7 @@ def _summary(claims: list[Claim]) -> Table:
         verdict = claim.verdict
         # The decisive check: the failing one of the printed claim, or its first if none fails.
         check = next((c for c in claim.printed if not c.passes), claim.printed[0])
-        number = f"{check.what}: {pretty(check.value)}"
+        number = f"{check.quantity}: {pretty(check.value)}"
         text = f"[{_COLOUR[verdict]}]{MARKS[verdict]} {verdict.value}[/]"
         table.add_row(claim.where, claim.says, number, text)
     return table
