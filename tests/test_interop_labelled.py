@@ -105,8 +105,8 @@ def test_bodies_and_axes_have_names():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"dims": ("batch",)}, "the length of dims must be 0"),
-        ({"components": ["x"]}, r"q has the shape \(2,\)"),
+        ({"dims": ("batch",)}, "dims must have 0 names"),
+        ({"components": ["x"]}, r"shape \(2,\), got \(1,\)"),
         ({"observe": {"E": ENERGY}}, "observe must be the same as for integrate"),
         ({"observe": {"E": ENERGY, "kept": {"drift": ENERGY}}}, "kept.drift"),
     ],
@@ -120,7 +120,7 @@ def test_labels_that_do_not_fit(options, words):
 @pytest.mark.parametrize("name", ["q", "newton_iterations", "failed_step", "max_residual"])
 def test_names_in_use(name):
     observe = {name: dvi.MaxDrift(ENERGY)}
-    with pytest.raises(ValueError, match=f"{name}' is already in use"):
+    with pytest.raises(ValueError, match=f"'{name}', which is already in use"):
         interop.to_xarray(run(observe=observe), observe=observe)
 
 

@@ -144,7 +144,7 @@ def test_problems_of_the_library():
         interop.to_rebound(systems.kepler())
     with pytest.raises(TypeError, match="give both"):
         interop.to_rebound(problem, q=problem.q0)
-    with pytest.raises(ValueError, match=r"q must be finite, got nan.*earlier state"):
+    with pytest.raises(ValueError, match="q must be finite, got nan"):
         interop.to_rebound(problem, np.nan * problem.q0, problem.p0)
     u = pytest.importorskip("astropy.units")
     with pytest.raises(TypeError, match="p has the unit 'km'"):
@@ -178,7 +178,7 @@ def test_numbers_that_are_not_finite(name):
     where = f"{name} of giant" if of_body else f"{name} of the simulation"
     for value in (np.nan, np.inf):
         setattr(sim.particles[1] if of_body else sim, name, value)
-        with pytest.raises(ValueError, match=f"{where} is {value}"):
+        with pytest.raises(ValueError, match=f"{where} must be finite, got {value}"):
             interop.from_rebound(sim)
 
 

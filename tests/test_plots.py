@@ -277,9 +277,11 @@ def test_unknown_keywords_are_rejected_with_those_that_there_are():
         (plot.invariants, (t, {"a": 1 + t}), "label", options),
         (plot.bifurcation, (t, np.ones((3, 2))), "labels", "units, title, ax"),
         (plot.animate, (arrays(), "a.gif"), "colour", "labels, units, title"),
-        (plot.sweep_map, (xr.DataArray(t),), "facets", "facet, over, pixels"),
     ):
         refuses(draw, (args, {wrong: 1}, f"'{wrong}'. Allowed are {known}", TypeError))
+    case = (xr.DataArray(t),), {"facets": "x"}, "'facets'. Did you mean 'facet'", TypeError
+    refuses(plot.sweep_map, case)
+    refuses(plot.failure_map, ((xr.DataArray(t),), {"limits": (0, 1)}, "'limits'", TypeError))
 
 
 def test_a_phase_portrait_draws_the_states_as_they_are(single):

@@ -29,7 +29,7 @@ def test_a_failure_says_what_was_measured_what_is_required_and_what_to_do():
     with pytest.raises(AssertionError) as raised:
         check_reversible(method)
     claim, measured, what, remedy = str(raised.value).splitlines()
-    assert claim == "Altered does not have all properties that it claims:"
+    assert claim == "AlteredMethod does not have all properties that it claims:"
     assert measured.startswith("reversal: measured 0.0")
     assert "required ≤ 1e-12" in measured
     assert what.startswith("  What is measured: max |z − z0| after ten steps")

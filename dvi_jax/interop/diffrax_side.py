@@ -6,7 +6,8 @@ import jax.numpy as jnp
 
 import dvi_jax as dvi
 
-from .extras import expect, require
+from ..base.checks import instance
+from .extras import require
 from .fields import system_and_strength
 
 if TYPE_CHECKING:
@@ -62,8 +63,8 @@ def diffrax_solver(
 
     **Raises** `ImportError` without diffrax; `TypeError` for another method or root solver.
     """
-    expect("method", method, dvi.Method, "a method such as dvi.Strang()")
-    expect("root_finder", root_finder, dvi.RootSolver, "a root solver such as dvi.Newton()")
+    instance("method", method, dvi.Method, "a method such as dvi.Strang()")
+    instance("root_finder", root_finder, dvi.RootSolver, "a root solver such as dvi.Newton()")
     require("diffrax", "interop.diffrax_solver")
     from .diffrax_classes import DiscreteMap
 

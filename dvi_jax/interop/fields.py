@@ -54,14 +54,10 @@ def as_pair(y: Any) -> tuple[Any, Any]:
     """A state (q, p) as two arrays of one shape."""
     if not (isinstance(y, tuple | list) and len(y) == 2):
         size = f" of length {len(y)}" if isinstance(y, tuple | list) else ""
-        raise TypeError(
-            f"the state y or y0 must be a pair (q0, p0), got type {type(y).__name__}{size}."
-        )
+        raise TypeError(f"y or y0 must be a pair (q0, p0), got type {type(y).__name__}{size}.")
     q, p = (jnp.asarray(x) for x in y)
     if q.shape != p.shape:
-        raise ValueError(
-            f"q0 and p0 in y or y0 must have the same shape, got {q.shape} and {p.shape}."
-        )
+        raise ValueError(f"q0 and p0 in y or y0 must have one shape, got {q.shape} and {p.shape}.")
     return q, p
 
 

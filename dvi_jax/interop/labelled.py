@@ -9,8 +9,9 @@ import numpy as np
 
 import dvi_jax as dvi
 
+from ..base.checks import instance
 from ..base.inputs import refuse_unit_or_mask
-from .extras import expect, require
+from .extras import require
 
 _STATUSES = ("successful", "not_converged", "not_finite", "bad_step_size")
 _STATUSES += ("no_root", "out_of_range", "stopped", "not_reached", "step_control_failed")
@@ -62,20 +63,19 @@ def to_xarray(
     import xarray as xr
 
     hint = "For a sweep call sweep.to_xarray(). For a UnitSolution s give s.solution and units=."
-    expect("solution", solution, dvi.Solution, "a dvi.Solution", hint)
+    instance("solution", solution, dvi.Solution, "a dvi.Solution", hint)
     dims = (dims,) if isinstance(dims, str) else tuple(dims)
     if solution.result.is_traced():
         raise TypeError(
-            "solution must have numerical values, but inside jax.jit, jax.vmap and jax.grad it has "
-            "only JAX tracers. Return solution, and call to_xarray outside of jit, vmap and grad."
+            "solution must have numbers, got JAX tracers: call to_xarray outside of jit and vmap."
         )
     ts, hs = np.asarray(solution.ts), np.asarray(solution.hs)
     *batch, count = ts.shape
     if len(dims) != len(batch):
-        alias = f"one name for each batch dimension of solution, of sizes {tuple(batch)}, with the "
-        alias += "name for the outermost vmap first"
-        alias = alias if batch else "solution is a single trajectory, without batch dimensions"
-        raise ValueError(f"the length of dims must be {len(batch)}: {alias}. Got dims={dims}.")
+        sizes = tuple(batch)
+        raise ValueError(
+            f"dims must have {len(batch)} names, of axes of sizes {sizes}, got {dims}."
+        )
     for name in dims:
         _check_free("dims", name, name in _RESERVED or dims.count(name) > 1)
     rows = ts.reshape(-1, count)
@@ -100,9 +100,8 @@ def to_xarray(
         own_shape = value.shape[len(dims) :]
         if per_step and own_shape[:1] != hs.shape[-1:]:
             raise ValueError(
-                "observe must be the same as for integrate. With this observe, "
-                f"{name!r} has one value per step, so the first axis of its values has length "
-                f"{hs.shape[-1]}, but in solution its values have shape {own_shape}."
+                "observe must be the same as for integrate: "
+                f"{name!r} has values of {hs.shape[-1]} steps, got shape {own_shape}."
             )
         front = [step] * per_step
         add(name, [*front, *_dims_of(name, own_shape[len(front) :])], value)
@@ -152,7 +151,7 @@ def to_inference_data(samples: dvi.Samples, observed: Any = None) -> Any:
     import xarray as xr
 
     hint = "For trajectories use interop.to_xarray."
-    expect("samples", samples, dvi.Samples, "a result of dvi.sample", hint)
+    instance("samples", samples, dvi.Samples, "a result of dvi.sample", hint)
     try:
         arviz = require("arviz", "interop.to_inference_data")
     except ImportError:
@@ -168,7 +167,7 @@ def to_inference_data(samples: dvi.Samples, observed: Any = None) -> Any:
         arcs = list(observed) if isinstance(observed, list | tuple) else [observed]
         arrays, where = {}, {}
         for i, arc in enumerate(arcs):
-            expect("observed", arc, dvi.Observations, "dvi.Observations, or a list of these")
+            instance("observed", arc, dvi.Observations, "dvi.Observations, or a list of these")
             end = "" if len(arcs) == 1 else f"_{i}"
             values, name_of_values = np.asarray(arc.values), f"values{end}"
             arrays[name_of_values] = (
@@ -188,10 +187,7 @@ def to_inference_data(samples: dvi.Samples, observed: Any = None) -> Any:
 
 def _check_free(where: str, name: str, is_taken: bool) -> None:
     if is_taken:
-        raise ValueError(
-            f"in the dataset the name {name!r} is already in use by another variable or dimension: "
-            f"choose another name in {where}."
-        )
+        raise ValueError(f"{where} has the name {name!r}, which is already in use: choose another.")
 
 
 def _components(
@@ -205,8 +201,7 @@ def _components(
     sizes = tuple(len(labels) for labels in components.values())
     if sizes != tuple(shape):
         raise ValueError(
-            "components must have a list of labels for each axis of q, with one label for each "
-            f"index. Got lists of lengths {sizes}, but at each time q has the shape {tuple(shape)}."
+            f"components must have labels of all axes of q, shape {tuple(shape)}, got {sizes}."
         )
     return tuple(components), {name: list(labels) for name, labels in components.items()}
 
@@ -234,8 +229,8 @@ def _observed(observed: Any, observe: Any) -> list[tuple[str, np.ndarray, bool]]
     except ValueError:
         structure = jax.tree.structure(observe, is_leaf=is_observable)
         raise ValueError(
-            f"observe must be the same as for integrate. Its structure is {structure}, but that of "
-            f"solution.observed is {jax.tree.structure(observed)} (each * is one leaf)."
+            f"observe must be the same as for integrate, got the structure {structure} for "
+            f"{jax.tree.structure(observed)}."
         ) from None
     arrays = jax.tree.leaves_with_path(observed, is_leaf=eqx.is_array)
     names = [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in arrays]

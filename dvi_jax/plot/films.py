@@ -33,9 +33,9 @@ _TAIL, _GHOSTS = 300, 12
 _DOT: dict[str, Any] = {"marker": "o", "ls": "none", "ms": 6}
 _DOT |= {"mec": "black", "mew": 0.6}
 
-_VIEW = ("coordinates", "bodies", "centre", "names")
+_VIEW, _CANVAS = ("coordinates", "bodies", "centre", "names"), ("size", "dpi")
 _SECOND = {None: (), "phase_portrait": ("dof",), "invariants": ("values", "change", "log")}
-"""Keywords of `orbit`, and of the second picture."""
+"""Keywords of `orbit`, of the figure, and of the second picture."""
 
 
 @in_style
@@ -46,8 +46,6 @@ def animate(
     seconds: float = 8.0,
     fps: float = 25.0,
     tail: float = 0.2,
-    size: tuple[float, float] | None = None,
-    dpi: float = 100.0,
     progress: Callable[[int, int], Any] | None = None,
     **options: Any,
 ) -> Path:
@@ -62,7 +60,8 @@ def animate(
       and `log`: a second picture, as these functions draw it, in which the current time is marked.
     - `seconds`: how long the film is; `fps`: frames a second, of a GIF at most 50. A run with fewer
       saved states than frames has as many frames as states, which last longer.
-    - `tail`: its length, as a fraction of the run. `size`: inches; `dpi`: pixels an inch.
+    - `tail`: its length, as a fraction of the run. `size`: inches; `dpi`: pixels an inch, by
+      default 100.
     - `progress`: called with the numbers of frames done and of all, after each.
 
     A cross stays where an orbit ended too early, and the legend says how many did and why. An
@@ -75,7 +74,7 @@ def animate(
     path = Path(path)
     suffix = path.suffix.lower()
     _check_film(path, suffix, seconds, fps, tail, beside)
-    extra_names = {name for names in (_VIEW, *_SECOND.values()) for name in names}
+    extra_names = {name for names in (_VIEW, _CANVAS, *_SECOND.values()) for name in names}
     extra = {name: options.pop(name) for name in extra_names & options.keys()}
     look = look_of(options, "colour", "colour_label", "ax")
     lanes = lanes_of(orbits, look.labels, momenta=False)
@@ -89,7 +88,8 @@ def animate(
     else:
         view = view_of(lanes, **view_options)
     times = _moments(lanes, seconds * fps)
-    width, height = size or ((9.6, 4.6) if beside else (5.0, 4.8))
+    width, height = extra.get("size") or ((9.6, 4.6) if beside else (5.0, 4.8))
+    dpi = extra.get("dpi", 100.0)
     pixels = round(width * dpi) * round(height * dpi)
     if suffix == ".gif":
         remedy = "by less seconds, fps, size or dpi, or write an .mp4"

@@ -1,7 +1,7 @@
 """Axes and panels of a map: assignment of dimensions, positions of their points, tick labels."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -10,14 +10,32 @@ from matplotlib.ticker import LogFormatterMathtext, LogLocator
 from ..base.checks import instance
 from .axes import at_most, canvas, cell_edges, check_not_empty, check_real, stack
 from .blocks import Bins, make_bins
-from .style import check_keywords, with_unit
+from .style import with_unit
 
-_WHERE: dict[str, Any] = {"facet": None, "over": (), "pixels": (480, 320)}
-"""Keywords of all maps; the largest number of pixels in x and y."""
+_PIXELS = 480, 320
+"""Largest numbers of pixels in x and y."""
 
 _GREEK = {"epsilon": "ε", "h": "step size h", "start": "number of the start", "t0": "t$_0$"}
 _MOST_NAMES, _MOST_PANELS = 12, 16
 """Names that are written along an axis; panels of a figure."""
+
+
+class GridSettings(TypedDict, total=False):
+    """Keywords of all maps.
+
+    - `facet`: dimension of which each value has a panel. `over`: dimensions that are reduced.
+    - `pixels`: (width, height), the largest numbers of pixels; by default (480, 320).
+    """
+
+    facet: str | None
+    over: str | Sequence[str] | None
+    pixels: tuple[float, float] | None
+
+
+class NumberSettings(GridSettings, total=False):
+    """The same, and `limits`: (low, high) of the scale of the numbers."""
+
+    limits: tuple[float, float] | None
 
 
 class Place(NamedTuple):
@@ -187,7 +205,7 @@ class Grid(NamedTuple):
 
 
 def arrange(
-    data: Any, x: str | None, y: str | None, where: Mapping[str, Any], replacements: Any = None
+    data: Any, x: str | None, y: str | None, settings: Mapping[str, Any], replacements: Any = None
 ) -> Grid:
     """Assign dimensions to x, y and facets; those that are not named become x and y in turn.
 
@@ -195,9 +213,9 @@ def arrange(
     dimension that does not appear. **Raises** `ValueError` for a dimension that does not exist, is
     named twice, or is in excess.
     """
-    check_keywords(where, *_WHERE)
-    facet, reduced_names, pixels = (where.get(k, v) for k, v in _WHERE.items())
-    width, height = two_numbers(pixels)
+    facet, reduced_names, pixels = map(settings.get, ("facet", "over", "pixels"))
+    reduced_names = reduced_names or ()
+    width, height = two_numbers(_PIXELS if pixels is None else pixels)
     if not (width >= 1 and height >= 1):
         raise ValueError(f"pixels must be (width, height), both at least 1, got {pixels!r}.")
     for dimension, size in data.sizes.items():

@@ -6,16 +6,27 @@ Each takes `xarray` data as `to_xarray` gives them, and returns the `Axes`, one 
 
 from collections.abc import Iterable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Unpack
 
 import numpy as np
 from matplotlib.colors import BoundaryNorm, CenteredNorm, ListedColormap, LogNorm
 from matplotlib.patches import Patch
 
 from ..base.checks import one_of
+from ..base.keywords import checked_keywords
 from .axes import at_edge, cells, entry, flat_cells, legend, scale_of
 from .blocks import REDUCTIONS, Lines, Picture, count_codes, reduce_to_pixels
-from .grid import Grid, arrange, checked_array, dim_of, label_of, names_of, two_numbers
+from .grid import (
+    Grid,
+    GridSettings,
+    NumberSettings,
+    arrange,
+    checked_array,
+    dim_of,
+    label_of,
+    names_of,
+    two_numbers,
+)
 from .style import COLOURS, GREY, HATCH, NO_NUMBER, SHADES, ZERO, in_style
 
 _NOT_COMPUTED = "#ffffff"
@@ -46,6 +57,7 @@ _STATUS_COLOURS = {
 """One colour for each status in all pictures, so that they can be compared."""
 
 
+@checked_keywords
 @in_style
 def sweep_map(
     data: Any,
@@ -54,9 +66,8 @@ def sweep_map(
     reduce: str = "max",
     log: bool | None = None,
     status: Any = None,
-    limits: tuple[float, float] | None = None,
     ax: Any = None,
-    **where: Any,
+    **settings: Unpack[NumberSettings],
 ) -> Any:
     """A map of one variable of a sweep, or a line for a sweep of one dimension.
 
@@ -80,16 +91,25 @@ def sweep_map(
     """
     data = checked_array(data)
     one_of("reduce", reduce, REDUCTIONS)
-    grid = arrange(data, x, y, where)
+    grid = arrange(data, x, y, settings)
     label = label_of(data, data.name or "value")
     fewer = any(len(place.centres) < place.bins.size for place in grid.places)
     if fewer or any(data.sizes[d] > 1 for d in grid.reduced_dims):
         label = f"{REDUCTIONS[reduce]} {label}"
     pictures = [reduce_to_pixels(panel, grid.bins, reduce) for _, panel in grid.panels]
     counts = None if status is None else _count_beside(status, grid)
-    return _draw(grid, pictures, label, "no number", ax, _scale(pictures, log, limits), counts)
+    return _draw(
+        grid,
+        pictures,
+        label,
+        "no number",
+        ax,
+        _scale(pictures, log, settings.get("limits")),
+        counts,
+    )
 
 
+@checked_keywords
 @in_style
 def slope_map(
     data: Any,
@@ -99,9 +119,8 @@ def slope_map(
     local: bool = False,
     floor: float = 0.0,
     reduce: str = "mean",
-    limits: tuple[float, float] | None = None,
     ax: Any = None,
-    **where: Any,
+    **settings: Unpack[NumberSettings],
 ) -> Any:
     """A map of orders: slopes d log(data) / d log(along), such as that of a drift over ε.
 
@@ -109,8 +128,9 @@ def slope_map(
     - `local`: False: the least-squares slope along the dimension, over the others. True, or if
       `along` is `x` or `y`: slopes between neighbours, at the geometric means of their values.
     - `floor`: numbers that are not above it, such as round-off, are left out.
-    - `reduce`: of the slopes that meet in one pixel. Other arguments, with `facet`, `over` and
-      `pixels`, as for `sweep_map`; each block that is read holds whole lines along the dimension.
+    - `reduce`: of the slopes that meet in one pixel. Other arguments, with `facet`, `over`,
+      `pixels` and `limits`, as for `sweep_map`; each block that is read holds whole lines along
+      the dimension.
 
     Pixels without a slope (fewer than two positive numbers) are hatched grey.
 
@@ -136,15 +156,18 @@ def slope_map(
         replacements = {
             along: xr.DataArray(middle, dims=[dim], coords={along: (dim, middle, attributes)})
         }
-    grid = arrange(data, x, y, where, replacements)
+    grid = arrange(data, x, y, settings, replacements)
     lines = Lines(dim, partial(_slopes, np.log(values), order, floor, local))
     pictures = [reduce_to_pixels(panel, grid.bins, reduce, lines) for _, panel in grid.panels]
     name = str(data.name or "data").replace("_", " ")
     over_what = label_of(data.coords[along], along).partition(" [")[0]
     label = f"{'local slope' if local else 'slope'} of log {name} over log {over_what}"
-    return _draw(grid, pictures, label, "no slope", ax, _scale(pictures, False, limits))
+    return _draw(
+        grid, pictures, label, "no slope", ax, _scale(pictures, False, settings.get("limits"))
+    )
 
 
+@checked_keywords
 @in_style
 def failure_map(
     data: Any,
@@ -152,7 +175,7 @@ def failure_map(
     y: str | None = None,
     reduce: str = "any",
     ax: Any = None,
-    **where: Any,
+    **settings: Unpack[GridSettings],
 ) -> Any:
     """A map of the status of each trajectory of a sweep.
 
@@ -169,7 +192,7 @@ def failure_map(
     """
     status = _status_of("data", data)
     one_of("reduce", reduce, ("any", "fraction"))
-    grid = arrange(status, x, y, where)
+    grid = arrange(status, x, y, settings)
     statuses = _count("data", status, grid, (panel for _, panel in grid.panels))
     codes, names = statuses.codes, statuses.names
     if reduce == "fraction":

@@ -1,6 +1,5 @@
 """Every method under every check, and whether every check can fail."""
 
-import math
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -8,6 +7,7 @@ from typing import Any
 
 import dvi_jax as dvi
 
+from ..base.checks import instance, positive
 from .candidate import Candidate
 from .check import CHECKS, Measured, require_double_precision, selected_names
 from .controls import CONTROLS, Control
@@ -126,26 +126,17 @@ def _methods_by_name(methods: Any) -> dict[str, dvi.Method]:
     """Name → method, checked."""
     if isinstance(methods, dvi.Method):
         raise TypeError(
-            "methods must have names as keys of a dict, got one method without a name. Write "
-            f'certify({{"mine": {methods!r}}}).'
+            f'methods must be a dict such as {{"mine": {methods!r}}}, got a method without a name.'
         )
     if not isinstance(methods, Mapping):
         hint = " For your own method call certify({name: method})."
         return {name: METHODS[name] for name in selected_names("method", methods, METHODS, hint)}
     for name, method in methods.items():
-        if not isinstance(method, dvi.Method):
-            kind = (
-                f"the class {method.__name__}" if isinstance(method, type) else f"{method!r:.200}"
-            )
-            raise TypeError(f"methods[{name!r}] must be a method such as dvi.TypeII(), got {kind}.")
+        instance(f"methods[{name!r}]", method, dvi.Method, "a method such as dvi.TypeII()")
         order = method.order
         if isinstance(order, bool) or not isinstance(order, int | float):
             raise TypeError(f"methods[{name!r}].order must be an int or a float, got {order!r}.")
-        if not (math.isfinite(order) and order > 0):
-            raise ValueError(f"methods[{name!r}].order must be positive and finite, got {order!r}.")
+        positive(f"methods[{name!r}].order", order)
     if not methods:
-        raise ValueError(
-            'methods is empty: give at least one method with its name, such as {"mine": '
-            "dvi.TypeII()}, or None for all methods of the package."
-        )
+        raise ValueError('methods is empty: give {"mine": dvi.TypeII()}, or None for all.')
     return {str(name): method for name, method in methods.items()}

@@ -49,12 +49,11 @@ def reproduce(out: Path | str, force: bool = False, console: Console | None = No
     """
     out = Path(out)
     if out.exists() and not out.is_dir():
-        raise NotADirectoryError(f"out must be a folder, but {out} is a file: choose another name.")
+        raise NotADirectoryError(f"out must be a folder, but {out} is a file.")
     if out.exists() and any(out.iterdir()) and not force:
         raise FileExistsError(
-            f"out must be a new or an empty folder, but {out} is not empty. Choose another folder. "
-            "To overwrite the files of an earlier reproduction use force=True, on the command line "
-            "--force; other files stay."
+            f"out must be a new or an empty folder, but {out} is not empty: choose another folder, "
+            "or use force=True (--force), which overwrites files of the same names."
         )
     out.mkdir(parents=True, exist_ok=True)
     console = Console() if console is None else console
