@@ -98,15 +98,8 @@ def sweep_map(
         label = f"{REDUCTIONS[reduce]} {label}"
     pictures = [reduce_to_pixels(panel, grid.bins, reduce) for _, panel in grid.panels]
     counts = None if status is None else _count_beside(status, grid)
-    return _draw(
-        grid,
-        pictures,
-        label,
-        "no number",
-        ax,
-        _scale(pictures, log, settings.get("limits")),
-        counts,
-    )
+    scale = _scale(pictures, log, settings.get("limits"))
+    return _draw(grid, pictures, label, "no number", ax, scale, counts)
 
 
 @checked_keywords
@@ -162,9 +155,8 @@ def slope_map(
     name = str(data.name or "data").replace("_", " ")
     over_what = label_of(data.coords[along], along).partition(" [")[0]
     label = f"{'local slope' if local else 'slope'} of log {name} over log {over_what}"
-    return _draw(
-        grid, pictures, label, "no slope", ax, _scale(pictures, False, settings.get("limits"))
-    )
+    scale = _scale(pictures, False, settings.get("limits"))
+    return _draw(grid, pictures, label, "no slope", ax, scale)
 
 
 @checked_keywords
