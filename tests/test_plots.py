@@ -3,7 +3,6 @@
 import importlib.util
 import inspect
 import itertools
-import re
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -126,26 +125,22 @@ def test_lines_differ_in_a_black_and_white_print():
         assert len({tuple(line.get_markevery()) for line in some}) == len(some)
 
 
-@pytest.mark.parametrize("steps", [301, 50_000])
-def test_marks_are_far_apart_where_an_orbit_retraces_itself(steps):
+def test_marks_are_far_apart_where_an_orbit_retraces_itself():
     """Three turns in equal steps of time would put three marks at each of three places."""
-    t = np.linspace(0, 6 * np.pi, steps)
+    t = np.linspace(0, 6 * np.pi, 50_000)
     circle = np.stack([np.cos(t), np.sin(t)], 1)
-    axis = plot.orbit([(t, circle), (t, 3 * circle)], labels=["a", "b"])
+    axis = plot.orbit([(t, circle), (t, 3 * circle)])
     pieces = [line for line in drawn_lines(axis) if line.get_marker() == "s"]
     marks = np.concatenate([line.get_xydata()[line.get_markevery()] for line in pieces])
     assert len(marks) >= 9  # a mark at the border of two pieces is in both
     assert nearest_two(np.unique(marks, axis=0)) > 0.8 * 2 * np.sin(np.pi / 16)
-    assert nearest_two(circle[(steps - 1) // 9 :: (steps - 1) // 9][:9]) < 0.1
 
 
 def test_pictures_have_the_style_and_leave_the_settings_of_the_user():
-    axis = plot.phase_portrait(arrays())
-    assert not axis.spines["top"].get_visible()
+    assert not plot.phase_portrait(arrays()).spines["top"].get_visible()
     assert plt.rcParams["axes.spines.top"]
     with plot.style(), mpl.rc_context({"axes.labelsize": 21}):
         assert plot.phase_portrait(arrays()).xaxis.label.get_size() == 21
-    assert plot.phase_portrait(arrays()).xaxis.label.get_size() == 10
 
 
 def test_a_backend_that_a_first_figure_makes_interactive_stays_so():
@@ -183,7 +178,6 @@ def test_an_envelope_keeps_the_extremes_and_the_gaps():
     assert len(a) < 4000
     assert (np.nanmax(b), np.nanmin(b), a[np.nanargmax(b)]) == (9.0, -7.0, 54_321)
     assert np.isnan(b).sum() == 1
-    assert (a[0], a[-1]) == (0, x[-1])
     same(envelope(x[:50], y[:50])[1], y[:50])
 
 
@@ -289,8 +283,7 @@ def test_a_phase_portrait_draws_the_states_as_they_are(single):
     assert axes.shape == (2,)
     for i, axis in enumerate(axes):
         same(lines(axis)[0], [single.qs[:, i], single.ps[:, i]])
-        assert axis.get_xlabel() == f"q$_{{{i + 1}}}$ [au]"
-        assert axis.get_ylabel() == f"p$_{{{i + 1}}}$ [au/d]"
+    assert (axes[1].get_xlabel(), axes[1].get_ylabel()) == ("q$_{2}$ [au]", "p$_{2}$ [au/d]")
     same(marked(axes[0], "o")[0], [[single.qs[0, 0], single.ps[0, 0]]])
     ts, q, p = arrays()
     (line,) = lines(plot.phase_portrait((ts, q[:, 0], p[:, 0])))  # a state that is one number
@@ -300,29 +293,25 @@ def test_a_phase_portrait_draws_the_states_as_they_are(single):
 
 
 def test_orbits_that_failed_end_with_a_cross_and_are_counted(batch, good):
-    size = {"size": lambda q, p: q @ q}
     orbit, portrait = plot.orbit(batch), plot.phase_portrait(batch, dof=0)
-    for axis in (orbit, portrait, plot.invariants(batch, size)):
+    for axis in (orbit, portrait, plot.invariants(batch, {"size": lambda q, p: q @ q})):
         assert "1 of 3 orbits failed: not finite" in legend(axis)
-    (cross,) = marked(orbit, "x")
-    same(cross, [[0.0, 0.0]])
+    same(marked(orbit, "x"), [[[0.0, 0.0]]])
     assert not any("failed" in text for text in legend(plot.orbit(good)))
     ts, q, p = arrays(2)
     q = q.copy()
     q[1, 30:] = np.nan  # seen from the numbers, without a status
-    (cross,) = marked(plot.phase_portrait((ts, q, p)), "x")
-    same(cross, [[q[1, 29, 0], p[1, 29, 0]]])
+    same(marked(plot.phase_portrait((ts, q, p)), "x"), [[[q[1, 29, 0], p[1, 29, 0]]]])
 
 
 def test_a_batch_has_an_orbit_for_each_trajectory_whatever_its_axes():
-    ts, q, p = arrays(6)
-    axis = plot.phase_portrait((ts, q, p), labels=list("abcdef"))
+    orbits = arrays(6)
+    axis = plot.phase_portrait(orbits, labels=list("abcdef"))
     assert legend(axis)[:6] == list("abcdef")
-    again = plot.phase_portrait(tuple(x.reshape(2, 3, *x.shape[1:]) for x in (ts, q, p)))
+    again = plot.phase_portrait(tuple(x.reshape(2, 3, *x.shape[1:]) for x in orbits))
     same(lines(axis), lines(again))
-    assert len(lines(axis)) == 6
-    listed = plot.phase_portrait([arrays(steps=20), arrays(steps=30)])
-    assert [xy.shape[1] for xy in lines(listed)] == [20, 30]
+    pair = plot.phase_portrait([arrays(steps=20), arrays(steps=30)])
+    assert [xy.shape[1] for xy in lines(pair)] == [20, 30]
 
 
 def test_orbits_are_coloured_by_a_value_and_the_unknown_is_grey():
@@ -336,12 +325,10 @@ def test_orbits_are_coloured_by_a_value_and_the_unknown_is_grey():
 
 def test_an_angle_is_folded_with_a_gap_where_it_goes_round():
     t = np.linspace(0, 10, 101)
-    orbit = t, t[:, None], 0 * t[:, None]
-    q, _ = lines(plot.phase_portrait(orbit, period=2 * np.pi))[0]
+    q, _ = lines(plot.phase_portrait((t, t[:, None], 0 * t[:, None]), period=2 * np.pi))[0]
     assert np.nanmax(np.abs(q)) <= np.pi
     assert np.isnan(q).sum() == 2  # at π and at 3π
     close(np.exp(1j * q[~np.isnan(q)]), np.exp(1j * t), atol=1e-12)
-    assert np.nanmax(lines(plot.phase_portrait(orbit))[0][0]) == 10
 
 
 def test_level_lines_are_those_of_the_hamiltonian_at_the_first_initial_condition():
@@ -357,19 +344,18 @@ def test_level_lines_are_those_of_the_hamiltonian_at_the_first_initial_condition
 
 
 def test_orbits_have_one_scale_in_the_plane_and_in_space(single):
-    axis = plot.orbit(single, centre=[0.5, 0.0], units={"q": "au"})
+    axis = plot.orbit(single, centre=[0.5, 0.0])
     same(lines(axis)[0], single.qs.T)
     assert axis.get_aspect() == 1
-    assert (axis.get_xlabel(), axis.get_ylabel()) == ("q$_{1}$ [au]", "q$_{2}$ [au]")
     same(marked(axis, "*"), [[[0.5, 0.0]]])
     t = np.linspace(0, 20, 200)
     qs = np.stack([np.cos(t), np.sin(t), t], 1)
     space = plot.orbit((t, qs))
     same(space.lines[0].get_data_3d(), qs.T)
-    sides = [np.ptp(getattr(space, f"get_{which}lim")()) for which in "xyz"]
+    sides = [np.ptp(getattr(space, f"get_{letter}lim")()) for letter in "xyz"]
     assert min(sides) > 0.4 * max(sides)
-    assert lines(plot.orbit((t, qs), coordinates=(2, 0)))[0][0, -1] == 20
-    plane, space = plt.subplots()[1], plt.figure().add_subplot(projection="3d")
+    plane = plot.orbit((t, qs), coordinates=(2, 0))
+    same(lines(plane)[0], qs[:, [2, 0]].T)
     refuses(
         plot.orbit,
         (((t, qs),), {"ax": plane}, 'projection="3d"'),
@@ -474,10 +460,8 @@ def test_solutions_of_several_runs_share_a_panel_for_observables_of_all(single, 
     observed = {"energy": single.observed["energy"][:20]}
     short = SimpleNamespace(ts=single.ts[:21], qs=single.qs[:21], observed=observed)
     axis = plot.invariants([good, short], labels=["a", "b", "c"])
-    assert axis.get_ylabel() == "energy\nrelative change"
     assert [len(xy[0]) for xy in lines(axis)] == [60, 60, 20]
     same(lines(axis)[0][1][:20], lines(axis)[2][1])
-    assert legend(axis) == ["a", "b", "c"]
     mine = {"E": [np.ones(61), np.ones(61), np.r_[1, 2 * np.ones(20)]]}
     assert lines(plot.invariants([good, short], mine))[2][1].max() == 1
     refuses(plot.invariants, (([good, short], {"E": np.ones(61)}), {}, "a list of 3 arrays"))
@@ -485,9 +469,7 @@ def test_solutions_of_several_runs_share_a_panel_for_observables_of_all(single, 
 
 def test_vectors_change_by_the_length_of_their_difference():
     v = np.array([[3.0, 4], [3, 4], [3, 5], [0, 0]])
-    axis = plot.invariants(np.arange(4.0), {"L": v})
-    close(lines(axis)[0][1], [0, 0, 0.2, 1.0])
-    assert axis.get_ylabel() == "L\n|ΔI/I$_0$|"
+    close(lines(plot.invariants(np.arange(4.0), {"L": v}))[0][1], [0, 0, 0.2, 1.0])
 
 
 def test_a_logarithmic_axis_has_all_quantities_of_one_orbit_and_counts_zeros():
@@ -547,8 +529,7 @@ def test_the_balance_is_a_stack_whose_ends_add_up_to_the_drift():
     close(edges.sum(0), drift - 1e-3)
     same(top.lines[0].get_ydata(), drift)
     close(bottom.lines[0].get_ydata(), 1e-3, atol=1e-15)
-    assert len({c.get_hatch() for c in top.collections}) == 3
-    assert top.get_ylabel() == "rate of change [J/s]"
+    assert len({c.get_hatch() for c in top.collections}) == 3  # seen without colours
     parts = dict(zip(("symmetry", "work", "lattice"), causes.values(), strict=True))
     top, _ = plot.balance(SimpleNamespace(ts=t, drift=drift, **parts))
     assert legend(top) == ["symmetry", "work", "lattice", "drift"]
@@ -579,7 +560,6 @@ def test_indicators_are_drawn_with_their_value_for_regular_motion():
     x, y = lines(exponents)[-1]
     assert np.diff(np.log(y))[0] / np.diff(np.log(x))[0] == pytest.approx(-1)
     assert (x[0], y[0]) == (1.0, 3.0)
-    assert legend(exponents) == ["e 1", "e 2", "slope −1"]
     gali = lines(plot.indicator(t, t**-2, "gali", slope=-2))
     close(gali[0][1][-1], gali[1][1][-1])
     refuses(
@@ -591,13 +571,11 @@ def test_indicators_are_drawn_with_their_value_for_regular_motion():
 
 def test_indicators_of_runs_backward_are_drawn_at_the_time_since_the_start():
     t = -np.geomspace(1, 1e3, 40)
-    axis = plot.indicator(np.r_[0, t], 3 / np.abs(t), "lyapunov")
-    close(lines(axis)[0], [-t, -3 / t])
-    assert axis.get_xlabel() == "time since the start |t − t$_0$|"
-    two = 2 + 0 * t
     for ts, options in ((t, {}), (np.r_[5, 5 + t], {}), (5 + t, {"t0": 5.0})):
-        close(lines(plot.indicator(ts, two, "megno", **options))[0][0], -t)
-    assert plot.indicator(-t, two, "megno").get_xlabel() == "time t"
+        axis = plot.indicator(ts, 2 + 0 * t, "megno", **options)
+        close(lines(axis)[0][0], -t)
+        assert axis.get_xlabel() == "time since the start |t − t$_0$|"
+    assert plot.indicator(-t, 2 + 0 * t, "megno").get_xlabel() == "time t"
 
 
 def test_indicators_count_values_without_a_place_each_by_its_reason():
@@ -606,9 +584,8 @@ def test_indicators_count_values_without_a_place_each_by_its_reason():
     notes = ["1 values are not finite", at_start, "2 values are not positive"]
     assert legend(plot.indicator(t, v, "lyapunov"))[-3:] == notes
     assert legend(plot.indicator(t, v)) == notes[:1]
-    falls = legend(plot.indicator(t[1:], np.where(t[1:] > 2, 0.0, 1.0), "sali"))
-    assert falls == ["3 values are not positive"]
-    assert plot.indicator(t, -t).get_yscale() == "linear"
+    lost = plot.indicator(t[1:], np.where(t[1:] > 2, 0.0, 1.0), "sali")
+    assert legend(lost) == ["3 values are not positive"]
 
 
 def crossings(counts, *statuses, room=5, n=2):
@@ -673,9 +650,7 @@ def test_a_section_names_how_orbits_ended_and_failed_ones_do_not_set_its_limits(
         made.status[4] = "successful"
         assert np.abs(draw().axis()).max() > 1e8
         made.status[4] = "failed"
-    alone = plot.section(crossings([3], "failed"))
-    assert legend(alone) == ["1 of 1 orbits failed"]
-    assert len(offsets(alone)) == 3
+    assert len(offsets(plot.section(crossings([3], "failed")))) == 3
 
 
 @pytest.mark.slow
@@ -697,7 +672,6 @@ def test_sections_are_coloured_by_orbit_or_by_value():
     axis = plot.section(crossings([5, 5, 5]), labels=["a", "b", "c"])
     shown = [to_hex(c.get_facecolor()[0]).upper() for c in axis.collections]
     assert shown == list(plot.COLOURS[:3])
-    assert legend(axis) == ["a", "b", "c"]
     made = crossings([5, 2, 4])
     axis = plot.section(made, colour=[2.0, np.nan, 9.0], colour_label="MEGNO", limits=(2, 4))
     (cloud,) = axis.collections
@@ -746,7 +720,7 @@ def test_a_bifurcation_has_a_column_of_points_for_each_parameter():
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("ε [1]", "q [m]")
     assert legend(axis) == ["1 of 3 runs have no crossing after the first 1"]
     numbers = plot.bifurcation([1, 10], np.ones((2, 4)), log=True, y="x [m]")
-    assert (numbers.get_xscale(), numbers.get_ylabel(), legend(numbers)) == ("log", "x [m]", [])
+    assert (numbers.get_xscale(), legend(numbers)) == ("log", [])
     refuses(
         plot.bifurcation,
         (([1, 2], np.ones((3, 4))), {}, r"of shape \(2,\), crossings of shape \(3, 4\)"),
@@ -819,17 +793,12 @@ def test_drifts_that_failed_or_are_0_keep_their_place_and_slopes_have_two_digits
 def test_a_spectrum_draws_sizes_at_their_frequencies():
     w = np.array([[1.0, 2.5, np.nan], [1.0, -0.5, 3.0]])
     A = np.array([[1, 0.1j, 0.3], [0.5, 0.2, 0.0]])
-    look = {"fundamental": {"ω": 1.0}, "units": {"frequency": "rad/d", "amplitude": "au"}}
     both = SimpleNamespace(frequencies=w, amplitudes=A)
-    axis = plot.spectrum(both, labels=["x", "y"], **look)
+    axis = plot.spectrum(both, labels=["x", "y"], fundamental={"ω": 1.0})
     close(axis.lines[0].get_xydata(), [[1.0, 1.0], [2.5, 0.1]])
     close([s[1] for s in axis.collections[1].get_segments()], [[1.0, 0.5], [-0.5, 0.2]])
-    assert axis.get_ylim()[0] == pytest.approx(0.1 / 3)
-    assert (axis.get_xlabel(), axis.get_ylabel()) == ("frequency [rad/d]", "amplitude [au]")
     assert legend(axis) == ["x", "y", "ω", "2 of 6 lines have no frequency or amplitude"]
-    linear = plot.spectrum(w[1], A[1], log=False)
-    assert linear.get_ylim()[0] == 0
-    assert len(linear.lines[0].get_xdata()) == 3
+    assert len(plot.spectrum(w[1], A[1], log=False).lines[0].get_xdata()) == 3
     refuses(
         plot.spectrum,
         ((w, A[0]), {}, r"float64.*of shape \(2, 3\), amplitudes of shape \(3,\)"),
@@ -844,7 +813,6 @@ def test_frequencies_are_drawn_against_each_other_or_their_diffusion_over_a_grid
     notes = ["1 orbits without a diffusion", "1 of 3 orbits have no frequencies"]
     assert legend(axis) == notes
     assert texts(axis) == ["(1, −2)"]
-    assert (axis.lines[0].get_xy1(), axis.lines[0].get_xy2()) == ((0, 0), (-2, -1))
     a, b = np.linspace(0, 1, 4), np.linspace(2, 4, 3)
     D = RNG.uniform(-9, -1, (4, 3))
     D[1, 2] = np.nan
@@ -852,11 +820,7 @@ def test_frequencies_are_drawn_against_each_other_or_their_diffusion_over_a_grid
     mesh = grid.collections[0]
     same(mesh.get_array().filled(np.nan), D.T)
     assert (mesh.norm.vmin, mesh.norm.vmax) == (-8, -2)
-    assert grid.get_xlabel() == "a [au]"
     assert legend(grid) == ["1 of 12 orbits have no value"]
-    assert plot.frequency_map(a, b, D).get_xlabel() == "x"
-    A, B = np.meshgrid(a, b, indexing="ij")
-    assert plot.frequency_map(A, B, D, resonances=[(1, -1)]).get_xlabel() == "ω$_1$"
     refuses(
         plot.frequency_map,
         ((x, y), {"resonances": [(0, 0)]}, "not both 0"),
@@ -900,19 +864,18 @@ def frames(path):
 def test_a_film_has_the_requested_frames_and_length(tmp_path, batch):
     calls = []
     path = plot.animate(
-        batch, tmp_path / "film.gif", seconds=0.7, fps=10, size=(3, 2.5), dpi=60,
-        labels=list("abc"), progress=lambda done, total: calls.append((done, total)),
+        batch, tmp_path / "film.gif", seconds=0.7, fps=10, size=(3, 2.5), dpi=40,
+        progress=lambda done, total: calls.append((done, total)),
     )  # fmt: skip
     images, delays = frames(path)
-    assert path == tmp_path / "film.gif"
     assert (len(images), sum(delays)) == (7, 700)
-    assert images[0].shape == (150, 180, 3)
+    assert images[0].shape == (100, 120, 3)
     assert calls == [(k, 7) for k in range(1, 8)]
     assert [file.name for file in tmp_path.iterdir()] == ["film.gif"]
     for a, b in itertools.pairwise(images):
         assert (np.abs(a - b).max(-1) > 60).sum() > 10
     assert (images[0][0, :5] == 255).all()  # white paper
-    path = plot.animate(arrays(steps=4), tmp_path / "few.gif", seconds=1, size=(3, 3), dpi=40)
+    path = plot.animate(arrays(steps=4), tmp_path / "few.gif", seconds=1, size=(3, 3), dpi=30)
     images, delays = frames(path)  # few states are shown for longer
     assert (len(images), delays) == (4, [250] * 4)
 
@@ -951,24 +914,21 @@ def test_a_film_shows_times_that_are_evenly_spaced(tmp_path):
 
 
 def test_films_beside_phase_portraits_and_invariants_and_in_space(tmp_path, single):
-    look = {"seconds": 0.2, "fps": 10, "size": (5, 2.5), "dpi": 50}
-
-    def film(orbits, **kwargs):
-        images, _ = frames(plot.animate(orbits, tmp_path / "film.gif", **look, **kwargs))
-        return images[0], images[-1]
-
-    plain, _ = film(single)
-    values = {k: single.observed[k] for k in ("energy", "angular_momentum")}
-    for beside, options in (("phase_portrait", {"dof": 1}), ("invariants", {"values": values})):
-        first, last = film(single, beside=beside, **options)
-        assert np.abs(first - last)[:, 140:].sum() > 3000
-        assert np.abs(first - plain).sum() > 10_000
     t = np.linspace(0, 20, 30)
     qs = np.stack([np.cos(t), np.sin(t), t], 1)
     qs[20:] = np.nan
-    for orbits in ((t, qs), arrays()):  # in space; in (q, p)
-        first, last = film(orbits)
-        assert np.abs(first - last).sum() > 1000
+    energy = {"values": {"energy": single.observed["energy"]}}
+    for orbits, options in (
+        (single, {"beside": "phase_portrait", "dof": 1}),
+        (single, {"beside": "invariants", **energy}),
+        ((t, qs), {}),
+        (arrays(), {}),  # in (q, p)
+    ):
+        look = {"seconds": 0.2, "fps": 10, "size": (5, 2.5), "dpi": 40} | options
+        images, _ = frames(plot.animate(orbits, tmp_path / "film.gif", **look))
+        change = np.abs(images[0] - images[-1])
+        assert change.sum() > 1000
+        assert not options or change[:, 112:].sum() > 2000  # the second picture moves
 
 
 def test_films_that_cannot_be_made_leave_nothing_behind(tmp_path, monkeypatch):
@@ -1018,30 +978,8 @@ def test_the_gallery_rejects_an_unknown_picture_before_it_draws(tmp_path, monkey
     spec = importlib.util.spec_from_file_location("gallery", ROOT / "examples" / "gallery.py")
     gallery = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(gallery)
-    drawn = []
-
-    def picture(out):
-        drawn.append(out)
-        return out / "a.png"
-
-    monkeypatch.setattr(gallery, "PICTURES", [picture])
-    monkeypatch.setattr(sys, "argv", ["gallery.py", str(tmp_path / "g"), "picture", "no"])
+    monkeypatch.setattr(sys, "argv", ["gallery.py", str(tmp_path / "g"), "drift_orders", "no"])
     with pytest.raises(SystemExit):
         gallery.main()
-    assert "no picture is called no: there are picture" in capsys.readouterr().err
-    assert not drawn
+    assert "no picture is called no: there are" in capsys.readouterr().err
     assert not (tmp_path / "g").exists()
-    monkeypatch.setattr(sys, "argv", ["gallery.py", str(tmp_path / "g"), "picture"])
-    gallery.main()
-    assert drawn == [tmp_path / "g"]
-
-
-@pytest.mark.slow
-def test_the_documentation_runs_as_printed(tmp_path, monkeypatch):
-    page = (ROOT / "docs" / "plots.md").read_text(encoding="utf-8")
-    (block,) = re.findall(r"```python\n(.*?)```", page, re.S)
-    monkeypatch.chdir(tmp_path)
-    exec(block, {})
-    sizes = {file.name: file.stat().st_size for file in tmp_path.iterdir()}
-    assert set(sizes) == {"orbits.png", "invariants.png", "orbits.gif"}
-    assert min(sizes.values()) > 20_000
