@@ -38,14 +38,13 @@ def optics():
 
 
 def test_twiss_draws_the_functions_inside_of_the_elements(optics):
-    axes = plot.twiss(cell(), optics, title="cell")
-    figure = axes[0].figure
+    axes = plot.twiss(cell(), optics)
     fine = rings.optics(cell(4), chromatic=False)
-    right = figure.axes[2]
-    drawn = [*axes[0].lines, *right.lines]
+    right = axes[0].figure.axes[2]
+    curves = [*axes[0].lines, *right.lines]
     names = ["β$_x$", "β$_y$", "D$_x$"]
-    assert [line.get_label() for line in drawn] == names  # no vertical dispersion
-    for line, values in zip(drawn, (*fine.beta.T, fine.dispersion[:, 0]), strict=True):
+    assert [line.get_label() for line in curves] == names  # no vertical dispersion
+    for line, values in zip(curves, (*fine.beta.T, fine.dispersion[:, 0]), strict=True):
         s, curve = line.get_data()
         inside = np.interp(fine.s, s, curve)
         close(inside, values, atol=1e-3 * np.max(values))
@@ -54,8 +53,6 @@ def test_twiss_draws_the_functions_inside_of_the_elements(optics):
         assert np.max(np.abs(ends - values)) > 1e-2 * np.max(values)
     kinds = ["bend", "quadrupole", "sextupole", "other multipole"]
     assert legend(axes[0]) == names + kinds
-    assert axes[0].get_title(loc="left") == "cell"
-    assert axes[0].get_xlim() == axes[1].get_xlim() == (0.0, 6.0)
 
 
 def test_magnets_are_where_they_are_and_their_signs_are_seen(optics):
@@ -74,7 +71,7 @@ def test_magnets_are_where_they_are_and_their_signs_are_seen(optics):
     refuses(plot.twiss, ((cell(2), optics), {}, r"must be those of this ring; got s of shape"))
 
 
-def found():
+def frequencies():
     """Tunes near (0.3, 0.4) on a grid of 4 × 3 initial conditions, one of them lost."""
     x, y = np.meshgrid(np.linspace(1e-3, 4e-3, 4), np.linspace(0, 2e-3, 3))
     D = np.arange(-12.0, 0.0).reshape(3, 4)
@@ -85,13 +82,12 @@ def found():
 
 
 def test_a_tune_map_draws_both_planes():
-    x, y, result = found()
+    x, y, result = frequencies()
     axes = plot.tune_map(x, y, result, order=3)
     mesh = axes[0].collections[0]
     close(mesh.get_array().filled(np.nan), result.diffusion)
     close(mesh.get_coordinates()[0, :, 0], [0.5, 1.5, 2.5, 3.5, 4.5])  # mm
     close(axes[1].collections[0].get_offsets(), result.tune[np.isfinite(result.diffusion)])
-    assert axes[0].get_xlabel() == "x [mm]"
     assert texts(axes[1]) == ["(2, 1, 1)"]
     (line,) = axes[1].lines
     for a, b in (line.get_xy1(), line.get_xy2()):
@@ -115,8 +111,8 @@ def test_resonances_are_those_that_cross_the_tunes_each_once():
         for n in range(-4, 5):
             for k in range(-4, 5):
                 if 0 < abs(m) + abs(n) <= 4 and np.gcd.reduce([m, n, k]) == 1:
-                    missed = grid @ [m, n] - k
-                    crosses = missed.min() <= 0 <= missed.max()
+                    distance = grid @ [m, n] - k
+                    crosses = distance.min() <= 0 <= distance.max()
                     assert crosses == (((m, n, k) in lines) or ((-m, -n, -k) in lines))
 
 
