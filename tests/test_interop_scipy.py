@@ -94,8 +94,7 @@ def test_events_are_where_those_of_scipy_are(t_span, direction):
             np.testing.assert_allclose(a, b.reshape(a.shape), rtol=0, atol=2e-8)
 
 
-@pytest.mark.parametrize("terminal", [True, 2])
-@pytest.mark.parametrize("t_span", [(0.0, 9.0), (2.0, -7.0)])
+@pytest.mark.parametrize(("terminal", "t_span"), [(True, (0.0, 9.0)), (2, (2.0, -7.0))])
 def test_a_terminal_event_truncates_the_output(terminal, t_span):
     events = [marked(high, terminal), marked(low)]
     wanted, found = theirs(t_span, events=events), ours(t_span, events=events)

@@ -133,6 +133,7 @@ def test_implicit_kernels_agree_with_the_package(baseline, name, kernel):
     assert defect(one, qs[-1, :, 3], ps[-1, :, 3]) < TOLERANCE
 
 
+@pytest.mark.slow
 def test_a_larger_step_takes_more_iterations(baseline):
     _, start, given = settings("product")
     few, _ = baseline.iterations_needed("product", *start, **given)
@@ -155,6 +156,7 @@ def test_a_missing_compiler_is_reported(monkeypatch, tmp_path):
             made.Baseline()
 
 
+@pytest.mark.slow
 def test_the_library_leaves_subnormal_numbers_alone(baseline):
     _, start, given = settings("product")
     baseline.implicit("product", *start, iterations=2, **given)()

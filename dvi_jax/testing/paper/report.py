@@ -198,8 +198,8 @@ def _check_texts(claim: Claim) -> list[tuple[str, str]]:
         mark = f" ({'✓' if check.passes else '✗'} required: {check.band})" if check.decides else ""
         return f"{check.quantity}: {pretty(check.value)}{mark}"
 
-    parts = ("printed", "corrected", "also")
-    return [(part, text(check)) for part in parts for check in getattr(claim, part)]
+    parts = {"printed": claim.printed, "corrected": claim.corrected, "also": claim.context}
+    return [(part, text(check)) for part, checks in parts.items() for check in checks]
 
 
 def _setting_line(setting: dict[str, Any]) -> str:
