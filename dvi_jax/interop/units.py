@@ -186,8 +186,8 @@ def integrate(
         with suppress(*[] if units is None else [ValueError]):
             own_units = UnitSystem.of(problem)
     example = "interop.UnitSystem(length=u.au, time=u.day, mass=u.Msun, args={...})"
-    target = own_units if units is None else units
-    target: UnitSystem = instance("units", target, UnitSystem, example)
+    selection: Any = own_units if units is None else units
+    target: UnitSystem = instance("units", selection, UnitSystem, example)
     save, lattice = options.get("save"), options.get("lattice")
     is_grid = isinstance(lattice, dvi.Given)
     if is_grid or getattr(save, "ts", None) is not None:

@@ -83,7 +83,7 @@ def check_not_empty(name: str, things: Any, hint: str) -> None:
         raise ValueError(f"{name} is empty: {hint}.")
 
 
-def check_real(name: str, values: np.ndarray, kinds: str = "biuf") -> None:
+def check_real(name: str, values: Any, kinds: str = "biuf") -> None:
     """**Raises** `TypeError` for values that are not real numbers."""
     if values.dtype.kind not in kinds:
         raise TypeError(f"{name} must be real numbers, got dtype {values.dtype}.")

@@ -250,6 +250,7 @@ class Plane(NamedTuple):
     def coordinates_of(self, lane: Lane, k: int = 0) -> Any:
         """(q, p) along an orbit, shape (S,) each."""
         check_momenta([lane])
+        assert lane.ps is not None
         return [x[(slice(None), *self.place)] for x in (lane.qs, lane.ps)]
 
     def lines(self, lanes: Sequence[Lane]) -> Iterator[tuple[int, int, int, str]]:
