@@ -681,13 +681,6 @@ def test_sections_are_coloured_by_orbit_or_by_value():
     assert "1 of 3 orbits have no value" in legend(axis)
 
 
-def test_many_crossings_are_one_collection_of_pixels():
-    axis = plot.section(crossings([1000] * 100, room=1000, n=1), x="q", y="p")
-    (cloud,) = axis.collections
-    assert len(cloud.get_offsets()) == 10**5
-    assert cloud.get_rasterized()
-
-
 def test_sections_take_functions_of_the_state():
     made = crossings([3, 4])
 
