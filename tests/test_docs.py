@@ -25,7 +25,9 @@ BLOCK = re.compile(
     re.S | re.M,
 )
 ELSEWHERE = {"sweeps", "fitting", "chaos", "certificate", "examples"}
-"""Pages that test_readme.py, test_certify.py and test_docstrings.py run, with their numbers."""
+ELSEWHERE |= {"interoperability", "migration"}
+"""Pages whose numbers test_readme.py, test_certify.py, test_docstrings.py and test_interop_pages.py
+compare."""
 
 
 def examples(page):
