@@ -44,9 +44,9 @@ def verdicts(measurements):
 
 def test_oscillator(m):
     mesh, cross, small = m.fixed_mesh, m.crossover, m.small_step
-    mixed = mesh.mixed[0]
-    assert np.ptp(mixed) == pytest.approx(9.52e-6, rel=0.01)
-    assert np.ptp(mixed) / np.mean([mixed.min(), mixed.max()]) == pytest.approx(0.1, rel=0.01)
+    E = mesh.mixed_energy[0]
+    assert np.ptp(E) == pytest.approx(9.52e-6, rel=0.01)
+    assert np.ptp(E) / np.mean([E.min(), E.max()]) == pytest.approx(0.1, rel=0.01)
     assert mesh.energy == pytest.approx(1e-4)
     assert mesh.exact.shape == (5, 10_000)
     assert np.all(relative_spread(mesh.exact) < 4e-14)
@@ -114,10 +114,11 @@ def replaced(m, field, **changes):
 
 def test_verdicts_follow_the_measurements(m):
     before, mesh, small = verdicts(m), m.fixed_mesh, m.small_step_sweep
-    steady = np.repeat(mesh.mixed[:1, :1] * (1 + 1e-9 * np.sin(mesh.ts)), len(mesh.mixed), 0)
+    first = mesh.mixed_energy[:1, :1] * (1 + 1e-9 * np.sin(mesh.ts))
+    steady = np.repeat(first, len(mesh.mixed_energy), 0)
     holds, corrected, fails = Verdict
     changes = {
-        "fixed_mesh": {"mixed": steady},
+        "fixed_mesh": {"mixed_energy": steady},
         "mesh_sweep": {"relative_49": m.mesh_sweep.relative_49 + 1e-6},
         "small_step_sweep": {"attracting": small.repelling, "repelling": small.attracting},
         "crossover": {"steps": np.full_like(m.crossover.steps, np.nan)},

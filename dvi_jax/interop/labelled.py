@@ -18,7 +18,7 @@ _STATUSES += ("no_root", "out_of_range", "stopped", "not_reached", "step_control
 _STATUSES += ("inconsistent", "redundant", "lost")
 """Names of `RESULTS`, by the number of each in a dataset, as in that of a sweep."""
 
-_RESERVED = ("t", "q", "p", "h", "status", "time", "save", "step")
+_RESERVED_NAMES = ("t", "q", "p", "h", "status", "time", "save", "step")
 
 
 def to_xarray(
@@ -77,7 +77,7 @@ def to_xarray(
             f"dims must have {len(batch)} names, of axes of sizes {sizes}, got {dims}."
         )
     for name in dims:
-        _check_free("dims", name, name in _RESERVED or dims.count(name) > 1)
+        _check_free("dims", name, name in _RESERVED_NAMES or dims.count(name) > 1)
     rows = ts.reshape(-1, count)
     alike = bool(np.isfinite(rows).all() and (rows == rows[:1]).all())
     axis, index = ("time", rows[0]) if alike else ("save", np.arange(count))
@@ -90,9 +90,9 @@ def to_xarray(
 
     def add(name: str, axes: Sequence[str], value: Any) -> None:
         first = name.partition(".")[0]
-        name_in_use = first if first in _RESERVED else name
+        name_in_use = first if first in _RESERVED_NAMES else name
         _check_free(
-            "observe of dvi.integrate", name_in_use, first in _RESERVED or name in variables
+            "observe of dvi.integrate", name_in_use, first in _RESERVED_NAMES or name in variables
         )
         variables[name] = ((*dims, *axes), np.asarray(value))
 

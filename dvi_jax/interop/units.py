@@ -243,7 +243,7 @@ def _with_defaults(
 
 def _arguments(u: Any, args: Any, units: UnitSystem) -> Any:
     """The same pytree with every quantity as a number."""
-    used, bare = set(), []
+    matches, bare = set(), []
 
     def number(path: Any, leaf: Any) -> Any:
         words = [str(getattr(k, "key", getattr(k, "idx", k))) for k in path]
@@ -251,7 +251,7 @@ def _arguments(u: Any, args: Any, units: UnitSystem) -> Any:
         paths = [".".join(words[:i]) for i in range(len(words), 0, -1)]
         name = paths[0] if paths else "args"
         if path_of_unit := next((x for x in paths if x in units.args), None):
-            used.add(path_of_unit)
+            matches.add(path_of_unit)
             return _number(u, f"args {name}", leaf, units.args[path_of_unit])
         if isinstance(leaf, u.Quantity) and leaf.unit != u.dimensionless_unscaled:
             key, subject = (name, f"{name} in args") if path else ("name", "args")
@@ -265,7 +265,7 @@ def _arguments(u: Any, args: Any, units: UnitSystem) -> Any:
         return _number(u, f"args {name}", leaf, u.dimensionless_unscaled)
 
     numbers = jax.tree.map_with_path(number, args)
-    unmet = [name for name in units.args if name not in used]
+    unmet = [name for name in units.args if name not in matches]
     if unmet and bare:  # a mistyped name would let a bare number through
         names, bare_names = (", ".join(map(repr, group)) for group in (unmet, bare))
         kind = f"args is of type {type(args).__name__}, whose entries have no names: give a dict."

@@ -119,11 +119,11 @@ def _distance_from_span(fields: dvi.Symmetries, samples) -> float:
     """How far the rotation (40) is outside of the span of what was found, relative."""
 
     def at_samples(generator):
-        def one(q, p):
+        def at_sample(q, p):
             point = dvi.LatticePoint(jnp.zeros(()), q, p)
             return jnp.concatenate([jnp.ravel(x) for x in generator(point)])
 
-        return np.asarray(jax.vmap(one)(*samples)).ravel()
+        return np.asarray(jax.vmap(at_sample)(*samples)).ravel()
 
     target = at_samples(ROTATION)
     if not fields.count:
