@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from dvi_jax.testing.paper import reproduce, values
-from dvi_jax.testing.paper.claims import Check, Claim, Verdict, judge, pretty
+from dvi_jax.testing.paper.claims import Claim, NumberCheck, Verdict, judge, pretty
 from dvi_jax.testing.paper.equations import EQUATIONS, resolve
 from dvi_jax.testing.paper.figures import FIGURES
 from dvi_jax.testing.paper.numbers import crossing, relative_spread, slope
@@ -148,7 +148,7 @@ def test_every_number_has_one_name_and_every_claim_a_bound(m, run):
 
 
 def test_nan_passes_no_check():
-    check = Check("a number", float("nan"))
+    check = NumberCheck("a number", float("nan"))
     assert not check.passes
     claim = Claim("k", "w", "s", (check,), (check,), Verdict.FAILS, "why")
     assert claim.verdict is Verdict.FAILS

@@ -51,7 +51,7 @@ def make_bins(size: int, pixels: int, order: np.ndarray | None = None) -> Bins:
     return Bins(size, np.arange(count) * size // count, order)
 
 
-class Lines(NamedTuple):
+class LineFunction(NamedTuple):
     """Function of lines along `dim`, from shape (n, ...) to (m, ...), applied before the reduction.
 
     If `dim` is a dimension of the result it has m points there; else m = 1.
@@ -73,7 +73,7 @@ _COMBINE: dict[str, Any] = {"max": np.fmax, "min": np.fmin, "mean": np.add}
 
 
 def reduce_to_pixels(
-    data: Any, bins: Mapping[str, Bins], reduce: str, lines: Lines | None = None
+    data: Any, bins: Mapping[str, Bins], reduce: str, lines: LineFunction | None = None
 ) -> Picture:
     """The values of a `xarray.DataArray`, reduced to pixels; one block is read at a time.
 
@@ -111,7 +111,10 @@ def count_codes(data: Any, bins: Mapping[str, Bins], codes: Sequence[int]) -> np
 
 
 def blocks(
-    data: Any, bins: Mapping[str, Bins], lines: Lines | None = None, whole_pixels: bool = False
+    data: Any,
+    bins: Mapping[str, Bins],
+    lines: LineFunction | None = None,
+    whole_pixels: bool = False,
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """(number of the pixel of each point, the points), both of shape (rest, *points).
 

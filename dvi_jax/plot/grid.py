@@ -38,7 +38,7 @@ class NumberSettings(GridSettings, total=False):
     limits: tuple[float, float] | None
 
 
-class Place(NamedTuple):
+class GridAxis(NamedTuple):
     """An axis along a dimension, with edges (pixels + 1,) and centres (pixels,) of its pixels.
 
     `zero`: where on a logarithmic axis the value 0 is put, or None. `names`: (positions, texts) of
@@ -75,7 +75,7 @@ class Place(NamedTuple):
             ticks(minor, minor=True, labels=[""] * len(minor))
 
 
-def find_place(data: Any, name: str, pixels: int) -> Place:
+def find_axis(data: Any, name: str, pixels: int) -> GridAxis:
     """The axis along a dimension, or along a one-dimensional coordinate that has the name.
 
     Numbers that are all different are put in their order, on a logarithmic axis if that spaces
@@ -93,7 +93,7 @@ def find_place(data: Any, name: str, pixels: int) -> Place:
         edges = bins.ends - 0.5
         texts = None if values is None else [_short(v) for v in values[::stride]]
         names = None if texts is None else (np.arange(0, size, stride), texts)
-        return Place(dim, label, bins, edges, (edges[1:] + edges[:-1]) / 2, names=names)
+        return GridAxis(dim, label, bins, edges, (edges[1:] + edges[:-1]) / 2, names=names)
     rising = bool((np.diff(values) > 0).all())
     order = None if rising else np.argsort(values, kind="stable")
     bins = make_bins(size, pixels, order)
@@ -106,7 +106,7 @@ def find_place(data: Any, name: str, pixels: int) -> Place:
     if len(bins.starts) < size:
         low, high = x[bins.starts], x[bins.ends[1:] - 1]
         centres = np.sqrt(low) * np.sqrt(high) if log else (low + high) / 2
-    return Place(dim, label, bins, edges[bins.ends], centres, log, zero)
+    return GridAxis(dim, label, bins, edges[bins.ends], centres, log, zero)
 
 
 def dim_of(data: Any, name: str, role: str = "each of x, y, facet, over and along") -> str:
@@ -157,13 +157,13 @@ class Grid(NamedTuple):
     """
 
     panels: list[tuple[str, Any]]
-    x: Place
-    y: Place | None
+    x: GridAxis
+    y: GridAxis | None
     reduced_dims: tuple[str, ...]
     facet: str | None
 
     @property
-    def places(self) -> list[Place]:
+    def places(self) -> list[GridAxis]:
         """The axes in the order of an array that is drawn: y, x."""
         return [self.x] if self.y is None else [self.y, self.x]
 
@@ -251,8 +251,8 @@ def arrange(
         )
     data = data.isel({d: 0 for d in left if data.sizes[d] == 1})
     arrays: dict[Any, Any] = dict.fromkeys((x, y), data) | replacements
-    along_x = find_place(arrays[x], x, int(width))
-    along_y = None if y is None else find_place(arrays[y], y, int(height))
+    along_x = find_axis(arrays[x], x, int(width))
+    along_y = None if y is None else find_axis(arrays[y], y, int(height))
     dims = tuple(dim_of(data, name) for name in reduced_names)
     return Grid(_panels(data, facet), along_x, along_y, dims, facet)
 

@@ -15,7 +15,7 @@ from matplotlib.patches import Patch
 from ..base.checks import one_of
 from ..base.keywords import checked_keywords
 from .axes import at_edge, cells, entry, flat_cells, legend, scale_of
-from .blocks import REDUCTIONS, Lines, Picture, count_codes, reduce_to_pixels
+from .blocks import REDUCTIONS, LineFunction, Picture, count_codes, reduce_to_pixels
 from .grid import (
     Grid,
     GridSettings,
@@ -150,7 +150,7 @@ def slope_map(
             along: xr.DataArray(middle, dims=[dim], coords={along: (dim, middle, attributes)})
         }
     grid = arrange(data, x, y, settings, replacements)
-    lines = Lines(dim, partial(_slopes, np.log(values), order, floor, local))
+    lines = LineFunction(dim, partial(_slopes, np.log(values), order, floor, local))
     pictures = [reduce_to_pixels(panel, grid.bins, reduce, lines) for _, panel in grid.panels]
     name = str(data.name or "data").replace("_", " ")
     over_what = label_of(data.coords[along], along).partition(" [")[0]

@@ -11,7 +11,7 @@ from ..base.checks import instance, positive
 from .candidate import Candidate
 from .check import CHECKS, Measured, require_double_precision, selected_names
 from .controls import CONTROLS, Control
-from .page import Table, markdown, tables
+from .page import Sheet, markdown, tables
 from .problems import COUPLED, STRENGTH, reference
 from .registry import METHODS
 
@@ -61,7 +61,7 @@ class Certificate:
             f"controls: {detections} of {len(self.controls)} caught"
         )
 
-    def tables(self) -> list[Table]:
+    def tables(self) -> list[Sheet]:
         """The tables, as text."""
         return tables(self.methods, self.rows, self.controls)
 

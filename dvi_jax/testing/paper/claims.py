@@ -30,7 +30,7 @@ def pretty(value: float) -> str:
 
 
 @dataclass(frozen=True)
-class Check:
+class NumberCheck:
     """A measured number and its allowed band, bounds included; NaN is never in it."""
 
     quantity: str
@@ -65,11 +65,11 @@ class Claim:
     key: str
     where: str
     says: str
-    printed: tuple[Check, ...]
-    corrected: tuple[Check, ...]
+    printed: tuple[NumberCheck, ...]
+    corrected: tuple[NumberCheck, ...]
     on_record: Verdict
     explanation: str
-    context: tuple[Check, ...] = ()
+    context: tuple[NumberCheck, ...] = ()
 
     @property
     def verdict(self) -> Verdict:
@@ -101,7 +101,7 @@ def judge(measurements: Measurements) -> list[Claim]:
     def claim(row: dict[str, Any]) -> Claim:
         checks = {
             part: tuple(
-                Check(quantity, values[name], *map(float, bounds))
+                NumberCheck(quantity, values[name], *map(float, bounds))
                 for quantity, name, *bounds in row.get(part, ())
             )
             for part in ("printed", "corrected", "context")

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from .claims import Check, Claim, Verdict, pretty
+from .claims import Claim, NumberCheck, Verdict, pretty
 from .equations import EQUATIONS, Equation
 from .experiments import Measurements
 from .figures import FIGURES
@@ -35,10 +35,10 @@ def counts(claims: Sequence[Claim]) -> str:
 def write_json(claims: Sequence[Claim], setting: dict[str, Any], path: Path) -> None:
     """The verdicts with every number, its band and its place; non-finite numbers as null."""
 
-    def value(check: Check) -> float | None:
+    def value(check: NumberCheck) -> float | None:
         return check.value if math.isfinite(check.value) else None
 
-    def rows(checks: Sequence[Check]) -> list[dict[str, Any]]:
+    def rows(checks: Sequence[NumberCheck]) -> list[dict[str, Any]]:
         return [
             {"what": c.quantity, "value": value(c), "band": c.band, "passes": c.passes}
             for c in checks
@@ -194,7 +194,7 @@ def write_tables(m: Measurements, folder: Path) -> None:
 def _check_texts(claim: Claim) -> list[tuple[str, str]]:
     """The part (printed, corrected, also) and the text of each number of a claim."""
 
-    def text(check: Check) -> str:
+    def text(check: NumberCheck) -> str:
         mark = f" ({'✓' if check.passes else '✗'} required: {check.band})" if check.decides else ""
         return f"{check.quantity}: {pretty(check.value)}{mark}"
 
