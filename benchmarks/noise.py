@@ -46,9 +46,9 @@ class Uncorrected(dvi.StochasticEuler):
     """Without the term of second order in the generating function: it converges to Itô's equation,
     and not to Stratonovich's."""
 
-    def _driven(self, equations, interval, q, p):
-        driven = super()._driven(equations, interval, q, p)
-        return dataclasses.replace(driven, system=dataclasses.replace(driven.system, is_map=False))
+    def _with_noise(self, equations, interval, q, p):
+        noisy = super()._with_noise(equations, interval, q, p)
+        return dataclasses.replace(noisy, system=dataclasses.replace(noisy.system, is_map=False))
 
 
 KINDS = {

@@ -43,7 +43,7 @@ IN_EVERY_RUN = {
     ("GaussLegendre2", "forced-order"),
     ("RungeKutta4", "order"),
     *(("Yoshida4", check) for check in ("energy", "momentum")),
-    *(("TypeII", check) for check in CHECKS),
+    *(("TypeII", check) for check in CHECKS if check not in ("gradient", "modes")),
 }
 
 
@@ -102,8 +102,14 @@ def test_order_of_the_force_alone_can_be_wrong():
     assert CHECKS["order"](Candidate(control.method)).passed
 
 
-@pytest.mark.parametrize("epsilon", [0.0, problems.FORCED])
-@pytest.mark.parametrize("problem", [problems.COUPLED, problem("double_pendulum", h=0.05)])
+@pytest.mark.parametrize("epsilon", [0.0, problems.STRENGTH])
+@pytest.mark.parametrize(
+    "problem",
+    [
+        problems.COUPLED,
+        pytest.param(problem("double_pendulum", h=0.05), marks=pytest.mark.slow),
+    ],
+)
 def test_reference_agrees_with_scipy(problem, epsilon):
     system, args = problem.system, problem.args
     gradient = jax.jit(jax.grad(system.H_D, argnums=(2, 3)))
@@ -162,7 +168,7 @@ def test_too_few_points_above_round_off_are_no_measurement():
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_a_passed_value_is_a_number(value):
-    with pytest.raises(ValueError, match="cannot have passed"):
+    with pytest.raises(ValueError, match="passed must be False"):
         Measured(value, "≤ 1", True)
 
 
@@ -172,8 +178,7 @@ def _broken(method, equations, interval, q, p):
 
 def test_an_exception_is_a_failure_that_names_itself():
     measured = CHECKS["reversal"](Candidate(altered(dvi.Strang(), _broken)))
-    assert measured.verdict == "NOT MEASURED"
-    assert measured.detail == "RuntimeError: no luck"
+    assert (measured.verdict, measured.detail) == ("NOT MEASURED", "RuntimeError: no luck")
 
 
 def test_what_is_not_promised_is_measured_and_no_failure():
@@ -227,15 +232,15 @@ def test_a_control_that_passes_is_missed(monkeypatch):
     ("methods", "checks", "error", "said"),
     [
         (["yoshida4"], None, ValueError, r"got 'yoshida4' \(did you mean Yoshida4\?\)"),
-        (None, ["symmetry"], ValueError, r"got 'symmetry'.*The known names are order, forced"),
-        ([], None, ValueError, "methods is empty: name"),
+        (None, ["symmetry"], ValueError, "some of order, forced.*got 'symmetry'"),
+        ([], None, ValueError, "methods is empty: give"),
         ({}, None, ValueError, "methods is empty: give"),
-        (None, [], ValueError, "checks is empty: name"),
+        (None, [], ValueError, "checks is empty: give"),
         ("TypeII", None, TypeError, "must be a list of names"),
-        (dvi.TypeII(), None, TypeError, "methods must have names"),
+        (dvi.TypeII(), None, TypeError, "methods must be a dict"),
         ({"mine": dvi.TypeII}, None, TypeError, r"'mine'\] must be a method such as"),
         ({"m": altered(dvi.TypeII(), order="2")}, None, TypeError, "order must be an int or"),
-        ({"m": altered(dvi.TypeII(), order=0)}, None, ValueError, "order must be positive"),
+        ({"m": altered(dvi.TypeII(), order=0)}, None, ValueError, "order must be a positive"),
     ],
 )
 def test_bad_input(methods, checks, error, said):

@@ -21,15 +21,8 @@ from dvi_jax.systems import rings
 sys.path.append(str(Path(__file__).parents[1] / "docs/_ext"))
 import usage
 
-KNOWN = {
-    "jax": jax,
-    "jnp": jnp,
-    "np": np,
-    "dvi": dvi,
-    "systems": systems,
-    "plot": plot,
-    "rings": rings,
-}
+KNOWN = {"jax": jax, "jnp": jnp, "np": np, "dvi": dvi}
+KNOWN |= {"systems": systems, "plot": plot, "rings": rings}
 PAGE = usage.page()
 
 DOCSTRINGS = {

@@ -201,7 +201,7 @@ def test_mistyped_names_of_parameters():
         weights([1, 2] * u.kg, k=5.0, kinds={"kk": u.N / u.m})
     with pytest.raises(ValueError, match=r"'J22', but oblate_kepler has no such.*mu, R, J2"):
         interop.integrate(systems.oblate_kepler(), h=10 * u.s, num_steps=1, args={"J22": 0.0})
-    with pytest.raises(TypeError, match=r"mapping from name to value, got .* of type list"):
+    with pytest.raises(TypeError, match=r"mapping from name to value, got \[0\.0\]"):
         interop.integrate(systems.oblate_kepler(), h=10 * u.s, num_steps=1, args=[0.0])
 
 
@@ -221,7 +221,7 @@ def test_masked_values_and_units_without_a_factor():
     with pytest.raises(ValueError, match="q0 must not have masked values"):
         run(SOLAR, q0=masked([1, 0] * u.au, mask=[False, True]))
     for unit in (u.deg_C, u.mag, u.ABmag, u.photon / u.s):
-        with pytest.raises(ValueError, match="T cannot be in"):
+        with pytest.raises(ValueError, match="the unit of T must"):
             interop.UnitSystem(u.m, u.s, u.kg, args={"T": unit})
     with pytest.raises(ValueError, match=r"Convert it: k\.to\(u\.K, u\.temperature"):
         weights([1, 2] * u.kg, k=5 * u.deg_C, kinds={"k": u.K})

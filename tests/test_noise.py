@@ -418,6 +418,20 @@ def test_strong_order(bench, kind, name, expected, within):
     assert order == pytest.approx(expected, abs=within + 2 * error)
 
 
+def test_the_wrong_methods_of_the_benchmark_are_other_maps(bench):
+    """An override of a method that no longer exists would change nothing."""
+    z = jnp.array([0.7, -0.4])
+    right, wrong = (
+        one_step(TWISTED, method)(z) for method in (dvi.StochasticEuler(), bench.Uncorrected())
+    )
+    assert 1e-6 < np.abs(right - wrong).max() < 0.1
+    kicks = [
+        noise(0.3, 0.2).kick(0.0, z[:1], z[1:], None, 0.1, jnp.array([0.21]))
+        for noise in (dvi.Langevin, bench.Mistaken)
+    ]
+    assert abs(float(kicks[0][0] - kicks[1][0])) > 1e-4
+
+
 @pytest.mark.slow
 def test_a_scheme_for_the_equation_of_ito_does_not_converge(bench):
     order, _ = bench.strong_order("h(q, p)", "Uncorrected", 3000)

@@ -3,7 +3,6 @@
 import importlib.util
 import inspect
 import itertools
-import re
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -65,8 +64,8 @@ def arrays(lanes=None, n=1, steps=50, shape=None):
     radii = np.arange(1, (lanes or 1) + 1)[:, None, None] * np.ones(n)
     q, p = radii * np.cos(t)[:, None], -radii * np.sin(t)[:, None]
     ts = np.broadcast_to(t, (lanes or 1, steps))
-    found = ts, *(x.reshape(*ts.shape, *(shape or (n,))) for x in (q, p))
-    return found if lanes else tuple(x[0] for x in found)
+    orbits = ts, *(x.reshape(*ts.shape, *(shape or (n,))) for x in (q, p))
+    return orbits if lanes else tuple(x[0] for x in orbits)
 
 
 def drawn_lines(axis):
@@ -89,15 +88,11 @@ def lab(colours, sight):
     """CIELAB coordinates of colours as eyes of a kind see them, shape (count, 3)."""
     c = np.array([to_rgb(x) for x in colours])
     linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
-    seen = np.array(SIGHTS[sight].split(), float).reshape(3, 3)
-    xyz = np.clip(linear @ seen.T, 0, 1) @ SRGB.T / SRGB.sum(1)
+    eye = np.array(SIGHTS[sight].split(), float).reshape(3, 3)
+    xyz = np.clip(linear @ eye.T, 0, 1) @ SRGB.T / SRGB.sum(1)
     f = np.where(xyz > (6 / 29) ** 3, np.cbrt(xyz), xyz / (3 * (6 / 29) ** 2) + 4 / 29)
     x, y, z = f.T
     return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=1)
-
-
-def nearest(colours, sight):
-    return nearest_two(lab(colours, sight))
 
 
 def nearest_two(points):
@@ -108,9 +103,9 @@ def nearest_two(points):
 @pytest.mark.parametrize("sight", SIGHTS)
 def test_colours_differ_and_shades_grow_lighter_for_all_eyes(sight):
     """A distance of 2.3 is just noticeable; matplotlib's own colours are within 8."""
-    assert nearest(plot.COLOURS, sight) > 15
+    assert nearest_two(lab(plot.COLOURS, sight)) > 15
     if sight == "deuteranopia":
-        assert nearest(["#d62728", "#2ca02c", "#8c564b"], sight) < 8
+        assert nearest_two(lab(["#d62728", "#2ca02c", "#8c564b"], sight)) < 8
     lightness = lab(SHADES(np.linspace(0, 1, 64)), sight)[:, 0]
     assert (np.diff(lightness) > 0.5).all()
     assert lightness[-1] < 84
@@ -122,44 +117,30 @@ def test_lines_differ_in_a_black_and_white_print():
     assert (np.diff(lab(plot.COLOURS, "normal")[:5, 0]) > 3).all()
     assert len(set(plot.DASHES)) == len(plot.DASHES) == len(plot.COLOURS)
     assert len(set(MARKERS)) >= len(plot.COLOURS)
-    axis = plot.phase_portrait(arrays(5, steps=4001), labels=list("abcde"))
-    drawn = drawn_lines(axis)
-    assert len({str(line._dash_pattern) for line in drawn}) == 5
-    assert [line.get_color() for line in drawn] == list(plot.COLOURS[:5])
-    marks = [line.get_marker() for line in drawn]
-    assert len(set(marks)) == 5
-    assert not {"None", "o", "x"} & set(marks)
-    assert [h.get_marker() for h in axis.figure.legends[0].legend_handles[:5]] == marks
-    bodies = drawn_lines(plot.orbit(arrays(n=6, shape=(3, 2), steps=4001)[:2]))
-    assert len({line.get_marker() for line in bodies}) == 3
-    for some in (drawn, bodies):
-        marks = [line.get_markevery() for line in some]
-        assert len({tuple(one) for one in marks}) == len(some)
-        assert all(len(set(one)) == 9 and 0 <= min(one) < max(one) <= 4000 for one in marks)
-    for plain in (plot.phase_portrait(arrays()), plot.phase_portrait(arrays(9))):
-        assert {x.get_marker() for x in drawn_lines(plain)} == {"None"}
+    drawing = drawn_lines(plot.phase_portrait(arrays(5), labels=list("abcde")))
+    assert [line.get_color() for line in drawing] == list(plot.COLOURS[:5])
+    bodies = drawn_lines(plot.orbit(arrays(n=6, shape=(3, 2))[:2]))
+    for some in (drawing, bodies):
+        assert len({line.get_marker() for line in some}) == len(some)
+        assert len({tuple(line.get_markevery()) for line in some}) == len(some)
 
 
-@pytest.mark.parametrize("steps", [301, 50_000])
-def test_marks_are_far_apart_where_an_orbit_retraces_itself(steps):
+def test_marks_are_far_apart_where_an_orbit_retraces_itself():
     """Three turns in equal steps of time would put three marks at each of three places."""
-    t = np.linspace(0, 6 * np.pi, steps)
+    t = np.linspace(0, 6 * np.pi, 50_000)
     circle = np.stack([np.cos(t), np.sin(t)], 1)
-    axis = plot.orbit([(t, circle), (t, 3 * circle)], labels=["a", "b"])
+    axis = plot.orbit([(t, circle), (t, 3 * circle)])
     pieces = [line for line in drawn_lines(axis) if line.get_marker() == "s"]
     marks = np.concatenate([line.get_xydata()[line.get_markevery()] for line in pieces])
     assert len(marks) >= 9  # a mark at the border of two pieces is in both
     assert nearest_two(np.unique(marks, axis=0)) > 0.8 * 2 * np.sin(np.pi / 16)
-    assert nearest_two(circle[(steps - 1) // 9 :: (steps - 1) // 9][:9]) < 0.1
 
 
 def test_pictures_have_the_style_and_leave_the_settings_of_the_user():
-    axis = plot.phase_portrait(arrays())
-    assert not axis.spines["top"].get_visible()
+    assert not plot.phase_portrait(arrays()).spines["top"].get_visible()
     assert plt.rcParams["axes.spines.top"]
     with plot.style(), mpl.rc_context({"axes.labelsize": 21}):
         assert plot.phase_portrait(arrays()).xaxis.label.get_size() == 21
-    assert plot.phase_portrait(arrays()).xaxis.label.get_size() == 10
 
 
 def test_a_backend_that_a_first_figure_makes_interactive_stays_so():
@@ -178,13 +159,13 @@ def test_a_backend_that_a_first_figure_makes_interactive_stays_so():
 def test_save_takes_what_the_pictures_return(tmp_path):
     one, several = plot.phase_portrait(arrays()), plot.phase_portrait(arrays(n=2))
     inside = plt.figure().subfigures(1, 2)[0].subplots()
-    for drawn in (one, several, one.figure, inside):
-        assert Image.open(plot.save(drawn, tmp_path / "a.png")).size[0] > 500
+    for drawing in (several, one.figure, inside):
+        assert Image.open(plot.save(drawing, tmp_path / "a.png")).size[0] > 500
     assert not plt.fignum_exists(inside.figure.figure.number)
     refuses(
         plot.save,
         (([one, several[0]], tmp_path / "b.png"), {}, "2 figures"),
-        (("picture", tmp_path / "b.png"), {}, "a figure, or the Axes", TypeError),
+        (("picture", tmp_path / "b.png"), {}, "a figure", TypeError),
     )
     assert not (tmp_path / "b.png").exists()
 
@@ -197,7 +178,6 @@ def test_an_envelope_keeps_the_extremes_and_the_gaps():
     assert len(a) < 4000
     assert (np.nanmax(b), np.nanmin(b), a[np.nanargmax(b)]) == (9.0, -7.0, 54_321)
     assert np.isnan(b).sum() == 1
-    assert (a[0], a[-1]) == (0, x[-1])
     same(envelope(x[:50], y[:50])[1], y[:50])
 
 
@@ -208,8 +188,8 @@ def pictures(single):
         epsilons=t, drifts=t, used=t > 0, slope=1.0, interval=(0.9, 1.1), floor=0.5, resolved=True
     )
     proved = SimpleNamespace(per_step=(0.2,), rounding=(0.0,), level=None, steps=0)
-    about = {"flag_values": [0, 1, 2, 3, 4, 5], "flag_meanings": "successful a b c d e"}
-    data = xr.DataArray(t, dims="x", coords={"x": t}, name="drift", attrs=about)
+    flags = {"flag_values": [0, 1, 2, 3, 4, 5], "flag_meanings": "successful a b c d e"}
+    data = xr.DataArray(t, dims="x", coords={"x": t}, name="drift", attrs=flags)
     history = {"stage": 0 * t, "loss": t, "accepted": t > 0, "horizon": t}
     fit = SimpleNamespace(
         whitened=[t[:, None]], ts=[t], chi2=1.0, degrees_of_freedom=3, has_errors=True,
@@ -264,25 +244,19 @@ def test_every_picture_draws_on_the_axes_it_is_given_and_on_nothing_else(single)
     drawing = pictures(single)
     functions = {name for name, f in vars(plot).items() if inspect.isfunction(f)}
     assert set(drawing) == functions - {"save", "style", "animate"}
-    assert len(drawing) == 27
     for name, (count, draw) in drawing.items():
-        for nothing in (3, "axes", [3]):
-            with pytest.raises(TypeError, match="must be the matplotlib Axes"):
-                draw(nothing)
+        with pytest.raises(TypeError, match="must be the matplotlib Axes"):
+            draw([3])
         assert plt.get_fignums() == [], name
         figure, (*mine, other) = plt.subplots(1, count + 1, figsize=(4 * count + 4, 4))
-        given = mine if count > 1 or name == "fit_corner" else mine[0]
-        assert np.ravel(draw(given)).tolist() == mine, name
+        canvas = mine if count > 1 or name == "fit_corner" else mine[0]
+        assert np.ravel(draw(canvas)).tolist() == mine, name
         assert plt.get_fignums() == [figure.number], name
         assert all(axis.has_data() for axis in mine), name
         assert not other.has_data(), name
-        assert figure.legends == [], name
         if count > 1:
             with pytest.raises(ValueError, match=f"needs {count} Axes"):
                 draw(mine[:-1])
-        if name in ("planet_orbits", "ephemeris_comparison"):
-            figure.canvas.draw()
-            assert mine[0].get_legend().get_window_extent().y0 >= mine[0].get_window_extent().y0
         plt.close(figure)
         if name in ("orbit", "balance", "sweep_map", "fit_residuals", "ephemeris_comparison"):
             assert np.size(draw(None)) == count, name
@@ -294,16 +268,14 @@ def test_unknown_keywords_are_rejected_with_those_that_there_are():
     options = "labels, colour, colour_label, units, title, ax"
     for draw, args, wrong, known in (
         (plot.phase_portrait, (arrays(),), "color", options),
-        (plot.orbit, (arrays(n=2),), "size", options),
         (plot.invariants, (t, {"a": 1 + t}), "label", options),
-        (plot.indicator, (t, t), "unit", options),
-        (plot.section, (crossings([3]),), "name", options),
         (plot.bifurcation, (t, np.ones((3, 2))), "labels", "units, title, ax"),
         (plot.animate, (arrays(), "a.gif"), "colour", "labels, units, title"),
-        (plot.sweep_map, (xr.DataArray(t),), "facets", "facet, over, pixels"),
     ):
-        match = f"unknown keyword '{wrong}'. Allowed are {known}"
-        refuses(draw, (args, {wrong: 1}, match, TypeError))
+        refuses(draw, (args, {wrong: 1}, f"'{wrong}'. Allowed are {known}", TypeError))
+    case = (xr.DataArray(t),), {"facets": "x"}, "'facets'. Did you mean 'facet'", TypeError
+    refuses(plot.sweep_map, case)
+    refuses(plot.failure_map, ((xr.DataArray(t),), {"limits": (0, 1)}, "'limits'", TypeError))
 
 
 def test_a_phase_portrait_draws_the_states_as_they_are(single):
@@ -311,44 +283,35 @@ def test_a_phase_portrait_draws_the_states_as_they_are(single):
     assert axes.shape == (2,)
     for i, axis in enumerate(axes):
         same(lines(axis)[0], [single.qs[:, i], single.ps[:, i]])
-        assert axis.get_xlabel() == f"q$_{{{i + 1}}}$ [au]"
-        assert axis.get_ylabel() == f"p$_{{{i + 1}}}$ [au/d]"
+    assert (axes[1].get_xlabel(), axes[1].get_ylabel()) == ("q$_{2}$ [au]", "p$_{2}$ [au/d]")
     same(marked(axes[0], "o")[0], [[single.qs[0, 0], single.ps[0, 0]]])
     ts, q, p = arrays()
     (line,) = lines(plot.phase_portrait((ts, q[:, 0], p[:, 0])))  # a state that is one number
     same(line, [q[:, 0], p[:, 0]])
-    dots = plot.phase_portrait((ts, q, p), dots=True).lines[0]
-    assert (dots.get_linestyle(), dots.get_marker()) == ("None", "o")
+    assert not drawn_lines(plot.phase_portrait((ts, q, p), dots=True))
     assert plot.phase_portrait(arrays(n=2), dof=[1]).shape == (1,)
 
 
 def test_orbits_that_failed_end_with_a_cross_and_are_counted(batch, good):
-    assert list(np.asarray(batch.status)) == ["successful", "successful", "not_finite"]
-    size = {"size": lambda q, p: q @ q}
     orbit, portrait = plot.orbit(batch), plot.phase_portrait(batch, dof=0)
-    for axis in (orbit, portrait, plot.invariants(batch, size)):
+    for axis in (orbit, portrait, plot.invariants(batch, {"size": lambda q, p: q @ q})):
         assert "1 of 3 orbits failed: not finite" in legend(axis)
-    (cross,) = marked(orbit, "x")
-    same(cross, [[0.0, 0.0]])
+    same(marked(orbit, "x"), [[[0.0, 0.0]]])
     assert not any("failed" in text for text in legend(plot.orbit(good)))
     ts, q, p = arrays(2)
     q = q.copy()
     q[1, 30:] = np.nan  # seen from the numbers, without a status
-    axis = plot.phase_portrait((ts, q, p))
-    assert "1 of 2 orbits failed: not finite" in legend(axis)
-    (cross,) = marked(axis, "x")
-    same(cross, [[q[1, 29, 0], p[1, 29, 0]]])
+    same(marked(plot.phase_portrait((ts, q, p)), "x"), [[[q[1, 29, 0], p[1, 29, 0]]]])
 
 
 def test_a_batch_has_an_orbit_for_each_trajectory_whatever_its_axes():
-    ts, q, p = arrays(6)
-    axis = plot.phase_portrait((ts, q, p), labels=list("abcdef"))
+    orbits = arrays(6)
+    axis = plot.phase_portrait(orbits, labels=list("abcdef"))
     assert legend(axis)[:6] == list("abcdef")
-    again = plot.phase_portrait(tuple(x.reshape(2, 3, *x.shape[1:]) for x in (ts, q, p)))
+    again = plot.phase_portrait(tuple(x.reshape(2, 3, *x.shape[1:]) for x in orbits))
     same(lines(axis), lines(again))
-    assert len(lines(axis)) == 6
-    listed = plot.phase_portrait([arrays(steps=20), arrays(steps=30)])
-    assert [xy.shape[1] for xy in lines(listed)] == [20, 30]
+    pair = plot.phase_portrait([arrays(steps=20), arrays(steps=30)])
+    assert [xy.shape[1] for xy in lines(pair)] == [20, 30]
 
 
 def test_orbits_are_coloured_by_a_value_and_the_unknown_is_grey():
@@ -362,12 +325,10 @@ def test_orbits_are_coloured_by_a_value_and_the_unknown_is_grey():
 
 def test_an_angle_is_folded_with_a_gap_where_it_goes_round():
     t = np.linspace(0, 10, 101)
-    orbit = t, t[:, None], 0 * t[:, None]
-    q, _ = lines(plot.phase_portrait(orbit, period=2 * np.pi))[0]
+    q, _ = lines(plot.phase_portrait((t, t[:, None], 0 * t[:, None]), period=2 * np.pi))[0]
     assert np.nanmax(np.abs(q)) <= np.pi
     assert np.isnan(q).sum() == 2  # at π and at 3π
     close(np.exp(1j * q[~np.isnan(q)]), np.exp(1j * t), atol=1e-12)
-    assert np.nanmax(lines(plot.phase_portrait(orbit))[0][0]) == 10
 
 
 def test_level_lines_are_those_of_the_hamiltonian_at_the_first_initial_condition():
@@ -377,29 +338,24 @@ def test_level_lines_are_those_of_the_hamiltonian_at_the_first_initial_condition
     axis = plot.phase_portrait(arrays(n=2), dof=0, hamiltonian=H, levels=[0.7, 0.9])
     (contours,) = axis.collections
     same(contours.levels, [0.7, 0.9])
-    assert contours.get_zorder() < min(line.get_zorder() for line in axis.lines)
     for level, path in zip([0.7, 0.9], contours.get_paths(), strict=True):
         # The other degree of freedom is at (1, 0), its energy ½.
         close(np.hypot(*path.vertices.T), np.sqrt(2 * (level - 0.5)), rtol=2e-3)
-    assert "levels of H" in legend(axis)
-    assert not list(plot.phase_portrait(arrays(n=2), dof=0).collections)
 
 
 def test_orbits_have_one_scale_in_the_plane_and_in_space(single):
-    axis = plot.orbit(single, centre=[0.5, 0.0], units={"q": "au"})
+    axis = plot.orbit(single, centre=[0.5, 0.0])
     same(lines(axis)[0], single.qs.T)
     assert axis.get_aspect() == 1
-    assert (axis.get_xlabel(), axis.get_ylabel()) == ("q$_{1}$ [au]", "q$_{2}$ [au]")
     same(marked(axis, "*"), [[[0.5, 0.0]]])
     t = np.linspace(0, 20, 200)
     qs = np.stack([np.cos(t), np.sin(t), t], 1)
     space = plot.orbit((t, qs))
     same(space.lines[0].get_data_3d(), qs.T)
-    sides = [np.ptp(getattr(space, f"get_{which}lim")()) for which in "xyz"]
-    close(space._box_aspect / np.max(space._box_aspect), sides / np.max(sides), rtol=1e-6)
+    sides = [np.ptp(getattr(space, f"get_{letter}lim")()) for letter in "xyz"]
     assert min(sides) > 0.4 * max(sides)
-    assert lines(plot.orbit((t, qs), coordinates=(2, 0)))[0][0, -1] == 20
-    plane, space = plt.subplots()[1], plt.figure().add_subplot(projection="3d")
+    plane = plot.orbit((t, qs), coordinates=(2, 0))
+    same(lines(plane)[0], qs[:, [2, 0]].T)
     refuses(
         plot.orbit,
         (((t, qs),), {"ax": plane}, 'projection="3d"'),
@@ -411,9 +367,9 @@ def test_bodies_are_drawn_by_name_about_one_of_them():
     ts, q, _ = arrays(n=6, shape=(3, 2))
     ts, q = np.ravel(ts), q.reshape(50, 3, 2) + RNG.normal(size=(50, 3, 2))
     assert legend(plot.orbit((ts, q), names=["A", "B", "C"])) == ["A", "B", "C", "start"]
-    about = plot.orbit((ts, q), centre=1)
-    same(lines(about), [(q[:, 0] - q[:, 1]).T, (q[:, 2] - q[:, 1]).T])
-    assert about.get_xlabel() == "x − x$_{2}$"
+    relative = plot.orbit((ts, q), centre=1)
+    same(lines(relative), [(q[:, 0] - q[:, 1]).T, (q[:, 2] - q[:, 1]).T])
+    assert relative.get_xlabel() == "x − x$_{2}$"
     assert len(lines(plot.orbit((ts, q), bodies=[2]))) == 1
 
 
@@ -423,12 +379,10 @@ def states(*shapes, dtype=float):
 
 def test_orbits_and_choices_that_do_not_fit_are_named():
     two, bodies = arrays(n=2), arrays(n=6, shape=(3, 2))
-    shapes = r"ts of shape \(5,\), qs of shape \(4, 2\)"
     refuses(
         plot.phase_portrait,
-        ((states(5, (4, 2), (4, 2)),), {}, shapes),
+        ((states(5, (4, 2), (4, 2)),), {}, r"ts of shape \(5,\), qs of shape \(4, 2\)"),
         ((states(5, (5, 2), (5, 3)),), {}, r"qs of .*\(5, 2\), ps of .*\(5, 3\)"),
-        (((np.arange(4.0), np.ones((2, 4, 1)), None),), {}, "broadcast_to"),
         ((states((), 2, 2),), {}, r"ts of shape \(\), qs of shape \(2,\)"),
         ((states(3, (3, 1), (3, 1), dtype=complex),), {}, "complex", TypeError),
         ((states(3, (3, 1)),), {}, "needs momenta", TypeError),
@@ -439,16 +393,16 @@ def test_orbits_and_choices_that_do_not_fit_are_named():
         ((two,), {"dof": 2}, "dof must be a number from 0 to 1 .*, got 2"),
         ((two,), {"dof": "q"}, "dof must be a number .*, got 'q'"),
         ((two,), {"dof": []}, "dof is empty"),
-        ((two,), {"labels": ["a", "b"]}, r"orbits \(1 in total\), got \['a', 'b'\]"),
-        ((two,), {"labels": "ab"}, r"orbits \(1 in total\), got 'ab'"),
+        ((two,), {"labels": ["a", "b"]}, r"1 names .* got \['a', 'b'\]"),
+        ((two,), {"labels": "ab"}, "1 names .* got 'ab'"),
         ((bodies,), {"dof": 0}, "a tuple of 2 numbers"),
         ((two,), {"period": 0}, "period must be a positive"),
-        ((arrays(3),), {"colour": [1, 2]}, "colour must have length 3, .*got length 2"),
-        ((two, 0, lambda q, p: q), {}, r"must return one number, got shape \(2,\)"),
+        ((arrays(3),), {"colour": [1, 2]}, r"shape \(3,\); got colour of shape \(2,\)"),
+        ((two, 0, lambda q, p: q), {}, r"must return one number; .*shape \(2,\)"),
     )
     refuses(
         plot.orbit,
-        ((arrays(n=1),), {}, "For a single coordinate use phase_portrait"),
+        ((arrays(n=1),), {}, "use phase_portrait"),
         ((arrays(n=4),), {}, r"coordinates=\(0, 1\)"),
         ((two,), {"coordinates": (0, 2)}, "from 0 to 1"),
         ((two,), {"coordinates": (0,)}, "two or three"),
@@ -456,7 +410,7 @@ def test_orbits_and_choices_that_do_not_fit_are_named():
         ((two,), {"centre": [1.0]}, r"shape \(2,\)"),
         ((two,), {"colour": [1.0]}, "several orbits"),
         ((bodies,), {"bodies": [3]}, "from 0 to 2"),
-        ((bodies,), {"names": ["A"]}, r"one for each of the bodies \(3 in"),
+        ((bodies,), {"names": ["A"]}, "3 names of the bodies"),
         ((arrays(2, n=2),), {"names": ["A", "B"]}, "2 orbits.*labels="),
     )
 
@@ -478,14 +432,13 @@ def test_a_long_line_is_drawn_whole_in_pieces():
 
 def test_invariants_are_changes_since_the_first_value(single):
     axes = plot.invariants(single, units={"t": "d"})
-    found = {axis.get_ylabel().splitlines()[0] for axis in axes}
     # "largest" and "section" have no value per step.
-    assert found == {"angular momentum", "energy", "mixed energy"} | found - {"largest", "section"}
+    assert not {"largest", "section"} & {axis.get_ylabel().splitlines()[0] for axis in axes}
     (axis,) = [a for a in axes if a.get_ylabel() == "energy\nrelative change"]
     E = np.asarray(single.observed["energy"])
-    t, drawn = lines(axis)[0]
+    t, change = lines(axis)[0]
     same(t, single.ts[1:])
-    close(drawn, (E - E[0]) / abs(E[0]), atol=1e-15)
+    close(change, (E - E[0]) / abs(E[0]), atol=1e-15)
     assert axes[-1].get_xlabel() == "time t [d]"
 
 
@@ -495,41 +448,34 @@ def test_functions_of_the_state_begin_at_the_initial_condition(good):
 
     axis = plot.invariants(good, {"L": L}, change="absolute", units={"L": "J s"})
     assert axis.get_ylabel() == "L\nchange [J s]"
-    for k, (t, drawn) in enumerate(lines(axis)):
+    for k, (t, change) in enumerate(lines(axis)):
         values = L(good.qs[k].T, good.ps[k].T)
         same(t, good.ts[k])
-        close(drawn, values - values[0], atol=1e-14)
+        close(change, values - values[0], atol=1e-14)
     value = plot.invariants(good, {"r": lambda q, p: jnp.linalg.norm(q)}, change="value")
     assert lines(value)[0][1][0] == pytest.approx(1.2)
-    assert value.get_ylabel() == "r"
 
 
 def test_solutions_of_several_runs_share_a_panel_for_observables_of_all(single, good):
     observed = {"energy": single.observed["energy"][:20]}
     short = SimpleNamespace(ts=single.ts[:21], qs=single.qs[:21], observed=observed)
     axis = plot.invariants([good, short], labels=["a", "b", "c"])
-    assert axis.get_ylabel() == "energy\nrelative change"
     assert [len(xy[0]) for xy in lines(axis)] == [60, 60, 20]
     same(lines(axis)[0][1][:20], lines(axis)[2][1])
-    assert legend(axis) == ["a", "b", "c"]
     mine = {"E": [np.ones(61), np.ones(61), np.r_[1, 2 * np.ones(20)]]}
     assert lines(plot.invariants([good, short], mine))[2][1].max() == 1
-    wrong = ([good, short], {"E": np.ones(61)})
-    refuses(plot.invariants, (wrong, {}, "a list of length 3 with one array for each orbit"))
+    refuses(plot.invariants, (([good, short], {"E": np.ones(61)}), {}, "a list of 3 arrays"))
 
 
 def test_vectors_change_by_the_length_of_their_difference():
     v = np.array([[3.0, 4], [3, 4], [3, 5], [0, 0]])
-    axis = plot.invariants(np.arange(4.0), {"L": v})
-    close(lines(axis)[0][1], [0, 0, 0.2, 1.0])
-    assert axis.get_ylabel() == "L\n|ΔI/I$_0$|"
+    close(lines(plot.invariants(np.arange(4.0), {"L": v}))[0][1], [0, 0, 0.2, 1.0])
 
 
 def test_a_logarithmic_axis_has_all_quantities_of_one_orbit_and_counts_zeros():
     t = np.arange(1.0, 7.0)
     v = 1 + np.array([0, 1e-15, 0, 3e-15, -2e-14, 0])
     axis = plot.invariants(t, {"E": v, "L": 2 + 1e-3 * t}, log=True)
-    assert axis.get_yscale() == "log"
     assert legend(axis) == ["E", "L", "2 values exactly 0"]
     same(np.isnan(lines(axis)[0][1]), [True, False, True, False, False, True])
     assert texts(axis) == ["machine epsilon"]
@@ -543,21 +489,19 @@ def test_invariants_that_cannot_be_drawn_are_named(single):
     axis = plot.invariants(np.stack([t, t]), {"L": two})  # a batch keeps its good ones
     same([xy[1] for xy in lines(axis)], [[np.nan] * 4, t])
     assert "L: 1 of 2 orbits start at 0" in legend(axis)
-    known = "change must be one of 'relative', 'absolute', 'value'"
     refuses(
         plot.invariants,
         ((t, {"L": t}), {}, "is 0 at the start of every orbit"),
         ((t, {"E": np.ones(6)}), {}, r"shape \(4,\).*of shape \(6,\)"),
         ((t, {"E": 1j * t}), {}, "complex", TypeError),
-        ((t, {"E": lambda q, p: q}), {}, "function", TypeError),
-        ((t,), {}, "have a dict of observables, got no", TypeError),
-        (("orbit", {"E": t}), {}, "or an array of times together", TypeError),
+        ((t, {"E": lambda q, p: q}), {}, "momenta", TypeError),
+        ((t,), {}, "a dict of observables, got type NoneType", TypeError),
+        (("orbit", {"E": t}), {}, "or times, got 'orbit'", TypeError),
         ((t, {}), {}, "values is empty: give"),
         ((t, dict.fromkeys("abcdefghijklm", 1 + t)), {}, "13 quantities are too"),
-        ((single,), {"change": "log"}, known),
+        ((single,), {"change": "log"}, "change must be one of 'relative', 'absolute', 'value'"),
     )
-    wrong = t, {"E": np.ones(3)}, "t", ""
-    refuses(plot.conserved, (wrong, {}, "'E' must have one number"))
+    refuses(plot.conserved, ((t, {"E": np.ones(3)}, "t", ""), {}, "'E' must have one number"))
 
 
 def test_numbers_without_a_place_on_the_axis_are_counted():
@@ -566,9 +510,7 @@ def test_numbers_without_a_place_on_the_axis_are_counted():
     axis = plot.conserved(t, {"a": 0 * t, "b": part, "c": 1 + t}, "t", "")
     assert legend(axis)[:3] == ["a", "b", "c"]
     assert legend(axis)[3:] == ["a: 8 of 8 are exactly 0", "b: 3 of 8 are not finite"]
-    drawn = [line for line in axis.lines if len(line.get_xdata()) == 8]
-    assert [line.get_linestyle() for line in drawn] == ["-", "--", "-."]
-    same(drawn[2].get_ydata(), 1 + t[1:])
+    same(axis.lines[2].get_ydata(), 1 + t[1:])
     axes = plot.changes(t, {"a": np.nan * t, "b": part, "c": t}, "t", "")
     assert [texts(a) for a in axes] == [["9 of 9 are not finite"], ["3 of 9 are not finite"], []]
 
@@ -587,15 +529,14 @@ def test_the_balance_is_a_stack_whose_ends_add_up_to_the_drift():
     close(edges.sum(0), drift - 1e-3)
     same(top.lines[0].get_ydata(), drift)
     close(bottom.lines[0].get_ydata(), 1e-3, atol=1e-15)
-    assert len({c.get_hatch() for c in top.collections}) == 3
-    assert top.get_ylabel() == "rate of change [J/s]"
+    assert len({c.get_hatch() for c in top.collections}) == 3  # seen without colours
     parts = dict(zip(("symmetry", "work", "lattice"), causes.values(), strict=True))
     top, _ = plot.balance(SimpleNamespace(ts=t, drift=drift, **parts))
     assert legend(top) == ["symmetry", "work", "lattice", "drift"]
     refuses(
         plot.balance,
         ((t, drift, {"a": np.ones(3)}), {}, r"a of shape \(3,\)"),
-        ((t, drift), {}, "got causes=None.*noether_balance", TypeError),
+        ((t, drift), {}, "got causes=None", TypeError),
     )
 
 
@@ -612,16 +553,13 @@ def test_a_cumulative_balance_begins_at_0_and_has_uneven_steps():
 def test_indicators_are_drawn_with_their_value_for_regular_motion():
     t = np.geomspace(1, 1e4, 60)
     megno = plot.indicator(t, np.stack([2 - 1 / t, 0.1 * t]), "megno", labels=["regular", "wild"])
-    assert (megno.get_xscale(), megno.get_yscale()) == ("log", "linear")
     same(lines(megno)[0], [t, 2 - 1 / t])
     assert legend(megno) == ["regular", "wild", "regular: 2"]
     assert 2.0 in {line.get_ydata()[0] for line in megno.lines if len(line.get_xdata()) == 2}
     exponents = plot.indicator(np.r_[0, t], {"e": np.stack([3 / t, 0.1 + 0 * t])}, "lyapunov")
-    assert exponents.get_yscale() == "log"
     x, y = lines(exponents)[-1]
     assert np.diff(np.log(y))[0] / np.diff(np.log(x))[0] == pytest.approx(-1)
     assert (x[0], y[0]) == (1.0, 3.0)
-    assert legend(exponents) == ["e 1", "e 2", "slope −1"]
     gali = lines(plot.indicator(t, t**-2, "gali", slope=-2))
     close(gali[0][1][-1], gali[1][1][-1])
     refuses(
@@ -633,24 +571,21 @@ def test_indicators_are_drawn_with_their_value_for_regular_motion():
 
 def test_indicators_of_runs_backward_are_drawn_at_the_time_since_the_start():
     t = -np.geomspace(1, 1e3, 40)
-    axis = plot.indicator(np.r_[0, t], 3 / np.abs(t), "lyapunov")
-    close(lines(axis)[0], [-t, -3 / t])
-    assert axis.get_xlabel() == "time since the start |t − t$_0$|"
-    two = 2 + 0 * t
     for ts, options in ((t, {}), (np.r_[5, 5 + t], {}), (5 + t, {"t0": 5.0})):
-        close(lines(plot.indicator(ts, two, "megno", **options))[0][0], -t)
-    assert plot.indicator(-t, two, "megno").get_xlabel() == "time t"
+        axis = plot.indicator(ts, 2 + 0 * t, "megno", **options)
+        close(lines(axis)[0][0], -t)
+        assert axis.get_xlabel() == "time since the start |t − t$_0$|"
+    assert plot.indicator(-t, 2 + 0 * t, "megno").get_xlabel() == "time t"
 
 
 def test_indicators_count_values_without_a_place_each_by_its_reason():
     t, v = np.arange(6.0), np.array([1.0, 2, np.nan, 0, -1, 3])
     at_start = "1 values at the start, t = t$_0$"
-    lost = ["1 values are not finite", at_start, "2 values are not positive"]
-    assert legend(plot.indicator(t, v, "lyapunov"))[-3:] == lost
-    assert legend(plot.indicator(t, v)) == lost[:1]
-    falls = legend(plot.indicator(t[1:], np.where(t[1:] > 2, 0.0, 1.0), "sali"))
-    assert falls == ["3 values are not positive"]
-    assert plot.indicator(t, -t).get_yscale() == "linear"
+    notes = ["1 values are not finite", at_start, "2 values are not positive"]
+    assert legend(plot.indicator(t, v, "lyapunov"))[-3:] == notes
+    assert legend(plot.indicator(t, v)) == notes[:1]
+    lost = plot.indicator(t[1:], np.where(t[1:] > 2, 0.0, 1.0), "sali")
+    assert legend(lost) == ["3 values are not positive"]
 
 
 def crossings(counts, *statuses, room=5, n=2):
@@ -658,10 +593,10 @@ def crossings(counts, *statuses, room=5, n=2):
     rows = np.arange(room) < np.minimum(np.asarray(counts), room)[:, None]
     q = np.where(rows[..., None], RNG.normal(size=(len(counts), room, n)), np.nan)
     p = np.where(rows[..., None], RNG.normal(size=q.shape), np.nan)
-    made = SimpleNamespace(ts=q[..., 0], qs=q, ps=p, count=np.asarray(counts, float))
+    orbits = SimpleNamespace(ts=q[..., 0], qs=q, ps=p, count=np.asarray(counts, float))
     if statuses:
-        made.status = np.asarray(statuses)
-    return made
+        orbits.status = np.asarray(statuses)
+    return orbits
 
 
 def offsets(axis):
@@ -669,27 +604,23 @@ def offsets(axis):
 
 
 def test_a_section_draws_every_crossing_once(batch):
-    found = batch.observed["section"]
+    section = batch.observed["section"]
     axis = plot.section(batch, x="p[0]", y="q[1]")
-    there = np.isfinite(np.asarray(found.ts))
-    assert there.sum() > 0
-    same(offsets(axis), np.stack([found.ps[there][:, 0], found.qs[there][:, 1]], 1))
+    finite = np.isfinite(np.asarray(section.ts))
+    assert finite.sum() > 0
+    same(offsets(axis), np.stack([section.ps[finite][:, 0], section.qs[finite][:, 1]], 1))
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("p$_{1}$", "q$_{2}$")
     assert "1 of 3 orbits failed: not finite" in legend(axis)
 
 
 def test_a_section_reports_missing_crossings():
-    made = crossings([7, 0, 3])
-    axis = plot.section(made)
-    assert [len(c.get_offsets()) for c in axis.collections] == [5, 0, 3]
+    axis = plot.section(crossings([7, 0, 3]))
+    assert len(offsets(axis)) == 8
     assert legend(axis) == [
         "1 of 3 orbits crossed more than the 5 times stored",
         "1 of 3 orbits did not cross",
     ]
-    assert not texts(axis)
-    empty = plot.section(crossings([0, 0]))
-    assert texts(empty) == ["no orbit crossed the section"]
-    assert not list(empty.collections)
+    assert texts(plot.section(crossings([0, 0]))) == ["no orbit crossed the section"]
 
 
 ENDED = [
@@ -706,25 +637,20 @@ def test_a_section_names_how_orbits_ended_and_failed_ones_do_not_set_its_limits(
     made = crossings([5, 2, 0, 4, 3], *names)
     made.qs[4, :2], made.ps[4, :2] = made.qs[0, 0], made.ps[0, 0]
     made.qs[4, 2], made.ps[4, 2] = 1e9, 1e12
-    drawings = [
-        lambda: plot.section(made),
-        lambda: plot.section(made, colour=np.arange(5.0)),
-        lambda: plot.bifurcation([0, 1, 3, 4, 2], made),
-    ]
-    for i, draw in enumerate(drawings):
+    for_bifurcation = [*ENDED[:3], ENDED[4], "1 of 5 runs have no crossing"]
+    for draw, notes in (
+        (lambda: plot.section(made), ENDED),
+        (lambda: plot.section(made, colour=np.arange(5.0)), ENDED),
+        (lambda: plot.bifurcation([0, 1, 3, 4, 2], made), for_bifurcation),
+    ):
         axis = draw()
-        if i == 2:  # its own text on runs without crossings
-            assert legend(axis) == [*ENDED[:3], ENDED[4], "1 of 5 runs have no crossing"]
-        else:
-            assert legend(axis) == ENDED
+        assert legend(axis) == notes
         assert np.abs(axis.axis()).max() < 10
         assert len(offsets(axis)) == 14  # drawn nevertheless
         made.status[4] = "successful"
         assert np.abs(draw().axis()).max() > 1e8
         made.status[4] = "failed"
-    alone = plot.section(crossings([3], "failed"))
-    assert legend(alone) == ["1 of 1 orbits failed"]
-    assert len(offsets(alone)) == 3
+    assert len(offsets(plot.section(crossings([3], "failed")))) == 3
 
 
 @pytest.mark.slow
@@ -746,7 +672,6 @@ def test_sections_are_coloured_by_orbit_or_by_value():
     axis = plot.section(crossings([5, 5, 5]), labels=["a", "b", "c"])
     shown = [to_hex(c.get_facecolor()[0]).upper() for c in axis.collections]
     assert shown == list(plot.COLOURS[:3])
-    assert legend(axis) == ["a", "b", "c"]
     made = crossings([5, 2, 4])
     axis = plot.section(made, colour=[2.0, np.nan, 9.0], colour_label="MEGNO", limits=(2, 4))
     (cloud,) = axis.collections
@@ -754,15 +679,6 @@ def test_sections_are_coloured_by_orbit_or_by_value():
     assert shades == [to_hex(SHADES(0.0))] * 5 + ["#b8b8b8"] * 2 + [to_hex(SHADES(1.0))] * 4
     assert axis.figure.axes[1].get_ylim() == (2, 4)
     assert "1 of 3 orbits have no value" in legend(axis)
-    assert len(plot.section(crossings([5] * 40)).collections) == 1
-
-
-def test_a_million_crossings_are_one_collection_of_pixels():
-    axis = plot.section(crossings([1000] * 1000, room=1000, n=1), x="q", y="p")
-    (cloud,) = axis.collections
-    assert len(cloud.get_offsets()) == 10**6
-    assert cloud.get_rasterized()
-    assert not plot.section(crossings([5])).collections[0].get_rasterized()
 
 
 def test_sections_take_functions_of_the_state():
@@ -777,15 +693,14 @@ def test_sections_take_functions_of_the_state():
     close(offsets(axis), np.stack([(np.sum(q**2, 1) + np.sum(p**2, 1)) / 2, angle], 1))
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("action", "")
     nothing, several = SimpleNamespace(ts=1, qs=1, ps=1, observed={}), [made] * 2
-    wrong = r"result of one dvi\.Section, got"
     refuses(
         plot.section,
         ((made,), {"x": "q[2]"}, "the index in 'q.2.' must be a number from 0 to 1"),
         ((made,), {"x": "r[0]"}, r'such as "q\[0\]"'),
         ((made,), {"x": "q"}, r'such as "q\[0\]"'),
-        ((made,), {"colour": [1.0]}, "colour must have length 2, .*got length 1"),
-        ((made,), {"labels": ["a"]}, r"orbits \(2 in total\), got \['a'\]"),
-        *(((x,), {}, wrong, TypeError) for x in (np.ones((3, 2)), nothing, several)),
+        ((made,), {"colour": [1.0]}, r"colour of shape \(1,\)"),
+        ((made,), {"labels": ["a"]}, "2 names of the orbits"),
+        *(((x,), {}, "one dvi.Section", TypeError) for x in (np.ones((3, 2)), nothing, several)),
     )
 
 
@@ -798,15 +713,12 @@ def test_a_bifurcation_has_a_column_of_points_for_each_parameter():
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("ε [1]", "q [m]")
     assert legend(axis) == ["1 of 3 runs have no crossing after the first 1"]
     numbers = plot.bifurcation([1, 10], np.ones((2, 4)), log=True, y="x [m]")
-    assert (numbers.get_xscale(), numbers.get_ylabel(), legend(numbers)) == ("log", "x [m]", [])
-    none = plot.bifurcation([1, 2], np.full((2, 4), np.nan))
-    assert texts(none) == ["no orbit crossed the section"]
-    shapes = r"of shape \(2,\), crossings of shape \(3, 4\)"
+    assert (numbers.get_xscale(), legend(numbers)) == ("log", [])
     refuses(
         plot.bifurcation,
-        (([1, 2], np.ones((3, 4))), {}, shapes),
+        (([1, 2], np.ones((3, 4))), {}, r"of shape \(2,\), crossings of shape \(3, 4\)"),
         (([1, 2], np.ones((2, 4))), {"skip": -1}, "of at least 0, got -1"),
-        (([0, 2], np.ones((2, 4))), {"log": True}, "positive values of parameter"),
+        (([0, 2], np.ones((2, 4))), {"log": True}, "positive parameter, got 0"),
     )
 
 
@@ -838,21 +750,18 @@ def test_work_precision_measures_slopes_before_round_off(runs, slope):
 def test_work_precision_finds_the_front_and_marks_runs_without_a_place():
     errors = {"two": COST**-2, "four": np.maximum(1e4 * COST**-4, 1e-14)}
     axis = plot.work_precision({name: (COST, e) for name, e in errors.items()})
-    assert (axis.get_xscale(), axis.get_yscale()) == ("log", "log")
     same(lines(axis)[2], [COST, [1e-2, 1e-4, 1e-8, 1e-12, 1e-14]])
     assert legend(axis)[-1] == "front"
-    looks = {(line.get_marker(), line.get_color()) for line in axis.lines[:2]}
-    assert looks == {("o", plot.COLOURS[0]), ("s", plot.COLOURS[1])}
     axis = plot.work_precision({"a": ([1.0, 2, 4, 8], [np.nan, 0.0, 0.1, np.inf])})
     same(marked(axis, "x")[0][:, 0], [1.0, 8.0])
     same(marked(axis, "v")[0][:, 0], [2.0])
     assert legend(axis)[-2:] == ["2 of 4 runs failed", "1 of 4 runs without error"]
     refuses(
         plot.work_precision,
-        (({},), {}, "results must have at least one method"),
-        (({"a": ([1, 2], [1])},), {}, r"got the shapes \(2,\) and \(1,\)"),
+        (({},), {}, "results is empty"),
+        (({"a": ([1, 2], [1])},), {}, r"of one shape \(runs,\), got"),
         (({"a": ([0, 2], [1, 1])},), {}, "must be positive and finite, got 0.0"),
-        (({"a": 3},), {}, r"must be \(costs, errors\)"),
+        (({"a": 3},), {}, r"must be \(costs, errors\).*got 3"),
     )
 
 
@@ -877,23 +786,16 @@ def test_drifts_that_failed_or_are_0_keep_their_place_and_slopes_have_two_digits
 def test_a_spectrum_draws_sizes_at_their_frequencies():
     w = np.array([[1.0, 2.5, np.nan], [1.0, -0.5, 3.0]])
     A = np.array([[1, 0.1j, 0.3], [0.5, 0.2, 0.0]])
-    look = {"fundamental": {"ω": 1.0}, "units": {"frequency": "rad/d", "amplitude": "au"}}
     both = SimpleNamespace(frequencies=w, amplitudes=A)
-    axis = plot.spectrum(both, labels=["x", "y"], **look)
-    assert axis.get_yscale() == "log"
+    axis = plot.spectrum(both, labels=["x", "y"], fundamental={"ω": 1.0})
     close(axis.lines[0].get_xydata(), [[1.0, 1.0], [2.5, 0.1]])
     close([s[1] for s in axis.collections[1].get_segments()], [[1.0, 0.5], [-0.5, 0.2]])
-    assert axis.get_ylim()[0] == pytest.approx(0.1 / 3)
-    assert (axis.get_xlabel(), axis.get_ylabel()) == ("frequency [rad/d]", "amplitude [au]")
     assert legend(axis) == ["x", "y", "ω", "2 of 6 lines have no frequency or amplitude"]
-    linear = plot.spectrum(w[1], A[1], log=False)
-    assert linear.get_ylim()[0] == 0
-    assert len(linear.lines[0].get_xdata()) == 3
-    shapes = r"float64.*of shape \(2, 3\), amplitudes of shape \(3,\)"
+    assert len(plot.spectrum(w[1], A[1], log=False).lines[0].get_xdata()) == 3
     refuses(
         plot.spectrum,
-        ((w, A[0]), {}, shapes),
-        ((w,), {}, "without the attributes frequencies, amplitudes", TypeError),
+        ((w, A[0]), {}, r"float64.*of shape \(2, 3\), amplitudes of shape \(3,\)"),
+        ((w,), {}, "without attributes frequencies, amplitudes", TypeError),
     )
 
 
@@ -901,10 +803,9 @@ def test_frequencies_are_drawn_against_each_other_or_their_diffusion_over_a_grid
     x, y = np.array([1.0, 2.0, np.nan]), np.array([0.5, 1.0, 1.0])
     axis = plot.frequency_map(x, y, [-9.0, np.nan, -1.0], resonances=[(1, -2)])
     same(offsets(axis), [[1.0, 0.5], [2.0, 1.0]])
-    unknown = ["1 orbits without a diffusion", "1 of 3 orbits have no frequencies"]
-    assert legend(axis) == unknown
+    notes = ["1 orbits without a diffusion", "1 of 3 orbits have no frequencies"]
+    assert legend(axis) == notes
     assert texts(axis) == ["(1, −2)"]
-    assert (axis.lines[0].get_xy1(), axis.lines[0].get_xy2()) == ((0, 0), (-2, -1))
     a, b = np.linspace(0, 1, 4), np.linspace(2, 4, 3)
     D = RNG.uniform(-9, -1, (4, 3))
     D[1, 2] = np.nan
@@ -912,18 +813,13 @@ def test_frequencies_are_drawn_against_each_other_or_their_diffusion_over_a_grid
     mesh = grid.collections[0]
     same(mesh.get_array().filled(np.nan), D.T)
     assert (mesh.norm.vmin, mesh.norm.vmax) == (-8, -2)
-    assert grid.get_xlabel() == "a [au]"
     assert legend(grid) == ["1 of 12 orbits have no value"]
-    assert plot.frequency_map(a, b, D).get_xlabel() == "x"
-    A, B = np.meshgrid(a, b, indexing="ij")
-    assert plot.frequency_map(A, B, D, resonances=[(1, -1)]).get_xlabel() == "ω$_1$"
-    line = r"only if x and y are frequencies.* of shape \(4, 3\)"
     refuses(
         plot.frequency_map,
         ((x, y), {"resonances": [(0, 0)]}, "not both 0"),
         ((x, y[:2]), {}, r"y of shape \(2,\)"),
         ((a[::-1], b, D), {}, r"must be increasing and finite, got x\[1\] ="),
-        ((a, b, D), {"resonances": [(1, -1)]}, line),
+        ((a, b, D), {"resonances": [(1, -1)]}, r"require frequencies.* of shape \(4, 3\)"),
     )
 
 
@@ -941,8 +837,8 @@ def test_a_resonance_has_its_name_where_its_line_leaves_the_picture(x, y, k, edg
     (left, right), (low, high) = axis.get_xlim(), axis.get_ylim()
     at_x, at_y = name.xy
     assert k[0] * at_x + k[1] * at_y == pytest.approx(0, abs=1e-12)
-    found, wanted = {"top": (at_y, high), "right": (at_x, right), "left": (at_x, left)}[edge]
-    assert found == pytest.approx(wanted)
+    place, border = {"top": (at_y, high), "right": (at_x, right), "left": (at_x, left)}[edge]
+    assert place == pytest.approx(border)
     assert left <= at_x <= right
     assert low <= at_y <= high
 
@@ -950,32 +846,31 @@ def test_a_resonance_has_its_name_where_its_line_leaves_the_picture(x, y, k, edg
 def frames(path):
     """Pictures and delays [ms] of a GIF."""
     image = Image.open(path)
-    found, delays = [], []
+    pictures, delays = [], []
     for k in range(image.n_frames):
         image.seek(k)
-        found.append(np.asarray(image.convert("RGB")).astype(int))
+        pictures.append(np.asarray(image.convert("RGB")).astype(int))
         delays.append(image.info["duration"])
-    return found, delays
+    return pictures, delays
 
 
 def test_a_film_has_the_requested_frames_and_length(tmp_path, batch):
     calls = []
     path = plot.animate(
-        batch, tmp_path / "film.gif", seconds=0.7, fps=10, size=(3, 2.5), dpi=60,
-        labels=list("abc"), progress=lambda done, total: calls.append((done, total)),
+        batch, tmp_path / "film.gif", seconds=0.7, fps=10, size=(3, 2.5), dpi=40,
+        progress=lambda done, total: calls.append((done, total)),
     )  # fmt: skip
-    found, delays = frames(path)
-    assert path == tmp_path / "film.gif"
-    assert (len(found), sum(delays)) == (7, 700)
-    assert found[0].shape == (150, 180, 3)
+    images, delays = frames(path)
+    assert (len(images), sum(delays)) == (7, 700)
+    assert images[0].shape == (100, 120, 3)
     assert calls == [(k, 7) for k in range(1, 8)]
     assert [file.name for file in tmp_path.iterdir()] == ["film.gif"]
-    for a, b in itertools.pairwise(found):
+    for a, b in itertools.pairwise(images):
         assert (np.abs(a - b).max(-1) > 60).sum() > 10
-    assert (found[0][0, :5] == 255).all()  # white paper
-    path = plot.animate(arrays(steps=4), tmp_path / "few.gif", seconds=1, size=(3, 3), dpi=40)
-    found, delays = frames(path)  # few states are shown for longer
-    assert (len(found), delays) == (4, [250] * 4)
+    assert (images[0][0, :5] == 255).all()  # white paper
+    path = plot.animate(arrays(steps=4), tmp_path / "few.gif", seconds=1, size=(3, 3), dpi=30)
+    images, delays = frames(path)  # few states are shown for longer
+    assert (len(images), delays) == (4, [250] * 4)
 
 
 def test_a_film_names_all_its_orbits_and_counts_those_that_failed(tmp_path, monkeypatch):
@@ -993,64 +888,58 @@ def test_a_film_names_all_its_orbits_and_counts_those_that_failed(tmp_path, monk
     names = [f"orbit with a long name {k}" for k in range(8)]
     plot.animate((ts, q, p), tmp_path / "a.gif", labels=names, size=(5, 5), dpi=60)
     (figure,) = figures
-    (drawn,) = figure.legends
-    said = [text.get_text() for text in drawn.get_texts()]
-    assert said == [*names, "1 of 8 orbits failed: not finite"]
+    (box,) = figure.legends
+    labels = [text.get_text() for text in box.get_texts()]
+    assert labels == [*names, "1 of 8 orbits failed: not finite"]
     figure.canvas.draw()
-    assert all(lies_within(text, figure) for text in drawn.get_texts())
-    plot.animate(arrays(), tmp_path / "b.gif", dpi=30)
-    assert not figures[1].legends
+    assert all(lies_within(text, figure) for text in box.get_texts())
 
 
 def test_a_film_shows_times_that_are_evenly_spaced(tmp_path):
     """Steps that grow: the head is where the orbit is, not at every so many states."""
     t = np.linspace(0, 3, 400) ** 2
     look = {"seconds": 1, "fps": 5, "size": (4, 2), "dpi": 60, "tail": 0}
-    found, _ = frames(plot.animate((t, np.stack([t, 0 * t], 1)), tmp_path / "line.gif", **look))
+    images, _ = frames(plot.animate((t, np.stack([t, 0 * t], 1)), tmp_path / "line.gif", **look))
     blue = 255 * np.array(to_rgb(plot.COLOURS[0]))
-    heads = [np.argwhere(np.abs(f - blue).max(-1) < 40)[:, 1].mean() for f in found]
+    heads = [np.argwhere(np.abs(f - blue).max(-1) < 40)[:, 1].mean() for f in images]
     close(np.diff(heads), np.diff(heads).mean(), atol=2.5)
     assert np.diff(heads).mean() > 20
 
 
 def test_films_beside_phase_portraits_and_invariants_and_in_space(tmp_path, single):
-    look = {"seconds": 0.2, "fps": 10, "size": (5, 2.5), "dpi": 50}
-
-    def film(orbits, **kwargs):
-        found, _ = frames(plot.animate(orbits, tmp_path / "film.gif", **look, **kwargs))
-        return found[0], found[-1]
-
-    plain, _ = film(single)
-    values = {k: single.observed[k] for k in ("energy", "angular_momentum")}
-    for beside, options in (("phase_portrait", {"dof": 1}), ("invariants", {"values": values})):
-        first, last = film(single, beside=beside, **options)
-        assert np.abs(first - last)[:, 140:].sum() > 3000
-        assert np.abs(first - plain).sum() > 10_000
     t = np.linspace(0, 20, 30)
     qs = np.stack([np.cos(t), np.sin(t), t], 1)
     qs[20:] = np.nan
-    for orbits in ((t, qs), arrays()):  # in space; in (q, p)
-        first, last = film(orbits)
-        assert np.abs(first - last).sum() > 1000
+    energy = {"values": {"energy": single.observed["energy"]}}
+    for orbits, options in (
+        (single, {"beside": "phase_portrait", "dof": 1}),
+        (single, {"beside": "invariants", **energy}),
+        ((t, qs), {}),
+        (arrays(), {}),  # in (q, p)
+    ):
+        look = {"seconds": 0.2, "fps": 10, "size": (5, 2.5), "dpi": 40} | options
+        images, _ = frames(plot.animate(orbits, tmp_path / "film.gif", **look))
+        change = np.abs(images[0] - images[-1])
+        assert change.sum() > 1000
+        assert not options or change[:, 112:].sum() > 2000  # the second picture moves
 
 
 def test_films_that_cannot_be_made_leave_nothing_behind(tmp_path, monkeypatch):
     orbit = arrays(n=2)
-    known = "one of None, 'phase_portrait', 'invariants'"
     nowhere = (np.arange(3.0), np.full((3, 2), np.nan))
     names = {"names": ["A", "B"]}
     cases = [
-        (orbit, "a.avi", {}, "end with .gif or .mp4, got 'a.avi'"),
+        (orbit, "a.avi", {}, "one of '.gif', '.mp4', got '.avi'"),
         (orbit, "a.gif", {"fps": 60}, "at most 50"),
         (orbit, "a.gif", {"seconds": 0}, "seconds must be a positive and finite"),
         (orbit, "a.gif", {"fps": float("nan")}, "fps must be"),
         (orbit, "a.gif", {"tail": 2}, "a fraction from 0 to 1, got 2"),
-        (orbit, "a.gif", {"beside": "energy"}, known),
+        (orbit, "a.gif", {"beside": "energy"}, "one of None, 'phase_portrait', 'invariants'"),
         (orbit, "none/a.gif", {}, "path must lie in an existing folder, got"),
-        (orbit, "a.gif", {"size": (40, 40), "dpi": 600}, "pixels in all frames together, got"),
+        (orbit, "a.gif", {"size": (40, 40), "dpi": 600}, "pixels of all frames"),
         (arrays(2, n=2), "a.gif", names, "2 orbits"),
         (arrays(), "a.gif", names, r"states of shape \(1,\)"),
-        (nowhere, "a.gif", {}, "at least one finite state"),
+        (nowhere, "a.gif", {}, "finite states"),
         (arrays()[:2], "a.gif", {}, "needs momenta", TypeError),
         (orbit, "a.mp4", {}, r"ffmpeg.*install.*or write a \.gif", RuntimeError),
     ]
@@ -1082,30 +971,8 @@ def test_the_gallery_rejects_an_unknown_picture_before_it_draws(tmp_path, monkey
     spec = importlib.util.spec_from_file_location("gallery", ROOT / "examples" / "gallery.py")
     gallery = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(gallery)
-    drawn = []
-
-    def picture(out):
-        drawn.append(out)
-        return out / "a.png"
-
-    monkeypatch.setattr(gallery, "PICTURES", [picture])
-    monkeypatch.setattr(sys, "argv", ["gallery.py", str(tmp_path / "g"), "picture", "no"])
+    monkeypatch.setattr(sys, "argv", ["gallery.py", str(tmp_path / "g"), "drift_orders", "no"])
     with pytest.raises(SystemExit):
         gallery.main()
-    assert "no picture is called no: there are picture" in capsys.readouterr().err
-    assert not drawn
+    assert "no picture is called no: there are" in capsys.readouterr().err
     assert not (tmp_path / "g").exists()
-    monkeypatch.setattr(sys, "argv", ["gallery.py", str(tmp_path / "g"), "picture"])
-    gallery.main()
-    assert drawn == [tmp_path / "g"]
-
-
-@pytest.mark.slow
-def test_the_documentation_runs_as_printed(tmp_path, monkeypatch):
-    page = (ROOT / "docs" / "plots.md").read_text(encoding="utf-8")
-    (block,) = re.findall(r"```python\n(.*?)```", page, re.S)
-    monkeypatch.chdir(tmp_path)
-    exec(block, {})
-    sizes = {file.name: file.stat().st_size for file in tmp_path.iterdir()}
-    assert set(sizes) == {"orbits.png", "invariants.png", "orbits.gif"}
-    assert min(sizes.values()) > 20_000

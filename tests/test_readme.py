@@ -18,35 +18,36 @@ def as_users_compile(monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", flags_of_users())
 
 
+def blocks(page):
+    return re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.S)
+
+
+def output_of(code, folder):
+    """The lines that a program prints."""
+    out = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=folder,
+        env={**os.environ, "MPLBACKEND": "Agg"},
+    )  # fmt: skip
+    assert out.returncode == 0, out.stderr
+    return out.stdout.strip().splitlines()
+
+
 @pytest.mark.slow
 def test_python_blocks_run(tmp_path):
-    blocks = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.S)
-    assert len(blocks) >= 2
-    assert len(blocks[0].splitlines()) <= 12
-    code = (
-        "\n".join(blocks)
-        + """
+    code = blocks(README)
+    assert len(code) >= 2
+    assert len(code[0].splitlines()) <= 12
+    code.append("""
 energy = (sol.qs**2 + sol.ps**2).ravel()
 J = jax.vmap(lambda q, p: found.invariants[0].evaluate(q, p, 0.05))(sol.qs, sol.ps)
 print(*(float(np.abs(x / x[0] - 1).max()) for x in (energy, J)))
 print(slopes.shape, bool(np.isfinite(slopes).all()))
-"""
-    )
-    env = {**os.environ, "MPLBACKEND": "Agg"}
-    out = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=tmp_path,
-        env=env,
-    )
-    assert out.returncode == 0, out.stderr
-    formula, changes, last = out.stdout.strip().splitlines()
+""")
+    formula, changes, last = output_of("\n".join(code), tmp_path)
     assert formula.startswith("0.5 q² − 0.05 q p + 0.5 p² + ε (0.251256 q⁴ − 0.0502513 q³ p")
-    energy, found = map(float, changes.split())
+    energy, invariant = map(float, changes.split())
     assert 0.07 < energy < 0.09
-    assert found < 5e-6
+    assert invariant < 5e-6
     assert last == "(8,) True"
     assert (tmp_path / "invariants.png").stat().st_size > 10_000
 
@@ -62,39 +63,28 @@ def test_readme_answers_the_first_questions_early():
 
 @pytest.mark.slow
 def test_the_page_on_sweeps_runs(tmp_path):
-    page = (README.parent / "docs" / "sweeps.md").read_text(encoding="utf-8")
-    (block,) = re.findall(r"```python\n(.*?)```", page, re.S)
-    code = "import matplotlib; matplotlib.use('Agg')\n" + block + "\nprint(result.status_counts())"
-    out = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=tmp_path
-    )
-    assert out.returncode == 0, out.stderr
-    assert out.stdout.strip() == "{'successful': 12000}"
+    (block,) = blocks(README.parent / "docs" / "sweeps.md")
+    printed = output_of(block + "\nprint(result.status_counts())", tmp_path)
+    assert printed == ["{'successful': 12000}"]
 
 
 @pytest.mark.slow
-def test_the_page_on_fitting_runs():
-    page = (README.parent / "docs" / "fitting.md").read_text(encoding="utf-8")
-    block = re.findall(r"```python\n(.*?)```", page, re.S)[0]
+def test_the_page_on_fitting_runs(tmp_path):
+    block = blocks(README.parent / "docs" / "fitting.md")[0]
     code = block + "\nprint(found.status, abs(float(found.params['epsilon']) - 0.02))"
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert out.returncode == 0, out.stderr
-    status, off = out.stdout.strip().splitlines()[-1].split()
+    status, distance = output_of(code, tmp_path)[-1].split()
     assert status == "converged"
-    assert float(off) < 2e-3
+    assert float(distance) < 2e-3
 
 
 @pytest.mark.slow
-def test_the_page_on_chaos_runs():
-    page = (README.parent / "docs" / "chaos.md").read_text(encoding="utf-8")
-    code = "\n".join(re.findall(r"```python\n(.*?)```", page, re.S))
+def test_the_page_on_chaos_runs(tmp_path):
+    code = "\n".join(blocks(README.parent / "docs" / "chaos.md"))
     code += "\nprint(sorted({int(n) for n in np.bincount(megno.status.values.ravel())}))"
     code = code.replace("found = dvi.sweep(", "megno = dvi.sweep(").replace(
         '"megno": dvi.MEGNO()},\n)\n', '"megno": dvi.MEGNO()},\n).to_xarray()\n'
     )
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert out.returncode == 0, out.stderr
-    first, points, statuses = out.stdout.strip().splitlines()
+    first, points, statuses = output_of(code, tmp_path)
     assert 1.9 < float(first.split()[0]) < 2
     assert points == "[1, 2, 4, 5, 2]"
     assert len(statuses.split(",")) > 1  # some of the grid escape

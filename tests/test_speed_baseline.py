@@ -133,6 +133,7 @@ def test_implicit_kernels_agree_with_the_package(baseline, name, kernel):
     assert defect(one, qs[-1, :, 3], ps[-1, :, 3]) < TOLERANCE
 
 
+@pytest.mark.slow
 def test_a_larger_step_takes_more_iterations(baseline):
     _, start, given = settings("product")
     few, _ = baseline.iterations_needed("product", *start, **given)
@@ -143,18 +144,19 @@ def test_a_larger_step_takes_more_iterations(baseline):
 
 
 def test_a_missing_compiler_is_reported(monkeypatch, tmp_path):
-    made = module("_baseline")
+    compiled = module("_baseline")
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(made.NoCompilerError, match="Install one"):
-        made.find_compiler()
+    with pytest.raises(compiled.NoCompilerError, match="Install one"):
+        compiled.find_compiler()
     fails = f"{sys.executable} -c 'raise SystemExit(3)'"
-    for compiler, how in (("no-such-compiler", "does not start"), (fails, "does not compile")):
+    for compiler, fault in (("no-such-compiler", "does not start"), (fails, "does not compile")):
         monkeypatch.setenv("CC", compiler)
-        with pytest.raises(made.NoCompilerError, match=how):
-            made.Baseline()
+        with pytest.raises(compiled.NoCompilerError, match=fault):
+            compiled.Baseline()
 
 
+@pytest.mark.slow
 def test_the_library_leaves_subnormal_numbers_alone(baseline):
     _, start, given = settings("product")
     baseline.implicit("product", *start, iterations=2, **given)()
@@ -215,13 +217,13 @@ def test_waiting_does_not_count_as_work(speed):
 
 def test_growing_ratios_are_found_and_set_the_exit_status(speed, tmp_path, capsys):
     before = {"a": 2.0, "b": 1.0, "flat": 0.0}
-    for now, found in (
+    for now, worse in (
         ({"a": 2.1, "b": 1.2, "flat": 1e-4}, []),
         ({"a": 2.7}, [("a", 2.7, 2.0)]),
         ({"a": None}, [("a", None, 2.0)]),
         ({"flat": 0.5}, [("flat", 0.5, 0.0)]),
     ):
-        assert speed.worse(now, before, 1.3) == found
+        assert speed.worse(now, before, 1.3) == worse
     assert speed.worse({"a": float("nan")}, before, 1.3)
     with pytest.raises(ValueError, match="nothing was checked"):
         speed.worse({"new": 1.0}, before, 1.3)
@@ -232,15 +234,12 @@ def test_growing_ratios_are_found_and_set_the_exit_status(speed, tmp_path, capsy
         others = ({"row": "b", "unit": "s", "value": 9.0}, {"row": "c", "unit": "× faster"})
         return speed.ratios([{"row": "a", "unit": "×", "value": value}, *others])
 
-    def check(first, second):
-        return speed.check(ratio(first), file, 1.3, lambda rows: ratio(second))
-
     assert ratio(1.1) == {"a": 1.1}  # seconds depend on the machine
-    statuses = [check(*pair) for pair in ((1.1, None), (1.5, 1.2), (1.5, 1.4), (1.5, None))]
-    assert statuses == [0, 0, 1, 1]
+    for first, second, status in ((1.1, None, 0), (1.5, 1.2, 0), (1.5, 1.4, 1), (1.5, None, 1)):
+        assert speed.check(ratio(first), file, 1.3, lambda rows, x=second: ratio(x)) == status
     assert "1.4   was 1" in capsys.readouterr().out
     file.write_text(json.dumps({"ratios": {"other": 1.0}}))
-    assert check(1.1, 1.1) == 2
+    assert speed.check(ratio(1.1), file, 1.3, lambda rows: ratio(1.1)) == 2
 
 
 def test_the_status_of_a_row(speed):

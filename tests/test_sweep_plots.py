@@ -25,6 +25,7 @@ FLAGS = {
     "flag_meanings": " ".join(("not_computed", *STATUS_NAMES)),
 }
 RNG = np.random.default_rng(1)
+same, close = np.testing.assert_array_equal, np.testing.assert_allclose
 
 
 def drift(order=1.0):
@@ -58,30 +59,29 @@ def colour_at(axis, x, y):
 
 def test_the_numbers_and_their_places():
     axis = plot.sweep_map(drift())
-    np.testing.assert_array_equal(array_of(axis), drift().values.T)
+    same(array_of(axis), drift().values.T)
     assert (axis.get_xscale(), axis.get_yscale()) == ("log", "linear")
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("ε", "x [kg]")
     assert axis.figure.axes[1].get_ylabel() == "drift [J]"
-    assert isinstance(axis.collections[0].norm, LogNorm)
     edges = axis.collections[0].get_coordinates()
-    np.testing.assert_allclose(edges[0, 1:-1, 0], np.sqrt(EPS[1:] * EPS[:-1]))
-    np.testing.assert_allclose(edges[:, 0, 1], [0.05, 0.15, 0.3, 0.45, 0.7, 1.1])
-    np.testing.assert_allclose(axis.get_xlim(), edges[0, [0, -1], 0])
+    close(edges[0, 1:-1, 0], np.sqrt(EPS[1:] * EPS[:-1]))
+    close(edges[:, 0, 1], [0.05, 0.15, 0.3, 0.45, 0.7, 1.1])
     assert not axis.figure.legends
+    same(array_of(plot.sweep_map(drift(), x="x")), drift().values)
+    # The lightest colour is not the yellow of viridis, which is invisible on paper.
+    assert to_hex(axis.collections[0].cmap(1.0)) == to_hex(SHADES(1.0))
 
 
 def test_scales_are_logarithmic_over_decades_and_centred_for_both_signs():
     narrow = drift(0.2)
-    axis = plot.sweep_map(narrow, x="x")
-    np.testing.assert_array_equal(array_of(axis), narrow.values)
-    assert axis.get_ylabel() == "ε"
 
     def norm(data, **options):
         return plot.sweep_map(data, **options).collections[0].norm
 
     assert type(norm(narrow)) is type(norm(drift(), log=False)) is Normalize
     assert type(norm(drift())) is type(norm(narrow, log=True)) is LogNorm
-    assert norm(drift() - 0.05).vmin == -norm(drift() - 0.05).vmax
+    centred = norm(drift() - 0.05)
+    assert centred.vmin == -centred.vmax
     limited = norm(drift() - 0.05, limits=(-0.01, 0.2))
     assert (limited.vmin, limited.vmax) == (-0.01, 0.2)
 
@@ -89,24 +89,20 @@ def test_scales_are_logarithmic_over_decades_and_centred_for_both_signs():
 def test_places_along_the_axes():
     """Values out of order, a coordinate along a dimension, names, and a place for 0."""
     mixed = drift().isel(epsilon=[3, 0, 5, 1, 6, 2, 4])
-    np.testing.assert_array_equal(array_of(plot.sweep_map(mixed)), drift().values.T)
+    same(array_of(plot.sweep_map(mixed)), drift().values.T)
     case = drift().rename(epsilon="case").drop_vars("case").assign_coords(epsilon=("case", EPS))
     axis = plot.sweep_map(case, x="epsilon")
-    np.testing.assert_array_equal(array_of(axis), drift().values.T)
-    assert (axis.get_xscale(), axis.get_xlabel()) == ("log", "ε")
-    axis = plot.sweep_map(case)
-    assert (axis.get_xscale(), axis.get_xlabel()) == ("linear", "case")
+    same(array_of(axis), drift().values.T)
+    assert axis.get_xscale() == "log"
+    assert plot.sweep_map(case).get_xscale() == "linear"
     methods = ["TypeII()", "Strang()", "Yoshida()"]
     axis = plot.sweep_map(drift().isel(x=slice(3)).assign_coords(x=methods).rename(x="method"))
     assert [t.get_text() for t in axis.get_yticklabels()] == methods
-    np.testing.assert_array_equal(axis.get_yticks(), [0, 1, 2])
     axis = plot.sweep_map(drift().reindex(epsilon=[0, *EPS], fill_value=1e-9))
-    assert axis.get_xscale() == "log"
     assert axis.get_xticklabels()[0].get_text() == "0"
     edges = axis.collections[0].get_coordinates()[0, :, 0]
     assert edges[0] < axis.get_xticks()[0] < edges[1] < EPS[0]
     assert (axis.get_xticks()[1:] > edges[1]).all()
-    assert (axis.get_xticks(minor=True) > edges[1]).all()
 
 
 def test_exact_zeros_on_a_logarithmic_scale_are_black():
@@ -123,11 +119,9 @@ def test_one_dimension_is_a_line():
     data = drift()[:, 2].copy()
     data[3] = np.nan
     axis = plot.sweep_map(data)
-    np.testing.assert_array_equal(axis.lines[0].get_xdata(), EPS)
-    np.testing.assert_array_equal(axis.lines[0].get_ydata(), data)
-    np.testing.assert_array_equal(axis.lines[1].get_xdata(), EPS[3:4])
+    same(axis.lines[0].get_data(), [EPS, data])
+    same(axis.lines[1].get_xdata(), EPS[3:4])
     assert (axis.get_xscale(), axis.get_yscale()) == ("log", "log")
-    assert axis.get_ylabel() == "drift [J]"
     assert texts(axis) == ["no number: 1 of 7 (14.3 %)"]
 
 
@@ -137,45 +131,31 @@ def test_facets_share_their_colours():
     titles = [a.get_title(loc="left") for a in axes]  # where the style puts them
     assert titles == ["step size h = 0.1 s", "step size h = 0.05 s"]
     for axis, scale in zip(axes, (1, 100), strict=True):
-        np.testing.assert_array_equal(array_of(axis), scale * drift().values.T)
+        same(array_of(axis), scale * drift().values.T)
         assert axis.collections[0].norm.vmin == drift().min()
         assert axis.collections[0].norm.vmax == 100 * drift().max()
     assert [a.get_ylabel() for a in axes] == ["x [kg]", ""]
 
 
 @pytest.mark.parametrize("layout", ["constrained", "none"])
-def test_maps_on_given_axes_have_their_legends_below_the_labels(tmp_path, layout):
+def test_maps_on_given_axes_have_their_legends_below_the_labels(layout):
     """A legend does not cover a map; without a layout that makes space below, it is inside."""
-    with plot.style():
-        figure, axes = plt.subplots(1, 3, layout=layout, figsize=(15, 4))
-        data = with_status()
-        plot.sweep_map(data.drift, ax=axes[0], status=data.status)
-        plot.slope_map(data.drift, ax=axes[1])
-        plot.failure_map(data, ax=axes[2])
-        figure.canvas.draw()
-        for axis in (axes[0], axes[2]):
-            found, map_ = axis.get_legend().get_window_extent(), axis.get_window_extent()
-            if layout == "none":
-                assert map_.y0 <= found.y0 < found.y1 <= map_.y1
-            else:
-                assert found.y1 <= axis.xaxis.label.get_window_extent().y0
-                assert lies_within(axis.get_legend(), figure)
-        assert plot.save(figure, tmp_path / "maps.png").stat().st_size > 10_000
-
-
-def test_maps_have_the_colours_that_are_measured():
-    data = with_status()
-    maps = plot.sweep_map(data.drift), plot.slope_map(data.drift, x="epsilon", y="x")
-    for axis in (*maps, plot.failure_map(data, reduce="fraction")):
-        top = to_hex(axis.collections[0].cmap(1.0))
-        assert top == to_hex(SHADES(1.0)) != to_hex(plt.get_cmap("viridis")(1.0))
+    figure, axis = plt.subplots(layout=layout, figsize=(5, 4))
+    plot.failure_map(with_status(), ax=axis)
+    figure.canvas.draw()
+    box, map_ = axis.get_legend().get_window_extent(), axis.get_window_extent()
+    if layout == "none":
+        assert map_.y0 <= box.y0 < box.y1 <= map_.y1
+    else:
+        assert box.y1 <= axis.xaxis.label.get_window_extent().y0
+        assert lies_within(axis.get_legend(), figure)
 
 
 def test_cells_without_a_number_are_grey_and_counted():
     """With a status, those that are not computed are white."""
     data = with_status()
     axis = plot.sweep_map(data.drift)
-    np.testing.assert_array_equal(array_of(axis).mask, np.isnan(data.drift.values.T))
+    same(array_of(axis).mask, np.isnan(data.drift.values.T))
     assert texts(axis) == ["no number: 6 of 35 (17.1 %)"]
     grey, good = (colour_at(axis, EPS[2], x).astype(int) for x in X[1:3])
     assert np.ptp(grey) == 0
@@ -188,20 +168,16 @@ def test_cells_without_a_number_are_grey_and_counted():
 
 
 def test_the_failures_of_a_real_sweep():
-    result = small_sweep()
-    data = result.to_xarray()
+    data = small_sweep().to_xarray()
     axis = plot.failure_map(data)
-    np.testing.assert_array_equal(array_of(axis), data.status.values.T)
+    same(array_of(axis), data.status.values.T)
     assert texts(axis) == ["successful: 15 of 20 (75 %)", "not finite: 5 of 20 (25 %)"]
-    mesh = axis.collections[0]
-    shown = [to_hex(mesh.cmap(mesh.norm(code))) for code in (0, STATUS_NAMES.index("not_finite"))]
-    assert shown == ["#d9d9d9", plot.COLOURS[1].lower()]
     bad = colour_at(axis, *(data[n].values[-1] for n in ("epsilon", "k")))
-    np.testing.assert_array_equal(bad, [0xD5, 0x5E, 0x00])
+    same(bad, [0xD5, 0x5E, 0x00])
     fine = plot.failure_map(data.isel(epsilon=slice(3)))
     assert texts(fine) == ["successful: 15 of 15 (100 %)"]
     status = with_status().status.assign_coords(epsilon=EPS)[:, 1]
-    np.testing.assert_array_equal(array_of(plot.failure_map(status)), status.values[None])
+    same(array_of(plot.failure_map(status)), status.values[None])
 
 
 def test_a_single_failure_is_not_hidden_in_its_pixel():
@@ -216,8 +192,8 @@ def test_a_single_failure_is_not_hidden_in_its_pixel():
     assert (shown > 0).sum() == 2
     axis = plot.failure_map(status, reduce="fraction", pixels=(10, 10))
     values = array_of(axis).T
-    np.testing.assert_allclose(values[5, 5], 1.0)
-    np.testing.assert_allclose(values[1, 1], 1 / 24)
+    close(values[5, 5], 1.0)
+    close(values[1, 1], 1 / 24)
     assert (values > 0).sum() == 2
     assert texts(axis) == ["not computed: 60 of 2400 (2.5 %)"]
 
@@ -227,14 +203,11 @@ def test_fitted_slopes_against_polyfit():
     noisy[1, 2], noisy[4, 2], noisy[2, 0] = np.nan, 0.0, -1.0
     noisy[1:, 4] = np.nan
     axis = plot.slope_map(noisy)
-    found = axis.lines[0].get_ydata()
-    for i in range(4):
-        y = noisy.values[:, i]
+    slopes = axis.lines[0].get_ydata()
+    for slope, y in zip(slopes[:4], noisy.values.T, strict=False):
         good = y > 0
-        want = np.polyfit(np.log(EPS[good]), np.log(y[good]), 1)[0]
-        np.testing.assert_allclose(found[i], want, rtol=1e-12)
-    assert np.isnan(found[4])
-    assert axis.get_ylabel() == "slope of log drift over log ε"
+        close(slope, np.polyfit(np.log(EPS[good]), np.log(y[good]), 1)[0], rtol=1e-12)
+    assert np.isnan(slopes[4])
     assert texts(axis) == ["no slope: 1 of 5 (20 %)"]
 
 
@@ -242,12 +215,12 @@ def test_local_slopes_lie_between_the_points():
     data = drift(1) + 1e3 * drift(3)
     axis = plot.slope_map(data, x="epsilon", y="x")
     want = np.diff(np.log(data.values), axis=0) / np.diff(np.log(EPS))[:, None]
-    np.testing.assert_allclose(array_of(axis), want.T, rtol=1e-12)
+    close(array_of(axis), want.T, rtol=1e-12)
     assert 1 < want.min() < 2 < want.max() < 3
     edges = axis.collections[0].get_coordinates()[0, :, 0]
-    np.testing.assert_allclose(edges, EPS)
+    close(edges, EPS)
     other = plot.slope_map(data, local=True, y="x")
-    np.testing.assert_array_equal(array_of(other), array_of(axis))
+    same(array_of(other), array_of(axis))
 
 
 def test_slopes_leave_out_0_and_numbers_below_the_floor():
@@ -260,9 +233,9 @@ def test_slopes_leave_out_0_and_numbers_below_the_floor():
 def test_slopes_over_two_dimensions():
     orders = np.asarray([1.0, 2.0, 3.0])
     data = xr.concat([drift(k) for k in orders], xr.IndexVariable("k", [0, 1, 2]))
-    np.testing.assert_allclose(array_of(plot.slope_map(data)), np.broadcast_to(orders, (5, 3)))
+    close(array_of(plot.slope_map(data)), np.broadcast_to(orders, (5, 3)))
     axis = plot.slope_map(data, x="k", over="x", reduce="median")
-    np.testing.assert_allclose(axis.lines[0].get_ydata(), orders)
+    close(axis.lines[0].get_ydata(), orders)
 
 
 class Counted(BackendArray):
@@ -307,7 +280,7 @@ REDUCED = {"max": np.nanmax, "min": np.nanmin, "mean": np.nanmean, "median": np.
 
 
 @pytest.mark.parametrize("reduce", REDUCED)
-@pytest.mark.parametrize("block", [1000, 3777, 2**21])
+@pytest.mark.parametrize("block", [3777, 2**21])
 def test_a_reduced_map_is_the_reduction_of_the_whole(monkeypatch, reduce, block):
     monkeypatch.setattr(blocks, "BLOCK", block)
     _, data = lazily((60, 5, 41), ("a", "k", "b"), lambda i, k, j: rough(i, j, k))
@@ -318,10 +291,8 @@ def test_a_reduced_map_is_the_reduction_of_the_whole(monkeypatch, reduce, block)
         [REDUCED[reduce](whole[ends[y] : ends[y + 1], 5 * x : 5 * x + 5]) for x in range(12)]
         for y in range(7)
     ]
-    np.testing.assert_allclose(array_of(axis), want, rtol=1e-13)
+    close(array_of(axis), want, rtol=1e-13)
     assert texts(axis) == [f"no number: {np.isnan(whole).sum()} of 12300 (9.1 %)"]
-    other = np.asarray(want) * (1 + 1e-9)
-    assert not np.allclose(array_of(axis), other, rtol=1e-13, atol=0)
 
 
 @pytest.mark.parametrize("reduce", REDUCED)
@@ -331,7 +302,7 @@ def test_reduced_points_out_of_order(monkeypatch, reduce):
     _, data = lazily((90, 40), ("a", "b"), rough, {"a": values})
     axis = plot.sweep_map(data, reduce=reduce, pixels=(9, 40))
     whole = data.values[np.argsort(values)].reshape(9, 10, 40)
-    np.testing.assert_allclose(array_of(axis), REDUCED[reduce](whole, axis=1).T, rtol=1e-13)
+    close(array_of(axis), REDUCED[reduce](whole, axis=1).T, rtol=1e-13)
 
 
 def test_memory_is_one_block_however_large_the_grid(monkeypatch):
@@ -345,16 +316,15 @@ def test_memory_is_one_block_however_large_the_grid(monkeypatch):
     assert source.largest <= 2**18
     assert peak < 12 * 2**18 * 8 < source.total * 8 / 6
     want = 40 * np.arange(1, 51) * 250 * np.arange(1, 41)[:, None]
-    np.testing.assert_array_equal(array_of(axis), want)
+    same(array_of(axis), want)
 
 
 def test_a_dimension_without_values_costs_nothing_for_its_length(monkeypatch):
     """10¹² points: their axis, pixels and selections are made without a list of them."""
     source, data = lazily((3, 10**12), ("a", "b"), lambda i, j: (i + 1.0) * (j + 1.0))
-    found = grid.arrange(data, "b", "a", {"pixels": (400, 300)})
-    assert found.x.edges[-1] == 10**12 - 0.5
-    chosen = slice(10**11, 10**11 + 5)
-    np.testing.assert_array_equal(found.x.bins.pixels(chosen), [40] * 5)
+    arranged = grid.arrange(data, "b", "a", {"pixels": (400, 300)})
+    assert arranged.x.edges[-1] == 10**12 - 0.5
+    same(arranged.x.bins.pixels(slice(10**11, 10**11 + 5)), [40] * 5)
     assert source.total == 0
 
 
@@ -368,7 +338,7 @@ def test_what_lies_in_chunks_is_read_in_chunks(monkeypatch):
     for dim, chunk, most in (("a", 4, 4), ("b", 120, 240)):
         assert {s[dim].start % chunk for s in read} == {0}
         assert max(s[dim].stop - s[dim].start for s in read) == most
-    np.testing.assert_array_equal(array_of(plot.sweep_map(data, pixels=(5, 50))), plain)
+    same(array_of(plot.sweep_map(data, pixels=(5, 50))), plain)
     assert (source.largest, source.total) == (960, 25_000)
     data.encoding["preferred_chunks"] = {"a": 4, "b": 500}  # more than a block
     assert max(s["b"].stop for s in blocks.selections(data, {})) == 2500
@@ -379,7 +349,7 @@ def test_what_lies_in_chunks_is_read_in_chunks(monkeypatch):
 def test_a_median_that_is_too_large_is_refused(monkeypatch):
     monkeypatch.setattr(blocks, "BLOCK", 100)
     _, data = lazily((60, 40), ("a", "b"), rough)
-    with pytest.raises(ValueError, match=r"all numbers of a pixel .*got 240.*mean"):
+    with pytest.raises(ValueError, match=r"at most 100 numbers in a pixel, got 240.*mean"):
         plot.sweep_map(data, reduce="median", pixels=(10, 1))
     plot.sweep_map(data, reduce="median", pixels=(10, 40))
 
@@ -391,7 +361,7 @@ def test_slopes_of_more_points_than_pixels(monkeypatch):
         (7, 100), ("epsilon", "b"), lambda i, j: EPS[i] ** orders[j], {"epsilon": EPS}
     )
     axis = plot.slope_map(data, pixels=(20, 5))
-    np.testing.assert_allclose(axis.lines[0].get_ydata(), orders.reshape(20, 5).mean(1))
+    close(axis.lines[0].get_ydata(), orders.reshape(20, 5).mean(1))
     assert source.largest == 70
 
 
@@ -425,7 +395,7 @@ def test_a_store_is_read_in_blocks(tmp_path, monkeypatch):
     monkeypatch.setattr(blocks, "BLOCK", 60)
     data = dvi.open_sweep(tmp_path / "s").to_xarray()
     axis = plot.sweep_map(data.drift, pixels=(20, 5))
-    np.testing.assert_array_equal(array_of(axis), whole.reshape(20, 10, 5).max(1).T)
+    same(array_of(axis), whole.reshape(20, 10, 5).max(1).T)
     assert axis.figure.axes[1].get_ylabel() == "largest drift"
     assert max(r.size for r in read) == 60
     assert sum(r.size for r in read) == 1000
@@ -438,25 +408,24 @@ def test_invalid_input_is_rejected():
     three = xr.DataArray(np.ones((2, 3, 4)), dims=("a", "b", "c"), name="v")
     two, many = three[0], xr.DataArray(np.ones((40, 2, 2)))
     status, ax = with_status().status.expand_dims(k=2), plt.subplots()[1]
-    left = r"also has 'c'.*isel\(c=0\).*over=\['c'\].*facet"
     refuses(
         plot.sweep_map,
-        ((drift(), "y"), {}, r"x must be a dim.*got 'y'.*epsilon \(7\), x"),
-        ((three,), {}, left),
-        ((three, "a", "a"), {}, "y and x must use different .*both use 'a'"),
-        ((three, "a"), {"over": "a"}, "both use 'a'"),
-        ((three[:, :0],), {}, "got size 0 along 'b'"),
+        ((drift(), "y"), {}, r"x must be one of .*epsilon \(7\), x .*got 'y'"),
+        ((three,), {}, r"also has 'c'.*isel\(c=0\).*over=\['c'\].*facet"),
+        ((three, "a", "a"), {}, "y and x must use different .*got 'a' for both"),
+        ((three, "a"), {"over": "a"}, "got 'a' for both"),
+        ((three[:, :0],), {}, "data along 'b' is empty"),
         ((three[0, 0, 0],), {}, "have a dimension of size 2 .*used: none"),
         ((two,), {"reduce": "sum"}, "one of 'max', 'min'"),
         ((two,), {"pixels": 3}, "pixels must be"),
         ((two,), {"limits": (2, 1)}, "two increasing numbers"),
-        ((-two,), {"log": True}, r"log=True is not allowed .* is -\d"),
+        ((-two,), {"log": True}, r"log=True requires .*got -\d"),
         ((np.ones(3),), {}, "must be an xarray.DataArray", TypeError),
         ((with_status(),), {}, "one variable.*drift, status", TypeError),
         ((two + 1j,), {}, "real numbers, got .* complex128", TypeError),
-        ((three,), {"facet": "a", "ax": ax}, "leave out ax or facet"),
+        ((three,), {"facet": "a", "ax": ax}, "leave out ax"),
         ((many,), {"facet": "dim_0"}, r"40 values.*at most 16.*slice\(None, None, 3\)"),
-        ((drift(),), {"status": status}, "select the same values in both"),
+        ((drift(),), {"status": status}, "the same sweep and selection"),
     )
     refuses(
         plot.failure_map,
@@ -466,9 +435,10 @@ def test_invalid_input_is_rejected():
     local = {"x": "x", "y": "k", "local": True}
     refuses(
         plot.slope_map,
-        ((drift(), "h"), {}, "along must be a dimension .*got 'h'"),
-        ((three, "a"), {}, "along='a' must have numbers.* has no coordinate values"),
-        ((drift(),), {"facet": "epsilon"}, "must not use the dimension 'epsilon', got 'epsilon'"),
-        ((drift()[:1],), {}, "at least two positive values"),
+        ((drift(), "h"), {}, "along must be one of .*got 'h'"),
+        ((three, "a"), {}, r"along='a' must have .*got array\(\[\]"),
+        ((drift(),), {"facet": "epsilon"}, "along='epsilon' and facet must use different"),
+        ((drift(),), {"over": "epsilon"}, "along='epsilon' and over"),
+        ((drift()[:1],), {}, "two or more positive numbers"),
         ((drift().expand_dims(k=2),), local, "needs 'epsilon' as x or y"),
     )

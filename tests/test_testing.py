@@ -29,27 +29,21 @@ def test_a_failure_says_what_was_measured_what_is_required_and_what_to_do():
     with pytest.raises(AssertionError) as raised:
         check_reversible(method)
     claim, measured, what, remedy = str(raised.value).splitlines()
-    assert claim == "Altered does not have all properties that it claims:"
+    assert claim == "AlteredMethod does not have all properties that it claims:"
     assert measured.startswith("reversal: measured 0.0")
     assert "required ≤ 1e-12" in measured
     assert what.startswith("  What is measured: max |z − z0| after ten steps")
     assert remedy.startswith("  What to do: Make the step its own adjoint")
     with pytest.raises(AssertionError, match=r"reversal: measured"):
         check_method(method, ["symplecticity", "reversal"])
-
-
-def test_a_property_that_is_not_claimed_is_measured_and_returned():
-    found = check_method(METHODS["TypeII"], ["reversal", "symplecticity"])
-    assert list(found) == ["reversal", "symplecticity"]
-    assert found["reversal"].verdict == "not claimed"
-    assert found["reversal"].value > 1e-3
-    assert found["symplecticity"].value < 1e-12
+    results = check_method(METHODS["TypeII"], ["reversal", "symplecticity"])
+    assert [result.verdict for result in results.values()] == ["not claimed", "pass"]
 
 
 def test_another_problem_takes_the_place_of_the_own_one():
     assert check_reversible(dvi.Strang(), problem("kepler")).passed
-    found = [check_reversible(dvi.TypeII(), made).value for made in (None, problem("kepler"))]
-    assert found[0] != found[1]
+    values = [check_reversible(dvi.TypeII(), made).value for made in (None, problem("kepler"))]
+    assert values[0] != values[1]
 
 
 def test_an_order_is_measured_on_its_own_problem():
@@ -76,12 +70,6 @@ def test_unknown_checks_are_refused(checks, error):
 def test_symplectic_defect():
     assert testing.symplectic_defect(np.eye(4)) == 0
     assert testing.symplectic_defect(np.diag([2.0, 1.0])) == 1
-
-
-def test_importing_the_package_imports_no_checks():
-    code = "import sys, dvi_jax; print({'pytest', 'dvi_jax.testing'} & set(sys.modules))"
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert out.stdout == "set()\n"
 
 
 @pytest.mark.slow

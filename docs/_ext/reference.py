@@ -389,7 +389,7 @@ class EquationMap(SphinxDirective):
         for equation in EQUATIONS:
             code = ", ".join(f"`{_as_written(name)}`" for name in equation.code)
             note = equation.note or "as printed"
-            cells = (f"({equation.number})", equation.what, note, code)
+            cells = (f"({equation.number})", equation.statement, note, code)
             rows.append("| " + " | ".join(literally(c).replace("|", r"\|") for c in cells) + " |")
         holder = nodes.container()
         self.state.nested_parse(rows, 0, holder)

@@ -48,7 +48,7 @@ class DiscreteMap(diffrax.AbstractSolver):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         del solver_state, made_jump
         q0, p0 = y0
-        term, direction = unwrapped(terms)
+        term, direction = term_and_direction(terms)
         # One step of `integrate`, so that its arithmetic and its status are the same.
         step = {"t0": direction * t0, "h": direction * (t1 - t0), "num_steps": 1, "args": args}
         options: Any = {
@@ -64,13 +64,13 @@ class DiscreteMap(diffrax.AbstractSolver):
             name: terms.prod(terms.vf(t, y, args), terms.contr(t0, t1))
             for name, t, y in (("k0", t0, y0), ("k1", t1, y1))
         }
-        return y1, None, {"y0": y0, "y1": y1, **slopes}, None, promoted(solution.result)
+        return y1, None, {"y0": y0, "y1": y1, **slopes}, None, diffrax_status(solution.result)
 
     def func(self, terms, t0, y0, args):
         return terms.vf(t0, y0, args)
 
 
-def unwrapped(terms: Any) -> tuple[DiscreteTerm, Any]:
+def term_and_direction(terms: Any) -> tuple[DiscreteTerm, Any]:
     """The term itself and the direction of time, 1 or −1."""
     if isinstance(terms, DiscreteTerm):
         return terms, 1
@@ -78,7 +78,7 @@ def unwrapped(terms: Any) -> tuple[DiscreteTerm, Any]:
     return terms.term, terms.direction
 
 
-def promoted(result: dvi.RESULTS) -> Any:
+def diffrax_status(result: dvi.RESULTS) -> Any:
     """The status of diffrax for one of ours."""
     theirs: Any = diffrax.RESULTS
     status: Any = theirs.nonlinear_divergence

@@ -6,8 +6,9 @@ import jax.numpy as jnp
 
 import dvi_jax as dvi
 
-from .extras import expect, needed
-from .fields import checked
+from ..base.checks import instance
+from .extras import require
+from .fields import system_and_strength
 
 if TYPE_CHECKING:
     from .diffrax_classes import DiscreteMap, DiscreteTerm
@@ -24,10 +25,10 @@ def diffrax_term(system: Any, epsilon: Any = None) -> "DiscreteTerm":
 
     **Raises** `ImportError` without diffrax, `TypeError` for another object than a system.
     """
-    needed("diffrax", "interop.diffrax_term")
+    require("diffrax", "interop.diffrax_term")
     from .diffrax_classes import DiscreteTerm
 
-    system, epsilon = checked(system, epsilon)
+    system, epsilon = system_and_strength(system, epsilon)
     return DiscreteTerm(system, jnp.asarray(epsilon, float))
 
 
@@ -62,9 +63,9 @@ def diffrax_solver(
 
     **Raises** `ImportError` without diffrax; `TypeError` for another method or root solver.
     """
-    expect("method", method, dvi.Method, "a method such as dvi.Strang()")
-    expect("root_finder", root_finder, dvi.RootSolver, "a root solver such as dvi.Newton()")
-    needed("diffrax", "interop.diffrax_solver")
+    instance("method", method, dvi.Method, "a method such as dvi.Strang()")
+    instance("root_finder", root_finder, dvi.RootSolver, "a root solver such as dvi.Newton()")
+    require("diffrax", "interop.diffrax_solver")
     from .diffrax_classes import DiscreteMap
 
     return DiscreteMap(method, root_finder)

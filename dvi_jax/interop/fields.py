@@ -34,7 +34,7 @@ def vector_field(system: Any, epsilon: Any = None) -> Callable[[Any, Any, Any], 
     **Accuracy** round-off. ``dvi.from_lagrangian`` divides by t1 − t0 and has no H_D(t, t, …): its
     field is NaN everywhere. With ``slow_time=True`` t is the time itself, and H_D receives εt.
     """
-    system, epsilon = checked(system, epsilon)
+    system, epsilon = system_and_strength(system, epsilon)
     push = dvi.ConstraintForce().bind(system, epsilon)
 
     def field(t, y, args):
@@ -54,18 +54,14 @@ def as_pair(y: Any) -> tuple[Any, Any]:
     """A state (q, p) as two arrays of one shape."""
     if not (isinstance(y, tuple | list) and len(y) == 2):
         size = f" of length {len(y)}" if isinstance(y, tuple | list) else ""
-        raise TypeError(
-            f"the state y or y0 must be a pair (q0, p0), got type {type(y).__name__}{size}."
-        )
+        raise TypeError(f"y or y0 must be a pair (q0, p0), got type {type(y).__name__}{size}.")
     q, p = (jnp.asarray(x) for x in y)
     if q.shape != p.shape:
-        raise ValueError(
-            f"q0 and p0 in y or y0 must have the same shape, got {q.shape} and {p.shape}."
-        )
+        raise ValueError(f"q0 and p0 in y or y0 must have one shape, got {q.shape} and {p.shape}.")
     return q, p
 
 
-def checked(system: Any, epsilon: Any) -> tuple[dvi.System, Any]:
+def system_and_strength(system: Any, epsilon: Any) -> tuple[dvi.System, Any]:
     """The system and ε. Warns, as `integrate` does, if ε is known to have no effect."""
     system = system_of(system)
     epsilon = system.strength(epsilon)

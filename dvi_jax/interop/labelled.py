@@ -9,15 +9,16 @@ import numpy as np
 
 import dvi_jax as dvi
 
+from ..base.checks import instance
 from ..base.inputs import refuse_unit_or_mask
-from .extras import expect, needed
+from .extras import require
 
 _STATUSES = ("successful", "not_converged", "not_finite", "bad_step_size")
 _STATUSES += ("no_root", "out_of_range", "stopped", "not_reached", "step_control_failed")
 _STATUSES += ("inconsistent", "redundant", "lost")
 """Names of `RESULTS`, by the number of each in a dataset, as in that of a sweep."""
 
-_TAKEN = ("t", "q", "p", "h", "status", "time", "save", "step")
+_RESERVED_NAMES = ("t", "q", "p", "h", "status", "time", "save", "step")
 
 
 def to_xarray(
@@ -62,22 +63,21 @@ def to_xarray(
     import xarray as xr
 
     hint = "For a sweep call sweep.to_xarray(). For a UnitSolution s give s.solution and units=."
-    expect("solution", solution, dvi.Solution, "a dvi.Solution", hint)
+    instance("solution", solution, dvi.Solution, "a dvi.Solution", hint)
     dims = (dims,) if isinstance(dims, str) else tuple(dims)
     if solution.result.is_traced():
         raise TypeError(
-            "solution must have numerical values, but inside jax.jit, jax.vmap and jax.grad it has "
-            "only JAX tracers. Return solution, and call to_xarray outside of jit, vmap and grad."
+            "solution must have numbers, got JAX tracers: call to_xarray outside of jit and vmap."
         )
     ts, hs = np.asarray(solution.ts), np.asarray(solution.hs)
     *batch, count = ts.shape
     if len(dims) != len(batch):
-        alias = f"one name for each batch dimension of solution, of sizes {tuple(batch)}, with the "
-        alias += "name for the outermost vmap first"
-        alias = alias if batch else "solution is a single trajectory, without batch dimensions"
-        raise ValueError(f"the length of dims must be {len(batch)}: {alias}. Got dims={dims}.")
+        sizes = tuple(batch)
+        raise ValueError(
+            f"dims must have {len(batch)} names, of axes of sizes {sizes}, got {dims}."
+        )
     for name in dims:
-        _check_free("dims", name, name in _TAKEN or dims.count(name) > 1)
+        _check_free("dims", name, name in _RESERVED_NAMES or dims.count(name) > 1)
     rows = ts.reshape(-1, count)
     alike = bool(np.isfinite(rows).all() and (rows == rows[:1]).all())
     axis, index = ("time", rows[0]) if alike else ("save", np.arange(count))
@@ -90,27 +90,28 @@ def to_xarray(
 
     def add(name: str, axes: Sequence[str], value: Any) -> None:
         first = name.partition(".")[0]
-        name_in_use = first if first in _TAKEN else name
-        _check_free("observe of dvi.integrate", name_in_use, first in _TAKEN or name in variables)
+        name_in_use = first if first in _RESERVED_NAMES else name
+        _check_free(
+            "observe of dvi.integrate", name_in_use, first in _RESERVED_NAMES or name in variables
+        )
         variables[name] = ((*dims, *axes), np.asarray(value))
 
     for name, value, per_step in _observed(solution.observed, observe):
         own_shape = value.shape[len(dims) :]
         if per_step and own_shape[:1] != hs.shape[-1:]:
             raise ValueError(
-                "observe must be the same as for integrate. With this observe, "
-                f"{name!r} has one value per step, so the first axis of its values has length "
-                f"{hs.shape[-1]}, but in solution its values have shape {own_shape}."
+                "observe must be the same as for integrate: "
+                f"{name!r} has values of {hs.shape[-1]} steps, got shape {own_shape}."
             )
         front = [step] * per_step
-        add(name, [*front, *_own(name, own_shape[len(front) :])], value)
+        add(name, [*front, *_dims_of(name, own_shape[len(front) :])], value)
     flags: dict[str, Any] = {"flag_values": np.arange(len(_STATUSES), dtype=np.int8)}
     flags |= {"flag_meanings": " ".join(_STATUSES)}
     matches = [np.asarray(solution.result == getattr(dvi.RESULTS, name)) for name in _STATUSES]
     variables["status"] = (dims, np.argmax(matches, axis=0).astype(np.int8), flags)
     for name, value in solution.stats.items():
         if name != "num_steps":
-            add(name, _own(name, np.shape(value)[len(batch) :]), value)
+            add(name, _dims_of(name, np.shape(value)[len(batch) :]), value)
     for name, value in zip("tqp", solution.stop or (), strict=False):
         add(f"stop_{name}", [] if name == "t" else of_state, value)
     for name, values in (coords or {}).items():
@@ -150,11 +151,11 @@ def to_inference_data(samples: dvi.Samples, observed: Any = None) -> Any:
     import xarray as xr
 
     hint = "For trajectories use interop.to_xarray."
-    expect("samples", samples, dvi.Samples, "a result of dvi.sample", hint)
+    instance("samples", samples, dvi.Samples, "a result of dvi.sample", hint)
     try:
-        arviz = needed("arviz", "interop.to_inference_data")
+        arviz = require("arviz", "interop.to_inference_data")
     except ImportError:
-        arviz = needed("arviz_base", "interop.to_inference_data")
+        arviz = require("arviz_base", "interop.to_inference_data")
     tree = samples.to_xarray()
     groups = {name: tree[name].to_dataset() for name in tree.children}
     steps = np.asarray(samples.steps)
@@ -166,16 +167,19 @@ def to_inference_data(samples: dvi.Samples, observed: Any = None) -> Any:
         arcs = list(observed) if isinstance(observed, list | tuple) else [observed]
         arrays, where = {}, {}
         for i, arc in enumerate(arcs):
-            expect("observed", arc, dvi.Observations, "dvi.Observations, or a list of these")
+            instance("observed", arc, dvi.Observations, "dvi.Observations, or a list of these")
             end = "" if len(arcs) == 1 else f"_{i}"
             values, name_of_values = np.asarray(arc.values), f"values{end}"
-            arrays[name_of_values] = ((f"ts{end}", *_own(name_of_values, values.shape[1:])), values)
+            arrays[name_of_values] = (
+                (f"ts{end}", *_dims_of(name_of_values, values.shape[1:])),
+                values,
+            )
             where[f"ts{end}"] = np.asarray(arc.ts)
         groups["observed_data"] = xr.Dataset(arrays, where)
-    about = {"inference_library": "dvi_jax", "inference_library_version": dvi.__version__}
-    about |= {"sampler": "NUTS of numpyro", "status": samples.status}
+    attributes = {"inference_library": "dvi_jax", "inference_library_version": dvi.__version__}
+    attributes |= {"sampler": "NUTS of numpyro", "status": samples.status}
     for group in groups.values():
-        group.attrs.update(about)
+        group.attrs.update(attributes)
     if hasattr(arviz, "InferenceData"):  # version 0.x, later ones take trees
         return arviz.InferenceData(**groups)
     return xr.DataTree.from_dict(groups)
@@ -183,10 +187,7 @@ def to_inference_data(samples: dvi.Samples, observed: Any = None) -> Any:
 
 def _check_free(where: str, name: str, is_taken: bool) -> None:
     if is_taken:
-        raise ValueError(
-            f"in the dataset the name {name!r} is already in use by another variable or dimension: "
-            f"choose another name in {where}."
-        )
+        raise ValueError(f"{where} has the name {name!r}, which is already in use: choose another.")
 
 
 def _components(
@@ -194,19 +195,18 @@ def _components(
 ) -> tuple[tuple[str, ...], dict[str, Any]]:
     """Names of the axes of a state, and labels along them."""
     if components is None:
-        return tuple(_own("component", shape)), {}
+        return tuple(_dims_of("component", shape)), {}
     if not isinstance(components, Mapping):
         components = {"component": components}
     sizes = tuple(len(labels) for labels in components.values())
     if sizes != tuple(shape):
         raise ValueError(
-            "components must have a list of labels for each axis of q, with one label for each "
-            f"index. Got lists of lengths {sizes}, but at each time q has the shape {tuple(shape)}."
+            f"components must have labels of all axes of q, shape {tuple(shape)}, got {sizes}."
         )
     return tuple(components), {name: list(labels) for name, labels in components.items()}
 
 
-def _own(name: str, shape: tuple[int, ...]) -> list[str]:
+def _dims_of(name: str, shape: tuple[int, ...]) -> list[str]:
     """Names for the dimensions that are a variable's own."""
     word = name if name == "component" else f"{name}_dim"
     return [word] if len(shape) == 1 else [f"{word}_{i}" for i in range(len(shape))]
@@ -218,17 +218,19 @@ def _observed(observed: Any, observe: Any) -> list[tuple[str, np.ndarray, bool]]
     def is_observable(x: Any) -> bool:
         return x is None or callable(x) or isinstance(x, dvi.Reduction | dvi.Running)
 
-    def flags_of(f: Any, found: Any) -> Any:
-        return jax.tree.map(lambda _: f is not None and not isinstance(f, dvi.Reduction), found)
+    def flags_of(observable: Any, values: Any) -> Any:
+        return jax.tree.map(
+            lambda _: observable is not None and not isinstance(observable, dvi.Reduction), values
+        )
 
     try:
         # Without `observe` one None applies to all.
         flags = jax.tree.map(flags_of, observe, observed, is_leaf=is_observable)
     except ValueError:
-        given = jax.tree.structure(observe, is_leaf=is_observable)
+        structure = jax.tree.structure(observe, is_leaf=is_observable)
         raise ValueError(
-            f"observe must be the same as for integrate. Its structure is {given}, but that of "
-            f"solution.observed is {jax.tree.structure(observed)} (each * is one leaf)."
+            f"observe must be the same as for integrate, got the structure {structure} for "
+            f"{jax.tree.structure(observed)}."
         ) from None
     arrays = jax.tree.leaves_with_path(observed, is_leaf=eqx.is_array)
     names = [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in arrays]

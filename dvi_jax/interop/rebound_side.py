@@ -10,6 +10,7 @@ import numpy as np
 
 import dvi_jax as dvi
 
+from ..base.checks import instance, positive
 from ..base.inputs import refuse_unit_or_mask
 from ..systems import Problem
 from ..systems._problem import at_end
@@ -23,7 +24,7 @@ from ..systems.n_body import (
     linear_momentum,
     symmetries,
 )
-from .extras import expect, needed
+from .extras import require
 
 _NEWTONIAN = ("basic", "compensated", "jacobi", "mercurius", "trace")
 """Modules for gravity that evaluate Newton's law in full, whichever way they order the sums."""
@@ -110,30 +111,28 @@ def from_rebound(
 
     **Source** Rein & Liu 2012, *Astron. Astrophys.* 537, A128.
     """
-    rebound = needed("rebound", "interop.from_rebound")
+    rebound = require("rebound", "interop.from_rebound")
     if isinstance(simulation, str | PathLike):
         if not Path(simulation).is_file():
             raise FileNotFoundError(
-                "simulation must be a rebound.Simulation or the path of a Simulationarchive, but "
-                f"there is no file at the path {str(simulation)!r}. Check the path."
+                "simulation must be the path of a Simulationarchive, got no file at the path "
+                f"{str(simulation)!r}."
             )
         try:
             simulation = rebound.Simulation(str(simulation), snapshot=snapshot)
         except (RuntimeError, ValueError) as error:
             raise ValueError(
-                f"REBOUND cannot read snapshot {snapshot} of {str(simulation)!r}. Check that the "
-                "file is a Simulationarchive, and give the number of one of its snapshots: 0 for "
-                f"the first, −1 for the last. Cause: {error}"
+                f"REBOUND cannot read snapshot {snapshot} of {str(simulation)!r} (0: the first, "
+                f"−1: the last): {error}"
             ) from None
         simulation.synchronize()  # a snapshot may have been taken between half steps
     elif snapshot != -1 and isinstance(simulation, rebound.Simulation):
         raise ValueError(
-            "snapshot can only be used if simulation is the path of a Simulationarchive, got "
-            f"snapshot={snapshot} with a rebound.Simulation: leave snapshot out."
+            f"snapshot requires the path of a Simulationarchive, got {snapshot} with a Simulation."
         )
     description = "a rebound.Simulation, or the path of a Simulationarchive"
     hint = "For snapshot i of an open archive give archive[i]."
-    expect("simulation", simulation, rebound.Simulation, description, hint)
+    instance("simulation", simulation, rebound.Simulation, description, hint)
     _check_convertible(simulation)
     numbers = _finite("the simulation", simulation, ("t", "dt", "G", "softening"))
     names = tuple(_name(b) for b in simulation.particles)
@@ -179,8 +178,8 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
     `ValueError` for another system than Newton's N bodies or one with a force or a perturbation,
     for shapes that do not agree and for values that are not finite; `ImportError` without rebound.
     """
-    rebound = needed("rebound", "interop.to_rebound")
-    expect("problem", problem, Problem, "a problem of dvi_jax.systems or of from_rebound")
+    rebound = require("rebound", "interop.to_rebound")
+    instance("problem", problem, Problem, "a problem of dvi_jax.systems or of from_rebound")
     system, args = problem.system, problem.args
     differences = {
         "another Hamiltonian": system.H_D not in (hamiltonian, softened_hamiltonian),
@@ -190,14 +189,11 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
     }
     if any(differences.values()):
         raise ValueError(
-            "problem must be N bodies under Newton's law, such as systems.n_body(), but "
-            f"{problem.name} has {' and '.join(name for name in differences if differences[name])}."
+            f"problem must be N bodies under Newton's law, got {problem.name} with "
+            f"{' and '.join(name for name in differences if differences[name])}."
         )
     if (q is None) != (p is None):
-        raise TypeError(
-            f"q and p must be given together, got only {'p' if q is None else 'q'}: give both, or "
-            "leave both out."
-        )
+        raise TypeError(f"give both q and p, or none; got only {'p' if q is None else 'q'}.")
     masses = np.asarray(args["masses"], float)
     theirs = problem if isinstance(problem, ReboundProblem) else None
     velocities = theirs.velocities if theirs is not None and q is None else None
@@ -207,11 +203,7 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
     t = float(t if t is not None else theirs.t0 if theirs is not None else 0.0)
     check_bodies(q, p, args)
     for name, values in (("q", q), ("p", p), ("t", np.array(t))):
-        if (bad := ~np.isfinite(values)).any():
-            raise ValueError(
-                f"{name} must be finite, got {values[bad][0]}. If a run failed, its states after "
-                "the failure are NaN: give an earlier state."
-            )
+        _check_finite(name, values)
     v = p / masses[:, None]
     if velocities is not None and np.array_equal(p, masses[:, None] * np.asarray(velocities)):
         v = np.asarray(velocities, float)  # neither p0 nor the masses have been replaced
@@ -247,28 +239,30 @@ def _check_convertible(sim: Any) -> None:
             features.append(f"{field} = {value!r} (allowed: {', '.join(map(repr, choices))})")
     if str(sim.integrator) == "sei":
         features.append("the shearing sheet, integrator sei (see the system hill)")
+    if not sim.is_synchronized:
+        features.append("a state in the middle of a step (call sim.synchronize())")
+    if sim.N == 0:
+        features.append("no bodies (call sim.add(...))")
     if features:
         raise ValueError(
-            f"from_rebound cannot convert these features of the simulation: {'; '.join(features)}. "
-            "Remove them in REBOUND, and convert again. A copy made by sim.copy() has no "
-            "callbacks, such as additional_forces or heartbeat."
+            f"from_rebound cannot convert a simulation with {'; '.join(features)}. Remove this, or "
+            "convert sim.copy(), which has no callbacks."
         )
-    if not sim.is_synchronized:
-        raise ValueError("the simulation is in the middle of a step: call sim.synchronize() first.")
-    if sim.N == 0:
-        raise ValueError("the simulation has no bodies: add some with sim.add(...).")
 
 
 def _finite(owner: str, source: Any, fields: Sequence[str]) -> dict[str, float]:
     """Numbers of a simulation or a body, which must be finite."""
     numbers = {name: float(getattr(source, name)) for name in fields}
     for name, value in numbers.items():
-        if not np.isfinite(value):
-            raise ValueError(
-                f"{name} of {owner} is {value}, but must be a finite number. If the simulation "
-                "failed, use a snapshot from before the failure. Otherwise correct the number."
-            )
+        _check_finite(f"{name} of {owner}", np.array(value))
     return numbers
+
+
+def _check_finite(name: str, values: np.ndarray) -> None:
+    if (bad := ~np.isfinite(values)).any():
+        raise ValueError(
+            f"{name} must be finite, got {values[bad][0]}: give a state before the failure."
+        )
 
 
 def _with_mass(sim: Any, masses: np.ndarray, massless: float | None) -> np.ndarray:
@@ -278,24 +272,18 @@ def _with_mass(sim: Any, masses: np.ndarray, massless: float | None) -> np.ndarr
     heavy = np.flatnonzero(masses[active:]) + active
     if heavy.size and (sim.testparticle_type == 0 or len(masses) - active > 1):
         raise ValueError(
-            f"body {heavy[0]} has mass {masses[heavy[0]]:g}, but N_active = {active} makes it a "
-            "test particle, and REBOUND omits some of its attractions. The Hamiltonian of N "
-            f"bodies has all of them. Set sim.N_active = {len(masses)}, the number of all bodies, "
-            "or set the masses of all test particles to 0 and call from_rebound with massless=..."
+            f"test particles must have mass 0, got {masses[heavy[0]]:g} of body {heavy[0]} with "
+            f"N_active = {active}: set sim.N_active = {len(masses)}, or their masses to 0."
         )
     empty = masses == 0
     if not empty.any():
         return masses
     if massless is None:
         raise ValueError(
-            "every mass must be positive, because p = m v does not determine v if m = 0. Number of "
-            f"bodies with mass 0: {empty.sum()}, the first at index {int(np.argmax(empty))}. Give "
-            "them a small mass, for example: "
-            f"from_rebound(sim, massless={1e-20 * masses.max() or 1e-20:.0e})."
+            f"every mass must be positive, got {empty.sum()} of mass 0, the first at index "
+            f"{int(np.argmax(empty))}: give massless={1e-20 * masses.max() or 1e-20:.0e}."
         )
-    if not 0 < massless < np.inf:
-        raise ValueError(f"massless must be a positive and finite mass, got {massless!r}.")
-    return np.where(empty, massless, masses)
+    return np.where(empty, positive("massless", massless), masses)
 
 
 def _name(body: Any) -> Any:

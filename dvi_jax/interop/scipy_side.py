@@ -11,16 +11,17 @@ import numpy as np
 
 import dvi_jax as dvi
 
+from ..base.checks import function, positive, whole
 from ..base.inputs import refuse_unit_or_mask
 from ..systems import Problem
-from .extras import needed, system_of
+from .extras import require, system_of
 
 _JACOBIAN = "Jacobians of implicit steps are computed by autodiff. Leave this argument out"
 _ESTIMATE = (
     "The size of the steps is fixed, so that the invariants are conserved. Leave this argument "
     "out, choose h, and compare the results for h and h/2 to estimate the error"
 )
-_REJECTED = {
+_REASONS = {
     **dict.fromkeys(("rtol", "atol"), _ESTIMATE),
     **dict.fromkeys(("max_step", "min_step", "first_step"), "Give the largest step size as h"),
     **dict.fromkeys(("jac", "jac_sparsity", "lband", "uband"), _JACOBIAN),
@@ -64,7 +65,7 @@ def solve_ivp(
     events: Any = None,
     shape: tuple[int, ...] | None = None,
     root_finder: dvi.RootSolver | None = None,
-    **unsupported: Any,
+    **excess: Any,
 ) -> Any:
     r"""One trajectory with the arguments and the results of `scipy.integrate.solve_ivp`.
 
@@ -99,12 +100,12 @@ def solve_ivp(
     **Accuracy** the order of the method in h. Values are NumPy's: nothing can be differentiated
     through it; take ``dvi.integrate`` for that.
     """
-    for name in unsupported:
-        reason = _REJECTED.get(name, "Check its name: SciPy's solve_ivp does not have it either")
+    for name in excess:
+        reason = _REASONS.get(name, "Check its name: SciPy's solve_ivp does not have it either")
         raise TypeError(f"interop.solve_ivp has no argument {name!r}. {reason}.")
     for name, value in (("t_span", t_span), ("y0", y0), ("t_eval", t_eval), ("h", h)):
         refuse_unit_or_mask(name, value)
-    bunch = needed("scipy.optimize", "interop.solve_ivp").OptimizeResult
+    bunch = require("scipy.optimize", "interop.solve_ivp").OptimizeResult
     if isinstance(system, Problem):
         args = system.args if args is None else args
         shape = np.shape(system.q0) if shape is None else shape
@@ -205,24 +206,19 @@ def _span(t_span: Any, h: Any) -> tuple[float, float, int]:
         t0 = t1 = math.nan
     if not (math.isfinite(t0) and math.isfinite(t1)) or t0 == t1:
         raise ValueError(f"t_span must be two finite times (t0, t1) that differ, got {t_span!r}.")
-    step = float(h) if np.ndim(h) == 0 and np.asarray(h).dtype.kind in "iuf" else math.nan
-    if not (math.isfinite(step) and step > 0):
-        raise ValueError(
-            f"h must be a positive and finite number, got {h!r}. The order of t0 and t1 in t_span "
-            "gives the direction of time."
-        )
+    step = positive("h", h, hint="t_span gives the direction of time.")
     # 1/0.1 is 10 steps, not 11.
     return t0, t1, max(1, math.ceil(abs(t1 - t0) / step * (1 - 1e-12)))
 
 
 def _halves(y0: Any, shape: Any) -> tuple[np.ndarray, np.ndarray]:
     y0 = np.asarray(y0)
-    size = "even" if shape is None else f"twice the size of q of shape {shape}"
+    size = "even" if shape is None else f"twice that of q of shape {shape}"
     shape = (y0.size // 2,) if shape is None else tuple(np.ravel(shape).tolist())
     if y0.ndim != 1 or y0.size == 0 or y0.size != 2 * math.prod(shape):
         raise ValueError(
-            "y0 must be a one-dimensional array with all of q0 and then all of p0. Its length must "
-            f"be positive and {size}, got shape {y0.shape}."
+            f"y0 must be a vector with all of q0 and then all of p0, of {size} length, got shape "
+            f"{y0.shape}."
         )
     q0, p0 = np.split(y0, 2)
     return q0.reshape(shape), p0.reshape(shape)
@@ -231,18 +227,13 @@ def _halves(y0: Any, shape: Any) -> tuple[np.ndarray, np.ndarray]:
 def _times(t_eval: Any, t0: float, t1: float) -> np.ndarray | None:
     if t_eval is None:
         return None
-    times, low, high = np.asarray(t_eval, float), min(t0, t1), max(t0, t1)
-    if times.ndim != 1 or not ((times >= low) & (times <= high)).all():
-        text = f"{times.min()} to {times.max()}" if times.ndim == 1 else f"shape {times.shape}"
+    times, sign = np.asarray(t_eval, float), np.sign(t1 - t0)
+    fits = times.ndim == 1 and (sign * (times - t0) >= 0).all() and (sign * (t1 - times) >= 0).all()
+    if not fits or not (np.diff(times) * sign > 0).all():
+        order = "increasing" if sign > 0 else "decreasing"
         raise ValueError(
-            f"t_eval must be a one-dimensional array of times within t_span, from {low} to {high}, "
-            f"got {text}."
-        )
-    if not (rises := np.diff(times) * np.sign(t1 - t0) > 0).all():
-        order, i = "increasing" if t1 > t0 else "decreasing", int(np.argmin(rises))
-        raise ValueError(
-            f"t_eval must be strictly {order}, as t_span is, got t_eval[{i}] = {times[i]} and "
-            f"t_eval[{i + 1}] = {times[i + 1]}. Sort the times, and remove equal ones."
+            f"t_eval must be a strictly {order} vector of times within t_span, from {t0} to {t1}, "
+            f"got {times!r:.200}."
         )
     return times
 
@@ -255,29 +246,18 @@ def _method(method: Any) -> dvi.Method:
     if isinstance(method, str) and method in METHODS:
         return METHODS[method]
     raise ValueError(
-        f"method must be a dvi.Method or one of the names {', '.join(METHODS)}, got {method!r}. "
-        "For a method of SciPy call scipy.integrate.solve_ivp with fun(t, y) = "
-        "np.concatenate(field(t, np.split(y, 2), args)), where field = "
-        "interop.vector_field(system, epsilon). Such a method does not conserve the invariants."
+        f"method must be a dvi.Method or one of {', '.join(METHODS)}, got {method!r}. For one of "
+        "SciPy give interop.vector_field(system) to its solve_ivp."
     )
 
 
 def _event(event: Any) -> _Event:
-    if not callable(event):
-        raise TypeError(
-            "each of the events must be a function event(t, y) or event(t, y, args), got "
-            f"{event!r:.100}."
-        )
+    function("each of the events", event, "(t, y) or (t, y, args)")
     terminal = getattr(event, "terminal", False)
     terminal = int(terminal or 0) if isinstance(terminal, bool | None | np.bool_) else terminal
-    if not isinstance(terminal, int | np.integer) or terminal < 0:
-        raise ValueError(
-            f"terminal of the event {getattr(event, '__name__', event)} must be True, False or an "
-            f"integer of at least 0, got {terminal!r}. The run ends after that number of "
-            "crossings. With 0 or False the event does not end the run."
-        )
+    terminal = whole("terminal of an event", terminal, 0, hint="False or 0 does not end the run.")
     direction = int(np.sign(getattr(event, "direction", 0)))
-    return _Event(event, _takes_args(event), int(terminal), direction)
+    return _Event(event, _takes_args(event), terminal, direction)
 
 
 def _takes_args(event: Callable[..., Any]) -> bool:

@@ -11,8 +11,9 @@ import numpy as np
 
 import dvi_jax as dvi
 
+from ..base.checks import instance
 from ..systems import Problem
-from .extras import expect, needed, system_of
+from .extras import require, system_of
 
 _POWERS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
 
@@ -47,7 +48,7 @@ class UnitSystem:
         p: Any = "momentum",
         args: Mapping[str, Any] | None = None,
     ):
-        u = needed("astropy.units", "interop.UnitSystem")
+        u = require("astropy.units", "interop.UnitSystem")
         base_units = {"length": length, "time": time, "mass": mass}
         bases = L, T, M = [_unit(u, kind, word) for kind, word in base_units.items()]
         for kind, unit, like in zip(base_units, bases, (u.m, u.s, u.kg), strict=True):
@@ -69,9 +70,8 @@ class UnitSystem:
                 return u.CompositeUnit(1.0, parts.bases, parts.powers)
             except (AttributeError, u.UnitConversionError):  # °C, magnitudes, photons
                 raise ValueError(
-                    f"{name} cannot be in {unit}. The unit of {name} must be a constant times "
-                    "powers of m, s, kg, rad, A, K, mol and cd. Give such a unit, and convert the "
-                    f"values of {name} to it."
+                    f"the unit of {name} must be a constant times powers of m, s, kg, rad, A, K, "
+                    f"mol and cd, got {unit}."
                 ) from None
 
         units = {name: coherent(name, unit) for name, unit in (args or {}).items()}
@@ -87,15 +87,14 @@ class UnitSystem:
 
         **Raises** `ValueError` for a problem whose units are words, such as "period/2π".
         """
-        u = needed("astropy.units", "interop.UnitSystem")
-        expect("problem", problem, Problem, "a problem of dvi_jax.systems")
+        u = require("astropy.units", "interop.UnitSystem")
+        instance("problem", problem, Problem, "a problem of dvi_jax.systems")
         texts = {name: problem.units.get(name, "unknown units") for name in ("q", "p", "t")}
         read = {name: _read(u, text) for name, text in texts.items()}
         if bad := [name for name, unit in read.items() if unit is None]:
             raise ValueError(
-                f"{problem.name} measures {bad[0]} in {texts[bad[0]]!r}, but astropy has no such "
-                "unit. Call dvi.integrate with numbers, or call interop.integrate with q0, "
-                "p0, args and units=interop.UnitSystem(length, time, mass)."
+                f"{problem.name} measures {bad[0]} in {texts[bad[0]]!r}, which is not a unit of "
+                "astropy: call dvi.integrate, or give q0, p0, args and units."
             )
         brackets = {n: re.search(r"\[([^\]]*)\]\s*$", m) for n, m in problem.parameters.items()}
         args = {name: _read(u, match[1]) for name, match in brackets.items() if match}
@@ -151,8 +150,6 @@ def integrate(
     h: Any,
     num_steps: int,
     units: UnitSystem | None = None,
-    t0: Any = None,
-    epsilon: Any = None,
     args: Any = None,
     ts: Any = None,
     **options: Any,
@@ -164,9 +161,10 @@ def integrate(
 
     - `system`: a `System`; or a problem of the library, whose initial condition and parameters
       replace what is left out, in its own units, which are taken where `units` is left out too.
-    - `q0`, `p0`: quantities of the shape of the state. `h`, `t0` (zero when left out): times.
-    - `num_steps`, and `options`: as for ``dvi.integrate``. `units`: the `UnitSystem`.
-    - `epsilon`: a number. `args`: pytree; a quantity where `units` names a unit, else a number.
+    - `q0`, `p0`: quantities of the shape of the state. `h`: a time.
+    - `num_steps`, and `options`: as for ``dvi.integrate``, where `t0` is a time (zero when left
+      out) and `epsilon` a number. `units`: the `UnitSystem`.
+    - `args`: pytree; a quantity where `units` names a unit, else a number.
     - `ts`: times at which states are saved, for ``dvi.Save(ts=...)``, as a quantity.
 
     **Returns** a `UnitSolution`.
@@ -180,7 +178,7 @@ def integrate(
     units agrees to round-off. Quantities are values that cannot be traced: for `jax.grad`,
     `jax.jit` and `jax.vmap` call ``dvi.integrate`` on numbers in one system of units.
     """
-    u = needed("astropy.units", "interop.integrate")
+    u = require("astropy.units", "interop.integrate")
     problem = system if isinstance(system, Problem) else None
     system = system_of(system)
     own_units = None
@@ -188,28 +186,22 @@ def integrate(
         with suppress(*[] if units is None else [ValueError]):
             own_units = UnitSystem.of(problem)
     example = "interop.UnitSystem(length=u.au, time=u.day, mass=u.Msun, args={...})"
-    target: UnitSystem = expect("units", own_units if units is None else units, UnitSystem, example)
+    selection: Any = own_units if units is None else units
+    target: UnitSystem = instance("units", selection, UnitSystem, example)
     save, lattice = options.get("save"), options.get("lattice")
-    if isinstance(lattice, dvi.Given):
-        raise TypeError(
-            "the times in lattice=dvi.Given(ts) have no unit: call dvi.integrate with numbers."
-        )
-    if getattr(save, "ts", None) is not None:
-        raise TypeError(
-            "the times in save=dvi.Save(ts=...) have no unit: leave save out, and give the times "
-            "as a quantity, interop.integrate(..., ts=...)."
-        )
+    is_grid = isinstance(lattice, dvi.Given)
+    if is_grid or getattr(save, "ts", None) is not None:
+        source = f"lattice={lattice!r:.100}" if is_grid else f"save={save!r:.100}"
+        raise TypeError(f"the times in {source} have no unit: give ts=... to interop.integrate.")
     if ts is not None and save is not None:
-        raise TypeError(
-            f"ts and save must not be given together, got save={save!r:.100}: leave save out. "
-            "The states are saved at the times ts."
-        )
+        raise TypeError(f"ts and save exclude each other: leave save out, got {save!r:.100}.")
     if ts is not None:
         options["save"] = dvi.Save(ts=_number(u, "ts", ts, target.t))
-    q0, p0, args = _filled(u, problem, own_units, q0, p0, args)
+    q0, p0, args = _with_defaults(u, problem, own_units, q0, p0, args)
     inputs = ("q0", q0, target.q), ("p0", p0, target.p), ("h", h, target.t)
-    inputs += (("epsilon", epsilon, u.dimensionless_unscaled),)
-    inputs += () if t0 is None else (("t0", t0, target.t),)
+    inputs += (("epsilon", options.pop("epsilon", None), u.dimensionless_unscaled),)
+    if (t0 := options.pop("t0", None)) is not None:
+        inputs += (("t0", t0, target.t),)
     numbers = {name: _number(u, name, x, unit) for name, x, unit in inputs}
     numbers |= {"args": _arguments(u, args, target), "num_steps": num_steps}
     sol = dvi.integrate(system, **numbers, **options)
@@ -223,7 +215,7 @@ def integrate(
     return UnitSolution(*with_unit, observed=sol.observed, units=target, solution=sol)
 
 
-def _filled(
+def _with_defaults(
     u: Any, problem: Problem | None, basis: UnitSystem | None, q0: Any, p0: Any, args: Any
 ) -> tuple[Any, Any, Any]:
     """q0, p0 and args, in which quantities of the problem replace what was left out."""
@@ -231,11 +223,11 @@ def _filled(
         return q0, p0, args
     defaults = problem.args
     if args is not None and defaults is not None:
-        expect(f"args of {problem.name}", args, Mapping, "a mapping from name to value")
+        instance(f"args of {problem.name}", args, Mapping, "a mapping from name to value")
         if extra := [name for name in args if name not in defaults]:
             raise ValueError(
-                f"args has {extra[0]!r}, but {problem.name} has no such parameter: use only the "
-                f"names {', '.join(defaults)}."
+                f"args has {extra[0]!r}, but {problem.name} has no such parameter, only "
+                f"{', '.join(defaults)}."
             )
     if basis is None:  # the units of its numbers are not known
         return q0, p0, args
@@ -251,7 +243,7 @@ def _filled(
 
 def _arguments(u: Any, args: Any, units: UnitSystem) -> Any:
     """The same pytree with every quantity as a number."""
-    met, bare = set(), []
+    matches, bare = set(), []
 
     def number(path: Any, leaf: Any) -> Any:
         words = [str(getattr(k, "key", getattr(k, "idx", k))) for k in path]
@@ -259,31 +251,27 @@ def _arguments(u: Any, args: Any, units: UnitSystem) -> Any:
         paths = [".".join(words[:i]) for i in range(len(words), 0, -1)]
         name = paths[0] if paths else "args"
         if path_of_unit := next((x for x in paths if x in units.args), None):
-            met.add(path_of_unit)
+            matches.add(path_of_unit)
             return _number(u, f"args {name}", leaf, units.args[path_of_unit])
         if isinstance(leaf, u.Quantity) and leaf.unit != u.dimensionless_unscaled:
             key, subject = (name, f"{name} in args") if path else ("name", "args")
             advice = f'add the unit: UnitSystem(..., args={{"{key}": u.Unit("{leaf.unit}")}})'
             as_dict = "" if path else 'give args as a dict {"name": value} and '
             raise TypeError(
-                f"{subject} has the unit {leaf.unit}, but units has no unit for {name}. Give a "
-                f"number without a unit, or {as_dict}{advice}."
+                f"{subject} has the unit {leaf.unit}, but units has no unit for {name}: "
+                f"{as_dict}{advice}."
             )
         bare.append(name)
         return _number(u, f"args {name}", leaf, u.dimensionless_unscaled)
 
     numbers = jax.tree.map_with_path(number, args)
-    unmet = [name for name in units.args if name not in met]
+    unmet = [name for name in units.args if name not in matches]
     if unmet and bare:  # a mistyped name would let a bare number through
         names, bare_names = (", ".join(map(repr, group)) for group in (unmet, bare))
         kind = f"args is of type {type(args).__name__}, whose entries have no names: give a dict."
         if isinstance(args, Mapping):
-            kind = f"Entries of args without a unit: {bare_names}. Use the same names in both, or "
-            kind += f"remove {names} from UnitSystem(args=...)."
-        raise ValueError(
-            f"UnitSystem(args=...) has units for {names}, but args has no entries of these names. "
-            + kind
-        )
+            kind = f"Entries of args without a unit: {bare_names}. Use the same names in both."
+        raise ValueError(f"UnitSystem(args=...) has units for {names}, which args lacks. {kind}")
     return numbers
 
 
@@ -295,22 +283,17 @@ def _number(u: Any, name: str, entry: Any, unit: Any) -> Any:
             value = u.Quantity(entry)
         except (TypeError, u.UnitsError) as error:
             raise TypeError(
-                f"all entries of {name} must be quantities that can be converted to one unit, got "
-                f"{entry!r:.100}. Give one array with a unit, such as [1.0, 2.0] * "
-                f"u.Unit({str(unit)!r}). Cause: {error}."
+                f"all entries of {name} must be quantities in {str(unit)!r} or another such unit, "
+                f"got {entry!r:.100} ({error})."
             ) from None
     if np.any(getattr(value, "mask", False)):
-        raise ValueError(
-            f"{name} must not have masked values, got {value!r:.200}. Give valid values in their "
-            "place."
-        )
+        raise ValueError(f"{name} must not have masked values, got {value!r:.200}.")
     if not isinstance(value, u.Quantity):
         if unit == u.dimensionless_unscaled:
             return value
         fault = "is missing" if value is None else f"= {value!r:.100} has no unit"
         raise TypeError(
-            f"{name} {fault}. Give a quantity, such as {name.split()[-1]} * u.Unit({str(unit)!r}). "
-            "Other units are allowed if they can be converted to this unit."
+            f"{name} {fault}: give a quantity, such as {name.split()[-1]} * u.Unit({str(unit)!r})."
         )
     try:
         return value.to_value(unit, equivalencies=u.dimensionless_angles())
@@ -318,8 +301,8 @@ def _number(u: Any, name: str, entry: Any, unit: Any) -> Any:
         to_kelvin = f" Convert it: {name.split()[-1]}.to(u.K, u.temperature())."
         is_celsius = value.unit == u.deg_C and unit.is_equivalent(u.K)
         raise ValueError(
-            f"{name} is in {str(value.unit) or 1} ({value.unit.physical_type}), but its unit must "
-            f"be convertible to {str(unit) or 1} ({unit.physical_type}).{to_kelvin * is_celsius}"
+            f"{name} is in {str(value.unit) or 1} ({value.unit.physical_type}), but must be in "
+            f"{str(unit) or 1} ({unit.physical_type}).{to_kelvin * is_celsius}"
         ) from None
 
 
@@ -328,8 +311,10 @@ def _unit(u: Any, name: str, text_or_unit: Any) -> Any:
         return u.Unit(text_or_unit)
     except (ValueError, TypeError) as error:
         words = "" if name in ("length", "time", "mass") else ", or a word such as 'momentum'"
-        text = f"{name} must be a unit of astropy or its name{words}, got {text_or_unit!r:.100}."
-        raise ValueError(f"{text} Cause: {error}") from None
+        raise ValueError(
+            f"{name} must be a unit of astropy or its name{words}, got {text_or_unit!r:.100} "
+            f"({error})."
+        ) from None
 
 
 def _read(u: Any, text: str) -> Any:

@@ -36,10 +36,7 @@ def canvas(ax: Any, size: Any = None, space: bool = False) -> tuple[Any, bool]:
     instance("ax", ax, Axes, "the matplotlib Axes to draw on")
     if space != (ax.name == "3d"):
         raise ValueError(
-            f'the given Axes must be Axes {"with" if space else "without"} projection="3d", got '
-            f'Axes with projection="{ax.name}". Make them by figure.add_subplot('
-            + ('projection="3d"' if space else "")
-            + "), or give no Axes."
+            f'ax must be Axes {"with" if space else "without"} projection="3d", got "{ax.name}".'
         )
     return ax, False
 
@@ -62,8 +59,7 @@ def stack(
     count = len({name for row in places for name in row} - {"."})
     if len(axes) != count:
         raise ValueError(
-            f"this picture needs {count} Axes to draw on, {purpose}; got {len(axes)}. Give this "
-            "number of Axes, or none: then a new figure is made."
+            f"this picture needs {count} Axes, {purpose}, or none (a new figure); got {len(axes)}."
         )
     return axes, False
 
@@ -81,11 +77,22 @@ def at_most(limit: int, count: int, things: str, choice: str) -> None:
         raise ValueError(f"{count} {things} are too many: choose at most {limit}, e.g. {choice}.")
 
 
+def check_not_empty(name: str, things: Any, hint: str) -> None:
+    """**Raises** `ValueError` if there are none of them, with what to give."""
+    if not len(things):
+        raise ValueError(f"{name} is empty: {hint}.")
+
+
+def check_real(name: str, values: Any, kinds: str = "biuf") -> None:
+    """**Raises** `TypeError` for values that are not real numbers."""
+    if values.dtype.kind not in kinds:
+        raise TypeError(f"{name} must be real numbers, got dtype {values.dtype}.")
+
+
 def check_attributes(thing: Any, names: Sequence[str], rule: str) -> None:
     """**Raises** `TypeError` for an object without these attributes."""
     if lacking := ", ".join(name for name in names if not hasattr(thing, name)):
-        kind = type(thing).__name__
-        raise TypeError(f"{rule}; got an object of type {kind} without the attributes {lacking}.")
+        raise TypeError(f"{rule}; got type {type(thing).__name__} without attributes {lacking}.")
 
 
 def labels_of(labels: Any, count: int, things: str, name: str = "labels") -> list[str]:
@@ -95,8 +102,7 @@ def labels_of(labels: Any, count: int, things: str, name: str = "labels") -> lis
     texts = [labels] if isinstance(labels, str) else labels
     if len(texts) != count or isinstance(labels, str):
         raise ValueError(
-            f"{name} must be a list of names, one for each of the {things} ({count} in total), got "
-            f"{labels!r:.200}."
+            f"{name} must be a list of {count} names of the {things}, got {labels!r:.200}."
         )
     return [str(label) for label in texts]
 
@@ -214,7 +220,11 @@ def without_place_entries(counts: Any, total: int, invalid: str, zero: str) -> l
     """Legend entries of the marks that `without_place` draws."""
     marks = zip(counts, "xv", (invalid, zero), strict=True)
     look: Any = {"color": PALE, "ls": "none"}
-    return [entry(f"{n} of {total} {text}", marker=m, **look) for n, m, text in marks if n]
+    return [
+        entry(f"{number} of {total} {text}", marker=marker, **look)
+        for number, marker, text in marks
+        if number
+    ]
 
 
 def guide(axis: Any, x: Sequence[float], y: float, slope: float, **look: Any) -> None:

@@ -51,7 +51,7 @@ def make_bins(size: int, pixels: int, order: np.ndarray | None = None) -> Bins:
     return Bins(size, np.arange(count) * size // count, order)
 
 
-class Lines(NamedTuple):
+class LineFunction(NamedTuple):
     """Function of lines along `dim`, from shape (n, ...) to (m, ...), applied before the reduction.
 
     If `dim` is a dimension of the result it has m points there; else m = 1.
@@ -73,7 +73,7 @@ _COMBINE: dict[str, Any] = {"max": np.fmax, "min": np.fmin, "mean": np.add}
 
 
 def reduce_to_pixels(
-    data: Any, bins: Mapping[str, Bins], reduce: str, lines: Lines | None = None
+    data: Any, bins: Mapping[str, Bins], reduce: str, lines: LineFunction | None = None
 ) -> Picture:
     """The values of a `xarray.DataArray`, reduced to pixels; one block is read at a time.
 
@@ -111,24 +111,27 @@ def count_codes(data: Any, bins: Mapping[str, Bins], codes: Sequence[int]) -> np
 
 
 def blocks(
-    data: Any, bins: Mapping[str, Bins], lines: Lines | None = None, whole_pixels: bool = False
+    data: Any,
+    bins: Mapping[str, Bins],
+    lines: LineFunction | None = None,
+    whole_pixels: bool = False,
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """(number of the pixel of each point, the points), both of shape (rest, *points).
 
     `whole`: every pixel lies in one block, as a median needs it.
     """
-    shape = [len(b.starts) for b in bins.values()]
+    shape = [len(pixels_of.starts) for pixels_of in bins.values()]
     for selection in selections(data, bins, None if lines is None else lines.dim, whole_pixels):
         block = data.variable.isel(selection).values
         names = list(data.dims)
         if lines is not None:
             block = lines.function(np.moveaxis(block, names.index(lines.dim), 0))
-            names = [lines.dim, *(d for d in names if d != lines.dim)]
+            names = [lines.dim, *(dim for dim in names if dim != lines.dim)]
             selection = selection | {lines.dim: slice(None)}
-        outer = [i for i, d in enumerate(names) if d not in bins]
-        block = block.transpose(*outer, *(names.index(d) for d in bins))
+        outer = [i for i, dim in enumerate(names) if dim not in bins]
+        block = block.transpose(*outer, *(names.index(dim) for dim in bins))
         block = block.reshape(-1, *block.shape[len(outer) :])
-        places = np.ix_(*(b.pixels(selection[d]) for d, b in bins.items()))
+        places = np.ix_(*(pixels_of.pixels(selection[dim]) for dim, pixels_of in bins.items()))
         yield np.broadcast_to(np.ravel_multi_index(places, shape), block.shape), block
 
 
@@ -146,13 +149,16 @@ def selections(
         unit |= {d: int(np.diff(b.ends).max()) for d, b in bins.items() if d != line}
         if math.prod(unit.values()) > BLOCK:
             raise ValueError(
-                f"reduce='median' needs all numbers of a pixel in memory at once, at most {BLOCK}; "
-                f"got {math.prod(unit.values())}. Use reduce='mean' or more "
-                "pixels=(width, height), or select a part of the data by data.isel(...)."
+                f"reduce='median' needs at most {BLOCK} numbers in a pixel, got "
+                f"{math.prod(unit.values())}: use reduce='mean', or more pixels."
             )
     else:
-        stored = data.encoding.get("preferred_chunks") or {}
-        chunks = {d: min(stored[d], n) for d, n in sizes.items() if isinstance(stored.get(d), int)}
+        preferences = data.encoding.get("preferred_chunks") or {}
+        chunks = {
+            d: min(preferences[d], n)
+            for d, n in sizes.items()
+            if isinstance(preferences.get(d), int)
+        }
         chunks |= {line: sizes[line]} if line is not None else {}
         if len(chunks) == len(sizes) and math.prod(chunks.values()) <= BLOCK:
             unit = chunks

@@ -16,7 +16,7 @@ from PIL import Image
 
 from ..base.checks import one_of, positive
 from . import series
-from .axes import legend
+from .axes import at_most, check_not_empty, legend
 from .orbits import Plane, phase_portrait, view_of
 from .states import Lane, lanes_of, looks_of, one_shape, place_in, troubles
 from .style import CROSS, STAR, in_style, look_of
@@ -33,9 +33,9 @@ _TAIL, _GHOSTS = 300, 12
 _DOT: dict[str, Any] = {"marker": "o", "ls": "none", "ms": 6}
 _DOT |= {"mec": "black", "mew": 0.6}
 
-_VIEW = ("coordinates", "bodies", "centre", "names")
+_VIEW, _CANVAS = ("coordinates", "bodies", "centre", "names"), ("size", "dpi")
 _SECOND = {None: (), "phase_portrait": ("dof",), "invariants": ("values", "change", "log")}
-"""Keywords of `orbit`, and of the second picture."""
+"""Keywords of `orbit`, of the figure, and of the second picture."""
 
 
 @in_style
@@ -46,8 +46,6 @@ def animate(
     seconds: float = 8.0,
     fps: float = 25.0,
     tail: float = 0.2,
-    size: tuple[float, float] | None = None,
-    dpi: float = 100.0,
     progress: Callable[[int, int], Any] | None = None,
     **options: Any,
 ) -> Path:
@@ -62,7 +60,8 @@ def animate(
       and `log`: a second picture, as these functions draw it, in which the current time is marked.
     - `seconds`: how long the film is; `fps`: frames a second, of a GIF at most 50. A run with fewer
       saved states than frames has as many frames as states, which last longer.
-    - `tail`: its length, as a fraction of the run. `size`: inches; `dpi`: pixels an inch.
+    - `tail`: its length, as a fraction of the run. `size`: inches; `dpi`: pixels an inch, by
+      default 100.
     - `progress`: called with the numbers of frames done and of all, after each.
 
     A cross stays where an orbit ended too early, and the legend says how many did and why. An
@@ -75,7 +74,7 @@ def animate(
     path = Path(path)
     suffix = path.suffix.lower()
     _check_film(path, suffix, seconds, fps, tail, beside)
-    extra_names = {name for names in (_VIEW, *_SECOND.values()) for name in names}
+    extra_names = {name for names in (_VIEW, _CANVAS, *_SECOND.values()) for name in names}
     extra = {name: options.pop(name) for name in extra_names & options.keys()}
     look = look_of(options, "colour", "colour_label", "ax")
     lanes = lanes_of(orbits, look.labels, momenta=False)
@@ -89,14 +88,12 @@ def animate(
     else:
         view = view_of(lanes, **view_options)
     times = _moments(lanes, seconds * fps)
-    width, height = size or ((9.6, 4.6) if beside else (5.0, 4.8))
+    width, height = extra.get("size") or ((9.6, 4.6) if beside else (5.0, 4.8))
+    dpi = extra.get("dpi", 100.0)
     pixels = round(width * dpi) * round(height * dpi)
-    if suffix == ".gif" and pixels * len(times) > _MOST_BYTES:
-        raise ValueError(
-            f"a GIF must have at most {_MOST_BYTES:.2g} pixels in all frames together, got "
-            f"{pixels * len(times):.2g} ({len(times)} frames of {pixels} pixels): reduce seconds, "
-            "fps, size or dpi, or write an .mp4 file."
-        )
+    if suffix == ".gif":
+        remedy = "by less seconds, fps, size or dpi, or write an .mp4"
+        at_most(_MOST_BYTES, pixels * len(times), "pixels of all frames of a GIF", remedy)
     figure = Figure(figsize=(width, height), dpi=dpi, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     grid = figure.add_gridspec(1, 2 if beside else 1)
@@ -125,25 +122,20 @@ def animate(
     return path
 
 
-def _check_film(path: Path, suffix: str, seconds: Any, fps: Any, tail: Any, beside: Any) -> None:
-    if suffix not in (".gif", ".mp4"):
-        raise ValueError(f"path must end with .gif or .mp4, got {path.name!r}.")
+def _check_film(path: Path, suffix: str, seconds: Any, fps: Any, tail: Any, second: Any) -> None:
+    one_of("the suffix of path", suffix, (".gif", ".mp4"))
     if not path.parent.is_dir():
-        folder = f"create the folder {str(path.parent)!r} first"
-        raise ValueError(f"path must lie in an existing folder, got {str(path)!r}: {folder}.")
+        raise ValueError(f"path must lie in an existing folder, got {str(path)!r}.")
     positive("seconds", seconds)
     positive("fps", fps)
-    one_of("beside", beside, _SECOND)
+    one_of("beside", second, _SECOND)
     if not 0 <= tail <= 1:
         raise ValueError(f"tail must be a fraction from 0 to 1, got {tail!r}.")
-    if suffix == ".gif" and fps > _FASTEST_GIF:
-        raise ValueError(
-            f"fps must be at most {_FASTEST_GIF} for a GIF, got {fps}: reduce fps or write an .mp4."
-        )
+    if suffix == ".gif":
+        at_most(_FASTEST_GIF, fps, "fps of a GIF", "fps=25, or write an .mp4")
     if suffix == ".mp4" and not writers.is_available("ffmpeg"):
         raise RuntimeError(
-            f"path {path.name!r} requires the program ffmpeg, but ffmpeg was not found: install it "
-            "(with conda install ffmpeg, apt or brew), set its path in "
+            f"path {path.name!r} requires the program ffmpeg, which was not found: install it, set "
             'matplotlib.rcParams["animation.ffmpeg_path"], or write a .gif.'
         )
 
@@ -151,11 +143,7 @@ def _check_film(path: Path, suffix: str, seconds: Any, fps: Any, tail: Any, besi
 def _moments(lanes: Sequence[Lane], frames: float) -> np.ndarray:
     """Times of the frames, evenly from the first to the last finite state."""
     finite = [lane.ts[lane.finite] for lane in lanes if lane.finite.any()]
-    if not finite:
-        raise ValueError(
-            "orbits must have at least one finite state, but each saved state contains NaN "
-            "or inf in ts, qs or ps. Check the arrays, or the status of the Solution."
-        )
+    check_not_empty("the list of finite states in orbits", finite, "see the status of the Solution")
     count = max(2, min(round(frames), max(len(t) for t in finite)))
     ends = np.array([[t[0], t[-1]] for t in finite])
     times = np.linspace(ends.min(), ends.max(), count)

@@ -215,10 +215,7 @@ def learning_curve(fit: Any, ax: Any = None) -> Any:
     _check(fit, "history")
     columns = ("stage", "loss", "accepted", "horizon")
     stage, loss, is_accepted, horizon = (np.asarray(fit.history[name]) for name in columns)
-    if loss.size == 0:
-        raise ValueError(
-            "fit.history must have at least one step, but the fit took no step: see fit.status."
-        )
+    draw.check_not_empty("fit.history", loss, "the fit took no step, see fit.status")
     ax, new = canvas(ax)
     steps, is_accepted, finite = (
         np.arange(1, len(loss) + 1),
@@ -330,23 +327,16 @@ def _of_parameters(fit: Any, params: Sequence[str] | None) -> tuple[list[int], n
     """(numbers of the parameters that are drawn, values of all), checked."""
     names, variances = list(fit.names), np.diag(np.asarray(fit.covariance))
     determinate = [n for n, v in zip(names, variances, strict=True) if np.isfinite(v) and v > 0]
-    if not determinate:
-        raise ValueError(
-            "fit.covariance must have at least one positive and finite variance on its diagonal; "
-            f"the first variances are {variances[:3].tolist()}. Possible causes: the fit failed, "
-            "there are more than 400 parameters, the data determine no parameter, sigma is missing "
-            "and cannot be estimated, or all draws of dvi.Samples are equal."
-        )
     if params is None:
         draw.at_most(_PARAMETERS, len(names), "parameters", f"params={names[:3]}")
     params = names if params is None else [params] if isinstance(params, str) else [*params]
     if len(set(params)) < len(params) or not params or not {*params} <= {*names}:
         raise ValueError(f"params must be one or more different names from {names}, got {params}.")
     if indeterminate := [name for name in params if name not in determinate]:
-        variance = f"{variances[names.index(indeterminate[0])]} for {indeterminate[0]!r}"
         raise ValueError(
-            f"params must have positive and finite variances, got {variance}. The data do not "
-            f"determine it, or it is at a bound: choose params from {determinate}."
+            f"fit.covariance must have a positive and finite variance of {indeterminate[0]!r}, got "
+            f"{variances[names.index(indeterminate[0])]}. The fit failed, or the data do not "
+            f"determine it: choose params from {determinate}."
         )
     values = np.asarray(fit.x if np.ndim(fit.x) == 1 else fit.mean)
     return [names.index(n) for n in params], values
@@ -358,16 +348,12 @@ def _draws(samples: Any, names: list[str]) -> list[np.ndarray]:
     instance("samples", arrays, Mapping, "a dvi.Samples or a dict of names with arrays of draws")
     if absent := [name for name in names if name not in arrays]:
         raise ValueError(
-            f"samples must have draws of each of params, {names}, got only the names {[*arrays]}: "
-            f"add draws of {absent[0]!r}, or choose params without it."
+            f"samples must have draws of {absent[0]!r} and of all params, got only {[*arrays]}."
         )
-    flat = [np.ravel(np.asarray(arrays[n], float)) for n in names]
-    if len({len(f) for f in flat}) > 1:
-        raise ValueError(
-            "samples must have the same number of draws for each of params, got "
-            f"{dict(zip(names, map(len, flat), strict=True))}."
-        )
-    return flat
+    flat = {name: np.ravel(np.asarray(arrays[name], float)) for name in names}
+    rule = "samples must have the same number of draws of each of params"
+    draw.check_shapes(len({x.shape for x in flat.values()}) == 1, rule, **flat)
+    return list(flat.values())
 
 
 def _scale(name: str, value: float, sigma: float) -> _Scale:

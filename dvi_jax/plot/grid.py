@@ -1,26 +1,44 @@
 """Axes and panels of a map: assignment of dimensions, positions of their points, tick labels."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.ticker import LogFormatterMathtext, LogLocator
 
 from ..base.checks import instance
-from .axes import at_most, canvas, cell_edges, stack
+from .axes import at_most, canvas, cell_edges, check_not_empty, check_real, stack
 from .blocks import Bins, make_bins
-from .style import check_keywords, with_unit
+from .style import with_unit
 
-_WHERE: dict[str, Any] = {"facet": None, "over": (), "pixels": (480, 320)}
-"""Keywords of all maps; the largest number of pixels in x and y."""
+_PIXELS = 480, 320
+"""Largest numbers of pixels in x and y."""
 
 _GREEK = {"epsilon": "ε", "h": "step size h", "start": "number of the start", "t0": "t$_0$"}
 _MOST_NAMES, _MOST_PANELS = 12, 16
 """Names that are written along an axis; panels of a figure."""
 
 
-class Place(NamedTuple):
+class GridSettings(TypedDict, total=False):
+    """Keywords of all maps.
+
+    - `facet`: dimension of which each value has a panel. `over`: dimensions that are reduced.
+    - `pixels`: (width, height), the largest numbers of pixels; by default (480, 320).
+    """
+
+    facet: str | None
+    over: str | Sequence[str] | None
+    pixels: tuple[float, float] | None
+
+
+class NumberSettings(GridSettings, total=False):
+    """The same, and `limits`: (low, high) of the scale of the numbers."""
+
+    limits: tuple[float, float] | None
+
+
+class GridAxis(NamedTuple):
     """An axis along a dimension, with edges (pixels + 1,) and centres (pixels,) of its pixels.
 
     `zero`: where on a logarithmic axis the value 0 is put, or None. `names`: (positions, texts) of
@@ -57,7 +75,7 @@ class Place(NamedTuple):
             ticks(minor, minor=True, labels=[""] * len(minor))
 
 
-def find_place(data: Any, name: str, pixels: int) -> Place:
+def find_axis(data: Any, name: str, pixels: int) -> GridAxis:
     """The axis along a dimension, or along a one-dimensional coordinate that has the name.
 
     Numbers that are all different are put in their order, on a logarithmic axis if that spaces
@@ -75,7 +93,7 @@ def find_place(data: Any, name: str, pixels: int) -> Place:
         edges = bins.ends - 0.5
         texts = None if values is None else [_short(v) for v in values[::stride]]
         names = None if texts is None else (np.arange(0, size, stride), texts)
-        return Place(dim, label, bins, edges, (edges[1:] + edges[:-1]) / 2, names=names)
+        return GridAxis(dim, label, bins, edges, (edges[1:] + edges[:-1]) / 2, names=names)
     rising = bool((np.diff(values) > 0).all())
     order = None if rising else np.argsort(values, kind="stable")
     bins = make_bins(size, pixels, order)
@@ -88,7 +106,7 @@ def find_place(data: Any, name: str, pixels: int) -> Place:
     if len(bins.starts) < size:
         low, high = x[bins.starts], x[bins.ends[1:] - 1]
         centres = np.sqrt(low) * np.sqrt(high) if log else (low + high) / 2
-    return Place(dim, label, bins, edges[bins.ends], centres, log, zero)
+    return GridAxis(dim, label, bins, edges[bins.ends], centres, log, zero)
 
 
 def dim_of(data: Any, name: str, role: str = "each of x, y, facet, over and along") -> str:
@@ -100,10 +118,7 @@ def dim_of(data: Any, name: str, role: str = "each of x, y, facet, over and alon
         return name
     if name in data.coords and data.coords[name].ndim == 1:
         return str(data.coords[name].dims[0])
-    raise ValueError(
-        f"{role} must be a dimension of the data, got {name!r}. The dimensions (with their sizes) "
-        f"are {names_of(data)}."
-    )
+    raise ValueError(f"{role} must be one of the dimensions {names_of(data)}, got {name!r}.")
 
 
 def names_of(data: Any) -> str:
@@ -138,17 +153,17 @@ def _short(value: Any) -> str:
 class Grid(NamedTuple):
     """(title, array) of each panel, and the axes that all panels share; no `y` for a line.
 
-    `over`: dimensions of which the numbers meet in a pixel.
+    `reduced_dims`: dimensions of which the numbers meet in a pixel.
     """
 
     panels: list[tuple[str, Any]]
-    x: Place
-    y: Place | None
-    over: tuple[str, ...]
+    x: GridAxis
+    y: GridAxis | None
+    reduced_dims: tuple[str, ...]
     facet: str | None
 
     @property
-    def places(self) -> list[Place]:
+    def places(self) -> list[GridAxis]:
         """The axes in the order of an array that is drawn: y, x."""
         return [self.x] if self.y is None else [self.y, self.x]
 
@@ -162,8 +177,7 @@ class Grid(NamedTuple):
         if ax is not None:
             if count > 1:
                 raise ValueError(
-                    f"ax is for one map, but facet={self.facet!r} makes a new figure of {count} "
-                    "maps: leave out ax or facet."
+                    f"facet={self.facet!r} makes a new figure of {count} maps: leave out ax."
                 )
             return [canvas(ax)[0]]
         if count == 1:
@@ -191,7 +205,7 @@ class Grid(NamedTuple):
 
 
 def arrange(
-    data: Any, x: str | None, y: str | None, where: Mapping[str, Any], replacements: Any = None
+    data: Any, x: str | None, y: str | None, settings: Mapping[str, Any], replacements: Any = None
 ) -> Grid:
     """Assign dimensions to x, y and facets; those that are not named become x and y in turn.
 
@@ -199,30 +213,26 @@ def arrange(
     dimension that does not appear. **Raises** `ValueError` for a dimension that does not exist, is
     named twice, or is in excess.
     """
-    check_keywords(where, *_WHERE)
-    facet, reduced_names, pixels = (where.get(k, v) for k, v in _WHERE.items())
-    width, height = two_numbers(pixels)
+    facet, reduced_names, pixels = map(settings.get, ("facet", "over", "pixels"))
+    reduced_names = reduced_names or ()
+    width, height = two_numbers(_PIXELS if pixels is None else pixels)
     if not (width >= 1 and height >= 1):
         raise ValueError(f"pixels must be (width, height), both at least 1, got {pixels!r}.")
-    if empty := [str(d) for d, n in data.sizes.items() if n == 0]:
-        raise ValueError(
-            "data must have at least one value along each dimension, got size 0 along "
-            f"{', '.join(map(repr, empty))}. Change the selection, so that it is not empty."
-        )
+    for dimension, size in data.sizes.items():
+        check_not_empty(f"data along {dimension!r}", range(size), "change the selection")
     reduced_names = (reduced_names,) if isinstance(reduced_names, str) else tuple(reduced_names)
+    replacements = replacements or {}
     roles = {"x": x, "y": y, "facet": facet, **{f"over={name!r}": name for name in reduced_names}}
+    roles |= {f"along={name!r}": name for name, array in replacements.items() if array is None}
     roles_of: dict[str, str] = {}
     for role, name in roles.items():
         dim = None if name is None else dim_of(data, name, role.partition("=")[0])
         if dim in roles_of:
             raise ValueError(
-                f"{role} and {roles_of[dim]} must use different dimensions, but both use "
-                f"{dim!r}: change one of them."
+                f"{role} and {roles_of[dim]} must use different dimensions, got {dim!r} for both."
             )
         roles_of |= {} if dim is None else {dim: role}
-    replacements = replacements or {}
-    absent = [dim_of(data, name) for name, array in replacements.items() if array is None]
-    left = [str(d) for d in data.dims if d not in roles_of and d not in absent]
+    left = [str(d) for d in data.dims if d not in roles_of]
     free = [d for d in left if data.sizes[d] > 1]
     if x is None:
         x, y = (free.pop(0), y) if free else (y, None)
@@ -230,22 +240,19 @@ def arrange(
         y = free.pop(0)
     if x is None:
         raise ValueError(
-            "data must have a dimension of size 2 or more for x that is not used otherwise. The "
-            f"dimensions (with their sizes) are {names_of(data)}; used: "
-            f"{[*roles_of, *absent] or 'none'}. Remove a dimension from facet or over, or use data "
-            "with one more dimension."
+            "data must have a dimension of size 2 or more for x that is not used otherwise, got "
+            f"{names_of(data)}; used: {[*roles_of] or 'none'}."
         )
     if free:
         raise ValueError(
             f"a map has two dimensions, here {x!r} and {y!r}, but data also has "
-            f"{', '.join(map(repr, free))}. Select one value with "
-            f"data.isel({', '.join(f'{d}=0' for d in free)}), or reduce all values with "
-            f"over={[*reduced_names, *free]}. With facet, each value has its own map."
+            f"{', '.join(map(repr, free))}: select data.isel({', '.join(f'{d}=0' for d in free)}), "
+            f"reduce with over={[*reduced_names, *free]}, or use facet."
         )
     data = data.isel({d: 0 for d in left if data.sizes[d] == 1})
     arrays: dict[Any, Any] = dict.fromkeys((x, y), data) | replacements
-    along_x = find_place(arrays[x], x, int(width))
-    along_y = None if y is None else find_place(arrays[y], y, int(height))
+    along_x = find_axis(arrays[x], x, int(width))
+    along_y = None if y is None else find_axis(arrays[y], y, int(height))
     dims = tuple(dim_of(data, name) for name in reduced_names)
     return Grid(_panels(data, facet), along_x, along_y, dims, facet)
 
@@ -282,6 +289,5 @@ def checked_array(data: Any) -> Any:
     if isinstance(data, xr.Dataset):
         hint += f" There are {', '.join(map(str, data.data_vars))}."
     instance("data", data, xr.DataArray, "an xarray.DataArray", hint)
-    if data.dtype.kind not in "biuf":
-        raise TypeError(f"data must be an array of real numbers, got dtype {data.dtype}.")
+    check_real("data", data)
     return data

@@ -10,10 +10,21 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 
 from ..base.checks import positive, whole
-from .axes import at_most, canvas, entry, labels_of, legend, path, stack
+from .axes import (
+    at_most,
+    canvas,
+    check_not_empty,
+    check_shapes,
+    entry,
+    labels_of,
+    legend,
+    path,
+    stack,
+)
 from .states import (
     Lane,
     Looks,
+    check_momenta,
     index_label,
     lanes_of,
     looks_of,
@@ -97,9 +108,7 @@ def _planes(shape: tuple[int, ...], dof: Any) -> list["Plane"]:
     else:
         example = "0, 1" if len(shape) == 1 else "(0, 0), (0, 1)"
         at_most(_PANELS, len(places), "degrees of freedom", f"dof=[{example}]")
-    if not places:
-        first = 0 if len(shape) == 1 else (0,) * len(shape)
-        raise ValueError(f"dof is empty: choose a degree of freedom, such as dof=[{first}].")
+    check_not_empty("dof", places, f"choose some of {[*np.ndindex(shape)]}")
     return [Plane(place, shape) for place in places]
 
 
@@ -175,8 +184,8 @@ def _level_lines(
         return hamiltonian(q.at[place].set(a), p.at[place].set(b))
 
     H = np.asarray(jax.jit(jax.vmap(jax.vmap(value, (0, None)), (None, 0)))(x, y))
-    if H.shape != (_MESH, _MESH):
-        raise ValueError(f"hamiltonian(q, p) must return one number, got shape {H.shape[2:]}.")
+    rule = "hamiltonian(q, p) must return one number"
+    check_shapes(H.shape == (_MESH, _MESH), rule, hamiltonian=H[0, 0])
     axis.autoscale(False)
     if np.isfinite(H).any():
         look: dict[str, Any] = {"colors": "#a8a8a8", "linewidths": 0.7, "linestyles": "-"}
@@ -217,7 +226,7 @@ def orbit(
     lanes = lanes_of(orbits, look.labels, momenta=False)
     view = view_of(lanes, coordinates, bodies, centre, names)
     if look.colour is not None and len(lanes) == 1:
-        raise ValueError("colour requires several orbits, but there is only one: leave colour out.")
+        raise ValueError("colour requires several orbits, got one: leave colour out.")
     looks = looks_of(len(lanes) if len(lanes) > 1 else len(view.bodies), look.colour)
     axis, new = canvas(look.ax, (5.4, 5.0), len(view.coordinates) == 3)
     for i, k, number, name in view.lines(lanes):
@@ -240,11 +249,8 @@ class Plane(NamedTuple):
 
     def coordinates_of(self, lane: Lane, k: int = 0) -> Any:
         """(q, p) along an orbit, shape (S,) each."""
-        if lane.ps is None:
-            raise TypeError(
-                "this picture needs momenta, but an orbit has only times and positions: give each "
-                "orbit as a Solution or (ts, qs, ps)."
-            )
+        check_momenta([lane])
+        assert lane.ps is not None
         return [x[(slice(None), *self.place)] for x in (lane.qs, lane.ps)]
 
     def lines(self, lanes: Sequence[Lane]) -> Iterator[tuple[int, int, int, str]]:
@@ -316,19 +322,15 @@ def view_of(
     if names is not None and (len(lanes) > 1 or math.prod(shape) == 1):
         cause = f"{len(lanes)} orbits" if len(lanes) > 1 else f"states of shape {shape}"
         raise ValueError(
-            f"names requires a single orbit with states of at least two numbers, got {cause}: use "
-            "labels=[...] to name orbits."
+            f"names requires one orbit with several coordinates, got {cause}: use labels=[...]."
         )
-    if len(shape) not in (1, 2):
-        raise ValueError(f"orbits must have states of shape (n,) or (bodies, dim), got {shape}.")
+    rule = "the states of orbits must have shape (n,) or (bodies, dim)"
+    check_shapes(len(shape) in (1, 2), rule, state=lanes[0].qs[0])
     has_bodies, dim, count = len(shape) == 2, shape[-1], shape[0] if len(shape) == 2 else 1
     axes = tuple(selected_numbers("coordinates", coordinates, dim))
     if len(axes) not in (2, 3):
-        advice = "For a single coordinate use phase_portrait, which requires momenta."
-        raise ValueError(
-            f"coordinates must select two or three coordinates, got {len(axes)} for states of "
-            f"shape {shape}. {'Choose for example coordinates=(0, 1).' if dim > 1 else advice}"
-        )
+        remedy = "use coordinates=(0, 1)" if dim > 1 else "use phase_portrait"
+        raise ValueError(f"coordinates must select two or three, got {len(axes)}: {remedy}.")
     numbers = selected_numbers("bodies", bodies, count)
     view = View(axes, numbers, [], has_bodies)
     if isinstance(centre, int | np.integer) and has_bodies:
@@ -339,9 +341,9 @@ def view_of(
         numbers = [b for b in numbers if b != origin] if bodies is None else numbers
     elif centre is not None:
         point = np.asarray(centre, float)
-        if point.shape != (dim,):
-            body = f"the number of a body (0 to {count - 1}) or " if has_bodies else ""
-            raise ValueError(f"centre must be {body}a point of shape {(dim,)}, got {centre!r}.")
+        body = f"the number of a body (0 to {count - 1}) or " if has_bodies else ""
+        rule = f"centre must be {body}a point of shape {(dim,)}"
+        check_shapes(point.shape == (dim,), rule, centre=point)
         view = view._replace(mark=point[list(axes)])
     return view._replace(bodies=numbers, names=labels_of(names, len(numbers), "bodies", "names"))
 
@@ -370,10 +372,7 @@ def trajectory(
     """
     lanes = lanes_of(ts if qs is None else (ts, qs, ps))
     if len(lanes) > 1:
-        raise ValueError(
-            f"ts must contain a single orbit, got {len(lanes)}: choose one, or draw all with "
-            "phase_portrait or orbit."
-        )
+        raise ValueError(f"ts must be a single orbit, got {len(lanes)}: use orbit.")
     t, q, p = lanes[0][:3]
     assert p is not None
     units, shape = {"q": position or "", "p": momentum or ""}, q.shape[1:]

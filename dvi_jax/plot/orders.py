@@ -52,8 +52,8 @@ def balance(
     if drift is None or not causes:
         name, value = ("drift", drift) if drift is None else ("causes", causes)
         raise TypeError(
-            f"{name} must be given if ts is an array of times, got {name}={value!r}. A result of "
-            "dvi.noether_balance as ts requires neither drift nor causes."
+            f"{name} must be given, got {name}={value!r}, unless ts is a dvi.Balance, a result of "
+            "dvi.noether_balance."
         )
     inputs = {"ts": ts, "drift": drift, **causes}
     arrays = {name: np.asarray(x, float) for name, x in inputs.items()}
@@ -118,8 +118,8 @@ def drift_orders(
     slopes = [*promised] if isinstance(promised, Sequence) else [promised] * len(results)
     if len(slopes) != len(results):
         raise ValueError(
-            "promised or expected must have one order for each result. The number of results is "
-            f"{len(results)}, got the orders {slopes}."
+            f"promised (expected) must have one order for each of {len(results)} results, got "
+            f"{slopes}."
         )
     axis, new = canvas(ax, (6.4, 4.8))
     left = 0.7 * min(order.epsilons.min() for order in results.values())
@@ -317,11 +317,7 @@ def work_precision(
     exactly 0, triangles at the bottom. **Returns** the `Axes`. **Raises** `ValueError` for no
     methods, for shapes that do not fit and for costs that are not positive.
     """
-    if not results:
-        raise ValueError(
-            "results must have at least one method, such as {'Verlet': (costs, errors)}, got "
-            f"{results!r}."
-        )
+    draw.check_not_empty("results", results, "give {'Verlet': (costs, errors)}")
     axis, new = canvas(ax, (6.4, 4.8))
     runs = {name: _costs_and_errors(name, pair) for name, pair in results.items()}
     points, marks = np.hstack(list(runs.values())), np.zeros(2, int)
@@ -354,17 +350,15 @@ def _costs_and_errors(name: str, pair: Any) -> tuple[np.ndarray, np.ndarray]:
     try:
         costs, errors = (np.asarray(x, float) for x in pair)
     except (TypeError, ValueError):
-        raise ValueError(
-            f"results[{name!r}] must be (costs, errors), two arrays of numbers, got {pair!r:.100}."
-        ) from None
+        costs = errors = np.zeros(0)
     if costs.ndim != 1 or costs.shape != errors.shape or not len(costs):
         raise ValueError(
-            f"results[{name!r}] must be (costs, errors) of the same shape (runs,), with at least "
-            f"one run, got the shapes {costs.shape} and {errors.shape}."
+            f"results[{name!r}] must be (costs, errors), arrays of one shape (runs,), got "
+            f"{pair!r:.100}."
         )
     if (bad := ~(np.isfinite(costs) & (costs > 0))).any():
         raise ValueError(
-            f"the costs in results[{name!r}] must be positive and finite, got {costs[bad][0]}."
+            f"costs in results[{name!r}] must be positive and finite, got {costs[bad][0]}."
         )
     order = np.argsort(costs, kind="stable")
     return costs[order], np.abs(errors[order])

@@ -75,16 +75,18 @@ def _draw_magnets(axis: Any, ring: Any, s: np.ndarray) -> list[Any]:
 
 
 @in_style
-def tune_map(x: Any, y: Any, found: Any, order: int = 4, title: str = "", ax: Any = None) -> Any:
+def tune_map(
+    x: Any, y: Any, frequencies: Any, order: int = 4, title: str = "", ax: Any = None
+) -> Any:
     """Diffusion of the tunes over initial conditions, and in the plane of the tunes.
 
     - `x`, `y`: initial conditions [m], as they were given to `rings.frequency_map`; those of
-      ``np.meshgrid`` are drawn as cells, others as points. `found`: its result.
+      ``np.meshgrid`` are drawn as cells, others as points. `frequencies`: its result.
     - `order`: of the resonances (m, n, k), m Q_x + n Q_y = k: \\|m\\| + \\|n\\|. `ax`: two `Axes`.
 
     **Returns** two `Axes`. **Raises** `ValueError` for shapes that do not fit.
     """
-    D, Q = np.asarray(found.diffusion), np.asarray(found.tune)
+    D, Q = np.asarray(frequencies.diffusion), np.asarray(frequencies.tune)
     x, y = (np.asarray(a, float) * 1e3 for a in np.broadcast_arrays(x, y))
     rule = "x and y must have the shape of the diffusion"
     check_shapes(x.shape == D.shape, rule, x=x, diffusion=D)

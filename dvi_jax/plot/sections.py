@@ -54,16 +54,21 @@ class _Points(NamedTuple):
         total, room = self.qs.shape[:2]
         none = int(np.sum((counts == 0) & ~has_failed & (statuses != "stopped")))
         reasons = np.where(np.isin(self.reasons, _GOOD), "", self.reasons)[has_failed].tolist()
-        causes = {f": {r.replace('_', ' ')}" if r else "": n for r, n in Counter(reasons).items()}
+        causes = {
+            f": {r.replace('_', ' ')}" if r else "": number
+            for r, number in Counter(reasons).items()
+        }
         texts = {
             f"crossed less than the required {room} times": statuses == "too_few_crossings",
             "stopped": statuses == "stopped",
-            **{f"failed{reason}": n for reason, n in causes.items()},
+            **{f"failed{cause}": count for cause, count in causes.items()},
             f"crossed more than the {room} times stored": counts > room,
             "did not cross": none if none < total else 0,
             "have no count of crossings": ~np.isfinite(counts) & ~has_failed,
         }
-        return counts_text({f"of {total} orbits {text}": np.sum(n) for text, n in texts.items()})
+        return counts_text(
+            {f"of {total} orbits {text}": np.sum(number) for text, number in texts.items()}
+        )
 
     def draw(
         self, axis: Any, x: Any, y: Any, colours: Any, size: float | None, names: Any = None, skip=0
@@ -153,11 +158,9 @@ def section(
 def _points_of(crossings: Any) -> _Points:
     pairs = _crossings_in(crossings)
     if len(pairs) != 1:
-        kind = type(crossings).__name__
-        plural = f"{len(pairs)} results: choose one, such as solution.observed['name']"
-        none = f"no such result in {kind}: integrate with observe=dvi.Section(...)"
         raise TypeError(
-            f"crossings must have the result of one dvi.Section, got {plural if pairs else none}."
+            "crossings must have the result of one dvi.Section, such as solution.observed['name'], "
+            f"got type {type(crossings).__name__} with {len(pairs)}."
         )
     ((crossing, status),) = pairs
     qs, ps, ts = (np.asarray(v) for v in (crossing.qs, crossing.ps, crossing.ts))
@@ -185,7 +188,7 @@ def _crossings_in(tree: Any, status: Any = "") -> list[tuple[Any, Any]]:
         tree, status = [getattr(tree, "observed", None)], getattr(tree, "status", "")
     parts = tree.values() if isinstance(tree, Mapping) else tree
     if isinstance(tree, Mapping | list | tuple):
-        return [c for v in parts for c in _crossings_in(v, status)]
+        return [pair for part in parts for pair in _crossings_in(part, status)]
     return []
 
 
@@ -235,9 +238,7 @@ def bifurcation(
     check_shapes(fits, rule, parameter=parameter, crossings=values)
     skip = whole("skip", skip, 0)
     if log and not (parameter > 0).all():
-        raise ValueError(
-            f"log=True requires positive values of parameter, got {parameter.min()}: leave log out."
-        )
+        raise ValueError(f"log=True requires a positive parameter, got {parameter.min()}.")
     values = values[:, skip:]
     x = np.broadcast_to(parameter[:, None], values.shape)
     axis, new = canvas(look.ax, (6.8, 4.4))

@@ -12,6 +12,8 @@ from ..base.checks import one_of
 from .axes import (
     at_most,
     canvas,
+    check_not_empty,
+    check_real,
     check_shapes,
     counts_text,
     envelope,
@@ -20,7 +22,7 @@ from .axes import (
     legend,
     stack,
 )
-from .states import Lane, each_state, lanes_of, looks_of, troubles
+from .states import Lane, check_momenta, each_state, lanes_of, looks_of, troubles
 from .style import (
     COLOURS,
     CROSS,
@@ -95,10 +97,7 @@ def invariants(
     ts, names, lanes, quantities = _read(orbits, values, look.labels)
     rows_of = {k: [_change_of(k, v, change, log) for v in rows] for k, rows in quantities.items()}
     if zero := [name for name, rows in rows_of.items() if all(v is None for v in rows)]:
-        raise ValueError(
-            f"{zero[0]!r} is 0 at the start of every orbit, so that relative changes are not "
-            "defined: use change='absolute'."
-        )
+        raise ValueError(f"{zero[0]!r} is 0 at the start of every orbit: use change='absolute'.")
     on_one_axis = log and len(ts) == 1 < len(quantities)
     count = 1 if on_one_axis else len(quantities)
     at_most(_PANELS, count, "quantities", "values={...}")
@@ -145,8 +144,7 @@ def invariants(
 
 def _change_of(name: str, v: np.ndarray, change: str, log: bool) -> np.ndarray | None:
     """Changes since the first finite value, shape (S,); None if they are relative to 0."""
-    if v.dtype.kind not in "biuf":
-        raise TypeError(f"the values of {name!r} must be real numbers, got dtype {v.dtype}.")
+    check_real(f"values[{name!r}]", v)
     v = v.reshape(len(v), -1).astype(float)
     first = next((row for row in v if np.isfinite(row).all()), np.full(v.shape[1], np.nan))
     v = v if change == "value" else v - first
@@ -176,8 +174,8 @@ def _read(
         lanes, times = [], np.asarray(getattr(orbits, "ts", orbits))
         if times.dtype.kind not in "iuf" or times.ndim == 0:
             raise TypeError(
-                "orbits must be a Solution, arrays (ts, qs, ps), a list of these, or an array of "
-                f"times together with values, got {orbits!r:.60}."
+                "orbits must be a Solution, arrays (ts, qs, ps), a list of these, or times, got "
+                f"{orbits!r:.60}."
             )
         ts = list(times.reshape(-1, times.shape[-1]))
         names = labels_of(labels, len(ts), "orbits")
@@ -193,11 +191,7 @@ def _read(
                 ]
     for name, v in (values or {}).items():
         if callable(v):
-            if any(lane.ps is None for lane in lanes) or not lanes:
-                raise TypeError(
-                    f"the function {name!r} in values requires positions and momenta, but orbits "
-                    "does not contain both: give a Solution or (ts, qs, ps) as orbits."
-                )
+            check_momenta(lanes)
             quantities[name] = [each_state(v, lane.qs, lane.ps) for lane in lanes]
         elif not isinstance(orbits, list):
             quantities[name] = _rows(name, {name: v}, orbits)
@@ -206,15 +200,11 @@ def _read(
         else:
             kind = f"list of length {len(v)}" if isinstance(v, list) else type(v).__name__
             raise ValueError(
-                f"values[{name!r}] must be a function (q, p), or a list of length {len(lanes)} "
-                f"with one array for each orbit, got {kind}."
+                f"values[{name!r}] must be a function (q, p), or a list of {len(lanes)} arrays, of "
+                f"one for each orbit, got {kind}."
             )
-    if not quantities:
-        cause = "no observable has, in all orbits, one value for each saved state or each step"
-        raise ValueError(
-            f"{cause if values is None else 'values is empty'}: give values={{'energy': f}}, "
-            "where f is a function (q, p) or an array (for a list of orbits, a list of arrays)."
-        )
+    name = "the list of observables with a value per step" if values is None else "values"
+    check_not_empty(name, quantities, "give values={'energy': f}, of a function (q, p) or an array")
     return ts, names, lanes, quantities
 
 
@@ -222,10 +212,9 @@ def _observed(solution: Any) -> dict[str, Any]:
     """The observables of a solution that have a value per step."""
     observed = getattr(solution, "observed", None)
     if not isinstance(observed, Mapping):
-        kind = "no observables" if observed is None else type(observed).__name__
         raise TypeError(
-            f"without values, orbits must have a dict of observables, got {kind}. Give values, or "
-            "integrate(...) with observe={'energy': f}."
+            "without values, orbits must have a dict of observables, got type "
+            f"{type(observed).__name__}: give values."
         )
     *lead, n = np.shape(solution.ts)
     shapes, front = ((*lead, n), (*lead, n - 1)), len(lead) + 1
@@ -305,10 +294,10 @@ def conserved(ts: Any, series: Mapping[str, Any], time: str, title: str, ax: Any
 
 
 def _pair(ts: Any, values: Any, label: str) -> tuple[np.ndarray, np.ndarray]:
-    t, v = np.asarray(ts), np.asarray(values)
+    t, numbers = np.asarray(ts), np.asarray(values)
     rule = f"{label!r} must have one number for each time, shape (S,)"
-    check_shapes(t.ndim == 1 and v.shape == t.shape, rule, ts=t, values=v)
-    return t, v
+    check_shapes(t.ndim == 1 and numbers.shape == t.shape, rule, ts=t, values=numbers)
+    return t, numbers
 
 
 class _Kind(NamedTuple):

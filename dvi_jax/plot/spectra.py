@@ -105,9 +105,8 @@ def frequency_map(
     check_shapes(on_grid or len({a.shape for a in arrays.values()}) == 1, rule, **arrays)
     if on_grid and len(resonances):
         raise ValueError(
-            "resonances can be drawn only if x and y are frequencies, but here they are a grid of "
-            "initial conditions. Leave out resonances, or give the frequencies of all orbits as x "
-            f"and y, both of shape {(len(x), len(y))}."
+            "resonances require frequencies as x and y, of the shape of diffusion, got a grid of "
+            f"initial conditions of shape {(len(x), len(y))}."
         )
     axis, new = canvas(ax, (6.0, 4.8))
     numbers = D if on_grid or D is None else D[np.isfinite(x) & np.isfinite(y)]
@@ -169,8 +168,7 @@ def _draw_resonances(axis: Any, resonances: Sequence[tuple[int, ...]]) -> None:
     for k in resonances:
         if len(k) not in (2, 3) or tuple(k[:2]) == (0, 0):
             raise ValueError(
-                "resonances must be pairs of integers, not both 0, or these with the integer on "
-                f"the right-hand side, got {k!r}."
+                f"resonances must be (k1, k2) or (k1, k2, k), k1 and k2 not both 0, got {k!r}."
             )
         a, b, c = (*k, 0)[:3]
         x, y = (i * c / (a * a + b * b) for i in (a, b))

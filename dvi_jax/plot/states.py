@@ -12,7 +12,16 @@ import numpy as np
 from matplotlib.cm import ScalarMappable
 
 from ..base.checks import whole
-from .axes import check_shapes, counts_text, entry, labels_of, legend, scale_of
+from .axes import (
+    check_not_empty,
+    check_real,
+    check_shapes,
+    counts_text,
+    entry,
+    labels_of,
+    legend,
+    scale_of,
+)
 from .style import COLOURS, CROSS, DASHES, PALE, SHADES, Look, with_unit
 
 _GOOD = ("", "successful", "stopped")
@@ -50,15 +59,17 @@ def lanes_of(orbits: Any, labels: Sequence[str] | None = None, momenta: bool = T
     """
     parts = orbits if isinstance(orbits, list) else [orbits]
     lanes = [lane for part in parts for lane in _lanes_of_one(part)]
-    if not lanes:
-        raise ValueError("orbits is empty: give at least one orbit.")
-    if momenta and any(lane.ps is None for lane in lanes):
-        raise TypeError(
-            "this picture needs momenta, but an orbit has only times and positions: give each "
-            "orbit as a Solution or (ts, qs, ps)."
-        )
+    check_not_empty("orbits", lanes, "give at least one orbit")
+    if momenta:
+        check_momenta(lanes)
     names = labels_of(labels, len(lanes), "orbits")
     return [lane._replace(label=name) for lane, name in zip(lanes, names, strict=True)]
+
+
+def check_momenta(lanes: Sequence[Lane]) -> None:
+    """**Raises** `TypeError` for orbits without states, or with positions alone."""
+    if not lanes or any(lane.ps is None for lane in lanes):
+        raise TypeError("this picture needs momenta: give each orbit as (ts, qs, ps).")
 
 
 def _lanes_of_one(part: Any) -> list[Lane]:
@@ -68,13 +79,10 @@ def _lanes_of_one(part: Any) -> list[Lane]:
         arrays = list(part)
     else:
         kind = type(part).__name__ + (f" of length {len(part)}" if isinstance(part, tuple) else "")
-        raise TypeError(
-            f"each orbit must be a Solution or a tuple of arrays (ts, qs, ps), got {kind}."
-        )
+        raise TypeError(f"each orbit must be a Solution or arrays (ts, qs, ps), got {kind}.")
     ts, *states = (np.asarray(x) for x in arrays if x is not None)
     for name, x in zip(("ts", "qs", "ps"), (ts, *states), strict=False):
-        if x.dtype.kind not in "iuf":
-            raise TypeError(f"{name} of an orbit must be real numbers, got dtype {x.dtype}.")
+        check_real(f"{name} of an orbit", x, "iuf")
     if ts.ndim and states[0].shape == ts.shape:  # a state that is one number
         states = [x[..., None] for x in states]
     fits = all(x.shape[: ts.ndim] == ts.shape and x.ndim > ts.ndim for x in states)
@@ -102,8 +110,7 @@ def one_shape(lanes: Sequence[Lane]) -> tuple[int, ...]:
 def selected_numbers(name: str, selection: Any, count: int) -> list[int]:
     """Numbers below `count`: all of them for None."""
     numbers = range(count) if selection is None else np.ravel(selection).tolist()
-    if not len(numbers):
-        raise ValueError(f"{name} is empty: choose at least one number from 0 to {count - 1}.")
+    check_not_empty(name, numbers, f"choose numbers from 0 to {count - 1}")
     return [whole(name, i, 0, count - 1) for i in numbers]
 
 
@@ -143,8 +150,8 @@ def component(
     if match is None or (match[2] is None and math.prod(shape) != 1):
         example = f"q[{', '.join('0' * len(shape))}]"
         raise ValueError(
-            f'x or y must be a component of the state, such as "{example}", or a function (q, p) '
-            f"that returns a number. The states have shape {shape}; got {coordinate!r}."
+            f'x or y must be a component of a state of shape {shape}, such as "{example}", or a '
+            f"function (q, p), got {coordinate!r}."
         )
     letter, indices = match.groups()
     index = tuple(map(int, indices.split(","))) if indices else (0,) * len(shape)
@@ -156,11 +163,8 @@ def component(
 def each_state(function: Callable[..., Any], qs: Any, ps: Any) -> np.ndarray:
     """A function ``(q, p)`` of every state, shape (N, ...)."""
     values = np.asarray(jax.vmap(function)(qs, ps))
-    if values.dtype.kind not in "biuf":
-        name = getattr(function, "__name__", type(function).__name__)
-        raise TypeError(
-            f"a function (q, p) must return real numbers, but {name} returned dtype {values.dtype}."
-        )
+    name = getattr(function, "__name__", type(function).__name__)
+    check_real(f"the results of the function {name}", values)
     return values
 
 
@@ -197,11 +201,8 @@ def looks_of(count: int, values: Any = None, limits: tuple[float, float] | None 
     if values is None:
         return Looks([tuple(c) for c in SHADES(np.linspace(0, 1, count))], ["-"] * count)
     values = np.ravel(np.asarray(values, float))
-    if len(values) != count:
-        raise ValueError(
-            f"colour must have length {count}, one value for each orbit or line, got length "
-            f"{len(values)}."
-        )
+    rule = f"colour must have one value for each orbit or line, shape {(count,)}"
+    check_shapes(len(values) == count, rule, colour=values)
     finite = np.isfinite(values)
     scale = ScalarMappable(scale_of(values, limits)[0], SHADES)
     shades = [tuple(scale.to_rgba(v)) if k else PALE for v, k in zip(values, finite, strict=True)]

@@ -104,8 +104,8 @@ def check_keywords(keywords: Mapping[str, Any], *names: str) -> None:
     """**Raises** `TypeError` for a keyword that is not one of `names`."""
     if excess := [name for name in keywords if name not in names]:
         raise TypeError(
-            f"unknown keyword {excess[0]!r}. Allowed are {', '.join(names)}, and those that the "
-            "docstring of the function describes."
+            f"unknown keyword {excess[0]!r}. Allowed are {', '.join(names)}, and those in the "
+            "signature."
         )
 
 
@@ -119,16 +119,10 @@ def save(drawn: Any, path: str | Path) -> Path:
     path = Path(path)
     axes = np.ravel(np.asarray(drawn, object)).tolist()
     if not axes or not all(hasattr(axis, "figure") for axis in axes):
-        raise TypeError(
-            "drawn must be a figure, or the Axes that a function of dvi_jax.plot returns, got "
-            f"{drawn!r:.200}."
-        )
+        raise TypeError(f"drawn must be a figure, or the Axes of one, got {drawn!r:.200}.")
     figures = {figure_of(axis) for axis in axes}  # a figure's own `figure` is itself
     if len(figures) > 1:
-        raise ValueError(
-            f"drawn must be from one figure, got axes of {len(figures)} figures: call save once "
-            "for each figure."
-        )
+        raise ValueError(f"drawn must be of one figure, got Axes of {len(figures)} figures.")
     figure = figures.pop()
     figure.savefig(path)
     plt.close(figure)

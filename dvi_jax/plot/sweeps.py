@@ -6,16 +6,27 @@ Each takes `xarray` data as `to_xarray` gives them, and returns the `Axes`, one 
 
 from collections.abc import Iterable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Unpack
 
 import numpy as np
 from matplotlib.colors import BoundaryNorm, CenteredNorm, ListedColormap, LogNorm
 from matplotlib.patches import Patch
 
 from ..base.checks import one_of
+from ..base.keywords import checked_keywords
 from .axes import at_edge, cells, entry, flat_cells, legend, scale_of
-from .blocks import REDUCTIONS, Lines, Picture, count_codes, reduce_to_pixels
-from .grid import Grid, arrange, checked_array, dim_of, label_of, names_of, two_numbers
+from .blocks import REDUCTIONS, LineFunction, Picture, count_codes, reduce_to_pixels
+from .grid import (
+    Grid,
+    GridSettings,
+    NumberSettings,
+    arrange,
+    checked_array,
+    dim_of,
+    label_of,
+    names_of,
+    two_numbers,
+)
 from .style import COLOURS, GREY, HATCH, NO_NUMBER, SHADES, ZERO, in_style
 
 _NOT_COMPUTED = "#ffffff"
@@ -46,6 +57,7 @@ _STATUS_COLOURS = {
 """One colour for each status in all pictures, so that they can be compared."""
 
 
+@checked_keywords
 @in_style
 def sweep_map(
     data: Any,
@@ -54,9 +66,8 @@ def sweep_map(
     reduce: str = "max",
     log: bool | None = None,
     status: Any = None,
-    limits: tuple[float, float] | None = None,
     ax: Any = None,
-    **where: Any,
+    **settings: Unpack[NumberSettings],
 ) -> Any:
     """A map of one variable of a sweep, or a line for a sweep of one dimension.
 
@@ -80,16 +91,18 @@ def sweep_map(
     """
     data = checked_array(data)
     one_of("reduce", reduce, REDUCTIONS)
-    grid = arrange(data, x, y, where)
+    grid = arrange(data, x, y, settings)
     label = label_of(data, data.name or "value")
     fewer = any(len(place.centres) < place.bins.size for place in grid.places)
-    if fewer or any(data.sizes[d] > 1 for d in grid.over):
+    if fewer or any(data.sizes[d] > 1 for d in grid.reduced_dims):
         label = f"{REDUCTIONS[reduce]} {label}"
     pictures = [reduce_to_pixels(panel, grid.bins, reduce) for _, panel in grid.panels]
     counts = None if status is None else _count_beside(status, grid)
-    return _draw(grid, pictures, label, "no number", ax, _scale(pictures, log, limits), counts)
+    scale = _scale(pictures, log, settings.get("limits"))
+    return _draw(grid, pictures, label, "no number", ax, scale, counts)
 
 
+@checked_keywords
 @in_style
 def slope_map(
     data: Any,
@@ -99,9 +112,8 @@ def slope_map(
     local: bool = False,
     floor: float = 0.0,
     reduce: str = "mean",
-    limits: tuple[float, float] | None = None,
     ax: Any = None,
-    **where: Any,
+    **settings: Unpack[NumberSettings],
 ) -> Any:
     """A map of orders: slopes d log(data) / d log(along), such as that of a drift over ε.
 
@@ -109,8 +121,9 @@ def slope_map(
     - `local`: False: the least-squares slope along the dimension, over the others. True, or if
       `along` is `x` or `y`: slopes between neighbours, at the geometric means of their values.
     - `floor`: numbers that are not above it, such as round-off, are left out.
-    - `reduce`: of the slopes that meet in one pixel. Other arguments, with `facet`, `over` and
-      `pixels`, as for `sweep_map`; each block that is read holds whole lines along the dimension.
+    - `reduce`: of the slopes that meet in one pixel. Other arguments, with `facet`, `over`,
+      `pixels` and `limits`, as for `sweep_map`; each block that is read holds whole lines along
+      the dimension.
 
     Pixels without a slope (fewer than two positive numbers) are hatched grey.
 
@@ -123,22 +136,12 @@ def slope_map(
     one_of("reduce", reduce, REDUCTIONS)
     dim = dim_of(data, along, "along")
     values, order = _positive(data, along)
-    names, facet = where.get("over", ()), where.get("facet")
-    names = [*([names] if isinstance(names, str) else names), *([facet] if facet else [])]
-    if wrong := [name for name in names if dim_of(data, name) == dim]:
-        raise ValueError(
-            f"facet and over must not use the dimension {dim!r}, got {wrong[0]!r}: the slopes are "
-            "computed along this dimension. Choose another dimension for facet or over."
-        )
     x, y = (along if name is not None and dim_of(data, name) == dim else name for name in (x, y))
     local = local or along in (x, y)
     replacements: dict[str, Any] = {along: None}
     if local:
         if along not in (x, y) and None not in (x, y):
-            raise ValueError(
-                f"local=True needs {along!r} as x or y, got x={x!r} and y={y!r}: set x or y to "
-                f"{along!r}, or leave one of them out."
-            )
+            raise ValueError(f"local=True needs {along!r} as x or y, got x={x!r}, y={y!r}.")
         if along not in (x, y):
             x, y = (along, y) if x is None else (x, along)
         middle = np.sqrt(values[1:] * values[:-1])
@@ -146,15 +149,17 @@ def slope_map(
         replacements = {
             along: xr.DataArray(middle, dims=[dim], coords={along: (dim, middle, attributes)})
         }
-    grid = arrange(data, x, y, where, replacements)
-    lines = Lines(dim, partial(_slopes, np.log(values), order, floor, local))
+    grid = arrange(data, x, y, settings, replacements)
+    lines = LineFunction(dim, partial(_slopes, np.log(values), order, floor, local))
     pictures = [reduce_to_pixels(panel, grid.bins, reduce, lines) for _, panel in grid.panels]
     name = str(data.name or "data").replace("_", " ")
     over_what = label_of(data.coords[along], along).partition(" [")[0]
     label = f"{'local slope' if local else 'slope'} of log {name} over log {over_what}"
-    return _draw(grid, pictures, label, "no slope", ax, _scale(pictures, False, limits))
+    scale = _scale(pictures, False, settings.get("limits"))
+    return _draw(grid, pictures, label, "no slope", ax, scale)
 
 
+@checked_keywords
 @in_style
 def failure_map(
     data: Any,
@@ -162,7 +167,7 @@ def failure_map(
     y: str | None = None,
     reduce: str = "any",
     ax: Any = None,
-    **where: Any,
+    **settings: Unpack[GridSettings],
 ) -> Any:
     """A map of the status of each trajectory of a sweep.
 
@@ -179,7 +184,7 @@ def failure_map(
     """
     status = _status_of("data", data)
     one_of("reduce", reduce, ("any", "fraction"))
-    grid = arrange(status, x, y, where)
+    grid = arrange(status, x, y, settings)
     statuses = _count("data", status, grid, (panel for _, panel in grid.panels))
     codes, names = statuses.codes, statuses.names
     if reduce == "fraction":
@@ -227,8 +232,7 @@ def _scale(pictures: Sequence[Picture], log: bool | None, limits: Any) -> tuple[
         log = log and bool(positive.max() > 10**_DECADES * positive.min())
     if log and (numbers < 0).any():
         raise ValueError(
-            "log=True is not allowed for negative values, and the smallest value of a pixel is "
-            f"{numbers.min():.3g}: leave out log=True, or draw abs(data)."
+            f"log=True requires values of at least 0, got {numbers.min():.3g}: draw abs(data)."
         )
     if limits is not None:
         low, high = two_numbers(limits)
@@ -322,24 +326,15 @@ def _share(count: int, total: int) -> str:
 
 def _positive(data: Any, coordinate: str) -> tuple[np.ndarray, np.ndarray]:
     """(positive values of a coordinate, rising; their places along the dimension)."""
-    kind = data.coords[coordinate].dtype if coordinate in data.coords else None
-    if kind is None or kind.kind not in "iuf":
-        kind_text = "has no coordinate values" if kind is None else f"has values of dtype {kind}"
+    values = data.coords[coordinate].values if coordinate in data.coords else np.zeros(0)
+    order = np.zeros(0, int)
+    if values.dtype.kind in "iuf":
+        order = np.argsort(values, kind="stable")
+        order = order[np.isfinite(values[order]) & (values[order] > 0)]
+    if len(order) < 2 or (np.diff(values[order]) == 0).any():
         raise ValueError(
-            f"along={coordinate!r} must have numbers as coordinate values, but it {kind_text}: add "
-            "numbers with data.assign_coords, or choose another dimension or coordinate. The "
-            f"dimensions are {names_of(data)}."
-        )
-    values = data.coords[coordinate].values
-    order = np.argsort(values, kind="stable")
-    order = order[np.isfinite(values[order]) & (values[order] > 0)]
-    equal = np.flatnonzero(np.diff(values[order]) == 0)
-    if len(order) < 2 or len(equal):
-        cause = f"{values[order[equal[0]]]} more than once" if len(equal) else f"only {len(order)}"
-        raise ValueError(
-            f"along={coordinate!r} must have at least two positive values, all different, got "
-            f"{cause}. "
-            "Select other values, or choose another coordinate."
+            f"along={coordinate!r} must have as coordinate two or more positive numbers, all "
+            f"different, got {values!r:.100}: choose one of {names_of(data)}."
         )
     return np.asarray(values[order], float), order
 
@@ -380,10 +375,7 @@ def _status_of(name: str, data: Any) -> Any:
     if isinstance(data, xr.Dataset):
         if "status" not in data:
             names = ", ".join(map(str, data.data_vars)) or "no variables"
-            raise ValueError(
-                f"{name} must contain the variable status, got a Dataset with {names}: give "
-                "result.to_xarray(), where result is the result of dvi.sweep."
-            )
+            raise ValueError(f"{name} must contain the variable status, got a Dataset of {names}.")
         data = data["status"]
     return checked_array(data)
 
@@ -393,9 +385,8 @@ def _count(name: str, status: Any, grid: Grid, panels: Iterable[Any]) -> _Status
     values, meanings = map(status.attrs.get, ("flag_values", "flag_meanings"))
     if values is None or meanings is None or len(values) != len(meanings.split()):
         raise ValueError(
-            f"{name} must have the attributes flag_values and flag_meanings, with one word in "
-            f"flag_meanings for each value, got {values!r} and {meanings!r}: give "
-            "result.to_xarray().status, where result is the result of dvi.sweep."
+            f"{name} must have attributes flag_values and flag_meanings, a word for each value, "
+            f"got {values!r} and {meanings!r}: give the status of dvi.sweep(...).to_xarray()."
         )
     codes, names = zip(*sorted(zip(map(int, values), meanings.split(), strict=True)), strict=True)
     counts = [count_codes(panel, grid.bins, codes) for panel in panels]
@@ -409,12 +400,15 @@ def _count_beside(status: Any, grid: Grid) -> _Statuses:
     status = _status_of("status", status)
     facets = [] if grid.facet is None else [dim_of(status, grid.facet)]
     dims = [*grid.bins, *facets]
-    excess = [d for d in status.dims if d not in (*dims, *grid.over) and status.sizes[d] > 1]
-    if excess or any(d not in status.dims for d in dims):
+    excess = [
+        dim
+        for dim in status.dims
+        if dim not in (*dims, *grid.reduced_dims) and status.sizes[dim] > 1
+    ]
+    if excess or any(dim not in status.dims for dim in dims):
         raise ValueError(
             f"status must have the dimensions {', '.join(dims)} of the map and no others, got "
-            f"{names_of(status)}: use the status of the same sweep as data, and select the same "
-            "values in both before the plot."
+            f"{names_of(status)}: give that of the same sweep and selection."
         )
     selections = (dict.fromkeys(facets, i) for i in range(len(grid.panels)))
     return _count("status", status, grid, (status.isel(selection) for selection in selections))

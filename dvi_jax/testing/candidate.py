@@ -49,7 +49,7 @@ class Candidate:
         return state(solution), solution.result == dvi.RESULTS.successful
 
     @functools.cached_property
-    def compiled(self):
+    def program(self):
         """`run`, compiled."""
         return jax.jit(self.run)
 
@@ -65,14 +65,16 @@ class Candidate:
         In reverse mode, for each adjoint and each input; in forward mode, of all inputs together.
         """
 
-        def of(x):
-            def lost(x, adjoint=ADJOINTS["Direct"]):
+        def derivatives(x):
+            def loss_of_run(x, adjoint=ADJOINTS["Direct"]):
                 return loss(self.run(x, adjoint)[0])
 
-            backward = {name: jax.grad(lost)(x, adjoint) for name, adjoint in ADJOINTS.items()}
-            return backward, jax.jvp(lost, (x,), (jax.tree.map(jnp.ones_like, x),))[1]
+            backward = {
+                name: jax.grad(loss_of_run)(x, adjoint) for name, adjoint in ADJOINTS.items()
+            }
+            return backward, jax.jvp(loss_of_run, (x,), (jax.tree.map(jnp.ones_like, x),))[1]
 
-        backward, forward = jax.jit(of)(inputs(self.small))
+        backward, forward = jax.jit(derivatives)(inputs(self.small))
         total = jax.tree.map(lambda slope: float(jnp.sum(slope)), backward)
         return total, float(forward)
 

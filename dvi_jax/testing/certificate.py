@@ -1,6 +1,5 @@
 """Every method under every check, and whether every check can fail."""
 
-import math
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -8,11 +7,12 @@ from typing import Any
 
 import dvi_jax as dvi
 
+from ..base.checks import instance, positive
 from .candidate import Candidate
-from .check import CHECKS, Measured, chosen, require_double_precision
+from .check import CHECKS, Measured, require_double_precision, selected_names
 from .controls import CONTROLS, Control
-from .page import Table, markdown, tables
-from .problems import COUPLED, FORCED, reference
+from .page import Sheet, markdown, tables
+from .problems import COUPLED, STRENGTH, reference
 from .registry import METHODS
 
 _WORKERS = 2
@@ -34,7 +34,12 @@ class Certificate:
     @property
     def failures(self) -> list[tuple[str, str, Measured]]:
         """(method, check, measured) wherever a method lacks a property that it claims."""
-        return [(m, c, x) for m, row in self.rows.items() for c, x in row.items() if not x.ok]
+        return [
+            (method, check, result)
+            for method, row in self.rows.items()
+            for check, result in row.items()
+            if not result.ok
+        ]
 
     @property
     def missed(self) -> list[Control]:
@@ -56,7 +61,7 @@ class Certificate:
             f"controls: {detections} of {len(self.controls)} caught"
         )
 
-    def tables(self) -> list[Table]:
+    def tables(self) -> list[Sheet]:
         """The tables, as text."""
         return tables(self.methods, self.rows, self.controls)
 
@@ -90,11 +95,11 @@ def certify(
     method takes 15 to 35 seconds.
     """
     require_double_precision()
-    by_name = _named(methods)
-    names = chosen("check", checks, CHECKS)
+    by_name = _methods_by_name(methods)
+    names = selected_names("check", checks, CHECKS)
     controls = [control for control in CONTROLS if control.check in names]
     if {"order", "forced-order"} & set(names):
-        for epsilon in (0.0, FORCED):
+        for epsilon in (0.0, STRENGTH):
             reference(COUPLED, epsilon)  # here, not in each worker at once
 
     def row(method: dvi.Method, names: list[str]) -> dict[str, Measured]:
@@ -117,30 +122,21 @@ def certify(
     return Certificate(by_name, outcomes_of, outcomes)
 
 
-def _named(methods: Any) -> dict[str, dvi.Method]:
+def _methods_by_name(methods: Any) -> dict[str, dvi.Method]:
     """Name → method, checked."""
     if isinstance(methods, dvi.Method):
         raise TypeError(
-            "methods must have names as keys of a dict, got one method without a name. Write "
-            f'certify({{"mine": {methods!r}}}).'
+            f'methods must be a dict such as {{"mine": {methods!r}}}, got a method without a name.'
         )
     if not isinstance(methods, Mapping):
         hint = " For your own method call certify({name: method})."
-        return {name: METHODS[name] for name in chosen("method", methods, METHODS, hint)}
+        return {name: METHODS[name] for name in selected_names("method", methods, METHODS, hint)}
     for name, method in methods.items():
-        if not isinstance(method, dvi.Method):
-            kind = (
-                f"the class {method.__name__}" if isinstance(method, type) else f"{method!r:.200}"
-            )
-            raise TypeError(f"methods[{name!r}] must be a method such as dvi.TypeII(), got {kind}.")
+        instance(f"methods[{name!r}]", method, dvi.Method, "a method such as dvi.TypeII()")
         order = method.order
         if isinstance(order, bool) or not isinstance(order, int | float):
             raise TypeError(f"methods[{name!r}].order must be an int or a float, got {order!r}.")
-        if not (math.isfinite(order) and order > 0):
-            raise ValueError(f"methods[{name!r}].order must be positive and finite, got {order!r}.")
+        positive(f"methods[{name!r}].order", order)
     if not methods:
-        raise ValueError(
-            'methods is empty: give at least one method with its name, such as {"mine": '
-            "dvi.TypeII()}, or None for all methods of the package."
-        )
+        raise ValueError('methods is empty: give {"mine": dvi.TypeII()}, or None for all.')
     return {str(name): method for name, method in methods.items()}

@@ -33,10 +33,7 @@ class Measured:
 
     def __post_init__(self):
         if self.passed and not math.isfinite(self.value):
-            raise ValueError(
-                f"a check that measured {self.value} cannot have passed: give passed=False. "
-                f"{self.detail}".rstrip()
-            )
+            raise ValueError(f"passed must be False for a value of {self.value}. {self.detail}")
 
     @property
     def ok(self) -> bool:
@@ -100,10 +97,7 @@ def check(name: str, remedy: str, digits: str = ".0e", any_problem: bool = False
 
         def requirement(method: dvi.Method, problem: Problem | None = None) -> Measured:
             if problem is not None and not any_problem:
-                raise ValueError(
-                    f"problem must be None, because {name} is measured on a fixed problem. Call "
-                    f"{requirement.__name__}(method)."
-                )
+                raise ValueError(f"problem must be None: {name} is measured on a fixed problem.")
             return _require(Candidate(method, problem), [name])[name]
 
         # Not functools.wraps: the signature shown must be that of `required`.
@@ -129,7 +123,7 @@ def check_method(method: dvi.Method, checks: Iterable[str] | None = None) -> dic
 
 def _require(candidate: Candidate, checks: Iterable[str] | None) -> dict[str, Measured]:
     require_double_precision()
-    results = {name: CHECKS[name](candidate) for name in chosen("check", checks, CHECKS)}
+    results = {name: CHECKS[name](candidate) for name in selected_names("check", checks, CHECKS)}
     faults = [
         f"{name}: measured {result.value:.3g}, required {result.allowed}. {result.detail}\n"
         f"  What is measured: {CHECKS[name].says}\n  What to do: {CHECKS[name].remedy}"
@@ -146,12 +140,12 @@ def require_double_precision() -> None:
     """**Raises** `ValueError` where x64 is off: the bounds are those of double precision."""
     if jnp.result_type(float) != jnp.float64:
         raise ValueError(
-            "methods must be measured in double precision, but x64 is off. First call "
+            "methods are measured in double precision, but x64 is off: first call "
             'jax.config.update("jax_enable_x64", True).'
         )
 
 
-def chosen(kind: str, names: Any, choices: Iterable[str], hint: str = "") -> list[str]:
+def selected_names(kind: str, names: Any, choices: Iterable[str], hint: str = "") -> list[str]:
     """`names` without repetitions, or all that are known for None.
 
     **Raises** `ValueError` for an unknown name and for none at all, `TypeError` for no list.
@@ -165,16 +159,13 @@ def chosen(kind: str, names: Any, choices: Iterable[str], hint: str = "") -> lis
         )
     names = list(dict.fromkeys(names))
     if not names:
-        raise ValueError(
-            f"{kind}s is empty: name at least one of {', '.join(choices)}; or give None for all."
-        )
+        raise ValueError(f"{kind}s is empty: give some of {', '.join(choices)}, or None for all.")
     lower_case = {name.lower(): name for name in choices}
     for name in names:
         if name not in choices:
             matches = difflib.get_close_matches(str(name).lower(), lower_case, n=1)
             proposal = f" (did you mean {lower_case[matches[0]]}?)" if matches else ""
             raise ValueError(
-                f"{kind}s must be known names, got {name!r:.200}{proposal}. The known names are "
-                f"{', '.join(choices)}.{hint}"
+                f"{kind}s must be some of {', '.join(choices)}, got {name!r:.200}{proposal}.{hint}"
             )
     return names

@@ -12,7 +12,7 @@ import dvi_jax as dvi
 from . import problems
 from .candidate import LONG, LONG_H, STEPS, Candidate, loss
 from .check import Measured, at_most, check, not_measured
-from .problems import FORCED, SPAN, inputs
+from .problems import SPAN, STRENGTH, inputs
 
 ROUND_OFF = 1e-12
 
@@ -46,7 +46,7 @@ def check_order(candidate: Candidate) -> Measured:
 @check("forced-order", _ORDER, ".2f")
 def check_forced_order(candidate: Candidate) -> Measured:
     """The same as order, with the force."""
-    return _measured_order(candidate, FORCED)
+    return _measured_order(candidate, STRENGTH)
 
 
 def _measured_order(candidate: Candidate, epsilon: float) -> Measured:
@@ -149,7 +149,7 @@ def check_inverse(candidate: Candidate) -> Measured:
         return not_measured(bound, "the method has no inverse", claimed=False)
     adjoint = dvi.Adjoint(method)  # pyright: ignore[reportCallIssue]
     x = inputs(candidate.small)
-    z, success = candidate.compiled(x)
+    z, success = candidate.program(x)
     q, p = (part.reshape(x["q0"].shape) for part in jnp.split(z, 2))
     end = {"q0": q, "p0": p, "t0": x["t0"] + STEPS * x["h"], "h": -x["h"]}
     final, success_of_inverse = jax.jit(lambda x: candidate.run(x, method=adjoint))(x | end)
@@ -175,7 +175,7 @@ def check_energy(candidate: Candidate) -> Measured:
     x, run = inputs(problems.CENTRAL), candidate.long_run
     drift = abs(float(run.observed["slope"])) * LONG * LONG_H
     swing = float(run.observed["range"])
-    start = float(problems.central(0, 0, x["q0"], x["p0"], x["args"]))
+    start = float(problems.central_hamiltonian(0, 0, x["q0"], x["p0"], x["args"]))
     detail = f"over {LONG} steps drift {drift:.1e}, range {swing:.1e}, energy {start:.2g}"
     return _of_long_run(candidate, drift / max(swing, QUIET * start), FRACTION, detail)
 
@@ -238,7 +238,7 @@ def _quotient(candidate: Candidate, name: str) -> float:
     x = inputs(candidate.small)
 
     def loss_of(shift):
-        return float(loss(np.asarray(candidate.compiled(x | {name: x[name] + shift})[0])))
+        return float(loss(np.asarray(candidate.program(x | {name: x[name] + shift})[0])))
 
     def slope(s):
         return (loss_of(s) - loss_of(-s)) / (2 * s)
@@ -267,8 +267,8 @@ def check_batch(candidate: Candidate) -> Measured:
     """Relative difference between four trajectories in a batch (`jax.vmap`), different in every
     input, and the same four computed one by one; coupled problem with its force. At most 1e-12."""
     xs = _batch(candidate)
-    batch = candidate.batch(_stacked(xs))[0]
-    alone = [candidate.compiled(x)[0] for x in xs]
+    batch = candidate.batch(_stack(xs))[0]
+    alone = [candidate.program(x)[0] for x in xs]
     return at_most(_relative(batch, alone), ROUND_OFF, detail=f"{len(xs)} trajectories")
 
 
@@ -278,12 +278,12 @@ def check_failure(candidate: Candidate) -> Measured:
     and be NaN, and the others must agree to 1e-12 with those computed alone."""
     xs, bad = _batch(candidate), 1
     xs[bad] |= {"q0": jnp.full_like(xs[bad]["q0"], 1e200)}
-    batch, good = candidate.batch(_stacked(xs))
+    batch, good = candidate.batch(_stack(xs))
     if good[bad] or np.isfinite(batch[bad]).any():
         report = "as a success" if good[bad] else "as a failure, but its state is a number"
         detail = f"the trajectory that overflows is reported {report}"
         return Measured(np.inf, f"≤ {ROUND_OFF:g}", False, detail=detail)
-    alone = [candidate.compiled(x)[0] for i, x in enumerate(xs) if i != bad]
+    alone = [candidate.program(x)[0] for i, x in enumerate(xs) if i != bad]
     return at_most(_relative(np.delete(batch, bad, 0), alone), ROUND_OFF)
 
 
@@ -320,7 +320,7 @@ def _batch(candidate: Candidate) -> list[dict[str, jax.Array]]:
     return [jax.tree.map(lambda a, i=i: a * (1 + 0.1 * i), x) for i in range(4)]
 
 
-def _stacked(xs):
+def _stack(xs):
     return jax.tree.map(lambda *a: jnp.stack(a), *xs)
 
 

@@ -22,7 +22,7 @@ class Control(NamedTuple):
     method: dvi.Method
 
 
-class Altered(dvi.Method):
+class AlteredMethod(dvi.Method):
     """A method with another step, inverse or claims."""
 
     method: dvi.Method
@@ -59,11 +59,11 @@ def altered(
     step: Callable[..., Any] = _step,
     inverse: Callable[..., Any] = _inverse,
     **claims: Any,
-) -> Altered:
+) -> AlteredMethod:
     """`method` with another step or inverse, ``(method, equations, interval, q, p)``, or claims."""
     names = ("order", "is_symmetric", "is_symplectic", "is_invertible")
     properties: Any = {name: getattr(method, name) for name in names} | claims
-    return Altered(method=method, **properties, own_step=step, own_inverse=inverse)
+    return AlteredMethod(method=method, **properties, own_step=step, own_inverse=inverse)
 
 
 def _explicit_euler(method, equations, interval, q, p):
@@ -100,18 +100,18 @@ def _with_a_number_from_python(method, equations, interval, q, p):
 
 
 @jax.custom_batching.custom_vmap
-def _itself(q):
+def _identity(q):
     return q
 
 
-@_itself.def_vmap
-def _mixed(axis_size, in_batched, q):
+@_identity.def_vmap
+def _mixing_rule(axis_size, in_batched, q):
     del axis_size, in_batched
     return q + 1e-9 * jnp.mean(q, axis=0, keepdims=True), True
 
 
 def _mixing_lanes(method, equations, interval, q, p):
-    return method.step(equations, interval, _itself(q), p)
+    return method.step(equations, interval, _identity(q), p)
 
 
 def _hiding_nan(method, equations, interval, q, p):

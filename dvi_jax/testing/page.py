@@ -46,7 +46,7 @@ def page_for(out: Path) -> Path:
     return page
 
 
-class Table(NamedTuple):
+class Sheet(NamedTuple):
     """A title, names of columns, rows of text."""
 
     title: str
@@ -58,7 +58,7 @@ def tables(
     methods: Mapping[str, dvi.Method],
     rows: Mapping[str, Mapping[str, Measured]],
     controls: Sequence[tuple[Control, Measured]],
-) -> list[Table]:
+) -> list[Sheet]:
     """The methods under each group of checks, then the controls."""
     sheets = []
     for title, group in GROUPS.items():
@@ -68,15 +68,21 @@ def tables(
             columns["claims"] = [claims(methods[name]) for name in rows]
         columns |= {n: [cell(n, row[n]) for row in rows.values()] for n in names}
         if names:
-            sheets.append(Table(title, list(columns), list(zip(*columns.values(), strict=True))))
+            sheets.append(Sheet(title, list(columns), list(zip(*columns.values(), strict=True))))
     if controls:
         words = {True: "caught", False: "MISSED"}
         body = [
-            [c.check, c.name, cell(c.check, x), x.allowed, words[x.verdict == "FAIL"]]
-            for c, x in controls
+            [
+                control.check,
+                control.name,
+                cell(control.check, result),
+                result.allowed,
+                words[result.verdict == "FAIL"],
+            ]
+            for control, result in controls
         ]
         columns = ["check", "broken method", "measured", "allowed", "verdict"]
-        sheets.append(Table("Controls", columns, body))
+        sheets.append(Sheet("Controls", columns, body))
     return sheets
 
 
@@ -97,7 +103,7 @@ def cell(check: str, result: Measured) -> str:
 
 
 def markdown(
-    sheets: Sequence[Table], summary: str, failures: Sequence[tuple[str, str, Measured]]
+    sheets: Sequence[Sheet], summary: str, failures: Sequence[tuple[str, str, Measured]]
 ) -> str:
     """The page, from the template `page.md`."""
     versions = ", ".join(f"{n} {version(n)}" for n in ("dvi-jax", "jax", "jaxlib", "numpy"))
@@ -106,7 +112,8 @@ def markdown(
     parts = [f"## {table.title}\n\n{_as_markdown(table)}" for table in sheets]
     if failures:
         faults = [
-            f"- {m}, {c}: {x.verdict}, allowed {x.allowed}. {x.detail}" for m, c, x in failures
+            f"- {method}, {c}: {result.verdict}, allowed {result.allowed}. {result.detail}"
+            for method, c, result in failures
         ]
         parts.append("\n".join(["## Failures\n", *faults]))
     template = Path(__file__).with_name("page.md").read_text(encoding="utf-8")
@@ -119,7 +126,7 @@ def markdown(
     )
 
 
-def _as_markdown(table: Table) -> str:
+def _as_markdown(table: Sheet) -> str:
     rows = [table.columns, ["---"] * len(table.columns), *table.rows]
     return "\n".join(
         "| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows

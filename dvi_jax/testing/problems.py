@@ -10,13 +10,13 @@ import numpy as np
 import dvi_jax as dvi
 from dvi_jax.systems import Problem
 
-FORCED = 0.2
+STRENGTH = 0.2
 """ε where the force is on."""
 
 _DEFAULT = dvi.Reversible()
 
 
-def coupled(t0, t1, q0, p1, args):
+def coupled_hamiltonian(t0, t1, q0, p1, args):
     """H = (1 + |q|²)(1 + |p|²)/2 + a |p|² Σq: not separable, not integrable, bounded below."""
     pp = p1 @ p1
     return (1 + q0 @ q0) * (1 + pp) / 2 + args * jnp.sum(q0) * pp
@@ -27,7 +27,7 @@ def damping(t0, t1, q0, p1, args):
     return -(1 + q0 @ q0) * p1 + jnp.cos(t0)
 
 
-def central(t0, t1, q0, p1, args):
+def central_hamiltonian(t0, t1, q0, p1, args):
     """H = |p|²/2 + |q|²/2 + a |q|⁴/4: a central force whose orbits are rosettes."""
     r2 = q0 @ q0
     return p1 @ p1 / 2 + r2 / 2 + args * r2**2 / 4
@@ -40,7 +40,7 @@ def modulation(t0, t1, q0, p1, args):
 
 def central_energy(t0, t1, q0, p0, q1, p1, args):
     """H of `CENTRAL` at the end of a step."""
-    return central(t1, t1, q1, p1, args)
+    return central_hamiltonian(t1, t1, q1, p1, args)
 
 
 def angular_momentum(t0, t1, q0, p0, q1, p1, args):
@@ -53,19 +53,19 @@ def _problem(name, hamiltonian, force, q0, p0) -> Problem:
     return Problem(name, system, np.array(q0), np.array(p0), h=0.1, args=0.3)
 
 
-COUPLED = _problem("coupled", coupled, damping, [0.5, -0.3], [0.2, 0.4])
+COUPLED = _problem("coupled", coupled_hamiltonian, damping, [0.5, -0.3], [0.2, 0.4])
 """Two degrees of freedom; every step of every method but the explicit ones solves."""
 
-SINGLE = _problem("coupled", coupled, damping, [0.4], [0.3])
+SINGLE = _problem("coupled", coupled_hamiltonian, damping, [0.4], [0.3])
 """The same with one degree of freedom."""
 
-CENTRAL = _problem("central", central, modulation, [0.5, 0.1], [0.2, 0.6])
+CENTRAL = _problem("central", central_hamiltonian, modulation, [0.5, 0.1], [0.2, 0.6])
 """Separable: compositions of `TypeII` need no solve, so that 100 000 steps are fast."""
 
 
 def inputs(problem: Problem, t0: float = 0.3) -> dict[str, Any]:
     """All that a run depends on, as arrays; the force is on."""
-    x = {"q0": problem.q0, "p0": problem.p0, "t0": t0, "h": problem.h, "epsilon": FORCED}
+    x = {"q0": problem.q0, "p0": problem.p0, "t0": t0, "h": problem.h, "epsilon": STRENGTH}
     x = {name: jnp.asarray(value, jnp.float64) for name, value in x.items()}
     return x | {"args": jax.tree.map(jnp.asarray, problem.args)}
 

@@ -49,12 +49,11 @@ def reproduce(out: Path | str, force: bool = False, console: Console | None = No
     """
     out = Path(out)
     if out.exists() and not out.is_dir():
-        raise NotADirectoryError(f"out must be a folder, but {out} is a file: choose another name.")
+        raise NotADirectoryError(f"out must be a folder, but {out} is a file.")
     if out.exists() and any(out.iterdir()) and not force:
         raise FileExistsError(
-            f"out must be a new or an empty folder, but {out} is not empty. Choose another folder. "
-            "To overwrite the files of an earlier reproduction use force=True, on the command line "
-            "--force; other files stay."
+            f"out must be a new or an empty folder, but {out} is not empty: choose another folder, "
+            "or use force=True (--force), which overwrites files of the same names."
         )
     out.mkdir(parents=True, exist_ok=True)
     console = Console() if console is None else console
@@ -102,7 +101,7 @@ def _summary(claims: list[Claim]) -> Table:
         verdict = claim.verdict
         # The decisive check: the failing one of the printed claim, or its first if none fails.
         check = next((c for c in claim.printed if not c.passes), claim.printed[0])
-        number = f"{check.what}: {pretty(check.value)}"
+        number = f"{check.quantity}: {pretty(check.value)}"
         text = f"[{_COLOUR[verdict]}]{MARKS[verdict]} {verdict.value}[/]"
         table.add_row(claim.where, claim.says, number, text)
     return table

@@ -19,21 +19,21 @@ class Verdict(Enum):
     FAILS = "does not hold"
 
 
-_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def pretty(value: float) -> str:
     """The number with three digits as text, 1.39e-08 written as 1.39×10⁻⁸."""
     mantissa, _, exponent = f"{value:.3g}".partition("e")
     mantissa = mantissa.replace("-", "−")
-    return f"{mantissa}×10{str(int(exponent)).translate(_RAISED)}" if exponent else mantissa
+    return f"{mantissa}×10{str(int(exponent)).translate(_SUPERSCRIPTS)}" if exponent else mantissa
 
 
 @dataclass(frozen=True)
-class Check:
+class NumberCheck:
     """A measured number and its allowed band, bounds included; NaN is never in it."""
 
-    what: str
+    quantity: str
     value: float
     low: float = -math.inf
     high: float = math.inf
@@ -60,16 +60,16 @@ class Check:
 
 @dataclass(frozen=True)
 class Claim:
-    """A row of `claims.toml` with its numbers; `why` explains the verdict `on_record`."""
+    """A row of `claims.toml` with its numbers; `explanation` is that of the verdict `on_record`."""
 
     key: str
     where: str
     says: str
-    printed: tuple[Check, ...]
-    corrected: tuple[Check, ...]
+    printed: tuple[NumberCheck, ...]
+    corrected: tuple[NumberCheck, ...]
     on_record: Verdict
-    why: str
-    also: tuple[Check, ...] = ()
+    explanation: str
+    context: tuple[NumberCheck, ...] = ()
 
     @property
     def verdict(self) -> Verdict:
@@ -86,7 +86,7 @@ class Claim:
     @property
     def reason(self) -> str:
         if self.is_expected:
-            return self.why
+            return self.explanation
         return (
             f"Unexpected: the verdict on record is “{self.on_record.value}”. The package or its "
             "dependencies have changed; compare the numbers with their bands."
@@ -101,10 +101,10 @@ def judge(measurements: Measurements) -> list[Claim]:
     def claim(row: dict[str, Any]) -> Claim:
         checks = {
             part: tuple(
-                Check(quantity, values[name], *map(float, bounds))
+                NumberCheck(quantity, values[name], *map(float, bounds))
                 for quantity, name, *bounds in row.get(part, ())
             )
-            for part in ("printed", "corrected", "also")
+            for part in ("printed", "corrected", "context")
         }
         return Claim(**{**row, **checks, "on_record": Verdict(row["on_record"])})
 

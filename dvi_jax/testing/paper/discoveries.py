@@ -104,7 +104,7 @@ def _on_kepler(rng, tick: Tick) -> dict[str, Any]:
         "gauge_50_exponent": slope(hs, np.array(left)),
         "balance_gap_by_tool": largest(causes.defect) / scale,
         "variational_count": float(len(symmetries.variational)),
-        "found_rotation": _outside(symmetries, samples["samples"]),
+        "found_rotation": _distance_from_span(symmetries, samples["samples"]),
         "found_residual": max((float(np.max(s.residuals)) for s in symmetries), default=np.inf),
     }
 
@@ -115,15 +115,15 @@ def _ring(rng, count):
     return np.stack([r * np.cos(angle), r * np.sin(angle)], 1), rng.uniform(-1, 1, (count, 2))
 
 
-def _outside(fields: dvi.Symmetries, samples) -> float:
+def _distance_from_span(fields: dvi.Symmetries, samples) -> float:
     """How far the rotation (40) is outside of the span of what was found, relative."""
 
     def at_samples(generator):
-        def one(q, p):
+        def at_sample(q, p):
             point = dvi.LatticePoint(jnp.zeros(()), q, p)
             return jnp.concatenate([jnp.ravel(x) for x in generator(point)])
 
-        return np.asarray(jax.vmap(one)(*samples)).ravel()
+        return np.asarray(jax.vmap(at_sample)(*samples)).ravel()
 
     target = at_samples(ROTATION)
     if not fields.count:

@@ -11,7 +11,7 @@ class Equation:
     """A numbered equation; `code`: names of its implementation; `note`: error of the print."""
 
     number: int
-    what: str
+    statement: str
     code: tuple[str, ...]
     note: str = ""
 

@@ -47,7 +47,7 @@ def _figure(name: str, caption: str, heading: str, size: tuple[float, float], **
 )
 def energy_error(m: Measurements, figure: Any, axes: Any) -> None:
     run, (full, close) = m.fixed_mesh, axes
-    error = (run.mixed[0] - run.mixed[0, 0]) / 1e-6
+    error = (run.mixed_energy[0] - run.mixed_energy[0, 0]) / 1e-6
     exact = (run.exact[0] - run.exact[0, 0]) / 1e-6
     t, low, high = _bands(run.ts, error, run.h)
     full.plot(t, high, color=BLUE)
@@ -75,7 +75,7 @@ def energy_error(m: Measurements, figure: Any, axes: Any) -> None:
 )
 def against_rk4(m: Measurements, figure: Any, axes: Any) -> None:
     run = m.fixed_mesh
-    variational = np.abs(run.mixed[0] - run.mixed[0, 0])
+    variational = np.abs(run.mixed_energy[0] - run.mixed_energy[0, 0])
     rk4 = np.abs(run.rk4 - run.energy)
     # The error passes through zero twice a period, a filled band on a log axis: show the maxima.
     t, _, crests = _bands(run.ts, variational, run.h)

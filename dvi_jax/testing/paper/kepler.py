@@ -18,11 +18,14 @@ DURATION = 200.0
 """Time over which ranges and drifts are taken; about five revolutions."""
 
 
-def _turned(v):
+def _quarter_turn(v):
     return jnp.stack([-v[1], v[0]])
 
 
-_TURN: Any = {"xi": lambda t, q, p, args: _turned(q), "eta": lambda t, q, p, args: _turned(p)}
+_TURN: Any = {
+    "xi": lambda t, q, p, args: _quarter_turn(q),
+    "eta": lambda t, q, p, args: _quarter_turn(p),
+}
 
 ROTATION = dvi.Generator(**_TURN)
 """The rotation (40); its series in ε, (46), has it twice."""

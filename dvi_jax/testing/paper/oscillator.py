@@ -29,15 +29,15 @@ EPSILONS = (0.0, 1e-4, 1e-3, 1e-2, 1e-1)
 class FixedMesh:
     """The paper's run at its h = 0.1: 10 000 steps for five strengths of the perturbation.
 
-    `epsilons` (E,), `ts` (N,), `mixed` (E, N): (p_k² + q_{k−1}²)/2, `exact` (E, N): the invariant
-    of the perturbed map, `rk4` (N,): (p² + q²)/2 along RK4 at ε = 0, `energy`: its initial value.
-    Dimensionless, as all quantities of the paper.
+    `epsilons` (E,), `ts` (N,), `mixed_energy` (E, N): (p_k² + q_{k−1}²)/2, `exact` (E, N): the
+    invariant of the perturbed map, `rk4` (N,): (p² + q²)/2 along RK4 at ε = 0, `energy`: its
+    initial value. Dimensionless, as all quantities of the paper.
     """
 
     h: float
     epsilons: np.ndarray
     ts: np.ndarray
-    mixed: np.ndarray
+    mixed_energy: np.ndarray
     exact: np.ndarray
     rk4: np.ndarray
     energy: float
@@ -45,7 +45,7 @@ class FixedMesh:
     @property
     def printed(self) -> np.ndarray:
         """(34) as printed, (1+ε)(p_k² + q_{k−1}²)/2, shape (E, N)."""
-        return (1 + self.epsilons[:, None]) * self.mixed
+        return (1 + self.epsilons[:, None]) * self.mixed_energy
 
 
 @dataclass(frozen=True)
@@ -91,8 +91,8 @@ def fixed_mesh(tick: Tick) -> FixedMesh:
     """The oscillator at the paper's h = 0.1, by the variational map and by RK4."""
     problem = systems.oscillator()
     h, epsilons = problem.h, np.array(EPSILONS)
-    mixed, energy = problem.observables["mixed_energy"], problem.observables["energy"]
-    variational = jax.vmap(lambda e: run(problem, h, STEPS, epsilon=e, observe=mixed))(
+    mixed_energy, energy = problem.observables["mixed_energy"], problem.observables["energy"]
+    variational = jax.vmap(lambda e: run(problem, h, STEPS, epsilon=e, observe=mixed_energy))(
         jnp.asarray(epsilons)
     )
     tick(0.5)
@@ -103,7 +103,7 @@ def fixed_mesh(tick: Tick) -> FixedMesh:
         h=h,
         epsilons=epsilons,
         ts=np.asarray(variational.ts)[0, 1:],
-        mixed=np.asarray(variational.observed),
+        mixed_energy=np.asarray(variational.observed),
         # The perturbed map is the unperturbed one with stiffness 1 + ε, and so is its invariant.
         exact=((p**2 + stiffness * q**2 - h * stiffness * q * p) / 2)[:, 1:],
         rk4=np.asarray(rk4.observed),

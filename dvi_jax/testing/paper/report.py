@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from .claims import Check, Claim, Verdict, pretty
+from .claims import Claim, NumberCheck, Verdict, pretty
 from .equations import EQUATIONS, Equation
 from .experiments import Measurements
 from .figures import FIGURES
@@ -35,12 +35,13 @@ def counts(claims: Sequence[Claim]) -> str:
 def write_json(claims: Sequence[Claim], setting: dict[str, Any], path: Path) -> None:
     """The verdicts with every number, its band and its place; non-finite numbers as null."""
 
-    def value(check: Check) -> float | None:
+    def value(check: NumberCheck) -> float | None:
         return check.value if math.isfinite(check.value) else None
 
-    def rows(checks: Sequence[Check]) -> list[dict[str, Any]]:
+    def rows(checks: Sequence[NumberCheck]) -> list[dict[str, Any]]:
         return [
-            {"what": c.what, "value": value(c), "band": c.band, "passes": c.passes} for c in checks
+            {"what": c.quantity, "value": value(c), "band": c.band, "passes": c.passes}
+            for c in checks
         ]
 
     document = {
@@ -56,7 +57,7 @@ def write_json(claims: Sequence[Claim], setting: dict[str, Any], path: Path) -> 
                 "as_on_record": claim.is_expected,
                 "checks_as_printed": rows(claim.printed),
                 "checks_as_corrected": rows(claim.corrected),
-                "also_measured": {c.what: value(c) for c in claim.also},
+                "also_measured": {c.quantity: value(c) for c in claim.context},
             }
             for claim in claims
         ],
@@ -79,7 +80,8 @@ def write_markdown(claims: Sequence[Claim], setting: dict[str, Any], path: Path)
 
     columns = ("where", "the paper says", "measured now", "verdict", "why")
     equations = [
-        (f"({e.number})", e.what, ", ".join(f"`{c}`" for c in e.code), e.note) for e in EQUATIONS
+        (f"({e.number})", e.statement, ", ".join(f"`{c}`" for c in e.code), e.note)
+        for e in EQUATIONS
     ]
     lines = [
         "# The paper's claims, measured",
@@ -122,7 +124,7 @@ def write_html(claims: Sequence[Claim], setting: dict[str, Any], figures: Path, 
 
     def equation_row(e: Equation) -> str:
         code = " ".join(f"<code>{html.escape(c)}</code>" for c in e.code)
-        return row((f"({e.number})", _math(e.what), code, _math(e.note)))
+        return row((f"({e.number})", _math(e.statement), code, _math(e.note)))
 
     template = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
     page = string.Template(template).substitute(
@@ -192,12 +194,12 @@ def write_tables(m: Measurements, folder: Path) -> None:
 def _check_texts(claim: Claim) -> list[tuple[str, str]]:
     """The part (printed, corrected, also) and the text of each number of a claim."""
 
-    def text(check: Check) -> str:
+    def text(check: NumberCheck) -> str:
         mark = f" ({'✓' if check.passes else '✗'} required: {check.band})" if check.decides else ""
-        return f"{check.what}: {pretty(check.value)}{mark}"
+        return f"{check.quantity}: {pretty(check.value)}{mark}"
 
-    parts = ("printed", "corrected", "also")
-    return [(part, text(check)) for part in parts for check in getattr(claim, part)]
+    parts = {"printed": claim.printed, "corrected": claim.corrected, "also": claim.context}
+    return [(part, text(check)) for part, checks in parts.items() for check in checks]
 
 
 def _setting_line(setting: dict[str, Any]) -> str:

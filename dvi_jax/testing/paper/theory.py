@@ -231,13 +231,13 @@ def _oscillator_identities():
         points = dvi.LatticePoint(orbit.ts, orbit.qs, orbit.ps)
         first, second = (jax.tree.map(lambda x, k=k: x[k : 500 + k], points) for k in (0, 1))
 
-        def one(first, second):
+        def of_pair(first, second):
             return dvi.noether_identity(
                 problem.system, [SCALING] * 2, gauges, order, first, second, jnp.asarray(epsilon)
             )
 
         q0, p1 = first.q[:, 0], second.p[:, 0]
-        return jax.vmap(one)(first, second), q0 * (p1 - q0) + epsilon * q0**2
+        return jax.vmap(of_pair)(first, second), q0 * (p1 - q0) + epsilon * q0**2
 
     order_0, _ = identity(0, 0.0)
     order_1, reference = identity(1, EPSILON)

@@ -11,13 +11,13 @@ from .numbers import largest, relative_spread, slope
 
 def _oscillator(m: Measurements) -> dict[str, float]:
     mesh, cross = m.fixed_mesh, m.crossover
-    mixed, rk4 = mesh.mixed[0], mesh.rk4 - mesh.energy
+    energies, rk4 = mesh.mixed_energy[0], mesh.rk4 - mesh.energy
     accuracy, exact = relative_spread(mesh.printed)[1:], relative_spread(mesh.exact)
     return {
-        "mixed_range": float(np.ptp(mixed)),
-        "mixed_range_relative": float(relative_spread(mixed)),
-        "mixed_range_over_rk4": float(np.ptp(mixed)) / largest(rk4),
-        "mixed_drift": largest(mixed - mixed[0]),
+        "mixed_range": float(np.ptp(energies)),
+        "mixed_range_relative": float(relative_spread(energies)),
+        "mixed_range_over_rk4": float(np.ptp(energies)) / largest(rk4),
+        "mixed_drift": largest(energies - energies[0]),
         "rk4_error": largest(rk4),
         "rk4_error_at_end": float(rk4[-1]),
         "rk4_loss": cross.loss,
