@@ -16,6 +16,7 @@ from lanewise.jaxprs.jaxapi import linear_map
 
 from ...base.checks import instance, whole
 from ...base.machine import results_memory
+from ...integration.reconstruction import fold_blocks
 from ._maps import Particle
 from ._ring import Ring
 from ._turn import Passage, start
@@ -189,9 +190,8 @@ def _pulled(passage, primals, saved, cotangent, counts, moves):
     saved = jnp.where(lost, 0.0, saved)
     starts = jnp.concatenate([z0[:, None], saved[:, :-1]], axis=1)
 
-    def block(state, x):
-        k, c, of_rows, of_epsilon, worst = state
-        start, end, more = x
+    def block(state, k, start, end, more):
+        c, of_rows, of_epsilon, worst = state
 
         def undo(_, state):
             k, z, c, of_rows, of_epsilon = state
@@ -199,21 +199,15 @@ def _pulled(passage, primals, saved, cotangent, counts, moves):
             of_rows = jax.tree.map(lambda a, b: a + jnp.sum(b, 0), of_rows, found)
             return k - 1, z, c, of_rows, of_epsilon + by_epsilon
 
-        begin = (k, end, c + more, of_rows, of_epsilon)
-        k, z, *state = lax.fori_loop(0, every, undo, begin)
+        begin = (k + jnp.asarray(first + every - 1, jnp.int32), end, c + more, of_rows, of_epsilon)
+        _, z, *state = lax.fori_loop(0, every, undo, begin)
         missed = jnp.max(jnp.abs(z - start), axis=1)
-        return (k, *state, jnp.maximum(worst, missed)), None
+        return *state, jnp.maximum(worst, missed)
 
     none = jnp.zeros(len(z0))
-    begin = (
-        jnp.asarray(first + blocks * every - 1, jnp.int32),
-        jnp.zeros_like(z0),
-        {n: jnp.zeros_like(rows[n]) for n in moved},
-        none,
-        none,
-    )
+    begin = jnp.zeros_like(z0), {n: jnp.zeros_like(rows[n]) for n in moved}, none, none
     xs = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), (starts, saved, cotangent))
-    (_, c, of_rows, of_epsilon, worst), _ = lax.scan(block, begin, xs, reverse=True)
+    c, of_rows, of_epsilon, worst = fold_blocks(block, begin, blocks, every, xs)
     fine = ~wrong & ((worst < _MISSED) | jnp.any(lost, axis=(1, 2)))
     all_fine = jnp.where(jnp.all(fine), 1.0, jnp.nan)
     nan = jnp.where(fine, 1.0, jnp.nan)
