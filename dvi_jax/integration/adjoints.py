@@ -14,8 +14,7 @@ from lanewise import Layout
 from ..base.checks import whole
 from ..base.types import State
 from .loop import Loop, outcome, run, start, with_start
-from .plan import Plan, adds_start_outside
-from .task import Outcome, Task
+from .task import Outcome, Plan, Task, adds_start_outside
 
 
 class AbstractAdjoint(eqx.Module):

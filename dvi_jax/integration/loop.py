@@ -19,8 +19,7 @@ from ..lattices import Place, Uniform
 from ..methods.constraint import start_status
 from ..observe import Deviations, Pushed, Reduction, has_initial_value
 from ..observe._kept import Start, as_row, event
-from .plan import Plan, adds_start_outside
-from .task import Carry, Outcome, Saved, StepTaken, Task, or_nan
+from .task import Carry, Outcome, Plan, Saved, StepTaken, Task, adds_start_outside, or_nan
 
 Loop = Callable[[Callable, Any, None, int], tuple[Any, Any]]
 """``(body, carry, None, count) -> (carry, ys)``: `lax.scan`, or one with another derivative."""

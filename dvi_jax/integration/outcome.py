@@ -1,80 +1,75 @@
-"""Observables: checks before a run, and their values in the pytree of the user after it."""
+"""From the result of the loop to the `Solution`, or to the error of a run that has failed."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import PyTree
 
 import lanewise
 from lanewise import Layout
+from lanewise.jaxprs.jaxapi import is_traced, manual_axes
 
-from ..base.checks import function as check_function
-from ..base.signature import tracing_note
-from ..lattices import Run
-from ..observe import FORMS, Deviations, OfState, Range, Reduction, Running, is_observable
-from .task import Task
-
-
-def check_observe(task: Task, q0: Array, p0: Array) -> int:
-    """**Raises** `TypeError` or `ValueError` for observables that are not functions of a step with
-    an array as value. **Returns** the bytes of those without a reduction, at one save point."""
-    size = 0
-    for leaf in jax.tree.leaves(task.observe, is_leaf=is_observable):
-        if isinstance(leaf, type) and issubclass(leaf, Reduction | Running):
-            raise TypeError(
-                f"observe contains the class {leaf.__name__}: give an object of this class. "
-                "Examples are dvi.MEGNO(), dvi.Running(dvi.MEGNO()) and dvi.MaxDrift(function), "
-                f"with a function of {FORMS}."
-            )
-        if not is_observable(leaf):
-            raise TypeError(
-                f"observe must be a function of {FORMS}, a reduction such as dvi.MaxDrift(f), "
-                f"dvi.Running(reduction), or a dict, list or tuple of these, got {leaf!r:.200}."
-            )
-        if isinstance(leaf, Running):
-            leaf = leaf.reduction
-        if isinstance(leaf, Deviations):
-            _check_deviations(leaf, task, q0, p0)
-            continue
-        function = leaf.function if isinstance(leaf, Reduction) else leaf
-        called = getattr(function, "__name__", type(function).__name__)
-        check_function(f"the argument of {type(leaf).__name__}", function, FORMS)
-        t0, bound = task.t0, task.bound(function)
-        try:
-            out = eqx.filter_eval_shape(bound, t0, t0, q0, p0, q0, p0, task.args)
-        except Exception as error:
-            # The error itself stays: its type and traceback show the line of the user.
-            error.add_note(f"(in the observable {called}, with the arguments {FORMS})")
-            error.add_note(tracing_note(called, error))
-            raise
-        if not hasattr(out, "shape") and not isinstance(out, int | float):
-            seen = "None (is a return missing?)" if out is None else f"type {type(out).__name__}"
-            raise TypeError(
-                f"the observable {called!r} must return one array, got {seen}. For several values "
-                "use jnp.stack, or give observe a dict of observables."
-            )
-        if isinstance(leaf, Range) and jnp.issubdtype(jnp.result_type(out), jnp.complexfloating):
-            raise TypeError(
-                f"dvi.Range requires real values, but the observable {called!r} returns complex "
-                "values. Take their real part, imaginary part or absolute value."
-            )
-        if not isinstance(leaf, Reduction):
-            size += int(np.prod(np.shape(out), dtype=int)) * jnp.result_type(out).itemsize
-    return size
+from ..base.results import RESULTS, IntegrationError, status_code, status_name
+from ..engine.newton import relative_size
+from ..engine.rounding import each
+from ..lattices import Place, Run
+from ..observe import OfState, Reduction, RequestedTimes, Running, Section, is_observable
+from ..observe._kept import Start
+from ..observe.solution import Solution
+from .dense import Curve, at_times, crossings, stopped
+from .task import Outcome, Plan, StepTaken, Task
 
 
-def _check_deviations(leaf: Deviations, task: Task, q0: Array, p0: Array) -> None:
-    name = type(leaf).__name__
-    # The derivative of a step is taken at a fixed h; the derivative of h would be missing.
-    if task.lattice.has_memory:
-        raise ValueError(
-            f"{name} requires steps whose size does not depend on the state, got "
-            f"lattice={task.lattice!r}. Use lattice=dvi.Uniform() or dvi.Given(ts)."
-        )
-    eqx.filter_eval_shape(leaf.start, jnp.zeros(2 * q0.size, q0.dtype))  # counts and units
+def as_solution(
+    task: Task, plan: Plan, observe: PyTree, outcome: Outcome, q0, p0, layout: Layout
+) -> Solution:
+    """The public `Solution` of a run."""
+    carry, saved, reduced, defect = outcome
+    curve = Curve.of(task.method, task.equations, layout)
+    first = task.first_interval()
+    # A batch element without a step to interpolate in uses the first one: its numbers are finite.
+    safe = Start(first.t0, first.t1, first.t1, q0, p0)
+    _, reductions = task.observables()
+    values: list[Any] = [
+        crossings(curve, r, value, safe) if isinstance(r, Section) else value
+        for r, value in zip(reductions, reduced, strict=True)
+    ]
+    result = carry.result
+    if reductions and isinstance(reductions[0], RequestedTimes):
+        reached, starts, (ts, qs, ps) = at_times(curve, reductions[0], values[0], safe)
+        if reductions[0].clock is None:
+            ts = reductions[0].ts  # also the times that were not reached
+        missed = (result == RESULTS.successful) & ~jnp.all(reached)
+        result = RESULTS.where(missed, RESULTS.not_reached, result)
+        values, hs = values[1:], ts - starts.t0
+        steps = StepTaken(starts.t0, ts, starts.q0, starts.p0, qs, ps)
+        own, _ = dataclasses.replace(task, observe=observe).observables()
+        alone = each(_observed, (own, task.args), steps, layout=layout)
+    else:
+        ts = jnp.concatenate([task.t0[None], saved.t])
+        qs, ps, hs, alone = saved.q, saved.p, saved.h, saved.observed
+    place = Place(task.t0, task.h, carry.k, carry.q, carry.p)
+    stats = {
+        "num_steps": plan.num_steps,
+        "newton_iterations": carry.iterations,
+        "max_residual": relative_size(*carry.residual),
+        "failed_step": carry.failed_step,
+        "failed_residual": relative_size(*carry.failed_residual),
+        **task.lattice.report(carry.lattice, task.equations, place),
+        **({} if defect is None else {"round_trip_defect": defect}),
+    }
+    found = observed(observe, alone, values)
+    end = None if task.stop is None else stopped(curve, task.stop, carry.stop, safe)
+    return Solution(ts, qs, ps, hs, found, result, stats, end)
+
+
+def _observed(given: tuple[Any, Any], step: StepTaken) -> list[PyTree]:
+    observables, args = given
+    return [step.value(f, args) for f in observables]
 
 
 def observed(observe: PyTree, alone: list[Any], reduced: list[Any]) -> PyTree:
@@ -106,3 +101,47 @@ def with_initial_values(observe: PyTree, found: PyTree, run: Run, layout: Layout
         return jnp.concatenate([first[None].astype(values.dtype), values])
 
     return jax.tree.map(value, observe, found, is_leaf=is_observable)
+
+
+def checked(solution: Solution, task: Task) -> Solution:
+    result = solution.result
+    if is_traced(status_code(result)):
+        # The status is known when the compiled program runs: only an error of equinox can report
+        # it, without the solution up to the failure.
+        fine = (result == RESULTS.successful) | (result == RESULTS.stopped)
+        arrays, rest = eqx.partition(solution, eqx.is_array)
+        if not manual_axes(*jax.tree.leaves(arrays)):
+            return result.error_if(solution, ~fine)
+
+        # In jax.shard_map the branches of error_if differ in type: form it for one device.
+        def check(result, arrays, fine):
+            return result.error_if(arrays, ~fine)
+
+        checked = lanewise.call(check, result, arrays, fine, layout=Layout(form="arrays"))
+        return eqx.combine(checked, rest)
+    if status_name(result) in ("successful", "stopped"):
+        return solution
+    kept = "The solution is the attribute `solution` of this error. With throw=False it is "
+    kept += "returned with its status, without an error."
+    if bool(result == RESULTS.not_reached):
+        missed = np.isnan(np.asarray(solution.qs)).reshape(len(solution.ts), -1).any(1)
+        first = float(solution.ts[missed.argmax()])
+        which = f"; the first missing one is t = {first:.17g}" if np.isfinite(first) else ""
+        raise IntegrationError(
+            f"the run reached {(~missed).sum()} of {missed.size} values of ts in "
+            f"dvi.Save(ts=...){which}. {RESULTS[result]} {kept}",
+            solution,
+        )
+    step = int(solution.stats["failed_step"])
+    if task.lattice.has_memory:
+        at = f"last h = {float(solution.stats['last_h']):g}"
+    else:
+        at = f"h = {float(task.interval(jnp.asarray(step, jnp.int32)).h):g}"
+    solved = int(solution.stats["newton_iterations"]) > 0
+    residual = float(solution.stats["failed_residual"])
+    how = f" and relative residual {residual:.3g} of the implicit solve" if solved else ""
+    raise IntegrationError(
+        f"the trajectory failed at step {step} of {solution.stats['num_steps']} (the first step "
+        f"has number 0), with {at}{how}. {RESULTS[result]} {kept}",
+        solution,
+    )

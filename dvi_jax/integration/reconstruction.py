@@ -11,8 +11,7 @@ from jaxtyping import Array
 
 from ..base.results import RESULTS
 from ..base.types import State
-from .plan import Plan, piece_length
-from .task import Saved, Task
+from .task import Plan, Saved, Task, piece_length
 
 # Steps back between two updates of the sizes of the components, relative to which differences are
 # measured. An update in every step would take a noticeable part of the time of an explicit one.

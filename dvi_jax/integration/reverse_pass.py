@@ -15,9 +15,8 @@ from ..base.types import State
 from ..engine.newton import KnownRoot, RootSolver
 from ..observe import Reduction, has_initial_value
 from .loop import number_of
-from .plan import adds_start_outside
 from .reconstruction import Point, Reconstruction, fold_blocks
-from .task import Saved, StepTaken, Task
+from .task import Saved, StepTaken, Task, adds_start_outside
 
 
 class Smooth(NamedTuple):

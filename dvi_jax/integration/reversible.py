@@ -20,10 +20,9 @@ from ..base.checks import instance, positive, whole as check_whole
 from ..engine.pairs import rounded
 from .adjoints import AbstractAdjoint, Checkpointed
 from .loop import outcome, run, start, with_start
-from .plan import adds_start_outside, piece_length
 from .reconstruction import Reconstruction
 from .reverse_pass import ReversePass, Smooth
-from .task import Carry, Outcome, Saved, Task
+from .task import Carry, Outcome, Saved, Task, adds_start_outside, piece_length
 
 
 class Reversible(AbstractAdjoint):

@@ -1,4 +1,4 @@
-"""The constants of a trajectory, and what the loop over its steps carries and saves."""
+"""The constants of a trajectory, which of its steps are saved, and what the loop carries."""
 
 import dataclasses
 from collections.abc import Callable
@@ -18,6 +18,7 @@ from ..lattices import Lattice
 from ..methods import Method
 from ..methods.step import Equations
 from ..observe import Deviations, Reduction, Running, Stop, is_observable
+from ..observe.solution import Save
 from ..problem.noise import NoisePath
 from .arithmetic import Arithmetic, FloatingPoint
 
@@ -109,6 +110,43 @@ class Task(eqx.Module):
         if isinstance(observable, Bindable):
             return observable.bind(self.equations.system, self.equations.epsilon)
         return observable
+
+
+class Plan(NamedTuple):
+    """Steps as blocks of `block` steps with a save after each, then a tail. Static."""
+
+    num_blocks: int
+    block: int
+    tail: int
+    save_tail: bool
+
+    @property
+    def num_steps(self) -> int:
+        return self.num_blocks * self.block + self.tail
+
+
+def make_plan(save: Save, num_steps: int) -> Plan:
+    every = save.every
+    if every is None:
+        # Without `every` a run that saves its end only is one block. A block has at least one step.
+        keeps_end_alone = save.final or save.ts is not None
+        every = max(num_steps, 1) if keeps_end_alone else 1
+    num_blocks, tail = divmod(num_steps, every)
+    return Plan(num_blocks, every, tail, save.final and tail > 0)
+
+
+def piece_length(count: int, every: int) -> int:
+    """The length, about `every`, of the pieces of `count` steps."""
+    # A divisor of `count`, if there is one near: with pieces of one length one loop is compiled.
+    lengths = range(min(3 * every // 2, count), every // 2, -1)
+    return next((n for n in lengths if count % n == 0), every)
+
+
+def adds_start_outside(plan: Plan) -> bool:
+    """Whether the start is added to the saved states after the compiled run, not in it."""
+    # Among few states the start is a large fraction, which need not be written for a user who reads
+    # the last state only. Among many it is a small fraction, and adding it later copies them all.
+    return plan.num_blocks <= 4
 
 
 class Carry(NamedTuple):
