@@ -27,9 +27,9 @@ from ..problem.system import System, check_system, of_problem
 from .adjoints import AbstractAdjoint
 from .arithmetic import Arithmetic
 from .integrator import Integrator, chosen
-from .loop import reduce, run, start, with_start, with_tail
-from .outcome import as_solution, checked, with_initial_values
-from .preparation import Prepared, prepared, steps_of
+from .loop import results_of, run, start, with_start, with_tail
+from .outcome import as_solution, raise_on_failure, with_initial_values
+from .preparation import PreparedRun, prepare, steps_of
 from .task import Outcome, Plan, Task
 
 _MOST_REPORTS = 100
@@ -156,25 +156,24 @@ def integrate(
     epsilon = as_scalar("epsilon", System.strength(system, epsilon), q0.dtype)
     args = jax.tree.map(as_parameter, args)
     request = Run(system, t0, q0, p0, epsilon, args, observe, save, stop)
-    trajectory = prepared(request, integrator, h, num_steps, as_path(path))
-    solution = solved(trajectory, progress)
-    return checked(solution, trajectory.task) if throw else solution
+    trajectory = prepare(request, integrator, h, num_steps, as_path(path))
+    solution = solve(trajectory, progress)
+    return raise_on_failure(solution, trajectory.task) if throw else solution
 
 
-def solved(trajectory: Prepared, progress: Any = None) -> Solution:
-    """The solution of a prepared run, whose status may be that of a failure."""
+def solve(trajectory: PreparedRun, progress: Any = None) -> Solution:
+    """The solution of a run; its status may be that of a failure."""
     request, task, plan, q0, p0, observe, undo, adjoint, layout, has_tracer = trajectory
     if progress is None or progress is False:
-        solution = _whole(task, plan, observe, q0, p0, adjoint, layout)
+        solution = _in_one_program(task, plan, observe, q0, p0, adjoint, layout)
     elif has_tracer:
         raise ValueError(
-            "progress cannot be reported inside of jax.jit, jax.vmap, jax.grad or another "
-            "transformation of JAX. Leave out progress, or use none of these transformations."
+            "progress cannot be reported inside of a transformation of JAX, such as jax.jit or "
+            "jax.vmap."
         )
     elif getattr(adjoint, "report_defect", False):
         raise ValueError(
-            "dvi.Reversible(report_defect=True) cannot be combined with progress: leave out "
-            "report_defect or progress."
+            "dvi.Reversible(report_defect=True) cannot be combined with progress: leave one out."
         )
     else:
         with _reporter(progress) as report:
@@ -219,7 +218,7 @@ def _save_hint(save: Any) -> str:
 
 # Compiled here, not by the user: a call without jax.jit takes one program, that of its shapes.
 @eqx.filter_jit
-def _whole(
+def _in_one_program(
     task: Task, plan: Plan, observe: PyTree, q0, p0, adjoint: AbstractAdjoint, layout: Layout
 ) -> Solution:
     outcome = adjoint.rollout(task, plan, q0, p0, layout)
@@ -241,14 +240,14 @@ def _piece(task: Task, plan: Plan, carry, layout: Layout):
     arrays, functions = eqx.partition(task, eqx.is_array)
 
     def piece(arrays, carry):
-        carry, saved, tail = run(eqx.combine(arrays, functions), plan, carry, lax.scan)
-        return carry, with_tail(plan, saved, tail)
+        carry, rows, tail = run(eqx.combine(arrays, functions), plan, carry, lax.scan)
+        return carry, with_tail(plan, rows, tail)
 
     return lanewise.call(piece, arrays, carry, layout=layout)
 
 
 def _in_pieces(task: Task, plan: Plan, q0, p0, report, layout) -> Outcome:
-    """The same run as `_whole`, in pieces between save points, with a report after each."""
+    """The same run in pieces between save points, with a report after each."""
     # Whole blocks, and as many in each piece (the last one may have fewer): one program serves all.
     size = max(1, -(-plan.num_blocks // _MOST_REPORTS))
     carry, blocks, parts, is_last = _begin(task, q0, p0), 0, [], False
@@ -257,10 +256,10 @@ def _in_pieces(task: Task, plan: Plan, q0, p0, report, layout) -> Outcome:
         blocks += count
         is_last = blocks >= plan.num_blocks
         tail = (plan.tail, plan.save_tail) if is_last else (0, False)
-        carry, saved = _piece(task, Plan(count, plan.block, *tail), carry, layout)
+        carry, rows = _piece(task, Plan(count, plan.block, *tail), carry, layout)
         # JAX computes asynchronously: without waiting all reports would come at the beginning.
         jax.block_until_ready(carry)
-        parts.append(saved)
+        parts.append(rows)
         report(plan.num_steps if is_last else blocks * plan.block, plan.num_steps)
-    saved = jax.tree.map(lambda *xs: jnp.concatenate(xs), *parts)
-    return Outcome(carry, with_start(saved, q0, p0), reduce(task, carry))
+    rows = jax.tree.map(lambda *xs: jnp.concatenate(xs), *parts)
+    return Outcome(carry, with_start(rows, q0, p0), results_of(task, carry))

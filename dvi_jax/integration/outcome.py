@@ -20,38 +20,38 @@ from ..lattices import Place, Run
 from ..observe import OfState, Reduction, RequestedTimes, Running, Section, is_observable
 from ..observe._kept import Start
 from ..observe.solution import Solution
-from .dense import Curve, at_times, crossings, stopped
-from .task import Outcome, Plan, StepTaken, Task
+from .dense import Curve, at_times, crossings, stop_point
+from .task import Ends, Outcome, Plan, Task
 
 
 def as_solution(
     task: Task, plan: Plan, observe: PyTree, outcome: Outcome, q0, p0, layout: Layout
 ) -> Solution:
     """The public `Solution` of a run."""
-    carry, saved, reduced, defect = outcome
-    curve = Curve.of(task.method, task.equations, layout)
+    carry, rows, values, defect = outcome
+    curve = Curve.create(task.method, task.equations, layout)
     first = task.first_interval()
     # A batch element without a step to interpolate in uses the first one: its numbers are finite.
     safe = Start(first.t0, first.t1, first.t1, q0, p0)
     _, reductions = task.observables()
-    values: list[Any] = [
+    results: list[Any] = [
         crossings(curve, r, value, safe) if isinstance(r, Section) else value
-        for r, value in zip(reductions, reduced, strict=True)
+        for r, value in zip(reductions, values, strict=True)
     ]
-    result = carry.result
-    if reductions and isinstance(reductions[0], RequestedTimes):
-        reached, starts, (ts, qs, ps) = at_times(curve, reductions[0], values[0], safe)
-        if reductions[0].clock is None:
-            ts = reductions[0].ts  # also the times that were not reached
-        missed = (result == RESULTS.successful) & ~jnp.all(reached)
-        result = RESULTS.where(missed, RESULTS.not_reached, result)
-        values, hs = values[1:], ts - starts.t0
-        steps = StepTaken(starts.t0, ts, starts.q0, starts.p0, qs, ps)
-        own, _ = dataclasses.replace(task, observe=observe).observables()
-        alone = each(_observed, (own, task.args), steps, layout=layout)
+    status = carry.result
+    if reductions and isinstance(request := reductions[0], RequestedTimes):
+        is_reached, starts, (ts, qs, ps) = at_times(curve, request, results[0], safe)
+        if request.clock is None:
+            ts = request.ts  # also the times that were not reached
+        is_short = (status == RESULTS.successful) & ~jnp.all(is_reached)
+        status = RESULTS.where(is_short, RESULTS.not_reached, status)
+        results, hs = results[1:], ts - starts.t0
+        steps = Ends(starts.t0, ts, starts.q0, starts.p0, qs, ps)
+        functions, _ = dataclasses.replace(task, observe=observe).observables()
+        columns = each(_values, (functions, task.args), steps, layout=layout)
     else:
-        ts = jnp.concatenate([task.t0[None], saved.t])
-        qs, ps, hs, alone = saved.q, saved.p, saved.h, saved.observed
+        ts = jnp.concatenate([task.t0[None], rows.t])
+        qs, ps, hs, columns = rows.q, rows.p, rows.h, rows.observed
     place = Place(task.t0, task.h, carry.k, carry.q, carry.p)
     stats = {
         "num_steps": plan.num_steps,
@@ -62,86 +62,96 @@ def as_solution(
         **task.lattice.report(carry.lattice, task.equations, place),
         **({} if defect is None else {"round_trip_defect": defect}),
     }
-    found = observed(observe, alone, values)
-    end = None if task.stop is None else stopped(curve, task.stop, carry.stop, safe)
-    return Solution(ts, qs, ps, hs, found, result, stats, end)
+    observed = observed_values(observe, columns, results)
+    end = None if task.stop is None else stop_point(curve, task.stop, carry.stop, safe)
+    return Solution(ts, qs, ps, hs, observed, status, stats, end)
 
 
-def _observed(given: tuple[Any, Any], step: StepTaken) -> list[PyTree]:
-    observables, args = given
-    return [step.value(f, args) for f in observables]
+def _values(observables: tuple[list[Any], Any], ends: Ends) -> list[PyTree]:
+    functions, args = observables
+    return [ends.value(f, args) for f in functions]
 
 
-def observed(observe: PyTree, alone: list[Any], reduced: list[Any]) -> PyTree:
-    """The pytree `observe` with every observable replaced by its values."""
+def observed_values(observe: PyTree, columns: list[Any], results: list[Any]) -> PyTree:
+    """The pytree `observe` with every function replaced by its values at save points, and every
+    reduction by its result."""
     # Both lists are in the order of the leaves, in which `Task.observables` has separated them.
-    values, lone = iter(reduced), iter(alone)
+    next_column, next_result = iter(columns).__next__, iter(results).__next__
 
-    def value(f):
-        if isinstance(f, Reduction):
-            return next(values)
-        if isinstance(f, Running):  # its final value is the last of its rows, and not needed
-            next(values)
-        return next(lone)
+    def value(observable):
+        if isinstance(observable, Reduction):
+            return next_result()
+        if isinstance(observable, Running):  # its final value is the last of its rows
+            next_result()
+        return next_column()
 
     return jax.tree.map(value, observe, is_leaf=is_observable)
 
 
-def with_initial_values(observe: PyTree, found: PyTree, run: Run, layout: Layout) -> PyTree:
+def with_initial_values(observe: PyTree, observed: PyTree, run: Run, layout: Layout) -> PyTree:
     """The values of functions of the state, with that at the initial state as their first row."""
 
-    def value(f, values):
-        if not isinstance(f, OfState):
+    def with_first_row(observable, values):
+        if not isinstance(observable, OfState):
             return values
 
         def at_start(t, q, p, args):
-            return jnp.asarray(f(t, t, q, p, q, p, args))
+            return jnp.asarray(observable(t, t, q, p, q, p, args))
 
         first = lanewise.call(at_start, run.t0, run.q0, run.p0, run.args, layout=layout)
         return jnp.concatenate([first[None].astype(values.dtype), values])
 
-    return jax.tree.map(value, observe, found, is_leaf=is_observable)
+    return jax.tree.map(with_first_row, observe, observed, is_leaf=is_observable)
 
 
-def checked(solution: Solution, task: Task) -> Solution:
-    result = solution.result
-    if is_traced(status_code(result)):
-        # The status is known when the compiled program runs: only an error of equinox can report
-        # it, without the solution up to the failure.
-        fine = (result == RESULTS.successful) | (result == RESULTS.stopped)
-        arrays, rest = eqx.partition(solution, eqx.is_array)
-        if not manual_axes(*jax.tree.leaves(arrays)):
-            return result.error_if(solution, ~fine)
-
-        # In jax.shard_map the branches of error_if differ in type: form it for one device.
-        def check(result, arrays, fine):
-            return result.error_if(arrays, ~fine)
-
-        checked = lanewise.call(check, result, arrays, fine, layout=Layout(form="arrays"))
-        return eqx.combine(checked, rest)
-    if status_name(result) in ("successful", "stopped"):
+def raise_on_failure(solution: Solution, task: Task) -> Solution:
+    """The solution. **Raises** `IntegrationError` if the run has failed; inside a transformation of
+    JAX an error of equinox."""
+    status = solution.result
+    if is_traced(status_code(status)):
+        return _when_compiled(solution)
+    if status_name(status) in ("successful", "stopped"):
         return solution
-    kept = "The solution is the attribute `solution` of this error. With throw=False it is "
-    kept += "returned with its status, without an error."
-    if bool(result == RESULTS.not_reached):
-        missed = np.isnan(np.asarray(solution.qs)).reshape(len(solution.ts), -1).any(1)
-        first = float(solution.ts[missed.argmax()])
-        which = f"; the first missing one is t = {first:.17g}" if np.isfinite(first) else ""
+    remark = (
+        f"{RESULTS[status]} The attribute `solution` of this error is what throw=False returns."
+    )
+    if bool(status == RESULTS.not_reached):
+        is_missing = np.isnan(np.asarray(solution.qs)).reshape(len(solution.ts), -1).any(1)
+        first = float(solution.ts[is_missing.argmax()])
+        example = f"; the first missing one is t = {first:.17g}" if np.isfinite(first) else ""
         raise IntegrationError(
-            f"the run reached {(~missed).sum()} of {missed.size} values of ts in "
-            f"dvi.Save(ts=...){which}. {RESULTS[result]} {kept}",
+            f"the run reached {(~is_missing).sum()} of {is_missing.size} values of ts in "
+            f"dvi.Save(ts=...){example}. {remark}",
             solution,
         )
-    step = int(solution.stats["failed_step"])
+    stats = solution.stats
+    step = int(stats["failed_step"])
     if task.lattice.has_memory:
-        at = f"last h = {float(solution.stats['last_h']):g}"
+        details = f"last h = {float(stats['last_h']):g}"
     else:
-        at = f"h = {float(task.interval(jnp.asarray(step, jnp.int32)).h):g}"
-    solved = int(solution.stats["newton_iterations"]) > 0
-    residual = float(solution.stats["failed_residual"])
-    how = f" and relative residual {residual:.3g} of the implicit solve" if solved else ""
+        details = f"h = {float(task.interval(jnp.asarray(step, jnp.int32)).h):g}"
+    if int(stats["newton_iterations"]) > 0:
+        residual = float(stats["failed_residual"])
+        details += f" and relative residual {residual:.3g} of the implicit solve"
     raise IntegrationError(
-        f"the trajectory failed at step {step} of {solution.stats['num_steps']} (the first step "
-        f"has number 0), with {at}{how}. {RESULTS[result]} {kept}",
+        f"the trajectory failed at step {step} of {stats['num_steps']} (the first step has number "
+        f"0), with {details}. {remark}",
         solution,
     )
+
+
+def _when_compiled(solution: Solution) -> Solution:
+    """The solution, whose failure raises an error when the compiled program runs."""
+    # Its status is not known before: only an error of equinox can report it, without the solution.
+    status = solution.result
+    is_failure = (status != RESULTS.successful) & (status != RESULTS.stopped)
+    arrays, functions = eqx.partition(solution, eqx.is_array)
+    if not manual_axes(*jax.tree.leaves(arrays)):
+        return status.error_if(solution, is_failure)
+
+    # In jax.shard_map the branches of error_if differ in type: form it for one device.
+    def check(status, arrays, is_failure):
+        return status.error_if(arrays, is_failure)
+
+    arrays = lanewise.call(check, status, arrays, is_failure, layout=Layout(form="arrays"))
+    return eqx.combine(arrays, functions)

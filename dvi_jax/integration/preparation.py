@@ -28,7 +28,7 @@ from .integrator import Integrator
 from .task import Plan, Task, make_plan
 
 
-class Prepared(NamedTuple):
+class PreparedRun(NamedTuple):
     """A run that is ready to start.
 
     - `task`, `plan`, `q0`, `p0`: what the loop over the steps takes, in the variables of the
@@ -46,7 +46,7 @@ class Prepared(NamedTuple):
     undo: Callable[[Solution], Solution]
     adjoint: AbstractAdjoint
     layout: Layout
-    is_traced: bool
+    has_tracer: bool
 
 
 def steps_of(
@@ -60,13 +60,13 @@ def steps_of(
     return kind.prepare(lattice, t0, h, num_steps)
 
 
-def prepared(
+def prepare(
     run: Run,
     integrator: Integrator,
     h: Array,
     num_steps: int,
     path: BrownianPath | None,
-) -> Prepared:
+) -> PreparedRun:
     """The run in the variables of its lattice. **Raises** `ValueError` or `TypeError` for options
     that do not fit each other, the system or the initial state."""
     # Here and not in `Integrator`: the default method depends on the system.
@@ -76,9 +76,9 @@ def prepared(
     System.check_shapes(run.system, run.t0, run.q0, run.p0, run.epsilon, run.args)
     lattice, layout = integrator.lattice, integrator.layout
     noise = noise_path(run, path, integrator, method, h, num_steps)
-    transformed, undo = type(lattice).transform(lattice, run)
+    image, undo = type(lattice).transform(lattice, run)
     type(lattice).check(lattice, method, integrator.arithmetic)
-    task, q0, p0 = _task(transformed, integrator, method, h)
+    task, q0, p0 = _task(image, integrator, method, h)
     if noise is not None:
         task = dataclasses.replace(task, path=noise)
     plan = make_plan(run.save, num_steps)
@@ -91,10 +91,10 @@ def prepared(
     if run.save.ts is not None:
         # The run itself saves nothing at these times: it stores the steps that contain them, and
         # `as_solution` evaluates the method between their ends.
-        steps = requested_times(transformed.save, task, num_steps)
+        steps = requested_times(image.save, task, num_steps)
         task = dataclasses.replace(task, observe=steps)
-    adjoint, observe = integrator.adjoint, transformed.observe
-    return Prepared(run, task, plan, q0, p0, observe, undo, adjoint, layout, has_tracer)
+    adjoint, observe = integrator.adjoint, image.observe
+    return PreparedRun(run, task, plan, q0, p0, observe, undo, adjoint, layout, has_tracer)
 
 
 def _check_start(task: Task, q0: State, p0: State) -> None:

@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from ..base.results import RESULTS
 from ..base.types import State
-from .task import Plan, Saved, Task, piece_length
+from .task import Plan, Rows, Task, piece_length
 
 # Steps back between two updates of the sizes of the components, relative to which differences are
 # measured. An update in every step would take a noticeable part of the time of an explicit one.
@@ -72,24 +72,24 @@ class Reconstruction(eqx.Module):
     spacing: int = eqx.field(static=True)
     tolerance: float = eqx.field(static=True)
 
-    def starts(self, start: Point, saved: Saved) -> Point:
+    def starts(self, start: Point, rows: Rows) -> Point:
         """The states at the beginning of each block and of the tail: saved ones, thus exact."""
-        return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, (saved.q, saved.p))
+        return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, (rows.q, rows.p))
 
-    def pieces(self, start: Point, saved: Saved, first: Any, count: int) -> list[Pieces]:
+    def pieces(self, start: Point, rows: Rows, first: Any, count: int) -> list[Pieces]:
         """The `count` steps to a save point, divided at the checkpoints in between."""
-        checkpoints = 0 if saved.inner is None else len(saved.inner[0])
+        checkpoints = 0 if rows.inner is None else len(rows.inner[0])
         size = piece_length(count, self.spacing) if checkpoints else count
-        parts = [[x[None] for x in start], saved.inner, [saved.q[None], saved.p[None]]]
+        parts = [[x[None] for x in start], rows.inner, [rows.q[None], rows.p[None]]]
         points = [jnp.concatenate(x) for x in zip(*filter(None, parts), strict=True)]
         starts, ends = (points[0][:-1], points[1][:-1]), (points[0][1:], points[1][1:])
         remainder = count - checkpoints * size
         # The code for a piece is compiled for each length: the last one joins the others if it can.
         if remainder == size:
             return [Pieces(starts, ends, first, size)]
-        most, last = slice(-1), slice(-1, None)
+        all_but_last, last = slice(-1), slice(-1, None)
         return [
-            Pieces(_row(starts, most), _row(ends, most), first, size),
+            Pieces(_row(starts, all_but_last), _row(ends, all_but_last), first, size),
             Pieces(_row(starts, last), _row(ends, last), first + checkpoints * size, remainder),
         ]
 
@@ -99,23 +99,23 @@ class Reconstruction(eqx.Module):
         end: Point,
         first: Array,
         count: int,
-        visit: Callable = lambda sums, k, before, after: sums,
+        visit: Callable = lambda sums, k, start, end: sums,
         sums: Any = None,
     ) -> tuple[Any, Array, Array]:
         """The states from `end` back over `count` steps, by inverse steps: the `sums` that
-        ``visit(sums, k, before, after)`` accumulates, the relative difference of each component
-        from `start`, and whether all solves succeeded."""
+        ``visit(sums, k, start, end)`` accumulates over them, the relative difference of each
+        component from `start`, and whether all solves succeeded."""
         task = self.task
         # A divisor of `count`, so that one loop serves all groups.
         group = next((d for d in range(min(count, GROUP), 1, -1) if count % d == 0), 1)
 
         # Cotangents go along in the same loop: states are needed once, and none is stored.
         def one_step(carry, _):
-            k, after, sums, is_solved = carry
+            k, state, sums, is_solved = carry
             # Without the memory of the arithmetic, whose effect is below the accepted difference.
             interval = task.interval(k)
-            q, p, info = task.method.inverse(task.equations_at(k, interval), interval, *after)
-            sums = visit(sums, k, (q, p), after)
+            q, p, info = task.method.inverse(task.equations_at(k, interval), interval, *state)
+            sums = visit(sums, k, (q, p), state)
             return (k - 1, (q, p), sums, is_solved & (info.result == RESULTS.successful)), None
 
         def one_group(carry, _):
@@ -139,13 +139,13 @@ class Reconstruction(eqx.Module):
         round_off = 64 * eps * jnp.max(size, initial=0.0)
         return jnp.abs(a - b) / (size + (round_off / self.tolerance + tiny))
 
-    def defect(self, start: Point, saved: Saved, tail: Saved | None) -> Array:
+    def defect(self, start: Point, rows: Rows, tail: Rows | None) -> Array:
         """The largest difference of a reconstructed state at a stored one; ∞ where an inverse step
         failed."""
-        plan, starts = self.plan, self.starts(start, saved)
+        plan, starts = self.plan, self.starts(start, rows)
 
-        def of_block(worst, first, start, saved, count=plan.block):
-            for pieces in self.pieces(start, saved, first, count):
+        def of_block(worst, first, start, rows, count=plan.block):
+            for pieces in self.pieces(start, rows, first, count):
 
                 def of_piece(worst, k, start, end, size=pieces.size):
                     _, defects, is_solved = self.steps_by_inverse(start, end, k, size)
@@ -159,8 +159,8 @@ class Reconstruction(eqx.Module):
         if tail is not None:
             first = jnp.asarray(plan.num_blocks * plan.block, jnp.int32)
             worst = of_block(worst, first, _row(starts, -1), tail, plan.tail)
-        rows = _row(starts, slice(-1)), saved
-        return fold_blocks(of_block, worst, plan.num_blocks, plan.block, rows)
+        blocks = _row(starts, slice(-1)), rows
+        return fold_blocks(of_block, worst, plan.num_blocks, plan.block, blocks)
 
 
 def _largest(sizes: Point, point: Point) -> Point:

@@ -16,7 +16,7 @@ from ..engine.newton import KnownRoot, RootSolver
 from ..observe import Reduction, has_initial_value
 from .loop import number_of
 from .reconstruction import Point, Reconstruction, fold_blocks
-from .task import Saved, StepTaken, Task, adds_start_outside
+from .task import Ends, Rows, Task, adds_start_outside
 
 
 class Smooth(NamedTuple):
@@ -24,8 +24,8 @@ class Smooth(NamedTuple):
 
     q: State
     p: State
-    saved: Saved
-    reduced: list[Any]
+    rows: Rows
+    results: list[Any]
 
 
 class Cotangents(NamedTuple):
@@ -53,27 +53,27 @@ class ReversePass(eqx.Module):
 
     and the cotangents of saved and observed values are added where they belong.
 
-    - `theta`: the arrays of the task that are differentiated. `others`: the rest of the task.
+    - `theta`: the arrays of the task that are differentiated. `constants`: its other parts.
     - `memories`: of the reductions, after the run. `cotangent`: of the outputs of the run.
     """
 
     theta: Any
-    others: Any
+    constants: Any
     states: Reconstruction
     memories: list[Any]
     cotangent: Smooth
 
     def task(self, theta: Any) -> Task:
-        return eqx.combine(theta, self.others)
+        return eqx.combine(theta, self.constants)
 
     def transport(
-        self, after_step: Cotangents, k: Array, before: Point, after: Point, save: SavePoint
+        self, after_step: Cotangents, k: Array, start: Point, end: Point, save: SavePoint
     ) -> Cotangents:
-        """The adjoint equation of step k, between the states `before` and `after` it."""
+        """The adjoint equation of step k, from the state `start` to `end`."""
         # The step is linearised at the reconstructed state: one more forward evaluation per step
         # takes the place of stored intermediate values.
         ((_, _, t1), _, values), pull = jax.vjp(
-            lambda theta, q0, p0: self.local_step(theta, q0, p0, k, after[1]), self.theta, *before
+            lambda theta, q0, p0: self.local_step(theta, q0, p0, k, end[1]), self.theta, *start
         )
         # Functions are observed at save points only.
         is_saved = k == save.step
@@ -95,7 +95,7 @@ class ReversePass(eqx.Module):
         solver = KnownRoot(p1.ravel(), newton) if is_root else newton
         equations = dataclasses.replace(task.equations_at(k, interval), newton=solver)
         q1, p1, _ = task.method.step(equations, interval, q0, p0)
-        step = StepTaken(interval.t0, interval.t1, q0, p0, q1, p1)
+        step = Ends(interval.t0, interval.t1, q0, p0, q1, p1)
         values = [step.value(f, task.args) for f in functions]
         numbers = [step.number(task.bound(r.function), task.args) for r in reductions]
         return (q1, p1, interval.t1), eqx.filter(values, eqx.is_inexact_array), numbers
@@ -103,7 +103,7 @@ class ReversePass(eqx.Module):
     def reductions(self) -> list[tuple[Reduction, Any, Any]]:
         """Each reduction with its memory and the cotangent of its result."""
         _, reductions = self.task(self.theta).observables()
-        return list(zip(reductions, self.memories, self.cotangent.reduced, strict=True))
+        return list(zip(reductions, self.memories, self.cotangent.results, strict=True))
 
     def steps(
         self,
@@ -117,8 +117,8 @@ class ReversePass(eqx.Module):
         """`count` steps back from the exact state `end`, by inverse steps. Where these miss the
         state `start`, by the steps from there."""
 
-        def transport(cotangents, k, before, after):
-            return self.transport(cotangents, k, before, after, save)
+        def transport(cotangents, k, start, end):
+            return self.transport(cotangents, k, start, end, save)
 
         cheap, defects, is_solved = self.states.steps_by_inverse(
             start, end, first, count, transport, cotangents
@@ -128,11 +128,11 @@ class ReversePass(eqx.Module):
         # wait for the steps of one whose result is known.
         is_wrong = ~is_exact & _all_finite(start) & _all_finite(end)
 
-        def corrected(cheap):
+        def correct(cheap):
             exact = self.steps_again(cotangents, first, start, end, count, save)
             return jax.tree.map(lambda a, b: jnp.where(is_wrong, a, b), exact, cheap)
 
-        return lax.cond(lanewise.on_any(is_wrong), corrected, lambda cheap: cheap, cheap)
+        return lax.cond(lanewise.on_any(is_wrong), correct, lambda cheap: cheap, cheap)
 
     def steps_again(
         self,
@@ -147,14 +147,14 @@ class ReversePass(eqx.Module):
         task = self.states.task
 
         def forward(carry, _):
-            k, before = carry
+            k, state = carry
             interval = task.interval(k)
-            q, p, _ = task.method.step(task.equations_at(k, interval), interval, *before)
-            return (k + 1, (q, p)), before
+            q, p, _ = task.method.step(task.equations_at(k, interval), interval, *state)
+            return (k + 1, (q, p)), state
 
-        def backward(carry, before):
-            k, after, cotangents = carry
-            return (k - 1, before, self.transport(cotangents, k, before, after, save)), None
+        def backward(carry, start):
+            k, end, cotangents = carry
+            return (k - 1, start, self.transport(cotangents, k, start, end, save)), None
 
         _, points = lax.scan(forward, (first, start), None, count)
         begin = (first + count - 1, end, cotangents)
@@ -166,19 +166,19 @@ class ReversePass(eqx.Module):
         cotangents: Cotangents,
         first: Array,
         start: Point,
-        saved: Saved,
-        row: Saved,
+        row: Rows,
+        of_row: Rows,
         count: int,
     ) -> Cotangents:
-        """The `count` steps between two save points; `row`: the cotangents of the values that are
-        saved at the second one."""
+        """The `count` steps between two save points. `row`: what is saved at the second one, and
+        `of_row` its cotangents."""
         step = first + count - 1
-        # Saved times and steps depend on h and t0 directly, not through the state.
+        # Rows times and steps depend on h and t0 directly, not through the state.
         _, pull = jax.vjp(lambda theta: self.task(theta).interval(step)[1:], self.theta)
-        of_theta = jax.tree.map(jnp.add, cotangents.theta, *pull((row.t, row.h)))
-        cotangents = Cotangents(of_theta, cotangents.q + row.q, cotangents.p + row.p)
-        save = SavePoint(step, row.observed)
-        for pieces in reversed(self.states.pieces(start, saved, first, count)):
+        of_theta = jax.tree.map(jnp.add, cotangents.theta, *pull((of_row.t, of_row.h)))
+        cotangents = Cotangents(of_theta, cotangents.q + of_row.q, cotangents.p + of_row.p)
+        save = SavePoint(step, of_row.observed)
+        for pieces in reversed(self.states.pieces(start, row, first, count)):
 
             def of_piece(cotangents, k, start, end, size=pieces.size):
                 return self.steps(cotangents, k, start, end, size, save)
@@ -186,30 +186,31 @@ class ReversePass(eqx.Module):
             cotangents = pieces.fold(of_piece, cotangents, reverse=True)
         return cotangents
 
-    def run(self, start: Point, saved: Saved, tail: Saved | None) -> Cotangents:
+    def run(self, start: Point, rows: Rows, tail: Rows | None) -> Cotangents:
         """The cotangents of θ and of the initial state, from the states that the run has stored."""
-        plan, rows = self.states.plan, self.cotangent.saved
+        plan, of_rows = self.states.plan, self.cotangent.rows
         zero = jax.tree.map(jnp.zeros_like, self.theta)
         cotangents = Cotangents(zero, self.cotangent.q, self.cotangent.p)
         of_start = None
         if not adds_start_outside(plan):
-            of_start, rows = (rows.q[0], rows.p[0]), rows._replace(q=rows.q[1:], p=rows.p[1:])
-        starts = self.states.starts(start, saved)
+            of_start = of_rows.q[0], of_rows.p[0]
+            of_rows = of_rows._replace(q=of_rows.q[1:], p=of_rows.p[1:])
+        starts = self.states.starts(start, rows)
         if tail is not None:
             # Without a saved tail nothing is observed at the end of the run: cotangents of zero.
-            row = jax.tree.map(
-                lambda x: x[-1] if plan.save_tail else jnp.zeros(x.shape[1:], x.dtype), rows
+            of_tail = jax.tree.map(
+                lambda x: x[-1] if plan.save_tail else jnp.zeros(x.shape[1:], x.dtype), of_rows
             )
             first = jnp.asarray(plan.num_blocks * plan.block, jnp.int32)
-            newest = jax.tree.map(lambda x: x[-1], starts)
-            cotangents = self.block(cotangents, first, newest, tail, row, plan.tail)
+            last_start = jax.tree.map(lambda x: x[-1], starts)
+            cotangents = self.block(cotangents, first, last_start, tail, of_tail, plan.tail)
 
-        def one_block(cotangents, first, start, saved, row):
-            return self.block(cotangents, first, start, saved, row, plan.block)
+        def one_block(cotangents, first, start, row, of_row):
+            return self.block(cotangents, first, start, row, of_row, plan.block)
 
         starts = jax.tree.map(lambda x: x[:-1], starts)
-        rows = jax.tree.map(lambda x: x[: plan.num_blocks], rows)
-        blocks = starts, saved, rows
+        of_rows = jax.tree.map(lambda x: x[: plan.num_blocks], of_rows)
+        blocks = starts, rows, of_rows
         cotangents = fold_blocks(one_block, cotangents, plan.num_blocks, plan.block, blocks)
         if of_start is not None:
             q, p = map(jnp.add, (cotangents.q, cotangents.p), of_start)
@@ -225,7 +226,7 @@ class ReversePass(eqx.Module):
         def values_of(theta, q0, p0):
             task = self.task(theta)
             t0 = task.first_interval().t0
-            step = StepTaken(t0, t0, q0, p0, q0, p0)
+            step = Ends(t0, t0, q0, p0, q0, p0)
             _, reductions = task.observables()
             functions = [r.function for r in reductions if has_initial_value(r.function)]
             return t0, [step.number(task.bound(f), task.args) for f in functions]

@@ -22,7 +22,7 @@ from .adjoints import AbstractAdjoint, Checkpointed
 from .loop import outcome, run, start, with_start
 from .reconstruction import Reconstruction
 from .reverse_pass import ReversePass, Smooth
-from .task import Carry, Outcome, Saved, Task, adds_start_outside, piece_length
+from .task import Carry, Outcome, Rows, Task, adds_start_outside, piece_length
 
 
 class Reversible(AbstractAdjoint):
@@ -68,14 +68,14 @@ class Reversible(AbstractAdjoint):
             positive("max_defect", self.max_defect)
         instance("report_defect", self.report_defect, bool, "True or False")
 
-    def allowed(self, dtype) -> float:
+    def tolerance(self, dtype) -> float:
         """The largest relative difference that is accepted."""
         return self.max_defect or (1e-6 if jnp.dtype(dtype).itemsize >= 8 else 1e-3)
 
     def rollout(self, task, plan, q0, p0, layout=Layout()):
-        theta, others = eqx.partition(task, eqx.is_inexact_array)
+        theta, remainder = eqx.partition(task, eqx.is_inexact_array)
         # Integers and booleans may be traced as well: inputs without a derivative.
-        counts, functions = eqx.partition(others, eqx.is_array)
+        counts, functions = eqx.partition(remainder, eqx.is_array)
         inputs = theta, q0, p0
 
         @jax.jit  # so that its uses below share one trace, and one trace of its derivative
@@ -83,22 +83,21 @@ class Reversible(AbstractAdjoint):
             theta, q0, p0 = inputs
             task = eqx.combine(theta, counts, functions)
             ends = run(task, plan, start(task, q0, p0), lax.scan, self._inner_loop)
-            carry, saved, reduced, _ = outcome(task, plan, ends, q0, p0)
-            saved, integers = eqx.partition(saved, eqx.is_inexact_array)
-            return Smooth(carry.q, carry.p, saved, reduced), Trace(*ends, integers)
+            carry, rows, results, _ = outcome(task, plan, ends, q0, p0)
+            rows, integers = eqx.partition(rows, eqx.is_inexact_array)
+            return Smooth(carry.q, carry.p, rows, results), Trace(*ends, integers)
 
         if reason := _obstacle(task, forward, inputs, counts):
             if self.report_defect:
                 raise ValueError(
                     "dvi.Reversible(report_defect=True) requires states that can be reconstructed "
-                    f"backwards, but {reason}. Leave report_defect out: gradients are then those "
-                    "of dvi.Checkpointed()."
+                    f"backwards, but {reason}. Leave report_defect out."
                 )
             return Checkpointed().rollout(task, plan, q0, p0, layout)
 
         def states_of(theta, counts):
             task = eqx.combine(theta, counts, functions)
-            return Reconstruction(task, plan, self.checkpoint_every, self.allowed(q0.dtype))
+            return Reconstruction(task, plan, self.checkpoint_every, self.tolerance(q0.dtype))
 
         @jax.custom_jvp
         def trajectory(inputs, counts):
@@ -124,7 +123,7 @@ class Reversible(AbstractAdjoint):
             def pull(variables, constants, counts, record, cotangent):
                 theta, q0, p0 = eqx.combine(variables, constants)
                 variable, constant = eqx.partition(theta, is_variable[0])
-                memories, saved, tail = record
+                memories, rows, tail = record
                 reverse_pass = ReversePass(
                     variable,
                     eqx.combine(constant, counts, functions),
@@ -132,7 +131,7 @@ class Reversible(AbstractAdjoint):
                     memories,
                     cotangent,
                 )
-                cotangents = eqx.filter(tuple(reverse_pass.run((q0, p0), saved, tail)), is_variable)
+                cotangents = eqx.filter(tuple(reverse_pass.run((q0, p0), rows, tail)), is_variable)
                 # A failed trajectory that the loss does not use: zero, although the states along
                 # which the cotangent zero would be transported are NaN.
                 nonzero = [jnp.any(x != 0) for x in jax.tree.leaves(cotangent)]
@@ -152,16 +151,16 @@ class Reversible(AbstractAdjoint):
             def largest_defect(theta, counts, *ends):
                 return states_of(theta, counts).defect(*ends)
 
-            ends = (q0, p0), trace.saved, trace.tail
+            ends = (q0, p0), trace.rows, trace.tail
             defect = lanewise.call(
                 largest_defect, *lax.stop_gradient((theta, counts, *ends)), layout=layout
             )
-        saved = eqx.combine(smooth.saved, trace.integers)
+        rows = eqx.combine(smooth.rows, trace.integers)
         if adds_start_outside(plan):
-            saved = with_start(saved, q0, p0)
+            rows = with_start(rows, q0, p0)
         # The differentiable outputs take the place of their copies in the carry, which have none.
         carry = trace.carry._replace(q=smooth.q, p=smooth.p)
-        return Outcome(carry, saved, smooth.reduced, defect)
+        return Outcome(carry, rows, smooth.results, defect)
 
     def _inner_loop(self, body, state, _, count, state_of):
         """A scan over the steps of a block that stores a state every `checkpoint_every` steps."""
@@ -186,18 +185,18 @@ class Trace(NamedTuple):
     """What a run leaves besides its differentiable outputs."""
 
     carry: Carry
-    saved: Saved
-    tail: Saved | None
-    integers: Saved  # those of the saved values that have no derivative
+    rows: Rows
+    tail: Rows | None
+    integers: Rows  # those of the rows, which have no derivative
 
-    def record(self) -> tuple[list[Any], Saved, Saved | None]:
+    def record(self) -> tuple[list[Any], Rows, Rows | None]:
         """Only what the reverse pass reads: the other values need not be computed."""
 
-        def states(saved: Saved) -> Saved:
-            return saved._replace(t=None, h=None, observed=[])
+        def states(rows: Rows) -> Rows:
+            return rows._replace(t=None, h=None, observed=[])
 
         tail = None if self.tail is None else states(self.tail)
-        return rounded(self.carry.reductions), states(self.saved), tail
+        return rounded(self.carry.reductions), states(self.rows), tail
 
 
 def _no_tangent(x):
