@@ -167,7 +167,7 @@ def test_boolean_observables_are_counted():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("form", "few"), [("arrays", 100), ("components", 1000)])
+@pytest.mark.parametrize(("form", "few"), [("arrays", 100), ("auto", 1000)])
 def test_streamed_reductions_need_no_memory_for_the_steps(form, few):
     def size(n):
         def final(q):

@@ -256,7 +256,7 @@ ERRORS = {
     ),
     "newton and root_finder": (
         lambda: run(newton=dvi.Newton(), root_finder=dvi.Newton()),
-        "two names of one argument",
+        "only one of newton and root_finder",
     ),
     "a root finder as text": (lambda: run(root_finder="newton"), "root_finder|newton"),
     "the class of a root finder": (lambda: run(root_finder=dvi.Newton), "parentheses|dvi.Newton"),
