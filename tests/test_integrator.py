@@ -168,7 +168,7 @@ def test_a_root_finder_is_used(name):
     assert np.isfinite(expected).all()
     if name in ("integrate", "Integrator", "Model"):
         np.testing.assert_array_equal(call(newton=solver), expected)
-        with pytest.raises(TypeError, match="two names of one argument"):
+        with pytest.raises(TypeError, match="only one of newton and root_finder"):
             call(root_finder=solver, newton=solver)
     else:
         with pytest.raises(TypeError, match="argument 'newton'"):

@@ -285,8 +285,8 @@ def _in_loop(task: Task, q: State) -> tuple[Callable | None, Callable, Callable]
 
     return (
         quick.step,
-        lambda carry: substep(quick.before, carry, carry.k),
-        lambda carry: substep(quick.after, carry, carry.k - 1),
+        lambda carry: substep(quick.first, carry, carry.k),
+        lambda carry: substep(quick.last, carry, carry.k - 1),
     )
 
 
