@@ -1,5 +1,6 @@
 """Guiding centres in Boozer coordinates: fields, equations of motion, files, initial conditions."""
 
+import dataclasses
 import functools
 from typing import NamedTuple
 
@@ -12,7 +13,6 @@ from scipy.io import netcdf_file
 
 import dvi_jax as dvi
 from dvi_jax.systems import boozer
-from dvi_jax.systems.boozer import _sums
 
 slow = pytest.mark.slow
 EDGE = 5.7 * 1.7**2 / 2
@@ -35,12 +35,7 @@ def helical():
     )  # fmt: skip
 
 
-FIELDS = {
-    "axisymmetric": axisymmetric,
-    "helical": helical,
-    "precise_qa": boozer.precise_qa,
-    "w7x": boozer.w7x,
-}
+FIELDS = {f.__name__: f for f in (axisymmetric, helical, boozer.precise_qa, boozer.w7x)}
 
 
 @functools.cache
@@ -97,6 +92,11 @@ BLOCK = 500
 """Steps of one compiled run."""
 
 
+def integrate(particles, q, p, args, h, num_steps, **options):
+    options = {"method": dvi.GaussLegendre(2), "save": dvi.Save(final=True), **options}
+    return dvi.integrate(particles.system, q, p, args=args, h=h, num_steps=num_steps, **options)
+
+
 @functools.cache
 def _run(name, coordinates, stages):
     particles = boozer.GuidingCentres(FIELDS[name](), coordinates=coordinates)
@@ -109,10 +109,8 @@ def _run(name, coordinates, stages):
     observed = {"drift": dvi.MaxDrift(energy), "last": dvi.Last(energy)}
 
     def run(q, p, mu, h):
-        sol = dvi.integrate(
-            system, q, p, h=h, num_steps=BLOCK, args={**args, "mu": mu}, observe=observed,
-            method=dvi.GaussLegendre(stages), save=dvi.Save(final=True), throw=False,
-        )  # fmt: skip
+        options = {"observe": observed, "method": dvi.GaussLegendre(stages), "throw": False}
+        sol = integrate(particles, q, p, {**args, "mu": mu}, h, BLOCK, **options)
         return sol.qs[-1], sol.ps[-1], sol.observed
 
     return particles, jax.jit(jax.vmap(run, in_axes=(0, 0, 0, None)))
@@ -152,15 +150,11 @@ def difference(z, reference):
 # Passing, banana, and trapped in a helical well (where there is one): s, θ, ζ, pitch.
 ORBITS = {
     "axisymmetric": ([0.3, 0.3, 0.5], [0.3, 0.2, 2.0], [0.1, 0.4, 0.2], [0.8, 0.3, -0.6]),
-    "helical": (
-        [0.3, 0.209, 0.171],
-        [0.3, 1.876, 3.014],
-        [0.1, 0.782, 4.871],
-        [-0.9, 0.023, 0.174],
-    ),
+    "helical": ([0.3, 0.209, 0.171], [0.3, 1.876, 3.014], [0.1, 0.782, 4.871],
+                [-0.9, 0.023, 0.174]),
     "precise_qa": ([0.3, 0.25], [0.3, 0.2], [0.1, 0.4], [0.8, -0.25]),
     "w7x": ([0.3, 0.25], [0.3, 0.0], [0.1, 0.1], [0.9, 0.1]),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -187,17 +181,15 @@ def test_orbits_agree_with_the_equations_of_the_literature(name, h, blocks):
     assert found.drift.max() < 1e-9
 
 
-@pytest.mark.slow
+@slow
 def test_trapped_orbits_bounce_and_passing_ones_do_not():
     particles = boozer.GuidingCentres(helical())
     s, theta, zeta, pitch = (np.array(x) for x in ORBITS["helical"])
     q, p, args = particles.start(s, theta, zeta, pitch)
 
     def run(q, p, mu):
-        sol = dvi.integrate(
-            particles.system, q, p, h=2.0, num_steps=750, args={**args, "mu": mu},
-            method=dvi.GaussLegendre(2), save=dvi.Save(every=5),
-        )  # fmt: skip
+        save = dvi.Save(every=5)
+        sol = integrate(particles, q, p, {**args, "mu": mu}, 2.0, 750, save=save)
         return sol.qs, sol.ps
 
     u = np.asarray(particles.coordinates_of(*jax.jit(jax.vmap(run))(q, p, args["mu"])).v_parallel)
@@ -206,7 +198,7 @@ def test_trapped_orbits_bounce_and_passing_ones_do_not():
     assert (bounces[1:] >= 10).all()
 
 
-@pytest.mark.slow
+@slow
 def test_both_charts_and_the_nested_solve_give_one_orbit():
     start = [np.array(x) for x in ORBITS["axisymmetric"]]
     a = final("axisymmetric", start, 0.5).z
@@ -215,10 +207,7 @@ def test_both_charts_and_the_nested_solve_give_one_orbit():
     # RungeKutta4 evaluates H with its inner solve; GaussLegendre takes s among its unknowns.
     particles, _ = _run("axisymmetric", "regular", 3)
     q, p, args = particles.start(*(x[1] for x in start))
-    sol = dvi.integrate(
-        particles.system, q, p, h=0.25, num_steps=1000, args=args, method=dvi.RungeKutta4(),
-        save=dvi.Save(final=True),
-    )  # fmt: skip
+    sol = integrate(particles, q, p, args, 0.25, 1000, method=dvi.RungeKutta4())
     at = particles.coordinates_of(sol.qs[-1], sol.ps[-1])
     c = np.array([at.s, at.theta, at.zeta, at.v_parallel / particles.speed])
     assert difference(c, a[1]) < 1e-8
@@ -246,10 +235,7 @@ def test_a_step_is_symplectic():
     q, p, args = particles.start(0.3, 0.2, 0.1, 0.4)
 
     def step(z):
-        sol = dvi.integrate(
-            particles.system, z[:2], z[2:], h=2.0, num_steps=1, args=args,
-            method=dvi.GaussLegendre(2), save=dvi.Save(final=True),
-        )  # fmt: skip
+        sol = integrate(particles, z[:2], z[2:], args, 2.0, 1)
         return jnp.concatenate([sol.qs[-1], sol.ps[-1]])
 
     A = np.asarray(jax.jit(jax.jacfwd(step))(jnp.concatenate([q, p])))
@@ -273,22 +259,16 @@ def test_orbits_cross_the_magnetic_axis():
 def test_a_start_at_the_edge_is_lost_at_once():
     particles = boozer.GuidingCentres(axisymmetric(current=False))
     q, p, args = particles.start(1.0, 0.1, 0.0, 0.5)
-    sol = dvi.integrate(
-        particles.system, q, p, h=2.0, num_steps=10, args=args, method=dvi.GaussLegendre(2),
-        stop=particles.loss,
-    )  # fmt: skip
+    sol = integrate(particles, q, p, args, 2.0, 10, stop=particles.loss)
     assert (sol.status, float(sol.stop.t)) == ("stopped", 0.0)
 
 
-@pytest.mark.slow
+@slow
 def test_without_rotational_transform():
     field = boozer.from_modes([0, 1], [0, 0], [[5.7], [-0.5]], psi_edge=EDGE, iota=0.0, G=57.0)
     particles = boozer.GuidingCentres(field)
     q, p, args = particles.start(0.2, 0.3, 0.0, 0.5)
-    sol = dvi.integrate(
-        particles.system, q, p, h=4.0, num_steps=400, args=args, method=dvi.GaussLegendre(2),
-        save=dvi.Save(final=True), stop=particles.loss,
-    )  # fmt: skip
+    sol = integrate(particles, q, p, args, 4.0, 400, stop=particles.loss)
     # Without ι the vertical drift is not averaged: it leaves, at constant p_ζ.
     assert sol.status == "stopped"
     at = particles.coordinates_of(sol.stop.q, sol.stop.p)
@@ -306,9 +286,8 @@ def test_sums_and_their_derivatives(parts, helicity):
         for m in range(3):
             for k in (-1, 0, 1):
                 angle = m * theta - 4 * (k + helicity * m) * zeta
-                for part, wave in zip(
-                    c[:, m, k + 1], (jnp.cos(angle), jnp.sin(angle)), strict=False
-                ):
+                waves = jnp.cos(angle), jnp.sin(angle)
+                for part, wave in zip(c[:, m, k + 1], waves, strict=False):
                     total += s ** (m / 2) * (part[0] + s * (part[1] + s * part[2])) * wave
         return total
 
@@ -319,7 +298,12 @@ def test_sums_and_their_derivatives(parts, helicity):
         at = (jnp.asarray(c), 0.4, 0.3, 0.7)
         return jax.tree.leaves((f(*at), slopes(*at), second(*at), third))
 
-    ours = all_of(lambda c, *u: _sums.total(c, _sums.Shape(4, helicity), *map(jnp.asarray, u)))
+    field = modes([0], [0], [[1.0]], periods=4, helicity=helicity)
+
+    def strength(c, *point):
+        return dataclasses.replace(field, coefficients=c).at(*map(jnp.asarray, point))
+
+    ours = all_of(strength)
     for a, b in zip(ours, all_of(defined), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12 * np.abs(b).max())
 
@@ -411,10 +395,8 @@ def test_near_axis_expansions(name):
     stellarator = qsc.Qsc.from_paper(name)
     field = boozer.from_near_axis(stellarator, minor_radius=0.1)
     s, theta, zeta = np.random.default_rng(0).uniform([0, 0, 0], [1, 6, 3], (20, 3)).T
-    expected = [
-        stellarator.B_mag(0.1 * np.sqrt(x), y, z, Boozer_toroidal=True)
-        for x, y, z in zip(s, theta, zeta, strict=True)
-    ]  # fmt: skip
+    points = zip(0.1 * np.sqrt(s), theta, zeta, strict=True)
+    expected = [stellarator.B_mag(*point, Boozer_toroidal=True) for point in points]
     np.testing.assert_allclose(field.strength(s, theta, zeta), expected, rtol=1e-6)
     assert float(field.G[0]) == pytest.approx(stellarator.G0)
     particles = boozer.GuidingCentres(field.scaled())
@@ -424,63 +406,60 @@ def test_near_axis_expansions(name):
 
 
 def test_bad_files(tmp_path):
-    with pytest.raises(ValueError, match=r"it has no bmnc_b\.$"):
-        boozer.read_booz_xform(written(tmp_path / "a.nc", drop=["bmnc_b"]))
     (tmp_path / "b.nc").write_text("not netCDF, and long enough to look at")
-    with pytest.raises(ValueError, match="not a file of netCDF version 3"):
-        boozer.read_booz_xform(tmp_path / "b.nc")
-    with pytest.raises(ValueError, match=r"psi_edge=.*read_wout\(path, True\)"):
-        boozer.read_booz_xform(written(tmp_path / "c.nc", sign=0))
-    with pytest.raises(ValueError, match="more than 6 surfaces"):
-        boozer.from_surfaces(
-            [0.1, 0.95], [0], [0], [[1.0], [1.0]], iota=[1, 1], G=[1, 1], psi_edge=1.0
-        )
     (tmp_path / "d.json").write_text("{}")
-    with pytest.raises(ValueError, match="not a field that save_field has written"):
-        boozer.load_field(tmp_path / "d.json")
+    files = [
+        (written(tmp_path / "a.nc", drop=["bmnc_b"]), r"it has no bmnc_b\.$"),
+        (tmp_path / "b.nc", "not a file of netCDF version 3"),
+        (written(tmp_path / "c.nc", sign=0), r"psi_edge=.*read_wout\(path, True\)"),
+        (tmp_path / "d.json", "not a field that save_field has written"),
+    ]
+    for path, message in files:
+        with pytest.raises(ValueError, match=message):
+            boozer.load_field(path) if path.suffix == ".json" else boozer.read_booz_xform(path)
 
 
-def test_bad_fields_and_particles():
-    good = {"psi_edge": 1.0, "iota": 0.4, "G": 10.0}
-    with pytest.raises(ValueError, match="mode m = n = 0"):
-        boozer.from_modes([1], [0], [[1.0]], **good)
-    with pytest.raises(ValueError, match=r"\|B\| must be positive"):
-        boozer.from_modes([0, 1], [0, 0], [[1.0], [1.5]], **good)
-    with pytest.raises(ValueError, match="G must not be zero"):
-        boozer.from_modes([0], [0], [[1.0]], **good | {"G": [1.0, -2.0]})
-    with pytest.raises(ValueError, match="zero on the axis"):
-        boozer.from_modes([0], [0], [[1.0]], I=[0.1], **good)
-    with pytest.raises(ValueError, match="a multiple of periods=2"):
-        boozer.from_modes([0, 1], [0, 1], [[1.0], [0.1]], periods=2, **good)
-    with pytest.raises(ValueError, match="1 values are not finite"):
-        boozer.from_modes([0], [0], [[np.nan]], **good)
-    s = np.linspace(0.05, 0.8, 20)
-    with pytest.raises(ValueError, match="to the edge"):
-        boozer.from_surfaces(s, [0], [0], np.ones((20, 1)), iota=s, G=s, psi_edge=1.0)
-    particles = boozer.GuidingCentres(axisymmetric())
-    with pytest.raises(ValueError, match=r"s must be between 0 and 1, got 1\.2"):
-        particles.start([0.5, 1.2], 0.0, 0.0, 0.1)
-    with pytest.raises(ValueError, match="pitch must be between -1 and 1, got nan"):
-        particles.start(0.5, 0.0, 0.0, np.nan)
-    with pytest.raises(ValueError, match=r"m must be integers \(mode numbers\), got 1\.5"):
-        boozer.from_modes([0, 1.5], [0, 0], [[1.0], [0.1]], **good)
-    to_edge = np.linspace(0.01, 0.99, 20)
-    values = {"psi_edge": 1.0, "iota": 0 * to_edge, "G": 1 + 0 * to_edge}
-    with pytest.raises(ValueError, match=r"iota must have one value .* the shape \(3,\)"):
-        boozer.from_surfaces(to_edge, [0], [0], np.ones((20, 1)), **values | {"iota": np.ones(3)})
-    with pytest.raises(TypeError, match=r"box must be a pair"):
-        boozer.from_surfaces(to_edge, [0], [0], np.ones((20, 1)), box=3, **values)
-    with pytest.raises(ValueError, match="charge must be a finite number, got nan"):
-        boozer.GuidingCentres(axisymmetric(), charge=np.nan)
-    with pytest.raises(ValueError, match=r"breaking must have the shape of field\.coefficients"):
-        boozer.GuidingCentres(axisymmetric(), breaking=np.zeros((1, 1, 1, 1)))
-    with pytest.raises(ValueError, match="charge must not be zero"):
-        boozer.GuidingCentres(axisymmetric(), charge=0.0)
-    with pytest.raises(ValueError, match="rate"):
-        boozer.Births(10, particles, rate=lambda s: s - 0.5)
+def modes(m, n, B, **options):
+    return boozer.from_modes(m, n, B, **{"psi_edge": 1.0, "iota": 0.4, "G": 10.0, **options})
 
 
-@pytest.mark.slow
+def surfaces(s=np.linspace(0.01, 0.99, 20), **options):
+    ones = np.ones(len(s))
+    options = {"psi_edge": 1.0, "iota": ones, "G": ones, **options}
+    return boozer.from_surfaces(s, [0], [0], ones[:, None], **options)
+
+
+ERRORS = [
+    (lambda _: modes([1], [0], [[1.0]]), ValueError, "mode m = n = 0"),
+    (lambda _: modes([0, 1], [0, 0], [[1.0], [1.5]]), ValueError, r"\|B\| must be positive"),
+    (lambda _: modes([0], [0], [[1.0]], G=[1.0, -2.0]), ValueError, "G must not be zero"),
+    (lambda _: modes([0], [0], [[1.0]], I=[0.1]), ValueError, "zero on the axis"),
+    (lambda _: modes([0, 1], [0, 1], [[1.0], [0.1]], periods=2), ValueError, "of periods=2"),
+    (lambda _: modes([0], [0], [[np.nan]]), ValueError, "B must be finite, got nan"),
+    (lambda _: modes([0, 1.5], [0, 0], [[1.0], [0.1]]), ValueError, "m must be integers.* 1.5"),
+    (lambda _: modes([0], [0, 1], [[1.0]]), ValueError, "one entry for each mode"),
+    (lambda _: surfaces(np.array([0.1, 0.95])), ValueError, "more than 6 surfaces"),
+    (lambda _: surfaces(np.linspace(0.05, 0.8, 20)), ValueError, "to the edge"),
+    (lambda _: surfaces(iota=np.ones(3)), ValueError, r"iota must be .* got shape \(3,\)"),
+    (lambda _: surfaces(box=3), TypeError, "box must be a pair"),
+    (lambda _: surfaces(period=2), TypeError, "no argument 'period'. Did you mean 'periods'"),
+    (lambda x: x.start([0.5, 1.2], 0.0, 0.0, 0.1), ValueError, "s must be between 0 and 1.* 1.2"),
+    (lambda x: x.start(0.5, 0.0, 0.0, np.nan), ValueError, "pitch must be between -1 and 1.*nan"),
+    (lambda x: boozer.GuidingCentres(x.field, charge=np.nan), ValueError, "charge must be a fin"),
+    (lambda x: boozer.GuidingCentres(x.field, charge=0.0), ValueError, "charge must not be zero"),
+    (lambda x: boozer.GuidingCentres(x.field, breaking=np.zeros((1, 1, 1, 1))), ValueError,
+     "breaking must be .*shape"),
+    (lambda x: boozer.Births(10, x, rate=lambda s: s - 0.5), ValueError, "rate"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("make", "kind", "message"), ERRORS)
+def test_bad_fields_and_particles(make, kind, message):
+    with pytest.raises(kind, match=message):
+        make(boozer.GuidingCentres(axisymmetric()))
+
+
+@slow
 def test_births_have_the_distribution_of_the_reactions():
     particles = boozer.GuidingCentres(helical())
     births = boozer.Births(4000, particles, seed=3)
@@ -522,7 +501,7 @@ def test_loss_fractions_have_wilsons_interval():
         boozer.loss_fraction([], [1.0])
 
 
-@pytest.mark.slow
+@slow
 def test_a_sweep_over_births():
     """Each particle has its own μ; losses at the times of single runs."""
     field = boozer.from_modes(
@@ -539,10 +518,7 @@ def test_a_sweep_over_births():
     assert 0 < counts["stopped"] == np.isfinite(stops).sum() < 16
     i = int(np.nanargmin(stops))
     q, p, args = births.at(jnp.asarray(i), 0.0, None)
-    alone = dvi.integrate(
-        particles.system, q, p, h=2.0, num_steps=400, args=args, method=dvi.GaussLegendre(2),
-        stop=particles.loss, save=dvi.Save(final=True),
-    )  # fmt: skip
+    alone = integrate(particles, q, p, args, 2.0, 400, stop=particles.loss)
     assert float(alone.stop.t) == pytest.approx(stops[i], rel=1e-9)
 
 

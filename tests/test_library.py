@@ -433,7 +433,7 @@ def test_initial_conditions_of_another_shape_are_refused(name):
             made.check(np.ones(shape), np.ones(shape), made.args)
 
 
-POSITIVE, NO_GYRATION = "must be a positive.*got ", "must not be zero, got .* not gyrate"
+POSITIVE, NO_GYRATION = "must be a positive.*got ", "must not be zero, got "
 
 
 @pytest.mark.parametrize(
@@ -451,7 +451,7 @@ POSITIVE, NO_GYRATION = "must be a positive.*got ", "must not be zero, got .* no
         ("restricted_three_body", {"mu": 0.7}, "must satisfy 0 < mu ≤ 1/2, got 0.7"),
         ("lotka_volterra", {"alpha": -0.1}, POSITIVE),
         ("uniform_field", {"B": 0.0}, NO_GYRATION),
-        ("uniform_field", {"E": [0.1]}, r"must have shape \(3,\), got shape \(1,\)"),
+        ("uniform_field", {"E": [0.1]}, r"must be .* shape \(3,\), got shape \(1,\)"),
         ("dipole_field", {"radius": -1.0}, POSITIVE),
         ("dipole_field", {"B0": 0.0}, NO_GYRATION),
         ("rigid_body", {"I3": 4.0}, ""),
@@ -463,9 +463,9 @@ POSITIVE, NO_GYRATION = "must be a positive.*got ", "must not be zero, got .* no
         ("magnetic_mirror", {"B0": 0.0}, NO_GYRATION),
         ("magnetic_mirror", {"mass": -1.0}, POSITIVE + "-1.0"),
         ("magnetic_mirror", {"length": math.inf}, POSITIVE + "inf"),
-        ("polar_motion", {"mean": [0.1]}, r"must have shape \(2,\), got shape \(1,\)"),
-        ("polar_motion", {"drift": [0.1]}, r"must have shape \(2,\), got shape \(1,\)"),
-        ("polar_motion", {"prograde": 0.1}, r"must have shape \(2,\), got shape \(\)"),
+        ("polar_motion", {"mean": [0.1]}, r"must be .* shape \(2,\), got shape \(1,\)"),
+        ("polar_motion", {"drift": [0.1]}, r"must be .* shape \(2,\), got shape \(1,\)"),
+        ("polar_motion", {"prograde": 0.1}, r"must be .* shape \(2,\), got shape \(\)"),
         ("polar_motion", {"retrograde": [0.1, math.nan]}, "must be finite"),
         ("polar_motion", {"period": -433.0}, POSITIVE + "-433"),
         ("stiff_fput", {"omega": 0.0}, POSITIVE + "0.0"),
@@ -473,7 +473,7 @@ POSITIVE, NO_GYRATION = "must be a positive.*got ", "must not be zero, got .* no
 )
 def test_parameters_out_of_range_are_refused(name, change, said):
     made, ((key, _),) = problem(name), change.items()
-    said = f"{key} {said}" if said else "falls into the centre|inside the planet|at most the sum"
+    said = f"{key} {said}" if said else "falls into the centre|of the planet|at most the sum"
     with pytest.raises(ValueError, match=said):
         made.check(made.q0, made.p0, {**made.args, **change})
 
@@ -534,7 +534,7 @@ def test_invalid_arguments_of_systems_are_refused(make, options, said):
         ("hill", [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], "q0 must not be at the small body"),
         ("dipole_field", [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], "q0 must not be at the dipole"),
         ("rigid_body", [0.0, 0.0, 0.0], [1.0, 1.0, 0.5], r"\|L\| < G and"),
-        ("spinning_top", [0.0, 0.0, 0.0], [1.0, 0.0, 1.0], "singular"),
+        ("spinning_top", [0.0, 0.0, 0.0], [1.0, 0.0, 1.0], "θ"),
     ],
 )
 def test_singular_starts_are_refused(name, q0, p0, said):
@@ -546,13 +546,11 @@ def test_facts_about_nothing_are_refused():
     """A `Problem` does not promise what it cannot show."""
     made = problem("kepler")
     parts = {"name": "x", "system": made.system, "q0": [0.0], "p0": [0.0], "h": 0.1}
-    with pytest.raises(
-        ValueError, match=r"invariants of .* contains 'energy'.*observables .it has no names"
-    ):
+    with pytest.raises(ValueError, match=r"invariants of .* in observables, \[\], got 'energy'"):
         systems.Problem(**parts, invariants=("energy",))
-    with pytest.raises(ValueError, match=r"parameters of .* contains 'k'.*in the dict args .K"):
+    with pytest.raises(ValueError, match=r"parameters of .* in the dict args, .'K'.*got 'k'"):
         systems.Problem(**parts, args={"K": 1.0}, parameters={"k": "strength [1]"})
-    with pytest.raises(ValueError, match=r"adiabatic of .* contains 'action'"):
+    with pytest.raises(ValueError, match=r"adiabatic of .* got 'action'"):
         systems.Problem(**parts, adiabatic={"action": systems.Adiabatic("ε", 1)})
 
 

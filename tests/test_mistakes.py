@@ -416,7 +416,7 @@ REFUSALS = [
     (lambda: variational(method=dvi.Strang()), "^ValueError.*TypeII"),
     (
         lambda: variational(arithmetic=dvi.FixedPoint(2.0**-40)),
-        "^ValueError.*step sizes are rounded",
+        "^ValueError.*sizes are rounded",
     ),
     (lambda: dvi.Save(every=2.0), "^ValueError.*at least 1"),
     (lambda: dvi.Save(every=True), "^ValueError.*at least 1"),

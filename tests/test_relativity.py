@@ -296,10 +296,8 @@ def test_a_run_is_differentiable_in_j2():
 
     def where(J2):
         args = {"masses": MERCURY_LIKE, "J2": J2, "R": 0.1, "pole": POLE}
-        options = {"h": 0.05, "num_steps": 20, "method": dvi.TypeII()}
-        return dvi.integrate(OBLATE, q0, MERCURY_LIKE[:, None] * v0, args=args, **options).qs[
-            -1, 1, 2
-        ]
+        options = {"h": 0.05, "num_steps": 20, "method": dvi.TypeII(), "args": args}
+        return dvi.integrate(OBLATE, q0, MERCURY_LIKE[:, None] * v0, **options).qs[-1, 1, 2]
 
     # One program for values and slope; centred differences: error s² and rounding 1e-16/s.
     both, s = jax.jit(lambda J2: jax.jvp(where, (J2,), (1.0,))), 1e-4
@@ -336,30 +334,21 @@ def test_mercury_follows_the_ephemeris():
 # Starts that are refused
 
 
-@pytest.mark.parametrize(
-    "function",
-    [
-        hamiltonian,
-        post_newtonian_force,
-        post_newtonian_hamiltonian,
-        hamiltonian_with_oblateness,
-        lambda t0, t1, q0, p1, args: oblateness(q0, args),
-        lambda t0, t1, q0, p1, args: momenta_from_velocities(q0, p1, args),
-        lambda t0, t1, q0, p1, args: velocities_from_momenta(q0, p1, args),
-    ],
-)
-def test_shapes_that_do_not_agree(function):
+def test_shapes_that_do_not_agree():
     args = {"masses": np.ones(3), "J2": 0.1}
-    function(0.0, 0.0, jnp.asarray(Q), jnp.asarray(V), args)
-    for q in (jnp.asarray(Q[:2]), jnp.ones(3)):
-        with pytest.raises(
-            ValueError, match=r"needs positions of shape \(bodies, dim\) and masses"
-        ):
-            function(0.0, 0.0, q, q, args)
+    of_step = hamiltonian, post_newtonian_force, post_newtonian_hamiltonian
+    for function in (*of_step, hamiltonian_with_oblateness):
+        for q in (jnp.asarray(Q[:2]), jnp.ones(3)):
+            with pytest.raises(ValueError, match=r"(positions|masses) must be"):
+                function(0.0, 0.0, q, q, args)
+    for function in (momenta_from_velocities, velocities_from_momenta):
+        for q in (jnp.asarray(Q[:2]), jnp.ones(3)):
+            with pytest.raises(ValueError, match=r"(positions|masses) must be"):
+                function(q, q, args)
 
 
 def test_a_pole_of_another_dimension():
     args = {"masses": np.ones(3), "J2": 0.1}
-    with pytest.raises(ValueError, match=r"pole.*\(2,\) for q of shape \(3, 2\), got shape \(3,\)"):
+    with pytest.raises(ValueError, match=r"pole.*\(2,\).*got shape \(3,\)"):
         oblateness(jnp.asarray(Q[:, :2]), args)
     oblateness(jnp.asarray(Q[:, :2]), args | {"pole": np.array([0.0, 1.0])})

@@ -1,7 +1,4 @@
-"""Rigid bodies in rotation matrices: helper functions, tops against Euler's angles, discovery.
-
-The long tests print what they measure: ``pytest tests/test_rigid_bodies.py -m slow -s``.
-"""
+"""Rigid bodies in rotation matrices: helper functions, tops against Euler's angles, discovery."""
 
 import functools
 import sys
@@ -117,7 +114,6 @@ def top_step():
 def test_the_map_of_a_top_is_symplectic_on_the_manifold():
     q, p = jnp.asarray(LAGRANGE.q0), jnp.asarray(LAGRANGE.p0)
     defect = defect_of_two_form(LAGRANGE.system, LAGRANGE.args, top_step(), q, p)
-    print(f"two-form on T*SO(3): {defect:.1e}")
     assert defect < 1e-13
 
     def scaled(q, p):
@@ -166,12 +162,9 @@ def test_a_heavy_top_moves_as_in_eulers_angles(kind):
     omega = rigid.body_momentum(q0, p0) / moments
     rates = jnp.linalg.solve(jax.jacfwd(spin, 1)(angles, jnp.zeros(3)), omega)
     y0 = np.concatenate([angles, rates])
-    found = solve_ivp(
-        lambda t, y: np.asarray(field(y)), (0, 5), y0, "DOP853", rtol=1e-13, atol=1e-14
-    )
+    found = solve_ivp(lambda t, y: field(y), (0, 5), y0, "DOP853", rtol=1e-13, atol=1e-14)
     expected = rigid.rotation(*jnp.asarray(found.y[:3, -1]))
     off = np.max(np.abs(run(made, 500, h=0.01, method=EIGHTH).qs[-1] - expected))
-    print(f"heavy top ({kind}), 5 time units: {off:.1e} from DOP853 in Euler's angles")
     assert found.success
     assert off < 1e-9
 
@@ -214,7 +207,6 @@ def test_angular_momentum_does_not_drift_with_compensated_steps():
         key: dvi.MaxDrift(LAGRANGE.observables[key]) for key in LAGRANGE.invariants[1:]
     })  # fmt: skip
     drifts = [float(x) for x in sol.observed.values()]
-    print(f"heavy top, 10⁶ compensated steps: momenta change by {max(drifts):.1e}")
     assert max(drifts) < 2e-14
 
 
@@ -245,14 +237,10 @@ def test_a_gradient_with_respect_to_moments_and_centre_is_that_of_differences():
 # Discovery
 
 
-def formulas(result):
-    return [str(x) for x in result.invariants]
-
-
 @slow
 def test_discovery_finds_the_integrals_of_lagranges_top():
     result = example.found(LAGRANGE, 2)
-    assert set(formulas(result)) == {
+    assert set(map(str, result.invariants)) == {
         "0.5 π3",
         "0.5 γ3 + 0.25 π1² + 0.25 π2²",
         "0.5 π1 γ1 + 0.5 π2 γ2 + 0.5 π3 γ3",
@@ -266,7 +254,7 @@ def test_discovery_finds_kovalevskayas_integral_among_polynomials_of_degree_4():
     """209 monomials, of which 182 are independent where |γ| = 1."""
     result = example.found(systems.heavy_top("kovalevskaya"), 4)
     assert result.basis.size == 182
-    found = formulas(result)
+    found = [str(x) for x in result.invariants]
     assert len(found) == 4
     K = "0.5 γ1² + 0.5 γ2² − 0.5 π1² γ1 − π1 π2 γ2 + 0.5 π2² γ1"
     assert f"{K} + 0.125 π1⁴ + 0.25 π1² π2² + 0.125 π2⁴" in found

@@ -40,21 +40,27 @@ def with_sextupole(k=0.3, b2=1.0):
     return rings.problem(ring, planes="x")
 
 
+def invariants(problem, beta, degree, order=0):
+    return dvi.discover_invariants(
+        problem.system, dvi.Polynomials(degree), order, h=1.0, samples=samples(beta),
+        args=problem.args,
+    ).invariants  # fmt: skip
+
+
 @functools.cache
 def series(order):
+    return invariants(with_sextupole(), linear()[1], order + 2, order)[0]
+
+
+def slope(order, epsilons, turns=5000):
+    """The order of the drift in ε; it is resolved."""
     problem = with_sextupole()
-    return dvi.discover_invariants(
-        problem.system, dvi.Polynomials(order + 2), order, h=1.0,
-        samples=samples(linear()[1]), args=problem.args,
-    ).invariants[0]  # fmt: skip
-
-
-def slope(invariant, epsilons, amplitude=0.003, turns=5000, k=0.3):
-    problem = with_sextupole(k)
-    return dvi.drift_order(
-        problem.system, invariant, [amplitude], [0.0], epsilons=epsilons, h=1.0,
-        num_steps=turns, args=problem.args,
+    drift = dvi.drift_order(
+        problem.system, series(order), [0.003], [0.0], epsilons=epsilons, h=1.0, num_steps=turns,
+        args=problem.args,
     )  # fmt: skip
+    assert drift.resolved, drift
+    return drift.slope
 
 
 # --- Courant & Snyder -----------------------------------------------------------------------------
@@ -67,9 +73,7 @@ def test_invariant_of_the_linear_map_is_that_of_courant_and_snyder():
     o, problem = rings.optics(ring, chromatic=False), rings.problem(ring, planes="x")
     beta, alpha = float(o.beta[0, 0]), float(o.alpha[0, 0])
     assert abs(alpha) > 0.5
-    found = dvi.discover_invariants(
-        problem.system, dvi.Polynomials(2), h=1.0, samples=samples(beta), args=problem.args
-    ).invariants[0]
+    found = invariants(problem, beta, 2)[0]
     c = dict(zip(found.basis.names, np.asarray(found.coefficients[0]), strict=True))
     gamma = (1 + alpha**2) / beta
     ratios = np.array([c["q p"], c["p²"]]) / c["q²"]
@@ -77,22 +81,12 @@ def test_invariant_of_the_linear_map_is_that_of_courant_and_snyder():
 
 
 @pytest.mark.slow
-def test_drift_of_the_invariant_of_order_one():
-    found = slope(series(1), np.geomspace(0.05, 1, 6))
-    print(found)
-    assert found.resolved
-    assert abs(found.slope - 2) < 0.1
-    # A control: the invariant without its correction.
-    assert abs(slope(series(0), np.geomspace(0.05, 1, 6)).slope - 1) < 0.1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("order", [2, 3])
-def test_drift_of_higher_orders(order):
-    found = slope(series(order), np.geomspace(0.2, 3, 7), turns=20_000)
-    print(found)
-    assert found.resolved
-    assert abs(found.slope - order - 1) < 0.15
+@pytest.mark.parametrize("order", [0, 1, 2, 3])
+def test_the_drift_of_an_invariant_is_of_the_next_order(order):
+    if order < 2:
+        assert abs(slope(order, np.geomspace(0.05, 1, 6)) - order - 1) < 0.1
+    else:
+        assert abs(slope(order, np.geomspace(0.2, 3, 7), turns=20_000) - order - 1) < 0.15
 
 
 def strength_for(tune):
@@ -108,21 +102,14 @@ def test_the_correction_grows_without_bound_at_the_third_order_resonance():
         k = strength_for(1 / 3 - distance)
         mu, beta = linear(k)
         np.testing.assert_allclose(mu / 2 / np.pi, 1 / 3 - distance, rtol=1e-10)
-        problem = with_sextupole(k)
-        found = dvi.discover_invariants(
-            problem.system, dvi.Polynomials(3), 1, h=1.0, samples=samples(beta), args=problem.args
-        ).invariants[0]
+        found = invariants(with_sextupole(k), beta, 3, 1)[0]
         values = jax.vmap(found.basis)(*samples(beta, 50)) @ found.coefficients.T
         sizes.append(float(jnp.linalg.norm(values[:, 1]) / jnp.linalg.norm(values[:, 0])))
     ratios = np.array(sizes[1:]) / sizes[:-1]
     assert ((ratios > 1.7) & (ratios < 2.1)).all(), sizes
     # On the resonance there is no invariant of order 1 that begins with that of the linear map.
-    problem = with_sextupole(strength_for(1 / 3))
-    mu, beta = linear(strength_for(1 / 3))
-    found = dvi.discover_invariants(
-        problem.system, dvi.Polynomials(3), 1, h=1.0, samples=samples(beta), args=problem.args
-    )
-    for s in found.invariants:
+    k = strength_for(1 / 3)
+    for s in invariants(with_sextupole(k), linear(k)[1], 3, 1):
         c = dict(zip(s.basis.names, np.asarray(s.coefficients[0]), strict=True))
         assert abs(c["q³"]) * AMPLITUDE > 1e-3 * abs(c["q²"]), s
 
@@ -139,7 +126,6 @@ def test_a_proved_bound_of_the_drift_of_a_cell_with_one_sextupole(order, least):
         method=rings.Turn(losses=False), domain=(np.array([r]), np.array([r / beta])),
         change=0.01 * r**2 / 2, ratio=4.0, max_boxes=64, max_seconds=20.0,
     )  # fmt: skip
-    print(bound)
     assert bound.seen[0] <= bound.per_step[0] < 4 * bound.seen[0]
     assert bound.steps > least
 
@@ -177,32 +163,29 @@ def mcmillan_invariant(z, g=0.3, a=0.01):
 
 def test_mcmillan_ring_conserves_its_invariant_to_round_off():
     z = jnp.zeros((5, 6)).at[:, 0].set(np.linspace(1e-3, 2e-2, 5))
-    values = mcmillan_invariant(np.asarray(rings.track(mcmillan_ring(), z, 1000, every=1).z))
-    assert (np.ptp(values, axis=1) / values[:, 0]).max() < 1e-12
-    # A control: a lens for a phase advance that is wrong by 1e-3.
-    wrong = rings.track(mcmillan_ring(wrong=1e-3), z, 1000, every=1).z
-    values = mcmillan_invariant(np.asarray(wrong))
-    assert (np.ptp(values, axis=1) / values[:, 0]).min() > 1e-4
+
+    def change(wrong):
+        out = rings.track(mcmillan_ring(wrong=wrong), z, 1000, every=1).z
+        values = mcmillan_invariant(np.asarray(out))
+        return np.ptp(values, axis=1) / values[:, 0]
+
+    assert change(0.0).max() < 1e-12
+    assert change(1e-3).min() > 1e-4  # a control: a lens for a wrong phase advance
 
 
 def test_mcmillan_invariant_is_found():
     problem = rings.problem(mcmillan_ring(), planes="x")
     _, beta = linear()
-    args = {"h": 1.0, "samples": samples(beta), "args": problem.args}
-    found = dvi.discover_invariants(problem.system, dvi.Polynomials(4), **args)
-    assert len(found.invariants) == 1
+    (found,) = invariants(problem, beta, 4)
     q, p = samples(beta, 100)
-    values = jax.vmap(lambda q, p: found.invariants[0].evaluate(q, p, 0.0))(q, p)
+    values = jax.vmap(lambda q, p: found.evaluate(q, p, 0.0))(q, p)
     z = np.zeros((100, 6))
     z[:, 0], z[:, 1] = q[:, 0], p[:, 0]
     ratio = np.asarray(values) / mcmillan_invariant(z)
     assert np.ptp(ratio) < 1e-9 * abs(ratio[0])
     # A control: a wrong phase advance.
     problem = rings.problem(mcmillan_ring(wrong=1e-3), planes="x")
-    found = dvi.discover_invariants(
-        problem.system, dvi.Polynomials(4), **{**args, "args": problem.args}
-    )
-    assert not found.invariants
+    assert not invariants(problem, beta, 4)
 
 
 # --- Danilov & Nagaitsev --------------------------------------------------------------------------
@@ -311,7 +294,6 @@ def test_what_breaks_the_invariants_of_danilov_and_nagaitsev():
     phase = [changes(nagaitsev(32, phase=2 * np.pi * e)[0], beta) for e in (0.001, 0.002)]
     chromatic = [changes(ring, beta, delta=d) for d in (0.005, 0.01)]
     for small, large in (unequal, phase, chromatic):
-        print("changes of H and the second invariant:", right, small, large)
         assert (small > 10 * right).all()
         assert (large / small > 1.6).all()
         assert (large / small < 2.4).all()

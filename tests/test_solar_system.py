@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 import dvi_jax as dvi
 from dvi_jax.systems import n_body, solar_system
 from dvi_jax.systems.n_body import OBSERVABLES, angular_momentum, check_bodies, hamiltonian
+from dvi_jax.systems.planets.polar_motion import read_polar_motion
 from dvi_jax.systems.planets.solar_system import (
     BODIES,
     GM,
@@ -58,29 +59,18 @@ def beside_ephemeris(solution, masses=GM):
 # The ephemeris
 
 
-@pytest.mark.parametrize(
-    ("date", "jd"),
-    [
-        ("1900-01-01", START),
-        ("2000-01-01", 2451544.5),
-        (2451545.0, 2451545.0),
-        (np.int64(2451545), 2451545.0),
-        (np.float32(2451545), 2451545.0),
-    ],
-)
-def test_dates(date, jd):
-    assert julian_date(date) == jd
+def test_dates():
+    assert [julian_date(x) for x in ("1900-01-01", "2000-01-01")] == [START, 2451544.5]
+    for kind in (float, np.int64, np.float32):
+        assert julian_date(kind(2451545)) == 2451545.0
 
 
 @pytest.mark.parametrize(
     ("date", "said"),
     [
-        (
-            "1899-07-28",
-            r"DE421, 1899-07-29 to 2053-10-09 .* got the Julian date 2414863\.5 \(1899-07-28\)",
-        ),
+        ("1899-07-28", r"1899-07-29 to 2053-10-09 .* got 2414863\.5 \(1899-07-28\)"),
         ("2053-10-10", r"\(2053-10-10\)"),
-        ("01/01/1900", "must be an existing day such as"),
+        ("01/01/1900", "must be a day such as"),
         (True, r"got True\. Give a calendar day or a Julian date"),
         (float("nan"), "finite number, got nan"),
     ],
@@ -92,8 +82,7 @@ def test_invalid_dates(date, said):
 
 def test_ephemeris_is_barycentric_in_au_and_days():
     jd = START + np.linspace(0, 36525, 200)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")  # of the age of a file that is not read
+    with warnings.catch_warnings(action="error"):  # of the age of a file that is not read
         q, v = ephemeris(jd)
     assert q.shape == v.shape == (200, 10, 3)
     radius = np.linalg.norm(q - q[:, :1], axis=-1)
@@ -120,9 +109,8 @@ def test_earth_stays_on_the_ecliptic():
     jd = START + np.linspace(0, 3652, 100)
     q, _ = ephemeris(jd)
     earth = q[:, BODIES.index("Earth–Moon")] - q[:, 0]
-    assert (
-        np.abs(to_ecliptic(earth)[:, 2]).max() < 3e-4
-    )  # the ecliptic of 1900 is near that of J2000
+    # the ecliptic of 1900 is near that of J2000
+    assert np.abs(to_ecliptic(earth)[:, 2]).max() < 3e-4
     assert np.abs(earth[:, 2]).max() > 0.39  # negative control: on the equator's axes it does not
 
 
@@ -130,8 +118,9 @@ def test_missing_extra_names_the_command(monkeypatch):
     solar = sys.modules["dvi_jax.systems.planets.solar_system"]
     monkeypatch.setattr(solar, "find_spec", lambda name: None)
     solar._kernel.cache_clear()
-    with pytest.raises(EphemerisMissing, match=r'pip install "dvi-jax\[ephemeris\]"'):
-        ephemeris([START])
+    for read in (lambda: ephemeris([START]), read_polar_motion):
+        with pytest.raises(EphemerisMissing, match=r'pip install "dvi-jax\[ephemeris\]"'):
+            read()
     monkeypatch.undo()
     monkeypatch.setitem(sys.modules, "jplephem.spk", None)
     with pytest.raises(EphemerisMissing, match=r"jplephem: pip install"):
@@ -165,11 +154,11 @@ def test_bodies_in_one_place_are_not_finite():
 @pytest.mark.parametrize(
     ("masses", "q0", "said"),
     [
-        ([1, 1, 1], [[0, 0], [1, 0], [1, 0]], "body 1 and body 2 are at the same position"),
-        ([1, 1, 1], [[0, 0], [1, 0], [1, 1e-17]], "body 1 and body 2 are at the same"),
-        ([1, -1, 1], [[0, 0], [1, 0], [2, 0]], "mass of body 1 is -1.0"),
-        ([1, np.nan, 1], [[0, 0], [1, 0], [2, 0]], "mass of body 1 is nan"),
-        ([1, 1], [[0, 0], [1, 0], [2, 0]], r"one number for each body in q0, shape \(3,\)"),
+        ([1, 1, 1], [[0, 0], [1, 0], [1, 0]], "body 1 and body 2 must have different"),
+        ([1, 1, 1], [[0, 0], [1, 0], [1, 1e-17]], "body 1 and body 2 must have"),
+        ([1, -1, 1], [[0, 0], [1, 0], [2, 0]], "mass of body 1 .*got -1.0"),
+        ([1, np.nan, 1], [[0, 0], [1, 0], [2, 0]], "mass of body 1 .*got nan"),
+        ([1, 1], [[0, 0], [1, 0], [2, 0]], r"masses must be .* shape \(3,\)"),
         ([1, 1, 1], [0, 1, 2], r"\(bodies, 2\) or \(bodies, 3\)"),
     ],
 )
@@ -181,7 +170,7 @@ def test_starts_that_are_refused(masses, q0, said):
 def test_planets_are_named_when_they_coincide(century):
     q = century.q0.copy()
     q[3] = q[2]
-    with pytest.raises(ValueError, match="Venus and Earth–Moon are at the same position"):
+    with pytest.raises(ValueError, match="Venus and Earth–Moon must have"):
         century.check(q, century.p0, century.args)
     check_bodies(century.q0, century.p0, century.args)
 
@@ -197,10 +186,10 @@ def test_momenta_are_kept_and_runge_kutta_loses_them(run, century):
     assert np.linalg.norm(drift["angular_momentum"]) / size < 1e-13  # measured 1e-14
     assert np.linalg.norm(drift["linear_momentum"]) / total < 1e-13
     # Negative control. Its own drift is small (order h⁵) and yet far above rounding.
-    foil = run(1.0, dvi.RungeKutta4()).observed
-    same_step = run(1.0).observed
-    lost = np.linalg.norm(foil["angular_momentum"]) / size
-    kept = np.linalg.norm(same_step["angular_momentum"]) / size
+    lost, kept = (
+        np.linalg.norm(solution.observed["angular_momentum"])
+        for solution in (run(1.0, dvi.RungeKutta4()), run(1.0))
+    )
     assert lost > 100 * kept
 
 

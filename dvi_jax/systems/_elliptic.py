@@ -31,8 +31,8 @@ def _complete(m):
     """K(m), where m < 1, and Σ_{n>0} 2^(n−1) c_n², with c_0² = m left out: E = K (1 − m/2 − Σ)."""
     (a, b), mean = _means(m)
     # c_n is half the difference of the pass before
-    lost = sum(2.0 ** (n - 1) * ((a[n - 1] - b[n - 1]) / 2) ** 2 for n in range(1, _PASSES))
-    return jnp.pi / (2 * mean), lost
+    tail = sum(2.0 ** (n - 1) * ((a[n - 1] - b[n - 1]) / 2) ** 2 for n in range(1, _PASSES))
+    return jnp.pi / (2 * mean), tail
 
 
 def complete(m):
@@ -41,19 +41,19 @@ def complete(m):
     At m = 1 they are ∞ and 1, beyond it NaN.
     """
     m = jnp.asarray(m)
-    K, lost = _complete(m)
+    K, tail = _complete(m)
     end = jnp.where(m == 1, jnp.inf, jnp.nan)
     return (
         jnp.where(m < 1, K, end),
-        jnp.where(m < 1, K * (1 - m / 2 - lost), jnp.where(m == 1, 1.0, jnp.nan)),
+        jnp.where(m < 1, K * (1 - m / 2 - tail), jnp.where(m == 1, 1.0, jnp.nan)),
     )
 
 
 def swing(m):
     """E(m) − (1 − m) K(m), to the last digits for small m too; 1 at m = 1, beyond it NaN."""
     m = jnp.asarray(m)
-    K, lost = _complete(m)
-    return jnp.where(m < 1, K * (m / 2 - lost), jnp.where(m == 1, 1.0, jnp.nan))
+    K, tail = _complete(m)
+    return jnp.where(m < 1, K * (m / 2 - tail), jnp.where(m == 1, 1.0, jnp.nan))
 
 
 def first_kind(phi, m):
@@ -61,14 +61,14 @@ def first_kind(phi, m):
     phi, m = jnp.broadcast_arrays(jnp.asarray(phi), jnp.asarray(m))
     (a, b), mean = _means(m)
 
-    def doubled(phi, means):
+    def double(phi, means):
         # φ + atan((b/a) tan φ) on the branch that φ is on
         a, b = means
         turns = jnp.round(phi / jnp.pi)
-        rest = phi - jnp.pi * turns
-        return phi + jnp.pi * turns + jnp.arctan2(b * jnp.sin(rest), a * jnp.cos(rest)), None
+        angle = phi - jnp.pi * turns
+        return phi + jnp.pi * turns + jnp.arctan2(b * jnp.sin(angle), a * jnp.cos(angle)), None
 
-    return lax.scan(doubled, phi, (a, b))[0] / (2.0**_PASSES * mean)
+    return lax.scan(double, phi, (a, b))[0] / (2.0**_PASSES * mean)
 
 
 def third_kind(phi, complement, m):
@@ -79,15 +79,15 @@ def third_kind(phi, complement, m):
     phi, complement, m = jnp.broadcast_arrays(*map(jnp.asarray, (phi, complement, m)))
     turns = jnp.round(phi / jnp.pi)
 
-    def within(s, c):
+    def difference(s, c):
         """Beyond F, for a φ between −π/2 and π/2 of this sine and cosine."""
         weight = c**2 + complement * s**2
         three = _third(c**2, c**2 + (1 - m) * s**2, jnp.ones_like(c), weight)
         return (1 - complement) / 3 * s**3 * three
 
-    rest = phi - jnp.pi * turns
-    whole = within(jnp.ones_like(phi), jnp.zeros_like(phi))
-    return first_kind(phi, m) + 2 * turns * whole + within(jnp.sin(rest), jnp.cos(rest))
+    angle = phi - jnp.pi * turns
+    quarter = difference(jnp.ones_like(phi), jnp.zeros_like(phi))
+    return first_kind(phi, m) + 2 * turns * quarter + difference(jnp.sin(angle), jnp.cos(angle))
 
 
 def _third(x, y, z, p):
@@ -97,24 +97,24 @@ def _third(x, y, z, p):
     """
 
     def duplicate(state, _):
-        x, y, z, p, added, quarter = state
+        x, y, z, p, total, quarter = state
         a, b, c, r = jnp.sqrt(jnp.where(x > 0, x, 1.0)), *map(jnp.sqrt, (y, z, p))
         a = jnp.where(x > 0, a, 0.0)
         d = (r + a) * (r + b) * (r + c)
         e = (p - x) / (r + a) ** 2 * ((p - y) / (r + b) ** 2) * ((p - z) / (r + c) ** 2)
         shift = a * b + a * c + b * c
-        added = added + 6 * quarter / d * _arc(e)
+        total = total + 6 * quarter / d * _arc(e)
         x, y, z, p = ((v + shift) / 4 for v in (x, y, z, p))
-        return (x, y, z, p, added, quarter / 4), None
+        return (x, y, z, p, total, quarter / 4), None
 
     state = (x, y, z, p, jnp.zeros_like(p), jnp.ones_like(p))
-    (x, y, z, p, added, quarter), _ = lax.scan(duplicate, state, None, _DUPLICATIONS)
+    (x, y, z, p, total, quarter), _ = lax.scan(duplicate, state, None, _DUPLICATIONS)
     mean = (x + y + z + 2 * p) / 5
     X, Y, Z = ((mean - v) / mean for v in (x, y, z))
     P = -(X + Y + Z) / 2
     two, three = X * Y + X * Z + Y * Z - 3 * P**2, X * Y * Z
     three = three + 2 * two * P + 4 * P**3
-    return quarter / mean**1.5 * (1 - 3 * two / 14 + three / 6) + added
+    return quarter / mean**1.5 * (1 - 3 * two / 14 + three / 6) + total
 
 
 def _arc(e):
@@ -133,11 +133,11 @@ def jacobi(u, m):
     K = jnp.pi / (2 * mean)
     turns = jnp.round(u / (2 * K))
 
-    def halved(phi, means):
+    def halve(phi, means):
         a, b = means  # of the pass before: c = (a − b)/2 belongs to their mean
         return (phi + jnp.arcsin((a - b) / (a + b) * jnp.sin(phi))) / 2, None
 
-    phi, _ = lax.scan(halved, 2.0**_PASSES * mean * (u - 2 * K * turns), (a, b), reverse=True)
+    phi, _ = lax.scan(halve, 2.0**_PASSES * mean * (u - 2 * K * turns), (a, b), reverse=True)
     sign = jnp.where(turns % 2 == 0, 1.0, -1.0)
     sn, cn = sign * jnp.sin(phi), sign * jnp.cos(phi)
     return sn, cn, jnp.sqrt(cn**2 + (1 - m) * sn**2), phi + jnp.pi * turns

@@ -27,13 +27,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ._problem import Adiabatic, Parameter, Problem, gyrates
+from ._problem import Adiabatic, Parameter, Problem, nonzero
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 _HALVINGS = 54
 """Halvings of the interval that contains the mirror point, which give all its digits."""
 
-PARTICLE = {"charge": Parameter(1.0, "e [charge]", gyrates), "mass": Parameter(1.0, "m [mass]")}
+PARTICLE = {"charge": Parameter(1.0, "e [charge]", nonzero), "mass": Parameter(1.0, "m [mass]")}
 
 
 def adiabatic(small: str, smaller: Callable[[float], Problem]) -> dict[str, Adiabatic]:
@@ -47,8 +47,8 @@ def parts(q: Any, mv: Any, field: Callable[[Any], Any], args: Any) -> tuple[Any,
     B = field(q)
     strength = jnp.sqrt(jnp.sum(B**2))
     b, v = B / strength, mv / args["mass"]
-    along = jnp.sum(v * b)
-    return strength, b, along, v - along * b
+    parallel = jnp.sum(v * b)
+    return strength, b, parallel, v - parallel * b
 
 
 class ChargedParticle(NamedTuple):
@@ -73,13 +73,13 @@ class ChargedParticle(NamedTuple):
 
         It oscillates at the gyrofrequency, by the order of gyroradius over field scale length.
         """
-        strength, _, _, across = parts(q1, *self._at(q1, p1, args), args)
-        return args["mass"] * jnp.sum(across**2) / (2 * strength)
+        strength, _, _, perpendicular = parts(q1, *self._momentum_and_field(q1, p1, args), args)
+        return args["mass"] * jnp.sum(perpendicular**2) / (2 * strength)
 
     def corrected_moment(self, t0, t1, q0, p0, q1, p1, args):
         """μ0 + μ1 at t1, which oscillates by the second order in gyroradius over scale length."""
         return self.magnetic_moment(t0, t1, q0, p0, q1, p1, args) + first_correction(
-            q1, *self._at(q1, p1, args), args
+            q1, *self._momentum_and_field(q1, p1, args), args
         )
 
     def centre(self, q, p, args):
@@ -87,17 +87,17 @@ class ChargedParticle(NamedTuple):
         mv, B = self.kinetic_momentum(q, p, args), self.B(q, args)
         return q - jnp.cross(B, mv) / (args["charge"] * jnp.sum(B**2))
 
-    def _at(self, q, p, args):
+    def _momentum_and_field(self, q, p, args):
         return self.kinetic_momentum(q, p, args), lambda q: self.B(q, args)
 
 
 def first_correction(q: Any, mv: Any, field: Callable[[Any], Any], args: Any) -> Any:
     """μ1, as above [energy / field]; `field`: q → B, shape (3,); args: charge and mass."""
     m = args["mass"]
-    strength, b, along, across = parts(q, mv, field, args)
+    strength, b, parallel, perpendicular = parts(q, mv, field, args)
     gyration = args["charge"] * strength / m
-    u, rho = jnp.cross(across, b), jnp.cross(b, across) / gyration
-    mu0 = m * jnp.sum(across**2) / (2 * strength)
+    u, rho = jnp.cross(perpendicular, b), jnp.cross(b, perpendicular) / gyration
+    mu0 = m * jnp.sum(perpendicular**2) / (2 * strength)
 
     def strength_and_direction(x):
         B = field(x)
@@ -108,12 +108,12 @@ def first_correction(q: Any, mv: Any, field: Callable[[Any], Any], args: Any) ->
         return jax.jvp(strength_and_direction, (q,), (direction,))[1]
 
     (grow, _), (_, curvature) = change(rho), change(b)
-    (_, along_across), (_, along_u) = change(across), change(u)
-    shear = jnp.sum(u * along_across) + jnp.sum(across * along_u)
+    (_, change_across), (_, change_u) = change(perpendicular), change(u)
+    shear = jnp.sum(u * change_across) + jnp.sum(perpendicular * change_u)
     return (
         mu0 * grow / strength
-        + m * along**2 * jnp.sum(rho * curvature) / strength
-        - m * along * shear / (4 * strength * gyration)
+        + m * parallel**2 * jnp.sum(rho * curvature) / strength
+        - m * parallel * shear / (4 * strength * gyration)
     )
 
 
@@ -134,8 +134,8 @@ def bounce_action(
     def halve(_, ends):
         low, high = ends
         middle = (low + high) / 2
-        inside = strength(middle) < limit
-        return jnp.where(inside, middle, low), jnp.where(inside, high, middle)
+        is_inside = strength(middle) < limit
+        return jnp.where(is_inside, middle, low), jnp.where(is_inside, high, middle)
 
     ends = (jnp.zeros_like(limit), far * jnp.ones_like(limit))
     mirror, _ = jax.lax.fori_loop(0, _HALVINGS, halve, ends)
@@ -143,5 +143,5 @@ def bounce_action(
     theta = jnp.asarray(np.pi / 4 * (1 + _NODES), limit.dtype)
     weights = jnp.asarray(np.pi / 4 * _WEIGHTS, limit.dtype)
     x = mirror * jnp.sin(theta)
-    along = jnp.sqrt(jnp.maximum(2 * m * (E - mu * strength(x)), 0.0))
-    return 4 * jnp.sum(weights * along * arc(x) * mirror * jnp.cos(theta))
+    momentum = jnp.sqrt(jnp.maximum(2 * m * (E - mu * strength(x)), 0.0))
+    return 4 * jnp.sum(weights * momentum * arc(x) * mirror * jnp.cos(theta))

@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..base.checks import finite as finite, positive as positive
+from ..base.checks import all_finite, array, finite as finite, positive as positive
 from ..discover.functions.generators import Generator
 from ..discover.symmetries.library import time_translation
 from ..problem.noise import Langevin
-from ..problem.system import System
+from ..problem.system import System as System
 
 DIMENSIONLESS = {"q": "1", "p": "1", "t": "1", "energy": "1"}
 """Units of a dimensionless system."""
@@ -100,9 +100,8 @@ class Problem:
         ):
             for name in set(getattr(self, field_name)) - set(names):
                 raise ValueError(
-                    f"{field_name} of the problem {self.name!r} contains {name!r}, but must have "
-                    f"only names in {kind} ({', '.join(sorted(names)) or 'it has no names'}). "
-                    f"Correct the name, or add {name!r} to {kind}."
+                    f"{field_name} of {self.name!r} must be names in {kind}, {sorted(names)}, got "
+                    f"{name!r}."
                 )
 
 
@@ -119,10 +118,10 @@ class Start:
     """A check of initial conditions and parameters: a function of (q0, p0, args).
 
     - `system`: the system in words, for messages.
-    - `shape`: of q0 and of p0, with None for any number from `least` on; None for any shape.
+    - `shape`: of q0 and of p0, with None for any number from `smallest` on; None for any shape.
     - `parameters`: name in args → check of its value.
     - `singular`: name of a singular point → the point, or a function of args.
-    - `also`: a further check, function of q0, p0 (NumPy arrays) and args.
+    - `check`: a further check, function of q0, p0 (NumPy arrays) and args.
 
     **Raises** `ValueError` that shows what was seen; `ParameterError` for a parameter.
     """
@@ -131,14 +130,14 @@ class Start:
     shape: tuple[int | None, ...] | None
     parameters: Mapping[str, Check] = field(default_factory=dict)
     singular: Mapping[str, Any] = field(default_factory=dict)
-    also: Callable[[Any, Any, Any], None] | None = None
-    least: int = 1
+    check: Callable[[Any, Any, Any], None] | None = None
+    smallest: int = 1
 
     def __call__(self, q0: Any, p0: Any, args: Any) -> None:
-        check_shape(q0, p0, self._fits, f"{self.system}: q0 and p0 must have {self._wanted}")
+        check_shape(q0, p0, self._fits, f"{self.system}: q0 and p0 must have {self._shape_rule}")
         for name, check in self.parameters.items():
             check_parameter(args, name, check)
-        if not (self.singular or self.also):
+        if not (self.singular or self.check):
             return
         q, p = np.asarray(q0, float), np.asarray(p0, float)
         for name_of_point, place in self.singular.items():
@@ -148,22 +147,22 @@ class Start:
                 raise ValueError(
                     f"q0 must not be at {name_of_point} {values}: the system is singular there."
                 )
-        if self.also is not None:
-            self.also(q, p, args)
+        if self.check is not None:
+            self.check(q, p, args)
 
     def _fits(self, state_shape: tuple[int, ...]) -> bool:
         if self.shape is None:
             return True
         pairs = zip(state_shape, self.shape, strict=False)
         return len(state_shape) == len(self.shape) and all(
-            n >= self.least if m is None else n == m for n, m in pairs
+            n >= self.smallest if m is None else n == m for n, m in pairs
         )
 
     @property
-    def _wanted(self) -> str:
+    def _shape_rule(self) -> str:
         if self.shape is None:
             return "the same shape"
-        range_of_n = f" with the same n ≥ {self.least}" if None in self.shape else ""
+        range_of_n = f" with the same n ≥ {self.smallest}" if None in self.shape else ""
         return f"shape {self.shape}{range_of_n}".replace("None", "n")
 
 
@@ -177,10 +176,9 @@ def check_shape(q0: Any, p0: Any, fits: Callable[[tuple[int, ...]], bool], rule:
 def parameter(args: Any, name: str) -> Any:
     """The parameter of this name. **Raises** `ParameterError`, with the names that args has."""
     if not isinstance(args, Mapping) or name not in args:
-        keys = ", ".join(map(str, args)) if isinstance(args, Mapping) else ""
+        keys = list(args) if isinstance(args, Mapping) else args
         raise ParameterError(
-            f"the parameter {name} is missing: args must be a dict with the key {name!r}, got "
-            + (f"the keys {keys}." if keys else f"{args!r:.200}.")
+            f"the parameter {name} is missing: args must be a dict with it, got {keys!r:.200}."
         )
     return args[name]
 
@@ -194,13 +192,13 @@ def check_parameter(args: Any, name: str, check: Check) -> None:
         raise ParameterError(str(error)) from None
 
 
-def gyrates(name: str, value: Any) -> None:
-    """A check for the charge of a particle or the strength of a magnetic field."""
+def nonzero(name: str, value: Any) -> None:
+    """A check such as for a charge or a magnetic field, by which a particle gyrates."""
     if finite(name, value) == 0:
-        raise ValueError(f"{name} must not be zero, got {value}: the particle would not gyrate.")
+        raise ValueError(f"{name} must not be zero, got {value}.")
 
 
-def between(low: float, high: float) -> Check:
+def interval(low: float, high: float) -> Check:
     """A check for a number in the open interval."""
 
     def check(name: str, value: Any) -> None:
@@ -215,17 +213,12 @@ def between(low: float, high: float) -> Check:
 def vector(size: int) -> Check:
     """A check for `size` finite numbers."""
 
-    def check(name: str, array_like: Any) -> None:
+    def check(name: str, value: Any) -> None:
         try:
-            value = np.asarray(array_like, float)
-        except (TypeError, ValueError) as error:
-            raise ValueError(
-                f"{name} must be an array of {size} numbers, got {array_like!r:.200} ({error})."
-            ) from None
-        if value.shape != (size,):
-            raise ValueError(f"{name} must have shape ({size},), got shape {value.shape}.")
-        if not np.isfinite(value).all():
-            raise ValueError(f"{name} must be finite, got {value}.")
+            array(name, np.asarray(value, float), (size,), integers=True)
+        except TypeError as error:
+            raise ValueError(f"{name}: {error}.") from None
+        all_finite(name, value)
 
     return check
 
@@ -240,39 +233,35 @@ class Parameter:
 
 
 def library_problem(
-    hamiltonian: Callable[..., Any],
+    system: System | Callable[..., Any],
     start: Start,
-    parameters: Mapping[str, Parameter] | None = None,
+    parameters: Mapping[str, Parameter] = MappingProxyType({}),
     observables: Sequence[Callable[..., Any]] = (),
-    force: Callable[..., Any] | None = None,
-    perturbation: Callable[..., Any] | None = None,
     autonomous: bool = True,
-    slow_time: bool = False,
-    more: Mapping[str, Any] = MappingProxyType({}),
     **fields: Any,
 ) -> Problem:
     """A `Problem` of the library.
 
+    - `system`: the `System`, or its Hamiltonian.
     - `start`: check of initial conditions; those of `parameters` are added to it.
     - `autonomous`: whether H is independent of time at ε = 0. The energy is then an observable and
-      an invariant, and the translation in time a symmetry, though not one of `slow_time` or with
-      a constraint: symmetries are those of the type II map.
-    - `slow_time`: whether the times of the Hamiltonian and of the observables are ε times t.
-    - `more`: further arguments of `System`.
+      an invariant, and the translation in time a symmetry, though not one of a system with a slow
+      time or a constraint: symmetries are those of the type II map.
     - `fields`: the other fields of `Problem`.
     """
-    parameters, fields = parameters or {}, {"units": DIMENSIONLESS, **fields}
+    system = system if isinstance(system, System) else System(system)
+    fields = {"units": DIMENSIONLESS, **fields}
     if autonomous:
-        observables = (at_end(hamiltonian), *observables)
+        observables = (at_end(system.H_D), *observables)
         fields["invariants"] = ("energy", *fields.get("invariants", ()))
-    if autonomous and not slow_time and "constraint" not in more:
+    if autonomous and not system.slow_time and system.constraint is None:
         fields["symmetries"] = {"time": time_translation(), **fields.get("symmetries", {})}
     return Problem(
-        system=System(hamiltonian, force, perturbation, slow_time, **more),
+        system=system,
         args={name: entry.value for name, entry in parameters.items()} or None,
         check=replace(start, parameters={name: entry.check for name, entry in parameters.items()}),
         parameters={name: entry.meaning for name, entry in parameters.items()},
-        observables={f.__name__: InSlowTime(f) if slow_time else f for f in observables},
+        observables={f.__name__: InSlowTime(f) if system.slow_time else f for f in observables},
         **fields,
     )
 
@@ -297,9 +286,8 @@ class InSlowTime(eqx.Module):
     def __call__(self, t0, t1, q0, p0, q1, p1, args):
         if self.epsilon is None:
             raise ValueError(
-                f"the observable {getattr(self.function, '__name__', 'f')} needs the value of "
-                "epsilon, because its system has slow_time=True. Call observable.bind(system, "
-                "epsilon)(t0, t1, ...), or give the observable in dvi.integrate(observe=...)."
+                f"{getattr(self.function, '__name__', 'f')} needs the value of epsilon, since its "
+                "system has slow_time=True: call its method bind(system, epsilon)."
             )
         return self.function(self.epsilon * t0, self.epsilon * t1, q0, p0, q1, p1, args)
 
@@ -352,13 +340,18 @@ def at_end(hamiltonian: Callable[..., Any]) -> Callable[..., Any]:
 _THERMAL = Langevin(lambda args: args["friction"], lambda args: args["temperature"])
 
 
-def thermal(friction: float, temperature: float | None, **parameters: Parameter) -> dict[str, Any]:
-    """Parameters and noise of unit masses, both without noise if there is no temperature."""
+def thermal(
+    hamiltonian: Callable[..., Any],
+    friction: float,
+    temperature: float | None,
+    **parameters: Parameter,
+) -> tuple[System, dict[str, Parameter]]:
+    """A system of unit masses and its parameters, without noise if there is no temperature."""
     if temperature is None:
-        return {"parameters": parameters}
+        return System(hamiltonian), parameters
     parameters["friction"] = Parameter(friction, "rate of friction γ [1/time]")
     parameters["temperature"] = Parameter(temperature, "k_B T [energy]")
-    return {"parameters": parameters, "more": {"noise": _THERMAL}}
+    return System(hamiltonian, noise=_THERMAL), parameters
 
 
 @functools.cache

@@ -5,7 +5,7 @@ import numpy as np
 
 from ..discover.symmetries.library import rotation
 from . import _guiding_centre as guiding_centre
-from ._problem import Parameter, Problem, Start, gyrates, library_problem, positive
+from ._problem import Parameter, Problem, Start, library_problem, nonzero, positive
 
 
 def vector_potential(q, args):
@@ -60,7 +60,7 @@ def bounce_action(t0, t1, q0, p0, q1, p1, args):
 
 
 def dipole_field(radius: float = 50.0) -> Problem:
-    """A charged particle trapped in a dipole field: it gyrates, bounces and drifts in longitude.
+    """A charged particle trapped in a dipole field: it nonzero, bounces and drifts in longitude.
 
     Dimensionless: e = m = B0 = 1, so that gyrofrequency and gyroradius at the start are 1; it
     starts at the equator at r ≈ R with its velocity at 45° to the field.
@@ -87,7 +87,7 @@ def dipole_field(radius: float = 50.0) -> Problem:
         parameters={
             **guiding_centre.PARTICLE,
             "B0": Parameter(
-                1.0, "field at r = radius on the equator [mass/(charge time)]", gyrates
+                1.0, "field at r = radius on the equator [mass/(charge time)]", nonzero
             ),
             "radius": Parameter(radius, "R, where the field is B0 [length]"),
         },

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ._elliptic import first_kind, jacobi
-from ._problem import Parameter, Problem, Start, finite, library_problem, over_times
+from ._problem import Parameter, Problem, Start, System, finite, library_problem, over_times
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -34,22 +34,22 @@ def exact(t, q0, p0, args):
     E = jnp.where(E == 0, jnp.nan, E)
     # s² as a sum of squares: α² + 4βE cancels near the bottom of a well
     slope = alpha + beta * q0**2
-    over, root = E > 0, jnp.sqrt(slope**2 + 2 * beta * p0**2) + 0 * E
+    is_high, root = E > 0, jnp.sqrt(slope**2 + 2 * beta * p0**2) + 0 * E
     # 4E/(α + root) is (root − α)/β without its cancellation, for α > 0
     square = jnp.where(alpha > 0, 4 * E / (alpha + root), (root - alpha) / beta)
     A = jnp.sqrt(square)
-    rate = jnp.sqrt(jnp.where(over, root, beta * square / 2))
-    m = jnp.where(over, beta * square / (2 * root), 2 * root / (beta * square))
+    rate = jnp.sqrt(jnp.where(is_high, root, beta * square / 2))
+    m = jnp.where(is_high, beta * square / (2 * root), 2 * root / (beta * square))
     # cn = q/A and sn dn = −p/(Aλ)
     c = q0 / A
     cn_phase = jnp.arctan2(-p0 / (A * rate * jnp.sqrt(1 - m + m * c**2)), c)
     # dn = |q|/A and sn cn = ∓p/(Aλm), whose sine and cosine of twice the phase, times s
     sign = jnp.where(q0 < 0, -1.0, 1.0)
     dn_phase = jnp.arctan2(-sign * p0 * jnp.sqrt(2 * beta), slope) / 2
-    u = first_kind(jnp.where(over, cn_phase, dn_phase), m)
+    u = first_kind(jnp.where(is_high, cn_phase, dn_phase), m)
     sn, cn, dn, _ = jacobi(rate * t + u, m)
-    q = A * jnp.where(over, cn, sign * dn)
-    p = -A * rate * jnp.where(over, sn * dn, sign * m * sn * cn)
+    q = A * jnp.where(is_high, cn, sign * dn)
+    p = -A * rate * jnp.where(is_high, sn * dn, sign * m * sn * cn)
     return q, p
 
 
@@ -63,7 +63,7 @@ def duffing() -> Problem:
     *The Duffing Equation*.
     """
     return library_problem(
-        hamiltonian,
+        System(hamiltonian, friction_and_drive),
         Start("Duffing's oscillator has one degree of freedom", (1,)),
         name="duffing",
         q0=np.array([-1.2]),
@@ -78,7 +78,6 @@ def duffing() -> Problem:
             "gamma": Parameter(0.5, "amplitude of the drive at ε = 1 [length/time²]", finite),
             "omega": Parameter(1.2, "frequency of the drive [1/time]", finite),
         },
-        force=friction_and_drive,
         source="Guckenheimer & Holmes 1983, Nonlinear Oscillations, 2.2",
         exact=exact,
     )

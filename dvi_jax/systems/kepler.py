@@ -4,7 +4,7 @@ import jax.numpy as jnp
 
 from ..discover.symmetries.library import rotation, scaling
 from ..problem.kepler import change
-from ._problem import Parameter, Problem, Start, library_problem, over_times
+from ._problem import Parameter, Problem, Start, System, library_problem, over_times
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -41,7 +41,7 @@ def exact(t, q0, p0, args):
 def kepler() -> Problem:
     """The paper's Kepler problem with its initial conditions and h = 0.1; dimensionless, K = 1."""
     return library_problem(
-        hamiltonian,
+        System(hamiltonian, linear_force),
         Start(
             "the Kepler problem is in the plane (for more dimensions or bodies take n_body)",
             (2,),
@@ -54,7 +54,6 @@ def kepler() -> Problem:
         parameters={
             "K": Parameter(1.0, "root of the strength of attraction, K² = GM [length^(3/2)/time]")
         },
-        force=linear_force,
         observables=[mixed_energy, angular_momentum],
         source="the paper, Section 5.2",
         invariants=("angular_momentum",),

@@ -4,7 +4,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from ._elliptic import swing
-from ._problem import Adiabatic, Parameter, Problem, Start, at_end, between, library_problem
+from ._problem import (
+    Adiabatic,
+    Parameter,
+    Problem,
+    Start,
+    System,
+    at_end,
+    interval,
+    library_problem,
+)
 from .pendulum import exact as of_pendulum
 
 
@@ -42,8 +51,8 @@ def action(t0, t1, q0, p0, q1, p1, args):
 def small_swing_action(t0, t1, q0, p0, q1, p1, args):
     """(E + M g l)/√(g/l) at the end of the step: adiabatic for small amplitudes only."""
     string = length(t1, args)
-    above = energy(t0, t1, q0, p0, q1, p1, args) + args["mass"] * args["g"] * string
-    return above * jnp.sqrt(string / args["g"])
+    excess = energy(t0, t1, q0, p0, q1, p1, args) + args["mass"] * args["g"] * string
+    return excess * jnp.sqrt(string / args["g"])
 
 
 def exact(t, q0, p0, args):
@@ -64,7 +73,7 @@ def lorentz_pendulum() -> Problem:
     quanta*, p. 450); action: Landau & Lifshitz 1976, *Mechanics*, §49.
     """
     return library_problem(
-        hamiltonian,
+        System(hamiltonian, slow_time=True),
         Start("Lorentz's pendulum has one angle", (1,)),
         name="lorentz_pendulum",
         q0=np.array([1.0]),
@@ -74,9 +83,8 @@ def lorentz_pendulum() -> Problem:
             "mass": Parameter(1.0, "of the bob [kg]"),
             "g": Parameter(9.81, "gravity [m/s²]"),
             "length": Parameter(1.0, "mean length of the string [m]"),
-            "depth": Parameter(0.3, "relative change of the length [1]", between(-1, 1)),
+            "depth": Parameter(0.3, "relative change of the length [1]", interval(-1, 1)),
         },
-        slow_time=True,
         observables=[action, small_swing_action],
         units={"q": "rad", "p": "kg m²/s", "t": "s", "energy": "J"},
         source="Langevin & de Broglie 1912, La théorie du rayonnement et les quanta, p. 450",

@@ -36,8 +36,8 @@ def from_populations(x, y):
     x, y = np.asarray(x, float), np.asarray(y, float)
     for name, number in (("x of prey", x), ("y of predators", y)):
         if not (positive := number > 0).all():
-            seen = number[~positive][0]
-            raise ValueError(f"the population {name} must be positive, got {seen}.")
+            value = number[~positive][0]
+            raise ValueError(f"the population {name} must be positive, got {value}.")
     return np.log(x), np.log(y)
 
 

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 
 from ..discover.symmetries.library import rotation
 from . import _guiding_centre as guiding_centre
-from ._problem import Parameter, Problem, Start, at_end, finite, gyrates, library_problem, positive
+from ._problem import Parameter, Problem, Start, at_end, finite, library_problem, nonzero, positive
 
 
 def vector_potential(q, args):
@@ -90,7 +90,7 @@ def magnetic_mirror(length: float = 20.0, distance: float = 2.0) -> Problem:
         h=0.1,
         parameters={
             **guiding_centre.PARTICLE,
-            "B0": Parameter(1.0, "field in the middle [mass/(charge time)]", gyrates),
+            "B0": Parameter(1.0, "field in the middle [mass/(charge time)]", nonzero),
             "length": Parameter(length, "ℓ, over which it doubles along the axis [length]"),
         },
         observables=[canonical_angular_momentum, magnetic_moment, corrected_moment, bounce_action],

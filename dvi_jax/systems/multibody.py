@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..base.checks import whole
-from ._problem import Parameter, Problem, Start, finite, library_problem, over_times
+from ._problem import Parameter, Problem, Start, System, finite, library_problem, over_times
 from .spinning_top import exact as exact_of_top
 
 _SI = {"q": "m", "p": "kg m/s", "t": "s", "energy": "J"}
@@ -58,12 +58,13 @@ def spherical_pendulum() -> Problem:
     **Source** Whittaker 1937, *Analytical Dynamics*, §55; Hairer, Lubich & Wanner 2006, VII.1.
     """
     return library_problem(
-        _weights, Start("the spherical pendulum is a point in space", (3,)),
+        System(_weights, constraint=_links),
+        Start("the spherical pendulum is a point in space", (3,)),
         {"m": Parameter(1.0, "mass [kg]"), "l": Parameter(1.0, "length of the rod [m]"),
          "g": _GRAVITY},
         [vertical_momentum], name="spherical_pendulum", invariants=("vertical_momentum",),
         q0=np.array([0.8, 0.0, -0.6]), p0=np.array([0.3, 1.0, 0.4]), h=0.01, units=_SI,
-        more={"constraint": _links}, exact=_exact_on_sphere,
+        exact=_exact_on_sphere,
         source="Whittaker 1937, Analytical Dynamics, §55",
     )  # fmt: skip
 
@@ -77,14 +78,14 @@ def chain(links: int = 20) -> Problem:
 
     **Source** Leimkuhler & Reich 2004, *Simulating Hamiltonian Dynamics*, 7.
     """
-    along = 0.1 * np.arange(1, whole("links", links) + 1)[:, None]
+    distances = 0.1 * np.arange(1, whole("links", links) + 1)[:, None]
     return library_problem(
-        _weights, Start("the chain has positions of n masses", (None, None)),
+        System(_weights, constraint=_links),
+        Start("the chain has positions of n masses", (None, None)),
         {"m": Parameter(1.0, "mass of each link [kg]"),
          "l": Parameter(0.1, "length of each link [m]"), "g": _GRAVITY},
-        name="chain", q0=along * np.array([np.sin(0.4), -np.cos(0.4)]), p0=np.zeros((links, 2)),
+        name="chain", q0=distances * np.array([np.sin(0.4), -np.cos(0.4)]), p0=np.zeros((links, 2)),
         h=0.002, units=_SI, source="Leimkuhler & Reich 2004, Simulating Hamiltonian Dynamics, 7",
-        more={"constraint": _links},
     )  # fmt: skip
 
 
@@ -124,16 +125,16 @@ def slider_crank() -> Problem:
         "l2": Parameter(0.8, "length of the connecting rod [m]"),
         "g": _GRAVITY,
     }
-    args = {name: one.value for name, one in parameters.items()}
+    args = {name: entry.value for name, entry in parameters.items()}
     (a, b, c), l1 = _inertia(args), args["l1"]
     x, y, rate = l1 / 2, l1 * np.sqrt(3) / 2, 5.0
     reach = np.sqrt(args["l2"] ** 2 - y**2)
     A, B = rate * np.array([[-y, x], [-y - x * y / reach, 0.0]])  # velocities
     return library_problem(
-        _crank_energy, Start("the slider-crank has positions (A, B) in the plane", (2, 2)),
+        System(_crank_energy, constraint=_rods_and_rail),
+        Start("the slider-crank has positions (A, B) in the plane", (2, 2)),
         parameters, name="slider_crank", q0=np.array([[x, y], [x + reach, 0.0]]),
         p0=np.array([a * A + b * B, b * A + c * B]), h=0.002, units=_SI,
-        more={"constraint": _rods_and_rail},
         source="García de Jalón & Bayo 1994, Kinematic and Dynamic Simulation, 2 and 4",
     )  # fmt: skip
 
@@ -167,12 +168,13 @@ def dumbbell() -> Problem:
     sides = np.array([[-1 / 3], [2 / 3]])  # of the centre of mass, as parts of the rod
     turning = np.array([0.0, 1.05, 0.1]) + sides * np.array([-0.12 * s, 0.12 * c, 0.06])
     return library_problem(
-        _dumbbell_energy, Start("the dumbbell has positions of two masses in space", (2, 3)),
+        System(_dumbbell_energy, constraint=_rod),
+        Start("the dumbbell has positions of two masses in space", (2, 3)),
         {"m1": Parameter(1.0, "first mass [mass]"), "m2": Parameter(0.5, "second mass [mass]"),
          "l": Parameter(0.1, "length of the rod [length]"),
          "mu": Parameter(1.0, "strength of the centre [length³/time²]")},
         [angular_momentum], name="dumbbell", invariants=("angular_momentum",),
         q0=np.array([1.0, 0.0, 0.0]) + sides * np.array([0.1 * c, 0.1 * s, 0.0]),
-        p0=np.array([[1.0], [0.5]]) * turning, h=0.02, more={"constraint": _rod},
+        p0=np.array([[1.0], [0.5]]) * turning, h=0.02,
         source="Celletti & Sidorenko 2008, Celest. Mech. Dyn. Astr. 101, 105",
     )  # fmt: skip

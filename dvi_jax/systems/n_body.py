@@ -6,6 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from ..base.checks import array, require
 from ..discover.functions.generators import Generator
 from ..discover.symmetries.library import rotation, scaling, space_translation, time_translation
 from ..problem.system import System
@@ -48,24 +49,20 @@ def energy_of(q0, p1, args, softening=None):
     kinetic = jnp.sum(jnp.sum(p1**2, axis=-1) / masses) / 2
     # Every pair twice, and a body with itself at distance 1 but with weight 0: dense arrays
     # that one kernel can run through, where a list of pairs would gather and scatter.
-    itself = jnp.eye(masses.shape[0], dtype=bool)
+    diagonal = jnp.eye(masses.shape[0], dtype=bool)
     difference = q0[:, None, :] - q0[None, :, :]
     square = jnp.sum(difference**2, axis=-1)
     square = square if softening is None else square + softening**2
-    distance = jnp.sqrt(jnp.where(itself, 1.0, square))
-    weight = jnp.where(itself, 0.0, masses[:, None] * masses[None, :])
+    distance = jnp.sqrt(jnp.where(diagonal, 1.0, square))
+    weight = jnp.where(diagonal, 0.0, masses[:, None] * masses[None, :])
     return kinetic - args.get("G", 1.0) * jnp.sum(weight / distance) / 2
 
 
 def masses_of(q, args):
     """The masses as an array. **Raises** `ValueError` where q has not as many bodies."""
     masses = jnp.asarray(args["masses"], q.dtype)
-    if q.ndim != 2 or masses.shape != q.shape[:1]:
-        raise ValueError(
-            "the N-body system needs positions of shape (bodies, dim) and masses of shape (bodies,)"
-            f", got positions of shape {q.shape} and masses of shape {masses.shape}."
-        )
-    return masses
+    array("positions", q, ("bodies", "dim"), integers=True, empty=True)
+    return array("masses", masses, q.shape[:1], integers=True)
 
 
 energy = at_end(hamiltonian)
@@ -119,23 +116,19 @@ def check_bodies(q0: Any, p0: Any, args: Any, names: Sequence[str] | None = None
     masses = np.asarray(parameter(args, "masses"), float)
     if "G" in args:
         check_parameter(args, "G", finite)
-    wanted = "q0 and p0 of N bodies must both have shape (bodies, 2) or (bodies, 3)"
-    check_shape(q, p, lambda shape: len(shape) == 2 and shape[1] in (2, 3), wanted)
-    if masses.shape != q.shape[:1]:
-        raise ValueError(
-            f"masses must have one number for each body in q0, shape {q.shape[:1]}, got shape "
-            f"{masses.shape}."
-        )
+    rule = "q0 and p0 of N bodies must both have shape (bodies, 2) or (bodies, 3)"
+    check_shape(q, p, lambda shape: len(shape) == 2 and shape[1] in (2, 3), rule)
+    array("masses", masses, q.shape[:1], integers=True)
 
-    def called(i: int) -> str:
+    def label(i: int) -> str:
         return names[i] if names is not None and len(names) == len(masses) else f"body {i}"
 
     bad = ~(np.isfinite(masses) & (masses > 0))
     if bad.any():
         i = int(np.argmax(bad))
         raise ValueError(
-            f"the mass of {called(i)} is {masses[i]}: every mass must be positive and finite. For "
-            "a test particle give a very small mass, such as 1e-20 of the largest."
+            f"the mass of {label(i)} must be positive and finite, got {masses[i]}. For a test "
+            "particle give a very small one."
         )
     separation = np.linalg.norm(q[:, None, :] - q[None, :, :], axis=-1)
     size = np.linalg.norm(q, axis=-1)
@@ -144,8 +137,8 @@ def check_bodies(q0: Any, p0: Any, args: Any, names: Sequence[str] | None = None
     if i.size:
         a, b = int(i[0]), int(j[0])
         raise ValueError(
-            f"{called(a)} and {called(b)} are at the same position {q[a].tolist()} up to "
-            "rounding: their attraction would be infinite. Give them different positions."
+            f"{label(a)} and {label(b)} must have different positions, got {q[a].tolist()} for "
+            "both, up to rounding."
         )
 
 
@@ -156,13 +149,13 @@ INVARIANTS = tuple(OBSERVABLES)
 def symmetries(dim: int) -> dict[str, Generator]:
     """Galilean symmetries in `dim` dimensions, and the scaling of Kepler's third law."""
     axes = "xyz"[:dim]
-    found = {"time": time_translation(), "scaling": scaling(q=1.0, p=-0.5, t=1.5)}
+    generators = {"time": time_translation(), "scaling": scaling(q=1.0, p=-0.5, t=1.5)}
     for i, x in enumerate(axes):
-        found[f"translation_{x}"] = space_translation(np.eye(dim)[i])
-        found[f"boost_{x}"] = _boost(np.eye(dim)[i])
+        generators[f"translation_{x}"] = space_translation(np.eye(dim)[i])
+        generators[f"boost_{x}"] = _boost(np.eye(dim)[i])
         for j in range(i + 1, dim):
-            found[f"rotation_{x}{axes[j]}"] = rotation(i, j)
-    return found
+            generators[f"rotation_{x}{axes[j]}"] = rotation(i, j)
+    return generators
 
 
 def _boost(direction):
@@ -192,11 +185,8 @@ def n_body(
     """
     if masses is None and q0 is None and p0 is None:
         masses, q0, p0 = np.ones(3), EIGHT_POSITIONS, EIGHT_MOMENTA
-    given = {"masses": masses, "q0": q0, "p0": p0}
-    if missing := [name for name, x in given.items() if x is None]:
-        raise TypeError(
-            "give all of masses, q0 and p0, or none of them. Missing: " + ", ".join(missing) + "."
-        )
+    hint = "Give all of masses, q0 and p0, or none."
+    require("n_body", {"masses": masses, "q0": q0, "p0": p0}, hint=hint)
     args = {"masses": np.asarray(masses, float), "G": finite("G", G)}
     check_bodies(q0, p0, args)
     return Problem(

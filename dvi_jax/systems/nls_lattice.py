@@ -70,7 +70,7 @@ def nls_lattice(n: int = 8) -> Problem:
     q0, p0 = size * np.cos(phase), size * np.sin(phase)
     return library_problem(
         hamiltonian,
-        Start("the lattice is a ring of at least three sites", (None,), least=3),
+        Start("the lattice is a ring of at least three sites", (None,), smallest=3),
         name="nls_lattice",
         q0=q0,
         p0=p0,

@@ -50,8 +50,8 @@ def elements(q, p, mu, xp: Any = jnp):
     a = 1 / (2 / length(q) - xp.sum(p**2, axis=-1) / mu)
     node = xp.arctan2(L[..., 0], -L[..., 1])
     to_node = xp.stack([xp.cos(node), xp.sin(node), xp.zeros_like(node)], axis=-1)
-    across = xp.sum(xp.cross(to_node, e) * L, axis=-1) / length(L)
-    perigee = xp.arctan2(across, xp.sum(to_node * e, axis=-1))
+    sine = xp.sum(xp.cross(to_node, e) * L, axis=-1) / length(L)
+    perigee = xp.arctan2(sine, xp.sum(to_node * e, axis=-1))
     return xp.stack([a, length(e), xp.arccos(L[..., 2] / length(L)), node, perigee], axis=-1)
 
 
@@ -75,11 +75,9 @@ def secular_rates(a, e, i, args):
     return -1.5 * size * jnp.cos(i), 0.75 * size * (5 * jnp.cos(i) ** 2 - 1)
 
 
-def _outside(q, p, args):
+def _above_surface(q, p, args):
     if (r := float(np.linalg.norm(q))) < args["R"]:
-        raise ValueError(
-            f"|q0| must be at least R = {args['R']}, got {r}. This point is inside the planet."
-        )
+        raise ValueError(f"|q0| must be at least R = {args['R']}, of the planet, got {r}.")
 
 
 def oblate_kepler() -> Problem:
@@ -95,7 +93,7 @@ def oblate_kepler() -> Problem:
     speed = np.sqrt(mu / a * (1 + e) / (1 - e))
     return library_problem(
         hamiltonian,
-        Start("the satellite is one body in space", (3,), also=_outside),
+        Start("the satellite is one body in space", (3,), check=_above_surface),
         name="oblate_kepler",
         q0=np.array([a * (1 - e), 0.0, 0.0]),
         p0=speed * np.array([0.0, np.cos(i), np.sin(i)]),

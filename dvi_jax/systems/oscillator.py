@@ -4,7 +4,7 @@ import jax.numpy as jnp
 
 from ..discover.functions.generators import Generator
 from ..discover.symmetries.library import scaling
-from ._problem import Problem, Start, at_end, library_problem, over_times
+from ._problem import Problem, Start, System, at_end, library_problem, over_times
 
 PHASE = Generator(xi=lambda t, q, p, args: p, eta=lambda t, q, p, args: -q)
 """The rotation of the phase plane, ξ = p, η = −q: the flow of the oscillator."""
@@ -46,13 +46,12 @@ def exact(t, q0, p0, args):
 def oscillator() -> Problem:
     """The paper's oscillator from q = p = 0.01 with h = 0.1; dimensionless."""
     return library_problem(
-        hamiltonian,
+        System(hamiltonian, linear_force),
         Start("the oscillator can have any dimension", None),
         name="oscillator",
         q0=[0.01],
         p0=[0.01],
         h=0.1,
-        force=linear_force,
         observables=[mixed_energy, map_invariant],
         units={"q": "1", "p": "1", "t": "1/ω", "energy": "1"},
         source="the paper, Section 5.1",

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ._elliptic import complete, first_kind, jacobi, swing
-from ._problem import Parameter, Problem, Start, library_problem, over_times
+from ._problem import Parameter, Problem, Start, System, library_problem, over_times
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -34,8 +34,8 @@ def period(q, p, args):
     """Period: 4K(m)/ω of a libration, 2K(1/m)/(√m ω) of a rotation, infinite at m = 1."""
     m = modulus(q, p, args)
     swings = m < 1
-    k, over = jnp.where(swings, m, 0.5), jnp.where(swings, 2.0, m)
-    libration, rotation = 4 * complete(k)[0], 2 * complete(1 / over)[0] / jnp.sqrt(over)
+    k, large = jnp.where(swings, m, 0.5), jnp.where(swings, 2.0, m)
+    libration, rotation = 4 * complete(k)[0], 2 * complete(1 / large)[0] / jnp.sqrt(large)
     return jnp.where(swings, libration, rotation) / args["omega"]
 
 
@@ -62,9 +62,9 @@ def exact(t, q0, p0, args):
     q_swing = turns + 2 * jnp.arctan2(sine, cosine)
     p_swing = 2 * w * (cn * P - sn * dn * S * D) / (cn**2 + (sn * D) ** 2)
     # Rotation. Each branch has a valid modulus also where the other applies: no NaN in gradients.
-    over, sign = jnp.where(swings, 2.0, m), jnp.where(p0 < 0, -1.0, 1.0)
-    root = jnp.sqrt(over)
-    _, _, dn, am = jacobi(root * w * t + first_kind(sign * q0 / 2, 1 / over), 1 / over)
+    large, sign = jnp.where(swings, 2.0, m), jnp.where(p0 < 0, -1.0, 1.0)
+    root = jnp.sqrt(large)
+    _, _, dn, am = jacobi(root * w * t + first_kind(sign * q0 / 2, 1 / large), 1 / large)
     q, p = (
         jnp.where(swings, q_swing, 2 * sign * am),
         jnp.where(swings, p_swing, 2 * sign * w * root * dn),
@@ -82,14 +82,13 @@ def pendulum() -> Problem:
     Bodies*, §44.
     """
     return library_problem(
-        hamiltonian,
+        System(hamiltonian, friction),
         Start("the pendulum has one angle", (1,)),
         name="pendulum",
         q0=np.array([1.5]),
         p0=np.array([1.0]),
         h=0.1,
         parameters={"omega": Parameter(1.0, "frequency of small oscillations [1/time]")},
-        force=friction,
         observables=[action],
         units={"q": "rad", "p": "1", "t": "1", "energy": "1"},
         source="Whittaker 1937, Analytical Dynamics, §44",

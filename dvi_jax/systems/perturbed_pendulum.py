@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from ._problem import Problem, Start, library_problem
+from ._problem import Problem, Start, System, library_problem
 from .pendulum import exact as of_pendulum
 
 
@@ -30,13 +30,12 @@ def perturbed_pendulum() -> Problem:
     **Source** the pendulum: any text.
     """
     return library_problem(
-        hamiltonian,
+        System(hamiltonian, perturbation=coupling),
         Start("the perturbed pendulum has one angle", (1,)),
         name="perturbed_pendulum",
         q0=[0.5],
         p0=[0.3],
         h=0.1,
-        perturbation=coupling,
         source="our own choice",
         exact=exact,
     )

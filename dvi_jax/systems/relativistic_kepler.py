@@ -58,9 +58,8 @@ def _misses_the_centre(q, p, args):
     L = q[0] * p[1] - q[1] * p[0]
     if abs(L) * args["c"] <= args["K"] ** 2:
         raise ValueError(
-            f"the angular momentum must satisfy |L| > K²/c = {args['K'] ** 2 / args['c']}, got "
-            f"L = {L} from q0 and p0: the orbit falls into the centre. Give other q0 and p0, or a "
-            "larger c."
+            f"the angular momentum of q0 and p0 must satisfy |L| > K²/c = "
+            f"{args['K'] ** 2 / args['c']}, got L = {L}: the orbit falls into the centre."
         )
 
 
@@ -78,7 +77,7 @@ def relativistic_kepler() -> Problem:
             "the relativistic Kepler problem is in the plane",
             (2,),
             singular={"the centre": (0, 0)},
-            also=_misses_the_centre,
+            check=_misses_the_centre,
         ),
         name="relativistic_kepler",
         q0=np.array([0.6, 0.0]),

@@ -13,8 +13,8 @@ EARTH_MOON = 0.012150585
 def potential(q, mu):
     """−(1 − μ)/r1 − μ/r2 with the large body at (−μ, 0, 0), the small one at (1 − μ, 0, 0)."""
     x, y, z = q
-    across = y**2 + z**2
-    r1, r2 = jnp.sqrt((x + mu) ** 2 + across), jnp.sqrt((x - 1 + mu) ** 2 + across)
+    square = y**2 + z**2
+    r1, r2 = jnp.sqrt((x + mu) ** 2 + square), jnp.sqrt((x - 1 + mu) ** 2 + square)
     return -(1 - mu) / r1 - mu / r2
 
 
@@ -47,10 +47,7 @@ def momentum(q, v):
 
 def _mass_fraction(name, mu):
     if not 0 < finite(name, mu) <= 0.5:
-        raise ValueError(
-            f"{name} must satisfy 0 < mu ≤ 1/2, got {mu}. It is the mass of the smaller body "
-            "divided by the total mass."
-        )
+        raise ValueError(f"{name} must satisfy 0 < mu ≤ 1/2, got {mu}.")
 
 
 def lagrange_points(mu):

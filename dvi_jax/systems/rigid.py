@@ -57,9 +57,9 @@ def rotation(phi: Any, theta: Any, psi: Any) -> Array:
 
 def euler_angles(R: Array) -> Array:
     """Euler's angles (φ, θ, ψ) [rad] of a rotation matrix; φ and ψ jump where θ is 0 or π."""
-    across = jnp.sqrt(R[2, 0] ** 2 + R[2, 1] ** 2)
+    sine = jnp.sqrt(R[2, 0] ** 2 + R[2, 1] ** 2)
     phi, psi = jnp.arctan2(R[0, 2], -R[1, 2]), jnp.arctan2(R[2, 0], R[2, 1])
-    return jnp.stack([phi, jnp.arctan2(across, R[2, 2]), psi])
+    return jnp.stack([phi, jnp.arctan2(sine, R[2, 2]), psi])
 
 
 @partial(jnp.vectorize, signature="(n,n)->(m)")

@@ -34,8 +34,8 @@ def hamiltonian(t0, t1, q0, p1, args):
 
 def body_momentum(q, p):
     """Angular momentum on the principal axes of the body: shape (3,)."""
-    across = jnp.sqrt(p[1] ** 2 - p[0] ** 2)
-    return jnp.stack([across * jnp.sin(q[0]), across * jnp.cos(q[0]), p[0]])
+    transverse = jnp.sqrt(p[1] ** 2 - p[0] ** 2)
+    return jnp.stack([transverse * jnp.sin(q[0]), transverse * jnp.cos(q[0]), p[0]])
 
 
 def orientation(q, p):
@@ -45,15 +45,15 @@ def orientation(q, p):
     """
     (body, spin, node), (L, G, K) = q, p
 
-    one, zero = jnp.ones_like(G), jnp.zeros_like(G)
+    ones, zeros = jnp.ones_like(G), jnp.zeros_like(G)
 
     def about_z(angle):
         c, s = jnp.cos(angle), jnp.sin(angle)
-        return jnp.stack([c, -s, zero, s, c, zero, zero, zero, one]).reshape(3, 3)
+        return jnp.stack([c, -s, zeros, s, c, zeros, zeros, zeros, ones]).reshape(3, 3)
 
     def about_x(c):
         s = jnp.sqrt(1 - c**2)
-        return jnp.stack([one, zero, zero, zero, c, -s, zero, s, c]).reshape(3, 3)
+        return jnp.stack([ones, zeros, zeros, zeros, c, -s, zeros, s, c]).reshape(3, 3)
 
     return about_z(node) @ about_x(K / G) @ about_z(spin) @ about_x(L / G) @ about_z(body)
 
@@ -100,8 +100,8 @@ def exact(t, q0, p0, args):
 
     sn, cn, dn, end = jacobi(rate * t + start, m)
     begin = jacobi(start, m)[3]
-    one, two, three = sign * a * cn, b * sn, c * dn
-    M1, M3 = jnp.where(about_third, one, three), jnp.where(about_third, three, one)
+    along_a, along_b, along_c = sign * a * cn, b * sn, c * dn
+    M1, M3 = jnp.where(about_third, along_a, along_c), jnp.where(about_third, along_c, along_a)
 
     def body_angle(am, M1, M2):
         """l without jumps: it increases with am for rotations about the third axis only."""
@@ -114,7 +114,7 @@ def exact(t, q0, p0, args):
     complement = jnp.where(about_third, middle * wide / (first * low), G2 / c**2)
     time = (third_kind(end, complement, m) - third_kind(begin, complement, m)) / rate
     g = q0[1] + p0[1] * (t / I[2] + (1 / I[0] - 1 / I[2]) * time)
-    angle = body_angle(end, M1, two) + turns
+    angle = body_angle(end, M1, along_b) + turns
     q, p = jnp.stack([angle, g, q0[2]]), jnp.stack([M3, p0[1], p0[2]])
     return q + 0 * m, p + 0 * m  # NaN in all components if in one
 
@@ -123,15 +123,13 @@ def _possible(q, p, args):
     moments = [args["I1"], args["I2"], args["I3"]]
     if 2 * max(moments) > sum(moments):
         raise ValueError(
-            "each moment of inertia must be at most the sum of the other two, got "
-            "I1 = {}, I2 = {}, I3 = {}.".format(*moments)
+            f"I1, I2 and I3 must each be at most the sum of the other two, got {moments}."
         )
     L, G, K = p
     if not (abs(L) < G and abs(K) <= G):
         raise ValueError(
-            f"p0 = (L, G, K) must satisfy |L| < G and |K| ≤ G, got L = {L}, G = {G}, K = {K}. G is "
-            "the magnitude of the angular momentum. L is its component along the third axis of the "
-            "body, and K along the fixed z axis."
+            f"p0 = (L, G, K) must satisfy |L| < G and |K| ≤ G, got {p.tolist()}. G is the magnitude"
+            " of the angular momentum, L and K are components."
         )
 
 
@@ -145,7 +143,7 @@ def rigid_body() -> Problem:
     """
     return library_problem(
         hamiltonian,
-        Start("the rigid body has angles (l, g, k) and momenta (L, G, K)", (3,), also=_possible),
+        Start("the rigid body has angles (l, g, k) and momenta (L, G, K)", (3,), check=_possible),
         name="rigid_body",
         q0=np.array([0.1, 0.0, 0.4]),
         p0=np.array([0.1, 1.0, 0.6]),

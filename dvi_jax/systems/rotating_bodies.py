@@ -7,7 +7,7 @@ import numpy as np
 
 from ..base.checks import one_of
 from . import rigid
-from ._problem import Parameter, Problem, Start, library_problem, over_times, vector
+from ._problem import Parameter, Problem, Start, System, library_problem, over_times, vector
 from .spinning_top import exact as exact_of_top
 
 
@@ -15,12 +15,12 @@ def _moments(name, value):
     vector(3)(name, value)
     if not 2 * np.max(value) < np.sum(value) or np.min(value) <= 0:
         raise ValueError(
-            f"{name} must be three positive moments of inertia, each smaller than the sum of the "
-            f"other two, got {value}."
+            f"{name} must be three positive moments, each smaller than the sum of the others, got "
+            f"{value}."
         )
 
 
-def _body(name, energy, parameters, state, observables, source, **known) -> Problem:
+def _body(name, energy, parameters, state, observables, source, **properties) -> Problem:
     """The problem of a rotation matrix; `state`: Euler's angles, π on the body's axes, and h."""
     angles, pi, h = state
     # As `rigid.rotation` and `rigid.momentum`, but in NumPy: making a problem starts no device.
@@ -30,8 +30,9 @@ def _body(name, energy, parameters, state, observables, source, **known) -> Prob
                    [y * z, y * c, b]])  # fmt: skip
     p0 = q0 @ np.cross(np.eye(3), pi / I) * (np.sum(I) / 2 - I)
     start = Start(f"the {name.replace('_', ' ')} has a rotation matrix", (3, 3))
-    known |= {"name": name, "q0": q0, "p0": p0, "h": h, "more": {"constraint": rigid.orthonormal}}
-    return library_problem(energy, start, parameters, observables, source=source, **known)
+    properties |= {"name": name, "q0": q0, "p0": p0, "h": h, "source": source}
+    system = System(energy, constraint=rigid.orthonormal)
+    return library_problem(system, start, parameters, observables, **properties)
 
 
 def _top_energy(t0, t1, q0, p1, args):
@@ -73,8 +74,8 @@ def _exact_top(t, q0, p0, args):
     (phi, theta, psi), (p_phi, p_theta, p_psi) = exact_of_top(t, angles, momenta, top)
     pi = jnp.stack([p_theta, (p_phi - p_psi * jnp.cos(theta)) / jnp.sin(theta), p_psi])
     R = rigid.rotation(phi, theta, psi)
-    one = jnp.where((I[0] == I[1]) & jnp.all(c[:2] == 0), 1.0, jnp.nan)
-    return R * one, rigid.momentum(R, pi @ rigid.rotation(psi, 0.0, 0.0), I) * one
+    mask = jnp.where((I[0] == I[1]) & jnp.all(c[:2] == 0), 1.0, jnp.nan)
+    return R * mask, rigid.momentum(R, pi @ rigid.rotation(psi, 0.0, 0.0), I) * mask
 
 
 def heavy_top(kind: Literal["lagrange", "kovalevskaya"] = "lagrange") -> Problem:

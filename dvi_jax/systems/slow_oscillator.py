@@ -4,7 +4,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..discover.symmetries.library import scaling
-from ._problem import Adiabatic, Parameter, Problem, Start, at_end, between, library_problem
+from ._problem import (
+    Adiabatic,
+    Parameter,
+    Problem,
+    Start,
+    System,
+    at_end,
+    interval,
+    library_problem,
+)
 from .oscillator import exact as of_oscillator
 
 
@@ -41,16 +50,15 @@ def slow_oscillator() -> Problem:
     Classical Mechanics*, §52.
     """
     return library_problem(
-        hamiltonian,
+        System(hamiltonian, slow_time=True),
         Start("the slow oscillator has one degree of freedom", (1,)),
         name="slow_oscillator",
         q0=np.array([0.4]),
         p0=np.array([0.3]),
         h=0.1,
         parameters={
-            "depth": Parameter(0.3, "relative change of the frequency [1]", between(-1, 1))
+            "depth": Parameter(0.3, "relative change of the frequency [1]", interval(-1, 1))
         },
-        slow_time=True,
         observables=[action],
         source="Ehrenfest 1916, Ann. Phys. 356, 327; Arnold 1989, §52",
         invariants=("action",),

@@ -5,7 +5,7 @@ import numpy as np
 
 from ..discover.symmetries.library import space_translation
 from ._elliptic import first_kind, jacobi, third_kind
-from ._problem import Parameter, Problem, Start, library_problem, over_times
+from ._problem import Parameter, Problem, Start, interval, library_problem, over_times
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -71,7 +71,7 @@ def _turning_points(E, p_phi, p_psi, args):
     def root(turns):  # ascending for 0 ≤ angle ≤ π and turns 0, −2, 2
         return -2 * jnp.sqrt(Q) * jnp.cos((angle + turns * jnp.pi) / 3) - a / 3
 
-    def polished(x, sign):
+    def polish(x, sign):
         """A root x = 1 + sign u: the same cubic in x, times A²."""
         P, free = p_phi + sign * p_psi, E + sign * w
         cubic = (
@@ -87,7 +87,7 @@ def _turning_points(E, p_phi, p_psi, args):
             x = x - value / slope
         return x
 
-    return polished(1 + root(0), 1), polished(1 - root(-2), -1), polished(1 + root(2), 1)
+    return polish(1 + root(0), 1), polish(1 - root(-2), -1), polish(1 + root(2), 1)
 
 
 @over_times((3,))
@@ -108,14 +108,14 @@ def exact(t, q0, p0, args):
     """
     A, C, w = (jnp.asarray(args[name], p0.dtype) for name in ("A", "C", "w"))
     p_phi, p_psi = p0[0], p0[2]
-    above, below = p_phi - p_psi, p_phi + p_psi  # p_φ − p_ψ cos θ at θ = 0 and π
+    minus, plus = p_phi - p_psi, p_phi + p_psi  # p_φ − p_ψ cos θ at θ = 0 and π
     s2, c2 = jnp.sin(q0[1] / 2) ** 2, jnp.cos(q0[1] / 2) ** 2
-    leaning = (above + 2 * p_psi * s2) ** 2 / (8 * A * s2 * c2)
+    leaning = (minus + 2 * p_psi * s2) ** 2 / (8 * A * s2 * c2)
     E = p0[1] ** 2 / (2 * A) + leaning + w * (c2 - s2)
     x1, v2, x3 = _turning_points(E, p_phi, p_psi, {"A": A, "w": w})  # 1 + u1, 1 − u2, 1 + u3
     x2, v1, spread = 2 - v2, 2 - x1, 2 - x1 - v2
-    through = ((above == 0) & (w <= E)) | (below == 0)
-    spread = jnp.where((spread > 0) & ~through, spread, jnp.nan)
+    is_vertical = ((minus == 0) & (w <= E)) | (plus == 0)
+    spread = jnp.where((spread > 0) & ~is_vertical, spread, jnp.nan)
     rate, m = jnp.sqrt(w * (x3 - x1) / (2 * A)), spread / (x3 - x1)
     # sn² and sn cn at t = 0 give sine and cosine of twice the phase
     sn2, cn2 = (2 * c2 - x1) / spread, (2 * s2 - v2) / spread
@@ -125,14 +125,14 @@ def exact(t, q0, p0, args):
     sn, cn, dn, end = jacobi(rate * t + start, m)
     begin = jacobi(start, m)[3]
 
-    def turned(P, base, complement):
+    def integral(P, base, complement):
         """∫ P/2A over 1 ± u, which is base (1 − n sn²)."""
-        passed = third_kind(end, complement, m) - third_kind(begin, complement, m)
-        return P / (2 * A * base * rate) * passed
+        difference = third_kind(end, complement, m) - third_kind(begin, complement, m)
+        return P / (2 * A * base * rate) * difference
 
-    up, down = turned(above, v1, v2 / v1), turned(below, x1, x2 / x1)
-    phi = q0[0] + down + up
-    psi = q0[2] + (1 / C - 1 / A) * p_psi * t + down - up
+    minus_angle, plus_angle = integral(minus, v1, v2 / v1), integral(plus, x1, x2 / x1)
+    phi = q0[0] + plus_angle + minus_angle
+    psi = q0[2] + (1 / C - 1 / A) * p_psi * t + plus_angle - minus_angle
     # 1 − u and 1 + u, each without cancellation
     from_top, from_bottom = v2 + spread * cn**2, x1 + spread * sn**2
     theta = 2 * jnp.arctan2(jnp.sqrt(from_top), jnp.sqrt(from_bottom))
@@ -143,10 +143,7 @@ def exact(t, q0, p0, args):
 
 
 def _leans(q, p, args):
-    if not 0 < q[1] < np.pi:
-        raise ValueError(
-            f"θ = q0[1] must satisfy 0 < θ < π, got {q[1]}. Euler's angles are singular at 0 and π."
-        )
+    interval(0.0, np.pi)("q0[1], the angle θ,", q[1])  # Euler's angles are singular at 0 and π
 
 
 def spinning_top() -> Problem:
@@ -159,7 +156,7 @@ def spinning_top() -> Problem:
     """
     return library_problem(
         hamiltonian,
-        Start("the top has Euler's angles (φ, θ, ψ)", (3,), also=_leans),
+        Start("the top has Euler's angles (φ, θ, ψ)", (3,), check=_leans),
         name="spinning_top",
         q0=np.array([0.0, 0.6, 0.0]),
         p0=np.array([2.4, 0.1, 2.5]),

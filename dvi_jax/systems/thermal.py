@@ -24,16 +24,17 @@ def double_well(temperature: float | None = None, friction: float = 1.0) -> Prob
     **Source** Kramers 1940, *Physica* 7, 284; Leimkuhler & Matthews 2015, *Molecular Dynamics*, 7.
     """
     barrier = Parameter(1.0, "height of the barrier between the wells [energy]")
+    system, parameters = thermal(well, friction, temperature, barrier=barrier)
     return library_problem(
-        well,
+        system,
         Start("the particle in a double well has one degree of freedom", (1,)),
+        parameters,
         name="double_well",
         q0=np.array([1.2]),
         p0=np.array([0.2]),
         h=0.1,
         observables=[configurational(well)],
         source="Kramers 1940, Physica 7, 284",
-        **thermal(friction, temperature, barrier=barrier),
     )
 
 
@@ -65,14 +66,15 @@ def thermal_chain(n: int = 10, temperature: float | None = None, friction: float
     """
     n = whole("n", n, hint="The thermal chain is a row of particles.")
     beta = Parameter(1.0, "quartic part of a spring [energy/length⁴]")
+    system, parameters = thermal(chain, friction, temperature, beta=beta)
     return library_problem(
-        chain,
+        system,
         Start("the thermal chain is a row of particles", (None,)),
+        parameters,
         name="thermal_chain",
         q0=np.linspace(0.0, 0.5, n),
         p0=np.linspace(0.3, -0.3, n),
         h=0.1,
         observables=[bonds, configurational(chain)],
         source="Lepri, Livi & Politi 2003, Phys. Rep. 377, 1",
-        **thermal(friction, temperature, beta=beta),
     )

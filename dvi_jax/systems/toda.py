@@ -25,8 +25,8 @@ def lax_matrix(q, p):
     **Source** Flaschka 1974, *Phys. Rev. B* 9, 1924; Hairer, Lubich & Wanner 2006, X.1.3.
     """
     n = q.shape[0]
-    a, after = jnp.exp((q - jnp.roll(q, -1)) / 2) / 2, (np.arange(n) + 1) % n
-    upper = jnp.zeros((n, n), q.dtype).at[np.arange(n), after].set(a)
+    a, neighbour = jnp.exp((q - jnp.roll(q, -1)) / 2) / 2, (np.arange(n) + 1) % n
+    upper = jnp.zeros((n, n), q.dtype).at[np.arange(n), neighbour].set(a)
     return upper + upper.T - jnp.diag(p) / 2
 
 
@@ -65,7 +65,7 @@ def toda(n: int = 5) -> Problem:
     q0, p0 = np.zeros(n), 0.1 + np.cos(angle) + np.sin(2 * angle) / 2
     return library_problem(
         hamiltonian,
-        Start("the periodic Toda lattice needs at least three particles", (None,), least=3),
+        Start("the periodic Toda lattice needs at least three particles", (None,), smallest=3),
         name="toda",
         q0=q0,
         p0=p0,

@@ -11,8 +11,8 @@ from .oblate_kepler import axial_angular_momentum
 def distances(q, args):
     """r1 and r2, from the centres at z = +d and z = −d."""
     x, y, z = q
-    d, across = args["d"], x**2 + y**2
-    return jnp.sqrt(across + (z - d) ** 2), jnp.sqrt(across + (z + d) ** 2)
+    d, square = args["d"], x**2 + y**2
+    return jnp.sqrt(square + (z - d) ** 2), jnp.sqrt(square + (z + d) ** 2)
 
 
 def hamiltonian(t0, t1, q0, p1, args):

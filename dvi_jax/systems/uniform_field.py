@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..discover.functions.generators import Generator
-from ._problem import Parameter, Problem, Start, gyrates, library_problem, over_times, vector
+from ._problem import Parameter, Problem, Start, library_problem, nonzero, over_times, vector
 
 
 def vector_potential(q, args):
@@ -43,8 +43,8 @@ def kinetic_energy(t0, t1, q0, p0, q1, p1, args):
 def pseudomomentum(t0, t1, q0, p0, q1, p1, args):
     """K = p + e B × q/2 − e E t1 at t1, shape (3,), conserved by magnetic translations."""
     half = args["charge"] * args["B"] / 2
-    turned = jnp.stack([-q1[1], q1[0], jnp.zeros_like(q1[2])])
-    return p1 + half * turned - args["charge"] * jnp.asarray(args["E"], q1.dtype) * t1
+    normal = jnp.stack([-q1[1], q1[0], jnp.zeros_like(q1[2])])
+    return p1 + half * normal - args["charge"] * jnp.asarray(args["E"], q1.dtype) * t1
 
 
 def _translation(axis):
@@ -68,14 +68,14 @@ def exact(t, q0, p0, args):
     """
     m, turn = args["mass"], args["charge"] * args["B"] / args["mass"]
     push = args["charge"] * jnp.asarray(args["E"])[2] / m
-    across = drift(args)
+    guide = drift(args)
     v = kinetic_momentum(q0, p0, args) / m
-    w, c, s = v - across, jnp.cos(turn * t), jnp.sin(turn * t)
-    x = q0[0] + across[0] * t + (w[0] * s + w[1] * (1 - c)) / turn
-    y = q0[1] + across[1] * t + (w[1] * s - w[0] * (1 - c)) / turn
+    w, c, s = v - guide, jnp.cos(turn * t), jnp.sin(turn * t)
+    x = q0[0] + guide[0] * t + (w[0] * s + w[1] * (1 - c)) / turn
+    y = q0[1] + guide[1] * t + (w[1] * s - w[0] * (1 - c)) / turn
     z = q0[2] + v[2] * t + push * t**2 / 2
-    vx = across[0] + w[0] * c + w[1] * s
-    vy = across[1] + w[1] * c - w[0] * s
+    vx = guide[0] + w[0] * c + w[1] * s
+    vy = guide[1] + w[1] * c - w[0] * s
     half = args["charge"] * args["B"] / 2
     p = jnp.stack([m * vx - half * y, m * vy + half * x, m * (v[2] + push * t)])
     return jnp.stack([x, y, z]), p
@@ -97,9 +97,9 @@ def uniform_field() -> Problem:
         p0=np.array([0.0, -0.5, 0.2]),
         h=0.1,
         parameters={
-            "charge": Parameter(1.0, "e [charge]", gyrates),
+            "charge": Parameter(1.0, "e [charge]", nonzero),
             "mass": Parameter(1.0, "m [mass]"),
-            "B": Parameter(1.0, "magnetic field along z [mass/(charge time)]", gyrates),
+            "B": Parameter(1.0, "magnetic field along z [mass/(charge time)]", nonzero),
             "E": Parameter(
                 np.array([0.1, 0.0, 0.0]), "electric field [mass length/(charge time²)]", vector(3)
             ),

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..discover.symmetries.library import scaling
-from ._problem import Problem, Start, library_problem
+from ._problem import Problem, Start, System, library_problem
 from .oscillator import PHASE, exact, hamiltonian
 
 
@@ -19,8 +19,8 @@ def amplitude(t0, t1, q0, p0, q1, p1, args):
     The gradient at the origin, where it does not exist, is set to zero.
     """
     square = jnp.sum(q1**2) + jnp.sum(p1**2)
-    away = square > 0
-    return jnp.where(away, jnp.sqrt(jnp.where(away, square, 1.0)), 0.0 * square)
+    is_away = square > 0
+    return jnp.where(is_away, jnp.sqrt(jnp.where(is_away, square, 1.0)), 0.0 * square)
 
 
 def averaged_amplitude(t, epsilon, start):
@@ -44,13 +44,12 @@ def van_der_pol() -> Problem:
     **Source** van der Pol 1926, *Phil. Mag.* 2, 978.
     """
     return library_problem(
-        hamiltonian,
+        System(hamiltonian, feedback),
         Start("Van der Pol's oscillator has one degree of freedom", (1,)),
         name="van_der_pol",
         q0=np.array([0.5]),
         p0=np.array([0.0]),
         h=0.1,
-        force=feedback,
         observables=[amplitude],
         source="van der Pol 1926, Phil. Mag. 2, 978",
         invariants=("amplitude",),

@@ -60,7 +60,7 @@ class Births(Seeded):
 
     particles: GuidingCentres
     surface: float | None = eqx.field(static=True)
-    cumulated: Any
+    cumulative: Any
     largest: Any
 
     def __init__(
@@ -79,7 +79,7 @@ class Births(Seeded):
         if surface is not None:
             check_range("surface", surface, 0.0)
         self.surface = surface
-        self.cumulated, self.largest = self._tables(rate)
+        self.cumulative, self.largest = self._tables(rate)
 
     def _tables(self, rate: Callable[[Any], Any]) -> tuple[Any, Any]:
         """The fraction of births inside of equidistant s, and the largest √g there, on a grid."""
@@ -93,12 +93,12 @@ class Births(Seeded):
         density = np.asarray(rate(jnp.asarray(s)) * jnp.ones_like(s)) * mean
         if not np.isfinite(density).all() or (density < 0).any() or not density.any():
             raise ValueError(
-                "rate(s) must be finite and not negative for 0 ≤ s ≤ 1, and positive somewhere, "
-                f"got values from {np.min(density / mean):.3g} to {np.max(density / mean):.3g}."
+                "rate(s) must be finite, not negative and not zero everywhere for 0 ≤ s ≤ 1, got "
+                f"{np.min(density / mean):.3g} to {np.max(density / mean):.3g}."
             )
-        between = (density[1:] + density[:-1]) / 2
-        inside = np.concatenate([[0.0], np.cumsum(between) / np.sum(between)])
-        return jnp.asarray(inside), jnp.asarray(jacobian.max((1, 2)))
+        midpoints = (density[1:] + density[:-1]) / 2
+        fractions = np.concatenate([[0.0], np.cumsum(midpoints) / np.sum(midpoints)])
+        return jnp.asarray(fractions), jnp.asarray(jacobian.max((1, 2)))
 
     def at(self, index, t0, args):
         of_s, of_pitch, of_angles = jax.random.split(self.key(index), 3)
@@ -106,9 +106,9 @@ class Births(Seeded):
         nodes = jnp.linspace(0, 1, _TABLE)
         s = like + (0.0 if self.surface is None else self.surface)
         if self.surface is None:
-            s = jnp.interp(jax.random.uniform(of_s, (), like.dtype), self.cumulated, nodes)
+            s = jnp.interp(jax.random.uniform(of_s, (), like.dtype), self.cumulative, nodes)
         # A margin, since the largest √g is known on a grid only.
-        most = 1.05 * jnp.interp(s, nodes, self.largest)
+        bound = 1.05 * jnp.interp(s, nodes, self.largest)
 
         field = self.particles.field
 
@@ -118,7 +118,7 @@ class Births(Seeded):
 
         def proceed(k):
             angles, u = draw(k)
-            return (u * most > volume_element(field, s, *angles)) & (k < _TRIES)
+            return (u * bound > volume_element(field, s, *angles)) & (k < _TRIES)
 
         k = lax.while_loop(proceed, lambda k: k + 1, jnp.zeros((), jnp.int32))
         pitch = jax.random.uniform(of_pitch, (), like.dtype, -1.0, 1.0)

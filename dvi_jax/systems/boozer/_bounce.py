@@ -78,7 +78,7 @@ class _Line(eqx.Module):
 def _end(line: _Line, zeta: Array, direction: float, turns: float) -> tuple[Array, Array]:
     """The bounce point next to ζ in a direction, and whether there is one."""
     step = direction * line.step()
-    most = 2 * np.pi * turns / jnp.abs(step)
+    limit = 2 * np.pi * turns / jnp.abs(step)
     fixed = lax.stop_gradient(line)
 
     def advance(state):
@@ -88,13 +88,13 @@ def _end(line: _Line, zeta: Array, direction: float, turns: float) -> tuple[Arra
     # A point where the guiding centre bounces is inside of its well, up to rounding.
     begin = jnp.maximum(fixed.parallel(zeta), 0.0)
     state = 0.0 * step, begin, 0.0 * step + 1.0
-    k, behind, ahead = lax.while_loop(lambda x: (x[2] > 0) & (x[0] < most), advance, state)
+    k, previous, ahead = lax.while_loop(lambda x: (x[2] > 0) & (x[0] < limit), advance, state)
     exists = ahead <= 0
     a, b = zeta + (k - 1) * step, zeta + k * step
-    return bracketed_root(line.parallel, a, behind, b, ahead, exists), exists
+    return bracketed_root(line.parallel, a, previous, b, ahead, exists), exists
 
 
-def _well(line: _Line, zeta: Array, turns: float) -> tuple[Array, Array, Array]:
+def _bounce_points(line: _Line, zeta: Array, turns: float) -> tuple[Array, Array, Array]:
     low, has_low = _end(line, zeta, -1.0, turns)
     high, has_high = _end(line, zeta, 1.0, turns)
     return low, high, has_low & has_high
@@ -116,8 +116,8 @@ def well(
     """
     _check(field, turns)
     line = _line(field, s, theta, zeta, mu, energy)
-    low, high, exists = _well(line, jnp.asarray(zeta, float), turns)
-    return Well(*(jnp.where(exists, x, jnp.nan) for x in (low, high)))
+    low, high, exists = _bounce_points(line, jnp.asarray(zeta, float), turns)
+    return Well(*(jnp.where(exists, end, jnp.nan) for end in (low, high)))
 
 
 def second_invariant(
@@ -149,12 +149,12 @@ def second_invariant(
     """
     _check(field, turns)
     line = _line(field, s, theta, zeta, mu, energy)
-    low, high, exists = _well(line, jnp.asarray(zeta, float), turns)
+    low, high, exists = _bounce_points(line, jnp.asarray(zeta, float), turns)
     middle, half = (low + high) / 2, (high - low) / 2
     # Midpoints in φ, of an integrand that is even about −π/2 and π/2.
     phi = np.pi * ((np.arange(_NODES) + 0.5) / _NODES - 0.5)
-    at = middle + half * np.sin(phi)
-    B = line.strength(at)
+    points = middle + half * np.sin(phi)
+    B = line.strength(points)
     kinetic = line.energy - line.mu * B
     # Two selections: the derivative of √ at 0 is infinite, and infinity times zero NaN.
     speed = jnp.where(kinetic > 0, jnp.sqrt(2 * jnp.where(kinetic > 0, kinetic, 1.0)), 0.0)
@@ -177,7 +177,7 @@ def complete(args: Any, epsilon: Any) -> Field:
     )
 
 
-class Place(NamedTuple):
+class GuidingCentre(NamedTuple):
     """A guiding centre: s, θ, ζ, u = v∥/v0, |B|, and E = u²/2 + μB."""
 
     s: Array
@@ -188,13 +188,13 @@ class Place(NamedTuple):
     energy: Array
 
 
-def place(chart: Regular | Angles, q: Any, p: Any, args: Any, epsilon: Any) -> Place:
+def centre_of(chart: Regular | Angles, q: Any, p: Any, args: Any, epsilon: Any) -> GuidingCentre:
     """Of one state, in the field with ε."""
     field, rho = complete(args, epsilon), args["rho"]
     s = flux(chart, q, p, args)
     B = field.at(*chart.point(field, rho, q, p, s), q[1])
     u = speed_along(field, rho, s, p[1], B)
-    return Place(s, chart.angle(q, p), q[1], u, B, u**2 / 2 + args["mu"] * B)
+    return GuidingCentre(s, chart.angle(q, p), q[1], u, B, u**2 / 2 + args["mu"] * B)
 
 
 class SecondInvariant(eqx.Module):
@@ -208,14 +208,15 @@ class SecondInvariant(eqx.Module):
         del system
         return replace(self, epsilon=epsilon)
 
-    def of(self, q: Any, p: Any, args: Any) -> Array:
+    def value(self, q: Any, p: Any, args: Any) -> Array:
         """J∥ of one state [m]."""
-        at = place(self.chart, q, p, args, self.epsilon)
+        centre = centre_of(self.chart, q, p, args, self.epsilon)
         field = complete(args, self.epsilon)
-        return second_invariant(field, at.s, at.theta, at.zeta, args["mu"], at.energy)
+        point = centre.s, centre.theta, centre.zeta
+        return second_invariant(field, *point, args["mu"], centre.energy)
 
     def __call__(self, t0, t1, q0, p0, q1, p1, args):
-        return self.of(q1, p1, args)
+        return self.value(q1, p1, args)
 
 
 class Pitch(eqx.Module):
@@ -229,4 +230,4 @@ class Pitch(eqx.Module):
 
 def at_crossings(observable: SecondInvariant, crossings: Any, args: Any) -> Array:
     """J∥ of recorded crossings of one orbit; NaN after the last one."""
-    return jax.vmap(lambda q, p: observable.of(q, p, args))(crossings.qs, crossings.ps)
+    return jax.vmap(lambda q, p: observable.value(q, p, args))(crossings.qs, crossings.ps)

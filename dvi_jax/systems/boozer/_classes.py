@@ -8,13 +8,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ...observe import Reduction
-from ._bounce import place
+from ._bounce import centre_of
 from ._field import Field
 from ._motion import Angles, Regular
 
 _SURFACES, _DEGREE = 33, 12
 _ANGLES = 64
-LABELS = ("trapped", "transitional", "passing")
 
 
 def largest_strength(field: Field) -> Float[Array, " degree"]:
@@ -30,26 +29,26 @@ def largest_strength(field: Field) -> Float[Array, " degree"]:
     theta, zeta = (x.ravel() for x in np.meshgrid(angles, angles / N, indexing="ij"))
     s, theta, zeta = (x.copy() for x in np.broadcast_arrays(r[:, None] ** 2, theta, zeta))
     B = field.strength(s, theta, zeta).reshape(_SURFACES, _ANGLES, _ANGLES)
-    largest = jnp.stack([_improved(each) for each in B])
+    largest = jnp.stack([_parabola_maximum(values) for values in B])
     pseudo_inverse = np.linalg.pinv(np.polynomial.chebyshev.chebvander(2 * r - 1, _DEGREE))
     return jnp.asarray(pseudo_inverse) @ largest
 
 
-def _improved(B: Array) -> Array:
+def _parabola_maximum(B: Array) -> Array:
     """The maximum of the parabola through the largest value on a periodic grid and its eight
     neighbours; the largest value itself where that parabola has no maximum."""
     i, j = jnp.unravel_index(jnp.argmax(B), B.shape)
-    near = jnp.roll(jnp.roll(B, 1 - i, 0), 1 - j, 1)[:3, :3]
-    gx, gy = (near[2, 1] - near[0, 1]) / 2, (near[1, 2] - near[1, 0]) / 2
-    xx = near[2, 1] - 2 * near[1, 1] + near[0, 1]
-    yy = near[1, 2] - 2 * near[1, 1] + near[1, 0]
-    xy = (near[2, 2] - near[2, 0] - near[0, 2] + near[0, 0]) / 4
+    patch = jnp.roll(jnp.roll(B, 1 - i, 0), 1 - j, 1)[:3, :3]
+    gx, gy = (patch[2, 1] - patch[0, 1]) / 2, (patch[1, 2] - patch[1, 0]) / 2
+    xx = patch[2, 1] - 2 * patch[1, 1] + patch[0, 1]
+    yy = patch[1, 2] - 2 * patch[1, 1] + patch[1, 0]
+    xy = (patch[2, 2] - patch[2, 0] - patch[0, 2] + patch[0, 0]) / 4
     # A direction in which |B| does not change has no curvature.
-    flat = 1e-12 * jnp.abs(near[1, 1])
+    flat = 1e-12 * jnp.abs(patch[1, 1])
     xx, yy = jnp.minimum(xx, -flat), jnp.minimum(yy, -flat)
     determinant = xx * yy - xy**2
     gain = -(yy * gx**2 - 2 * xy * gx * gy + xx * gy**2) / (2 * determinant)
-    return near[1, 1] + jnp.where((determinant > 0) & (gain > 0), gain, 0.0)
+    return patch[1, 1] + jnp.where((determinant > 0) & (gain > 0), gain, 0.0)
 
 
 class Trapping(eqx.Module):
@@ -59,9 +58,9 @@ class Trapping(eqx.Module):
     largest: Float[Array, " degree"]
 
     def __call__(self, t, q, p, args):
-        at = place(self.chart, q, p, args, None)
-        x = 2 * jnp.sqrt(at.s) - 1
-        return 1 - args["mu"] * chebyshev(self.largest, x) / at.energy
+        centre = centre_of(self.chart, q, p, args, None)
+        x = 2 * jnp.sqrt(centre.s) - 1
+        return 1 - args["mu"] * chebyshev(self.largest, x) / centre.energy
 
 
 def chebyshev(c: Any, x: Any) -> Array:
@@ -84,8 +83,8 @@ class Extremes(Reduction):
     function: Any
 
     def start(self, value):
-        nan, at = jnp.full_like(value, jnp.nan), jnp.zeros(value.shape, jnp.int32)
-        return nan, nan, at, at
+        nan, index = jnp.full_like(value, jnp.nan), jnp.zeros(value.shape, jnp.int32)
+        return nan, nan, index, index
 
     def update(self, memory, k, t, value):
         low, high, at_low, at_high = memory
@@ -98,9 +97,9 @@ class Extremes(Reduction):
         return jnp.stack(memory[:2])
 
     def combine(self, memory, k, t, value):
-        low, high, *at = memory
-        low = low + self.change(value, k == at[0])
-        return low, high + self.change(value, k == at[1]), *at
+        low, high, *indices = memory
+        low = low + self.change(value, k == indices[0])
+        return low, high + self.change(value, k == indices[1]), *indices
 
 
 def classify(extremes: Any) -> np.ndarray:
@@ -129,13 +128,13 @@ def classify(extremes: Any) -> np.ndarray:
     # ['trapped' 'passing']
     ```
     """
-    found = np.asarray(extremes, float)
-    if found.ndim == 0 or found.shape[-1] != 2:
+    margins = np.asarray(extremes, float)
+    if margins.ndim == 0 or margins.shape[-1] != 2:
         raise ValueError(
-            "extremes must have the smallest and the largest margin on its last axis, shape "
-            f"(…, 2), got {found.shape}. Observe boozer.Extremes(centres.trapping)."
+            "extremes must be those of boozer.Extremes(centres.trapping), of shape (…, 2), got "
+            f"shape {margins.shape}."
         )
-    low, high = found[..., 0], found[..., 1]
+    low, high = margins[..., 0], margins[..., 1]
     labels = np.full(low.shape, "transitional")
     labels[low > 0] = "passing"
     labels[high < 0] = "trapped"

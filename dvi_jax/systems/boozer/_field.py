@@ -1,13 +1,14 @@
 """Magnetic fields in Boozer coordinates: a spectrum of |B| and profiles of flux functions."""
 
-from typing import Any
+from typing import Any, Required, TypedDict, Unpack
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ...base.checks import finite, positive, whole
+from ...base.checks import all_finite, array, finite, positive, whole
+from ...base.keywords import checked_keywords
 from ._sums import Coefficients, Shape, total
 
 Profile = Float[Array, " d"]
@@ -114,17 +115,18 @@ def polynomial(c: Profile, s: Any) -> Array:
     return value
 
 
-def _array(name: str, values: Any, ndim: int) -> np.ndarray:
+def as_numbers(name: str, values: Any) -> np.ndarray:
+    """An array of floating-point numbers. **Raises** `TypeError`."""
     try:
-        array = np.asarray(values, float)
+        return np.asarray(values, float)
     except (TypeError, ValueError) as error:
         raise TypeError(f"{name} must be an array of numbers, got {values!r:.200}.") from error
-    if array.ndim != ndim or not np.isfinite(array).all():
-        raise ValueError(
-            f"{name} must be an array of {ndim} dimensions with finite numbers, got shape "
-            f"{array.shape}; {np.count_nonzero(~np.isfinite(array))} values are not finite."
-        )
-    return array
+
+
+def _array(name: str, values: Any, *shape: int | str) -> np.ndarray:
+    entries = array(name, as_numbers(name, values), shape, integers=True, empty=True)
+    all_finite(name, entries)
+    return entries
 
 
 def from_modes(
@@ -155,15 +157,13 @@ def from_modes(
     positive("psi_edge", psi_edge)
     ms, ns = (_integers(name, x) for name, x in (("m", m), ("n", n)))
     parts = _parts(B)
-    if len({len(ms), len(ns), len(parts[0])}) > 1:
+    lengths = len(ms), len(ns), len(parts[0])
+    if len(set(lengths)) > 1 or 0 in lengths:
+        raise ValueError(f"m, n and B must have one entry for each mode, got {lengths} entries.")
+    if ms.min() < 0 or (ns % periods).any():
         raise ValueError(
-            "m, n and B must have one entry for each mode, got the lengths "
-            f"{[len(x) for x in (ms, ns, parts[0])]}."
-        )
-    if len(ms) == 0 or ms.min() < 0 or (ns % periods).any():
-        raise ValueError(
-            f"the modes must have m ≥ 0 and n a multiple of periods={periods}, got m = {list(ms)} "
-            f"and n = {list(ns)}."
+            f"m must not be negative and n a multiple of periods={periods}, got m = {list(ms)}, "
+            f"n = {list(ns)}."
         )
     k = ns // periods - h * ms
     K = int(np.abs(k).max())
@@ -172,16 +172,15 @@ def from_modes(
         np.add.at(table[part], (ms, k + K), values)
     if not table[0, 0, K, 0] > 0:
         raise ValueError(
-            "the spectrum must contain the mode m = n = 0 with a positive value on the axis, which "
-            f"is the mean of |B| there, got {table[0, 0, K, 0]} T. Add it to m, n and B."
+            "B must have a positive value of the mode m = n = 0 on the axis, the mean of |B|, got "
+            f"{table[0, 0, K, 0]} T."
         )
     profiles = [np.atleast_1d(np.asarray(x, float)) for x in (iota, G, 0.0 if I is None else I)]
     for name, profile in zip(("iota", "G", "I"), profiles, strict=True):
-        _array(name, profile, 1)
+        _array(name, profile, "degree")
     if profiles[2][0] != 0:
         raise ValueError(
-            "I must be zero on the axis (the toroidal current inside of a surface of no area), got "
-            f"the constant {profiles[2][0]}. Give I as [0, ...]: the coefficients of s, s², …"
+            f"I must be zero on the axis, I = [0, ...], got the constant {profiles[2][0]}."
         )
     iota, G, current = map(jnp.asarray, profiles)
     psi, current = jnp.asarray(float(psi_edge)), None if I is None else current
@@ -191,19 +190,19 @@ def from_modes(
 
 
 def _integers(name: str, values: Any) -> np.ndarray:
-    numbers = _array(name, values, 1)
+    numbers = _array(name, values, "modes")
     if wrong := numbers[numbers != np.round(numbers)].tolist():
         raise ValueError(f"{name} must be integers (mode numbers), got {wrong[0]}.")
     return numbers.astype(int)
 
 
-def _parts(B: Any) -> list[np.ndarray]:
+def _parts(values: Any) -> list[np.ndarray]:
     """The cosine part of B and, if it has three dimensions, the sine part."""
-    if np.ndim(B) != 3:
-        return [_array("B", B, 2)]
-    if len(B) not in (1, 2):
-        raise ValueError(f"the first of three dimensions of B must be 1 or 2, got {len(B)}.")
-    return list(_array("B", B, 3))
+    if np.ndim(values) != 3:
+        return [_array("B", values, "modes", "d")]
+    if len(values) not in (1, 2):
+        raise ValueError(f"B must have 1 or 2 parts on the first of three axes, got {len(values)}.")
+    return list(_array("B", values, "parts", "modes", "d"))
 
 
 def _check_positive(field: Field) -> None:
@@ -215,29 +214,35 @@ def _check_positive(field: Field) -> None:
     low = jnp.min(field.strength(s, theta, zeta))
     if not low > 0:
         raise ValueError(
-            f"|B| must be positive for 0 ≤ s ≤ 1, but its least value on a grid is {low:.3g} T. "
-            "Check signs and units of the modes."
+            f"|B| must be positive for 0 ≤ s ≤ 1, got {low:.3g} T. Check the signs of the modes."
         )
     G = polynomial(field.G, jnp.linspace(0, 1, 65))
     if not (jnp.all(G > 0) or jnp.all(G < 0)):
-        raise ValueError("G must not be zero for 0 ≤ s ≤ 1: it is the poloidal current outside.")
+        raise ValueError(f"G must not be zero for 0 ≤ s ≤ 1, got {G.min():.3g} to {G.max():.3g}.")
 
 
+class ProfileSettings(TypedDict, total=False):
+    """Keywords of `from_modes`."""
+
+    psi_edge: Required[float]
+    iota: Required[Any]
+    G: Required[Any]
+    I: Any  # noqa: E741
+    periods: int
+    helicity: int
+
+
+@checked_keywords
 def from_surfaces(
     s: Any,
     m: Any,
     n: Any,
     B: Any,
     *,
-    psi_edge: float,
-    iota: Any,
-    G: Any,
-    I: Any = None,  # noqa: E741
-    periods: int = 1,
-    helicity: int = 0,
     degree: int = 6,
     box: tuple[int, int] | None = None,
     tolerance: float = 1e-2,
+    **settings: Unpack[ProfileSettings],
 ) -> Field:
     r"""A `Field` from values on flux surfaces, by least-squares polynomials in s.
 
@@ -258,29 +263,20 @@ def from_surfaces(
     **Raises** `ValueError` for surfaces that do not reach the edge, or if the error of |B| is
     larger than `tolerance`. The modes outside of `box` are not part of that error.
     """
-    s = _array("s", s, 1)
-    values = _parts(B)
+    s, values = _array("s", s, "surfaces"), _parts(B)
+    periods, helicity = settings.get("periods", 1), settings.get("helicity", 0)
     degree = whole("degree", degree, 0)
     if len(s) < 2 or np.any(np.diff(s) <= 0) or s[0] < 0 or s[-1] > 1 or s[-1] < 0.9:
         raise ValueError(
-            "s must increase, from 0 or more to the edge (at least 0.9, at most 1), got "
-            f"{len(s)} surfaces from {s[0] if len(s) else None} to {s[-1] if len(s) else None}. "
-            "If the grid ends inside of the plasma, divide s by its last value and give psi_edge "
-            "of that surface."
+            "s must increase, from 0 or more to the edge (0.9 to 1), got "
+            f"{np.array2string(s, threshold=4)}. Divide s and psi_edge of an inner grid by s[-1]."
         )
     if len(s) <= degree:
         raise ValueError(f"degree={degree} requires more than {degree} surfaces, got {len(s)}.")
     ms, ns = (_integers(name, x) for name, x in (("m", m), ("n", n)))
-    if values[0].shape != (len(s), len(ms)):
-        raise ValueError(
-            f"B must have the shape (surfaces, modes) = {(len(s), len(ms))}, got {values[0].shape}."
-        )
-    for name, x in (("iota", iota), ("G", G), ("I", I)):
-        if x is not None and np.shape(x) != s.shape:
-            raise ValueError(
-                f"{name} must have one value for each of the {len(s)} surfaces, got the shape "
-                f"{np.shape(x)}."
-            )
+    array("B", values[0], (len(s), len(ms)), integers=True)
+    names = ["iota", "G", *(["I"] if settings.get("I") is not None else [])]
+    profiles = {name: _array(name, settings.get(name), len(s)) for name in names}
     if box is not None:
         if not isinstance(box, tuple | list) or len(box) != 2:
             raise TypeError(f"box must be a pair (M, K), such as (6, 4), got {box!r}.")
@@ -300,19 +296,15 @@ def from_surfaces(
     mean = np.abs(values[0][:, (ms == 0) & (ns == 0)]).mean() if len(ms) else 0.0
     if mean > 0 and error.max() > finite("tolerance", tolerance) * mean:
         raise ValueError(
-            f"polynomials of degree {degree} give |B| with an error of up to "
-            f"{error.max() / mean:.1g} of its mean, more than tolerance={tolerance}. Give a larger "
-            "degree or more surfaces near the axis, or leave modes with a large m out."
+            f"tolerance={tolerance} is exceeded by degree={degree}: the error of |B| is "
+            f"{error.max() / mean:.1g} of its mean. Give a larger degree, or fewer large m."
         )
     high = min(degree + 2, len(s) - 1)
-    profiles = [_fit(s, _array(name, x, 1), high) for name, x in (("iota", iota), ("G", G))]
-    current = None
-    if I is not None and np.abs(I).max() > 1e-9 * np.abs(G).max():
-        current = np.concatenate([[0.0], _fit(s, _array("I", I, 1), high - 1, 1.0)])
-    return from_modes(
-        ms, ns, np.stack(fits), psi_edge=psi_edge, iota=profiles[0], G=profiles[1], I=current,
-        periods=periods, helicity=helicity,
-    )  # fmt: skip
+    current, settings["I"] = profiles.get("I"), None
+    settings["iota"], settings["G"] = (_fit(s, profiles[name], high) for name in ("iota", "G"))
+    if current is not None and np.abs(current).max() > 1e-9 * np.abs(profiles["G"]).max():
+        settings["I"] = np.append(0.0, _fit(s, current, high - 1, 1.0))
+    return from_modes(ms, ns, np.stack(fits), **settings)
 
 
 def fitted_modes(

@@ -38,11 +38,6 @@ class Geometry(eqx.Module):
         R, Z, nu = (total(c, *point) for c in (self.R, self.Z, self.nu))
         return R, self.direction * (zeta - nu), Z
 
-    def cartesian(self, s: Any, theta: Any, zeta: Any) -> Array:
-        """(x, y, z) [m], shape (…, 3)."""
-        R, phi, Z = self.cylindrical(s, theta, zeta)
-        return jnp.stack([R * jnp.cos(phi), R * jnp.sin(phi), Z], axis=-1)
-
 
 class _Surfaces(NamedTuple):
     """What a file holds, in right-handed coordinates with ψ ≥ 0."""
@@ -83,11 +78,12 @@ def read_booz_xform(
 
     **Source** Sanchez et al. 2000, *J. Comput. Phys.* 161, 576 (booz_xform).
     """
-    f = _surfaces(path, ["bmnc_b"], ["bmns_b"], psi_edge)
-    B = [f.even["bmnc_b"], *f.odd.values()]
+    data = _surfaces(path, ["bmnc_b"], ["bmns_b"], psi_edge)
+    parts = [data.even["bmnc_b"], *data.odd.values()]
     return from_surfaces(
-        f.s, f.m, f.n, np.stack(B) if len(B) > 1 else B[0], psi_edge=f.psi_edge, iota=f.iota, G=f.G,
-        I=f.I, periods=f.periods, helicity=helicity, degree=degree, box=box, tolerance=tolerance,
+        data.s, data.m, data.n, np.stack(parts) if len(parts) > 1 else parts[0],
+        psi_edge=data.psi_edge, iota=data.iota, G=data.G, I=data.I, periods=data.periods,
+        helicity=helicity, degree=degree, box=box, tolerance=tolerance,
     )  # fmt: skip
 
 
@@ -145,8 +141,7 @@ def read_geometry(
     f = _surfaces(path, ["bmnc_b", "rmnc_b"], ["zmns_b", "pmns_b", "bmns_b"])
     if "bmns_b" in f.odd:
         raise ValueError(
-            f"{path}: the field is not symmetric under (θ, ζ) → (−θ, −ζ). read_geometry requires "
-            "this symmetry."
+            f"{path}: read_geometry requires the symmetry (θ, ζ) → (−θ, −ζ), got bmns_b."
         )
     tables = {}
     for name, values, factor in (
@@ -170,8 +165,7 @@ def _surfaces(
             variables = {k: np.array(v.data) for k, v in file.variables.items()}
     except TypeError as error:  # of a file in another format
         raise ValueError(
-            f"{path} is not a file of netCDF version 3, the format of booz_xform and of "
-            f"desc.vmec_utils.make_boozmn_output ({error})."
+            f"{path} is not a file of netCDF version 3, as of booz_xform ({error})."
         ) from None
     names = ["nfp_b", "ns_b", "jlist", "ixm_b", "ixn_b", "iota_b", "bvco_b", "buco_b", "phi_b"]
     absent = [name for name in (*names, *even) if name not in variables]
@@ -183,9 +177,8 @@ def _surfaces(
     flux = float(variables["phi_b"][-1]) / (2 * np.pi) if psi_edge is None else psi_edge
     if flux == 0:
         raise ValueError(
-            f"{path}: the toroidal flux phi_b at the edge is 0. Give psi_edge= (its value/2π, with "
-            "its sign), or make the file again: booz_xform writes phi_b if its read_wout is called "
-            "as read_wout(path, True)."
+            f"{path}: the toroidal flux phi_b at the edge is 0. Give psi_edge= (flux/2π, with its "
+            "sign), or call read_wout(path, True) of booz_xform."
         )
     m, n = variables["ixm_b"].astype(int), -variables["ixn_b"].astype(int)
     G, I = variables["bvco_b"][rows], variables["buco_b"][rows]  # noqa: E741

@@ -32,9 +32,9 @@ def loss_fraction(stop_t: Any, times: Any, sigmas: float = 1.0) -> LossFraction:
     z = positive("sigmas", sigmas)
     stops, times = np.asarray(stop_t, float).ravel(), np.asarray(times, float)
     if stops.size == 0:
-        raise ValueError("stop_t must have one entry for each particle, got none.")
-    ordered = np.sort(stops[np.isfinite(stops)])
-    p, N = np.searchsorted(ordered, times, side="right") / stops.size, stops.size
+        raise ValueError("stop_t must have an entry for each particle, got none.")
+    losses = np.sort(stops[np.isfinite(stops)])
+    p, N = np.searchsorted(losses, times, side="right") / stops.size, stops.size
     middle = (p + z**2 / (2 * N)) / (1 + z**2 / N)
     half = z * np.sqrt(p * (1 - p) / N + z**2 / (4 * N**2)) / (1 + z**2 / N)
     return LossFraction(times, p, np.maximum(middle - half, 0), np.minimum(middle + half, 1))

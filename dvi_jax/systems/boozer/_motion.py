@@ -32,8 +32,8 @@ def flux_equation(field: Field, rho: Any, p_theta: Any, p_zeta: Any, s: Any) -> 
     if field.I is None:
         return ratio * p_theta - s
     current = polynomial(field.I, s) / polynomial(field.G, s)
-    along = ratio * p_zeta + field.poloidal_flux(s) / field.psi_edge
-    return ratio * p_theta - s - current * along
+    toroidal = ratio * p_zeta + field.poloidal_flux(s) / field.psi_edge
+    return ratio * p_theta - s - current * toroidal
 
 
 def _per_action(field: Field, rho: Any, p_zeta: Any, s: Any) -> Array:

@@ -9,13 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ...base.checks import finite, instance, one_of, positive
+from ...base.checks import array, instance, one_of, positive
 from ...observe import Crossings, Section, Stop
 from ...problem.discretise import discretise
 from ...problem.system import System
+from .._problem import nonzero
 from ._bounce import Pitch, SecondInvariant, at_crossings, complete
 from ._classes import Trapping, largest_strength
-from ._field import Field, polynomial
+from ._field import Field, as_numbers, polynomial
 from ._motion import Angles, Breaking, Regular, continuous_hamiltonian, flux, speed_along
 
 # CODATA 2018: e and the electronvolt exactly, and the mass of the alpha particle.
@@ -74,15 +75,11 @@ class GuidingCentres(eqx.Module):
         instance("field", self.field, Field, "a Field, such as boozer.precise_qa()")
         for name in ("energy", "mass"):
             positive(name, getattr(self, name))
-        if finite("charge", self.charge) == 0:
-            raise ValueError("charge must not be zero: neutral particles do not follow the field.")
+        nonzero("charge", self.charge)
         one_of("coordinates", self.coordinates, _CHARTS)
-        shape = self.field.coefficients.shape
-        if self.breaking is not None and np.shape(self.breaking) != shape:
-            raise ValueError(
-                f"breaking must have the shape of field.coefficients, {shape}, got "
-                f"{np.shape(self.breaking)}. Field.split returns such coefficients."
-            )
+        if self.breaking is not None:
+            shape, hint = self.field.coefficients.shape, "Take the result of Field.split."
+            array("breaking", jnp.asarray(self.breaking), shape, integers=True, hint=hint)
 
     @property
     def speed(self) -> float:
@@ -101,9 +98,9 @@ class GuidingCentres(eqx.Module):
     @property
     def system(self) -> System:
         """The `System`: continuous equations, for `GaussLegendre`."""
-        H = continuous_hamiltonian(self.field, self.chart)
+        hamiltonian = continuous_hamiltonian(self.field, self.chart)
         extra = None if self.breaking is None else Breaking(self.chart)
-        return System(discretise(H), perturbation=extra)
+        return System(discretise(hamiltonian), perturbation=extra)
 
     @property
     def h(self) -> float:
@@ -122,8 +119,8 @@ class GuidingCentres(eqx.Module):
         B = float(table[~wave][0])
         # A passing particle goes around the axis as the mode (1, 0).
         k = [abs(iota), *(np.abs(m * iota - n)[wave] * (table[wave] / B) ** 0.2)]
-        most = max(k) * B / G
-        return float(0.4 / most) if most > 0 else float(G / B)
+        largest = max(k) * B / G
+        return float(0.4 / largest) if largest > 0 else float(G / B)
 
     def step(self, seconds: Any) -> Any:
         """The h or t of a run [m] for a time in seconds."""
@@ -139,8 +136,8 @@ class GuidingCentres(eqx.Module):
 
     def args(self, mu: Any) -> dict[str, Any]:
         """The args of a run, for the moment μ [1/T], in units of m v0²."""
-        found = {"field": self.field, "mu": mu, "rho": self.rho}
-        return found if self.breaking is None else {**found, "breaking": self.breaking}
+        parameters = {"field": self.field, "mu": mu, "rho": self.rho}
+        return parameters if self.breaking is None else {**parameters, "breaking": self.breaking}
 
     def start(self, s: Any, theta: Any, zeta: Any, pitch: Any) -> tuple[Array, Array, dict]:
         """(q0, p0, args) at s, θ, ζ with the pitch v∥/v0; arrays of one shape, which is that of
@@ -171,7 +168,7 @@ class GuidingCentres(eqx.Module):
         """Boozer coordinates of states: q, p of shape (…, 2) → arrays of shape (…)."""
 
         @functools.partial(jnp.vectorize, signature="(n),(n)->(),(),(),(),()")
-        def one(q, p):
+        def coordinates(q, p):
             args = self.args(0.0)
             s = flux(self.chart, q, p, args)
             x, y = self.chart.point(self.field, self.rho, q, p, s)
@@ -179,12 +176,12 @@ class GuidingCentres(eqx.Module):
             u = speed_along(self.field, self.rho, s, p[1], B)
             return s, self.chart.angle(q, p), q[1], self.speed * u, B
 
-        return Coordinates(*one(jnp.asarray(q), jnp.asarray(p)))
+        return Coordinates(*coordinates(jnp.asarray(q), jnp.asarray(p)))
 
     def second_invariant(self, q: Any, p: Any, args: Any, epsilon: Any = None) -> Array:
         """J∥ = ∮ v∥ dl [m] of one state, in the well of |B| where it lies; NaN for a passing
         particle. See `boozer.second_invariant`; E is that of the state, H(q, p)."""
-        return SecondInvariant(self.chart, epsilon).of(q, p, args)
+        return SecondInvariant(self.chart, epsilon).value(q, p, args)
 
     def bounces(self, max_crossings: int = 100, direction: int = 0) -> Section:
         """Observable: the bounce points v∥ = 0 of an orbit, a `dvi.Section`.
@@ -203,8 +200,8 @@ class GuidingCentres(eqx.Module):
     def observables(self) -> dict[str, Any]:
         """Observables by name, for `integrate`: "second_invariant" [m], and "trapping" [1] where
         the field is complete. The first uses the ε of the run."""
-        found: dict[str, Any] = {"second_invariant": SecondInvariant(self.chart)}
-        return found if self.breaking is not None else {**found, "trapping": self.trapping}
+        functions: dict[str, Any] = {"second_invariant": SecondInvariant(self.chart)}
+        return functions if self.breaking is not None else {**functions, "trapping": self.trapping}
 
     @property
     def trapping(self) -> Any:
@@ -218,9 +215,8 @@ class GuidingCentres(eqx.Module):
         """
         if self.breaking is not None:
             raise ValueError(
-                "trapping requires a complete field, but these GuidingCentres have modes "
-                "`breaking`, whose strength ε is not known here. Use centres.at_epsilon(ε), its "
-                "trapping and its system."
+                "trapping requires a complete field, got one with `breaking` of unknown ε. Use "
+                "centres.at_epsilon(ε)."
             )
         return Trapping(self.chart, largest_strength(self.field))
 
@@ -232,10 +228,10 @@ class GuidingCentres(eqx.Module):
     @property
     def loss(self) -> Stop:
         """Ends a run where the guiding centre reaches the edge, s = 1."""
-        return Stop(_Outside(self.chart))
+        return Stop(_Edge(self.chart))
 
 
-class _Outside(eqx.Module):
+class _Edge(eqx.Module):
     chart: Any
 
     def __call__(self, t, q, p, args):
@@ -243,11 +239,6 @@ class _Outside(eqx.Module):
 
 
 def check_range(name: str, value: Any, low: float) -> None:
-    try:
-        x = np.asarray(value, float)
-    except (TypeError, ValueError):
-        raise TypeError(
-            f"{name} must be a number or an array of them, got {value!r:.200}."
-        ) from None
-    if wrong := x[~((x >= low) & (x <= 1))].ravel().tolist():
+    numbers = as_numbers(name, value)
+    if wrong := numbers[~((numbers >= low) & (numbers <= 1))].ravel().tolist():
         raise ValueError(f"{name} must be between {low:g} and 1, got {wrong[0]}.")

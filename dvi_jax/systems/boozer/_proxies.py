@@ -57,13 +57,13 @@ def symmetry_error(
     )
     s, theta, zeta = np.meshgrid(np.asarray(surfaces, float), theta, zeta / periods, indexing="ij")
     s, theta, zeta = map(jnp.asarray, (s, theta, zeta))
-    along = jnp.full_like(theta, N), jnp.ones_like(zeta)
-    B, change = jax.jvp(functools.partial(field.strength, s), (theta, zeta), along)
+    direction = jnp.full_like(theta, N), jnp.ones_like(zeta)
+    B, change = jax.jvp(functools.partial(field.strength, s), (theta, zeta), direction)
     average = jnp.sum(change**2 / B**4, axis=(1, 2)) / jnp.sum(1 / B**2, axis=(1, 2))
     return jnp.mean(average)
 
 
-class _Weighted(eqx.Module):
+class _Weight(eqx.Module):
     """(16π/3) sin(2πτ) sin²(πτ) s with τ = t/T, whose mean over a run is −Δs."""
 
     chart: Any
@@ -74,13 +74,15 @@ class _Weighted(eqx.Module):
         return 16 * jnp.pi / 3 * weight * flux(self.chart, q, p, args)
 
 
-def _run(particles: GuidingCentres, start: Any, num_steps: int, h: Any, more: dict, **how: Any):
-    """A run of one particle, of which the last state is saved; `more`: further args."""
-    q, p, args = particles.state(*start)
-    how |= {"h": h, "num_steps": num_steps, "args": args | more, "method": GaussLegendre(2)}
-    epsilon = None if particles.breaking is None else 1.0
-    save = Save(final=True)
-    return integrate(particles.system, q, p, epsilon=epsilon, save=save, throw=False, **how)
+def _run(particles: GuidingCentres, start: Any, duration: tuple[int, Any], **options: Any):
+    """A run of one particle with `duration` = (num_steps, h), of which the last state is saved."""
+    (num_steps, h), (q, p, args) = duration, particles.state(*start)
+    args |= {"duration": num_steps * h}
+    return integrate(
+        particles.system, q, p, h=h, num_steps=num_steps, args=args, method=GaussLegendre(2),
+        epsilon=None if particles.breaking is None else 1.0, save=Save(final=True), throw=False,
+        **options,
+    )  # fmt: skip
 
 
 def radial_drift(
@@ -110,10 +112,10 @@ def radial_drift(
     """
     instance("particles", particles, GuidingCentres, "such as boozer.GuidingCentres(field)")
     num_steps = whole("num_steps", num_steps)
-    how = {"adjoint": Reversible(checkpoint_every=25), "observe": Mean(_Weighted(particles.chart))}
-    sol = _run(particles, start, num_steps, h, {"duration": num_steps * h}, **how)
-    succeeded = sol.result == RESULTS.successful
-    return -jnp.where(succeeded, sol.observed, 0.0), succeeded
+    adjoint, mean = Reversible(checkpoint_every=25), Mean(_Weight(particles.chart))
+    sol = _run(particles, start, (num_steps, h), adjoint=adjoint, observe=mean)
+    is_success = sol.result == RESULTS.successful
+    return -jnp.where(is_success, sol.observed, 0.0), is_success
 
 
 def mean_drift(
@@ -141,12 +143,12 @@ def mean_drift(
     """
     positive("width", width)
 
-    def one(start):
-        drift, succeeded = radial_drift(particles, start, num_steps=num_steps, h=h)
+    def term(start):
+        drift, is_success = radial_drift(particles, start, num_steps=num_steps, h=h)
         square = drift**2
-        return jnp.where(succeeded, square / (square + width**2), 1.0)
+        return jnp.where(is_success, square / (square + width**2), 1.0)
 
-    return jnp.mean(jax.vmap(one)(jnp.asarray(starts)))
+    return jnp.mean(jax.vmap(term)(jnp.asarray(starts)))
 
 
 def lost_at(particles: GuidingCentres, start: Any, *, num_steps: int, h: Any = 4.0) -> Array:
@@ -154,7 +156,7 @@ def lost_at(particles: GuidingCentres, start: Any, *, num_steps: int, h: Any = 4
 
     Arguments as for `radial_drift`. It has no useful derivative.
     """
-    sol = _run(particles, start, whole("num_steps", num_steps), h, {}, stop=particles.loss)
+    sol = _run(particles, start, (whole("num_steps", num_steps), h), stop=particles.loss)
     seconds = particles.seconds(sol.stop.t)
     stays = sol.result == RESULTS.successful
     return lax.stop_gradient(jnp.where(stays, jnp.inf, seconds))

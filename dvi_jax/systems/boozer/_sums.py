@@ -40,11 +40,11 @@ def _plus(a: Complex, b: Complex) -> Complex:
     return a[0] + b[0], a[1] + b[1]
 
 
-def _scaled(number: Any, a: Complex) -> Complex:
+def _scale(number: Any, a: Complex) -> Complex:
     return number * a[0], number * a[1]
 
 
-def _turned(number: Any, a: Complex) -> Complex:
+def _rotate(number: Any, a: Complex) -> Complex:
     """−i·number·a."""
     return number * a[1], -number * a[0]
 
@@ -67,13 +67,13 @@ def _polynomials(c: Float[Array, " d"], s: Any, order: int) -> list[Any]:
 
 def _powers(first: Complex, factor: Complex, count: int) -> Complex:
     """first · factor^k for k = 0 … count − 1, in arrays with k first."""
-    _, powers = lax.scan(lambda a, _: (_times(a, factor), a), first, None, length=count)
+    _, powers = lax.scan(lambda power, _: (_times(power, factor), power), first, None, length=count)
     return powers
 
 
-def _shifted(a: Complex) -> Complex:
+def _shift(number: Complex) -> Complex:
     """(0, a_0, a_1, …) without the last entry."""
-    real, imaginary = (jnp.concatenate([jnp.zeros_like(x[:1]), x[:-1]]) for x in a)
+    real, imaginary = (jnp.concatenate([jnp.zeros_like(part[:1]), part[:-1]]) for part in number)
     return real, imaginary
 
 
@@ -84,17 +84,18 @@ def _over_k(c: Any, s: Any, phases: Complex, n: Any, order: int) -> tuple[Comple
     zero = jnp.zeros_like(s)
 
     def add(sums, row):
-        c_k, e, n = row
+        c_k, phase, n = row
         real = _polynomials(c_k[0], s, order)
-        terms = [_scaled(x, e) for x in real]
+        terms = [_scale(value, phase) for value in real]
         if c_k.shape[0] == 2:
             imaginary = _polynomials(c_k[1], s, order)
-            terms = [_plus(x, _turned(y, e)) for x, y in zip(terms, imaginary, strict=True)]
+            rotations = [_rotate(term, phase) for term in imaginary]
+            terms = [_plus(*pair) for pair in zip(terms, rotations, strict=True)]
         if order >= 1:
-            terms += [_turned(n, x) for x in terms[:order]]
+            terms += [_rotate(n, term) for term in terms[:order]]
         if order == 2:
-            terms.append(_turned(n, terms[3]))
-        return tuple(_plus(x, y) for x, y in zip(sums, terms, strict=True)), None
+            terms.append(_rotate(n, terms[3]))
+        return tuple(_plus(*pair) for pair in zip(sums, terms, strict=True)), None
 
     start = tuple((zero, zero) for _ in range((1, 3, 6)[order]))
     # A loop in machine code is short to compile. On a GPU each round of a loop would be several
@@ -114,7 +115,7 @@ def derivatives(c: Coefficients, shape: Shape, x: Any, y: Any, zeta: Any, order:
     k = jnp.arange(K2, dtype=s.dtype) - K2 // 2
     phases = _powers(_phase(-N * (K2 // 2) * zeta), _phase(N * zeta), K2)
     power = _powers((unit, zero), w, M)
-    down_one = _shifted(power)
+    down_one = _shift(power)
     of_m = _powers((unit, zero), _phase(N * h * zeta), M) if h else None
 
     def add(sums, row):
@@ -129,17 +130,17 @@ def derivatives(c: Coefficients, shape: Shape, x: Any, y: Any, zeta: Any, order:
             if order == 2:
                 A_ss, *tail = tail
             A_zeta, *tail = tail
-            lower = _scaled(m, w1)  # m w^{m−1}
+            lower = _scale(m, w1)  # m w^{m−1}
             terms += [_times(w0, A_s)[0], *_times(lower, A), _times(w0, A_zeta)[0]]
         if order == 2:
             A_szeta, A_zetazeta = tail
-            down_twice = _scaled(m * (m - 1), w2)
+            down_twice = _scale(m * (m - 1), w2)
             terms += [_times(w0, A_ss)[0], *_times(lower, A_s), *_times(down_twice, A)]
             terms += [_times(w0, A_szeta)[0], *_times(lower, A_zeta), _times(w0, A_zetazeta)[0]]
         return tuple(a + b for a, b in zip(sums, terms, strict=True)), None
 
     start = tuple(zero for _ in range((1, 5, 14)[order]))
-    rows = jnp.arange(M, dtype=s.dtype), power, down_one, _shifted(down_one), of_m
+    rows = jnp.arange(M, dtype=s.dtype), power, down_one, _shift(down_one), of_m
     B, *tail = lax.scan(add, start, (jnp.swapaxes(c, 0, 1), *rows))[0]
     if order == 0:
         return (B,)
@@ -174,14 +175,14 @@ def _sum_of_products(factors: tuple, changes: tuple) -> Any:
     return functools.reduce(jnp.add, parts) if parts else jnp.zeros_like(factors[0])
 
 
-def _known(changes: Any) -> list[Any]:
-    return [None if isinstance(d, SymbolicZero) else d for d in changes]
+def _nonzero(changes: Any) -> list[Any]:
+    return [None if isinstance(change, SymbolicZero) else change for change in changes]
 
 
 def _total_jvp(shape, primals, changes):
     c, x, y, zeta = primals
     B, *slopes = _with_gradient(c, shape, x, y, zeta)
-    of_c, *of_point = _known(changes)
+    of_c, *of_point = _nonzero(changes)
     change = _sum_of_products(tuple(slopes), tuple(of_point))
     if of_c is not None:  # B is linear in its coefficients
         change = change + total(of_c, shape, x, y, zeta)
@@ -190,14 +191,14 @@ def _total_jvp(shape, primals, changes):
 
 def _with_gradient_jvp(shape, primals, changes):
     c, x, y, zeta = primals
-    B, bx, by, bz, xx, xy, xz, yy, yz, zz = derivatives(c, shape, x, y, zeta, order=2)
-    of_c, *of_point = _known(changes)
-    rows = ((bx, by, bz), (xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+    B, b_x, b_y, b_z, xx, xy, xz, yy, yz, zz = derivatives(c, shape, x, y, zeta, order=2)
+    of_c, *of_point = _nonzero(changes)
+    rows = ((b_x, b_y, b_z), (xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
     out = tuple(_sum_of_products(row, tuple(of_point)) for row in rows)
     if of_c is not None:
         extra = _with_gradient(of_c, shape, x, y, zeta)
         out = tuple(a + b for a, b in zip(out, extra, strict=True))
-    return (B, bx, by, bz), out
+    return (B, b_x, b_y, b_z), out
 
 
 total.defjvp(_total_jvp, symbolic_zeros=True)

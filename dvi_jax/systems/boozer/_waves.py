@@ -21,8 +21,8 @@ class _Cosines(eqx.Module):
 def _name(m: int, n: int) -> str:
     """Such as "cos(2q1 − 4q2)"."""
     terms = [(m, "q1"), (-n, "q2")]
-    signed = [f"{'−' if c < 0 else '+'} {'' if abs(c) == 1 else abs(c)}{v}" for c, v in terms if c]
-    text = " ".join(signed)
+    parts = [f"{'−' if c < 0 else '+'} {'' if abs(c) == 1 else abs(c)}{v}" for c, v in terms if c]
+    text = " ".join(parts)
     return f"cos({text[2:] if text[0] == '+' else '−' + text[2:]})"
 
 

@@ -24,7 +24,16 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from .._problem import Parameter, Problem, Start, finite, library_problem, over_times, vector
+from .._problem import (
+    Parameter,
+    Problem,
+    Start,
+    System,
+    finite,
+    library_problem,
+    over_times,
+    vector,
+)
 from .solar_system import installed_file
 
 REFERENCE = 51544.0
@@ -77,8 +86,8 @@ def read_polar_motion(path: str | Path | None = None) -> PolarMotion:
         lines = [(i, line) for i, line in enumerate(file, 1) if line[_FLAG : _FLAG + 1] == "I"]
     if not lines:
         raise ValueError(
-            f"{path.name} has no measured pole positions, because no line has the letter I in "
-            "column 17. Give a file in the format finals2000A that has measured positions."
+            f"{path.name} has no measured pole positions: no line with I in column 17, as in the "
+            "format finals2000A."
         )
     table = np.empty((len(lines), 5))
     for row, (number, line) in zip(table, lines, strict=True):
@@ -86,8 +95,8 @@ def read_polar_motion(path: str | Path | None = None) -> PolarMotion:
             row[:] = [float(line[column]) for column in _COLUMNS]
         except ValueError:
             raise ValueError(
-                f"line {number} of {path.name} is not in the format of finals2000A: "
-                f"{line[:55].rstrip()!r}. Correct or remove this line."
+                f"line {number} of {path.name} is not in the format finals2000A: "
+                f"{line[:55].rstrip()!r}."
             ) from None
     return PolarMotion(*table.T)
 
@@ -217,7 +226,7 @@ def polar_motion() -> Problem:
     fit to 1976–2008. Review: Gross 2015, *Treatise on Geophysics*, 2nd ed., 3.09.
     """
     return library_problem(
-        hamiltonian,
+        System(hamiltonian, damping, disturbance),
         Start("the pole has one x, in q0, and one y, in p0", (1,)),
         name="polar_motion",
         q0=[0.043301],
@@ -235,8 +244,6 @@ def polar_motion() -> Problem:
                 0.001677, 0.003460, "of the mean pole (x, y) in a year [arcsec/365.25 day]"
             ),
         },
-        force=damping,
-        perturbation=disturbance,
         observables=[amplitude, free_amplitude],
         autonomous=False,
         units={"q": "arcsec", "p": "arcsec", "t": "day", "energy": "arcsec²/day"},

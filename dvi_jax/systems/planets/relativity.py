@@ -16,6 +16,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from ...base.checks import array
 from ..n_body import hamiltonian, masses_of
 from .solar_system import AU_IN_KM
 
@@ -79,8 +80,8 @@ def post_newtonian_hamiltonian(t0, t1, q0, p1, args):
     masses, mu = _masses(q0, args)
     r, v = _length(_from_sun(q0)), _from_sun(p1 / masses[:, None])
     v2 = jnp.sum(v**2, axis=-1, keepdims=True)
-    added = v2**2 / 8 + 1.5 * mu * v2 / r - mu**2 / (2 * r**2)
-    return -jnp.sum(masses[1:, None] * added) / _c2(args)
+    terms = v2**2 / 8 + 1.5 * mu * v2 / r - mu**2 / (2 * r**2)
+    return -jnp.sum(masses[1:, None] * terms) / _c2(args)
 
 
 def momenta_from_velocities(q: Any, v: Any, args: Any):
@@ -106,8 +107,8 @@ def velocities_from_momenta(q: Any, p: Any, args: Any):
     """
     q, p = jnp.asarray(q), jnp.asarray(p)
     masses, _ = _masses(q, args)
-    rest = p / masses[:, None]
-    return rest - _added_momenta(q, rest, args) / masses[:, None]
+    ratios = p / masses[:, None]
+    return ratios - _added_momenta(q, ratios, args) / masses[:, None]
 
 
 def oblateness(q, args):
@@ -132,17 +133,12 @@ def oblateness(q, args):
     """
     masses, mu = _masses(q, args)
     pole = jnp.asarray(args.get("pole", SUN_POLE), q.dtype)
-    if pole.shape != q.shape[1:]:
-        raise ValueError(
-            f'args["pole"], the axis of the Sun, must have shape {q.shape[1:]} for q of shape '
-            f"{q.shape}, got shape {pole.shape}. The default pole has shape (3,): in the plane, "
-            'add a "pole" of shape (2,) to args.'
-        )
+    array('args["pole"]', pole, q.shape[1:], hint="In the plane it must be given.")
     r = _from_sun(q)
     r2 = jnp.sum(r**2, axis=-1)
-    along = jnp.sum(r * pole[None, :], axis=-1) ** 2 / (r2 * jnp.sum(pole**2))
+    sine_squared = jnp.sum(r * pole[None, :], axis=-1) ** 2 / (r2 * jnp.sum(pole**2))
     size = mu * args["J2"] * args.get("R", SUN_RADIUS) ** 2
-    return size / 2 * jnp.sum(masses[1:] * (3 * along - 1) / r2**1.5)
+    return size / 2 * jnp.sum(masses[1:] * (3 * sine_squared - 1) / r2**1.5)
 
 
 def hamiltonian_with_oblateness(t0, t1, q0, p1, args):
@@ -173,5 +169,5 @@ def _added_momenta(q, v, args):
     masses, mu = _masses(q, args)
     u = _from_sun(v)
     w = (_length(u) ** 2 / 2 + 3 * mu / _length(_from_sun(q))) / _c2(args) * u
-    added = masses[1:, None] * w
-    return jnp.concatenate([-jnp.sum(added, axis=0, keepdims=True), added])
+    corrections = masses[1:, None] * w
+    return jnp.concatenate([-jnp.sum(corrections, axis=0, keepdims=True), corrections])

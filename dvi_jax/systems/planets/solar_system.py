@@ -4,6 +4,7 @@ Newton's law between ten point masses. General relativity, the Sun's oblateness 
 are neglected; a comparison with the ephemeris shows their effect.
 """
 
+import contextlib
 import datetime
 from dataclasses import replace
 from functools import cache
@@ -13,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ...base.checks import finite
+from ...base.checks import array, finite
 from .._problem import Problem
 from ..n_body import check_bodies, n_body
 from ..oblate_kepler import elements
@@ -53,22 +54,18 @@ class EphemerisMissing(ImportError):
     """The ephemeris or its reader is not installed; the message has the command."""
 
 
-def installed_file(name: str, what: str) -> Path:
+def installed_file(name: str, contents: str) -> Path:
     """A file of the package skyfield-data; `what`: its contents, for the message.
 
     Nothing is downloaded. **Raises** `EphemerisMissing` where it is not installed.
     """
     # The package is located, not imported: its import warns about the age of its files.
     package = find_spec("skyfield_data")
-    if package is None or package.origin is None:
+    path = Path(getattr(package, "origin", None) or "").parent / "data" / name
+    if package is None or not path.is_file():
         raise EphemerisMissing(
-            f"{what} requires the package skyfield-data. It is not installed: run {_EXTRA}"
-        )
-    path = Path(package.origin).parent / "data" / name
-    if not path.is_file():
-        raise EphemerisMissing(
-            f"the installed package skyfield-data has no file {path}. Install its newest version: "
-            "pip install --upgrade --force-reinstall skyfield-data"
+            f"{contents} requires {name} of the package skyfield-data: {_EXTRA}, or install its "
+            "newest version"
         )
     return path
 
@@ -80,18 +77,12 @@ def julian_date(date: str | datetime.date | float) -> float:
 
     **Raises** `ValueError` for another text, and for dates that DE421 does not cover.
     """
-    if isinstance(date, str):
-        try:
-            date = datetime.date.fromisoformat(date)
-        except ValueError:
-            raise ValueError(
-                'date must be an existing day such as "1900-01-31" (year-month-day), or a Julian '
-                f"date as a number, got {date!r}."
-            ) from None
-    if isinstance(date, datetime.datetime):
+    with contextlib.suppress(ValueError):
+        date = datetime.date.fromisoformat(date) if isinstance(date, str) else date
+    if isinstance(date, str | datetime.datetime):
         raise ValueError(
-            f"date must not be a datetime.datetime, got {date}. Give a datetime.date for a day at "
-            "0h TDB, or a Julian date (TDB) for another time."
+            'date must be a day such as "1900-01-31", a datetime.date, or a Julian date (TDB), got '
+            f"{date!r}."
         )
     if isinstance(date, datetime.date):
         jd, day = date.toordinal() + 1721424.5, f" ({date})"
@@ -108,11 +99,11 @@ def check_covered(jd: Any, day: str = "") -> None:
     """
     first, last = COVERAGE
     jd = np.atleast_1d(jd)
-    outside = jd[~((jd >= first) & (jd <= last))]  # NaN is outside
-    if outside.size:
+    invalid = jd[~((jd >= first) & (jd <= last))]  # NaN is outside
+    if invalid.size:
         raise ValueError(
-            "dates must be in the range of the ephemeris DE421, 1899-07-29 to 2053-10-09 (Julian "
-            f"dates {first} to {last}), got the Julian date {outside[0]}{day}."
+            f"dates must be from 1899-07-29 to 2053-10-09 (Julian dates {first} to {last}), got "
+            f"{invalid[0]}{day}."
         )
 
 
@@ -131,12 +122,7 @@ def ephemeris(jd: Any) -> tuple[np.ndarray, np.ndarray]:
     **Source** Folkner, Williams & Boggs 2009, *The planetary and lunar ephemeris DE 421*, IPN
     Progress Report 42-178.
     """
-    jd = np.asarray(jd, float)
-    if jd.ndim != 1:
-        raise ValueError(
-            f"jd must be a one-dimensional array of Julian dates, got shape {jd.shape}. Give a "
-            "single date as [jd]."
-        )
+    jd = array("jd", np.asarray(jd, float), ("times",), empty=True, hint="Give one date as [jd].")
     check_covered(jd)
     kernel = _kernel()
     states = [kernel[0, code].compute_and_differentiate(jd) for code, _ in _BODIES.values()]
@@ -159,8 +145,8 @@ def perihelion_longitude(q: Any, v: Any, mu: float) -> np.ndarray:
 
     Returns shape (times,), continuous in time (unwrapped).
     """
-    of = elements(np.asarray(q, float), np.asarray(v, float), mu, np)
-    return np.unwrap(of[..., 3] + of[..., 4])
+    orbit = elements(np.asarray(q, float), np.asarray(v, float), mu, np)
+    return np.unwrap(orbit[..., 3] + orbit[..., 4])
 
 
 def check_start(q0: Any, p0: Any, args: Any) -> None:

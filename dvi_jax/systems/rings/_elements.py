@@ -1,12 +1,12 @@
 """Elements of a ring: magnets, cavities, apertures."""
 
 import dataclasses
-import inspect
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypedDict, Unpack, get_args
 
-from ...base.checks import finite, instance, one_of, positive, refuse_unknown, whole
+from ...base.checks import finite, instance, one_of, positive, whole
+from ...base.keywords import checked_keywords
 from ._maps import KICKS, Part
 
 Model = Literal["paraxial", "exact"]
@@ -48,11 +48,11 @@ class Element:
                 element = element.within(*ends, **dict(zip(keys, limits, strict=True)))
         return element
 
-    def within(self, before: Part, after: Part, **values: Any) -> "Element":
+    def within(self, first: Part, last: Part, **values: Any) -> "Element":
         """The element between two parts with parameters of their own."""
         return dataclasses.replace(
             self,
-            parts=(before, *self.parts, after) if self.parts else (before, after),
+            parts=(first, *self.parts, last) if self.parts else (first, last),
             values={**self.values, **values},
         )
 
@@ -69,6 +69,25 @@ def marker(name: str, kind: str = "marker") -> Element:
     return Element(name, kind)
 
 
+class MagnetSettings(TypedDict, total=False):
+    """Keywords of a magnet in slices, see `multipole`."""
+
+    slices: int
+    scheme: int
+    fringe: bool
+    model: Model
+
+
+class BendSettings(MagnetSettings, total=False):
+    """Keywords of `bend`."""
+
+    edge_in: float
+    edge_out: float
+    fringe_in: float
+    fringe_out: float
+
+
+@checked_keywords
 def multipole(
     name: str,
     length: float,
@@ -76,17 +95,17 @@ def multipole(
     a: Iterable[float] = (0.0,),
     *,
     kind: str = "multipole",
-    **how: Any,
+    **options: Unpack[MagnetSettings],
 ) -> Element:
     """A straight magnet with the field Σ (b_n + i a_n)(x + i y)^n = (B_y + i B_x)/(Bρ).
 
     **Arguments** `b`, `a`: from n = 0 (dipole) [1/m^{n+1}]; MAD-X's k_n is n! b_n. Length zero: b
-    and a are integrated over the length. `how`: ``slices=10``; ``scheme=4``, the order 2, 4 or 6
-    of the composition in each slice; ``model="paraxial"`` or "exact"; ``fringe=False``, whether it
-    has the hard edges of the quadrupole, or those of all multipoles if exact.
+    and a are integrated over the length. `options`: ``slices=10``; ``scheme=4``, the order 2, 4 or
+    6 of the composition in each slice; ``model="paraxial"`` or "exact"; ``fringe=False``, whether
+    it has the hard edges of the quadrupole, or those of all multipoles if exact.
     """
     order, values = _field(name, b, a)
-    slices, scheme, fringe, model = _options(how)
+    slices, scheme, fringe, model = _slicing(**options)
     values["length"] = finite("length", length)
     if length == 0:
         return Element(name, kind, (Part("thin", order),), values)
@@ -97,56 +116,48 @@ def multipole(
     return Element(name, kind, parts if has_edges else (body,), values)
 
 
-def quadrupole(name: str, length: float, k1: float, **how: Any) -> Element:
+def quadrupole(name: str, length: float, k1: float, **options: Any) -> Element:
     """A quadrupole: b = (0, k1) [1/m²]; other arguments as for `multipole`."""
-    return multipole(name, length, (0.0, k1), kind="quadrupole", **how)
+    return multipole(name, length, (0.0, k1), kind="quadrupole", **options)
 
 
-def sextupole(name: str, length: float, b2: float, **how: Any) -> Element:
+def sextupole(name: str, length: float, b2: float, **options: Any) -> Element:
     """A sextupole: b = (0, 0, b2) [1/m³], b2 half of MAD-X's k2; others as for `multipole`."""
-    return multipole(name, length, (0.0, 0.0, b2), kind="sextupole", **how)
+    return multipole(name, length, (0.0, 0.0, b2), kind="sextupole", **options)
 
 
-def octupole(name: str, length: float, b3: float, **how: Any) -> Element:
+def octupole(name: str, length: float, b3: float, **options: Any) -> Element:
     """An octupole: b = (0, 0, 0, b3) [1/m⁴], b3 a sixth of MAD-X's k3; others as for
     `multipole`."""
-    return multipole(name, length, (0.0, 0.0, 0.0, b3), kind="octupole", **how)
+    return multipole(name, length, (0.0, 0.0, 0.0, b3), kind="octupole", **options)
 
 
+@checked_keywords
 def bend(
     name: str,
     length: float,
     angle: float,
     b: Iterable[float] = (0.0, 0.0),
     a: Iterable[float] = (0.0,),
-    *,
-    edge_in: float = 0.0,
-    edge_out: float = 0.0,
-    fringe_in: float = 0.0,
-    fringe_out: float = 0.0,
-    **how: Any,
+    **options: Unpack[BendSettings],
 ) -> Element:
     """A bend by `angle` [rad] along an arc of `length` [m]; `edge_in` = `edge_out` = angle/2 for a
     rectangular one.
 
     **Arguments** `b`, `a`: further field, as for `multipole`; b_0 is an error of the main field.
-    `edge_in`, `edge_out`: angles of the pole faces [rad]. `fringe_in`, `fringe_out`: gap times
-    fringe field integral [m]. `how`: as for `multipole`; the exact model has the hard edges of the
-    main field.
+    `edge_in`, `edge_out`: angles of the pole faces [rad], `fringe_in`, `fringe_out`: gap times
+    fringe field integral [m], all 0 by default; other `options` as for `multipole`: the exact model
+    has the hard edges of the main field.
 
     **Raises** `ValueError` for a length that is not positive.
     """
     positive("length of a bend", length)
     order, values = _field(name, b, a)
-    slices, scheme, fringe, model = _options(how)
-    values |= {
-        "length": length,
-        "h": finite("angle", angle) / length,
-        "edge_in": finite("edge_in", edge_in),
-        "edge_out": finite("edge_out", edge_out),
-        "fringe_in": finite("fringe_in", fringe_in),
-        "fringe_out": finite("fringe_out", fringe_out),
-    }
+    values |= {"length": length, "h": finite("angle", angle) / length}
+    settings: dict[str, Any] = {**options}
+    for end in ("edge_in", "edge_out", "fringe_in", "fringe_out"):
+        values[end] = finite(end, settings.pop(end, 0.0))
+    slices, scheme, fringe, model = _slicing(**settings)
     if model == "exact" and angle != 0:
         ends = ["rotation", "dipole_fringe", *["gradient_fringe"] * fringe, "wedge"]
         body = Part("exact_bend", order, scheme, slices)
@@ -217,8 +228,7 @@ def aperture(name: str, **limits: Any) -> Element:
     element = Element(name, "aperture").inside(**limits)
     if not element.parts:
         raise ValueError(
-            f"aperture {name!r} must have limits: rectangle=(x_min, x_max, y_min, y_max) or "
-            "ellipse=(x, y), got neither."
+            f"aperture {name!r} must have the limits rectangle=... or ellipse=..., got neither."
         )
     return element
 
@@ -226,22 +236,18 @@ def aperture(name: str, **limits: Any) -> Element:
 def _field(name: str, b: Iterable[float], a: Iterable[float]) -> tuple[int, dict[str, Any]]:
     b, a = tuple(b), tuple(a)
     order = max(len(b), len(a), 1) - 1
-    found = {}
-    for key, given in (("b", b), ("a", a)):
+    values = {}
+    for key, coefficients in (("b", b), ("a", a)):
         for n in range(order + 1):
-            value = given[n] if n < len(given) else 0.0
-            found[f"{key}{n}"] = finite(f"{key}{n} of element {name!r}", value)
-    return order, found
+            value = coefficients[n] if n < len(coefficients) else 0.0
+            values[f"{key}{n}"] = finite(f"{key}{n} of element {name!r}", value)
+    return order, values
 
 
-def _options(how: dict[str, Any]) -> tuple[int, int, bool, Model]:
-    """The options of a magnet in slices. **Raises** `TypeError` for an unknown one, `ValueError`
-    for an invalid one."""
-
-    def of(slices: int = 10, scheme: int = 4, fringe: bool = False, model: Model = "paraxial"):
-        one_of("scheme", scheme, KICKS)
-        one_of("model", model, get_args(Model))
-        return whole("slices", slices), scheme, fringe, model
-
-    refuse_unknown("a magnet", of, set(how) - set(inspect.signature(of).parameters))
-    return of(**how)
+def _slicing(
+    slices: int = 10, scheme: int = 4, fringe: bool = False, model: Model = "paraxial"
+) -> tuple[int, int, bool, Model]:
+    """The checked settings of a magnet in slices. **Raises** `ValueError` for an invalid one."""
+    one_of("scheme", scheme, KICKS)
+    one_of("model", model, get_args(Model))
+    return whole("slices", slices), scheme, fringe, model

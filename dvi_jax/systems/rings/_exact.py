@@ -16,30 +16,30 @@ def pz_of(z: Particle, px: Any = None) -> Any:
 def exact_drift(z: Particle, length: Any, par: Parameters) -> Particle:
     """The flow of −√((1 + δ)² − px² − py²) over a length [m]."""
     p, p2, pz = 1 + z.delta, z.px * z.px + z.py * z.py, pz_of(z)
-    each = length / pz
+    scale = length / pz
     # The path of the reference particle is subtracted: (p − pz)/pz without cancellation.
-    return z.moved(x=each * z.px, y=each * z.py, zeta=-each * p2 / (p + pz))
+    return z.plus(x=scale * z.px, y=scale * z.py, zeta=-scale * p2 / (p + pz))
 
 
 def _arc(z: Particle, px: Any) -> Any:
     """The angle between the momenta px before and after a bend, in the plane of the bend."""
-    across = jnp.sqrt((1 + z.delta) ** 2 - z.py * z.py)
-    return jnp.arcsin(z.px / across) - jnp.arcsin(px / across)
+    radius = jnp.sqrt((1 + z.delta) ** 2 - z.py * z.py)
+    return jnp.arcsin(z.px / radius) - jnp.arcsin(px / radius)
 
 
 def exact_bend(z: Particle, length: Any, par: Parameters) -> Particle:
     """The flow in a uniform field h in coordinates of curvature h. Forest 1998, (12.18)."""
     h = par["h"]
-    rest = pz_of(z) - (1 + z.x * h)
+    excess = pz_of(z) - (1 + z.x * h)
     c, s = jnp.cos(h * length), jnp.sin(h * length)
-    px = z.px * c + rest * s
+    px = z.px * c + excess * s
     path = length + _arc(z, px) / h
-    x = (pz_of(z, px) - rest * c + z.px * s - 1) / h
+    x = (pz_of(z, px) - excess * c + z.px * s - 1) / h
     late = (1 + z.delta) * path - length
     return z._replace(x=x, px=px, y=z.y + z.py * path, zeta=z.zeta - late)
 
 
-def rotated(z: Particle, angle: Any) -> Particle:
+def rotate(z: Particle, angle: Any) -> Particle:
     """Free motion to a plane that is rotated about the y-axis. Forest 1998, (10.26)."""
     c, s, pz = jnp.cos(angle), jnp.sin(angle), pz_of(z)
     p = c * pz - s * z.px
@@ -57,8 +57,8 @@ def wedge(z: Particle, angle: Any, h: Any) -> Particle:
     c, s, pz = jnp.cos(angle), jnp.sin(angle), pz_of(z)
     px = z.px * c + (pz - h * z.x) * s
     path = (angle + _arc(z, px)) / h
-    above = z.x * (z.px * jnp.sin(2 * angle) + s * s * (2 * pz - h * z.x))
-    x = z.x * c + above / (pz_of(z, px) + pz * c - z.px * s)
+    numerator = z.x * (z.px * jnp.sin(2 * angle) + s * s * (2 * pz - h * z.x))
+    x = z.x * c + numerator / (pz_of(z, px) + pz * c - z.px * s)
     return z._replace(x=x, px=px, y=z.y + z.py * path, zeta=z.zeta - (1 + z.delta) * path)
 
 
@@ -76,15 +76,15 @@ def dipole_fringe(z: Particle, h: Any, gap: Any) -> Particle:
     )
     y = 2 * z.y / (1 + jnp.sqrt(1 - 2 * of_py * z.y))
     half = y * y / 2
-    return z._replace(y=y).moved(x=of_px * half, py=-value * y, zeta=of_delta * half)
+    return z._replace(y=y).plus(x=of_px * half, py=-value * y, zeta=of_delta * half)
 
 
 def multipole_fringe(z: Particle, par: Parameters, side: int, order: int, skips_b0: bool):
     """The hard edge of multipoles, to first order in the field. Forest 1998, (13.29)."""
 
-    def shift(at):
-        x, y = at
-        re, im, total = 1.0, 0.0, jnp.zeros_like(at)
+    def shift(point):
+        x, y = point
+        re, im, total = 1.0, 0.0, jnp.zeros_like(point)
         for n in range(order + 1):
             re, im = re * x - im * y, re * y + im * x
             b = 0.0 if n == 0 and skips_b0 else par[f"b{n}"]
@@ -94,15 +94,15 @@ def multipole_fringe(z: Particle, par: Parameters, side: int, order: int, skips_
             total = total - side / (4 * (j + 1)) * jnp.stack([u * x + c * v * y, u * y - c * v * x])
         return total
 
-    at, p = jnp.stack([z.x, z.y]), 1 + z.delta
-    f = shift(at)
-    J = jax.jacfwd(shift)(at) / p
+    point, p = jnp.stack([z.x, z.y]), 1 + z.delta
+    f = shift(point)
+    J = jax.jacfwd(shift)(point) / p
     # (1 − Jᵀ) p' = p, two equations.
     a, d, b, c = 1 - J[0, 0], 1 - J[1, 1], -J[1, 0], -J[0, 1]
     det = a * d - b * c
     px, py = (d * z.px - b * z.py) / det, (a * z.py - c * z.px) / det
     late = -(px * f[0] + py * f[1]) / (p * p)
-    return z._replace(px=px, py=py).moved(x=-f[0] / p, y=-f[1] / p, zeta=-late)
+    return z._replace(px=px, py=py).plus(x=-f[0] / p, y=-f[1] / p, zeta=-late)
 
 
 # --- bends to second order -----------------------------------------------------------------------
@@ -153,29 +153,29 @@ def _second_order_kick(z: Particle, length: Any, par: Parameters, order: int) ->
     h, x, y = par["h"], z.x, z.y
     b1, b2 = (par[f"b{n}"] if n <= order else 0.0 for n in (1, 2))
     re, im = field(z, {**par, **{f"a{n}": 0.0 for n in range(order + 1)}}, order)
-    bent = h * x + b1 * (x * x - y * y / 2) + b2 * (x**3 - 4 / 3 * x * y * y)
-    up = b1 * x * y + 4 / 3 * b2 * x * x * y + (h / 6 * b1 - b2 / 3) * y**3
-    return z.moved(
-        px=-length * (re - h * z.delta + h * bent),
-        py=length * (im + h * up),
+    horizontal = h * x + b1 * (x * x - y * y / 2) + b2 * (x**3 - 4 / 3 * x * y * y)
+    vertical = b1 * x * y + 4 / 3 * b2 * x * x * y + (h / 6 * b1 - b2 / 3) * y**3
+    return z.plus(
+        px=-length * (re - h * z.delta + h * horizontal),
+        py=length * (im + h * vertical),
         zeta=-length * h * x,
     )
 
 
-def second_order_bend(of: Part) -> list[Piece]:
-    kicks, order = KICKS[of.scheme], of.order
+def second_order_bend(part: Part) -> list[Piece]:
+    kicks, order = KICKS[part.scheme], part.order
     coasts = [(a + b) / 2 for a, b in zip((0.0, *kicks), (*kicks, 0.0), strict=True)]
 
     def one_slice(z, par, turn, sign):
-        part = par["length"] / of.slices
+        thickness = par["length"] / part.slices
         # Not a flow: two of these drifts are not one, and the inverse is solved for.
         for i in range(len(coasts))[::sign]:
             if sign < 0 and i < len(kicks):
-                z = _second_order_kick(z, -kicks[i] * part, par, order)
-            coast = near_identity(lambda z, par, c=coasts[i]: _curved_drift(z, c * part, par))
+                z = _second_order_kick(z, -kicks[i] * thickness, par, order)
+            coast = near_identity(lambda z, par, c=coasts[i]: _curved_drift(z, c * thickness, par))
             z = coast.apply(z, par, turn, sign)
             if sign > 0 and i < len(kicks):
-                z = _second_order_kick(z, kicks[i] * part, par, order)
+                z = _second_order_kick(z, kicks[i] * thickness, par, order)
         return z
 
-    return [Piece(one_slice, of.slices)]
+    return [Piece(one_slice, part.slices)]

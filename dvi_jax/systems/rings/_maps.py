@@ -20,9 +20,9 @@ class Particle(NamedTuple):
     zeta: Any
     delta: Any
 
-    def moved(self, **by: Any) -> "Particle":
-        """The particle with `by` added to its coordinates."""
-        return self._replace(**{name: getattr(self, name) + d for name, d in by.items()})
+    def plus(self, **changes: Any) -> "Particle":
+        """The particle with these changes added to its coordinates."""
+        return self._replace(**{name: getattr(self, name) + d for name, d in changes.items()})
 
 
 Parameters = Mapping[str, Any]
@@ -58,10 +58,10 @@ def forward(
     """The map of a part of an element, or its inverse for sign −1."""
     for piece in pieces[::sign]:
 
-        def once(z, _, piece=piece):
+        def step(z, _, piece=piece):
             return piece.apply(z, par, turn, sign), None
 
-        z, _ = once(z, None) if piece.times == 1 else lax.scan(once, z, None, piece.times)
+        z, _ = step(z, None) if piece.times == 1 else lax.scan(step, z, None, piece.times)
     return z
 
 
@@ -78,18 +78,18 @@ def pull_back(
     state = z, cotangent, jax.tree.map(jnp.zeros_like, moving)
     for piece in reversed(pieces):
 
-        def once(state, _, piece=piece):
+        def step(state, _, piece=piece):
             z, cotangent, total = state
             z = piece.apply(z, par, turn, -1)
 
-            def of(z, moving):
+            def image(z, moving):
                 return piece.apply(z, {**par, **moving}, turn, 1)
 
-            cotangent, more = jax.vjp(of, z, moving)[1](cotangent)
-            return (z, cotangent, jax.tree.map(jnp.add, total, more)), None
+            cotangent, slope = jax.vjp(image, z, moving)[1](cotangent)
+            return (z, cotangent, jax.tree.map(jnp.add, total, slope)), None
 
         state, _ = (
-            once(state, None) if piece.times == 1 else lax.scan(once, state, None, piece.times)
+            step(state, None) if piece.times == 1 else lax.scan(step, state, None, piece.times)
         )
     return state
 
@@ -99,11 +99,11 @@ def near_identity(change: Callable[[Particle, Parameters], dict[str, Any]]) -> P
 
     def apply(z, par, turn, sign):
         if sign > 0:
-            return z.moved(**change(z, par))
-        found = z
+            return z.plus(**change(z, par))
+        root = z
         for _ in range(8):  # a change of 1 % of the coordinates has converged to round-off
-            found = z.moved(**{name: -d for name, d in change(found, par).items()})
-        return found
+            root = z.plus(**{name: -shift for name, shift in change(root, par).items()})
+        return root
 
     return Piece(apply)
 
@@ -120,19 +120,19 @@ KICKS = {
 }
 
 
-def sliced(coast: Callable, kick: Callable, part: Part) -> list[Piece]:
+def drifts_and_kicks(coast: Callable, kick: Callable, part: Part) -> list[Piece]:
     """``coast(z, length, par)`` and ``kick(z, length, par, order)`` by turns in each slice. The two
     coasts between slices are one; half a coast before the first slice and after the last completes
     them."""
     kicks = KICKS[part.scheme]
-    between = [(a + b) / 2 for a, b in zip(kicks, (*kicks[1:], kicks[0]), strict=True)]
+    coasts = [(a + b) / 2 for a, b in zip(kicks, (*kicks[1:], kicks[0]), strict=True)]
 
     def end(c):
         c = c / part.slices
         return Piece(lambda z, par, turn, sign: coast(z, sign * c * par["length"], par))
 
     def one_slice(z, par, turn, sign):
-        moves = [m for k, d in zip(kicks, between, strict=True) for m in ((True, k), (False, d))]
+        moves = [m for k, d in zip(kicks, coasts, strict=True) for m in ((True, k), (False, d))]
         for is_kick, c in moves[::sign]:
             length = sign * c / part.slices * par["length"]
             z = kick(z, length, par, part.order) if is_kick else coast(z, length, par)
@@ -144,9 +144,9 @@ def sliced(coast: Callable, kick: Callable, part: Part) -> list[Piece]:
 def drift(z: Particle, length: Any, par: Parameters) -> Particle:
     """The flow of (px² + py²)/(2 (1 + δ)) over a length [m]."""
     p = 1 + z.delta
-    each = length / p
-    late = each * (z.px * z.px + z.py * z.py) / (2 * p)
-    return z.moved(x=each * z.px, y=each * z.py, zeta=-late)
+    scale = length / p
+    late = scale * (z.px * z.px + z.py * z.py) / (2 * p)
+    return z.plus(x=scale * z.px, y=scale * z.py, zeta=-late)
 
 
 def field(z: Particle, par: Parameters, order: int) -> tuple[Any, Any]:
@@ -160,14 +160,14 @@ def field(z: Particle, par: Parameters, order: int) -> tuple[Any, Any]:
 def kick(z: Particle, length: Any, par: Parameters, order: int) -> Particle:
     """The kick of multipoles over a length [m]."""
     re, im = field(z, par, order)
-    return z.moved(px=-length * re, py=length * im)
+    return z.plus(px=-length * re, py=length * im)
 
 
 def curved_kick(z: Particle, length: Any, par: Parameters, order: int) -> Particle:
     """The kick in a bend of curvature h: also h δ − h² x, from the field that bends by h."""
     h = par["h"]
     z = kick(z, length, par, order)
-    return z.moved(px=length * h * (z.delta - h * z.x), zeta=-length * h * z.x)
+    return z.plus(px=length * h * (z.delta - h * z.x), zeta=-length * h * z.x)
 
 
 # --- thin parts ----------------------------------------------------------------------------------
@@ -219,22 +219,22 @@ def thin_kick(z: Particle, par: Parameters, sign: int, order: int) -> Particle:
 def lens(z: Particle, par: Parameters, sign: int, potential: Callable) -> Particle:
     """The kick −∇V of a potential V(x, y, par)."""
     of_x, of_y = jax.grad(potential, argnums=(0, 1))(z.x, z.y, par)
-    return z.moved(px=-sign * of_x, py=-sign * of_y)
+    return z.plus(px=-sign * of_x, py=-sign * of_y)
 
 
 def cavity(z: Particle, par: Parameters, turn: Any, sign: int) -> Particle:
     """δ − V sin(k (−ζ − lag) − turn·slip − phase): V over the energy, k = 2π f/c."""
     angle = par["wave_number"] * (-z.zeta - par["lag"]) - turn * par["slip"] - par["phase"]
-    return z.moved(delta=-sign * par["voltage"] * jnp.sin(angle))
+    return z.plus(delta=-sign * par["voltage"] * jnp.sin(angle))
 
 
 def corrector(z: Particle, par: Parameters, turn: Any, sign: int) -> Particle:
     """A constant field over a length, with the whole kick at the end of it."""
     kx, ky, p = sign * par["kick_x"], sign * par["kick_y"], 1 + z.delta
-    each = sign * par["length"] / p
+    scale = sign * par["length"] / p
     squares = (kx * kx + ky * ky) / 3 + z.px * (z.px + kx) + z.py * (z.py + ky)
-    shift = {"x": each * (z.px + kx / 2), "y": each * (z.py + ky / 2)}
-    return z.moved(px=kx, py=ky, zeta=-each * squares / (2 * p), **shift)
+    shift = {"x": scale * (z.px + kx / 2), "y": scale * (z.py + ky / 2)}
+    return z.plus(px=kx, py=ky, zeta=-scale * squares / (2 * p), **shift)
 
 
 def solenoid(z: Particle, par: Parameters, turn: Any, sign: int) -> Particle:
@@ -258,15 +258,15 @@ def solenoid(z: Particle, par: Parameters, turn: Any, sign: int) -> Particle:
     )
 
 
-def placed(z: Particle, par: Parameters, sign: int) -> Particle:
+def element_coordinates(z: Particle, par: Parameters, sign: int) -> Particle:
     """Coordinates relative to an element that is shifted by (dx, dy) [m] and then rolled."""
     c, s = jnp.cos(par["roll"]), jnp.sin(par["roll"])
 
-    def turned(u, v, s):
+    def rotate(u, v, s):
         return c * u + s * v, c * v - s * u
 
     x, y = (z.x - par["dx"], z.y - par["dy"]) if sign > 0 else (z.x, z.y)
-    (x, y), (px, py) = turned(x, y, sign * s), turned(z.px, z.py, sign * s)
+    (x, y), (px, py) = rotate(x, y, sign * s), rotate(z.px, z.py, sign * s)
     if sign < 0:
         x, y = x + par["dx"], y + par["dy"]
     return z._replace(x=x, px=px, y=y, py=py)

@@ -17,7 +17,7 @@ from ...base.checks import finite, positive, whole
 from ...base.progress import bar_of, reporter
 from ...dynamics.frequencies import frequencies, frequency_diffusion
 from ._maps import Particle
-from ._optics import SLICED, Optics, analysis, four, maps, optics
+from ._optics import SLICED_PARTS, Optics, analysis, four, maps, optics
 from ._ring import Ring, Where
 from ._track import track
 from ._turn import Passage, start
@@ -52,10 +52,10 @@ def detuning(ring: Ring, dp: float = 0.0, action: float = 1e-9, turns: int = 102
     o, ring = optics(ring, finite("dp", dp), chromatic=False), four(ring)
     size = np.sqrt(2 * positive("action", action) * np.mgrid[1:5, 1:5].reshape(2, 16).T)
     z = o.orbit[:1] + jnp.pad(jnp.real(size @ o.modes[0]), ((0, 0), (0, 2)))
-    found = frequencies(np.arange(turns), _signal(o, track(ring, z, turns, every=1).z), count=2)
-    x, y = jnp.abs(found.amplitudes[..., 0].T) ** 2 / 2 / action
+    lines = frequencies(np.arange(turns), _signal(o, track(ring, z, turns, every=1).z), count=2)
+    x, y = jnp.abs(lines.amplitudes[..., 0].T) ** 2 / 2 / action
     terms = jnp.stack([x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3], 1)
-    change = found.frequencies[..., 0] / (2 * np.pi) - 0.25
+    change = lines.frequencies[..., 0] / (2 * np.pi) - 0.25
     return jnp.linalg.lstsq(terms, change)[0][:2].T / action
 
 
@@ -65,8 +65,8 @@ def _signal(o: Optics, z: Array) -> Array:
     v, n = o.modes[0, :2], o.modes.shape[-1]
     S = np.kron(np.eye(n // 2), [[0, 1], [-1, 0]])
     w = -1j * jnp.conj(v) @ S
-    back = jnp.exp(2j * np.pi * jnp.outer(0.25 - o.tune[:2], jnp.arange(z.shape[1])))
-    return jnp.einsum("ki,pti,kt->pkt", w, z[..., :n] - o.orbit[:1, None, :n], back)
+    carrier = jnp.exp(2j * np.pi * jnp.outer(0.25 - o.tune[:2], jnp.arange(z.shape[1])))
+    return jnp.einsum("ki,pti,kt->pkt", w, z[..., :n] - o.orbit[:1, None, :n], carrier)
 
 
 def resonance_driving_terms(
@@ -100,32 +100,32 @@ def _driving_terms(ring: Ring, z: Array, terms: tuple[str, ...]) -> dict[str, Ar
     o, _ = analysis(ring, z, jnp.zeros(()), False, False, True)
     apply, xs = maps(four(ring), 0.0)
     names = np.asarray([ring.program.parts[part].name for part, _ in ring.program.rows])
-    mine = np.flatnonzero(np.isin(names, (*SLICED, "thin", "second_order_bend")))
+    mine = np.flatnonzero(np.isin(names, (*SLICED_PARTS, "thin", "second_order_bend")))
     points, weights = np.polynomial.legendre.leggauss(5)
 
-    def inside(x, share):
-        (par, *how), z, v, D = x
+    def point_optics(x, share):
+        (par, *tail), z, v, D = x
         part = {**par, "length": share * par["length"]}
-        M = jax.jacfwd(lambda z: jnp.stack(apply(Particle(*z), (part, *how))))(z)
+        M = jax.jacfwd(lambda z: jnp.stack(apply(Particle(*z), (part, *tail))))(z)
         return M[0, :4] @ v[0], M[2, :4] @ v[1], M[0, :4] @ D + M[0, 5]
 
-    every = jax.tree.map(lambda a: a[mine], (xs, o.orbit, o.modes, o.dispersion))
-    x, y, D = lax.map(lambda s: lax.map(lambda e: inside(e, s), every), (1 + points) / 2)
-    par = every[0][0]
+    magnets = jax.tree.map(lambda a: a[mine], (xs, o.orbit, o.modes, o.dispersion))
+    x, y, D = lax.map(lambda s: lax.map(lambda e: point_optics(e, s), magnets), (1 + points) / 2)
+    par = magnets[0][0]
     length = np.outer(weights / 2, 1.0) * jnp.where(names[mine] == "thin", 1.0, par["length"])[None]
-    found = {}
+    totals = {}
     for name in terms:
         j, k, m, n, p = map(int, name[1:])
-        found[name] = jnp.zeros((), complex)
+        totals[name] = jnp.zeros((), complex)
         for q in range(p + 1):
             N, ny = j + k + m + n + q, m + n
             field = par.get(f"{'ab'[ny % 2 == 0]}{N - 1}")
             if N > 1 and field is not None:
                 count = math.comb(N, ny) * math.comb(ny, m) * math.comb(N - ny, q)
                 count *= math.comb(j + k, j) * (-1) ** (p - q + (ny + 1) // 2)
-                at = x**j * jnp.conj(x) ** k * y**m * jnp.conj(y) ** n * D**q
-                found[name] += count / N / 2 ** (j + k + ny) * jnp.sum(length * field[None] * at)
-    return found
+                term = x**j * jnp.conj(x) ** k * y**m * jnp.conj(y) ** n * D**q
+                totals[name] += count / N / 2 ** (j + k + ny) * jnp.sum(length * field[None] * term)
+    return totals
 
 
 def dynamic_aperture(
@@ -177,19 +177,18 @@ def momentum_aperture(
     orbit = optics(ring, chromatic=False).orbit
     first = np.repeat(np.arange(len(ring)) if where is None else ring.where(where), 2)
     side = positive("largest", largest) * np.resize([-1.0, 1.0], len(first))
-    begins, passage = orbit[first] + 1e-6 * _XY.sum(0)[None], Passage.of(ring)
+    begins, passage = orbit[first] + 1e-6 * _XY.sum(0)[None], Passage.from_ring(ring)
 
-    def one(passage, z, first):
-        def row(flight, x):
-            number, par = jax.tree.map(lambda a: a[None], x)
-            after = Passage(par, number, passage.parts).flown(flight, 0, 0.0)
-            skips = x[0]["element"] < first
-            return jax.tree.map(lambda a, b: jnp.where(skips, a, b), flight, after), None
+    def end_of_turn(passage, z, first):
+        def row(flight, columns):
+            numbers, rows, slopes = jax.tree.map(lambda a: a[None], columns)
+            continuation = Passage(rows, slopes, numbers, passage.parts).fly(flight, 0, 0.0)
+            skips = columns[0]["element"] < first
+            return jax.tree.map(lambda a, b: jnp.where(skips, a, b), flight, continuation), None
 
-        xs = passage.numbers, passage.rows
-        return jnp.stack(lax.scan(row, start(Particle(*z)), xs)[0].z)
+        return jnp.stack(lax.scan(row, start(Particle(*z)), passage.tables)[0].z)
 
-    finish = jax.jit(jax.vmap(lambda z, first: lanewise.call(one, passage, z, first)))
+    finish = jax.jit(jax.vmap(lambda z, first: lanewise.call(end_of_turn, passage, z, first)))
 
     def survive(r):
         z = jnp.einsum("rs,i->rsi", r * side[:, None], np.eye(6)[5]) + begins[:, None]
@@ -212,15 +211,15 @@ def frequency_map(
     xy = 1e-9 + np.stack(np.broadcast_arrays(x, y), -1).reshape(-1, 2)
     whole("turns", turns, 64)
 
-    def found(z):
+    def tunes_of_halves(z):
         signal = _signal(o, track(ring, z, turns, every=1).z)
         halves = frequency_diffusion(np.arange(turns), signal, throw=False)
         return jnp.stack([halves.first, halves.second], 1)
 
-    both = _pieces(found, progress, o.orbit[:1] + xy @ _XY) / (2 * np.pi) - 0.25
-    both = both.reshape(*np.broadcast_shapes(np.shape(x), np.shape(y)), 2, 2)
-    change = jnp.linalg.norm(both[..., 1, :] - both[..., 0, :], axis=-1)
-    tune = (both + o.tune[:2].reshape((1,) * (both.ndim - 1) + (2,))) % 1
+    tunes = _pieces(tunes_of_halves, progress, o.orbit[:1] + xy @ _XY) / (2 * np.pi) - 0.25
+    tunes = tunes.reshape(*np.broadcast_shapes(np.shape(x), np.shape(y)), 2, 2)
+    change = jnp.linalg.norm(tunes[..., 1, :] - tunes[..., 0, :], axis=-1)
+    tune = (tunes + o.tune[:2].reshape((1,) * (tunes.ndim - 1) + (2,))) % 1
     return FrequencyMap(tune[..., 0, :], tune[..., 1, :], jnp.log10(jnp.maximum(change, 1e-16)))
 
 
@@ -229,8 +228,9 @@ def _first_loss(survive: Callable, rays: int, steps: int, rounds: int) -> Array:
     low, width = jnp.zeros((rays, 1)), jnp.ones((rays, 1))
     for _ in range(whole("rounds", rounds)):
         shares = np.arange(1, whole("steps", steps, 2) + 1)[None] / steps
-        many = jnp.sum(jnp.cumprod(survive(low + width * shares), 1), 1, keepdims=True)
-        low, width = low + width * many / steps, jnp.where(many == steps, 0.0, width / steps)
+        survivals = jnp.sum(jnp.cumprod(survive(low + width * shares), 1), 1, keepdims=True)
+        low = low + width * survivals / steps
+        width = jnp.where(survivals == steps, 0.0, width / steps)
     return low[:, 0]
 
 
@@ -238,17 +238,17 @@ def _pieces(function: Callable, progress: Report, *arrays: Array) -> Array:
     """`function` of particles, arrays (…, 6) and (…), in batches of one size, with progress."""
     shape = arrays[0].shape[:-1]
     flat = [a.reshape(-1, *a.shape[len(shape) :]) for a in arrays]
-    each = -(-len(flat[0]) // -(-len(flat[0]) // _BATCH))
+    size = -(-len(flat[0]) // -(-len(flat[0]) // _BATCH))
     outs = []
 
     def columns(p: tuple[int, int]) -> dict[str, Any]:
         return {"completed": p[0], "total": p[1]}
 
     with reporter(progress, bar_of("particles", (), columns)) as report:
-        for i in range(0, N := len(flat[0]), each):
-            some = np.minimum(np.arange(i, i + each), N - 1)
-            outs.append(jax.block_until_ready(function(*(a[some] for a in flat))))
+        for i in range(0, N := len(flat[0]), size):
+            indices = np.minimum(np.arange(i, i + size), N - 1)
+            outs.append(jax.block_until_ready(function(*(a[indices] for a in flat))))
             if report:
-                report((min(i + each, N), N))
+                report((min(i + size, N), N))
     out = jnp.concatenate(outs)[:N]
     return out.reshape(*shape, *out.shape[1:])

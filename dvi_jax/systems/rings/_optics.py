@@ -17,10 +17,10 @@ from ...base.checks import instance
 from ._maps import KICKS, Particle, distinct, forward
 from ._parts import pieces_of
 from ._ring import Ring
-from ._turn import Passage, perturbed
+from ._turn import Passage, coordinates, parameters_at
 
-SLICED = "straight", "bend", "exact_straight", "exact_bend"
-_MOST, _AFTER, _NEAR = 15, 3, 1e-9
+SLICED_PARTS = "straight", "bend", "exact_straight", "exact_bend"
+_MOST_ITERATIONS, _EXTRA_ITERATIONS, _SMALL = 15, 3, 1e-9
 """Newton iterations at most, and after the first correction that is smaller than the last one."""
 _EQUAL = 1e-12
 """Difference of two eigenvalues that is round-off."""
@@ -64,34 +64,27 @@ def one_turn(ring: Ring, z: Any, epsilon: Any = 0.0) -> Array:
     differentiated repeatedly in every mode. See `track` for the coordinates.
     """
     instance("ring", ring, Ring, "a rings.Ring")
-    passage = Passage.of(ring)
+    passage = Passage.from_ring(ring)
 
-    def one(passage, z, epsilon):
-        return jnp.stack(passage.moved(Particle(*z), 0, epsilon))
+    def image(passage, z, epsilon):
+        return jnp.stack(passage.image(Particle(*z), 0, epsilon))
 
-    def of(z):
-        return lanewise.call(one, passage, z, jnp.asarray(epsilon, float))
+    def turn_map(z):
+        return lanewise.call(image, passage, z, jnp.asarray(epsilon, float))
 
-    z = _coordinates("z", z)
-    return jax.vmap(of)(z.reshape(-1, 6)).reshape(z.shape) if z.ndim > 1 else of(z)
-
-
-def _coordinates(name: str, z: Any) -> Array:
-    z = jnp.asarray(z, float)
-    if z.shape[-1:] != (6,):
-        raise ValueError(f"{name} must have 6 coordinates on its last axis, got shape {z.shape}.")
-    return z
+    z = coordinates("z", z)
+    return jax.vmap(turn_map)(z.reshape(-1, 6)).reshape(z.shape) if z.ndim > 1 else turn_map(z)
 
 
 def closed_orbit(ring: Ring, dp: Any = None, guess: Any = None, epsilon: Any = 0.0) -> Array:
     """Closed orbit at the start, shape (6,); see `optics`. The motion may be unstable."""
-    return _analysed(ring, dp, guess, epsilon, False, False).orbit[0]
+    return _analyse(ring, dp, guess, epsilon, False, False).orbit[0]
 
 
 def matrix(ring: Ring, dp: Any = None, guess: Any = None, epsilon: Any = 0.0) -> Array:
     """One-turn matrix of (x, px, y, py, ζ, δ) about the closed orbit, shape (6, 6); see `optics`.
     The motion may be unstable."""
-    return _analysed(ring, dp, guess, epsilon, False, False).matrix[-1]
+    return _analyse(ring, dp, guess, epsilon, False, False).matrix[-1]
 
 
 def optics(
@@ -135,42 +128,41 @@ def optics(
     # [0.22 0.18]
     ```
     """
-    return _analysed(ring, dp, guess, epsilon, chromatic, True)
+    return _analyse(ring, dp, guess, epsilon, chromatic, True)
 
 
-def _analysed(ring: Ring, dp: Any, guess: Any, epsilon: Any, chromatic: bool, stable: bool):
+def _analyse(ring: Ring, dp: Any, guess: Any, epsilon: Any, chromatic: bool, stable: bool):
     instance("ring", ring, Ring, "a rings.Ring").check()
     voltage = ring.columns.get("voltage", np.zeros(1))
     six = dp is None and (is_traced(voltage) or bool(np.any(np.asarray(voltage) != 0)))
-    z = _coordinates("guess", np.zeros(6) if guess is None else guess)
+    z = coordinates("guess", np.zeros(6) if guess is None else guess)
     if not six:
         z = z.at[4].set(0.0).at[5].set(0.0 if dp is None else dp)
-    found, change = analysis(ring, z, jnp.asarray(epsilon, float), six, chromatic)
+    twiss, change = analysis(ring, z, jnp.asarray(epsilon, float), six, chromatic)
     if is_traced(change):
-        return found
-    if not change < _NEAR:
+        return twiss
+    if not change < _SMALL:
         raise ValueError(
-            f"no closed orbit was found: after {_MOST} iterations of Newton's method the last "
-            f"correction is {change:.2g}. Likely causes: (a) δ is beyond the momentum acceptance; "
-            "(b) errors of magnets that are too large: give a guess, for example the orbit with "
-            "half of the errors; (c) a tune at a whole number."
+            f"no closed orbit was found: correction {_MOST_ITERATIONS} of Newton's method is "
+            f"{change:.2g}. Give a guess, such as the orbit with half of the errors."
         )
-    if stable and np.isnan(found.tune).any():
-        M = np.asarray(found.matrix[-1])[: found.modes.shape[-1], : found.modes.shape[-1]]
+    if stable and np.isnan(twiss.tune).any():
+        M = np.asarray(twiss.matrix[-1])[: twiss.modes.shape[-1], : twiss.modes.shape[-1]]
         half = [round(float(np.trace(M[i : i + 2, i : i + 2])) / 2, 4) for i in range(0, len(M), 2)]
         raise ValueError(
             f"the motion is unstable: half of the trace of the one-turn matrix is {half} in x, y "
-            f"(, ζ), between −1 and 1 if stable and uncoupled, and its eigenvalues have the moduli "
-            f"{np.sort(np.abs(np.linalg.eigvals(M))).round(6).tolist()}. Change the strengths of "
-            "the quadrupoles, or the phase of the cavities if the plane is ζ."
+            "(, ζ), not between −1 and 1, or its eigenvalues have moduli other than 1: "
+            f"{np.sort(np.abs(np.linalg.eigvals(M))).round(6).tolist()}."
         )
-    return found
+    return twiss
 
 
 def four(ring: Ring) -> Ring:
     """The ring with its cavities off."""
-    off = {n: jnp.zeros_like(c) if n == "voltage" else c for n, c in ring.columns.items()}
-    return eqx.tree_at(lambda r: r.columns, ring, off)
+    columns = dict(ring.columns)
+    if "voltage" in columns:
+        columns["voltage"] = jnp.zeros_like(columns["voltage"])
+    return eqx.tree_at(lambda r: r.columns, ring, columns)
 
 
 def maps(ring: Ring, epsilon: Any) -> tuple[Callable, Any]:
@@ -179,20 +171,20 @@ def maps(ring: Ring, epsilon: Any) -> tuple[Callable, Any]:
     Less code is compiled than for tracking: magnets in slices of any number and scheme are one
     sequence of kicks, with drifts between them.
     """
-    passage = Passage.of(ring)
+    passage = Passage.from_ring(ring)
     parts, thick = passage.parts, {"scheme": 2, "slices": 1}
     order = max(p.order for p in parts)
-    kinds = [p._replace(order=order, **(thick if p.name in SLICED else {})) for p in parts]
+    kinds = [p._replace(order=order, **(thick if p.name in SLICED_PARTS else {})) for p in parts]
     kicks = [np.divide([0.0, *KICKS.get(p.scheme, ()) * p.slices], p.slices) for p in parts]
     steps = np.stack([np.pad(k, (0, max(map(len, kicks)) + 1 - len(k))) for k in kicks])
     all_kinds = distinct(kinds)
-    which = np.asarray([all_kinds.index(kind) for kind in kinds], np.int32)
+    numbers = np.asarray([all_kinds.index(kind) for kind in kinds], np.int32)
 
     def apply(z, x):
-        par, which, steps = x
-        par = perturbed(par, epsilon)
+        values, slopes, part, steps = x
+        par = parameters_at(values, slopes, epsilon)
 
-        def through(kind):
+        def kind_map(kind):
             pieces = pieces_of(kind)
 
             def kick(z, step):
@@ -201,37 +193,38 @@ def maps(ring: Ring, epsilon: Any) -> tuple[Callable, Any]:
                     z = piece.apply(z, {**par, "length": share * par["length"]}, 0, 1)
                 return z, None
 
-            if kind.name in SLICED:
+            if kind.name in SLICED_PARTS:
                 return lambda z: lax.scan(kick, z, jnp.stack([steps[:-1], steps[1:]], 1))[0]
             return lambda z: forward(pieces, z, par, 0, 1)
 
-        return lax.switch(which, [through(kind) for kind in all_kinds], z)
+        return lax.switch(part, [kind_map(kind) for kind in all_kinds], z)
 
-    number = passage.numbers["part"]
+    part = passage.numbers["part"]
     # Recomputed in reverse mode: otherwise each part stores what every kind of part would need.
-    return jax.checkpoint(apply), (passage.rows, which[number], steps[number])
+    rows, slopes = passage.rows, passage.slopes
+    return jax.checkpoint(apply), (rows, slopes, numbers[part], steps[part])
 
 
 @eqx.filter_jit
 def analysis(
-    ring: Ring, z: Array, epsilon: Array, six: bool, chromatic: bool, inside: bool = False
+    ring: Ring, z: Array, epsilon: Array, six: bool, chromatic: bool, by_part: bool = False
 ) -> tuple[Optics, Array]:
     """See `optics`; also the last correction of the closed orbit. `inside`: before each part of an
     element and at the end, not at the elements (but for `s`)."""
     c, shift, n, (e_zeta, e_delta) = ring.columns, 0.0, 6 if six else 4, np.eye(6)[4:]
     if six:
         # The change of ζ per turn of a particle that keeps its phase in the cavities.
-        on = c["voltage"] != 0
-        slip = jnp.where(on, c["slip"] / jnp.where(on, c["wave_number"], 1.0), 0.0)
-        shift = -jnp.sum(slip) / jnp.sum(on)
+        active = c["voltage"] != 0
+        slip = jnp.where(active, c["slip"] / jnp.where(active, c["wave_number"], 1.0), 0.0)
+        shift = -jnp.sum(slip) / jnp.sum(active)
     apply, xs = maps(ring if six else four(ring), epsilon)
 
-    def along(z):
+    def states(z):
         zs = lax.scan(lambda z, x: (apply(z, x),) * 2, Particle(*z), xs)[1]
         zs = jnp.concatenate([z[None], jnp.stack(zs, 1)])
         return zs, zs
 
-    linear = jax.jacfwd(along, has_aux=True)
+    linear = jax.jacfwd(states, has_aux=True)
 
     def iterate(state):
         z, D, _, count = state
@@ -246,15 +239,18 @@ def analysis(
         slip = 1 / D[5] if six else -(M @ (D + e_delta))[4]
         D = D * slip if six else D + e_delta
         size = jnp.max(jnp.abs(change))
-        count = jnp.where((count > 0) | (size < _NEAR), count + 1, 0)
+        count = jnp.where((count > 0) | (size < _SMALL), count + 1, 0)
         return z + change, D, (zs, Ms, dMs[-1], D, slip, size), count
 
-    shapes = (rows := len(xs[1]) + 1, 6), (rows, 6, 6), (6, 6), (6,), (), ()
+    shapes = (rows := len(xs[-1]) + 1, 6), (rows, 6, 6), (6, 6), (6,), (), ()
     begin = z, jnp.asarray(e_delta), tuple(jnp.full(x, jnp.nan) for x in shapes), jnp.asarray(0)
     (*_, (zs, Ms, dM, D, slip, size), _), _ = lax.scan(
-        lambda s, _: (lax.cond(s[3] > _AFTER, lambda s: s, iterate, s), None), begin, None, _MOST
+        lambda s, _: (lax.cond(s[3] > _EXTRA_ITERATIONS, lambda s: s, iterate, s), None),
+        begin,
+        None,
+        _MOST_ITERATIONS,
     )
-    zs, Ms, slip = (jnp.where(size < _NEAR, x, jnp.nan) for x in (zs, Ms, slip))
+    zs, Ms, slip = (jnp.where(size < _SMALL, x, jnp.nan) for x in (zs, Ms, slip))
     v, chromaticity = _modes(Ms[-1, :n, :n], dM[:n, :n])
     vs = jnp.einsum("rij,kj->rki", Ms[:, :n, :n], v)
     x, px = (jnp.diagonal(vs[:, :, i::2], axis1=1, axis2=2) for i in (0, 1))
@@ -262,23 +258,23 @@ def analysis(
     mu = jnp.where(np.arange(n // 2)[None] < 2, (mu + 0.5) % (2 * np.pi) - 0.5, mu)
     mu = jnp.concatenate([jnp.zeros((1, n // 2)), jnp.cumsum(mu, 0)])
     Ds = jnp.real(vs[:, 2] / vs[:, 2, 5:]) if six else Ms @ D
-    at = np.searchsorted([element for _, element in ring.program.rows], np.arange(len(ring) + 1))
-    at, tune = np.arange(rows) if inside else at, mu[-1] / (2 * np.pi)
-    found = Optics(
+    index = np.searchsorted([element for _, element in ring.program.rows], np.arange(len(ring) + 1))
+    index, tune = np.arange(rows) if by_part else index, mu[-1] / (2 * np.pi)
+    twiss = Optics(
         s=ring.places,
-        orbit=zs[at],
-        beta=jnp.abs(x[at, :2]) ** 2,
-        alpha=-jnp.real(jnp.conj(x) * px)[at, :2],
-        mu=mu[at],
-        dispersion=Ds[at, :4],
-        modes=vs[at],
-        gamma=jnp.sqrt(jnp.imag(jnp.conj(x) * px)[at, 0]),
-        matrix=Ms[at],
+        orbit=zs[index],
+        beta=jnp.abs(x[index, :2]) ** 2,
+        alpha=-jnp.real(jnp.conj(x) * px)[index, :2],
+        mu=mu[index],
+        dispersion=Ds[index, :4],
+        modes=vs[index],
+        gamma=jnp.sqrt(jnp.imag(jnp.conj(x) * px)[index, 0]),
+        matrix=Ms[index],
         tune=jnp.abs(tune),
         chromaticity=jnp.sign(tune) * chromaticity,
         compaction=slip / ring.places[-1],
     )
-    return found, size
+    return twiss, size
 
 
 def _modes(M: Array, dM: Array) -> tuple[Array, Array]:
@@ -292,11 +288,11 @@ def _modes(M: Array, dM: Array) -> tuple[Array, Array]:
 
     _, V = jnp.linalg.eig(lax.stop_gradient(M))
     areas, order = area(V), []
-    taken = jnp.where(jnp.sum(areas, 0) > _UNSTABLE, 0.0, np.inf)
-    stable = jnp.sum(taken == 0) == n // 2
+    penalty = jnp.where(jnp.sum(areas, 0) > _UNSTABLE, 0.0, np.inf)
+    stable = jnp.sum(penalty == 0) == n // 2
     for plane in range(n // 2):
-        order.append(jnp.argmax(areas[plane] - taken))
-        taken = taken.at[order[-1]].set(np.inf)
+        order.append(jnp.argmax(areas[plane] - penalty))
+        penalty = penalty.at[order[-1]].set(np.inf)
     V = jnp.where(stable, V[:, jnp.stack(order)], jnp.nan)
     V = jnp.concatenate([V, jnp.conj(V)], 1)
     W = jnp.linalg.inv(V)
@@ -304,12 +300,12 @@ def _modes(M: Array, dM: Array) -> tuple[Array, Array]:
     for _ in range(2):
         R = W @ M @ V
         r = jnp.diagonal(R)
-        apart = r[None] - r[:, None]
-        same = jnp.abs(apart) < _EQUAL  # itself, or a mode of equal tune in another plane
-        X = jnp.where(same, 0.0, R / jnp.where(same, 1.0, apart))
+        gaps = r[None] - r[:, None]
+        equal = jnp.abs(gaps) < _EQUAL  # itself, or a mode of equal tune in another plane
+        X = jnp.where(equal, 0.0, R / jnp.where(equal, 1.0, gaps))
         V, W = V + V @ X, W - X @ W + X @ X @ W
     V, W = V[:, : n // 2], W[: n // 2]
     change = jnp.sum(W @ dM * V.T, 1) / jnp.sum(W @ M * V.T, 1)
-    own = jnp.diagonal(V[::2])
-    size = own / jnp.abs(own) * jnp.sqrt(jnp.sum(area(V), 0))
+    component = jnp.diagonal(V[::2])
+    size = component / jnp.abs(component) * jnp.sqrt(jnp.sum(area(V), 0))
     return (V / size[None]).T, change.imag / (2 * np.pi)

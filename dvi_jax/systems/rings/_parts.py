@@ -8,7 +8,7 @@ from ._exact import (
     exact_bend,
     exact_drift,
     multipole_fringe,
-    rotated,
+    rotate,
     second_order_bend,
     second_order_edge,
     wedge,
@@ -21,13 +21,13 @@ from ._maps import (
     corrector,
     curved_kick,
     drift,
+    drifts_and_kicks,
     edge,
+    element_coordinates,
     kick,
     lens,
     near_identity,
-    placed,
     quadrupole_fringe,
-    sliced,
     solenoid,
     thin_kick,
 )
@@ -41,18 +41,18 @@ def _plain(move: Callable) -> list[Piece]:
     return [Piece(lambda z, par, turn, sign: move(z, par, sign))]
 
 
-def _solved(move: Callable) -> list[Piece]:
+def _near_identity_map(move: Callable) -> list[Piece]:
     """A map near the identity, given as a function from state to state."""
 
     def change(z, par):
-        after = move(z, par)
-        return {n: getattr(after, n) - getattr(z, n) for n in z._fields}
+        image = move(z, par)
+        return {name: getattr(image, name) - getattr(z, name) for name in z._fields}
 
     return [near_identity(change)]
 
 
 def _exact_fringe(side: int, order: int, skips_b0: bool) -> list[Piece]:
-    return _solved(
+    return _near_identity_map(
         lambda z, par: multipole_fringe(z, par, side, order, skips_b0),
     )
 
@@ -61,10 +61,10 @@ _MAPS: dict[str, Callable[[Part], list[Piece]]] = {
     "drift": lambda p: _flow(drift),
     "half_drift": lambda p: _flow(lambda z, length, par: drift(z, length / 2, par)),
     "exact_drift": lambda p: _flow(exact_drift),
-    "straight": lambda p: sliced(drift, kick, p),
-    "bend": lambda p: sliced(drift, curved_kick, p),
-    "exact_straight": lambda p: sliced(exact_drift, kick, p),
-    "exact_bend": lambda p: sliced(exact_bend, kick, p),
+    "straight": lambda p: drifts_and_kicks(drift, kick, p),
+    "bend": lambda p: drifts_and_kicks(drift, curved_kick, p),
+    "exact_straight": lambda p: drifts_and_kicks(exact_drift, kick, p),
+    "exact_bend": lambda p: drifts_and_kicks(exact_bend, kick, p),
     "second_order_bend": second_order_bend,
     "thin": lambda p: _plain(functools.partial(thin_kick, order=p.order)),
     "lens": lambda p: _plain(functools.partial(lens, potential=p.potential)),  # pyright: ignore[reportArgumentType]
@@ -80,21 +80,21 @@ _MAPS: dict[str, Callable[[Part], list[Piece]]] = {
     "multipole_fringe_out": lambda p: _exact_fringe(-1, p.order, False),
     "gradient_fringe_in": lambda p: _exact_fringe(1, p.order, True),
     "gradient_fringe_out": lambda p: _exact_fringe(-1, p.order, True),
-    "dipole_fringe_in": lambda p: _solved(
+    "dipole_fringe_in": lambda p: _near_identity_map(
         lambda z, par: dipole_fringe(z, par["h"], par["fringe_in"])
     ),
-    "dipole_fringe_out": lambda p: _solved(
+    "dipole_fringe_out": lambda p: _near_identity_map(
         lambda z, par: dipole_fringe(z, -par["h"], par["fringe_out"])
     ),
-    "rotation_in": lambda p: _plain(lambda z, par, sign: rotated(z, sign * par["edge_in"])),
-    "rotation_out": lambda p: _plain(lambda z, par, sign: rotated(z, sign * par["edge_out"])),
+    "rotation_in": lambda p: _plain(lambda z, par, sign: rotate(z, sign * par["edge_in"])),
+    "rotation_out": lambda p: _plain(lambda z, par, sign: rotate(z, sign * par["edge_out"])),
     "wedge_in": lambda p: _plain(lambda z, par, sign: wedge(z, -sign * par["edge_in"], par["h"])),
     "wedge_out": lambda p: _plain(lambda z, par, sign: wedge(z, -sign * par["edge_out"], par["h"])),
     "cavity": lambda p: [Piece(cavity)],
     "corrector": lambda p: [Piece(corrector)],
     "solenoid": lambda p: [Piece(solenoid)],
-    "placed_in": lambda p: _plain(placed),
-    "placed_out": lambda p: _plain(lambda z, par, sign: placed(z, par, -sign)),
+    "placed_in": lambda p: _plain(element_coordinates),
+    "placed_out": lambda p: _plain(lambda z, par, sign: element_coordinates(z, par, -sign)),
     "affine_in": lambda p: [affine("in")],
     "affine_out": lambda p: [affine("out")],
 }

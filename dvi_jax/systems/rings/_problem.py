@@ -20,7 +20,7 @@ from ._turn import Passage, start
 Planes = Literal["x", "xy", "xyz"]
 
 
-class Packed(eqx.Module):
+class RingArgs(eqx.Module):
     """The parts of a ring in the order of passage, and δ where it does not change: `args`."""
 
     passage: Passage
@@ -61,8 +61,8 @@ class Turn(Method):
         ring, epsilon = equations.args, equations.epsilon
         z, turn = ring.particle(q0, p0), jnp.round(interval.t0)
         if not self.losses:
-            return _state(ring.passage.moved(z, turn, epsilon), q0)
-        flight = ring.passage.flown(start(z), turn, epsilon)
+            return _state(ring.passage.image(z, turn, epsilon), q0)
+        flight = ring.passage.fly(start(z), turn, epsilon)
         q, p, info = _state(flight.z, q0)
         result = RESULTS.where(flight.element >= 0, RESULTS.lost, info.result)
         return q, p, info._replace(result=result)
@@ -70,7 +70,7 @@ class Turn(Method):
     def inverse(self, equations, interval, q1, p1):
         ring, epsilon = equations.args, equations.epsilon
         turn, z = jnp.round(interval.t0), ring.particle(q1, p1)
-        return _state(ring.passage.moved(z, turn, epsilon, -1), q1)
+        return _state(ring.passage.image(z, turn, epsilon, -1), q1)
 
     def needs_no_solve(self, equations, interval, q) -> bool:
         return True
@@ -79,7 +79,9 @@ class Turn(Method):
 
     def check(self, equations, first_interval, q, p) -> None:
         hint = "Use the system and the args of rings.problem(ring)."
-        instance("args of a run with rings.Turn()", equations.args, Packed, "those of a ring", hint)
+        instance(
+            "args of a run with rings.Turn()", equations.args, RingArgs, "those of a ring", hint
+        )
         h = float(first_interval().h)
         if h != 1:
             raise ValueError(f"h must be 1, one turn, for a ring; got h = {h}.")
@@ -91,11 +93,11 @@ def _state(z: Particle, like: Array) -> tuple[Array, Array, Any]:
     return q, p, judge(no_solve(q), q, p)
 
 
-class _Along(eqx.Module):
-    """The paraxial Hamiltonian at the place s = t C, over one turn of length C; `prefix` of the
-    parameters it contains."""
+class _PlaceHamiltonian(eqx.Module):
+    """The paraxial Hamiltonian at the place s = t C, over one turn of length C, or its derivative
+    by ε, with b' in place of b."""
 
-    prefix: str = eqx.field(static=True, default="")
+    is_slope: bool = eqx.field(static=True, default=False)
     own_method: ClassVar[Method] = Turn()
 
     def __call__(self, t0, t1, q0, p1, args):
@@ -104,19 +106,19 @@ class _Along(eqx.Module):
         row = jnp.searchsorted(ends, (t0 - jnp.floor(t0)) * ends[-1], side="right")
         element = args.passage.numbers["element"]
         row = jnp.searchsorted(element, element[row], side="right") - 1
-        par = {
-            n: lax.dynamic_index_in_dim(c, row, keepdims=False)
-            for n, c in args.passage.rows.items()
-        }
+        rows, slopes = (
+            {n: lax.dynamic_index_in_dim(c, row, keepdims=False) for n, c in table.items()}
+            for table in (args.passage.rows, args.passage.slopes)
+        )
         free = (z.px**2 + z.py**2) / (2 * (1 + z.delta))
-        h = par.get("h", 0.0)
-        bent = h * z.x * (h * z.x / 2 - z.delta)
+        h = rows.get("h", 0.0)
+        focusing = h * z.x * (h * z.x / 2 - z.delta)
         energy, power = 0.0, 1.0 + 0j
         for n in range(12):
             power = power * (z.x + 1j * z.y)
-            b, a = (par.get(f"{self.prefix}{k}{n}", 0.0) for k in "ba")
+            b, a = ((slopes if self.is_slope else rows).get(f"{k}{n}", 0.0) for k in "ba")
             energy = energy + jnp.real((b + 1j * a) * power) / (n + 1)
-        return ends[-1] * (energy if self.prefix else free + bent + energy)
+        return ends[-1] * (energy if self.is_slope else free + focusing + energy)
 
 
 class RingProblem(NamedTuple):
@@ -126,7 +128,7 @@ class RingProblem(NamedTuple):
     q0: Array
     p0: Array
     h: float
-    args: Packed
+    args: RingArgs
 
 
 def problem(ring: Ring, planes: Planes = "xyz", delta: Any = 0.0) -> RingProblem:
@@ -156,8 +158,10 @@ def problem(ring: Ring, planes: Planes = "xyz", delta: Any = 0.0) -> RingProblem
     """
     instance("ring", ring, Ring, "a rings.Ring")
     one_of("planes", planes, ("x", "xy", "xyz"))
-    passage = jax.tree.map(jnp.asarray, Passage.of(ring))
-    args = Packed(passage, jnp.asarray(delta, float))
-    perturbation = _Along("ε ") if ring.extra else None
+    passage = jax.tree.map(jnp.asarray, Passage.from_ring(ring))
+    args = RingArgs(passage, jnp.asarray(delta, float))
+    perturbation = _PlaceHamiltonian(is_slope=True) if ring.extra else None
     zero = jnp.zeros(len(planes))
-    return RingProblem(System(_Along(), perturbation=perturbation), zero, zero, 1.0, args)
+    return RingProblem(
+        System(_PlaceHamiltonian(), perturbation=perturbation), zero, zero, 1.0, args
+    )

@@ -20,12 +20,12 @@ from ._maps import Part, distinct
 Where = str | int | Sequence[int]
 
 
-class Program(eqx.Module):
+class RingStructure(eqx.Module):
     """What a ring consists of, without its parameters: compared as a whole, and hashed once."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     kinds: tuple[str, ...] = eqx.field(static=True)
-    known: tuple[frozenset[str], ...] = eqx.field(static=True)
+    parameters: tuple[frozenset[str], ...] = eqx.field(static=True)
     """The parameters of each element."""
     parts: tuple[Part, ...] = eqx.field(static=True)
     """The different parts."""
@@ -61,33 +61,33 @@ class Ring(eqx.Module):
     """Parameter → its values, one for each element (zero where an element has no such one)."""
     extra: dict[str, Array]
     """What ε times is added to the columns; see `perturbed`."""
-    program: Program = eqx.field(static=True)
+    program: RingStructure = eqx.field(static=True)
     energy: float = eqx.field(static=True)
     periods: int = eqx.field(static=True)
 
     def __init__(self, elements: Iterable[Element], energy: float = 1e9, periods: int = 1):
         require_double("a ring")
         elements = list(elements)
-        for i, e in enumerate(elements):
-            instance(f"elements[{i}]", e, Element, "an element such as rings.drift('D', 1.0)")
-        if not any(e.parts for e in elements):
-            raise ValueError("elements must contain an element that acts on a particle, got none.")
+        for i, element in enumerate(elements):
+            instance(f"elements[{i}]", element, Element, "an element such as rings.drift('D', 1.0)")
+        if not any(element.parts for element in elements):
+            raise ValueError("elements must contain one that acts on particles, got none.")
         self.energy = positive("energy", energy)
         self.periods = whole("periods", periods)
-        parts = tuple(distinct(part for e in elements for part in e.parts))
+        parts = tuple(distinct(part for element in elements for part in element.parts))
         number = {part: i for i, part in enumerate(parts)}
-        rows = [(number[part], i) for i, e in enumerate(elements) for part in e.parts]
-        self.program = Program(
-            tuple(e.name for e in elements),
-            tuple(e.kind for e in elements),
-            tuple(frozenset(e.values) for e in elements),
+        rows = [(number[part], i) for i, element in enumerate(elements) for part in element.parts]
+        self.program = RingStructure(
+            tuple(element.name for element in elements),
+            tuple(element.kind for element in elements),
+            tuple(frozenset(element.values) for element in elements),
             parts,
             tuple(rows),
         )
-        names = {name: np.shape(v) for e in elements for name, v in e.values.items()}
+        names = {name: np.shape(x) for element in elements for name, x in element.values.items()}
         columns = {
-            name: np.stack([np.asarray(e.values.get(name, np.zeros(shape)), float)
-                            for e in elements])
+            name: np.stack([np.asarray(element.values.get(name, np.zeros(shape)), float)
+                            for element in elements])
             for name, shape in sorted(names.items())
         }  # fmt: skip
         self.columns = {name: jnp.asarray(column) for name, column in columns.items()}
@@ -118,66 +118,70 @@ class Ring(eqx.Module):
         """The time of one turn of the reference particle [s]."""
         return self.places[-1] / C
 
-    def where(self, which: Where) -> np.ndarray:
+    def where(self, selection: Where) -> np.ndarray:
         """The numbers of the elements whose name or kind matches a pattern such as "QF*", or
         the given numbers. **Raises** `ValueError` if no element matches."""
-        if not isinstance(which, str):
-            numbers = np.atleast_1d(np.asarray(which))
+        if not isinstance(selection, str):
+            numbers = np.atleast_1d(np.asarray(selection))
             if numbers.dtype.kind != "i" or (numbers >= len(self)).any() or (numbers < 0).any():
                 raise ValueError(
-                    f"elements must be given by a pattern of their name or by numbers from 0 to "
-                    f"{len(self) - 1}, got {which!r}."
+                    f"elements must be a pattern of names or numbers from 0 to {len(self) - 1}, "
+                    f"got {selection!r}."
                 )
             return numbers
-        found = [
+        matches = [
             i
             for i, names in enumerate(zip(self.names, self.kinds, strict=True))
-            if any(fnmatch.fnmatchcase(name, which) for name in names)
+            if any(fnmatch.fnmatchcase(name, selection) for name in names)
         ]
-        if not found:
-            known = sorted({*self.names, *self.kinds})
-            near = difflib.get_close_matches(which, known, 3, 0.4) or known[:8]
-            raise ValueError(f"no element matches {which!r}. Names are, for example: {near}.")
-        return np.asarray(found)
+        if not matches:
+            labels = sorted({*self.names, *self.kinds})
+            suggestions = difflib.get_close_matches(selection, labels, 3, 0.4) or labels[:8]
+            raise ValueError(
+                f"no element matches {selection!r}. Names are, for example: {suggestions}."
+            )
+        return np.asarray(matches)
 
-    def get(self, which: Where, parameter: str) -> Array:
-        """The values of a parameter, one for each element of `where(which)`."""
-        numbers = self._numbers(which, parameter)
+    def get(self, selection: Where, parameter: str) -> Array:
+        """The values of a parameter, one for each element of `where(selection)`."""
+        numbers = self._numbers(selection, parameter)
         return self.columns[parameter][numbers]
 
-    def set(self, which: Where, **values: Any) -> "Ring":
-        """The ring with other parameters: one number for all elements of `where(which)`, or one
+    def set(self, selection: Where, **values: Any) -> "Ring":
+        """The ring with other parameters: one number for all elements of `where(selection)`, or one
         for each of them. **Raises** `ValueError` for a parameter that an element does not have."""
         columns = dict(self.columns)
         for name, value in values.items():
-            numbers, value = self._numbers(which, name), jnp.asarray(value)
+            numbers, value = self._numbers(selection, name), jnp.asarray(value)
             if value.ndim and len(value) != len(numbers):
                 raise ValueError(
-                    f"{name} must be one number or {len(numbers)} numbers, one for each element "
-                    f"that matches {which!r}, got an array of shape {value.shape}."
+                    f"{name} must be one number or {len(numbers)}, one for each element that "
+                    f"matches {selection!r}, got shape {value.shape}."
                 )
             columns[name] = columns[name].at[numbers].set(value)
         return eqx.tree_at(lambda ring: ring.columns, self, columns)
 
-    def _numbers(self, which: Where, parameter: str) -> np.ndarray:
-        numbers = self.where(which)
+    def _label(self, i: int) -> str:
+        return f"element {i}, the {self.kinds[i]} {self.names[i]!r},"
+
+    def _numbers(self, selection: Where, parameter: str) -> np.ndarray:
+        numbers = self.where(selection)
         for i in numbers:
-            if parameter not in self.program.known[i]:
+            if parameter not in self.program.parameters[i]:
                 raise ValueError(
-                    f"element {i}, the {self.kinds[i]} {self.names[i]!r}, has no parameter "
-                    f"{parameter!r}. Its parameters are {sorted(self.program.known[i])}; those of "
-                    "a magnet with more multipoles: rings.multipole(name, length, b=[...])."
+                    f"{self._label(i)} has no parameter {parameter!r}, only "
+                    f"{sorted(self.program.parameters[i])}; `rings.multipole` has more."
                 )
         return numbers
 
-    def perturbed(self, which: Where, *parameters: str) -> "Ring":
-        """The ring in which `parameters` of the elements `where(which)` are multiplied by ε, and
-        are zero in the unperturbed ring."""
+    def perturbed(self, selection: Where, *parameters: str) -> "Ring":
+        """The ring in which `parameters` of the elements `where(selection)` are multiplied by ε,
+        and are zero in the unperturbed ring."""
         columns, extra = dict(self.columns), dict(self.extra)
         for name in parameters:
-            numbers = self._numbers(which, name)
-            moved = jnp.zeros_like(columns[name]).at[numbers].set(columns[name][numbers])
-            extra[name] = extra.get(name, 0.0) + moved
+            numbers = self._numbers(selection, name)
+            slope = jnp.zeros_like(columns[name]).at[numbers].set(columns[name][numbers])
+            extra[name] = extra.get(name, 0.0) + slope
             columns[name] = columns[name].at[numbers].set(0.0)
         return eqx.tree_at(lambda r: (r.columns, r.extra), self, (columns, extra))
 
@@ -189,6 +193,5 @@ class Ring(eqx.Module):
                 if len(bad):
                     i = bad[0][0]
                     raise ValueError(
-                        f"{name} of element {i}, the {self.kinds[i]} {self.names[i]!r}, must be "
-                        f"finite, got {column[tuple(bad[0])]}."
+                        f"{name} of {self._label(i)} must be finite, got {column[tuple(bad[0])]}."
                     )

@@ -19,7 +19,7 @@ from ...base.machine import results_memory
 from ...integration.reconstruction import fold_blocks
 from ._maps import Particle
 from ._ring import Ring
-from ._turn import Passage, start
+from ._turn import Passage, coordinates, start
 
 
 class Tracked(NamedTuple):
@@ -86,130 +86,138 @@ def track(
     every = turns if every is None else whole("every", every)
     if turns % every:
         raise ValueError(f"every must divide turns = {turns}, got every = {every}.")
-    z = jnp.asarray(z, float)
-    if z.shape[-1:] != (6,):
+    z = coordinates("z", z)
+    size, memory = z.size * z.itemsize * (turns // every), results_memory()
+    if memory is not None and size > memory:
         raise ValueError(
-            "z must have six coordinates (x, px, y, py, ζ, δ) on its last axis, got an array of "
-            f"shape {z.shape}."
-        )
-    needed, there = z.size * z.itemsize * (turns // every), results_memory()
-    if there is not None and needed > there:
-        raise ValueError(
-            f"the results need {needed / 2**30:.3g} GiB of memory, but only {there / 2**30:.3g} "
-            "GiB are available. Save fewer turns with a larger every, or track fewer particles."
+            f"the results need {size / 2**30:.3g} GiB of memory, got {memory / 2**30:.3g} GiB. Use "
+            "a larger every, or fewer particles."
         )
     shape = z.shape[:-1]
     epsilon = jnp.broadcast_to(jnp.asarray(epsilon, float), shape).reshape(-1)
     counts = turns // every, every, first_turn
-    saved, turn, element, last = _tracked(ring, z.reshape(-1, 6), epsilon, counts)
-    saved = saved[:, -1] if turns == every else saved
-    parts = saved, turn, element, last
+    states, turn, element, last = _track(ring, z.reshape(-1, 6), epsilon, counts)
+    states = states[:, -1] if turns == every else states
+    parts = states, turn, element, last
     return Tracked(*(x.reshape(*shape, *x.shape[1:]) for x in parts))
 
 
-def _batched(function, *on):
-    """`function` of one particle as machine code for many; `on`: which arguments have one each."""
-    return jax.vmap(functools.partial(lanewise.call, function), [0 if o else None for o in on])
+def _batched(function, *flags):
+    """`function` of one particle as machine code for many; `flags`: which arguments are batches."""
+    axes = [0 if flag else None for flag in flags]
+    return jax.vmap(functools.partial(lanewise.call, function), axes)
 
 
 @eqx.filter_jit
-def _tracked(ring: Ring, z: Array, epsilon: Array, counts: tuple[int, int, int]):
+def _track(ring: Ring, z: Array, epsilon: Array, counts: tuple[int, int, int]):
     blocks, every, first = counts
-    passage = Passage.of(ring)
+    passage = Passage.from_ring(ring)
 
-    def forward(numbers, rows, z, epsilon):
-        along = Passage(rows, numbers, passage.parts)
+    def forward(numbers, tables, z, epsilon):
+        rows, slopes = tables
+        line = Passage(rows, slopes, numbers, passage.parts)
 
-        def one(state, _):
+        def one_turn(state, _):
             k, flight = state
-            return (k + 1, along.flown(flight, k, epsilon)), None
+            return (k + 1, line.fly(flight, k, epsilon)), None
 
         def block(state, _):
-            (k, flight), _ = lax.scan(one, state, None, every)
+            (k, flight), _ = lax.scan(one_turn, state, None, every)
             return (k, flight), jnp.stack(flight.z)
 
         state = jnp.asarray(first, jnp.int32), start(Particle(*z))
-        (_, flight), saved = lax.scan(block, state, None, blocks)
-        return saved, (flight.turn, flight.element, jnp.stack(flight.last))
+        (_, flight), states = lax.scan(block, state, None, blocks)
+        return states, (flight.turn, flight.element, jnp.stack(flight.last))
 
     @jax.custom_jvp
-    def tracked(rows, z, epsilon):
-        return _batched(forward, False, False, True, True)(passage.numbers, rows, z, epsilon)
+    def states_and_losses(tables, z, epsilon):
+        return _batched(forward, False, False, True, True)(passage.numbers, tables, z, epsilon)
 
-    @functools.partial(tracked.defjvp, symbolic_zeros=True)
+    @functools.partial(states_and_losses.defjvp, symbolic_zeros=True)
     def _(primals, tangents):
-        saved, losses = tracked(*primals)
+        states, losses = states_and_losses(*primals)
         moves = jax.tree.map(lambda x: not isinstance(x, SymbolicZero), tangents)
         change = jax.tree.map(
             lambda t, x, m: t if m else jnp.zeros_like(x), tangents, primals, moves
         )
 
         def push(residuals, change):
-            def along(numbers, x, change):
+            def derivative(numbers, x, change):
                 return jax.jvp(lambda *x: forward(numbers, *x)[0], x, change)[1]
 
             axes = (None, (None, 0, 0), (None, 0, 0))
-            return jax.vmap(functools.partial(lanewise.call, along), axes)(
+            return jax.vmap(functools.partial(lanewise.call, derivative), axes)(
                 passage.numbers, residuals[0], change
             )
 
         def pull(residuals, cotangent):
-            primals, saved = residuals
-            return _pulled(passage, primals, saved, cotangent, counts, moves)
+            primals, states = residuals
+            return _pull(passage, primals, states, cotangent, counts, moves)
 
-        moved = linear_map(push, pull, push, (primals, saved), change)
+        slopes_of_states = linear_map(push, pull, push, (primals, states), change)
         none = [np.zeros(x.shape, jax.dtypes.float0) for x in losses[:2]]
-        return (saved, losses), (moved, (*none, jnp.zeros_like(losses[2])))
+        return (states, losses), (slopes_of_states, (*none, jnp.zeros_like(losses[2])))
 
-    saved, losses = tracked(passage.rows, z, epsilon)
-    return saved, *losses
-
-
-_MISSED = 1e-6
+    states, losses = states_and_losses((passage.rows, passage.slopes), z, epsilon)
+    return states, *losses
 
 
-def _pulled(passage, primals, saved, cotangent, counts, moves):
-    """The cotangents of rows, z and ε: all particles backwards, turn by turn."""
-    rows, z0, epsilon = primals
+_TOLERANCE = 1e-6
+"""Largest distance [unit of z] between a start and what the turns backwards reach."""
+
+
+def _pull(passage, primals, states, cotangent, counts, moves):
+    """The cotangents of rows and slopes, z and ε: all particles backwards, turn by turn."""
+    tables, z0, epsilon = primals
     blocks, every, first = counts
-    moved = [n for n, m in moves[0].items() if m]
-    by_epsilon = [n.removeprefix("ε ") for n in rows if n.startswith("ε ") and moves[2]]
-    moving = sorted({n.removeprefix("ε ") for n in moved} | set(by_epsilon))
+    names = [[n for n, is_moving in table.items() if is_moving] for table in moves[0]]
+    by_epsilon = list(tables[1]) if moves[2] else []
+    parameters = sorted({*names[0], *names[1], *by_epsilon})
 
-    def one_turn(numbers, rows, z, c, k, epsilon):
-        along = Passage(rows, numbers, passage.parts)
-        z, c, found = along.pulled(moving, Particle(*z), Particle(*c), k, epsilon)
-        of_rows = {n: epsilon * found[n[2:]] if n.startswith("ε ") else found[n] for n in moved}
-        of_epsilon = [jnp.sum(found[n] * rows[f"ε {n}"]) for n in by_epsilon]
-        return jnp.stack(z), jnp.stack(c), of_rows, sum(of_epsilon, jnp.zeros(()))
+    def one_turn(numbers, tables, z, c, k, epsilon):
+        rows, slopes = tables
+        line = Passage(rows, slopes, numbers, passage.parts)
+        z, c, gradient = line.pulled(parameters, Particle(*z), Particle(*c), k, epsilon)
+        # Of b(ε) = b + ε b' by b, b' and ε.
+        of_rows = {n: gradient[n] for n in names[0]}
+        of_slopes = {n: epsilon * gradient[n] for n in names[1]}
+        of_epsilon = sum((jnp.sum(gradient[n] * slopes[n]) for n in by_epsilon), jnp.zeros(()))
+        return jnp.stack(z), jnp.stack(c), (of_rows, of_slopes), of_epsilon
 
     turn_back = _batched(one_turn, False, False, True, True, False, True)
-    lost = jnp.isnan(saved[:, :, :1])
+    is_lost = jnp.isnan(states[:, :, :1])
     # A lost particle has no influence, unless its cotangent is not zero.
-    wrong = jnp.any(lost & (cotangent != 0), axis=(1, 2))
-    saved = jnp.where(lost, 0.0, saved)
-    starts = jnp.concatenate([z0[:, None], saved[:, :-1]], axis=1)
+    is_wrong = jnp.any(is_lost & (cotangent != 0), axis=(1, 2))
+    states = jnp.where(is_lost, 0.0, states)
+    starts = jnp.concatenate([z0[:, None], states[:, :-1]], axis=1)
 
-    def block(state, k, start, end, more):
-        c, of_rows, of_epsilon, worst = state
+    def block(state, k, start, end, of_end):
+        c, of_tables, of_epsilon, distance = state
 
         def undo(_, state):
-            k, z, c, of_rows, of_epsilon = state
-            z, c, found, by_epsilon = turn_back(passage.numbers, rows, z, c, k, epsilon)
-            of_rows = jax.tree.map(lambda a, b: a + jnp.sum(b, 0), of_rows, found)
-            return k - 1, z, c, of_rows, of_epsilon + by_epsilon
+            k, z, c, of_tables, of_epsilon = state
+            z, c, gradient, slope = turn_back(passage.numbers, tables, z, c, k, epsilon)
+            of_tables = jax.tree.map(lambda a, b: a + jnp.sum(b, 0), of_tables, gradient)
+            return k - 1, z, c, of_tables, of_epsilon + slope
 
-        begin = (k + jnp.asarray(first + every - 1, jnp.int32), end, c + more, of_rows, of_epsilon)
+        last = k + jnp.asarray(first + every - 1, jnp.int32)
+        begin = last, end, c + of_end, of_tables, of_epsilon
         _, z, *state = lax.fori_loop(0, every, undo, begin)
-        missed = jnp.max(jnp.abs(z - start), axis=1)
-        return *state, jnp.maximum(worst, missed)
+        return *state, jnp.maximum(distance, jnp.max(jnp.abs(z - start), axis=1))
 
-    none = jnp.zeros(len(z0))
-    begin = jnp.zeros_like(z0), {n: jnp.zeros_like(rows[n]) for n in moved}, none, none
-    xs = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), (starts, saved, cotangent))
-    c, of_rows, of_epsilon, worst = fold_blocks(block, begin, blocks, every, xs)
-    fine = ~wrong & ((worst < _MISSED) | jnp.any(lost, axis=(1, 2)))
-    all_fine = jnp.where(jnp.all(fine), 1.0, jnp.nan)
-    nan = jnp.where(fine, 1.0, jnp.nan)
-    of_rows = {n: all_fine * of_rows[n] if n in of_rows else jnp.zeros_like(rows[n]) for n in rows}
-    return of_rows, nan[:, None] * c, nan * of_epsilon
+    zero = jnp.zeros(len(z0))
+    of_tables = tuple(
+        {n: jnp.zeros_like(table[n]) for n in group}
+        for table, group in zip(tables, names, strict=True)
+    )
+    begin = jnp.zeros_like(z0), of_tables, zero, zero
+    rows = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), (starts, states, cotangent))
+    c, of_tables, of_epsilon, distance = fold_blocks(block, begin, blocks, every, rows)
+    is_good = ~is_wrong & ((distance < _TOLERANCE) | jnp.any(is_lost, axis=(1, 2)))
+    factor = jnp.where(is_good, 1.0, jnp.nan)
+    of_all = jnp.where(jnp.all(is_good), 1.0, jnp.nan)
+    of_tables = tuple(
+        {n: of_all * slope[n] if n in slope else jnp.zeros_like(table[n]) for n in table}
+        for table, slope in zip(tables, of_tables, strict=True)
+    )
+    return of_tables, factor[:, None] * c, factor * of_epsilon

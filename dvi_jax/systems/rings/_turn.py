@@ -22,7 +22,7 @@ LARGEST = 1.0
 
 
 Rows = dict[str, Any]
-"""Parameters of each part of the elements of a ring, in the order of passage."""
+"""Name of a parameter → its values, one for each part of the elements in the order of passage."""
 
 
 class Flight(NamedTuple):
@@ -34,28 +34,37 @@ class Flight(NamedTuple):
     last: Particle
 
 
+def coordinates(name: str, z: Any) -> Array:
+    """(x, px, y, py, ζ, δ) on the last axis of an array. **Raises** `ValueError` for others."""
+    z = jnp.asarray(z, float)
+    if z.shape[-1:] != (6,):
+        raise ValueError(f"{name} must have 6 coordinates on its last axis, got shape {z.shape}.")
+    return z
+
+
 def start(z: Particle) -> Flight:
     none = jnp.asarray(-1, jnp.int32)
     return Flight(z, none, none, Particle(*[jnp.full((), jnp.nan)] * 6))
 
 
-def _noted(flight: Flight, z: Particle, passes: Any, number: Rows, turn: Any) -> Flight:
+def _record(flight: Flight, z: Particle, passes: Any, number: Rows, turn: Any) -> Flight:
     """The flight with the particle after a part of an element, or with its loss there."""
-    inside = functools.reduce(jnp.logical_and, [jnp.abs(z[i]) <= LARGEST for i in (0, 1, 2, 3, 5)])
+    moduli = [jnp.abs(z[i]) for i in (0, 1, 2, 3, 5)]
+    is_inside = functools.reduce(jnp.logical_and, [size <= LARGEST for size in moduli])
     # NaN in a coordinate fails the comparison. Within an element the limit does not hold.
-    passes = passes & ((inside & jnp.isfinite(z.zeta)) | ~number["ends"])
+    passes = passes & ((is_inside & jnp.isfinite(z.zeta)) | ~number["ends"])
     is_lost = ~passes & (flight.element < 0)
 
     def note():
-        def chosen(new, old):
-            return jax.tree.map(lambda a, b: jnp.where(is_lost, a, b), new, old)
+        def select(new, old):
+            return jax.tree.map(functools.partial(jnp.where, is_lost), new, old)
 
         nan = Particle(*[jnp.full((), jnp.nan)] * 6)
         return Flight(
-            chosen(nan, z),
-            chosen(number["element"], flight.element),
-            chosen(jnp.asarray(turn, jnp.int32), flight.turn),
-            chosen(z, flight.last),
+            select(nan, z),
+            select(number["element"], flight.element),
+            select(jnp.asarray(turn, jnp.int32), flight.turn),
+            select(z, flight.last),
         )
 
     # The branch keeps this work out of parts in which no particle is lost, which is nearly all.
@@ -65,54 +74,64 @@ def _noted(flight: Flight, z: Particle, passes: Any, number: Rows, turn: Any) ->
 class Passage(eqx.Module):
     """The parts of the elements of a ring in the order of passage.
 
-    - `rows`: the parameters of each part; ``"ε b1"`` is what ε times is added to ``"b1"``.
+    - `rows`: the parameters b of each part at ε = 0. `slopes`: their derivatives b' by ε, of the
+      parameters that depend on it; see `parameters_at`.
     - `numbers`: of each part in `parts`, and of its element; whether the element ends there.
     """
 
     rows: Rows
+    slopes: Rows
     numbers: Rows
     parts: tuple[Part, ...] = eqx.field(static=True)
 
     @classmethod
-    def of(cls, ring: Ring) -> "Passage":
+    def from_ring(cls, ring: Ring) -> "Passage":
         part, element = np.asarray(ring.program.rows, np.int32).T
-        rows = {name: column[element] for name, column in ring.columns.items()}
-        rows |= {f"ε {name}": column[element] for name, column in ring.extra.items()}
+        rows, slopes = (
+            {name: column[element] for name, column in columns.items()}
+            for columns in (ring.columns, ring.extra)
+        )
         ends = np.append(element[1:] != element[:-1], True)
-        return cls(rows, {"part": part, "element": element, "ends": ends}, ring.program.parts)
+        numbers = {"part": part, "element": element, "ends": ends}
+        return cls(rows, slopes, numbers, ring.program.parts)
 
-    def moved(self, z: Particle, turn: Any, epsilon: Any, sign: int = 1) -> Particle:
+    @property
+    def tables(self) -> tuple[Rows, Rows, Rows]:
+        """Numbers, rows and slopes, for a loop over the parts."""
+        return self.numbers, self.rows, self.slopes
+
+    def image(self, z: Particle, turn: Any, epsilon: Any, sign: int = 1) -> Particle:
         """The particle after all parts, or before them for sign −1; without apertures."""
 
         def row(z, x):
-            number, par = x
-            par = perturbed(par, epsilon)
+            number, values, slopes = x
+            par = parameters_at(values, slopes, epsilon)
 
-            def through(part):
+            def part_map(part):
                 return lambda z: forward(pieces_of(part), z, par, turn, sign)
 
-            return lax.switch(number["part"], [through(p) for p in self.parts], z), None
+            return lax.switch(number["part"], [part_map(p) for p in self.parts], z), None
 
-        return lax.scan(row, z, (self.numbers, self.rows), reverse=sign < 0)[0]
+        return lax.scan(row, z, self.tables, reverse=sign < 0)[0]
 
-    def flown(self, flight: Flight, turn: Any, epsilon: Any) -> Flight:
+    def fly(self, flight: Flight, turn: Any, epsilon: Any) -> Flight:
         """The flight after all parts, with losses. A particle that is lost becomes NaN."""
 
         def row(flight, x):
-            number, par = x
-            par = perturbed(par, epsilon)
+            number, values, slopes = x
+            par = parameters_at(values, slopes, epsilon)
 
-            def through(part):
-                inside = APERTURES.get(part.name)
-                if inside is not None:
-                    return lambda z: (z, inside(z, par))
+            def part_map(part):
+                is_inside = APERTURES.get(part.name)
+                if is_inside is not None:
+                    return lambda z: (z, is_inside(z, par))
                 return lambda z: (forward(pieces_of(part), z, par, turn, 1), jnp.asarray(True))
 
-            maps = [through(part) for part in self.parts]
+            maps = [part_map(part) for part in self.parts]
             z, passes = lax.switch(number["part"], maps, flight.z)
-            return _noted(flight, z, passes, number, turn), None
+            return _record(flight, z, passes, number, turn), None
 
-        return lax.scan(row, flight, (self.numbers, self.rows))[0]
+        return lax.scan(row, flight, self.tables)[0]
 
     def pulled(
         self, moving: Sequence[str], z: Particle, cotangent: Particle, turn: Any, epsilon: Any
@@ -121,22 +140,22 @@ class Passage(eqx.Module):
         cotangents of the parameters `moving`, one for each part."""
 
         def row(state, x):
-            number, par = x
-            par = perturbed(par, epsilon)
-            known = {name: par[name] for name in moving}
+            number, values, slopes = x
+            par = parameters_at(values, slopes, epsilon)
+            parameters = {name: par[name] for name in moving}
 
-            def back(part):
-                return lambda z, c: pull_back(pieces_of(part), z, c, par, known, turn)
+            def part_map(part):
+                return lambda z, c: pull_back(pieces_of(part), z, c, par, parameters, turn)
 
-            z, cotangent, found = lax.switch(number["part"], [back(p) for p in self.parts], *state)
-            return (z, cotangent), found
+            z, cotangent, cotangents = lax.switch(
+                number["part"], [part_map(p) for p in self.parts], *state
+            )
+            return (z, cotangent), cotangents
 
-        begin, xs = (z, cotangent), (self.numbers, self.rows)
-        (z, cotangent), found = lax.scan(row, begin, xs, reverse=True)
-        return z, cotangent, found
+        (z, cotangent), cotangents = lax.scan(row, (z, cotangent), self.tables, reverse=True)
+        return z, cotangent, cotangents
 
 
-def perturbed(par: Rows, epsilon: Any) -> Rows:
-    """The parameters of a part, with what ε is multiplied by added."""
-    extra = {name[2:]: value for name, value in par.items() if name.startswith("ε ")}
-    return {**par, **{name: par[name] + epsilon * value for name, value in extra.items()}}
+def parameters_at(values: Rows, slopes: Rows, epsilon: Any) -> Rows:
+    """The parameters of a part at ε: b(ε) = b + ε b'."""
+    return {**values, **{name: values[name] + epsilon * slopes[name] for name in slopes}}
