@@ -46,8 +46,8 @@ def with_keywords_of(source: Callable[..., Any], names: str = "", **extra: Any) 
     - `names`: those of `source` that are taken, separated by blanks; by default all.
     - `extra`: further keywords, with their defaults.
 
-    The function receives every keyword, with its default if it is not given. `inspect.signature`,
-    `help` and the reference list them by name.
+    The function receives every keyword, with its default if it is not given. Its signature lists
+    them by name.
 
     **Raises** `TypeError` when it is called with an unknown keyword or without a necessary one.
     """

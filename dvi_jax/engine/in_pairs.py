@@ -22,9 +22,9 @@ from .pairs import Number, Pair, add, as_pair, is_pair, mul, rounded, sub
 def in_pairs(function: Callable, *args: Any) -> Any:
     """``function(*args)`` with each operation on float64 numbers in pairs.
 
-    `args` are pytrees whose arrays may be pairs; an array is exact. Float64 results are pairs.
-    Numbers in the function itself are float64. Derivatives are those of the function in float64 at
-    the rounded arguments; those of the lower parts are 0.
+    `args` are pytrees whose arrays may be pairs; an array is exact, and so are numbers in the
+    function. Float64 results are pairs. Derivatives are those of the function in float64 at the
+    rounded arguments.
 
     **Raises** `NotImplementedError` for a primitive of JAX that has no rule here.
     """

@@ -11,7 +11,7 @@ from lanewise.rules.exact import two_sum
 
 from ..base.results import RESULTS
 from ..base.signature import check_takes
-from ..base.types import Interval, Scalar, State
+from ..base.types import Interval, Scalar
 from ..engine.rounding import one_by_one
 from ..methods.step import Equations
 from ._base import Place, StepSizes, check_rounding, check_speed
@@ -125,9 +125,7 @@ class AdaptiveReversible(StepSizes):
         g, slope = self._along_the_motion(equations, memory.t, place.q, place.p)
         return jnp.where(place.k == 0, place.h, 2 * memory.h / (2 * g - memory.h * slope))
 
-    def _along_the_motion(
-        self, equations: Equations, t: Scalar, q: State, p: State
-    ) -> tuple[Scalar, Scalar]:
+    def _along_the_motion(self, equations, t, q, p) -> tuple[Scalar, Scalar]:
         """g and dg/dt."""
         rates = equations.rates(Interval(t, t, jnp.zeros_like(t)), q, p)
 

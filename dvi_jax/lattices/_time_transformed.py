@@ -175,8 +175,8 @@ class ExtendedSpace(eqx.Module):
         observed = jax.tree.map(original, observed, is_leaf=lambda x: isinstance(x, Crossings))
         stop = solution.stop
         if stop is not None:
-            end = self.parts(stop.q, stop.p)
-            stop = Stopped(end[2], *end[:2])
+            q_end, p_end, t_end, _ = self.parts(stop.q, stop.p)
+            stop = Stopped(t_end, q_end, p_end)
         return Solution(t, q, p, hs, observed, solution.result, solution.stats, stop)
 
 

@@ -13,7 +13,7 @@ import lanewise
 
 from ..base.checks import one_of, require_system
 from ..base.results import RESULTS
-from ..base.types import Args, Interval, Scalar, State
+from ..base.types import Interval, Scalar, State
 from ..engine.bracket import bracketed_root, divide
 from ..methods.step import Equations, step
 from ..problem.energies import disturbing_work, incoming_energy, outgoing_energy
@@ -203,9 +203,7 @@ class LatticeCondition(eqx.Module):
         """The same observable for this system and strength ε."""
         return LatticeCondition(system, epsilon)
 
-    def __call__(
-        self, t0: Scalar, t1: Scalar, q0: State, p0: State, q1: State, p1: State, args: Args
-    ) -> Scalar:
+    def __call__(self, t0, t1, q0, p0, q1, p1, args):
         require_system("LatticeCondition", self.system)
         equations = Equations(self.system, self.epsilon, args)
 

@@ -26,12 +26,10 @@ _DEFECT = 1e-11
 
 
 class CompositionMethod(Method):
-    """Base of the methods that alternate a map with its adjoint.
-
-        Ψ_h = … ∘ Φ*_{c₄h} ∘ Φ_{c₃h} ∘ Φ*_{c₂h} ∘ Φ_{c₁h}        (c₁ acts first)
+    """Base of the methods that alternate a map Φ with its adjoint, as `Composition` does.
 
     The inverse undoes the substeps in the opposite order. Φ is any invertible method, forced and
-    implicit ones too; a substep with negative c goes backwards in time.
+    implicit ones too; a substep with a negative coefficient goes backwards in time.
     """
 
     base: eqx.AbstractVar[Method]

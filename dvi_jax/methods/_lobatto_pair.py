@@ -77,12 +77,9 @@ class LobattoIIIAIIIB(Collocation):
     and â_{ij} = b_j (1 − a_{ji} / b_i) (IIIB). Q_1 = q0 and Q_s = q1. Symmetric; without a force
     symplectic, and every invariant that is bilinear in q and p, angular momentum for instance, is
     conserved to round-off. Without a force it is the type II variational map (12)–(13) of another
-    discrete Hamiltonian, the value that is stationary in P_i and V_i of
-
-        Σ_i b_i [H(t_i, Q_i, P_i) − (P_i − p1)·V_i],    Q_i = q0 + h Σ_j a_ij V_j,
-
-    the action of curves q of degree s by Lobatto quadrature; for a regular Lagrangian it is the
-    variational integrator of that quadrature of ∫L dt.
+    discrete Hamiltonian, with the formula of `GaussLegendre`: the action of curves q of degree s by
+    Lobatto quadrature. For a regular Lagrangian it is the variational integrator of that quadrature
+    of ∫L dt.
 
     Two stages are the generalised leapfrog, Störmer–Verlet (kick, drift, kick) for a separable H:
     the map of `Strang` wherever H_D and W do not depend on t1, and `Strang` has the smaller solves.

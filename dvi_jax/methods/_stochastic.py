@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..base.types import Interval, Scalar, State
+from ..base.types import Scalar, State
 from ..problem.noise import NoiseHamiltonians
 from ..problem.system import System
 from ._base import Method
@@ -86,9 +86,7 @@ class _WithNoise(Method):
         noisy = self._with_noise(equations, interval, q, q)
         return self.plain.inverse_needs_no_solve(noisy, interval, q)
 
-    def _with_noise(
-        self, equations: Equations, interval: Interval, q: State, p: State
-    ) -> Equations:
+    def _with_noise(self, equations, interval, q, p) -> Equations:
         noise, dB = equations.system.noise, equations.increments
         if noise is None:
             return equations

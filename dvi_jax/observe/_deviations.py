@@ -36,9 +36,8 @@ class Deviations(Reduction):
     """Base of the reductions that follow deviation vectors along a trajectory.
 
     The derivative of each step is applied to `vectors` of the memory, and `update` receives the
-    result as a `Pushed` in place of a value. It is the derivative of the discrete map, perturbation
-    included: exact, by autodiff, through implicit solves as well. Gradients are those of the steps,
-    so that there is no `combine`.
+    result as a `Pushed` in place of a value: exact, by autodiff, with the perturbation and through
+    implicit solves. Gradients are those of the steps, so that there is no `combine`.
     """
 
     # For a type checker, an abstract variable would be a constructor argument of every subclass.

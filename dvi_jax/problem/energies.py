@@ -36,10 +36,7 @@ def incoming_energy(
     args: Args = None,
     h: Any = None,
 ) -> Scalar:
-    """E⁻ = H_D + h ∂H_D/∂t1 of the step from t0 to t1 [energy], at its second point.
-
-    `h` is t1 − t0 by default; pass it where that difference has lost digits.
-    """
+    """E⁻ = H_D + h ∂H_D/∂t1 of the step [energy], at its second point; see `outgoing_energy`."""
     return _energy(1, system, h, (t0, t1, q0, p1, epsilon, args))
 
 
