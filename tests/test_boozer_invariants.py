@@ -160,7 +160,7 @@ def test_second_invariant_at_the_tips_of_banana_orbits_is_constant():
 def test_classes_of_orbits():
     J, margins = seen(6.0, 0.0)
     assert boozer.classify(margins).tolist() == ["trapped", "transitional", "passing"]
-    assert np.isnan(J[2]).all()
+    assert np.isnan(J[2]).all()  # it does not bounce; the trapped one does: see `spreads`
     found = boozer.classify([[-1.0, 1.0], [np.nan, np.nan], [0.1, 0.2]])
     assert found.tolist() == ["transitional", "unknown", "passing"]
     with pytest.raises(ValueError, match="extremes must be"):

@@ -59,9 +59,8 @@ def functions(name):
     system = problem(name).system
 
     def rates(t, q, p, epsilon, args):
-        fall, rate = jax.grad(
-            lambda q, p: system.hamiltonian(t, t, q, p, epsilon, args), argnums=(0, 1)
-        )(q, p)
+        H = functools.partial(system.hamiltonian, t, t, epsilon=epsilon, args=args)
+        fall, rate = jax.grad(H, argnums=(0, 1))(q, p)
         return rate, system.disturbing_force(t, t, q, p, epsilon, args) - fall
 
     return jax.jit(rates)
@@ -109,10 +108,8 @@ def test_equations_are_those_of_an_independent_derivation(name):
             assert np.max(np.abs(a - b)) <= 1e-12 * np.max(np.abs(b))
         # negative control: a change in the seventh digit of the state is detected
         other = DERIVATIONS[name](t, q * (1 + 1e-6), p * (1 + 1e-6), args, epsilon)
-        assert any(
-            np.max(np.abs(a - b)) > 1e-8 * np.max(np.abs(b))
-            for a, b in zip(ours, other, strict=True)
-        )
+        pairs = zip(ours, other, strict=True)
+        assert any(np.max(np.abs(a - b)) > 1e-8 * np.max(np.abs(b)) for a, b in pairs)
 
 
 # 2. Invariants, and 5. exact solutions, along the flow
@@ -142,9 +139,8 @@ def flow(name):
     z0 = np.concatenate([q0, p0], axis=None)
     # positions and momenta of very different sizes: each to its own rounding
     size = np.repeat([np.max(np.abs(x)) or 1.0 for x in (q0, p0)], q0.size)
-    run = solve_ivp(
-        field, times[[0, -1]], z0, method="DOP853", t_eval=times, rtol=1e-13, atol=1e-15 * size
-    )
+    options = {"method": "DOP853", "t_eval": times, "rtol": 1e-13, "atol": 1e-15 * size}
+    run = solve_ivp(field, times[[0, -1]], z0, **options)
     assert run.success
     return times, run.y.T.reshape(-1, 2, *q0.shape)
 
@@ -336,9 +332,8 @@ def residuals(name):
     return of
 
 
-SYMMETRIC = [
-    n for n in NAMES if n == "solar_system" or problem(n).symmetries or problem(n).flow_symmetries
-]
+SYMMETRIC = [n for n in NAMES if n == "solar_system"
+             or problem(n).symmetries or problem(n).flow_symmetries]  # fmt: skip
 
 
 @pytest.mark.parametrize("name", listed(SYMMETRIC, MOST))
@@ -485,17 +480,12 @@ def test_every_parameter_must_be_there_and_be_a_number(name):
     for key, value in (made.args or {}).items():
         rest = {k: v for k, v in made.args.items() if k != key}
         if key != "G":  # which is 1 when it is left out
-            with pytest.raises(
-                ValueError, match=f"parameter {key} is missing: args must be a dict"
-            ):
-                made.check(made.q0, made.p0, rest)
-            with pytest.raises(ValueError, match=r"is missing: args must be a dict.*got None"):
-                made.check(made.q0, made.p0, None)
+            for args in (rest, None):
+                with pytest.raises(ValueError, match=f"parameter {key} is missing"):
+                    made.check(made.q0, made.p0, args)
         wrong = [np.nan * np.asarray(value, float), np.ones((2, 2))]
         for bad in wrong if np.ndim(value) else [*wrong, None, "1", True]:
-            with pytest.raises(
-                ValueError, match="mass of" if key == "masses" and bad is wrong[0] else key
-            ):
+            with pytest.raises(ValueError, match="mass of|masses" if key == "masses" else key):
                 made.check(made.q0, made.p0, {**made.args, key: bad})
         made.check(made.q0, made.p0, {**rest, key: np.asarray(value)})  # an array of no axes is one
 
@@ -509,11 +499,7 @@ def test_every_parameter_must_be_there_and_be_a_number(name):
         ("fput", {"alpha": math.nan}, "alpha must be a finite number, got nan"),
         ("toda", {"n": 2}, "n must be an integer of at least 3, got 2.*at least three particles"),
         ("nls_lattice", {"n": 2.5}, "got 2.5.*ring of at least three sites"),
-        (
-            "n_body",
-            {"masses": np.ones(2), "q0": np.eye(2), "p0": np.eye(2), "G": math.nan},
-            "G must be a finite",
-        ),
+        ("n_body", {"G": math.nan}, "G must be a finite"),
         ("magnetic_mirror", {"length": -1.0}, "length must be a positive.*got -1"),
         ("magnetic_mirror", {"distance": np.inf}, "distance must be a finite.*got inf"),
         ("dipole_field", {"radius": 0.0}, "radius must be a positive.*got 0"),
@@ -546,12 +532,13 @@ def test_facts_about_nothing_are_refused():
     """A `Problem` does not promise what it cannot show."""
     made = problem("kepler")
     parts = {"name": "x", "system": made.system, "q0": [0.0], "p0": [0.0], "h": 0.1}
-    with pytest.raises(ValueError, match=r"invariants of .* in observables, \[\], got 'energy'"):
-        systems.Problem(**parts, invariants=("energy",))
-    with pytest.raises(ValueError, match=r"parameters of .* in the dict args, .'K'.*got 'k'"):
-        systems.Problem(**parts, args={"K": 1.0}, parameters={"k": "strength [1]"})
-    with pytest.raises(ValueError, match=r"adiabatic of .* got 'action'"):
-        systems.Problem(**parts, adiabatic={"action": systems.Adiabatic("ε", 1)})
+    for facts, message in (
+        ({"invariants": ("energy",)}, r"invariants of .* in observables, \[\], got 'energy'"),
+        ({"args": {"K": 1.0}, "parameters": {"k": "strength [1]"}}, r"parameters .*'K'.*got 'k'"),
+        ({"adiabatic": {"action": systems.Adiabatic("ε", 1)}}, "adiabatic of .* got 'action'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            systems.Problem(**parts, **facts)
 
 
 def test_an_observable_in_slow_time_asks_for_epsilon():
@@ -599,9 +586,8 @@ def test_integrals_of_the_third_kind_are_those_of_scipy():
     """Both signs of n, up to 1 − n = 1e-12 and n = −1e8; negative control: another n."""
     rng = np.random.default_rng(1)
     m, phi = rng.uniform(0, 1, 100), rng.uniform(-20, 20, 100)
-    complement = np.r_[
-        1 + 10 ** rng.uniform(-3, 8, 50), (1 - m[50:]) * 10 ** rng.uniform(-12, 0, 50)
-    ]
+    large, small = 1 + 10 ** rng.uniform(-3, 8, 50), 10 ** rng.uniform(-12, 0, 50)
+    complement = np.r_[large, (1 - m[50:]) * small]
 
     def by_scipy(s, c):
         x, y = c**2, c**2 + (1 - m) * s**2
@@ -790,9 +776,7 @@ def test_exact_solutions_keep_the_dtype_and_refuse_other_shapes(name):
             assert x.shape == (1, 2, *q0.shape)
     many = jnp.stack([q0] * 3)
     if name not in ("oscillator", "van_der_pol", "slow_oscillator"):  # of any number of dimensions
-        with pytest.raises(
-            ValueError, match=r"one initial condition.*jax\.vmap.*got q0 of shape \(3, "
-        ):
+        with pytest.raises(ValueError, match=r"one initial condition.*got q0 of shape \(3, "):
             made.exact(1.0, many, many, made.args)
     with pytest.raises(ValueError, match="shape"):
         made.exact(1.0, many, q0, made.args)

@@ -27,6 +27,7 @@ ELEMENTS = {
     "bend with fringe": rings.bend("B", 1.1, 0.2, edge_in=0.1, fringe_in=0.02, fringe_out=0.01),
     "exact bend": rings.bend("B", 1.1, 0.2, (0, 0.4), edge_in=0.1, fringe=True, model="exact"),
     "corrector": rings.corrector("C", 0.3, 1e-3, -2e-3),
+    "lens": rings.lens("L", lambda x, y, par: par["g"] * x**3 * y, g=3e3),
     "solenoid": rings.solenoid("S", 0.6, 0.8),
     "cavity": rings.cavity("RF", 0.4, 1e-3, 5e8, lag=0.05),
     "placed": rings.quadrupole("Q", 0.3, 1.1, slices=2).placed(1e-4, -2e-4, 0.05),
@@ -218,6 +219,8 @@ ERRORS = [
     (lambda r: rings.quadrupole("Q", 0.3, 1.0, slice=4), TypeError, "no argument 'slice'"),
     (lambda r: rings.bend("B", 0.3, 1.0, edge=0.1), TypeError, "no argument 'edge'"),
     (lambda r: rings.aperture("A"), ValueError, "aperture 'A' must have"),
+    (lambda r: rings.lens("N", max, t=np.nan), ValueError, "t of lens 'N' must be a finite number"),
+    (lambda r: rings.lens("N", 3.0), TypeError, "potential must be a function"),
     (lambda r: rings.Ring(["QF"]), TypeError, r"elements\[0\]"),
     (lambda r: turns(r, 4), ValueError, "shape of q0 must be one of"),
     (lambda r: turns(r, 3, h=0.5, method=rings.Turn()), ValueError, "h must be 1"),
@@ -305,23 +308,18 @@ def at_elements(at):
     }  # fmt: skip
 
 
-def check_elements(at, names):
-    """Each element of `names` in a ring of its own against pyAT."""
+QUICK_ELEMENTS = ["BndMPoleSymplectic4Pass", "StrMPoleSymplectic4Pass", "RFCavityPass"]
+
+
+@pytest.mark.parametrize("names", [QUICK_ELEMENTS, pytest.param([], marks=pytest.mark.slow)])
+def test_elements_agree_with_pyat(at, names):
+    """Each in a ring of its own; without names all."""
     z, elements = particles(1000), at_elements(at)
-    for name in names:
+    for name in names or elements:
         lattice = at.Lattice([elements[name]], energy=1e9)
         ours = np.asarray(rings.track(rings.from_at(lattice), z).z)
         assert np.abs(ours - tracked_by_at(lattice, z)).max() < 1e-12, name
         assert np.abs(ours - z).max() > 1e-6, name
-
-
-def test_elements_agree_with_pyat(at):
-    check_elements(at, ["BndMPoleSymplectic4Pass", "StrMPoleSymplectic4Pass", "RFCavityPass"])
-
-
-@pytest.mark.slow
-def test_all_elements_agree_with_pyat(at):
-    check_elements(at, at_elements(at))
 
 
 def lattices(*names, marks=()):

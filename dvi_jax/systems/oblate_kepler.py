@@ -76,8 +76,8 @@ def secular_rates(a, e, i, args):
 
 
 def _above_surface(q, p, args):
-    if (r := float(np.linalg.norm(q))) < args["R"]:
-        raise ValueError(f"|q0| must be at least R = {args['R']}, of the planet, got {r}.")
+    if (radius := float(np.linalg.norm(q))) < args["R"]:
+        raise ValueError(f"|q0| must be at least R = {args['R']}, of the planet, got {radius}.")
 
 
 def oblate_kepler() -> Problem:

@@ -148,7 +148,7 @@ class GuidingCentres(eqx.Module):
         for name, value, low in (("s", s, 0.0), ("pitch", pitch, -1.0)):
             check_range(name, value, low)
         s, theta, zeta, pitch = jnp.broadcast_arrays(
-            *(jnp.asarray(x, jnp.result_type(float)) for x in (s, theta, zeta, pitch))
+            *(jnp.asarray(values, jnp.result_type(float)) for values in (s, theta, zeta, pitch))
         )
         return self.state(s, theta, zeta, pitch)
 

@@ -1,5 +1,6 @@
 """Detuning with amplitude, driving terms, dynamic and momentum aperture, frequency maps."""
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -181,10 +182,11 @@ def momentum_aperture(
 
     def end_of_turn(passage, z, first):
         def row(flight, columns):
-            numbers, rows, slopes = jax.tree.map(lambda a: a[None], columns)
+            numbers, rows, slopes = jax.tree.map(lambda column: column[None], columns)
             continuation = Passage(rows, slopes, numbers, passage.parts).fly(flight, 0, 0.0)
             skips = columns[0]["element"] < first
-            return jax.tree.map(lambda a, b: jnp.where(skips, a, b), flight, continuation), None
+            select = functools.partial(jnp.where, skips)
+            return jax.tree.map(select, flight, continuation), None
 
         return jnp.stack(lax.scan(row, start(Particle(*z)), passage.tables)[0].z)
 

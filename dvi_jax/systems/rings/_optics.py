@@ -162,7 +162,7 @@ def four(ring: Ring) -> Ring:
     columns = dict(ring.columns)
     if "voltage" in columns:
         columns["voltage"] = jnp.zeros_like(columns["voltage"])
-    return eqx.tree_at(lambda r: r.columns, ring, columns)
+    return eqx.tree_at(lambda other: other.columns, ring, columns)
 
 
 def maps(ring: Ring, epsilon: Any) -> tuple[Callable, Any]:
@@ -180,8 +180,8 @@ def maps(ring: Ring, epsilon: Any) -> tuple[Callable, Any]:
     all_kinds = distinct(kinds)
     numbers = np.asarray([all_kinds.index(kind) for kind in kinds], np.int32)
 
-    def apply(z, x):
-        values, slopes, part, steps = x
+    def apply(z, columns):
+        values, slopes, part, steps = columns
         par = parameters_at(values, slopes, epsilon)
 
         def kind_map(kind):

@@ -88,8 +88,8 @@ class Turn(Method):
 
 
 def _state(z: Particle, like: Array) -> tuple[Array, Array, Any]:
-    n = like.shape[0]
-    q, p = jnp.stack([z.x, z.y, z.zeta])[:n], jnp.stack([z.px, z.py, z.delta])[:n]
+    size = like.shape[0]
+    q, p = jnp.stack([z.x, z.y, z.zeta])[:size], jnp.stack([z.px, z.py, z.delta])[:size]
     return q, p, judge(no_solve(q), q, p)
 
 

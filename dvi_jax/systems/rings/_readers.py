@@ -159,10 +159,10 @@ def _marker(source, energy, period, edge):
     return Element(source.FamName, type(source).__name__.lower(), (), {"length": source.Length})
 
 
-def _fringes(source: Any, exact: bool, b: np.ndarray) -> list[bool]:
+def _fringes(source: Any, exact: bool, field: np.ndarray) -> list[bool]:
     """Whether it has a quadrupole fringe at its ends; a paraxial one needs a gradient."""
     ends = [bool(getattr(source, f"FringeQuad{side}", 0)) for side in ("Entrance", "Exit")]
-    return ends if exact or (len(b) > 1 and b[1] != 0) else [False, False]
+    return ends if exact or (len(field) > 1 and field[1] != 0) else [False, False]
 
 
 def _remove_ends(element: Element, name: str, flags: list[bool]) -> Element:
@@ -238,18 +238,18 @@ _MAKERS = {
     "BndMPoleSymplectic4Pass": _bend,
     "BndMPoleSymplectic4E2Pass": _bend,
     "ExactSectorBendPass": _bend,
-    "ThinMPolePass": lambda e, *_: multipole(
-        e.FamName, 0.0, **_field(e, thin=True), kind=type(e).__name__.lower()
+    "ThinMPolePass": lambda source, *_: multipole(
+        source.FamName, 0.0, **_field(source, thin=True), kind=type(source).__name__.lower()
     ),
-    "CorrectorPass": lambda e, *_: corrector(e.FamName, e.Length, *e.KickAngle),
-    "SolenoidLinearPass": lambda e, *_: solenoid(e.FamName, e.Length, e.K),
+    "CorrectorPass": lambda source, *_: corrector(source.FamName, source.Length, *source.KickAngle),
+    "SolenoidLinearPass": lambda source, *_: solenoid(source.FamName, source.Length, source.K),
     "RFCavityPass": _cavity,
     "CavityPass": _cavity,
     "Matrix66Pass": _matrix,
-    "AperturePass": lambda e, *_: Element(
-        e.FamName,
+    "AperturePass": lambda source, *_: Element(
+        source.FamName,
         "aperture",
         (Part("rectangle"),),
-        {"length": 0.0, **dict(zip(("x_min", "x_max", "y_min", "y_max"), e.Limits, strict=True))},
+        dict(zip(("x_min", "x_max", "y_min", "y_max"), source.Limits, strict=True), length=0.0),
     ),
 }

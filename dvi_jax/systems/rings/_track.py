@@ -138,12 +138,12 @@ def _track(ring: Ring, z: Array, epsilon: Array, counts: tuple[int, int, int]):
         states, losses = states_and_losses(*primals)
         moves = jax.tree.map(lambda x: not isinstance(x, SymbolicZero), tangents)
         change = jax.tree.map(
-            lambda t, x, m: t if m else jnp.zeros_like(x), tangents, primals, moves
+            lambda t, x, flag: t if flag else jnp.zeros_like(x), tangents, primals, moves
         )
 
         def push(residuals, change):
-            def derivative(numbers, x, change):
-                return jax.jvp(lambda *x: forward(numbers, *x)[0], x, change)[1]
+            def derivative(numbers, primals, change):
+                return jax.jvp(lambda *primals: forward(numbers, *primals)[0], primals, change)[1]
 
             axes = (None, (None, 0, 0), (None, 0, 0))
             return jax.vmap(functools.partial(lanewise.call, derivative), axes)(

@@ -103,8 +103,8 @@ class Passage(eqx.Module):
     def image(self, z: Particle, turn: Any, epsilon: Any, sign: int = 1) -> Particle:
         """The particle after all parts, or before them for sign −1; without apertures."""
 
-        def row(z, x):
-            number, values, slopes = x
+        def row(z, columns):
+            number, values, slopes = columns
             par = parameters_at(values, slopes, epsilon)
 
             def part_map(part):
@@ -117,8 +117,8 @@ class Passage(eqx.Module):
     def fly(self, flight: Flight, turn: Any, epsilon: Any) -> Flight:
         """The flight after all parts, with losses. A particle that is lost becomes NaN."""
 
-        def row(flight, x):
-            number, values, slopes = x
+        def row(flight, columns):
+            number, values, slopes = columns
             par = parameters_at(values, slopes, epsilon)
 
             def part_map(part):
@@ -139,8 +139,8 @@ class Passage(eqx.Module):
         """The particle before all parts and its cotangent, from those after them; and the
         cotangents of the parameters `moving`, one for each part."""
 
-        def row(state, x):
-            number, values, slopes = x
+        def row(state, columns):
+            number, values, slopes = columns
             par = parameters_at(values, slopes, epsilon)
             parameters = {name: par[name] for name in moving}
 
