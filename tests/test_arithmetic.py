@@ -387,12 +387,12 @@ def test_steps_that_fixed_point_cannot_undo_are_rejected():
         dvi.Yoshida(4, base=dvi.GaussLegendre(1)),
         dvi.Adjoint(dvi.GaussLegendre(1)),
     ):
-        with pytest.raises(ValueError, match=r"composed of dvi.TypeII.*got .*dvi\.Compensated"):
+        with pytest.raises(ValueError, match=r"composed of dvi.TypeII"):
             run(separable, method)
     damped = dvi.System(pendulum, force=lambda t0, t1, q0, p1, args: -p1)
     for system in (SYSTEMS["non_separable"][0], damped):
         for method in (dvi.TypeII(), dvi.Adjoint()):
-            with pytest.raises(ValueError, match=r"explicit forwards and backwards.*separable"):
+            with pytest.raises(ValueError, match=r"explicit steps.*separable"):
                 run(system, method, epsilon=0.1)
     with pytest.raises(ValueError, match="too small or too large for a state in float32"):
         run(separable, q0=np.array([0.3], np.float32), quantum=2.0**-140)

@@ -563,51 +563,6 @@ def test_indicators_under_sweep():
     assert abs(result.megno.values[1, 1] - alone) < 1e-10
 
 
-INVALID = [
-    (lambda: dvi.LyapunovSpectrum(0), ValueError, "at least 1, got 0"),
-    (lambda: dvi.GALI(1), ValueError, "at least 2, got 1"),
-    (lambda: dvi.GALI(2.0), ValueError, "got 2.0"),
-    (lambda: dvi.MEGNO(seed=-1), ValueError, "seed of MEGNO .* got -1"),
-    (lambda: dvi.SALI(scale=1.0), TypeError, "scale of SALI must be a pair"),
-    (lambda: dvi.MEGNO(scale=(0.0, 1.0)), ValueError, "scale of q in MEGNO .* positive .* 0.0"),
-    (lambda: dvi.MEGNO(scale=(1.0, np.nan)), ValueError, "scale of p in MEGNO .* nan"),
-    (lambda: dvi.GALI(2, scale=("a", 1.0)), ValueError, "scale of q in GALI .* a"),
-    (lambda: dvi.SALI(scale=(1j, 1.0)), ValueError, "scale of q in SALI .* 1j"),
-    (lambda: dvi.Running(HENON.observables["energy"]), TypeError, "reduction of Running must"),
-    (lambda: dvi.Running(dvi.Section(lambda t, q, p, a: q[0])), TypeError, "dvi.Section"),
-]
-
-
-@pytest.mark.parametrize(("make", "error", "message"), INVALID)
-def test_invalid_indicators(make, error, message):
-    with pytest.raises(error, match=message):
-        make()
-
-
-TRANSFORMED = {"lattice": dvi.TimeTransformed(lambda t, q, p, a: 1.0)}
-SOLVED_FOR = {"lattice": dvi.Variational(), "method": dvi.TypeII()}
-AT_TIMES = {"save": dvi.Save(ts=[0.1])}
-INVALID_RUNS = [
-    (dvi.GALI(5), {}, "from 1 to 4, got 5"),
-    (
-        dvi.MEGNO(scale=(np.ones(3), 1.0)),
-        {},
-        r"scale of q .* shape \(1,\) or \(2,\).* got shape \(3,\)",
-    ),
-    (dvi.MEGNO(), TRANSFORMED, "MEGNO requires lattice"),
-    (dvi.SALI(), SOLVED_FOR, "whose size does not depend on the state"),
-    (dvi.Running(dvi.MEGNO()), AT_TIMES, r"Running.*=dvi.Save\(every=m\)"),
-    (dvi.MEGNO, {}, r"contains the class MEGNO: .* dvi.MEGNO\(\)"),
-    (dvi.Running, {}, r"contains the class Running: .* dvi.Running\(dvi.MEGNO\(\)\)"),
-]
-
-
-@pytest.mark.parametrize(("observe", "options", "message"), INVALID_RUNS)
-def test_invalid_runs(observe, options, message):
-    with pytest.raises((ValueError, TypeError), match=message):
-        run(HENON.system, *REGULAR, observe, num_steps=10, **options)
-
-
 class SumOfSquares(dvi.Reduction):
     """A reduction of a user; `pull` is not needed."""
 

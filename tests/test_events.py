@@ -296,56 +296,6 @@ def test_implicit_forced_steps_and_progress():
     np.testing.assert_array_equal(sol.observed.ts, shown.observed.ts)
 
 
-def vector(t, q, p, args):
-    return q
-
-
-def condition(t, q, p, args):
-    return q[0] > 0.1
-
-
-def integer(t, q, p, args):
-    return 1
-
-
-BAD = (condition, integer)
-INVALID = [
-    (
-        lambda: dvi.Section(lambda q: q),
-        TypeError,
-        r"g of Section must take the arguments \(t, q, p, args\), got <lambda>\(q\)",
-    ),
-    (lambda: dvi.Stop(3.0), TypeError, r"g of Stop must be a function of \(t, q, p, args\)"),
-    (lambda: dvi.Section(on_axis, 2), ValueError, "direction must be one of 1, -1, 0"),
-    (
-        lambda: dvi.Section(on_axis, max_crossings=0),
-        ValueError,
-        "max_crossings must be an integer",
-    ),
-    (lambda: kepler(observe=dvi.Section(vector)), ValueError, "must return a real scalar"),
-    (lambda: kepler(stop=dvi.Stop(vector)), ValueError, "must return a real scalar"),
-    (lambda: kepler(stop=too_far), TypeError, r"stop must be a dvi\.Stop"),
-    (lambda: dvi.Save(ts=[0.1], final=True), ValueError, "only one of ts, every and final"),
-    (lambda: dvi.Save(ts=[0.1, 0.3, 0.2]), ValueError, "ascending or"),
-    (lambda: dvi.Save(ts=0.1), ValueError, r"shape \(times,\)"),
-    (lambda: dvi.Save(clock=on_axis), ValueError, "requires ts"),
-    (lambda: dvi.Save(ts=[0.1], clock=3), TypeError, "the clock of Save"),
-    (
-        lambda: kepler(save=dvi.Save(ts=[0.1], clock=vector)),
-        ValueError,
-        r"the clock\(t, q, p, args\) must return a real scalar",
-    ),
-    *((lambda g=g: kepler(observe=dvi.Section(g)), ValueError, "take the diff") for g in BAD),
-    *((lambda g=g: kepler(stop=dvi.Stop(g)), ValueError, "take the difference") for g in BAD),
-]
-
-
-@pytest.mark.parametrize(("make", "error", "says"), INVALID)
-def test_invalid_input(make, error, says):
-    with pytest.raises(error, match=says):
-        make()
-
-
 @pytest.mark.slow
 def test_slope_at_the_start_and_round_off_at_the_end():
     def positions(ts, t0=0.0, **settings):

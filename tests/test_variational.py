@@ -278,30 +278,6 @@ def test_progress_changes_nothing():
     np.testing.assert_array_equal(reported.ts, kepler(0.1, 60).ts)
 
 
-@pytest.mark.parametrize(
-    ("call", "error", "message"),
-    [
-        (lambda: dvi.Variational("halve"), ValueError, "on_no_root must be one of 'stop', 'hold'"),
-        (lambda: dvi.Variational(reach=1.0), ValueError, "reach .*finite number above 1"),
-        (lambda: dvi.Variational(bounds=(2.0, 3.0)), ValueError, "0 < smallest ≤ 1 ≤ largest"),
-        (
-            lambda: kepler(0.1, 3, method=dvi.Strang()),
-            ValueError,
-            r"requires method=dvi\.TypeII\(\)",
-        ),
-        (
-            lambda: kepler(0.1, 3, arithmetic=dvi.FixedPoint(2.0**-40)),
-            ValueError,
-            "step sizes are rounded",
-        ),
-        (lambda: kepler(None, 3), TypeError, r"Variational.* requires h\."),
-        (
-            lambda: kepler(0.1, 80, throw=True),
-            dvi.IntegrationError,
-            r"last h = 3\.07.*no root near the last step",
-        ),
-    ],
-)
-def test_invalid_lattices_and_runs_without_a_root_raise(call, error, message):
-    with pytest.raises(error, match=message):
-        call()
+def test_a_run_without_a_root_raises():
+    with pytest.raises(dvi.IntegrationError, match=r"last h = 3\.07.*no root near the last step"):
+        kepler(0.1, 80, throw=True)

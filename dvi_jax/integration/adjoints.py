@@ -14,8 +14,7 @@ from lanewise import Layout
 from ..base.checks import whole
 from ..base.types import State
 from .loop import Loop, outcome, run, start, with_start
-from .plan import Plan, adds_start_outside
-from .task import Outcome, Task
+from .task import Outcome, Plan, Task, adds_start_outside
 
 
 class AbstractAdjoint(eqx.Module):
@@ -35,16 +34,16 @@ class AbstractAdjoint(eqx.Module):
 def _direct_rollout(
     task: Task, plan: Plan, q0: State, p0: State, loop: Loop, layout: Layout
 ) -> Outcome:
-    # Only arrays may be arguments of a compiled function; the rest of a task is static.
-    arrays, rest = eqx.partition(task, eqx.is_array)
+    # Only arrays may be arguments of a compiled function; other parts of a task are static.
+    arrays, functions = eqx.partition(task, eqx.is_array)
 
     def forward(arrays, q0, p0):
-        task = eqx.combine(arrays, rest)
+        task = eqx.combine(arrays, functions)
         return outcome(task, plan, run(task, plan, start(task, q0, p0), loop), q0, p0)
 
     result = lanewise.call(forward, arrays, q0, p0, layout=layout)
     if adds_start_outside(plan):
-        return result._replace(saved=with_start(result.saved, q0, p0))
+        return result._replace(rows=with_start(result.rows, q0, p0))
     return result
 
 
@@ -93,6 +92,6 @@ class Checkpointed(AbstractAdjoint):
         # A shorter last segment, without padding: a step beyond the end could fail.
         left = count - size * segments
         if left:
-            carry, rest = segment(left)(carry, None)
-            ys = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), ys, rest)
+            carry, tail = segment(left)(carry, None)
+            ys = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), ys, tail)
         return carry, ys

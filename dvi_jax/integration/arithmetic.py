@@ -54,11 +54,11 @@ class Arithmetic(eqx.Module):
         """The state after a step from (q0, p0), whose result is (x1, y1), and the memory."""
         return x1, y1, None
 
-    def whole(self, q: State, p: State, memory: Any) -> tuple[Any, Any]:
-        """The state as arguments of a function for `evaluated`."""
+    def full_state(self, q: State, p: State, memory: Any) -> tuple[Any, Any]:
+        """The state as arguments of a function for `interpret`."""
         return q, p
 
-    def evaluated(self, function: Callable) -> Callable:
+    def interpret(self, function: Callable) -> Callable:
         """A function, the step of a method or a part of an observable, in this representation."""
         return function
 
@@ -137,14 +137,12 @@ class DoubleDouble(Arithmetic):
         if q0.dtype != jnp.float64:
             raise ValueError(
                 f"arithmetic=dvi.DoubleDouble() requires q0 and p0 in float64, got {q0.dtype}: "
-                'call jax.config.update("jax_enable_x64", True) first and convert them, or use '
-                "arithmetic=dvi.Compensated()."
+                'call jax.config.update("jax_enable_x64", True) first and convert them.'
             )
         if method.is_double_only(equations):
             raise ValueError(
                 f"arithmetic=dvi.DoubleDouble() cannot be used with method={method!r:.100}, whose "
-                "Kepler flow is accurate to float64 only. Use arithmetic=dvi.Compensated(), or "
-                "another method such as dvi.KahanLi(8)."
+                "Kepler flow has the accuracy of float64: use another, such as dvi.KahanLi(8)."
             )
         return equations, q0, p0
 
@@ -152,16 +150,16 @@ class DoubleDouble(Arithmetic):
         return jnp.zeros_like(q0), jnp.zeros_like(p0)
 
     def enter(self, equations: Equations, q0: State, p0: State, memory: Any) -> tuple:
-        return equations, *self.whole(q0, p0, memory)
+        return equations, *self.full_state(q0, p0, memory)
 
     def leave(self, q0: State, p0: State, x1: Any, y1: Any) -> tuple[State, State, Any]:
         return x1.hi, y1.hi, lax.stop_gradient((x1.lo, y1.lo))
 
-    def whole(self, q, p, memory):
+    def full_state(self, q, p, memory):
         return Pair(q, memory[0]), Pair(p, memory[1])
 
     # The whole step is interpreted, so that no method needs code of its own for pairs.
-    def evaluated(self, function):
+    def interpret(self, function):
         return functools.partial(in_pairs, function)
 
 
@@ -206,25 +204,18 @@ class FixedPoint(Arithmetic):
     def __check_init__(self):
         quantum = self.quantum
         is_number = isinstance(quantum, int | float) and not isinstance(quantum, bool)
-        if not is_number or not 0 < quantum < math.inf:
-            raise ValueError(
-                "quantum must be a power of two of the type float or int, such as 2.0**-40, got "
-                f"{quantum!r} (type {type(quantum).__name__})."
-            )
         # A power of two: multiplication by it and by its reciprocal is exact, and so are sums.
-        mantissa, exponent = math.frexp(quantum)
-        if mantissa != 0.5:
+        if not is_number or not 0 < quantum < math.inf or math.frexp(quantum)[0] != 0.5:
             raise ValueError(
-                f"quantum must be a power of two, got {quantum!r}. The nearest powers of two are "
-                f"2.0**{exponent - 1} and 2.0**{exponent}: use one of these."
+                f"quantum must be a power of two, such as 2.0**-40, got {quantum!r} (type "
+                f"{type(quantum).__name__})."
             )
 
     def prepare(self, method, equations, first_interval, q0, p0):
         if not method.is_made_of_the_map():
             raise ValueError(
                 "arithmetic=dvi.FixedPoint(...) requires a method composed of dvi.TypeII() and its "
-                f"adjoint, got {method!r}. Use dvi.Strang(), dvi.Yoshida(4) or another "
-                "composition, or arithmetic=dvi.Compensated(), which works with every method."
+                f"adjoint, such as dvi.Strang() or dvi.Yoshida(4), got {method!r}."
             )
         interval = first_interval()
         if not (
@@ -232,17 +223,16 @@ class FixedPoint(Arithmetic):
             and method.inverse_needs_no_solve(equations, interval, q0)
         ):
             raise ValueError(
-                "arithmetic=dvi.FixedPoint(...) requires steps that are explicit forwards and "
-                "backwards, but the steps of this system are implicit. H_D and the perturbation "
-                "must be separable, T(p1) + V(q0), and the force must not depend on p1. For other "
-                "systems use arithmetic=dvi.Compensated()."
+                "arithmetic=dvi.FixedPoint(...) requires explicit steps, also backwards: H_D and "
+                "the perturbation must be separable, T(p1) + V(q0), and the force independent of "
+                "p1."
             )
         # Both the quantum and its reciprocal, by which a state is multiplied, must be normal.
         smallest, largest = jnp.finfo(q0.dtype).tiny, 1 / jnp.finfo(q0.dtype).tiny
         if not smallest <= self.quantum <= largest:
             raise ValueError(
                 f"quantum = {self.quantum!r} is too small or too large for a state in {q0.dtype}: "
-                f"choose a power of two between {smallest:.1e} and {largest:.1e}."
+                f"it must be from {smallest:.1e} to {largest:.1e}."
             )
         equations = dataclasses.replace(equations, quantum=self.quantum)
         return equations, _start_on_grid(q0, self.quantum), _start_on_grid(p0, self.quantum)

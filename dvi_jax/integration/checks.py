@@ -1,51 +1,151 @@
-"""Which runs may have noise, and the path of such a run."""
+"""Checks before a run: its observables, its noise, and the memory of its results."""
 
+from typing import Any
+
+import equinox as eqx
 import jax
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
-from lanewise.jaxprs.jaxapi import is_traced
+from lanewise import Layout
+from lanewise.jaxprs.jaxapi import batch_size, is_traced
+from lanewise.primitive import generates
 
+from ..base.checks import function as check_function
+from ..base.machine import results_memory
+from ..base.signature import tracing_note
 from ..lattices import Lattice, Run
 from ..methods import Method
-from ..observe import Section, is_observable
+from ..observe import FORMS, Deviations, Range, Reduction, Running, Section, is_observable
+from ..observe.solution import Save
 from ..problem.noise import BrownianPath, NoisePath
 from .arithmetic import Compensated, FloatingPoint
 from .integrator import Integrator
+from .task import Plan, Task
+
+
+def check_observe(task: Task, q0: Array, p0: Array) -> int:
+    """**Raises** `TypeError` or `ValueError` for observables that are not functions of a step with
+    an array as value. **Returns** the bytes of those without a reduction, at one save point."""
+    size = 0
+    for leaf in jax.tree.leaves(task.observe, is_leaf=is_observable):
+        is_class = isinstance(leaf, type) and issubclass(leaf, Reduction | Running)
+        if is_class or not is_observable(leaf):
+            value = f"the class {leaf.__name__} (no object)" if is_class else f"{leaf!r:.200}"
+            raise TypeError(
+                f"observe must be a function of {FORMS}, a reduction such as dvi.MaxDrift(f), or a "
+                f"dict, list or tuple of these, got {value}."
+            )
+        if isinstance(leaf, Running):
+            leaf = leaf.reduction
+        if isinstance(leaf, Deviations):
+            _check_deviations(leaf, task, q0)
+            continue
+        function = leaf.function if isinstance(leaf, Reduction) else leaf
+        name = getattr(function, "__name__", type(function).__name__)
+        check_function(f"the argument of {type(leaf).__name__}", function, FORMS)
+        t0, bound = task.t0, task.bound(function)
+        try:
+            value = eqx.filter_eval_shape(bound, t0, t0, q0, p0, q0, p0, task.args)
+        except Exception as error:
+            # The error itself stays: its type and traceback show the line of the user.
+            error.add_note(f"(in the observable {name}, with the arguments {FORMS})")
+            error.add_note(tracing_note(name, error))
+            raise
+        if not hasattr(value, "shape") and not isinstance(value, int | float):
+            kind = "None (is a return missing?)" if value is None else type(value).__name__
+            raise TypeError(
+                f"the observable {name!r} must return one array, got {kind}. Stack several values "
+                "with jnp.stack, or observe a dict of functions."
+            )
+        if isinstance(leaf, Range) and jnp.issubdtype(jnp.result_type(value), jnp.complexfloating):
+            raise TypeError(
+                f"dvi.Range requires real values, but {name!r} returns complex ones: observe their "
+                "real or imaginary part, or absolute value."
+            )
+        if not isinstance(leaf, Reduction):
+            size += int(np.prod(np.shape(value), dtype=int)) * jnp.result_type(value).itemsize
+    return size
+
+
+def _check_deviations(leaf: Deviations, task: Task, q0: Array) -> None:
+    # The derivative of a step is taken at a fixed h; the derivative of h would be missing.
+    if task.lattice.has_memory:
+        raise ValueError(
+            f"{type(leaf).__name__} requires steps whose size does not depend on the state: "
+            f"lattice=dvi.Uniform() or dvi.Given(ts), got {task.lattice!r}."
+        )
+    eqx.filter_eval_shape(leaf.start, jnp.zeros(2 * q0.size, q0.dtype))  # counts and units
 
 
 def noise_path(
-    run: Run, path: BrownianPath | None, how: Integrator, method: Method, h: Array, num_steps: int
+    run: Run,
+    path: BrownianPath | None,
+    integrator: Integrator,
+    method: Method,
+    h: Array,
+    num_steps: int,
 ) -> NoisePath | None:
     """The path for a run, None without noise. **Raises** `ValueError` if they do not fit."""
     noise = run.system.noise
     if noise is None and path is None:  # nearly every run
         return None
-    observed = jax.tree.leaves(run.observe, is_leaf=is_observable)
-    stops = run.save.ts is not None or run.stop is not None
-    adapts = how.lattice.has_memory or type(how.lattice).transform is not Lattice.transform
+    lattice, arithmetic = integrator.lattice, integrator.arithmetic
+    observables = jax.tree.leaves(run.observe, is_leaf=is_observable)
+    has_section = any(isinstance(f, Section) for f in observables)
+    is_adaptive = lattice.has_memory or type(lattice).transform is not Lattice.transform
     # What the user has to change first comes first.
-    wrong = {
-        "path has no effect, because the system has no noise: leave path out, or give noise= in "
-        "dvi.System.": noise is None,
+    conditions = {
+        "path has no effect without noise: leave it out, or give noise= in dvi.System.": (
+            noise is None
+        ),
         "path must be given for a system with noise: path=dvi.Brownian(jax.random.key(0)), or an "
         "integer, the seed of a key.": path is None,
-        f"method={method!r:.200} is not a method for systems with noise. Use dvi.BAOAB() or "
-        "dvi.OBABO() for noise on the momenta, dvi.StochasticEuler() or dvi.StochasticMidpoint() "
-        "for every kind of noise.": not method.increments,
+        f"method={method!r:.200} is not a method for systems with noise: use dvi.BAOAB() or "
+        "dvi.OBABO() for noise on the momenta, dvi.StochasticEuler() for any noise.": (
+            not method.increments
+        ),
         # The path would not be independent of the state.
-        f"lattice={how.lattice!r:.200} cannot be used with noise, because its steps depend on the "
-        "state. Use dvi.Uniform() or dvi.Given(ts).": adapts,
-        f"arithmetic={how.arithmetic!r:.200} cannot be used with noise. Use dvi.FloatingPoint() "
-        "or dvi.Compensated().": not isinstance(how.arithmetic, FloatingPoint | Compensated),
+        f"lattice={lattice!r:.200} cannot be used with noise, because its steps depend on the "
+        "state: use dvi.Uniform() or dvi.Given(ts).": is_adaptive,
+        f"arithmetic={arithmetic!r:.200} cannot be used with noise: use dvi.FloatingPoint() or "
+        "dvi.Compensated().": not isinstance(arithmetic, FloatingPoint | Compensated),
         f"h must be positive for a system with noise, got h={h}.": not is_traced(h) and not h > 0,
         # Between the ends of a step the path is not known.
         "dvi.Save(ts=...), dvi.Stop and dvi.Section cannot be used with noise, because they need "
-        "states within a step. Use dvi.Save(every=m) and a reduction such as dvi.Range.": stops
-        or any(isinstance(f, Section) for f in observed),
+        "states within a step: use dvi.Save(every=m) and a reduction such as dvi.Range.": (
+            run.save.ts is not None or run.stop is not None or has_section
+        ),
     }
-    if found := [why for why, is_so in wrong.items() if is_so]:
-        raise ValueError(found[0])
+    messages = [message for message, applies in conditions.items() if applies]
+    if messages:
+        raise ValueError(messages[0])
     assert noise is not None
     assert path is not None
     path.check(num_steps)
     return NoisePath(path, method.increments, noise.count(run.t0, run.q0, run.p0, run.args))
+
+
+def check_memory(
+    save: Save, plan: Plan, q0: Array, observed_bytes: int, leaves: list[Any], layout: Layout
+) -> None:
+    """**Raises** `ValueError` for results that no memory can hold; `observed_bytes`: those of
+    observables at a save point."""
+    memory = results_memory()
+    num_states = plan.num_blocks + 1 + plan.save_tail if save.ts is None else save.ts.shape[0]
+    row = (2 * q0.size + 2) * q0.dtype.itemsize + observed_bytes  # q, p, t and h
+    lanes, is_compiled = batch_size(leaves)
+    size = lanes * num_states * row
+    if memory is None or size <= memory:
+        return
+    # XLA does not compute results that the function around this one does not use.
+    if is_compiled and (layout.form == "arrays" or not generates()):
+        return
+    batch = f" of each of {lanes} trajectories" if lanes > 1 else ""
+    other = ", run fewer trajectories at once, or use dvi.sweep(store=...)" if lanes > 1 else ""
+    raise ValueError(
+        f"the results need {size / 2**30:.3g} GiB of memory ({num_states} saved "
+        f"state{'s' * (num_states > 1)}{batch}), but only {memory / 2**30:.3g} GiB are available. "
+        f"Save fewer states with save=dvi.Save(every=m), final=True or ts=times{other}."
+    )

@@ -37,7 +37,7 @@ class Curve(eqx.Module):
     layout: Layout = eqx.field(static=True)
 
     @classmethod
-    def of(cls, method: Method, equations: Equations, layout: Layout) -> "Curve":
+    def create(cls, method: Method, equations: Equations, layout: Layout) -> "Curve":
         # In fixed point the curve would be a staircase, on which no root can be found.
         return cls(method, dataclasses.replace(equations, quantum=None), layout)
 
@@ -52,12 +52,12 @@ class Curve(eqx.Module):
         """The point of the step where g(t, q, p, args) = 0, or its end if none `exists`."""
         args = self.equations.args
 
-        def at(theta):
+        def value(theta):
             return event(g, *self.point(start, theta), args)
 
-        zero, one = jnp.zeros_like(start.t0), jnp.ones_like(start.t0)
+        zero, unit = jnp.zeros_like(start.t0), jnp.ones_like(start.t0)
         at_zero = event(g, start.t0, start.q0, start.p0, args)
-        theta = bracketed_root(at, zero, at_zero, one, at(one), exists)
+        theta = bracketed_root(value, zero, at_zero, unit, value(unit), exists)
         return self.point(start, theta)
 
 
@@ -66,11 +66,11 @@ def requested_times(save: Save, task: Task, num_steps: int) -> tuple[RequestedTi
     all reductions."""
     if task.has_running_values:
         raise ValueError(
-            "dvi.Running in observe cannot be combined with save=dvi.Save(ts=...), because its "
-            "values exist at grid points only. Use save=dvi.Save(every=m), or remove dvi.Running."
+            "dvi.Running, whose values exist at grid points only, cannot be combined with "
+            "save=dvi.Save(ts=...): use dvi.Save(every=m)."
         )
     # Functions that are not reductions are evaluated at the requested times, after the run.
-    kept = jax.tree.map(
+    reductions = jax.tree.map(
         lambda f: f if isinstance(f, Reduction) else None, task.observe, is_leaf=is_observable
     )
     ts = jnp.asarray(save.ts, task.t0.dtype)
@@ -80,83 +80,89 @@ def requested_times(save: Save, task: Task, num_steps: int) -> tuple[RequestedTi
         end = task.interval(jnp.asarray(num_steps - 1, jnp.int32)).t1
         # N·(T/N) may differ from T in the last digit: a request at an end of the run is moved to
         # it, so that it is not outside. The derivative is that of the requested time.
-        for known in (task.t0, end):
-            size = jnp.maximum(jnp.abs(task.t0), jnp.abs(known))
-            near = jnp.abs(ts - known) <= 16 * eps * size
-            ts = jnp.where(near, ts + lax.stop_gradient(known - ts), ts)
+        for edge in (task.t0, end):
+            size = jnp.maximum(jnp.abs(task.t0), jnp.abs(edge))
+            is_edge = jnp.abs(ts - edge) <= 16 * eps * size
+            ts = jnp.where(is_edge, ts + lax.stop_gradient(edge - ts), ts)
         # Also t0 + k h, compiled in a loop, may differ in the last digit from its value here.
         slack = 4 * eps * (jnp.abs(task.t0) + jnp.abs(ts))
         due = lax.stop_gradient(ts - jnp.where(end >= task.t0, slack, -slack))
-    return RequestedTimes(ts=ts, due=due, ordered=jnp.sort(due), clock=save.clock), kept
+    return RequestedTimes(ts=ts, due=due, ordered=jnp.sort(due), clock=save.clock), reductions
 
 
-def crossings(curve: Curve, section: Section, kept: tuple[Array, Array], safe: Start) -> Crossings:
-    """The crossings in the steps that a section has stored. `safe` is any step that exists."""
-    rows, count = kept
+def crossings(
+    curve: Curve, section: Section, record: tuple[Array, Array], safe: Start
+) -> Crossings:
+    """The crossings in the steps that a section has recorded. `safe` is any step that exists."""
+    rows, count = record
     exists, starts = _steps(rows, safe)
-    found = each(_crossing, (curve, section.g), starts, exists, layout=curve.layout)
-    ts, qs, ps = _or_nan(exists, found)
+    points = each(_crossing, (curve, section.g), starts, exists, layout=curve.layout)
+    ts, qs, ps = _or_nan(exists, points)
     return Crossings(ts, qs, ps, count.astype(jnp.int32))
 
 
-def _crossing(given: tuple[Curve, Callable], start: Start, exists: Array) -> Point:
-    curve, g = given
+def _crossing(surface: tuple[Curve, Callable], start: Start, exists: Array) -> Point:
+    curve, g = surface
     return curve.where(g, start, exists)
 
 
 def at_times(
-    curve: Curve, requested: RequestedTimes, kept: tuple[Array, Array], safe: Start
+    curve: Curve, request: RequestedTimes, record: tuple[Array, Array], safe: Start
 ) -> tuple[Array, Start, Point]:
     """For each requested time: is it reached, the step that contains it, and the point there."""
-    exists, starts = _steps(kept[0], safe)
-    given = (curve, requested.clock)
-    began = each(_shown, given, starts, layout=curve.layout)
-    first = one_by_one(_shown, given, safe, layout=curve.layout)
-    sense = jnp.where(starts.until[0] >= began[0], 1, -1)  # −1: time runs backwards
+    exists, starts = _steps(record[0], safe)
+    clock = (curve, request.clock)
+    readings = each(_reading, clock, starts, layout=curve.layout)
+    first = one_by_one(_reading, clock, safe, layout=curve.layout)
+    sense = jnp.where(starts.until[0] >= readings[0], 1, -1)  # −1: time runs backwards
     # In ascending order, as bisection requires: empty rows, which are last, are at infinity.
     ends = jnp.where(exists, sense * starts.until, jnp.inf)
 
-    def one(time, due):
+    def at_time(time, due):
         i = jnp.minimum(jnp.searchsorted(ends, sense * due), ends.size - 1)
-        reached = exists[i] & (sense * began[i] < sense * due) & (sense * due <= ends[i])
-        start = jax.tree.map(lambda x, y: jnp.where(reached, x[i], y), starts, safe)
-        is_start = time == first
-        if requested.clock is None:
-            time = jnp.where(is_start, _just_after(time, start), time)
-        point, is_shown = one_by_one(_within, given, start, time, reached, layout=curve.layout)
-        known = (safe.t0, safe.q0, safe.p0)
-        if requested.clock is None:  # the value of the start to the bit, the slope of the curve
-            known = jax.tree.map(lambda a, b: a + lax.stop_gradient(b - a), point, known)
-        point = jax.tree.map(lambda a, b: jnp.where(is_start, b, a), point, known)
-        found = (reached & is_shown) | is_start
-        return found, start, _or_nan(found, point)
+        is_reached = exists[i] & (sense * readings[i] < sense * due) & (sense * due <= ends[i])
+        start = jax.tree.map(lambda x, y: jnp.where(is_reached, x[i], y), starts, safe)
+        is_first = time == first
+        if request.clock is None:
+            time = jnp.where(is_first, _just_after(time, start), time)
+        point, is_shown = one_by_one(_point_at, clock, start, time, is_reached, layout=curve.layout)
+        origin = (safe.t0, safe.q0, safe.p0)
+        if request.clock is None:  # the value of the start to the bit, the slope of the curve
+            origin = jax.tree.map(lambda a, b: a + lax.stop_gradient(b - a), point, origin)
+        point = jax.tree.map(lambda a, b: jnp.where(is_first, b, a), point, origin)
+        has_point = (is_reached & is_shown) | is_first
+        return has_point, start, _or_nan(has_point, point)
 
-    return jax.vmap(one)(requested.ts, requested.due)
+    return jax.vmap(at_time)(request.ts, request.due)
 
 
-def _shown(given, start: Start) -> Scalar:
+Clock = tuple[Curve, Any]
+"""A curve, and the function whose value is the time (None: t itself)."""
+
+
+def _reading(clock: Clock, start: Start) -> Scalar:
     """The value of the clock at the start of a step."""
-    curve, clock = given
-    return shown(clock, start.t0, start.q0, start.p0, curve.equations.args)
+    curve, function = clock
+    return shown(function, start.t0, start.q0, start.p0, curve.equations.args)
 
 
-def _within(given, start: Start, time: Scalar, reached: Array) -> tuple[Point, Array]:
+def _point_at(clock: Clock, start: Start, time: Scalar, is_reached: Array) -> tuple[Point, Array]:
     """The point of the step at a requested time, and whether the clock shows that time there."""
-    curve, clock = given
-    if clock is None:
+    curve, function = clock
+    if function is None:
         theta = (time - start.t0) / (start.t1 - start.t0)
         return curve.point(start, theta), jnp.asarray(True)
     args = curve.equations.args
 
-    def late(t, q, p, args):
-        return shown(clock, t, q, p, args) - time
+    def delay(t, q, p, args):
+        return shown(function, t, q, p, args) - time
 
-    t, q, p = curve.where(late, start, reached)
+    t, q, p = curve.where(delay, start, is_reached)
     # A clock that jumps has passed the value without showing it; so has one that is not monotonic.
-    missed = jnp.abs(shown(clock, t, q, p, args) - time)
-    span = jnp.abs(start.until - _shown(given, start))
-    close = jnp.sqrt(jnp.finfo(start.q0.dtype).eps)
-    return (t, q, p), missed <= close * (span + jnp.abs(time))
+    error = jnp.abs(shown(function, t, q, p, args) - time)
+    span = jnp.abs(start.until - _reading(clock, start))
+    tolerance = jnp.sqrt(jnp.finfo(start.q0.dtype).eps)
+    return (t, q, p), error <= tolerance * (span + jnp.abs(time))
 
 
 def _just_after(time: Scalar, start: Start) -> Scalar:
@@ -166,14 +172,15 @@ def _just_after(time: Scalar, start: Start) -> Scalar:
     return time + lax.stop_gradient(part * (start.t1 - start.t0))
 
 
-def stopped(curve: Curve, stop: Stop, row: Array, safe: Start) -> Stopped:
+def stop_point(curve: Curve, stop: Stop, row: Array, safe: Start) -> Stopped:
     """The point g = 0 in the last step of a run; the start of that step if g ≥ 0 there already."""
     exists, start = _steps(row, safe)
-    began = (start.t0, start.q0, start.p0)
-    at_start = one_by_one(event, stop.g, *began, curve.equations.args, layout=curve.layout) >= 0
-    given = (curve, stop.g)
-    point = one_by_one(_crossing, given, start, exists & ~at_start, layout=curve.layout)
-    point = jax.tree.map(lambda a, b: jnp.where(at_start, b, a), point, began)
+    origin = (start.t0, start.q0, start.p0)
+    value = one_by_one(event, stop.g, *origin, curve.equations.args, layout=curve.layout)
+    is_start = value >= 0
+    surface = (curve, stop.g)
+    point = one_by_one(_crossing, surface, start, exists & ~is_start, layout=curve.layout)
+    point = jax.tree.map(lambda a, b: jnp.where(is_start, b, a), point, origin)
     return Stopped(*_or_nan(exists, point))
 
 
@@ -182,15 +189,16 @@ def _steps(rows: Array, safe: Start) -> tuple[Array, Start]:
     # Points are computed for empty rows as well, in a batch: from NaN the derivative would be NaN.
     exists, starts = from_rows(rows, safe.q0.shape)
 
-    def filled(x, substitute):
-        return jnp.where(_beside(exists, x), x, substitute)
+    def fill(x, substitute):
+        return jnp.where(_flags_like(exists, x), x, substitute)
 
-    return exists, jax.tree.map(filled, starts, safe)
+    return exists, jax.tree.map(fill, starts, safe)
 
 
 def _or_nan(exists: Array, points: Any) -> Any:
-    return jax.tree.map(lambda x: jnp.where(_beside(exists, x), x, jnp.nan), points)
+    return jax.tree.map(lambda x: jnp.where(_flags_like(exists, x), x, jnp.nan), points)
 
 
-def _beside(exists: Array, x: Array) -> Array:
+def _flags_like(exists: Array, x: Array) -> Array:
+    """Flags of rows, in a shape that broadcasts to that of x."""
     return exists.reshape(exists.shape + (1,) * (x.ndim - exists.ndim))

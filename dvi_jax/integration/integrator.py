@@ -74,22 +74,23 @@ class Integrator(eqx.Module):
         """The method, or the default for this system. **Raises** `ValueError` for options that do
         not fit a constraint, or its absence."""
         method = default_method(system) if self.method is None else self.method
-        constrained = system.constraint is not None
-        if method.needs_constraint() != constrained:
+        has_constraint = system.constraint is not None
+        if method.needs_constraint() != has_constraint:
             raise ValueError(
-                "a system with a constraint needs method=dvi.Rattle(), or a composition of it such "
-                f"as dvi.Yoshida(4, base=dvi.Rattle()), got {method!r}."
-                if constrained
-                else f"method={method!r} needs a constraint, but the system has none: use "
-                "dvi.System(H_D, constraint=g), or another method such as dvi.Strang()."
+                "a system with a constraint needs method=dvi.Rattle() or a composition of it, got "
+                f"{method!r}."
+                if has_constraint
+                else f"method={method!r} needs a constraint: give dvi.System(H_D, constraint=g), "
+                "or another method."
             )
         # By type: `TimeTransformed` is a `Uniform` that takes other equations.
         plain = {"lattice": (Uniform, Given), "arithmetic": (FloatingPoint, Compensated)}
-        for name, kinds in plain.items() if constrained else ():
+        for name, kinds in plain.items() if has_constraint else ():
             if type(value := getattr(self, name)) not in kinds:
-                names = " or ".join(f"dvi.{kind.__name__}" for kind in kinds)
-                seen = f"{value!r:.200}"
-                raise ValueError(f"a system with a constraint needs {name}={names}, got {seen}.")
+                choices = " or ".join(f"dvi.{kind.__name__}" for kind in kinds)
+                raise ValueError(
+                    f"a system with a constraint needs {name}={choices}, got {value!r:.200}."
+                )
         return method
 
 
@@ -121,39 +122,38 @@ def default_method(system: System) -> Method:
     # of it has order two. A map that the user wrote stays as it is.
     if isinstance(system.H_D, Split):
         return Splitting()
-    own = getattr(system.H_D, "own_method", None)
-    if isinstance(own, Method):
-        return own
+    method = getattr(system.H_D, "own_method", None)
+    if isinstance(method, Method):
+        return method
     return _STRANG if is_first_order(system.H_D) else _TYPE_II
 
 
-def chosen(integrator: Integrator | None = None, **given: Any) -> Integrator:
-    """The integrator of a call: the object, or one made of single keywords (None: not given).
+def chosen(integrator: Integrator | None = None, **options: Any) -> Integrator:
+    """The integrator of a call: the object, or one made of single options (None: not given).
 
     **Raises** `TypeError` for another object, `ValueError` for both.
     """
-    given = {name: value for name, value in given.items() if value is not None}
+    options = {name: value for name, value in options.items() if value is not None}
     if integrator is None:
-        return Integrator(**given) if given else _DEFAULT
+        return Integrator(**options) if options else _DEFAULT
     instance("integrator", integrator, Integrator, "a dvi.Integrator(...)")
-    if given:
-        names = ", ".join(given).replace("root_finder", "root_finder (or newton)")
+    if options:
+        names = ", ".join(options)
         raise ValueError(
-            f"{names} and integrator cannot be given together: set {names} in "
-            "dvi.Integrator(...), or leave integrator out."
+            f"{names} and integrator cannot be given together: set {names} in dvi.Integrator(...)."
         )
     return integrator
 
 
-def only(integrator: Integrator, function: str, *used: str) -> Integrator:
+def only(integrator: Integrator, function: str, *names: str) -> Integrator:
     """The integrator. **Raises** `ValueError` for a field that the function does not use and that
     differs from the default."""
     # Otherwise an option without effect would be ignored without a word.
     for name in _FIELDS:
         value, default = getattr(integrator, name), getattr(_DEFAULT, name)
-        if name not in used and not eqx.tree_equal(value, default):
+        if name not in names and not eqx.tree_equal(value, default):
             raise ValueError(
-                f"{function} does not use {name}, but integrator has {name}={value!r:.200}: leave "
-                f"{name} out of dvi.Integrator(...). {function} uses only {' and '.join(used)}."
+                f"{function} does not use {name}, got an integrator with {name}={value!r:.200}. It "
+                f"uses only {' and '.join(names)}."
             )
     return integrator

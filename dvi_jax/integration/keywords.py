@@ -88,6 +88,6 @@ _FIELDS = ("method", "lattice", "root_finder", "arithmetic", "layout", "integrat
 
 def integrator_of(settings: Mapping[str, Any]) -> tuple[Integrator, dict[str, Any]]:
     """The `Integrator` that the keywords of a call describe, and the other keywords."""
-    fields = {name: value for name, value in settings.items() if name in _FIELDS}
-    others = {name: value for name, value in settings.items() if name not in _FIELDS}
-    return chosen(**fields), others
+    options = {name: value for name, value in settings.items() if name in _FIELDS}
+    arguments = {name: value for name, value in settings.items() if name not in _FIELDS}
+    return chosen(**options), arguments

@@ -1,108 +1,157 @@
-"""Observables: checks before a run, and their values in the pytree of the user after it."""
+"""From the result of the loop to the `Solution`, or to the error of a run that has failed."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import PyTree
 
 import lanewise
 from lanewise import Layout
+from lanewise.jaxprs.jaxapi import is_traced, manual_axes
 
-from ..base.checks import function as check_function
-from ..base.signature import tracing_note
-from ..lattices import Run
-from ..observe import FORMS, Deviations, OfState, Range, Reduction, Running, is_observable
-from .task import Task
-
-
-def check_observe(task: Task, q0: Array, p0: Array) -> int:
-    """**Raises** `TypeError` or `ValueError` for observables that are not functions of a step with
-    an array as value. **Returns** the bytes of those without a reduction, at one save point."""
-    size = 0
-    for leaf in jax.tree.leaves(task.observe, is_leaf=is_observable):
-        if isinstance(leaf, type) and issubclass(leaf, Reduction | Running):
-            raise TypeError(
-                f"observe contains the class {leaf.__name__}: give an object of this class. "
-                "Examples are dvi.MEGNO(), dvi.Running(dvi.MEGNO()) and dvi.MaxDrift(function), "
-                f"with a function of {FORMS}."
-            )
-        if not is_observable(leaf):
-            raise TypeError(
-                f"observe must be a function of {FORMS}, a reduction such as dvi.MaxDrift(f), "
-                f"dvi.Running(reduction), or a dict, list or tuple of these, got {leaf!r:.200}."
-            )
-        if isinstance(leaf, Running):
-            leaf = leaf.reduction
-        if isinstance(leaf, Deviations):
-            _check_deviations(leaf, task, q0, p0)
-            continue
-        function = leaf.function if isinstance(leaf, Reduction) else leaf
-        called = getattr(function, "__name__", type(function).__name__)
-        check_function(f"the argument of {type(leaf).__name__}", function, FORMS)
-        t0, bound = task.t0, task.bound(function)
-        try:
-            out = eqx.filter_eval_shape(bound, t0, t0, q0, p0, q0, p0, task.args)
-        except Exception as error:
-            # The error itself stays: its type and traceback show the line of the user.
-            error.add_note(f"(in the observable {called}, with the arguments {FORMS})")
-            error.add_note(tracing_note(called, error))
-            raise
-        if not hasattr(out, "shape") and not isinstance(out, int | float):
-            seen = "None (is a return missing?)" if out is None else f"type {type(out).__name__}"
-            raise TypeError(
-                f"the observable {called!r} must return one array, got {seen}. For several values "
-                "use jnp.stack, or give observe a dict of observables."
-            )
-        if isinstance(leaf, Range) and jnp.issubdtype(jnp.result_type(out), jnp.complexfloating):
-            raise TypeError(
-                f"dvi.Range requires real values, but the observable {called!r} returns complex "
-                "values. Take their real part, imaginary part or absolute value."
-            )
-        if not isinstance(leaf, Reduction):
-            size += int(np.prod(np.shape(out), dtype=int)) * jnp.result_type(out).itemsize
-    return size
+from ..base.results import RESULTS, IntegrationError, status_code, status_name
+from ..engine.newton import relative_size
+from ..engine.rounding import each
+from ..lattices import Place, Run
+from ..observe import OfState, Reduction, RequestedTimes, Running, Section, is_observable
+from ..observe._kept import Start
+from ..observe.solution import Solution
+from .dense import Curve, at_times, crossings, stop_point
+from .task import Ends, Outcome, Plan, Task
 
 
-def _check_deviations(leaf: Deviations, task: Task, q0: Array, p0: Array) -> None:
-    name = type(leaf).__name__
-    # The derivative of a step is taken at a fixed h; the derivative of h would be missing.
-    if task.lattice.has_memory:
-        raise ValueError(
-            f"{name} requires steps whose size does not depend on the state, got "
-            f"lattice={task.lattice!r}. Use lattice=dvi.Uniform() or dvi.Given(ts)."
-        )
-    eqx.filter_eval_shape(leaf.start, jnp.zeros(2 * q0.size, q0.dtype))  # counts and units
+def as_solution(
+    task: Task, plan: Plan, observe: PyTree, outcome: Outcome, q0, p0, layout: Layout
+) -> Solution:
+    """The public `Solution` of a run."""
+    carry, rows, values, defect = outcome
+    curve = Curve.create(task.method, task.equations, layout)
+    first = task.first_interval()
+    # A batch element without a step to interpolate in uses the first one: its numbers are finite.
+    safe = Start(first.t0, first.t1, first.t1, q0, p0)
+    _, reductions = task.observables()
+    results: list[Any] = [
+        crossings(curve, r, value, safe) if isinstance(r, Section) else value
+        for r, value in zip(reductions, values, strict=True)
+    ]
+    status = carry.result
+    if reductions and isinstance(request := reductions[0], RequestedTimes):
+        is_reached, starts, (ts, qs, ps) = at_times(curve, request, results[0], safe)
+        if request.clock is None:
+            ts = request.ts  # also the times that were not reached
+        is_short = (status == RESULTS.successful) & ~jnp.all(is_reached)
+        status = RESULTS.where(is_short, RESULTS.not_reached, status)
+        results, hs = results[1:], ts - starts.t0
+        steps = Ends(starts.t0, ts, starts.q0, starts.p0, qs, ps)
+        functions, _ = dataclasses.replace(task, observe=observe).observables()
+        columns = each(_values, (functions, task.args), steps, layout=layout)
+    else:
+        ts = jnp.concatenate([task.t0[None], rows.t])
+        qs, ps, hs, columns = rows.q, rows.p, rows.h, rows.observed
+    place = Place(task.t0, task.h, carry.k, carry.q, carry.p)
+    stats = {
+        "num_steps": plan.num_steps,
+        "newton_iterations": carry.iterations,
+        "max_residual": relative_size(*carry.residual),
+        "failed_step": carry.failed_step,
+        "failed_residual": relative_size(*carry.failed_residual),
+        **task.lattice.report(carry.lattice, task.equations, place),
+        **({} if defect is None else {"round_trip_defect": defect}),
+    }
+    observed = observed_values(observe, columns, results)
+    end = None if task.stop is None else stop_point(curve, task.stop, carry.stop, safe)
+    return Solution(ts, qs, ps, hs, observed, status, stats, end)
 
 
-def observed(observe: PyTree, alone: list[Any], reduced: list[Any]) -> PyTree:
-    """The pytree `observe` with every observable replaced by its values."""
+def _values(observables: tuple[list[Any], Any], ends: Ends) -> list[PyTree]:
+    functions, args = observables
+    return [ends.value(f, args) for f in functions]
+
+
+def observed_values(observe: PyTree, columns: list[Any], results: list[Any]) -> PyTree:
+    """The pytree `observe` with every function replaced by its values at save points, and every
+    reduction by its result."""
     # Both lists are in the order of the leaves, in which `Task.observables` has separated them.
-    values, lone = iter(reduced), iter(alone)
+    next_column, next_result = iter(columns).__next__, iter(results).__next__
 
-    def value(f):
-        if isinstance(f, Reduction):
-            return next(values)
-        if isinstance(f, Running):  # its final value is the last of its rows, and not needed
-            next(values)
-        return next(lone)
+    def value(observable):
+        if isinstance(observable, Reduction):
+            return next_result()
+        if isinstance(observable, Running):  # its final value is the last of its rows
+            next_result()
+        return next_column()
 
     return jax.tree.map(value, observe, is_leaf=is_observable)
 
 
-def with_initial_values(observe: PyTree, found: PyTree, run: Run, layout: Layout) -> PyTree:
+def with_initial_values(observe: PyTree, observed: PyTree, run: Run, layout: Layout) -> PyTree:
     """The values of functions of the state, with that at the initial state as their first row."""
 
-    def value(f, values):
-        if not isinstance(f, OfState):
+    def with_first_row(observable, values):
+        if not isinstance(observable, OfState):
             return values
 
         def at_start(t, q, p, args):
-            return jnp.asarray(f(t, t, q, p, q, p, args))
+            return jnp.asarray(observable(t, t, q, p, q, p, args))
 
         first = lanewise.call(at_start, run.t0, run.q0, run.p0, run.args, layout=layout)
         return jnp.concatenate([first[None].astype(values.dtype), values])
 
-    return jax.tree.map(value, observe, found, is_leaf=is_observable)
+    return jax.tree.map(with_first_row, observe, observed, is_leaf=is_observable)
+
+
+def raise_on_failure(solution: Solution, task: Task) -> Solution:
+    """The solution. **Raises** `IntegrationError` if the run has failed; inside a transformation of
+    JAX an error of equinox."""
+    status = solution.result
+    if is_traced(status_code(status)):
+        return _when_compiled(solution)
+    if status_name(status) in ("successful", "stopped"):
+        return solution
+    remark = (
+        f"{RESULTS[status]} The attribute `solution` of this error is what throw=False returns."
+    )
+    if bool(status == RESULTS.not_reached):
+        is_missing = np.isnan(np.asarray(solution.qs)).reshape(len(solution.ts), -1).any(1)
+        first = float(solution.ts[is_missing.argmax()])
+        example = f"; the first missing one is t = {first:.17g}" if np.isfinite(first) else ""
+        raise IntegrationError(
+            f"the run reached {(~is_missing).sum()} of {is_missing.size} values of ts in "
+            f"dvi.Save(ts=...){example}. {remark}",
+            solution,
+        )
+    stats = solution.stats
+    step = int(stats["failed_step"])
+    if task.lattice.has_memory:
+        details = f"last h = {float(stats['last_h']):g}"
+    else:
+        details = f"h = {float(task.interval(jnp.asarray(step, jnp.int32)).h):g}"
+    if int(stats["newton_iterations"]) > 0:
+        residual = float(stats["failed_residual"])
+        details += f" and relative residual {residual:.3g} of the implicit solve"
+    raise IntegrationError(
+        f"the trajectory failed at step {step} of {stats['num_steps']} (the first step has number "
+        f"0), with {details}. {remark}",
+        solution,
+    )
+
+
+def _when_compiled(solution: Solution) -> Solution:
+    """The solution, whose failure raises an error when the compiled program runs."""
+    # Its status is not known before: only an error of equinox can report it, without the solution.
+    status = solution.result
+    is_failure = (status != RESULTS.successful) & (status != RESULTS.stopped)
+    arrays, functions = eqx.partition(solution, eqx.is_array)
+    if not manual_axes(*jax.tree.leaves(arrays)):
+        return status.error_if(solution, is_failure)
+
+    # In jax.shard_map the branches of error_if differ in type: form it for one device.
+    def check(status, arrays, is_failure):
+        return status.error_if(arrays, is_failure)
+
+    arrays = lanewise.call(check, status, arrays, is_failure, layout=Layout(form="arrays"))
+    return eqx.combine(arrays, functions)

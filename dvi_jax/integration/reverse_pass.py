@@ -1,7 +1,6 @@
-"""The reverse pass of `Reversible`: states by inverse steps, and cotangents along them."""
+"""The adjoint equation of a trajectory: cotangents from its end to its start."""
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,324 +11,243 @@ from jaxtyping import Array
 
 import lanewise
 
-from ..base.results import RESULTS
 from ..base.types import State
 from ..engine.newton import KnownRoot, RootSolver
-from ..observe import has_initial_value
+from ..observe import Reduction, has_initial_value
 from .loop import number_of
-from .plan import Plan, adds_start_outside, piece_length
-from .task import Saved, StepTaken, Task
-
-# Steps back between two updates of the sizes of the components, relative to which differences are
-# measured. An update in every step would take a noticeable part of the time of an explicit one.
-LOOKS = 16
+from .reconstruction import Point, Reconstruction, fold_blocks
+from .task import Ends, Rows, Task, adds_start_outside
 
 
 class Smooth(NamedTuple):
-    """The differentiable outputs of a trajectory."""
+    """The differentiable outputs of a trajectory, or their cotangents."""
 
     q: State
     p: State
-    saved: Saved
-    reduced: list[Any]
+    rows: Rows
+    results: list[Any]
 
 
-def states_of(saved: Saved) -> Saved:
-    """The saved values that the reverse pass reads."""
-    return saved._replace(t=None, h=None, observed=[])
+class Cotangents(NamedTuple):
+    """λ = (q, p), of the state between two steps, and the sum dL/dθ over the steps after it."""
+
+    theta: Any
+    q: State
+    p: State
 
 
-class _Pieces(NamedTuple):
-    """Pieces of `size` steps each between two known states, in order from step `first`."""
+class SavePoint(NamedTuple):
+    """The number of the step that ends at a save point, and the cotangents of the values of the
+    functions that are observed there."""
 
-    starts: tuple[State, State]
-    ends: tuple[State, State]
-    first: Array
-    size: int
-
-    def over(self, step: Callable, state: Any, reverse: bool = False) -> Any:
-        """``state = step(state, k, start, end)`` for each piece, from step number k."""
-        count = len(self.starts[0])
-        if count == 1:  # without a loop around one piece, which would be compiled
-            return step(state, self.first, _row(self.starts, 0), _row(self.ends, 0))
-        k, stride = self.first, self.size
-        if reverse:
-            k, stride = k + (count - 1) * stride, -stride
-
-        def one(carry, x):
-            k, state = carry
-            return (k + stride, step(state, k, *x)), None
-
-        (_, state), _ = lax.scan(one, (k, state), (self.starts, self.ends), reverse=reverse)
-        return state
+    step: Array
+    observed: list[Any]
 
 
-def _row(states: tuple[State, State], i: int) -> tuple[State, State]:
-    return states[0][i], states[1][i]
+class ReversePass(eqx.Module):
+    r"""Lᵀ times the cotangent of a trajectory, L being its derivative.
 
+    Backwards along reconstructed states, with the step Φ_k from (q_k, p_k) to (q_{k+1}, p_{k+1}),
 
-def _pieces(known_start, saved: Saved, first, count: int, every: int) -> list[_Pieces]:
-    """The `count` steps to a save point, divided at the checkpoints in between."""
-    inner = saved.inner
-    kept = 0 if inner is None else len(inner[0])
-    size = piece_length(count, every) if kept else count
-    parts = [known_start[0][None], known_start[1][None]], inner, [saved.q[None], saved.p[None]]
-    known = [jnp.concatenate(x) for x in zip(*(p for p in parts if p is not None), strict=True)]
-    starts, ends = (known[0][:-1], known[1][:-1]), (known[0][1:], known[1][1:])
-    rest = count - kept * size
-    # The code for a piece is compiled for each length: the last piece joins the others if it can.
-    if rest == size:
-        return [_Pieces(starts, ends, first, size)]
+        λ_k = (∂Φ_k/∂(q_k, p_k))ᵀ λ_{k+1},     dL/dθ += (∂Φ_k/∂θ)ᵀ λ_{k+1},
 
-    def some(which: slice, first, size):
-        start, end = ((q[which], p[which]) for q, p in (starts, ends))
-        return _Pieces(start, end, first, size)
+    and the cotangents of saved and observed values are added where they belong.
 
-    return [some(slice(-1), first, size), some(slice(-1, None), first + kept * size, rest)]
-
-
-def _rebuilt(
-    task: Task,
-    end,
-    first,
-    count: int,
-    known_start,
-    allowed: float,
-    along: Callable | None = None,
-    sums: Any = None,
-):
-    """The states from `end` back over `count` steps, by inverse steps: the `sums` that
-    ``along(k, after, before, sums)`` accumulates, the relative difference of each component from
-    `known_start`, and whether all solves succeeded."""
-    # A divisor of `count`, so that one loop serves all groups.
-    group = next((d for d in range(min(count, LOOKS), 1, -1) if count % d == 0), 1)
-
-    # Cotangents go along in the same loop: states are needed once, and none is stored.
-    def undo(state, _):
-        k, after, sums, solved = state
-        # Without the memory of the arithmetic, whose effect is below the accepted difference.
-        interval = task.interval(k)
-        q, p, info = task.method.inverse(task.equations_at(k, interval), interval, *after)
-        if along is not None:
-            sums = along(k, after, (q, p), sums)
-        return (k - 1, (q, p), sums, solved & (info.result == RESULTS.successful)), None
-
-    def undo_group(state, _):
-        state, sizes = state
-        state, _ = lax.scan(undo, state, None, group)
-        return (state, _largest(sizes, state[1])), None
-
-    begin = ((first + (count - 1), end, sums, jnp.asarray(True)), _largest(end, end))
-    ((_, state, sums, solved), sizes), _ = lax.scan(undo_group, begin, None, count // group)
-    misses = [
-        _miss(a, b, size, allowed).ravel()
-        for a, b, size in zip(state, known_start, sizes, strict=True)
-    ]
-    return sums, jnp.concatenate(misses), solved
-
-
-def round_trip_defect(
-    task: Task, plan: Plan, every: int, allowed: float, start_state, saved: Saved, tail
-) -> Array:
-    """The largest difference of a reconstructed state at a checkpoint; ∞ where an inverse step
-    failed."""
-
-    def of_piece(size):
-        def of(worst, k, start, end):
-            _, misses, solved = _rebuilt(task, end, k, size, start, allowed)
-            return jnp.maximum(worst, jnp.where(solved, jnp.max(misses, initial=0.0), jnp.inf))
-
-        return of
-
-    def of_block(worst, start, saved, first, count):
-        for pieces in _pieces(start, saved, first, count, every):
-            worst = pieces.over(of_piece(pieces.size), worst)
-        return worst
-
-    def block(carry, saved):
-        k, start, worst = carry
-        worst = of_block(worst, start, saved, k, plan.block)
-        return (k + plan.block, (saved.q, saved.p), worst), None
-
-    begin = (jnp.asarray(0, jnp.int32), start_state, jnp.zeros((), start_state[0].dtype))
-    (k, start, worst), _ = lax.scan(block, begin, saved)
-    return worst if tail is None else of_block(worst, start, tail, k, plan.tail)
-
-
-def pull_back(
-    fixed, plan: Plan, every: int, allowed: float, inputs, known, cotangent: Smooth
-) -> tuple[Any, Array, Array]:
-    """Lᵀ·cotangent: the reverse pass of `Reversible`, from the end of a trajectory to its start.
-
-    `every`: steps between checkpoints. `allowed`: the largest relative difference there.
+    - `theta`: the arrays of the task that are differentiated. `constants`: its other parts.
+    - `memories`: of the reductions, after the run. `cotangent`: of the outputs of the run.
     """
-    theta, q_start, p_start = inputs
-    memories, saved, tail = known
-    task: Task = eqx.combine(theta, fixed)
-    _, reductions = task.observables()
-    newton = task.equations.newton
-    assert isinstance(newton, RootSolver)
 
-    def local_step(theta, q0, p0, k, p1):
-        task: Task = eqx.combine(theta, fixed)
-        alone, reductions = task.observables()
-        interval = task.interval(k)
-        # The unknown of (13) is the state after the step, which is known here: no solve.
-        known_root = task.method.is_the_map and task.arithmetic.is_plain
-        solver = KnownRoot(p1.ravel(), newton) if known_root else newton
-        equations = dataclasses.replace(task.equations_at(k, interval), newton=solver)
-        q1, p1, _ = task.method.step(equations, interval, q0, p0)
-        taken = StepTaken(interval.t0, interval.t1, q0, p0, q1, p1)
-        values = [taken.value(f, task.args) for f in alone]
-        reduced = [taken.number(task.bound(r.function), task.args) for r in reductions]
-        return (q1, p1, interval.t1), eqx.filter(values, eqx.is_inexact_array), reduced
+    theta: Any
+    constants: Any
+    states: Reconstruction
+    memories: list[Any]
+    cotangent: Smooth
 
-    def pull_through(k, after, before, sums, is_last, at_save):
-        """The cotangents before step k, from the states before and after it."""
-        p1, (grad, (cq, cp)) = after[1], sums
+    def task(self, theta: Any) -> Task:
+        return eqx.combine(theta, self.constants)
+
+    def transport(
+        self, after_step: Cotangents, k: Array, start: Point, end: Point, save: SavePoint
+    ) -> Cotangents:
+        """The adjoint equation of step k, from the state `start` to `end`."""
         # The step is linearised at the reconstructed state: one more forward evaluation per step
         # takes the place of stored intermediate values.
         ((_, _, t1), _, values), pull = jax.vjp(
-            lambda theta, q, p: local_step(theta, q, p, k, p1), theta, *before
+            lambda theta, q0, p0: self.local_step(theta, q0, p0, k, end[1]), self.theta, *start
         )
-        # Functions are observed at save points only, which the last step of a block ends at.
-        at_end = jax.tree.map(lambda c: jnp.where(is_last, c, jnp.zeros_like(c)), at_save)
-        ct, seeds = jnp.zeros_like(t1), []
-        for r, memory, c, value in zip(
-            reductions, memories, cotangent.reduced, values, strict=True
-        ):
-            of_t, of_value = r.pull(memory, c, number_of(r, k), t1, value)
-            ct = ct + of_t
-            seeds.append(of_value.astype(value.dtype))
-        of_theta, cq, cp = pull(((cq, cp, ct), at_end, seeds))
-        return jax.tree.map(jnp.add, grad, of_theta), (cq, cp)
+        # Functions are observed at save points only.
+        is_saved = k == save.step
+        observed = jax.tree.map(lambda c: jnp.where(is_saved, c, jnp.zeros_like(c)), save.observed)
+        of_t1, of_values = _of_values(self.reductions(), k, t1, values)
+        of_theta, q, p = pull(((after_step.q, after_step.p, of_t1), observed, of_values))
+        return Cotangents(jax.tree.map(jnp.add, after_step.theta, of_theta), q, p)
 
-    def undo_steps(known_start, end, first, count, last, at_save, grad, cot):
-        """`count` steps back from the exact state `end`, by inverse steps. Where these miss
-        `known_start`, by the steps from there, computed again and stored."""
+    def local_step(self, theta: Any, q0: State, p0: State, k: Array, p1: State) -> tuple:
+        """((q1, p1, t1), observed values, arguments of the reductions) of step k, whose p1 is known
+        from the reconstruction; all differentiable."""
+        task = self.task(theta)
+        functions, reductions = task.observables()
+        newton = task.equations.newton
+        assert isinstance(newton, RootSolver)
+        interval = task.interval(k)
+        # The unknown of (13) is the state after the step: no solve.
+        is_root = task.method.is_the_map and task.arithmetic.is_plain
+        solver = KnownRoot(p1.ravel(), newton) if is_root else newton
+        equations = dataclasses.replace(task.equations_at(k, interval), newton=solver)
+        q1, p1, _ = task.method.step(equations, interval, q0, p0)
+        step = Ends(interval.t0, interval.t1, q0, p0, q1, p1)
+        values = [step.value(f, task.args) for f in functions]
+        numbers = [step.number(task.bound(r.function), task.args) for r in reductions]
+        return (q1, p1, interval.t1), eqx.filter(values, eqx.is_inexact_array), numbers
 
-        def along(k, after, before, sums):
-            return pull_through(k, after, before, sums, k == last, at_save)
+    def reductions(self) -> list[tuple[Reduction, Any, Any]]:
+        """Each reduction with its memory and the cotangent of its result."""
+        _, reductions = self.task(self.theta).observables()
+        return list(zip(reductions, self.memories, self.cotangent.results, strict=True))
 
-        out, misses, solved = _rebuilt(
-            task, end, first, count, known_start, allowed, along, (grad, cot)
+    def steps(
+        self,
+        cotangents: Cotangents,
+        first: Array,
+        start: Point,
+        end: Point,
+        count: int,
+        save: SavePoint,
+    ) -> Cotangents:
+        """`count` steps back from the exact state `end`, by inverse steps. Where these miss the
+        state `start`, by the steps from there."""
+
+        def transport(cotangents, k, start, end):
+            return self.transport(cotangents, k, start, end, save)
+
+        cheap, defects, is_solved = self.states.steps_by_inverse(
+            start, end, first, count, transport, cotangents
         )
-        fine = solved & jnp.all(misses <= allowed)
-
-        def stored(known_start, end, first, last, at_save, grad, cot):
-            def forward(state, _):
-                k, before = state
-                interval = task.interval(k)
-                q, p, _ = task.method.step(task.equations_at(k, interval), interval, *before)
-                return (k + 1, (q, p)), before
-
-            _, states = lax.scan(forward, (first, known_start), None, count)
-
-            def back(state, before):
-                k, after, sums = state
-                sums = pull_through(k, after, before, sums, k == last, at_save)
-                return (k - 1, before, sums), None
-
-            begin = (first + count - 1, end, (grad, cot))
-            (_, _, sums), _ = lax.scan(back, begin, states, reverse=True)
-            return sums
-
-        def corrected(out):
-            again = stored(known_start, end, first, last, at_save, grad, cot)
-            return jax.tree.map(lambda a, b: jnp.where(missing, a, b), again, out)
-
+        is_exact = is_solved & jnp.all(defects <= self.states.tolerance)
         # Not for a trajectory that has failed itself: its gradient is NaN, and a batch must not
         # wait for the steps of one whose result is known.
-        missing = ~fine & _all_finite(known_start) & _all_finite(end)
-        return lax.cond(lanewise.on_any(missing), corrected, lambda out: out, tuple(out))
+        is_wrong = ~is_exact & _all_finite(start) & _all_finite(end)
 
-    def undo_block(known_start, saved: Saved, first, count, at_save, grad, cot):
-        last = first + count - 1
-        cot = (cot[0] + at_save.q, cot[1] + at_save.p)
-        # Saved times and steps depend on h and t0 directly, not through the state.
-        _, pull_times = jax.vjp(lambda theta: eqx.combine(theta, fixed).interval(last)[1:], theta)
-        grad = jax.tree.map(jnp.add, grad, *pull_times((at_save.t, at_save.h)))
-        at_save = at_save.observed
-        sums = grad, cot
-        for pieces in reversed(_pieces(known_start, saved, first, count, every)):
+        def correct(cheap):
+            exact = self.steps_again(cotangents, first, start, end, count, save)
+            return jax.tree.map(lambda a, b: jnp.where(is_wrong, a, b), exact, cheap)
 
-            def undo(sums, k, start, end, size=pieces.size):
-                return undo_steps(start, end, k, size, last, at_save, *sums)
+        return lax.cond(lanewise.on_any(is_wrong), correct, lambda cheap: cheap, cheap)
 
-            sums = pieces.over(undo, sums, reverse=True)
-        return sums
+    def steps_again(
+        self,
+        cotangents: Cotangents,
+        first: Array,
+        start: Point,
+        end: Point,
+        count: int,
+        save: SavePoint,
+    ) -> Cotangents:
+        """The same from the states of `count` steps that are computed again and stored."""
+        task = self.states.task
 
-    # Each block begins where the one before ended; saved states are exact, not reconstructed.
-    start_state = (q_start, p_start)
-    ends = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start_state, (saved.q, saved.p))
-    grad = jax.tree.map(jnp.zeros_like, theta)
-    cot = (cotangent.q, cotangent.p)
-    rows = cotangent.saved
-    of_start = None
-    if not adds_start_outside(plan):
-        of_start, rows = (rows.q[0], rows.p[0]), rows._replace(q=rows.q[1:], p=rows.p[1:])
-    if tail is not None:
-        # Without a saved tail nothing is observed at the end of the run: cotangents of zero.
-        at_save = jax.tree.map(
-            lambda x: x[-1] if plan.save_tail else jnp.zeros(x.shape[1:], x.dtype), rows
-        )
-        newest = jax.tree.map(lambda x: x[-1], ends)
-        k = jnp.asarray(plan.num_blocks * plan.block, jnp.int32)
-        grad, cot = undo_block(newest, tail, k, plan.tail, at_save, grad, cot)
+        def forward(carry, _):
+            k, state = carry
+            interval = task.interval(k)
+            q, p, _ = task.method.step(task.equations_at(k, interval), interval, *state)
+            return (k + 1, (q, p)), state
 
-    def block(state, x):
-        k, grad, cot = state
-        known_start, saved, at_save = x
-        k = k - plan.block
-        return (k, *undo_block(known_start, saved, k, plan.block, at_save, grad, cot)), None
+        def backward(carry, start):
+            k, end, cotangents = carry
+            return (k - 1, start, self.transport(cotangents, k, start, end, save)), None
 
-    starts = jax.tree.map(lambda x: x[:-1], ends)
-    rows = jax.tree.map(lambda x: x[: plan.num_blocks], rows)
-    k = jnp.asarray(plan.num_blocks * plan.block, jnp.int32)
-    (_, grad, cot), _ = lax.scan(block, (k, grad, cot), (starts, saved, rows), reverse=True)
-    of_q, of_p = cot if of_start is None else map(jnp.add, cot, of_start)
-    return _through_initial(fixed, inputs, memories, cotangent.reduced, (grad, of_q, of_p))
+        _, points = lax.scan(forward, (first, start), None, count)
+        begin = (first + count - 1, end, cotangents)
+        (_, _, cotangents), _ = lax.scan(backward, begin, points, reverse=True)
+        return cotangents
+
+    def block(
+        self,
+        cotangents: Cotangents,
+        first: Array,
+        start: Point,
+        row: Rows,
+        of_row: Rows,
+        count: int,
+    ) -> Cotangents:
+        """The `count` steps between two save points. `row`: what is saved at the second one, and
+        `of_row` its cotangents."""
+        step = first + count - 1
+        # Rows times and steps depend on h and t0 directly, not through the state.
+        _, pull = jax.vjp(lambda theta: self.task(theta).interval(step)[1:], self.theta)
+        of_theta = jax.tree.map(jnp.add, cotangents.theta, *pull((of_row.t, of_row.h)))
+        cotangents = Cotangents(of_theta, cotangents.q + of_row.q, cotangents.p + of_row.p)
+        save = SavePoint(step, of_row.observed)
+        for pieces in reversed(self.states.pieces(start, row, first, count)):
+
+            def of_piece(cotangents, k, start, end, size=pieces.size):
+                return self.steps(cotangents, k, start, end, size, save)
+
+            cotangents = pieces.fold(of_piece, cotangents, reverse=True)
+        return cotangents
+
+    def run(self, start: Point, rows: Rows, tail: Rows | None) -> Cotangents:
+        """The cotangents of θ and of the initial state, from the states that the run has stored."""
+        plan, of_rows = self.states.plan, self.cotangent.rows
+        zero = jax.tree.map(jnp.zeros_like, self.theta)
+        cotangents = Cotangents(zero, self.cotangent.q, self.cotangent.p)
+        of_start = None
+        if not adds_start_outside(plan):
+            of_start = of_rows.q[0], of_rows.p[0]
+            of_rows = of_rows._replace(q=of_rows.q[1:], p=of_rows.p[1:])
+        starts = self.states.starts(start, rows)
+        if tail is not None:
+            # Without a saved tail nothing is observed at the end of the run: cotangents of zero.
+            of_tail = jax.tree.map(
+                lambda x: x[-1] if plan.save_tail else jnp.zeros(x.shape[1:], x.dtype), of_rows
+            )
+            first = jnp.asarray(plan.num_blocks * plan.block, jnp.int32)
+            last_start = jax.tree.map(lambda x: x[-1], starts)
+            cotangents = self.block(cotangents, first, last_start, tail, of_tail, plan.tail)
+
+        def one_block(cotangents, first, start, row, of_row):
+            return self.block(cotangents, first, start, row, of_row, plan.block)
+
+        starts = jax.tree.map(lambda x: x[:-1], starts)
+        of_rows = jax.tree.map(lambda x: x[: plan.num_blocks], of_rows)
+        blocks = starts, rows, of_rows
+        cotangents = fold_blocks(one_block, cotangents, plan.num_blocks, plan.block, blocks)
+        if of_start is not None:
+            q, p = map(jnp.add, (cotangents.q, cotangents.p), of_start)
+            cotangents = cotangents._replace(q=q, p=p)
+        return self.initial_values(cotangents, start)
+
+    def initial_values(self, cotangents: Cotangents, start: Point) -> Cotangents:
+        """The cotangents, with those of the values of reductions at the initial state."""
+        reductions = [r for r in self.reductions() if has_initial_value(r[0].function)]
+        if not reductions:
+            return cotangents
+
+        def values_of(theta, q0, p0):
+            task = self.task(theta)
+            t0 = task.first_interval().t0
+            step = Ends(t0, t0, q0, p0, q0, p0)
+            _, reductions = task.observables()
+            functions = [r.function for r in reductions if has_initial_value(r.function)]
+            return t0, [step.number(task.bound(f), task.args) for f in functions]
+
+        (t0, values), pull = jax.vjp(values_of, self.theta, *start)
+        seeds = _of_values(reductions, jnp.asarray(-1, jnp.int32), t0, values)
+        return jax.tree.map(jnp.add, cotangents, Cotangents(*pull(seeds)))
 
 
-def _through_initial(fixed, inputs, memories, cotangents, sums) -> tuple[Any, Array, Array]:
-    """The cotangents, with those of the values of reductions at the initial state."""
-
-    def initial(theta, q0, p0):
-        task: Task = eqx.combine(theta, fixed)
-        t0 = task.first_interval().t0
-        taken = StepTaken(t0, t0, q0, p0, q0, p0)
-        _, reductions = task.observables()
-        known = [r for r in reductions if has_initial_value(r.function)]
-        return t0, [taken.number(task.bound(r.function), task.args) for r in known]
-
-    _, reductions = eqx.combine(inputs[0], fixed).observables()
-    of_state = [
-        (r, memory, c)
-        for r, memory, c in zip(reductions, memories, cotangents, strict=True)
-        if has_initial_value(r.function)
-    ]
-    if not of_state:
-        return sums
-    (t0, values), pull = jax.vjp(initial, *inputs)
-    ct, seeds = jnp.zeros_like(t0), []
-    for (r, memory, c), value in zip(of_state, values, strict=True):
-        of_t, of_value = r.pull(memory, c, jnp.asarray(0, jnp.int32), t0, value)
-        ct = ct + of_t
-        seeds.append(of_value.astype(value.dtype))
-    return jax.tree.map(jnp.add, sums, pull((ct, seeds)))
+def _of_values(
+    reductions: list[tuple[Reduction, Any, Any]], k: Array, t1: Array, values: list[Array]
+) -> tuple[Array, list[Array]]:
+    """The cotangents of t1 and of the values that the reductions receive at the end of step k;
+    k = −1: at the initial state."""
+    of_t1, of_values = jnp.zeros_like(t1), []
+    for (reduction, memory, cotangent), value in zip(reductions, values, strict=True):
+        of_t, of_value = reduction.pull(memory, cotangent, number_of(reduction, k), t1, value)
+        of_t1 = of_t1 + of_t
+        of_values.append(of_value.astype(value.dtype))
+    return of_t1, of_values
 
 
-def _largest(sizes, state):
-    return jax.tree.map(lambda s, x: jnp.maximum(jnp.abs(s), jnp.abs(x)), sizes, state)
-
-
-def _miss(a, b, size, allowed):
-    """The difference of each component of a from b, relative to its size."""
-    # A small component inherits round-off of the largest one, which is no fault of the inverse
-    # steps. The size is increased so that this round-off is just accepted.
-    round_off = 64 * jnp.finfo(a.dtype).eps * jnp.max(size, initial=0.0)
-    return jnp.abs(a - b) / (size + (round_off / allowed + jnp.finfo(a.dtype).tiny))
-
-
-def _all_finite(state) -> Array:
-    return jnp.all(jnp.isfinite(state[0])) & jnp.all(jnp.isfinite(state[1]))
+def _all_finite(point: Point) -> Array:
+    return jnp.all(jnp.isfinite(point[0])) & jnp.all(jnp.isfinite(point[1]))

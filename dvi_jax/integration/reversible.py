@@ -1,6 +1,8 @@
 """Reverse-mode gradients along reconstructed states."""
 
 import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,15 +13,16 @@ from jax.custom_derivatives import SymbolicZero
 
 import lanewise
 from lanewise import Layout
-from lanewise.jaxprs.jaxapi import is_traced, linear_map, manual_axes
+from lanewise.jaxprs.jaxapi import is_traced, manual_axes
+from lanewise.linear_map import LinearMap
 
 from ..base.checks import instance, positive, whole as check_whole
 from ..engine.pairs import rounded
 from .adjoints import AbstractAdjoint, Checkpointed
 from .loop import outcome, run, start, with_start
-from .plan import adds_start_outside, piece_length
-from .reverse_pass import Smooth, pull_back, round_trip_defect, states_of
-from .task import Outcome, Task
+from .reconstruction import Reconstruction
+from .reverse_pass import ReversePass, Smooth
+from .task import Carry, Outcome, Rows, Task, adds_start_outside, piece_length
 
 
 class Reversible(AbstractAdjoint):
@@ -65,111 +68,99 @@ class Reversible(AbstractAdjoint):
             positive("max_defect", self.max_defect)
         instance("report_defect", self.report_defect, bool, "True or False")
 
-    def allowed(self, dtype) -> float:
+    def tolerance(self, dtype) -> float:
         """The largest relative difference that is accepted."""
         return self.max_defect or (1e-6 if jnp.dtype(dtype).itemsize >= 8 else 1e-3)
 
     def rollout(self, task, plan, q0, p0, layout=Layout()):
-        theta, others = eqx.partition(task, eqx.is_inexact_array)
+        theta, remainder = eqx.partition(task, eqx.is_inexact_array)
         # Integers and booleans may be traced as well: inputs without a derivative.
-        whole, fixed = eqx.partition(others, eqx.is_array)
+        counts, functions = eqx.partition(remainder, eqx.is_array)
+        inputs = theta, q0, p0
 
         @jax.jit  # so that its uses below share one trace, and one trace of its derivative
-        def forward(inputs, whole):
+        def forward(inputs, counts):
             theta, q0, p0 = inputs
-            task = eqx.combine(theta, whole, fixed)
-            ran = run(task, plan, start(task, q0, p0), lax.scan, self._inner_loop)
-            out = outcome(task, plan, ran, q0, p0)
-            kept, counts = eqx.partition(out.saved, eqx.is_inexact_array)
-            return Smooth(out.carry.q, out.carry.p, kept, out.reduced), (*ran, counts)
+            task = eqx.combine(theta, counts, functions)
+            ends = run(task, plan, start(task, q0, p0), lax.scan, self._inner_loop)
+            carry, rows, results, _ = outcome(task, plan, ends, q0, p0)
+            rows, integers = eqx.partition(rows, eqx.is_inexact_array)
+            return Smooth(carry.q, carry.p, rows, results), Trace(*ends, integers)
 
-        inputs, every, allowed = (theta, q0, p0), self.checkpoint_every, self.allowed(q0.dtype)
-        why = _why_not(task, inputs, whole)
-        # A traced value that a function closes over is not an input of the trajectory: a custom
-        # derivative with respect to the inputs would miss it.
-        if not why and any(map(is_traced, jax.make_jaxpr(forward)(inputs, whole).consts)):
-            why = "a function of the run uses a traced value from outside (pass it in args)"
-        if why:
+        if reason := _obstacle(task, forward, inputs, counts):
             if self.report_defect:
                 raise ValueError(
                     "dvi.Reversible(report_defect=True) requires states that can be reconstructed "
-                    f"backwards, but {why}. Leave report_defect out: gradients are then computed "
-                    "in the same way as with dvi.Checkpointed()."
+                    f"backwards, but {reason}. Leave report_defect out."
                 )
             return Checkpointed().rollout(task, plan, q0, p0, layout)
 
+        def states_of(theta, counts):
+            task = eqx.combine(theta, counts, functions)
+            return Reconstruction(task, plan, self.checkpoint_every, self.tolerance(q0.dtype))
+
         @jax.custom_jvp
-        def trajectory(inputs, whole):
-            return lanewise.call(forward, inputs, whole, layout=layout)
+        def trajectory(inputs, counts):
+            return lanewise.call(forward, inputs, counts, layout=layout)
 
+        # The tangent is L·dx with L the derivative: forward mode applies L along the scan, reverse
+        # mode applies Lᵀ along reconstructed states. It is a linear map with its own transpose, not
+        # a custom_vjp, under which forward mode would be impossible.
         @functools.partial(trajectory.defjvp, symbolic_zeros=True)
-        def _(primals, tangents):
-            # The tangent is L·dx with L the derivative: forward mode applies L along the scan,
-            # reverse mode applies Lᵀ along reconstructed states. It is a linear map with its own
-            # transpose, not a custom_vjp, under which forward mode would be impossible.
-            (inputs, whole), (change, _) = primals, tangents
-            smooth, trace = trajectory(inputs, whole)
+        def tangent(primals, tangents):
+            (inputs, counts), (change, _) = primals, tangents
+            smooth, trace = trajectory(inputs, counts)
             # Inputs with a tangent of zero are constants: no derivative is computed for them.
-            moves = jax.tree.map(lambda x: not isinstance(x, SymbolicZero), change)
-            moving, still = eqx.partition(inputs, moves)
-            change = eqx.filter(change, moves)
-            # Only the values that the reverse pass reads: the others need not be computed.
-            carry, saved, tail, _ = trace
-            known = (
-                rounded(carry.reductions),
-                states_of(saved),
-                None if tail is None else states_of(tail),
-            )
+            is_variable = jax.tree.map(lambda x: not isinstance(x, SymbolicZero), change)
+            variables, constants = eqx.partition(inputs, is_variable)
 
-            def along(moving, still, whole, u):
-                def of(moving):
-                    return forward(eqx.combine(moving, still), whole)[0]
+            def push(variables, constants, counts, change):
+                def smooth_outputs(variables):
+                    return forward(eqx.combine(variables, constants), counts)[0]
 
-                return jax.jvp(of, (moving,), (u,))[1]
+                return jax.jvp(smooth_outputs, (variables,), (change,))[1]
 
-            def definition(residuals, u):
-                moving, still, whole, _ = residuals
-                return along(moving, still, whole, u)
-
-            def push(residuals, u):
-                moving, still, whole, _ = residuals
-                return lanewise.call(along, moving, still, whole, u, layout=layout)
-
-            def back(moving, still, whole, known, v):
-                theta, q0, p0 = eqx.combine(moving, still)
-                theta, others = eqx.partition(theta, moves[0])
-                rest = eqx.combine(others, whole, fixed)
-                out = pull_back(rest, plan, every, allowed, (theta, q0, p0), known, v)
-                return eqx.filter(out, moves)
-
-            def pull(residuals, v):
-                out = lanewise.call(back, *residuals, v, layout=layout)
+            def pull(variables, constants, counts, record, cotangent):
+                theta, q0, p0 = eqx.combine(variables, constants)
+                variable, constant = eqx.partition(theta, is_variable[0])
+                memories, rows, tail = record
+                reverse_pass = ReversePass(
+                    variable,
+                    eqx.combine(constant, counts, functions),
+                    states_of(theta, counts),
+                    memories,
+                    cotangent,
+                )
+                cotangents = eqx.filter(tuple(reverse_pass.run((q0, p0), rows, tail)), is_variable)
                 # A failed trajectory that the loss does not use: zero, although the states along
                 # which the cotangent zero would be transported are NaN.
-                used = jnp.any(jnp.stack([jnp.any(x != 0) for x in jax.tree.leaves(v)]))
-                return jax.tree.map(lambda x: jnp.where(used, x, 0), out)
+                nonzero = [jnp.any(x != 0) for x in jax.tree.leaves(cotangent)]
+                is_used = jnp.any(jnp.stack(nonzero))
+                return jax.tree.map(lambda x: jnp.where(is_used, x, 0), cotangents)
 
-            residuals = moving, still, whole, known
-            moved = linear_map(push, pull, definition, residuals, change)
-            return (smooth, trace), (moved, jax.tree.map(_no_tangent, trace))
+            derivative = LinearMap(push, pull, layout)
+            point = variables, constants, counts
+            change = derivative(point, trace.record(), eqx.filter(change, is_variable))
+            return (smooth, trace), (change, jax.tree.map(_no_tangent, trace))
 
-        smooth, (carry, saved, tail, counts) = trajectory(inputs, whole)
+        smooth, trace = trajectory(inputs, counts)
         # In the forward pass: a reverse pass cannot return a number besides the cotangents.
-        rebuilt = None
+        defect = None
         if self.report_defect:
 
-            def defect(theta, whole, *of):
-                task = eqx.combine(theta, whole, fixed)
-                return round_trip_defect(task, plan, every, allowed, *of)
+            def largest_defect(theta, counts, *ends):
+                return states_of(theta, counts).defect(*ends)
 
-            rebuilt = lanewise.call(
-                defect, *lax.stop_gradient((theta, whole, (q0, p0), saved, tail)), layout=layout
+            ends = (q0, p0), trace.rows, trace.tail
+            defect = lanewise.call(
+                largest_defect, *lax.stop_gradient((theta, counts, *ends)), layout=layout
             )
-        kept = eqx.combine(smooth.saved, counts)
+        rows = eqx.combine(smooth.rows, trace.integers)
         if adds_start_outside(plan):
-            kept = with_start(kept, q0, p0)
+            rows = with_start(rows, q0, p0)
         # The differentiable outputs take the place of their copies in the carry, which have none.
-        return Outcome(carry._replace(q=smooth.q, p=smooth.p), kept, smooth.reduced, rebuilt)
+        carry = trace.carry._replace(q=smooth.q, p=smooth.p)
+        return Outcome(carry, rows, smooth.results, defect)
 
     def _inner_loop(self, body, state, _, count, state_of):
         """A scan over the steps of a block that stores a state every `checkpoint_every` steps."""
@@ -190,13 +181,31 @@ class Reversible(AbstractAdjoint):
         return state, ends
 
 
+class Trace(NamedTuple):
+    """What a run leaves besides its differentiable outputs."""
+
+    carry: Carry
+    rows: Rows
+    tail: Rows | None
+    integers: Rows  # those of the rows, which have no derivative
+
+    def record(self) -> tuple[list[Any], Rows, Rows | None]:
+        """Only what the reverse pass reads: the other values need not be computed."""
+
+        def states(rows: Rows) -> Rows:
+            return rows._replace(t=None, h=None, observed=[])
+
+        tail = None if self.tail is None else states(self.tail)
+        return rounded(self.carry.reductions), states(self.rows), tail
+
+
 def _no_tangent(x):
     if jnp.issubdtype(x.dtype, jnp.inexact):
         return jnp.zeros_like(x)
     return np.zeros(x.shape, jax.dtypes.float0)
 
 
-def _why_not(task: Task, *inputs) -> str | None:
+def _obstacle(task: Task, forward: Callable, *inputs: Any) -> str | None:
     """Why no states of this run can be reconstructed; None if they can."""
     if not task.method.is_invertible:
         return f"{type(task.method).__name__} has no inverse step"
@@ -210,4 +219,8 @@ def _why_not(task: Task, *inputs) -> str | None:
         return "running values of reductions are not reconstructed"
     if manual_axes(*jax.tree.leaves(inputs)):
         return "the run is inside of jax.shard_map with check_vma=True"
+    # A traced value that a function closes over is not an input of the trajectory: a custom
+    # derivative with respect to the inputs would miss it.
+    if any(map(is_traced, jax.make_jaxpr(forward)(*inputs).consts)):
+        return "a function of the run uses a traced value from outside (pass it in args)"
     return None

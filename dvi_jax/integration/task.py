@@ -1,4 +1,4 @@
-"""The constants of a trajectory, and what the loop over its steps carries and saves."""
+"""The constants of a trajectory, which of its steps are saved, and what the loop carries."""
 
 import dataclasses
 from collections.abc import Callable
@@ -18,6 +18,7 @@ from ..lattices import Lattice
 from ..methods import Method
 from ..methods.step import Equations
 from ..observe import Deviations, Reduction, Running, Stop, is_observable
+from ..observe.solution import Save
 from ..problem.noise import NoisePath
 from .arithmetic import Arithmetic, FloatingPoint
 
@@ -60,24 +61,26 @@ class Task(eqx.Module):
 
     def observables(self) -> tuple[list[Callable], list[Reduction]]:
         """The functions without a reduction, and the reductions, in tree order."""
-        alone = [self.bound(f) for f in self._leaves() if not isinstance(f, Reduction | Running)]
-        found = [f.reduction if isinstance(f, Running) else f for f in self._leaves()]
-        return alone, [f for f in found if isinstance(f, Reduction)]
+        functions = [
+            self.bound(f) for f in self._leaves() if not isinstance(f, Reduction | Running)
+        ]
+        leaves = [f.reduction if isinstance(f, Running) else f for f in self._leaves()]
+        return functions, [f for f in leaves if isinstance(f, Reduction)]
 
-    def at_save(self, carry: "Carry", taken: "StepTaken | None") -> list[Any]:
+    def at_save(self, carry: "Carry", ends: "Ends | None") -> list[Any]:
         """The values of functions without a reduction and the running values of reductions, in tree
-        order, at a save point after the step `taken`."""
+        order, at a save point after a step with these ends."""
         # A running value is NaN after a failure: the reduction still has that of the steps before.
         memories, values = iter(carry.reductions), []
         for f in self._leaves():
             if isinstance(f, Running):
-                value = self.finished(f.reduction, next(memories))
+                value = self.finish(f.reduction, next(memories))
                 values.append(or_nan(carry.result == RESULTS.successful, value))
             elif isinstance(f, Reduction):
                 next(memories)
             else:
-                assert taken is not None
-                values.append(taken.value(self.bound(f), self.args))
+                assert ends is not None
+                values.append(ends.value(self.bound(f), self.args))
         return values
 
     def evaluate(self, reduction: Reduction, function: Callable, *args: Any) -> Any:
@@ -85,9 +88,9 @@ class Task(eqx.Module):
         # Deviation vectors and recorded steps are values in floating point.
         if isinstance(reduction, Deviations) or not reduction.has_running_value:
             return function(*rounded(args))
-        return self.arithmetic.evaluated(function)(*args)
+        return self.arithmetic.interpret(function)(*args)
 
-    def finished(self, reduction: Reduction, memory: Any) -> Any:
+    def finish(self, reduction: Reduction, memory: Any) -> Any:
         """The reduced value of a memory."""
         return rounded(self.evaluate(reduction, reduction.finish, memory))
 
@@ -111,6 +114,43 @@ class Task(eqx.Module):
         return observable
 
 
+class Plan(NamedTuple):
+    """Steps as blocks of `block` steps with a save after each, then a tail. Static."""
+
+    num_blocks: int
+    block: int
+    tail: int
+    save_tail: bool
+
+    @property
+    def num_steps(self) -> int:
+        return self.num_blocks * self.block + self.tail
+
+
+def make_plan(save: Save, num_steps: int) -> Plan:
+    block = save.every
+    if block is None:
+        # Without `every` a run that saves its end only is one block. A block has at least one step.
+        saves_end_only = save.final or save.ts is not None
+        block = max(num_steps, 1) if saves_end_only else 1
+    num_blocks, tail = divmod(num_steps, block)
+    return Plan(num_blocks, block, tail, save.final and tail > 0)
+
+
+def piece_length(count: int, target: int) -> int:
+    """The length, about `target`, of the pieces of `count` steps."""
+    # A divisor of `count`, if there is one near: with pieces of one length one loop is compiled.
+    lengths = range(min(3 * target // 2, count), target // 2, -1)
+    return next((n for n in lengths if count % n == 0), target)
+
+
+def adds_start_outside(plan: Plan) -> bool:
+    """Whether the start is added to the saved states after the compiled run, not in it."""
+    # Among few states the start is a large fraction, which need not be written for a user who reads
+    # the last state only. Among many it is a small fraction, and adding it later copies them all.
+    return plan.num_blocks <= 4
+
+
 class Carry(NamedTuple):
     """State between steps; k is the number of the next one."""
 
@@ -124,11 +164,11 @@ class Carry(NamedTuple):
     iterations: Int[Array, ""]
     residual: Float[Array, "2"]
     reductions: list[Any]
-    beside: Any = None  # memory of the arithmetic
+    remainder: Any = None  # what the arithmetic stores next to q and p
     stop: Any = None  # with a `Stop`: the last step, as a row
 
 
-class StepTaken(NamedTuple):
+class Ends(NamedTuple):
     """One step, the arguments of an observable."""
 
     t0: Scalar
@@ -151,8 +191,8 @@ class StepTaken(NamedTuple):
         return lax.optimization_barrier(value)
 
 
-class Saved(NamedTuple):
-    """The saved values of a step."""
+class Rows(NamedTuple):
+    """The values at save points, a row for each; or those at one save point."""
 
     t: Array
     h: Array
@@ -163,12 +203,12 @@ class Saved(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """Result of the loop: last carry, saved states with the start in front, reduced observables,
-    and the largest error of a reconstructed state if it was requested."""
+    """Result of the loop: last carry, rows with the start in front, results of the reductions, and
+    the largest error of a reconstructed state if it was requested."""
 
     carry: Carry
-    saved: Saved
-    reduced: list[Any]
+    rows: Rows
+    results: list[Any]
     round_trip_defect: Array | None = None
 
 

@@ -16,6 +16,7 @@ from lanewise.jaxprs.jaxapi import linear_map
 
 from ...base.checks import instance, whole
 from ...base.machine import results_memory
+from ...integration.reconstruction import fold_blocks
 from ._maps import Particle
 from ._ring import Ring
 from ._turn import Passage, coordinates, start
@@ -151,7 +152,7 @@ def _track(ring: Ring, z: Array, epsilon: Array, counts: tuple[int, int, int]):
 
         def pull(residuals, cotangent):
             primals, states = residuals
-            return _pulled(passage, primals, states, cotangent, counts, moves)
+            return _pull(passage, primals, states, cotangent, counts, moves)
 
         slopes_of_states = linear_map(push, pull, push, (primals, states), change)
         none = [np.zeros(x.shape, jax.dtypes.float0) for x in losses[:2]]
@@ -161,67 +162,62 @@ def _track(ring: Ring, z: Array, epsilon: Array, counts: tuple[int, int, int]):
     return states, *losses
 
 
-_MISSED = 1e-6
+_TOLERANCE = 1e-6
+"""Largest distance [unit of z] between a start and what the turns backwards reach."""
 
 
-def _pulled(passage, primals, saved, cotangent, counts, moves):
+def _pull(passage, primals, states, cotangent, counts, moves):
     """The cotangents of rows and slopes, z and ε: all particles backwards, turn by turn."""
     tables, z0, epsilon = primals
     blocks, every, first = counts
-    moved = [[n for n, m in table.items() if m] for table in moves[0]]
+    names = [[n for n, is_moving in table.items() if is_moving] for table in moves[0]]
     by_epsilon = list(tables[1]) if moves[2] else []
-    moving = sorted({*moved[0], *moved[1], *by_epsilon})
+    parameters = sorted({*names[0], *names[1], *by_epsilon})
 
     def one_turn(numbers, tables, z, c, k, epsilon):
         rows, slopes = tables
-        along = Passage(rows, slopes, numbers, passage.parts)
-        z, c, found = along.pulled(moving, Particle(*z), Particle(*c), k, epsilon)
+        line = Passage(rows, slopes, numbers, passage.parts)
+        z, c, gradient = line.pulled(parameters, Particle(*z), Particle(*c), k, epsilon)
         # Of b(ε) = b + ε b' by b, b' and ε.
-        of_rows = {n: found[n] for n in moved[0]}
-        of_slopes = {n: epsilon * found[n] for n in moved[1]}
-        of_epsilon = sum((jnp.sum(found[n] * slopes[n]) for n in by_epsilon), jnp.zeros(()))
+        of_rows = {n: gradient[n] for n in names[0]}
+        of_slopes = {n: epsilon * gradient[n] for n in names[1]}
+        of_epsilon = sum((jnp.sum(gradient[n] * slopes[n]) for n in by_epsilon), jnp.zeros(()))
         return jnp.stack(z), jnp.stack(c), (of_rows, of_slopes), of_epsilon
 
     turn_back = _batched(one_turn, False, False, True, True, False, True)
-    lost = jnp.isnan(saved[:, :, :1])
+    is_lost = jnp.isnan(states[:, :, :1])
     # A lost particle has no influence, unless its cotangent is not zero.
-    wrong = jnp.any(lost & (cotangent != 0), axis=(1, 2))
-    saved = jnp.where(lost, 0.0, saved)
-    starts = jnp.concatenate([z0[:, None], saved[:, :-1]], axis=1)
+    is_wrong = jnp.any(is_lost & (cotangent != 0), axis=(1, 2))
+    states = jnp.where(is_lost, 0.0, states)
+    starts = jnp.concatenate([z0[:, None], states[:, :-1]], axis=1)
 
-    def block(state, x):
-        k, c, of_rows, of_epsilon, worst = state
-        start, end, more = x
+    def block(state, k, start, end, of_end):
+        c, of_tables, of_epsilon, distance = state
 
         def undo(_, state):
-            k, z, c, of_rows, of_epsilon = state
-            z, c, found, by_epsilon = turn_back(passage.numbers, tables, z, c, k, epsilon)
-            of_rows = jax.tree.map(lambda a, b: a + jnp.sum(b, 0), of_rows, found)
-            return k - 1, z, c, of_rows, of_epsilon + by_epsilon
+            k, z, c, of_tables, of_epsilon = state
+            z, c, gradient, slope = turn_back(passage.numbers, tables, z, c, k, epsilon)
+            of_tables = jax.tree.map(lambda a, b: a + jnp.sum(b, 0), of_tables, gradient)
+            return k - 1, z, c, of_tables, of_epsilon + slope
 
-        begin = (k, end, c + more, of_rows, of_epsilon)
-        k, z, *state = lax.fori_loop(0, every, undo, begin)
-        missed = jnp.max(jnp.abs(z - start), axis=1)
-        return (k, *state, jnp.maximum(worst, missed)), None
+        last = k + jnp.asarray(first + every - 1, jnp.int32)
+        begin = last, end, c + of_end, of_tables, of_epsilon
+        _, z, *state = lax.fori_loop(0, every, undo, begin)
+        return *state, jnp.maximum(distance, jnp.max(jnp.abs(z - start), axis=1))
 
-    none = jnp.zeros(len(z0))
-    begin = (
-        jnp.asarray(first + blocks * every - 1, jnp.int32),
-        jnp.zeros_like(z0),
-        tuple(
-            {n: jnp.zeros_like(table[n]) for n in names}
-            for table, names in zip(tables, moved, strict=True)
-        ),
-        none,
-        none,
+    zero = jnp.zeros(len(z0))
+    of_tables = tuple(
+        {n: jnp.zeros_like(table[n]) for n in group}
+        for table, group in zip(tables, names, strict=True)
     )
-    xs = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), (starts, saved, cotangent))
-    (_, c, of_rows, of_epsilon, worst), _ = lax.scan(block, begin, xs, reverse=True)
-    fine = ~wrong & ((worst < _MISSED) | jnp.any(lost, axis=(1, 2)))
-    all_fine = jnp.where(jnp.all(fine), 1.0, jnp.nan)
-    nan = jnp.where(fine, 1.0, jnp.nan)
-    of_rows = tuple(
-        {n: all_fine * slope[n] if n in slope else jnp.zeros_like(table[n]) for n in table}
-        for table, slope in zip(tables, of_rows, strict=True)
+    begin = jnp.zeros_like(z0), of_tables, zero, zero
+    rows = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), (starts, states, cotangent))
+    c, of_tables, of_epsilon, distance = fold_blocks(block, begin, blocks, every, rows)
+    is_good = ~is_wrong & ((distance < _TOLERANCE) | jnp.any(is_lost, axis=(1, 2)))
+    factor = jnp.where(is_good, 1.0, jnp.nan)
+    of_all = jnp.where(jnp.all(is_good), 1.0, jnp.nan)
+    of_tables = tuple(
+        {n: of_all * slope[n] if n in slope else jnp.zeros_like(table[n]) for n in table}
+        for table, slope in zip(tables, of_tables, strict=True)
     )
-    return of_rows, nan[:, None] * c, nan * of_epsilon
+    return of_tables, factor[:, None] * c, factor * of_epsilon

@@ -1,0 +1,167 @@
+"""States of a trajectory, reconstructed backwards by inverse steps from those that are stored."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from ..base.results import RESULTS
+from ..base.types import State
+from .task import Plan, Rows, Task, piece_length
+
+# Steps back between two updates of the sizes of the components, relative to which differences are
+# measured. An update in every step would take a noticeable part of the time of an explicit one.
+GROUP = 16
+
+Point = tuple[State, State]
+"""(q, p)."""
+
+
+def fold_blocks(block: Callable, state: Any, count: int, size: int, rows: Any) -> Any:
+    """``state = block(state, k, *row)`` for each of `count` blocks of `size` steps, from the last
+    block to the first. k: the number of its first step; row: its row of the arrays `rows`."""
+
+    def one_block(carry, row):
+        k, state = carry
+        return (k - size, block(state, k - size, *row)), None
+
+    begin = (jnp.asarray(count * size, jnp.int32), state)
+    (_, state), _ = lax.scan(one_block, begin, rows, reverse=True)
+    return state
+
+
+class Pieces(NamedTuple):
+    """Pieces of `size` steps each between two stored states, in order from step `first`."""
+
+    starts: Point
+    ends: Point
+    first: Array
+    size: int
+
+    def fold(self, step: Callable, state: Any, reverse: bool = False) -> Any:
+        """``state = step(state, k, start, end)`` for each piece, from step number k."""
+        count = len(self.starts[0])
+        if count == 1:  # without a loop around one piece, which would be compiled
+            return step(state, self.first, _row(self.starts, 0), _row(self.ends, 0))
+        k, stride = self.first, self.size
+        if reverse:
+            k, stride = k + (count - 1) * stride, -stride
+
+        def one_piece(carry, ends):
+            k, state = carry
+            return (k + stride, step(state, k, *ends)), None
+
+        (_, state), _ = lax.scan(one_piece, (k, state), (self.starts, self.ends), reverse=reverse)
+        return state
+
+
+def _row(points: Point, i: int | slice) -> Point:
+    return points[0][i], points[1][i]
+
+
+class Reconstruction(eqx.Module):
+    """The states of a run between those that it stores: at save points, and at checkpoints about
+    `spacing` steps apart. `tolerance`: the largest relative difference that is accepted there."""
+
+    task: Task
+    plan: Plan = eqx.field(static=True)
+    spacing: int = eqx.field(static=True)
+    tolerance: float = eqx.field(static=True)
+
+    def starts(self, start: Point, rows: Rows) -> Point:
+        """The states at the beginning of each block and of the tail: saved ones, thus exact."""
+        return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, (rows.q, rows.p))
+
+    def pieces(self, start: Point, rows: Rows, first: Any, count: int) -> list[Pieces]:
+        """The `count` steps to a save point, divided at the checkpoints in between."""
+        checkpoints = 0 if rows.inner is None else len(rows.inner[0])
+        size = piece_length(count, self.spacing) if checkpoints else count
+        parts = [[x[None] for x in start], rows.inner, [rows.q[None], rows.p[None]]]
+        points = [jnp.concatenate(x) for x in zip(*filter(None, parts), strict=True)]
+        starts, ends = (points[0][:-1], points[1][:-1]), (points[0][1:], points[1][1:])
+        remainder = count - checkpoints * size
+        # The code for a piece is compiled for each length: the last one joins the others if it can.
+        if remainder == size:
+            return [Pieces(starts, ends, first, size)]
+        all_but_last, last = slice(-1), slice(-1, None)
+        return [
+            Pieces(_row(starts, all_but_last), _row(ends, all_but_last), first, size),
+            Pieces(_row(starts, last), _row(ends, last), first + checkpoints * size, remainder),
+        ]
+
+    def steps_by_inverse(
+        self,
+        start: Point,
+        end: Point,
+        first: Array,
+        count: int,
+        visit: Callable = lambda sums, k, start, end: sums,
+        sums: Any = None,
+    ) -> tuple[Any, Array, Array]:
+        """The states from `end` back over `count` steps, by inverse steps: the `sums` that
+        ``visit(sums, k, start, end)`` accumulates over them, the relative difference of each
+        component from `start`, and whether all solves succeeded."""
+        task = self.task
+        # A divisor of `count`, so that one loop serves all groups.
+        group = next((d for d in range(min(count, GROUP), 1, -1) if count % d == 0), 1)
+
+        # Cotangents go along in the same loop: states are needed once, and none is stored.
+        def one_step(carry, _):
+            k, state, sums, is_solved = carry
+            # Without the memory of the arithmetic, whose effect is below the accepted difference.
+            interval = task.interval(k)
+            q, p, info = task.method.inverse(task.equations_at(k, interval), interval, *state)
+            sums = visit(sums, k, (q, p), state)
+            return (k - 1, (q, p), sums, is_solved & (info.result == RESULTS.successful)), None
+
+        def one_group(carry, _):
+            carry, sizes = carry
+            carry, _ = lax.scan(one_step, carry, None, group)
+            return (carry, _largest(sizes, carry[1])), None
+
+        begin = ((first + (count - 1), end, sums, jnp.asarray(True)), _largest(end, end))
+        ((_, point, sums, is_solved), sizes), _ = lax.scan(one_group, begin, None, count // group)
+        defects = [
+            self.difference(a, b, size).ravel()
+            for a, b, size in zip(point, start, sizes, strict=True)
+        ]
+        return sums, jnp.concatenate(defects), is_solved
+
+    def difference(self, a: State, b: State, size: State) -> Array:
+        """The difference of each component of a from b, relative to its size."""
+        # A small component inherits round-off of the largest one, which is no fault of the inverse
+        # steps. The size is increased so that this round-off is just accepted.
+        eps, tiny = jnp.finfo(a.dtype).eps, jnp.finfo(a.dtype).tiny
+        round_off = 64 * eps * jnp.max(size, initial=0.0)
+        return jnp.abs(a - b) / (size + (round_off / self.tolerance + tiny))
+
+    def defect(self, start: Point, rows: Rows, tail: Rows | None) -> Array:
+        """The largest difference of a reconstructed state at a stored one; ∞ where an inverse step
+        failed."""
+        plan, starts = self.plan, self.starts(start, rows)
+
+        def of_block(worst, first, start, rows, count=plan.block):
+            for pieces in self.pieces(start, rows, first, count):
+
+                def of_piece(worst, k, start, end, size=pieces.size):
+                    _, defects, is_solved = self.steps_by_inverse(start, end, k, size)
+                    defect = jnp.max(defects, initial=0.0)
+                    return jnp.maximum(worst, jnp.where(is_solved, defect, jnp.inf))
+
+                worst = pieces.fold(of_piece, worst)
+            return worst
+
+        worst = jnp.zeros((), start[0].dtype)
+        if tail is not None:
+            first = jnp.asarray(plan.num_blocks * plan.block, jnp.int32)
+            worst = of_block(worst, first, _row(starts, -1), tail, plan.tail)
+        blocks = _row(starts, slice(-1)), rows
+        return fold_blocks(of_block, worst, plan.num_blocks, plan.block, blocks)
+
+
+def _largest(sizes: Point, point: Point) -> Point:
+    return jax.tree.map(lambda size, x: jnp.maximum(jnp.abs(size), jnp.abs(x)), sizes, point)
