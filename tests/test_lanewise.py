@@ -25,11 +25,11 @@ import dvi_jax as dvi
 import lanewise
 from lanewise import assumed, evaluator as components, primitive
 from lanewise.jaxprs import extent
-from lanewise.jaxprs.traced import Traced
+from lanewise.jaxprs.traced import Trace
 from lanewise.module import Module
 from lanewise.native import cache, handler, machine
 from lanewise.rules import moves
-from lanewise.targets import TARGETS, Code, compiled
+from lanewise.targets import TARGETS, Code, compile_program
 from lanewise.targets.numbers import kernel_text
 from lanewise.targets.target import compiled_by
 
@@ -781,8 +781,8 @@ def test_no_warning_from_constants():
 
 def test_code_stays_short_for_arrays():
     leaves, tree = jax.tree.flatten((1.0,))
-    program = primitive.Program(Traced.of(lambda x: jnp.full((128,), x), leaves, tree))
-    text = compiled(program, [True], 64, "cpu").code.text
+    program = primitive.Callee(Trace.from_function(lambda x: jnp.full((128,), x), leaves, tree))
+    text = compile_program(program, [True], 64, "cpu").code.text
     blocks = text.split(":\n")
     assert max(b.count("\n") for b in blocks) < 3000
 
@@ -855,17 +855,17 @@ def test_an_unknown_parameter_is_left_to_xla():
     """Of a primitive that moves numbers: a rule that does not know it might move them wrongly."""
     of = {"new_sizes": (4,), "dimensions": None, "sharding": None}
     x = np.arange(4.0).reshape(2, 2)
-    np.testing.assert_array_equal(moves.moved("reshape", of, x)[0], [0, 1, 2, 3])
+    np.testing.assert_array_equal(moves.move_entries("reshape", of, x)[0], [0, 1, 2, 3])
     of["dimensions"] = (1, 0)
-    np.testing.assert_array_equal(moves.moved("reshape", of, x)[0], [0, 2, 1, 3])
-    with pytest.raises(lanewise.llvm.ir.Unsupported, match=r"reshape has parameters .*: order"):
-        moves.moved("reshape", {**of, "order": "F"}, x)
+    np.testing.assert_array_equal(moves.move_entries("reshape", of, x)[0], [0, 2, 1, 3])
+    with pytest.raises(lanewise.llvm.ir.NotCompilable, match="unknown parameters: order"):
+        moves.move_entries("reshape", {**of, "order": "F"}, x)
 
 
 def operations(function, *args):
     leaves, tree = jax.tree.flatten(args)
-    program = primitive.Program(Traced.of(function, leaves, tree))
-    return compiled(program, [True] * len(leaves), 64, "cpu").code.operations
+    program = primitive.Callee(Trace.from_function(function, leaves, tree))
+    return compile_program(program, [True] * len(leaves), 64, "cpu").code.operations
 
 
 class Refusing:
@@ -878,22 +878,22 @@ class Refusing:
         return self.is_suited
 
     def write(self, closed, on, lanes, width):
-        raise lanewise.llvm.ir.Unsupported(f"refused by {self.name}")
+        raise lanewise.llvm.ir.NotCompilable(f"refused by {self.name}")
 
-    def registered(self, code):
+    def register(self, code):
         raise AssertionError
 
-    assembly = registered
+    assembly = register
 
 
 def test_first_target_with_code_is_used_and_reasons_of_others_are_collected():
-    program = primitive.Program(Traced.of(jnp.sin, [1.0], jax.tree.structure((1.0,))))
+    program = primitive.Callee(Trace.from_function(jnp.sin, [1.0], jax.tree.structure((1.0,))))
     targets = [Refusing("unsuited", False), Refusing("first"), *TARGETS["cpu"], Refusing("last")]
     result = compiled_by(targets, program, [True], 8)
     assert result.target is TARGETS["cpu"][0]
     assert result.reasons == {"first": "refused by first"}
-    assert result.code == compiled(program, [True], 8, "cpu").code
-    with pytest.raises(lanewise.llvm.ir.Unsupported, match="refused by a; refused by b"):
+    assert result.code == compile_program(program, [True], 8, "cpu").code
+    with pytest.raises(lanewise.llvm.ir.NotCompilable, match="refused by a; refused by b"):
         compiled_by([Refusing("a"), Refusing("b")], program, [True], 8)
 
 
@@ -950,7 +950,7 @@ CODE = "define i64 @number() {\n  ret i64 NUMBER\n}\n"
 
 def number(value):
     """What compiled code gives that gives this number."""
-    engine = machine.loaded(CODE.replace("NUMBER", str(value)))
+    engine = machine.load(CODE.replace("NUMBER", str(value)))
     return ctypes.CFUNCTYPE(ctypes.c_int64)(engine.get_function_address("number"))()
 
 
@@ -1156,7 +1156,7 @@ def test_switched_off(left, monkeypatch):
 
 def test_one_warning_where_code_cannot_be_generated(left, monkeypatch):
     monkeypatch.setitem(sys.modules, "llvmlite.binding", None)  # as if it were not installed
-    caches = machine.started, primitive._can_start
+    caches = machine.start_llvm, primitive._can_start
     for cached in caches:
         cached.cache_clear()
     try:
@@ -1262,7 +1262,7 @@ def test_code_for_other_processors(width):
         return rows_of(q, 200), jnp.any(x > 0), jnp.asarray(TABLE)[k], k.astype("float32")
 
     x, k = np.float64(1), np.int32(3)
-    traced = Traced.of(function, [x, k], jax.tree.structure((x, k)))
+    traced = Trace.from_function(function, [x, k], jax.tree.structure((x, k)))
     module = Module(width, 2)
     text = handler.module_text(kernel_text(module, traced.all_inputs, [True, True]), 2 * width)
     for kind, cpu, features, code in PROCESSORS:
@@ -1348,15 +1348,15 @@ def test_small_arrays_are_numbers():
 def test_long_chains_of_operations_need_no_deep_stack():
     """A trace within traces has little of Python's stack left."""
     b = Module(4, 1).b
-    first = x = b.made(["%x"], "float64", True)
+    first = x = b.number(["%x"], "float64", True)
     for _ in range(200):
         x = b.add(x, b.mul(x, x))
     before = sys.getrecursionlimit()
     try:
         sys.setrecursionlimit(len(inspect.stack()) + 30)
-        found = b.shown(frozenset([first.serial]), [x])
+        found = b.finite_where(frozenset([first.serial]), [x])
     finally:
         sys.setrecursionlimit(before)
     assert found <= {first.serial}
     short = b.add(first, b.mul(first, first))
-    assert b.shown(frozenset([first.serial]), [short]) == {first.serial}
+    assert b.finite_where(frozenset([first.serial]), [short]) == {first.serial}

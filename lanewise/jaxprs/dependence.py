@@ -16,11 +16,11 @@ def depends_on(function: Callable[..., Any], argnum: int, *args: Any) -> bool:
     True where it is not certain, as for primitives whose body is unknown. `args` are arrays or
     shape structs: only shapes and types matter.
     """
-    before = len(jax.tree.leaves(args[:argnum]))
+    start = len(jax.tree.leaves(args[:argnum]))
     count = len(jax.tree.leaves(args[argnum]))
-    closed = jax.make_jaxpr(function)(*args)
-    marked = [before <= i < before + count for i in range(len(closed.jaxpr.invars))]
-    return any(reached_outputs(closed.jaxpr, marked))
+    function_jaxpr = jax.make_jaxpr(function)(*args)
+    marks = [start <= i < start + count for i in range(len(function_jaxpr.jaxpr.invars))]
+    return any(reached_outputs(function_jaxpr.jaxpr, marks))
 
 
 def reached_outputs(
@@ -30,10 +30,10 @@ def reached_outputs(
 
     Nothing is reached through the primitives named in `ends`.
     """
-    known, question = _ANSWERS.setdefault(jaxpr, {}), (tuple(reached_inputs), ends)
-    if question not in known:  # nested loops need the same result many times
-        known[question] = _reached_outputs(jaxpr, *question)
-    return list(known[question])
+    answers, question = _ANSWERS.setdefault(jaxpr, {}), (tuple(reached_inputs), ends)
+    if question not in answers:  # nested loops need the same result many times
+        answers[question] = _reached_outputs(jaxpr, *question)
+    return list(answers[question])
 
 
 _ANSWERS: weakref.WeakKeyDictionary[Jaxpr, dict] = weakref.WeakKeyDictionary()
@@ -41,17 +41,21 @@ _ANSWERS: weakref.WeakKeyDictionary[Jaxpr, dict] = weakref.WeakKeyDictionary()
 
 def _reached_outputs(jaxpr: Jaxpr, reached_inputs: Sequence[bool], ends: frozenset[str]) -> Any:
     # Equations come in the order of their dependence: one pass is enough.
-    reached = {v for v, r in zip(jaxpr.invars, reached_inputs, strict=True) if r}
+    variables = {
+        var for var, is_marked in zip(jaxpr.invars, reached_inputs, strict=True) if is_marked
+    }
 
     def is_reached(atom: Any) -> bool:
-        return not isinstance(atom, Literal) and atom in reached
+        return not isinstance(atom, Literal) and atom in variables
 
     for eqn in jaxpr.eqns:
-        inputs = [is_reached(v) for v in eqn.invars]
+        inputs = [is_reached(var) for var in eqn.invars]
         if any(inputs):
             outputs = reached_by(eqn, inputs, ends)
-            reached.update(v for v, r in zip(eqn.outvars, outputs, strict=True) if r)
-    return [is_reached(v) for v in jaxpr.outvars]
+            variables.update(
+                var for var, is_marked in zip(eqn.outvars, outputs, strict=True) if is_marked
+            )
+    return [is_reached(var) for var in jaxpr.outvars]
 
 
 def reached_by(eqn: Any, inputs: list[bool], ends: frozenset[str] = frozenset()) -> list[bool]:
@@ -67,23 +71,23 @@ def reached_by(eqn: Any, inputs: list[bool], ends: frozenset[str] = frozenset())
             inputs[consts + count :],
         )
 
-        def scanned(carry):
+        def outputs_of_round(carry):
             return reached_outputs(params["jaxpr"].jaxpr, [*fixed, *carry, *xs], ends)
 
         # A dependence of one part of the carry may become one of another part in the next round.
-        carry = fixed_point(lambda carry: scanned(carry)[:count], carry)
-        return [*carry, *scanned(carry)[count:]]
+        carry = fixed_point(lambda carry: outputs_of_round(carry)[:count], carry)
+        return [*carry, *outputs_of_round(carry)[count:]]
     if name == "while":
         first, second = params["cond_nconsts"], params["body_nconsts"]
         of_test, of_body = inputs[:first], inputs[first : first + second]
 
-        def after(carry):
+        def next_carry(carry):
             (test,) = reached_outputs(params["cond_jaxpr"].jaxpr, [*of_test, *carry], ends)
             body = reached_outputs(params["body_jaxpr"].jaxpr, [*of_body, *carry], ends)
             # If the number of rounds is reached, so is everything that the rounds compute.
             return [test or r for r in body]
 
-        return fixed_point(after, inputs[first + second :])
+        return fixed_point(next_carry, inputs[first + second :])
     if name == "cond":
         # The choice of the branch alone decides about all outputs.
         if inputs[0]:
@@ -94,24 +98,26 @@ def reached_by(eqn: Any, inputs: list[bool], ends: frozenset[str] = frozenset())
     return [True] * len(eqn.outvars) if inner is None else reached_outputs(inner, inputs, ends)
 
 
-def fixed_point(after: Callable[[list[bool]], list[bool]], marks: list[bool]) -> list[bool]:
-    """The smallest set that holds `marks` and, with each set, what comes `after` it."""
+def fixed_point(step: Callable[[list[bool]], list[bool]], marks: list[bool]) -> list[bool]:
+    """The smallest set that contains `marks` and, with each set, ``step(set)``."""
     while True:
-        more = [a or b for a, b in zip(marks, after(marks), strict=True)]
-        if more == marks:
+        union = [mark or new_mark for mark, new_mark in zip(marks, step(marks), strict=True)]
+        if union == marks:
             return marks
-        marks = more
+        marks = union
 
 
 def _called_jaxpr(eqn: Any) -> Jaxpr | None:
     """The body of a call (jit, checkpoint, `lanewise.call`, …) with the inputs and outputs of the
     equation; None for other equations."""
     if eqn.primitive.name == "lanewise":
-        return eqn.params["program"].traced.all_inputs.jaxpr
+        return eqn.params["program"].trace.all_inputs.jaxpr
     # With two bodies (a function and its derivative) it is not certain which one is run.
     bodies = list(jaxprs_in_params(eqn.params))
     if len(bodies) != 1:
         return None
     (body,) = bodies
-    same = len(body.invars) == len(eqn.invars) and len(body.outvars) == len(eqn.outvars)
-    return body if same else None
+    has_equal_lengths = len(body.invars) == len(eqn.invars) and len(body.outvars) == len(
+        eqn.outvars
+    )
+    return body if has_equal_lengths else None

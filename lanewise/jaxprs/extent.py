@@ -12,21 +12,24 @@ def functions_in(eqn: Any) -> list[ClosedJaxpr]:
     """The jaxpr of what `call` was given, if an equation of a jaxpr is such a call: it is not
     among those that the equation shows."""
     is_call = eqn.primitive.name == "lanewise"
-    return [eqn.params["program"].traced.closed] if is_call else []
+    return [eqn.params["program"].trace.closed_jaxpr] if is_call else []
 
 
-def carried(jaxpr: Any) -> int:
+def carry_size(jaxpr: Any) -> int:
     """Numbers that the innermost loop with most of them carries from step to step."""
-    most = 0
+    largest = 0
     for eqn in jaxpr.eqns:
         for body in bodies(eqn):
-            most = max(most, carried(body.jaxpr))
+            largest = max(largest, carry_size(body.jaxpr))
         if eqn.primitive.name == "scan":
             _, count = scan_counts(eqn.params)
-            state = [v.aval for v in eqn.outvars[:count]]
+            state = [var.aval for var in eqn.outvars[:count]]
             # Large arrays stay in memory and take no register; integers are few.
-            most = max(most, sum(a.size for a in state if a.size <= 64 and a.dtype.kind == "f"))
-    return most
+            largest = max(
+                largest,
+                sum(aval.size for aval in state if aval.size <= 64 and aval.dtype.kind == "f"),
+            )
+    return largest
 
 
 MOST_IN_PAIRS = 150_000
@@ -51,19 +54,19 @@ def operation_count(jaxpr: Any) -> int:
     """How many operations on numbers the evaluation is made of, loops counted once; roughly."""
     count = 0
     for eqn in jaxpr.eqns:
-        inside = (*bodies(eqn), *functions_in(eqn))
+        functions = (*bodies(eqn), *functions_in(eqn))
         if eqn.primitive.name == "custom_linear_solve":
             # Only this one of its four functions is run.
-            inside = (eqn.params["jaxprs"].solve,)
-        inner = [operation_count(b.jaxpr) for b in inside]
+            functions = (eqn.params["jaxprs"].solve,)
+        inner = [operation_count(function.jaxpr) for function in functions]
         if inner:
             count += sum(inner)
             continue
         size = max((v.aval.size for v in eqn.outvars), default=0)
         if eqn.primitive.name == "dot_general":
-            (contracted, _), _ = eqn.params["dimension_numbers"]
+            (axes, _), _ = eqn.params["dimension_numbers"]
             # One fused multiply-add for each term.
-            size *= int(np.prod([eqn.invars[0].aval.shape[i] for i in contracted]))
+            size *= int(np.prod([eqn.invars[0].aval.shape[i] for i in axes]))
         elif eqn.primitive.name.startswith("reduce_"):
             size = eqn.invars[0].aval.size
         elif eqn.primitive.name == "eliminate":

@@ -1,13 +1,13 @@
 """Arrays in memory: operands, results, rows that a loop writes, all seen through strides."""
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
 from .builder import Builder
-from .ir import TYPES, Num, Unsupported
+from .ir import TYPES, NotCompilable, Num
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,26 +33,27 @@ class Buffer:
 
     @property
     def is_contiguous(self) -> bool:
-        expected = contiguous(self.shape, self.strides[-1] if self.strides else 1)
+        strides = contiguous(self.shape, self.strides[-1] if self.strides else 1)
         return all(
-            s == e or n <= 1 for s, e, n in zip(self.strides, expected, self.shape, strict=True)
+            stride == row_major or n <= 1
+            for stride, row_major, n in zip(self.strides, strides, self.shape, strict=True)
         )
 
-    def moved(self, by: Num | int) -> "Buffer":
-        return dataclasses.replace(self, offset=(*self.offset, by))
+    def shift(self, distance: Num | int) -> "Buffer":
+        return dataclasses.replace(self, offset=(*self.offset, distance))
 
     def row(self, b: Builder, index: Num) -> "Buffer":
         """``self[index]`` of the first axis, by an index that is known when the code runs."""
-        by = b.mul(index, b.known(self.strides[0], "int64"))
+        distance = b.mul(index, b.const(self.strides[0], "int64"))
         return dataclasses.replace(
-            self, shape=self.shape[1:], strides=self.strides[1:], offset=(*self.offset, by)
+            self, shape=self.shape[1:], strides=self.strides[1:], offset=(*self.offset, distance)
         )
 
     def from_row(self, b: Builder, index: Num) -> "Buffer":
         """The array from row `index` on; the length of its first axis is not adjusted."""
-        return self.moved(b.mul(index, b.known(self.strides[0], "int64")))
+        return self.shift(b.mul(index, b.const(self.strides[0], "int64")))
 
-    def reshaped(self, shape: Sequence[int]) -> "Buffer | None":
+    def reshape(self, shape: Sequence[int]) -> "Buffer | None":
         """The same elements in row-major order with other axes, if strides can say that."""
         if not self.is_contiguous:
             return None
@@ -60,8 +61,8 @@ class Buffer:
         step = long[-1] if long else 1  # the stride of an axis of length 1 may be anything
         return dataclasses.replace(self, shape=tuple(shape), strides=contiguous(shape, step))
 
-    def seen(self, view: Any) -> "Buffer | None":
-        """The buffer as `view` arranges it, a function of NumPy arrays that copies nothing."""
+    def view(self, arrangement: Callable) -> "Buffer | None":
+        """The buffer as a function of NumPy arrays that copies nothing arranges it."""
         item = 8
         # NumPy computes the strides of a view without reading the array: the memory of one number
         # is enough.
@@ -69,20 +70,20 @@ class Buffer:
             np.broadcast_to(np.int64(0), ()), self.shape, [s * item for s in self.strides]
         )
         try:
-            other = view(like)
+            other = arrangement(like)
         except (TypeError, ValueError):
             return None
         start = like.__array_interface__["data"][0]
         # A copy has elements in an order that no strides of this buffer describe.
         if other.size and not np.may_share_memory(like, other, max_work=0):
             return None
-        by = (other.__array_interface__["data"][0] - start) // item
+        distance = (other.__array_interface__["data"][0] - start) // item
         strides = tuple(s // item for s in other.strides)
         return dataclasses.replace(
-            self, shape=other.shape, strides=strides, offset=(*self.offset, int(by))
+            self, shape=other.shape, strides=strides, offset=(*self.offset, int(distance))
         )
 
-    def at(self, index: Sequence[int]) -> int:
+    def position(self, index: Sequence[int]) -> int:
         return sum(i * s for i, s in zip(index, self.strides, strict=True))
 
 
@@ -99,74 +100,78 @@ def stored_type(dtype: str) -> str:
     return "i8" if dtype == "bool" else TYPES[dtype]
 
 
-def _offset(b: Builder, buffer: Buffer, by: Num | int) -> tuple[Num, int]:
+def _offset(b: Builder, buffer: Buffer, distance: Num | int) -> tuple[Num, int]:
     """The offset as (a number, a constant)."""
     # Constants are added while the code is written; the rest is one addition in it.
-    total, fixed = b.known(0, "int64"), 0
-    for part in (*buffer.offset, by):
+    total, fixed = b.const(0, "int64"), 0
+    for part in (*buffer.offset, distance):
         if isinstance(part, int):
             fixed += part
-        elif part.known is not None:
-            fixed += int(part.known)
+        elif part.value is not None:
+            fixed += int(part.value)
         else:
             total = b.add(total, part)
     return total, fixed
 
 
-def load(b: Builder, buffer: Buffer, by: Num | int = 0) -> Num:
-    """The element at `by` elements from the start."""
+def load(b: Builder, buffer: Buffer, distance: Num | int = 0) -> Num:
+    """The element at `distance` elements from the start."""
     item = stored_type(buffer.dtype)
-    moving, fixed = _offset(b, buffer, by)
+    moving, fixed = _offset(b, buffer, distance)
     # Shared memory at a shared index: one number for all trajectories.
     if buffer.lane is None and not moving.vec:
-        where = _moved(b, buffer.base[0], moving, fixed, item)
-        return _from_memory(b, b.made([_load(b, item, where)], buffer.dtype, False))
+        where = _pointer_at(b, buffer.base[0], moving, fixed, item)
+        return _from_memory(b, b.number([_load(b, item, where)], buffer.dtype, False))
     names = []
     for u in range(b.U):
         if b.W > 1 and buffer.lane == 1 and not moving.vec:
-            where = _moved(b, buffer.base[u], moving, fixed, item)
+            where = _pointer_at(b, buffer.base[u], moving, fixed, item)
             # Neighbours in memory are neighbours in the vector.
             names.append(_load(b, f"<{b.W} x {item}>", where, item))
             continue
-        ones = [_load(b, item, at) for at in _pointers(b, buffer, u, moving, fixed, item)]
-        made = "poison" if b.W > 1 else ones[0]
+        elements = [
+            _load(b, item, pointer) for pointer in _pointers(b, buffer, u, moving, fixed, item)
+        ]
+        vector = "poison" if b.W > 1 else elements[0]
         for i in range(b.W if b.W > 1 else 0):
-            made = b.new(f"insertelement <{b.W} x {item}> {made}, {item} {ones[i]}, i64 {i}")
-        names.append(made)
-    return _from_memory(b, b.made(names, buffer.dtype, True))
+            vector = b.new(
+                f"insertelement <{b.W} x {item}> {vector}, {item} {elements[i]}, i64 {i}"
+            )
+        names.append(vector)
+    return _from_memory(b, b.number(names, buffer.dtype, True))
 
 
-def store(b: Builder, buffer: Buffer, x: Num, by: Num | int = 0) -> None:
-    """Write a number to `by` elements from the start."""
+def store(b: Builder, buffer: Buffer, x: Num, distance: Num | int = 0) -> None:
+    """Write a number to `distance` elements from the start."""
     assert x.dtype == buffer.dtype, (x.dtype, buffer.dtype)
     item = stored_type(buffer.dtype)
-    moving, fixed = _offset(b, buffer, by)
+    moving, fixed = _offset(b, buffer, distance)
     if buffer.lane is None:
         if x.vec or moving.vec:
             # Which trajectory wrote last would decide.
-            raise Unsupported(
-                f"an array of shape {buffer.shape} is shared by all trajectories, but the value or "
-                "the index that the function writes to it differs between trajectories"
+            raise NotCompilable(
+                f"an array of shape {buffer.shape} that all trajectories share is written with a "
+                "value or an index that differs between them"
             )
-        where = _moved(b, buffer.base[0], moving, fixed, item)
+        where = _pointer_at(b, buffer.base[0], moving, fixed, item)
         _store(b, item, _to_memory(b, x, 0, False), where)
         return
     vector = f"<{b.W} x {item}>"
     for u in range(b.U):
         name = _to_memory(b, x, u, True)
         if b.W > 1 and buffer.lane == 1 and not moving.vec:
-            _store(b, vector, name, _moved(b, buffer.base[u], moving, fixed, item), item)
+            _store(b, vector, name, _pointer_at(b, buffer.base[u], moving, fixed, item), item)
             continue
-        for i, at in enumerate(_pointers(b, buffer, u, moving, fixed, item)):
-            one = name
+        for i, pointer in enumerate(_pointers(b, buffer, u, moving, fixed, item)):
+            element = name
             if b.W > 1:
-                one = b.new(f"extractelement {vector} {name}, i64 {i}")
-            _store(b, item, one, at)
+                element = b.new(f"extractelement {vector} {name}, i64 {i}")
+            _store(b, item, element, pointer)
 
 
-def _moved(b: Builder, base: str, moving: Num, fixed: int, item: str) -> str:
+def _pointer_at(b: Builder, base: str, moving: Num, fixed: int, item: str) -> str:
     """A pointer moved by so many elements."""
-    where = b.pointer(item, base, moving.names[0] if moving.known is None else 0)
+    where = b.pointer(item, base, moving.names[0] if moving.value is None else 0)
     return b.pointer(item, where, fixed)
 
 
@@ -177,33 +182,33 @@ def _pointers(
     base = buffer.base[u if buffer.lane is not None else 0]
     if not moving.vec:
         assert buffer.lane is not None  # else the number is the same on all trajectories
-        where = _moved(b, base, moving, fixed, item)
+        where = _pointer_at(b, base, moving, fixed, item)
         for i in range(b.W):
             yield _lane_pointer(b, where, i, buffer.lane, item)
         return
-    index = b.ref(b.add(moving, b.known(fixed, "int64")), u, True)
+    index = b.ref(b.add(moving, b.const(fixed, "int64")), u, True)
     for i in range(b.W):
-        one = index
+        element_index = index
         if b.W > 1:
-            one = b.new(f"extractelement <{b.W} x i64> {index}, i64 {i}")
-        at = base if buffer.lane is None else _lane_pointer(b, base, i, buffer.lane, item)
-        yield b.pointer(item, at, one)
+            element_index = b.new(f"extractelement <{b.W} x i64> {index}, i64 {i}")
+        start = base if buffer.lane is None else _lane_pointer(b, base, i, buffer.lane, item)
+        yield b.pointer(item, start, element_index)
 
 
 def _lane_pointer(b: Builder, base: str, i: int, lane: int | str, item: str) -> str:
     if i == 0 or isinstance(lane, int):
         return b.pointer(item, base, i and i * lane)
-    by = b.once(("lane", lane, i), lambda: b.new(f"mul i64 {lane}, {i}"))
-    return b.pointer(item, base, by)
+    distance = b.find_or_make(("lane", lane, i), lambda: b.new(f"mul i64 {lane}, {i}"))
+    return b.pointer(item, base, distance)
 
 
-def _load(b: Builder, what: str, where: str, item: str = "") -> str:
+def _load(b: Builder, kind: str, where: str, item: str = "") -> str:
     # The alignment of one element, not of the vector: a row may begin anywhere.
-    return b.new(f"load {what}, ptr {where}, align {_bytes(item or what)}")
+    return b.new(f"load {kind}, ptr {where}, align {_bytes(item or kind)}")
 
 
-def _store(b: Builder, what: str, name: str, where: str, item: str = "") -> None:
-    b.emit(f"store {what} {name}, ptr {where}, align {_bytes(item or what)}")
+def _store(b: Builder, kind: str, name: str, where: str, item: str = "") -> None:
+    b.emit(f"store {kind} {name}, ptr {where}, align {_bytes(item or kind)}")
 
 
 def _bytes(item: str) -> int:
@@ -217,7 +222,7 @@ def _from_memory(b: Builder, x: Num) -> Num:
     # Any byte but 0 counts as true.
     t = f"<{b.W} x i8>" if x.vec and b.W > 1 else "i8"
     zero = "zeroinitializer" if x.vec and b.W > 1 else "0"
-    return b.made([b.new(f"icmp ne {t} {n}, {zero}") for n in x.names], "bool", x.vec)
+    return b.number([b.new(f"icmp ne {t} {n}, {zero}") for n in x.names], "bool", x.vec)
 
 
 def _to_memory(b: Builder, x: Num, u: int, vec: bool) -> str:
@@ -234,7 +239,7 @@ def _to_memory(b: Builder, x: Num, u: int, vec: bool) -> str:
 def load_row(b: Builder, buffer: Buffer) -> list[Num]:
     """All elements in row-major order."""
     if not _is_row(b, buffer):
-        return [load(b, buffer, buffer.at(i)) for i in np.ndindex(buffer.shape)]
+        return [load(b, buffer, buffer.position(i)) for i in np.ndindex(buffer.shape)]
     item, moving, fixed = TYPES[buffer.dtype], *_offset(b, buffer, 0)
     names: list[list[str]] = [[] for _ in range(buffer.size)]
     for u in range(b.U):
@@ -242,15 +247,15 @@ def load_row(b: Builder, buffer: Buffer) -> list[Num]:
         for first, count in _pieces(buffer.size, buffer.lane):
             of_lanes = _load_lanes(b, buffer, where, fixed + first, count, item)
             for j in range(count):
-                names[first + j].append(_picked(b, of_lanes, j, count, item))
-    return [b.made(of_u, buffer.dtype, True) for of_u in names]
+                names[first + j].append(_pick(b, of_lanes, j, count, item))
+    return [b.number(of_u, buffer.dtype, True) for of_u in names]
 
 
 def store_row(b: Builder, buffer: Buffer, numbers: Sequence[Num]) -> None:
     """Write all elements, given in row-major order."""
     if not _is_row(b, buffer):
         for i, x in zip(np.ndindex(buffer.shape), numbers, strict=True):
-            store(b, buffer, x, buffer.at(i))
+            store(b, buffer, x, buffer.position(i))
         return
     item, moving, fixed = TYPES[buffer.dtype], *_offset(b, buffer, 0)
     for u in range(b.U):
@@ -287,7 +292,7 @@ def _is_row(b: Builder, buffer: Buffer) -> bool:
 
 
 def _start_of_row(b: Builder, buffer: Buffer, u: int, moving: Num, item: str) -> str:
-    return b.pointer(item, buffer.base[u], moving.names[0] if moving.known is None else 0)
+    return b.pointer(item, buffer.base[u], moving.names[0] if moving.value is None else 0)
 
 
 def _load_lanes(b: Builder, buffer: Buffer, where: str, first: int, count: int, item: str) -> str:
@@ -295,13 +300,13 @@ def _load_lanes(b: Builder, buffer: Buffer, where: str, first: int, count: int, 
     assert buffer.lane is not None
     where = b.pointer(item, where, first)
     if buffer.lane == count:
-        whole = f"<{b.W * count} x {item}>"
-        return b.new(f"load {whole}, ptr {where}, align {_bytes(item)}")
+        kind = f"<{b.W * count} x {item}>"
+        return b.new(f"load {kind}, ptr {where}, align {_bytes(item)}")
     parts = []
     for i in range(b.W):
-        at = _lane_pointer(b, where, i, buffer.lane, item)
-        parts.append(b.new(f"load <{count} x {item}>, ptr {at}, align {_bytes(item)}"))
-    return _joined(b, parts, count, item)
+        pointer = _lane_pointer(b, where, i, buffer.lane, item)
+        parts.append(b.new(f"load <{count} x {item}>, ptr {pointer}, align {_bytes(item)}"))
+    return _join(b, parts, count, item)
 
 
 def _store_lanes(
@@ -310,30 +315,30 @@ def _store_lanes(
     """Write one vector for each of some neighbours."""
     assert buffer.lane is not None
     count, where = len(vectors), b.pointer(item, where, first)
-    joined = _joined(b, vectors, b.W, item)
+    vector = _join(b, vectors, b.W, item)
     if buffer.lane == count:
         order = [j * b.W + i for i in range(b.W) for j in range(count)]
-        whole = _shuffled(b, joined, b.W * count, order, item)
-        b.emit(f"store <{b.W * count} x {item}> {whole}, ptr {where}, align {_bytes(item)}")
+        row_major = _shuffle(b, vector, b.W * count, order, item)
+        b.emit(f"store <{b.W * count} x {item}> {row_major}, ptr {where}, align {_bytes(item)}")
         return
     for i in range(b.W):
-        mine = _shuffled(b, joined, b.W * count, [j * b.W + i for j in range(count)], item)
-        at = _lane_pointer(b, where, i, buffer.lane, item)
-        b.emit(f"store <{count} x {item}> {mine}, ptr {at}, align {_bytes(item)}")
+        row = _shuffle(b, vector, b.W * count, [j * b.W + i for j in range(count)], item)
+        pointer = _lane_pointer(b, where, i, buffer.lane, item)
+        b.emit(f"store <{count} x {item}> {row}, ptr {pointer}, align {_bytes(item)}")
 
 
-def _picked(b: Builder, joined: str, j: int, count: int, item: str) -> str:
+def _pick(b: Builder, vector: str, j: int, count: int, item: str) -> str:
     """Number j of each trajectory, of `count` that lie next to each other."""
-    return _shuffled(b, joined, b.W * count, [i * count + j for i in range(b.W)], item)
+    return _shuffle(b, vector, b.W * count, [i * count + j for i in range(b.W)], item)
 
 
-def _joined(b: Builder, parts: list[str], length: int, item: str) -> str:
+def _join(b: Builder, parts: list[str], length: int, item: str) -> str:
     """Vectors of one length, one after the other."""
     parts = list(parts)
     # A shuffle joins two vectors of one length: fill up to a power of two.
-    missing = (1 << (len(parts) - 1).bit_length()) - len(parts)
-    wanted = len(parts) * length
-    parts += ["poison"] * missing
+    padding = (1 << (len(parts) - 1).bit_length()) - len(parts)
+    count = len(parts) * length
+    parts += ["poison"] * padding
     while len(parts) > 1:
         t, order = f"<{length} x {item}>", ", ".join(f"i32 {k}" for k in range(2 * length))
         parts = [
@@ -343,17 +348,17 @@ def _joined(b: Builder, parts: list[str], length: int, item: str) -> str:
             for x, y in zip(parts[::2], parts[1::2], strict=True)
         ]
         length *= 2
-    return parts[0] if length == wanted else _shuffled(b, parts[0], length, range(wanted), item)
+    return parts[0] if length == count else _shuffle(b, parts[0], length, range(count), item)
 
 
-def _shuffled(b: Builder, x: str, length: int, order: Sequence[int], item: str) -> str:
+def _shuffle(b: Builder, vector: str, length: int, order: Sequence[int], item: str) -> str:
     if list(order) == list(range(length)):
-        return x
-    t, which = f"<{length} x {item}>", ", ".join(f"i32 {k}" for k in order)
-    return b.new(f"shufflevector {t} {x}, {t} poison, <{len(order)} x i32> <{which}>")
+        return vector
+    t, indices = f"<{length} x {item}>", ", ".join(f"i32 {k}" for k in order)
+    return b.new(f"shufflevector {t} {vector}, {t} poison, <{len(order)} x i32> <{indices}>")
 
 
-def transposed(b: Builder, source: Buffer, target: Buffer) -> None:
+def copy_transposed(b: Builder, source: Buffer, target: Buffer) -> None:
     """Copy all elements of `source`, whose vectors are contiguous, to the first ones of
     `target`, where those of one trajectory are neighbours. The size is a multiple of the width."""
     item, W = TYPES[source.dtype], b.W
@@ -370,14 +375,14 @@ def transposed(b: Builder, source: Buffer, target: Buffer) -> None:
         yours = b.pointer(item, start, b.new(f"mul i64 {u}, {by_vector}"))
 
         def square(_, c: str) -> list[Num]:
-            at = b.pointer(item, mine, b.new(f"mul i64 {c}, {W * block}"))
+            start_of_square = b.pointer(item, mine, b.new(f"mul i64 {c}, {W * block}"))
             vectors = []
             for j in range(W):
-                where = b.new(f"getelementptr {item}, ptr {at}, i64 {j * block}")
+                where = b.new(f"getelementptr {item}, ptr {start_of_square}, i64 {j * block}")
                 vectors.append(b.new(f"load <{W} x {item}>, ptr {where}, align {_bytes(item)}"))
-            to = b.pointer(item, yours, b.new(f"mul i64 {c}, {W}"))
+            destination = b.pointer(item, yours, b.new(f"mul i64 {c}, {W}"))
             for i, row in enumerate(_square_transposed(b, vectors, item)):
-                where = _lane_pointer(b, to, i, lane, item)
+                where = _lane_pointer(b, destination, i, lane, item)
                 b.emit(f"store <{W} x {item}> {row}, ptr {where}, align {_bytes(item)}")
             return []
 
@@ -401,8 +406,8 @@ def _square_transposed(b: Builder, rows: list[str], item: str) -> list[str]:
             x, y = rows[i], rows[i + half]
             low = [k if not k & half else W + k - half for k in range(W)]
             high = [k + half if not k & half else W + k for k in range(W)]
-            for at, order in ((i, low), (i + half, high)):
-                which = ", ".join(f"i32 {k}" for k in order)
-                rows[at] = b.new(f"shufflevector {t} {x}, {t} {y}, <{W} x i32> <{which}>")
+            for place, order in ((i, low), (i + half, high)):
+                indices = ", ".join(f"i32 {k}" for k in order)
+                rows[place] = b.new(f"shufflevector {t} {x}, {t} {y}, <{W} x i32> <{indices}>")
         half //= 2
     return rows

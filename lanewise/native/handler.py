@@ -289,15 +289,15 @@ _targets: dict[str, str] = {}
 @functools.cache
 def runtime() -> Any:
     """The machine code that all kernels share."""
-    return machine.loaded(_RUNTIME)
+    return machine.load(_RUNTIME)
 
 
 def set_threads(count: int) -> None:
     """Set the number of threads of a batch; 0 means all of XLA's pool."""
     if isinstance(count, bool) or not isinstance(count, int):
-        raise TypeError(f"count must be a number of threads of the type int, got {count!r}.")
+        raise TypeError(f"count must be an int, got {count!r}.")
     if count < 0:
-        raise ValueError(f"count must be a positive number of threads, or 0 for all, got {count}.")
+        raise ValueError(f"count must be a number of threads, or 0 for all, got {count}.")
     _threads().value = count
 
 
@@ -316,7 +316,7 @@ def module_text(kernel: str, block: int) -> str:
     return kernel + HANDLER.replace("BLOCK", str(block))
 
 
-def registered(text: str) -> str:
+def register(text: str) -> str:
     """The name by which XLA calls a module's handler, compiled and registered if it was not."""
     # The text is the key, not the function: two programs with equal code are compiled once.
     key = hashlib.sha256(text.encode()).hexdigest()
@@ -326,7 +326,7 @@ def registered(text: str) -> str:
             name = f"lanewise_{key[:32]}"
             # One engine holds all modules, so that each needs a name of its own.
             text = text.replace("@lanewise_handler", f"@{name}")
-            engine = machine.loaded(text, {"lanewise_run": run})
+            engine = machine.load(text, {"lanewise_run": run})
             address = engine.get_function_address(name)
             jax.ffi.register_ffi_target(name, _capsule(address), platform="cpu")
             _targets[key] = name

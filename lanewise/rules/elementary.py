@@ -18,13 +18,13 @@ from ..module import Module
 def elementary(e: Evaluator, name: str, args: Sequence[Num]) -> Num:
     """An elementary function of float64, as a call of a function of the module."""
     vec = any(a.vec for a in args)
-    known: list[Any] = [a.known for a in args]
-    if all(x is not None for x in known):
-        return e.b.known(_at_known(name, tuple(float(x) for x in known)), "float64")
-    called = _function(e.module, name, len(args), vec)
+    numbers: list[Any] = [a.value for a in args]
+    if all(x is not None for x in numbers):
+        return e.b.const(_at_known(name, tuple(float(x) for x in numbers)), "float64")
+    function = _function(e.module, name, len(args), vec)
 
     def write(t: str, *names: str) -> str:
-        return f"call {t} {called}({', '.join(f'{t} {x}' for x in names)})"
+        return f"call {t} {function}({', '.join(f'{t} {x}' for x in names)})"
 
     return e.b.op(f"call {name}", args, "float64", write)
 
@@ -32,33 +32,33 @@ def elementary(e: Evaluator, name: str, args: Sequence[Num]) -> Num:
 def sincos(e: Evaluator, x: Num) -> tuple[Num, Num]:
     """sin x and cos x in one call."""
     b = e.b
-    if x.known is not None:
+    if x.value is not None:
         return elementary(e, "sin", [x]), elementary(e, "cos", [x])
 
     def make() -> tuple[Num, ...]:
-        called, t = _function(e.module, "sincos", 1, x.vec), b.type("float64", x.vec)
+        function, t = _function(e.module, "sincos", 1, x.vec), b.type("float64", x.vec)
         pair = f"{{{t}, {t}}}"
-        calls = [b.new(f"call {pair} {called}({t} {name})") for name in x.names]
+        calls = [b.new(f"call {pair} {function}({t} {name})") for name in x.names]
         b.operations += 2
         return tuple(
-            b.made([b.new(f"extractvalue {pair} {c}, {i}") for c in calls], "float64", x.vec)
+            b.number([b.new(f"extractvalue {pair} {c}, {i}") for c in calls], "float64", x.vec)
             for i in range(2)
         )
 
-    return b.once(("sincos", x.serial), make)
+    return b.find_or_make(("sincos", x.serial), make)
 
 
 def _function(module: Module, name: str, count: int, vec: bool) -> str:
     """The name of an elementary function of `count` arguments, which the module then contains."""
     width = module.b.W if vec else 1
-    called = f"@{name.replace(' ', '_').replace('-', 'm')}_{'v' if width > 1 else 's'}"
+    symbol = f"@{name.replace(' ', '_').replace('-', 'm')}_{'v' if width > 1 else 's'}"
     if (name, width) not in module.functions:
         module.functions[name, width] = ""  # its place: a function comes after those it calls
-        text, declared, constants = _function_text(name, count, width, called)
+        text, declarations, constants = _function_text(name, count, width, symbol)
         module.functions[name, width] = text
-        module.declared |= declared
-        module.globals += [c for c in constants if c not in module.globals]
-    return called
+        module.declarations |= declarations
+        module.globals += [constant for constant in constants if constant not in module.globals]
+    return symbol
 
 
 def sine_or_cosine(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
@@ -78,7 +78,7 @@ def _by_name(name: str) -> Callable:
 
 
 @functools.cache
-def _traced(name: str, count: int) -> ClosedJaxpr:
+def _jaxpr_of(name: str, count: int) -> ClosedJaxpr:
     """An elementary function as a jaxpr of scalars."""
     with jax.enable_x64(True):
         return jax.make_jaxpr(_by_name(name))(*[jnp.zeros((), jnp.float64)] * count)
@@ -86,17 +86,17 @@ def _traced(name: str, count: int) -> ClosedJaxpr:
 
 @functools.cache
 def _function_text(
-    name: str, count: int, width: int, called: str
+    name: str, count: int, width: int, symbol: str
 ) -> tuple[str, frozenset[str], tuple[str, ...]]:
     """An elementary function of vectors of `width`, with what it declares."""
     inner = Module(width, 1)
     # A module of its own: its numbers and scopes do not mix with those of the caller.
-    closed = _traced(name, count)
+    function = _jaxpr_of(name, count)
     b = inner.b
-    args = [b.made([f"%x{i}"], "float64", True) for i in range(count)]
+    args = [b.number([f"%x{i}"], "float64", True) for i in range(count)]
     evaluator = Evaluator(inner)
     values = [Value((), "float64", objects([x], ())) for x in args]
-    outs = evaluator.closed(closed, values)
+    outs = evaluator.evaluate(function, values)
     t = result_type = b.type("float64", True)
     results = [b.ref(evaluator.entries(out)[()], 0, True) for out in outs]
     result = results[0]
@@ -104,7 +104,7 @@ def _function_text(
         result_type = f"{{{t}, {t}}}"
         half = b.new(f"insertvalue {result_type} poison, {t} {results[0]}, 0")
         result = b.new(f"insertvalue {result_type} {half}, {t} {results[1]}, 1")
-    prefix = called[1:]
+    prefix = symbol[1:]
     text = "\n".join([*b.lines, f"  ret {result_type} {result}"])
     data = []
     for line in inner.globals:  # constants of each function have names of their own
@@ -113,8 +113,8 @@ def _function_text(
         text, line = text.replace(old + ",", new + ","), line.replace(old, new, 1)
         data.append(line)
     parameters = ", ".join(f"{t} %x{i}" for i in range(count))
-    body = f"define internal {result_type} {called}({parameters}) {{\nentry:\n{text}\n}}\n"
-    return body, frozenset(b.declared | inner.declared), tuple(data)
+    body = f"define internal {result_type} {symbol}({parameters}) {{\nentry:\n{text}\n}}\n"
+    return body, frozenset(b.declarations | inner.declarations), tuple(data)
 
 
 @functools.lru_cache(maxsize=4096)
