@@ -156,16 +156,8 @@ class Evaluator:
 
     def count(self, length: int, body: Callable[[Num], None]) -> None:
         """``body(i)`` for i = 0, …, length − 1."""
-        b, end = self.b, self.module.parameter(length)
-
-        def test(_, i):
-            return b.new(f"icmp slt i64 {i}, {end.names[0]}")
-
-        def inner(_, i):
-            body(b.number([i], "int64", False))
-            return []
-
-        b.loop([], [], test, inner, count=True)
+        (end,) = self.module.parameter(length).names
+        self.b.repeat(end, lambda i: body(self.b.number([i], "int64", False)))
 
     def value(self, entries: Sequence[Num], like: Any) -> Value:
         return Value(like.shape, like.dtype, objects(list(entries), like.shape))

@@ -6,7 +6,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from .jaxprs.jaxapi import ClosedJaxpr, Literal, bodies
+from .jaxprs.jaxapi import ClosedJaxpr, Literal, bodies, variables
 from .llvm.ir import TYPES
 from .llvm.values import MOST_ENTRIES
 from .rules.elementwise import ELEMENTWISE
@@ -32,12 +32,10 @@ class FunctionPiece:
         return self.reason is not None and not self.is_call
 
 
-def pieces(
-    function: ClosedJaxpr, reason: Callable[[ClosedJaxpr], str | None]
-) -> list[FunctionPiece]:
+def pieces(function: ClosedJaxpr, reason: Callable) -> list[FunctionPiece]:
     """The pieces of a function, in the order in which they are computed.
 
-    `reason` returns why no code can be generated for a function, None if it can be. A loop, a
+    ``reason(function)`` is why no code can be generated for a jaxpr, None if it can be. A loop, a
     branch or a linear solve is never cut: it is in one piece with all that it calls. Code is
     generated for pieces with a loop; what is between them belongs to the piece before it.
     """
@@ -63,19 +61,19 @@ def pieces(
         group.loops = group.loops or loops
         group.reason = group.reason or refusal
     result: list[FunctionPiece] = []
-    variables = {v for v in jaxpr.outvars if not isinstance(v, Literal)}
+    needs = set(variables(jaxpr.outvars))
     # Backwards: what a piece has to give is what later ones read.
     for group in reversed(groups):
-        writes = [v for eqn in group.eqns for v in eqn.outvars if v in variables]
+        writes = [v for eqn in group.eqns for v in eqn.outvars if v in needs]
         if not writes:
             continue
         eqns = _equations_for(group.eqns, writes)
         part, reads = _function_of(eqns, writes, jaxpr, constants)
-        variables |= set(reads)
+        needs |= set(reads)
         if group.is_call:
             (part,) = bodies(eqns[0])
             reads, writes = eqns[0].invars, eqns[0].outvars
-            variables |= {v for v in reads if not isinstance(v, Literal)}
+            needs |= set(variables(reads))
         # Without a loop XLA is as fast, and a call less is made.
         refusal = group.reason or (None if group.loops else "it has no loop")
         result.append(FunctionPiece(part, tuple(reads), tuple(writes), refusal, group.is_call))
@@ -96,9 +94,8 @@ def in_pieces(
     ``run(piece, *arrays, lane_flags=…)`` computes one piece.
     """
     jaxpr = function.jaxpr
-    values = dict(
-        zip((*jaxpr.constvars, *jaxpr.invars), (*function.consts, *operands), strict=True)
-    )
+    inputs = (*jaxpr.constvars, *jaxpr.invars)
+    values = dict(zip(inputs, (*function.consts, *operands), strict=True))
     flag_of = dict(zip(jaxpr.invars, lane_flags, strict=True))
 
     def read(var: Any) -> Any:
@@ -146,11 +143,11 @@ def _has_loop(eqn: Any) -> bool:
 
 def _equations_for(eqns: Sequence[Any], writes: Sequence[Any]) -> list[Any]:
     """The equations that the variables `writes` need."""
-    variables, selection = set(writes), []
+    needs, selection = set(writes), []
     for eqn in reversed(eqns):
-        if any(var in variables for var in eqn.outvars):
+        if any(var in needs for var in eqn.outvars):
             selection.append(eqn)
-            variables |= {var for var in eqn.invars if not isinstance(var, Literal)}
+            needs |= set(variables(eqn.invars))
     return selection[::-1]
 
 
@@ -159,12 +156,8 @@ def _function_of(
 ) -> tuple[ClosedJaxpr, list[Any]]:
     """Some equations as a function, and the variables that are its arguments."""
     results = {var for eqn in eqns for var in eqn.outvars}
-    operands = dict.fromkeys(
-        var
-        for eqn in eqns
-        for var in eqn.invars
-        if not isinstance(var, Literal) and var not in results
-    )
+    operands = dict.fromkeys(var for eqn in eqns for var in variables(eqn.invars))
+    operands = [var for var in operands if var not in results]
     reads = [var for var in operands if var not in constants]
     consts = [var for var in operands if var in constants]
     part = jaxpr.replace(

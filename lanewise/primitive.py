@@ -174,23 +174,16 @@ def _in_jax(program: Callee, lanes: int | None, lane_flags: tuple[bool, ...]) ->
     front of all outputs."""
     if lanes is None:
         return program.trace
-    return jax.vmap(
-        program.trace, [0 if has_lanes else None for has_lanes in lane_flags], 0, axis_size=lanes
-    )
+    axes = [0 if has_lanes else None for has_lanes in lane_flags]
+    return jax.vmap(program.trace, axes, 0, axis_size=lanes)
 
 
-def _through_xla(*operands, program: Callee, lanes: int | None, lane_flags: tuple[bool, ...]):
+def _through_xla(*operands, **params):
     """The program as XLA compiles it."""
-    return _in_jax(program, lanes, lane_flags)(*operands)
+    return _in_jax(**params)(*operands)
 
 
-def _lower(
-    *operands,
-    program: Callee,
-    lanes: int | None,
-    lane_flags: tuple[bool, ...],
-    platform: str,
-):
+def _lower(*operands, platform: str, program: Callee, lanes: int | None, lane_flags):
     """The program as machine code, through XLA where none can be generated."""
     try:
         if not generates():
@@ -233,9 +226,7 @@ def pieces_of(program: Callee, lanes: int, platform: str) -> list[FunctionPiece]
     return [] if is_whole or all(piece.is_left_to_xla for piece in parts) else parts
 
 
-def _shape_of(
-    *operands, program: Callee, lanes: int | None, lane_flags: tuple[bool, ...]
-) -> list[Any]:
+def _shape_of(*_operands, program: Callee, lanes: int | None, **_params) -> list[Any]:
     return program.shape_of(lanes)
 
 
@@ -243,26 +234,19 @@ def _shape_of(
 _through_xla.shape_of = _shape_of  # pyright: ignore[reportFunctionMemberAccess]
 
 
-def _batch_rule(
-    operands, axes, *, program: Callee, lanes: int | None, lane_flags: tuple[bool, ...]
-):
+def _batch_rule(operands, axes, *, program: Callee, lanes: int | None, lane_flags):
     """One more axis of trajectories: all of them become one."""
-    outer_flags = [axis is not None for axis in axes]
-    size, front_arrays, _ = batch_in_front(operands, axes)
+    size, arrays, axes_in_front = batch_in_front(operands, axes)
+    outer = [axis is not None for axis in axes_in_front]
     if lanes is None:
-        outs = _lanewise.bind(
-            *front_arrays, program=program, lanes=size, lane_flags=tuple(outer_flags)
-        )
+        outs = _lanewise.bind(*arrays, program=program, lanes=size, lane_flags=tuple(outer))
         return outs, [0] * len(outs)
     # One batch of all trajectories: nested batches need no rule of their own.
-    arrays = [
-        _merge(x, outer, inner, size, lanes)
-        for x, outer, inner in zip(front_arrays, outer_flags, lane_flags, strict=True)
-    ]
-    new_flags = tuple(outer or inner for outer, inner in zip(outer_flags, lane_flags, strict=True))
+    flags = list(zip(outer, lane_flags, strict=True))
+    arrays = [_merge(x, *pair, size, lanes) for x, pair in zip(arrays, flags, strict=True)]
+    new_flags = tuple(any(pair) for pair in flags)
     outs = _lanewise.bind(*arrays, program=program, lanes=size * lanes, lane_flags=new_flags)
-    outs = [x.reshape(size, lanes, *x.shape[1:]) for x in outs]
-    return outs, [0] * len(outs)
+    return [x.reshape(size, lanes, *x.shape[1:]) for x in outs], [0] * len(outs)
 
 
 _lanewise = primitive("lanewise", _through_xla, _batch_rule, multiple=True)
@@ -275,7 +259,7 @@ def _derivative(primals, changes: dict[int, Any], **params):
     vectors = list(changes.values())
     function = _in_jax(**params)
 
-    def of_tangents(primals, *vectors):
+    def outputs(primals, *vectors):
         values = dict(zip(changes, vectors, strict=True))
         return function(*(values.get(i, x) for i, x in enumerate(primals)))
 
@@ -284,21 +268,23 @@ def _derivative(primals, changes: dict[int, Any], **params):
 
     # Outside of `jax.shard_map` JAX's own rules do everything.
     if not manual_axes(*primals, *vectors):
-        along_vectors = functools.partial(of_tangents, primals)
-        outs, tangents = jax.jvp(along_vectors, [primals[i] for i in changes], vectors)
+        of_vectors = functools.partial(outputs, primals)
+        outs, tangents = jax.jvp(of_vectors, [primals[i] for i in changes], vectors)
         return outs, [t if is_real(x) else None for x, t in zip(outs, tangents, strict=True)]
 
     # In jax.shard_map the derivative is taken for one device, like the function itself.
-    def real(primals, *vectors):
-        return [x for x in of_tangents(primals, *vectors) if is_real(x)]
+    def real_outputs(primals):
+        def real(*vectors):
+            return [x for x in outputs(primals, *vectors) if is_real(x)]
+
+        return real, [primals[i] for i in changes]
 
     def push(primals, vectors):
-        along_vectors = functools.partial(real, primals)
-        return jax.jvp(along_vectors, [primals[i] for i in changes], vectors)[1]
+        return jax.jvp(*real_outputs(primals), vectors)[1]
 
     def pull(primals, ys):
-        _, transpose = jax.vjp(functools.partial(real, primals), *(primals[i] for i in changes))
-        return list(transpose(ys))
+        real, point = real_outputs(primals)
+        return list(jax.vjp(real, *point)[1](ys))
 
     outs = _lanewise.bind(*primals, **params)
     tangents = iter(linear_map(push, pull, push, list(primals), with_equal_axes(vectors)))

@@ -1,5 +1,6 @@
 """Whether an output of a function depends on an input, read from its jaxpr."""
 
+import itertools
 import weakref
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -41,21 +42,16 @@ _ANSWERS: weakref.WeakKeyDictionary[Jaxpr, dict] = weakref.WeakKeyDictionary()
 
 def _reached_outputs(jaxpr: Jaxpr, reached_inputs: Sequence[bool], ends: frozenset[str]) -> Any:
     # Equations come in the order of their dependence: one pass is enough.
-    variables = {
-        var for var, is_marked in zip(jaxpr.invars, reached_inputs, strict=True) if is_marked
-    }
+    variables = set(itertools.compress(jaxpr.invars, reached_inputs))
 
     def is_reached(atom: Any) -> bool:
         return not isinstance(atom, Literal) and atom in variables
 
     for eqn in jaxpr.eqns:
-        inputs = [is_reached(var) for var in eqn.invars]
+        inputs = [is_reached(atom) for atom in eqn.invars]
         if any(inputs):
-            outputs = reached_by(eqn, inputs, ends)
-            variables.update(
-                var for var, is_marked in zip(eqn.outvars, outputs, strict=True) if is_marked
-            )
-    return [is_reached(var) for var in jaxpr.outvars]
+            variables.update(itertools.compress(eqn.outvars, reached_by(eqn, inputs, ends)))
+    return [is_reached(atom) for atom in jaxpr.outvars]
 
 
 def reached_by(eqn: Any, inputs: list[bool], ends: frozenset[str] = frozenset()) -> list[bool]:
@@ -65,11 +61,7 @@ def reached_by(eqn: Any, inputs: list[bool], ends: frozenset[str] = frozenset())
         return [False] * len(eqn.outvars)
     if name == "scan":
         consts, count = scan_counts(params)
-        fixed, carry, xs = (
-            inputs[:consts],
-            inputs[consts : consts + count],
-            inputs[consts + count :],
-        )
+        fixed, carry, xs = cut(inputs, consts, count)
 
         def outputs_of_round(carry):
             return reached_outputs(params["jaxpr"].jaxpr, [*fixed, *carry, *xs], ends)
@@ -78,8 +70,7 @@ def reached_by(eqn: Any, inputs: list[bool], ends: frozenset[str] = frozenset())
         carry = fixed_point(lambda carry: outputs_of_round(carry)[:count], carry)
         return [*carry, *outputs_of_round(carry)[count:]]
     if name == "while":
-        first, second = params["cond_nconsts"], params["body_nconsts"]
-        of_test, of_body = inputs[:first], inputs[first : first + second]
+        of_test, of_body, carry = cut(inputs, params["cond_nconsts"], params["body_nconsts"])
 
         def next_carry(carry):
             (test,) = reached_outputs(params["cond_jaxpr"].jaxpr, [*of_test, *carry], ends)
@@ -87,7 +78,7 @@ def reached_by(eqn: Any, inputs: list[bool], ends: frozenset[str] = frozenset())
             # If the number of rounds is reached, so is everything that the rounds compute.
             return [test or r for r in body]
 
-        return fixed_point(next_carry, inputs[first + second :])
+        return fixed_point(next_carry, carry)
     if name == "cond":
         # The choice of the branch alone decides about all outputs.
         if inputs[0]:
@@ -96,6 +87,11 @@ def reached_by(eqn: Any, inputs: list[bool], ends: frozenset[str] = frozenset())
         return [any(r) for r in zip(*per_branch, strict=True)]
     inner = _called_jaxpr(eqn)
     return [True] * len(eqn.outvars) if inner is None else reached_outputs(inner, inputs, ends)
+
+
+def cut(items: list, first: int, second: int) -> tuple[list, list, list]:
+    """The first items, the second ones, and those after them."""
+    return items[:first], items[first : first + second], items[first + second :]
 
 
 def fixed_point(step: Callable[[list[bool]], list[bool]], marks: list[bool]) -> list[bool]:
@@ -117,7 +113,5 @@ def _called_jaxpr(eqn: Any) -> Jaxpr | None:
     if len(bodies) != 1:
         return None
     (body,) = bodies
-    has_equal_lengths = len(body.invars) == len(eqn.invars) and len(body.outvars) == len(
-        eqn.outvars
-    )
-    return body if has_equal_lengths else None
+    counts = len(body.invars), len(body.outvars)
+    return body if counts == (len(eqn.invars), len(eqn.outvars)) else None

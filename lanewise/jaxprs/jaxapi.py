@@ -87,6 +87,11 @@ def _expansion(eqn: Any) -> ClosedJaxpr:
     return jax.make_jaxpr(function)(*(var.aval for var in eqn.invars))
 
 
+def variables(atoms: Iterable[Any]) -> list[Any]:
+    """Those of the operands of an equation that are no literals."""
+    return [atom for atom in atoms if not isinstance(atom, Literal)]
+
+
 def scan_counts(params: dict[str, Any]) -> tuple[int, int]:
     """How many constants and how many parts of a carry a scan has, from its parameters."""
     if "num_consts" in params:
@@ -141,7 +146,7 @@ def primitive(
 ) -> Primitive:
     """A primitive of its own name that does what `function` (of arrays and parameters) does.
 
-    `batched(arrays, axes, **params)` → (output, axis or None) is its rule under `vmap`, that of
+    `batch_rule(arrays, axes, **params)` → (output, axis or None) is its rule under `vmap`, that of
     `function` if left out. `multiple` says that it gives a list of arrays. It has no derivative.
     """
     new = Primitive(name)
@@ -164,11 +169,9 @@ def batch_in_front(arrays: Sequence[Any], axes: Sequence[Any]) -> tuple[int, lis
     """The number of elements of a batch, the arrays with its axis in front, and whether they have
     it: 0 or None, as `jax.vmap` takes it."""
     pairs = list(zip(arrays, axes, strict=True))
-    (size,) = {array.shape[axis] for array, axis in pairs if axis is not None}
-    front_arrays = [
-        array if axis is None else jnp.moveaxis(array, axis, 0) for array, axis in pairs
-    ]
-    return size, front_arrays, [None if axis is None else 0 for axis in axes]
+    (size,) = {x.shape[axis] for x, axis in pairs if axis is not None}
+    in_front = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in pairs]
+    return size, in_front, [None if axis is None else 0 for axis in axes]
 
 
 def lower_on(platform: str, operation: Primitive, function: Callable) -> None:
@@ -177,7 +180,7 @@ def lower_on(platform: str, operation: Primitive, function: Callable) -> None:
 
 
 def drops_outputs(operation: Primitive, new_params: Callable) -> None:
-    """Have unused outputs of a primitive dropped: `without(params, used)` → its new parameters."""
+    """Have unused outputs of a primitive dropped; `new_params(params, flags)`: its parameters."""
 
     def rule(flags: list[bool], *arguments: Any):
         eqn = arguments[-1]  # newer releases put something in between
@@ -198,14 +201,10 @@ def has_derivative(operation: Primitive, rule: Callable) -> None:
     and None for an output that does not change."""
 
     def outputs_and_tangents(primals, tangents, **params):
-        changes = {
-            i: tangent for i, tangent in enumerate(tangents) if not isinstance(tangent, ad.Zero)
-        }
+        changes = {i: t for i, t in enumerate(tangents) if not isinstance(t, ad.Zero)}
         outs, out_tangents = rule(primals, changes, **params)
-        return outs, [
-            ad.Zero(jax.typeof(out).to_tangent_aval()) if tangent is None else tangent
-            for out, tangent in zip(outs, out_tangents, strict=True)
-        ]
+        zeros = [ad.Zero(jax.typeof(out).to_tangent_aval()) for out in outs]
+        return outs, [z if t is None else t for z, t in zip(zeros, out_tangents, strict=True)]
 
     ad.primitive_jvps[operation] = outputs_and_tangents
 

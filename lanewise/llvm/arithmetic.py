@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from .ir import FLOATS, TYPES, NotCompilable, Num, Writer, check_type
+from .ir import FLOATS, TYPES, NotCompilable, Num, Writer, call_of, check_type
 
 # Operations whose result is not finite where an operand is not.
 _HANDED_ON = frozenset(["add", "sub", "mul", "fma", "neg", "sqrt", "same"])
@@ -37,8 +37,7 @@ class Operations(Writer):
             return self._commute("add", a, b, "add")
         # The one rule of contraction: a product that is an operand of a sum, the first one first.
         for product, other in ((a, b), (b, a)):
-            factors = self._factors(product)
-            if factors is not None:
+            if factors := self._factors(product):
                 return self.fma(*factors, other)
         return self._commute("add", a, b, "fadd")
 
@@ -51,11 +50,9 @@ class Operations(Writer):
             return self.instruction("sub", (a, b))
         if a.is_const(0):
             return self.neg(b)
-        factors = self._factors(a)
-        if factors is not None:
+        if factors := self._factors(a):
             return self.fma(*factors, self.neg(b))
-        factors = self._factors(b)
-        if factors is not None:
+        if factors := self._factors(b):
             return self.fma(self.neg(factors[0]), factors[1], a)
         return self.instruction("fsub", (a, b), "sub")
 
@@ -63,8 +60,7 @@ class Operations(Writer):
         if a.value is not None and b.value is not None:
             return self._fold(np.multiply, a, b)
         for x, y in ((a, b), (b, a)):
-            factors = self._joined_factors(x, y)
-            if factors is not None:
+            if factors := self._joined_factors(x, y):
                 return self.mul(*factors)
         for x, y in ((a, b), (b, a)):
             # Not for every zero: 0·∞ and 0·NaN are NaN, as in IEEE 754.
@@ -165,20 +161,19 @@ class Operations(Writer):
         """Quotient or remainder; by zero −1 or the dividend, as XLA has it."""
         if a.dtype == "bool":
             raise NotCompilable(f"{op} requires numbers, got bool")
-        is_signed = not a.dtype.startswith("u")
         zero, unit = self.const(0, a.dtype), self.const(1, a.dtype)
         by_zero = self.compare("eq", b, zero)
         smallest = self.const(np.iinfo(a.dtype).min, a.dtype)
         overflow = self.const(False, "bool")
-        if is_signed:
+        if not a.is_unsigned:
             is_smallest, minus_1 = self.compare("eq", a, smallest), self.const(-1, a.dtype)
             overflow = self.logic("and", is_smallest, self.compare("eq", b, minus_1))
         # The instruction ends the process for both, also on trajectories that do not need it.
         safe = self.select(self.logic("or", by_zero, overflow), unit, b)
-        word = ("s" if is_signed else "u") + ("div" if op == "div" else "rem")
+        word = ("u" if a.is_unsigned else "s") + ("div" if op == "div" else "rem")
         value = self.instruction(word, (a, safe))
         if op == "div":
-            at_zero = self.const(-1 if is_signed else np.iinfo(a.dtype).max, a.dtype)
+            at_zero = self.const(np.iinfo(a.dtype).max if a.is_unsigned else -1, a.dtype)
             value = self.select(overflow, smallest, value)
         else:
             at_zero, value = a, self.select(overflow, zero, value)
@@ -210,7 +205,7 @@ class Operations(Writer):
             return self._fold(np.abs, a)
         if a.is_float:
             return self.intrinsic("fabs", (a,))
-        if a.dtype.startswith("u"):
+        if a.is_unsigned:
             return a
         return self.select(self.compare("lt", a, self.const(0, a.dtype)), self.neg(a), a)
 
@@ -228,8 +223,7 @@ class Operations(Writer):
         elif op in ("eq", "ne"):
             word = f"icmp {op}"
         else:
-            is_unsigned = a.dtype.startswith("u") or a.dtype == "bool"
-            word = f"icmp {'u' if is_unsigned else 's'}{op}"
+            word = f"icmp {'u' if a.is_unsigned else 's'}{op}"
         return self.op(op, (a, b), "bool", lambda t, x, y: f"{word} {t} {x}, {y}")
 
     def is_less(self, a: Num, b: Num) -> str:
@@ -256,8 +250,7 @@ class Operations(Writer):
             return self._fold(np.invert, a)
         if a.op == "not":
             return a.args[0]
-        is_unsigned = a.dtype.startswith("u")
-        mask = True if a.dtype == "bool" else np.iinfo(a.dtype).max if is_unsigned else -1
+        mask = True if a.dtype == "bool" else np.iinfo(a.dtype).max if a.is_unsigned else -1
         return self.instruction("xor", (a, self.const(mask, a.dtype)), "not")
 
     def select(self, condition: Num, yes: Num, no: Num) -> Num:
@@ -279,12 +272,11 @@ class Operations(Writer):
         t = self.type(yes.dtype, vec)
         if not vec or condition.vec:
             bits = self.type("bool", vec)
-            return self.op(
-                "select",
-                (condition, yes, no),
-                yes.dtype,
-                lambda _, w, x, y: f"select {bits} {w}, {t} {x}, {t} {y}",
-            )
+
+            def write(_, c: str, x: str, y: str) -> str:
+                return f"select {bits} {c}, {t} {x}, {t} {y}"
+
+            return self.op("select", (condition, yes, no), yes.dtype, write)
 
         def make() -> Num:  # one bit for all trajectories, which need not become a vector
             pairs = zip(self.refs(yes, True), self.refs(no, True), strict=True)
@@ -334,17 +326,16 @@ class Operations(Writer):
                 tests = [*(y for y in tests if y.serial not in implications), x]
         zero = self.const(0, terms[0].dtype)
         total = self.instruction("fmul", (zero, tests[0]), "0·x")
-        if len(tests) > 1:
-            for vec in (False, True):
-                t = self.type(zero.dtype, vec)
-                self.declare(f"{t} @llvm.fma.{self.suffix(zero.dtype, vec)}({t}, {t}, {t})")
 
-        def write(t: str, *names: str) -> str:
-            suffix = self.suffix(zero.dtype, t.startswith("<"))
-            return f"call {t} @llvm.fma.{suffix}({', '.join(f'{t} {x}' for x in names)})"
+        def write_fma(kind: str, *names: str) -> str:
+            suffix = self.suffix(zero.dtype, kind.startswith("<"))
+            return call_of(f"@llvm.fma.{suffix}", kind, names)
 
+        for vec in (False, True) if len(tests) > 1 else ():
+            kind = self.type(zero.dtype, vec)
+            self.declare(f"{kind} @llvm.fma.{self.suffix(zero.dtype, vec)}({kind}, {kind}, {kind})")
         for x in tests[1:]:
-            total = self.op("Σ 0·x", (zero, x, total), zero.dtype, write)
+            total = self.op("Σ 0·x", (zero, x, total), zero.dtype, write_fma)
         return self.op("finite", (total,), "bool", lambda t, x: f"fcmp ord {t} {x}, {x}")
 
     def finite_terms(self, flag: Num) -> tuple[Num, ...]:
@@ -390,16 +381,15 @@ class Operations(Writer):
             return self.compare("ne", a, self.const(0, a.dtype))
         if a.is_float and not to_float:
             return self._to_integer(a, dtype)
-        is_unsigned = a.dtype.startswith("u") or a.dtype == "bool"
         bits, new_bits = (int(TYPES[d][1:]) if d not in FLOATS else 0 for d in (a.dtype, dtype))
         if a.is_float:
             word = "fpext" if dtype == "float64" else "fptrunc"
         elif to_float:
-            word = "uitofp" if is_unsigned else "sitofp"
+            word = "uitofp" if a.is_unsigned else "sitofp"
         elif new_bits == bits:
             word = "bitcast"
         else:
-            word = "trunc" if new_bits < bits else "zext" if is_unsigned else "sext"
+            word = "trunc" if new_bits < bits else "zext" if a.is_unsigned else "sext"
         out = self.type(dtype, a.vec)
         return self.op(f"to {word}", (a,), dtype, lambda t, x: f"{word} {t} {x} to {out}")
 
@@ -414,14 +404,8 @@ class Operations(Writer):
     def bitcast(self, a: Num, dtype: str) -> Num:
         if a.value is not None:
             return self.const(np.asarray(a.value, a.dtype).view(dtype)[()], dtype)
-        out = self.type(dtype, a.vec)
-        is_same_type = TYPES[a.dtype] == TYPES[dtype]
-        return self.op(
-            f"as {dtype}",
-            (a,),
-            dtype,
-            lambda t, x: f"bitcast {t} {x} to {t if is_same_type else out}",
-        )
+        kind = self.type(dtype, a.vec)
+        return self.op(f"as {dtype}", (a,), dtype, lambda t, x: f"bitcast {t} {x} to {kind}")
 
     def shift(self, op: str, a: Num, count: Num) -> Num:
         """Bits to the left or right; all bits are shifted out by their number or more."""
@@ -430,10 +414,9 @@ class Operations(Writer):
             return self.instruction(word, (a, count))
         largest = self.const(bits - 1, count.dtype)
         is_small = self.compare("le", count, largest)
-        if not count.dtype.startswith("u"):
-            is_small = self.logic(
-                "and", is_small, self.compare("ge", count, self.const(0, count.dtype))
-            )
+        if not count.is_unsigned:
+            is_positive = self.compare("ge", count, self.const(0, count.dtype))
+            is_small = self.logic("and", is_small, is_positive)
         # LLVM leaves the result of a larger shift undefined.
         value = self.instruction(word, (a, self.select(is_small, count, largest)))
         return value if word == "ashr" else self.select(is_small, value, self.const(0, a.dtype))

@@ -101,6 +101,15 @@ class Builder(Operations):
         self.begin(end)
         return phis
 
+    def repeat(self, end: str | int, body: Callable[[str], object]) -> None:
+        """``body(i)`` for i = 0, …, end − 1; `i` is the name of an i64."""
+
+        def run(_, i: str) -> list[Num]:
+            body(i)
+            return []
+
+        self.loop([], [], lambda _, i: self.new(f"icmp slt i64 {i}, {end}"), run, count=True)
+
     def recompute(self, x: Num, substitutes: dict[int, Num]) -> Num:
         """The number x with other numbers in place of some that it is made of."""
         if x.value is not None or (not x.op and x.serial not in substitutes):

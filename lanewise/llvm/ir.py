@@ -78,6 +78,10 @@ class Num:
     def is_float(self) -> bool:
         return self.dtype in FLOATS
 
+    @property
+    def is_unsigned(self) -> bool:
+        return self.dtype.startswith("u") or self.dtype == "bool"
+
     def is_const(self, value: float) -> bool:
         return self.value is not None and bool(self.value == value)
 
@@ -286,10 +290,8 @@ class Writer:
     def instruction(self, word: str, args: Sequence[Num], op: str = "") -> Num:
         """The number made by an instruction of one word, of numbers of one type."""
 
-        def write(t: str, *names: str) -> str:
-            return f"{word} {t} {', '.join(names)}"
-
-        return self.op(op or word, args, args[0].dtype, write)
+        dtype = args[0].dtype
+        return self.op(op or word, args, dtype, lambda t, *xs: f"{word} {t} {', '.join(xs)}")
 
     def intrinsic(self, name: str, args: Sequence[Num]) -> Num:
         """``llvm.<name>`` of numbers of one type."""
@@ -297,10 +299,12 @@ class Writer:
         t, full = self.type(dtype, vec), f"llvm.{name}.{self.suffix(dtype, vec)}"
         self.declare(f"{t} @{full}({', '.join([t] * len(args))})")
 
-        def write(t: str, *names: str) -> str:
-            return f"call {t} @{full}({', '.join(f'{t} {x}' for x in names)})"
+        return self.op(name, args, dtype, lambda t, *names: call_of(f"@{full}", t, names))
 
-        return self.op(name, args, dtype, write)
+
+def call_of(function: str, kind: str, names: Sequence[str]) -> str:
+    """The call of a function of numbers of one type, with a result of this type."""
+    return f"call {kind} {function}({', '.join(f'{kind} {name}' for name in names)})"
 
 
 def _text(section: Section) -> Iterator[str]:

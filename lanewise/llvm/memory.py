@@ -34,20 +34,16 @@ class Buffer:
     @property
     def is_contiguous(self) -> bool:
         strides = contiguous(self.shape, self.strides[-1] if self.strides else 1)
-        return all(
-            stride == row_major or n <= 1
-            for stride, row_major, n in zip(self.strides, strides, self.shape, strict=True)
-        )
+        pairs = zip(self.strides, strides, strict=True)
+        return all(n <= 1 or a == b for n, (a, b) in zip(self.shape, pairs, strict=True))
 
     def shift(self, distance: Num | int) -> "Buffer":
         return dataclasses.replace(self, offset=(*self.offset, distance))
 
     def row(self, b: Builder, index: Num) -> "Buffer":
         """``self[index]`` of the first axis, by an index that is known when the code runs."""
-        distance = b.mul(index, b.const(self.strides[0], "int64"))
-        return dataclasses.replace(
-            self, shape=self.shape[1:], strides=self.strides[1:], offset=(*self.offset, distance)
-        )
+        row = self.from_row(b, index)
+        return dataclasses.replace(row, shape=self.shape[1:], strides=self.strides[1:])
 
     def from_row(self, b: Builder, index: Num) -> "Buffer":
         """The array from row `index` on; the length of its first axis is not adjusted."""
@@ -79,9 +75,8 @@ class Buffer:
             return None
         distance = (other.__array_interface__["data"][0] - start) // item
         strides = tuple(s // item for s in other.strides)
-        return dataclasses.replace(
-            self, shape=other.shape, strides=strides, offset=(*self.offset, int(distance))
-        )
+        view = dataclasses.replace(self, shape=other.shape, strides=strides)
+        return view.shift(int(distance))
 
     def position(self, index: Sequence[int]) -> int:
         return sum(i * s for i, s in zip(index, self.strides, strict=True))
@@ -125,20 +120,32 @@ def load(b: Builder, buffer: Buffer, distance: Num | int = 0) -> Num:
     names = []
     for u in range(b.U):
         if b.W > 1 and buffer.lane == 1 and not moving.vec:
-            where = _pointer_at(b, buffer.base[u], moving, fixed, item)
             # Neighbours in memory are neighbours in the vector.
-            names.append(_load(b, f"<{b.W} x {item}>", where, item))
+            where = _pointer_at(b, buffer.base[u], moving, fixed, item)
+            names.append(_load(b, _vector(b, item), where, item))
             continue
-        elements = [
-            _load(b, item, pointer) for pointer in _pointers(b, buffer, u, moving, fixed, item)
-        ]
-        vector = "poison" if b.W > 1 else elements[0]
-        for i in range(b.W if b.W > 1 else 0):
-            vector = b.new(
-                f"insertelement <{b.W} x {item}> {vector}, {item} {elements[i]}, i64 {i}"
-            )
-        names.append(vector)
+        pointers = _pointers(b, buffer, u, moving, fixed, item)
+        elements = [_load(b, item, pointer) for pointer in pointers]
+        names.append(_vector_of(b, elements, item))
     return _from_memory(b, b.number(names, buffer.dtype, True))
+
+
+def _vector(b: Builder, item: str, count: int = 1) -> str:
+    """The type of a vector with `count` elements of each trajectory."""
+    return f"<{b.W * count} x {item}>" if b.W * count > 1 else item
+
+
+def _vector_of(b: Builder, elements: Sequence[str], item: str) -> str:
+    if b.W == 1:
+        return elements[0]
+    vector = "poison"
+    for i, element in enumerate(elements):
+        vector = b.new(f"insertelement {_vector(b, item)} {vector}, {item} {element}, i64 {i}")
+    return vector
+
+
+def _element(b: Builder, vector: str, i: int, item: str) -> str:
+    return vector if b.W == 1 else b.new(f"extractelement {_vector(b, item)} {vector}, i64 {i}")
 
 
 def store(b: Builder, buffer: Buffer, x: Num, distance: Num | int = 0) -> None:
@@ -156,17 +163,14 @@ def store(b: Builder, buffer: Buffer, x: Num, distance: Num | int = 0) -> None:
         where = _pointer_at(b, buffer.base[0], moving, fixed, item)
         _store(b, item, _to_memory(b, x, 0, False), where)
         return
-    vector = f"<{b.W} x {item}>"
     for u in range(b.U):
         name = _to_memory(b, x, u, True)
         if b.W > 1 and buffer.lane == 1 and not moving.vec:
-            _store(b, vector, name, _pointer_at(b, buffer.base[u], moving, fixed, item), item)
+            where = _pointer_at(b, buffer.base[u], moving, fixed, item)
+            _store(b, _vector(b, item), name, where, item)
             continue
         for i, pointer in enumerate(_pointers(b, buffer, u, moving, fixed, item)):
-            element = name
-            if b.W > 1:
-                element = b.new(f"extractelement {vector} {name}, i64 {i}")
-            _store(b, item, element, pointer)
+            _store(b, item, _element(b, name, i, item), pointer)
 
 
 def _pointer_at(b: Builder, base: str, moving: Num, fixed: int, item: str) -> str:
@@ -188,9 +192,7 @@ def _pointers(
         return
     index = b.ref(b.add(moving, b.const(fixed, "int64")), u, True)
     for i in range(b.W):
-        element_index = index
-        if b.W > 1:
-            element_index = b.new(f"extractelement <{b.W} x i64> {index}, i64 {i}")
+        element_index = _element(b, index, i, "i64")
         start = base if buffer.lane is None else _lane_pointer(b, base, i, buffer.lane, item)
         yield b.pointer(item, start, element_index)
 
@@ -220,17 +222,17 @@ def _from_memory(b: Builder, x: Num) -> Num:
     if x.dtype != "bool":
         return x
     # Any byte but 0 counts as true.
-    t = f"<{b.W} x i8>" if x.vec and b.W > 1 else "i8"
-    zero = "zeroinitializer" if x.vec and b.W > 1 else "0"
-    return b.number([b.new(f"icmp ne {t} {n}, {zero}") for n in x.names], "bool", x.vec)
+    is_vector = x.vec and b.W > 1
+    kind, zero = ("i8", "0") if not is_vector else (_vector(b, "i8"), "zeroinitializer")
+    return b.number([b.new(f"icmp ne {kind} {n}, {zero}") for n in x.names], "bool", x.vec)
 
 
 def _to_memory(b: Builder, x: Num, u: int, vec: bool) -> str:
     name = b.ref(x, u, vec)
     if x.dtype != "bool":
         return name
-    wide = f"<{b.W} x i8>" if vec and b.W > 1 else "i8"
-    return b.new(f"zext {b.type('bool', vec)} {name} to {wide}")
+    kind = _vector(b, "i8") if vec else "i8"
+    return b.new(f"zext {b.type('bool', vec)} {name} to {kind}")
 
 
 # --- whole rows: the numbers of a trajectory are neighbours, those of a vector are not ------------
@@ -300,12 +302,11 @@ def _load_lanes(b: Builder, buffer: Buffer, where: str, first: int, count: int, 
     assert buffer.lane is not None
     where = b.pointer(item, where, first)
     if buffer.lane == count:
-        kind = f"<{b.W * count} x {item}>"
-        return b.new(f"load {kind}, ptr {where}, align {_bytes(item)}")
+        return _load(b, f"<{b.W * count} x {item}>", where, item)
     parts = []
     for i in range(b.W):
         pointer = _lane_pointer(b, where, i, buffer.lane, item)
-        parts.append(b.new(f"load <{count} x {item}>, ptr {pointer}, align {_bytes(item)}"))
+        parts.append(_load(b, f"<{count} x {item}>", pointer, item))
     return _join(b, parts, count, item)
 
 
@@ -319,12 +320,12 @@ def _store_lanes(
     if buffer.lane == count:
         order = [j * b.W + i for i in range(b.W) for j in range(count)]
         row_major = _shuffle(b, vector, b.W * count, order, item)
-        b.emit(f"store <{b.W * count} x {item}> {row_major}, ptr {where}, align {_bytes(item)}")
+        _store(b, f"<{b.W * count} x {item}>", row_major, where, item)
         return
     for i in range(b.W):
         row = _shuffle(b, vector, b.W * count, [j * b.W + i for j in range(count)], item)
         pointer = _lane_pointer(b, where, i, buffer.lane, item)
-        b.emit(f"store <{count} x {item}> {row}, ptr {pointer}, align {_bytes(item)}")
+        _store(b, f"<{count} x {item}>", row, pointer, item)
 
 
 def _pick(b: Builder, vector: str, j: int, count: int, item: str) -> str:
@@ -334,17 +335,13 @@ def _pick(b: Builder, vector: str, j: int, count: int, item: str) -> str:
 
 def _join(b: Builder, parts: list[str], length: int, item: str) -> str:
     """Vectors of one length, one after the other."""
-    parts = list(parts)
     # A shuffle joins two vectors of one length: fill up to a power of two.
     padding = (1 << (len(parts) - 1).bit_length()) - len(parts)
     count = len(parts) * length
-    parts += ["poison"] * padding
+    parts = [*parts, *["poison"] * padding]
     while len(parts) > 1:
-        t, order = f"<{length} x {item}>", ", ".join(f"i32 {k}" for k in range(2 * length))
         parts = [
-            b.new(f"shufflevector {t} {x}, {t} {y}, <{2 * length} x i32> <{order}>")
-            if x != "poison"
-            else x
+            _shuffle_two(b, x, y, length, range(2 * length), item) if x != "poison" else x
             for x, y in zip(parts[::2], parts[1::2], strict=True)
         ]
         length *= 2
@@ -354,8 +351,13 @@ def _join(b: Builder, parts: list[str], length: int, item: str) -> str:
 def _shuffle(b: Builder, vector: str, length: int, order: Sequence[int], item: str) -> str:
     if list(order) == list(range(length)):
         return vector
-    t, indices = f"<{length} x {item}>", ", ".join(f"i32 {k}" for k in order)
-    return b.new(f"shufflevector {t} {vector}, {t} poison, <{len(order)} x i32> <{indices}>")
+    return _shuffle_two(b, vector, "poison", length, order, item)
+
+
+def _shuffle_two(b: Builder, x: str, y: str, length: int, order: Sequence[int], item: str) -> str:
+    """The elements of two vectors of this length with the numbers in `order`."""
+    kind, indices = f"<{length} x {item}>", ", ".join(f"i32 {k}" for k in order)
+    return b.new(f"shufflevector {kind} {x}, {kind} {y}, <{len(order)} x i32> <{indices}>")
 
 
 def copy_transposed(b: Builder, source: Buffer, target: Buffer) -> None:
@@ -369,45 +371,38 @@ def copy_transposed(b: Builder, source: Buffer, target: Buffer) -> None:
     block = b.U * W  # the vectors of one element
     by_vector = f"{lane * W}" if isinstance(lane, int) else b.new(f"mul i64 {lane}, {W}")
 
-    def of_vector(_, u: str) -> list[Num]:
+    def copy_vector(u: str) -> None:
         first = b.new(f"mul i64 {u}, {W}")
-        mine = b.pointer(item, source.base[0], first)
-        yours = b.pointer(item, start, b.new(f"mul i64 {u}, {by_vector}"))
+        of_source = b.pointer(item, source.base[0], first)
+        of_target = b.pointer(item, start, b.new(f"mul i64 {u}, {by_vector}"))
 
-        def square(_, c: str) -> list[Num]:
-            start_of_square = b.pointer(item, mine, b.new(f"mul i64 {c}, {W * block}"))
+        def copy_square(c: str) -> None:
+            corner = b.pointer(item, of_source, b.new(f"mul i64 {c}, {W * block}"))
             vectors = []
             for j in range(W):
-                where = b.new(f"getelementptr {item}, ptr {start_of_square}, i64 {j * block}")
-                vectors.append(b.new(f"load <{W} x {item}>, ptr {where}, align {_bytes(item)}"))
-            destination = b.pointer(item, yours, b.new(f"mul i64 {c}, {W}"))
+                where = b.new(f"getelementptr {item}, ptr {corner}, i64 {j * block}")
+                vectors.append(_load(b, f"<{W} x {item}>", where, item))
+            destination = b.pointer(item, of_target, b.new(f"mul i64 {c}, {W}"))
             for i, row in enumerate(_square_transposed(b, vectors, item)):
                 where = _lane_pointer(b, destination, i, lane, item)
-                b.emit(f"store <{W} x {item}> {row}, ptr {where}, align {_bytes(item)}")
-            return []
+                _store(b, f"<{W} x {item}>", row, where, item)
 
         # Squares of W elements of W trajectories: each is transposed in registers.
-        squares = source.size // W
-        b.loop([], [], lambda _, c: b.new(f"icmp slt i64 {c}, {squares}"), square, count=True)
-        return []
+        b.repeat(source.size // W, copy_square)
 
-    b.loop([], [], lambda _, u: b.new(f"icmp slt i64 {u}, {b.U}"), of_vector, count=True)
+    b.repeat(b.U, copy_vector)
 
 
 def _square_transposed(b: Builder, rows: list[str], item: str) -> list[str]:
     """W vectors of W as rows of a matrix → its columns, by exchanging halves, quarters, …"""
     W, rows = len(rows), list(rows)
-    t = f"<{W} x {item}>"
     half = W // 2
     while half:
-        for i in range(W):
-            if i & half:
-                continue
+        for i in (i for i in range(W) if not i & half):
             x, y = rows[i], rows[i + half]
             low = [k if not k & half else W + k - half for k in range(W)]
             high = [k + half if not k & half else W + k for k in range(W)]
-            for place, order in ((i, low), (i + half, high)):
-                indices = ", ".join(f"i32 {k}" for k in order)
-                rows[place] = b.new(f"shufflevector {t} {x}, {t} {y}, <{W} x i32> <{indices}>")
+            rows[i] = _shuffle_two(b, x, y, W, low, item)
+            rows[i + half] = _shuffle_two(b, x, y, W, high, item)
         half //= 2
     return rows

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from .. import elementary as functions
 from ..evaluator import RULES, SINE_AND_COSINE, Evaluator
 from ..jaxprs.jaxapi import ClosedJaxpr
-from ..llvm.ir import Num
+from ..llvm.ir import Num, call_of
 from ..llvm.values import Value, objects
 from ..module import Module
 
@@ -22,11 +22,7 @@ def elementary(e: Evaluator, name: str, args: Sequence[Num]) -> Num:
     if all(x is not None for x in numbers):
         return e.b.const(_at_known(name, tuple(float(x) for x in numbers)), "float64")
     function = _function(e.module, name, len(args), vec)
-
-    def write(t: str, *names: str) -> str:
-        return f"call {t} {function}({', '.join(f'{t} {x}' for x in names)})"
-
-    return e.b.op(f"call {name}", args, "float64", write)
+    return e.b.op(f"call {name}", args, "float64", lambda t, *xs: call_of(function, t, xs))
 
 
 def sincos(e: Evaluator, x: Num) -> tuple[Num, Num]:

@@ -17,8 +17,9 @@ from . import exact
 from .elementary import elementary
 
 
-def _binary(method: str) -> Callable:
-    return lambda e, _, a, b: getattr(e.b, method)(a, b)
+def _method(name: str, *first: Any) -> Callable:
+    """The rule that calls a method of the builder with the numbers, after some arguments."""
+    return lambda e, _, *xs: getattr(e.b, name)(*first, *xs)
 
 
 def _equal(e: Evaluator, _: Any, x: Num, y: Num) -> Num:
@@ -151,20 +152,16 @@ _FUNCTIONS = (
     "sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh "
     "exp exp2 expm1 log log1p log2 cbrt erf erfc erf_inv logistic"
 )
+_SHIFTS = "left right_logical right_arithmetic"
 
 # Applied number by number; an operand without axes is combined with each number of the others.
 ELEMENTWISE: dict[str, Callable] = {
     **{op: _combination(op) for op in ("add", "mul", "max", "min")},
     "add_any": _combination("add"),
-    "sub": _binary("sub"),
-    "div": _binary("div"),
-    "rem": _binary("rem"),
-    "neg": lambda e, _, x: e.b.neg(x),
-    "abs": lambda e, _, x: e.b.abs(x),
+    **{name: _method(name) for name in ("sub", "div", "rem", "neg", "abs", "sqrt", "is_finite")},
     "sign": _sign,
     "clamp": _clamp,
     "select_n": _select,
-    "sqrt": lambda e, _, x: e.b.sqrt(x),
     "rsqrt": lambda e, _, x: e.b.div(_unit(e, x), e.b.sqrt(x)),
     "square": lambda e, _, x: e.b.mul(x, x),
     "one_minus_square": lambda e, _, x: e.b.sub(_unit(e, x), e.b.mul(x, x)),
@@ -173,23 +170,17 @@ ELEMENTWISE: dict[str, Callable] = {
     "floor": _integral("floor", np.floor),
     "ceil": _integral("ceil", np.ceil),
     "round": _round,
-    "is_finite": lambda e, _, x: e.b.is_finite(x),
     "convert_element_type": lambda e, params, x: e.b.convert(x, str(np.dtype(params["new_dtype"]))),
     "bitcast_convert_type": _bitcast,
     "reduce_precision": _reduced_precision,
     **dict.fromkeys(["copy", "copy_p", "stop_gradient", "real", "conj"], _identity),
-    **{op: (lambda e, _, a, b, op=op: e.b.logic(op, a, b)) for op in ("and", "or", "xor")},
-    "not": lambda e, _, x: e.b.invert(x),
+    **{op: _method("logic", op) for op in ("and", "or", "xor")},
+    "not": _method("invert"),
     "rounded_product": exact.product_rule,
     "lost_by_product": exact.error_rule,
     "eq": _equal,
-    **{
-        op: (lambda e, _, a, b, o=op: e.b.compare(o, a, b)) for op in ("ne", "lt", "le", "gt", "ge")
-    },
-    **{
-        op: (lambda e, _, a, b, op=op: e.b.shift(op, a, b))
-        for op in ("shift_left", "shift_right_logical", "shift_right_arithmetic")
-    },
+    **{op: _method("compare", op) for op in ("ne", "lt", "le", "gt", "ge")},
+    **{f"shift_{kind}": _method("shift", f"shift_{kind}") for kind in _SHIFTS.split()},
     **{name: _elementary(name) for name in _FUNCTIONS.split()},
 }
 

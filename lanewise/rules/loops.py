@@ -9,7 +9,7 @@ import numpy as np
 
 from ..assumed import assumed_number, assumed_value
 from ..evaluator import RULES, Evaluator
-from ..jaxprs.dependence import fixed_point, reached_outputs
+from ..jaxprs.dependence import cut, fixed_point, reached_outputs
 from ..jaxprs.jaxapi import ClosedJaxpr, scan_counts
 from ..llvm.ir import TYPES, NotCompilable, Num
 from ..llvm.values import Value, objects
@@ -44,7 +44,7 @@ def scan(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Valu
     body: ClosedJaxpr = params["jaxpr"]
     num_consts, num_carry = scan_counts(params)
     length, reverse = params["length"], params["reverse"]
-    consts, carry, xs = _cut(values, num_consts, num_carry)
+    consts, carry, xs = cut(values, num_consts, num_carry)
     jaxpr, row_avals = body.jaxpr, [v.aval for v in eqn.outvars[num_carry:]]
     if length == 0:
         return [*carry, *(Value(a.shape, a.dtype, np.empty(a.shape, object)) for a in row_avals)]
@@ -100,7 +100,7 @@ def while_loop(e: Evaluator, eqn: Any, values: list[Value], places: list) -> lis
     carry, by its leading axes, goes on."""
     params = eqn.params
     test, body = params["cond_jaxpr"], params["body_jaxpr"]
-    of_test, of_body, carry = _cut(values, params["cond_nconsts"], params["body_nconsts"])
+    of_test, of_body, carry = cut(values, params["cond_nconsts"], params["body_nconsts"])
     shape = test.jaxpr.outvars[0].aval.shape
     lanes_of_test = [v.has_lanes() for v in of_test]
     lanes_of_body = [v.has_lanes() for v in of_body]
@@ -223,10 +223,6 @@ def _one_of(e: Evaluator, takes, runs, vec, dtypes) -> list[Num]:
     b = e.b
     others_of = functools.partial(_one_of, e, takes[1:], runs[1:], vec, dtypes)
     return b.branch(b.ref(takes[0], 0, False), runs[0], others_of, vec, dtypes)
-
-
-def _cut(values: list[Value], first: int, second: int) -> tuple[list, list, list]:
-    return values[:first], values[first : first + second], values[first + second :]
 
 
 def minimum_over_lanes(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:

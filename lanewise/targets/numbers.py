@@ -50,7 +50,7 @@ def kernel_text(module: Module, function: ClosedJaxpr, lane_flags: Sequence[bool
 
     consts = [evaluator.constant(c) for c in function.consts]
 
-    def block(_, i):
+    def write_block(i: str) -> None:
         first = b.new(f"add i64 %first, {i}")
         start = b.new(f"mul i64 {first}, {b.W * b.U}")
         # The last block ends with the last trajectory, and computes some of them again: there
@@ -71,9 +71,8 @@ def kernel_text(module: Module, function: ClosedJaxpr, lane_flags: Sequence[bool
         outs = evaluator.jaxpr(jaxpr, consts, values, places)
         for value, place in zip(outs, places, strict=True):
             evaluator.write(value, place)
-        return []
 
-    b.loop([], [], lambda _, i: b.new(f"icmp slt i64 {i}, %count"), block, count=True)
+    b.repeat("%count", write_block)
     prologue = [
         "  %lanes = load i64, ptr %params",
         "  %count = sub i64 %last, %first",
