@@ -1,6 +1,7 @@
 """How a function is compiled: operations, vectors, blocks, and the parts that XLA computes."""
 
 import dataclasses
+import itertools
 import re
 from collections.abc import Callable
 from typing import Any
@@ -116,13 +117,13 @@ def _parts(program: Any, batch: int) -> list[Part]:
     try:
         result = compile_program(program, [True] * count, batch, "cpu")
     except NotCompilable as reason:
-        parts = []
-        for piece in pieces_of(program, batch, "cpu"):
-            if piece.is_left_to_xla:
-                parts.append(Part(piece.reason))
-            else:
-                parts += _parts(Callee(Trace(piece.function), program.layout), batch)
-        return parts or [Part(str(reason))]
+        parts = [
+            [Part(piece.reason)]
+            if piece.is_left_to_xla
+            else _parts(Callee(Trace(piece.function), program.layout), batch)
+            for piece in pieces_of(program, batch, "cpu")
+        ]
+        return list(itertools.chain(*parts)) or [Part(str(reason))]
     code = result.code
     # Registers that do not suffice show in moves to and from the stack; their number says whether a
     # block has too many vectors.

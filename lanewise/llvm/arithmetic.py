@@ -226,10 +226,6 @@ class Operations(Writer):
             word = f"icmp {'u' if a.is_unsigned else 's'}{op}"
         return self.op(op, (a, b), "bool", lambda t, x, y: f"{word} {t} {x}, {y}")
 
-    def is_less(self, a: Num, b: Num) -> str:
-        """Whether a < b, as a scalar i1, for two scalars."""
-        return self.ref(self.compare("lt", a, b), 0, False)
-
     def logic(self, op: str, a: Num, b: Num) -> Num:
         """and, or, xor of truth values or of bits."""
         if a.value is not None and b.value is not None:

@@ -110,6 +110,14 @@ class Builder(Operations):
 
         self.loop([], [], lambda _, i: self.new(f"icmp slt i64 {i}, {end}"), run, count=True)
 
+    def loop_below(self, stop: Num, carry: Sequence[Num], vec, body, **options) -> list[Num]:
+        """The carry after a loop that goes on while its first number, a scalar, is below `stop`."""
+
+        def test(state: list[Num], _) -> str:
+            return self.ref(self.compare("lt", state[0], stop), 0, False)
+
+        return self.loop(carry, vec, test, lambda state, _: body(*state), **options)
+
     def recompute(self, x: Num, substitutes: dict[int, Num]) -> Num:
         """The number x with other numbers in place of some that it is made of."""
         if x.value is not None or (not x.op and x.serial not in substitutes):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..evaluator import RULES, Evaluator
+from ..jaxprs.dependence import cut
 from ..llvm.builder import Builder
 from ..llvm.ir import TYPES, Num, check_size
 from ..llvm.memory import Buffer, load, store
@@ -22,10 +23,8 @@ _LARGEST_FACTOR = 8.0  # of a row that is subtracted from another without an exc
 def linear_solve(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     """custom_linear_solve: what it solves with."""
     lengths, jaxprs = eqn.params["const_lengths"], eqn.params["jaxprs"]
-    start = lengths.matvec + lengths.vecmat
-    consts = values[start : start + lengths.solve]
-    b = values[sum(lengths) :]
-    return e.evaluate(jaxprs.solve, [*consts, *b])
+    _, consts, _ = cut(values, lengths.matvec + lengths.vecmat, lengths.solve)
+    return e.evaluate(jaxprs.solve, [*consts, *values[sum(lengths) :]])
 
 
 def eliminate(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
@@ -58,10 +57,8 @@ def _solution(e: Evaluator, matrix: Entries, vector: Entries) -> list[Num]:
         exact_solution = solve_with_exchanges(e, numbers, vec)
         return [b.select(weak, x, y) for x, y in zip(exact_solution, solution, strict=True)]
 
-    n = len(solution)
-    return b.branch(
-        b.any_lane(weak), selection, lambda: solution, [vec] * n, [numbers[0].dtype] * n
-    )
+    flags, dtypes = [vec] * len(rows), [numbers[0].dtype] * len(rows)
+    return b.branch(b.any_lane(weak), selection, lambda: solution, flags, dtypes)
 
 
 def solve_with_exchanges(e: Evaluator, numbers: Sequence[Num], vec: bool) -> list[Num]:
@@ -80,10 +77,8 @@ def solve_with_exchanges(e: Evaluator, numbers: Sequence[Num], vec: bool) -> lis
     count = len(numbers) + n
     # One trajectory's vector after the other: each call has a piece of memory of its own.
     memory = module.scratch((count * calls,), dtype, False, block)
-    item = np.dtype(dtype).itemsize * block * count
-    pieces = [
-        b.new(f"getelementptr i8, ptr {memory.base[0]}, i64 {u * item}") for u in range(calls)
-    ]
+    size, (base,) = np.dtype(dtype).itemsize * block * count, memory.base
+    pieces = [b.new(f"getelementptr i8, ptr {base}, i64 {u * size}") for u in range(calls)]
     place = Buffer(tuple(pieces), dtype, (count,), (block,), 1 if vec else None)
     for i, x in enumerate(numbers):
         store(b, place, x, i * block)
@@ -140,11 +135,11 @@ def with_exchanges(b: Builder, system: Buffer, solution: Buffer) -> None:
     size, width = b.const(n, "int64"), b.const(n + 1, "int64")
 
     def count(first: Num, last: Num, body: Callable[[Num], None]) -> None:
-        def turn(state, _):
-            body(state[0])
-            return [b.add(state[0], unit)]
+        def turn(i: Num) -> list[Num]:
+            body(i)
+            return [b.add(i, unit)]
 
-        b.loop([first], [False], lambda state, _: b.is_less(state[0], last), turn)
+        b.loop_below(last, [first], [False], turn)
 
     def element(i: Num, j: Num) -> Buffer:
         return system.row(b, i).row(b, j)
@@ -180,15 +175,12 @@ def with_exchanges(b: Builder, system: Buffer, solution: Buffer) -> None:
     def substitute(k: Num) -> None:
         i = b.sub(b.const(n - 1, "int64"), k)
 
-        def subtract(state, _):
-            j, total = state
+        def subtract(j: Num, total: Num) -> list[Num]:
             product = b.mul(load(b, element(i, j)), load(b, solution.row(b, j)))
             return [b.add(j, unit), b.sub(total, product)]
 
         first, right = b.add(i, unit), load(b, element(i, size))
-        _, total = b.loop(
-            [first, right], [False, True], lambda state, _: b.is_less(state[0], size), subtract
-        )
+        _, total = b.loop_below(size, [first, right], [False, True], subtract)
         store(b, solution.row(b, i), b.mul(total, load(b, element(i, i))))
 
     zero = b.const(0, "int64")

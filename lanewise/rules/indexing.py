@@ -21,10 +21,9 @@ SCATTERS = {
 def iota(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     params = eqn.params
     shape, axis = params["shape"], params["dimension"]
-    line = np.arange(shape[axis], dtype=params["dtype"])
-    other = [1] * len(shape)
-    other[axis] = shape[axis]
-    return [e.constant(np.broadcast_to(line.reshape(other), shape))]
+    numbers = np.arange(shape[axis], dtype=params["dtype"])
+    rows = np.broadcast_to(numbers, (*shape[:axis], *shape[axis + 1 :], shape[axis]))
+    return [e.constant(np.moveaxis(rows, -1, axis))]
 
 
 def empty(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
@@ -90,12 +89,10 @@ def dynamic_slice(e: Evaluator, eqn: Any, values: list[Value], places: list) -> 
     offsets = _starts(e, starts, value.shape, sizes)
     if value.entries is None and not value.is_small:
         # A long array stays in memory, and only its pointer moves.
-        buffer = value.buffer
-        assert buffer is not None
+        buffer = e.in_memory(value)
         for start, stride in zip(offsets, buffer.strides, strict=True):
             buffer = buffer.shift(b.mul(start, b.const(stride, "int64")))
-        buffer = dataclasses.replace(buffer, shape=tuple(sizes))
-        return [Value(sizes, value.dtype, buffer=buffer)]
+        return [Value.in_memory(dataclasses.replace(buffer, shape=tuple(sizes)))]
     value = Value(value.shape, value.dtype, e.entries(value), value.buffer)
     strides = contiguous(value.shape)
     results = []
@@ -146,12 +143,10 @@ def gather(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Va
     window = [d for d in range(len(value.shape)) if d not in dropped_axes]
     batch = [d for d in range(len(shape)) if d not in dims.offset_dims]
     strides = contiguous(value.shape)
-    small = Value(value.shape, value.dtype, value.entries, value.buffer)
-    if value.is_small:
-        small.entries = e.entries(value)
+    entries = e.entries(value) if value.is_small else None
+    small = Value(value.shape, value.dtype, entries, value.buffer)
     fill = params["fill_value"]
-    if fill is None:
-        fill = _default_fill(value.dtype)
+    fill = b.const(_default_fill(value.dtype) if fill is None else fill, value.dtype)
     results = []
     for o in np.ndindex(*shape):
         where = tuple(o[d] for d in batch)
@@ -168,8 +163,7 @@ def gather(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Va
             if "fill" in mode.lower():
                 is_inside = b.logic("and", is_inside, b.compare("eq", nearest, start))
             total = b.add(total, b.mul(nearest, b.const(strides[d], "int64")))
-        number = _pick(e, small, total)
-        results.append(b.select(is_inside, number, b.const(fill, value.dtype)))
+        results.append(b.select(is_inside, _pick(e, small, total), fill))
     return [e.value(results, out.aval)]
 
 
@@ -234,12 +228,8 @@ def scatter(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[V
     return [Value(value.shape, value.dtype, entries)]
 
 
-RULES |= {
-    "iota": iota,
-    "empty": empty,
-    "empty2": empty,
-    "argmax": argument_of,
-    "argmin": argument_of,
-}
+RULES |= {"iota": iota, "gather": gather, **dict.fromkeys(SCATTERS, scatter)}
 RULES |= {"dynamic_slice": dynamic_slice, "dynamic_update_slice": dynamic_update_slice}
-RULES |= {"gather": gather, **dict.fromkeys(SCATTERS, scatter)}
+RULES |= dict.fromkeys(("empty", "empty2"), empty) | dict.fromkeys(
+    ("argmax", "argmin"), argument_of
+)

@@ -1,8 +1,9 @@
 """Loops and branches: scan, while, cond."""
 
 import functools
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ def _numbers_to_carry(e: Evaluator, carry: Sequence[Value], lane_flags: Sequence
     return numbers, vec, functools.partial(_values_of, carry)
 
 
-def _numbers_of(e: Evaluator, values: Sequence[Value]) -> list[Num]:
+def _numbers_of(e: Evaluator, values: Iterable[Value]) -> list[Num]:
     return [x for value in values for x in e.entries(value).flat]
 
 
@@ -58,16 +59,16 @@ def scan(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Valu
     def outputs(carry_flags: list[bool]) -> list[bool]:
         return reached_outputs(jaxpr, [*lanes_of_consts, *carry_flags, *lanes_of_xs], UNIFORM)
 
-    carry_lanes = fixed_point(
-        lambda carry_lanes: outputs(carry_lanes)[:num_carry], [v.has_lanes() for v in carry]
+    carry_lanes = [v.has_lanes() for v in carry]
+    carry_lanes = fixed_point(lambda flags: outputs(flags)[:num_carry], carry_lanes)
+    row_lanes = outputs(carry_lanes)[num_carry:]
+    numbers, vec, to_values = _numbers_to_carry(
+        e, list(itertools.compress(carry, moves)), list(itertools.compress(carry_lanes, moves))
     )
-    on_rows = outputs(carry_lanes)[num_carry:]
-    moving = [(c, o) for c, o, m in zip(carry, carry_lanes, moves, strict=True) if m]
-    numbers, vec, to_values = _numbers_to_carry(e, [c for c, _ in moving], [o for _, o in moving])
     sources = [e.in_memory(x) for x in xs]
     rows = [
         place or e.module.scratch(aval.shape, str(aval.dtype), o)
-        for aval, place, o in zip(row_avals, places[num_carry:], on_rows, strict=True)
+        for aval, place, o in zip(row_avals, places[num_carry:], row_lanes, strict=True)
     ]
     end = e.module.parameter(length)
     collector = None if reverse else RowCollector.for_results(e, rows, length)
@@ -89,7 +90,7 @@ def scan(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Valu
         )
         for y, target in zip(outs[num_carry:], targets, strict=True):
             e.write(y, target)
-        return _numbers_of(e, [y for y, m in zip(outs[:num_carry], moves, strict=True) if m])
+        return _numbers_of(e, itertools.compress(outs, moves))
 
     rounds = Rounds(e, vec, length, end, round_of, collector)
     return [*full_carry(rounds.run(jaxpr, numbers)), *map(Value.in_memory, rows)]
@@ -153,15 +154,11 @@ def _masked_loop(e: Evaluator, numbers, vec, per_lane, part, goes_on, step) -> l
     def masked_step(state, _):
         active, numbers = state[:count], state[count:]
         news = step(numbers)
-        selection = [
-            b.select(active[i], new, old) for i, new, old in zip(part, news, numbers, strict=True)
-        ]
+        triples = zip(part, news, numbers, strict=True)
+        selection = [b.select(active[i], new, old) for i, new, old in triples]
         # A trajectory or a part that has stopped has no influence on whether the loop continues.
-        state_to_test = selection if count > 1 else news
-        conditions = [
-            b.logic("and", x, y) for x, y in zip(active, goes_on(state_to_test), strict=True)
-        ]
-        return [*conditions, *selection]
+        news = goes_on(selection if count > 1 else news)
+        return [*(b.logic("and", x, y) for x, y in zip(active, news, strict=True)), *selection]
 
     end = b.loop([*first, *numbers], [*[per_lane] * count, *vec], any_goes_on, masked_step)
     return end[count:]
@@ -169,14 +166,11 @@ def _masked_loop(e: Evaluator, numbers, vec, per_lane, part, goes_on, step) -> l
 
 def cond(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     branches = eqn.params["branches"]
-    index, operands = values[0], values[1:]
-    choice = e.entries(index)[()]
-    if choice.value is not None:
-        return e.evaluate(branches[int(np.clip(choice.value, 0, len(branches) - 1))], operands)
-    assumption = assumed_value(choice)
-    if assumption is not None:
-        branch = branches[int(np.clip(assumption, 0, len(branches) - 1))]
-        return [e.without_origin(v) for v in e.evaluate(branch, operands)]
+    choice, operands = e.entries(values[0])[()], values[1:]
+    index = assumed_value(choice)  # the value, if it is known
+    if index is not None:
+        outs = e.evaluate(branches[int(np.clip(index, 0, len(branches) - 1))], operands)
+        return outs if choice.value is not None else [e.without_origin(v) for v in outs]
     with e.assuming(None):
         return _branches(e, eqn, choice, operands)
 
@@ -196,24 +190,19 @@ def _branches(e: Evaluator, eqn: Any, choice: Num, operands: list[Value]) -> lis
     def run(branch):
         return lambda: _numbers_of(e, e.evaluate(branch, operands))
 
-    # XLA clamps the index to the branches that exist.
-    last = len(branches) - 1
-    takes = []  # whether a branch is taken; the first and the last beyond their index too
-    for i in range(len(branches)):
-        op = "le" if i == 0 else "ge" if i == last else "eq"
-        takes.append(b.compare(op, choice, b.const(i, choice.dtype)))
+    # XLA clamps the index to the branches that exist: the first and the last are taken beyond it.
+    ops = ["le", *["eq"] * (len(branches) - 2), "ge"][: len(branches)]
+    takes = [b.compare(op, choice, b.const(i, choice.dtype)) for i, op in enumerate(ops)]
     # The same branch on all trajectories: jump. Otherwise run all branches that some trajectory
     # takes, and let each trajectory select its own result.
     if not choice.vec:
-        results = _one_of(e, takes, [run(x) for x in branches], vec, dtypes)
-    else:
-        results: Any = None
-        for take, branch in zip(takes, branches, strict=True):
-            zeros = [b.const(0, d) for d in dtypes]
-            mine = b.branch(b.any_lane(take), run(branch), lambda z=zeros: z, vec, dtypes)
-            if results is not None:
-                mine = [b.select(take, x, y) for x, y in zip(mine, results, strict=True)]
-            results = mine
+        return _values_of(avals, _one_of(e, takes, [run(x) for x in branches], vec, dtypes))
+    results: list[Num] = []
+    for take, branch in zip(takes, branches, strict=True):
+        zeros = [b.const(0, d) for d in dtypes]
+        mine = b.branch(b.any_lane(take), run(branch), lambda z=zeros: z, vec, dtypes)
+        pairs = zip(mine, results or mine, strict=True)
+        results = [b.select(take, x, y) for x, y in pairs] if results else mine
     return _values_of(avals, results)
 
 
@@ -237,15 +226,14 @@ def minimum_over_lanes(e: Evaluator, eqn: Any, values: list[Value], places: list
     # it, because each trajectory selects its own.
     if not eqn.params["rare"]:  # one of several trajectories nearly always needs it
         return [e.value([assumed_number(b, 0, x.dtype)], eqn.outvars[0].aval)]
-    t, full = b.type(x.dtype, True), b.suffix(x.dtype, True)
-    total = x.names[0]
+    kind, bits, total = b.type(x.dtype, True), b.type("bool", True), x.names[0]
     for other in x.names[1:]:
-        is_less = b.new(f"icmp slt {t} {total}, {other}")
-        bits = b.type("bool", True)
-        total = b.new(f"select {bits} {is_less}, {t} {total}, {t} {other}")
+        is_less = b.new(f"icmp slt {kind} {total}, {other}")
+        total = b.new(f"select {bits} {is_less}, {kind} {total}, {kind} {other}")
     if b.W > 1:
-        b.declare(f"{TYPES[x.dtype]} @llvm.vector.reduce.smin.{full}({t})")
-        total = b.new(f"call {TYPES[x.dtype]} @llvm.vector.reduce.smin.{full}({t} {total})")
+        result = f"{TYPES[x.dtype]} @llvm.vector.reduce.smin.{b.suffix(x.dtype, True)}"
+        b.declare(f"{result}({kind})")
+        total = b.new(f"call {result}({kind} {total})")
     return [e.value([b.number([total], x.dtype, False)], eqn.outvars[0].aval)]
 
 

@@ -110,13 +110,8 @@ CALLS = frozenset(_CALL_NAMES.split())
 
 # Taken from the first entry to the last, by this operation of two.
 REDUCTIONS = {
-    "reduce_sum": "add",
-    "reduce_prod": "mul",
-    "reduce_max": "max",
-    "reduce_min": "min",
-    "reduce_and": "and",
-    "reduce_or": "or",
-    "reduce_xor": "xor",
+    **{"reduce_sum": "add", "reduce_prod": "mul"},
+    **{f"reduce_{op}": op for op in ("max", "min", "and", "or", "xor")},
 }
 
 # Running reductions along one axis.

@@ -1,6 +1,7 @@
 """The rounds of a scan: in portions, where rows wait or rounds are first run on assumptions."""
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Sequence
 
@@ -26,14 +27,11 @@ class RowCollector:
 
     def __init__(self, evaluator: Evaluator, results: Sequence[Buffer], count: int):
         self.b, self.evaluator, self.results, self.count = evaluator.b, evaluator, results, count
-        self.stages = [
-            evaluator.module.scratch((count, *r.shape[1:]), r.dtype, True) for r in results
-        ]
+        scratch = evaluator.module.scratch
+        self.stages = [scratch((count, *r.shape[1:]), r.dtype, True) for r in results]
 
     @classmethod
-    def for_results(
-        cls, evaluator: Evaluator, results: Sequence[Buffer], length: int
-    ) -> "RowCollector | None":
+    def for_results(cls, evaluator: Evaluator, results: Sequence[Buffer], length: int):
         """For results of a loop with `length` rounds, None where waiting saves no time."""
         apart = all(r.lane not in (None, 1) and r.dtype != "bool" for r in results)
         in_order = all(r.strides == contiguous(r.shape) for r in results)
@@ -59,14 +57,13 @@ class RowCollector:
                 copy_transposed(b, stage, result.from_row(b, start))
             return []
 
-        def row(state, _) -> list[Num]:
-            (k,) = state
+        def write_row(k: Num) -> list[Num]:
             for stage, result in zip(self.rows(k, start), self.results, strict=True):
                 self.evaluator.write(Value.in_memory(stage), result.row(b, k))
             return [b.add(k, b.const(1, "int64"))]
 
         def write_rows() -> list[Num]:
-            b.loop([start], [False], lambda state, _: b.is_less(state[0], stop), row)
+            b.loop_below(stop, [start], [False], write_row)
             return []
 
         # The last portion may be shorter; its rows are written one by one.
@@ -107,12 +104,10 @@ class Rounds:
         """Rounds start, …, stop − 1, with all branches."""
         b = self.e.b
 
-        def body(state, _):
-            k, *old = state
+        def body(k: Num, *old: Num) -> list[Num]:
             return [b.add(k, b.const(1, "int64")), *self.round_of(old, k, start)]
 
-        vec = [False, *self.vec]
-        return b.loop([start, *numbers], vec, lambda state, _: b.is_less(state[0], stop), body)[1:]
+        return b.loop_below(stop, [start, *numbers], [False, *self.vec], body)[1:]
 
     def _portions(
         self, state: Sequence[Num], vec: list[bool], size: Num, portion: Callable[..., list[Num]]
@@ -120,8 +115,7 @@ class Rounds:
         """All rounds, ``portion(start, stop, state)`` by portion, and the rows of each written."""
         b = self.e.b
 
-        def body(state, _):
-            start, *old = state
+        def body(start: Num, *old: Num) -> list[Num]:
             stop = b.add(start, size)
             stop = b.select(b.compare("lt", stop, self.end), stop, self.end)
             new = portion(start, stop, old)
@@ -129,8 +123,7 @@ class Rounds:
                 self.collector.write(start, stop)
             return [stop, *new]
 
-        first, vec = [b.const(0, "int64"), *state], [False, *vec]
-        return b.loop(first, vec, lambda state, _: b.is_less(state[0], self.end), body)[1:]
+        return b.loop_below(self.end, [b.const(0, "int64"), *state], [False, *vec], body)[1:]
 
     def _on_assumptions(self, numbers: list[Num]) -> list[Num]:
         """The rounds in portions: first without the branches that are rarely taken; if one should
@@ -153,21 +146,15 @@ class Rounds:
         def without_branches(start: Num, stop: Num, numbers: Sequence[Num]) -> list[Num]:
             assumptions = Assumptions(b)
 
-            def body(state, _):
-                k, failure, *old = state
+            def body(k: Num, failure: Num, *old: Num) -> list[Num]:
                 with e.assuming(assumptions):
                     new = self.round_of(old, k, start)
                 assumptions.defer(old, new)
                 changes.extend(x is not y for x, y in zip(old, new, strict=True))
                 return [b.add(k, b.const(1, "int64")), assumptions.wrong(failure), *new]
 
-            _, failure, *new = b.loop(
-                [start, false, *numbers],
-                [False, False, *vec],
-                lambda state, _: b.is_less(state[0], stop),
-                body,
-                carried_over=carried_over,
-            )
+            carry, lanes = [start, false, *numbers], [False, False, *vec]
+            _, failure, *new = b.loop_below(stop, carry, lanes, body, carried_over=carried_over)
             return [assumptions.wrong_at_the_end(failure, new), *new]
 
         def portion(start: Num, stop: Num, state: Sequence[Num]) -> list[Num]:
@@ -184,16 +171,14 @@ class Rounds:
             )
             # Which numbers change is known only after the round is written. They are stored in
             # memory before it, so that the rounds have all registers.
-            backup = list(zip(changes, numbers, aside, vec, strict=True))
+            backup = list(zip(numbers, aside, vec, strict=True))
             with b.writing(copies):
-                for is_changed, x, pointers, v in backup:
-                    if is_changed:
-                        e.module.set_aside(x, pointers, v)
+                for copy in itertools.compress(backup, changes):
+                    e.module.set_aside(*copy)
 
             def repeat() -> list[Num]:
-                old = [
-                    e.module.taken_back(x, pointers, v) if c else x for c, x, pointers, v in backup
-                ]
+                pairs = zip(backup, changes, strict=True)
+                old = [e.module.taken_back(*copy) if c else copy[0] for copy, c in pairs]
                 return self._with_branches(start, stop, old)
 
             results = b.branch(b.ref(failure, 0, False), repeat, lambda: results, vec, dtypes)

@@ -27,27 +27,24 @@ def kernel_text(module: Module, function: ClosedJaxpr, lane_flags: Sequence[bool
     b, jaxpr = module.b, function.jaxpr
     for v in (*jaxpr.invars, *jaxpr.outvars):
         check_type(v.aval.dtype, "arguments and results")
-    operands = []
-    for i, (v, o) in enumerate(zip(jaxpr.invars, lane_flags, strict=True)):
-        b.emit(f"%ap{i} = getelementptr ptr, ptr %args, i64 {i}")
-        b.emit(f"%a{i} = load ptr, ptr %ap{i}")
-        operands.append((f"%a{i}", v.aval, o))
-    results = []
-    for i, v in enumerate(jaxpr.outvars):
-        b.emit(f"%rp{i} = getelementptr ptr, ptr %rets, i64 {i}")
-        b.emit(f"%r{i} = load ptr, ptr %rp{i}")
-        results.append((f"%r{i}", v.aval))
-    # Before the loop over blocks, so that they are read once.
-    strides = [_lane_stride(module, a) for _, a, o in operands if o]
-    strides_out = [_lane_stride(module, a) for _, a in results]
-    evaluator = Evaluator(module)
-    shared_values = {}
-    # Operands that all trajectories share are read once, before the loop over blocks.
-    for i, (pointer, aval, o) in enumerate(operands):
-        if not o:
-            buffer = Buffer((pointer,), str(aval.dtype), aval.shape, contiguous(aval.shape), None)
-            shared_values[i] = _operand(evaluator, buffer)
 
+    def pointers(source: str, letter: str, variables: Sequence[Any]) -> list[tuple[str, Any]]:
+        for i in range(len(variables)):
+            b.emit(f"%{letter}p{i} = getelementptr ptr, ptr {source}, i64 {i}")
+            b.emit(f"%{letter}{i} = load ptr, ptr %{letter}p{i}")
+        return [(f"%{letter}{i}", var.aval) for i, var in enumerate(variables)]
+
+    operands = pointers("%args", "a", jaxpr.invars)
+    results = pointers("%rets", "r", jaxpr.outvars)
+    # Before the loop over blocks: strides, and operands that all trajectories share, are read once.
+    pairs = zip(operands, lane_flags, strict=True)
+    lanes = [_lane_stride(module, aval) if has_lanes else None for (_, aval), has_lanes in pairs]
+    result_lanes = [_lane_stride(module, aval) for _, aval in results]
+    evaluator = Evaluator(module)
+    shared = [
+        _operand(evaluator, _array(module, *operand, None, "")) if lane is None else None
+        for operand, lane in zip(operands, lanes, strict=True)
+    ]
     consts = [evaluator.constant(c) for c in function.consts]
 
     def write_block(i: str) -> None:
@@ -57,16 +54,13 @@ def kernel_text(module: Module, function: ClosedJaxpr, lane_flags: Sequence[bool
         # is no code for a remainder, which could have other bits.
         fits = b.new(f"icmp slt i64 {start}, %last.start")
         start = b.new(f"select i1 {fits}, i64 {start}, i64 %last.start")
-        strides_in, values = iter(strides), []
-        for k, (pointer, aval, o) in enumerate(operands):
-            if o:
-                buffer = _per_lane(module, pointer, aval, next(strides_in), start)
-                values.append(_operand(evaluator, buffer))
-            else:
-                values.append(shared_values[k])
+        values = [
+            value or _operand(evaluator, _array(module, *operand, lane, start))
+            for operand, lane, value in zip(operands, lanes, shared, strict=True)
+        ]
         places = [
-            _per_lane(module, pointer, aval, stride, start)
-            for (pointer, aval), stride in zip(results, strides_out, strict=True)
+            _array(module, *result, lane, start)
+            for result, lane in zip(results, result_lanes, strict=True)
         ]
         outs = evaluator.jaxpr(jaxpr, consts, values, places)
         for value, place in zip(outs, places, strict=True):
@@ -113,15 +107,17 @@ def _lane_stride(module: Module, aval: Any) -> int | str:
     return module.parameter(aval.size).names[0]
 
 
-def _per_lane(module: Module, pointer: str, aval: Any, stride: int | str, start: str) -> Buffer:
+def _array(module: Module, pointer: str, aval: Any, lane: int | str | None, start: str) -> Buffer:
+    """An operand or a result of the block whose first trajectory is `start`; that of all
+    trajectories without a `lane`."""
     b, item = module.b, stored_type(str(aval.dtype))
-    bases = []
-    for u in range(b.U):
+    bases = [pointer] if lane is None else []
+    for u in range(b.U if lane is not None else 0):
         position = start if u == 0 else b.new(f"add i64 {start}, {u * b.W}")
-        if stride != 1:
-            position = b.new(f"mul i64 {position}, {stride}")
+        if lane != 1:
+            position = b.new(f"mul i64 {position}, {lane}")
         bases.append(b.new(f"getelementptr {item}, ptr {pointer}, i64 {position}"))
-    return Buffer(tuple(bases), str(aval.dtype), aval.shape, contiguous(aval.shape), stride)
+    return Buffer(tuple(bases), str(aval.dtype), aval.shape, contiguous(aval.shape), lane)
 
 
 def _operand(evaluator: Evaluator, buffer: Buffer) -> Value:
@@ -158,16 +154,8 @@ class Numbers:
         module = Module(*variant(lanes, vectors))
         module.b.limit = limit
         text = kernel_text(module, function, lane_flags)
-        b = module.b
-        return Code(
-            text=text,
-            block=b.W * b.U,
-            values=tuple(module.values),
-            operations=b.operations,
-            scratch=module.scratch_bytes,
-            width=b.W,
-            vectors=b.U,
-        )
+        b, values, scratch = module.b, tuple(module.values), module.scratch_bytes
+        return Code(text, b.W * b.U, values, (), b.operations, scratch, b.W, b.U)
 
     def register(self, code: Code) -> str:
         return handler.register(handler.module_text(code.text, code.block))
