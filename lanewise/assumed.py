@@ -34,7 +34,7 @@ def assumed_value(x: Num) -> Any:
         return x.args[0].value
     if x.op not in ("eq", "ne", "not", "to zext", "to sext", "to trunc"):
         return None
-    parts = [assumed_value(a) for a in x.args]
+    parts = [assumed_value(operand) for operand in x.args]
     if any(part is None for part in parts):
         return None
     if x.op in ("eq", "ne"):
@@ -79,7 +79,7 @@ class Assumptions:
         if x.value is not None:
             return x
         # Only the form that `on_any` writes; another integer could decide anything.
-        if x.op != "select" or not all(a.value is not None for a in x.args[1:]):
+        if x.op != "select" or not all(operand.value is not None for operand in x.args[1:]):
             raise NotAssumable
         flag, yes, no = x.args
         if yes.value < no.value:

@@ -35,8 +35,8 @@ def implicit_root(
 
     def search_root(*operands):
         *consts, x0 = operands
-        x, information = solve(lambda x: equation(*consts, x)[0], x0)
-        leaves, tree = jax.tree.flatten(information)
+        x, info = solve(lambda x: equation(*consts, x)[0], x0)
+        leaves, tree = jax.tree.flatten(info)
         trees.append(tree)
         return [x, *leaves]
 
@@ -44,21 +44,20 @@ def implicit_root(
     operands = [*equation.outer, guess]
     search = Trace.from_function(search_root, operands, jax.tree.structure(tuple(operands)))
     functions = _Functions(
-        lambda *operands_and_root: jaxpr_as_fun(equation.all_inputs)(*operands_and_root)[0],
-        lambda *operands_and_root: _divide(equation.all_inputs, divide, *operands_and_root),
+        lambda *arrays: jaxpr_as_fun(equation.all_inputs)(*arrays)[0],
+        lambda *arrays: _divide(equation.all_inputs, divide, *arrays),
         # These come first among the operands. They do not change the root: it has no derivative by
         # them.
         len(search.outer),
     )
-    x, *leaves_of_information = _root.bind(
-        *search.outer, *operands, search=search.all_inputs, functions=functions
-    )
-    return x, jax.tree.unflatten(trees[-1], leaves_of_information)
+    inputs = [*search.outer, *operands]
+    x, *info = _root.bind(*inputs, search=search.all_inputs, functions=functions)
+    return x, jax.tree.unflatten(trees[-1], info)
 
 
 class _Functions(NamedTuple):
-    """The parts of the derivative: ``equation(*consts, x)``, ``divide(*consts, x, b)``, and how
-    many operands of the search the equation does not have."""
+    """The parts of the derivative: ``equation(*consts, x)`` and ``divide(*consts, x, b)``, and the
+    number of operands that only the search has."""
 
     equation: Callable
     divide: Callable
@@ -66,9 +65,9 @@ class _Functions(NamedTuple):
 
 
 def _divide(equation: ClosedJaxpr, divide: Callable, *arrays: Array) -> Array:
-    *consts, x, b = arrays
+    *consts, x, right = arrays
     _, linear = jax.linearize(lambda x: jaxpr_as_fun(equation)(*consts, x)[0], x)
-    return divide(linear, b)
+    return divide(linear, right)
 
 
 def _search(*operands: Array, search: ClosedJaxpr, functions: _Functions) -> list[Array]:

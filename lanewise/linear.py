@@ -60,12 +60,9 @@ def by_elimination(A: Array, b: Array) -> Array:
     for c in range(n):
         for i in range(c + 1, n):  # bring the larger of rows c and i to place c
             larger = jnp.abs(rows[i][c]) > jnp.abs(rows[c][c])
-            pairs = [
-                (jnp.where(larger, y, x), jnp.where(larger, x, y))
-                for x, y in zip(rows[c], rows[i], strict=True)
-            ]
-            rows[c] = [e[0] for e in pairs]
-            rows[i] = [e[1] for e in pairs]
+            pairs = list(zip(rows[c], rows[i], strict=True))
+            rows[c] = [jnp.where(larger, y, x) for x, y in pairs]
+            rows[i] = [jnp.where(larger, x, y) for x, y in pairs]
         for i in range(c + 1, n):
             factor = rows[i][c] / rows[c][c]
             rows[i] = [y - factor * x for x, y in zip(rows[c], rows[i], strict=True)]
@@ -100,8 +97,8 @@ def _in_batches(arrays, axes):
     """More systems at once: their axis goes in front, of length 1 for what they share."""
     front_arrays = [
         # One matrix for several right-hand sides stays one: its elimination is shared.
-        jnp.expand_dims(array, 0) if axis is None else jnp.moveaxis(jnp.asarray(array), axis, 0)
-        for array, axis in zip(arrays, axes, strict=True)
+        jnp.expand_dims(x, 0) if axis is None else jnp.moveaxis(jnp.asarray(x), axis, 0)
+        for x, axis in zip(arrays, axes, strict=True)
     ]
     return _eliminate.bind(*front_arrays), 0
 

@@ -1,6 +1,6 @@
 """An LLVM module while it is written: its parameters, constants, scratch memory and functions."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -71,6 +71,14 @@ class Module:
             )
         name = self._constants[key]
         return Buffer((name,), dtype, array.shape, contiguous(array.shape), None)
+
+    def add_function(self, key: tuple[str, int], write: Callable[[], tuple]) -> None:
+        """Add a function that is not there yet; ``write()`` → (text, declarations, constants)."""
+        if key not in self.functions:
+            self.functions[key] = ""  # its place: a function comes after those it calls
+            self.functions[key], declarations, constants = write()
+            self.declarations |= declarations
+            self.globals += [line for line in constants if line not in self.globals]
 
     # Numbers that wait in memory while a loop runs. Without "volatile" the optimiser would keep
     # them in registers, which the loop needs.

@@ -64,7 +64,7 @@ def pieces(function: ClosedJaxpr, reason: Callable) -> list[FunctionPiece]:
     needs = set(variables(jaxpr.outvars))
     # Backwards: what a piece has to give is what later ones read.
     for group in reversed(groups):
-        writes = [v for eqn in group.eqns for v in eqn.outvars if v in needs]
+        writes = [var for eqn in group.eqns for var in eqn.outvars if var in needs]
         if not writes:
             continue
         eqns = _equations_for(group.eqns, writes)

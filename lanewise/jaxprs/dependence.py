@@ -76,7 +76,7 @@ def reached_by(eqn: Any, inputs: list[bool], ends: frozenset[str] = frozenset())
             (test,) = reached_outputs(params["cond_jaxpr"].jaxpr, [*of_test, *carry], ends)
             body = reached_outputs(params["body_jaxpr"].jaxpr, [*of_body, *carry], ends)
             # If the number of rounds is reached, so is everything that the rounds compute.
-            return [test or r for r in body]
+            return [test or is_reached for is_reached in body]
 
         return fixed_point(next_carry, carry)
     if name == "cond":
@@ -84,7 +84,7 @@ def reached_by(eqn: Any, inputs: list[bool], ends: frozenset[str] = frozenset())
         if inputs[0]:
             return [True] * len(eqn.outvars)
         per_branch = [reached_outputs(b.jaxpr, inputs[1:], ends) for b in params["branches"]]
-        return [any(r) for r in zip(*per_branch, strict=True)]
+        return [any(is_reached) for is_reached in zip(*per_branch, strict=True)]
     inner = _called_jaxpr(eqn)
     return [True] * len(eqn.outvars) if inner is None else reached_outputs(inner, inputs, ends)
 

@@ -25,10 +25,8 @@ def carry_size(jaxpr: Any) -> int:
             _, count = scan_counts(eqn.params)
             state = [var.aval for var in eqn.outvars[:count]]
             # Large arrays stay in memory and take no register; integers are few.
-            largest = max(
-                largest,
-                sum(aval.size for aval in state if aval.size <= 64 and aval.dtype.kind == "f"),
-            )
+            sizes = [aval.size for aval in state if aval.size <= 64 and aval.dtype.kind == "f"]
+            largest = max(largest, sum(sizes))
     return largest
 
 
@@ -43,11 +41,9 @@ def most_operations(jaxpr: Any) -> int:
 
 
 def _has_exact_products(jaxpr: Any) -> bool:
-    return any(
-        eqn.primitive.name == "lost_by_product"
-        or any(_has_exact_products(body.jaxpr) for body in (*bodies(eqn), *functions_in(eqn)))
-        for eqn in jaxpr.eqns
-    )
+    functions = [f for eqn in jaxpr.eqns for f in (*bodies(eqn), *functions_in(eqn))]
+    has_one = any(eqn.primitive.name == "lost_by_product" for eqn in jaxpr.eqns)
+    return has_one or any(_has_exact_products(function.jaxpr) for function in functions)
 
 
 def operation_count(jaxpr: Any) -> int:
@@ -62,17 +58,17 @@ def operation_count(jaxpr: Any) -> int:
         if inner:
             count += sum(inner)
             continue
-        size = max((v.aval.size for v in eqn.outvars), default=0)
-        if eqn.primitive.name == "dot_general":
+        name, size = eqn.primitive.name, max((v.aval.size for v in eqn.outvars), default=0)
+        if name == "dot_general":
             (axes, _), _ = eqn.params["dimension_numbers"]
             # One fused multiply-add for each term.
             size *= int(np.prod([eqn.invars[0].aval.shape[i] for i in axes]))
-        elif eqn.primitive.name.startswith("reduce_"):
+        elif name.startswith("reduce_"):
             size = eqn.invars[0].aval.size
-        elif eqn.primitive.name == "eliminate":
+        elif name == "eliminate":
             n, matrices = eqn.invars[0].aval.shape[-1], eqn.invars[0].aval.size
             size = matrices * n // 3 + size * n - matrices  # more columns of one matrix
-        elif eqn.primitive.name in _FREE:
+        elif name in _FREE:
             size = 0
         count += size
     return count

@@ -174,6 +174,13 @@ def batch_in_front(arrays: Sequence[Any], axes: Sequence[Any]) -> tuple[int, lis
     return size, in_front, [None if axis is None else 0 for axis in axes]
 
 
+def broadcast_in_front(arrays: Sequence[Any], axes: Sequence[Any]) -> tuple[int, list]:
+    """The number of elements of a batch, and all arrays with its axis in front."""
+    size, in_front, axes = batch_in_front(arrays, axes)
+    pairs = zip(in_front, axes, strict=True)
+    return size, [jnp.broadcast_to(x, (size, *x.shape)) if a is None else x for x, a in pairs]
+
+
 def lower_on(platform: str, operation: Primitive, function: Callable) -> None:
     """Have a primitive of several outputs compiled for `platform` as what `function` does."""
     mlir.register_lowering(operation, _lowering(function, True), platform=platform)
@@ -204,7 +211,8 @@ def has_derivative(operation: Primitive, rule: Callable) -> None:
         changes = {i: t for i, t in enumerate(tangents) if not isinstance(t, ad.Zero)}
         outs, out_tangents = rule(primals, changes, **params)
         zeros = [ad.Zero(jax.typeof(out).to_tangent_aval()) for out in outs]
-        return outs, [z if t is None else t for z, t in zip(zeros, out_tangents, strict=True)]
+        pairs = zip(zeros, out_tangents, strict=True)
+        return outs, [zero if tangent is None else tangent for zero, tangent in pairs]
 
     ad.primitive_jvps[operation] = outputs_and_tangents
 
@@ -258,23 +266,20 @@ def _push(*arrays, functions: _Linear, count: int) -> list[Any]:
 
 
 def _linear_batched(arrays, axes, *, functions: _Linear, count: int):
-    size, front_arrays, axes_in_front = batch_in_front(arrays, axes)
-    axes_of_residuals = axes_in_front[:count]
-    vector = [
-        jnp.broadcast_to(x, (size, *x.shape)) if o is None else x
-        for x, o in zip(front_arrays[count:], axes_in_front[count:], strict=True)
-    ]
+    size, residuals, residual_axes = batch_in_front(arrays, axes)
+    _, vector = broadcast_in_front(arrays, axes)
 
     def in_batches(function: Callable) -> Callable:
         def batched_function(*arrays):
-            all_axes = [*axes_of_residuals, *[0] * (len(arrays) - count)]
+            all_axes = [*residual_axes[:count], *[0] * (len(arrays) - count)]
             return jax.vmap(function, all_axes, 0, axis_size=size)(*arrays)
 
         return batched_function
 
     push, pull, definition, transposed = functions
     new = _Linear(in_batches(push), in_batches(pull), in_batches(definition), transposed)
-    outs = _linear.bind(*front_arrays[:count], *vector, functions=new, count=count)
+    operands = [*residuals[:count], *vector[count:]]
+    outs = _linear.bind(*operands, functions=new, count=count)
     return outs, [0] * len(outs)
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -53,15 +54,10 @@ class Trace:
             return self.closed_jaxpr
         flags = [is_traced(const) for const in consts]
         # Constants whose values are known stay constants, which may be folded.
-        front = [var for var, is_outer in zip(jaxpr.constvars, flags, strict=True) if is_outer]
-        constants = [
-            (var, const)
-            for var, const, is_outer in zip(jaxpr.constvars, consts, flags, strict=True)
-            if not is_outer
-        ]
+        others = [not is_outer for is_outer in flags]
         new = jaxpr.replace(
-            constvars=[var for var, _ in constants],
-            invars=[*front, *jaxpr.invars],
+            constvars=list(itertools.compress(jaxpr.constvars, others)),
+            invars=[*itertools.compress(jaxpr.constvars, flags), *jaxpr.invars],
             debug_info=jaxpr.debug_info.with_unknown_names(),
         )
-        return ClosedJaxpr(new, [const for _, const in constants])
+        return ClosedJaxpr(new, list(itertools.compress(consts, others)))

@@ -224,7 +224,7 @@ class Operations(Writer):
             word = f"icmp {op}"
         else:
             word = f"icmp {'u' if a.is_unsigned else 's'}{op}"
-        return self.op(op, (a, b), "bool", lambda t, x, y: f"{word} {t} {x}, {y}")
+        return self.op(op, (a, b), "bool", lambda kind, x, y: f"{word} {kind} {x}, {y}")
 
     def logic(self, op: str, a: Num, b: Num) -> Num:
         """and, or, xor of truth values or of bits."""
@@ -265,19 +265,19 @@ class Operations(Writer):
                 other = self.invert(condition) if no.value else condition
                 return self.logic("or" if no.value else "and", other, yes)
         vec = condition.vec or yes.vec or no.vec
-        t = self.type(yes.dtype, vec)
+        kind = self.type(yes.dtype, vec)
         if not vec or condition.vec:
             bits = self.type("bool", vec)
 
             def write(_, c: str, x: str, y: str) -> str:
-                return f"select {bits} {c}, {t} {x}, {t} {y}"
+                return f"select {bits} {c}, {kind} {x}, {kind} {y}"
 
             return self.op("select", (condition, yes, no), yes.dtype, write)
 
         def make() -> Num:  # one bit for all trajectories, which need not become a vector
             pairs = zip(self.refs(yes, True), self.refs(no, True), strict=True)
             bit = condition.names[0]
-            names = [self.new(f"select i1 {bit}, {t} {x}, {t} {y}") for x, y in pairs]
+            names = [self.new(f"select i1 {bit}, {kind} {x}, {kind} {y}") for x, y in pairs]
             return self.number(names, yes.dtype, True, "select", (condition, yes, no))
 
         return self.find_or_make(("select1", condition.key, yes.key, no.key), make)
@@ -299,7 +299,7 @@ class Operations(Writer):
     # --- whether numbers are finite --------------------------------------------------------------
 
     def is_nan(self, a: Num) -> Num:
-        return self.op("isnan", (a,), "bool", lambda t, x: f"fcmp uno {t} {x}, {x}")
+        return self.op("isnan", (a,), "bool", lambda kind, x: f"fcmp uno {kind} {x}, {x}")
 
     def is_finite(self, a: Num) -> Num:
         if not a.is_float:
@@ -387,7 +387,7 @@ class Operations(Writer):
         else:
             word = "trunc" if new_bits < bits else "zext" if a.is_unsigned else "sext"
         out = self.type(dtype, a.vec)
-        return self.op(f"to {word}", (a,), dtype, lambda t, x: f"{word} {t} {x} to {out}")
+        return self.op(f"to {word}", (a,), dtype, lambda kind, x: f"{word} {kind} {x} to {out}")
 
     def _to_integer(self, a: Num, dtype: str) -> Num:
         """Rounded towards zero, and to the nearest integer there is; NaN to 0."""
@@ -395,7 +395,8 @@ class Operations(Writer):
         source, out = self.type(a.dtype, a.vec), self.type(dtype, a.vec)
         full = f"llvm.{word}.sat.{self.suffix(dtype, a.vec)}.{self.suffix(a.dtype, a.vec)}"
         self.declare(f"{out} @{full}({source})")
-        return self.op(f"to {dtype}", (a,), dtype, lambda t, x: f"call {out} @{full}({t} {x})")
+        text = f"call {out} @{full}({source} "
+        return self.op(f"to {dtype}", (a,), dtype, lambda _, x: f"{text}{x})")
 
     def bitcast(self, a: Num, dtype: str) -> Num:
         if a.value is not None:

@@ -16,19 +16,19 @@ class Builder(Operations):
         # The sum over the vectors is NaN if one of them is, so that one comparison is enough.
         if a.op == "not" and a.args[0].op == "finite":  # one comparison for the block
             (zero,) = a.args[0].args
-            t, total = self.type(zero.dtype, True), zero.names[0]
+            kind, total = self.type(zero.dtype, True), zero.names[0]
             for other in zero.names[1:]:
-                total = self.new(f"fadd {t} {total}, {other}")
-            bits = self.new(f"fcmp uno {t} {total}, {total}")
+                total = self.new(f"fadd {kind} {total}, {other}")
+            bits = self.new(f"fcmp uno {kind} {total}, {total}")
             a = self.number([bits], "bool", True)
-        t = self.type("bool", True)
+        kind = self.type("bool", True)
         total = a.names[0]
         for other in a.names[1:]:
-            total = self.new(f"or {t} {total}, {other}")
+            total = self.new(f"or {kind} {total}, {other}")
         if self.W == 1:
             return total
         # A mask as an integer compiles to one test of a register; a reduction by `or` does not.
-        bits = self.new(f"bitcast {t} {total} to i{self.W}")
+        bits = self.new(f"bitcast {kind} {total} to i{self.W}")
         return self.new(f"icmp ne i{self.W} {bits}, 0")
 
     def loop(
@@ -45,7 +45,7 @@ class Builder(Operations):
         `carried_over(carry before a round, carry after it)` finds pairs (x, y) where y is what x
         will be in the next round; x is then not computed but carried.
         """
-        start = [self.refs(c, v) for c, v in zip(carry, vec, strict=True)]
+        start = [self.refs(number, wide) for number, wide in zip(carry, vec, strict=True)]
         # The preheader is the end of the block from which the loop is entered.
         entered_from, preheader = self.block, self.reserve()
         # head: phis and the test; inner: a round, which goes back to head; end: after the last
@@ -55,9 +55,9 @@ class Builder(Operations):
         first_block = len(self.blocks)
         self.begin(head)
         phis, phi_section = [], self.reserve()
-        for c, v in zip(carry, vec, strict=True):
-            names = [self.name() for _ in range(self.U if v else 1)]
-            phis.append(self.number(names, c.dtype, v))
+        for number, wide in zip(carry, vec, strict=True):
+            names = [self.name() for _ in range(self.U if wide else 1)]
+            phis.append(self.number(names, number.dtype, wide))
         counter = self.name() if count else ""
         self.scopes.append({})
         goes_on = test(phis, counter)
@@ -66,30 +66,29 @@ class Builder(Operations):
         next_carry = body(phis, counter)
         # `vec` comes from the dependence of the jaxpr. A number that varies in a scalar would lose
         # the values of all trajectories but one.
-        assert not any(a.vec and not v for a, v in zip(next_carry, vec, strict=True)), (
-            "a carry that varies"
-        )
-        next_names = [self.refs(a, v) for a, v in zip(next_carry, vec, strict=True)]
+        assert all(wide or not a.vec for a, wide in zip(next_carry, vec, strict=True))
+        next_names = [self.refs(a, wide) for a, wide in zip(next_carry, vec, strict=True)]
         next_counter = self.new(f"add nuw nsw i64 {counter}, 1") if count else ""
         self.scopes.pop()
         left_from = self.block
         self.emit(f"br label %{head}")
 
         # The value of a number after a round is known only now.
-        def write_phi(name: str, t: str, old: str, new: str) -> None:
-            phi_section.append((name, f"phi {t} [{old}, %{entered_from}], [{new}, %{left_from}]"))
+        def write_phi(name: str, kind: str, old: str, new: str) -> None:
+            text = f"phi {kind} [{old}, %{entered_from}], [{new}, %{left_from}]"
+            phi_section.append((name, text))
 
-        for p, olds, news, v in zip(phis, start, next_names, vec, strict=True):
-            for name, old, new in zip(p.names, olds, news, strict=True):
-                write_phi(name, self.type(p.dtype, v), old, new)
+        for phi, olds, news, wide in zip(phis, start, next_names, vec, strict=True):
+            for name, old, new in zip(phi.names, olds, news, strict=True):
+                write_phi(name, self.type(phi.dtype, wide), old, new)
         if count:
             write_phi(counter, "i64", "0", next_counter)
         if carried_over is not None:
             # The number of the first round is computed before the loop, from the numbers that enter
             # it.
             entering = {
-                p.serial: self.number(old, p.dtype, v)
-                for p, old, v in zip(phis, start, vec, strict=True)
+                phi.serial: self.number(old, phi.dtype, wide)
+                for phi, old, wide in zip(phis, start, vec, strict=True)
             }
             pairs = carried_over(phis, next_carry)
             with self.writing(preheader):
@@ -149,18 +148,18 @@ class Builder(Operations):
         for label, run in zip(labels, (yes, no), strict=True):
             self.begin(label)
             self.scopes.append({})
-            names.append([self.refs(x, v) for x, v in zip(run(), vec, strict=True)])
+            names.append([self.refs(x, wide) for x, wide in zip(run(), vec, strict=True)])
             self.scopes.pop()
             # A branch may contain loops and branches: it ends in another block than it began with.
             ends.append(self.block)
             self.emit(f"br label %{end}")
         self.begin(end)
         results = []
-        for v, dtype, *pairs in zip(vec, dtypes, *names, strict=True):
-            t = self.type(dtype, v)
+        for wide, dtype, *pairs in zip(vec, dtypes, *names, strict=True):
+            kind = self.type(dtype, wide)
             phis = [
-                self.new(f"phi {t} [{a}, %{ends[0]}], [{b}, %{ends[1]}]")
+                self.new(f"phi {kind} [{a}, %{ends[0]}], [{b}, %{ends[1]}]")
                 for a, b in zip(*pairs, strict=True)
             ]
-            results.append(self.number(phis, dtype, v))
+            results.append(self.number(phis, dtype, wide))
         return results

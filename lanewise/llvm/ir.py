@@ -260,11 +260,11 @@ class Writer:
         """A vector with a scalar in each element."""
 
         def make() -> str:
-            t = self.type(x.dtype, True)
+            kind = self.type(x.dtype, True)
             # LLVM has no instruction for it: it recognises this pair as a broadcast.
-            first = self.new(f"insertelement {t} poison, {TYPES[x.dtype]} {x.names[0]}, i64 0")
+            first = self.new(f"insertelement {kind} poison, {TYPES[x.dtype]} {x.names[0]}, i64 0")
             zeros = f"<{self.W} x i32> zeroinitializer"
-            return self.new(f"shufflevector {t} {first}, {t} poison, {zeros}")
+            return self.new(f"shufflevector {kind} {first}, {kind} poison, {zeros}")
 
         return self.find_or_make(("splat", x.serial), make)
 
@@ -276,10 +276,10 @@ class Writer:
         if old is not None:
             return old
         vec = any(a.vec for a in args)
-        t = self.type(args[0].dtype, vec)
+        kind = self.type(args[0].dtype, vec)
         self.operations += 1
         names = [
-            self.new(write(t, *(self.ref(a, u, vec) for a in args)))
+            self.new(write(kind, *(self.ref(a, u, vec) for a in args)))
             for u in range(self.U if vec else 1)
         ]
         number = self.number(names, dtype, vec, op, tuple(args))
@@ -291,15 +291,15 @@ class Writer:
         """The number made by an instruction of one word, of numbers of one type."""
 
         dtype = args[0].dtype
-        return self.op(op or word, args, dtype, lambda t, *xs: f"{word} {t} {', '.join(xs)}")
+        return self.op(op or word, args, dtype, lambda kind, *xs: f"{word} {kind} {', '.join(xs)}")
 
     def intrinsic(self, name: str, args: Sequence[Num]) -> Num:
         """``llvm.<name>`` of numbers of one type."""
         dtype, vec = args[0].dtype, any(a.vec for a in args)
-        t, full = self.type(dtype, vec), f"llvm.{name}.{self.suffix(dtype, vec)}"
-        self.declare(f"{t} @{full}({', '.join([t] * len(args))})")
+        kind, full = self.type(dtype, vec), f"llvm.{name}.{self.suffix(dtype, vec)}"
+        self.declare(f"{kind} @{full}({', '.join([kind] * len(args))})")
 
-        return self.op(name, args, dtype, lambda t, *names: call_of(f"@{full}", t, names))
+        return self.op(name, args, dtype, lambda kind, *names: call_of(f"@{full}", kind, names))
 
 
 def call_of(function: str, kind: str, names: Sequence[str]) -> str:

@@ -35,7 +35,7 @@ class Buffer:
     def is_contiguous(self) -> bool:
         strides = contiguous(self.shape, self.strides[-1] if self.strides else 1)
         pairs = zip(self.strides, strides, strict=True)
-        return all(n <= 1 or a == b for n, (a, b) in zip(self.shape, pairs, strict=True))
+        return all(n <= 1 or len({*pair}) == 1 for n, pair in zip(self.shape, pairs, strict=True))
 
     def shift(self, distance: Num | int) -> "Buffer":
         return dataclasses.replace(self, offset=(*self.offset, distance))
@@ -224,7 +224,7 @@ def _from_memory(b: Builder, x: Num) -> Num:
     # Any byte but 0 counts as true.
     is_vector = x.vec and b.W > 1
     kind, zero = ("i8", "0") if not is_vector else (_vector(b, "i8"), "zeroinitializer")
-    return b.number([b.new(f"icmp ne {kind} {n}, {zero}") for n in x.names], "bool", x.vec)
+    return b.number([b.new(f"icmp ne {kind} {name}, {zero}") for name in x.names], "bool", x.vec)
 
 
 def _to_memory(b: Builder, x: Num, u: int, vec: bool) -> str:

@@ -19,10 +19,10 @@ def elementary(e: Evaluator, name: str, args: Sequence[Num]) -> Num:
     """An elementary function of float64, as a call of a function of the module."""
     vec = any(a.vec for a in args)
     numbers: list[Any] = [a.value for a in args]
-    if all(x is not None for x in numbers):
-        return e.b.const(_at_known(name, tuple(float(x) for x in numbers)), "float64")
+    if all(number is not None for number in numbers):
+        return e.b.const(_at_known(name, tuple(float(number) for number in numbers)), "float64")
     function = _function(e.module, name, len(args), vec)
-    return e.b.op(f"call {name}", args, "float64", lambda t, *xs: call_of(function, t, xs))
+    return e.b.op(f"call {name}", args, "float64", lambda kind, *xs: call_of(function, kind, xs))
 
 
 def sincos(e: Evaluator, x: Num) -> tuple[Num, Num]:
@@ -32,12 +32,12 @@ def sincos(e: Evaluator, x: Num) -> tuple[Num, Num]:
         return elementary(e, "sin", [x]), elementary(e, "cos", [x])
 
     def make() -> tuple[Num, ...]:
-        function, t = _function(e.module, "sincos", 1, x.vec), b.type("float64", x.vec)
-        pair = f"{{{t}, {t}}}"
-        calls = [b.new(f"call {pair} {function}({t} {name})") for name in x.names]
+        function, kind = _function(e.module, "sincos", 1, x.vec), b.type("float64", x.vec)
+        pair = f"{{{kind}, {kind}}}"
+        calls = [b.new(f"call {pair} {function}({kind} {name})") for name in x.names]
         b.operations += 2
         return tuple(
-            b.number([b.new(f"extractvalue {pair} {c}, {i}") for c in calls], "float64", x.vec)
+            b.number([b.new(f"extractvalue {pair} {y}, {i}") for y in calls], "float64", x.vec)
             for i in range(2)
         )
 
@@ -48,12 +48,7 @@ def _function(module: Module, name: str, count: int, vec: bool) -> str:
     """The name of an elementary function of `count` arguments, which the module then contains."""
     width = module.b.W if vec else 1
     symbol = f"@{name.replace(' ', '_').replace('-', 'm')}_{'v' if width > 1 else 's'}"
-    if (name, width) not in module.functions:
-        module.functions[name, width] = ""  # its place: a function comes after those it calls
-        text, declarations, constants = _function_text(name, count, width, symbol)
-        module.functions[name, width] = text
-        module.declarations |= declarations
-        module.globals += [constant for constant in constants if constant not in module.globals]
+    module.add_function((name, width), lambda: _function_text(name, count, width, symbol))
     return symbol
 
 
@@ -85,30 +80,27 @@ def _function_text(
     name: str, count: int, width: int, symbol: str
 ) -> tuple[str, frozenset[str], tuple[str, ...]]:
     """An elementary function of vectors of `width`, with what it declares."""
-    inner = Module(width, 1)
     # A module of its own: its numbers and scopes do not mix with those of the caller.
-    function = _jaxpr_of(name, count)
-    b = inner.b
+    inner = Module(width, 1)
+    b, evaluator = inner.b, Evaluator(inner)
     args = [b.number([f"%x{i}"], "float64", True) for i in range(count)]
-    evaluator = Evaluator(inner)
     values = [Value((), "float64", objects([x], ())) for x in args]
-    outs = evaluator.evaluate(function, values)
-    t = result_type = b.type("float64", True)
+    outs = evaluator.evaluate(_jaxpr_of(name, count), values)
+    kind = result_type = b.type("float64", True)
     results = [b.ref(evaluator.entries(out)[()], 0, True) for out in outs]
     result = results[0]
     if len(outs) == 2:
-        result_type = f"{{{t}, {t}}}"
-        half = b.new(f"insertvalue {result_type} poison, {t} {results[0]}, 0")
-        result = b.new(f"insertvalue {result_type} {half}, {t} {results[1]}, 1")
-    prefix = symbol[1:]
+        result_type = f"{{{kind}, {kind}}}"
+        half = b.new(f"insertvalue {result_type} poison, {kind} {results[0]}, 0")
+        result = b.new(f"insertvalue {result_type} {half}, {kind} {results[1]}, 1")
     text = "\n".join([*b.lines, f"  ret {result_type} {result}"])
     data = []
     for line in inner.globals:  # constants of each function have names of their own
         old = line.split(" ", 1)[0]
-        new = f"@{prefix}.{old[1:]}"
-        text, line = text.replace(old + ",", new + ","), line.replace(old, new, 1)
-        data.append(line)
-    parameters = ", ".join(f"{t} %x{i}" for i in range(count))
+        new = f"{symbol}.{old[1:]}"
+        text = text.replace(old + ",", new + ",")
+        data.append(line.replace(old, new, 1))
+    parameters = ", ".join(f"{kind} %x{i}" for i in range(count))
     body = f"define internal {result_type} {symbol}({parameters}) {{\nentry:\n{text}\n}}\n"
     return body, frozenset(b.declarations | inner.declarations), tuple(data)
 

@@ -190,9 +190,9 @@ def _elementwise(e: Evaluator, eqn: Any, values: list[Value], rule: Callable) ->
     shape, params = out.aval.shape, eqn.params
     # Long arrays in a loop over their elements: otherwise the code would be as long as the
     # array.
-    if not all(v.is_small for v in values) or math.prod(shape) > MOST_ENTRIES:
+    if not all(value.is_small for value in values) or math.prod(shape) > MOST_ENTRIES:
         return _in_a_loop(e, eqn, values, rule)
-    operands = [np.broadcast_to(e.entries(v), shape) for v in values]
+    operands = [np.broadcast_to(e.entries(value), shape) for value in values]
     results = [rule(e, params, *(x[i] for x in operands)) for i in np.ndindex(*shape)]
     return e.value(results, out.aval)
 
@@ -201,9 +201,9 @@ def _in_a_loop(e: Evaluator, eqn: Any, values: list[Value], rule: Callable) -> V
     """An elementwise primitive on arrays that stay in memory."""
     (out,) = eqn.outvars
     shape = out.aval.shape
-    has_lanes = any(v.has_lanes() for v in values)
+    has_lanes = any(value.has_lanes() for value in values)
     place = e.module.scratch(shape, str(out.aval.dtype), has_lanes)
-    sources = [v if v.shape == () else e.in_memory(v) for v in values]
+    sources = [value if value.shape == () else e.in_memory(value) for value in values]
 
     def loop_over(places: list, target: Buffer) -> None:
         if not target.shape:

@@ -70,10 +70,7 @@ def solve_with_exchanges(e: Evaluator, numbers: Sequence[Num], vec: bool) -> lis
     n = math.isqrt(len(numbers))
     block, calls = (b.W, b.U) if vec else (1, 1)
     symbol = f"@exchanged_{n}_{TYPES[dtype]}_{'v' if block > 1 else 's'}"
-    if (symbol, block) not in module.functions:
-        text, declarations = _exchange_text(n, dtype, block, symbol)
-        module.functions[symbol, block] = text
-        module.declarations |= declarations
+    module.add_function((symbol, block), lambda: _exchange_text(n, dtype, block, symbol))
     count = len(numbers) + n
     # One trajectory's vector after the other: each call has a piece of memory of its own.
     memory = module.scratch((count * calls,), dtype, False, block)
@@ -88,7 +85,9 @@ def solve_with_exchanges(e: Evaluator, numbers: Sequence[Num], vec: bool) -> lis
 
 
 @functools.cache
-def _exchange_text(n: int, dtype: str, width: int, symbol: str) -> tuple[str, frozenset[str]]:
+def _exchange_text(
+    n: int, dtype: str, width: int, symbol: str
+) -> tuple[str, frozenset[str], tuple]:
     """A function that solves the system at a pointer, n rows (A, b), and puts x after it."""
     inner = Module(width, 1)
     b = inner.b
@@ -97,7 +96,7 @@ def _exchange_text(n: int, dtype: str, width: int, symbol: str) -> tuple[str, fr
     with_exchanges(b, system, solution)
     lines = "\n".join(b.lines)
     text = f"define internal void {symbol}(ptr %p) noinline {{\nentry:\n{lines}\n  ret void\n}}\n"
-    return text, frozenset(b.declarations)
+    return text, frozenset(b.declarations), ()
 
 
 def eliminate_in_order(b: Builder, rows: list[list[Num]]) -> tuple[list[Num], Num]:

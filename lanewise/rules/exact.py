@@ -7,7 +7,7 @@ from jax import Array, lax
 from jax.typing import ArrayLike
 
 from ..evaluator import Evaluator
-from ..jaxprs.jaxapi import batch_in_front, primitive
+from ..jaxprs.jaxapi import broadcast_in_front, primitive
 from ..llvm.arithmetic import is_power_of_two
 from ..llvm.ir import Num
 
@@ -57,12 +57,7 @@ def two_sum(a: ArrayLike, b: ArrayLike) -> tuple[Array, Array]:
 
 def _in_batches(operation):
     def batch_rule(arrays: Any, axes: Any):
-        size, front_arrays, axes_in_front = batch_in_front(arrays, axes)
-        operands = [
-            jnp.broadcast_to(array, (size, *array.shape)) if axis is None else array
-            for array, axis in zip(front_arrays, axes_in_front, strict=True)
-        ]
-        return operation().bind(*operands), 0
+        return operation().bind(*broadcast_in_front(arrays, axes)[1]), 0
 
     return batch_rule
 

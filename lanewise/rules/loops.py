@@ -46,7 +46,7 @@ def scan(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Valu
     num_consts, num_carry = scan_counts(params)
     length, reverse = params["length"], params["reverse"]
     consts, carry, xs = cut(values, num_consts, num_carry)
-    jaxpr, row_avals = body.jaxpr, [v.aval for v in eqn.outvars[num_carry:]]
+    jaxpr, row_avals = body.jaxpr, [var.aval for var in eqn.outvars[num_carry:]]
     if length == 0:
         return [*carry, *(Value(a.shape, a.dtype, np.empty(a.shape, object)) for a in row_avals)]
     # A carry that no round changes is not carried: it stays a constant, or a scalar.
@@ -54,12 +54,12 @@ def scan(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Valu
     moves = [o is not i for o, i in zip(jaxpr.outvars[:num_carry], carry_in, strict=True)]
 
     # Which values differ between trajectories, in some round of the loop.
-    lanes_of_consts, lanes_of_xs = ([v.has_lanes() for v in group] for group in (consts, xs))
+    lanes_of_consts, lanes_of_xs = [v.has_lanes() for v in consts], [v.has_lanes() for v in xs]
 
     def outputs(carry_flags: list[bool]) -> list[bool]:
         return reached_outputs(jaxpr, [*lanes_of_consts, *carry_flags, *lanes_of_xs], UNIFORM)
 
-    carry_lanes = [v.has_lanes() for v in carry]
+    carry_lanes = [value.has_lanes() for value in carry]
     carry_lanes = fixed_point(lambda flags: outputs(flags)[:num_carry], carry_lanes)
     row_lanes = outputs(carry_lanes)[num_carry:]
     numbers, vec, to_values = _numbers_to_carry(
@@ -75,7 +75,8 @@ def scan(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Valu
 
     def full_carry(numbers: Sequence[Num]) -> list[Value]:
         moving_values = iter(to_values(numbers))
-        return [next(moving_values) if m else c for c, m in zip(carry, moves, strict=True)]
+        pairs = zip(carry, moves, strict=True)
+        return [next(moving_values) if is_moving else value for value, is_moving in pairs]
 
     def round_of(numbers: Sequence[Num], k: Num, start: Num) -> list[Num]:
         if reverse:
@@ -170,7 +171,7 @@ def cond(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Valu
     index = assumed_value(choice)  # the value, if it is known
     if index is not None:
         outs = e.evaluate(branches[int(np.clip(index, 0, len(branches) - 1))], operands)
-        return outs if choice.value is not None else [e.without_origin(v) for v in outs]
+        return outs if choice.value is not None else [e.without_origin(value) for value in outs]
     with e.assuming(None):
         return _branches(e, eqn, choice, operands)
 
@@ -246,13 +247,13 @@ def by_itself(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list
             "the function contains a batch of another lanewise function: make a batch of the outer "
             "function only"
         )
-    outs = e.evaluate(program.trace.all_inputs, [e.opaque(v) for v in values])
-    return [e.opaque(v) for v in outs]
+    outs = e.evaluate(program.trace.all_inputs, [e.opaque(value) for value in values])
+    return [e.opaque(value) for value in outs]
 
 
 def barrier(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     """The values as they are, in no operation that is contracted with those after them."""
-    return [e.opaque(v) for v in values]
+    return [e.opaque(value) for value in values]
 
 
 RULES |= {"scan": scan, "while": while_loop, "cond": cond, "lanewise": by_itself}

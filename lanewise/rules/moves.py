@@ -158,12 +158,12 @@ def _move(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Val
         views = _views(e, eqn, values)
         if views is not None:
             return views
-    if name == "concatenate" and any(v.entries is None for v in values):
+    if name == "concatenate" and any(value.entries is None for value in values):
         return [_concatenation(e, eqn, values, places[0])]
-    entries = move_entries(name, eqn.params, *(e.entries(v) for v in values))
+    entries = move_entries(name, eqn.params, *(e.entries(value) for value in values))
     return [
-        Value(v.aval.shape, v.aval.dtype, np.asarray(x, object))
-        for v, x in zip(eqn.outvars, entries, strict=True)
+        Value(var.aval.shape, var.aval.dtype, np.asarray(array, object))
+        for var, array in zip(eqn.outvars, entries, strict=True)
     ]
 
 

@@ -22,7 +22,7 @@ def reduction(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list
     # From the first row to the last, whatever the batch is: another order has other bits.
     totals = list(rows[0])
     for row in rows[1:]:
-        totals = [e.combine(op, a, c) for a, c in zip(totals, row, strict=True)]
+        totals = [e.combine(op, total, entry) for total, entry in zip(totals, row, strict=True)]
     return [e.value(totals, out.aval)]
 
 
@@ -50,7 +50,7 @@ def running_reduction(e: Evaluator, eqn: Any, values: list[Value], places: list)
     rows = rows[::-1] if reverse else rows
     totals = [list(rows[0])]
     for row in rows[1:]:
-        totals.append([e.combine(op, a, c) for a, c in zip(totals[-1], row, strict=True)])
+        totals.append([e.combine(op, x, y) for x, y in zip(totals[-1], row, strict=True)])
     flat = [entry for row in (totals[::-1] if reverse else totals) for entry in row]
     entries = np.moveaxis(objects(flat, front.shape), 0, axis)
     return [Value(out.aval.shape, out.aval.dtype, entries)]

@@ -28,14 +28,14 @@ class RowCollector:
     def __init__(self, evaluator: Evaluator, results: Sequence[Buffer], count: int):
         self.b, self.evaluator, self.results, self.count = evaluator.b, evaluator, results, count
         scratch = evaluator.module.scratch
-        self.stages = [scratch((count, *r.shape[1:]), r.dtype, True) for r in results]
+        self.stages = [scratch((count, *x.shape[1:]), x.dtype, True) for x in results]
 
     @classmethod
     def for_results(cls, evaluator: Evaluator, results: Sequence[Buffer], length: int):
         """For results of a loop with `length` rounds, None where waiting saves no time."""
-        apart = all(r.lane not in (None, 1) and r.dtype != "bool" for r in results)
-        in_order = all(r.strides == contiguous(r.shape) for r in results)
-        width = sum(math.prod(r.shape[1:]) for r in results)
+        apart = all(result.lane not in (None, 1) and result.dtype != "bool" for result in results)
+        in_order = all(result.strides == contiguous(result.shape) for result in results)
+        width = sum(math.prod(result.shape[1:]) for result in results)
         # Wide rows fill cache lines by themselves, and the memory for waiting would not stay in the
         # cache.
         if evaluator.b.W == 1 or not (apart and in_order and 0 < width <= 8):
@@ -45,7 +45,7 @@ class RowCollector:
 
     def rows(self, k: Num, start: Num) -> list[Buffer]:
         """Where round k writes, of a portion that begins with round `start`."""
-        return [s.row(self.b, self.b.sub(k, start)) for s in self.stages]
+        return [stage.row(self.b, self.b.sub(k, start)) for stage in self.stages]
 
     def write(self, start: Num, stop: Num) -> None:
         """Write the rows start, …, stop − 1 to where they belong."""

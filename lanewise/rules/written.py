@@ -215,7 +215,7 @@ EXPANSIONS: dict[str, Callable] = {
 def _rule(name: str) -> Callable:
     def rule(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
         body = jax.make_jaxpr(functools.partial(EXPANSIONS[name], **eqn.params))
-        return e.evaluate(body(*(v.aval for v in eqn.invars)), values)
+        return e.evaluate(body(*(var.aval for var in eqn.invars)), values)
 
     return check_types(rule)
 
