@@ -86,16 +86,11 @@ def explain(
     print(lanewise.explain(lambda x: jnp.sin(x) / x, 1.0))
     ```
     """
-    leaves, tree = jax.tree.flatten(args)
     # Arrays: a number of Python would be traced with a weak type, which a batch does not have.
-    leaves = [jnp.asarray(leaf) for leaf in leaves]
-
-    def flat(*leaves):
-        return jax.tree.leaves(function(*jax.tree.unflatten(tree, leaves)))
-
-    function_jaxpr = jax.make_jaxpr(flat)(*leaves)
+    leaves, tree = jax.tree.flatten(jax.tree.map(jnp.asarray, args))
+    trace = Trace.from_function(function, leaves, tree)
     # Without a call in it, the function is explained as if it were called.
-    programs = _calls(function_jaxpr.jaxpr) or [Callee(Trace(function_jaxpr), layout)]
+    programs = _calls(trace.closed_jaxpr.jaxpr) or [Callee(trace, layout)]
     return Explanation(tuple(part for program in programs for part in _parts(program, batch)))
 
 

@@ -56,8 +56,7 @@ def implicit_root(
 
 
 class _Functions(NamedTuple):
-    """The parts of the derivative: ``equation(*consts, x)`` and ``divide(*consts, x, b)``, and the
-    number of operands that only the search has."""
+    """``equation(*consts, x)``, ``divide(*consts, x, b)``, count of operands of the search only."""
 
     equation: Callable
     divide: Callable

@@ -51,10 +51,7 @@ def _on_each(solve_one: Callable) -> Callable:
 
 
 def by_elimination(A: Array, b: Array) -> Array:
-    """The solution of A x = b by elimination with partial pivoting, written out.
-
-    The exchanges are selections: under `vmap` every operation is elementwise over the batch.
-    """
+    """The solution of A x = b by elimination with partial pivoting; exchanges are selections."""
     n = b.shape[0]
     rows = [[A[i, j] for j in range(n)] + [b[i]] for i in range(n)]
     for c in range(n):

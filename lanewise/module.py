@@ -36,8 +36,7 @@ class Module:
         return self.b.number([name], "int64", False)
 
     def scratch(self, shape: Sequence[int], dtype: str, has_lanes: bool, copies: int = 1) -> Buffer:
-        """Memory for an array of every trajectory of the block, next to each other; for one array
-        that all share unless `has_lanes`."""
+        """Memory for an array of each trajectory of the block; for a shared one without lanes."""
         size = int(np.prod(shape, dtype=np.int64))
         block = self.b.W * self.b.U if has_lanes else copies
         start = self.scratch_bytes

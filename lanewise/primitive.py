@@ -170,8 +170,7 @@ class Callee:
 
 
 def _in_jax(program: Callee, lanes: int | None, lane_flags: tuple[bool, ...]) -> Callable:
-    """The program as a function of JAX, with the batch in front where `lane_flags` are true, and in
-    front of all outputs."""
+    """The program as a function of JAX; operands with a flag and outputs begin with the batch."""
     if lanes is None:
         return program.trace
     axes = [0 if has_lanes else None for has_lanes in lane_flags]

@@ -27,10 +27,7 @@ def depends_on(function: Callable[..., Any], argnum: int, *args: Any) -> bool:
 def reached_outputs(
     jaxpr: Jaxpr, reached_inputs: Sequence[bool], ends: frozenset[str] = frozenset()
 ) -> list[bool]:
-    """Which outputs of `jaxpr` are reached from the inputs that are marked.
-
-    Nothing is reached through the primitives named in `ends`.
-    """
+    """Which outputs are reached from the marked inputs, not through the primitives in `ends`."""
     answers, question = _ANSWERS.setdefault(jaxpr, {}), (tuple(reached_inputs), ends)
     if question not in answers:  # nested loops need the same result many times
         answers[question] = _reached_outputs(jaxpr, *question)
@@ -104,8 +101,7 @@ def fixed_point(step: Callable[[list[bool]], list[bool]], marks: list[bool]) -> 
 
 
 def _called_jaxpr(eqn: Any) -> Jaxpr | None:
-    """The body of a call (jit, checkpoint, `lanewise.call`, …) with the inputs and outputs of the
-    equation; None for other equations."""
+    """The body of a call (jit, checkpoint, `lanewise.call`, …), None for other equations."""
     if eqn.primitive.name == "lanewise":
         return eqn.params["program"].trace.all_inputs.jaxpr
     # With two bodies (a function and its derivative) it is not certain which one is run.

@@ -9,8 +9,7 @@ from .jaxapi import ClosedJaxpr, bodies, scan_counts
 
 
 def functions_in(eqn: Any) -> list[ClosedJaxpr]:
-    """The jaxpr of what `call` was given, if an equation of a jaxpr is such a call: it is not
-    among those that the equation shows."""
+    """The function of a `call`, if an equation is one: it is not among its `bodies`."""
     is_call = eqn.primitive.name == "lanewise"
     return [eqn.params["program"].trace.closed_jaxpr] if is_call else []
 

@@ -166,8 +166,7 @@ def primitive(
 
 
 def batch_in_front(arrays: Sequence[Any], axes: Sequence[Any]) -> tuple[int, list, list]:
-    """The number of elements of a batch, the arrays with its axis in front, and whether they have
-    it: 0 or None, as `jax.vmap` takes it."""
+    """The size of a batch, the arrays with its axis in front, and the axis of each: 0 or None."""
     pairs = list(zip(arrays, axes, strict=True))
     (size,) = {x.shape[axis] for x, axis in pairs if axis is not None}
     in_front = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in pairs]

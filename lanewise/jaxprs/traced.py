@@ -13,8 +13,7 @@ from .jaxapi import ClosedJaxpr, is_traced, jaxpr_as_fun, without_manual_axes, w
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Trace:
-    """A function of one trajectory as a jaxpr; the values of a trace outside that it closes over
-    (`outer`) are its first operands."""
+    """A function as a jaxpr; traced values that it closes over are its first operands, `outer`."""
 
     closed_jaxpr: ClosedJaxpr
     out_tree: Any = None

@@ -361,8 +361,8 @@ def _shuffle_two(b: Builder, x: str, y: str, length: int, order: Sequence[int], 
 
 
 def copy_transposed(b: Builder, source: Buffer, target: Buffer) -> None:
-    """Copy all elements of `source`, whose vectors are contiguous, to the first ones of
-    `target`, where those of one trajectory are neighbours. The size is a multiple of the width."""
+    """Copy `source`, with contiguous vectors, to the first elements of `target`, in which those of
+    one trajectory are neighbours. The size is a multiple of the width."""
     item, W = TYPES[source.dtype], b.W
     moving, fixed = _offset(b, target, 0)
     start = b.pointer(item, _start_of_row(b, target, 0, moving, item), fixed)

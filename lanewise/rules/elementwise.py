@@ -99,9 +99,7 @@ def _pow(e: Evaluator, _: Any, x: Num, y: Num) -> Num:
 def _elementary(name: str) -> Callable:
     def rule(e: Evaluator, _: Any, *xs: Num) -> Num:
         if not xs[0].is_float:
-            raise NotCompilable(
-                f"{name} requires floating-point numbers, got {xs[0].dtype}: use .astype(float)"
-            )
+            raise NotCompilable(f"{name} requires floats, got {xs[0].dtype}: use .astype(float)")
         if xs[0].dtype == "float32":
             # Own functions for float32 would be faster, and one more set to test.
             wide = elementary(e, name, [e.b.convert(x, "float64") for x in xs])
@@ -119,9 +117,7 @@ def _bitcast(e: Evaluator, params: dict, x: Num) -> Num:
     new = np.dtype(params["new_dtype"])
     # Other sizes change the shape of the array, which a rule for one number cannot.
     if new.itemsize != np.dtype(x.dtype).itemsize or "bool" in (x.dtype, str(new)):
-        raise NotCompilable(
-            f"bitcast_convert_type requires numbers of equal size, got {x.dtype} and {new}"
-        )
+        raise NotCompilable(f"bitcast requires numbers of equal size, got {x.dtype} and {new}")
     return e.b.bitcast(x, str(new))
 
 
@@ -134,17 +130,11 @@ def _identity(e: Evaluator, _: Any, x: Num) -> Num:
 
 
 def _reduced_precision(e: Evaluator, params: dict, x: Num) -> Num:
-    least_bits = {"float64": (11, 52), "float32": (8, 23)}.get(x.dtype)
-    if (
-        least_bits is None
-        or params["exponent_bits"] < least_bits[0]
-        or params["mantissa_bits"] < least_bits[1]
-    ):
-        bits = params["exponent_bits"], params["mantissa_bits"]
-        raise NotCompilable(
-            "exponent_bits and mantissa_bits of reduce_precision must be at least those of "
-            f"{x.dtype}, {least_bits}, got {bits}"
-        )
+    least = {"float64": (11, 52), "float32": (8, 23)}.get(x.dtype, (64, 64))
+    bits = params["exponent_bits"], params["mantissa_bits"]
+    if bits[0] < least[0] or bits[1] < least[1]:
+        names = "exponent_bits and mantissa_bits of reduce_precision"
+        raise NotCompilable(f"{names} must be at least {least} for {x.dtype}, got {bits}")
     return x
 
 

@@ -62,10 +62,7 @@ def _solution(e: Evaluator, matrix: Entries, vector: Entries) -> list[Num]:
 
 
 def solve_with_exchanges(e: Evaluator, numbers: Sequence[Num], vec: bool) -> list[Num]:
-    """The solution of a linear system with exchanges of rows, of its numbers row by row (A, b).
-
-    It is needed rarely and takes many operations: a function of the module, by way of memory.
-    """
+    """The solution of the system with these rows (A, b) by a function with exchanges of rows."""
     module, b, dtype = e.module, e.b, numbers[0].dtype
     n = math.isqrt(len(numbers))
     block, calls = (b.W, b.U) if vec else (1, 1)
@@ -100,8 +97,7 @@ def _exchange_text(
 
 
 def eliminate_in_order(b: Builder, rows: list[list[Num]]) -> tuple[list[Num], Num]:
-    """The solution of the system with rows (A, b), zeros of the structure left out and no rows
-    exchanged, and whether a pivot was too small for that."""
+    """The solution of the system with rows (A, b) without exchanges; whether a pivot is small."""
     n, dtype, weak = len(rows), rows[0][0].dtype, b.const(False, "bool")
     limit = b.const(_LARGEST_FACTOR, dtype)
     for c in range(n):
@@ -128,8 +124,7 @@ def eliminate_in_order(b: Builder, rows: list[list[Num]]) -> tuple[list[Num], Nu
 
 
 def with_exchanges(b: Builder, system: Buffer, solution: Buffer) -> None:
-    """Solve the system with rows (A, b) in memory by partial pivoting, where exchanges are
-    selections; the system is overwritten."""
+    """Solve the system with rows (A, b) in memory by partial pivoting; exchanges are selections."""
     n, unit = system.shape[0], b.const(1, "int64")
     size, width = b.const(n, "int64"), b.const(n + 1, "int64")
 

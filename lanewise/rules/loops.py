@@ -98,8 +98,7 @@ def scan(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Valu
 
 
 def while_loop(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
-    """`while`; a condition that is an array says of each of its entries whether that entry of the
-    carry, by its leading axes, goes on."""
+    """`while`; an array as condition says which entries of the carry, by leading axes, go on."""
     params = eqn.params
     test, body = params["cond_jaxpr"], params["body_jaxpr"]
     of_test, of_body, carry = cut(values, params["cond_nconsts"], params["body_nconsts"])
@@ -243,10 +242,7 @@ def by_itself(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list
     way round, so that its numbers have the same bits wherever it is called."""
     program = eqn.params["program"]
     if eqn.params["lanes"] is not None:
-        raise NotCompilable(
-            "the function contains a batch of another lanewise function: make a batch of the outer "
-            "function only"
-        )
+        raise NotCompilable("the function contains a batch of another function of lanewise")
     outs = e.evaluate(program.trace.all_inputs, [e.opaque(value) for value in values])
     return [e.opaque(value) for value in outs]
 

@@ -128,10 +128,8 @@ def _views(e: Evaluator, eqn: Any, values: list[Value]) -> list[Value] | None:
     if name == "reshape" and params["dimensions"] is None:
         buffers = [e.reshape(value, params["new_sizes"])]
     else:
-        buffers = [
-            value.buffer.view(lambda x, i=i: move_entries(name, params, x)[i])
-            for i in range(len(eqn.outvars))
-        ]
+        count, view = len(eqn.outvars), value.buffer.view
+        buffers = [view(lambda x, i=i: move_entries(name, params, x)[i]) for i in range(count)]
     views = [Value.in_memory(x) for x in buffers if x is not None]
     if len(views) < len(buffers):
         check_size(value.size, SMALL, f"elements that {name} copies", value.shape)
@@ -143,11 +141,10 @@ def _concatenation(e: Evaluator, eqn: Any, values: list[Value], place: Buffer | 
     (out,) = eqn.outvars
     axis = eqn.params["dimension"]
     if place is None:
-        has_lanes = any(v.has_lanes() for v in values)
+        has_lanes = any(value.has_lanes() for value in values)
         place = e.module.scratch(out.aval.shape, str(out.aval.dtype), has_lanes)
-    for value, part in zip(
-        values, parts_along(place, axis, [v.shape for v in values]), strict=True
-    ):
+    parts = parts_along(place, axis, [value.shape for value in values])
+    for value, part in zip(values, parts, strict=True):
         e.write(value, part)
     return Value.in_memory(place)
 

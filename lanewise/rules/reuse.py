@@ -66,8 +66,7 @@ class _Forms:
     """
 
     def __init__(self, place: dict[int, int], first_serial: int, names: dict[Any, int]):
-        """`place` has the numbers of the state; those from `first_serial` on belong to the
-        round, and the others are the same in all rounds. `names`: keys given so far."""
+        """`place`: numbers of the state. Those before `first_serial` are equal in all rounds."""
         self.place, self.first_serial, self.names = place, first_serial, names
         self.forms: dict[int, int | None] = {}
 

@@ -73,9 +73,8 @@ class RowCollector:
 
 @dataclasses.dataclass
 class Rounds:
-    """The rounds 0, …, end − 1 of a loop that carries numbers, of which `vec` says whether they
-    differ between trajectories. ``round_of(numbers, k, start)`` is round k of a portion that begins
-    with round `start`."""
+    """The rounds 0, …, end − 1 of a loop that carries numbers, vectors where `vec` is true;
+    ``round_of(numbers, k, start)`` is round k of a portion that begins with round `start`."""
 
     e: Evaluator
     vec: list[bool]

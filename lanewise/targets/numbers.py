@@ -108,8 +108,7 @@ def _lane_stride(module: Module, aval: Any) -> int | str:
 
 
 def _array(module: Module, pointer: str, aval: Any, lane: int | str | None, start: str) -> Buffer:
-    """An operand or a result of the block whose first trajectory is `start`; that of all
-    trajectories without a `lane`."""
+    """An operand or a result of the block that begins at `start`; a shared one without a lane."""
     b, item = module.b, stored_type(str(aval.dtype))
     bases = [pointer] if lane is None else []
     for u in range(b.U if lane is not None else 0):
