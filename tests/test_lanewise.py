@@ -357,8 +357,8 @@ def table(x):
     return values[k], lax.dynamic_slice(values, (k,), (5,)), jnp.sum(jnp.sin(values * x))
 
 
-def of_the_second(f):
-    return lambda x, m: f(m)
+def index(x, count):
+    return (x[0, 0] * count).astype(int)
 
 
 LONG = RNG.normal(size=(9, 200))
@@ -382,49 +382,30 @@ CASES = {
     "long": (lambda x: (x, x + 1, jnp.sin(x) * x[3], x[::-1], jnp.where(x > 0, x, 2 * x)), LONG),
     "long and scanned": (lambda x: lax.scan(lambda c, z: (0.5 * c + z, c > z), 0.0, x), LONG),
     "long and indexed": (lambda x: (x[(x[0] * 60).astype(int)], x[5:9], x.reshape(20, 10).T), LONG),
-    "long, joined": (
-        lambda x: jnp.concatenate([x[:7], 2 * x, jnp.asarray(TABLE), x[None, 0]]),
-        LONG,
-    ),
+    "long, joined": (lambda x: jnp.concatenate([x[:7], 2 * x, TABLE, x[None, 0]]), LONG),
     "wide": (lambda x: (x.T, x[3], x.reshape(30, 20), x.reshape(-1), x[:, 4] * x[2, 0]), WIDE),
     "wide and scanned": (lambda x: lax.scan(lambda c, z: (c + z[0], z[1:4] * c), 0.0, x.T), WIDE),
-    "wide and sliced": (
-        lambda x: lax.dynamic_slice(x, ((x[0, 0] * 9).astype(int), 3), (2, 200 // 20)),
-        WIDE,
-    ),
+    "wide and sliced": (lambda x: lax.dynamic_slice(x, (index(x, 9), 3), (2, 10)), WIDE),
     "wide, turned and indexed": (
-        lambda x: (x.T.reshape(-1)[::7], jnp.take(x.T, (x[0, 0] * 600).astype(int), mode="clip")),
-        WIDE,
-    ),
+        lambda x: (x.T.reshape(-1)[::7], jnp.take(x.T, index(x, 600), mode="clip")), WIDE),
     "wide sum": (lambda x: (jnp.sum(x[:, :7], 0), jnp.max(x[:7, ::2], 1)), WIDE),
     "array of truth": (
-        lambda x: (x & ~x[::-1], jnp.any(x), x[None].T, x.astype(float)),
-        RNG.random((9, 5)) > 0.5,
-    ),
-    "long truth": (
-        lambda x: (~x, lax.scan(lambda c, z: (c ^ z, c), True, x)),
-        RNG.random((9, 200)) > 0.5,
-    ),
+        lambda x: (x & ~x[::-1], jnp.any(x), x[None].T, x.astype(float)), LONG[:, :5] > 0),
+    "long truth": (lambda x: (~x, lax.scan(lambda c, z: (c ^ z, c), True, x)), LONG > 0),
     "int64": (lambda n: (n * n, n // 3, n % 7, n << 3, n > 2**40), np.arange(9) * 2**40 - 2**41),
-    "uint32": (
-        lambda n: (n * n, n // 3, n - 5, n > 2**31, n.astype(float)),
-        (np.arange(9) * 2**29).astype("uint32"),
-    ),
-    "int8": (
-        lambda n: (n * n, -n, n.astype("uint8"), n.astype(int)),
-        (np.arange(9) * 31 - 128).astype("int8"),
-    ),
+    "uint32": (lambda n: (n * n, n // 3, n - 5, n > 2**31, n.astype(float)),
+        (np.arange(9) * 2**29).astype("uint32")),
+    "int8": (lambda n: (n * n, -n, n.astype("uint8"), n.astype(int)),
+        (np.arange(9) * 31 - 128).astype("int8")),
     "no step": (lambda x: lax.scan(lambda c, _: (c + 1, c), x, None, length=0), VALUES),
     "empty": (lambda x: (x[None][:0], jnp.zeros((3, 0)), x), VALUES),
     "an empty operand": (lambda x: (x * 2, 1.0), np.zeros((9, 0))),
     "unsigned, inverted": (lambda n: ~n, np.arange(9, dtype="uint32")),
     "constants only": (lambda x: (1.0, jnp.arange(3), True), VALUES),
     "a call in a call": (
-        lambda x: lanewise.call(lambda y: lanewise.call(jnp.sin, y) + y, x) * 2,
-        VALUES,
-    ),
+        lambda x: lanewise.call(lambda y: lanewise.call(jnp.sin, y) + y, x) * 2, VALUES),
     "a dictionary": (lambda x: {"a": x, "b": [x + 1, {"c": x * 2}]}, VALUES),
-}
+}  # fmt: skip
 
 
 def shared_operands(wrap):
@@ -689,9 +670,7 @@ FUNCTIONS = {
     "small systems": (small_systems, np.append(MATRICES, np.eye(3)[[[1, 2, 0], [2, 1, 0]]], 0)),
     "stacks of systems": (stacks_of_systems, MATRICES),
     "determinant of four": (
-        lambda m: jax.value_and_grad(jnp.linalg.det)(jnp.pad(m, (0, 1)) + jnp.eye(4)),
-        MATRICES,
-    ),
+        lambda m: jax.value_and_grad(jnp.linalg.det)(jnp.pad(m, (0, 1)) + jnp.eye(4)), MATRICES),
     "a derivative's rule": (jax.grad(with_a_rule), VALUES),
     "late to vary": (late_to_vary, VALUES),
     "same number of rounds": (same_number_of_rounds, VALUES),
@@ -705,46 +684,27 @@ FUNCTIONS = {
     "to integers": (to_integers, VALUES),
     "root": (a_root, np.abs(VALUES)),
     "matrices": (
-        lambda m: (
-            jnp.einsum("ij,jk->ki", m, m),
-            jnp.kron(m[0], m[1]),
-            jnp.tensordot(m, m, 2),
-            lax.dot(m.astype(jnp.float32), m, preferred_element_type=jnp.float64),
-            jnp.linalg.norm(m[0]),
-            jnp.cross(m[0], m[1]),
-            jnp.tril(m),
-            jnp.roll(m, 1),
-            m.std(),
-        ),
-        MATRICES,
-    ),
+        lambda m: (jnp.einsum("ij,jk->ki", m, m), jnp.kron(m[0], m[1]), jnp.tensordot(m, m, 2),
+            lax.dot(m.astype(jnp.float32), m, preferred_element_type=jnp.float64), m.std(),
+            jnp.linalg.norm(m[0]), jnp.cross(m[0], m[1]), jnp.tril(m), jnp.roll(m, 1)), MATRICES),
     "along axes": (
         lambda m: (jnp.diff(m), jnp.cumsum(m), jnp.prod(m, 0), m.argmax(), jnp.repeat(m, 2, 0)),
-        MATRICES,
-    ),
+        MATRICES),
     "axes in another order": (
-        lambda m: (
-            jax.vmap(jnp.prod, in_axes=1)(m),
-            jax.vmap(jax.grad(jnp.prod), in_axes=1)(m),
+        lambda m: (jax.vmap(jnp.prod, in_axes=1)(m), jax.vmap(jax.grad(jnp.prod), in_axes=1)(m),
             lax.reshape(m, (9,), dimensions=(1, 0)),
-            jax.jacfwd(jax.vmap(lambda z: jnp.prod(z[0])))(jnp.stack([m[:2], m[1:]])),
-        ),
-        MATRICES,
-    ),
+            jax.jacfwd(jax.vmap(lambda z: jnp.prod(z[0])))(jnp.stack([m[:2], m[1:]]))), MATRICES),
     "rounds of each row": (rounds_of_each_row, MATRICES),
     "map": (lambda m: lax.map(lambda r: jnp.sin(r).sum(), m), MATRICES),
     "hessian": (lambda m: jax.hessian(lambda y: jnp.sum(jnp.sin(y) * y[0]))(m[0]), MATRICES),
     "derivatives inside": (
         lambda x: (jax.grad(energy_like)(x, 1.5, 2), jax.jacfwd(lambda x: jnp.sin(x) * x[0])(x)),
-        MATRICES[:, 0, :2],
-    ),
+        MATRICES[:, 0, :2]),
     "derivative of a call": (
-        jax.grad(lambda x: lanewise.call(lambda z: jnp.sin(z) * z, x)),
-        VALUES,
-    ),
+        jax.grad(lambda x: lanewise.call(lambda z: jnp.sin(z) * z, x)), VALUES),
     "used twice": (used_twice, VALUES),
     "bits": (lambda x: lax.bitcast_convert_type(x, jnp.int64), VALUES),
-}
+}  # fmt: skip
 
 
 QUICK = {
