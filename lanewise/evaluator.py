@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from .assumed import Assumed
+from .assumed import Assumptions
 from .jaxprs.jaxapi import ClosedJaxpr, Jaxpr, Literal
-from .llvm.ir import TYPES, Num, Unsupported
+from .llvm.ir import NotCompilable, Num, check_size, check_type
 from .llvm.memory import Buffer, load, load_row, store, store_row
-from .llvm.values import MADE, SMALL, Entries, Value, objects
+from .llvm.values import MOST_ENTRIES, SMALL, Entries, Value, objects
 from .module import Module
 
 RULES: dict[str, Callable] = {}
@@ -26,21 +26,20 @@ class Evaluator:
 
     def __init__(self, module: Module):
         self.b, self.module = module.b, module
-        self.assumed: Assumed | None = None
+        self.assumptions: Assumptions | None = None
 
     # --- jaxprs ------------------------------------------------------------------------------
 
-    def closed(self, closed: ClosedJaxpr, values, wanted=None) -> list[Value]:
-        return self.jaxpr(closed.jaxpr, [self.constant(c) for c in closed.consts], values, wanted)
+    def evaluate(self, function: ClosedJaxpr, values, places=None) -> list[Value]:
+        consts = [self.constant(const) for const in function.consts]
+        return self.jaxpr(function.jaxpr, consts, values, places)
 
     def constant(self, array: Any) -> Value:
         array = np.asarray(array)
-        dtype = str(array.dtype)
-        if dtype not in TYPES:
-            raise Unsupported(f"numbers of type {dtype} are not compiled")
+        dtype = check_type(array.dtype)
         if array.size > SMALL:
             return Value(array.shape, dtype, buffer=self.module.constant(array))
-        entries = [self.b.known(x, dtype) for x in array.reshape(-1)]
+        entries = [self.b.const(number, dtype) for number in array.reshape(-1)]
         return Value(array.shape, dtype, objects(entries, array.shape))
 
     def jaxpr(
@@ -48,49 +47,48 @@ class Evaluator:
         jaxpr: Jaxpr,
         consts: Sequence[Value],
         values: Sequence[Value],
-        wanted: Sequence[Buffer | None] | None = None,
+        destinations: Sequence[Buffer | None] | None = None,
     ) -> list[Value]:
-        """The outputs. `wanted` says where outputs should be written if they are in memory."""
+        """The outputs. `destinations`: where outputs are written if they are in memory."""
         # From the variables of the jaxpr to their values.
-        known: dict[Any, Value] = dict(zip(jaxpr.constvars, consts, strict=True))
-        known.update(zip(jaxpr.invars, values, strict=True))
-        places = _places(jaxpr, wanted or [None] * len(jaxpr.outvars))
+        environment: dict[Any, Value] = dict(zip(jaxpr.constvars, consts, strict=True))
+        environment.update(zip(jaxpr.invars, values, strict=True))
+        places = _places(jaxpr, destinations or [None] * len(jaxpr.outvars))
 
         def read(atom: Any) -> Value:
             if isinstance(atom, Literal):
                 return self.constant(np.asarray(atom.val, atom.aval.dtype))  # pyright: ignore[reportAttributeAccessIssue]
-            return known[atom]
+            return environment[atom]
 
         # One call gives the sine and the cosine of a number, and costs little more than one of
         # them.
-        both = _sines_and_cosines(jaxpr)
+        sines_and_cosines = _sines_and_cosines(jaxpr)
         for eqn in jaxpr.eqns:
             inputs = [read(v) for v in eqn.invars]
-            if id(eqn) in both:
-                (known[eqn.outvars[0]],) = RULES[SINE_AND_COSINE](self, eqn, inputs, [None])
+            if id(eqn) in sines_and_cosines:
+                (environment[eqn.outvars[0]],) = RULES[SINE_AND_COSINE](self, eqn, inputs, [None])
                 continue
             outputs = self.equation(eqn, inputs, [places.get(v) for v in eqn.outvars])
             # A number that is linear in unit vectors is a derivative: its zeros stay zeros, also
             # times infinity.
             if eqn.primitive.name not in _ENDS and any(v.is_tangent for v in inputs):
                 outputs = [self.as_tangent(v) for v in outputs]
-            known.update(zip(eqn.outvars, outputs, strict=True))
-        if self.b.operations > self.b.most:
-            raise Unsupported(f"the function has more than {self.b.most} operations")
+            environment.update(zip(eqn.outvars, outputs, strict=True))
+        check_size(self.b.operations, self.b.limit, "the number of operations")
         return [read(v) for v in jaxpr.outvars]
 
     def equation(self, eqn: Any, values: list[Value], places: list) -> list[Value]:
         """The results of one equation, by the rule of its primitive."""
         rule = RULES.get(eqn.primitive.name)
         if rule is None:
-            raise Unsupported(f"no rule compiles the primitive {eqn.primitive.name}")
+            raise NotCompilable(f"there is no rule for the primitive {eqn.primitive.name}")
         return rule(self, eqn, values, places)
 
-    def unrelated(self, value: Value) -> Value:
+    def without_origin(self, value: Value) -> Value:
         """The same numbers, treated as results of a loop or a branch."""
-        return self.value([self.b.unrelated(x) for x in self.entries(value).flat], value)
+        return self.value([self.b.without_origin(x) for x in self.entries(value).flat], value)
 
-    def closed_off(self, value: Value) -> Value:
+    def opaque(self, value: Value) -> Value:
         """The same numbers, of which it is not known how they were made."""
         if value.entries is None:
             return value
@@ -98,20 +96,18 @@ class Evaluator:
 
     # --- values --------------------------------------------------------------------------------
 
-    def entries(self, value: Value, most: int = MADE) -> Entries:
+    def entries(self, value: Value, limit: int = MOST_ENTRIES) -> Entries:
         """The numbers of an array, read from memory if it is there."""
         if value.entries is not None:
             return value.entries
         buffer = value.buffer
         assert buffer is not None
-        if value.size > most:
-            rule = f"an operation on single elements is compiled for at most {most} elements"
-            raise Unsupported(f"{rule}, got an array of shape {value.shape}")
+        check_size(value.size, limit, "elements of an array that are read one by one", value.shape)
 
         def make() -> tuple[Value, Entries]:  # the value as well, so that no other one gets its id
             return value, objects(load_row(self.b, buffer), value.shape)
 
-        return self.b.once(("entries", id(value)), make)[1]
+        return self.b.find_or_make(("entries", id(value)), make)[1]
 
     def in_memory(self, value: Value) -> Buffer:
         """Where an array is in memory, written there if it was not."""
@@ -119,23 +115,23 @@ class Evaluator:
             return value.buffer
         assert value.entries is not None
         # Known numbers go into the module once, and no instruction writes them.
-        known = value.known()
-        if known is not None:
-            return self.module.constant(known)
+        constants = value.constants()
+        if constants is not None:
+            return self.module.constant(constants)
         place = self.module.scratch(value.shape, value.dtype, value.has_lanes())
         self.write(value, place)
         return place
 
-    def reshaped(self, value: Value, shape: Sequence[int]) -> Buffer:
+    def reshape(self, value: Value, shape: Sequence[int]) -> Buffer:
         """Where an array is in memory with other axes, copied if its strides cannot say that."""
-        seen = self.in_memory(value).reshaped(shape)
-        if seen is not None:
-            return seen
+        view = self.in_memory(value).reshape(shape)
+        if view is not None:
+            return view
         place = self.module.scratch(value.shape, value.dtype, value.has_lanes())
         self.write(value, place)
-        copied = place.reshaped(shape)
-        assert copied is not None
-        return copied
+        copy = place.reshape(shape)
+        assert copy is not None
+        return copy
 
     def write(self, value: Value, place: Buffer) -> None:
         """Write an array to a place of its shape."""
@@ -149,7 +145,7 @@ class Evaluator:
         # Few elements are moved one by one; a loop would cost more instructions.
         if value.size <= 16:
             for i in np.ndindex(value.shape):
-                store(self.b, place, load(self.b, source, source.at(i)), place.at(i))
+                store(self.b, place, load(self.b, source, source.position(i)), place.position(i))
             return
 
         def copy(index: Num) -> None:
@@ -160,16 +156,8 @@ class Evaluator:
 
     def count(self, length: int, body: Callable[[Num], None]) -> None:
         """``body(i)`` for i = 0, …, length − 1."""
-        b, end = self.b, self.module.parameter(length)
-
-        def test(_, i):
-            return b.new(f"icmp slt i64 {i}, {end.names[0]}")
-
-        def inner(_, i):
-            body(b.made([i], "int64", False))
-            return []
-
-        b.loop([], [], test, inner, count=True)
+        (end,) = self.module.parameter(length).names
+        self.b.repeat(end, lambda i: body(self.b.number([i], "int64", False)))
 
     def value(self, entries: Sequence[Num], like: Any) -> Value:
         return Value(like.shape, like.dtype, objects(list(entries), like.shape))
@@ -179,37 +167,35 @@ class Evaluator:
         if value.entries is None:
             return value
 
-        def marked(x: Num) -> Num:
-            is_zero = x.is_float and x.is_known_as(0)
-            return self.b.known(0, x.dtype, structural=True) if is_zero else x
+        def structural_zero(x: Num) -> Num:
+            is_zero = x.is_float and x.is_const(0)
+            return self.b.const(0, x.dtype, structural=True) if is_zero else x
 
-        out = self.value([marked(x) for x in value.entries.flat], value)
+        out = self.value([structural_zero(x) for x in value.entries.flat], value)
         out.is_tangent = True
         return out
 
     # --- arithmetic ------------------------------------------------------------------------------
 
-    def combine(self, op: str, a: Num, b: Num) -> Num:
+    def combine(self, op: str, x: Num, y: Num) -> Num:
         """An operation of two, by name."""
-        builder = self.b
-        if op == "add":
-            return builder.logic("or", a, b) if a.dtype == "bool" else builder.add(a, b)
-        if op == "mul":
-            return builder.logic("and", a, b) if a.dtype == "bool" else builder.mul(a, b)
+        b = self.b
         if op in ("max", "min"):
-            return builder.maximum(a, b, "gt" if op == "max" else "lt")
-        return builder.logic(op, a, b)
+            return b.maximum(x, y, "gt" if op == "max" else "lt")
+        if op in ("add", "mul") and x.dtype != "bool":
+            return b.add(x, y) if op == "add" else b.mul(x, y)
+        return b.logic({"add": "or", "mul": "and"}.get(op, op), x, y)
 
     # --- branches that are rarely taken ----------------------------------------------------------
 
     @contextlib.contextmanager
-    def assuming(self, assumed: Any):
-        """Write code that assumes that no rare branch is needed; `assumed` collects what for."""
-        before, self.assumed = self.assumed, assumed
+    def assuming(self, assumptions: Any):
+        """Write code that assumes that no rare branch is needed; `assumptions` collects them."""
+        previous, self.assumptions = self.assumptions, assumptions
         try:
-            yield assumed
+            yield assumptions
         finally:
-            self.assumed = before
+            self.assumptions = previous
 
 
 def parts_along(place: Buffer, axis: int, shapes: Sequence[tuple[int, ...]]) -> list[Buffer]:
@@ -217,68 +203,63 @@ def parts_along(place: Buffer, axis: int, shapes: Sequence[tuple[int, ...]]) -> 
     parts, start = [], 0
     for shape in shapes:
         front = (slice(None),) * axis
-        part = place.seen(lambda x, s=start, n=shape[axis], f=front: x[(*f, slice(s, s + n))])
+        part = place.view(lambda x, s=start, n=shape[axis], f=front: x[(*f, slice(s, s + n))])
         assert part is not None
         parts.append(part)
         start += shape[axis]
     return parts
 
 
-def _places(jaxpr: Jaxpr, wanted: Sequence[Buffer | None]) -> dict[Any, Buffer]:
-    """Where variables are to be written so that the outputs are where they are wanted."""
+def _places(jaxpr: Jaxpr, destinations: Sequence[Buffer | None]) -> dict[Any, Buffer]:
+    """Where variables are to be written so that the outputs are at their destinations."""
     places: dict[Any, Buffer] = {}
-    for v, place in zip(jaxpr.outvars, wanted, strict=True):
-        if place is not None and not isinstance(v, Literal):
-            places.setdefault(v, place)
-    if not places:
-        return places
+
+    def assign(var: Any, place: Buffer | None) -> None:
+        if place is not None and not isinstance(var, Literal):
+            places.setdefault(var, place)
+
+    for var, place in zip(jaxpr.outvars, destinations, strict=True):
+        assign(var, place)
     # Backwards, from the outputs: an array that is joined from parts is written part by part to
-    # where the whole is wanted, without a copy.
-    for eqn in reversed(jaxpr.eqns):
+    # the destination of the array, without a copy.
+    for eqn in reversed(jaxpr.eqns) if places else ():
         place = places.get(eqn.outvars[0]) if len(eqn.outvars) == 1 else None
         if place is None:
             continue
-        name = eqn.primitive.name
+        name, params = eqn.primitive.name, eqn.params
+        shapes = [var.aval.shape for var in eqn.invars]  # pyright: ignore[reportAttributeAccessIssue]
         if name == "concatenate":
-            shapes = [v.aval.shape for v in eqn.invars]  # pyright: ignore[reportAttributeAccessIssue]
-            for v, part in zip(
-                eqn.invars, parts_along(place, eqn.params["dimension"], shapes), strict=True
-            ):
-                if not isinstance(v, Literal):
-                    places.setdefault(v, part)
-        elif name in ("reshape", "squeeze", "expand_dims"):
-            if name == "reshape" and eqn.params["dimensions"] is not None:
-                continue
-            (v, *_) = eqn.invars
-            part = place.reshaped(v.aval.shape)  # pyright: ignore[reportAttributeAccessIssue]
-            if part is not None and not isinstance(v, Literal):
-                places.setdefault(v, part)
+            parts = parts_along(place, params["dimension"], shapes)
+            for var, part in zip(eqn.invars, parts, strict=True):
+                assign(var, part)
+        elif name in ("squeeze", "expand_dims") or (
+            name == "reshape" and params["dimensions"] is None
+        ):
+            assign(eqn.invars[0], place.reshape(shapes[0]))
     return places
 
 
 def _sines_and_cosines(jaxpr: Jaxpr) -> set[int]:
     """The equations that are the sine or the cosine of a variable of which both are taken."""
-    taken = [
+    calls = [
         (eqn.primitive.name, eqn.invars[0], id(eqn))
         for eqn in jaxpr.eqns
         if eqn.primitive.name in ("sin", "cos") and not isinstance(eqn.invars[0], Literal)
     ]
-    sines, cosines = ({x for name, x, _ in taken if name == which} for which in ("sin", "cos"))
-    return {eqn for _, x, eqn in taken if x in sines & cosines}
+    sines, cosines = ({x for name, x, _ in calls if name == f} for f in ("sin", "cos"))
+    return {eqn for _, x, eqn in calls if x in sines & cosines}
 
 
 # Linear solves: the result of one is a change of the state and not a derivative any more.
 _ENDS = frozenset(["custom_linear_solve", "eliminate"])
 
 
-def typed(rule: Callable) -> Callable:
+def check_types(rule: Callable) -> Callable:
     """A rule for results of the types that are compiled."""
 
-    def checked(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
-        for v in eqn.outvars:
-            if str(v.aval.dtype) not in TYPES:
-                types = "float64, float32, bool or integers of 8 to 64 bits"
-                raise Unsupported(f"{eqn.primitive.name} must return {types}, got {v.aval.dtype}")
+    def rule_with_check(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+        for var in eqn.outvars:
+            check_type(var.aval.dtype, f"results of {eqn.primitive.name}")
         return rule(e, eqn, values, places)
 
-    return checked
+    return rule_with_check

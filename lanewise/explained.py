@@ -1,6 +1,7 @@
 """How a function is compiled: operations, vectors, blocks, and the parts that XLA computes."""
 
 import dataclasses
+import itertools
 import re
 from collections.abc import Callable
 from typing import Any
@@ -10,11 +11,11 @@ import jax.numpy as jnp
 
 from .jaxprs.extent import functions_in
 from .jaxprs.jaxapi import jaxprs_in_params
-from .jaxprs.traced import Traced
-from .llvm.ir import Unsupported
+from .jaxprs.traced import Trace
+from .llvm.ir import NotCompilable
 from .native import handler, machine
-from .primitive import AUTO, Layout, Program, pieces_of
-from .targets import compiled
+from .primitive import AUTO, Callee, Layout, pieces_of
+from .targets import compile_program
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,44 +86,39 @@ def explain(
     print(lanewise.explain(lambda x: jnp.sin(x) / x, 1.0))
     ```
     """
-    leaves, tree = jax.tree.flatten(args)
     # Arrays: a number of Python would be traced with a weak type, which a batch does not have.
-    leaves = [jnp.asarray(x) for x in leaves]
-
-    def flat(*leaves):
-        return jax.tree.leaves(function(*jax.tree.unflatten(tree, leaves)))
-
-    closed = jax.make_jaxpr(flat)(*leaves)
+    leaves, tree = jax.tree.flatten(jax.tree.map(jnp.asarray, args))
+    trace = Trace.from_function(function, leaves, tree)
     # Without a call in it, the function is explained as if it were called.
-    programs = _calls(closed.jaxpr) or [Program(Traced(closed), layout)]
+    programs = _calls(trace.closed_jaxpr.jaxpr) or [Callee(trace, layout)]
     return Explanation(tuple(part for program in programs for part in _parts(program, batch)))
 
 
 def _calls(jaxpr: Any) -> list[Any]:
     """The programs of the calls in a jaxpr, in order."""
-    found = []
+    programs = []
     for eqn in jaxpr.eqns:
         if functions_in(eqn):
-            found.append(eqn.params["program"])
+            programs.append(eqn.params["program"])
             continue
         for body in jaxprs_in_params(eqn.params):
-            found += _calls(body)
-    return found
+            programs += _calls(body)
+    return programs
 
 
 def _parts(program: Any, batch: int) -> list[Part]:
     """How a program is compiled; its pieces if it is not compiled as a whole."""
-    count = len(program.traced.all_inputs.jaxpr.invars)
+    count = len(program.trace.all_inputs.jaxpr.invars)
     try:
-        result = compiled(program, [True] * count, batch, "cpu")
-    except Unsupported as reason:
-        parts = []
-        for piece in pieces_of(program, batch, "cpu"):
-            if piece.is_left_to_xla:
-                parts.append(Part(piece.reason))
-            else:
-                parts += _parts(Program(Traced(piece.closed), program.layout), batch)
-        return parts or [Part(str(reason))]
+        result = compile_program(program, [True] * count, batch, "cpu")
+    except NotCompilable as reason:
+        parts = [
+            [Part(piece.reason)]
+            if piece.is_left_to_xla
+            else _parts(Callee(Trace(piece.function), program.layout), batch)
+            for piece in pieces_of(program, batch, "cpu")
+        ]
+        return list(itertools.chain(*parts)) or [Part(str(reason))]
     code = result.code
     # Registers that do not suffice show in moves to and from the stack; their number says whether a
     # block has too many vectors.

@@ -7,7 +7,7 @@ import jax
 from jax import Array
 
 from .jaxprs.jaxapi import ClosedJaxpr, batch_in_front, has_derivative, jaxpr_as_fun, primitive
-from .jaxprs.traced import Traced
+from .jaxprs.traced import Trace
 
 
 def implicit_root(
@@ -29,81 +29,81 @@ def implicit_root(
     derivative. (JAX forms the batch of a `custom_jvp` rule after it, and has no transpose of the
     result.)
     """
-    one = jax.tree.structure((guess,))
-    equation = Traced.of(function, [guess], one)
+    structure = jax.tree.structure((guess,))
+    equation = Trace.from_function(function, [guess], structure)
     trees: list[Any] = []
 
-    def found(*operands):
+    def search_root(*operands):
         *consts, x0 = operands
-        x, how = solve(lambda x: equation(*consts, x)[0], x0)
-        leaves, tree = jax.tree.flatten(how)
+        x, info = solve(lambda x: equation(*consts, x)[0], x0)
+        leaves, tree = jax.tree.flatten(info)
         trees.append(tree)
         return [x, *leaves]
 
     # Values that the equation closes over become operands, so that derivatives by it are found.
     operands = [*equation.outer, guess]
-    search = Traced.of(found, operands, jax.tree.structure(tuple(operands)))
-    rest = _Rest(
-        lambda *at: jaxpr_as_fun(equation.all_inputs)(*at)[0],
-        lambda *at: _divided(equation.all_inputs, divide, *at),
+    search = Trace.from_function(search_root, operands, jax.tree.structure(tuple(operands)))
+    functions = _Functions(
+        lambda *arrays: jaxpr_as_fun(equation.all_inputs)(*arrays)[0],
+        lambda *arrays: _divide(equation.all_inputs, divide, *arrays),
         # These come first among the operands. They do not change the root: it has no derivative by
         # them.
         len(search.outer),
     )
-    x, *how = _root.bind(*search.outer, *operands, search=search.all_inputs, rest=rest)
-    return x, jax.tree.unflatten(trees[-1], how)
+    inputs = [*search.outer, *operands]
+    x, *info = _root.bind(*inputs, search=search.all_inputs, functions=functions)
+    return x, jax.tree.unflatten(trees[-1], info)
 
 
-class _Rest(NamedTuple):
-    """The parts of the derivative: ``equation(*consts, x)``, ``divide(*consts, x, b)``, and how
-    many operands of the search the equation does not have."""
+class _Functions(NamedTuple):
+    """``equation(*consts, x)``, ``divide(*consts, x, b)``, count of operands of the search only."""
 
     equation: Callable
     divide: Callable
-    own: int
+    search_only: int
 
 
-def _divided(equation: ClosedJaxpr, divide: Callable, *at: Array) -> Array:
-    *consts, x, b = at
+def _divide(equation: ClosedJaxpr, divide: Callable, *arrays: Array) -> Array:
+    *consts, x, right = arrays
     _, linear = jax.linearize(lambda x: jaxpr_as_fun(equation)(*consts, x)[0], x)
-    return divide(linear, b)
+    return divide(linear, right)
 
 
-def _searched(*operands: Array, search: ClosedJaxpr, rest: _Rest) -> list[Array]:
+def _search(*operands: Array, search: ClosedJaxpr, functions: _Functions) -> list[Array]:
     return jaxpr_as_fun(search)(*operands)
 
 
-def _batched(operands, axes, *, search: ClosedJaxpr, rest: _Rest):
-    size, operands, on = batch_in_front(operands, axes)
+def _batch_rule(operands, axes, *, search: ClosedJaxpr, functions: _Functions):
+    size, operands, axes_in_front = batch_in_front(operands, axes)
     # The batch is formed now: a derivative that is taken later finds functions of a batch, in which
     # `lax.cond` has become a selection.
-    new = jax.make_jaxpr(jax.vmap(jaxpr_as_fun(search), on, axis_size=size))(*operands)
-    consts = on[rest.own : -1]
-    of = _Rest(
-        jax.vmap(rest.equation, [*consts, 0], axis_size=size),
-        jax.vmap(rest.divide, [*consts, 0, 0], axis_size=size),
-        rest.own,
+    new = jax.make_jaxpr(jax.vmap(jaxpr_as_fun(search), axes_in_front, axis_size=size))(*operands)
+    consts = axes_in_front[functions.search_only : -1]
+    batch_functions = _Functions(
+        jax.vmap(functions.equation, [*consts, 0], axis_size=size),
+        jax.vmap(functions.divide, [*consts, 0, 0], axis_size=size),
+        functions.search_only,
     )
-    outs = _root.bind(*operands, search=new, rest=of)
+    outs = _root.bind(*operands, search=new, functions=batch_functions)
     return outs, [0] * len(outs)
 
 
-def _derivative(primals, changes: dict[int, Array], *, search: ClosedJaxpr, rest: _Rest):
-    outs = _root.bind(*primals, search=search, rest=rest)
-    x, consts = outs[0], primals[rest.own : -1]
+def _derivative(primals, changes: dict[int, Array], *, search: ClosedJaxpr, functions: _Functions):
+    outs = _root.bind(*primals, search=search, functions=functions)
+    x, consts = outs[0], primals[functions.search_only : -1]
     # Changes of the guess and of what the search alone uses are left out.
-    moves = [i for i in range(len(consts)) if i + rest.own in changes]
-    if not moves:
+    indices = [i for i in range(len(consts)) if i + functions.search_only in changes]
+    if not indices:
         return outs, [None] * len(outs)
 
     def defect(*moving):
-        values = dict(zip(moves, moving, strict=True))
-        return rest.equation(*(values.get(i, c) for i, c in enumerate(consts)), x)
+        values = dict(zip(indices, moving, strict=True))
+        return functions.equation(*(values.get(i, const) for i, const in enumerate(consts)), x)
 
-    moved = [changes[i + rest.own] for i in moves]
-    _, change = jax.jvp(defect, [consts[i] for i in moves], moved)
-    return outs, [rest.divide(*consts, x, -change), *[None] * (len(outs) - 1)]
+    tangents = [changes[i + functions.search_only] for i in indices]
+    _, change = jax.jvp(defect, [consts[i] for i in indices], tangents)
+    return outs, [functions.divide(*consts, x, -change), *[None] * (len(outs) - 1)]
 
 
-_root = primitive("implicit_root", _searched, _batched, multiple=True)
+_root = primitive("implicit_root", _search, _batch_rule, multiple=True)
 has_derivative(_root, _derivative)

@@ -25,8 +25,8 @@ def solve(A: Array, b: Array) -> Array:
     """
     if A.ndim != 2 or A.shape[0] != A.shape[1] or b.shape != A.shape[:1]:
         raise ValueError(
-            f"A must have shape (n, n) and b shape (n,), got {A.shape} for A, {b.shape} for b. For "
-            "several systems use jax.vmap or lanewise.batched."
+            f"A and b must have shapes (n, n) and (n,), got {A.shape} and {b.shape}. For several "
+            "systems use jax.vmap."
         )
     # It makes the solution differentiable any number of times by solving with the same matrix.
     return lax.custom_linear_solve(
@@ -34,45 +34,39 @@ def solve(A: Array, b: Array) -> Array:
     )
 
 
-def _in_arrays(A: ArrayLike, b: ArrayLike) -> Array:
+def _in_arrays(A: ArrayLike, right: ArrayLike) -> Array:
     """The solutions of systems with the shapes (..., n, n) and (..., n)."""
-    A, b = jnp.asarray(A), jnp.asarray(b)
-    n, lapack = b.shape[-1], _on_each(jnp.linalg.solve)
+    A, right = jnp.asarray(A), jnp.asarray(right)
+    n, lapack = right.shape[-1], _on_each(jnp.linalg.solve)
     # A loop over columns, or a call of LAPACK, takes longer than so few operations.
     if n <= WRITTEN_OUT:
-        return _on_each(by_elimination)(A, b)
-    if b.ndim == 1 or n > IN_A_LOOP:
-        return lapack(A, b)
-    return lax.platform_dependent(A, b, cpu=_on_each(_column_by_column), default=lapack)
+        return _on_each(by_elimination)(A, right)
+    if right.ndim == 1 or n > IN_A_LOOP:
+        return lapack(A, right)
+    return lax.platform_dependent(A, right, cpu=_on_each(_column_by_column), default=lapack)
 
 
-def _on_each(one: Callable) -> Callable:
-    return jnp.vectorize(one, signature="(n,n),(n)->(n)")
+def _on_each(solve_one: Callable) -> Callable:
+    return jnp.vectorize(solve_one, signature="(n,n),(n)->(n)")
 
 
 def by_elimination(A: Array, b: Array) -> Array:
-    """The solution of A x = b by elimination with partial pivoting, written out.
-
-    The exchanges are selections: under `vmap` every operation is elementwise over the batch.
-    """
+    """The solution of A x = b by elimination with partial pivoting; exchanges are selections."""
     n = b.shape[0]
     rows = [[A[i, j] for j in range(n)] + [b[i]] for i in range(n)]
     for c in range(n):
         for i in range(c + 1, n):  # bring the larger of rows c and i to place c
             larger = jnp.abs(rows[i][c]) > jnp.abs(rows[c][c])
-            exchanged = [
-                (jnp.where(larger, y, x), jnp.where(larger, x, y))
-                for x, y in zip(rows[c], rows[i], strict=True)
-            ]
-            rows[c] = [e[0] for e in exchanged]
-            rows[i] = [e[1] for e in exchanged]
+            pairs = list(zip(rows[c], rows[i], strict=True))
+            rows[c] = [jnp.where(larger, y, x) for x, y in pairs]
+            rows[i] = [jnp.where(larger, x, y) for x, y in pairs]
         for i in range(c + 1, n):
             factor = rows[i][c] / rows[c][c]
             rows[i] = [y - factor * x for x, y in zip(rows[c], rows[i], strict=True)]
     x: list = [None] * n
     for i in reversed(range(n)):
-        known = sum((rows[i][j] * x[j] for j in range(i + 1, n)), start=jnp.zeros_like(b[0]))
-        x[i] = (rows[i][n] - known) / rows[i][i]
+        total = sum((rows[i][j] * x[j] for j in range(i + 1, n)), start=jnp.zeros_like(b[0]))
+        x[i] = (rows[i][n] - total) / rows[i][i]
     return jnp.stack(x)
 
 
@@ -88,8 +82,8 @@ def _column_by_column(A: Array, b: Array) -> Array:
         # Rows before c have been used: −1 is below every magnitude, so that none is chosen again.
         size = jnp.where(jnp.arange(n) >= c, jnp.abs(rows[:, c]), -1.0)
         p = jnp.argmax(size)
-        pivot, there = rows[p], rows[c]
-        rows = rows.at[p].set(there).at[c].set(pivot / pivot[c])
+        pivot, old_row = rows[p], rows[c]
+        rows = rows.at[p].set(old_row).at[c].set(pivot / pivot[c])
         factors = jnp.where(jnp.arange(n) == c, 0.0, rows[:, c])
         return rows - factors[:, None] * rows[c][None]
 
@@ -98,12 +92,12 @@ def _column_by_column(A: Array, b: Array) -> Array:
 
 def _in_batches(arrays, axes):
     """More systems at once: their axis goes in front, of length 1 for what they share."""
-    moved = [
+    front_arrays = [
         # One matrix for several right-hand sides stays one: its elimination is shared.
         jnp.expand_dims(x, 0) if axis is None else jnp.moveaxis(jnp.asarray(x), axis, 0)
         for x, axis in zip(arrays, axes, strict=True)
     ]
-    return _eliminate.bind(*moved), 0
+    return _eliminate.bind(*front_arrays), 0
 
 
 _eliminate = primitive("eliminate", _in_arrays, _in_batches)
@@ -130,19 +124,18 @@ def on_any(x: Array, rare: bool = True) -> Array:
     kind = jnp.asarray(x)
     if kind.dtype != bool or kind.shape != ():
         raise TypeError(
-            "x must be a boolean scalar, the condition for one trajectory, got dtype "
-            f"{kind.dtype} and shape {kind.shape}. For a number use a comparison, such as x > 0. "
-            "For a boolean array use jnp.any(x)."
+            f"x must be one boolean, got dtype {kind.dtype} and shape {kind.shape}. Write x > 0 or "
+            "jnp.any(x)."
         )
     if not isinstance(rare, bool):
         raise TypeError(f"rare must be True or False, got {rare!r}.")
-    return _least.bind(jnp.where(x, jnp.int32(0), jnp.int32(1)), rare=rare) == 0
+    return _minimum.bind(jnp.where(x, jnp.int32(0), jnp.int32(1)), rare=rare) == 0
 
 
 def _least_of_batch(arrays, axes, *, rare):
     (x,), (axis,) = arrays, axes
     # Without a batch axis, so that a `cond` on it stays a branch and does not become a selection.
-    return _least.bind(jnp.min(x, axis=axis), rare=rare), None
+    return _minimum.bind(jnp.min(x, axis=axis), rare=rare), None
 
 
-_least = primitive("least_over_lanes", lambda x, *, rare: x, _least_of_batch)
+_minimum = primitive("least_over_lanes", lambda x, *, rare: x, _least_of_batch)

@@ -1,11 +1,11 @@
 """An LLVM module while it is written: its parameters, constants, scratch memory and functions."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from .llvm.builder import Builder
-from .llvm.ir import Num, Unsupported, literal
+from .llvm.ir import Num, check_size, literal
 from .llvm.memory import Buffer, contiguous, stored_type
 
 
@@ -24,7 +24,7 @@ class Module:
         self.values: list[int] = []
         self.globals: list[str] = []
         self.functions: dict[tuple[str, int], str] = {}
-        self.declared: set[str] = set()
+        self.declarations: set[str] = set()
         self.scratch_bytes = 0
         self._constants: dict[bytes, str] = {}
 
@@ -33,27 +33,24 @@ class Module:
         # So a run of other length, or with longer arrays, finds its code in the cache.
         name = f"%par{len(self.values)}"
         self.values.append(int(value))
-        return self.b.made([name], "int64", False)
+        return self.b.number([name], "int64", False)
 
-    def scratch(self, shape: Sequence[int], dtype: str, on: bool, each: int = 1) -> Buffer:
-        """Memory for an array of every trajectory of the block, next to each other; for one array
-        that all share unless `on`."""
+    def scratch(self, shape: Sequence[int], dtype: str, has_lanes: bool, copies: int = 1) -> Buffer:
+        """Memory for an array of each trajectory of the block; for a shared one without lanes."""
         size = int(np.prod(shape, dtype=np.int64))
-        block = self.b.W * self.b.U if on else each
+        block = self.b.W * self.b.U if has_lanes else copies
         start = self.scratch_bytes
         # Whole cache lines, so that no vector lies in two of them.
         self.scratch_bytes += (size * block * 8 + 63) // 64 * 64
-        if self.scratch_bytes > self.largest:
-            raise Unsupported(
-                f"intermediate arrays must have at most {self.largest} bytes in all, got "
-                f"{self.scratch_bytes} or more for a block of {self.b.W * self.b.U} trajectories"
-            )
+        check_size(self.scratch_bytes, self.largest, "bytes of intermediate arrays of a block")
         item = np.dtype(dtype).itemsize
         bases = tuple(
             self.b.new(f"getelementptr i8, ptr %scratch, i64 {start + u * self.b.W * item}")
-            for u in range(self.b.U if on else 1)
+            for u in range(self.b.U if has_lanes else 1)
         )
-        return Buffer(bases, dtype, tuple(shape), contiguous(shape, block), 1 if on else None)
+        return Buffer(
+            bases, dtype, tuple(shape), contiguous(shape, block), 1 if has_lanes else None
+        )
 
     def constant(self, array: np.ndarray) -> Buffer:
         """A known array in the module."""
@@ -64,9 +61,9 @@ class Module:
         if key not in self._constants:
             name = f"@data{len(self._constants)}"
             self._constants[key] = name
-            stored = "int8" if dtype == "bool" else dtype
+            stored_dtype = "int8" if dtype == "bool" else dtype
             numbers = ", ".join(
-                f"{item} {literal(x, stored)}" for x in array.astype(stored).reshape(-1)
+                f"{item} {literal(x, stored_dtype)}" for x in array.astype(stored_dtype).reshape(-1)
             )
             self.globals.append(
                 f"{name} = private unnamed_addr constant [{array.size} x {item}] [{numbers}]"
@@ -74,18 +71,26 @@ class Module:
         name = self._constants[key]
         return Buffer((name,), dtype, array.shape, contiguous(array.shape), None)
 
+    def add_function(self, key: tuple[str, int], write: Callable[[], tuple]) -> None:
+        """Add a function that is not there yet; ``write()`` → (text, declarations, constants)."""
+        if key not in self.functions:
+            self.functions[key] = ""  # its place: a function comes after those it calls
+            self.functions[key], declarations, constants = write()
+            self.declarations |= declarations
+            self.globals += [line for line in constants if line not in self.globals]
+
     # Numbers that wait in memory while a loop runs. Without "volatile" the optimiser would keep
     # them in registers, which the loop needs.
 
     def set_aside(self, x: Num, pointers: Sequence[str], vec: bool) -> None:
         """Write a number of a carry to one pointer for each vector."""
-        t = self.b.type(x.dtype, vec)
+        kind = self.b.type(x.dtype, vec)
         for name, pointer in zip(x.names, pointers, strict=True):
-            self.b.emit(f"store volatile {t} {name}, ptr {pointer}")
+            self.b.emit(f"store volatile {kind} {name}, ptr {pointer}")
 
     def taken_back(self, x: Num, pointers: Sequence[str], vec: bool) -> Num:
         """The number that was set aside there."""
         b = self.b
-        t = b.type(x.dtype, vec)
-        names = [b.new(f"load volatile {t}, ptr {pointer}") for pointer in pointers]
-        return b.made(names, x.dtype, vec)
+        kind = b.type(x.dtype, vec)
+        names = [b.new(f"load volatile {kind}, ptr {pointer}") for pointer in pointers]
+        return b.number(names, x.dtype, vec)

@@ -21,11 +21,11 @@ from .jaxprs.jaxapi import (
     primitive,
     with_equal_axes,
 )
-from .jaxprs.traced import Traced
-from .llvm.ir import Unsupported
+from .jaxprs.traced import Trace
+from .llvm.ir import NotCompilable
 from .native import handler, machine
-from .pieces import Piece, in_pieces, pieces
-from .targets import TARGETS, compiled
+from .pieces import FunctionPiece, in_pieces, pieces
+from .targets import TARGETS, compile_program
 
 FORMS = ("auto", "arrays")
 
@@ -72,13 +72,13 @@ def call(function: Callable, *args: Any, layout: Layout = AUTO) -> Any:
     """
     leaves, tree = jax.tree.flatten(args)
     # Traced here, for one trajectory: `vmap` outside only reaches the primitive.
-    traced = Traced.of(function, leaves, tree)
-    program = Program(traced, layout)
+    trace = Trace.from_function(function, leaves, tree)
+    program = Callee(trace, layout)
     # A value that is traced outside and closed over is an input like the others.
-    operands = [*traced.outer, *leaves]
-    on = (False,) * len(operands)
-    outs = _lanewise.bind(*operands, program=program, lanes=None, on=on)
-    return jax.tree.unflatten(traced.out_tree, outs)
+    operands = [*trace.outer, *leaves]
+    lane_flags = (False,) * len(operands)
+    outs = _lanewise.bind(*operands, program=program, lanes=None, lane_flags=lane_flags)
+    return jax.tree.unflatten(trace.out_tree, outs)
 
 
 def batched(function: Callable, in_axes: Any = 0, layout: Layout = AUTO) -> Callable:
@@ -111,15 +111,13 @@ def batched(function: Callable, in_axes: Any = 0, layout: Layout = AUTO) -> Call
     """
     if not callable(function):
         raise TypeError(
-            "function must be a function of one trajectory, got an object of the type "
-            f"{type(function).__name__}. Write batched(f), not batched(f(x))."
+            f"function must be callable, got an object of type {type(function).__name__}. Write "
+            "batched(f), not batched(f(x))."
         )
     if not isinstance(layout, Layout):
-        raise TypeError(
-            f"layout must be a lanewise.Layout, got {layout!r}. Write Layout(form=...)."
-        )
-    one = functools.partial(call, function, layout=layout)
-    return jax.vmap(one, in_axes)
+        raise TypeError(f"layout must be a lanewise.Layout, got {layout!r}.")
+    of_trajectory = functools.partial(call, function, layout=layout)
+    return jax.vmap(of_trajectory, in_axes)
 
 
 def generates() -> bool:
@@ -132,7 +130,7 @@ def generates() -> bool:
 @functools.cache
 def _can_start() -> bool:
     try:
-        machine.started()
+        machine.start_llvm()
         handler.runtime()
     except Exception as error:
         warnings.warn(
@@ -147,79 +145,76 @@ def _can_start() -> bool:
 
 # Compared by identity: JAX takes two calls of one program for the same, and hashes its parameters.
 @dataclasses.dataclass(frozen=True, eq=False)
-class Program:
+class Callee:
     """The function of a call, and the options of its compilation."""
 
-    traced: Traced
+    trace: Trace
     layout: Layout = AUTO
 
     def shape_of(self, lanes: int | None) -> list[Any]:
         """The shapes and types of the outputs for a batch."""
         front = () if lanes is None else (lanes,)
-        avals = self.traced.closed.out_avals
-        return [jax.ShapeDtypeStruct((*front, *a.shape), a.dtype) for a in avals]
+        avals = self.trace.closed_jaxpr.out_avals
+        return [jax.ShapeDtypeStruct((*front, *aval.shape), aval.dtype) for aval in avals]
 
 
-def _in_jax(program: Program, lanes: int | None, on: tuple[bool, ...]) -> Callable:
-    """The program as a function of JAX: the batch in front of operands where `on`, and of all
-    outputs."""
+def _in_jax(program: Callee, lanes: int | None, lane_flags: tuple[bool, ...]) -> Callable:
+    """The program as a function of JAX; operands with a flag and outputs begin with the batch."""
     if lanes is None:
-        return program.traced
-    return jax.vmap(program.traced, [0 if o else None for o in on], 0, axis_size=lanes)
+        return program.trace
+    axes = [0 if has_lanes else None for has_lanes in lane_flags]
+    return jax.vmap(program.trace, axes, 0, axis_size=lanes)
 
 
-def _through_xla(*operands, program: Program, lanes: int | None, on: tuple[bool, ...]):
+def _through_xla(*operands, **params):
     """The program as XLA compiles it."""
-    return _in_jax(program, lanes, on)(*operands)
+    return _in_jax(**params)(*operands)
 
 
-def _lowered(*operands, program: Program, lanes: int | None, on: tuple[bool, ...], platform: str):
+def _lower(*operands, platform: str, program: Callee, lanes: int | None, lane_flags):
     """The program as machine code, through XLA where none can be generated."""
     try:
         if not generates():
-            raise Unsupported(
-                "no machine code is generated in this process: the environment variable "
-                f"{SWITCH} switches it off, or a warning reported the reason"
-            )
+            raise NotCompilable(f"the variable {SWITCH} is off, or LLVM did not start")
         if lanes == 0:
-            raise Unsupported("the batch has no trajectories")
-        return compiled(program, on, lanes, platform).call(operands, program, lanes)
-    except Unsupported as reason:
+            raise NotCompilable("the batch has no trajectories")
+        return compile_program(program, lane_flags, lanes, platform).call(operands, program, lanes)
+    except NotCompilable as reason:
         # This is for developers of the compiler; users have `explain`.
         if os.environ.get("LANEWISE_LOG"):
             print("left to XLA:", reason, flush=True)
-        found = pieces_of(program, lanes or 1, platform) if lanes != 0 else []
-        if not found:
-            return _through_xla(*operands, program=program, lanes=lanes, on=on)
+        parts = pieces_of(program, lanes or 1, platform) if lanes != 0 else []
+        if not parts:
+            return _through_xla(*operands, program=program, lanes=lanes, lane_flags=lane_flags)
 
-        def run(piece: Piece, *arrays: Any, on: tuple[bool, ...]) -> list[Any]:
-            part = Program(Traced(piece.closed), program.layout)
+        def run(piece: FunctionPiece, *arrays: Any, lane_flags: tuple[bool, ...]) -> list[Any]:
+            part = Callee(Trace(piece.function), program.layout)
             compute = _through_xla if piece.is_left_to_xla else _lanewise.bind
-            return compute(*arrays, program=part, lanes=lanes, on=on)
+            return compute(*arrays, program=part, lanes=lanes, lane_flags=lane_flags)
 
-        return in_pieces(found, program.traced.all_inputs, operands, lanes, on, run)
+        return in_pieces(parts, program.trace.all_inputs, operands, lanes, lane_flags, run)
 
 
-def pieces_of(program: Program, lanes: int, platform: str) -> list[Piece]:
+def pieces_of(program: Callee, lanes: int, platform: str) -> list[FunctionPiece]:
     """The pieces of a program that is not compiled as a whole; none if XLA computes all of it."""
     if program.layout.form == "arrays" or not generates():
         return []
 
-    def reason(closed: ClosedJaxpr) -> str | None:
+    def reason(function: ClosedJaxpr) -> str | None:
         try:
-            part = Program(Traced(closed), program.layout)
-            compiled(part, [True] * len(closed.jaxpr.invars), lanes, platform)
-        except Unsupported as why:
-            return str(why)
+            part = Callee(Trace(function), program.layout)
+            compile_program(part, [True] * len(function.jaxpr.invars), lanes, platform)
+        except NotCompilable as refusal:
+            return str(refusal)
         return None
 
-    found = pieces(program.traced.all_inputs, reason)
+    parts = pieces(program.trace.all_inputs, reason)
     # One piece is all of it, and too large as a whole: it cannot be cut any further.
-    is_whole = len(found) == 1 and not found[0].is_call
-    return [] if is_whole or all(piece.is_left_to_xla for piece in found) else found
+    is_whole = len(parts) == 1 and not parts[0].is_call
+    return [] if is_whole or all(piece.is_left_to_xla for piece in parts) else parts
 
 
-def _shape_of(*operands, program: Program, lanes: int | None, on: tuple[bool, ...]) -> list[Any]:
+def _shape_of(*_operands, program: Callee, lanes: int | None, **_params) -> list[Any]:
     return program.shape_of(lanes)
 
 
@@ -227,58 +222,60 @@ def _shape_of(*operands, program: Program, lanes: int | None, on: tuple[bool, ..
 _through_xla.shape_of = _shape_of  # pyright: ignore[reportFunctionMemberAccess]
 
 
-def _batched(operands, axes, *, program: Program, lanes: int | None, on: tuple[bool, ...]):
+def _batch_rule(operands, axes, *, program: Callee, lanes: int | None, lane_flags):
     """One more axis of trajectories: all of them become one."""
-    batched = [axis is not None for axis in axes]
-    size, moved, _ = batch_in_front(operands, axes)
+    size, arrays, axes_in_front = batch_in_front(operands, axes)
+    outer = [axis is not None for axis in axes_in_front]
     if lanes is None:
-        outs = _lanewise.bind(*moved, program=program, lanes=size, on=tuple(batched))
+        outs = _lanewise.bind(*arrays, program=program, lanes=size, lane_flags=tuple(outer))
         return outs, [0] * len(outs)
     # One batch of all trajectories: nested batches need no rule of their own.
-    merged = [_merge(x, b, o, size, lanes) for x, b, o in zip(moved, batched, on, strict=True)]
-    either = tuple(b or o for b, o in zip(batched, on, strict=True))
-    outs = _lanewise.bind(*merged, program=program, lanes=size * lanes, on=either)
-    outs = [x.reshape(size, lanes, *x.shape[1:]) for x in outs]
-    return outs, [0] * len(outs)
+    flags = list(zip(outer, lane_flags, strict=True))
+    arrays = [_merge(x, *pair, size, lanes) for x, pair in zip(arrays, flags, strict=True)]
+    new_flags = tuple(any(pair) for pair in flags)
+    outs = _lanewise.bind(*arrays, program=program, lanes=size * lanes, lane_flags=new_flags)
+    return [x.reshape(size, lanes, *x.shape[1:]) for x in outs], [0] * len(outs)
 
 
-_lanewise = primitive("lanewise", _through_xla, _batched, multiple=True)
+_lanewise = primitive("lanewise", _through_xla, _batch_rule, multiple=True)
 for _platform in TARGETS:
-    lower_on(_platform, _lanewise, functools.partial(_lowered, platform=_platform))
+    lower_on(_platform, _lanewise, functools.partial(_lower, platform=_platform))
 
 
 def _derivative(primals, changes: dict[int, Any], **params):
     """The derivative of the function, computed by XLA."""
-    moving = list(changes.values())
+    vectors = list(changes.values())
     function = _in_jax(**params)
 
-    def moved(primals, *moving):
-        values = dict(zip(changes, moving, strict=True))
+    def outputs(primals, *vectors):
+        values = dict(zip(changes, vectors, strict=True))
         return function(*(values.get(i, x) for i, x in enumerate(primals)))
 
     def is_real(x: Any) -> bool:
         return jnp.issubdtype(x.dtype, jnp.inexact)
 
     # Outside of `jax.shard_map` JAX's own rules do everything.
-    if not manual_axes(*primals, *moving):
-        of = functools.partial(moved, primals)
-        outs, tangents = jax.jvp(of, [primals[i] for i in changes], moving)
+    if not manual_axes(*primals, *vectors):
+        of_vectors = functools.partial(outputs, primals)
+        outs, tangents = jax.jvp(of_vectors, [primals[i] for i in changes], vectors)
         return outs, [t if is_real(x) else None for x, t in zip(outs, tangents, strict=True)]
 
     # In jax.shard_map the derivative is taken for one device, like the function itself.
-    def real(primals, *moving):
-        return [x for x in moved(primals, *moving) if is_real(x)]
+    def real_outputs(primals):
+        def real(*vectors):
+            return [x for x in outputs(primals, *vectors) if is_real(x)]
 
-    def push(primals, moving):
-        of = functools.partial(real, primals)
-        return jax.jvp(of, [primals[i] for i in changes], moving)[1]
+        return real, [primals[i] for i in changes]
+
+    def push(primals, vectors):
+        return jax.jvp(*real_outputs(primals), vectors)[1]
 
     def pull(primals, ys):
-        _, back = jax.vjp(functools.partial(real, primals), *(primals[i] for i in changes))
-        return list(back(ys))
+        real, point = real_outputs(primals)
+        return list(jax.vjp(real, *point)[1](ys))
 
     outs = _lanewise.bind(*primals, **params)
-    tangents = iter(linear_map(push, pull, push, list(primals), with_equal_axes(moving)))
+    tangents = iter(linear_map(push, pull, push, list(primals), with_equal_axes(vectors)))
     return outs, [next(tangents) if is_real(x) else None for x in outs]
 
 
@@ -302,12 +299,12 @@ def _compiled_call(params: tuple) -> Callable:
 _lanewise.def_impl(_eagerly)
 
 
-def _without(params: dict[str, Any], used: list[bool]) -> dict[str, Any]:
+def _with_outputs(params: dict[str, Any], flags: list[bool]) -> dict[str, Any]:
     program = params["program"]
-    return dict(params, program=Program(program.traced.giving(used), program.layout))
+    return dict(params, program=Callee(program.trace.with_outputs(flags), program.layout))
 
 
-drops_outputs(_lanewise, _without)
+drops_outputs(_lanewise, _with_outputs)
 
 
 def _merge(x: Any, has_outer: bool, has_inner: bool, size: int, lanes: int) -> Any:

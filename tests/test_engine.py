@@ -172,7 +172,7 @@ def test_derivatives_of_a_linear_map_are_those_of_its_definition():
 
 
 def test_arguments_of_on_any():
-    with pytest.raises(TypeError, match="must be a boolean scalar"):
+    with pytest.raises(TypeError, match="must be one boolean"):
         lanewise.on_any(jnp.array([1.5, 2.0]))
     with pytest.raises(TypeError, match="rare"):
         lanewise.on_any(jnp.asarray(True), rare="often")  # pyright: ignore[reportArgumentType]

@@ -41,7 +41,10 @@ def run(H, method, k=2.0, steps=50, **how):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("method", [dvi.GaussLegendre(2), dvi.RungeKutta4(), dvi.TypeII()])
+SLOW = [pytest.param(m, marks=pytest.mark.slow) for m in (dvi.GaussLegendre(2), dvi.RungeKutta4())]
+
+
+@pytest.mark.parametrize("method", [dvi.TypeII(), *SLOW])
 def test_all_methods_agree_with_the_closed_form(method):
     a, b = run(BY_VELOCITY, method), run(closed, method)
     np.testing.assert_allclose(a.qs[-1], b.qs[-1], rtol=0, atol=2e-14)
@@ -56,9 +59,7 @@ def test_a_force_acts_in_the_solve_of_all_unknowns():
     assert np.abs(a.ps[-1] - free.ps[-1]).max() > 1e-3
 
 
-@pytest.mark.parametrize(
-    "method", [dvi.GaussLegendre(2), pytest.param(dvi.RungeKutta4(), marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("method", [dvi.TypeII(), *SLOW])
 def test_gradients(method):
     def last(H, k):
         return run(H, method, k, steps=5).qs[-1, 0]
@@ -69,7 +70,7 @@ def test_gradients(method):
     assert float(a) == pytest.approx(float(difference), rel=1e-7)
 
 
-@pytest.mark.parametrize("method", [dvi.GaussLegendre(2), dvi.TypeII()])
+@pytest.mark.parametrize("method", [dvi.TypeII(), SLOW[0]])
 def test_no_root_is_reported(method):
     nowhere = dvi.Implicit(energy, lambda t, q, p, y, args: y * y + 1.0 + p * p, guess)
     system = dvi.System(dvi.discretise(nowhere))
@@ -84,21 +85,28 @@ def test_wrong_functions_are_refused():
         dvi.Implicit(energy, relation, energy)
 
 
+def oscillator(omega):
+    """H = (p² + ω²q²)/2."""
+    return lambda t0, t1, q0, p1, args: (p1 @ p1 + omega**2 * (q0 @ q0)) / 2
+
+
+def extra(t0, t1, q0, p1, args, epsilon):
+    """What makes 1 + ε of ω = 1, which is not linear in ε."""
+    return (2.0 + epsilon) * (q0 @ q0) / 2
+
+
 def test_a_perturbation_may_take_epsilon():
-    """H(ω + ε) with H = (p² + ω²q²)/2, which is not linear in ε."""
-
-    def H(omega):
-        return lambda t0, t1, q0, p1, args: (p1 @ p1 + omega**2 * (q0 @ q0)) / 2
-
-    def extra(t0, t1, q0, p1, args, epsilon):
-        return (2.0 + epsilon) * (q0 @ q0) / 2
-
-    system = dvi.System(H(1.0), perturbation=extra)
+    system = dvi.System(oscillator(1.0), perturbation=extra)
     for epsilon in (0.0, 0.3):
         a = dvi.integrate(system, [1.0], [0.2], h=0.1, num_steps=20, epsilon=epsilon)
-        b = dvi.integrate(dvi.System(H(1.0 + epsilon)), [1.0], [0.2], h=0.1, num_steps=20)
+        b = dvi.integrate(dvi.System(oscillator(1.0 + epsilon)), [1.0], [0.2], h=0.1, num_steps=20)
         np.testing.assert_allclose(a.qs, b.qs, atol=1e-13)
-    # Discovery takes all powers of ε from it: the modified energy of the oscillator 1 + ε.
+
+
+@pytest.mark.slow
+def test_discovery_takes_all_powers_of_epsilon_from_a_perturbation():
+    """The modified energy of the oscillator 1 + ε."""
+    system = dvi.System(oscillator(1.0), perturbation=extra)
     samples = np.random.default_rng(0).uniform(-1, 1, (2, 60, 1))
     found = dvi.discover_invariants(system, dvi.Polynomials(2), order=2, h=0.1, samples=samples)
     assert len(found.invariants) == 1

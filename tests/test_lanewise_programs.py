@@ -83,7 +83,7 @@ UNARY = {
     "plus 1": (lambda x: x + 1, "sum"),
     "1 minus": (lambda x: 1 - x, "sum"),
     **{
-        f"power {n}": (lambda x, n=n: lax.integer_pow(x, n), "product")
+        f"power {n}": (functools.partial(lax.integer_pow, y=n), "product")
         for n in (-3, -1, 0, 2, 3, 5)
     },
     **{
@@ -116,8 +116,12 @@ AS = ("float64", "float32", "int32", "int64", "uint32", "int8", "bool")
 MODES = ("fill", "clip", "promise_in_bounds")
 
 
-def inside(i, mode):
-    return i % 3 if mode == "promise_in_bounds" else i
+def inside(i, mode, length=3):
+    return i % length if mode == "promise_in_bounds" else i
+
+
+def _update_of_a_matrix(x, u, i):
+    return lax.dynamic_update_slice(x, u[None], (i, i - i))
 
 
 ARRAYS: dict[str, tuple[str, str, Callable]] = {
@@ -127,22 +131,14 @@ ARRAYS: dict[str, tuple[str, str, Callable]] = {
     "slice of a matrix": ("f23 i i", "exact", lambda x, *i: lax.dynamic_slice(x, i, (1, 2))[0]),
     "update": ("f3 f2 i", "exact", lambda x, u, i: lax.dynamic_update_slice(x, u, (i,))),
     "update at 0": ("f3 f2", "exact", lambda x, u: lax.dynamic_update_slice(x, u, (0,))),
-    "update of a matrix": (
-        "f23 f3 i",
-        "exact",
-        lambda x, u, i: lax.dynamic_update_slice(x, u[None], (i, i - i)),
-    ),
+    "update of a matrix": ("f23 f3 i", "exact", _update_of_a_matrix),
     "element": ("f3 i", "exact", lambda x, i: lax.dynamic_index_in_dim(x, i, keepdims=False)),
     **{
         f"take {m}": ("f3 i3", "exact", lambda x, i, m=m: x.at[inside(i, m)].get(mode=m))
         for m in MODES
     },
     **{
-        f"take a row {m}": (
-            "f23 i",
-            "exact",
-            lambda x, i, m=m: x.at[i % 2 if m == "promise_in_bounds" else i].get(mode=m),
-        )
+        f"take a row {m}": ("f23 i", "exact", lambda x, i, m=m: x.at[inside(i, m, 2)].get(mode=m))
         for m in MODES
     },
     "pairs": ("f23 i3", "exact", lambda x, i: x[(i % 2, i % 3)]),
@@ -164,11 +160,7 @@ ARRAYS: dict[str, tuple[str, str, Callable]] = {
     "matrix vector": ("f23 f3", "dot", lambda x, y: x @ y),
     "matrix matrix": ("f23 f23", "dot", lambda x, y: (x @ y.T)[0]),
     "outer": ("f2 f3", "near", jnp.outer),
-    "batch of products": (
-        "f23 f23",
-        "dot",
-        lambda x, y: lax.dot_general(x, y, (((1,), (1,)), ((0,), (0,)))),
-    ),
+    "batch of products": ("f23 f23", "dot", lambda x, y: jnp.einsum("ij,ij->i", x, y)),
     "integer dot": ("i3 i3", "exact", lax.dot),
     "sum": ("f3", "sum", jnp.sum),
     "sum of rows": ("f23", "sum", lambda x: jnp.sum(x, 1)),
@@ -267,12 +259,11 @@ def _counted(x, i):
 
 def _halved(x):
     """Exact: which trajectory goes on when has one right answer."""
-    n, x = lax.while_loop(
-        lambda c: jnp.any(jnp.abs(c[1]) > 0.3) & (c[0] < 12),
-        lambda c: (c[0] + 1, c[1] / 2),
-        (0, x),
-    )
-    return n, x
+
+    def goes_on(c):
+        return jnp.any(jnp.abs(c[1]) > 0.3) & (c[0] < 12)
+
+    return lax.while_loop(goes_on, lambda c: (c[0] + 1, c[1] / 2), (0, x))
 
 
 def _while_in_scan(x, j):
@@ -284,9 +275,8 @@ def _while_in_scan(x, j):
 
 
 def _fixed_while(x):
-    return lax.while_loop(
-        lambda c: c[0] < 4, lambda c: (c[0] + 1, mixed(c[1], c[1])), (0, bounded(x))
-    )
+    start = 0, bounded(x)
+    return lax.while_loop(lambda c: c[0] < 4, lambda c: (c[0] + 1, mixed(c[1], c[1])), start)
 
 
 def _cond(b, x, y):
@@ -351,14 +341,11 @@ class Generator:
 
     def some(self, dtypes, shapes):
         """The place of a value; recent ones more often, so that programs are deep."""
-        found = [
-            k for k, a in enumerate(self.avals) if str(a.dtype) in dtypes and a.shape in shapes
-        ]
+        avals = enumerate(self.avals)
+        found = [k for k, a in avals if str(a.dtype) in dtypes and a.shape in shapes]
         if not found:
             return None
-        if self.rng.random() < 0.5:
-            found = found[-4:]
-        return self.choice(found)
+        return self.choice(found[-4:] if self.rng.random() < 0.5 else found)
 
     def append(self, key, function, args, kind, inner=None):
         if None in args:
@@ -615,18 +602,7 @@ def agree(node, args, found, expected, of_products, counts):
         return near | edge
 
 
-MULTIPLIED = [
-    "mul",
-    "square",
-    "scaled",
-    "power",
-    "pow",
-    "prod",
-    "dot",
-    "product",
-    "outer",
-    "divided",
-]
+MULTIPLIED = "mul square scaled power pow prod dot product outer divided".split()  # noqa: SIM905
 
 
 class Checker:

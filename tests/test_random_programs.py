@@ -44,12 +44,15 @@ def searched(tmp_path, count, seed):
     return [line for line in done.stdout.splitlines() if "of 5 traj" in line]
 
 
-@pytest.mark.parametrize("seed", [20, pytest.param(100, marks=pytest.mark.slow)])
-def test_random_programs_agree(tmp_path, seed):
-    count = 20 if seed == 20 else 70
+@pytest.mark.parametrize(
+    ("seed", "count"),
+    [(20, 4), *(pytest.param(*pair, marks=pytest.mark.slow) for pair in [(24, 16), (100, 70)])],
+)
+def test_random_programs_agree(tmp_path, seed, count):
     checked = searched(tmp_path, count, seed)
-    assert sum(int(line.split()[0]) for line in checked) > count - 10
-    assert any("gradient" in line and "no gradient" not in line for line in checked)
+    assert sum(int(line.split()[0]) for line in checked) > count - max(count // 3, 2)
+    has_gradient = any("gradient" in line and "no gradient" not in line for line in checked)
+    assert has_gradient or count < 10
 
 
 def test_a_small_program_passes():
@@ -63,10 +66,15 @@ SIGN = "(1 if form == 'auto' else -1)"
     ("old", "new", "message"),
     [
         ("SYSTEM,", "dvi.System(lambda *at: H(*at) * (1 + 1e-11 * (form == 'auto'))),", "numbers"),
-        ("h=0.1", f"h=0.1, stop=dvi.Stop(lambda t, q, p, a: t - 4.5 + 4.35 * {SIGN})", "status"),
-        ("h=0.1", f"h=0.1, observe=lambda *a: {SIGN} / (a[3][0] * 0)", "infinities"),
         ("SYSTEM, q,", "SYSTEM, q + (0.0 if form == 'auto' else jnp.nan),", "status"),
-        ("h=0.1", "h=0.1, observe=lambda t0, t1, q0, p0, q, p, a: bent(q[0])", "gradient"),
+        *(
+            pytest.param("h=0.1", f"h=0.1, {new}", message, marks=pytest.mark.slow)
+            for new, message in [
+                (f"stop=dvi.Stop(lambda t, q, p, a: t - 4.5 + 4.35 * {SIGN})", "status"),
+                (f"observe=lambda *a: {SIGN} / (a[3][0] * 0)", "infinities"),
+                ("observe=lambda t0, t1, q0, p0, q, p, a: bent(q[0])", "gradient"),
+            ]
+        ),
     ],
 )
 def test_differences_are_found(old, new, message):

@@ -1,6 +1,7 @@
 """Batches on several threads have the same numbers; the import changes no flag of XLA."""
 
 import os
+import shutil
 import subprocess
 import sys
 
@@ -11,6 +12,7 @@ import pytest
 
 import dvi_jax as dvi
 import lanewise
+from lanewise.native.structures import STRUCTURES, offset
 
 STEPS = 5
 
@@ -59,3 +61,23 @@ def test_importing_changes_no_flag_and_does_not_import_llvmlite():
     command = [sys.executable, "-c", IMPORT]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["None", "False", "True"]
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="requires a C compiler")
+def test_structures_are_those_of_the_header_of_xla(tmp_path):
+    xla = [name for name in STRUCTURES if name != "Job"]
+    fields = {name: STRUCTURES[name].replace("+", " ").split() for name in xla}
+    lines = [
+        f'printf("%zu ", offsetof(XLA_FFI_{name}, {field}));'
+        for name in xla
+        for field in fields[name]
+    ]
+    source = tmp_path / "offsets.c"
+    headers = "#include <stdbool.h>\n#include <stdio.h>\n#include <xla/ffi/api/c_api.h>\n"
+    source.write_text(headers + "int main(void) {" + "\n".join(lines) + "}")
+    program = str(tmp_path / "offsets")
+    subprocess.run(["cc", "-I", jax.ffi.include_dir(), str(source), "-o", program], check=True)
+    printed = subprocess.run([program], capture_output=True, text=True, check=True).stdout
+    assert [int(x) for x in printed.split()] == [
+        offset(name, field) for name in xla for field in fields[name]
+    ]

@@ -12,7 +12,7 @@ from jax import Array, lax
 
 import lanewise
 from lanewise.jaxprs.jaxapi import ClosedJaxpr, Jaxpr, Literal, bodies, jaxpr_as_fun, scan_counts
-from lanewise.jaxprs.traced import Traced
+from lanewise.jaxprs.traced import Trace
 from lanewise.rules.moves import CALLS
 
 from . import pair_functions as functions, pairs
@@ -35,7 +35,9 @@ def in_pairs(function: Callable, *args: Any) -> Any:
     def of_arrays(*leaves: Array) -> Any:
         return function(*eqx.combine(jax.tree.unflatten(tree, leaves), static))
 
-    trace = Traced.of(of_arrays, rounded(leaves), jax.tree.structure(tuple(rounded(leaves))))
+    trace = Trace.from_function(
+        of_arrays, rounded(leaves), jax.tree.structure(tuple(rounded(leaves)))
+    )
     program = trace.all_inputs
 
     # Values of an outer trace that the function closes over are operands too, so that they have a
@@ -298,9 +300,9 @@ def _linear_solve(eqn: Any, values: list[Any]) -> list[Any]:
 
 
 def _root(eqn: Any, values: list[Any]) -> list[Any]:
-    problem, plain = eqn.params["rest"], rounded(values)
+    problem, plain = eqn.params["functions"], rounded(values)
     x, *statistics = _bound(eqn, plain)
-    parameters, consts = values[problem.own : -1], plain[problem.own : -1]
+    parameters, consts = values[problem.search_only : -1], plain[problem.search_only : -1]
     # The iteration itself stays in float64, with its status; a Jacobian of float64 is enough to
     # continue from its root.
     equation = jax.make_jaxpr(problem.equation)(*consts, x)
@@ -327,7 +329,7 @@ def _call(eqn: Any, values: list[Any]) -> list[Any]:
         raise NotImplementedError(
             "arithmetic=dvi.DoubleDouble() has no rule for lanewise.batched: use jax.vmap alone."
         )
-    inner = program.traced.all_inputs
+    inner = program.trace.all_inputs
     return _evaluate(inner.jaxpr, inner.consts, values)
 
 

@@ -27,7 +27,7 @@ from .parts import (
 _LIMIT_4, _LIMIT_5 = 2.0**21, 2.0**27
 
 
-def _reduced(size: Array) -> tuple[Array, Array, Array]:
+def _reduce(size: Array) -> tuple[Array, Array, Array]:
     r"""(r, y, bits): r + y = `size` − k π/2, |r| ≤ π/4, and k mod 4 in the last bits of `bits`.
 
     Cody & Waite 1980, ch. 8, with π/2 = P1 + P2 + P3 + P4 and k ≤ 2²¹,
@@ -42,10 +42,10 @@ def _reduced(size: Array) -> tuple[Array, Array, Array]:
     part = k * tables.HALF_PI_4[2]
     r = b - part
     y = ((b - r) - part) - k * tables.HALF_PI_4[3]
-    return lax.cond(size > _LIMIT_4, _reduced_large, lambda *args: args[1:], size, r, y, bits)
+    return lax.cond(size > _LIMIT_4, _reduce_large, lambda *args: args[1:], size, r, y, bits)
 
 
-def _reduced_large(size: Array, *_: Array) -> tuple[Array, Array, Array]:
+def _reduce_large(size: Array, *_: Array) -> tuple[Array, Array, Array]:
     """The same in five parts for k ≤ 2²⁷, with a further branch beyond."""
     k, bits = nearest(size * (2 / math.pi))
     b = (size - k * tables.HALF_PI_5[0]) - k * tables.HALF_PI_5[1]
@@ -55,13 +55,13 @@ def _reduced_large(size: Array, *_: Array) -> tuple[Array, Array, Array]:
     part = k * tables.HALF_PI_5[3]
     u = t - part
     f = (t - u) - part
-    rest = (e + f) - k * tables.HALF_PI_5[4]
-    r = u + rest
-    y = (u - r) + rest
-    return lax.cond(size > _LIMIT_5, _reduced_huge, lambda *args: args[1:], size, r, y, bits)
+    remainder = (e + f) - k * tables.HALF_PI_5[4]
+    r = u + remainder
+    y = (u - r) + remainder
+    return lax.cond(size > _LIMIT_5, _reduce_huge, lambda *args: args[1:], size, r, y, bits)
 
 
-def _reduced_huge(size: Array, *_: Array) -> tuple[Array, Array, Array]:
+def _reduce_huge(size: Array, *_: Array) -> tuple[Array, Array, Array]:
     r"""The same in integer arithmetic for all larger numbers (Payne & Hanek 1983).
 
     With x = m 2^e and an integer m < 2⁵³, the digits of 2/π before position e − 2 contribute
@@ -74,11 +74,11 @@ def _reduced_huge(size: Array, *_: Array) -> tuple[Array, Array, Array]:
 
     # Four words of the table from word position // 64 on, chosen by one binary digit after another.
     words = [np.uint64(word).astype(np.int64) for word in tables.TWO_OVER_PI]
-    for step, needed in ((16, 19), (8, 11), (4, 7), (2, 5), (1, 4)):
+    for step, length in ((16, 19), (8, 11), (4, 7), (2, 5), (1, 4)):
         is_set = (position & np.int64(64 * step)) != 0
         words = [
             lax.select(is_set, words[i + step], words[i]) if i + step < len(words) else words[i]
-            for i in range(needed)
+            for i in range(length)
         ]
     count = position & np.int64(63)
     digits = []
@@ -155,7 +155,7 @@ def _cosine(s: Array, c: Array, bits: Array) -> Array:
 
 def _sine_and_cosine(x: Array) -> tuple[Array, Array, Array]:
     """sin and cos of the reduced argument, and the number of the quadrant."""
-    r, y, bits = _reduced(lax.abs(x))
+    r, y, bits = _reduce(lax.abs(x))
     (s, ds), (c, dc) = _sines(r, y)
     return s + ds, c + dc, bits
 
@@ -179,15 +179,15 @@ def cos(x: Array) -> Array:
 
 def tan(x: Array) -> Array:
     """Tangent, the quotient of sine and cosine with their rounding errors."""
-    r, y, bits = _reduced(lax.abs(x))
+    r, y, bits = _reduce(lax.abs(x))
     (s, ds), (c, dc) = (fast_two_sum(*pair) for pair in _sines(r, y))
     is_odd = (bits & np.int64(1)) != 0
-    above, d_above = lax.select(is_odd, c, s), lax.select(is_odd, dc, ds)
-    below, d_below = lax.select(is_odd, s, c), lax.select(is_odd, ds, dc)
+    numerator, d_numerator = lax.select(is_odd, c, s), lax.select(is_odd, dc, ds)
+    denominator, d_denominator = lax.select(is_odd, s, c), lax.select(is_odd, ds, dc)
     # Without the rounding errors of both, which enter in first order, the quotient has a larger
     # error.
-    quotient = above / below
-    value = quotient + (d_above - quotient * d_below) / below
+    quotient = numerator / denominator
+    value = quotient + (d_numerator - quotient * d_denominator) / denominator
     return float_of(bits_of(value) ^ (((bits << 63) ^ bits_of(x)) & SIGN))
 
 
@@ -229,7 +229,7 @@ def atan2(y: Array, x: Array) -> Array:
     larger = where(n > d, n, d)
     is_ordinary = (larger < 2.0**1000) & (larger > 2.0**-900)
 
-    def scaled(n, d):
+    def scale_sides(n, d):
         # The limits: ∞/∞ counts as 1, a quotient of a finite number and ∞ as 0 or ∞, 0/0 as 0/1.
         infinite = larger == math.inf
         n = where(infinite, where(n == math.inf, 1.0, 0.0 * n), n)
@@ -238,7 +238,7 @@ def atan2(y: Array, x: Array) -> Array:
         scale = where(larger > 2.0**100, 0.25, 2.0**100)
         return scale * n, scale * d
 
-    n, d = lax.cond(is_ordinary, lambda n, d: (n, d), scaled, n, d)
+    n, d = lax.cond(is_ordinary, lambda n, d: (n, d), scale_sides, n, d)
     angle = _angle(n, d)
     angle = where(bits_of(x) < 0, 2 * tables.PI_2[0] - (angle - 2 * tables.PI_2[1]), angle)
     return with_sign_of(angle, bits_of(y))

@@ -7,9 +7,10 @@ from jax import Array, lax
 
 from . import tables
 from .parts import (
-    ONE,
+    ONE_BITS,
     Real,
     bits_of,
+    branch_unless,
     fast_two_sum,
     float_of,
     head_of,
@@ -18,7 +19,6 @@ from .parts import (
     shift_right,
     split_polynomial,
     two_sum,
-    unless,
     where,
     with_sign_of,
 )
@@ -45,15 +45,15 @@ def exp_terms(r: Array, y: Array | None = None) -> tuple[Array, Array]:
 
 def _power_of_two(bits: Array) -> Array:
     """2^k, |k| ≤ 1022, with k in the last bits of `bits`."""
-    return float_of((bits << 52) + ONE)
+    return float_of((bits << 52) + ONE_BITS)
 
 
-def scaled(value: Array, bits: Array) -> Array:
+def scale_by_power(value: Array, bits: Array) -> Array:
     """`value` 2^k for a normal result, with k in the last bits of `bits`."""
     return float_of(bits_of(value) + (bits << 52))
 
 
-def scaled_twice(value: Array, bits: Array) -> Array:
+def scale_in_two_steps(value: Array, bits: Array) -> Array:
     """`value` 2^k for |k| ≤ 2000, with one rounding at the end if the result is subnormal."""
     # In two steps, because 2^k itself may be outside of the range.
     half = shift_right(bits, 1)  # k/2 in the last bits; those above are shifted out
@@ -67,12 +67,12 @@ def exp(x: Array) -> Array:
     w, d = exp_terms((x - k * tables.LOG_2[0]) - k * tables.LOG_2[1])
 
     def extreme(x, value, bits):
-        value = where(x > 710.0, math.inf, scaled_twice(value, bits))
+        value = where(x > 710.0, math.inf, scale_in_two_steps(value, bits))
         value = where(x < -746.0, 0.0, value)
         return where(x == x, value, x)
 
     value = w + d
-    return unless(lax.abs(x) < LIMIT, scaled(value, bits), extreme, x, value, bits)
+    return branch_unless(lax.abs(x) < LIMIT, scale_by_power(value, bits), extreme, x, value, bits)
 
 
 def exp2_terms(high: Array, low: Real) -> tuple[Array, Array]:
@@ -93,12 +93,12 @@ def exp2(x: Array) -> Array:
     w, d = exp2_terms(x - k, np.float64(0.0))
 
     def extreme(x, value, bits):
-        value = where(x >= 1024.0, math.inf, scaled_twice(value, bits))
+        value = where(x >= 1024.0, math.inf, scale_in_two_steps(value, bits))
         value = where(x < -1076.0, 0.0, value)
         return where(x == x, value, x)
 
     value = w + d
-    return unless(lax.abs(x) < 1021.0, scaled(value, bits), extreme, x, value, bits)
+    return branch_unless(lax.abs(x) < 1021.0, scale_by_power(value, bits), extreme, x, value, bits)
 
 
 def _expm1_terms(x: Array) -> tuple[Array, Array]:
@@ -122,7 +122,7 @@ def expm1(x: Array) -> Array:
         value = where(x > 0.0, exp(x), -1.0)
         return where(x == x, value, x)
 
-    value = unless(lax.abs(x) < LIMIT, w + d, extreme, x)
+    value = branch_unless(lax.abs(x) < LIMIT, w + d, extreme, x)
     return where(x == 0.0, x, value)  # −0
 
 
@@ -130,7 +130,7 @@ def _exp_half(size: Array) -> Array:
     """e^size/2 for size ≥ 708."""
     r, y, bits = exp_reduced(size)
     w, d = exp_terms(r, y)
-    value = scaled_twice(w + d, bits - np.int64(1))
+    value = scale_in_two_steps(w + d, bits - np.int64(1))
     value = where(size > 711.0, math.inf, value)
     return where(size == size, value, size)
 
@@ -143,9 +143,9 @@ def sinh(x: Array) -> Array:
     n, dn = two_sum(t, np.float64(1.0))
     quotient = t / n
     # 1/n to first order is 1 − quotient.
-    rest = dt + (dt - quotient * (dn + dt)) * (1.0 - quotient)
-    value = 0.5 * ((t + quotient) + rest)
-    return with_sign_of(unless(size < LIMIT, value, _exp_half, size), bits_of(x))
+    error = dt + (dt - quotient * (dn + dt)) * (1.0 - quotient)
+    value = 0.5 * ((t + quotient) + error)
+    return with_sign_of(branch_unless(size < LIMIT, value, _exp_half, size), bits_of(x))
 
 
 def cosh(x: Array) -> Array:
@@ -156,7 +156,7 @@ def cosh(x: Array) -> Array:
     scale = _power_of_two(bits)
     total, e = fast_two_sum(scale * w, 1.0 / (scale * (w + d)))
     value = 0.5 * (total + (e + scale * d))
-    return unless(size < LIMIT, value, _exp_half, size)
+    return branch_unless(size < LIMIT, value, _exp_half, size)
 
 
 def tanh(x: Array) -> Array:
@@ -188,7 +188,7 @@ def logistic(x: Array) -> Array:
     def extreme(x):
         return where(x > 0.0, 1.0, exp(x))  # NaN too
 
-    return unless(size < LIMIT, value, extreme, x)
+    return branch_unless(size < LIMIT, value, extreme, x)
 
 
 # --- error functions --------------------------------------------------------------------------
@@ -222,23 +222,23 @@ def _erfc_tail(x: Array) -> Array:
     v = 1.0 - 8.0 * t
     dv = -8.0 * (t_rest - (t - t_head))
     slope = polynomial(v, [k * c for k, c in enumerate(tables.ERFC[:5])][1:])
-    factor, rest = fast_two_sum(tables.ERFC[0], v * split_polynomial(v, v * v, tables.ERFC[1:]))
+    factor, low = fast_two_sum(tables.ERFC[0], v * split_polynomial(v, v * v, tables.ERFC[1:]))
     factor_head = head_of(factor)
-    factor_rest = (factor - factor_head) + (rest + (tables.ERFC_0 + slope * dv))
+    factor_rest = (factor - factor_head) + (low + (tables.ERFC_0 + slope * dv))
 
     product = factor_head * t_head
     head = head_of(product)
-    rest = (product - head) + (factor_head * t_rest + factor_rest * t)
+    low = (product - head) + (factor_head * t_rest + factor_rest * t)
     w_head = head_of(w)
     w_rest = (w - w_head) + d
-    return scaled_twice(w_head * head + (w_head * rest + w_rest * (head + rest)), bits)
+    return scale_in_two_steps(w_head * head + (w_head * low + w_rest * (head + low)), bits)
 
 
 def erf(x: Array) -> Array:
     """Error function."""
     size = lax.abs(x)
     centre = size + _erf_rest(size)
-    value = unless(size <= 0.75, centre, lambda size: 1.0 - _erfc_tail(size), size)
+    value = branch_unless(size <= 0.75, centre, lambda size: 1.0 - _erfc_tail(size), size)
     return with_sign_of(value, bits_of(x))
 
 
@@ -252,4 +252,4 @@ def erfc(x: Array) -> Array:
         value = _erfc_tail(lax.abs(x))
         return where(x < 0.0, 2.0 - value, value)
 
-    return unless(lax.abs(x) <= 0.75, centre, tail, x)
+    return branch_unless(lax.abs(x) <= 0.75, centre, tail, x)

@@ -7,12 +7,13 @@ import numpy as np
 from jax import Array, lax
 
 from . import tables
-from .exponential import exp2_terms, scaled, scaled_twice
+from .exponential import exp2_terms, scale_by_power, scale_in_two_steps
 from .parts import (
     FRACTION,
-    ONE,
+    ONE_BITS,
     TINY,
     bits_of,
+    branch_unless,
     exponent_of,
     fast_two_sum,
     float_of,
@@ -21,7 +22,6 @@ from .parts import (
     polynomial,
     split_polynomial,
     two_sum,
-    unless,
     where,
     with_sign_of,
 )
@@ -29,9 +29,9 @@ from .parts import (
 _ROOT_HALF = np.int64(0x3FE6_A09E_667F_3BCD)  # the bits of √½
 
 
-def _normalised(x: Array) -> tuple[Array, Array]:
+def _normal_form(x: Array) -> tuple[Array, Array]:
     """(k, m) with x = 2^k m, √½ ≤ m < √2, for a normal x > 0."""
-    bits = bits_of(x) + (ONE - _ROOT_HALF)
+    bits = bits_of(x) + (ONE_BITS - _ROOT_HALF)
     return exponent_of(bits), float_of((bits & FRACTION) + _ROOT_HALF)
 
 
@@ -45,7 +45,7 @@ def _log_sum(x: Array, e: Array | None = None, shift: float = 0.0) -> Array:
     and 1/(1 + f) = (1 − s)/(1 + s) by the first terms of its series.
     """
     # m near 1 on both sides, so that k log 2 and log m do not cancel.
-    k, m = _normalised(x)
+    k, m = _normal_form(x)
     k = k + shift if shift else k
     f = m - 1.0
     s = f / (2.0 + f)
@@ -53,7 +53,7 @@ def _log_sum(x: Array, e: Array | None = None, shift: float = 0.0) -> Array:
     half = 0.5 * f * f
     small = k * tables.LOG_2[1]
     if e is not None:
-        inverse = float_of((bits_of(m) - bits_of(x)) + ONE)
+        inverse = float_of((bits_of(m) - bits_of(x)) + ONE_BITS)
         small = small + (e * inverse) * (1.0 - (2.0 * s) * (1.0 - s))
     series = s * (half + z * split_polynomial(z, z * z, tables.LOG))
     return k * tables.LOG_2[0] - ((half - (series + small)) - f)
@@ -68,7 +68,7 @@ def log(x: Array) -> Array:
         value = where(x > 0.0, value, math.nan)
         return where(x == 0.0, -math.inf, value)
 
-    return unless((x >= TINY) & (x < math.inf), _log_sum(x), extreme, x)
+    return branch_unless((x >= TINY) & (x < math.inf), _log_sum(x), extreme, x)
 
 
 def log1p(x: Array) -> Array:
@@ -79,14 +79,14 @@ def log1p(x: Array) -> Array:
         return where(x == x, value, x)
 
     value = _log_sum(*two_sum(x, np.float64(1.0)))
-    value = unless((x > -1.0) & (x < 2.0**500), value, extreme, x)
+    value = branch_unless((x > -1.0) & (x < 2.0**500), value, extreme, x)
     return where(x == 0.0, x, value)  # −0
 
 
 def _log1p_sum(z: Array, e: Array) -> Array:
     """log(1 + z + e), 0 ≤ z < 2⁶⁰⁰, |e| below the rounding error of z."""
-    total, rest = two_sum(z, np.float64(1.0))
-    return _log_sum(total, rest + e)
+    total, error = two_sum(z, np.float64(1.0))
+    return _log_sum(total, error + e)
 
 
 def _log_double(x: Array) -> Array:
@@ -99,7 +99,7 @@ def asinh(x: Array) -> Array:
     size = lax.abs(x)
     square = size * size
     z, e = fast_two_sum(size, square / (1.0 + lax.sqrt(1.0 + square)))
-    value = unless(size < 2.0**500, _log1p_sum(z, e), _log_double, size)
+    value = branch_unless(size < 2.0**500, _log1p_sum(z, e), _log_double, size)
     return with_sign_of(value, bits_of(x))
 
 
@@ -111,7 +111,7 @@ def acosh(x: Array) -> Array:
     def extreme(x):
         return where(x < 1.0, math.nan, _log_double(x))
 
-    return unless((x >= 1.0) & (x < 2.0**500), _log1p_sum(z, e), extreme, x)
+    return branch_unless((x >= 1.0) & (x < 2.0**500), _log1p_sum(z, e), extreme, x)
 
 
 def atanh(x: Array) -> Array:
@@ -139,7 +139,7 @@ def _log2_terms(x: Array, shift: float = 0.0) -> tuple[Array, Array]:
     that matters.
     """
     bits = bits_of(x)
-    m = float_of((bits & FRACTION) | ONE)
+    m = float_of((bits & FRACTION) | ONE_BITS)
     c: Array | float = 1.0
     k: Array | float = 0.0
     dk: Array | float = 0.0
@@ -162,9 +162,9 @@ def _log2_terms(x: Array, shift: float = 0.0) -> tuple[Array, Array]:
     dz = (square - z_head) + ds * (s + s + ds)
     z = z_head + dz
     leading = z_head * tables.LOG2_3[0]
-    rest = z * (tables.LOG2_3[1] + z * polynomial(z, tables.LOG2_5)) + dz * tables.LOG2_3[0]
+    error = z * (tables.LOG2_3[1] + z * polynomial(z, tables.LOG2_5)) + dz * tables.LOG2_3[0]
     g = head_of(tables.LOG2_1[0] + leading)
-    dg = ((tables.LOG2_1[0] - g) + leading) + (rest + tables.LOG2_1[1])
+    dg = ((tables.LOG2_1[0] - g) + leading) + (error + tables.LOG2_1[1])
 
     value, e = fast_two_sum(k, s * g)  # k is 0 or the larger one
     return fast_two_sum(value, e + (dk + (s * dg + ds * (g + dg))))
@@ -173,8 +173,8 @@ def _log2_terms(x: Array, shift: float = 0.0) -> tuple[Array, Array]:
 def _product_terms(y: Array, log: tuple[Array, Array]) -> tuple[Array, Array]:
     """The product of y and the sum of two numbers: the first term has 52 bits, exactly."""
     y_head, log_head = head_of(y), head_of(log[0])
-    rest = y_head * (log[0] - log_head) + (y - y_head) * log[0]
-    return y_head * log_head, rest + y * log[1]
+    error = y_head * (log[0] - log_head) + (y - y_head) * log[0]
+    return y_head * log_head, error + y * log[1]
 
 
 def pow(x: Array, y: Array) -> Array:
@@ -183,7 +183,7 @@ def pow(x: Array, y: Array) -> Array:
     k, bits = nearest(high)
     w, d = exp2_terms(high - k, low)
     is_ordinary = (x >= TINY) & (x < math.inf) & (lax.abs(high) < 1021.0)
-    return unless(is_ordinary, scaled(w + d, bits), _pow_extreme, x, y)
+    return branch_unless(is_ordinary, scale_by_power(w + d, bits), _pow_extreme, x, y)
 
 
 def _pow_extreme(x: Array, y: Array) -> Array:
@@ -193,16 +193,16 @@ def _pow_extreme(x: Array, y: Array) -> Array:
     is_limit = is_0 | (size == math.inf)
     is_subnormal = size < TINY
     # Beyond these limits of y and of the exponent the power is 0, 1 or ∞, and they avoid ∞ − ∞.
-    bounded = where(lax.abs(y) > 2.0**65, where(y > 0.0, 2.0**65, -(2.0**65)), y)
+    exponent = where(lax.abs(y) > 2.0**65, where(y > 0.0, 2.0**65, -(2.0**65)), y)
     log, d_log = _log2_terms(where(is_subnormal, size * 2.0**54, size))
     exact, e = two_sum(log, where(is_subnormal, -54.0, 0.0))
-    high, low = _product_terms(bounded, fast_two_sum(exact, e + d_log))
+    high, low = _product_terms(exponent, fast_two_sum(exact, e + d_log))
     is_far = lax.abs(high) > 2000.0
     high = where(is_far, where(high > 0.0, 2000.0, -2000.0), high)
     low = where(is_far, 0.0, low)
     k, bits = nearest(high)
     w, d = exp2_terms(high - k, low)
-    value = scaled_twice(w + d, bits)
+    value = scale_in_two_steps(w + d, bits)
 
     value = where(is_limit, where(is_0 ^ (y < 0.0), 0.0, math.inf), value)
     is_integer = lax.floor(y) == y
@@ -215,24 +215,24 @@ def _pow_extreme(x: Array, y: Array) -> Array:
     return where((x == 1.0) | (y == 0.0), 1.0, value)
 
 
-def half_integer_power(twice: int) -> Callable[[Array], Array]:
-    """The function x^(twice/2) of odd `twice`: products, a root, and a quotient if negative.
+def half_integer_power(numerator: int) -> Callable[[Array], Array]:
+    """The function x^(`numerator`/2): products, a root, and a quotient if it is negative.
 
     Errors grow by about one ulp per product. Intermediate results leave the range of normal numbers
-    only if x^(|twice|/2) does.
+    only if x^(|numerator|/2) does.
     """
-    if twice % 2 == 0:
-        raise ValueError(f"twice must be odd, got {twice}.")
-    count = abs(twice) // 2
-    at_infinity, at_0 = (0.0, math.inf) if twice < 0 else (math.inf, 0.0)
+    if numerator % 2 == 0:
+        raise ValueError(f"numerator must be odd, got {numerator}.")
+    count = abs(numerator) // 2
+    at_infinity, at_0 = (0.0, math.inf) if numerator < 0 else (math.inf, 0.0)
 
     def power(x: Array) -> Array:
-        value, factor, remaining = lax.sqrt(x), x, count
-        while remaining:
-            value = value * factor if remaining % 2 else value
-            remaining //= 2
-            factor = factor * factor if remaining else factor
-        value = 1.0 / value if twice < 0 else value
+        value, factor, exponent = lax.sqrt(x), x, count
+        while exponent:
+            value = value * factor if exponent % 2 else value
+            exponent //= 2
+            factor = factor * factor if exponent else factor
+        value = 1.0 / value if numerator < 0 else value
         value = where(x == 0.0, at_0, value)  # −0 and −∞ included, as in C99
         return where(lax.abs(x) == math.inf, at_infinity, value)
 
@@ -249,7 +249,7 @@ def cbrt(x: Array) -> Array:
 
     def normal(size, shift):
         bits = bits_of(size)
-        m = float_of((bits & FRACTION) | ONE)
+        m = float_of((bits & FRACTION) | ONE_BITS)
         exponent = exponent_of(bits)
         k, k_bits = nearest(exponent * (1 / 3) - 1 / 3)
         j = exponent - 3.0 * k
@@ -264,14 +264,14 @@ def cbrt(x: Array) -> Array:
         head = head_of(t)
         cube = head * head
         cube_head = head_of(cube)
-        rest = (v - cube_head * head) - (cube - cube_head) * head
-        value = head + rest * (square * (1 / 3)) * (1.0 + (t - head) * y)
-        return scaled(value, k_bits - np.int64(shift))
+        residual = (v - cube_head * head) - (cube - cube_head) * head
+        value = head + residual * (square * (1 / 3)) * (1.0 + (t - head) * y)
+        return scale_by_power(value, k_bits - np.int64(shift))
 
     def extreme(size):
         return where((size > 0.0) & (size < TINY), normal(size * 2.0**54, 18), size)
 
-    value = unless((size >= TINY) & (size < math.inf), normal(size, 0), extreme, size)
+    value = branch_unless((size >= TINY) & (size < math.inf), normal(size, 0), extreme, size)
     return with_sign_of(value, bits_of(x))
 
 
@@ -288,4 +288,4 @@ def erf_inv(x: Array) -> Array:
         value = x * polynomial(1.0 - 6.0 / (lax.sqrt(w) + 2.0), tables.ERF_INV_TAIL)
         return where(lax.abs(x) == 1.0, x * math.inf, value)
 
-    return unless(w < 6.25, x * split_polynomial(v, v * v, tables.ERF_INV), tail, x, w)
+    return branch_unless(w < 6.25, x * split_polynomial(v, v * v, tables.ERF_INV), tail, x, w)

@@ -12,7 +12,7 @@ Real = Any  # an array or a constant of NumPy or Python
 SIGN = np.int64(-(2**63))
 FRACTION = np.int64(2**52 - 1)
 LOW_HALF = np.int64(2**32 - 1)
-ONE = np.int64(0x3FF0_0000_0000_0000)  # the bits of 1.0
+ONE_BITS = np.int64(0x3FF0_0000_0000_0000)  # the bits of 1.0
 TINY = 2.0**-1022  # the smallest normal number
 
 
@@ -38,7 +38,7 @@ def where(condition: Array, x: Array | float, y: Array | float) -> Array:
     )
 
 
-def unless(is_ordinary: Array, ordinary: Array, extreme: Callable[..., Array], *args: Array):
+def branch_unless(is_ordinary: Array, ordinary: Array, extreme: Callable[..., Array], *args: Array):
     """`ordinary`, and `extreme(*args)` in a branch for the other arguments, NaN among them."""
     return lax.cond(
         is_ordinary, lambda ordinary, *_: ordinary, lambda _, *args: extreme(*args), ordinary, *args

@@ -9,24 +9,24 @@ from .jaxapi import ClosedJaxpr, bodies, scan_counts
 
 
 def functions_in(eqn: Any) -> list[ClosedJaxpr]:
-    """The jaxpr of what `call` was given, if an equation of a jaxpr is such a call: it is not
-    among those that the equation shows."""
+    """The function of a `call`, if an equation is one: it is not among its `bodies`."""
     is_call = eqn.primitive.name == "lanewise"
-    return [eqn.params["program"].traced.closed] if is_call else []
+    return [eqn.params["program"].trace.closed_jaxpr] if is_call else []
 
 
-def carried(jaxpr: Any) -> int:
+def carry_size(jaxpr: Any) -> int:
     """Numbers that the innermost loop with most of them carries from step to step."""
-    most = 0
+    largest = 0
     for eqn in jaxpr.eqns:
         for body in bodies(eqn):
-            most = max(most, carried(body.jaxpr))
+            largest = max(largest, carry_size(body.jaxpr))
         if eqn.primitive.name == "scan":
             _, count = scan_counts(eqn.params)
-            state = [v.aval for v in eqn.outvars[:count]]
+            state = [var.aval for var in eqn.outvars[:count]]
             # Large arrays stay in memory and take no register; integers are few.
-            most = max(most, sum(a.size for a in state if a.size <= 64 and a.dtype.kind == "f"))
-    return most
+            sizes = [aval.size for aval in state if aval.size <= 64 and aval.dtype.kind == "f"]
+            largest = max(largest, sum(sizes))
+    return largest
 
 
 MOST_IN_PAIRS = 150_000
@@ -40,36 +40,34 @@ def most_operations(jaxpr: Any) -> int:
 
 
 def _has_exact_products(jaxpr: Any) -> bool:
-    return any(
-        eqn.primitive.name == "lost_by_product"
-        or any(_has_exact_products(body.jaxpr) for body in (*bodies(eqn), *functions_in(eqn)))
-        for eqn in jaxpr.eqns
-    )
+    functions = [f for eqn in jaxpr.eqns for f in (*bodies(eqn), *functions_in(eqn))]
+    has_one = any(eqn.primitive.name == "lost_by_product" for eqn in jaxpr.eqns)
+    return has_one or any(_has_exact_products(function.jaxpr) for function in functions)
 
 
 def operation_count(jaxpr: Any) -> int:
     """How many operations on numbers the evaluation is made of, loops counted once; roughly."""
     count = 0
     for eqn in jaxpr.eqns:
-        inside = (*bodies(eqn), *functions_in(eqn))
+        functions = (*bodies(eqn), *functions_in(eqn))
         if eqn.primitive.name == "custom_linear_solve":
             # Only this one of its four functions is run.
-            inside = (eqn.params["jaxprs"].solve,)
-        inner = [operation_count(b.jaxpr) for b in inside]
+            functions = (eqn.params["jaxprs"].solve,)
+        inner = [operation_count(function.jaxpr) for function in functions]
         if inner:
             count += sum(inner)
             continue
-        size = max((v.aval.size for v in eqn.outvars), default=0)
-        if eqn.primitive.name == "dot_general":
-            (contracted, _), _ = eqn.params["dimension_numbers"]
+        name, size = eqn.primitive.name, max((v.aval.size for v in eqn.outvars), default=0)
+        if name == "dot_general":
+            (axes, _), _ = eqn.params["dimension_numbers"]
             # One fused multiply-add for each term.
-            size *= int(np.prod([eqn.invars[0].aval.shape[i] for i in contracted]))
-        elif eqn.primitive.name.startswith("reduce_"):
+            size *= int(np.prod([eqn.invars[0].aval.shape[i] for i in axes]))
+        elif name.startswith("reduce_"):
             size = eqn.invars[0].aval.size
-        elif eqn.primitive.name == "eliminate":
+        elif name == "eliminate":
             n, matrices = eqn.invars[0].aval.shape[-1], eqn.invars[0].aval.size
             size = matrices * n // 3 + size * n - matrices  # more columns of one matrix
-        elif eqn.primitive.name in _FREE:
+        elif name in _FREE:
             size = 0
         count += size
     return count

@@ -68,7 +68,7 @@ def backends_are_initialized() -> bool:
 def bodies(eqn: Any) -> Iterator[ClosedJaxpr]:
     """The jaxprs among the parameters of an equation, closed: what it calls."""
     if "_prim" in eqn.params:  # from jax 0.12 on, custom_root and others
-        yield _expanded(eqn)
+        yield _expansion(eqn)
     for value in eqn.params.values():
         for item in value if isinstance(value, tuple | list) else (value,):
             if isinstance(item, ClosedJaxpr):
@@ -77,14 +77,19 @@ def bodies(eqn: Any) -> Iterator[ClosedJaxpr]:
                 yield ClosedJaxpr(item, ())
 
 
-def _expanded(eqn: Any) -> ClosedJaxpr:
+def _expansion(eqn: Any) -> ClosedJaxpr:
     """The jaxpr of an equation that is expanded late."""
-    which = eqn.params["_prim"]
+    operation = eqn.params["_prim"]
 
     def function(*leaves):
-        return jax.tree.leaves(which.expand(*jax.tree.unflatten(which.in_tree, leaves)))
+        return jax.tree.leaves(operation.expand(*jax.tree.unflatten(operation.in_tree, leaves)))
 
-    return jax.make_jaxpr(function)(*(v.aval for v in eqn.invars))
+    return jax.make_jaxpr(function)(*(var.aval for var in eqn.invars))
+
+
+def variables(atoms: Iterable[Any]) -> list[Any]:
+    """Those of the operands of an equation that are no literals."""
+    return [atom for atom in atoms if not isinstance(atom, Literal)]
 
 
 def scan_counts(params: dict[str, Any]) -> tuple[int, int]:
@@ -97,8 +102,8 @@ def scan_counts(params: dict[str, Any]) -> tuple[int, int]:
 
 def manual_axes(*values: Any) -> frozenset[str]:
     """The mesh axes of `jax.shard_map` along which one of some values or types varies."""
-    types = [jax.typeof(x) if not isinstance(x, ShapedArray) else x for x in values]
-    return frozenset().union(*(t.manual_axis_type.varying for t in types))
+    types = [jax.typeof(value) if not isinstance(value, ShapedArray) else value for value in values]
+    return frozenset().union(*(kind.manual_axis_type.varying for kind in types))
 
 
 def without_manual_axes(x: Any) -> Any:
@@ -121,13 +126,13 @@ def with_equal_axes(xs: Sequence[Any]) -> list[Any]:
     ]
 
 
-def _lowered(function: Callable, multiple: bool) -> Callable:
+def _lowering(function: Callable, multiple: bool) -> Callable:
     """The lowering of a primitive as what `function` does on one device."""
     rule = mlir.lower_fun(function, multiple_results=multiple)
 
     def for_one_device(ctx: Any, *operands: Any, **params: Any) -> Any:
         plain = {
-            name: [ShapedArray(a.shape, a.dtype) for a in getattr(ctx, name)]
+            name: [ShapedArray(aval.shape, aval.dtype) for aval in getattr(ctx, name)]
             for name in ("avals_in", "avals_out")
             if manual_axes(*getattr(ctx, name))
         }
@@ -137,11 +142,11 @@ def _lowered(function: Callable, multiple: bool) -> Callable:
 
 
 def primitive(
-    name: str, function: Callable, batched: Callable | None = None, multiple: bool = False
+    name: str, function: Callable, batch_rule: Callable | None = None, multiple: bool = False
 ) -> Primitive:
     """A primitive of its own name that does what `function` (of arrays and parameters) does.
 
-    `batched(arrays, axes, **params)` → (output, axis or None) is its rule under `vmap`, that of
+    `batch_rule(arrays, axes, **params)` → (output, axis or None) is its rule under `vmap`, that of
     `function` if left out. `multiple` says that it gives a list of arrays. It has no derivative.
     """
     new = Primitive(name)
@@ -151,65 +156,70 @@ def primitive(
     new.is_high = lambda *avals, **params: False
     new.def_impl(function)
     new.def_abstract_eval(lambda *avals, **params: _abstract(function, avals, params))
-    mlir.register_lowering(new, _lowered(function, multiple))
+    mlir.register_lowering(new, _lowering(function, multiple))
 
     def as_function(arrays, axes, **params):
-        return jax.vmap(lambda *a: function(*a, **params), axes, 0)(*arrays), 0
+        return jax.vmap(lambda *operands: function(*operands, **params), axes, 0)(*arrays), 0
 
-    batching.primitive_batchers[new] = batched or as_function
+    batching.primitive_batchers[new] = batch_rule or as_function
     return new
 
 
 def batch_in_front(arrays: Sequence[Any], axes: Sequence[Any]) -> tuple[int, list, list]:
-    """The number of elements of a batch, the arrays with its axis in front, and whether they have
-    it: 0 or None, as `jax.vmap` takes it."""
+    """The size of a batch, the arrays with its axis in front, and the axis of each: 0 or None."""
     pairs = list(zip(arrays, axes, strict=True))
-    (size,) = {x.shape[a] for x, a in pairs if a is not None}
-    moved = [x if a is None else jnp.moveaxis(x, a, 0) for x, a in pairs]
-    return size, moved, [None if a is None else 0 for a in axes]
+    (size,) = {x.shape[axis] for x, axis in pairs if axis is not None}
+    in_front = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in pairs]
+    return size, in_front, [None if axis is None else 0 for axis in axes]
 
 
-def lower_on(platform: str, of: Primitive, function: Callable) -> None:
+def broadcast_in_front(arrays: Sequence[Any], axes: Sequence[Any]) -> tuple[int, list]:
+    """The number of elements of a batch, and all arrays with its axis in front."""
+    size, in_front, axes = batch_in_front(arrays, axes)
+    pairs = zip(in_front, axes, strict=True)
+    return size, [jnp.broadcast_to(x, (size, *x.shape)) if a is None else x for x, a in pairs]
+
+
+def lower_on(platform: str, operation: Primitive, function: Callable) -> None:
     """Have a primitive of several outputs compiled for `platform` as what `function` does."""
-    mlir.register_lowering(of, _lowered(function, True), platform=platform)
+    mlir.register_lowering(operation, _lowering(function, True), platform=platform)
 
 
-def drops_outputs(of: Primitive, without: Callable) -> None:
-    """Have unused outputs of a primitive dropped: `without(params, used)` → its new parameters."""
+def drops_outputs(operation: Primitive, new_params: Callable) -> None:
+    """Have unused outputs of a primitive dropped; `new_params(params, flags)`: its parameters."""
 
-    def rule(used: list[bool], *more: Any):
-        eqn = more[-1]  # newer releases put something in between
+    def rule(flags: list[bool], *arguments: Any):
+        eqn = arguments[-1]  # newer releases put something in between
         # JAX drops the equation then.
-        if not any(used):
+        if not any(flags):
             return [False] * len(eqn.invars), None
-        outvars = [v for v, u in zip(eqn.outvars, used, strict=True) if u]
-        new = eqn.replace(outvars=outvars, params=without(eqn.params, used))
+        outvars = [v for v, u in zip(eqn.outvars, flags, strict=True) if u]
+        new = eqn.replace(outvars=outvars, params=new_params(eqn.params, flags))
         # All inputs stay: which of them are needed would take a further trace.
         return [True] * len(eqn.invars), new
 
-    partial_eval.dce_rules[of] = rule
+    partial_eval.dce_rules[operation] = rule
 
 
-def has_derivative(of: Primitive, rule: Callable) -> None:
+def has_derivative(operation: Primitive, rule: Callable) -> None:
     """Give a primitive of several outputs a derivative: ``rule(primals, changes, **params)`` →
     (outputs, their changes), where `changes` has those of the operands that change, by position,
     and None for an output that does not change."""
 
-    def both(primals, tangents, **params):
+    def outputs_and_tangents(primals, tangents, **params):
         changes = {i: t for i, t in enumerate(tangents) if not isinstance(t, ad.Zero)}
-        outs, moved = rule(primals, changes, **params)
-        return outs, [
-            ad.Zero(jax.typeof(x).to_tangent_aval()) if t is None else t
-            for x, t in zip(outs, moved, strict=True)
-        ]
+        outs, out_tangents = rule(primals, changes, **params)
+        zeros = [ad.Zero(jax.typeof(out).to_tangent_aval()) for out in outs]
+        pairs = zip(zeros, out_tangents, strict=True)
+        return outs, [zero if tangent is None else tangent for zero, tangent in pairs]
 
-    ad.primitive_jvps[of] = both
+    ad.primitive_jvps[operation] = outputs_and_tangents
 
 
-def without_outputs(closed: ClosedJaxpr, used: list[bool]) -> ClosedJaxpr:
+def without_outputs(function: ClosedJaxpr, flags: list[bool]) -> ClosedJaxpr:
     """The jaxpr that computes only some outputs, of the same inputs."""
-    jaxpr = partial_eval.dce_jaxpr(closed.jaxpr, used, instantiate=True)[0]
-    return ClosedJaxpr(jaxpr, closed.consts)
+    jaxpr = partial_eval.dce_jaxpr(function.jaxpr, flags, instantiate=True)[0]
+    return ClosedJaxpr(jaxpr, function.consts)
 
 
 def linear_map(push: Callable, pull: Callable, definition: Callable, residuals: Any, x: Any) -> Any:
@@ -250,28 +260,25 @@ class _Linear(NamedTuple):
     transposed: bool
 
 
-def _pushed(*arrays, functions: _Linear, count: int) -> list[Any]:
+def _push(*arrays, functions: _Linear, count: int) -> list[Any]:
     return functions.push(*arrays)
 
 
 def _linear_batched(arrays, axes, *, functions: _Linear, count: int):
-    size, moved, on = batch_in_front(arrays, axes)
-    own = on[:count]
-    vector = [
-        jnp.broadcast_to(x, (size, *x.shape)) if o is None else x
-        for x, o in zip(moved[count:], on[count:], strict=True)
-    ]
+    size, residuals, residual_axes = batch_in_front(arrays, axes)
+    _, vector = broadcast_in_front(arrays, axes)
 
-    def all_of(function: Callable) -> Callable:
-        def of(*arrays):
-            every = [*own, *[0] * (len(arrays) - count)]
-            return jax.vmap(function, every, 0, axis_size=size)(*arrays)
+    def in_batches(function: Callable) -> Callable:
+        def batched_function(*arrays):
+            all_axes = [*residual_axes[:count], *[0] * (len(arrays) - count)]
+            return jax.vmap(function, all_axes, 0, axis_size=size)(*arrays)
 
-        return of
+        return batched_function
 
     push, pull, definition, transposed = functions
-    new = _Linear(all_of(push), all_of(pull), all_of(definition), transposed)
-    outs = _linear.bind(*moved[:count], *vector, functions=new, count=count)
+    new = _Linear(in_batches(push), in_batches(pull), in_batches(definition), transposed)
+    operands = [*residuals[:count], *vector[count:]]
+    outs = _linear.bind(*operands, functions=new, count=count)
     return outs, [0] * len(outs)
 
 
@@ -279,12 +286,12 @@ def _linear_transposed(cotangents, *arrays, functions: _Linear, count: int):
     push, pull, definition, transposed = functions
     types = [x.aval if ad.is_undefined_primal(x) else jax.typeof(x) for x in arrays]
     like = jax.eval_shape(push, *(jax.ShapeDtypeStruct(a.shape, a.dtype) for a in types))
-    given = [
+    vector = [
         jnp.zeros(a.shape, a.dtype) if isinstance(c, ad.Zero) else c
         for c, a in zip(cotangents, like, strict=True)
     ]
     new = _Linear(pull, push, definition, not transposed)
-    return [None] * count + list(_linear.bind(*arrays[:count], *given, functions=new, count=count))
+    return [None] * count + list(_linear.bind(*arrays[:count], *vector, functions=new, count=count))
 
 
 def _linear_derivative(primals, tangents, *, functions: _Linear, count: int):
@@ -293,47 +300,47 @@ def _linear_derivative(primals, tangents, *, functions: _Linear, count: int):
     change = [ad.instantiate_zeros(t) for t in tangents[count:]]
     # Linear in x: the map of the change.
     total = _linear.bind(*known, *change, functions=functions, count=count)
-    moves = [i for i, t in enumerate(tangents[:count]) if not isinstance(t, ad.Zero)]
+    indices = [i for i, t in enumerate(tangents[:count]) if not isinstance(t, ad.Zero)]
     # In the residuals the map is not linear: its definition is differentiated by them.
-    if moves:
+    if indices:
 
         def of(*moving):
-            values = dict(zip(moves, moving, strict=True))
+            values = dict(zip(indices, moving, strict=True))
             residuals = [values.get(i, r) for i, r in enumerate(known)]
             if not functions.transposed:
                 return functions.definition(*residuals, *x)
             back = jax.linear_transpose(lambda *y: functions.definition(*residuals, *y), *outs)
             return list(back(list(x)))
 
-        _, more = jax.jvp(of, [known[i] for i in moves], [tangents[i] for i in moves])
-        total = [a + b for a, b in zip(total, more, strict=True)]
+        _, residual_part = jax.jvp(of, [known[i] for i in indices], [tangents[i] for i in indices])
+        total = [a + b for a, b in zip(total, residual_part, strict=True)]
     return outs, total
 
 
-_linear = primitive("linear_map", _pushed, _linear_batched, multiple=True)
+_linear = primitive("linear_map", _push, _linear_batched, multiple=True)
 ad.primitive_transposes[_linear] = _linear_transposed
 ad.primitive_jvps[_linear] = _linear_derivative
 
 
 def _abstract(function: Callable, avals: Any, params: dict[str, Any]) -> Any:
-    shapes = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in avals]
+    shapes = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in avals]
     shape_of = getattr(function, "shape_of", None)
     if shape_of is not None:
         out = shape_of(*shapes, **params)
     else:
-        out = jax.eval_shape(lambda *a: function(*a, **params), *shapes)
+        out = jax.eval_shape(lambda *aval: function(*aval, **params), *shapes)
     # Inside of `jax.shard_map` the types of results have to say along which axes they vary.
     axes = manual_axes(*avals)
     if not axes:
         return jax.tree.map(lambda x: ShapedArray(x.shape, x.dtype), out)
     varying = type(avals[0].manual_axis_type)(varying=axes)
-    mesh = next(a.sharding.mesh for a in avals if manual_axes(a))
+    mesh = next(aval.sharding.mesh for aval in avals if manual_axes(aval))
 
-    def typed(x: Any) -> ShapedArray:
+    def result_type(x: Any) -> ShapedArray:
         sharding = NamedSharding(mesh, PartitionSpec(*[None] * len(x.shape)))
         return ShapedArray(x.shape, x.dtype, sharding=sharding, manual_axis_type=varying)
 
-    return jax.tree.map(typed, out)
+    return jax.tree.map(result_type, out)
 
 
 def of_one_equation(jaxpr: Jaxpr, eqn: Any, inputs: Sequence[Any]) -> ClosedJaxpr:

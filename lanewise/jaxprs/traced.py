@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -11,15 +12,14 @@ from .jaxapi import ClosedJaxpr, is_traced, jaxpr_as_fun, without_manual_axes, w
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Traced:
-    """A function of one trajectory as a jaxpr; the values of a trace outside that it closes over
-    (`outer`) are its first operands."""
+class Trace:
+    """A function as a jaxpr; traced values that it closes over are its first operands, `outer`."""
 
-    closed: ClosedJaxpr
+    closed_jaxpr: ClosedJaxpr
     out_tree: Any = None
 
     @classmethod
-    def of(cls, function: Callable, leaves: Sequence[Any], tree: Any) -> "Traced":
+    def from_function(cls, function: Callable, leaves: Sequence[Any], tree: Any) -> "Trace":
         # The structure of the result is known only once the function has run.
         trees: list[Any] = []
 
@@ -33,31 +33,30 @@ class Traced:
 
     @functools.cached_property
     def outer(self) -> list[Any]:
-        return [c for c in self.closed.consts if is_traced(c)]
+        return [const for const in self.closed_jaxpr.consts if is_traced(const)]
 
     def __call__(self, *operands: Any) -> list[Any]:
         outer = iter(operands[: len(self.outer)])
-        consts = [next(outer) if is_traced(c) else c for c in self.closed.consts]
-        closed = ClosedJaxpr(self.closed.jaxpr, consts)
-        return jaxpr_as_fun(closed)(*operands[len(self.outer) :])
+        consts = [next(outer) if is_traced(const) else const for const in self.closed_jaxpr.consts]
+        function = ClosedJaxpr(self.closed_jaxpr.jaxpr, consts)
+        return jaxpr_as_fun(function)(*operands[len(self.outer) :])
 
-    def giving(self, used: list[bool]) -> "Traced":
+    def with_outputs(self, flags: list[bool]) -> "Trace":
         """The function that gives some of the outputs only, as a flat list."""
-        return Traced(without_outputs(self.closed, used))
+        return Trace(without_outputs(self.closed_jaxpr, flags))
 
     @functools.cached_property
     def all_inputs(self) -> ClosedJaxpr:
         """The jaxpr with what is closed over and traced in front of its inputs."""
-        jaxpr, consts = self.closed.jaxpr, self.closed.consts
+        jaxpr, consts = self.closed_jaxpr.jaxpr, self.closed_jaxpr.consts
         if not self.outer:
-            return self.closed
-        traced = [is_traced(c) for c in consts]
+            return self.closed_jaxpr
+        flags = [is_traced(const) for const in consts]
         # Constants whose values are known stay constants, which may be folded.
-        front = [v for v, t in zip(jaxpr.constvars, traced, strict=True) if t]
-        known = [(v, c) for v, c, t in zip(jaxpr.constvars, consts, traced, strict=True) if not t]
+        others = [not is_outer for is_outer in flags]
         new = jaxpr.replace(
-            constvars=[v for v, _ in known],
-            invars=[*front, *jaxpr.invars],
+            constvars=list(itertools.compress(jaxpr.constvars, others)),
+            invars=[*itertools.compress(jaxpr.constvars, flags), *jaxpr.invars],
             debug_info=jaxpr.debug_info.with_unknown_names(),
         )
-        return ClosedJaxpr(new, [c for _, c in known])
+        return ClosedJaxpr(new, list(itertools.compress(consts, others)))

@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from .ir import FLOATS, TYPES, Num, Unsupported, Writer
+from .ir import FLOATS, TYPES, NotCompilable, Num, Writer, call_of, check_type
 
 # Operations whose result is not finite where an operand is not.
 _HANDED_ON = frozenset(["add", "sub", "mul", "fma", "neg", "sqrt", "same"])
 _MOST_SEEN = 300  # operations that are followed back: more would take longer than what they save
-_FEW = 12  # with more numbers than this each of them is checked
+_MOST_COMPARED = 12  # with more numbers than this each of them is checked
 _COMPARISONS: dict[str, Callable] = {
     "eq": np.equal,
     "ne": np.not_equal,
@@ -23,56 +23,52 @@ _LOGIC = {"and": np.bitwise_and, "or": np.bitwise_or, "xor": np.bitwise_xor}
 _SHIFTS = {"shift_left": "shl", "shift_right_logical": "lshr", "shift_right_arithmetic": "ashr"}
 
 
-class Arithmetic(Writer):
+class Operations(Writer):
     """The operations of the components of a function."""
 
     def add(self, a: Num, b: Num) -> Num:
-        if a.known is not None and b.known is not None:
+        if a.value is not None and b.value is not None:
             return self._fold(np.add, a, b)
-        if a.is_known_as(0):
+        if a.is_const(0):
             return b
-        if b.is_known_as(0):
+        if b.is_const(0):
             return a
         if not a.is_float:
             return self._commute("add", a, b, "add")
         # The one rule of contraction: a product that is an operand of a sum, the first one first.
         for product, other in ((a, b), (b, a)):
-            factors = self._factors(product)
-            if factors is not None:
+            if factors := self._factors(product):
                 return self.fma(*factors, other)
         return self._commute("add", a, b, "fadd")
 
     def sub(self, a: Num, b: Num) -> Num:
-        if a.known is not None and b.known is not None:
+        if a.value is not None and b.value is not None:
             return self._fold(np.subtract, a, b)
-        if b.is_known_as(0):
+        if b.is_const(0):
             return a
         if not a.is_float:
             return self.instruction("sub", (a, b))
-        if a.is_known_as(0):
+        if a.is_const(0):
             return self.neg(b)
-        factors = self._factors(a)
-        if factors is not None:
+        if factors := self._factors(a):
             return self.fma(*factors, self.neg(b))
-        factors = self._factors(b)
-        if factors is not None:
+        if factors := self._factors(b):
             return self.fma(self.neg(factors[0]), factors[1], a)
         return self.instruction("fsub", (a, b), "sub")
 
     def mul(self, a: Num, b: Num) -> Num:
-        if a.known is not None and b.known is not None:
+        if a.value is not None and b.value is not None:
             return self._fold(np.multiply, a, b)
         for x, y in ((a, b), (b, a)):
-            joined = self._joined_factors(x, y)
-            if joined is not None:
-                return self.mul(*joined)
+            if factors := self._joined_factors(x, y):
+                return self.mul(*factors)
         for x, y in ((a, b), (b, a)):
             # Not for every zero: 0·∞ and 0·NaN are NaN, as in IEEE 754.
-            if x.structural and x.is_known_as(0):
+            if x.structural and x.is_const(0):
                 return x
-            if x.is_known_as(1):
+            if x.is_const(1):
                 return y
-            if x.is_known_as(-1) and x.is_float:
+            if x.is_const(-1) and x.is_float:
                 return self.neg(y)
         if not a.is_float:
             return self._commute("imul", a, b, "mul")
@@ -95,20 +91,20 @@ class Arithmetic(Writer):
     def _joined_factors(self, c: Num, x: Num) -> tuple[Num, Num] | None:
         """(c·d, y) for c and x = d·y with c and d known, where c·(d·y) = (c·d)·y to the bit and no
         number leaves the range earlier: one of them is a power of two. x + x counts as 2·x."""
-        if c.known is None or not c.is_float or c.structural:
+        if c.value is None or not c.is_float or c.structural:
             return None
         if x.op == "add" and x.args[0].key == x.args[1].key:
-            d, y = self.known(2, x.dtype), x.args[0]
-        elif x.op == "mul" and (x.args[0].known is not None or x.args[1].known is not None):
-            d, y = x.args if x.args[0].known is not None else x.args[::-1]
+            d, y = self.const(2, x.dtype), x.args[0]
+        elif x.op == "mul" and (x.args[0].value is not None or x.args[1].value is not None):
+            d, y = x.args if x.args[0].value is not None else x.args[::-1]
         else:
             return None
-        two = is_power_of_two(c.known) or is_power_of_two(d.known)
+        two = is_power_of_two(c.value) or is_power_of_two(d.value)
         with np.errstate(all="ignore"):
-            both = np.asarray(c.known * d.known, x.dtype)
+            product = np.asarray(c.value * d.value, x.dtype)
         # A subnormal d·y would have lost digits, which (c·d)·y has.
-        normal = np.finfo(x.dtype).tiny <= abs(both) < np.inf
-        return (self.known(both, x.dtype), y) if two and normal else None
+        normal = np.finfo(x.dtype).tiny <= abs(product) < np.inf
+        return (self.const(product, x.dtype), y) if two and normal else None
 
     def fma(self, a: Num, b: Num, c: Num) -> Num:
         # fma(−a, b, c) has one instruction, whatever operand the sign belongs to.
@@ -119,69 +115,68 @@ class Arithmetic(Writer):
         return self.intrinsic("fma", (a, b, c))
 
     def div(self, a: Num, b: Num) -> Num:
-        if a.known is not None and b.known is not None and a.is_float:
+        if a.value is not None and b.value is not None and a.is_float:
             return self._fold(np.divide, a, b)
         if not a.is_float:
             return self._integer_division("div", a, b)
-        if b.is_known_as(1):
+        if b.is_const(1):
             return a
-        if b.is_known_as(-1):
+        if b.is_const(-1):
             return self.neg(a)
-        if a.structural and a.is_known_as(0):
+        if a.structural and a.is_const(0):
             return a
         if a.op == "neg":
             return self.neg(self.div(a.args[0], b))
-        if b.known is not None and _has_exact_reciprocal(b.known):
-            return self.mul(a, self.known(1 / b.known, b.dtype))
+        if b.value is not None and _has_exact_reciprocal(b.value):
+            return self.mul(a, self.const(1 / b.value, b.dtype))
         # c/x = c·(1/x) to the bit where 1/x cannot leave the range: −1, or x a square root. So that
         # 1/x is computed once for several c.
-        by_reciprocal = b.op == "sqrt" and a.known is not None and is_power_of_two(a.known)
-        if a.is_known_as(-1) or (by_reciprocal and not a.is_known_as(1)):
-            return self.mul(a, self.div(self.known(1, a.dtype), b))
+        by_reciprocal = b.op == "sqrt" and a.value is not None and is_power_of_two(a.value)
+        if a.is_const(-1) or (by_reciprocal and not a.is_const(1)):
+            return self.mul(a, self.div(self.const(1, a.dtype), b))
         return self.instruction("fdiv", (a, b), "div")
 
     def neg(self, a: Num) -> Num:
-        if a.known is not None:
+        if a.value is not None:
             with np.errstate(all="ignore"):
-                return self.known(-a.known, a.dtype, a.structural and a.known == 0)
+                return self.const(-a.value, a.dtype, a.structural and a.value == 0)
         if a.op == "neg":
             return a.args[0]
         if not a.is_float:
-            return self.sub(self.known(0, a.dtype), a)
+            return self.sub(self.const(0, a.dtype), a)
         # −(x − y) stays: it is y − x but for the sign of a zero.
         return self.instruction("fneg", (a,), "neg")
 
     def _commute(self, op: str, a: Num, b: Num, word: str) -> Num:
-        found = self.find((op, a.dtype, b.key, a.key))
-        return self.instruction(word, (a, b), op) if found is None else found
+        number = self.find((op, a.dtype, b.key, a.key))
+        return self.instruction(word, (a, b), op) if number is None else number
 
     def _fold(self, function: Callable, *args: Num) -> Num:
         with np.errstate(all="ignore"):
-            value = function(*(a.known for a in args))
+            value = function(*(a.value for a in args))
         structural = all(a.structural for a in args) and value in (0, 1)
-        return self.known(value, args[0].dtype, structural)
+        return self.const(value, args[0].dtype, structural)
 
     def _integer_division(self, op: str, a: Num, b: Num) -> Num:
         """Quotient or remainder; by zero −1 or the dividend, as XLA has it."""
         if a.dtype == "bool":
-            raise Unsupported(f"{op} is not compiled for truth values")
-        signed = not a.dtype.startswith("u")
-        zero, one = self.known(0, a.dtype), self.known(1, a.dtype)
+            raise NotCompilable(f"{op} requires numbers, got bool")
+        zero, unit = self.const(0, a.dtype), self.const(1, a.dtype)
         by_zero = self.compare("eq", b, zero)
-        least = self.known(np.iinfo(a.dtype).min, a.dtype)
-        over = self.known(False, "bool")
-        if signed:
-            is_least, minus_1 = self.compare("eq", a, least), self.known(-1, a.dtype)
-            over = self.logic("and", is_least, self.compare("eq", b, minus_1))
+        smallest = self.const(np.iinfo(a.dtype).min, a.dtype)
+        overflow = self.const(False, "bool")
+        if not a.is_unsigned:
+            is_smallest, minus_1 = self.compare("eq", a, smallest), self.const(-1, a.dtype)
+            overflow = self.logic("and", is_smallest, self.compare("eq", b, minus_1))
         # The instruction ends the process for both, also on trajectories that do not need it.
-        safe = self.select(self.logic("or", by_zero, over), one, b)
-        word = ("s" if signed else "u") + ("div" if op == "div" else "rem")
+        safe = self.select(self.logic("or", by_zero, overflow), unit, b)
+        word = ("u" if a.is_unsigned else "s") + ("div" if op == "div" else "rem")
         value = self.instruction(word, (a, safe))
         if op == "div":
-            at_zero = self.known(-1 if signed else np.iinfo(a.dtype).max, a.dtype)
-            value = self.select(over, least, value)
+            at_zero = self.const(np.iinfo(a.dtype).max if a.is_unsigned else -1, a.dtype)
+            value = self.select(overflow, smallest, value)
         else:
-            at_zero, value = a, self.select(over, zero, value)
+            at_zero, value = a, self.select(overflow, zero, value)
         return self.select(by_zero, at_zero, value)
 
     def rem(self, a: Num, b: Num) -> Num:
@@ -192,7 +187,7 @@ class Arithmetic(Writer):
     def power(self, x: Num, n: int) -> Num:
         """xⁿ by squaring; of a negative n by that of 1/x."""
         if n < 0:
-            return self.power(self.div(self.known(1, x.dtype), x), -n)
+            return self.power(self.div(self.const(1, x.dtype), x), -n)
         result, square = None, x
         while n:
             if n & 1:
@@ -200,151 +195,143 @@ class Arithmetic(Writer):
             n >>= 1
             if n:
                 square = self.mul(square, square)
-        return self.known(1, x.dtype) if result is None else result
+        return self.const(1, x.dtype) if result is None else result
 
     def sqrt(self, a: Num) -> Num:
-        return self.intrinsic("sqrt", (a,)) if a.known is None else self._fold(np.sqrt, a)
+        return self.intrinsic("sqrt", (a,)) if a.value is None else self._fold(np.sqrt, a)
 
     def abs(self, a: Num) -> Num:
-        if a.known is not None:
+        if a.value is not None:
             return self._fold(np.abs, a)
         if a.is_float:
             return self.intrinsic("fabs", (a,))
-        if a.dtype.startswith("u"):
+        if a.is_unsigned:
             return a
-        return self.select(self.compare("lt", a, self.known(0, a.dtype)), self.neg(a), a)
+        return self.select(self.compare("lt", a, self.const(0, a.dtype)), self.neg(a), a)
 
     # --- comparisons and choices -----------------------------------------------------------------
 
     def compare(self, op: str, a: Num, b: Num) -> Num:
-        if a.known is not None and b.known is not None:
-            return self.known(_COMPARISONS[op](a.known, b.known), "bool")
-        if a.op == "select" and b.known is not None and not a.is_float:
-            which, yes, no = a.args  # a status that was chosen: compare what it was chosen from
-            if yes.known is not None or no.known is not None:
-                return self.select(which, self.compare(op, yes, b), self.compare(op, no, b))
+        if a.value is not None and b.value is not None:
+            return self.const(_COMPARISONS[op](a.value, b.value), "bool")
+        if a.op == "select" and b.value is not None and not a.is_float:
+            condition, yes, no = a.args  # a status that was chosen: compare what it was chosen from
+            if yes.value is not None or no.value is not None:
+                return self.select(condition, self.compare(op, yes, b), self.compare(op, no, b))
         if a.is_float:
             word = "fcmp " + {"eq": "oeq", "ne": "une"}.get(op, "o" + op)
         elif op in ("eq", "ne"):
             word = f"icmp {op}"
         else:
-            unsigned = a.dtype.startswith("u") or a.dtype == "bool"
-            word = f"icmp {'u' if unsigned else 's'}{op}"
-        return self.op(op, (a, b), "bool", lambda t, x, y: f"{word} {t} {x}, {y}")
-
-    def less(self, a: Num, b: Num) -> str:
-        """Whether a < b, as a scalar i1, for two scalars."""
-        return self.ref(self.compare("lt", a, b), 0, False)
+            word = f"icmp {'u' if a.is_unsigned else 's'}{op}"
+        return self.op(op, (a, b), "bool", lambda kind, x, y: f"{word} {kind} {x}, {y}")
 
     def logic(self, op: str, a: Num, b: Num) -> Num:
         """and, or, xor of truth values or of bits."""
-        if a.known is not None and b.known is not None:
+        if a.value is not None and b.value is not None:
             return self._fold(_LOGIC[op], a, b)
         if op == "and" and a.op == b.op == "finite" and a.args[0].dtype == b.args[0].dtype:
             first = self.finite_terms(a)
             return self.all_finite([*first, *self.finite_terms(b)], len(first))
         if a.dtype == "bool" and op != "xor":
             for x, y in ((a, b), (b, a)):
-                if x.known is not None:
-                    return y if bool(x.known) == (op == "and") else x
+                if x.value is not None:
+                    return y if bool(x.value) == (op == "and") else x
             if a.serial == b.serial:
                 return a
         return self._commute(op, a, b, op)
 
     def invert(self, a: Num) -> Num:
-        if a.known is not None:
+        if a.value is not None:
             return self._fold(np.invert, a)
         if a.op == "not":
             return a.args[0]
-        unsigned = a.dtype.startswith("u")
-        ones = True if a.dtype == "bool" else np.iinfo(a.dtype).max if unsigned else -1
-        return self.instruction("xor", (a, self.known(ones, a.dtype)), "not")
+        mask = True if a.dtype == "bool" else np.iinfo(a.dtype).max if a.is_unsigned else -1
+        return self.instruction("xor", (a, self.const(mask, a.dtype)), "not")
 
-    def select(self, which: Num, yes: Num, no: Num) -> Num:
-        if which.known is not None:
-            return yes if which.known else no
+    def select(self, condition: Num, yes: Num, no: Num) -> Num:
+        if condition.value is not None:
+            return yes if condition.value else no
         if yes is no or yes.key == no.key:
             return no
         # The same choice as one that may have been made: it is found again by its key.
-        if which.op == "not":
-            return self.select(which.args[0], no, yes)
+        if condition.op == "not":
+            return self.select(condition.args[0], no, yes)
         if yes.dtype == "bool":
-            if yes.known is not None:
-                other = which if yes.known else self.invert(which)
-                return self.logic("or" if yes.known else "and", other, no)
-            if no.known is not None:
-                other = self.invert(which) if no.known else which
-                return self.logic("or" if no.known else "and", other, yes)
-        vec = which.vec or yes.vec or no.vec
-        t = self.type(yes.dtype, vec)
-        if not vec or which.vec:
+            if yes.value is not None:
+                other = condition if yes.value else self.invert(condition)
+                return self.logic("or" if yes.value else "and", other, no)
+            if no.value is not None:
+                other = self.invert(condition) if no.value else condition
+                return self.logic("or" if no.value else "and", other, yes)
+        vec = condition.vec or yes.vec or no.vec
+        kind = self.type(yes.dtype, vec)
+        if not vec or condition.vec:
             bits = self.type("bool", vec)
-            return self.op(
-                "select",
-                (which, yes, no),
-                yes.dtype,
-                lambda _, w, x, y: f"select {bits} {w}, {t} {x}, {t} {y}",
-            )
+
+            def write(_, c: str, x: str, y: str) -> str:
+                return f"select {bits} {c}, {kind} {x}, {kind} {y}"
+
+            return self.op("select", (condition, yes, no), yes.dtype, write)
 
         def make() -> Num:  # one bit for all trajectories, which need not become a vector
             pairs = zip(self.refs(yes, True), self.refs(no, True), strict=True)
-            bit = which.names[0]
-            names = [self.new(f"select i1 {bit}, {t} {x}, {t} {y}") for x, y in pairs]
-            return self.made(names, yes.dtype, True, "select", (which, yes, no))
+            bit = condition.names[0]
+            names = [self.new(f"select i1 {bit}, {kind} {x}, {kind} {y}") for x, y in pairs]
+            return self.number(names, yes.dtype, True, "select", (condition, yes, no))
 
-        return self.once(("select1", which.key, yes.key, no.key), make)
+        return self.find_or_make(("select1", condition.key, yes.key, no.key), make)
 
     def maximum(self, a: Num, b: Num, op: str = "gt") -> Num:
         """The larger (smaller) of two; NaN where one is NaN."""
-        if a.known is not None and b.known is not None:
+        if a.value is not None and b.value is not None:
             return self._fold(np.maximum if op == "gt" else np.minimum, a, b)
         if not a.is_float:
             return self.select(self.compare(op, a, b), a, b)
-        if b.known is not None:
+        if b.value is not None:
             a, b = b, a
         # b where the comparison fails, so also where b is NaN.
         larger = self.select(self.compare(op, a, b), a, b)
-        if a.known is not None and a.known == a.known:
+        if a.value is not None and a.value == a.value:
             return larger
         return self.select(self.is_nan(a), a, larger)
 
     # --- whether numbers are finite --------------------------------------------------------------
 
     def is_nan(self, a: Num) -> Num:
-        return self.op("isnan", (a,), "bool", lambda t, x: f"fcmp uno {t} {x}, {x}")
+        return self.op("isnan", (a,), "bool", lambda kind, x: f"fcmp uno {kind} {x}, {x}")
 
     def is_finite(self, a: Num) -> Num:
         if not a.is_float:
-            return self.known(True, "bool")
-        if a.known is not None:
-            return self.known(np.isfinite(a.known), "bool")
+            return self.const(True, "bool")
+        if a.value is not None:
+            return self.const(np.isfinite(a.value), "bool")
         return self.all_finite([a])
 
-    def all_finite(self, terms: Sequence[Num], known: int = 1) -> Num:
+    def all_finite(self, terms: Sequence[Num], start: int = 1) -> Num:
         """Whether all numbers, of one type, are finite: whether Σ 0·x is not NaN.
 
-        A number is left out if another one cannot be finite without it. The first `known` numbers
+        A number is left out if another one cannot be finite without it. The first `start` numbers
         are not compared with each other.
         """
         terms = list({x.serial: x for x in terms}.values())
-        needed = terms if len(terms) > _FEW else terms[:known]
-        for x in terms[len(needed) :]:
-            if not self.shown(frozenset([x.serial]), needed):
-                others = self.shown(frozenset(y.serial for y in needed), [x])
-                needed = [*(y for y in needed if y.serial not in others), x]
-        zero = self.known(0, terms[0].dtype)
-        total = self.instruction("fmul", (zero, needed[0]), "0·x")
-        if len(needed) > 1:
-            for vec in (False, True):
-                t = self.type(zero.dtype, vec)
-                self.declare(f"{t} @llvm.fma.{self.suffix(zero.dtype, vec)}({t}, {t}, {t})")
+        tests = terms if len(terms) > _MOST_COMPARED else terms[:start]
+        for x in terms[len(tests) :]:
+            if not self.finite_where(frozenset([x.serial]), tests):
+                implications = self.finite_where(frozenset(y.serial for y in tests), [x])
+                tests = [*(y for y in tests if y.serial not in implications), x]
+        zero = self.const(0, terms[0].dtype)
+        total = self.instruction("fmul", (zero, tests[0]), "0·x")
 
-        def write(t: str, *names: str) -> str:
-            suffix = self.suffix(zero.dtype, t.startswith("<"))
-            return f"call {t} @llvm.fma.{suffix}({', '.join(f'{t} {x}' for x in names)})"
+        def write_fma(kind: str, *names: str) -> str:
+            suffix = self.suffix(zero.dtype, kind.startswith("<"))
+            return call_of(f"@llvm.fma.{suffix}", kind, names)
 
-        for x in needed[1:]:
-            total = self.op("Σ 0·x", (zero, x, total), zero.dtype, write)
+        for vec in (False, True) if len(tests) > 1 else ():
+            kind = self.type(zero.dtype, vec)
+            self.declare(f"{kind} @llvm.fma.{self.suffix(zero.dtype, vec)}({kind}, {kind}, {kind})")
+        for x in tests[1:]:
+            total = self.op("Σ 0·x", (zero, x, total), zero.dtype, write_fma)
         return self.op("finite", (total,), "bool", lambda t, x: f"fcmp ord {t} {x}, {x}")
 
     def finite_terms(self, flag: Num) -> tuple[Num, ...]:
@@ -355,54 +342,52 @@ class Arithmetic(Writer):
             total = total.args[2]
         return (total.args[1], *reversed(terms))
 
-    def shown(self, targets: frozenset[int], by: Sequence[Num]) -> frozenset[int]:
-        """Which of `targets`, serials of numbers, are finite for certain where all numbers `by`
-        are: those numbers themselves, what they are a sum or a product of, and so on."""
-        found: dict[int, frozenset[int]] = {}
+    def finite_where(self, targets: frozenset[int], premises: Sequence[Num]) -> frozenset[int]:
+        """Which of `targets`, serials of numbers, are finite for certain where all
+        `premises` are: those numbers themselves, what they are a sum or a product of, and so on."""
+        answers: dict[int, frozenset[int]] = {}
         # A stack of our own: chains of operations are longer than the stack of Python allows.
-        stack = [(x, False) for x in by]
+        stack = [(x, False) for x in premises]
         while stack:
             x, is_seen = stack.pop()
-            if x.known is not None or x.serial in found:
+            if x.value is not None or x.serial in answers:
                 continue
             parts = x.args if x.op in _HANDED_ON else x.args[1:] if x.op == "select" else ()
-            if parts and not is_seen and len(found) + len(stack) < _MOST_SEEN:
+            if parts and not is_seen and len(answers) + len(stack) < _MOST_SEEN:
                 stack.append((x, True))
                 stack += [(a, False) for a in parts]
                 continue
-            mine = [found.get(a.serial, frozenset()) for a in parts] or [frozenset()]
+            mine = [answers.get(a.serial, frozenset()) for a in parts] or [frozenset()]
             # A selection takes one operand, and it is not known which: only what both show counts.
             of_parts = mine[0].intersection if x.op == "select" else mine[0].union
-            found[x.serial] = of_parts(*mine[1:]) | (frozenset([x.serial]) & targets)
-        return frozenset().union(*(found.get(x.serial, frozenset()) for x in by))
+            answers[x.serial] = of_parts(*mine[1:]) | (frozenset([x.serial]) & targets)
+        return frozenset().union(*(answers.get(x.serial, frozenset()) for x in premises))
 
     # --- types -----------------------------------------------------------------------------------
 
     def convert(self, a: Num, dtype: str) -> Num:
         if a.dtype == dtype:
             return a
-        if dtype not in TYPES:
-            raise Unsupported(f"numbers of type {dtype} are not compiled")
+        check_type(dtype)
         to_float = dtype in FLOATS
-        if a.known is not None and (to_float or not a.is_float):
+        if a.value is not None and (to_float or not a.is_float):
             structural = a.structural and to_float
-            return self.known(np.asarray(a.known).astype(dtype), dtype, structural)
+            return self.const(np.asarray(a.value).astype(dtype), dtype, structural)
         if dtype == "bool":
-            return self.compare("ne", a, self.known(0, a.dtype))
+            return self.compare("ne", a, self.const(0, a.dtype))
         if a.is_float and not to_float:
             return self._to_integer(a, dtype)
-        unsigned = a.dtype.startswith("u") or a.dtype == "bool"
         bits, new_bits = (int(TYPES[d][1:]) if d not in FLOATS else 0 for d in (a.dtype, dtype))
         if a.is_float:
             word = "fpext" if dtype == "float64" else "fptrunc"
         elif to_float:
-            word = "uitofp" if unsigned else "sitofp"
+            word = "uitofp" if a.is_unsigned else "sitofp"
         elif new_bits == bits:
             word = "bitcast"
         else:
-            word = "trunc" if new_bits < bits else "zext" if unsigned else "sext"
+            word = "trunc" if new_bits < bits else "zext" if a.is_unsigned else "sext"
         out = self.type(dtype, a.vec)
-        return self.op(f"to {word}", (a,), dtype, lambda t, x: f"{word} {t} {x} to {out}")
+        return self.op(f"to {word}", (a,), dtype, lambda kind, x: f"{word} {kind} {x} to {out}")
 
     def _to_integer(self, a: Num, dtype: str) -> Num:
         """Rounded towards zero, and to the nearest integer there is; NaN to 0."""
@@ -410,29 +395,28 @@ class Arithmetic(Writer):
         source, out = self.type(a.dtype, a.vec), self.type(dtype, a.vec)
         full = f"llvm.{word}.sat.{self.suffix(dtype, a.vec)}.{self.suffix(a.dtype, a.vec)}"
         self.declare(f"{out} @{full}({source})")
-        return self.op(f"to {dtype}", (a,), dtype, lambda t, x: f"call {out} @{full}({t} {x})")
+        text = f"call {out} @{full}({source} "
+        return self.op(f"to {dtype}", (a,), dtype, lambda _, x: f"{text}{x})")
 
     def bitcast(self, a: Num, dtype: str) -> Num:
-        if a.known is not None:
-            return self.known(np.asarray(a.known, a.dtype).view(dtype)[()], dtype)
-        out = self.type(dtype, a.vec)
-        same = TYPES[a.dtype] == TYPES[dtype]
-        return self.op(
-            f"as {dtype}", (a,), dtype, lambda t, x: f"bitcast {t} {x} to {t if same else out}"
-        )
+        if a.value is not None:
+            return self.const(np.asarray(a.value, a.dtype).view(dtype)[()], dtype)
+        kind = self.type(dtype, a.vec)
+        return self.op(f"as {dtype}", (a,), dtype, lambda t, x: f"bitcast {t} {x} to {kind}")
 
-    def shift(self, op: str, a: Num, by: Num) -> Num:
+    def shift(self, op: str, a: Num, count: Num) -> Num:
         """Bits to the left or right; all bits are shifted out by their number or more."""
         bits, word = int(TYPES[a.dtype][1:]), _SHIFTS[op]
-        if by.known is not None and 0 <= by.known < bits:
-            return self.instruction(word, (a, by))
-        most = self.known(bits - 1, by.dtype)
-        inside = self.compare("le", by, most)
-        if not by.dtype.startswith("u"):
-            inside = self.logic("and", inside, self.compare("ge", by, self.known(0, by.dtype)))
+        if count.value is not None and 0 <= count.value < bits:
+            return self.instruction(word, (a, count))
+        largest = self.const(bits - 1, count.dtype)
+        is_small = self.compare("le", count, largest)
+        if not count.is_unsigned:
+            is_positive = self.compare("ge", count, self.const(0, count.dtype))
+            is_small = self.logic("and", is_small, is_positive)
         # LLVM leaves the result of a larger shift undefined.
-        value = self.instruction(word, (a, self.select(inside, by, most)))
-        return value if word == "ashr" else self.select(inside, value, self.known(0, a.dtype))
+        value = self.instruction(word, (a, self.select(is_small, count, largest)))
+        return value if word == "ashr" else self.select(is_small, value, self.const(0, a.dtype))
 
 
 def is_power_of_two(x: Any) -> bool:

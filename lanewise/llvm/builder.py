@@ -2,33 +2,33 @@
 
 from collections.abc import Callable, Sequence
 
-from .arithmetic import Arithmetic
+from .arithmetic import Operations
 from .ir import Num
 
 
-class Builder(Arithmetic):
+class Builder(Operations):
     """The body of one function."""
 
-    def any(self, a: Num) -> str:
+    def any_lane(self, a: Num) -> str:
         """Whether a truth value is true on a trajectory of the block, as a scalar i1."""
         if not a.vec:
             return self.ref(a, 0, False)
         # The sum over the vectors is NaN if one of them is, so that one comparison is enough.
         if a.op == "not" and a.args[0].op == "finite":  # one comparison for the block
             (zero,) = a.args[0].args
-            t, total = self.type(zero.dtype, True), zero.names[0]
+            kind, total = self.type(zero.dtype, True), zero.names[0]
             for other in zero.names[1:]:
-                total = self.new(f"fadd {t} {total}, {other}")
-            bits = self.new(f"fcmp uno {t} {total}, {total}")
-            a = self.made([bits], "bool", True)
-        t = self.type("bool", True)
+                total = self.new(f"fadd {kind} {total}, {other}")
+            bits = self.new(f"fcmp uno {kind} {total}, {total}")
+            a = self.number([bits], "bool", True)
+        kind = self.type("bool", True)
         total = a.names[0]
         for other in a.names[1:]:
-            total = self.new(f"or {t} {total}, {other}")
+            total = self.new(f"or {kind} {total}, {other}")
         if self.W == 1:
             return total
         # A mask as an integer compiles to one test of a register; a reduction by `or` does not.
-        bits = self.new(f"bitcast {t} {total} to i{self.W}")
+        bits = self.new(f"bitcast {kind} {total} to i{self.W}")
         return self.new(f"icmp ne i{self.W} {bits}, 0")
 
     def loop(
@@ -45,55 +45,54 @@ class Builder(Arithmetic):
         `carried_over(carry before a round, carry after it)` finds pairs (x, y) where y is what x
         will be in the next round; x is then not computed but carried.
         """
-        before = [self.refs(c, v) for c, v in zip(carry, vec, strict=True)]
+        start = [self.refs(number, wide) for number, wide in zip(carry, vec, strict=True)]
         # The preheader is the end of the block from which the loop is entered.
-        entered_from, preheader = self.block, self.reserved()
+        entered_from, preheader = self.block, self.reserve()
         # head: phis and the test; inner: a round, which goes back to head; end: after the last
         # round.
         head, inner, end = self.label(), self.label(), self.label()
         self.emit(f"br label %{head}")
         first_block = len(self.blocks)
         self.begin(head)
-        phis, phi_section = [], self.reserved()
-        for c, v in zip(carry, vec, strict=True):
-            names = [self.name() for _ in range(self.U if v else 1)]
-            phis.append(self.made(names, c.dtype, v))
+        phis, phi_section = [], self.reserve()
+        for number, wide in zip(carry, vec, strict=True):
+            names = [self.name() for _ in range(self.U if wide else 1)]
+            phis.append(self.number(names, number.dtype, wide))
         counter = self.name() if count else ""
         self.scopes.append({})
-        going = test(phis, counter)
-        self.emit(f"br i1 {going}, label %{inner}, label %{end}")
+        goes_on = test(phis, counter)
+        self.emit(f"br i1 {goes_on}, label %{inner}, label %{end}")
         self.begin(inner)
-        after = body(phis, counter)
+        next_carry = body(phis, counter)
         # `vec` comes from the dependence of the jaxpr. A number that varies in a scalar would lose
         # the values of all trajectories but one.
-        assert not any(a.vec and not v for a, v in zip(after, vec, strict=True)), (
-            "a carry that varies"
-        )
-        again = [self.refs(a, v) for a, v in zip(after, vec, strict=True)]
-        following = self.new(f"add nuw nsw i64 {counter}, 1") if count else ""
+        assert all(wide or not a.vec for a, wide in zip(next_carry, vec, strict=True))
+        next_names = [self.refs(a, wide) for a, wide in zip(next_carry, vec, strict=True)]
+        next_counter = self.new(f"add nuw nsw i64 {counter}, 1") if count else ""
         self.scopes.pop()
         left_from = self.block
         self.emit(f"br label %{head}")
 
         # The value of a number after a round is known only now.
-        def write_phi(name: str, t: str, old: str, new: str) -> None:
-            phi_section.append((name, f"phi {t} [{old}, %{entered_from}], [{new}, %{left_from}]"))
+        def write_phi(name: str, kind: str, old: str, new: str) -> None:
+            text = f"phi {kind} [{old}, %{entered_from}], [{new}, %{left_from}]"
+            phi_section.append((name, text))
 
-        for p, olds, news, v in zip(phis, before, again, vec, strict=True):
-            for name, old, new in zip(p.names, olds, news, strict=True):
-                write_phi(name, self.type(p.dtype, v), old, new)
+        for phi, olds, news, wide in zip(phis, start, next_names, vec, strict=True):
+            for name, old, new in zip(phi.names, olds, news, strict=True):
+                write_phi(name, self.type(phi.dtype, wide), old, new)
         if count:
-            write_phi(counter, "i64", "0", following)
+            write_phi(counter, "i64", "0", next_counter)
         if carried_over is not None:
             # The number of the first round is computed before the loop, from the numbers that enter
             # it.
             entering = {
-                p.serial: self.made(old, p.dtype, v)
-                for p, old, v in zip(phis, before, vec, strict=True)
+                phi.serial: self.number(old, phi.dtype, wide)
+                for phi, old, wide in zip(phis, start, vec, strict=True)
             }
-            pairs = carried_over(phis, after)
+            pairs = carried_over(phis, next_carry)
             with self.writing(preheader):
-                firsts = [self.refs(self.made_again(x, entering), True) for x, _ in pairs]
+                firsts = [self.refs(self.recompute(x, entering), True) for x, _ in pairs]
             for (x, y), olds in zip(pairs, firsts, strict=True):
                 for name, old, new in zip(x.names, olds, y.names, strict=True):
                     self.remove(name, first_block)
@@ -101,21 +100,38 @@ class Builder(Arithmetic):
         self.begin(end)
         return phis
 
-    def made_again(self, x: Num, instead: dict[int, Num]) -> Num:
+    def repeat(self, end: str | int, body: Callable[[str], object]) -> None:
+        """``body(i)`` for i = 0, …, end − 1; `i` is the name of an i64."""
+
+        def run(_, i: str) -> list[Num]:
+            body(i)
+            return []
+
+        self.loop([], [], lambda _, i: self.new(f"icmp slt i64 {i}, {end}"), run, count=True)
+
+    def loop_below(self, stop: Num, carry: Sequence[Num], vec, body, **options) -> list[Num]:
+        """The carry after a loop that goes on while its first number, a scalar, is below `stop`."""
+
+        def test(state: list[Num], _) -> str:
+            return self.ref(self.compare("lt", state[0], stop), 0, False)
+
+        return self.loop(carry, vec, test, lambda state, _: body(*state), **options)
+
+    def recompute(self, x: Num, substitutes: dict[int, Num]) -> Num:
         """The number x with other numbers in place of some that it is made of."""
-        if x.known is not None or (not x.op and x.serial not in instead):
+        if x.value is not None or (not x.op and x.serial not in substitutes):
             return x
-        found = instead.get(x.serial)
-        if found is None:
-            args = [self.made_again(a, instead) for a in x.args]
+        number = substitutes.get(x.serial)
+        if number is None:
+            args = [self.recompute(a, substitutes) for a in x.args]
             # A closed-off number is a name for another one and has no instruction of its own.
             if x.op == "same":
-                found = args[0]
+                number = args[0]
             else:
                 assert x.write is not None
-                found = self.op(x.op, args, x.dtype, x.write)
-            instead[x.serial] = found
-        return found
+                number = self.op(x.op, args, x.dtype, x.write)
+            substitutes[x.serial] = number
+        return number
 
     def branch(
         self,
@@ -132,18 +148,18 @@ class Builder(Arithmetic):
         for label, run in zip(labels, (yes, no), strict=True):
             self.begin(label)
             self.scopes.append({})
-            names.append([self.refs(x, v) for x, v in zip(run(), vec, strict=True)])
+            names.append([self.refs(x, wide) for x, wide in zip(run(), vec, strict=True)])
             self.scopes.pop()
             # A branch may contain loops and branches: it ends in another block than it began with.
             ends.append(self.block)
             self.emit(f"br label %{end}")
         self.begin(end)
         results = []
-        for v, dtype, *both in zip(vec, dtypes, *names, strict=True):
-            t = self.type(dtype, v)
+        for wide, dtype, *pairs in zip(vec, dtypes, *names, strict=True):
+            kind = self.type(dtype, wide)
             phis = [
-                self.new(f"phi {t} [{a}, %{ends[0]}], [{b}, %{ends[1]}]")
-                for a, b in zip(*both, strict=True)
+                self.new(f"phi {kind} [{a}, %{ends[0]}], [{b}, %{ends[1]}]")
+                for a, b in zip(*pairs, strict=True)
             ]
-            results.append(self.made(phis, dtype, v))
+            results.append(self.number(phis, dtype, wide))
         return results

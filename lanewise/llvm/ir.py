@@ -1,7 +1,7 @@
 """The text of one function in LLVM IR, and the numbers in it.
 
 A number is either the same on all trajectories (a scalar in the IR) or has a value for each (`U`
-vectors of `W` elements). The operations do not depend on `W` and `U`: `Arithmetic` decides on
+vectors of `W` elements). The operations do not depend on `W` and `U`: `Operations` decides on
 numbers which products and sums become fused multiply-adds, and LLVM may not change an operation.
 """
 
@@ -27,15 +27,30 @@ TYPES = {
 FLOATS = ("float64", "float32")
 
 
-class Unsupported(Exception):
+class NotCompilable(Exception):
     """Something for which no code is generated; the message says what."""
+
+
+def check_type(dtype: Any, name: str = "numbers") -> str:
+    """The name of a type for which code is generated."""
+    if str(dtype) not in TYPES:
+        types = "float64, float32, bool or integers of 8 to 64 bits"
+        raise NotCompilable(f"{name} must be {types}, got {dtype}")
+    return str(dtype)
+
+
+def check_size(size: int, limit: int, name: str, *shapes: Sequence[int]) -> None:
+    """Refuse what would become too much code, or too much memory."""
+    if size > limit:
+        arrays = f" for shapes {', '.join(map(str, shapes))}" if shapes else ""
+        raise NotCompilable(f"{name} must be at most {limit}, got {size}{arrays}")
 
 
 @dataclasses.dataclass(eq=False, slots=True)
 class Num:
     """One number: a constant, a scalar, or one value for each trajectory of a block.
 
-    - `names`: of its vectors in the IR, or of its scalar; none for a constant, which is `known`.
+    - `names`: of its vectors in the IR, or of its scalar; none for a constant, which has a `value`.
     - `op`, `args`, `write`: how it was made, where that matters for later numbers.
     - `structural`: a 0 or 1 that the structure of the problem makes, whatever the values are. Only
       for such a zero 0·x is 0 for every x.
@@ -44,7 +59,7 @@ class Num:
     names: tuple[str, ...]
     dtype: str
     vec: bool
-    known: Any = None
+    value: Any = None
     op: str = ""
     args: tuple["Num", ...] = ()
     serial: int = 0
@@ -54,17 +69,21 @@ class Num:
     @property
     def key(self) -> Any:
         """Equal for two numbers only if they are the same."""
-        if self.known is None:
+        if self.value is None:
             return self.serial
         # The bytes: 0 and −0 are two numbers, and a NaN is equal to itself here.
-        return self.dtype, np.asarray(self.known, self.dtype).tobytes(), self.structural
+        return self.dtype, np.asarray(self.value, self.dtype).tobytes(), self.structural
 
     @property
     def is_float(self) -> bool:
         return self.dtype in FLOATS
 
-    def is_known_as(self, value: float) -> bool:
-        return self.known is not None and bool(self.known == value)
+    @property
+    def is_unsigned(self) -> bool:
+        return self.dtype.startswith("u") or self.dtype == "bool"
+
+    def is_const(self, value: float) -> bool:
+        return self.value is not None and bool(self.value == value)
 
 
 def literal(value: Any, dtype: str) -> str:
@@ -94,10 +113,10 @@ class Writer:
         self.block = "entry"
         self.section: Section = []  # where instructions are written
         self.blocks: list[tuple[str, Section]] = [(self.block, self.section)]
-        self.operations, self.most = 0, MOST_OPERATIONS
+        self.operations, self.limit = 0, MOST_OPERATIONS
         # A number that was made in a loop or a branch is not known outside of it: each has a scope.
         self.scopes: list[dict] = [{}]
-        self.declared: set[str] = set()
+        self.declarations: set[str] = set()
         self._names, self._serials = itertools.count(), itertools.count(1)
 
     # --- text --------------------------------------------------------------------------------
@@ -113,9 +132,9 @@ class Writer:
         self.section.append((name, instruction))
         return name
 
-    def pointer(self, item: str, base: str, by: str | int) -> str:
-        """The pointer that is `by` items further."""
-        return self.new(f"getelementptr {item}, ptr {base}, i64 {by}") if by != 0 else base
+    def pointer(self, item: str, base: str, count: str | int) -> str:
+        """The pointer that is `count` items further."""
+        return self.new(f"getelementptr {item}, ptr {base}, i64 {count}") if count != 0 else base
 
     def label(self) -> str:
         return f"L{next(self._names)}"
@@ -124,7 +143,7 @@ class Writer:
         self.block, self.section = label, []
         self.blocks.append((label, self.section))
 
-    def reserved(self) -> Section:
+    def reserve(self) -> Section:
         """A section at the current place, to be written later."""
         section: Section = []
         self.section.append(section)
@@ -158,7 +177,7 @@ class Writer:
         return lines
 
     def declare(self, line: str) -> None:
-        self.declared.add("declare " + line)
+        self.declarations.add("declare " + line)
 
     def type(self, dtype: str, vec: bool) -> str:
         return f"<{self.W} x {TYPES[dtype]}>" if vec and self.W > 1 else TYPES[dtype]
@@ -190,48 +209,45 @@ class Writer:
     def note(self, key: Any, value: Any) -> None:
         self.scopes[-1][key] = value
 
-    def once(self, key: Any, make: Callable[[], Any]) -> Any:
-        """The object that was made under a key; made now if it is not known here."""
-        found = self.find(key)
-        if found is None:
-            found = make()
-            self.note(key, found)
-        return found
+    def find_or_make(self, key: Any, make: Callable[[], Any]) -> Any:
+        """The object that was made under a key; made now if there is none."""
+        item = self.find(key)
+        if item is None:
+            item = make()
+            self.note(key, item)
+        return item
 
     # --- numbers -----------------------------------------------------------------------------
 
-    def known(self, value: Any, dtype: str, structural: bool = False) -> Num:
-        if dtype not in TYPES:
-            raise Unsupported(
-                f"numbers must be float64, float32, bool or integers of 8 to 64 bits, got {dtype}"
-            )
+    def const(self, value: Any, dtype: str, structural: bool = False) -> Num:
+        check_type(dtype)
         return Num((), dtype, False, np.asarray(value, dtype)[()], structural=structural)
 
-    def made(self, names: Sequence[str], dtype: str, vec: bool, op: str = "", args=()) -> Num:
+    def number(self, names: Sequence[str], dtype: str, vec: bool, op: str = "", args=()) -> Num:
         return Num(tuple(names), dtype, vec, None, op, args, next(self._serials))
 
     def opaque(self, x: Num) -> Num:
         """The number itself, without what is known of how it was made."""
-        if x.known is not None or not x.op:
+        if x.value is not None or not x.op:
             return x
-        return self.once(
-            ("opaque", x.serial), lambda: self.made(x.names, x.dtype, x.vec, "same", (x,))
+        return self.find_or_make(
+            ("opaque", x.serial), lambda: self.number(x.names, x.dtype, x.vec, "same", (x,))
         )
 
-    def unrelated(self, x: Num) -> Num:
+    def without_origin(self, x: Num) -> Num:
         """The number treated as a result of a loop: not even a constant is known any more."""
         # Integers stay known: they decide indices and branches, and have no rounding.
-        if x.known is None or not x.is_float:
+        if x.value is None or not x.is_float:
             return self.opaque(x)
-        return self.made([literal(x.known, x.dtype)], x.dtype, False)
+        return self.number([literal(x.value, x.dtype)], x.dtype, False)
 
     def ref(self, x: Num, u: int, vec: bool) -> str:
         """The name of a number in vector u, as a vector where `vec`."""
-        if x.known is not None:
-            one = literal(x.known, x.dtype)
+        if x.value is not None:
+            text = literal(x.value, x.dtype)
             if not vec or self.W == 1:
-                return one
-            return "<" + ", ".join([f"{TYPES[x.dtype]} {one}"] * self.W) + ">"
+                return text
+            return "<" + ", ".join([f"{TYPES[x.dtype]} {text}"] * self.W) + ">"
         if x.vec:
             return x.names[u]
         return self.splat(x) if vec and self.W > 1 else x.names[0]
@@ -244,51 +260,51 @@ class Writer:
         """A vector with a scalar in each element."""
 
         def make() -> str:
-            t = self.type(x.dtype, True)
+            kind = self.type(x.dtype, True)
             # LLVM has no instruction for it: it recognises this pair as a broadcast.
-            first = self.new(f"insertelement {t} poison, {TYPES[x.dtype]} {x.names[0]}, i64 0")
+            first = self.new(f"insertelement {kind} poison, {TYPES[x.dtype]} {x.names[0]}, i64 0")
             zeros = f"<{self.W} x i32> zeroinitializer"
-            return self.new(f"shufflevector {t} {first}, {t} poison, {zeros}")
+            return self.new(f"shufflevector {kind} {first}, {kind} poison, {zeros}")
 
-        return self.once(("splat", x.serial), make)
+        return self.find_or_make(("splat", x.serial), make)
 
     def op(self, op: str, args: Sequence[Num], dtype: str, write: Callable[..., str]) -> Num:
         """The number made by the instruction ``write(type of the operands, *names)``."""
         # Most of the time of the compiler is spent here: no further function is called.
         key = (op, dtype, *(a.key for a in args))
-        found = self.find(key)
-        if found is not None:
-            return found
+        old = self.find(key)
+        if old is not None:
+            return old
         vec = any(a.vec for a in args)
-        t = self.type(args[0].dtype, vec)
+        kind = self.type(args[0].dtype, vec)
         self.operations += 1
         names = [
-            self.new(write(t, *(self.ref(a, u, vec) for a in args)))
+            self.new(write(kind, *(self.ref(a, u, vec) for a in args)))
             for u in range(self.U if vec else 1)
         ]
-        made = self.made(names, dtype, vec, op, tuple(args))
-        made.write = write
-        self.note(key, made)
-        return made
+        number = self.number(names, dtype, vec, op, tuple(args))
+        number.write = write
+        self.note(key, number)
+        return number
 
     def instruction(self, word: str, args: Sequence[Num], op: str = "") -> Num:
         """The number made by an instruction of one word, of numbers of one type."""
 
-        def write(t: str, *names: str) -> str:
-            return f"{word} {t} {', '.join(names)}"
-
-        return self.op(op or word, args, args[0].dtype, write)
+        dtype = args[0].dtype
+        return self.op(op or word, args, dtype, lambda kind, *xs: f"{word} {kind} {', '.join(xs)}")
 
     def intrinsic(self, name: str, args: Sequence[Num]) -> Num:
         """``llvm.<name>`` of numbers of one type."""
         dtype, vec = args[0].dtype, any(a.vec for a in args)
-        t, full = self.type(dtype, vec), f"llvm.{name}.{self.suffix(dtype, vec)}"
-        self.declare(f"{t} @{full}({', '.join([t] * len(args))})")
+        kind, full = self.type(dtype, vec), f"llvm.{name}.{self.suffix(dtype, vec)}"
+        self.declare(f"{kind} @{full}({', '.join([kind] * len(args))})")
 
-        def write(t: str, *names: str) -> str:
-            return f"call {t} @{full}({', '.join(f'{t} {x}' for x in names)})"
+        return self.op(name, args, dtype, lambda kind, *names: call_of(f"@{full}", kind, names))
 
-        return self.op(name, args, dtype, write)
+
+def call_of(function: str, kind: str, names: Sequence[str]) -> str:
+    """The call of a function of numbers of one type, with a result of this type."""
+    return f"call {kind} {function}({', '.join(f'{kind} {name}' for name in names)})"
 
 
 def _text(section: Section) -> Iterator[str]:

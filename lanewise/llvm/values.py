@@ -16,7 +16,7 @@ Entries = Any
 SMALL = 128  # arrays of up to so many elements are numbers of their own; larger ones stay in memory
 
 
-MADE = 4096  # arrays made of numbers (a Jacobian) may have so many
+MOST_ENTRIES = 4096  # arrays made of numbers (a Jacobian) may have so many
 
 
 class Value:
@@ -50,13 +50,13 @@ class Value:
         moving = any(isinstance(x, Num) and x.vec for x in self.buffer.offset)
         return self.buffer.lane is not None or moving
 
-    def known(self) -> np.ndarray | None:
+    def constants(self) -> np.ndarray | None:
         """The numbers, if all of them are known now."""
-        if self.entries is None or any(x.known is None for x in self.entries.flat):
+        if self.entries is None or any(x.value is None for x in self.entries.flat):
             return None
         out = np.empty(self.shape, self.dtype)
         for i in np.ndindex(self.shape):
-            out[i] = self.entries[i].known
+            out[i] = self.entries[i].value
         return out
 
 

@@ -30,11 +30,11 @@ def key(*parts: Any) -> str:
 
 def folder() -> Path | None:
     """The folder of machine code, None if the cache is switched off."""
-    named = os.environ.get(VARIABLE, "").strip()
-    if named.lower() in ("off", "0", "no", "false"):
+    setting = os.environ.get(VARIABLE, "").strip()
+    if setting.lower() in ("off", "0", "no", "false"):
         return None
-    if named:
-        return Path(named).expanduser()
+    if setting:
+        return Path(setting).expanduser()
     base = os.environ.get("XDG_CACHE_HOME", "").strip()
     try:
         return (Path(base) if base else Path.home() / ".cache") / "dvi_jax"
@@ -48,8 +48,8 @@ def _is_safe(path: Path) -> bool:
     if not hasattr(os, "getuid"):
         return True
     # Anybody who can write to the folder could make this process run any code.
-    others = status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-    return stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not others
+    is_open = status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    return stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not is_open
 
 
 def read(name: str) -> bytes | None:
@@ -91,13 +91,13 @@ def write(name: str, code: bytes) -> None:
         if not _is_safe(where):
             return
         # Renaming is atomic: another process reads the whole file or none.
-        handle, made = tempfile.mkstemp(prefix=".new-", dir=where)
+        handle, temporary = tempfile.mkstemp(prefix=".new-", dir=where)
         try:
             with os.fdopen(handle, "wb") as file:
                 file.write(_MARK + _checksum(name, code) + code)
-            os.replace(made, where / name)
+            os.replace(temporary, where / name)
         except OSError:
-            os.unlink(made)
+            os.unlink(temporary)
             raise
         _bound(where)
 

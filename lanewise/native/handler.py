@@ -1,18 +1,15 @@
 """The calls from XLA into machine code: a typed handler, and the threads that share a batch.
 
-A handler gets XLA's call frame, a C structure that `jax.ffi.include_dir()` documents
-(``xla/ffi/api/c_api.h``); the offsets below are those of its 64-bit layout, which is stable for a
-major version of the interface. Blocks of trajectories are claimed one chunk after the other from a
-counter, by the caller and by the threads of XLA's own pool; the caller waits only for chunks that
-somebody has begun. A task that starts later finds nothing to do: all that it reads is in a record
-that the last user frees.
+A handler gets XLA's call frame, a C structure; `structures` has the positions of its fields. Blocks
+of trajectories are claimed one chunk after the other from a counter, by the caller and by the
+threads of XLA's own pool; the caller waits only for chunks that another thread has begun. A task
+that starts later finds nothing to do: all that it reads is in a record, the `Job`, that the last
+user frees.
 """
 
 import ctypes
 import functools
 import hashlib
-import itertools
-import re
 import sys
 import threading
 from typing import Any
@@ -20,36 +17,39 @@ from typing import Any
 import jax.ffi
 
 from . import machine
+from .structures import addresses, offset, size
 
 API_MAJOR, API_MINOR = 0, 1
-"""The version of XLA's interface that the offsets are for; newer ones of 0 keep them."""
+"""The version of XLA's interface that the structures are of; newer ones of 0 keep them."""
 
-HANDLER = """
+HANDLER = f"""
 declare ptr @lanewise_run(ptr, ptr, i64)
 
-define ptr @lanewise_handler(ptr %frame) {
-  %ext.at = getelementptr i8, ptr %frame, i64 8
+define ptr @lanewise_handler(ptr %frame) {{
+  %ext.at = getelementptr i8, ptr %frame, i64 {offset("CallFrame", "extension_start")}
   %ext = load ptr, ptr %ext.at
   %is.call = icmp eq ptr %ext, null
   br i1 %is.call, label %call, label %version
 version:                                     ; XLA queries the version of the interface
-  %meta.at = getelementptr i8, ptr %ext, i64 24
+  %meta.at = getelementptr i8, ptr %ext, i64 {offset("Metadata_Extension", "metadata")}
   %meta = load ptr, ptr %meta.at
-  %major = getelementptr i8, ptr %meta, i64 24
-  store i32 MAJOR, ptr %major
-  %minor = getelementptr i8, ptr %meta, i64 28
-  store i32 MINOR, ptr %minor
+  %major = getelementptr i8, ptr %meta, i64 {offset("Metadata", "api_version.major_version")}
+  store i32 {API_MAJOR}, ptr %major
+  %minor = getelementptr i8, ptr %meta, i64 {offset("Metadata", "api_version.minor_version")}
+  store i32 {API_MINOR}, ptr %minor
   ret ptr null
 call:
   %r = tail call ptr @lanewise_run(ptr %frame, ptr @lanewise_kernel, i64 BLOCK)
   ret ptr %r
-}
+}}
 """
 """`lanewise_kernel(args, rets, params, first, last)` computes the blocks first … last − 1."""
 
-# Offsets in the record of a job: users, next block, blocks done, blocks, chunk, kernel, parameters,
-# pointers of arguments, pointers of results; the pointers themselves come after it.
-_RUNTIME = """
+# Only Linux has `madvise`. Below 32 MiB the C library reuses memory that is mapped already, so that
+# the call would cost more time than it saves.
+_LARGE = 32 * 2**20 if sys.platform == "linux" else 2**63 - 1
+
+_RUNTIME = f"""
 @lanewise_threads = global i64 0
 
 declare ptr @malloc(i64)
@@ -58,8 +58,8 @@ declare i32 @sched_yield()
 declare i32 @madvise(ptr, i64, i32)
 
 ; Large results in large pages: at 4 KiB each, the first touch of new memory costs as much as steps.
-define internal void @large_pages(ptr %at, i64 %bytes) {
-  %is.large = icmp uge i64 %bytes, LARGE
+define internal void @large_pages(ptr %at, i64 %bytes) {{
+  %is.large = icmp uge i64 %bytes, {_LARGE}
   br i1 %is.large, label %yes, label %no
 yes:
   %address = ptrtoint ptr %at to i64
@@ -73,9 +73,9 @@ yes:
   ret void
 no:
   ret void
-}
+}}
 
-define internal void @drop(ptr %job) {
+define internal void @drop(ptr %job) {{
   %before = atomicrmw sub ptr %job, i64 1 acq_rel
   %last = icmp eq i64 %before, 1
   br i1 %last, label %yes, label %no
@@ -84,21 +84,20 @@ yes:
   ret void
 no:
   ret void
-}
+}}
 
-define internal void @work(ptr %job) {
+define internal void @work(ptr %job) {{
 entry:
-  %next = getelementptr i8, ptr %job, i64 8
-  %done = getelementptr i8, ptr %job, i64 16
-  %blocks = load i64, i8 %job[24]
-  %chunk = load i64, i8 %job[32]
-  %kernel = load ptr, i8 %job[40]
-  %params = load ptr, i8 %job[48]
-  %args = load ptr, i8 %job[56]
-  %rets = load ptr, i8 %job[64]
+  {addresses("job", "Job", "next done blocks chunk kernel params args rets")}
+  %blocks = load i64, ptr %job.blocks
+  %chunk = load i64, ptr %job.chunk
+  %kernel = load ptr, ptr %job.kernel
+  %params = load ptr, ptr %job.params
+  %args = load ptr, ptr %job.args
+  %rets = load ptr, ptr %job.rets
   br label %claim
 claim:
-  %first = atomicrmw add ptr %next, i64 %chunk acq_rel
+  %first = atomicrmw add ptr %job.next, i64 %chunk acq_rel
   %is.over = icmp sge i64 %first, %blocks
   br i1 %is.over, label %over, label %run
 run:
@@ -107,19 +106,19 @@ run:
   %last = select i1 %fits, i64 %end, i64 %blocks
   call void %kernel(ptr %args, ptr %rets, ptr %params, i64 %first, i64 %last)
   %mine = sub i64 %last, %first
-  %ignored = atomicrmw add ptr %done, i64 %mine acq_rel
+  %ignored = atomicrmw add ptr %job.done, i64 %mine acq_rel
   br label %claim
 over:
   ret void
-}
+}}
 
-define internal void @task(ptr %job) {
+define internal void @task(ptr %job) {{
   call void @work(ptr %job)
   call void @drop(ptr %job)
   ret void
-}
+}}
 
-define internal void @pointers(ptr %from, i64 %count, ptr %to) {
+define internal void @pointers(ptr %from, i64 %count, ptr %to) {{
 entry:
   br label %head
 head:
@@ -127,36 +126,42 @@ head:
   %more = icmp slt i64 %i, %count
   br i1 %more, label %body, label %over
 body:
-  %buffer = load ptr, ptr %from[%i]
-  %data = load ptr, i8 %buffer[24]
-  store ptr %data, ptr %to[%i]
+  %from.i = getelementptr ptr, ptr %from, i64 %i
+  %buffer = load ptr, ptr %from.i
+  {addresses("buffer", "Buffer", "data")}
+  %data = load ptr, ptr %buffer.data
+  %to.i = getelementptr ptr, ptr %to, i64 %i
+  store ptr %data, ptr %to.i
   %i.next = add i64 %i, 1
   br label %head
 over:
   ret void
-}
+}}
 
-define ptr @lanewise_run(ptr %frame, ptr %kernel, i64 %block) {
+define ptr @lanewise_run(ptr %frame, ptr %kernel, i64 %block) {{
 entry:
-  %seen = alloca i64
-  %ask = alloca [4 x i64]
-  %api = load ptr, i8 %frame[16]
-  %ctx = load ptr, i8 %frame[24]
-  %nargs = load i64, i8 %frame[56]
-  %args = load ptr, i8 %frame[72]
-  %nrets = load i64, i8 %frame[96]
-  %rets = load ptr, i8 %frame[112]
-  %attrs = load ptr, i8 %frame[160]
-  %attr = load ptr, ptr %attrs
-  %params = load ptr, i8 %attr[16]
+  %count = alloca i64
+  %query = alloca [{size("ThreadPool_NumThreads_Args")} x i8], align 8
+  {addresses("frame", "CallFrame", "api ctx args.size args.args rets.size rets.rets attrs.attrs")}
+  %api = load ptr, ptr %frame.api
+  %ctx = load ptr, ptr %frame.ctx
+  %nargs = load i64, ptr %frame.args.size
+  %args = load ptr, ptr %frame.args.args
+  %nrets = load i64, ptr %frame.rets.size
+  %rets = load ptr, ptr %frame.rets.rets
+  %attrs = load ptr, ptr %frame.attrs.attrs
+  %attr = load ptr, ptr %attrs                 ; the only attribute: the parameters
+  {addresses("attr", "Array", "data")}
+  %params = load ptr, ptr %attr.data
   %lanes = load i64, ptr %params
-  %cost = load i64, i64 %params[1]
+  %params.1 = getelementptr i64, ptr %params, i64 1
+  %cost = load i64, ptr %params.1
 
-  %count = add i64 %nargs, %nrets
-  %bytes0 = mul i64 %count, 8
-  %bytes = add i64 %bytes0, 72
+  %pointers = add i64 %nargs, %nrets
+  %bytes0 = mul i64 %pointers, 8
+  %bytes = add i64 %bytes0, {size("Job")}
   %job = call ptr @malloc(i64 %bytes)
-  %a = getelementptr i8, ptr %job, i64 72
+  %a = getelementptr i8, ptr %job, i64 {size("Job")}
   %r = getelementptr ptr, ptr %a, i64 %nargs
   call void @pointers(ptr %args, i64 %nargs, ptr %a)
   call void @pointers(ptr %rets, i64 %nrets, ptr %r)
@@ -167,8 +172,10 @@ next.result:
   %n.more = icmp slt i64 %n, %nrets
   br i1 %n.more, label %one.result, label %ready.to.run
 one.result:
-  %result = load ptr, ptr %r[%n]
-  %size.each = load i64, i64 %sizes[%n]
+  %r.n = getelementptr ptr, ptr %r, i64 %n
+  %result = load ptr, ptr %r.n
+  %sizes.n = getelementptr i64, ptr %sizes, i64 %n
+  %size.each = load i64, ptr %sizes.n
   %size.all = mul i64 %size.each, %lanes
   call void @large_pages(ptr %result, i64 %size.all)
   %n.next = add i64 %n, 1
@@ -193,15 +200,17 @@ alone:
   ret ptr null
 
 ask.pool:
-  store i64 1, ptr %seen
-  store i64 32, ptr %ask
-  store ptr null, i64 %ask[1]
-  store ptr %ctx, i64 %ask[2]
-  store ptr %seen, i64 %ask[3]
-  %size = load ptr, i8 %api[COUNT]
-  %error = call ptr %size(ptr %ask)
+  store i64 1, ptr %count
+  {addresses("query", "ThreadPool_NumThreads_Args", "extension_start ctx num_threads")}
+  store i64 {size("ThreadPool_NumThreads_Args")}, ptr %query
+  store ptr null, ptr %query.extension_start
+  store ptr %ctx, ptr %query.ctx
+  store ptr %count, ptr %query.num_threads
+  {addresses("api", "Api", "XLA_FFI_ThreadPool_NumThreads XLA_FFI_ThreadPool_Schedule")}
+  %num_threads = load ptr, ptr %api.XLA_FFI_ThreadPool_NumThreads
+  %error = call ptr %num_threads(ptr %query)
   %failed = icmp ne ptr %error, null
-  %pool0 = load i64, ptr %seen
+  %pool0 = load i64, ptr %count
   %pool1 = select i1 %failed, i64 1, i64 %pool0
   %is.set = icmp sgt i64 %set, 0
   %fewer = icmp slt i64 %set, %pool1
@@ -216,29 +225,30 @@ ask.pool:
   %parts.less = sub i64 %parts.up, 1
   %chunk = udiv i64 %parts.less, %parts
 
-  store i64 %threads, ptr %job                 ; every task has one share, the caller another
-  store i64 0, i8 %job[8]
-  %done = getelementptr i8, ptr %job, i64 16
-  store i64 0, ptr %done
-  store i64 %blocks, i8 %job[24]
-  store i64 %chunk, i8 %job[32]
-  store ptr %kernel, i8 %job[40]
-  store ptr %params, i8 %job[48]
-  store ptr %a, i8 %job[56]
-  store ptr %r, i8 %job[64]
-  %schedule = load ptr, i8 %api[SCHEDULE]
+  {addresses("job", "Job", "next done blocks chunk kernel params args rets")}
+  store i64 %threads, ptr %job                 ; users: each task is one, and the caller another
+  store i64 0, ptr %job.next
+  store i64 0, ptr %job.done
+  store i64 %blocks, ptr %job.blocks
+  store i64 %chunk, ptr %job.chunk
+  store ptr %kernel, ptr %job.kernel
+  store ptr %params, ptr %job.params
+  store ptr %a, ptr %job.args
+  store ptr %r, ptr %job.rets
+  %schedule = load ptr, ptr %api.XLA_FFI_ThreadPool_Schedule
   br label %next.task
 next.task:
   %t = phi i64 [1, %ask.pool], [%t.next, %scheduled]
   %t.more = icmp slt i64 %t, %threads
   br i1 %t.more, label %one.task, label %own
 one.task:
-  %plan = alloca [5 x i64]
-  store i64 40, ptr %plan
-  store ptr null, i64 %plan[1]
-  store ptr %ctx, i64 %plan[2]
-  store ptr @task, i64 %plan[3]
-  store ptr %job, i64 %plan[4]
+  %plan = alloca [{size("ThreadPool_Schedule_Args")} x i8], align 8
+  {addresses("plan", "ThreadPool_Schedule_Args", "extension_start ctx task data")}
+  store i64 {size("ThreadPool_Schedule_Args")}, ptr %plan
+  store ptr null, ptr %plan.extension_start
+  store ptr %ctx, ptr %plan.ctx
+  store ptr @task, ptr %plan.task
+  store ptr %job, ptr %plan.data
   %refused = call ptr %schedule(ptr %plan)
   %is.refused = icmp ne ptr %refused, null
   br i1 %is.refused, label %give.back, label %scheduled
@@ -253,7 +263,7 @@ own:
   br label %wait
 wait:
   %spins = phi i64 [0, %own], [%spins.next, %again]
-  %so.far = load atomic i64, ptr %done acquire, align 8
+  %so.far = load atomic i64, ptr %job.done acquire, align 8
   %ready = icmp sge i64 %so.far, %blocks
   br i1 %ready, label %finish, label %not.yet
 not.yet:
@@ -268,49 +278,26 @@ again:
 finish:
   call void @drop(ptr %job)
   ret ptr null
-}
+}}
 """
-
-# The functions in XLA's table follow its size, extension, version (24 bytes) and internal table.
-_SCHEDULE, _COUNT = (48 + 8 * place for place in (11, 12))
 
 # Several threads of Python may trace and compile at once; a name may be registered once only.
 _lock = threading.RLock()
 _targets: dict[str, str] = {}
 
 
-_PLACE = re.compile(r"^(.*(?:load|store) .*), (i8|i64|ptr) (%[\w.]+)\[(%?[\w.]+)\]$", re.MULTILINE)
-
-
-def _addressed(text: str) -> str:
-    """Operands of the form ``i8 %pointer[24]``, which LLVM has not, as pointers."""
-    names = itertools.count()
-
-    def expanded(found: re.Match) -> str:
-        instruction, item, base, index = found.groups()
-        at = f"%at{next(names)}"
-        pointer = f"  {at} = getelementptr {item}, ptr {base}, i64 {index}"
-        return f"{pointer}\n{instruction}, ptr {at}"
-
-    return _PLACE.sub(expanded, text)
-
-
 @functools.cache
 def runtime() -> Any:
     """The machine code that all kernels share."""
-    text = _addressed(_RUNTIME).replace("SCHEDULE", str(_SCHEDULE)).replace("COUNT", str(_COUNT))
-    # Only Linux has this system call. Below 32 MiB the C library reuses memory that is mapped
-    # already, so that the call would cost more time than it saves.
-    text = text.replace("LARGE", str(32 * 2**20 if sys.platform == "linux" else 2**63 - 1))
-    return machine.loaded(text)
+    return machine.load(_RUNTIME)
 
 
 def set_threads(count: int) -> None:
     """Set the number of threads of a batch; 0 means all of XLA's pool."""
     if isinstance(count, bool) or not isinstance(count, int):
-        raise TypeError(f"count must be a number of threads of the type int, got {count!r}.")
+        raise TypeError(f"count must be an int, got {count!r}.")
     if count < 0:
-        raise ValueError(f"count must be a positive number of threads, or 0 for all, got {count}.")
+        raise ValueError(f"count must be a number of threads, or 0 for all, got {count}.")
     _threads().value = count
 
 
@@ -326,11 +313,10 @@ def _threads() -> ctypes.c_int64:
 
 def module_text(kernel: str, block: int) -> str:
     """A kernel with its handler."""
-    handler = HANDLER.replace("MAJOR", str(API_MAJOR)).replace("MINOR", str(API_MINOR))
-    return kernel + handler.replace("BLOCK", str(block))
+    return kernel + HANDLER.replace("BLOCK", str(block))
 
 
-def registered(text: str) -> str:
+def register(text: str) -> str:
     """The name by which XLA calls a module's handler, compiled and registered if it was not."""
     # The text is the key, not the function: two programs with equal code are compiled once.
     key = hashlib.sha256(text.encode()).hexdigest()
@@ -340,7 +326,7 @@ def registered(text: str) -> str:
             name = f"lanewise_{key[:32]}"
             # One engine holds all modules, so that each needs a name of its own.
             text = text.replace("@lanewise_handler", f"@{name}")
-            engine = machine.loaded(text, {"lanewise_run": run})
+            engine = machine.load(text, {"lanewise_run": run})
             address = engine.get_function_address(name)
             jax.ffi.register_ffi_target(name, _capsule(address), platform="cpu")
             _targets[key] = name

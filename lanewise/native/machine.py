@@ -11,7 +11,7 @@ FORMAT = 3
 
 
 @functools.cache
-def started() -> Any:
+def start_llvm() -> Any:
     """The module `llvmlite.binding`, with LLVM started.
 
     **Raises** `ImportError` where llvmlite is not installed.
@@ -20,9 +20,7 @@ def started() -> Any:
     try:
         import llvmlite.binding as llvm
     except ImportError as error:
-        raise ImportError(
-            f"llvmlite cannot be imported: {error}. Run pip install --force-reinstall llvmlite"
-        ) from error
+        raise ImportError(f"{error}. Run pip install --force-reinstall llvmlite") from error
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     return llvm
@@ -31,7 +29,7 @@ def started() -> Any:
 @functools.cache
 def host() -> tuple[str, str]:
     """(name, features) of the processor, as LLVM calls them."""
-    llvm = started()
+    llvm = start_llvm()
     features = llvm.get_host_cpu_features().flatten()
     if "+avx512f" in features.split(","):
         # LLVM prefers half of a register on some processors with AVX-512; our vectors fill it.
@@ -51,7 +49,7 @@ def width() -> int:
 @functools.cache
 def target_machine(triple: str | None = None, cpu: str | None = None, features: str | None = None):
     """LLVM's view of a machine, by default of this one."""
-    llvm = started()
+    llvm = start_llvm()
     if triple is None:
         target, (cpu, features) = llvm.Target.from_default_triple(), host()
     else:
@@ -62,9 +60,9 @@ def target_machine(triple: str | None = None, cpu: str | None = None, features: 
     )
 
 
-def _optimised(ir: str, machine: Any) -> Any:
+def _optimise(ir: str, machine: Any) -> Any:
     """A module after the passes that pay for code which is written number by number."""
-    llvm = started()
+    llvm = start_llvm()
     module = llvm.parse_assembly(ir)
     module.verify()
     module.triple, module.data_layout = machine.triple, str(machine.target_data)
@@ -79,15 +77,15 @@ def _optimised(ir: str, machine: Any) -> Any:
 def object_code(ir: str, machine: Any = None) -> bytes:
     """The object file of a module, by default for the processor of this process."""
     machine = target_machine() if machine is None else machine
-    return machine.emit_object(_optimised(ir, machine))
+    return machine.emit_object(_optimise(ir, machine))
 
 
 def assembly(ir: str) -> str:
     """The machine code of a module in the assembler's language."""
-    return target_machine().emit_assembly(_optimised(ir, target_machine()))
+    return target_machine().emit_assembly(_optimise(ir, target_machine()))
 
 
-def loaded(ir: str, symbols: dict[str, int] | None = None) -> Any:
+def load(ir: str, symbols: dict[str, int] | None = None) -> Any:
     """The engine, with a module's machine code in it; from the cache on disk, if it is there.
 
     One engine holds the code of all modules, which must define different names; JAX may call it as
@@ -95,7 +93,7 @@ def loaded(ir: str, symbols: dict[str, int] | None = None) -> Any:
     """
     import llvmlite
 
-    llvm = started()
+    llvm = start_llvm()
     for name, address in (symbols or {}).items():
         llvm.add_symbol(name, address)
     cpu, features = host()
@@ -123,7 +121,7 @@ _codes: dict[str, bytes] = {}  # of modules that are being added to the engine, 
 
 @functools.cache
 def _engine() -> Any:
-    llvm, (cpu, features) = started(), host()
+    llvm, (cpu, features) = start_llvm(), host()
     first = llvm.parse_assembly("define internal void @nothing() { ret void }")
     # A machine of its own: an engine takes possession of the one that it gets.
     machine = llvm.Target.from_default_triple().create_target_machine(

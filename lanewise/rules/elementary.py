@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from .. import elementary as functions
 from ..evaluator import RULES, SINE_AND_COSINE, Evaluator
 from ..jaxprs.jaxapi import ClosedJaxpr
-from ..llvm.ir import Num
+from ..llvm.ir import Num, call_of
 from ..llvm.values import Value, objects
 from ..module import Module
 
@@ -18,47 +18,38 @@ from ..module import Module
 def elementary(e: Evaluator, name: str, args: Sequence[Num]) -> Num:
     """An elementary function of float64, as a call of a function of the module."""
     vec = any(a.vec for a in args)
-    known: list[Any] = [a.known for a in args]
-    if all(x is not None for x in known):
-        return e.b.known(_at_known(name, tuple(float(x) for x in known)), "float64")
-    called = _function(e.module, name, len(args), vec)
-
-    def write(t: str, *names: str) -> str:
-        return f"call {t} {called}({', '.join(f'{t} {x}' for x in names)})"
-
-    return e.b.op(f"call {name}", args, "float64", write)
+    numbers: list[Any] = [a.value for a in args]
+    if all(number is not None for number in numbers):
+        return e.b.const(_at_known(name, tuple(float(number) for number in numbers)), "float64")
+    function = _function(e.module, name, len(args), vec)
+    return e.b.op(f"call {name}", args, "float64", lambda kind, *xs: call_of(function, kind, xs))
 
 
 def sincos(e: Evaluator, x: Num) -> tuple[Num, Num]:
     """sin x and cos x in one call."""
     b = e.b
-    if x.known is not None:
+    if x.value is not None:
         return elementary(e, "sin", [x]), elementary(e, "cos", [x])
 
     def make() -> tuple[Num, ...]:
-        called, t = _function(e.module, "sincos", 1, x.vec), b.type("float64", x.vec)
-        pair = f"{{{t}, {t}}}"
-        calls = [b.new(f"call {pair} {called}({t} {name})") for name in x.names]
+        function, kind = _function(e.module, "sincos", 1, x.vec), b.type("float64", x.vec)
+        pair = f"{{{kind}, {kind}}}"
+        calls = [b.new(f"call {pair} {function}({kind} {name})") for name in x.names]
         b.operations += 2
         return tuple(
-            b.made([b.new(f"extractvalue {pair} {c}, {i}") for c in calls], "float64", x.vec)
+            b.number([b.new(f"extractvalue {pair} {y}, {i}") for y in calls], "float64", x.vec)
             for i in range(2)
         )
 
-    return b.once(("sincos", x.serial), make)
+    return b.find_or_make(("sincos", x.serial), make)
 
 
 def _function(module: Module, name: str, count: int, vec: bool) -> str:
     """The name of an elementary function of `count` arguments, which the module then contains."""
     width = module.b.W if vec else 1
-    called = f"@{name.replace(' ', '_').replace('-', 'm')}_{'v' if width > 1 else 's'}"
-    if (name, width) not in module.functions:
-        module.functions[name, width] = ""  # its place: a function comes after those it calls
-        text, declared, constants = _function_text(name, count, width, called)
-        module.functions[name, width] = text
-        module.declared |= declared
-        module.globals += [c for c in constants if c not in module.globals]
-    return called
+    symbol = f"@{name.replace(' ', '_').replace('-', 'm')}_{'v' if width > 1 else 's'}"
+    module.add_function((name, width), lambda: _function_text(name, count, width, symbol))
+    return symbol
 
 
 def sine_or_cosine(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
@@ -78,7 +69,7 @@ def _by_name(name: str) -> Callable:
 
 
 @functools.cache
-def _traced(name: str, count: int) -> ClosedJaxpr:
+def _jaxpr_of(name: str, count: int) -> ClosedJaxpr:
     """An elementary function as a jaxpr of scalars."""
     with jax.enable_x64(True):
         return jax.make_jaxpr(_by_name(name))(*[jnp.zeros((), jnp.float64)] * count)
@@ -86,35 +77,32 @@ def _traced(name: str, count: int) -> ClosedJaxpr:
 
 @functools.cache
 def _function_text(
-    name: str, count: int, width: int, called: str
+    name: str, count: int, width: int, symbol: str
 ) -> tuple[str, frozenset[str], tuple[str, ...]]:
     """An elementary function of vectors of `width`, with what it declares."""
-    inner = Module(width, 1)
     # A module of its own: its numbers and scopes do not mix with those of the caller.
-    closed = _traced(name, count)
-    b = inner.b
-    args = [b.made([f"%x{i}"], "float64", True) for i in range(count)]
-    evaluator = Evaluator(inner)
+    inner = Module(width, 1)
+    b, evaluator = inner.b, Evaluator(inner)
+    args = [b.number([f"%x{i}"], "float64", True) for i in range(count)]
     values = [Value((), "float64", objects([x], ())) for x in args]
-    outs = evaluator.closed(closed, values)
-    t = result_type = b.type("float64", True)
+    outs = evaluator.evaluate(_jaxpr_of(name, count), values)
+    kind = result_type = b.type("float64", True)
     results = [b.ref(evaluator.entries(out)[()], 0, True) for out in outs]
     result = results[0]
     if len(outs) == 2:
-        result_type = f"{{{t}, {t}}}"
-        half = b.new(f"insertvalue {result_type} poison, {t} {results[0]}, 0")
-        result = b.new(f"insertvalue {result_type} {half}, {t} {results[1]}, 1")
-    prefix = called[1:]
+        result_type = f"{{{kind}, {kind}}}"
+        half = b.new(f"insertvalue {result_type} poison, {kind} {results[0]}, 0")
+        result = b.new(f"insertvalue {result_type} {half}, {kind} {results[1]}, 1")
     text = "\n".join([*b.lines, f"  ret {result_type} {result}"])
     data = []
     for line in inner.globals:  # constants of each function have names of their own
         old = line.split(" ", 1)[0]
-        new = f"@{prefix}.{old[1:]}"
-        text, line = text.replace(old + ",", new + ","), line.replace(old, new, 1)
-        data.append(line)
-    parameters = ", ".join(f"{t} %x{i}" for i in range(count))
-    body = f"define internal {result_type} {called}({parameters}) {{\nentry:\n{text}\n}}\n"
-    return body, frozenset(b.declared | inner.declared), tuple(data)
+        new = f"{symbol}.{old[1:]}"
+        text = text.replace(old + ",", new + ",")
+        data.append(line.replace(old, new, 1))
+    parameters = ", ".join(f"{kind} %x{i}" for i in range(count))
+    body = f"define internal {result_type} {symbol}({parameters}) {{\nentry:\n{text}\n}}\n"
+    return body, frozenset(b.declarations | inner.declarations), tuple(data)
 
 
 @functools.lru_cache(maxsize=4096)

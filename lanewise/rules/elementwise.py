@@ -7,42 +7,43 @@ from typing import Any
 
 import numpy as np
 
-from ..assumed import taken_for, taken_value
-from ..evaluator import RULES, Evaluator, typed
+from ..assumed import assumed_number, assumed_value
+from ..evaluator import RULES, Evaluator, check_types
 from ..llvm.builder import Builder
-from ..llvm.ir import Num, Unsupported
+from ..llvm.ir import NotCompilable, Num
 from ..llvm.memory import Buffer, load, store
-from ..llvm.values import MADE, Value
+from ..llvm.values import MOST_ENTRIES, Value
 from . import exact
 from .elementary import elementary
 
 
-def _binary(method: str) -> Callable:
-    return lambda e, _, a, b: getattr(e.b, method)(a, b)
+def _method(name: str, *first: Any) -> Callable:
+    """The rule that calls a method of the builder with the numbers, after some arguments."""
+    return lambda e, _, *xs: getattr(e.b, name)(*first, *xs)
 
 
 def _equal(e: Evaluator, _: Any, x: Num, y: Num) -> Num:
     """A loop's counter equals a given number in one round: taken for rare."""
-    same = e.b.compare("eq", x, y)
+    is_equal = e.b.compare("eq", x, y)
     # A number that changes and is the same on all trajectories of a batch is a counter.
-    is_count = e.b.W > 1 and taken_value(same) is None and not same.vec and not x.is_float
-    if e.assumed is not None and is_count and (x.known is not None or y.known is not None):
-        e.assumed.never(same)
-        return taken_for(e.b, 0, "bool")
-    return same
+    is_count = e.b.W > 1 and assumed_value(is_equal) is None and not is_equal.vec and not x.is_float
+    if e.assumptions is not None and is_count and (x.value is not None or y.value is not None):
+        e.assumptions.assume_false(is_equal)
+        return assumed_number(e.b, 0, "bool")
+    return is_equal
 
 
-def _select(e: Evaluator, _: Any, which: Num, *cases: Num) -> Num:
+def _select(e: Evaluator, _: Any, condition: Num, *cases: Num) -> Num:
     b = e.b
-    if which.dtype == "bool":
-        taken = None if which.known is not None else taken_value(which)
-        if taken is not None:
-            return b.unrelated(cases[int(taken)])
-        return b.select(which, cases[1], cases[0])
+    if condition.dtype == "bool":
+        assumption = None if condition.value is not None else assumed_value(condition)
+        if assumption is not None:
+            return b.without_origin(cases[int(assumption)])
+        return b.select(condition, cases[1], cases[0])
     # Indices outside select the first or the last case, as in XLA.
     result = cases[-1]
     for i in reversed(range(len(cases) - 1)):
-        result = b.select(b.compare("le", which, b.known(i, which.dtype)), cases[i], result)
+        result = b.select(b.compare("le", condition, b.const(i, condition.dtype)), cases[i], result)
     return result
 
 
@@ -51,12 +52,12 @@ def _clamp(e: Evaluator, _: Any, low: Num, x: Num, high: Num) -> Num:
 
 
 def _sign(e: Evaluator, _: Any, x: Num) -> Num:
-    b, zero = e.b, e.b.known(0, x.dtype)
+    b, zero = e.b, e.b.const(0, x.dtype)
     if x.dtype.startswith("u"):
-        return b.select(b.compare("eq", x, zero), zero, b.known(1, x.dtype))
+        return b.select(b.compare("eq", x, zero), zero, b.const(1, x.dtype))
     # x itself where it is neither: NaN stays NaN and −0 stays −0.
-    one = b.select(b.compare("gt", x, zero), b.known(1, x.dtype), x)
-    return b.select(b.compare("lt", x, zero), b.known(-1, x.dtype), one)
+    sign = b.select(b.compare("gt", x, zero), b.const(1, x.dtype), x)
+    return b.select(b.compare("lt", x, zero), b.const(-1, x.dtype), sign)
 
 
 def _integral(name: str, function: Callable | None) -> Callable:
@@ -65,30 +66,30 @@ def _integral(name: str, function: Callable | None) -> Callable:
     def rule(e: Evaluator, _: Any, x: Num) -> Num:
         if not x.is_float:
             return x
-        if x.known is not None and function is not None:
-            return e.b.known(function(x.known), x.dtype)
+        if x.value is not None and function is not None:
+            return e.b.const(function(x.value), x.dtype)
         return e.b.intrinsic(name, (x,))
 
     return rule
 
 
-def _rounded(e: Evaluator, params: dict, x: Num) -> Num:
+def _round(e: Evaluator, params: dict, x: Num) -> Num:
     # NumPy has no function that rounds halves away from zero.
-    away = int(params["rounding_method"]) == 0
-    rule = _integral("round", None) if away else _integral("roundeven", np.rint)
+    is_away_from_0 = int(params["rounding_method"]) == 0
+    rule = _integral("round", None) if is_away_from_0 else _integral("roundeven", np.rint)
     return rule(e, params, x)
 
 
 def _pow(e: Evaluator, _: Any, x: Num, y: Num) -> Num:
-    if y.known is not None and x.is_float:
-        if not y.is_float or float(y.known).is_integer():
-            n = int(y.known)
+    if y.value is not None and x.is_float:
+        if not y.is_float or float(y.value).is_integer():
+            n = int(y.value)
             # More products would have larger errors than the function.
             if abs(n) <= 64:
                 return e.b.power(x, n)
         # A root and few products: 1/r³ of a force takes a small part of the operations of pow.
-        elif abs(2 * float(y.known)) <= 7 and float(2 * y.known).is_integer():
-            name = f"half_integer_power {int(2 * float(y.known))}"
+        elif abs(2 * float(y.value)) <= 7 and float(2 * y.value).is_integer():
+            name = f"half_integer_power {int(2 * float(y.value))}"
             return _elementary(name)(e, {}, x)
     if not y.is_float:
         y = e.b.convert(y, x.dtype)
@@ -98,10 +99,7 @@ def _pow(e: Evaluator, _: Any, x: Num, y: Num) -> Num:
 def _elementary(name: str) -> Callable:
     def rule(e: Evaluator, _: Any, *xs: Num) -> Num:
         if not xs[0].is_float:
-            raise Unsupported(
-                f"{name} is compiled for floating-point numbers only, got {xs[0].dtype}: convert "
-                "them with .astype(float)"
-            )
+            raise NotCompilable(f"{name} requires floats, got {xs[0].dtype}: use .astype(float)")
         if xs[0].dtype == "float32":
             # Own functions for float32 would be faster, and one more set to test.
             wide = elementary(e, name, [e.b.convert(x, "float64") for x in xs])
@@ -111,37 +109,32 @@ def _elementary(name: str) -> Callable:
     return rule
 
 
-def _one(e: Evaluator, like: Num) -> Num:
-    return e.b.known(1, like.dtype)
+def _unit(e: Evaluator, like: Num) -> Num:
+    return e.b.const(1, like.dtype)
 
 
 def _bitcast(e: Evaluator, params: dict, x: Num) -> Num:
     new = np.dtype(params["new_dtype"])
     # Other sizes change the shape of the array, which a rule for one number cannot.
     if new.itemsize != np.dtype(x.dtype).itemsize or "bool" in (x.dtype, str(new)):
-        raise Unsupported(
-            "bitcast_convert_type is compiled for two types of equal size other than bool, got "
-            f"{x.dtype} and {new}"
-        )
+        raise NotCompilable(f"bitcast requires numbers of equal size, got {x.dtype} and {new}")
     return e.b.bitcast(x, str(new))
 
 
-def _combined(op: str) -> Callable:
+def _combination(op: str) -> Callable:
     return lambda e, _, a, b: e.combine(op, a, b)
 
 
-def _same(e: Evaluator, _: Any, x: Num) -> Num:
+def _identity(e: Evaluator, _: Any, x: Num) -> Num:
     return x
 
 
 def _reduced_precision(e: Evaluator, params: dict, x: Num) -> Num:
-    wide = {"float64": (11, 52), "float32": (8, 23)}.get(x.dtype)
-    if wide is None or params["exponent_bits"] < wide[0] or params["mantissa_bits"] < wide[1]:
-        got = params["exponent_bits"], params["mantissa_bits"]
-        raise Unsupported(
-            f"reduce_precision is compiled only if it does not reduce the precision of {x.dtype}: "
-            f"(exponent_bits, mantissa_bits) must be at least {wide}, got {got}"
-        )
+    least = {"float64": (11, 52), "float32": (8, 23)}.get(x.dtype, (64, 64))
+    bits = params["exponent_bits"], params["mantissa_bits"]
+    if bits[0] < least[0] or bits[1] < least[1]:
+        names = "exponent_bits and mantissa_bits of reduce_precision"
+        raise NotCompilable(f"{names} must be at least {least} for {x.dtype}, got {bits}")
     return x
 
 
@@ -149,45 +142,35 @@ _FUNCTIONS = (
     "sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh "
     "exp exp2 expm1 log log1p log2 cbrt erf erfc erf_inv logistic"
 )
+_SHIFTS = "left right_logical right_arithmetic"
 
 # Applied number by number; an operand without axes is combined with each number of the others.
 ELEMENTWISE: dict[str, Callable] = {
-    **{op: _combined(op) for op in ("add", "mul", "max", "min")},
-    "add_any": _combined("add"),
-    "sub": _binary("sub"),
-    "div": _binary("div"),
-    "rem": _binary("rem"),
-    "neg": lambda e, _, x: e.b.neg(x),
-    "abs": lambda e, _, x: e.b.abs(x),
+    **{op: _combination(op) for op in ("add", "mul", "max", "min")},
+    "add_any": _combination("add"),
+    **{name: _method(name) for name in ("sub", "div", "rem", "neg", "abs", "sqrt", "is_finite")},
     "sign": _sign,
     "clamp": _clamp,
     "select_n": _select,
-    "sqrt": lambda e, _, x: e.b.sqrt(x),
-    "rsqrt": lambda e, _, x: e.b.div(_one(e, x), e.b.sqrt(x)),
+    "rsqrt": lambda e, _, x: e.b.div(_unit(e, x), e.b.sqrt(x)),
     "square": lambda e, _, x: e.b.mul(x, x),
-    "one_minus_square": lambda e, _, x: e.b.sub(_one(e, x), e.b.mul(x, x)),
+    "one_minus_square": lambda e, _, x: e.b.sub(_unit(e, x), e.b.mul(x, x)),
     "integer_pow": lambda e, params, x: e.b.power(x, params["y"]),
     "pow": _pow,
     "floor": _integral("floor", np.floor),
     "ceil": _integral("ceil", np.ceil),
-    "round": _rounded,
-    "is_finite": lambda e, _, x: e.b.is_finite(x),
+    "round": _round,
     "convert_element_type": lambda e, params, x: e.b.convert(x, str(np.dtype(params["new_dtype"]))),
     "bitcast_convert_type": _bitcast,
     "reduce_precision": _reduced_precision,
-    **dict.fromkeys(["copy", "copy_p", "stop_gradient", "real", "conj"], _same),
-    **{op: (lambda e, _, a, b, op=op: e.b.logic(op, a, b)) for op in ("and", "or", "xor")},
-    "not": lambda e, _, x: e.b.invert(x),
-    "rounded_product": exact.rounded,
-    "lost_by_product": exact.lost,
+    **dict.fromkeys(["copy", "copy_p", "stop_gradient", "real", "conj"], _identity),
+    **{op: _method("logic", op) for op in ("and", "or", "xor")},
+    "not": _method("invert"),
+    "rounded_product": exact.product_rule,
+    "lost_by_product": exact.error_rule,
     "eq": _equal,
-    **{
-        op: (lambda e, _, a, b, o=op: e.b.compare(o, a, b)) for op in ("ne", "lt", "le", "gt", "ge")
-    },
-    **{
-        op: (lambda e, _, a, b, op=op: e.b.shift(op, a, b))
-        for op in ("shift_left", "shift_right_logical", "shift_right_arithmetic")
-    },
+    **{op: _method("compare", op) for op in ("ne", "lt", "le", "gt", "ge")},
+    **{f"shift_{kind}": _method("shift", f"shift_{kind}") for kind in _SHIFTS.split()},
     **{name: _elementary(name) for name in _FUNCTIONS.split()},
 }
 
@@ -197,9 +180,9 @@ def _elementwise(e: Evaluator, eqn: Any, values: list[Value], rule: Callable) ->
     shape, params = out.aval.shape, eqn.params
     # Long arrays in a loop over their elements: otherwise the code would be as long as the
     # array.
-    if not all(v.is_small for v in values) or math.prod(shape) > MADE:
+    if not all(value.is_small for value in values) or math.prod(shape) > MOST_ENTRIES:
         return _in_a_loop(e, eqn, values, rule)
-    operands = [np.broadcast_to(e.entries(v), shape) for v in values]
+    operands = [np.broadcast_to(e.entries(value), shape) for value in values]
     results = [rule(e, params, *(x[i] for x in operands)) for i in np.ndindex(*shape)]
     return e.value(results, out.aval)
 
@@ -208,19 +191,21 @@ def _in_a_loop(e: Evaluator, eqn: Any, values: list[Value], rule: Callable) -> V
     """An elementwise primitive on arrays that stay in memory."""
     (out,) = eqn.outvars
     shape = out.aval.shape
-    on = any(v.has_lanes() for v in values)
-    place = e.module.scratch(shape, str(out.aval.dtype), on)
-    sources = [v if v.shape == () else e.in_memory(v) for v in values]
+    has_lanes = any(value.has_lanes() for value in values)
+    place = e.module.scratch(shape, str(out.aval.dtype), has_lanes)
+    sources = [value if value.shape == () else e.in_memory(value) for value in values]
 
-    def one(places: list, target: Buffer) -> None:
+    def loop_over(places: list, target: Buffer) -> None:
         if not target.shape:
             numbers = [e.entries(x)[()] if isinstance(x, Value) else load(e.b, x) for x in places]
             store(e.b, target, rule(e, eqn.params, *numbers))
             return
         rows = functools.partial(_row_of, e.b)
-        e.count(target.shape[0], lambda i: one([rows(x, i) for x in places], target.row(e.b, i)))
+        e.count(
+            target.shape[0], lambda i: loop_over([rows(x, i) for x in places], target.row(e.b, i))
+        )
 
-    one(sources, place)
+    loop_over(sources, place)
     return Value.in_memory(place)
 
 
@@ -228,7 +213,7 @@ def _row_of(b: Builder, x: Any, index: Num) -> Any:
     if isinstance(x, Value):  # one number for all elements
         return x
     if x.shape[0] == 1:
-        index = b.known(0, "int64")
+        index = b.const(0, "int64")
     return x.row(b, index)
 
 
@@ -238,7 +223,7 @@ def _on_arrays(number_rule: Callable) -> Callable:
     def rule(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
         return [_elementwise(e, eqn, values, number_rule)]
 
-    return typed(rule)
+    return check_types(rule)
 
 
 RULES |= {name: _on_arrays(number_rule) for name, number_rule in ELEMENTWISE.items()}

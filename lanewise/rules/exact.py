@@ -7,7 +7,7 @@ from jax import Array, lax
 from jax.typing import ArrayLike
 
 from ..evaluator import Evaluator
-from ..jaxprs.jaxapi import batch_in_front, primitive
+from ..jaxprs.jaxapi import broadcast_in_front, primitive
 from ..llvm.arithmetic import is_power_of_two
 from ..llvm.ir import Num
 
@@ -23,7 +23,7 @@ def exact_product(a: ArrayLike, b: ArrayLike) -> tuple[Array, Array]:
     **Source** Dekker 1971, *Numerische Mathematik* 18, 224; the halves by bits are our own.
     """
     a, b = jnp.broadcast_arrays(a, b)
-    return _rounded.bind(a, b), _lost.bind(a, b)
+    return _product.bind(a, b), _error.bind(a, b)
 
 
 def _halves(x: Array) -> tuple[Array, Array]:
@@ -38,11 +38,11 @@ def _halves(x: Array) -> tuple[Array, Array]:
 def _by_halves(a: Array, b: Array) -> tuple[Array, Array]:
     (a1, a0), (b1, b0) = _halves(a), _halves(b)
     # All four products are exact, so that contraction with a sum changes nothing.
-    middle, lost = two_sum(a1 * b0, a0 * b1)
-    middle, more = two_sum(middle, a0 * b0)
+    middle, low = two_sum(a1 * b0, a0 * b1)
+    middle, lower = two_sum(middle, a0 * b0)
     high = a1 * b1
     p = high + middle
-    return p, (middle - (p - high)) + (lost + more)
+    return p, (middle - (p - high)) + (low + lower)
 
 
 def two_sum(a: ArrayLike, b: ArrayLike) -> tuple[Array, Array]:
@@ -55,32 +55,27 @@ def two_sum(a: ArrayLike, b: ArrayLike) -> tuple[Array, Array]:
     return s, (a - (s - b_seen)) + (b - b_seen)
 
 
-def _in_batches(of):
-    def batched(arrays: Any, axes: Any):
-        size, moved, on = batch_in_front(arrays, axes)
-        both = [
-            jnp.broadcast_to(x, (size, *x.shape)) if o is None else x
-            for x, o in zip(moved, on, strict=True)
-        ]
-        return of().bind(*both), 0
+def _in_batches(operation):
+    def batch_rule(arrays: Any, axes: Any):
+        return operation().bind(*broadcast_in_front(arrays, axes)[1]), 0
 
-    return batched
+    return batch_rule
 
 
-_rounded = primitive(
-    "rounded_product", lambda a, b: _by_halves(a, b)[0], _in_batches(lambda: _rounded)
+_product = primitive(
+    "rounded_product", lambda a, b: _by_halves(a, b)[0], _in_batches(lambda: _product)
 )
-_lost = primitive("lost_by_product", lambda a, b: _by_halves(a, b)[1], _in_batches(lambda: _lost))
+_error = primitive("lost_by_product", lambda a, b: _by_halves(a, b)[1], _in_batches(lambda: _error))
 
 
-def rounded(e: Evaluator, _: Any, a: Num, b: Num) -> Num:
+def product_rule(e: Evaluator, _: Any, a: Num, b: Num) -> Num:
     """The rule of the rounded product in machine code."""
     # Opaque: it is not contracted with a sum after it.
     return e.b.opaque(e.b.mul(a, b))
 
 
-def lost(e: Evaluator, _: Any, a: Num, b: Num) -> Num:
+def error_rule(e: Evaluator, _: Any, a: Num, b: Num) -> Num:
     """The rule of the error of the rounded product in machine code."""
-    if any(x.known is not None and (x.known == 0 or is_power_of_two(x.known)) for x in (a, b)):
-        return e.b.known(0, a.dtype)
+    if any(x.value is not None and (x.value == 0 or is_power_of_two(x.value)) for x in (a, b)):
+        return e.b.const(0, a.dtype)
     return e.b.fma(a, b, e.b.neg(e.b.mul(a, b)))

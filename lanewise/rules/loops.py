@@ -1,41 +1,42 @@
 """Loops and branches: scan, while, cond."""
 
 import functools
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
-from ..assumed import taken_for, taken_value
+from ..assumed import assumed_number, assumed_value
 from ..evaluator import RULES, Evaluator
-from ..jaxprs.dependence import fixed_point, reached_outputs
+from ..jaxprs.dependence import cut, fixed_point, reached_outputs
 from ..jaxprs.jaxapi import ClosedJaxpr, scan_counts
-from ..llvm.ir import TYPES, Num, Unsupported
+from ..llvm.ir import TYPES, NotCompilable, Num
 from ..llvm.values import Value, objects
-from .rounds import Rounds, Waiting
+from .rounds import Rounds, RowCollector
 
 # Primitives whose result is the same on all trajectories, even if the operands differ.
-AGREED = frozenset(["least_over_lanes"])
+UNIFORM = frozenset(["least_over_lanes"])
 
 
-def _carried(e: Evaluator, carry: Sequence[Value], on: Sequence[bool]):
+def _numbers_to_carry(e: Evaluator, carry: Sequence[Value], lane_flags: Sequence[bool]):
     """The numbers of a carry in a row, which of them are vectors, and the way back."""
     numbers = _numbers_of(e, carry)
-    vec = [lanes for value, lanes in zip(carry, on, strict=True) for _ in range(value.size)]
+    vec = [lanes for value, lanes in zip(carry, lane_flags, strict=True) for _ in range(value.size)]
     return numbers, vec, functools.partial(_values_of, carry)
 
 
-def _numbers_of(e: Evaluator, values: Sequence[Value]) -> list[Num]:
+def _numbers_of(e: Evaluator, values: Iterable[Value]) -> list[Num]:
     return [x for value in values for x in e.entries(value).flat]
 
 
 def _values_of(like: Sequence[Any], numbers: Sequence[Num]) -> list[Value]:
     """Values with the shapes and types of `like`, of numbers in a row."""
-    values, rest = [], iter(numbers)
-    for x in like:
-        entries = objects([next(rest) for _ in range(x.size)], x.shape)
-        values.append(Value(x.shape, x.dtype, entries))
+    values, remaining_numbers = [], iter(numbers)
+    for aval in like:
+        entries = objects([next(remaining_numbers) for _ in range(aval.size)], aval.shape)
+        values.append(Value(aval.shape, aval.dtype, entries))
     return values
 
 
@@ -44,8 +45,8 @@ def scan(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Valu
     body: ClosedJaxpr = params["jaxpr"]
     num_consts, num_carry = scan_counts(params)
     length, reverse = params["length"], params["reverse"]
-    consts, carry, xs = _cut(values, num_consts, num_carry)
-    jaxpr, row_avals = body.jaxpr, [v.aval for v in eqn.outvars[num_carry:]]
+    consts, carry, xs = cut(values, num_consts, num_carry)
+    jaxpr, row_avals = body.jaxpr, [var.aval for var in eqn.outvars[num_carry:]]
     if length == 0:
         return [*carry, *(Value(a.shape, a.dtype, np.empty(a.shape, object)) for a in row_avals)]
     # A carry that no round changes is not carried: it stays a constant, or a scalar.
@@ -53,91 +54,93 @@ def scan(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Valu
     moves = [o is not i for o, i in zip(jaxpr.outvars[:num_carry], carry_in, strict=True)]
 
     # Which values differ between trajectories, in some round of the loop.
-    lanes_of_consts, lanes_of_xs = ([v.has_lanes() for v in some] for some in (consts, xs))
+    lanes_of_consts, lanes_of_xs = [v.has_lanes() for v in consts], [v.has_lanes() for v in xs]
 
-    def outputs(on: list[bool]) -> list[bool]:
-        return reached_outputs(jaxpr, [*lanes_of_consts, *on, *lanes_of_xs], AGREED)
+    def outputs(carry_flags: list[bool]) -> list[bool]:
+        return reached_outputs(jaxpr, [*lanes_of_consts, *carry_flags, *lanes_of_xs], UNIFORM)
 
-    on = fixed_point(lambda on: outputs(on)[:num_carry], [v.has_lanes() for v in carry])
-    on_rows = outputs(on)[num_carry:]
-    moving = [(c, o) for c, o, m in zip(carry, on, moves, strict=True) if m]
-    numbers, vec, back = _carried(e, [c for c, _ in moving], [o for _, o in moving])
+    carry_lanes = [value.has_lanes() for value in carry]
+    carry_lanes = fixed_point(lambda flags: outputs(flags)[:num_carry], carry_lanes)
+    row_lanes = outputs(carry_lanes)[num_carry:]
+    numbers, vec, to_values = _numbers_to_carry(
+        e, list(itertools.compress(carry, moves)), list(itertools.compress(carry_lanes, moves))
+    )
     sources = [e.in_memory(x) for x in xs]
     rows = [
         place or e.module.scratch(aval.shape, str(aval.dtype), o)
-        for aval, place, o in zip(row_avals, places[num_carry:], on_rows, strict=True)
+        for aval, place, o in zip(row_avals, places[num_carry:], row_lanes, strict=True)
     ]
     end = e.module.parameter(length)
-    waiting = None if reverse else Waiting.of(e, rows, length)
+    collector = None if reverse else RowCollector.for_results(e, rows, length)
 
-    def merged(numbers: Sequence[Num]) -> list[Value]:
-        of = iter(back(numbers))
-        return [next(of) if m else c for c, m in zip(carry, moves, strict=True)]
+    def full_carry(numbers: Sequence[Num]) -> list[Value]:
+        moving_values = iter(to_values(numbers))
+        pairs = zip(carry, moves, strict=True)
+        return [next(moving_values) if is_moving else value for value, is_moving in pairs]
 
     def round_of(numbers: Sequence[Num], k: Num, start: Num) -> list[Num]:
         if reverse:
-            k = b.sub(b.sub(end, b.known(1, "int64")), k)
+            k = b.sub(b.sub(end, b.const(1, "int64")), k)
         slices = [Value.in_memory(source.row(b, k)) for source in sources]
-        targets = [r.row(b, k) for r in rows] if waiting is None else waiting.rows(k, start)
+        targets = [r.row(b, k) for r in rows] if collector is None else collector.rows(k, start)
         outs = e.jaxpr(
             jaxpr,
             [e.constant(c) for c in body.consts],
-            [*consts, *merged(numbers), *slices],
+            [*consts, *full_carry(numbers), *slices],
             [*[None] * num_carry, *targets],
         )
         for y, target in zip(outs[num_carry:], targets, strict=True):
             e.write(y, target)
-        return _numbers_of(e, [y for y, m in zip(outs[:num_carry], moves, strict=True) if m])
+        return _numbers_of(e, itertools.compress(outs, moves))
 
-    rounds = Rounds(e, vec, length, end, round_of, waiting)
-    return [*merged(rounds.all(jaxpr, numbers)), *map(Value.in_memory, rows)]
+    rounds = Rounds(e, vec, length, end, round_of, collector)
+    return [*full_carry(rounds.run(jaxpr, numbers)), *map(Value.in_memory, rows)]
 
 
 def while_loop(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
-    """`while`; a condition that is an array says of each of its entries whether that entry of the
-    carry, by its leading axes, goes on."""
+    """`while`; an array as condition says which entries of the carry, by leading axes, go on."""
     params = eqn.params
     test, body = params["cond_jaxpr"], params["body_jaxpr"]
-    of_test, of_body, carry = _cut(values, params["cond_nconsts"], params["body_nconsts"])
+    of_test, of_body, carry = cut(values, params["cond_nconsts"], params["body_nconsts"])
     shape = test.jaxpr.outvars[0].aval.shape
     lanes_of_test = [v.has_lanes() for v in of_test]
     lanes_of_body = [v.has_lanes() for v in of_body]
 
-    def after(on):
-        (goes_on,) = reached_outputs(test.jaxpr, [*lanes_of_test, *on], AGREED)
-        outs = reached_outputs(body.jaxpr, [*lanes_of_body, *on], AGREED)
+    def next_flags(carry_flags):
+        (goes_on,) = reached_outputs(test.jaxpr, [*lanes_of_test, *carry_flags], UNIFORM)
+        outs = reached_outputs(body.jaxpr, [*lanes_of_body, *carry_flags], UNIFORM)
         return [goes_on or x for x in outs]
 
-    on = fixed_point(after, [v.has_lanes() for v in carry])
-    (per_lane,) = reached_outputs(test.jaxpr, [*lanes_of_test, *on], AGREED)
-    numbers, vec, back = _carried(e, carry, on)
+    carry_lanes = fixed_point(next_flags, [v.has_lanes() for v in carry])
+    (per_lane,) = reached_outputs(test.jaxpr, [*lanes_of_test, *carry_lanes], UNIFORM)
+    numbers, vec, to_values = _numbers_to_carry(e, carry, carry_lanes)
     parts = math.prod(shape)
     # The condition has the leading axes of each array of the carry.
     part = [i * parts // v.size for v in carry for i in range(v.size)]  # of which a number is
 
     def goes_on(numbers: Sequence[Num]) -> list[Num]:
-        return _numbers_of(e, e.closed(test, [*of_test, *back(numbers)]))
+        return _numbers_of(e, e.evaluate(test, [*of_test, *to_values(numbers)]))
 
     def step(numbers: Sequence[Num]) -> list[Num]:
-        return _numbers_of(e, e.closed(body, [*of_body, *back(numbers)]))
+        return _numbers_of(e, e.evaluate(body, [*of_body, *to_values(numbers)]))
 
     # In a round on assumptions: a loop that starts at all is the rare case.
-    if per_lane and e.assumed is not None:
-        for going in goes_on(numbers):
-            e.assumed.never(going)
-        return back([e.b.unrelated(x) for x in numbers])
+    if per_lane and e.assumptions is not None:
+        for condition in goes_on(numbers):
+            e.assumptions.assume_false(condition)
+        return to_values([e.b.without_origin(x) for x in numbers])
     with e.assuming(None):
         # Trajectories that have finished keep their values, and the block goes on.
         if per_lane or shape:
-            return back(_masked(e, numbers, vec, per_lane, part, goes_on, step))
+            return to_values(_masked_loop(e, numbers, vec, per_lane, part, goes_on, step))
 
         def proceeds(state, _):
             return e.b.ref(goes_on(state)[0], 0, False)
 
-        return back(e.b.loop(numbers, vec, proceeds, lambda state, _: step(state)))
+        return to_values(e.b.loop(numbers, vec, proceeds, lambda state, _: step(state)))
 
 
-def _masked(e: Evaluator, numbers, vec, per_lane, part, goes_on, step) -> list[Num]:
+def _masked_loop(e: Evaluator, numbers, vec, per_lane, part, goes_on, step) -> list[Num]:
     """A loop of which every trajectory, or every part of the carry, stops by itself; the block goes
     on while one of them does. `part[i]` is the condition of number i."""
     b = e.b
@@ -145,71 +148,61 @@ def _masked(e: Evaluator, numbers, vec, per_lane, part, goes_on, step) -> list[N
     count = len(first)
 
     def any_goes_on(state, _):
-        one = functools.reduce(lambda x, y: b.logic("or", x, y), state[:count])
-        return b.any(one) if per_lane else b.ref(one, 0, False)
+        is_active = functools.reduce(lambda x, y: b.logic("or", x, y), state[:count])
+        return b.any_lane(is_active) if per_lane else b.ref(is_active, 0, False)
 
-    def masked(state, _):
+    def masked_step(state, _):
         active, numbers = state[:count], state[count:]
         news = step(numbers)
-        kept = [
-            b.select(active[i], new, old) for i, new, old in zip(part, news, numbers, strict=True)
-        ]
+        triples = zip(part, news, numbers, strict=True)
+        selection = [b.select(active[i], new, old) for i, new, old in triples]
         # A trajectory or a part that has stopped has no influence on whether the loop continues.
-        of = kept if count > 1 else news
-        going = [b.logic("and", x, y) for x, y in zip(active, goes_on(of), strict=True)]
-        return [*going, *kept]
+        news = goes_on(selection if count > 1 else news)
+        return [*(b.logic("and", x, y) for x, y in zip(active, news, strict=True)), *selection]
 
-    end = b.loop([*first, *numbers], [*[per_lane] * count, *vec], any_goes_on, masked)
+    end = b.loop([*first, *numbers], [*[per_lane] * count, *vec], any_goes_on, masked_step)
     return end[count:]
 
 
 def cond(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     branches = eqn.params["branches"]
-    index, operands = values[0], values[1:]
-    which = e.entries(index)[()]
-    if which.known is not None:
-        return e.closed(branches[int(np.clip(which.known, 0, len(branches) - 1))], operands)
-    taken = taken_value(which)
-    if taken is not None:
-        chosen = branches[int(np.clip(taken, 0, len(branches) - 1))]
-        return [e.unrelated(v) for v in e.closed(chosen, operands)]
+    choice, operands = e.entries(values[0])[()], values[1:]
+    index = assumed_value(choice)  # the value, if it is known
+    if index is not None:
+        outs = e.evaluate(branches[int(np.clip(index, 0, len(branches) - 1))], operands)
+        return outs if choice.value is not None else [e.without_origin(value) for value in outs]
     with e.assuming(None):
-        return _branches(e, eqn, which, operands)
+        return _branches(e, eqn, choice, operands)
 
 
-def _branches(e: Evaluator, eqn: Any, which: Num, operands: list[Value]) -> list[Value]:
+def _branches(e: Evaluator, eqn: Any, choice: Num, operands: list[Value]) -> list[Value]:
     branches, b = eqn.params["branches"], e.b
-    if which.dtype == "bool":
-        which = b.convert(which, "int32")
+    if choice.dtype == "bool":
+        choice = b.convert(choice, "int32")
     flags = [v.has_lanes() for v in operands]
     # A result varies if the choice does, or if it does in one of the branches.
-    per_branch = [reached_outputs(x.jaxpr, flags, AGREED) for x in branches]
-    on = [which.vec or any(x) for x in zip(*per_branch, strict=True)]
+    per_branch = [reached_outputs(x.jaxpr, flags, UNIFORM) for x in branches]
+    lane_flags = [choice.vec or any(x) for x in zip(*per_branch, strict=True)]
     avals = [v.aval for v in eqn.outvars]
-    vec = [o for o, a in zip(on, avals, strict=True) for _ in range(a.size)]
+    vec = [o for o, a in zip(lane_flags, avals, strict=True) for _ in range(a.size)]
     dtypes = [str(a.dtype) for a in avals for _ in range(a.size)]
 
     def run(branch):
-        return lambda: _numbers_of(e, e.closed(branch, operands))
+        return lambda: _numbers_of(e, e.evaluate(branch, operands))
 
-    # XLA clamps the index to the branches that exist.
-    last = len(branches) - 1
-    takes = []  # whether a branch is taken; the first and the last beyond their index too
-    for i in range(len(branches)):
-        op = "le" if i == 0 else "ge" if i == last else "eq"
-        takes.append(b.compare(op, which, b.known(i, which.dtype)))
+    # XLA clamps the index to the branches that exist: the first and the last are taken beyond it.
+    ops = ["le", *["eq"] * (len(branches) - 2), "ge"][: len(branches)]
+    takes = [b.compare(op, choice, b.const(i, choice.dtype)) for i, op in enumerate(ops)]
     # The same branch on all trajectories: jump. Otherwise run all branches that some trajectory
     # takes, and let each trajectory select its own result.
-    if not which.vec:
-        results = _one_of(e, takes, [run(x) for x in branches], vec, dtypes)
-    else:
-        results: Any = None
-        for take, branch in zip(takes, branches, strict=True):
-            zeros = [b.known(0, d) for d in dtypes]
-            mine = b.branch(b.any(take), run(branch), lambda z=zeros: z, vec, dtypes)
-            if results is not None:
-                mine = [b.select(take, x, y) for x, y in zip(mine, results, strict=True)]
-            results = mine
+    if not choice.vec:
+        return _values_of(avals, _one_of(e, takes, [run(x) for x in branches], vec, dtypes))
+    results: list[Num] = []
+    for take, branch in zip(takes, branches, strict=True):
+        zeros = [b.const(0, d) for d in dtypes]
+        mine = b.branch(b.any_lane(take), run(branch), lambda z=zeros: z, vec, dtypes)
+        pairs = zip(mine, results or mine, strict=True)
+        results = [b.select(take, x, y) for x, y in pairs] if results else mine
     return _values_of(avals, results)
 
 
@@ -217,36 +210,31 @@ def _one_of(e: Evaluator, takes, runs, vec, dtypes) -> list[Num]:
     if len(runs) == 1:
         return runs[0]()
     b = e.b
-    rest = functools.partial(_one_of, e, takes[1:], runs[1:], vec, dtypes)
-    return b.branch(b.ref(takes[0], 0, False), runs[0], rest, vec, dtypes)
+    others_of = functools.partial(_one_of, e, takes[1:], runs[1:], vec, dtypes)
+    return b.branch(b.ref(takes[0], 0, False), runs[0], others_of, vec, dtypes)
 
 
-def _cut(values: list[Value], first: int, second: int) -> tuple[list, list, list]:
-    return values[:first], values[first : first + second], values[first + second :]
-
-
-def agreed(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+def minimum_over_lanes(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     """The least of an integer over the trajectories of a block."""
     b, x = e.b, e.entries(values[0])[()]
     # Not reduced over the block: the assumption is checked after some rounds.
-    if e.assumed is not None and eqn.params["rare"]:
-        return [e.value([e.assumed.least(x)], eqn.outvars[0].aval)]
+    if e.assumptions is not None and eqn.params["rare"]:
+        return [e.value([e.assumptions.minimum(x)], eqn.outvars[0].aval)]
     if not x.vec:
         return values
     # The block runs a branch that some trajectory nearly always needs. Results do not depend on
     # it, because each trajectory selects its own.
     if not eqn.params["rare"]:  # one of several trajectories nearly always needs it
-        return [e.value([taken_for(b, 0, x.dtype)], eqn.outvars[0].aval)]
-    t, full = b.type(x.dtype, True), b.suffix(x.dtype, True)
-    total = x.names[0]
+        return [e.value([assumed_number(b, 0, x.dtype)], eqn.outvars[0].aval)]
+    kind, bits, total = b.type(x.dtype, True), b.type("bool", True), x.names[0]
     for other in x.names[1:]:
-        less = b.new(f"icmp slt {t} {total}, {other}")
-        bits = b.type("bool", True)
-        total = b.new(f"select {bits} {less}, {t} {total}, {t} {other}")
+        is_less = b.new(f"icmp slt {kind} {total}, {other}")
+        total = b.new(f"select {bits} {is_less}, {kind} {total}, {kind} {other}")
     if b.W > 1:
-        b.declare(f"{TYPES[x.dtype]} @llvm.vector.reduce.smin.{full}({t})")
-        total = b.new(f"call {TYPES[x.dtype]} @llvm.vector.reduce.smin.{full}({t} {total})")
-    return [e.value([b.made([total], x.dtype, False)], eqn.outvars[0].aval)]
+        result = f"{TYPES[x.dtype]} @llvm.vector.reduce.smin.{b.suffix(x.dtype, True)}"
+        b.declare(f"{result}({kind})")
+        total = b.new(f"call {result}({kind} {total})")
+    return [e.value([b.number([total], x.dtype, False)], eqn.outvars[0].aval)]
 
 
 def by_itself(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
@@ -254,18 +242,15 @@ def by_itself(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list
     way round, so that its numbers have the same bits wherever it is called."""
     program = eqn.params["program"]
     if eqn.params["lanes"] is not None:
-        raise Unsupported(
-            "the function contains a batch of another lanewise function, made by "
-            "lanewise.batched or jax.vmap: make a batch of the outer function only"
-        )
-    outs = e.closed(program.traced.all_inputs, [e.closed_off(v) for v in values])
-    return [e.closed_off(v) for v in outs]
+        raise NotCompilable("the function contains a batch of another function of lanewise")
+    outs = e.evaluate(program.trace.all_inputs, [e.opaque(value) for value in values])
+    return [e.opaque(value) for value in outs]
 
 
-def rounded(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+def barrier(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     """The values as they are, in no operation that is contracted with those after them."""
-    return [e.closed_off(v) for v in values]
+    return [e.opaque(value) for value in values]
 
 
 RULES |= {"scan": scan, "while": while_loop, "cond": cond, "lanewise": by_itself}
-RULES |= {"least_over_lanes": agreed, "optimization_barrier": rounded}
+RULES |= {"least_over_lanes": minimum_over_lanes, "optimization_barrier": barrier}

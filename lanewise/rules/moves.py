@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from ..evaluator import RULES, Evaluator, parts_along, typed
+from ..evaluator import RULES, Evaluator, check_types, parts_along
 from ..jaxprs.jaxapi import bodies
-from ..llvm.ir import Unsupported
+from ..llvm.ir import NotCompilable, check_size
 from ..llvm.memory import Buffer
 from ..llvm.values import SMALL, Value
 
@@ -82,18 +82,18 @@ MOVES: dict[str, Callable] = {
 }
 
 
-def moved(name: str, params: dict[str, Any], *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+def move_entries(name: str, params: dict[str, Any], *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
     """The outputs of a primitive that moves numbers.
 
-    **Raises** `Unsupported` for a parameter that its rule does not know, which might move them
+    **Raises** `NotCompilable` for a parameter that its rule does not know, which might move them
     elsewhere.
     """
     rule, params = MOVES[name], {k: v for k, v in params.items() if k not in _ABOUT_DEVICES}
     # A later release of JAX may add a parameter: better no code than wrong code.
-    unknown = params.keys() - inspect.signature(rule).parameters.keys()
-    if unknown:
-        names = ", ".join(sorted(unknown))
-        raise Unsupported(f"{name} has parameters that this version cannot compile: {names}")
+    extra = params.keys() - inspect.signature(rule).parameters.keys()
+    if extra:
+        names = ", ".join(sorted(extra))
+        raise NotCompilable(f"{name} has unknown parameters: {names}")
     out = rule(*arrays, **params)
     return out if isinstance(out, tuple) else (out,)
 
@@ -110,20 +110,15 @@ CALLS = frozenset(_CALL_NAMES.split())
 
 # Taken from the first entry to the last, by this operation of two.
 REDUCTIONS = {
-    "reduce_sum": "add",
-    "reduce_prod": "mul",
-    "reduce_max": "max",
-    "reduce_min": "min",
-    "reduce_and": "and",
-    "reduce_or": "or",
-    "reduce_xor": "xor",
+    **{"reduce_sum": "add", "reduce_prod": "mul"},
+    **{f"reduce_{op}": op for op in ("max", "min", "and", "or", "xor")},
 }
 
 # Running reductions along one axis.
 CUMULATIVE = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}
 
 
-def _viewed(e: Evaluator, eqn: Any, values: list[Value]) -> list[Value] | None:
+def _views(e: Evaluator, eqn: Any, values: list[Value]) -> list[Value] | None:
     """The outputs as other views of an array in memory, if it is there."""
     (value, *_) = values
     if value.entries is not None or value.size <= SMALL:
@@ -131,29 +126,25 @@ def _viewed(e: Evaluator, eqn: Any, values: list[Value]) -> list[Value] | None:
     assert value.buffer is not None
     name, params = eqn.primitive.name, eqn.params
     if name == "reshape" and params["dimensions"] is None:
-        buffers = [e.reshaped(value, params["new_sizes"])]
+        buffers = [e.reshape(value, params["new_sizes"])]
     else:
-        buffers = [
-            value.buffer.seen(lambda x, i=i: moved(name, params, x)[i])
-            for i in range(len(eqn.outvars))
-        ]
-    found = [Value.in_memory(x) for x in buffers if x is not None]
-    if len(found) < len(buffers):
-        rule = f"{name} with a copy is compiled for at most {SMALL} elements"
-        raise Unsupported(f"{rule}, got an array of shape {value.shape}")
-    return found
+        count, view = len(eqn.outvars), value.buffer.view
+        buffers = [view(lambda x, i=i: move_entries(name, params, x)[i]) for i in range(count)]
+    views = [Value.in_memory(x) for x in buffers if x is not None]
+    if len(views) < len(buffers):
+        check_size(value.size, SMALL, f"elements that {name} copies", value.shape)
+    return views
 
 
-def _joined(e: Evaluator, eqn: Any, values: list[Value], place: Buffer | None) -> Value:
+def _concatenation(e: Evaluator, eqn: Any, values: list[Value], place: Buffer | None) -> Value:
     """Arrays one after the other, in memory."""
     (out,) = eqn.outvars
     axis = eqn.params["dimension"]
     if place is None:
-        on = any(v.has_lanes() for v in values)
-        place = e.module.scratch(out.aval.shape, str(out.aval.dtype), on)
-    for value, part in zip(
-        values, parts_along(place, axis, [v.shape for v in values]), strict=True
-    ):
+        has_lanes = any(value.has_lanes() for value in values)
+        place = e.module.scratch(out.aval.shape, str(out.aval.dtype), has_lanes)
+    parts = parts_along(place, axis, [value.shape for value in values])
+    for value, part in zip(values, parts, strict=True):
         e.write(value, part)
     return Value.in_memory(place)
 
@@ -161,27 +152,27 @@ def _joined(e: Evaluator, eqn: Any, values: list[Value], place: Buffer | None) -
 def _move(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     name = eqn.primitive.name
     if name == "reshape" or name in VIEWS:
-        seen = _viewed(e, eqn, values)
-        if seen is not None:
-            return seen
-    if name == "concatenate" and any(v.entries is None for v in values):
-        return [_joined(e, eqn, values, places[0])]
-    entries = moved(name, eqn.params, *(e.entries(v) for v in values))
+        views = _views(e, eqn, values)
+        if views is not None:
+            return views
+    if name == "concatenate" and any(value.entries is None for value in values):
+        return [_concatenation(e, eqn, values, places[0])]
+    entries = move_entries(name, eqn.params, *(e.entries(value) for value in values))
     return [
-        Value(v.aval.shape, v.aval.dtype, np.asarray(x, object))
-        for v, x in zip(eqn.outvars, entries, strict=True)
+        Value(var.aval.shape, var.aval.dtype, np.asarray(array, object))
+        for var, array in zip(eqn.outvars, entries, strict=True)
     ]
 
 
 def _call(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     (body,) = bodies(eqn)
-    return e.closed(body, values, places)
+    return e.evaluate(body, values, places)
 
 
-def _same(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+def _identity(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     return values
 
 
-RULES |= dict.fromkeys(MOVES, typed(_move))
+RULES |= dict.fromkeys(MOVES, check_types(_move))
 RULES |= dict.fromkeys(CALLS, _call)
-RULES |= dict.fromkeys(["reshard", "sharding_constraint", "mesh_cast"], _same)
+RULES |= dict.fromkeys(["reshard", "sharding_constraint", "mesh_cast"], _identity)

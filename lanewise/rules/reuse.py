@@ -12,50 +12,52 @@ from ..llvm.ir import Num
 # Operations worth carrying; calls of elementary functions are too.
 _COSTLY = frozenset(["sqrt", "div"])
 
-_MOST = 8  # numbers that are carried over
+_MOST_PAIRS = 8  # numbers that are carried over
 
 
-def carried_over(before: Sequence[Num], after: Sequence[Num]) -> list[tuple[Num, Num]]:
-    """Pairs (x, y): x follows from the numbers `before` a round as y does from those `after` it, so
+def carried_over(state_before: Sequence[Num], state_after: Sequence[Num]) -> list[tuple[Num, Num]]:
+    """Pairs (x, y): x follows from the state before a round as y does from the state after it, so
     that y is the next round's x."""
-    place = {x.serial: i for i, x in enumerate(before)}
-    new_place = {x.serial: i for i, x in enumerate(after) if x.known is None and x.op}
+    place = {x.serial: i for i, x in enumerate(state_before)}
+    new_place = {x.serial: i for i, x in enumerate(state_after) if x.value is None and x.op}
     names: dict[Any, int] = {}
     # The same names for both, so that equal forms have equal keys.
     first, second = _Forms(place, min(place), names), _Forms(new_place, min(place), names)
-    seen = _all_of(after)
+    numbers = _all_of(state_after)
+    for x in sorted(numbers, key=lambda x: x.serial):  # operands first, so that no call is deep
+        first.key(x), second.key(x)
     ends = {}
-    for y in seen:
-        form = second.of(y)
+    for y in numbers:
+        form = second.key(y)
         if form is not None and _is_costly(y):
             ends.setdefault(form, y)
-    pairs, found = [], set()
-    for x in seen:
-        form = first.of(x)
+    pairs, serials = [], set()
+    for x in numbers:
+        form = first.key(x)
         # A number that is the same on all trajectories is cheap.
         if form in ends and _is_costly(x) and x.vec and x.write and ends[form].vec:
             pairs.append((x, ends[form]))
-            found.add(x.serial)
+            serials.add(x.serial)
     # A number that only other carried numbers need does not have to be carried.
-    needed = {a.serial for z in seen if z.serial not in found for a in z.args}
-    pairs = [(x, y) for x, y in pairs if x.serial in needed]
+    operands = {a.serial for z in numbers if z.serial not in serials for a in z.args}
+    pairs = [(x, y) for x, y in pairs if x.serial in operands]
     # More of them would need more registers than the state leaves.
-    return pairs if len(pairs) <= _MOST else []
+    return pairs if len(pairs) <= _MOST_PAIRS else []
 
 
 def _is_costly(x: Num) -> bool:
     return x.op in _COSTLY or x.op.startswith("call ")
 
 
-def _all_of(numbers: Sequence[Num]) -> list[Num]:
+def _all_of(ends: Sequence[Num]) -> list[Num]:
     """The numbers and all that they are made of."""
-    seen, open_ = {}, list(numbers)
+    result, open_ = {}, list(ends)
     while open_:
         x = open_.pop()
-        if x.known is None and x.serial not in seen:
-            seen[x.serial] = x
+        if x.value is None and x.serial not in result:
+            result[x.serial] = x
             open_ += x.args
-    return list(seen.values())
+    return list(result.values())
 
 
 class _Forms:
@@ -65,31 +67,30 @@ class _Forms:
     in which one number occurs twice, again and again, is as long as a power of two.
     """
 
-    def __init__(self, place: dict[int, int], inside: int, names: dict[Any, int]):
-        """`place` has the numbers of the state; those from the serial `inside` on belong to the
-        round, and the others are the same in all rounds. `names`: keys given so far."""
-        self.place, self.inside, self.names = place, inside, names
+    def __init__(self, place: dict[int, int], first_serial: int, names: dict[Any, int]):
+        """`place`: numbers of the state. Those before `first_serial` are equal in all rounds."""
+        self.place, self.first_serial, self.names = place, first_serial, names
         self.forms: dict[int, int | None] = {}
 
-    def _named(self, *form: Any) -> int:
+    def _key_of(self, *form: Any) -> int:
         return self.names.setdefault(form, len(self.names))
 
-    def of(self, x: Num) -> int | None:
+    def key(self, x: Num) -> int | None:
         """The key, None for a number that does not follow from this state alone."""
-        if x.known is not None:
-            return self._named("known", x.key)
+        if x.value is not None:
+            return self._key_of("known", x.key)
         if x.serial in self.place:
-            return self._named("state", self.place[x.serial])
-        if x.serial < self.inside:
-            return self._named("outside", x.serial)
+            return self._key_of("state", self.place[x.serial])
+        if x.serial < self.first_serial:
+            return self._key_of("outside", x.serial)
         # A result of a loop or a branch: nothing is known of how it was made.
         if x.write is None and x.op != "same":
             return None
         if x.serial not in self.forms:
             self.forms[x.serial] = None
-            parts = [self.of(a) for a in x.args]
+            parts = [self.key(a) for a in x.args]
             if x.op == "same":
                 self.forms[x.serial] = parts[0]
             elif all(part is not None for part in parts):
-                self.forms[x.serial] = self._named(x.op, x.dtype, *parts)
+                self.forms[x.serial] = self._key_of(x.op, x.dtype, *parts)
         return self.forms[x.serial]

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from ..evaluator import RULES, Evaluator, typed
-from ..llvm.ir import Unsupported
+from ..evaluator import RULES, Evaluator, check_types
+from ..llvm.ir import NotCompilable, check_size
 from ..llvm.values import Value
 
 # Larger matrices are left to XLA, which calls LAPACK; so are stacks that cost more operations than
@@ -22,29 +22,25 @@ MOST_SORTED = 16  # longer arrays are sorted by XLA
 
 
 def _square(x: Array, name: str) -> int:
-    if x.shape[0] > MOST_UNKNOWNS:
-        raise Unsupported(
-            f"{name} is compiled for at most {MOST_UNKNOWNS} rows, got shape {x.shape}"
-        )
+    check_size(x.shape[0], MOST_UNKNOWNS, f"rows of {name}")
     return x.shape[0]
 
 
-def _of_each_matrix(one: Callable) -> Callable:
+def _of_each_matrix(of_matrix: Callable) -> Callable:
     """A function of matrices, for stacks of them."""
 
     def of_stacks(*arrays: Array, **parameters: Any) -> Any:
         *front, n, _ = arrays[0].shape
         if not front:
-            return one(*arrays, **parameters)
+            return of_matrix(*arrays, **parameters)
         count = math.prod(front)
-        if not 0 < count * n**3 <= MOST_UNKNOWNS**3:
-            raise Unsupported(
-                f"number of matrices × rows³ must be from 1 to {MOST_UNKNOWNS**3} for "
-                f"{one.__name__}, got shape {arrays[0].shape}"
-            )
+        name = f"matrices × rows³ of {of_matrix.__name__}"
+        check_size(count * n**3, MOST_UNKNOWNS**3, name)
+        if count == 0 or n == 0:
+            raise NotCompilable(f"{name} must be positive, got shape {arrays[0].shape}")
         flat = [x.reshape(count, *x.shape[len(front) :]) for x in arrays]
-        found = [one(*(x[i] for x in flat), **parameters) for i in range(count)]
-        return jax.tree.map(lambda *x: jnp.stack(x).reshape(*front, *x[0].shape), *found)
+        results = [of_matrix(*(x[i] for x in flat), **parameters) for i in range(count)]
+        return jax.tree.map(lambda *x: jnp.stack(x).reshape(*front, *x[0].shape), *results)
 
     return of_stacks
 
@@ -53,7 +49,7 @@ def lu(a: Array, **_) -> tuple[Array, Array, Array]:
     """L and U in one matrix, the row that each row was exchanged with, and the permutation."""
     n = _square(a, "lu")
     if a.shape[1] != n:
-        raise Unsupported(f"lu is compiled for square matrices only, got shape {a.shape}")
+        raise NotCompilable(f"lu requires a square matrix, got shape {a.shape}")
     rows = [[a[i, j] for j in range(n)] for i in range(n)]
     order, pivots = [jnp.int32(i) for i in range(n)], []
     for c in range(n):
@@ -65,13 +61,16 @@ def lu(a: Array, **_) -> tuple[Array, Array, Array]:
             pivot = lax.select(larger, jnp.int32(i), pivot)
         pivots.append(pivot)
         for i in range(c + 1, n):
-            here = pivot == i
+            is_pivot = pivot == i
             for j in range(n):
                 upper, lower = rows[c][j], rows[i][j]
-                rows[c][j] = lax.select(here, lower, upper)
-                rows[i][j] = lax.select(here, upper, lower)
+                rows[c][j] = lax.select(is_pivot, lower, upper)
+                rows[i][j] = lax.select(is_pivot, upper, lower)
             first, second = order[c], order[i]
-            order[c], order[i] = lax.select(here, second, first), lax.select(here, first, second)
+            order[c], order[i] = (
+                lax.select(is_pivot, second, first),
+                lax.select(is_pivot, first, second),
+            )
         for i in range(c + 1, n):
             factor = rows[i][c] / rows[c][c]
             # As LAPACK: a column of zeros is left as it is.
@@ -105,66 +104,67 @@ def cholesky(a: Array, **_) -> Array:
     n = _square(a, "cholesky")
     rows: list[list] = [[jnp.zeros_like(a[0, 0])] * n for _ in range(n)]
     for j in range(n):
-        rest = a[j, j] - sum((rows[j][k] ** 2 for k in range(j)), start=jnp.zeros_like(a[0, 0]))
-        rows[j][j] = jnp.sqrt(lax.select(rest > 0, rest, jnp.full_like(rest, jnp.nan)))
+        square = a[j, j] - sum((rows[j][k] ** 2 for k in range(j)), start=jnp.zeros_like(a[0, 0]))
+        rows[j][j] = jnp.sqrt(lax.select(square > 0, square, jnp.full_like(square, jnp.nan)))
         for i in range(j + 1, n):
             total = a[i, j]
             for k in range(j):
                 total = total - rows[i][k] * rows[j][k]
             rows[i][j] = total / rows[j][j]
     # One pivot that is not positive makes the whole factor NaN, as LAPACK's caller in JAX does.
-    nothing = sum(rows[j][j] * 0 for j in range(n))
-    return jnp.stack([jnp.stack([x + nothing for x in r]) for r in rows])
+    zero_or_nan = sum(rows[j][j] * 0 for j in range(n))
+    return jnp.stack([jnp.stack([x + zero_or_nan for x in r]) for r in rows])
 
 
 def sort(*arrays: Array, dimension: int, num_keys: int, **_) -> list[Array]:
     """Arrays in the order of the first `num_keys` of them, by exchanges of neighbours."""
     n = arrays[0].shape[dimension]
-    if n > MOST_SORTED:
-        raise Unsupported(f"sort is compiled for an axis of at most {MOST_SORTED} numbers, got {n}")
+    check_size(n, MOST_SORTED, "numbers to sort")
     items = [[lax.index_in_dim(x, i, dimension, False) for x in arrays] for i in range(n)]
     # Exchanges at fixed places, whatever the numbers are: odd and even neighbours in turn.
     for turn in range(n):
         for i in range(turn % 2, n - 1, 2):
             a, b = items[i], items[i + 1]
-            swap = _before(b[:num_keys], a[:num_keys])
+            swap = _precedes(b[:num_keys], a[:num_keys])
             items[i] = [lax.select(swap, y, x) for x, y in zip(a, b, strict=True)]
             items[i + 1] = [lax.select(swap, x, y) for x, y in zip(a, b, strict=True)]
     return [jnp.stack([item[k] for item in items], dimension) for k in range(len(arrays))]
 
 
-def _before(x: Sequence[Array], y: Sequence[Array]) -> Array:
+def _precedes(x: Sequence[Array], y: Sequence[Array]) -> Array:
     """Whether x comes before y and not at one place with it; −0 equals 0, NaN is last."""
     # From the last key to the first, which decides unless it is equal.
-    before = jnp.zeros(x[0].shape, bool)
+    is_before = jnp.zeros(x[0].shape, bool)
     for a, b in reversed(list(zip(x, y, strict=True))):
         both_nan = (a != a) & (b != b)
-        before = (a < b) | ((a == a) & (b != b)) | (((a == b) | both_nan) & before)
-    return before
+        is_before = (a < b) | ((a == a) & (b != b)) | (((a == b) | both_nan) & is_before)
+    return is_before
 
 
-def _ordered(x: Array) -> Array:
+def _order_key(x: Array) -> Array:
     """Integers in the order of numbers, −NaN < −∞ < … < −0 < 0 < … < ∞ < NaN."""
     if not jnp.issubdtype(x.dtype, jnp.floating):
         return x
     kind = jnp.dtype(f"int{8 * x.dtype.itemsize}")
     bits = lax.bitcast_convert_type(x, kind)
-    most = jnp.asarray(jnp.iinfo(kind).max, kind)
-    return lax.select(bits < 0, bits ^ most, bits)
+    mask = jnp.asarray(jnp.iinfo(kind).max, kind)
+    return lax.select(bits < 0, bits ^ mask, bits)
 
 
 def nextafter(x: Array, y: Array) -> Array:
     """The number next to x in the direction of y."""
     kind = jnp.dtype(f"int{8 * x.dtype.itemsize}")
     bits = lax.bitcast_convert_type(x, kind)
-    away = (x < y) == (x > 0)
+    is_away = (x < y) == (x > 0)
     # Neighbouring floats have neighbouring bits, in order of their size.
-    moved = lax.bitcast_convert_type(bits + lax.select(away, kind.type(1), kind.type(-1)), x.dtype)
-    least = lax.bitcast_convert_type(jnp.ones((), kind), x.dtype)
+    neighbour = lax.bitcast_convert_type(
+        bits + lax.select(is_away, kind.type(1), kind.type(-1)), x.dtype
+    )
+    smallest = lax.bitcast_convert_type(jnp.ones((), kind), x.dtype)
     # 0 and −0 are one number with two patterns of bits.
-    moved = lax.select(x == 0, lax.select(y > 0, least, -least), moved)
-    moved = lax.select(x == y, y, moved)
-    return lax.select((x != x) | (y != y), x + y, moved)
+    neighbour = lax.select(x == 0, lax.select(y > 0, smallest, -smallest), neighbour)
+    neighbour = lax.select(x == y, y, neighbour)
+    return lax.select((x != x) | (y != y), x + y, neighbour)
 
 
 def threefry2x32(*words: Array, **_) -> tuple[Array, Array]:
@@ -199,14 +199,14 @@ def platform_index(*, platforms: Sequence, **_) -> Array:
 
 
 # function(*arrays, **parameters of the equation) → the equation's results.
-WRITTEN: dict[str, Callable] = {
+EXPANSIONS: dict[str, Callable] = {
     "lu": _of_each_matrix(lu),
     "triangular_solve": _of_each_matrix(triangular_solve),
     "cholesky": _of_each_matrix(cholesky),
     "sort": sort,
     "nextafter": nextafter,
-    "lt_to": lambda x, y: _ordered(x) < _ordered(y),
-    "le_to": lambda x, y: _ordered(x) <= _ordered(y),
+    "lt_to": lambda x, y: _order_key(x) < _order_key(y),
+    "le_to": lambda x, y: _order_key(x) <= _order_key(y),
     "threefry2x32": threefry2x32,
     "platform_index": platform_index,
 }
@@ -214,10 +214,10 @@ WRITTEN: dict[str, Callable] = {
 
 def _rule(name: str) -> Callable:
     def rule(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
-        body = jax.make_jaxpr(functools.partial(WRITTEN[name], **eqn.params))
-        return e.closed(body(*(v.aval for v in eqn.invars)), values)
+        body = jax.make_jaxpr(functools.partial(EXPANSIONS[name], **eqn.params))
+        return e.evaluate(body(*(var.aval for var in eqn.invars)), values)
 
-    return typed(rule)
+    return check_types(rule)
 
 
-RULES |= {name: _rule(name) for name in WRITTEN if name not in RULES}
+RULES |= {name: _rule(name) for name in EXPANSIONS if name not in RULES}

@@ -7,11 +7,13 @@ from collections.abc import Sequence
 from typing import Any
 
 from .numbers import Numbers
-from .target import Code as Code, Compiled as Compiled, Target as Target, compiled_by
+from .target import Code as Code, CompiledProgram as CompiledProgram, Target as Target, compiled_by
 
 TARGETS: dict[str, tuple[Target, ...]] = {"cpu": (Numbers(),)}
 
 
-def compiled(program: Any, on: Sequence[bool], lanes: int | None, platform: str) -> Compiled:
-    """A program as code for a platform. **Raises** `Unsupported` with the reason."""
-    return compiled_by(TARGETS[platform], program, on, lanes)
+def compile_program(
+    program: Any, lane_flags: Sequence[bool], lanes: int | None, platform: str
+) -> CompiledProgram:
+    """A program as code for a platform. **Raises** `NotCompilable` with the reason."""
+    return compiled_by(TARGETS[platform], program, lane_flags, lanes)

@@ -8,9 +8,9 @@ from typing import Any
 
 from .. import rules as rules  # each file registers its rules with the evaluator
 from ..evaluator import Evaluator
-from ..jaxprs.extent import carried, most_operations, operation_count
+from ..jaxprs.extent import carry_size, most_operations, operation_count
 from ..jaxprs.jaxapi import ClosedJaxpr
-from ..llvm.ir import TYPES, Unsupported
+from ..llvm.ir import check_size, check_type
 from ..llvm.memory import Buffer, contiguous, load_row, stored_type
 from ..llvm.values import SMALL, Value, objects
 from ..module import Module
@@ -22,62 +22,51 @@ from .target import Code
 HEAD = 2
 
 
-def kernel_text(module: Module, closed: ClosedJaxpr, on: Sequence[bool]) -> str:
-    """The text of the module; `on` says which inputs differ between trajectories."""
-    b, jaxpr = module.b, closed.jaxpr
+def kernel_text(module: Module, function: ClosedJaxpr, lane_flags: Sequence[bool]) -> str:
+    """The text of the module; `lane_flags` says which inputs differ between trajectories."""
+    b, jaxpr = module.b, function.jaxpr
     for v in (*jaxpr.invars, *jaxpr.outvars):
-        if str(v.aval.dtype) not in TYPES:
-            raise Unsupported(
-                "arguments and results must be float64, float32, bool or integers of 8 to 64 "
-                f"bits, got {v.aval.dtype}"
-            )
-    operands = []
-    for i, (v, o) in enumerate(zip(jaxpr.invars, on, strict=True)):
-        b.emit(f"%ap{i} = getelementptr ptr, ptr %args, i64 {i}")
-        b.emit(f"%a{i} = load ptr, ptr %ap{i}")
-        operands.append((f"%a{i}", v.aval, o))
-    results = []
-    for i, v in enumerate(jaxpr.outvars):
-        b.emit(f"%rp{i} = getelementptr ptr, ptr %rets, i64 {i}")
-        b.emit(f"%r{i} = load ptr, ptr %rp{i}")
-        results.append((f"%r{i}", v.aval))
-    # Before the loop over blocks, so that they are read once.
-    strides = [_lane_stride(module, a) for _, a, o in operands if o]
-    strides_out = [_lane_stride(module, a) for _, a in results]
+        check_type(v.aval.dtype, "arguments and results")
+
+    def pointers(source: str, letter: str, variables: Sequence[Any]) -> list[tuple[str, Any]]:
+        for i in range(len(variables)):
+            b.emit(f"%{letter}p{i} = getelementptr ptr, ptr {source}, i64 {i}")
+            b.emit(f"%{letter}{i} = load ptr, ptr %{letter}p{i}")
+        return [(f"%{letter}{i}", var.aval) for i, var in enumerate(variables)]
+
+    operands = pointers("%args", "a", jaxpr.invars)
+    results = pointers("%rets", "r", jaxpr.outvars)
+    # Before the loop over blocks: strides, and operands that all trajectories share, are read once.
+    pairs = zip(operands, lane_flags, strict=True)
+    lanes = [_lane_stride(module, aval) if has_lanes else None for (_, aval), has_lanes in pairs]
+    result_lanes = [_lane_stride(module, aval) for _, aval in results]
     evaluator = Evaluator(module)
-    shared = {}
-    # Operands that all trajectories share are read once, before the loop over blocks.
-    for i, (pointer, aval, o) in enumerate(operands):
-        if not o:
-            buffer = Buffer((pointer,), str(aval.dtype), aval.shape, contiguous(aval.shape), None)
-            shared[i] = _operand(evaluator, buffer)
+    shared = [
+        _operand(evaluator, _array(module, *operand, None, "")) if lane is None else None
+        for operand, lane in zip(operands, lanes, strict=True)
+    ]
+    consts = [evaluator.constant(c) for c in function.consts]
 
-    consts = [evaluator.constant(c) for c in closed.consts]
-
-    def block(_, i):
+    def write_block(i: str) -> None:
         first = b.new(f"add i64 %first, {i}")
         start = b.new(f"mul i64 {first}, {b.W * b.U}")
         # The last block ends with the last trajectory, and computes some of them again: there
         # is no code for a remainder, which could have other bits.
         fits = b.new(f"icmp slt i64 {start}, %last.start")
         start = b.new(f"select i1 {fits}, i64 {start}, i64 %last.start")
-        own, of = iter(strides), []
-        for k, (pointer, aval, o) in enumerate(operands):
-            if o:
-                buffer = _per_lane(module, pointer, aval, next(own), start)
-                of.append(_operand(evaluator, buffer))
-            else:
-                of.append(shared[k])
-        places = [
-            _per_lane(module, pointer, aval, stride, start)
-            for (pointer, aval), stride in zip(results, strides_out, strict=True)
+        values = [
+            value or _operand(evaluator, _array(module, *operand, lane, start))
+            for operand, lane, value in zip(operands, lanes, shared, strict=True)
         ]
-        outs = evaluator.jaxpr(jaxpr, consts, of, places)
+        places = [
+            _array(module, *result, lane, start)
+            for result, lane in zip(results, result_lanes, strict=True)
+        ]
+        outs = evaluator.jaxpr(jaxpr, consts, values, places)
         for value, place in zip(outs, places, strict=True):
             evaluator.write(value, place)
-        return []
 
-    b.loop([], [], lambda _, i: b.new(f"icmp slt i64 {i}, %count"), block, count=True)
+    b.repeat("%count", write_block)
     prologue = [
         "  %lanes = load i64, ptr %params",
         "  %count = sub i64 %last, %first",
@@ -91,7 +80,7 @@ def kernel_text(module: Module, closed: ClosedJaxpr, on: Sequence[bool]) -> str:
     epilogue = []
     if module.scratch_bytes:
         # Not from the stack: that of a thread of XLA's pool may be small.
-        b.declared |= {"declare ptr @malloc(i64)", "declare void @free(ptr)"}
+        b.declarations |= {"declare ptr @malloc(i64)", "declare void @free(ptr)"}
         size = module.scratch_bytes + 64
         prologue += [
             f"  %memory = call ptr @malloc(i64 {size})",
@@ -102,13 +91,13 @@ def kernel_text(module: Module, closed: ClosedJaxpr, on: Sequence[bool]) -> str:
         ]
         epilogue.append("  call void @free(ptr %memory)")
     body = "\n".join([*prologue, *b.lines, *epilogue, "  ret void"])
-    declared = "\n".join(sorted(module.declared | b.declared))
+    declarations = "\n".join(sorted(module.declarations | b.declarations))
     functions = "\n".join(module.functions.values())
     head = (
         "define internal void @lanewise_kernel(ptr %args, ptr %rets, ptr %params, "
         "i64 %first, i64 %last) alignstack(64) align 64 {\nentry:"
     )
-    return "\n".join(["\n".join(module.globals), declared, functions, head, body, "}\n"])
+    return "\n".join(["\n".join(module.globals), declarations, functions, head, body, "}\n"])
 
 
 def _lane_stride(module: Module, aval: Any) -> int | str:
@@ -118,15 +107,16 @@ def _lane_stride(module: Module, aval: Any) -> int | str:
     return module.parameter(aval.size).names[0]
 
 
-def _per_lane(module: Module, pointer: str, aval: Any, stride: int | str, start: str) -> Buffer:
+def _array(module: Module, pointer: str, aval: Any, lane: int | str | None, start: str) -> Buffer:
+    """An operand or a result of the block that begins at `start`; a shared one without a lane."""
     b, item = module.b, stored_type(str(aval.dtype))
-    bases = []
-    for u in range(b.U):
-        at = start if u == 0 else b.new(f"add i64 {start}, {u * b.W}")
-        if stride != 1:
-            at = b.new(f"mul i64 {at}, {stride}")
-        bases.append(b.new(f"getelementptr {item}, ptr {pointer}, i64 {at}"))
-    return Buffer(tuple(bases), str(aval.dtype), aval.shape, contiguous(aval.shape), stride)
+    bases = [pointer] if lane is None else []
+    for u in range(b.U if lane is not None else 0):
+        position = start if u == 0 else b.new(f"add i64 {start}, {u * b.W}")
+        if lane != 1:
+            position = b.new(f"mul i64 {position}, {lane}")
+        bases.append(b.new(f"getelementptr {item}, ptr {pointer}, i64 {position}"))
+    return Buffer(tuple(bases), str(aval.dtype), aval.shape, contiguous(aval.shape), lane)
 
 
 def _operand(evaluator: Evaluator, buffer: Buffer) -> Value:
@@ -141,48 +131,39 @@ class Numbers:
 
     name = "numbers"
 
-    def suits(self, closed: ClosedJaxpr) -> bool:
+    def suits(self, function: ClosedJaxpr) -> bool:
         return True
 
-    def write(self, closed: ClosedJaxpr, on: Sequence[bool], lanes: int, width: int | None) -> Code:
+    def write(
+        self, function: ClosedJaxpr, lane_flags: Sequence[bool], lanes: int, width: int | None
+    ) -> Code:
         # Counted before code is written, which would take minutes for the largest functions.
-        count = operation_count(closed.jaxpr)
-        most = most_operations(closed.jaxpr)
-        if count > most:
-            raise Unsupported(
-                f"the function has {count} operations, more than {most} (a loop counts once)"
-            )
+        count = operation_count(function.jaxpr)
+        limit = most_operations(function.jaxpr)
+        check_size(count, limit, "the number of operations (a loop counts once)")
         if width is not None:
             vectors = max(width // machine.width(), 1)
         else:
             # Every number of an argument or a result is moved trajectory by trajectory: most work
             # where there is no loop.
-            state = carried(closed.jaxpr)
-            ends = [v.aval.size for v in (*closed.jaxpr.invars, *closed.jaxpr.outvars)]
-            moved = sum(n for n in ends if n <= SMALL)
-            vectors = vectors_for(state, count) if state or moved <= 24 else 1
+            state = carry_size(function.jaxpr)
+            ends = [v.aval.size for v in (*function.jaxpr.invars, *function.jaxpr.outvars)]
+            size = sum(n for n in ends if n <= SMALL)
+            vectors = vectors_for(state, count) if state or size <= 24 else 1
         module = Module(*variant(lanes, vectors))
-        module.b.most = most
-        text = kernel_text(module, closed, on)
-        b = module.b
-        return Code(
-            text=text,
-            block=b.W * b.U,
-            values=tuple(module.values),
-            operations=b.operations,
-            scratch=module.scratch_bytes,
-            width=b.W,
-            vectors=b.U,
-        )
+        module.b.limit = limit
+        text = kernel_text(module, function, lane_flags)
+        b, values, scratch = module.b, tuple(module.values), module.scratch_bytes
+        return Code(text, b.W * b.U, values, (), b.operations, scratch, b.W, b.U)
 
-    def registered(self, code: Code) -> str:
-        return handler.registered(handler.module_text(code.text, code.block))
+    def register(self, code: Code) -> str:
+        return handler.register(handler.module_text(code.text, code.block))
 
     def assembly(self, code: Code) -> str:
         return machine.assembly(handler.module_text(code.text, code.block))
 
 
-def variant(lanes: int, most: int, width: int | None = None) -> tuple[int, int]:
+def variant(lanes: int, limit: int, width: int | None = None) -> tuple[int, int]:
     """(W, U): numbers in a vector, vectors in a block, for so many trajectories."""
     width = machine.width() if width is None else width
     # A block has no more trajectories than the batch: the last block could not end with the last
@@ -190,22 +171,22 @@ def variant(lanes: int, most: int, width: int | None = None) -> tuple[int, int]:
     while width > lanes:
         width //= 2
     vectors = 1
-    if lanes >= most * width:
-        return width, most
+    if lanes >= limit * width:
+        return width, limit
     # A power of two here, so that batches of different small sizes share code.
-    while 2 * vectors <= most and 2 * vectors * width <= lanes:
+    while 2 * vectors <= limit and 2 * vectors * width <= lanes:
         vectors *= 2
     return width, vectors
 
 
-def vectors_for(carried: int, operations: int) -> int:
+def vectors_for(state: int, operations: int) -> int:
     """Vectors in a block: enough to hide latency, few enough that the state stays in registers."""
     # A short step has few independent operations: several vectors hide the latency of its
     # divisions. A long one has many, and more vectors would need more registers than there are.
     if operations < 150:
-        return max(1, min(8, 32 // max(carried, 1)))
-    if operations < 800 and carried <= 12:
+        return max(1, min(8, 32 // max(state, 1)))
+    if operations < 800 and state <= 12:
         return 4
     if operations < 1500:
-        return 3 if carried <= 12 else 2
-    return 2 if operations < 4000 and carried <= 12 else 1
+        return 3 if state <= 12 else 2
+    return 2 if operations < 4000 and state <= 12 else 1

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from ..jaxprs.jaxapi import ClosedJaxpr
-from ..llvm.ir import Unsupported
+from ..llvm.ir import NotCompilable
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,19 +49,21 @@ class Target(Protocol):
         """Its name in reports."""
         ...
 
-    def suits(self, closed: ClosedJaxpr) -> bool:
+    def suits(self, function: ClosedJaxpr) -> bool:
         """Whether it is tried for a program. The answer must not depend on the batch."""
         ...
 
-    def write(self, closed: ClosedJaxpr, on: Sequence[bool], lanes: int, width: int | None) -> Code:
-        """The kernel for a batch of `lanes` trajectories; `on` says which inputs differ between
-        them. `width`: see `Layout`.
+    def write(
+        self, function: ClosedJaxpr, lane_flags: Sequence[bool], lanes: int, width: int | None
+    ) -> Code:
+        """The kernel for a batch of `lanes` trajectories; `lane_flags` says which inputs differ
+        between them. `width`: see `Layout`.
 
-        **Raises** `Unsupported` with the reason if no code can be generated.
+        **Raises** `NotCompilable` with the reason if no code can be generated.
         """
         ...
 
-    def registered(self, code: Code) -> str:
+    def register(self, code: Code) -> str:
         """The name by which XLA calls the code, compiled and registered at the first call."""
         ...
 
@@ -71,7 +73,7 @@ class Target(Protocol):
 
 
 @dataclasses.dataclass(frozen=True)
-class Compiled:
+class CompiledProgram:
     """A program's code, and why the targets that were tried before have none."""
 
     target: Target
@@ -80,28 +82,28 @@ class Compiled:
 
     def call(self, operands: Sequence[Any], program: Any, lanes: int | None) -> list[Any]:
         """The results of the program, as an operation of XLA."""
-        params = self.code.params(lanes, program.traced.closed.out_avals)
+        params = self.code.params(lanes, program.trace.closed_jaxpr.out_avals)
         # Constants follow the operands, so that their text is not part of the code.
-        run = jax.ffi.ffi_call(self.target.registered(self.code), program.shape_of(lanes))
+        run = jax.ffi.ffi_call(self.target.register(self.code), program.shape_of(lanes))
         return list(run(*operands, *self.code.operands, params=params))
 
 
 def compiled_by(
-    targets: Sequence[Target], program: Any, on: Sequence[bool], lanes: int | None
-) -> Compiled:
-    """The code of the first target that has some. **Raises** `Unsupported` with all reasons."""
+    targets: Sequence[Target], program: Any, lane_flags: Sequence[bool], lanes: int | None
+) -> CompiledProgram:
+    """The code of the first target that has some. **Raises** `NotCompilable` with all reasons."""
     if program.layout.form == "arrays":
-        raise Unsupported('the layout has form="arrays"')
-    closed, reasons = program.traced.all_inputs, {}
+        raise NotCompilable('the layout has form="arrays"')
+    function, reasons = program.trace.all_inputs, {}
     for target in targets:
-        if not target.suits(closed):
+        if not target.suits(function):
             continue
         # Only `write` decides, by what it cannot express: a second list of what a target supports
         # would have to be kept equal to its rules.
         try:
-            code = target.write(closed, on, lanes or 1, program.layout.width)
-            return Compiled(target, code, reasons)
-        except Unsupported as why:
-            reasons[target.name] = str(why)
+            code = target.write(function, lane_flags, lanes or 1, program.layout.width)
+            return CompiledProgram(target, code, reasons)
+        except NotCompilable as refusal:
+            reasons[target.name] = str(refusal)
     # Targets share rules, and give the same reason where a rule is missing.
-    raise Unsupported("; ".join(dict.fromkeys(reasons.values())))
+    raise NotCompilable("; ".join(dict.fromkeys(reasons.values())))
