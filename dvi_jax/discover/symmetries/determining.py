@@ -119,9 +119,8 @@ def conformal_factor(
     samples, size = len(first.q), 2 * first.q[0].size
     if not pointwise and samples < size:
         raise ValueError(
-            f"the number of points in first and in second must be at least {size} for a constant "
-            f"{size}×{size} conformal factor, got {samples}. Give more points. For a factor that "
-            "differs from point to point pass pointwise=True."
+            f"first and second must have at least {size} points for a constant {size}×{size} "
+            f"conformal factor, got {samples}: one for each point requires pointwise=True."
         )
     find = _pointwise if pointwise else _constant
     return find(system, generators, first, second, jnp.asarray(epsilon), args)
@@ -208,8 +207,8 @@ def _sizes(system, generators, first, second, epsilon, args):
     places = jnp.eye(len(leaves), dtype=rates.dtype)
     alone = [jnp.tensordot(places[i], x, axes=0) for i, x in enumerate(leaves)]
     _, derivative = jax.linearize(F, first, second)
-    each = jax.vmap(derivative)(*jax.tree.unflatten(structure, alone))
-    of_change = jnp.sum(jnp.abs(each), axis=0)
+    terms = jax.vmap(derivative)(*jax.tree.unflatten(structure, alone))
+    of_change = jnp.sum(jnp.abs(terms), axis=0)
     return of_F, of_change
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from ..algebra.nullspace import CLEAR, in_units_of
 from ..functions.basis import BoundBasis
 from ..functions.generators import Generator
-from ..invariants.expansions import Larger, grown
+from ..invariants.expansions import Larger, growth_note
 from ..invariants.series import in_powers_of_epsilon
 from .gauge import BasisGauge
 from .noether import AdiabaticInvariant
@@ -87,18 +87,18 @@ class Symmetry(eqx.Module):
         """The symmetry, its kind, residuals and gauge, as lines of text."""
         kind = "variational" if self.is_variational else "conformal only"
         mark = ", dependent" if self.is_dependent else ""
-        half, most = np.max(self.typical_residuals, axis=0)
+        half, nearly_all = np.max(self.typical_residuals, axis=0)
         lines = [
             f"  {self}",
             f"      {kind}{mark}; residuals on held-out samples: median {half:.1e}, 95 % below "
-            f"{most:.1e}, largest {np.max(self.residuals):.1e}; of Noether's identity "
+            f"{nearly_all:.1e}, largest {np.max(self.residuals):.1e}; of Noether's identity "
             f"{np.max(self.identity_residuals):.1e}",
         ]
         if self.gauges is not None:
             gauges = np.stack([np.asarray(g.coefficients) for g in self.gauges])
             shares = _shares(gauges, self.scale, self.gauge_sizes)
-            others = _shares(self.coefficients, self.scale, self.sizes)
-            largest = max(np.max(shares, initial=0.0), np.max(others))
+            field_shares = _shares(self.coefficients, self.scale, self.sizes)
+            largest = max(np.max(shares, initial=0.0), np.max(field_shares))
             gauges = np.where(shares > _ROUND_OFF * largest, gauges, 0.0)
             lines.append(f"      gauge G = {_series(self.gauges[0].basis, gauges)}")
             if self.moves_time:
@@ -220,7 +220,7 @@ class Symmetries(eqx.Module):
         if not count and self.survivors[0]:
             lines.append("  what order 0 has does not go on: a lower order, or a larger basis?")
         for symmetry, power in zip(self.found, self.powers, strict=True):
-            lines += [*symmetry.report(), *grown("residuals grow", power)]
+            lines += [*symmetry.report(), *growth_note("residuals grow", power)]
         dependent = sum(s.is_dependent for s in self.found)
         if dependent:
             lines.append(
