@@ -52,9 +52,7 @@ class Motion(NamedTuple):
         """Of combinations of the functions, columns of shape (size, count)."""
         return Motion(times(self.changes, combinations), self.rounding @ np.abs(combinations))
 
-    def candidates(self, combinations: np.ndarray) -> "Motion":
-        """The same as `in_functions`."""
-        return self.in_functions(combinations)
+    candidates = in_functions
 
     def with_perturbation(self, terms: np.ndarray, combinations: np.ndarray) -> "Motion":
         """The same, and what the perturbation changes the combinations by, order by order: the

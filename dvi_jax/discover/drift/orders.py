@@ -17,6 +17,10 @@ _MEANINGS = {
 }
 
 
+def _of_fit(name: str, doc: str) -> Any:
+    return property(lambda self: getattr(self.fit, name), doc=doc)
+
+
 class DriftOrder(NamedTuple):
     """The measured order in ε of a drift; print it for a report.
 
@@ -48,29 +52,18 @@ class DriftOrder(NamedTuple):
     statuses: np.ndarray
     fit: Exponent
 
-    @property
-    def interval(self) -> tuple[float, float]:
-        """95 % interval of the order for ε → 0, from the scatter and from the choice of the law.
-
-        If the order is not `resolved`, it also contains `slope`, the slope of the straight line.
-        """
-        return self.fit.interval
-
-    @property
-    def resolved(self) -> bool:
-        """Whether the 95 % interval of the order for ε → 0 is at most 0.6 long."""
-        return self.fit.resolved
-
-    @property
-    def model(self) -> str:
-        """The most probable law: "power", "sum of two powers", …; see `Exponent`."""
-        return self.fit.model
-
-    @property
-    def curvature(self) -> float:
-        """d² log(drift) / d log(ε)² of a parabola through the points used, 0 for a power law; NaN
-        with fewer than four points."""
-        return self.fit.curvature
+    interval = _of_fit(
+        "interval",
+        "95 % interval of the order for ε → 0, from the scatter and from the choice of the law; if "
+        "the order is not `resolved`, it also contains `slope`, that of the straight line.",
+    )
+    resolved = _of_fit("resolved", "Whether that interval is at most 0.6 long.")
+    model = _of_fit("model", 'The most probable law: "power", "saturation", …; see `Exponent`.')
+    curvature = _of_fit(
+        "curvature",
+        "d² log(drift) / d log(ε)² of a parabola through the points used, 0 for a power law; NaN "
+        "with fewer than four points.",
+    )
 
     @property
     def limit(self) -> float:

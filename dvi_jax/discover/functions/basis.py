@@ -118,15 +118,15 @@ class BoundBasis(eqx.Module):
           functions stay as they are.
         - `exactly`: only if no constants are left over.
         """
-        shift = self.recentring(middle)
-        if shift is None or (exactly and not shift.is_closed):
-            return self, np.eye(self.size)
+        shift = self.recentring(middle, exactly)
         return dataclasses.replace(self, function=shift.function, names=shift.names), shift.matrix
 
-    def recentring(self, middle: np.ndarray) -> "Recentring | None":
-        """The same as `Recentring`; None where all functions stay as they are."""
-        recentring = getattr(self.function, "recentring", None)
-        return None if recentring is None else recentring(middle)
+    def recentring(self, middle: np.ndarray, exactly: bool) -> "Recentring":
+        """The same as `Recentring`: the identity where all functions stay as they are."""
+        shift = getattr(self.function, "recentring", lambda _: None)(middle)
+        if shift is None or (exactly and not shift.is_closed):
+            return Recentring(self.function, self.names, np.eye(self.size), True)
+        return shift
 
 
 class _Selection(eqx.Module):
@@ -289,21 +289,13 @@ class _Pair(eqx.Module):
         a, b = self.first(q, p, t), self.second(q, p, t)
         return jnp.outer(a, b).ravel() if self.is_product else jnp.concatenate([a, b])
 
-    def recentring(self, middle: np.ndarray) -> Recentring | None:
+    def recentring(self, middle: np.ndarray) -> Recentring:
         parts = self.first, self.second
-        shifts = [part.recentring(middle) for part in parts]
-        if self.is_product:
-            # A constant that remains of one part would be multiplied by functions of the other.
-            shifts = [shift if shift and shift.is_closed else None for shift in shifts]
-        if not any(shifts):
-            return None
-        a, b = (
-            shift or Recentring(part.function, part.names, np.eye(part.size), True)
-            for shift, part in zip(shifts, parts, strict=True)
-        )
+        # A constant that remains of one part would be multiplied by functions of the other.
+        a, b = (part.recentring(middle, exactly=self.is_product) for part in parts)
         first, second = (
             dataclasses.replace(part, function=shift.function, names=shift.names)
-            for shift, part in zip((a, b), parts, strict=True)
+            for part, shift in zip(parts, (a, b), strict=True)
         )
         matrix = np.kron(a.matrix, b.matrix)
         if not self.is_product:

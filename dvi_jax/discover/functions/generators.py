@@ -103,6 +103,17 @@ def _multiple(component, number, *point):
     return number * component(*point)
 
 
+def symplectic_gradient(function: Callable[..., Any]) -> Generator:
+    """ξ = ∂K/∂p, η = −∂K/∂q of a function K(t, q, p, args)."""
+    return Generator(
+        xi=eqx.Partial(_slope, function, 2, 1.0), eta=eqx.Partial(_slope, function, 1, -1.0)
+    )
+
+
+def _slope(function, argnum, sign, t, q, p, args):
+    return sign * jax.grad(function, argnums=argnum)(t, q, p, args)
+
+
 def prolong(
     generators: Generator | Sequence[Generator],
     function: Callable[..., Any],

@@ -68,7 +68,7 @@ class Chooser(NamedTuple):
         shape = -1, null.order + 1, null.basis.size
         groups: dict[bool, list[Any]] = {True: [], False: []}
         flags = []
-        for series, is_independent in span.representatives(null.samples, null.slopes):
+        for series, is_independent in span.representatives(null.of_fit):
             coefficients, is_exact_series = self._representative(span, series, representative)
             groups[is_independent].append(_normalise(coefficients, null.conditions.rms))
             flags += [is_exact_series] * is_independent
@@ -101,7 +101,8 @@ class Chooser(NamedTuple):
             return self._without_rounding(shares) / self.sizes, False
         simplest = self._without_rounding(clean(span.simplest(series))) / self.sizes
         coefficients, *sizes = map(jnp.asarray, (simplest, self.typical, null.conditions.scale))
-        samples = null.samples.subset(slice(None, None, max(1, len(null.samples.q) // 100)))
+        samples = null.of_fit.samples
+        samples = samples.subset(slice(None, None, max(1, len(samples.q) // 100)))
         step_map = null.changes.step_map.without_names()
         exact = bool(is_exact(step_map, coefficients, sizes, samples))
         if exact or representative == "simplest":
@@ -156,8 +157,7 @@ def chooser(null: NullSpaces) -> Chooser:
         for part in (~fit, fit)
     )
     linear = LinearConditions.from_terms(times(compress(null.rows), conditions.R))
-    motion, values = changes.motion.subset(fit), null.values
-    fewest = Fewest(null.basis.complexity, conditions.rms, changes.terms[fit, 0], motion, values)
+    fewest = Fewest(conditions.rms, null.of_fit, null.values)
     step = triangle(null.calm[:, None] * conditions.terms[fit, 0]) / np.sqrt(np.sum(fit))
     typical = float(np.linalg.norm(step, 2)) or 1.0
     return Chooser(null, null.sizes, judge, judge_fitted, linear, fewest, typical)

@@ -13,11 +13,10 @@ from jaxtyping import Array
 from ...base.files import publish_npz, read_npz
 from ...base.precision import refuse_double_without_x64
 from ...base.types import State
-from ..algebra.nullspace import CLEAR
 from ..functions.basis import AbstractBasis, BoundBasis, bind_basis
 from ..functions.sampling import SamplePoints, values_at
 from .energy import Energy
-from .expansions import Larger
+from .expansions import Larger, unreliable
 from .obstructions import DriftLaw
 from .report import report
 from .series import InvariantSeries
@@ -163,23 +162,18 @@ class Discovery(eqx.Module):
     @property
     def warnings(self) -> tuple[str, ...]:
         """Reasons why the result is not reliable, each with a remedy; empty if it is reliable."""
-        reasons = []
-        if self.survivors[0] and self.gap < CLEAR:
-            reasons.append("the gap is not clear: let drift_order on a long run decide")
+        reasons = unreliable(
+            self,
+            "let drift_order on a long run decide",
+            "combinations of the functions change in a step by less than 1000 times their "
+            "rounding, or by hardly more than it: whether they are conserved",
+        )
         if self.impossible:
             reasons.append(
                 "as many independent invariants as coordinates were found, which is impossible "
                 "for a map that moves: none is reported; take a smaller tolerance, or samples "
                 "where functions change clearly in a step"
             )
-        if self.undecided > 0:
-            reasons.append(
-                f"{self.undecided} combinations of the functions change in a step by less than "
-                "1000 times their rounding, or by hardly more than it: whether they are conserved "
-                "cannot be decided in this arithmetic; take another h, samples that spread wider, "
-                "or an origin among them"
-            )
-        reasons += filter(None, (other.warning(self.survivors[0]) for other in self.larger))
         if self.condition > _ILL:
             reasons.append(
                 f"the basis is ill-conditioned on the samples ({self.condition:.0e}): formulas "

@@ -70,7 +70,7 @@ def unconserved_energy(null: NullSpaces) -> Energy | None:
     if system.slow_time or depends_on(lambda t: energy(q, p, t), 0, t):
         return None
     basis = BoundBasis(energy, ("energy",), (1,))
-    values = values_at(basis, null.samples)[:, 0]
+    values = values_at(basis, null.of_fit.samples)[:, 0]
     if not np.isfinite(values).all():
         return None
     calm = null.calm

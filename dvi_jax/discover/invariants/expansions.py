@@ -1,11 +1,12 @@
 """Whether invariants are exact or an expansion: larger samples, and a larger step."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..algebra.motion import ROUNDING, coefficient_errors
+from ..algebra.nullspace import CLEAR
 from ..functions.sampling import LEAST_STEP, SMALL, Displacements, SamplePoints
 from .changes import Changes
 from .judging import CLEARLY, Judge
@@ -135,6 +136,20 @@ class Larger(NamedTuple):
             f"{small}: {count} functions are conserved to rounding, and {self.number} of them "
             f"{where.format(f'{self.factor:.2g}')}; each of the others is {expansion}{condition}"
         )
+
+
+def unreliable(result: Any, remedy: str, subject: str) -> list[str]:
+    """Reasons why a `Discovery` or `Symmetries` is not reliable; `remedy`: of a gap that is not
+    clear, `subject`: what may be conserved."""
+    reasons, count = [], result.survivors[0]
+    if count and result.gap < CLEAR:
+        reasons.append(f"the gap is not clear: {remedy}")
+    if result.undecided:
+        reasons.append(
+            f"{result.undecided} {subject} cannot be decided in this arithmetic; take another h, "
+            "samples that spread wider, or an origin among them"
+        )
+    return reasons + [text for larger in result.larger if (text := larger.warning(count))]
 
 
 def growth_note(subject: str, power: float) -> list[str]:

@@ -66,9 +66,10 @@ class Fewest:
     """Invariants of order 0 found again, to more digits, in the functions up to the lowest
     complexity that represent them: coefficients of all others are only errors."""
 
-    def __init__(self, complexity, rms, changes, motion, values):
-        self.complexity, self.rms = np.array(complexity), rms
-        self.changes, self.motion, self.values = changes, motion, values
+    def __init__(self, rms: np.ndarray, changes: Changes, values: np.ndarray):
+        self.complexity = np.array(changes.step_map.basis.complexity)
+        self.rms, self.values = rms, values
+        self.changes, self.motion = changes.terms[:, 0], changes.motion
         self.levels: dict[int, tuple[np.ndarray, np.ndarray] | None] = {}
 
     def up_to(self, level: int) -> tuple[np.ndarray, np.ndarray] | None:

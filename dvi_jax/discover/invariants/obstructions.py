@@ -73,7 +73,7 @@ def drift_laws(
       `slow_time`: of the system. `blur`: see `Span`.
     """
     basis, rms, R, scale = null.basis, null.conditions.rms, null.conditions.R, null.conditions.scale
-    spaces, values, terms = null.spaces, null.changes.values[null.fit], null.rows
+    spaces, values, terms = null.spaces, null.of_fit.values, null.rows
     kernel, size = spaces[0].leading, basis.size
     if kernel.shape[1] == 0:
         return ()

@@ -9,7 +9,8 @@ from ..algebra.motion import Motion
 from ..algebra.nullspace import SeriesSpace, orthonormal_range, singular_vectors
 from ..algebra.weighing import WeightedConditions
 from ..functions.basis import BoundBasis
-from ..functions.sampling import SamplePoints, spreads
+from ..functions.sampling import spreads
+from .changes import Changes
 from .search import NullSpaces
 
 
@@ -40,21 +41,16 @@ class Span(NamedTuple):
     def orders(self) -> int:
         return self.space.leading.shape[0] // self.size
 
-    def representatives(
-        self, samples: SamplePoints, slopes: np.ndarray
-    ) -> list[tuple[np.ndarray, bool]]:
+    def representatives(self, changes: Changes) -> list[tuple[np.ndarray, bool]]:
         """One series, shape (order + 1, size), for each leading-order term, the simplest first; and
-        whether it is independent of those before it: its differential is, at generic points,
-        outside the span of theirs.
-
-        `slopes`: ∂φ/∂(q, p) of the functions at the samples, shape (S, size, 2n).
-        """
+        whether it is independent of those before it: its differential is, at generic points of
+        `changes`, outside the span of theirs."""
         representatives: list[tuple[np.ndarray, bool]] = []
         if self.space.leading.shape[1] == 0:
             return representatives
-        sparse = slice(None, None, max(1, len(samples.q) // 40))
+        slopes = changes.slopes[:: max(1, len(changes.good) // 40), :, :-1]
         # in units of the spread of (q, p), so that their own units do not matter
-        gradients = slopes[sparse] * spreads(samples) / self.conditions.rms[:, None]
+        gradients = slopes * spreads(changes.samples) / self.conditions.rms[:, None]
         complexity, span = np.array(self.basis.complexity), np.zeros((self.size, 0))
         differentials: list[np.ndarray] = []
         shares = self.conditions.shares(self.space.leading)

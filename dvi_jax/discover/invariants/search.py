@@ -1,5 +1,6 @@
 """The null space of a search for invariants."""
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,7 @@ from ..algebra.nullspace import SeriesSpace, compress, series_spaces
 from ..algebra.pair_series import ROUNDING, spaces_in_pairs
 from ..algebra.weighing import WeightedConditions, times_weights, weigh
 from ..functions.basis import BoundBasis
-from ..functions.sampling import SamplePoints, check_basis
+from ..functions.sampling import check_basis
 from .changes import Changes
 
 
@@ -45,10 +46,10 @@ class NullSpaces:
         """Which samples are fitted."""
         return ~self.changes.samples.held_out
 
-    @property
-    def samples(self) -> SamplePoints:
-        """Those that are fitted; so of all that follow."""
-        return self.changes.samples.subset(self.fit)
+    @functools.cached_property
+    def of_fit(self) -> Changes:
+        """The changes at these; so `calm`, `values`, `weights`, `rows`."""
+        return self.changes.subset(self.fit)
 
     @property
     def calm(self) -> np.ndarray:
@@ -57,12 +58,7 @@ class NullSpaces:
     @property
     def values(self) -> np.ndarray:
         """The functions, times the weights `calm`."""
-        return self.calm[:, None] * self.changes.values[self.fit]
-
-    @property
-    def slopes(self) -> np.ndarray:
-        """∂φ/∂(q, p), shape (samples, size, 2n)."""
-        return self.changes.slopes[self.fit, :, :-1]
+        return self.calm[:, None] * self.of_fit.values
 
     @property
     def weights(self) -> np.ndarray:

@@ -5,7 +5,6 @@ from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -14,7 +13,7 @@ from ...base.types import Scalar, State
 from ...problem.system import System
 from ..functions.basis import BoundBasis
 from ..functions.families import power_text
-from ..functions.generators import Generator, require_bound
+from ..functions.generators import Generator, require_bound, symplectic_gradient
 from .digits import closed_form, digits_of
 
 _DROP = 1e-9  # Formulas leave out terms below this share of the largest
@@ -74,7 +73,11 @@ class InvariantSeries(eqx.Module):
                 "generators require functions of q and p, but this basis has functions of the slow "
                 "time εt: search without them."
             )
-        return [_symplectic_gradient(self.basis, c) for c in self.coefficients]
+
+        def generator(c):
+            return symplectic_gradient(lambda t, q, p, args: c @ self.basis(q, p, t))
+
+        return [generator(c) for c in self.coefficients]
 
     def __str__(self) -> str:
         return self.formula()
@@ -137,13 +140,3 @@ def short_text(
     text = basis.formula(terms_in_text, digits, drop=0.0)
     omissions = np.sum(shares > drop * np.max(shares)) - np.count_nonzero(terms_in_text)
     return f"{text} + … ({omissions} smaller terms)" if omissions else text
-
-
-def _symplectic_gradient(basis: BoundBasis, coefficients: Array) -> Generator:
-    def value(t, q, p):
-        return coefficients @ basis(q, p, t)
-
-    return Generator(
-        xi=lambda t, q, p, args: jax.grad(value, argnums=2)(t, q, p),
-        eta=lambda t, q, p, args: -jax.grad(value, argnums=1)(t, q, p),
-    )

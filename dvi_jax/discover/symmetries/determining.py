@@ -122,18 +122,23 @@ def conformal_factor(
             f"first and second must have at least {size} points for a constant {size}×{size} "
             f"conformal factor, got {samples}: one for each point requires pointwise=True."
         )
-    find = _pointwise if pointwise else _constant
-    return find(system, generators, first, second, jnp.asarray(epsilon), args)
+    problem = system, generators, first, second, jnp.asarray(epsilon), args
+    return _conformal_factor(*problem, pointwise)
 
 
 @eqx.filter_jit
-def _constant(system, generators, first, second, epsilon, args) -> ConformalFactor:
+def _conformal_factor(system, generators, first, second, epsilon, args, pointwise):
     def at_sample(first, second):
-        pair = (first, second, epsilon, args)
-        F, change = _equations_and_change(system, generators, *pair)
-        return F, change, *_sizes(system, generators, *pair)
+        if pointwise:
+            first, second = _solution_through(system, first, second, epsilon, args)
+        problem = system, generators, first, second, epsilon, args
+        factor = _pointwise_factor(*problem) if pointwise else None
+        return factor, *_equations_and_change(*problem), *_sizes(*problem)
 
-    values, changes, of_values, of_changes = jax.vmap(at_sample)(first, second)
+    factor, values, changes, of_values, of_changes = jax.vmap(at_sample)(first, second)
+    if pointwise:
+        residual = _relative(changes, of_changes)
+        return ConformalFactor(factor, residual, jnp.ones_like(residual))
     factor = jnp.linalg.lstsq(values, changes)[0].T
     # The columns in units of their terms: an F that is only their round-off determines nothing.
     units = jnp.max(of_values, axis=0, keepdims=True)
@@ -142,23 +147,10 @@ def _constant(system, generators, first, second, epsilon, args) -> ConformalFact
     return ConformalFactor(factor, _relative(changes - values @ factor.T, of_changes), condition)
 
 
-@eqx.filter_jit
-def _pointwise(system, generators, first, second, epsilon, args) -> ConformalFactor:
-    def at_sample(first, second):
-        pair = (*_solution_through(system, first, second, epsilon, args), epsilon, args)
-        change = _equations_and_change(system, generators, *pair)[1]
-        size = _sizes(system, generators, *pair)[1]
-        return _pointwise_factor(system, generators, *pair), change, size
-
-    factors, changes, of_changes = jax.vmap(at_sample)(first, second)
-    residual = _relative(changes, of_changes)
-    return ConformalFactor(factors, residual, jnp.ones_like(residual))
-
-
-def _relative(left, sizes):
+def _relative(residuals, sizes):
     """The largest residual over the largest of its terms."""
     largest = jnp.max(sizes)
-    return jnp.max(jnp.abs(left)) / jnp.where(largest > 0, largest, 1)
+    return jnp.max(jnp.abs(residuals)) / jnp.where(largest > 0, largest, 1)
 
 
 def _equations_and_change(system, generators, first, second, epsilon, args):

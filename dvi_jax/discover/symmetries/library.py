@@ -14,7 +14,7 @@ from jaxtyping import Array
 
 from ...base import checks as _checks
 from ...base.types import State
-from ..functions.generators import Generator, LatticePoint
+from ..functions.generators import Generator, LatticePoint, symplectic_gradient
 
 
 def time_translation() -> Generator:
@@ -95,9 +95,7 @@ def hamiltonian_flow(function: Callable[..., Any]) -> Generator:
     **Raises** `TypeError` for what is not callable. **Source** Olver 1993, Chapter 6.
     """
     _checks.function("the argument of hamiltonian_flow", function, "(t, q, p, args) → scalar")
-    return Generator(
-        xi=eqx.Partial(_slope, function, 2, 1.0), eta=eqx.Partial(_slope, function, 1, -1.0)
-    )
+    return symplectic_gradient(function)
 
 
 def bracket(first: Generator, second: Generator) -> Generator:
@@ -143,10 +141,6 @@ def _boost(direction, mass, t, q, p, args):
     if mass.ndim == 1 and q.ndim == 2 and len(mass) == len(q):
         mass = mass[:, None]  # one for each body
     return _broadcast("mass", mass, q) * v
-
-
-def _slope(function, argnum, sign, t, q, p, args):
-    return sign * jax.grad(function, argnums=argnum)(t, q, p, args)
 
 
 def _bracket(first, second, place, t, q, p, args):

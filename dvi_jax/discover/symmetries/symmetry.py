@@ -5,10 +5,10 @@ from collections.abc import Iterator
 import equinox as eqx
 import numpy as np
 
-from ..algebra.nullspace import CLEAR, in_units_of
+from ..algebra.nullspace import in_units_of
 from ..functions.basis import BoundBasis
 from ..functions.generators import Generator
-from ..invariants.expansions import Larger, growth_note
+from ..invariants.expansions import Larger, growth_note, unreliable
 from ..invariants.series import in_powers_of_epsilon
 from .gauge import BasisGauge
 from .noether import AdiabaticInvariant
@@ -180,22 +180,18 @@ class Symmetries(eqx.Module):
     @property
     def warnings(self) -> tuple[str, ...]:
         """Reasons why the result is not reliable, each with a remedy; empty if it is reliable."""
-        reasons = []
-        if self.survivors[0] and self.gap < CLEAR:
-            reasons.append("the gap is not clear: take more samples, or others")
-        if self.undecided:
-            reasons.append(
-                f"{self.undecided} vector fields change in a step by hardly more than rounding: "
-                "whether they are symmetries cannot be decided in this arithmetic; take another "
-                "h, samples that spread wider, or an origin among them"
-            )
+        reasons = unreliable(
+            self,
+            "take more samples, or others",
+            "vector fields change in a step by hardly more than rounding: whether they are "
+            "symmetries",
+        )
         if self.null > _COARSE:
             reasons.append(
                 f"what breaks a symmetry by less than {self.null:.0e} cannot be decided in this "
                 "arithmetic: the step is small, the samples lie far from the origin, or the "
                 "tolerance is large"
             )
-        reasons += filter(None, (other.warning(self.survivors[0]) for other in self.larger))
         return tuple(reasons)
 
     def __len__(self) -> int:
