@@ -274,8 +274,11 @@ def test_gauge_of_the_time_shift_closes_up_to_the_step_size():
     assert np.max(np.abs(closed)) < 0.05 * np.max(np.abs(open_))
 
 
-def test_solve_gauge_refuses_few_or_unequal_samples():
+def test_solve_gauge_refuses_samples_and_generators_that_do_not_fit():
     with pytest.raises(ValueError, match="too few"):
         solve([TIME], 4, samples=square(count=8))
     with pytest.raises(ValueError, match="the same shape"):
         solve([TIME], 2, samples=(np.ones((9, 1)), np.ones((9, 2))))
+    for generators in ([], TIME):
+        with pytest.raises(ValueError, match="one Generator for each order"):
+            solve(generators, 2)
