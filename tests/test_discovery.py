@@ -13,6 +13,7 @@ import pytest
 
 import dvi_jax as dvi
 from dvi_jax import systems
+from dvi_jax.base.files import publish_npz, read_npz
 from dvi_jax.discover.functions.basis import bind_basis
 from dvi_jax.discover.functions.sampling import SamplePoints, as_samples
 from dvi_jax.discover.invariants import changes
@@ -430,6 +431,17 @@ def test_a_discovery_is_saved_and_loaded(tmp_path, monkeypatch):
             dvi.Discovery.load(damaged, named)
     with pytest.raises(FileNotFoundError, match="of a discovery does not exist"):
         dvi.Discovery.load(path.with_suffix(".none"), named)
+
+
+@pytest.mark.parametrize("name", ["energy", "larger", "obstructions", "names", "errors", "probe_q"])
+def test_a_file_without_one_entry_is_named(name, tmp_path):
+    path = tmp_path / "found.npz"
+    found("cubic", 2, 1).save(path)
+    header, arrays = read_npz(path, 2, "discovery")
+    header, arrays = ({k: v for k, v in x.items() if k != name} for x in (header, arrays))
+    publish_npz(path, 2, header | {"holds": sorted(arrays)}, arrays)
+    with pytest.raises(ValueError, match=f"file of Discovery.save, but .* has no '{name}'"):
+        dvi.Discovery.load(path, dvi.Polynomials(2))
 
 
 def test_an_order_that_the_basis_cannot_express_is_reported():

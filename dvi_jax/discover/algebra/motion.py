@@ -46,7 +46,7 @@ class Motion(NamedTuple):
 
     def subset(self, index: Any) -> "Motion":
         """Of some of the samples."""
-        return Motion(*(x[index] for x in self))
+        return Motion(*(field[index] for field in self))
 
     def in_functions(self, combinations: np.ndarray) -> "Motion":
         """Of combinations of the functions, columns of shape (size, count)."""
@@ -111,7 +111,7 @@ class FieldMotion(NamedTuple):
 
     def subset(self, index: Any) -> "FieldMotion":
         """Of some of the samples."""
-        return FieldMotion(*(x[index] for x in self))
+        return FieldMotion(*(field[index] for field in self))
 
     def in_functions(self, combinations: np.ndarray) -> "FieldMotion":
         """For combinations of the functions φ, columns of shape (B, count)."""

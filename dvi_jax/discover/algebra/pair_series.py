@@ -166,7 +166,7 @@ def staircase(blocks: Sequence[Pair], basis: np.ndarray, noise: float) -> list[S
 
 
 def _stack(matrices: Sequence[Pair], axis: int = 0) -> Pair:
-    parts: Any = (np.concatenate(x, axis=axis) for x in zip(*matrices, strict=True))
+    parts: Any = (np.concatenate(halves, axis=axis) for halves in zip(*matrices, strict=True))
     return Pair(*parts)
 
 

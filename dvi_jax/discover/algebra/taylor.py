@@ -71,9 +71,8 @@ class _Program:
 
     def __init__(self, closed_jaxpr: ClosedJaxpr, inputs: Sequence[_Series], context: tuple = ()):
         jaxpr = closed_jaxpr.jaxpr
-        values = dict(
-            zip(jaxpr.constvars, (_Series(False, c) for c in closed_jaxpr.consts), strict=True)
-        )
+        constants = [_Series(False, constant) for constant in closed_jaxpr.consts]
+        values = dict(zip(jaxpr.constvars, constants, strict=True))
         values.update(zip(jaxpr.invars, inputs, strict=True))
 
         def series_of(atom: Any) -> _Series:
@@ -81,7 +80,7 @@ class _Program:
 
         self.parts: list[Any] = []
         for eqn in jaxpr.eqns:
-            operands = [series_of(v) for v in eqn.invars]
+            operands = list(map(series_of, eqn.invars))
             outputs = next((y for e, x, y in context if _is_equal(eqn, operands, e, x)), None)
             if outputs is None:
                 if eqn.primitive.name in _CALLS:
@@ -91,7 +90,7 @@ class _Program:
                 self.parts.append(part)
                 outputs = part.outputs
             values.update(zip(eqn.outvars, outputs, strict=True))
-        self.outputs = [series_of(v) for v in jaxpr.outvars]
+        self.outputs = list(map(series_of, jaxpr.outvars))
 
     def advance(self, k: int) -> None:
         """Compute the coefficients k."""
@@ -111,12 +110,12 @@ class _Operation:
 
     def __init__(self, jaxpr: Any, eqn: Any, operands: list[_Series], context: tuple):
         self.eqn, self.operands, self.context = eqn, operands, context
-        moves = any(x.moves for x in operands)
-        self.outputs = [_Series(moves and _is_real(v)) for v in eqn.outvars]
+        moves = any(operand.moves for operand in operands)
+        self.outputs = [_Series(moves and _is_real(variable)) for variable in eqn.outvars]
         self.derivative_program: _Program | None = None
         # A jaxpr of this equation alone.
-        variables = dict.fromkeys(v for v in eqn.invars if not isinstance(v, Literal))
-        self.places = [eqn.invars.index(v) for v in variables]
+        variables = dict.fromkeys(x for x in eqn.invars if not isinstance(x, Literal))
+        self.places = [eqn.invars.index(variable) for variable in variables]
         self.alone = of_one_equation(jaxpr, eqn, list(variables))
 
     def function(self, *operands: Any) -> list[Any]:
@@ -126,7 +125,7 @@ class _Operation:
     def values(self, k: int) -> list[Any]:
         """Coefficients of the operands; numbers that are not real are constant."""
         pairs = zip(self.operands, self.eqn.invars, strict=True)
-        return [_or_zeros(x[k], v) if _is_real(v) else x[0] for x, v in pairs]
+        return [_or_zeros(x[k], atom) if _is_real(atom) else x[0] for x, atom in pairs]
 
     def apply(self, *operands: Any) -> list[Any]:
         """g of sums and products, of which literals are operands too."""
@@ -136,11 +135,11 @@ class _Operation:
     def advance(self, k: int) -> None:
         """Compute the coefficients k of the outputs."""
         if k == 0:
-            for y, term in zip(self.outputs, self.function(*self.values(0)), strict=True):
-                y.terms.append(term)
-        elif any(y.moves for y in self.outputs):
-            for y, term in zip(self.outputs, self.coefficients(k), strict=True):
-                y.terms.append(term)
+            for series, term in zip(self.outputs, self.function(*self.values(0)), strict=True):
+                series.terms.append(term)
+        elif any(series.moves for series in self.outputs):
+            for series, term in zip(self.outputs, self.coefficients(k), strict=True):
+                series.terms.append(term)
 
     def coefficients(self, k: int) -> list[Any]:
         """Those of order k ≥ 1."""

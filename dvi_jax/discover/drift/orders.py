@@ -114,7 +114,11 @@ class DriftOrder(NamedTuple):
 
 def _of_each_order(name: str, doc: str, axis: int = 0) -> Any:
     """A field of every order, stacked along an axis."""
-    return property(lambda self: np.stack([getattr(o, name) for o in self.orders], axis), doc=doc)
+
+    def stack(self):
+        return np.stack([getattr(order, name) for order in self.orders], axis)
+
+    return property(stack, doc=doc)
 
 
 class DriftSurface(NamedTuple):

@@ -242,7 +242,7 @@ class _Values(eqx.Module):
 
     def __call__(self, q, p, t):
         pairs = zip(self.functions, self.takes_time, strict=True)
-        values = [f(q, p, t) if takes_time else f(q, p) for f, takes_time in pairs]
+        values = [call(q, p, t) if timely else call(q, p) for call, timely in pairs]
         return jnp.stack([jnp.asarray(value, float) for value in values])
 
 

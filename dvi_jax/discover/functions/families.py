@@ -55,7 +55,7 @@ class _ComponentFunctions(eqx.Module):
 def _bound(family: Any, variables: Sequence[str], shape, names, complexity) -> BoundBasis:
     """A family of functions of these variables, for states of this shape."""
     function = _ComponentFunctions(family, _places(variables, shape))
-    uses_time = any(v in TIME for v in variables)
+    uses_time = any(name in TIME for name in variables)
     return BoundBasis(function, tuple(names), tuple(complexity), uses_time)
 
 

@@ -70,7 +70,7 @@ class Generator(eqx.Module):
         if callable(number) or jnp.shape(number) != ():
             return NotImplemented
         parts = (getattr(self, name) for name in _COMPONENTS)
-        return Generator(*(None if f is None else eqx.Partial(_multiple, f, number) for f in parts))
+        return Generator(*(None if x is None else eqx.Partial(_multiple, x, number) for x in parts))
 
     def __rmul__(self, number: Any) -> "Generator":
         return self * number

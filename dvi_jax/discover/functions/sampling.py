@@ -34,7 +34,7 @@ class SamplePoints(NamedTuple):
 
     def subset(self, index: Any) -> "SamplePoints":
         """Some of the samples."""
-        return SamplePoints(*(x[index] for x in self))
+        return SamplePoints(*(field[index] for field in self))
 
     @property
     def held_out(self) -> np.ndarray:
@@ -142,7 +142,7 @@ def as_samples(samples: Any, t0: float = 0.0) -> SamplePoints:
     if isinstance(samples, SamplePoints):
         return samples
     try:
-        arrays = [np.asarray(x, float) for x in samples]
+        arrays = [np.asarray(array, float) for array in samples]
     except (TypeError, ValueError):
         arrays = []
     if len(arrays) not in (2, 3):
@@ -162,7 +162,7 @@ def as_samples(samples: Any, t0: float = 0.0) -> SamplePoints:
             f"ts of samples must have one time for each point, shape ({len(q)},), got {t.shape}."
         )
     points = SamplePoints(q, p, t)
-    finite = [np.isfinite(x).reshape(len(q), -1).all(axis=1) for x in points]
+    finite = [np.isfinite(array).reshape(len(q), -1).all(axis=1) for array in points]
     if len(bad := np.flatnonzero(~np.all(finite, axis=0))):
         raise ValueError(
             f"samples must be finite, but {len(bad)} of {len(q)} points are not, first "

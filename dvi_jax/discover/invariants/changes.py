@@ -79,7 +79,8 @@ class Changes(NamedTuple):
 
     def subset(self, index: np.ndarray) -> "Changes":
         """Of some of the samples."""
-        arrays = {name: x[index] for name, x in self._asdict().items() if isinstance(x, np.ndarray)}
+        fields = self._asdict().items()
+        arrays = {name: x[index] for name, x in fields if isinstance(x, np.ndarray)}
         samples, motion = self.samples.subset(index), self.motion.subset(index)
         return self._replace(samples=samples, motion=motion, **arrays)
 

@@ -36,14 +36,13 @@ class Choice(NamedTuple):
 class Chooser(NamedTuple):
     """What representatives are compared by.
 
-    - `null`: the series that are conserved. `sizes`: see `NullSpaces`.
+    - `null`: the series that are conserved.
     - `judge`, `judge_fitted`: their changes at the held-out and at the fitted samples.
     - `linear`: for digits and errors of coefficients. `fewest`: for order 0.
     - `typical`: change of functions of size 1 in a step.
     """
 
     null: NullSpaces
-    sizes: np.ndarray
     judge: Judge
     judge_fitted: Judge
     linear: LinearConditions
@@ -53,7 +52,7 @@ class Chooser(NamedTuple):
     def best(self, representative: str) -> Choice:
         """The choice by which fewer series are rejected."""
         # Null vectors are known up to a share of about 1 / gap.
-        fuzzy = min(_FUZZY / self.null.gap, _FUZZIEST)
+        fuzzy = min(_FUZZY / self.null.spaces[-1].gap, _FUZZIEST)
         if self.null.tolerance is not None:
             return self.choice(max(RANK, np.sqrt(self.null.tolerance)), representative)
         choice = self.choice(max(RANK, fuzzy), representative)
@@ -64,11 +63,11 @@ class Chooser(NamedTuple):
 
     def choice(self, blur: float, representative: str) -> Choice:
         """One series for each leading-order term, in functions of the basis; `blur`: see `Span`."""
-        null, span = self.null, Span.from_spaces(self.null, blur)
+        null, span = self.null, Span(self.null, blur)
         shape = -1, null.order + 1, null.basis.size
         groups: dict[bool, list[Any]] = {True: [], False: []}
         flags = []
-        for series, is_independent in span.representatives(null.of_fit):
+        for series, is_independent in span.representatives():
             coefficients, is_exact_series = self._representative(span, series, representative)
             groups[is_independent].append(_normalise(coefficients, null.conditions.rms))
             flags += [is_exact_series] * is_independent
@@ -86,8 +85,8 @@ class Chooser(NamedTuple):
         terms = np.count_nonzero(coefficients, (1, 2))
         order = np.lexsort((terms, ~exact, ~(changes <= CLEARLY)))
         coefficients, exact = coefficients[order], tuple(exact[order].tolist())
-        errors = [self.linear.errors(c * self.sizes, null.tolerance) for c in coefficients]
-        errors = np.array(errors).reshape(coefficients.shape) / self.sizes
+        errors = [self.linear.errors(c * self.null.sizes, null.tolerance) for c in coefficients]
+        errors = np.array(errors).reshape(coefficients.shape) / self.null.sizes
         unclear = int(np.sum(rejections < UNCLEAR))
         return Choice(coefficients, dependent, errors, exact, len(rejections), unclear, blur)
 
@@ -98,8 +97,8 @@ class Chooser(NamedTuple):
         null = self.null
         if null.order == 0:
             shares = self._of_order_0(series[0], span.blur)[None]
-            return self._without_rounding(shares) / self.sizes, False
-        simplest = self._without_rounding(clean(span.simplest(series))) / self.sizes
+            return self._without_rounding(shares) / self.null.sizes, False
+        simplest = self._without_rounding(clean(span.simplest(series))) / self.null.sizes
         coefficients, *sizes = map(jnp.asarray, (simplest, self.typical, null.conditions.scale))
         samples = null.of_fit.samples
         samples = samples.subset(slice(None, None, max(1, len(samples.q) // 100)))
@@ -107,13 +106,13 @@ class Chooser(NamedTuple):
         exact = bool(is_exact(step_map, coefficients, sizes, samples))
         if exact or representative == "simplest":
             return simplest, exact
-        return self._without_rounding(clean(span.smallest(series))) / self.sizes, exact
+        return self._without_rounding(clean(span.smallest(series))) / self.null.sizes, exact
 
     def _without_rounding(self, shares: np.ndarray) -> np.ndarray:
         if self.null.tolerance is not None:
             return shares
         return self.linear.without_rounding(
-            shares, lambda candidate: self.judge.largest((candidate / self.sizes)[None])[0]
+            shares, lambda candidate: self.judge.largest((candidate / self.null.sizes)[None])[0]
         )
 
     def _of_order_0(self, series: np.ndarray, blur: float) -> np.ndarray:
@@ -122,7 +121,7 @@ class Chooser(NamedTuple):
             return clean(series, blur)
 
         def changes_of(candidates):
-            return self.judge.largest((np.array(candidates) / self.sizes[0])[:, None])
+            return self.judge.largest((np.array(candidates) / self.null.sizes[0])[:, None])
 
         candidates = [clean(self.fewest.represent(clean(series, blur)), blur)]
         if blur > RANK:  # what was taken for errors of others may be a part of it
@@ -130,7 +129,9 @@ class Chooser(NamedTuple):
         candidates = [shares for shares in candidates if shares.any()] or [series]
         changes = changes_of(candidates)
         if np.min(changes) > CLEARLY:  # rows weighted by what its own slopes predict
-            rows = self.judge_fitted.own_rows(series / self.sizes[0]) / self.null.conditions.rms
+            rows = (
+                self.judge_fitted.own_rows(series / self.null.sizes[0]) / self.null.conditions.rms
+            )
             singular, V = singular_vectors(rows)
             null = V[singular <= CLEARLY * np.sqrt(len(rows))]
             projection = null.T @ (null @ series)
@@ -160,7 +161,7 @@ def chooser(null: NullSpaces) -> Chooser:
     fewest = Fewest(conditions.rms, null.of_fit, null.values)
     step = triangle(null.calm[:, None] * conditions.terms[fit, 0]) / np.sqrt(np.sum(fit))
     typical = float(np.linalg.norm(step, 2)) or 1.0
-    return Chooser(null, null.sizes, judge, judge_fitted, linear, fewest, typical)
+    return Chooser(null, judge, judge_fitted, linear, fewest, typical)
 
 
 def _normalise(series: np.ndarray, rms: np.ndarray) -> np.ndarray:

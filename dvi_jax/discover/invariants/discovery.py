@@ -155,8 +155,8 @@ class Discovery(eqx.Module):
 
     def _series(self, coefficients: Array, errors: Any) -> list[InvariantSeries]:
         return [
-            InvariantSeries(self.inner, c, self.slow_time, sizes=self.sizes, errors=error)
-            for c, error in zip(coefficients, errors, strict=True)
+            InvariantSeries(self.inner, series, self.slow_time, sizes=self.sizes, errors=error)
+            for series, error in zip(coefficients, errors, strict=True)
         ]
 
     @property
@@ -193,13 +193,13 @@ class Discovery(eqx.Module):
         header["names"] = self.basis.names
         header["obstructions"] = [
             {
-                name: x.tolist() if isinstance(x, np.ndarray) else x
-                for name, x in law._asdict().items()
+                name: value.tolist() if isinstance(value, np.ndarray) else value
+                for name, value in law._asdict().items()
             }
             for law in self.obstructions
         ]
         arrays: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in names}
-        arrays |= {f"probe_{name}": x for name, x in self.probe._asdict().items()}
+        arrays |= {f"probe_{name}": value for name, value in self.probe._asdict().items()}
         arrays["probe_values"] = values_at(self.basis, self.probe)
         publish_npz(path, _FORMAT, header, arrays)
 

@@ -156,15 +156,16 @@ def discover_invariants(
     number, scale = len(coefficients), null.conditions.scale
     unclear = max(null.conditions.motion.unclear_count() - count, 0) + null.unclear + choice.unclear
     volume = np.max(np.abs(in_units_of(scale, changes.volume)), axis=0)
+    parts = null.conditions.orthonormal @ null.spaces[-1].leading[: inner.size]
     return Discovery(
         inner_coefficients=jnp.asarray(coefficients),
         inner_dependent=jnp.asarray(dependent),
         errors=choice.errors[:number],
         exact=choice.exact[:number],
-        leading_parts=null.leading_parts @ to_basis,
+        leading_parts=parts.T @ to_basis,
         survivors=tuple(space.leading.shape[1] for space in null.spaces),
         singular_values=null.spaces[-1].singular_values,
-        gap=null.gap,
+        gap=null.spaces[-1].gap,
         refused=rejections,
         residuals=judge.quantiles(coefficients, 1.0),
         typical_residuals=residuals[:number],

@@ -56,7 +56,7 @@ class DriftLaw(NamedTuple):
         if len(self.powers):
             text += f"\n      = {power} ({linear_text(self.powers, _POWERS[: len(self.powers)])})"
         if len(self.rest):
-            text += f", at rest at I = {', '.join(f'{x:.4g}' for x in self.rest)}"
+            text += f", at rest at I = {', '.join(f'{point:.4g}' for point in self.rest)}"
         return text
 
 

@@ -60,7 +60,7 @@ def _up_to(order: int) -> str:
 
 def _numbers(discovery: Any) -> list[str]:
     """How many combinations are conserved at each order, and how clear that is."""
-    counts = [f"{n}{_up_to(m) or ' for ε = 0'}" for m, n in enumerate(discovery.survivors)]
+    counts = [f"{count}{_up_to(m) or ' for ε = 0'}" for m, count in enumerate(discovery.survivors)]
     next_value = f"the smallest singular value of the others is {discovery.gap:.1e} times as large"
     return [f"combinations conserved: {', '.join(counts)}; {next_value}"]
 
@@ -81,7 +81,9 @@ def _invariant_lines(discovery: Any, i: int, series: Any) -> list[str]:
         *(f"      {note}" for note in notes),
         *growth_note("changes grow", discovery.powers[i]),
     ]
-    forms = [f"{x} = {y}" for x, y in series.recognised.items() if y not in _OBVIOUS]
+    forms = [
+        f"{number} = {form}" for number, form in series.recognised.items() if form not in _OBVIOUS
+    ]
     if forms and discovery.tolerance is None:
         total = f", … ({len(forms)} in all)" if len(forms) > _CLOSED_FORMS else ""
         lines.append(f"      recognised: {', '.join(forms[:_CLOSED_FORMS])}{total}")

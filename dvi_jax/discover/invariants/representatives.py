@@ -8,9 +8,7 @@ from ..algebra.echelon import reduced_echelon, reduction
 from ..algebra.motion import Motion
 from ..algebra.nullspace import SeriesSpace, orthonormal_range, singular_vectors
 from ..algebra.weighing import WeightedConditions
-from ..functions.basis import BoundBasis
 from ..functions.sampling import spreads
-from .changes import Changes
 from .search import NullSpaces
 
 
@@ -18,43 +16,40 @@ class Span(NamedTuple):
     """All invariants found, as series in a basis that is orthonormal on the samples.
 
     Coefficients are compared as shares: those of functions scaled to one size on the samples, see
-    `WeightedConditions.shares`. `space`: that of the highest order. `blur`: size below which shares
-    count as zero. `constant`: the shares of a constant, None without one.
+    `WeightedConditions.shares`. `blur`: size below which shares count as zero.
     """
 
-    basis: BoundBasis
-    conditions: WeightedConditions[Motion]
-    space: SeriesSpace
+    null: NullSpaces
     blur: float
-    constant: np.ndarray | None
 
-    @classmethod
-    def from_spaces(cls, null: NullSpaces, blur: float) -> "Span":
-        """From the null spaces of a search."""
-        return cls(null.basis, null.conditions, null.spaces[-1], blur, null.constant)
+    @property
+    def conditions(self) -> WeightedConditions[Motion]:
+        return self.null.conditions
+
+    @property
+    def space(self) -> SeriesSpace:
+        """That of the highest order."""
+        return self.null.spaces[-1]
 
     @property
     def size(self) -> int:
-        return self.basis.size
+        return self.null.basis.size
 
-    @property
-    def orders(self) -> int:
-        return self.space.leading.shape[0] // self.size
-
-    def representatives(self, changes: Changes) -> list[tuple[np.ndarray, bool]]:
+    def representatives(self) -> list[tuple[np.ndarray, bool]]:
         """One series, shape (order + 1, size), for each leading-order term, the simplest first; and
-        whether it is independent of those before it: its differential is, at generic points of
-        `changes`, outside the span of theirs."""
+        whether it is independent of those before it: its differential is, at generic points,
+        outside the span of theirs."""
+        changes = self.null.of_fit
         representatives: list[tuple[np.ndarray, bool]] = []
         if self.space.leading.shape[1] == 0:
             return representatives
         slopes = changes.slopes[:: max(1, len(changes.good) // 40), :, :-1]
         # in units of the spread of (q, p), so that their own units do not matter
         gradients = slopes * spreads(changes.samples) / self.conditions.rms[:, None]
-        complexity, span = np.array(self.basis.complexity), np.zeros((self.size, 0))
+        complexity, span = np.array(self.null.basis.complexity), np.zeros((self.size, 0))
         differentials: list[np.ndarray] = []
         shares = self.conditions.shares(self.space.leading)
-        for level in sorted(set(self.basis.complexity)):
+        for level in sorted(set(self.null.basis.complexity)):
             candidates = self._up_to(level, shares)
             for vector in reduced_echelon(candidates, complexity, self.blur).T:
                 leading = vector[: self.size]
@@ -71,14 +66,14 @@ class Span(NamedTuple):
                 is_independent = rank == len(differentials) + 1
                 if is_independent:
                     differentials.append(d / length)
-                series = self._without_constants(vector.reshape(self.orders, self.size))
+                series = self._without_constants(vector.reshape(self.null.order + 1, self.size))
                 representatives.append((series, is_independent))
         return representatives
 
     def _up_to(self, level: int, shares: np.ndarray) -> np.ndarray:
         """Those whose leading-order term uses no function above this complexity."""
         leading = shares[: self.size]
-        complex_part = leading[np.array(self.basis.complexity) > level]
+        complex_part = leading[np.array(self.null.basis.complexity) > level]
         singular, V = singular_vectors(complex_part / max(np.linalg.norm(leading, 2), 1e-300))
         return shares @ V[singular < self.blur].T
 
@@ -91,7 +86,7 @@ class Span(NamedTuple):
 
     def simplest(self, series: np.ndarray) -> np.ndarray:
         """The corrections that use complex functions as little as can be."""
-        complexity = np.tile(self.basis.complexity, self.orders)
+        complexity = np.tile(self.null.basis.complexity, self.null.order + 1)
         shifts = self.conditions.shares(self.space.shifts)
         simplify = reduction(shifts, complexity, self.size, self.blur)
         return simplify(series.reshape(-1)).reshape(series.shape)
@@ -105,7 +100,7 @@ class Span(NamedTuple):
 
     def _without_constants(self, series: np.ndarray) -> np.ndarray:
         """The series less the multiple of the constant at each order that makes it simplest."""
-        if self.constant is None:
+        if self.null.constant is None:
             return series
-        j = np.argmax(np.abs(self.constant))
-        return series - np.outer(series[:, j] / self.constant[j], self.constant)
+        j = np.argmax(np.abs(self.null.constant))
+        return series - np.outer(series[:, j] / self.null.constant[j], self.null.constant)

@@ -80,16 +80,6 @@ class NullSpaces:
         return self.spaces[0].leading.shape[1]
 
     @property
-    def gap(self) -> float:
-        return self.spaces[-1].gap
-
-    @property
-    def leading_parts(self) -> np.ndarray:
-        """Order 0 of everything in the null space, in functions of the basis, (count, size)."""
-        leading = self.spaces[-1].leading[: self.basis.size]
-        return (self.conditions.shares(leading) / self.conditions.rms[:, None]).T
-
-    @property
     def unclear(self) -> int:
         """Null vectors of which rounding decides whether they are series."""
         unclear = max(space.unclear for space in self.spaces) + self.pair_unclear

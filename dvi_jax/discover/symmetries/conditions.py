@@ -58,7 +58,7 @@ def at_samples(equations, h, basis, gauge_basis, order, samples, later) -> Condi
     n = int(np.prod(shape, dtype=int))
 
     def flat(parts):
-        return jnp.concatenate([jnp.ravel(x) for x in parts])
+        return jnp.concatenate([jnp.ravel(part) for part in parts])
 
     def point(x):
         return LatticePoint(x[0], x[1 : 1 + n].reshape(shape), x[1 + n :].reshape(shape))

@@ -132,7 +132,7 @@ def _conformal_factor(system, generators, first, second, epsilon, args, pointwis
         if pointwise:
             first, second = _solution_through(system, first, second, epsilon, args)
         problem = system, generators, first, second, epsilon, args
-        factor = _pointwise_factor(*problem) if pointwise else None
+        factor = _pointwise_factor(*problem) if pointwise else jnp.zeros(())
         return factor, *_equations_and_change(*problem), *_sizes(*problem)
 
     factor, values, changes, of_values, of_changes = jax.vmap(at_sample)(first, second)

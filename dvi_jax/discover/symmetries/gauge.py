@@ -90,8 +90,8 @@ class GaugeSolution(eqx.Module):
 
     def __str__(self) -> str:
         lines = [
-            f"order {m}: residual {residual:.1e}, G = {gauge}"
-            for m, (gauge, residual) in enumerate(zip(self.gauges, self.residuals, strict=True))
+            f"order {order}: residual {residual:.1e}, G = {gauge}"
+            for order, (gauge, residual) in enumerate(zip(self.gauges, self.residuals, strict=True))
         ]
         return "\n".join([*lines, *self.warnings])
 

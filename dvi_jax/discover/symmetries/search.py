@@ -128,22 +128,9 @@ class SymmetrySearch:
         return self.determining.shape[1] - 1
 
     @property
-    def components(self) -> np.ndarray:
-        """The units of ξ0, ξ and η."""
-        return self.units.components
-
-    @property
     def size(self) -> int:
         """The number of unknowns of each order."""
-        return len(self.components) * self.basis.size
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return _component_names(self.shape)[self.units.columns]
-
-    @property
-    def complexity(self) -> np.ndarray:
-        return np.tile(self.basis.complexity, len(self.components))
+        return len(self.units.components) * self.basis.size
 
     @property
     def n(self) -> int:
@@ -263,13 +250,13 @@ class SymmetrySearch:
         """The series that are locally Hamiltonian: ξ0 = 0 and ∂(η, −ξ)/∂(q, p) symmetric."""
         if series.shape[1] == 0:
             return series
-        n, shape = self.n, (self.order + 1, len(self.components), self.basis.size, -1)
+        n, shape = self.n, (self.order + 1, len(self.units.components), self.basis.size, -1)
         c = self.conditions.shares(series).reshape(shape) / self.conditions.rms[:, None]
-        slopes = self.raw.slopes[self._sparse, 0, :, 1:] * self.components[-2 * n :]
+        slopes = self.raw.slopes[self._sparse, 0, :, 1:] * self.units.components[-2 * n :]
         slopes = np.einsum("sbj,mibk->smijk", slopes, c[:, -2 * n :])
         matrix = np.concatenate([slopes[:, :, n:], -slopes[:, :, :n]], axis=2)
         rows = [(matrix - matrix.swapaxes(2, 3)).reshape(-1, series.shape[1])]
-        if len(self.components) > 2 * n:
+        if len(self.units.components) > 2 * n:
             values = self.raw.values[self._sparse, 0, 0]
             rows.append(np.einsum("sb,mbk->smk", values, c[:, 0]).reshape(-1, series.shape[1]))
         singular, V = singular_vectors(np.concatenate(rows) / np.sqrt(len(slopes)))
@@ -284,23 +271,24 @@ class SymmetrySearch:
         """The same series up to the free ones, with complex functions as little as can be."""
         if columns.shape[1] == 0:
             return columns
-        complexity = np.tile(self.complexity, self.order + 1).astype(float)
+        of_fields = np.tile(self.basis.complexity, len(self.units.components))
+        complexity = np.tile(of_fields, self.order + 1).astype(float)
         if free.size:  # among equals first where the free series are large, and ξ before η
             share = np.max(np.abs(free[: len(complexity)]), axis=1)
             complexity += 0.5 * (share > 0.5 * np.max(share))
             complexity -= np.linspace(0, 0.1, len(complexity))
         simplify = reduction(free, complexity, self.size)
         columns = np.stack([simplify(c.copy()) for c in columns.T], axis=1)
-        columns = reduced_echelon(columns, self.complexity)
+        columns = reduced_echelon(columns, of_fields)
         return np.stack([simplify(c.copy()) for c in columns.T], axis=1)
 
     def _symmetry(self, vector, variational, symplectic, simpler: list[Symmetry]) -> Symmetry:
         orders, held_out = self.order + 1, self.held_out
-        shares = vector[: orders * self.size].reshape(orders, len(self.components), -1)
+        shares = vector[: orders * self.size].reshape(orders, len(self.units.components), -1)
         smallest = (_TINY if self.null <= NULL else self.null) * np.max(np.abs(shares))
         shares = np.where(np.abs(shares) > smallest, shares, 0.0)
         x = shares / self.conditions.rms  # in units of the components
-        sizes = x[0] * self.components[:, None]
+        sizes = x[0] * self.units.components[:, None]
         largest = np.argmax(np.round(np.abs(sizes) / np.max(np.abs(sizes)), 6))
         scale = 1 / sizes.ravel()[largest]
         x = x * scale
@@ -315,7 +303,7 @@ class SymmetrySearch:
         errors = coefficient_errors(self.conditions.terms[held_out])
         residuals = self._residuals(x, motion, determining, errors)
         identity_residuals = self._relative(identity, x[0])
-        c = x * self.components[:, None]
+        c = x * self.units.components[:, None]
         c, g = (in_units_of(1 / self.conditions.scale, x, axis=0) for x in (c, g))
         generators = tuple(self._generator(x) for x in c)
         gauges = tuple(BasisGauge(self.gauge_basis, jnp.asarray(x / self.gauge_units)) for x in g)
@@ -329,10 +317,10 @@ class SymmetrySearch:
             is_dependent=self._depends(c, simpler),
             is_symplectic=symplectic and all(g.xi0 is None for g in generators),
             coefficients=c,
-            names=self.names,
+            names=_component_names(self.shape)[self.units.columns],
             basis=self.basis,
             scale=self.conditions.scale,
-            sizes=self.conditions.rms / self.components[:, None],
+            sizes=self.conditions.rms / self.units.components[:, None],
             gauge_sizes=self.gauge_units,
         )
 
@@ -374,7 +362,10 @@ class SymmetrySearch:
             errors = coefficient_errors(terms @ self.conditions.orthonormal)
             residuals = [
                 self._residuals(
-                    s.coefficients / self.components[:, None], motion.subset(index), terms, errors
+                    s.coefficients / self.units.components[:, None],
+                    motion.subset(index),
+                    terms,
+                    errors,
                 )
                 for s in symmetries
             ]
@@ -399,7 +390,7 @@ class SymmetrySearch:
         are then dependent.
         """
         leading = np.stack([*(s.coefficients[0] for s in simpler if not s.is_dependent), c[0]])
-        shares = leading / self.components[:, None]
+        shares = leading / self.units.components[:, None]
         vectors = np.einsum("sjb,kcb->skjc", self.raw.values[self._sparse, 0], shares)
         vectors = vectors.reshape(*vectors.shape[:2], -1)
         length = np.linalg.norm(vectors, axis=-1, keepdims=True)
@@ -415,4 +406,4 @@ def rows_of(terms: np.ndarray) -> np.ndarray:
 def _component_names(shape: tuple[int, ...]) -> tuple[str, ...]:
     names = coordinate_names(shape)
     half = len(names) // 2
-    return ("ξ0", *(f"ξ_{v}" for v in names[:half]), *(f"η_{v}" for v in names[half:]))
+    return ("ξ0", *(f"ξ_{name}" for name in names[:half]), *(f"η_{name}" for name in names[half:]))

@@ -160,12 +160,12 @@ class Symmetries(eqx.Module):
     @property
     def variational(self) -> tuple[Symmetry, ...]:
         """Those whose Noether identity closes."""
-        return tuple(s for s in self.found if s.is_variational)
+        return tuple(symmetry for symmetry in self.found if symmetry.is_variational)
 
     @property
     def conformal(self) -> tuple[Symmetry, ...]:
         """Those that are conformal only."""
-        return tuple(s for s in self.found if not s.is_variational)
+        return tuple(symmetry for symmetry in self.found if not symmetry.is_variational)
 
     @property
     def order(self) -> int:
@@ -205,11 +205,11 @@ class Symmetries(eqx.Module):
 
     def __str__(self) -> str:
         count = len(self.found)
+        numbers = ", ".join(f"{m}: {n}" for m, n in enumerate(self.survivors))
         lines = [
             f"{count} symmetr{'y' if count == 1 else 'ies'} of order {self.order} in "
             f"{self.basis.size} functions for each component: {len(self.variational)} variational, "
-            f"{len(self.conformal)} conformal only; number at order "
-            f"{', '.join(f'{m}: {n}' for m, n in enumerate(self.survivors))}; the smallest "
+            f"{len(self.conformal)} conformal only; number at order {numbers}; the smallest "
             f"singular value of all other fields is {self.gap:.1e} times as large"
         ]
         lines += [f"  {warning}" for warning in self.warnings]
