@@ -82,10 +82,10 @@ def test_functions_of_time_are_recognised():
         (lambda: dvi.Chebyshev(0, "q"), ValueError, "count must be an integer of at least 1"),
         (lambda: dvi.Chebyshev(3, "q", domain=(1, 1)), ValueError, "a < b"),
         (lambda: dvi.Chebyshev(3, "x").for_shape(()), ValueError, "the variable 'x', but"),
-        (lambda: dvi.Trigonometric(2, "q", period=0.0), ValueError, "period must be positive"),
-        (lambda: dvi.Radial([0.5]), ValueError, "list of one or more integers"),
+        (lambda: dvi.Trigonometric(2, "q", period=0.0), ValueError, "period must be a positive"),
+        (lambda: dvi.Radial([0.5]), ValueError, "one or more integers"),
         (lambda: dvi.Basis([]), ValueError, "at least one"),
-        (lambda: dvi.Basis([lambda q: q]), TypeError, r"must take .*a function of \(q\)"),
+        (lambda: dvi.Basis([lambda q: q]), TypeError, r"must take .*got \(q\)"),
         (lambda: dvi.Basis([3.0]), TypeError, "must be a function"),
     ],
 )

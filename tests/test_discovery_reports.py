@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import dvi_jax as dvi
-from dvi_jax.discover.invariants.digits import Conditions, closed_form, digits_of
+from dvi_jax.discover.invariants.digits import LinearConditions, closed_form, digits_of
 
 MAGNETIC = dvi.System(
     lambda t0, t1, q, p, args: (p[0] ** 2 + (p[1] - q[0]) ** 2) / 2,
@@ -66,7 +66,7 @@ def test_rounding_is_removed_and_small_terms_are_not():
     rows = np.random.default_rng(0).normal(size=(200, 6))
     truth = np.array([1.0, 0.3, 1e-9, 0.0, 0.0, 0.0])
     rows[:, 0] = -rows[:, 1:] @ truth[1:]
-    conditions = Conditions.of(rows[:, None])
+    conditions = LinearConditions.from_terms(rows[:, None])
 
     def change(shares):
         return float(np.max(np.abs(rows @ shares[0])))

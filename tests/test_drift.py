@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from matplotlib.colors import LogNorm
 from truths import curves
 
 import dvi_jax as dvi
@@ -44,8 +43,8 @@ def synthetic(drifts, floor=1e-15, epsilons=EPSILONS):
     """The fit to given drifts of one start."""
     lanes = np.append(drifts, floor)[:, None]
     good = np.full(lanes.shape, "successful")
-    given = drift._Lanes(lanes, np.ones_like(lanes), good, 1000, 2.0**-52)
-    return drift._order(np.asarray(epsilons), given, np.array([True]))
+    given = drift.Drifts(lanes, np.ones_like(lanes), good, 1000, 2.0**-52)
+    return drift.order_of(np.asarray(epsilons), given, np.array([True]))
 
 
 @pytest.mark.slow
@@ -176,14 +175,14 @@ def test_interval_covers_the_truth_as_often_as_it_promises_with_three_points():
 
 def test_no_initial_condition_that_succeeds_everywhere_is_reported():
     good, bad = "successful", "not_finite"
-    lanes = drift._Lanes(
+    lanes = drift.Drifts(
         drifts=np.array([[1e-3, np.nan], [np.nan, 2e-3], [3e-3, 3e-3], [1e-15, 1e-15]]),
         sizes=np.ones((4, 2)),
         statuses=np.array([[good, bad], [bad, good], [good, good], [good, good]]),
         num_steps=10,
         epsilon=2.0**-52,
     )
-    measured = drift._order(EPSILONS[:3], lanes, drift._kept(lanes.good))
+    measured = drift.order_of(EPSILONS[:3], lanes, drift.valid_starts(lanes.good))
     assert set(measured.excluded) == {"failed"}
     assert np.isnan(measured.slope)
     assert "left out: 2 of 2 initial conditions (not_finite): number 0, 1" in str(measured)
@@ -230,6 +229,7 @@ def test_a_crossover_below_the_range_is_reported_as_the_power_in_the_range():
     assert not covers(measured.fit, 1)
 
 
+@pytest.mark.slow
 def test_orders_of_400_synthetic_curves():
     """95 % intervals that contain the true order in 93 to 97 %, and few curves unresolved."""
     found = curves.measured(seed=0)
@@ -396,8 +396,9 @@ def test_single_precision_has_its_own_floor():
 def test_memory_does_not_grow_with_the_steps():
     def scratch(num_steps):
         lanes = jnp.ones(64), (jnp.ones((64, 1)), jnp.ones((64, 1)))
-        run = drift._run.lower(CUBIC, KEPT, *lanes, 0.1, num_steps, {"args": None})
-        memory = run.compile().compiled.memory_analysis()
+        run = {"h": 0.1, "num_steps": num_steps, "args": None}
+        program = drift.run_trajectories.lower(CUBIC, KEPT, *lanes, run)
+        memory = program.compile().compiled.memory_analysis()
         return memory.temp_size_in_bytes + memory.output_size_in_bytes
 
     assert scratch(20_000) == scratch(2_000)
@@ -444,16 +445,18 @@ def test_surface_has_an_order_at_each_h_and_none_where_it_failed():
     assert "above round-off at 1 of 3 step sizes" in str(surface)
 
 
+def legend(axis):
+    return [text.get_text() for text in axis.figure.legends[0].get_texts()]
+
+
 @pytest.mark.slow
 def test_pictures_show_what_was_excluded():
     with plot.style():
         axis = plot.drift_orders({"kept": usual(), "energy": sweep(ENERGY)}, [1, None])
-        labels = [text.get_text() for text in axis.figure.legends[0].get_texts()]
-        assert labels[0].endswith(", expected 1")
-        assert labels[1] == "energy: no order"
+        assert legend(axis)[0].endswith(", expected 1")
+        assert legend(axis)[1] == "energy: no order"
         hollow = [line for line in axis.lines if line.get_markerfacecolor() == "white"]
         assert sum(len(line.get_xdata()) for line in hollow) == 10
-        plt.close(axis.figure)
         for surface in map(surface_of, (True, False)):
             axes = plot.drift_surface(surface, promised=1)
             excluded = sum(len(line.get_xdata()) for line in axes[0].lines)
@@ -462,68 +465,55 @@ def test_pictures_show_what_was_excluded():
             plt.close(axes[0].figure)
         with pytest.raises(ValueError, match=r"each of 2 results, got \[1\]"):
             plot.drift_orders([usual(), usual()], [1])
-        axis = plot.drift_orders(usual(), expected=1)
-        assert axis.figure.legends[0].get_texts()[0].get_text().endswith(", expected 1")
-        plt.close(axis.figure)
+        assert legend(plot.drift_orders(usual(), expected=1))[0].endswith(", expected 1")
         with pytest.raises(TypeError, match="expected and promised are two names of one argument"):
             plot.drift_orders(usual(), 1, expected=1)
+    plt.close("all")
 
 
 def test_a_surface_shows_zeros_failures_and_limits():
     """Of 3 × 4 drifts one is exactly 0 and at most one failed; one order is not resolved."""
     eps = np.array([0.1, 0.2, 0.4, 0.8])
 
-    def order(drifts, resolved=True):
-        there = np.isfinite(drifts) & (drifts > 0)
-        return types.SimpleNamespace(drifts=drifts, resolved=resolved, used=there)
-
     def surface(odd):
-        orders = [order(eps * k) for k in (1.0, 10.0, 100.0)]
-        orders[1] = order(np.array([0.0, odd, 4.0, 8.0]), resolved=False)
+        drifts = np.stack([eps, [0.0, odd, 4.0, 8.0], 100 * eps], 1)
+        used = np.isfinite(drifts) & (drifts > 0)
+        orders = [
+            types.SimpleNamespace(drifts=drifts[:, i], resolved=i != 1, used=used[:, i])
+            for i in range(3)
+        ]
         return types.SimpleNamespace(
             epsilons=eps,
             hs=np.array([0.05, 0.1, 0.2]),
             orders=orders,
             slopes=np.ones(3),
             intervals=np.array([[0.99, 1.01], [0.8, 1.7], [0.99, 1.01]]),
-            drifts=np.stack([o.drifts for o in orders], 1),
-            used=np.stack([o.used for o in orders], 1),
+            drifts=drifts,
+            used=used,
         )
 
     left, right = plot.drift_surface(surface(np.nan), promised=1)
     mesh, black = left.collections
-    assert isinstance(mesh.norm, LogNorm)
     assert (mesh.norm.vmin, mesh.norm.vmax) == (0.1, 80.0)
     assert (~black.get_array().mask).sum() == 1
     low, high = right.get_ylim()
     assert low < 1 < 1.7 < high
-    texts = [text.get_text() for text in left.figure.legends[0].get_texts()]
-    assert "1 of 12 exactly 0" in texts
-    assert "1 of 12 failed" in texts
-    assert "not resolved: slope of the straight line" in texts
-    assert left.patch.get_hatch()  # no colour of the scale
-    whole = plot.drift_surface(surface(2.0))[0].figure.legends[0].get_texts()
-    assert not any("failed" in text.get_text() for text in whole)
+    texts = {"1 of 12 exactly 0", "1 of 12 failed", "not resolved: slope of the straight line"}
+    assert texts <= set(legend(left))
+    assert not any("failed" in text for text in legend(plot.drift_surface(surface(2.0))[0]))
     mine = plt.subplots(1, 2, layout="constrained", figsize=(10, 4))[1]
     plot.drift_surface(surface(np.nan), promised=1, ax=mine)
     mine[0].figure.canvas.draw()
-    (below, map_box), (inside, box) = (
-        (axis.get_legend().get_window_extent(), axis.get_window_extent()) for axis in mine
-    )
-    assert 0 <= below.y0 < below.y1 < map_box.y0  # a map fills its axes: its legend is below them
-    assert box.y0 <= inside.y0 < inside.y1 <= box.y1
+    below, box = mine[0].get_legend().get_window_extent(), mine[0].get_window_extent()
+    assert 0 <= below.y0 < below.y1 < box.y0  # a map fills its axes: its legend is below them
     plt.close("all")
 
 
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        ({"epsilons": [0.0, 0.1, 0.2]}, "positive"),
-        ({"epsilons": [0.1, np.inf]}, "positive"),
-        ({"epsilons": []}, "positive"),
-        ({"epsilons": "a"}, "positive"),
-        ({"epsilons": 0.1}, "positive"),
-        ({"epsilons": [0.1, 0.2, 0.1]}, "distinct"),
+        *(({"epsilons": bad}, "positive") for bad in ([0.0, 0.1], [0.1, np.inf], [], "a", 0.1)),
+        ({"epsilons": [0.1, 0.2, 0.1]}, "equal"),
         ({"h": np.float64(0.0)}, "must not be zero"),
         ({"h": [0.1, 0.2]}, "h must be one number"),
         ({"starts": (np.ones((3, 1)), np.ones((2, 1)))}, "the same shape"),
@@ -540,13 +530,10 @@ def test_bad_sweeps_are_refused(change, match):
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        ({"hs": [0.2, 0.1]}, "hs must be in increasing order"),
-        ({"hs": [0.1, 0.1]}, "hs must be in increasing order"),
-        ({"hs": [-0.1, 0.1]}, "hs must be a list of one or more"),
-        ({"epsilons": [0.2, 0.1]}, "epsilons must be in increasing order"),
-        ({"duration": 0.3}, "twice the longest"),
-        ({"duration": np.nan}, "twice the longest"),
-        ({"invariant": [KEPT]}, "hs is 2, but the length of invariant is 1"),
+        *(({"hs": hs}, "hs must be positive.*increasing") for hs in ([2, 1], [1, 1], [-1, 1])),
+        ({"epsilons": [0.2, 0.1]}, "epsilons must be .*increasing"),
+        *(({"duration": bad}, "twice the longest") for bad in (0.3, np.nan)),
+        ({"invariant": [KEPT]}, "a list of 2, .*got 1"),
     ],
 )
 def test_bad_surfaces_are_refused(change, match):

@@ -9,7 +9,7 @@ import pytest
 
 import dvi_jax as dvi
 import lanewise
-from dvi_jax.discover.algebra.block_triangular import BlockTriangular, above
+from dvi_jax.discover.algebra.block_triangular import BlockTriangular, larger_than
 from dvi_jax.discover.algebra.nullspace import toeplitz
 from dvi_jax.discover.algebra.taylor import taylor_coefficients
 from dvi_jax.engine.newton import Newton, find_root
@@ -102,7 +102,7 @@ def series_system(seed=0, orders=4, size=9, secular=3):
 
 def test_null_vectors_order_by_order_are_those_of_the_whole_matrix():
     terms = series_system()
-    system = BlockTriangular(terms, above(1e-10))
+    system = BlockTriangular(terms, larger_than(1e-10))
     counts = [tuple(c.shape[2] for c in system.null(k)) for k in range(4)]
     assert counts == [(3, 0), (2, 3), (2, 5), (1, 7)]
     for k in range(4):
@@ -118,20 +118,20 @@ def test_null_vectors_order_by_order_are_those_of_the_whole_matrix():
         )
         assert not shifts[:9].any()
     terms[:, 3, -1] += 1e-3 * np.random.default_rng(1).normal(size=40)  # lost at order 3 as well
-    assert BlockTriangular(terms, above(1e-10)).null(3)[0].shape[2] == 0
+    assert BlockTriangular(terms, larger_than(1e-10)).null(3)[0].shape[2] == 0
 
 
 def test_solutions_order_by_order_have_only_the_coefficients_that_are_free():
     terms, rng = series_system(), np.random.default_rng(2)
     free = rng.uniform(size=(4, 9)) < 0.7
     c = np.where(free, rng.normal(size=(4, 9)), 0.0)[..., None]
-    system = BlockTriangular(terms, above(1e-10), free)
+    system = BlockTriangular(terms, larger_than(1e-10), free)
     right = system.left_sides(c)
-    solution = system.solved(right)
+    solution = system.solve(right)
     assert not solution[~free].any()
     np.testing.assert_allclose(system.left_sides(solution), right, atol=1e-12)
     right[2] += rng.normal(size=right[2].shape)  # outside of the range
-    assert np.max(np.abs(system.left_sides(system.solved(right)) - right)) > 0.1
+    assert np.max(np.abs(system.left_sides(system.solve(right)) - right)) > 0.1
 
 
 def change_in_a_step(series, powers, q, p, epsilon, h):

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import dvi_jax as dvi
-from dvi_jax.discover.algebra.block_triangular import BlockTriangular, above
+from dvi_jax.discover.algebra.block_triangular import BlockTriangular, larger_than
 from dvi_jax.discover.algebra.pair_series import staircase
 from dvi_jax.discover.functions.sampling import as_samples
-from dvi_jax.discover.invariants.changes import Stepped, terms_in_pairs
+from dvi_jax.discover.invariants.changes import StepMap, terms_in_pairs
 from dvi_jax.engine.pair_matrices import Left, plus, zeros
 from dvi_jax.engine.pairs import Pair
 from dvi_jax.methods.step import Equations
@@ -67,8 +67,8 @@ def test_null_vectors_with_a_tiny_secular_term_are_lost(secular, count):
     terms = conditions(secular)
     steps = staircase(terms, np.eye(9), noise=1e-31)
     assert [step.series.hi.shape[1] for step in steps] == [3, 2, 2, count]
-    assert sum(step.undecided for step in steps) == 0
-    in_float64 = BlockTriangular(np.stack([x.hi for x in terms], axis=1), above(1e-10))
+    assert sum(step.unclear for step in steps) == 0
+    in_float64 = BlockTriangular(np.stack([x.hi for x in terms], axis=1), larger_than(1e-10))
     assert in_float64.null(3)[0].shape[2] == (count if secular == 1e-6 else 1)
     for k, step in enumerate(steps):
         left = zeros(40, step.series.hi.shape[1])
@@ -76,7 +76,7 @@ def test_null_vectors_with_a_tiny_secular_term_are_lost(secular, count):
             c = Pair(*(x[m * 9 : (m + 1) * 9] for x in step.series))
             left = plus(left, Left(terms[k - m]) @ c)
         assert np.max(np.abs(left.hi), initial=0.0) < 1e-29
-        assert step.kept.min(initial=1.0) > 1e-24
+        assert step.nonzero.min(initial=1.0) > 1e-24
 
 
 # q'' = −q − ε (q² + args p)
@@ -103,7 +103,7 @@ def test_terms_in_pairs_are_those_of_exact_arithmetic():
     basis, h = dvi.Polynomials(4).for_shape((1,)), Fraction(0.1)
     monomials: Any = basis.function
     samples = as_samples(np.random.default_rng(0).uniform(-0.5, 0.5, (2, 3, 1)))
-    stepped = Stepped(Equations(DAMPED, jnp.zeros(()), 0.0), np.asarray(0.1), dvi.TypeII(), basis)
+    stepped = StepMap(Equations(DAMPED, jnp.zeros(()), 0.0), np.asarray(0.1), dvi.TypeII(), basis)
     terms = terms_in_pairs(stepped, 3, samples)
     for i, (q, p) in enumerate(zip(samples.q[:, 0], samples.p[:, 0], strict=True)):
         q, p = Fraction(float(q)), Fraction(float(p))

@@ -242,7 +242,7 @@ def test_bad_input_is_refused():
     with pytest.raises(TypeError, match=r"must be a dvi\.System or None, got the function"):
         dvi.ShadowHamiltonian(1, pendulum)
     for h in (0.0, np.nan, [0.1, 0.2]):
-        with pytest.raises(ValueError, match="a finite number other than zero"):
+        with pytest.raises(ValueError, match="finite step size other than zero"):
             dvi.ShadowHamiltonian(1, h=h)
     with pytest.raises(ValueError, match=r"has no system yet.*bind"):
         dvi.ShadowHamiltonian(1).evaluate(0.0, Q, P, 0.1)

@@ -141,9 +141,9 @@ def test_brackets_close_the_algebra():
         (lambda: library.space_translation([0.0, 0.0]), "component that is not zero"),
         (lambda: library.space_translation([np.nan, 1.0]), "finite"),
         (lambda: library.rotation(1, 1), "two different axes"),
-        (lambda: library.rotation(-1, 0), "two different axes"),
-        (lambda: library.scaling(0.0, 0.0, 0.0), "are all 0"),
-        (lambda: library.scaling(t=[1.0, 2.0]), "must be one number"),
+        (lambda: library.rotation(-1, 0), "at least 0"),
+        (lambda: library.scaling(0.0, 0.0, 0.0), "all are 0"),
+        (lambda: library.scaling(t=[1.0, 2.0]), "must be one finite number"),
         (lambda: library.boost([1.0, 0.0], mass=-1.0), "positive"),
         (lambda: library.rotation(0, 2)(POINT), "at least 3 components"),
         (lambda: library.space_translation([1.0, 0.0, 0.0])(POINT), r"direction must .*\(2,\)"),
@@ -410,7 +410,7 @@ def test_no_symmetry_of_a_chaotic_system_and_of_an_order_the_basis_cannot_expres
 @pytest.mark.slow
 def test_equations_with_time_need_samples_in_time():
     driven = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 - q[0] * jnp.cos(t0))
-    with pytest.raises(ValueError, match="depend on the time"):
+    with pytest.raises(ValueError, match="depends on the time"):
         find(driven, LINEAR, time=True)
     waves = dvi.Trigonometric(1, "t", constant=True) + dvi.Polynomials(1)
     symmetries = find(driven, waves, samples=box(1, times=True), gauges=waves)
@@ -430,29 +430,20 @@ POLE = {
 
 
 @pytest.mark.parametrize(
-    ("changed", "error", "message"),
+    ("change", "error", "message"),
     [
-        ({"samples": box(1, 8)}, ValueError, "too few"),
-        ({"samples": (np.full((50, 1), np.nan), np.ones((50, 1)))}, ValueError, "not finite"),
-        ({"samples": (np.ones((50, 1)), np.ones((50, 2)))}, ValueError, "the same shape"),
-        ({"h": 0.0}, ValueError, "step size"),
-        ({"order": -1}, ValueError, "order must be"),
-        ({"order": 0.5}, ValueError, "order must be"),
-        ({"tolerance": 2.0}, ValueError, "tolerance"),
-        ({"basis": dvi.Basis([lambda q, p: q[0], lambda q, p: 2 * q[0]])}, ValueError, "rank-def"),
         ({"basis": LOG}, ValueError, "'log' is not finite"),
         ({"gauges": LOG}, ValueError, "'log' is not finite"),
-        (ROOT, ValueError, "at the end of the step"),
-        ({"basis": TIMED}, ValueError, "all samples have the same time"),
+        (ROOT, ValueError, "the ends of their steps"),
         (POLE, ValueError, "step fails at 1 of 60"),
-        ({"basis": 3}, TypeError, "basis must be a basis"),
         ({"gauges": 3}, TypeError, "basis must be a basis"),
     ],
 )
-def test_bad_input_is_refused(changed, error, message):
-    given = {"system": OSCILLATOR, "basis": LINEAR, "h": 0.1, "samples": box(1, 60), **changed}
+def test_bad_input_is_refused(change, error, message):
+    """What both searches refuse: `test_bad_input_is_named` in `test_discovery.py`."""
+    given = {"system": OSCILLATOR, "basis": LINEAR, "samples": box(1, 60), **change}
     with pytest.raises(error, match=message):
-        dvi.find_symmetries(**given)
+        find(given.pop("system"), given.pop("basis"), **given)
 
 
 @pytest.mark.parametrize("strength", [1e-10, 1e10])

@@ -20,8 +20,8 @@ from .functions.generators import (
     prolong as prolong,
 )
 from .functions.sampling import random_pairs as random_pairs, solution_pairs as solution_pairs
+from .invariants.discovery import Discovery as Discovery
 from .invariants.find import discover_invariants as discover_invariants
-from .invariants.found import Discovery as Discovery
 from .invariants.obstructions import DriftLaw as DriftLaw
 from .invariants.series import InvariantSeries as InvariantSeries
 from .invariants.shadow import ShadowHamiltonian as ShadowHamiltonian
@@ -32,7 +32,6 @@ from .symmetries.determining import (
     discrete_equations as discrete_equations,
 )
 from .symmetries.find import find_symmetries as find_symmetries
-from .symmetries.found import Symmetries as Symmetries, Symmetry as Symmetry
 from .symmetries.gauge import (
     BasisGauge as BasisGauge,
     GaugeSolution as GaugeSolution,
@@ -43,3 +42,4 @@ from .symmetries.noether import (
     lattice_defect as lattice_defect,
     noether_identity as noether_identity,
 )
+from .symmetries.symmetry import Symmetries as Symmetries, Symmetry as Symmetry

@@ -14,7 +14,7 @@ from ..base.machine import processors
 from ..base.precision import refuse_double_without_x64
 from ..base.types import Interval
 from ..discover.functions.basis import check_step_size
-from ..discover.invariants.found import Discovery
+from ..discover.invariants.discovery import Discovery
 from ..discover.invariants.series import InvariantSeries
 from ..integration.arithmetic import DoubleDouble, FixedPoint, FloatingPoint
 from ..integration.integrator import Integrator, chosen, only

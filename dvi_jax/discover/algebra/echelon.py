@@ -8,22 +8,22 @@ from .nullspace import RANK
 
 
 def echelon(
-    columns: np.ndarray, complexity: np.ndarray, above: float = RANK
+    columns: np.ndarray, complexity: np.ndarray, threshold: float = RANK
 ) -> tuple[list[int], np.ndarray]:
     """Columns of the same span, each with a pivot row in which those after it are zero.
 
     Rows are gone through from the most complex function to the simplest. An entry up to the share
-    `above` of the largest in its column is taken for zero.
+    `threshold` of the largest in its column is taken for zero.
     """
     rows = np.argsort(complexity, kind="stable")[::-1]
     work, pivots, out = columns.copy(), [], []
-    nothing = RANK * np.max(np.abs(columns), initial=0.0)
+    smallest = RANK * np.max(np.abs(columns), initial=0.0)
 
     def eliminate(row: int, j: int) -> None:
         nonlocal work
         pivot = work[:, j]
-        rest = np.delete(work, j, axis=1)
-        work = rest - np.outer(pivot, rest[row] / pivot[row])
+        remainder = np.delete(work, j, axis=1)
+        work = remainder - np.outer(pivot, remainder[row] / pivot[row])
         pivots.append(int(row))
         out.append(pivot)
 
@@ -31,39 +31,41 @@ def echelon(
         if work.shape[1] == 0:
             break
         size = np.max(np.abs(work), axis=0)
-        shares = np.where(size > nothing, np.abs(work[row]) / np.maximum(size, 1e-300), 0.0)
+        shares = np.where(size > smallest, np.abs(work[row]) / np.maximum(size, 1e-300), 0.0)
         j = int(np.argmax(shares))
-        if shares[j] > above:
+        if shares[j] > threshold:
             eliminate(row, j)
-    while work.size and np.max(np.abs(work)) > nothing:  # columns without a clear pivot
+    while work.size and np.max(np.abs(work)) > smallest:  # columns without a clear pivot
         row, j = np.unravel_index(np.argmax(np.abs(work)), work.shape)
         eliminate(int(row), int(j))
     return pivots, np.stack(out, axis=1) if out else columns[:, :0]
 
 
-def reduced(columns: np.ndarray, complexity: np.ndarray, above: float = RANK) -> np.ndarray:
+def reduced_echelon(
+    columns: np.ndarray, complexity: np.ndarray, threshold: float = RANK
+) -> np.ndarray:
     """The same span, its leading-order terms in reduced echelon form: one pivot for each column.
 
     `columns` may have more rows below the leading-order term, which are combined in the same way.
     """
-    pivots, _ = echelon(columns[: len(complexity)], complexity, above)
+    pivots, _ = echelon(columns[: len(complexity)], complexity, threshold)
     pivots = pivots[::-1]  # simplest first
     at_pivots = columns[pivots]
     return columns @ np.linalg.pinv(at_pivots) if pivots else columns[:, :0]
 
 
 def reduction(
-    columns: np.ndarray, complexity: np.ndarray, size: int, above: float = RANK
+    columns: np.ndarray, complexity: np.ndarray, size: int, threshold: float = RANK
 ) -> Callable[[np.ndarray], np.ndarray]:
     """A function that adds multiples of `columns` to a vector until it is as simple as can be.
 
     The most complex functions go first, those of the lowest order in ε before the others.
     """
     order = np.repeat(np.arange(len(complexity) // size), size)
-    pivots, reduced = echelon(columns, complexity - (1 + np.max(complexity)) * order, above)
+    pivots, forms = echelon(columns, complexity - (1 + np.max(complexity)) * order, threshold)
 
     def simplify(vector: np.ndarray) -> np.ndarray:
-        for row, column in zip(pivots, reduced.T, strict=True):
+        for row, column in zip(pivots, forms.T, strict=True):
             vector = vector - vector[row] / column[row] * column
             vector[row] = 0.0
         return vector

@@ -10,7 +10,7 @@ from .nullspace import HELD_OUT, NULL, series_changes, singular_vectors, triangl
 # rounding, may be an invariant or not.
 UNCLEAR = 1e-6
 ROUNDING = 1e-12  # Rows are weighted so that their rounding is below this; `NULL` is above it
-_RESOLVED = 1e-3  # Rounding may be this share of a change that counts as not zero
+_SHARE = 1e-3  # Rounding may be this share of a change that counts as not zero
 _COEFFICIENTS = 1e-15  # Errors of the coefficients of a null vector, relative to its length
 # Samples at which functions are so many times larger than at three quarters of them count less.
 _RARE = 100.0
@@ -44,17 +44,15 @@ class Motion(NamedTuple):
     changes: np.ndarray
     rounding: np.ndarray
 
-    def at(self, some: Any) -> "Motion":
+    def subset(self, index: Any) -> "Motion":
         """Of some of the samples."""
-        return Motion(*(x[some] for x in self))
+        return Motion(*(field[index] for field in self))
 
     def in_functions(self, combinations: np.ndarray) -> "Motion":
         """Of combinations of the functions, columns of shape (size, count)."""
         return Motion(times(self.changes, combinations), self.rounding @ np.abs(combinations))
 
-    def candidates(self, combinations: np.ndarray) -> "Motion":
-        """The same as `in_functions`."""
-        return self.in_functions(combinations)
+    candidates = in_functions
 
     def with_perturbation(self, terms: np.ndarray, combinations: np.ndarray) -> "Motion":
         """The same, and what the perturbation changes the combinations by, order by order: the
@@ -63,9 +61,9 @@ class Motion(NamedTuple):
 
         `terms`: A_0 … A_z of the functions, shape (S, z + 1, …, size).
         """
-        perturbed = times(terms[:, 1:], combinations)
-        perturbed = perturbed.reshape(len(terms), -1, combinations.shape[1])
-        return self._replace(changes=np.concatenate([self.changes, perturbed], axis=1))
+        perturbations = times(terms[:, 1:], combinations)
+        perturbations = perturbations.reshape(len(terms), -1, combinations.shape[1])
+        return self._replace(changes=np.concatenate([self.changes, perturbations], axis=1))
 
     def at_most(self, spread: float) -> "Motion":
         """The same, with no larger changes than the functions differ by between samples: a step
@@ -80,13 +78,13 @@ class Motion(NamedTuple):
         rounding = np.sqrt(np.sum(self.rounding**2, axis=1))
         return 1 / np.maximum(np.maximum(typical, rounding / ROUNDING), np.finfo(float).tiny)
 
-    def undecided(self) -> int:
+    def unclear_count(self) -> int:
         """How many combinations change in the steps by hardly more than rounding."""
-        some = _enough(len(self.changes), *self.changes.shape[1:])
-        weighted = (self.weights()[:, None, None] * self.changes)[some]
-        slopes = np.linalg.svd(triangle(weighted.reshape(-1, weighted.shape[2])), compute_uv=False)
-        missing = weighted.shape[2] - len(slopes)
-        return missing + int(np.sum(slopes / np.sqrt(len(weighted)) < ROUNDING / _RESOLVED))
+        thinning = _thinning(len(self.changes), *self.changes.shape[1:])
+        rows = (self.weights()[:, None, None] * self.changes)[thinning]
+        slopes = np.linalg.svd(triangle(rows.reshape(-1, rows.shape[2])), compute_uv=False)
+        zeros = rows.shape[2] - len(slopes)
+        return zeros + int(np.sum(slopes / np.sqrt(len(rows)) < ROUNDING / _SHARE))
 
 
 class FieldMotion(NamedTuple):
@@ -101,19 +99,19 @@ class FieldMotion(NamedTuple):
     cancel, with ∂X/∂z_i Δz_i for the difference.
 
     - `values`: φ at z0, (S, B). `changes`: ∂φ/∂z_i Δz_i, (S, 2n + 1, B).
-    - `second`, `both`: lengths of the columns of J_1 and of J_0 + J_1, (S, C).
+    - `second`, `total`: lengths of the columns of J_1 and of J_0 + J_1, (S, C).
     - `rounding`: the largest rounding error of the left side for each φ_b e_k, (S, C, B).
     """
 
     values: np.ndarray
     changes: np.ndarray
     second: np.ndarray
-    both: np.ndarray
+    total: np.ndarray
     rounding: np.ndarray
 
-    def at(self, some: Any) -> "FieldMotion":
+    def subset(self, index: Any) -> "FieldMotion":
         """Of some of the samples."""
-        return FieldMotion(*(x[some] for x in self))
+        return FieldMotion(*(field[index] for field in self))
 
     def in_functions(self, combinations: np.ndarray) -> "FieldMotion":
         """For combinations of the functions φ, columns of shape (B, count)."""
@@ -127,26 +125,26 @@ class FieldMotion(NamedTuple):
         """Of fields, columns of shape (C · B, count)."""
         X = fields.reshape(self.second.shape[1], self.values.shape[1], -1)
         changes = np.einsum("sdb,cbk->scdk", self.changes, X) * self.second[:, :, None, None]
-        both = np.einsum("sb,cbk->sck", self.values, X) * self.both[..., None]
-        changes = np.concatenate([changes, both[:, :, None]], axis=2)
+        total = np.einsum("sb,cbk->sck", self.values, X) * self.total[..., None]
+        changes = np.concatenate([changes, total[:, :, None]], axis=2)
         rounding = np.einsum("scb,cbk->sk", self.rounding, np.abs(X))
         return Motion(changes.reshape(len(changes), -1, fields.shape[1]), rounding)
 
-    def over(self, sizes: np.ndarray) -> "FieldMotion":
+    def divide_by(self, sizes: np.ndarray) -> "FieldMotion":
         """With the equations of each sample divided by a number, shape (S,)."""
         return self._replace(
             second=self.second / sizes[:, None],
-            both=self.both / sizes[:, None],
+            total=self.total / sizes[:, None],
             rounding=self.rounding / sizes[:, None, None],
         )
 
     def typical(self) -> np.ndarray:
         """The typical residual of all fields together, shape (S,)."""
-        changes, values, second, both = (
+        changes, values, second, total = (
             np.sum(x.reshape(len(x), -1) ** 2, axis=1)
-            for x in (self.changes, self.values, self.second, self.both)
+            for x in (self.changes, self.values, self.second, self.total)
         )
-        return np.sqrt(second * changes + both * values)
+        return np.sqrt(second * changes + total * values)
 
     def weights(self) -> np.ndarray:
         """For rows of conditions, shape (S,): see `Motion.weights`."""
@@ -154,25 +152,26 @@ class FieldMotion(NamedTuple):
         largest = np.maximum(self.typical(), rounding / ROUNDING)
         return 1 / np.maximum(largest, np.finfo(float).tiny)
 
-    def undecided(self) -> int:
+    def unclear_count(self) -> int:
         """How many fields change in the steps by hardly more than rounding."""
         size = self.rounding[0].size
         rows = self.second.shape[1] * (self.changes.shape[1] + 1)
-        return self.at(_enough(len(self.second), rows, size)).candidates(np.eye(size)).undecided()
+        motion = self.subset(_thinning(len(self.second), rows, size))
+        return motion.candidates(np.eye(size)).unclear_count()
 
 
-def _enough(samples: int, rows: int, size: int) -> slice:
+def _thinning(samples: int, rows: int, size: int) -> slice:
     """Samples, each with so many rows, that have about eight rows for each of `size` columns."""
     return slice(None, None, max(1, samples * rows // (8 * size)))
 
 
 def coefficient_errors(terms: np.ndarray) -> np.ndarray:
     """What errors of the coefficients of a series of length one change at each sample, (S,): all
-    are known to the same absolute size. `terms`: see `conserved`."""
+    are known to the same absolute size. `terms`: see `conserved_series`."""
     return _COEFFICIENTS * np.linalg.norm(terms.reshape(len(terms), -1), axis=1)
 
 
-def conserved(
+def conserved_series(
     leading: np.ndarray,
     terms: np.ndarray,
     motion: Motion | FieldMotion,
@@ -188,23 +187,23 @@ def conserved(
     count, size = leading.shape[1], terms.shape[-1]
     if count == 0:
         return leading, 0
-    own = motion.candidates(leading[:size])
+    candidates = motion.candidates(leading[:size])
     digits = coefficient_errors(terms)[:, None]
     if tolerance is not None:
-        own = own.with_perturbation(terms, leading[:size])
-    own = own._replace(rounding=own.rounding + digits).at_most(1.0)
-    weights = own.weights() / np.sqrt(len(terms))
+        candidates = candidates.with_perturbation(terms, leading[:size])
+    candidates = candidates._replace(rounding=candidates.rounding + digits).at_most(1.0)
+    weights = candidates.weights() / np.sqrt(len(terms))
     changes = series_changes(terms, leading).reshape(len(terms), -1, count)
-    changes, predicted = (weights[:, None, None] * x for x in (changes, own.changes))
-    predicted = predicted.reshape(-1, count)
-    slopes, V = singular_vectors(predicted)
+    changes, predictions = (weights[:, None, None] * x for x in (changes, candidates.changes))
+    predictions = predictions.reshape(-1, count)
+    slopes, V = singular_vectors(predictions)
     limit = HELD_OUT * (NULL if tolerance is None else tolerance)
     # Where slopes predict little more than rounding, that is what a change is compared with.
     by_slopes = V.T / np.maximum(slopes, HELD_OUT * ROUNDING / limit)
     left, U = singular_vectors(changes.reshape(-1, count) @ by_slopes)
-    kept = leading @ by_slopes @ U[left <= limit].T
+    series = leading @ by_slopes @ U[left <= limit].T
     unclear = int(np.sum((left > limit) & (left < UNCLEAR)))
-    return kept @ np.linalg.inv(triangle(kept[:size])) if kept.size else kept, unclear
+    return series @ np.linalg.inv(triangle(series[:size])) if series.size else series, unclear
 
 
 def relative_changes(
@@ -215,13 +214,14 @@ def relative_changes(
     digits: np.ndarray | float = 0.0,
     approximately: bool = False,
 ) -> np.ndarray:
-    """The change of one series, shape (z + 1, size), at each order, by the measure of `conserved`:
-    shape (S, z + 1). `spread`: of its leading-order term; `digits`: see
+    """The change of one series, shape (z + 1, size), at each order, by the measure of
+    `conserved_series`: shape (S, z + 1). `spread`: of its leading-order term; `digits`: see
     `coefficient_errors`; `approximately`: see `Motion.with_perturbation`."""
-    own = motion.candidates(series[:1].T)
+    candidate = motion.candidates(series[:1].T)
     if approximately:
-        own = own.with_perturbation(terms, series[:1].T)
-    own = own._replace(rounding=own.rounding + np.reshape(digits, (-1, 1))).at_most(spread)
+        candidate = candidate.with_perturbation(terms, series[:1].T)
+    rounding = candidate.rounding + np.reshape(digits, (-1, 1))
+    candidate = candidate._replace(rounding=rounding).at_most(spread)
     changes = series_changes(terms, series.reshape(-1, 1))[..., 0]
     changes = np.linalg.norm(changes.reshape(*changes.shape[:2], -1), axis=2)
-    return own.weights()[:, None] * changes
+    return candidate.weights()[:, None] * changes

@@ -5,7 +5,7 @@ coefficients c_0 … c_z: a block-Toeplitz matrix.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,7 +18,7 @@ RANK = 1e-7  # Relative size below which a direction counts as dependent on othe
 DENSE = 1000  # Coefficients up to which all orders are solved together
 _FREE = 1e-9  # Directions of a least-squares problem below this relative size are free
 # A perturbation that changes a step by less than this share of the step counts as zero.
-_NOTHING = 1e-250
+_NO_PERTURBATION = 1e-250
 
 
 class NullSpace(NamedTuple):
@@ -45,11 +45,11 @@ def singular_vectors(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.append(singular, np.zeros(columns - len(singular))), V
 
 
-def by_leading(leading: np.ndarray, above: float = RANK) -> tuple[np.ndarray, np.ndarray]:
+def by_leading(leading: np.ndarray, threshold: float = RANK) -> tuple[np.ndarray, np.ndarray]:
     """Combinations of columns whose leading-order terms are orthonormal, and those without one, up
-    to the size `above`. `leading`: the leading-order terms of the columns, shape (size, count)."""
+    to the size `threshold`. `leading`: those of the columns, shape (size, count)."""
     singular, V = singular_vectors(leading)
-    large = singular > above
+    large = singular > threshold
     return V[large].T / singular[large], V[~large].T
 
 
@@ -57,35 +57,35 @@ def null_space(
     matrix: np.ndarray,
     tolerance: float | None = None,
     unit: float | None = None,
-    below: float = NULL,
+    limit: float = NULL,
 ) -> NullSpace:
     """Directions that the matrix takes to zero.
 
     With a tolerance: all singular values at most that share of the largest. Without: those
-    before the widest gap, as long as they are under `below`, in units of `unit` or of the largest.
+    before the widest gap, as long as they are under `limit`, in units of `unit` or of the largest.
     """
     size = matrix.shape[1]
     singular, V = singular_vectors(matrix)
     if size == 0 or singular[0] == 0:
         return NullSpace(V.T, np.zeros(size), np.inf)
     relative = singular / (singular[0] if unit is None or tolerance is not None else unit)
-    kept, gap = _cut(relative, tolerance, below)
-    return NullSpace(V.T[:, kept:], relative, gap)
+    rank, gap = _cut(relative, tolerance, limit)
+    return NullSpace(V.T[:, rank:], relative, gap)
 
 
-def _cut(relative: np.ndarray, tolerance: float | None, below: float = NULL) -> tuple[int, float]:
+def _cut(relative: np.ndarray, tolerance: float | None, limit: float = NULL) -> tuple[int, float]:
     """How many singular values, descending, are not zero, and the ratio at the cut."""
     if len(relative) == 0:
         return 0, np.inf
     # ratio[i]: how far the value i is below the one before it, the first one below the unit
-    before = np.append(max(1.0, relative[0]), relative[:-1])
-    ratio = before / np.maximum(relative, np.finfo(float).eps)
+    previous = np.append(max(1.0, relative[0]), relative[:-1])
+    ratio = previous / np.maximum(relative, np.finfo(float).eps)
     if tolerance is not None:
-        kept = int(np.sum(relative > tolerance))
+        rank = int(np.sum(relative > tolerance))
     else:
-        allowed = relative < below
-        kept = int(np.argmax(np.where(allowed, ratio, 0))) if allowed.any() else len(relative)
-    return kept, float(ratio[kept]) if kept < len(relative) else 1.0
+        is_small = relative < limit
+        rank = int(np.argmax(np.where(is_small, ratio, 0))) if is_small.any() else len(relative)
+    return rank, float(ratio[rank]) if rank < len(relative) else 1.0
 
 
 def _spaces_of_orders(terms: np.ndarray, tolerance: float | None) -> list[NullSpace]:
@@ -98,28 +98,42 @@ def _spaces_of_orders(terms: np.ndarray, tolerance: float | None) -> list[NullSp
     for k, (step, order) in enumerate(zip(system.steps, system.orders, strict=True)):
         leading, shifts = (c.reshape((k + 1) * terms.shape[2], -1) for c in system.null(k))
         shifts = np.linalg.qr(shifts)[0]
-        kept, null = [step.singular], [step.every[len(step.singular) :]]
-        for columns, split in ((leading, order.rest), (shifts, order.later)):
+        nonzero, null = [step.singular], [step.spectrum[len(step.singular) :]]
+        for columns, split in ((leading, order.initial), (shifts, order.later)):
             # Singular values of the residuals, which may be less than the rounding on the way.
             left = system.left_sides(columns.reshape(k + 1, terms.shape[2], -1))
             null.append(singular_vectors(np.concatenate(left))[0])
-            kept.append(split.singular)
+            nonzero.append(split.singular)
         ratios = [
-            above.min(initial=1.0) / below.max(initial=np.finfo(float).eps)
-            for above, below in zip(kept, null, strict=True)
+            large.min(initial=1.0) / small.max(initial=np.finfo(float).eps)
+            for large, small in zip(nonzero, null, strict=True)
         ]
         gap = float(min(ratios)) if sum(map(len, null)) else 1.0
-        singular = np.sort(np.concatenate(kept + null))[::-1]
+        singular = np.sort(np.concatenate(nonzero + null))[::-1]
         spaces.append(NullSpace(np.hstack([leading, shifts]), singular, gap))
     return spaces
 
 
-def orthonormal_range(columns: np.ndarray, above: float = RANK) -> np.ndarray:
-    """Orthonormal columns of the same span, directions up to the size `above` left out."""
+def orthonormal_range(columns: np.ndarray, threshold: float = RANK) -> np.ndarray:
+    """Orthonormal columns of the same span, directions up to the size `threshold` left out."""
     if columns.size == 0:
         return columns[:, :0]
     U, singular, _ = np.linalg.svd(columns, full_matrices=False)
-    return U[:, singular > above]
+    return U[:, singular > threshold]
+
+
+def independent_columns(columns: np.ndarray, complexity: Any, threshold: float) -> np.ndarray:
+    """Numbers of the columns, ascending, of which more than the share `threshold` is orthogonal to
+    those of lower complexity."""
+    places, span = [], np.zeros((len(columns), 0))
+    for j in np.argsort(complexity, kind="stable"):
+        remainder = columns[:, j] / max(np.linalg.norm(columns[:, j]), 1e-300)
+        for _ in range(2):  # the second time removes the rounding of the first
+            remainder = remainder - span @ (span.T @ remainder)
+        if (size := np.linalg.norm(remainder)) > threshold:
+            places.append(int(j))
+            span = np.column_stack([span, remainder / size])
+    return np.sort(np.array(places, int))
 
 
 # --- series --------------------------------------------------------------------------
@@ -159,7 +173,7 @@ def epsilon_scale(terms: np.ndarray) -> float:
     if len(orders) == 0 or sizes[0] == 0:
         return 1.0
     scale = float(np.max((sizes[1:] / sizes[0]) ** (1 / orders)))
-    return scale if scale > _NOTHING else 1.0
+    return scale if scale > _NO_PERTURBATION else 1.0
 
 
 def in_units_of(scale: float, terms: np.ndarray, axis: int = 1) -> np.ndarray:
@@ -175,7 +189,7 @@ class SeriesSpace(NamedTuple):
     - `leading`: columns, shape ((m + 1) · size, count), whose first blocks c_0 are orthonormal.
     - `shifts`: orthonormal columns without a first block: what may be added to any of them.
     - `singular_values`, `gap`: of the Toeplitz matrix, see `NullSpace`.
-    - `refused`: how many more there were that the judge or a lower order rejects.
+    - `rejections`: how many more there were that the judge or a lower order rejects.
     - `unclear`: how many of them change by less than `UNCLEAR`, but by more than rounding.
     """
 
@@ -183,12 +197,12 @@ class SeriesSpace(NamedTuple):
     shifts: np.ndarray
     singular_values: np.ndarray
     gap: float
-    refused: int
+    rejections: int
     unclear: int
 
 
 def series_spaces(
-    fitted: np.ndarray,
+    rows: np.ndarray,
     judge: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, int]],
     tolerance: float | None = None,
     trivial: np.ndarray | None = None,
@@ -198,35 +212,35 @@ def series_spaces(
     A vector with a small first block is not a series unless it is null for the size of that block:
     candidates are judged again. Those of an order have to lie among those of the order before.
 
-    - `fitted`: weighted rows of A_0 … A_z, shape (rows, z + 1, size).
+    - `rows`: weighted rows of A_0 … A_z, shape (rows, z + 1, size).
     - `judge`: (leading, shifts) → those combinations of them that are null by the measure of the
       search, on samples that were not fitted too, and how many are unclear.
     - `tolerance`: see `null_space`.
     - `trivial`: a first block to leave out, shape (size,): that of a constant.
     """
-    size = fitted.shape[2]
+    size = rows.shape[2]
     spaces: list[SeriesSpace] = []
-    for space in _spaces_of_orders(fitted, tolerance):
-        led, free = by_leading(space.columns[:size], max(RANK, tolerance or 0.0))
-        leading, shifts = space.columns @ led, space.columns @ free
+    for space in _spaces_of_orders(rows, tolerance):
+        first, free = by_leading(space.columns[:size], max(RANK, tolerance or 0.0))
+        leading, shifts = space.columns @ first, space.columns @ free
         if trivial is not None:
             leading = leading @ orthogonal_to(trivial @ leading[:size])
-        found = leading.shape[1] + shifts.shape[1]
+        count = leading.shape[1] + shifts.shape[1]
         leading, shifts, unclear = judge(leading, shifts)
         if spaces:
-            leading = within(leading, spaces[-1].leading[:size])
-        refused = found - leading.shape[1] - shifts.shape[1]
+            leading = intersection(leading, spaces[-1].leading[:size])
+        rejections = count - leading.shape[1] - shifts.shape[1]
         spaces.append(
-            SeriesSpace(leading, shifts, space.singular_values, space.gap, refused, unclear)
+            SeriesSpace(leading, shifts, space.singular_values, space.gap, rejections, unclear)
         )
     return spaces
 
 
-def within(leading: np.ndarray, before: np.ndarray) -> np.ndarray:
+def intersection(leading: np.ndarray, span: np.ndarray) -> np.ndarray:
     """The combinations whose first blocks lie in the span of orthonormal columns."""
-    if leading.shape[1] == 0 or before.shape[1] == 0:
+    if leading.shape[1] == 0 or span.shape[1] == 0:
         return leading[:, :0]
-    cosines, V = singular_vectors(before.T @ leading[: len(before)])
+    cosines, V = singular_vectors(span.T @ leading[: len(span)])
     return leading @ V[cosines > 0.9].T
 
 
@@ -246,8 +260,8 @@ def solve_series(terms: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.n
 
     **Returns** g, shape ((z + 1) · size,), and what may be added to it, as columns.
     """
-    both = compress(np.concatenate([terms, right[..., None]], axis=2))
-    terms, right = both[..., :-1], both[..., -1]
+    system = compress(np.concatenate([terms, right[..., None]], axis=2))
+    terms, right = system[..., :-1], system[..., -1]
     rows, orders, _ = terms.shape
     blocks = toeplitz(terms, orders - 1).reshape(orders, rows, -1)
     scale = np.tile(np.sqrt(np.mean(terms[:, 0] ** 2, axis=0)), orders)

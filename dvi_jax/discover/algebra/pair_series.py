@@ -15,12 +15,19 @@ import numpy as np
 from ...engine.pair_matrices import Left, exact, plus, zeros
 from ...engine.pairs import Pair, div, power
 from ...integration.arithmetic import Arithmetic, DoubleDouble, FloatingPoint
-from .nullspace import HELD_OUT, SeriesSpace, orthogonal_to, singular_vectors, triangle, within
+from .nullspace import (
+    HELD_OUT,
+    SeriesSpace,
+    intersection,
+    orthogonal_to,
+    singular_vectors,
+    triangle,
+)
 
 ROUNDING = 2.0**-104  # Relative rounding of pairs
 # A singular value counts as zero below so many times the rounding that was seen at lower orders,
 # and is undecided below so many.
-_ZERO, _UNDECIDED = 1e2, 1e6
+_ZERO, _NONZERO = 1e2, 1e6
 _SHARE = 1e-7  # Singular values above this share of the largest are factors of float64
 _SWEEPS = 6  # Corrections by factors of float64; each is about 1e-9 times the one before or less
 
@@ -47,16 +54,16 @@ class _Stage(NamedTuple):
 
     basis: Left
     image: Left
-    transposed: Left
+    adjoint: Left
     singular: np.ndarray
     right: np.ndarray
 
     def correction(self, x: Pair) -> np.ndarray:
         """−(M N)⁺ x, in float64."""
-        return -self.right.T @ ((self.transposed @ x).hi / self.singular[:, None])
+        return -self.right.T @ ((self.adjoint @ x).hi / self.singular[:, None])
 
 
-class _Split:
+class _StagedSVD:
     """The null space of a matrix of pairs, and solutions of linear systems with it.
 
     Factors of float64 resolve singular values down to `_SHARE` of the largest. The matrix on what
@@ -65,7 +72,7 @@ class _Split:
 
     def __init__(self, matrix: Pair, noise: float):
         self.stages: list[_Stage] = []
-        self.null, kept = exact(np.eye(matrix.hi.shape[1])), [np.zeros(0)]
+        self.null, nonzero = exact(np.eye(matrix.hi.shape[1])), [np.zeros(0)]
         while True:
             rows, columns = matrix.hi.shape
             U, singular, V = np.linalg.svd(matrix.hi, full_matrices=rows < columns)
@@ -73,22 +80,22 @@ class _Split:
             if largest <= _ZERO * noise:
                 break
             count = int(np.sum(singular > max(_SHARE * largest, _ZERO * noise)))
-            rest = exact(V[count:].T)
+            remainder = exact(V[count:].T)
             factors = Left(U[:, :count].T), singular[:count], V[:count]
             stage = _Stage(Left(self.null), Left(matrix), *factors)
             self.stages.append(stage)
-            kept.append(singular[:count])
-            rest, matrix = _corrected([stage], rest, stage.image @ rest, inner=True)
-            self.null = stage.basis @ rest
+            nonzero.append(singular[:count])
+            remainder, matrix = _correct([stage], remainder, stage.image @ remainder, inner=True)
+            self.null = stage.basis @ remainder
         self.zeros = singular
-        self.kept = np.concatenate(kept)
+        self.nonzero = np.concatenate(nonzero)
 
-    def solved(self, x: Pair) -> tuple[Pair, Pair]:
+    def solve(self, x: Pair) -> tuple[Pair, Pair]:
         """c, for which M c + x is orthogonal to the range of M, and M c + x."""
-        return _corrected(self.stages, zeros(len(self.null.hi), x.hi.shape[1]), x)
+        return _correct(self.stages, zeros(len(self.null.hi), x.hi.shape[1]), x)
 
 
-def _corrected(
+def _correct(
     stages: Sequence[_Stage], c: Pair, left: Pair, inner: bool = False
 ) -> tuple[Pair, Pair]:
     """c and the left side without the part of it in the range of the stages; `inner`: c in terms of
@@ -115,16 +122,16 @@ class Step(NamedTuple):
     - `series`: c_0 … c_k one below the other, shape ((k + 1) · size, count), with orthonormal c_0
       and the smallest corrections. `shifts`: orthonormal series that may be added to any of them,
       those of the orders below, later in ε.
-    - `kept`, `zeros`: singular values that are not zero, and those that are.
-    - `noise`: the largest zero up to this order. `undecided`: how many of `kept` are hardly larger.
+    - `nonzero`, `zeros`: singular values that are not zero, and those that are.
+    - `noise`: the largest zero up to this order. `unclear`: how many `nonzero` are hardly larger.
     """
 
     series: Pair
     shifts: Pair
-    kept: np.ndarray
+    nonzero: np.ndarray
     zeros: np.ndarray
     noise: float
-    undecided: int
+    unclear: int
 
 
 def staircase(blocks: Sequence[Pair], basis: np.ndarray, noise: float) -> list[Step]:
@@ -134,38 +141,38 @@ def staircase(blocks: Sequence[Pair], basis: np.ndarray, noise: float) -> list[S
       are those of B_m · `basis`. `noise`: rounding of the elements of B_0 · `basis`.
     """
     size, columns, lefts = len(basis), Left(basis), [Left(b) for b in blocks]
-    first = split = _Split(lefts[0] @ basis, noise)
+    first = split = _StagedSVD(lefts[0] @ basis, noise)
     c, shifts = split.null, zeros(size, 0)
-    lost: list[_Stage] = []
-    found: list[Step] = []
+    stages: list[_Stage] = []
+    steps: list[Step] = []
     for k in range(len(blocks)):
         if k:
             x = zeros(len(blocks[0].hi), c.hi.shape[1])
             for m in range(k):
                 x = plus(x, lefts[k - m] @ (columns @ _block(c, m, size)))
-            last, x = first.solved(x)
-            c, x = _corrected(lost, _stacked([c, last]), x)
-            split, series = _Split(x, noise), Left(c)
-            lost += [s._replace(basis=Left(series @ s.basis.matrix)) for s in split.stages]
+            last, x = first.solve(x)
+            c, x = _correct(stages, _stack([c, last]), x)
+            split, series = _StagedSVD(x, noise), Left(c)
+            stages += [s._replace(basis=Left(series @ s.basis.matrix)) for s in split.stages]
             c, left = series @ split.null, Left(shifts)
             for _ in range(_SWEEPS // 2):
                 c = plus(c, left @ -(shifts.hi.T @ c.hi))
-        undecided = int(np.sum(split.kept < _UNDECIDED * noise))
+        unclear = int(np.sum(split.nonzero < _NONZERO * noise))
         noise = max(noise, float(split.zeros.max(initial=0.0)))
-        found.append(Step(c, shifts, split.kept, split.zeros, noise, undecided))
-        own = Left(c) @ np.linalg.inv(triangle(np.asarray(c.hi)))
-        shifts = _lowest(_stacked([own, shifts], axis=1), (k + 2) * size)
-    return found
+        steps.append(Step(c, shifts, split.nonzero, split.zeros, noise, unclear))
+        orthonormal = Left(c) @ np.linalg.inv(triangle(np.asarray(c.hi)))
+        shifts = _lowest(_stack([orthonormal, shifts], axis=1), (k + 2) * size)
+    return steps
 
 
-def _stacked(matrices: Sequence[Pair], axis: int = 0) -> Pair:
-    parts: Any = (np.concatenate(x, axis=axis) for x in zip(*matrices, strict=True))
+def _stack(matrices: Sequence[Pair], axis: int = 0) -> Pair:
+    parts: Any = (np.concatenate(halves, axis=axis) for halves in zip(*matrices, strict=True))
     return Pair(*parts)
 
 
 def _lowest(x: Pair, rows: int) -> Pair:
     """Series that begin later in ε, so that there are so many rows."""
-    return _stacked([zeros(rows - len(x.hi), x.hi.shape[1]), x])
+    return _stack([zeros(rows - len(x.hi), x.hi.shape[1]), x])
 
 
 def _block(series: Pair, m: int, size: int) -> Pair:
@@ -195,22 +202,22 @@ def spaces_in_pairs(
         np.exp2(np.round(np.log2(x)))
         for x in (weights / np.sqrt(np.sum(~held_out)), np.max(np.abs(orthonormal), axis=1))
     )
-    each = row[:, None] * units
+    scales = row[:, None] * units
     blocks = []
     for m in range(orders):
         block = div(Pair(*(x[:, m] for x in terms)), power(np.float64(scale), m))
-        blocks.append(Pair(*(each * np.asarray(x) for x in block)))
+        blocks.append(Pair(*(scales * np.asarray(x) for x in block)))
     orthonormal = orthonormal / units[:, None]
     # Errors of single numbers are independent of each other.
-    errors = np.sqrt((each * rounding) ** 2 @ orthonormal**2)[~held_out]
+    errors = np.sqrt((scales * rounding) ** 2 @ orthonormal**2)[~held_out]
     noise = float(np.max(np.linalg.norm(errors, axis=0), initial=np.finfo(float).tiny))
     steps = staircase([Pair(*(x[~held_out] for x in b)) for b in blocks], orthonormal, noise)
     left = _left_sides(blocks, orthonormal, [step.series for step in steps])
     spaces: list[SeriesSpace] = []
-    kept, gap = [], np.inf
+    nonzero, gap = [], np.inf
     for step, x in zip(steps, left, strict=True):
-        kept.append(step.kept)
-        gap = min(gap, step.kept.min(initial=1.0) / step.noise)
+        nonzero.append(step.nonzero)
+        gap = min(gap, step.nonzero.min(initial=1.0) / step.noise)
         # The same conditions on samples that were not fitted.
         changes, V = singular_vectors(x[held_out])
         leading = np.asarray(step.series.hi) @ V[changes <= HELD_OUT * _ZERO * step.noise].T
@@ -218,12 +225,12 @@ def spaces_in_pairs(
         if trivial is not None:
             leading = leading @ orthogonal_to(trivial @ leading[:size])
         if spaces:
-            leading = within(leading, spaces[-1].leading[:size])
-        singular = np.sort(np.concatenate([*kept, step.zeros]))[::-1]
-        refused = step.series.hi.shape[1] - count
+            leading = intersection(leading, spaces[-1].leading[:size])
+        singular = np.sort(np.concatenate([*nonzero, step.zeros]))[::-1]
+        rejections = step.series.hi.shape[1] - count
         shifts = np.asarray(step.shifts.hi)
-        spaces.append(SeriesSpace(leading, shifts, singular, float(gap), refused, 0))
-    return spaces, sum(step.undecided for step in steps)
+        spaces.append(SeriesSpace(leading, shifts, singular, float(gap), rejections, 0))
+    return spaces, sum(step.unclear for step in steps)
 
 
 def _left_sides(
@@ -235,7 +242,7 @@ def _left_sides(
     total = zeros(len(blocks[0].hi), int(ends[-1]))
     for m, block in enumerate(blocks):
         later = [_block(c, k - m, size) for k, c in enumerate(series) if k >= m]
-        before = zeros(size, int(ends[m - 1]) if m else 0)
-        c = _stacked([before, *later], axis=1)
+        padding = zeros(size, int(ends[m - 1]) if m else 0)
+        c = _stack([padding, *later], axis=1)
         total = plus(total, Left(block) @ (columns @ c))
     return np.split(total.hi, ends[:-1], axis=1)

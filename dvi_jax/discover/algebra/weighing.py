@@ -10,7 +10,7 @@ from .nullspace import epsilon_scale, in_units_of, triangle
 M = TypeVar("M", Motion, FieldMotion)
 
 
-class Weighed(NamedTuple, Generic[M]):
+class WeightedConditions(NamedTuple, Generic[M]):
     """Conditions A_0 … A_z on S samples, in functions that are orthonormal on the fitted ones:
     singular values then measure functions, not their scaling.
 
@@ -44,8 +44,8 @@ class Weighed(NamedTuple, Generic[M]):
 
 def weigh(
     values: np.ndarray, terms: np.ndarray, motion: M, fit: np.ndarray, in_sizes: bool = True
-) -> Weighed[M]:
-    """Weighed conditions from `values` of φ, shape (S, size), and `terms` A, shape (S, z + 1, …,
+) -> WeightedConditions[M]:
+    """Weighted conditions from `values` of φ, shape (S, size), and `terms` A, shape (S, z + 1, …,
     size); `fit`: which samples are fitted, (S,). `in_sizes`: whether the units of φ are `rms`,
     or 1."""
     rms, calm = typical_sizes(values)
@@ -58,17 +58,17 @@ def weigh(
     rows = terms
     if terms.ndim > 3:  # (S, z + 1, rows, …) with the rows of a sample next to it
         rows = np.moveaxis(terms.reshape(*terms.shape[:3], -1), 1, 2)
-    rows = weighted(rows, weights)[fit]
+    rows = times_weights(rows, weights)[fit]
     scale = epsilon_scale(rows.reshape(-1, *rows.shape[-2:]))
     terms = in_units_of(scale, terms)
-    return Weighed(R, units, rms, calm, orthonormal, motion, weights, scale, terms)
+    return WeightedConditions(R, units, rms, calm, orthonormal, motion, weights, scale, terms)
 
 
-def weighted(terms: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def times_weights(terms: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Terms of each sample times its weight."""
     return weights.reshape(-1, *[1] * (terms.ndim - 1)) * terms
 
 
 def of_orthonormal(terms: np.ndarray, units: np.ndarray, R: np.ndarray) -> np.ndarray:
-    """Terms of the orthonormal functions, from those of φ in the last axis; see `Weighed`."""
+    """Terms of the orthonormal functions, from those of φ, in the last axis."""
     return np.linalg.solve(R.T, (terms / units).reshape(-1, len(R)).T).T.reshape(terms.shape)

@@ -87,15 +87,13 @@ def noether_balance(
     if jnp.ndim(solution.ts) != 1 or steps < 2:
         raise ValueError(
             "solution must be one trajectory with at least three states, got solution.ts of shape "
-            f"{jnp.shape(solution.ts)}. Integrate at least two steps with save=dvi.Save(). From a "
-            "batch take one trajectory: jax.tree.map(lambda x: x[i], solution)."
+            f"{jnp.shape(solution.ts)}: of a batch take jax.tree.map(lambda x: x[i], solution)."
         )
-    made = solution.stats["num_steps"]
-    if steps != jnp.size(solution.hs) or not (is_traced(made) or steps == made):
+    num_steps = solution.stats["num_steps"]
+    if steps != jnp.size(solution.hs) or not (is_traced(num_steps) or steps == num_steps):
         raise ValueError(
-            f"solution must have the state at every lattice point, but it has {steps + 1} states"
-            + (" at requested times" if steps != jnp.size(solution.hs) else "")
-            + f" for num_steps={solution.stats['num_steps']}. Integrate with save=dvi.Save()."
+            f"solution must have the state at every lattice point, got {steps + 1} states for "
+            f"num_steps={num_steps}: integrate with save=dvi.Save()."
         )
     return _balance(
         system,
@@ -109,25 +107,25 @@ def noether_balance(
 def _balance(system, invariant: AdiabaticInvariant, points: LatticePoint, args) -> Balance:
     generators, gauges, epsilon = invariant.generators, invariant.gauges, invariant.epsilon
 
-    def at(before, here, after):
-        h = after.t - here.t
+    def at_points(first, second, third):
+        h = third.t - second.t
 
-        def value(a, b):
-            return invariant(a.t, b.t, a.q, a.p, b.q, b.p, args)
+        def value(start, end):
+            return invariant(start.t, end.t, start.q, start.p, end.q, end.p, args)
 
-        drift = (value(here, after) - value(before, here)) / h
-        r = lattice_defect(system, (before, here, after), epsilon, args)
+        drift = (value(second, third) - value(first, second)) / h
+        r = lattice_defect(system, (first, second, third), epsilon, args)
         symmetry = lattice = jnp.zeros_like(drift)
         for m, generator in enumerate(generators):
-            N = noether_identity(system, generators, gauges, m, here, after, epsilon, args)
+            N = noether_identity(system, generators, gauges, m, second, third, epsilon, args)
             symmetry += epsilon**m * N
-            lattice -= epsilon**m * generator(here, args).t * r
-        last = generators[-1](here, args)
+            lattice -= epsilon**m * generator(second, args).t * r
+        last = generators[-1](second, args)
         # The system gives ε W; the other factor is ε^z.
-        force = system.disturbing_force(here.t, after.t, here.q, after.p, epsilon, args)
-        virtual = last.q - (after.q - here.q) / h * last.t
+        force = system.disturbing_force(second.t, third.t, second.q, third.p, epsilon, args)
+        virtual = last.q - (third.q - second.q) / h * last.t
         work = epsilon ** (len(generators) - 1) * jnp.sum(force * virtual)
-        return Balance(here.t, drift, symmetry, work, lattice)
+        return Balance(second.t, drift, symmetry, work, lattice)
 
-    shifted = [jax.tree.map(lambda x, i=i: x[i : len(x) - 2 + i], points) for i in range(3)]
-    return jax.vmap(at)(*shifted)
+    windows = [jax.tree.map(lambda x, i=i: x[i : len(x) - 2 + i], points) for i in range(3)]
+    return jax.vmap(at_points)(*windows)

@@ -1,7 +1,7 @@
 """The order in ε to which something is conserved, measured along trajectories."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Unpack
 
 import equinox as eqx
 import jax
@@ -10,22 +10,19 @@ import numpy as np
 
 from ...base.checks import function
 from ...base.inputs import as_parameter, as_scalar, start_state
-from ...base.keywords import take, with_keywords_of
+from ...base.keywords import checked_keywords
 from ...base.reads import Reads, reads
 from ...base.results import status_name
 from ...integration.integrate import integrate
-from ...integration.integrator import chosen
+from ...integration.keywords import MethodSettings, integrator_of
 from ...observe import MaxDrift
 from ...observe.solution import Save
 from ...problem.system import System, check_system
-from ..functions.sampling import TYPE_2
 from .exponents import line, plateau_level, small_epsilon_exponent
 from .orders import ABOVE_FLOOR, DriftOrder, DriftSurface
 
-_TAKEN = f"{TYPE_2} method"
 
-
-@with_keywords_of(integrate, _TAKEN)
+@checked_keywords
 def drift_order(
     system: System,
     invariant: Callable[..., Any],
@@ -36,7 +33,7 @@ def drift_order(
     h: Any,
     num_steps: int,
     batched: bool = False,
-    **how: Any,
+    **settings: Unpack[MethodSettings],
 ) -> DriftOrder:
     r"""The exponent of ε in the largest drift of a scalar along trajectories.
 
@@ -92,11 +89,12 @@ def drift_order(
     epsilons = _positive("epsilons", epsilons)
     starts = _starts(q0, p0, batched)
     h = float(as_scalar("h", h, starts[0].dtype, zero_allowed=False))
-    lanes = _sweep(system, invariant, starts, epsilons, h, num_steps, _settings(how))
-    return _order(epsilons, lanes, _kept(lanes.good))
+    run = _run_settings(settings)
+    lanes = _sweep(system, invariant, starts, epsilons, h, num_steps, run)
+    return order_of(epsilons, lanes, valid_starts(lanes.good))
 
 
-@with_keywords_of(integrate, _TAKEN)
+@checked_keywords
 def drift_surface(
     system: System,
     invariant: Callable[..., Any] | Sequence[Callable[..., Any]],
@@ -107,7 +105,7 @@ def drift_surface(
     hs: Any,
     duration: float,
     batched: bool = False,
-    **how: Any,
+    **settings: Unpack[MethodSettings],
 ) -> DriftSurface:
     r"""The largest drift of a scalar over ε and h, and its order in each.
 
@@ -139,34 +137,33 @@ def drift_surface(
     is_number = isinstance(duration, int | float | np.number)
     if not is_number or not np.isfinite(duration) or duration < 2 * hs[-1]:
         raise ValueError(
-            f"duration must be a finite float or int of at least {2 * hs[-1]} (twice the longest "
-            f"step in hs), got {duration!r:.200}."
+            f"duration must be a finite number of at least {2 * hs[-1]}, twice the longest step in "
+            f"hs, got {duration!r:.200}."
         )
-    given = isinstance(invariant, Sequence)
-    invariants = list(invariant) if given else [invariant] * len(hs)
+    is_list = isinstance(invariant, Sequence)
+    invariants = list(invariant) if is_list else [invariant] * len(hs)
     if len(invariants) != len(hs):
         raise ValueError(
-            "invariant must be one observable, or a list with one observable for each step size "
-            f"in hs. The length of hs is {len(hs)}, but the length of invariant is "
-            f"{len(invariants)}."
+            f"invariant must be one observable, or a list of {len(hs)}, one for each step size in "
+            f"hs, got {len(invariants)}."
         )
-    for each in invariants:
-        _check_observable(each)
-    starts, settings = _starts(q0, p0, batched), _settings(how)
+    for observable in invariants:
+        _check_observable(observable)
+    starts, run = _starts(q0, p0, batched), _run_settings(settings)
     num_steps = np.round(duration / hs).astype(int)
     lanes = [
-        _sweep(system, each, starts, epsilons, float(h), int(steps), settings)
-        for each, h, steps in zip(invariants, hs, num_steps, strict=True)
+        _sweep(system, observable, starts, epsilons, float(h), int(steps), run)
+        for observable, h, steps in zip(invariants, hs, num_steps, strict=True)
     ]
-    kept = _kept(np.concatenate([lane.good for lane in lanes]))
-    orders = tuple(_order(epsilons, lane, kept) for lane in lanes)
+    valid = valid_starts(np.concatenate([lane.good for lane in lanes]))
+    orders = tuple(order_of(epsilons, lane, valid) for lane in lanes)
     floors = np.array([o.floor for o in orders])
     by_mesh = np.isfinite(floors) & np.array([o.floor_cause == "mesh" for o in orders])
     mesh_slope, mesh_stderr = line(np.log(hs[by_mesh]), np.log(floors[by_mesh]))
     return DriftSurface(epsilons, hs, num_steps, orders, by_mesh, mesh_slope, mesh_stderr)
 
 
-class _Lanes(NamedTuple):
+class Drifts(NamedTuple):
     """Results of a sweep, shape (E + 1, S), the last row at ε = 0.
 
     `sizes` of the observable; `epsilon`: the relative rounding of one operation.
@@ -183,19 +180,18 @@ class _Lanes(NamedTuple):
         return self.statuses == "successful"
 
 
-def _sweep(system, invariant, starts, epsilons, h, num_steps, settings) -> _Lanes:
+def _sweep(system, invariant, starts, epsilons, h, num_steps, run) -> Drifts:
     """Every initial condition at every ε and at 0, as one batch."""
     check_system(system)
     shape, dtype = (len(epsilons) + 1, len(starts[0])), starts[0].dtype
     strengths = jnp.repeat(jnp.append(jnp.asarray(epsilons, dtype), 0), shape[1])
     starts = tuple(jnp.concatenate([x] * shape[0]) for x in starts)
-    drifts, last, result = _run(
-        system, invariant, strengths, starts, h, num_steps, settings, reads(invariant)
-    )
+    run = {"h": h, "num_steps": num_steps, **run}
+    arrays = run_trajectories(system, invariant, strengths, starts, run, reads(invariant))
+    drifts, last, result = arrays
     if drifts.ndim != 1:
         raise ValueError(
-            "invariant must return a scalar, but it returned an array of shape "
-            f"{drifts.shape[1:]}. Return one component of it."
+            f"invariant must return a scalar, got an array of shape {drifts.shape[1:]}."
         )
     drifts = np.asarray(drifts, float)
     # An odd observable may end near zero: its drift shows how large it was.
@@ -204,23 +200,23 @@ def _sweep(system, invariant, starts, epsilons, h, num_steps, settings) -> _Lane
     blind = (statuses == "successful") & ~np.isfinite(drifts)
     statuses = np.where(blind, "observable_not_finite", statuses)
     drifts, sizes, statuses = (x.reshape(shape) for x in (drifts, sizes, statuses))
-    return _Lanes(drifts, sizes, statuses, num_steps, float(jnp.finfo(dtype).eps))
+    return Drifts(drifts, sizes, statuses, num_steps, float(jnp.finfo(dtype).eps))
 
 
 @eqx.filter_jit
-def _run(system, invariant, strengths, starts, h, num_steps: int, settings, _: Reads = ()):
+def run_trajectories(system, invariant, strengths, starts, run, _: Reads = ()):
     """Drift, last value and status of every trajectory; no state in between is saved."""
-    run = {"h": h, "num_steps": num_steps, "save": Save(final=True), "throw": False, **settings}
 
     def lane(epsilon, q0, p0):
         observe = (MaxDrift(invariant), invariant)
-        solution = integrate(system, q0, p0, epsilon=epsilon, observe=observe, **run)
+        keywords = {"epsilon": epsilon, "observe": observe, "save": Save(final=True), **run}
+        solution = integrate(system, q0, p0, throw=False, **keywords)
         return *solution.observed, solution.result
 
     return jax.vmap(lane)(strengths, *starts)
 
 
-def _kept(good: np.ndarray) -> np.ndarray:
+def valid_starts(good: np.ndarray) -> np.ndarray:
     """The initial conditions that succeed wherever most of them do, shape (S,); `good`: (points,
     S)."""
     return np.all(good[_passable(good)], axis=0)
@@ -230,28 +226,28 @@ def _passable(good: np.ndarray) -> np.ndarray:
     return 2 * good.sum(axis=1) >= good.shape[1]
 
 
-def _order(epsilons: np.ndarray, lanes: _Lanes, kept: np.ndarray) -> DriftOrder:
+def order_of(epsilons: np.ndarray, lanes: Drifts, valid: np.ndarray) -> DriftOrder:
     """The fit over the initial conditions that count."""
-    passed = _passable(lanes.good) & kept.any()
-    largest = np.where(passed, lanes.drifts[:, kept].max(axis=1, initial=0), np.nan)
+    passable = _passable(lanes.good) & valid.any()
+    largest = np.where(passable, lanes.drifts[:, valid].max(axis=1, initial=0), np.nan)
     drifts, floor = largest[:-1], float(largest[-1])
-    rounding = lanes.sizes[-1, kept].max(initial=0) * lanes.epsilon
+    rounding = lanes.sizes[-1, valid].max(initial=0) * lanes.epsilon
     floor = max(floor, 4 * rounding)
     # One rounding in each step, and ten thousand for the coefficients of the observable.
     cause = "round-off" if floor <= (10_000 + lanes.num_steps) * rounding else "mesh"
-    excluded = np.full(len(epsilons), "", dtype="<U9")
-    excluded[~(drifts > ABOVE_FLOOR * floor)] = cause
-    if not passed[-1]:
+    reasons = np.full(len(epsilons), "", dtype="<U9")
+    reasons[~(drifts > ABOVE_FLOOR * floor)] = cause
+    if not passable[-1]:
         cause = "failed"
-        excluded[:] = "no floor"
-    excluded[~passed[:-1]] = "failed"
-    candidates = excluded == ""
+        reasons[:] = "no floor"
+    reasons[~passable[:-1]] = "failed"
+    candidates = reasons == ""
     level = plateau_level(epsilons[candidates], drifts[candidates])
-    excluded[candidates & ~(drifts > ABOVE_FLOOR * level)] = "flat"
-    used = excluded == ""
-    fit = small_epsilon_exponent(epsilons[used], drifts[used], max(floor, level))
-    points = epsilons, drifts, floor, cause, used, excluded
-    return DriftOrder(*points, fit.slope, fit.stderr, kept, lanes.drifts, lanes.statuses, fit)
+    reasons[candidates & ~(drifts > ABOVE_FLOOR * level)] = "flat"
+    is_fitted = reasons == ""
+    fit = small_epsilon_exponent(epsilons[is_fitted], drifts[is_fitted], max(floor, level))
+    points = epsilons, drifts, floor, cause, is_fitted, reasons
+    return DriftOrder(*points, fit.slope, fit.stderr, valid, lanes.drifts, lanes.statuses, fit)
 
 
 def _check_observable(invariant: Any) -> None:
@@ -263,31 +259,29 @@ def _positive(name: str, values: Any, increasing: bool = False) -> np.ndarray:
         array = np.asarray(values, float)
     except (TypeError, ValueError):
         array = np.zeros(())
-    if array.ndim != 1 or len(array) == 0 or not (np.isfinite(array) & (array > 0)).all():
-        raise ValueError(
-            f"{name} must be a list of one or more positive, finite numbers, got {values!r:.200}."
-        )
-    fits = (np.diff(array) > 0).all() if increasing else len(np.unique(array)) == len(array)
-    if not fits:
-        rule = "be in increasing order, without equal values" if increasing else "be distinct"
-        raise ValueError(f"the values of {name} must {rule}, got {array.tolist()!s:.200}.")
+    is_positive = array.ndim == 1 and array.size and (np.isfinite(array) & (array > 0)).all()
+    ascending = array if increasing else np.sort(array, axis=None)
+    if not is_positive or (np.diff(ascending) <= 0).any():
+        rule = "in increasing order" if increasing else "no two of them equal"
+        raise ValueError(f"{name} must be positive, finite numbers, {rule}, got {values!r:.200}.")
     return array
 
 
-def _starts(q0: Any, p0: Any, batched: bool):
+def _starts(q0: Any, p0: Any, is_batch: bool):
     """The initial conditions as arrays (S, *state)."""
     q0, p0 = start_state(q0, p0)
-    if not batched:
+    if not is_batch:
         return q0[None], p0[None]
     if q0.ndim == 0:
         raise ValueError(
-            "q0 and p0 must have the initial conditions along the first axis if batched=True, got "
-            f"the numbers q0 = {q0} and p0 = {p0}. For one initial condition leave out batched."
+            "q0 and p0 must have the initial conditions along the first axis for batched=True, got "
+            f"the numbers {q0} and {p0}."
         )
     return q0, p0
 
 
-def _settings(how: dict[str, Any]) -> dict[str, Any]:
-    """What `integrate` receives of the keywords that both functions take from it."""
-    run = take(how, "t0 args")  # removes them from `how`
-    return run | {"args": jax.tree.map(as_parameter, run["args"]), "integrator": chosen(**how)}
+def _run_settings(settings: MethodSettings) -> dict[str, Any]:
+    """The keywords of both functions as those of `integrate`."""
+    integrator, run = integrator_of(settings)
+    args = jax.tree.map(as_parameter, run.get("args"))
+    return {"t0": 0.0, **run, "args": args, "integrator": integrator}

@@ -6,9 +6,9 @@ import numpy as np
 
 from .laws import Fits, fits_of_laws, lines, names
 
-ENOUGH = 3  # Points that a slope needs: two points always lie on a line
-_RESOLVED = 0.3  # An order is resolved when half of its 95 % interval is at most this
-_CURVED = 0.05  # A straight line is rejected when its probability is below this
+LEAST_POINTS = 3  # Points that a slope needs: two points always lie on a line
+_RESOLUTION = 0.3  # An order is resolved when half of its 95 % interval is at most this
+_UNLIKELY = 0.05  # A straight line is rejected when its probability is below this
 
 
 class Exponent(NamedTuple):
@@ -45,9 +45,9 @@ class Exponent(NamedTuple):
     @property
     def curved(self) -> bool:
         """Whether a straight line is rejected: its probability is below 5 %."""
-        return self.points >= ENOUGH and self.probabilities["power"] < _CURVED
+        return self.points >= LEAST_POINTS and self.probabilities["power"] < _UNLIKELY
 
-    def report(self, points: int, wanted: tuple[float, float]) -> list[str]:
+    def report(self, points: int, target: tuple[float, float]) -> list[str]:
         """Lines of text: the order and its interval, or that none is resolved.
 
         - `points`: the number before points were excluded. `wanted`: what `resolving_range`
@@ -57,23 +57,23 @@ class Exponent(NamedTuple):
         law = f"not one power: {self.model} near ε = {self.crossover:.2g}"
         if self.crossover > self.range[1]:
             law = "the slope changes toward larger ε"
-        by = f"by {self.points} of {points} points"
+        count = f"by {self.points} of {points} points"
         straight = f"the slope of the straight line is {self.line_slope:.3g}"
         if self.resolved:
-            found = f"ε^{self.slope:.4g}, 95 % interval {low:.4g} … {high:.4g}, {by}"
+            power = f"ε^{self.slope:.4g}, 95 % interval {low:.4g} … {high:.4g}, {count}"
             if self.model == "power":
-                return [f"drift ∝ {found}"]
-            return [f"for ε → 0 the drift tends to {found}", f"  {law}; {straight}"]
+                return [f"drift ∝ {power}"]
+            return [f"for ε → 0 the drift tends to {power}", f"  {law}; {straight}"]
         lines = [
             f"no order resolved in this range: for ε → 0 it may be {low:.2g} … {high:.2g} (95 %), "
-            f"{by} ({straight})"
+            f"{count} ({straight})"
         ]
         if self.curved:
             lines.append(f"  {law}")
-        if np.isfinite(wanted).all():
+        if np.isfinite(target).all():
             lines.append(
-                f"  to resolve it, take more points (eight or more) at ε = {wanted[0]:.2g} … "
-                f"{wanted[1]:.2g}"
+                f"  to resolve it, take more points (eight or more) at ε = {target[0]:.2g} … "
+                f"{target[1]:.2g}"
             )
         else:
             lines.append(
@@ -118,7 +118,7 @@ def small_epsilon_exponent(epsilons: Any, drifts: Any, floor: float = 0.0) -> Ex
     Stat. Sci. 14 (1999) 382.
     """
     epsilons, drifts = np.asarray(epsilons, float), np.asarray(drifts, float)
-    if len(epsilons) < ENOUGH:
+    if len(epsilons) < LEAST_POINTS:
         nan = np.nan
         pair, count = (nan, nan), len(epsilons)
         return Exponent(nan, pair, nan, False, "", {}, nan, nan, nan, nan, count, pair)
@@ -129,18 +129,18 @@ def small_epsilon_exponent(epsilons: Any, drifts: Any, floor: float = 0.0) -> Ex
         name: float(fits.weights[fits.laws == i].sum()) for i, name in enumerate(names())
     }
     model = max(probabilities, key=lambda name: probabilities[name])
-    here = fits.laws == list(probabilities).index(model)
+    of_model = fits.laws == list(probabilities).index(model)
     crossover = np.nan
     if model != "power":
-        crossover = np.exp(np.average(fits.centres[here], weights=fits.weights[here]))
+        crossover = np.exp(np.average(fits.centres[of_model], weights=fits.weights[of_model]))
     low, middle, high = _quantiles(fits, freedom, np.array([0.025, 0.5, 0.975]))
-    resolved = bool((high - low) / 2 <= _RESOLVED)
+    is_resolved = bool((high - low) / 2 <= _RESOLUTION)
     line_slope, line_stderr = line(x, y)
-    slope = middle if resolved and model != "power" else line_slope
+    slope = middle if is_resolved and model != "power" else line_slope
     low, high = min(low, slope), max(high, slope)
     interval, stderr = (float(low), float(high)), float((high - low) / 2 / student_t(freedom))
-    curvature = 2 * float(np.polyfit(x - x.mean(), y, 2)[0]) if len(x) > ENOUGH else np.nan
-    order = float(slope), interval, stderr, resolved, model, probabilities, float(crossover)
+    curvature = 2 * float(np.polyfit(x - x.mean(), y, 2)[0]) if len(x) > LEAST_POINTS else np.nan
+    order = float(slope), interval, stderr, is_resolved, model, probabilities, float(crossover)
     ends = float(epsilons.min()), float(epsilons.max())
     return Exponent(*order, line_slope, line_stderr, curvature, len(x), ends)
 
@@ -159,7 +159,7 @@ def resolving_range(
     **Returns** (lowest, highest); NaN where `smallest_drift` leaves less than a factor of 3, or
     with fewer than three points.
     """
-    if fit.points < ENOUGH:
+    if fit.points < LEAST_POINTS:
         return np.nan, np.nan
     epsilons, drifts = np.asarray(epsilons, float), np.asarray(drifts, float)
     first, second = np.argsort(epsilons)[:2]
@@ -182,7 +182,7 @@ def plateau_level(epsilons: np.ndarray, drifts: np.ndarray) -> float:
     """The constant level of the drifts at the smallest ε; 0 if they rise from the first on."""
     order = np.argsort(epsilons)
     x, y = np.log(epsilons[order]), np.log(drifts[order])
-    for count in range(len(x), ENOUGH - 1, -1):
+    for count in range(len(x), LEAST_POINTS - 1, -1):
         if x[count - 1] - x[0] < np.log(_FLAT_SPAN):
             break
         rises = line(x[:count], y[:count])[0] >= _FLAT or np.ptp(y[:count]) > np.log(_FLAT_RISE)
@@ -193,7 +193,7 @@ def plateau_level(epsilons: np.ndarray, drifts: np.ndarray) -> float:
 
 def line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
     """Least-squares slope and its standard error; NaN for fewer than three points."""
-    if len(x) < ENOUGH:
+    if len(x) < LEAST_POINTS:
         return np.nan, np.nan
     slopes, squares = lines(x, y[None])
     dx = x - x.mean()
@@ -202,7 +202,7 @@ def line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
 
 def line_interval(slope: float, stderr: float, points: int) -> tuple[float, float]:
     """95 % interval of the slope of a straight line, by Student's t; NaN below three points."""
-    if points < ENOUGH:
+    if points < LEAST_POINTS:
         return np.nan, np.nan
     half = student_t(points - 2) * stderr
     return slope - half, slope + half
@@ -225,6 +225,6 @@ def _quantiles(fits: Fits, freedom: int, levels: np.ndarray) -> np.ndarray:
     for _ in range(36):
         middle = (low + high) / 2
         t = (middle[:, None] - fits.slopes) / fits.stderrs
-        below = special.stdtr(freedom, t) @ fits.weights < levels
-        low, high = np.where(below, middle, low), np.where(below, high, middle)
+        is_below = special.stdtr(freedom, t) @ fits.weights < levels
+        low, high = np.where(is_below, middle, low), np.where(is_below, high, middle)
     return (low + high) / 2

@@ -36,7 +36,7 @@ class _Law(NamedTuple):
     sharpnesses: tuple[tuple[float, float], ...] = ((1.0, 1.0),)
     points: int = 0
     """How many points it needs."""
-    beyond: bool = True
+    is_open: bool = True
     """Whether its centre may lie above the largest ε."""
 
 
@@ -71,7 +71,7 @@ _LAWS = (
         ranges=((-4, -0.5, 0.4), (0.5, 2.5, 0.4), (2.5, 6, 0.2)),
         sharpnesses=((1, 0.3), (2, 0.4), (5, 0.3)),
         points=6,
-        beyond=False,
+        is_open=False,
     ),
 )
 
@@ -84,13 +84,13 @@ def names() -> list[str]:
 # --- the probability of each law -------------------------------------
 
 _MARGIN = np.log(3.0)
-_BEYOND = np.log(1e4)
+_FAR = np.log(1e4)
 # Cells of the centre x_c in three regions of ε, where ε_max is the largest one measured: up to 3
 # ε_max; from there to 10⁴ ε_max, where the correction is 10⁻⁴ for k = 1; up to ε_max.
 _COUNTS = np.array([40, 20, 40])
-_WITHIN = 0.6  # Probability that the centre is below 3 ε_max, for laws where it may be above ε_max
+_NEAR = 0.6  # Probability that the centre is below 3 ε_max, for laws where it may be above ε_max
 _LEVELS = 7
-_REFINED = 100  # At each level this many cells, the most probable ones, are divided by four
+_DIVISIONS = 100  # At each level this many cells, the most probable ones, are divided by four
 # A cell is left out if the logarithm of its probability is this much below the largest one.
 _NEGLIGIBLE = 12.0
 
@@ -113,7 +113,7 @@ class _Cells(NamedTuple):
     def take(self, index: np.ndarray) -> "_Cells":
         return _Cells(*(field[index] for field in self))
 
-    def divided(self, by_size: bool, parts: int = 4) -> "_Cells":
+    def divide(self, by_size: bool, parts: int = 4) -> "_Cells":
         """Each cell cut along its centre or, where it has one, its range of sizes."""
         cut = np.repeat(by_size & (self.size_widths > 0), parts)
         cells = _Cells(*(np.repeat(field, parts) for field in self))
@@ -145,9 +145,9 @@ def fits_of_laws(x: np.ndarray, drifts: np.ndarray, floor: float) -> Fits:
     # Which part of the floor is in the drifts, with its probability.
     is_small = floor / drifts.min() < _LEAST_SCATTER
     parts = [(0.0, 1.0)] if is_small else [(0.0, 0.4), (1.0, 0.5), (-1.0, 0.1)]
-    found = [_refined_fits(x, np.log(drifts - part * floor), np.log(p)) for part, p in parts]
-    cells = _Cells(*map(np.concatenate, zip(*(f[0] for f in found), strict=True)))
-    slopes, squares, logs = (np.concatenate([f[i] for f in found]) for i in (1, 2, 3))
+    fits = [_refined_fits(x, np.log(drifts - part * floor), np.log(p)) for part, p in parts]
+    cells = _Cells(*map(np.concatenate, zip(*(f[0] for f in fits), strict=True)))
+    slopes, squares, logs = (np.concatenate([f[i] for f in fits]) for i in (1, 2, 3))
     weights = np.exp(logs - logs.max())
     keep = weights > 1e-4 * weights.max()
     dx = x - x.mean()
@@ -167,15 +167,15 @@ def _refined_fits(x: np.ndarray, y: np.ndarray, log_prior: float):
         logs = log_prior + np.log(cells.density) - freedom / 2 * np.log(squares)
         divide = np.zeros(len(logs), bool)
         if level < _LEVELS - 1:
-            divide[np.argsort(-logs)[:_REFINED]] = True
+            divide[np.argsort(-logs)[:_DIVISIONS]] = True
             divide &= cells.widths > 0
         keep = ~divide & (logs > logs.max() - _NEGLIGIBLE)
         out.append((cells.take(keep), slopes[keep], squares[keep], logs[keep]))
         if not divide.any():
             break
-        cells = cells.take(divide).divided(by_size=level % 2 == 1)
-    every = _Cells(*map(np.concatenate, zip(*(o[0] for o in out), strict=True)))
-    return every, *(np.concatenate([o[i] for o in out]) for i in (1, 2, 3))
+        cells = cells.take(divide).divide(by_size=level % 2 == 1)
+    all_cells = _Cells(*map(np.concatenate, zip(*(o[0] for o in out), strict=True)))
+    return all_cells, *(np.concatenate([o[i] for o in out]) for i in (1, 2, 3))
 
 
 def lines(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -183,8 +183,8 @@ def lines(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     dx = x - x.mean()
     y = y - y.mean(axis=1, keepdims=True)
     slopes = y @ dx / (dx @ dx)
-    rest = y - slopes[:, None] * dx
-    return slopes, np.einsum("ij,ij->i", rest, rest)
+    residuals = y - slopes[:, None] * dx
+    return slopes, np.einsum("ij,ij->i", residuals, residuals)
 
 
 def _shapes(x: np.ndarray, cells: _Cells) -> np.ndarray:
@@ -202,7 +202,7 @@ def _first_cells(x: np.ndarray) -> _Cells:
     regions, numbers, laws, sizes, size_widths, sharpnesses, density = _table(len(x))
     low, high = x.min(), x.max()
     starts = np.array([low, high + _MARGIN, low])
-    widths = (np.array([high + _MARGIN, high + _BEYOND, high]) - starts) / _COUNTS
+    widths = (np.array([high + _MARGIN, high + _FAR, high]) - starts) / _COUNTS
     regions = regions.astype(int)
     centres = starts[regions] + (numbers + 0.5) * widths[regions]
     widths = np.where(laws > 0, widths[regions], 0.0)
@@ -216,7 +216,7 @@ def _table(points: int) -> np.ndarray:
     for i, law in enumerate(_LAWS[1:], 1):
         if points < law.points:
             continue
-        regions = [(0, _WITHIN), (1, 1 - _WITHIN)] if law.beyond else [(2, 1.0)]
+        regions = [(0, _NEAR), (1, 1 - _NEAR)] if law.is_open else [(2, 1.0)]
         sizes = [(size, 0.0, prior) for size, prior in law.sizes]
         for first, last, prior in law.ranges:
             edges = np.linspace(first, last, 5)

@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .exponents import ENOUGH, Exponent, line, line_interval, resolving_range
+from .exponents import LEAST_POINTS, Exponent, line, line_interval, resolving_range
 
 # A point counts when its drift is this many times the one that does not come from ε.
 ABOVE_FLOOR = 10
@@ -15,6 +15,10 @@ _MEANINGS = {
     "mesh": "within ten times of the drift at ε = 0",
     "flat": "within ten times of a plateau at the smallest ε",
 }
+
+
+def _of_fit(name: str, doc: str) -> Any:
+    return property(lambda self: getattr(self.fit, name), doc=doc)
 
 
 class DriftOrder(NamedTuple):
@@ -48,29 +52,18 @@ class DriftOrder(NamedTuple):
     statuses: np.ndarray
     fit: Exponent
 
-    @property
-    def interval(self) -> tuple[float, float]:
-        """95 % interval of the order for ε → 0, from the scatter and from the choice of the law.
-
-        If the order is not `resolved`, it also contains `slope`, the slope of the straight line.
-        """
-        return self.fit.interval
-
-    @property
-    def resolved(self) -> bool:
-        """Whether the 95 % interval of the order for ε → 0 is at most 0.6 long."""
-        return self.fit.resolved
-
-    @property
-    def model(self) -> str:
-        """The most probable law: "power", "sum of two powers", …; see `Exponent`."""
-        return self.fit.model
-
-    @property
-    def curvature(self) -> float:
-        """d² log(drift) / d log(ε)² of a parabola through the points used, 0 for a power law; NaN
-        with fewer than four points."""
-        return self.fit.curvature
+    interval = _of_fit(
+        "interval",
+        "95 % interval of the order for ε → 0, from the scatter and from the choice of the law; if "
+        "the order is not `resolved`, it also contains `slope`, that of the straight line.",
+    )
+    resolved = _of_fit("resolved", "Whether that interval is at most 0.6 long.")
+    model = _of_fit("model", 'The most probable law: "power", "saturation", …; see `Exponent`.')
+    curvature = _of_fit(
+        "curvature",
+        "d² log(drift) / d log(ε)² of a parabola through the points used, 0 for a power law; NaN "
+        "with fewer than four points.",
+    )
 
     @property
     def limit(self) -> float:
@@ -100,15 +93,15 @@ class DriftOrder(NamedTuple):
         return line(np.log(self.epsilons[good]), np.log(self.drifts[good]))[0]
 
     def __str__(self) -> str:
-        points, used = len(self.epsilons), int(self.used.sum())
+        points, num_used = len(self.epsilons), int(self.used.sum())
         if (self.excluded == "round-off").all():
             lines = ["no order: conserved to round-off at every ε"]
-        elif used >= ENOUGH:
+        elif num_used >= LEAST_POINTS:
             lines = self.fit.report(points, self.resolving_range)
         else:
             lines = [
-                f"no order: {used} of {points} points can be used, {ENOUGH} are needed (through "
-                f"all of them the slope is {self.slope_of_all:.2g})"
+                f"no order: {num_used} of {points} points can be used, {LEAST_POINTS} are needed "
+                f"(through all of them the slope is {self.slope_of_all:.2g})"
             ]
         lines.append(f"  drift at ε = 0: {self.floor:.2g} ({self.floor_cause})")
         for reason, meaning in _MEANINGS.items():
@@ -121,7 +114,11 @@ class DriftOrder(NamedTuple):
 
 def _of_each_order(name: str, doc: str, axis: int = 0) -> Any:
     """A field of every order, stacked along an axis."""
-    return property(lambda self: np.stack([getattr(o, name) for o in self.orders], axis), doc=doc)
+
+    def stack(self):
+        return np.stack([getattr(order, name) for order in self.orders], axis)
+
+    return property(stack, doc=doc)
 
 
 class DriftSurface(NamedTuple):
@@ -179,7 +176,7 @@ class DriftSurface(NamedTuple):
             if count:
                 lines.append(f"* {count} excluded: {meaning}")
         count = int(self.mesh_used.sum())
-        if count >= ENOUGH:
+        if count >= LEAST_POINTS:
             low, high = self.mesh_interval
             lines.append(
                 f"drift at ε = 0 ∝ h^{self.mesh_slope:.4g}, 95 % interval {low:.4g} … {high:.4g}, "
@@ -187,16 +184,17 @@ class DriftSurface(NamedTuple):
             )
         else:
             lines.append(f"drift at ε = 0: above round-off at {count} of {len(self.hs)} step sizes")
-        kept = self.orders[0].kept
-        return "\n".join(lines + _starts_left_out(kept, self.statuses.reshape(-1, len(kept))))
+        valid = self.orders[0].kept
+        return "\n".join(lines + _starts_left_out(valid, self.statuses.reshape(-1, len(valid))))
 
 
-def _starts_left_out(kept: np.ndarray, statuses: np.ndarray) -> list[str]:
+def _starts_left_out(valid: np.ndarray, statuses: np.ndarray) -> list[str]:
     """Lines about the initial conditions that do not count; `statuses`: shape (points, S)."""
-    lost = np.flatnonzero(~kept)
-    if not len(lost):
+    failures = np.flatnonzero(~valid)
+    if not len(failures):
         return []
-    failed = statuses[:, lost]
-    names = ", ".join(np.unique(failed[failed != "successful"]))
-    some = ", ".join(map(str, lost[:8])) + (", …" if len(lost) > 8 else "")
-    return [f"  left out: {len(lost)} of {len(kept)} initial conditions ({names}): number {some}"]
+    causes = statuses[:, failures]
+    names = ", ".join(np.unique(causes[causes != "successful"]))
+    numbers = ", ".join(map(str, failures[:8])) + (", …" if len(failures) > 8 else "")
+    count = f"{len(failures)} of {len(valid)} initial conditions"
+    return [f"  left out: {count} ({names}): number {numbers}"]

@@ -38,8 +38,8 @@ class AbstractBasis(eqx.Module):
 
 def bind_basis(basis: Any, shape: tuple[int, ...]) -> "BoundBasis":
     """`basis.for_shape(shape)`, or a `TypeError` for any other object."""
-    known = "a basis such as dvi.Polynomials(4), dvi.Basis([f, g]), or a sum or product of them"
-    instance("basis", basis, AbstractBasis, known)
+    kinds = "a basis such as dvi.Polynomials(4), dvi.Basis([f, g]), or a sum or product of them"
+    instance("basis", basis, AbstractBasis, kinds)
     return dataclasses.replace(basis.for_shape(shape), shape=shape)
 
 
@@ -79,69 +79,85 @@ class BoundBasis(eqx.Module):
         q, p = jnp.asarray(q), jnp.asarray(p)
         if self.shape is not None and not q.shape == p.shape == self.shape:
             raise ValueError(
-                f"q and p must have the shape {self.shape} for this basis, that of one state; got "
-                f"q of shape {q.shape} and p of shape {p.shape}. For many states use jax.vmap."
+                f"q and p must have the shape {self.shape} of one state, got q of shape {q.shape} "
+                f"and p of shape {p.shape}: for many states use jax.vmap."
             )
         return self.function(q, p, jnp.asarray(t, float))
 
-    def unnamed(self) -> "BoundBasis":
+    def without_names(self) -> "BoundBasis":
         """The same functions without names. Names contain the centre of the samples; without them,
         programs that were compiled for one set of samples are used for another."""
 
-        def is_basis(x):
-            return isinstance(x, BoundBasis)
+        def is_basis(part):
+            return isinstance(part, BoundBasis)
 
-        def without(x):
-            return x.unnamed() if is_basis(x) else x
+        def strip(part):
+            return part.without_names() if is_basis(part) else part
 
-        function = jax.tree.map(without, self.function, is_leaf=is_basis)
+        function = jax.tree.map(strip, self.function, is_leaf=is_basis)
         return dataclasses.replace(self, function=function, names=("",) * self.size)
+
+    def select(self, places: np.ndarray) -> "BoundBasis":
+        """Some of the functions, by their numbers."""
+        names, complexity = (tuple(x[j] for j in places) for x in (self.names, self.complexity))
+        function = _Selection(self, tuple(places.tolist()))
+        return dataclasses.replace(self, function=function, names=names, complexity=complexity)
 
     def formula(self, coefficients: Any, digits: Any = 6, drop: float = 1e-9) -> str:
         """The combination with these coefficients as text; tiny ones (relative) are left out."""
         c = np.asarray(coefficients, float)
-        shown = np.abs(c) > drop * np.max(np.abs(c), initial=0.0)
-        return linear_text(np.where(shown, c, 0), self.names, digits)
+        is_large = np.abs(c) > drop * np.max(np.abs(c), initial=0.0)
+        return linear_text(np.where(is_large, c, 0), self.names, digits)
 
-    def about(self, middle: np.ndarray, exactly: bool = False) -> "tuple[BoundBasis, np.ndarray]":
+    def recentre(
+        self, middle: np.ndarray, exactly: bool = False
+    ) -> "tuple[BoundBasis, np.ndarray]":
         """Functions ψ of z − middle that span the same space, and N with ψ = N φ + constants.
 
         - `middle`: of z = (q, p, t), shape (2n + 1,). Polynomials are taken about it, other
           functions stay as they are.
         - `exactly`: only if no constants are left over.
         """
-        found = self.moved(middle)
-        if found is None or (exactly and not found.closed):
-            return self, np.eye(self.size)
-        return dataclasses.replace(self, function=found.function, names=found.names), found.matrix
+        shift = self.recentring(middle, exactly)
+        return dataclasses.replace(self, function=shift.function, names=shift.names), shift.matrix
 
-    def moved(self, middle: np.ndarray) -> "About | None":
-        """The same as `About`; None where all functions stay as they are."""
-        about = getattr(self.function, "about", None)
-        return None if about is None else about(middle)
+    def recentring(self, middle: np.ndarray, exactly: bool) -> "Recentring":
+        """The same as `Recentring`: the identity where all functions stay as they are."""
+        shift = getattr(self.function, "recentring", lambda _: None)(middle)
+        if shift is None or (exactly and not shift.is_closed):
+            return Recentring(self.function, self.names, np.eye(self.size), True)
+        return shift
+
+
+class _Selection(eqx.Module):
+    basis: BoundBasis
+    places: tuple[int, ...] = eqx.field(static=True)
+
+    def __call__(self, q, p, t):
+        return self.basis(q, p, t)[np.array(self.places, int)]
 
 
 def linear_text(coefficients: np.ndarray, names: Sequence[str], digits: Any = 6) -> str:
     """A linear combination as text, without what has the coefficient 0; the name "1" is implied.
     `digits`: of all coefficients, or of each."""
     text, digits = "", np.broadcast_to(digits, len(names))
-    for value, name, known in zip(coefficients, names, digits, strict=True):
+    for value, name, precision in zip(coefficients, names, digits, strict=True):
         if value == 0:
             continue
-        size = f"{abs(value):.{known}g}"
+        size = f"{abs(value):.{precision}g}"
         term = size if name == "1" else name if size == "1" else f"{size} {name}"
         sign = "−" if value < 0 else "+"
         text += f" {sign} {term}" if text else term if value > 0 else f"−{term}"
     return text or "0"
 
 
-class About(NamedTuple):
+class Recentring(NamedTuple):
     """Functions ψ of z − middle; N with ψ = N φ + constants; whether no constants are left."""
 
     function: Callable[[State, State, Scalar], Array]
     names: tuple[str, ...]
     matrix: np.ndarray
-    closed: bool
+    is_closed: bool
 
 
 class Basis(AbstractBasis):
@@ -165,28 +181,29 @@ class Basis(AbstractBasis):
         complexity: int = 1,
     ):
         if isinstance(functions, dict):
-            named = dict(functions)
+            members = dict(functions)
         else:
-            named = {_name(each, i): each for i, each in enumerate(tuple(functions))}
-        if not named:
-            raise ValueError("functions is empty: give at least one function (q, p) → scalar.")
-        for name, each in named.items():
-            function(f"basis function {name!r}", each, "(q, p) or (q, p, t)")
-            if not (_takes(each, 2) or _takes(each, 3)):
-                seen = inspect.signature(each)
+            members = {_name(member, i): member for i, member in enumerate(tuple(functions))}
+        if not members:
+            raise ValueError("functions must have at least one function (q, p) → scalar.")
+        for name, member in members.items():
+            function(f"basis function {name!r}", member, "(q, p) or (q, p, t)")
+            if not (_takes(member, 2) or _takes(member, 3)):
+                signature = inspect.signature(member)
                 raise TypeError(
-                    f"the basis function {name!r} must take the arguments (q, p) or (q, p, t), got "
-                    f"a function of {seen}."
+                    f"the basis function {name!r} must take (q, p) or (q, p, t), got {signature}."
                 )
-        self.functions, self.names = tuple(named.values()), tuple(named)
+        self.functions, self.names = tuple(members.values()), tuple(members)
         self.complexity = complexity
 
     def for_shape(self, shape):
-        timed = tuple(not _takes(f, 2) for f in self.functions)
-        for name, each, with_time in zip(self.names, self.functions, timed, strict=True):
-            _require_real_scalar(name, each, with_time, shape)
+        takes_time = tuple(not _takes(f, 2) for f in self.functions)
+        for name, member, with_time in zip(self.names, self.functions, takes_time, strict=True):
+            _require_real_scalar(name, member, with_time, shape)
         complexity = (self.complexity,) * len(self.names)
-        return BoundBasis(_Values(self.functions, timed), self.names, complexity, any(timed))
+        return BoundBasis(
+            _Values(self.functions, takes_time), self.names, complexity, any(takes_time)
+        )
 
 
 def _takes(function: Callable[..., Any], count: int) -> bool:
@@ -199,33 +216,33 @@ def _takes(function: Callable[..., Any], count: int) -> bool:
     return True
 
 
-def _require_real_scalar(name, function, timed: bool, shape) -> None:
+def _require_real_scalar(name, function, with_time: bool, shape) -> None:
     """Reject a function whose value is not a real scalar, by tracing it once."""
     state, time = (jax.ShapeDtypeStruct(s, jnp.result_type(float)) for s in (shape, ()))
     try:
-        out = eqx.filter_eval_shape(function, state, state, *([time] if timed else []))
+        out = eqx.filter_eval_shape(function, state, state, *([time] if with_time else []))
     except Exception as error:
         error.add_note(f"(in the basis function {name!r}, called with q of shape {shape})")
         raise
     kind, dtype = np.shape(out), getattr(out, "dtype", type(out))
     real = np.issubdtype(dtype, np.floating) or np.issubdtype(dtype, np.integer)
     if out is None or kind != () or not real:
-        seen = f"a value of type {type(out).__name__}"
+        description = f"a value of type {type(out).__name__}"
         if hasattr(out, "dtype"):
-            seen = f"an array of shape {kind}, type {dtype}"
+            description = f"an array of shape {kind}, type {dtype}"
         raise ValueError(
-            f"the basis function {name!r} must return a real scalar; for q of shape {shape} it "
-            f"returned {seen}. Return one real number, such as jnp.sum(q**2)."
+            f"the basis function {name!r} must return a real scalar, such as jnp.sum(q**2); for q "
+            f"of shape {shape} it returned {description}."
         )
 
 
 class _Values(eqx.Module):
     functions: tuple[Callable[..., Any], ...]
-    timed: tuple[bool, ...] = eqx.field(static=True)
+    takes_time: tuple[bool, ...] = eqx.field(static=True)
 
     def __call__(self, q, p, t):
-        pairs = zip(self.functions, self.timed, strict=True)
-        values = [f(q, p, t) if timed else f(q, p) for f, timed in pairs]
+        pairs = zip(self.functions, self.takes_time, strict=True)
+        values = [call(q, p, t) if timely else call(q, p) for call, timely in pairs]
         return jnp.stack([jnp.asarray(value, float) for value in values])
 
 
@@ -241,7 +258,7 @@ class Sum(AbstractBasis):
     second: AbstractBasis
 
     def for_shape(self, shape):
-        return _pair(self, shape, multiplied=False)
+        return _pair(self, shape, is_product=False)
 
 
 class Product(AbstractBasis):
@@ -251,54 +268,46 @@ class Product(AbstractBasis):
     second: AbstractBasis
 
     def for_shape(self, shape):
-        return _pair(self, shape, multiplied=True)
+        return _pair(self, shape, is_product=True)
 
 
-def _pair(basis: Sum | Product, shape: tuple[int, ...], multiplied: bool) -> BoundBasis:
+def _pair(basis: Sum | Product, shape: tuple[int, ...], is_product: bool) -> BoundBasis:
     a, b = basis.first.for_shape(shape), basis.second.for_shape(shape)
     complexity = a.complexity + b.complexity
-    if multiplied:
+    if is_product:
         complexity = tuple(c + d for c, d in itertools.product(a.complexity, b.complexity))
-    names = _names_of_pair(a.names, b.names, multiplied)
-    return BoundBasis(_Pair(a, b, multiplied), names, complexity, a.uses_time or b.uses_time)
+    names = _names_of_pair(a.names, b.names, is_product)
+    return BoundBasis(_Pair(a, b, is_product), names, complexity, a.uses_time or b.uses_time)
 
 
 class _Pair(eqx.Module):
     first: BoundBasis
     second: BoundBasis
-    multiplied: bool = eqx.field(static=True)
+    is_product: bool = eqx.field(static=True)
 
     def __call__(self, q, p, t):
         a, b = self.first(q, p, t), self.second(q, p, t)
-        return jnp.outer(a, b).ravel() if self.multiplied else jnp.concatenate([a, b])
+        return jnp.outer(a, b).ravel() if self.is_product else jnp.concatenate([a, b])
 
-    def about(self, middle: np.ndarray) -> About | None:
+    def recentring(self, middle: np.ndarray) -> Recentring:
         parts = self.first, self.second
-        found = [part.moved(middle) for part in parts]
-        if self.multiplied:
-            # A constant that remains of one part would be multiplied by functions of the other.
-            found = [one if one and one.closed else None for one in found]
-        if found[0] is None and found[1] is None:
-            return None
-        a, b = (
-            one or About(part.function, part.names, np.eye(part.size), True)
-            for one, part in zip(found, parts, strict=True)
-        )
+        # A constant that remains of one part would be multiplied by functions of the other.
+        a, b = (part.recentring(middle, exactly=self.is_product) for part in parts)
         first, second = (
-            dataclasses.replace(part, function=one.function, names=one.names)
-            for one, part in zip((a, b), parts, strict=True)
+            dataclasses.replace(part, function=shift.function, names=shift.names)
+            for part, shift in zip(parts, (a, b), strict=True)
         )
         matrix = np.kron(a.matrix, b.matrix)
-        if not self.multiplied:
-            none = np.zeros((first.size, second.size))
-            matrix = np.block([[a.matrix, none], [none.T, b.matrix]])
-        names = _names_of_pair(a.names, b.names, self.multiplied)
-        moved = _Pair(first, second, self.multiplied)
-        return About(moved, names, matrix, a.closed and b.closed)
+        if not self.is_product:
+            zeros = np.zeros((first.size, second.size))
+            matrix = np.block([[a.matrix, zeros], [zeros.T, b.matrix]])
+        names = _names_of_pair(a.names, b.names, self.is_product)
+        function = _Pair(first, second, self.is_product)
+        return Recentring(function, names, matrix, a.is_closed and b.is_closed)
 
 
-def _names_of_pair(a: tuple[str, ...], b: tuple[str, ...], multiplied: bool) -> tuple[str, ...]:
-    if not multiplied:
+def _names_of_pair(a: tuple[str, ...], b: tuple[str, ...], is_product: bool) -> tuple[str, ...]:
+    if not is_product:
         return a + tuple(name + "′" if name in a else name for name in b)
     words = ([w for w in pair if w != "1"] for pair in itertools.product(a, b))
     return tuple(" ".join(pair) or "1" for pair in words)

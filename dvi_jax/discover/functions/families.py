@@ -9,11 +9,11 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from ...base.checks import whole
-from .basis import About, AbstractBasis, BoundBasis
+from ...base.checks import positive, whole
+from .basis import AbstractBasis, BoundBasis, Recentring
 
 TIME = ("t", "τ")  # Names of the time, which is the slow time of a system with ``slow_time=True``
-_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def coordinate_names(shape: tuple[int, ...]) -> tuple[str, ...]:
@@ -26,37 +26,37 @@ def coordinate_names(shape: tuple[int, ...]) -> tuple[str, ...]:
 
 def _places(variables: Sequence[str], shape: tuple[int, ...]) -> tuple[int, ...]:
     """Places of the named variables in (q, p, t) flattened."""
-    every = coordinate_names(shape)
-    unknown = [v for v in variables if v not in every + TIME]
-    if unknown:
-        n = len(every) // 2
-        known = ", ".join(every) if n < 4 else f"q1 to q{n}, p1 to p{n}"
+    names = coordinate_names(shape)
+    strangers = [v for v in variables if v not in names + TIME]
+    if strangers:
+        n = len(names) // 2
+        choices = ", ".join(names) if n < 4 else f"q1 to q{n}, p1 to p{n}"
         raise ValueError(
-            f"the basis has the variable {unknown[0]!r}, but for states of shape {shape} the names "
-            f"of variables are {known}, and t for the time. Use these names."
+            f"the basis has the variable {strangers[0]!r}, but for states of shape {shape} these "
+            f"are {choices}, and t for the time."
         )
-    return tuple(len(every) if v in TIME else every.index(v) for v in variables)
+    return tuple(len(names) if v in TIME else names.index(v) for v in variables)
 
 
-def _at(places: tuple[int, ...], q: Any, p: Any, t: Any) -> Any:
+def _components(places: tuple[int, ...], q: Any, p: Any, t: Any) -> Any:
     return jnp.concatenate([jnp.ravel(q), jnp.ravel(p), jnp.ravel(t)])[np.array(places)]
 
 
-class _OfComponents(eqx.Module):
+class _ComponentFunctions(eqx.Module):
     """The functions of a family at some components of (q, p, t)."""
 
     family: Any
     places: tuple[int, ...] = eqx.field(static=True)
 
     def __call__(self, q, p, t):
-        return self.family.values(_at(self.places, q, p, t))
+        return self.family.values(_components(self.places, q, p, t))
 
 
 def _bound(family: Any, variables: Sequence[str], shape, names, complexity) -> BoundBasis:
     """A family of functions of these variables, for states of this shape."""
-    function = _OfComponents(family, _places(variables, shape))
-    timed = any(v in TIME for v in variables)
-    return BoundBasis(function, tuple(names), tuple(complexity), timed)
+    function = _ComponentFunctions(family, _places(variables, shape))
+    uses_time = any(name in TIME for name in variables)
+    return BoundBasis(function, tuple(names), tuple(complexity), uses_time)
 
 
 def _names(values: Any) -> tuple[str, ...] | None:
@@ -65,13 +65,13 @@ def _names(values: Any) -> tuple[str, ...] | None:
     return (values,) if isinstance(values, str) else tuple(values)
 
 
-def raised(name: str, k: int) -> str:
+def power_text(name: str, k: int) -> str:
     """The k-th power of a name, k ≥ 1."""
-    return name if k == 1 else name + str(k).translate(_RAISED)
+    return name if k == 1 else name + str(k).translate(_SUPERSCRIPTS)
 
 
 # Monomials of a basis: its samples and singular values are dense matrices of this width.
-_MOST = 10_000
+_MOST_MONOMIALS = 10_000
 
 
 class Polynomials(AbstractBasis):
@@ -94,29 +94,29 @@ class Polynomials(AbstractBasis):
         whole("degree", self.degree)
 
     def for_shape(self, shape):
-        chosen = coordinate_names(shape) if self.variables is None else self.variables
-        places = _places(chosen, shape)
-        size = math.comb(len(chosen) + self.degree, self.degree)
-        if size > _MOST:
+        variables = coordinate_names(shape) if self.variables is None else self.variables
+        places = _places(variables, shape)
+        size = math.comb(len(variables) + self.degree, self.degree)
+        if size > _MOST_MONOMIALS:
             raise ValueError(
-                f"Polynomials({self.degree}) of {len(chosen)} variables has {size:.6g} monomials, "
-                f"but at most {_MOST} are allowed. Use a lower degree, or choose fewer components "
-                f"in variables, such as variables={chosen[:1]!r}."
+                f"Polynomials({self.degree}) of {len(variables)} variables has {size:.6g} "
+                f"monomials, but at most {_MOST_MONOMIALS} are allowed: use a lower degree, or "
+                "fewer variables."
             )
         exponents = [
             tuple(sorted(c))
             for d in range(0 if self.constant else 1, self.degree + 1)
-            for c in itertools.combinations_with_replacement(range(len(chosen)), d)
+            for c in itertools.combinations_with_replacement(range(len(variables)), d)
         ]
-        names = tuple(_monomial([chosen[i] for i in c]) for c in exponents)
-        function = _Monomials(places, tuple(exponents), chosen)
-        timed = any(v in TIME for v in chosen)
-        return BoundBasis(function, names, tuple(map(len, exponents)), timed)
+        names = tuple(_monomial([variables[i] for i in c]) for c in exponents)
+        function = _Monomials(places, tuple(exponents), variables)
+        uses_time = any(v in TIME for v in variables)
+        return BoundBasis(function, names, tuple(map(len, exponents)), uses_time)
 
 
 def _monomial(factors: Sequence[str]) -> str:
-    counted = [(name, factors.count(name)) for name in dict.fromkeys(factors)]
-    return " ".join(raised(name, k) for name, k in counted) or "1"
+    powers = [(name, factors.count(name)) for name in dict.fromkeys(factors)]
+    return " ".join(power_text(name, k) for name, k in powers) or "1"
 
 
 class _Monomials(eqx.Module):
@@ -131,7 +131,7 @@ class _Monomials(eqx.Module):
         return np.array([[c.count(i) for i in range(len(self.places))] for c in self.exponents])
 
     def __call__(self, q, p, t):
-        flat = _at(self.places, q, p, t)
+        flat = _components(self.places, q, p, t)
         if self.middle is not None:
             flat = flat - self.middle
         counts = self.counts
@@ -141,7 +141,7 @@ class _Monomials(eqx.Module):
         table = jnp.stack(powers)  # (power, variable)
         return jnp.prod(table[counts, np.arange(len(self.places))], axis=-1)
 
-    def about(self, middle: np.ndarray) -> About | None:
+    def recentring(self, middle: np.ndarray) -> Recentring | None:
         """Π (x_i − m_i)^{k_i} = Π Σ_j binomial(k_i, j) (−m_i)^{k_i − j} x_i^j: all of them are
         combinations of those of lower degree, which this basis has, up to the constant."""
         shift = middle[list(self.places)]
@@ -151,16 +151,16 @@ class _Monomials(eqx.Module):
         matrix = np.zeros((len(place), len(place)))
         for row, counts in enumerate(self.counts.tolist()):
             lower = (range(k + 1) if m else (k,) for k, m in zip(counts, shift, strict=True))
-            for kept in itertools.product(*lower):
-                column = place.get(tuple(i for i, j in enumerate(kept) for _ in range(j)))
+            for powers in itertools.product(*lower):
+                column = place.get(tuple(i for i, j in enumerate(powers) for _ in range(j)))
                 if column is not None:
-                    terms = zip(counts, kept, shift, strict=True)
+                    terms = zip(counts, powers, shift, strict=True)
                     factors = (math.comb(k, j) * (-m) ** (k - j) for k, j, m in terms)
                     matrix[row, column] = math.prod(factors)
         words = [_distance(v, m) for v, m in zip(self.variables, shift, strict=True)]
         names = tuple(_monomial([words[i] for i in c]) for c in self.exponents)
-        moved = _Monomials(self.places, self.exponents, self.variables, shift)
-        return About(moved, names, matrix, () in place)
+        function = _Monomials(self.places, self.exponents, self.variables, shift)
+        return Recentring(function, names, matrix, () in place)
 
 
 def _distance(variable: str, middle: float) -> str:
@@ -230,8 +230,7 @@ class Trigonometric(AbstractBasis):
 
     def __check_init__(self):
         whole("count", self.count)
-        if not 0 < self.period < np.inf:
-            raise ValueError(f"period must be positive and finite, got {self.period!r}.")
+        positive("period", self.period)
 
     def for_shape(self, shape):
         omega = 2 * np.pi / self.period
@@ -253,7 +252,7 @@ class Trigonometric(AbstractBasis):
 def _of_radius(k: int) -> str:
     if k == 0:
         return "1"
-    return raised("r", k) if k > 0 else f"1/{raised('r', -k)}"
+    return power_text("r", k) if k > 0 else f"1/{power_text('r', -k)}"
 
 
 class Radial(AbstractBasis):
@@ -270,17 +269,14 @@ class Radial(AbstractBasis):
     variables: tuple[str, ...] | None = eqx.field(static=True, default=None, converter=_names)
 
     def __check_init__(self):
-        whole = all(isinstance(k, int) and not isinstance(k, bool) for k in self.powers)
-        if not self.powers or not whole:
-            raise ValueError(
-                "powers must be a list of one or more integers (of type int), such as [-1, 2]; got "
-                f"{self.powers!r}."
-            )
+        is_integer = all(isinstance(k, int) and not isinstance(k, bool) for k in self.powers)
+        if not self.powers or not is_integer:
+            raise ValueError(f"powers must be one or more integers, got {self.powers!r}.")
 
     def for_shape(self, shape):
         names = coordinate_names(shape)
-        chosen = names[: len(names) // 2] if self.variables is None else self.variables
-        return _bound(self, chosen, shape, map(_of_radius, self.powers), map(abs, self.powers))
+        variables = names[: len(names) // 2] if self.variables is None else self.variables
+        return _bound(self, variables, shape, map(_of_radius, self.powers), map(abs, self.powers))
 
     def values(self, x):
         """r^k for each power."""

@@ -1,7 +1,7 @@
 """Infinitesimal generators at a lattice point, and their prolongation."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -9,6 +9,8 @@ import jax.numpy as jnp
 
 from ...base.checks import function
 from ...base.types import Args, Scalar, State
+
+T = TypeVar("T")
 
 
 class LatticePoint(NamedTuple):
@@ -68,7 +70,7 @@ class Generator(eqx.Module):
         if callable(number) or jnp.shape(number) != ():
             return NotImplemented
         parts = (getattr(self, name) for name in _COMPONENTS)
-        return Generator(*(None if f is None else eqx.Partial(_multiple, f, number) for f in parts))
+        return Generator(*(None if x is None else eqx.Partial(_multiple, x, number) for x in parts))
 
     def __rmul__(self, number: Any) -> "Generator":
         return self * number
@@ -83,12 +85,33 @@ class Generator(eqx.Module):
 _COMPONENTS = ("xi0", "xi", "eta")
 
 
-def _sum(first, second, *at):
-    return first(*at) + second(*at)
+def require_bound(observable: Any, name: str, value: T | None) -> T:
+    """The value that `bind` sets, or an error if an observable is called before."""
+    if value is None:
+        raise ValueError(
+            f"this {type(observable).__name__} has no {name} yet: give it to "
+            "dvi.integrate(observe=...), or call .bind(system, epsilon) first."
+        )
+    return value
 
 
-def _multiple(component, number, *at):
-    return number * component(*at)
+def _sum(first, second, *point):
+    return first(*point) + second(*point)
+
+
+def _multiple(component, number, *point):
+    return number * component(*point)
+
+
+def symplectic_gradient(function: Callable[..., Any]) -> Generator:
+    """ξ = ∂K/∂p, η = −∂K/∂q of a function K(t, q, p, args)."""
+    return Generator(
+        xi=eqx.Partial(_slope, function, 2, 1.0), eta=eqx.Partial(_slope, function, 1, -1.0)
+    )
+
+
+def _slope(function, argnum, sign, t, q, p, args):
+    return sign * jax.grad(function, argnums=argnum)(t, q, p, args)
 
 
 def prolong(

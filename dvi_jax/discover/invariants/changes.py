@@ -23,21 +23,22 @@ from ..algebra.taylor import taylor_coefficients
 from ..functions.basis import BoundBasis
 from ..functions.sampling import (
     Displacements,
-    Samples,
+    SamplePoints,
     check_finite,
     later,
     require_finite,
     require_steps,
+    require_times,
 )
 
 # A series whose relative change at large ε is smaller is exact and not an expansion.
 _EXACT = 1e-12
 # The ε at which that is tried, in units of that at which the perturbation is as large as H_D.
-_TRIED = (0.5, -0.3)
+_TRIAL_EPSILONS = (0.5, -0.3)
 _EXACT_STEPS = 100  # Steps over which it is tried
 
 
-class Stepped(NamedTuple):
+class StepMap(NamedTuple):
     """The map of one step of a method, and functions whose change is computed."""
 
     equations: Equations
@@ -50,132 +51,133 @@ class Stepped(NamedTuple):
         """Whether samples lie on the manifold of a constraint."""
         return self.equations.system.constraint is not None
 
-    def unnamed(self) -> "Stepped":
-        """For compiled functions: see `BoundBasis.unnamed`."""
-        return self._replace(basis=self.basis.unnamed())
+    def without_names(self) -> "StepMap":
+        """For compiled functions: see `BoundBasis.without_names`."""
+        return self._replace(basis=self.basis.without_names())
 
 
 class Changes(NamedTuple):
     """S samples, and what B functions change by in one step from each.
 
-    - `stepped`, `samples`: the map with its functions, and where it was applied.
+    - `step_map`, `samples`: the map with its functions, and where it was applied.
     - `values`: φ, (S, B). `terms`: A_0 … A_z, (S, z + 1, B): Taylor coefficients in ε of
       φ(Φ_ε(z), t + h) − φ(z, t). `volume`: those of log |det DΦ_ε| from order 1, (S, z + 1).
     - `motion`: what slopes predict for A_0, and its rounding.
-    - `slopes`: ∂φ/∂(q, p, t), (S, B, 2n + 1). `moved`: z1 − z of z = (q, p, t), (S, 2n + 1).
+    - `slopes`: ∂φ/∂(q, p, t), (S, B, 2n + 1). `shifts`: z1 − z of z = (q, p, t), (S, 2n + 1).
     - `good`: where the step succeeds and all is finite, (S,).
     """
 
-    stepped: Stepped
-    samples: Samples
+    step_map: StepMap
+    samples: SamplePoints
     values: np.ndarray
     terms: np.ndarray
     volume: np.ndarray
     motion: Motion
     slopes: np.ndarray
-    moved: np.ndarray
+    shifts: np.ndarray
     good: np.ndarray
 
-    def at(self, some: np.ndarray) -> "Changes":
+    def subset(self, index: np.ndarray) -> "Changes":
         """Of some of the samples."""
-        parts = self.samples.at(some), self.motion.at(some)
-        names = "values", "terms", "volume", "slopes", "moved", "good"
-        arrays = {name: getattr(self, name)[some] for name in names}
-        return self._replace(samples=parts[0], motion=parts[1], **arrays)
+        fields = self._asdict().items()
+        arrays = {name: x[index] for name, x in fields if isinstance(x, np.ndarray)}
+        samples, motion = self.samples.subset(index), self.motion.subset(index)
+        return self._replace(samples=samples, motion=motion, **arrays)
 
     @property
     def displacements(self) -> Displacements:
         """What the step changes (q, p) by."""
-        return Displacements(self.samples, self.moved[:, :-1])
+        return Displacements(self.samples, self.shifts[:, :-1])
 
-    def elsewhere(self, samples: Samples | None = None, h: Any = None) -> "Changes":
+    def recompute(self, samples: SamplePoints | None = None, h: Any = None) -> "Changes":
         """Of order 0 at other samples or with another step, unchecked."""
-        stepped = self.stepped if h is None else self.stepped._replace(h=np.asarray(h))
-        return changes_at(stepped, 0, self.samples if samples is None else samples)
+        step_map = self.step_map if h is None else self.step_map._replace(h=np.asarray(h))
+        return changes_at(step_map, 0, self.samples if samples is None else samples)
 
 
-def changes_at(stepped: Stepped, order: int, samples: Samples) -> Changes:
+def changes_at(step_map: StepMap, order: int, samples: SamplePoints) -> Changes:
     """Unchecked."""
-    found = [np.asarray(x) for x in batched_changes(stepped.unnamed(), order, samples)]
-    values, terms, volume, good, slopes, move, blur = found
-    finite = [np.isfinite(x.reshape(len(good), -1)).all(axis=1) for x in found]
+    arrays = [np.asarray(x) for x in batched_changes(step_map.without_names(), order, samples)]
+    values, terms, volume, good, slopes, shifts, blur = arrays
+    finite = [np.isfinite(x.reshape(len(good), -1)).all(axis=1) for x in arrays]
     with np.errstate(all="ignore"):
         rounding = np.abs(values) + np.abs(values + terms[:, 0])
         rounding = rounding + np.einsum("sbi,si->sb", np.abs(slopes), blur)
-        predicted = (slopes * move[:, None]).swapaxes(1, 2)
-    motion = Motion(predicted, np.finfo(float).eps * rounding)
+        predictions = (slopes * shifts[:, None]).swapaxes(1, 2)
+    motion = Motion(predictions, np.finfo(float).eps * rounding)
     good = good & np.all(finite, axis=0)
-    return Changes(stepped, samples, values, terms, volume, motion, slopes, move, good)
+    return Changes(step_map, samples, values, terms, volume, motion, slopes, shifts, good)
 
 
-def checked_changes(stepped: Stepped, order: int, samples: Samples) -> Changes:
+def checked_changes(step_map: StepMap, order: int, samples: SamplePoints) -> Changes:
     """The same, or an error for steps that fail, numbers that are not finite, and a time that is
     not sampled."""
-    names, found = stepped.basis.names, changes_at(stepped, order, samples)
-    if not found.good.all():
-        require_steps(np.asarray(batched_changes(stepped.unnamed(), order, samples)[3]), samples)
-    check_finite(stepped.basis, found.values)
+    names, changes = step_map.basis.names, changes_at(step_map, order, samples)
+    if not changes.good.all():
+        require_steps(batched_changes(step_map.without_names(), order, samples)[3], samples)
+    check_finite(step_map.basis, changes.values)
 
     def change(m, j):
-        what = "the change" if m == 0 else f"the term of order {m} in ε of the change"
-        return f"{what} of the basis function {names[j]!r} in a step"
+        term = "the change" if m == 0 else f"the term of order {m} in ε of the change"
+        return f"{term} of the basis function {names[j]!r} in a step"
 
-    singular = "H_D, the force or the function is singular there or at the end of the step"
-    require_finite(found.terms, change, f"{singular}; keep the samples away from singularities")
-    require_finite(found.slopes, lambda j, i: f"the derivative of the basis function {names[j]!r}")
+    def derivative(j, _):
+        return f"the derivative of the basis function {names[j]!r}"
+
     hint = "keep the samples away from singularities of H_D and the force"
-    require_finite(np.where(found.good, 0, np.nan), lambda: "the derivative of the map", hint)
-    if np.ptp(samples.t) == 0 and _may_depend_on_time(stepped.equations, samples):
-        _require_no_time(found, order)
-    return found
+    require_finite(changes.terms, change, f"{hint}, also at the end of the step")
+    require_finite(changes.slopes, derivative)
+    require_finite(np.where(changes.good, 0, np.nan), lambda: "the derivative of the map", hint)
+    if np.ptp(samples.t) == 0 and _may_depend_on_time(step_map.equations, samples):
+        require_times(_depends_on_time(changes, order), samples, "the map")
+    return changes
 
 
-def _require_no_time(found: Changes, order: int) -> None:
-    stepped, samples = found.stepped, found.samples
-    allowed = 1e-8 * np.max(np.abs(found.terms), axis=0, keepdims=True)
-    allowed = np.broadcast_to(allowed, found.terms.shape).copy()
-    predicted = np.sum(np.abs(found.motion.changes), axis=1)
-    for shift in later(float(stepped.h), found.displacements.relative_step):
+def _depends_on_time(changes: Changes, order: int) -> bool:
+    """Whether the changes differ at later times, by more than rounding."""
+    step_map, samples = changes.step_map, changes.samples
+    limits = 1e-8 * np.max(np.abs(changes.terms), axis=0, keepdims=True)
+    limits = np.broadcast_to(limits, changes.terms.shape).copy()
+    predictions = np.sum(np.abs(changes.motion.changes), axis=1)
+    for shift in later(float(step_map.h), changes.displacements.relative_step):
         # t1 − t0 loses digits at a later time, and a step is in proportion to it.
-        lost = 4 * np.finfo(float).eps * (np.max(np.abs(samples.t)) + shift) / abs(stepped.h)
-        other = changes_at(stepped, order, samples._replace(t=samples.t + shift)).terms
-        allowed[:, 0] = np.maximum(1e-8, lost) * predicted + 8 * found.motion.rounding
-        if not (np.abs(other - found.terms) <= allowed).all():
-            raise ValueError(
-                "the map depends on the time, but all samples have the same time, "
-                f"t = {samples.t[0]:g}. Give samples=(qs, ps, ts) with different times in ts."
-            )
+        loss = 4 * np.finfo(float).eps * (np.max(np.abs(samples.t)) + shift) / abs(step_map.h)
+        other = changes_at(step_map, order, samples._replace(t=samples.t + shift)).terms
+        limits[:, 0] = np.maximum(1e-8, loss) * predictions + 8 * changes.motion.rounding
+        if not (np.abs(other - changes.terms) <= limits).all():
+            return True
+    return False
 
 
 def _may_depend_on_time(equations, samples) -> bool:
     """Whether t enters H_D, perturbation or force at all."""
     q, p, t = (jnp.asarray(x[0]) for x in samples)
-    system, args, one = equations.system, equations.args, jnp.ones(())
+    system, args, epsilon = equations.system, equations.args, jnp.ones(())
 
     def energies(t):
-        H = system.hamiltonian(t, t, q, p, one, args)
-        return H, system.disturbing_force(t, t, q, p, one, args)
+        H = system.hamiltonian(t, t, q, p, epsilon, args)
+        return H, system.disturbing_force(t, t, q, p, epsilon, args)
 
     return depends_on(energies, 0, t)
 
 
-def _map(stepped: Stepped, epsilon: Array) -> Any:
+def _map(step_map: StepMap, epsilon: Array) -> Any:
     """(q, p, t) → (q1, p1, t1) and the status, with t the slow time for a system that has one."""
-    equations, h, method, _ = stepped
+    equations, h, method, _ = step_map
     system, slow = equations.system, equations.system.slow_time
-    plain = dataclasses.replace(system, slow_time=False)
-    here = Equations(plain, epsilon, equations.args, equations.newton)
+    system = dataclasses.replace(system, slow_time=False)
+    equations = Equations(system, epsilon, equations.args, equations.newton)
 
     def step(q, p, t):
         t1 = t + (epsilon * h if slow else h)
-        q1, p1, info = method.step(here, Interval(t, t1, jnp.asarray(h, float)), q, p)
+        q1, p1, info = method.step(equations, Interval(t, t1, jnp.asarray(h, float)), q, p)
         return q1, p1, t1, info
 
     return step
 
 
 @eqx.filter_jit
-def batched_changes(stepped: Stepped, order: int, samples):
+def batched_changes(step_map: StepMap, order: int, samples):
     """Values of the basis, Taylor coefficients in ε of their changes and of log |det DΦ_ε| (its
     order 0 is 0 here).
 
@@ -183,27 +185,27 @@ def batched_changes(stepped: Stepped, order: int, samples):
     functions, (S, B, 2n + 1); z1 − z, and what z1 and z − z1 are rounded by in units of the last
     digit, (S, 2n + 1).
     """
-    basis = stepped.basis
+    basis = step_map.basis
 
     def at_point(q, p, t):
         z = jnp.concatenate([q.ravel(), p.ravel(), jnp.asarray(t)[None]])
 
-        def at(z):
+        def state(z):
             return z[: q.size].reshape(q.shape), z[q.size : -1].reshape(p.shape), z[-1]
 
-        def mapped(z, epsilon):
+        def image(z, epsilon):
             """(q1, p1, t1) as a vector, and again with the status."""
-            q1, p1, t1, info = _map(stepped, epsilon)(*at(z))
+            q1, p1, t1, info = _map(step_map, epsilon)(*state(z))
             end = jnp.concatenate([q1.ravel(), p1.ravel(), t1[None]])
             return end, (q1, p1, t1, info.result == RESULTS.successful)
 
         def change(epsilon):
-            *end, _ = mapped(z, epsilon)[1]
+            *end, _ = image(z, epsilon)[1]
             return basis(*end) - basis(q, p, t)
 
-        def both(epsilon):
+        def change_and_matrix(epsilon):
             """The change, and the matrix DΦ."""
-            D, (*end, _) = jax.jacfwd(mapped, has_aux=True)(z, epsilon)
+            D, (*end, _) = jax.jacfwd(image, has_aux=True)(z, epsilon)
             change = basis(*end) - basis(q, p, t)
             return jnp.concatenate([change, D[:-1, :-1].ravel()])
 
@@ -211,35 +213,36 @@ def batched_changes(stepped: Stepped, order: int, samples):
         if order == 0:
             terms = change(zero)[None]
         else:
-            terms, D = jnp.split(taylor_coefficients(both, zero, order), [basis.size], axis=1)
+            series = taylor_coefficients(change_and_matrix, zero, order)
+            terms, D = jnp.split(series, [basis.size], axis=1)
             volumes = _log_determinant(D.reshape(order + 1, z.size - 1, z.size - 1))
         # Rounding of z moves z1 − z by as much as the derivative along some vector of its size.
         signs = jnp.asarray(np.random.default_rng(0).choice([-1.0, 1.0], z.size))
-        z1, dz1, end = jax.jvp(lambda z: mapped(z, zero), (z,), (signs * jnp.abs(z),), has_aux=True)
+        z1, dz1, end = jax.jvp(lambda z: image(z, zero), (z,), (signs * jnp.abs(z),), has_aux=True)
         blur = jnp.abs(z1) + jnp.abs(dz1 - signs * jnp.abs(z))
-        slopes = jax.jacfwd(lambda z: basis(*at(z)))(z)
+        slopes = jax.jacfwd(lambda z: basis(*state(z)))(z)
         return basis(q, p, t), terms, volumes, end[3], slopes, z1 - z, blur
 
     return jax.vmap(at_point)(*samples)
 
 
-def terms_in_pairs(stepped: Stepped, order: int, samples: Samples) -> Pair:
+def terms_in_pairs(step_map: StepMap, order: int, samples: SamplePoints) -> Pair:
     """A_0 … A_z, shape (S, z + 1, B), with 31 digits: see `Changes`."""
-    basis = stepped.basis
+    basis = step_map.basis
 
     def terms(q, p, t):
         def change(epsilon):
-            *end, info = _map(stepped, epsilon)(q, p, t)
+            *end, info = _map(step_map, epsilon)(q, p, t)
             good = info.result == RESULTS.successful
             return jnp.where(good, basis(*end) - basis(q, p, t), jnp.nan)
 
         return taylor_coefficients(change, jnp.zeros(()), order)
 
-    (found,) = at_points_in_pairs(terms, *map(jnp.asarray, samples))
+    (pairs,) = at_points_in_pairs(terms, *map(jnp.asarray, samples))
     # Numbers below 1e-290 have no lower part; above 1e300 it is NaN.
-    what = "the change of the basis functions in a step, in pairs of numbers,"
-    require_finite(found.lo, lambda *_: what, "scale the coordinates, or use dvi.FloatingPoint()")
-    return found
+    name = "the change of the basis functions in a step, in pairs of numbers,"
+    require_finite(pairs.lo, lambda *_: name, "scale the coordinates, or use dvi.FloatingPoint()")
+    return pairs
 
 
 def _log_determinant(D: Array) -> Array:
@@ -248,39 +251,39 @@ def _log_determinant(D: Array) -> Array:
     divide = jax.vmap(lanewise.solve, (None, 1), 1)
     growth: list[Array] = []
     for k in range(len(D) - 1):
-        rest = sum((D[j] @ growth[k - j] for j in range(1, k + 1)), start=jnp.zeros_like(D[0]))
-        growth.append(divide(D[0], (k + 1) * D[k + 1] - rest))
+        lower = sum((D[j] @ growth[k - j] for j in range(1, k + 1)), start=jnp.zeros_like(D[0]))
+        growth.append(divide(D[0], (k + 1) * D[k + 1] - lower))
     traces = [jnp.trace(X) / (k + 1) for k, X in enumerate(growth)]
     return jnp.stack([jnp.zeros(()), *traces])
 
 
 @eqx.filter_jit
-def is_exact(stepped: Stepped, series, sizes, samples):
+def is_exact(step_map: StepMap, series, sizes, samples):
     """Whether Σ ε^m c_m·φ is conserved over many steps at ε that are not small; `sizes`: a typical
     change in a step, and the unit of 1/ε."""
-    (typical, scale), basis = sizes, stepped.basis
+    (typical, scale), basis = sizes, step_map.basis
 
-    def at(epsilon):
+    def conserved_at(epsilon):
         c = epsilon ** jnp.arange(series.shape[0]) @ series
-        step = _map(stepped, epsilon)
+        step = _map(step_map, epsilon)
 
         def value(q, p, t):
-            def once(_, state):
+            def take_step(_, state):
                 q, p, t, good = state
                 q, p, t, info = step(q, p, t)
                 return q, p, t, good & (info.result == RESULTS.successful)
 
             good = jnp.asarray(True)
-            q1, p1, t1, good = jax.lax.fori_loop(0, _EXACT_STEPS, once, (q, p, t, good))
-            before, after = basis(q, p, t), basis(q1, p1, t1)
-            rounding = jnp.abs(c) @ (jnp.abs(before) + jnp.abs(after))
+            q1, p1, t1, good = jax.lax.fori_loop(0, _EXACT_STEPS, take_step, (q, p, t, good))
+            start, end = basis(q, p, t), basis(q1, p1, t1)
+            rounding = jnp.abs(c) @ (jnp.abs(start) + jnp.abs(end))
             # An orbit that leaves the range of numbers says nothing.
-            good = good & jnp.all(jnp.isfinite(after))
-            return c @ before, c @ after - c @ before, rounding, good
+            good = good & jnp.all(jnp.isfinite(end))
+            return c @ start, c @ end - c @ start, rounding, good
 
-        before, change, rounding, good = jax.vmap(value)(*map(jnp.asarray, samples))
-        moved = jnp.minimum(_EXACT_STEPS * typical, 1) * jnp.std(before)
-        allowed = _EXACT * moved + _EXACT_STEPS * jnp.finfo(before.dtype).eps * rounding
-        return (jnp.mean(good) > 0.5) & jnp.all(~good | (jnp.abs(change) <= allowed))
+        start, change, rounding, good = jax.vmap(value)(*map(jnp.asarray, samples))
+        size = jnp.minimum(_EXACT_STEPS * typical, 1) * jnp.std(start)
+        limit = _EXACT * size + _EXACT_STEPS * jnp.finfo(start.dtype).eps * rounding
+        return (jnp.mean(good) > 0.5) & jnp.all(~good | (jnp.abs(change) <= limit))
 
-    return jnp.all(jax.vmap(at)(jnp.array(_TRIED) / scale))
+    return jnp.all(jax.vmap(conserved_at)(jnp.array(_TRIAL_EPSILONS) / scale))

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..algebra.block_triangular import BlockTriangular, above
+from ..algebra.block_triangular import BlockTriangular, larger_than
 from ..algebra.nullspace import DENSE, NULL, series_changes, toeplitz, triangle
 
 # Coefficients below such shares of the largest may be rounding; the first level that the held-out
@@ -13,16 +13,18 @@ from ..algebra.nullspace import DENSE, NULL, series_changes, toeplitz, triangle
 _LEVELS = 10.0 ** -np.arange(7.0, 13.0)
 _GROWS = 2.0  # A series with fewer terms may change by so many times more, or by rounding
 _ROUND_OFF = 1e-13
-_DETERMINED = 1e-6  # Coefficients are solved for again along directions that are determined so well
+_DETERMINACY = (
+    1e-6  # Coefficients are solved for again along directions that are determined so well
+)
 _PROBES = 64  # Random residuals by which errors are estimated beyond
-_MOST = 6  # Digits that a formula shows
+_MOST_DIGITS = 6  # Digits that a formula shows
 _SAFETY = 3.0  # Errors of a coefficient within which a closed form has to agree
 _BY_CHANCE = 1e-4  # Largest probability that a random number agrees with a closed form
 _LARGEST = 1000  # The largest numerator and denominator
 _TIMES = {"": 1.0, "√2": 2**0.5, "√3": 3**0.5, "√5": 5**0.5, "π": np.pi, "/π": 1 / np.pi}
 
 
-class Conditions(NamedTuple):
+class LinearConditions(NamedTuple):
     """The linear conditions on a series, with rows weighted by the typical change in a step, for
     functions that are scaled to one size on the samples.
 
@@ -33,7 +35,7 @@ class Conditions(NamedTuple):
     terms: np.ndarray
 
     @classmethod
-    def of(cls, terms: np.ndarray) -> "Conditions":
+    def from_terms(cls, terms: np.ndarray) -> "LinearConditions":
         """From A_0 … A_z, shape (rows, z + 1, size)."""
         _, orders, size = terms.shape
         if orders * size > DENSE:
@@ -47,36 +49,36 @@ class Conditions(NamedTuple):
         return free
 
     def _solver(self, free: np.ndarray, share: float) -> BlockTriangular:
-        return BlockTriangular(self.terms, above(share), free.reshape(self.terms.shape[1:]))
+        return BlockTriangular(self.terms, larger_than(share), free.reshape(self.terms.shape[1:]))
 
     def _residual(self, shares: np.ndarray) -> np.ndarray:
         """The left sides, shape (orders, rows, 1)."""
         series = shares.reshape(-1, 1)
         return np.moveaxis(series_changes(self.terms, series), 1, 0)
 
-    def solved(self, shares: np.ndarray) -> np.ndarray:
+    def nearest_solution(self, shares: np.ndarray) -> np.ndarray:
         """The nearest solution with the same coefficients equal to zero."""
-        solver = self._solver(self._free(shares), _DETERMINED)
-        return shares - solver.solved(self._residual(shares)).reshape(shares.shape)
+        solver = self._solver(self._free(shares), _DETERMINACY)
+        return shares - solver.solve(self._residual(shares)).reshape(shares.shape)
 
     def without_rounding(
         self, shares: np.ndarray, change: Callable[[np.ndarray], float]
     ) -> np.ndarray:
         """The series without the coefficients that are rounding: without them it changes by no more
         on the held-out samples. `change`: the change of a series there."""
-        size, allowed = np.abs(shares), None
-        before = np.count_nonzero(shares)
+        size, limit = np.abs(shares), None
+        count = np.count_nonzero(shares)
         for level in _LEVELS:
-            kept = size > level * np.max(size)
-            if np.count_nonzero(kept) == before:
+            is_kept = size > level * np.max(size)
+            if np.count_nonzero(is_kept) == count:
                 continue
-            before = np.count_nonzero(kept)
-            if before == np.count_nonzero(shares):
+            count = np.count_nonzero(is_kept)
+            if count == np.count_nonzero(shares):
                 break
-            allowed = allowed or max(_GROWS * change(shares), _ROUND_OFF)
-            tried = self.solved(np.where(kept, shares, 0.0))
-            if change(tried) <= allowed:
-                return tried
+            limit = limit or max(_GROWS * change(shares), _ROUND_OFF)
+            candidate = self.nearest_solution(np.where(is_kept, shares, 0.0))
+            if change(candidate) <= limit:
+                return candidate
         return shares
 
     def errors(self, shares: np.ndarray, tolerance: float | None = None) -> np.ndarray:
@@ -89,16 +91,18 @@ class Conditions(NamedTuple):
         right = np.eye(rows)[None]
         if orders > 1:  # the root mean square over random residuals of length one in each row
             right = np.random.default_rng(0).normal(size=(orders, rows, _PROBES)) / _PROBES**0.5
-        return residual * np.linalg.norm(solver.solved(right), axis=2).reshape(shares.shape)
+        return residual * np.linalg.norm(solver.solve(right), axis=2).reshape(shares.shape)
 
 
-def digits_of(values: np.ndarray, errors: np.ndarray | None, most: int = _MOST) -> np.ndarray:
+def digits_of(
+    values: np.ndarray, errors: np.ndarray | None, largest: int = _MOST_DIGITS
+) -> np.ndarray:
     """How many digits of each value its error leaves, from 2 to `most`."""
     if errors is None:
-        return np.full(np.shape(values), most)
+        return np.full(np.shape(values), largest)
     size = np.maximum(np.abs(values), np.finfo(float).tiny)
     relative = np.maximum(2 * errors / size, 1e-300)
-    return np.clip(np.floor(-np.log10(relative)), 2, most).astype(int)
+    return np.clip(np.floor(-np.log10(relative)), 2, largest).astype(int)
 
 
 def closed_form(value: float, error: float) -> str | None:
@@ -110,30 +114,30 @@ def closed_form(value: float, error: float) -> str | None:
     """
     if not np.isfinite(value) or value == 0:
         return None
-    within = max(_SAFETY * abs(error / value), 4 * np.finfo(float).eps)
+    tolerance = max(_SAFETY * abs(error / value), 4 * np.finfo(float).eps)
     best: tuple[int, str] | None = None
     for name, factor in _TIMES.items():
         for p, q in _convergents(abs(value) / factor):
             if max(p, q) > _LARGEST or (best and p * q >= best[0]):
                 break
-            if p and abs(p / q * factor - abs(value)) <= within * abs(value):
+            if p and abs(p / q * factor - abs(value)) <= tolerance * abs(value):
                 best = p * q, _text(p, q, name)
                 break
-    if best is None or 2 * len(_TIMES) * best[0] * within > _BY_CHANCE:
+    if best is None or 2 * len(_TIMES) * best[0] * tolerance > _BY_CHANCE:
         return None
     return ("−" if value < 0 else "") + best[1]
 
 
 def _convergents(x: float) -> Iterator[tuple[int, int]]:
     """Convergents p, q of the continued fraction of x ≥ 0."""
-    p, q, before = 1, 0, (0, 1)
+    p, q, previous = 1, 0, (0, 1)
     for _ in range(30):
-        whole = int(np.floor(x))
-        (p, q), before = (whole * p + before[0], whole * q + before[1]), (p, q)
+        integer = int(np.floor(x))
+        (p, q), previous = (integer * p + previous[0], integer * q + previous[1]), (p, q)
         yield p, q
-        if x - whole < 1e-12 or q > _LARGEST:
+        if x - integer < 1e-12 or q > _LARGEST:
             return
-        x = 1 / (x - whole)
+        x = 1 / (x - integer)
 
 
 def _text(p: int, q: int, name: str) -> str:

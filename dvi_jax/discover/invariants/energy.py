@@ -3,7 +3,6 @@
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -12,13 +11,14 @@ from lanewise.jaxprs.dependence import depends_on
 from ...methods import TypeII
 from ...methods.step import Equations
 from ..functions.basis import BoundBasis
-from ..functions.families import raised
+from ..functions.families import power_text
+from ..functions.sampling import values_at
 from .changes import changes_at
 from .judging import CLEARLY
 from .search import NullSpaces
 
-_FOUND = 0.05  # Energy differs by so little from an invariant that was found
-_EXPRESSED = 1e-6  # … or from a combination of the basis functions
+_SAME_AS_INVARIANT = 0.05  # Energy differs by so little from an invariant that was found
+_IN_BASIS = 1e-6  # … or from a combination of the basis functions
 # A search with a tolerance of this share of the change of the energy finds it, and not much more.
 _TOLERANCE = 0.12
 _ORDERS = 0.5, 20.0  # Orders in h that the change of an energy may have
@@ -41,8 +41,8 @@ class Energy(NamedTuple):
     def __str__(self) -> str:
         r = max(1, round(self.order))
         text = (
-            f"energy is conserved to O({raised('h', r)}) only by this map: a step changes it by "
-            f"{self.change:.1e} of what its slopes predict"
+            f"energy is conserved to O({power_text('h', r)}) only by this map: a step changes it "
+            f"by {self.change:.1e} of what its slopes predict"
         )
         if np.isnan(self.tolerance):
             tries = "to find it, add it to the basis, which lacks it, and give a tolerance"
@@ -52,7 +52,7 @@ class Energy(NamedTuple):
         return f"{text}; {tries}{shadow}"
 
 
-class _OfEnergy(eqx.Module):
+class _EnergyFunction(eqx.Module):
     equations: Equations
 
     def __call__(self, q, p, t):
@@ -60,47 +60,44 @@ class _OfEnergy(eqx.Module):
         return system.hamiltonian(t, t, q, p, zero, self.equations.args)[None]
 
 
-@eqx.filter_jit
-def _values(energy, q, p, t):
-    return jax.vmap(energy)(q, p, t)
-
-
 def unconserved_energy(null: NullSpaces) -> Energy | None:
-    """The energy, if it is neither among the invariants found at order 0 nor conserved
-    to rounding by the map, and its change in a step is a power of h."""
-    changes, stepped = null.changes, null.changes.stepped
-    energy = _OfEnergy(stepped.equations)
+    """The energy, if it is neither among the invariants of order 0 nor conserved to rounding by the
+    map, and its change in a step is a power of h."""
+    changes, step_map = null.changes, null.changes.step_map
+    energy = _EnergyFunction(step_map.equations)
     q, p, t = (jnp.asarray(x[0]) for x in changes.samples)
-    system = stepped.equations.system
+    system = step_map.equations.system
     if system.slow_time or depends_on(lambda t: energy(q, p, t), 0, t):
         return None
-    values = np.asarray(_values(energy, *map(jnp.asarray, null.samples)))[:, 0]
+    basis = BoundBasis(energy, ("energy",), (1,))
+    values = values_at(basis, null.of_fit.samples)[:, 0]
     if not np.isfinite(values).all():
         return None
     calm = null.calm
     spread = np.linalg.norm(calm * (values - np.average(values, weights=calm**2)))
-    functions = null.values @ null.weighed.orthonormal
+    functions = null.values @ null.conditions.orthonormal
     leading = null.spaces[0].leading[: functions.shape[1]]
 
-    def missing(columns):
+    def distance(columns):
         columns = np.column_stack([columns, calm])
         c = np.linalg.lstsq(columns, calm * values)[0]
         return np.linalg.norm(columns @ c - calm * values) / max(spread, 1e-300)
 
-    if spread == 0 or (others := missing(functions @ leading)) < _FOUND:
+    if spread == 0 or (from_invariants := distance(functions @ leading)) < _SAME_AS_INVARIANT:
         return None
-    basis = BoundBasis(energy, ("energy",), (1,))
 
     def change(h):
-        found = changes_at(stepped._replace(basis=basis, h=np.asarray(h)), 0, changes.samples)
-        predicted = np.linalg.norm(found.motion.changes[..., 0], axis=1)[found.good]
-        ratio = np.abs(found.terms[found.good, 0, 0]) / np.maximum(predicted, 1e-300)
+        of_step = changes_at(step_map._replace(basis=basis, h=np.asarray(h)), 0, changes.samples)
+        of_step = of_step.subset(of_step.good)
+        predictions = np.linalg.norm(of_step.motion.changes[..., 0], axis=1)
+        ratio = np.abs(of_step.terms[:, 0, 0]) / np.maximum(predictions, 1e-300)
         return float(np.median(ratio)) if len(ratio) else np.nan
 
-    here, half = change(float(stepped.h)), change(float(stepped.h) / 2)
-    order = float(np.log2(here / half)) if half > 0 and here > CLEARLY else np.nan
-    if not _ORDERS[0] < order < _ORDERS[1] or here > 1 or others < 3 * here:
+    h = float(step_map.h)
+    ratio, half = change(h), change(h / 2)
+    order = float(np.log2(ratio / half)) if half > 0 and ratio > CLEARLY else np.nan
+    if not _ORDERS[0] < order < _ORDERS[1] or ratio > 1 or from_invariants < 3 * ratio:
         return None
-    expressed = missing(functions) < _EXPRESSED
-    tolerance = float(f"{_TOLERANCE * here:.0e}") if expressed else np.nan
-    return Energy(order, here, tolerance, isinstance(stepped.method, TypeII))
+    is_in_basis = distance(functions) < _IN_BASIS
+    tolerance = float(f"{_TOLERANCE * ratio:.0e}") if is_in_basis else np.nan
+    return Energy(order, ratio, tolerance, isinstance(step_map.method, TypeII))

@@ -1,12 +1,13 @@
-"""Whether what is conserved is exact or an expansion: larger samples, and a larger step."""
+"""Whether invariants are exact or an expansion: larger samples, and a larger step."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..algebra.motion import ROUNDING, coefficient_errors
-from ..functions.sampling import SMALL, UNSEEN, Displacements, Samples
+from ..algebra.nullspace import CLEAR
+from ..functions.sampling import LEAST_STEP, SMALL, Displacements, SamplePoints
 from .changes import Changes
 from .judging import CLEARLY, Judge
 
@@ -16,17 +17,22 @@ _LARGER = (2.0, 4.0, 8.0)
 _MODERATE = 0.03
 
 # Nonlinearity of the map on larger samples, and how many times larger they are at most.
-_CURVED, _WIDEST = 0.3, 1e3
+_NONLINEAR, _WIDEST = 0.3, 1e3
 _LINEAR = 1e-9  # A map that differs by less from a linear one may be linear
 # A map that moves nothing, to rounding, at a step so many times larger moves nothing at all.
 _LAST = 1e30
 _HARDLY = 2.0  # A step, or samples, larger by a smaller factor say nothing new
 
+Step = Callable[[SamplePoints, float], Displacements]
+"""(samples, h) → displacements of the samples in a step h."""
+Count = Callable[[SamplePoints, float], int | None]
+"""(samples, h) → how many are conserved; None where the map is not defined there."""
+
 
 def powers_of_size(
-    fitted: Changes,
+    fit: Changes,
     coefficients: np.ndarray,
-    most: np.ndarray,
+    changes: np.ndarray,
     sizes: np.ndarray,
     orthonormal: np.ndarray,
 ) -> np.ndarray:
@@ -34,68 +40,72 @@ def powers_of_size(
     is conserved on samples several times as large (an expansion about their middle is not); NaN
     where the map or a function is not defined there.
 
-    `fitted`: changes on the samples; `most`: those of the invariants; `sizes`: of the functions
-    there, (count,); `orthonormal`: orthonormal combinations of them, as columns, or 0 if
-    coefficients are exact.
+    `fit`: changes of the functions on the samples; `changes`: those of the invariants; `sizes`: of
+    the invariants there, (count,); `orthonormal`: orthonormal combinations of the functions, as
+    columns, or 0 if coefficients are exact.
     """
     if len(coefficients) == 0:
         return np.zeros(0)
-    at, which = enlarged(fitted.samples, fitted.stepped.is_constrained)
-    found = fitted.elsewhere(at)
+    samples, factors = larger_samples(fit.samples, fit.step_map.is_constrained)
+    larger = fit.recompute(samples)
 
-    def changes(some):
-        there = found.at(some)
-        digits = coefficient_errors(there.terms @ orthonormal)
-        judge = Judge(there, np.ones(np.sum(some)), digits=digits)
+    def larger_changes(index):
+        subset = larger.subset(index)
+        digits = coefficient_errors(subset.terms @ orthonormal)
+        judge = Judge(subset, np.ones(np.sum(index)), digits=digits)
         return judge.quantiles(coefficients, 0.95, sizes)[:, 0]
 
-    return growth(most, which, found.good, changes)
+    return growth(changes, factors, larger.good, larger_changes)
 
 
-def enlarged(samples: Samples, constrained: bool = False) -> tuple[Samples, np.ndarray]:
-    """The samples, each farther from their median, and which of the sizes `_LARGER` it has."""
-    which = np.arange(len(samples.q)) % len(_LARGER)
-    return farther(samples, np.array(_LARGER)[which], constrained), which
+def larger_samples(
+    samples: SamplePoints, is_constrained: bool = False
+) -> tuple[SamplePoints, np.ndarray]:
+    """The samples, each farther from their median, and by which of the factors `_LARGER`."""
+    factors = np.resize(_LARGER, len(samples.q))
+    return farther(samples, factors, is_constrained), factors
 
 
-def farther(samples: Samples, factors: np.ndarray | float, constrained: bool = False) -> Samples:
-    """Samples so many times as far from their median, or `constrained` ones so many times as fast:
-    positions stay on the manifold, and multiples of momenta along it are along it."""
-    if constrained:
+def farther(
+    samples: SamplePoints, factors: np.ndarray | float, is_constrained: bool = False
+) -> SamplePoints:
+    """Samples so many times as far from their median, or on a manifold so many times as fast:
+    positions stay on it, and multiples of momenta along it are along it."""
+    if is_constrained:
         factors = np.reshape(factors, (-1, *[1] * (samples.p.ndim - 1)))
         return samples._replace(p=factors * samples.p)
 
-    def moved(x):
+    def stretch(x):
         centre = np.median(x, axis=0)
         return centre + np.reshape(factors, (-1, *[1] * (x.ndim - 1))) * (x - centre)
 
-    return samples._replace(q=moved(samples.q), p=moved(samples.p))
+    return samples._replace(q=stretch(samples.q), p=stretch(samples.p))
 
 
 def growth(
-    most: np.ndarray,
-    which: np.ndarray,
+    changes: np.ndarray,
+    factors: np.ndarray,
     good: np.ndarray,
-    changes: Callable[[np.ndarray], np.ndarray],
+    larger_changes: Callable[[np.ndarray], np.ndarray],
 ) -> np.ndarray:
-    """See `powers_of_size`; `changes`: those on some of the larger samples; `which`, `good`: the
-    size of each larger sample, and whether it can be used."""
-    rows, sizes = [most], [1.0]
-    for k, factor in enumerate(_LARGER):
-        some = good & (which == k)
-        if np.sum(some) < 0.5 * np.sum(which == k):
+    """See `powers_of_size`; `larger_changes`: those on some of the larger samples; `factors`,
+    `good`: by what each of these is larger, and whether it can be used."""
+    rows, sizes = [changes], [1.0]
+    for factor in _LARGER:
+        index = good & (factors == factor)
+        if np.sum(index) < 0.5 * np.sum(factors == factor):
             break
-        rows.append(changes(some))
+        rows.append(larger_changes(index))
         sizes.append(factor)
     if len(rows) < 2:
-        return np.full(len(most), np.nan)
-    powers = np.zeros(len(most))
+        return np.full(len(changes), np.nan)
+    powers = np.zeros(len(changes))
     for i, row in enumerate(np.stack(rows, axis=1)):
-        above = np.flatnonzero(row > 10 * CLEARLY)
-        if len(above):
-            k = max(above[0], 1)
-            grows = np.log(row[k] / max(row[k - 1], ROUNDING))
-            powers[i] = grows / np.log(sizes[k] / sizes[k - 1])
+        is_large = row > 10 * CLEARLY
+        if is_large.any():
+            k = max(np.argmax(is_large), 1)
+            ratio = np.log(row[k] / max(row[k - 1], ROUNDING))
+            powers[i] = ratio / np.log(sizes[k] / sizes[k - 1])
     return powers
 
 
@@ -105,85 +115,93 @@ class Larger(NamedTuple):
 
     kind: str
     factor: float
-    conserved: int
+    number: int
 
     def warning(self, count: int) -> str | None:
         """Why `count` that are conserved at a small step, or in a small box, may not be exact."""
-        if self.conserved >= count:
+        if self.number >= count:
             return None
         step = self.kind == "step"
         small = "the step is small" if step else "the samples lie close to their median"
-        what = "an expansion in h" if step else "an expansion about it"
+        expansion = "an expansion in h" if step else "an expansion about it"
         if np.isnan(self.factor):
             other = "a larger h" if step else "samples that spread wider"
             return (
                 f"{small}, and no larger one can be tried: an invariant cannot be distinguished "
-                f"from {what}; take {other}"
+                f"from {expansion}; take {other}"
             )
         where = "at a step {} times as large" if step else "on samples {} times as far from it"
-        made = " (or H_D is made for this h)" if step else ""
+        condition = " (or H_D is made for this h)" if step else ""
         return (
-            f"{small}: {count} functions are conserved to rounding, and {self.conserved} of them "
-            f"{where.format(f'{self.factor:.2g}')}; each of the others is {what}{made}"
+            f"{small}: {count} functions are conserved to rounding, and {self.number} of them "
+            f"{where.format(f'{self.factor:.2g}')}; each of the others is {expansion}{condition}"
         )
 
 
-def grown(what: str, power: float) -> list[str]:
-    """The line of a report on a power that is not 0; `what`: "changes grow"."""
+def unreliable(result: Any, remedy: str, subject: str) -> list[str]:
+    """Reasons why a `Discovery` or `Symmetries` is not reliable; `remedy`: of a gap that is not
+    clear, `subject`: what may be conserved."""
+    reasons, count = [], result.survivors[0]
+    if count and result.gap < CLEAR:
+        reasons.append(f"the gap is not clear: {remedy}")
+    if result.undecided:
+        reasons.append(
+            f"{result.undecided} {subject} cannot be decided in this arithmetic; take another h, "
+            "samples that spread wider, or an origin among them"
+        )
+    return reasons + [text for larger in result.larger if (text := larger.warning(count))]
+
+
+def growth_note(subject: str, power: float) -> list[str]:
+    """The line of a report on a power that is not 0; `subject`: "changes grow"."""
     if not power > 0:
         return []
     return [
-        f"      not exact: with the size of the samples {what} as its power {power:.2g}, as those "
-        "of an expansion about their middle do"
+        f"      not exact: with the size of the samples {subject} as its power {power:.2g}, as "
+        "those of an expansion about their middle do"
     ]
 
 
-def at_larger_step(
-    h: float, step: Callable[[float], Displacements], count: Callable[[float], int | None]
-) -> tuple[Larger, ...]:
+def at_larger_step(samples: SamplePoints, h: float, step: Step, count: Count) -> tuple[Larger, ...]:
     """How many are conserved at a larger step; empty where the step is not small, so that an
-    expansion in h would be seen.
-
-    `step`: displacements of the samples for an h; `count`: how many are conserved, None where the
-    map is not defined there.
-    """
-    ratio, relative = 1.0, step(h).relative_step
-    while relative < UNSEEN:  # or the map moves nothing at any step
+    expansion in h would be seen."""
+    ratio, relative = 1.0, step(samples, h).relative_step
+    while relative < LEAST_STEP:  # or the map moves nothing at any step
         ratio *= 1e3
         if ratio > _LAST:
             return ()
-        relative = step(ratio * h).relative_step
+        relative = step(samples, ratio * h).relative_step
     if ratio == 1 and not relative < SMALL:
         return ()
     factor = ratio * _MODERATE / relative if np.isfinite(relative) else ratio
-    return (_larger("step", factor, lambda factor: count(factor * h)),)
+    return (_larger("step", factor, lambda factor: count(samples, factor * h)),)
 
 
 def in_larger_box(
-    displacements: Displacements,
-    step: Callable[[Samples], Displacements],
-    count: Callable[[Samples], int | None],
-    constrained: bool = False,
+    samples: SamplePoints, h: float, step: Step, count: Count, is_constrained: bool = False
 ) -> tuple[Larger, ...]:
     """How many are conserved on samples that spread wider; empty where a map is not nearly linear
-    on those given, or linear on all. `step`: displacements of other samples."""
-    samples, near = displacements.samples, displacements.nonlinearity
-    if near >= SMALL:
+    on those given, or linear on all."""
+
+    def box(factor):
+        return farther(samples, factor, is_constrained)
+
+    nonlinearity, factor = step(samples, h).nonlinearity, _WIDEST
+    if nonlinearity >= SMALL:
         return ()
-    factor = _WIDEST
-    if near >= _LINEAR:
-        factor = min(_CURVED / near, _WIDEST)
+    if nonlinearity >= _LINEAR:
+        factor = min(_NONLINEAR / nonlinearity, _WIDEST)
     else:
-        values = step(farther(samples, factor, constrained)).values / factor
+        values = step(box(factor), h).values / factor
         if np.isfinite(values).all() and Displacements(samples, values).nonlinearity < _LINEAR:
             return ()
-    return (_larger("box", factor, lambda factor: count(farther(samples, factor, constrained))),)
+    return (_larger("box", factor, lambda factor: count(box(factor), h)),)
 
 
 def _larger(kind: str, factor: float, count: Callable[[float], int | None]) -> Larger:
     while factor > _HARDLY:
-        found = count(factor)
-        if found is not None:
-            return Larger(kind, factor, found)
+        number = count(factor)
+        if number is not None:
+            return Larger(kind, factor, number)
         factor /= 10
     return Larger(kind, np.nan, 0)

@@ -2,34 +2,33 @@
 
 import time
 import warnings
-from typing import Any, Literal
+from typing import Any, Literal, Unpack
 
 import jax.numpy as jnp
 import numpy as np
 
 from ...base.checks import fraction, one_of, whole
-from ...base.keywords import with_keywords_of
-from ...integration.integrate import integrate
-from ...methods.step import Equations
+from ...base.keywords import checked_keywords
+from ...integration.keywords import ArithmeticSettings
 from ...problem.system import System, check_system
 from ..algebra.nullspace import in_units_of
 from ..algebra.pair_series import uses_pairs
 from ..functions.basis import AbstractBasis, bind_basis, check_step_size
 from ..functions.manifold import on_manifold
 from ..functions.sampling import (
-    TYPE_2,
     Displacements,
+    SamplePoints,
     as_samples,
     map_of,
     middle,
     require_enough,
-    require_time,
+    require_times,
 )
-from .changes import Changes, Stepped, checked_changes, terms_in_pairs
+from .changes import Changes, StepMap, checked_changes, terms_in_pairs
 from .choice import chooser
+from .discovery import Discovery
 from .energy import unconserved_energy
 from .expansions import Larger, at_larger_step, in_larger_box, powers_of_size
-from .found import Discovery
 from .judging import reach
 from .obstructions import drift_laws
 from .search import null_spaces
@@ -37,7 +36,7 @@ from .search import null_spaces
 _RELIABLE = 6  # The largest order that float64 decides reliably
 
 
-@with_keywords_of(integrate, f"{TYPE_2} method arithmetic")
+@checked_keywords
 def discover_invariants(
     system: System,
     basis: AbstractBasis,
@@ -47,7 +46,7 @@ def discover_invariants(
     samples: Any,
     tolerance: float | None = None,
     representative: Literal["least", "simplest"] = "least",
-    **how: Any,
+    **settings: Unpack[ArithmeticSettings],
 ) -> Discovery:
     r"""Adiabatic invariants of order z in a basis of functions, found from the iterated map.
 
@@ -107,9 +106,9 @@ def discover_invariants(
     # 0.5 q² − 0.05 q p + 0.5 p² + ε (0.251256 q⁴ − 0.0502513 q³ p + 0.00251256 q² p²)
     ```
     """
-    began = time.perf_counter()
+    start = time.perf_counter()
     check_system(system)
-    one_step = map_of("discover_invariants", system, **how)
+    one_step = map_of("discover_invariants", system, settings, "method", "arithmetic")
     samples = as_samples(samples, one_step.t0)
     order = whole("order", order, low=0)
     in_pairs = uses_pairs(one_step.arithmetic, tolerance)
@@ -124,98 +123,91 @@ def discover_invariants(
     one_of("representative", representative, ("least", "simplest"))
     bound, h = bind_basis(basis, samples.q.shape[1:]), check_step_size(h)
     require_enough(samples, bound.size)
-    require_time(bound, samples)
-    q, p, t = (jnp.asarray(x[0]) for x in samples)
-    system.check_shapes(t, q, p, jnp.zeros(()), one_step.args)
-    equations = Equations(system, jnp.zeros(()), one_step.args, one_step.root_finder)
+    require_times(bound.uses_time, samples)
+    equations = one_step.equations(system, samples)
     bound = on_manifold(equations, bound, samples)
-    at = middle(samples, max(bound.complexity))
-    inner, to_basis = bound.about(at)
-    stepped = Stepped(equations, np.asarray(h), one_step.method, inner)
-    changes = checked_changes(stepped, order, samples)
-    terms = terms_in_pairs(stepped, order, samples) if in_pairs else None
+    centre = middle(samples, max(bound.complexity))
+    inner, to_basis = bound.recentre(centre)
+    step_map = StepMap(equations, np.asarray(h), one_step.method, inner)
+    changes = checked_changes(step_map, order, samples)
+    terms = terms_in_pairs(step_map, order, samples) if in_pairs else None
     null = null_spaces(changes, tolerance, terms)
-    judges = chooser(null)
-    choice = judges.best(representative)
-    coefficients, dependent, exact = choice.coefficients, choice.dependent, choice.exact
-    errors = choice.errors
-    refused = null.spaces[-1].refused + choice.refused
-    known = null.count if order else len(coefficients) + len(dependent)
-    larger: tuple[Larger, ...] = ()
-    if tolerance is None and known:
-        larger = _at_larger(changes, order)
-    energy = None if tolerance is not None else unconserved_energy(null)
-    known += null.constant is not None
-    judge = judges.judge
-    typical_residuals = np.stack([judge.quantiles(coefficients, x) for x in (0.5, 0.95)], axis=-1)
+    representatives = chooser(null)
+    choice, judge = representatives.best(representative), representatives.judge
+    coefficients, dependent = choice.coefficients, choice.dependent
+    count = null.count if order else len(coefficients) + len(dependent)
+    larger = _at_larger(changes, order) if tolerance is None and count else ()
+    count += null.constant is not None
+    residuals = np.stack([judge.quantiles(coefficients, x) for x in (0.5, 0.95)], axis=-1)
     powers = np.full(len(coefficients), np.nan)
     if order == 0 and tolerance is None:
         # Where fewer are conserved in a larger box, growth is not from errors of coefficients.
-        doubted = any(x.kind == "box" and x.conserved < null.count for x in larger)
-        most, sizes = typical_residuals[:, 0, 1], judges.judge_fitted.sizes(coefficients)
-        columns = null.weighed.orthonormal * (not doubted)
-        powers = powers_of_size(changes, coefficients, most, sizes, columns)
-    everything = len(coefficients) == 2 * samples.q[0].size and not bound.uses_time
-    everything = everything and not system.slow_time and bool(np.any(changes.motion.changes))
+        is_expansion = any(x.kind == "box" and x.number < null.count for x in larger)
+        columns = null.conditions.orthonormal * (not is_expansion)
+        sizes = representatives.judge_fitted.sizes(coefficients)
+        powers = powers_of_size(changes, coefficients, residuals[:, 0, 1], sizes, columns)
+    moves = bool(np.any(changes.motion.changes)) and not (bound.uses_time or system.slow_time)
     # If so many are conserved each orbit is a finite set of points, or functions are periodic.
-    impossible = everything and not (powers == 0).all()
+    impossible = moves and len(coefficients) == 2 * samples.q[0].size and not (powers == 0).all()
+    rejections = null.spaces[-1].rejections + choice.rejections
     if impossible:
-        refused, exact = refused + len(coefficients) + len(dependent), ()
-        coefficients, dependent, errors = coefficients[:0], dependent[:0], errors[:0]
-        typical_residuals, powers = typical_residuals[:0], powers[:0]
-    scale = null.weighed.scale
+        rejections += len(coefficients) + len(dependent)
+        coefficients, dependent = coefficients[:0], dependent[:0]
+    number, scale = len(coefficients), null.conditions.scale
+    unclear = max(null.conditions.motion.unclear_count() - count, 0) + null.unclear + choice.unclear
     volume = np.max(np.abs(in_units_of(scale, changes.volume)), axis=0)
+    parts = null.conditions.orthonormal @ null.spaces[-1].leading[: inner.size]
     return Discovery(
         inner_coefficients=jnp.asarray(coefficients),
         inner_dependent=jnp.asarray(dependent),
-        errors=errors,
-        exact=exact,
-        leading_parts=null.leading_parts @ to_basis,
+        errors=choice.errors[:number],
+        exact=choice.exact[:number],
+        leading_parts=parts.T @ to_basis,
         survivors=tuple(space.leading.shape[1] for space in null.spaces),
         singular_values=null.spaces[-1].singular_values,
-        gap=null.gap,
-        refused=refused,
+        gap=null.spaces[-1].gap,
+        refused=rejections,
         residuals=judge.quantiles(coefficients, 1.0),
-        typical_residuals=typical_residuals,
+        typical_residuals=residuals[:number],
         dependent_residuals=judge.quantiles(dependent, 1.0),
-        undecided=max(null.weighed.motion.undecided() - known, 0) + null.unclear + choice.unclear,
+        undecided=unclear,
         impossible=impossible,
         larger=larger,
-        powers=powers,
+        powers=powers[:number],
         reach=reach(coefficients, null.values),
         obstructions=drift_laws(null, volume, system.slow_time, choice.blur),
         basis=bound,
         inner=inner,
-        middle=at,
+        middle=centre,
         to_basis=to_basis,
         sizes=null.sizes,
         condition=null.condition,
         scale=scale,
-        probe=samples.at(slice(3)),
+        probe=samples.subset(slice(3)),
         shape=samples.q.shape[1:],
         slow_time=system.slow_time,
         tolerance=tolerance,
-        energy=energy,
-        seconds=time.perf_counter() - began,
+        energy=unconserved_energy(null) if tolerance is None else None,
+        seconds=time.perf_counter() - start,
     )
 
 
 def _at_larger(changes: Changes, order: int) -> tuple[Larger, ...]:
     """How many are conserved at a larger step and, at order 0, in a larger box."""
-    h = float(changes.stepped.h)
+    samples, h = changes.samples, float(changes.step_map.h)
 
-    def count(other: Changes) -> int | None:
+    def recompute(points: SamplePoints, step: float) -> Changes:
+        return changes if points is samples and step == h else changes.recompute(points, step)
+
+    def displacements(points: SamplePoints, step: float) -> Displacements:
+        return recompute(points, step).displacements
+
+    def count(points: SamplePoints, step: float) -> int | None:
+        other = recompute(points, step)
         return null_spaces(other).count if other.good.all() else None
 
-    def displacements(step: float) -> Displacements:
-        return (changes if step == h else changes.elsewhere(h=step)).displacements
-
-    larger = at_larger_step(h, displacements, lambda step: count(changes.elsewhere(h=step)))
+    larger = at_larger_step(samples, h, displacements, count)
     if order == 0:
-        larger += in_larger_box(
-            changes.displacements,
-            lambda samples: changes.elsewhere(samples).displacements,
-            lambda samples: count(changes.elsewhere(samples)),
-            changes.stepped.is_constrained,
-        )
+        is_constrained = changes.step_map.is_constrained
+        larger += in_larger_box(samples, h, displacements, count, is_constrained)
     return larger

@@ -1,4 +1,4 @@
-"""How well what was found is conserved: sample by sample, by size, and in how few functions."""
+"""How well invariants are conserved: sample by sample, by size, and in how few functions."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ from .changes import Changes
 
 CLEARLY = 1e-9  # Changes of an invariant, by the measure of `Motion`, for nearly all samples
 # Two functions whose difference is this share of them are one, with and without errors.
-_SAME = 1e-3
+_DIFFERENCE = 1e-3
 _ROUND_OFF = 1e-13  # Shares below this of the largest are not there
 
 
@@ -35,8 +35,8 @@ class Judge(NamedTuple):
             series = c / self.scale ** np.arange(len(c))[:, None]
             terms, motion, spread = self.changes.terms, self.changes.motion, self._spread(c[0])
             digits = sizes[i] * self.digits
-            found = relative_changes(terms, series, motion, spread, digits, self.approximately)
-            out[i] = np.quantile(found, share, axis=0)
+            changes = relative_changes(terms, series, motion, spread, digits, self.approximately)
+            out[i] = np.quantile(changes, share, axis=0)
         return out
 
     def sizes(self, coefficients: np.ndarray) -> np.ndarray:
@@ -54,62 +54,60 @@ class Judge(NamedTuple):
     def own_rows(self, leading: np.ndarray) -> np.ndarray:
         """What functions change by at order 0, weighted by what the slopes of one of their
         combinations predict, shape (S, size)."""
-        own = self.changes.motion.in_functions(leading[:, None]).at_most(self._spread(leading))
-        return own.weights()[:, None] * self.changes.terms[:, 0]
+        motion = self.changes.motion.in_functions(leading[:, None]).at_most(self._spread(leading))
+        return motion.weights()[:, None] * self.changes.terms[:, 0]
 
     def largest(self, coefficients: np.ndarray) -> np.ndarray:
         """The change of nearly all samples, the largest of all orders, shape (count,)."""
         return np.max(self.quantiles(coefficients, 0.95), axis=1, initial=0.0)
-
-    def keep(self, coefficients: np.ndarray) -> np.ndarray:
-        """Which series change by no more than rounding, shape (count,)."""
-        return self.largest(coefficients) <= CLEARLY
 
 
 class Fewest:
     """Invariants of order 0 found again, to more digits, in the functions up to the lowest
     complexity that represent them: coefficients of all others are only errors."""
 
-    def __init__(self, complexity, rms, changes, motion, values):
-        self.complexity, self.rms = np.array(complexity), rms
-        self.changes, self.motion, self.values = changes, motion, values
-        self.kept: dict[int, tuple[np.ndarray, np.ndarray] | None] = {}
+    def __init__(self, rms: np.ndarray, changes: Changes, values: np.ndarray):
+        self.complexity = np.array(changes.step_map.basis.complexity)
+        self.rms, self.values = rms, values
+        self.changes, self.motion = changes.terms[:, 0], changes.motion
+        self.levels: dict[int, tuple[np.ndarray, np.ndarray] | None] = {}
 
     def up_to(self, level: int) -> tuple[np.ndarray, np.ndarray] | None:
         """Invariants in the functions up to a complexity: columns of coefficients, and values."""
-        some = self.complexity <= level
-        R = triangle(self.values[:, some] / self.rms[some]) / np.sqrt(len(self.values))
-        if len(R) < np.sum(some) or np.linalg.cond(R) > 1 / RANK**2:
+        is_simple = self.complexity <= level
+        R = triangle(self.values[:, is_simple] / self.rms[is_simple]) / np.sqrt(len(self.values))
+        if len(R) < np.sum(is_simple) or np.linalg.cond(R) > 1 / RANK**2:
             return None
-        orthonormal = np.linalg.inv(R) / self.rms[some][:, None]
-        motion = Motion(self.motion.changes[..., some], self.motion.rounding[:, some])
-        rows = self.changes[:, some] @ orthonormal
+        orthonormal = np.linalg.inv(R) / self.rms[is_simple][:, None]
+        motion = Motion(self.motion.changes[..., is_simple], self.motion.rounding[:, is_simple])
+        rows = self.changes[:, is_simple] @ orthonormal
         rows = motion.in_functions(orthonormal).weights()[:, None] * rows / np.sqrt(len(rows))
         columns = orthonormal @ null_space(rows, unit=1.0).columns
-        return columns, self.values[:, some] @ columns
+        return columns, self.values[:, is_simple] @ columns
 
-    def again(self, shares: np.ndarray) -> np.ndarray:
+    def represent(self, shares: np.ndarray) -> np.ndarray:
         """The shares of an invariant, in as few functions as can be."""
         target = self.values @ (shares / self.rms)
         for level in sorted(set(self.complexity)):
-            if level not in self.kept:
-                self.kept[level] = self.up_to(level)
-            kept = self.kept[level]
-            if kept is None or kept[0].shape[1] == 0:
+            if level not in self.levels:
+                self.levels[level] = self.up_to(level)
+            invariants = self.levels[level]
+            if invariants is None or invariants[0].shape[1] == 0:
                 continue
-            found = np.linalg.lstsq(kept[1], target)[0]
-            if np.linalg.norm(kept[1] @ found - target) <= _SAME * np.linalg.norm(target):
-                out = np.zeros(len(shares))
-                some = self.complexity <= level
-                out[some] = (kept[0] @ found) * self.rms[some]
-                return cleaned(out)
+            columns, values = invariants
+            combination = np.linalg.lstsq(values, target)[0]
+            distance = np.linalg.norm(values @ combination - target)
+            if distance <= _DIFFERENCE * np.linalg.norm(target):
+                out, is_simple = np.zeros(len(shares)), self.complexity <= level
+                out[is_simple] = (columns @ combination) * self.rms[is_simple]
+                return clean(out)
         return shares
 
 
-def cleaned(shares: np.ndarray, blur: float = RANK) -> np.ndarray:
+def clean(shares: np.ndarray, blur: float = RANK) -> np.ndarray:
     """The shares without what is round-off of the others."""
-    above = _ROUND_OFF if blur <= RANK else blur
-    return np.where(np.abs(shares) > above * np.max(np.abs(shares)), shares, 0.0)
+    threshold = _ROUND_OFF if blur <= RANK else blur
+    return np.where(np.abs(shares) > threshold * np.max(np.abs(shares)), shares, 0.0)
 
 
 def reach(coefficients: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -4,19 +4,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..algebra.block_triangular import Split, above
-from ..algebra.echelon import reduced
+from ..algebra.block_triangular import TruncatedSVD, larger_than
+from ..algebra.echelon import reduced_echelon
 from ..algebra.nullspace import RANK, orthonormal_range
+from ..algebra.weighing import of_orthonormal
 from ..functions.basis import linear_text
-from ..functions.families import raised
+from ..functions.families import power_text
 from .search import NullSpaces
-from .series import shortened
+from .series import short_text
 
 # A drift law is reported when it leaves less than this share of the drift unexplained.
-EXPLAINED = 1e-6
-_SHOWN = 12  # Terms of a formula in a law
+EXPLANATION = 1e-6
+_FORMULA_TERMS = 12  # Terms of a formula in a law
 _DEGREE = 4  # A law is sought as a polynomial of the leading-order term up to this degree
-_POWERS = ("1", *(raised("I", k) for k in range(1, _DEGREE + 1)))
+_POWERS = ("1", *(power_text("I", k) for k in range(1, _DEGREE + 1)))
 
 
 class DriftLaw(NamedTuple):
@@ -55,7 +56,7 @@ class DriftLaw(NamedTuple):
         if len(self.powers):
             text += f"\n      = {power} ({linear_text(self.powers, _POWERS[: len(self.powers)])})"
         if len(self.rest):
-            text += f", at rest at I = {', '.join(f'{x:.4g}' for x in self.rest)}"
+            text += f", at rest at I = {', '.join(f'{point:.4g}' for point in self.rest)}"
         return text
 
 
@@ -68,38 +69,39 @@ def drift_laws(
     Σ_k A_{m−k} c_k + A_0 c_m = 0, has no solution c_m; with a function of what order 0 conserves
     on the right it may: = φ·K d, K the null space of A_0. That is the averaged law.
 
-    - `null`: what was found. `volume`: how much phase volume changes at each order in
-      ε · scale. `slow_time`: of the system. `blur`: see `Span`.
+    - `null`: the series. `volume`: how much phase volume changes at each order in ε · scale.
+      `slow_time`: of the system. `blur`: see `Span`.
     """
-    basis, rms, R = null.basis, null.weighed.rms, null.weighed.R
-    spaces, values, terms = null.spaces, null.changes.values[null.fit], null.rows
-    kept, size, allowed = spaces[0].leading, basis.size, max(EXPLAINED, blur)
-    if kept.shape[1] == 0:
+    basis, rms, R, scale = null.basis, null.conditions.rms, null.conditions.R, null.conditions.scale
+    spaces, values, terms = null.spaces, null.of_fit.values, null.rows
+    kernel, size = spaces[0].leading, basis.size
+    if kernel.shape[1] == 0:
         return ()
-    orthonormal = np.linalg.solve(R.T, (values / rms).T).T
-    system = np.concatenate([-terms[:, 0], null.weights[:, None] * orthonormal @ kept], axis=1)
-    solver = Split.of(system, above(1e-10))
+    functions = of_orthonormal(values, rms, R) @ kernel
+    system = np.concatenate([-terms[:, 0], null.weights[:, None] * functions], axis=1)
+    solver = TruncatedSVD.factor(system, larger_than(1e-10))
 
     def text(coefficients, shares):
-        return shortened(basis, coefficients, np.abs(shares), _SHOWN, max(0.1 * EXPLAINED, blur**2))
+        drop = max(0.1 * EXPLANATION, blur**2)
+        return short_text(basis, coefficients, np.abs(shares), _FORMULA_TERMS, drop)
 
     laws = []
     for m in range(1, len(spaces)):
-        before = np.concatenate([spaces[m - 1].leading, spaces[m - 1].shifts], axis=1)
-        alive, through = spaces[m - 1].leading[:size], spaces[m].leading[:size]
-        drifts = terms[:, m:0:-1].reshape(len(terms), m * size) @ before
-        for shares in _lost(basis, R, alive, orthonormal_range(through), blur):
+        lower = np.concatenate([spaces[m - 1].leading, spaces[m - 1].shifts], axis=1)
+        alive, survivors = spaces[m - 1].leading[:size], spaces[m].leading[:size]
+        drifts = terms[:, m:0:-1].reshape(len(terms), m * size) @ lower
+        for shares in _without_correction(basis, R, alive, orthonormal_range(survivors), blur):
             c = shares / rms
             normal = 1 / (2 * c[np.argmax(np.abs(shares))])
             shares, c = shares * normal, c * normal
-            series = np.linalg.lstsq(before[:size], R @ shares, rcond=blur)[0]
+            series = np.linalg.lstsq(lower[:size], R @ shares, rcond=blur)[0]
             drift = drifts @ series
-            solution = solver.solved(drift[:, None])[:, 0]
+            solution = solver.solve(drift[:, None])[:, 0]
             rate = max(np.linalg.norm(drift), np.finfo(float).tiny)
-            left = float(np.linalg.norm(system @ solution - drift) / rate)
-            law = np.linalg.solve(R, kept @ solution[size:]) / rms * null.weighed.scale**m
-            explained = left < allowed
-            powers = _own_powers(values @ c, values @ law) if explained else np.zeros(0)
+            residual = float(np.linalg.norm(system @ solution - drift) / rate)
+            law = np.linalg.solve(R, kernel @ solution[size:]) / rms * scale**m
+            is_explained = residual < max(EXPLANATION, blur)
+            powers = _own_powers(values @ c, values @ law) if is_explained else np.zeros(0)
             dissipates = np.max(volume[1 : m + 1]) * np.linalg.norm(values @ c) > 1e-4 * rate
             kind = "dissipation" if dissipates else "slow time" if slow_time else "resonance"
             laws.append(
@@ -109,8 +111,8 @@ def drift_laws(
                     formula=text(law, law * rms),
                     leading_coefficients=c,
                     coefficients=law,
-                    residual=left,
-                    kind=kind if explained else "unexplained",
+                    residual=residual,
+                    kind=kind if is_explained else "unexplained",
                     powers=powers,
                     rest=_zeros(powers, np.max(np.abs(values @ c))),
                 )
@@ -118,19 +120,19 @@ def drift_laws(
     return tuple(laws)
 
 
-def _lost(basis, R, alive, through, blur) -> list[np.ndarray]:
-    """The simplest of the leading-order terms `alive` that are outside of `through`."""
-    count = alive.shape[1] - through.shape[1]
-    candidates = reduced(np.linalg.solve(R, alive), np.array(basis.complexity), blur).T
-    taken, lost = through, []
-    for clear in (max(blur, 1e-4), RANK):  # what is clearly outside before what hardly is
+def _without_correction(basis, R, alive, survivors, blur) -> list[np.ndarray]:
+    """The simplest of the leading-order terms `alive` that are outside of `survivors`."""
+    count = alive.shape[1] - survivors.shape[1]
+    candidates = reduced_echelon(np.linalg.solve(R, alive), np.array(basis.complexity), blur).T
+    span, terms = survivors, []
+    for threshold in (max(blur, 1e-4), RANK):  # what is clearly outside before what hardly is
         for c in candidates:
             leading = R @ c / np.linalg.norm(R @ c)
-            rest = leading - taken @ (taken.T @ leading)
-            if len(lost) < count and np.linalg.norm(rest) > clear:
-                taken = np.column_stack([taken, rest / np.linalg.norm(rest)])
-                lost.append(c)
-    return lost
+            remainder = leading - span @ (span.T @ leading)
+            if len(terms) < count and np.linalg.norm(remainder) > threshold:
+                span = np.column_stack([span, remainder / np.linalg.norm(remainder)])
+                terms.append(c)
+    return terms
 
 
 def _own_powers(leading: np.ndarray, law: np.ndarray) -> np.ndarray:
@@ -139,8 +141,8 @@ def _own_powers(leading: np.ndarray, law: np.ndarray) -> np.ndarray:
     for degree in range(1, _DEGREE + 1):
         columns = (leading[:, None] / scale) ** np.arange(degree + 1)
         a = np.linalg.lstsq(columns, law, rcond=None)[0]
-        if np.linalg.norm(columns @ a - law) <= EXPLAINED * np.linalg.norm(law):
-            a[np.abs(a) < EXPLAINED * np.max(np.abs(a))] = 0.0
+        if np.linalg.norm(columns @ a - law) <= EXPLANATION * np.linalg.norm(law):
+            a[np.abs(a) < EXPLANATION * np.max(np.abs(a))] = 0.0
             return a / scale ** np.arange(degree + 1)
     return np.zeros(0)
 

@@ -4,12 +4,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..algebra.echelon import reduced, reduction
+from ..algebra.echelon import reduced_echelon, reduction
 from ..algebra.motion import Motion
 from ..algebra.nullspace import SeriesSpace, orthonormal_range, singular_vectors
-from ..algebra.weighing import Weighed
-from ..functions.basis import BoundBasis
-from ..functions.sampling import Samples, spreads
+from ..algebra.weighing import WeightedConditions
+from ..functions.sampling import spreads
 from .search import NullSpaces
 
 
@@ -17,72 +16,65 @@ class Span(NamedTuple):
     """All invariants found, as series in a basis that is orthonormal on the samples.
 
     Coefficients are compared as shares: those of functions scaled to one size on the samples, see
-    `Weighed.shares`. `space`: what was found at the highest order. `blur`: size below which shares
-    count as none. `constant`: the shares of a constant, None without one.
+    `WeightedConditions.shares`. `blur`: size below which shares count as zero.
     """
 
-    basis: BoundBasis
-    weighed: Weighed[Motion]
-    space: SeriesSpace
+    null: NullSpaces
     blur: float
-    constant: np.ndarray | None
 
-    @classmethod
-    def of(cls, null: NullSpaces, blur: float) -> "Span":
-        """From what was found."""
-        return cls(null.basis, null.weighed, null.spaces[-1], blur, null.constant)
+    @property
+    def conditions(self) -> WeightedConditions[Motion]:
+        return self.null.conditions
+
+    @property
+    def space(self) -> SeriesSpace:
+        """That of the highest order."""
+        return self.null.spaces[-1]
 
     @property
     def size(self) -> int:
-        return self.basis.size
+        return self.null.basis.size
 
-    @property
-    def orders(self) -> int:
-        return self.space.leading.shape[0] // self.size
-
-    def representatives(
-        self, samples: Samples, slopes: np.ndarray
-    ) -> list[tuple[np.ndarray, bool]]:
+    def representatives(self) -> list[tuple[np.ndarray, bool]]:
         """One series, shape (order + 1, size), for each leading-order term, the simplest first; and
         whether it is independent of those before it: its differential is, at generic points,
-        outside the span of theirs.
-
-        `slopes`: ∂φ/∂(q, p) of the functions at the samples, shape (S, size, 2n).
-        """
-        found: list[tuple[np.ndarray, bool]] = []
+        outside the span of theirs."""
+        changes = self.null.of_fit
+        representatives: list[tuple[np.ndarray, bool]] = []
         if self.space.leading.shape[1] == 0:
-            return found
-        some = slice(None, None, max(1, len(samples.q) // 40))
+            return representatives
+        slopes = changes.slopes[:: max(1, len(changes.good) // 40), :, :-1]
         # in units of the spread of (q, p), so that their own units do not matter
-        gradients = slopes[some] * spreads(samples) / self.weighed.rms[:, None]
-        complexity = np.array(self.basis.complexity)
-        taken: list[np.ndarray] = []
-        done = np.zeros((self.size, 0))
-        shares = self.weighed.shares(self.space.leading)
-        for level in sorted(set(self.basis.complexity)):
+        gradients = slopes * spreads(changes.samples) / self.conditions.rms[:, None]
+        complexity, span = np.array(self.null.basis.complexity), np.zeros((self.size, 0))
+        differentials: list[np.ndarray] = []
+        shares = self.conditions.shares(self.space.leading)
+        for level in sorted(set(self.null.basis.complexity)):
             candidates = self._up_to(level, shares)
-            for vector in reduced(candidates, complexity, self.blur).T:
+            for vector in reduced_echelon(candidates, complexity, self.blur).T:
                 leading = vector[: self.size]
-                rest = leading - done @ (done.T @ leading)
-                if np.linalg.norm(rest) <= self.blur * np.linalg.norm(leading):
+                remainder = leading - span @ (span.T @ leading)
+                distance = np.linalg.norm(remainder)
+                if distance <= self.blur * np.linalg.norm(leading):
                     continue  # in the span of those before
-                done = orthonormal_range(np.column_stack([done, rest / np.linalg.norm(rest)]))
+                span = orthonormal_range(np.column_stack([span, remainder / distance]))
                 d = np.einsum("sbn,b->sn", gradients, leading)
                 length = np.linalg.norm(d)
-                if length < self.blur * np.linalg.norm(self.weighed.R @ leading):
+                if length < self.blur * np.linalg.norm(self.conditions.R @ leading):
                     continue  # a constant
-                grown = self._rank_of([*taken, d / length]) == len(taken) + 1
-                if grown:
-                    taken.append(d / length)
-                series = self._without_constants(vector.reshape(self.orders, self.size))
-                found.append((series, grown))
-        return found
+                rank = self._rank_of([*differentials, d / length])
+                is_independent = rank == len(differentials) + 1
+                if is_independent:
+                    differentials.append(d / length)
+                series = self._without_constants(vector.reshape(self.null.order + 1, self.size))
+                representatives.append((series, is_independent))
+        return representatives
 
     def _up_to(self, level: int, shares: np.ndarray) -> np.ndarray:
         """Those whose leading-order term uses no function above this complexity."""
         leading = shares[: self.size]
-        above = leading[np.array(self.basis.complexity) > level]
-        singular, V = singular_vectors(above / max(np.linalg.norm(leading, 2), 1e-300))
+        complex_part = leading[np.array(self.null.basis.complexity) > level]
+        singular, V = singular_vectors(complex_part / max(np.linalg.norm(leading, 2), 1e-300))
         return shares @ V[singular < self.blur].T
 
     def _rank_of(self, differentials: list[np.ndarray]) -> int:
@@ -94,22 +86,21 @@ class Span(NamedTuple):
 
     def simplest(self, series: np.ndarray) -> np.ndarray:
         """The corrections that use complex functions as little as can be."""
-        complexity = np.tile(self.basis.complexity, self.orders)
-        simplify = reduction(
-            self.weighed.shares(self.space.shifts), complexity, self.size, self.blur
-        )
+        complexity = np.tile(self.null.basis.complexity, self.null.order + 1)
+        shifts = self.conditions.shares(self.space.shifts)
+        simplify = reduction(shifts, complexity, self.size, self.blur)
         return simplify(series.reshape(-1)).reshape(series.shape)
 
-    def least(self, series: np.ndarray) -> np.ndarray:
+    def smallest(self, series: np.ndarray) -> np.ndarray:
         """The corrections that are smallest on the samples: orthogonal to what may be added."""
-        columns = (self.weighed.R @ series[..., None])[..., 0].reshape(-1)
+        columns = (self.conditions.R @ series[..., None])[..., 0].reshape(-1)
         basis = orthonormal_range(self.space.shifts)
-        columns = columns - basis @ (basis.T @ columns)
-        return self._without_constants(self.weighed.shares(columns[:, None]).reshape(series.shape))
+        columns = (columns - basis @ (basis.T @ columns))[:, None]
+        return self._without_constants(self.conditions.shares(columns).reshape(series.shape))
 
     def _without_constants(self, series: np.ndarray) -> np.ndarray:
         """The series less the multiple of the constant at each order that makes it simplest."""
-        if self.constant is None:
+        if self.null.constant is None:
             return series
-        j = np.argmax(np.abs(self.constant))
-        return series - np.outer(series[:, j] / self.constant[j], self.constant)
+        j = np.argmax(np.abs(self.null.constant))
+        return series - np.outer(series[:, j] / self.null.constant[j], self.null.constant)

@@ -1,16 +1,17 @@
 """The null space of a search for invariants."""
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
 
 from ...engine.pairs import Pair
-from ..algebra.motion import Motion, conserved, typical_sizes
+from ..algebra.motion import Motion, conserved_series, typical_sizes
 from ..algebra.nullspace import SeriesSpace, compress, series_spaces
 from ..algebra.pair_series import ROUNDING, spaces_in_pairs
-from ..algebra.weighing import Weighed, weigh, weighted
+from ..algebra.weighing import WeightedConditions, times_weights, weigh
 from ..functions.basis import BoundBasis
-from ..functions.sampling import Samples, check_basis
+from ..functions.sampling import check_basis
 from .changes import Changes
 
 
@@ -19,22 +20,22 @@ class NullSpaces:
     """The series that samples show to be conserved, order by order.
 
     - `changes`, `tolerance`: what was searched, and how.
-    - `weighed`: the conditions; `spaces`: their null spaces of order 0 … z.
-    - `undecided`: how many singular values are, in pairs of numbers.
+    - `conditions`: see `WeightedConditions`; `spaces`: their null spaces of order 0 … z.
+    - `pair_unclear`: how many singular values are hardly above rounding, in pairs of numbers.
     - `constant`: the shares of a constant, None without one. `condition`: of the basis.
     """
 
     changes: Changes
     tolerance: float | None
-    weighed: Weighed[Motion]
+    conditions: WeightedConditions[Motion]
     spaces: list[SeriesSpace]
-    undecided: int
+    pair_unclear: int
     constant: np.ndarray | None
     condition: float
 
     @property
     def basis(self) -> BoundBasis:
-        return self.changes.stepped.basis
+        return self.changes.step_map.basis
 
     @property
     def order(self) -> int:
@@ -45,38 +46,33 @@ class NullSpaces:
         """Which samples are fitted."""
         return ~self.changes.samples.held_out
 
-    @property
-    def samples(self) -> Samples:
-        """Those that are fitted; so of all that follow."""
-        return self.changes.samples.at(self.fit)
+    @functools.cached_property
+    def of_fit(self) -> Changes:
+        """The changes at these; so `calm`, `values`, `weights`, `rows`."""
+        return self.changes.subset(self.fit)
 
     @property
     def calm(self) -> np.ndarray:
-        return self.weighed.calm[self.fit]
+        return self.conditions.calm[self.fit]
 
     @property
     def values(self) -> np.ndarray:
         """The functions, times the weights `calm`."""
-        return self.calm[:, None] * self.changes.values[self.fit]
-
-    @property
-    def slopes(self) -> np.ndarray:
-        """∂φ/∂(q, p), shape (samples, size, 2n)."""
-        return self.changes.slopes[self.fit, :, :-1]
+        return self.calm[:, None] * self.of_fit.values
 
     @property
     def weights(self) -> np.ndarray:
-        return self.weighed.weights[self.fit]
+        return self.conditions.weights[self.fit]
 
     @property
     def rows(self) -> np.ndarray:
         """The weighed conditions, shape (samples, z + 1, size)."""
-        return weighted(self.weighed.terms[self.fit], self.weights)
+        return times_weights(self.conditions.terms[self.fit], self.weights)
 
     @property
     def sizes(self) -> np.ndarray:
         """Of a term with coefficient 1, shape (z + 1, size)."""
-        return self.weighed.rms / self.weighed.scale ** np.arange(self.order + 1)[:, None]
+        return self.conditions.rms / self.conditions.scale ** np.arange(self.order + 1)[:, None]
 
     @property
     def count(self) -> int:
@@ -84,19 +80,9 @@ class NullSpaces:
         return self.spaces[0].leading.shape[1]
 
     @property
-    def gap(self) -> float:
-        return self.spaces[-1].gap
-
-    @property
-    def leading_parts(self) -> np.ndarray:
-        """Order 0 of everything in the null space, in functions of the basis, (count, size)."""
-        leading = self.spaces[-1].leading[: self.basis.size]
-        return (self.weighed.shares(leading) / self.weighed.rms[:, None]).T
-
-    @property
     def unclear(self) -> int:
         """Null vectors of which rounding decides whether they are series."""
-        unclear = max(space.unclear for space in self.spaces) + self.undecided
+        unclear = max(space.unclear for space in self.spaces) + self.pair_unclear
         return unclear if self.tolerance is None else 0
 
 
@@ -107,28 +93,29 @@ def null_spaces(
     fit = ~changes.samples.held_out
     calm = typical_sizes(changes.values)[1][fit]
     values = calm[:, None] * changes.values[fit]
-    condition = check_basis(changes.stepped.basis, values)
-    weighed = weigh(changes.values, changes.terms, changes.motion, fit)
-    constant = _shares_of_constant(weighed.rms, values, calm, changes.slopes[fit, :, :-1])
-    trivial = None if constant is None else weighed.R @ constant
+    condition = check_basis(changes.step_map.basis, values)
+    conditions = weigh(changes.values, changes.terms, changes.motion, fit)
+    constant = _shares_of_constant(conditions.rms, values, calm, changes.slopes[fit, :, :-1])
+    trivial = None if constant is None else conditions.R @ constant
     if pairs is None:
 
         def judge(leading, shifts):
-            leading, unclear = conserved(leading, weighed.terms, weighed.motion, tolerance)
+            terms, motion = conditions.terms, conditions.motion
+            leading, unclear = conserved_series(leading, terms, motion, tolerance)
             return leading, shifts, unclear
 
-        rows = compress(weighted(weighed.terms, weighed.weights)[fit])
-        spaces, undecided = series_spaces(rows, judge, tolerance, trivial), 0
+        rows = compress(times_weights(conditions.terms, conditions.weights)[fit])
+        spaces, pair_unclear = series_spaces(rows, judge, tolerance, trivial), 0
     else:
         rounding = ROUNDING / np.finfo(float).eps
-        motion = weighed.motion
+        motion = conditions.motion
         motion = motion._replace(rounding=rounding * motion.rounding)
-        weighed = weighed._replace(motion=motion)
+        conditions = conditions._replace(motion=motion)
         errors = rounding * changes.motion.rounding
-        spaces, undecided = spaces_in_pairs(
-            pairs, weighed.scale, weighed.orthonormal, motion.weights(), ~fit, errors, trivial
+        spaces, pair_unclear = spaces_in_pairs(
+            pairs, conditions.scale, conditions.orthonormal, motion.weights(), ~fit, errors, trivial
         )
-    return NullSpaces(changes, tolerance, weighed, spaces, undecided, constant, condition)
+    return NullSpaces(changes, tolerance, conditions, spaces, pair_unclear, constant, condition)
 
 
 def _shares_of_constant(rms, values, calm, slopes) -> np.ndarray | None:

@@ -5,7 +5,6 @@ from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -13,8 +12,8 @@ from jaxtyping import Array, Float
 from ...base.types import Scalar, State
 from ...problem.system import System
 from ..functions.basis import BoundBasis
-from ..functions.families import raised
-from ..functions.generators import Generator
+from ..functions.families import power_text
+from ..functions.generators import Generator, require_bound, symplectic_gradient
 from .digits import closed_form, digits_of
 
 _DROP = 1e-9  # Formulas leave out terms below this share of the largest
@@ -56,11 +55,7 @@ class InvariantSeries(eqx.Module):
         return powers @ self.coefficients @ self.basis(q, p, t)
 
     def __call__(self, t0, t1, q0, p0, q1, p1, args):
-        if self.epsilon is None:
-            raise ValueError(
-                "this InvariantSeries has no value of ε. Give it to dvi.integrate(observe=...), or "
-                "set ε before the call: invariant = invariant.bind(system, epsilon)."
-            )
+        require_bound(self, "value of ε", self.epsilon)
         time = self.epsilon * t1 if self.slow_time else t1
         return self.evaluate(q1, p1, self.epsilon, time)
 
@@ -75,10 +70,14 @@ class InvariantSeries(eqx.Module):
         """
         if self.slow_time and self.basis.uses_time:
             raise ValueError(
-                "`generators` requires a basis without functions of time, but the basis of this "
-                "invariant has functions of the slow time εt. Search again without them."
+                "generators require functions of q and p, but this basis has functions of the slow "
+                "time εt: search without them."
             )
-        return [_symplectic_gradient(self.basis, c) for c in self.coefficients]
+
+        def generator(c):
+            return symplectic_gradient(lambda t, q, p, args: c @ self.basis(q, p, t))
+
+        return [generator(c) for c in self.coefficients]
 
     def __str__(self) -> str:
         return self.formula()
@@ -93,12 +92,12 @@ class InvariantSeries(eqx.Module):
         if self.errors is None:
             return {}
         c, errors = np.asarray(self.coefficients), np.asarray(self.errors)
-        found = {}
+        forms = {}
         for m, j in np.argwhere(self._shares() > _DROP * np.max(self._shares())):
             value, error = float(abs(c[m, j])), float(errors[m, j])
             if error > 0 and (text := closed_form(value, error)):
-                found[f"{value:.{digits_of(c[m, j], errors[m, j])}g}"] = text
-        return found
+                forms[f"{value:.{digits_of(c[m, j], errors[m, j])}g}"] = text
+        return forms
 
     def _shares(self) -> np.ndarray:
         c = np.asarray(self.coefficients)
@@ -111,22 +110,22 @@ class InvariantSeries(eqx.Module):
         The number of terms left out is printed, unless they are round-off.
         """
         c, shares = np.asarray(self.coefficients), self._shares()
-        known = digits_of(c, None if self.errors is None else np.asarray(self.errors), digits)
+        precision = digits_of(c, None if self.errors is None else np.asarray(self.errors), digits)
         return in_powers_of_epsilon(
-            shortened(self.basis, block, share, terms, drop, some)
+            short_text(self.basis, block, share, terms, drop, block_digits)
             if m == 0 or np.max(share) > _DROP * np.max(shares)
             else ""
-            for m, (block, share, some) in enumerate(zip(c, shares, known, strict=True))
+            for m, (block, share, block_digits) in enumerate(zip(c, shares, precision, strict=True))
         )
 
 
 def in_powers_of_epsilon(texts: Iterable[str]) -> str:
     """c_0 + ε (c_1) + … from the texts of the orders; empty ones are left out."""
-    parts = [f"{raised('ε', m)} ({text})" if m else text for m, text in enumerate(texts) if text]
-    return " + ".join(parts) or "0"
+    parts = enumerate(texts)
+    return " + ".join(f"{power_text('ε', m)} ({x})" if m else x for m, x in parts if x) or "0"
 
 
-def shortened(
+def short_text(
     basis: BoundBasis,
     c: np.ndarray,
     shares: np.ndarray,
@@ -135,19 +134,9 @@ def shortened(
     digits: int | np.ndarray = 6,
 ) -> str:
     """The combination as text: at most so many terms, all above the share `drop` of the largest."""
-    shown = np.where(shares > drop * np.max(shares), c, 0.0)
+    terms_in_text = np.where(shares > drop * np.max(shares), c, 0.0)
     if terms is not None:
-        shown[np.argsort(-shares, kind="stable")[terms:]] = 0.0
-    text = basis.formula(shown, digits, drop=0.0)
-    hidden = np.sum(shares > drop * np.max(shares)) - np.count_nonzero(shown)
-    return f"{text} + … ({hidden} smaller terms)" if hidden else text
-
-
-def _symplectic_gradient(basis: BoundBasis, coefficients: Array) -> Generator:
-    def value(t, q, p):
-        return coefficients @ basis(q, p, t)
-
-    return Generator(
-        xi=lambda t, q, p, args: jax.grad(value, argnums=2)(t, q, p),
-        eta=lambda t, q, p, args: -jax.grad(value, argnums=1)(t, q, p),
-    )
+        terms_in_text[np.argsort(-shares, kind="stable")[terms:]] = 0.0
+    text = basis.formula(terms_in_text, digits, drop=0.0)
+    omissions = np.sum(shares > drop * np.max(shares)) - np.count_nonzero(terms_in_text)
+    return f"{text} + … ({omissions} smaller terms)" if omissions else text

@@ -18,6 +18,8 @@ from ...base.precision import refuse_double_without_x64
 from ...base.types import Args, Scalar, State
 from ...problem.system import System, check_system
 from ..algebra.taylor import taylor_coefficients
+from ..functions.basis import check_step_size
+from ..functions.generators import require_bound
 
 
 class ShadowHamiltonian(eqx.Module):
@@ -90,10 +92,8 @@ class ShadowHamiltonian(eqx.Module):
         if self.system is not None:
             hint = "Wrap the discrete Hamiltonian: dvi.System(H_D)."
             instance("system", self.system, System, "a dvi.System or None", hint)
-        if self.h is None or is_traced(self.h):
-            return
-        if np.shape(self.h) != () or not np.isfinite(self.h) or self.h == 0:
-            raise ValueError(f"h must be None or a finite number other than zero, got {self.h!r}.")
+        if self.h is not None and not is_traced(self.h):
+            check_step_size(self.h)
 
     def bind(self, system: System, epsilon: Any) -> "ShadowHamiltonian":
         """The same Hamiltonian for this system and ε, unless they were given before."""
@@ -117,12 +117,7 @@ class ShadowHamiltonian(eqx.Module):
         H_D at (t + kh, t + (k+1)h, q_k, p_{k+1}), Δ b_k = b_{k+1} − b_k. Since [h^i] b_k is a
         polynomial of degree i in k, its differences Δ^j with j > i vanish.
         """
-        system = self.system
-        if system is None:
-            raise ValueError(
-                "this ShadowHamiltonian has no system yet. Give it to dvi.integrate(observe=...), "
-                "or set the system before the call: shadow = shadow.bind(system, epsilon)."
-            )
+        system = require_bound(self, "system", self.system)
         for name, value in (("q", q), ("p", p)):
             if not is_traced(value):
                 refuse_double_without_x64(name, getattr(value, "dtype", np.float32))
@@ -147,7 +142,7 @@ class ShadowHamiltonian(eqx.Module):
     def evaluate(self, t: Any, q: Any, p: Any, h: Any, args: Args = None) -> Scalar:
         """H̃(t, q, p; h), a scalar [energy]."""
         terms = self.terms(t, q, p, args)
-        return _at(terms, jnp.asarray(h, terms.dtype))
+        return _horner(terms, jnp.asarray(h, terms.dtype))
 
     def __call__(self, t0, t1, q0, p0, q1, p1, args):
         return self.evaluate(t1, q1, p1, t1 - t0 if self.h is None else self.h, args)
@@ -165,13 +160,13 @@ def _series_along_orbit(
     def energy_and_slopes(k, qs, ps):
         """The series of H_D, ∂H_D/∂q0, ∂H_D/∂p1 in step k, for those of q_k and p_{k+1}."""
 
-        def at(h):
+        def action_terms(h):
             ends = t + k * h, t + (k + 1) * h
-            point = _at(qs, h).reshape(q.shape), _at(ps, h).reshape(q.shape)
+            point = _horner(qs, h).reshape(q.shape), _horner(ps, h).reshape(q.shape)
             H, (dq, dp) = jax.value_and_grad(hamiltonian, argnums=(2, 3))(*ends, *point)
             return jnp.concatenate([H[None], dq.ravel(), dp.ravel()])
 
-        series = taylor_coefficients(at, jnp.zeros((), q.dtype), order)
+        series = taylor_coefficients(action_terms, jnp.zeros((), q.dtype), order)
         return series[:, 0], series[:, 1 : n + 1], series[:, n + 1 :]
 
     # p_{k+1} = p_k − h ∂H_D/∂q0: each pass of the fixed-point iteration gains one power of h, and
@@ -184,11 +179,11 @@ def _series_along_orbit(
     def step(state, k):
         qs, ps = state
 
-        def once_more(_, found):
-            H, dq, dp = energy_and_slopes(k, qs, found[-1])
+        def one_pass(_, values):
+            H, dq, dp = energy_and_slopes(k, qs, values[-1])
             return H, dp, ps - _times_h(dq)
 
-        H, dp, ps1 = lax.fori_loop(0, passes, once_more, (ps[:, 0], ps, ps))
+        H, dp, ps1 = lax.fori_loop(0, passes, one_pass, (ps[:, 0], ps, ps))
         b = H - _product(ps1 - first, dp)
         return (qs + _times_h(dp), ps1), b
 
@@ -203,7 +198,7 @@ def _constant(value: State, order: int) -> Float[Array, "order+1 n"]:
     return jnp.zeros((order + 1, value.size), value.dtype).at[0].set(value.ravel())
 
 
-def _at(series: Array, h: Scalar) -> Array:
+def _horner(series: Array, h: Scalar) -> Array:
     """The sum of a series at h (Horner)."""
     value = series[-1]
     for coefficient in series[-2::-1]:

@@ -12,9 +12,8 @@ from ...base.results import RESULTS
 from ...base.types import Interval
 from ...methods.step import Equations, step
 from ..algebra.taylor import taylor_coefficients
-from ..functions.basis import BoundBasis
 from ..functions.generators import LatticePoint
-from ..functions.sampling import Displacements, Samples, require_finite
+from ..functions.sampling import Displacements, SamplePoints, require_finite
 from .determining import discrete_equations
 
 
@@ -36,19 +35,30 @@ class Conditions(NamedTuple):
     points: Any  # (S, z + 1, 2, 1 + 2n): both points (t, q, p)
     good: Any  # (S, z + 1): at z = 0, 1 where the step succeeds
 
-    def displacements(self, samples: Samples) -> Displacements:
+    def displacements(self, samples: SamplePoints) -> Displacements:
         """What the step changes (q, p) by at the samples."""
         return Displacements(samples, np.diff(self.points[:, 0, :, 1:], axis=1)[:, 0])
+
+    def depends_on_time(self, samples: SamplePoints, h: float, shift: float) -> bool:
+        """Whether the equations differ at a later time, by more than rounding; `shift`: the
+        largest shift of `later`."""
+        size = abs(h) * np.max(np.abs(self.clock)) + np.finfo(float).tiny
+        # (q1 − q0)/h is rounded by the last digits of q1, and of t1 − t0 = h at a later time.
+        largest = max(np.max(np.abs(x)) for x in (samples.q, samples.p))
+        displacement = np.max(np.abs(np.diff(self.points[:, 0, :, 1:], axis=1)))
+        later = (np.max(np.abs(samples.t)) + shift) / abs(h)
+        rounding = 64 * np.finfo(float).eps * (largest + later * displacement) / abs(h)
+        return not np.max(np.abs(self.later)) <= 1e-8 * size + rounding  # True for NaN
 
 
 @eqx.filter_jit
 def at_samples(equations, h, basis, gauge_basis, order, samples, later) -> Conditions:
-    """`later`: shifts of the time, shape (2,), for `require_times`."""
+    """`later`: shifts of the time, shape (2,), for `Conditions.depends_on_time`."""
     system, args, shape = equations.system, equations.args, samples.q.shape[1:]
     n = int(np.prod(shape, dtype=int))
 
     def flat(parts):
-        return jnp.concatenate([jnp.ravel(x) for x in parts])
+        return jnp.concatenate([jnp.ravel(part) for part in parts])
 
     def point(x):
         return LatticePoint(x[0], x[1 : 1 + n].reshape(shape), x[1 + n :].reshape(shape))
@@ -58,8 +68,8 @@ def at_samples(equations, h, basis, gauge_basis, order, samples, later) -> Condi
         return jnp.append(basis(q, p, t), gauge_basis(q, p, t))
 
     def conditions(epsilon, q, p, t):
-        here = Equations(system, epsilon, args, equations.newton)
-        q1, p1, info = step(here, Interval(t, t + h, h), q, p)
+        discrete = Equations(system, epsilon, args, equations.newton)
+        q1, p1, info = step(discrete, Interval(t, t + h, h), q, p)
         pair = jnp.stack([flat((t, q, p)), flat((t + h, q1, p1))])
         values, slopes = jax.vmap(functions)(pair), jax.vmap(jax.jacfwd(functions))(pair)
 
@@ -72,15 +82,15 @@ def at_samples(equations, h, basis, gauge_basis, order, samples, later) -> Condi
             H = system.hamiltonian(a.t, b.t, a.q, b.p, epsilon, args)
             return jnp.sum(b.p * (b.q - a.q)) - (b.t - a.t) * H
 
-        def identity(moved):
+        def identity(shifted_pair):
             """The factors of both points' components, and of the gauge, at a pair close by."""
-            near = values + jnp.einsum("jbi,ji->jb", slopes, moved - pair)
-            phi, gauge = near[:, : basis.size], near[:, basis.size :]
-            a, b = map(point, moved)
+            functions_near = values + jnp.einsum("jbi,ji->jb", slopes, shifted_pair - pair)
+            phi, gauge = functions_near[:, : basis.size], functions_near[:, basis.size :]
+            a, b = map(point, shifted_pair)
             force = system.disturbing_force(a.t, b.t, a.q, b.p, epsilon, args)
             power = jnp.sum(force * (b.q - a.q)) / h
             work = flat((-power, force, jnp.zeros_like(force)))
-            factors = jax.grad(action)(moved) / h + jnp.stack([work, jnp.zeros_like(work)])
+            factors = jax.grad(action)(shifted_pair) / h + jnp.stack([work, jnp.zeros_like(work)])
             return jnp.einsum("jc,jb->jcb", factors, phi), (gauge[1] - gauge[0]) / h
 
         def rows(value, by_pair):
@@ -90,14 +100,14 @@ def at_samples(equations, h, basis, gauge_basis, order, samples, later) -> Condi
 
         by_pair = jax.jacfwd(F)(pair)  # (2n, 2, C)
         noether, gauge = map(rows, identity(pair), jax.jacfwd(identity)(pair))
-        shifted = jax.vmap(lambda shift: F(pair.at[:, 0].add(shift)))(later)
+        later_equations = jax.vmap(lambda shift: F(pair.at[:, 0].add(shift)))(later)
         phi, good = values[:, : basis.size], jnp.where(info.result == RESULTS.successful, 1.0, 0.0)
         return Conditions(
             determining=jnp.einsum("rjc,jb->jrcb", by_pair, phi),
             identity=jnp.moveaxis(noether, 0, 1),
             gauge=gauge,
             clock=by_pair[:, 1, 0],
-            later=shifted,
+            later=later_equations,
             values=phi,
             slopes=slopes[0, : basis.size],
             jacobian=by_pair,
@@ -110,46 +120,17 @@ def at_samples(equations, h, basis, gauge_basis, order, samples, later) -> Condi
         zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
         as_conditions = ravel_pytree(zeros)[1]
 
-        def flattened(epsilon):
+        def flat_conditions(epsilon):
             return ravel_pytree(conditions(epsilon, q, p, t))[0]
 
-        return jax.vmap(as_conditions)(taylor_coefficients(flattened, jnp.zeros(()), order))
+        return jax.vmap(as_conditions)(taylor_coefficients(flat_conditions, jnp.zeros(()), order))
 
     return jax.vmap(at_point)(*map(jnp.asarray, samples))
 
 
 def require_finite_conditions(raw: Conditions) -> None:
     """Reject conditions that are not finite: at the samples, or where the step leads."""
-    hint = (
-        "H_D or the functions are singular there or at the end of the step; keep the samples away "
-        "from singularities"
-    )
+    hint = "keep the samples and the ends of their steps away from singularities"
     require_finite(raw.determining, lambda *_: "the left side of a determining equation", hint)
     require_finite(raw.identity, lambda *_: "a term of Noether's identity", hint)
     require_finite(raw.gauge, lambda *_: "a function of the gauge basis", hint)
-
-
-def require_times(raw: Conditions, samples: Samples, h: float, shift: float) -> None:
-    """Reject samples of one time for equations that depend on it; `shift`: see `later`."""
-    size = abs(h) * np.max(np.abs(raw.clock)) + np.finfo(float).tiny
-    # (q1 − q0)/h is rounded by the last digits of q1 and of t1 − t0, which is h at a later time.
-    largest = max(np.max(np.abs(x)) for x in (samples.q, samples.p))
-    moved = np.max(np.abs(np.diff(raw.points[:, 0, :, 1:], axis=1)))
-    later = (np.max(np.abs(samples.t)) + shift) / abs(h)
-    rounding = 64 * np.finfo(float).eps * (largest + later * moved) / abs(h)
-    same = np.max(np.abs(raw.later)) <= 1e-8 * size + rounding  # False for NaN
-    if np.ptp(samples.t) == 0 and not same:
-        raise ValueError(
-            "the discrete equations depend on the time, but all samples have the same time, "
-            f"t = {samples.t[0]:g}. Give samples=(qs, ps, ts) with different times in ts."
-        )
-
-
-@eqx.filter_jit
-def _on_samples(basis, samples):
-    return jax.vmap(basis)(*map(jnp.asarray, samples))
-
-
-def values_at(basis: BoundBasis, samples: Samples) -> np.ndarray:
-    """The functions at the samples, shape (S, size)."""
-    return np.asarray(_on_samples(basis.unnamed(), samples))

@@ -119,22 +119,26 @@ def conformal_factor(
     samples, size = len(first.q), 2 * first.q[0].size
     if not pointwise and samples < size:
         raise ValueError(
-            f"the number of points in first and in second must be at least {size} for a constant "
-            f"{size}×{size} conformal factor, got {samples}. Give more points. For a factor that "
-            "differs from point to point pass pointwise=True."
+            f"first and second must have at least {size} points for a constant {size}×{size} "
+            f"conformal factor, got {samples}: one for each point requires pointwise=True."
         )
-    find = _pointwise if pointwise else _constant
-    return find(system, generators, first, second, jnp.asarray(epsilon), args)
+    problem = system, generators, first, second, jnp.asarray(epsilon), args
+    return _conformal_factor(*problem, pointwise)
 
 
 @eqx.filter_jit
-def _constant(system, generators, first, second, epsilon, args) -> ConformalFactor:
+def _conformal_factor(system, generators, first, second, epsilon, args, pointwise):
     def at_sample(first, second):
-        pair = (first, second, epsilon, args)
-        F, change = _equations_and_change(system, generators, *pair)
-        return F, change, *_sizes(system, generators, *pair)
+        if pointwise:
+            first, second = _solution_through(system, first, second, epsilon, args)
+        problem = system, generators, first, second, epsilon, args
+        factor = _pointwise_factor(*problem) if pointwise else jnp.zeros(())
+        return factor, *_equations_and_change(*problem), *_sizes(*problem)
 
-    values, changes, of_values, of_changes = jax.vmap(at_sample)(first, second)
+    factor, values, changes, of_values, of_changes = jax.vmap(at_sample)(first, second)
+    if pointwise:
+        residual = _relative(changes, of_changes)
+        return ConformalFactor(factor, residual, jnp.ones_like(residual))
     factor = jnp.linalg.lstsq(values, changes)[0].T
     # The columns in units of their terms: an F that is only their round-off determines nothing.
     units = jnp.max(of_values, axis=0, keepdims=True)
@@ -143,23 +147,10 @@ def _constant(system, generators, first, second, epsilon, args) -> ConformalFact
     return ConformalFactor(factor, _relative(changes - values @ factor.T, of_changes), condition)
 
 
-@eqx.filter_jit
-def _pointwise(system, generators, first, second, epsilon, args) -> ConformalFactor:
-    def at_sample(first, second):
-        pair = (*_solution_through(system, first, second, epsilon, args), epsilon, args)
-        change = _equations_and_change(system, generators, *pair)[1]
-        size = _sizes(system, generators, *pair)[1]
-        return _pointwise_factor(system, generators, *pair), change, size
-
-    factors, changes, of_changes = jax.vmap(at_sample)(first, second)
-    residual = _relative(changes, of_changes)
-    return ConformalFactor(factors, residual, jnp.ones_like(residual))
-
-
-def _relative(left, sizes):
+def _relative(residuals, sizes):
     """The largest residual over the largest of its terms."""
     largest = jnp.max(sizes)
-    return jnp.max(jnp.abs(left)) / jnp.where(largest > 0, largest, 1)
+    return jnp.max(jnp.abs(residuals)) / jnp.where(largest > 0, largest, 1)
 
 
 def _equations_and_change(system, generators, first, second, epsilon, args):
@@ -208,8 +199,8 @@ def _sizes(system, generators, first, second, epsilon, args):
     places = jnp.eye(len(leaves), dtype=rates.dtype)
     alone = [jnp.tensordot(places[i], x, axes=0) for i, x in enumerate(leaves)]
     _, derivative = jax.linearize(F, first, second)
-    each = jax.vmap(derivative)(*jax.tree.unflatten(structure, alone))
-    of_change = jnp.sum(jnp.abs(each), axis=0)
+    terms = jax.vmap(derivative)(*jax.tree.unflatten(structure, alone))
+    of_change = jnp.sum(jnp.abs(terms), axis=0)
     return of_F, of_change
 
 

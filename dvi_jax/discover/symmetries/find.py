@@ -1,19 +1,17 @@
 """Symmetries as the null space of the determining equations on the iterated map."""
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, Unpack
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 from ...base.checks import fraction, whole
-from ...base.keywords import with_keywords_of
-from ...integration.integrate import integrate
-from ...methods.step import Equations
+from ...base.keywords import checked_keywords
+from ...integration.keywords import MapSettings
 from ...problem.system import System, check_system
 from ..algebra.motion import typical_sizes
-from ..algebra.nullspace import triangle
+from ..algebra.nullspace import independent_columns, triangle
 from ..functions.basis import (
     AbstractBasis,
     Basis,
@@ -26,8 +24,7 @@ from ..functions.basis import (
 from ..functions.families import TIME, Polynomials, coordinate_names
 from ..functions.sampling import (
     SMALL,
-    TYPE_2,
-    Samples,
+    SamplePoints,
     as_samples,
     check_basis,
     check_finite,
@@ -36,19 +33,20 @@ from ..functions.sampling import (
     middle,
     require_enough,
     require_steps,
-    require_time,
+    require_times,
     spreads,
+    values_at,
 )
-from ..invariants.expansions import at_larger_step, enlarged, in_larger_box
-from .conditions import Conditions, at_samples, require_finite_conditions, require_times, values_at
-from .found import Symmetries
+from ..invariants.expansions import at_larger_step, in_larger_box, larger_samples
+from .conditions import Conditions, at_samples, require_finite_conditions
 from .search import rows_of, weigh_conditions
+from .symmetry import Symmetries
 
 # A step that moves the samples by less than this share of their spread is rounding.
 _NO_STEP = 1e-13
 
 
-@with_keywords_of(integrate, TYPE_2)
+@checked_keywords
 def find_symmetries(
     system: System,
     basis: AbstractBasis,
@@ -59,7 +57,7 @@ def find_symmetries(
     gauges: AbstractBasis | None = None,
     time: bool = True,
     tolerance: float | None = None,
-    **how: Any,
+    **settings: Unpack[MapSettings],
 ) -> Symmetries:
     r"""The symmetries of order z of the perturbed discrete equations that a basis can express.
 
@@ -124,33 +122,28 @@ def find_symmetries(
     if tolerance is not None:
         tolerance = fraction("tolerance", tolerance)
     check_system(system, "find_symmetries")
-    one_step = map_of("find_symmetries", system, **how)
+    one_step = map_of("find_symmetries", system, settings)
     samples, h = as_samples(samples, one_step.t0), check_step_size(h)
     shape = samples.q.shape[1:]
     bound = bind_basis(basis, shape)
-    require_time(bound, samples)
-    gauge_basis = bind_basis(_enlarged(basis, shape) if gauges is None else gauges, shape)
-    at = middle(samples, max(gauge_basis.complexity))
-    bound, gauge_basis = bound.about(at, exactly=True)[0], gauge_basis.about(at)[0]
-    if gauges is not None:
-        require_time(gauge_basis, samples)
+    gauge_basis = bind_basis(_default_gauges(basis, shape) if gauges is None else gauges, shape)
+    user_bases = (bound,) if gauges is None else (bound, gauge_basis)
+    require_times(any(basis.uses_time for basis in user_bases), samples)
+    centre = middle(samples, max(gauge_basis.complexity))
+    bound, gauge_basis = bound.recentre(centre, exactly=True)[0], gauge_basis.recentre(centre)[0]
     n = int(np.prod(shape, dtype=int))
     require_enough(samples, (2 * n + bool(time)) * bound.size, 2 * n)
     require_enough(samples, gauge_basis.size, 1 + 2 * n)
+    equations = one_step.equations(system, samples)
+    for functions in (bound,) if gauges is None else (bound, gauge_basis):
+        values = values_at(functions, samples)
+        check_finite(functions, values)
+        check_basis(functions, typical_sizes(values)[1][:, None] * values)
+    bases = bound.without_names(), gauge_basis.without_names()
 
-    q, p, t = (jnp.asarray(x[0]) for x in samples)
-    system.check_shapes(t, q, p, jnp.zeros(()), one_step.args)
-    equations = Equations(system, jnp.zeros(()), one_step.args, one_step.root_finder)
-    for one in (bound, gauge_basis) if gauges is not None else (bound,):
-        values = values_at(one, samples)
-        check_finite(one, values)
-        check_basis(one, typical_sizes(values)[1][:, None] * values)
-
-    functions = bound.unnamed(), gauge_basis.unnamed()
-
-    def conditions(shifts, at=samples, step=h, order=order):
-        found = at_samples(equations, jnp.asarray(step), *functions, order, at, shifts)
-        return Conditions(*map(np.asarray, found))
+    def conditions(shifts, points=samples, step=h, order=order):
+        arrays = at_samples(equations, jnp.asarray(step), *bases, order, points, shifts)
+        return Conditions(*map(np.asarray, arrays))
 
     shifts = later(h)
     raw = conditions(shifts)
@@ -160,103 +153,77 @@ def find_symmetries(
     if relative < _NO_STEP:
         raise ValueError(
             f"one step must change the samples by at least {_NO_STEP:g} times their spread, got "
-            f"{relative:.0e} for h = {h:g}. Smaller changes are close to round-off, so that "
-            "symmetries cannot be identified. Take a larger |h|, or samples away from equilibria."
+            f"{relative:.0e} for h = {h:g}: take a larger |h|, or samples away from equilibria."
         )
     if relative < SMALL and np.ptp(samples.t) == 0:
         shifts = later(h, relative)
         raw = conditions(shifts)
-    require_times(raw, samples, h, shifts[-1])
-    independent, places = _independent_gauges(gauge_basis, raw, samples, h)
-    raw = raw._replace(gauge=raw.gauge[..., places])
-    kind = bool(time), bound, independent, tolerance
-    search = weigh_conditions(raw, samples, h, *kind)
-    found = search.result()
-    if not found.count or tolerance is not None:
-        return found
+    require_times(raw.depends_on_time(samples, h, shifts[-1]), samples, "the map")
+    gauge_places = _independent_gauges(gauge_basis, raw, samples, h)
+    gauge_basis = gauge_basis.select(gauge_places)
 
-    def count(step, at=samples):
-        raw = conditions(shifts, at, step, order=0)
-        raw = raw._replace(gauge=raw.gauge[..., places])
-        if not all(np.isfinite(x).all() for x in raw) or not raw.good[:, 0].all():
+    def search(raw, points=samples, step=h):
+        raw = raw._replace(gauge=raw.gauge[..., gauge_places])
+        return weigh_conditions(raw, points, step, bool(time), bound, gauge_basis, tolerance)
+
+    original = search(raw)
+    symmetries = original.result()
+    if not symmetries.count or tolerance is not None:
+        return symmetries
+
+    def displacements(points, step):
+        is_original = points is samples and step == h
+        return (raw if is_original else conditions(shifts, points, step)).displacements(points)
+
+    def count(points, step):
+        larger = conditions(shifts, points, step, order=0)
+        if not all(np.isfinite(x).all() for x in larger) or not larger.good[:, 0].all():
             return None
-        return weigh_conditions(raw, at, step, *kind).spaces()[0].leading.shape[1]
+        return search(larger, points, step).spaces()[0].leading.shape[1]
 
-    displacements = raw.displacements(samples)
-
-    def steps(step):
-        return displacements if step == h else conditions(shifts, step=step).displacements(samples)
-
-    powers, larger = found.powers, at_larger_step(h, steps, count)
-    if order == 0:
-        at, which = enlarged(samples)
-        powers = search.powers(found, conditions(shifts, at), which)
-        larger += in_larger_box(
-            displacements,
-            lambda samples: conditions(shifts, samples).displacements(samples),
-            lambda samples: count(h, samples),
-        )
-    return replace(found, powers=powers, larger=larger)
+    larger = at_larger_step(samples, h, displacements, count)
+    if order > 0:
+        return replace(symmetries, larger=larger)
+    points, factors = larger_samples(samples)
+    powers = original.powers(symmetries, conditions(shifts, points), factors)
+    larger += in_larger_box(samples, h, displacements, count)
+    return replace(symmetries, powers=powers, larger=larger)
 
 
-def _enlarged(basis: AbstractBasis, shape: tuple[int, ...]) -> AbstractBasis:
+def _default_gauges(basis: AbstractBasis, shape: tuple[int, ...]) -> AbstractBasis:
     """The functions times 1 and the coordinates, all quadratic polynomials, and t."""
-    timed = bind_basis(basis, shape).uses_time
-    variables = coordinate_names(shape) + (("t",) if timed else ())
+    uses_time = bind_basis(basis, shape).uses_time
+    variables = coordinate_names(shape) + (("t",) if uses_time else ())
 
-    def raised(basis):
+    def products(basis):
         match basis:
             case Polynomials():
                 return Polynomials(basis.degree + 1, variables, constant=True)
             case Sum():
-                return raised(basis.first) + raised(basis.second)
+                return products(basis.first) + products(basis.second)
             case Product(second=Polynomials()):
-                return basis.first * raised(basis.second)
+                return basis.first * products(basis.second)
             case Product(first=Polynomials()):
-                return raised(basis.first) * basis.second
+                return products(basis.first) * basis.second
         return basis * Polynomials(1, variables, constant=True)
 
-    return Polynomials(2, variables) + _CLOCK + raised(basis)
+    return Polynomials(2, variables) + _CLOCK + products(basis)
 
 
 # One object, made once: with a new function in each search, each would compile its programs again.
 _CLOCK = Basis({TIME[0]: lambda q, p, t: t})
 
 
-class _Chosen(eqx.Module):
-    basis: BoundBasis
-    places: tuple[int, ...] = eqx.field(static=True)
-
-    def __call__(self, q, p, t):
-        return self.basis(q, p, t)[np.array(self.places, int)]
-
-
-def _independent_gauges(basis: BoundBasis, raw: Conditions, samples: Samples, h: float):
-    """The gauge functions without constants and those that depend on simpler ones, and their
-    places."""
-    fit = ~samples.held_out
+def _independent_gauges(
+    basis: BoundBasis, raw: Conditions, samples: SamplePoints, h: float
+) -> np.ndarray:
+    """Numbers of the gauge functions that are not constant and do not depend on simpler ones."""
     units = np.append(abs(h), spreads(samples))
     typical = typical_sizes(values_at(basis, samples))[0]
-    rows = raw.gauge[fit, 0] * units[:, None] / np.where(typical > 0, typical, abs(h))
+    rows = raw.gauge[~samples.held_out, 0] * units[:, None]
+    rows = rows / np.where(typical > 0, typical, abs(h))
     length = np.linalg.norm(rows, axis=(1, 2), keepdims=True)
     columns = triangle(rows_of(rows / np.where(length > 0, length, 1)))
     size = np.linalg.norm(columns, axis=0)
-    taken: list[int] = []
-    done = np.zeros((len(columns), 0))
-    for j in np.argsort(basis.complexity, kind="stable"):
-        if size[j] <= 1e-12 * np.max(size):
-            continue
-        rest = columns[:, j] / size[j]
-        for _ in range(2):  # the second time for round-off
-            rest = rest - done @ (done.T @ rest)
-        if np.linalg.norm(rest) > 1e-9:
-            taken.append(int(j))
-            done = np.column_stack([done, rest / np.linalg.norm(rest)])
-    places = np.array(sorted(taken), int)
-    chosen = BoundBasis(
-        _Chosen(basis, tuple(places.tolist())),
-        tuple(basis.names[j] for j in places),
-        tuple(basis.complexity[j] for j in places),
-        basis.uses_time,
-    )
-    return chosen, places
+    columns = np.where(size > 1e-12 * np.max(size), columns, 0.0)
+    return independent_columns(columns, basis.complexity, 1e-9)

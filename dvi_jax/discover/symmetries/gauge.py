@@ -24,12 +24,12 @@ from ..functions.sampling import (
     as_samples,
     require_enough,
     require_steps,
-    require_time,
+    require_times,
 )
 from .noether import noether_identity
 
 _ROUNDINGS = 64.0  # An identity below so many roundings of its terms is zero
-_HIDDEN = 1e-6  # Where rounding makes a larger residual, it does not decide whether a gauge exists
+_UNCLEAR = 1e-6  # Where rounding makes a larger residual, it does not decide whether a gauge exists
 # A sample is compared with itself where the identity is so many times larger than at 75 %.
 _STRONG = 100.0
 
@@ -72,7 +72,7 @@ class GaugeSolution(eqx.Module):
     @property
     def warnings(self) -> tuple[str, ...]:
         """Reasons why the result is not reliable, each with a remedy; empty if it is reliable."""
-        if self.rounding <= _HIDDEN:
+        if self.rounding <= _UNCLEAR:
             return ()
         return (
             f"rounding alone makes a residual of {self.rounding:.0e}: whether a gauge exists "
@@ -90,8 +90,8 @@ class GaugeSolution(eqx.Module):
 
     def __str__(self) -> str:
         lines = [
-            f"order {m}: residual {residual:.1e}, G = {gauge}"
-            for m, (gauge, residual) in enumerate(zip(self.gauges, self.residuals, strict=True))
+            f"order {order}: residual {residual:.1e}, G = {gauge}"
+            for order, (gauge, residual) in enumerate(zip(self.gauges, self.residuals, strict=True))
         ]
         return "\n".join([*lines, *self.warnings])
 
@@ -137,17 +137,16 @@ def solve_gauge(
     single = isinstance(generators, Generator)
     if single or len(generators) == 0:
         raise ValueError(
-            "generators must be a list with one Generator for each order, order 0 first; got "
-            f"{'a Generator: put it into a list, [generator]' if single else 'an empty list'}."
+            "generators must be a list with one Generator for each order, got "
+            f"{'a Generator: give [generator]' if single else 'an empty list'}."
         )
     bound, h = bind_basis(basis, samples.q.shape[1:]), check_step_size(h)
     require_enough(samples, bound.size)
-    require_time(bound, samples)
-    held, order = samples.held_out, len(generators) - 1
+    require_times(bound.uses_time, samples)
+    held_out, order = samples.held_out, len(generators) - 1
     equations = Equations(system, jnp.zeros(()), args)
-    terms, sizes, moved, good = map(
-        np.asarray, _identity_terms(equations, h, list(generators), bound, samples)
-    )
+    arrays = _identity_terms(equations, h, list(generators), bound, samples)
+    terms, sizes, displacement, good = map(np.asarray, arrays)
     require_steps(good, samples)
     n, changes, size = terms[:, :, 0], terms[:, :, 1:] / h, bound.size
     largest = np.max(np.abs(n), axis=1)
@@ -155,18 +154,18 @@ def solve_gauge(
     # An identity that does not close is at least this fraction of its terms.
     relative = np.maximum(largest / np.maximum(sizes, np.finfo(float).tiny), 1e-300)
     relative = np.where(relative > _ROUNDINGS * np.finfo(float).eps, relative, 1e-300)
-    relative = np.maximum(relative, Displacements(samples, moved).relative_step)
+    relative = np.maximum(relative, Displacements(samples, displacement).relative_step)
 
-    rows = changes / scale[:, None, None]
-    g, free = solve_series(rows[~held], -n[~held] / scale[~held, None])
+    rows, n = changes / scale[:, None, None], n / scale[:, None]
+    g, free = solve_series(rows[~held_out], -n[~held_out])
     # Invariants may be added to any gauge: the simplest sum is taken.
     g = reduction(free, np.tile(bound.complexity, order + 1), size)(g)
-    left = series_changes(rows, g[:, None])[held, :, 0] + n[held] / scale[held, None]
+    residuals = series_changes(rows, g[:, None])[held_out, :, 0] + n[held_out]
     g = g.reshape(order + 1, size)
     return GaugeSolution(
         gauges=tuple(BasisGauge(bound, jnp.asarray(c)) for c in g),
         coefficients=g,
-        residuals=np.max(np.abs(left), axis=0),
+        residuals=np.max(np.abs(residuals), axis=0),
         rounding=min(1.0, float(_ROUNDINGS * np.finfo(float).eps / np.median(relative))),
     )
 
@@ -194,40 +193,41 @@ def _identity_terms(equations, h, generators, basis, samples):
         interval = Interval(t, t + h, jnp.asarray(h, float))
         first = LatticePoint(interval.t0, q, p)
 
-        def stepped(epsilon):
-            here = Equations(equations.system, epsilon, equations.args, Newton())
-            q1, p1, info = step(here, interval, q, p)
+        def next_point(epsilon):
+            discrete = Equations(equations.system, epsilon, equations.args, Newton())
+            q1, p1, info = step(discrete, interval, q, p)
             return LatticePoint(interval.t1, q1, p1), info.result == RESULTS.successful
 
         def identities(epsilon, second, series):
-            given = equations.system, series, [None for _ in orders]
-            rest = first, second, epsilon, equations.args
-            return [noether_identity(*given, m, *rest) for m in orders]
+            problem = equations.system, series, [None for _ in orders]
+            points = first, second, epsilon, equations.args
+            return [noether_identity(*problem, m, *points) for m in orders]
 
-        def of(epsilon):
-            second, _ = stepped(epsilon)
+        def identity_and_change(epsilon):
+            second, _ = next_point(epsilon)
             of_order = identities(epsilon, second, generators)
             total = sum(epsilon**m * N for m, N in enumerate(of_order))
             change = basis(second.q, second.p, second.t) - basis(q, p, first.t)
             return jnp.append(total, change)
 
-        second, good = stepped(zero)
+        second, good = next_point(zero)
 
         def in_parts(weights):
             """The identities of all orders at ε = 0, linear in weights of the components."""
-            weighted = [_weighted(g, first, w) for g, w in zip(generators, weights, strict=True)]
-            return jnp.stack(identities(0.0, second, weighted))
+            pairs = zip(generators, weights, strict=True)
+            products = [_times_weights(g, first, w) for g, w in pairs]
+            return jnp.stack(identities(0.0, second, products))
 
         parts = jax.jacfwd(in_parts)(jnp.ones((len(generators), 2, 1 + 2 * q.size)))
         size = jnp.max(jnp.sum(jnp.abs(parts), axis=(1, 2, 3)))
-        terms = taylor_coefficients(of, zero, len(generators) - 1)
-        moved = jnp.concatenate([(second.q - q).ravel(), (second.p - p).ravel()])
-        return terms, size, moved, good
+        terms = taylor_coefficients(identity_and_change, zero, len(generators) - 1)
+        displacement = jnp.concatenate([(second.q - q).ravel(), (second.p - p).ravel()])
+        return terms, size, displacement, good
 
     return jax.vmap(at_point)(*samples)
 
 
-def _weighted(generator: Generator, first: LatticePoint, weights: Array) -> Generator:
+def _times_weights(generator: Generator, first: LatticePoint, weights: Array) -> Generator:
     """The generator with components times weights, at the first point and elsewhere, shape
     (2, 2n + 1)."""
 

@@ -14,12 +14,12 @@ from jaxtyping import Array
 
 from ...base import checks as _checks
 from ...base.types import State
-from ..functions.generators import Generator, LatticePoint
+from ..functions.generators import Generator, LatticePoint, symplectic_gradient
 
 
 def time_translation() -> Generator:
     """X = ∂/∂t: ξ0 = 1. Conserves the energy, on the variational lattice."""
-    return Generator(xi0=_one)
+    return Generator(xi0=_unit)
 
 
 def space_translation(direction: Any) -> Generator:
@@ -44,13 +44,10 @@ def rotation(i: int = 0, j: int = 1) -> Generator:
     **Raises** `ValueError` for axes that are equal or negative, and at the point for axes that q
     does not have. **Source** the paper, (40).
     """
-    axes = (i, j)
-    if any(isinstance(a, bool) or not isinstance(a, int) or a < 0 for a in axes) or i == j:
-        raise ValueError(
-            "i and j must be the numbers of two different axes of q, of type int and ≥ 0; got "
-            f"i = {i!r} and j = {j!r}."
-        )
-    return Generator(xi=eqx.Partial(_turned, 1, i, j), eta=eqx.Partial(_turned, 2, i, j))
+    i, j = (_checks.whole(name, axis, least=0) for name, axis in (("i", i), ("j", j)))
+    if i == j:
+        raise ValueError(f"i and j must be two different axes of q, got i = j = {i}.")
+    return Generator(xi=eqx.Partial(_turn, 1, i, j), eta=eqx.Partial(_turn, 2, i, j))
 
 
 def scaling(q: Any = 1.0, p: Any = 1.0, t: float = 0.0) -> Generator:
@@ -62,13 +59,14 @@ def scaling(q: Any = 1.0, p: Any = 1.0, t: float = 0.0) -> Generator:
     **Raises** `ValueError` for weights that are not finite or all zero, or a `t` that is no
     number. **Source** Olver 1993, *Applications of Lie Groups to Differential Equations*.
     """
-    a, b, c = (_finite(name, x) for name, x in (("t", t), ("q", q), ("p", p)))
-    if a.shape != ():
-        raise ValueError(f"the weight t must be one number, got an array of shape {a.shape}.")
-    if not (a.any() or b.any() or c.any()):
-        raise ValueError("at least one of the weights q, p, t must not be 0, but they are all 0.")
-    weights = enumerate((a, b, c))
-    return Generator(*(eqx.Partial(_scaled, i, w) if w.any() else None for i, w in weights))
+    weights = (
+        _array("the weight t", t, "one finite number", lambda weight: weight.ndim == 0),
+        *(_array(f"the weight {name}", weight) for name, weight in (("q", q), ("p", p))),
+    )
+    if not any(weight.any() for weight in weights):
+        raise ValueError("one of the weights q, p, t must not be 0, but all are 0.")
+    parts = (eqx.Partial(_scale, i, w) if w.any() else None for i, w in enumerate(weights))
+    return Generator(*parts)
 
 
 def boost(direction: Any, mass: Any = 1.0) -> Generator:
@@ -81,11 +79,11 @@ def boost(direction: Any, mass: Any = 1.0) -> Generator:
     **Raises** `ValueError` for a direction that is zero or not finite, masses that are not
     positive, and at the point for what does not fit q. **Source** Olver 1993, Chapter 4.
     """
-    masses = _finite("mass", mass)
-    if not (masses > 0).all():
-        raise ValueError(f"mass must be positive for every body, got {mass!r:.200}.")
-    v = _direction(direction)
-    return Generator(xi=eqx.Partial(_boosted, v, None), eta=eqx.Partial(_boosted, v, masses))
+    masses = _array("mass", mass, "positive for every body", lambda masses: (masses > 0).all())
+    velocity = _direction(direction)
+    return Generator(
+        xi=eqx.Partial(_boost, velocity, None), eta=eqx.Partial(_boost, velocity, masses)
+    )
 
 
 def hamiltonian_flow(function: Callable[..., Any]) -> Generator:
@@ -97,9 +95,7 @@ def hamiltonian_flow(function: Callable[..., Any]) -> Generator:
     **Raises** `TypeError` for what is not callable. **Source** Olver 1993, Chapter 6.
     """
     _checks.function("the argument of hamiltonian_flow", function, "(t, q, p, args) → scalar")
-    return Generator(
-        xi=eqx.Partial(_slope, function, 2, 1.0), eta=eqx.Partial(_slope, function, 1, -1.0)
-    )
+    return symplectic_gradient(function)
 
 
 def bracket(first: Generator, second: Generator) -> Generator:
@@ -114,75 +110,71 @@ def bracket(first: Generator, second: Generator) -> Generator:
     return Generator(*(eqx.Partial(_bracket, first, second, place) for place in range(3)))
 
 
-def _one(t, q, p, args):
+def _unit(t, q, p, args):
     return 1.0
 
 
 def _constant(value, t, q, p, args):
-    return _fitted("direction", value, q)
+    return _broadcast("direction", value, q)
 
 
-def _turned(place, i, j, t, q, p, args):
+def _turn(place, i, j, t, q, p, args):
     """The vector at `place` of (t, q, p), turned by a right angle in the plane of two axes."""
     v = (t, q, p)[place]
     if v.ndim == 0 or v.shape[-1] <= max(i, j):
         raise ValueError(
-            f"q must have at least {max(i, j) + 1} components along its last axis for "
-            f"rotation({i}, {j}), got q of shape {q.shape}. Correct i and j, or the shape of q."
+            f"rotation({i}, {j}) requires at least {max(i, j) + 1} components along the last axis "
+            f"of q, got shape {q.shape}."
         )
     return jnp.zeros_like(v).at[..., i].set(-v[..., j]).at[..., j].set(v[..., i])
 
 
-def _scaled(place, weight, t, q, p, args):
+def _scale(place, weight, t, q, p, args):
     value = (t, q, p)[place]
-    return value * _fitted(f"the weight {'tqp'[place]}", weight, value)
+    return value * _broadcast(f"the weight {'tqp'[place]}", weight, value)
 
 
-def _boosted(direction, mass, t, q, p, args):
-    v = _fitted("direction", direction, q)
+def _boost(direction, mass, t, q, p, args):
+    v = _broadcast("direction", direction, q)
     if mass is None:
         return t * v
     if mass.ndim == 1 and q.ndim == 2 and len(mass) == len(q):
         mass = mass[:, None]  # one for each body
-    return _fitted("mass", mass, q) * v
-
-
-def _slope(function, argnum, sign, t, q, p, args):
-    return sign * jax.grad(function, argnums=argnum)(t, q, p, args)
+    return _broadcast("mass", mass, q) * v
 
 
 def _bracket(first, second, place, t, q, p, args):
     point = LatticePoint(t, q, p)
 
-    def derivative(along, of):
-        return jax.jvp(lambda at: of(at, args)[place], (point,), (along(point, args),))[1]
+    def derivative(direction, generator):
+        def component(point):
+            return generator(point, args)[place]
+
+        return jax.jvp(component, (point,), (direction(point, args),))[1]
 
     return derivative(first, second) - derivative(second, first)
 
 
-def _finite(name: str, value: Any) -> np.ndarray:
+def _array(name: str, value: Any, rule: str = "finite", fits: Any = np.isfinite) -> np.ndarray:
     """As an array of NumPy: a generator can be made before JAX has started its devices."""
     array = np.asarray(value, float)
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name} must be finite, got {value!r}.")
+    if not (np.isfinite(array).all() and np.all(fits(array))):
+        raise ValueError(f"{name} must be {rule}, got {value!r:.200}.")
     return array
 
 
 def _direction(value: Any) -> np.ndarray:
-    direction = _finite("direction", value)
-    if not direction.any():
-        raise ValueError(f"direction must have a component that is not zero, got {value!r}.")
-    return direction
+    return _array("direction", value, "finite, with a component that is not zero", np.any)
 
 
-def _fitted(name: str, value: np.ndarray, q: State) -> Array:
+def _broadcast(name: str, value: np.ndarray, q: State) -> Array:
     """The value with the shape of q, if that can be."""
     try:
         return jnp.broadcast_to(value, q.shape).astype(q.dtype)
     except ValueError:
         shapes = [q.shape[i:] for i in range(q.ndim)] + [q.shape[:1]] * (name == "mass")
-        allowed = " or ".join(map(str, dict.fromkeys(shapes))) if q.ndim else "()"
+        choices = " or ".join(map(str, dict.fromkeys(shapes))) if q.ndim else "()"
         raise ValueError(
-            f"{name} must be a number, or an array of shape {allowed}, since q has shape "
-            f"{q.shape}; got shape {value.shape}."
+            f"{name} must be a number or an array of shape {choices}, for q of shape {q.shape}, "
+            f"got shape {value.shape}."
         ) from None

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from ...base.types import Args, Scalar
 from ...problem.energies import disturbing_work, incoming_energy, outgoing_energy
 from ...problem.system import System, check_system
-from ..functions.generators import Generator, LatticePoint, prolong
+from ..functions.generators import Generator, LatticePoint, prolong, require_bound
 
 Gauge = Callable[..., Any]  # ``G(t, q, p, args)`` → scalar [action] at a lattice point
 
@@ -30,9 +30,9 @@ def lattice_defect(
     check_system(system, "lattice_defect")
     (t_, q_, _), (t0, q0, p0), (t1, q1, p1) = points
     work = disturbing_work(system, t0, t1, q0, q1, p1, epsilon, args)
-    leaving = outgoing_energy(system, t0, t1, q0, p1, epsilon, args)
+    outgoing = outgoing_energy(system, t0, t1, q0, p1, epsilon, args)
     arriving = incoming_energy(system, t_, t0, q_, p0, epsilon, args)
-    return (leaving - arriving - work) / (t1 - t0)
+    return (outgoing - arriving - work) / (t1 - t0)
 
 
 def noether_identity(
@@ -117,16 +117,13 @@ class AdiabaticInvariant(eqx.Module):
     epsilon: Any = None
 
     def __check_init__(self):
-        given = self.generators, self.gauges
-        sizes = [len(x) if isinstance(x, list | tuple) else 0 for x in given]
-        if sizes[0] != sizes[1] or not all(sizes):
-            kinds = " and ".join(
-                f"a {type(x).__name__}" + (f" of length {n}" if isinstance(x, list | tuple) else "")
-                for x, n in zip(given, sizes, strict=True)
-            )
+        lists = self.generators, self.gauges
+        sizes = [len(x) if isinstance(x, list | tuple) else 0 for x in lists]
+        if sizes[0] != sizes[1] or 0 in sizes:
             raise ValueError(
-                "generators and gauges must be lists of the same length, one entry for each order. "
-                f"They must not be empty. Got {kinds}. Use None for a gauge that is zero."
+                "generators and gauges must be lists of one entry for each order, the same number "
+                f"in both, got {' and '.join(type(x).__name__ for x in lists)} of {sizes} entries: "
+                "a gauge that is zero is None."
             )
 
     @property
@@ -139,13 +136,8 @@ class AdiabaticInvariant(eqx.Module):
         return AdiabaticInvariant(self.generators, self.gauges, system, epsilon)
 
     def __call__(self, t0, t1, q0, p0, q1, p1, args):
-        if self.system is None:
-            raise ValueError(
-                "an AdiabaticInvariant must have a system and ε before it is called. Call "
-                "invariant.bind(system, epsilon)(...), or pass the invariant to dvi.integrate as "
-                "observe."
-            )
-        energy = incoming_energy(self.system, t0, t1, q0, p1, self.epsilon, args)
+        system = require_bound(self, "system", self.system)
+        energy = incoming_energy(system, t0, t1, q0, p1, self.epsilon, args)
         end = LatticePoint(t1, q1, p1)
         total = jnp.zeros((), q1.dtype)
         for m, (generator, gauge) in enumerate(zip(self.generators, self.gauges, strict=True)):

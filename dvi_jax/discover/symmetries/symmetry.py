@@ -5,10 +5,10 @@ from collections.abc import Iterator
 import equinox as eqx
 import numpy as np
 
-from ..algebra.nullspace import CLEAR, in_units_of
+from ..algebra.nullspace import in_units_of
 from ..functions.basis import BoundBasis
 from ..functions.generators import Generator
-from ..invariants.expansions import Larger, grown
+from ..invariants.expansions import Larger, growth_note, unreliable
 from ..invariants.series import in_powers_of_epsilon
 from .gauge import BasisGauge
 from .noether import AdiabaticInvariant
@@ -87,18 +87,18 @@ class Symmetry(eqx.Module):
         """The symmetry, its kind, residuals and gauge, as lines of text."""
         kind = "variational" if self.is_variational else "conformal only"
         mark = ", dependent" if self.is_dependent else ""
-        half, most = np.max(self.typical_residuals, axis=0)
+        half, nearly_all = np.max(self.typical_residuals, axis=0)
         lines = [
             f"  {self}",
             f"      {kind}{mark}; residuals on held-out samples: median {half:.1e}, 95 % below "
-            f"{most:.1e}, largest {np.max(self.residuals):.1e}; of Noether's identity "
+            f"{nearly_all:.1e}, largest {np.max(self.residuals):.1e}; of Noether's identity "
             f"{np.max(self.identity_residuals):.1e}",
         ]
         if self.gauges is not None:
             gauges = np.stack([np.asarray(g.coefficients) for g in self.gauges])
             shares = _shares(gauges, self.scale, self.gauge_sizes)
-            others = _shares(self.coefficients, self.scale, self.sizes)
-            largest = max(np.max(shares, initial=0.0), np.max(others))
+            field_shares = _shares(self.coefficients, self.scale, self.sizes)
+            largest = max(np.max(shares, initial=0.0), np.max(field_shares))
             gauges = np.where(shares > _ROUND_OFF * largest, gauges, 0.0)
             lines.append(f"      gauge G = {_series(self.gauges[0].basis, gauges)}")
             if self.moves_time:
@@ -160,12 +160,12 @@ class Symmetries(eqx.Module):
     @property
     def variational(self) -> tuple[Symmetry, ...]:
         """Those whose Noether identity closes."""
-        return tuple(s for s in self.found if s.is_variational)
+        return tuple(symmetry for symmetry in self.found if symmetry.is_variational)
 
     @property
     def conformal(self) -> tuple[Symmetry, ...]:
         """Those that are conformal only."""
-        return tuple(s for s in self.found if not s.is_variational)
+        return tuple(symmetry for symmetry in self.found if not symmetry.is_variational)
 
     @property
     def order(self) -> int:
@@ -180,22 +180,18 @@ class Symmetries(eqx.Module):
     @property
     def warnings(self) -> tuple[str, ...]:
         """Reasons why the result is not reliable, each with a remedy; empty if it is reliable."""
-        reasons = []
-        if self.survivors[0] and self.gap < CLEAR:
-            reasons.append("the gap is not clear: take more samples, or others")
-        if self.undecided:
-            reasons.append(
-                f"{self.undecided} vector fields change in a step by hardly more than rounding: "
-                "whether they are symmetries cannot be decided in this arithmetic; take another "
-                "h, samples that spread wider, or an origin among them"
-            )
+        reasons = unreliable(
+            self,
+            "take more samples, or others",
+            "vector fields change in a step by hardly more than rounding: whether they are "
+            "symmetries",
+        )
         if self.null > _COARSE:
             reasons.append(
                 f"what breaks a symmetry by less than {self.null:.0e} cannot be decided in this "
                 "arithmetic: the step is small, the samples lie far from the origin, or the "
                 "tolerance is large"
             )
-        reasons += filter(None, (other.warning(self.survivors[0]) for other in self.larger))
         return tuple(reasons)
 
     def __len__(self) -> int:
@@ -209,18 +205,18 @@ class Symmetries(eqx.Module):
 
     def __str__(self) -> str:
         count = len(self.found)
+        numbers = ", ".join(f"{m}: {n}" for m, n in enumerate(self.survivors))
         lines = [
             f"{count} symmetr{'y' if count == 1 else 'ies'} of order {self.order} in "
             f"{self.basis.size} functions for each component: {len(self.variational)} variational, "
-            f"{len(self.conformal)} conformal only; number at order "
-            f"{', '.join(f'{m}: {n}' for m, n in enumerate(self.survivors))}; the smallest "
+            f"{len(self.conformal)} conformal only; number at order {numbers}; the smallest "
             f"singular value of all other fields is {self.gap:.1e} times as large"
         ]
         lines += [f"  {warning}" for warning in self.warnings]
         if not count and self.survivors[0]:
             lines.append("  what order 0 has does not go on: a lower order, or a larger basis?")
         for symmetry, power in zip(self.found, self.powers, strict=True):
-            lines += [*symmetry.report(), *grown("residuals grow", power)]
+            lines += [*symmetry.report(), *growth_note("residuals grow", power)]
         dependent = sum(s.is_dependent for s in self.found)
         if dependent:
             lines.append(

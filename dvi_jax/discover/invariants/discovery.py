@@ -1,11 +1,11 @@
 """What discovery returns: the invariants, what is lost, and a report; saved and loaded."""
 
 import dataclasses
+import itertools
 import os
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -13,16 +13,16 @@ from jaxtyping import Array
 from ...base.files import publish_npz, read_npz
 from ...base.precision import refuse_double_without_x64
 from ...base.types import State
-from ..algebra.nullspace import CLEAR
 from ..functions.basis import AbstractBasis, BoundBasis, bind_basis
-from ..functions.sampling import Samples
+from ..functions.sampling import SamplePoints, values_at
 from .energy import Energy
-from .expansions import Larger
+from .expansions import Larger, unreliable
 from .obstructions import DriftLaw
 from .report import report
 from .series import InvariantSeries
 
 _ILL = 1e8  # Condition number of a basis from which on formulas have lost half of their digits
+_FORMAT = 2  # Of a file
 
 
 class Discovery(eqx.Module):
@@ -113,7 +113,7 @@ class Discovery(eqx.Module):
     sizes: np.ndarray
     condition: float = eqx.field(static=True)
     scale: float = eqx.field(static=True)
-    probe: Samples
+    probe: SamplePoints
     shape: tuple[int, ...] = eqx.field(static=True)
     slow_time: bool = eqx.field(static=True)
     tolerance: float | None = eqx.field(static=True)
@@ -155,30 +155,25 @@ class Discovery(eqx.Module):
 
     def _series(self, coefficients: Array, errors: Any) -> list[InvariantSeries]:
         return [
-            InvariantSeries(self.inner, c, self.slow_time, sizes=self.sizes, errors=error)
-            for c, error in zip(coefficients, errors, strict=True)
+            InvariantSeries(self.inner, series, self.slow_time, sizes=self.sizes, errors=error)
+            for series, error in zip(coefficients, errors, strict=True)
         ]
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Reasons why the result is not reliable, each with a remedy; empty if it is reliable."""
-        reasons = []
-        if self.survivors[0] and self.gap < CLEAR:
-            reasons.append("the gap is not clear: let drift_order on a long run decide")
+        reasons = unreliable(
+            self,
+            "let drift_order on a long run decide",
+            "combinations of the functions change in a step by less than 1000 times their "
+            "rounding, or by hardly more than it: whether they are conserved",
+        )
         if self.impossible:
             reasons.append(
                 "as many independent invariants as coordinates were found, which is impossible "
                 "for a map that moves: none is reported; take a smaller tolerance, or samples "
                 "where functions change clearly in a step"
             )
-        if self.undecided > 0:
-            reasons.append(
-                f"{self.undecided} combinations of the functions change in a step by less than "
-                "1000 times their rounding, or by hardly more than it: whether they are conserved "
-                "cannot be decided in this arithmetic; take another h, samples that spread wider, "
-                "or an origin among them"
-            )
-        reasons += filter(None, (other.warning(self.survivors[0]) for other in self.larger))
         if self.condition > _ILL:
             reasons.append(
                 f"the basis is ill-conditioned on the samples ({self.condition:.0e}): formulas "
@@ -193,17 +188,20 @@ class Discovery(eqx.Module):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write everything but the basis functions themselves to a file (NumPy's npz)."""
-        laws = [
-            {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in law._asdict().items()}
+        plain, names = _fields()
+        header = {name: getattr(self, name) for name in plain}
+        header["names"] = self.basis.names
+        header["obstructions"] = [
+            {
+                name: value.tolist() if isinstance(value, np.ndarray) else value
+                for name, value in law._asdict().items()
+            }
             for law in self.obstructions
         ]
-        plain, names = _fields()
-        about = {name: getattr(self, name) for name in plain}
-        about |= {"names": self.basis.names, "obstructions": laws}
         arrays: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in names}
-        arrays |= {f"probe_{name}": x for name, x in self.probe._asdict().items()}
-        arrays["probe_values"] = _probed(self.basis, self.probe)
-        publish_npz(path, _FORMAT, about, arrays)
+        arrays |= {f"probe_{name}": value for name, value in self.probe._asdict().items()}
+        arrays["probe_values"] = values_at(self.basis, self.probe)
+        publish_npz(path, _FORMAT, header, arrays)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], basis: AbstractBasis) -> "Discovery":
@@ -213,64 +211,57 @@ class Discovery(eqx.Module):
         something else, or another basis.
         """
         refuse_double_without_x64("a saved Discovery", np.float64)
-        about, found = read_npz(path, _FORMAT, "discovery")
+        header, arrays = read_npz(path, _FORMAT, "discovery")
         plain, names = _fields()
-        try:
-            arrays: dict[str, Any] = {name: found[name] for name in names}
-            probe = Samples(*(found[f"probe_{name}"] for name in Samples._fields))
-            values = found["probe_values"]
-        except KeyError as error:
+        probe_names = [f"probe_{name}" for name in SamplePoints._fields]
+        entries = [*plain, "names", "obstructions", *names, *probe_names, "probe_values"]
+        if gaps := [name for name in entries if name not in header | arrays]:
             raise ValueError(
-                f"path must be a file of Discovery.save, but {os.fspath(path)} has no array "
-                f"{error}. Check the path, or repeat the search and save it."
-            ) from error
-        bound = bind_basis(basis, tuple(about["shape"]))
-        inner, to_basis = bound.about(arrays["middle"])
-        own, saved = list(bound.names), about["names"]
-        if own != saved:
-            pairs = enumerate(zip(own, saved, strict=False))
-            i = next((i for i, (a, b) in pairs if a != b), min(len(own), len(saved)))
-            there, here = (repr(x[i]) if i < len(x) else "missing" for x in (saved, own))
-            raise ValueError(
-                f"basis must be the basis of the search saved in {os.fspath(path)}. The number of "
-                f"functions is {len(saved)} in the file and {len(own)} in basis. The function with "
-                f"index {i} is {there} in the file and {here} in basis."
+                f"path must be a file of Discovery.save, but {os.fspath(path)} has no {gaps[0]!r}: "
+                "check the path, or repeat the search and save it."
             )
-        differs = ~np.isclose(_probed(bound, probe), values, rtol=1e-9)
-        if differs.any():
-            raise ValueError(
-                f"basis must be the basis of the search saved in {os.fspath(path)}, but the values "
-                f"of {bound.names[int(np.argmax(differs.any(axis=0)))]!r} differ from those saved. "
-                "Define this function as in the search."
-            )
-        for name in ("inner_coefficients", "inner_dependent"):
-            arrays[name] = jnp.asarray(arrays[name])
-        given = {k: tuple(v) if isinstance(v, list) else v for k, v in about.items() if k in plain}
-        if about["energy"]:
-            given["energy"] = Energy(*about["energy"])
-        given["larger"] = tuple(Larger(*x) for x in about["larger"])
-        laws: list[dict[str, Any]] = [
-            {k: np.array(v) if isinstance(v, list) else v for k, v in law.items()}
-            for law in about["obstructions"]
+        bound = bind_basis(basis, tuple(header["shape"]))
+        inner, to_basis = bound.recentre(arrays["middle"])
+        probe = SamplePoints(*(arrays[name] for name in probe_names))
+        pairs = itertools.zip_longest(header["names"], bound.names, fillvalue="no function")
+        differences = [
+            f"the function with index {i}, {name!r} there and {bound_name!r} here"
+            for i, (name, bound_name) in enumerate(pairs)
+            if name != bound_name
         ]
-        given["obstructions"] = tuple(DriftLaw(**law) for law in laws)
-        return cls(basis=bound, inner=inner, to_basis=to_basis, probe=probe, **given, **arrays)
+        if not differences:
+            is_close = np.isclose(values_at(bound, probe), arrays["probe_values"], rtol=1e-9)
+            places = np.flatnonzero(~is_close.all(axis=0))
+            differences = [f"the values of {bound.names[j]!r}" for j in places]
+        if differences:
+            raise ValueError(
+                f"basis must be that of the search in {os.fspath(path)}, of {len(header['names'])} "
+                f"functions, got {bound.size} functions, which differ in {differences[0]}."
+            )
+        fields: dict[str, Any] = {name: arrays[name] for name in names}
+        for name in ("inner_coefficients", "inner_dependent"):
+            fields[name] = jnp.asarray(fields[name])
+        fields |= {name: _convert(header[name], tuple) for name in plain}
+        fields["energy"] = Energy(*header["energy"]) if header["energy"] else None
+        fields["larger"] = tuple(Larger(*entry) for entry in header["larger"])
+        fields["obstructions"] = tuple(
+            DriftLaw(**{name: _convert(value, np.array) for name, value in law.items()})
+            for law in header["obstructions"]
+        )
+        return cls(basis=bound, inner=inner, to_basis=to_basis, probe=probe, **fields)
 
     def __str__(self) -> str:
         return report(self)
 
 
+def _convert(value: Any, kind: Any) -> Any:
+    """A list of a file as a tuple or an array; other values as they are."""
+    return kind(value) if isinstance(value, list) else value
+
+
 def _fields() -> tuple[list[str], list[str]]:
     """Names of the fields that are plain values in a file, and of those that are arrays."""
-    apart = ("obstructions", "basis", "inner", "to_basis", "probe")
-    fields = [f for f in dataclasses.fields(Discovery) if f.name not in apart]
-    plain = [f.name for f in fields if f.metadata.get("static")]
-    return plain, [f.name for f in fields if f.name not in plain]
-
-
-_FORMAT = 2
-
-
-def _probed(basis: BoundBasis, probe: Samples) -> np.ndarray:
-    """The functions at some points, shape (points, size)."""
-    return np.asarray(jax.vmap(basis)(*map(jnp.asarray, probe)))
+    special = ("obstructions", "basis", "inner", "to_basis", "probe")
+    fields = [field for field in dataclasses.fields(Discovery) if field.name not in special]
+    plain = [field.name for field in fields if field.metadata.get("static")]
+    return plain, [field.name for field in fields if field.name not in plain]
