@@ -20,6 +20,7 @@ from ..integration.arithmetic import DoubleDouble, FixedPoint, FloatingPoint
 from ..integration.integrator import Integrator, chosen, only
 from ..methods.step import Equations
 from ..problem.system import System, check_system, of_problem
+from .comparison import compare, random_points
 from .components import Unsupported, program_of
 from .confinement import confine
 from .rational import ExactInvariant
@@ -140,12 +141,12 @@ def bound_drift(
     strengths = _interval("epsilon", epsilon)
     times = None if time is None else _interval("time", time)
     functions = _functions(found, system, time is not None)
-    step_map, programs = _step_of(system, integrator_used, shape, args, h, times)
+    points = _points_of(shape, (lower, upper), times, strengths, h, inside)
+    step_map, programs = _step_of(system, integrator_used, shape, args, h, times, points)
     digits = (
         "pairs of float64" if isinstance(integrator_used.arithmetic, DoubleDouble) else "float64"
     )
-    numbers = [shape, shape, (), (), ()]
-    invariants = [_program(f"the invariant {name}", f, numbers, 0) for f, name in functions]
+    invariants = [_program(f"the invariant {name}", f, points[:5], 0) for f, name in functions]
     n, t = len(lower) // 2, ["input", len(lower)]
     certificate = {
         "format": exact.FORMAT,
@@ -156,7 +157,7 @@ def bound_drift(
         "slow": system.slow_time,
         "timed": any(t in p["operations"] for p in (programs["step"], *invariants)),
         "domain": [[x.hex() for x in side] for side in (lower, upper)],
-        "inside": _program("inside", inside or (lambda q, p: jnp.zeros(0)), [shape, shape], None),
+        "inside": _program("inside", inside or (lambda q, p: jnp.zeros(0)), points[:2], None),
         "invariants": invariants,
         "arithmetic": digits,
         "bits": 100,
@@ -217,8 +218,32 @@ class _WithErrors(Equations):
         return h * rate + self.error
 
 
+def _points_of(
+    shape: Any, sides: tuple, times: tuple | None, strengths: tuple, h: float, inside: Any
+) -> list[np.ndarray]:
+    """Points (q, p, t, ε, h, error of an increment) of the domain for comparisons."""
+    (q_low, p_low), (q_high, p_high) = (np.reshape(side, (2, *shape)) for side in sides)
+    times = times or (0.0, 0.0)
+    ends = [(q_low, q_high), (p_low, p_high), times, strengths, (h, h), (-1e-9, 1e-9)]
+    if inside is None:
+        return random_points(ends)
+    points = random_points(ends, lambda q, p, *_: jnp.all(jnp.asarray(inside(q, p)) >= 0))
+    if not len(points[0]):
+        raise ProofError(
+            "inside(q, p) must be ≥ 0 for some states of the domain, but is negative for all of "
+            "4096 random ones. Use a smaller domain around them."
+        )
+    return points
+
+
 def _step_of(
-    system: System, integrator: Integrator, shape: Any, args: Any, h: float, times: tuple | None
+    system: System,
+    integrator: Integrator,
+    shape: Any,
+    args: Any,
+    h: float,
+    times: tuple | None,
+    points: list[np.ndarray],
 ) -> tuple[Callable, dict[str, Any]]:
     """The step, a function of (q, p, t, ε, h), and what the certificate has about it: the list of
     operations, of (q0, p0), or of (q0, p1) if it is implicit. Without `times` it is that at t = 0.
@@ -257,8 +282,9 @@ def _step_of(
     interval_or_map = (
         step_map if times else lambda q, p, t, *numbers: step_map(q, p, zero, *numbers)
     )
-    shapes = [shape, shape, *[()] * (4 if quantum else 3)]
-    program = _program("the step of the system", interval_or_map, shapes, None)
+    program = _program(
+        "the step of the system", interval_or_map, points[: 6 if quantum else 5], None
+    )
     return step_of_states, {
         "step": program,
         "implicit": not explicit,
@@ -318,8 +344,10 @@ def _functions(invariants: Any, system: System, with_time: bool) -> list[tuple[C
     return pairs
 
 
-def _program(subject: str, function: Callable, shapes: list, ndim: int | None) -> dict[str, Any]:
-    """The operations of a function, whose result must have so many axes (None: any)."""
+def _program(subject: str, function: Callable, points: list, ndim: int | None) -> dict[str, Any]:
+    """The operations of a function, whose result must have so many axes (None: any), compared with
+    the function at points."""
+    shapes = [column.shape[1:] for column in points]
     structs = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes]
     result = jax.eval_shape(function, *structs)
     if ndim is not None and getattr(result, "ndim", None) != ndim:
@@ -329,9 +357,11 @@ def _program(subject: str, function: Callable, shapes: list, ndim: int | None) -
         )
         raise ValueError(f"{subject} must return one number, got {description}.")
     try:
-        return program_of(function, *shapes)
+        program = program_of(function, *shapes)
     except Unsupported as error:
         raise Unsupported(f"{subject}: {error}") from None
+    compare(subject, function, program, points)
+    return program
 
 
 def _takes(function: Callable, count: int) -> bool:

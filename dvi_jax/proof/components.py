@@ -4,6 +4,10 @@ The list is what a certificate contains: it is read from the jaxpr of the packag
 that a user writes no second definition of the system. Operations that only move numbers (slices,
 reshapes, gathers) disappear; what remains are sums, products, quotients, integer powers and
 elementary functions. Those of constants remain, too, where float64 would round the result.
+
+What the list cannot express is refused by name: a number of the state that is converted to another
+type, an index or a condition that is computed from the state, any other operation. The module
+`comparison` compares the list with the function afterwards.
 """
 
 import math
@@ -22,8 +26,14 @@ UNARY = ("exp", "log", "sin", "cos", "tan", "atan", "asin", "acos", "sqrt")
 _MOVES = (
     "reshape", "broadcast_in_dim", "squeeze", "transpose", "slice", "rev", "concatenate", "gather",
     "dynamic_slice", "pad", "select_n", "dynamic_update_slice", "scatter", "split",
-    "stack", "unstack", "copy", "copy_p", "reduce_precision", "optimization_barrier",
+    "stack", "unstack", "copy", "copy_p", "optimization_barrier",
 )  # fmt: skip
+_SUMS = ("scatter-add", "cumsum", "reduce_window_sum")
+_INDICES = {
+    "gather": (1,), "scatter": (1,), "scatter-add": (1,), "select_n": (0,),
+    "dynamic_slice": range(1, 99), "dynamic_update_slice": range(2, 99),
+}  # fmt: skip
+"""Operands that say where numbers go, and are not such numbers themselves."""
 _CALLS = ("pjit", "jit", "closed_call", "core_call", "remat", "checkpoint", "custom_jvp_call",
           "custom_vjp_call", "custom_lin")  # fmt: skip
 
@@ -48,6 +58,8 @@ class Program:
         return Scalar(self, self._numbers[key])
 
     def constant(self, value: float) -> "Scalar":
+        if not math.isfinite(value):
+            return self.write("unknown", f"the constant {float(value)}")
         scalar = self.write("constant", float(value).hex())
         self.constants[scalar.index] = float(value)
         return scalar
@@ -237,24 +249,46 @@ def _apply(program: Program, equation: Any, values: list) -> list:
         return _evaluate(program, inner, [], values)
     if name == "scan":
         return _scan(program, params, values)
-    if name == "cond" and not _is_symbolic(values[0]):
-        branch = params["branches"][int(values[0])]
-        return _evaluate(program, branch.jaxpr, branch.consts, values[1:])
     values = [_concrete(v) for v in values]
-    rounds = name in _ROUNDING_OPERATIONS and equation.outvars[0].aval.dtype == jnp.float64
+    if name == "cond" and not _is_symbolic(values[0]):
+        branches = params["branches"]
+        branch = branches[min(max(int(values[0]), 0), len(branches) - 1)]
+        return _evaluate(program, branch.jaxpr, branch.consts, values[1:])
+    rounds = name in _ROUNDING_OPERATIONS and any(
+        jnp.issubdtype(v.aval.dtype, jnp.inexact) for v in equation.outvars
+    )
     if not (rounds or any(map(_is_symbolic, values))):
         out = equation.primitive.bind(*map(jnp.asarray, values), **params)
         return list(out) if equation.primitive.multiple_results else [out]
-    if name in _MOVES and not (name == "select_n" and _is_symbolic(values[0])):
+    obstacle = _obstacle(equation, values)
+    if not obstacle and name in _MOVES:
         return _rearrange(program, equation, values)
-    if name == "convert_element_type":
+    if not obstacle and name == "convert_element_type":
         return [values[0]]
-    array = _arithmetic(program, equation, [_symbolic(program, v) for v in values], values)
+    array = None
+    if not obstacle:
+        arrays = [_symbolic(program, v) for v in values]
+        array = _arithmetic(program, equation, arrays, values)
     if array is None:  # which is an error only if an output needs it: a status does not
-        placeholder = program.write("unknown", name)
+        placeholder = program.write("unknown", obstacle or name)
         shapes = [v.aval.shape for v in equation.outvars]
         return [_array([placeholder] * int(np.prod(shape)), shape) for shape in shapes]
     return [array]
+
+
+def _obstacle(equation: Any, values: list) -> str:
+    """Why an operation of numbers of the state is not one of float64, or moves them to computed
+    places; empty if neither."""
+    name = equation.primitive.name
+    types = {str(v.aval.dtype) for v in equation.outvars} - {"float64"}
+    if name == "convert_element_type":
+        types |= {str(equation.invars[0].aval.dtype)} - {"float64"}
+        return f"a conversion to or from {', '.join(sorted(types))}" if types else ""
+    if types:
+        return f"{name} with a result of type {', '.join(sorted(types))}"
+    if any(_is_symbolic(v) for i, v in enumerate(values) if i in _INDICES.get(name, ())):
+        return name if name == "select_n" else f"{name} with computed indices"
+    return ""
 
 
 def _arithmetic(program: Program, equation: Any, arrays: list, values: list) -> np.ndarray | None:
@@ -282,7 +316,7 @@ def _arithmetic(program: Program, equation: Any, arrays: list, values: list) -> 
         return _array([combine(column) for column in flat.T], shape)
     if name == "dot_general":
         return _dot(params["dimension_numbers"], *arrays).reshape(shape)
-    if name in ("scatter-add", "cumsum", "reduce_window_sum"):
+    if name in _SUMS:
         return _linear(program, equation, values)
     return None
 
@@ -339,37 +373,41 @@ def _dot(dimensions: Any, a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def _rearrange(program: Program, equation: Any, values: list) -> list:
     """Apply an operation that only moves numbers to their places in a list."""
-    table: list[Any] = [program.constant(0.0)]
-    arguments = []
-    for atom, value in zip(equation.invars, values, strict=True):
-        if _is_symbolic(value) or atom.aval.dtype == equation.outvars[0].aval.dtype:
-            flat = _symbolic(program, value)
-            arguments.append(jnp.arange(len(table), len(table) + flat.size).reshape(flat.shape))
-            table.extend(flat.ravel())
+    name, params = equation.primitive.name, dict(equation.params)
+    # Places are integers. At place 0 is the number with which a gather fills what is out of range.
+    table: list[Any] = [program.write("unknown", f"{name} with an index out of range")]
+    if params.get("fill_value") is not None:
+        table = [program.constant(params["fill_value"])]
+    params |= {"fill_value": 0} if "fill_value" in params else {}
+    places = []
+    for i, value in enumerate(values):
+        if i in _INDICES.get(name, ()):
+            places.append(jnp.asarray(value))
         else:
-            arguments.append(jnp.asarray(value))
-    # Places are integers; 0 is the place of the number 0, with which a gather or a pad fills.
-    params = {k: v for k, v in equation.params.items() if k not in ("fill_value",)}
-    if "fill_value" in equation.params:
-        params["fill_value"] = 0
-    out = equation.primitive.bind(*arguments, **params)
-    places = out if equation.primitive.multiple_results else [out]
-    return [_array([table[i] for i in np.asarray(x).ravel()], x.shape) for x in places]
+            flat = _symbolic(program, value)
+            places.append(jnp.arange(len(table), len(table) + flat.size).reshape(flat.shape))
+            table.extend(flat.ravel())
+    out = equation.primitive.bind(*places, **params)
+    results = out if equation.primitive.multiple_results else [out]
+    return [_array([table[i] for i in np.asarray(x).ravel()], x.shape) for x in results]
 
 
 def _linear(program: Program, equation: Any, values: list) -> np.ndarray:
-    """An operation that is linear in its symbolic arguments, by its effect on each number."""
+    """An operation that is linear in all its numbers, by its effect on each of them."""
+    indices = _INDICES.get(equation.primitive.name, ())
+    zeros = [np.asarray(v) if i in indices else np.zeros(np.shape(v)) for i, v in enumerate(values)]
     parts, shape = [], equation.outvars[0].aval.shape
-    symbolic = [i for i, v in enumerate(values) if _is_symbolic(v)]
-    for i in symbolic:
-        for place in np.ndindex(values[i].shape):
-            units = [
-                np.zeros(np.shape(v)) if j in symbolic else np.asarray(v)
-                for j, v in enumerate(values)
-            ]
+    for i, value in enumerate(values):
+        if i in indices:
+            continue
+        scalars = _symbolic(program, value)
+        for place in np.ndindex(scalars.shape):
+            if scalars[place].value == 0:
+                continue
+            units = [x.copy() for x in zeros]
             units[i][place] = 1.0
             out = equation.primitive.bind(*map(jnp.asarray, units), **equation.params)
-            parts.append((values[i][place], np.asarray(out)))
+            parts.append((scalars[place], np.asarray(out)))
     zero = program.constant(0.0)
     sums = [
         total([zero, *(x * float(m.ravel()[k]) for x, m in parts if m.ravel()[k])])
