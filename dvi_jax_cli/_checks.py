@@ -74,11 +74,15 @@ def verify(
     certificate: Annotated[
         Path, typer.Argument(metavar="CERTIFICATE", help="A file of DriftBound.save.")
     ],
+    max_seconds: Annotated[
+        float, typer.Option(min=0.0, help="Time after which the check is given up.")
+    ] = 60.0,
 ) -> None:
     """Check a certificate of `bound_drift` with a small program of its own.
 
-    It evaluates every box of the proof again, with python-flint and without JAX. Exit code 0: the
-    bounds are proved. 1: they are not; the message says where. 2: there is no such file.
+    It evaluates every box of the proof again, with python-flint and without JAX, in at most 1 GiB.
+    Exit code 0: the bounds are proved. 1: they are not; the message says where. 2: there is no such
+    file.
 
     Examples
         dvi-jax verify bound.json
@@ -86,7 +90,7 @@ def verify(
     require_file("CERTIFICATE", certificate, "a file that DriftBound.save wrote")
     from .work.verify import verify_certificate
 
-    contents, message = verify_certificate(certificate)
+    contents, message = verify_certificate(certificate, max_seconds)
     if not message:
         session.line(f"proved: {contents['proved']}")
     session.finish(contents, message)

@@ -204,7 +204,7 @@ def test_rounding_on_a_grid_is_bounded():
         worst = max(worst, abs(float(values[0] - values[1])))
     assert bound.rounding[0] / 3 < worst <= bound.rounding[0] < 6e-10
     assert "on a grid of 9.31" in str(bound)
-    assert f"on a grid of {2.0**-30}" in exact.check(bound.certificate)
+    assert f"multiples of {2.0**-30}" in exact.check(bound.certificate)
 
 
 def test_rounding_in_pairs_is_bounded():
@@ -328,7 +328,7 @@ def test_a_map_that_depends_on_a_slow_time():
     assert "τ in [0, 3]" in str(bound)
     # The interval of τ ends after 3/(0.01·0.1) steps.
     assert bound.steps == min(3000, int(1e-3 / (bound.per_step[0] + bound.rounding[0])))
-    assert "the domain is not left" in exact.check(bound.certificate)
+    assert "stay there for" in exact.check(bound.certificate)
     longer = copy.deepcopy(bound.certificate)
     longer["steps"] = 3001
     longer["hash"] = exact.digest(longer)
@@ -555,6 +555,14 @@ def test_constants_are_not_rounded():
 # --- the certificate -----------------------------------------------------------------------------
 
 
+def is_accepted(certificate):
+    """Whether the checker proves something from it; any error is a refusal."""
+    try:
+        return bool(exact.check(certificate))
+    except Exception:
+        return False
+
+
 def mutations(c):
     """Name → a certificate with one thing changed."""
 
@@ -613,7 +621,7 @@ def mutations(c):
 
 def test_a_changed_certificate_fails(cubic):
     c = cubic.certificate
-    assert "the domain is not left" in exact.check(c)
+    assert "stay there for" in exact.check(c)
     changed = mutations(c)
     assert len(changed) >= 25
     for name, certificate in changed.items():
@@ -621,8 +629,7 @@ def test_a_changed_certificate_fails(cubic):
             exact.check(certificate)
         # Also if the hash is computed again.
         certificate["hash"] = exact.digest(certificate)
-        with pytest.raises((exact.Failed, *exact.MALFORMED)):
-            print(name, exact.check(certificate))
+        assert not is_accepted(certificate), name
 
 
 def test_the_checker_is_a_small_program_of_its_own(cubic, tmp_path):

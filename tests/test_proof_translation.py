@@ -92,7 +92,7 @@ REFUSED = {
     "slice at a computed place": (
         lambda x: jax.lax.dynamic_slice(x, ((x[0] * 2).astype(int),), (1,)), "indices"),
     "update at a computed place": (
-        lambda x: jax.lax.dynamic_update_slice(x, x[:1] ** 2, ((x[0] * 2).astype(int),)), "indices"),
+        lambda x: jax.lax.dynamic_update_slice(x, x[:1] ** 2, (x[0].astype(int),)), "indices"),
     "addition at a computed place": (lambda x: x.at[(x[0] * 2).astype(int)].add(1.0), "indices"),
     "largest": (lambda x: x * jnp.argmax(x), "int"),
     "index out of range": (

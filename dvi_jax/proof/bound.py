@@ -164,6 +164,8 @@ def bound_drift(
         "orders": 24 if n < 2 else 10 if n < 3 else 8,  # of the expansion of a function
         "accepted": (_RESIDUAL[digits] * max(map(abs, (*lower[n:], *upper[n:])))).hex(),
         "spread": [(0.0).hex()] * n,
+        "start": (times or (0.0, 0.0))[0].hex(),
+        "example": [float(x).hex() for x in np.concatenate([np.ravel(x[0]) for x in points[:4]])],
     }
     if certificate["implicit"]:
         sides = lower, upper

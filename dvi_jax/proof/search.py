@@ -146,7 +146,9 @@ def resolve(checker: Any, changes: list[float], ratio: float) -> None:
             return
         bits_before, checker.bits = checker.bits, bits[0]
         finer = examine(checker, leaf.box, rng)
-        if any(finer.remainders[k] > leaf.remainders[k] / 4 for k in open_invariants):
+        if finer.failure or any(
+            finer.remainders[k] > leaf.remainders[k] / 4 for k in open_invariants
+        ):
             # More bits do not help much: the box is too large.
             checker.bits = bits_before
             leaf = _bounded_part(checker, rng, [half(s, rng.random() < 0.5) for s in leaf.box])
@@ -410,7 +412,10 @@ def _claim(checker: Any, level: tuple, root: list, task: tuple[list, bool]) -> t
             return claim, 0
     if low:
         return "", _widest(box, root)
-    algebra, value = exact.combination_model(checker, weights, box)
+    try:
+        algebra, value = exact.combination_model(checker, weights, box)
+    except SINGULAR:
+        return "", _widest(box, root)
     return "above" * (algebra.range(value)[0] > limit), int(np.argmax(_shares(value, len(box))))
 
 
