@@ -102,11 +102,11 @@ namespace; each is also an attribute of `dvi_jax`."""
 def names() -> list[str]:
     """All names of `dvi_jax` that are objects, aliases left out."""
     package = sys.modules["dvi_jax"]
-    known = {n for n, thing in vars(package).items() if not isinstance(thing, ModuleType)}
-    return sorted(n for n in {*known, *LAZY} - {*ALIASES} if not n.startswith("_"))
+    attributes = {n for n, thing in vars(package).items() if not isinstance(thing, ModuleType)}
+    return sorted(n for n in {*attributes, *LAZY} - {*ALIASES} if not n.startswith("_"))
 
 
-_MEANT = {
+_FOREIGN_NAMES = {
     **dict.fromkeys(("Verlet", "VelocityVerlet"), "StormerVerlet"),
     **dict.fromkeys(("odeint", "solve", "simulate", "diffeqsolve"), "integrate"),
     **{"discretize": "discretise", "TimeGrid": "Uniform"},
@@ -115,10 +115,10 @@ _MEANT = {
 
 
 def _hint(name: str) -> str:
-    if name in _MEANT:
-        return f" Did you mean {_MEANT[name]!r}?"
-    known = {*names(), *ALIASES, *NAMESPACES}
-    close = difflib.get_close_matches(name, known, 1, 0.7)
+    if name in _FOREIGN_NAMES:
+        return f" Did you mean {_FOREIGN_NAMES[name]!r}?"
+    candidates = {*names(), *ALIASES, *NAMESPACES}
+    close = difflib.get_close_matches(name, candidates, 1, 0.7)
     return f" Did you mean {close[0]!r}?" if close else " dir(dvi_jax) lists the main names."
 
 
@@ -129,16 +129,16 @@ class Package(ModuleType):
         if name in NAMESPACES:
             return importlib.import_module(NAMESPACES[name])
         if name in ALIASES:
-            found = getattr(self, ALIASES[name])
+            value = getattr(self, ALIASES[name])
         elif name in LAZY:
-            found = getattr(importlib.import_module(f"{self.__name__}.{LAZY[name]}"), name)
+            value = getattr(importlib.import_module(f"{self.__name__}.{LAZY[name]}"), name)
         else:
             raise AttributeError(
                 f"module {self.__name__!r} has no attribute {name!r}.{_hint(name)}", name=name
             )
         # Stored in the module: `__getattr__` is called for missing names only, so once for each.
-        setattr(self, name, found)
-        return found
+        setattr(self, name, value)
+        return value
 
     def __setattr__(self, name: str, value: object) -> None:
         # An import of the package `dvi_jax.fit` would hide the function `dvi_jax.fit`.
@@ -160,8 +160,8 @@ class Folders(MetaPathFinder, Loader):
         # of `dvi_jax.rings`, with classes that differ from those of the first.
         package, _, name = fullname.partition(".")
         first, _, _ = name.partition(".")
-        elsewhere = NAMESPACES.get(first, f"dvi_jax.{first}") != f"dvi_jax.{first}"
-        return ModuleSpec(fullname, self) if package == "dvi_jax" and elsewhere else None
+        is_alias = NAMESPACES.get(first, f"dvi_jax.{first}") != f"dvi_jax.{first}"
+        return ModuleSpec(fullname, self) if package == "dvi_jax" and is_alias else None
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
         _, first, *inner = spec.name.split(".")

@@ -27,7 +27,7 @@ from .native import handler, machine
 from .pieces import Piece, in_pieces, pieces
 from .targets import TARGETS, compiled
 
-FORMS = ("auto", "components", "arrays", "kernel")
+FORMS = ("auto", "arrays")
 
 SWITCH = "LANEWISE"  # the variable that switches the generator off: ``LANEWISE=off``
 
@@ -40,30 +40,19 @@ class Layout:
 
     - `form`: ``"auto"``: machine code of our own on a CPU, XLA's loops elsewhere and for functions
       that hold something for which no code is generated (see `explain`); ``"arrays"``: XLA's
-      loops, batched by `vmap`. ``"components"`` is an older name of ``"auto"``, and so is
-      ``"kernel"``, of a GPU kernel that was removed.
+      loops, batched by `vmap`.
     - `width`: trajectories of a block, rounded to a power of two that suits the processor; None
       means by the size of the state. No result depends on it.
-    - `library`: has no effect any more; it chose the library's elementary functions.
 
     **Raises** `ValueError` for another form, or a width that is not positive.
     """
 
-    form: Literal["auto", "components", "arrays", "kernel"] = "auto"
+    form: Literal["auto", "arrays"] = "auto"
     width: int | None = None
-    library: bool = False
 
     def __post_init__(self):
         if self.form not in FORMS:
-            raise ValueError(f'form must be "auto", "components" or "arrays", got {self.form!r}.')
-        if self.form == "kernel":
-            warnings.warn(
-                'form="kernel" is deprecated and means form="auto": the Pallas kernel was removed. '
-                'Write Layout(form="auto"). On a GPU, XLA compiles the batch.',
-                DeprecationWarning,
-                stacklevel=3,
-            )
-            object.__setattr__(self, "form", "auto")
+            raise ValueError(f'form must be "auto" or "arrays", got {self.form!r}.')
         width = self.width
         if width is not None and (
             isinstance(width, bool) or not isinstance(width, int) or width < 1

@@ -189,8 +189,8 @@ def test_steps_that_cannot_follow_are_reported():
 @pytest.mark.parametrize(
     ("settings", "says"),
     [
-        ({"method": dvi.TypeII()}, "requires a symmetric method, got TypeII"),
-        ({"method": dvi.RungeKutta4()}, "requires a symmetric method, got RungeKutta4"),
+        ({"method": dvi.TypeII()}, "requires a symmetric method, .* got TypeII"),
+        ({"method": dvi.RungeKutta4()}, "requires a symmetric method, .* got RungeKutta4"),
         ({"arithmetic": dvi.FixedPoint(2.0**-40)}, "AdaptiveReversible.*step sizes are rounded"),
         ({"observe": dvi.MEGNO()}, "does not depend on the state"),
         ({"lattice": dvi.AdaptiveReversible(lambda t, q, p, a: -1.0)}, "of AdaptiveRev.* -1"),
@@ -204,7 +204,10 @@ def test_settings_that_do_not_fit_are_rejected(settings, says):
 
 
 def test_a_speed_must_be_a_function_of_four_arguments():
-    for wrong, says in ((0.5, "must be a function"), (lambda t, q, p: 1.0, "must take four")):
+    for wrong, says in (
+        (0.5, "must be a function"),
+        (lambda t, q, p: 1.0, "must take the arguments"),
+    ):
         with pytest.raises(TypeError, match=says):
             dvi.AdaptiveReversible(wrong)
 

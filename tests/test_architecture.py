@@ -179,15 +179,6 @@ def test_nothing_imports_the_command_line():
     assert users == [ROOT / "__main__.py"]
 
 
-def test_importing_the_package_does_not_import_pydantic():
-    code = "import sys, dvi_jax; assert 'pydantic' not in sys.modules, 'imported'"
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert out.returncode == 0, out.stderr
-    code = "import sys, dvi_jax.run; assert 'pydantic' not in sys.modules, 'imported'"
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert "imported" in out.stderr  # the control: it would be found
-
-
 def test_public_names_exist_and_are_documented():
     undocumented = [name for name in _namespaces.names() if not getattr(dvi, name).__doc__]
     assert undocumented == []

@@ -528,7 +528,7 @@ def test_a_surface_shows_zeros_failures_and_limits():
         ({"h": [0.1, 0.2]}, "h must be one number"),
         ({"starts": (np.ones((3, 1)), np.ones((2, 1)))}, "the same shape"),
         ({"starts": (0.1, 0.1)}, "initial conditions along the first axis"),
-        ({"starts": (np.array([[0.1], [np.nan]]), np.ones((2, 1)))}, "not finite at index"),
+        ({"starts": (np.array([[0.1], [np.nan]]), np.ones((2, 1)))}, "finite, got nan at index"),
         ({"observable": lambda t0, t1, q0, p0, q1, p1, args: q1}, "must return a scalar"),
     ],
 )

@@ -38,19 +38,13 @@ def test_solve_pivots(solve, n):
     assert not np.allclose(_eliminate_without_pivoting(A, b), b[::-1])  # as without it
 
 
+@np.errstate(all="ignore")
 def _eliminate_without_pivoting(A, b):
-    A, b = A.copy(), b.copy()
-    n = len(b)
-    with np.errstate(all="ignore"):
-        for c in range(n):
-            for i in range(c + 1, n):
-                f = A[i, c] / A[c, c]
-                A[i] -= f * A[c]
-                b[i] -= f * b[c]
-        x = np.zeros(n)
-        for i in reversed(range(n)):
-            x[i] = (b[i] - A[i, i + 1 :] @ x[i + 1 :]) / A[i, i]
-    return x
+    if len(b) == 1:
+        return b / A[0]
+    f = A[1:, 0] / A[0, 0]
+    x = _eliminate_without_pivoting(A[1:, 1:] - np.outer(f, A[0, 1:]), b[1:] - f * b[0])
+    return np.append((b[0] - A[0, 1:] @ x) / A[0, 0], x)
 
 
 @EACH

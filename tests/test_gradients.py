@@ -261,7 +261,7 @@ def test_second_derivatives_in_every_combination_of_modes():
         np.testing.assert_allclose(second(outer, inner, "Reversible"), direct, rtol=1e-10)
 
 
-@pytest.mark.parametrize("form", ["arrays", pytest.param("components", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("form", ["arrays", pytest.param("auto", marks=pytest.mark.slow)])
 def test_a_failed_trajectory_that_the_loss_omits_spoils_no_shared_parameter(form):
     """A start of NaN, and an implicit step without a root."""
     q = jnp.array([[0.3, 0.0], [jnp.nan, 0.1], [0.1, 0.1], [0.2, 0.1]])
@@ -352,7 +352,7 @@ def rebuilt(num_steps, e=0.0, save=None, every=20, form="arrays", **how):
     return light_and_heavy(0.5, e, **how).stats["round_trip_defect"]
 
 
-@pytest.mark.parametrize("form", ["arrays", "components"])
+@pytest.mark.parametrize("form", ["arrays", "auto"])
 @pytest.mark.slow
 def test_round_trip_defect_is_that_of_reconstructed_states(form):
     """About round-off where the map preserves volume; e^(εt/2) times that where it is damped, for

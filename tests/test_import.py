@@ -11,6 +11,7 @@ from dvi_jax._namespaces import ALIASES
 LATER = (
     "optax", "optimistix", "lineax", "matplotlib", "scipy", "xarray", "zarr", "rich", "typer",
     "numpyro", "distributed", "diffrax", "rebound", "astropy", "arviz", "jplephem", "sympy",
+    "pydantic",
 )  # fmt: skip
 """Each of these is imported by the function that needs it."""
 
@@ -27,6 +28,7 @@ def imported(code):
 def test_importing_takes_only_what_every_program_needs():
     assert imported("import dvi_jax, dvi_jax.systems") == []
     assert imported("import dvi_jax.plot") == ["matplotlib"]  # and so it would be seen
+    assert "pydantic" in imported("import dvi_jax.run")
 
 
 def test_every_alias_is_listed_and_means_its_name():

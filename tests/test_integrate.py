@@ -121,7 +121,7 @@ def test_given_rejects_times_that_are_no_grid_and_contradictions():
         ([0.0, 0.1, 0.1], "strictly"),
         ([0.0, 0.2, 0.1], "strictly"),
         ([0.0, np.nan], "finite"),
-        ([[0.0, 1.0]], "one-dimensional"),
+        ([[0.0, 1.0]], r"shape \(times,\)"),
     ):
         with pytest.raises(ValueError, match=match):
             dvi.Given(np.array(ts))
@@ -181,7 +181,7 @@ def test_boolean_observables_are_counted():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("form", "few"), [("arrays", 100), ("components", 1000)])
+@pytest.mark.parametrize(("form", "few"), [("arrays", 100), ("auto", 1000)])
 def test_streamed_reductions_need_no_memory_for_the_steps(form, few):
     def size(n):
         def final(q):
@@ -406,22 +406,22 @@ def test_numbers_beyond_double_precision_are_named():
     ("change", "error", "match"),
     [
         ({"p0": [0.1]}, ValueError, r"the same shape, got \(2,\) for q0 and \(1,\)"),
-        ({"q0": [np.nan, 1.0]}, ValueError, r"q0.*not finite at index \[0\]"),
-        ({"p0": [1.0, np.inf]}, ValueError, r"p0.*not finite at index \[1\]"),
+        ({"q0": [np.nan, 1.0]}, ValueError, r"q0 must be finite, got nan at index \[0\]"),
+        ({"p0": [1.0, np.inf]}, ValueError, r"p0 must be finite, got inf at index \[1\]"),
         ({"q0": [1j, 1.0]}, TypeError, "real"),
         ({"q0": ["a", "b"]}, TypeError, "array of real numbers"),
         ({"q0": [], "p0": []}, ValueError, "empty"),
         ({"h": 0.0}, ValueError, "h must not be zero"),
-        ({"h": np.nan}, ValueError, "h must be finite"),
-        ({"h": np.inf}, ValueError, "h must be finite"),
-        ({"h": None}, TypeError, "^h must be given"),
+        ({"h": np.nan}, ValueError, "h must be a finite"),
+        ({"h": np.inf}, ValueError, "h must be a finite"),
+        ({"h": None}, TypeError, r"Uniform\(\) requires h\."),
         ({"h": [0.1, 0.2]}, ValueError, r"h must be one number.*vmap"),
         ({"h": "0.1s"}, TypeError, "h must be an integer or a floating"),
         ({"num_steps": -1}, ValueError, r"from 0 to .*negative h"),
-        ({"num_steps": 2**31}, ValueError, "several runs"),
-        ({"num_steps": 2.5}, TypeError, "Python integer"),
-        ({"num_steps": None}, TypeError, "^num_steps must be given"),
-        ({"epsilon": np.nan}, ValueError, "epsilon must be finite"),
+        ({"num_steps": 2**31}, ValueError, "from 0 to 2147483646"),
+        ({"num_steps": 2.5}, TypeError, "integer that is not traced"),
+        ({"num_steps": None}, TypeError, "requires num_steps.*duration"),
+        ({"epsilon": np.nan}, ValueError, "epsilon must be a finite"),
         ({"epsilon": 1j}, TypeError, "epsilon must be an integer or"),
         ({"method": dvi.TypeII}, TypeError, "parentheses missing"),
         ({"save": 10}, TypeError, "save must be a dvi.Save"),
@@ -430,11 +430,11 @@ def test_numbers_beyond_double_precision_are_named():
         ({"observe": lambda *a: None}, TypeError, "must return one array"),
         ({"observe": dvi.Range(lambda *a: a[2] * 1j)}, TypeError, "imaginary part"),
         ({"args": {"k": {1, 2}}}, TypeError, "args must .* got {.*} of type set"),
-        ({"q0": MASKED}, ValueError, r"q0 is a masked array with a masked number at index \[1\]"),
-        ({"p0": MASKED}, ValueError, "p0 is a masked array"),
-        ({"t0": np.ma.masked}, ValueError, "t0 is a masked array"),
-        ({"h": np.ma.array(0.1, mask=True)}, ValueError, "h is a masked array"),
-        ({"args": {"k": MASKED}}, ValueError, "args is a masked array"),
+        ({"q0": MASKED}, ValueError, r"q0 must not have masked numbers, got one at index \[1\]"),
+        ({"p0": MASKED}, ValueError, "p0 must not have masked"),
+        ({"t0": np.ma.masked}, ValueError, "t0 must not have masked"),
+        ({"h": np.ma.array(0.1, mask=True)}, ValueError, "h must not have masked"),
+        ({"args": {"k": MASKED}}, ValueError, "args must not have masked"),
         ({"t0": np.datetime64("2000")}, TypeError, "t0 must be an integer or a floating"),
         ({"args": {"k": np.array([1.0], object)}}, TypeError, "args .* dtype object"),
         ({"args": {"k": np.array(["2000"], "M8[D]")}}, TypeError, "args .* dtype datetime64"),
@@ -453,7 +453,7 @@ def test_invalid_saves_are_rejected():
         with pytest.raises(ValueError, match="an integer of at least 1"):
             dvi.Save(every=every)
     for times in (dvi.Save, dvi.Given):
-        with pytest.raises(ValueError, match="ts is a masked array"):
+        with pytest.raises(ValueError, match="ts must not have masked"):
             times(ts=MASKED)
 
 

@@ -187,8 +187,8 @@ def unit():
         ({"events": marked(lambda t, y: y[0], terminal=-1)}, ValueError, "terminal"),
         ({"h": -0.1}, ValueError, "t_span gives the direction"),
         ({"h": [0.1, 0.1]}, ValueError, r"positive and finite .*, got \[0.1, 0.1\]"),
-        ({"t_eval": unit}, TypeError, "has the unit 'min', but numbers without"),
-        ({"h": unit}, TypeError, "has the unit 'min', but numbers without"),
+        ({"t_eval": unit}, TypeError, "has the unit 'min'"),
+        ({"h": unit}, TypeError, "has the unit 'min'"),
     ],
     ids=lambda x: "",
 )

@@ -11,7 +11,6 @@ from helpers import ARGS, IN_EVERY_RUN, SYSTEMS, covering, flow, problem, state
 import dvi_jax as dvi
 from dvi_jax.base.types import Interval
 from dvi_jax.methods import warn_of_dissipation
-from dvi_jax.methods._composition import CompositionMethod, of_strang
 from dvi_jax.methods._order_conditions import order_defects
 from dvi_jax.methods.step import Equations, inverse_step, step
 from dvi_jax.testing import METHODS, check_inverse, check_reversible, check_symplectic, problems
@@ -88,7 +87,7 @@ def test_symmetric_methods_reverse_and_others_do_not(system, method):
 
 def test_order_conditions_hold_and_the_next_ones_do_not():
     for method in METHODS.values():
-        if isinstance(method, CompositionMethod):
+        if hasattr(method, "fractions"):
             base, order = method.base, method.order + 1
             defects = order_defects(method.fractions(), order, base.order, base.is_symmetric)
             assert max(defects[:-1]) < 5e-16, method
@@ -121,17 +120,22 @@ def wrong_digits():
 )  # fmt: skip
 def test_an_order_that_coefficients_do_not_have_is_rejected(coefficients, claimed, found):
     assert dvi.Composition(coefficients, order=found).order == found
-    with pytest.raises(ValueError, match=f"have order {found}, not {claimed}"):
+    with pytest.raises(ValueError, match=f"at most {found}, .* got {claimed}"):
         dvi.Composition(coefficients, order=claimed)
 
 
 def test_printed_digits_are_enough_for_a_claim():
     """Twelve digits pass, six do not."""
-    good, poor = ([round(x, n) for x in (0.784513610477557, 0.235573213359358)] for n in (12, 6))
-    third = -1.177679984178871
-    assert dvi.Composition(of_strang(*good, third), order=6).is_symmetric
-    with pytest.raises(ValueError, match="violate the conditions"):
-        dvi.Composition(of_strang(*poor, third), order=6)
+
+    def yoshida(digits):
+        outer = [round(x, digits) for x in (0.784513610477557, 0.235573213359358)]
+        outer.append(-1.177679984178871)
+        coefficients = (*outer, 1 - 2 * sum(outer), *outer[::-1])
+        return dvi.Composition(coefficients, order=6, base=dvi.Strang())
+
+    assert yoshida(12).is_symmetric
+    with pytest.raises(ValueError, match="conditions of order"):
+        yoshida(6)
 
 
 # --- the step ----------------------------------------------------------------------------------
@@ -196,14 +200,13 @@ def test_explicitness_is_read_from_the_system():
     ):
         assert [method.is_explicit(s, q, 1.0) for s in (spring, damped)] == explicit
     assert dvi.TypeII().is_explicit(dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + q @ q))
-    with pytest.raises(ValueError, match="that the system requires"):
+    with pytest.raises(ValueError, match="cannot be evaluated"):
         dvi.TypeII().is_explicit(spring)
 
 
 def test_negative_substeps_are_reported():
-    assert not dvi.Strang().has_negative_substeps
-    assert dvi.Yoshida(4).has_negative_substeps
-    assert dvi.Composition((1.0,), base=dvi.Yoshida(4)).has_negative_substeps
+    methods = dvi.Strang(), dvi.Yoshida(4), dvi.Composition((1.0,), base=dvi.Yoshida(4))
+    assert [method.has_negative_substeps for method in methods] == [False, True, True]
 
 
 def test_a_substep_backwards_against_strong_dissipation_warns():
@@ -216,12 +219,9 @@ def test_a_substep_backwards_against_strong_dissipation_warns():
         equations = Equations(s, jnp.asarray(epsilon))
         warn_of_dissipation(method, equations, lambda: Interval(t0, t0 + h, h), q, p)
 
-    with pytest.warns(
-        UserWarning, match=r"Yoshida .*backwards .* 0.85 h.*substep is 0\.306\. .*St"
-    ):
-        check(dvi.Yoshida(4), 3.6)
-    with pytest.warns(UserWarning, match="not more accurate than a map of order 2"):
-        check(dvi.Adjoint(dvi.Yoshida(4)), 3.6)
+    for method in (dvi.Yoshida(4), dvi.Adjoint(dvi.Yoshida(4))):
+        with pytest.warns(UserWarning, match=r"backwards .* 0.85 h.*substep is 0\.306\. .*St"):
+            check(method, 3.6)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check(dvi.Yoshida(4), 3.5)
@@ -232,9 +232,6 @@ def test_a_substep_backwards_against_strong_dissipation_warns():
         dvi.integrate(system, q, p, h=0.1, num_steps=2, epsilon=3.6, method=dvi.Yoshida(4))
 
 
-PAIR = (0.5, 0.5)
-
-
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
@@ -242,18 +239,14 @@ PAIR = (0.5, 0.5)
           for c in ((), (0.5, 0.6), (np.nan, 1.0))),
         *((lambda c=c: dvi.Composition(c), TypeError, "sequence of numbers")
           for c in (0.5, "half", [None])),
-        (lambda: dvi.Yoshida(5), ValueError, "4, 6 or 8, got 5"),
-        (lambda: dvi.Suzuki(6), ValueError, "must be 4, got 6"),
-        (lambda: dvi.BlanesMoan(8), ValueError, "must be 4 or 6, got 8"),
-        (lambda: dvi.McLachlan(2), ValueError, "4, 6 or 8, got 2"),
-        (lambda: dvi.KahanLi(4), ValueError, "6 or 8, got 4"),
-        (lambda: dvi.Composition(PAIR, order=13), ValueError, "from 1 to 12"),
-        (lambda: dvi.Composition(PAIR, base=dvi.RungeKutta4()), ValueError, "have an inverse step"),
-        (lambda: dvi.Composition(PAIR, base=dvi.TypeII), TypeError, "base must be a method"),
-        (lambda: dvi.Yoshida(4, base=4), TypeError, "base must be a method"),
-        (lambda: dvi.Strang(base=dvi.RungeKutta4()), ValueError, "have an inverse step"),
-        (lambda: dvi.Adjoint(dvi.RungeKutta4()), ValueError, "have an inverse step"),
-        (lambda: dvi.Adjoint(dvi.TypeII), TypeError, "method must be a method"),
+        *((lambda c=c, n=n: c(n), ValueError, f"{orders}, got {n}") for c, n, orders in (
+            (dvi.Yoshida, 5, "4, 6, 8"), (dvi.Suzuki, 6, "must be 4"), (dvi.BlanesMoan, 8, "4, 6"),
+            (dvi.McLachlan, 2, "4, 6, 8"), (dvi.KahanLi, 4, "6, 8"))),
+        (lambda: dvi.Composition((0.5, 0.5), order=13), ValueError, "from 1 to 12"),
+        *((lambda m=m, base=base: m(base), *error) for base, *error in (
+            (dvi.RungeKutta4(), ValueError, "with an inverse step"),
+            (dvi.TypeII, TypeError, "must be a method"), (4, TypeError, "must be a method"))
+          for m in (lambda base: dvi.Composition((0.5, 0.5), base=base), dvi.Strang, dvi.Adjoint)),
     ],
 )  # fmt: skip
 def test_invalid_methods_are_rejected(make, error, message):

@@ -346,17 +346,20 @@ SIGMA_OF_P = dvi.System(H_D, noise=lambda t, q, p, args: p)
         ({"method": dvi.Strang()}, r"Strang.* is not a method for systems with noise.*BAOAB"),
         ({"method": dvi.Strang(base=dvi.BAOAB())}, "is not a method for systems with noise"),
         ({"system": TWISTED}, "OBABO.* require noise on the momenta.*StochasticMidpoint"),
-        ({"system": SIGMA_OF_P}, r"depends on p, which dvi.BAOAB\(\).*StochasticMidpoint"),
+        (
+            {"system": SIGMA_OF_P},
+            r"BAOAB\(\) requires noise that does not depend on p.*StochasticMidpoint",
+        ),
         ({"lattice": dvi.TimeTransformed(lambda t, q, p, args: 1.0)}, "steps depend on the state"),
         ({"arithmetic": dvi.DoubleDouble()}, "cannot be used with noise.*Compensated"),
         ({"save": dvi.Save(ts=[0.05])}, "need states within a step"),
         ({"stop": dvi.Stop(lambda t, q, p, args: q[0])}, "need states within a step"),
         ({"h": -0.1}, "h must be positive.*got h=-0.1"),
-        ({"path": 1.5}, "an integer, got 1.5"),
+        ({"path": 1.5}, "must be an integer, or one key.*got 1.5"),
         ({"path": jax.random.split(jax.random.key(0), 3)}, "use jax.vmap"),
         ({"path": jax.random.key(0, impl="rbg")}, "generator threefry2x32"),
         ({"path": dvi.Brownian(0, first_step=-1)}, "first_step must be an integer from 0"),
-        ({"system": dvi.System(H_D, noise=lambda t, q, p, args: jnp.ones(3))}, r"got \(3,\)"),
+        ({"system": dvi.System(H_D, noise=lambda t, q, p, args: jnp.ones(3))}, r"got shape \(3,\)"),
         ({"system": dvi.System(H_D, noise=dvi.Langevin(jnp.ones(2)))}, r"must broadcast with q0"),
     ],
 )
@@ -366,9 +369,9 @@ def test_what_does_not_fit_is_refused(more, message):
 
 
 def test_other_functions_and_arguments_are_refused():
-    with pytest.raises(ValueError, match="has noise, which only"):
+    with pytest.raises(ValueError, match="must not have noise"):
         dvi.drift_order(THERMAL, lambda q, p: q[0], [1.0], [0.0], epsilons=[0.1], **FEW)
-    with pytest.raises(TypeError, match=r"noise must take four positional arguments"):
+    with pytest.raises(TypeError, match=r"noise must take the arguments"):
         dvi.System(H_D, noise=lambda q, p: q)
     with pytest.raises(ValueError, match="substeps must be an integer of at least 1, got 0"):
         dvi.Brownian(0, substeps=0)

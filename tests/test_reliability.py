@@ -80,7 +80,7 @@ def test_a_pickle_in_a_file_of_arrays_is_refused_and_not_run(tmp_path):
     np.savez(file, about=np.array(Payload(trace), dtype=object))
     for read in (lambda p: read_npz(p, 1, "fit"), dvi.FitResult.load, read_columns,
                  lambda p: dvi.Discovery.load(p, dvi.Polynomials(2))):  # fmt: skip
-        with pytest.raises(ValueError, match=r"is no|cannot be read"):
+        with pytest.raises(ValueError, match=r"damaged|cannot be read"):
             read(file)
     assert not trace.exists()
 
@@ -147,7 +147,7 @@ def test_every_flipped_bit_and_every_cut_of_a_file_is_found(file):
 
 def test_a_file_of_another_version_is_refused_with_what_to_do(tmp_path):
     publish_npz(tmp_path / "fit.npz", 0, {}, {})
-    with pytest.raises(ValueError, match=r"format 0, but .* reads only 1: use the version that"):
+    with pytest.raises(ValueError, match=r"format 0, but .* reads 1: use the version that"):
         dvi.FitResult.load(tmp_path / "fit.npz")
 
 
@@ -204,7 +204,7 @@ def test_a_damaged_checkpoint_is_refused_and_stays(tmp_path, monkeypatch):
     take_step(a_run(file), 3.0)
     damaged = file.read_bytes()[:-30]
     file.write_bytes(damaged)
-    with pytest.raises(ValueError, match=r"checkpoint\.npz' is not the file of .*or remove the"):
+    with pytest.raises(ValueError, match=r"checkpoint\.npz' is damaged"):
         a_run(file)
     assert file.read_bytes() == damaged
 

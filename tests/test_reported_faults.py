@@ -36,8 +36,8 @@ def test_a_swept_argument_that_only_an_observable_uses():
 
 @pytest.mark.parametrize(
     "settings",
-    [{"layout": dvi.Layout(form="components")}, {"adjoint": dvi.Reversible(checkpoint_every=500)}],
-    ids=["components", "one checkpoint"],
+    [{}, {"adjoint": dvi.Reversible(checkpoint_every=500)}],
+    ids=["default", "one checkpoint"],
 )
 def test_an_observable_of_one_trajectory(settings):
     run = {"h": 0.05, "num_steps": 500, "observe": dvi.MaxDrift(kinetic), "save": FINAL}

@@ -169,8 +169,8 @@ def test_gradients_batches_and_statuses_go_through():
 @pytest.mark.parametrize(
     ("speed", "observe", "says"),
     [
-        (lambda t, q, p, args: -1.0, None, "one positive number .* it returns -1"),
-        (lambda t, q, p, args: q, None, "one positive number .* it returns an array"),
+        (lambda t, q, p, args: -1.0, None, "one positive number, .* it returns -1"),
+        (lambda t, q, p, args: q, None, "one positive number, .* it returns an array"),
         (radius, dvi.Trend(energy), "fictitious time"),
     ],
 )
@@ -178,7 +178,10 @@ def test_invalid_speeds_and_observables_are_rejected(speed, observe, says):
     how = {"h": 0.1, "num_steps": 3, "lattice": dvi.TimeTransformed(speed), "observe": observe}
     with pytest.raises(ValueError, match=says):
         dvi.integrate(KEPLER, *start(0.5), **how)
-    for wrong, says in ((0.5, "must be a function"), (lambda t, q, p: 1.0, "must take four")):
+    for wrong, says in (
+        (0.5, "must be a function"),
+        (lambda t, q, p: 1.0, "must take the arguments"),
+    ):
         with pytest.raises(TypeError, match=says):
             dvi.TimeTransformed(wrong)
 

@@ -282,7 +282,7 @@ def test_progress_changes_nothing():
     ("call", "error", "message"),
     [
         (lambda: dvi.Variational("halve"), ValueError, "on_no_root must be one of 'stop', 'hold'"),
-        (lambda: dvi.Variational(reach=1.0), ValueError, "reach .*finite and greater than 1"),
+        (lambda: dvi.Variational(reach=1.0), ValueError, "reach .*finite number above 1"),
         (lambda: dvi.Variational(bounds=(2.0, 3.0)), ValueError, "0 < smallest ≤ 1 ≤ largest"),
         (
             lambda: kepler(0.1, 3, method=dvi.Strang()),
@@ -292,9 +292,9 @@ def test_progress_changes_nothing():
         (
             lambda: kepler(0.1, 3, arithmetic=dvi.FixedPoint(2.0**-40)),
             ValueError,
-            "cannot be undone bit for bit",
+            "step sizes are rounded",
         ),
-        (lambda: kepler(None, 3), TypeError, r"^h must be given, .* requires h and"),
+        (lambda: kepler(None, 3), TypeError, r"Variational.* requires h\."),
         (
             lambda: kepler(0.1, 80, throw=True),
             dvi.IntegrationError,

@@ -26,7 +26,7 @@ from sphinx.util.docutils import SphinxDirective
 import dvi_jax
 import lanewise
 from dvi_jax._namespaces import SHORT, names
-from dvi_jax.base.checks import unpacked
+from dvi_jax.base.checks import settings_type
 from dvi_jax.testing.paper.equations import EQUATIONS
 
 PAGES = {
@@ -153,7 +153,7 @@ def signature(thing: Any) -> str:
         for name, p in found.parameters.items()
         if name not in ("self", "cls") and not name.startswith("_")
     ]
-    if (settings := unpacked(thing)) is not None:
+    if (settings := settings_type(thing)) is not None:
         plain[-1:] = _keywords(settings)
     try:
         return str(found.replace(parameters=plain, return_annotation=found.empty))

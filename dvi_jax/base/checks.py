@@ -4,18 +4,21 @@ import difflib
 import inspect
 import math
 import numbers
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Unpack, get_args, get_origin
 
 import numpy as np
 
+Dimension = int | str
+"""The length of an axis: a number, or the name of a length that may have any positive value."""
 
-def whole(name: str, value: Any, least: int = 1, most: int | None = None, hint: str = "") -> int:
-    """A whole number from `least` to `most` (None: any), not a bool. **Raises** `ValueError`."""
+
+def whole(name: str, value: Any, low: int = 1, high: int | None = None, hint: str = "") -> int:
+    """A whole number from `low` to `high` (None: any), not a bool. **Raises** `ValueError`."""
     # True is an integer in Python, but as a number it is nearly always a mistake.
     fits = isinstance(value, int | np.integer) and not isinstance(value, bool)
-    if not fits or value < least or (most is not None and value > most):
-        span = f"of at least {least}" if most is None else f"from {least} to {most}"
+    if not fits or value < low or (high is not None and value > high):
+        span = f"of at least {low}" if high is None else f"from {low} to {high}"
         text = f"{value!r:.200}" + ("" if fits else f" (type {type(value).__name__})")
         raise ValueError(f"{name} must be an integer {span}, got {text}.{_sentence(hint)}")
     return int(value)
@@ -23,30 +26,115 @@ def whole(name: str, value: Any, least: int = 1, most: int | None = None, hint: 
 
 def positive(name: str, value: Any, zero: bool = False, hint: str = "") -> float:
     """A positive and finite number; `zero`: or 0. **Raises** `ValueError`."""
-    fits = _is_number(value) and math.isfinite(value)
-    if not fits or value < 0 or (value == 0 and not zero):
-        kind = "zero or a positive finite number" if zero else "a positive and finite number"
-        raise ValueError(f"{name} must be {kind}, got {value!r}.{_sentence(hint)}")
-    return float(value)
+    kind = "zero or a positive finite number" if zero else "a positive and finite number"
+    return _number(name, value, kind, lambda x: x > 0 or (zero and x == 0), hint)
 
 
 def fraction(name: str, value: Any) -> float:
     """A number between 0 and 1, both excluded. **Raises** `ValueError`."""
-    if not _is_number(value) or not 0 < value < 1:
-        raise ValueError(f"{name} must be a number between 0 and 1 (both excluded), got {value!r}.")
-    return float(value)
+    return _number(name, value, "between 0 and 1 (both excluded)", lambda x: 0 < x < 1)
 
 
 def finite(name: str, value: Any, hint: str = "") -> float:
     """A finite number. **Raises** `ValueError`."""
-    if not _is_number(value) or not math.isfinite(value):
-        raise ValueError(f"{name} must be a finite number, got {value!r}.{_sentence(hint)}")
+    return _number(name, value, "a finite number", lambda x: True, hint)
+
+
+def _number(
+    name: str, value: Any, kind: str, is_allowed: Callable[[Any], bool], hint: str = ""
+) -> float:
+    if not _is_number(value) or not math.isfinite(value) or not is_allowed(value):
+        raise ValueError(f"{name} must be {kind}, got {value!r}.{_sentence(hint)}")
     return float(value)
+
+
+def array(
+    name: str,
+    value: Any,
+    *shapes: tuple[Dimension, ...],
+    verb: str = "be",
+    integers: bool = False,
+    empty: bool = False,
+    hint: str = "",
+) -> Any:
+    """A real array, or anything else with a shape and a dtype, of one of the shapes.
+
+    - `shapes`: such as (), a scalar, or (3, "m"), for any m ≥ 1; `empty`: also m = 0.
+    - `verb`: "return" for the value of a function.
+    - `integers`: whether they are allowed, next to floating-point numbers.
+
+    **Raises** `ValueError`.
+    """
+    # By name: bfloat16, which NumPy does not know, has no kind.
+    is_real = "float" in str(value.dtype) or (integers and value.dtype.kind in "iub")
+    if not is_real or not any(_has_shape(value.shape, shape, empty) for shape in shapes):
+        kinds = (f"array of shape {_shape_text(shape)}" if shape else "scalar" for shape in shapes)
+        raise ValueError(
+            f"{name} must {verb} a real {' or '.join(kinds).replace('or array of shape', 'or')}"
+            f"{'' if integers else ' of a floating-point type'}, got shape {value.shape} and dtype "
+            f"{value.dtype}.{_sentence(hint)}"
+        )
+    return value
+
+
+def all_finite(name: str, values: Any, positive: bool = False, hint: str = "") -> None:
+    """**Raises** `ValueError` for an array with a number that is not finite, or not `positive`."""
+    entries = np.asarray(values)
+    is_real = entries.dtype.kind in "iub" or "float" in str(entries.dtype)
+    is_wrong = np.ones(entries.shape, bool)
+    if is_real:
+        is_wrong = ~np.isfinite(entries) | (positive & (entries <= 0))
+    if is_wrong.any():
+        index = tuple(np.argwhere(is_wrong)[0].tolist())
+        place = f" at index {list(index)}" if index else ""
+        raise ValueError(
+            f"{name} must be {'positive and ' * positive}finite, got {entries[index]}{place}."
+            f"{_sentence(hint)}"
+        )
+
+
+def in_order(name: str, values: Any, strictly: bool = False, hint: str = "") -> None:
+    """**Raises** `ValueError` unless the values are finite, in ascending or descending order;
+    `strictly`: without equal neighbours."""
+    entries = np.asarray(values)
+    steps = np.diff(entries)
+    rises = steps * (np.sign(steps[steps != 0][:1]).sum() or 1)
+    is_good = np.isfinite(steps) & (rises > 0 if strictly else rises >= 0)
+    if not np.isfinite(entries).all() or not is_good.all():
+        k = 0 if is_good.all() else int(np.argmin(is_good))  # one place, since the list may be long
+        raise ValueError(
+            f"{name} must be finite and in {'strictly ' if strictly else ''}ascending or descending"
+            f" order, got {entries[k : k + 2].tolist()} at index {k}.{_sentence(hint)}"
+        )
+
+
+def only_one(kind: type[Exception] = ValueError, /, **values: Any) -> None:
+    """**Raises** an error of this `kind` if more than one of the arguments is not None."""
+    texts = [f"{name}={value!r:.100}" for name, value in values.items() if value is not None]
+    if len(texts) > 1:
+        raise kind(f"only one of {_enumeration(values)} can be given, got {_enumeration(texts)}.")
+
+
+def require(owner: str, values: Mapping[str, Any], absent: Any = None, hint: str = "") -> None:
+    """**Raises** `TypeError` for arguments with the value `absent`, which `owner` requires."""
+    names = [name for name, value in values.items() if value is absent]
+    if names:
+        raise TypeError(f"{owner} requires {_enumeration(names)}.{_sentence(hint)}")
+
+
+def require_system(name: str, system: Any) -> None:
+    """**Raises** `ValueError` for an observable without a system, which `bind` gives it."""
+    if system is None:
+        raise ValueError(
+            f"{name} has no system: give it to dvi.integrate(observe=...), or call its method "
+            "bind(system, epsilon)."
+        )
 
 
 def one_of(name: str, value: Any, choices: Iterable[Any], hint: str = "") -> Any:
     """One of the known values. **Raises** `ValueError`."""
     choices = list(choices)
+    value = value.item() if isinstance(value, np.integer) else value
     # The types are compared as well: True == 1, and an array has no truth value.
     if not any(
         value is choice or (type(value) is type(choice) and value == choice) for choice in choices
@@ -58,18 +146,15 @@ def one_of(name: str, value: Any, choices: Iterable[Any], hint: str = "") -> Any
 
 
 def instance(name: str, value: Any, kind: Any, description: str, hint: str = "") -> Any:
-    """An instance of a class (or of one of several); `called` is its name in the message.
-
-    **Raises** `TypeError`.
-    """
+    """An instance of a class, or of one of several. **Raises** `TypeError`."""
     if not isinstance(value, kind):
-        text = f"{value!r:.200}"
+        value_text = f"{value!r:.200}"
         # The class in place of an object is the usual mistake: dvi.Strang for dvi.Strang().
         if isinstance(value, type):
-            text = f"the class {value.__name__} (is a pair of parentheses missing?)"
+            value_text = f"the class {value.__name__} (is a pair of parentheses missing?)"
         elif inspect.isfunction(value):  # its repr has an address
-            text = f"the function {value.__name__}"
-        raise TypeError(f"{name} must be {description}, got {text}.{_sentence(hint)}")
+            value_text = f"the function {value.__name__}"
+        raise TypeError(f"{name} must be {description}, got {value_text}.{_sentence(hint)}")
     return value
 
 
@@ -100,7 +185,7 @@ SYNONYMS = {
 """Names of arguments in other packages → the name here."""
 
 
-def unpacked(function: Callable[..., Any]) -> Any:
+def settings_type(function: Callable[..., Any]) -> Any:
     """The `TypedDict` of a function with ``**settings: Unpack[...]``; None for others."""
     for parameter in inspect.signature(function).parameters.values():
         if parameter.kind == parameter.VAR_KEYWORD and get_origin(parameter.annotation) is Unpack:
@@ -111,8 +196,8 @@ def unpacked(function: Callable[..., Any]) -> Any:
 def argument_names(function: Callable[..., Any]) -> list[str]:
     """The arguments that a function accepts, those of an unpacked `TypedDict` included."""
     parameters = inspect.signature(function).parameters.values()
-    own = [x.name for x in parameters if x.kind != x.VAR_KEYWORD]
-    return [*own, *getattr(unpacked(function), "__annotations__", ())]
+    names = [entry.name for entry in parameters if entry.kind != entry.VAR_KEYWORD]
+    return [*names, *getattr(settings_type(function), "__annotations__", ())]
 
 
 def refuse_unknown(name: str, function: Callable[..., Any], keywords: Iterable[str]) -> None:
@@ -123,11 +208,9 @@ def refuse_unknown(name: str, function: Callable[..., Any], keywords: Iterable[s
         # Synonyms first: by spelling alone the nearest name to dt0 would be t0.
         suggestion = SYNONYMS.get(keyword) if SYNONYMS.get(keyword) in names else None
         suggestion = suggestion or (close[0] if close else None)
-        hint = (
-            f" Did you mean {suggestion!r}?"
-            if suggestion
-            else f" Its arguments are {', '.join(names)}."
-        )
+        hint = f" Its arguments are {', '.join(names)}."
+        if suggestion:
+            hint = f" Did you mean {suggestion!r}?"
         if keyword in ("rtol", "atol", "tolerance"):
             hint = " No tolerance controls the size of the steps: choose h."
         raise TypeError(f"{name} has no argument {keyword!r}.{hint}")
@@ -138,8 +221,25 @@ def _is_number(value: Any) -> bool:
     # Arrays of JAX, traced or not, by their attributes: this file does not import JAX.
     if isinstance(value, np.ndarray) or hasattr(value, "__jax_array__") or hasattr(value, "aval"):
         value = np.asarray(value)
-        return value.ndim == 0 and value.dtype.kind in "iuf"
+        return value.ndim == 0 and (value.dtype.kind in "iu" or "float" in str(value.dtype))
     return isinstance(value, numbers.Real | np.number) and not isinstance(value, bool)
+
+
+def _has_shape(shape: tuple[int, ...], pattern: tuple[Dimension, ...], empty: bool) -> bool:
+    return len(shape) == len(pattern) and all(
+        size > 0 or empty if isinstance(length, str) else size == length
+        for size, length in zip(shape, pattern, strict=True)
+    )
+
+
+def _shape_text(pattern: tuple[Dimension, ...]) -> str:
+    return f"({', '.join(map(str, pattern))}{',' * (len(pattern) == 1)})"
+
+
+def _enumeration(texts: Iterable[str]) -> str:
+    """Such as "a, b and c"."""
+    *first, last = texts
+    return f"{', '.join(first)} and {last}" if first else last
 
 
 def _sentence(hint: str) -> str:

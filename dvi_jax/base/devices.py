@@ -41,8 +41,8 @@ def over_devices(
     check_function("the argument of over_devices", function, hint="Give jax.vmap(f), for example.")
     array = np.asarray(jax.devices() if devices is None else list(devices))
     if array.size == 0:
-        raise ValueError("devices is empty: give at least one, or leave devices out to use all.")
-    whole("out_axes", out_axes, least=0)
+        raise ValueError("devices must have at least one device, got none.")
+    whole("out_axes", out_axes, low=0)
     # Auto: shardings of arguments outside are left to JAX, and need not be declared.
     mesh = jax.sharding.Mesh(array, (LANES,), axis_types=(AxisType.Auto,))
 
@@ -51,8 +51,8 @@ def over_devices(
         entries = list(axes) if isinstance(axes, list | tuple) else [axes] * len(args)
         if len(entries) != len(args):
             raise ValueError(
-                "in_axes must be an integer, None, or a list with one entry for each argument. It "
-                f"is {in_axes!r}, of length {len(entries)}, for {len(args)} arguments."
+                f"in_axes must have one entry for each of the {len(args)} arguments, got "
+                f"{in_axes!r}."
             )
         for axis in entries:
             instance("each entry of in_axes", axis, int | None, "a whole number or None")
@@ -62,10 +62,8 @@ def over_devices(
         )
         out = PartitionSpec(*(None,) * out_axes, LANES)
         # With check_vma=True there would be no reversible gradient: `integration/reversible.py`.
-        sharded_call = jax.shard_map(
-            function, mesh=mesh, in_specs=specs, out_specs=out, check_vma=False
-        )
-        return sharded_call(*args)
+        options: Any = {"in_specs": specs, "out_specs": out, "check_vma": False}
+        return jax.shard_map(function, mesh=mesh, **options)(*args)
 
     return call
 
@@ -76,13 +74,13 @@ def _spec(x: Any, i: int, axis: int | None, count: int) -> PartitionSpec:
     shape = np.shape(x)
     if not -len(shape) <= axis < len(shape):
         raise ValueError(
-            f"in_axes must give an axis of each array, got axis {axis} for an array of shape "
-            f"{shape} in argument {i}, counted from 0. Use None for an argument without batch axis."
+            f"in_axes must give an axis of each array, got {axis} for shape {shape} in argument "
+            f"{i} (from 0). Use None for an argument without batch axis."
         )
     if shape[axis] % count:
         raise ValueError(
-            f"the length of the batch axis must be a multiple of {count}, the number of devices, "
-            f"got {shape[axis]} (axis {axis} of shape {shape} in argument {i}, counted from 0). "
-            "Change the batch, or give devices=jax.devices()[:n]."
+            f"the batch must be a multiple of {count}, the number of devices, got {shape[axis]} "
+            f"(axis {axis} of shape {shape} in argument {i}, from 0). Give fewer devices=..., or "
+            "another batch."
         )
     return PartitionSpec(*(None,) * (axis % len(shape)), LANES)

@@ -60,7 +60,7 @@ def sync(folder: Path) -> None:
 
 
 def publish_npz(
-    path: str | os.PathLike[str], form: int, about: Mapping[str, Any], arrays: Mapping[str, Any]
+    path: str | os.PathLike[str], form: int, header: Mapping[str, Any], arrays: Mapping[str, Any]
 ) -> None:
     """Write a JSON header and arrays into one file (NumPy's npz), whole or not at all.
 
@@ -70,32 +70,30 @@ def publish_npz(
     written; an older file of that name is then unchanged.
     """
     path, content = Path(path), io.BytesIO()
-    header = {"format": form, "holds": sorted(arrays), **about}  # so that a lost array is noticed
+    header = {"format": form, "holds": sorted(arrays), **header}  # so that a lost array is noticed
     if not path.parent.is_dir():
         raise FileNotFoundError(
-            f"the file '{path.name}' cannot be written: there is no directory '{path.parent}'. "
-            "Create this directory, or give another path."
+            f"the file '{path.name}' cannot be written: there is no directory '{path.parent}'."
         )
     np.savez(content, about=np.array(json.dumps(header)), **arrays)
     try:
         publish(path, content.getvalue())
     except OSError as error:
-        message = f"{error.strerror or error}: give another path, or permit writing to this one"
-        raise OSError(error.errno, message, str(path)) from error
+        raise OSError(
+            error.errno, f"{error.strerror or error}: give another path", str(path)
+        ) from error
 
 
 def read_npz(
     path: str | os.PathLike[str], form: int, kind: str
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Header and arrays of a file of `publish_npz`; `what` names its content in messages.
+    """Header and arrays of a file of `publish_npz`; `kind` names its content in messages.
 
     **Raises** `FileNotFoundError`; `ValueError` for a damaged or another file, or another format.
     """
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(
-            f"the file of a {kind} does not exist: there is no file '{path}'. Check the path."
-        )
+        raise FileNotFoundError(f"there is no file '{path}' of a {kind}.")
     try:
         # Without pickles: loading one would execute code from the file.
         with np.load(path, allow_pickle=False) as file:
@@ -109,13 +107,12 @@ def read_npz(
         raise
     except Exception as error:  # zipfile and NumPy raise many types for damaged bytes
         raise ValueError(
-            f"'{path}' is not the file of a {kind} of this package, or it is damaged "
-            f"({type(error).__name__}: {str(error).split('. ')[0]}). Check the path, or "
-            "remove the file and compute again."
+            f"'{path}' is damaged, or not the file of a {kind} ({type(error).__name__}: "
+            f"{str(error).split('. ')[0]}). Check the path, or compute again."
         ) from None
     if number != form:
         raise ValueError(
-            f"the file '{path}' has the format {number!r}, but this version of dvi_jax reads only "
-            f"{form!r}: use the version that wrote it, or compute again."
+            f"'{path}' has the format {number!r}, but this version of dvi_jax reads {form!r}: use "
+            "the version that wrote it, or compute again."
         )
     return header, arrays

@@ -26,12 +26,10 @@ def out_of_bounds(program: ClosedJaxpr) -> Iterator[tuple[int, int]]:
 
     JAX moves such an index to the end of the array without an error.
     """
-    constants: dict[Any, np.ndarray] = dict(
-        zip(program.jaxpr.constvars, program.consts, strict=True)
-    )
+    constants: dict[Any, Any] = dict(zip(program.jaxpr.constvars, program.consts, strict=True))
 
-    def value(x: Any) -> np.ndarray | None:
-        constant = x.val if isinstance(x, Literal) else constants.get(x)
+    def value(atom: Any) -> np.ndarray | None:
+        constant = atom.val if isinstance(atom, Literal) else constants.get(atom)
         try:
             array = None if constant is None else np.asarray(constant)
         except Exception:  # a traced constant has no value
@@ -46,8 +44,7 @@ def out_of_bounds(program: ClosedJaxpr) -> Iterator[tuple[int, int]]:
             sizes, shape = equation.params["slice_sizes"], equation.invars[0].aval.shape
             for start, size, length in zip(inputs[1:], sizes, shape, strict=True):
                 if start is not None and not 0 <= start <= length - size:
-                    # JAX has added the length to a negative index; the message has the one that was
-                    # written.
+                    # JAX has added the length to a negative index.
                     yield int(start if start >= 0 else start - length), length
         elif name == "gather" and inputs[1] is not None:
             axes = equation.params["dimension_numbers"].start_index_map
@@ -59,9 +56,8 @@ def out_of_bounds(program: ClosedJaxpr) -> Iterator[tuple[int, int]]:
         elif name == "broadcast_in_dim" and inputs[0] is not None:
             shape, axes = equation.params["shape"], equation.params["broadcast_dimensions"]
             if np.prod(shape) <= SMALL:
-                lengths = [
-                    inputs[0].shape[axes.index(i)] if i in axes else 1 for i in range(len(shape))
-                ]
+                lengths = np.ones(len(shape), int)
+                lengths[list(axes)] = inputs[0].shape
                 constants[equation.outvars[0]] = np.broadcast_to(inputs[0].reshape(lengths), shape)
         elif name in _OPERATIONS and all(x is not None for x in inputs):
             constants[equation.outvars[0]] = _OPERATIONS[name](*inputs)

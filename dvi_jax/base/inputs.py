@@ -9,6 +9,7 @@ from jaxtyping import Array
 
 from lanewise.jaxprs.jaxapi import is_traced
 
+from .checks import all_finite, array, finite
 from .precision import refuse_double_without_x64
 
 
@@ -18,22 +19,21 @@ def start_state(q0: Any, p0: Any) -> tuple[Array, Array]:
     q, p = _real_array("q0", q0), _real_array("p0", p0)
     if q.shape != p.shape:
         raise ValueError(
-            f"q0 and p0 must have the same shape, got {q.shape} for q0 and {p.shape} for p0: give "
-            "one momentum for each position."
+            f"q0 and p0 must have the same shape, got {q.shape} for q0 and {p.shape} for p0."
         )
     if q.size == 0:
-        raise ValueError(f"q0 must not be empty, got shape {q.shape}: give at least one position.")
+        raise ValueError(f"q0 must not be empty, got shape {q.shape}.")
     if q.dtype != p.dtype:
         dtype = jnp.result_type(q.dtype, p.dtype)
         q, p = q.astype(dtype), p.astype(dtype)
     # Half precision has at most three digits: neither a solve nor an invariant can be checked.
     if q.dtype.itemsize < 4:
-        raise TypeError(f"q0 and p0 must be float32 or float64, got {q.dtype}: convert them.")
+        raise TypeError(f"q0 and p0 must be float32 or float64, got {q.dtype}.")
     return q, p
 
 
 def as_times(call: str, ts: Any) -> Array:
-    """Times as an array of real numbers; `of`: the name of the call in messages."""
+    """Times as a one-dimensional array of real numbers; `call`: its name in messages."""
     ts = _join(ts)
     if not is_traced(ts):
         ts = _as_numpy("ts", ts)
@@ -41,43 +41,34 @@ def as_times(call: str, ts: Any) -> Array:
     if jnp.issubdtype(ts.dtype, jnp.integer):
         ts = ts.astype(jnp.result_type(float))
     if not jnp.issubdtype(ts.dtype, jnp.floating):
-        raise TypeError(f"ts in {call} must be real numbers, got dtype {ts.dtype}: use floats.")
-    return jnp.asarray(ts)
+        raise TypeError(f"ts in {call} must be real numbers, got dtype {ts.dtype}.")
+    return jnp.asarray(array(f"ts in {call}", ts, ("times",)))
 
 
 def _join(value: Any) -> Any:
     """A list with traced numbers as one array, which NumPy cannot make."""
-    has_tracer = isinstance(value, list | tuple) and any(
-        is_traced(x) for x in jax.tree.leaves(value)
-    )
-    return jnp.asarray(value) if has_tracer else value
+    is_list = isinstance(value, list | tuple)
+    return jnp.asarray(value) if is_list and any(map(is_traced, jax.tree.leaves(value))) else value
 
 
 def _real_array(name: str, value: Any) -> Array:
     value = original = _join(value)
-    if isinstance(value, jax.Array) and is_traced(value):
-        kind = value.dtype
-    else:
+    if not (isinstance(value, jax.Array) and is_traced(value)):
         # In NumPy: under jit, jax.numpy would give tracers even for values that are known.
         value = _as_numpy(name, value)
-        kind = value.dtype
-        refuse_double_without_x64(name, kind)
+        refuse_double_without_x64(name, value.dtype)
+    kind = value.dtype
     if kind.kind == "c":
         raise TypeError(
-            f"{name} must be real, got dtype {kind}. If its imaginary part is zero, take jnp.real; "
-            "for ψ = (q0 + i p0)/√2 give q0 = √2 Re ψ and p0 = √2 Im ψ."
+            f"{name} must be real, got dtype {kind}: for ψ = (q0 + i p0)/√2 give q0 = √2 Re ψ and "
+            "p0 = √2 Im ψ."
         )
     if not _is_real(kind):
-        text = f": {value!s:.80}" if isinstance(value, np.ndarray) else ""
-        raise TypeError(f"{name} must be an array of real numbers, got dtype {kind}{text}.")
+        excerpt = f": {value!s:.80}" if isinstance(value, np.ndarray) else ""
+        raise TypeError(f"{name} must be an array of real numbers, got dtype {kind}{excerpt}.")
     # A traced value that is not finite becomes the status of its trajectory.
-    if isinstance(value, np.ndarray) and not np.isfinite(value).all():
-        where = tuple(np.argwhere(~np.isfinite(value))[0].tolist())
-        place = f" at index {list(where)}" if where else ""
-        raise ValueError(
-            f"{name} has a value that is not finite{place}: {value[where]}. "
-            "Every component of the initial conditions must be a finite number."
-        )
+    if isinstance(value, np.ndarray):
+        all_finite(name, value)
     # A copy would take some ten microseconds, and the transfer of a long array longer.
     array = original if _is_strong(original, kind) else jnp.asarray(value)
     return array.astype(jnp.result_type(float)) if kind.kind in "iu" else array
@@ -104,21 +95,16 @@ def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> A
         kind = type(value).__name__
         raise TypeError(
             f"{name} must be an integer or a floating-point number, got {value!r:.200} of type "
-            f"{kind}. Convert a real number x with float(x), or with x.real if its type is complex."
+            f"{kind}."
         )
     if shape != ():
         raise ValueError(
-            f"{name} must be one number, got an array of shape {shape}. For several "
-            f"values use jax.vmap over {name}."
-            + (" Steps of different sizes need lattice=dvi.Given(ts)." if name == "h" else "")
+            f"{name} must be one number, got an array of shape {shape}. For several values use "
+            f"jax.vmap over {name}"
+            + (", for steps of several sizes lattice=dvi.Given(ts)." if name == "h" else ".")
         )
-    if number is not None and not np.isfinite(number):
-        raise ValueError(f"{name} must be finite, got {number}.")
-    if number is not None and not zero_allowed and number == 0:
-        raise ValueError(
-            f"{name} must not be zero: no step would advance time. Give a positive h (forward) "
-            "or a negative h (backward)."
-        )
+    if number is not None and finite(name, number.item()) == 0 and not zero_allowed:
+        raise ValueError(f"{name} must not be zero; a negative h runs backwards in time.")
     # Cast in NumPy: each operation of JAX on a known number would cost some ten microseconds.
     if number is None:
         return jnp.asarray(value, dtype)
@@ -131,8 +117,7 @@ def _as_numpy(name: str, value: Any) -> np.ndarray:
         return np.asarray(value)
     except (TypeError, ValueError) as error:
         raise TypeError(
-            f"{name} must be a real number or an array of real numbers, got {value!r:.200}. Rows "
-            f"of nested lists must have the same length. NumPy reports: {error}"
+            f"{name} must be a real number or an array of real numbers, got {value!r:.200}: {error}"
         ) from None
 
 
@@ -143,8 +128,9 @@ def as_parameter(leaf: Any) -> Any:
         leaf = np.asarray(leaf)
         refuse_double_without_x64("args", leaf.dtype)
         if leaf.dtype.kind in "OMm":
-            text = f"dtype {leaf.dtype}: {leaf!s:.80}"
-            raise TypeError(f"args must contain arrays of numbers, got {text}. Convert this array.")
+            raise TypeError(
+                f"args must contain arrays of numbers, got dtype {leaf.dtype}: {leaf!s:.80}."
+            )
         return jnp.asarray(leaf)
     if not isinstance(leaf, jax.Array):
         # Everything but arrays is static: compiled programs are looked up by its hash.
@@ -152,8 +138,8 @@ def as_parameter(leaf: Any) -> Any:
             hash(leaf)
         except TypeError:
             raise TypeError(
-                "args must contain arrays, numbers or hashable objects, in dicts, lists and "
-                f"tuples, got {leaf!r:.80} of type {type(leaf).__name__}. Use an array or tuple."
+                "args must contain arrays, numbers or hashable objects in dicts, lists and tuples, "
+                f"got {leaf!r:.80} of type {type(leaf).__name__}."
             ) from None
     # A float becomes an array: a new value needs no new compilation, and has a derivative.
     return jnp.asarray(leaf) if isinstance(leaf, float) else leaf
@@ -166,9 +152,7 @@ def refuse_unit_or_mask(name: str, value: Any) -> None:
     if np.ma.is_masked(value):
         where = np.argwhere(np.ma.getmaskarray(value))[0].tolist()
         raise ValueError(
-            f"{name} is a masked array with a masked number"
-            + (f" at index {where}" if where else "")
-            + ". The mask would be ignored: remove the masked numbers, or replace them."
+            f"{name} must not have masked numbers, got one{f' at index {where}' if where else ''}."
         )
     unit = None
     if hasattr(value, "to_value"):
@@ -177,7 +161,6 @@ def refuse_unit_or_mask(name: str, value: Any) -> None:
         unit = getattr(value, "units", None)
     if unit is not None:
         raise TypeError(
-            f"{name} has the unit {str(unit) or '1'!r}, but numbers without units are required "
-            "here: x.to_value(unit) of astropy, x.m_as(unit) of pint. "
-            "dvi_jax.interop.integrate(..., units=...) accepts quantities of astropy."
+            f"{name} has the unit {str(unit) or '1'!r}, but must be without one: use "
+            "x.to_value(unit), x.m_as(unit), or dvi_jax.interop.integrate(..., units=...)."
         )

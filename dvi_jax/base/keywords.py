@@ -5,10 +5,12 @@ import inspect
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from .checks import argument_names, refuse_unknown, unpacked
+from .checks import argument_names, only_one, refuse_unknown, require, settings_type
 
 F = TypeVar("F", bound=Callable[..., Any])
 T = TypeVar("T")
+
+_ABSENT = inspect.Parameter.empty
 
 INTEGRATOR = "method lattice root_finder arithmetic layout integrator"
 """Keywords of functions that run trajectories which `chosen` turns into one `Integrator`."""
@@ -20,16 +22,14 @@ def checked_keywords(function: F) -> F:
     **Raises** `TypeError` when it is called with an unknown keyword or without a necessary one.
     """
     names = frozenset(argument_names(function))
-    required = sorted(getattr(unpacked(function), "__required_keys__", ()))
+    necessary = sorted(getattr(settings_type(function), "__required_keys__", ()))
 
     @functools.wraps(function)
     def call(*args: Any, **keywords: Any) -> Any:
-        refuse_unknown(
-            function.__name__, function, [name for name in keywords if name not in names]
-        )
-        for name in required:
-            if name not in keywords:
-                raise TypeError(f"{function.__name__} requires {name}=...: give a value.")
+        unknown = [name for name in keywords if name not in names]
+        refuse_unknown(function.__name__, function, unknown)
+        values: dict[str, Any] = {name: keywords.get(name, _ABSENT) for name in necessary}
+        require(function.__name__, values, _ABSENT)
         return function(*args, **keywords)
 
     return call  # pyright: ignore[reportReturnType]
@@ -44,7 +44,7 @@ def with_keywords_of(source: Callable[..., Any], names: str = "", **extra: Any) 
     """Decorator of a function that ends with ``**keywords``: these are the keywords of `source`.
 
     - `names`: those of `source` that are taken, separated by blanks; by default all.
-    - `more`: further keywords, with their defaults.
+    - `extra`: further keywords, with their defaults.
 
     The function receives every keyword, with its default if it is not given. `inspect.signature`,
     `help` and the reference list them by name.
@@ -52,28 +52,25 @@ def with_keywords_of(source: Callable[..., Any], names: str = "", **extra: Any) 
     **Raises** `TypeError` when it is called with an unknown keyword or without a necessary one.
     """
     parameters = inspect.signature(source).parameters
-    kind, empty = inspect.Parameter.KEYWORD_ONLY, inspect.Parameter.empty
-    keywords = [parameters[n] for n in names.split()] or [
-        p for p in parameters.values() if p.kind == kind
-    ]
+    kind = inspect.Parameter.KEYWORD_ONLY
+    keywords = [parameters[name] for name in names.split()]
+    keywords = keywords or [entry for entry in parameters.values() if entry.kind == kind]
     keywords += [inspect.Parameter(name, kind, default=value) for name, value in extra.items()]
 
     def decorate(function: F) -> F:
         signature = inspect.signature(function)
         *positional, _ = signature.parameters.values()  # without **keywords
-        additional = [p for p in keywords if p.name not in signature.parameters]
-        defaults = {p.name: p.default for p in additional}
+        additional = [entry for entry in keywords if entry.name not in signature.parameters]
+        defaults = {entry.name: entry.default for entry in additional}
         # `inspect` requires positional parameters before keyword-only ones.
-        ordering = sorted([*additional, *positional], key=lambda p: p.kind)
+        ordering = sorted([*additional, *positional], key=lambda parameter: parameter.kind)
 
         @functools.wraps(function)
         def call(*args: Any, **options: Any) -> Any:
             names = call.__dict__["__signature__"].parameters
-            if strangers := [name for name in options if name not in names]:
-                refuse_unknown(function.__name__, call, strangers)
+            refuse_unknown(function.__name__, call, [x for x in options if x not in names])
             options = {**defaults, **options}
-            if gaps := [name for name, value in options.items() if value is empty]:
-                raise TypeError(f"{function.__name__} requires {gaps[0]}=...: give a value.")
+            require(function.__name__, options, _ABSENT)
             return function(*args, **options)
 
         call.__dict__["__signature__"] = signature.replace(parameters=ordering)
@@ -90,8 +87,7 @@ def accept_newton(cls: type[T]) -> type[T]:
     @functools.wraps(construct)
     def init(self: T, *args: Any, **options: Any) -> None:
         if "newton" in options:
-            if "root_finder" in options:
-                raise TypeError("newton and root_finder are two names of one argument: give one.")
+            only_one(TypeError, newton=options["newton"], root_finder=options.get("root_finder"))
             options["root_finder"] = options.pop("newton")
         construct(self, *args, **options)
 

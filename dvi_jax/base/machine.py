@@ -36,8 +36,8 @@ def _limits() -> list[int]:
     with contextlib.suppress(OSError):
         for line in Path("/proc/self/cgroup").read_text().splitlines():
             if line.startswith("0::/"):  # version 2
-                own = _CGROUPS / line.removeprefix("0::/")
-                files += [folder / "memory.max" for folder in (own, *own.parents)]
+                group = _CGROUPS / line.removeprefix("0::/")
+                files += [folder / "memory.max" for folder in (group, *group.parents)]
         for file in files:
             with contextlib.suppress(OSError, ValueError):  # no such limit, or the word "max"
                 limits.append(int(file.read_text()))
@@ -46,10 +46,9 @@ def _limits() -> list[int]:
 
 @functools.cache
 def _devices_memory() -> int | None:
-    limits = [(device.memory_stats() or {}).get("bytes_limit") for device in jax.devices()]
-    sizes = [n for n in limits if n is not None]
+    sizes = [(device.memory_stats() or {}).get("bytes_limit") for device in jax.devices()]
     # A sum over some of the devices would reject results that all of them can hold.
-    return sum(sizes) if sizes and len(sizes) == len(limits) else None
+    return None if None in sizes else sum(filter(None, sizes))
 
 
 def processors() -> int:

@@ -23,15 +23,14 @@ def refuse_double_without_x64(name: str, dtype: Any) -> None:
         )
     if np.dtype(dtype) in (np.dtype(np.float64), np.dtype(np.complex128)) and not x64_enabled():
         single = "complex64" if np.dtype(dtype).kind == "c" else "float32"
-        python = "complex numbers" if single == "complex64" else "floats"
         raise TypeError(
-            f"{name} has the type {np.dtype(dtype)}, as Python {python} have, but this process "
-            f"computes in float32. {_ENABLE} Or give {single} arrays, where these suffice."
+            f"{name} has the type {np.dtype(dtype)}, but this process computes in float32. "
+            f"{_ENABLE} Or give {single} arrays, where these suffice."
         )
 
 
 def require_double(subject: str) -> None:
-    """**Raises** `ValueError` in a process that computes in float32: `what` needs more."""
+    """**Raises** `ValueError` in a process that computes in float32: `subject` needs more."""
     if not x64_enabled():
         raise ValueError(
             f"{subject} needs double precision, but this process computes in float32. {_ENABLE}"

@@ -156,8 +156,8 @@ class _Reader:
             self.add(name, ("array", value.shape, str(value.dtype), _digest(value)))
         elif isinstance(value, list | tuple):
             self.add(name, ("length", len(value)))
-            for i, x in enumerate(value[:_MOST_ENTRIES]):
-                self.note(f"{name}[{i}]", x, names)
+            for i, entry in enumerate(value[:_MOST_ENTRIES]):
+                self.note(f"{name}[{i}]", entry, names)
         elif isinstance(value, dict):
             self.add(name, ("length", len(value)))
             for key in list(value)[:_MOST_ENTRIES]:
@@ -204,8 +204,9 @@ def _digest(array: np.ndarray) -> Any:
 @functools.lru_cache(maxsize=4096)
 def _names(code: types.CodeType) -> tuple[str, ...]:
     """The names of globals and attributes in a function and in the functions inside it."""
-    inner = [c for c in code.co_consts if isinstance(c, types.CodeType)]
-    return tuple(dict.fromkeys([*code.co_names, *(n for c in inner for n in _names(c))]))
+    inner = [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
+    inner_names = [name for inner_code in inner for name in _names(inner_code)]
+    return tuple(dict.fromkeys([*code.co_names, *inner_names]))
 
 
 @functools.lru_cache(maxsize=4096)

@@ -18,7 +18,7 @@ def accepts(function: Callable[..., Any], count: int) -> bool:
     except TypeError:
         return False
     except ValueError:  # a builtin without a signature: the call itself raises if it does not
-        return True
+        pass
     return True
 
 
@@ -34,12 +34,8 @@ def check_takes(
     signature = inspect.signature(function)
     hint = (hints or {}).get(len(signature.parameters), "")
     raise TypeError(
-        f"{name} must take {_WORDS[count]} positional arguments {arguments}, got "
-        f"{signature_of(function)}. {hint}".rstrip()
+        f"{name} must take the arguments {arguments}, got {signature_of(function)}. {hint}".rstrip()
     )
-
-
-_WORDS = {2: "two", 4: "four", 5: "five"}
 
 
 def signature_of(function: Callable[..., Any]) -> str:
@@ -57,9 +53,10 @@ def warn_of_exchanged(name: str, function: Callable[..., Any], arguments: str) -
         names = list(inspect.signature(function).parameters)
     except (TypeError, ValueError):
         return
-    order = arguments.strip("()").split(", ")
-    q, p = (next(i for i, x in enumerate(order) if x[0] == letter) for letter in "qp")
-    if p < len(names) and names[q][:1].lower() == "p" and names[p][:1].lower() == "q":
+    letters = [argument[0] for argument in arguments.strip("()").split(", ")]
+    initials = [name[:1].lower() for name in names]
+    places = [letters.index("q"), letters.index("p")]
+    if max(places) < len(names) and [initials[i] for i in places] == ["p", "q"]:
         warnings.warn(
             f"{name} is called with {arguments}, but its definition has the arguments "
             f"({', '.join(names)}). If it takes p before q, exchange them in the definition. If "
@@ -75,9 +72,8 @@ def tracing_note(name: str, error: Exception) -> str:
             f"{name} is traced by JAX: its values are not known yet, so if and while cannot depend "
             "on them. Use jnp.where(condition, a, b), jax.lax.cond or jax.lax.while_loop."
         )
-    if isinstance(
-        error, jax.errors.ConcretizationTypeError | jax.errors.TracerArrayConversionError
-    ):
+    errors = jax.errors
+    if isinstance(error, errors.ConcretizationTypeError | errors.TracerArrayConversionError):
         return (
             f"{name} is traced by JAX: use jnp.cos, jnp.sqrt, … in place of np.cos, math.cos, "
             "float() or int()."

@@ -47,10 +47,10 @@ def divide(linear: Function, rhs: Number) -> Number:
 def _false_position(f: Function, a, fa, b, fb, exists) -> Number:
     # The values at the ends may come from another program, and have another sign where they are
     # round-off: without a change of sign the root is the end where the function is smaller.
-    apart_in_sign = jnp.sign(fa) * jnp.sign(fb) <= 0
-    is_at_a = ~apart_in_sign & (jnp.abs(fa) < jnp.abs(fb))
+    has_sign_change = jnp.sign(fa) * jnp.sign(fb) <= 0
+    is_at_a = ~has_sign_change & (jnp.abs(fa) < jnp.abs(fb))
     b, fb = jnp.where(is_at_a, a, b), jnp.where(is_at_a, fa, fb)
-    exists = exists & apart_in_sign
+    exists = exists & has_sign_change
 
     def proceed(state):
         a, _, b, fb, n = state

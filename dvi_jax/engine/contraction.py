@@ -24,7 +24,7 @@ def _verdict(
     its estimated error, from the last corrections δ_{k−1}, δ_k."""
     eps = float(jnp.finfo(x.dtype).eps)
     previous, last = corrections
-    scale = jnp.maximum(scales.start, jnp.abs(x))
+    scale = jnp.maximum(scales.represented_size, jnp.abs(x))
     tolerance = (eps / 16 if rtol is None else rtol) * scale + atol
     # With corrections that shrink by θ = δ_k / δ_{k−1} the sum of all further ones is
     # δ_k θ/(1 − θ), which is the error of x.
@@ -72,7 +72,7 @@ def contract(
         # Round-off of many components fluctuates: all of them are rarely good in one iteration. A
         # component that was good and is round-off still counts as good.
         good = good | (was_good & round_off)
-        scale = jnp.maximum(scales.start, jnp.abs(x))
+        scale = jnp.maximum(scales.represented_size, jnp.abs(x))
         safe = jnp.where(scale > 0, scale, 1)
         is_slow = largest(last / safe) > slowest * largest(previous / safe)
         # Compiled for a batch, the maximum may ignore NaN: no decision may depend on NaN in it.

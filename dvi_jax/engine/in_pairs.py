@@ -52,8 +52,8 @@ def in_pairs(function: Callable, *args: Any) -> Any:
         plain = jaxpr_as_fun(program)
         _, change = jax.jvp(plain, rounded(*primals), rounded(*tangents))
         return out, [
-            Pair(t, jnp.zeros_like(t)) if is_pair(x) else t
-            for x, t in zip(out, change, strict=True)
+            Pair(tangent, jnp.zeros_like(tangent)) if is_pair(x) else tangent
+            for x, tangent in zip(out, change, strict=True)
         ]
 
     return jax.tree.unflatten(trace.out_tree, evaluate([*trace.outer, *leaves]))
@@ -95,9 +95,9 @@ def _evaluate(jaxpr: Jaxpr, consts: Sequence[Any], values: Sequence[Any]) -> lis
         return environment[atom]
 
     for eqn in jaxpr.eqns:
-        out = _equation(eqn, [read(v) for v in eqn.invars])
+        out = _equation(eqn, [read(variable) for variable in eqn.invars])
         environment.update(zip(eqn.outvars, out, strict=True))
-    return [read(v) for v in jaxpr.outvars]
+    return [read(variable) for variable in jaxpr.outvars]
 
 
 def _equation(eqn: Any, values: list[Any]) -> list[Any]:
@@ -105,13 +105,13 @@ def _equation(eqn: Any, values: list[Any]) -> list[Any]:
     if name in _EQUATIONS:
         return _EQUATIONS[name](eqn, values)
     # Integers, truth values, and what moves or rounds exact numbers: as JAX does it.
-    in_float64 = any(v.aval.dtype == jnp.float64 for v in eqn.outvars)
+    in_float64 = any(variable.aval.dtype == jnp.float64 for variable in eqn.outvars)
     has_pairs = any(map(is_pair, values))
     if not has_pairs and (not in_float64 or name in _EXACT or name in _MOVES):
         return _bound(eqn, values)
     if name in _MOVES:
         # Numbers change their places only: the lower parts move as the upper ones.
-        lower = [v.lo if is_pair(v) else _zero(v) for v in values]
+        lower = [value.lo if is_pair(value) else _zero(value) for value in values]
         upper = _bound(eqn, rounded(values))
         return [Pair(*x) for x in zip(upper, _bound(eqn, lower), strict=True)]
     if name in _ELEMENTWISE:
@@ -122,9 +122,8 @@ def _equation(eqn: Any, values: list[Any]) -> list[Any]:
         (body, *_) = bodies(eqn)
         return _evaluate(body.jaxpr, body.consts, values)
     raise NotImplementedError(
-        f"arithmetic=dvi.DoubleDouble() has no rule for the operation {name} of JAX in a "
-        "function of this run. Write it with elementary functions, sums, products, "
-        "lanewise.solve(A, b) or loops, or use arithmetic=dvi.Compensated()."
+        f"arithmetic=dvi.DoubleDouble() has no rule for the operation {name} of JAX. Use others, "
+        "such as lanewise.solve(A, b), or arithmetic=dvi.Compensated()."
     )
 
 
@@ -141,7 +140,7 @@ def _zero(x: Any) -> Any:
 
 
 def _over_axes(operation: Callable, neutral: float) -> Callable:
-    return lambda params, x: pairs.reduced(operation, as_pair(x), params["axes"], neutral)
+    return lambda params, x: pairs.reduce_axes(operation, as_pair(x), params["axes"], neutral)
 
 
 def _running(operation: Callable) -> Callable:
@@ -159,7 +158,7 @@ def _dot(params: dict, x: Number, y: Number) -> Pair:
         shape = np.shape(rounded(x))
         free = [i for i in range(len(shape)) if i not in (*batch, *contraction)]
         groups = [[shape[i] for i in axes] for axes in (batch, free, contraction)]
-        sizes = [int(np.prod(g, dtype=int)) for g in groups]
+        sizes = [int(np.prod(group, dtype=int)) for group in groups]
         return jax.tree.map(
             lambda a: jnp.transpose(a, (*batch, *free, *contraction)).reshape(sizes), x
         ), groups
@@ -168,7 +167,7 @@ def _dot(params: dict, x: Number, y: Number) -> Pair:
     x, (front, rows, _) = arrange(x, with_x, of_x)
     y, (_, columns, _) = arrange(y, with_y, of_y)
     x, y = jax.tree.map(lambda a: a[:, :, None], x), jax.tree.map(lambda a: a[:, None], y)
-    total = pairs.reduced(add, as_pair(_broadcast(mul, x, y)), [3], 0.0)
+    total = pairs.reduce_axes(add, as_pair(_broadcast(mul, x, y)), [3], 0.0)
     return jax.tree.map(lambda a: a.reshape(*front, *rows, *columns), total)
 
 
@@ -186,7 +185,7 @@ def _scatter_add(eqn: Any, values: list[Any]) -> list[Any]:
     shape = np.shape(rounded(updates))
     # The adjoint of indexing: several updates may have one index.
     window = eqn.params["dimension_numbers"].update_window_dims
-    rows = [n if i not in window else 1 for i, n in enumerate(shape)]
+    rows = [length if i not in window else 1 for i, length in enumerate(shape)]
     number = jnp.broadcast_to(jnp.arange(np.prod(rows, dtype=int)).reshape(rows), shape)
 
     def row(k: Array, part: Array) -> Array:
@@ -195,7 +194,7 @@ def _scatter_add(eqn: Any, values: list[Any]) -> list[Any]:
 
     numbers = jnp.arange(np.prod(rows, dtype=int))
     terms = jax.tree.map(lambda x: jax.vmap(row, (0, None))(numbers, x), as_pair(updates))
-    return [add(operand, pairs.reduced(add, terms, [0], 0.0))]
+    return [add(operand, pairs.reduce_axes(add, terms, [0], 0.0))]
 
 
 # Powers, conversions
@@ -203,9 +202,8 @@ def _scatter_add(eqn: Any, values: list[Any]) -> list[Any]:
 
 def _power(x: Number, y: Any) -> Number:
     if isinstance(y, np.floating | np.integer) and float(2 * y).is_integer() and abs(y) <= 64:
-        return (
-            pairs.power(x, int(y)) if float(y).is_integer() else functions.root_power(x, int(2 * y))
-        )
+        is_whole = float(y).is_integer()
+        return pairs.power(x, int(y)) if is_whole else functions.root_power(x, int(2 * y))
     return functions.general_power(x, y if is_pair(y) else jnp.asarray(y, jnp.float64))
 
 
@@ -222,10 +220,11 @@ def _convert(params: dict, x: Any) -> Any:
 
 
 def _select(index: Array, *cases: Any) -> Any:
-    upper = lax.select_n(index, *(jnp.asarray(rounded(c)) for c in cases))
+    upper = lax.select_n(index, *(jnp.asarray(rounded(case)) for case in cases))
     if not any(map(is_pair, cases)):
         return upper
-    return Pair(upper, lax.select_n(index, *(c.lo if is_pair(c) else _zero(c) for c in cases)))
+    lower = [case.lo if is_pair(case) else _zero(case) for case in cases]
+    return Pair(upper, lax.select_n(index, *lower))
 
 
 def _remainder(x: Number, y: Number) -> Number:
@@ -269,9 +268,8 @@ def _loop(eqn: Any, values: list[Any]) -> list[Any]:
     n, m = eqn.params["cond_nconsts"], eqn.params["body_nconsts"]
     test, body = _as_function(eqn.params["cond_jaxpr"]), _as_function(eqn.params["body_jaxpr"])
     begin = [as_pair(x) for x in values[n + m :]]
-    return lax.while_loop(
-        lambda x: test(*values[:n], *x)[0], lambda x: body(*values[n : n + m], *x), begin
-    )
+    consts = values[n : n + m]
+    return lax.while_loop(lambda x: test(*values[:n], *x)[0], lambda x: body(*consts, *x), begin)
 
 
 def _cond(eqn: Any, values: list[Any]) -> list[Any]:
@@ -327,8 +325,7 @@ def _call(eqn: Any, values: list[Any]) -> list[Any]:
     program = eqn.params["program"]
     if eqn.params["lanes"] is not None:
         raise NotImplementedError(
-            "arithmetic=dvi.DoubleDouble() has no rule for lanewise.batched, nor for jax.vmap of "
-            "lanewise.call. Use jax.vmap without lanewise, or arithmetic=dvi.Compensated()."
+            "arithmetic=dvi.DoubleDouble() has no rule for lanewise.batched: use jax.vmap alone."
         )
     inner = program.traced.all_inputs
     return _evaluate(inner.jaxpr, inner.consts, values)

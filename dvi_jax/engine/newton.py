@@ -22,12 +22,12 @@ Function = Callable[[Vector], Vector]
 class Scales(NamedTuple):
     """Scales of the convergence test, per unknown and not negative, next to its own size.
 
-    `known` is the size of the known value that it starts from, `start` the size of that value as it
-    is represented. They differ for states relative to an origin only.
+    `size` is that of the value that a step starts from, `represented_size` that of its
+    representation. They differ for states relative to an origin only.
     """
 
-    known: Vector
-    start: Vector
+    size: Vector
+    represented_size: Vector
 
 
 class RootInfo(NamedTuple):
@@ -66,7 +66,7 @@ def check_settings(rtol: float | None, atol: float, max_steps: int) -> None:
         if value is not None:
             positive(name, value, zero=True)
     if rtol == 0 and atol == 0:
-        raise ValueError("rtol and atol are both 0, so no iteration would stop: make one positive.")
+        raise ValueError("rtol and atol are both 0: one must be positive.")
 
 
 class Newton(RootSolver):
@@ -102,7 +102,7 @@ class Newton(RootSolver):
         check_settings(self.rtol, self.atol, self.max_steps)
 
     def solve(self, F, x0, scales):
-        magnitude, eps = scales.known, float(jnp.finfo(x0.dtype).eps)
+        magnitude, eps = scales.size, float(jnp.finfo(x0.dtype).eps)
         tiny = float(jnp.finfo(x0.dtype).tiny)
 
         def proceed(state: _Iterate):
@@ -118,7 +118,7 @@ class Newton(RootSolver):
             previous, worst = _largest_of(jnp.abs(first)), _largest_of(jnp.abs(second))
             scale = _larger(magnitude, jnp.abs(x))
             shrinks = worst < previous
-            # worst²/before is the next correction. Only where it would be above round-off is a
+            # worst²/previous is the next correction. Only where it would be above round-off is a
             # third evaluation of F worth its time.
             is_large = shrinks & (worst * worst > eps / 16 * previous * _least_of(scale))
 
@@ -140,9 +140,9 @@ class Newton(RootSolver):
 
         def is_root(second, scale, previous, worst):
             if by_rate:
-                # With one Jacobian corrections shrink linearly, here by worst/before: the error
+                # With one Jacobian corrections shrink linearly, here by worst/previous: the error
                 # is that fraction of the last one. Written as products, since a division by
-                # `before` may be one by zero.
+                # `previous` may be one by zero.
                 bound = (eps / 16 * previous) * scale
                 # Beyond the range of normal numbers the comparison of products is meaningless.
                 in_range = (bound > tiny) & (bound < jnp.inf)
@@ -208,20 +208,19 @@ class _Iterate(NamedTuple):
 def find_root(
     function: Function,
     guess: Vector,
-    known: Vector,
+    size: Vector,
     solver: RootSolver | KnownRoot,
-    start: Vector | None = None,
+    represented_size: Vector | None = None,
 ) -> tuple[Vector, RootInfo]:
     """Root x of function(x) = 0 near `guess`, and how it was found.
 
     The derivative of x with respect to values that `function` closes over is that of the implicit
-    function theorem, dx = −(∂F/∂x)⁻¹ dF, in forward and reverse mode and to any order. `known` and
-    `start` (`known` if left out) are the `Scales` of the tolerances.
+    function theorem, dx = −(∂F/∂x)⁻¹ dF, in forward and reverse mode and to any order. `size` and
+    `represented_size` (`size` if left out) are the `Scales` of the tolerances.
     """
     # Scales decide when to stop, and no iteration is differentiated: no derivative of theirs.
-    known = lax.stop_gradient(jnp.abs(known))
-    start = known if start is None else lax.stop_gradient(jnp.abs(start))
-    scales = Scales(known, start)
+    scales = Scales(size, size if represented_size is None else represented_size)
+    scales = jax.tree.map(lambda x: lax.stop_gradient(jnp.abs(x)), scales)
     method = solver.solver if isinstance(solver, KnownRoot) else solver
 
     def solve(F, x0):

@@ -52,10 +52,8 @@ def _tables() -> tuple[tuple[float, ...], np.ndarray, tuple[float, ...], np.ndar
         context.prec = 60
 
         def arctan_of_inverse(n: int) -> Decimal:
-            terms = (
-                (-1) ** k / (Decimal(2 * k + 1) * Decimal(n) ** (2 * k + 1)) for k in range(99)
-            )
-            return sum(terms, Decimal(0))
+            odd = range(1, 199, 2)
+            return sum(((2 - k % 4) / (Decimal(k) * Decimal(n) ** k) for k in odd), Decimal(0))
 
         turn = 8 * (4 * arctan_of_inverse(5) - arctan_of_inverse(239))  # 2π (Machin)
         quarter, circle = _PER_TURN // 4, []

@@ -189,7 +189,7 @@ def floor(x: Number) -> Number:
     return fast_two_sum(integer, jnp.where(integer == x.hi, jnp.floor(x.lo), 0.0))
 
 
-def reduced(operation: Callable, x: Pair, axes: Sequence[int], neutral: float) -> Pair:
+def reduce_axes(operation: Callable, x: Pair, axes: Sequence[int], neutral: float) -> Pair:
     """Elements along axes combined by an operation of two, by halves."""
     free = [i for i in range(x.hi.ndim) if i not in axes]
     shape = [x.hi.shape[i] for i in free]

@@ -1,5 +1,7 @@
 """Fixed-point iteration for implicit steps with many unknowns, and the default solver."""
 
+import functools
+
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
@@ -71,7 +73,7 @@ class PicardThenNewton(RootSolver):
 
     def __check_init__(self):
         if self.newton_up_to is not None:
-            whole("newton_up_to", self.newton_up_to, least=0)
+            whole("newton_up_to", self.newton_up_to, low=0)
         instance("picard", self.picard, Picard, "a dvi.Picard(...)")
         instance("newton", self.newton, Newton, "a dvi.Newton(...)")
 
@@ -81,19 +83,15 @@ class PicardThenNewton(RootSolver):
     def solve(self, F, x0, scales):
         if self._is_few(x0.size):
             return self.newton.solve(F, x0, scales)
-        settings = self.picard
-        first = contract(
-            F, x0, scales, settings.rtol, settings.atol, settings.max_steps, slowest=0.5
-        )
+        settings = self.picard.rtol, self.picard.atol, self.picard.max_steps
+        first = contract(F, x0, scales, *settings, slowest=0.5)
 
         # From x0, not from where Picard's iteration stopped: it may have diverged. The branch runs
         # for the whole batch, so that the trajectories that have converged keep their numbers.
         def with_newton(first: RootInfo) -> RootInfo:
             second = self.newton.solve(F, x0, scales)
             second = second._replace(iterations=first.iterations + second.iterations)
-            return RootInfo(
-                *(jnp.where(first.converged, a, b) for a, b in zip(first, second, strict=True))
-            )
+            return RootInfo(*map(functools.partial(jnp.where, first.converged), first, second))
 
         return lax.cond(lanewise.on_any(~first.converged), with_newton, lambda first: first, first)
 

@@ -26,9 +26,9 @@ def one_by_one(
 
 def each(
     function: Callable[..., Any],
-    shared: Any,
+    constants: Any,
     *rows: Any,
     layout: lanewise.Layout = lanewise.Layout(),
 ) -> Any:
     """``function(given, *row)`` for every row, with the bits of a call for one row alone."""
-    return jax.vmap(lambda *row: one_by_one(function, shared, *row, layout=layout))(*rows)
+    return jax.vmap(lambda *row: one_by_one(function, constants, *row, layout=layout))(*rows)

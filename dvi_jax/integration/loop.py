@@ -283,8 +283,8 @@ def _in_loop(task: Task, q: State) -> tuple[Callable | None, Callable, Callable]
 
     return (
         quick.step,
-        lambda carry: moved(quick.before, carry, carry.k),
-        lambda carry: moved(quick.after, carry, carry.k - 1),
+        lambda carry: moved(quick.first, carry, carry.k),
+        lambda carry: moved(quick.last, carry, carry.k - 1),
     )
 
 

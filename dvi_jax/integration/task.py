@@ -48,7 +48,7 @@ class Task(eqx.Module):
         """The equations of step k, with the increments of its noise."""
         if self.path is None:
             return self.equations
-        return dataclasses.replace(self.equations, increments=self.path.at(k, interval))
+        return dataclasses.replace(self.equations, increments=self.path.increments_of(k, interval))
 
     def first_interval(self) -> Interval:
         """The interval of step 0."""

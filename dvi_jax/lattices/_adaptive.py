@@ -21,7 +21,7 @@ _LARGEST_RATIO = 4.0
 step, which is a factor below two for every h that resolves g."""
 
 
-class Memory(NamedTuple):
+class ControllerState(NamedTuple):
     """State of the controller between steps."""
 
     t: Scalar  # where the next step begins
@@ -87,9 +87,8 @@ class AdaptiveReversible(StepSizes):
     def check(self, method, arithmetic):
         if not method.is_symmetric:
             raise ValueError(
-                f"lattice=dvi.AdaptiveReversible(...) requires a symmetric method, got {method!r}. "
-                "Otherwise the steps are not reversible, and energies drift. Use "
-                "method=dvi.Strang(), method=dvi.KahanLi(8) or another symmetric method."
+                "lattice=dvi.AdaptiveReversible(...) requires a symmetric method, such as "
+                f"dvi.Strang(), got {method!r}."
             )
         check_rounding(type(self).__name__, arithmetic)
 
@@ -101,7 +100,7 @@ class AdaptiveReversible(StepSizes):
         return Interval(t0, t0 + h, h)
 
     def begin(self, t0, h):
-        return Memory(t0, jnp.zeros_like(h), h)
+        return ControllerState(t0, jnp.zeros_like(h), h)
 
     def next(self, memory, equations, place):
         g, slope = self._along_the_motion(equations, memory.t, place.q, place.p)
@@ -115,15 +114,13 @@ class AdaptiveReversible(StepSizes):
         # Times carry no accumulated round-off: over many steps it would exceed the smallest h.
         t1, error = two_sum(memory.t, h + memory.error)
         status = RESULTS.where(follows, RESULTS.successful, RESULTS.step_control_failed)
-        return Interval(memory.t, t1, h), Memory(t1, lax.stop_gradient(error), h), status
+        return Interval(memory.t, t1, h), ControllerState(t1, lax.stop_gradient(error), h), status
 
     def report(self, memory, equations, place):
-        return {
-            "last_h": memory.h,
-            "resume_h": one_by_one(AdaptiveReversible._resume_step, self, memory, equations, place),
-        }
+        resume = one_by_one(AdaptiveReversible._resume_step, self, memory, equations, place)
+        return {"last_h": memory.h, "resume_h": resume}
 
-    def _resume_step(self, memory: Memory, equations: Equations, place: Place) -> Scalar:
+    def _resume_step(self, memory: ControllerState, equations: Equations, place: Place) -> Scalar:
         """The δ for which δ g is half a change after the last step, as it is at the start."""
         g, slope = self._along_the_motion(equations, memory.t, place.q, place.p)
         return jnp.where(place.k == 0, place.h, 2 * memory.h / (2 * g - memory.h * slope))

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Int, PyTree
 
 from lanewise.jaxprs.jaxapi import is_traced
 
-from ..base.checks import whole
+from ..base.checks import require, whole
 from ..base.results import RESULTS
 from ..base.types import Args, Interval, Scalar, State
 from ..methods.step import Equations
@@ -66,10 +66,10 @@ class Lattice(eqx.Module):
     def steps_to(self, t0: Any, h: Any, num_steps: Any, t1: Any, duration: Any) -> int:
         """Number of steps to the time t1, or over a duration. **Raises** `ValueError`."""
         raise ValueError(
-            f"t1 and duration must be left out with lattice={self!r}, because its steps can have "
-            f"different sizes; got t1={t1!r}, duration={duration!r}. "
-            f"{'Give num_steps' if self.takes_h else 'ts determines the end of the run'}. To save "
-            "the state at a time t use save=dvi.Save(ts=[t])."
+            f"t1 and duration must be left out with lattice={self!r}, whose steps have different "
+            f"sizes, got t1={t1!r}, duration={duration!r}. "
+            f"{'Give num_steps' if self.takes_h else 'ts determines the end'}, or "
+            "save=dvi.Save(ts=[t])."
         )
 
     @abc.abstractmethod
@@ -107,13 +107,8 @@ class StepSizes(Lattice):
     """Base of the lattices with a given step size, at least of the first step, and their number."""
 
     def prepare(self, t0, h, num_steps):
-        absent = [name for name, x in (("h", h), ("num_steps", num_steps)) if x is None]
-        if absent:
-            hint = " The lattice dvi.Uniform() also accepts t1 or duration in place of num_steps."
-            raise TypeError(
-                f"{' and '.join(absent)} must be given, because lattice={self!r} requires h and "
-                f"num_steps.{hint if num_steps is None else ''}"
-            )
+        hint = "dvi.Uniform() also accepts t1 or duration." if num_steps is None else ""
+        require(f"lattice={self!r}", {"h": h, "num_steps": num_steps}, hint=hint)
         return t0, h, check_num_steps(num_steps)
 
     def is_usable(self, t0, h):
@@ -124,9 +119,8 @@ def check_rounding(owner: str, arithmetic: Any) -> None:
     """**Raises** `ValueError` for an arithmetic that undoes steps bit for bit."""
     if arithmetic.undoes_steps:
         raise ValueError(
-            f"arithmetic={arithmetic!r} cannot be used with lattice=dvi.{owner}(...), whose "
-            "step sizes are rounded: steps cannot be undone bit for bit. Use "
-            "arithmetic=dvi.Compensated(), or lattice=dvi.Uniform()."
+            f"arithmetic={arithmetic!r} cannot be used with lattice=dvi.{owner}(...), whose step "
+            "sizes are rounded: use dvi.Compensated(), or dvi.Uniform()."
         )
 
 
@@ -136,9 +130,8 @@ def check_speed(owner: str, speed: Callable[..., Any], run: Run) -> None:
     value = jnp.asarray(speed(run.t0, run.q0, run.p0, run.args))
     if value.shape != () or (not is_traced(value) and not float(value) > 0):
         raise ValueError(
-            f"speed of {owner} must return one positive number for each state, but at the "
-            "initial state (t0, q0, p0) it returns "
-            f"{value if value.shape == () else f'an array of shape {value.shape}'}."
+            f"speed of {owner} must return one positive number, but at the initial state it "
+            f"returns {value if value.shape == () else f'an array of shape {value.shape}'}."
         )
 
 
@@ -152,9 +145,8 @@ def check_num_steps(num_steps: object) -> int:
         count = None
     if count is None:
         raise TypeError(
-            "num_steps must be a Python integer, because it determines array shapes; got "
-            f"{num_steps!r}. Under jax.jit mark it as static: static_argnames."
+            f"num_steps must be an integer that is not traced (static_argnames of jax.jit), got "
+            f"{num_steps!r}."
         )
-    hint = "To go backwards in time give a negative h; divide a longer run into several runs, each "
-    hint += "from the end of the one before."
+    hint = "A negative h runs backwards in time."
     return whole("num_steps", count, 0, 2**31 - 2, hint)  # steps are counted in 32 bits

@@ -4,11 +4,11 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from lanewise.jaxprs.jaxapi import is_traced
 
+from ..base.checks import in_order
 from ..base.inputs import as_times
 from ..base.types import Interval
 from ._base import Lattice, check_num_steps
@@ -36,42 +36,24 @@ class Given(Lattice):
     ts: Float[Array, " times"] = eqx.field(converter=_times)
 
     def __check_init__(self):
-        if self.ts.ndim != 1 or self.ts.shape[0] < 1:
-            raise ValueError(
-                "ts in Given(ts) must be a one-dimensional array of at least one time, got shape "
-                f"{self.ts.shape}."
-            )
         if not is_traced(self.ts):
-            steps = np.diff(np.asarray(self.ts))
-            bad = ~np.isfinite(steps) | (steps * (np.sign(steps[0]) if steps.size else 1) <= 0)
-            if not np.isfinite(np.asarray(self.ts)).all() or bad.any():
-                k = int(np.argmax(bad)) if bad.any() else 0
-                # The first two times as well: they determine the direction.
-                pairs = {i: np.asarray(self.ts)[i : i + 2].tolist() for i in (0, k)}
-                raise ValueError(
-                    "ts in Given(ts) must be finite times in strictly increasing order, or finite "
-                    "times in strictly decreasing order; got "
-                    f"{' and '.join(f'ts[{i}:{i + 2}] = {pair}' for i, pair in pairs.items())}. "
-                    "np.unique(ts) puts finite times in increasing order and removes equal times."
-                )
+            in_order("ts in Given(ts)", self.ts, strictly=True, hint="np.unique(ts) is.")
 
     def prepare(self, t0, h, num_steps):
-        available = self.ts.shape[0] - 1
-        if h is not None:
+        count = self.ts.shape[0] - 1
+        t0_is_known = not is_traced(t0) and not is_traced(self.ts)
+        contradictions = {
+            f"h={h!r}": h is not None,
+            f"t0={t0}": t0_is_known and t0 != 0.0 and t0 != self.ts[0],
+            f"num_steps={num_steps}": num_steps is not None and check_num_steps(num_steps) != count,
+        }
+        texts = [text for text, is_so in contradictions.items() if is_so]
+        if texts:
             raise ValueError(
-                "h must be left out with lattice=Given(ts), because ts determines the steps; got "
-                f"h={h!r}."
+                "h, t0 and num_steps must be left out with lattice=Given(ts), whose ts determine "
+                f"the {count} steps from t = {self.ts[0]}, got {', '.join(texts)}."
             )
-        if not is_traced(t0) and not is_traced(self.ts) and t0 != 0.0 and t0 != self.ts[0]:
-            raise ValueError(
-                f"t0 must be left out with Given(ts), or equal ts[0] = {self.ts[0]}; got t0={t0}."
-            )
-        if num_steps is not None and check_num_steps(num_steps) != available:
-            raise ValueError(
-                "num_steps must be left out with Given(ts), or equal len(ts) − 1 = "
-                f"{available}; got num_steps={num_steps}."
-            )
-        return self.ts[0], 1.0, available  # any h: the steps do not depend on it
+        return self.ts[0], 1.0, count  # any h: the steps do not depend on it
 
     def interval(self, t0, h, k):
         start, end = self.ts[k], self.ts[k + 1]

@@ -144,14 +144,13 @@ class ExtendedSpace(eqx.Module):
             return Running(self.on_steps(observable.reduction))
         if isinstance(observable, Trend):
             raise ValueError(
-                "observe must not contain a dvi.Trend with lattice=TimeTransformed(...): its slope "
-                "would be the change per unit of fictitious time, not of t. Use observe=f, "
-                "and fit a line to its values against solution.ts."
+                "observe must not contain a dvi.Trend with lattice=TimeTransformed(...), since its "
+                "slope would be that in fictitious time. Use observe=f, and fit a line."
             )
         if isinstance(observable, Deviations):
             raise ValueError(
-                f"{type(observable).__name__} requires steps whose size does not depend on the "
-                "state: use lattice=dvi.Uniform() or lattice=dvi.Given(ts)."
+                f"{type(observable).__name__} requires lattice=dvi.Uniform() or dvi.Given(ts), "
+                "whose steps do not depend on the state."
             )
         if isinstance(observable, Section):
             return eqx.tree_at(lambda s: s.g, observable, _PointFunction(observable.g, self))

@@ -11,7 +11,7 @@ from jaxtyping import Array, Int
 
 import lanewise
 
-from ..base.checks import one_of
+from ..base.checks import one_of, require_system
 from ..base.results import RESULTS
 from ..base.types import Args, Interval, Scalar, State
 from ..engine.bracket import bracketed_root, divide
@@ -31,7 +31,7 @@ _GOLDEN = 0.6180339887498949
 _GOLDEN_STEPS = 40
 
 
-class Memory(NamedTuple):
+class BalanceState(NamedTuple):
     """State of the lattice equation between steps."""
 
     t: Scalar  # where the next step begins
@@ -89,8 +89,7 @@ class Variational(StepSizes):
         one_of("on_no_root", self.on_no_root, get_args(Policy))
         if not (isinstance(self.reach, int | float) and 1 < self.reach < float("inf")):
             raise ValueError(
-                "reach of Variational must be a Python number, finite and greater than 1; got "
-                f"{self.reach!r}. It is the largest ratio of a step size to the previous one."
+                f"reach of Variational must be a finite number above 1, got {self.reach!r}."
             )
         try:
             smallest, largest = map(float, self.bounds)
@@ -98,18 +97,15 @@ class Variational(StepSizes):
             smallest, largest = 1.0, 0.0
         if not 0 < smallest <= 1 <= largest < float("inf"):
             raise ValueError(
-                "bounds of Variational must be a pair (smallest, largest) of finite numbers with "
-                f"0 < smallest ≤ 1 ≤ largest, got {self.bounds!r}. They are "
-                "ratios to the first step size h."
+                "bounds of Variational must be finite numbers (smallest, largest) with 0 < "
+                f"smallest ≤ 1 ≤ largest, ratios to the first step, got {self.bounds!r}."
             )
 
     def check(self, method, arithmetic):
         if not method.is_the_map:
             raise ValueError(
-                "lattice=dvi.Variational() requires method=dvi.TypeII(), got "
-                f"method={method!r}. The equation for the step sizes, (14) in the paper, is "
-                "derived for TypeII only. For a higher order give the system a discrete "
-                "Hamiltonian of higher order: dvi.System(dvi.discretise(H, order=2))."
+                f"lattice=dvi.Variational() requires method=dvi.TypeII(), got {method!r}. For a "
+                "higher order use dvi.discretise(H, order=2)."
             )
         check_rounding(type(self).__name__, arithmetic)
 
@@ -118,7 +114,7 @@ class Variational(StepSizes):
 
     def begin(self, t0, h):
         zero = jnp.zeros_like(h)
-        return Memory(t0, h, zero, jnp.asarray(0, jnp.int32), zero)
+        return BalanceState(t0, h, zero, jnp.asarray(0, jnp.int32), zero)
 
     def next(self, memory, equations, place):
         def energies(h):
@@ -137,27 +133,19 @@ class Variational(StepSizes):
         balance = energies(h)
         defect = jnp.where(first, 0.0, jnp.abs(balance.imbalance(memory.energy)))
         interval = Interval(memory.t, memory.t + h, h)
-        memory = Memory(
-            interval.t1,
-            h,
-            balance.incoming,
-            memory.misses + jnp.where(is_root, 0, 1),
-            jnp.maximum(memory.defect, lax.stop_gradient(defect)),
-        )
+        misses = memory.misses + jnp.where(is_root, 0, 1)
+        defect = jnp.maximum(memory.defect, lax.stop_gradient(defect))
+        memory = BalanceState(interval.t1, h, balance.incoming, misses, defect)
         if self.on_no_root != "stop":
             return interval, memory, None
         return interval, memory, RESULTS.where(is_root, RESULTS.successful, RESULTS.no_root)
 
     def report(self, memory, equations, place):
-        del equations, place
-        return {
-            "last_h": memory.h,
-            "lattice_misses": memory.misses,
-            "lattice_defect": memory.defect,
-        }
+        misses, defect = memory.misses, memory.defect
+        return {"last_h": memory.h, "lattice_misses": misses, "lattice_defect": defect}
 
     def _factors(self, growth: Scalar) -> Array:
-        """Candidate ratios to the last step, which is `grown` times the first; 1 in the middle."""
+        """Candidate ratios to the last step, which is `growth` times the first; 1 in the middle."""
         smallest, largest = (jnp.asarray(b, growth.dtype) / growth for b in self.bounds)
         # The last step stays in the range, also if rounding has moved it beyond a bound.
         low = jnp.clip(smallest, 1 / self.reach, 1)
@@ -218,11 +206,7 @@ class LatticeCondition(eqx.Module):
     def __call__(
         self, t0: Scalar, t1: Scalar, q0: State, p0: State, q1: State, p1: State, args: Args
     ) -> Scalar:
-        if self.system is None:
-            raise ValueError(
-                "LatticeCondition requires the system and ε when it is called directly: "
-                "dvi.LatticeCondition(system, epsilon)."
-            )
+        require_system("LatticeCondition", self.system)
         equations = Equations(self.system, self.epsilon, args)
 
         def balance(h):
@@ -253,18 +237,13 @@ def _energies(equations: Equations, t: Scalar, h: Scalar, q: State, p: State) ->
     q1, p1, info = step(equations, interval, q, p)
     # The energy of a p1 that does not solve (13) could change sign where there is no root.
     p1 = jnp.where(info.result == RESULTS.successful, p1, jnp.nan)
-    start, parameters = (
-        (equations.system, *interval[:2], q),
-        (p1, equations.epsilon, equations.args),
-    )
-    outgoing, incoming = (
-        outgoing_energy(*start, *parameters, h),
-        incoming_energy(*start, *parameters, h),
-    )
+    start = equations.system, *interval[:2], q
+    parameters = p1, equations.epsilon, equations.args
+    outgoing = outgoing_energy(*start, *parameters, h)
+    incoming = incoming_energy(*start, *parameters, h)
     work = disturbing_work(*start, q1, *parameters)
-    return _Energies(
-        outgoing, incoming, work, jnp.abs(outgoing) + jnp.abs(incoming) + jnp.abs(work)
-    )
+    size = jnp.abs(outgoing) + jnp.abs(incoming) + jnp.abs(work)
+    return _Energies(outgoing, incoming, work, size)
 
 
 def _minimum(residual: Callable, hs: Array, values: Array, is_minimum: Array) -> Scalar:

@@ -15,11 +15,11 @@ from .step import Equations, StepInfo
 
 
 class InLoop(NamedTuple):
-    """Functions as `Method.step`: after ∘ stepⁿ ∘ before is n steps of equal length."""
+    """Functions as `Method.step`: last ∘ stepⁿ ∘ first is n steps of equal length."""
 
-    before: Callable
+    first: Callable
     step: Callable
-    after: Callable
+    last: Callable
 
 
 class Method(eqx.Module):
@@ -52,9 +52,9 @@ class Method(eqx.Module):
     def needs_no_solve(self, equations: Equations, interval: Interval, q: State) -> bool:
         """Whether `step` is explicit for these equations; see `Equations.step_is_explicit`."""
 
-    @abc.abstractmethod
     def inverse_needs_no_solve(self, equations: Equations, interval: Interval, q: State) -> bool:
-        """Whether `inverse` is explicit for these equations."""
+        """Whether `inverse` is explicit for these equations; by default where `step` is."""
+        return self.needs_no_solve(equations, interval, q)
 
     def in_loop(self, equations: Equations, interval: Interval, q: State) -> InLoop | None:
         """The same steps with less work, where they have some in common (None: nowhere)."""
@@ -107,9 +107,8 @@ class Method(eqx.Module):
         # The errors that a function raises for a q or args of another structure than it expects.
         except (TypeError, IndexError, KeyError, ValueError, AttributeError) as error:
             raise ValueError(
-                "the functions of the system cannot be evaluated or differentiated for q of shape "
-                f"{q.shape} and args={args!r:.200}. {type(error).__name__}: {error}. Give the q "
-                "and the args that the system requires."
+                f"the system cannot be evaluated for q of shape {q.shape} and args={args!r:.200}. "
+                f"{type(error).__name__}: {error}"
             ) from error
         return answers[0]
 
@@ -120,6 +119,5 @@ def check_invertible(name: str, method: Any) -> None:
     instance(name, method, Method, "a method such as dvi.TypeII()")
     if not method.is_invertible:
         raise ValueError(
-            f"{name} must have an inverse step, got {method!r}, a method without an inverse step. "
-            "Use another method, such as dvi.TypeII()."
+            f"{name} must be a method with an inverse step, such as dvi.TypeII(), got {method!r}."
         )

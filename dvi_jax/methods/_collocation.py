@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..base.types import Interval, Scalar, State
+from ..base.types import Interval, Scalar
 from ._base import Method
 from .step import Equations
 
@@ -26,9 +26,6 @@ class Collocation(Method):
     def inverse(self, equations, interval, q1, p1):
         # A symmetric method is its own adjoint, so that the step by −h undoes the step by h.
         return self.step(equations, interval.reversed(), q1, p1)
-
-    def inverse_needs_no_solve(self, equations, interval, q) -> bool:
-        return self.needs_no_solve(equations, interval, q)
 
 
 def exact_nodes(guesses: Iterable[float], slope: Callable) -> list[Fraction]:
@@ -67,9 +64,8 @@ def integrals(x: Sequence[Fraction], b: Sequence[Any], degree: int) -> np.ndarra
 
     **Source** Hairer & Wanner 1996, *Solving ODEs II*, IV.5 (the W-transformation).
     """
-    # This is the expansion of ℓ_j in Legendre polynomials, integrated term by term. `degree` is s
-    # for s Gauss nodes, and s − 1 for s Lobatto nodes, where the integral of the last term, a
-    # multiple of (1 − x²) P'_{s−1}, vanishes at every node.
+    # The expansion of ℓ_j in Legendre polynomials, integrated term by term. `degree` is s for s
+    # Gauss nodes, and s − 1 for s Lobatto nodes, where the integral of the last term vanishes.
     P = np.array([legendre(y, degree) for y in x], object)  # (s, degree + 1)
     lower = np.concatenate([np.full((len(x), 1), -1), P[:, : degree - 1]], axis=1)
     return np.array(b, object) * ((P[:, 1:] - lower) / 2 @ P[:, :degree].T)
@@ -90,10 +86,7 @@ def continuous_rates(equations: Equations, like: Scalar) -> tuple[Callable, Call
     def instant(t: Scalar) -> Interval:
         return Interval(t, t, jnp.zeros_like(like))
 
-    def position_rate(t: Scalar, q: State, p: State) -> State:
-        return equations.position_rate(instant(t), q, p)
-
-    def momentum_rate(t: Scalar, q: State, p: State) -> State:
-        return equations.momentum_rate(instant(t), q, p)
-
-    return position_rate, momentum_rate
+    return (
+        lambda t, q, p: equations.position_rate(instant(t), q, p),
+        lambda t, q, p: equations.momentum_rate(instant(t), q, p),
+    )

@@ -129,9 +129,6 @@ class CompositionMethod(Method):
         forwards = self.base.needs_no_solve(equations, interval, q)
         return forwards and self.base.inverse_needs_no_solve(equations, interval, q)
 
-    def inverse_needs_no_solve(self, equations, interval, q) -> bool:
-        return self.needs_no_solve(equations, interval, q)
-
 
 def _in_turn(body: Callable, pairs: list) -> Callable:
     """state → state after `body` on each pair in turn."""
@@ -143,7 +140,7 @@ def _in_turn(body: Callable, pairs: list) -> Callable:
     if not pairs:
         return lambda state: state
     stack = jax.tree.map(lambda *xs: jnp.stack(xs), *pairs)
-    return lambda state: lax.scan(lambda s, parts: (body(s, parts), None), state, stack)[0]
+    return lambda state: lax.scan(lambda carry, parts: (body(carry, parts), None), state, stack)[0]
 
 
 def of_strang(*outer: float) -> tuple[float, ...]:
@@ -155,12 +152,11 @@ def of_strang(*outer: float) -> tuple[float, ...]:
 
 def _as_coefficients(values: Sequence[float]) -> tuple[float, ...]:
     try:
-        return tuple(float(c) for c in values)
+        return tuple(float(value) for value in values)
     except (TypeError, ValueError):
         raise TypeError(
-            "coefficients of Composition must be a sequence of numbers, such as (0.2, 0.3, 0.3, "
-            f"0.2), got {values!r:.200}. Make the "
-            "Composition outside of jax.jit, jax.grad and jax.vmap."
+            "coefficients of Composition must be a sequence of numbers that are not traced, got "
+            f"{values!r:.200}."
         ) from None
 
 
@@ -208,17 +204,17 @@ class Composition(CompositionMethod):
         if not c or not all(math.isfinite(x) for x in c) or abs(math.fsum(c) - 1) > 1e-12:
             raise ValueError(
                 f"coefficients of Composition must be finite and sum to 1 up to 1e-12, got {c} "
-                f"with the sum {sum(c)!r}. Compute one of them as 1 minus the sum of the others."
+                f"with the sum {sum(c)!r}."
             )
         hint = "Conditions of higher orders cannot be checked."
-        whole("order", order, most=_MOST_CHECKED, hint=hint)
+        whole("order", order, high=_MOST_CHECKED, hint=hint)
         defects = order_defects(c, order, base.order, base.is_symmetric)
         actual = next((n for n, defect in enumerate(defects) if defect > _DEFECT), order)
         if actual < order:
             raise ValueError(
-                f"order={order} is too high: the coefficients have order {actual}, not {order}. "
-                f"They violate the conditions of order {actual + 1} by {defects[actual]:.1e}; at "
-                f"most {_DEFECT} is allowed."
+                f"order must be at most {actual}, that of the coefficients, got {order}: the "
+                f"conditions of order {actual + 1} have the defect {defects[actual]:.1e}, above "
+                f"{_DEFECT}."
             )
 
     def fractions(self):
@@ -227,6 +223,7 @@ class Composition(CompositionMethod):
     @property
     def is_symmetric(self) -> bool:
         """Whether the map is its own adjoint."""
-        c = self.coefficients
         # An odd number has one step of the base in the middle, which has to be symmetric itself.
-        return c == c[::-1] and (len(c) % 2 == 0 or self.base.is_symmetric)
+        is_even = len(self.coefficients) % 2 == 0
+        is_palindrome = self.coefficients == self.coefficients[::-1]
+        return is_palindrome and (is_even or self.base.is_symmetric)

@@ -47,21 +47,22 @@ class _Inner(NamedTuple):
 
     def rates(self, interval: Interval, z: Any, y: Any) -> tuple[Any, Any]:
         """(q̇, ṗ) at z = (q, p) and y."""
-        e = self.equations
-        point = (*interval[:2], *e.absolute(*z), y, e.epsilon, e.args)
-        return _inner_rates(e.system, self.implicit, *point)
+        system, epsilon, args = self.equations.system, self.equations.epsilon, self.equations.args
+        point = (*interval[:2], *self.equations.absolute(*z), y, epsilon, args)
+        return _inner_rates(system, self.implicit, *point)
+
+    def _place(self, t: Any, z: Any) -> tuple[Any, ...]:
+        """(t, q, p), the arguments of the user's functions before y and args."""
+        time, _ = self.equations.system.times(t, t, self.equations.epsilon)
+        return time, *self.equations.absolute(*z)
 
     def defect(self, t: Any, z: Any, y: Any) -> Any:
-        e = self.equations
-        s, _ = e.system.times(t, t, e.epsilon)
-        return self.implicit.relation(s, *e.absolute(*z), y, e.args)
+        return self.implicit.relation(*self._place(t, z), y, self.equations.args)
 
     def start(self, t: Any, z: Any, stages: int) -> Any:
         """The y of the first point, for each stage."""
         # The guess of the user suffices: Newton's first iteration corrects it with the stages.
-        e = self.equations
-        s, _ = e.system.times(t, t, e.epsilon)
-        y = self.implicit.guess(s, *e.absolute(*z), e.args)
+        y = self.implicit.guess(*self._place(t, z), self.equations.args)
         return jnp.broadcast_to(y, (stages, *y.shape))
 
 
@@ -138,9 +139,9 @@ class GaussLegendre(Collocation):
         def rates(t, z, y):
             # Both times of H_D are t. The rates do not use the h of the interval.
             instant = Interval(t, t, jnp.zeros_like(h))
-            return jnp.stack(
-                equations.rates(instant, *z) if inner is None else inner.rates(instant, z, y)
-            )
+            if inner is None:
+                return jnp.stack(equations.rates(instant, *z))
+            return jnp.stack(inner.rates(instant, z, y))
 
         def advance(weights, stages, y):
             """z0 + h Σ_j weights_j (q̇, ṗ)_j: shape (2, *q0.shape), with weights' rows in front."""
@@ -150,9 +151,8 @@ class GaussLegendre(Collocation):
         # The inner unknowns follow the stages, so that without them nothing is concatenated.
         def split(x):
             """The stages, and the inner unknowns of each stage."""
-            return x[: all_at_start.size].reshape(all_at_start.shape), x[
-                all_at_start.size :
-            ].reshape((self.stages, -1))
+            stages, y = x[: all_at_start.size], x[all_at_start.size :]
+            return stages.reshape(all_at_start.shape), y.reshape((self.stages, -1))
 
         def residual(x):
             stages, y = split(x)
@@ -162,19 +162,15 @@ class GaussLegendre(Collocation):
             return jnp.concatenate([implicit, jax.vmap(inner.defect)(times, stages, y).ravel()])
 
         # One fixed-point sweep: for one more evaluation of the rates the guess is good to O(h²).
-        y0 = (
-            jnp.zeros((self.stages, 0), q0.dtype)
-            if inner is None
-            else inner.start(t0, z0, self.stages)
-        )
+        y0 = jnp.zeros((self.stages, 0), q0.dtype)
+        y0 = y0 if inner is None else inner.start(t0, z0, self.stages)
         guess = advance(a, all_at_start, y0)
         # The accuracy of a solve is relative to the whole state, also where increments relative to
         # an origin are solved for, as in compensated summation.
         size = jnp.broadcast_to(jnp.stack(equations.absolute(q0, p0)), all_at_start.shape)
         start = jnp.maximum(jnp.abs(all_at_start), jnp.abs(guess))
-        guess, size, start = (
-            jnp.concatenate([u.ravel(), y0.ravel()]) for u in (guess, size, start)
-        )
+        parts = guess, size, start
+        guess, size, start = (jnp.concatenate([u.ravel(), y0.ravel()]) for u in parts)
         x, info = find_root(residual, guess, size, equations.newton, start)
         z, y = split(x)
         q1, p1 = advance(b, z, y)

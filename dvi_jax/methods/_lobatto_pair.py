@@ -3,7 +3,6 @@
 import functools
 import math
 from fractions import Fraction
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -31,16 +30,8 @@ _MOST_STAGES = 6
 _SWEEPS = 3
 
 
-class _Table(NamedTuple):
-    c: np.ndarray
-    b: np.ndarray
-    a: np.ndarray
-    a_hat: np.ndarray
-    last: np.ndarray
-
-
 @functools.cache
-def _table(stages: int) -> _Table:
+def _table(stages: int) -> tuple[np.ndarray, ...]:
     r"""Nodes c, weights b, IIIA's a, IIIB's â and the weights of the last P, as fractions.
 
     x = 2c − 1 are the ends ∓1 and the zeros of P'_{s−1}; b_i = 1/(s(s − 1) P_{s−1}(x_i)²). Then
@@ -69,7 +60,7 @@ def _table(stages: int) -> _Table:
     inner = x[:-1]
     last = [math.prod((1 - z) / (y - z) for z in inner if z != y) for y in inner]
     c, b, last = (np.array(part, object) for part in (x, b, last))
-    return _Table((c + 1) / 2, b, a, b * (1 - ratio.T), last)
+    return (c + 1) / 2, b, a, b * (1 - ratio.T), last
 
 
 class LobattoIIIAIIIB(Collocation):

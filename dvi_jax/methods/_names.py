@@ -24,7 +24,6 @@ def as_method(method: Any) -> Any:
     """
     if not isinstance(method, str):
         return method
-    text = method
     plain = {
         **dict.fromkeys(("TypeII", "SymplecticEuler"), TypeII),
         "Adjoint": Adjoint,
@@ -37,7 +36,7 @@ def as_method(method: Any) -> Any:
     }
     kinds = Yoshida, Suzuki, BlanesMoan, McLachlan, KahanLi, GaussLegendre, LobattoIIIAIIIB
     with_number = {kind.__name__: kind for kind in kinds}
-    key = re.sub(r"[\s_-]", "", text).lower().replace("ö", "o").removesuffix("()")
+    key = re.sub(r"[\s_-]", "", method).lower().replace("ö", "o").removesuffix("()")
     for name, make in plain.items():
         if key == name.lower():
             return make()
@@ -47,11 +46,10 @@ def as_method(method: Any) -> Any:
             return kind(int(match[2]))
     number = match[2] if match else ""
     spellings = {name.lower(): name for name in plain}
-    spellings |= {f"{n}{number}".lower(): f"{n}{number or '(...)'}" for n in with_number}
+    spellings |= {f"{name}{number}".lower(): f"{name}{number or '(...)'}" for name in with_number}
     close = difflib.get_close_matches(key, spellings, 1, 0.5)
     suggestion = f" Did you mean {spellings[close[0]]!r}?" if close else ""
     raise ValueError(
-        f"method must be an object such as dvi.Strang() or a known name, got {text!r}.{suggestion} "
-        f"Names are {', '.join(plain)}; with an order, or a number of stages, as in 'Yoshida4': "
-        f"{', '.join(with_number)}."
+        f"method must be an object such as dvi.Strang(), or a name, got {method!r}.{suggestion} "
+        f"Names are {', '.join(plain)}; with a number, as in 'Yoshida4', {', '.join(with_number)}."
     )

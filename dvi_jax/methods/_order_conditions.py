@@ -20,16 +20,13 @@ def order_defects(
 
         Φ_h = exp(hX₁ + h²X₂ + h³X₃ + …),    Φ*_h = exp(hX₁ − h²X₂ + h³X₃ − …)
 
-    where X₁ is the vector field of the equations and nothing is known of X₂, X₃, …. A product of
-    such exponentials is a series of words X_i X_j X_k …; the part of it with h^n has words of
-    degree i + j + k + … = n. The composition is of order r when those of degree 1 to r are the
-    words of exp(hX₁). For a base of order s the generators X₂, …, X_s are zero, for a symmetric
-    one all with even index.
+    where X₁ is the vector field of the equations. A product of such exponentials is a series of
+    words X_i X_j X_k …, of degree n = i + j + k + … with h^n. The composition is of order r when
+    those of degree 1 to r are the words of exp(hX₁). For a base of order s the generators X₂, …,
+    X_s are zero, for a symmetric one all with even index.
 
     **Returns** for each degree n = 1, …, `order` the largest |coefficient of a word − that in
     exp(hX₁)|, in units of max(1, (Σ|c_i|)^n / n!), the size of what cancels.
-
-    **Accuracy** round-off in these units, some 1e-16.
 
     **Source** Hairer, Lubich & Wanner 2006, *Geometric Numerical Integration*, III.4–5 (the
     Baker–Campbell–Hausdorff formula and order conditions), III.3 (the same by trees).
@@ -59,13 +56,8 @@ def order_defects(
 
 def _words(degree: int, letters: list[int]) -> list[Word]:
     """All words of letters whose sum is at most `degree`, the empty one included."""
-    longer = [
-        (first, *tail)
-        for first in letters
-        if first <= degree
-        for tail in _words(degree - first, letters)
-    ]
-    return [(), *longer]
+    heads = [letter for letter in letters if letter <= degree]
+    return [(), *((head, *tail) for head in heads for tail in _words(degree - head, letters))]
 
 
 def _in_exponential(word: Word, c: float, sign: int) -> float:

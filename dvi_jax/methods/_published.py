@@ -5,6 +5,7 @@ from typing import ClassVar
 
 import equinox as eqx
 
+from ..base.checks import one_of
 from ._base import Method
 from ._composition import CompositionMethod, of_strang
 from ._type_ii import TypeII
@@ -15,7 +16,7 @@ from ._type_ii import TypeII
 Tables = Mapping[int, tuple[float, ...]]
 
 
-class Published(CompositionMethod):
+class TabulatedComposition(CompositionMethod):
     """Base of the symmetric compositions whose coefficients are in a table, by order."""
 
     order: int = eqx.field(static=True, default=4)
@@ -25,19 +26,13 @@ class Published(CompositionMethod):
     is_symmetric: ClassVar[bool] = True
 
     def __check_init__(self):
-        if self.order not in self.tables:
-            *others, last = self.tables
-            orders = f"{', '.join(map(str, others))} or {last}" if others else f"{last}"
-            raise ValueError(
-                f"order of {type(self).__name__} must be {orders}, got {self.order!r}. For "
-                "others use dvi.Strang() or dvi.Composition(coefficients, order=...)."
-            )
+        one_of(f"order of {type(self).__name__}", self.order, self.tables)
 
     def fractions(self):
         return self.tables[self.order]
 
 
-class Yoshida(Published):
+class Yoshida(TabulatedComposition):
     r"""Yoshida's compositions of `Strang`, of order 4, 6 and 8.
 
         Ψ_h = S_{γ₁h} ∘ S_{γ₂h} ∘ … ∘ S_{γ₂h} ∘ S_{γ₁h}    of 3, 7 and 15 S
@@ -47,9 +42,7 @@ class Yoshida(Published):
     accuracy: `BlanesMoan`, `McLachlan` and `KahanLi` have smaller errors for the same work. None of
     the orders suits strong dissipation.
 
-    **Arguments** `order`: 4, 6 or 8. `base`: the map that `Strang` is made of, any with an inverse.
-
-    **Raises** `ValueError` for another order.
+    **Arguments** `order`: 4, 6 or 8, `ValueError` for others. `base`: as for `Strang`.
 
     **Accuracy** the order conditions hold to round-off, 4e-16.
 
@@ -74,7 +67,7 @@ class Yoshida(Published):
 _GAMMA = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
 
 
-class Suzuki(Published):
+class Suzuki(TabulatedComposition):
     r"""Suzuki's composition of five steps of `Strang`, of order 4.
 
         Ψ_h = S_{γh} ∘ S_{γh} ∘ S_{(1−4γ)h} ∘ S_{γh} ∘ S_{γh},    γ = 1/(4 − 4^{1/3}) ≈ 0.41
@@ -82,9 +75,7 @@ class Suzuki(Published):
     One substep goes backwards, by 0.66 h: less than in the triple jump of `Yoshida` (1.70 h), with
     an error some seventy times smaller in the same condition.
 
-    **Arguments** `order`: 4. `base`: the map that `Strang` is made of, any with an inverse.
-
-    **Raises** `ValueError` for an order other than 4.
+    **Arguments** `order`: 4, `ValueError` for others. `base`: as for `Strang`.
 
     **Source** Suzuki 1990, *Phys. Lett. A* 146, 319; Hairer, Lubich & Wanner 2006, II.4 (4.5).
     """
@@ -95,15 +86,13 @@ class Suzuki(Published):
 _ROOT = 19.0**0.5
 
 
-class McLachlan(Published):
+class McLachlan(TabulatedComposition):
     r"""McLachlan's optimised compositions, of order 4, 6 and 8.
 
     Order 4 has five pairs of the map with its adjoint of unequal length, coefficients in √19;
     orders 6 and 8 are symmetric compositions of 9 and 15 `Strang`.
 
-    **Arguments** `order`: 4, 6 or 8. `base`: Φ, any method with an inverse.
-
-    **Raises** `ValueError` for another order.
+    **Arguments** `order`: 4, 6 or 8, `ValueError` for others. `base`: as for `Strang`.
 
     **Accuracy** the order conditions hold to round-off, 2e-16.
 
@@ -132,7 +121,7 @@ class McLachlan(Published):
     }
 
 
-class KahanLi(Published):
+class KahanLi(TabulatedComposition):
     r"""Kahan and Li's compositions of `Strang`, of order 6 and 8.
 
         Ψ_h = S_{γ₁h} ∘ S_{γ₂h} ∘ … ∘ S_{γ₂h} ∘ S_{γ₁h}    of 9 and 17 S
@@ -140,9 +129,7 @@ class KahanLi(Published):
     Try these first when a high order is needed: no substep is longer than 0.8 h, and Σ|γ| is
     3.8 and 5.4.
 
-    **Arguments** `order`: 6 or 8. `base`: the map that `Strang` is made of, any with an inverse.
-
-    **Raises** `ValueError` for an order other than 6 or 8.
+    **Arguments** `order`: 6 or 8, `ValueError` for others. `base`: as for `Strang`.
 
     **Accuracy** the order conditions hold to round-off, 4e-16.
 
@@ -154,10 +141,8 @@ class KahanLi(Published):
 
     tables: ClassVar[Tables] = {
         6: of_strang(
-            0.39216144400731413927925056,
-            0.33259913678935943859974864,
-            -0.70624617255763935980996482,
-            0.08221359629355080023149045,
+            *(0.39216144400731413927925056, 0.33259913678935943859974864),
+            *(-0.70624617255763935980996482, 0.08221359629355080023149045),
         ),
         8: of_strang(
             *(0.13020248308889008087881763, 0.56116298177510838456196441),
@@ -179,7 +164,7 @@ def _of_splitting(a: Sequence[float], b: Sequence[float]) -> tuple[float, ...]:
     return (*c, *c[::-1])
 
 
-class BlanesMoan(Published):
+class BlanesMoan(TabulatedComposition):
     r"""Blanes and Moan's optimised compositions, S₆ of order 4 and S₁₀ of order 6.
 
     They were published as splittings, symmetric, with parts e^{a₁hA} e^{b₁hB} e^{a₂hA} …. A
@@ -190,9 +175,7 @@ class BlanesMoan(Published):
     and has, for any map Φ with its adjoint, the order of the splitting: 12 and 20 coefficients,
     six and ten pairs.
 
-    **Arguments** `order`: 4 or 6. `base`: Φ, any method with an inverse.
-
-    **Raises** `ValueError` for an order other than 4 or 6.
+    **Arguments** `order`: 4 or 6, `ValueError` for others. `base`: as for `Strang`.
 
     **Accuracy** the order conditions hold to round-off, 2e-16, with the 15 printed digits.
 
@@ -207,11 +190,8 @@ class BlanesMoan(Published):
         ),
         6: _of_splitting(
             a=(
-                0.0502627644003922,
-                0.413514300428344,
-                0.0450798897943977,
-                -0.188054853819569,
-                0.541960678450780,
+                *(0.0502627644003922, 0.413514300428344, 0.0450798897943977),
+                *(-0.188054853819569, 0.541960678450780),
             ),
             b=(0.148816447901042, -0.132385865767784, 0.067307604692185, 0.432666402578175),
         ),

@@ -90,8 +90,8 @@ class Rattle(Method):
             def residual(x):
                 z, p_half, q1 = split(x)
                 p, v = half_step(z, p_half, q1)
-                left = (p_half - p).ravel(), (q1 - q0 - h * v).ravel()
-                return jnp.concatenate([violation(z, v), *left])
+                defects = (p_half - p).ravel(), (q1 - q0 - h * v).ravel()
+                return jnp.concatenate([violation(z, v), *defects])
 
             p_half, v = half_step(zero, p0, q0)
             guess = jnp.concatenate([zero, p_half.ravel(), (q0 + h * v).ravel()])
@@ -108,9 +108,6 @@ class Rattle(Method):
         return self.step(equations, interval.reversed(), q1, p1)
 
     def needs_no_solve(self, equations, interval, q):
-        return False
-
-    def inverse_needs_no_solve(self, equations, interval, q):
         return False
 
 

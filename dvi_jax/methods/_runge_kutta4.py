@@ -25,9 +25,7 @@ class RungeKutta4(Method):
 
     def step(self, equations, interval, q0, p0):
         t0, t1, h = interval
-        middle = t0 + h / 2
-
-        velocity, force = continuous_rates(equations, h)
+        middle, (velocity, force) = t0 + h / 2, continuous_rates(equations, h)
 
         def field(t, q, p):
             return velocity(t, q, p), force(t, q, p)
@@ -43,8 +41,7 @@ class RungeKutta4(Method):
     def inverse(self, equations, interval, q1, p1):
         # Callers check `is_invertible` first; only code of a user gets here.
         raise TypeError(
-            "RungeKutta4 has no inverse step. Use another method, such as dvi.Strang(), or "
-            "adjoint=dvi.Checkpointed() for gradients."
+            "RungeKutta4 has no inverse step: use another method, or adjoint=dvi.Checkpointed()."
         )
 
     def needs_no_solve(self, equations, interval, q):

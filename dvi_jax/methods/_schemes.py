@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from ._base import Method
 from ._composition import CompositionMethod
 from ._type_ii import TypeII
 
@@ -36,10 +35,8 @@ _COEFFICIENTS: dict[Orders, tuple[tuple[float, ...], tuple[float, ...]]] = {
     ),
     (10, 6, 4): (
         (
-            0.0380944974224121955,
-            0.1452987161169137493,
-            0.2076276957255412507,
-            0.4359097036515261592,
+            *(0.0380944974224121955, 0.1452987161169137493),
+            *(0.2076276957255412507, 0.4359097036515261592),
         ),
         (0.0958588808370752106, 0.2044461531429987807, 0.2170703479789911017),
     ),
@@ -80,8 +77,8 @@ def sequence_of(scheme: Any, parts: int) -> Flows:
         assert coefficients is not None
         if parts != 2:
             raise ValueError(
-                f"the scheme {scheme} requires two parts, A + εB, got {parts}. Join the parts of "
-                "B, or use dvi.Split(..., perturbed=1) or a scheme such as dvi.Strang()."
+                f"the scheme {scheme} requires two parts, A + εB, got {parts}. Use "
+                "dvi.Split(..., perturbed=1) or dvi.Strang()."
             )
         a, b = coefficients
         pairs = itertools.zip_longest(a, b)
@@ -89,10 +86,10 @@ def sequence_of(scheme: Any, parts: int) -> Flows:
     # The map is one part after the other, the adjoint the opposite order.
     orders = itertools.cycle((range(parts), range(parts)[::-1]))
     pairs = zip(scheme.fractions(), orders, strict=False)
-    return joined((i, c) for c, order in pairs for i in order)
+    return join_neighbours((i, c) for c, order in pairs for i in order)
 
 
-def joined(stages: Iterable[tuple[int, float]]) -> Flows:
+def join_neighbours(stages: Iterable[tuple[int, float]]) -> Flows:
     """The same flows, with neighbouring flows of one part as one flow."""
     groups = itertools.groupby(stages, key=lambda stage: stage[0])
     return tuple((i, math.fsum(c for _, c in group)) for i, group in groups)
@@ -104,15 +101,14 @@ def as_scheme(scheme: Any) -> Any:
 
 def check_scheme(scheme: Any) -> None:
     """**Raises** `TypeError` or `ValueError` for a scheme that is not known."""
-    names = f"The known generalised orders are {_names()}."
+    names = f"a tuple of generalised orders, one of {_names()}"
     if isinstance(scheme, tuple):
         if near_integrable(scheme) is None:
-            raise ValueError(f"scheme has unknown generalised orders {scheme}. {names}")
+            raise ValueError(f"scheme must be {names}, got {scheme}.")
     elif not isinstance(scheme, CompositionMethod) or scheme.base != TypeII():
-        hint = "Its base must be dvi.TypeII()." if isinstance(scheme, Method) else names
         raise TypeError(
-            "scheme must be a composition, such as dvi.Strang() or dvi.BlanesMoan(6), or a tuple "
-            f"of generalised orders, such as (8, 4), got {scheme!r}. {hint}"
+            f"scheme must be a composition of dvi.TypeII(), such as dvi.Strang(), or {names}, got "
+            f"{scheme!r}."
         )
 
 

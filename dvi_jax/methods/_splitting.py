@@ -28,7 +28,7 @@ from .step import Equations, StepInfo, judge, no_solve, no_step_yet
 StateAndInfo = tuple[State, State, StepInfo]
 
 
-class Part(NamedTuple):
+class PartFlow(NamedTuple):
     """The motion of one part, ``advance(interval, q, p)``, and whether it is its exact flow."""
 
     advance: Callable[[Interval, State, State], StateAndInfo]
@@ -52,8 +52,7 @@ class Stage(NamedTuple):
 
 
 def stages_of(sequence: Sequence[tuple[int, float]], time: float = 0.0) -> list[Stage]:
-    # The first part carries the time; the others act at a fixed time. The end is not a sum of all
-    # coefficients, which is 1 only up to rounding.
+    # The first part carries the time. The end is no sum of all coefficients, 1 only up to rounding.
     stages, total = [], math.fsum(c for i, c in sequence if i == 0) + time
     for i, c in sequence:
         end = time + c if i == 0 else time
@@ -75,7 +74,7 @@ class SplittingMethod(Method):
     is_invertible: ClassVar[bool] = True
 
     @abc.abstractmethod
-    def parts(self, equations: Equations, interval: Interval, q: State) -> list[Part]:
+    def parts(self, equations: Equations, interval: Interval, q: State) -> list[PartFlow]:
         """The flow of each part. **Raises** for a system that has no such parts."""
 
     def enter(self, equations: Equations, interval: Interval, q: State, p: State) -> StateAndInfo:
@@ -146,23 +145,19 @@ class SplittingMethod(Method):
         if count:
             rounds = [tuple(pieces[k * period : (k + 1) * period]) for k in range(count)]
             stack = jax.tree.map(lambda *xs: jnp.stack(xs), *rounds)
-            state, _ = lax.scan(
-                lambda s, x: (advance_all(s, x, part_numbers[:period]), None), state, stack
-            )
+            numbers = part_numbers[:period]
+            state, _ = lax.scan(lambda s, x: (advance_all(s, x, numbers), None), state, stack)
         return advance_all(state, pieces[count * period :], part_numbers[count * period :])
 
     def in_loop(self, equations, interval, q):
         parts = self.parts(equations, interval, q)
         sequence = sequence_of(self.scheme, len(parts))
         # Two flows of the first part are one only if they are exact.
-        (_, a), *others = sequence
-        return _in_loop(self, a) if self.is_symmetric and others and parts[0].is_exact else None
+        (_, a), *flows = sequence
+        return _in_loop(self, a) if self.is_symmetric and flows and parts[0].is_exact else None
 
     def needs_no_solve(self, equations, interval, q) -> bool:
         return all(part.is_exact for part in self.parts(equations, interval, q))
-
-    def inverse_needs_no_solve(self, equations, interval, q) -> bool:
-        return self.needs_no_solve(equations, interval, q)
 
 
 def _in_loop(method: SplittingMethod, a: float) -> InLoop:
@@ -224,17 +219,16 @@ class Splitting(SplittingMethod):
         for i, H_i in enumerate(getattr(equations.system.H_D, "parts", ())):
             if isinstance(H_i, Known):
                 flow = functools.partial(H_i.change, q=q, p=p, args=equations.args)
-                moved, found = (jnp.stack(x[:2]) for x in jax.jvp(flow, (zero,), (zero + 1,)))
-                own = dataclasses.replace(equations, system=System(H_i))
-                wanted = jnp.stack(own.rates(Interval(t, t, zero), q, p))
-                size = jnp.max(jnp.abs(jnp.stack([q, p, *wanted, *found])))
-                off = jnp.max(jnp.abs(jnp.stack([moved, found - wanted])))
-                if not off <= 1e-5 * size:
+                change, slope = (jnp.stack(x[:2]) for x in jax.jvp(flow, (zero,), (zero + 1,)))
+                part_equations = dataclasses.replace(equations, system=System(H_i))
+                rates = jnp.stack(part_equations.rates(Interval(t, t, zero), q, p))
+                size = jnp.max(jnp.abs(jnp.stack([q, p, *rates, *slope])))
+                defect = jnp.max(jnp.abs(jnp.stack([change, slope - rates])))
+                if not defect <= 1e-5 * size:
                     raise ValueError(
-                        f"the flow of part {i} of Split is not that of its Hamiltonian. At the "
-                        "initial state the flow with h = 0 must not change (q, p), and its "
-                        f"derivative by h must be (∂H/∂p, −∂H/∂q); the difference is {off:.3g}. "
-                        "Correct the flow, or leave it out: the part is then solved numerically."
+                        f"the flow of part {i} of Split must be that of its Hamiltonian: the "
+                        "identity at h = 0, with the derivative (∂H/∂p, −∂H/∂q); at the initial "
+                        f"state the difference is {defect:.3g}."
                     )
 
     def is_double_only(self, equations) -> bool:
@@ -245,8 +239,8 @@ class Splitting(SplittingMethod):
         H = system.H_D
         if not isinstance(H, Split):
             raise TypeError(
-                "method=dvi.Splitting(...) requires a system with known parts: "
-                f"dvi.System(dvi.Split([H_A, H_B])). Its H_D is {H!r:.100}."
+                "method=dvi.Splitting(...) requires dvi.System(dvi.Split([H_A, H_B])), got an H_D "
+                f"that is {H!r:.100}."
             )
         perturbations = system.force, system.perturbation
         parts: list[Any] = [(H_i, None, None) for H_i in H.parts]
@@ -262,7 +256,7 @@ class Splitting(SplittingMethod):
             part_equations = dataclasses.replace(equations, system=part_equations)
             is_exact = _is_exact(part_equations, interval, q, has_time=i == 0)
             method = TypeII() if is_exact else GaussLegendre(-(-self.order // 2))
-            return Part(functools.partial(method.step, part_equations), is_exact)
+            return PartFlow(functools.partial(method.step, part_equations), is_exact)
 
         return [part(i, *arguments) for i, arguments in enumerate(parts)]
 
@@ -271,13 +265,13 @@ def _no_energy(t0, t1, q0, p1, args):
     return jnp.zeros((), q0.dtype)
 
 
-def _flow_part(equations: Equations, flow: Flow) -> Part:
+def _flow_part(equations: Equations, flow: Flow) -> PartFlow:
     def advance(interval, q, p):
         dq, dp, converged = flow.change(interval.h, *equations.absolute(q, p), equations.args)
         q, p = q + dq, p + dp
         return q, p, judge(no_solve(q)._replace(converged=converged), q, p)
 
-    return Part(advance, True)
+    return PartFlow(advance, True)
 
 
 def _is_exact(equations: Equations, interval: Interval, like: State, has_time: bool) -> bool:

@@ -10,13 +10,13 @@ from jaxtyping import Array
 
 from lanewise.jaxprs.dependence import depends_on
 
-from ..base.checks import one_of
+from ..base.checks import array, one_of, whole
 from ..base.types import Args, Interval, State
 from ..engine.newton import find_root
 from ..problem import kepler as _kepler
 from ..problem.flows import value_of
-from ._schemes import ORDERS_OF_CORRECTORS, as_scheme, check_scheme, corrector, joined
-from ._splitting import Part, SplittingMethod, Stage
+from ._schemes import ORDERS_OF_CORRECTORS, as_scheme, check_scheme, corrector, join_neighbours
+from ._splitting import PartFlow, SplittingMethod, Stage
 from ._strang import Strang
 from .step import Equations, judge, no_solve, no_step_yet
 
@@ -138,9 +138,9 @@ class WisdomHolman(SplittingMethod):
         check_scheme(self.scheme)
         if self.corrector and (self.coordinates != "jacobi" or self.scheme != Strang()):
             raise ValueError(
-                'corrector must be 0 unless coordinates="jacobi" and scheme=dvi.Strang(), for '
-                f"which its coefficients are derived; got corrector={self.corrector}, coordinates="
-                f"{self.coordinates!r}, scheme={self.scheme!r}."
+                'corrector must be 0 unless coordinates="jacobi" and scheme=dvi.Strang(), got '
+                f"corrector={self.corrector}, coordinates={self.coordinates!r}, "
+                f"scheme={self.scheme!r}."
             )
 
     def is_double_only(self, equations) -> bool:
@@ -153,23 +153,18 @@ class WisdomHolman(SplittingMethod):
         rtol = 1e5 * float(jnp.finfo(q.dtype).eps)
         if not (masses > 0).all() or not np.allclose(masses[:, None] * v, p, rtol=rtol, atol=0):
             raise ValueError(
-                "method=dvi.WisdomHolman(...) requires a kinetic energy Σ |p_i|²/(2 m_i) with "
-                f"positive masses, but ∂H_D/∂p1 at the initial state is not p/m with m = {masses}. "
-                "Use canonical momenta p = m v, or another method such as dvi.KahanLi(8)."
+                "dvi.WisdomHolman requires ∂H_D/∂p1 = p/m with positive masses, but it is not p/m "
+                f"at the initial state with m = {masses}."
             )
         if masses[0] < masses.max():
             raise ValueError(
-                "method=dvi.WisdomHolman(...) requires the dominant body first, but body "
-                f"{masses.argmax()} has the mass {masses.max():g} and body 0 only {masses[0]:g}. "
-                "Change the order of the bodies, or use another method such as dvi.KahanLi(8)."
+                f"dvi.WisdomHolman requires the dominant body first, but body {masses.argmax()} "
+                f"has the mass {masses.max():g} and body 0 only {masses[0]:g}."
             )
 
     def _frame(self, equations: Equations, interval: Interval, q: State) -> Any:
-        if q.ndim != 2 or q.shape[0] < 2 or q.shape[1] not in (2, 3):
-            raise ValueError(
-                "method=dvi.WisdomHolman(...) requires positions of shape (bodies, 2) or "
-                f"(bodies, 3) with at least two bodies, got shape {q.shape}."
-            )
+        array("q0 of dvi.WisdomHolman", q, ("bodies", 2), ("bodies", 3))
+        whole("the number of bodies", len(q), 2)
 
         def velocity(q, p):
             return equations.position_rate(interval, q, p)
@@ -181,8 +176,8 @@ class WisdomHolman(SplittingMethod):
         if is_coupled or depends_on(inverse_mass, 0, q):
             reason = "q0 enters ∂H_D/∂p1" if is_coupled else "T is not quadratic in the momenta"
             raise ValueError(
-                "method=dvi.WisdomHolman(...) requires H_D = T(p1) + V(q0) with T = Σ |p_i|²/"
-                f"(2 m_i), but {reason}. Use another method, such as dvi.GaussLegendre(2)."
+                "dvi.WisdomHolman requires H_D = T(p1) + V(q0) with T = Σ |p_i|²/(2 m_i), but "
+                f"{reason}."
             )
         return _COORDINATES[self.coordinates](1 / inverse_mass(q)[:, 0])
 
@@ -205,9 +200,9 @@ class WisdomHolman(SplittingMethod):
 
         def kepler(interval, X, V):
             h = interval.h
-            whole_X, whole_V = base[0] + X, base[1] + V
-            dX, dV, is_root = _kepler.change(h, whole_X[1:], whole_V[1:], mu)
-            X1 = X + jnp.concatenate([h * whole_V[:1], dX])
+            full_X, full_V = base[0] + X, base[1] + V
+            dX, dV, is_root = _kepler.change(h, full_X[1:], full_V[1:], mu)
+            X1 = X + jnp.concatenate([h * full_V[:1], dX])
             V1 = V + jnp.concatenate([jnp.zeros_like(V[:1]), dV])
             return X1, V1, judge(no_solve(X)._replace(converged=is_root), X1, V1)
 
@@ -236,7 +231,7 @@ class WisdomHolman(SplittingMethod):
             X = X + interval.h / 2 * frame.drift(base[1] + V)
             return X, V, judge(info, X, V)
 
-        return [Part(kepler, True), Part(interaction, not implicit)]
+        return [PartFlow(kepler, True), PartFlow(interaction, not implicit)]
 
     def enter(self, equations, interval, q, p):
         frame = self._frame(equations, interval, q)
@@ -252,7 +247,7 @@ class WisdomHolman(SplittingMethod):
         if not self.corrector:
             return X, V, no_step_yet(X)
         # The inverse of Z(a, b) is Z(−a, b), and a and −a are at opposite places: b changes sign.
-        sequence = joined(
+        sequence = join_neighbours(
             stage
             for a, b in corrector(self.corrector)
             for stage in ((0, a), (1, sign * b), (0, -2 * a), (1, -sign * b), (0, a))

@@ -20,7 +20,7 @@ from ..base.results import RESULTS
 from ..base.types import Args, Interval, Scalar, State
 from ..engine.newton import KnownRoot, RootInfo, RootSolver, find_root
 from ..engine.picard import PicardThenNewton
-from ..problem.system import check_system, of_problem
+from ..problem.system import check_system, of_problem, require_constraint
 from .step import Equations, no_solve
 
 # A start is consistent up to so many times the round-off of the terms in g and in dg/dt, and of
@@ -114,11 +114,8 @@ class _Defects(NamedTuple):
 
 
 def _defects(equations: Equations, t: Scalar, q: State, p: State) -> _Defects:
-    g, G, linear = (
-        equations.constraint(q),
-        gradient(equations, q),
-        Linear.of_constraint(equations, q),
-    )
+    g, G = equations.constraint(q), gradient(equations, q)
+    linear = Linear.of_constraint(equations, q)
     v = velocity_at(equations, t, q)(p)
     rate, sizes, eps = linear.product(v), jnp.abs(G), float(jnp.finfo(q.dtype).eps)
 
@@ -151,15 +148,14 @@ def check_start(equations: Equations, t: Scalar, q: State, p: State) -> None:
     """**Raises** `ValueError` for a start with constraints that are violated or redundant."""
     defects = _compiled_defects(equations, t, q, p)
     _require_independent(defects)
-    rate = "the rate of change (∂g/∂q) ∂H/∂p of the constraint"
     first = (defects.is_off, defects.g, "the constraint")
-    for flags, value, quantity in (first, (defects.is_moving_off, defects.rate, rate)):
+    second = (defects.is_moving_off, defects.rate, "its rate of change (∂g/∂q) ∂H/∂p")
+    for flags, value, quantity in (first, second):
         if np.any(flags):
             i = int(np.argmax(np.where(flags, np.abs(value), -1)))
             raise ValueError(
                 f"the initial state is not consistent: {quantity} must be 0 to round-off, but "
-                f"component {i} is {float(value[i]):.3g}. Use "
-                "dvi.project(system, q0, p0, args)."
+                f"component {i} is {float(value[i]):.3g}. Use dvi.project."
             )
 
 
@@ -171,9 +167,8 @@ def _require_independent(defects: _Defects) -> None:
         rows = G / np.where(lengths > 0, lengths, 1)
         rank = np.linalg.matrix_rank(rows, tol=8 * np.sqrt(np.finfo(rows.dtype).eps))
         raise ValueError(
-            f"the constraint has {count} components, but the rank of ∂g/∂q at the initial state is "
-            f"{rank}: {count - rank} of them are redundant. Leave out components that follow from "
-            "the others."
+            f"the rank of ∂g/∂q at the initial state must be {count}, the number of constraints, "
+            f"got {rank}: {count - rank} of them are redundant."
         )
 
 
@@ -215,8 +210,7 @@ def project(
     """
     system, q0, p0, _, args = of_problem(system, q0, p0, None, args)
     check_system(system)
-    if system.constraint is None:
-        raise ValueError("project requires dvi.System(H_D, constraint=g): this system has none.")
+    require_constraint("project", system)
     q0, p0 = start_state(q0, p0)
     t0, epsilon = as_scalar("t0", t0, q0.dtype), as_scalar("epsilon", epsilon, q0.dtype)
     args = jax.tree.map(as_parameter, args)
@@ -226,8 +220,8 @@ def project(
     if not is_traced(is_projection) and not bool(is_projection):
         _require_independent(defects)
         raise ValueError(
-            "no state that satisfies the constraint was found near the one given, at which it is "
-            f"{np.asarray(defects.g)!s:.80}. Start nearer to the manifold."
+            "no state with g = 0 was found near the one given, where g is "
+            f"{np.asarray(defects.g)!s:.80}."
         )
     return projection
 

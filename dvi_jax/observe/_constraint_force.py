@@ -8,9 +8,11 @@ import jax.numpy as jnp
 
 import lanewise
 
+from ..base.checks import require_system
 from ..base.types import Interval
 from ..methods.constraint import Linear, velocity_at
 from ..methods.step import Equations
+from ..problem.system import require_constraint
 
 
 class ConstraintForce(eqx.Module):
@@ -42,11 +44,8 @@ class ConstraintForce(eqx.Module):
         return ConstraintForce(self.multipliers, system, epsilon)
 
     def __call__(self, t0, t1, q0, p0, q1, p1, args):
-        if getattr(self.system, "constraint", None) is None:
-            raise ValueError(
-                "ConstraintForce needs a system with a constraint: dvi.System(H_D, constraint=g). "
-                "Outside of dvi.integrate call bind(system, epsilon) first."
-            )
+        require_system("ConstraintForce", self.system)
+        require_constraint("ConstraintForce", self.system)
         equations = Equations(self.system, jnp.asarray(self.epsilon, q1.dtype), args)
 
         # Its derivative along the motion is linear in λ: the part at λ = 0 is the right side.

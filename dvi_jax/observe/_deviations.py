@@ -13,11 +13,11 @@ from jaxtyping import Array
 
 from lanewise.jaxprs.jaxapi import is_traced
 
-from ..base.checks import whole
+from ..base.checks import all_finite, array, whole
 from ..base.types import Scalar
 from ._reductions import Reduction
 
-_UNROLLED = 12
+_UNROLL_UP_TO = 12
 """Vectors up to which the Gram–Schmidt process is unrolled: a loop compiles faster for many."""
 
 
@@ -97,22 +97,12 @@ class _FrameIndicator(Deviations):
         whole(f"seed of {type(self).__name__}", self.seed, 0)
         if not isinstance(self.scale, tuple | list) or len(self.scale) != 2:
             raise TypeError(
-                f"scale of {type(self).__name__} must be a pair (unit of q, unit of p), as a tuple "
-                f"or a list of two entries; got {self.scale!r:.200}."
+                f"scale of {type(self).__name__} must be a pair (unit of q, unit of p), got "
+                f"{self.scale!r:.200}."
             )
         for letter, unit in zip("qp", self.scale, strict=True):
-            if any(is_traced(x) for x in jax.tree.leaves(unit)):
-                continue  # the value of a tracer is unknown
-            try:
-                good = np.isrealobj(unit) and np.all(np.isfinite(unit) & (np.asarray(unit) > 0))
-            except TypeError:
-                good = False
-            if not good:
-                raise ValueError(
-                    f"the scale of {letter} in {type(self).__name__} must be a positive and finite "
-                    f"number, or an array of such numbers with the shape of {letter}; got "
-                    f"{unit!r:.200}."
-                )
+            if not any(map(is_traced, jax.tree.leaves(unit))):  # their values are not known
+                all_finite(f"the scale of {letter} in {type(self).__name__}", unit, positive=True)
 
     def vectors(self, memory):
         units = self._units(memory[0])
@@ -126,11 +116,8 @@ class _FrameIndicator(Deviations):
     def _first_frame(self: Any, value: Array, count: int | None) -> Array:
         """Random orthonormal vectors, the same for every trajectory, shape (count, 2N)."""
         size = value.shape[0]
-        if count is not None and count > size:
-            raise ValueError(
-                f"{type(self).__name__} can have at most {size} deviation vectors, one for each "
-                f"component of q and p; got {count}. Choose a smaller number."
-            )
+        if count is not None:
+            whole(f"the number of vectors of {type(self).__name__}", count, high=size)
         # All `size` vectors are drawn, so that the first ones do not depend on the count.
         random = np.random.default_rng(self.seed).standard_normal((size, size))
         # In NumPy the frame is a constant of the program, and costs nothing in a run.
@@ -145,11 +132,7 @@ class _FrameIndicator(Deviations):
         parts = []
         for letter, unit in zip("qp", self.scale, strict=True):
             unit = jnp.asarray(unit, like.dtype).ravel()
-            if unit.size not in (1, size):
-                raise ValueError(
-                    f"the scale of {letter} in {type(self).__name__} must be one number, or an "
-                    f"array with the size of {letter} ({size}); got {unit.size} numbers."
-                )
+            array(f"the scale of {letter} in {type(self).__name__}", unit, (1,), (size,))
             parts.append(jnp.broadcast_to(unit, (size,)))
         return jnp.concatenate(parts)[None, :]
 
@@ -269,7 +252,7 @@ class MEGNO(_FrameIndicator):
         growth = growth.plus(jnp.log(square) * (time.value + value.h / 2))
         time = time.plus(value.h)
         current = growth.value / time.value
-        # Trapezoidal rule, with Y(0) = 0 as the first `before`.
+        # Trapezoidal rule, with Y(0) = 0 as the first `previous`.
         area = area.plus(value.h * (previous + current) / 2)
         return vector * lax.rsqrt(square), growth, current, area, time
 
@@ -367,7 +350,7 @@ def _gram_schmidt(vectors: Array) -> tuple[Array, Array]:
     """
     # Once is enough: the vectors are an orthonormal frame after one step, far from dependent.
     count = vectors.shape[0]
-    if count > _UNROLLED:
+    if count > _UNROLL_UP_TO:
         return _gram_schmidt_in_a_loop(vectors)
     frame, rows = [], []
     for i in range(count):
@@ -385,14 +368,14 @@ def _gram_schmidt(vectors: Array) -> tuple[Array, Array]:
 def _gram_schmidt_in_a_loop(vectors: Array) -> tuple[Array, Array]:
     """The same for many vectors: one program whatever their number."""
     count = vectors.shape[0]
-    place = jnp.arange(count)
+    index = jnp.arange(count)
 
     def row(i, state):
         V, R = state
         square = jnp.sum(V[i] ** 2)
         shrink = lax.rsqrt(square)
         unit = V[i] * shrink
-        projections = jnp.where(place > i, V @ unit, 0)
+        projections = jnp.where(index > i, V @ unit, 0)
         V = (V - projections[:, None] * unit[None, :]).at[i].set(unit)
         return V, R.at[i].set(projections.at[i].set(square * shrink))
 
@@ -402,4 +385,4 @@ def _gram_schmidt_in_a_loop(vectors: Array) -> tuple[Array, Array]:
 def _diagonal(R: Array) -> Array:
     # Single elements of a small matrix stay in registers of the machine code.
     count = R.shape[0]
-    return jnp.stack([R[i, i] for i in range(count)]) if count <= _UNROLLED else jnp.diagonal(R)
+    return jnp.stack([R[i, i] for i in range(count)]) if count <= _UNROLL_UP_TO else jnp.diagonal(R)

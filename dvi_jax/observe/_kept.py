@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..base.checks import one_of, whole
+from ..base.checks import array, one_of, whole
 from ..base.signature import check_takes
 from ..base.types import Args, Scalar, State
 from ._reductions import Reduction
@@ -31,10 +31,8 @@ class Start(NamedTuple):
 class KeptSteps(Reduction):
     """Base of the reductions that record the starts of some steps, in the order of time.
 
-    `function` returns a row, see `as_row`. Its first number is 1 for a step to record, 2 for one to
-    record unless it is the first of the run. The first `skip` of them are left out. The result is
-    the rows, NaN where there are fewer than the capacity, and the number of hits after the skipped
-    ones.
+    `function` returns a row, see `as_row`. The first `skip` of these steps are left out. The result
+    is the rows, NaN where there are fewer than the capacity, and how many there were.
     """
 
     has_running_value: ClassVar[bool] = False
@@ -158,7 +156,7 @@ class Section(KeptSteps):
         self.skip = whole("skip", skip, 0, hint="It is a number of crossings.")
 
     def __check_init__(self):
-        check_event(self.g, "Section")
+        check_takes("g of Section", self.g, "(t, q, p, args)")
         hint = "1 selects the crossings where g increases, -1 where it decreases, 0 both."
         one_of("direction", self.direction, (1, -1, 0), hint)
 
@@ -166,15 +164,11 @@ class Section(KeptSteps):
         g0, g1 = event(self.g, t0, q0, p0, args), event(self.g, t1, q1, p1, args)
         # A zero belongs to the step that ends there: a crossing at a grid point is counted once.
         rises, falls = (g0 < 0) & (g1 >= 0), (g0 > 0) & (g1 <= 0)
-        ahead = t1 > t0
         hit = rises | falls
         # `direction` refers to increasing time: for h < 0 a step passes the surface the other way.
         if self.direction != 0:
-            hit = (
-                jnp.where(ahead, rises, falls)
-                if self.direction == 1
-                else jnp.where(ahead, falls, rises)
-            )
+            with_time, against_time = (rises, falls)[:: self.direction]
+            hit = jnp.where(t1 > t0, with_time, against_time)
         # A run that continues from a crossing starts on the surface only up to rounding.
         tolerance = jnp.finfo(g0.dtype).eps ** 0.4
         begins_on_it = jnp.abs(g0) <= tolerance * jnp.abs(g1 - g0)
@@ -200,20 +194,16 @@ class RequestedTimes(KeptSteps):
         return self.ts.shape[0]
 
     def _row(self, t0, t1, q0, p0, q1, p1, args):
-        start, end = (
-            shown(self.clock, t0, q0, p0, args),
-            shown(self.clock, t1, q1, p1, args),
-        )
+        start = shown(self.clock, t0, q0, p0, args)
+        end = shown(self.clock, t1, q1, p1, args)
+
         # Bisection: a comparison with every requested time would be made in each step.
-        count_start, count_end = (
-            jnp.searchsorted(self.ordered, x, side="right") for x in (start, end)
-        )
-        below_start, below_end = (
-            jnp.searchsorted(self.ordered, x, side="left") for x in (start, end)
-        )
-        hit = jnp.where(
-            end >= start, count_end > count_start, below_start > below_end
-        )  # (start, end], [end, start)
+        def count(x, side):
+            return jnp.searchsorted(self.ordered, x, side=side)
+
+        forwards = count(end, "right") > count(start, "right")  # (start, end]
+        backwards = count(start, "left") > count(end, "left")  # [end, start)
+        hit = jnp.where(end >= start, forwards, backwards)
         # A failed step has no curve on which a state could be computed.
         return as_row(hit & jnp.all(jnp.isfinite(q1)), Start(t0, t1, end, q0, p0))
 
@@ -228,16 +218,6 @@ def event(
 ) -> Scalar:
     """g at a point, refused unless it is a real scalar that can pass through a value."""
     value = jnp.asarray(g(t, q, p, args))
-    if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
-        hint = "For a condition such as |q| > 2 take the difference |q| − 2."
-        raise ValueError(
-            f"{name} (t, q, p, args) must return a real scalar of a floating-point type, got a "
-            f"value of shape {value.shape} and dtype {value.dtype}. "
-            + (hint if value.shape == () else "Return for example one component of the array.")
-        )
+    hint = "For a condition such as |q| > 2 take the difference |q| − 2."
+    array(f"{name}(t, q, p, args)", value, (), verb="return", hint=hint)
     return value.astype(q.dtype)
-
-
-def check_event(g: Any, owner: str) -> None:
-    """Refuse a g that cannot be called as ``g(t, q, p, args)``."""
-    check_takes(f"g of {owner}", g, "(t, q, p, args)")

@@ -45,8 +45,8 @@ class Reduction(eqx.Module):
         ``memory + self.change(value, k == at)``.
         """
         raise NotImplementedError(
-            f"{type(self).__name__} cannot be differentiated with adjoint=dvi.Reversible(): it has "
-            "no method combine(memory, k, t, value). Define it, or use adjoint=dvi.Checkpointed()."
+            f"{type(self).__name__} has no method combine(memory, k, t, value), as required for "
+            "adjoint=dvi.Reversible(): use adjoint=dvi.Checkpointed()."
         )
 
     @staticmethod
@@ -119,10 +119,7 @@ class MaxDrift(_OfFunction):
 
 
 class Range(_OfFunction):
-    """Largest value minus smallest value: max_k f_k − min_k f_k, elementwise.
-
-    `function`: an observable ``(t0, t1, q0, p0, q1, p1, args)`` → array.
-    """
+    """Largest minus smallest value of an observable f, max_k f_k − min_k f_k, elementwise."""
 
     def start(self, value):
         nan, step = jnp.full_like(value, jnp.nan), jnp.zeros(value.shape, jnp.int32)
@@ -147,14 +144,12 @@ class Range(_OfFunction):
 
 
 class Trend(_OfFunction):
-    """Least-squares slope of f against time [unit of f / unit of time], elementwise.
+    """Least-squares slope of an observable f against time [unit of f / time], elementwise.
 
         Σ (t_k − t̄)(f_k − f̄) / Σ (t_k − t̄)²
 
     Means and moments are updated together (Welford 1962), so that digits do not cancel in long
     runs. NaN for fewer than two steps.
-
-    `function`: an observable ``(t0, t1, q0, p0, q1, p1, args)`` → array.
     """
 
     def start(self, value):
@@ -183,14 +178,18 @@ class Trend(_OfFunction):
         return mean_t, mean_f, t_t + 2 * (t - mean_t) * dt, t_f
 
 
-class Mean(_OfFunction):
-    """Mean over the steps: (1/N) Σ f_k, elementwise.
-
-    `function`: an observable ``(t0, t1, q0, p0, q1, p1, args)`` → array.
-    """
+class _WithCount(_OfFunction):
+    """Base of the reductions with a memory of a value and the number of steps."""
 
     def start(self, value):
         return jnp.full_like(value, jnp.nan), jnp.asarray(0, jnp.int32)
+
+    def finish(self, memory):
+        return memory[0]
+
+
+class Mean(_WithCount):
+    """Mean of an observable f over the steps, (1/N) Σ f_k, elementwise."""
 
     def update(self, memory, k, t, value):
         mean, _ = memory
@@ -198,28 +197,16 @@ class Mean(_OfFunction):
         mean = jnp.where(k == 0, jnp.zeros_like(mean), mean)
         return mean + (value - mean) * (1 / jnp.asarray(k + 1, value.dtype)), k + 1
 
-    def finish(self, memory):
-        return memory[0]
-
     def combine(self, memory, k, t, value):
         mean, count = memory
         return mean + self.change(value) / jnp.asarray(count, value.dtype), count
 
 
-class Last(_OfFunction):
-    """The value at the last step.
-
-    `function`: an observable ``(t0, t1, q0, p0, q1, p1, args)`` → array.
-    """
-
-    def start(self, value):
-        return jnp.full_like(value, jnp.nan), jnp.asarray(0, jnp.int32)
+class Last(_WithCount):
+    """The value of an observable at the last step."""
 
     def update(self, memory, k, t, value):
         return value, k
-
-    def finish(self, memory):
-        return memory[0]
 
     def combine(self, memory, k, t, value):
         last, step = memory
@@ -241,13 +228,13 @@ class Running(eqx.Module):
 
     def __check_init__(self):
         if not (isinstance(self.reduction, Reduction) and self.reduction.has_running_value):
-            text = getattr(self.reduction, "__name__", f"{self.reduction!r:.200}")
+            description = getattr(self.reduction, "__name__", f"{self.reduction!r:.200}")
             raise TypeError(
-                "reduction of Running must be an object such as dvi.Mean(f) or dvi.MEGNO(), got "
-                f"{text}. A function and dvi.Section(...) are not allowed."
+                "reduction of Running must be an object such as dvi.Mean(f), not a function or a "
+                f"dvi.Section, got {description}."
             )
 
 
-def is_observable(x: Any) -> bool:
+def is_observable(leaf: Any) -> bool:
     """Whether x is a leaf of `observe`: a reduction, or a function."""
-    return isinstance(x, Reduction | Running) or callable(x)
+    return isinstance(leaf, Reduction | Running) or callable(leaf)

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 from jaxtyping import Array
 
-from ._kept import check_event
+from ..base.signature import check_takes
 
 
 class Stop(eqx.Module):
@@ -39,7 +39,7 @@ class Stop(eqx.Module):
     g: Callable[..., Any]
 
     def __check_init__(self):
-        check_event(self.g, "Stop")
+        check_takes("g of Stop", self.g, "(t, q, p, args)")
 
 
 class Stopped(NamedTuple):

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from lanewise.jaxprs.jaxapi import is_traced
 
-from ..base.checks import whole
+from ..base.checks import in_order, only_one, whole
 from ..base.inputs import as_times
 from ..base.results import RESULTS, status_name
 from ..base.signature import check_takes
@@ -66,28 +66,12 @@ class Save(eqx.Module):
             check_takes("the clock of Save", self.clock, "(t, q, p, args)")
         if self.ts is None:
             if self.clock is not None:
-                raise ValueError("clock requires ts: write Save(ts=values, clock=...).")
+                raise ValueError("clock of Save requires ts, its values.")
             return
-        if self.every is not None or self.final:
-            raise ValueError(
-                f"Save(ts=...) saves at the times ts only, got also every={self.every} and "
-                f"final={self.final}: leave out every and final."
-            )
-        if self.ts.ndim != 1 or self.ts.shape[0] == 0:
-            raise ValueError(
-                "ts in Save(ts=...) must be a one-dimensional array with at least one time, such "
-                f"as [0.5], got shape {self.ts.shape}."
-            )
+        only_one(ts=self.ts, every=self.every, final=self.final or None)
         if not is_traced(self.ts):
-            steps = np.diff(np.asarray(self.ts))
             # In order, since a step finds its times by bisection. Traced ones are sorted in a run.
-            is_sorted = bool((steps >= 0).all() or (steps <= 0).all())
-            if not (is_sorted and np.isfinite(np.asarray(self.ts)).all()):
-                text = np.array2string(np.asarray(self.ts), threshold=20)
-                raise ValueError(
-                    "ts in Save(ts=...) must be finite and in ascending order, or for h < 0 in "
-                    f"descending order, got {text}: use np.sort(ts)."
-                )
+            in_order("ts in Save(ts=...)", self.ts)
 
 
 class Solution(eqx.Module):

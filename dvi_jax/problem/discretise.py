@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..base.checks import whole
 from ..base.signature import check_takes, warn_of_exchanged
 from ..base.types import Args, HamiltonianFn, Scalar, State
 
@@ -56,15 +57,22 @@ class _ActionRule(eqx.Module):
         return jnp.dot(b, energy(times, qs, ps, args) - pq)
 
 
-_DISCRETE = (
-    "A discrete Hamiltonian H_D(t0, t1, q0, p1, args) does not need dvi.discretise: pass it to "
-    "dvi.System directly."
-)
+_DISCRETE = "A discrete Hamiltonian H_D(t0, t1, q0, p1, args) is passed to dvi.System directly."
 
 
 def is_first_order(H_D: Any) -> bool:
     """Whether a discrete Hamiltonian is a continuous one, evaluated at (t0, q0, p1)."""
     return isinstance(H_D, _LeftRule)
+
+
+def refuse_step_from_times(name: str, H_D: Any) -> None:
+    """**Raises** `ValueError` for an H_D that computes the step as t1 − t0, where that is not h."""
+    if getattr(H_D, "step_is_from_times", False):
+        raise ValueError(
+            f"{name} must not compute the step as t1 − t0, as dvi.discretise(H, order) with order "
+            "≥ 2, dvi.from_lagrangian and dvi.from_type_iii do. Use dvi.discretise(H, order=1) or "
+            "dvi.legendre(L)."
+        )
 
 
 def discretise(H: Callable[..., Any], order: int = 1) -> HamiltonianFn:
@@ -127,9 +135,5 @@ def discretise(H: Callable[..., Any], order: int = 1) -> HamiltonianFn:
     """
     check_takes("H", H, "(t, q, p, args)", {5: _DISCRETE})
     warn_of_exchanged("H", H, "(t, q, p, args)")
-    if isinstance(order, bool) or order not in (1, *_RULES):
-        raise ValueError(
-            f"order must be 1, 2, 3 or 4, got {order!r}. For a higher order use a composition, "
-            "such as method=dvi.Yoshida(6)."
-        )
+    order = whole("order", order, 1, 4, "A composition has more, such as method=dvi.Yoshida(6).")
     return _LeftRule(H) if order == 1 else _ActionRule(H, order)

@@ -131,13 +131,12 @@ class Rotation(Flow):
         return rate * jnp.sum(q0[..., 0] * p1[..., 1] - q0[..., 1] * p1[..., 0])
 
     def change(self, h, q, p, args):
-        x = h * value_of(self.rate, args, q)
-        s, versine = jnp.sin(x), 2 * jnp.sin(x / 2) ** 2
+        angle = h * value_of(self.rate, args, q)
+        s, versine = jnp.sin(angle), 2 * jnp.sin(angle / 2) ** 2
 
         def rotate(u):
-            plane = jnp.stack(
-                [-versine * u[..., 0] - s * u[..., 1], s * u[..., 0] - versine * u[..., 1]], -1
-            )
+            x, y = u[..., 0], u[..., 1]
+            plane = jnp.stack([-versine * x - s * y, s * x - versine * y], -1)
             return jnp.concatenate([plane, jnp.zeros_like(u[..., 2:])], -1)
 
         return rotate(q), rotate(p), jnp.asarray(True)

@@ -52,7 +52,7 @@ class Implicit(eqx.Module):
         ):
             check_takes(name, getattr(self, name), arguments)
 
-    def solved(self, t: Scalar, q: State, p: State, args: Args) -> Vector:
+    def root(self, t: Scalar, q: State, p: State, args: Args) -> Vector:
         """y at (t, q, p); NaN where it is not found. Differentiable to any order."""
         guess = self.guess(t, q, p, args)
         y, info = find_root(
@@ -62,7 +62,7 @@ class Implicit(eqx.Module):
         return y * jnp.where(info.converged, 1.0, jnp.nan).astype(y.dtype)
 
     def __call__(self, t: Scalar, q: State, p: State, args: Args) -> Scalar:
-        return self.energy(t, q, p, self.solved(t, q, p, args), args)
+        return self.energy(t, q, p, self.root(t, q, p, args), args)
 
     def rates(self, t: Scalar, q: State, p: State, y: Vector, args: Args) -> tuple[State, State]:
         """∂H/∂q and ∂H/∂p as functions of (q, p, y), which are those of H where R = 0:

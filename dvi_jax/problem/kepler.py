@@ -12,6 +12,7 @@ from jaxtyping import Array
 import lanewise
 
 from ..base.types import Scalar
+from ..engine.bracket import divide
 
 _SERIES_UP_TO = 1.0
 """|β X²| up to which nine terms of the series are exact to round-off: 6 steps per revolution."""
@@ -32,10 +33,10 @@ _SHORT = 1e-4
 class _G(NamedTuple):
     """G_n = Xⁿ c_n(β X²) for n = 0, 1, 2, 3, with c_n the functions of Stumpff."""
 
-    zero: Array
-    one: Array
-    two: Array
-    three: Array
+    g0: Array
+    g1: Array
+    g2: Array
+    g3: Array
 
 
 class _Orbit(NamedTuple):
@@ -48,26 +49,26 @@ class _Orbit(NamedTuple):
 
     def time(self, X: Array, g: _G) -> Array:
         """t(X) = r₀ X + η G₂ + ζ G₃, the time at which the universal variable is X."""
-        return self.r0 * X + self.eta * g.two + self.zeta * g.three
+        return self.r0 * X + self.eta * g.g2 + self.zeta * g.g3
 
     def radius(self, g: _G) -> Array:
         """r(X) = dt/dX = r₀ + η G₁ + ζ G₂."""
-        return self.r0 + self.eta * g.one + self.zeta * g.two
+        return self.r0 + self.eta * g.g1 + self.zeta * g.g2
 
     def on_time(self, h: Scalar, X: Array, g: _G) -> _G:
         """The functions at the X where t(X) = h in their own rounding, which differs from the root
         by round-off."""
         # Without it the energy drifts by 3e-19 in each step, since f and g are not of one orbit.
         d = (h - self.time(X, g)) / self.radius(g)
-        return _G(g.zero, g.one + g.zero * d, g.two + g.one * d, g.three + g.two * d)
+        return _G(g.g0, g.g1 + g.g0 * d, g.g2 + g.g1 * d, g.g3 + g.g2 * d)
 
     def correction(self, h: Scalar, X: Array) -> tuple[Array, Array, Array]:
         """The step towards t(X) = h of a method of order four, t(X) − h, and whether the next step
         would be below round-off."""
         g = _universal(X, self.beta)
         past, r = self.time(X, g) - h, self.radius(g)
-        slope = self.eta * g.zero + self.zeta * g.one
-        curve = self.zeta * g.zero - self.beta * self.eta * g.one
+        slope = self.eta * g.g0 + self.zeta * g.g1
+        curve = self.zeta * g.g0 - self.beta * self.eta * g.g1
         newton = -past / r
         step = -past / (r + newton * slope / 2)
         step = -past / (r + step * (slope / 2 + step * curve / 6))
@@ -88,11 +89,11 @@ def change(h: Scalar, q: Array, v: Array, mu: Array) -> tuple[Array, Array, Arra
 
         f − 1 = −μ G₂/r₀,   g = h − μ G₃,   ḟ = −μ G₁/(r₀ r),   ġ − 1 = −μ G₂/r
 
-    - `q`, `v`: shape (…, dim), one orbit a row. `mu`: μ [length³/time²], of the shape of the rows.
+    `q`, `v` of shape (…, dim) have one orbit a row, and `mu` one μ for each [length³/time²].
 
-    **Returns** q(h) − q, v(h) − v, and whether the solution of Kepler's equation was found for all
-    rows. Elliptic, parabolic and hyperbolic orbits, of any h; derivatives are those of the implicit
-    function theorem, to any order. A body that starts at the centre gives NaN.
+    **Returns** q(h) − q, v(h) − v, and whether Kepler's equation was solved for all rows. Orbits of
+    any eccentricity, any h; derivatives to any order are those of the implicit function theorem. A
+    body that starts at the centre gives NaN.
 
     **Source** Stumpff 1959, *Himmelsmechanik* I; Danby 1988, *Fundamentals of Celestial Mechanics*,
     6.9; Wisdom & Hernandez 2015, *MNRAS* 453, 3015; Rein & Tamayo 2015, *MNRAS* 452, 376.
@@ -104,21 +105,17 @@ def change(h: Scalar, q: Array, v: Array, mu: Array) -> tuple[Array, Array, Arra
     def equation(X):
         return orbit.time(X, _universal(X, beta)) - h
 
+    # The equations of different orbits do not depend on one another: `divide` solves all of them.
     X, is_root = lanewise.implicit_root(
-        equation, jnp.zeros_like(r0), lambda _, __: _solve(orbit, h), _divide
+        equation, jnp.zeros_like(r0), lambda _, __: _solve(orbit, h), divide
     )
     g = orbit.on_time(h, X, _universal(X, beta))
     # Increments, not the new state: a small change keeps its digits next to a large coordinate.
-    a = (mu * g.two)[..., None]
+    a = (mu * g.g2)[..., None]
     r, r0 = orbit.radius(g)[..., None], r0[..., None]
-    dq = (h - mu * g.three)[..., None] * v - a / r0 * q
-    dv = -(mu * g.one)[..., None] / (r0 * r) * q - a / r * v
+    dq = (h - mu * g.g3)[..., None] * v - a / r0 * q
+    dv = -(mu * g.g1)[..., None] / (r0 * r) * q - a / r * v
     return dq, dv, is_root
-
-
-def _divide(linear, rhs):
-    # The equations of different orbits do not depend on one another.
-    return rhs / linear(jnp.ones_like(rhs))
 
 
 def _solve(orbit: _Orbit, h: Scalar) -> tuple[Array, Array]:
@@ -160,9 +157,8 @@ def _solve(orbit: _Orbit, h: Scalar) -> tuple[Array, Array]:
         is_nan = ~jnp.isfinite(orbit.zeta + s)
         begin = (start, inner, sign * jnp.full_like(s, jnp.inf), is_nan, jnp.int32(0))
         x, _, _, is_root_at_end, _ = lax.while_loop(proceed, improve, begin)
-        return jnp.where(is_root_already, X, x), jnp.all(
-            is_root_already | (is_root_at_end & ~is_nan)
-        )
+        good = is_root_already | (is_root_at_end & ~is_nan)
+        return jnp.where(is_root_already, X, x), jnp.all(good)
 
     good = jnp.all(is_root_already)
     return lax.cond(lanewise.on_any(~good), search, lambda: (X, good))

@@ -12,6 +12,7 @@ from jax import lax
 import lanewise
 from lanewise.jaxprs.dependence import depends_on
 
+from ..base.checks import array
 from ..base.signature import accepts, check_takes, signature_of
 from ..base.types import Args, ForceFn, HamiltonianFn, Scalar, State
 from ..engine.newton import Newton, Vector, find_root
@@ -32,9 +33,8 @@ class _LegendreTransform(eqx.Module):
     root_finder: Newton
 
     def __call__(self, t: Scalar, q: State, p: State, args: Args) -> Scalar:
-        return _legendre_transform(
-            lambda v: self.L(t, q, v, args), p, self.root_finder, "L(t, q, v, args)"
-        )
+        name = "L(t, q, v, args)"
+        return _legendre_transform(lambda v: self.L(t, q, v, args), p, self.root_finder, name)
 
 
 class _DiscreteLegendreTransform(eqx.Module):
@@ -44,10 +44,8 @@ class _DiscreteLegendreTransform(eqx.Module):
     root_finder: Newton
 
     def __call__(self, t0: Scalar, t1: Scalar, q0: State, p1: State, args: Args) -> Scalar:
-        name = "L_D(t0, t1, q0, v, args)"
-        return _legendre_transform(
-            lambda v: self.L_D(t0, t1, q0, v, args), p1, self.root_finder, name
-        )
+        L, name = (lambda v: self.L_D(t0, t1, q0, v, args)), "L_D(t0, t1, q0, v, args)"
+        return _legendre_transform(L, p1, self.root_finder, name)
 
 
 class _FromLagrangian(eqx.Module):
@@ -80,7 +78,7 @@ class _FromTypeIII(eqx.Module):
 
         def energy(q1, p0):
             H = self.H_minus(t0, t1, q1, p0, args)
-            return _require_scalar(H, "H_minus(t0, t1, q1, p0, args)", q0.shape, "an energy")
+            return _scalar(H, "H_minus(t0, t1, q1, p0, args)")
 
         def ends(v, f):
             return q0 + h * v, p1 - h * f
@@ -142,17 +140,13 @@ def legendre(L: Callable[..., Any], root_finder: Newton = Newton()) -> Callable[
     # The number of arguments decides; a function that takes four and five cannot be classified.
     discrete, continuous = (callable(L) and accepts(L, count) for count in (5, 4))
     if discrete == continuous:
-        text = signature_of(L) if callable(L) else repr(L)  # the value of a number, say
+        description = signature_of(L) if callable(L) else repr(L)  # the value of a number, say
         raise TypeError(
-            "L must be a function of (t, q, v, args), continuous, or of (t0, t1, q0, v, args), "
-            f"discrete, got {text}, which accepts "
-            + ("both: wrap it in a lambda of four or of five." if discrete else "neither.")
+            f"L must be a function of (t, q, v, args) or of (t0, t1, q0, v, args), got "
+            f"{description}, which accepts {'both' if discrete else 'neither'}."
         )
-    return (
-        _DiscreteLegendreTransform(L, root_finder)
-        if discrete
-        else _LegendreTransform(L, root_finder)
-    )
+    kind = _DiscreteLegendreTransform if discrete else _LegendreTransform
+    return kind(L, root_finder)
 
 
 def from_lagrangian(L_d: Callable[..., Any], root_finder: Newton = Newton()) -> HamiltonianFn:
@@ -278,10 +272,9 @@ def _legendre_transform(
 ) -> Scalar:
     """p·v − L(v) at the v with ∂L/∂v = p; NaN where none is found. `scale`: a scale of the
     round-off of v, q0/h where v is a difference of positions."""
-    quantity = "an action" if name.startswith("L_d") else "an energy"
 
     def lagrangian(v):
-        return _require_scalar(L(v.reshape(p.shape)), name, p.shape, quantity)
+        return _scalar(L(v.reshape(p.shape)), name)
 
     momentum = p.ravel()
     # A custom derivative may not close over traced values: they become arguments.
@@ -314,7 +307,6 @@ def _(L, root_finder, inputs, changes):
 def _velocity(
     L: Callable[..., Scalar], root_finder: Newton, p: Vector, parameters: list, scale: Vector
 ) -> Vector:
-
     def slope(v):
         return jax.grad(L)(v, *parameters)
 
@@ -330,9 +322,7 @@ def _velocity(
     return _root(lambda v: slope(v) - p, start, scale, root_finder)
 
 
-def _root(
-    residual: Callable[[Vector], Vector], guess: Vector, scale: Vector, root_finder: Newton
-) -> Vector:
+def _root(residual: Callable, guess: Vector, scale: Vector, root_finder: Newton) -> Vector:
     x, info = find_root(residual, guess, scale, root_finder)
     # An H_D has no status: NaN reports a failure, from which the step gets its status.
     return jnp.where(info.converged, x, jnp.nan)
@@ -368,11 +358,5 @@ def _start(slope: Callable[[Vector], Vector], p: Vector, zero: Vector) -> Vector
     return lax.while_loop(far, closer, start)[0]
 
 
-def _require_scalar(value: Any, name: str, shape: tuple[int, ...], quantity: str) -> Scalar:
-    value = jnp.asarray(value)
-    if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
-        raise ValueError(
-            f"{name} must return a real scalar ({quantity}), got shape {value.shape} and dtype "
-            f"{value.dtype} for q0 of shape {shape}. Use jnp.sum, one component or jnp.real."
-        )
-    return value
+def _scalar(value: Any, name: str) -> Scalar:
+    return array(name, jnp.asarray(value), (), verb="return", hint="Use jnp.sum or jnp.real.")

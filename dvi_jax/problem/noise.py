@@ -15,9 +15,10 @@ from jaxtyping import Array, Int
 from lanewise.jaxprs.dependence import depends_on
 from lanewise.jaxprs.jaxapi import is_traced, threefry2x32
 
-from ..base.checks import whole
+from ..base.checks import array, whole
 from ..base.signature import check_takes, warn_of_exchanged
 from ..base.types import Args, Interval, Scalar, State
+from .flows import value_of
 
 _NAMES = "(t, q, p, args)"
 
@@ -28,7 +29,7 @@ class Noise(eqx.Module):
     @property
     def functions(self) -> list[Callable[..., Any]]:
         """The functions of the user."""
-        return [x for x in vars(self).values() if callable(x)]
+        return [value for value in vars(self).values() if callable(value)]
 
     @abc.abstractmethod
     def count(self, t: Scalar, q: State, p: State, args: Args) -> int:
@@ -57,13 +58,10 @@ class MomentumNoise(Noise):
 
     def count(self, t, q, p, args):
         # Traced only: at the start σ may be singular.
-        shape = jax.eval_shape(self.sigma, t, q, p, args).shape
-        if shape not in (q.shape, (*q.shape, *shape[-1:])):
-            raise ValueError(
-                f"noise{_NAMES} must return an array like q0, {q.shape}, for an independent noise "
-                f"in each momentum, or of the shape {(*q.shape, 'm')} for m motions; got {shape}."
-            )
-        return q.size if shape == q.shape else shape[-1]
+        sigma = jax.eval_shape(self.sigma, t, q, p, args)
+        shapes = q.shape, (*q.shape, "m")
+        array(f"noise{_NAMES}", sigma, *shapes, verb="return", integers=True, empty=True)
+        return q.size if sigma.shape == q.shape else sigma.shape[-1]
 
     def force(self, t, q, p, args, rates):
         sigma = jnp.asarray(self.sigma(t, q, p, args), p.dtype)
@@ -73,8 +71,8 @@ class MomentumNoise(Noise):
     def check_fixed_momentum(self, method, t, q, p, args):
         if depends_on(lambda p: self.sigma(t, q, p, args), 0, p):
             raise ValueError(
-                f"the noise of the system depends on p, which dvi.{method}() cannot integrate in "
-                "the sense of Stratonovich. Use method=dvi.StochasticMidpoint()."
+                f"method=dvi.{method}() requires noise that does not depend on p. Use "
+                "method=dvi.StochasticMidpoint()."
             )
 
 
@@ -100,19 +98,19 @@ class Langevin(Noise):
     mass: Any = 1.0
 
     def _values(self, args: Args, like: State) -> list[Array]:
-        values = (self.friction, self.temperature, self.mass)
-        arrays = [jnp.asarray(x(args) if callable(x) else x, like.dtype) for x in values]
+        parameters = (self.friction, self.temperature, self.mass)
+        values = [value_of(parameter, args, like) for parameter in parameters]
         # Numbers stay numbers: e^{−γh} of a step is then computed once.
-        return [jnp.broadcast_to(x, like.shape) if x.ndim else x for x in arrays]
+        return [jnp.broadcast_to(value, like.shape) if value.ndim else value for value in values]
 
     def count(self, t, q, p, args):
         try:
             self._values(args, q)
         except ValueError as error:
-            condition = (
+            raise ValueError(
                 "friction, temperature and mass of dvi.Langevin must broadcast with q0, shape "
-            )
-            raise ValueError(f"{condition}{q.shape}: {error}") from None
+                f"{q.shape}: {error}"
+            ) from None
         return q.size
 
     def force(self, t, q, p, args, rates):
@@ -148,13 +146,11 @@ class NoiseHamiltonians(Noise):
         check_takes("h of dvi.NoiseHamiltonians", self.h, _NAMES)
 
     def count(self, t, q, p, args):
-        shape = jax.eval_shape(self.h, t, q, p, args).shape
-        if len(shape) != 1:
-            raise ValueError(
-                "the function of dvi.NoiseHamiltonians must return an array of shape (m,), got "
-                f"shape {shape}. For one noise return jnp.array([energy])."
-            )
-        return shape[0]
+        energies = jax.eval_shape(self.h, t, q, p, args)
+        hint = "For one noise return jnp.array([energy])."
+        name = f"h{_NAMES} of dvi.NoiseHamiltonians"
+        array(name, energies, ("m",), verb="return", integers=True, empty=True, hint=hint)
+        return energies.shape[0]
 
     def energy(self, t, q, p, args, rates):
         return jnp.sum(jnp.asarray(self.h(t, q, p, args), p.dtype) * rates)
@@ -162,8 +158,8 @@ class NoiseHamiltonians(Noise):
     # Positions change as well: there is no exact flow at constant q.
     def kick(self, t, q, p, args, h, dB):
         raise ValueError(
-            "dvi.BAOAB() and dvi.OBABO() require noise on the momenta, but the system has noise "
-            "Hamiltonians. Use method=dvi.StochasticMidpoint() or dvi.StochasticEuler()."
+            "dvi.BAOAB() and dvi.OBABO() require noise on the momenta, got noise Hamiltonians. Use "
+            "dvi.StochasticMidpoint() or dvi.StochasticEuler()."
         )
 
 
@@ -253,17 +249,12 @@ class NoisePath(eqx.Module):
     parts: int = eqx.field(static=True)
     count: int = eqx.field(static=True)
 
-    def at(self, k: Int[Array, ""], interval: Interval) -> Array:
+    def increments_of(self, k: Int[Array, ""], interval: Interval) -> Array:
         """The increments of step k, shape (parts, count)."""
         increments = self.path.increments(k, interval, self.parts, self.count)
-        if increments.shape != (self.parts, self.count):
-            raise ValueError(
-                f"the increments of {type(self.path).__name__} must have the shape (parts, number "
-                f"of motions) = {(self.parts, self.count)}, got {increments.shape}."
-            )
-        return increments.astype(
-            interval.h.dtype
-        )  # a path of the user has that of its own functions
+        name = f"the increments (parts, motions) of {type(self.path).__name__}"
+        array(name, increments, (self.parts, self.count), integers=True)
+        return increments.astype(interval.h.dtype)  # a path of the user may have another type
 
 
 def as_path(path: Any) -> BrownianPath | None:
@@ -277,19 +268,19 @@ def as_path(path: Any) -> BrownianPath | None:
 
 def _words(key: Any) -> Array:
     try:
-        array = jnp.asarray(key)
+        words = jnp.asarray(key)
     except TypeError:
-        array = jnp.zeros(0)
-    if array.shape == () and jnp.issubdtype(array.dtype, jnp.integer):
-        array = jax.random.key(array, impl="threefry2x32")
+        words = jnp.zeros(0)
+    if words.shape == () and jnp.issubdtype(words.dtype, jnp.integer):
+        words = jax.random.key(words, impl="threefry2x32")
     # Another generator has keys of another length, or another meaning.
-    if array.shape == () and "fry" in str(array.dtype):
-        return jax.random.key_data(array)
-    if array.shape == (2,) and array.dtype == jnp.uint32:  # an old key of JAX: its words
-        return array
+    if words.shape == () and "fry" in str(words.dtype):
+        return jax.random.key_data(words)
+    if words.shape == (2,) and words.dtype == jnp.uint32:  # an old key of JAX: its words
+        return words
     raise ValueError(
-        "the key of a path must be one key of jax.random with the generator threefry2x32, such as "
-        f"jax.random.key(0), or an integer, got {key!r:.200}. For many paths use jax.vmap."
+        "the key of a path must be an integer, or one key of jax.random with the generator "
+        f"threefry2x32, got {key!r:.200}. For many paths use jax.vmap."
     )
 
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from ..base.checks import whole
 from ..base.signature import check_takes
 from ..base.types import Args, HamiltonianFn, Scalar, State
+from .discretise import refuse_step_from_times
 from .flows import Flow, Known
 
 
@@ -52,23 +53,19 @@ class Split(eqx.Module):
         all_flows = [None] * len(parts) if flows is None else list(flows)
         if len(all_flows) != len(parts):
             raise ValueError(
-                f"flows of Split must have one entry for each of the {len(parts)} parts, None for "
-                f"a flow that is not known, got {len(all_flows)} entries."
+                f"flows of Split must have one entry, a function or None, for each of the "
+                f"{len(parts)} parts, got {len(all_flows)}."
             )
         for i, (H, flow) in enumerate(zip(parts, all_flows, strict=True)):
             check_takes(f"part {i} of Split", H, "(t0, t1, q0, p1, args)")
-            if getattr(H, "step_is_from_times", False):
-                raise ValueError(
-                    f"part {i} of Split must not compute the step as t1 − t0, as results of "
-                    "dvi.discretise(H, order) with order ≥ 2 do. Use dvi.discretise(H, order=1)."
-                )
+            refuse_step_from_times(f"part {i} of Split", H)
             parts[i] = H if flow is None else Known(H, flow)
         if perturbed is not None:
             whole("perturbed", perturbed, 0, len(parts) - 1, hint="It is the number of a part.")
             if isinstance(parts[perturbed], Flow):
                 raise ValueError(
-                    f"part {perturbed} of Split has a known flow, which does not contain the "
-                    "perturbation. Name another part, or leave perturbed out."
+                    f"perturbed={perturbed} must be a part of Split without a known flow, which "
+                    "does not contain the perturbation."
                 )
         self.parts, self.perturbed = tuple(parts), perturbed
 

@@ -8,15 +8,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ..base.checks import finite, instance
+from ..base.checks import array, finite, instance, require
 from ..base.indices import out_of_bounds
 from ..base.reads import Reads, differences, reads
 from ..base.signature import accepts, check_takes, tracing_note, warn_of_exchanged
 from ..base.types import Args, ConstraintFn, ForceFn, HamiltonianFn, Scalar, State
+from .discretise import refuse_step_from_times
 from .noise import Noise, as_noise
 
 _NAMES = "(t0, t1, q0, p1, args)"
-_CONTINUOUS = "Make a discrete Hamiltonian of a continuous H(t, q, p, args) by dvi.discretise(H)."
+_CONTINUOUS = "Use dvi.discretise(H) for a continuous H(t, q, p, args)."
 
 
 class System(eqx.Module):
@@ -91,32 +92,24 @@ class System(eqx.Module):
 
     def __check_init__(self):
         for name in ("H_D", "force", "perturbation"):
-            function = getattr(self, name)
-            if name == "perturbation" and self._is_nonlinear:
-                continue
-            if function is not None or name == "H_D":
-                check_takes(name, function, _NAMES, {4: _CONTINUOUS})
-            if function is not None:
-                warn_of_exchanged(name, function, _NAMES)
+            is_absent = getattr(self, name) is None and name != "H_D"
+            if not is_absent and not (name == "perturbation" and self._is_nonlinear):
+                check_takes(name, getattr(self, name), _NAMES, {4: _CONTINUOUS})
+                warn_of_exchanged(name, getattr(self, name), _NAMES)
         if self.constraint is not None:
             check_takes("constraint", self.constraint, "(q, args)")
         instance("slow_time", self.slow_time, bool, "True or False")
         if self.epsilon is not None:
             finite("epsilon of a System", self.epsilon)
-        functions = {"H_D": self.H_D, "perturbation": self.perturbation}
-        offenders = [n for n, f in functions.items() if getattr(f, "step_is_from_times", False)]
-        if self.slow_time and offenders:
-            raise ValueError(
-                f"{offenders[0]} must not compute the step as t1 − t0 if slow_time=True, where it "
-                "is ε h, as dvi.discretise(H, order) with order ≥ 2, dvi.from_lagrangian and "
-                "dvi.from_type_iii do. Use dvi.discretise(H, order=1) or dvi.legendre(L)."
-            )
+        if self.slow_time:
+            refuse_step_from_times("H_D of a System with slow_time=True", self.H_D)
+            refuse_step_from_times("perturbation with slow_time=True", self.perturbation)
 
     @property
     def _is_nonlinear(self) -> bool:
         """Whether the perturbation takes ε."""
-        f = self.perturbation
-        return callable(f) and accepts(f, 6) and not accepts(f, 5)
+        function = self.perturbation
+        return callable(function) and accepts(function, 6) and not accepts(function, 5)
 
     def strength(self, epsilon: Any) -> Any:
         """ε of a run: the one given, else the default of the system, else 0 for a system that does
@@ -125,16 +118,13 @@ class System(eqx.Module):
             return epsilon
         if self.epsilon is not None:
             return self.epsilon
-        parts = {
-            "a force": self.force is not None,
-            "a perturbation": self.perturbation is not None,
-            "slow_time=True": self.slow_time,
-        }
-        if any(parts.values()):
-            names = " and ".join(name for name, is_there in parts.items() if is_there)
+        names = ["a force"] * (self.force is not None)
+        names += ["a perturbation"] * (self.perturbation is not None)
+        names += ["slow_time=True"] * self.slow_time
+        if names:
             raise ValueError(
-                f"epsilon must be given for a system with {names}. It is their factor: "
-                "epsilon=1.0 uses the functions as they are."
+                f"epsilon=... must be given for a system with {' and '.join(names)}: it is their "
+                "factor."
             )
         return 0.0
 
@@ -172,40 +162,24 @@ class System(eqx.Module):
             tree,
             *((x.shape, x.dtype) if eqx.is_array(x) else (type(x), x) for x in leaves),
         )
-        scalar = "a real scalar (an energy)"
-        for name, function, shape, description in (
-            ("H_D", self.H_D, (), scalar),
-            ("perturbation", self.perturbation, (), scalar),
-            ("force", self.force, q.shape, f"a real array shaped like q0, {q.shape}"),
-        ):
-            if function is None:
-                continue
-            extra = (t,) if name == "perturbation" and self._is_nonlinear else ()
-            out = _traced_output(function, name, kinds, (t, t, q, p, args, *extra))
-            if out.shape == shape and jnp.issubdtype(out.dtype, jnp.floating):
-                continue
-            hint = "" if shape else "Return a floating-point number."
-            if out.shape and not shape:
-                hint = "Sum its entries with jnp.sum, or take one component."
-            raise ValueError(
-                f"{name}{_NAMES} must return {description}; for q0 of shape {q.shape} it returned "
-                f"shape {out.shape}, dtype {out.dtype}. {hint}".rstrip()
-            )
+        for name, shape in (("H_D", ()), ("perturbation", ()), ("force", q.shape)):
+            function = getattr(self, name)
+            if function is not None:
+                extra = (t,) if name == "perturbation" and self._is_nonlinear else ()
+                out = _traced_output(function, name, kinds, (t, t, q, p, args, *extra))
+                hint = "Use jnp.sum or one component." if out.shape and not shape else ""
+                array(f"{name}{_NAMES}", out, shape, verb="return", hint=hint)
         if self.constraint is not None:
             # A scalar is refused too: one component needs an axis as several do.
             out = _traced_output(self.constraint, "constraint", kinds, (q, args))
-            if len(out.shape) != 1 or 0 in out.shape or not jnp.issubdtype(out.dtype, jnp.floating):
-                raise ValueError(
-                    "constraint(q, args) must return a real array of shape (m,), m ≥ 1; for q of "
-                    f"shape {q.shape} it returned {out.shape}, dtype {out.dtype}. Use jnp.ravel."
-                )
+            array("constraint(q, args)", out, ("m",), verb="return", hint="Use jnp.ravel.")
 
 
 def _read_by(system: System) -> Reads:
     of_noise = [] if system.noise is None else system.noise.functions
     functions = (system.H_D, system.force, system.perturbation, system.constraint, *of_noise)
     # A counter of calls, for instance, changes with every trace, and no program depends on it.
-    counters = {name for f in functions for name in _changed_by_tracing(f)}
+    counters = {name for function in functions for name in _changed_by_tracing(function)}
     return tuple(item for item in reads(*functions) if item[0] not in counters)
 
 
@@ -221,13 +195,10 @@ def of_problem(
     if isinstance(getattr(system, "system", None), System):
         problem, system = system, system.system
         defaults = (("q0", q0), ("p0", p0), ("h", h), ("args", args))
-        values = (getattr(problem, n) if x is None else x for n, x in defaults)
+        values = (getattr(problem, name) if value is None else value for name, value in defaults)
         q0, p0, h, args = (None, None, *tuple(values)[2:]) if has_start else values
-    elif isinstance(system, System) and not has_start and (q0 is None or p0 is None):
-        raise TypeError(
-            f"q0 and p0 must both be given for a dvi.System, but {'q0' if q0 is None else 'p0'} is "
-            "missing."
-        )
+    elif isinstance(system, System) and not has_start:
+        require("a call with a dvi.System", {"q0": q0, "p0": p0})
     return system, q0, p0, h, args
 
 
@@ -236,34 +207,37 @@ def check_system(system: Any, of_map: str = "", noise_allowed: bool = False) -> 
     functions read a value that has changed since it was made, for one with noise, and for a
     constraint if `of_map` is the name of a function that examines the map (12)–(13) itself."""
     if not isinstance(system, System):
-        hint = "Wrap the discrete Hamiltonian H_D(t0, t1, q0, p1, args) in it: dvi.System(H_D)."
+        hint = "Write dvi.System(H_D) for a function H_D(t0, t1, q0, p1, args)."
         if isinstance(getattr(system, "system", None), System):
-            hint = "Take the system of a problem of the library: problem.system."
+            hint = "Write problem.system."
         name = getattr(system, "__name__", "")
         of_library = str(getattr(system, "__module__", "")).startswith("dvi_jax.systems.")
         if of_library and accepts(system, 0):
             hint = f"Call the function: {name}()."
         kind = "class" if isinstance(system, type) else type(system).__name__
-        text = f"the {kind} {name}" if name else f"a value of type {kind}"
-        raise TypeError(f"system must be a dvi.System, got {text}. {hint}")
+        description = f"the {kind} {name}" if name else f"a value of type {kind}"
+        raise TypeError(f"system must be a dvi.System, got {description}. {hint}")
     if system.noise is not None and not noise_allowed:
         raise ValueError(
-            "the system has noise, which only dvi.integrate, dvi.sweep and dvi.invariant_diffusion "
-            "support: give the same system without noise=."
+            "the system must not have noise, except in dvi.integrate, dvi.sweep and "
+            "dvi.invariant_diffusion."
         )
     if of_map and system.constraint is not None:
-        raise ValueError(
-            f"{of_map} requires a system without constraint. Use other coordinates, or "
-            "dvi.discover_invariants or dvi.drift_order."
-        )
+        raise ValueError(f"{of_map} requires a system without constraint: use other coordinates.")
     # Programs that are compiled already would compute with the old value.
     current = _read_by(system)
     names = differences(system.reads, current) if current != system.reads else []
     if names:
         raise ValueError(
-            "the functions of the system read values that have changed since it was made: "
-            f"{', '.join(names)}. Make a new System, or pass such values in args."
+            "values that the functions of the system read have changed since it was made: "
+            f"{', '.join(names)}. Make a new System, or pass them in args."
         )
+
+
+def require_constraint(name: str, system: System) -> None:
+    """**Raises** `ValueError` for a system without a constraint."""
+    if system.constraint is None:
+        raise ValueError(f"{name} requires a constraint: dvi.System(H_D, constraint=g).")
 
 
 # Weak, so that functions and the arrays in their closures can be deleted.
@@ -300,30 +274,23 @@ def _traced_output(
         error.add_note(f"(in {name}{names}, called with q0 of shape {q.shape} and args={args!r})")
         error.add_note(tracing_note(name, error))
         if q.ndim > 1:
-            error.add_note(
-                f"{name} receives the whole q0. If its first axis is a batch of initial states, "
-                "write the function of one state and use jax.vmap."
-            )
+            error.add_note(f"{name} receives the whole q0. For a batch of states use jax.vmap.")
         raise
     # JAX moves such an index to the end of the array, so that the result would be wrong silently.
     for index, size in out_of_bounds(program):
         raise IndexError(
-            f"{name}{names} must use indices inside its arrays, but the index {index} is out of "
-            f"bounds for an axis of length {size}. q0 and p1 have the shape {q.shape}."
+            f"{name}{names} uses the index {index}, out of bounds for an axis of length {size}; q0 "
+            f"has the shape {q.shape}."
         )
     out = eqx.combine(*out)
     new_values = reads(function)
     if new_values != values:  # such as a counter of calls
         marks = dict(values)
-        _CHANGED_BY_TRACING[function] = _changed_by_tracing(function) | {
-            name for name, mark in new_values if marks.get(name) != mark
-        }
+        changes = {name for name, mark in new_values if marks.get(name) != mark}
+        _CHANGED_BY_TRACING[function] = _changed_by_tracing(function) | changes
     if out is None or not hasattr(out, "shape"):
         if isinstance(out, int | float):
             return outputs.setdefault(kinds, jax.ShapeDtypeStruct((), jnp.result_type(float)))
-        text = "None (is a return missing?)" if out is None else f"type {type(out).__name__}"
-        description = (
-            f"an array of shape {q.shape}, that of q0" if name == "force" else "a real scalar"
-        )
-        raise TypeError(f"{name}{names} must return {description}, got {text}.")
+        description = "None (is a return missing?)" if out is None else f"type {type(out).__name__}"
+        raise TypeError(f"{name}{names} must return an array, got {description}.")
     return outputs.setdefault(kinds, jax.ShapeDtypeStruct(out.shape, out.dtype))

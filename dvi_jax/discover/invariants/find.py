@@ -111,7 +111,7 @@ def discover_invariants(
     check_system(system)
     one_step = map_of("discover_invariants", system, **how)
     samples = as_samples(samples, one_step.t0)
-    order = whole("order", order, least=0)
+    order = whole("order", order, low=0)
     in_pairs = uses_pairs(one_step.arithmetic, tolerance)
     if order > _RELIABLE and not in_pairs:
         warnings.warn(

@@ -86,7 +86,7 @@ class ShadowHamiltonian(eqx.Module):
     h: Any = None
 
     def __check_init__(self):
-        whole("order", self.order, least=0)
+        whole("order", self.order, low=0)
         if self.system is not None:
             hint = "Wrap the discrete Hamiltonian: dvi.System(H_D)."
             instance("system", self.system, System, "a dvi.System or None", hint)

@@ -120,7 +120,7 @@ def find_symmetries(
     #   ξ_q1 = q2, ξ_q2 = −q1, η_p1 = p2, η_p2 = −p1…
     ```
     """
-    order = whole("order", order, least=0)
+    order = whole("order", order, low=0)
     if tolerance is not None:
         tolerance = fraction("tolerance", tolerance)
     check_system(system, "find_symmetries")

@@ -160,4 +160,4 @@ def flux(chart: Regular | Angles, q: Any, p: Any, args: Any) -> Array:
     guess = _Guess(chart)
     if args["field"].I is None:
         return guess(0.0, q, p, args)[0]
-    return Implicit(_Energy(chart), _Relation(chart), guess).solved(jnp.zeros(()), q, p, args)[0]
+    return Implicit(_Energy(chart), _Relation(chart), guess).root(jnp.zeros(()), q, p, args)[0]
