@@ -12,6 +12,7 @@ from jaxtyping import PyTree
 
 from ..base.checks import fraction, instance, one_of, whole
 from ..base.precision import require_double
+from .checks import requires
 from .losses import LeastSquares, Likelihood, Loss
 from .observations import Data, as_arcs
 from .optimise import FIT_RESULTS, FitError
@@ -127,16 +128,12 @@ def fit(
     max_steps = max_steps or (2000 if uses_optax else 200)
     if batch is not None:
         whole("batch", batch)
-        if not uses_optax:
-            raise ValueError(
-                f"batch requires an optimiser of optax, got {type(solver).__name__}: give, for "
-                "example, optimiser=optax.adam(1e-3)."
-            )
-    if isinstance(shooting, MultipleShooting) and not is_vector:
-        raise ValueError(
-            "dvi.MultipleShooting requires a loss of residuals and a least-squares optimiser, got "
-            f"the loss {type(problem.loss).__name__} and the optimiser {type(solver).__name__}."
-        )
+        example = "an optimiser of optax, such as optax.adam(1e-3)"
+        requires(uses_optax, "batch", example, type(solver).__name__)
+    if isinstance(shooting, MultipleShooting):
+        condition = "a loss of residuals and a least-squares optimiser"
+        names = f"{type(problem.loss).__name__} and {type(solver).__name__}"
+        requires(is_vector, "dvi.MultipleShooting", condition, names)
     stage_horizons = _horizons(horizons)
     u = problem.space.to_u(problem.start)
     name = identity(problem, u, solver, shooting, stage_horizons, batch, seed, tolerance)
@@ -156,8 +153,8 @@ def fit(
         return estimate
     raise FitError(
         f"the fit did not converge (status: {estimate.status}, steps: {len(run.records)}, loss: "
-        f"{estimate.loss:.6g}). {FIT_RESULTS[status]} The result is in the attribute `fit` of this "
-        "error; throw=False returns it.",
+        f"{estimate.loss:.6g}). {FIT_RESULTS[status]} The attribute `fit` is the result; "
+        "throw=False returns it.",
         estimate,
     )
 
@@ -172,8 +169,7 @@ def _horizons(horizons: Any) -> list[float] | None:
     times = np.asarray(horizons, float)
     if times.ndim != 1 or not (np.diff(times) > 0).all() or not (times > 0).all():
         raise ValueError(
-            "horizons must be 'auto', None or a list of increasing positive times, got "
-            f"{horizons!r:.200}."
+            f"horizons must be 'auto', None or increasing positive times, got {horizons!r:.200}."
         )
     return [*times.tolist(), np.inf]
 

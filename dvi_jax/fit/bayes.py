@@ -14,6 +14,7 @@ from jaxtyping import Array, PyTree
 
 from ..base.checks import fraction, instance, whole
 from ._fit import fit
+from .checks import package, same_parameters
 from .losses import LeastSquares, Likelihood, Loss
 from .observations import Data
 from .parameters import make_space
@@ -131,12 +132,7 @@ class Samples:
 
         **Raises** `ImportError` without arviz.
         """
-        try:
-            import arviz  # pyright: ignore[reportMissingImports]
-        except ImportError as error:
-            raise ImportError(
-                f"to_arviz requires arviz, but its import failed ({error}): pip install arviz"
-            ) from None
+        arviz = package("arviz", "to_arviz", "arviz")
         tree = self.to_xarray()
         if int(arviz.__version__.split(".")[0]) >= 1:
             return tree
@@ -188,7 +184,7 @@ def sample(
     **Source** Hoffman & Gelman 2014, *J. Mach. Learn. Res.* 15, 1593 (by numpyro); R̂, Gelman et
     al. 2013, *Bayesian Data Analysis*, 11.4.
     """
-    numpyro = _numpyro()
+    infer = _numpyro("infer")
     counts = {"num_warmup": num_warmup, "num_samples": num_samples, "num_chains": chains}
     whole("num_samples", num_samples, 4)
     whole("num_warmup", num_warmup, 0)
@@ -214,11 +210,11 @@ def sample(
     def in_z(z):
         return posterior.potential(centre + L @ z)
 
-    kernel = numpyro.infer.NUTS(
+    kernel = infer.NUTS(
         potential_fn=in_z, target_accept_prob=target_accept, max_tree_depth=max_tree_depth
     )
     shows = sys.stderr.isatty() if progress is None else progress
-    mcmc = numpyro.infer.MCMC(kernel, **counts, chain_method="vectorized", progress_bar=shows)
+    mcmc = infer.MCMC(kernel, **counts, chain_method="vectorized", progress_bar=shows)
     begin = _starts(in_z, chains, posterior.size, seed)
     with jax.numpy_rank_promotion("allow"):  # numpyro's own arithmetic
         mcmc.run(
@@ -229,22 +225,14 @@ def sample(
     z = mcmc.get_samples(group_by_chain=True)
     x = jax.jit(jax.vmap(jax.vmap(lambda z: posterior.to_x(centre + L @ z))))(z)
     statistics = mcmc.get_extra_fields(group_by_chain=True)
-    samples = _collect(numpyro, posterior, x, statistics, notes, 2**max_tree_depth - 1)
+    samples = _collect(posterior, x, statistics, notes, 2**max_tree_depth - 1)
     for text in samples.warnings:
         warnings.warn(text, UserWarning, stacklevel=2)
     return samples
 
 
-def _numpyro() -> Any:
-    try:
-        import numpyro.diagnostics
-        import numpyro.infer
-    except ImportError as error:
-        raise ImportError(
-            f"dvi.sample requires numpyro, but its import failed ({error}): pip install "
-            f'"dvi-jax[bayes]"'
-        ) from None
-    return numpyro
+def _numpyro(part: str) -> Any:
+    return package(f"numpyro.{part}", "dvi.sample", '"dvi-jax[bayes]"')
 
 
 def _start_of(posterior: Posterior, start: Any, bounds: PyTree, priors: PyTree) -> np.ndarray:
@@ -257,15 +245,7 @@ def _start_of(posterior: Posterior, start: Any, bounds: PyTree, priors: PyTree) 
     is_fit = isinstance(start, FitResult)
     arguments = (start.params,) if is_fit else (start, bounds, priors)
     space, x = make_space(*arguments)
-    if list(space.names) != posterior.names:
-        lacking, surplus = (
-            ", ".join([name for name in a if name not in b][:8]) or "none"
-            for a, b in ((posterior.names, space.names), (space.names, posterior.names))
-        )
-        raise ValueError(
-            "start must have the same parameters as params. Missing in start: "
-            f"{lacking}. Unknown in start: {surplus}."
-        )
+    same_parameters("start", space.names, posterior.names, "params")
     if is_fit:
         at_bounds = np.isin(posterior.names, posterior._space.at_bounds(x, start.sigma))
         x = np.where(at_bounds, posterior.to_x(jnp.asarray(posterior.start)), x)
@@ -285,14 +265,14 @@ def _starts(potential: Callable[[Array], Array], chains: int, size: int, seed: i
 
 
 def _collect(
-    numpyro: Any, posterior: Posterior, x: Any, statistics: Any, notes: list[str], longest: int
+    posterior: Posterior, x: Any, statistics: Any, notes: list[str], longest: int
 ) -> Samples:
     """Draws with their diagnostics."""
-    x = np.asarray(x)
+    x, diagnostics = np.asarray(x), _numpyro("diagnostics")
     columns = {name: x[..., i] for i, name in enumerate(posterior.names)}
     with np.errstate(invalid="ignore", divide="ignore"):
-        r_hat = {n: float(numpyro.diagnostics.split_gelman_rubin(c)) for n, c in columns.items()}
-        ess = {n: float(numpyro.diagnostics.effective_sample_size(c)) for n, c in columns.items()}
+        r_hat = {n: float(diagnostics.split_gelman_rubin(c)) for n, c in columns.items()}
+        ess = {n: float(diagnostics.effective_sample_size(c)) for n, c in columns.items()}
     samples = Samples(
         names=posterior.names,
         x=x,

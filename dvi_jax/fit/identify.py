@@ -175,8 +175,7 @@ def identify(
             break
     else:
         raise FitError(
-            "the first fit of dvi.identify, with all terms of library, failed (see the attribute "
-            f"`fit`). {FIT_RESULTS[full.result]}",
+            f"the fit of all terms failed; it is the attribute `fit`. {FIT_RESULTS[full.result]}",
             full,
         )
     problem = Problem(full_model, arcs_with_errors, is_list, full.params, **setting)
@@ -224,15 +223,14 @@ def _check_input(
             )
     instance("library", library, ForceLibrary, "a dvi.ForceLibrary")
     if library.coefficients is not None:
-        raise ValueError("library already has coefficients: make a dvi.ForceLibrary without them.")
+        raise ValueError(f"library must have no coefficients, got {library.coefficients}.")
     losses = "dvi.LeastSquares(), dvi.SoftL1() or dvi.Cauchy()"
     instance("loss", loss, Loss, losses, "Terms are distinguished from noise by residuals.")
     for name, value in (("params", params), ("bounds", bounds), ("priors", priors)):
         instance(name, {} if value is None else value, Mapping, "a dict or None")
         if value is not None and KEY in value:
             raise ValueError(
-                f"{name} must not contain the key {KEY!r}, to which dvi.identify adds the "
-                "coefficients."
+                f"{name} must not contain {KEY!r}: dvi.identify adds the coefficients."
             )
     if penalty is not None:
         positive("penalty", penalty)
@@ -273,19 +271,18 @@ def _with_library(
     args, system, epsilon = spec.get("args"), spec["system"], spec.get("epsilon", 0.0)
     if not (args is None or (isinstance(args, Mapping) and KEY not in args)):
         raise TypeError(
-            f"args of the model must be None or a dict without the key {KEY!r}, got {args!r:.200}."
+            f"args of the model must be None or a dict without {KEY!r}, got {args!r:.200}."
         )
     is_perturbed = system.force is not None or system.perturbation is not None
     if "epsilon" in params and not is_perturbed:
         raise ValueError(
-            "epsilon and the coefficients of library cannot both be fitted, since the system has "
-            "no other force: only their product is determined. Remove epsilon from params."
+            "epsilon cannot be fitted if library is the only force, because only their product is "
+            "determined: remove epsilon from params."
         )
     is_alone = not np.any(np.asarray(epsilon)) and "epsilon" not in params
     if is_alone and is_perturbed:
         raise ValueError(
-            "the model must have an epsilon other than 0, got epsilon = 0 (the default), which "
-            "removes the force of its system and the library."
+            "the model must have an epsilon other than 0, got epsilon = 0: there is no force then."
         )
     return _ModelWithLibrary(model, library, is_list, is_alone)
 

@@ -11,6 +11,7 @@ from jaxtyping import Array
 
 from ..base.checks import function, one_of, positive, whole
 from ..base.types import Args, Scalar, State
+from .checks import shaped
 
 
 def _momentum(q: Any, p: Any) -> Any:
@@ -155,11 +156,7 @@ class NetworkForce(eqx.Module):
 
     def _vector(self, x: Any) -> Array:
         x = jnp.asarray(x)
-        if x.shape != (self.n,):
-            raise ValueError(
-                "q and p of a dvi.NetworkForce(n, ...) must have shape (n,), here with n = "
-                f"{self.n}, got shape {x.shape}."
-            )
+        shaped(f"q and p for dvi.NetworkForce({self.n}, ...)", x, (self.n,))
         return x
 
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .checks import same_fit
 from .roundoff import STIFFNESS, Evaluation, settle, undamped_step
 from .solvers import is_optax
 from .uncertainty import inverse_or
@@ -352,9 +353,8 @@ class ScalarStage:
         state = self.solver.init(function, zero, setting(), {}, struct, None, frozenset())
         if not (hasattr(state, "f") or hasattr(state, "f_info")):
             raise TypeError(
-                f"optimiser={type(self.solver).__name__} cannot be used: its state has no "
-                "attribute f or "
-                "f_info with the loss. Use, for example, optimistix.BFGS(rtol=1e-10, atol=1e-10)."
+                "the state of optimiser must have the loss as f or f_info, got optimiser="
+                f"{type(self.solver).__name__}: use, for example, optimistix.BFGS(1e-10, 1e-10)."
             )
         if task.resume is not None:
             state = _with_leaves(state, position.leaves)
@@ -394,14 +394,12 @@ class ScalarStage:
 
 def _check_same(residual: Any, reference: Any) -> None:
     """Refuse a checkpoint whose residuals are not those of this model."""
-    if not np.allclose(
-        residual, reference, rtol=1e-6, atol=1e-6 * float(np.abs(reference).max(initial=0.0))
-    ):
-        difference = np.abs(np.subtract(residual, reference)).max()
-        raise ValueError(
-            "the checkpoint is of another model: at the same parameters residuals differ by up to "
-            f"{difference:.3g}. Use its model, or another path in checkpoint."
-        )
+    atol = 1e-6 * float(np.abs(reference).max(initial=0.0))
+    difference = np.abs(np.subtract(residual, reference)).max(initial=0.0)
+    same_fit(
+        np.allclose(residual, reference, rtol=1e-6, atol=atol),
+        f"models, whose residuals (by {difference:.3g}),",
+    )
 
 
 def _leaves(state: Any) -> list[np.ndarray]:
@@ -412,10 +410,6 @@ def _with_leaves(state: Any, leaves: list[np.ndarray]) -> Any:
     """The same state with other numbers."""
     arrays, functions = eqx.partition(state, eqx.is_array)
     old, tree = jax.tree.flatten(arrays)
-    if [np.shape(x) for x in old] != [np.shape(x) for x in leaves]:
-        raise ValueError(
-            "the checkpoint is of a fit with another optimiser, or another version of it: use that "
-            "optimiser, or another path in checkpoint."
-        )
+    same_fit([*map(np.shape, old)] == [*map(np.shape, leaves)], "optimisers or their versions")
     new = [jnp.asarray(x, o.dtype) for x, o in zip(leaves, old, strict=True)]
     return eqx.combine(jax.tree.unflatten(tree, new), functions)

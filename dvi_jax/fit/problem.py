@@ -14,6 +14,7 @@ from ..base.checks import instance
 from ..base.reads import Reads, reads
 from ..base.results import RESULTS, status_name
 from ..problem.system import check_system
+from .checks import enough_values, requires, shaped
 from .losses import LeastSquares, Likelihood, Loss
 from .model import Group, Model, check_observable, make_groups, predict, specification, weigh
 from .observations import Observations
@@ -114,22 +115,15 @@ class Core(eqx.Module):
         return total
 
     def _likelihood(self, group: Group, predictions: Array, horizon: Any, params: PyTree) -> Array:
-        if group.whiten.ndim == 4:
-            raise ValueError(
-                "loss=dvi.Likelihood(...) accepts sigma of dvi.Observations, got covariance: use "
-                "dvi.LeastSquares()."
-            )
+        hint = "dvi.LeastSquares() accepts both."
+        requires(group.whiten.ndim < 4, "dvi.Likelihood", "sigma of the data", "covariance", hint)
         keep, values = horizon_mask(group, horizon), jnp.asarray(group.values)
         sigma = 1 / jnp.where(keep, jnp.asarray(group.whiten), 1.0)
         # Missing values get the observed ones as predictions, so that no NaN reaches the density.
         densities = jax.vmap(self.loss.negative_log_density, in_axes=(0, 0, 0, None))(
             jnp.where(keep, predictions, values), values, sigma, params
         )
-        if jnp.shape(densities) != jnp.shape(predictions):
-            raise ValueError(
-                "the function of dvi.Likelihood must return −log density of each value, an array "
-                f"of shape {predictions.shape[1:]}, got shape {jnp.shape(densities)[1:]}."
-            )
+        shaped("−log density by dvi.Likelihood, with all arcs,", densities, predictions.shape)
         return jnp.sum(jnp.where(keep, densities, 0.0))
 
     def hessian(self, u: Array) -> Array:
@@ -215,14 +209,9 @@ class Problem:
         self.has_errors = arcs[0].has_errors
         if not self.has_errors and not isinstance(loss, Likelihood):
             robust = not isinstance(loss, LeastSquares)
-            if self.space.count_of_priors or robust:
-                subject = (
-                    f"a robust loss ({type(loss).__name__})" if robust else "a fit with priors"
-                )
-                raise ValueError(
-                    f"{subject} requires standard errors of the data, but dvi.Observations has "
-                    "none: give sigma or covariance there."
-                )
+            subject = f"a robust loss ({type(loss).__name__})" if robust else "a fit with priors"
+            fits = not (self.space.count_of_priors or robust)
+            requires(fits, subject, "sigma or covariance of dvi.Observations", "neither")
         if isinstance(model, Model):
             check_system(model.settings["system"])
         arrays = self.space.to_params(jnp.asarray(self.start))
@@ -266,11 +255,8 @@ class Problem:
 
     def check_count(self) -> None:
         """**Raises** `ValueError` for fewer observed values than parameters."""
-        if self.degrees_of_freedom < 0:
-            raise ValueError(
-                f"{self.size} parameters cannot be determined from {self.count} observed "
-                f"value{'s' * (self.count != 1)} and {self.space.count_of_priors} priors."
-            )
+        least = self.size - self.space.count_of_priors
+        enough_values(self.count, least, f"{least} parameters without a prior")
 
     # ---- the functions of `core`, compiled
 
@@ -324,41 +310,41 @@ class Problem:
         """Refuse a start at which the model fails from the first observation on, or whose
         predictions differ in size from the data.
 
-        - `known`: predictions and statuses of each group.
+        - `predictions`: with the statuses of each group.
         """
-        where = f"at the starting parameters ({self.space.in_words(self.start)}) the model gives "
         for group, (values_of_group, result) in zip(self.groups, predictions, strict=True):
             names = np.atleast_1d(status_name(result))
             for a, arc in enumerate(group.arcs):
                 first = group.mask[a].any(axis=1).argmax()
                 values = np.asarray(values_of_group)[a, first][group.mask[a, first]]
                 if not np.isfinite(values).all():
-                    hint = f"The status of the trajectory is {str(names[a])!r}: use a smaller h"
+                    hint = f"a smaller h: the status of the trajectory is {str(names[a])!r}"
                     if str(names[a]) == "successful":
-                        hint = "The trajectory does not fail: correct the function observe"
-                    raise ValueError(
-                        f"{where}{values[~np.isfinite(values)][0]} for the first observation of "
-                        f"arc {arc}, at t = {group.ts[a, first]:g}. {hint}, or start from other "
-                        "parameters."
+                        hint = "another observe: the trajectory does not fail"
+                    value, t = values[~np.isfinite(values)][0], group.ts[a, first]
+                    self._refuse_start(
+                        f"{value} for the first observation of arc {arc}, at t = {t:g}", hint
                     )
         if check_units:
-            self._check_sizes(
-                [np.asarray(values_of_group) for values_of_group, _ in predictions], where
-            )
+            self._check_sizes([np.asarray(values_of_group) for values_of_group, _ in predictions])
 
-    def _check_sizes(self, predictions: list[np.ndarray], where: str) -> None:
+    def _refuse_start(self, defect: str, hint: str) -> None:
+        raise ValueError(
+            f"at the starting parameters ({self.space.in_words(self.start)}) the model gives "
+            f"{defect}. Give other starting parameters, or {hint}."
+        )
+
+    def _check_sizes(self, predictions: list[np.ndarray]) -> None:
         pairs = list(zip(self.groups, predictions, strict=True))
         data = max(float(np.abs(g.values[g.mask]).max()) for g, _ in pairs)
         sizes = [np.where(g.mask & np.isfinite(f), np.abs(f), 0.0).max(axis=2) for g, f in pairs]
         largest = max(float(size.max()) for size in sizes)
         if data == 0 or largest == 0 or 1 / _UNITS < data / largest < _UNITS:
             return
-        hint = "If the difference is intended, use check_units=False."
+        hint = "data in the same units; check_units=False permits the difference"
+        largest_observed = f"but the largest observed value is {data:.3g}"
         if largest < data:
-            raise ValueError(
-                f"{where}values of at most {largest:.3g}, but the largest observed value is "
-                f"{data:.3g}. Use the same units, or start from other parameters. {hint}"
-            )
+            self._refuse_start(f"values of at most {largest:.3g}, {largest_observed}", hint)
         large, pairs_of_sizes = _UNITS * data, zip(self.groups, sizes, strict=True)
         group, size = next((g, s) for g, s in pairs_of_sizes if (s >= large).any())
         a, row = np.argwhere(size >= large)[0]
@@ -368,9 +354,9 @@ class Problem:
         first = float(
             jnp.max(jnp.abs(observations.function(observations.t0, q0, p0, spec.get("args"))))
         )
-        raise ValueError(
-            f"{where}{size[a, row]:.3g} for arc {arc} at t = {group.ts[a, row]:g}, but the largest "
-            f"observed value is {data:.3g}; at the start, t = {group.t0[a]:g}, the model gives "
-            f"{first:.3g}, later at most {size[a].max():.3g}. Use the same units; if the "
-            f"trajectory diverges, other parameters or a smaller h. {hint}"
+        self._refuse_start(
+            f"{size[a, row]:.3g} for arc {arc} at t = {group.ts[a, row]:g}, {largest_observed}; at "
+            f"the start, t = {group.t0[a]:g}, the model gives {first:.3g}, later at most "
+            f"{size[a].max():.3g}",
+            f"a smaller h if the trajectory diverges, or {hint}",
         )

@@ -18,6 +18,7 @@ import numpy as np
 from ..base.files import publish_npz, read_npz
 from ..base.progress import bar_of, reporter
 from ..base.reads import reads
+from .checks import same_fit
 from .optimise import Position, Record, Task
 from .problem import Problem
 
@@ -88,13 +89,10 @@ class Run:
             file = Path(self.checkpoint)
             if not file.parent.is_dir():
                 raise FileNotFoundError(
-                    f"there is no directory {str(file.parent)!r} for checkpoint={str(file)!r}: "
-                    "create it."
+                    f"there is no directory for checkpoint={str(file)!r}: create it."
                 )
             if file.is_dir():
-                raise IsADirectoryError(
-                    f"checkpoint must be the path of a file, but {str(file)!r} is a directory."
-                )
+                raise IsADirectoryError(f"checkpoint={str(file)!r} is a directory: give a file.")
             if file.exists():
                 self.resume, self.records = _read_checkpoint(file, self.identity)
 
@@ -171,11 +169,7 @@ def _write_checkpoint(path: Any, identity: str, position: Position, records: lis
 
 def _read_checkpoint(path: Any, identity: str) -> tuple[Position, list[Record]]:
     header, arrays = read_npz(path, _FORMAT, "checkpoint of a fit")
-    if header.get("identity") != identity:
-        raise ValueError(
-            f"the checkpoint {path} is of another fit: data, model, parameters, start or settings "
-            "differ. Repeat its call unchanged, or give another path in checkpoint."
-        )
+    same_fit(header.get("identity") == identity, "data, model, parameters, start or settings")
     fields = {name: header[name] for name in Position.__dataclass_fields__ if name in header}
     fields |= {name: arrays[name] for name in _VECTORS}
     fields |= {name: [arrays[f"{name}.{i}"] for i in range(header[name])] for name in _LISTS}
