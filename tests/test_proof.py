@@ -318,7 +318,7 @@ def test_a_map_that_depends_on_a_slow_time():
         return (p @ p + w * (q @ q) - 0.1 * w * (q @ p)) / 2
 
     given = {"h": 0.1, "epsilon": 0.01, "domain": np.array([0.5])}
-    with pytest.raises(ValueError, match="give the interval in which steps begin"):
+    with pytest.raises(ValueError, match="depends on the time: give time="):
         dvi.bound_drift(energy, system, **given)
     bound = dvi.bound_drift(energy, system, time=(0.0, 3.0), **given)
     sol = dvi.integrate(system, [0.4], [0.1], h=0.1, num_steps=2000, epsilon=0.01)
@@ -351,11 +351,11 @@ def test_what_a_bound_says_of_a_start(cubic):
     far, near = cubic.steps_inside([0.3], [0.1], 0.01), cubic.steps_inside([0.1], [0.0], 0.0)
     assert cubic.steps < far < near
     assert cubic.steps_inside([0.6], [0.0], 0.01) == 0  # outside of the domain
-    with pytest.raises(ValueError, match=r"is not in the interval .* of the proof"):
+    with pytest.raises(ValueError, match=r"epsilon must be from"):
         cubic.steps_inside([0.1], [0.1], 0.02)
-    with pytest.raises(ValueError, match="must be finite numbers"):
+    with pytest.raises(ValueError, match="1 finite"):
         cubic.steps_inside([np.nan], [0.1], 0.01)
-    with pytest.raises(ValueError, match=r"size 1, .* got the sizes 2 and 0"):
+    with pytest.raises(ValueError, match="each have 1 finite"):
         cubic.steps_inside([0.1, 0.2], [], 0.01)
 
 
@@ -492,13 +492,13 @@ def test_no_number_of_steps_is_claimed(epsilon, function):
     [
         ({"epsilon": (0.1, 0.1)}, ValueError, "with least < largest"),
         ({"ratio": 1.0}, ValueError, "larger than 1"),
-        ({"domain": 0.5}, ValueError, "domain must be an array with the shape"),
+        ({"domain": 0.5}, ValueError, "domain must be an array like q"),
         ({"domain": (np.ones(1), np.ones(2))}, ValueError, r"of p must be .* got shape \(2,\)"),
-        ({"domain": np.array([-1.0])}, ValueError, "lower bounds below finite"),
-        ({"method": dvi.GaussLegendre(2)}, ValueError, "is implicit for this system"),
+        ({"domain": np.array([-1.0])}, ValueError, "lower < upper"),
+        ({"method": dvi.GaussLegendre(2)}, ValueError, "explicit for this system"),
         ({"h": 0.0}, ValueError, "other than zero"),
         ({"epsilon": None}, ValueError, "epsilon must be a finite number"),
-        ({"arithmetic": dvi.Compensated()}, ValueError, "does not bound the rounding of other"),
+        ({"arithmetic": dvi.Compensated()}, ValueError, "arithmetic must be"),
     ],
 )
 def test_bad_input(how, kind, message):

@@ -30,11 +30,6 @@ _RESIDUAL = {"float64": 2.0**-49, "pairs of float64": 2.0**-94}
 """Residual of an implicit equation that a solver accepts, relative to the largest momentum: eight
 units of round-off, and twice what `DoubleDouble` leaves out."""
 
-_GIVE_TIME = (
-    "give the interval in which steps begin, time=(t_begin, t_end). If the system has "
-    "slow_time=True, give an interval of τ = εt."
-)
-
 
 class ProofError(Exception):
     """Nothing is proved: the message says what failed, and for which states."""
@@ -131,9 +126,7 @@ def bound_drift(
     if not isinstance(integrator_used.arithmetic, FloatingPoint | DoubleDouble | FixedPoint):
         raise ValueError(
             "arithmetic must be dvi.FloatingPoint(), dvi.DoubleDouble() or "
-            "dvi.FixedPoint(quantum), "
-            f"got {integrator_used.arithmetic!r}: bound_drift does not bound the rounding of "
-            "others."
+            f"dvi.FixedPoint(quantum), got {integrator_used.arithmetic!r}."
         )
     h = check_step_size(h)
     shape, (lower, upper) = _domain(domain, found)
@@ -227,8 +220,7 @@ def _step_of(
     explicit = method.is_explicit(system, jnp.zeros(shape), args)
     if not (explicit or method.is_the_map):
         raise ValueError(
-            f"method must be explicit for this system or dvi.TypeII(), but {method!r} is implicit "
-            "for this system."
+            f"method must be dvi.TypeII() or explicit for this system, got {method!r}."
         )
     plain = System(system.H_D, system.force, system.perturbation)
     start, number = jnp.full(shape, 0.1), jnp.asarray(0.1)
@@ -251,8 +243,8 @@ def _step_of(
         first, later = (
             step_of_states(q, p, np.full(8, t), np.full(8, 0.1), jnp.asarray(h)) for t in (0.0, 1.0)
         )
-        if not np.allclose(first, later, rtol=1e-12, atol=1e-12, equal_nan=True):
-            raise ValueError(f"time is missing, but the map depends on the time: {_GIVE_TIME}")
+        is_constant = np.allclose(first, later, rtol=1e-12, atol=1e-12, equal_nan=True)
+        _require_time(is_constant, "the map")
     zero = jnp.zeros(())
     interval_or_map = (
         step_map if times else lambda q, p, t, *numbers: step_map(q, p, zero, *numbers)
@@ -281,21 +273,13 @@ def _spread(
 def _functions(invariants: Any, system: System, with_time: bool) -> list[tuple[Callable, str]]:
     """(function of (q, p, t, ε, h), formula) for each invariant."""
     if isinstance(invariants, Discovery):
-        if not invariants.count:
-            raise ValueError(
-                "found must contain at least one invariant, but this Discovery has none: discover "
-                "with more functions in the basis, or a lower order."
-            )
-        return _functions(list(invariants.invariants), system, with_time)
+        invariants = list(invariants.invariants)
     if isinstance(invariants, InvariantSeries):
-        if invariants.basis.uses_time and not with_time:
-            raise ValueError(
-                f"time is missing, but the invariant depends on the time: {_GIVE_TIME}"
-            )
+        _require_time(with_time or not invariants.basis.uses_time, "an invariant")
         if invariants.basis.uses_time and invariants.slow_time != system.slow_time:
             raise ValueError(
-                f"the invariant was found with slow_time={invariants.slow_time}, but system has "
-                f"slow_time={system.slow_time}."
+                f"found and system must have one slow_time, got {invariants.slow_time} and "
+                f"{system.slow_time}."
             )
         return [
             (lambda q, p, t, e, h: invariants.evaluate(q, p, e, t), invariants.formula(terms=8))
@@ -304,8 +288,8 @@ def _functions(invariants: Any, system: System, with_time: bool) -> list[tuple[C
         return [(lambda q, p, t, e, h: invariants.evaluate(q, p, e, h, t), str(invariants))]
     if isinstance(invariants, str) or not (callable(invariants) or np.iterable(invariants)):
         raise TypeError(
-            "found must be a Discovery, an InvariantSeries, an ExactInvariant, a function (q, p, "
-            f"epsilon) or (q, p, epsilon, t), or a list of these, got {invariants!r:.200}."
+            "found must be a Discovery, InvariantSeries, ExactInvariant, a function (q, p, "
+            f"epsilon[, t]) or a list of these, got {invariants!r:.200}."
         )
     if callable(invariants):
         name = getattr(invariants, "__name__", type(invariants).__name__)
@@ -314,8 +298,18 @@ def _functions(invariants: Any, system: System, with_time: bool) -> list[tuple[C
         return [(lambda q, p, t, e, h: invariants(q, p, e), name)]
     pairs = [pair for item in invariants for pair in _functions(item, system, with_time)]
     if not pairs:
-        raise ValueError(f"found must contain at least one invariant, got {invariants!r:.200}.")
+        raise ValueError(
+            "found must have at least one invariant, got none: use more functions or a lower order."
+        )
     return pairs
+
+
+def _require_time(fits: Any, subject: str) -> None:
+    if not fits:
+        raise ValueError(
+            f"{subject} depends on the time: give time=(t_begin, t_end) of the steps, of τ = εt "
+            "with slow_time=True."
+        )
 
 
 def _program(subject: str, function: Callable, shapes: list, ndim: int | None) -> dict[str, Any]:
@@ -350,16 +344,15 @@ def _domain(
     parts = domain if isinstance(domain, tuple) else (domain, domain)
     if len(parts) != 2:
         raise ValueError(
-            "domain must be half-widths, or a pair (domain of q, domain of p), got a tuple of "
-            f"length {len(parts)}: {domain!r:.200}."
+            f"domain must be an array or a pair for q and p, got {len(parts)} entries: "
+            f"{domain!r:.200}."
         )
     shapes = [np.shape(x)[1:] if np.ndim(x) > 1 else np.shape(x) for x in parts]
     discovery = invariants if isinstance(invariants, Discovery) else None
     shape = discovery.shape if discovery is not None else max(shapes, key=len)
     if not shape:
         raise ValueError(
-            "domain must be an array with the shape of q, unless found is a Discovery, got "
-            f"{domain!r}."
+            f"domain must be an array like q, unless found is a Discovery, got {domain!r}."
         )
     lower, upper = [], []
     for name, x in zip("qp", parts, strict=True):
@@ -367,14 +360,14 @@ def _domain(
         low, high = (x[0], x[-1]) if x.ndim > len(shape) else (-x, x)
         if np.shape(low) not in ((), shape) or (x.ndim > len(shape) and len(x) != 2):
             raise ValueError(
-                f"domain of {name} must be a half-width, an array of half-widths of shape {shape} "
-                f"like q, or an array (lower, upper) of shape {(2, *shape)}, got shape {x.shape}."
+                f"domain of {name} must be half-widths of shape () or {shape}, or (lower, upper) "
+                f"of shape {(2, *shape)}, got shape {x.shape}."
             )
         low, high = (np.broadcast_to(side, shape).ravel() for side in (low, high))
         if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
             raise ValueError(
-                f"domain of {name} must have finite lower bounds below finite upper bounds, got "
-                f"{low.tolist()} and {high.tolist()}."
+                f"domain of {name} must be finite, with lower < upper, got {low.tolist()} and "
+                f"{high.tolist()}."
             )
         lower.extend(low.tolist())
         upper.extend(high.tolist())
@@ -385,8 +378,7 @@ def _interval(name: str, ends: Any) -> tuple[float, float]:
     value, ends = ends, [finite(name, x) for x in (ends if np.ndim(ends) else (0.0, ends))]
     if len(ends) != 2 or not ends[0] < ends[1]:
         raise ValueError(
-            f"{name} must be a pair (least, largest) with least < largest, or one positive number "
-            f"x for the pair (0, x); got {value!r}."
+            f"{name} must be a positive number, or a pair with least < largest, got {value!r}."
         )
     low, high = ends
     return low, high

@@ -66,9 +66,8 @@ class Program:
         if primitives:
             names = ", ".join(sorted(primitives)).replace("select_n", "select_n (jnp.where)")
             raise Unsupported(
-                f"operations of JAX that a proof does not allow: {names}. Allowed are sums, "
-                "products, quotients, powers with constant exponents, sinh, cosh, tanh, "
-                f"{', '.join(UNARY)}."
+                f"a proof does not allow: {names} of JAX, only + − × /, constant powers, sinh, "
+                f"cosh, tanh, {', '.join(UNARY)}."
             )
         numbers = {old: i for i, old in enumerate(order)}
         operations = []

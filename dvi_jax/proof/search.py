@@ -277,13 +277,13 @@ def subdivide(
     failures = [leaf for leaf in inner if leaf.failure]
     if failures:
         raise TooMany(
-            f"no bound was found on {len(failures)} of {count} boxes of the domain. The first is "
-            f"{place(checker, failures[0].box)}: {failures[0].failure}. Exclude singular states by "
-            "domain or inside, or use a smaller domain, epsilon or h, or larger limits"
+            f"no bound was found on {len(failures)} of {count} boxes, first for "
+            f"{place(checker, failures[0].box)}: {failures[0].failure}. Exclude singularities; use "
+            "a smaller domain, epsilon or h, or larger limits"
         )
     if not inner:
         raise exact.Failed(
-            "inside(q, p) must be ≥ 0 for some states of the domain, but is negative for all"
+            "inside(q, p) must be ≥ 0 somewhere in the domain, got negative values only"
         )
     bounds, rounding, moves = (
         [max(column) for column in zip(*(getattr(leaf, name) for leaf in inner), strict=True)]
@@ -383,9 +383,8 @@ def enclose(
             narrow = all(b - a <= (d - c) / 4096 for (a, b), (c, d) in zip(box, root, strict=True))
             if late or narrow or (minimum <= float(limit) and not checker.inside["outputs"]):
                 raise TooMany(
-                    "the invariants do not exclude that a trajectory leaves the domain and "
-                    "reaches the box "
-                    f"{place(checker, box)}. Try a smaller epsilon or h, or larger limits"
+                    f"the invariants do not exclude that a trajectory reaches "
+                    f"{place(checker, box)}. Use a smaller epsilon or h, or larger limits"
                 )
             left, right, where = [], [], None
             if borders:  # first the domain itself is cut out
