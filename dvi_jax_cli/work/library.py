@@ -8,7 +8,7 @@ import numpy as np
 
 from dvi_jax import systems
 
-from .._errors import InputError, require_name
+from .._errors import as_input_error, require_name
 from .._show import Table
 
 
@@ -23,11 +23,9 @@ def library_tables(name: str | None = None) -> tuple[str, list[Table]]:
         return "", [Table("Systems of the library", ["name", "what it is"], rows)]
     require_name("NAME", name, systems.LIBRARY)
     make = systems.LIBRARY[name]
-    try:
+    rule = "a system whose extras are installed"
+    with as_input_error("NAME", rule, ImportError, defect=lambda error: f"{name}: {error}"):
         problem = make()
-    except ImportError as error:
-        rule = "a system whose extras are installed"
-        raise InputError("NAME", f"{name}: {error}", rule) from None
     heading = f"{inspect.getdoc(make)}\n\nEquations: {_first_line(problem.system.H_D)}"
     for kind in ("force", "perturbation"):
         if (function := getattr(problem.system, kind)) is not None:

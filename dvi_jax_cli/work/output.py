@@ -13,7 +13,7 @@ import numpy as np
 
 from dvi_jax import plot
 
-from .._errors import InputError, reason, require
+from .._errors import as_input_error, reason, require
 from .._show import Table, json_types
 from .schema import FILES
 from .table import read_file
@@ -63,13 +63,13 @@ class Output(Report):
         rule = "a directory that does not exist or is empty; with --force, one to write into"
         folder, is_new = self.folder, False
         try:
-            try:
+            with as_input_error(
+                self.key, rule, OSError, ValueError, defect=lambda e: f"{folder}: {reason(e)}"
+            ):
                 is_new = not folder.exists()
                 if is_new:
                     folder.mkdir(parents=True)
                 is_free = not folder.is_dir() or self.force or not any(folder.iterdir())
-            except (OSError, ValueError) as error:
-                raise InputError(self.key, f"{folder}: {reason(error)}", rule) from None
             require(folder.is_dir(), self.key, f"{folder} is not a directory", rule)
             require(is_free, self.key, f"{folder} exists and is not empty", rule)
             yield

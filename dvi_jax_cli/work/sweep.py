@@ -18,7 +18,7 @@ import dvi_jax as dvi
 from dvi_jax.sweep.bar import shown as shown_bar
 from dvi_jax.sweep.variables import RESERVED
 
-from .._errors import InputError, describe, require
+from .._errors import InputError, as_input_error, describe, require
 from .._show import Table
 from .expressions import parse_method
 from .observables import read_observables
@@ -86,15 +86,16 @@ def sweep_cost(path: str | Path) -> Report:
 
 def _check_folder(folder: Path, key: str, resume: bool) -> None:
     """Fail early if the path holds other data, or this sweep without --resume."""
-    try:
+
+    def defect(error):  # ValueError: a name that no directory can have
+        is_store = isinstance(error, dvi.StoreError | OSError)
+        kind = "exists, but is not the store of a sweep" if is_store else "cannot be used"
+        return f"{folder} {kind}: {error}"
+
+    with as_input_error(key, "a new directory", dvi.StoreError, OSError, ValueError, defect=defect):
         if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
             return
         result = dvi.open_sweep(folder)
-    except (dvi.StoreError, OSError) as error:
-        defect = f"{folder} exists, but is not the store of a sweep ({error})"
-        raise InputError(key, defect, "a new directory") from None
-    except ValueError as error:  # a name that no directory can have
-        raise InputError(key, f"{folder} cannot be used: {error}", "a new directory") from None
     progress = f"{result.tasks_done} of {result.num_tasks} tasks are done"
     rule = "--resume to continue it, or another directory, with --store PATH"
     require(resume, key, f"{folder} exists already: {progress}", rule)
@@ -192,10 +193,8 @@ def _for_sweep(key: str, value: Any) -> Any:
 
 
 def _axis(key: str, axis: Axis, values: Any) -> dvi.Axis:
-    try:
+    with as_input_error(f"{key}.{axis.kind}", AN_AXIS):
         return dvi.Axis(axis.axis or key.rpartition(".")[2], values, axis.units)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{key}.{axis.kind}", str(error), AN_AXIS) from None
 
 
 def _parameters(value: Any, key: str = "args") -> Any:
@@ -250,11 +249,9 @@ def _initial_conditions(file: SweepFile, source: Source) -> dict[str, Any]:
         return {"q0": _for_sweep("state.q0", q0), "p0": _for_sweep("state.p0", p0)}
     start = _start(file.start, source)
     t0, args = select(file.t0, 0), select(source.args, 0)
-    try:
+    rule = "an H (t, q, p, args) that fits the box and args"
+    with as_input_error("start", rule, Exception, defect=source.error_line):
         q0, p0, *start_args = start.at(jnp.zeros((), jnp.int32), t0, args)
-    except Exception as error:  # whatever a user's H raises
-        rule = "an H (t, q, p, args) that fits the box and args"
-        raise InputError("start", source.error_line(error), rule) from error
     source.check_start(np.asarray(q0), np.asarray(p0), start_args[0] if start_args else args)
     return {"start": start}
 
@@ -283,21 +280,17 @@ def _start(table: Any, source: Source) -> dvi.starts.Starts:
     if "H" in options:
         options["H"] = source.loader.load("start.H", options["H"])
     starts = getattr(dvi.starts, table.kind.title().replace("_", ""))  # energy_shell → EnergyShell
-    try:
+    rule = f'arguments of dvi.starts.{starts.__name__}, because kind = "{table.kind}"'
+    with as_input_error("start", rule):
         return starts(**options)
-    except (TypeError, ValueError) as error:
-        rule = f'arguments of dvi.starts.{starts.__name__}, because kind = "{table.kind}"'
-        raise InputError("start", str(error), rule) from None
 
 
 # Stores
 
 
 def _open_store(store: str | Path) -> dvi.SweepResult:
-    try:
+    with as_input_error("STORE", "the directory of a sweep", dvi.StoreError):
         return dvi.open_sweep(store)
-    except dvi.StoreError as error:
-        raise InputError("STORE", str(error), "the directory of a sweep") from None
 
 
 def sweep_status(store: str | Path) -> Report:

@@ -26,7 +26,7 @@ from pydantic import (
 from pydantic.json_schema import GenerateJsonSchema
 from typing_extensions import TypeAliasType
 
-from .._errors import InputError, describe, nearest, one_of, require, toml_type
+from .._errors import InputError, as_input_error, describe, nearest, one_of, require, toml_type
 
 NO_KEY = "the key is missing"
 
@@ -102,19 +102,25 @@ def read_file(file: Path, model: type[T]) -> tuple[T, dict[str, Any]]:
     **Raises** `InputError` for a missing or unreadable file, TOML that does not parse, an
     unknown key and a value of the wrong type or out of range.
     """
-    try:
-        raw = tomllib.loads(file.read_text(encoding="utf-8-sig"))  # some editors begin with a BOM
-    except FileNotFoundError:
-        raise InputError(str(file), "there is no such file", "the path of a TOML file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(str(file), f"it cannot be read: {error}", "a TOML file in UTF-8") from None
-    except (ValueError, RecursionError) as error:  # also thousands of digits, of brackets
-        raise InputError(str(file), f"it is not TOML: {error}", "https://toml.io") from None
+    key = str(file)
+    with as_input_error(
+        key, "a TOML file in UTF-8", OSError, UnicodeDecodeError, defect=_unreadable
+    ):
+        text = file.read_text(encoding="utf-8-sig")  # some editors begin with a BOM
+    # RecursionError: thousands of brackets.
+    kinds = ValueError, RecursionError
+    with as_input_error(key, "https://toml.io", *kinds, defect=lambda e: f"it is not TOML: {e}"):
+        raw = tomllib.loads(text)
     try:
         return model.model_validate(raw), raw
     except ValidationError as error:  # pydantic wraps the one of the outermost table
         context: Any = error.errors()[0].get("ctx")
         raise context["error"] from None
+
+
+def _unreadable(error: Any) -> str:
+    is_missing = isinstance(error, FileNotFoundError)
+    return "there is no such file" if is_missing else f"it cannot be read: {error}"
 
 
 class JsonSchema(GenerateJsonSchema):
