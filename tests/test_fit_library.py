@@ -248,7 +248,7 @@ INVALID = [
     ({"model": 3}, TypeError, "model must be"),
     ({"model": dvi.Model(FORCED, h=H, q0=[1.0], p0=[0.0])}, ValueError, "epsilon = 0"),
     ({"model": dvi.Model(FREE, h=H, q0=[1.0], p0=[0.0], args=2.0)}, TypeError, "args of the model"),
-    ({"optimiser": None}, TypeError, "has no option 'optimiser': use one of max_steps"),
+    ({"optimiser": None}, TypeError, "has no argument 'optimiser'"),
     ({"max_steps": 0}, ValueError, "max_steps must be"),
 ]
 

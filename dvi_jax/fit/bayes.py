@@ -4,7 +4,7 @@ import sys
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Unpack
 
 import equinox as eqx
 import jax
@@ -13,9 +13,11 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from ..base.checks import fraction, instance, whole
+from ..base.keywords import checked_keywords
 from ._fit import fit
 from .checks import package, same_parameters
-from .losses import LeastSquares, Likelihood, Loss
+from .keywords import LossSettings, SampleSettings, select
+from .losses import Likelihood
 from .observations import Data
 from .parameters import make_space
 from .posterior import Posterior
@@ -139,23 +141,18 @@ class Samples:
         return arviz.InferenceData(**{name: tree[name].to_dataset() for name in tree.children})
 
 
+@checked_keywords
 def sample(
     model: Callable[..., Any],
     data: Data,
     params: PyTree,
     *,
-    bounds: PyTree = None,
-    priors: PyTree = None,
-    loss: Loss | Likelihood = LeastSquares(),
     num_samples: int = 1000,
     num_warmup: int = 300,
     chains: int = 4,
     seed: int = 0,
     start: FitResult | PyTree = None,
-    gradient: str = "reverse",
-    target_accept: float = 0.8,
-    max_tree_depth: int = 10,
-    progress: bool | None = None,
+    **settings: Unpack[SampleSettings],
 ) -> Samples:
     r"""Samples of the posterior of parameters by the No-U-Turn sampler.
 
@@ -169,8 +166,8 @@ def sample(
       they agree. `seed`: of all draws; the same seed gives the same draws.
     - `start`: a `FitResult` of these parameters, or a pytree like `params`; None: a fit from
       `params`. A parameter that such a fit left at a bound starts at its value in `params`.
-    - `target_accept`: acceptance for the step size; nearer to 1 against divergences.
-      `max_tree_depth`: a path has at most 2^max_tree_depth steps.
+    - `target_accept`: acceptance for the step size, by default 0.8; nearer to 1 against
+      divergences. `max_tree_depth`: a path has at most 2^max_tree_depth steps, by default 2¹⁰.
     - `progress`: True shows a bar, False none, None where there is a terminal.
 
     **Returns** `Samples`, with a `UserWarning` and a text in ``warnings`` for chains that do not
@@ -190,29 +187,28 @@ def sample(
     whole("num_warmup", num_warmup, 0)
     whole("chains", chains)
     whole("seed", seed, 0)
-    whole("max_tree_depth", max_tree_depth)
-    fraction("target_accept", target_accept)
+    depth = whole("max_tree_depth", settings.get("max_tree_depth", 10))
+    acceptance = fraction("target_accept", settings.get("target_accept", 0.8))
+    progress = settings.get("progress")
     instance("progress", progress, bool | None, "True, False or None")
-    posterior = Posterior(
-        model, data, params, bounds=bounds, priors=priors, loss=loss, gradient=gradient
-    )
+    terms, gradient = select(settings, LossSettings), settings.get("gradient", "reverse")
+    posterior = Posterior(model, data, params, **terms, gradient=gradient)
     notes: list[str] = []
     if start is None:
-        has_errors = posterior._problem.has_errors or isinstance(loss, Likelihood)
-        of_fit = {"bounds": bounds, "priors": priors if has_errors else None, "loss": loss}
+        has_errors = posterior._problem.has_errors or isinstance(terms.get("loss"), Likelihood)
+        of_fit = terms if has_errors else {**terms, "priors": None}
         quiet: dict[str, Any] = {"check_curvature": False, "progress": False, "throw": False}
         start = fit(model, data, params, **of_fit, **quiet)
     if isinstance(start, FitResult) and start.status != "converged":
         notes.append(f"the chains start from a fit that did not converge: {start.status}.")
-    mode, root = posterior.laplace(_start_of(posterior, start, bounds, priors))
+    limits = terms.get("bounds"), terms.get("priors")
+    mode, root = posterior.laplace(_start_of(posterior, start, *limits))
     centre, L = jnp.asarray(mode), jnp.asarray(root)
 
     def in_z(z):
         return posterior.potential(centre + L @ z)
 
-    kernel = infer.NUTS(
-        potential_fn=in_z, target_accept_prob=target_accept, max_tree_depth=max_tree_depth
-    )
+    kernel = infer.NUTS(potential_fn=in_z, target_accept_prob=acceptance, max_tree_depth=depth)
     shows = sys.stderr.isatty() if progress is None else progress
     mcmc = infer.MCMC(kernel, **counts, chain_method="vectorized", progress_bar=shows)
     begin = _starts(in_z, chains, posterior.size, seed)
@@ -225,7 +221,7 @@ def sample(
     z = mcmc.get_samples(group_by_chain=True)
     x = jax.jit(jax.vmap(jax.vmap(lambda z: posterior.to_x(centre + L @ z))))(z)
     statistics = mcmc.get_extra_fields(group_by_chain=True)
-    samples = _collect(posterior, x, statistics, notes, 2**max_tree_depth - 1)
+    samples = _collect(posterior, x, statistics, notes, 2**depth - 1)
     for text in samples.warnings:
         warnings.warn(text, UserWarning, stacklevel=2)
     return samples

@@ -2,17 +2,18 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Unpack
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
 
 from ..base.checks import instance, positive
+from ..base.keywords import checked_keywords
 from ..problem.system import System
 from ._fit import fit
 from .elimination import Elimination, Removal, places
+from .keywords import IdentifySettings
 from .library import KEY, ForceLibrary, with_force
 from .losses import LeastSquares, Loss
 from .model import specification
@@ -31,9 +32,9 @@ _PROVISIONAL_ERROR = 1e-3
 """Provisional errors of data without any, in scatters of the data."""
 
 
-_OPTIONS = ("max_steps", "tolerance", "check_units", "progress")
+_OF_ALL = ("max_steps", "tolerance", "check_units", "progress")
 _OF_FIRST = ("shooting", "horizons")
-"""Options of `fit` for all fits, and for that of all candidates."""
+"""Keywords of `fit` for all fits, and for that of all candidates."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,18 +99,16 @@ class Identification:
     __repr__ = __str__
 
 
+@checked_keywords
 def identify(
     model: Callable[..., Any],
     data: Data,
     library: ForceLibrary,
     params: Mapping[str, Any] | None = None,
     *,
-    bounds: PyTree = None,
-    priors: PyTree = None,
-    loss: Loss = LeastSquares(),
     penalty: float | None = None,
     throw: bool = True,
-    **options: Any,
+    **settings: Unpack[IdentifySettings],
 ) -> Identification:
     r"""Terms of an unknown force, selected from a library of candidates by observations.
 
@@ -136,8 +135,8 @@ def identify(
     - `penalty`: λ; None means log N + 2 log M for M candidates. log N alone is Schwarz's BIC, by
       which one of twenty idle candidates is often kept; 2 log M accounts for the choice among M.
     - `throw`: raise `FitError` when the last fit does not converge.
-    - `options`: `shooting`, `max_steps`, `tolerance`, `horizons`, `check_units`, `progress` as in
-      `fit`, and `check_curvature` (False if left out). Multiple shooting and horizons are for the
+    - `shooting`, `max_steps`, `tolerance`, `horizons`, `check_units`, `progress`: as in `fit`;
+      `check_curvature`: the same, by default False. Multiple shooting and horizons are for the
       fit of all candidates; refits, which begin at a minimum, use single shooting.
 
     **Returns** an `Identification`. Read its `alternatives` and `undetermined`: the data cannot
@@ -150,7 +149,9 @@ def identify(
     as a bound of 2 log C(M, k), Chen & Chen 2008.
     """
     params = {} if params is None else params
-    _check_input(library, params, bounds, priors, loss, penalty, options)
+    bounds, priors = settings.get("bounds"), settings.get("priors")
+    loss: Any = settings.get("loss", LeastSquares())
+    _check_input(library, params, bounds, priors, loss, penalty)
     arcs, is_list = as_arcs(data)
     full_model = _with_library(model, library, is_list, params)
     start = {**params, KEY: dict.fromkeys(library.names, 0.0)}
@@ -159,8 +160,8 @@ def identify(
         Problem(full_model, arcs_with_errors, is_list, start, bounds=bounds, loss=loss), library
     )
     setting = {"bounds": bounds, "priors": {**(priors or {}), KEY: guard}, "loss": loss}
-    common = {name: options[name] for name in _OPTIONS if name in options}
-    first = {name: options[name] for name in _OF_FIRST if name in options}
+    common: dict[str, Any] = {name: x for name, x in settings.items() if name in _OF_ALL}
+    first: dict[str, Any] = {name: x for name, x in settings.items() if name in _OF_FIRST}
     first |= {**common, **setting, "check_curvature": False, "throw": False}
     full: Any = None
     for change in ({}, {"horizons": None}):
@@ -188,7 +189,7 @@ def identify(
     if terms or set(values) != {KEY}:
         # The remaining terms by `fit` itself: errors, residuals, statuses.
         common |= {"bounds": bounds, "priors": priors, "loss": loss, "horizons": None}
-        common |= {"check_curvature": options.get("check_curvature", False), "throw": throw}
+        common |= {"check_curvature": settings.get("check_curvature", False), "throw": throw}
         final = fit(full_model, data, values, **common)
         values = final.params
         indices = [final.names.index(f"{KEY}.{name}") for name in terms]
@@ -213,14 +214,8 @@ def identify(
 
 
 def _check_input(
-    library: Any, params: Any, bounds: Any, priors: Any, loss: Any, penalty: Any, options: Any
+    library: Any, params: Any, bounds: Any, priors: Any, loss: Any, penalty: Any
 ) -> None:
-    option_names = (*_OPTIONS, *_OF_FIRST, "check_curvature")
-    for name in options:
-        if name not in option_names:
-            raise TypeError(
-                f"dvi.identify has no option {name!r}: use one of {', '.join(option_names)}."
-            )
     instance("library", library, ForceLibrary, "a dvi.ForceLibrary")
     if library.coefficients is not None:
         raise ValueError(f"library must have no coefficients, got {library.coefficients}.")

@@ -3,21 +3,23 @@
 import functools
 import inspect
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ..base.checks import finite, positive, whole
+from ..base.keywords import checked_keywords
 from ..base.machine import processors
 from ..base.precision import refuse_double_without_x64
 from ..base.types import Interval
 from ..discover.functions.basis import check_step_size
 from ..discover.invariants.found import Discovery
 from ..discover.invariants.series import InvariantSeries
-from ..integration.arithmetic import DoubleDouble, FixedPoint, FloatingPoint
+from ..integration.arithmetic import Arithmetic, DoubleDouble, FixedPoint, FloatingPoint
 from ..integration.integrator import Integrator, chosen, only
+from ..methods import Method
 from ..methods.step import Equations
 from ..problem.system import System, check_system, of_problem
 from .components import Unsupported, program_of
@@ -35,6 +37,20 @@ class ProofError(Exception):
     """Nothing is proved: the message says what failed, and for which states."""
 
 
+class BoundSettings(TypedDict, total=False):
+    """Keywords of `bound_drift` that describe the map, and when the search ends."""
+
+    h: Any
+    args: Any
+    method: Method | str | None
+    arithmetic: Arithmetic | None
+    integrator: Integrator | None
+    ratio: float
+    max_boxes: int
+    max_seconds: float
+
+
+@checked_keywords
 def bound_drift(
     found: Discovery | InvariantSeries | Callable | Sequence[Any],
     system: Any,
@@ -42,16 +58,9 @@ def bound_drift(
     epsilon: Any,
     domain: Any,
     time: Any = None,
-    h: Any = None,
     inside: Callable | None = None,
-    args: Any = None,
-    method: Any = None,
-    arithmetic: Any = None,
-    integrator: Integrator | None = None,
     change: float = 1e-3,
-    ratio: float = 2.0,
-    max_boxes: int = 2000,
-    max_seconds: float = 300.0,
+    **settings: Unpack[BoundSettings],
 ) -> DriftBound:
     r"""Prove how little invariants of the map change in a step, for all states of a domain.
 
@@ -79,10 +88,10 @@ def bound_drift(
       `DoubleDouble()` or `FixedPoint(quantum)`; in the latter each increment is rounded by at most
       quantum/2. `integrator`: an object that contains these two.
     - `change`: of an invariant, for which a number of steps is stated.
-    - `ratio`: the boxes are cut until no bound exceeds the largest change seen by this factor, or
-      the limits `max_boxes` or `max_seconds` are reached. After one second the search
-      continues in one process per processor. Their number has no effect on the result, unless
-      `max_seconds` is reached.
+    - `ratio`: the boxes are cut until no bound exceeds the largest change seen by this factor, by
+      default 2, or the limits `max_boxes` (2000) or `max_seconds` (300) are reached. After one
+      second the search continues in one process per processor. Their number has no effect on the
+      result, unless `max_seconds` is reached.
 
     **Returns** a `DriftBound`; ``print`` shows what is proved.
 
@@ -115,28 +124,29 @@ def bound_drift(
     # In float32 the bound of the rounding would be that of another program.
     refuse_double_without_x64("domain", np.dtype(float))
     positive("change", change)
-    whole("max_boxes", max_boxes)
-    positive("max_seconds", max_seconds)
-    if not finite("ratio", ratio) > 1:
+    max_boxes = whole("max_boxes", settings.get("max_boxes", 2000))
+    max_seconds = positive("max_seconds", settings.get("max_seconds", 300.0))
+    ratio = finite("ratio", settings.get("ratio", 2.0))
+    if not ratio > 1:
         raise ValueError(f"ratio must be larger than 1, got {ratio!r}.")
+    h, args = settings.get("h"), settings.get("args")
     system, _, _, h, args = of_problem(system, None, None, h, args, has_start=True)
     check_system(system, "bound_drift")
-    options = chosen(integrator, method=method, arithmetic=arithmetic)
-    integrator_used = only(options, "bound_drift", "method", "arithmetic")
-    if not isinstance(integrator_used.arithmetic, FloatingPoint | DoubleDouble | FixedPoint):
+    method, arithmetic = settings.get("method"), settings.get("arithmetic")
+    options = chosen(settings.get("integrator"), method=method, arithmetic=arithmetic)
+    integrator = only(options, "bound_drift", "method", "arithmetic")
+    if not isinstance(integrator.arithmetic, FloatingPoint | DoubleDouble | FixedPoint):
         raise ValueError(
             "arithmetic must be dvi.FloatingPoint(), dvi.DoubleDouble() or "
-            f"dvi.FixedPoint(quantum), got {integrator_used.arithmetic!r}."
+            f"dvi.FixedPoint(quantum), got {integrator.arithmetic!r}."
         )
     h = check_step_size(h)
     shape, (lower, upper) = _domain(domain, found)
     strengths = _interval("epsilon", epsilon)
     times = None if time is None else _interval("time", time)
     functions = _functions(found, system, time is not None)
-    step_map, programs = _step_of(system, integrator_used, shape, args, h, times)
-    digits = (
-        "pairs of float64" if isinstance(integrator_used.arithmetic, DoubleDouble) else "float64"
-    )
+    step_map, programs = _step_of(system, integrator, shape, args, h, times)
+    digits = "pairs of float64" if isinstance(integrator.arithmetic, DoubleDouble) else "float64"
     numbers = [shape, shape, (), (), ()]
     invariants = [_program(f"the invariant {name}", f, numbers, 0) for f, name in functions]
     n, t = len(lower) // 2, ["input", len(lower)]

@@ -72,7 +72,7 @@ class Source:
     def args(self) -> Any:
         """The parameters of the system, with those of the file in their place."""
         values, problem = self.file.args, self.problem
-        names = problem.args if problem is not None else None
+        names: Any = getattr(problem, "args", None)
         if values is None or problem is None:
             return names if values is None else values
         cause = f"args of the type {type(names).__name__}: set them in its Python code"
