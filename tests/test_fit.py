@@ -112,7 +112,7 @@ def test_predictions_between_grid_points_have_the_order_of_the_method():
     exact = np.exp(-gamma * t) * (np.cos(omega * t) + gamma / omega * np.sin(omega * t))
     for h in (0.05, 0.025):
         problem, u = problem_of(observed(np.zeros((60, 1)), t), TRUE, model_of(h=h))
-        ((found, _),) = problem.whitened(u)[1]
+        ((found, _),) = problem.weighted_residuals(u)[1]
         errors.append(np.abs(np.asarray(found)[0, :, 0] - exact).max())
     assert errors[0] < 5e-3
     assert 3.4 < errors[0] / errors[1] < 4.6
@@ -122,7 +122,7 @@ def test_predictions_between_grid_points_have_the_order_of_the_method():
 def test_grid_points_are_picked():
     problem, u = problem_of(observed(np.zeros((60, 1))), TRUE)
     assert problem.groups[0].block == 10
-    ((found, _),) = problem.whitened(u)[1]
+    ((found, _),) = problem.weighted_residuals(u)[1]
     np.testing.assert_allclose(np.asarray(found)[0], states_at(REGULAR).qs, atol=1e-12)
 
 

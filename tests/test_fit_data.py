@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import dvi_jax as dvi
-from dvi_jax.fit.problem import Problem
+from dvi_jax.fit.problem import FitProblem
 
 
 def H(t0, t1, q0, p1, args):
@@ -99,7 +99,7 @@ def test_the_order_of_the_observations_does_not_matter(sign, of):
     groups = []
     for rows in (slice(None), slice(None, None, -1)):
         data = dvi.Observations(sign * TS[rows], VALUES[rows], t0=0.0, **{of: error[rows]})
-        groups += Problem(model, [data], False, PARAMS).groups
+        groups += FitProblem(model, [data], False, PARAMS).groups
     for of_one, of_other in zip(*(vars(group).values() for group in groups), strict=True):
         np.testing.assert_array_equal(of_one, of_other)
 

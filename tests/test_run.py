@@ -11,7 +11,7 @@ from dvi_jax.run import InputError, library_tables, run_file
 import dvi_jax as dvi
 from dvi_jax import systems
 from dvi_jax_cli.work.expressions import parse_method
-from dvi_jax_cli.work.output import Output
+from dvi_jax_cli.work.output import FolderReport
 from dvi_jax_cli.work.schema import RunFile
 
 OWN = """
@@ -402,7 +402,7 @@ def test_systems_are_listed_and_described():
 
 def test_ctrl_c_while_results_are_written_lists_the_files(tmp_path):
     def output(force=False):
-        return Output(folder=tmp_path, key="--out", names=("a.npz",), force=force).writing()
+        return FolderReport(folder=tmp_path, key="--out", names=("a.npz",), force=force).writing()
 
     def interrupted():
         with output():

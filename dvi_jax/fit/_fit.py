@@ -18,9 +18,9 @@ from .keywords import FitSettings, LossSettings, select
 from .losses import Loss
 from .observations import Data, as_arcs
 from .optimise import FIT_RESULTS, FitError
-from .problem import Problem
+from .problem import FitProblem
 from .result import FitResult
-from .run import Run, identity, progress_display
+from .run import FitRun, identity, progress_display
 from .shooting import MultipleShooting, Segments, SingleShooting
 from .solvers import is_gauss_newton, is_optax, solver_for
 from .stages import JACOBIAN_LIMIT, Minimum, by_gradient, in_segments, least_squares
@@ -109,7 +109,7 @@ def fit(
     began = time.monotonic()
     require_double("a fit")
     arcs, is_list = as_arcs(data)
-    problem = Problem(model, arcs, is_list, params, **select(settings, LossSettings))
+    problem = FitProblem(model, arcs, is_list, params, **select(settings, LossSettings))
     kinds = SingleShooting | MultipleShooting
     instance("shooting", shooting, kinds, "a dvi.SingleShooting() or a dvi.MultipleShooting(n)")
     max_steps, batch = settings.get("max_steps"), settings.get("batch")
@@ -135,7 +135,7 @@ def fit(
     u = problem.space.to_u(problem.start)
     name = identity(problem, u, solver, shooting, stage_horizons, batch, seed, tolerance)
     with progress_display(settings.get("progress")) as show:
-        run = Run(problem, max_steps, tolerance, show, began, checkpoint, name)
+        run = FitRun(problem, max_steps, tolerance, show, began, checkpoint, name)
         if isinstance(shooting, MultipleShooting):
             minimum = in_segments(run, Segments(problem, shooting), u, solver)
         elif is_vector:
@@ -172,11 +172,11 @@ def _horizons(horizons: Any) -> list[float] | None:
     return [*times.tolist(), np.inf]
 
 
-def _result(run: Run, minimum: Minimum, check_curvature: bool) -> FitResult:
+def _result(run: FitRun, minimum: Minimum, check_curvature: bool) -> FitResult:
     """Errors, undetermined directions and residuals at a minimum."""
     problem, n = run.problem, run.problem.size
     space, u, has_residuals = problem.space, jnp.asarray(minimum.u), isinstance(problem.loss, Loss)
-    rows, predictions = minimum.aux or problem.whitened(u)
+    rows, predictions = minimum.aux or problem.weighted_residuals(u)
     predictions_by_arc, residuals_in_sigma, trajectories = problem.by_arc(rows, predictions)
     x = np.asarray(space.to_x(u))
     r = problem.root_rows(u, rows)
@@ -236,7 +236,7 @@ def _result(run: Run, minimum: Minimum, check_curvature: bool) -> FitResult:
 
 
 def _curvature_ratio(
-    problem: Problem, u: Any, r: np.ndarray, J: np.ndarray, spectrum: Uncertainty
+    problem: FitProblem, u: Any, r: np.ndarray, J: np.ndarray, spectrum: Uncertainty
 ) -> np.ndarray:
     """Second derivative of the loss along each principal direction over Gauss–Newton's, which
     lacks r · r''.

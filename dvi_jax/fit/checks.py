@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 
 
-def shaped(name: str, value: Any, *shapes: tuple[int, ...], hint: str = "") -> None:
+def require_shape(name: str, value: Any, *shapes: tuple[int, ...], hint: str = "") -> None:
     """**Raises** `ValueError` unless an array has one of the shapes."""
     if (shape := np.shape(value)) not in shapes:
-        allowed = " or ".join(map(str, shapes))
-        raise ValueError(f"{name} must have shape {allowed}, got shape {shape}.{_sentence(hint)}")
+        text = " or ".join(map(str, shapes))
+        raise ValueError(f"{name} must have shape {text}, got shape {shape}.{_sentence(hint)}")
 
 
-def every(name: str, values: np.ndarray, fits: np.ndarray, rule: str, hint: str = "") -> None:
+def require_all(name: str, values: np.ndarray, fits: np.ndarray, rule: str, hint: str = "") -> None:
     """**Raises** `ValueError` with the first of the values for which `fits` is false."""
     if not fits.all():
         index = np.argwhere(~fits)[0].tolist()
@@ -28,11 +28,11 @@ def requires(fits: Any, subject: str, condition: str, value: str, hint: str = ""
         raise ValueError(f"{subject} requires {condition}, got {value}.{_sentence(hint)}")
 
 
-def enough_values(count: int, least: int, purpose: str) -> None:
+def enough_values(count: int, minimum: int, purpose: str) -> None:
     """**Raises** `ValueError` for fewer observed values than a fit needs."""
-    if count < least:
+    if count < minimum:
         raise ValueError(
-            f"data must have at least {least} observed values, one for each of {purpose}, got "
+            f"data must have at least {minimum} observed values, one for each of {purpose}, got "
             f"{count}."
         )
 

@@ -13,15 +13,16 @@ from ..base.keywords import checked_keywords
 from ..problem.system import System
 from ._fit import fit
 from .elimination import Elimination, Removal, places
-from .keywords import IdentifySettings
+from .keywords import OptimiserSettings
 from .library import KEY, ForceLibrary, with_force
 from .losses import LeastSquares, Loss
 from .model import specification
 from .observations import Data, Observations, as_arcs
 from .optimise import FIT_RESULTS, FitError
 from .parameters import Prior
-from .problem import Problem
+from .problem import FitProblem
 from .result import FitResult, with_error
+from .shooting import MultipleShooting, SingleShooting
 
 _GUARD = 3.0
 """Width of a prior: the change of the predictions by the candidate alone, to first order, in
@@ -33,8 +34,7 @@ _PROVISIONAL_ERROR = 1e-3
 
 
 _OF_ALL = ("max_steps", "tolerance", "check_units", "progress")
-_OF_FIRST = ("shooting", "horizons")
-"""Keywords of `fit` for all fits, and for that of all candidates."""
+"""Keywords of `fit` for the fit of all candidates and for the last one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,8 +107,10 @@ def identify(
     params: Mapping[str, Any] | None = None,
     *,
     penalty: float | None = None,
+    shooting: SingleShooting | MultipleShooting = SingleShooting(),
+    horizons: str | list[float] | None = "auto",
     throw: bool = True,
-    **settings: Unpack[IdentifySettings],
+    **settings: Unpack[OptimiserSettings],
 ) -> Identification:
     r"""Terms of an unknown force, selected from a library of candidates by observations.
 
@@ -157,12 +159,18 @@ def identify(
     start = {**params, KEY: dict.fromkeys(library.names, 0.0)}
     arcs_with_errors = [_with_errors(arc) for arc in arcs]
     guard = _guard(
-        Problem(full_model, arcs_with_errors, is_list, start, bounds=bounds, loss=loss), library
+        FitProblem(full_model, arcs_with_errors, is_list, start, bounds=bounds, loss=loss), library
     )
     setting = {"bounds": bounds, "priors": {**(priors or {}), KEY: guard}, "loss": loss}
     common: dict[str, Any] = {name: x for name, x in settings.items() if name in _OF_ALL}
-    first: dict[str, Any] = {name: x for name, x in settings.items() if name in _OF_FIRST}
-    first |= {**common, **setting, "check_curvature": False, "throw": False}
+    first = {
+        "shooting": shooting,
+        "horizons": horizons,
+        **common,
+        **setting,
+        "check_curvature": False,
+        "throw": False,
+    }
     full: Any = None
     for change in ({}, {"horizons": None}):
         # A fit of the beginning may diverge later; without a force nothing does.
@@ -179,7 +187,7 @@ def identify(
             f"the fit of all terms failed; it is the attribute `fit`. {FIT_RESULTS[full.result]}",
             full,
         )
-    problem = Problem(full_model, arcs_with_errors, is_list, full.params, **setting)
+    problem = FitProblem(full_model, arcs_with_errors, is_list, full.params, **setting)
     search = Elimination(problem, library, penalty, arcs[0].has_errors)
     search.eliminate()
     terms = search.terms
@@ -207,7 +215,7 @@ def identify(
         path=search.path,
         penalty=search.penalty,
         alternatives=search.alternatives(),
-        undetermined=search.undetermined,
+        undetermined=search.combinations,
         fit=final,
         full=full,
     )
@@ -290,7 +298,7 @@ def _with_errors(arc: Observations) -> Observations:
     return replace(arc, sigma=_PROVISIONAL_ERROR * scatter)
 
 
-def _guard(problem: Problem, library: ForceLibrary) -> dict[str, Prior]:
+def _guard(problem: FitProblem, library: ForceLibrary) -> dict[str, Prior]:
     """A wide prior for each coefficient, by the candidate's effect on the predictions."""
 
     def in_errors(arc):  # 1 where errors are covariances

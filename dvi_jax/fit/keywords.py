@@ -7,7 +7,6 @@ from jaxtyping import PyTree
 
 from .losses import Likelihood, Loss
 from .run import FitProgress
-from .shooting import MultipleShooting, SingleShooting
 
 
 class LossSettings(TypedDict, total=False):
@@ -33,13 +32,6 @@ class FitSettings(OptimiserSettings, total=False):
 
     batch: int | None
     seed: int
-
-
-class IdentifySettings(OptimiserSettings, total=False):
-    """The same, and the path to the minimum of all candidates."""
-
-    shooting: SingleShooting | MultipleShooting
-    horizons: str | list[float] | None
 
 
 class SampleSettings(LossSettings, total=False):

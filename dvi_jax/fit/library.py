@@ -15,7 +15,7 @@ from ..base.checks import instance, one_of, whole
 from ..base.signature import check_takes
 from ..base.types import Args, Scalar, State
 from ..problem.system import System
-from .checks import shaped
+from .checks import require_shape
 
 KEY = "coefficients"
 """Key of the coefficients in args and parameters."""
@@ -37,7 +37,7 @@ class ForceLibrary(eqx.Module):
 
     **Raises** `TypeError` if it is not a dict of such functions; `ValueError` for an empty dict and
     for coefficients of another shape; and when called for args without coefficients, and for a
-    candidate whose value is not shaped like q0.
+    candidate whose value is not require_shape like q0.
     """
 
     functions: tuple[Callable[..., Any], ...]
@@ -93,7 +93,7 @@ class ForceLibrary(eqx.Module):
         total = jnp.zeros_like(q0)
         for i, (name, function) in enumerate(zip(self.names, self.functions, strict=True)):
             value = function(t0, t1, q0, p1, args)
-            shaped(f"the value of the candidate {name!r}, like q0,", value, q0.shape)
+            require_shape(f"the value of the candidate {name!r}, like q0,", value, q0.shape)
             total = total + c[i] * value
         return total
 
@@ -113,7 +113,7 @@ class ForceLibrary(eqx.Module):
 
     def _check_shape(self, c: Array, name: str) -> None:
         hint = f"The candidates are {', '.join(self.names[:4])}{', …' * (len(self) > 4)}."
-        shaped(name, c, (len(self),), hint=hint)
+        require_shape(name, c, (len(self),), hint=hint)
 
     def __len__(self) -> int:
         return len(self.names)
@@ -177,7 +177,7 @@ class _Monomial(eqx.Module):
 
     def __call__(self, t0, t1, q0, p1, args):
         del t0, t1, args
-        shaped(f"q0 for dvi.ForceLibrary.monomials(degree, {self.n})", q0, (self.n,))
+        require_shape(f"q0 for dvi.ForceLibrary.monomials(degree, {self.n})", q0, (self.n,))
         value = jnp.ones((), q0.dtype)
         for (v, i), power in self.powers:
             value = value * (q0 if v == "q" else p1)[i] ** power
@@ -193,7 +193,7 @@ class _Monomial(eqx.Module):
         return " ".join([*(parts or ["1"]), *([] if self.n == 1 else [f"e{self.k + 1}"])])
 
 
-class _Sum(eqx.Module):
+class _ForceSum(eqx.Module):
     """A known force and an unknown one."""
 
     force: Callable[..., Any]
@@ -205,5 +205,5 @@ class _Sum(eqx.Module):
 
 def with_force(system: System, library: ForceLibrary) -> System:
     """The system with the library's force added to its own."""
-    force = library if system.force is None else _Sum(system.force, library)
+    force = library if system.force is None else _ForceSum(system.force, library)
     return replace(system, force=force)

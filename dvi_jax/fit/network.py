@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from ..base.checks import argument_names, function, one_of, positive, refuse_unknown, whole
 from ..base.types import Args, Scalar, State
-from .checks import shaped
+from .checks import require_shape
 
 
 class LayerSettings(TypedDict, total=False):
@@ -167,7 +167,7 @@ class NetworkForce(eqx.Module):
 
     def _vector(self, x: Any) -> Array:
         x = jnp.asarray(x)
-        shaped(f"q and p for dvi.NetworkForce({self.n}, ...)", x, (self.n,))
+        require_shape(f"q and p for dvi.NetworkForce({self.n}, ...)", x, (self.n,))
         return x
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from ..base.checks import finite, instance
 from ..base.inputs import refuse_unit_or_mask
 from ..base.signature import accepts, signature_of
-from .checks import every, shaped
+from .checks import require_all, require_shape
 
 _RANGE = (1e-140, 1e140)
 """Standard errors relative to the largest value for which a sum of squares can be computed."""
@@ -76,7 +76,7 @@ class Observations:
                 f"row for each, got shapes {ts.shape} and {values.shape}."
             )
         _check_times(ts)
-        every("values", values, ~np.isinf(values), "finite", "NaN means a missing value.")
+        require_all("values", values, ~np.isinf(values), "finite", "NaN means a missing value.")
         if np.isnan(values).all():
             raise ValueError(f"values must have at least one number, got {values!r:.200}.")
         refuse_unit_or_mask("t0", self.t0)
@@ -193,7 +193,7 @@ def _first(where: np.ndarray) -> list[int]:
 
 
 def _check_times(ts: np.ndarray) -> None:
-    every("ts", ts, np.isfinite(ts), "finite")
+    require_all("ts", ts, np.isfinite(ts), "finite")
     steps = np.diff(ts)
     is_up = (steps > 0).sum() >= (steps < 0).sum()
     if index := _first(steps <= 0 if is_up else steps >= 0):
@@ -215,19 +215,19 @@ def _sigma(sigma: Any, values: np.ndarray) -> np.ndarray:
         ) from None
     is_missing = np.isnan(values)
     is_valid = np.isfinite(full) & (full > 0) | is_missing
-    every("sigma", full, is_valid, "positive and finite", "To ignore a value, set it to NaN.")
+    require_all("sigma", full, is_valid, "positive and finite", "To ignore a value, set it to NaN.")
     largest = np.nanmax(np.abs(values))
     low, high = (factor * (largest or 1.0) for factor in _RANGE)
     rule = f"between {low:.3g} and {high:.3g} for values of up to {largest:.3g}"
     is_valid = (full > low) & (full < high) | is_missing
-    every("sigma", full, is_valid, rule, "Give sigma in the units of the values.")
+    require_all("sigma", full, is_valid, rule, "Give sigma in the units of the values.")
     return full
 
 
 def _covariance(covariance: Any, values: np.ndarray) -> np.ndarray:
     C = _real("covariance", covariance)
     n, k = len(values), int(np.prod(values.shape[1:], dtype=int))
-    shaped("covariance", C, (k, k), (n, k, k))
+    require_shape("covariance", C, (k, k), (n, k, k))
     full = np.array(np.broadcast_to(C, (n, k, k)))
     variance = np.einsum("nii->ni", full)
     scale = np.sqrt(np.abs(variance))

@@ -124,7 +124,7 @@ class Position:
 
 
 @dataclass(frozen=True)
-class Task:
+class StageTask:
     """One stage: its number and horizon, when it ends, and who watches its steps.
 
     - `max_steps`: those before it was resumed included. `resume`: the position to continue from.
@@ -209,7 +209,12 @@ class LeastSquaresStage:
         return self.evaluate(jnp.asarray(u), jnp.asarray(horizon), extra)
 
     def run(
-        self, u: np.ndarray, task: Task, degrees: int, first: Evaluation | None = None, extra=None
+        self,
+        u: np.ndarray,
+        task: StageTask,
+        degrees: int,
+        first: Evaluation | None = None,
+        extra: Any = None,
     ) -> tuple[np.ndarray, Evaluation, FIT_RESULTS]:
         """u at the minimum, the evaluation there, and the status.
 
@@ -240,8 +245,8 @@ class LeastSquaresStage:
                 trial = self.values_at(base + scale * np.asarray(state.y_eval), horizon, extra)
             linearisation = trial.residual, np.asarray(trial.jacobian) * scale
             z, state = _advance(self._solver, z, linearisation, state)
-            accepted = int(state.num_steps_since_acceptance) == 0
-            best, position.rejected = (trial, 0) if accepted else (best, position.rejected + 1)
+            has_moved = int(state.num_steps_since_acceptance) == 0
+            best, position.rejected = (trial, 0) if has_moved else (best, position.rejected + 1)
             trial = None
             residual = np.asarray(best.residual)
             loss = float(residual @ residual) / 2
@@ -252,7 +257,7 @@ class LeastSquaresStage:
             position.leaves, position.extra = _leaves(state), _leaves(extra)
             u = position.u
             threshold = tolerance * spread
-            if accepted:  # at a bound the free variable grows for ever, and nothing changes
+            if has_moved:  # at a bound the free variable grows for ever, and nothing changes
                 position.still = (
                     position.still + 1 if position.last - loss <= (tolerance * spread) ** 2 else 0
                 )
@@ -270,7 +275,7 @@ class LeastSquaresStage:
             ):
                 position.status = "stalled"
             in_sigma = change / spread if spread else 0.0
-            task.watch(Record(task.stage, horizon, loss, in_sigma, accepted, u), position)
+            task.watch(Record(task.stage, horizon, loss, in_sigma, has_moved, u), position)
         status = position.status or "max_steps_reached"
         if status == "stalled" and horizon == np.inf:  # of a part of the data it does not matter
             spread = float(np.linalg.norm(best.residual)) / np.sqrt(max(degrees, 1))
@@ -331,7 +336,7 @@ class ScalarStage:
     def run(
         self,
         u: np.ndarray,
-        task: Task,
+        task: StageTask,
         scale: np.ndarray,
         choose: Callable[[int], Any] | None = None,
     ) -> tuple[np.ndarray, FIT_RESULTS]:

@@ -14,7 +14,7 @@ from jaxtyping import Array, PyTree
 from lanewise.jaxprs.jaxapi import is_traced
 
 from ..base.inputs import refuse_unit_or_mask
-from .checks import shaped
+from .checks import require_shape
 
 
 @dataclass(frozen=True)
@@ -268,7 +268,7 @@ def _spread(value: Any, size: int, shape: tuple[int, ...], label: str) -> np.nda
         value = np.asarray(value, float)
     except (TypeError, ValueError):
         raise TypeError(f"{label} must be a real number or array, got {value!r:.200}.") from None
-    shaped(label, value, *dict.fromkeys([(), shape]))
+    require_shape(label, value, *dict.fromkeys([(), shape]))
     return value.ravel() if value.ndim else np.full(size, float(value))
 
 

@@ -14,7 +14,7 @@ from .checks import enough_values
 from .losses import LeastSquares, Likelihood, Loss
 from .observations import Data, as_arcs
 from .parameters import Space, make_space
-from .problem import Problem
+from .problem import FitProblem
 from .stages import JACOBIAN_LIMIT
 from .uncertainty import in_words, uncertainty
 
@@ -69,7 +69,7 @@ class Posterior:
         one_of("gradient", gradient, ("reverse", "forward"))
         arcs, is_list = as_arcs(data)
         # Priors are added here, so that they also work with errors of unknown size.
-        self._problem = Problem(model, arcs, is_list, params, bounds=bounds, loss=loss)
+        self._problem = FitProblem(model, arcs, is_list, params, bounds=bounds, loss=loss)
         self._core = self._problem.core
         self._space, x = make_space(params, bounds, priors)
         self.names, self.size = list(self._space.names), self._space.size

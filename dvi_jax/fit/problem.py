@@ -14,7 +14,7 @@ from ..base.checks import instance
 from ..base.reads import Reads, reads
 from ..base.results import RESULTS, status_name
 from ..problem.system import check_system
-from .checks import enough_values, requires, shaped
+from .checks import enough_values, require_shape, requires
 from .losses import LeastSquares, Likelihood, Loss
 from .model import Group, Model, check_observable, make_groups, predict, specification, weigh
 from .observations import Observations
@@ -56,7 +56,7 @@ class Core(eqx.Module):
             )
         return jax.vmap(predict_arc)(*arrays)
 
-    def whitened(self, u: Array, horizon: Any = np.inf) -> tuple[list[Array], list[Any]]:
+    def weighted_residuals(self, u: Array, horizon: Any = np.inf) -> tuple[list[Array], list[Any]]:
         """Residuals predicted − observed in standard errors, (A, N, K) for each group, zero for
         missing values and those later than `horizon` after the start; predictions and statuses."""
         params = self.space.to_params(self.space.to_x(u))
@@ -66,7 +66,7 @@ class Core(eqx.Module):
 
     def residuals(self, u: Array, horizon: Any = np.inf) -> Array:
         """The vector whose half square is the loss, priors last."""
-        return self.root_rows(u, self.whitened(u, horizon)[0])
+        return self.root_rows(u, self.weighted_residuals(u, horizon)[0])
 
     def root_rows(self, u: Array, rows: list[Array]) -> Array:
         """The same from whitened residuals."""
@@ -87,7 +87,7 @@ class Core(eqx.Module):
         """
 
         def residual_and_aux(u):
-            rows, predictions = self.whitened(u, horizon)
+            rows, predictions = self.weighted_residuals(u, horizon)
             r = self.root_rows(u, rows)
             return r, (r, rows, predictions)
 
@@ -123,7 +123,9 @@ class Core(eqx.Module):
         densities = jax.vmap(self.loss.negative_log_density, in_axes=(0, 0, 0, None))(
             jnp.where(keep, predictions, values), values, sigma, params
         )
-        shaped("−log density by dvi.Likelihood, with all arcs,", densities, predictions.shape)
+        require_shape(
+            "−log density by dvi.Likelihood, with all arcs,", densities, predictions.shape
+        )
         return jnp.sum(jnp.where(keep, densities, 0.0))
 
     def hessian(self, u: Array) -> Array:
@@ -175,13 +177,13 @@ def _whiten(group: Group, predictions: Array, horizon: Any) -> Array:
 
 # Functions of the module: a method of an instance would be compiled again for each fit.
 _evaluate = eqx.filter_jit(Core.evaluate)
-_whitened = eqx.filter_jit(Core.whitened)
+_weighted_residuals = eqx.filter_jit(Core.weighted_residuals)
 _root_rows = eqx.filter_jit(Core.root_rows)
 _hessian = eqx.filter_jit(Core.hessian)
 _curvature = eqx.filter_jit(Core.curvature)
 
 
-class Problem:
+class FitProblem:
     """A fit in free variables u.
 
     - `core`: its functions. `space`: the parameters, `start` their x. `data`: the data as given,
@@ -255,8 +257,8 @@ class Problem:
 
     def check_count(self) -> None:
         """**Raises** `ValueError` for fewer observed values than parameters."""
-        least = self.size - self.space.count_of_priors
-        enough_values(self.count, least, f"{least} parameters without a prior")
+        minimum = self.size - self.space.count_of_priors
+        enough_values(self.count, minimum, f"{minimum} parameters without a prior")
 
     # ---- the functions of `core`, compiled
 
@@ -264,9 +266,9 @@ class Problem:
         """`Core.evaluate`; there is nothing `extra`."""
         return _evaluate(self.core, jnp.asarray(u), jnp.asarray(horizon, float))
 
-    def whitened(self, u: Any, horizon: Any = np.inf) -> tuple[list[Array], list[Any]]:
-        """`Core.whitened`."""
-        return _whitened(self.core, jnp.asarray(u), jnp.asarray(horizon, float))
+    def weighted_residuals(self, u: Any, horizon: Any = np.inf) -> tuple[list[Array], list[Any]]:
+        """`Core.weighted_residuals`."""
+        return _weighted_residuals(self.core, jnp.asarray(u), jnp.asarray(horizon, float))
 
     def root_rows(self, u: Any, rows: list[Any]) -> np.ndarray:
         """`Core.root_rows`."""

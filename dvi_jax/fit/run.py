@@ -19,8 +19,8 @@ from ..base.files import publish_npz, read_npz
 from ..base.progress import bar_of, reporter
 from ..base.reads import reads
 from .checks import same_fit
-from .optimise import Position, Record, Task
-from .problem import Problem
+from .optimise import Position, Record, StageTask
+from .problem import FitProblem
 
 _INTERVAL = 5.0
 """Seconds between checkpoints."""
@@ -65,7 +65,7 @@ def progress_display(progress: Any) -> Any:
 
 
 @dataclass
-class Run:
+class FitRun:
     """A fit in progress.
 
     - `show`: a function of the progress, or None. `began`: when, for the seconds shown.
@@ -73,7 +73,7 @@ class Run:
       first stage has continued from it.
     """
 
-    problem: Problem
+    problem: FitProblem
     max_steps: int
     tolerance: float
     show: Callable[[FitProgress], None] | None
@@ -101,14 +101,14 @@ class Run:
         """How many steps remain."""
         return self.max_steps - len(self.records)
 
-    def task(self, stage: int, horizon: float, tolerance: float, limit: int | None) -> Task:
+    def task(self, stage: int, horizon: float, tolerance: float, limit: int | None) -> StageTask:
         """The next stage, of at most `most` steps, which continues from the checkpoint once."""
         resume, self.resume = self.resume, None
         count = 0 if resume is None else resume.done
         steps = count + self.left
         if limit is not None:
             steps = min(max(limit, count), steps)
-        return Task(stage, horizon, steps, tolerance, self.watch, resume)
+        return StageTask(stage, horizon, steps, tolerance, self.watch, resume)
 
     def watch(self, record: Record, position: Position) -> None:
         """A step was taken."""
@@ -140,7 +140,7 @@ def _columns(records: list[Record]) -> dict[str, np.ndarray]:
     return {name: np.array([getattr(r, name) for r in records]) for name in Record._fields}
 
 
-def identity(problem: Problem, u: np.ndarray, *settings_of_call: Any) -> str:
+def identity(problem: FitProblem, u: np.ndarray, *settings_of_call: Any) -> str:
     """Hash by which a checkpoint is recognised: data, names, start and settings."""
     # The repr of an optax optimiser does not contain its numbers: its functions read them.
     read = [

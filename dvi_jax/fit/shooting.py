@@ -13,10 +13,10 @@ from jaxtyping import Array
 from ..base.checks import fraction, whole
 from ..integration.integrate import integrate
 from ..observe.solution import Save
-from .checks import requires, shaped
+from .checks import require_shape, requires
 from .model import make_group, predict, specification, weigh
 from .observations import Observations
-from .problem import Problem
+from .problem import FitProblem
 from .roundoff import Evaluation
 
 
@@ -60,7 +60,7 @@ class MultipleShooting:
             )
 
 
-class _Part:
+class _SegmentData:
     """The observations of an arc that belong to one segment."""
 
     def __init__(self, arc: Observations, keep: np.ndarray, t0: float, whitening: np.ndarray):
@@ -85,7 +85,7 @@ class Segments:
     so that half its square is the augmented Lagrangian of the constraints c = 0 up to a constant.
     """
 
-    def __init__(self, problem: Problem, shooting: MultipleShooting):
+    def __init__(self, problem: FitProblem, shooting: MultipleShooting):
         self.problem, self.shooting = problem, shooting
         spec, arcs, S = problem.specs[0], problem.arcs, shooting.segments
         other = next((s["h"] for s in problem.specs if s["h"] != spec["h"]), None)
@@ -115,9 +115,8 @@ class Segments:
             whitening = arc.whitening()
             place = (arc.ts - arc.t0) / (self.steps * h)
             numbers_of_segments = np.clip(np.ceil(place - 1e-9).astype(int) - 1, 0, S - 1)
-            parts += [
-                _Part(arc, numbers_of_segments == s, float(cuts[s]), whitening) for s in range(S)
-            ]
+            for s, cut in enumerate(cuts):
+                parts.append(_SegmentData(arc, numbers_of_segments == s, float(cut), whitening))
         numbers = np.repeat(np.arange(len(arcs)), S)
         self.group = make_group(numbers.tolist(), parts, spec, self.steps)
         self.shape = np.shape(spec["q0"])
@@ -155,7 +154,7 @@ class Segments:
                 [np.concatenate([np.ravel(q), np.ravel(p)]) for q, p in pairs], float
             )
             name = f"the array of q and p by guess, each of shape {self.shape}, at all cuts"
-            shaped(name, states_of_cuts, (len(times), 2 * self.half))
+            require_shape(name, states_of_cuts, (len(times), 2 * self.half))
         elif guess == "data":
             states_of_cuts = from_data(arc, spec, times)
         else:

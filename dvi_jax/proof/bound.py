@@ -22,7 +22,7 @@ from ..integration.integrator import Integrator, chosen, only
 from ..methods import Method
 from ..methods.step import Equations
 from ..problem.system import System, check_system, of_problem
-from .components import Unsupported, program_of
+from .components import NotAnalytic, program_of
 from .confinement import confine
 from .rational import ExactInvariant
 from .result import DriftBound, tools
@@ -180,9 +180,9 @@ def bound_drift(
         limits = {"max_boxes": max_boxes, "max_seconds": max_seconds, "workers": workers}
         try:
             result = search.subdivide(checker, identities, estimates, ratio=ratio, **limits)
-        except exact.Failed as error:
+        except exact.Failure as error:
             raise ProofError(f"{error}.") from None
-        per_step = [exact.up(b) for b in result.bounds]
+        per_step = [exact.round_up(b) for b in result.bounds]
         certificate |= {
             "per_step": [b.hex() for b in per_step],
             "rounding": [r.hex() for r in result.rounding],
@@ -199,7 +199,7 @@ def bound_drift(
     return DriftBound(
         per_step=tuple(per_step),
         rounding=tuple(result.rounding),
-        seen=tuple(result.seen),
+        seen=tuple(result.extremes),
         level=level,
         steps=certificate["steps"],
         start=start,
@@ -292,10 +292,15 @@ def _functions(invariants: Any, system: System, with_time: bool) -> list[tuple[C
                 f"{system.slow_time}."
             )
         return [
-            (lambda q, p, t, e, h: invariants.evaluate(q, p, e, t), invariants.formula(terms=8))
+            (
+                lambda q, p, t, epsilon, h: invariants.evaluate(q, p, epsilon, t),
+                invariants.formula(terms=8),
+            )
         ]
     if isinstance(invariants, ExactInvariant):
-        return [(lambda q, p, t, e, h: invariants.evaluate(q, p, e, h, t), str(invariants))]
+        return [
+            (lambda q, p, t, epsilon, h: invariants.evaluate(q, p, epsilon, h, t), str(invariants))
+        ]
     if isinstance(invariants, str) or not (callable(invariants) or np.iterable(invariants)):
         raise TypeError(
             "found must be a Discovery, InvariantSeries, ExactInvariant, a function (q, p, "
@@ -304,8 +309,8 @@ def _functions(invariants: Any, system: System, with_time: bool) -> list[tuple[C
     if callable(invariants):
         name = getattr(invariants, "__name__", type(invariants).__name__)
         if _takes(invariants, 4) and (with_time or not _takes(invariants, 3)):
-            return [(lambda q, p, t, e, h: invariants(q, p, e, t), name)]
-        return [(lambda q, p, t, e, h: invariants(q, p, e), name)]
+            return [(lambda q, p, t, epsilon, h: invariants(q, p, epsilon, t), name)]
+        return [(lambda q, p, t, epsilon, h: invariants(q, p, epsilon), name)]
     pairs = [pair for item in invariants for pair in _functions(item, system, with_time)]
     if not pairs:
         raise ValueError(
@@ -334,8 +339,8 @@ def _program(subject: str, function: Callable, shapes: list, ndim: int | None) -
         raise ValueError(f"{subject} must return one number, got {description}.")
     try:
         return program_of(function, *shapes)
-    except Unsupported as error:
-        raise Unsupported(f"{subject}: {error}") from None
+    except NotAnalytic as error:
+        raise NotAnalytic(f"{subject}: {error}") from None
 
 
 def _takes(function: Callable, count: int) -> bool:

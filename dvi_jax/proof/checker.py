@@ -32,20 +32,20 @@ from flint import arb, arb_series, ctx, fmpq, fmpq_mpoly_ctx, fmpz_mpoly_ctx
 FORMAT = "dvi_jax drift bound 1"
 FUNCTIONS = ("exp", "log", "sin", "cos", "tan", "atan", "asin", "acos", "sqrt", "inverse")
 ULPS = {"sqrt": 1, "inverse": 1}  # errors of functions in units of round-off; 8 (4 ulp) for others
-MALFORMED = (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RecursionError)
+FORMAT_ERRORS = LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RecursionError
 UNITS = {"float64": Fraction(1, 2**53), "pairs of float64": Fraction(1, 2**103)}  # round-off
 LEVEL = 30  # bits for levels, where nothing cancels
 SMALLEST = 2.0**-1000  # added to each error, for results below the normal numbers
 
 
-class Failed(Exception):
+class Failure(Exception):
     """What could not be shown, and where."""
 
 
 def require(condition, message, box=()):
     if not condition:
         where = " × ".join(f"[{float(a):.6g}, {float(b):.6g}]" for a, b in box)
-        raise Failed(f"{message} on the box {where}" if box else message)
+        raise Failure(f"{message} on the box {where}" if box else message)
 
 
 def digest(certificate):
@@ -59,7 +59,7 @@ def exact(texts) -> Any:
     return Fraction(float.fromhex(texts)) if isinstance(texts, str) else [exact(x) for x in texts]
 
 
-def up(value):
+def round_up(value):
     """A fraction or a ball, rounded up to a float."""
     if isinstance(value, arb):
         value = value.upper()
@@ -70,7 +70,7 @@ def up(value):
 
 def ball(value, radius=0):
     """A fraction as a ball."""
-    return arb(value.numerator) / value.denominator + arb(0, up(Fraction(radius)))
+    return arb(value.numerator) / value.denominator + arb(0, round_up(Fraction(radius)))
 
 
 def series(name, point, length):
@@ -107,11 +107,11 @@ class Models:
     and coefficients of P. Products are rounded towards zero, so that small terms vanish."""
 
     def __init__(self, size, bits, orders):
-        self.bits, self.one, self.orders = bits, 1 << bits, range(orders + 1)
+        self.bits, self.unit, self.orders = bits, 1 << bits, range(orders + 1)
         self.ring = fmpz_mpoly_ctx.get([f"s{i}" for i in range(size)], "lex")
 
     def constant(self, value, error=0):  # exact arithmetic has no error
-        multiple = value * self.one
+        multiple = value * self.unit
         return self.ring.constant(math.floor(multiple)), int(multiple.denominator != 1)
 
     def sum(self, *terms):
@@ -122,8 +122,8 @@ class Models:
         error = norm[0] * b[1] + norm[1] * a[1] + a[1] * b[1]
         product = a[0] * b[0]
         signs = product // (norm[0] * norm[1] + 1)  # rounded down: −1 where a coefficient is < 0
-        integers = (product - (self.one - 1) * signs) // self.one
-        error += int(sum(map(abs, (product - self.one * integers).coeffs())))
+        integers = (product - (self.unit - 1) * signs) // self.unit
+        error += int(sum(map(abs, (product - self.unit * integers).coeffs())))
         return integers, (error >> self.bits) + 1
 
     def range(self, a):
@@ -133,31 +133,31 @@ class Models:
             span = (0, c) if any(powers) else (c, c)
             span = (-c, c) if any(k % 2 for k in powers) else span
             low, high = low + min(span), high + max(span)
-        return Fraction(int(low), self.one), Fraction(int(high), self.one)
+        return Fraction(int(low), self.unit), Fraction(int(high), self.unit)
 
     def bound(self, a):
         return max(map(abs, self.range(a)))
 
     def apply(self, name, a):
         """f(c + r) = Σ f⁽ᵏ⁾(c)/k! rᵏ, with Lagrange's remainder on the range of c + r."""
-        low, high = (value * self.one for value in self.range(a))
+        low, high = (value * self.unit for value in self.range(a))
         middle = int(low + high) // 2
         expansion = series(
-            name, arb(int(low)).union(arb(int(high))) / self.one, len(self.orders) + 1
+            name, arb(int(low)).union(arb(int(high))) / self.unit, len(self.orders) + 1
         )
-        radius = arb(int(max(high - middle, middle - low))) / self.one
-        remainders = [abs(expansion[k + 1]) * radius ** (k + 1) * self.one for k in self.orders]
+        radius = arb(int(max(high - middle, middle - low))) / self.unit
+        remainders = [abs(expansion[k + 1]) * radius ** (k + 1) * self.unit for k in self.orders]
         require(all(x.is_finite() for x in remainders), f"{name} is singular, or varies too much")
         small = (k for k in self.orders if remainders[k] < 1)
-        order = next(small, min(self.orders, key=lambda k: up(remainders[k])))
-        terms = series(name, arb(middle) / self.one, order + 1)
+        order = next(small, min(self.orders, key=lambda k: round_up(remainders[k])))
+        terms = series(name, arb(middle) / self.unit, order + 1)
         deviation, result = (a[0] - middle, a[1]), self.constant(Fraction(0))
         for k in range(order, -1, -1):
-            multiple = terms[k] * self.one
+            multiple = terms[k] * self.unit
             integer = int(multiple.mid().floor().unique_fmpz() or 0)
-            coefficient = self.ring.constant(integer), math.ceil(up(abs(multiple - integer)))
+            coefficient = self.ring.constant(integer), math.ceil(round_up(abs(multiple - integer)))
             result = self.sum(self.multiply(result, deviation), coefficient)
-        return result[0], result[1] + math.ceil(up(remainders[order]))
+        return result[0], result[1] + math.ceil(round_up(remainders[order]))
 
 
 class Rounding:
@@ -184,7 +184,7 @@ class Rounding:
         return self.with_error(a[0] * b[0], error)
 
     def apply(self, name, a):
-        derivatives = series(name, a[0] + arb(0, up(a[1])), 2)
+        derivatives = series(name, a[0] + arb(0, round_up(a[1])), 2)
         require(derivatives[1].is_finite(), f"{name} is singular")
         return self.with_error(derivatives[0], abs(derivatives[1]) * a[1], ULPS.get(name, 8))
 
@@ -195,11 +195,11 @@ class Identities:
 
     def __init__(self, size):
         self.ring = fmpq_mpoly_ctx.get([f"x{i}" for i in range(size + 40)], "lex")
-        self.one, self.values = self.ring.constant(1), {}
+        self.unit, self.values = self.ring.constant(1), {}
         self.x, self.free = self.ring.gens()[:size], list(self.ring.gens()[size:])
 
     def constant(self, value, error=0):
-        return self.ring.constant(fmpq(value.numerator, value.denominator)), self.one
+        return self.ring.constant(fmpq(value.numerator, value.denominator)), self.unit
 
     def sum(self, *terms):
         (a, b), *addends = terms
@@ -214,7 +214,7 @@ class Identities:
         if name == "inverse":
             return a[1], a[0]
         key = name, str(a[0]), str(a[1])
-        self.values[key] = self.values.get(key) or (self.free.pop(), self.one)
+        self.values[key] = self.values.get(key) or (self.free.pop(), self.unit)
         return self.values[key]
 
 
@@ -228,7 +228,7 @@ class Checker:
         self.time, self.epsilon = exact(certificate["time"]), exact(certificate["epsilon"])
         self.n, self.slow = len(self.lower) // 2, certificate["slow"]
         numbers = (exact(certificate[name]) for name in ("h", "quantum", "accepted", "spread"))
-        self.h, self.quantum, self.accepted, self.spread = numbers
+        self.h, self.quantum, self.residual_limit, self.spread = numbers
         self.bits, self.orders = certificate["bits"], certificate["orders"]
         self.arithmetic, self.unit = certificate["arithmetic"], UNITS[certificate["arithmetic"]]
         has_grid = ["input", 2 * self.n + 3] in self.step["operations"]
@@ -246,7 +246,7 @@ class Checker:
         algebra = Models(len(box), self.bits, self.orders)
         parts = [((a + b) / 2, (b - a) / 2) for a, b in box]
         parts[-1] = (Fraction(0), box[-1][1]) if box[-1][0] == 0 else parts[-1]
-        gens = [(s * algebra.one, 0) for s in algebra.ring.gens()]
+        gens = [(s * algebra.unit, 0) for s in algebra.ring.gens()]
         c = [[algebra.constant(value) for value in part] for part in parts]
         pairs = zip(gens, c, strict=True)
         return algebra, [algebra.sum(a, algebra.multiply(s, b)) for s, (a, b) in pairs]
@@ -281,13 +281,13 @@ class Checker:
     def is_identity(self, k):
         """Whether I_k is conserved exactly, for all x, t and ε."""
         algebra = Identities(2 * self.n + 2)
-        step = self.states_of_step([(x, algebra.one) for x in algebra.x], algebra)
+        step = self.states_of_step([(x, algebra.unit) for x in algebra.x], algebra)
         numerator, denominator = self.change(k, step, algebra)
         return numerator == 0 and denominator != 0
 
     def rounding(self, box):
         """The changes of the I_k by the rounding of a step, and the errors of the coordinates.
-        The solver accepts a p1 whose residual is `accepted` and as computed."""
+        The solver accepts a p1 whose residual is at most `residual_limit`, as computed."""
         algebra, exactly, n = Rounding(self.unit), Rounding(0), self.n
         x = [(ball((a + b) / 2, (b - a) / 2), arb(0)) for a, b in box]
         x[-2] = x[-2][0], 2 * ball(UNITS["float64"]) * abs(x[-2][0])  # t = t0 + kh in float64
@@ -296,13 +296,14 @@ class Checker:
             # A Lipschitz constant of p1 → h·rate(q0, p1) in the maximum norm: the effect of errors.
             momenta = [(p1, arb(2) ** -60) for p1, _ in x[n:-2]]
             inputs = [*x[:n], *momenta, *x[-2:], exactly.constant(self.h)]
-            lipschitz = max(up(e) * 2.0**60 for _, e in run(self.step, inputs, exactly)[:n])
+            lipschitz = max(round_up(e) * 2.0**60 for _, e in run(self.step, inputs, exactly)[:n])
             require(lipschitz < 1 / 3, "the implicit step is not shown to be a contraction", box)
-            error = max((e + arb(up(self.accepted)) for _, e in start[n : 2 * n]), key=up)
+            residual = arb(round_up(self.residual_limit))
+            error = max((e + residual for _, e in start[n : 2 * n]), key=round_up)
             x[n:-2] = [(p1, error / (1 - arb(lipschitz))) for p1, _ in momenta]
             end = self.states_of_step(x, algebra)[1]
         changes = [run(function, end, exactly)[0][1] for function in self.invariants]
-        return list(map(up, changes)), [up(error) for _, error in end[: 2 * n]]
+        return list(map(round_up, changes)), [round_up(error) for _, error in end[: 2 * n]]
 
 
 def leaves(box, node):
@@ -361,7 +362,7 @@ def check_confined(checker, box, claim, weights, limit, reach):
 
 
 def check(certificate):
-    """What a certificate proves, as a sentence. **Raises** `Failed` if it does not."""
+    """What a certificate proves, as a sentence. **Raises** `Failure` if it does not."""
     require(certificate["format"] == FORMAT, f"the format is not {FORMAT!r}")
     require(digest(certificate) == certificate["hash"], "the file was changed: its hash differs")
     checker = Checker(certificate)
@@ -372,7 +373,8 @@ def check(certificate):
     text = f"on {len(boxes)} boxes a step changes I by ≤ {[*map(float, per_step)]}"
     text += f", its rounding in {checker.arithmetic} by ≤ {[*map(float, rounding)]}"
     text += f" on a grid of {float(checker.quantum)}" * bool(checker.quantum)
-    text += f" if a solver accepts residuals ≤ {float(checker.accepted):.3g}" * checker.implicit
+    residual = float(checker.residual_limit)
+    text += f" if a solver accepts residuals ≤ {residual:.3g}" * checker.implicit
     if certificate["level"] is None:
         return text
     (weights, value), steps = exact(certificate["level"]), certificate["steps"]
@@ -394,7 +396,7 @@ def main(path):
     """Check one file. Returns the exit code: 0 for a proof, 1 otherwise."""
     try:
         print("proved:", check(json.loads(pathlib.Path(path).read_text(encoding="utf-8"))))
-    except (Failed, OSError, *MALFORMED) as error:
+    except (Failure, OSError, *FORMAT_ERRORS) as error:
         print(f"not proved: {type(error).__name__}: {error}")
         return 1
     return 0

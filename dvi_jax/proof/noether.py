@@ -144,6 +144,6 @@ def prove_noether(
 
     program = program_of(statements, (), (), shape, shape, (), ())
     algebra = exact.Identities(2 * int(np.prod(shape)) + 4)
-    values = exact.run(program, [(x, algebra.one) for x in algebra.x], algebra)
+    values = exact.run(program, [(x, algebra.unit) for x in algebra.x], algebra)
     zero = [bool(numerator == 0 and denominator != 0) for numerator, denominator in values]
     return NoetherProof(tuple(zero[: z + 1]), zero[z + 1], all(zero[z + 3 :]), zero[z + 2])

@@ -92,7 +92,7 @@ class DriftBound(eqx.Module):
         state.append(algebra.constant(checker.h))
         values = [exact.run(f, state, algebra)[0][0] for f in checker.invariants]
         value = sum(exact.ball(w) * v for w, v in zip(weights, values, strict=True))
-        margin = level + self.steps * rate - Fraction(exact.up(value))
+        margin = level + self.steps * rate - Fraction(exact.round_up(value))
         steps = max(0, math.floor(margin / rate)) if rate else (2**62 if margin >= 0 else 0)
         last = checker.h * (Fraction(float(epsilon)) if checker.slow else 1)
         times = checker.time[1] - checker.time[0]

@@ -18,7 +18,7 @@ from . import checker as exact
 _BITS = (20, 26, 32, 40, 50, 60, 75, 90, 110, 140)
 """Binary digits of the models that are tried."""
 
-SINGULAR = exact.Failed, ValueError, ArithmeticError
+SINGULAR = exact.Failure, ValueError, ArithmeticError
 """Errors of an evaluation on a box with a singularity."""
 
 _POINTS = 64
@@ -33,7 +33,8 @@ class Leaf:
     """A box and what was found there.
 
     - `failure`: why nothing is bounded there.
-    - `bounds`, `seen`: for each invariant an upper bound of the change, and the largest one seen.
+    - `bounds`, `extremes`: for each invariant an upper bound of the change, and the largest
+      one seen.
     - `rounding`, `displacement`: changes by rounding, and how far a step moves each coordinate.
     - `remainders`: of the models of the changes. `shares`: for each invariant and coordinate, by
       how much the bound would decrease if the coordinate were cut.
@@ -46,7 +47,7 @@ class Leaf:
     failure: str = ""
     is_outside: bool = False
     bounds: list = field(default_factory=list)
-    seen: list = field(default_factory=list)
+    extremes: list = field(default_factory=list)
     rounding: list = field(default_factory=list)
     displacement: list = field(default_factory=list)
     remainders: list = field(default_factory=list)
@@ -75,19 +76,20 @@ def examine(checker: Any, box: list, rng: Any, identities: frozenset = frozenset
         changes = [checker.change(k, step, algebra) for k in range(len(checker.invariants))]
         rows = enumerate(changes)
         leaf.bounds = [Fraction(0) if k in identities else algebra.bound(x) for k, x in rows]
-        leaf.remainders = [change[1] / algebra.one for change in changes]
+        leaf.remainders = [change[1] / algebra.unit for change in changes]
         points = _points(box, rng)
         counts = _is_inside(checker, algebra, step[0], points)
-        leaf.seen = [_largest(algebra, change, points[counts]) for change in changes]
+        leaf.extremes = [_largest(algebra, change, points[counts]) for change in changes]
         corner = [(x := side[rng.integers(2)], x) for side in box]
         for k in identities:  # boxes are cut until the bound of the rounding is near that of points
-            leaf.seen[k] = checker.rounding(corner)[0][k]
+            leaf.extremes[k] = checker.rounding(corner)[0][k]
         leaf.shares = [_shares(change, len(box)) for change in changes]
-        leaf.displacement = [exact.up(m + Fraction(e)) for m, e in zip(moves, errors, strict=True)]
+        pairs = zip(moves, errors, strict=True)
+        leaf.displacement = [exact.round_up(m + Fraction(e)) for m, e in pairs]
         finite = all(map(math.isfinite, (*leaf.rounding, *leaf.displacement)))
         exact.require(finite, "a value is not bounded")
     except SINGULAR as error:
-        leaf.failure = str(error) if isinstance(error, exact.Failed) else "a function is singular"
+        leaf.failure = str(error) if isinstance(error, exact.Failure) else "a function is singular"
     return leaf
 
 
@@ -184,7 +186,7 @@ def _values(algebra: exact.Models, model: Any, s: np.ndarray) -> np.ndarray:
     """The polynomial of a model at points s."""
     terms = model[0].to_dict()
     powers = np.array([[int(k) for k in powers] for powers in terms]).reshape(-1, s.shape[1])
-    values = np.array([float(Fraction(int(c), algebra.one)) for c in terms.values()])
+    values = np.array([float(Fraction(int(c), algebra.unit)) for c in terms.values()])
     # Not by BLAS, whose rounding depends on the number of its threads.
     return np.einsum("ij,j->i", np.prod(s[:, None, :] ** powers[None], axis=2), values)
 
@@ -192,7 +194,7 @@ def _values(algebra: exact.Models, model: Any, s: np.ndarray) -> np.ndarray:
 def _largest(algebra: exact.Models, model: Any, s: np.ndarray) -> float:
     """A lower bound of the largest |value| at points s."""
     values = np.abs(_values(algebra, model, s))
-    return max(0.0, float(np.max(values, initial=0.0)) - float(Fraction(model[1], algebra.one)))
+    return max(0.0, float(np.max(values, initial=0.0)) - float(Fraction(model[1], algebra.unit)))
 
 
 def _is_inside(checker: Any, algebra: exact.Models, x: list, s: np.ndarray) -> Any:
@@ -215,7 +217,7 @@ def _shares(model: Any, size: int) -> list[float]:
     return np.einsum("i,ij->j", sizes, 1 - 0.5**powers).tolist()
 
 
-class TooMany(exact.Failed):
+class TooMany(exact.Failure):
     """The subdivision reached its limit."""
 
 
@@ -226,7 +228,7 @@ class Subdivision:
     tree: Any
     count: int
     bounds: list
-    seen: list
+    extremes: list
     rounding: list
     displacement: list
 
@@ -248,7 +250,7 @@ def subdivide(
     """
     end, order = time.monotonic() + max_seconds, itertools.count()
     root = _part(checker, identities, (checker.root(), 1))
-    best = [max(b, s) for b, s in itertools.zip_longest(best, root.seen, fillvalue=0.0)]
+    best = [max(b, s) for b, s in itertools.zip_longest(best, root.extremes, fillvalue=0.0)]
     heap = [(_rank(root, best), next(order), root)]
     count = 1
     while -heap[0][0] > ratio and count < max_boxes and time.monotonic() < end:
@@ -268,7 +270,9 @@ def subdivide(
                 leaf.parts = [next(leaves), next(leaves)]
                 count += 1
             for part in leaf.parts or [leaf]:
-                best = [max(b, s) for b, s in itertools.zip_longest(best, part.seen, fillvalue=0.0)]
+                best = [
+                    max(b, s) for b, s in itertools.zip_longest(best, part.extremes, fillvalue=0.0)
+                ]
                 heapq.heappush(heap, (_rank(part, best), next(order), part))
         if best != old:
             heap = [(_rank(item[2], best), *item[1:]) for item in heap]
@@ -282,7 +286,7 @@ def subdivide(
             "a smaller domain, epsilon or h, or larger limits"
         )
     if not inner:
-        raise exact.Failed(
+        raise exact.Failure(
             "inside(q, p) must be ≥ 0 somewhere in the domain, got negative values only"
         )
     bounds, rounding, moves = (

@@ -9,7 +9,7 @@ import numpy as np
 import dvi_jax as dvi
 
 from .._errors import as_input_error
-from .._show import Table
+from .._show import TextTable
 from .discover import box_of
 from .output import Report, open_report
 from .system import find_source
@@ -56,10 +56,10 @@ def _contents(bound: dvi.DriftBound) -> dict[str, Any]:
     return {"formulas": bound.formulas} | {name: getattr(bound, name) for name in names}
 
 
-def _tables(bound: dvi.DriftBound) -> list[Table]:
+def _tables(bound: dvi.DriftBound) -> list[TextTable]:
     rows = []
     for k, b in enumerate(bound.per_step):
         steps = bound.num_steps(bound.change, k)
         rows.append([f"I_{k}", f"{b:.2e}", f"{bound.rounding[k]:.2e}", f"{steps:.3g}"])
     columns = ["invariant", "change in a step ≤", "by rounding ≤", f"steps for {bound.change:g}"]
-    return [Table("Proved bounds", columns, rows)]
+    return [TextTable("Proved bounds", columns, rows)]

@@ -11,7 +11,7 @@ import dvi_jax as dvi
 from dvi_jax import plot
 
 from .._errors import as_input_error, describe, require
-from .._show import Table
+from .._show import TextTable
 from .expressions import parse_basis
 from .output import Report, open_report
 from .schema import DiscoverFile
@@ -154,7 +154,7 @@ def _invariant(result: dvi.Discovery, orders: list[dvi.DriftOrder], i: int) -> d
     return invariant | {"drift": drift | {"starts": len(mask), "starts_kept": int(mask.sum())}}
 
 
-def _tables(contents: dict[str, Any]) -> list[Table]:
+def _tables(contents: dict[str, Any]) -> list[TextTable]:
     rows = []
     for i, invariant in enumerate(contents["invariants"], 1):
         residual = f"{np.max(invariant['residuals']):.1e}"
@@ -162,7 +162,7 @@ def _tables(contents: dict[str, Any]) -> list[Table]:
         rows.append([str(i), residual, order, *_drift_in_words(invariant.get("drift"))])
     columns = ["number", "residual", "order expected", "drift ∝ ε^", "largest drift"]
     title = "Invariants, in the order of the formulas below"
-    return [Table(title, columns, rows)] if rows else []
+    return [TextTable(title, columns, rows)] if rows else []
 
 
 def _drift_in_words(drift: dict[str, Any] | None) -> tuple[str, str]:

@@ -13,7 +13,7 @@ from dvi_jax import plot
 from dvi_jax.systems.planets.solar_system import check_covered
 
 from .._errors import as_input_error
-from .._show import Table
+from .._show import TextTable
 from . import solar
 from .observables import Observed, observe, read_observables
 from .output import Report, open_report
@@ -113,7 +113,7 @@ def _describe(
     if observed:
         title = "Observables (changes: relative, where the start is not zero)"
         columns = ["name", "reduction", "start", "end or value", "change"]
-        report.tables.append(Table(title, columns, [_row(*item) for item in observed.items()]))
+        report.tables.append(TextTable(title, columns, [_row(*item) for item in observed.items()]))
     report.summary = f"{steps} steps in {seconds:.1f} s (compilation included)"
     if solution.status != "successful":
         report.message = (

@@ -19,13 +19,13 @@ from dvi_jax.sweep.bar import shown as shown_bar
 from dvi_jax.sweep.variables import RESERVED
 
 from .._errors import InputError, as_input_error, describe, require
-from .._show import Table
+from .._show import TextTable
 from .expressions import parse_method
 from .observables import read_observables
 from .output import Report, recorder
-from .schema import ARRAY, Pair, SweepFile
+from .schema import ARRAY, StatePair, SweepFile
 from .system import Source, find_source
-from .table import AN_AXIS, NO_KEY, Axis, axes_in, read_file, select
+from .table import AN_AXIS, NO_KEY, AxisTable, axes_in, read_file, select
 
 _MAX_NUMBERS = 10_000_000
 """Numbers up to which results are read again for the table at the end."""
@@ -118,7 +118,7 @@ def _report(result: dvi.SweepResult, last: dvi.SweepProgress) -> Report:
         report.contents["observed"] = observed
         rows = [[name, *(f"{x:.6g}" for x in values.values())] for name, values in observed.items()]
         title = "Observables of the successful trajectories"
-        report.tables.append(Table(title, ["name", "min", "median", "max"], rows))
+        report.tables.append(TextTable(title, ["name", "min", "median", "max"], rows))
     speed = f"{last.seconds:.1f} s (compilation included), {last.rate:.3g} steps/s"
     report.summary = (
         f"{last.num_lanes} trajectories in {last.num_tasks} tasks; "
@@ -147,10 +147,10 @@ def _statistics(result: dvi.SweepResult) -> dict[str, dict[str, float]]:
     return statistics
 
 
-def _status_table(counts: dict[str, int]) -> Table:
+def _status_table(counts: dict[str, int]) -> TextTable:
     total = sum(counts.values())
     rows = [[name, str(n), f"{100 * n / total:.4g} %"] for name, n in counts.items()]
-    return Table("How the trajectories ended", ["status", "trajectories", "fraction"], rows)
+    return TextTable("How the trajectories ended", ["status", "trajectories", "fraction"], rows)
 
 
 # The arguments of `dvi.sweep`
@@ -189,10 +189,10 @@ def _for_sweep(key: str, value: Any) -> Any:
     """A value with its axes as those of `dvi.sweep`; one without a name has that of the key."""
     if isinstance(value, list):
         return [_for_sweep(f"{key}[{i}]", part) for i, part in enumerate(value)]
-    return _axis(key, value, value.elements) if isinstance(value, Axis) else value
+    return _axis(key, value, value.elements) if isinstance(value, AxisTable) else value
 
 
-def _axis(key: str, axis: Axis, values: Any) -> dvi.Axis:
+def _axis(key: str, axis: AxisTable, values: Any) -> dvi.Axis:
     with as_input_error(f"{key}.{axis.kind}", AN_AXIS):
         return dvi.Axis(axis.axis or key.rpartition(".")[2], values, axis.units)
 
@@ -271,7 +271,7 @@ def _start(table: Any, source: Source) -> dvi.starts.Starts:
         return starts
     options = {name: getattr(table, name) for name in table.model_fields_set - {"kind"}}
     for name, value in options.items():
-        if isinstance(value, Pair):
+        if isinstance(value, StatePair):
             options[name] = (value.q, value.p)
     for name in ("q0", "p0") if table.kind == "normal" else ():
         if name not in options:
@@ -329,7 +329,10 @@ def sweep_status(store: str | Path) -> Report:
     remainder += f" (about {left / rate:.3g} s)" if left and rate else ""
     return Report(
         contents,
-        [_status_table(contents["trajectories"]), Table("Provenance", ["what", "value"], origin)],
+        [
+            _status_table(contents["trajectories"]),
+            TextTable("Provenance", ["what", "value"], origin),
+        ],
         summary=f"{result.path}: {grid}; {tasks_done} of {result.num_tasks} tasks done{remainder}; "
         f"{rate:.3g} trajectories/s{'' if speed is None else f', {speed:.3g} steps/s'}; "
         f"{contents['bytes'] / 1e6:.3g} MB",
@@ -379,7 +382,7 @@ def verify_store(store: str | Path, progress: Callable[[int, int], None] | None 
     report = Report(contents, summary=summary)
     if verification.bad:
         rows = [[str(number), wrong] for number, wrong in verification.bad.items()]
-        report.tables.append(Table("Bad tasks", ["task", "error"], rows))
+        report.tables.append(TextTable("Bad tasks", ["task", "error"], rows))
         report.message = (
             "bad tasks were found; they will be computed again. To repair the store, run the sweep "
             "again with --resume."

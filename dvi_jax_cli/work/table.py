@@ -36,7 +36,7 @@ def key(default: Any, rule: str) -> Any:
     return Field(default, description=rule)
 
 
-class Table(BaseModel):
+class TomlTable(BaseModel):
     """A table of a TOML file. The description of a field is what its key allows."""
 
     model_config = ConfigDict(
@@ -93,7 +93,7 @@ def path(place: tuple[int | str, ...], inner: str = "") -> str:
     return text
 
 
-T = TypeVar("T", bound=Table)
+T = TypeVar("T", bound=TomlTable)
 
 
 def read_file(file: Path, model: type[T]) -> tuple[T, dict[str, Any]]:
@@ -157,7 +157,7 @@ def union(tag_of: Callable[[Any], str] = type_tag, **kinds: Any) -> Any:
     return Annotated[Union[tuple(members)], Discriminator(tag_of)]  # noqa: UP007
 
 
-def union_by_kind(*tables: type[Table]) -> Any:
+def union_by_kind(*tables: type[TomlTable]) -> Any:
     """The union of tables that differ in the values of their key ``kind``."""
     for table in tables:
         _TAGS.update(get_args(table.model_fields["kind"].annotation))
@@ -247,7 +247,7 @@ _THREE = WithJsonSchema(
 )
 
 
-class Axis(Table, Generic[V]):
+class AxisTable(TomlTable, Generic[V]):
     """An axis of a sweep: the values that a number takes."""
 
     linspace: Annotated[list[V], BeforeValidator(_range_reader("linspace")), _THREE] | None = key(
@@ -286,7 +286,7 @@ class Axis(Table, Generic[V]):
         return getattr(self, self.kind)
 
 
-class NamedAxis(Axis[V], Generic[V]):
+class NamedAxis(AxisTable[V], Generic[V]):
     """An axis of a sweep that has no key of its own to be named after."""
 
     axis: AxisName = key(..., 'a name for this axis, such as axis = "x"')
@@ -294,21 +294,21 @@ class NamedAxis(Axis[V], Generic[V]):
 
 def number_or_axis(number: Any, of_axis: Any = None) -> Any:
     """A number or an axis of them."""
-    return union(number=number, table=Axis[of_axis or number])
+    return union(number=number, table=AxisTable[of_axis or number])
 
 
 def select(value: Any, index: int) -> Any:
     """An argument with every axis in it at one of its values."""
-    if isinstance(value, Axis):
+    if isinstance(value, AxisTable):
         return value.elements[index]
     if isinstance(value, dict):
         return {name: select(v, index) for name, v in value.items()}
     return [select(v, index) for v in value] if isinstance(value, list) else value
 
 
-def axes_in(value: Any) -> list[Axis]:
+def axes_in(value: Any) -> list[AxisTable]:
     """The axes in an argument."""
-    if isinstance(value, Axis):
+    if isinstance(value, AxisTable):
         return [value]
     parts = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
     return [axis for part in parts for axis in axes_in(part)]
@@ -336,7 +336,7 @@ def _parameter_tag(value: Any) -> str:
 
 
 _Single = union(number=Scalar, array=Array)
-_KINDS = {"boolean": bool, "number": Scalar, "array": Components, "axis": Axis[_Single]}
+_KINDS = {"boolean": bool, "number": Scalar, "array": Components, "axis": AxisTable[_Single]}
 SweepParameter = TypeAliasType(
     "SweepParameter", union(_parameter_tag, **_KINDS, table=dict[str, "SweepParameter"])
 )

@@ -16,6 +16,6 @@ def verify_certificate(path: Path) -> tuple[dict[str, Any], str]:
     exact = runpy.run_path(str(CHECKER))  # as a file: the package itself would import JAX
     try:
         statement = exact["check"](json.loads(path.read_text(encoding="utf-8")))
-    except (exact["Failed"], *exact["MALFORMED"]) as error:
+    except (exact["Failure"], *exact["FORMAT_ERRORS"]) as error:
         return {"certificate": str(path), "proved": None}, f"not proved: {error}"
     return {"certificate": str(path), "proved": statement}, ""
