@@ -84,7 +84,7 @@ def regular():
 
 def problem_of(data, params=START, model=MODEL, **options):
     arcs, many = as_arcs(data)
-    made = problems.Problem(model, arcs, many, params, **options)
+    made = problems.FitProblem(model, arcs, many, params, **options)
     return made, made.space.to_u(made.start)
 
 
