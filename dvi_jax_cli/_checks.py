@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from ._errors import InputError, require, require_file, require_name
+from ._errors import as_input_error, require, require_file, require_name
 from ._group import CHECKING, START, app
 from ._names import CHECKS, FILES, METHODS, SYSTEMS, completer
 from ._runs import Force
@@ -114,10 +114,9 @@ def paper(
     """
     from dvi_jax.testing.paper import reproduce
 
-    try:
+    kinds = FileExistsError, NotADirectoryError, PermissionError
+    with as_input_error("--out", "a new directory, or --force", *kinds):
         reproduction = reproduce(out, force, console(stderr=session.as_json))
-    except (FileExistsError, NotADirectoryError, PermissionError) as error:
-        raise InputError("--out", str(error), "a new directory, or --force") from None
     verdicts = json.loads((reproduction.out / "verdicts.json").read_text(encoding="utf-8"))
     session.finish({"folder": str(reproduction.out), **verdicts})
 
@@ -156,13 +155,11 @@ def certify(
 
     is_single = not (quick and method)
     require(is_single, "--quick", "it is given together with --method", "only one of the two")
-    try:
+    rule = "names as in dvi-jax certify --help, and a page that can be written"
+    with as_input_error("certify", rule):
         page = None if out is None else page_for(out)
         with progress_bar("certifying") as bar:
             certificate = certify(QUICK if quick else method or None, check or None, bar)
-    except (ValueError, TypeError) as error:
-        rule = "names as in dvi-jax certify --help, and a page that can be written"
-        raise InputError("certify", str(error), rule) from error
     failures = [
         f"{name}, {quantity}: {result.verdict}, allowed {result.allowed}. {result.detail}"
         for name, quantity, result in certificate.failures

@@ -13,7 +13,7 @@ import dvi_jax as dvi
 pytest.importorskip("flint")
 from dvi_jax.proof import checker as exact, comparison, components
 from dvi_jax.proof.comparison import Mistranslated, compare, random_points
-from dvi_jax.proof.components import Unsupported, program_of
+from dvi_jax.proof.components import NotAnalytic, program_of
 
 LONG_DOUBLE = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "proof.py"))["Extended"]
 TABLE = np.array([3.0, 0.0, -2.0, 1.0])
@@ -136,7 +136,7 @@ def test_the_list_is_the_function(name):
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_a_list_cannot_express_is_refused_by_name(name):
     function, word = REFUSED[name]
-    with pytest.raises(Unsupported, match=word):
+    with pytest.raises(NotAnalytic, match=word):
         program_of(function, (3,))
 
 
@@ -149,7 +149,7 @@ def of_module(name, spoiled):
 
 
 def of_numbers(name, spoiled):
-    return components.Scalar, name, spoiled
+    return components.ProgramNumber, name, spoiled
 
 
 def of_rule(name, rule):
@@ -176,7 +176,7 @@ def without_constants(right):
 
 def rounded(right):
     def scalar(self, other):
-        return right(self, other if isinstance(other, components.Scalar) else other + 1e-8)
+        return right(self, other if isinstance(other, components.ProgramNumber) else other + 1e-8)
 
     return scalar
 
@@ -234,9 +234,9 @@ def test_a_proof_stops_at_a_mistranslation(monkeypatch):
     energy = lambda q, p, epsilon: (p @ p + q @ q) / 2 + jnp.sum(jnp.cos(q))  # noqa: E731
     how = {"h": 0.1, "epsilon": 0.1, "domain": np.array([0.5])}
     assert dvi.bound_drift(energy, system, **how).per_step[0] > 0
-    right = components.Scalar.apply
+    right = components.ProgramNumber.apply
     spoiled = lambda x, name: right(x, "cos" if name == "sin" else name)  # noqa: E731
-    monkeypatch.setattr(components.Scalar, "apply", spoiled)
+    monkeypatch.setattr(components.ProgramNumber, "apply", spoiled)
     with pytest.raises(Mistranslated, match="the step of the system"):
         dvi.bound_drift(energy, system, **how)
 

@@ -3,25 +3,27 @@
 import functools
 import inspect
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ..base.checks import finite, positive, whole
+from ..base.keywords import checked_keywords
 from ..base.machine import processors
 from ..base.precision import refuse_double_without_x64
 from ..base.types import Interval
 from ..discover.functions.basis import check_step_size
 from ..discover.invariants.found import Discovery
 from ..discover.invariants.series import InvariantSeries
-from ..integration.arithmetic import DoubleDouble, FixedPoint, FloatingPoint
+from ..integration.arithmetic import Arithmetic, DoubleDouble, FixedPoint, FloatingPoint
 from ..integration.integrator import Integrator, chosen, only
+from ..methods import Method
 from ..methods.step import Equations
 from ..problem.system import System, check_system, of_problem
 from .comparison import compare, random_points
-from .components import Unsupported, program_of
+from .components import NotAnalytic, program_of
 from .confinement import confine
 from .rational import ExactInvariant
 from .result import DriftBound, tools
@@ -31,16 +33,25 @@ _RESIDUAL = {"float64": 2.0**-49, "pairs of float64": 2.0**-94}
 """Residual of an implicit equation that a solver accepts, relative to the largest momentum: eight
 units of round-off, and twice what `DoubleDouble` leaves out."""
 
-_GIVE_TIME = (
-    "give the interval in which steps begin, time=(t_begin, t_end). If the system has "
-    "slow_time=True, give an interval of τ = εt."
-)
-
 
 class ProofError(Exception):
     """Nothing is proved: the message says what failed, and for which states."""
 
 
+class BoundSettings(TypedDict, total=False):
+    """Keywords of `bound_drift` that describe the map, and when the search ends."""
+
+    h: Any
+    args: Any
+    method: Method | str | None
+    arithmetic: Arithmetic | None
+    integrator: Integrator | None
+    ratio: float
+    max_boxes: int
+    max_seconds: float
+
+
+@checked_keywords
 def bound_drift(
     found: Discovery | InvariantSeries | Callable | Sequence[Any],
     system: Any,
@@ -48,16 +59,9 @@ def bound_drift(
     epsilon: Any,
     domain: Any,
     time: Any = None,
-    h: Any = None,
     inside: Callable | None = None,
-    args: Any = None,
-    method: Any = None,
-    arithmetic: Any = None,
-    integrator: Integrator | None = None,
     change: float = 1e-3,
-    ratio: float = 2.0,
-    max_boxes: int = 2000,
-    max_seconds: float = 300.0,
+    **settings: Unpack[BoundSettings],
 ) -> DriftBound:
     r"""Prove how little invariants of the map change in a step, for all states of a domain.
 
@@ -85,10 +89,10 @@ def bound_drift(
       `DoubleDouble()` or `FixedPoint(quantum)`; in the latter each increment is rounded by at most
       quantum/2. `integrator`: an object that contains these two.
     - `change`: of an invariant, for which a number of steps is stated.
-    - `ratio`: the boxes are cut until no bound exceeds the largest change seen by this factor, or
-      the limits `max_boxes` or `max_seconds` are reached. After one second the search
-      continues in one process per processor. Their number has no effect on the result, unless
-      `max_seconds` is reached.
+    - `ratio`: the boxes are cut until no bound exceeds the largest change seen by this factor, by
+      default 2, or the limits `max_boxes` (2000) or `max_seconds` (300) are reached. After one
+      second the search continues in one process per processor. Their number has no effect on the
+      result, unless `max_seconds` is reached.
 
     **Returns** a `DriftBound`; ``print`` shows what is proved.
 
@@ -121,20 +125,21 @@ def bound_drift(
     # In float32 the bound of the rounding would be that of another program.
     refuse_double_without_x64("domain", np.dtype(float))
     positive("change", change)
-    whole("max_boxes", max_boxes)
-    positive("max_seconds", max_seconds)
-    if not finite("ratio", ratio) > 1:
+    max_boxes = whole("max_boxes", settings.get("max_boxes", 2000))
+    max_seconds = positive("max_seconds", settings.get("max_seconds", 300.0))
+    ratio = finite("ratio", settings.get("ratio", 2.0))
+    if not ratio > 1:
         raise ValueError(f"ratio must be larger than 1, got {ratio!r}.")
+    h, args = settings.get("h"), settings.get("args")
     system, _, _, h, args = of_problem(system, None, None, h, args, has_start=True)
     check_system(system, "bound_drift")
-    options = chosen(integrator, method=method, arithmetic=arithmetic)
-    integrator_used = only(options, "bound_drift", "method", "arithmetic")
-    if not isinstance(integrator_used.arithmetic, FloatingPoint | DoubleDouble | FixedPoint):
+    method, arithmetic = settings.get("method"), settings.get("arithmetic")
+    options = chosen(settings.get("integrator"), method=method, arithmetic=arithmetic)
+    integrator = only(options, "bound_drift", "method", "arithmetic")
+    if not isinstance(integrator.arithmetic, FloatingPoint | DoubleDouble | FixedPoint):
         raise ValueError(
             "arithmetic must be dvi.FloatingPoint(), dvi.DoubleDouble() or "
-            "dvi.FixedPoint(quantum), "
-            f"got {integrator_used.arithmetic!r}: bound_drift does not bound the rounding of "
-            "others."
+            f"dvi.FixedPoint(quantum), got {integrator.arithmetic!r}."
         )
     h = check_step_size(h)
     shape, (lower, upper) = _domain(domain, found)
@@ -142,10 +147,8 @@ def bound_drift(
     times = None if time is None else _interval("time", time)
     functions = _functions(found, system, time is not None)
     points = _points_of(shape, (lower, upper), times, strengths, h, inside)
-    step_map, programs = _step_of(system, integrator_used, shape, args, h, times, points)
-    digits = (
-        "pairs of float64" if isinstance(integrator_used.arithmetic, DoubleDouble) else "float64"
-    )
+    step_map, programs = _step_of(system, integrator, shape, args, h, times, points)
+    digits = "pairs of float64" if isinstance(integrator.arithmetic, DoubleDouble) else "float64"
     invariants = [_program(f"the invariant {name}", f, points[:5], 0) for f, name in functions]
     n, t = len(lower) // 2, ["input", len(lower)]
     certificate = {
@@ -180,9 +183,9 @@ def bound_drift(
         limits = {"max_boxes": max_boxes, "max_seconds": max_seconds, "workers": workers}
         try:
             result = search.subdivide(checker, identities, estimates, ratio=ratio, **limits)
-        except exact.Failed as error:
+        except exact.Failure as error:
             raise ProofError(f"{error}.") from None
-        per_step = [exact.up(b) for b in result.bounds]
+        per_step = [exact.round_up(b) for b in result.bounds]
         certificate |= {
             "per_step": [b.hex() for b in per_step],
             "rounding": [r.hex() for r in result.rounding],
@@ -199,7 +202,7 @@ def bound_drift(
     return DriftBound(
         per_step=tuple(per_step),
         rounding=tuple(result.rounding),
-        seen=tuple(result.seen),
+        seen=tuple(result.extremes),
         level=level,
         steps=certificate["steps"],
         start=start,
@@ -254,8 +257,7 @@ def _step_of(
     explicit = method.is_explicit(system, jnp.zeros(shape), args)
     if not (explicit or method.is_the_map):
         raise ValueError(
-            f"method must be explicit for this system or dvi.TypeII(), but {method!r} is implicit "
-            "for this system."
+            f"method must be dvi.TypeII() or explicit for this system, got {method!r}."
         )
     plain = System(system.H_D, system.force, system.perturbation)
     start, number = jnp.full(shape, 0.1), jnp.asarray(0.1)
@@ -278,8 +280,8 @@ def _step_of(
         first, later = (
             step_of_states(q, p, np.full(8, t), np.full(8, 0.1), jnp.asarray(h)) for t in (0.0, 1.0)
         )
-        if not np.allclose(first, later, rtol=1e-12, atol=1e-12, equal_nan=True):
-            raise ValueError(f"time is missing, but the map depends on the time: {_GIVE_TIME}")
+        is_constant = np.allclose(first, later, rtol=1e-12, atol=1e-12, equal_nan=True)
+        _require_time(is_constant, "the map")
     zero = jnp.zeros(())
     interval_or_map = (
         step_map if times else lambda q, p, t, *numbers: step_map(q, p, zero, *numbers)
@@ -309,41 +311,48 @@ def _spread(
 def _functions(invariants: Any, system: System, with_time: bool) -> list[tuple[Callable, str]]:
     """(function of (q, p, t, ε, h), formula) for each invariant."""
     if isinstance(invariants, Discovery):
-        if not invariants.count:
-            raise ValueError(
-                "found must contain at least one invariant, but this Discovery has none: discover "
-                "with more functions in the basis, or a lower order."
-            )
-        return _functions(list(invariants.invariants), system, with_time)
+        invariants = list(invariants.invariants)
     if isinstance(invariants, InvariantSeries):
-        if invariants.basis.uses_time and not with_time:
-            raise ValueError(
-                f"time is missing, but the invariant depends on the time: {_GIVE_TIME}"
-            )
+        _require_time(with_time or not invariants.basis.uses_time, "an invariant")
         if invariants.basis.uses_time and invariants.slow_time != system.slow_time:
             raise ValueError(
-                f"the invariant was found with slow_time={invariants.slow_time}, but system has "
-                f"slow_time={system.slow_time}."
+                f"found and system must have one slow_time, got {invariants.slow_time} and "
+                f"{system.slow_time}."
             )
         return [
-            (lambda q, p, t, e, h: invariants.evaluate(q, p, e, t), invariants.formula(terms=8))
+            (
+                lambda q, p, t, epsilon, h: invariants.evaluate(q, p, epsilon, t),
+                invariants.formula(terms=8),
+            )
         ]
     if isinstance(invariants, ExactInvariant):
-        return [(lambda q, p, t, e, h: invariants.evaluate(q, p, e, h, t), str(invariants))]
+        return [
+            (lambda q, p, t, epsilon, h: invariants.evaluate(q, p, epsilon, h, t), str(invariants))
+        ]
     if isinstance(invariants, str) or not (callable(invariants) or np.iterable(invariants)):
         raise TypeError(
-            "found must be a Discovery, an InvariantSeries, an ExactInvariant, a function (q, p, "
-            f"epsilon) or (q, p, epsilon, t), or a list of these, got {invariants!r:.200}."
+            "found must be a Discovery, InvariantSeries, ExactInvariant, a function (q, p, "
+            f"epsilon[, t]) or a list of these, got {invariants!r:.200}."
         )
     if callable(invariants):
         name = getattr(invariants, "__name__", type(invariants).__name__)
         if _takes(invariants, 4) and (with_time or not _takes(invariants, 3)):
-            return [(lambda q, p, t, e, h: invariants(q, p, e, t), name)]
-        return [(lambda q, p, t, e, h: invariants(q, p, e), name)]
+            return [(lambda q, p, t, epsilon, h: invariants(q, p, epsilon, t), name)]
+        return [(lambda q, p, t, epsilon, h: invariants(q, p, epsilon), name)]
     pairs = [pair for item in invariants for pair in _functions(item, system, with_time)]
     if not pairs:
-        raise ValueError(f"found must contain at least one invariant, got {invariants!r:.200}.")
+        raise ValueError(
+            "found must have at least one invariant, got none: use more functions or a lower order."
+        )
     return pairs
+
+
+def _require_time(fits: Any, subject: str) -> None:
+    if not fits:
+        raise ValueError(
+            f"{subject} depends on the time: give time=(t_begin, t_end) of the steps, of τ = εt "
+            "with slow_time=True."
+        )
 
 
 def _program(subject: str, function: Callable, points: list, ndim: int | None) -> dict[str, Any]:
@@ -360,8 +369,8 @@ def _program(subject: str, function: Callable, points: list, ndim: int | None) -
         raise ValueError(f"{subject} must return one number, got {description}.")
     try:
         program = program_of(function, *shapes)
-    except Unsupported as error:
-        raise Unsupported(f"{subject}: {error}") from None
+    except NotAnalytic as error:
+        raise NotAnalytic(f"{subject}: {error}") from None
     compare(subject, function, program, points)
     return program
 
@@ -382,16 +391,15 @@ def _domain(
     parts = domain if isinstance(domain, tuple) else (domain, domain)
     if len(parts) != 2:
         raise ValueError(
-            "domain must be half-widths, or a pair (domain of q, domain of p), got a tuple of "
-            f"length {len(parts)}: {domain!r:.200}."
+            f"domain must be an array or a pair for q and p, got {len(parts)} entries: "
+            f"{domain!r:.200}."
         )
     shapes = [np.shape(x)[1:] if np.ndim(x) > 1 else np.shape(x) for x in parts]
     discovery = invariants if isinstance(invariants, Discovery) else None
     shape = discovery.shape if discovery is not None else max(shapes, key=len)
     if not shape:
         raise ValueError(
-            "domain must be an array with the shape of q, unless found is a Discovery, got "
-            f"{domain!r}."
+            f"domain must be an array like q, unless found is a Discovery, got {domain!r}."
         )
     lower, upper = [], []
     for name, x in zip("qp", parts, strict=True):
@@ -399,14 +407,14 @@ def _domain(
         low, high = (x[0], x[-1]) if x.ndim > len(shape) else (-x, x)
         if np.shape(low) not in ((), shape) or (x.ndim > len(shape) and len(x) != 2):
             raise ValueError(
-                f"domain of {name} must be a half-width, an array of half-widths of shape {shape} "
-                f"like q, or an array (lower, upper) of shape {(2, *shape)}, got shape {x.shape}."
+                f"domain of {name} must be half-widths of shape () or {shape}, or (lower, upper) "
+                f"of shape {(2, *shape)}, got shape {x.shape}."
             )
         low, high = (np.broadcast_to(side, shape).ravel() for side in (low, high))
         if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
             raise ValueError(
-                f"domain of {name} must have finite lower bounds below finite upper bounds, got "
-                f"{low.tolist()} and {high.tolist()}."
+                f"domain of {name} must be finite, with lower < upper, got {low.tolist()} and "
+                f"{high.tolist()}."
             )
         lower.extend(low.tolist())
         upper.extend(high.tolist())
@@ -417,8 +425,7 @@ def _interval(name: str, ends: Any) -> tuple[float, float]:
     value, ends = ends, [finite(name, x) for x in (ends if np.ndim(ends) else (0.0, ends))]
     if len(ends) != 2 or not ends[0] < ends[1]:
         raise ValueError(
-            f"{name} must be a pair (least, largest) with least < largest, or one positive number "
-            f"x for the pair (0, x); got {value!r}."
+            f"{name} must be a positive number, or a pair with least < largest, got {value!r}."
         )
     low, high = ends
     return low, high

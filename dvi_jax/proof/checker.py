@@ -37,14 +37,14 @@ SMALLEST = 2.0**-1000  # added to each error, for results below the normal numbe
 LARGEST = 2.0**990  # of a number that is computed: its product with 2^27, in pairs, is finite
 
 
-class Failed(Exception):
+class Failure(Exception):
     """What could not be shown, and where."""
 
 
 def require(condition, message, box=()):
     if not condition:
         where = " × ".join(f"[{float(a):.6g}, {float(b):.6g}]" for a, b in box)
-        raise Failed(f"{message} on the box {where}" if box else message)
+        raise Failure(f"{message} on the box {where}" if box else message)
 
 
 def digest(certificate):
@@ -71,7 +71,7 @@ def whole(high, *values, low=0):
     return values
 
 
-def up(value):
+def round_up(value):
     """A fraction or a ball, rounded up to a float."""
     if isinstance(value, arb):
         return math.nextafter(float(value.upper()), math.inf) if value.is_finite() else math.inf
@@ -80,7 +80,7 @@ def up(value):
 
 
 def ball(value, radius=0):
-    return arb(value.numerator) / value.denominator + arb(0, up(Fraction(radius)))
+    return arb(value.numerator) / value.denominator + arb(0, round_up(Fraction(radius)))
 
 
 def series(name, point, length):
@@ -115,11 +115,11 @@ class Models:
     coefficients of P are integers. Products are rounded towards zero: small terms vanish."""
 
     def __init__(self, size, bits, orders):
-        self.bits, self.one, self.orders = bits, 1 << bits, range(orders + 1)
+        self.bits, self.unit, self.orders = bits, 1 << bits, range(orders + 1)
         self.ring = fmpz_mpoly_ctx.get([f"s{i}" for i in range(size)], "lex")
 
     def constant(self, value, error=0):  # exact arithmetic has no error
-        multiple = value * self.one
+        multiple = value * self.unit
         return self.ring.constant(math.floor(multiple)), int(multiple.denominator != 1)
 
     def sum(self, *terms):
@@ -130,8 +130,8 @@ class Models:
         error = norm[0] * b[1] + norm[1] * a[1] + a[1] * b[1]
         product = a[0] * b[0]
         signs = product // (norm[0] * norm[1] + 1)  # rounded down: −1 where a coefficient is < 0
-        integers = (product - (self.one - 1) * signs) // self.one
-        error += int(sum(map(abs, (product - self.one * integers).coeffs())))
+        integers = (product - (self.unit - 1) * signs) // self.unit
+        error += int(sum(map(abs, (product - self.unit * integers).coeffs())))
         return integers, (error >> self.bits) + 1
 
     def range(self, a):
@@ -141,30 +141,30 @@ class Models:
             span = (0, c) if any(powers) else (c, c)
             span = (-c, c) if any(k % 2 for k in powers) else span
             low, high = low + min(span), high + max(span)
-        return Fraction(int(low), self.one), Fraction(int(high), self.one)
+        return Fraction(int(low), self.unit), Fraction(int(high), self.unit)
 
     def bound(self, a):
         return max(map(abs, self.range(a)))
 
     def apply(self, name, a):
         """f(c + r) = Σ f⁽ᵏ⁾(c)/k! rᵏ, with Lagrange's remainder on the range of c + r."""
-        low, high = (value * self.one for value in self.range(a))
+        low, high = (value * self.unit for value in self.range(a))
         middle = int(low + high) // 2
-        values = arb(int(low)).union(arb(int(high))) / self.one
+        values = arb(int(low)).union(arb(int(high))) / self.unit
         expansion = series(name, values, len(self.orders) + 1)
-        radius = arb(int(max(high - middle, middle - low))) / self.one
-        remainders = [abs(expansion[k + 1]) * radius ** (k + 1) * self.one for k in self.orders]
+        radius = arb(int(max(high - middle, middle - low))) / self.unit
+        remainders = [abs(expansion[k + 1]) * radius ** (k + 1) * self.unit for k in self.orders]
         require(all(x.is_finite() for x in remainders), f"{name} is singular, or varies too much")
         small = (k for k in self.orders if remainders[k] < 1)
-        order = next(small, min(self.orders, key=lambda k: up(remainders[k])))
-        terms = series(name, arb(middle) / self.one, order + 1)
+        order = next(small, min(self.orders, key=lambda k: round_up(remainders[k])))
+        terms = series(name, arb(middle) / self.unit, order + 1)
         deviation, result = (a[0] - middle, a[1]), self.constant(Fraction(0))
         for k in range(order, -1, -1):
-            multiple = terms[k] * self.one
+            multiple = terms[k] * self.unit
             integer = int(multiple.mid().floor().unique_fmpz() or 0)
-            coefficient = self.ring.constant(integer), math.ceil(up(abs(multiple - integer)))
+            coefficient = self.ring.constant(integer), math.ceil(round_up(abs(multiple - integer)))
             result = self.sum(self.multiply(result, deviation), coefficient)
-        return result[0], result[1] + math.ceil(up(remainders[order]))
+        return result[0], result[1] + math.ceil(round_up(remainders[order]))
 
 
 class Rounding:
@@ -192,7 +192,7 @@ class Rounding:
         return self.inexact((a[0] * b[0], error), 1)
 
     def apply(self, name, a):
-        derivatives = series(name, a[0] + arb(0, up(a[1])), 2)
+        derivatives = series(name, a[0] + arb(0, round_up(a[1])), 2)
         require(derivatives[1].is_finite(), f"{name} is singular")
         return self.inexact((derivatives[0], abs(derivatives[1]) * a[1]), ULPS.get(name, 8))
 
@@ -203,11 +203,11 @@ class Identities:
 
     def __init__(self, size):
         self.ring = fmpq_mpoly_ctx.get([f"x{i}" for i in range(size + 40)], "lex")
-        self.one, self.values = self.ring.constant(1), {}
+        self.unit, self.values = self.ring.constant(1), {}
         self.x, self.free = self.ring.gens()[:size], list(self.ring.gens()[size:])
 
     def constant(self, value, error=0):
-        return self.ring.constant(fmpq(value.numerator, value.denominator)), self.one
+        return self.ring.constant(fmpq(value.numerator, value.denominator)), self.unit
 
     def sum(self, *terms):
         (a, b), *addends = terms
@@ -222,7 +222,7 @@ class Identities:
         if name == "inverse":
             return a[1], a[0]
         key = name, str(a[0]), str(a[1])
-        self.values[key] = self.values.get(key) or (self.free.pop(), self.one)
+        self.values[key] = self.values.get(key) or (self.free.pop(), self.unit)
         return self.values[key]
 
 
@@ -240,7 +240,7 @@ class Checker:
         require({type(self.slow), type(self.implicit)} == {bool}, "slow, implicit: true or false")
         self.h, self.spread = number(c["h"]), numbers(c["spread"], self.n, 0)
         require(self.h != 0, "h is zero")
-        self.quantum, self.accepted = (number(c[x], 0) for x in ("quantum", "accepted"))
+        self.quantum, self.residual_limit = (number(c[x], 0) for x in ("quantum", "accepted"))
         self.bits, self.orders = whole(400, c["bits"], low=8) + whole(60, c["orders"], low=1)
         self.arithmetic, self.unit = c["arithmetic"], UNITS[c["arithmetic"]]
         self.step, self.invariants, self.inside = c["step"], c["invariants"], c["inside"]
@@ -261,7 +261,7 @@ class Checker:
         algebra = Models(len(box), self.bits, self.orders)
         parts = [((a + b) / 2, (b - a) / 2) for a, b in box]
         parts[-1] = (Fraction(0), box[-1][1]) if box[-1][0] == 0 else parts[-1]
-        gens = [(s * algebra.one, 0) for s in algebra.ring.gens()]
+        gens = [(s * algebra.unit, 0) for s in algebra.ring.gens()]
         c = [[algebra.constant(value) for value in part] for part in parts]
         pairs = zip(gens, c, strict=True)
         return algebra, [algebra.sum(a, algebra.multiply(s, b)) for s, (a, b) in pairs]
@@ -290,8 +290,7 @@ class Checker:
         t1 = algebra.sum(t0, algebra.multiply(epsilon, h) if self.slow else h)
         return [*q0, *p0, t0, epsilon, h], [*end, t1, epsilon, h]
 
-    def change(self, k, step, algebra):
-        """I_k(Φ(x)) − I_k(x), from x before and after a step."""
+    def change(self, k, step, algebra):  # I_k(Φ(x)) − I_k(x)
         start_value, end_value = (run(self.invariants[k], x, algebra)[0] for x in step)
         return algebra.sum(end_value, (-start_value[0], start_value[1]))
 
@@ -307,7 +306,7 @@ class Checker:
     def is_identity(self, k):
         """Whether I_k is conserved exactly, for all x, t and ε."""
         algebra = Identities(2 * self.n + 2)
-        step = self.states_of_step([(x, algebra.one) for x in algebra.x], algebra)
+        step = self.states_of_step([(x, algebra.unit) for x in algebra.x], algebra)
         numerator, denominator = self.change(k, step, algebra)
         return numerator == 0 and denominator != 0
 
@@ -321,13 +320,15 @@ class Checker:
             # A Lipschitz constant of p1 → h·rate(q0, p1) in the maximum norm: the effect of errors.
             momenta = [(p1, arb(2) ** -60) for p1, _ in x[n:-2]]
             inputs = [*x[:n], *momenta, *x[-2:], exactly.constant(self.h)]
-            lipschitz = max(up(e) * 2.0**60 for _, e in run(self.step, inputs, exactly)[:n])
+            lipschitz = max(round_up(e) * 2.0**60 for _, e in run(self.step, inputs, exactly)[:n])
             require(lipschitz < 1 / 3, "the implicit step is not shown to be a contraction", box)
-            error = max((e + arb(up(self.accepted)) for _, e in start[n : 2 * n]), key=up)
+            error = max(
+                (e + arb(round_up(self.residual_limit)) for _, e in start[n : 2 * n]), key=round_up
+            )
             x[n:-2] = [(p1, error / (1 - arb(lipschitz))) for p1, _ in momenta]
             end = self.states_of_step(x, algebra)[1]
         changes = [run(function, end, exactly)[0][1] for function in self.invariants]
-        return list(map(up, changes)), [up(error) for _, error in end[: 2 * n]]
+        return list(map(round_up, changes)), [round_up(error) for _, error in end[: 2 * n]]
 
 
 def leaves(box, node):
@@ -383,7 +384,7 @@ def check_confined(checker, box, claim, weights, limit, reach):
 
 
 def check(certificate):
-    """What a certificate proves, as text. **Raises** `Failed` if it does not."""
+    """What a certificate proves, as text. **Raises** `Failure` if it does not."""
     c = certificate
     require(c["format"] == FORMAT, f"the format is not {FORMAT!r}")
     require(digest(c) == c["hash"], "the file was changed: its hash differs")
@@ -428,10 +429,9 @@ def statement(checker, count, *bounds):
         f"from {lower} to {upper}{' with inside ≥ 0' * bool(checker.inside['outputs'])}, all t"
         f"{', which is ε times the time,' * checker.slow} in {time} and all ε in {epsilon}:"
         f"\n- a step changes I by ≤ {per_step} in exact arithmetic"
-        f"\n- its rounding in {checker.arithmetic} changes I by ≤ {rounding} more, if functions "
-        "have the errors of the file and other operations are rounded to nearest"
-        f"{f', increments to multiples of {float(checker.quantum)!r}' * bool(checker.quantum)}"
-        f"{f', and a solver accepts residuals ≤ {float(checker.accepted):.3g}' * checker.implicit}"
+        f"\n- its rounding in {checker.arithmetic} to nearest changes I by ≤ {rounding} more"
+        f"{f', of increments to multiples of {float(checker.quantum)!r}' * bool(checker.quantum)}"
+        f"{f', for residuals ≤ {float(checker.residual_limit):.3g}' * checker.implicit}"
         "\n- not checked: whether these operations are those of a program (see holds_for)"
     )
 

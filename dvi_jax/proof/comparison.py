@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from .components import Unsupported
+from .components import NotAnalytic
 from .result import tools
 
 POINTS = 48
@@ -27,7 +27,7 @@ float32, the finest difference that matters, has up to 3e8."""
 _CANDIDATES = 4096
 
 
-class Mistranslated(Unsupported):
+class Mistranslated(NotAnalytic):
     """A list of operations that is not the function it was read from."""
 
 
@@ -75,7 +75,7 @@ def compare(subject: str, function: Callable, program: dict, points: Sequence[np
         try:
             start = [(exact.ball(Fraction(float(v))), exact.arb(0)) for v in x]
             enclosures = exact.run(program, start, algebra)
-        except (exact.Failed, ValueError, ArithmeticError):
+        except (exact.Failure, ValueError, ArithmeticError):
             continue  # a singularity, of which the proof speaks
         if not all(ball.is_finite() and error.is_finite() for ball, error in enclosures):
             continue

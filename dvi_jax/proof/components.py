@@ -38,11 +38,11 @@ _CALLS = ("pjit", "jit", "closed_call", "core_call", "remat", "checkpoint", "cus
           "custom_vjp_call", "custom_lin")  # fmt: skip
 
 
-class Unsupported(ValueError):
+class NotAnalytic(ValueError):
     """A function that has no list of operations; the message says what is in it."""
 
 
-class Program:
+class ScalarProgram:
     """Operations (name, operands), written one by one; equal ones are written once."""
 
     def __init__(self):
@@ -50,21 +50,21 @@ class Program:
         self._numbers: dict[tuple, int] = {}
         self.constants: dict[int, float] = {}
 
-    def write(self, name: str, *operands: Any) -> "Scalar":
+    def write(self, name: str, *operands: Any) -> "ProgramNumber":
         key = (name, *operands)
         if key not in self._numbers:
             self._numbers[key] = len(self.operations)
             self.operations.append([name, *operands])
-        return Scalar(self, self._numbers[key])
+        return ProgramNumber(self, self._numbers[key])
 
-    def constant(self, value: float) -> "Scalar":
+    def constant(self, value: float) -> "ProgramNumber":
         if not math.isfinite(value):
             return self.write("unknown", f"the constant {float(value)}")
         scalar = self.write("constant", float(value).hex())
         self.constants[scalar.index] = float(value)
         return scalar
 
-    def as_json(self, outputs: Sequence["Scalar"]) -> dict[str, Any]:
+    def as_json(self, outputs: Sequence["ProgramNumber"]) -> dict[str, Any]:
         """With the operations that the outputs need only."""
         indices = set()
         stack = [out.index for out in outputs]
@@ -77,10 +77,9 @@ class Program:
         primitives = {self.operations[i][1] for i in order if self.operations[i][0] == "unknown"}
         if primitives:
             names = ", ".join(sorted(primitives)).replace("select_n", "select_n (jnp.where)")
-            raise Unsupported(
-                f"operations of JAX that a proof does not allow: {names}. Allowed are sums, "
-                "products, quotients, powers with constant exponents, sinh, cosh, tanh, "
-                f"{', '.join(UNARY)}."
+            raise NotAnalytic(
+                f"a proof does not allow: {names} of JAX, only + − × /, constant powers, sinh, "
+                f"cosh, tanh, {', '.join(UNARY)}."
             )
         numbers = {old: i for i, old in enumerate(order)}
         operations = []
@@ -96,22 +95,22 @@ def _operands(operation: list[Any]) -> list[int]:
     return [] if name in ("input", "constant", "unknown") else arguments
 
 
-class Scalar:
+class ProgramNumber:
     """One number of a program, with Python's operators."""
 
     __slots__ = ("index", "program")
 
-    def __init__(self, program: Program, index: int):
+    def __init__(self, program: ScalarProgram, index: int):
         self.program, self.index = program, index
 
     @property
     def value(self) -> float | None:
         return self.program.constants.get(self.index)
 
-    def _scalar(self, other: Any) -> "Scalar":
-        return other if isinstance(other, Scalar) else self.program.constant(other)
+    def _scalar(self, other: Any) -> "ProgramNumber":
+        return other if isinstance(other, ProgramNumber) else self.program.constant(other)
 
-    def _constant(self, operation: Callable, other: "Scalar") -> "Scalar | None":
+    def _constant(self, operation: Callable, other: "ProgramNumber") -> "ProgramNumber | None":
         """The result for two constants, if it is a number of float64."""
         if self.value is None or other.value is None:
             return None
@@ -119,7 +118,7 @@ class Scalar:
         is_exact = abs(value) < 2**1000 and Fraction(float(value)) == value
         return self.program.constant(float(value)) if is_exact else None
 
-    def __add__(self, other: Any) -> "Scalar":
+    def __add__(self, other: Any) -> "ProgramNumber":
         other = self._scalar(other)
         if self.value == 0:
             return other
@@ -128,15 +127,15 @@ class Scalar:
         constant = self._constant(operator.add, other)
         return constant or self.program.write("sum", self.index, other.index)
 
-    def __neg__(self) -> "Scalar":
+    def __neg__(self) -> "ProgramNumber":
         if self.value is not None:
             return self.program.constant(-self.value)
         return self * -1.0
 
-    def __sub__(self, other: Any) -> "Scalar":
+    def __sub__(self, other: Any) -> "ProgramNumber":
         return self + -self._scalar(other)
 
-    def __mul__(self, other: Any) -> "Scalar":
+    def __mul__(self, other: Any) -> "ProgramNumber":
         other = self._scalar(other)
         for a, b in ((self, other), (other, self)):
             if a.value == 0 or b.value == 1:
@@ -144,7 +143,7 @@ class Scalar:
         constant = self._constant(operator.mul, other)
         return constant or self.program.write("multiply", self.index, other.index)
 
-    def __truediv__(self, other: Any) -> "Scalar":
+    def __truediv__(self, other: Any) -> "ProgramNumber":
         other = self._scalar(other)
         if self.value == 0 or other.value == 1:
             return self
@@ -154,13 +153,13 @@ class Scalar:
 
     __radd__, __rmul__ = __add__, __mul__
 
-    def __rsub__(self, other: Any) -> "Scalar":
+    def __rsub__(self, other: Any) -> "ProgramNumber":
         return self._scalar(other) - self
 
-    def __rtruediv__(self, other: Any) -> "Scalar":
+    def __rtruediv__(self, other: Any) -> "ProgramNumber":
         return self._scalar(other) / self
 
-    def power(self, n: int) -> "Scalar":
+    def power(self, n: int) -> "ProgramNumber":
         """selfⁿ: n − 1 products."""
         if n < 1:
             unit = self.program.constant(1.0)
@@ -170,13 +169,13 @@ class Scalar:
         square = (self * self).power(n // 2)
         return square * self if n % 2 else square
 
-    def apply(self, name: str) -> "Scalar":
+    def apply(self, name: str) -> "ProgramNumber":
         return self.program.write(name, self.index)
 
 
 def total(scalars: Sequence[Any]) -> Any:
     """The sum of several numbers as one operation, whose order is open."""
-    parts = [s for s in scalars if not (isinstance(s, Scalar) and s.value == 0)]
+    parts = [s for s in scalars if not (isinstance(s, ProgramNumber) and s.value == 0)]
     if len(parts) < 2:
         return parts[0] if parts else scalars[0]
     return parts[0].program.write("sum", *(part.index for part in parts))
@@ -188,11 +187,11 @@ def program_of(function: Callable, *shapes: tuple[int, ...]) -> dict[str, Any]:
     Returns ``{"operations": [[name, *operands], ...], "outputs": [...]}``: an operand is the number
     of an earlier operation; inputs and outputs are in the order of the raveled arrays.
 
-    **Raises** `Unsupported` for operations that are not analytic, or that depend on the values.
+    **Raises** `NotAnalytic` for operations that are not analytic, or that depend on the values.
     """
     structs = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes]
     closed_jaxpr = jax.make_jaxpr(function)(*structs)
-    program, inputs, offset = Program(), [], 0
+    program, inputs, offset = ScalarProgram(), [], 0
     for shape in shapes:
         size = int(np.prod(shape))
         numbers = [program.write("input", offset + i) for i in range(size)]
@@ -203,7 +202,7 @@ def program_of(function: Callable, *shapes: tuple[int, ...]) -> dict[str, Any]:
     return program.as_json(scalars)
 
 
-def _array(scalars: Sequence[Scalar], shape: tuple[int, ...]) -> np.ndarray:
+def _array(scalars: Sequence[ProgramNumber], shape: tuple[int, ...]) -> np.ndarray:
     array = np.empty(len(scalars), object)
     array[:] = scalars
     return array.reshape(shape)
@@ -220,14 +219,16 @@ def _concrete(x: Any) -> Any:
     return np.array([scalar.value for scalar in x.ravel()]).reshape(x.shape)
 
 
-def _symbolic(program: Program, x: Any) -> np.ndarray:
+def _symbolic(program: ScalarProgram, x: Any) -> np.ndarray:
     if _is_symbolic(x):
         return x
     values = np.asarray(x)
     return _array([program.constant(v) for v in values.ravel()], values.shape)
 
 
-def _evaluate(program: Program, jaxpr: Any, consts: Sequence[Any], inputs: Sequence[Any]) -> list:
+def _evaluate(
+    program: ScalarProgram, jaxpr: Any, consts: Sequence[Any], inputs: Sequence[Any]
+) -> list:
     environment: dict[Any, Any] = dict(zip(jaxpr.constvars, consts, strict=True))
     environment.update(zip(jaxpr.invars, inputs, strict=True))
 
@@ -240,7 +241,7 @@ def _evaluate(program: Program, jaxpr: Any, consts: Sequence[Any], inputs: Seque
     return [read(v) for v in jaxpr.outvars]
 
 
-def _apply(program: Program, equation: Any, values: list) -> list:
+def _apply(program: ScalarProgram, equation: Any, values: list) -> list:
     name, params = equation.primitive.name, equation.params
     inner = params.get("jaxpr") or params.get("call_jaxpr") or params.get("fun_jaxpr")
     if inner is not None and (name in _CALLS or "call" in name or "jit" in name):
@@ -291,7 +292,9 @@ def _obstacle(equation: Any, values: list) -> str:
     return ""
 
 
-def _arithmetic(program: Program, equation: Any, arrays: list, values: list) -> np.ndarray | None:
+def _arithmetic(
+    program: ScalarProgram, equation: Any, arrays: list, values: list
+) -> np.ndarray | None:
     """The output of an operation; None for one that has no list of operations."""
     name, params = equation.primitive.name, equation.params
     shape = equation.outvars[0].aval.shape
@@ -321,7 +324,7 @@ def _arithmetic(program: Program, equation: Any, arrays: list, values: list) -> 
     return None
 
 
-def _real_power(x: Scalar, y: float) -> Scalar:
+def _real_power(x: ProgramNumber, y: float) -> ProgramNumber:
     if y.is_integer():
         return x.power(int(y))
     if (2 * y).is_integer():
@@ -371,7 +374,7 @@ def _dot(dimensions: Any, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return out
 
 
-def _rearrange(program: Program, equation: Any, values: list) -> list:
+def _rearrange(program: ScalarProgram, equation: Any, values: list) -> list:
     """Apply an operation that only moves numbers to their places in a list."""
     name, params = equation.primitive.name, dict(equation.params)
     # Places are integers. At place 0 is the number with which a gather fills what is out of range.
@@ -392,7 +395,7 @@ def _rearrange(program: Program, equation: Any, values: list) -> list:
     return [_array([table[i] for i in np.asarray(x).ravel()], x.shape) for x in results]
 
 
-def _linear(program: Program, equation: Any, values: list) -> np.ndarray:
+def _linear(program: ScalarProgram, equation: Any, values: list) -> np.ndarray:
     """An operation that is linear in all its numbers, by its effect on each of them."""
     indices = _INDICES.get(equation.primitive.name, ())
     zeros = [np.asarray(v) if i in indices else np.zeros(np.shape(v)) for i, v in enumerate(values)]
@@ -416,7 +419,7 @@ def _linear(program: Program, equation: Any, values: list) -> np.ndarray:
     return _array(sums, shape)
 
 
-def _scan(program: Program, params: Any, values: list) -> list:
+def _scan(program: ScalarProgram, params: Any, values: list) -> list:
     """A loop of a fixed length, written out."""
     (nc, nk), length = scan_counts(params), params["length"]
     body, consts, carry = params["jaxpr"], values[:nc], values[nc : nc + nk]

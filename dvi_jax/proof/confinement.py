@@ -61,7 +61,7 @@ def confine(
                 shell, count = search.enclose(
                     checker, w, value + steps * rate, reach, quick, **limits
                 )
-            except exact.Failed as error:
+            except exact.Failure as error:
                 reason = str(error)
                 continue
             certificate |= {"level": [[x.hex() for x in weights], level.hex()]}

@@ -72,18 +72,15 @@ class DriftBound(eqx.Module):
         """
         exact, _ = tools()
         checker, x = exact.Checker(self.certificate), [*np.ravel(q0), *np.ravel(p0)]
-        if not np.size(q0) == np.size(p0) == checker.n:
+        if not np.size(q0) == np.size(p0) == checker.n or not np.isfinite(x).all():
             raise ValueError(
-                f"q0 and p0 must each have the size {checker.n}, as in the domain of the proof, "
-                f"got the sizes {np.size(q0)} and {np.size(p0)}."
+                f"q0 and p0 must each have {checker.n} finite numbers, got {q0!r} and {p0!r}."
             )
         low, high = map(float, checker.epsilon)
         epsilon = finite("epsilon", epsilon)
-        if not np.isfinite(x).all():
-            raise ValueError(f"q0 and p0 must be finite numbers, got {q0!r} and {p0!r}.")
         if not low <= epsilon <= high:
             raise ValueError(
-                f"epsilon={epsilon!r} is not in the interval [{low!r}, {high!r}] of the proof."
+                f"epsilon must be from {low!r} to {high!r} as in the proof, got {epsilon!r}."
             )
         if self.level is None:
             return 0
@@ -107,7 +104,7 @@ class DriftBound(eqx.Module):
         state.append(algebra.constant(checker.h))
         values = [exact.run(f, state, algebra)[0][0] for f in checker.invariants]
         value = sum(exact.ball(w) * v for w, v in zip(weights, values, strict=True))
-        margin = level + self.steps * rate - Fraction(exact.up(value))
+        margin = level + self.steps * rate - Fraction(exact.round_up(value))
         steps = max(0, math.floor(margin / rate)) if rate else (2**62 if margin >= 0 else 0)
         rate = checker.h * (Fraction(float(epsilon)) if checker.slow else 1)
         end = checker.time[0] if rate < 0 else checker.time[1]
@@ -173,7 +170,7 @@ def tools() -> tuple[Any, Any]:
         from . import checker, search
     except ImportError as error:
         raise ImportError(
-            f"proofs require python-flint, but the import failed ({error}): "
+            f"proofs require python-flint, but its import failed ({error}): "
             'pip install "dvi-jax[proof]"'
         ) from error
     return checker, search
