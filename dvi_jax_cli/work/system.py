@@ -75,10 +75,11 @@ class Source:
         names: Any = getattr(problem, "args", None)
         if values is None or problem is None:
             return names if values is None else values
-        cause = f"args of the type {type(names).__name__}: set them in its Python code"
-        cause = "no parameters" if names is None else cause
-        rule = f"no key args, because {problem.name} has {cause}"
-        require(isinstance(names, dict), "args", describe(values), rule)
+        if not isinstance(names, dict):
+            cause = f"args of the type {type(names).__name__}: set them in its Python code"
+            cause = "no parameters" if names is None else cause
+            rule = f"no key args, because {problem.name} has {cause}"
+            raise InputError("args", describe(values), rule)
         for name, value in values.items():
             require_name(f"args.{name}", name, names, defect="there is no such parameter")
             fits = isinstance(names[name], dict) or not isinstance(value, dict)
