@@ -39,17 +39,21 @@ def require(fits: Any, key: str, defect: str, rule: str) -> None:
 
 @contextmanager
 def as_input_error(
-    key: str, rule: str, *kinds: type[BaseException], defect: Callable[[Any], str] = str
+    key: str,
+    rule: str,
+    *kinds: type[BaseException],
+    prefix: str = "",
+    text: Callable[[Any], str] = str,
 ) -> Iterator[None]:
     """Within this an exception of these kinds, by default `ValueError` and `TypeError`, is an
-    `InputError` with the text that `defect` makes of it."""
+    `InputError` with the prefix and what `text` makes of it."""
     kinds = kinds or (ValueError, TypeError)
     try:
         yield
     except InputError:
         raise
     except kinds as error:
-        raise InputError(key, defect(error), rule) from error
+        raise InputError(key, prefix + text(error), rule) from error
 
 
 def require_name(
@@ -63,7 +67,7 @@ def require_name(
 def require_file(key: str, path: Path, rule: str) -> Path:
     """The absolute path of a file. **Raises** `InputError` if it does not exist."""
     # For a name that no file can have.
-    with as_input_error(key, rule, OSError, ValueError, defect=lambda e: f"{path}: {reason(e)}"):
+    with as_input_error(key, rule, OSError, ValueError, prefix=f"{path}: ", text=reason):
         path = path.resolve()
         require(path.is_file(), key, f"there is no file {path}", rule)
     return path

@@ -274,10 +274,10 @@ def test_a_fit_that_ended_at_a_bound_is_a_start():
     assert found.at_bounds == ["q0[0]"]
     dvi.Posterior(NEAR_0, data, found.params, bounds=ABOVE_1)  # its numbers are within bounds
     made = dvi.Posterior(NEAR_0, data, params, bounds=ABOVE_1)
-    u = bayes._start_of(made, found, ABOVE_1, None)
+    u = bayes.start_of(made, found, ABOVE_1, None)
     np.testing.assert_allclose(made.to_x(u), 1.1, rtol=1e-12)
     with pytest.raises(ValueError, match="not between its bounds"):
-        bayes._start_of(made, {"q0": np.ones(1)}, ABOVE_1, None)
+        bayes.start_of(made, {"q0": np.ones(1)}, ABOVE_1, None)
 
 
 @pytest.mark.slow
@@ -335,7 +335,7 @@ def fake(x, diverging=0, steps=3):
         "potential_energy": x**2 / 2, "diverging": lost, "num_steps": np.full(x.shape, steps),
         "mean_accept_prob": np.full(x.shape, 0.8),
     }  # fmt: skip
-    return bayes._collect(posterior, x[..., None], about, [], 1023)
+    return bayes.collect(posterior, x[..., None], about, [], 1023)
 
 
 def test_warnings():

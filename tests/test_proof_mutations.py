@@ -84,7 +84,7 @@ def intervals(c):
 
 def starts(c, count, rng):
     low, high = intervals(c).T
-    return rng.uniform(low, np.maximum(low, high), (count, len(low))).T  # −0.0 is below 0.0
+    return rng.uniform(low + 0.0, high + 0.0, (count, len(low))).T  # −0.0 is below 0.0
 
 
 def largest_change(c, k, rng, count=2000, rounds=12):

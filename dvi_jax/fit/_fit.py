@@ -202,11 +202,8 @@ def _result(run: FitRun, minimum: Minimum, check_curvature: bool) -> FitResult:
             curvature = _curvature_ratio(problem, u, r, J, spectrum)
     at_bounds = space.at_bounds(x, np.sqrt(np.diag(covariance)))
     free = ~np.isin(space.names, at_bounds)  # a parameter at its bound is known: it is there
-    words = [
-        in_words(d, list(space.names))
-        for d in free_directions
-        if np.abs(d[free]).max(initial=0) > 1e-6
-    ]
+    directions = [d for d in free_directions if np.abs(d[free]).max(initial=0) > 1e-6]
+    words = [in_words(d, list(space.names)) for d in directions]
     return FitResult(
         params=space.to_params(jnp.asarray(x)),
         x=x,
@@ -252,10 +249,8 @@ def _curvature_ratio(
     t = _PART * np.linalg.norm(r) / np.sqrt(squares * max(problem.degrees_of_freedom, 1))
     ratios = []
     for d, step, square in zip(D.T, t, squares, strict=True):
-        forward, backward = (
-            np.asarray(problem.evaluate(u + s * step * d).jacobian) for s in (1, -1)
-        )
-        ratios.append(
-            1 + (r @ ((forward - backward) @ d) / (2 * step * square) if step > 0 else 0.0)
-        )
+        points = (u + step * d, u - step * d)
+        forward, backward = (np.asarray(problem.evaluate(x).jacobian) for x in points)
+        change = r @ ((forward - backward) @ d)
+        ratios.append(1 + (change / (2 * step * square) if step > 0 else 0.0))
     return np.array(ratios)

@@ -202,7 +202,7 @@ def sample(
     if isinstance(start, FitResult) and start.status != "converged":
         notes.append(f"the chains start from a fit that did not converge: {start.status}.")
     limits = terms.get("bounds"), terms.get("priors")
-    mode, root = posterior.laplace(_start_of(posterior, start, *limits))
+    mode, root = posterior.laplace(start_of(posterior, start, *limits))
     centre, L = jnp.asarray(mode), jnp.asarray(root)
 
     def in_z(z):
@@ -221,9 +221,9 @@ def sample(
     z = mcmc.get_samples(group_by_chain=True)
     x = jax.jit(jax.vmap(jax.vmap(lambda z: posterior.to_x(centre + L @ z))))(z)
     statistics = mcmc.get_extra_fields(group_by_chain=True)
-    samples = _collect(posterior, x, statistics, notes, 2**depth - 1)
+    samples = collect(posterior, x, statistics, notes, 2**depth - 1)
     for text in samples.warnings:
-        warnings.warn(text, UserWarning, stacklevel=2)
+        warnings.warn(text, UserWarning, stacklevel=3)
     return samples
 
 
@@ -231,7 +231,7 @@ def _numpyro(part: str) -> Any:
     return package(f"numpyro.{part}", "dvi.sample", '"dvi-jax[bayes]"')
 
 
-def _start_of(posterior: Posterior, start: Any, bounds: PyTree, priors: PyTree) -> np.ndarray:
+def start_of(posterior: Posterior, start: Any, bounds: PyTree, priors: PyTree) -> np.ndarray:
     """The free vector of a fit or of a pytree.
 
     A number that the fit left at a bound, where u is infinite, starts as in `params`.
@@ -260,7 +260,7 @@ def _starts(potential: Callable[[Array], Array], chains: int, size: int, seed: i
     return jnp.zeros((chains, size))  # the mode, where it is positive
 
 
-def _collect(
+def collect(
     posterior: Posterior, x: Any, statistics: Any, notes: list[str], longest: int
 ) -> Samples:
     """Draws with their diagnostics."""

@@ -107,10 +107,8 @@ class Elimination:
                 self.combinations = [in_words(d, names) for d in spectrum.null_directions.T]
             i = self._weakest(u, J, keep, spectrum)
             remainder = keep & (np.arange(len(u)) != self.where[i])
-            u, keep = (
-                _eliminate(u, np.asarray(evaluation.jacobian), self.where[i], remainder),
-                remainder,
-            )
+            u = _eliminate(u, np.asarray(evaluation.jacobian), self.where[i], remainder)
+            keep = remainder
             name = self.library.names[i]
 
     def _refit(self, u: np.ndarray, keep: np.ndarray) -> tuple[Any, Evaluation, FIT_RESULTS]:

@@ -163,23 +163,12 @@ def identify(
     )
     setting = {"bounds": bounds, "priors": {**(priors or {}), KEY: guard}, "loss": loss}
     common: dict[str, Any] = {name: x for name, x in settings.items() if name in _OF_ALL}
-    first = {
-        "shooting": shooting,
-        "horizons": horizons,
-        **common,
-        **setting,
-        "check_curvature": False,
-        "throw": False,
-    }
+    first: dict[str, Any] = {**common, **setting, "shooting": shooting, "throw": False}
+    observations = arcs_with_errors if is_list else arcs_with_errors[0]
     full: Any = None
-    for change in ({}, {"horizons": None}):
+    for path in (horizons, None):
         # A fit of the beginning may diverge later; without a force nothing does.
-        full = fit(
-            full_model,
-            arcs_with_errors if is_list else arcs_with_errors[0],
-            start,
-            **{**first, **change},
-        )
+        full = fit(full_model, observations, start, horizons=path, check_curvature=False, **first)
         if full.status != "not_finite":
             break
     else:

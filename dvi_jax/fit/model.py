@@ -207,11 +207,9 @@ class Group(eqx.Module):
 
 def weigh(residual: Any, whiten: Any) -> Any:
     """Residuals in standard errors: by those, or by matrices L⁻¹ of covariances L Lᵀ."""
-    return (
-        residual * whiten
-        if whiten.ndim == residual.ndim
-        else jnp.einsum("...ij,...j->...i", whiten, residual)
-    )
+    if whiten.ndim == residual.ndim:
+        return residual * whiten
+    return jnp.einsum("...ij,...j->...i", whiten, residual)
 
 
 def make_groups(arcs: list[Observations], specs: list[dict[str, Any]]) -> list[Group]:
@@ -237,10 +235,8 @@ def make_groups(arcs: list[Observations], specs: list[dict[str, Any]]) -> list[G
         key = (arc.function, arc.values.shape[1:], arc.covariance is not None, size, spec["h"])
         kinds.setdefault(key, []).append(i)
     return [
-        make_group(
-            members, [arcs[i] for i in members], specs[members[0]], max(steps[i] for i in members)
-        )
-        for members in kinds.values()
+        make_group(n, [arcs[i] for i in n], specs[n[0]], max(steps[i] for i in n))
+        for n in kinds.values()
     ]
 
 

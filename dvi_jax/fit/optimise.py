@@ -258,10 +258,8 @@ class LeastSquaresStage:
             u = position.u
             threshold = tolerance * spread
             if has_moved:  # at a bound the free variable grows for ever, and nothing changes
-                position.still = (
-                    position.still + 1 if position.last - loss <= (tolerance * spread) ** 2 else 0
-                )
-                position.last = loss
+                is_still = position.last - loss <= threshold**2
+                position.still, position.last = position.still + 1 if is_still else 0, loss
             is_end = position.still >= 3 or (change <= threshold and position.rejected < 3)
             if not np.isfinite(change):
                 position.status = "stalled"
@@ -367,11 +365,8 @@ class ScalarStage:
         while not position.status and position.done < task.max_steps:
             old = z
             z, state, is_end = _descend(self.solver, self.core, self.divisor, z, setting(), state)
-            position.done, position.z, position.leaves = (
-                position.done + 1,
-                np.asarray(z),
-                _leaves(state),
-            )
+            position.done, position.z = position.done + 1, np.asarray(z)
+            position.leaves = _leaves(state)
             loss = float(state.f if fixed_steps else state.f_info.f)
             if not np.isfinite(loss) and position.done == 1:
                 return u, FIT_RESULTS.not_finite
@@ -381,10 +376,8 @@ class ScalarStage:
             if choose is None and not fixed_steps:
                 position.rejected = 0 if length > 0 else position.rejected + 1
                 if length > 0:
-                    position.still = (
-                        position.still + 1 if abs(position.last - loss) <= task.tolerance**2 else 0
-                    )
-                    position.last = loss
+                    is_still = abs(position.last - loss) <= task.tolerance**2
+                    position.still, position.last = position.still + 1 if is_still else 0, loss
                 if bool(is_end) or position.still >= 3:
                     position.status = "converged"
                 elif position.rejected >= _REJECTED_ON_LINE:
@@ -401,10 +394,8 @@ def _check_same(residual: Any, reference: Any) -> None:
     """Refuse a checkpoint whose residuals are not those of this model."""
     atol = 1e-6 * float(np.abs(reference).max(initial=0.0))
     difference = np.abs(np.subtract(residual, reference)).max(initial=0.0)
-    same_fit(
-        np.allclose(residual, reference, rtol=1e-6, atol=atol),
-        f"models, whose residuals (by {difference:.3g}),",
-    )
+    fits = np.allclose(residual, reference, rtol=1e-6, atol=atol)
+    same_fit(fits, f"models, whose residuals (by {difference:.3g}),")
 
 
 def _leaves(state: Any) -> list[np.ndarray]:

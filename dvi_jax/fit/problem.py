@@ -51,9 +51,8 @@ class Core(eqx.Module):
 
         arrays = jax.tree.map(jnp.asarray, (group.arcs, group.t0, group.ts, group.pick))
         if len(group.arcs) == 1:  # a batch of one takes twice the time of a single trajectory
-            return jax.tree.map(
-                lambda x: x[None], predict_arc(*jax.tree.map(lambda x: x[0], arrays))
-            )
+            values = predict_arc(*jax.tree.map(lambda x: x[0], arrays))
+            return jax.tree.map(lambda x: x[None], values)
         return jax.vmap(predict_arc)(*arrays)
 
     def weighted_residuals(self, u: Array, horizon: Any = np.inf) -> tuple[list[Array], list[Any]]:
@@ -169,9 +168,8 @@ def horizon_mask(group: Group, horizon: Any) -> Array:
 
 def _whiten(group: Group, predictions: Array, horizon: Any) -> Array:
     # First where, then subtract: a trajectory that fails after the horizon leaves no NaN behind.
-    difference = jnp.where(
-        horizon_mask(group, horizon), predictions - jnp.asarray(group.values), 0.0
-    )
+    mask = horizon_mask(group, horizon)
+    difference = jnp.where(mask, predictions - jnp.asarray(group.values), 0.0)
     return weigh(difference, jnp.asarray(group.whiten))
 
 
@@ -248,11 +246,8 @@ class FitProblem:
         if all(arc.t0 == arc.ts[0] for arc in self.data):
             moment += " (the first observation)"
         roots = {name.split("[")[0] for name in self.space.names}
-        sources = [
-            f"{n} "
-            f"{'fitted' if n in roots and isinstance(self.core.model, Model) else 'of the model'}"
-            for n in ("q0", "p0")
-        ]
+        roots &= {"q0", "p0"} if isinstance(self.core.model, Model) else set()
+        sources = [f"{n} {'fitted' if n in roots else 'of the model'}" for n in ("q0", "p0")]
         return f"initial state at {moment}: {', '.join(sources)}"
 
     def check_count(self) -> None:
@@ -292,14 +287,10 @@ class FitProblem:
                 arc, n = self.arcs[i], len(self.arcs[i].ts)
                 order = slice(None, None, 1 if arc is self.data[i] else -1)
                 values_of_arc = np.asarray(values[a, :n]).reshape(arc.values.shape)[order]
-                residuals_in_sigma = np.where(group.mask[a, :n], -np.asarray(r[a, :n]), np.nan)[
-                    order
-                ]
-                rows_of_arcs[i] = values_of_arc, residuals_in_sigma, str(status[a])
-        values_of_arc, residuals_in_sigma, names = (
-            list(column) for column in zip(*rows_of_arcs, strict=True)
-        )
-        return values_of_arc, residuals_in_sigma, names
+                residual = np.where(group.mask[a, :n], -np.asarray(r[a, :n]), np.nan)[order]
+                rows_of_arcs[i] = values_of_arc, residual, str(status[a])
+        values_of_arcs, residuals, names = map(list, zip(*rows_of_arcs, strict=True))
+        return values_of_arcs, residuals, names
 
     def rows_within(self, horizon: float) -> np.ndarray:
         """Which entries of the residual vector lie within a horizon; priors do."""
@@ -353,9 +344,8 @@ class FitProblem:
         arc = int(group.arcs[a])
         spec, observations = self.specs[arc], self.arcs[arc]
         q0, p0 = (jnp.asarray(spec[name], float) for name in ("q0", "p0"))
-        first = float(
-            jnp.max(jnp.abs(observations.function(observations.t0, q0, p0, spec.get("args"))))
-        )
+        values = observations.function(observations.t0, q0, p0, spec.get("args"))
+        first = float(jnp.max(jnp.abs(values)))
         self._refuse_start(
             f"{size[a, row]:.3g} for arc {arc} at t = {group.ts[a, row]:g}, {largest_observed}; at "
             f"the start, t = {group.t0[a]:g}, the model gives {first:.3g}, later at most "

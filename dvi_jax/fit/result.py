@@ -126,9 +126,8 @@ class FitResult:
         a worse one. NaN for data that are constant.
         """
         residual_sum = total = 0.0
-        for values_of_arc, model, errors in zip(
-            self.observed, self.predicted, self.errors, strict=True
-        ):
+        arcs = zip(self.observed, self.predicted, self.errors, strict=True)
+        for values_of_arc, model, errors in arcs:
             is_observed = np.isfinite(values_of_arc)
             sigma = np.where(is_observed, errors if self.has_errors else 1.0, np.inf)
             weight, values = 1 / sigma**2, np.where(is_observed, values_of_arc, 0.0)

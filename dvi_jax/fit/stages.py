@@ -175,10 +175,8 @@ def _horizon(
     threshold = _MISFIT_LIMIT * np.sqrt(
         np.mean(observed_entries(map(_scatter, problem.groups)) ** 2)
     )
-    times_since_start, misfit = (
-        observed_entries(span[..., None] for span in spans),
-        observed_entries(map(np.asarray, rows)),
-    )
+    times_since_start = observed_entries(span[..., None] for span in spans)
+    misfit = observed_entries(map(np.asarray, rows))
     minimum_count = 2 * max(problem.size - problem.space.count_of_priors, 1)
     horizon = full
     while horizon > at_least:

@@ -1,7 +1,6 @@
 """`bound_drift`: a proved bound of how much invariants change, for all starts of a domain."""
 
 import functools
-import inspect
 from collections.abc import Callable, Sequence
 from typing import Any, TypedDict, Unpack
 
@@ -13,6 +12,7 @@ from ..base.checks import finite, positive, whole
 from ..base.keywords import checked_keywords
 from ..base.machine import processors
 from ..base.precision import refuse_double_without_x64
+from ..base.signature import accepts
 from ..base.types import Interval
 from ..discover.functions.basis import check_step_size
 from ..discover.invariants.found import Discovery
@@ -277,18 +277,17 @@ def _step_of(
     step_of_states = jax.vmap(step_map, (0, 0, 0, 0, None))
     if times is None:
         q, p = np.random.default_rng(0).uniform(0.1, 0.2, (2, 8, *shape))
-        first, later = (
-            step_of_states(q, p, np.full(8, t), np.full(8, 0.1), jnp.asarray(h)) for t in (0.0, 1.0)
-        )
+        epsilon, step = np.full(8, 0.1), jnp.asarray(h)
+        first, later = (step_of_states(q, p, np.full(8, t), epsilon, step) for t in (0.0, 1.0))
         is_constant = np.allclose(first, later, rtol=1e-12, atol=1e-12, equal_nan=True)
         _require_time(is_constant, "the map")
     zero = jnp.zeros(())
-    interval_or_map = (
-        step_map if times else lambda q, p, t, *numbers: step_map(q, p, zero, *numbers)
-    )
-    program = _program(
-        "the step of the system", interval_or_map, points[: 6 if quantum else 5], None
-    )
+
+    def step_at_zero(q, p, t, *numbers):
+        return step_map(q, p, zero, *numbers)
+
+    step = step_map if times else step_at_zero
+    program = _program("the step of the system", step, points[: 6 if quantum else 5], None)
     return step_of_states, {
         "step": program,
         "implicit": not explicit,
@@ -336,7 +335,7 @@ def _functions(invariants: Any, system: System, with_time: bool) -> list[tuple[C
         )
     if callable(invariants):
         name = getattr(invariants, "__name__", type(invariants).__name__)
-        if _takes(invariants, 4) and (with_time or not _takes(invariants, 3)):
+        if accepts(invariants, 4) and (with_time or not accepts(invariants, 3)):
             return [(lambda q, p, t, epsilon, h: invariants(q, p, epsilon, t), name)]
         return [(lambda q, p, t, epsilon, h: invariants(q, p, epsilon), name)]
     pairs = [pair for item in invariants for pair in _functions(item, system, with_time)]
@@ -362,10 +361,8 @@ def _program(subject: str, function: Callable, points: list, ndim: int | None) -
     structs = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes]
     result = jax.eval_shape(function, *structs)
     if ndim is not None and getattr(result, "ndim", None) != ndim:
-        kind = type(result).__name__
-        description = (
-            f"an array of shape {result.shape}" if hasattr(result, "shape") else f"a {kind}"
-        )
+        kind = f"a {type(result).__name__}"
+        description = f"shape {result.shape}" if hasattr(result, "shape") else kind
         raise ValueError(f"{subject} must return one number, got {description}.")
     try:
         program = program_of(function, *shapes)
@@ -373,15 +370,6 @@ def _program(subject: str, function: Callable, points: list, ndim: int | None) -
         raise NotAnalytic(f"{subject}: {error}") from None
     compare(subject, function, program, points)
     return program
-
-
-def _takes(function: Callable, count: int) -> bool:
-    """Whether a function can be called with so many arguments."""
-    try:
-        inspect.signature(function).bind(*range(count))
-    except TypeError:
-        return False
-    return True
 
 
 def _domain(

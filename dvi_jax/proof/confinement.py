@@ -32,9 +32,8 @@ def confine(
     """
     exact, search = tools()
     checker.bits = exact.LEVEL
-    per_step, rounding, reach = (
-        [exact.number(x) for x in certificate[name]] for name in ("per_step", "rounding", "reach")
-    )
+    names = ("per_step", "rounding", "reach")
+    per_step, rounding, reach = ([exact.number(x) for x in certificate[name]] for name in names)
     start, limit = _start(checker)
     certificate["start"] = start.hex()
     reason = "no combination of the invariants is larger all around the domain than inside"
@@ -168,9 +167,8 @@ def _points(checker: Any, inside: Any, shape: Any, reach: list) -> tuple[np.ndar
     border_points = rng.uniform(low, high, (200000, len(low)))
     border_points = border_points[np.asarray(keep(border_points))]
     neighbours = border_points + rng.choice([-1.0, 1.0], border_points.shape) * wide
-    is_outside = (
-        ~np.asarray(keep(neighbours)) | (neighbours < low).any(1) | (neighbours > high).any(1)
-    )
+    is_outside = (neighbours < low).any(1) | (neighbours > high).any(1)
+    is_outside |= ~np.asarray(keep(neighbours))
     return border_points[:4000], neighbours[is_outside][:40000]
 
 

@@ -86,10 +86,8 @@ class DriftBound(eqx.Module):
             return 0
         start = exact.number(self.certificate["start"])
         point = [Fraction(float(v)) for v in (*x, start, epsilon)]
-        state, algebra = (
-            [(exact.ball(v), exact.ball(Fraction(0))) for v in point],
-            exact.Rounding(0),
-        )
+        algebra, zero = exact.Rounding(0), exact.ball(Fraction(0))
+        state = [(exact.ball(v), zero) for v in point]
         sides = zip(point, checker.lower, checker.upper, strict=False)
         margins = [g for g, _ in exact.run(checker.inside, state, algebra)]
         if not (all(a <= v <= b for v, a, b in sides) and all(g >= 0 for g in margins)):

@@ -395,9 +395,9 @@ def enclose(
             if borders:  # first the domain itself is cut out
                 (axis, where), *borders_left = borders
                 # The part outside of a border has no further ones.
-                left, right = (
-                    ([], borders_left) if where == checker.lower[axis] else (borders_left, [])
-                )
+                left, right = borders_left, []
+                if where == checker.lower[axis]:
+                    left, right = right, left
             first, second = halves(box, axis, where)
             tree[i] = ["cut", axis, float(first[axis][1]).hex(), None, None]
             add(first, 2 * number, left, tree[i], 3)

@@ -23,7 +23,7 @@ def read_columns(path: Path, key: str = "data.file") -> dict[str, np.ndarray]:
     require_file(key, path, "the path of a CSV or npz file")
     rule = "a CSV file in UTF-8, or an npz file that numpy.savez wrote"
     kinds = OSError, ValueError, EOFError, csv.Error, zipfile.BadZipFile
-    with as_input_error(key, rule, *kinds, defect=lambda e: f"{path} cannot be read: {e}"):
+    with as_input_error(key, rule, *kinds, prefix=f"{path} cannot be read: "):
         return _npz(path) if path.suffix == ".npz" else _csv(path, key)
 
 

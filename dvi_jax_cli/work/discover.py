@@ -84,7 +84,7 @@ def _arguments(file: DiscoverFile, source: Source) -> tuple[dict[str, Any], Any]
     shape = low[0].shape
     basis = parse_basis(file.basis, source.loader)
     rule = f"a basis that can be used for q of shape {shape}"
-    with as_input_error("basis", rule, defect=source.error_line):
+    with as_input_error("basis", rule, text=source.error_line):
         size = basis.for_shape(shape).size
     count = file.samples.count or max(_MIN_SAMPLES, _SAMPLES_PER_FUNCTION * size)
     rule = f"at least {2 * size}, twice the number of functions"
@@ -119,7 +119,7 @@ def box_of(table: Any, key: str, source: Source) -> list[tuple[np.ndarray, ...]]
         pair = [np.asarray(x, float) for x in (corner.q, corner.p)]
         defect = f"q has shape {pair[0].shape} and p has shape {pair[1].shape}"
         rule = f"numbers, or arrays of the shape of q, {shape}"
-        with as_input_error(f"{key}.{name}", rule, defect=lambda _, text=defect: text):
+        with as_input_error(f"{key}.{name}", rule, text=lambda _, text=defect: text):
             corners.append(tuple(np.broadcast_to(x, shape) for x in pair))
     is_below = all((a < b).all() for a, b in zip(*corners, strict=True))
     defect = f"it is not below {key}.high"

@@ -192,8 +192,9 @@ def _observations(
         return dvi.Observations(ts, observed, observe, sigma=sigma, t0=t0), names
     except (TypeError, ValueError) as error:
         key = "data.time" if str(error).startswith("ts") else "data"
-        rule = f"finite times in order in the column {table.time}, values that fit observe, "
-        rule += "positive standard errors"
+        rule = (
+            f"finite times in order in the column {table.time}, values that fit observe, sigma > 0"
+        )
         raise InputError(key, str(error), rule) from None
 
 

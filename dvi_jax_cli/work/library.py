@@ -24,7 +24,7 @@ def library_tables(name: str | None = None) -> tuple[str, list[TextTable]]:
     require_name("NAME", name, systems.LIBRARY)
     make = systems.LIBRARY[name]
     rule = "a system whose extras are installed"
-    with as_input_error("NAME", rule, ImportError, defect=lambda error: f"{name}: {error}"):
+    with as_input_error("NAME", rule, ImportError, prefix=f"{name}: "):
         problem = make()
     heading = f"{inspect.getdoc(make)}\n\nEquations: {_first_line(problem.system.H_D)}"
     for kind in ("force", "perturbation"):

@@ -46,11 +46,10 @@ class Loader:
         module = importlib.util.module_from_spec(spec)
         sys.modules[spec.name] = module  # dataclasses and pickle look their module up
         sys.path.insert(0, str(path.parent))  # so that it may import its neighbours
+        prefix, rule = f"{text!r} cannot be imported: ", "a file that Python can import"
+        kinds, line = (Exception, SystemExit), lambda error: in_one_line(error, path)
         try:
-            with as_input_error(
-                *(key, "a file that Python can import", Exception, SystemExit),
-                defect=lambda error: f"{text!r} cannot be imported: {in_one_line(error, path)}",
-            ):
+            with as_input_error(key, rule, *kinds, prefix=prefix, text=line):
                 spec.loader.exec_module(module)
         finally:
             sys.path.remove(str(path.parent))

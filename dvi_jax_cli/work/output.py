@@ -63,9 +63,8 @@ class FolderReport(Report):
         rule = "a directory that does not exist or is empty; with --force, one to write into"
         folder, is_new = self.folder, False
         try:
-            with as_input_error(
-                self.key, rule, OSError, ValueError, defect=lambda e: f"{folder}: {reason(e)}"
-            ):
+            kinds = OSError, ValueError
+            with as_input_error(self.key, rule, *kinds, prefix=f"{folder}: ", text=reason):
                 is_new = not folder.exists()
                 if is_new:
                     folder.mkdir(parents=True)

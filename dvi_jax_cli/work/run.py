@@ -58,9 +58,8 @@ def run_file(
             jax.block_until_ready(result)
         seconds = time.perf_counter() - began
     with report.writing():
-        observed, conservation = (
-            observe(run, observables[x], result.observed[x]) for x in ("own", "always")
-        )
+        changes = [observe(run, observables[x], result.observed[x]) for x in ("own", "always")]
+        observed, conservation = changes
         _describe(report, result, observed, seconds)
         arrays = {name: np.asarray(getattr(result, name)) for name in ("ts", "qs", "ps", "hs")}
         values = {f"observed/{name}": np.asarray(result.observed["own"][name]) for name in observed}
@@ -86,8 +85,8 @@ def _arguments(file: RunFile, source: Source) -> dict[str, Any]:
     if source.jd is not None:  # a run that is compared with the ephemeris must not leave it
         ts = file.lattice.times if run["h"] is None else (0.0, run["h"] * run["num_steps"])
         span = float(ts[-1] - ts[0])
-        text, rule = f"the run ends {span:g} days after its start", "a shorter run or another date"
-        with as_input_error("steps", rule, ValueError, defect=lambda error: f"{text}: {error}"):
+        prefix = f"the run ends {span:g} days after its start: "
+        with as_input_error("steps", "a shorter run or another date", prefix=prefix):
             check_covered(source.jd + span)
     return run
 

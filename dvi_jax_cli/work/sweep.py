@@ -87,12 +87,9 @@ def sweep_cost(path: str | Path) -> Report:
 def _check_folder(folder: Path, key: str, resume: bool) -> None:
     """Fail early if the path holds other data, or this sweep without --resume."""
 
-    def defect(error):  # ValueError: a name that no directory can have
-        is_store = isinstance(error, dvi.StoreError | OSError)
-        kind = "exists, but is not the store of a sweep" if is_store else "cannot be used"
-        return f"{folder} {kind}: {error}"
-
-    with as_input_error(key, "a new directory", dvi.StoreError, OSError, ValueError, defect=defect):
+    kinds = dvi.StoreError, OSError, ValueError  # of a name that no directory can have
+    prefix = f"{folder} is not the store of a sweep: "
+    with as_input_error(key, "a new directory", *kinds, prefix=prefix):
         if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
             return
         result = dvi.open_sweep(folder)
@@ -250,7 +247,7 @@ def _initial_conditions(file: SweepFile, source: Source) -> dict[str, Any]:
     start = _start(file.start, source)
     t0, args = select(file.t0, 0), select(source.args, 0)
     rule = "an H (t, q, p, args) that fits the box and args"
-    with as_input_error("start", rule, Exception, defect=source.error_line):
+    with as_input_error("start", rule, Exception, text=source.error_line):
         q0, p0, *start_args = start.at(jnp.zeros((), jnp.int32), t0, args)
     source.check_start(np.asarray(q0), np.asarray(p0), start_args[0] if start_args else args)
     return {"start": start}

@@ -75,10 +75,11 @@ class Source:
         names: Any = getattr(problem, "args", None)
         if values is None or problem is None:
             return names if values is None else values
-        cause = f"args of the type {type(names).__name__}: set them in its Python code"
-        cause = "no parameters" if names is None else cause
-        rule = f"no key args, because {problem.name} has {cause}"
-        require(isinstance(names, dict), "args", describe(values), rule)
+        if not isinstance(names, dict):
+            cause = f"args of the type {type(names).__name__}: set them in its Python code"
+            cause = "no parameters" if names is None else cause
+            rule = f"no key args, because {problem.name} has {cause}"
+            raise InputError("args", describe(values), rule)
         for name, value in values.items():
             require_name(f"args.{name}", name, names, defect="there is no such parameter")
             fits = isinstance(names[name], dict) or not isinstance(value, dict)
@@ -126,7 +127,7 @@ class Source:
     def epsilon(self) -> Any:
         """The strength of the perturbation in the file, or else of the system."""
         rule = "a number: the system has a force or a perturbation (0.0: unperturbed)"
-        with as_input_error("epsilon", rule, ValueError, defect=lambda _: NO_KEY):
+        with as_input_error("epsilon", rule, ValueError, text=lambda _: NO_KEY):
             return self.system.strength(getattr(self.file, "epsilon", None))
 
 
@@ -145,10 +146,9 @@ def find_source(file: SystemFile, folder: Path) -> Source:
         return _of_the_library(file, loader)
     target, defect = loader.load("system", name), repr(name)
     if callable(target) and not isinstance(target, type | dvi.System) and accepts(target, 0):
-        with as_input_error(
-            *("system", "a function that returns a system", Exception, SystemExit),
-            defect=lambda error: f"{name!r} failed: {in_one_line(error, *loader.modules)}",
-        ):
+        prefix, rule = f"{name!r} failed: ", "a function that returns a system"
+        kinds, text = (Exception, SystemExit), lambda error: in_one_line(error, *loader.modules)
+        with as_input_error("system", rule, *kinds, prefix=prefix, text=text):
             target, defect = target(), f"the result of {name!r}"
     if isinstance(target, systems.Problem):
         return Source(file, loader, target, target.system)
@@ -165,15 +165,11 @@ def find_source(file: SystemFile, folder: Path) -> Source:
 
 def _of_a_ring(file: SystemFile, loader: Loader) -> Source:
     require(file.ring is not None, "ring", NO_KEY, 'a table [ring] with file = "…"')
-    require(
-        file.method in ("TypeII", "Turn"), "method", describe(file.method), "no method for a ring"
-    )
-    ring = file.ring
+    ring, is_turn = file.ring, file.method in ("TypeII", "Turn")
+    require(is_turn, "method", describe(file.method), "no method for a ring")
     assert ring is not None
-    with as_input_error(
-        *("ring.file", "a lattice file that pyAT can read", Exception),
-        defect=lambda error: f"{ring.file!r} cannot be read: {in_one_line(error)}",
-    ):
+    prefix, rule = f"{ring.file!r} cannot be read: ", "a lattice file that pyAT can read"
+    with as_input_error("ring.file", rule, Exception, prefix=prefix, text=in_one_line):
         read = rings.load(loader.folder / ring.file, symplectic=ring.symplectic)
     record = rings.problem(read, planes=ring.planes, delta=ring.delta)
     units = {"q": "m", "t": "turns"}

@@ -102,14 +102,11 @@ def read_file(file: Path, model: type[T]) -> tuple[T, dict[str, Any]]:
     **Raises** `InputError` for a missing or unreadable file, TOML that does not parse, an
     unknown key and a value of the wrong type or out of range.
     """
-    key = str(file)
-    with as_input_error(
-        key, "a TOML file in UTF-8", OSError, UnicodeDecodeError, defect=_unreadable
-    ):
+    key, kinds = str(file), (OSError, UnicodeDecodeError)
+    with as_input_error(key, "a TOML file in UTF-8", *kinds, text=_unreadable):
         text = file.read_text(encoding="utf-8-sig")  # some editors begin with a BOM
-    # RecursionError: thousands of brackets.
-    kinds = ValueError, RecursionError
-    with as_input_error(key, "https://toml.io", *kinds, defect=lambda e: f"it is not TOML: {e}"):
+    kinds = ValueError, RecursionError  # of thousands of brackets
+    with as_input_error(key, "https://toml.io", *kinds, prefix="it is not TOML: "):
         raw = tomllib.loads(text)
     try:
         return model.model_validate(raw), raw
