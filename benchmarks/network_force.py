@@ -31,7 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import dvi_jax as dvi
-from dvi_jax.fit.optimise import Evaluation, LeastSquaresStage, Task
+from dvi_jax.fit.optimise import Evaluation, LeastSquaresStage, StageTask
 from dvi_jax.fit.solvers import levenberg_marquardt
 
 jax.config.update("jax_enable_x64", True)
@@ -195,7 +195,7 @@ def _fit_reference(field, seed, steps):
     for number, horizon in enumerate((*HORIZONS, np.inf)):
         last = horizon == np.inf
         taken = []
-        task = Task(
+        task = StageTask(
             number,
             horizon,
             max_steps=left if last else min(IN_STAGE, left),

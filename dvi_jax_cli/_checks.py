@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from ._errors import InputError, require, require_file, require_name
+from ._errors import as_input_error, require, require_file, require_name
 from ._group import CHECKING, START, app
 from ._names import CHECKS, FILES, METHODS, SYSTEMS, completer
 from ._runs import Force
@@ -74,11 +74,15 @@ def verify(
     certificate: Annotated[
         Path, typer.Argument(metavar="CERTIFICATE", help="A file of DriftBound.save.")
     ],
+    max_seconds: Annotated[
+        float, typer.Option(min=0.0, help="Time after which the check is given up.")
+    ] = 60.0,
 ) -> None:
     """Check a certificate of `bound_drift` with a small program of its own.
 
-    It evaluates every box of the proof again, with python-flint and without JAX. Exit code 0: the
-    bounds are proved. 1: they are not; the message says where. 2: there is no such file.
+    It evaluates every box of the proof again, with python-flint and without JAX, in at most 1 GiB.
+    Exit code 0: the bounds are proved. 1: they are not; the message says where. 2: there is no such
+    file.
 
     Examples
         dvi-jax verify bound.json
@@ -86,7 +90,7 @@ def verify(
     require_file("CERTIFICATE", certificate, "a file that DriftBound.save wrote")
     from .work.verify import verify_certificate
 
-    contents, message = verify_certificate(certificate)
+    contents, message = verify_certificate(certificate, max_seconds)
     if not message:
         session.line(f"proved: {contents['proved']}")
     session.finish(contents, message)
@@ -110,10 +114,9 @@ def paper(
     """
     from dvi_jax.testing.paper import reproduce
 
-    try:
+    kinds = FileExistsError, NotADirectoryError, PermissionError
+    with as_input_error("--out", "a new directory, or --force", *kinds):
         reproduction = reproduce(out, force, console(stderr=session.as_json))
-    except (FileExistsError, NotADirectoryError, PermissionError) as error:
-        raise InputError("--out", str(error), "a new directory, or --force") from None
     verdicts = json.loads((reproduction.out / "verdicts.json").read_text(encoding="utf-8"))
     session.finish({"folder": str(reproduction.out), **verdicts})
 
@@ -152,13 +155,11 @@ def certify(
 
     is_single = not (quick and method)
     require(is_single, "--quick", "it is given together with --method", "only one of the two")
-    try:
+    rule = "names as in dvi-jax certify --help, and a page that can be written"
+    with as_input_error("certify", rule):
         page = None if out is None else page_for(out)
         with progress_bar("certifying") as bar:
             certificate = certify(QUICK if quick else method or None, check or None, bar)
-    except (ValueError, TypeError) as error:
-        rule = "names as in dvi-jax certify --help, and a page that can be written"
-        raise InputError("certify", str(error), rule) from error
     failures = [
         f"{name}, {quantity}: {result.verdict}, allowed {result.allowed}. {result.detail}"
         for name, quantity, result in certificate.failures

@@ -2,7 +2,8 @@
 
 import difflib
 import reprlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,25 @@ def require(fits: Any, key: str, defect: str, rule: str) -> None:
         raise InputError(key, defect, rule)
 
 
+@contextmanager
+def as_input_error(
+    key: str,
+    rule: str,
+    *kinds: type[BaseException],
+    prefix: str = "",
+    text: Callable[[Any], str] = str,
+) -> Iterator[None]:
+    """Within this an exception of these kinds, by default `ValueError` and `TypeError`, is an
+    `InputError` with the prefix and what `text` makes of it."""
+    kinds = kinds or (ValueError, TypeError)
+    try:
+        yield
+    except InputError:
+        raise
+    except kinds as error:
+        raise InputError(key, prefix + text(error), rule) from error
+
+
 def require_name(
     key: str, name: str, names: Iterable[str], rule: str = "{}", defect: str = ""
 ) -> None:
@@ -46,12 +66,10 @@ def require_name(
 
 def require_file(key: str, path: Path, rule: str) -> Path:
     """The absolute path of a file. **Raises** `InputError` if it does not exist."""
-    try:
+    # For a name that no file can have.
+    with as_input_error(key, rule, OSError, ValueError, prefix=f"{path}: ", text=reason):
         path = path.resolve()
-        is_file = path.is_file()
-    except (OSError, ValueError) as error:  # a name that no file can have
-        raise InputError(key, f"{path} cannot be opened: {reason(error)}", rule) from None
-    require(is_file, key, f"there is no file {path}", rule)
+        require(path.is_file(), key, f"there is no file {path}", rule)
     return path
 
 

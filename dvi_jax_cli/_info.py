@@ -9,7 +9,7 @@ from importlib import metadata
 from typing import Any
 
 from ._names import EXTRAS, VERSION
-from ._show import Table
+from ._show import TextTable
 
 PACKAGES = (
     *("jax", "jaxlib", "equinox", "optax", "optimistix"),
@@ -67,7 +67,7 @@ def _extra(name: str) -> dict[str, Any]:
     return {"missing": modules, "install": f'pip install "dvi-jax[{name}]"' if modules else None}
 
 
-def tables(information: dict[str, Any]) -> list[Table]:
+def tables(information: dict[str, Any]) -> list[TextTable]:
     """The collected information as tables."""
     versions = [[name, v or "not installed"] for name, v in information["versions"].items()]
     versions.append(["python", f"{information['python']} ({information['executable']})"])
@@ -89,10 +89,10 @@ def tables(information: dict[str, Any]) -> list[Table]:
         status = f"missing: {', '.join(extra['missing'])}" if extra["missing"] else "installed"
         extras.append([name, status, extra["install"] or ""])
     candidates = [
-        Table("Versions", ["package", "version"], versions),
-        Table("Machine", ["", ""], machine),
-        Table("Devices", ["number", "kind", "platform", "memory"], devices),
-        Table("Environment", ["name", "value"], [[k, v] for k, v in information["flags"].items()]),
-        Table("Extras", ["name", "", "to install it"], extras),
+        TextTable("Versions", ["package", "version"], versions),
+        TextTable("Machine", ["", ""], machine),
+        TextTable("Devices", ["number", "kind", "platform", "memory"], devices),
+        TextTable("Environment", ["name", "value"], [*map(list, information["flags"].items())]),
+        TextTable("Extras", ["name", "", "to install it"], extras),
     ]
     return [table for table in candidates if table.rows]

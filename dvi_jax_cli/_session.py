@@ -90,12 +90,8 @@ class Session:
         if place := contents.get("folder") or contents.get("store"):
             self.note(f"written to {place}")
         seconds, count = time.perf_counter() - self._began, len(self._compile_seconds)
-        part = (
-            f"; XLA compiled {count} programs in {sum(self._compile_seconds):.1f} s"
-            if count
-            else ""
-        )
-        self.note(f"{seconds:.1f} s in all{part}")
+        compilation = f"; XLA compiled {count} programs in {sum(self._compile_seconds):.1f} s"
+        self.note(f"{seconds:.1f} s in all{compilation if count else ''}")
         if self.as_json:
             error = {"error": {"kind": "failed", "message": failure}} if failure else {}
             print_json({**contents, **error})
@@ -132,11 +128,9 @@ class Session:
         lines = str(error).strip().splitlines() or ["(without a message)"]
         if len(lines) > 12:
             lines[12:] = [f"… ({len(lines) - 12} more lines)"]
-        remedy = (
-            "The same command with --debug shows where it comes from; please report it with that."
-        )
-        if self.debug:
-            remedy = "Please report it, with the traceback above."
+        remedy = "Please report it, with the traceback above."
+        if not self.debug:
+            remedy = "The same command with --debug shows where it comes from; please report that."
         cause = "\n".join([f"{type(error).__name__}: {lines[0]}", *lines[1:], remedy])
         return "fault", f"this is a fault of dvi_jax, not of your input.\n{cause}"
 

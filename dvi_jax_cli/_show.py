@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 
-class Table(NamedTuple):
+class TextTable(NamedTuple):
     """A table for the reader: names of the columns, rows of texts."""
 
     title: str

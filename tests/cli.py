@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 import dvi_jax as dvi
 from dvi_jax_cli import app
-from dvi_jax_cli.work.table import Table
+from dvi_jax_cli.work.table import TomlTable
 
 ROOT = Path(dvi.__file__).parent.parent
 EXAMPLES = ROOT / "examples"
@@ -76,6 +76,6 @@ def keys_not_in(text, model):
         if key not in ELSEWHERE and f"{key} = " not in text and f"[{key}]" not in text:
             missing.append(key)
         kind = field.annotation
-        if key not in ELSEWHERE and isinstance(kind, type) and issubclass(kind, Table):
+        if key not in ELSEWHERE and isinstance(kind, type) and issubclass(kind, TomlTable):
             missing += keys_not_in(text, kind)
     return missing

@@ -26,54 +26,68 @@ from dvi_jax_cli._session import CODES, Session
 COMMANDS = ["new", "systems", "schema", "run", "sweep", "fit", "discover", "bound", "paper"]
 COMMANDS += ["certify", "verify", "info"]
 
-WITHOUT_JAX = """
-import sys
+CALLS = """
+import contextlib, io, json, os, sys
 from dvi_jax_cli import main
-sys.argv = ["dvi-jax", *sys.argv[1:]]
-try:
-    main()
-except SystemExit as end:
-    code = end.code or 0
+results = []
+for words, environment in json.loads(sys.argv[1]):
+    os.environ.update(environment)
+    sys.argv, code = ["dvi-jax", *words], 0
+    out, stderr = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(stderr):
+        try:
+            main()
+        except SystemExit as end:
+            code = end.code or 0
+    for name in environment:
+        del os.environ[name]
+    results.append((code, out.getvalue(), stderr.getvalue()))
 heavy = sorted({"jax", "jaxlib", "numpy", "matplotlib", "dvi_jax"} & set(sys.modules))
-print("END", code, ",".join(heavy), file=sys.stderr)
+print(json.dumps((results, heavy)))
 """
 
 
-def ended(*words, before="", **environment):
-    """(exit code, what was imported, stdout, stderr) of a call."""
-    done = process(before + WITHOUT_JAX, *words, **environment)
-    stderr, _, last = done.stderr.rpartition("END ")
-    code, heavy = last.rstrip("\n").split(" ")
-    return int(code), heavy, done.stdout, stderr
+def ended(calls):
+    """[(exit code, stdout, stderr) of each call], and what one process has imported for all."""
+    done = process(CALLS, json.dumps(calls))
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
 
 
 # Help, errors and completion without JAX
 
+LIGHT = {"--help": 0, "--version": 0, "sweep run --help": 0, "wlak": 2, "run --forse": 2}
+COMPLETED = {
+    "systems ke": ["kepler"],
+    "certify --check ener": ["energy"],
+    "certify --method Gauss": [f"GaussLegendre{s}" for s in (1, 2, 3, 4)],
+    "sw": ["sweep"],
+    "systems nothing": [],
+}
 
-@pytest.mark.parametrize(
-    ("words", "code"),
-    [
-        (["--help"], 0),
-        (["--version"], 0),
-        (["sweep", "run", "--help"], 0),
-        (["wlak"], 2),
-        (["run", "--forse"], 2),
-    ],
-)
-def test_help_and_errors_import_no_jax(words, code):
-    status, heavy, out, stderr = ended(*words)
-    assert (status, heavy) == (code, "")
-    assert "Traceback" not in stderr
-    assert out or stderr
-    assert words != ["--version"] or out.strip() == f"dvi-jax {dvi.__version__}"
+
+def test_help_errors_and_completion_import_no_jax():
+    calls = [(line.split(), {}) for line in LIGHT]
+    for line in COMPLETED:
+        words = {"COMP_WORDS": f"dvi-jax {line}", "COMP_CWORD": str(len(line.split(" ")))}
+        calls.append(([], {"_DVI_JAX_COMPLETE": "complete_bash", **words}))
+    results, heavy = ended(calls)
+    assert heavy == []
+    for (line, code), (status, out, stderr) in zip(LIGHT.items(), results, strict=False):
+        assert status == code, line
+        assert "Traceback" not in stderr
+        assert out or stderr
+        assert line != "--version" or out.strip() == f"dvi-jax {dvi.__version__}"
+    for names, (status, out, _) in zip(COMPLETED.values(), results[len(LIGHT) :], strict=True):
+        assert (status, sorted(out.split())) == (0, names)
 
 
 @pytest.mark.slow
 def test_a_command_at_work_imports_jax():
     """The control of the test above."""
-    code, heavy, _, _ = ended("systems", "keppler")
+    [(code, _, _)], heavy = ended([(["systems", "keppler"], {})])
     assert code == 2
-    assert {"jax", "dvi_jax", "numpy"} <= set(heavy.split(","))
+    assert {"jax", "dvi_jax", "numpy"} <= set(heavy)
 
 
 @pytest.mark.slow
@@ -121,22 +135,6 @@ def test_wrong_arguments_are_shown_in_one_block(words, message):
     error = found(*words, code=2)["error"]
     assert error["kind"] == "bad input"
     assert message in error["message"]
-
-
-@pytest.mark.parametrize(
-    ("line", "completed"),
-    [
-        ("systems ke", ["kepler"]),
-        ("certify --check ener", ["energy"]),
-        ("certify --method Gauss", [f"GaussLegendre{s}" for s in (1, 2, 3, 4)]),
-        ("sw", ["sweep"]),
-        ("systems nothing", []),
-    ],
-)
-def test_completion_without_jax(line, completed):
-    words = {"COMP_WORDS": f"dvi-jax {line}", "COMP_CWORD": str(len(line.split(" ")))}
-    code, heavy, out, _ = ended(_DVI_JAX_COMPLETE="complete_bash", **words)
-    assert (code, heavy, sorted(out.split())) == (0, "", completed)
 
 
 def test_names_that_complete_are_those_of_the_package():
@@ -214,7 +212,7 @@ def test_debug_shows_the_traceback_and_has_the_same_exit_code():
     assert done.returncode == 2
     assert json.loads(done.stdout)["error"]["kind"] == "bad input"
     assert "Traceback (most recent call last)" in done.stderr
-    assert done.stderr.rstrip().endswith("allowed: the path of a TOML file")
+    assert done.stderr.rstrip().endswith("allowed: a TOML file in UTF-8")
 
 
 def test_closed_outputs_raise_no_error():
@@ -223,8 +221,8 @@ def test_closed_outputs_raise_no_error():
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(words, capture_output=True, text=True, check=False, env=environment)
     assert (done.stdout.strip(), done.stderr) == ("Versions", "")
-    before = "import sys; sys.stdout = None\n"
-    assert ended("--version", before=before)[::3] == (0, "")
+    done = process(f"import sys; sys.stdout = None; {MAIN}", "--version")
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_no_control_codes_without_a_terminal():
@@ -236,9 +234,9 @@ def test_no_control_codes_without_a_terminal():
 
 
 def test_an_output_in_ascii():
-    code, heavy, out, stderr = ended("discover", "--help", PYTHONIOENCODING="ascii", COLUMNS="99")
-    assert (code, heavy, stderr) == (0, "", "")
-    assert "invariants in ? as formulas" in out
+    done = process(MAIN, "discover", "--help", PYTHONIOENCODING="ascii", COLUMNS="99")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "invariants in ? as formulas" in done.stdout
     text = "from dvi_jax_cli._show import print_json; print_json({'a': 'ε', 'b': float('nan')})"
     done = process(text, PYTHONIOENCODING="ascii")
     assert json.loads(done.stdout, parse_constant=pytest.fail) == {"a": "ε", "b": None}
@@ -354,7 +352,7 @@ def test_its_notebook_runs(inside, monkeypatch):
     run = runpy.run_path("explore.py")
     assert run["solution"].observed["angular momentum"] < 1e-13
     assert run["order"].slope == pytest.approx(1, abs=0.1)
-    drifts = run["many"].to_xarray().energy_drift
+    drifts = run["result"].to_xarray().energy_drift
     assert dict(drifts.sizes) == {"x": 24, "epsilon": 12}
     largest = drifts.max("x").values
     strengths = drifts["epsilon"].values  # large enough for the method's own error to be small

@@ -86,7 +86,6 @@ def test_nothing_is_proved_at_a_singularity(folder):
         ("low = {q = [-0.5]", "low = {q = [0.7]", "it is not below domain.high"),
         ("[0.0, 0.1]", "[0.1, 0.1]", "epsilon"),
         ("change = 1e-4", "ratio = 0.5", "bound.ratio"),
-        ("[bound]", 'inside = "own.py:none"\n[bound]', "own.py has no 'none'"),
     ],
 )
 def test_bad_input(folder, old, new, seen):

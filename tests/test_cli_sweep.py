@@ -10,7 +10,7 @@ import time
 import jax
 import numpy as np
 import pytest
-from cli import EXAMPLES, MAIN, command, found, keys_not_in, refuses, write
+from cli import EXAMPLES, MAIN, command, found, refuses, write
 from dvi_jax.run import InputError, sweep_file, sweep_status
 from jax._src import pretty_printer
 
@@ -158,29 +158,25 @@ def test_axes_in_arrays(folder):
     np.testing.assert_array_equal(arguments(folder, states)["q0"].values, [[0.5], [0.6]])
 
 
+SIDES = "low = [-1]\nhigh = [1]\n"
 CORNERS = "low = {q = [0], p = [0]}\nhigh = {q = [1], p = [2]}\n"
 
 
 @pytest.mark.parametrize(
-    ("kind", "keys", "made", "seed", "name"),
+    ("kind", "keys", "made"),
     [
-        ("halton", CORNERS + "seed = 3", dvi.starts.Halton, 3, "start"),
-        ("random", CORNERS + 'name = "s"', dvi.starts.Random, 0, "s"),
-        ("normal", "q0 = [1]\np0 = [0]\nsigma = {q = 1, p = [2]}", dvi.starts.Normal, 0, "start"),
-        (
-            "energy_shell",
-            'energy = 1.0\nlow = [-1]\nhigh = [1]\nH = "own.py:H"',
-            dvi.starts.EnergyShell,
-            0,
-            "start",
-        ),
+        ("halton", CORNERS + "seed = 3", dvi.starts.Halton),
+        ("random", CORNERS + 'name = "s"', dvi.starts.Random),
+        ("normal", "q0 = [1]\np0 = [0]\nsigma = {q = 1, p = [2]}", dvi.starts.Normal),
+        ("energy_shell", f"energy = 1.0\n{SIDES}H = 'own.py:H'", dvi.starts.EnergyShell),
     ],
 )
-def test_generated_initial_conditions(folder, kind, keys, made, seed, name):
+def test_generated_initial_conditions(folder, kind, keys, made):
     head, _, tail = SMALL.partition("[state]")
     table = f'[start]\nkind = "{kind}"\ncount = 20\n{keys}\n[args]'
     start = arguments(folder, head + table + tail.partition("[args]")[2])["start"]
     assert isinstance(start, made)
+    seed, name = 3 if "seed" in keys else 0, "s" if "name" in keys else "start"
     assert (start.count, start.seed, start.name) == (20, seed, name)
     q, p = start.at(np.int32(4), 0.0, {"k": 1.0})
     assert q.shape == p.shape == (1,)
@@ -196,11 +192,6 @@ def test_the_example(folder):
     assert data.energy_drift.dims == ("epsilon", "start")
     assert data.angular_momentum_drift.max() < 1e-12
     assert data.energy_drift.min() > 1e-3  # negative control
-
-
-def test_the_example_shows_every_key():
-    text = (EXAMPLES / "sweep.toml").read_text(encoding="utf-8")
-    assert keys_not_in(text, SweepFile) == []
 
 
 @pytest.mark.slow
@@ -232,15 +223,13 @@ at_zero = dvi.Stop(lambda t, q, p, args: -q[0])
 def test_starts_with_parameters_and_a_stop_from_a_file(folder):
     """An oscillator of frequency ω = 1 + i is at q = 0 after a quarter of its period."""
     write(folder, OF_A_FILE, "file.py")
-    text = SMALL.replace(
-        "epsilon = {linspace = [0.0, 0.2, 12]}", 'epsilon = 0.0\nstop = "file.py:at_zero"'
-    )
-    text = text.replace(
-        "[state]\nq0 = [0.5]\np0 = [0.1]\n", '[start]\nkind = "own"\nstarts = "file.py:starts"\n'
-    )
-    text = text.replace("h = 0.1", 'h = 0.02\nmethod = "Yoshida(4)"').replace(
-        "steps = 30", "steps = 100"
-    )
+    text = SMALL
+    for old, new in {
+        "epsilon = {linspace = [0.0, 0.2, 12]}": 'epsilon = 0.0\nstop = "file.py:at_zero"',
+        "[state]\nq0 = [0.5]\np0 = [0.1]": '[start]\nkind = "own"\nstarts = "file.py:starts"',
+        "h = 0.1\nsteps = 30": 'h = 0.02\nmethod = "Yoshida(4)"\nsteps = 100',
+    }.items():
+        text = text.replace(old, new)
     report = sweep_file(write(folder, text), threads=1)
     assert report.contents["trajectories"]["stopped"] == 3
     np.testing.assert_allclose(
@@ -389,26 +378,20 @@ SHELL = "[start]\nkind = 'energy_shell'\ncount = 2\nenergy = -1\nlow = [0, 1]\nh
 IN_A = "{values = [1], axis = 'a'}"
 REJECTED = [
     (KEPLER, "epsilon: neither epsilon nor another number varies", "[start]"),
-    (SMALL.replace("h = 0.1", "h = 0.0"), "h: the value is 0.0", "not zero"),
     (E + "[0.1, 0.2]", "epsilon: the value is [0.1, 0.2] (an array)", "{values = […]}"),
     (E + "{lin = 3}", "epsilon.lin: there is no such key", "linspace, geomspace, values"),
-    (E + "{linspace = [0, 1, 2], unit = 'm'}", "epsilon.unit: there is no", "mean units?"),
     (E + "{linspace = [0, 1, 2], values = [1]}", "epsilon: ", "one of {linspace"),
-    (E + "{linspace = [0, 1]}", "epsilon.linspace: the value is [0, 1]", "how many]"),
     (E + "{linspace = [0, 1, 2.5]}", "epsilon.linspace: the value is [0, 1, 2.5]", "whole"),
     (E + "{geomspace = [0, 1, 3]}", "epsilon.geomspace: the value is [0, 1, 3]", "above zero"),
     (E + "{linspace = [0, 1, 10_000_001]}", "epsilon.linspace[2]", "at most 10000000"),
-    (E + "{values = []}", "epsilon.values: the value is [] (an array)", "at least one"),
     (E + "{values = [0.1, nan]}", "epsilon.values[1]: the value is nan", "without an axis"),
     (E + "{values = [1], axis = 'a b'}", "epsilon.axis: the value is 'a b'", "a name"),
     (E + "{values = [1], axis = 'status'}", "epsilon.axis: the value is 'status'", "except status"),
-    (E + "{values = [1], units = 3}", "epsilon.units: the value is 3", "text"),
     (E + "{values = [1, 2], axis = 'a'}\nh = " + IN_A, "2 values in epsilon and 1", "axes"),
     (EPS + "[observables]\n'zarr.json' = 'energy'", "the observable 'zarr.json'", "fit"),
     (EPS + "[observables]", "observables: nothing would be saved", 'save = "final"'),
     (EPS + "[observables]\nepsilon = 'energy'", "has the name of an axis", "fit one another"),
     (EPS + "save = 'all'", "save: the value is 'all' (text)", "{every = n}"),
-    (EPS + "save = {every = 0}", "save.every: the value is 0", "positive"),
     (KEPLER + "h = {linspace = [-1, 1, 3]}", "h.linspace[1]: the value is 0.0", "without an axis"),
     ("system = 'kepler'\nsteps = {values = [1, 2.5]}", "steps.values[1]", "without an axis"),
     (Q + "[{values = [1.0]}, 0.0]", "state.q0[0].axis: the key is missing", 'axis = "x"'),
@@ -418,10 +401,7 @@ REJECTED = [
     (K + "{values = [1, [2]]}", "args.K.values: the value is [1, [2]]", "one shape"),
     (K + f"[{IN_A}, {{values = [1], axis = 'b'}}]", "args.K: one array", "same name"),
     (KEPLER + "method = ['TypeII', 'Strng']", "method: 'Strng'", "did you mean Strang?"),
-    (KEPLER + "method = [3]", "method[0]: the value is 3", "an array of such texts"),
-    (HALTON.replace("halton", "haltn"), "start.kind: the value is 'haltn'", "did you mean halton?"),
     (KEPLER + "[start]\ncount = 3", "start.kind: the key is missing", "normal"),
-    (HALTON + BOX + "sigma = {q = 1, p = 1}", "start.sigma: there is no such key", "seed"),
     (HALTON + BOX.replace("low = {q", "low = {x"), "start.low.x: there is no such key", "q, p"),
     (HALTON + "low = [0, 0]\nhigh = [1, 1]", "start.low", "the keys q, p"),
     (HALTON + BOX.replace("[1, 1]", "[-1, 1]"), "start: low of Halton must not", "halton"),

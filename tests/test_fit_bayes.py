@@ -1,6 +1,5 @@
 """Posteriors and samples of them: densities, gradients, bounds, agreement with the fit."""
 
-import builtins
 import dataclasses
 import sys
 import types
@@ -171,7 +170,7 @@ def test_a_failing_trajectory_has_density_0_and_no_nan():
         assert slope[0] != 0
         assert slope[1] == 0
         assert posterior.log_density(jnp.array([9.0])) == -np.inf
-    with pytest.raises(ValueError, match=r"density is 0 at the start \(args.b = 9\)"):
+    with pytest.raises(ValueError, match=r"got 0 at args.b = 9"):
         posterior.laplace([9.0])
 
 
@@ -275,10 +274,10 @@ def test_a_fit_that_ended_at_a_bound_is_a_start():
     assert found.at_bounds == ["q0[0]"]
     dvi.Posterior(NEAR_0, data, found.params, bounds=ABOVE_1)  # its numbers are within bounds
     made = dvi.Posterior(NEAR_0, data, params, bounds=ABOVE_1)
-    u = bayes._start_of(made, found, ABOVE_1, None)
+    u = bayes.start_of(made, found, ABOVE_1, None)
     np.testing.assert_allclose(made.to_x(u), 1.1, rtol=1e-12)
     with pytest.raises(ValueError, match="not between its bounds"):
-        bayes._start_of(made, {"q0": np.ones(1)}, ABOVE_1, None)
+        bayes.start_of(made, {"q0": np.ones(1)}, ABOVE_1, None)
 
 
 @pytest.mark.slow
@@ -336,7 +335,7 @@ def fake(x, diverging=0, steps=3):
         "potential_energy": x**2 / 2, "diverging": lost, "num_steps": np.full(x.shape, steps),
         "mean_accept_prob": np.full(x.shape, 0.8),
     }  # fmt: skip
-    return bayes._collect(bayes._numpyro(), posterior, x[..., None], about, [], 1023)
+    return bayes.collect(posterior, x[..., None], about, [], 1023)
 
 
 def test_warnings():
@@ -374,14 +373,7 @@ def test_arviz_old_new_and_none(monkeypatch):
 
 
 def test_without_numpyro_the_extra_is_named(monkeypatch):
-    real = builtins.__import__
-
-    def without(name, *args, **kwargs):
-        if name.startswith("numpyro"):
-            raise ImportError(name)
-        return real(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.setitem(sys.modules, "numpyro.infer", None)
     with pytest.raises(ImportError, match=r"dvi-jax\[bayes\]"):
         dvi.sample(LINE, on_a_line(), PAIR)
     assert np.isfinite(dvi.Posterior(LINE, on_a_line(), PAIR).potential(jnp.ones(2)))
@@ -391,10 +383,9 @@ ONE = dvi.Observations([0.0], np.zeros((1, 1)), sigma=0.1)
 IDLE = {"p0": np.ones(1), "args": {"unused": 1.0}}
 RESTING = dvi.Model(dvi.System(free), h=H, q0=jnp.zeros(1))
 OUTSIDE = {"bounds": {"q0": dvi.Bounds(0, 1)}, "start": {"q0": np.ones(1) * 2, "p0": np.ones(1)}}
-OTHERS = r"Missing in start: p0\[0\]\. Unknown in start: none\."
 INVALID_POSTERIORS = [
-    (ONE, {}, ValueError, r"at least 2 observed values.* Got 1"),
-    (on_a_line(None, 2), {}, ValueError, r"size of the errors, .*Got 2"),
+    (ONE, {}, ValueError, r"at least 2 observed values.* got 1"),
+    (on_a_line(None, 2), {}, ValueError, r"size of the errors .*got 2"),
     (ONE, {"gradient": "both"}, ValueError, "'forward', got"),
     (np.ones(3), {}, TypeError, "dvi.Observations"),
     (on_a_line(None), {"loss": dvi.SoftL1()}, ValueError, "a robust loss .*sigma or covariance"),
@@ -404,7 +395,7 @@ INVALID_SAMPLES = [
     ({"chains": 0}, ValueError, "chains must be"),
     ({"target_accept": 1.0}, ValueError, "target_accept must be a number between 0 and 1"),
     ({"progress": 3}, TypeError, "progress must be"),
-    ({"start": {"q0": np.zeros(1)}}, ValueError, OTHERS),
+    ({"start": {"q0": np.zeros(1)}}, ValueError, r"Missing: p0\[0\]\. Unknown: none"),
     (OUTSIDE, ValueError, "not between its bounds"),
 ]
 

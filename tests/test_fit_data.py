@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import dvi_jax as dvi
-from dvi_jax.fit.problem import Problem
+from dvi_jax.fit.problem import FitProblem
 
 
 def H(t0, t1, q0, p1, args):
@@ -32,30 +32,30 @@ def put(x, i, value):
 
 
 VALUE_ERRORS = [
-    ({"ts": put(TS, 3, np.nan)}, r"ts\[3\] is nan"),
-    ({"ts": put(TS, 3, np.inf)}, r"ts\[3\] is inf"),
-    ({"ts": put(TS, [4, 5], TS[[5, 4]])}, r"not in order: ts\[4\].*argsort"),
-    ({"ts": put(TS, 4, TS[3])}, r"ts\[3\] and ts\[4\] are the same time"),
+    ({"ts": put(TS, 3, np.nan)}, r"ts must be finite, got nan at index \[3\]"),
+    ({"ts": put(TS, 3, np.inf)}, "ts must be finite, got inf"),
+    ({"ts": put(TS, [4, 5], TS[[5, 4]])}, r"increase .* ts\[4\].*argsort"),
+    ({"ts": put(TS, 4, TS[3])}, r"equal, got ts\[3\] = 2.0 and ts\[4\] = 2.0"),
     ({"t0": 0.75}, "one side of t0 = 0.75, got times from 0.5 to 10"),
     ({"t0": np.nan}, "t0 must be a finite number"),
-    ({"ts": TS[:5]}, r"one row for each time: ts has shape \(5,\)"),
-    ({"ts": TS[:, None]}, "one-dimensional array of times"),
+    ({"ts": TS[:5]}, r"one row for each, got shapes \(5,\)"),
+    ({"ts": TS[:, None]}, "one-dimensional"),
     ({"ts": np.zeros(0), "values": np.zeros((0, 1))}, "one-dimensional"),
-    ({"values": put(VALUES, (2, 0), np.inf)}, r"infinite at index \[2, 0\]"),
-    ({"values": VALUES * np.nan}, "give at least one number"),
-    ({"sigma": 0.0}, "sigma is 0.0 .* positive"),
+    ({"values": put(VALUES, (2, 0), np.inf)}, r"got inf at index \[2, 0\]"),
+    ({"values": VALUES * np.nan}, "at least one number"),
+    ({"sigma": 0.0}, "positive .* got 0.0"),
     ({"sigma": -1.0}, "positive"),
-    ({"sigma": np.nan}, "sigma is nan"),
+    ({"sigma": np.nan}, "sigma must be .* got nan"),
     ({"sigma": np.ma.array(VALUES, mask=TS[:, None] == 2)}, r"index \[3, 0\]"),
-    ({"ts": np.ma.array(TS, mask=TS == 2)}, r"ts must not have masked .* index \[3\]"),
-    ({"t0": np.ma.masked}, "t0 must not have masked numbers, got one"),
-    ({"sigma": 1e-200}, r"1e-200 .*values are up to 0.99.*double precision"),
+    ({"ts": np.ma.array(TS, mask=TS == 2)}, r"ts .*masked .* index \[3\]"),
+    ({"t0": np.ma.masked}, "t0 .*masked number"),
+    ({"sigma": 1e-200}, r"values of up to 0.99.* got 1e-200"),
     ({"sigma": 1e200}, "in the units of the values"),
-    ({"sigma": np.ones((20, 2))}, "broadcasts to the shape"),
-    ({"sigma": None, "covariance": np.zeros((1, 1))}, "not positive definite"),
-    ({"sigma": None, "covariance": -np.eye(1)}, "not positive definite"),
+    ({"sigma": np.ones((20, 2))}, "broadcast to the shape"),
+    ({"sigma": None, "covariance": np.zeros((1, 1))}, "positive definite"),
+    ({"sigma": None, "covariance": -np.eye(1)}, "positive definite"),
     ({"sigma": None, "covariance": np.eye(2)}, r"shape \(1, 1\) or \(20, 1, 1\)"),
-    ({"covariance": np.eye(1)}, "sigma and covariance are both given"),
+    ({"covariance": np.eye(1)}, "one of sigma and covariance"),
 ]
 TYPE_ERRORS = [
     ({"values": VALUES * 1j}, "real numbers, got dtype complex"),
@@ -99,7 +99,7 @@ def test_the_order_of_the_observations_does_not_matter(sign, of):
     groups = []
     for rows in (slice(None), slice(None, None, -1)):
         data = dvi.Observations(sign * TS[rows], VALUES[rows], t0=0.0, **{of: error[rows]})
-        groups += Problem(model, [data], False, PARAMS).groups
+        groups += FitProblem(model, [data], False, PARAMS).groups
     for of_one, of_other in zip(*(vars(group).values() for group in groups), strict=True):
         np.testing.assert_array_equal(of_one, of_other)
 
@@ -139,36 +139,33 @@ REFUSED = {
         ({"model": lambda params: {"system": SYSTEM}}, "'q0' is missing"),
         ({"model": returning(num_steps=3)}, "the model must not set 'num_steps'"),
         ({"model": returning(t0=0.0)}, r"Observations\(\.\.\., t0"),
-        ({"model": returning(h=0.0)}, "finite and not zero"),
+        ({"model": returning(h=0.0)}, "other than zero"),
         ({"model": returning(h=-0.1)}, LATER + ".*Give h = 0.1"),
         ({"data": data(ts=-TS[::-1])}, EARLIER),
         ({"model": VARIATIONAL}, "lie after t0 = 0, but h = -0.1 leads to earlier"),
         ({"model": TRANSFORMED}, "num_steps .* other than dvi.Uniform"),
         ({"model": returning(h=1e-12)}, "times in one unit"),
         ({"model": returning(h=1e3)}, "times in one unit"),
-        ({"model": lambda p: {**MODEL(p), "h": p["epsilon"] + 0.1}}, "not a parameter"),
-        ({"data": []}, "empty"),
-        ({"data": [DATA, WITHOUT]}, r"data\[1\] has neither sigma"),
+        ({"model": lambda p: {**MODEL(p), "h": p["epsilon"] + 0.1}}, "not a JAX array"),
+        ({"data": []}, "at least one"),
+        ({"data": [DATA, WITHOUT]}, r"not for data\[1\]"),
         ({"data": data(1e6 * VALUES)}, "same units"),
         ({"data": data(1e-6 * VALUES)}, "same units"),
         ({"data": WITHOUT, "loss": dvi.Cauchy()}, "a robust loss .*sigma or covariance"),
         ({"data": WITHOUT, "priors": PRIORS}, "priors .*sigma or covariance"),
         ({"params": {}}, "that can be fitted"),
         ({"params": {"epsilon": np.nan}}, "epsilon starts at nan"),
-        ({"params": {"args": {"k": np.ones(40)}}}, "scalar|parameters cannot be determined"),
-        ({"params": {"epsilon": np.ma.masked}}, "the parameter epsilon must not have masked"),
-        ({"params": {"q0": MASKED}}, r"q0 must not have masked numbers, got one at index \[0\]"),
-        (
-            {"bounds": {"epsilon": dvi.Bounds(np.ma.masked, 1)}},
-            "lower of epsilon must not have masked",
-        ),
-        ({"model": starting(q0=MASKED)}, "q0 must not have masked"),
+        ({"params": {"args": {"k": np.ones(40)}}}, "scalar|at least"),
+        ({"params": {"epsilon": np.ma.masked}}, "the parameter epsilon .*masked"),
+        ({"params": {"q0": MASKED}}, r"q0 .*masked .*index \[0\]"),
+        ({"bounds": {"epsilon": dvi.Bounds(np.ma.masked, 1)}}, "lower of epsilon .*masked"),
+        ({"model": starting(q0=MASKED)}, "q0 .*masked"),
         ({"bounds": {"epsilon": dvi.Bounds(np.nan, 1)}}, "lower one must be less"),
         ({"bounds": {"epsilon": dvi.Bounds(0.5, 1)}}, "not between"),
-        ({"bounds": {"eps": dvi.Bounds(0.5, 1)}}, "given for 'eps'"),
+        ({"bounds": {"eps": dvi.Bounds(0.5, 1)}}, "got 'eps'"),
         ({"priors": {"epsilon": dvi.Prior(0.0, 0.0)}}, "positive sigma"),
         ({"priors": {"epsilon": dvi.Prior(None, 1.0)}}, "finite mean"),
-        ({"shooting": dvi.MultipleShooting(300)}, "must be at most the number of steps"),
+        ({"shooting": dvi.MultipleShooting(300)}, "from 2 to 100, got 300"),
         ({"batch": 3}, "batch requires an optimiser of optax"),
         ({"max_steps": 0}, "max_steps"),
         ({"tolerance": 0.0}, "tolerance"),
@@ -182,7 +179,7 @@ REFUSED = {
         ({"model": lambda params: 3}, "must be a dict of the arguments of dvi.integrate"),
         ({"data": (TS, VALUES)}, "dvi.Observations"),
         ({"params": 0.1}, "a dict with keys among"),
-        ({"params": {"k": 1.0}}, "{'args': {'k': ...}}"),
+        ({"params": {"k": 1.0}}, "the key 'k'.* into args"),
         ({"model": starting(p0=np.array([0.0], object))}, "p0 .* dtype object"),
         ({"model": starting(q0=np.array(["2000"], "M8[D]"))}, "q0 .* dtype datetime64"),
         ({"model": starting(args={"k": np.array(1.0, object)})}, "args .* dtype object"),
@@ -228,7 +225,7 @@ def test_a_robust_loss_has_a_positive_scale(loss):
 @pytest.mark.slow
 def test_fewer_values_than_parameters():
     few, params = data(VALUES[:1], TS[:1]), {"epsilon": 0.0, "args": {"k": 1.0}}
-    with pytest.raises(ValueError, match=r"2 parameters .*determined from 1 observed"):
+    with pytest.raises(ValueError, match=r"at least 2 observed .*, got 1"):
         fit(data=few, params=params)
     priors = {"epsilon": dvi.Prior(0.0, 0.1)}
     assert fit(data=few, params=params, priors=priors).degrees_of_freedom == 0

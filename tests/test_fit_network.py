@@ -160,7 +160,7 @@ def test_invalid_networks(change, error, match):
 
 @pytest.mark.slow
 def test_a_state_of_another_shape_is_refused():
-    with pytest.raises(ValueError, match=r"n = 2, got shape \(1,\)"):
+    with pytest.raises(ValueError, match=r"\(2,\), got shape \(1,\)"):
         network(2).conservative(jnp.array([1.0]))
 
 

@@ -1,6 +1,5 @@
 """Runs from TOML files: what they write, which input they reject, how they fail."""
 
-import re
 import shutil
 
 import numpy as np
@@ -11,8 +10,8 @@ from dvi_jax.run import InputError, library_tables, run_file
 import dvi_jax as dvi
 from dvi_jax import systems
 from dvi_jax_cli.work.expressions import parse_method
-from dvi_jax_cli.work.output import Output
-from dvi_jax_cli.work.schema import RunFile
+from dvi_jax_cli.work.output import FolderReport
+from dvi_jax_cli.work.schema import FILES
 
 OWN = """
 import jax.numpy as jnp
@@ -170,16 +169,12 @@ REJECTED = [
     (KEPLER, "steps: the key is missing", "positive whole number"),
     (KEPLER + "steps = 1.5", "steps: the value is 1.5 (a number)", "positive whole number"),
     (KEPLER + "steps = true", "steps: the value is true (a boolean)", "positive whole number"),
-    (KEPLER + "steps = -1", "steps: the value is -1 (a whole number)", "positive whole number"),
     (FIVE + "h = 0.0", "h: the value is 0.0 (a number)", "not zero"),
-    (FIVE + "h = inf", "h: the value is inf (a number)", "finite"),
     (FIVE + 'epsilon = "big"', "epsilon: the value is 'big' (text)", "finite number"),
     (FIVE + "epsilon = 1" + 400 * "0", "epsilon: the value is 1000", "finite number"),
     (FIVE + 'method = "Yosida(4)"', "method: 'Yosida'", "did you mean Yoshida?"),
     (FIVE + 'method = "Yoshida(5)"', "order of Yoshida must be one of 4, 6, 8, got 5", "Strang"),
-    (FIVE + 'method = "3"', "method: '3'", "Strang"),
     (FIVE + f'method = "{3000 * "-"}5"', "method: ", "Strang"),
-    (FIVE + 'lattice = "given"', "lattice: the value is 'given' (text)", "uniform"),
     (KEPLER + "lattice = {times = [0, 1, 0.5]}", "lattice.times", "all increasing"),
     (FIVE + "lattice = {times = [0.0, 1.0]}", "steps: the value is 5", "lattice.times gives"),
     (FIVE + "state = 1", "state: the value is 1", "q0, p0, date"),
@@ -191,19 +186,15 @@ REJECTED = [
     (FIVE + '[state]\ndate = "1950-01-01"', "state.date:", "solar_system"),
     (FIVE + "[args]\nk = 1.0", "args.k: there is no such", "did you mean K?"),
     (FIVE + '[args]\nK = "one"', "args.K: the value is 'one' (text)", "numbers"),
-    (FIVE + "[args]\nK = 1" + "0" * 400, "args.K: the value is 1000", "numbers"),
     (FIVE + "[args]\nK = [1.0, 2.0]", "args: K must be a positive and finite", "args that fit"),
     (FIVE + "[observables]\n'../x' = 'energy'", "the name is '../x'", "without /"),
     (FIVE + '[observables]\na = "enrgy"', "observables.a: 'enrgy'", "mean energy?"),
-    (FIVE + "[observables]\na = 3", "observables.a: the value is 3 (a whole number)", ""),
     (FIVE + '[observables]\na = "Max(energy)"', "observables.a: 'Max'", "MaxDrift"),
     (FIVE + '[observables]\na = "own.py:number"', "own.py:number' has the type int", "function"),
-    (FIVE + '[observables]\na = "own.py:too_few"', "takes (t0, t1)", "a function"),
+    (FIVE + '[observables]\na = "own.py:too_few"', "too_few(t0, t1)", "a function"),
     (FIVE + "[output]\nevery = 0", "output.every: the value is 0", "positive whole number"),
-    (FIVE + "[output]\nevrey = 1", "output.evrey: there is no", "mean every?"),
     ('system = "kepler', "is not TOML", "toml.io"),
     ("h = 1" + "0" * 5000, "is not TOML", "toml.io"),
-    ("h = " + "[" * 5000, "is not TOML", "toml.io"),
     (f'system = "{LONG}.py:system"', "File name too long", ""),
     ('system = "a\\u0000.py:system"', "null ", ""),
     ('system = "nowhere.py:system"', "there is no file", "file.py:name"),
@@ -217,21 +208,9 @@ REJECTED = [
     (SPRING + STATE, "h: the key is missing", "the system has no default"),
     (SPRING + "h = 0.1\n" + STATE, "(own.py, line 7)", "state and args that fit"),
     ('system = "own.py:forced"\n' + FULL, "epsilon: the key is missing", "a force"),
-    (
-        'system = "own.py:forced"\nepsilon = 0.1\n' + FULL,
-        "jnp.where in place of if (own.py, line 25)",
-        "fit",
-    ),
-    (
-        'system = "own.py:numbered"\nepsilon = 0.1\n' + FULL,
-        "in place of if (own.py, line 28)",
-        "fit",
-    ),
-    (
-        N_BODY + "[state]\nq0 = [[0, 0], [0, 0], [1, 1]]",
-        "body 0 and body 1 are at the same position",
-        "start",
-    ),
+    ('system = "own.py:forced"\nepsilon = 0.1\n' + FULL, "of if (own.py, line 25)", "fit"),
+    ('system = "own.py:numbered"\nepsilon = 0.1\n' + FULL, "of if (own.py, line 28)", "fit"),
+    (N_BODY + "[state]\nq0 = [[0, 0], [0, 0], [1, 1]]", "body 0 and body 1 are at", "start"),
     (N_BODY + "[args]\nmasses = [1, 0, 1]", "mass of body 1 is 0", "start"),
 ]
 
@@ -249,9 +228,7 @@ def test_bad_paths(folder):
     path = write(folder, FIVE + '[output]\ndir = "a\\u0000"')
     refuses(command("run", path), "output.dir: ")
     (folder / "bom.toml").write_bytes(b"\xef\xbb\xbf" + b'system = "none"\r\n')
-    refuses(
-        command("run", "bom.toml"), "system: the value is 'none'"
-    )  # a byte order mark is allowed
+    refuses(command("run", "bom.toml"), "system: the value is 'none'")  # the mark is allowed
 
 
 def test_all_wrong_keys_of_a_file_are_named(folder):
@@ -316,10 +293,13 @@ def test_a_failed_trajectory_is_written(folder):
     assert (folder / "out" / "trajectory.png").exists()
 
 
-def test_the_examples_show_every_key():
-    text = "".join(p.read_text(encoding="utf-8") for p in EXAMPLES.glob("*.toml"))
-    assert keys_not_in(text, RunFile) == []
-    assert keys_not_in("steps = 3", RunFile)[:2] == ["observables", "system"]  # the control
+@pytest.mark.parametrize("kind", FILES)
+def test_the_examples_show_every_key(kind):
+    """Those of a run in several examples."""
+    paths = EXAMPLES.glob("*.toml" if kind == "run" else f"{kind}.toml")
+    text = "".join(path.read_text(encoding="utf-8") for path in paths)
+    assert keys_not_in(text, FILES[kind]) == []
+    assert keys_not_in("steps = 3", FILES[kind])  # the control
 
 
 @pytest.mark.slow
@@ -402,7 +382,7 @@ def test_systems_are_listed_and_described():
 
 def test_ctrl_c_while_results_are_written_lists_the_files(tmp_path):
     def output(force=False):
-        return Output(folder=tmp_path, key="--out", names=("a.npz",), force=force).writing()
+        return FolderReport(folder=tmp_path, key="--out", names=("a.npz",), force=force).writing()
 
     def interrupted():
         with output():
@@ -418,8 +398,6 @@ def test_ctrl_c_while_results_are_written_lists_the_files(tmp_path):
 
 
 def test_the_error_in_python(folder):
-    with pytest.raises(
-        InputError, match=re.escape("h: the value is 0.0 (a number)\n  allowed: ")
-    ) as error:
+    with pytest.raises(InputError, match=r"h: the value is 0.0 .*\n  allowed: ") as error:
         run_file(write(folder, FIVE + "h = 0.0"))
     assert (error.value.key, error.value.seen) == ("h", "the value is 0.0 (a number)")

@@ -14,7 +14,7 @@ import types
 from collections.abc import Iterable, Iterator
 from importlib import import_module
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import usage
@@ -162,13 +162,17 @@ def signature(thing: Any) -> str:
 
 
 def _keywords(settings: Any) -> Iterator[inspect.Parameter]:
-    """The keywords of a `TypedDict`, with the defaults that they have in `integrate`."""
+    """The keywords of a `TypedDict`, with the defaults that they have in `integrate`, or else None;
+    `...` for those that cannot be None, whose default the docstring states."""
     defaults = inspect.signature(dvi_jax.integrate).parameters
     for name, kind in get_type_hints(settings).items():
         default = inspect.Parameter.empty
         if name not in settings.__required_keys__:
-            has_default = name in defaults and name != "save"
-            default = _default(defaults[name].default if has_default else None)
+            default = _default(None)
+            if name in defaults and name != "save":
+                default = _default(defaults[name].default)
+            elif kind is not Any and type(None) not in get_args(kind):
+                default = _Shown("...")
         yield inspect.Parameter(
             name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=_type(kind)
         )

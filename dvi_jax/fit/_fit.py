@@ -4,20 +4,23 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
 from ..base.checks import fraction, instance, one_of, whole
+from ..base.keywords import checked_keywords
 from ..base.precision import require_double
-from .losses import LeastSquares, Likelihood, Loss
+from .checks import requires
+from .keywords import FitSettings, LossSettings, select
+from .losses import Loss
 from .observations import Data, as_arcs
 from .optimise import FIT_RESULTS, FitError
-from .problem import Problem
+from .problem import FitProblem
 from .result import FitResult
-from .run import FitProgress, Run, identity, progress_display
+from .run import FitRun, identity, progress_display
 from .shooting import MultipleShooting, Segments, SingleShooting
 from .solvers import is_gauss_newton, is_optax, solver_for
 from .stages import JACOBIAN_LIMIT, Minimum, by_gradient, in_segments, least_squares
@@ -33,26 +36,18 @@ _PART = 0.01
 """Part of a standard error over which Jacobians are subtracted."""
 
 
+@checked_keywords
 def fit(
     model: Callable[..., Any],
     data: Data,
     params: PyTree,
     *,
-    bounds: PyTree = None,
-    priors: PyTree = None,
-    loss: Loss | Likelihood = LeastSquares(),
     shooting: SingleShooting | MultipleShooting = SingleShooting(),
     optimiser: Any = None,
-    max_steps: int | None = None,
-    tolerance: float = 1e-4,
     horizons: str | list[float] | None = "auto",
-    batch: int | None = None,
-    seed: int = 0,
-    check_units: bool = True,
-    check_curvature: bool = True,
     checkpoint: str | os.PathLike[str] | None = None,
-    progress: bool | Callable[[FitProgress], None] | None = None,
     throw: bool = True,
+    **settings: Unpack[FitSettings],
 ) -> FitResult:
     r"""Parameters of a perturbed system from observed trajectories.
 
@@ -68,20 +63,21 @@ def fit(
       leaves are fixed. For a `Model` a dict with keys among q0, p0, epsilon, args.
     - `bounds`, `priors`: pytrees like params, with `Bounds` and `Prior` in place of numbers;
       entries without one may be left out.
-    - `loss`: `LeastSquares()`; `SoftL1()`, `Cauchy()` against outliers; `Likelihood(f)`.
+    - `loss`: `LeastSquares()` (default); `SoftL1()`, `Cauchy()` against outliers; `Likelihood(f)`.
     - `shooting`: `SingleShooting()`, or `MultipleShooting(segments)` for long or chaotic arcs.
     - `optimiser`: None uses Levenberg–Marquardt, for more than 400 parameters Adam, for a
       `Likelihood` BFGS; or a solver of optimistix, or a gradient transformation of optax.
     - `max_steps`: in all; None means 200, with optax 2000.
     - `tolerance`: a fit has converged when the next step would change the predictions by less than
-      this many standard errors in total, or if round-off of the predictions prevents that.
+      this many standard errors in total, by default 1e-4, or if round-off of the predictions
+      prevents that.
     - `horizons`: ``"auto"`` fits the beginning of the arcs first where the start is so far off
       that later data would mislead the fit, and extends it step by step; None fits all data at
       once; or a list of times since t0 to fit up to before all data.
     - `batch`: with optax, how many arcs of each group are drawn for each step; `seed` of the draw.
-    - `check_units`: refuse data that differ from the model by orders of magnitude.
-    - `check_curvature`: compare the Gauss–Newton errors with second derivatives (for up to 50
-      parameters).
+    - `check_units`: refuse data that differ from the model by orders of magnitude (by default).
+    - `check_curvature`: compare the Gauss–Newton errors with second derivatives, for up to 50
+      parameters (by default).
     - `checkpoint`: a file that is written every few seconds. The same call continues from it, with
       the same bits as without the interruption, also with more `max_steps`; it is removed when
       the fit has converged.
@@ -113,12 +109,14 @@ def fit(
     began = time.monotonic()
     require_double("a fit")
     arcs, is_list = as_arcs(data)
-    problem = Problem(model, arcs, is_list, params, bounds=bounds, priors=priors, loss=loss)
+    problem = FitProblem(model, arcs, is_list, params, **select(settings, LossSettings))
     kinds = SingleShooting | MultipleShooting
     instance("shooting", shooting, kinds, "a dvi.SingleShooting() or a dvi.MultipleShooting(n)")
+    max_steps, batch = settings.get("max_steps"), settings.get("batch")
+    check_units, seed = settings.get("check_units", True), settings.get("seed", 0)
     if max_steps is not None:
         whole("max_steps", max_steps)
-    fraction("tolerance", tolerance)
+    tolerance = fraction("tolerance", settings.get("tolerance", 1e-4))
     has_residuals = isinstance(problem.loss, Loss)
     solver = solver_for(optimiser, has_residuals, problem.size > JACOBIAN_LIMIT, max_steps or 2000)
     uses_optax, is_vector = is_optax(solver), is_gauss_newton(solver)
@@ -127,28 +125,25 @@ def fit(
     max_steps = max_steps or (2000 if uses_optax else 200)
     if batch is not None:
         whole("batch", batch)
-        if not uses_optax:
-            raise ValueError(
-                f"batch requires an optimiser of optax, got {type(solver).__name__}: give, for "
-                "example, optimiser=optax.adam(1e-3)."
-            )
-    if isinstance(shooting, MultipleShooting) and not is_vector:
-        raise ValueError(
-            "dvi.MultipleShooting requires a loss of residuals and a least-squares optimiser, got "
-            f"the loss {type(problem.loss).__name__} and the optimiser {type(solver).__name__}."
-        )
+        example = "an optimiser of optax, such as optax.adam(1e-3)"
+        requires(uses_optax, "batch", example, type(solver).__name__)
+    if isinstance(shooting, MultipleShooting):
+        condition = "a loss of residuals and a least-squares optimiser"
+        names = f"{type(problem.loss).__name__} and {type(solver).__name__}"
+        requires(is_vector, "dvi.MultipleShooting", condition, names)
     stage_horizons = _horizons(horizons)
     u = problem.space.to_u(problem.start)
     name = identity(problem, u, solver, shooting, stage_horizons, batch, seed, tolerance)
-    with progress_display(progress) as show:
-        run = Run(problem, max_steps, tolerance, show, began, checkpoint, name)
+    with progress_display(settings.get("progress")) as show:
+        run = FitRun(problem, max_steps, tolerance, show, began, checkpoint, name)
         if isinstance(shooting, MultipleShooting):
             minimum = in_segments(run, Segments(problem, shooting), u, solver)
         elif is_vector:
             minimum = least_squares(run, u, solver, stage_horizons, check_units)
         else:
             minimum = by_gradient(run, u, solver, stage_horizons, check_units, batch, seed)
-    estimate, status = _result(run, minimum, check_curvature), minimum.status
+    estimate = _result(run, minimum, settings.get("check_curvature", True))
+    status = minimum.status
     fine = bool((status == FIT_RESULTS.converged) | (status == FIT_RESULTS.steps_done))
     if checkpoint is not None and fine:
         Path(checkpoint).unlink(missing_ok=True)
@@ -156,8 +151,8 @@ def fit(
         return estimate
     raise FitError(
         f"the fit did not converge (status: {estimate.status}, steps: {len(run.records)}, loss: "
-        f"{estimate.loss:.6g}). {FIT_RESULTS[status]} The result is in the attribute `fit` of this "
-        "error; throw=False returns it.",
+        f"{estimate.loss:.6g}). {FIT_RESULTS[status]} The attribute `fit` is the result; "
+        "throw=False returns it.",
         estimate,
     )
 
@@ -172,17 +167,16 @@ def _horizons(horizons: Any) -> list[float] | None:
     times = np.asarray(horizons, float)
     if times.ndim != 1 or not (np.diff(times) > 0).all() or not (times > 0).all():
         raise ValueError(
-            "horizons must be 'auto', None or a list of increasing positive times, got "
-            f"{horizons!r:.200}."
+            f"horizons must be 'auto', None or increasing positive times, got {horizons!r:.200}."
         )
     return [*times.tolist(), np.inf]
 
 
-def _result(run: Run, minimum: Minimum, check_curvature: bool) -> FitResult:
+def _result(run: FitRun, minimum: Minimum, check_curvature: bool) -> FitResult:
     """Errors, undetermined directions and residuals at a minimum."""
     problem, n = run.problem, run.problem.size
     space, u, has_residuals = problem.space, jnp.asarray(minimum.u), isinstance(problem.loss, Loss)
-    rows, predictions = minimum.aux or problem.whitened(u)
+    rows, predictions = minimum.aux or problem.weighted_residuals(u)
     predictions_by_arc, residuals_in_sigma, trajectories = problem.by_arc(rows, predictions)
     x = np.asarray(space.to_x(u))
     r = problem.root_rows(u, rows)
@@ -208,11 +202,8 @@ def _result(run: Run, minimum: Minimum, check_curvature: bool) -> FitResult:
             curvature = _curvature_ratio(problem, u, r, J, spectrum)
     at_bounds = space.at_bounds(x, np.sqrt(np.diag(covariance)))
     free = ~np.isin(space.names, at_bounds)  # a parameter at its bound is known: it is there
-    words = [
-        in_words(d, list(space.names))
-        for d in free_directions
-        if np.abs(d[free]).max(initial=0) > 1e-6
-    ]
+    directions = [d for d in free_directions if np.abs(d[free]).max(initial=0) > 1e-6]
+    words = [in_words(d, list(space.names)) for d in directions]
     return FitResult(
         params=space.to_params(jnp.asarray(x)),
         x=x,
@@ -242,7 +233,7 @@ def _result(run: Run, minimum: Minimum, check_curvature: bool) -> FitResult:
 
 
 def _curvature_ratio(
-    problem: Problem, u: Any, r: np.ndarray, J: np.ndarray, spectrum: Uncertainty
+    problem: FitProblem, u: Any, r: np.ndarray, J: np.ndarray, spectrum: Uncertainty
 ) -> np.ndarray:
     """Second derivative of the loss along each principal direction over Gauss–Newton's, which
     lacks r · r''.
@@ -258,10 +249,8 @@ def _curvature_ratio(
     t = _PART * np.linalg.norm(r) / np.sqrt(squares * max(problem.degrees_of_freedom, 1))
     ratios = []
     for d, step, square in zip(D.T, t, squares, strict=True):
-        forward, backward = (
-            np.asarray(problem.evaluate(u + s * step * d).jacobian) for s in (1, -1)
-        )
-        ratios.append(
-            1 + (r @ ((forward - backward) @ d) / (2 * step * square) if step > 0 else 0.0)
-        )
+        points = (u + step * d, u - step * d)
+        forward, backward = (np.asarray(problem.evaluate(x).jacobian) for x in points)
+        change = r @ ((forward - backward) @ d)
+        ratios.append(1 + (change / (2 * step * square) if step > 0 else 0.0))
     return np.array(ratios)

@@ -4,7 +4,7 @@ import sys
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Unpack
 
 import equinox as eqx
 import jax
@@ -13,8 +13,11 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from ..base.checks import fraction, instance, whole
+from ..base.keywords import checked_keywords
 from ._fit import fit
-from .losses import LeastSquares, Likelihood, Loss
+from .checks import package, same_parameters
+from .keywords import LossSettings, SampleSettings, select
+from .losses import Likelihood
 from .observations import Data
 from .parameters import make_space
 from .posterior import Posterior
@@ -131,35 +134,25 @@ class Samples:
 
         **Raises** `ImportError` without arviz.
         """
-        try:
-            import arviz  # pyright: ignore[reportMissingImports]
-        except ImportError as error:
-            raise ImportError(
-                f"to_arviz requires arviz, but its import failed ({error}): pip install arviz"
-            ) from None
+        arviz = package("arviz", "to_arviz", "arviz")
         tree = self.to_xarray()
         if int(arviz.__version__.split(".")[0]) >= 1:
             return tree
         return arviz.InferenceData(**{name: tree[name].to_dataset() for name in tree.children})
 
 
+@checked_keywords
 def sample(
     model: Callable[..., Any],
     data: Data,
     params: PyTree,
     *,
-    bounds: PyTree = None,
-    priors: PyTree = None,
-    loss: Loss | Likelihood = LeastSquares(),
     num_samples: int = 1000,
     num_warmup: int = 300,
     chains: int = 4,
     seed: int = 0,
     start: FitResult | PyTree = None,
-    gradient: str = "reverse",
-    target_accept: float = 0.8,
-    max_tree_depth: int = 10,
-    progress: bool | None = None,
+    **settings: Unpack[SampleSettings],
 ) -> Samples:
     r"""Samples of the posterior of parameters by the No-U-Turn sampler.
 
@@ -173,8 +166,8 @@ def sample(
       they agree. `seed`: of all draws; the same seed gives the same draws.
     - `start`: a `FitResult` of these parameters, or a pytree like `params`; None: a fit from
       `params`. A parameter that such a fit left at a bound starts at its value in `params`.
-    - `target_accept`: acceptance for the step size; nearer to 1 against divergences.
-      `max_tree_depth`: a path has at most 2^max_tree_depth steps.
+    - `target_accept`: acceptance for the step size, by default 0.8; nearer to 1 against
+      divergences. `max_tree_depth`: a path has at most 2^max_tree_depth steps, by default 2¹⁰.
     - `progress`: True shows a bar, False none, None where there is a terminal.
 
     **Returns** `Samples`, with a `UserWarning` and a text in ``warnings`` for chains that do not
@@ -188,37 +181,36 @@ def sample(
     **Source** Hoffman & Gelman 2014, *J. Mach. Learn. Res.* 15, 1593 (by numpyro); R̂, Gelman et
     al. 2013, *Bayesian Data Analysis*, 11.4.
     """
-    numpyro = _numpyro()
+    infer = _numpyro("infer")
     counts = {"num_warmup": num_warmup, "num_samples": num_samples, "num_chains": chains}
     whole("num_samples", num_samples, 4)
     whole("num_warmup", num_warmup, 0)
     whole("chains", chains)
     whole("seed", seed, 0)
-    whole("max_tree_depth", max_tree_depth)
-    fraction("target_accept", target_accept)
+    depth = whole("max_tree_depth", settings.get("max_tree_depth", 10))
+    acceptance = fraction("target_accept", settings.get("target_accept", 0.8))
+    progress = settings.get("progress")
     instance("progress", progress, bool | None, "True, False or None")
-    posterior = Posterior(
-        model, data, params, bounds=bounds, priors=priors, loss=loss, gradient=gradient
-    )
+    terms, gradient = select(settings, LossSettings), settings.get("gradient", "reverse")
+    posterior = Posterior(model, data, params, **terms, gradient=gradient)
     notes: list[str] = []
     if start is None:
-        has_errors = posterior._problem.has_errors or isinstance(loss, Likelihood)
-        of_fit = {"bounds": bounds, "priors": priors if has_errors else None, "loss": loss}
+        has_errors = posterior._problem.has_errors or isinstance(terms.get("loss"), Likelihood)
+        of_fit = terms if has_errors else {**terms, "priors": None}
         quiet: dict[str, Any] = {"check_curvature": False, "progress": False, "throw": False}
         start = fit(model, data, params, **of_fit, **quiet)
     if isinstance(start, FitResult) and start.status != "converged":
         notes.append(f"the chains start from a fit that did not converge: {start.status}.")
-    mode, root = posterior.laplace(_start_of(posterior, start, bounds, priors))
+    limits = terms.get("bounds"), terms.get("priors")
+    mode, root = posterior.laplace(start_of(posterior, start, *limits))
     centre, L = jnp.asarray(mode), jnp.asarray(root)
 
     def in_z(z):
         return posterior.potential(centre + L @ z)
 
-    kernel = numpyro.infer.NUTS(
-        potential_fn=in_z, target_accept_prob=target_accept, max_tree_depth=max_tree_depth
-    )
+    kernel = infer.NUTS(potential_fn=in_z, target_accept_prob=acceptance, max_tree_depth=depth)
     shows = sys.stderr.isatty() if progress is None else progress
-    mcmc = numpyro.infer.MCMC(kernel, **counts, chain_method="vectorized", progress_bar=shows)
+    mcmc = infer.MCMC(kernel, **counts, chain_method="vectorized", progress_bar=shows)
     begin = _starts(in_z, chains, posterior.size, seed)
     with jax.numpy_rank_promotion("allow"):  # numpyro's own arithmetic
         mcmc.run(
@@ -229,25 +221,17 @@ def sample(
     z = mcmc.get_samples(group_by_chain=True)
     x = jax.jit(jax.vmap(jax.vmap(lambda z: posterior.to_x(centre + L @ z))))(z)
     statistics = mcmc.get_extra_fields(group_by_chain=True)
-    samples = _collect(numpyro, posterior, x, statistics, notes, 2**max_tree_depth - 1)
+    samples = collect(posterior, x, statistics, notes, 2**depth - 1)
     for text in samples.warnings:
-        warnings.warn(text, UserWarning, stacklevel=2)
+        warnings.warn(text, UserWarning, stacklevel=3)
     return samples
 
 
-def _numpyro() -> Any:
-    try:
-        import numpyro.diagnostics
-        import numpyro.infer
-    except ImportError as error:
-        raise ImportError(
-            f"dvi.sample requires numpyro, but its import failed ({error}): pip install "
-            f'"dvi-jax[bayes]"'
-        ) from None
-    return numpyro
+def _numpyro(part: str) -> Any:
+    return package(f"numpyro.{part}", "dvi.sample", '"dvi-jax[bayes]"')
 
 
-def _start_of(posterior: Posterior, start: Any, bounds: PyTree, priors: PyTree) -> np.ndarray:
+def start_of(posterior: Posterior, start: Any, bounds: PyTree, priors: PyTree) -> np.ndarray:
     """The free vector of a fit or of a pytree.
 
     A number that the fit left at a bound, where u is infinite, starts as in `params`.
@@ -257,15 +241,7 @@ def _start_of(posterior: Posterior, start: Any, bounds: PyTree, priors: PyTree) 
     is_fit = isinstance(start, FitResult)
     arguments = (start.params,) if is_fit else (start, bounds, priors)
     space, x = make_space(*arguments)
-    if list(space.names) != posterior.names:
-        lacking, surplus = (
-            ", ".join([name for name in a if name not in b][:8]) or "none"
-            for a, b in ((posterior.names, space.names), (space.names, posterior.names))
-        )
-        raise ValueError(
-            "start must have the same parameters as params. Missing in start: "
-            f"{lacking}. Unknown in start: {surplus}."
-        )
+    same_parameters("start", space.names, posterior.names, "params")
     if is_fit:
         at_bounds = np.isin(posterior.names, posterior._space.at_bounds(x, start.sigma))
         x = np.where(at_bounds, posterior.to_x(jnp.asarray(posterior.start)), x)
@@ -284,15 +260,15 @@ def _starts(potential: Callable[[Array], Array], chains: int, size: int, seed: i
     return jnp.zeros((chains, size))  # the mode, where it is positive
 
 
-def _collect(
-    numpyro: Any, posterior: Posterior, x: Any, statistics: Any, notes: list[str], longest: int
+def collect(
+    posterior: Posterior, x: Any, statistics: Any, notes: list[str], longest: int
 ) -> Samples:
     """Draws with their diagnostics."""
-    x = np.asarray(x)
+    x, diagnostics = np.asarray(x), _numpyro("diagnostics")
     columns = {name: x[..., i] for i, name in enumerate(posterior.names)}
     with np.errstate(invalid="ignore", divide="ignore"):
-        r_hat = {n: float(numpyro.diagnostics.split_gelman_rubin(c)) for n, c in columns.items()}
-        ess = {n: float(numpyro.diagnostics.effective_sample_size(c)) for n, c in columns.items()}
+        r_hat = {n: float(diagnostics.split_gelman_rubin(c)) for n, c in columns.items()}
+        ess = {n: float(diagnostics.effective_sample_size(c)) for n, c in columns.items()}
     samples = Samples(
         names=posterior.names,
         x=x,

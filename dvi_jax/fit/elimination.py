@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Array
 
 from .library import KEY, ForceLibrary
-from .optimise import FIT_RESULTS, Evaluation, LeastSquaresStage, Task
-from .problem import Problem
+from .optimise import FIT_RESULTS, Evaluation, LeastSquaresStage, StageTask
+from .problem import FitProblem
 from .solvers import levenberg_marquardt
 from .uncertainty import Uncertainty, in_words, inverse_or, uncertainty
 
@@ -42,7 +42,7 @@ class Removal:
     status: FIT_RESULTS
 
 
-def places(problem: Problem, library: ForceLibrary) -> np.ndarray:
+def places(problem: FitProblem, library: ForceLibrary) -> np.ndarray:
     """Indices of the coefficients among the free variables."""
     names = list(problem.space.names)
     return np.array([names.index(f"{KEY}.{name}") for name in library.names])
@@ -56,7 +56,7 @@ class Elimination:
     """
 
     def __init__(
-        self, problem: Problem, library: ForceLibrary, penalty: float | None, has_errors: bool
+        self, problem: FitProblem, library: ForceLibrary, penalty: float | None, has_errors: bool
     ):
         self.problem, self.library, self.has_errors = problem, library, has_errors
         self.where = places(problem, library)
@@ -64,7 +64,7 @@ class Elimination:
         self.penalty = float(usual if penalty is None else penalty)
         self.stage = LeastSquaresStage(self._evaluate, levenberg_marquardt())
         self.path: list[Removal] = []
-        self.undetermined: list[str] = []
+        self.combinations: list[str] = []
         self.best = problem.space.to_u(problem.start)
         self.keep = np.ones(problem.size, bool)
 
@@ -104,13 +104,11 @@ class Elimination:
             spectrum = uncertainty(J[:, keep], 1.0)
             if name is None:
                 names = [n.removeprefix(f"{KEY}.") for n in self.problem.space.names]
-                self.undetermined = [in_words(d, names) for d in spectrum.null_directions.T]
+                self.combinations = [in_words(d, names) for d in spectrum.null_directions.T]
             i = self._weakest(u, J, keep, spectrum)
             remainder = keep & (np.arange(len(u)) != self.where[i])
-            u, keep = (
-                _eliminate(u, np.asarray(evaluation.jacobian), self.where[i], remainder),
-                remainder,
-            )
+            u = _eliminate(u, np.asarray(evaluation.jacobian), self.where[i], remainder)
+            keep = remainder
             name = self.library.names[i]
 
     def _refit(self, u: np.ndarray, keep: np.ndarray) -> tuple[Any, Evaluation, FIT_RESULTS]:
@@ -118,7 +116,7 @@ class Elimination:
         u = np.where(keep, u, 0.0)
         if not keep.any():
             return u, self.stage.values_at(u, np.inf, jnp.asarray(keep)), FIT_RESULTS.converged
-        task = Task(0, np.inf, _REFIT, _PRECISE)
+        task = StageTask(0, np.inf, _REFIT, _PRECISE)
         degrees, extra = self.problem.count - int(keep.sum()), jnp.asarray(keep)
         outcome = self.stage.run(u, task, degrees, extra=extra)
         zero = u.copy()

@@ -2,25 +2,27 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Unpack
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
 
 from ..base.checks import instance, positive
+from ..base.keywords import checked_keywords
 from ..problem.system import System
 from ._fit import fit
 from .elimination import Elimination, Removal, places
+from .keywords import OptimiserSettings
 from .library import KEY, ForceLibrary, with_force
 from .losses import LeastSquares, Loss
 from .model import specification
 from .observations import Data, Observations, as_arcs
 from .optimise import FIT_RESULTS, FitError
 from .parameters import Prior
-from .problem import Problem
+from .problem import FitProblem
 from .result import FitResult, with_error
+from .shooting import MultipleShooting, SingleShooting
 
 _GUARD = 3.0
 """Width of a prior: the change of the predictions by the candidate alone, to first order, in
@@ -31,9 +33,8 @@ _PROVISIONAL_ERROR = 1e-3
 """Provisional errors of data without any, in scatters of the data."""
 
 
-_OPTIONS = ("max_steps", "tolerance", "check_units", "progress")
-_OF_FIRST = ("shooting", "horizons")
-"""Options of `fit` for all fits, and for that of all candidates."""
+_OF_ALL = ("max_steps", "tolerance", "check_units", "progress")
+"""Keywords of `fit` for the fit of all candidates and for the last one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,18 +99,18 @@ class Identification:
     __repr__ = __str__
 
 
+@checked_keywords
 def identify(
     model: Callable[..., Any],
     data: Data,
     library: ForceLibrary,
     params: Mapping[str, Any] | None = None,
     *,
-    bounds: PyTree = None,
-    priors: PyTree = None,
-    loss: Loss = LeastSquares(),
     penalty: float | None = None,
+    shooting: SingleShooting | MultipleShooting = SingleShooting(),
+    horizons: str | list[float] | None = "auto",
     throw: bool = True,
-    **options: Any,
+    **settings: Unpack[OptimiserSettings],
 ) -> Identification:
     r"""Terms of an unknown force, selected from a library of candidates by observations.
 
@@ -136,8 +137,8 @@ def identify(
     - `penalty`: λ; None means log N + 2 log M for M candidates. log N alone is Schwarz's BIC, by
       which one of twenty idle candidates is often kept; 2 log M accounts for the choice among M.
     - `throw`: raise `FitError` when the last fit does not converge.
-    - `options`: `shooting`, `max_steps`, `tolerance`, `horizons`, `check_units`, `progress` as in
-      `fit`, and `check_curvature` (False if left out). Multiple shooting and horizons are for the
+    - `shooting`, `max_steps`, `tolerance`, `horizons`, `check_units`, `progress`: as in `fit`;
+      `check_curvature`: the same, by default False. Multiple shooting and horizons are for the
       fit of all candidates; refits, which begin at a minimum, use single shooting.
 
     **Returns** an `Identification`. Read its `alternatives` and `undetermined`: the data cannot
@@ -150,36 +151,32 @@ def identify(
     as a bound of 2 log C(M, k), Chen & Chen 2008.
     """
     params = {} if params is None else params
-    _check_input(library, params, bounds, priors, loss, penalty, options)
+    bounds, priors = settings.get("bounds"), settings.get("priors")
+    loss: Any = settings.get("loss", LeastSquares())
+    _check_input(library, params, bounds, priors, loss, penalty)
     arcs, is_list = as_arcs(data)
     full_model = _with_library(model, library, is_list, params)
     start = {**params, KEY: dict.fromkeys(library.names, 0.0)}
     arcs_with_errors = [_with_errors(arc) for arc in arcs]
     guard = _guard(
-        Problem(full_model, arcs_with_errors, is_list, start, bounds=bounds, loss=loss), library
+        FitProblem(full_model, arcs_with_errors, is_list, start, bounds=bounds, loss=loss), library
     )
     setting = {"bounds": bounds, "priors": {**(priors or {}), KEY: guard}, "loss": loss}
-    common = {name: options[name] for name in _OPTIONS if name in options}
-    first = {name: options[name] for name in _OF_FIRST if name in options}
-    first |= {**common, **setting, "check_curvature": False, "throw": False}
+    common: dict[str, Any] = {name: x for name, x in settings.items() if name in _OF_ALL}
+    first: dict[str, Any] = {**common, **setting, "shooting": shooting, "throw": False}
+    observations = arcs_with_errors if is_list else arcs_with_errors[0]
     full: Any = None
-    for change in ({}, {"horizons": None}):
+    for path in (horizons, None):
         # A fit of the beginning may diverge later; without a force nothing does.
-        full = fit(
-            full_model,
-            arcs_with_errors if is_list else arcs_with_errors[0],
-            start,
-            **{**first, **change},
-        )
+        full = fit(full_model, observations, start, horizons=path, check_curvature=False, **first)
         if full.status != "not_finite":
             break
     else:
         raise FitError(
-            "the first fit of dvi.identify, with all terms of library, failed (see the attribute "
-            f"`fit`). {FIT_RESULTS[full.result]}",
+            f"the fit of all terms failed; it is the attribute `fit`. {FIT_RESULTS[full.result]}",
             full,
         )
-    problem = Problem(full_model, arcs_with_errors, is_list, full.params, **setting)
+    problem = FitProblem(full_model, arcs_with_errors, is_list, full.params, **setting)
     search = Elimination(problem, library, penalty, arcs[0].has_errors)
     search.eliminate()
     terms = search.terms
@@ -189,7 +186,7 @@ def identify(
     if terms or set(values) != {KEY}:
         # The remaining terms by `fit` itself: errors, residuals, statuses.
         common |= {"bounds": bounds, "priors": priors, "loss": loss, "horizons": None}
-        common |= {"check_curvature": options.get("check_curvature", False), "throw": throw}
+        common |= {"check_curvature": settings.get("check_curvature", False), "throw": throw}
         final = fit(full_model, data, values, **common)
         values = final.params
         indices = [final.names.index(f"{KEY}.{name}") for name in terms]
@@ -207,32 +204,25 @@ def identify(
         path=search.path,
         penalty=search.penalty,
         alternatives=search.alternatives(),
-        undetermined=search.undetermined,
+        undetermined=search.combinations,
         fit=final,
         full=full,
     )
 
 
 def _check_input(
-    library: Any, params: Any, bounds: Any, priors: Any, loss: Any, penalty: Any, options: Any
+    library: Any, params: Any, bounds: Any, priors: Any, loss: Any, penalty: Any
 ) -> None:
-    option_names = (*_OPTIONS, *_OF_FIRST, "check_curvature")
-    for name in options:
-        if name not in option_names:
-            raise TypeError(
-                f"dvi.identify has no option {name!r}: use one of {', '.join(option_names)}."
-            )
     instance("library", library, ForceLibrary, "a dvi.ForceLibrary")
     if library.coefficients is not None:
-        raise ValueError("library already has coefficients: make a dvi.ForceLibrary without them.")
+        raise ValueError(f"library must have no coefficients, got {library.coefficients}.")
     losses = "dvi.LeastSquares(), dvi.SoftL1() or dvi.Cauchy()"
     instance("loss", loss, Loss, losses, "Terms are distinguished from noise by residuals.")
     for name, value in (("params", params), ("bounds", bounds), ("priors", priors)):
         instance(name, {} if value is None else value, Mapping, "a dict or None")
         if value is not None and KEY in value:
             raise ValueError(
-                f"{name} must not contain the key {KEY!r}, to which dvi.identify adds the "
-                "coefficients."
+                f"{name} must not contain {KEY!r}: dvi.identify adds the coefficients."
             )
     if penalty is not None:
         positive("penalty", penalty)
@@ -273,19 +263,18 @@ def _with_library(
     args, system, epsilon = spec.get("args"), spec["system"], spec.get("epsilon", 0.0)
     if not (args is None or (isinstance(args, Mapping) and KEY not in args)):
         raise TypeError(
-            f"args of the model must be None or a dict without the key {KEY!r}, got {args!r:.200}."
+            f"args of the model must be None or a dict without {KEY!r}, got {args!r:.200}."
         )
     is_perturbed = system.force is not None or system.perturbation is not None
     if "epsilon" in params and not is_perturbed:
         raise ValueError(
-            "epsilon and the coefficients of library cannot both be fitted, since the system has "
-            "no other force: only their product is determined. Remove epsilon from params."
+            "epsilon cannot be fitted if library is the only force, because only their product is "
+            "determined: remove epsilon from params."
         )
     is_alone = not np.any(np.asarray(epsilon)) and "epsilon" not in params
     if is_alone and is_perturbed:
         raise ValueError(
-            "the model must have an epsilon other than 0, got epsilon = 0 (the default), which "
-            "removes the force of its system and the library."
+            "the model must have an epsilon other than 0, got epsilon = 0: there is no force then."
         )
     return _ModelWithLibrary(model, library, is_list, is_alone)
 
@@ -298,7 +287,7 @@ def _with_errors(arc: Observations) -> Observations:
     return replace(arc, sigma=_PROVISIONAL_ERROR * scatter)
 
 
-def _guard(problem: Problem, library: ForceLibrary) -> dict[str, Prior]:
+def _guard(problem: FitProblem, library: ForceLibrary) -> dict[str, Prior]:
     """A wide prior for each coefficient, by the candidate's effect on the predictions."""
 
     def in_errors(arc):  # 1 where errors are covariances

@@ -12,9 +12,10 @@ import numpy as np
 from jaxtyping import Array
 
 from ..base.checks import instance, one_of, whole
-from ..base.signature import accepts, signature_of
+from ..base.signature import check_takes
 from ..base.types import Args, Scalar, State
 from ..problem.system import System
+from .checks import require_shape
 
 KEY = "coefficients"
 """Key of the coefficients in args and parameters."""
@@ -36,7 +37,7 @@ class ForceLibrary(eqx.Module):
 
     **Raises** `TypeError` if it is not a dict of such functions; `ValueError` for an empty dict and
     for coefficients of another shape; and when called for args without coefficients, and for a
-    candidate whose value is not shaped like q0.
+    candidate whose value is not require_shape like q0.
     """
 
     functions: tuple[Callable[..., Any], ...]
@@ -49,15 +50,10 @@ class ForceLibrary(eqx.Module):
         a_dict = "a dict {name: function (t0, t1, q0, p1, args)}"
         instance("the candidates of a dvi.ForceLibrary", candidates, Mapping, a_dict)
         if not candidates:
-            raise ValueError("a dvi.ForceLibrary must have at least one candidate, got none.")
+            raise ValueError("a dvi.ForceLibrary must have at least one candidate, got {}.")
         for name, function in candidates.items():
             instance("the name of a candidate", name, str, "a string")
-            if not (callable(function) and accepts(function, 5)):
-                description = signature_of(function) if callable(function) else f"{function!r:.200}"
-                raise TypeError(
-                    f"the candidate {name!r} must be a function with the five arguments "
-                    f"(t0, t1, q0, p1, args), got {description}."
-                )
+            check_takes(f"the candidate {name!r}", function, "(t0, t1, q0, p1, args)")
         self.functions, self.names = tuple(candidates.values()), tuple(candidates)
         if coefficients is not None:
             coefficients = jnp.asarray(coefficients, float)
@@ -97,11 +93,7 @@ class ForceLibrary(eqx.Module):
         total = jnp.zeros_like(q0)
         for i, (name, function) in enumerate(zip(self.names, self.functions, strict=True)):
             value = function(t0, t1, q0, p1, args)
-            if jnp.shape(value) != q0.shape:
-                raise ValueError(
-                    f"the candidate {name!r} must return an array of the shape of q0, {q0.shape}, "
-                    f"got shape {jnp.shape(value)}."
-                )
+            require_shape(f"the value of the candidate {name!r}, like q0,", value, q0.shape)
             total = total + c[i] * value
         return total
 
@@ -109,26 +101,19 @@ class ForceLibrary(eqx.Module):
         if self.coefficients is not None:
             return self.coefficients
         if not (isinstance(args, Mapping) and KEY in args):
-            other = "None" if args is None else "an object that is not a dict"
-            description = (
-                f"a dict with the keys {list(args)}" if isinstance(args, Mapping) else other
-            )
+            is_dict = isinstance(args, Mapping)
+            keys = f"the keys {list(args)}" if is_dict else f"the type {type(args).__name__}"
             raise ValueError(
-                f'args["{KEY}"] must contain the coefficients of a dvi.ForceLibrary, an array of '
-                "shape "
-                f"({len(self.names)},), got {description}."
+                f'args["{KEY}"] must be the {len(self)} coefficients of the dvi.ForceLibrary, but '
+                f"args has {keys}."
             )
         c = jnp.asarray(args[KEY])
         self._check_shape(c, f'args["{KEY}"]')
         return c
 
-    def _check_shape(self, c: Array, called: str) -> None:
-        if c.shape != (len(self.names),):
-            raise ValueError(
-                f"{called} must have shape ({len(self.names)},), got shape {c.shape}. Give one "
-                "number for each candidate: "
-                f"{', '.join(self.names[:4])}{', …' if len(self.names) > 4 else ''}."
-            )
+    def _check_shape(self, c: Array, name: str) -> None:
+        hint = f"The candidates are {', '.join(self.names[:4])}{', …' * (len(self) > 4)}."
+        require_shape(name, c, (len(self),), hint=hint)
 
     def __len__(self) -> int:
         return len(self.names)
@@ -139,13 +124,13 @@ class ForceLibrary(eqx.Module):
         duplicates = sorted(set(self.names) & set(other.names))
         if duplicates:
             raise ValueError(
-                f"both libraries of the sum have a candidate {duplicates[0]!r}: rename one, or "
-                "select the others with library.only(names)."
+                f"both libraries have a candidate {duplicates[0]!r}: rename one, or select the "
+                "others by library.only(names)."
             )
         if (self.coefficients is None) != (other.coefficients is None):
             raise ValueError(
-                f"only the {'second' if self.coefficients is None else 'first'} library of the "
-                "sum has coefficients: both must have them, or neither."
+                "both libraries must have coefficients, or neither, got only those of the "
+                f"{'second' if self.coefficients is None else 'first'}."
             )
         c = None
         if self.coefficients is not None and other.coefficients is not None:
@@ -175,11 +160,8 @@ class ForceLibrary(eqx.Module):
         names = tuple(names)
         for name in names:
             if name not in self.names:
-                raise ValueError(
-                    f"unknown candidate {name!r}. The library has "
-                    f"{', '.join(map(repr, self.names[:8]))}"
-                    f"{', …' if len(self.names) > 8 else '.'}{hint}"
-                )
+                listing = ", ".join(map(repr, self.names[:8])) + ", …" * (len(self) > 8)
+                raise ValueError(f"unknown candidate {name!r}: the library has {listing}.{hint}")
         return names
 
     def _candidates(self) -> dict[str, Callable[..., Any]]:
@@ -195,11 +177,7 @@ class _Monomial(eqx.Module):
 
     def __call__(self, t0, t1, q0, p1, args):
         del t0, t1, args
-        if q0.shape != (self.n,):
-            raise ValueError(
-                f"q0 must have shape ({self.n},), as in dvi.ForceLibrary.monomials(degree, n) "
-                f"with n = {self.n}, got shape {q0.shape}."
-            )
+        require_shape(f"q0 for dvi.ForceLibrary.monomials(degree, {self.n})", q0, (self.n,))
         value = jnp.ones((), q0.dtype)
         for (v, i), power in self.powers:
             value = value * (q0 if v == "q" else p1)[i] ** power
@@ -215,7 +193,7 @@ class _Monomial(eqx.Module):
         return " ".join([*(parts or ["1"]), *([] if self.n == 1 else [f"e{self.k + 1}"])])
 
 
-class _Sum(eqx.Module):
+class _ForceSum(eqx.Module):
     """A known force and an unknown one."""
 
     force: Callable[..., Any]
@@ -227,5 +205,5 @@ class _Sum(eqx.Module):
 
 def with_force(system: System, library: ForceLibrary) -> System:
     """The system with the library's force added to its own."""
-    force = library if system.force is None else _Sum(system.force, library)
+    force = library if system.force is None else _ForceSum(system.force, library)
     return replace(system, force=force)

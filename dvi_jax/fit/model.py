@@ -12,7 +12,7 @@ from jaxtyping import Array, PyTree
 
 from lanewise.jaxprs.jaxapi import is_traced
 
-from ..base.checks import instance
+from ..base.checks import instance, whole
 from ..base.inputs import as_parameter, start_state
 from ..base.results import RESULTS
 from ..base.signature import accepts
@@ -32,6 +32,9 @@ _OPTIONS = (
     *("integrator", "num_steps"),
 )
 _MAY_BE_FITTED = ("q0", "p0", "epsilon", "args")
+_MOST_STEPS = 2e9
+"""Steps of a trajectory: their number is a 32-bit integer."""
+
 _REASONS = {
     "num_steps": "it follows from h and the times of the data",
     "save": "the times of the data determine which states are saved",
@@ -90,30 +93,23 @@ class Model(eqx.Module):
 
     def __call__(self, params: Mapping[str, Any], arc: Any = None) -> dict[str, Any]:
         """The arguments of `integrate` for an arc (None: there is one, without rows)."""
-        keys = ", ".join(_MAY_BE_FITTED)
-        if not isinstance(params, Mapping):
-            kind = f"an object of type {type(params).__name__}"
+        surplus = "an array" if hasattr(params, "shape") else f"the type {type(params).__name__}"
+        if isinstance(params, Mapping):
+            surplus = "".join([f"the key {key!r}" for key in params if key not in self.fixed][:1])
+        if surplus:
             raise TypeError(
-                f"params of a dvi.Model must be a dict with keys among {keys}, got "
-                f"{'a number or an array' if hasattr(params, 'shape') else kind}. For others write "
-                "the model as a function of params."
+                "params of a dvi.Model must be a dict with keys among q0, p0, epsilon, args, got "
+                f"{surplus}. Parameters of the system belong into args; for others write the model "
+                "as a function."
             )
         values = dict(self.fixed)
         for name, value in params.items():
-            if name not in _MAY_BE_FITTED:
-                raise TypeError(
-                    f"params of a dvi.Model must be a dict with keys among {keys}, got the key "
-                    f"{name!r}. For a parameter of the system give {{'args': {{{name!r}: ...}}}}."
-                )
             old = values[name]
             mergeable = isinstance(old, Mapping) and isinstance(value, Mapping)
             values[name] = {**old, **value} if mergeable else value
         for name in ("q0", "p0"):
             if values[name] is None:
-                raise TypeError(
-                    f"{name} is missing: give dvi.Model(..., {name}=...), or {{{name!r}: ...}} in "
-                    "params."
-                )
+                raise TypeError(f"{name} is missing: give it to dvi.Model, or in params.")
             if arc is not None:
                 values[name] = _row(name, values[name], arc)
         return {**self.settings, **values}
@@ -121,13 +117,9 @@ class Model(eqx.Module):
     def check_rows(self, params: Mapping[str, Any], arcs: int) -> None:
         """Reject q0 and p0 with more rows than there are arcs."""
         for name in ("q0", "p0"):
-            shape = np.shape(params.get(name, self.fixed[name]))
-            if shape[0] != arcs:
-                hint = " For a single arc give data without the list." if arcs == 1 else ""
-                raise ValueError(
-                    f"the first axis of {name} must have length {arcs}, one row for each arc in "
-                    f"data, got shape {shape}.{hint}"
-                )
+            _check_rows(
+                name, shape := np.shape(params.get(name, self.fixed[name])), shape[0] == arcs
+            )
 
 
 def _as_array(x: Any) -> Any:
@@ -139,12 +131,16 @@ def _as_array(x: Any) -> Any:
 def _row(name: str, rows: Any, arc: Any) -> Array:
     rows = jnp.asarray(rows)
     # JAX takes the last row for a number that is too large, without an error.
-    if rows.ndim == 0 or (not is_traced(arc) and arc >= len(rows)):
-        raise ValueError(
-            f"{name} must have one row for each arc, got shape {rows.shape}. For a single arc give "
-            "data without the list."
-        )
+    _check_rows(name, rows.shape, rows.ndim and (is_traced(arc) or arc < len(rows)))
     return rows[arc]
+
+
+def _check_rows(name: str, shape: tuple[int, ...], fits: Any) -> None:
+    if not fits:
+        raise ValueError(
+            f"{name} must have one row for each arc in data, got shape {shape}. Give a single arc "
+            "without a list."
+        )
 
 
 def specification(model: Callable[..., Any], params: PyTree, arc: Any, is_list: bool) -> dict:
@@ -164,16 +160,16 @@ def specification(model: Callable[..., Any], params: PyTree, arc: Any, is_list: 
     for name in ("system", "q0", "p0", "h"):
         if spec.get(name) is None:
             raise ValueError(
-                f"the model must return a dict with system, q0, p0 and h; {name!r} is missing or "
-                f"None. Got the keys {list(spec)}."
+                f"the model must return system, q0, p0 and h, but {name!r} is missing or None; the "
+                f"keys are {list(spec)}."
             )
     for name in _REASONS:
         if name in spec and not (name == "num_steps" and not _is_uniform(spec)):
             raise ValueError(f"the model must not set {name!r}: {_REASONS[name]}.")
     if isinstance(spec["h"], jax.Array):
         raise ValueError(
-            "h of the model must be a Python number such as 0.1, not a parameter or another JAX "
-            "array: it determines the number of steps, and cannot be fitted."
+            "h of the model must be a number of Python, not a JAX array: it determines the number "
+            "of steps, and cannot be fitted."
         )
     return spec
 
@@ -211,11 +207,9 @@ class Group(eqx.Module):
 
 def weigh(residual: Any, whiten: Any) -> Any:
     """Residuals in standard errors: by those, or by matrices L⁻¹ of covariances L Lᵀ."""
-    return (
-        residual * whiten
-        if whiten.ndim == residual.ndim
-        else jnp.einsum("...ij,...j->...i", whiten, residual)
-    )
+    if whiten.ndim == residual.ndim:
+        return residual * whiten
+    return jnp.einsum("...ij,...j->...i", whiten, residual)
 
 
 def make_groups(arcs: list[Observations], specs: list[dict[str, Any]]) -> list[Group]:
@@ -224,13 +218,15 @@ def make_groups(arcs: list[Observations], specs: list[dict[str, Any]]) -> list[G
     **Raises** `ValueError` for step sizes that do not suit the data.
     """
     pairs = list(zip(arcs, specs, strict=True))
-    steps = [_steps(i, arc, spec) for i, (arc, spec) in enumerate(pairs)]
+    for i, (arc, spec) in enumerate(pairs):
+        _check_direction(i, arc, float(check_step_size(spec["h"])))
     longest, h = max((abs((arc.ts[-1] - arc.t0) / spec["h"]), spec["h"]) for arc, spec in pairs)
-    if _is_uniform(specs[0]) and 0 < longest < 0.5:
+    if _is_uniform(specs[0]) and longest and not 0.5 <= longest <= _MOST_STEPS:
         raise ValueError(
-            f"the last observation must be at least half a step from t0, got {longest:.3g} steps "
-            f"of h = {h:g}. Give a smaller |h|, or give h and times in one unit."
+            f"the last observation must be 0.5 to {_MOST_STEPS:.0e} steps from t0, got "
+            f"{longest:.3g} steps of h = {h:g}. Give another |h|, or h and times in one unit."
         )
+    steps = [_steps(arc, spec) for arc, spec in pairs]
     # Compiling takes seconds for each program; some millions of steps too many do not.
     separate = len(arcs) * max(steps) - sum(steps) > _WASTE
     kinds: dict[Any, list[int]] = {}
@@ -239,43 +235,29 @@ def make_groups(arcs: list[Observations], specs: list[dict[str, Any]]) -> list[G
         key = (arc.function, arc.values.shape[1:], arc.covariance is not None, size, spec["h"])
         kinds.setdefault(key, []).append(i)
     return [
-        make_group(
-            members, [arcs[i] for i in members], specs[members[0]], max(steps[i] for i in members)
-        )
-        for members in kinds.values()
+        make_group(n, [arcs[i] for i in n], specs[n[0]], max(steps[i] for i in n))
+        for n in kinds.values()
     ]
 
 
-def _steps(i: int, arc: Observations, spec: Mapping[str, Any]) -> int:
-    """Number of steps to the last observation.
-
-    **Raises** `ValueError` for an h that does not lead from t0 to the observations.
-    """
-    h = float(spec["h"])
-    if not np.isfinite(h) or h == 0:
-        raise ValueError(f"the step size h of the model must be finite and not zero, got {h}.")
+def _check_direction(i: int, arc: Observations, h: float) -> None:
+    """**Raises** `ValueError` for an h that does not lead from t0 to the observations."""
     span = arc.ts[-1] - arc.t0
     if span * h < 0:
         side, direction = ("before", "later") if span < 0 else ("after", "earlier")
         raise ValueError(
             f"arc {i}: the observations (t = {arc.ts.min():g} to {arc.ts.max():g}) lie {side} t0 = "
-            f"{arc.t0:g}, but h = {h:g} leads to {direction} times. Give "
-            f"h = {-h:g}, or dvi.Observations(..., t0=...); t0 is ts[0] by default."
+            f"{arc.t0:g}, but h = {h:g} leads to {direction} times. Give h = {-h:g}, or "
+            "dvi.Observations(..., t0=...)."
         )
+
+
+def _steps(arc: Observations, spec: Mapping[str, Any]) -> int:
+    """Number of steps to the last observation."""
     if not _is_uniform(spec):
-        if not isinstance(spec.get("num_steps"), int):
-            raise ValueError(
-                "num_steps of the model must be an int for a lattice other than dvi.Uniform(), "
-                f"got {spec.get('num_steps')!r}."
-            )
-        return spec["num_steps"]
-    steps = span / h
-    if steps > 2e9:
-        raise ValueError(
-            f"arc {i}: h = {h:g} requires {steps:.3g} steps to the last observation, at most 2e9 "
-            "are possible. Give a larger |h|, or give h and times in one unit."
-        )
-    return max(1, math.ceil(steps - 1e-9))
+        hint = "A lattice other than dvi.Uniform() requires it."
+        return whole("num_steps of the model", spec.get("num_steps"), hint=hint)
+    return max(1, math.ceil((arc.ts[-1] - arc.t0) / float(spec["h"]) - 1e-9))
 
 
 def make_group(
@@ -392,7 +374,7 @@ def check_observable(i: int, arc: Observations, spec: Mapping[str, Any]) -> bool
         name = f"observe={arc.observe!r}" if isinstance(arc.observe, str) else "observe"
         result = f"an object of type {type(out).__name__}" if shape is None else f"shape {shape}"
         raise ValueError(
-            f"arc {i}: values has shape {arc.values.shape}, so observe must return an array of "
-            f"shape {row_shape} at each time. Got {result} from {name}, for q of shape {q.shape}."
+            f"arc {i}: values has shape {arc.values.shape}, so observe must return shape "
+            f"{row_shape}, got {result} from {name} for q of shape {q.shape}."
         )
     return False

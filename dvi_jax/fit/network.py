@@ -1,7 +1,7 @@
 """Unknown forces as networks of a potential and a damping."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import equinox as eqx
 import jax
@@ -9,8 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..base.checks import function, one_of, positive, whole
+from ..base.checks import argument_names, function, one_of, positive, refuse_unknown, whole
 from ..base.types import Args, Scalar, State
+from .checks import require_shape
+
+
+class LayerSettings(TypedDict, total=False):
+    """The layers of the networks of a `NetworkForce`."""
+
+    width: int
+    depth: int
+    activation: Callable[..., Any]
+    initial: float
 
 
 def _momentum(q: Any, p: Any) -> Any:
@@ -25,7 +35,8 @@ class NetworkForce(eqx.Module):
     The second part never does positive work: −vᵀ D v ≤ 0 for all parameters.
 
     - `n`: q and p have shape (n,). `key`: of `jax.random`, for the initial weights.
-    - `width`, `depth`: neurons of a hidden layer, and number of hidden layers, of each network.
+    - `width`, `depth`: neurons of a hidden layer, and number of hidden layers, of each network, by
+      default 8 and 2.
     - `conservative`, `dissipative`: which of the parts are present.
     - `damping_of`: ``"q"``, or ``"qp"`` for a D that depends on both.
     - `activation`: a smooth function. The force contains its derivative: with softplus, the
@@ -34,8 +45,9 @@ class NetworkForce(eqx.Module):
       for masses 1, or any that are equal.
     - `scale_q`, `scale_p`: sizes of q and p: networks receive ``q / scale_q`` and
       ``p / scale_p``.
-    - `initial`: initial scale of the last layers, so that the force begins small. With much smaller
-      values the earlier layers have no effect, and the least-squares problem is ill-conditioned.
+    - `initial`: initial scale of the last layers, by default 0.3, so that the force begins small.
+      With much smaller values the earlier layers have no effect, and the least-squares problem is
+      ill-conditioned.
 
     The module is a force, ``dvi.System(H_D, force=network)``, and its own parameters:
 
@@ -67,34 +79,34 @@ class NetworkForce(eqx.Module):
         n: int,
         *,
         key: Array,
-        width: int = 8,
-        depth: int = 2,
         conservative: bool = True,
         dissipative: bool = True,
         damping_of: str = "q",
-        activation: Callable[..., Any] = jax.nn.softplus,
         velocity: Callable[..., Any] | None = None,
         scale_q: float = 1.0,
         scale_p: float = 1.0,
-        initial: float = 0.3,
+        **layers: Unpack[LayerSettings],
     ):
+        names = argument_names(NetworkForce)
+        refuse_unknown("NetworkForce", NetworkForce, [n for n in layers if n not in names])
         if not (conservative or dissipative):
             raise ValueError("conservative and dissipative are both False: set one to True.")
         self.n = whole("n", n)
         self.damping_of = one_of("damping_of", damping_of, ("q", "qp"))
         self.scale_q, self.scale_p = positive("scale_q", scale_q), positive("scale_p", scale_p)
         self.velocity = function("velocity", _momentum if velocity is None else velocity)
-        shape = whole("width", width), whole("depth", depth), function("activation", activation)
-        initial = positive("initial", initial)
+        shape = whole("width", layers.get("width", 8)), whole("depth", layers.get("depth", 2))
+        activation = function("activation", layers.get("activation", jax.nn.softplus))
+        initial = positive("initial", layers.get("initial", 0.3))
         potential_key, damping_key = jax.random.split(key)
         self.potential_net = self.damping_net = None
         if conservative:
             # A constant of φ is no force: a bias there would be a parameter without effect.
-            net = eqx.nn.MLP(n, 1, *shape, use_final_bias=False, key=potential_key)
+            net = eqx.nn.MLP(n, 1, *shape, activation, use_final_bias=False, key=potential_key)
             self.potential_net = _with_last_layer(net, initial)
         if dissipative:
             inputs = n if damping_of == "q" else 2 * n
-            net = eqx.nn.MLP(inputs, n * (n + 1) // 2, *shape, key=damping_key)
+            net = eqx.nn.MLP(inputs, n * (n + 1) // 2, *shape, activation, key=damping_key)
             # D is quadratic in L and has no slope at L = 0: it begins at initial² on the diagonal.
             start = jnp.asarray(initial * np.eye(n)[np.tril_indices(n)])
             net = _with_last_layer(net, initial)
@@ -155,11 +167,7 @@ class NetworkForce(eqx.Module):
 
     def _vector(self, x: Any) -> Array:
         x = jnp.asarray(x)
-        if x.shape != (self.n,):
-            raise ValueError(
-                "q and p of a dvi.NetworkForce(n, ...) must have shape (n,), here with n = "
-                f"{self.n}, got shape {x.shape}."
-            )
+        require_shape(f"q and p for dvi.NetworkForce({self.n}, ...)", x, (self.n,))
         return x
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from ..base.checks import finite, instance
 from ..base.inputs import refuse_unit_or_mask
 from ..base.signature import accepts, signature_of
+from .checks import require_all, require_shape
 
 _RANGE = (1e-140, 1e140)
 """Standard errors relative to the largest value for which a sum of squares can be computed."""
@@ -66,40 +67,30 @@ class Observations:
         if not (observe in OBSERVABLES if is_name else callable(observe) and accepts(observe, 4)):
             description = signature_of(observe) if callable(observe) else f"{observe!r:.200}"
             raise TypeError(
-                'observe must be "positions", "momenta", "state" or a function with the four '
-                f"arguments (t, q, p, args), got {description}."
+                'observe must be "positions", "momenta", "state" or a function (t, q, p, args), '
+                f"got {description}."
             )
-        if ts.ndim != 1 or ts.size == 0:
+        if ts.ndim != 1 or ts.size == 0 or values.shape[:1] != ts.shape:
             raise ValueError(
-                "ts must be a one-dimensional array of times that is not empty, got shape "
-                f"{ts.shape}."
-            )
-        if values.shape[:1] != ts.shape:
-            raise ValueError(
-                f"values must have one row for each time: ts has shape {ts.shape}, values has "
-                f"shape {values.shape}."
+                "ts must be a one-dimensional array of at least one time, and values must have one "
+                f"row for each, got shapes {ts.shape} and {values.shape}."
             )
         _check_times(ts)
-        if where := _first(np.isinf(values)):
-            raise ValueError(f"values is infinite at index {where}: give NaN for a missing value.")
+        require_all("values", values, ~np.isinf(values), "finite", "NaN means a missing value.")
         if np.isnan(values).all():
-            description = (
-                "all values are NaN" if values.size else f"values has shape {values.shape}"
-            )
-            raise ValueError(f"{description}: give at least one number. NaN means a missing value.")
+            raise ValueError(f"values must have at least one number, got {values!r:.200}.")
         refuse_unit_or_mask("t0", self.t0)
         t0 = finite("t0", ts[0] if self.t0 is None else self.t0)
         if ts.min() < t0 < ts.max():
             raise ValueError(
-                f"all times must be on one side of t0 = {t0}, got times from {ts.min()} to "
-                f"{ts.max()}."
+                f"ts must be on one side of t0 = {t0}, got times from {ts.min()} to {ts.max()}."
             )
         fields: dict[str, Any] = {"ts": ts, "values": values, "t0": t0}
         if self.sigma is not None:
             fields["sigma"] = _sigma(self.sigma, values)
         if self.covariance is not None:
             if self.sigma is not None:
-                raise ValueError("sigma and covariance are both given: give only one of them.")
+                raise ValueError("only one of sigma and covariance can be given, got both.")
             fields["covariance"] = _covariance(self.covariance, values)
         fields["t0_is_given"] = self.t0 is not None
         for name, value in fields.items():
@@ -172,14 +163,14 @@ def as_arcs(data: Any) -> tuple[list[Observations], bool]:
         return [data], False
     instance("data", data, list | tuple, "a dvi.Observations or a list of them, one for each arc")
     if not data:
-        raise ValueError("data is empty: give at least one dvi.Observations.")
+        raise ValueError(f"data must contain at least one dvi.Observations, got {data!r}.")
     for i, arc in enumerate(data):
         instance(f"data[{i}]", arc, Observations, "a dvi.Observations")
-    with_error_flags = [arc.has_errors for arc in data]
-    if any(with_error_flags) and not all(with_error_flags):
+    flags = [arc.has_errors for arc in data]
+    if any(flags) and not all(flags):
         raise ValueError(
-            f"data[{with_error_flags.index(False)}] has neither sigma nor covariance, but "
-            f"data[{with_error_flags.index(True)}] has one of them: give them for all arcs or none."
+            "all arcs must have sigma or covariance, or none of them, got one for "
+            f"data[{flags.index(True)}], but not for data[{flags.index(False)}]."
         )
     return list(data), True
 
@@ -188,13 +179,11 @@ def _real(name: str, value: Any) -> np.ndarray:
     refuse_unit_or_mask(name, value)
     try:
         array = np.asarray(value)
-    except (TypeError, ValueError) as error:
-        raise TypeError(
-            f"{name} must be an array of real numbers with rows of equal length, got "
-            f"{type(value).__name__}: {str(error).partition(chr(10))[0]}"
-        ) from None
+        kind = f"dtype {array.dtype}"
+    except (TypeError, ValueError) as error:  # rows of unequal length
+        array, kind = np.array(None), f"{type(value).__name__}: {str(error).partition(chr(10))[0]}"
     if array.dtype.kind not in "fiu":
-        raise TypeError(f"{name} must be an array of real numbers, got dtype {array.dtype}.")
+        raise TypeError(f"{name} must be an array of real numbers, got {kind}.")
     return array.astype(float)
 
 
@@ -204,22 +193,15 @@ def _first(where: np.ndarray) -> list[int]:
 
 
 def _check_times(ts: np.ndarray) -> None:
-    if index := _first(~np.isfinite(ts)):
-        [i] = index
-        raise ValueError(f"ts[{i}] is {ts[i]}: every time must be finite.")
+    require_all("ts", ts, np.isfinite(ts), "finite")
     steps = np.diff(ts)
-    if index := _first(steps == 0):
-        [i] = index
-        raise ValueError(
-            f"ts[{i}] and ts[{i + 1}] are the same time, {ts[i]}: give one row for each time, "
-            "with all components, or the mean of repeated measurements."
-        )
     is_up = (steps > 0).sum() >= (steps < 0).sum()
-    if index := _first(steps < 0 if is_up else steps > 0):
+    if index := _first(steps <= 0 if is_up else steps >= 0):
         [i] = index
         raise ValueError(
-            f"ts is not in order: ts[{i}] = {ts[i]} is followed by ts[{i + 1}] = {ts[i + 1]}. "
-            "Times must all increase or all decrease: sort the rows by np.argsort(ts)."
+            "ts must all increase or all decrease, and no two be equal, got "
+            f"ts[{i}] = {ts[i]} and ts[{i + 1}] = {ts[i + 1]}. Sort the rows by np.argsort(ts); "
+            "give one row for each time."
         )
 
 
@@ -229,34 +211,23 @@ def _sigma(sigma: Any, values: np.ndarray) -> np.ndarray:
         full = np.array(np.broadcast_to(sigma, values.shape))
     except ValueError:
         raise ValueError(
-            f"sigma must be one number or an array that broadcasts to the shape {values.shape} of "
-            f"values, got shape {sigma.shape}."
+            f"sigma must broadcast to the shape {values.shape} of values, got shape {sigma.shape}."
         ) from None
-    is_observed = ~np.isnan(values)
-    if index := _first(~(np.isfinite(full) & (full > 0)) & is_observed):
-        raise ValueError(
-            f"sigma is {full[tuple(index)]} for the value at index {index}: standard errors must "
-            "be positive and finite. To ignore a value, set it to NaN."
-        )
+    is_missing = np.isnan(values)
+    is_valid = np.isfinite(full) & (full > 0) | is_missing
+    require_all("sigma", full, is_valid, "positive and finite", "To ignore a value, set it to NaN.")
     largest = np.nanmax(np.abs(values))
-    size = largest or 1.0
-    if index := _first(~((full > _RANGE[0] * size) & (full < _RANGE[1] * size)) & is_observed):
-        raise ValueError(
-            f"sigma is {full[tuple(index)]:g} at index {index}, but values are up to "
-            f"{largest:.3g}: squares "
-            "of their ratio exceed double precision. Give sigma in the units of the values."
-        )
+    low, high = (factor * (largest or 1.0) for factor in _RANGE)
+    rule = f"between {low:.3g} and {high:.3g} for values of up to {largest:.3g}"
+    is_valid = (full > low) & (full < high) | is_missing
+    require_all("sigma", full, is_valid, rule, "Give sigma in the units of the values.")
     return full
 
 
 def _covariance(covariance: Any, values: np.ndarray) -> np.ndarray:
     C = _real("covariance", covariance)
     n, k = len(values), int(np.prod(values.shape[1:], dtype=int))
-    if C.shape not in ((k, k), (n, k, k)):
-        raise ValueError(
-            f"covariance must have shape {(k, k)} or {(n, k, k)} for values of shape "
-            f"{values.shape}, got shape {C.shape}."
-        )
+    require_shape("covariance", C, (k, k), (n, k, k))
     full = np.array(np.broadcast_to(C, (n, k, k)))
     variance = np.einsum("nii->ni", full)
     scale = np.sqrt(np.abs(variance))
@@ -266,12 +237,12 @@ def _covariance(covariance: Any, values: np.ndarray) -> np.ndarray:
         [i] = index
         asymmetry = np.nan_to_num(np.abs(full[i] - full[i].T), nan=np.inf, posinf=np.inf)
         a, b = np.unravel_index(np.argmax(asymmetry), asymmetry.shape)
-        hint = "If these differ only by round-off, give (C + C.T) / 2 for each covariance matrix C."
+        hint = "Against round-off give (C + C.T) / 2."
         if not np.isfinite(asymmetry[a, b]):
-            hint = "Mark a missing value by NaN in values only, not in covariance."
+            hint = "Mark a missing value by NaN in values only."
         raise ValueError(
             f"the covariance of observation {i} must be symmetric and finite, got {full[i, a, b]} "
-            f"at index [{a}, {b}] and {full[i, b, a]} at [{b}, {a}]. {hint}"
+            f"at [{a}, {b}] and {full[i, b, a]} at [{b}, {a}]. {hint}"
         )
     with np.errstate(divide="ignore", invalid="ignore"):
         unit = full / (scale[:, :, None] * scale[:, None, :])
@@ -279,14 +250,11 @@ def _covariance(covariance: Any, values: np.ndarray) -> np.ndarray:
     smallest = np.linalg.eigvalsh(np.where(good[:, None, None], unit, np.eye(k)))[:, 0]
     if index := _first(~good | (smallest <= 1e-14)):
         [i] = index
-        description = (
-            "smallest eigenvalue of its correlation matrix must be greater than 1e-14, got "
-        )
-        description += f"{smallest[i]:.3g}"
+        description = f"an eigenvalue of {smallest[i]:.3g} of its correlation matrix"
         if not good[i]:  # then the correlation matrix is not defined
-            description = f"variances on its diagonal must be positive, got {variance[i].min():.3g}"
+            description = f"a variance of {variance[i].min():.3g}"
         raise ValueError(
-            f"the covariance of observation {i} is not positive definite: the {description}. "
+            f"the covariance of observation {i} must be positive definite, got {description}. "
             "Leave out values or combinations that are known exactly."
         )
     return full

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .checks import same_fit
 from .roundoff import STIFFNESS, Evaluation, settle, undamped_step
 from .solvers import is_optax
 from .uncertainty import inverse_or
@@ -123,7 +124,7 @@ class Position:
 
 
 @dataclass(frozen=True)
-class Task:
+class StageTask:
     """One stage: its number and horizon, when it ends, and who watches its steps.
 
     - `max_steps`: those before it was resumed included. `resume`: the position to continue from.
@@ -208,7 +209,12 @@ class LeastSquaresStage:
         return self.evaluate(jnp.asarray(u), jnp.asarray(horizon), extra)
 
     def run(
-        self, u: np.ndarray, task: Task, degrees: int, first: Evaluation | None = None, extra=None
+        self,
+        u: np.ndarray,
+        task: StageTask,
+        degrees: int,
+        first: Evaluation | None = None,
+        extra: Any = None,
     ) -> tuple[np.ndarray, Evaluation, FIT_RESULTS]:
         """u at the minimum, the evaluation there, and the status.
 
@@ -239,8 +245,8 @@ class LeastSquaresStage:
                 trial = self.values_at(base + scale * np.asarray(state.y_eval), horizon, extra)
             linearisation = trial.residual, np.asarray(trial.jacobian) * scale
             z, state = _advance(self._solver, z, linearisation, state)
-            accepted = int(state.num_steps_since_acceptance) == 0
-            best, position.rejected = (trial, 0) if accepted else (best, position.rejected + 1)
+            has_moved = int(state.num_steps_since_acceptance) == 0
+            best, position.rejected = (trial, 0) if has_moved else (best, position.rejected + 1)
             trial = None
             residual = np.asarray(best.residual)
             loss = float(residual @ residual) / 2
@@ -251,11 +257,9 @@ class LeastSquaresStage:
             position.leaves, position.extra = _leaves(state), _leaves(extra)
             u = position.u
             threshold = tolerance * spread
-            if accepted:  # at a bound the free variable grows for ever, and nothing changes
-                position.still = (
-                    position.still + 1 if position.last - loss <= (tolerance * spread) ** 2 else 0
-                )
-                position.last = loss
+            if has_moved:  # at a bound the free variable grows for ever, and nothing changes
+                is_still = position.last - loss <= threshold**2
+                position.still, position.last = position.still + 1 if is_still else 0, loss
             is_end = position.still >= 3 or (change <= threshold and position.rejected < 3)
             if not np.isfinite(change):
                 position.status = "stalled"
@@ -269,7 +273,7 @@ class LeastSquaresStage:
             ):
                 position.status = "stalled"
             in_sigma = change / spread if spread else 0.0
-            task.watch(Record(task.stage, horizon, loss, in_sigma, accepted, u), position)
+            task.watch(Record(task.stage, horizon, loss, in_sigma, has_moved, u), position)
         status = position.status or "max_steps_reached"
         if status == "stalled" and horizon == np.inf:  # of a part of the data it does not matter
             spread = float(np.linalg.norm(best.residual)) / np.sqrt(max(degrees, 1))
@@ -330,7 +334,7 @@ class ScalarStage:
     def run(
         self,
         u: np.ndarray,
-        task: Task,
+        task: StageTask,
         scale: np.ndarray,
         choose: Callable[[int], Any] | None = None,
     ) -> tuple[np.ndarray, FIT_RESULTS]:
@@ -352,9 +356,8 @@ class ScalarStage:
         state = self.solver.init(function, zero, setting(), {}, struct, None, frozenset())
         if not (hasattr(state, "f") or hasattr(state, "f_info")):
             raise TypeError(
-                f"optimiser={type(self.solver).__name__} cannot be used: its state has no "
-                "attribute f or "
-                "f_info with the loss. Use, for example, optimistix.BFGS(rtol=1e-10, atol=1e-10)."
+                "the state of optimiser must have the loss as f or f_info, got optimiser="
+                f"{type(self.solver).__name__}: use, for example, optimistix.BFGS(1e-10, 1e-10)."
             )
         if task.resume is not None:
             state = _with_leaves(state, position.leaves)
@@ -362,11 +365,8 @@ class ScalarStage:
         while not position.status and position.done < task.max_steps:
             old = z
             z, state, is_end = _descend(self.solver, self.core, self.divisor, z, setting(), state)
-            position.done, position.z, position.leaves = (
-                position.done + 1,
-                np.asarray(z),
-                _leaves(state),
-            )
+            position.done, position.z = position.done + 1, np.asarray(z)
+            position.leaves = _leaves(state)
             loss = float(state.f if fixed_steps else state.f_info.f)
             if not np.isfinite(loss) and position.done == 1:
                 return u, FIT_RESULTS.not_finite
@@ -376,10 +376,8 @@ class ScalarStage:
             if choose is None and not fixed_steps:
                 position.rejected = 0 if length > 0 else position.rejected + 1
                 if length > 0:
-                    position.still = (
-                        position.still + 1 if abs(position.last - loss) <= task.tolerance**2 else 0
-                    )
-                    position.last = loss
+                    is_still = abs(position.last - loss) <= task.tolerance**2
+                    position.still, position.last = position.still + 1 if is_still else 0, loss
                 if bool(is_end) or position.still >= 3:
                     position.status = "converged"
                 elif position.rejected >= _REJECTED_ON_LINE:
@@ -394,14 +392,10 @@ class ScalarStage:
 
 def _check_same(residual: Any, reference: Any) -> None:
     """Refuse a checkpoint whose residuals are not those of this model."""
-    if not np.allclose(
-        residual, reference, rtol=1e-6, atol=1e-6 * float(np.abs(reference).max(initial=0.0))
-    ):
-        difference = np.abs(np.subtract(residual, reference)).max()
-        raise ValueError(
-            "the checkpoint is of another model: at the same parameters residuals differ by up to "
-            f"{difference:.3g}. Use its model, or another path in checkpoint."
-        )
+    atol = 1e-6 * float(np.abs(reference).max(initial=0.0))
+    difference = np.abs(np.subtract(residual, reference)).max(initial=0.0)
+    fits = np.allclose(residual, reference, rtol=1e-6, atol=atol)
+    same_fit(fits, f"models, whose residuals (by {difference:.3g}),")
 
 
 def _leaves(state: Any) -> list[np.ndarray]:
@@ -412,10 +406,6 @@ def _with_leaves(state: Any, leaves: list[np.ndarray]) -> Any:
     """The same state with other numbers."""
     arrays, functions = eqx.partition(state, eqx.is_array)
     old, tree = jax.tree.flatten(arrays)
-    if [np.shape(x) for x in old] != [np.shape(x) for x in leaves]:
-        raise ValueError(
-            "the checkpoint is of a fit with another optimiser, or another version of it: use that "
-            "optimiser, or another path in checkpoint."
-        )
+    same_fit([*map(np.shape, old)] == [*map(np.shape, leaves)], "optimisers or their versions")
     new = [jnp.asarray(x, o.dtype) for x, o in zip(leaves, old, strict=True)]
     return eqx.combine(jax.tree.unflatten(tree, new), functions)

@@ -14,6 +14,7 @@ from jaxtyping import Array, PyTree
 from lanewise.jaxprs.jaxapi import is_traced
 
 from ..base.inputs import refuse_unit_or_mask
+from .checks import require_shape
 
 
 @dataclass(frozen=True)
@@ -37,8 +38,7 @@ class Bounds:
         numbers = all(isinstance(x, int | float) for x in (self.lower, self.upper))
         if numbers and self.lower >= self.upper:
             raise ValueError(
-                "lower of dvi.Bounds must be less than upper, got "
-                f"lower={self.lower!r} and upper={self.upper!r}."
+                f"lower must be less than upper, got dvi.Bounds({self.lower!r}, {self.upper!r})."
             )
 
 
@@ -170,20 +170,22 @@ def make_space(
     paths, tree = jax.tree_util.tree_flatten_with_path(numbers)
     if not paths:
         raise ValueError(
-            f"params has no float or floating-point array that can be fitted, got {params!r:.200}."
+            f"params must have a number or an array that can be fitted, got {params!r:.200}."
         )
     names, places = [], {}
     for path, leaf in paths:
         name, shape = _name(path), np.shape(leaf)
         refuse_unit_or_mask(f"the parameter {name}", leaf)
         if np.iscomplexobj(leaf):
-            raise TypeError(f"the parameter {name} is complex: give its real and imaginary parts.")
+            raise TypeError(
+                f"the parameter {name} must be real, got {leaf!r:.200}: give its two parts."
+            )
         places[name] = len(names) + np.arange(math.prod(shape)).reshape(shape)
         indices = np.ndindex(shape)
         names += [f"{name}[{', '.join(map(str, i))}]" for i in indices] if shape else [name]
     if len(set(names)) < len(names):
         duplicate = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"params has two parameters named {duplicate}: rename one of their keys.")
+        raise ValueError(f"the names of params must differ, got {duplicate} twice: rename a key.")
     x = np.concatenate([np.ravel(np.asarray(leaf, float)) for _, leaf in paths])
     limits, _ = _entries(bounds, Bounds, {"lower": -np.inf, "upper": np.inf}, places, len(x))
     (mean, sigma), has_prior = _entries(
@@ -241,15 +243,15 @@ def _entries(
         if not isinstance(entry, kind):
             label = f"dvi.{kind.__name__}"
             raise TypeError(
-                f"{noun} must have the structure of params, with {label}(...) or None in place of "
-                f"numbers and arrays, got {entry!r:.200} at {name}."
+                f"{noun} must be like params, with {label}(...) or None in place of numbers, got "
+                f"{entry!r:.200} at {name}."
             )
         prefixes = tuple(name + end for end in ("[", "."))
         leaves = [k for k in places if not path or k == name or k.startswith(prefixes)]
         if not leaves:
             raise ValueError(
-                f"{noun} are given for {name!r}, but the fitted parameters are "
-                f"{', '.join(map(repr, places))}."
+                f"{noun} must be for fitted parameters, {', '.join(map(repr, places))}, got "
+                f"{name!r}."
             )
         where = np.concatenate([places[k].ravel() for k in leaves])
         mask[where] = True
@@ -265,11 +267,8 @@ def _spread(value: Any, size: int, shape: tuple[int, ...], label: str) -> np.nda
     try:
         value = np.asarray(value, float)
     except (TypeError, ValueError):
-        kind = "a real number or an array of real numbers"
-        raise TypeError(f"{label} must be {kind}, got {value!r:.200}.") from None
-    if value.ndim and value.shape != shape:
-        kind = f"a number or an array of shape {shape}" if shape else "a single number"
-        raise ValueError(f"{label} must be {kind}, got shape {value.shape}.")
+        raise TypeError(f"{label} must be a real number or array, got {value!r:.200}.") from None
+    require_shape(label, value, *dict.fromkeys([(), shape]))
     return value.ravel() if value.ndim else np.full(size, float(value))
 
 

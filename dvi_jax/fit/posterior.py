@@ -10,10 +10,11 @@ from jaxtyping import Array, PyTree
 
 from ..base.checks import one_of
 from ..base.precision import require_double
+from .checks import enough_values
 from .losses import LeastSquares, Likelihood, Loss
 from .observations import Data, as_arcs
 from .parameters import Space, make_space
-from .problem import Problem
+from .problem import FitProblem
 from .stages import JACOBIAN_LIMIT
 from .uncertainty import in_words, uncertainty
 
@@ -68,7 +69,7 @@ class Posterior:
         one_of("gradient", gradient, ("reverse", "forward"))
         arcs, is_list = as_arcs(data)
         # Priors are added here, so that they also work with errors of unknown size.
-        self._problem = Problem(model, arcs, is_list, params, bounds=bounds, loss=loss)
+        self._problem = FitProblem(model, arcs, is_list, params, bounds=bounds, loss=loss)
         self._core = self._problem.core
         self._space, x = make_space(params, bounds, priors)
         self.names, self.size = list(self._space.names), self._space.size
@@ -78,14 +79,9 @@ class Posterior:
         is_proper |= np.array(self._space.has_lower) & self._space.has_upper
         free, count = int((~is_proper).sum()), self._problem.count
         unknown_scale = not (self._problem.has_errors or self._has_density)
-        if count < free + unknown_scale:
-            of_errors = (
-                ", and one for the size of the errors, because sigma is not given" * unknown_scale
-            )
-            raise ValueError(
-                f"data must have at least {free + unknown_scale} observed values: one for each of "
-                f"{free} parameters without a prior or two bounds{of_errors}. Got {count}."
-            )
+        purpose = f"{free} parameters without a prior or two bounds"
+        purpose += " and for the size of the errors without sigma" * unknown_scale
+        enough_values(count, free + unknown_scale, purpose)
         reverse = jax.value_and_grad(self._value)
         self._slopes = self._forward if gradient == "forward" else reverse
         self._potential = jax.jit(_finite_potential(self._value, self._slopes))
@@ -179,8 +175,8 @@ class Posterior:
         if spectrum.null_directions.size:
             words = "; ".join(in_words(d, self.names) for d in spectrum.null_directions.T)
             raise ValueError(
-                f"neither the data nor priors determine {words} (combinations of scaled "
-                "parameters): give a prior or bounds on both sides."
+                f"neither the data nor priors determine {words} (scaled parameters): give a prior "
+                "or bounds on both sides."
             )
         return u, spectrum.directions / spectrum.singular_values
 
@@ -188,8 +184,9 @@ class Posterior:
         if not np.isfinite(value):
             x = np.asarray(self.to_x(jnp.asarray(u)))
             raise ValueError(
-                f"the posterior density is 0 at the start ({self._space.in_words(x)}): the "
-                "trajectory fails there, or the log likelihood is not finite."
+                f"the posterior density must be positive at the start, got 0 at "
+                f"{self._space.in_words(x)}: the trajectory fails there, or the log likelihood is "
+                "not finite."
             )
 
     def _descend(self, u: np.ndarray, max_steps: int) -> tuple[np.ndarray, np.ndarray]:

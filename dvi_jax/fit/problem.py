@@ -14,6 +14,7 @@ from ..base.checks import instance
 from ..base.reads import Reads, reads
 from ..base.results import RESULTS, status_name
 from ..problem.system import check_system
+from .checks import enough_values, require_shape, requires
 from .losses import LeastSquares, Likelihood, Loss
 from .model import Group, Model, check_observable, make_groups, predict, specification, weigh
 from .observations import Observations
@@ -50,12 +51,11 @@ class Core(eqx.Module):
 
         arrays = jax.tree.map(jnp.asarray, (group.arcs, group.t0, group.ts, group.pick))
         if len(group.arcs) == 1:  # a batch of one takes twice the time of a single trajectory
-            return jax.tree.map(
-                lambda x: x[None], predict_arc(*jax.tree.map(lambda x: x[0], arrays))
-            )
+            values = predict_arc(*jax.tree.map(lambda x: x[0], arrays))
+            return jax.tree.map(lambda x: x[None], values)
         return jax.vmap(predict_arc)(*arrays)
 
-    def whitened(self, u: Array, horizon: Any = np.inf) -> tuple[list[Array], list[Any]]:
+    def weighted_residuals(self, u: Array, horizon: Any = np.inf) -> tuple[list[Array], list[Any]]:
         """Residuals predicted − observed in standard errors, (A, N, K) for each group, zero for
         missing values and those later than `horizon` after the start; predictions and statuses."""
         params = self.space.to_params(self.space.to_x(u))
@@ -65,7 +65,7 @@ class Core(eqx.Module):
 
     def residuals(self, u: Array, horizon: Any = np.inf) -> Array:
         """The vector whose half square is the loss, priors last."""
-        return self.root_rows(u, self.whitened(u, horizon)[0])
+        return self.root_rows(u, self.weighted_residuals(u, horizon)[0])
 
     def root_rows(self, u: Array, rows: list[Array]) -> Array:
         """The same from whitened residuals."""
@@ -86,7 +86,7 @@ class Core(eqx.Module):
         """
 
         def residual_and_aux(u):
-            rows, predictions = self.whitened(u, horizon)
+            rows, predictions = self.weighted_residuals(u, horizon)
             r = self.root_rows(u, rows)
             return r, (r, rows, predictions)
 
@@ -114,22 +114,17 @@ class Core(eqx.Module):
         return total
 
     def _likelihood(self, group: Group, predictions: Array, horizon: Any, params: PyTree) -> Array:
-        if group.whiten.ndim == 4:
-            raise ValueError(
-                "loss=dvi.Likelihood(...) accepts sigma of dvi.Observations, got covariance: use "
-                "dvi.LeastSquares()."
-            )
+        hint = "dvi.LeastSquares() accepts both."
+        requires(group.whiten.ndim < 4, "dvi.Likelihood", "sigma of the data", "covariance", hint)
         keep, values = horizon_mask(group, horizon), jnp.asarray(group.values)
         sigma = 1 / jnp.where(keep, jnp.asarray(group.whiten), 1.0)
         # Missing values get the observed ones as predictions, so that no NaN reaches the density.
         densities = jax.vmap(self.loss.negative_log_density, in_axes=(0, 0, 0, None))(
             jnp.where(keep, predictions, values), values, sigma, params
         )
-        if jnp.shape(densities) != jnp.shape(predictions):
-            raise ValueError(
-                "the function of dvi.Likelihood must return −log density of each value, an array "
-                f"of shape {predictions.shape[1:]}, got shape {jnp.shape(densities)[1:]}."
-            )
+        require_shape(
+            "−log density by dvi.Likelihood, with all arcs,", densities, predictions.shape
+        )
         return jnp.sum(jnp.where(keep, densities, 0.0))
 
     def hessian(self, u: Array) -> Array:
@@ -173,21 +168,20 @@ def horizon_mask(group: Group, horizon: Any) -> Array:
 
 def _whiten(group: Group, predictions: Array, horizon: Any) -> Array:
     # First where, then subtract: a trajectory that fails after the horizon leaves no NaN behind.
-    difference = jnp.where(
-        horizon_mask(group, horizon), predictions - jnp.asarray(group.values), 0.0
-    )
+    mask = horizon_mask(group, horizon)
+    difference = jnp.where(mask, predictions - jnp.asarray(group.values), 0.0)
     return weigh(difference, jnp.asarray(group.whiten))
 
 
 # Functions of the module: a method of an instance would be compiled again for each fit.
 _evaluate = eqx.filter_jit(Core.evaluate)
-_whitened = eqx.filter_jit(Core.whitened)
+_weighted_residuals = eqx.filter_jit(Core.weighted_residuals)
 _root_rows = eqx.filter_jit(Core.root_rows)
 _hessian = eqx.filter_jit(Core.hessian)
 _curvature = eqx.filter_jit(Core.curvature)
 
 
-class Problem:
+class FitProblem:
     """A fit in free variables u.
 
     - `core`: its functions. `space`: the parameters, `start` their x. `data`: the data as given,
@@ -215,14 +209,9 @@ class Problem:
         self.has_errors = arcs[0].has_errors
         if not self.has_errors and not isinstance(loss, Likelihood):
             robust = not isinstance(loss, LeastSquares)
-            if self.space.count_of_priors or robust:
-                subject = (
-                    f"a robust loss ({type(loss).__name__})" if robust else "a fit with priors"
-                )
-                raise ValueError(
-                    f"{subject} requires standard errors of the data, but dvi.Observations has "
-                    "none: give sigma or covariance there."
-                )
+            subject = f"a robust loss ({type(loss).__name__})" if robust else "a fit with priors"
+            fits = not (self.space.count_of_priors or robust)
+            requires(fits, subject, "sigma or covariance of dvi.Observations", "neither")
         if isinstance(model, Model):
             check_system(model.settings["system"])
         arrays = self.space.to_params(jnp.asarray(self.start))
@@ -257,20 +246,14 @@ class Problem:
         if all(arc.t0 == arc.ts[0] for arc in self.data):
             moment += " (the first observation)"
         roots = {name.split("[")[0] for name in self.space.names}
-        sources = [
-            f"{n} "
-            f"{'fitted' if n in roots and isinstance(self.core.model, Model) else 'of the model'}"
-            for n in ("q0", "p0")
-        ]
+        roots &= {"q0", "p0"} if isinstance(self.core.model, Model) else set()
+        sources = [f"{n} {'fitted' if n in roots else 'of the model'}" for n in ("q0", "p0")]
         return f"initial state at {moment}: {', '.join(sources)}"
 
     def check_count(self) -> None:
         """**Raises** `ValueError` for fewer observed values than parameters."""
-        if self.degrees_of_freedom < 0:
-            raise ValueError(
-                f"{self.size} parameters cannot be determined from {self.count} observed "
-                f"value{'s' * (self.count != 1)} and {self.space.count_of_priors} priors."
-            )
+        minimum = self.size - self.space.count_of_priors
+        enough_values(self.count, minimum, f"{minimum} parameters without a prior")
 
     # ---- the functions of `core`, compiled
 
@@ -278,9 +261,9 @@ class Problem:
         """`Core.evaluate`; there is nothing `extra`."""
         return _evaluate(self.core, jnp.asarray(u), jnp.asarray(horizon, float))
 
-    def whitened(self, u: Any, horizon: Any = np.inf) -> tuple[list[Array], list[Any]]:
-        """`Core.whitened`."""
-        return _whitened(self.core, jnp.asarray(u), jnp.asarray(horizon, float))
+    def weighted_residuals(self, u: Any, horizon: Any = np.inf) -> tuple[list[Array], list[Any]]:
+        """`Core.weighted_residuals`."""
+        return _weighted_residuals(self.core, jnp.asarray(u), jnp.asarray(horizon, float))
 
     def root_rows(self, u: Any, rows: list[Any]) -> np.ndarray:
         """`Core.root_rows`."""
@@ -304,14 +287,10 @@ class Problem:
                 arc, n = self.arcs[i], len(self.arcs[i].ts)
                 order = slice(None, None, 1 if arc is self.data[i] else -1)
                 values_of_arc = np.asarray(values[a, :n]).reshape(arc.values.shape)[order]
-                residuals_in_sigma = np.where(group.mask[a, :n], -np.asarray(r[a, :n]), np.nan)[
-                    order
-                ]
-                rows_of_arcs[i] = values_of_arc, residuals_in_sigma, str(status[a])
-        values_of_arc, residuals_in_sigma, names = (
-            list(column) for column in zip(*rows_of_arcs, strict=True)
-        )
-        return values_of_arc, residuals_in_sigma, names
+                residual = np.where(group.mask[a, :n], -np.asarray(r[a, :n]), np.nan)[order]
+                rows_of_arcs[i] = values_of_arc, residual, str(status[a])
+        values_of_arcs, residuals, names = map(list, zip(*rows_of_arcs, strict=True))
+        return values_of_arcs, residuals, names
 
     def rows_within(self, horizon: float) -> np.ndarray:
         """Which entries of the residual vector lie within a horizon; priors do."""
@@ -324,53 +303,52 @@ class Problem:
         """Refuse a start at which the model fails from the first observation on, or whose
         predictions differ in size from the data.
 
-        - `known`: predictions and statuses of each group.
+        - `predictions`: with the statuses of each group.
         """
-        where = f"at the starting parameters ({self.space.in_words(self.start)}) the model gives "
         for group, (values_of_group, result) in zip(self.groups, predictions, strict=True):
             names = np.atleast_1d(status_name(result))
             for a, arc in enumerate(group.arcs):
                 first = group.mask[a].any(axis=1).argmax()
                 values = np.asarray(values_of_group)[a, first][group.mask[a, first]]
                 if not np.isfinite(values).all():
-                    hint = f"The status of the trajectory is {str(names[a])!r}: use a smaller h"
+                    hint = f"a smaller h: the status of the trajectory is {str(names[a])!r}"
                     if str(names[a]) == "successful":
-                        hint = "The trajectory does not fail: correct the function observe"
-                    raise ValueError(
-                        f"{where}{values[~np.isfinite(values)][0]} for the first observation of "
-                        f"arc {arc}, at t = {group.ts[a, first]:g}. {hint}, or start from other "
-                        "parameters."
+                        hint = "another observe: the trajectory does not fail"
+                    value, t = values[~np.isfinite(values)][0], group.ts[a, first]
+                    self._refuse_start(
+                        f"{value} for the first observation of arc {arc}, at t = {t:g}", hint
                     )
         if check_units:
-            self._check_sizes(
-                [np.asarray(values_of_group) for values_of_group, _ in predictions], where
-            )
+            self._check_sizes([np.asarray(values_of_group) for values_of_group, _ in predictions])
 
-    def _check_sizes(self, predictions: list[np.ndarray], where: str) -> None:
+    def _refuse_start(self, defect: str, hint: str) -> None:
+        raise ValueError(
+            f"at the starting parameters ({self.space.in_words(self.start)}) the model gives "
+            f"{defect}. Give other starting parameters, or {hint}."
+        )
+
+    def _check_sizes(self, predictions: list[np.ndarray]) -> None:
         pairs = list(zip(self.groups, predictions, strict=True))
         data = max(float(np.abs(g.values[g.mask]).max()) for g, _ in pairs)
         sizes = [np.where(g.mask & np.isfinite(f), np.abs(f), 0.0).max(axis=2) for g, f in pairs]
         largest = max(float(size.max()) for size in sizes)
         if data == 0 or largest == 0 or 1 / _UNITS < data / largest < _UNITS:
             return
-        hint = "If the difference is intended, use check_units=False."
+        hint = "data in the same units; check_units=False permits the difference"
+        largest_observed = f"but the largest observed value is {data:.3g}"
         if largest < data:
-            raise ValueError(
-                f"{where}values of at most {largest:.3g}, but the largest observed value is "
-                f"{data:.3g}. Use the same units, or start from other parameters. {hint}"
-            )
+            self._refuse_start(f"values of at most {largest:.3g}, {largest_observed}", hint)
         large, pairs_of_sizes = _UNITS * data, zip(self.groups, sizes, strict=True)
         group, size = next((g, s) for g, s in pairs_of_sizes if (s >= large).any())
         a, row = np.argwhere(size >= large)[0]
         arc = int(group.arcs[a])
         spec, observations = self.specs[arc], self.arcs[arc]
         q0, p0 = (jnp.asarray(spec[name], float) for name in ("q0", "p0"))
-        first = float(
-            jnp.max(jnp.abs(observations.function(observations.t0, q0, p0, spec.get("args"))))
-        )
-        raise ValueError(
-            f"{where}{size[a, row]:.3g} for arc {arc} at t = {group.ts[a, row]:g}, but the largest "
-            f"observed value is {data:.3g}; at the start, t = {group.t0[a]:g}, the model gives "
-            f"{first:.3g}, later at most {size[a].max():.3g}. Use the same units; if the "
-            f"trajectory diverges, other parameters or a smaller h. {hint}"
+        values = observations.function(observations.t0, q0, p0, spec.get("args"))
+        first = float(jnp.max(jnp.abs(values)))
+        self._refuse_start(
+            f"{size[a, row]:.3g} for arc {arc} at t = {group.ts[a, row]:g}, {largest_observed}; at "
+            f"the start, t = {group.t0[a]:g}, the model gives {first:.3g}, later at most "
+            f"{size[a].max():.3g}",
+            f"a smaller h if the trajectory diverges, or {hint}",
         )

@@ -12,6 +12,7 @@ from jaxtyping import PyTree
 
 from ..base.checks import one_of
 from ..base.files import publish_npz, read_npz
+from .checks import same_parameters
 from .optimise import FIT_RESULTS, NAMES, name_of
 from .parameters import make_space
 from .uncertainty import correlations
@@ -125,9 +126,8 @@ class FitResult:
         a worse one. NaN for data that are constant.
         """
         residual_sum = total = 0.0
-        for values_of_arc, model, errors in zip(
-            self.observed, self.predicted, self.errors, strict=True
-        ):
+        arcs = zip(self.observed, self.predicted, self.errors, strict=True)
+        for values_of_arc, model, errors in arcs:
             is_observed = np.isfinite(values_of_arc)
             sigma = np.where(is_observed, errors if self.has_errors else 1.0, np.inf)
             weight, values = 1 / sigma**2, np.where(is_observed, values_of_arc, 0.0)
@@ -222,20 +222,12 @@ class FitResult:
         if params is None:
             if header["shape"] is None:
                 raise ValueError(
-                    f"params is required to load {path}, because not all fitted parameters are "
-                    "numbers or arrays in dicts: give params as in dvi.fit."
+                    f"params is required to load {path}, which has more than numbers and arrays in "
+                    "dicts: give params as in dvi.fit."
                 )
             params = jax.tree.map(np.array, header["shape"], is_leaf=lambda x: isinstance(x, list))
         space, _ = make_space(params)
-        names, stored_names = list(space.names), header["names"]
-        if names != stored_names:
-            pairs = enumerate(zip(names, stored_names, strict=False))
-            i = next((i for i, (a, b) in pairs if a != b), min(len(names), len(stored_names)))
-            raise ValueError(
-                f"params must have the same parameters as the fit in {path}. Number {i + 1} is "
-                f"{''.join(stored_names[i : i + 1]) or 'no parameter'} in the file, "
-                f"{''.join(names[i : i + 1]) or 'no parameter'} in params."
-            )
+        same_parameters("params", space.names, header["names"], f"the fit in {path}")
         by_arc: dict[str, Any] = {
             n: [arrays[f"{n}.{i}"] for i in range(header["arcs"])] for n in _BY_ARC
         }

@@ -18,8 +18,9 @@ import numpy as np
 from ..base.files import publish_npz, read_npz
 from ..base.progress import bar_of, reporter
 from ..base.reads import reads
-from .optimise import Position, Record, Task
-from .problem import Problem
+from .checks import same_fit
+from .optimise import Position, Record, StageTask
+from .problem import FitProblem
 
 _INTERVAL = 5.0
 """Seconds between checkpoints."""
@@ -64,7 +65,7 @@ def progress_display(progress: Any) -> Any:
 
 
 @dataclass
-class Run:
+class FitRun:
     """A fit in progress.
 
     - `show`: a function of the progress, or None. `began`: when, for the seconds shown.
@@ -72,7 +73,7 @@ class Run:
       first stage has continued from it.
     """
 
-    problem: Problem
+    problem: FitProblem
     max_steps: int
     tolerance: float
     show: Callable[[FitProgress], None] | None
@@ -88,13 +89,10 @@ class Run:
             file = Path(self.checkpoint)
             if not file.parent.is_dir():
                 raise FileNotFoundError(
-                    f"there is no directory {str(file.parent)!r} for checkpoint={str(file)!r}: "
-                    "create it."
+                    f"there is no directory for checkpoint={str(file)!r}: create it."
                 )
             if file.is_dir():
-                raise IsADirectoryError(
-                    f"checkpoint must be the path of a file, but {str(file)!r} is a directory."
-                )
+                raise IsADirectoryError(f"checkpoint={str(file)!r} is a directory: give a file.")
             if file.exists():
                 self.resume, self.records = _read_checkpoint(file, self.identity)
 
@@ -103,14 +101,14 @@ class Run:
         """How many steps remain."""
         return self.max_steps - len(self.records)
 
-    def task(self, stage: int, horizon: float, tolerance: float, limit: int | None) -> Task:
+    def task(self, stage: int, horizon: float, tolerance: float, limit: int | None) -> StageTask:
         """The next stage, of at most `most` steps, which continues from the checkpoint once."""
         resume, self.resume = self.resume, None
         count = 0 if resume is None else resume.done
         steps = count + self.left
         if limit is not None:
             steps = min(max(limit, count), steps)
-        return Task(stage, horizon, steps, tolerance, self.watch, resume)
+        return StageTask(stage, horizon, steps, tolerance, self.watch, resume)
 
     def watch(self, record: Record, position: Position) -> None:
         """A step was taken."""
@@ -142,7 +140,7 @@ def _columns(records: list[Record]) -> dict[str, np.ndarray]:
     return {name: np.array([getattr(r, name) for r in records]) for name in Record._fields}
 
 
-def identity(problem: Problem, u: np.ndarray, *settings_of_call: Any) -> str:
+def identity(problem: FitProblem, u: np.ndarray, *settings_of_call: Any) -> str:
     """Hash by which a checkpoint is recognised: data, names, start and settings."""
     # The repr of an optax optimiser does not contain its numbers: its functions read them.
     read = [
@@ -171,11 +169,7 @@ def _write_checkpoint(path: Any, identity: str, position: Position, records: lis
 
 def _read_checkpoint(path: Any, identity: str) -> tuple[Position, list[Record]]:
     header, arrays = read_npz(path, _FORMAT, "checkpoint of a fit")
-    if header.get("identity") != identity:
-        raise ValueError(
-            f"the checkpoint {path} is of another fit: data, model, parameters, start or settings "
-            "differ. Repeat its call unchanged, or give another path in checkpoint."
-        )
+    same_fit(header.get("identity") == identity, "data, model, parameters, start or settings")
     fields = {name: header[name] for name in Position.__dataclass_fields__ if name in header}
     fields |= {name: arrays[name] for name in _VECTORS}
     fields |= {name: [arrays[f"{name}.{i}"] for i in range(header[name])] for name in _LISTS}

@@ -13,9 +13,10 @@ from jaxtyping import Array
 from ..base.checks import fraction, whole
 from ..integration.integrate import integrate
 from ..observe.solution import Save
+from .checks import require_shape, requires
 from .model import make_group, predict, specification, weigh
 from .observations import Observations
-from .problem import Problem
+from .problem import FitProblem
 from .roundoff import Evaluation
 
 
@@ -55,12 +56,11 @@ class MultipleShooting:
         )
         if not (is_name or callable(self.guess)):
             raise TypeError(
-                'guess must be "data", "model", None or a function (t) that returns (q, p), got '
-                f"{self.guess!r}."
+                f'guess must be "data", "model", None or a function t → (q, p), got {self.guess!r}.'
             )
 
 
-class _Part:
+class _SegmentData:
     """The observations of an arc that belong to one segment."""
 
     def __init__(self, arc: Observations, keep: np.ndarray, t0: float, whitening: np.ndarray):
@@ -85,45 +85,38 @@ class Segments:
     so that half its square is the augmented Lagrangian of the constraints c = 0 up to a constant.
     """
 
-    def __init__(self, problem: Problem, shooting: MultipleShooting):
+    def __init__(self, problem: FitProblem, shooting: MultipleShooting):
         self.problem, self.shooting = problem, shooting
         spec, arcs, S = problem.specs[0], problem.arcs, shooting.segments
         other = next((s["h"] for s in problem.specs if s["h"] != spec["h"]), None)
-        if other is not None or problem.groups[0].block == 0:
-            lattice = spec.get("lattice", getattr(spec.get("integrator"), "lattice", None))
-            description = (
-                type(lattice).__name__ if other is None else f"h = {spec['h']} and h = {other}"
-            )
-            raise ValueError(
-                "dvi.MultipleShooting requires lattice=dvi.Uniform() and the same h for all arcs, "
-                f"got {description}."
-            )
+        lattice = spec.get("lattice", getattr(spec.get("integrator"), "lattice", None))
+        requires(
+            other is None and problem.groups[0].block,
+            "dvi.MultipleShooting",
+            "lattice=dvi.Uniform() and the same h for all arcs",
+            type(lattice).__name__ if other is None else f"h = {spec['h']} and h = {other}",
+        )
+        names = "observe", "the shape of an observation", "the use of covariance"
         kinds = [(a.function, a.values.shape[1:], a.covariance is None) for a in arcs]
-        if differing := [i for i, kind in enumerate(kinds) if kind != kinds[0]]:
-            names = "observe", "the shape of one observation", "the use of covariance"
-            pairs = zip(names, kinds[0], kinds[differing[0]], strict=True)
-            raise ValueError(
-                f"dvi.MultipleShooting requires that all arcs agree in {', '.join(names[:2])} and "
-                f"{names[2]}, but arcs 0 and {differing[0]} differ in "
-                f"{' and '.join(name for name, a, b in pairs if a != b)}."
-            )
+        for i, kind in enumerate(kinds):
+            pairs = zip(names, kinds[0], kind, strict=True)
+            differing = " and ".join(name for name, a, b in pairs if a != b)
+            condition = "arcs that agree in " + ", ".join(names)
+            value = f"other values for {differing} in arcs 0 and {i}"
+            requires(not differing, "dvi.MultipleShooting", condition, value)
         h = float(spec["h"])
         steps = max(math.ceil(abs(a.ts[-1] - a.t0) / abs(h) - 1e-9) for a in arcs)
         self.steps = math.ceil(steps / S)
-        if self.steps < 1 or steps < S:
-            raise ValueError(
-                "segments of dvi.MultipleShooting must be at most the number of steps of the "
-                f"longest arc, {steps}, got {S}."
-            )
+        hint = f"The longest arc has {steps} steps."
+        whole("segments of dvi.MultipleShooting", S, 2, steps, hint=hint)
         self.cuts = np.array([[arc.t0 + s * self.steps * h for s in range(S)] for arc in arcs])
         parts = []
         for arc, cuts in zip(arcs, self.cuts, strict=True):
             whitening = arc.whitening()
             place = (arc.ts - arc.t0) / (self.steps * h)
             numbers_of_segments = np.clip(np.ceil(place - 1e-9).astype(int) - 1, 0, S - 1)
-            parts += [
-                _Part(arc, numbers_of_segments == s, float(cuts[s]), whitening) for s in range(S)
-            ]
+            for s, cut in enumerate(cuts):
+                parts.append(_SegmentData(arc, numbers_of_segments == s, float(cut), whitening))
         numbers = np.repeat(np.arange(len(arcs)), S)
         self.group = make_group(numbers.tolist(), parts, spec, self.steps)
         self.shape = np.shape(spec["q0"])
@@ -160,11 +153,8 @@ class Segments:
             states_of_cuts = np.array(
                 [np.concatenate([np.ravel(q), np.ravel(p)]) for q, p in pairs], float
             )
-            if states_of_cuts.shape != (len(times), 2 * self.half):
-                raise ValueError(
-                    "the function guess of dvi.MultipleShooting must return (q, p), each of shape "
-                    f"{self.shape}, got shapes {' and '.join(str(np.shape(x)) for x in pairs[0])}."
-                )
+            name = f"the array of q and p by guess, each of shape {self.shape}, at all cuts"
+            require_shape(name, states_of_cuts, (len(times), 2 * self.half))
         elif guess == "data":
             states_of_cuts = from_data(arc, spec, times)
         else:
@@ -173,14 +163,11 @@ class Segments:
             flat = [np.asarray(x[:-1]).reshape(len(times), -1) for x in (sol.qs, sol.ps)]
             states_of_cuts = np.concatenate(flat, axis=1)
         if not np.isfinite(states_of_cuts).all():
-            source = f"guess={guess!r}"
-            hint = "Start from other parameters, or give a function (t) → (q, p) as guess."
-            if callable(guess):
-                source, hint = "the function guess", "Correct this function."
+            t = times[np.argmin(np.isfinite(states_of_cuts).all(axis=1))]
+            source = "by a function" if callable(guess) else repr(guess)
             raise ValueError(
-                f"the guess of dvi.MultipleShooting must be finite, but {source} gives NaN or inf "
-                f"for arc {i} "
-                f"at t = {times[np.argmin(np.isfinite(states_of_cuts).all(axis=1))]:g}. {hint}"
+                f"the states of guess, {source}, must be finite, got NaN or inf for arc {i} at "
+                f"t = {t:g}. Give other starting parameters or another function t → (q, p)."
             )
         return states_of_cuts
 
@@ -260,12 +247,12 @@ def from_data(arc: Observations, spec: dict[str, Any], times: np.ndarray) -> np.
 
     **Raises** `ValueError` for an arc that observes something else.
     """
-    if arc.observe not in ("positions", "state"):
-        raise ValueError(
-            'guess="data" of dvi.MultipleShooting requires observe="positions" or '
-            'observe="state", got '
-            f"{repr(arc.observe) if isinstance(arc.observe, str) else 'a function'}."
-        )
+    requires(
+        arc.observe in ("positions", "state"),
+        'guess="data"',
+        'observe="positions" or observe="state"',
+        repr(arc.observe) if isinstance(arc.observe, str) else "a function",
+    )
     flat = arc.values.reshape(len(arc.ts), -1)
     good = np.isfinite(flat).all(axis=1)
     ts, flat = arc.ts[good], flat[good]

@@ -8,6 +8,7 @@ import functools
 from typing import Any
 
 from ..base.checks import instance
+from .checks import requires
 
 
 @functools.cache
@@ -59,12 +60,9 @@ def solver_for(optimiser: Any, residuals: bool, is_large: bool, steps: int) -> A
         optimiser = optax.adam(rate)
     if isinstance(optimiser, optax.GradientTransformation):
         return optx.OptaxMinimiser(optimiser, rtol=0.0, atol=0.0)
-    if is_gauss_newton(optimiser) and not residuals:
-        raise ValueError(
-            "optimiser must be a minimiser if the loss is a dvi.Likelihood, got "
-            f"{type(optimiser).__name__}. Use, for example, optimistix.BFGS(rtol=1e-10, "
-            "atol=1e-10)."
-        )
+    condition = "a minimiser as optimiser, such as optimistix.BFGS(1e-10, 1e-10)"
+    fits = residuals or not is_gauss_newton(optimiser)
+    requires(fits, "dvi.Likelihood", condition, type(optimiser).__name__)
     minimisers = optx.OptaxMinimiser, optx.AbstractQuasiNewton, optx.AbstractLBFGS
     classes = optx.AbstractGaussNewton, optx.AbstractGradientDescent, *minimisers
     of_optimistix = "None, a least-squares solver or minimiser of optimistix"

@@ -13,9 +13,9 @@ import numpy as np
 from .losses import Likelihood
 from .model import Group, weigh
 from .optimise import FIT_RESULTS, LeastSquaresStage, ScalarStage
-from .problem import Problem
+from .problem import FitProblem
 from .roundoff import Evaluation
-from .run import Run
+from .run import FitRun
 from .shooting import Segments
 from .solvers import is_optax
 from .uncertainty import inverse_or, null_space
@@ -55,7 +55,7 @@ class Minimum(NamedTuple):
 
 
 def least_squares(
-    run: Run, u: np.ndarray, solver: Any, horizons: Any, check_units: bool
+    run: FitRun, u: np.ndarray, solver: Any, horizons: Any, check_units: bool
 ) -> Minimum:
     """Stages of growing horizon with a solver for the residual vector."""
     problem = run.problem
@@ -78,7 +78,7 @@ def least_squares(
 
 
 def by_gradient(
-    run: Run, u: np.ndarray, solver: Any, horizons: Any, check_units: bool, batch: Any, seed: int
+    run: FitRun, u: np.ndarray, solver: Any, horizons: Any, check_units: bool, batch: Any, seed: int
 ) -> Minimum:
     """The same with a minimiser of the scalar loss."""
     problem, optax = run.problem, is_optax(solver)
@@ -93,7 +93,7 @@ def by_gradient(
         scale = inverse_or(np.linalg.norm(np.where(np.isfinite(J), J, 0.0), axis=0), 1.0)
 
     def look(u):
-        return Evaluation(jnp.zeros(0), jnp.zeros(0), problem.whitened(u))
+        return Evaluation(jnp.zeros(0), jnp.zeros(0), problem.weighted_residuals(u))
 
     def solve(u, task, evaluation):
         u, status = stage.run(u, task, scale, choose)
@@ -114,7 +114,7 @@ def by_gradient(
 
 
 def _stages(
-    run: Run,
+    run: FitRun,
     u: np.ndarray,
     horizons: list[float] | None,
     check_units: bool,
@@ -153,7 +153,7 @@ def _stages(
 
 
 def _horizon(
-    problem: Problem, horizons: list[float] | None, number: int, rows: list[Any], at_least: float
+    problem: FitProblem, horizons: list[float] | None, number: int, rows: list[Any], at_least: float
 ) -> float:
     """The horizon of a stage; infinite for all data.
 
@@ -175,10 +175,8 @@ def _horizon(
     threshold = _MISFIT_LIMIT * np.sqrt(
         np.mean(observed_entries(map(_scatter, problem.groups)) ** 2)
     )
-    times_since_start, misfit = (
-        observed_entries(span[..., None] for span in spans),
-        observed_entries(map(np.asarray, rows)),
-    )
+    times_since_start = observed_entries(span[..., None] for span in spans)
+    misfit = observed_entries(map(np.asarray, rows))
     minimum_count = 2 * max(problem.size - problem.space.count_of_priors, 1)
     horizon = full
     while horizon > at_least:
@@ -205,7 +203,7 @@ def _scatter(group: Group) -> np.ndarray:
 # ---- what gradient methods need
 
 
-def _draw(problem: Problem, batch: int, seed: int) -> Callable[[int], Any]:
+def _draw(problem: FitProblem, batch: int, seed: int) -> Callable[[int], Any]:
     """The arcs of each group that a step uses: a function of its number."""
 
     def choose(step):
@@ -218,7 +216,7 @@ def _draw(problem: Problem, batch: int, seed: int) -> Callable[[int], Any]:
     return choose
 
 
-def _root_of_hessian(problem: Problem, u: np.ndarray) -> np.ndarray:
+def _root_of_hessian(problem: FitProblem, u: np.ndarray) -> np.ndarray:
     """A matrix whose square JᵀJ is the exact Hessian of the loss, NaN if it is not positive."""
     H = np.asarray(problem.hessian(u))
     length = np.sqrt(np.abs(np.diag(H)))
@@ -231,7 +229,7 @@ def _root_of_hessian(problem: Problem, u: np.ndarray) -> np.ndarray:
 # ---- multiple shooting
 
 
-def in_segments(run: Run, segments: Segments, u: np.ndarray, solver: Any) -> Minimum:
+def in_segments(run: FitRun, segments: Segments, u: np.ndarray, solver: Any) -> Minimum:
     """Multiple shooting: Levenberg–Marquardt inside of an augmented Lagrangian."""
     n, gaps, resume = run.problem.size, segments.num_gaps, run.resume
     stage = LeastSquaresStage(eqx.filter_jit(segments.evaluate), solver)

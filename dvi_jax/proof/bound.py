@@ -1,26 +1,29 @@
 """`bound_drift`: a proved bound of how much invariants change, for all starts of a domain."""
 
 import functools
-import inspect
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ..base.checks import finite, positive, whole
+from ..base.keywords import checked_keywords
 from ..base.machine import processors
 from ..base.precision import refuse_double_without_x64
+from ..base.signature import accepts
 from ..base.types import Interval
 from ..discover.functions.basis import check_step_size
 from ..discover.invariants.discovery import Discovery
 from ..discover.invariants.series import InvariantSeries
-from ..integration.arithmetic import DoubleDouble, FixedPoint, FloatingPoint
+from ..integration.arithmetic import Arithmetic, DoubleDouble, FixedPoint, FloatingPoint
 from ..integration.integrator import Integrator, chosen, only
+from ..methods import Method
 from ..methods.step import Equations
 from ..problem.system import System, check_system, of_problem
-from .components import Unsupported, program_of
+from .comparison import compare, random_points
+from .components import NotAnalytic, program_of
 from .confinement import confine
 from .rational import ExactInvariant
 from .result import DriftBound, tools
@@ -30,16 +33,25 @@ _RESIDUAL = {"float64": 2.0**-49, "pairs of float64": 2.0**-94}
 """Residual of an implicit equation that a solver accepts, relative to the largest momentum: eight
 units of round-off, and twice what `DoubleDouble` leaves out."""
 
-_GIVE_TIME = (
-    "give the interval in which steps begin, time=(t_begin, t_end). If the system has "
-    "slow_time=True, give an interval of τ = εt."
-)
-
 
 class ProofError(Exception):
     """Nothing is proved: the message says what failed, and for which states."""
 
 
+class BoundSettings(TypedDict, total=False):
+    """Keywords of `bound_drift` that describe the map, and when the search ends."""
+
+    h: Any
+    args: Any
+    method: Method | str | None
+    arithmetic: Arithmetic | None
+    integrator: Integrator | None
+    ratio: float
+    max_boxes: int
+    max_seconds: float
+
+
+@checked_keywords
 def bound_drift(
     found: Discovery | InvariantSeries | Callable | Sequence[Any],
     system: Any,
@@ -47,16 +59,9 @@ def bound_drift(
     epsilon: Any,
     domain: Any,
     time: Any = None,
-    h: Any = None,
     inside: Callable | None = None,
-    args: Any = None,
-    method: Any = None,
-    arithmetic: Any = None,
-    integrator: Integrator | None = None,
     change: float = 1e-3,
-    ratio: float = 2.0,
-    max_boxes: int = 2000,
-    max_seconds: float = 300.0,
+    **settings: Unpack[BoundSettings],
 ) -> DriftBound:
     r"""Prove how little invariants of the map change in a step, for all states of a domain.
 
@@ -84,10 +89,10 @@ def bound_drift(
       `DoubleDouble()` or `FixedPoint(quantum)`; in the latter each increment is rounded by at most
       quantum/2. `integrator`: an object that contains these two.
     - `change`: of an invariant, for which a number of steps is stated.
-    - `ratio`: the boxes are cut until no bound exceeds the largest change seen by this factor, or
-      the limits `max_boxes` or `max_seconds` are reached. After one second the search
-      continues in one process per processor. Their number has no effect on the result, unless
-      `max_seconds` is reached.
+    - `ratio`: the boxes are cut until no bound exceeds the largest change seen by this factor, by
+      default 2, or the limits `max_boxes` (2000) or `max_seconds` (300) are reached. After one
+      second the search continues in one process per processor. Their number has no effect on the
+      result, unless `max_seconds` is reached.
 
     **Returns** a `DriftBound`; ``print`` shows what is proved.
 
@@ -120,32 +125,31 @@ def bound_drift(
     # In float32 the bound of the rounding would be that of another program.
     refuse_double_without_x64("domain", np.dtype(float))
     positive("change", change)
-    whole("max_boxes", max_boxes)
-    positive("max_seconds", max_seconds)
-    if not finite("ratio", ratio) > 1:
+    max_boxes = whole("max_boxes", settings.get("max_boxes", 2000))
+    max_seconds = positive("max_seconds", settings.get("max_seconds", 300.0))
+    ratio = finite("ratio", settings.get("ratio", 2.0))
+    if not ratio > 1:
         raise ValueError(f"ratio must be larger than 1, got {ratio!r}.")
+    h, args = settings.get("h"), settings.get("args")
     system, _, _, h, args = of_problem(system, None, None, h, args, has_start=True)
     check_system(system, "bound_drift")
-    options = chosen(integrator, method=method, arithmetic=arithmetic)
-    integrator_used = only(options, "bound_drift", "method", "arithmetic")
-    if not isinstance(integrator_used.arithmetic, FloatingPoint | DoubleDouble | FixedPoint):
+    method, arithmetic = settings.get("method"), settings.get("arithmetic")
+    options = chosen(settings.get("integrator"), method=method, arithmetic=arithmetic)
+    integrator = only(options, "bound_drift", "method", "arithmetic")
+    if not isinstance(integrator.arithmetic, FloatingPoint | DoubleDouble | FixedPoint):
         raise ValueError(
             "arithmetic must be dvi.FloatingPoint(), dvi.DoubleDouble() or "
-            "dvi.FixedPoint(quantum), "
-            f"got {integrator_used.arithmetic!r}: bound_drift does not bound the rounding of "
-            "others."
+            f"dvi.FixedPoint(quantum), got {integrator.arithmetic!r}."
         )
     h = check_step_size(h)
     shape, (lower, upper) = _domain(domain, found)
     strengths = _interval("epsilon", epsilon)
     times = None if time is None else _interval("time", time)
     functions = _functions(found, system, time is not None)
-    step_map, programs = _step_of(system, integrator_used, shape, args, h, times)
-    digits = (
-        "pairs of float64" if isinstance(integrator_used.arithmetic, DoubleDouble) else "float64"
-    )
-    numbers = [shape, shape, (), (), ()]
-    invariants = [_program(f"the invariant {name}", f, numbers, 0) for f, name in functions]
+    points = _points_of(shape, (lower, upper), times, strengths, h, inside)
+    step_map, programs = _step_of(system, integrator, shape, args, h, times, points)
+    digits = "pairs of float64" if isinstance(integrator.arithmetic, DoubleDouble) else "float64"
+    invariants = [_program(f"the invariant {name}", f, points[:5], 0) for f, name in functions]
     n, t = len(lower) // 2, ["input", len(lower)]
     certificate = {
         "format": exact.FORMAT,
@@ -156,13 +160,15 @@ def bound_drift(
         "slow": system.slow_time,
         "timed": any(t in p["operations"] for p in (programs["step"], *invariants)),
         "domain": [[x.hex() for x in side] for side in (lower, upper)],
-        "inside": _program("inside", inside or (lambda q, p: jnp.zeros(0)), [shape, shape], None),
+        "inside": _program("inside", inside or (lambda q, p: jnp.zeros(0)), points[:2], None),
         "invariants": invariants,
         "arithmetic": digits,
         "bits": 100,
         "orders": 24 if n < 2 else 10 if n < 3 else 8,  # of the expansion of a function
         "accepted": (_RESIDUAL[digits] * max(map(abs, (*lower[n:], *upper[n:])))).hex(),
         "spread": [(0.0).hex()] * n,
+        "start": (times or (0.0, 0.0))[0].hex(),
+        "example": [float(x).hex() for x in np.concatenate([np.ravel(x[0]) for x in points[:4]])],
     }
     if certificate["implicit"]:
         sides = lower, upper
@@ -177,9 +183,9 @@ def bound_drift(
         limits = {"max_boxes": max_boxes, "max_seconds": max_seconds, "workers": workers}
         try:
             result = search.subdivide(checker, identities, estimates, ratio=ratio, **limits)
-        except exact.Failed as error:
+        except exact.Failure as error:
             raise ProofError(f"{error}.") from None
-        per_step = [exact.up(b) for b in result.bounds]
+        per_step = [exact.round_up(b) for b in result.bounds]
         certificate |= {
             "per_step": [b.hex() for b in per_step],
             "rounding": [r.hex() for r in result.rounding],
@@ -196,7 +202,7 @@ def bound_drift(
     return DriftBound(
         per_step=tuple(per_step),
         rounding=tuple(result.rounding),
-        seen=tuple(result.seen),
+        seen=tuple(result.extremes),
         level=level,
         steps=certificate["steps"],
         start=start,
@@ -217,8 +223,32 @@ class _WithErrors(Equations):
         return h * rate + self.error
 
 
+def _points_of(
+    shape: Any, sides: tuple, times: tuple | None, strengths: tuple, h: float, inside: Any
+) -> list[np.ndarray]:
+    """Points (q, p, t, ε, h, error of an increment) of the domain for comparisons."""
+    (q_low, p_low), (q_high, p_high) = (np.reshape(side, (2, *shape)) for side in sides)
+    times = times or (0.0, 0.0)
+    ends = [(q_low, q_high), (p_low, p_high), times, strengths, (h, h), (-1e-9, 1e-9)]
+    if inside is None:
+        return random_points(ends)
+    points = random_points(ends, lambda q, p, *_: jnp.all(jnp.asarray(inside(q, p)) >= 0))
+    if not len(points[0]):
+        raise ProofError(
+            "inside(q, p) must be ≥ 0 for some states of the domain, but is negative for all of "
+            "4096 random ones. Use a smaller domain around them."
+        )
+    return points
+
+
 def _step_of(
-    system: System, integrator: Integrator, shape: Any, args: Any, h: float, times: tuple | None
+    system: System,
+    integrator: Integrator,
+    shape: Any,
+    args: Any,
+    h: float,
+    times: tuple | None,
+    points: list[np.ndarray],
 ) -> tuple[Callable, dict[str, Any]]:
     """The step, a function of (q, p, t, ε, h), and what the certificate has about it: the list of
     operations, of (q0, p0), or of (q0, p1) if it is implicit. Without `times` it is that at t = 0.
@@ -227,8 +257,7 @@ def _step_of(
     explicit = method.is_explicit(system, jnp.zeros(shape), args)
     if not (explicit or method.is_the_map):
         raise ValueError(
-            f"method must be explicit for this system or dvi.TypeII(), but {method!r} is implicit "
-            "for this system."
+            f"method must be dvi.TypeII() or explicit for this system, got {method!r}."
         )
     plain = System(system.H_D, system.force, system.perturbation)
     start, number = jnp.full(shape, 0.1), jnp.asarray(0.1)
@@ -248,17 +277,17 @@ def _step_of(
     step_of_states = jax.vmap(step_map, (0, 0, 0, 0, None))
     if times is None:
         q, p = np.random.default_rng(0).uniform(0.1, 0.2, (2, 8, *shape))
-        first, later = (
-            step_of_states(q, p, np.full(8, t), np.full(8, 0.1), jnp.asarray(h)) for t in (0.0, 1.0)
-        )
-        if not np.allclose(first, later, rtol=1e-12, atol=1e-12, equal_nan=True):
-            raise ValueError(f"time is missing, but the map depends on the time: {_GIVE_TIME}")
+        epsilon, step = np.full(8, 0.1), jnp.asarray(h)
+        first, later = (step_of_states(q, p, np.full(8, t), epsilon, step) for t in (0.0, 1.0))
+        is_constant = np.allclose(first, later, rtol=1e-12, atol=1e-12, equal_nan=True)
+        _require_time(is_constant, "the map")
     zero = jnp.zeros(())
-    interval_or_map = (
-        step_map if times else lambda q, p, t, *numbers: step_map(q, p, zero, *numbers)
-    )
-    shapes = [shape, shape, *[()] * (4 if quantum else 3)]
-    program = _program("the step of the system", interval_or_map, shapes, None)
+
+    def step_at_zero(q, p, t, *numbers):
+        return step_map(q, p, zero, *numbers)
+
+    step = step_map if times else step_at_zero
+    program = _program("the step of the system", step, points[: 6 if quantum else 5], None)
     return step_of_states, {
         "step": program,
         "implicit": not explicit,
@@ -281,66 +310,66 @@ def _spread(
 def _functions(invariants: Any, system: System, with_time: bool) -> list[tuple[Callable, str]]:
     """(function of (q, p, t, ε, h), formula) for each invariant."""
     if isinstance(invariants, Discovery):
-        if not invariants.count:
-            raise ValueError(
-                "found must contain at least one invariant, but this Discovery has none: discover "
-                "with more functions in the basis, or a lower order."
-            )
-        return _functions(list(invariants.invariants), system, with_time)
+        invariants = list(invariants.invariants)
     if isinstance(invariants, InvariantSeries):
-        if invariants.basis.uses_time and not with_time:
-            raise ValueError(
-                f"time is missing, but the invariant depends on the time: {_GIVE_TIME}"
-            )
+        _require_time(with_time or not invariants.basis.uses_time, "an invariant")
         if invariants.basis.uses_time and invariants.slow_time != system.slow_time:
             raise ValueError(
-                f"the invariant was found with slow_time={invariants.slow_time}, but system has "
-                f"slow_time={system.slow_time}."
+                f"found and system must have one slow_time, got {invariants.slow_time} and "
+                f"{system.slow_time}."
             )
         return [
-            (lambda q, p, t, e, h: invariants.evaluate(q, p, e, t), invariants.formula(terms=8))
+            (
+                lambda q, p, t, epsilon, h: invariants.evaluate(q, p, epsilon, t),
+                invariants.formula(terms=8),
+            )
         ]
     if isinstance(invariants, ExactInvariant):
-        return [(lambda q, p, t, e, h: invariants.evaluate(q, p, e, h, t), str(invariants))]
+        return [
+            (lambda q, p, t, epsilon, h: invariants.evaluate(q, p, epsilon, h, t), str(invariants))
+        ]
     if isinstance(invariants, str) or not (callable(invariants) or np.iterable(invariants)):
         raise TypeError(
-            "found must be a Discovery, an InvariantSeries, an ExactInvariant, a function (q, p, "
-            f"epsilon) or (q, p, epsilon, t), or a list of these, got {invariants!r:.200}."
+            "found must be a Discovery, InvariantSeries, ExactInvariant, a function (q, p, "
+            f"epsilon[, t]) or a list of these, got {invariants!r:.200}."
         )
     if callable(invariants):
         name = getattr(invariants, "__name__", type(invariants).__name__)
-        if _takes(invariants, 4) and (with_time or not _takes(invariants, 3)):
-            return [(lambda q, p, t, e, h: invariants(q, p, e, t), name)]
-        return [(lambda q, p, t, e, h: invariants(q, p, e), name)]
+        if accepts(invariants, 4) and (with_time or not accepts(invariants, 3)):
+            return [(lambda q, p, t, epsilon, h: invariants(q, p, epsilon, t), name)]
+        return [(lambda q, p, t, epsilon, h: invariants(q, p, epsilon), name)]
     pairs = [pair for item in invariants for pair in _functions(item, system, with_time)]
     if not pairs:
-        raise ValueError(f"found must contain at least one invariant, got {invariants!r:.200}.")
+        raise ValueError(
+            "found must have at least one invariant, got none: use more functions or a lower order."
+        )
     return pairs
 
 
-def _program(subject: str, function: Callable, shapes: list, ndim: int | None) -> dict[str, Any]:
-    """The operations of a function, whose result must have so many axes (None: any)."""
+def _require_time(fits: Any, subject: str) -> None:
+    if not fits:
+        raise ValueError(
+            f"{subject} depends on the time: give time=(t_begin, t_end) of the steps, of τ = εt "
+            "with slow_time=True."
+        )
+
+
+def _program(subject: str, function: Callable, points: list, ndim: int | None) -> dict[str, Any]:
+    """The operations of a function, whose result must have so many axes (None: any), compared with
+    the function at points."""
+    shapes = [column.shape[1:] for column in points]
     structs = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes]
     result = jax.eval_shape(function, *structs)
     if ndim is not None and getattr(result, "ndim", None) != ndim:
-        kind = type(result).__name__
-        description = (
-            f"an array of shape {result.shape}" if hasattr(result, "shape") else f"a {kind}"
-        )
+        kind = f"a {type(result).__name__}"
+        description = f"shape {result.shape}" if hasattr(result, "shape") else kind
         raise ValueError(f"{subject} must return one number, got {description}.")
     try:
-        return program_of(function, *shapes)
-    except Unsupported as error:
-        raise Unsupported(f"{subject}: {error}") from None
-
-
-def _takes(function: Callable, count: int) -> bool:
-    """Whether a function can be called with so many arguments."""
-    try:
-        inspect.signature(function).bind(*range(count))
-    except TypeError:
-        return False
-    return True
+        program = program_of(function, *shapes)
+    except NotAnalytic as error:
+        raise NotAnalytic(f"{subject}: {error}") from None
+    compare(subject, function, program, points)
+    return program
 
 
 def _domain(
@@ -350,16 +379,15 @@ def _domain(
     parts = domain if isinstance(domain, tuple) else (domain, domain)
     if len(parts) != 2:
         raise ValueError(
-            "domain must be half-widths, or a pair (domain of q, domain of p), got a tuple of "
-            f"length {len(parts)}: {domain!r:.200}."
+            f"domain must be an array or a pair for q and p, got {len(parts)} entries: "
+            f"{domain!r:.200}."
         )
     shapes = [np.shape(x)[1:] if np.ndim(x) > 1 else np.shape(x) for x in parts]
     discovery = invariants if isinstance(invariants, Discovery) else None
     shape = discovery.shape if discovery is not None else max(shapes, key=len)
     if not shape:
         raise ValueError(
-            "domain must be an array with the shape of q, unless found is a Discovery, got "
-            f"{domain!r}."
+            f"domain must be an array like q, unless found is a Discovery, got {domain!r}."
         )
     lower, upper = [], []
     for name, x in zip("qp", parts, strict=True):
@@ -367,14 +395,14 @@ def _domain(
         low, high = (x[0], x[-1]) if x.ndim > len(shape) else (-x, x)
         if np.shape(low) not in ((), shape) or (x.ndim > len(shape) and len(x) != 2):
             raise ValueError(
-                f"domain of {name} must be a half-width, an array of half-widths of shape {shape} "
-                f"like q, or an array (lower, upper) of shape {(2, *shape)}, got shape {x.shape}."
+                f"domain of {name} must be half-widths of shape () or {shape}, or (lower, upper) "
+                f"of shape {(2, *shape)}, got shape {x.shape}."
             )
         low, high = (np.broadcast_to(side, shape).ravel() for side in (low, high))
         if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
             raise ValueError(
-                f"domain of {name} must have finite lower bounds below finite upper bounds, got "
-                f"{low.tolist()} and {high.tolist()}."
+                f"domain of {name} must be finite, with lower < upper, got {low.tolist()} and "
+                f"{high.tolist()}."
             )
         lower.extend(low.tolist())
         upper.extend(high.tolist())
@@ -385,8 +413,7 @@ def _interval(name: str, ends: Any) -> tuple[float, float]:
     value, ends = ends, [finite(name, x) for x in (ends if np.ndim(ends) else (0.0, ends))]
     if len(ends) != 2 or not ends[0] < ends[1]:
         raise ValueError(
-            f"{name} must be a pair (least, largest) with least < largest, or one positive number "
-            f"x for the pair (0, x); got {value!r}."
+            f"{name} must be a positive number, or a pair with least < largest, got {value!r}."
         )
     low, high = ends
     return low, high

@@ -1,22 +1,22 @@
 """The checker of drift certificates, short enough to be read completely: python checker.py FILE.
 
-It needs Python and python-flint only. A certificate states, for a map Φ(x, t, ε) and functions
-I_k(x, t, ε) of x = (q, p), given as lists of scalar operations, which also contain h:
+It needs python-flint only. A certificate states, for a map Φ and functions I_k of x = (q, p), t and
+ε, given as lists of scalar operations, which also contain h:
 
 1. |I_k(Φ(x, t, ε), t1, ε) − I_k(x, t, ε)| ≤ `per_step`[k] in exact arithmetic, in the domain, for
    all t and ε of their intervals, with t1 = t + h, or t + εh if t is a slow time;
 2. a step that is computed in the `arithmetic` changes I_k by at most `rounding`[k] more, and moves
-   no coordinate by more than `reach`;
-3. trajectories that start in the domain with Σ w_k I_k ≤ c, where (w, c) is the `level`, stay in
-   the domain for `steps` steps, exact or computed.
+   no coordinate by more than `reach`; no intermediate number overflows;
+3. trajectories that start in the domain at the time `start` with Σ w_k I_k ≤ c, where (w, c) is the
+   `level`, stay in the domain for `steps` steps, exact or computed; the state `example` is one.
 
 For 1 and 2 boxes cover the domain. On a box a function is a polynomial with integer coefficients
-and a bound of the remainder (a Taylor model; Makino & Berz 2003); elementary functions are enclosed
-by balls (Arb). For 3, boxes cover all places outside of the domain that one step can reach, and on
-each Σ w_k I_k exceeds c by more than `steps` steps can change it: no trajectory gets there. A step
-that is implicit in p1 is a function of (q0, p1): each (q0, p0) of the domain has one p1 within
-`spread`, because p1 → p0 + h·rate maps this box into itself and is a contraction. If increments are
-rounded to multiples of `quantum`, the step has one more input, the error of each of them.
+and a bound of the remainder (a Taylor model; Makino & Berz 2003); balls (Arb) enclose elementary
+functions. For 3, boxes cover all places outside of the domain that one step can reach, and on each
+Σ w_k I_k exceeds c by more than `steps` steps can change it. An implicit step is a function of
+(q0, p1): each (q0, p0) of the domain has one p1 within `spread`, because p1 → p0 + h·rate maps this
+box into itself and is a contraction. If increments are rounded to multiples of `quantum`, the step
+has one more input, the error of each of them.
 """
 
 import hashlib
@@ -25,27 +25,26 @@ import math
 import pathlib
 import sys
 from fractions import Fraction
-from typing import Any
 
 from flint import arb, arb_series, ctx, fmpq, fmpq_mpoly_ctx, fmpz_mpoly_ctx
 
-FORMAT = "dvi_jax drift bound 1"
+FORMAT = "dvi_jax drift bound 2"
 FUNCTIONS = ("exp", "log", "sin", "cos", "tan", "atan", "asin", "acos", "sqrt", "inverse")
 ULPS = {"sqrt": 1, "inverse": 1}  # errors of functions in units of round-off; 8 (4 ulp) for others
-MALFORMED = (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RecursionError)
 UNITS = {"float64": Fraction(1, 2**53), "pairs of float64": Fraction(1, 2**103)}  # round-off
 LEVEL = 30  # bits for levels, where nothing cancels
 SMALLEST = 2.0**-1000  # added to each error, for results below the normal numbers
+LARGEST = 2.0**990  # of a number that is computed: its product with 2^27, in pairs, is finite
 
 
-class Failed(Exception):
+class Failure(Exception):
     """What could not be shown, and where."""
 
 
 def require(condition, message, box=()):
     if not condition:
         where = " × ".join(f"[{float(a):.6g}, {float(b):.6g}]" for a, b in box)
-        raise Failed(f"{message} on the box {where}" if box else message)
+        raise Failure(f"{message} on the box {where}" if box else message)
 
 
 def digest(certificate):
@@ -54,23 +53,34 @@ def digest(certificate):
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def exact(texts) -> Any:
-    """The numbers that hexadecimal floats stand for."""
-    return Fraction(float.fromhex(texts)) if isinstance(texts, str) else [exact(x) for x in texts]
+def number(text, low=-LARGEST):
+    value = float.fromhex(text) if isinstance(text, str) and len(text) < 64 else math.nan
+    require(low <= value <= LARGEST, f"{text!r:.64} is no hexadecimal float, or out of range")
+    return Fraction(value)
 
 
-def up(value):
+def numbers(texts, count, low=-LARGEST):
+    require(isinstance(texts, list) and len(texts) == count, f"not {count} numbers: {texts!r:.64}")
+    return [number(text, low) for text in texts]
+
+
+def whole(high, *values, low=0):
+    for value in values:
+        is_whole = type(value) is int and low <= value <= high
+        require(is_whole, f"{value!r:.64} is not a whole number from {low} to {high}")
+    return values
+
+
+def round_up(value):
     """A fraction or a ball, rounded up to a float."""
     if isinstance(value, arb):
-        value = value.upper()
-        return math.nextafter(float(value), math.inf) if value.is_finite() else math.inf
+        return math.nextafter(float(value.upper()), math.inf) if value.is_finite() else math.inf
     nearest = float(value)
     return nearest if Fraction(nearest) >= value else math.nextafter(nearest, math.inf)
 
 
 def ball(value, radius=0):
-    """A fraction as a ball."""
-    return arb(value.numerator) / value.denominator + arb(0, up(Fraction(radius)))
+    return arb(value.numerator) / value.denominator + arb(0, round_up(Fraction(radius)))
 
 
 def series(name, point, length):
@@ -80,38 +90,36 @@ def series(name, point, length):
     return 1 / x if name == "inverse" else getattr(x, name)()
 
 
-def difference(a, b, algebra):
-    return algebra.sum(a, (-b[0], b[1]))
-
-
 def run(program, inputs, algebra):
     """The outputs of a list of operations (name, operands): numbers of earlier operations."""
     values = []
     for name, *operands in program["operations"]:
         if name == "input":
-            value = inputs[operands[0]]
+            value = inputs[whole(len(inputs) - 1, *operands)[0]]
         elif name == "constant":
-            value = algebra.constant(exact(operands[0]))
-        elif name in FUNCTIONS:
-            value = algebra.apply(name, values[operands[0]])
+            value = algebra.constant(number(*operands))
+        elif name == "inexact":  # a number that is computed with an error of so many units
+            a, units = values[whole(len(values) - 1, operands[0])[0]], whole(2**30, *operands[1:])
+            value = algebra.inexact(a, *units) if isinstance(algebra, Rounding) else a
         else:
-            require(name in ("sum", "multiply"), f"unknown operation {name}")
-            value = getattr(algebra, name)(*(values[i] for i in operands))
+            require(name in ("sum", "multiply", *FUNCTIONS), f"unknown operation {name!r:.64}")
+            a = [values[k] for k in whole(len(values) - 1, *operands)]
+            value = algebra.apply(name, *a) if name in FUNCTIONS else getattr(algebra, name)(*a)
         values.append(value)
-    return [values[i] for i in program["outputs"]]
+    return [values[k] for k in whole(len(values) - 1, *program["outputs"])]
 
 
 class Models:
     """Taylor models in variables s with |s| ≤ 1.
-    Functions that differ from P(s)/2^bits by at most E/2^bits are a model (P, E), with integers E
-    and coefficients of P. Products are rounded towards zero, so that small terms vanish."""
+    (P, E) contains the functions that differ from P(s)/2^bits by at most E/2^bits; E and the
+    coefficients of P are integers. Products are rounded towards zero: small terms vanish."""
 
     def __init__(self, size, bits, orders):
-        self.bits, self.one, self.orders = bits, 1 << bits, range(orders + 1)
+        self.bits, self.unit, self.orders = bits, 1 << bits, range(orders + 1)
         self.ring = fmpz_mpoly_ctx.get([f"s{i}" for i in range(size)], "lex")
 
     def constant(self, value, error=0):  # exact arithmetic has no error
-        multiple = value * self.one
+        multiple = value * self.unit
         return self.ring.constant(math.floor(multiple)), int(multiple.denominator != 1)
 
     def sum(self, *terms):
@@ -122,8 +130,8 @@ class Models:
         error = norm[0] * b[1] + norm[1] * a[1] + a[1] * b[1]
         product = a[0] * b[0]
         signs = product // (norm[0] * norm[1] + 1)  # rounded down: −1 where a coefficient is < 0
-        integers = (product - (self.one - 1) * signs) // self.one
-        error += int(sum(map(abs, (product - self.one * integers).coeffs())))
+        integers = (product - (self.unit - 1) * signs) // self.unit
+        error += int(sum(map(abs, (product - self.unit * integers).coeffs())))
         return integers, (error >> self.bits) + 1
 
     def range(self, a):
@@ -133,37 +141,35 @@ class Models:
             span = (0, c) if any(powers) else (c, c)
             span = (-c, c) if any(k % 2 for k in powers) else span
             low, high = low + min(span), high + max(span)
-        return Fraction(int(low), self.one), Fraction(int(high), self.one)
+        return Fraction(int(low), self.unit), Fraction(int(high), self.unit)
 
     def bound(self, a):
         return max(map(abs, self.range(a)))
 
     def apply(self, name, a):
         """f(c + r) = Σ f⁽ᵏ⁾(c)/k! rᵏ, with Lagrange's remainder on the range of c + r."""
-        low, high = (value * self.one for value in self.range(a))
+        low, high = (value * self.unit for value in self.range(a))
         middle = int(low + high) // 2
-        expansion = series(
-            name, arb(int(low)).union(arb(int(high))) / self.one, len(self.orders) + 1
-        )
-        radius = arb(int(max(high - middle, middle - low))) / self.one
-        remainders = [abs(expansion[k + 1]) * radius ** (k + 1) * self.one for k in self.orders]
+        values = arb(int(low)).union(arb(int(high))) / self.unit
+        expansion = series(name, values, len(self.orders) + 1)
+        radius = arb(int(max(high - middle, middle - low))) / self.unit
+        remainders = [abs(expansion[k + 1]) * radius ** (k + 1) * self.unit for k in self.orders]
         require(all(x.is_finite() for x in remainders), f"{name} is singular, or varies too much")
         small = (k for k in self.orders if remainders[k] < 1)
-        order = next(small, min(self.orders, key=lambda k: up(remainders[k])))
-        terms = series(name, arb(middle) / self.one, order + 1)
+        order = next(small, min(self.orders, key=lambda k: round_up(remainders[k])))
+        terms = series(name, arb(middle) / self.unit, order + 1)
         deviation, result = (a[0] - middle, a[1]), self.constant(Fraction(0))
         for k in range(order, -1, -1):
-            multiple = terms[k] * self.one
+            multiple = terms[k] * self.unit
             integer = int(multiple.mid().floor().unique_fmpz() or 0)
-            coefficient = self.ring.constant(integer), math.ceil(up(abs(multiple - integer)))
+            coefficient = self.ring.constant(integer), math.ceil(round_up(abs(multiple - integer)))
             result = self.sum(self.multiply(result, deviation), coefficient)
-        return result[0], result[1] + math.ceil(up(remainders[order]))
+        return result[0], result[1] + math.ceil(round_up(remainders[order]))
 
 
 class Rounding:
-    """Values (ball, error): a computed number differs by at most `error` from one in the ball.
-    Each operation has a relative error of at most `unit`, a quotient of two. If a product is
-    contracted with a sum, there is one rounding less; a sum may be taken in any order."""
+    """Values (ball, error): a computed number differs by at most `error` from one in the ball. Each
+    operation has a relative error of at most `unit`, a quotient of two. A sum has any order."""
 
     def __init__(self, unit):
         self.unit = ball(Fraction(unit))
@@ -171,22 +177,24 @@ class Rounding:
     def constant(self, value, error=0):
         return ball(value), ball(Fraction(error))
 
-    def with_error(self, value, error, units=1):
-        return value, arb((error + units * self.unit * (abs(value) + error) + SMALLEST).upper())
+    def inexact(self, a, units, size=0):
+        """`size`: of the value and of what is computed on the way to it."""
+        size = size or abs(a[0]) + a[1]
+        require(self.unit == 0 or size < LARGEST, "an intermediate number may overflow")
+        return a[0], arb((a[1] + units * self.unit * size + SMALLEST).upper())
 
     def sum(self, *terms):
-        error, size = sum(t[1] for t in terms), sum(abs(t[0]) + t[1] for t in terms)
-        roundoff = len(terms) * self.unit * size + SMALLEST
-        return sum(t[0] for t in terms), arb((error + roundoff).upper())
+        value, error = sum(t[0] for t in terms), sum(t[1] for t in terms)
+        return self.inexact((value, error), len(terms), sum(abs(t[0]) + t[1] for t in terms))
 
     def multiply(self, a, b):
         error = abs(a[0]) * b[1] + abs(b[0]) * a[1] + a[1] * b[1]
-        return self.with_error(a[0] * b[0], error)
+        return self.inexact((a[0] * b[0], error), 1)
 
     def apply(self, name, a):
-        derivatives = series(name, a[0] + arb(0, up(a[1])), 2)
+        derivatives = series(name, a[0] + arb(0, round_up(a[1])), 2)
         require(derivatives[1].is_finite(), f"{name} is singular")
-        return self.with_error(derivatives[0], abs(derivatives[1]) * a[1], ULPS.get(name, 8))
+        return self.inexact((derivatives[0], abs(derivatives[1]) * a[1]), ULPS.get(name, 8))
 
 
 class Identities:
@@ -195,11 +203,11 @@ class Identities:
 
     def __init__(self, size):
         self.ring = fmpq_mpoly_ctx.get([f"x{i}" for i in range(size + 40)], "lex")
-        self.one, self.values = self.ring.constant(1), {}
+        self.unit, self.values = self.ring.constant(1), {}
         self.x, self.free = self.ring.gens()[:size], list(self.ring.gens()[size:])
 
     def constant(self, value, error=0):
-        return self.ring.constant(fmpq(value.numerator, value.denominator)), self.one
+        return self.ring.constant(fmpq(value.numerator, value.denominator)), self.unit
 
     def sum(self, *terms):
         (a, b), *addends = terms
@@ -214,7 +222,7 @@ class Identities:
         if name == "inverse":
             return a[1], a[0]
         key = name, str(a[0]), str(a[1])
-        self.values[key] = self.values.get(key) or (self.free.pop(), self.one)
+        self.values[key] = self.values.get(key) or (self.free.pop(), self.unit)
         return self.values[key]
 
 
@@ -222,15 +230,22 @@ class Checker:
     """A certificate, and what is evaluated on a box of (q, p, t, ε)."""
 
     def __init__(self, certificate):
-        self.step, self.invariants = certificate["step"], certificate["invariants"]
-        self.inside, self.implicit = certificate["inside"], certificate["implicit"]
-        self.lower, self.upper = exact(certificate["domain"])
-        self.time, self.epsilon = exact(certificate["time"]), exact(certificate["epsilon"])
-        self.n, self.slow = len(self.lower) // 2, certificate["slow"]
-        numbers = (exact(certificate[name]) for name in ("h", "quantum", "accepted", "spread"))
-        self.h, self.quantum, self.accepted, self.spread = numbers
-        self.bits, self.orders = certificate["bits"], certificate["orders"]
-        self.arithmetic, self.unit = certificate["arithmetic"], UNITS[certificate["arithmetic"]]
+        c, lower = certificate, certificate["domain"][0]
+        self.n, self.slow, self.implicit = len(lower) // 2, c["slow"], c["implicit"]
+        require(0 < self.n == len(lower) / 2, "the domain has no q or p, or not as many of each")
+        self.lower, self.upper = (numbers(side, 2 * self.n) for side in c["domain"])
+        self.time, self.epsilon = numbers(c["time"], 2), numbers(c["epsilon"], 2)
+        self.ends = [*zip(self.lower, self.upper, strict=True), self.time, self.epsilon]
+        require(all(a <= b for a, b in self.ends), "a lower end is larger than an upper end")
+        require({type(self.slow), type(self.implicit)} == {bool}, "slow, implicit: true or false")
+        self.h, self.spread = number(c["h"]), numbers(c["spread"], self.n, 0)
+        require(self.h != 0, "h is zero")
+        self.quantum, self.residual_limit = (number(c[x], 0) for x in ("quantum", "accepted"))
+        self.bits, self.orders = whole(400, c["bits"], low=8) + whole(60, c["orders"], low=1)
+        self.arithmetic, self.unit = c["arithmetic"], UNITS[c["arithmetic"]]
+        self.step, self.invariants, self.inside = c["step"], c["invariants"], c["inside"]
+        used = [operation[1] for operation in self.inside["operations"] if operation[0] == "input"]
+        require(all(k < 2 * self.n for k in used), "inside depends on t or ε")
         has_grid = ["input", 2 * self.n + 3] in self.step["operations"]
         require(has_grid == (self.quantum > 0), "a grid is used or stated, but not both")
         ctx.prec = self.bits + 60
@@ -246,10 +261,17 @@ class Checker:
         algebra = Models(len(box), self.bits, self.orders)
         parts = [((a + b) / 2, (b - a) / 2) for a, b in box]
         parts[-1] = (Fraction(0), box[-1][1]) if box[-1][0] == 0 else parts[-1]
-        gens = [(s * algebra.one, 0) for s in algebra.ring.gens()]
+        gens = [(s * algebra.unit, 0) for s in algebra.ring.gens()]
         c = [[algebra.constant(value) for value in part] for part in parts]
         pairs = zip(gens, c, strict=True)
         return algebra, [algebra.sum(a, algebra.multiply(s, b)) for s, (a, b) in pairs]
+
+    def is_inside(self, box):
+        """Whether all states of a box are shown to be in the domain."""
+        sides = zip(box, self.ends, strict=True)
+        is_between = all(low <= a and b <= high for (a, b), (low, high) in sides)
+        algebra, x = self.models(box)
+        return is_between and all(algebra.range(g)[0] >= 0 for g in run(self.inside, x, algebra))
 
     def is_outside(self, algebra, x):
         """Whether no state of these models is in the domain."""
@@ -264,61 +286,66 @@ class Checker:
         end = run(self.step, [*x, h, error], algebra)
         if self.implicit:  # (q0, p1) → (h·rate, q1)
             end, moves, p1 = [*end[self.n :], *p0], end[: self.n], p0
-            p0 = [difference(p, m, algebra) for p, m in zip(p1, moves, strict=True)]
+            p0 = [algebra.sum(p, (-m[0], m[1])) for p, m in zip(p1, moves, strict=True)]
         t1 = algebra.sum(t0, algebra.multiply(epsilon, h) if self.slow else h)
         return [*q0, *p0, t0, epsilon, h], [*end, t1, epsilon, h]
 
-    def change(self, k, step, algebra):
-        """I_k(Φ(x)) − I_k(x), from x before and after a step."""
+    def change(self, k, step, algebra):  # I_k(Φ(x)) − I_k(x)
         start_value, end_value = (run(self.invariants[k], x, algebra)[0] for x in step)
-        return difference(end_value, start_value, algebra)
+        return algebra.sum(end_value, (-start_value[0], start_value[1]))
+
+    def times(self, start, steps):
+        rates = [self.h * e for e in self.epsilon] if self.slow else [self.h]
+        return start + steps * min(0, *rates), start + steps * max(0, *rates)
 
     def displacement(self, step, algebra):
         """How far a step moves each coordinate, in exact arithmetic."""
         pairs = list(zip(*step, strict=True))[: 2 * self.n]
-        return [algebra.bound(difference(b, a, algebra)) for a, b in pairs]
+        return [algebra.bound(algebra.sum(b, (-a[0], a[1]))) for a, b in pairs]
 
     def is_identity(self, k):
         """Whether I_k is conserved exactly, for all x, t and ε."""
         algebra = Identities(2 * self.n + 2)
-        step = self.states_of_step([(x, algebra.one) for x in algebra.x], algebra)
+        step = self.states_of_step([(x, algebra.unit) for x in algebra.x], algebra)
         numerator, denominator = self.change(k, step, algebra)
         return numerator == 0 and denominator != 0
 
     def rounding(self, box):
-        """The changes of the I_k by the rounding of a step, and the errors of the coordinates.
-        The solver accepts a p1 whose residual is `accepted` and as computed."""
+        """The changes of the I_k by the rounding of a step, and the errors of the coordinates."""
         algebra, exactly, n = Rounding(self.unit), Rounding(0), self.n
         x = [(ball((a + b) / 2, (b - a) / 2), arb(0)) for a, b in box]
         x[-2] = x[-2][0], 2 * ball(UNITS["float64"]) * abs(x[-2][0])  # t = t0 + kh in float64
         start, end = self.states_of_step(x, algebra)
-        if self.implicit:
+        if self.implicit:  # the solver accepts a p1 whose residual is `accepted` and as computed
             # A Lipschitz constant of p1 → h·rate(q0, p1) in the maximum norm: the effect of errors.
             momenta = [(p1, arb(2) ** -60) for p1, _ in x[n:-2]]
             inputs = [*x[:n], *momenta, *x[-2:], exactly.constant(self.h)]
-            lipschitz = max(up(e) * 2.0**60 for _, e in run(self.step, inputs, exactly)[:n])
+            lipschitz = max(round_up(e) * 2.0**60 for _, e in run(self.step, inputs, exactly)[:n])
             require(lipschitz < 1 / 3, "the implicit step is not shown to be a contraction", box)
-            error = max((e + arb(up(self.accepted)) for _, e in start[n : 2 * n]), key=up)
+            error = max(
+                (e + arb(round_up(self.residual_limit)) for _, e in start[n : 2 * n]), key=round_up
+            )
             x[n:-2] = [(p1, error / (1 - arb(lipschitz))) for p1, _ in momenta]
             end = self.states_of_step(x, algebra)[1]
         changes = [run(function, end, exactly)[0][1] for function in self.invariants]
-        return list(map(up, changes)), [up(error) for _, error in end[: 2 * n]]
+        return list(map(round_up, changes)), [round_up(error) for _, error in end[: 2 * n]]
 
 
 def leaves(box, node):
     """The boxes of a tree of cuts ["cut", axis, where, part, part], with what is claimed there."""
-    if not (isinstance(node, list) and node[0] == "cut"):
+    if isinstance(node, str):
         return (yield box, node)
-    _, axis, where, *parts = node
-    require(axis in range(len(box)) and len(parts) == 2, "a cut has no axis or part", box)
-    (a, b), c = box[axis], exact(where)
+    cut, axis, where, *parts = node
+    require(cut == "cut" and len(parts) == 2, "a cut has not two parts", box)
+    (a, b), c = box[whole(len(box) - 1, axis)[0]], number(where)
     require(a <= c <= b, "a cut is outside of its box,", box)
     for side, part in zip(((a, c), (c, b)), parts, strict=True):
         yield from leaves([*box[:axis], side, *box[axis + 1 :]], part)
 
 
 def check_step(checker, box, claim, limits):
-    """Statements 1 and 2 on one box; `stated`: the numbers per_step, rounding and reach."""
+    """Statements 1 and 2 on one box; `limits`: the numbers per_step, rounding and reach."""
+    require(claim in ("bounded", "outside"), f"{claim:.64} is no claim", box)
     algebra, x = checker.models(box)
     if claim == "outside" and not checker.implicit:  # the step may be singular there
         return require(checker.is_outside(algebra, x), "not shown to be outside", box)
@@ -328,8 +355,7 @@ def check_step(checker, box, claim, limits):
     require(not checker.implicit or all(m <= s for m, s in pairs), "p1 is far from p0", box)
     if claim == "outside":
         return require(checker.is_outside(algebra, step[0]), "not shown to be outside", box)
-    changes = [checker.change(k, step, algebra) for k in range(len(checker.invariants))]
-    changes = map(algebra.bound, changes)
+    changes = [algebra.bound(checker.change(k, step, algebra)) for k in range(len(roundings))]
     changes = [0 if limits[k] == 0 and checker.is_identity(k) else b for k, b in enumerate(changes)]
     moves = [m + Fraction(e) for m, e in zip(moves, errors, strict=True)]
     fits = [a <= b for a, b in zip([*changes, *roundings, *moves], limits, strict=True)]
@@ -350,51 +376,71 @@ def check_confined(checker, box, claim, weights, limit, reach):
         wide = [(a - w, b + w) for (a, b), w in zip(box[:-2], reach, strict=True)]
         is_shown = checker.is_outside(*checker.models([*wide, *box[-2:]]))
     elif claim == "inside":
-        sides = zip(box, checker.lower, checker.upper, strict=False)
-        is_shown = all(low <= a and b <= high for (a, b), low, high in sides)
-        algebra, x = checker.models(box)
-        is_shown &= all(algebra.range(g)[0] >= 0 for g in run(checker.inside, x, algebra))
+        is_shown = checker.is_inside(box)
     else:
         algebra, value = combination_model(checker, weights, box)
-        is_shown = algebra.range(value)[0] > limit
-    require(is_shown, f"{claim} is not shown", box)
+        is_shown = claim == "above" and algebra.range(value)[0] > limit
+    require(is_shown, f"{claim:.64} is not shown", box)
 
 
 def check(certificate):
-    """What a certificate proves, as a sentence. **Raises** `Failed` if it does not."""
-    require(certificate["format"] == FORMAT, f"the format is not {FORMAT!r}")
-    require(digest(certificate) == certificate["hash"], "the file was changed: its hash differs")
-    checker = Checker(certificate)
-    per_step, rounding, reach = (exact(certificate[x]) for x in ("per_step", "rounding", "reach"))
-    boxes = list(leaves(checker.root(), certificate["boxes"]))
+    """What a certificate proves, as text. **Raises** `Failure` if it does not."""
+    c = certificate
+    require(c["format"] == FORMAT, f"the format is not {FORMAT!r}")
+    require(digest(c) == c["hash"], "the file was changed: its hash differs")
+    checker, count = Checker(c), len(c["invariants"])
+    per_step, rounding = numbers(c["per_step"], count, 0), numbers(c["rounding"], count, 0)
+    reach = numbers(c["reach"], 2 * checker.n, 0)
+    boxes = list(leaves(checker.root(), c["boxes"]))
     for box, claim in boxes:
         check_step(checker, box, claim, [*per_step, *rounding, *reach])
-    text = f"on {len(boxes)} boxes a step changes I by ≤ {[*map(float, per_step)]}"
-    text += f", its rounding in {checker.arithmetic} by ≤ {[*map(float, rounding)]}"
-    text += f" on a grid of {float(checker.quantum)}" * bool(checker.quantum)
-    text += f" if a solver accepts residuals ≤ {float(checker.accepted):.3g}" * checker.implicit
-    if certificate["level"] is None:
+    example = [(x, x) for x in numbers(c["example"], 2 * checker.n + 2)]
+    require(count > 0 and checker.is_inside(example), "no invariant, or no state of the domain")
+    text = statement(checker, len(boxes), per_step, rounding)
+    if c["level"] is None:
         return text
-    (weights, value), steps = exact(certificate["level"]), certificate["steps"]
+    (weights, value), (steps,) = c["level"], whole(2**200, c["steps"], low=1)
+    weights, value, start = numbers(weights, count), number(value), number(c["start"])
     rates = [abs(w) * (b + r) for w, b, r in zip(weights, per_step, rounding, strict=True)]
-    *sides, time, epsilon = checker.root()
-    sides = [(a - w, b + w) for (a, b), w in zip(sides, reach, strict=True)]
-    t, lasts = ["input", 2 * checker.n], steps * checker.h * (epsilon[1] if checker.slow else 1)
-    is_timed = any(t in program["operations"] for program in [checker.step, *checker.invariants])
-    require(
-        not is_timed or lasts <= time[1] - time[0], "the steps last longer than the time", [time]
-    )
+    programs = [checker.step, *checker.invariants]
+    is_timed = any(["input", 2 * checker.n] in program["operations"] for program in programs)
+    first, last = checker.times(start, steps)
+    is_long = is_timed and (first < checker.time[0] or last > checker.time[1])
+    require(not is_long, "the steps last longer than the time", [checker.time])
     checker.bits = LEVEL
-    for box, claim in leaves([*sides, time, epsilon], certificate["shell"]):
+    algebra, least = combination_model(checker, weights, example)
+    require(algebra.range(least)[1] <= value, "the example is above the level")
+    sides = [(a - w, b + w) for (a, b), w in zip(checker.root(), [*reach, 0, 0], strict=True)]
+    for box, claim in leaves(sides, c["shell"]):
         check_confined(checker, box, claim, weights, value + steps * sum(rates), reach)
-    return text + f"; from Σ w_k I_k ≤ {float(value):.6g} the domain is not left in {steps} steps"
+    text += (
+        f"\n- trajectories from there{f' and t = {float(start)!r}' * is_timed} with Σ w_k I_k ≤ "
+    )
+    return f"{text}{float(value)!r}, w = {[*map(float, weights)]}, stay there for {steps} steps"
+
+
+def statement(checker, count, *bounds):
+    """What statements 1 and 2 say, and what they assume."""
+    lower, upper, time, epsilon, per_step, rounding = (
+        [*map(float, row)] for row in (checker.lower, checker.upper, *checker.ends[-2:], *bounds)
+    )
+    return (
+        f"on {count} boxes, with h = {float(checker.h)!r}, for all (q, p) "
+        f"from {lower} to {upper}{' with inside ≥ 0' * bool(checker.inside['outputs'])}, all t"
+        f"{', which is ε times the time,' * checker.slow} in {time} and all ε in {epsilon}:"
+        f"\n- a step changes I by ≤ {per_step} in exact arithmetic"
+        f"\n- its rounding in {checker.arithmetic} to nearest changes I by ≤ {rounding} more"
+        f"{f', of increments to multiples of {float(checker.quantum)!r}' * bool(checker.quantum)}"
+        f"{f', for residuals ≤ {float(checker.residual_limit):.3g}' * checker.implicit}"
+        "\n- not checked: whether these operations are those of a program (see holds_for)"
+    )
 
 
 def main(path):
     """Check one file. Returns the exit code: 0 for a proof, 1 otherwise."""
     try:
         print("proved:", check(json.loads(pathlib.Path(path).read_text(encoding="utf-8"))))
-    except (Failed, OSError, *MALFORMED) as error:
+    except Exception as error:  # whatever is wrong with a file, nothing is proved
         print(f"not proved: {type(error).__name__}: {error}")
         return 1
     return 0

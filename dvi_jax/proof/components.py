@@ -4,6 +4,10 @@ The list is what a certificate contains: it is read from the jaxpr of the packag
 that a user writes no second definition of the system. Operations that only move numbers (slices,
 reshapes, gathers) disappear; what remains are sums, products, quotients, integer powers and
 elementary functions. Those of constants remain, too, where float64 would round the result.
+
+What the list cannot express is refused by name: a number of the state that is converted to another
+type, an index or a condition that is computed from the state, any other operation. The module
+`comparison` compares the list with the function afterwards.
 """
 
 import math
@@ -22,17 +26,23 @@ UNARY = ("exp", "log", "sin", "cos", "tan", "atan", "asin", "acos", "sqrt")
 _MOVES = (
     "reshape", "broadcast_in_dim", "squeeze", "transpose", "slice", "rev", "concatenate", "gather",
     "dynamic_slice", "pad", "select_n", "dynamic_update_slice", "scatter", "split",
-    "stack", "unstack", "copy", "copy_p", "reduce_precision", "optimization_barrier",
+    "stack", "unstack", "copy", "copy_p", "optimization_barrier",
 )  # fmt: skip
+_SUMS = ("scatter-add", "cumsum", "reduce_window_sum")
+_INDICES = {
+    "gather": (1,), "scatter": (1,), "scatter-add": (1,), "select_n": (0,),
+    "dynamic_slice": range(1, 99), "dynamic_update_slice": range(2, 99),
+}  # fmt: skip
+"""Operands that say where numbers go, and are not such numbers themselves."""
 _CALLS = ("pjit", "jit", "closed_call", "core_call", "remat", "checkpoint", "custom_jvp_call",
           "custom_vjp_call", "custom_lin")  # fmt: skip
 
 
-class Unsupported(ValueError):
+class NotAnalytic(ValueError):
     """A function that has no list of operations; the message says what is in it."""
 
 
-class Program:
+class ScalarProgram:
     """Operations (name, operands), written one by one; equal ones are written once."""
 
     def __init__(self):
@@ -40,19 +50,21 @@ class Program:
         self._numbers: dict[tuple, int] = {}
         self.constants: dict[int, float] = {}
 
-    def write(self, name: str, *operands: Any) -> "Scalar":
+    def write(self, name: str, *operands: Any) -> "ProgramNumber":
         key = (name, *operands)
         if key not in self._numbers:
             self._numbers[key] = len(self.operations)
             self.operations.append([name, *operands])
-        return Scalar(self, self._numbers[key])
+        return ProgramNumber(self, self._numbers[key])
 
-    def constant(self, value: float) -> "Scalar":
+    def constant(self, value: float) -> "ProgramNumber":
+        if not math.isfinite(value):
+            return self.write("unknown", f"the constant {float(value)}")
         scalar = self.write("constant", float(value).hex())
         self.constants[scalar.index] = float(value)
         return scalar
 
-    def as_json(self, outputs: Sequence["Scalar"]) -> dict[str, Any]:
+    def as_json(self, outputs: Sequence["ProgramNumber"]) -> dict[str, Any]:
         """With the operations that the outputs need only."""
         indices = set()
         stack = [out.index for out in outputs]
@@ -65,10 +77,9 @@ class Program:
         primitives = {self.operations[i][1] for i in order if self.operations[i][0] == "unknown"}
         if primitives:
             names = ", ".join(sorted(primitives)).replace("select_n", "select_n (jnp.where)")
-            raise Unsupported(
-                f"operations of JAX that a proof does not allow: {names}. Allowed are sums, "
-                "products, quotients, powers with constant exponents, sinh, cosh, tanh, "
-                f"{', '.join(UNARY)}."
+            raise NotAnalytic(
+                f"a proof does not allow: {names} of JAX, only + − × /, constant powers, sinh, "
+                f"cosh, tanh, {', '.join(UNARY)}."
             )
         numbers = {old: i for i, old in enumerate(order)}
         operations = []
@@ -84,22 +95,22 @@ def _operands(operation: list[Any]) -> list[int]:
     return [] if name in ("input", "constant", "unknown") else arguments
 
 
-class Scalar:
+class ProgramNumber:
     """One number of a program, with Python's operators."""
 
     __slots__ = ("index", "program")
 
-    def __init__(self, program: Program, index: int):
+    def __init__(self, program: ScalarProgram, index: int):
         self.program, self.index = program, index
 
     @property
     def value(self) -> float | None:
         return self.program.constants.get(self.index)
 
-    def _scalar(self, other: Any) -> "Scalar":
-        return other if isinstance(other, Scalar) else self.program.constant(other)
+    def _scalar(self, other: Any) -> "ProgramNumber":
+        return other if isinstance(other, ProgramNumber) else self.program.constant(other)
 
-    def _constant(self, operation: Callable, other: "Scalar") -> "Scalar | None":
+    def _constant(self, operation: Callable, other: "ProgramNumber") -> "ProgramNumber | None":
         """The result for two constants, if it is a number of float64."""
         if self.value is None or other.value is None:
             return None
@@ -107,7 +118,7 @@ class Scalar:
         is_exact = abs(value) < 2**1000 and Fraction(float(value)) == value
         return self.program.constant(float(value)) if is_exact else None
 
-    def __add__(self, other: Any) -> "Scalar":
+    def __add__(self, other: Any) -> "ProgramNumber":
         other = self._scalar(other)
         if self.value == 0:
             return other
@@ -116,15 +127,15 @@ class Scalar:
         constant = self._constant(operator.add, other)
         return constant or self.program.write("sum", self.index, other.index)
 
-    def __neg__(self) -> "Scalar":
+    def __neg__(self) -> "ProgramNumber":
         if self.value is not None:
             return self.program.constant(-self.value)
         return self * -1.0
 
-    def __sub__(self, other: Any) -> "Scalar":
+    def __sub__(self, other: Any) -> "ProgramNumber":
         return self + -self._scalar(other)
 
-    def __mul__(self, other: Any) -> "Scalar":
+    def __mul__(self, other: Any) -> "ProgramNumber":
         other = self._scalar(other)
         for a, b in ((self, other), (other, self)):
             if a.value == 0 or b.value == 1:
@@ -132,7 +143,7 @@ class Scalar:
         constant = self._constant(operator.mul, other)
         return constant or self.program.write("multiply", self.index, other.index)
 
-    def __truediv__(self, other: Any) -> "Scalar":
+    def __truediv__(self, other: Any) -> "ProgramNumber":
         other = self._scalar(other)
         if self.value == 0 or other.value == 1:
             return self
@@ -142,13 +153,13 @@ class Scalar:
 
     __radd__, __rmul__ = __add__, __mul__
 
-    def __rsub__(self, other: Any) -> "Scalar":
+    def __rsub__(self, other: Any) -> "ProgramNumber":
         return self._scalar(other) - self
 
-    def __rtruediv__(self, other: Any) -> "Scalar":
+    def __rtruediv__(self, other: Any) -> "ProgramNumber":
         return self._scalar(other) / self
 
-    def power(self, n: int) -> "Scalar":
+    def power(self, n: int) -> "ProgramNumber":
         """selfⁿ: n − 1 products."""
         if n < 1:
             unit = self.program.constant(1.0)
@@ -158,13 +169,13 @@ class Scalar:
         square = (self * self).power(n // 2)
         return square * self if n % 2 else square
 
-    def apply(self, name: str) -> "Scalar":
+    def apply(self, name: str) -> "ProgramNumber":
         return self.program.write(name, self.index)
 
 
 def total(scalars: Sequence[Any]) -> Any:
     """The sum of several numbers as one operation, whose order is open."""
-    parts = [s for s in scalars if not (isinstance(s, Scalar) and s.value == 0)]
+    parts = [s for s in scalars if not (isinstance(s, ProgramNumber) and s.value == 0)]
     if len(parts) < 2:
         return parts[0] if parts else scalars[0]
     return parts[0].program.write("sum", *(part.index for part in parts))
@@ -176,11 +187,11 @@ def program_of(function: Callable, *shapes: tuple[int, ...]) -> dict[str, Any]:
     Returns ``{"operations": [[name, *operands], ...], "outputs": [...]}``: an operand is the number
     of an earlier operation; inputs and outputs are in the order of the raveled arrays.
 
-    **Raises** `Unsupported` for operations that are not analytic, or that depend on the values.
+    **Raises** `NotAnalytic` for operations that are not analytic, or that depend on the values.
     """
     structs = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes]
     closed_jaxpr = jax.make_jaxpr(function)(*structs)
-    program, inputs, offset = Program(), [], 0
+    program, inputs, offset = ScalarProgram(), [], 0
     for shape in shapes:
         size = int(np.prod(shape))
         numbers = [program.write("input", offset + i) for i in range(size)]
@@ -191,7 +202,7 @@ def program_of(function: Callable, *shapes: tuple[int, ...]) -> dict[str, Any]:
     return program.as_json(scalars)
 
 
-def _array(scalars: Sequence[Scalar], shape: tuple[int, ...]) -> np.ndarray:
+def _array(scalars: Sequence[ProgramNumber], shape: tuple[int, ...]) -> np.ndarray:
     array = np.empty(len(scalars), object)
     array[:] = scalars
     return array.reshape(shape)
@@ -208,14 +219,16 @@ def _concrete(x: Any) -> Any:
     return np.array([scalar.value for scalar in x.ravel()]).reshape(x.shape)
 
 
-def _symbolic(program: Program, x: Any) -> np.ndarray:
+def _symbolic(program: ScalarProgram, x: Any) -> np.ndarray:
     if _is_symbolic(x):
         return x
     values = np.asarray(x)
     return _array([program.constant(v) for v in values.ravel()], values.shape)
 
 
-def _evaluate(program: Program, jaxpr: Any, consts: Sequence[Any], inputs: Sequence[Any]) -> list:
+def _evaluate(
+    program: ScalarProgram, jaxpr: Any, consts: Sequence[Any], inputs: Sequence[Any]
+) -> list:
     environment: dict[Any, Any] = dict(zip(jaxpr.constvars, consts, strict=True))
     environment.update(zip(jaxpr.invars, inputs, strict=True))
 
@@ -228,7 +241,7 @@ def _evaluate(program: Program, jaxpr: Any, consts: Sequence[Any], inputs: Seque
     return [read(v) for v in jaxpr.outvars]
 
 
-def _apply(program: Program, equation: Any, values: list) -> list:
+def _apply(program: ScalarProgram, equation: Any, values: list) -> list:
     name, params = equation.primitive.name, equation.params
     inner = params.get("jaxpr") or params.get("call_jaxpr") or params.get("fun_jaxpr")
     if inner is not None and (name in _CALLS or "call" in name or "jit" in name):
@@ -237,27 +250,51 @@ def _apply(program: Program, equation: Any, values: list) -> list:
         return _evaluate(program, inner, [], values)
     if name == "scan":
         return _scan(program, params, values)
-    if name == "cond" and not _is_symbolic(values[0]):
-        branch = params["branches"][int(values[0])]
-        return _evaluate(program, branch.jaxpr, branch.consts, values[1:])
     values = [_concrete(v) for v in values]
-    rounds = name in _ROUNDING_OPERATIONS and equation.outvars[0].aval.dtype == jnp.float64
+    if name == "cond" and not _is_symbolic(values[0]):
+        branches = params["branches"]
+        branch = branches[min(max(int(values[0]), 0), len(branches) - 1)]
+        return _evaluate(program, branch.jaxpr, branch.consts, values[1:])
+    rounds = name in _ROUNDING_OPERATIONS and any(
+        jnp.issubdtype(v.aval.dtype, jnp.inexact) for v in equation.outvars
+    )
     if not (rounds or any(map(_is_symbolic, values))):
         out = equation.primitive.bind(*map(jnp.asarray, values), **params)
         return list(out) if equation.primitive.multiple_results else [out]
-    if name in _MOVES and not (name == "select_n" and _is_symbolic(values[0])):
+    obstacle = _obstacle(equation, values)
+    if not obstacle and name in _MOVES:
         return _rearrange(program, equation, values)
-    if name == "convert_element_type":
+    if not obstacle and name == "convert_element_type":
         return [values[0]]
-    array = _arithmetic(program, equation, [_symbolic(program, v) for v in values], values)
+    array = None
+    if not obstacle:
+        arrays = [_symbolic(program, v) for v in values]
+        array = _arithmetic(program, equation, arrays, values)
     if array is None:  # which is an error only if an output needs it: a status does not
-        placeholder = program.write("unknown", name)
+        placeholder = program.write("unknown", obstacle or name)
         shapes = [v.aval.shape for v in equation.outvars]
         return [_array([placeholder] * int(np.prod(shape)), shape) for shape in shapes]
     return [array]
 
 
-def _arithmetic(program: Program, equation: Any, arrays: list, values: list) -> np.ndarray | None:
+def _obstacle(equation: Any, values: list) -> str:
+    """Why an operation of numbers of the state is not one of float64, or moves them to computed
+    places; empty if neither."""
+    name = equation.primitive.name
+    types = {str(v.aval.dtype) for v in equation.outvars} - {"float64"}
+    if name == "convert_element_type":
+        types |= {str(equation.invars[0].aval.dtype)} - {"float64"}
+        return f"a conversion to or from {', '.join(sorted(types))}" if types else ""
+    if types:
+        return f"{name} with a result of type {', '.join(sorted(types))}"
+    if any(_is_symbolic(v) for i, v in enumerate(values) if i in _INDICES.get(name, ())):
+        return name if name == "select_n" else f"{name} with computed indices"
+    return ""
+
+
+def _arithmetic(
+    program: ScalarProgram, equation: Any, arrays: list, values: list
+) -> np.ndarray | None:
     """The output of an operation; None for one that has no list of operations."""
     name, params = equation.primitive.name, equation.params
     shape = equation.outvars[0].aval.shape
@@ -282,12 +319,12 @@ def _arithmetic(program: Program, equation: Any, arrays: list, values: list) -> 
         return _array([combine(column) for column in flat.T], shape)
     if name == "dot_general":
         return _dot(params["dimension_numbers"], *arrays).reshape(shape)
-    if name in ("scatter-add", "cumsum", "reduce_window_sum"):
+    if name in _SUMS:
         return _linear(program, equation, values)
     return None
 
 
-def _real_power(x: Scalar, y: float) -> Scalar:
+def _real_power(x: ProgramNumber, y: float) -> ProgramNumber:
     if y.is_integer():
         return x.power(int(y))
     if (2 * y).is_integer():
@@ -337,39 +374,43 @@ def _dot(dimensions: Any, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return out
 
 
-def _rearrange(program: Program, equation: Any, values: list) -> list:
+def _rearrange(program: ScalarProgram, equation: Any, values: list) -> list:
     """Apply an operation that only moves numbers to their places in a list."""
-    table: list[Any] = [program.constant(0.0)]
-    arguments = []
-    for atom, value in zip(equation.invars, values, strict=True):
-        if _is_symbolic(value) or atom.aval.dtype == equation.outvars[0].aval.dtype:
-            flat = _symbolic(program, value)
-            arguments.append(jnp.arange(len(table), len(table) + flat.size).reshape(flat.shape))
-            table.extend(flat.ravel())
+    name, params = equation.primitive.name, dict(equation.params)
+    # Places are integers. At place 0 is the number with which a gather fills what is out of range.
+    table: list[Any] = [program.write("unknown", f"{name} with an index out of range")]
+    if params.get("fill_value") is not None:
+        table = [program.constant(params["fill_value"])]
+    params |= {"fill_value": 0} if "fill_value" in params else {}
+    places = []
+    for i, value in enumerate(values):
+        if i in _INDICES.get(name, ()):
+            places.append(jnp.asarray(value))
         else:
-            arguments.append(jnp.asarray(value))
-    # Places are integers; 0 is the place of the number 0, with which a gather or a pad fills.
-    params = {k: v for k, v in equation.params.items() if k not in ("fill_value",)}
-    if "fill_value" in equation.params:
-        params["fill_value"] = 0
-    out = equation.primitive.bind(*arguments, **params)
-    places = out if equation.primitive.multiple_results else [out]
-    return [_array([table[i] for i in np.asarray(x).ravel()], x.shape) for x in places]
+            flat = _symbolic(program, value)
+            places.append(jnp.arange(len(table), len(table) + flat.size).reshape(flat.shape))
+            table.extend(flat.ravel())
+    out = equation.primitive.bind(*places, **params)
+    results = out if equation.primitive.multiple_results else [out]
+    return [_array([table[i] for i in np.asarray(x).ravel()], x.shape) for x in results]
 
 
-def _linear(program: Program, equation: Any, values: list) -> np.ndarray:
-    """An operation that is linear in its symbolic arguments, by its effect on each number."""
+def _linear(program: ScalarProgram, equation: Any, values: list) -> np.ndarray:
+    """An operation that is linear in all its numbers, by its effect on each of them."""
+    indices = _INDICES.get(equation.primitive.name, ())
+    zeros = [np.asarray(v) if i in indices else np.zeros(np.shape(v)) for i, v in enumerate(values)]
     parts, shape = [], equation.outvars[0].aval.shape
-    symbolic = [i for i, v in enumerate(values) if _is_symbolic(v)]
-    for i in symbolic:
-        for place in np.ndindex(values[i].shape):
-            units = [
-                np.zeros(np.shape(v)) if j in symbolic else np.asarray(v)
-                for j, v in enumerate(values)
-            ]
+    for i, value in enumerate(values):
+        if i in indices:
+            continue
+        scalars = _symbolic(program, value)
+        for place in np.ndindex(scalars.shape):
+            if scalars[place].value == 0:
+                continue
+            units = [x.copy() for x in zeros]
             units[i][place] = 1.0
             out = equation.primitive.bind(*map(jnp.asarray, units), **equation.params)
-            parts.append((values[i][place], np.asarray(out)))
+            parts.append((scalars[place], np.asarray(out)))
     zero = program.constant(0.0)
     sums = [
         total([zero, *(x * float(m.ravel()[k]) for x, m in parts if m.ravel()[k])])
@@ -378,7 +419,7 @@ def _linear(program: Program, equation: Any, values: list) -> np.ndarray:
     return _array(sums, shape)
 
 
-def _scan(program: Program, params: Any, values: list) -> list:
+def _scan(program: ScalarProgram, params: Any, values: list) -> list:
     """A loop of a fixed length, written out."""
     (nc, nk), length = scan_counts(params), params["length"]
     body, consts, carry = params["jaxpr"], values[:nc], values[nc : nc + nk]

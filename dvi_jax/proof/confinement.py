@@ -32,17 +32,17 @@ def confine(
     """
     exact, search = tools()
     checker.bits = exact.LEVEL
-    per_step, rounding, reach = (
-        exact.exact(certificate[name]) for name in ("per_step", "rounding", "reach")
-    )
+    names = ("per_step", "rounding", "reach")
+    per_step, rounding, reach = ([exact.number(x) for x in certificate[name]] for name in names)
+    start, limit = _start(checker)
+    certificate["start"] = start.hex()
     reason = "no combination of the invariants is larger all around the domain than inside"
-    for weights, minimum, border in _candidates(checker, functions, inside, shape, reach):
+    for weights, minimum, border, state in _candidates(checker, functions, inside, shape, reach):
         w = [Fraction(x) for x in weights]
         rate = sum(abs(x) * (b + r) for x, b, r in zip(w, per_step, rounding, strict=True))
         steps = math.floor(Fraction(change) / rate) if rate else 2**62
         if certificate["timed"]:
-            last = checker.h * (checker.epsilon[1] if checker.slow else 1)
-            steps = min(steps, math.floor((checker.time[1] - checker.time[0]) / last))
+            steps = min(steps, limit)
         if not steps:
             reason = f"{combination(weights)} may change by more than change={change:g} in one step"
             continue
@@ -51,19 +51,34 @@ def confine(
             if level <= minimum:
                 reason = f"change={change:g} is larger than the range of {combination(weights)}"
                 continue
-            value = Fraction(level)
+            value, example = Fraction(level), [(Fraction(x),) * 2 for x in state]
+            algebra, least = exact.combination_model(checker, w, example)
+            if algebra.range(least)[1] > value:
+                continue
             quick = _value(functions, weights, shape, float(checker.h))
             try:
                 shell, count = search.enclose(
                     checker, w, value + steps * rate, reach, quick, **limits
                 )
-            except exact.Failed as error:
+            except exact.Failure as error:
                 reason = str(error)
                 continue
             certificate |= {"level": [[x.hex() for x in weights], level.hex()]}
-            certificate |= {"steps": steps, "shell": shell}
+            certificate |= {"steps": steps, "shell": shell, "example": [x.hex() for x in state]}
             return (tuple(weights), level), _scale(checker, w, value), "", count
     return None, 0.0, reason, 0
+
+
+def _start(checker: Any) -> tuple[float, int]:
+    """The time at which trajectories start that stay longest in the interval of times, and the
+    number of their steps."""
+    begin, end = checker.time
+    first, last = checker.times(Fraction(0), 1)
+    if first == last:
+        return float(begin), 2**62
+    start = Fraction(float(begin + (end - begin) * first / (first - last)))
+    limits = [(side - start) / rate for side, rate in ((end, last), (begin, first)) if rate]
+    return float(start), max(0, math.floor(min(limits)))
 
 
 def _value(functions: list, weights: list[float], shape: Any, h: float) -> Any:
@@ -75,11 +90,12 @@ def _value(functions: list, weights: list[float], shape: Any, h: float) -> Any:
 
 
 def _candidates(checker: Any, functions: list, inside: Any, shape: Any, reach: list) -> list[tuple]:
-    """(weights, least value in the domain, least value around it) of Σ w_k I_k where the latter is
-    larger, those first that leave most of the domain; from random points."""
+    """(weights, least value in the domain, least value around it, the state (q, p, t, ε) of the
+    former) of Σ w_k I_k where the latter is larger, those first that leave most of the domain; from
+    random points."""
     inner, outer = _points(checker, inside, shape, [float(x) for x in reach])
     middle = (np.array(checker.lower, float) + np.array(checker.upper, float))[None] / 2
-    spans = [[float(end) for end in ends] for ends in (checker.time, checker.epsilon)]
+    pairs = [(float(t), float(e)) for t in checker.time for e in checker.epsilon]
 
     h = float(checker.h)
 
@@ -90,7 +106,7 @@ def _candidates(checker: Any, functions: list, inside: Any, shape: Any, reach: l
                 (0, None, None),
             )
         )
-        rows = np.concatenate([np.asarray(evaluate(z, t, e)) for t in spans[0] for e in spans[1]])
+        rows = np.concatenate([np.asarray(evaluate(z, t, e)) for t, e in pairs])
         return np.where(np.isfinite(rows), rows, 0.0)  # candidates only: the checker decides
 
     inner_values, outer_values, center = values(inner), values(outer), values(middle)[0]
@@ -102,7 +118,9 @@ def _candidates(checker: Any, functions: list, inside: Any, shape: Any, reach: l
         border, minimum = float(np.min(outer_values @ w)), float(np.min(inner_values @ w))
         if border > minimum:
             share = float(np.mean(inner_values @ w < border))
-            candidates.append((share, (w.tolist(), minimum, border)))
+            lap, place = divmod(int(np.argmin(inner_values @ w)), len(inner))
+            state = [*inner[place].tolist(), *pairs[lap]]
+            candidates.append((share, (w.tolist(), minimum, border, state)))
     return [item for _, item in sorted(candidates, key=lambda pair: -pair[0])]
 
 
@@ -149,9 +167,8 @@ def _points(checker: Any, inside: Any, shape: Any, reach: list) -> tuple[np.ndar
     border_points = rng.uniform(low, high, (200000, len(low)))
     border_points = border_points[np.asarray(keep(border_points))]
     neighbours = border_points + rng.choice([-1.0, 1.0], border_points.shape) * wide
-    is_outside = (
-        ~np.asarray(keep(neighbours)) | (neighbours < low).any(1) | (neighbours > high).any(1)
-    )
+    is_outside = (neighbours < low).any(1) | (neighbours > high).any(1)
+    is_outside |= ~np.asarray(keep(neighbours))
     return border_points[:4000], neighbours[is_outside][:40000]
 
 

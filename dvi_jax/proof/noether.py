@@ -14,7 +14,8 @@ from ..discover.symmetries.noether import AdiabaticInvariant, Gauge, noether_ide
 from ..methods.step import Equations
 from ..problem.energies import disturbing_work, outgoing_energy
 from ..problem.system import check_system, of_problem
-from .components import program_of
+from .comparison import POINTS, compare, random_points
+from .components import NotAnalytic, program_of
 from .result import tools
 
 
@@ -143,7 +144,17 @@ def prove_noether(
         )
 
     program = program_of(statements, (), (), shape, shape, (), ())
+    q, p_range = np.asarray(q0, float), np.ones(shape)
+    width = 0.2 * (1 + np.abs(q))
+    points = random_points(
+        [(-1, 1), (0.01, 0.2), (q - width, q + width), (-p_range, p_range), (-0.2, 0.2), (-1, 1)]
+    )
+    if compare("Noether's identity", statements, program, points) < POINTS / 4:
+        raise NotAnalytic(
+            f"Noether's identity is singular at most of the {POINTS} random points near q0, so "
+            "that its list of operations cannot be compared with it. Give another q0."
+        )
     algebra = exact.Identities(2 * int(np.prod(shape)) + 4)
-    values = exact.run(program, [(x, algebra.one) for x in algebra.x], algebra)
+    values = exact.run(program, [(x, algebra.unit) for x in algebra.x], algebra)
     zero = [bool(numerator == 0 and denominator != 0) for numerator, denominator in values]
     return NoetherProof(tuple(zero[: z + 1]), zero[z + 1], all(zero[z + 3 :]), zero[z + 2])

@@ -90,9 +90,7 @@ def exact_coefficients(invariant: InvariantSeries, h: float) -> ExactInvariant:
         if not numbers[place][0]:
             raise ValueError(
                 f"the coefficient of ε^{place[0]} {invariant.basis.names[place[1]]} over the "
-                "largest one, "
-                f"{ratio:.10g}, has no form (n_0 + n_1 h + n_2 h²)/d with small integers at "
-                f"h={h!r}."
+                f"largest, {ratio:.10g}, has no form (n_0 + n_1 h + n_2 h²)/d at h={h!r}."
             )
     return ExactInvariant(invariant.basis, numbers)
 

@@ -29,6 +29,9 @@ class DriftBound(eqx.Module):
       `steps` steps, exact or computed; None if that is not shown, and `reason` says why.
     - `start`: factor by which the domain is scaled about its middle so that all its states satisfy
       that. `change`: the change of Σ w_k I_k that `steps` steps exclude.
+    - `start_time`: the time at which these trajectories start, if the map depends on the time: the
+      begin of the interval if the steps go forwards, its end if they go backwards (h < 0, or ε < 0
+      for a slow time), and a time between them for an interval of ε with both signs.
     - `boxes`: number of boxes of the proof. `formulas`: the invariants as text.
     - `certificate`: all that `dvi-jax verify` checks, see `save`.
     """
@@ -45,6 +48,10 @@ class DriftBound(eqx.Module):
     formulas: tuple[str, ...] = eqx.field(static=True)
     certificate: dict[str, Any] = eqx.field(static=True)
 
+    @property
+    def start_time(self) -> float:
+        return float.fromhex(self.certificate["start"])
+
     def num_steps(self, change: float, invariant: int = 0) -> int | float:
         """The number of computed steps within which I_k changes by at most `change`, as long as
         the trajectory is in the domain; inf if it is conserved exactly, without rounding."""
@@ -55,8 +62,8 @@ class DriftBound(eqx.Module):
         """The number of steps, exact or computed, within which the trajectory from this start is
         proved to stay in the domain; 0 if nothing is proved for it.
 
-        - `q0`, `p0`: the start, with the shape that the domain has; at the time of the begin of the
-          interval, if the map depends on the time. `epsilon`: its ε.
+        - `q0`, `p0`: the start, with the shape that the domain has. If the map depends on the time,
+          the start is at the time `start_time`. `epsilon`: its ε.
 
         With C = Σ w_k I_k and the `level` (w, c), the trajectory is in the domain as long as
         C(q0, p0) + N Σ |w_k| (per_step[k] + rounding[k]) ≤ c + `steps` Σ |w_k| (…).
@@ -65,41 +72,43 @@ class DriftBound(eqx.Module):
         """
         exact, _ = tools()
         checker, x = exact.Checker(self.certificate), [*np.ravel(q0), *np.ravel(p0)]
-        if not np.size(q0) == np.size(p0) == checker.n:
+        if not np.size(q0) == np.size(p0) == checker.n or not np.isfinite(x).all():
             raise ValueError(
-                f"q0 and p0 must each have the size {checker.n}, as in the domain of the proof, "
-                f"got the sizes {np.size(q0)} and {np.size(p0)}."
+                f"q0 and p0 must each have {checker.n} finite numbers, got {q0!r} and {p0!r}."
             )
         low, high = map(float, checker.epsilon)
         epsilon = finite("epsilon", epsilon)
-        if not np.isfinite(x).all():
-            raise ValueError(f"q0 and p0 must be finite numbers, got {q0!r} and {p0!r}.")
         if not low <= epsilon <= high:
             raise ValueError(
-                f"epsilon={epsilon!r} is not in the interval [{low!r}, {high!r}] of the proof."
+                f"epsilon must be from {low!r} to {high!r} as in the proof, got {epsilon!r}."
             )
         if self.level is None:
             return 0
-        point = [Fraction(float(v)) for v in (*x, checker.time[0], epsilon)]
-        state, algebra = (
-            [(exact.ball(v), exact.ball(Fraction(0))) for v in point],
-            exact.Rounding(0),
-        )
+        start = exact.number(self.certificate["start"])
+        point = [Fraction(float(v)) for v in (*x, start, epsilon)]
+        algebra, zero = exact.Rounding(0), exact.ball(Fraction(0))
+        state = [(exact.ball(v), zero) for v in point]
         sides = zip(point, checker.lower, checker.upper, strict=False)
         margins = [g for g, _ in exact.run(checker.inside, state, algebra)]
         if not (all(a <= v <= b for v, a, b in sides) and all(g >= 0 for g in margins)):
             return 0
-        weights, level = exact.exact(self.certificate["level"])
-        per_step, rounding = (exact.exact(self.certificate[n]) for n in ("per_step", "rounding"))
+        weights, level = self.certificate["level"]
+        level = exact.number(level)
+        weights, per_step, rounding = (
+            [exact.number(x) for x in row]
+            for row in (weights, self.certificate["per_step"], self.certificate["rounding"])
+        )
         rate = sum(abs(w) * (b + r) for w, b, r in zip(weights, per_step, rounding, strict=True))
         state.append(algebra.constant(checker.h))
         values = [exact.run(f, state, algebra)[0][0] for f in checker.invariants]
         value = sum(exact.ball(w) * v for w, v in zip(weights, values, strict=True))
-        margin = level + self.steps * rate - Fraction(exact.up(value))
+        margin = level + self.steps * rate - Fraction(exact.round_up(value))
         steps = max(0, math.floor(margin / rate)) if rate else (2**62 if margin >= 0 else 0)
-        last = checker.h * (Fraction(float(epsilon)) if checker.slow else 1)
-        times = checker.time[1] - checker.time[0]
-        return min(steps, math.floor(times / last)) if self.certificate["timed"] and last else steps
+        rate = checker.h * (Fraction(float(epsilon)) if checker.slow else 1)
+        end = checker.time[0] if rate < 0 else checker.time[1]
+        if self.certificate["timed"] and rate:
+            steps = min(steps, math.floor((end - start) / rate))
+        return steps
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the certificate, a JSON file that ``dvi-jax verify`` checks."""
@@ -146,6 +155,7 @@ class DriftBound(eqx.Module):
             weights, level = self.level
             text = f"no trajectory that starts in the domain with {combination(weights)} ≤ "
             text += f"{level:.6g} leaves it in {self.steps:.3g} steps"
+            text += f" from {names[-1]} = {self.start_time:.6g}" if c["timed"] else ""
             if self.start:
                 text += f"; all states of the domain scaled by {self.start:.3g} satisfy this"
             lines.append(text)
@@ -158,7 +168,7 @@ def tools() -> tuple[Any, Any]:
         from . import checker, search
     except ImportError as error:
         raise ImportError(
-            f"proofs require python-flint, but the import failed ({error}): "
+            f"proofs require python-flint, but its import failed ({error}): "
             'pip install "dvi-jax[proof]"'
         ) from error
     return checker, search

@@ -1,5 +1,6 @@
 """The search for a certificate: boxes, bounds, levels. What it finds, the checker decides."""
 
+import contextlib
 import heapq
 import itertools
 import math
@@ -17,13 +18,10 @@ from . import checker as exact
 
 _BITS = (20, 26, 32, 40, 50, 60, 75, 90, 110, 140)
 """Binary digits of the models that are tried."""
-
-SINGULAR = exact.Failed, ValueError, ArithmeticError
+SINGULAR = exact.Failure, ValueError, ArithmeticError
 """Errors of an evaluation on a box with a singularity."""
-
 _POINTS = 64
 """Random points of a box at which a change is evaluated, for a lower estimate of its supremum."""
-
 _BATCH = 32
 """Boxes that are examined at once, for any number of processors: the result is the same for all."""
 
@@ -33,7 +31,7 @@ class Leaf:
     """A box and what was found there.
 
     - `failure`: why nothing is bounded there.
-    - `bounds`, `seen`: for each invariant an upper bound of the change, and the largest one seen.
+    - `bounds`, `extremes`: for each invariant a bound of the change, and the largest one seen.
     - `rounding`, `displacement`: changes by rounding, and how far a step moves each coordinate.
     - `remainders`: of the models of the changes. `shares`: for each invariant and coordinate, by
       how much the bound would decrease if the coordinate were cut.
@@ -46,7 +44,7 @@ class Leaf:
     failure: str = ""
     is_outside: bool = False
     bounds: list = field(default_factory=list)
-    seen: list = field(default_factory=list)
+    extremes: list = field(default_factory=list)
     rounding: list = field(default_factory=list)
     displacement: list = field(default_factory=list)
     remainders: list = field(default_factory=list)
@@ -75,19 +73,20 @@ def examine(checker: Any, box: list, rng: Any, identities: frozenset = frozenset
         changes = [checker.change(k, step, algebra) for k in range(len(checker.invariants))]
         rows = enumerate(changes)
         leaf.bounds = [Fraction(0) if k in identities else algebra.bound(x) for k, x in rows]
-        leaf.remainders = [change[1] / algebra.one for change in changes]
+        leaf.remainders = [change[1] / algebra.unit for change in changes]
         points = _points(box, rng)
         counts = _is_inside(checker, algebra, step[0], points)
-        leaf.seen = [_largest(algebra, change, points[counts]) for change in changes]
+        leaf.extremes = [_largest(algebra, change, points[counts]) for change in changes]
         corner = [(x := side[rng.integers(2)], x) for side in box]
         for k in identities:  # boxes are cut until the bound of the rounding is near that of points
-            leaf.seen[k] = checker.rounding(corner)[0][k]
+            leaf.extremes[k] = checker.rounding(corner)[0][k]
         leaf.shares = [_shares(change, len(box)) for change in changes]
-        leaf.displacement = [exact.up(m + Fraction(e)) for m, e in zip(moves, errors, strict=True)]
+        pairs = zip(moves, errors, strict=True)
+        leaf.displacement = [exact.round_up(m + Fraction(e)) for m, e in pairs]
         finite = all(map(math.isfinite, (*leaf.rounding, *leaf.displacement)))
         exact.require(finite, "a value is not bounded")
     except SINGULAR as error:
-        leaf.failure = str(error) if isinstance(error, exact.Failed) else "a function is singular"
+        leaf.failure = str(error) if isinstance(error, exact.Failure) else "a function is singular"
     return leaf
 
 
@@ -146,7 +145,9 @@ def resolve(checker: Any, changes: list[float], ratio: float) -> None:
             return
         bits_before, checker.bits = checker.bits, bits[0]
         finer = examine(checker, leaf.box, rng)
-        if any(finer.remainders[k] > leaf.remainders[k] / 4 for k in open_invariants):
+        pairs = zip(finer.remainders, leaf.remainders, strict=False)  # none, if `finer` failed
+        gains = [a <= b / 4 for a, b in pairs]
+        if not gains or not all(gains[k] for k in open_invariants):
             # More bits do not help much: the box is too large.
             checker.bits = bits_before
             leaf = _bounded_part(checker, rng, [half(s, rng.random() < 0.5) for s in leaf.box])
@@ -184,7 +185,7 @@ def _values(algebra: exact.Models, model: Any, s: np.ndarray) -> np.ndarray:
     """The polynomial of a model at points s."""
     terms = model[0].to_dict()
     powers = np.array([[int(k) for k in powers] for powers in terms]).reshape(-1, s.shape[1])
-    values = np.array([float(Fraction(int(c), algebra.one)) for c in terms.values()])
+    values = np.array([float(Fraction(int(c), algebra.unit)) for c in terms.values()])
     # Not by BLAS, whose rounding depends on the number of its threads.
     return np.einsum("ij,j->i", np.prod(s[:, None, :] ** powers[None], axis=2), values)
 
@@ -192,7 +193,7 @@ def _values(algebra: exact.Models, model: Any, s: np.ndarray) -> np.ndarray:
 def _largest(algebra: exact.Models, model: Any, s: np.ndarray) -> float:
     """A lower bound of the largest |value| at points s."""
     values = np.abs(_values(algebra, model, s))
-    return max(0.0, float(np.max(values, initial=0.0)) - float(Fraction(model[1], algebra.one)))
+    return max(0.0, float(np.max(values, initial=0.0)) - float(Fraction(model[1], algebra.unit)))
 
 
 def _is_inside(checker: Any, algebra: exact.Models, x: list, s: np.ndarray) -> Any:
@@ -215,7 +216,7 @@ def _shares(model: Any, size: int) -> list[float]:
     return np.einsum("i,ij->j", sizes, 1 - 0.5**powers).tolist()
 
 
-class TooMany(exact.Failed):
+class TooMany(exact.Failure):
     """The subdivision reached its limit."""
 
 
@@ -226,7 +227,7 @@ class Subdivision:
     tree: Any
     count: int
     bounds: list
-    seen: list
+    extremes: list
     rounding: list
     displacement: list
 
@@ -248,7 +249,7 @@ def subdivide(
     """
     end, order = time.monotonic() + max_seconds, itertools.count()
     root = _part(checker, identities, (checker.root(), 1))
-    best = [max(b, s) for b, s in itertools.zip_longest(best, root.seen, fillvalue=0.0)]
+    best = _larger(best, root.extremes)
     heap = [(_rank(root, best), next(order), root)]
     count = 1
     while -heap[0][0] > ratio and count < max_boxes and time.monotonic() < end:
@@ -268,7 +269,7 @@ def subdivide(
                 leaf.parts = [next(leaves), next(leaves)]
                 count += 1
             for part in leaf.parts or [leaf]:
-                best = [max(b, s) for b, s in itertools.zip_longest(best, part.seen, fillvalue=0.0)]
+                best = _larger(best, part.extremes)
                 heapq.heappush(heap, (_rank(part, best), next(order), part))
         if best != old:
             heap = [(_rank(item[2], best), *item[1:]) for item in heap]
@@ -277,13 +278,13 @@ def subdivide(
     failures = [leaf for leaf in inner if leaf.failure]
     if failures:
         raise TooMany(
-            f"no bound was found on {len(failures)} of {count} boxes of the domain. The first is "
-            f"{place(checker, failures[0].box)}: {failures[0].failure}. Exclude singular states by "
-            "domain or inside, or use a smaller domain, epsilon or h, or larger limits"
+            f"no bound was found on {len(failures)} of {count} boxes, first for "
+            f"{place(checker, failures[0].box)}: {failures[0].failure}. Exclude singularities; use "
+            "a smaller domain, epsilon or h, or larger limits"
         )
     if not inner:
-        raise exact.Failed(
-            "inside(q, p) must be ≥ 0 for some states of the domain, but is negative for all"
+        raise exact.Failure(
+            "inside(q, p) must be ≥ 0 somewhere in the domain, got negative values only"
         )
     bounds, rounding, moves = (
         [max(column) for column in zip(*(getattr(leaf, name) for leaf in inner), strict=True)]
@@ -291,6 +292,10 @@ def subdivide(
     )
     changes = [0.0 if k in identities else s for k, s in enumerate(best)]
     return Subdivision(_tree(root), count, bounds, changes, rounding, moves)
+
+
+def _larger(best: list[float], extremes: list[float]) -> list[float]:
+    return [max(b, s) for b, s in itertools.zip_longest(best, extremes, fillvalue=0.0)]
 
 
 def _tree(leaf: Leaf) -> Any:
@@ -383,17 +388,16 @@ def enclose(
             narrow = all(b - a <= (d - c) / 4096 for (a, b), (c, d) in zip(box, root, strict=True))
             if late or narrow or (minimum <= float(limit) and not checker.inside["outputs"]):
                 raise TooMany(
-                    "the invariants do not exclude that a trajectory leaves the domain and "
-                    "reaches the box "
-                    f"{place(checker, box)}. Try a smaller epsilon or h, or larger limits"
+                    f"the invariants do not exclude that a trajectory reaches "
+                    f"{place(checker, box)}. Use a smaller epsilon or h, or larger limits"
                 )
             left, right, where = [], [], None
             if borders:  # first the domain itself is cut out
                 (axis, where), *borders_left = borders
                 # The part outside of a border has no further ones.
-                left, right = (
-                    ([], borders_left) if where == checker.lower[axis] else (borders_left, [])
-                )
+                left, right = borders_left, []
+                if where == checker.lower[axis]:
+                    left, right = right, left
             first, second = halves(box, axis, where)
             tree[i] = ["cut", axis, float(first[axis][1]).hex(), None, None]
             add(first, 2 * number, left, tree[i], 3)
@@ -406,20 +410,16 @@ def _claim(checker: Any, level: tuple, root: list, task: tuple[list, bool]) -> t
     the box, and whether Σ w_k I_k is known to be too small at a point of it."""
     (box, low), (weights, limit, _) = task, level
     for claim in ("inside", "unreachable"):
-        if _is_shown(checker, box, claim, *level):
+        with contextlib.suppress(*SINGULAR):
+            exact.check_confined(checker, box, claim, *level)
             return claim, 0
     if low:
         return "", _widest(box, root)
-    algebra, value = exact.combination_model(checker, weights, box)
-    return "above" * (algebra.range(value)[0] > limit), int(np.argmax(_shares(value, len(box))))
-
-
-def _is_shown(checker: Any, box: list, claim: str, *level: Any) -> bool:
     try:
-        exact.check_confined(checker, box, claim, *level)
+        algebra, value = exact.combination_model(checker, weights, box)
     except SINGULAR:
-        return False
-    return True
+        return "", _widest(box, root)
+    return "above" * (algebra.range(value)[0] > limit), int(np.argmax(_shares(value, len(box))))
 
 
 def _corners(box: list, rng: Any) -> np.ndarray:

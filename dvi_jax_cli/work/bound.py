@@ -8,8 +8,8 @@ import numpy as np
 
 import dvi_jax as dvi
 
-from .._errors import InputError
-from .._show import Table
+from .._errors import as_input_error
+from .._show import TextTable
 from .discover import box_of
 from .output import Report, open_report
 from .system import find_source
@@ -35,15 +35,12 @@ def bound_file(path: str | Path, out: str | Path | None = None, force: bool = Fa
     options["domain"] = tuple(np.stack(pair) for pair in zip(low, high, strict=True))
     rule = "invariants, a domain and a method that fit the system"
     began, bound = time.perf_counter(), None
-    with report.reservation():
+    with report.reservation(), source.at_work("invariants", "bounded", rule):
         try:
-            with source.at_work("invariants", "bounded", rule):
-                try:
-                    bound = dvi.bound_drift(functions, source.system, **options, **dict(file.bound))
-                except dvi.ProofError as error:
-                    report.message = f"nothing is proved: {error}"
-        except ImportError as error:
-            raise InputError("system", str(error), "an installation with python-flint") from None
+            with as_input_error("system", "an installation with python-flint", ImportError):
+                bound = dvi.bound_drift(functions, source.system, **options, **dict(file.bound))
+        except dvi.ProofError as error:
+            report.message = f"nothing is proved: {error}"
     with report.writing():
         if bound is not None:
             bound.save(report.path("certificate.json"))
@@ -59,10 +56,10 @@ def _contents(bound: dvi.DriftBound) -> dict[str, Any]:
     return {"formulas": bound.formulas} | {name: getattr(bound, name) for name in names}
 
 
-def _tables(bound: dvi.DriftBound) -> list[Table]:
+def _tables(bound: dvi.DriftBound) -> list[TextTable]:
     rows = []
     for k, b in enumerate(bound.per_step):
         steps = bound.num_steps(bound.change, k)
         rows.append([f"I_{k}", f"{b:.2e}", f"{bound.rounding[k]:.2e}", f"{steps:.3g}"])
     columns = ["invariant", "change in a step ≤", "by rounding ≤", f"steps for {bound.change:g}"]
-    return [Table("Proved bounds", columns, rows)]
+    return [TextTable("Proved bounds", columns, rows)]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .._errors import InputError, require, require_file, require_name
+from .._errors import InputError, as_input_error, require, require_file, require_name
 
 _EMPTY = ("", "nan", "na", "null", "none", "-", "--")
 """Cells in which nothing was observed."""
@@ -21,13 +21,10 @@ def read_columns(path: Path, key: str = "data.file") -> dict[str, np.ndarray]:
     **Raises** `InputError` with the key, and the line and column of a cell that is not a number.
     """
     require_file(key, path, "the path of a CSV or npz file")
-    try:
+    rule = "a CSV file in UTF-8, or an npz file that numpy.savez wrote"
+    kinds = OSError, ValueError, EOFError, csv.Error, zipfile.BadZipFile
+    with as_input_error(key, rule, *kinds, prefix=f"{path} cannot be read: "):
         return _npz(path) if path.suffix == ".npz" else _csv(path, key)
-    except InputError:
-        raise
-    except (OSError, ValueError, EOFError, csv.Error, zipfile.BadZipFile) as error:
-        rule = "a CSV file in UTF-8, or an npz file that numpy.savez wrote"
-        raise InputError(key, f"{path} cannot be read: {error}", rule) from None
 
 
 def _npz(path: Path) -> dict[str, np.ndarray]:

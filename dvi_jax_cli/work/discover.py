@@ -10,8 +10,8 @@ import numpy as np
 import dvi_jax as dvi
 from dvi_jax import plot
 
-from .._errors import InputError, describe, require
-from .._show import Table
+from .._errors import as_input_error, describe, require
+from .._show import TextTable
 from .expressions import parse_basis
 from .output import Report, open_report
 from .schema import DiscoverFile
@@ -83,11 +83,9 @@ def _arguments(file: DiscoverFile, source: Source) -> tuple[dict[str, Any], Any]
     low, high = box_of(file.samples, "samples", source)
     shape = low[0].shape
     basis = parse_basis(file.basis, source.loader)
-    try:
+    rule = f"a basis that can be used for q of shape {shape}"
+    with as_input_error("basis", rule, text=source.error_line):
         size = basis.for_shape(shape).size
-    except (TypeError, ValueError) as error:
-        rule = f"a basis that can be used for q of shape {shape}"
-        raise InputError("basis", source.error_line(error), rule) from None
     count = file.samples.count or max(_MIN_SAMPLES, _SAMPLES_PER_FUNCTION * size)
     rule = f"at least {2 * size}, twice the number of functions"
     require(count >= 2 * size, "samples.count", describe(count), rule)
@@ -118,13 +116,11 @@ def box_of(table: Any, key: str, source: Source) -> list[tuple[np.ndarray, ...]]
         shape = shapes.pop()
     corners = []
     for name, corner in tables.items():
-        try:
-            pair = [np.asarray(x, float) for x in (corner.q, corner.p)]
+        pair = [np.asarray(x, float) for x in (corner.q, corner.p)]
+        defect = f"q has shape {pair[0].shape} and p has shape {pair[1].shape}"
+        rule = f"numbers, or arrays of the shape of q, {shape}"
+        with as_input_error(f"{key}.{name}", rule, text=lambda _, text=defect: text):
             corners.append(tuple(np.broadcast_to(x, shape) for x in pair))
-        except ValueError:
-            defect = f"q has shape {np.shape(corner.q)} and p has shape {np.shape(corner.p)}"
-            rule = f"numbers, or arrays of the shape of q, {shape}"
-            raise InputError(f"{key}.{name}", defect, rule) from None
     is_below = all((a < b).all() for a, b in zip(*corners, strict=True))
     defect = f"it is not below {key}.high"
     require(is_below, f"{key}.low", defect, "low < high in each component")
@@ -158,7 +154,7 @@ def _invariant(result: dvi.Discovery, orders: list[dvi.DriftOrder], i: int) -> d
     return invariant | {"drift": drift | {"starts": len(mask), "starts_kept": int(mask.sum())}}
 
 
-def _tables(contents: dict[str, Any]) -> list[Table]:
+def _tables(contents: dict[str, Any]) -> list[TextTable]:
     rows = []
     for i, invariant in enumerate(contents["invariants"], 1):
         residual = f"{np.max(invariant['residuals']):.1e}"
@@ -166,7 +162,7 @@ def _tables(contents: dict[str, Any]) -> list[Table]:
         rows.append([str(i), residual, order, *_drift_in_words(invariant.get("drift"))])
     columns = ["number", "residual", "order expected", "drift ∝ ε^", "largest drift"]
     title = "Invariants, in the order of the formulas below"
-    return [Table(title, columns, rows)] if rows else []
+    return [TextTable(title, columns, rows)] if rows else []
 
 
 def _drift_in_words(drift: dict[str, Any] | None) -> tuple[str, str]:

@@ -14,7 +14,7 @@ from dvi_jax.fit.result import little_explained, numbers_in_words
 from dvi_jax.fit.run import progress_display as shown_bar
 
 from .._errors import InputError, one_of, require, require_name
-from .._show import Table
+from .._show import TextTable
 from .columns import column, read_columns
 from .loader import Loader
 from .output import Report, open_report, recorder
@@ -192,8 +192,9 @@ def _observations(
         return dvi.Observations(ts, observed, observe, sigma=sigma, t0=t0), names
     except (TypeError, ValueError) as error:
         key = "data.time" if str(error).startswith("ts") else "data"
-        rule = f"finite times in order in the column {table.time}, values that fit observe, "
-        rule += "positive standard errors"
+        rule = (
+            f"finite times in order in the column {table.time}, values that fit observe, sigma > 0"
+        )
         raise InputError(key, str(error), rule) from None
 
 
@@ -254,10 +255,10 @@ def _contents(arguments: dict[str, Any], result: dvi.FitResult) -> dict[str, Any
     }
 
 
-def _tables(result: dvi.FitResult, contents: dict[str, Any]) -> list[Table]:
+def _tables(result: dvi.FitResult, contents: dict[str, Any]) -> list[TextTable]:
     values = zip(contents["parameters"].items(), numbers_in_words(result), strict=True)
     rows = [[name, words, f"{p['start']:.6g}"] for (name, p), words in values]
-    tables = [Table("Parameters, ± standard error", ["name", "value", "start"], rows)]
+    tables = [TextTable("Parameters, ± standard error", ["name", "value", "start"], rows)]
     if len(result.names) > 1:
         tables.append(_correlation_table(result.names, result.correlations))
     has_errors, prior, residuals = result.has_errors, result.prior_chi2, contents["residuals"]
@@ -273,17 +274,17 @@ def _tables(result: dvi.FitResult, contents: dict[str, Any]) -> list[Table]:
         ["largest [standard errors]", f"{residuals['largest']:.3g}" if has_errors else ""],
         ["correlation of neighbours", f"{residuals['lag_one']:.3f}"],
     ]
-    return [*tables, Table("Residuals", ["", "value"], [row for row in rows if row[1]])]
+    return [*tables, TextTable("Residuals", ["", "value"], [row for row in rows if row[1]])]
 
 
-def _correlation_table(names: list[str], matrix: np.ndarray) -> Table:
+def _correlation_table(names: list[str], matrix: np.ndarray) -> TextTable:
     pairs = [(i, j) for i in range(len(names)) for j in range(i)]
     if len(names) > _MATRIX:
         strongest = sorted(pairs, key=lambda ij: -np.nan_to_num(abs(matrix[ij]), nan=-1))[:10]
         rows = [[names[i], names[j], f"{matrix[i, j]:.3f}"] for i, j in strongest]
-        return Table("Strongest correlations", ["of", "and", "value"], rows)
+        return TextTable("Strongest correlations", ["of", "and", "value"], rows)
     rows = [[name, *(f"{x:.2f}" for x in matrix[i, :i])] for i, name in enumerate(names)]
-    return Table("Correlations", ["", *names[:-1]], rows[1:])
+    return TextTable("Correlations", ["", *names[:-1]], rows[1:])
 
 
 def _notes(result: dvi.FitResult) -> list[str]:

@@ -8,11 +8,11 @@ import numpy as np
 
 from dvi_jax import systems
 
-from .._errors import InputError, require_name
-from .._show import Table
+from .._errors import as_input_error, require_name
+from .._show import TextTable
 
 
-def library_tables(name: str | None = None) -> tuple[str, list[Table]]:
+def library_tables(name: str | None = None) -> tuple[str, list[TextTable]]:
     """A heading and tables: all systems of the library, or what is known of one.
 
     **Raises** `InputError` for a name that is not in the library, or a system that cannot be made
@@ -20,14 +20,12 @@ def library_tables(name: str | None = None) -> tuple[str, list[Table]]:
     """
     if name is None:
         rows = [[key, _first_line(make)] for key, make in systems.LIBRARY.items()]
-        return "", [Table("Systems of the library", ["name", "what it is"], rows)]
+        return "", [TextTable("Systems of the library", ["name", "what it is"], rows)]
     require_name("NAME", name, systems.LIBRARY)
     make = systems.LIBRARY[name]
-    try:
+    rule = "a system whose extras are installed"
+    with as_input_error("NAME", rule, ImportError, prefix=f"{name}: "):
         problem = make()
-    except ImportError as error:
-        rule = "a system whose extras are installed"
-        raise InputError("NAME", f"{name}: {error}", rule) from None
     heading = f"{inspect.getdoc(make)}\n\nEquations: {_first_line(problem.system.H_D)}"
     for kind in ("force", "perturbation"):
         if (function := getattr(problem.system, kind)) is not None:
@@ -40,10 +38,10 @@ def library_tables(name: str | None = None) -> tuple[str, list[Table]]:
     symmetries += [[key, "of the flow"] for key in problem.flow_symmetries]
     start = [[key, _short(getattr(problem, key))] for key in ("q0", "p0", "h")]
     tables = [
-        Table("Parameters", ["args", "value", "meaning [unit]"], args),
-        Table("Observables", ["name", "", "what it is"], observed),
-        Table("Symmetries at ε = 0", ["generator", ""], symmetries),
-        Table("Start and step", ["", "value"], start),
+        TextTable("Parameters", ["args", "value", "meaning [unit]"], args),
+        TextTable("Observables", ["name", "", "what it is"], observed),
+        TextTable("Symmetries at ε = 0", ["generator", ""], symmetries),
+        TextTable("Start and step", ["", "value"], start),
     ]
     return heading, [table for table in tables if table.rows]
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 
-from .._errors import InputError, one_of, require, require_file
+from .._errors import InputError, as_input_error, one_of, require, require_file
 
 _RULE = '"file.py:name", a Python file in the folder of the TOML file and a name in it'
 
@@ -46,11 +46,11 @@ class Loader:
         module = importlib.util.module_from_spec(spec)
         sys.modules[spec.name] = module  # dataclasses and pickle look their module up
         sys.path.insert(0, str(path.parent))  # so that it may import its neighbours
+        prefix, rule = f"{text!r} cannot be imported: ", "a file that Python can import"
+        kinds, line = (Exception, SystemExit), lambda error: in_one_line(error, path)
         try:
-            spec.loader.exec_module(module)
-        except (Exception, SystemExit) as error:
-            defect = f"{text!r} cannot be imported: {in_one_line(error, path)}"
-            raise InputError(key, defect, "a file that Python can import") from error
+            with as_input_error(key, rule, *kinds, prefix=prefix, text=line):
+                spec.loader.exec_module(module)
         finally:
             sys.path.remove(str(path.parent))
         return module

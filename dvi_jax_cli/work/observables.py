@@ -1,6 +1,5 @@
 """The observables of a TOML file, and how those of a run changed."""
 
-import inspect
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -10,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import dvi_jax as dvi
-from dvi_jax.base.signature import accepts
+from dvi_jax.base.signature import accepts, signature_of
 from dvi_jax.systems.n_body import linear_momentum
 
-from .._errors import InputError, require, require_name
+from .._errors import require, require_name
 from .expressions import Expressions, public
 from .system import Source
 
@@ -47,11 +46,9 @@ def _observable(key: str, text: str, names: dict[str, Callable], source: Source)
         defect = f"{inner!r} has the type {type(function).__name__}"
         require(callable(function), key, defect, _A_FUNCTION)
         # An energy has `bind` and is called with the system.
-        if not hasattr(function, "bind") and not accepts(function, 7):
-            defect = (
-                f"{inner!r} takes {inspect.signature(function)}, but is called with 7 arguments"
-            )
-            raise InputError(key, defect, _A_FUNCTION)
+        fits = hasattr(function, "bind") or accepts(function, 7)
+        defect = f"{inner!r}, {signature_of(function)}, is called with 7 arguments"
+        require(fits, key, defect, _A_FUNCTION)
         return wrap(function)
     calls = ", ".join(f"{name}()" for name in indicators)
     rule = f'{{}}; or "file.py:name"; alone or in {", ".join(reductions)}; or {calls}'

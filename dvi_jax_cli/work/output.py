@@ -13,8 +13,8 @@ import numpy as np
 
 from dvi_jax import plot
 
-from .._errors import InputError, reason, require
-from .._show import Table, json_types
+from .._errors import as_input_error, reason, require
+from .._show import TextTable, json_types
 from .schema import FILES
 from .table import read_file
 
@@ -29,7 +29,7 @@ class Report:
     """
 
     contents: dict[str, Any] = field(default_factory=dict)
-    tables: list[Table] = field(default_factory=list)
+    tables: list[TextTable] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     summary: str = ""
     message: str = ""
@@ -43,7 +43,7 @@ class Report:
 
 
 @dataclass(kw_only=True)
-class Output(Report):
+class FolderReport(Report):
     """A report with files in `folder`.
 
     - `key`: the key or option that names the folder.
@@ -63,13 +63,12 @@ class Output(Report):
         rule = "a directory that does not exist or is empty; with --force, one to write into"
         folder, is_new = self.folder, False
         try:
-            try:
+            kinds = OSError, ValueError
+            with as_input_error(self.key, rule, *kinds, prefix=f"{folder}: ", text=reason):
                 is_new = not folder.exists()
                 if is_new:
                     folder.mkdir(parents=True)
                 is_free = not folder.is_dir() or self.force or not any(folder.iterdir())
-            except (OSError, ValueError) as error:
-                raise InputError(self.key, f"{folder}: {reason(error)}", rule) from None
             require(folder.is_dir(), self.key, f"{folder} is not a directory", rule)
             require(is_free, self.key, f"{folder} exists and is not empty", rule)
             yield
@@ -129,7 +128,7 @@ class Output(Report):
 
 def open_report(
     kind: str, path: Path, out: str | Path | None, names: tuple[str, ...], force: bool
-) -> tuple[Any, Output]:
+) -> tuple[Any, FolderReport]:
     """The values of a TOML file, and the directory of the results: of the option --out, or of the
     file, or one named after the file.
 
@@ -142,7 +141,7 @@ def open_report(
     contents = {kind: str(path), "config": raw, "versions": versions}
     key = "--out" if out is not None else "output.dir"
     folder = Path(out or file.output.dir or f"results/{path.stem}")
-    return file, Output(contents, folder=folder, key=key, names=names, force=force)
+    return file, FolderReport(contents, folder=folder, key=key, names=names, force=force)
 
 
 def recorder(last: list[Any], show: Callable[[Any], None] | None) -> Callable[[Any], None]:

@@ -3,10 +3,10 @@
 
 from typing import Literal
 
-from .table import Number, Table, Text, key
+from .table import Number, Text, TomlTable, key
 
 
-class RingFile(Table):
+class RingFile(TomlTable):
     """A storage ring from a file that pyAT can read."""
 
     file: Text = key(..., "the path of a lattice file, from the folder of this one")

@@ -12,8 +12,8 @@ import dvi_jax as dvi
 from dvi_jax import plot
 from dvi_jax.systems.planets.solar_system import check_covered
 
-from .._errors import InputError
-from .._show import Table
+from .._errors import as_input_error
+from .._show import TextTable
 from . import solar
 from .observables import Observed, observe, read_observables
 from .output import Report, open_report
@@ -58,9 +58,8 @@ def run_file(
             jax.block_until_ready(result)
         seconds = time.perf_counter() - began
     with report.writing():
-        observed, conservation = (
-            observe(run, observables[x], result.observed[x]) for x in ("own", "always")
-        )
+        changes = [observe(run, observables[x], result.observed[x]) for x in ("own", "always")]
+        observed, conservation = changes
         _describe(report, result, observed, seconds)
         arrays = {name: np.asarray(getattr(result, name)) for name in ("ts", "qs", "ps", "hs")}
         values = {f"observed/{name}": np.asarray(result.observed["own"][name]) for name in observed}
@@ -86,12 +85,9 @@ def _arguments(file: RunFile, source: Source) -> dict[str, Any]:
     if source.jd is not None:  # a run that is compared with the ephemeris must not leave it
         ts = file.lattice.times if run["h"] is None else (0.0, run["h"] * run["num_steps"])
         span = float(ts[-1] - ts[0])
-        try:
+        prefix = f"the run ends {span:g} days after its start: "
+        with as_input_error("steps", "a shorter run or another date", prefix=prefix):
             check_covered(source.jd + span)
-        except ValueError as error:
-            defect = f"the run ends {span:g} days after its start: {error}"
-            rule = "a shorter run (fewer steps, a smaller h, earlier times), or another date"
-            raise InputError("steps", defect, rule) from None
     return run
 
 
@@ -116,7 +112,7 @@ def _describe(
     if observed:
         title = "Observables (changes: relative, where the start is not zero)"
         columns = ["name", "reduction", "start", "end or value", "change"]
-        report.tables.append(Table(title, columns, [_row(*item) for item in observed.items()]))
+        report.tables.append(TextTable(title, columns, [_row(*item) for item in observed.items()]))
     report.summary = f"{steps} steps in {seconds:.1f} s (compilation included)"
     if solution.status != "successful":
         report.message = (

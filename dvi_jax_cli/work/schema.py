@@ -16,8 +16,8 @@ from .ring import RingFile
 from .table import (
     AN_AXIS,
     Array,
-    Axis,
     AxisName,
+    AxisTable,
     Count,
     Fraction,
     JsonSchema,
@@ -30,8 +30,8 @@ from .table import (
     StateOrAxis,
     StepSize,
     SweepParameter,
-    Table,
     Text,
+    TomlTable,
     Two,
     check,
     key,
@@ -68,7 +68,7 @@ Parameter = TypeAliasType(
 )
 
 
-class State(Table):
+class State(TomlTable):
     """The initial condition."""
 
     q0: Array | None = key(None, ARRAY)
@@ -82,7 +82,7 @@ class State(Table):
         return self
 
 
-class SystemFile(Table):
+class SystemFile(TomlTable):
     """The common keys of the files of run, fit, discover and bound."""
 
     system: Text = key(..., f"the name of a system in the library, ring, or {FILE}")
@@ -94,7 +94,7 @@ class SystemFile(Table):
     method: Text = key("TypeII", METHOD)
 
 
-class Output(Table):
+class Output(TomlTable):
     """The directory of the results, and whether there are pictures."""
 
     dir: Text | None = key(None, NEW_DIRECTORY)
@@ -109,7 +109,7 @@ def _in_order(times: np.ndarray) -> bool:
     return steps.size > 0 and bool((steps > 0).all() or (steps < 0).all())
 
 
-class Times(Table):
+class Times(TomlTable):
     """The times of the steps."""
 
     times: Annotated[Array, check(_in_order)] = key(..., TIMES)
@@ -122,7 +122,7 @@ def _check_names(observables: dict[str, str]) -> dict[str, str]:
     return observables
 
 
-class Integration(Table):
+class Integration(TomlTable):
     """The common keys of the files of run and sweep."""
 
     lattice: union(text=Literal["uniform"], table=Times) = key(
@@ -168,14 +168,14 @@ class SweepState(State):
     p0: StateOrAxis | None = key(None, f"{ARRAY}; numbers in it may be axes")
 
 
-class Pair(Table):
+class StatePair(TomlTable):
     """Two values, for q and for p."""
 
     q: NumberOrArray = key(..., "a number, or an array of the shape of q")
     p: NumberOrArray = key(..., "a number, or an array of the shape of q")
 
 
-class _Start(Table):
+class _Start(TomlTable):
     count: Count = key(..., COUNT)
     seed: NonNegative = key(0, SEED)
     name: AxisName = key("start", "a name such as start")
@@ -185,8 +185,8 @@ class BoxStart(_Start):
     """Points in a box."""
 
     kind: Literal["halton", "random"]
-    low: Pair = key(..., BOX)
-    high: Pair = key(..., BOX)
+    low: StatePair = key(..., BOX)
+    high: StatePair = key(..., BOX)
 
 
 class NormalStart(_Start):
@@ -195,7 +195,7 @@ class NormalStart(_Start):
     kind: Literal["normal"]
     q0: Array | None = key(None, ARRAY)
     p0: Array | None = key(None, ARRAY)
-    sigma: Pair = key(..., "{q = …, p = …}: standard deviations, numbers or arrays")
+    sigma: StatePair = key(..., "{q = …, p = …}: standard deviations, numbers or arrays")
 
 
 class EnergyShellStart(_Start):
@@ -208,7 +208,7 @@ class EnergyShellStart(_Start):
     high: Array = key(..., f"a corner of the box of q, {ARRAY}")
 
 
-class OwnStart(Table):
+class OwnStart(TomlTable):
     """Initial conditions of a Python file."""
 
     kind: Literal["own"]
@@ -218,13 +218,13 @@ class OwnStart(Table):
 Start = union_by_kind(BoxStart, NormalStart, EnergyShellStart, OwnStart)
 
 
-class SaveEvery(Table):
+class SaveEvery(TomlTable):
     """Every n-th state is saved."""
 
     every: Count = key(..., COUNT)
 
 
-class SweepOutput(Table):
+class SweepOutput(TomlTable):
     """The store of a sweep."""
 
     store: Text | None = key(None, NEW_DIRECTORY)
@@ -250,7 +250,7 @@ class SweepFile(SystemFile, Integration):
         None, f"{COUNT}{OR_AXIS} of such numbers"
     )
     epsilon: number_or_axis(Number) | None = key(None, FINITE + OR_AXIS)
-    method: union(text=Text, array=NonEmpty[Text], table=Axis[Text]) = key(
+    method: union(text=Text, array=NonEmpty[Text], table=AxisTable[Text]) = key(
         "TypeII", f"{METHOD}; or an array of such texts"
     )
     save: union(text=Literal["final"], table=SaveEvery) | None = key(None, '"final", {every = n}')
@@ -294,7 +294,7 @@ Sigma = union(
 )
 
 
-class Data(Table):
+class Data(TomlTable):
     """The observations."""
 
     file: Text = key(..., "the path of a CSV or npz file, from the folder of this one")
@@ -312,7 +312,7 @@ class Data(Table):
     )
 
 
-class Options(Table):
+class Options(TomlTable):
     """The options of a fit."""
 
     loss: Literal["LeastSquares", "SoftL1", "Cauchy"] = key(
@@ -349,12 +349,12 @@ class FitFile(SystemFile):
 # A discovery
 
 
-class Samples(Table):
+class SampleBox(TomlTable):
     """The box that samples are taken from."""
 
     count: Count | None = key(None, f"{COUNT}; not given: four for each function")
-    low: Pair = key(..., f"a corner of the box, {BOX}")
-    high: Pair = key(..., f"a corner of the box, {BOX}")
+    low: StatePair = key(..., f"a corner of the box, {BOX}")
+    high: StatePair = key(..., f"a corner of the box, {BOX}")
     times: Annotated[Two[Number], check(lambda span: span[0] < span[1])] | None = key(
         None, "[first, last]: times of the samples, all at t0 if not given"
     )
@@ -362,17 +362,17 @@ class Samples(Table):
 
 
 def _strengths(value: Any) -> list[float]:
-    strengths = value.elements if isinstance(value, Axis) else value
+    strengths = value.elements if isinstance(value, AxisTable) else value
     if len(strengths) < 3 or min(strengths) <= 0 or len(set(strengths)) < len(strengths):
         raise ValueError
     return strengths
 
 
-class Drift(Table):
+class Drift(TomlTable):
     """How drifts are measured."""
 
     epsilons: Annotated[
-        union(array=list[Number], table=Axis[Number]), AfterValidator(_strengths)
+        union(array=list[Number], table=AxisTable[Number]), AfterValidator(_strengths)
     ] = key(
         [1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2],
         "three numbers or more above zero, no two the same: an array, or {geomspace = [a, b, n]}",
@@ -392,7 +392,7 @@ class DiscoverFile(SystemFile):
     order: NonNegative = key(1, SEED)
     tolerance: Fraction | None = key(None, f"{FRACTION}; not given: exact invariants alone")
     representative: Literal["least", "simplest"] = key("least", '"least" or "simplest"')
-    samples: Samples = key(..., "[samples], a table with the box of the samples")
+    samples: SampleBox = key(..., "[samples], a table with the box of the samples")
     drift: Drift = Drift()
     output: Output = Output()
 
@@ -403,18 +403,18 @@ class DiscoverFile(SystemFile):
 Above0 = Annotated[Number, check(lambda value: value > 0)]
 
 
-class Domain(Table):
+class Domain(TomlTable):
     """The states for which a bound is proved."""
 
-    low: Pair = key(..., f"a corner of the box, {BOX}")
-    high: Pair = key(..., f"a corner of the box, {BOX}")
+    low: StatePair = key(..., f"a corner of the box, {BOX}")
+    high: StatePair = key(..., f"a corner of the box, {BOX}")
     inside: Text | None = key(None, f"{FILE} of a function (q, p) that is ≥ 0 in the domain")
     times: Annotated[Two[Number], check(lambda span: span[0] < span[1])] | None = key(
         None, "[first, last]: times at which steps begin, where the map depends on the time"
     )
 
 
-class Bound(Table):
+class Bound(TomlTable):
     """How far the domain is divided, and the change for which steps are counted."""
 
     change: Above0 = key(1e-3, "a number above zero")
@@ -436,7 +436,7 @@ class BoundFile(SystemFile):
 
 
 _MODELS = (RunFile, SweepFile, FitFile, DiscoverFile, BoundFile)
-FILES: dict[str, type[Table]] = dict(zip(KINDS, _MODELS, strict=True))
+FILES: dict[str, type[TomlTable]] = dict(zip(KINDS, _MODELS, strict=True))
 """Kind of file → its model."""
 
 

@@ -17,7 +17,7 @@ from dvi_jax.systems.planets.solar_system import (
     to_ecliptic,
 )
 
-from .._show import Table
+from .._show import TextTable
 from .observables import Observed
 from .output import Report
 
@@ -178,10 +178,10 @@ def report(
     rows = [[f"{c.years[k]:.1f}", *(f"{x[k]:.1e}" for x in changes.values())] for k in indices]
     rows.append(["largest, every step", *(f"{x:.1e}" for x in largest.values())])
     title = "Conserved: relative change (linear momentum: of Σ|p|)"
-    report.tables.append(Table(title, ["years", *changes], rows))
+    report.tables.append(TextTable(title, ["years", *changes], rows))
     rows = [[name, *(f"{x:.3g}" for x in error.values())] for name, error in errors.items()]
     columns = ["planet", "largest [km]", "last [km]", "largest, from the Sun [″]"]
-    report.tables.append(Table("Heliocentric position compared with DE421", columns, rows))
+    report.tables.append(TextTable("Heliocentric position compared with DE421", columns, rows))
     if np.isfinite(c.slope):
         report.notes.append(
             f"Mercury's perihelion, ephemeris minus integration: {c.slope:.2f}″ per century "

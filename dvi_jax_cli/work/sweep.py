@@ -18,14 +18,14 @@ import dvi_jax as dvi
 from dvi_jax.sweep.bar import progress_display as shown_bar
 from dvi_jax.sweep.variables import RESERVED_NAMES
 
-from .._errors import InputError, describe, require
-from .._show import Table
+from .._errors import InputError, as_input_error, describe, require
+from .._show import TextTable
 from .expressions import parse_method
 from .observables import read_observables
 from .output import Report, recorder
-from .schema import ARRAY, Pair, SweepFile
+from .schema import ARRAY, StatePair, SweepFile
 from .system import Source, find_source
-from .table import AN_AXIS, NO_KEY, Axis, axes_in, read_file, select
+from .table import AN_AXIS, NO_KEY, AxisTable, axes_in, read_file, select
 
 _MAX_NUMBERS = 10_000_000
 """Numbers up to which results are read again for the table at the end."""
@@ -86,15 +86,13 @@ def sweep_cost(path: str | Path) -> Report:
 
 def _check_folder(folder: Path, key: str, resume: bool) -> None:
     """Fail early if the path holds other data, or this sweep without --resume."""
-    try:
+
+    kinds = dvi.StoreError, OSError, ValueError  # of a name that no directory can have
+    prefix = f"{folder} is not the store of a sweep: "
+    with as_input_error(key, "a new directory", *kinds, prefix=prefix):
         if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
             return
         result = dvi.open_sweep(folder)
-    except (dvi.StoreError, OSError) as error:
-        defect = f"{folder} exists, but is not the store of a sweep ({error})"
-        raise InputError(key, defect, "a new directory") from None
-    except ValueError as error:  # a name that no directory can have
-        raise InputError(key, f"{folder} cannot be used: {error}", "a new directory") from None
     progress = f"{result.tasks_done} of {result.num_tasks} tasks are done"
     rule = "--resume to continue it, or another directory, with --store PATH"
     require(resume, key, f"{folder} exists already: {progress}", rule)
@@ -117,7 +115,7 @@ def _report(result: dvi.SweepResult, last: dvi.SweepProgress) -> Report:
         report.contents["observed"] = observed
         rows = [[name, *(f"{x:.6g}" for x in values.values())] for name, values in observed.items()]
         title = "Observables of the successful trajectories"
-        report.tables.append(Table(title, ["name", "min", "median", "max"], rows))
+        report.tables.append(TextTable(title, ["name", "min", "median", "max"], rows))
     speed = f"{last.seconds:.1f} s (compilation included), {last.rate:.3g} steps/s"
     report.summary = (
         f"{last.num_lanes} trajectories in {last.num_tasks} tasks; "
@@ -146,10 +144,10 @@ def _statistics(result: dvi.SweepResult) -> dict[str, dict[str, float]]:
     return statistics
 
 
-def _status_table(counts: dict[str, int]) -> Table:
+def _status_table(counts: dict[str, int]) -> TextTable:
     total = sum(counts.values())
     rows = [[name, str(n), f"{100 * n / total:.4g} %"] for name, n in counts.items()]
-    return Table("How the trajectories ended", ["status", "trajectories", "fraction"], rows)
+    return TextTable("How the trajectories ended", ["status", "trajectories", "fraction"], rows)
 
 
 # The arguments of `dvi.sweep`
@@ -188,14 +186,12 @@ def _for_sweep(key: str, value: Any) -> Any:
     """A value with its axes as those of `dvi.sweep`; one without a name has that of the key."""
     if isinstance(value, list):
         return [_for_sweep(f"{key}[{i}]", part) for i, part in enumerate(value)]
-    return _axis(key, value, value.elements) if isinstance(value, Axis) else value
+    return _axis(key, value, value.elements) if isinstance(value, AxisTable) else value
 
 
-def _axis(key: str, axis: Axis, values: Any) -> dvi.Axis:
-    try:
+def _axis(key: str, axis: AxisTable, values: Any) -> dvi.Axis:
+    with as_input_error(f"{key}.{axis.kind}", AN_AXIS):
         return dvi.Axis(axis.axis or key.rpartition(".")[2], values, axis.units)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{key}.{axis.kind}", str(error), AN_AXIS) from None
 
 
 def _parameters(value: Any, key: str = "args") -> Any:
@@ -250,11 +246,9 @@ def _initial_conditions(file: SweepFile, source: Source) -> dict[str, Any]:
         return {"q0": _for_sweep("state.q0", q0), "p0": _for_sweep("state.p0", p0)}
     start = _start(file.start, source)
     t0, args = select(file.t0, 0), select(source.args, 0)
-    try:
+    rule = "an H (t, q, p, args) that fits the box and args"
+    with as_input_error("start", rule, Exception, text=source.error_line):
         q0, p0, *start_args = start.at(jnp.zeros((), jnp.int32), t0, args)
-    except Exception as error:  # whatever a user's H raises
-        rule = "an H (t, q, p, args) that fits the box and args"
-        raise InputError("start", source.error_line(error), rule) from error
     source.check_start(np.asarray(q0), np.asarray(p0), start_args[0] if start_args else args)
     return {"start": start}
 
@@ -274,7 +268,7 @@ def _start(table: Any, source: Source) -> dvi.starts.Starts:
         return starts
     options = {name: getattr(table, name) for name in table.model_fields_set - {"kind"}}
     for name, value in options.items():
-        if isinstance(value, Pair):
+        if isinstance(value, StatePair):
             options[name] = (value.q, value.p)
     for name in ("q0", "p0") if table.kind == "normal" else ():
         if name not in options:
@@ -283,21 +277,17 @@ def _start(table: Any, source: Source) -> dvi.starts.Starts:
     if "H" in options:
         options["H"] = source.loader.load("start.H", options["H"])
     starts = getattr(dvi.starts, table.kind.title().replace("_", ""))  # energy_shell → EnergyShell
-    try:
+    rule = f'arguments of dvi.starts.{starts.__name__}, because kind = "{table.kind}"'
+    with as_input_error("start", rule):
         return starts(**options)
-    except (TypeError, ValueError) as error:
-        rule = f'arguments of dvi.starts.{starts.__name__}, because kind = "{table.kind}"'
-        raise InputError("start", str(error), rule) from None
 
 
 # Stores
 
 
 def _open_store(store: str | Path) -> dvi.SweepResult:
-    try:
+    with as_input_error("STORE", "the directory of a sweep", dvi.StoreError):
         return dvi.open_sweep(store)
-    except dvi.StoreError as error:
-        raise InputError("STORE", str(error), "the directory of a sweep") from None
 
 
 def sweep_status(store: str | Path) -> Report:
@@ -336,7 +326,10 @@ def sweep_status(store: str | Path) -> Report:
     remainder += f" (about {left / rate:.3g} s)" if left and rate else ""
     return Report(
         contents,
-        [_status_table(contents["trajectories"]), Table("Provenance", ["what", "value"], origin)],
+        [
+            _status_table(contents["trajectories"]),
+            TextTable("Provenance", ["what", "value"], origin),
+        ],
         summary=f"{result.path}: {grid}; {tasks_done} of {result.num_tasks} tasks done{remainder}; "
         f"{rate:.3g} trajectories/s{'' if speed is None else f', {speed:.3g} steps/s'}; "
         f"{contents['bytes'] / 1e6:.3g} MB",
@@ -386,7 +379,7 @@ def verify_store(store: str | Path, progress: Callable[[int, int], None] | None 
     report = Report(contents, summary=summary)
     if verification.bad:
         rows = [[str(number), wrong] for number, wrong in verification.bad.items()]
-        report.tables.append(Table("Bad tasks", ["task", "error"], rows))
+        report.tables.append(TextTable("Bad tasks", ["task", "error"], rows))
         report.message = (
             "bad tasks were found; they will be computed again. To repair the store, run the sweep "
             "again with --resume."

@@ -15,7 +15,7 @@ from dvi_jax.base.signature import accepts
 from dvi_jax.systems import rings
 from dvi_jax.systems.planets.solar_system import EphemerisMissing, julian_date
 
-from .._errors import InputError, describe, require, require_name
+from .._errors import InputError, as_input_error, describe, require, require_name
 from .expressions import parse_method
 from .loader import Loader, in_one_line
 from .schema import COUNT, RunFile, SweepFile, SystemFile, Times
@@ -55,7 +55,7 @@ class Source:
             yield
         except Exception as error:
             writes = progress is not None and isinstance(error, dvi.StoreError | OSError)
-            if progress or writes:
+            if progress or writes or isinstance(error, InputError):
                 raise
             defect = f"{self.name} cannot be {action}: {self.error_line(error)}"
             raise InputError(key, defect, rule) from error
@@ -72,7 +72,7 @@ class Source:
     def args(self) -> Any:
         """The parameters of the system, with those of the file in their place."""
         values, problem = self.file.args, self.problem
-        names = problem.args if problem is not None else None
+        names: Any = getattr(problem, "args", None)
         if values is None or problem is None:
             return names if values is None else values
         if not isinstance(names, dict):
@@ -100,13 +100,12 @@ class Source:
         require(np.shape(q0) == np.shape(p0), "state.p0", f"p0 has shape {np.shape(p0)}", rule)
         if self.problem is None or self.problem.check is None:
             return
-        try:
+        rule = "initial conditions from which the system can start"
+        with (
+            as_input_error("state", rule, ValueError),
+            as_input_error("args", "args that fit the system", systems.ParameterError),
+        ):
             self.problem.check(q0, p0, args)
-        except systems.ParameterError as error:
-            raise InputError("args", str(error), "args that fit the system") from None
-        except ValueError as error:
-            rule = "initial conditions from which the system can start"
-            raise InputError("state", str(error), rule) from None
 
     @property
     def h(self) -> Any:
@@ -127,11 +126,9 @@ class Source:
     @property
     def epsilon(self) -> Any:
         """The strength of the perturbation in the file, or else of the system."""
-        try:
+        rule = "a number: the system has a force or a perturbation (0.0: unperturbed)"
+        with as_input_error("epsilon", rule, ValueError, text=lambda _: NO_KEY):
             return self.system.strength(getattr(self.file, "epsilon", None))
-        except ValueError:
-            rule = "a number: the system has a force or a perturbation (0.0: unperturbed)"
-            raise InputError("epsilon", NO_KEY, rule) from None
 
 
 def find_source(file: SystemFile, folder: Path) -> Source:
@@ -149,11 +146,10 @@ def find_source(file: SystemFile, folder: Path) -> Source:
         return _of_the_library(file, loader)
     target, defect = loader.load("system", name), repr(name)
     if callable(target) and not isinstance(target, type | dvi.System) and accepts(target, 0):
-        try:
+        prefix, rule = f"{name!r} failed: ", "a function that returns a system"
+        kinds, text = (Exception, SystemExit), lambda error: in_one_line(error, *loader.modules)
+        with as_input_error("system", rule, *kinds, prefix=prefix, text=text):
             target, defect = target(), f"the result of {name!r}"
-        except (Exception, SystemExit) as error:
-            defect = f"{name!r} failed: {in_one_line(error, *loader.modules)}"
-            raise InputError("system", defect, "a function that returns a system") from error
     if isinstance(target, systems.Problem):
         return Source(file, loader, target, target.system)
     if isinstance(target, dvi.System):
@@ -169,16 +165,12 @@ def find_source(file: SystemFile, folder: Path) -> Source:
 
 def _of_a_ring(file: SystemFile, loader: Loader) -> Source:
     require(file.ring is not None, "ring", NO_KEY, 'a table [ring] with file = "…"')
-    require(
-        file.method in ("TypeII", "Turn"), "method", describe(file.method), "no method for a ring"
-    )
-    ring = file.ring
+    ring, is_turn = file.ring, file.method in ("TypeII", "Turn")
+    require(is_turn, "method", describe(file.method), "no method for a ring")
     assert ring is not None
-    try:
+    prefix, rule = f"{ring.file!r} cannot be read: ", "a lattice file that pyAT can read"
+    with as_input_error("ring.file", rule, Exception, prefix=prefix, text=in_one_line):
         read = rings.load(loader.folder / ring.file, symplectic=ring.symplectic)
-    except Exception as error:  # whatever the reader of a format raises
-        defect = f"{ring.file!r} cannot be read: {in_one_line(error)}"
-        raise InputError("ring.file", defect, "a lattice file that pyAT can read") from error
     record = rings.problem(read, planes=ring.planes, delta=ring.delta)
     units = {"q": "m", "t": "turns"}
     problem = systems.Problem("ring", *record[:4], args=record.args, units=units)
@@ -188,15 +180,14 @@ def _of_a_ring(file: SystemFile, loader: Loader) -> Source:
 def _of_the_library(file: SystemFile, loader: Loader) -> Source:
     name, date, jd = file.system, file.state.date, None
     require_name("system", name, systems.LIBRARY, '{}; or "file.py:name"')
-    try:
+    rule = 'a day that the ephemeris covers, such as "1900-01-01"'
+    with (
+        as_input_error("state.date", rule, ValueError),
+        as_input_error("system", "an installed ephemeris", EphemerisMissing),
+    ):
         if name == "solar_system" and file.state.q0 is None:
             jd = julian_date("1900-01-01" if date is None else date)
             problem = systems.solar_system(jd)
         else:
             problem = systems.LIBRARY[name]()
-    except EphemerisMissing as error:
-        raise InputError("system", f"{name!r}: {error}", "an installed ephemeris") from None
-    except ValueError as error:
-        rule = 'a day that the ephemeris covers, such as "1900-01-01"'
-        raise InputError("state.date", str(error), rule) from None
     return Source(file, loader, problem, problem.system, jd)

@@ -26,7 +26,7 @@ from pydantic import (
 from pydantic.json_schema import GenerateJsonSchema
 from typing_extensions import TypeAliasType
 
-from .._errors import InputError, describe, nearest, one_of, require, toml_type
+from .._errors import InputError, as_input_error, describe, nearest, one_of, require, toml_type
 
 NO_KEY = "the key is missing"
 
@@ -36,7 +36,7 @@ def key(default: Any, rule: str) -> Any:
     return Field(default, description=rule)
 
 
-class Table(BaseModel):
+class TomlTable(BaseModel):
     """A table of a TOML file. The description of a field is what its key allows."""
 
     model_config = ConfigDict(
@@ -93,7 +93,7 @@ def path(place: tuple[int | str, ...], inner: str = "") -> str:
     return text
 
 
-T = TypeVar("T", bound=Table)
+T = TypeVar("T", bound=TomlTable)
 
 
 def read_file(file: Path, model: type[T]) -> tuple[T, dict[str, Any]]:
@@ -102,19 +102,22 @@ def read_file(file: Path, model: type[T]) -> tuple[T, dict[str, Any]]:
     **Raises** `InputError` for a missing or unreadable file, TOML that does not parse, an
     unknown key and a value of the wrong type or out of range.
     """
-    try:
-        raw = tomllib.loads(file.read_text(encoding="utf-8-sig"))  # some editors begin with a BOM
-    except FileNotFoundError:
-        raise InputError(str(file), "there is no such file", "the path of a TOML file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(str(file), f"it cannot be read: {error}", "a TOML file in UTF-8") from None
-    except (ValueError, RecursionError) as error:  # also thousands of digits, of brackets
-        raise InputError(str(file), f"it is not TOML: {error}", "https://toml.io") from None
+    key, kinds = str(file), (OSError, UnicodeDecodeError)
+    with as_input_error(key, "a TOML file in UTF-8", *kinds, text=_unreadable):
+        text = file.read_text(encoding="utf-8-sig")  # some editors begin with a BOM
+    kinds = ValueError, RecursionError  # of thousands of brackets
+    with as_input_error(key, "https://toml.io", *kinds, prefix="it is not TOML: "):
+        raw = tomllib.loads(text)
     try:
         return model.model_validate(raw), raw
     except ValidationError as error:  # pydantic wraps the one of the outermost table
         context: Any = error.errors()[0].get("ctx")
         raise context["error"] from None
+
+
+def _unreadable(error: Any) -> str:
+    is_missing = isinstance(error, FileNotFoundError)
+    return "there is no such file" if is_missing else f"it cannot be read: {error}"
 
 
 class JsonSchema(GenerateJsonSchema):
@@ -151,7 +154,7 @@ def union(tag_of: Callable[[Any], str] = type_tag, **kinds: Any) -> Any:
     return Annotated[Union[tuple(members)], Discriminator(tag_of)]  # noqa: UP007
 
 
-def union_by_kind(*tables: type[Table]) -> Any:
+def union_by_kind(*tables: type[TomlTable]) -> Any:
     """The union of tables that differ in the values of their key ``kind``."""
     for table in tables:
         _TAGS.update(get_args(table.model_fields["kind"].annotation))
@@ -241,7 +244,7 @@ _THREE = WithJsonSchema(
 )
 
 
-class Axis(Table, Generic[V]):
+class AxisTable(TomlTable, Generic[V]):
     """An axis of a sweep: the values that a number takes."""
 
     linspace: Annotated[list[V], BeforeValidator(_range_reader("linspace")), _THREE] | None = key(
@@ -280,7 +283,7 @@ class Axis(Table, Generic[V]):
         return getattr(self, self.kind)
 
 
-class NamedAxis(Axis[V], Generic[V]):
+class NamedAxis(AxisTable[V], Generic[V]):
     """An axis of a sweep that has no key of its own to be named after."""
 
     axis: AxisName = key(..., 'a name for this axis, such as axis = "x"')
@@ -288,21 +291,21 @@ class NamedAxis(Axis[V], Generic[V]):
 
 def number_or_axis(number: Any, of_axis: Any = None) -> Any:
     """A number or an axis of them."""
-    return union(number=number, table=Axis[of_axis or number])
+    return union(number=number, table=AxisTable[of_axis or number])
 
 
 def select(value: Any, index: int) -> Any:
     """An argument with every axis in it at one of its values."""
-    if isinstance(value, Axis):
+    if isinstance(value, AxisTable):
         return value.elements[index]
     if isinstance(value, dict):
         return {name: select(v, index) for name, v in value.items()}
     return [select(v, index) for v in value] if isinstance(value, list) else value
 
 
-def axes_in(value: Any) -> list[Axis]:
+def axes_in(value: Any) -> list[AxisTable]:
     """The axes in an argument."""
-    if isinstance(value, Axis):
+    if isinstance(value, AxisTable):
         return [value]
     parts = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
     return [axis for part in parts for axis in axes_in(part)]
@@ -330,7 +333,7 @@ def _parameter_tag(value: Any) -> str:
 
 
 _Single = union(number=Scalar, array=Array)
-_KINDS = {"boolean": bool, "number": Scalar, "array": Components, "axis": Axis[_Single]}
+_KINDS = {"boolean": bool, "number": Scalar, "array": Components, "axis": AxisTable[_Single]}
 SweepParameter = TypeAliasType(
     "SweepParameter", union(_parameter_tag, **_KINDS, table=dict[str, "SweepParameter"])
 )

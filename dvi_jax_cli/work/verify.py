@@ -1,21 +1,44 @@
-"""The check of a certificate of `bound_drift`."""
+"""The check of a certificate of `bound_drift`, in a process with limits of time and memory."""
 
-import json
-import runpy
+import importlib
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 CHECKER = Path(__file__).parents[2] / "dvi_jax" / "proof" / "checker.py"
 
+_LIMITED = """
+import runpy, sys
+try:
+    import resource
+    resource.setrlimit(resource.RLIMIT_AS, (1 << 30, 1 << 30))
+except (ImportError, OSError, ValueError):
+    pass  # not on every system
+sys.argv = sys.argv[1:]
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
 
-def verify_certificate(path: Path) -> tuple[dict[str, Any], str]:
+
+def verify_certificate(path: Path, max_seconds: float) -> tuple[dict[str, Any], str]:
     """What a certificate proves, and why it proves nothing, or "".
+
+    The checker runs alone, without this package, in at most `max_seconds` and 1 GiB: whatever a
+    file contains, it can neither stop this process nor occupy the machine.
 
     **Raises** `ModuleNotFoundError` without python-flint.
     """
-    exact = runpy.run_path(str(CHECKER))  # as a file: the package itself would import JAX
+    importlib.import_module("flint")
+    command = [sys.executable, "-P", "-X", "utf8", "-c", _LIMITED, str(CHECKER), str(path)]
     try:
-        statement = exact["check"](json.loads(path.read_text(encoding="utf-8")))
-    except (exact["Failed"], *exact["MALFORMED"]) as error:
-        return {"certificate": str(path), "proved": None}, f"not proved: {error}"
-    return {"certificate": str(path), "proved": statement}, ""
+        done = subprocess.run(
+            command, capture_output=True, timeout=max_seconds, check=False, encoding="utf-8"
+        )
+        first, _, text = done.stdout.strip().partition(": ")
+        is_proof = done.returncode == 0 and first == "proved"
+    except subprocess.TimeoutExpired:
+        is_proof, text = False, f"the check takes longer than {max_seconds:g} s (--max-seconds)"
+    if is_proof:
+        return {"certificate": str(path), "proved": text}, ""
+    text = text or "the system ended the check, which needs more than 1 GiB or makes FLINT fail"
+    return {"certificate": str(path), "proved": None}, f"not proved: {text}"

@@ -72,5 +72,5 @@ print(slope)
 # %%
 x = dvi.Axis("x", np.linspace(0.2, 1.2, 24), units="m")
 run = settings | {"num_steps": 1000, "epsilon": np.geomspace(1e-3, 1e-1, 12)}
-many = dvi.sweep(system, [x, 0.0], p0, observe={"energy_drift": dvi.MaxDrift(energy)}, **run)
-plot.sweep_map(many.to_xarray().energy_drift, x="epsilon", y="x")
+result = dvi.sweep(system, [x, 0.0], p0, observe={"energy_drift": dvi.MaxDrift(energy)}, **run)
+plot.sweep_map(result.to_xarray().energy_drift, x="epsilon", y="x")
