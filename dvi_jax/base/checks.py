@@ -65,8 +65,9 @@ def array(
 
     **Raises** `ValueError`.
     """
+    kind = value.dtype.kind
     # By name: bfloat16, which NumPy does not know, has no kind.
-    is_real = "float" in str(value.dtype) or (integers and value.dtype.kind in "iub")
+    is_real = kind == "f" or "float" in str(value.dtype) or (integers and kind in "iub")
     if not is_real or not any(_has_shape(value.shape, shape, empty) for shape in shapes):
         kinds = (f"array of shape {_shape_text(shape)}" if shape else "scalar" for shape in shapes)
         raise ValueError(
@@ -80,12 +81,12 @@ def array(
 def all_finite(name: str, values: Any, positive: bool = False, hint: str = "") -> None:
     """**Raises** `ValueError` for an array with a number that is not finite, or not `positive`."""
     entries = np.asarray(values)
-    is_real = entries.dtype.kind in "iub" or "float" in str(entries.dtype)
-    is_wrong = np.ones(entries.shape, bool)
-    if is_real:
-        is_wrong = ~np.isfinite(entries) | (positive & (entries <= 0))
-    if is_wrong.any():
-        index = tuple(np.argwhere(is_wrong)[0].tolist())
+    is_real = entries.dtype.kind in "iubf" or "float" in str(entries.dtype)
+    is_good = np.isfinite(entries) if is_real else np.zeros(entries.shape, bool)
+    if is_real and positive:
+        is_good = is_good & (entries > 0)
+    if not is_good.all():
+        index = tuple(np.argwhere(~is_good)[0].tolist())
         place = f" at index {list(index)}" if index else ""
         raise ValueError(
             f"{name} must be {'positive and ' * positive}finite, got {entries[index]}{place}."

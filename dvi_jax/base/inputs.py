@@ -103,7 +103,9 @@ def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> A
             f"jax.vmap over {name}"
             + (", for steps of several sizes lattice=dvi.Given(ts)." if name == "h" else ".")
         )
-    if number is not None and finite(name, number.item()) == 0 and not zero_allowed:
+    # In one expression of NumPy: every run has three such numbers, and most are right.
+    if number is not None and not (np.isfinite(number) and (zero_allowed or number != 0)):
+        finite(name, number.item())
         raise ValueError(f"{name} must not be zero; a negative h runs backwards in time.")
     # Cast in NumPy: each operation of JAX on a known number would cost some ten microseconds.
     if number is None:

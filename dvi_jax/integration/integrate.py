@@ -149,7 +149,7 @@ def integrate(
         observe = of_steps(observe)
     grid = integrator.lattice
     # The h of a problem does not count where the times are given.
-    h = default_h if grid.takes_h else h
+    h = default_h if type(grid).takes_h else h
     t0, h, num_steps = steps_of(grid, t0, h, num_steps, t1, duration)
     t0 = as_scalar("t0", t0, q0.dtype)
     h = as_scalar("h", h, q0.dtype, zero_allowed=False)
@@ -183,6 +183,7 @@ def solve(trajectory: PreparedRun, progress: Any = None) -> Solution:
     if request.observe is None or request.save.ts is not None:
         return solution
     observables = jax.tree.leaves(request.observe, is_leaf=is_observable)
+    # In the variables of the request: those of the lattice may have no initial state of this form.
     if any(isinstance(f, OfState) for f in observables):
         return _with_initial_values(solution, request, layout)
     return solution

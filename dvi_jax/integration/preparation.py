@@ -76,6 +76,7 @@ def prepare(
     System.check_shapes(run.system, run.t0, run.q0, run.p0, run.epsilon, run.args)
     lattice, layout = integrator.lattice, integrator.layout
     noise = noise_path(run, path, integrator, method, h, num_steps)
+    # The same run in the variables of the lattice, such as a fictitious time.
     image, undo = type(lattice).transform(lattice, run)
     type(lattice).check(lattice, method, integrator.arithmetic)
     task, q0, p0 = _task(image, integrator, method, h)
@@ -86,6 +87,7 @@ def prepare(
     # An allocation that fails ends the process, or makes the machine swap.
     check_memory(run.save, plan, q0, check_observe(task, q0, p0), leaves, layout)
     has_tracer = any(is_traced(leaf) for leaf in leaves)
+    # Traced values are not known before the compiled program runs: they give a status.
     if not has_tracer:
         _check_start(task, q0, p0)
     if run.save.ts is not None:
@@ -100,11 +102,12 @@ def prepare(
 def _check_start(task: Task, q0: State, p0: State) -> None:
     """Checks of the first step, which need numbers that are known."""
     method, equations = task.method, task.equations
+    system = equations.system
     first_interval = functools.partial(Task.first_interval, task)
     type(method).check(method, equations, first_interval, q0, p0)
-    if equations.system.constraint is not None:
+    if system.constraint is not None:
         check_start(equations, task.t0, q0, p0)
-    if equations.system.force is not None:
+    if system.force is not None:
         warn_of_dissipation(method, equations, first_interval, q0, p0)
 
 

@@ -107,8 +107,10 @@ class StepSizes(Lattice):
     """Base of the lattices with a given step size, at least of the first step, and their number."""
 
     def prepare(self, t0, h, num_steps):
-        hint = "dvi.Uniform() also accepts t1 or duration." if num_steps is None else ""
-        require(f"lattice={self!r}", {"h": h, "num_steps": num_steps}, hint=hint)
+        # A lattice takes a tenth of a millisecond to print, which only the error needs.
+        if h is None or num_steps is None:
+            hint = "dvi.Uniform() also accepts t1 or duration." if num_steps is None else ""
+            require(f"lattice={self!r}", {"h": h, "num_steps": num_steps}, hint=hint)
         return t0, h, check_num_steps(num_steps)
 
     def is_usable(self, t0, h):
