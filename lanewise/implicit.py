@@ -43,7 +43,7 @@ def implicit_root(
     # Values that the equation closes over become operands, so that derivatives by it are found.
     operands = [*equation.outer, guess]
     search = Trace.from_function(search_root, operands, jax.tree.structure(tuple(operands)))
-    functions = _Functions(
+    rest = _Rest(
         lambda *arrays: jaxpr_as_fun(equation.all_inputs)(*arrays)[0],
         lambda *arrays: _divide(equation.all_inputs, divide, *arrays),
         # These come first among the operands. They do not change the root: it has no derivative by
@@ -51,16 +51,19 @@ def implicit_root(
         len(search.outer),
     )
     inputs = [*search.outer, *operands]
-    x, *info = _root.bind(*inputs, search=search.all_inputs, functions=functions)
+    x, *info = _root.bind(*inputs, search=search.all_inputs, rest=rest)
     return x, jax.tree.unflatten(trees[-1], info)
 
 
-class _Functions(NamedTuple):
-    """``equation(*consts, x)``, ``divide(*consts, x, b)``, count of operands of the search only."""
+class _Rest(NamedTuple):
+    """``equation(*consts, x)``, ``divide(*consts, x, b)``, count of operands of the search only.
+
+    Stored sweeps recognise their functions by the text of jaxprs, in which these names occur.
+    """
 
     equation: Callable
     divide: Callable
-    search_only: int
+    own: int
 
 
 def _divide(equation: ClosedJaxpr, divide: Callable, *arrays: Array) -> Array:
@@ -69,40 +72,40 @@ def _divide(equation: ClosedJaxpr, divide: Callable, *arrays: Array) -> Array:
     return divide(linear, right)
 
 
-def _search(*operands: Array, search: ClosedJaxpr, functions: _Functions) -> list[Array]:
+def _search(*operands: Array, search: ClosedJaxpr, rest: _Rest) -> list[Array]:
     return jaxpr_as_fun(search)(*operands)
 
 
-def _batch_rule(operands, axes, *, search: ClosedJaxpr, functions: _Functions):
+def _batch_rule(operands, axes, *, search: ClosedJaxpr, rest: _Rest):
     size, operands, axes_in_front = batch_in_front(operands, axes)
     # The batch is formed now: a derivative that is taken later finds functions of a batch, in which
     # `lax.cond` has become a selection.
     new = jax.make_jaxpr(jax.vmap(jaxpr_as_fun(search), axes_in_front, axis_size=size))(*operands)
-    consts = axes_in_front[functions.search_only : -1]
-    batch_functions = _Functions(
-        jax.vmap(functions.equation, [*consts, 0], axis_size=size),
-        jax.vmap(functions.divide, [*consts, 0, 0], axis_size=size),
-        functions.search_only,
+    consts = axes_in_front[rest.own : -1]
+    of_batch = _Rest(
+        jax.vmap(rest.equation, [*consts, 0], axis_size=size),
+        jax.vmap(rest.divide, [*consts, 0, 0], axis_size=size),
+        rest.own,
     )
-    outs = _root.bind(*operands, search=new, functions=batch_functions)
+    outs = _root.bind(*operands, search=new, rest=of_batch)
     return outs, [0] * len(outs)
 
 
-def _derivative(primals, changes: dict[int, Array], *, search: ClosedJaxpr, functions: _Functions):
-    outs = _root.bind(*primals, search=search, functions=functions)
-    x, consts = outs[0], primals[functions.search_only : -1]
+def _derivative(primals, changes: dict[int, Array], *, search: ClosedJaxpr, rest: _Rest):
+    outs = _root.bind(*primals, search=search, rest=rest)
+    x, consts = outs[0], primals[rest.own : -1]
     # Changes of the guess and of what the search alone uses are left out.
-    indices = [i for i in range(len(consts)) if i + functions.search_only in changes]
+    indices = [i for i in range(len(consts)) if i + rest.own in changes]
     if not indices:
         return outs, [None] * len(outs)
 
     def defect(*moving):
         values = dict(zip(indices, moving, strict=True))
-        return functions.equation(*(values.get(i, const) for i, const in enumerate(consts)), x)
+        return rest.equation(*(values.get(i, const) for i, const in enumerate(consts)), x)
 
-    tangents = [changes[i + functions.search_only] for i in indices]
+    tangents = [changes[i + rest.own] for i in indices]
     _, change = jax.jvp(defect, [consts[i] for i in indices], tangents)
-    return outs, [functions.divide(*consts, x, -change), *[None] * (len(outs) - 1)]
+    return outs, [rest.divide(*consts, x, -change), *[None] * (len(outs) - 1)]
 
 
 _root = primitive("implicit_root", _search, _batch_rule, multiple=True)

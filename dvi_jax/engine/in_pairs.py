@@ -35,9 +35,8 @@ def in_pairs(function: Callable, *args: Any) -> Any:
     def of_arrays(*leaves: Array) -> Any:
         return function(*eqx.combine(jax.tree.unflatten(tree, leaves), static))
 
-    trace = Trace.from_function(
-        of_arrays, rounded(leaves), jax.tree.structure(tuple(rounded(leaves)))
-    )
+    plain = rounded(leaves)
+    trace = Trace.from_function(of_arrays, plain, jax.tree.structure(tuple(plain)))
     program = trace.all_inputs
 
     # Values of an outer trace that the function closes over are operands too, so that they have a
@@ -300,9 +299,9 @@ def _linear_solve(eqn: Any, values: list[Any]) -> list[Any]:
 
 
 def _root(eqn: Any, values: list[Any]) -> list[Any]:
-    problem, plain = eqn.params["functions"], rounded(values)
+    problem, plain = eqn.params["rest"], rounded(values)
     x, *statistics = _bound(eqn, plain)
-    parameters, consts = values[problem.search_only : -1], plain[problem.search_only : -1]
+    parameters, consts = values[problem.own : -1], plain[problem.own : -1]
     # The iteration itself stays in float64, with its status; a Jacobian of float64 is enough to
     # continue from its root.
     equation = jax.make_jaxpr(problem.equation)(*consts, x)

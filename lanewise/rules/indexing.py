@@ -61,9 +61,8 @@ def _clip(b: Builder, x: Num, largest: int) -> Num:
 
 def _starts(e: Evaluator, starts: list[Value], shape: Any, sizes: Any) -> list[Num]:
     """Where a part of `sizes` begins in an array of `shape`, inside of it."""
-    return [
-        _clip(e.b, e.entries(s)[()], n - m) for s, n, m in zip(starts, shape, sizes, strict=True)
-    ]
+    triples = zip(starts, shape, sizes, strict=True)
+    return [_clip(e.b, e.entries(start)[()], n - m) for start, n, m in triples]
 
 
 def _pick(e: Evaluator, value: Value, index: Num) -> Num:
@@ -230,6 +229,4 @@ def scatter(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[V
 
 RULES |= {"iota": iota, "gather": gather, **dict.fromkeys(SCATTERS, scatter)}
 RULES |= {"dynamic_slice": dynamic_slice, "dynamic_update_slice": dynamic_update_slice}
-RULES |= dict.fromkeys(("empty", "empty2"), empty) | dict.fromkeys(
-    ("argmax", "argmin"), argument_of
-)
+RULES |= {"empty": empty, "empty2": empty, "argmax": argument_of, "argmin": argument_of}
