@@ -39,12 +39,12 @@ def uses_pairs(arithmetic: Arithmetic, tolerance: float | None) -> bool:
     if not (in_pairs or isinstance(arithmetic, FloatingPoint)):
         raise ValueError(
             "arithmetic of discover_invariants must be dvi.FloatingPoint() or dvi.DoubleDouble(), "
-            f"got {arithmetic!r}: other representations of a state do not change one step."
+            f"got {arithmetic!r}."
         )
     if in_pairs and tolerance is not None:
         raise ValueError(
-            f"tolerance={tolerance!r} is for approximate invariants, arithmetic=dvi.DoubleDouble() "
-            "for those that are conserved to 30 digits: give one of the two."
+            f"tolerance={tolerance!r} is for approximate invariants, dvi.DoubleDouble() for those "
+            "conserved to 30 digits: give one of the two."
         )
     return in_pairs
 

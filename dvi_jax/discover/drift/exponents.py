@@ -50,7 +50,7 @@ class Exponent(NamedTuple):
     def report(self, points: int, target: tuple[float, float]) -> list[str]:
         """Lines of text: the order and its interval, or that none is resolved.
 
-        - `points`: the number before points were excluded. `wanted`: what `resolving_range`
+        - `points`: the number before points were excluded. `target`: what `resolving_range`
           returns.
         """
         low, high = self.interval

@@ -136,8 +136,8 @@ def as_samples(samples: Any, t0: float = 0.0) -> SamplePoints:
     """(qs, ps) at the time t0, or (qs, ps, ts), after rejecting what cannot be sampled points."""
     if not x64_enabled():
         raise TypeError(
-            "this function computes in float64, but JAX is set to float32: put the line\n"
-            '    jax.config.update("jax_enable_x64", True)\nbefore the first array is made.'
+            "this function computes in float64, but JAX in float32: call first\n"
+            '    jax.config.update("jax_enable_x64", True)'
         )
     if isinstance(samples, SamplePoints):
         return samples

@@ -146,15 +146,9 @@ def chooser(null: NullSpaces) -> Chooser:
     """The `Chooser` for these null spaces."""
     changes, conditions, fit = null.changes, null.conditions, null.fit
     in_units = changes._replace(terms=in_units_of(conditions.scale, changes.terms))
-    digits, scale = coefficient_errors(conditions.terms), conditions.scale
+    digits, calm, scale = coefficient_errors(conditions.terms), conditions.calm, conditions.scale
     judge, judge_fitted = (
-        Judge(
-            in_units.subset(part),
-            conditions.calm[part],
-            scale,
-            digits[part],
-            approximately=null.tolerance is not None,
-        )
+        Judge(in_units.subset(part), calm[part], scale, digits[part], null.tolerance is not None)
         for part in (~fit, fit)
     )
     linear = LinearConditions.from_terms(times(compress(null.rows), conditions.R))

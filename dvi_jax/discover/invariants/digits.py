@@ -97,7 +97,7 @@ class LinearConditions(NamedTuple):
 def digits_of(
     values: np.ndarray, errors: np.ndarray | None, largest: int = _MOST_DIGITS
 ) -> np.ndarray:
-    """How many digits of each value its error leaves, from 2 to `most`."""
+    """How many digits of each value its error leaves, from 2 to `largest`."""
     if errors is None:
         return np.full(np.shape(values), largest)
     size = np.maximum(np.abs(values), np.finfo(float).tiny)

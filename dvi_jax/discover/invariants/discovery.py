@@ -192,10 +192,7 @@ class Discovery(eqx.Module):
         header = {name: getattr(self, name) for name in plain}
         header["names"] = self.basis.names
         header["obstructions"] = [
-            {
-                name: value.tolist() if isinstance(value, np.ndarray) else value
-                for name, value in law._asdict().items()
-            }
+            {name: np.asarray(value).tolist() for name, value in law._asdict().items()}
             for law in self.obstructions
         ]
         arrays: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in names}

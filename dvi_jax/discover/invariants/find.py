@@ -83,11 +83,10 @@ def discover_invariants(
 
     **Returns** a `Discovery`; print it for a report.
 
-    **Raises** `ValueError` for too few samples, samples or basis functions that are not
-    finite there, a step that fails there, a basis that is rank-deficient on them, a basis or a
-    map of time with samples of one time, a tolerance outside (0, 1) or in pairs, another
-    arithmetic, or h = 0; `TypeError` for anything but a system, basis, method or root finder, and
-    for samples without x64.
+    **Raises** `ValueError` for too few samples, or samples of one time where basis or map depend
+    on it; where functions are not finite on them, rank-deficient, or the step fails; for h = 0, a
+    tolerance outside (0, 1) or in pairs, another arithmetic. `TypeError` for objects of another
+    type, and without x64.
 
     **Accuracy** round-off of the singular values, times the conditioning of the basis; Taylor
     coefficients by nested forward autodiff, through implicit steps. Coefficients are float64.

@@ -119,8 +119,8 @@ def conformal_factor(
     samples, size = len(first.q), 2 * first.q[0].size
     if not pointwise and samples < size:
         raise ValueError(
-            f"first and second must have at least {size} points for a constant {size}×{size} "
-            f"conformal factor, got {samples}: one for each point requires pointwise=True."
+            f"first and second must have at least {size} points for a constant conformal factor, "
+            f"got {samples}: give more, or pointwise=True."
         )
     problem = system, generators, first, second, jnp.asarray(epsilon), args
     return _conformal_factor(*problem, pointwise)

@@ -95,10 +95,9 @@ def find_symmetries(
     **Returns** `Symmetries`; print it for a report. t in the basis is the time, also of a system
     with ``slow_time=True``.
 
-    **Raises** `ValueError` for too few samples, samples or functions that are not finite, a step
-    that fails on them, a basis that is rank-deficient on them, samples of one time where basis or
-    system depend on t, an order below 0, a tolerance outside (0, 1), or h = 0; `TypeError` for
-    anything but a basis.
+    **Raises** `ValueError` for too few samples, or samples of one time where basis or map depend
+    on it; where functions are not finite on them, rank-deficient, or the step fails; for h = 0, an
+    order below 0, a tolerance outside (0, 1). `TypeError` for anything but a basis.
 
     **Accuracy** round-off of the singular values, times the conditioning of the basis; Taylor
     coefficients by nested forward autodiff, through implicit steps.

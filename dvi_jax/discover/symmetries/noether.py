@@ -121,9 +121,8 @@ class AdiabaticInvariant(eqx.Module):
         sizes = [len(x) if isinstance(x, list | tuple) else 0 for x in lists]
         if sizes[0] != sizes[1] or 0 in sizes:
             raise ValueError(
-                "generators and gauges must be lists of one entry for each order, the same number "
-                f"in both, got {' and '.join(type(x).__name__ for x in lists)} of {sizes} entries: "
-                "a gauge that is zero is None."
+                "generators and gauges must be lists of one entry for each order, got "
+                f"{' and '.join(type(x).__name__ for x in lists)} of {sizes} entries."
             )
 
     @property
