@@ -2,7 +2,7 @@
 
 import difflib
 import reprlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -39,11 +39,7 @@ def require(fits: Any, key: str, defect: str, rule: str) -> None:
 
 @contextmanager
 def as_input_error(
-    key: str,
-    rule: str,
-    *kinds: type[BaseException],
-    prefix: str = "",
-    text: Callable[[Any], str] = str,
+    key: str, rule: str, *kinds: type[BaseException], prefix: str = "", text: Any = str
 ) -> Iterator[None]:
     """Within this an exception of these kinds, by default `ValueError` and `TypeError`, is an
     `InputError` with the prefix and what `text` makes of it."""

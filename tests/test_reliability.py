@@ -175,7 +175,7 @@ def test_two_writers_of_one_file_never_mix(file):
 def a_run(file):
     """The part of a fit that writes its checkpoint."""
     problem = SimpleNamespace(size=1, space=SimpleNamespace(to_x=lambda x: x, names=["k"]))
-    return run.Run(problem, 10, 1e-8, None, 0.0, file, "identity")  # pyright: ignore
+    return run.FitRun(problem, 10, 1e-8, None, 0.0, file, "identity")  # pyright: ignore
 
 
 def take_step(of, value):

@@ -72,13 +72,15 @@ class Observations:
             )
         if ts.ndim != 1 or ts.size == 0 or values.shape[:1] != ts.shape:
             raise ValueError(
-                "ts must be a one-dimensional array of at least one time, and values must have one "
+                "ts must be a one-dimensional array of times, not empty, and values must have one "
                 f"row for each, got shapes {ts.shape} and {values.shape}."
             )
         _check_times(ts)
         require_all("values", values, ~np.isinf(values), "finite", "NaN means a missing value.")
         if np.isnan(values).all():
-            raise ValueError(f"values must have at least one number, got {values!r:.200}.")
+            raise ValueError(
+                f"values must have at least one number, got {values.size} values, all NaN."
+            )
         refuse_unit_or_mask("t0", self.t0)
         t0 = finite("t0", ts[0] if self.t0 is None else self.t0)
         if ts.min() < t0 < ts.max():

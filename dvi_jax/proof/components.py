@@ -405,12 +405,13 @@ def _linear(program: ScalarProgram, equation: Any, values: list) -> np.ndarray:
             continue
         scalars = _symbolic(program, value)
         for place in np.ndindex(scalars.shape):
-            if scalars[place].value == 0:
+            scalar: ProgramNumber = scalars[place]
+            if scalar.value == 0:
                 continue
             units = [x.copy() for x in zeros]
             units[i][place] = 1.0
             out = equation.primitive.bind(*map(jnp.asarray, units), **equation.params)
-            parts.append((scalars[place], np.asarray(out)))
+            parts.append((scalar, np.asarray(out)))
     zero = program.constant(0.0)
     sums = [
         total([zero, *(x * float(m.ravel()[k]) for x, m in parts if m.ravel()[k])])

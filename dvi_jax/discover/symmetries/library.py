@@ -44,7 +44,7 @@ def rotation(i: int = 0, j: int = 1) -> Generator:
     **Raises** `ValueError` for axes that are equal or negative, and at the point for axes that q
     does not have. **Source** the paper, (40).
     """
-    i, j = (_checks.whole(name, axis, least=0) for name, axis in (("i", i), ("j", j)))
+    i, j = (_checks.whole(name, axis, low=0) for name, axis in (("i", i), ("j", j)))
     if i == j:
         raise ValueError(f"i and j must be two different axes of q, got i = j = {i}.")
     return Generator(xi=eqx.Partial(_turn, 1, i, j), eta=eqx.Partial(_turn, 2, i, j))
