@@ -31,11 +31,7 @@ class Leaf:
     """A box and what was found there.
 
     - `failure`: why nothing is bounded there.
-<<<<<<< HEAD
     - `bounds`, `extremes`: for each invariant a bound of the change, and the largest one seen.
-=======
-    - `bounds`, `extremes`: for each invariant an upper bound of the change, and the largest seen.
->>>>>>> wt-fitcli
     - `rounding`, `displacement`: changes by rounding, and how far a step moves each coordinate.
     - `remainders`: of the models of the changes. `shares`: for each invariant and coordinate, by
       how much the bound would decrease if the coordinate were cut.
