@@ -79,9 +79,9 @@ def test_no_root_is_reported(method):
 
 
 def test_wrong_functions_are_refused():
-    with pytest.raises(TypeError, match=r"relation must take five positional arguments"):
+    with pytest.raises(TypeError, match=r"relation.*five"):
         dvi.Implicit(energy, lambda t, q: q, guess)
-    with pytest.raises(TypeError, match=r"guess must take four positional arguments"):
+    with pytest.raises(TypeError, match=r"guess.*four"):
         dvi.Implicit(energy, relation, energy)
 
 
