@@ -54,7 +54,7 @@ HOMES = {
     ),
     "proof": (
         *("DriftBound", "ExactInvariant", "NoetherProof", "ProofError", "bound_drift"),
-        *("exact_coefficients", "prove_noether"),
+        *("exact_coefficients", "holds_for", "prove_noether"),
     ),
     "sweep": (
         *("Axis", "ClusterError", "StoreError", "StoreMismatch", "SweepCost"),

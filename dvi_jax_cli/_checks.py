@@ -77,15 +77,21 @@ def verify(
     max_seconds: Annotated[
         float, typer.Option(min=0.0, help="Time after which the check is given up.")
     ] = 60.0,
+    system: Annotated[
+        str, typer.Option(metavar="FILE.py:NAME", help="A system that the proof must be about.")
+    ] = "",
+    method: Annotated[str, typer.Option(help="The method of this system.")] = "",
 ) -> None:
     """Check a certificate of `bound_drift` with a small program of its own.
 
     It evaluates every box of the proof again, with python-flint and without JAX, in at most 1 GiB.
-    Exit code 0: the bounds are proved. 1: they are not; the message says where. 2: there is no such
-    file.
+    With --system the map of this system is read again, and compared with that of the certificate.
+    Exit code 0: the bounds are proved. 1: they are not, or for another system; the message says
+    where. 2: there is no such file.
 
     Examples
         dvi-jax verify bound.json
+        dvi-jax verify bound.json --system model.py:pendulum --method Strang
     """
     require_file("CERTIFICATE", certificate, "a file that DriftBound.save wrote")
     from .work.verify import verify_certificate
@@ -93,6 +99,13 @@ def verify(
     contents, message = verify_certificate(certificate, max_seconds)
     if not message:
         session.line(f"proved: {contents['proved']}")
+    if system and not message:
+        session.start_jax()
+        from .work.verify import compare_system
+
+        binding, message = compare_system(certificate, system, method)
+        session.line(binding["text"])
+        contents["system"] = binding
     session.finish(contents, message)
 
 

@@ -257,9 +257,11 @@ _ENDS = frozenset(["custom_linear_solve", "eliminate"])
 def check_types(rule: Callable) -> Callable:
     """A rule for results of the types that are compiled."""
 
-    def rule_with_check(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+    def rule_with_check(
+        evaluator: Evaluator, eqn: Any, values: list[Value], places: list
+    ) -> list[Value]:
         for var in eqn.outvars:
             check_type(var.aval.dtype, f"results of {eqn.primitive.name}")
-        return rule(e, eqn, values, places)
+        return rule(evaluator, eqn, values, places)
 
     return rule_with_check

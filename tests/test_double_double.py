@@ -420,9 +420,9 @@ def test_what_has_no_rule_is_an_error():
         how = {"h": 0.1, "num_steps": 2, "arithmetic": dvi.DoubleDouble()}
         return dvi.integrate(dvi.System(H), q0, np.ones_like(q0), **how)
 
-    with pytest.raises(ValueError, match=r"requires q0 and p0 in float64, got float32"):
+    with pytest.raises(ValueError, match="float64, got float32"):
         run(pendulum, np.array([0.1], np.float32))
-    with pytest.raises(NotImplementedError, match="no rule for the operation erf of JAX"):
+    with pytest.raises(NotImplementedError, match="erf"):
         run(lambda t0, t1, q, p, args: jnp.sum(p**2) / 2 + jnp.sum(jax.scipy.special.erf(q)))
 
 

@@ -79,9 +79,9 @@ def test_no_root_is_reported(method):
 
 
 def test_wrong_functions_are_refused():
-    with pytest.raises(TypeError, match=r"relation must take the arguments"):
+    with pytest.raises(TypeError, match="relation"):
         dvi.Implicit(energy, lambda t, q: q, guess)
-    with pytest.raises(TypeError, match=r"guess must take the arguments"):
+    with pytest.raises(TypeError, match="guess"):
         dvi.Implicit(energy, relation, energy)
 
 

@@ -121,7 +121,7 @@ class Samples:
 
         dims = ("chain", "draw")
         stats = {"diverging": self.diverging, "lp": -self.potential, "n_steps": self.steps}
-        coords = {d: np.arange(n) for d, n in zip(dims, self.x.shape[:2], strict=True)}
+        coords = {d: np.arange(size) for d, size in zip(dims, self.x.shape[:2], strict=True)}
         groups = {"posterior": self.samples, "sample_stats": stats}
         datasets = {
             group: xr.Dataset({name: (dims, x) for name, x in columns.items()}, coords=coords)
@@ -267,8 +267,8 @@ def collect(
     x, diagnostics = np.asarray(x), _numpyro("diagnostics")
     columns = {name: x[..., i] for i, name in enumerate(posterior.names)}
     with np.errstate(invalid="ignore", divide="ignore"):
-        r_hat = {n: float(diagnostics.split_gelman_rubin(c)) for n, c in columns.items()}
-        ess = {n: float(diagnostics.effective_sample_size(c)) for n, c in columns.items()}
+        r_hat = {n: float(diagnostics.split_gelman_rubin(chain)) for n, chain in columns.items()}
+        ess = {n: float(diagnostics.effective_sample_size(chain)) for n, chain in columns.items()}
     samples = Samples(
         names=posterior.names,
         x=x,

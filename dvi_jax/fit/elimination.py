@@ -80,7 +80,9 @@ class Elimination:
         return self._terms_of(self.keep)
 
     def _terms_of(self, keep: np.ndarray) -> tuple[str, ...]:
-        return tuple(n for n, k in zip(self.library.names, keep[self.where], strict=True) if k)
+        return tuple(
+            name for name, k in zip(self.library.names, keep[self.where], strict=True) if k
+        )
 
     def eliminate(self) -> None:
         """Remove terms until the criterion exceeds its minimum by a few penalties, or none is

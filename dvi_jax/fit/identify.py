@@ -182,7 +182,7 @@ def identify(
     terms = search.terms
     best: Any = problem.space.to_params(problem.space.to_x(jnp.asarray(search.best)))
     values: Any = {**best, KEY: {name: best[KEY][name] for name in terms}}
-    final, c, sigma = None, np.zeros(0), np.zeros(0)
+    final, coefficients, sigma = None, np.zeros(0), np.zeros(0)
     if terms or set(values) != {KEY}:
         # The remaining terms by `fit` itself: errors, residuals, statuses.
         common |= {"bounds": bounds, "priors": priors, "loss": loss, "horizons": None}
@@ -190,14 +190,14 @@ def identify(
         final = fit(full_model, data, values, **common)
         values = final.params
         indices = [final.names.index(f"{KEY}.{name}") for name in terms]
-        c, sigma = final.x[indices], final.sigma[indices]
+        coefficients, sigma = final.x[indices], final.sigma[indices]
     spec = full_model.base_specification({k: v for k, v in values.items() if k != KEY}, 0)
     system = spec["system"]
     if terms:
-        system = with_force(system, library.only(terms).with_coefficients(c))
+        system = with_force(system, library.only(terms).with_coefficients(coefficients))
     return Identification(
         terms=terms,
-        coefficients=c,
+        coefficients=coefficients,
         sigma=sigma,
         system=system,
         epsilon=spec["epsilon"],
@@ -246,12 +246,15 @@ class _ModelWithLibrary(eqx.Module):
         return {**spec, "epsilon": 1.0} if self.alone else spec
 
     def __call__(self, params: Mapping[str, Any], arc: Any) -> dict[str, Any]:
-        c = params[KEY]
+        coefficients = params[KEY]
         spec = self.base_specification({k: v for k, v in params.items() if k != KEY}, arc)
-        if not c:
+        if not coefficients:
             return spec
-        library = self.library.only(c)
-        args = {**(spec.get("args") or {}), KEY: jnp.stack([c[n] for n in library.names])}
+        library = self.library.only(coefficients)
+        args = {
+            **(spec.get("args") or {}),
+            KEY: jnp.stack([coefficients[name] for name in library.names]),
+        }
         return {**spec, "system": with_force(spec["system"], library), "args": args}
 
 

@@ -107,9 +107,9 @@ class ForceLibrary(eqx.Module):
                 f'args["{KEY}"] must be the {len(self)} coefficients of the dvi.ForceLibrary, but '
                 f"args has {keys}."
             )
-        c = jnp.asarray(args[KEY])
-        self._check_shape(c, f'args["{KEY}"]')
-        return c
+        coefficients = jnp.asarray(args[KEY])
+        self._check_shape(coefficients, f'args["{KEY}"]')
+        return coefficients
 
     def _check_shape(self, c: Array, name: str) -> None:
         hint = f"The candidates are {', '.join(self.names[:4])}{', …' * (len(self) > 4)}."
@@ -132,10 +132,10 @@ class ForceLibrary(eqx.Module):
                 "both libraries must have coefficients, or neither, got only those of the "
                 f"{'second' if self.coefficients is None else 'first'}."
             )
-        c = None
+        coefficients = None
         if self.coefficients is not None and other.coefficients is not None:
-            c = jnp.concatenate([self.coefficients, other.coefficients])
-        return ForceLibrary({**self._candidates(), **other._candidates()}, c)
+            coefficients = jnp.concatenate([self.coefficients, other.coefficients])
+        return ForceLibrary({**self._candidates(), **other._candidates()}, coefficients)
 
     def only(self, names: Iterable[str]) -> "ForceLibrary":
         """The library of some of the candidates, in the order of this one.
@@ -144,8 +144,8 @@ class ForceLibrary(eqx.Module):
         """
         names = self._require(names)
         indices = np.array([i for i, name in enumerate(self.names) if name in names], int)
-        c = None if self.coefficients is None else self.coefficients[indices]
-        return ForceLibrary({self.names[i]: self.functions[i] for i in indices}, c)
+        coefficients = None if self.coefficients is None else self.coefficients[indices]
+        return ForceLibrary({self.names[i]: self.functions[i] for i in indices}, coefficients)
 
     def with_coefficients(self, coefficients: Any) -> "ForceLibrary":
         """The same with coefficients: an array in the order of names, or a dict of the nonzero

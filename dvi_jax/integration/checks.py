@@ -93,7 +93,7 @@ def noise_path(
         return None
     lattice, arithmetic = integrator.lattice, integrator.arithmetic
     observables = jax.tree.leaves(run.observe, is_leaf=is_observable)
-    has_section = any(isinstance(f, Section) for f in observables)
+    has_section = any(isinstance(observable, Section) for observable in observables)
     is_adaptive = lattice.has_memory or type(lattice).transform is not Lattice.transform
     # What the user has to change first comes first.
     conditions = {

@@ -166,19 +166,24 @@ def _memories(
     start = task.arithmetic.full_state(ends.q0, ends.p0, carry.remainder)
     end = task.arithmetic.full_state(ends.q1, ends.p1, remainder)
 
-    def update(r: Reduction, memory: Any) -> Any:
-        k = number_of(r, carry.k)
-        if isinstance(r, Deviations):
+    def update(reduction: Reduction, memory: Any) -> Any:
+        k = number_of(reduction, carry.k)
+        if isinstance(reduction, Deviations):
             assert push is not None
-            return r.update(memory, k, ends.t1, _deviations(push, r.vectors(memory), ends, h))
-        function = task.bound(r.function)
+            return reduction.update(
+                memory, k, ends.t1, _deviations(push, reduction.vectors(memory), ends, h)
+            )
+        function = task.bound(reduction.function)
 
         def with_value(ends, memory):
-            return r.update(memory, k, ends.t1, ends.number(function, task.args))
+            return reduction.update(memory, k, ends.t1, ends.number(function, task.args))
 
-        return task.evaluate(r, with_value, Ends(*ends[:2], *start, *end), memory)
+        return task.evaluate(reduction, with_value, Ends(*ends[:2], *start, *end), memory)
 
-    return [update(r, memory) for r, memory in zip(reductions, carry.reductions, strict=True)]
+    return [
+        update(reduction, memory)
+        for reduction, memory in zip(reductions, carry.reductions, strict=True)
+    ]
 
 
 def number_of(reduction: Reduction, k: Int[Array, ""]) -> Int[Array, ""]:
@@ -305,7 +310,7 @@ def results_of(task: Task, carry: Carry) -> list[Any]:
     """The results of the reductions, in tree order."""
     _, reductions = task.observables()
     pairs = zip(reductions, carry.reductions, strict=True)
-    return [task.finish(r, memory) for r, memory in pairs]
+    return [task.finish(reduction, memory) for reduction, memory in pairs]
 
 
 def with_tail(plan: Plan, rows: Rows, tail: Rows | None) -> Rows:

@@ -69,7 +69,7 @@ def as_solution(
 
 def _values(observables: tuple[list[Any], Any], ends: Ends) -> list[PyTree]:
     functions, args = observables
-    return [ends.value(f, args) for f in functions]
+    return [ends.value(function, args) for function in functions]
 
 
 def observed_values(observe: PyTree, columns: list[Any], results: list[Any]) -> PyTree:

@@ -96,8 +96,10 @@ class ReversePass(eqx.Module):
         equations = dataclasses.replace(task.equations_at(k, interval), newton=solver)
         q1, p1, _ = task.method.step(equations, interval, q0, p0)
         step = Ends(interval.t0, interval.t1, q0, p0, q1, p1)
-        values = [step.value(f, task.args) for f in functions]
-        numbers = [step.number(task.bound(r.function), task.args) for r in reductions]
+        values = [step.value(function, task.args) for function in functions]
+        numbers = [
+            step.number(task.bound(reduction.function), task.args) for reduction in reductions
+        ]
         return (q1, p1, interval.t1), eqx.filter(values, eqx.is_inexact_array), numbers
 
     def reductions(self) -> list[tuple[Reduction, Any, Any]]:
@@ -219,7 +221,9 @@ class ReversePass(eqx.Module):
 
     def initial_values(self, cotangents: Cotangents, start: Point) -> Cotangents:
         """The cotangents, with those of the values of reductions at the initial state."""
-        reductions = [r for r in self.reductions() if has_initial_value(r[0].function)]
+        reductions = [
+            reduction for reduction in self.reductions() if has_initial_value(reduction[0].function)
+        ]
         if not reductions:
             return cotangents
 
@@ -228,8 +232,12 @@ class ReversePass(eqx.Module):
             t0 = task.first_interval().t0
             step = Ends(t0, t0, q0, p0, q0, p0)
             _, reductions = task.observables()
-            functions = [r.function for r in reductions if has_initial_value(r.function)]
-            return t0, [step.number(task.bound(f), task.args) for f in functions]
+            functions = [
+                reduction.function
+                for reduction in reductions
+                if has_initial_value(reduction.function)
+            ]
+            return t0, [step.number(task.bound(function), task.args) for function in functions]
 
         (t0, values), pull = jax.vjp(values_of, self.theta, *start)
         seeds = _of_values(reductions, jnp.asarray(-1, jnp.int32), t0, values)

@@ -62,25 +62,25 @@ class Task(eqx.Module):
     def observables(self) -> tuple[list[Callable], list[Reduction]]:
         """The functions without a reduction, and the reductions, in tree order."""
         functions = [
-            self.bound(f) for f in self._leaves() if not isinstance(f, Reduction | Running)
+            self.bound(leaf) for leaf in self._leaves() if not isinstance(leaf, Reduction | Running)
         ]
-        leaves = [f.reduction if isinstance(f, Running) else f for f in self._leaves()]
-        return functions, [f for f in leaves if isinstance(f, Reduction)]
+        leaves = [leaf.reduction if isinstance(leaf, Running) else leaf for leaf in self._leaves()]
+        return functions, [leaf for leaf in leaves if isinstance(leaf, Reduction)]
 
     def at_save(self, carry: "Carry", ends: "Ends | None") -> list[Any]:
         """The values of functions without a reduction and the running values of reductions, in tree
         order, at a save point after a step with these ends."""
         # A running value is NaN after a failure: the reduction still has that of the steps before.
         memories, values = iter(carry.reductions), []
-        for f in self._leaves():
-            if isinstance(f, Running):
-                value = self.finish(f.reduction, next(memories))
+        for leaf in self._leaves():
+            if isinstance(leaf, Running):
+                value = self.finish(leaf.reduction, next(memories))
                 values.append(or_nan(carry.result == RESULTS.successful, value))
-            elif isinstance(f, Reduction):
+            elif isinstance(leaf, Reduction):
                 next(memories)
             else:
                 assert ends is not None
-                values.append(ends.value(self.bound(f), self.args))
+                values.append(ends.value(self.bound(leaf), self.args))
         return values
 
     def evaluate(self, reduction: Reduction, function: Callable, *args: Any) -> Any:
@@ -100,12 +100,12 @@ class Task(eqx.Module):
     @property
     def has_running_values(self) -> bool:
         """Whether a reduction has a value at every save point."""
-        return any(isinstance(f, Running) for f in self._leaves())
+        return any(isinstance(leaf, Running) for leaf in self._leaves())
 
     @property
     def has_deviations(self) -> bool:
         """Whether a reduction follows deviation vectors, for which steps are differentiated."""
-        return any(isinstance(r, Deviations) for r in self.observables()[1])
+        return any(isinstance(reduction, Deviations) for reduction in self.observables()[1])
 
     def bound(self, observable: Callable) -> Callable:
         """The observable, bound to the system and ε if it requires them."""

@@ -326,7 +326,11 @@ def fit_corner(
 def _of_parameters(fit: Any, params: Sequence[str] | None) -> tuple[list[int], np.ndarray]:
     """(numbers of the parameters that are drawn, values of all), checked."""
     names, variances = list(fit.names), np.diag(np.asarray(fit.covariance))
-    determinate = [n for n, v in zip(names, variances, strict=True) if np.isfinite(v) and v > 0]
+    determinate = [
+        n
+        for n, variance in zip(names, variances, strict=True)
+        if np.isfinite(variance) and variance > 0
+    ]
     if params is None:
         draw.at_most(_PARAMETERS, len(names), "parameters", f"params={names[:3]}")
     params = names if params is None else [params] if isinstance(params, str) else [*params]

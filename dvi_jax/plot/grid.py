@@ -260,7 +260,7 @@ def arrange(
 def two_numbers(values: Any) -> tuple[float, float]:
     """Two numbers; NaN, which fails every comparison, for anything else."""
     try:
-        first, second = (float(v) for v in values)
+        first, second = (float(value) for value in values)
     except (TypeError, ValueError):
         return np.nan, np.nan
     return first, second
@@ -276,7 +276,9 @@ def _panels(data: Any, facet: str | None) -> list[tuple[str, Any]]:
     coordinate = data.coords.get(facet)
     name, _, units = label_of(coordinate, facet).partition(" [")
     values = np.arange(count) if coordinate is None else coordinate.values
-    texts = [f"{v:.4g}" if np.issubdtype(type(v), np.number) else str(v) for v in values]
+    texts = [
+        f"{value:.4g}" if np.issubdtype(type(value), np.number) else str(value) for value in values
+    ]
     tail = f" {units.rstrip(']')}" if units else ""
     return [(f"{name} = {t}{tail}", data.isel({dim: i})) for i, t in enumerate(texts)]
 

@@ -163,7 +163,7 @@ def _points_of(crossings: Any) -> _Points:
             f"got type {type(crossings).__name__} with {len(pairs)}."
         )
     ((crossing, status),) = pairs
-    qs, ps, ts = (np.asarray(v) for v in (crossing.qs, crossing.ps, crossing.ts))
+    qs, ps, ts = (np.asarray(column) for column in (crossing.qs, crossing.ps, crossing.ts))
     fits = ts.ndim and qs.shape[: ts.ndim] == ts.shape and qs.shape == ps.shape
     rule = "crossings must have ts of shape (..., n), and qs and ps of shape (..., n, *state)"
     check_shapes(fits, rule, ts=ts, qs=qs, ps=ps)

@@ -48,16 +48,16 @@ _NEAR_ROUNDING = 1e-12
 
 
 def draw_series(
-    axis: Any, t: np.ndarray, v: np.ndarray, label: str, log: bool = False, **look: Any
+    axis: Any, t: np.ndarray, values: np.ndarray, label: str, log: bool = False, **look: Any
 ) -> dict[str, int]:
     """One line along time through the values that have a place on the axis; counts the others.
 
     Long series are drawn by the extremes of each piece.
     """
-    masks = {"are not finite": ~np.isfinite(v)}
+    masks = {"are not finite": ~np.isfinite(values)}
     if log:
-        masks |= {"are exactly 0": v == 0, "are below 0": v < 0}
-    numbers = np.where(np.logical_or.reduce(list(masks.values())), np.nan, v)
+        masks |= {"are exactly 0": values == 0, "are below 0": values < 0}
+    numbers = np.where(np.logical_or.reduce(list(masks.values())), np.nan, values)
     axis.plot(*envelope(t, numbers), label=label or None, **look)
     return {text: int(mask.sum()) for text, mask in masks.items()}
 
@@ -189,16 +189,20 @@ def _read(
                 quantities[name] = [
                     row for part, table in pairs for row in _rows(name, table, part)
                 ]
-    for name, v in (values or {}).items():
-        if callable(v):
+    for name, column in (values or {}).items():
+        if callable(column):
             check_momenta(lanes)
-            quantities[name] = [each_state(v, lane.qs, lane.ps) for lane in lanes]
+            quantities[name] = [each_state(column, lane.qs, lane.ps) for lane in lanes]
         elif not isinstance(orbits, list):
-            quantities[name] = _rows(name, {name: v}, orbits)
-        elif isinstance(v, list) and len(v) == len(lanes):
-            quantities[name] = [np.asarray(x) for x in v]
+            quantities[name] = _rows(name, {name: column}, orbits)
+        elif isinstance(column, list) and len(column) == len(lanes):
+            quantities[name] = [np.asarray(x) for x in column]
         else:
-            kind = f"list of length {len(v)}" if isinstance(v, list) else type(v).__name__
+            kind = (
+                f"list of length {len(column)}"
+                if isinstance(column, list)
+                else type(column).__name__
+            )
             raise ValueError(
                 f"values[{name!r}] must be a function (q, p), or a list of {len(lanes)} arrays, of "
                 f"one for each orbit, got {kind}."
@@ -281,9 +285,9 @@ def conserved(ts: Any, series: Mapping[str, Any], time: str, title: str, ax: Any
     looks = itertools.cycle(zip(COLOURS, DASHES, strict=True))
     for (label, values), (colour, dash) in zip(series.items(), looks, strict=False):
         # The change at the start is 0 by definition and is left out.
-        t, v = (x[1:] for x in _pair(ts, values, label))
-        counts = draw_series(axis, t, v, label, True, color=colour, ls=dash, lw=0.9)
-        texts = counts_text({f"of {len(v)} {cause}": n for cause, n in counts.items()})
+        t, column = (x[1:] for x in _pair(ts, values, label))
+        counts = draw_series(axis, t, column, label, True, color=colour, ls=dash, lw=0.9)
+        texts = counts_text({f"of {len(column)} {cause}": n for cause, n in counts.items()})
         notes += [f"{label}: {text}" for text in texts]
     _rounding(axis)
     axis.set(xlabel=time, ylabel="relative change since the start |ΔI/I$_0$|", title=title)

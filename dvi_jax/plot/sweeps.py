@@ -94,7 +94,7 @@ def sweep_map(
     grid = arrange(data, x, y, settings)
     label = label_of(data, data.name or "value")
     fewer = any(len(place.centres) < place.bins.size for place in grid.places)
-    if fewer or any(data.sizes[d] > 1 for d in grid.reduced_dims):
+    if fewer or any(data.sizes[dim] > 1 for dim in grid.reduced_dims):
         label = f"{REDUCTIONS[reduce]} {label}"
     pictures = [reduce_to_pixels(panel, grid.bins, reduce) for _, panel in grid.panels]
     counts = None if status is None else _count_beside(status, grid)

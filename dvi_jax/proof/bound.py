@@ -1,10 +1,8 @@
 """`bound_drift`: a proved bound of how much invariants change, for all starts of a domain."""
 
-import functools
 from collections.abc import Callable, Sequence
 from typing import Any, TypedDict, Unpack
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -12,20 +10,15 @@ from ..base.checks import finite, positive, whole
 from ..base.keywords import checked_keywords
 from ..base.machine import processors
 from ..base.precision import refuse_double_without_x64
-from ..base.signature import accepts
-from ..base.types import Interval
 from ..discover.functions.basis import check_step_size
 from ..discover.invariants.discovery import Discovery
 from ..discover.invariants.series import InvariantSeries
 from ..integration.arithmetic import Arithmetic, DoubleDouble, FixedPoint, FloatingPoint
 from ..integration.integrator import Integrator, chosen, only
 from ..methods import Method
-from ..methods.step import Equations
-from ..problem.system import System, check_system, of_problem
-from .comparison import compare, random_points
-from .components import NotAnalytic, program_of
+from ..problem.system import check_system, of_problem
 from .confinement import confine
-from .rational import ExactInvariant
+from .programs import Region, functions_of, programs_of
 from .result import DriftBound, tools
 from .workers import Workers
 
@@ -145,11 +138,15 @@ def bound_drift(
     shape, (lower, upper) = _domain(domain, found)
     strengths = _interval("epsilon", epsilon)
     times = None if time is None else _interval("time", time)
-    functions = _functions(found, system, time is not None)
-    points = _points_of(shape, (lower, upper), times, strengths, h, inside)
-    step_map, programs = _step_of(system, integrator, shape, args, h, times, points)
-    digits = "pairs of float64" if isinstance(integrator.arithmetic, DoubleDouble) else "float64"
-    invariants = [_program(f"the invariant {name}", f, points[:5], 0) for f, name in functions]
+    region = Region(shape, (lower, upper), times or (0.0, 0.0), strengths, h, time is not None)
+    functions = functions_of(found, system, region.is_timed)
+    points = region.points(inside)
+    if not len(points[0]):
+        raise ProofError(
+            "inside(q, p) must be ≥ 0 somewhere in the domain, but is negative for all of 4096 "
+            "random states. Use a smaller domain around those that you mean."
+        )
+    step_map, programs = programs_of(system, integrator, args, functions, inside, region, points)
     n, t = len(lower) // 2, ["input", len(lower)]
     certificate = {
         "format": exact.FORMAT,
@@ -158,21 +155,19 @@ def bound_drift(
         "epsilon": [x.hex() for x in strengths],
         "time": [x.hex() for x in times or (0.0, 0.0)],
         "slow": system.slow_time,
-        "timed": any(t in p["operations"] for p in (programs["step"], *invariants)),
+        "timed": any(t in p["operations"] for p in (programs["step"], *programs["invariants"])),
         "domain": [[x.hex() for x in side] for side in (lower, upper)],
-        "inside": _program("inside", inside or (lambda q, p: jnp.zeros(0)), points[:2], None),
-        "invariants": invariants,
-        "arithmetic": digits,
         "bits": 100,
         "orders": 24 if n < 2 else 10 if n < 3 else 8,  # of the expansion of a function
-        "accepted": (_RESIDUAL[digits] * max(map(abs, (*lower[n:], *upper[n:])))).hex(),
+        "accepted": (
+            _RESIDUAL[programs["arithmetic"]] * max(map(abs, (*lower[n:], *upper[n:])))
+        ).hex(),
         "spread": [(0.0).hex()] * n,
         "start": (times or (0.0, 0.0))[0].hex(),
         "example": [float(x).hex() for x in np.concatenate([np.ravel(x[0]) for x in points[:4]])],
     }
     if certificate["implicit"]:
-        sides = lower, upper
-        certificate["spread"] = _spread(step_map, shape, sides, strengths, times, h)
+        certificate["spread"] = _spread(step_map, region)
     checker = exact.Checker(certificate)
     estimates = search.estimate(checker)
     identities = frozenset(k for k, s in enumerate(estimates) if s == 0 and checker.is_identity(k))
@@ -214,162 +209,14 @@ def bound_drift(
     )
 
 
-class _WithErrors(Equations):
-    """Equations of which each increment has an error."""
-
-    error: Any = 0.0
-
-    def increment(self, h: Any, rate: Any) -> Any:
-        return h * rate + self.error
-
-
-def _points_of(
-    shape: Any, sides: tuple, times: tuple | None, strengths: tuple, h: float, inside: Any
-) -> list[np.ndarray]:
-    """Points (q, p, t, ε, h, error of an increment) of the domain for comparisons."""
-    (q_low, p_low), (q_high, p_high) = (np.reshape(side, (2, *shape)) for side in sides)
-    times = times or (0.0, 0.0)
-    ends = [(q_low, q_high), (p_low, p_high), times, strengths, (h, h), (-1e-9, 1e-9)]
-    if inside is None:
-        return random_points(ends)
-    points = random_points(ends, lambda q, p, *_: jnp.all(jnp.asarray(inside(q, p)) >= 0))
-    if not len(points[0]):
-        raise ProofError(
-            "inside(q, p) must be ≥ 0 for some states of the domain, but is negative for all of "
-            "4096 random ones. Use a smaller domain around them."
-        )
-    return points
-
-
-def _step_of(
-    system: System,
-    integrator: Integrator,
-    shape: Any,
-    args: Any,
-    h: float,
-    times: tuple | None,
-    points: list[np.ndarray],
-) -> tuple[Callable, dict[str, Any]]:
-    """The step, a function of (q, p, t, ε, h), and what the certificate has about it: the list of
-    operations, of (q0, p0), or of (q0, p1) if it is implicit. Without `times` it is that at t = 0.
-    """
-    method = integrator.method_for(system)
-    explicit = method.is_explicit(system, jnp.zeros(shape), args)
-    if not (explicit or method.is_the_map):
-        raise ValueError(
-            f"method must be dvi.TypeII() or explicit for this system, got {method!r}."
-        )
-    plain = System(system.H_D, system.force, system.perturbation)
-    start, number = jnp.full(shape, 0.1), jnp.asarray(0.1)
-    equations = Equations(plain, number, args)
-    first_interval = functools.partial(Interval, 0 * number, number, number)
-    integrator.arithmetic.prepare(method, equations, first_interval, start, start)
-    quantum = getattr(integrator.arithmetic, "quantum", 0.0)
-
-    def step_map(q, p, t, epsilon, h, error=0.0):
-        equations = _WithErrors(plain, epsilon, args, error=error)
-        interval = Interval(t, t + (epsilon * h if system.slow_time else h), h)
-        if explicit:
-            return method.step(equations, interval, q, p)[:2]
-        rate = h * equations.momentum_rate(interval, q, p)
-        return rate, q + h * equations.position_rate(interval, q, p)
-
-    step_of_states = jax.vmap(step_map, (0, 0, 0, 0, None))
-    if times is None:
-        q, p = np.random.default_rng(0).uniform(0.1, 0.2, (2, 8, *shape))
-        epsilon, step = np.full(8, 0.1), jnp.asarray(h)
-        first, later = (step_of_states(q, p, np.full(8, t), epsilon, step) for t in (0.0, 1.0))
-        is_constant = np.allclose(first, later, rtol=1e-12, atol=1e-12, equal_nan=True)
-        _require_time(is_constant, "the map")
-    zero = jnp.zeros(())
-
-    def step_at_zero(q, p, t, *numbers):
-        return step_map(q, p, zero, *numbers)
-
-    step = step_map if times else step_at_zero
-    program = _program("the step of the system", step, points[: 6 if quantum else 5], None)
-    return step_of_states, {
-        "step": program,
-        "implicit": not explicit,
-        "quantum": float(quantum).hex(),
-    }
-
-
-def _spread(
-    step_map: Callable, shape: Any, sides: tuple, strengths: tuple, times: tuple | None, h: float
-) -> list[str]:
+def _spread(step_map: Callable, region: Region) -> list[str]:
     """A guess of how far p1 is from p0 in an implicit step; the checker decides."""
-    rng, size = np.random.default_rng(0), int(np.prod(shape))
-    low, high = sides
-    z = rng.uniform(low, high, (4000, 2 * size)).reshape(4000, 2, *shape)
-    t, epsilon = rng.choice(times or (0.0, 0.0), 4000), rng.choice(strengths, 4000)
-    moves = np.abs(step_map(z[:, 0], z[:, 1], t, epsilon, jnp.asarray(h))[0])
+    rng, size = np.random.default_rng(0), int(np.prod(region.shape))
+    low, high = region.sides
+    z = rng.uniform(low, high, (4000, 2 * size)).reshape(4000, 2, *region.shape)
+    t, epsilon = rng.choice(region.times, 4000), rng.choice(region.strengths, 4000)
+    moves = np.abs(step_map(z[:, 0], z[:, 1], t, epsilon, jnp.asarray(region.h))[0])
     return [float(m).hex() for m in 1.3 * np.nanmax(moves, axis=0).ravel() + 1e-12]
-
-
-def _functions(invariants: Any, system: System, with_time: bool) -> list[tuple[Callable, str]]:
-    """(function of (q, p, t, ε, h), formula) for each invariant."""
-    if isinstance(invariants, Discovery):
-        invariants = list(invariants.invariants)
-    if isinstance(invariants, InvariantSeries):
-        _require_time(with_time or not invariants.basis.uses_time, "an invariant")
-        if invariants.basis.uses_time and invariants.slow_time != system.slow_time:
-            raise ValueError(
-                f"found and system must have one slow_time, got {invariants.slow_time} and "
-                f"{system.slow_time}."
-            )
-        return [
-            (
-                lambda q, p, t, epsilon, h: invariants.evaluate(q, p, epsilon, t),
-                invariants.formula(terms=8),
-            )
-        ]
-    if isinstance(invariants, ExactInvariant):
-        return [
-            (lambda q, p, t, epsilon, h: invariants.evaluate(q, p, epsilon, h, t), str(invariants))
-        ]
-    if isinstance(invariants, str) or not (callable(invariants) or np.iterable(invariants)):
-        raise TypeError(
-            "found must be a Discovery, InvariantSeries, ExactInvariant, a function (q, p, "
-            f"epsilon[, t]) or a list of these, got {invariants!r:.200}."
-        )
-    if callable(invariants):
-        name = getattr(invariants, "__name__", type(invariants).__name__)
-        if accepts(invariants, 4) and (with_time or not accepts(invariants, 3)):
-            return [(lambda q, p, t, epsilon, h: invariants(q, p, epsilon, t), name)]
-        return [(lambda q, p, t, epsilon, h: invariants(q, p, epsilon), name)]
-    pairs = [pair for item in invariants for pair in _functions(item, system, with_time)]
-    if not pairs:
-        raise ValueError(
-            "found must have at least one invariant, got none: use more functions or a lower order."
-        )
-    return pairs
-
-
-def _require_time(fits: Any, subject: str) -> None:
-    if not fits:
-        raise ValueError(
-            f"{subject} depends on the time: give time=(t_begin, t_end) of the steps, of τ = εt "
-            "with slow_time=True."
-        )
-
-
-def _program(subject: str, function: Callable, points: list, ndim: int | None) -> dict[str, Any]:
-    """The operations of a function, whose result must have so many axes (None: any), compared with
-    the function at points."""
-    shapes = [column.shape[1:] for column in points]
-    structs = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes]
-    result = jax.eval_shape(function, *structs)
-    if ndim is not None and getattr(result, "ndim", None) != ndim:
-        kind = f"a {type(result).__name__}"
-        description = f"shape {result.shape}" if hasattr(result, "shape") else kind
-        raise ValueError(f"{subject} must return one number, got {description}.")
-    try:
-        program = program_of(function, *shapes)
-    except NotAnalytic as error:
-        raise NotAnalytic(f"{subject}: {error}") from None
-    compare(subject, function, program, points)
-    return program
 
 
 def _domain(

@@ -53,7 +53,11 @@ def to_netcdf(dataset: Any, boxes: Iterator[dict[str, slice]], path: Any, force:
                     array[...] = variable.values.astype(object) if is_text else variable.values
                 elif auxiliary:
                     dims = set(variable.dims)
-                    coordinates = " ".join(n for n in auxiliary if set(dataset[n].dims) <= dims)
+                    coordinates = " ".join(
+                        coordinate
+                        for coordinate in auxiliary
+                        if set(dataset[coordinate].dims) <= dims
+                    )
                     array.attrs["coordinates"] = coordinates or " "
             for box in boxes:
                 for name in dataset.data_vars:
@@ -75,7 +79,7 @@ def to_parquet(dataset: Any, boxes: Iterator[dict[str, slice]], path: Any, force
         for box in boxes:
             table = pa.table(_columns(dataset.isel(box), list(box)))
             if writer is None:
-                metadata = {k: str(v) for k, v in dataset.attrs.items()}
+                metadata = {k: str(value) for k, value in dataset.attrs.items()}
                 schema = table.schema.with_metadata(metadata)
                 writer = stack.enter_context(pq.ParquetWriter(temporary, schema))
             writer.write_table(table.replace_schema_metadata(writer.schema.metadata))

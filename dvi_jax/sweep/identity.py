@@ -75,7 +75,10 @@ def description(
         "dims": dict(plan.dims),
         "axes": axes,
         "chunk": list(plan.chunk),
-        "variables": {n: [v.dtype, list(v.shape), list(v.dims)] for n, v in variables.items()},
+        "variables": {
+            n: [variable.dtype, list(variable.shape), list(variable.dims)]
+            for n, variable in variables.items()
+        },
     }
 
 
@@ -146,11 +149,13 @@ class Describer:
         if isinstance(x, np.ndarray | np.generic | jax.Array):
             return _of_array(np.asarray(x))
         if isinstance(x, Mapping):
-            return {str(k): self(v) for k, v in x.items()}
+            return {str(k): self(value) for k, value in x.items()}
         if isinstance(x, list | tuple):
-            return [self(v) for v in x]
+            return [self(value) for value in x]
         if dataclasses.is_dataclass(x) and not isinstance(x, type):
-            fields = {f.name: self(getattr(x, f.name, None)) for f in dataclasses.fields(x)}
+            fields = {
+                field.name: self(getattr(x, field.name, None)) for field in dataclasses.fields(x)
+            }
             code = {"function": self.function(x)} if callable(x) else {}
             return {"is": type(x).__qualname__, **fields, **code}
         if isinstance(x, type):
@@ -159,30 +164,32 @@ class Describer:
             return self.function(x)
         return {"is": type(x).__qualname__, "repr": _VOLATILE.sub("", repr(x))}
 
-    def function(self, f: Callable[..., Any]) -> str:
+    def function(self, subject: Callable[..., Any]) -> str:
         """The hash of what a function computes, or of its code where it cannot be traced alone."""
-        number_required = _arity(f)
-        for count in sorted(_SIGNATURES, key=lambda n: n != number_required):
-            if not accepts(f, count):
+        number_required = _arity(subject)
+        for count in sorted(
+            _SIGNATURES, key=lambda count_of_arguments: count_of_arguments != number_required
+        ):
+            if not accepts(subject, count):
                 continue
             try:
                 arguments = _SIGNATURES[count](self.t, self.state, self.args)
                 dynamic, static = eqx.partition(arguments, eqx.is_array)
-                jaxpr = jax.make_jaxpr(lambda d, s=static: f(*eqx.combine(d, s)))(dynamic)
+                jaxpr = jax.make_jaxpr(lambda d, s=static: subject(*eqx.combine(d, s)))(dynamic)
             except Exception:  # another kind of function; `integrate` reports errors in it
                 continue
             return f"computes {_hash(jaxpr)}"
         try:
-            code = inspect.getsource(f)
+            code = inspect.getsource(subject)
         except (OSError, TypeError):
-            code = _VOLATILE.sub("", repr(f))
+            code = _VOLATILE.sub("", repr(subject))
         return f"code {hashlib.sha256(code.encode()).hexdigest()[:16]}"
 
 
-def _arity(f: Callable[..., Any]) -> int:
+def _arity(function: Callable[..., Any]) -> int:
     """Number of arguments without default; constants of a function are often defaults."""
     try:
-        parameters = inspect.signature(f).parameters.values()
+        parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):
         return -1
     return sum(p.kind <= p.POSITIONAL_OR_KEYWORD and p.default is p.empty for p in parameters)

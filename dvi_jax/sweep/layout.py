@@ -80,7 +80,7 @@ def shard(plan: SweepPlan, variable: Variable, task: SweepTask, values: np.ndarr
     files: dict[str, Any] = {}
     shape = (*plan.chunk, *variable.shape)
     array = zarr.create_array(MemoryStore(files), shape=shape, **layout(plan.chunk, variable))
-    array[tuple(slice(n) for n in task.size)] = values
+    array[tuple(slice(size) for size in task.size)] = values
     (content,) = (x for key, x in files.items() if key.startswith("c/"))
     return content.to_bytes()
 

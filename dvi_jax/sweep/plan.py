@@ -48,8 +48,8 @@ class SweepPlan:
     chunk: tuple[int, ...]
 
     def __post_init__(self):
-        for name, n in (*self.dims.items(), *(("chunk", n) for n in self.chunk)):
-            whole(name, n)
+        for name, size in (*self.dims.items(), *(("chunk", size) for size in self.chunk)):
+            whole(name, size)
         if len(self.dims) != len(self.chunk):
             raise ValueError(f"chunk must have one size for each of {[*self.dims]}: {self.chunk}.")
 
@@ -69,7 +69,7 @@ class SweepPlan:
     @property
     def counts(self) -> tuple[int, ...]:
         """Boxes along each dimension."""
-        return tuple(-(-n // c) for n, c in zip(self.shape, self.chunk, strict=True))
+        return tuple(-(-size // c) for size, c in zip(self.shape, self.chunk, strict=True))
 
     @property
     def num_tasks(self) -> int:

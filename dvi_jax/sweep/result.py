@@ -143,7 +143,7 @@ class SweepResult:
         return (dict(zip(self.dims, t.box, strict=True)) for t in self._plan.tasks())
 
     def __repr__(self) -> str:
-        grid = " × ".join(f"{name} {n}" for name, n in self.dims.items())
+        grid = " × ".join(f"{name} {size}" for name, size in self.dims.items())
         tasks = f"{self.tasks_done} of {self.num_tasks} tasks done"
         names = ", ".join(self._source.variables)
         where = f", in {self.path}" if self.path is not None else ""

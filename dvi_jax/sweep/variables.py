@@ -43,7 +43,7 @@ class Variable:
 def variables(sweep: Sweep, shapes: Mapping[str, Any]) -> dict[str, Variable]:
     """The arrays of a result, with names for their own dimensions."""
     leaves = jax.tree.leaves_with_path(sweep.options["observe"], is_leaf=is_observable)
-    observables = [(place(path) or "observed", f) for path, f in leaves]
+    observables = [(place(path) or "observed", observable) for path, observable in leaves]
     names = [name for name, _ in observables]
     for name in names:
         check_array_name("the observable", name)
@@ -59,7 +59,9 @@ def variables(sweep: Sweep, shapes: Mapping[str, Any]) -> dict[str, Variable]:
     # than states, except for `Save(ts=...)`.
     save = sweep.options["save"]
     rows = "save" if save is not None and save.ts is not None else "saved_step"
-    first = {name: rows for name, f in observables if not isinstance(f, Reduction)}
+    first = {
+        name: rows for name, observable in observables if not isinstance(observable, Reduction)
+    }
     first |= dict.fromkeys("tqp", "save")
     arrays = {}
     for name, array in shapes.items():

@@ -112,8 +112,8 @@ def markdown(
     parts = [f"## {table.title}\n\n{_as_markdown(table)}" for table in sheets]
     if failures:
         faults = [
-            f"- {method}, {c}: {result.verdict}, allowed {result.allowed}. {result.detail}"
-            for method, c, result in failures
+            f"- {method}, {check}: {result.verdict}, allowed {result.allowed}. {result.detail}"
+            for method, check, result in failures
         ]
         parts.append("\n".join(["## Failures\n", *faults]))
     template = Path(__file__).with_name("page.md").read_text(encoding="utf-8")
@@ -122,7 +122,7 @@ def markdown(
         summary="\n".join(f"- {line}" for line in summary.splitlines()),
         versions=f"{versions}, Python {python}",
         tables="\n\n".join(parts),
-        legend="\n".join(f"- **{n}**: {c.says}" for n, c in CHECKS.items() if n in checks),
+        legend="\n".join(f"- **{n}**: {check.says}" for n, check in CHECKS.items() if n in checks),
     )
 
 

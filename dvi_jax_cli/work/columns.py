@@ -30,7 +30,11 @@ def read_columns(path: Path, key: str = "data.file") -> dict[str, np.ndarray]:
 def _npz(path: Path) -> dict[str, np.ndarray]:
     with np.load(path, allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
-    return {n: a for n, a in arrays.items() if a.ndim and np.issubdtype(a.dtype, np.number)}
+    return {
+        n: array
+        for n, array in arrays.items()
+        if array.ndim and np.issubdtype(array.dtype, np.number)
+    }
 
 
 def _csv(path: Path, key: str) -> dict[str, np.ndarray]:

@@ -17,11 +17,11 @@ def public(base: type, *exclusions: type) -> dict[str, type]:
     """The public classes of the package that are subclasses of `base`, by name."""
     # `dvi_jax` has some of its names after their first use only: the folder of `base` has them.
     folder = sys.modules[".".join(base.__module__.split(".")[:2])]
-    classes = {n: c for n, c in {**vars(dvi), **vars(folder)}.items() if isinstance(c, type)}
+    classes = {name: c for name, c in {**vars(dvi), **vars(folder)}.items() if isinstance(c, type)}
     return {
-        n: c
-        for n, c in classes.items()
-        if issubclass(c, base) and c is not base and c not in exclusions and hasattr(dvi, n)
+        name: c
+        for name, c in classes.items()
+        if issubclass(c, base) and c is not base and c not in exclusions and hasattr(dvi, name)
     }
 
 
@@ -95,7 +95,7 @@ class Expressions:
         if any(k.arg is None for k in keywords):
             raise self.error(f"{name!r} has an argument with **, not name=value")
         options = {str(k.arg): self._evaluate(k.value) for k in keywords}
-        return self.classes[name](*(self._evaluate(a) for a in arguments), **options)
+        return self.classes[name](*(self._evaluate(argument) for argument in arguments), **options)
 
 
 def parse_method(text: str) -> dvi.Method:

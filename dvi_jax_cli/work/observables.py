@@ -26,8 +26,14 @@ def read_observables(texts: dict[str, str] | None, source: Source) -> dict[str, 
     """
     defaults = dict(source.problem.observables) if source.problem is not None else {}
     if texts is None:
-        return {**defaults, **{f"{name}_drift": dvi.MaxDrift(f) for name, f in defaults.items()}}
-    return {n: _observable(f"observables.{n}", text, defaults, source) for n, text in texts.items()}
+        return {
+            **defaults,
+            **{f"{name}_drift": dvi.MaxDrift(function) for name, function in defaults.items()},
+        }
+    return {
+        key: _observable(f"observables.{key}", text, defaults, source)
+        for key, text in texts.items()
+    }
 
 
 def _observable(key: str, text: str, names: dict[str, Callable], source: Source) -> Any:

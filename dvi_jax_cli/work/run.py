@@ -122,12 +122,14 @@ def _describe(
 
 
 def _row(name: str, observable: Observed) -> list[str]:
-    s = observable.summary()
+    summary = observable.summary()
     if observable.reduction:
-        relative = f"{s['relative']:.2e}" if "relative" in s and observable.is_relative else ""
-        return [name, observable.reduction, "", _number(s["value"], 4), relative]
-    change = f"{s['largest_saved_change']:.2e}"
-    return [name, "", _number(s["start"]), _number(s["end"]), change]
+        relative = (
+            f"{summary['relative']:.2e}" if "relative" in summary and observable.is_relative else ""
+        )
+        return [name, observable.reduction, "", _number(summary["value"], 4), relative]
+    change = f"{summary['largest_saved_change']:.2e}"
+    return [name, "", _number(summary["start"]), _number(summary["end"]), change]
 
 
 def _number(value: Any, limit: int = 0) -> str:

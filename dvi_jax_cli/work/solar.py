@@ -132,7 +132,10 @@ def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
 
 def conserved_observables() -> dict[str, Any]:
     """Observables of every run of the solar system: all that is conserved, and its drift."""
-    return {**OBSERVABLES, **{f"{name}_drift": dvi.MaxDrift(f) for name, f in OBSERVABLES.items()}}
+    return {
+        **OBSERVABLES,
+        **{f"{name}_drift": dvi.MaxDrift(function) for name, function in OBSERVABLES.items()},
+    }
 
 
 def report(

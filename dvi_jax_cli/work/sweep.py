@@ -140,7 +140,9 @@ def _statistics(result: dvi.SweepResult) -> dict[str, dict[str, float]]:
         values = values[np.isfinite(values)]
         if values.size:
             functions = {"min": np.min, "median": np.median, "max": np.max}
-            statistics[name] = {word: float(f(values)) for word, f in functions.items()}
+            statistics[name] = {
+                word: float(function(values)) for word, function in functions.items()
+            }
     return statistics
 
 
@@ -222,7 +224,8 @@ def _observe(file: SweepFile, source: Source) -> dict[str, Any] | None:
     fits, rule = observables or file.save is not None, 'at least one observable, or save = "final"'
     require(fits, "observables", "nothing would be saved", rule)
     reductions = {
-        n: f if isinstance(f, dvi.Reduction) else dvi.Last(f) for n, f in observables.items()
+        name: function if isinstance(function, dvi.Reduction) else dvi.Last(function)
+        for name, function in observables.items()
     }
     return reductions or None
 

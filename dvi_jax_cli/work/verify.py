@@ -42,3 +42,16 @@ def verify_certificate(path: Path, max_seconds: float) -> tuple[dict[str, Any], 
         return {"certificate": str(path), "proved": text}, ""
     text = text or "the system ended the check, which needs more than 1 GiB or makes FLINT fail"
     return {"certificate": str(path), "proved": None}, f"not proved: {text}"
+
+
+def compare_system(certificate: Path, system: str, method: str) -> tuple[dict[str, Any], str]:
+    """Whether a certificate is about the system ``file.py:name``, and the message if it is not."""
+    from dvi_jax import holds_for
+
+    from .loader import Loader
+
+    path, _, name = system.rpartition(":")
+    loaded = Loader(Path(path).parent).load("--system", f"{Path(path).name}:{name}")
+    binding = holds_for(loaded, certificate, method=method or None)
+    contents = {"system": system, "text": str(binding), **binding._asdict()}
+    return contents, "" if binding else f"the certificate is not about {system}"

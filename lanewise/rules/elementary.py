@@ -15,24 +15,28 @@ from ..llvm.values import Value, objects
 from ..module import Module
 
 
-def elementary(e: Evaluator, name: str, args: Sequence[Num]) -> Num:
+def elementary(evaluator: Evaluator, name: str, args: Sequence[Num]) -> Num:
     """An elementary function of float64, as a call of a function of the module."""
     vec = any(a.vec for a in args)
     numbers: list[Any] = [a.value for a in args]
     if all(number is not None for number in numbers):
-        return e.b.const(_at_known(name, tuple(float(number) for number in numbers)), "float64")
-    function = _function(e.module, name, len(args), vec)
-    return e.b.op(f"call {name}", args, "float64", lambda kind, *xs: call_of(function, kind, xs))
+        return evaluator.b.const(
+            _at_known(name, tuple(float(number) for number in numbers)), "float64"
+        )
+    function = _function(evaluator.module, name, len(args), vec)
+    return evaluator.b.op(
+        f"call {name}", args, "float64", lambda kind, *xs: call_of(function, kind, xs)
+    )
 
 
-def sincos(e: Evaluator, x: Num) -> tuple[Num, Num]:
+def sincos(evaluator: Evaluator, x: Num) -> tuple[Num, Num]:
     """sin x and cos x in one call."""
-    b = e.b
+    b = evaluator.b
     if x.value is not None:
-        return elementary(e, "sin", [x]), elementary(e, "cos", [x])
+        return elementary(evaluator, "sin", [x]), elementary(evaluator, "cos", [x])
 
     def make() -> tuple[Num, ...]:
-        function, kind = _function(e.module, "sincos", 1, x.vec), b.type("float64", x.vec)
+        function, kind = _function(evaluator.module, "sincos", 1, x.vec), b.type("float64", x.vec)
         pair = f"{{{kind}, {kind}}}"
         calls = [b.new(f"call {pair} {function}({kind} {name})") for name in x.names]
         b.operations += 2
@@ -52,13 +56,19 @@ def _function(module: Module, name: str, count: int, vec: bool) -> str:
     return symbol
 
 
-def sine_or_cosine(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+def sine_or_cosine(
+    evaluator: Evaluator, eqn: Any, values: list[Value], places: list
+) -> list[Value]:
     """sin x or cos x of an x of which both are needed."""
     index = 0 if eqn.primitive.name == "sin" else 1
     (value,), (out,) = values, eqn.outvars
     if not value.is_small or value.dtype != "float64":
-        return e.equation(eqn, values, places)
-    return [e.value([sincos(e, x)[index] for x in e.entries(value).flat], out.aval)]
+        return evaluator.equation(eqn, values, places)
+    return [
+        evaluator.value(
+            [sincos(evaluator, x)[index] for x in evaluator.entries(value).flat], out.aval
+        )
+    ]
 
 
 def _by_name(name: str) -> Callable:

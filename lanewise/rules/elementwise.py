@@ -22,19 +22,28 @@ def _method(name: str, *first: Any) -> Callable:
     return lambda e, _, *xs: getattr(e.b, name)(*first, *xs)
 
 
-def _equal(e: Evaluator, _: Any, x: Num, y: Num) -> Num:
+def _equal(evaluator: Evaluator, _: Any, x: Num, y: Num) -> Num:
     """A loop's counter equals a given number in one round: taken for rare."""
-    is_equal = e.b.compare("eq", x, y)
+    is_equal = evaluator.b.compare("eq", x, y)
     # A number that changes and is the same on all trajectories of a batch is a counter.
-    is_count = e.b.W > 1 and assumed_value(is_equal) is None and not is_equal.vec and not x.is_float
-    if e.assumptions is not None and is_count and (x.value is not None or y.value is not None):
-        e.assumptions.assume_false(is_equal)
-        return assumed_number(e.b, 0, "bool")
+    is_count = (
+        evaluator.b.W > 1
+        and assumed_value(is_equal) is None
+        and not is_equal.vec
+        and not x.is_float
+    )
+    if (
+        evaluator.assumptions is not None
+        and is_count
+        and (x.value is not None or y.value is not None)
+    ):
+        evaluator.assumptions.assume_false(is_equal)
+        return assumed_number(evaluator.b, 0, "bool")
     return is_equal
 
 
-def _select(e: Evaluator, _: Any, condition: Num, *cases: Num) -> Num:
-    b = e.b
+def _select(evaluator: Evaluator, _: Any, condition: Num, *cases: Num) -> Num:
+    b = evaluator.b
     if condition.dtype == "bool":
         assumption = None if condition.value is not None else assumed_value(condition)
         if assumption is not None:
@@ -47,12 +56,12 @@ def _select(e: Evaluator, _: Any, condition: Num, *cases: Num) -> Num:
     return result
 
 
-def _clamp(e: Evaluator, _: Any, low: Num, x: Num, high: Num) -> Num:
-    return e.b.maximum(e.b.maximum(x, low), high, "lt")
+def _clamp(evaluator: Evaluator, _: Any, low: Num, x: Num, high: Num) -> Num:
+    return evaluator.b.maximum(evaluator.b.maximum(x, low), high, "lt")
 
 
-def _sign(e: Evaluator, _: Any, x: Num) -> Num:
-    b, zero = e.b, e.b.const(0, x.dtype)
+def _sign(evaluator: Evaluator, _: Any, x: Num) -> Num:
+    b, zero = evaluator.b, evaluator.b.const(0, x.dtype)
     if x.dtype.startswith("u"):
         return b.select(b.compare("eq", x, zero), zero, b.const(1, x.dtype))
     # x itself where it is neither: NaN stays NaN and −0 stays −0.
@@ -63,73 +72,73 @@ def _sign(e: Evaluator, _: Any, x: Num) -> Num:
 def _integral(name: str, function: Callable | None) -> Callable:
     """Rounding to an integer by a function of NumPy, if it has one, and LLVM's of that name."""
 
-    def rule(e: Evaluator, _: Any, x: Num) -> Num:
+    def rule(evaluator: Evaluator, _: Any, x: Num) -> Num:
         if not x.is_float:
             return x
         if x.value is not None and function is not None:
-            return e.b.const(function(x.value), x.dtype)
-        return e.b.intrinsic(name, (x,))
+            return evaluator.b.const(function(x.value), x.dtype)
+        return evaluator.b.intrinsic(name, (x,))
 
     return rule
 
 
-def _round(e: Evaluator, params: dict, x: Num) -> Num:
+def _round(evaluator: Evaluator, params: dict, x: Num) -> Num:
     # NumPy has no function that rounds halves away from zero.
     is_away_from_0 = int(params["rounding_method"]) == 0
     rule = _integral("round", None) if is_away_from_0 else _integral("roundeven", np.rint)
-    return rule(e, params, x)
+    return rule(evaluator, params, x)
 
 
-def _pow(e: Evaluator, _: Any, x: Num, y: Num) -> Num:
+def _pow(evaluator: Evaluator, _: Any, x: Num, y: Num) -> Num:
     if y.value is not None and x.is_float:
         if not y.is_float or float(y.value).is_integer():
             n = int(y.value)
             # More products would have larger errors than the function.
             if abs(n) <= 64:
-                return e.b.power(x, n)
+                return evaluator.b.power(x, n)
         # A root and few products: 1/r³ of a force takes a small part of the operations of pow.
         elif abs(2 * float(y.value)) <= 7 and float(2 * y.value).is_integer():
             name = f"half_integer_power {int(2 * float(y.value))}"
-            return _elementary(name)(e, {}, x)
+            return _elementary(name)(evaluator, {}, x)
     if not y.is_float:
-        y = e.b.convert(y, x.dtype)
-    return _elementary("pow")(e, {}, x, y)
+        y = evaluator.b.convert(y, x.dtype)
+    return _elementary("pow")(evaluator, {}, x, y)
 
 
 def _elementary(name: str) -> Callable:
-    def rule(e: Evaluator, _: Any, *xs: Num) -> Num:
+    def rule(evaluator: Evaluator, _: Any, *xs: Num) -> Num:
         if not xs[0].is_float:
             raise NotCompilable(f"{name} requires floats, got {xs[0].dtype}: use .astype(float)")
         if xs[0].dtype == "float32":
             # Own functions for float32 would be faster, and one more set to test.
-            wide = elementary(e, name, [e.b.convert(x, "float64") for x in xs])
-            return e.b.convert(wide, "float32")
-        return elementary(e, name, xs)
+            wide = elementary(evaluator, name, [evaluator.b.convert(x, "float64") for x in xs])
+            return evaluator.b.convert(wide, "float32")
+        return elementary(evaluator, name, xs)
 
     return rule
 
 
-def _unit(e: Evaluator, like: Num) -> Num:
-    return e.b.const(1, like.dtype)
+def _unit(evaluator: Evaluator, like: Num) -> Num:
+    return evaluator.b.const(1, like.dtype)
 
 
-def _bitcast(e: Evaluator, params: dict, x: Num) -> Num:
+def _bitcast(evaluator: Evaluator, params: dict, x: Num) -> Num:
     new = np.dtype(params["new_dtype"])
     # Other sizes change the shape of the array, which a rule for one number cannot.
     if new.itemsize != np.dtype(x.dtype).itemsize or "bool" in (x.dtype, str(new)):
         raise NotCompilable(f"bitcast requires numbers of equal size, got {x.dtype} and {new}")
-    return e.b.bitcast(x, str(new))
+    return evaluator.b.bitcast(x, str(new))
 
 
 def _combination(op: str) -> Callable:
     return lambda e, _, a, b: e.combine(op, a, b)
 
 
-def _identity(e: Evaluator, _: Any, x: Num) -> Num:
+def _identity(evaluator: Evaluator, _: Any, x: Num) -> Num:
     return x
 
 
-def _reduced_precision(e: Evaluator, params: dict, x: Num) -> Num:
+def _reduced_precision(evaluator: Evaluator, params: dict, x: Num) -> Num:
     least = {"float64": (11, 52), "float32": (8, 23)}.get(x.dtype, (64, 64))
     bits = params["exponent_bits"], params["mantissa_bits"]
     if bits[0] < least[0] or bits[1] < least[1]:
@@ -175,34 +184,38 @@ ELEMENTWISE: dict[str, Callable] = {
 }
 
 
-def _elementwise(e: Evaluator, eqn: Any, values: list[Value], rule: Callable) -> Value:
+def _elementwise(evaluator: Evaluator, eqn: Any, values: list[Value], rule: Callable) -> Value:
     (out,) = eqn.outvars
     shape, params = out.aval.shape, eqn.params
     # Long arrays in a loop over their elements: otherwise the code would be as long as the
     # array.
     if not all(value.is_small for value in values) or math.prod(shape) > MOST_ENTRIES:
-        return _in_a_loop(e, eqn, values, rule)
-    operands = [np.broadcast_to(e.entries(value), shape) for value in values]
-    results = [rule(e, params, *(x[i] for x in operands)) for i in np.ndindex(*shape)]
-    return e.value(results, out.aval)
+        return _in_a_loop(evaluator, eqn, values, rule)
+    operands = [np.broadcast_to(evaluator.entries(value), shape) for value in values]
+    results = [rule(evaluator, params, *(x[i] for x in operands)) for i in np.ndindex(*shape)]
+    return evaluator.value(results, out.aval)
 
 
-def _in_a_loop(e: Evaluator, eqn: Any, values: list[Value], rule: Callable) -> Value:
+def _in_a_loop(evaluator: Evaluator, eqn: Any, values: list[Value], rule: Callable) -> Value:
     """An elementwise primitive on arrays that stay in memory."""
     (out,) = eqn.outvars
     shape = out.aval.shape
     has_lanes = any(value.has_lanes() for value in values)
-    place = e.module.scratch(shape, str(out.aval.dtype), has_lanes)
-    sources = [value if value.shape == () else e.in_memory(value) for value in values]
+    place = evaluator.module.scratch(shape, str(out.aval.dtype), has_lanes)
+    sources = [value if value.shape == () else evaluator.in_memory(value) for value in values]
 
     def loop_over(places: list, target: Buffer) -> None:
         if not target.shape:
-            numbers = [e.entries(x)[()] if isinstance(x, Value) else load(e.b, x) for x in places]
-            store(e.b, target, rule(e, eqn.params, *numbers))
+            numbers = [
+                evaluator.entries(x)[()] if isinstance(x, Value) else load(evaluator.b, x)
+                for x in places
+            ]
+            store(evaluator.b, target, rule(evaluator, eqn.params, *numbers))
             return
-        rows = functools.partial(_row_of, e.b)
-        e.count(
-            target.shape[0], lambda i: loop_over([rows(x, i) for x in places], target.row(e.b, i))
+        rows = functools.partial(_row_of, evaluator.b)
+        evaluator.count(
+            target.shape[0],
+            lambda i: loop_over([rows(x, i) for x in places], target.row(evaluator.b, i)),
         )
 
     loop_over(sources, place)
@@ -220,8 +233,8 @@ def _row_of(b: Builder, x: Any, index: Num) -> Any:
 def _on_arrays(number_rule: Callable) -> Callable:
     """The rule for arrays of a rule for numbers."""
 
-    def rule(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
-        return [_elementwise(e, eqn, values, number_rule)]
+    def rule(evaluator: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+        return [_elementwise(evaluator, eqn, values, number_rule)]
 
     return check_types(rule)
 

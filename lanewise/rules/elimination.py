@@ -20,26 +20,30 @@ from ..module import Module
 _LARGEST_FACTOR = 8.0  # of a row that is subtracted from another without an exchange
 
 
-def linear_solve(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+def linear_solve(evaluator: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     """custom_linear_solve: what it solves with."""
     lengths, jaxprs = eqn.params["const_lengths"], eqn.params["jaxprs"]
     _, consts, _ = cut(values, lengths.matvec + lengths.vecmat, lengths.solve)
-    return e.evaluate(jaxprs.solve, [*consts, *values[sum(lengths) :]])
+    return evaluator.evaluate(jaxprs.solve, [*consts, *values[sum(lengths) :]])
 
 
-def eliminate(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+def eliminate(evaluator: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     """Dense systems, by elimination; rows are exchanged on trajectories that need it."""
     matrices, vectors = values
     check_size(matrices.size, MOST_ENTRIES // 4, "elements of the matrices", matrices.shape)
     (out,) = eqn.outvars
     front = out.aval.shape[:-1]
-    A = np.broadcast_to(e.entries(matrices), (*front, *matrices.shape[-2:]))
-    b = np.broadcast_to(e.entries(vectors), out.aval.shape)
-    return [e.value([x for i in np.ndindex(front) for x in _solution(e, A[i], b[i])], out.aval)]
+    A = np.broadcast_to(evaluator.entries(matrices), (*front, *matrices.shape[-2:]))
+    b = np.broadcast_to(evaluator.entries(vectors), out.aval.shape)
+    return [
+        evaluator.value(
+            [x for i in np.ndindex(front) for x in _solution(evaluator, A[i], b[i])], out.aval
+        )
+    ]
 
 
-def _solution(e: Evaluator, matrix: Entries, vector: Entries) -> list[Num]:
-    b = e.b
+def _solution(evaluator: Evaluator, matrix: Entries, vector: Entries) -> list[Num]:
+    b = evaluator.b
     rows = [[*row, x] for row, x in zip(matrix, vector, strict=True)]
     numbers = [x for row in rows for x in row]
     vec = any(x.vec for x in numbers)
@@ -47,23 +51,23 @@ def _solution(e: Evaluator, matrix: Entries, vector: Entries) -> list[Num]:
     solution, weak = eliminate_in_order(b, [list(r) for r in rows])
     if weak.value is not None and not weak.value:
         return solution
-    if e.assumptions is not None:
-        e.assumptions.assume_false(weak)
+    if evaluator.assumptions is not None:
+        evaluator.assumptions.assume_false(weak)
         # As results of a branch, so that the bits are those of the version with branches.
         return [b.without_origin(x) for x in solution]
 
     def selection() -> list[Num]:
         # Only where it is needed: other trajectories of the block keep their numbers to the bit.
-        exact_solution = solve_with_exchanges(e, numbers, vec)
+        exact_solution = solve_with_exchanges(evaluator, numbers, vec)
         return [b.select(weak, x, y) for x, y in zip(exact_solution, solution, strict=True)]
 
     flags, dtypes = [vec] * len(rows), [numbers[0].dtype] * len(rows)
     return b.branch(b.any_lane(weak), selection, lambda: solution, flags, dtypes)
 
 
-def solve_with_exchanges(e: Evaluator, numbers: Sequence[Num], vec: bool) -> list[Num]:
+def solve_with_exchanges(evaluator: Evaluator, numbers: Sequence[Num], vec: bool) -> list[Num]:
     """The solution of the system with these rows (A, b) by a function with exchanges of rows."""
-    module, b, dtype = e.module, e.b, numbers[0].dtype
+    module, b, dtype = evaluator.module, evaluator.b, numbers[0].dtype
     n = math.isqrt(len(numbers))
     block, calls = (b.W, b.U) if vec else (1, 1)
     symbol = f"@exchanged_{n}_{TYPES[dtype]}_{'v' if block > 1 else 's'}"
@@ -182,10 +186,12 @@ def with_exchanges(b: Builder, system: Buffer, solution: Buffer) -> None:
     count(zero, size, substitute)
 
 
-def unit_vectors(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+def unit_vectors(evaluator: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     n, dtype = eqn.params["n"], str(eqn.params["dtype"])
-    numbers = [e.b.const(int(i == j), dtype, structural=True) for i in range(n) for j in range(n)]
-    value = e.value(numbers, eqn.outvars[0].aval)
+    numbers = [
+        evaluator.b.const(int(i == j), dtype, structural=True) for i in range(n) for j in range(n)
+    ]
+    value = evaluator.value(numbers, eqn.outvars[0].aval)
     value.is_tangent = True
     return [value]
 

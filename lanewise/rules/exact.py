@@ -68,14 +68,14 @@ _product = primitive(
 _error = primitive("lost_by_product", lambda a, b: _by_halves(a, b)[1], _in_batches(lambda: _error))
 
 
-def product_rule(e: Evaluator, _: Any, a: Num, b: Num) -> Num:
+def product_rule(evaluator: Evaluator, _: Any, a: Num, b: Num) -> Num:
     """The rule of the rounded product in machine code."""
     # Opaque: it is not contracted with a sum after it.
-    return e.b.opaque(e.b.mul(a, b))
+    return evaluator.b.opaque(evaluator.b.mul(a, b))
 
 
-def error_rule(e: Evaluator, _: Any, a: Num, b: Num) -> Num:
+def error_rule(evaluator: Evaluator, _: Any, a: Num, b: Num) -> Num:
     """The rule of the error of the rounded product in machine code."""
     if any(x.value is not None and (x.value == 0 or is_power_of_two(x.value)) for x in (a, b)):
-        return e.b.const(0, a.dtype)
-    return e.b.fma(a, b, e.b.neg(e.b.mul(a, b)))
+        return evaluator.b.const(0, a.dtype)
+    return evaluator.b.fma(a, b, evaluator.b.neg(evaluator.b.mul(a, b)))

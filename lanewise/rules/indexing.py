@@ -18,27 +18,27 @@ SCATTERS = {
 }
 
 
-def iota(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+def iota(evaluator: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     params = eqn.params
     shape, axis = params["shape"], params["dimension"]
     numbers = np.arange(shape[axis], dtype=params["dtype"])
     rows = np.broadcast_to(numbers, (*shape[:axis], *shape[axis + 1 :], shape[axis]))
-    return [e.constant(np.moveaxis(rows, -1, axis))]
+    return [evaluator.constant(np.moveaxis(rows, -1, axis))]
 
 
-def empty(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+def empty(evaluator: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     """An array that is written before it is read."""
     (out,) = eqn.outvars
-    return [e.constant(np.zeros(out.aval.shape, out.aval.dtype))]
+    return [evaluator.constant(np.zeros(out.aval.shape, out.aval.dtype))]
 
 
-def argument_of(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+def argument_of(evaluator: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     """argmax, argmin: the first of the largest, or the first NaN."""
-    (value,), b = values, e.b
+    (value,), b = values, evaluator.b
     (out,) = eqn.outvars
     (axis,) = eqn.params["axes"]
     op = "gt" if eqn.primitive.name == "argmax" else "lt"
-    rows = np.moveaxis(e.entries(value), axis, 0).reshape((value.shape[axis], -1))
+    rows = np.moveaxis(evaluator.entries(value), axis, 0).reshape((value.shape[axis], -1))
     dtype, results = str(out.aval.dtype), []
     for column in rows.T:
         best, where = column[0], b.const(0, dtype)
@@ -50,7 +50,7 @@ def argument_of(e: Evaluator, eqn: Any, values: list[Value], places: list) -> li
             best = b.select(better, x, best)
             where = b.select(better, b.const(i, dtype), where)
         results.append(where)
-    return [e.value(results, out.aval)]
+    return [evaluator.value(results, out.aval)]
 
 
 def _clip(b: Builder, x: Num, largest: int) -> Num:
@@ -59,15 +59,15 @@ def _clip(b: Builder, x: Num, largest: int) -> Num:
     return b.maximum(low, b.const(largest, "int64"), "lt")
 
 
-def _starts(e: Evaluator, starts: list[Value], shape: Any, sizes: Any) -> list[Num]:
+def _starts(evaluator: Evaluator, starts: list[Value], shape: Any, sizes: Any) -> list[Num]:
     """Where a part of `sizes` begins in an array of `shape`, inside of it."""
     triples = zip(starts, shape, sizes, strict=True)
-    return [_clip(e.b, e.entries(start)[()], n - m) for start, n, m in triples]
+    return [_clip(evaluator.b, evaluator.entries(start)[()], n - m) for start, n, m in triples]
 
 
-def _pick(e: Evaluator, value: Value, index: Num) -> Num:
+def _pick(evaluator: Evaluator, value: Value, index: Num) -> Num:
     """The element at a row-major index that lies inside of the array."""
-    b = e.b
+    b = evaluator.b
     if index.value is not None and value.entries is not None:
         return value.entries.flat[int(index.value)]
     # Selections among a few numbers in registers take less time than a way through memory.
@@ -77,22 +77,22 @@ def _pick(e: Evaluator, value: Value, index: Num) -> Num:
             is_index = b.compare("eq", index, b.const(i, "int64"))
             result = b.select(is_index, value.entries.flat[i], result)
         return result
-    flat = e.reshape(value, (value.size,))
+    flat = evaluator.reshape(value, (value.size,))
     return load(b, flat, b.mul(index, b.const(flat.strides[0], "int64")))
 
 
-def dynamic_slice(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+def dynamic_slice(evaluator: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     value, *starts = values
     (out,) = eqn.outvars
-    b, sizes = e.b, eqn.params["slice_sizes"]
-    offsets = _starts(e, starts, value.shape, sizes)
+    b, sizes = evaluator.b, eqn.params["slice_sizes"]
+    offsets = _starts(evaluator, starts, value.shape, sizes)
     if value.entries is None and not value.is_small:
         # A long array stays in memory, and only its pointer moves.
-        buffer = e.in_memory(value)
+        buffer = evaluator.in_memory(value)
         for start, stride in zip(offsets, buffer.strides, strict=True):
             buffer = buffer.shift(b.mul(start, b.const(stride, "int64")))
         return [Value.in_memory(dataclasses.replace(buffer, shape=tuple(sizes)))]
-    value = Value(value.shape, value.dtype, e.entries(value), value.buffer)
+    value = Value(value.shape, value.dtype, evaluator.entries(value), value.buffer)
     strides = contiguous(value.shape)
     results = []
     for i in np.ndindex(tuple(sizes)):
@@ -100,8 +100,8 @@ def dynamic_slice(e: Evaluator, eqn: Any, values: list[Value], places: list) -> 
         for start, k, stride in zip(offsets, i, strides, strict=True):
             place = b.add(start, b.const(k, "int64"))
             total = b.add(total, b.mul(place, b.const(stride, "int64")))
-        results.append(_pick(e, value, total))
-    return [e.value(results, out.aval)]
+        results.append(_pick(evaluator, value, total))
+    return [evaluator.value(results, out.aval)]
 
 
 def _check_update(value: Value, update: Value, limit: int) -> None:
@@ -109,14 +109,16 @@ def _check_update(value: Value, update: Value, limit: int) -> None:
     check_size(size, limit, "size of array × size of update", *shapes)
 
 
-def dynamic_update_slice(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+def dynamic_update_slice(
+    evaluator: Evaluator, eqn: Any, values: list[Value], places: list
+) -> list[Value]:
     value, update, *starts = values
-    b = e.b
-    offsets = _starts(e, starts, value.shape, update.shape)
-    entries = e.entries(value).copy()
+    b = evaluator.b
+    offsets = _starts(evaluator, starts, value.shape, update.shape)
+    entries = evaluator.entries(value).copy()
     # Each element is compared with each start: the code grows with the product of the sizes.
     _check_update(value, update, MOST_ENTRIES)
-    news = e.entries(update)
+    news = evaluator.entries(update)
     for i in np.ndindex(value.shape):
         for k in np.ndindex(update.shape):
             # The start that puts element k of the update to place i; none may lie outside.
@@ -131,18 +133,18 @@ def dynamic_update_slice(e: Evaluator, eqn: Any, values: list[Value], places: li
     return [Value(value.shape, value.dtype, entries)]
 
 
-def gather(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+def gather(evaluator: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     value, indices = values
     (out,) = eqn.outvars
-    b, params = e.b, eqn.params
+    b, params = evaluator.b, eqn.params
     dims, sizes = params["dimension_numbers"], params["slice_sizes"]
     mode, shape = str(params["mode"]), out.aval.shape
-    starts = e.entries(indices)
+    starts = evaluator.entries(indices)
     dropped_axes = (*dims.collapsed_slice_dims, *dims.operand_batching_dims)
     window = [d for d in range(len(value.shape)) if d not in dropped_axes]
     batch = [d for d in range(len(shape)) if d not in dims.offset_dims]
     strides = contiguous(value.shape)
-    entries = e.entries(value) if value.is_small else None
+    entries = evaluator.entries(value) if value.is_small else None
     small = Value(value.shape, value.dtype, entries, value.buffer)
     fill = params["fill_value"]
     fill = b.const(_default_fill(value.dtype) if fill is None else fill, value.dtype)
@@ -162,8 +164,8 @@ def gather(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Va
             if "fill" in mode.lower():
                 is_inside = b.logic("and", is_inside, b.compare("eq", nearest, start))
             total = b.add(total, b.mul(nearest, b.const(strides[d], "int64")))
-        results.append(b.select(is_inside, _pick(e, small, total), fill))
-    return [e.value(results, out.aval)]
+        results.append(b.select(is_inside, _pick(evaluator, small, total), fill))
+    return [evaluator.value(results, out.aval)]
 
 
 def _default_fill(dtype: str) -> Any:
@@ -175,13 +177,13 @@ def _default_fill(dtype: str) -> Any:
     return np.iinfo(dtype).min if np.issubdtype(dtype, np.signedinteger) else np.iinfo(dtype).max
 
 
-def scatter(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+def scatter(evaluator: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     value, indices, updates = values
-    b, params = e.b, eqn.params
+    b, params = evaluator.b, eqn.params
     dims, mode = params["dimension_numbers"], str(params["mode"]).lower()
     op = SCATTERS[eqn.primitive.name]
-    entries, news = e.entries(value).copy(), e.entries(updates)
-    starts = e.entries(indices)
+    entries, news = evaluator.entries(value).copy(), evaluator.entries(updates)
+    starts = evaluator.entries(indices)
     dropped_axes = (*dims.inserted_window_dims, *dims.operand_batching_dims)
     window = [d for d in range(len(value.shape)) if d not in dropped_axes]
     batch = [d for d in range(len(updates.shape)) if d not in dims.update_window_dims]
@@ -193,7 +195,7 @@ def scatter(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[V
     def new_entry(old: Num, new: Num) -> Num:
         if op is None:
             return new
-        return b.sub(old, new) if op == "sub" else e.combine(op, old, new)
+        return b.sub(old, new) if op == "sub" else evaluator.combine(op, old, new)
 
     for k in np.ndindex(updates.shape):
         where = tuple(k[d] for d in batch)

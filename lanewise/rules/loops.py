@@ -20,15 +20,15 @@ from .rounds import Rounds, RowCollector
 UNIFORM = frozenset(["least_over_lanes"])
 
 
-def _numbers_to_carry(e: Evaluator, carry: Sequence[Value], lane_flags: Sequence[bool]):
+def _numbers_to_carry(evaluator: Evaluator, carry: Sequence[Value], lane_flags: Sequence[bool]):
     """The numbers of a carry in a row, which of them are vectors, and the way back."""
-    numbers = _numbers_of(e, carry)
+    numbers = _numbers_of(evaluator, carry)
     vec = [lanes for value, lanes in zip(carry, lane_flags, strict=True) for _ in range(value.size)]
     return numbers, vec, functools.partial(_values_of, carry)
 
 
-def _numbers_of(e: Evaluator, values: Iterable[Value]) -> list[Num]:
-    return [x for value in values for x in e.entries(value).flat]
+def _numbers_of(evaluator: Evaluator, values: Iterable[Value]) -> list[Num]:
+    return [x for value in values for x in evaluator.entries(value).flat]
 
 
 def _values_of(like: Sequence[Any], numbers: Sequence[Num]) -> list[Value]:
@@ -40,8 +40,8 @@ def _values_of(like: Sequence[Any], numbers: Sequence[Num]) -> list[Value]:
     return values
 
 
-def scan(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
-    params, b = eqn.params, e.b
+def scan(evaluator: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+    params, b = eqn.params, evaluator.b
     body: ClosedJaxpr = params["jaxpr"]
     num_consts, num_carry = scan_counts(params)
     length, reverse = params["length"], params["reverse"]
@@ -63,15 +63,17 @@ def scan(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Valu
     carry_lanes = fixed_point(lambda flags: outputs(flags)[:num_carry], carry_lanes)
     row_lanes = outputs(carry_lanes)[num_carry:]
     numbers, vec, to_values = _numbers_to_carry(
-        e, list(itertools.compress(carry, moves)), list(itertools.compress(carry_lanes, moves))
+        evaluator,
+        list(itertools.compress(carry, moves)),
+        list(itertools.compress(carry_lanes, moves)),
     )
-    sources = [e.in_memory(x) for x in xs]
+    sources = [evaluator.in_memory(x) for x in xs]
     rows = [
-        place or e.module.scratch(aval.shape, str(aval.dtype), o)
+        place or evaluator.module.scratch(aval.shape, str(aval.dtype), o)
         for aval, place, o in zip(row_avals, places[num_carry:], row_lanes, strict=True)
     ]
-    end = e.module.parameter(length)
-    collector = None if reverse else RowCollector.for_results(e, rows, length)
+    end = evaluator.module.parameter(length)
+    collector = None if reverse else RowCollector.for_results(evaluator, rows, length)
 
     def full_carry(numbers: Sequence[Num]) -> list[Value]:
         moving_values = iter(to_values(numbers))
@@ -83,21 +85,21 @@ def scan(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Valu
             k = b.sub(b.sub(end, b.const(1, "int64")), k)
         slices = [Value.in_memory(source.row(b, k)) for source in sources]
         targets = [r.row(b, k) for r in rows] if collector is None else collector.rows(k, start)
-        outs = e.jaxpr(
+        outs = evaluator.jaxpr(
             jaxpr,
-            [e.constant(c) for c in body.consts],
+            [evaluator.constant(c) for c in body.consts],
             [*consts, *full_carry(numbers), *slices],
             [*[None] * num_carry, *targets],
         )
         for y, target in zip(outs[num_carry:], targets, strict=True):
-            e.write(y, target)
-        return _numbers_of(e, itertools.compress(outs, moves))
+            evaluator.write(y, target)
+        return _numbers_of(evaluator, itertools.compress(outs, moves))
 
-    rounds = Rounds(e, vec, length, end, round_of, collector)
+    rounds = Rounds(evaluator, vec, length, end, round_of, collector)
     return [*full_carry(rounds.run(jaxpr, numbers)), *map(Value.in_memory, rows)]
 
 
-def while_loop(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+def while_loop(evaluator: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     """`while`; an array as condition says which entries of the carry, by leading axes, go on."""
     params = eqn.params
     test, body = params["cond_jaxpr"], params["body_jaxpr"]
@@ -113,37 +115,37 @@ def while_loop(e: Evaluator, eqn: Any, values: list[Value], places: list) -> lis
 
     carry_lanes = fixed_point(next_flags, [v.has_lanes() for v in carry])
     (per_lane,) = reached_outputs(test.jaxpr, [*lanes_of_test, *carry_lanes], UNIFORM)
-    numbers, vec, to_values = _numbers_to_carry(e, carry, carry_lanes)
+    numbers, vec, to_values = _numbers_to_carry(evaluator, carry, carry_lanes)
     parts = math.prod(shape)
     # The condition has the leading axes of each array of the carry.
     part = [i * parts // v.size for v in carry for i in range(v.size)]  # of which a number is
 
     def goes_on(numbers: Sequence[Num]) -> list[Num]:
-        return _numbers_of(e, e.evaluate(test, [*of_test, *to_values(numbers)]))
+        return _numbers_of(evaluator, evaluator.evaluate(test, [*of_test, *to_values(numbers)]))
 
     def step(numbers: Sequence[Num]) -> list[Num]:
-        return _numbers_of(e, e.evaluate(body, [*of_body, *to_values(numbers)]))
+        return _numbers_of(evaluator, evaluator.evaluate(body, [*of_body, *to_values(numbers)]))
 
     # In a round on assumptions: a loop that starts at all is the rare case.
-    if per_lane and e.assumptions is not None:
+    if per_lane and evaluator.assumptions is not None:
         for condition in goes_on(numbers):
-            e.assumptions.assume_false(condition)
-        return to_values([e.b.without_origin(x) for x in numbers])
-    with e.assuming(None):
+            evaluator.assumptions.assume_false(condition)
+        return to_values([evaluator.b.without_origin(x) for x in numbers])
+    with evaluator.assuming(None):
         # Trajectories that have finished keep their values, and the block goes on.
         if per_lane or shape:
-            return to_values(_masked_loop(e, numbers, vec, per_lane, part, goes_on, step))
+            return to_values(_masked_loop(evaluator, numbers, vec, per_lane, part, goes_on, step))
 
         def proceeds(state, _):
-            return e.b.ref(goes_on(state)[0], 0, False)
+            return evaluator.b.ref(goes_on(state)[0], 0, False)
 
-        return to_values(e.b.loop(numbers, vec, proceeds, lambda state, _: step(state)))
+        return to_values(evaluator.b.loop(numbers, vec, proceeds, lambda state, _: step(state)))
 
 
-def _masked_loop(e: Evaluator, numbers, vec, per_lane, part, goes_on, step) -> list[Num]:
+def _masked_loop(evaluator: Evaluator, numbers, vec, per_lane, part, goes_on, step) -> list[Num]:
     """A loop of which every trajectory, or every part of the carry, stops by itself; the block goes
     on while one of them does. `part[i]` is the condition of number i."""
-    b = e.b
+    b = evaluator.b
     first = goes_on(numbers)
     count = len(first)
 
@@ -164,19 +166,23 @@ def _masked_loop(e: Evaluator, numbers, vec, per_lane, part, goes_on, step) -> l
     return end[count:]
 
 
-def cond(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+def cond(evaluator: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     branches = eqn.params["branches"]
-    choice, operands = e.entries(values[0])[()], values[1:]
+    choice, operands = evaluator.entries(values[0])[()], values[1:]
     index = assumed_value(choice)  # the value, if it is known
     if index is not None:
-        outs = e.evaluate(branches[int(np.clip(index, 0, len(branches) - 1))], operands)
-        return outs if choice.value is not None else [e.without_origin(value) for value in outs]
-    with e.assuming(None):
-        return _branches(e, eqn, choice, operands)
+        outs = evaluator.evaluate(branches[int(np.clip(index, 0, len(branches) - 1))], operands)
+        return (
+            outs
+            if choice.value is not None
+            else [evaluator.without_origin(value) for value in outs]
+        )
+    with evaluator.assuming(None):
+        return _branches(evaluator, eqn, choice, operands)
 
 
-def _branches(e: Evaluator, eqn: Any, choice: Num, operands: list[Value]) -> list[Value]:
-    branches, b = eqn.params["branches"], e.b
+def _branches(evaluator: Evaluator, eqn: Any, choice: Num, operands: list[Value]) -> list[Value]:
+    branches, b = eqn.params["branches"], evaluator.b
     if choice.dtype == "bool":
         choice = b.convert(choice, "int32")
     flags = [v.has_lanes() for v in operands]
@@ -188,7 +194,7 @@ def _branches(e: Evaluator, eqn: Any, choice: Num, operands: list[Value]) -> lis
     dtypes = [str(a.dtype) for a in avals for _ in range(a.size)]
 
     def run(branch):
-        return lambda: _numbers_of(e, e.evaluate(branch, operands))
+        return lambda: _numbers_of(evaluator, evaluator.evaluate(branch, operands))
 
     # XLA clamps the index to the branches that exist: the first and the last are taken beyond it.
     ops = ["le", *["eq"] * (len(branches) - 2), "ge"][: len(branches)]
@@ -196,7 +202,7 @@ def _branches(e: Evaluator, eqn: Any, choice: Num, operands: list[Value]) -> lis
     # The same branch on all trajectories: jump. Otherwise run all branches that some trajectory
     # takes, and let each trajectory select its own result.
     if not choice.vec:
-        return _values_of(avals, _one_of(e, takes, [run(x) for x in branches], vec, dtypes))
+        return _values_of(avals, _one_of(evaluator, takes, [run(x) for x in branches], vec, dtypes))
     results: list[Num] = []
     for take, branch in zip(takes, branches, strict=True):
         zeros = [b.const(0, d) for d in dtypes]
@@ -206,26 +212,28 @@ def _branches(e: Evaluator, eqn: Any, choice: Num, operands: list[Value]) -> lis
     return _values_of(avals, results)
 
 
-def _one_of(e: Evaluator, takes, runs, vec, dtypes) -> list[Num]:
+def _one_of(evaluator: Evaluator, takes, runs, vec, dtypes) -> list[Num]:
     if len(runs) == 1:
         return runs[0]()
-    b = e.b
-    others_of = functools.partial(_one_of, e, takes[1:], runs[1:], vec, dtypes)
+    b = evaluator.b
+    others_of = functools.partial(_one_of, evaluator, takes[1:], runs[1:], vec, dtypes)
     return b.branch(b.ref(takes[0], 0, False), runs[0], others_of, vec, dtypes)
 
 
-def minimum_over_lanes(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+def minimum_over_lanes(
+    evaluator: Evaluator, eqn: Any, values: list[Value], places: list
+) -> list[Value]:
     """The least of an integer over the trajectories of a block."""
-    b, x = e.b, e.entries(values[0])[()]
+    b, x = evaluator.b, evaluator.entries(values[0])[()]
     # Not reduced over the block: the assumption is checked after some rounds.
-    if e.assumptions is not None and eqn.params["rare"]:
-        return [e.value([e.assumptions.minimum(x)], eqn.outvars[0].aval)]
+    if evaluator.assumptions is not None and eqn.params["rare"]:
+        return [evaluator.value([evaluator.assumptions.minimum(x)], eqn.outvars[0].aval)]
     if not x.vec:
         return values
     # The block runs a branch that some trajectory nearly always needs. Results do not depend on
     # it, because each trajectory selects its own.
     if not eqn.params["rare"]:  # one of several trajectories nearly always needs it
-        return [e.value([assumed_number(b, 0, x.dtype)], eqn.outvars[0].aval)]
+        return [evaluator.value([assumed_number(b, 0, x.dtype)], eqn.outvars[0].aval)]
     kind, bits, total = b.type(x.dtype, True), b.type("bool", True), x.names[0]
     for other in x.names[1:]:
         is_less = b.new(f"icmp slt {kind} {total}, {other}")
@@ -234,22 +242,24 @@ def minimum_over_lanes(e: Evaluator, eqn: Any, values: list[Value], places: list
         result = f"{TYPES[x.dtype]} @llvm.vector.reduce.smin.{b.suffix(x.dtype, True)}"
         b.declare(f"{result}({kind})")
         total = b.new(f"call {result}({kind} {total})")
-    return [e.value([b.number([total], x.dtype, False)], eqn.outvars[0].aval)]
+    return [evaluator.value([b.number([total], x.dtype, False)], eqn.outvars[0].aval)]
 
 
-def by_itself(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+def by_itself(evaluator: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     """A call within a call: no product in it is contracted with a sum outside, nor the other
     way round, so that its numbers have the same bits wherever it is called."""
     program = eqn.params["program"]
     if eqn.params["lanes"] is not None:
         raise NotCompilable("the function contains a batch of another function of lanewise")
-    outs = e.evaluate(program.trace.all_inputs, [e.opaque(value) for value in values])
-    return [e.opaque(value) for value in outs]
+    outs = evaluator.evaluate(
+        program.trace.all_inputs, [evaluator.opaque(value) for value in values]
+    )
+    return [evaluator.opaque(value) for value in outs]
 
 
-def barrier(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+def barrier(evaluator: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     """The values as they are, in no operation that is contracted with those after them."""
-    return [e.opaque(value) for value in values]
+    return [evaluator.opaque(value) for value in values]
 
 
 RULES |= {"scan": scan, "while": while_loop, "cond": cond, "lanewise": by_itself}

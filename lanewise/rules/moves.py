@@ -118,7 +118,7 @@ REDUCTIONS = {
 CUMULATIVE = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}
 
 
-def _views(e: Evaluator, eqn: Any, values: list[Value]) -> list[Value] | None:
+def _views(evaluator: Evaluator, eqn: Any, values: list[Value]) -> list[Value] | None:
     """The outputs as other views of an array in memory, if it is there."""
     (value, *_) = values
     if value.entries is not None or value.size <= SMALL:
@@ -126,7 +126,7 @@ def _views(e: Evaluator, eqn: Any, values: list[Value]) -> list[Value] | None:
     assert value.buffer is not None
     name, params = eqn.primitive.name, eqn.params
     if name == "reshape" and params["dimensions"] is None:
-        buffers = [e.reshape(value, params["new_sizes"])]
+        buffers = [evaluator.reshape(value, params["new_sizes"])]
     else:
         count, view = len(eqn.outvars), value.buffer.view
         buffers = [view(lambda x, i=i: move_entries(name, params, x)[i]) for i in range(count)]
@@ -136,40 +136,42 @@ def _views(e: Evaluator, eqn: Any, values: list[Value]) -> list[Value] | None:
     return views
 
 
-def _concatenation(e: Evaluator, eqn: Any, values: list[Value], place: Buffer | None) -> Value:
+def _concatenation(
+    evaluator: Evaluator, eqn: Any, values: list[Value], place: Buffer | None
+) -> Value:
     """Arrays one after the other, in memory."""
     (out,) = eqn.outvars
     axis = eqn.params["dimension"]
     if place is None:
         has_lanes = any(value.has_lanes() for value in values)
-        place = e.module.scratch(out.aval.shape, str(out.aval.dtype), has_lanes)
+        place = evaluator.module.scratch(out.aval.shape, str(out.aval.dtype), has_lanes)
     parts = parts_along(place, axis, [value.shape for value in values])
     for value, part in zip(values, parts, strict=True):
-        e.write(value, part)
+        evaluator.write(value, part)
     return Value.in_memory(place)
 
 
-def _move(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+def _move(evaluator: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     name = eqn.primitive.name
     if name == "reshape" or name in VIEWS:
-        views = _views(e, eqn, values)
+        views = _views(evaluator, eqn, values)
         if views is not None:
             return views
     if name == "concatenate" and any(value.entries is None for value in values):
-        return [_concatenation(e, eqn, values, places[0])]
-    entries = move_entries(name, eqn.params, *(e.entries(value) for value in values))
+        return [_concatenation(evaluator, eqn, values, places[0])]
+    entries = move_entries(name, eqn.params, *(evaluator.entries(value) for value in values))
     return [
         Value(var.aval.shape, var.aval.dtype, np.asarray(array, object))
         for var, array in zip(eqn.outvars, entries, strict=True)
     ]
 
 
-def _call(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+def _call(evaluator: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     (body,) = bodies(eqn)
-    return e.evaluate(body, values, places)
+    return evaluator.evaluate(body, values, places)
 
 
-def _identity(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+def _identity(evaluator: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     return values
 
 

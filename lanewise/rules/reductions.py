@@ -12,18 +12,20 @@ from ..llvm.values import MOST_ENTRIES, Value, objects
 from .moves import CUMULATIVE, REDUCTIONS
 
 
-def reduction(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+def reduction(evaluator: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     (value,), (out,) = values, eqn.outvars
     op, axes = REDUCTIONS[eqn.primitive.name], tuple(eqn.params["axes"])
     if value.size == 0:
-        return [e.constant(np.full(out.aval.shape, _neutral(op, value.dtype), value.dtype))]
-    rows = np.moveaxis(e.entries(value), axes, range(len(axes)))
+        return [evaluator.constant(np.full(out.aval.shape, _neutral(op, value.dtype), value.dtype))]
+    rows = np.moveaxis(evaluator.entries(value), axes, range(len(axes)))
     rows = rows.reshape((-1, out.aval.size))
     # From the first row to the last, whatever the batch is: another order has other bits.
     totals = list(rows[0])
     for row in rows[1:]:
-        totals = [e.combine(op, total, entry) for total, entry in zip(totals, row, strict=True)]
-    return [e.value(totals, out.aval)]
+        totals = [
+            evaluator.combine(op, total, entry) for total, entry in zip(totals, row, strict=True)
+        ]
+    return [evaluator.value(totals, out.aval)]
 
 
 def _neutral(op: str, dtype: str) -> Any:
@@ -39,24 +41,26 @@ def _neutral(op: str, dtype: str) -> Any:
     return 1 if op == "mul" else 0
 
 
-def running_reduction(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+def running_reduction(
+    evaluator: Evaluator, eqn: Any, values: list[Value], places: list
+) -> list[Value]:
     (value,), (out,) = values, eqn.outvars
     axis, reverse = eqn.params["axis"], eqn.params["reverse"]
     if value.size == 0:
         return values
     op = CUMULATIVE[eqn.primitive.name]
-    front = np.moveaxis(e.entries(value), axis, 0)
+    front = np.moveaxis(evaluator.entries(value), axis, 0)
     rows = front.reshape((front.shape[0], -1))
     rows = rows[::-1] if reverse else rows
     totals = [list(rows[0])]
     for row in rows[1:]:
-        totals.append([e.combine(op, x, y) for x, y in zip(totals[-1], row, strict=True)])
+        totals.append([evaluator.combine(op, x, y) for x, y in zip(totals[-1], row, strict=True)])
     flat = [entry for row in (totals[::-1] if reverse else totals) for entry in row]
     entries = np.moveaxis(objects(flat, front.shape), 0, axis)
     return [Value(out.aval.shape, out.aval.dtype, entries)]
 
 
-def dot(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+def dot(evaluator: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     (a, c), (out,) = values, eqn.outvars
     (of_a, of_c), (batch_a, batch_c) = eqn.params["dimension_numbers"]
     dtype = str(out.aval.dtype)
@@ -72,19 +76,19 @@ def dot(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value
     # Each term is an instruction of its own: the code, and the time to compile it, grow with them.
     count = out.aval.size * terms
     check_size(count, 8 * MOST_ENTRIES, "terms of a matrix product", a.shape, c.shape)
-    x = _as_stack_of_matrices(e.entries(a), batch_a, of_a)
-    y = _as_stack_of_matrices(e.entries(c), batch_c, of_c)
+    x = _as_stack_of_matrices(evaluator.entries(a), batch_a, of_a)
+    y = _as_stack_of_matrices(evaluator.entries(c), batch_c, of_c)
     results = []
     for rows, columns in zip(x, y, strict=True):
         for row, column in ((row, column) for row in rows for column in columns):
             # A zero of the structure, which vanishes: the first term needs no addition. The sum
             # over nothing is a zero like any other: times NaN it is NaN.
-            total = e.b.const(0, dtype, structural=terms > 0)
+            total = evaluator.b.const(0, dtype, structural=terms > 0)
             for u, v in zip(row, column, strict=True):
-                u, v = e.b.convert(u, dtype), e.b.convert(v, dtype)
-                total = e.b.add(total, e.b.mul(u, v))
+                u, v = evaluator.b.convert(u, dtype), evaluator.b.convert(v, dtype)
+                total = evaluator.b.add(total, evaluator.b.mul(u, v))
             results.append(total)
-    return [e.value(results, out.aval)]
+    return [evaluator.value(results, out.aval)]
 
 
 def _as_stack_of_matrices(x, batch: Sequence[int], inner: Sequence[int]) -> np.ndarray:

@@ -213,9 +213,9 @@ EXPANSIONS: dict[str, Callable] = {
 
 
 def _rule(name: str) -> Callable:
-    def rule(e: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
+    def rule(evaluator: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
         body = jax.make_jaxpr(functools.partial(EXPANSIONS[name], **eqn.params))
-        return e.evaluate(body(*(var.aval for var in eqn.invars)), values)
+        return evaluator.evaluate(body(*(var.aval for var in eqn.invars)), values)
 
     return check_types(rule)
 

@@ -49,7 +49,7 @@ def uses_pairs(arithmetic: Arithmetic, tolerance: float | None) -> bool:
     return in_pairs
 
 
-class _Stage(NamedTuple):
+class _Factors(NamedTuple):
     """U Σ V of M N, for columns N, without small singular values."""
 
     basis: Left
@@ -71,7 +71,7 @@ class _StagedSVD:
     """
 
     def __init__(self, matrix: Pair, noise: float):
-        self.stages: list[_Stage] = []
+        self.stages: list[_Factors] = []
         self.null, nonzero = exact(np.eye(matrix.hi.shape[1])), [np.zeros(0)]
         while True:
             rows, columns = matrix.hi.shape
@@ -82,7 +82,7 @@ class _StagedSVD:
             count = int(np.sum(singular > max(_SHARE * largest, _ZERO * noise)))
             remainder = exact(V[count:].T)
             factors = Left(U[:, :count].T), singular[:count], V[:count]
-            stage = _Stage(Left(self.null), Left(matrix), *factors)
+            stage = _Factors(Left(self.null), Left(matrix), *factors)
             self.stages.append(stage)
             nonzero.append(singular[:count])
             remainder, matrix = _correct([stage], remainder, stage.image @ remainder, inner=True)
@@ -96,7 +96,7 @@ class _StagedSVD:
 
 
 def _correct(
-    stages: Sequence[_Stage], c: Pair, left: Pair, inner: bool = False
+    stages: Sequence[_Factors], c: Pair, left: Pair, inner: bool = False
 ) -> tuple[Pair, Pair]:
     """c and the left side without the part of it in the range of the stages; `inner`: c in terms of
     the columns of the stage."""
@@ -143,7 +143,7 @@ def staircase(blocks: Sequence[Pair], basis: np.ndarray, noise: float) -> list[S
     size, columns, lefts = len(basis), Left(basis), [Left(b) for b in blocks]
     first = split = _StagedSVD(lefts[0] @ basis, noise)
     c, shifts = split.null, zeros(size, 0)
-    stages: list[_Stage] = []
+    stages: list[_Factors] = []
     steps: list[Step] = []
     for k in range(len(blocks)):
         if k:

@@ -33,7 +33,7 @@ def taylor_coefficients(function: Callable[[Array], Array], point: Array, order:
     **Source** Griewank & Walther 2008, *Evaluating Derivatives*, ch. 13.
     """
     jaxpr = jax.make_jaxpr(function)(point)
-    program = _Program(jaxpr, [_Series(order > 0, point, jnp.ones_like(point))])
+    program = _SeriesProgram(jaxpr, [_Series(order > 0, point, jnp.ones_like(point))])
     for k in range(order + 1):
         program.advance(k)
     (out,), (aval,) = program.outputs, jaxpr.out_avals
@@ -65,7 +65,7 @@ class _Derivative(_Series):
         return self.terms[k]
 
 
-class _Program:
+class _SeriesProgram:
     """A jaxpr on series, one coefficient after the other. `context`: equations around it, with
     their operands and outputs, so that a derivative uses y = g(x) where it is known."""
 
@@ -84,7 +84,7 @@ class _Program:
             outputs = next((y for e, x, y in context if _is_equal(eqn, operands, e, x)), None)
             if outputs is None:
                 if eqn.primitive.name in _CALLS:
-                    part = _Program(next(bodies(eqn)), operands, context)
+                    part = _SeriesProgram(next(bodies(eqn)), operands, context)
                 else:
                     part = _Operation(jaxpr, eqn, operands, context)
                 self.parts.append(part)
@@ -112,7 +112,7 @@ class _Operation:
         self.eqn, self.operands, self.context = eqn, operands, context
         moves = any(operand.moves for operand in operands)
         self.outputs = [_Series(moves and _is_real(variable)) for variable in eqn.outvars]
-        self.derivative_program: _Program | None = None
+        self.derivative_program: _SeriesProgram | None = None
         # A jaxpr of this equation alone.
         variables = dict.fromkeys(x for x in eqn.invars if not isinstance(x, Literal))
         self.places = [eqn.invars.index(variable) for variable in variables]
@@ -162,7 +162,7 @@ class _Operation:
         slopes = [next(changes)[k - 1] if y.moves else None for y in self.outputs]
         return [None if y is None else y / k for y in slopes]
 
-    def derivative(self) -> _Program:
+    def derivative(self) -> _SeriesProgram:
         """y' = ∂g(x) x' as a program on x and x'."""
         moving = [i for i, x in enumerate(self.operands) if x.moves]
 
@@ -177,7 +177,9 @@ class _Operation:
         values = self.values(0)
         jaxpr = jax.make_jaxpr(change)(values, [values[i] for i in moving])
         inputs = [*self.operands, *(_Derivative(self.operands[i]) for i in moving)]
-        return _Program(jaxpr, inputs, (*self.context, (self.eqn, self.operands, self.outputs)))
+        return _SeriesProgram(
+            jaxpr, inputs, (*self.context, (self.eqn, self.operands, self.outputs))
+        )
 
 
 def _is_real(atom: Any) -> bool:

@@ -277,10 +277,10 @@ def _pair(basis: Sum | Product, shape: tuple[int, ...], is_product: bool) -> Bou
     if is_product:
         complexity = tuple(c + d for c, d in itertools.product(a.complexity, b.complexity))
     names = _names_of_pair(a.names, b.names, is_product)
-    return BoundBasis(_Pair(a, b, is_product), names, complexity, a.uses_time or b.uses_time)
+    return BoundBasis(_Combination(a, b, is_product), names, complexity, a.uses_time or b.uses_time)
 
 
-class _Pair(eqx.Module):
+class _Combination(eqx.Module):
     first: BoundBasis
     second: BoundBasis
     is_product: bool = eqx.field(static=True)
@@ -302,7 +302,7 @@ class _Pair(eqx.Module):
             zeros = np.zeros((first.size, second.size))
             matrix = np.block([[a.matrix, zeros], [zeros.T, b.matrix]])
         names = _names_of_pair(a.names, b.names, self.is_product)
-        function = _Pair(first, second, self.is_product)
+        function = _Combination(first, second, self.is_product)
         return Recentring(function, names, matrix, a.is_closed and b.is_closed)
 
 

@@ -16,7 +16,7 @@ from ...base.types import State
 from ..functions.basis import AbstractBasis, BoundBasis, bind_basis
 from ..functions.sampling import SamplePoints, values_at
 from .energy import Energy
-from .expansions import Larger, unreliable
+from .expansions import Larger, common_warnings
 from .obstructions import DriftLaw
 from .report import report
 from .series import InvariantSeries
@@ -162,7 +162,7 @@ class Discovery(eqx.Module):
     @property
     def warnings(self) -> tuple[str, ...]:
         """Reasons why the result is not reliable, each with a remedy; empty if it is reliable."""
-        reasons = unreliable(
+        reasons = common_warnings(
             self,
             "let drift_order on a long run decide",
             "combinations of the functions change in a step by less than 1000 times their "

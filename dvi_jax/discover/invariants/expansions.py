@@ -23,9 +23,9 @@ _LINEAR = 1e-9  # A map that differs by less from a linear one may be linear
 _LAST = 1e30
 _HARDLY = 2.0  # A step, or samples, larger by a smaller factor say nothing new
 
-Step = Callable[[SamplePoints, float], Displacements]
+DisplacementFunction = Callable[[SamplePoints, float], Displacements]
 """(samples, h) → displacements of the samples in a step h."""
-Count = Callable[[SamplePoints, float], int | None]
+CountFunction = Callable[[SamplePoints, float], int | None]
 """(samples, h) → how many are conserved; None where the map is not defined there."""
 
 
@@ -138,7 +138,7 @@ class Larger(NamedTuple):
         )
 
 
-def unreliable(result: Any, remedy: str, subject: str) -> list[str]:
+def common_warnings(result: Any, remedy: str, subject: str) -> list[str]:
     """Reasons why a `Discovery` or `Symmetries` is not reliable; `remedy`: of a gap that is not
     clear, `subject`: what may be conserved."""
     reasons, count = [], result.survivors[0]
@@ -162,7 +162,9 @@ def growth_note(subject: str, power: float) -> list[str]:
     ]
 
 
-def at_larger_step(samples: SamplePoints, h: float, step: Step, count: Count) -> tuple[Larger, ...]:
+def at_larger_step(
+    samples: SamplePoints, h: float, step: DisplacementFunction, count: CountFunction
+) -> tuple[Larger, ...]:
     """How many are conserved at a larger step; empty where the step is not small, so that an
     expansion in h would be seen."""
     ratio, relative = 1.0, step(samples, h).relative_step
@@ -178,7 +180,11 @@ def at_larger_step(samples: SamplePoints, h: float, step: Step, count: Count) ->
 
 
 def in_larger_box(
-    samples: SamplePoints, h: float, step: Step, count: Count, is_constrained: bool = False
+    samples: SamplePoints,
+    h: float,
+    step: DisplacementFunction,
+    count: CountFunction,
+    is_constrained: bool = False,
 ) -> tuple[Larger, ...]:
     """How many are conserved on samples that spread wider; empty where a map is not nearly linear
     on those given, or linear on all."""

@@ -8,7 +8,7 @@ import numpy as np
 from ..algebra.nullspace import in_units_of
 from ..functions.basis import BoundBasis
 from ..functions.generators import Generator
-from ..invariants.expansions import Larger, growth_note, unreliable
+from ..invariants.expansions import Larger, common_warnings, growth_note
 from ..invariants.series import in_powers_of_epsilon
 from .gauge import BasisGauge
 from .noether import AdiabaticInvariant
@@ -180,7 +180,7 @@ class Symmetries(eqx.Module):
     @property
     def warnings(self) -> tuple[str, ...]:
         """Reasons why the result is not reliable, each with a remedy; empty if it is reliable."""
-        reasons = unreliable(
+        reasons = common_warnings(
             self,
             "take more samples, or others",
             "vector fields change in a step by hardly more than rounding: whether they are "

@@ -80,7 +80,7 @@ def write_markdown(claims: Sequence[Claim], setting: dict[str, Any], path: Path)
 
     columns = ("where", "the paper says", "measured now", "verdict", "why")
     equations = [
-        (f"({e.number})", e.statement, ", ".join(f"`{c}`" for c in e.code), e.note)
+        (f"({e.number})", e.statement, ", ".join(f"`{code}`" for code in e.code), e.note)
         for e in EQUATIONS
     ]
     lines = [

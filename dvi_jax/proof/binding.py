@@ -1,0 +1,143 @@
+"""`holds_for`: whether a certificate is about a system."""
+
+import json
+import os
+from pathlib import Path
+from typing import Any, NamedTuple, TypedDict, Unpack
+
+from ..base.keywords import checked_keywords
+from ..base.precision import refuse_double_without_x64
+from ..integration.arithmetic import Arithmetic
+from ..integration.integrator import Integrator, chosen, only
+from ..methods import Method
+from ..problem.system import check_system, of_problem
+from .programs import Region, functions_of, programs_of
+from .result import DriftBound, tools
+
+_PARTS = {
+    "step": "the list of operations of the step",
+    "invariants": "the lists of operations of the invariants",
+    "inside": "the list of operations of inside",
+    "implicit": "whether the step is implicit",
+    "slow": "slow_time",
+    "quantum": "the quantum of FixedPoint",
+    "arithmetic": "the arithmetic",
+}
+
+
+class Binding(NamedTuple):
+    """Whether a certificate is about a program. `bool(...)` is `holds`.
+
+    - `differences`: what is not the same, so that the proof says nothing about the program.
+    - `remarks`: what was not compared, and differences that the lists of operations do not show,
+      such as another version of JAX.
+    """
+
+    holds: bool
+    differences: tuple[str, ...]
+    remarks: tuple[str, ...]
+
+    def __bool__(self) -> bool:
+        return self.holds
+
+    def __str__(self) -> str:
+        first = (
+            "the proof is about this program" if self.holds else "the proof is about another one"
+        )
+        rows = [*(f"differs: {text}" for text in self.differences), *self.remarks]
+        return "\n".join([first, *rows])
+
+
+class BindingSettings(TypedDict, total=False):
+    """Keywords of `holds_for` that describe the map as `bound_drift` received it."""
+
+    inside: Any
+    args: Any
+    method: Method | str | None
+    arithmetic: Arithmetic | None
+    integrator: Integrator | None
+
+
+@checked_keywords
+def holds_for(
+    system: Any,
+    certificate: DriftBound | dict[str, Any] | str | os.PathLike[str],
+    found: Any = None,
+    **settings: Unpack[BindingSettings],
+) -> Binding:
+    """Whether a certificate of `bound_drift` is about a system: its map is read again and compared.
+
+    The step of the system is traced, read as a list of operations, compared with the traced
+    function at random points of the domain, and then with the list of the certificate. The
+    certificate itself is not checked: ``dvi-jax verify`` does that.
+
+    **Arguments** `system`: a `System` or a problem of the library. `certificate`: a `DriftBound`,
+    or the path or contents of the file that its `save` wrote. `found`: the invariants, if these
+    shall be compared as well. `inside`, `args`, `method`, `arithmetic`, `integrator`: as in the
+    call of `bound_drift`.
+
+    **Returns** a `Binding`, which is true if nothing differs; ``print`` shows what differs.
+
+    **Raises** `ValueError` for a changed file, and for a system that has no list of operations.
+
+    **Example**
+
+    ```python
+    spring = dvi.System(lambda t0, t1, q0, p1, args: (p1 @ p1 + args * q0 @ q0) / 2)
+    energy = lambda q, p, epsilon: (p @ p + q @ q - 0.1 * q @ p) / 2
+    bound = dvi.bound_drift(energy, spring, args=1.0, h=0.1, epsilon=0.1, domain=np.array([0.5]))
+    print(bool(dvi.holds_for(spring, bound, energy, args=1.0)))
+    print(bool(dvi.holds_for(spring, bound, energy, args=1.1)))
+    # True
+    # False
+    ```
+    """
+    exact, _ = tools()
+    refuse_double_without_x64("the certificate", float)
+    c = _contents(certificate)
+    if c.get("format") != exact.FORMAT or exact.digest(c) != c["hash"]:
+        raise ValueError(
+            f"certificate must be a file that DriftBound.save wrote, of the format {exact.FORMAT!r}"
+            f" and unchanged, got the format {c.get('format')!r}."
+        )
+    system, *_, args = of_problem(system, None, None, None, settings.get("args"), has_start=True)
+    check_system(system, "holds_for")
+    method, arithmetic = settings.get("method"), settings.get("arithmetic")
+    options = chosen(settings.get("integrator"), method=method, arithmetic=arithmetic)
+    integrator = only(options, "holds_for", "method", "arithmetic")
+    numbers = {k: [float.fromhex(x) for x in c[k]] for k in ("time", "epsilon")}
+    sides = tuple([float.fromhex(x) for x in side] for side in c["domain"])
+    region = Region(
+        tuple(c["shape"]), sides, (*numbers["time"],), (*numbers["epsilon"],),
+        float.fromhex(c["h"]), c["timed"],
+    )  # fmt: skip
+    functions = [] if found is None else functions_of(found, system, region.is_timed)
+    inside = settings.get("inside")
+    _, programs = programs_of(
+        system, integrator, args, functions, inside, region, region.points(inside)
+    )
+    parts = [part for part in _PARTS if found is not None or part != "invariants"]
+    differences = [_PARTS[part] for part in parts if programs[part] != c[part]]
+    remarks = [] if found is not None else ["the invariants were not compared: give found=..."]
+    mine, its = programs["program"], c["program"]
+    if mine["elementary functions"] != its["elementary functions"]:
+        differences.append("the elementary functions, whose errors the rounding contains")
+    for name in mine["versions"]:
+        pair = its["versions"][name], mine["versions"][name]
+        if pair[0] != pair[1]:
+            remarks.append(f"{name} was {pair[0]} when the proof was made and is {pair[1]}")
+    names = ["step"] if found is None else ["step", "invariants"]
+    remarks += [
+        f"the program of the {name} is another one, with the same list of operations"
+        for name in names
+        if mine[name] != its[name] and programs[name] == c[name]
+    ]
+    return Binding(not differences, tuple(differences), tuple(remarks))
+
+
+def _contents(certificate: Any) -> dict[str, Any]:
+    if isinstance(certificate, DriftBound):
+        return certificate.certificate
+    if isinstance(certificate, dict):
+        return certificate
+    return json.loads(Path(certificate).read_text(encoding="utf-8"))
