@@ -66,7 +66,9 @@ def along(gradient, direction):
     return jax.tree.reduce(jnp.add, jax.tree.map(lambda a, b: jnp.sum(a * b), gradient, direction))
 
 
-@pytest.mark.parametrize("name", ["coefficients", "iota", "psi_edge", "G"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("coefficients", marks=pytest.mark.slow), "iota", "psi_edge", "G"]
+)
 def test_gradient_of_the_drift_equals_differences(broken, starts, name):
     direction = directions(broken)[name]
     found = along(gradient_of_drift(broken, starts), direction)

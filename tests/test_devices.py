@@ -90,9 +90,8 @@ print(largest([jax.pmap(batch, in_axes=(0, None))(q.reshape(4, 2, 1), k).reshape
 """
 
 
-@pytest.mark.parametrize(
-    "adjoint", [pytest.param("Reversible()", marks=pytest.mark.slow), "Direct()"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("adjoint", ["Reversible()", "Direct()"])
 def test_four_devices_by_shard_map_shardings_and_pmap(adjoint):
     """Numbers and gradients, also by a parameter that all devices share, are those of one."""
     flags = "--xla_force_host_platform_device_count=4"

@@ -585,7 +585,7 @@ def test_saved_and_loaded(regular, tmp_path):
     with pytest.raises(FileNotFoundError, match="no directory"):
         found.save(tmp_path / "nowhere" / "fit.npz")
     (tmp_path / "bad.npz").write_bytes(b"nonsense")
-    with pytest.raises(ValueError, match="is not the file of a fit"):
+    with pytest.raises(ValueError, match="damaged, or not the file of a fit"):
         dvi.FitResult.load(tmp_path / "bad.npz")
 
 

@@ -393,7 +393,7 @@ INVALID_POSTERIORS = [
 INVALID_SAMPLES = [
     ({"num_samples": 2}, ValueError, "num_samples must be an integer of at least 4, got 2"),
     ({"chains": 0}, ValueError, "chains must be"),
-    ({"target_accept": 1.0}, ValueError, "target_accept must be a number between 0 and 1"),
+    ({"target_accept": 1.0}, ValueError, "target_accept must be between 0 and 1"),
     ({"progress": 3}, TypeError, "progress must be"),
     ({"start": {"q0": np.zeros(1)}}, ValueError, r"Missing: p0\[0\]\. Unknown: none"),
     (OUTSIDE, ValueError, "not between its bounds"),

@@ -214,7 +214,7 @@ INVALID_LIBRARIES = [
     (lambda: dvi.ForceLibrary([Q]), TypeError, "must be a dict"),
     (lambda: dvi.ForceLibrary({}), ValueError, "at least one"),
     (lambda: dvi.ForceLibrary({1: H_D}), TypeError, "must be a string"),
-    (lambda: dvi.ForceLibrary({"f": lambda q: q}), TypeError, "'f' must take five"),
+    (lambda: dvi.ForceLibrary({"f": lambda q: q}), TypeError, "'f' must take the arguments"),
     (lambda: dvi.ForceLibrary({"f": H_D}, [1.0, 2.0]), ValueError, r"shape \(1,\)"),
     (lambda: ONE.only(["x"]), ValueError, "unknown candidate 'x'"),
     (lambda: ONE.with_coefficients({"x": 1.0}), ValueError, "unknown candidate 'x'"),

@@ -245,5 +245,5 @@ def test_other_objects():
         interop.from_rebound(three_bodies(), snapshot=2)
     sim = three_bodies()
     sim.add(m=1e-5, x=sim.particles[1].x, y=sim.particles[1].y, z=sim.particles[1].z)
-    with pytest.raises(ValueError, match="giant and body 3 are at the same position"):
+    with pytest.raises(ValueError, match="giant and body 3 must have different positions"):
         interop.from_rebound(sim)

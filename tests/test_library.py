@@ -37,6 +37,8 @@ ALIKE |= {"perturbed_pendulum", "lorentz_pendulum", "van_der_pol"}
 MOST = set(NAMES) - ALIKE
 CONSTRAINED = {"spherical_pendulum", "chain", "slider_crank", "dumbbell", "heavy_top", "satellite"}
 """Those with a constraint, whose forces are added to the flow, and whose method is `Rattle`."""
+EXPENSIVE = {"magnetic_mirror", "toda", "fput", "thermal_chain", "stiff_fput", "heavy_top"}
+"""Those whose flow takes more than two seconds to compile."""
 slow = pytest.mark.slow
 
 
@@ -171,7 +173,7 @@ def watched(name):
     return along
 
 
-@pytest.mark.parametrize("name", listed(NAMES, MOST))
+@pytest.mark.parametrize("name", listed(NAMES, MOST - EXPENSIVE))
 def test_declared_invariants_are_all_that_the_flow_conserves(name):
     """They are constant, and not along sheared states; other observables, if not adiabatic, change.
 

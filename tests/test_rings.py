@@ -118,6 +118,7 @@ def cell():
     )
 
 
+@pytest.mark.slow
 def test_gradients_by_strengths_and_coordinates(cell):
     """Reverse mode along states that are tracked backwards, against differences and forward mode;
     a lost particle changes nothing."""

@@ -78,7 +78,7 @@ def at_most(limit: int, count: int, things: str, choice: str) -> None:
 
 
 def check_not_empty(name: str, things: Any, hint: str) -> None:
-    """**Raises** `ValueError` if there are none of them, with what to give."""
+    """**Raises** `ValueError` if they are missing, with what to give."""
     if not len(things):
         raise ValueError(f"{name} is empty: {hint}.")
 

@@ -210,7 +210,7 @@ class Writer:
         self.scopes[-1][key] = value
 
     def find_or_make(self, key: Any, make: Callable[[], Any]) -> Any:
-        """The object that was made under a key; made now if there is none."""
+        """The object that was made under a key; made now if it is missing."""
         item = self.find(key)
         if item is None:
             item = make()
