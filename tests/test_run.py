@@ -212,7 +212,7 @@ REJECTED = [
     ('system = "own.py:numbered"\nepsilon = 0.1\n' + FULL, "of if (own.py, line 28)", "fit"),
     (
         N_BODY + "[state]\nq0 = [[0, 0], [0, 0], [1, 1]]",
-        "body 0 and body 1 must have different",
+        "body 1 must have different",
         "start",
     ),
     (N_BODY + "[args]\nmasses = [1, 0, 1]", "mass of body 1 must be positive", "start"),

@@ -313,7 +313,7 @@ STEP_FROM_TIMES = dvi.discretise(lambda t, q, p, args: q @ q, order=2)
         (lambda: dvi.Splitting(dvi.GaussLegendre(2)), TypeError, "must be a composition"),
         (lambda: end(dvi.Splitting(), 0.1, 2, dvi.System(quartic)), TypeError, "dvi.Split"),
         (lambda: end(dvi.Splitting((8, 4)), 0.1, 2, FORCED, epsilon=0.1), ValueError, "two parts"),
-        *((lambda m=m: end(m, 0.1, 2, arithmetic=dvi.DoubleDouble()), ValueError, "accuracy of float64")
+        *((lambda m=m: end(m, 0.1, 2, arithmetic=dvi.DoubleDouble()), ValueError, "Kepler flow")
           for m in (dvi.Splitting(), dvi.Adjoint(dvi.Splitting()))),
         (lambda: dvi.WisdomHolman("democratic", corrector=3), ValueError, "must be 0 unless"),
         (lambda: dvi.WisdomHolman("helio"), ValueError, "coordinates must be one of"),
