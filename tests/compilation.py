@@ -11,8 +11,8 @@ if HAS_BOTH_EMITTERS:
     FLAGS = "--xla_cpu_use_fusion_emitters=false " + FLAGS
 """The emitters that XLA:CPU uses by default take twice as long to compile the same program, and
 more than half of the processor time of the tests is compilation. A lower level of optimisation
-takes a sixth of it away. A second thread of compilation saves no time when a second worker runs. Numbers
-may differ in the last digit. The machine code of `lanewise` is not affected."""
+takes a sixth of it away. A second thread of compilation saves no time when a second worker runs.
+Numbers may differ in the last digit. The machine code of `lanewise` is not affected."""
 
 
 def set_flags() -> None:

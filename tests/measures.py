@@ -38,20 +38,20 @@ PACKAGES = ("dvi_jax", "lanewise", "dvi_jax_cli")
 LONGEST_FILE, MOST_PARAMETERS = 450, 9
 
 LIMITS: dict[str, float] = {
-    "lines of the core": 12_770,
-    "lines of the questions": 20_250,
-    "lines of the leaves": 17_550,
-    "lines of lanewise": 7_480,
-    "lines of the command line": 4_430,
-    "raise statements": 761,
-    "characters of error text": 67_100,
-    "functions with more than 9 parameters": 17,
+    "lines of the core": 12_710,
+    "lines of the questions": 20_540,
+    "lines of the leaves": 17_460,
+    "lines of lanewise": 7_460,
+    "lines of the command line": 4_490,
+    "raise statements": 600,
+    "characters of error text": 45_000,
+    "functions with more than 9 parameters": 2,
     "files of more than 450 lines": 0,
     "files at the top of dvi_jax": 3,
     "circles of imports": 0,
     "layers of imports": 16,
-    "names that are participles or function words, per cent": 5.8,
-    "names of one letter outside of equations, per cent": 18.9,
+    "names that are participles or function words, per cent": 1.0,
+    "names of one letter outside of equations, per cent": 15.0,
 }
 """What the tests allow. When the code has become smaller lower them; only a new capability raises
 the lines of a part, by its own size."""
