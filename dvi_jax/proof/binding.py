@@ -105,12 +105,10 @@ def holds_for(
     method, arithmetic = settings.get("method"), settings.get("arithmetic")
     options = chosen(settings.get("integrator"), method=method, arithmetic=arithmetic)
     integrator = only(options, "holds_for", "method", "arithmetic")
-    numbers = {k: [float.fromhex(x) for x in c[k]] for k in ("time", "epsilon")}
-    sides = tuple([float.fromhex(x) for x in side] for side in c["domain"])
-    region = Region(
-        tuple(c["shape"]), sides, (*numbers["time"],), (*numbers["epsilon"],),
-        float.fromhex(c["h"]), c["timed"],
-    )  # fmt: skip
+    low, high = ([float.fromhex(x) for x in side] for side in c["domain"])
+    (begin, end), (least, largest) = ([float.fromhex(x) for x in c[k]] for k in ("time", "epsilon"))
+    h, shape = float.fromhex(c["h"]), tuple(c["shape"])
+    region = Region(shape, (low, high), (begin, end), (least, largest), h, c["timed"])
     functions = [] if found is None else functions_of(found, system, region.is_timed)
     inside = settings.get("inside")
     _, programs = programs_of(

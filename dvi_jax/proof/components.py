@@ -405,7 +405,7 @@ def _linear(program: ScalarProgram, equation: Any, values: list) -> np.ndarray:
             continue
         scalars = _symbolic(program, value)
         for place in np.ndindex(scalars.shape):
-            scalar: ProgramNumber = scalars[place]
+            scalar: Any = scalars[place]
             if scalar.value == 0:
                 continue
             units = [x.copy() for x in zeros]

@@ -25,7 +25,8 @@ def carried_over(state_before: Sequence[Num], state_after: Sequence[Num]) -> lis
     first, second = _Forms(place, min(place), names), _Forms(new_place, min(place), names)
     numbers = _all_of(state_after)
     for x in sorted(numbers, key=lambda x: x.serial):  # operands first, so that no call is deep
-        first.key(x), second.key(x)
+        first.key(x)
+        second.key(x)
     ends = {}
     for y in numbers:
         form = second.key(y)
