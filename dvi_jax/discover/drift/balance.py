@@ -92,8 +92,8 @@ def noether_balance(
     num_steps = solution.stats["num_steps"]
     if steps != jnp.size(solution.hs) or not (is_traced(num_steps) or steps == num_steps):
         raise ValueError(
-            f"solution must have the state at every lattice point, got {steps + 1} states for "
-            f"num_steps={num_steps}: integrate with save=dvi.Save()."
+            f"solution must have the state at every lattice point, got {steps + 1} states, at some "
+            f"or at requested times, for num_steps={num_steps}: integrate with save=dvi.Save()."
         )
     return _balance(
         system,
