@@ -78,6 +78,16 @@ def test_a_changed_file_is_refused(bound, tmp_path):
         dvi.holds_for(SYSTEM, changed, **HOW)
 
 
+def test_what_is_no_certificate_is_refused(tmp_path):
+    (tmp_path / "text").write_text("no JSON")
+    (tmp_path / "list").write_text("[]")
+    for certificate, kind in (("text", ValueError), ("list", TypeError)):
+        with pytest.raises(kind, match=certificate):
+            dvi.holds_for(SYSTEM, tmp_path / certificate, **HOW)
+    with pytest.raises(TypeError, match="got 3"):
+        dvi.holds_for(SYSTEM, 3, **HOW)
+
+
 def test_the_command_line_compares_a_system(bound, tmp_path):
     (tmp_path / "model.py").write_text(
         "import dvi_jax as dvi\n"

@@ -136,6 +136,17 @@ def holds_for(
 def _contents(certificate: Any) -> dict[str, Any]:
     if isinstance(certificate, DriftBound):
         return certificate.certificate
-    if isinstance(certificate, dict):
-        return certificate
-    return json.loads(Path(certificate).read_text(encoding="utf-8"))
+    contents = certificate
+    if isinstance(certificate, str | os.PathLike):
+        try:
+            contents = json.loads(Path(certificate).read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise ValueError(
+                f"certificate {str(certificate)!r} is no JSON file: {error}."
+            ) from None
+    if not isinstance(contents, dict):
+        raise TypeError(
+            "certificate must be a DriftBound, or a file that its save wrote, got "
+            f"{certificate!r:.100}."
+        )
+    return contents
