@@ -127,7 +127,7 @@ def generates() -> bool:
     return _can_start()
 
 
-@functools.cache
+@machine.once
 def _can_start() -> bool:
     try:
         machine.start_llvm()

@@ -9,6 +9,7 @@ import os
 import subprocess
 import sys
 import threading
+import time
 import warnings
 from pathlib import Path
 from types import SimpleNamespace
@@ -1254,6 +1255,21 @@ def in_eight_threads(work):
     for w in workers:
         w.join(100)
     return found
+
+
+def test_threads_that_begin_together_start_llvm_once():
+    """Two devices of a sweep began together, and one of them got XLA's digits."""
+    starts = []
+
+    @machine.once
+    def start():
+        time.sleep(0.05)
+        starts.append(threading.get_ident())
+        return object()
+
+    engines = in_eight_threads(lambda i: start())
+    assert len(starts) == 1
+    assert len(set(map(id, engines))) == 1
 
 
 def test_eight_python_threads(left, threads):

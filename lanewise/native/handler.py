@@ -8,7 +8,6 @@ user frees.
 """
 
 import ctypes
-import functools
 import hashlib
 import sys
 import threading
@@ -286,7 +285,7 @@ _lock = threading.RLock()
 _targets: dict[str, str] = {}
 
 
-@functools.cache
+@machine.once
 def runtime() -> Any:
     """The machine code that all kernels share."""
     return machine.load(_RUNTIME)

@@ -1,6 +1,8 @@
 """LLVM IR to machine code: the host's features, the optimiser, and what an earlier process made."""
 
 import functools
+import threading
+from collections.abc import Callable
 from typing import Any
 
 from . import cache
@@ -9,8 +11,23 @@ from . import cache
 # expects of the process around it, or processes would load code that does not fit.
 FORMAT = 3
 
+_lock = threading.RLock()
 
-@functools.cache
+
+def once(function: Callable) -> Callable:
+    """`functools.cache` for threads: of two that begin together, as for two devices, one computes
+    and the other waits."""
+    cached = functools.cache(function)
+
+    @functools.wraps(function)
+    def locked(*args: Any) -> Any:
+        with _lock:
+            return cached(*args)
+
+    return locked
+
+
+@once
 def start_llvm() -> Any:
     """The module `llvmlite.binding`, with LLVM started.
 
@@ -26,7 +43,7 @@ def start_llvm() -> Any:
     return llvm
 
 
-@functools.cache
+@once
 def host() -> tuple[str, str]:
     """(name, features) of the processor, as LLVM calls them."""
     llvm = start_llvm()
@@ -37,7 +54,7 @@ def host() -> tuple[str, str]:
     return llvm.get_host_cpu_name(), features
 
 
-@functools.cache
+@once
 def width() -> int:
     """How many float64 a vector register has."""
     features = set(host()[1].split(","))
@@ -46,7 +63,7 @@ def width() -> int:
     return 4 if "+avx2" in features else 2
 
 
-@functools.cache
+@once
 def target_machine(triple: str | None = None, cpu: str | None = None, features: str | None = None):
     """LLVM's view of a machine, by default of this one."""
     llvm = start_llvm()
@@ -107,19 +124,20 @@ def load(ir: str, symbols: dict[str, int] | None = None) -> Any:
     # An empty module with the key as its name makes the engine read the code from its object cache.
     empty = llvm.parse_assembly("")
     empty.name = key
-    _codes[key] = code
-    try:
-        engine.add_module(empty)
-        engine.finalize_object()
-    finally:
-        del _codes[key]
+    with _lock:
+        _codes[key] = code
+        try:
+            engine.add_module(empty)
+            engine.finalize_object()
+        finally:
+            del _codes[key]
     return engine
 
 
 _codes: dict[str, bytes] = {}  # of modules that are being added to the engine, by their names
 
 
-@functools.cache
+@once
 def _engine() -> Any:
     llvm, (cpu, features) = start_llvm(), host()
     first = llvm.parse_assembly("define internal void @nothing() { ret void }")
