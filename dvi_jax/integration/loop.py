@@ -13,6 +13,7 @@ import lanewise
 
 from ..base.results import RESULTS, first_failure
 from ..base.types import Interval, Scalar, State
+from ..engine.guard import constant_if_it_fails, constant_unless
 from ..engine.newton import no_residual, worse
 from ..engine.pairs import rounded
 from ..lattices import Place, Uniform
@@ -89,11 +90,19 @@ def take_step(
     equations = task.equations_at(carry.k, interval)
     step = task.arithmetic.interpret(step or task.method.step)
 
-    def advance(q, p):
+    was_good = carry.result == RESULTS.successful
+
+    def one_step(q, p):
         local, *state = task.arithmetic.enter(equations, q, p, carry.remainder)
         q1, p1, info = step(local, interval, *state)
         q1, p1, remainder = task.arithmetic.leave(q, p, q1, p1)
         return (q1, p1), (remainder, rounded(info))
+
+    def guarded(q, p):
+        return constant_unless(was_good, one_step, q, p)
+
+    def advance(q, p):
+        return constant_if_it_fails(lambda out: out[1][1].result == RESULTS.successful, guarded, q, p)
 
     if task.has_deviations:
         # One linearisation serves all deviation vectors of all reductions.
@@ -110,12 +119,11 @@ def take_step(
         carry, q1, p1, result, good, residual
     )
     ends = Ends(interval.t0, interval.t1, carry.q, carry.p, q1, p1)
-    memories = _memories(task, carry, ends, remainder, push, interval.h)
+    memories = _memories(task, carry, ends, remainder, push, interval.h, good)
     if stop is not None:
         # Reductions cover the steps before the one in which the run stopped.
         is_end = result == RESULTS.stopped
         memories = jax.tree.map(lambda a, b: jnp.where(is_end, b, a), memories, carry.reductions)
-    was_good = carry.result == RESULTS.successful
     carry = Carry(
         k=carry.k + 1,
         q=q1,
@@ -159,9 +167,15 @@ def _with_failure(
 
 
 def _memories(
-    task: Task, carry: Carry, ends: Ends, remainder: Any, push: Callable | None, h: Scalar
+    task: Task,
+    carry: Carry,
+    ends: Ends,
+    remainder: Any,
+    push: Callable | None,
+    h: Scalar,
+    good: Array,
 ) -> list[Any]:
-    """The memories of the reductions after a step with the derivative `push`."""
+    """The memories of the reductions after a step with the derivative `push`, `good` or failed."""
     _, reductions = task.observables()
     start = task.arithmetic.full_state(ends.q0, ends.p0, carry.remainder)
     end = task.arithmetic.full_state(ends.q1, ends.p1, remainder)
@@ -176,7 +190,8 @@ def _memories(
         function = task.bound(reduction.function)
 
         def with_value(ends, memory):
-            return reduction.update(memory, k, ends.t1, ends.number(function, task.args))
+            value = constant_unless(good, lambda *ends: Ends(*ends).number(function, task.args), *ends)
+            return reduction.update(memory, k, ends.t1, value)
 
         return task.evaluate(reduction, with_value, Ends(*ends[:2], *start, *end), memory)
 
@@ -258,7 +273,8 @@ def run(
         if end is not carry:
             start = leave(carry._replace(k=carry.k - 1, q=ends.q0, p=ends.p0))
             ends = Ends(*ends[:2], start.q, start.p, end.q, end.p)
-        observed = task.at_save(carry, ends)
+        good = carry.result == RESULTS.successful
+        observed = constant_unless(good, task.at_save, carry, ends)
         return carry, Rows(interval.t1, interval.h, end.q, end.p, observed, inner)
 
     carry, rows = loop(steps, carry, None, plan.num_blocks)
@@ -281,7 +297,11 @@ def _in_loop(task: Task, q: State) -> tuple[Callable | None, Callable, Callable]
         return None, lambda carry: carry, lambda carry: carry
 
     def substep(advance, carry, k):
-        q, p, info = advance(task.equations, task.interval(k), carry.q, carry.p)
+        def part(q, p):
+            return advance(task.equations, task.interval(k), q, p)
+
+        was_good = carry.result == RESULTS.successful
+        q, p, info = constant_unless(was_good, part, carry.q, carry.p)
         good = info.result == RESULTS.successful
         residual = lax.stop_gradient(info.residual)
         state = _with_failure(carry, q, p, info.result, good, residual)

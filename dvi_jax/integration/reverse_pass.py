@@ -54,13 +54,14 @@ class ReversePass(eqx.Module):
     and the cotangents of saved and observed values are added where they belong.
 
     - `theta`: the arrays of the task that are differentiated. `constants`: its other parts.
-    - `memories`: of the reductions, after the run. `cotangent`: of the outputs of the run.
+    - `memories`, `results`: of the reductions, after the run. `cotangent`: of its outputs.
     """
 
     theta: Any
     constants: Any
     states: Reconstruction
     memories: list[Any]
+    results: list[Any]
     cotangent: Smooth
 
     def task(self, theta: Any) -> Task:
@@ -79,7 +80,10 @@ class ReversePass(eqx.Module):
         is_saved = k == save.step
         observed = jax.tree.map(lambda c: jnp.where(is_saved, c, jnp.zeros_like(c)), save.observed)
         of_t1, of_values = _of_values(self.reductions(), k, t1, values)
-        of_theta, q, p = pull(((after_step.q, after_step.p, of_t1), observed, of_values))
+        pulled = pull(((after_step.q, after_step.p, of_t1), observed, of_values))
+        # A failed step is a constant, NaN: zero times its derivative would be NaN as well.
+        good = _all_finite(start) & _all_finite(end)
+        of_theta, q, p = jax.tree.map(lambda x: jnp.where(good, x, 0), pulled)
         return Cotangents(jax.tree.map(jnp.add, after_step.theta, of_theta), q, p)
 
     def local_step(self, theta: Any, q0: State, p0: State, k: Array, p1: State) -> tuple:
@@ -107,6 +111,10 @@ class ReversePass(eqx.Module):
         _, reductions = self.task(self.theta).observables()
         return list(zip(reductions, self.memories, self.cotangent.results, strict=True))
 
+    def has_reductions_with_cotangents(self) -> Array:
+        """Whether the loss depends on a result of a reduction."""
+        return _any_nonzero(self.cotangent.results)
+
     def steps(
         self,
         cotangents: Cotangents,
@@ -126,9 +134,10 @@ class ReversePass(eqx.Module):
             start, end, first, count, transport, cotangents
         )
         is_exact = is_solved & jnp.all(defects <= self.states.tolerance)
-        # Not for a trajectory that has failed itself: its gradient is NaN, and a batch must not
-        # wait for the steps of one whose result is known.
-        is_wrong = ~is_exact & _all_finite(start) & _all_finite(end)
+        # A batch must not wait for the steps of a trajectory that fails in this piece, unless
+        # reductions read those before.
+        is_used = _all_finite(end) | self.has_reductions_with_cotangents()
+        is_wrong = ~is_exact & _all_finite(start) & is_used
 
         def correct(cheap):
             exact = self.steps_again(cotangents, first, start, end, count, save)
@@ -188,6 +197,26 @@ class ReversePass(eqx.Module):
             cotangents = pieces.fold(of_piece, cotangents, reverse=True)
         return cotangents
 
+    def uses_failed(self, starts: Point, of_rows: Rows, end: Point) -> Array:
+        """Whether the loss depends on a value after a failure: a saved one, the last state, or a
+        result of a reduction."""
+
+        def is_used(of_values, state):
+            return _any_nonzero(of_values) & ~_all_finite(state)
+
+        states = jax.tree.map(lambda x: x[1 : 1 + self.states.plan.num_blocks], starts)
+        of_saved = jax.tree.map(lambda x: x[: len(states[0])], of_rows[2:5])
+        of_end = self.cotangent.q, self.cotangent.p
+        if self.states.plan.save_tail:
+            of_end = of_end, jax.tree.map(lambda x: x[-1], of_rows[2:5])
+        of_results = jax.tree.map(
+            lambda cotangent, result: jnp.where(jnp.isfinite(result), 0, cotangent),
+            self.cotangent.results,
+            self.results,
+        )
+        in_rows = jnp.any(jax.vmap(is_used)(of_saved, states))
+        return in_rows | is_used(of_end, end) | _any_nonzero(of_results)
+
     def run(self, start: Point, rows: Rows, tail: Rows | None) -> Cotangents:
         """The cotangents of θ and of the initial state, from the states that the run has stored."""
         plan, of_rows = self.states.plan, self.cotangent.rows
@@ -198,6 +227,8 @@ class ReversePass(eqx.Module):
             of_start = of_rows.q[0], of_rows.p[0]
             of_rows = of_rows._replace(q=of_rows.q[1:], p=of_rows.p[1:])
         starts = self.states.starts(start, rows)
+        end = jax.tree.map(lambda x: x[-1], starts) if tail is None else (tail.q, tail.p)
+        uses_failed = self.uses_failed(starts, of_rows, end)
         if tail is not None:
             # Without a saved tail nothing is observed at the end of the run: cotangents of zero.
             of_tail = jax.tree.map(
@@ -217,7 +248,9 @@ class ReversePass(eqx.Module):
         if of_start is not None:
             q, p = map(jnp.add, (cotangents.q, cotangents.p), of_start)
             cotangents = cotangents._replace(q=q, p=p)
-        return self.initial_values(cotangents, start)
+        cotangents = self.initial_values(cotangents, start)
+        # Zero would hide that the loss is not a number.
+        return jax.tree.map(lambda x: jnp.where(uses_failed, jnp.nan, x), cotangents)
 
     def initial_values(self, cotangents: Cotangents, start: Point) -> Cotangents:
         """The cotangents, with those of the values of reductions at the initial state."""
@@ -241,7 +274,9 @@ class ReversePass(eqx.Module):
 
         (t0, values), pull = jax.vjp(values_of, self.theta, *start)
         seeds = _of_values(reductions, jnp.asarray(-1, jnp.int32), t0, values)
-        return jax.tree.map(jnp.add, cotangents, Cotangents(*pull(seeds)))
+        good = _all_finite(start)
+        pulled = jax.tree.map(lambda x: jnp.where(good, x, 0), pull(seeds))
+        return jax.tree.map(jnp.add, cotangents, Cotangents(*pulled))
 
 
 def _of_values(
@@ -255,6 +290,10 @@ def _of_values(
         of_t1 = of_t1 + of_t
         of_values.append(of_value.astype(value.dtype))
     return of_t1, of_values
+
+
+def _any_nonzero(cotangents: Any) -> Array:
+    return jnp.any(jnp.asarray([jnp.any(x != 0) for x in jax.tree.leaves(cotangents)], bool))
 
 
 def _all_finite(point: Point) -> Array:

@@ -42,9 +42,9 @@ class Reversible(AbstractAdjoint):
     ``stats["round_trip_defect"]`` (relative, ∞ where an inverse step has no solution). It takes as
     much time as the reconstruction of the states.
 
-    The gradient of a trajectory that has failed is NaN. The gradient of one that the loss does not
-    use is 0, failed or not, so that it does not affect parameters that a batch shares: a loss takes
-    ``jnp.where(ok, q, 0.0)``, ok of ``sol.result == dvi.RESULTS.successful``, before it computes.
+    The gradient of a loss that depends on a value after a failure is NaN. Values that it does not
+    use have no effect on parameters that a batch shares: a loss takes ``jnp.where(ok, q, 0.0)``, ok
+    of ``sol.result == dvi.RESULTS.successful``, before it computes.
 
     Forward mode (`jvp`) and higher derivatives go through the scan as with `Direct`. A method
     without an inverse (`RungeKutta4`), a `Variational` lattice, a run with a `Stop`, with deviation
@@ -123,24 +123,21 @@ class Reversible(AbstractAdjoint):
             def pull(variables, constants, counts, record, cotangent):
                 theta, q0, p0 = eqx.combine(variables, constants)
                 variable, constant = eqx.partition(theta, is_variable[0])
-                memories, rows, tail = record
+                (memories, rows, tail), results = record
                 reverse_pass = ReversePass(
                     variable,
                     eqx.combine(constant, counts, functions),
                     states_of(theta, counts),
                     memories,
+                    results,
                     cotangent,
                 )
-                cotangents = eqx.filter(tuple(reverse_pass.run((q0, p0), rows, tail)), is_variable)
-                # A failed trajectory that the loss does not use: zero, although the states along
-                # which the cotangent zero would be transported are NaN.
-                nonzero = [jnp.any(x != 0) for x in jax.tree.leaves(cotangent)]
-                is_used = jnp.any(jnp.stack(nonzero))
-                return jax.tree.map(lambda x: jnp.where(is_used, x, 0), cotangents)
+                return eqx.filter(tuple(reverse_pass.run((q0, p0), rows, tail)), is_variable)
 
             derivative = LinearMap(push, pull, layout)
             point = variables, constants, counts
-            change = derivative(point, trace.record(), eqx.filter(change, is_variable))
+            record = trace.record(), smooth.results
+            change = derivative(point, record, eqx.filter(change, is_variable))
             return (smooth, trace), (change, jax.tree.map(_no_tangent, trace))
 
         smooth, trace = trajectory(inputs, counts)
