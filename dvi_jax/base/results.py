@@ -4,6 +4,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -77,13 +78,17 @@ class RESULTS(eqx.Enumeration):
         "The particle was lost in the ring: it hit an aperture, or a coordinate exceeded 1. "
         "dvi.rings.track also reports the element."
     )
+    event_not_finite = (
+        "The function g of dvi.Stop or dvi.Section became NaN at a state of the trajectory, so that "
+        "its sign is not known. Give it a value at all states, for example with jnp.where."
+    )
 
 
 # In the order of the class, which numbers them. A new status goes to the end: stores have numbers.
 STATUS_NAMES = (
     *("successful", "not_converged", "not_finite", "bad_step_size", "no_root", "out_of_range"),
     *("stopped", "not_reached", "step_control_failed", "inconsistent", "redundant"),
-    "lost",
+    *("lost", "event_not_finite"),
 )
 
 
@@ -104,6 +109,19 @@ def first_failure(earlier: RESULTS, later: RESULTS) -> RESULTS:
     """The combined status when `later` follows `earlier`: the first failure."""
     # A selection, not a branch: in a batch every trajectory has its own status.
     return RESULTS.where(earlier == RESULTS.successful, later, earlier)
+
+
+def first_of(statuses: RESULTS, exists: Array) -> RESULTS:
+    """The first status of a row that is a failure, among the places that exist."""
+    is_failure = exists & (statuses != RESULTS.successful)
+    first = jax.tree.map(lambda code: code[jnp.argmax(is_failure)], statuses)
+    return RESULTS.where(jnp.any(is_failure), first, RESULTS.successful)
+
+
+def with_auxiliary(status: RESULTS, auxiliary: RESULTS) -> RESULTS:
+    """The status of a run whose evaluations beside its steps have the status `auxiliary`."""
+    is_good = (status == RESULTS.successful) | (status == RESULTS.stopped)
+    return RESULTS.where(is_good & (auxiliary != RESULTS.successful), auxiliary, status)
 
 
 class IntegrationError(RuntimeError):

@@ -55,7 +55,8 @@ def _false_position(f: Function, a, fa, b, fb, exists) -> Number:
     def proceed(state):
         a, _, b, fb, n = state
         apart = jnp.abs(b - a) > 2 * jnp.finfo(a.dtype).eps * jnp.maximum(jnp.abs(a), jnp.abs(b))
-        return exists & apart & (fb != 0) & (n < _EVALUATIONS)
+        # A value that is NaN ends the search there: the point gets the status of its step.
+        return exists & apart & (jnp.abs(fb) > 0) & (n < _EVALUATIONS)
 
     def narrow(state):
         a, fa, b, fb, n = state

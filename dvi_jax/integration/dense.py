@@ -12,6 +12,7 @@ from jaxtyping import Array, PyTree
 
 from lanewise import Layout
 
+from ..base.results import RESULTS, first_of
 from ..base.types import Interval, Scalar, State
 from ..engine.bracket import bracketed_root
 from ..engine.rounding import each, one_by_one
@@ -24,6 +25,9 @@ from .task import Task
 
 Point = tuple[Scalar, State, State]
 """(t, q, p)."""
+
+PointAndStatus = tuple[Point, RESULTS]
+"""A point, and the status of the step from which it follows."""
 
 
 class Curve(eqx.Module):
@@ -41,19 +45,20 @@ class Curve(eqx.Module):
         # In fixed point the curve would be a staircase, on which no root can be found.
         return cls(method, dataclasses.replace(equations, quantum=None), layout)
 
-    def point(self, start: Start, theta: Scalar) -> Point:
+    def point(self, start: Start, theta: Scalar) -> PointAndStatus:
         """(t, q, p) at the fraction θ of the step."""
         h = theta * (start.t1 - start.t0)
         t = start.t0 + h
-        q, p, _ = self.method.step(self.equations, Interval(start.t0, t, h), start.q0, start.p0)
-        return t, q, p
+        q, p, info = self.method.step(self.equations, Interval(start.t0, t, h), start.q0, start.p0)
+        return (t, q, p), info.result
 
-    def where(self, g: Callable[..., Any], start: Start, exists: Array) -> Point:
+    def where(self, g: Callable[..., Any], start: Start, exists: Array) -> PointAndStatus:
         """The point of the step where g(t, q, p, args) = 0, or its end if none `exists`."""
         args = self.equations.args
 
         def value(theta):
-            return event(g, *self.point(start, theta), args)
+            point, _ = self.point(start, theta)
+            return event(g, *point, args)
 
         zero, unit = jnp.zeros_like(start.t0), jnp.ones_like(start.t0)
         at_zero = event(g, start.t0, start.q0, start.p0, args)
@@ -92,24 +97,28 @@ def requested_times(save: Save, task: Task, num_steps: int) -> tuple[RequestedTi
 
 def crossings(
     curve: Curve, section: Section, record: tuple[Array, Array], safe: Start
-) -> Crossings:
-    """The crossings in the steps that a section has recorded. `safe` is any step that exists."""
+) -> tuple[Crossings, RESULTS]:
+    """The crossings in the steps that a section has recorded, and their status. `safe` is any step
+    that exists."""
     rows, count = record
     exists, starts = _steps(rows, safe)
-    points = each(_crossing, (curve, section.g), starts, exists, layout=curve.layout)
+    points, statuses = each(_crossing, (curve, section.g), starts, exists, layout=curve.layout)
     ts, qs, ps = _or_nan(exists, points)
-    return Crossings(ts, qs, ps, count.astype(jnp.int32))
+    is_known = ~jnp.isnan(count)
+    status = RESULTS.where(is_known, first_of(statuses, exists), RESULTS.event_not_finite)
+    return Crossings(ts, qs, ps, jnp.where(is_known, count, 0).astype(jnp.int32)), status
 
 
-def _crossing(surface: tuple[Curve, Callable], start: Start, exists: Array) -> Point:
+def _crossing(surface: tuple[Curve, Callable], start: Start, exists: Array) -> PointAndStatus:
     curve, g = surface
     return curve.where(g, start, exists)
 
 
 def at_times(
     curve: Curve, request: RequestedTimes, record: tuple[Array, Array], safe: Start
-) -> tuple[Array, Start, Point]:
-    """For each requested time: is it reached, the step that contains it, and the point there."""
+) -> tuple[Array, Start, Point, RESULTS]:
+    """For each requested time: is it reached, the step that contains it, and the point there; and
+    the status of these points."""
     exists, starts = _steps(record[0], safe)
     clock = (curve, request.clock)
     readings = each(_reading, clock, starts, layout=curve.layout)
@@ -125,15 +134,20 @@ def at_times(
         is_first = time == first
         if request.clock is None:
             time = jnp.where(is_first, _just_after(time, start), time)
-        point, is_shown = one_by_one(_point_at, clock, start, time, is_reached, layout=curve.layout)
+        point, status, is_shown = one_by_one(
+            _point_at, clock, start, time, is_reached, layout=curve.layout
+        )
         origin = (safe.t0, safe.q0, safe.p0)
         if request.clock is None:  # the value of the start to the bit, the slope of the curve
             origin = jax.tree.map(lambda a, b: a + lax.stop_gradient(b - a), point, origin)
         point = jax.tree.map(lambda a, b: jnp.where(is_first, b, a), point, origin)
         has_point = (is_reached & is_shown) | is_first
-        return has_point, start, _or_nan(has_point, point)
+        # The state at the start needs no step.
+        status = RESULTS.where(is_reached & ~is_first, status, RESULTS.successful)
+        return has_point, start, _or_nan(has_point, point), status
 
-    return jax.vmap(at_time)(request.ts, request.due)
+    has_point, start, points, statuses = jax.vmap(at_time)(request.ts, request.due)
+    return has_point, start, points, first_of(statuses, jnp.asarray(True))
 
 
 Clock = tuple[Curve, Any]
@@ -146,23 +160,26 @@ def _reading(clock: Clock, start: Start) -> Scalar:
     return shown(function, start.t0, start.q0, start.p0, curve.equations.args)
 
 
-def _point_at(clock: Clock, start: Start, time: Scalar, is_reached: Array) -> tuple[Point, Array]:
-    """The point of the step at a requested time, and whether the clock shows that time there."""
+def _point_at(
+    clock: Clock, start: Start, time: Scalar, is_reached: Array
+) -> tuple[Point, RESULTS, Array]:
+    """The point of the step at a requested time, its status, and whether the clock shows that time
+    there."""
     curve, function = clock
     if function is None:
         theta = (time - start.t0) / (start.t1 - start.t0)
-        return curve.point(start, theta), jnp.asarray(True)
+        return *curve.point(start, theta), jnp.asarray(True)
     args = curve.equations.args
 
     def delay(t, q, p, args):
         return shown(function, t, q, p, args) - time
 
-    t, q, p = curve.where(delay, start, is_reached)
+    (t, q, p), status = curve.where(delay, start, is_reached)
     # A clock that jumps has passed the value without showing it; so has one that is not monotonic.
     error = jnp.abs(shown(function, t, q, p, args) - time)
     span = jnp.abs(start.until - _reading(clock, start))
     tolerance = jnp.sqrt(jnp.finfo(start.q0.dtype).eps)
-    return (t, q, p), error <= tolerance * (span + jnp.abs(time))
+    return (t, q, p), status, error <= tolerance * (span + jnp.abs(time))
 
 
 def _just_after(time: Scalar, start: Start) -> Scalar:
@@ -172,16 +189,19 @@ def _just_after(time: Scalar, start: Start) -> Scalar:
     return time + lax.stop_gradient(part * (start.t1 - start.t0))
 
 
-def stop_point(curve: Curve, stop: Stop, row: Array, safe: Start) -> Stopped:
-    """The point g = 0 in the last step of a run; the start of that step if g ≥ 0 there already."""
+def stop_point(curve: Curve, stop: Stop, row: Array, safe: Start) -> tuple[Stopped, RESULTS]:
+    """The point g = 0 in the last step of a run, the start of that step if g ≥ 0 there already; and
+    its status."""
     exists, start = _steps(row, safe)
     origin = (start.t0, start.q0, start.p0)
     value = one_by_one(event, stop.g, *origin, curve.equations.args, layout=curve.layout)
     is_start = value >= 0
     surface = (curve, stop.g)
-    point = one_by_one(_crossing, surface, start, exists & ~is_start, layout=curve.layout)
+    has_root = exists & ~is_start
+    point, status = one_by_one(_crossing, surface, start, has_root, layout=curve.layout)
     point = jax.tree.map(lambda a, b: jnp.where(is_start, b, a), point, origin)
-    return Stopped(*_or_nan(exists, point))
+    status = RESULTS.where(has_root, status, RESULTS.successful)
+    return Stopped(*_or_nan(exists, point)), status
 
 
 def _steps(rows: Array, safe: Start) -> tuple[Array, Start]:

@@ -57,7 +57,10 @@ def start(task: Task, q0: State, p0: State) -> Carry:
     # A start that meets the condition of a Stop already has no step at all.
     stop = None
     if task.stop is not None:
-        is_end = ~is_failure & (event(task.stop.g, task.t0, q0, p0, task.args) >= 0)
+        value = event(task.stop.g, task.t0, q0, p0, task.args)
+        is_end = ~is_failure & (value >= 0)
+        result = RESULTS.where(~is_failure & jnp.isnan(value), RESULTS.event_not_finite, result)
+        is_failure = is_failure | jnp.isnan(value)
         result = RESULTS.where(is_end, RESULTS.stopped, result)
         stop = as_row(is_end, Start(task.t0, interval.t1, interval.t1, q0, p0))
     good = result == RESULTS.successful
@@ -102,7 +105,9 @@ def take_step(
         return constant_unless(was_good, one_step, q, p)
 
     def advance(q, p):
-        return constant_if_it_fails(lambda out: out[1][1].result == RESULTS.successful, guarded, q, p)
+        return constant_if_it_fails(
+            lambda out: out[1][1].result == RESULTS.successful, guarded, q, p
+        )
 
     if task.has_deviations:
         # One linearisation serves all deviation vectors of all reductions.
@@ -190,7 +195,9 @@ def _memories(
         function = task.bound(reduction.function)
 
         def with_value(ends, memory):
-            value = constant_unless(good, lambda *ends: Ends(*ends).number(function, task.args), *ends)
+            value = constant_unless(
+                good, lambda *ends: Ends(*ends).number(function, task.args), *ends
+            )
             return reduction.update(memory, k, ends.t1, value)
 
         return task.evaluate(reduction, with_value, Ends(*ends[:2], *start, *end), memory)
@@ -224,9 +231,11 @@ def _stop(
     """The status and the stored row, after a step that may meet the condition of a `Stop`."""
     if task.stop is None:
         return result, None
-    is_positive = event(task.stop.g, interval.t1, q1, p1, task.args) >= 0
-    is_end = (result == RESULTS.successful) & is_positive
+    value = event(task.stop.g, interval.t1, q1, p1, task.args)
+    good = result == RESULTS.successful
+    is_end = good & (value >= 0)
     row = as_row(is_end, Start(interval.t0, interval.t1, interval.t1, carry.q, carry.p))
+    result = RESULTS.where(good & jnp.isnan(value), RESULTS.event_not_finite, result)
     return RESULTS.where(is_end, RESULTS.stopped, result), jnp.where(is_end, row, carry.stop)
 
 
@@ -271,6 +280,9 @@ def run(
             ends = Ends(interval.t0, interval.t1, q0, p0, carry.q, carry.p)
         end = leave(carry)
         if end is not carry:
+            # A state that cannot be computed at a save point ends the trajectory.
+            good = end.result == RESULTS.successful
+            carry = end._replace(q=or_nan(good, carry.q), p=or_nan(good, carry.p))
             start = leave(carry._replace(k=carry.k - 1, q=ends.q0, p=ends.p0))
             ends = Ends(*ends[:2], start.q, start.p, end.q, end.p)
         good = carry.result == RESULTS.successful
@@ -304,7 +316,7 @@ def _in_loop(task: Task, q: State) -> tuple[Callable | None, Callable, Callable]
         q, p, info = constant_unless(was_good, part, carry.q, carry.p)
         good = info.result == RESULTS.successful
         residual = lax.stop_gradient(info.residual)
-        state = _with_failure(carry, q, p, info.result, good, residual)
+        state = _with_failure(carry._replace(k=k), q, p, info.result, good, residual)
         names = "q", "p", "result", "failed_step", "failed_residual"
         return carry._replace(**dict(zip(names, state, strict=True)))
 

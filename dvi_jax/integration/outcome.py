@@ -13,7 +13,7 @@ import lanewise
 from lanewise import Layout
 from lanewise.jaxprs.jaxapi import is_traced, manual_axes
 
-from ..base.results import RESULTS, IntegrationError, status_code, status_name
+from ..base.results import RESULTS, IntegrationError, status_code, status_name, with_auxiliary
 from ..engine.newton import relative_size
 from ..engine.rounding import each
 from ..lattices import Place, Run
@@ -34,13 +34,14 @@ def as_solution(
     # A batch element without a step to interpolate in uses the first one: its numbers are finite.
     safe = Start(first.t0, first.t1, first.t1, q0, p0)
     _, reductions = task.observables()
-    results: list[Any] = [
-        crossings(curve, r, value, safe) if isinstance(r, Section) else value
-        for r, value in zip(reductions, values, strict=True)
-    ]
-    status = carry.result
+    status, results = carry.result, list(values)
+    for i, reduction in enumerate(reductions):
+        if isinstance(reduction, Section):
+            results[i], of_points = crossings(curve, reduction, values[i], safe)
+            status = with_auxiliary(status, of_points)
     if reductions and isinstance(request := reductions[0], RequestedTimes):
-        is_reached, starts, (ts, qs, ps) = at_times(curve, request, results[0], safe)
+        is_reached, starts, (ts, qs, ps), of_points = at_times(curve, request, results[0], safe)
+        status = with_auxiliary(status, of_points)
         if request.clock is None:
             ts = request.ts  # also the times that were not reached
         is_short = (status == RESULTS.successful) & ~jnp.all(is_reached)
@@ -63,7 +64,10 @@ def as_solution(
         **({} if defect is None else {"round_trip_defect": defect}),
     }
     observed = observed_values(observe, columns, results)
-    end = None if task.stop is None else stop_point(curve, task.stop, carry.stop, safe)
+    end = None
+    if task.stop is not None:
+        end, of_point = stop_point(curve, task.stop, carry.stop, safe)
+        status = with_auxiliary(status, of_point)
     return Solution(ts, qs, ps, hs, observed, status, stats, end)
 
 
@@ -126,6 +130,12 @@ def raise_on_failure(solution: Solution, task: Task) -> Solution:
         )
     stats = solution.stats
     step = int(stats["failed_step"])
+    if step < 0:
+        raise IntegrationError(
+            "all steps succeeded, but a point between their ends could not be computed: a requested "
+            f"time, a crossing of a Section, or the end by a Stop. {remark}",
+            solution,
+        )
     if task.lattice.has_memory:
         details = f"last h = {float(stats['last_h']):g}"
     else:

@@ -11,12 +11,8 @@ import dvi_jax as dvi
 
 from ..base.checks import instance
 from ..base.inputs import refuse_unit_or_mask
+from ..base.results import STATUS_NAMES
 from .extras import require
-
-_STATUSES = ("successful", "not_converged", "not_finite", "bad_step_size")
-_STATUSES += ("no_root", "out_of_range", "stopped", "not_reached", "step_control_failed")
-_STATUSES += ("inconsistent", "redundant", "lost")
-"""Names of `RESULTS`, by the number of each in a dataset, as in that of a sweep."""
 
 _RESERVED_NAMES = ("t", "q", "p", "h", "status", "time", "save", "step")
 
@@ -105,9 +101,9 @@ def to_xarray(
             )
         front = [step] * per_step
         add(name, [*front, *_dims_of(name, own_shape[len(front) :])], value)
-    flags: dict[str, Any] = {"flag_values": np.arange(len(_STATUSES), dtype=np.int8)}
-    flags |= {"flag_meanings": " ".join(_STATUSES)}
-    matches = [np.asarray(solution.result == getattr(dvi.RESULTS, name)) for name in _STATUSES]
+    flags: dict[str, Any] = {"flag_values": np.arange(len(STATUS_NAMES), dtype=np.int8)}
+    flags |= {"flag_meanings": " ".join(STATUS_NAMES)}
+    matches = [np.asarray(solution.result == getattr(dvi.RESULTS, name)) for name in STATUS_NAMES]
     variables["status"] = (dims, np.argmax(matches, axis=0).astype(np.int8), flags)
     for name, value in solution.stats.items():
         if name != "num_steps":

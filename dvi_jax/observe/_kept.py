@@ -17,6 +17,9 @@ from ._reductions import Reduction
 _UNLESS_FIRST = 2
 """Row flag: keep this step unless it is the first of the run."""
 
+_UNKNOWN = -(2**30)
+"""The count after a row whose flag is NaN: whether that step belongs to the list is not known."""
+
 
 class Start(NamedTuple):
     """Start of a step, and its end t1, which is `until` by the clock."""
@@ -32,7 +35,8 @@ class KeptSteps(Reduction):
     """Base of the reductions that record the starts of some steps, in the order of time.
 
     `function` returns a row, see `as_row`. The first `skip` of these steps are left out. The result
-    is the rows, NaN where there are fewer than the capacity, and how many there were.
+    is the rows, NaN where there are fewer than the capacity, and how many there were: NaN if it is
+    not known whether a step belongs to them.
     """
 
     has_running_value: ClassVar[bool] = False
@@ -62,6 +66,7 @@ class KeptSteps(Reduction):
     def update(self, memory, k, t, value):
         rows, steps, count = memory
         hit = (value[0] == 1) | ((value[0] == _UNLESS_FIRST) & (k > 0))
+        count = jnp.where(jnp.isnan(value[0]), _UNKNOWN, count)
         # The count begins at −skip. A place beyond the end is dropped, without a branch.
         place = jnp.where(hit & (count >= 0), count, self.capacity)
         rows = rows.at[place].set(value, mode="drop")
@@ -70,7 +75,8 @@ class KeptSteps(Reduction):
     def finish(self, memory) -> Any:
         rows, _, count = memory
         # The count is negative while the first hits are skipped.
-        return rows, jnp.maximum(count, 0).astype(rows.dtype)
+        number = jnp.maximum(count, 0).astype(rows.dtype)
+        return rows, jnp.where(count < _UNKNOWN // 2, jnp.nan, number)
 
     def combine(self, memory, k, t, value):
         rows, steps, count = memory
@@ -78,7 +84,7 @@ class KeptSteps(Reduction):
 
 
 def as_row(hit: Array, start: Start) -> Float[Array, " width"]:
-    """One step as a row of numbers, the first of which is `hit`: 0, 1 or 2."""
+    """One step as a row of numbers, the first of which is `hit`: 0, 1, 2, or NaN if not known."""
     parts = (hit.astype(start.q0.dtype), start.t0, start.t1, start.until)
     return jnp.concatenate([jnp.stack(parts), start.q0.ravel(), start.p0.ravel()])
 
@@ -172,8 +178,11 @@ class Section(KeptSteps):
         # A run that continues from a crossing starts on the surface only up to rounding.
         tolerance = jnp.finfo(g0.dtype).eps ** 0.4
         begins_on_it = jnp.abs(g0) <= tolerance * jnp.abs(g1 - g0)
-        hit = jnp.where(hit & begins_on_it, _UNLESS_FIRST, hit.astype(jnp.int32))
-        return as_row(hit, Start(t0, t1, t1, q0, p0))
+        flag = jnp.where(hit & begins_on_it, _UNLESS_FIRST, hit.astype(g0.dtype))
+        # After a failure the state is NaN: the crossings before are still known.
+        is_state = jnp.all(jnp.isfinite(q1)) & jnp.all(jnp.isfinite(p1))
+        flag = jnp.where((jnp.isnan(g0) | jnp.isnan(g1)) & is_state, jnp.nan, flag)
+        return as_row(flag, Start(t0, t1, t1, q0, p0))
 
 
 class RequestedTimes(KeptSteps):

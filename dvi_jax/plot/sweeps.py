@@ -53,6 +53,7 @@ _STATUS_COLOURS = {
     "inconsistent": "#7f7f7f",
     "redundant": "#404040",
     "lost": "#8c564b",
+    "event_not_finite": "#bcbd22",
 }
 """One colour for each status in all pictures, so that they can be compared."""
 

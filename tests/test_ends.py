@@ -1,0 +1,151 @@
+"""Runs that end early, and evaluations beside the steps: gradients and statuses."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import central_difference
+
+import dvi_jax as dvi
+
+ADJOINTS = dvi.Reversible(), dvi.Checkpointed(), dvi.Direct()
+OSCILLATOR = dvi.System(dvi.discretise(lambda t, q, p, k: p @ p / 2 + k * q @ q / 2))
+# ∇H_D is NaN for q < 0, where H_D is NaN.
+HALF = dvi.System(lambda t0, t1, q, p, k: p @ p / 2 + k * jnp.sum(jnp.sqrt(q)))
+STARTS = jnp.array([[1.0], [0.2], [2.0]])
+
+
+def of_batch(system, k, adjoint, num_steps, **options):
+    def run(q):
+        options_of_all = {"h": 0.05, "num_steps": num_steps, "args": k, "throw": False}
+        return dvi.integrate(system, q, 0 * q, adjoint=adjoint, **options_of_all, **options)
+
+    return jax.vmap(run)(STARTS)
+
+
+def stopped(k, adjoint, num_steps):
+    """Of three trajectories one ends at q = 0.3 after 25 steps, one at its start."""
+    end = dvi.Stop(lambda t, q, p, args: 0.3 - q[0])
+    method, save = dvi.Strang(), dvi.Save(every=3)
+    return of_batch(OSCILLATOR, k, adjoint, num_steps, stop=end, method=method, save=save)
+
+
+def of_time(k, *run):
+    t = stopped(k, *run).stop.t
+    return jnp.sum(jnp.where(jnp.isfinite(t), t, 0.0))
+
+
+def of_states(k, *run):
+    q = stopped(k, *run).qs
+    return jnp.sum(jnp.where(jnp.isfinite(q), q, 0.0))
+
+
+def failed(k, adjoint, omits):
+    """The second of three trajectories fails in its step 12."""
+    sol = of_batch(HALF, k, adjoint, 30, save=dvi.Save(every=3), observe=lambda q, p: q[0] ** 2)
+    values = sol.qs[:, :, 0] + sol.observed
+    good = sol.result == dvi.RESULTS.successful
+    kept = {"trajectories": good[:, None], "values": jnp.isfinite(values), "none": True}[omits]
+    return jnp.sum(jnp.where(kept, values, 0.0))
+
+
+@pytest.mark.parametrize("loss", [of_time, of_states])
+@pytest.mark.parametrize("adjoint", ADJOINTS[1:], ids=lambda a: type(a).__name__)
+def test_gradients_of_runs_that_stop(loss, adjoint):
+    function = jax.jit(lambda k: loss(k, adjoint, 27))
+    assert int(jnp.sum(stopped(1.0, adjoint, 27).result == dvi.RESULTS.stopped)) == 2
+    reverse = jax.jit(jax.grad(function))(1.0)
+    np.testing.assert_allclose(reverse, jax.jit(jax.jacfwd(function))(1.0), rtol=1e-10)
+    np.testing.assert_allclose(reverse, central_difference(function, 1.0, 1.0), rtol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("loss", [of_time, of_states])
+def test_second_derivatives_of_runs_that_stop(loss):
+    function = lambda k: loss(k, dvi.Direct(), 27)  # noqa: E731
+    slope = jax.jit(jax.grad(function))
+    for second in (jax.jacfwd(jax.grad(function)), jax.grad(jax.grad(function))):
+        np.testing.assert_allclose(
+            jax.jit(second)(1.0), central_difference(slope, 1.0, 1.0), rtol=1e-6
+        )
+
+
+@pytest.mark.parametrize("omits", ["trajectories", "values", "none"])
+@pytest.mark.parametrize("adjoint", ADJOINTS, ids=lambda a: type(a).__name__)
+def test_gradients_of_a_batch_in_which_one_fails(omits, adjoint):
+    function = jax.jit(lambda k: failed(k, adjoint, omits))
+    reverse = jax.jit(jax.grad(function))(1.0)
+    if omits == "none":  # NaN is not hidden where the loss uses it
+        assert np.isnan(reverse)
+    else:
+        np.testing.assert_allclose(reverse, central_difference(function, 1.0, 1.0), rtol=1e-6)
+
+
+# --- statuses -----------------------------------------------------------------------------------
+
+
+def away_from(place):
+    """A flow that is not defined in a small interval of q."""
+
+    def flow(h, q, p, args):
+        q1 = q + h * p
+        return jnp.where(jnp.abs(q1 - place) < 0.02, jnp.nan, q1), p
+
+    free = lambda t0, t1, q0, p1, args: jnp.sum(p1**2) / 2  # noqa: E731
+    weak = lambda t0, t1, q0, p1, args: 0.01 * jnp.sum(q0**2) / 2  # noqa: E731
+    return free, weak, flow
+
+
+def run(place, first, **options):
+    free, weak, flow = away_from(place)
+    flows = {free: flow, weak: None}
+    parts = [free, weak] if first else [weak, free]
+    system = dvi.System(dvi.Split(parts, flows=[flows[part] for part in parts]))
+    return dvi.integrate(system, [0.0], [1.0], h=0.1, num_steps=10, throw=False, **options)
+
+
+@pytest.mark.parametrize("options", [{}, {"save": dvi.Save(every=5)}, {"observe": {"q": "range"}}])
+def test_a_flow_that_closes_a_joined_step_and_fails(options):
+    if "observe" in options:  # reductions read every state: no steps are joined
+        options = {"observe": {"q": dvi.Range(lambda q, p: q[0])}}
+    sol = run(0.5, first=True, **options)
+    assert sol.status == "not_finite"
+    assert sol.stats["failed_step"] == 4
+    has_failed = np.asarray(sol.ts) > 0.45
+    np.testing.assert_array_equal(np.isnan(sol.qs[:, 0]), has_failed)
+
+
+def test_points_between_the_steps_that_fail():
+    saved = run(0.55, first=False, save=dvi.Save(ts=[0.3, 0.55, 0.8]))
+    assert saved.status == "not_finite"
+    np.testing.assert_array_equal(np.isnan(saved.qs[:, 0]), [False, True, False])
+    crossed = run(0.55, first=False, observe=dvi.Section(lambda t, q, p, args: q[0] - 0.55))
+    ended = run(0.55, first=False, stop=dvi.Stop(lambda t, q, p, args: q[0] - 0.55))
+    assert crossed.status != "successful"
+    assert ended.status != "stopped"
+    # The controls: the same points where the flow is defined.
+    far = {"first": False, "save": dvi.Save(ts=[0.3, 0.55, 0.8])}
+    assert run(2.0, **far).status == "successful"
+    assert (
+        run(2.0, first=False, stop=dvi.Stop(lambda t, q, p, args: q[0] - 0.55)).status == "stopped"
+    )
+
+
+@pytest.mark.parametrize("h", [0.1, -0.1])
+def test_an_event_that_is_nan(h):
+    def g(t, q, p, args):
+        return jnp.sqrt(0.5 - jnp.abs(q[0])) - 0.4
+
+    free = dvi.System(lambda t0, t1, q, p, args: p @ p / 2)
+
+    def go(**options):
+        return dvi.integrate(free, [0.0], [1.0], h=h, num_steps=10, throw=False, **options)
+
+    sol = go(stop=dvi.Stop(lambda *point: g(*point) - 1))
+    assert sol.status == "event_not_finite"
+    assert sol.stats["failed_step"] == 5
+    sol = go(observe=dvi.Section(g))
+    assert sol.status == "event_not_finite"
+    np.testing.assert_allclose(sol.observed.ts[0], 0.34 * np.sign(h))
+    with pytest.raises(dvi.IntegrationError, match="g of dvi.Stop or dvi.Section"):
+        dvi.integrate(free, [0.0], [1.0], h=h, num_steps=10, observe=dvi.Section(g))
