@@ -54,8 +54,8 @@ def constant_if_it_fails(succeeds: Callable[[Any], Array], function: Callable, *
 
 
 def nan_if_used(values: Any, inputs: Any) -> Any:
-    """The floating-point arrays `values`. The gradient of a loss that depends on one of them that is
-    NaN is NaN by all `inputs`: zero would hide that the loss is not a number."""
+    """The floating-point arrays `values`. If a loss depends on one of them that is NaN, its gradient
+    by all `inputs` is NaN: zero would hide that the loss is not a number."""
 
     @jax.custom_jvp
     def same(values, inputs):
