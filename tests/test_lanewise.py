@@ -1257,6 +1257,20 @@ def in_eight_threads(work):
     return found
 
 
+def test_a_choice_between_an_array_and_itself_copies_nothing():
+    table = jnp.linspace(0.0, 1.0, 4096)
+
+    def lookup(x, table, keep):
+        index = jnp.int32(x * 4000)
+        return (jnp.where(x > 0.5, table, lax.stop_gradient(table)) if keep else table)[index]
+
+    plain, chosen = (
+        lanewise.explain(functools.partial(lookup, keep=keep), 0.3, table).parts[0].ir
+        for keep in (False, True)
+    )
+    assert len(chosen.splitlines()) == len(plain.splitlines())
+
+
 def test_threads_that_begin_together_start_llvm_once():
     """Two devices of a sweep began together, and one of them got XLA's digits."""
     starts = []

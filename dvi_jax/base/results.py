@@ -79,8 +79,8 @@ class RESULTS(eqx.Enumeration):
         "dvi.rings.track also reports the element."
     )
     event_not_finite = (
-        "The function g of dvi.Stop or dvi.Section became NaN at a state of the trajectory. Give it "
-        "a value at all states, for example with jnp.where."
+        "The function g of dvi.Stop or dvi.Section became NaN at a state of the trajectory. Give "
+        "it a value at all states, for example with jnp.where."
     )
 
 

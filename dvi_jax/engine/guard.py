@@ -22,7 +22,8 @@ def constant_unless(good: Bool[Array, ""], function: Callable, *args: Any) -> An
     trace, inputs = _traced(function, args)
 
     # The derivative is set to zero at the inputs: at the outputs it would be multiplied by NaN
-    # afterwards. Values are the same on both sides of each choice, which costs nothing.
+    # afterwards. Values are the same on both sides of each choice, which costs nothing. (A rule of
+    # its own for the derivative would be lost in second derivatives of a scan.)
     def variable(x: Any) -> Any:
         is_variable = jnp.issubdtype(jnp.result_type(x), jnp.inexact)
         return jnp.where(good, x, lax.stop_gradient(x)) if is_variable else x
@@ -54,8 +55,8 @@ def constant_if_it_fails(succeeds: Callable[[Any], Array], function: Callable, *
 
 
 def nan_if_used(values: Any, inputs: Any) -> Any:
-    """The floating-point arrays `values`. If a loss depends on one of them that is NaN, its gradient
-    by all `inputs` is NaN: zero would hide that the loss is not a number."""
+    """The floating-point arrays `values`. If a loss depends on one of them that is NaN, its
+    gradient by all `inputs` is NaN: zero would hide that the loss is not a number."""
 
     @jax.custom_jvp
     def same(values, inputs):

@@ -187,6 +187,10 @@ ELEMENTWISE: dict[str, Callable] = {
 def _elementwise(evaluator: Evaluator, eqn: Any, values: list[Value], rule: Callable) -> Value:
     (out,) = eqn.outvars
     shape, params = out.aval.shape, eqn.params
+    # An array that stays the same is not copied: it may be long, and the equation in a loop.
+    cases = values[1:] if rule is _select else values
+    if (rule is _select or rule is _identity) and all(case is cases[0] for case in cases):
+        return cases[0]
     # Long arrays in a loop over their elements: otherwise the code would be as long as the
     # array.
     if not all(value.is_small for value in values) or math.prod(shape) > MOST_ENTRIES:
