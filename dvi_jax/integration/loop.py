@@ -39,14 +39,13 @@ def start(task: Task, q0: State, p0: State) -> Carry:
 
     def memory(reduction):
         at_start = Ends(interval.t0, interval.t0, q0, p0, q0, p0)
-        function = task.bound(reduction.function)
-        like = eqx.filter_eval_shape(at_start.number, function, task.args)
+        like = eqx.filter_eval_shape(task.number, reduction, at_start)
 
         def initial_memory(ends):
             memory = reduction.start(jnp.zeros(like.shape, like.dtype))
             if not has_initial_value(reduction.function):
                 return memory
-            value = ends.number(function, task.args)
+            value = task.number(reduction, ends)
             return reduction.update(memory, jnp.asarray(0, jnp.int32), interval.t0, value)
 
         return task.evaluate(reduction, initial_memory, at_start)
@@ -81,8 +80,7 @@ def start(task: Task, q0: State, p0: State) -> Carry:
 def take_step(
     task: Task, carry: Carry, step: Callable | None = None
 ) -> tuple[Carry, Interval, Ends]:
-    """The next step of the trajectory, its status and its reductions; `step`: another one than that
-    of the method."""
+    """The next step, its status and its reductions; `step`: another one than that of the method."""
     place = Place(task.t0, task.h, carry.k, carry.q, carry.p)
     interval, memory, exists = task.lattice.next(carry.lattice, task.equations, place)
     interval = task.in_precision(interval)
@@ -106,38 +104,31 @@ def take_step(
     # enough, and the loop needs no flag.
     good = result == RESULTS.successful
     residual = lax.stop_gradient(info.residual)
-    q1, p1, result, failed_step, failed_residual = _with_failure(
-        carry, q1, p1, result, good, residual
-    )
-    ends = Ends(interval.t0, interval.t1, carry.q, carry.p, q1, p1)
+    new = _with_failure(carry, q1, p1, result, good, residual)
+    ends = Ends(interval.t0, interval.t1, carry.q, carry.p, new.q, new.p)
     memories = _memories(task, carry, ends, remainder, push, interval.h)
     if stop is not None:
         # Reductions cover the steps before the one in which the run stopped.
-        is_end = result == RESULTS.stopped
+        is_end = new.result == RESULTS.stopped
         memories = jax.tree.map(lambda a, b: jnp.where(is_end, b, a), memories, carry.reductions)
     was_good = carry.result == RESULTS.successful
-    carry = Carry(
+    new = new._replace(
         k=carry.k + 1,
-        q=q1,
-        p=p1,
         # The memory of the last good step, for the report: that of a failed one may be NaN.
         lattice=jax.tree.map(lambda new, old: jnp.where(good, new, old), memory, carry.lattice),
-        result=result,
-        failed_step=failed_step,
-        failed_residual=failed_residual,
         iterations=carry.iterations + jnp.where(was_good, info.iterations, 0),
         residual=worse(carry.residual, residual, good),
         reductions=memories,
         remainder=remainder,
         stop=stop,
     )
-    return carry, interval, ends
+    return new, interval, ends
 
 
 def _with_failure(
     carry: Carry, q1: State, p1: State, result: RESULTS, good: Array, residual: Array
-) -> tuple[State, State, RESULTS, Array, Array]:
-    """State, status, failed step and its residual after a step."""
+) -> Carry:
+    """The carry with the state, the status, the failed step and its residual after a step."""
 
     def note():
         first = ~good & (carry.result == RESULTS.successful)
@@ -155,7 +146,9 @@ def _with_failure(
         return q1, p1, carry.result, carry.failed_step, carry.failed_residual
 
     # The branch keeps this work out of steps in which nothing fails, which is nearly every step.
-    return lax.cond(lanewise.on_any(~good), note, keep)
+    values = lax.cond(lanewise.on_any(~good), note, keep)
+    names = "q", "p", "result", "failed_step", "failed_residual"
+    return carry._replace(**dict(zip(names, values, strict=True)))
 
 
 def _memories(
@@ -170,20 +163,15 @@ def _memories(
         k = number_of(reduction, carry.k)
         if isinstance(reduction, Deviations):
             assert push is not None
-            return reduction.update(
-                memory, k, ends.t1, _deviations(push, reduction.vectors(memory), ends, h)
-            )
-        function = task.bound(reduction.function)
+            vectors = _deviations(push, reduction.vectors(memory), ends, h)
+            return reduction.update(memory, k, ends.t1, vectors)
 
         def with_value(ends, memory):
-            return reduction.update(memory, k, ends.t1, ends.number(function, task.args))
+            return reduction.update(memory, k, ends.t1, task.number(reduction, ends))
 
         return task.evaluate(reduction, with_value, Ends(*ends[:2], *start, *end), memory)
 
-    return [
-        update(reduction, memory)
-        for reduction, memory in zip(reductions, carry.reductions, strict=True)
-    ]
+    return [update(*pair) for pair in zip(reductions, carry.reductions, strict=True)]
 
 
 def number_of(reduction: Reduction, k: Int[Array, ""]) -> Int[Array, ""]:
@@ -270,8 +258,7 @@ def run(
 
 
 def _in_loop(task: Task, q: State) -> tuple[Callable | None, Callable, Callable]:
-    """The step in the loop (None: that of the method), and the functions from a carry to that of
-    the loop and back."""
+    """The step in the loop (None: that of the method), and the functions to its carry and back."""
     is_simple = type(task.lattice) is Uniform and task.arithmetic.is_plain and task.stop is None
     quick = None
     # Reductions read the states of all steps.
@@ -283,10 +270,7 @@ def _in_loop(task: Task, q: State) -> tuple[Callable | None, Callable, Callable]
     def substep(advance, carry, k):
         q, p, info = advance(task.equations, task.interval(k), carry.q, carry.p)
         good = info.result == RESULTS.successful
-        residual = lax.stop_gradient(info.residual)
-        state = _with_failure(carry, q, p, info.result, good, residual)
-        names = "q", "p", "result", "failed_step", "failed_residual"
-        return carry._replace(**dict(zip(names, state, strict=True)))
+        return _with_failure(carry, q, p, info.result, good, lax.stop_gradient(info.residual))
 
     return (
         quick.step,

@@ -90,6 +90,10 @@ class Task(eqx.Module):
             return function(*rounded(args))
         return self.arithmetic.interpret(function)(*args)
 
+    def number(self, reduction: Reduction, ends: "Ends") -> Array:
+        """The value of the observable of a reduction on a step."""
+        return ends.number(self.bound(reduction.function), self.args)
+
     def finish(self, reduction: Reduction, memory: Any) -> Any:
         """The reduced value of a memory."""
         return rounded(self.evaluate(reduction, reduction.finish, memory))
