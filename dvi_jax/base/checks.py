@@ -12,6 +12,8 @@ import numpy as np
 Dimension = int | str
 """The length of an axis: a number, or the name of a length that may have any positive value."""
 
+Shape = tuple[Dimension, ...]
+
 
 def whole(name: str, value: Any, low: int = 1, high: int | None = None, hint: str = "") -> int:
     """A whole number from `low` to `high` (None: any), not a bool. **Raises** `ValueError`."""
@@ -49,13 +51,7 @@ def _number(
 
 
 def array(
-    name: str,
-    value: Any,
-    *shapes: tuple[Dimension, ...],
-    verb: str = "be",
-    integers: bool = False,
-    empty: bool = False,
-    hint: str = "",
+    name: str, value: Any, *shapes: Shape, verb: str = "be", integers=False, empty=False, hint=""
 ) -> Any:
     """A real array, or anything else with a shape and a dtype, of one of the shapes.
 
@@ -226,14 +222,14 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, numbers.Real | np.number) and not isinstance(value, bool)
 
 
-def _has_shape(shape: tuple[int, ...], pattern: tuple[Dimension, ...], empty: bool) -> bool:
+def _has_shape(shape: tuple[int, ...], pattern: Shape, empty: bool) -> bool:
     return len(shape) == len(pattern) and all(
         size > 0 or empty if isinstance(length, str) else size == length
         for size, length in zip(shape, pattern, strict=True)
     )
 
 
-def _shape_text(pattern: tuple[Dimension, ...]) -> str:
+def _shape_text(pattern: Shape) -> str:
     return f"({', '.join(map(str, pattern))}{',' * (len(pattern) == 1)})"
 
 

@@ -23,10 +23,9 @@ def over_devices(
 
     ``jax.jit(dvi.over_devices(jax.vmap(one)))(q0, p0)`` returns the same as
     ``jax.jit(jax.vmap(one))(q0, p0)``; each device computes its part of the batch. It can be
-    differentiated and compiled like any function: for a mean over all trajectories and its
-    gradient, for instance. Under `jax.distributed.initialize` the devices are those of all hosts,
-    which run the same program. For independent trajectories use `sweep`, which loses nothing when a
-    host fails.
+    differentiated and compiled like any function: for the gradient of a mean, for instance. Under
+    `jax.distributed.initialize` the devices are those of all hosts, which run the same program. For
+    independent trajectories use `sweep`, which loses nothing when a host fails.
 
     **Arguments**
 

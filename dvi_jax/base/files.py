@@ -88,9 +88,7 @@ def read_npz(
     path: str | os.PathLike[str], form: int, kind: str
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Header and arrays of a file of `publish_npz`; `kind` names its content in messages.
-
-    **Raises** `FileNotFoundError`; `ValueError` for a damaged or another file, or another format.
-    """
+    **Raises** `FileNotFoundError`; `ValueError` for a damaged or another file, or another form."""
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no file '{path}' of a {kind}.")

@@ -22,10 +22,8 @@ _OPERATIONS: dict[str, Any] = {
 
 
 def out_of_bounds(program: ClosedJaxpr) -> Iterator[tuple[int, int]]:
-    """(index, size of the axis) of each constant index that is not in its array.
-
-    JAX moves such an index to the end of the array without an error.
-    """
+    """(index, size of the axis) of each constant index that is not in its array; JAX moves it to
+    the end of the array without an error."""
     constants: dict[Any, Any] = dict(zip(program.jaxpr.constvars, program.consts, strict=True))
 
     def value(atom: Any) -> np.ndarray | None:

@@ -14,8 +14,7 @@ from .precision import refuse_double_without_x64
 
 
 def start_state(q0: Any, p0: Any) -> tuple[Array, Array]:
-    """Initial conditions as real arrays of one shape and precision. **Raises** `ValueError` or
-    `TypeError`."""
+    """Initial conditions, of one shape and precision. **Raises** `ValueError` or `TypeError`."""
     q, p = _real_array("q0", q0), _real_array("p0", p0)
     if q.shape != p.shape:
         raise ValueError(
@@ -92,10 +91,9 @@ def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> A
         refuse_double_without_x64(name, value.dtype)
     kind, shape = (value.dtype, value.shape) if number is None else (number.dtype, number.shape)
     if not _is_real(kind):
-        kind = type(value).__name__
         raise TypeError(
             f"{name} must be an integer or a floating-point number, got {value!r:.200} of type "
-            f"{kind}."
+            f"{type(value).__name__}."
         )
     if shape != ():
         raise ValueError(
@@ -148,8 +146,7 @@ def as_parameter(leaf: Any) -> Any:
 
 
 def refuse_unit_or_mask(name: str, value: Any) -> None:
-    """**Raises** `TypeError` for a quantity of astropy or pint, `ValueError` for an array with
-    masked numbers."""
+    """**Raises** `TypeError` for a quantity of astropy or pint, `ValueError` for masked numbers."""
     # Both are accepted by np.asarray, which drops the unit or the mask without a warning.
     if np.ma.is_masked(value):
         where = np.argwhere(np.ma.getmaskarray(value))[0].tolist()

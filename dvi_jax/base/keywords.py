@@ -13,10 +13,8 @@ _ABSENT = object()
 
 
 def checked_keywords(function: F) -> F:
-    """Decorator of a function with ``**settings: Unpack[...]``, which Python itself does not check.
-
-    **Raises** `TypeError` when it is called with an unknown keyword or without a necessary one.
-    """
+    """Decorator of a function with ``**settings: Unpack[...]``, which Python itself does not check:
+    an unknown keyword, or the absence of a necessary one, **raises** `TypeError`."""
     names = frozenset(argument_names(function))
     necessary = sorted(getattr(settings_type(function), "__required_keys__", ()))
 
@@ -24,17 +22,15 @@ def checked_keywords(function: F) -> F:
     def call(*args: Any, **keywords: Any) -> Any:
         unknown = [name for name in keywords if name not in names]
         refuse_unknown(function.__name__, function, unknown)
-        require(
-            function.__name__, {name: keywords.get(name, _ABSENT) for name in necessary}, _ABSENT
-        )
+        values: dict[str, Any] = {name: keywords.get(name, _ABSENT) for name in necessary}
+        require(function.__name__, values, _ABSENT)
         return function(*args, **keywords)
 
     return call  # pyright: ignore[reportReturnType]
 
 
 def accept_newton(cls: type[T]) -> type[T]:
-    """Decorator of a class whose keyword `root_finder` has `newton` as a second name; both at once
-    **raise** `TypeError`."""
+    """Decorator of a class: `newton=` means `root_finder=`; both at once **raise** `TypeError`."""
     construct = cls.__init__
 
     @functools.wraps(construct)

@@ -31,7 +31,6 @@ class _Identity:
     """An object that is compared by identity."""
 
     # It holds the object, since the id of one that is deleted may be given to another.
-
     def __init__(self, value: Any):
         self.value = value
 

@@ -15,7 +15,6 @@ HamiltonianFn: TypeAlias = Callable[..., Any]
 ForceFn: TypeAlias = Callable[..., Any]
 """``W(t0, t1, q0, p1, args)`` → like q0, units of force."""
 
-
 ConstraintFn: TypeAlias = Callable[..., Any]
 """``g(q, args)`` → shape (m,), zero for the positions allowed."""
 
@@ -25,7 +24,6 @@ class Interval(NamedTuple):
 
     # h is stored although it is t1 − t0: late in a run the difference of two large times has lost
     # digits, which an exact invariant would show.
-
     t0: Scalar
     t1: Scalar
     h: Scalar

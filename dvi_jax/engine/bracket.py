@@ -21,9 +21,9 @@ def bracketed_root(
     """The root of `function` between a and b, where it has the values `at_a` and `at_b`; b, without
     a derivative, where no root `exists`.
 
-    To the last digit, by false position (Illinois) with bisection in every third iteration. The
-    derivative with respect to values that `function` closes over is that of the implicit function
-    theorem, to any order.
+    To the last digit, by false position (Illinois) with bisection in every third iteration.
+    Derivatives in values that `function` closes over are those of the implicit function theorem,
+    to any order.
     """
     # The root does not depend on the ends of the bracket: no derivative of theirs enters it.
     a, at_a, b, at_b = lax.stop_gradient((a, at_a, b, at_b))

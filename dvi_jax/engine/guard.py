@@ -16,10 +16,16 @@ from lanewise.jaxprs.jaxapi import linear_map
 from lanewise.jaxprs.traced import Trace
 
 
-def constant_unless(good: Bool[Array, ""], function: Callable, *args: Any) -> Any:
+def constant_unless(
+    good: Bool[Array, ""], function: Callable, *args: Any, succeeds: Callable | None = None
+) -> Any:
     """``function(*args)``, whose derivative is zero where `good` is False: by the arguments and by
-    all that the function closes over."""
-    trace, inputs = _traced(function, args)
+    all that the function closes over.
+
+    With `succeeds` the first derivative is also zero where ``succeeds(result)`` is False.
+    """
+    leaves, tree = jax.tree.flatten(args)
+    trace = Trace.from_function(function, leaves, tree)
 
     # The derivative is set to zero at the inputs: at the outputs it would be multiplied by NaN
     # afterwards. Values are the same on both sides of each choice, which costs nothing. (A rule of
@@ -28,30 +34,26 @@ def constant_unless(good: Bool[Array, ""], function: Callable, *args: Any) -> An
         is_variable = jnp.issubdtype(jnp.result_type(x), jnp.inexact)
         return jnp.where(good, x, lax.stop_gradient(x)) if is_variable else x
 
-    return jax.tree.unflatten(trace.out_tree, trace(*map(variable, inputs)))
+    def result_of(outs: list[Any]) -> Any:
+        return jax.tree.unflatten(trace.out_tree, outs)
 
-
-def constant_if_it_fails(succeeds: Callable[[Any], Array], function: Callable, *args: Any) -> Any:
-    """``function(*args)``, whose first derivatives are zero where ``succeeds(result)`` is False: by
-    the arguments and by all that the function closes over."""
-    trace, inputs = _traced(function, args)
-
-    @jax.custom_jvp
-    def value(*inputs):
-        return trace(*inputs)
+    inputs = list(map(variable, [*trace.outer, *leaves]))
+    if succeeds is None:
+        return result_of(trace(*inputs))
+    value = jax.custom_jvp(trace.__call__)
 
     @value.defjvp
     def _(inputs, changes):
         outs, push = jax.linearize(trace, *inputs)
-        good = succeeds(jax.tree.unflatten(trace.out_tree, outs))
+        is_good = succeeds(result_of(outs))
 
         def guarded(change: Any) -> Any:
             is_variable = change.dtype != jax.dtypes.float0
-            return jnp.where(good, change, jnp.zeros_like(change)) if is_variable else change
+            return jnp.where(is_good, change, jnp.zeros_like(change)) if is_variable else change
 
         return outs, push(*map(guarded, changes))
 
-    return jax.tree.unflatten(trace.out_tree, value(*inputs))
+    return result_of(value(*inputs))
 
 
 def nan_if_used(values: Any, inputs: Any) -> Any:
@@ -79,10 +81,3 @@ def nan_if_used(values: Any, inputs: Any) -> Any:
         return primals[0], linear_map(push, pull, push, primals[0], tangents)
 
     return same(values, inputs)
-
-
-def _traced(function: Callable, args: tuple) -> tuple[Trace, list[Any]]:
-    """The function of a row of arrays, and these: what it closes over, and those of `args`."""
-    leaves, tree = jax.tree.flatten(args)
-    trace = Trace.from_function(function, leaves, tree)
-    return trace, [*trace.outer, *leaves]

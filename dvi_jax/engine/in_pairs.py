@@ -23,8 +23,7 @@ def in_pairs(function: Callable, *args: Any) -> Any:
     """``function(*args)`` with each operation on float64 numbers in pairs.
 
     `args` are pytrees whose arrays may be pairs; an array is exact, and so are numbers in the
-    function. Float64 results are pairs. Derivatives are those of the function in float64 at the
-    rounded arguments.
+    function. Float64 results are pairs. Derivatives are those in float64 at the rounded arguments.
 
     **Raises** `NotImplementedError` for a primitive of JAX that has no rule here.
     """
@@ -39,8 +38,7 @@ def in_pairs(function: Callable, *args: Any) -> Any:
     trace = Trace.from_function(of_arrays, plain, jax.tree.structure(tuple(plain)))
     program = trace.all_inputs
 
-    # Values of an outer trace that the function closes over are operands too, so that they have a
-    # derivative.
+    # Values of an outer trace that the function closes over are operands: they have a derivative.
     @jax.custom_jvp
     def evaluate(operands: list[Any]) -> list[Any]:
         # Machine code also within a derivative, which XLA computes: it compiles pairs slowly.
@@ -235,7 +233,7 @@ def _remainder(x: Number, y: Number) -> Number:
     # The quotient may be rounded to the integer next to it.
     r = pairs.where(r.hi < 0, add(r, b), r)
     r = pairs.where(pairs.compare(operator.ge)(r, b), sub(r, b), r)
-    return pairs.where(rounded(x) < 0, pairs.negative(r), r)
+    return pairs.where(rounded(x) < 0, pairs.negate(r), r)
 
 
 def _clamp(low: Number, x: Number, high: Number) -> Number:
@@ -377,7 +375,7 @@ _ELEMENTWISE: dict[str, Callable] = {
     "min": pairs.smaller,
     "clamp": _clamp,
     "floor": pairs.floor,
-    "ceil": lambda x: pairs.negative(pairs.floor(pairs.negative(x))),
+    "ceil": lambda x: pairs.negate(pairs.floor(pairs.negate(x))),
     "sign": lambda x: jnp.sign(rounded(x)),
     "rem": _remainder,
     "select_n": _select,

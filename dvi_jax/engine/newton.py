@@ -79,8 +79,7 @@ class Newton(RootSolver):
     stops once δ' times that rate is below round-off in each component, relative to the larger of
     its known and unknown value; or, for components that are only round-off of larger ones, once
     they are as small as that round-off and no longer shrink. So the root is accurate to round-off
-    also where J is not the derivative of F; the iteration is then longer. Convergence is of order 3
-    or 4.
+    also where J is not the derivative of F; the iteration is then longer. The order is 3 or 4.
 
     **Arguments**
 
@@ -188,11 +187,17 @@ _THIRD_UP_TO = 16
 """Unknowns up to which a third correction is made; larger systems rarely need a second Jacobian."""
 
 
-class KnownRoot(eqx.Module):
+class KnownRoot(RootSolver):
     """A root that is already known: only its derivative is solved for, by `solver`."""
 
     root: Vector
     solver: RootSolver = Newton()
+
+    def solve(self, F, x0, scales):
+        return RootInfo(self.root, jnp.int32(1), jnp.zeros(2, x0.dtype), jnp.asarray(True))
+
+    def solve_tangent(self, linear, rhs):
+        return self.solver.solve_tangent(linear, rhs)
 
 
 class _Iterate(NamedTuple):
@@ -206,11 +211,7 @@ class _Iterate(NamedTuple):
 
 
 def find_root(
-    function: Function,
-    guess: Vector,
-    size: Vector,
-    solver: RootSolver | KnownRoot,
-    represented_size: Vector | None = None,
+    function: Function, guess: Vector, size: Vector, solver: RootSolver, represented_size=None
 ) -> tuple[Vector, RootInfo]:
     """Root x of function(x) = 0 near `guess`, and how it was found.
 
@@ -221,15 +222,12 @@ def find_root(
     # Scales decide when to stop, and no iteration is differentiated: no derivative of theirs.
     scales = Scales(size, size if represented_size is None else represented_size)
     scales = jax.tree.map(lambda x: lax.stop_gradient(jnp.abs(x)), scales)
-    method = solver.solver if isinstance(solver, KnownRoot) else solver
 
     def solve(F, x0):
-        if isinstance(solver, KnownRoot):
-            return solver.root, (jnp.int32(1), jnp.zeros(2, x0.dtype), jnp.asarray(True))
-        x, *statistics = method.solve(F, x0, scales)
+        x, *statistics = solver.solve(F, x0, scales)
         return x, statistics
 
-    root, statistics = lanewise.implicit_root(function, guess, solve, method.solve_tangent)
+    root, statistics = lanewise.implicit_root(function, guess, solve, solver.solve_tangent)
     return root, RootInfo(root, *statistics)
 
 

@@ -13,20 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from .pairs import (
-    Number,
-    Pair,
-    add,
-    as_pair,
-    div,
-    magnitude,
-    mul,
-    negative,
-    power,
-    sqrt,
-    sub,
-    where,
-)
+from .pairs import Number, Pair, add, as_pair, div, magnitude, mul, negate, power, sqrt, sub, where
 
 _UNIT, _TWO, _HALF = np.float64(1), np.float64(2), np.float64(0.5)
 
@@ -119,8 +106,7 @@ def sin_cos(x: Number) -> tuple[Pair, Pair]:
     square = mul(r, r)
     sine = add(r, mul(mul(r, square), _series(square, _SINE, 3)))
     cosine_less_one = mul(square, _series(square, _COSINE, 3))  # its digits do not cancel
-    # The addition theorems. Small terms are added first: their sum has few digits in common with
-    # the entry of the table.
+    # The addition theorems, small terms first: their sum and the table share few digits.
     sum_of_sines = add(s, add(mul(c, sine), mul(s, cosine_less_one)))
     return sum_of_sines, add(c, sub(mul(c, cosine_less_one), mul(s, sine)))
 
@@ -145,7 +131,6 @@ def _power_of_two(n: Array) -> Array:
 
 
 def exp(x: Number) -> Pair:
-    """eˣ."""
     power, change = _exponential(x)
     return _in_range(x, add(power, mul(power, change)), jnp.exp(as_pair(x).hi))
 
@@ -178,7 +163,6 @@ def _logarithm(x: Number, excess: Number, guess: Array) -> Pair:
 
 
 def log(x: Number) -> Pair:
-    """log x."""
     return _logarithm(x, sub(x, _UNIT), jnp.log(as_pair(x).hi))
 
 
@@ -188,12 +172,10 @@ def log1p(x: Number) -> Pair:
 
 
 def exp2(x: Number) -> Pair:
-    """2ˣ."""
     return exp(mul(x, log(_TWO)))
 
 
 def log2(x: Number) -> Pair:
-    """log x / log 2."""
     return div(log(x), log(_TWO))
 
 
@@ -211,14 +193,12 @@ def root_power(x: Number, n: int) -> Number:
 
 
 def cbrt(x: Number) -> Pair:
-    """∛x."""
     root = jnp.cbrt(as_pair(x).hi)
     defect = as_pair(sub(x, power(root, 3))).hi / (3 * root * root)
     return add(root, jnp.where((root != 0) & jnp.isfinite(root), defect, 0.0))
 
 
 def tan(x: Number) -> Pair:
-    """tan x."""
     return div(*sin_cos(x))
 
 
@@ -233,45 +213,38 @@ def atan2(y: Number, x: Number) -> Pair:
 
 def _leg(x: Number) -> Pair:
     """√(1 − x²)."""
-    unit = _UNIT
-    return sqrt(mul(sub(unit, x), add(unit, x)))
+    return sqrt(mul(sub(_UNIT, x), add(_UNIT, x)))
 
 
 def asin(x: Number) -> Pair:
-    """arcsin x."""
     return atan2(x, _leg(x))
 
 
 def acos(x: Number) -> Pair:
-    """arccos x."""
     return atan2(_leg(x), x)
 
 
 def atan(x: Number) -> Pair:
-    """arctan x."""
     return atan2(x, _UNIT)
 
 
 def _odd(of_magnitude: Number, x: Number) -> Number:
     """The value of an odd function from that at |x|."""
-    return where(as_pair(x).hi < 0, negative(of_magnitude), of_magnitude)
+    return where(as_pair(x).hi < 0, negate(of_magnitude), of_magnitude)
 
 
 def sinh(x: Number) -> Number:
-    """sinh x."""
     # (e + e/(e + 1))/2 with e = e^|x| − 1, whose digits do not cancel near x = 0.
     e = expm1(magnitude(x))
     return _odd(mul(add(e, div(e, add(e, _UNIT))), _HALF), x)
 
 
 def cosh(x: Number) -> Number:
-    """cosh x."""
     e = exp(magnitude(x))
     return mul(add(e, div(_UNIT, e)), _HALF)
 
 
 def tanh(x: Number) -> Number:
-    """tanh x."""
     # e/(e + 2) with e = e^(2|x|) − 1; it is 1 to 34 digits for larger x, where e would overflow.
     size = magnitude(x)
     e = expm1(mul(where(as_pair(size).hi > 40, np.float64(40), size), _TWO))
@@ -300,4 +273,4 @@ def atanh(x: Number) -> Number:
 
 def logistic(x: Number) -> Pair:
     """1/(1 + e⁻ˣ)."""
-    return div(_UNIT, add(exp(negative(x)), _UNIT))
+    return div(_UNIT, add(exp(negate(x)), _UNIT))

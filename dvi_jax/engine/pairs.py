@@ -107,14 +107,12 @@ def sqrt(x: Number) -> Pair:
     return fast_two_sum(root, jnp.where((root > 0) & (root < jnp.inf), lo, 0.0))
 
 
-def negative(x: Number) -> Number:
-    """−x."""
+def negate(x: Number) -> Number:
     return Pair(-x.hi, -x.lo) if isinstance(x, Pair) else -x
 
 
 def sub(x: Number, y: Number) -> Pair:
-    """x − y."""
-    return add(x, negative(y))  # a change of sign is exact
+    return add(x, negate(y))  # a change of sign is exact
 
 
 def mul(x: Number, y: Number) -> Number:
@@ -165,19 +163,16 @@ def where(condition: Array, x: Number, y: Number) -> Number:
 
 def larger(x: Number, y: Number) -> Number:
     """The larger of two; NaN where one is NaN."""
-    takes_x = compare(operator.gt)(x, y) | jnp.isnan(rounded(x))
-    return where(takes_x, x, y)
+    return where(compare(operator.gt)(x, y) | jnp.isnan(rounded(x)), x, y)
 
 
 def smaller(x: Number, y: Number) -> Number:
     """The smaller of two; NaN where one is NaN."""
-    takes_x = compare(operator.lt)(x, y) | jnp.isnan(rounded(x))
-    return where(takes_x, x, y)
+    return where(compare(operator.lt)(x, y) | jnp.isnan(rounded(x)), x, y)
 
 
 def magnitude(x: Number) -> Number:
-    """|x|."""
-    return where(rounded(x) < 0, negative(x), x)
+    return where(rounded(x) < 0, negate(x), x)
 
 
 def floor(x: Number) -> Number:

@@ -9,7 +9,7 @@ from jax import lax
 import lanewise
 
 from ..base.checks import instance, whole
-from .contraction import Contraction, contract
+from .contraction import Contraction
 from .newton import Function, Newton, RootInfo, RootSolver, Scales, Vector
 
 
@@ -49,8 +49,7 @@ class Picard(Contraction):
 
 
 class PicardThenNewton(RootSolver):
-    """The default solver: Newton's method for few unknowns, for many `Picard` and, where it is not
-    fast, Newton's method.
+    """The default: Newton's method for few unknowns; for many `Picard`, then Newton if it is slow.
 
     With many unknowns Picard's iteration comes first. It stops for a trajectory as soon as a
     correction is more than half of the one before; then Newton's method solves that trajectory from
@@ -83,8 +82,7 @@ class PicardThenNewton(RootSolver):
     def solve(self, F, x0, scales):
         if self._is_few(x0.size):
             return self.newton.solve(F, x0, scales)
-        settings = self.picard.rtol, self.picard.atol, self.picard.max_steps
-        first = contract(F, x0, scales, *settings, slowest=0.5)
+        first = self.picard.contract(F, x0, scales, slowest=0.5)
 
         # From x0, not from where Picard's iteration stopped: it may have diverged. The branch runs
         # for the whole batch, so that the trajectories that have converged keep their numbers.

@@ -11,11 +11,10 @@ import equinox as eqx
 import jax
 
 import lanewise
+from lanewise import Layout
 
 
-def one_by_one(
-    function: Callable[..., Any], *args: Any, layout: lanewise.Layout = lanewise.Layout()
-) -> Any:
+def one_by_one(function: Callable[..., Any], *args: Any, layout: Layout = Layout()) -> Any:
     """``function(*args)`` of pytrees, compiled separately, so that no operation in it is joined
     with one outside. It must return a pytree of arrays."""
     arrays, constants = eqx.partition(args, eqx.is_array)
@@ -25,10 +24,7 @@ def one_by_one(
 
 
 def each(
-    function: Callable[..., Any],
-    constants: Any,
-    *rows: Any,
-    layout: lanewise.Layout = lanewise.Layout(),
+    function: Callable[..., Any], constants: Any, *rows: Any, layout: Layout = Layout()
 ) -> Any:
     """``function(given, *row)`` for every row, with the bits of a call for one row alone."""
     return jax.vmap(lambda *row: one_by_one(function, constants, *row, layout=layout))(*rows)

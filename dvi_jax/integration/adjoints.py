@@ -1,6 +1,7 @@
 """Ways to differentiate a trajectory in reverse mode."""
 
 import abc
+import dataclasses
 import math
 
 import equinox as eqx
@@ -21,8 +22,7 @@ from .task import Outcome, Plan, Task, adds_start_outside
 class AbstractAdjoint(eqx.Module):
     """Base of the ways to differentiate a trajectory.
 
-    All of them give the same derivative, that of the discrete map, to round-off; they differ in
-    memory and time.
+    All give the derivative of the discrete map, to round-off; they differ in memory and time.
     """
 
     @abc.abstractmethod
@@ -35,6 +35,7 @@ class AbstractAdjoint(eqx.Module):
 def _direct_rollout(
     task: Task, plan: Plan, q0: State, p0: State, loop: Loop, layout: Layout
 ) -> Outcome:
+    task = dataclasses.replace(task, is_transposed=True)
     # Only arrays may be arguments of a compiled function; other parts of a task are static.
     arrays, functions = eqx.partition(task, eqx.is_array)
 
@@ -54,8 +55,7 @@ def _direct_rollout(
 class Direct(AbstractAdjoint):
     """Forward and reverse mode through the scan itself.
 
-    Reverse mode stores intermediate values of each step: memory grows with num_steps. For short
-    runs.
+    For short runs: reverse mode stores values of each step, so that memory grows with num_steps.
     """
 
     def rollout(self, task, plan, q0, p0, layout=Layout()):
@@ -67,8 +67,7 @@ class Checkpointed(AbstractAdjoint):
 
     - `segments`: number of pieces of a scan; None means about √(number of steps).
 
-    Forward mode costs the same as with `Direct`. Works for every method and any dynamics, chaotic
-    or dissipative.
+    Forward mode costs the same as with `Direct`. Works for every method and any dynamics.
     """
 
     segments: int | None = eqx.field(static=True, default=None)

@@ -12,7 +12,7 @@ from jax import lax
 
 from lanewise.rules.exact import two_sum
 
-from ..base.types import Interval, State
+from ..base.types import State
 from ..engine.in_pairs import in_pairs
 from ..engine.pairs import Pair
 from ..methods import Method
@@ -29,12 +29,7 @@ class Arithmetic(eqx.Module):
     """Whether a step of the method begins and ends with the state itself."""
 
     def prepare(
-        self,
-        method: Method,
-        equations: Equations,
-        first_interval: Callable[[], Interval],
-        q0: State,
-        p0: State,
+        self, method: Method, equations: Equations, first_interval: Callable, q0: State, p0: State
     ) -> tuple[Equations, State, State]:
         """The equations and the start in this representation, once per run. **Raises**
         `ValueError` for a method or equations that it does not support."""
@@ -66,8 +61,7 @@ class Arithmetic(eqx.Module):
 class FloatingPoint(Arithmetic):
     """Plain floating point: each step rounds the state (default).
 
-    Invariants of the map then perform a random walk, with a relative size of about 1e-16 √N after N
-    steps in float64.
+    Invariants of the map perform a random walk, of relative size 1e-16 √N in N steps in float64.
     """
 
     is_plain: ClassVar[bool] = True
@@ -123,14 +117,12 @@ class DoubleDouble(Arithmetic):
     Saved states are q without e; observables without a reduction, `Stop`, `Section` and deviation
     vectors are evaluated at them in float64. Derivatives are those of the map in float64.
 
-    In a batch a step takes 8 to 32 times as long as with `FloatingPoint`, where machine code is
-    generated.
+    In a batch a step takes 8 to 32 times as long as with `FloatingPoint`, in machine code.
 
     **Raises** `ValueError` for a state that is not float64, `NotImplementedError` for a function
     with an operation that has no rule (`jax.scipy.special.erf`, factorisations of matrices, sorts).
 
-    **Source** Dekker 1971, *Numer. Math.* 18, 224; Joldes, Muller & Popescu 2017, *ACM TOMS* 44,
-    15.
+    **Source** Dekker 1971, *Numer. Math.* 18, 224; Joldes et al. 2017, *ACM TOMS* 44, 15.
     """
 
     def prepare(self, method, equations, first_interval, q0, p0):
@@ -146,8 +138,7 @@ class DoubleDouble(Arithmetic):
             )
         return equations, q0, p0
 
-    def start(self, q0, p0):
-        return jnp.zeros_like(q0), jnp.zeros_like(p0)
+    start = Compensated.start
 
     def enter(self, equations: Equations, q0: State, p0: State, memory: Any) -> tuple:
         return equations, *self.full_state(q0, p0, memory)

@@ -80,12 +80,7 @@ def _check_deviations(leaf: Deviations, task: Task, q0: Array) -> None:
 
 
 def noise_path(
-    run: Run,
-    path: BrownianPath | None,
-    integrator: Integrator,
-    method: Method,
-    h: Array,
-    num_steps: int,
+    run: Run, path: BrownianPath | None, integrator: Integrator, method: Method, h, num_steps: int
 ) -> NoisePath | None:
     """The path for a run, None without noise. **Raises** `ValueError` if they do not fit."""
     noise = run.system.noise

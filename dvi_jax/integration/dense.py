@@ -35,7 +35,6 @@ class Curve(eqx.Module):
 
     # A substep of the method itself, not an interpolation: it has the order of the method, and its
     # end is the end of the step.
-
     method: Method
     equations: Equations
     layout: Layout = eqx.field(static=True)
@@ -67,8 +66,7 @@ class Curve(eqx.Module):
 
 
 def requested_times(save: Save, task: Task, num_steps: int) -> tuple[RequestedTimes, PyTree]:
-    """The observables of a run that saves states at requested times: the steps of those times, and
-    all reductions."""
+    """The observables of a run with requested times: the steps of those times, and reductions."""
     if task.has_running_values:
         raise ValueError(
             "dvi.Running, whose values exist at grid points only, cannot be combined with "

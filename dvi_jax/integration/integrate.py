@@ -1,6 +1,5 @@
 """`integrate`, the function that computes one trajectory."""
 
-import dataclasses
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Never
@@ -185,14 +184,8 @@ def solve(trajectory: PreparedRun, progress: Any = None) -> Solution:
     observables = jax.tree.leaves(request.observe, is_leaf=is_observable)
     # In the variables of the request: those of the lattice may have no initial state of this form.
     if any(isinstance(observable, OfState) for observable in observables):
-        return _with_initial_values(solution, request, layout)
+        return with_initial_values(solution, request, layout)
     return solution
-
-
-@eqx.filter_jit
-def _with_initial_values(solution: Solution, request: Run, layout: Layout) -> Solution:
-    values = with_initial_values(request.observe, solution.observed, request, layout)
-    return dataclasses.replace(solution, observed=values)
 
 
 def _columns(steps: tuple[int, int]) -> dict[str, Any]:
@@ -231,9 +224,7 @@ _solution = eqx.filter_jit(as_solution)
 
 # The parts of a run with progress. Each is compiled for itself; the carry between them has all that
 # a step depends on, so that the numbers are those of one run.
-@eqx.filter_jit
-def _begin(task: Task, q0, p0):
-    return start(task, q0, p0)
+_begin = eqx.filter_jit(start)
 
 
 @eqx.filter_jit

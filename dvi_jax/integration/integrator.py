@@ -130,9 +130,7 @@ def default_method(system: System) -> Method:
 
 def chosen(integrator: Integrator | None = None, **options: Any) -> Integrator:
     """The integrator of a call: the object, or one made of single options (None: not given).
-
-    **Raises** `TypeError` for another object, `ValueError` for both.
-    """
+    **Raises** `TypeError` for another object, `ValueError` for both."""
     options = {name: value for name, value in options.items() if value is not None}
     if integrator is None:
         return Integrator(**options) if options else _DEFAULT
@@ -146,8 +144,7 @@ def chosen(integrator: Integrator | None = None, **options: Any) -> Integrator:
 
 
 def only(integrator: Integrator, function: str, *names: str) -> Integrator:
-    """The integrator. **Raises** `ValueError` for a field that the function does not use and that
-    differs from the default."""
+    """The integrator. **Raises** `ValueError` for a field that is not used and not the default."""
     # Otherwise an option without effect would be ignored without a word.
     for name in _FIELDS:
         value, default = getattr(integrator, name), getattr(_DEFAULT, name)

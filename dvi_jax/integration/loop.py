@@ -13,7 +13,6 @@ import lanewise
 
 from ..base.results import RESULTS, first_failure
 from ..base.types import Interval, Scalar, State
-from ..engine.guard import constant_if_it_fails, constant_unless
 from ..engine.newton import no_residual, worse
 from ..engine.pairs import rounded
 from ..lattices import Place, Uniform
@@ -40,14 +39,13 @@ def start(task: Task, q0: State, p0: State) -> Carry:
 
     def memory(reduction):
         at_start = Ends(interval.t0, interval.t0, q0, p0, q0, p0)
-        function = task.bound(reduction.function)
-        like = eqx.filter_eval_shape(at_start.number, function, task.args)
+        like = eqx.filter_eval_shape(task.number, reduction, at_start)
 
         def initial_memory(ends):
             memory = reduction.start(jnp.zeros(like.shape, like.dtype))
             if not has_initial_value(reduction.function):
                 return memory
-            value = ends.number(function, task.args)
+            value = task.number(reduction, ends)
             return reduction.update(memory, jnp.asarray(0, jnp.int32), interval.t0, value)
 
         return task.evaluate(reduction, initial_memory, at_start)
@@ -85,15 +83,19 @@ def start(task: Task, q0: State, p0: State) -> Carry:
 def take_step(
     task: Task, carry: Carry, step: Callable | None = None
 ) -> tuple[Carry, Interval, Ends]:
-    """The next step of the trajectory, its status and its reductions; `step`: another one than that
-    of the method."""
-    place = Place(task.t0, task.h, carry.k, carry.q, carry.p)
-    interval, memory, exists = task.lattice.next(carry.lattice, task.equations, place)
+    """The next step, its status and its reductions; `step`: another one than that of the method."""
+    was_good = carry.result == RESULTS.successful
+
+    def next_interval(memory, q, p):
+        place = Place(task.t0, task.h, carry.k, q, p)
+        return task.lattice.next(memory, task.equations, place)
+
+    interval, memory, exists = task.constant_unless(was_good, next_interval)(
+        carry.lattice, carry.q, carry.p
+    )
     interval = task.in_precision(interval)
     equations = task.equations_at(carry.k, interval)
     step = task.arithmetic.interpret(step or task.method.step)
-
-    was_good = carry.result == RESULTS.successful
 
     def one_step(q, p):
         local, *state = task.arithmetic.enter(equations, q, p, carry.remainder)
@@ -101,14 +103,11 @@ def take_step(
         q1, p1, remainder = task.arithmetic.leave(q, p, q1, p1)
         return (q1, p1), (remainder, rounded(info))
 
-    def guarded(q, p):
-        return constant_unless(was_good, one_step, q, p)
+    def has_succeeded(result):
+        _, (_, info) = result
+        return info.result == RESULTS.successful
 
-    def advance(q, p):
-        return constant_if_it_fails(
-            lambda out: out[1][1].result == RESULTS.successful, guarded, q, p
-        )
-
+    advance = task.constant_unless(was_good, one_step, has_succeeded)
     if task.has_deviations:
         # One linearisation serves all deviation vectors of all reductions.
         (q1, p1), push, (remainder, info) = jax.linearize(advance, carry.q, carry.p, has_aux=True)
@@ -120,37 +119,30 @@ def take_step(
     # enough, and the loop needs no flag.
     good = result == RESULTS.successful
     residual = lax.stop_gradient(info.residual)
-    q1, p1, result, failed_step, failed_residual = _with_failure(
-        carry, q1, p1, result, good, residual
-    )
-    ends = Ends(interval.t0, interval.t1, carry.q, carry.p, q1, p1)
+    new = _with_failure(carry, q1, p1, result, good, residual)
+    ends = Ends(interval.t0, interval.t1, carry.q, carry.p, new.q, new.p)
     memories = _memories(task, carry, ends, remainder, push, interval.h, good)
     if stop is not None:
         # Reductions cover the steps before the one in which the run stopped.
-        is_end = result == RESULTS.stopped
+        is_end = new.result == RESULTS.stopped
         memories = jax.tree.map(lambda a, b: jnp.where(is_end, b, a), memories, carry.reductions)
-    carry = Carry(
+    new = new._replace(
         k=carry.k + 1,
-        q=q1,
-        p=p1,
         # The memory of the last good step, for the report: that of a failed one may be NaN.
         lattice=jax.tree.map(lambda new, old: jnp.where(good, new, old), memory, carry.lattice),
-        result=result,
-        failed_step=failed_step,
-        failed_residual=failed_residual,
         iterations=carry.iterations + jnp.where(was_good, info.iterations, 0),
         residual=worse(carry.residual, residual, good),
         reductions=memories,
         remainder=remainder,
         stop=stop,
     )
-    return carry, interval, ends
+    return new, interval, ends
 
 
 def _with_failure(
     carry: Carry, q1: State, p1: State, result: RESULTS, good: Array, residual: Array
-) -> tuple[State, State, RESULTS, Array, Array]:
-    """State, status, failed step and its residual after a step."""
+) -> Carry:
+    """The carry with the state, the status, the failed step and its residual after a step."""
 
     def note():
         first = ~good & (carry.result == RESULTS.successful)
@@ -168,7 +160,9 @@ def _with_failure(
         return q1, p1, carry.result, carry.failed_step, carry.failed_residual
 
     # The branch keeps this work out of steps in which nothing fails, which is nearly every step.
-    return lax.cond(lanewise.on_any(~good), note, keep)
+    values = lax.cond(lanewise.on_any(~good), note, keep)
+    names = "q", "p", "result", "failed_step", "failed_residual"
+    return carry._replace(**dict(zip(names, values, strict=True)))
 
 
 def _memories(
@@ -189,23 +183,17 @@ def _memories(
         k = number_of(reduction, carry.k)
         if isinstance(reduction, Deviations):
             assert push is not None
-            return reduction.update(
-                memory, k, ends.t1, _deviations(push, reduction.vectors(memory), ends, h)
-            )
-        function = task.bound(reduction.function)
+            vectors = _deviations(push, reduction.vectors(memory), ends, h)
+            return reduction.update(memory, k, ends.t1, vectors)
 
         def with_value(ends, memory):
-            value = constant_unless(
-                good, lambda *ends: Ends(*ends).number(function, task.args), *ends
-            )
+            value_of = task.constant_unless(good, lambda *ends: task.number(reduction, Ends(*ends)))
+            value = value_of(*ends)
             return reduction.update(memory, k, ends.t1, value)
 
         return task.evaluate(reduction, with_value, Ends(*ends[:2], *start, *end), memory)
 
-    return [
-        update(reduction, memory)
-        for reduction, memory in zip(reductions, carry.reductions, strict=True)
-    ]
+    return [update(*pair) for pair in zip(reductions, carry.reductions, strict=True)]
 
 
 def number_of(reduction: Reduction, k: Int[Array, ""]) -> Int[Array, ""]:
@@ -286,7 +274,7 @@ def run(
             start = leave(carry._replace(k=carry.k - 1, q=ends.q0, p=ends.p0))
             ends = Ends(*ends[:2], start.q, start.p, end.q, end.p)
         good = carry.result == RESULTS.successful
-        observed = constant_unless(good, task.at_save, carry, ends)
+        observed = task.constant_unless(good, task.at_save)(carry, ends)
         return carry, Rows(interval.t1, interval.h, end.q, end.p, observed, inner)
 
     carry, rows = loop(steps, carry, None, plan.num_blocks)
@@ -298,8 +286,7 @@ def run(
 
 
 def _in_loop(task: Task, q: State) -> tuple[Callable | None, Callable, Callable]:
-    """The step in the loop (None: that of the method), and the functions from a carry to that of
-    the loop and back."""
+    """The step in the loop (None: that of the method), and the functions to its carry and back."""
     is_simple = type(task.lattice) is Uniform and task.arithmetic.is_plain and task.stop is None
     quick = None
     # Reductions read the states of all steps.
@@ -313,12 +300,12 @@ def _in_loop(task: Task, q: State) -> tuple[Callable | None, Callable, Callable]
             return advance(task.equations, task.interval(k), q, p)
 
         was_good = carry.result == RESULTS.successful
-        q, p, info = constant_unless(was_good, part, carry.q, carry.p)
+        q, p, info = task.constant_unless(was_good, part)(carry.q, carry.p)
         good = info.result == RESULTS.successful
-        residual = lax.stop_gradient(info.residual)
-        state = _with_failure(carry._replace(k=k), q, p, info.result, good, residual)
-        names = "q", "p", "result", "failed_step", "failed_residual"
-        return carry._replace(**dict(zip(names, state, strict=True)))
+        new = _with_failure(
+            carry._replace(k=k), q, p, info.result, good, lax.stop_gradient(info.residual)
+        )
+        return new._replace(k=carry.k)
 
     return (
         quick.step,

@@ -77,8 +77,7 @@ def _values(observables: tuple[list[Any], Any], ends: Ends) -> list[PyTree]:
 
 
 def observed_values(observe: PyTree, columns: list[Any], results: list[Any]) -> PyTree:
-    """The pytree `observe` with every function replaced by its values at save points, and every
-    reduction by its result."""
+    """The pytree `observe` with the values of functions and the results of reductions."""
     # Both lists are in the order of the leaves, in which `Task.observables` has separated them.
     next_column, next_result = iter(columns).__next__, iter(results).__next__
 
@@ -92,8 +91,9 @@ def observed_values(observe: PyTree, columns: list[Any], results: list[Any]) -> 
     return jax.tree.map(value, observe, is_leaf=is_observable)
 
 
-def with_initial_values(observe: PyTree, observed: PyTree, run: Run, layout: Layout) -> PyTree:
-    """The values of functions of the state, with that at the initial state as their first row."""
+@eqx.filter_jit
+def with_initial_values(solution: Solution, run: Run, layout: Layout) -> Solution:
+    """The solution, with values at the initial state in front of those of functions of a state."""
 
     def with_first_row(observable, values):
         if not isinstance(observable, OfState):
@@ -105,7 +105,8 @@ def with_initial_values(observe: PyTree, observed: PyTree, run: Run, layout: Lay
         first = lanewise.call(at_start, run.t0, run.q0, run.p0, run.args, layout=layout)
         return jnp.concatenate([first[None].astype(values.dtype), values])
 
-    return jax.tree.map(with_first_row, observe, observed, is_leaf=is_observable)
+    rows = jax.tree.map(with_first_row, run.observe, solution.observed, is_leaf=is_observable)
+    return dataclasses.replace(solution, observed=rows)
 
 
 def raise_on_failure(solution: Solution, task: Task) -> Solution:

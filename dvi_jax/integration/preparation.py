@@ -61,11 +61,7 @@ def steps_of(
 
 
 def prepare(
-    run: Run,
-    integrator: Integrator,
-    h: Array,
-    num_steps: int,
-    path: BrownianPath | None,
+    run: Run, integrator: Integrator, h: Array, num_steps: int, path: BrownianPath | None
 ) -> PreparedRun:
     """The run in the variables of its lattice. **Raises** `ValueError` or `TypeError` for options
     that do not fit each other, the system or the initial state."""

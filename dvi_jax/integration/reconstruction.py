@@ -34,32 +34,42 @@ def fold_blocks(block: Callable, state: Any, count: int, size: int, rows: Any) -
     return state
 
 
-class Pieces(NamedTuple):
-    """Pieces of `size` steps each between two stored states, in order from step `first`."""
+class Arc(NamedTuple):
+    """`size` steps, the first of which has the number `first`, and the states at their ends."""
 
-    starts: Point
-    ends: Point
     first: Array
     size: int
+    start: Point
+    end: Point
 
-    def fold(self, step: Callable, state: Any, reverse: bool = False) -> Any:
-        """``state = step(state, k, start, end)`` for each piece, from step number k."""
+
+class Pieces(NamedTuple):
+    """Arcs of `size` steps each between stored states, in order from step `first`."""
+
+    first: Array
+    size: int
+    starts: Point
+    ends: Point
+
+    def fold(self, function: Callable, state: Any, reverse: bool = False) -> Any:
+        """``state = function(state, arc)`` for each arc."""
         count = len(self.starts[0])
         if count == 1:  # without a loop around one piece, which would be compiled
-            return step(state, self.first, _row(self.starts, 0), _row(self.ends, 0))
+            start, end = row_of(self.starts, 0), row_of(self.ends, 0)
+            return function(state, Arc(self.first, self.size, start, end))
         k, stride = self.first, self.size
         if reverse:
             k, stride = k + (count - 1) * stride, -stride
 
         def one_piece(carry, ends):
             k, state = carry
-            return (k + stride, step(state, k, *ends)), None
+            return (k + stride, function(state, Arc(k, self.size, *ends))), None
 
         (_, state), _ = lax.scan(one_piece, (k, state), (self.starts, self.ends), reverse=reverse)
         return state
 
 
-def _row(points: Point, i: int | slice) -> Point:
+def row_of(points: Point, i: int | slice) -> Point:
     return points[0][i], points[1][i]
 
 
@@ -86,26 +96,17 @@ class Reconstruction(eqx.Module):
         remainder = count - checkpoints * size
         # The code for a piece is compiled for each length: the last one joins the others if it can.
         if remainder == size:
-            return [Pieces(starts, ends, first, size)]
-        all_but_last, last = slice(-1), slice(-1, None)
-        return [
-            Pieces(_row(starts, all_but_last), _row(ends, all_but_last), first, size),
-            Pieces(_row(starts, last), _row(ends, last), first + checkpoints * size, remainder),
-        ]
+            return [Pieces(first, size, starts, ends)]
+        parts = slice(-1), slice(-1, None)
+        front, last = ([row_of(points, part) for points in (starts, ends)] for part in parts)
+        return [Pieces(first, size, *front), Pieces(first + checkpoints * size, remainder, *last)]
 
     def steps_by_inverse(
-        self,
-        start: Point,
-        end: Point,
-        first: Array,
-        count: int,
-        visit: Callable = lambda sums, k, start, end: sums,
-        sums: Any = None,
+        self, arc: Arc, visit: Callable = lambda sums, k, start, end: sums, sums: Any = None
     ) -> tuple[Any, Array, Array]:
-        """The states from `end` back over `count` steps, by inverse steps: the `sums` that
-        ``visit(sums, k, start, end)`` accumulates over them, the relative difference of each
-        component from `start`, and whether all solves succeeded."""
-        task = self.task
+        """The arc backwards, by inverse steps: the `sums` of ``visit(sums, k, start, end)``, the
+        relative difference of each component at the start, and whether all solves succeeded."""
+        task, (first, count, start, end) = self.task, arc
         # A divisor of `count`, so that one loop serves all groups.
         group = next((d for d in range(min(count, GROUP), 1, -1) if count % d == 0), 1)
 
@@ -140,26 +141,24 @@ class Reconstruction(eqx.Module):
         return jnp.abs(a - b) / (size + (round_off / self.tolerance + tiny))
 
     def defect(self, start: Point, rows: Rows, tail: Rows | None) -> Array:
-        """The largest difference of a reconstructed state at a stored one; ∞ where an inverse step
-        failed."""
+        """The largest difference from a stored state; ∞ where an inverse step failed."""
         plan, starts = self.plan, self.starts(start, rows)
+
+        def of_arc(worst, arc):
+            _, defects, is_solved = self.steps_by_inverse(arc)
+            defect = jnp.max(defects, initial=0.0)
+            return jnp.maximum(worst, jnp.where(is_solved, defect, jnp.inf))
 
         def of_block(worst, first, start, rows, count=plan.block):
             for pieces in self.pieces(start, rows, first, count):
-
-                def of_piece(worst, k, start, end, size=pieces.size):
-                    _, defects, is_solved = self.steps_by_inverse(start, end, k, size)
-                    defect = jnp.max(defects, initial=0.0)
-                    return jnp.maximum(worst, jnp.where(is_solved, defect, jnp.inf))
-
-                worst = pieces.fold(of_piece, worst)
+                worst = pieces.fold(of_arc, worst)
             return worst
 
         worst = jnp.zeros((), start[0].dtype)
         if tail is not None:
             first = jnp.asarray(plan.num_blocks * plan.block, jnp.int32)
-            worst = of_block(worst, first, _row(starts, -1), tail, plan.tail)
-        blocks = _row(starts, slice(-1)), rows
+            worst = of_block(worst, first, row_of(starts, -1), tail, plan.tail)
+        blocks = row_of(starts, slice(-1)), rows
         return fold_blocks(of_block, worst, plan.num_blocks, plan.block, blocks)
 
 

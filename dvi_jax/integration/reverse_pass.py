@@ -1,6 +1,7 @@
 """The adjoint equation of a trajectory: cotangents from its end to its start."""
 
 import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,10 +13,10 @@ from jaxtyping import Array
 import lanewise
 
 from ..base.types import State
-from ..engine.newton import KnownRoot, RootSolver
+from ..engine.newton import KnownRoot
 from ..observe import Reduction, has_initial_value
 from .loop import number_of
-from .reconstruction import Point, Reconstruction, fold_blocks
+from .reconstruction import Arc, Point, Reconstruction, fold_blocks, row_of
 from .task import Ends, Rows, Task, adds_start_outside
 
 
@@ -83,7 +84,11 @@ class ReversePass(eqx.Module):
         pulled = pull(((after_step.q, after_step.p, of_t1), observed, of_values))
         # A failed step is a constant, NaN: zero times its derivative would be NaN as well.
         good = _all_finite(start) & _all_finite(end)
-        of_theta, q, p = jax.tree.map(lambda x: jnp.where(good, x, 0), pulled)
+        of_theta, q, p = lax.cond(
+            lanewise.on_any(~good),
+            lambda: jax.tree.map(lambda x: jnp.where(good, x, 0), pulled),
+            lambda: pulled,
+        )
         return Cotangents(jax.tree.map(jnp.add, after_step.theta, of_theta), q, p)
 
     def local_step(self, theta: Any, q0: State, p0: State, k: Array, p1: State) -> tuple:
@@ -92,7 +97,6 @@ class ReversePass(eqx.Module):
         task = self.task(theta)
         functions, reductions = task.observables()
         newton = task.equations.newton
-        assert isinstance(newton, RootSolver)
         interval = task.interval(k)
         # The unknown of (13) is the state after the step: no solve.
         is_root = task.method.is_the_map and task.arithmetic.is_plain
@@ -101,9 +105,7 @@ class ReversePass(eqx.Module):
         q1, p1, _ = task.method.step(equations, interval, q0, p0)
         step = Ends(interval.t0, interval.t1, q0, p0, q1, p1)
         values = [step.value(function, task.args) for function in functions]
-        numbers = [
-            step.number(task.bound(reduction.function), task.args) for reduction in reductions
-        ]
+        numbers = [task.number(reduction, step) for reduction in reductions]
         return (q1, p1, interval.t1), eqx.filter(values, eqx.is_inexact_array), numbers
 
     def reductions(self) -> list[tuple[Reduction, Any, Any]]:
@@ -111,51 +113,29 @@ class ReversePass(eqx.Module):
         _, reductions = self.task(self.theta).observables()
         return list(zip(reductions, self.memories, self.cotangent.results, strict=True))
 
-    def has_reductions_with_cotangents(self) -> Array:
-        """Whether the loss depends on a result of a reduction."""
-        return _any_nonzero(self.cotangent.results)
-
-    def steps(
-        self,
-        cotangents: Cotangents,
-        first: Array,
-        start: Point,
-        end: Point,
-        count: int,
-        save: SavePoint,
-    ) -> Cotangents:
-        """`count` steps back from the exact state `end`, by inverse steps. Where these miss the
-        state `start`, by the steps from there."""
+    def steps(self, cotangents: Cotangents, arc: Arc, save: SavePoint) -> Cotangents:
+        """The steps of an arc, backwards from its end by inverse steps. Where these miss its start,
+        by the steps from there."""
 
         def transport(cotangents, k, start, end):
             return self.transport(cotangents, k, start, end, save)
 
-        cheap, defects, is_solved = self.states.steps_by_inverse(
-            start, end, first, count, transport, cotangents
-        )
+        cheap, defects, is_solved = self.states.steps_by_inverse(arc, transport, cotangents)
         is_exact = is_solved & jnp.all(defects <= self.states.tolerance)
-        # A batch must not wait for the steps of a trajectory that fails in this piece, unless
+        # A batch must not wait for the steps of a trajectory that fails in this arc, unless
         # reductions read those before.
-        is_used = _all_finite(end) | self.has_reductions_with_cotangents()
-        is_wrong = ~is_exact & _all_finite(start) & is_used
+        is_used = _all_finite(arc.end) | _any_nonzero(self.cotangent.results)
+        is_wrong = ~is_exact & _all_finite(arc.start) & is_used
 
         def correct(cheap):
-            exact = self.steps_again(cotangents, first, start, end, count, save)
+            exact = self.steps_again(cotangents, arc, save)
             return jax.tree.map(lambda a, b: jnp.where(is_wrong, a, b), exact, cheap)
 
         return lax.cond(lanewise.on_any(is_wrong), correct, lambda cheap: cheap, cheap)
 
-    def steps_again(
-        self,
-        cotangents: Cotangents,
-        first: Array,
-        start: Point,
-        end: Point,
-        count: int,
-        save: SavePoint,
-    ) -> Cotangents:
-        """The same from the states of `count` steps that are computed again and stored."""
-        task = self.states.task
+    def steps_again(self, cotangents: Cotangents, arc: Arc, save: SavePoint) -> Cotangents:
+        """The same from the states of these steps, which are computed again and stored."""
+        task, (first, count, start, end) = self.states.task, arc
 
         def forward(carry, _):
             k, state = carry
@@ -173,28 +153,18 @@ class ReversePass(eqx.Module):
         return cotangents
 
     def block(
-        self,
-        cotangents: Cotangents,
-        first: Array,
-        start: Point,
-        row: Rows,
-        of_row: Rows,
-        count: int,
+        self, cotangents: Cotangents, first: Any, start: Point, row: Rows, of_row: Rows, count: int
     ) -> Cotangents:
-        """The `count` steps between two save points. `row`: what is saved at the second one, and
-        `of_row` its cotangents."""
+        """The steps between save points; `row`: values at the second one, `of_row`: cotangents."""
         step = first + count - 1
         # Rows times and steps depend on h and t0 directly, not through the state.
         _, pull = jax.vjp(lambda theta: self.task(theta).interval(step)[1:], self.theta)
         of_theta = jax.tree.map(jnp.add, cotangents.theta, *pull((of_row.t, of_row.h)))
         cotangents = Cotangents(of_theta, cotangents.q + of_row.q, cotangents.p + of_row.p)
         save = SavePoint(step, of_row.observed)
+        steps = functools.partial(self.steps, save=save)
         for pieces in reversed(self.states.pieces(start, row, first, count)):
-
-            def of_piece(cotangents, k, start, end, size=pieces.size):
-                return self.steps(cotangents, k, start, end, size, save)
-
-            cotangents = pieces.fold(of_piece, cotangents, reverse=True)
+            cotangents = pieces.fold(steps, cotangents, reverse=True)
         return cotangents
 
     def uses_failed(self, starts: Point, of_rows: Rows, end: Point) -> Array:
@@ -235,15 +205,11 @@ class ReversePass(eqx.Module):
                 lambda x: x[-1] if plan.save_tail else jnp.zeros(x.shape[1:], x.dtype), of_rows
             )
             first = jnp.asarray(plan.num_blocks * plan.block, jnp.int32)
-            last_start = jax.tree.map(lambda x: x[-1], starts)
-            cotangents = self.block(cotangents, first, last_start, tail, of_tail, plan.tail)
-
-        def one_block(cotangents, first, start, row, of_row):
-            return self.block(cotangents, first, start, row, of_row, plan.block)
-
-        starts = jax.tree.map(lambda x: x[:-1], starts)
+            start_of_tail = row_of(starts, -1)
+            cotangents = self.block(cotangents, first, start_of_tail, tail, of_tail, plan.tail)
         of_rows = jax.tree.map(lambda x: x[: plan.num_blocks], of_rows)
-        blocks = starts, rows, of_rows
+        blocks = row_of(starts, slice(-1)), rows, of_rows
+        one_block = functools.partial(self.block, count=plan.block)
         cotangents = fold_blocks(one_block, cotangents, plan.num_blocks, plan.block, blocks)
         if of_start is not None:
             q, p = map(jnp.add, (cotangents.q, cotangents.p), of_start)
@@ -254,9 +220,7 @@ class ReversePass(eqx.Module):
 
     def initial_values(self, cotangents: Cotangents, start: Point) -> Cotangents:
         """The cotangents, with those of the values of reductions at the initial state."""
-        reductions = [
-            reduction for reduction in self.reductions() if has_initial_value(reduction[0].function)
-        ]
+        reductions = [item for item in self.reductions() if has_initial_value(item[0].function)]
         if not reductions:
             return cotangents
 
@@ -265,12 +229,8 @@ class ReversePass(eqx.Module):
             t0 = task.first_interval().t0
             step = Ends(t0, t0, q0, p0, q0, p0)
             _, reductions = task.observables()
-            functions = [
-                reduction.function
-                for reduction in reductions
-                if has_initial_value(reduction.function)
-            ]
-            return t0, [step.number(task.bound(function), task.args) for function in functions]
+            initial = [item for item in reductions if has_initial_value(item.function)]
+            return t0, [task.number(reduction, step) for reduction in initial]
 
         (t0, values), pull = jax.vjp(values_of, self.theta, *start)
         seeds = _of_values(reductions, jnp.asarray(-1, jnp.int32), t0, values)

@@ -48,9 +48,8 @@ class Reversible(AbstractAdjoint):
 
     Forward mode (`jvp`) and higher derivatives go through the scan as with `Direct`. A method
     without an inverse (`RungeKutta4`), a `Variational` lattice, a run with a `Stop`, with deviation
-    vectors (such as `LyapunovSpectrum`) or with `Running` values, and a system or observable that
-    *closes over* a value being differentiated (better: pass it in args), are differentiated as by
-    `Checkpointed`.
+    vectors (`LyapunovSpectrum`) or `Running` values, and a system or observable that *closes over*
+    a value being differentiated (better: pass it in args), are differentiated as by `Checkpointed`.
 
     **Raises** `ValueError` for settings that are not positive, and for `report_defect` where no
     states are reconstructed.
@@ -124,14 +123,8 @@ class Reversible(AbstractAdjoint):
                 theta, q0, p0 = eqx.combine(variables, constants)
                 variable, constant = eqx.partition(theta, is_variable[0])
                 (memories, rows, tail), results = record
-                reverse_pass = ReversePass(
-                    variable,
-                    eqx.combine(constant, counts, functions),
-                    states_of(theta, counts),
-                    memories,
-                    results,
-                    cotangent,
-                )
+                others, states = eqx.combine(constant, counts, functions), states_of(theta, counts)
+                reverse_pass = ReversePass(variable, others, states, memories, results, cotangent)
                 return eqx.filter(tuple(reverse_pass.run((q0, p0), rows, tail)), is_variable)
 
             derivative = LinearMap(push, pull, layout)
@@ -148,10 +141,8 @@ class Reversible(AbstractAdjoint):
             def largest_defect(theta, counts, *ends):
                 return states_of(theta, counts).defect(*ends)
 
-            ends = (q0, p0), trace.rows, trace.tail
-            defect = lanewise.call(
-                largest_defect, *lax.stop_gradient((theta, counts, *ends)), layout=layout
-            )
+            values = lax.stop_gradient((theta, counts, (q0, p0), trace.rows, trace.tail))
+            defect = lanewise.call(largest_defect, *values, layout=layout)
         rows = eqx.combine(smooth.rows, trace.integers)
         if adds_start_outside(plan):
             rows = with_start(rows, q0, p0)

@@ -1,6 +1,7 @@
 """The constants of a trajectory, which of its steps are saved, and what the loop carries."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ from jaxtyping import Array, Float, Int, PyTree
 from ..base.reads import Reads
 from ..base.results import RESULTS
 from ..base.types import Args, Bindable, Interval, Scalar, State
+from ..engine.guard import constant_unless
 from ..engine.pairs import rounded
 from ..lattices import Lattice
 from ..methods import Method
@@ -36,6 +38,8 @@ class Task(eqx.Module):
     stop: Stop | None = None
     reads: Reads = eqx.field(static=True, default=())
     path: NoisePath | None = None
+    is_transposed: bool = eqx.field(static=True, default=False)
+    """Whether JAX transposes the loop over the steps itself, in reverse mode."""
 
     @property
     def args(self) -> Args:
@@ -89,6 +93,19 @@ class Task(eqx.Module):
         if isinstance(reduction, Deviations) or not reduction.has_running_value:
             return function(*rounded(args))
         return self.arithmetic.interpret(function)(*args)
+
+    def number(self, reduction: Reduction, ends: "Ends") -> Array:
+        """The value of the observable of a reduction on a step."""
+        return ends.number(self.bound(reduction.function), self.args)
+
+    def constant_unless(
+        self, good: Array, function: Callable, succeeds: Callable | None = None
+    ) -> Callable:
+        """The function; for reverse mode a constant where the trajectory is not `good`, or where
+        ``succeeds(result)`` is False."""
+        if not self.is_transposed:
+            return function
+        return functools.partial(constant_unless, good, function, succeeds=succeeds)
 
     def finish(self, reduction: Reduction, memory: Any) -> Any:
         """The reduced value of a memory."""

@@ -48,8 +48,7 @@ class Lattice(eqx.Module):
     """Base class of all lattices (time grids).
 
     Most know every interval in advance, by `interval`. A lattice that chooses its steps during the
-    run sets ``has_memory = True``: its `next` computes the interval from the state and from a
-    memory that `begin` makes.
+    run sets ``has_memory = True``: its `next` computes the interval from the state and a memory.
     """
 
     # Not decided from `next`: runs on lattices without a memory have loops without one, and states

@@ -1,6 +1,6 @@
 """Steps between times that the user gives."""
 
-from typing import Any
+from functools import partial
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,10 +12,6 @@ from ..base.checks import in_order
 from ..base.inputs import as_times
 from ..base.types import Interval
 from ._base import Lattice, check_num_steps
-
-
-def _times(ts: Any) -> Array:
-    return as_times("Given(ts)", ts)
 
 
 class Given(Lattice):
@@ -33,7 +29,7 @@ class Given(Lattice):
 
     takes_h = False
 
-    ts: Float[Array, " times"] = eqx.field(converter=_times)
+    ts: Float[Array, " times"] = eqx.field(converter=partial(as_times, "Given(ts)"))
 
     def __check_init__(self):
         if not is_traced(self.ts):

@@ -76,8 +76,7 @@ class TimeTransformed(Uniform):
 
     def transform(self, run):
         """The run in extended phase space, in the time σ from 0 on."""
-        # K contains ε: for the extended problem it is a parameter like any other, which may be
-        # traced and differentiated.
+        # K contains ε: for the extended problem it is a parameter, which may be traced.
         problem = ExtendedSpace(run.system, self.speed, run.epsilon, run.q0.shape)
         check_speed(type(self).__name__, self.speed, run)
         q0, p0 = start_state(*problem.start(run.t0, run.q0, run.p0, run.args))
@@ -98,8 +97,7 @@ class TimeTransformed(Uniform):
 
 
 class ExtendedSpace(eqx.Module):
-    """The transformed problem of `TimeTransformed`: positions (q, t) and momenta (p, p_t), each
-    flattened to shape (n + 1,)."""
+    """The transformed problem: positions (q, t) and momenta (p, p_t), flat, of shape (n + 1,)."""
 
     system: System
     speed: Callable[..., Any]

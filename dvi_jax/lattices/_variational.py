@@ -156,8 +156,7 @@ class Variational(StepSizes):
         return lax.stop_gradient(factors)
 
     def _choose(self, residual: Callable, hs: Array, scale: Scalar) -> tuple[Scalar, Array]:
-        """The root nearest to the last step, the middle one of `hs`, or the h of the policy; and
-        whether it is a root."""
+        """The root nearest to the middle one of `hs`, or the h of the policy; is it a root?"""
         last = hs[_CELLS]
         fixed = lax.stop_gradient(hs)
         # One candidate after the other: each may need a solve of its own, of another length.

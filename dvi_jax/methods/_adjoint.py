@@ -11,9 +11,8 @@ from ._type_ii import TypeII
 class Adjoint(Method):
     r"""The adjoint method Φ*_h = (Φ_{−h})⁻¹ of `method`.
 
-    Same order and symplecticity; the adjoint of a symmetric method is that method. The
-    adjoint of `TypeII` solves for q1 instead of p1, and is explicit when q0 does not enter
-    ∂H_D/∂p1.
+    Same order and symplecticity; a symmetric method is its own adjoint. The adjoint of `TypeII`
+    solves for q1 instead of p1, and is explicit when q0 does not enter ∂H_D/∂p1.
 
     **Source** Hairer, Lubich & Wanner 2006, II.3.
     """

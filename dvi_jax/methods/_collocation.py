@@ -1,4 +1,4 @@
-"""Common parts of the collocation methods: a base, their integrals, the continuous rates."""
+"""Common parts of the collocation methods: a base, and their integrals."""
 
 from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
@@ -9,9 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..base.types import Interval, Scalar
 from ._base import Method
-from .step import Equations
 
 
 class Collocation(Method):
@@ -28,17 +26,17 @@ class Collocation(Method):
         return self.step(equations, interval.reversed(), q1, p1)
 
 
-def exact_nodes(guesses: Iterable[float], slope: Callable) -> list[Fraction]:
-    """Zeros x near floating-point numbers, to 48 digits; ``slope(x)`` → (f(x), f'(x))."""
-    nodes = []
+def zeros_near(guesses: Iterable[float], slope: Callable) -> list[Fraction]:
+    """Zeros x of f near floating-point numbers, to 48 digits; ``slope(x)`` → (f(x), f'(x))."""
+    zeros = []
     for guess in guesses:
         x = Fraction(float(guess))
         for _ in range(3):  # Newton's steps double the digits
             value, derivative = slope(x)
             x = Fraction(round((x - value / derivative) * 2**160), 2**160)
-        nodes.append(x)
+        zeros.append(x)
     # Symmetric, because the reversal of a step depends on it.
-    return [(x - y) / 2 for x, y in zip(nodes, reversed(nodes), strict=True)]
+    return [(x - y) / 2 for x, y in zip(zeros, reversed(zeros), strict=True)]
 
 
 def legendre(x: Fraction, degree: int) -> list[Fraction]:
@@ -77,16 +75,3 @@ def coefficients(exact: np.ndarray, dtype: Any) -> Array:
     lower = (exact - np.vectorize(Fraction, otypes=[object])(upper)).astype(float)
     # A sum that floating point rounds to its first term, and pairs of numbers do not.
     return jnp.asarray(upper, dtype) + jnp.asarray(lower, dtype)
-
-
-def continuous_rates(equations: Equations, like: Scalar) -> tuple[Callable, Callable]:
-    """∂H/∂p and −∂H/∂q + εW as functions of (t, q, p), with H(t, q, p) = H_D(t, t, q, p)."""
-
-    # Both times of H_D are t. The rates do not use the h of the interval, which is therefore 0.
-    def instant(t: Scalar) -> Interval:
-        return Interval(t, t, jnp.zeros_like(like))
-
-    return (
-        lambda t, q, p: equations.position_rate(instant(t), q, p),
-        lambda t, q, p: equations.momentum_rate(instant(t), q, p),
-    )

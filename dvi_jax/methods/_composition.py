@@ -84,11 +84,8 @@ class CompositionMethod(Method):
             return q, p, info.then(first).then(second)
 
         pairs, single = self._parts(interval)
-        q, p, info = _in_turn(pair, pairs)((q0, p0, no_step_yet(q0)))
-        if single is None:
-            return q, p, info
-        q, p, last = self.base.step(equations, single, q, p)
-        return q, p, info.then(last)
+        state = _in_turn(pair, pairs)((q0, p0, no_step_yet(q0)))
+        return state if single is None else pair(state, (single,))
 
     def inverse(self, equations, interval, q1, p1):
         def pair(state, parts):
@@ -166,21 +163,17 @@ class Composition(CompositionMethod):
     **Arguments**
 
     - `coefficients`: c₁, c₂, … summing to 1; the map at odd places, its adjoint at even ones.
-    - `order`: the order that they have, at most 12. The order conditions are checked, to 1e-11 of
-      the terms that cancel.
+    - `order`: their order, at most 12. The order conditions are checked, to 1e-11 of what cancels.
     - `base`: Φ, any method with an inverse; `TypeII` when left out. A base of higher order, or a
       symmetric one, has fewer conditions to meet.
 
-    Symmetric when the coefficients read the same from both ends and either their number is even
-    or the base is symmetric.
+    Symmetric if the coefficients are, and their number is even or the base is symmetric.
 
     **Raises** `ValueError` when the coefficients are empty, not finite, or do not sum to 1 (to
-    1e-12), when they do not have the order claimed (the order that they have is named), and for a
-    base without an inverse; `TypeError` for a base that is not a method and for coefficients that
-    are not numbers.
+    1e-12), when they do not have the order claimed (their order is named), and for a base without
+    an inverse; `TypeError` for a base that is not a method and coefficients that are not numbers.
 
-    **Source** Hairer, Lubich & Wanner 2006, *Geometric Numerical Integration*, II.4 (4.6), V.3;
-    the conditions: `order_defects`.
+    **Source** Hairer, Lubich & Wanner 2006, II.4 (4.6), V.3; the conditions: `order_defects`.
 
     **Example**
 

@@ -18,11 +18,7 @@ _STRONG = 0.3
 
 
 def warn_of_dissipation(
-    method: Method,
-    equations: Equations,
-    first_interval: Callable[[], Interval],
-    q0: State,
-    p0: State,
+    method: Method, equations: Equations, first_interval: Callable, q0: State, p0: State
 ) -> None:
     r"""Warn of substeps backwards in time if the dissipation at the initial state is strong.
 

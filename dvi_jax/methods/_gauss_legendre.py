@@ -12,14 +12,7 @@ from ..base.checks import whole
 from ..base.types import Interval
 from ..engine.newton import find_root
 from ..problem.implicit import Implicit
-from ._collocation import (
-    Collocation,
-    coefficients,
-    exact_nodes,
-    integrals,
-    legendre,
-    legendre_slope,
-)
+from ._collocation import Collocation, coefficients, integrals, legendre, legendre_slope, zeros_near
 from .step import Equations, judge
 
 # Order 16: the order conditions are tested up to there.
@@ -31,10 +24,8 @@ def _table(stages: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     r"""Nodes c (s,), weights b (s,) and a (s, s), a_ij = ∫₀^{c_i} ℓ_j, as fractions."""
     # x = 2c − 1 are the zeros of P_s. Therefore the sum in `integrals` telescopes in
     # b_i a_ij + b_j a_ji = b_i b_j, the condition of symplecticity.
-    x = exact_nodes(
-        np.polynomial.legendre.leggauss(stages)[0],
-        lambda x: (legendre(x, stages)[-1], legendre_slope(x, stages)),
-    )
+    guesses, _ = np.polynomial.legendre.leggauss(stages)
+    x = zeros_near(guesses, lambda x: (legendre(x, stages)[-1], legendre_slope(x, stages)))
     b = [1 / ((1 - y * y) * legendre_slope(y, stages) ** 2) for y in x]
     return (np.array(x, object) + 1) / 2, np.array(b, object), integrals(x, b, stages)
 
@@ -94,9 +85,8 @@ class GaussLegendre(Collocation):
     The energy, a perturbation and the force are evaluated on the diagonal t0 = t1, as in
     `RungeKutta4`; c, b, a are the nodes, weights and integrals of Gauss quadrature. One stage is
     the implicit midpoint rule. Symmetric; without a force symplectic, and every quadratic
-    invariant, qᵀBp for instance, is conserved to round-off. Without a force it is the type II
-    variational map (12)–(13) of another discrete Hamiltonian, the value that is stationary in P_i
-    and V_i of
+    invariant, qᵀBp for instance, is conserved to round-off. Without a force it is the type II map
+    (12)–(13) of another discrete Hamiltonian, the value stationary in P_i and V_i of
 
         Σ_i b_i [H(t_i, Q_i, P_i) − (P_i − p1)·V_i],    Q_i = q0 + h Σ_j a_ij V_j
 
@@ -107,11 +97,9 @@ class GaussLegendre(Collocation):
 
     - `stages`: s, from 1 to 8.
 
-    **Raises** `ValueError` for any other number of stages. The status of the step reports a solve
-    that fails.
+    **Raises** `ValueError` for another number of stages. The status reports a solve that fails.
 
-    **Accuracy** order 2s with a force too, which may depend on p and on time. The coefficients
-    hold to round-off.
+    **Accuracy** order 2s with a force of p and time too. The coefficients hold to round-off.
 
     **Source** Butcher 1964; Hairer, Lubich & Wanner 2006, *Geometric Numerical Integration*,
     II.1.3, IV.2.1 (quadratic invariants), VI.4 and VI.6 (symplectic, variational); type II: Leok &

@@ -12,16 +12,8 @@ from jax import lax
 
 from ..base.checks import whole
 from ..engine.newton import find_root
-from ._collocation import (
-    Collocation,
-    coefficients,
-    continuous_rates,
-    exact_nodes,
-    integrals,
-    legendre,
-    legendre_slope,
-)
-from .step import judge, no_solve
+from ._collocation import Collocation, coefficients, integrals, legendre, legendre_slope, zeros_near
+from .step import continuous_rates, judge, no_solve
 
 # Order 10: the order conditions are tested up to there.
 _MOST_STAGES = 6
@@ -52,7 +44,7 @@ def _table(stages: int) -> tuple[np.ndarray, ...]:
         return first, (2 * x * first - n * stages * legendre(x, n)[-1]) / (1 - x * x)
 
     guesses = np.polynomial.legendre.Legendre.basis(n).deriv().roots()
-    x = [Fraction(-1), *exact_nodes(guesses, slope), Fraction(1)]
+    x = [Fraction(-1), *zeros_near(guesses, slope), Fraction(1)]
     b = [1 / (stages * n * legendre(y, n)[-1] ** 2) for y in x]
     a, ratio = integrals(x, b, n), integrals(x, [1] * stages, n)
     # The P_i lie on a polynomial of degree s − 2, so that P_s = Σ_{i<s} last_i P_i: one unknown
@@ -78,8 +70,7 @@ class LobattoIIIAIIIB(Collocation):
     symplectic, and every invariant that is bilinear in q and p, angular momentum for instance, is
     conserved to round-off. Without a force it is the type II variational map (12)–(13) of another
     discrete Hamiltonian, with the formula of `GaussLegendre`: the action of curves q of degree s by
-    Lobatto quadrature. For a regular Lagrangian it is the variational integrator of that quadrature
-    of ∫L dt.
+    Lobatto quadrature. For a regular Lagrangian it is the integrator of that quadrature of ∫L dt.
 
     Two stages are the generalised leapfrog, Störmer–Verlet (kick, drift, kick) for a separable H:
     the map of `Strang` wherever H_D and W do not depend on t1, and `Strang` has the smaller solves.
@@ -94,15 +85,12 @@ class LobattoIIIAIIIB(Collocation):
 
     - `stages`: s, from 2 to 6.
 
-    **Raises** `ValueError` for any other number of stages. The status of the step reports a solve
-    that fails.
+    **Raises** `ValueError` for another number of stages. The status reports a solve that fails.
 
-    **Accuracy** order 2s − 2 with a force too, which may depend on p and on time. The coefficients
-    hold to round-off.
+    **Accuracy** order 2s − 2 with a force of p and time too. The coefficients hold to round-off.
 
     **Source** Jay 1996, *SIAM J. Numer. Anal.* 33, 368; Hairer, Lubich & Wanner 2006, *Geometric
-    Numerical Integration*, II.2.2 (order), IV.2.2 (bilinear invariants), VI.4 and VI.6
-    (symplectic, variational).
+    Numerical Integration*, II.2.2 (order), IV.2.2 (invariants), VI.4, VI.6 (variational).
     """
 
     stages: int = eqx.field(static=True, default=2)

@@ -9,10 +9,7 @@ Word = tuple[int, ...]
 
 @functools.lru_cache(maxsize=64)
 def order_defects(
-    coefficients: tuple[float, ...],
-    order: int,
-    base_order: int = 1,
-    base_is_symmetric: bool = False,
+    coefficients: tuple[float, ...], order: int, base_order: int = 1, symmetric_base: bool = False
 ) -> tuple[float, ...]:
     r"""How far … ∘ Φ*_{c₂h} ∘ Φ_{c₁h} is from the exact flow, one number for each power of h.
 
@@ -32,7 +29,7 @@ def order_defects(
     Baker–Campbell–Hausdorff formula and order conditions), III.3 (the same by trees).
     """
     letters = [1, *range(base_order + 1, order + 1)]
-    if base_is_symmetric:
+    if symmetric_base:
         letters = [k for k in letters if k % 2 == 1]
     words = _words(order, letters)
     # The product of two series is a convolution: a word is cut in two at every place.

@@ -126,8 +126,7 @@ class KahanLi(TabulatedComposition):
 
         Ψ_h = S_{γ₁h} ∘ S_{γ₂h} ∘ … ∘ S_{γ₂h} ∘ S_{γ₁h}    of 9 and 17 S
 
-    Try these first when a high order is needed: no substep is longer than 0.8 h, and Σ|γ| is
-    3.8 and 5.4.
+    Try these first for a high order: no substep is longer than 0.8 h, and Σ|γ| is 3.8 and 5.4.
 
     **Arguments** `order`: 6 or 8, `ValueError` for others. `base`: as for `Strang`.
 
@@ -172,8 +171,7 @@ class BlanesMoan(TabulatedComposition):
 
         a₁ = c₁,    b₁ = c₁ + c₂,    a₂ = c₂ + c₃,    b₂ = c₃ + c₄,    …
 
-    and has, for any map Φ with its adjoint, the order of the splitting: 12 and 20 coefficients,
-    six and ten pairs.
+    and has, for any map Φ with its adjoint, the order of the splitting: six and ten pairs.
 
     **Arguments** `order`: 4 or 6, `ValueError` for others. `base`: as for `Strang`.
 

@@ -3,8 +3,7 @@
 from typing import ClassVar
 
 from ._base import Method
-from ._collocation import continuous_rates
-from .step import judge, no_solve
+from .step import continuous_rates, judge, no_solve
 
 
 class RungeKutta4(Method):

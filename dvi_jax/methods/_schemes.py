@@ -3,7 +3,7 @@
 import functools
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from fractions import Fraction
 from typing import Any
 
@@ -43,11 +43,6 @@ _COEFFICIENTS: dict[Orders, tuple[tuple[float, ...], tuple[float, ...]]] = {
 }
 
 
-def _names() -> str:
-    gauss = [f"({n}, 2)" for n in range(2, _LARGEST + 2, 2)]
-    return ", ".join([*gauss, *map(str, _COEFFICIENTS)])
-
-
 @functools.cache
 def near_integrable(orders: Orders) -> tuple[tuple[float, ...], ...] | None:
     """All a and b of the symmetric scheme of generalised orders, for A + εB; None if unknown."""
@@ -59,10 +54,7 @@ def near_integrable(orders: Orders) -> tuple[tuple[float, ...], ...] | None:
         return tuple(((a + a[::-1]) / 2).tolist()), tuple(((b + b[::-1]) / 2).tolist())
     if orders not in _COEFFICIENTS:
         return None
-    return _complete(*_COEFFICIENTS[orders])
-
-
-def _complete(a: Sequence[float], b: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+    a, b = _COEFFICIENTS[orders]
     # A has one coefficient more than B. The even number of the two has a pair in the middle.
     even, odd = (a, b) if len(a) == len(b) else (b, a)
     even, odd = (*even, 0.5 - math.fsum(even)), (*odd, 1 - 2 * math.fsum(odd))
@@ -101,7 +93,8 @@ def as_scheme(scheme: Any) -> Any:
 
 def check_scheme(scheme: Any) -> None:
     """**Raises** `TypeError` or `ValueError` for a scheme that is not known."""
-    names = f"a tuple of generalised orders, one of {_names()}"
+    schemes = [*((n, 2) for n in range(2, _LARGEST + 2, 2)), *_COEFFICIENTS]
+    names = f"a tuple of generalised orders, one of {', '.join(map(str, schemes))}"
     if isinstance(scheme, tuple):
         if near_integrable(scheme) is None:
             raise ValueError(f"scheme must be {names}, got {scheme}.")

@@ -63,10 +63,8 @@ def stages_of(sequence: Sequence[tuple[int, float]], time: float = 0.0) -> list[
 
 
 class SplittingMethod(Method):
-    """Base of the methods that compose flows of parts.
-
-    A subclass returns the parts, and the coordinates in which they are computed.
-    """
+    """Base of the methods that compose flows of parts. A subclass returns the parts, and the
+    coordinates in which they are computed."""
 
     scheme: eqx.AbstractVar[Any]
 

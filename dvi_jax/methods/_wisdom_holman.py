@@ -53,8 +53,7 @@ class _Jacobi(NamedTuple):
 
 
 class _Democratic(NamedTuple):
-    """Row 0 is the centre of mass; the others are heliocentric positions and barycentric
-    velocities."""
+    """Row 0 is the centre of mass, others are heliocentric positions and barycentric velocities."""
 
     masses: Array
 

@@ -18,7 +18,7 @@ from lanewise.jaxprs.jaxapi import is_traced
 from ..base.inputs import as_parameter, as_scalar, start_state
 from ..base.results import RESULTS
 from ..base.types import Args, Interval, Scalar, State
-from ..engine.newton import KnownRoot, RootInfo, RootSolver, find_root
+from ..engine.newton import RootInfo, RootSolver, find_root
 from ..engine.picard import PicardThenNewton
 from ..problem.system import check_system, of_problem, require_constraint
 from .step import Equations, no_solve
@@ -93,7 +93,7 @@ def tangent(equations: Equations, t: Scalar, q: State, p: State) -> tuple[State,
     return momentum(y), info
 
 
-def root_solver(equations: Equations) -> RootSolver | KnownRoot:
+def root_solver(equations: Equations) -> RootSolver:
     """The solver for multipliers: of the default, Newton's method for any number of them."""
     # The Jacobian is that of masses that are coupled, not near the identity as for other methods:
     # fixed points of a chain converge slowly. Newton's elimination is as cheap as it is banded.
@@ -182,13 +182,7 @@ class Projection(NamedTuple):
 
 
 def project(
-    system: Any,
-    q0: Any = None,
-    p0: Any = None,
-    args: Args = None,
-    *,
-    t0: Any = 0.0,
-    epsilon: Any = 0,
+    system, q0: Any = None, p0: Any = None, args: Args = None, *, t0: Any = 0.0, epsilon: Any = 0
 ) -> Projection:
     r"""The nearest consistent initial state of a constrained system.
 

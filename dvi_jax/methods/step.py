@@ -13,7 +13,7 @@ from lanewise.jaxprs.dependence import depends_on
 
 from ..base.results import RESULTS, first_failure
 from ..base.types import Args, Interval, Scalar, State
-from ..engine.newton import KnownRoot, Newton, RootInfo, RootSolver, find_root, no_residual, worse
+from ..engine.newton import Newton, RootInfo, RootSolver, find_root, no_residual, worse
 from ..engine.rounding import one_by_one
 from ..problem.system import System
 
@@ -53,7 +53,7 @@ class Equations(eqx.Module):
     system: System | Any  # or what has its functions, such as a system with the noise of a step
     epsilon: Scalar
     args: Args = None
-    newton: RootSolver | KnownRoot = Newton()
+    newton: RootSolver = Newton()
     origin: tuple[State, State] | None = None
     quantum: float | None = eqx.field(static=True, default=None)
     increments: Array | None = None
@@ -107,8 +107,7 @@ class Equations(eqx.Module):
         return not depends_on(lambda q0: self.position_rate(interval, q0, like), 0, like)
 
 
-# Jitted, so that all calls in a rollout share one trace of the user's functions and of their
-# derivatives.
+# Jitted: all calls in a run share one trace of the user's functions and of their derivatives.
 
 
 @eqx.filter_jit
@@ -173,6 +172,19 @@ def inverse_step(
     q0, info = _solve(velocity, h, q1, q0, equations, equations.absolute(q1, p1)[0])
     p0 = p1 - equations.increment(interval.h, equations.momentum_rate(interval, q0, p1))
     return q0, p0, judge(info, q0, p0, equations.quantum)
+
+
+def continuous_rates(equations: Equations, like: Scalar) -> tuple[Callable, Callable]:
+    """∂H/∂p and −∂H/∂q + εW as functions of (t, q, p), with H(t, q, p) = H_D(t, t, q, p)."""
+
+    # Both times of H_D are t. The rates do not use the h of the interval, which is therefore 0.
+    def instant(t: Scalar) -> Interval:
+        return Interval(t, t, jnp.zeros_like(like))
+
+    return (
+        lambda t, q, p: equations.position_rate(instant(t), q, p),
+        lambda t, q, p: equations.momentum_rate(instant(t), q, p),
+    )
 
 
 def no_solve(x: State) -> RootInfo:

@@ -23,8 +23,7 @@ class ConstraintForce(eqx.Module):
         q̇ = v = ∂H/∂p,   ṗ = −∂H/∂q + εW − Gᵀλ,   d²g/dt² = 0
         ⟹  (G ∂²H/∂p² Gᵀ) λ = d(G v)/dt at λ = 0,   G = ∂g/∂q
 
-    by automatic differentiation. It is the force of the differential equations at a state, not an
-    average over a step.
+    by autodiff. It is the force of the differential equations, not an average over a step.
 
     **Arguments** `multipliers`: return λ, shape (m,) [energy / unit of g].
 

@@ -2,7 +2,7 @@
 
 import abc
 import math
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -32,6 +32,10 @@ class Pushed(NamedTuple):
     h: Scalar
 
 
+def _state(t0, t1, q0, p0, q1, p1, args):
+    return jnp.concatenate([q1.ravel(), p1.ravel()])
+
+
 class Deviations(Reduction):
     """Base of the reductions that follow deviation vectors along a trajectory.
 
@@ -40,14 +44,7 @@ class Deviations(Reduction):
     implicit solves. Gradients are those of the steps, so that there is no `combine`.
     """
 
-    # For a type checker, an abstract variable would be a constructor argument of every subclass.
-    if TYPE_CHECKING:
-        function: ClassVar[Any]
-    else:
-
-        @property
-        def function(self):
-            return _state
+    function: ClassVar[Any] = staticmethod(_state)
 
     @abc.abstractmethod
     def vectors(self, memory: Any) -> Array:
@@ -58,13 +55,8 @@ class Deviations(Reduction):
         """Memory after step k, which ended at time t; `value` is a `Pushed`."""
 
 
-def _state(t0, t1, q0, p0, q1, p1, args):
-    return jnp.concatenate([q1.ravel(), p1.ravel()])
-
-
 class _Sum(NamedTuple):
-    """A compensated sum (Kahan 1965): in float32 a plain sum of a million steps has an error of per
-    cents."""
+    """A compensated sum (Kahan 1965): a plain float32 sum of 10⁶ steps is wrong by per cents."""
 
     value: Array
     excess: Array
@@ -72,8 +64,7 @@ class _Sum(NamedTuple):
     def plus(self, x: Array) -> "_Sum":
         term = x - self.excess
         value = self.value + term
-        # Zero in exact arithmetic: what rounding added to the sum, to be subtracted from the next
-        # term.
+        # What rounding added to the sum, to be subtracted from the next term; exactly it is zero.
         return _Sum(value, (value - self.value) - term)
 
 
@@ -87,10 +78,8 @@ def _as_python_integer(value: Any) -> Any:
 
 
 class _FrameIndicator(Deviations):
-    """Base of indicators with an orthonormal frame, the first part of their memory.
-
-    A subclass has the fields `seed`, of the first frame, and `scale`, a pair of units.
-    """
+    """Base of indicators with an orthonormal frame, the first part of their memory. A subclass has
+    the fields `seed`, of the first frame, and `scale`, a pair of units."""
 
     def __check_init__(self: Any):
         whole(f"seed of {type(self).__name__}", self.seed, 0)
@@ -175,11 +164,9 @@ class LyapunovSpectrum(_FrameIndicator):
 
     - `count`: number of exponents; None: all 2N. The cost grows with it.
     - `seed`: of the first frame, which is random.
-    - `scale`: (of q, of p): units of the deviations, numbers or arrays like q, which do not matter
-      in the limit.
+    - `scale`: (of q, of p): units of deviations, numbers or arrays like q; the limit is the same.
 
-    **Source** Benettin, Galgani, Giorgilli & Strelcyn 1980, *Meccanica* 15, 9 and 21; Shimada &
-    Nagashima 1979.
+    **Source** Benettin et al. 1980, *Meccanica* 15, 9 and 21; Shimada & Nagashima 1979.
     """
 
     count: int | None = eqx.field(static=True, default=None, converter=_as_python_integer)
@@ -274,8 +261,7 @@ class GALI(_FrameIndicator):
     **Arguments** `k`: number of vectors, 2 ≤ k ≤ 2N; `seed` of the first ones, which are random and
     orthogonal; `scale` as for `LyapunovSpectrum`.
 
-    **Source** Skokos, Bountis & Antonopoulos 2007, *Physica D* 231, 30. The triangular matrix: our
-    own.
+    **Source** Skokos, Bountis & Antonopoulos 2007, *Physica D* 231, 30; the matrix: our own.
     """
 
     k: int = eqx.field(static=True, default=2, converter=_as_python_integer)
@@ -300,8 +286,7 @@ class GALI(_FrameIndicator):
         return frame, columns * shrink[None, :], logs.plus(jnp.log(_diagonal(R) * shrink))
 
     def finish(self, memory):
-        # The volume is the product of the diagonal, whose first entry is 1. Logarithms do not
-        # underflow.
+        # The volume is the product of the diagonal, with 1 first. Logarithms do not underflow.
         logs = jnp.cumsum(memory[2].value)[1:]
         return logs / math.log(10) if self.log10 else jnp.exp(logs)
 
@@ -343,11 +328,9 @@ class SALI(_FrameIndicator):
 
 
 def _gram_schmidt(vectors: Array) -> tuple[Array, Array]:
-    """(Q, R) with ``vectors[j] = Σ_i R[i, j] Q[i]``, Q orthonormal, R upper triangular, R_jj > 0.
-
-    The modified process is used, row by row.
-    """
-    # Once is enough: the vectors are an orthonormal frame after one step, far from dependent.
+    """(Q, R), ``vectors[j] = Σ_i R[i, j] Q[i]``: Q orthonormal, R upper triangular, R_jj > 0."""
+    # The modified process, row by row. Once is enough: the vectors are an orthonormal frame after
+    # one step, far from dependent.
     count = vectors.shape[0]
     if count > _UNROLL_UP_TO:
         return _gram_schmidt_in_a_loop(vectors)

@@ -1,6 +1,5 @@
 """Steps that are recorded during a run and evaluated at its end."""
 
-import abc
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
@@ -39,24 +38,16 @@ class KeptSteps(Reduction):
     not known whether a step belongs to them.
     """
 
+    function: ClassVar[Callable[..., Any]]
     has_running_value: ClassVar[bool] = False
 
     # For a type checker, abstract variables would be constructor arguments of every subclass.
     if TYPE_CHECKING:
         capacity: ClassVar[int]
         skip: ClassVar[int]
-        function: ClassVar[Callable[..., Any]]
     else:
         capacity: eqx.AbstractVar[int]
         skip: eqx.AbstractVar[int]
-
-        @property
-        def function(self):
-            return self._row
-
-    @abc.abstractmethod
-    def _row(self, t0, t1, q0, p0, q1, p1, args) -> Array:
-        """The row of one step."""
 
     def start(self, value):
         rows = jnp.full((self.capacity, *value.shape), jnp.nan, value.dtype)
@@ -99,8 +90,7 @@ def from_rows(rows: Float[Array, "... width"], shape: tuple[int, ...]) -> tuple[
 class Crossings(eqx.Module):
     """The points where a trajectory crossed a section, in the order of time.
 
-    - `ts`, `qs`, `ps`: times and states, shapes (max_crossings,), (max_crossings, *q0.shape); NaN
-      after the last one.
+    - `ts`, `qs`, `ps`: shapes (max_crossings,), (max_crossings, *q0.shape); NaN after the last one.
     - `count`: number of crossings after the first `skip`. If it is above max_crossings, only the
       first of these are listed.
     """
@@ -116,8 +106,7 @@ class Section(KeptSteps):
 
     A step contains a crossing when g has different signs at its ends. The crossing is computed to
     round-off on the curve Φ_{θh}(q0, p0), 0 < θ ≤ 1, of the method inside of the step. So it has
-    the order of the method. The run only records these steps; their equations are solved together
-    at the end, on the device.
+    the order of the method. The run only records these steps, and computes the points at its end.
 
     **Arguments**
 
@@ -166,7 +155,7 @@ class Section(KeptSteps):
         hint = "1 selects the crossings where g increases, -1 where it decreases, 0 both."
         one_of("direction", self.direction, (1, -1, 0), hint)
 
-    def _row(self, t0, t1, q0, p0, q1, p1, args):
+    def function(self, t0, t1, q0, p0, q1, p1, args):
         g0, g1 = event(self.g, t0, q0, p0, args), event(self.g, t1, q1, p1, args)
         # A zero belongs to the step that ends there: a crossing at a grid point is counted once.
         rises, falls = (g0 < 0) & (g1 >= 0), (g0 > 0) & (g1 <= 0)
@@ -202,7 +191,7 @@ class RequestedTimes(KeptSteps):
     def capacity(self) -> int:
         return self.ts.shape[0]
 
-    def _row(self, t0, t1, q0, p0, q1, p1, args):
+    def function(self, t0, t1, q0, p0, q1, p1, args):
         start = shown(self.clock, t0, q0, p0, args)
         end = shown(self.clock, t1, q1, p1, args)
 

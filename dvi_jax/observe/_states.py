@@ -15,8 +15,7 @@ FORMS = "(q, p), (t, q, p, args) or (t0, t1, q0, p0, q1, p1, args)"
 
 
 class OfState(eqx.Module):
-    """A function of the state at the end of a step. Such a function has a value at the initial
-    state, too."""
+    """A function of the state at the end of a step, which has a value at the initial state, too."""
 
     function: Callable[..., Any]
     takes_time: bool = eqx.field(static=True)
@@ -35,10 +34,7 @@ def has_initial_value(function: Any) -> bool:
 
 
 def of_steps(observe: PyTree) -> PyTree:
-    """The observables, all as functions of a step.
-
-    **Raises** `TypeError` for a function with another number of arguments.
-    """
+    """The observables, all as functions of a step. **Raises** `TypeError` for other functions."""
     return jax.tree.map(_of_step, observe, is_leaf=is_observable)
 
 

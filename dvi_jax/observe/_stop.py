@@ -21,8 +21,7 @@ class Stop(eqx.Module):
 
     **Arguments** `g`: function ``(t, q, p, args)`` → scalar.
 
-    **Raises** `TypeError` for another g, and in `integrate` `ValueError` for one that is not a
-    scalar.
+    **Raises** `TypeError` for another g, and in `integrate` `ValueError` if it is not scalar.
 
     **Example**
 

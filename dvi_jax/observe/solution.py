@@ -38,8 +38,7 @@ class Save(eqx.Module):
       angle for instance, `ts` are values of it.
 
     **Raises** `ValueError` for an `every` that is not a positive integer, for `ts` together with
-    another choice, and for times that are not one-dimensional, finite, in ascending or descending
-    order.
+    another choice, and for times that are not one-dimensional, finite and in order.
 
     **Example**
 
@@ -79,17 +78,14 @@ class Solution(eqx.Module):
 
     - `ts`: saved times, shape (S,); ``ts[0]`` is t0, except with ``Save(ts=...)``.
     - `qs`, `ps`: saved positions and momenta, shape (S, *q0.shape).
-    - `hs`: size of the step that ended at each saved time except the first, shape (S − 1,).
-      With ``Save(ts=...)`` the first time is like the others: `hs` and the values of functions in
-      `observed` have shape (S, …), and belong to the shorter step that ends at each time (of size
-      zero at t0).
+    - `hs`: size of the step that ended at each saved time except the first, shape (S − 1,). With
+      ``Save(ts=...)`` the first time is like the others: `hs` and the values of functions in
+      `observed` have shape (S, …), of the shorter step that ends at each time (size zero at t0).
     - `observed`: the pytree given as `observe`; a function of the state is replaced by its values
       at ``ts``, shape (S, …), one of a step by its values on the steps that ended at ``ts[1:]``,
       shape (S − 1, …), a reduction by one value over all steps.
-    - `result`: the status, one of `RESULTS`. From the failing step on states and observables are
-      NaN.
-    - `stop`: the end (t, q, p) of a run with a `Stop`, a `Stopped`, NaN if it did not stop; else
-      None.
+    - `result`: the status, one of `RESULTS`. After a failure states and observables are NaN.
+    - `stop`: the end (t, q, p) of a run with a `Stop`, a `Stopped`, NaN if it did not; else None.
     - `stats`: `num_steps`; `newton_iterations` (total); `max_residual` (largest last correction of
       a solve relative to its scale); `failed_step` (number of the failing step from 0, or −1) and
       `failed_residual` (its last correction, likewise, or 0).

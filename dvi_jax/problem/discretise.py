@@ -92,14 +92,12 @@ def discretise(H: Callable[..., Any], order: int = 1) -> HamiltonianFn:
         q ← q0 + h ∫₀^σ ∂H/∂p,    p ← p1 + h ∫_σ¹ ∂H/∂q    from q = q0, p = p1,
 
     with the integrals at Gauss nodes: one node and one pass (order 2), two nodes and one pass
-    (order 3), two nodes and three passes (order 4; the limit of many passes is the Gauss method of
-    two stages).
+    (order 3), two nodes and three passes (order 4; many passes: the Gauss method of two stages).
 
     For every r the map is symplectic, as the map of one H_D, and every tool for H_D applies. H_D is
-    invariant under all translations, rotations and other linear maps of q under which H is. Orders
-    2 to 4 couple q0 and p1 even where H is separable, so that each step needs a solve: for a
-    separable H a composition (`Yoshida`, `BlanesMoan`, `KahanLi`) is cheaper. `Strang` on order 3
-    has order 4.
+    invariant under all linear maps and translations of q under which H is. Orders 2 to 4 couple q0
+    and p1 even where H is separable, so that each step needs a solve: for a separable H a
+    composition (`Yoshida`, `BlanesMoan`, `KahanLi`) is cheaper. `Strang` on order 3 has order 4.
 
     **Arguments**
 

@@ -10,14 +10,7 @@ from .system import System
 
 
 def outgoing_energy(
-    system: System,
-    t0: Any,
-    t1: Any,
-    q0: State,
-    p1: State,
-    epsilon: Any = 0.0,
-    args: Args = None,
-    h: Any = None,
+    system: System, t0, t1, q0: State, p1: State, epsilon: Any = 0.0, args: Args = None, h=None
 ) -> Scalar:
     """E⁺ = H_D − h ∂H_D/∂t0 of the step from t0 to t1 [energy], at its first point.
 
@@ -27,14 +20,7 @@ def outgoing_energy(
 
 
 def incoming_energy(
-    system: System,
-    t0: Any,
-    t1: Any,
-    q0: State,
-    p1: State,
-    epsilon: Any = 0.0,
-    args: Args = None,
-    h: Any = None,
+    system: System, t0, t1, q0: State, p1: State, epsilon: Any = 0.0, args: Args = None, h=None
 ) -> Scalar:
     """E⁻ = H_D + h ∂H_D/∂t1 of the step [energy], at its second point; see `outgoing_energy`."""
     return _energy(1, system, h, (t0, t1, q0, p1, epsilon, args))
@@ -48,14 +34,7 @@ def _energy(end: int, system: System, h: Any, point: tuple[Any, ...]) -> Scalar:
 
 
 def disturbing_work(
-    system: System,
-    t0: Any,
-    t1: Any,
-    q0: State,
-    q1: State,
-    p1: State,
-    epsilon: Any = 0.0,
-    args: Args = None,
+    system: System, t0, t1, q0: State, q1: State, p1: State, epsilon: Any = 0.0, args: Args = None
 ) -> Scalar:
     """εW(t0, t1, q0, p1)·(q1 − q0), the work of the perturbing force on a step [energy]."""
     return jnp.sum(system.disturbing_force(t0, t1, q0, p1, epsilon, args) * (q1 - q0))

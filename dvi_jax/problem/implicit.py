@@ -45,12 +45,9 @@ class Implicit(eqx.Module):
     root_finder: RootSolver = Newton()
 
     def __check_init__(self):
-        for name, arguments in (
-            ("energy", "(t, q, p, y, args)"),
-            ("relation", "(t, q, p, y, args)"),
-            ("guess", "(t, q, p, args)"),
-        ):
-            check_takes(name, getattr(self, name), arguments)
+        check_takes("energy", self.energy, "(t, q, p, y, args)")
+        check_takes("relation", self.relation, "(t, q, p, y, args)")
+        check_takes("guess", self.guess, "(t, q, p, args)")
 
     def solved(self, t: Scalar, q: State, p: State, args: Args) -> Vector:
         """y at (t, q, p); NaN where it is not found. Differentiable to any order."""

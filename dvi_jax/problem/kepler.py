@@ -56,15 +56,13 @@ class _Orbit(NamedTuple):
         return self.r0 + self.eta * g.g1 + self.zeta * g.g2
 
     def on_time(self, h: Scalar, X: Array, g: _G) -> _G:
-        """The functions at the X where t(X) = h in their own rounding, which differs from the root
-        by round-off."""
+        """The functions at the X where t(X) = h in their own rounding, next to the root."""
         # Without it the energy drifts by 3e-19 in each step, since f and g are not of one orbit.
         d = (h - self.time(X, g)) / self.radius(g)
         return _G(g.g0, g.g1 + g.g0 * d, g.g2 + g.g1 * d, g.g3 + g.g2 * d)
 
     def correction(self, h: Scalar, X: Array) -> tuple[Array, Array, Array]:
-        """The step towards t(X) = h of a method of order four, t(X) − h, and whether the next step
-        would be below round-off."""
+        """The step of a method of order four, t(X) − h, and whether the next is below round-off."""
         g = _universal(X, self.beta)
         past, r = self.time(X, g) - h, self.radius(g)
         slope = self.eta * g.g0 + self.zeta * g.g1
@@ -106,9 +104,8 @@ def change(h: Scalar, q: Array, v: Array, mu: Array) -> tuple[Array, Array, Arra
         return orbit.time(X, _universal(X, beta)) - h
 
     # The equations of different orbits do not depend on one another: `divide` solves all of them.
-    X, is_root = lanewise.implicit_root(
-        equation, jnp.zeros_like(r0), lambda _, __: _solve(orbit, h), divide
-    )
+    zero = jnp.zeros_like(r0)
+    X, is_root = lanewise.implicit_root(equation, zero, lambda _, __: _solve(orbit, h), divide)
     g = orbit.on_time(h, X, _universal(X, beta))
     # Increments, not the new state: a small change keeps its digits next to a large coordinate.
     a = (mu * g.g2)[..., None]

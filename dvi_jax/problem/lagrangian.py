@@ -157,8 +157,7 @@ def from_lagrangian(L_d: Callable[..., Any], root_finder: Newton = Newton()) -> 
         H_D(t0, t1, q0, p1) = [p1·(q1 − q0) − L_d(t0, t1, q0, q1)] / h,    h = t1 − t0
 
     where each evaluation solves the second equation for q1, at which the bracket is stationary. The
-    map (12)–(13) of H_D is that of L_d, and its solutions satisfy the discrete Euler–Lagrange
-    equations, with a force
+    map (12)–(13) is that of L_d, and satisfies the discrete Euler–Lagrange equations, with a force
 
         ∂L_d/∂q1 (q_{k−1}, q_k) + ∂L_d/∂q0 (q_k, q_{k+1}) + h ε W_k = 0.
 
@@ -182,8 +181,7 @@ def from_lagrangian(L_d: Callable[..., Any], root_finder: Newton = Newton()) -> 
 
     **Accuracy** as `legendre`, of L_d(q0, q0 + hv)/h in v. The step is computed as t1 − t0, which
     loses digits late in a long run. H_D(t, t, …) does not exist: methods on the continuous
-    equations (`RungeKutta4`, `GaussLegendre`, `LobattoIIIAIIIB`) end with `not_finite` on the first
-    step.
+    equations (`RungeKutta4`, `GaussLegendre`, `LobattoIIIAIIIB`) end with `not_finite` at once.
 
     **Source** Marsden & West 2001, *Acta Numerica* 10, 357, 1.5 and 3.2 (forces); Hairer, Lubich &
     Wanner 2006, *Geometric Numerical Integration*, VI.5 and VI.6.

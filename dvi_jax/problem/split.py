@@ -26,8 +26,7 @@ class Split(eqx.Module):
       map (12)–(13). That of others is computed by a Gauss–Legendre method of the same order.
     - `flows`: for each part None or a function ``(h, q, p, args)`` → (q, p), its flow.
     - `perturbed`: number of the part to which the perturbing force and the perturbation of the
-      `System` belong; its flow is then computed with them. None: they are a part of their own,
-      after the others.
+      `System` belong; its flow is then computed with them. None: they are the last part.
 
     The first part carries the time: the others are evaluated at fixed times within a step.
 
@@ -42,10 +41,7 @@ class Split(eqx.Module):
     perturbed: int | None = eqx.field(static=True)
 
     def __init__(
-        self,
-        parts: Sequence[HamiltonianFn],
-        flows: Sequence[Any] | None = None,
-        perturbed: int | None = None,
+        self, parts: Sequence[HamiltonianFn], flows: Any = None, perturbed: int | None = None
     ):
         parts = list(parts)
         if len(parts) < 2:

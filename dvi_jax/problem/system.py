@@ -39,8 +39,7 @@ class System(eqx.Module):
       ``epsilon * t1`` in place of t0 and t1.
     - `noise`: a function σ ``(t, q, p, args)`` → array like q0, or of the shape (*q0.shape, m), for
       ``dp = … + σ ∘ dB`` [unit of p/√time]; a `Langevin`; or `NoiseHamiltonians`. Runs then need a
-      path and a method for noise. ε does not multiply noise; stochastic integrals are those of
-      Stratonovich.
+      path and a method for noise. ε does not multiply noise; integrals are Stratonovich's.
     - `epsilon`: strength of the perturbation in runs without ``epsilon=``. None: each run of a
       system with a force, a perturbation or a slow time must give it. Systems of the library: 0.
     - `constraint`: g, function ``(q, args)`` → array of m numbers that are all zero for the
@@ -57,9 +56,8 @@ class System(eqx.Module):
     **Raises** `TypeError` when a function is not callable or does not take the five arguments.
     **Warns** when the names of the arguments suggest that p and q are exchanged.
 
-    **Source** H_D: type II generating function S = p1·q0 + h H_D (Marsden & West 2001,
-    *Discrete mechanics and variational integrators*; Leok & Zhang 2011). Perturbations: the paper,
-    (6)–(13).
+    **Source** H_D: type II generating function S = p1·q0 + h H_D (Marsden & West 2001, *Acta
+    Numerica* 10, 357; Leok & Zhang 2011). Perturbations: the paper, (6)–(13).
 
     **Example**
 
@@ -153,15 +151,11 @@ class System(eqx.Module):
         return (epsilon * t0, epsilon * t1) if self.slow_time else (t0, t1)
 
     def check_shapes(self, t: Scalar, q: State, p: State, epsilon: Scalar, args: Args) -> None:
-        """**Raises** `ValueError` or `TypeError` for functions whose values have the wrong shape or
-        type."""
+        """**Raises** `ValueError` or `TypeError` for functions with values of a wrong kind."""
         leaves, tree = jax.tree.flatten((t, q, p, args))
         # A function is traced once for each combination of shapes, types and values that it reads.
-        kinds = (
-            self.reads,
-            tree,
-            *((x.shape, x.dtype) if eqx.is_array(x) else (type(x), x) for x in leaves),
-        )
+        types = [(x.shape, x.dtype) if eqx.is_array(x) else (type(x), x) for x in leaves]
+        kinds = (self.reads, tree, *types)
         for name, shape in (("H_D", ()), ("perturbation", ()), ("force", q.shape)):
             function = getattr(self, name)
             if function is not None:
