@@ -11,7 +11,7 @@ import dvi_jax as dvi
 
 KEPLER = dvi.System(lambda t0, t1, q, p, a: p @ p / 2 - 1 / jnp.linalg.norm(q))
 Q0, P0 = [0.3, 1.2], [-1.0, -0.6]
-FINAL = dvi.Save(final=True)
+FINAL, SLOW = dvi.Save(final=True), pytest.mark.slow
 
 
 def kinetic(t0, t1, q0, p0, q1, p1, a):
@@ -147,7 +147,10 @@ def test_a_batch_that_is_fine_under_debug_nans():
     np.testing.assert_array_equal(found, expected)
 
 
-@pytest.mark.parametrize("adjoint", [dvi.Reversible(), dvi.Checkpointed(), dvi.Direct()])
+@pytest.mark.parametrize(
+    "adjoint",
+    [dvi.Reversible(), *(pytest.param(x, marks=SLOW) for x in (dvi.Checkpointed(), dvi.Direct()))],
+)
 def test_gradient_of_a_batch_with_a_branch_in_the_hamiltonian(adjoint):
     def H(t0, t1, q, p, a):
         def square(y):

@@ -1,12 +1,13 @@
 """Root solvers: the roots, derivatives and statuses of Newton's method, by fewer operations."""
 
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import double_pendulum, symplectic_defect
+from helpers import covering, double_pendulum, symplectic_defect
 
 import dvi_jax as dvi
 import lanewise
@@ -218,8 +219,11 @@ def newtons_step(case):
     return march(Newton(), *WITH_MANY[case])
 
 
-@EACH
-@pytest.mark.parametrize("case", list(WITH_MANY))
+@pytest.mark.parametrize(
+    ("name", "case"),
+    [pytest.param(*x, marks=() if x in covering(OTHERS, WITH_MANY) else pytest.mark.slow)
+     for x in itertools.product(OTHERS, WITH_MANY)],
+)  # fmt: skip
 def test_one_step_agrees_with_newton_to_a_few_ulp(name, case):
     q1, p1, info = march(OTHERS[name], *WITH_MANY[case])
     q_newton, p_newton, _ = newtons_step(case)
@@ -318,7 +322,7 @@ def test_no_iteration_ends_before_it_has_converged():
         return x - 1 + 0.1 * jnp.sin(x)
 
     verdicts = []
-    for most in (2, 3, 4, 5, 6, 12, 13, 14, 15):
+    for most in (2, 4, 6, 12, 14):
         root, info = find_root(F, jnp.full(3, 0.5), jnp.ones(3), Picard(max_steps=most))
         verdicts.append(bool(info.converged))
         if verdicts[-1]:

@@ -210,13 +210,9 @@ REJECTED = [
     ('system = "own.py:forced"\n' + FULL, "epsilon: the key is missing", "a force"),
     ('system = "own.py:forced"\nepsilon = 0.1\n' + FULL, "of if (own.py, line 25)", "fit"),
     ('system = "own.py:numbered"\nepsilon = 0.1\n' + FULL, "of if (own.py, line 28)", "fit"),
-    (
-        N_BODY + "[state]\nq0 = [[0, 0], [0, 0], [1, 1]]",
-        "body 1 must have different",
-        "start",
-    ),
+    (N_BODY + "[state]\nq0 = [[0, 0], [0, 0], [1, 1]]", "body 1 must have different", "start"),
     (N_BODY + "[args]\nmasses = [1, 0, 1]", "mass of body 1 must be positive", "start"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("text", "seen", "allowed"), REJECTED)
