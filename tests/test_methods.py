@@ -82,9 +82,6 @@ def test_symmetric_methods_reverse_and_others_do_not(system, method):
     assert measured.claimed or measured.value > 1e-9
 
 
-# --- order conditions --------------------------------------------------------------------------
-
-
 def test_order_conditions_hold_and_the_next_ones_do_not():
     for method in METHODS.values():
         if hasattr(method, "fractions"):
@@ -136,9 +133,6 @@ def test_printed_digits_are_enough_for_a_claim():
     assert yoshida(12).is_symmetric
     with pytest.raises(ValueError, match="conditions of order"):
         yoshida(6)
-
-
-# --- the step ----------------------------------------------------------------------------------
 
 
 @pytest.mark.slow

@@ -47,9 +47,6 @@ def momenta(path, h=0.1, num_steps=8, **more):
     return np.asarray(dvi.integrate(FREE, [0.0], [0.0], path=path, **run).ps[:, 0])
 
 
-# --- paths ----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_increments_are_the_numbers_of_jax(dtype):
     key = jax.random.key(3)
@@ -144,9 +141,6 @@ def test_a_path_of_diffrax(tree):
     np.testing.assert_allclose(coarse[-1], made.evaluate(0.0, 1.0)[0], atol=1e-12)
 
 
-# --- the same bits --------------------------------------------------------------------------------
-
-
 def test_equal_bits_alone_in_batches_and_after_a_resume():
     keys = jax.random.split(jax.random.key(0), 70)
     many = jax.vmap(lambda key: thermal(dvi.Brownian(key)).qs)
@@ -185,8 +179,6 @@ def test_a_sweep_resumes_with_its_own_seeds_only(tmp_path):
     with pytest.raises(dvi.StoreMismatch, match="path"):
         dvi.sweep(THERMAL, [1.0], [0.2], path=dvi.Axis("seed", np.arange(20) + 1), **store)
 
-
-# --- methods --------------------------------------------------------------------------------------
 
 OF_ALL = [
     *((THERMAL, m) for m in ("BAOAB", "OBABO", "StochasticEuler", "StochasticMidpoint")),
@@ -332,8 +324,6 @@ def test_compensated_summation_sees_the_whole_momentum():
     np.testing.assert_allclose(other.qs, plain.qs, atol=1e-12)
 
 
-# --- errors ---------------------------------------------------------------------------------------
-
 FEW = {"h": 0.1, "num_steps": 10, "args": ARGS}
 SIGMA_OF_P = dvi.System(H_D, noise=lambda t, q, p, args: p)
 
@@ -379,9 +369,6 @@ def test_other_functions_and_arguments_are_refused():
         dvi.invariant_diffusion(
             dvi.System(H_D), [1.0], [0.0], invariant=lambda q, p: q[0], h=0.1, num_steps=1
         )
-
-
-# --- distributions and orders ---------------------------------------------------------------------
 
 
 def test_harmonic_oscillator_in_equilibrium():
@@ -464,9 +451,6 @@ def test_canonical_distribution(bench, measure, paths):
     of_q, of_p, (temperature, _) = getattr(bench, measure)(paths, mistaken=True)
     assert max(of_q, of_p) < 1e-4
     assert abs(temperature / 0.5 - 1) > 0.05
-
-
-# --- diffusion of invariants ----------------------------------------------------------------------
 
 
 def test_diffusion_of_the_energy_of_an_oscillator():

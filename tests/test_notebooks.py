@@ -57,9 +57,6 @@ def test_it_links_to_what_is_there(make, name):
         assert (ROOT / path).exists(), path
 
 
-# --- negative controls: what the checks must catch ------------------------------------------------
-
-
 @pytest.fixture
 def book(make):
     return copy.deepcopy(make.committed("quick_start"))
@@ -179,9 +176,6 @@ def test_an_unknown_notebook_is_refused():
     run = subprocess.run(command, capture_output=True, text=True, check=False)
     assert run.returncode == 2
     assert "no source for no_such; there are alpha_particles" in run.stderr
-
-
-# --- executed again -----------------------------------------------------------------------------
 
 
 def kernels():

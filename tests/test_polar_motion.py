@@ -64,8 +64,6 @@ def solved(args, t1, one_sided=False):
     return found.y[:, -1]
 
 
-# What was measured
-
 C04 = [  # date, x, y, tolerance [arcsec], from IERS EOP 20 C04, another centre's own combination
     ("1977-01-01", -0.072400, 0.083200, 20 * MAS),
     ("1984-01-01", -0.133010, 0.091197, 2 * MAS),
@@ -128,9 +126,6 @@ def test_the_wobble_turns_as_the_sign_of_y_says(measured):
     assert at_chandler[0] > 10 * at_chandler[1]
 
 
-# The free wobble
-
-
 @pytest.mark.slow
 def test_the_unperturbed_pole_moves_on_a_circle():
     solution = run(QUIET, 1.0, 433, epsilon=0.0)
@@ -173,9 +168,6 @@ def test_half_the_disturbance_is_half_the_damping():
     np.testing.assert_allclose(ratio, [-np.pi * 0.1, -np.pi * 0.05], rtol=1e-8)
 
 
-# The driven wobble
-
-
 @pytest.mark.slow
 def test_response_is_the_resonance():
     sigma, omega = 2 * np.pi / 433.0, 2 * np.pi / YEAR
@@ -212,9 +204,6 @@ def test_mean_pole_moves_by_its_drift_in_a_year():
     np.testing.assert_allclose(mean_pole(10 * YEAR, ARGS), wanted, rtol=1e-14)
 
 
-# The map
-
-
 @pytest.mark.slow
 def test_eight_years_are_exact_enough_to_fit():
     assert distance(run(ARGS, 5.0, 584), ARGS) < 0.02 * MAS
@@ -245,9 +234,6 @@ def test_derivatives_by_the_parameters():
         np.testing.assert_allclose(got[name], wanted[name], rtol=0, atol=5e-4 * size)
         along = jnp.tensordot(jnp.arange(1.0, 5.0), wanted[name], 1)
         np.testing.assert_allclose(back[name], along, rtol=0, atol=5e-3 * size)
-
-
-# The start
 
 
 def test_start_is_the_measured_one(measured):

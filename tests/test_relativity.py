@@ -33,9 +33,6 @@ LIGHT = 1e-12  # mass of a planet here: effects of order m/M are then below the 
 TURN = 2 * np.pi
 
 
-# Constants
-
-
 def test_constants_of_the_sun():
     assert abs(SPEED_OF_LIGHT - 173.144633) < 1e-6
     a, e, days = 0.3870983, 0.2056307, 87.9691  # Mercury
@@ -49,8 +46,6 @@ def test_constants_of_the_sun():
     assert np.rad2deg(np.arccos(z)) == pytest.approx(7.25, abs=0.01)
     assert np.rad2deg(np.arctan2(x, -y)) == pytest.approx(75.77, abs=0.05)
 
-
-# The equations of relativity
 
 G = 2.0
 MASSES = np.array([0.6, LIGHT, 3 * LIGHT])
@@ -213,8 +208,6 @@ def test_both_forms_are_one_orbit():
     assert max(own[2], naive[2]) < 1e-11  # Newton
 
 
-# The oblate Sun
-
 OBLATE = dvi.System(hamiltonian_with_oblateness)
 POLE = np.array([0.3, -0.5, 0.8])
 J2_R2 = 1e-4
@@ -306,9 +299,6 @@ def test_a_run_is_differentiable_in_j2():
     assert abs(float(slope)) > 1e-4
 
 
-# The planets
-
-
 @needs_ephemeris
 @pytest.mark.slow
 def test_mercury_follows_the_ephemeris():
@@ -329,9 +319,6 @@ def test_mercury_follows_the_ephemeris():
     assert (errors[[BODIES.index("Mercury"), BODIES.index("Venus")]] < [0.5, 1.5]).all()  # km
     # Negative control: the round Sun lacks 0.025″.
     assert beside(0.0)[0] - slope == pytest.approx(0.0253, abs=1e-3)
-
-
-# Starts that are refused
 
 
 def test_shapes_that_do_not_agree():

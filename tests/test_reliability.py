@@ -23,7 +23,6 @@ SOURCES = [
     p for name in ("dvi_jax", "dvi_jax_cli", "lanewise") for p in (ROOT / name).rglob("*.py")
 ]
 
-# --- data files execute nothing ----------------------------------------------------------------
 
 UNSAFE = {"pickle", "cloudpickle", "dill", "joblib", "marshal", "shelve"}
 """Modules that run what is in a file."""
@@ -98,8 +97,6 @@ def test_a_toml_file_imports_only_from_its_own_folder(tmp_path, where):
     assert not (tmp_path / "own.py.trace").exists()
 
 
-# --- files that are written whole ---------------------------------------------------------------
-
 OLD, NEW = np.arange(5.0), np.arange(50.0)
 
 
@@ -171,9 +168,6 @@ def test_two_writers_of_one_file_never_mix(file):
     assert all(x == values[int(name)].tolist() for name, x in seen)
 
 
-# --- checkpoints of fits ------------------------------------------------------------------------
-
-
 def a_run(file):
     """The part of a fit that writes its checkpoint."""
     problem = SimpleNamespace(size=1, space=SimpleNamespace(to_x=lambda x: x, names=["k"]))
@@ -209,9 +203,6 @@ def test_a_damaged_checkpoint_is_refused_and_stays(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"checkpoint\.npz' is damaged"):
         a_run(file)
     assert file.read_bytes() == damaged
-
-
-# --- the page of the documentation --------------------------------------------------------------
 
 
 def test_every_test_that_the_page_on_reliability_names_exists():

@@ -22,9 +22,6 @@ def weighted(t0, t1, q0, p0, q1, p1, a):
     return a * (p1 @ p1)
 
 
-# --- XLA aborted the process -------------------------------------------------------------------
-
-
 def test_a_swept_argument_that_only_an_observable_uses():
     weights = np.linspace(1.0, 2.0, 6)
     observe = {"drift": dvi.MaxDrift(kinetic), "last": dvi.Last(weighted)}
@@ -46,9 +43,6 @@ def test_an_observable_of_one_trajectory(settings):
     values = np.sum(np.asarray(every.ps[1:]) ** 2, axis=1)
     drift = np.max(np.abs(values - values[0]))
     np.testing.assert_allclose(found.observed, drift, rtol=1e-14)
-
-
-# --- products in another order left the range of the numbers -----------------------------------
 
 
 def final_momenta(system, q, p, args, h, stop=None):
@@ -109,9 +103,6 @@ def test_a_product_that_would_overflow_in_another_order(stop):
         assert np.isinf(np.float32(m) * np.float32(M))
     expected = by_hand(lambda q: -G * M * m * q / np.linalg.norm(q) ** 3, q, p, h, m)
     np.testing.assert_allclose(found, np.tile(expected, (9, 1)), rtol=1e-5)
-
-
-# --- other faults --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("epsilon", [0.1, 0.6])

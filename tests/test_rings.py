@@ -97,9 +97,6 @@ def test_order_of_the_slices(scheme):
     assert np.log2(ratio) == pytest.approx(scheme, abs=0.35)
 
 
-# --- gradients -----------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def cell():
     return rings.Ring(
@@ -167,9 +164,6 @@ def test_gradient_by_epsilon_and_of_the_perturbed_strength(cell):
     assert d_epsilon == pytest.approx(float(central), rel=1e-6)
 
 
-# --- as a system ---------------------------------------------------------------------------------
-
-
 def test_one_turn_is_a_step_of_a_run(cell):
     problem = rings.problem(cell)
     z = particles(1)[0] / 3
@@ -197,9 +191,6 @@ def test_the_hamiltonian_is_that_of_the_bodies():
     out = rings.track(ring, z).z
     np.testing.assert_allclose(sol.qs[-1], out[::2], atol=1e-9)
     np.testing.assert_allclose(sol.ps[-1], out[1::2], atol=1e-9)
-
-
-# --- bad input -----------------------------------------------------------------------------------
 
 
 def turns(ring, size, **options):
@@ -238,9 +229,6 @@ def test_errors(cell, make, kind, message):
 def test_a_ring_needs_double_precision():
     with jax.enable_x64(False), pytest.raises(ValueError, match="a ring needs double precision"):
         rings.Ring([rings.drift("D", 1.0)])
-
-
-# --- pyAT ----------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

@@ -196,9 +196,6 @@ def test_frequency_map_has_the_linear_tunes_and_the_detuning():
     assert (np.asarray(found.diffusion)[:, :2] < -8).all()
 
 
-# --- against pyAT ---------------------------------------------------------------------------------
-
-
 def lattice(name, six=False):
     at = pytest.importorskip("at")
     import machine_data

@@ -67,9 +67,6 @@ def box(n, seed=0, width=0.5):
     return np.random.default_rng(seed).uniform(-width, width, (2, n))
 
 
-# --- Newton's method ---------------------------------------------------------------------------
-
-
 def test_newton_finds_the_root_to_round_off_and_counts():
     root, info = find_root(lambda x: x**3 - 2, jnp.array([1.5]), 2 * ONE, Newton())
     assert abs(float(root[0]) - 2 ** (1 / 3)) < 4e-16
@@ -161,8 +158,6 @@ def test_a_jacobian_without_pivots_is_solved_with_exchanged_rows(strength):
         assert np.all(converged)
         np.testing.assert_allclose(root, np.broadcast_to(expected, root.shape), rtol=1e-15)
 
-
-# --- the same roots ----------------------------------------------------------------------------
 
 GM = np.array([3e-4, 5e-11, 7e-10, 9e-10, 1e-10, 2.8e-7, 8.5e-8, 1.3e-8, 1.5e-8, 2.2e-12])
 DISTANCES = np.array([0, 0.39, 0.72, 1, 1.52, 5.2, 9.5, 19.2, 30.1, 39.5])
@@ -362,9 +357,6 @@ def test_compensated_arithmetic_keeps_its_accuracy():
     assert np.median(np.abs(run(Picard(), dvi.FloatingPoint()) - exact)) > 3 * EPS
 
 
-# --- derivatives -------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("adjoint", [dvi.Direct(), dvi.Reversible(checkpoint_every=5)])
 def test_gradients_are_newtons(adjoint):
@@ -410,9 +402,6 @@ def test_a_derivative_that_picard_cannot_find_is_nan():
     np.testing.assert_allclose(gradient(1.0, MANY), 0.25, rtol=1e-15)
 
 
-# --- without convergence -----------------------------------------------------------------------
-
-
 def strongly_damped(solver, gamma):
     """Pendulums with W = −p: fixed-point iteration multiplies an error by h γ = 0.1 γ."""
     return march(solver, PENDULUMS, *box(6), 0.1, 8, gamma)
@@ -456,9 +445,6 @@ def test_a_trajectory_that_fails_leaves_the_bits_of_others(name, form):
     np.testing.assert_array_equal(good, [True, name != "picard", True, True])
     np.testing.assert_array_equal(qs[jnp.array([0, 2, 3])], calm[jnp.array([0, 2, 3])])
     assert bool(jnp.all(jnp.isnan(qs[1][1:]))) == (name == "picard")
-
-
-# --- batches and machine code ------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -535,9 +521,6 @@ def test_factors_solve(n):
     """Above 64 unknowns by LAPACK's factors."""
     A, b = np.random.default_rng(n).normal(size=(n, n)), np.arange(1.0, n + 1)
     np.testing.assert_allclose(A @ factorise(jnp.asarray(A))(jnp.asarray(b)), b, atol=1e-12 * n)
-
-
-# --- settings ----------------------------------------------------------------------------------
 
 
 @pytest.mark.slow

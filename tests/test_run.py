@@ -64,9 +64,6 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-# What a run writes
-
-
 @pytest.mark.slow
 def test_kepler_example(folder):
     """The files, the report, and the numbers of `dvi.integrate`."""
@@ -157,8 +154,6 @@ def test_the_text_of_a_method_cannot_call_other_functions(tmp_path):
             parse_method(text)
     assert not target.exists()
 
-
-# Rejected input: the key, what was seen, what is allowed
 
 LONG = "a" * 5000
 REJECTED = [

@@ -146,9 +146,6 @@ def test_epsilon_that_is_traced():
     assert largest(slope[0, :, 1]) == 0
 
 
-# --- statuses ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("options", "status", "message"),
     [
@@ -237,8 +234,6 @@ def test_the_keywords_that_are_passed_on_are_known():
             function(HENON.system, HENON.q0, HENON.p0, methd=None)
 
 
-# --- return maps ------------------------------------------------------------------------------
-
 RETURN = return_map(h=0.02, num_steps=400, method=dvi.Yoshida(4))
 
 
@@ -320,9 +315,6 @@ def test_a_map_that_does_not_return():
     assert np.isnan(back.q).all()
     rarely = return_map(num_steps=100, returns=3)
     assert rarely(HENON.q0, HENON.p0).status == "too_few_crossings"
-
-
-# --- bifurcations -----------------------------------------------------------------------------
 
 
 @pytest.mark.slow

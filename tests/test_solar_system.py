@@ -56,9 +56,6 @@ def beside_ephemeris(solution, masses=GM):
     return compare(jd, np.asarray(solution.qs), np.asarray(solution.ps), masses)
 
 
-# The ephemeris
-
-
 def test_dates():
     assert [julian_date(x) for x in ("1900-01-01", "2000-01-01")] == [START, 2451544.5]
     for kind in (float, np.int64, np.float32):
@@ -140,9 +137,6 @@ def test_perihelion_of_a_known_ellipse():
     np.testing.assert_allclose(perihelion_longitude(q, v, mu), node + omega, rtol=0, atol=1e-12)
 
 
-# N bodies
-
-
 def test_bodies_in_one_place_are_not_finite():
     q = np.array([[0.0, 0.0], [0.0, 0.0], [1.0, 0.0]])
     options = {"h": 0.01, "num_steps": 2, "args": {"masses": np.ones(3)}, "throw": False}
@@ -173,9 +167,6 @@ def test_planets_are_named_when_they_coincide(century):
     with pytest.raises(ValueError, match="Venus and Earth–Moon must have"):
         century.check(q, century.p0, century.args)
     check_bodies(century.q0, century.p0, century.args)
-
-
-# Ten years compared with the ephemeris
 
 
 @pytest.mark.slow

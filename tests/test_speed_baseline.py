@@ -163,9 +163,6 @@ def test_the_library_leaves_subnormal_numbers_alone(baseline):
     assert np.float64(2.0**-1040) / np.float64(2.0) == 2.0**-1041
 
 
-# The table
-
-
 def test_the_table_has_every_row_of_the_targets(speed):
     rows = {row.name: row for row in speed.table()}
     for start, count in (

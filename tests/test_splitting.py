@@ -31,9 +31,6 @@ def end(method, h, num_steps, system=SPLIT, eps=1e-3, **options):
     return np.concatenate([sol.qs[-1], sol.ps[-1]])
 
 
-# --- the Kepler flow -----------------------------------------------------------------------------
-
-
 def orbit(eccentricity):
     """A state at the pericentre of an orbit with μ = 1, and the semi-latus rectum 1."""
     q_min = 1 / (1 + eccentricity)
@@ -129,9 +126,6 @@ def test_flows_belong_to_their_hamiltonians(flow):
     of_q, of_p = jax.grad(lambda q, p: flow(0.0, 0.0, q, p, None), argnums=(0, 1))(q, p)
     np.testing.assert_allclose([dq, dp], [of_p, -of_q], atol=1e-14)
     assert np.abs(state(0.0)[0] - Q0).max() == 0
-
-
-# --- schemes -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("orders", [(2, 2), (8, 2), (8, 4), (10, 4), (8, 6, 4), (10, 6, 4)])
@@ -343,8 +337,6 @@ def test_a_flow_of_another_hamiltonian_is_refused():
         with pytest.raises(ValueError, match="flow of part 1 of Split must be that"):
             end(dvi.Splitting(), 0.1, 5, make(wrong), eps=0.1)
 
-
-# --- Wisdom and Holman ---------------------------------------------------------------------------
 
 THREE = systems.n_body(
     masses=[1.0, 1e-3, 3e-4],

@@ -166,9 +166,6 @@ def test_what_does_not_change_numbers_does_not_change_it(what):
     assert differences(a, b) == []
 
 
-# --- results ----------------------------------------------------------------------------------
-
-
 def test_unsigned_integers_and_unknown_names(tmp_path):
     observe = {"count": lambda *a: jnp.uint8(3), "x": dvi.Last(position)}
     found = dvi.sweep(oscillator(), Q, Q, h=0.1, num_steps=2, t0=[0.0, 1.0], observe=observe,
@@ -199,9 +196,6 @@ def test_float32_takes_lists_of_numbers():
         assert found["q"].dtype == np.float32
         with pytest.raises(TypeError, match="float64"):
             dvi.sweep(oscillator(), q, q, h=np.asarray([0.1, 0.05]), **options)
-
-
-# --- file systems ---------------------------------------------------------------------------------
 
 
 def small(path):

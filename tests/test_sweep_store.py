@@ -67,9 +67,6 @@ def flip(path: Path, where: int):
     path.write_bytes(content)
 
 
-# --- contents ---------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_a_store_has_the_bits_of_memory_and_other_programs_read_it(expected, finished):
     found = dvi.open_sweep(finished)
@@ -167,9 +164,6 @@ def test_two_devices_give_the_bits_of_one(tmp_path, expected):
     flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=2"
     assert in_a_process(tmp_path / "s.zarr", XLA_FLAGS=flags)[1] == "2"
     same(dvi.open_sweep(tmp_path / "s.zarr"), expected)
-
-
-# --- damage -----------------------------------------------------------------------------------
 
 
 def flipped(name, where):
@@ -365,9 +359,6 @@ def test_foreign_and_temporary_files(copy):
     assert [file.exists() for file in (old, new, *foreign)] == [False, True, True, True, True]
 
 
-# --- interruptions ----------------------------------------------------------------------------
-
-
 SLOW = [pytest.param(*x, marks=pytest.mark.slow) for x in (("killed", 0, 0), ("full", 8, 0))]
 
 
@@ -420,9 +411,6 @@ def test_a_clock_that_is_set_back_changes_nothing(copy, expected, monkeypatch):
     assert all(r["seconds"] >= 0 for r in dvi.open_sweep(copy).records())
 
 
-# --- paths and permissions --------------------------------------------------------------------
-
-
 def test_missing_permissions(copy, tmp_path, monkeypatch):
     def refuse(*_, **__):
         raise PermissionError(13, "Permission denied")
@@ -466,9 +454,6 @@ def test_claims_exclude_threads_and_end_with_the_context(tmp_path):
         assert (first, again, other) == (True, False, True)
     with claim(file, 3) as later:
         assert later
-
-
-# --- several processes ------------------------------------------------------------------------
 
 
 def child(path, tasks, pause, cache):

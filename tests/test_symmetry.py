@@ -121,9 +121,6 @@ def test_an_unbound_invariant_names_what_it_needs():
         dvi.AdiabaticInvariant([ROTATION, TIME], [None])
 
 
-# --- the balance law -------------------------------------------------------------------------
-
-
 def anharmonic(t0, t1, q0, p1, args):
     return jnp.sum((q0**2 + 1) * (p1**2 + 1)) / 2 + jnp.sin(t0) * q0[0] * p1[1] + t1 * q0[1]
 
@@ -219,9 +216,6 @@ def test_lattice_defect_vanishes_with_h_where_the_printed_signs_do_not():
     assert abs(corrected[2]) < 1e-4 * abs(printed[2])
     assert abs(corrected[0] / corrected[1]) > 50  # O(h²)
     assert abs(printed[2]) > 0.5
-
-
-# --- gauges ----------------------------------------------------------------------------------
 
 
 def square(seed=0, count=120, n=1):

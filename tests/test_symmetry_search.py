@@ -64,8 +64,6 @@ def find(system, basis, order=0, samples=None, **more):
     return dvi.find_symmetries(system, basis, order, **given)
 
 
-# --- the library -----------------------------------------------------------------------------
-
 BODIES = box((2, 2), times=True)
 SHIFTED = library.space_translation([1.0, 2.0]) - 3 * library.rotation(1, 0)
 FLOW = library.hamiltonian_flow(lambda t, q, p, args: (q @ q + p @ p - 0.1 * q @ p) ** 2)
@@ -158,9 +156,6 @@ def test_library_refuses_what_does_not_fit(make, message):
 POINT = dvi.LatticePoint(0.0, np.ones(2), np.ones(2))
 
 
-# --- conformal factors -----------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_pointwise_factor_is_the_constant_one_where_there_is_one():
     samples = box(2)
@@ -236,9 +231,6 @@ def test_pairs_of_points():
         dvi.random_pairs(h=0.1, samples=(q[:1], p[:1]))
     with pytest.raises(ValueError, match="step fails"):
         dvi.solution_pairs(KEPLER.system, h=0.1, samples=(0 * q, p), args=KEPLER.args)
-
-
-# --- the search ------------------------------------------------------------------------------
 
 
 @functools.cache

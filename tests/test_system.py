@@ -84,9 +84,6 @@ def test_methods_of_a_system():
     np.testing.assert_allclose(system.disturbing_force(t, t, q, p, jnp.asarray(0.1), None), [-0.1])
 
 
-# --- checks of arguments -----------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("check", "good", "bad"),
     [
