@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import dvi_jax as dvi
-from dvi_jax import interop, plot, systems
+from dvi_jax import interop, systems
 
 
 def H_D(t0, t1, q0, p1, args):
@@ -108,11 +108,6 @@ def sweep(**how):
     return dvi.sweep(FORCED, Q, P, **({**STEPS, "epsilon": [0.1, 0.2], "progress": False, **how}))
 
 
-def section(**how):
-    start = {"q0": [[1.0]], "p0": [[0.0]], "num_steps": 100, "h": 0.1, "crossings": 1}
-    return dvi.poincare_section(FREE, g=lambda t, q, p, args: q[0], **(start | how))
-
-
 ERRORS = [
     # the state
     (lambda: run(p0=[0.0, 1.0]), r"^ValueError.*same shape.*\(1,\).*\(2,\)"),
@@ -128,13 +123,17 @@ ERRORS = [
     (lambda: dvi.integrate(FREE, [1.0, 0.0], **STEPS), "p0"),
     (lambda: without_x64(lambda: run(q0=np.ones(1), p0=np.ones(1))), "jax_enable_x64"),
     # the system
-    (lambda: dvi.System(H), "dvi.discretise"),
-    (lambda: dvi.discretise(H_D), "\\(t, q, p, args\\)"),
+    (lambda: dvi.System(H), r"^TypeError.*\(t0, t1, q0, p1, args\).*dvi.discretise"),
+    (lambda: dvi.discretise(H_D), r"^TypeError.*\(t, q, p, args\).*dvi.System"),
     (lambda: run(H_D), r"^TypeError.*dvi.System\(H_D"),
     (lambda: run(dvi.System), "dvi.System"),
-    (lambda: dvi.System(3.0), "function"),
-    (lambda: hamiltonian(lambda t0, t1, q0, p1, args: p1**2), "scalar"),
-    (lambda: hamiltonian(lambda t0, t1, q0, p1, args: None), "scalar|None"),
+    *((lambda name=name: dvi.System(**{"H_D": H_D, name: 3.0}),
+     f"^TypeError.*{name} must be a function") for name in ("H_D", "force", "perturbation")),
+    *((lambda name=name: dvi.System(**{"H_D": H_D, name: energy}),
+     f"^TypeError.*{name} must take") for name in ("H_D", "force", "perturbation")),
+    (lambda: hamiltonian(lambda t0, t1, q0, p1, args: p1**2),
+     r"^ValueError.*H_D.*scalar.*shape \(1,\).*jnp.sum"),
+    (lambda: hamiltonian(lambda t0, t1, q0, p1, args: None), "^TypeError.*return"),
     (lambda: hamiltonian(lambda t0, t1, q0, p1, args: (p1 @ p1, 0)), "scalar|tuple"),
     (lambda: hamiltonian(lambda t0, t1, q0, p1, args: p1 @ p1 + q0[2] ** 2), "out of bounds"),
     (lambda: run(dvi.System(H_D, force=lambda t0, t1, q0, p1, args: -p1[1:2]), epsilon=0.1),
@@ -153,9 +152,8 @@ ERRORS = [
      "args|'k'"),
     (lambda: run(args={"a": [bytearray(3)]}), "^TypeError.*args.*bytearray"),
     (lambda: run(args=np.array(["2020-01-01"], "M8[D]")), "^TypeError.*args"),
-    (lambda: dvi.System(H_D, force=lambda t, q, p, args: -q), "t0, t1, q0, p1, args"),
     (lambda: run(dvi.System(H_D, force=lambda t0, t1, q0, p1, args: jnp.ones(2)), epsilon=0.1),
-     "shape"),
+     r"^ValueError.*force.*shape \(1,\).*shape \(2,\)"),
     (lambda: run(dvi.System(H_D, perturbation=lambda t0, t1, q0, p1, args: q0), epsilon=0.1),
      "scalar"),
     (lambda: dvi.discretise(H, order=5), "order"),
@@ -191,17 +189,14 @@ ERRORS = [
     (lambda: run(method="leapfrgo"), "Leapfrog"),
     (lambda: run(method=dvi.Strang), "^TypeError.*parentheses"),
     (lambda: run(method=dvi.Newton()), "method must be"),
-    (lambda: dvi.Yoshida(5), "order"),
-    (lambda: dvi.KahanLi(4), "order|6.*8"),
     (lambda: dvi.GaussLegendre(0), "stages"),
     (lambda: run(integrator=dvi.Strang()), "^TypeError.*dvi.Integrator"),
     (lambda: run(integrator=dvi.Integrator(), method=dvi.Strang()),
      "^ValueError: method and integrator"),
     (lambda: run(newton=dvi.Newton(), root_finder=dvi.Newton()),
      "only one of newton and root_finder"),
-    (lambda: run(root_finder="newton"), "root_finder|newton"),
-    (lambda: run(root_finder=dvi.Newton), "parentheses|dvi.Newton"),
-    (lambda: dvi.Newton(max_steps=0), "max_steps"),
+    (lambda: run(root_finder="newton"), "^TypeError.*instance of dvi.RootSolver, got 'newton'"),
+    (lambda: run(root_finder=dvi.Newton), "^TypeError.*parentheses"),
     (lambda: run(lattice=dvi.Uniform), "parentheses|lattice"),
     (lambda: given(h=0.1), "^ValueError.*Given"),
     (lambda: dvi.Given([0.0, 0.2, 0.1]), "^ValueError.*strictly"),
@@ -264,10 +259,8 @@ ERRORS = [
     (lambda: fit(observed(values=np.full((3, 1), np.nan))), "NaN|missing|observ"),
     (lambda: dvi.Bounds(1.0, 0.0), "Bounds|lower|upper"),
     # other functions
-    (lambda: section(q0=[1.0], p0=[0.0]), "orbits|axis|shape"),
-    (lambda: section(crossings=0), "crossings"),
-    (lambda: plot.orbit(3.0), "Solution|orbit|ts"),
-    (lambda: plot.phase_portrait(run(), dof=3), "dof|3"),
+    (lambda: dvi.poincare_section(FREE, Q, P, lambda t, q, p, args: q[0], h=0.1, num_steps=9),
+     r"q0\[None\], p0\[None\]"),
     (lambda: run(q0=[1.0] * unit()), "unit|interop"),
     (lambda: interop.solve_ivp(FREE, (0.0, 1.0), [1.0, 0.0], h=0.1, rtol=1e-6), "rtol"),
     (lambda: systems.keppler, "keppler"),

@@ -372,6 +372,7 @@ def test_orbits_and_choices_that_do_not_fit_are_named():
         ((states(3, (3, 1), (3, 1), dtype=complex),), {}, "complex", TypeError),
         ((states(3, (3, 1)),), {}, "needs momenta", TypeError),
         (states((3, 1)), {}, "must be a Solution", TypeError),
+        ((3.0,), {}, "must be a Solution", TypeError),
         (([],), {}, "orbits is empty"),
         (([arrays(n=1), two],), {}, r"shapes \[\(1,\), \(2,\)\]"),
         ((arrays(n=7),), {}, r"7 degrees of freedom are too many.*dof=\[0, 1\]"),

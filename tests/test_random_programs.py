@@ -56,6 +56,8 @@ def test_random_programs_agree(tmp_path, seed, count):
 
 
 def test_a_small_program_passes():
+    assert lanewise.generates()
+    assert not jax.config.jax_disable_jit
     assert check(SMALL) == "2 of 2 trajectories, a gradient"
 
 
@@ -126,8 +128,3 @@ def test_a_failure_is_shrunk_to_a_script(tmp_path, monkeypatch, capsys):
     script = (tmp_path / "failure_3_0.py").read_text()
     assert "return p @ p / 2 + " in script
     compile(script, "failure_3_0.py", "exec")
-
-
-def test_code_is_generated_for_these_programs():
-    assert lanewise.generates()
-    assert not jax.config.jax_disable_jit

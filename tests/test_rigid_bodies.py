@@ -117,6 +117,7 @@ def test_the_map_of_a_top_is_symplectic_on_the_manifold():
     assert defect_of_two_form(LAGRANGE.system, LAGRANGE.args, scaled, q, p) > 1e-4
 
 
+@slow
 def test_a_top_converges_to_its_exact_solution():
     """By `Rattle`; the method of order 4: test_library.py."""
     q, _ = jax.jit(LAGRANGE.exact)(1.0, LAGRANGE.q0, LAGRANGE.p0, LAGRANGE.args)

@@ -544,8 +544,3 @@ def test_settings_that_cannot_work_are_rejected():
         PicardThenNewton(newton_up_to=-1)
     with pytest.raises(TypeError, match="picard must be a dvi"):
         PicardThenNewton(picard=Newton())
-    start = {"q0": [0.1, 0.1], "p0": [0.1, 0.1], "h": 0.1, "num_steps": 1}
-    with pytest.raises(TypeError, match=r"instance of dvi.RootSolver, got 'picard'. .*Picard"):
-        dvi.integrate(CHAIN, **start, newton="picard")
-    with pytest.raises(TypeError, match="is a pair of parentheses missing"):
-        dvi.integrate(CHAIN, **start, newton=dvi.Picard)

@@ -44,15 +44,6 @@ def deviation_from_shell(found):
 
 
 @pytest.mark.slow
-def test_ten_thousand_crossings_of_64_orbits():
-    found = section(*starts(64), num_steps=1_600_000, crossings=10_000)
-    assert set(found.status) == {"successful"}
-    assert found.qs.shape == (64, 10_000, 2)
-    assert largest(found.qs[..., 0]) < 1e-12
-    assert deviation_from_shell(found) < 1e-4
-
-
-@pytest.mark.slow
 def test_crossings_of_many_orbits():
     """They lie in the plane to round-off, upwards, on their energy shell; each orbit is that of
     `integrate`; `skip` leaves out the first ones."""
@@ -218,12 +209,6 @@ BAD = {
 def test_invalid_arguments(message):
     with pytest.raises((ValueError, TypeError), match=message):
         BAD[message](*starts(3))
-
-
-def test_the_error_for_a_single_initial_condition_says_how_to_give_it():
-    with pytest.raises(TypeError) as error:
-        section(HENON.q0, HENON.p0)
-    assert "Give a single initial condition as q0[None], p0[None]" in "".join(error.value.__notes__)
 
 
 def test_the_keywords_that_are_passed_on_are_known():
