@@ -179,7 +179,6 @@ def test_balance_closes_for_any_generator_gauge_and_mesh(seed, z):
 @pytest.mark.slow
 def test_every_cause_is_needed_for_the_balance_to_close():
     b, size = balance(*random_case(3, 1))
-    assert np.max(np.abs(b.defect)) <= 1e-12 * size
     for cause in (b.symmetry, b.work, b.lattice):
         assert np.max(np.abs(b.defect + cause)) > 1e-4 * size
 
@@ -232,15 +231,12 @@ def solve(generators, degree, samples=None, h=0.1):
     return dvi.solve_gauge(OSCILLATOR.system, generators, basis, h=h, samples=samples)
 
 
-def test_gauge_of_the_papers_oscillator_is_found():
-    """ξ0 = 1, ξ = q, η = p at ε = 0: G = −pq, so that I = (p² + q²)/2-like (below (32))."""
+def test_gauge_of_the_papers_oscillator_at_order_0_and_none_of_first_order():
+    """ξ0 = 1, ξ = q, η = p at ε = 0: G = −pq, so that I = (p² + q²)/2-like (below (32)). Of (33)
+    with its momentum part identity 0 closes, and identity 1 does not, in any quadratic."""
     found = solve([CLOCKED], 2)
     assert str(found.gauges[0]) == "−q p"
     assert found.residuals[0] < 1e-13
-
-
-def test_no_gauge_makes_34_an_invariant_of_first_order():
-    """(33) with its momentum part: identity 0 closes, identity 1 does not, in any quadratic."""
     found = solve([CLOCKED, CLOCKED], 4)
     assert found.residuals[0] < 1e-12
     assert found.residuals[1] > 1e-2
