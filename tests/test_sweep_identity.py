@@ -225,7 +225,6 @@ def test_links_and_relative_paths(tmp_path, monkeypatch):
         dvi.open_sweep(tmp_path / "there")
 
 
-@pytest.mark.slow
 def test_lengths_without_divisors_do_not_give_tiny_chunks():
     variable = layout.Variable("float64", (30,), ("x",))
     inner = layout.layout((32749,), variable)["chunks"]
