@@ -176,6 +176,7 @@ def test_observables_of_a_sweep_and_of_a_drift_read_the_new_value():
     assert found() == pytest.approx(tuple(3 * x for x in first), rel=1e-12)
 
 
+@pytest.mark.slow
 def test_a_fit_of_a_function_reads_the_new_value():
     mass = {"m": 1.0}
     system = dvi.System(lambda t0, t1, q0, p1, args: spring(args["k"], q0, p1))

@@ -134,7 +134,7 @@ def test_its_flow_is_the_map(H_D, order):
     assert measured_orders(errors, 2, 1e-14)[-1] == pytest.approx(order + 2, abs=0.2)
 
 
-@pytest.mark.parametrize("fraction", [0.0, 0.5])
+@pytest.mark.parametrize("fraction", [0.5, pytest.param(0.0, marks=pytest.mark.slow)])
 def test_time_is_a_coordinate_like_any_other(fraction):
     """H(t, q, p) is p_t + H(q_t, q, p) with t made a coordinate, and so is its shadow."""
 
