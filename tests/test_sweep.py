@@ -383,7 +383,6 @@ VALUE_ERRORS = {
     "two observables": E | {"observe": {"a.b": energy, "a": {"b": energy}}},
     "'a/b' cannot be the name": E | {"observe": {"a/b": energy}},
     r"'\.\./x' cannot be the name": E | {"observe": {"../x": energy}},
-    r"\.\./\.\./x.* cannot be the name": {"args": {"../../x": dvi.Axis("x", X), "k": 1.0}},
     "'component' has the name of another": {"t0": dvi.Axis("component", X), "save": FINAL},
     "'h' has the name of another": STEPS | {"observe": {"h": dvi.Last(energy)}},
     "num_steps must be .* got None": E | {"num_steps": None},

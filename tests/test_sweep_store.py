@@ -438,6 +438,14 @@ def test_paths_that_are_not_a_store(tmp_path):
             use(f"{tmp_path}/{path}")
 
 
+def test_keys_of_args_that_cannot_be_file_names(tmp_path):
+    axes = {name: dvi.Axis("x", [1.0, 2.0]) for name in ("../../x", "k")}
+    with pytest.raises(ValueError, match="cannot be the name of an array"):
+        dvi.sweep(sweep_child.SYSTEM, [0.0], [1.0], args=axes, h=0.1, num_steps=2, epsilon=0.0,
+                  save=dvi.Save(final=True), store=tmp_path / "s.zarr")  # fmt: skip
+    assert not list(tmp_path.iterdir())
+
+
 def test_claims_exclude_threads_and_end_with_the_context(tmp_path):
     file, claim = tmp_path / "claims", claims.claim
     with claim(file, 3) as first, claim(file, 3) as again, claim(file, 4) as other:
