@@ -82,9 +82,6 @@ def test_symmetric_methods_reverse_and_others_do_not(system, method):
     assert measured.claimed or measured.value > 1e-9
 
 
-# --- order conditions --------------------------------------------------------------------------
-
-
 def test_order_conditions_hold_and_the_next_ones_do_not():
     for method in METHODS.values():
         if hasattr(method, "fractions"):
@@ -136,9 +133,6 @@ def test_printed_digits_are_enough_for_a_claim():
     assert yoshida(12).is_symmetric
     with pytest.raises(ValueError, match="conditions of order"):
         yoshida(6)
-
-
-# --- the step ----------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -204,13 +198,10 @@ def test_explicitness_is_read_from_the_system():
         dvi.TypeII().is_explicit(spring)
 
 
-def test_negative_substeps_are_reported():
-    methods = dvi.Strang(), dvi.Yoshida(4), dvi.Composition((1.0,), base=dvi.Yoshida(4))
-    assert [method.has_negative_substeps for method in methods] == [False, True, True]
-
-
 def test_a_substep_backwards_against_strong_dissipation_warns():
     """W = −p, Yoshida(4) goes back by 0.85 h: from εh = 0.3/0.85 on."""
+    methods = dvi.Strang(), dvi.Yoshida(4), dvi.Composition((1.0,), base=dvi.Yoshida(4))
+    assert [method.has_negative_substeps for method in methods] == [False, True, True]
     system = dvi.System(SYSTEMS["pendulum"][0].H_D, force=lambda t0, t1, q, p, args: -p)
     undamped = dvi.System(SYSTEMS["pendulum"][0].H_D)
     q, p, t0, h = jnp.array([0.4]), jnp.array([0.7]), jnp.asarray(0.0), jnp.asarray(0.1)

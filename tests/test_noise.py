@@ -27,6 +27,10 @@ def H_D(t0, t1, q0, p1, args):
     return jnp.sum(p1**2) / 2 + args["k"] * jnp.sum(q0**4) / 4
 
 
+def spring_energy(t0, t1, q0, p1, args):
+    return p1 @ p1 / 2 + q0 @ q0 / 2
+
+
 ARGS = {"k": 1.1, "g": 0.3, "T": 0.2}
 THERMAL = dvi.System(H_D, noise=dvi.Langevin(lambda args: args["g"], lambda args: args["T"]))
 TWISTED = dvi.System(
@@ -45,9 +49,6 @@ def momenta(path, h=0.1, num_steps=8, **more):
     """Of a free particle with unit noise: B itself."""
     run = {"method": dvi.StochasticEuler(), "h": h, "num_steps": num_steps, **more}
     return np.asarray(dvi.integrate(FREE, [0.0], [0.0], path=path, **run).ps[:, 0])
-
-
-# --- paths ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
@@ -144,9 +145,6 @@ def test_a_path_of_diffrax(tree):
     np.testing.assert_allclose(coarse[-1], made.evaluate(0.0, 1.0)[0], atol=1e-12)
 
 
-# --- the same bits --------------------------------------------------------------------------------
-
-
 def test_equal_bits_alone_in_batches_and_after_a_resume():
     keys = jax.random.split(jax.random.key(0), 70)
     many = jax.vmap(lambda key: thermal(dvi.Brownian(key)).qs)
@@ -186,13 +184,16 @@ def test_a_sweep_resumes_with_its_own_seeds_only(tmp_path):
         dvi.sweep(THERMAL, [1.0], [0.2], path=dvi.Axis("seed", np.arange(20) + 1), **store)
 
 
-# --- methods --------------------------------------------------------------------------------------
+OF_ALL = {
+    f"{'Langevin' if system is THERMAL else 'Hamiltonian'} {name}": (system, name)
+    for name in ("BAOAB", "OBABO", "StochasticEuler", "StochasticMidpoint")
+    for system in (THERMAL, TWISTED)[: 1 + name.startswith("S")]
+}
 
-OF_ALL = [
-    *((THERMAL, m) for m in ("BAOAB", "OBABO", "StochasticEuler", "StochasticMidpoint")),
-    *((TWISTED, m) for m in ("StochasticEuler", "StochasticMidpoint")),
-]
-IDS = [f"{'Langevin' if s is THERMAL else 'Hamiltonian'} {m}" for s, m in OF_ALL]
+
+def each(*quick):
+    marks = {True: [], False: pytest.mark.slow}
+    return [pytest.param(*x, id=i, marks=marks[i in quick]) for i, x in OF_ALL.items()]
 
 
 def derivatives(system, method, adjoint):
@@ -207,18 +208,7 @@ def derivatives(system, method, adjoint):
     return loss
 
 
-EACH = [
-    pytest.param(*x, id=i, marks=[] if i in ("Langevin BAOAB", "Hamiltonian StochasticEuler")
-                 else pytest.mark.slow)
-    for x, i in zip(OF_ALL, IDS, strict=True)
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("system", "name"),
-    [x if x.id == "Langevin BAOAB" else pytest.param(*x.values, id=x.id, marks=pytest.mark.slow)
-     for x in EACH],
-)  # fmt: skip
+@pytest.mark.parametrize(("system", "name"), each("Langevin BAOAB"))
 def test_gradients_along_a_path(system, name):
     """Of states rebuilt backwards, and of differences with the same noise."""
     method, v, q0 = getattr(dvi, name)(), jnp.array([1.1, 0.3, 0.2, 0.05]), jnp.array([0.7])
@@ -248,7 +238,7 @@ def one_step(system, method, back=False):
     return step
 
 
-@pytest.mark.parametrize(("system", "name"), EACH)
+@pytest.mark.parametrize(("system", "name"), each("Langevin BAOAB", "Hamiltonian StochasticEuler"))
 def test_inverse_and_area_of_a_step(system, name):
     """Noise Hamiltonians conserve areas, and friction contracts them; splittings by e^{−γh}."""
     method, z = getattr(dvi, name)(), jnp.array([0.7, -0.4])
@@ -332,9 +322,6 @@ def test_compensated_summation_sees_the_whole_momentum():
     np.testing.assert_allclose(other.qs, plain.qs, atol=1e-12)
 
 
-# --- errors ---------------------------------------------------------------------------------------
-
-FEW = {"h": 0.1, "num_steps": 10, "args": ARGS}
 SIGMA_OF_P = dvi.System(H_D, noise=lambda t, q, p, args: p)
 
 
@@ -346,10 +333,7 @@ SIGMA_OF_P = dvi.System(H_D, noise=lambda t, q, p, args: p)
         ({"method": dvi.Strang()}, r"Strang.* is not a method for systems with noise.*BAOAB"),
         ({"method": dvi.Strang(base=dvi.BAOAB())}, "is not a method for systems with noise"),
         ({"system": TWISTED}, "OBABO.* require noise on the momenta.*StochasticMidpoint"),
-        (
-            {"system": SIGMA_OF_P},
-            r"BAOAB\(\) requires noise that does not depend on p.*StochasticMidpoint",
-        ),
+        ({"system": SIGMA_OF_P}, r"BAOAB\(\) requires noise that does not depend on p"),
         ({"lattice": dvi.TimeTransformed(lambda t, q, p, args: 1.0)}, "steps depend on the state"),
         ({"arithmetic": dvi.DoubleDouble()}, "cannot be used with noise.*Compensated"),
         ({"save": dvi.Save(ts=[0.05])}, "need states within a step"),
@@ -369,26 +353,22 @@ def test_what_does_not_fit_is_refused(more, message):
 
 
 def test_other_functions_and_arguments_are_refused():
-    with pytest.raises(ValueError, match="must not have noise"):
-        dvi.drift_order(THERMAL, lambda q, p: q[0], [1.0], [0.0], epsilons=[0.1], **FEW)
-    with pytest.raises(TypeError, match=r"noise must take the arguments"):
-        dvi.System(H_D, noise=lambda q, p: q)
-    with pytest.raises(ValueError, match="substeps must be an integer of at least 1, got 0"):
-        dvi.Brownian(0, substeps=0)
-    with pytest.raises(ValueError, match="must have noise"):
-        dvi.invariant_diffusion(
-            dvi.System(H_D), [1.0], [0.0], invariant=lambda q, p: q[0], h=0.1, num_steps=1
-        )
-
-
-# --- distributions and orders ---------------------------------------------------------------------
+    how = {"invariant": lambda q, p: q[0], "h": 0.1, "num_steps": 10, "args": ARGS}
+    for make, error, message in (
+        (lambda: dvi.drift_order(THERMAL, q0=[1.0], p0=[0.0], epsilons=[0.1], **how), ValueError,
+         "must not have noise"),
+        (lambda: dvi.System(H_D, noise=lambda q, p: q), TypeError, "noise must take the arguments"),
+        (lambda: dvi.Brownian(0, substeps=0), ValueError, "substeps must be .* at least 1, got 0"),
+        (lambda: dvi.invariant_diffusion(dvi.System(H_D), [1.0], [0.0], **how), ValueError,
+         "must have noise"),
+    ):  # fmt: skip
+        with pytest.raises(error, match=message):
+            make()
 
 
 def test_harmonic_oscillator_in_equilibrium():
     """BAOAB has the exact distribution of q for a harmonic force: variance T/k for every h < 2."""
-    spring = dvi.System(
-        lambda t0, t1, q0, p1, args: p1 @ p1 / 2 + q0 @ q0 / 2, noise=dvi.Langevin(1.0, 0.5)
-    )
+    spring = dvi.System(spring_energy, noise=dvi.Langevin(1.0, 0.5))
 
     def last(key):
         sol = dvi.integrate(spring, [0.0], [0.0], h=0.8, num_steps=60, method=dvi.BAOAB(),
@@ -416,6 +396,8 @@ def test_harmonic_oscillator_in_equilibrium():
 def test_strong_order(bench, kind, name, expected, within):
     order, error = bench.strong_order(kind, name, 3000)
     assert order == pytest.approx(expected, abs=within + 2 * error)
+    if (kind, name) == ("h(q, p)", "StochasticEuler"):  # a scheme for the equation of Itô
+        assert bench.strong_order(kind, "Uncorrected", 3000)[0] < 0.5
 
 
 def test_the_wrong_methods_of_the_benchmark_are_other_maps(bench):
@@ -430,12 +412,6 @@ def test_the_wrong_methods_of_the_benchmark_are_other_maps(bench):
         for noise in (dvi.Langevin, bench.Mistaken)
     ]
     assert abs(float(kicks[0][0] - kicks[1][0])) > 1e-4
-
-
-@pytest.mark.slow
-def test_a_scheme_for_the_equation_of_ito_does_not_converge(bench):
-    order, _ = bench.strong_order("h(q, p)", "Uncorrected", 3000)
-    assert order < 0.5
 
 
 @pytest.mark.slow
@@ -466,19 +442,16 @@ def test_canonical_distribution(bench, measure, paths):
     assert abs(temperature / 0.5 - 1) > 0.05
 
 
-# --- diffusion of invariants ----------------------------------------------------------------------
+OF_ENERGY = {"invariant": lambda q, p: (p @ p + q @ q) / 2, "h": 2 * np.pi / 100,
+             "num_steps": 300, "method": dvi.BAOAB()}  # fmt: skip
 
 
 def test_diffusion_of_the_energy_of_an_oscillator():
     """dE = (s²/2) dt + s p dB: A = s²/2, B = s² ⟨p²⟩ = s² E."""
-    system = dvi.System(
-        lambda t0, t1, q0, p1, args: p1 @ p1 / 2 + q0 @ q0 / 2,
-        noise=lambda t, q, p, args: args["s"] * jnp.ones(1),
-    )
+    system = dvi.System(spring_energy, noise=lambda t, q, p, args: args["s"] * jnp.ones(1))
     found = dvi.invariant_diffusion(
-        system, [1.0], [0.0], invariant=lambda q, p: (p @ p + q @ q) / 2, num_paths=4000,
-        h=2 * np.pi / 100, num_steps=300, args={"s": 0.05}, method=dvi.BAOAB(),
-    )  # fmt: skip
+        system, [1.0], [0.0], num_paths=4000, args={"s": 0.05}, **OF_ENERGY
+    )
     assert float(found.predicted_drift) == pytest.approx(0.05**2 / 2, rel=1e-10)
     assert float(found.predicted_diffusion) == pytest.approx(0.05**2 / 2, rel=2e-3)
     assert abs(found.drift - found.predicted_drift) < 3 * found.drift_error
@@ -490,31 +463,24 @@ def test_diffusion_of_the_energy_of_an_oscillator():
 
 def test_drift_of_an_energy_by_friction():
     """Langevin: A = γ (T − ⟨p²⟩), B = 2γT⟨p²⟩."""
-    spring = dvi.System(
-        lambda t0, t1, q0, p1, args: p1 @ p1 / 2 + q0 @ q0 / 2, noise=dvi.Langevin(1e-3, 0.7)
-    )
-    found = dvi.invariant_diffusion(
-        spring, [1.0], [0.0], invariant=lambda q, p: (p @ p + q @ q) / 2, num_paths=10,
-        h=2 * np.pi / 100, num_steps=300, method=dvi.BAOAB(),
-    )  # fmt: skip
+    spring = dvi.System(spring_energy, noise=dvi.Langevin(1e-3, 0.7))
+    found = dvi.invariant_diffusion(spring, [1.0], [0.0], num_paths=10, **OF_ENERGY)
     assert float(found.predicted_drift) == pytest.approx(1e-3 * 0.2, rel=5e-3)
     assert float(found.predicted_diffusion) == pytest.approx(2e-3 * 0.7 * 0.5, rel=2e-3)
 
 
 @pytest.mark.slow
 def test_diffusion_of_a_discovered_invariant_of_first_order():
-    def H(t0, t1, q0, p1, args):
-        return (p1 @ p1 + q0 @ q0) / 2
-
     def quartic(t0, t1, q0, p1, args):
         return jnp.sum(q0**4) / 4
 
     samples = np.random.default_rng(0).uniform(-1, 1, (2, 200, 1))
-    quiet = dvi.System(H, perturbation=quartic)
+    quiet = dvi.System(spring_energy, perturbation=quartic)
     known = dvi.discover_invariants(
         quiet, dvi.Polynomials(4), order=1, h=0.1, samples=samples, method=dvi.Strang()
     )
-    noisy = dvi.System(H, perturbation=quartic, noise=lambda t, q, p, args: 0.02 * jnp.cos(q))
+    cosine = lambda t, q, p, args: 0.02 * jnp.cos(q)  # noqa: E731
+    noisy = dvi.System(spring_energy, perturbation=quartic, noise=cosine)
     found = dvi.invariant_diffusion(
         noisy, [1.0], [0.0], invariant=lambda q, p: known.evaluate(q, p, 0.2)[0], epsilon=0.2,
         h=0.1, num_steps=628, method=dvi.BAOAB(), num_paths=20_000,

@@ -80,21 +80,24 @@ def loss(x, adjoint):
     return sum((i + 1) * jnp.sum(v) for i, v in enumerate(jax.tree.leaves(found)))
 
 
+X = jnp.array([1.0, 1.2, 0.1])
+
+
 def test_gradients_go_through_the_initial_value():
-    x = jnp.array([1.0, 1.2, 0.1])
-    forward = jax.jacfwd(loss)(x, dvi.Direct())
+    both = jax.jit(jax.value_and_grad(lambda x: loss(x, dvi.Reversible())))
+    differences = [(both(X + d)[0] - both(X - d)[0]) / 2e-5 for d in 1e-5 * jnp.eye(3)]
+    np.testing.assert_allclose(both(X)[1], differences, rtol=1e-7)
+
+
+@pytest.mark.slow
+def test_gradients_of_all_adjoints_agree():
+    forward = jax.jacfwd(loss)(X, dvi.Direct())
     for adjoint in (dvi.Reversible(), dvi.Checkpointed()):
-        np.testing.assert_allclose(jax.grad(loss)(x, adjoint), forward, rtol=1e-10)
-    step = 1e-5 * jnp.eye(3)
-    differences = [(loss(x + d, dvi.Direct()) - loss(x - d, dvi.Direct())) / 2e-5 for d in step]
-    np.testing.assert_allclose(forward, differences, rtol=1e-7)
+        np.testing.assert_allclose(jax.grad(loss)(X, adjoint), forward, rtol=1e-10)
 
 
-def test_a_solution_reads_well():
-    text = repr(run(observe=energy))
-    assert "Solution: successful; 12 steps, 13 saved states of shape (1,), t = 0 … 1.2" in text
-    assert "q_final" in text
+def test_a_solution_reads_well(plain):
+    assert "Solution: successful; 12 steps, 13 saved states of shape (1,)" in repr(plain[0])
     batch = jax.vmap(lambda q: run(q, throw=False))(jnp.array([1.0, 0.5]))
     assert "2 trajectories, 2 successful" in repr(batch)
-    assert batch.q_final.shape == (2, 1)
-    assert batch.t_final.shape == (2,)
+    assert (batch.q_final.shape, batch.t_final.shape) == ((2, 1), (2,))

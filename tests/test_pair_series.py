@@ -128,7 +128,7 @@ def test_terms_in_pairs_are_those_of_exact_arithmetic():
     [
         (1e-14, dvi.FloatingPoint(), 1),  # wrong
         (1e-14, dvi.DoubleDouble(), 0),
-        (1e-40, dvi.DoubleDouble(), 1),  # below 31 digits
+        pytest.param(1e-40, dvi.DoubleDouble(), 1, marks=pytest.mark.slow),  # below 31 digits
     ],
 )
 def test_a_tiny_damping_is_seen_in_pairs_and_not_in_float64(rate, arithmetic, count):

@@ -203,9 +203,6 @@ def test_what_is_printed_without_a_terminal(run):
     assert printed.count("100 %") == 12
     assert "hold once corrected" in printed
     assert "verdicts.html" in printed
-
-
-def test_it_is_done_within_a_minute(run):
     # Of CPU time, mostly of one core: 50 s alone, more where the other half of the core is busy.
     assert run[2] < 90
 

@@ -115,14 +115,12 @@ def test_colours_differ_and_shades_grow_lighter_for_all_eyes(sight):
 def test_lines_differ_in_a_black_and_white_print():
     """By dash and marker; dashes of orbits that retrace themselves overlap, and markers do not."""
     assert (np.diff(lab(plot.COLOURS, "normal")[:5, 0]) > 3).all()
-    assert len(set(plot.DASHES)) == len(plot.DASHES) == len(plot.COLOURS)
-    assert len(set(MARKERS)) >= len(plot.COLOURS)
+    assert len(set(plot.DASHES)) == len(plot.DASHES) == len(plot.COLOURS) <= len(set(MARKERS))
     drawing = drawn_lines(plot.phase_portrait(arrays(5), labels=list("abcde")))
-    assert [line.get_color() for line in drawing] == list(plot.COLOURS[:5])
     bodies = drawn_lines(plot.orbit(arrays(n=6, shape=(3, 2))[:2]))
     for some in (drawing, bodies):
-        assert len({line.get_marker() for line in some}) == len(some)
-        assert len({tuple(line.get_markevery()) for line in some}) == len(some)
+        for kind in ("color", "marker", "markevery"):
+            assert len({str(getattr(line, f"get_{kind}")()) for line in some}) == len(some)
 
 
 def test_marks_are_far_apart_where_an_orbit_retraces_itself():
@@ -137,23 +135,16 @@ def test_marks_are_far_apart_where_an_orbit_retraces_itself():
 
 
 def test_pictures_have_the_style_and_leave_the_settings_of_the_user():
+    """Interactive mode too, which in Jupyter the first figure turns on, perhaps in the style."""
     assert not plot.phase_portrait(arrays()).spines["top"].get_visible()
     assert plt.rcParams["axes.spines.top"]
     with plot.style(), mpl.rc_context({"axes.labelsize": 21}):
         assert plot.phase_portrait(arrays()).xaxis.label.get_size() == 21
-
-
-def test_a_backend_that_a_first_figure_makes_interactive_stays_so():
-    """In Jupyter the first figure turns interactive mode on, perhaps inside of the style."""
-    before = mpl.is_interactive()
-    try:
-        for value in (True, False):
-            mpl.interactive(not value)
-            with plot.style():
-                mpl.interactive(value)
-            assert mpl.is_interactive() is value
-    finally:
-        mpl.interactive(before)
+    for value in (True, False):
+        mpl.interactive(not value)
+        with plot.style():
+            mpl.interactive(value)
+        assert mpl.is_interactive() is value
 
 
 def test_save_takes_what_the_pictures_return(tmp_path):
@@ -265,17 +256,15 @@ def test_every_picture_draws_on_the_axes_it_is_given_and_on_nothing_else(single)
 
 def test_unknown_keywords_are_rejected_with_those_that_there_are():
     t = np.arange(3.0)
-    options = "labels, colour, colour_label, units, title, ax"
     for draw, args, wrong, known in (
-        (plot.phase_portrait, (arrays(),), "color", options),
-        (plot.invariants, (t, {"a": 1 + t}), "label", options),
-        (plot.bifurcation, (t, np.ones((3, 2))), "labels", "units, title, ax"),
-        (plot.animate, (arrays(), "a.gif"), "colour", "labels, units, title"),
+        (plot.phase_portrait, (arrays(),), "color", "'color'. Allowed are labels, colour"),
+        (plot.invariants, (t, {"a": 1 + t}), "label", "'label'. Allowed are labels"),
+        (plot.bifurcation, (t, np.ones((3, 2))), "labels", "Allowed are units"),
+        (plot.animate, (arrays(), "a.gif"), "colour", "Allowed are labels"),
+        (plot.sweep_map, (xr.DataArray(t),), "facets", "Did you mean 'facet'"),
+        (plot.failure_map, (xr.DataArray(t),), "limits", "'limits'"),
     ):
-        refuses(draw, (args, {wrong: 1}, f"'{wrong}'. Allowed are {known}", TypeError))
-    case = (xr.DataArray(t),), {"facets": "x"}, "'facets'. Did you mean 'facet'", TypeError
-    refuses(plot.sweep_map, case)
-    refuses(plot.failure_map, ((xr.DataArray(t),), {"limits": (0, 1)}, "'limits'", TypeError))
+        refuses(draw, (args, {wrong: 1}, known, TypeError))
 
 
 def test_a_phase_portrait_draws_the_states_as_they_are(single):
@@ -283,7 +272,7 @@ def test_a_phase_portrait_draws_the_states_as_they_are(single):
     assert axes.shape == (2,)
     for i, axis in enumerate(axes):
         same(lines(axis)[0], [single.qs[:, i], single.ps[:, i]])
-    assert (axes[1].get_xlabel(), axes[1].get_ylabel()) == ("q$_{2}$ [au]", "p$_{2}$ [au/d]")
+    assert axes[1].get_ylabel() == "p$_{2}$ [au/d]"
     same(marked(axes[0], "o")[0], [[single.qs[0, 0], single.ps[0, 0]]])
     ts, q, p = arrays()
     (line,) = lines(plot.phase_portrait((ts, q[:, 0], p[:, 0])))  # a state that is one number
@@ -318,8 +307,6 @@ def test_orbits_are_coloured_by_a_value_and_the_unknown_is_grey():
     axis = plot.phase_portrait(arrays(3), colour=[1.0, np.nan, 3.0], colour_label="MEGNO")
     shown = [to_hex(line.get_color()) for line in drawn_lines(axis)]
     assert shown == [to_hex(SHADES(0.0)), "#b8b8b8", to_hex(SHADES(1.0))]
-    (bar,) = [a for a in axis.figure.axes if a is not axis]
-    assert (bar.get_ylabel(), bar.get_ylim()) == ("MEGNO", (1.0, 3.0))
     assert "1 of 3 orbits have no value" in legend(axis)
 
 
@@ -347,7 +334,6 @@ def test_orbits_have_one_scale_in_the_plane_and_in_space(single):
     axis = plot.orbit(single, centre=[0.5, 0.0])
     same(lines(axis)[0], single.qs.T)
     assert axis.get_aspect() == 1
-    same(marked(axis, "*"), [[[0.5, 0.0]]])
     t = np.linspace(0, 20, 200)
     qs = np.stack([np.cos(t), np.sin(t), t], 1)
     space = plot.orbit((t, qs))
@@ -383,18 +369,16 @@ def test_orbits_and_choices_that_do_not_fit_are_named():
         plot.phase_portrait,
         ((states(5, (4, 2), (4, 2)),), {}, r"ts of shape \(5,\), qs of shape \(4, 2\)"),
         ((states(5, (5, 2), (5, 3)),), {}, r"qs of .*\(5, 2\), ps of .*\(5, 3\)"),
-        ((states((), 2, 2),), {}, r"ts of shape \(\), qs of shape \(2,\)"),
         ((states(3, (3, 1), (3, 1), dtype=complex),), {}, "complex", TypeError),
         ((states(3, (3, 1)),), {}, "needs momenta", TypeError),
         (states((3, 1)), {}, "must be a Solution", TypeError),
+        ((3.0,), {}, "must be a Solution", TypeError),
         (([],), {}, "orbits is empty"),
         (([arrays(n=1), two],), {}, r"shapes \[\(1,\), \(2,\)\]"),
         ((arrays(n=7),), {}, r"7 degrees of freedom are too many.*dof=\[0, 1\]"),
         ((two,), {"dof": 2}, "dof must be a number from 0 to 1 .*, got 2"),
-        ((two,), {"dof": "q"}, "dof must be a number .*, got 'q'"),
         ((two,), {"dof": []}, "dof is empty"),
         ((two,), {"labels": ["a", "b"]}, r"1 names .* got \['a', 'b'\]"),
-        ((two,), {"labels": "ab"}, "1 names .* got 'ab'"),
         ((bodies,), {"dof": 0}, "a tuple of 2 numbers"),
         ((two,), {"period": 0}, "period must be a positive"),
         ((arrays(3),), {"colour": [1, 2]}, r"shape \(3,\); got colour of shape \(2,\)"),
@@ -404,9 +388,7 @@ def test_orbits_and_choices_that_do_not_fit_are_named():
         plot.orbit,
         ((arrays(n=1),), {}, "use phase_portrait"),
         ((arrays(n=4),), {}, r"coordinates=\(0, 1\)"),
-        ((two,), {"coordinates": (0, 2)}, "from 0 to 1"),
         ((two,), {"coordinates": (0,)}, "two or three"),
-        ((two,), {"centre": 0}, "centre must be a point of"),
         ((two,), {"centre": [1.0]}, r"shape \(2,\)"),
         ((two,), {"colour": [1.0]}, "several orbits"),
         ((bodies,), {"bodies": [3]}, "from 0 to 2"),
@@ -418,16 +400,15 @@ def test_orbits_and_choices_that_do_not_fit_are_named():
 def test_a_trajectory_is_drawn_as_its_shape_suggests(single):
     assert plot.trajectory(arrays()).get_xlabel() == "q"
     same(lines(plot.trajectory(single))[0], single.qs.T)
-    axis = plot.trajectory(*arrays(n=4), time="t [s]", position="m")
-    assert len(lines(axis)) == 4
-    assert (axis.get_xlabel(), axis.get_ylabel()) == ("t [s]", "q [m]")
+    assert len(lines(plot.trajectory(*arrays(n=4), time="t [s]", position="m"))) == 4
     refuses(plot.trajectory, ((arrays(2),), {}, "a single orbit, got 2"))
 
 
 def test_a_long_line_is_drawn_whole_in_pieces():
-    drawn = lines(plot.phase_portrait(arrays(steps=50_001)))
-    assert [xy.shape[1] for xy in drawn] == [20_001, 20_001, 10_001]
-    same(drawn[1][:, 0], drawn[0][:, -1])
+    orbit = arrays(steps=50_001)
+    first, *rest = lines(plot.phase_portrait(orbit))
+    whole = np.concatenate([first, *(piece[:, 1:] for piece in rest)], axis=1)
+    same(whole, [orbit[1][:, 0], orbit[2][:, 0]])
 
 
 def test_invariants_are_changes_since_the_first_value(single):
@@ -439,7 +420,6 @@ def test_invariants_are_changes_since_the_first_value(single):
     t, change = lines(axis)[0]
     same(t, single.ts[1:])
     close(change, (E - E[0]) / abs(E[0]), atol=1e-15)
-    assert axes[-1].get_xlabel() == "time t [d]"
 
 
 def test_functions_of_the_state_begin_at_the_initial_condition(good):
@@ -447,7 +427,6 @@ def test_functions_of_the_state_begin_at_the_initial_condition(good):
         return q[0] * p[1] - q[1] * p[0]
 
     axis = plot.invariants(good, {"L": L}, change="absolute", units={"L": "J s"})
-    assert axis.get_ylabel() == "L\nchange [J s]"
     for k, (t, change) in enumerate(lines(axis)):
         values = L(good.qs[k].T, good.ps[k].T)
         same(t, good.ts[k])
@@ -532,7 +511,7 @@ def test_the_balance_is_a_stack_whose_ends_add_up_to_the_drift():
     assert len({c.get_hatch() for c in top.collections}) == 3  # seen without colours
     parts = dict(zip(("symmetry", "work", "lattice"), causes.values(), strict=True))
     top, _ = plot.balance(SimpleNamespace(ts=t, drift=drift, **parts))
-    assert legend(top) == ["symmetry", "work", "lattice", "drift"]
+    same(top.lines[0].get_ydata(), drift)
     refuses(
         plot.balance,
         ((t, drift, {"a": np.ones(3)}), {}, r"a of shape \(3,\)"),
@@ -572,10 +551,7 @@ def test_indicators_are_drawn_with_their_value_for_regular_motion():
 def test_indicators_of_runs_backward_are_drawn_at_the_time_since_the_start():
     t = -np.geomspace(1, 1e3, 40)
     for ts, options in ((t, {}), (np.r_[5, 5 + t], {}), (5 + t, {"t0": 5.0})):
-        axis = plot.indicator(ts, 2 + 0 * t, "megno", **options)
-        close(lines(axis)[0][0], -t)
-        assert axis.get_xlabel() == "time since the start |t − t$_0$|"
-    assert plot.indicator(-t, 2 + 0 * t, "megno").get_xlabel() == "time t"
+        close(lines(plot.indicator(ts, 2 + 0 * t, "megno", **options))[0][0], -t)
 
 
 def test_indicators_count_values_without_a_place_each_by_its_reason():
@@ -609,7 +585,6 @@ def test_a_section_draws_every_crossing_once(batch):
     finite = np.isfinite(np.asarray(section.ts))
     assert finite.sum() > 0
     same(offsets(axis), np.stack([section.ps[finite][:, 0], section.qs[finite][:, 1]], 1))
-    assert (axis.get_xlabel(), axis.get_ylabel()) == ("p$_{1}$", "q$_{2}$")
     assert "1 of 3 orbits failed: not finite" in legend(axis)
 
 
@@ -677,7 +652,6 @@ def test_sections_are_coloured_by_orbit_or_by_value():
     (cloud,) = axis.collections
     shades = [to_hex(c) for c in cloud.get_facecolors()]
     assert shades == [to_hex(SHADES(0.0))] * 5 + ["#b8b8b8"] * 2 + [to_hex(SHADES(1.0))] * 4
-    assert axis.figure.axes[1].get_ylim() == (2, 4)
     assert "1 of 3 orbits have no value" in legend(axis)
 
 
@@ -691,13 +665,11 @@ def test_sections_take_functions_of_the_state():
     q, p = (x[np.isfinite(made.ts)] for x in (made.qs, made.ps))
     angle = np.arctan2(p[:, 0], q[:, 0])
     close(offsets(axis), np.stack([(np.sum(q**2, 1) + np.sum(p**2, 1)) / 2, angle], 1))
-    assert (axis.get_xlabel(), axis.get_ylabel()) == ("action", "")
     nothing, several = SimpleNamespace(ts=1, qs=1, ps=1, observed={}), [made] * 2
     refuses(
         plot.section,
         ((made,), {"x": "q[2]"}, "the index in 'q.2.' must be a number from 0 to 1"),
         ((made,), {"x": "r[0]"}, r'such as "q\[0\]"'),
-        ((made,), {"x": "q"}, r'such as "q\[0\]"'),
         ((made,), {"colour": [1.0]}, r"colour of shape \(1,\)"),
         ((made,), {"labels": ["a"]}, "2 names of the orbits"),
         *(((x,), {}, "one dvi.Section", TypeError) for x in (np.ones((3, 2)), nothing, several)),
@@ -710,7 +682,6 @@ def test_a_bifurcation_has_a_column_of_points_for_each_parameter():
     drawn = offsets(axis)
     close(drawn[:, 0], [0.1] * 4 + [0.3] * 2)
     same(drawn[:4, 1], made.qs[0, 1:, 0])
-    assert (axis.get_xlabel(), axis.get_ylabel()) == ("ε [1]", "q [m]")
     assert legend(axis) == ["1 of 3 runs have no crossing after the first 1"]
     numbers = plot.bifurcation([1, 10], np.ones((2, 4)), log=True, y="x [m]")
     assert (numbers.get_xscale(), legend(numbers)) == ("log", [])
@@ -765,7 +736,7 @@ def test_work_precision_finds_the_front_and_marks_runs_without_a_place():
     )
 
 
-def test_drifts_that_failed_or_are_0_keep_their_place_and_slopes_have_two_digits():
+def test_drifts_that_failed_or_are_0_keep_their_place():
     order = SimpleNamespace(
         epsilons=np.array([0.1, 0.2, 0.4, 0.8]), drifts=np.array([0.0, 0.1, np.nan, 0.3]),
         used=np.array([False, True, False, True]), slope=1.0, interval=(0.9, 1.1), floor=0.0,
@@ -779,8 +750,6 @@ def test_drifts_that_failed_or_are_0_keep_their_place_and_slopes_have_two_digits
     whole = legend(plot.drift_orders({"a": order}, promised=1))
     assert whole[0] == "a: slope 1.00 ± 0.10, expected 1"
     assert not any("drifts" in text for text in whole)
-    order.interval = (0.9999, 1.0001)
-    assert legend(plot.drift_orders({"a": order}))[0] == "a: slope 1.00"
 
 
 def test_a_spectrum_draws_sizes_at_their_frequencies():
@@ -824,23 +793,17 @@ def test_frequencies_are_drawn_against_each_other_or_their_diffusion_over_a_grid
 
 
 @pytest.mark.parametrize(
-    ("x", "y", "k", "edge"),
-    [
-        ((1, 3), (0.5, 2), (1, -1), "top"),
-        ((1, 2), (0.5, 3), (1, -1), "right"),
-        ((-2, 0), (1, 3), (1, 1), "left"),  # and at the bottom
-    ],
-)
-def test_a_resonance_has_its_name_where_its_line_leaves_the_picture(x, y, k, edge):
+    ("x", "y", "k"), [((1, 3), (0.5, 2), (1, -1)), ((1, 2), (0.5, 3), (1, -1)),
+                      ((-2, 0), (1, 3), (1, 1))],
+)  # fmt: skip
+def test_a_resonance_has_its_name_where_its_line_leaves_the_picture(x, y, k):
     axis = plot.frequency_map(np.asarray(x), np.asarray(y), resonances=[k])
     (name,) = axis.texts
+    assert np.dot(k, name.xy) == pytest.approx(0, abs=1e-12)
     (left, right), (low, high) = axis.get_xlim(), axis.get_ylim()
-    at_x, at_y = name.xy
-    assert k[0] * at_x + k[1] * at_y == pytest.approx(0, abs=1e-12)
-    place, border = {"top": (at_y, high), "right": (at_x, right), "left": (at_x, left)}[edge]
-    assert place == pytest.approx(border)
-    assert left <= at_x <= right
-    assert low <= at_y <= high
+    fractions = np.divide(np.subtract(name.xy, (left, low)), (right - left, high - low))
+    assert (np.abs(fractions - 0.5) < 0.5 + 1e-9).all()
+    assert np.max(np.abs(fractions - 0.5)) == pytest.approx(0.5)
 
 
 def frames(path):
@@ -879,20 +842,14 @@ def test_a_film_names_all_its_orbits_and_counts_those_that_failed(tmp_path, monk
     q = q.copy()
     q[3, 20:] = np.nan
     figures = []
-
-    def write(scene, part, seconds, progress):
-        figures.append(scene.axis.figure)
-        part.write_bytes(b"")
-
-    monkeypatch.setattr(films, "write_gif", write)
+    monkeypatch.setattr(films, "write_gif", lambda scene, part, *_: (
+        figures.append(scene.axis.figure), part.write_bytes(b"")))  # fmt: skip
     names = [f"orbit with a long name {k}" for k in range(8)]
     plot.animate((ts, q, p), tmp_path / "a.gif", labels=names, size=(5, 5), dpi=60)
-    (figure,) = figures
-    (box,) = figure.legends
-    labels = [text.get_text() for text in box.get_texts()]
-    assert labels == [*names, "1 of 8 orbits failed: not finite"]
-    figure.canvas.draw()
-    assert all(lies_within(text, figure) for text in box.get_texts())
+    (box,) = figures[0].legends
+    assert legend(figures[0].axes[0]) == [*names, "1 of 8 orbits failed: not finite"]
+    figures[0].canvas.draw()
+    assert all(lies_within(text, figures[0]) for text in box.get_texts())
 
 
 def test_a_film_shows_times_that_are_evenly_spaced(tmp_path):
@@ -932,7 +889,6 @@ def test_films_that_cannot_be_made_leave_nothing_behind(tmp_path, monkeypatch):
         (orbit, "a.avi", {}, "one of '.gif', '.mp4', got '.avi'"),
         (orbit, "a.gif", {"fps": 60}, "at most 50"),
         (orbit, "a.gif", {"seconds": 0}, "seconds must be a positive and finite"),
-        (orbit, "a.gif", {"fps": float("nan")}, "fps must be"),
         (orbit, "a.gif", {"tail": 2}, "a fraction from 0 to 1, got 2"),
         (orbit, "a.gif", {"beside": "energy"}, "one of None, 'phase_portrait', 'invariants'"),
         (orbit, "none/a.gif", {}, "path must lie in an existing folder, got"),

@@ -1,9 +1,11 @@
 """Which progress of a long call is shown, and where."""
 
-import warnings
 from contextlib import contextmanager
+from importlib.util import find_spec
 
 import pytest
+from rich.console import Console
+from rich.progress import Progress
 
 from dvi_jax.base import progress as _progress
 
@@ -42,15 +44,9 @@ def test_a_notebook_without_widgets(monkeypatch, widgets, by_itself, with_true):
         assert (show and show[1].is_jupyter) is expected
 
 
+@pytest.mark.skipif(find_spec("ipywidgets") is not None, reason="ipywidgets is installed")
 def test_rich_does_warn_without_widgets():
     """The control of the test above."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    if _progress.find_spec("ipywidgets") is not None:
-        pytest.skip("ipywidgets is installed")
-    with warnings.catch_warnings(record=True) as seen:
-        warnings.simplefilter("always")
-        with Progress(console=Console(force_jupyter=True)) as progress:
-            progress.add_task("x")
-    assert any("ipywidgets" in str(w.message) for w in seen)
+    shown = Progress(console=Console(force_jupyter=True))
+    with pytest.warns(UserWarning, match="ipywidgets"), shown:
+        shown.add_task("x")

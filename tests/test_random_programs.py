@@ -46,7 +46,7 @@ def searched(tmp_path, count, seed):
 
 @pytest.mark.parametrize(
     ("seed", "count"),
-    [(20, 4), *(pytest.param(*pair, marks=pytest.mark.slow) for pair in [(24, 16), (100, 70)])],
+    [(20, 3), *(pytest.param(*pair, marks=pytest.mark.slow) for pair in [(24, 16), (100, 70)])],
 )
 def test_random_programs_agree(tmp_path, seed, count):
     checked = searched(tmp_path, count, seed)
@@ -56,6 +56,8 @@ def test_random_programs_agree(tmp_path, seed, count):
 
 
 def test_a_small_program_passes():
+    assert lanewise.generates()
+    assert not jax.config.jax_disable_jit
     assert check(SMALL) == "2 of 2 trajectories, a gradient"
 
 
@@ -67,16 +69,12 @@ SIGN = "(1 if form == 'auto' else -1)"
     [
         ("SYSTEM,", "dvi.System(lambda *at: H(*at) * (1 + 1e-11 * (form == 'auto'))),", "numbers"),
         ("SYSTEM, q,", "SYSTEM, q + (0.0 if form == 'auto' else jnp.nan),", "status"),
-        *(
-            pytest.param("h=0.1", f"h=0.1, {new}", message, marks=pytest.mark.slow)
-            for new, message in [
-                (f"stop=dvi.Stop(lambda t, q, p, a: t - 4.5 + 4.35 * {SIGN})", "status"),
-                (f"observe=lambda *a: {SIGN} / (a[3][0] * 0)", "infinities"),
-                ("observe=lambda t0, t1, q0, p0, q, p, a: bent(q[0])", "gradient"),
-            ]
-        ),
+        *(pytest.param("h=0.1", f"h=0.1, {new}", message, marks=pytest.mark.slow) for new,
+            message in [(f"stop=dvi.Stop(lambda t, q, p, a: t - 4.5 + 4.35 * {SIGN})", "status"),
+            (f"observe=lambda *a: {SIGN} / (a[3][0] * 0)", "infinities"),
+            ("observe=lambda t0, t1, q0, p0, q, p, a: bent(q[0])", "gradient")]),
     ],
-)
+)  # fmt: skip
 def test_differences_are_found(old, new, message):
     """Controls: a map that differs between machine code and arrays, and a wrong derivative."""
     with pytest.raises(AssertionError, match=message):
@@ -130,8 +128,3 @@ def test_a_failure_is_shrunk_to_a_script(tmp_path, monkeypatch, capsys):
     script = (tmp_path / "failure_3_0.py").read_text()
     assert "return p @ p / 2 + " in script
     compile(script, "failure_3_0.py", "exec")
-
-
-def test_code_is_generated_for_these_programs():
-    assert lanewise.generates()
-    assert not jax.config.jax_disable_jit

@@ -62,14 +62,10 @@ def test_readme_answers_the_first_questions_early():
 
 
 @pytest.mark.slow
-def test_the_page_on_sweeps_runs(tmp_path):
+def test_the_pages_on_sweeps_and_fitting_run(tmp_path):
     (block,) = blocks(README.parent / "docs" / "sweeps.md")
     printed = output_of(block + "\nprint(result.status_counts())", tmp_path)
     assert printed == ["{'successful': 12000}"]
-
-
-@pytest.mark.slow
-def test_the_page_on_fitting_runs(tmp_path):
     block = blocks(README.parent / "docs" / "fitting.md")[0]
     code = block + "\nprint(found.status, abs(float(found.params['epsilon']) - 0.02))"
     status, distance = output_of(code, tmp_path)[-1].split()

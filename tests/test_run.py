@@ -52,6 +52,8 @@ STATE = "[state]\nq0 = [1.0]\np0 = [0.0]\n"
 SPRING = 'system = "own.py:system"\nsteps = 5\n'
 FULL = f"steps = 5\nh = 0.1\n{STATE}[args]\nk = 1.0"
 N_BODY = 'system = "n_body"\nsteps = 5\n'
+CHAOS = 'system = "henon_heiles"\nh = 0.05\nmethod = "Strang"\nsteps = 2000\n[observables]\n'
+BAD_INDICATORS = "MEGNO(energy)", "GALI(1)", "GALI(", "MEGNOO()", "MEGNO() + SALI()", "MEGNO()(3)"
 
 
 @pytest.fixture
@@ -62,9 +64,6 @@ def folder(tmp_path, monkeypatch):
     write(tmp_path, "import sys\nsys.exit(0)\n", "leaves.py")
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-# What a run writes
 
 
 @pytest.mark.slow
@@ -134,31 +133,22 @@ def test_given_times_and_parameters(folder):
         np.testing.assert_array_equal(saved["ts"], times)
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
+def test_methods_are_read_and_their_text_cannot_call_other_functions(tmp_path):
+    for text, expected in (
         ("TypeII", dvi.TypeII()),
         (" Strang() ", dvi.Strang()),
-        ("Yoshida(4)", dvi.Yoshida(4)),
         ("Yoshida(order=4)", dvi.Yoshida(4)),
         ("Adjoint(Adjoint(Strang()))", dvi.Adjoint(dvi.Adjoint(dvi.Strang()))),
         ("Composition([0.5, 0.5], order=2)", dvi.Composition([0.5, 0.5], order=2)),
         ("Composition([-1.0, 2.0])", dvi.Composition([-1.0, 2.0])),
-    ],
-)
-def test_methods_are_read(text, expected):
-    assert parse_method(text) == expected
-
-
-def test_the_text_of_a_method_cannot_call_other_functions(tmp_path):
+    ):
+        assert parse_method(text) == expected
     target = tmp_path / "made"
     for text in (f"open('{target}', 'w')", f"Yoshida(open('{target}', 'w'))", "Strang().order"):
         with pytest.raises(InputError):
             parse_method(text)
     assert not target.exists()
 
-
-# Rejected input: the key, what was seen, what is allowed
 
 LONG = "a" * 5000
 REJECTED = [
@@ -210,13 +200,11 @@ REJECTED = [
     ('system = "own.py:forced"\n' + FULL, "epsilon: the key is missing", "a force"),
     ('system = "own.py:forced"\nepsilon = 0.1\n' + FULL, "of if (own.py, line 25)", "fit"),
     ('system = "own.py:numbered"\nepsilon = 0.1\n' + FULL, "of if (own.py, line 28)", "fit"),
-    (
-        N_BODY + "[state]\nq0 = [[0, 0], [0, 0], [1, 1]]",
-        "body 1 must have different",
-        "start",
-    ),
+    (N_BODY + "[state]\nq0 = [[0, 0], [0, 0], [1, 1]]", "body 1 must have different", "start"),
     (N_BODY + "[args]\nmasses = [1, 0, 1]", "mass of body 1 must be positive", "start"),
-]
+    *((f'{CHAOS}x = "{x}"\n', "observables.x: ", "MEGNO") for x in BAD_INDICATORS),
+    (f'{CHAOS}x = "MEGNO"\n', "observables.x: ", "MEGNO()"),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("text", "seen", "allowed"), REJECTED)
@@ -251,17 +239,14 @@ def test_all_wrong_keys_of_a_file_are_named(folder):
     assert command("run", many).stderr.rstrip().endswith("… and 12 more")
 
 
-@pytest.mark.parametrize(
-    ("date", "steps", "seen"),
-    [
+def test_dates_outside_the_ephemeris(folder):
+    pytest.importorskip("jplephem")
+    for date, steps, seen in (
         ("1850-01-01", 5, "1899-07-29 to 2053-10-09"),
         ("2053-10-01", 10_000, "the run ends 312.5 days after"),
-    ],
-)
-def test_dates_outside_the_ephemeris(folder, date, steps, seen):
-    pytest.importorskip("jplephem")
-    text = f'system = "solar_system"\nsteps = {steps}\n[state]\ndate = "{date}"\n'
-    refuses(command("run", write(folder, text)), seen)
+    ):
+        text = f'system = "solar_system"\nsteps = {steps}\n[state]\ndate = "{date}"\n'
+        refuses(command("run", write(folder, text)), seen)
 
 
 def test_results_are_not_overwritten(folder):
@@ -346,9 +331,6 @@ def test_solar_system_example(folder):
         assert (out / name).stat().st_size > 10_000
 
 
-CHAOS = 'system = "henon_heiles"\nh = 0.05\nmethod = "Strang"\nsteps = 2000\n[observables]\n'
-
-
 @pytest.mark.slow
 def test_indicators_of_chaos(folder):
     text = CHAOS + 'megno = "MEGNO()"\nl = "LyapunovSpectrum(2, seed=3)"\ng = "GALI(3)"\n'
@@ -361,16 +343,6 @@ def test_indicators_of_chaos(folder):
     assert 0 < results["megno"]["value"] < 3
 
 
-@pytest.mark.parametrize(
-    "text",
-    ["MEGNO(energy)", "GALI(1)", "GALI(", "MEGNOO()", "MEGNO() + SALI()", "MEGNO()(3)", "MEGNO"],
-)
-def test_bad_indicators_of_chaos(folder, text):
-    """They follow no observable, and need their parentheses."""
-    result = command("run", write(folder, f'{CHAOS}x = "{text}"\n'))
-    refuses(result, "observables.x: ", "MEGNO()" if text == "MEGNO" else "MEGNO")
-
-
 def test_systems_are_listed_and_described():
     result = command("systems")
     assert all(name in result.output for name in systems.LIBRARY)
@@ -379,8 +351,8 @@ def test_systems_are_listed_and_described():
         assert word in result.output
     _, tables = library_tables("magnetic_mirror")  # a terminal folds its lines
     kinds = {row[0]: row[1] for row in tables[1].rows}
-    assert kinds["corrected_moment"] == "adiabatic: oscillates by gyroradius over ℓ to power 2"
-    assert kinds["energy"] == "conserved by the unperturbed flow"
+    assert kinds["corrected_moment"].startswith("adiabatic")
+    assert kinds["energy"].startswith("conserved")
     refuses(command("systems", "magnetic_miror"), "NAME: ", "did you mean magnetic_mirror?")
 
 

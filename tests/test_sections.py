@@ -9,7 +9,6 @@ from scipy.integrate import solve_ivp
 
 import dvi_jax as dvi
 from dvi_jax import systems
-from dvi_jax.base.checks import argument_names
 from dvi_jax.systems.henon_heiles import hamiltonian
 
 HENON, SPRING = systems.henon_heiles(), systems.oscillator().system
@@ -41,15 +40,6 @@ def largest(x):
 def deviation_from_shell(found):
     shells = jax.vmap(jax.vmap(lambda q, p: hamiltonian(0.0, 0.0, q, p, None)))(found.qs, found.ps)
     return largest(np.asarray(shells) - ENERGY)
-
-
-@pytest.mark.slow
-def test_ten_thousand_crossings_of_64_orbits():
-    found = section(*starts(64), num_steps=1_600_000, crossings=10_000)
-    assert set(found.status) == {"successful"}
-    assert found.qs.shape == (64, 10_000, 2)
-    assert largest(found.qs[..., 0]) < 1e-12
-    assert deviation_from_shell(found) < 1e-4
 
 
 @pytest.mark.slow
@@ -146,9 +136,6 @@ def test_epsilon_that_is_traced():
     assert largest(slope[0, :, 1]) == 0
 
 
-# --- statuses ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("options", "status", "message"),
     [
@@ -203,13 +190,11 @@ BAD = {
     "skip must be an integer": lambda q, p: section(q, p, skip=-1),
     "crossings must be an integer of at least 1": lambda q, p: section(q, p, crossings=0),
     "be a dvi.System, got .*Problem.*problem.system": lambda q, p: section(q, p, system=HENON),
-    "'crosings'. Did you mean 'crossings'": lambda q, p: section(q, p, crosings=3),
     "section requires num_steps": lambda q, p: dvi.poincare_section(HENON.system, q, p, plane, h=1),
     "bifurcation requires num_steps": lambda q, p: dvi.bifurcation(HENON.system, q, p, plane, h=1),
     "requires an array for epsilon": lambda q, p: diagram(q, p, epsilon=0.1),
     "epsilon must be finite, got .*nan": lambda q, p: diagram(q, p, epsilon=[0.0, np.nan]),
     "1-D array, got shape": lambda q, p: diagram(q, p, epsilon=[[0.0]]),
-    "'folow'. Did you mean 'follow'": lambda q, p: diagram(q, p, folow=True),
     "system must be .* Problem": lambda q, p: return_map(HENON),
     "returns must be an integer": lambda q, p: return_map(returns=0),
     "phase of a stroboscope must be a finite": lambda q, p: dvi.stroboscope(1.0, np.nan),
@@ -223,21 +208,11 @@ def test_invalid_arguments(message):
         BAD[message](*starts(3))
 
 
-def test_the_error_for_a_single_initial_condition_says_how_to_give_it():
-    with pytest.raises(TypeError) as error:
-        section(HENON.q0, HENON.p0)
-    assert "Give a single initial condition as q0[None], p0[None]" in "".join(error.value.__notes__)
-
-
-def test_the_keywords_that_are_passed_on_are_known():
-    names = {"h", "num_steps", "t0", "epsilon", "args", "method", "root_finder", "integrator"}
+def test_unknown_keywords_are_refused():
     for function in (dvi.poincare_section, dvi.bifurcation, dvi.tangent_map):
-        assert names | {"throw"} <= set(argument_names(function))
         with pytest.raises(TypeError, match="Did you mean 'method'"):
             function(HENON.system, HENON.q0, HENON.p0, methd=None)
 
-
-# --- return maps ------------------------------------------------------------------------------
 
 RETURN = return_map(h=0.02, num_steps=400, method=dvi.Yoshida(4))
 
@@ -320,9 +295,6 @@ def test_a_map_that_does_not_return():
     assert np.isnan(back.q).all()
     rarely = return_map(num_steps=100, returns=3)
     assert rarely(HENON.q0, HENON.p0).status == "too_few_crossings"
-
-
-# --- bifurcations -----------------------------------------------------------------------------
 
 
 @pytest.mark.slow

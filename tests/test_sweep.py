@@ -238,9 +238,6 @@ def test_ctrl_c_returns_the_finished_tasks():
     np.testing.assert_array_equal(np.isfinite(result["drift"]), result["status"] == 0)
 
 
-# --- cost and export --------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_the_cost_of_a_sweep():
     grid = {"epsilon": np.linspace(0, 0.1, 100), "method": METHODS, "lanes_per_task": 10}
@@ -255,11 +252,7 @@ def test_the_cost_of_a_sweep():
     assert (large.tasks, large.files) == (10**8, 6 * 10**8)
     assert large.bytes == cost.bytes * 5 * 10**6
     assert large.seconds(1) > 60 * large.seconds(64) > 0
-    assert "| 1e+12 | 1e+11 |" in cost.table()
     assert "20 tasks of 10 trajectories" in str(cost)
-
-
-def test_times_as_text():
     texts = ["0.004 s", "70 s", "3.33 min", "2.78 h", "31.7 years"]
     assert [span(seconds) for seconds in (0.004, 70, 200, 1e4, 1e9)] == texts
 
@@ -298,9 +291,6 @@ def test_parquet_has_a_row_for_each_trajectory(result, tmp_path):
     near(one.drift, [found.drift])
     near(one.q_1_0, [found.q[1, 0]])
     near(one.p0_1, [found.p0[1]])
-
-
-# --- generated initial conditions -------------------------------------------------------------
 
 
 def generated(start, indices):
@@ -356,9 +346,6 @@ def test_states_on_an_energy_shell():
     assert sweep(start=nowhere).status_counts() == {"not_finite": 4}
 
 
-# --- tasks ------------------------------------------------------------------------------------
-
-
 def test_tasks_cover_the_grid_once():
     plan = make_plan({"method": 2, "a": 7, "b": 3, "c": 11}, 1, 100, 8, lanes=40)
     covered = np.zeros(plan.shape, int)
@@ -379,9 +366,6 @@ def test_the_size_of_a_task_depends_on_steps_and_bytes():
         (10**6, 100, 2**20, 1, 64),
     ):
         assert least <= make_plan({"start": count}, 0, steps, size).lanes_per_task <= most
-
-
-# --- errors -----------------------------------------------------------------------------------
 
 
 # Others are in `test_mistakes`.

@@ -166,9 +166,6 @@ def test_what_does_not_change_numbers_does_not_change_it(what):
     assert differences(a, b) == []
 
 
-# --- results ----------------------------------------------------------------------------------
-
-
 def test_unsigned_integers_and_unknown_names(tmp_path):
     observe = {"count": lambda *a: jnp.uint8(3), "x": dvi.Last(position)}
     found = dvi.sweep(oscillator(), Q, Q, h=0.1, num_steps=2, t0=[0.0, 1.0], observe=observe,
@@ -201,9 +198,6 @@ def test_float32_takes_lists_of_numbers():
             dvi.sweep(oscillator(), q, q, h=np.asarray([0.1, 0.05]), **options)
 
 
-# --- file systems ---------------------------------------------------------------------------------
-
-
 def small(path):
     return dvi.sweep(oscillator(), Q, Q, h=0.1, num_steps=3, t0=[0.0, 1.0, 2.0], lanes_per_task=1,
                      save=FINAL, store=path)  # fmt: skip
@@ -231,7 +225,6 @@ def test_links_and_relative_paths(tmp_path, monkeypatch):
         dvi.open_sweep(tmp_path / "there")
 
 
-@pytest.mark.slow
 def test_lengths_without_divisors_do_not_give_tiny_chunks():
     variable = layout.Variable("float64", (30,), ("x",))
     inner = layout.layout((32749,), variable)["chunks"]

@@ -121,9 +121,6 @@ def test_an_unbound_invariant_names_what_it_needs():
         dvi.AdiabaticInvariant([ROTATION, TIME], [None])
 
 
-# --- the balance law -------------------------------------------------------------------------
-
-
 def anharmonic(t0, t1, q0, p1, args):
     return jnp.sum((q0**2 + 1) * (p1**2 + 1)) / 2 + jnp.sin(t0) * q0[0] * p1[1] + t1 * q0[1]
 
@@ -182,7 +179,6 @@ def test_balance_closes_for_any_generator_gauge_and_mesh(seed, z):
 @pytest.mark.slow
 def test_every_cause_is_needed_for_the_balance_to_close():
     b, size = balance(*random_case(3, 1))
-    assert np.max(np.abs(b.defect)) <= 1e-12 * size
     for cause in (b.symmetry, b.work, b.lattice):
         assert np.max(np.abs(b.defect + cause)) > 1e-4 * size
 
@@ -221,9 +217,6 @@ def test_lattice_defect_vanishes_with_h_where_the_printed_signs_do_not():
     assert abs(printed[2]) > 0.5
 
 
-# --- gauges ----------------------------------------------------------------------------------
-
-
 def square(seed=0, count=120, n=1):
     rng = np.random.default_rng(seed)
     return rng.uniform(-1, 1, (count, n)), rng.uniform(-1, 1, (count, n))
@@ -238,15 +231,12 @@ def solve(generators, degree, samples=None, h=0.1):
     return dvi.solve_gauge(OSCILLATOR.system, generators, basis, h=h, samples=samples)
 
 
-def test_gauge_of_the_papers_oscillator_is_found():
-    """ξ0 = 1, ξ = q, η = p at ε = 0: G = −pq, so that I = (p² + q²)/2-like (below (32))."""
+def test_gauge_of_the_papers_oscillator_at_order_0_and_none_of_first_order():
+    """ξ0 = 1, ξ = q, η = p at ε = 0: G = −pq, so that I = (p² + q²)/2-like (below (32)). Of (33)
+    with its momentum part identity 0 closes, and identity 1 does not, in any quadratic."""
     found = solve([CLOCKED], 2)
     assert str(found.gauges[0]) == "−q p"
     assert found.residuals[0] < 1e-13
-
-
-def test_no_gauge_makes_34_an_invariant_of_first_order():
-    """(33) with its momentum part: identity 0 closes, identity 1 does not, in any quadratic."""
     found = solve([CLOCKED, CLOCKED], 4)
     assert found.residuals[0] < 1e-12
     assert found.residuals[1] > 1e-2

@@ -64,8 +64,6 @@ def find(system, basis, order=0, samples=None, **more):
     return dvi.find_symmetries(system, basis, order, **given)
 
 
-# --- the library -----------------------------------------------------------------------------
-
 BODIES = box((2, 2), times=True)
 SHIFTED = library.space_translation([1.0, 2.0]) - 3 * library.rotation(1, 0)
 FLOW = library.hamiltonian_flow(lambda t, q, p, args: (q @ q + p @ p - 0.1 * q @ p) ** 2)
@@ -135,9 +133,9 @@ def test_brackets_close_the_algebra():
         library.bracket(along, 1.0)
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
+def test_library_refuses_what_does_not_fit():
+    point = dvi.LatticePoint(0.0, np.ones(2), np.ones(2))
+    for make, message in (
         (lambda: library.space_translation([0.0, 0.0]), "component that is not zero"),
         (lambda: library.space_translation([np.nan, 1.0]), "finite"),
         (lambda: library.rotation(1, 1), "two different axes"),
@@ -145,20 +143,12 @@ def test_brackets_close_the_algebra():
         (lambda: library.scaling(0.0, 0.0, 0.0), "all are 0"),
         (lambda: library.scaling(t=[1.0, 2.0]), "must be one finite number"),
         (lambda: library.boost([1.0, 0.0], mass=-1.0), "positive"),
-        (lambda: library.rotation(0, 2)(POINT), "at least 3 components"),
-        (lambda: library.space_translation([1.0, 0.0, 0.0])(POINT), r"direction must .*\(2,\)"),
-        (lambda: library.boost([1.0, 0.0], [1.0, 2.0, 3.0])(POINT), "mass must be a number"),
-    ],
-)
-def test_library_refuses_what_does_not_fit(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
-
-
-POINT = dvi.LatticePoint(0.0, np.ones(2), np.ones(2))
-
-
-# --- conformal factors -----------------------------------------------------------------------
+        (lambda: library.rotation(0, 2)(point), "at least 3 components"),
+        (lambda: library.space_translation([1.0, 0.0, 0.0])(point), r"direction must .*\(2,\)"),
+        (lambda: library.boost([1.0, 0.0], [1.0, 2.0, 3.0])(point), "mass must be a number"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            make()
 
 
 @pytest.mark.slow
@@ -236,9 +226,6 @@ def test_pairs_of_points():
         dvi.random_pairs(h=0.1, samples=(q[:1], p[:1]))
     with pytest.raises(ValueError, match="step fails"):
         dvi.solution_pairs(KEPLER.system, h=0.1, samples=(0 * q, p), args=KEPLER.args)
-
-
-# --- the search ------------------------------------------------------------------------------
 
 
 @functools.cache

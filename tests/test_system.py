@@ -17,36 +17,6 @@ def run(system, q0=(0.1, 0.2), p0=(0.3, 0.4), **kwargs):
     return dvi.integrate(system, q0, p0, **{"h": 0.1, "num_steps": 2, **kwargs})
 
 
-@pytest.mark.parametrize("name", ["H_D", "force", "perturbation"])
-def test_each_function_is_checked_and_named(name):
-    with pytest.raises(TypeError, match=f"{name} must take the arguments"):
-        dvi.System(**{"H_D": H, name: lambda q, p: 0.0})
-    with pytest.raises(TypeError, match=f"{name} must be a function"):
-        dvi.System(**{"H_D": H, name: 3.0})
-
-
-def test_the_number_of_arguments_decides_about_discretise():
-    with pytest.raises(TypeError, match=r"\(t0, t1, q0, p1, args\).*dvi.discretise"):
-        dvi.System(lambda t, q, p, args: 0.0)
-    with pytest.raises(TypeError, match=r"\(t, q, p, args\).*dvi.System directly"):
-        dvi.discretise(H)
-
-
-@pytest.mark.parametrize(
-    ("functions", "error", "message"),
-    [
-        ({"H_D": lambda t0, t1, q0, p1, args: p1**2}, ValueError,
-         r"H_D.*real scalar.*shape \(2,\).*jnp.sum"),
-        ({"H_D": lambda t0, t1, q0, p1, args: None}, TypeError, "return missing"),
-        ({"H_D": H, "force": lambda t0, t1, q0, p1, args: q0[0]}, ValueError,
-         r"force.*array of shape \(2,\).*shape \(\)"),
-    ],
-)  # fmt: skip
-def test_values_of_another_shape_are_rejected(functions, error, message):
-    with pytest.raises(error, match=message):
-        run(dvi.System(**functions, epsilon=0.0))
-
-
 def test_discretise_is_the_rule_of_the_paper():
     def continuous(t, q, p, args):
         return (1 + t) * jnp.sum(p**2) / 2 + args * jnp.sum(q**4)
@@ -84,9 +54,6 @@ def test_methods_of_a_system():
     np.testing.assert_allclose(system.disturbing_force(t, t, q, p, jnp.asarray(0.1), None), [-0.1])
 
 
-# --- checks of arguments -----------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("check", "good", "bad"),
     [
@@ -105,14 +72,3 @@ def test_checks_of_values(check, good, bad):
     for value in bad:
         with pytest.raises(ValueError, match=r"^[nx] must be .*, got "):
             check(value)
-
-
-def test_checks_of_types():
-    method = dvi.TypeII()
-    assert _checks.instance("method", method, dvi.Method, "a dvi.Method") is method
-    with pytest.raises(TypeError, match=r"method must be a dvi.Method, got 'Strang'\. Take one"):
-        _checks.instance("method", "Strang", dvi.Method, "a dvi.Method", "Take one.")
-    with pytest.raises(TypeError, match=r"got the class TypeII .is a pair of parentheses missing"):
-        _checks.instance("method", dvi.TypeII, dvi.Method, "a dvi.Method")
-    with pytest.raises(TypeError, match=r"f must be a function of \(t, q\), got 3\."):
-        _checks.function("f", 3, "(t, q)")

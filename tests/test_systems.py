@@ -115,9 +115,6 @@ def test_two_formulations_of_one_method_agree(name, method):
     assert difference(by_hand(step, moved, 50), theirs[:51]) > 1e-10
 
 
-# Chains and lattices
-
-
 def test_henon_heiles_starts_below_the_energy_of_escape():
     made = problem("henon_heiles")
     H = functools.partial(made.system.H_D, 0.0, 0.0, args=None)
@@ -243,9 +240,6 @@ def test_plane_waves_solve_the_schroedinger_lattice():
             assert np.max(np.abs(b)) > 0.1
 
 
-# Oscillators, populations, tops
-
-
 @pytest.mark.parametrize("method", [dvi.TypeII(), pytest.param(dvi.GaussLegendre(1), marks=slow)])
 def test_a_hamiltonian_perturbation_leaves_the_map_symplectic(method):
     """At ε = 0.3 with the perturbation; as a force of the same kind it is not."""
@@ -304,9 +298,6 @@ def test_steady_precession_of_a_top():
         state[1][0] += 0.1
         assert abs(float(functions("spinning_top")(0.0, *state, 0.0, args)[1][1])) > 0.01
     assert np.all(np.isnan(steady_precession(theta, 0.5, args)))  # too slow
-
-
-# Orbits
 
 
 @slow
@@ -436,9 +427,6 @@ def test_outer_solar_system(method, h, least, most):
     error, spin = errors_of_200_000_days(method, h)
     assert least <= error <= most
     assert spin <= 1e-12 or isinstance(method, dvi.RungeKutta4)
-
-
-# Charged particles and adiabatic invariants
 
 
 def test_the_field_is_the_curl_of_the_potential_and_has_no_sources():

@@ -26,16 +26,11 @@ def test_every_check_is_a_function_with_a_remedy():
 
 def test_a_failure_says_what_was_measured_what_is_required_and_what_to_do():
     method = altered(dvi.TypeII(), is_symmetric=True)
-    with pytest.raises(AssertionError) as raised:
+    said = r"reversal: measured 0\.0.*required ≤ 1e-12.*What is measured: .*What to do: Make"
+    with pytest.raises(AssertionError, match=f"(?s){said}"):
         check_reversible(method)
-    claim, measured, what, remedy = str(raised.value).splitlines()
-    assert claim == "AlteredMethod does not have all properties that it claims:"
-    assert measured.startswith("reversal: measured 0.0")
-    assert "required ≤ 1e-12" in measured
-    assert what.startswith("  What is measured: max |z − z0| after ten steps")
-    assert remedy.startswith("  What to do: Make the step its own adjoint")
     with pytest.raises(AssertionError, match=r"reversal: measured"):
-        check_method(method, ["symplecticity", "reversal"])
+        check_method(method, ["reversal"])
     results = check_method(METHODS["TypeII"], ["reversal", "symplecticity"])
     assert [result.verdict for result in results.values()] == ["not claimed", "pass"]
 
@@ -61,10 +56,10 @@ def test_an_identity_is_not_taken_for_a_step_with_an_inverse():
         testing.check_inverse(altered(dvi.Strang(), stay, stay))
 
 
-@pytest.mark.parametrize(("checks", "error"), [(["symmetry"], ValueError), ("order", TypeError)])
-def test_unknown_checks_are_refused(checks, error):
-    with pytest.raises(error, match="check"):
-        check_method(dvi.Strang(), checks)
+def test_unknown_checks_are_refused():
+    for checks, error in ((["symmetry"], ValueError), ("order", TypeError)):
+        with pytest.raises(error, match="check"):
+            check_method(dvi.Strang(), checks)
 
 
 def test_symplectic_defect():

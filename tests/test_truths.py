@@ -37,10 +37,9 @@ RUN = [i for i, case in enumerate(CASES) if i % 3 == 0 or case.name in ONCE_WRON
 QUICK = {
     "rotations under a central force in a box of 1e-4",
     "gauge of a field that is no symmetry, h = 1e-11",
-    "cubic spring of strength 1e-15",
     "oscillator, one sample of twenty 1e+06 times as far",
 }
-"""One of each sort."""
+"""An invariant, symmetries and a gauge."""
 
 
 @functools.cache

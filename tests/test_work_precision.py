@@ -99,17 +99,13 @@ def test_evaluations_are_counted_as_they_are_made(bench, problem, method):
 
 
 def test_a_derivative_that_is_not_used_is_not_counted(bench):
-    halves = []
-    H_D = counting(bench.henon_heiles().system, halves).H_D
-    slopes = jax.grad(H_D, argnums=(2, 3))
+    """And a method of unknown cost is rejected."""
+    problem, halves = bench.henon_heiles(), []
+    slopes = jax.grad(counting(problem.system, halves).H_D, argnums=(2, 3))
     q, p, now = jnp.array([0.1, 0.2]), jnp.array([0.3, 0.1]), 0.0
     for used, made in ((lambda of: of[0], 1), (lambda of: of, 3)):
         jax.block_until_ready(jax.jit(lambda q, p, u=used: u(slopes(now, now, q, p, None)))(q, p))
         assert len(halves) == made
-
-
-def test_a_method_of_unknown_cost_is_rejected(bench):
-    problem = bench.henon_heiles()
     with pytest.raises(TypeError, match=r"what does a step of Strang.* cost"):
         bench.cost(dvi.Strang(base=dvi.Strang()), problem)
 

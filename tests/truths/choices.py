@@ -78,77 +78,59 @@ GAUSSIANS = functions(
 
 _BASES = {
     # a constant does not count as an invariant, nor does sin² q + cos² q
-    "oscillator with the constant 1 in the basis": case(
-        (OSCILLATOR, poly(4, constant=True), box(1, 80)), E
-    ),
-    "quartic oscillator with the constant 1 in the basis": case(
-        (QUARTIC, poly(4, constant=True), box(1, 80))
-    ),
-    "oscillator, a constant hidden in sin² + cos²": case(
-        (OSCILLATOR, QUADRATICS + functions("sin(q1)**2", "cos(q1)**2"), box(1, 80)), E
-    ),
+    "oscillator with the constant 1 in the basis": case((OSCILLATOR, poly(4, constant=True),
+        box(1, 80)), E),
+    "quartic oscillator with the constant 1 in the basis": case((QUARTIC, poly(4, constant=True),
+        box(1, 80))),
+    "oscillator, a constant hidden in sin² + cos²": case((OSCILLATOR,
+        QUADRATICS + functions("sin(q1)**2", "cos(q1)**2"), box(1, 80)), E),
     "oscillator, polynomials of degree 10": case((OSCILLATOR, poly(10), box(1, 200)), E),
-    "McMillan's map, polynomials of degree 9": case(
-        (MCMILLAN, poly(9), box(1, 200), 1.0), BIQUADRATIC
-    ),
+    "McMillan's map, polynomials of degree 9": case((MCMILLAN, poly(9), box(1, 200), 1.0),
+        BIQUADRATIC),
     "quartic oscillator, polynomials of degree 10": case((QUARTIC, poly(10), box(1, 200), 0.5)),
-    "McMillan's map in products of Chebyshev polynomials": case(
-        (MCMILLAN, CHEBYSHEV, box(1, 100, -2.0, 2.0), 1.0), BIQUADRATIC
-    ),
+    "McMillan's map in products of Chebyshev polynomials": case((MCMILLAN, CHEBYSHEV,
+        box(1, 100, -2.0, 2.0), 1.0), BIQUADRATIC),
     # p is conserved, and three of the four are functions of it
-    "functions of momentum alone on a twist map": case(
-        (TWIST, functions("sin(p1)", "exp(p1)", "p1**3", "q1"), box(1, 60)), "sin(p1)"
-    ),
-    "squares of sums in place of squares": case(
-        (OSCILLATOR, functions("(q1 + p1)**2", "(q1 - p1)**2", "(q1 + 2 * p1)**2"), box(1, 60)), E
-    ),
+    "functions of momentum alone on a twist map": case((TWIST,
+        functions("sin(p1)", "exp(p1)", "p1**3", "q1"), box(1, 60)), "sin(p1)"),
+    "squares of sums in place of squares": case((OSCILLATOR,
+        functions("(q1 + p1)**2", "(q1 - p1)**2", "(q1 + 2 * p1)**2"), box(1, 60)), E),
     # the condition number is 1e5
-    "functions that differ by 1e-5 of them": case(
-        (OSCILLATOR, functions("q1**2", "q1**2 + 1e-5 * q1 * p1", "p1**2"), box(1, 60)), E
-    ),
+    "functions that differ by 1e-5 of them": case((OSCILLATOR,
+        functions("q1**2", "q1**2 + 1e-5 * q1 * p1", "p1**2"), box(1, 60)), E),
     "the invariant alone": case((OSCILLATOR, functions(E), box(1, 40)), E),
     "angular momenta alone": case((CENTRAL, functions(LX, LY, L), box(3, 60)), (LX, LY, L)),
     # total momentum, and the quadratic form of the difference of the positions
-    "two invariants of three functions": case(
-        (COUPLED, functions("p1 + p2", RELATIVE, "q1"), box(2, 60)), ("p1 + p2", RELATIVE)
-    ),
-    "the square of the invariant, but not the invariant": case(
-        (OSCILLATOR, functions(f"({E})**2", "q1**4", "p1**4", "q1**2"), box(1, 60)), f"({E})**2"
-    ),
-    "exponential and logarithm of the invariant": case(
-        (OSCILLATOR, functions(f"exp({E})", f"log(1 + {E})", "q1"), box(1, 60)), f"exp({E})"
-    ),
+    "two invariants of three functions": case((COUPLED, functions("p1 + p2", RELATIVE, "q1"),
+        box(2, 60)), ("p1 + p2", RELATIVE)),
+    "the square of the invariant, but not the invariant": case((OSCILLATOR,
+        functions(f"({E})**2", "q1**4", "p1**4", "q1**2"), box(1, 60)), f"({E})**2"),
+    "exponential and logarithm of the invariant": case((OSCILLATOR,
+        functions(f"exp({E})", f"log(1 + {E})", "q1"), box(1, 60)), f"exp({E})"),
     # no linear function is conserved
     "a basis that is too small": case((OSCILLATOR, poly(1), box(1, 40))),
     # no function of q is conserved
     "positions alone": case((OSCILLATOR, poly(5, ["q"]), box(1, 60))),
     # the map conserves p² + q² − h q p, and the basis has no q p
-    "the energy of the flow alone": case(
-        (OSCILLATOR, functions("q @ q + p @ p", "q1", "p1"), box(1, 40), 1e-4)
-    ),
-    "the energy of the flow alone, in one function": case(
-        (OSCILLATOR, functions("q @ q + p @ p"), box(1, 40), 1e-4)
-    ),
-    "powers of the radius for Kepler's problem": case(
-        (KEPLER, poly(2) + dvi.Radial((-3, -2, -1, 1, 3)), shell(2, 100)), L
-    ),
-    "radial functions times polynomials for Kepler's problem": case(
-        (KEPLER, poly(2) + poly(2) * dvi.Radial((-1,)), shell(2, 120)), L
-    ),
+    "the energy of the flow alone": case((OSCILLATOR, functions("q @ q + p @ p", "q1", "p1"),
+        box(1, 40), 1e-4)),
+    "the energy of the flow alone, in one function": case((OSCILLATOR, functions("q @ q + p @ p"),
+        box(1, 40), 1e-4)),
+    "powers of the radius for Kepler's problem": case((KEPLER,
+        poly(2) + dvi.Radial((-3, -2, -1, 1, 3)), shell(2, 100)), L),
+    "radial functions times polynomials for Kepler's problem": case((KEPLER,
+        poly(2) + poly(2) * dvi.Radial((-1,)), shell(2, 120)), L),
     # e^{20 q} is of size 1e8 on the samples
-    "a steep function among tame ones": case(
-        (OSCILLATOR, QUADRATICS + functions("exp(20 * q1)"), box(1, 80)), E
-    ),
-    "functions with coefficients of 1e40 and 1e-40": case(
-        (OSCILLATOR, functions("1e40 * q1**2", "1e-40 * p1**2", "q1*p1"), box(1, 60)), E
-    ),
+    "a steep function among tame ones": case((OSCILLATOR, QUADRATICS + functions("exp(20 * q1)"),
+        box(1, 80)), E),
+    "functions with coefficients of 1e40 and 1e-40": case((OSCILLATOR,
+        functions("1e40 * q1**2", "1e-40 * p1**2", "q1*p1"), box(1, 60)), E),
     # Gaussians of width 0.1 around five points
     "localised functions": case((OSCILLATOR, GAUSSIANS, box(1, 300))),
     # max(q − 0.9, 0)² is not conserved
-    "a function that vanishes on most samples": case(
-        (OSCILLATOR, QUADRATICS + functions("maximum(q1 - 0.9, 0.0)**2"), box(1, 200)), E
-    ),
-}
+    "a function that vanishes on most samples": case((OSCILLATOR,
+        QUADRATICS + functions("maximum(q1 - 0.9, 0.0)**2"), box(1, 200)), E),
+}  # fmt: skip
 _FEW = {
     f"{name}, as few samples as are allowed": case(
         (system, basis, samples, h), truth, points=points
@@ -173,9 +155,8 @@ _FEW = {
 _WHERE = {
     "oscillator, 5000 samples": case((OSCILLATOR, poly(4), box(1, 5000)), E, points=box(1, 100)),
     # samples are points, and rounded ones are points too
-    "McMillan's map, samples in float32": case(
-        (MCMILLAN, poly(4), half_precision(box(1, 100)), 1.0), BIQUADRATIC
-    ),
+    "McMillan's map, samples in float32": case((MCMILLAN, poly(4), half_precision(box(1, 100)),
+        1.0), BIQUADRATIC),
     "Kepler, samples in float32": case((KEPLER, ENERGIES, half_precision(shell(2, 100))), L),
     "oscillator, samples on a grid": case((OSCILLATOR, poly(6), grid(12)), E),
     "Hénon's map, samples on a grid": case((HENON, poly(6), grid(12), 1.0)),
@@ -184,40 +165,21 @@ _WHERE = {
     "oscillator, samples on a curve": case((OSCILLATOR, poly(2), curve), E, points=box(1, 60)),
     "quartic oscillator, samples on a curve": case((QUARTIC, poly(2), curve), points=box(1, 60)),
     # an invariant is constant on each orbit, and so are its products with others
-    "oscillator, samples on one orbit": case(
-        (
-            OSCILLATOR,
-            poly(2),
-            orbits(lambda rng: rng.uniform(0.5, 1.0, (2, 1, 1)), of_oscillator, 80),
-        ),
-        E,
-        points=box(1, 60),
-    ),
-    "McMillan's map, samples on ten orbits": case(
-        (
-            MCMILLAN,
-            poly(4),
-            orbits(lambda rng: rng.uniform(-1, 1, (2, 10, 1)), of_mcmillan, 20),
-            1.0,
-        ),
-        BIQUADRATIC,
-    ),
+    "oscillator, samples on one orbit": case((OSCILLATOR, poly(2),
+        orbits(lambda rng: rng.uniform(0.5, 1.0, (2, 1, 1)), of_oscillator, 80)), E,
+        points=box(1, 60)),
+    "McMillan's map, samples on ten orbits": case((MCMILLAN, poly(4),
+        orbits(lambda rng: rng.uniform(-1, 1, (2, 10, 1)), of_mcmillan, 20), 1.0), BIQUADRATIC),
     "oscillator, each sample four times": case((OSCILLATOR, poly(4), repeated(box(1, 40), 4)), E),
-    "McMillan's map, samples in one quadrant": case(
-        (MCMILLAN, poly(4), box(1, 100, 0.2, 2.0), 1.0), BIQUADRATIC
-    ),
-    "McMillan's map, samples of a Cauchy distribution": case(
-        (MCMILLAN, poly(4), lambda rng: tuple(rng.standard_cauchy((2, 150, 1))), 1.0),
-        BIQUADRATIC,
-        points=box(1, 100),
-    ),
-    "oscillator, some samples at rest in the equilibrium": case(
-        (OSCILLATOR, poly(4), some_at_rest), E
-    ),
-    "oscillator, a box of 1e-8 about the equilibrium": case(
-        (OSCILLATOR, poly(2), box(1, 60, -1e-8, 1e-8)), E
-    ),
+    "McMillan's map, samples in one quadrant": case((MCMILLAN, poly(4), box(1, 100, 0.2, 2.0), 1.0),
+        BIQUADRATIC),
+    "McMillan's map, samples of a Cauchy distribution": case((MCMILLAN, poly(4),
+        lambda rng: tuple(rng.standard_cauchy((2, 150, 1))), 1.0), BIQUADRATIC, points=box(1, 100)),
+    "oscillator, some samples at rest in the equilibrium": case((OSCILLATOR, poly(4), some_at_rest),
+        E),
+    "oscillator, a box of 1e-8 about the equilibrium": case((OSCILLATOR, poly(2),
+        box(1, 60, -1e-8, 1e-8)), E),
     # the map is nearly a shear there; p changes by 1e-12 h, which is 1e-8 of p
     "quartic oscillator, a box of 1e-4": case((QUARTIC, poly(2), box(1, 60, -1e-4, 1e-4), 1.0)),
-}
+}  # fmt: skip
 CASES = (*named("bases", _BASES), *named("few samples", _FEW), *named("samples", _WHERE))

@@ -86,86 +86,53 @@ TAU = {count: dvi.Chebyshev(count, "τ", (0.0, 3.0)) for count in (3, 4)}
 
 _CASES = {
     # the quadratic form about the periodic orbit of the map
-    "oscillator with a periodic force": case(
-        (
-            DRIVEN,
-            poly(2, constant=True) * trig(2, "t", 2 * np.pi / 0.7, True),
-            timed(box(1, 100), 0.0, 50.0),
-        ),
-        about_orbit(0.7, 0.1),
-    ),
+    "oscillator with a periodic force": case((DRIVEN,
+        poly(2, constant=True) * trig(2, "t", 2 * np.pi / 0.7, True),
+        timed(box(1, 100), 0.0, 50.0)), about_orbit(0.7, 0.1)),
     # the form about the periodic orbit has products of q and cos ωt, which this basis lacks
-    "oscillator with a periodic force, too few harmonics": case(
-        (DRIVEN, poly(2) + HARMONICS, timed(box(1, 80), 0.0, 50.0))
-    ),
+    "oscillator with a periodic force, too few harmonics": case((DRIVEN, poly(2) + HARMONICS,
+        timed(box(1, 80), 0.0, 50.0))),
     # ζ e^{−iωt} with the frequency ω of the map itself
-    "oscillator in the frame that rotates with it": case(
-        (OSCILLATOR, poly(1) * trig(1, "t", 2 * np.pi / TURN), timed(box(1, 60), 0.0, 50.0)),
-        (rotating("real"), rotating("imaginary")),
-    ),
+    "oscillator in the frame that rotates with it": case((OSCILLATOR,
+        poly(1) * trig(1, "t", 2 * np.pi / TURN), timed(box(1, 60), 0.0, 50.0)),
+        (rotating("real"), rotating("imaginary"))),
     # with the frequency 1 of the flow nothing is conserved: the map is faster by h²/24
-    "oscillator in the frame that rotates with the flow": case(
-        (OSCILLATOR, poly(1) * trig(1, "t"), timed(box(1, 60), 0.0, 50.0))
-    ),
+    "oscillator in the frame that rotates with the flow": case((OSCILLATOR, poly(1) * trig(1, "t"),
+        timed(box(1, 60), 0.0, 50.0))),
     # p + g t, and p²/2 + g q − (h/2) g p; g = 9.81
-    "free fall": case(
-        (FALLING, poly(2, ["q", "p", "t"]), timed(box(1, 60))), ("p1 + 9.81 * t", FALL)
-    ),
+    "free fall": case((FALLING, poly(2, ["q", "p", "t"]), timed(box(1, 60))),
+        ("p1 + 9.81 * t", FALL)),
     "free fall without functions of time": case((FALLING, poly(3), box(1, 60)), FALL),
-    "free particle with functions of time": case(
-        (FREE, poly(3, ["q", "p", "t"]), timed(box(1, 80), -5.0, 5.0)), ("p1", "q1 - t * p1")
-    ),
+    "free particle with functions of time": case((FREE, poly(3, ["q", "p", "t"]),
+        timed(box(1, 80), -5.0, 5.0)), ("p1", "q1 - t * p1")),
     # the linear map of (q, e^{−γt} p) has the determinant e^{−γh}: its quadratic form times e^{γt}
-    "damped oscillator of Caldirola and Kanai": case(
-        (damped("q @ q / 2"), QUADRATICS * growing(0, 1, -1), timed(box(1, 60), 0.0, 5.0)),
-        damped_form(0.1, 0.3),
-    ),
+    "damped oscillator of Caldirola and Kanai": case((damped("q @ q / 2"),
+        QUADRATICS * growing(0, 1, -1), timed(box(1, 60), 0.0, 5.0)), damped_form(0.1, 0.3)),
     # p, and q + h e^{−γt} p/(1 − e^{−γh})
-    "damped free particle": case(
-        (
-            damped("0.0 * sum(q)"),
-            poly(1, constant=True) * growing(0, -1),
-            timed(box(1, 60), 0.0, 5.0),
-        ),
-        ("p1", "q1 + 0.1 / (1 - exp(-0.03)) * exp(-0.3 * t) * p1"),
-    ),
+    "damped free particle": case((damped("0.0 * sum(q)"), poly(1, constant=True) * growing(0, -1),
+        timed(box(1, 60), 0.0, 5.0)), ("p1", "q1 + 0.1 / (1 - exp(-0.03)) * exp(-0.3 * t) * p1")),
     # the rate of the basis is 1 % too large
-    "damped oscillator with another rate in the basis": case(
-        (
-            damped("q @ q / 2"),
-            QUADRATICS * growing(1, 0, -1, rate=0.303),
-            timed(box(1, 60), 0.0, 5.0),
-        )
-    ),
-    "damped pendulum": case(
-        (
-            damped("-sum(cos(q))"),
-            (QUADRATICS + trig(1, "q")) * growing(0, 1, -1),
-            timed(box(1, 80, -2.0, 2.0), 0.0, 5.0),
-        )
-    ),
+    "damped oscillator with another rate in the basis": case((damped("q @ q / 2"),
+        QUADRATICS * growing(1, 0, -1, rate=0.303), timed(box(1, 60), 0.0, 5.0))),
+    "damped pendulum": case((damped("-sum(cos(q))"),
+        (QUADRATICS + trig(1, "q")) * growing(0, 1, -1), timed(box(1, 80, -2.0, 2.0), 0.0, 5.0))),
     # Noether's theorem: rotations, at any time
     "central force that varies with time": case((VARYING, poly(3), timed(box(2, 80))), L),
     # linear with periodic coefficients whose period is no multiple of h: the form of Ermakov and
     # Lewis is no trigonometric polynomial
-    "parametric oscillator with harmonics": case(
-        (PERIODIC, QUADRATICS * trig(3, "t", constant=True), timed(box(1, 100), 0.0, 20.0))
-    ),
+    "parametric oscillator with harmonics": case((PERIODIC,
+        QUADRATICS * trig(3, "t", constant=True), timed(box(1, 100), 0.0, 20.0))),
     # at ε = 0 the slow time is constant: p² + ω² q² − h ω² q p with ω² = 1 + 0.3 τ, and its
     # products with functions of τ, which alone have no differential in q and p
-    "slow oscillator at order 0": case(
-        (SLOW, QUADRATICS * TAU[4], timed(box(1, 60), 0.0, 3.0)), SLOW_FORM
-    ),
-    "slow oscillator at order 0 with functions of τ alone": case(
-        (SLOW, poly(2, constant=True) * TAU[3], timed(box(1, 80), 0.0, 3.0)), SLOW_FORM
-    ),
-    "slow pendulum at order 0": case(
-        (SLOW_PENDULUM, (QUADRATICS + trig(1, "q")) * TAU[3], timed(box(1, 80), 0.0, 3.0))
-    ),
-    "oscillator, samples at many times": case(
-        (OSCILLATOR, poly(4), timed(box(1, 80), -1e6, 1e6)), E
-    ),
+    "slow oscillator at order 0": case((SLOW, QUADRATICS * TAU[4], timed(box(1, 60), 0.0, 3.0)),
+        SLOW_FORM),
+    "slow oscillator at order 0 with functions of τ alone": case((SLOW,
+        poly(2, constant=True) * TAU[3], timed(box(1, 80), 0.0, 3.0)), SLOW_FORM),
+    "slow pendulum at order 0": case((SLOW_PENDULUM, (QUADRATICS + trig(1, "q")) * TAU[3],
+        timed(box(1, 80), 0.0, 3.0))),
+    "oscillator, samples at many times": case((OSCILLATOR, poly(4), timed(box(1, 80), -1e6, 1e6)),
+        E),
     # q₊ + q₋ = (a + δt)/q + b/q²: integrable, and without an invariant
     "discrete Painlevé I": case((PAINLEVE, poly(4), timed(POSITIVE), 1.0)),
-}
+}  # fmt: skip
 CASES = named("time dependent", _CASES)

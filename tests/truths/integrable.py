@@ -204,212 +204,142 @@ SCALAR_PRODUCTS = functions(
 
 _CASES = {
     "oscillator, symplectic Euler": case((OSCILLATOR, poly(4), box(1, 200)), E),
-    "oscillator at h = 1.9, close to the limit of stability": case(
-        (OSCILLATOR, poly(4), box(1, 120), 1.9), energy(1.0, 1.9)
-    ),
+    "oscillator at h = 1.9, close to the limit of stability": case((OSCILLATOR, poly(4),
+        box(1, 120), 1.9), energy(1.0, 1.9)),
     # kick–drift–kick has equal diagonal elements and conserves p² + (1 − h²/4) q²
-    "oscillator, Strang": case(
-        (OSCILLATOR, poly(4), box(1, 120), 0.5), "p1**2 + (1 - 0.5**2/4) * q1**2", method=STRANG
-    ),
+    "oscillator, Strang": case((OSCILLATOR, poly(4), box(1, 120), 0.5),
+        "p1**2 + (1 - 0.5**2/4) * q1**2", method=STRANG),
     # Gauss methods conserve quadratic invariants: Hairer, Lubich & Wanner 2006, IV.2.1
-    "oscillator, Gauss–Legendre": case(
-        (OSCILLATOR, poly(4), box(1, 120), 0.5), "p1**2 + q1**2", method=GAUSS
-    ),
+    "oscillator, Gauss–Legendre": case((OSCILLATOR, poly(4), box(1, 120), 0.5), "p1**2 + q1**2",
+        method=GAUSS),
     # drift–kick is kick–drift backwards: p² + q² + h q p
-    "oscillator, adjoint": case(
-        (OSCILLATOR, poly(4), box(1, 120), 0.5), "p1**2 + q1**2 + 0.5*q1*p1", method=ADJOINT
-    ),
+    "oscillator, adjoint": case((OSCILLATOR, poly(4), box(1, 120), 0.5),
+        "p1**2 + q1**2 + 0.5*q1*p1", method=ADJOINT),
     # resonance 1:1: the same 2×2 map A on each (qᵢ, pᵢ) conserves the polar forms of its
     # quadratic form and of ω; three of the four are independent
-    "isotropic oscillator in the plane": case(
-        (ISOTROPIC, poly(2), box(2, 120)), (*energies(0.1, 1.0, 1.0), L)
-    ),
+    "isotropic oscillator in the plane": case((ISOTROPIC, poly(2), box(2, 120)),
+        (*energies(0.1, 1.0, 1.0), L)),
     # as in the plane: 2n − 1 = 5 of the nine quadratic invariants are independent
-    "isotropic oscillator in space": case(
-        (spring(1.0, 1.0, 1.0), poly(2), box(3, 120), 0.3), (*energies(0.3, 1.0, 1.0, 1.0), L, L23)
-    ),
+    "isotropic oscillator in space": case((spring(1.0, 1.0, 1.0), poly(2), box(3, 120), 0.3),
+        (*energies(0.3, 1.0, 1.0, 1.0), L, L23)),
     # cos θ₁ = 3/4 and cos θ₂ = 2 cos² θ₁ − 1 = 1/8, so that ζ₁² conj ζ₂ is conserved
-    "resonance 1:2 of the map": case(
-        (spring(0.5, 1.75), poly(3), box(2, 150), 1.0),
-        (*energies(1.0, 0.5, 1.75), resonant(0.5, 2, 1.75, 1)),
-    ),
+    "resonance 1:2 of the map": case((spring(0.5, 1.75), poly(3), box(2, 150), 1.0),
+        (*energies(1.0, 0.5, 1.75), resonant(0.5, 2, 1.75, 1))),
     # H = (p₁² + q₁²)/2 − (p₂² + q₂²)/2: λ₂ = 1/λ₁, so that ζ₁ζ₂ is conserved; three of four
     # quadratic forms are independent
-    "resonance 1:−1 of the map": case(
-        (system("(p1**2 + q1**2 - p2**2 - q2**2) / 2"), poly(2), box(2, 100), 0.25),
-        (energy(1.0, 0.25), "p2**2 + q2**2 + 0.25*q2*p2", "q1*p2 + p1*q2"),
-    ),
+    "resonance 1:−1 of the map": case((system("(p1**2 + q1**2 - p2**2 - q2**2) / 2"), poly(2),
+        box(2, 100), 0.25), (energy(1.0, 0.25), "p2**2 + q2**2 + 0.25*q2*p2", "q1*p2 + p1*q2")),
     # q1 = 2q + p, p1 = q + p conserves q² − qp − p²
-    "cat map on the plane": case(
-        (separable("-q @ q / 2"), poly(4), box(1, 120), 1.0), "q1**2 - q1*p1 - p1**2"
-    ),
-    "two coupled cat maps": case(
-        (separable("-(q @ q + q1*q2) / 2"), poly(3), box(2, 120), 1.0),
-        (area(COUPLED_CATS, k) for k in (1, 2)),
-    ),
-    "three coupled oscillators": case(
-        (separable("(q @ q + (q1 - q2)**2 + 0.7 * (q2 - q3)**2) / 2"), poly(2), box(3, 120), 0.4),
-        (area(THREE, k) for k in (1, 2, 3)),
-    ),
+    "cat map on the plane": case((separable("-q @ q / 2"), poly(4), box(1, 120), 1.0),
+        "q1**2 - q1*p1 - p1**2"),
+    "two coupled cat maps": case((separable("-(q @ q + q1*q2) / 2"), poly(3), box(2, 120), 1.0),
+        (area(COUPLED_CATS, k) for k in (1, 2))),
+    "three coupled oscillators": case((separable("(q @ q + (q1 - q2)**2 + 0.7 * (q2 - q3)**2) / 2"),
+        poly(2), box(3, 120), 0.4), (area(THREE, k) for k in (1, 2, 3))),
     # each degree of freedom has its quadratic form
-    "saddle and centre": case(
-        (spring(1.0, -1.0), poly(3), box(2, 120), 0.3), energies(0.3, 1.0, -1.0)
-    ),
+    "saddle and centre": case((spring(1.0, -1.0), poly(3), box(2, 120), 0.3),
+        energies(0.3, 1.0, -1.0)),
     # q1 = B q, p1 = B⁻ᵀ p with B = 1 + h(a + bJ) conserves p·Cq for every C that commutes with
     # B: 1 and J
-    "spiral in and out": case(
-        (system("0.3 * (q @ p) + 0.7 * (q1*p2 - q2*p1)"), poly(2), box(2, 100), 0.5), ("q @ p", L)
-    ),
+    "spiral in and out": case((system("0.3 * (q @ p) + 0.7 * (q1*p2 - q2*p1)"), poly(2),
+        box(2, 100), 0.5), ("q @ p", L)),
     # M from p1 = p − h(a q + b p1), q1 = q + h(b q + c p1); M = [[m, n], [k, l]] conserves
     # n p² + (m − l) q p − k q²
-    "general quadratic H_D, implicit": case(
-        (system("sum(0.8 * q**2 / 2 + 0.3 * q * p + 1.1 * p**2 / 2)"), poly(4), box(1, 120), 0.2),
-        "0.22/1.06 * p1**2 + (1.06 - (0.22*0.16 + 1)/1.06) * q1*p1 + 0.16/1.06 * q1**2",
-    ),
+    "general quadratic H_D, implicit": case((system(
+        "sum(0.8 * q**2 / 2 + 0.3 * q * p + 1.1 * p**2 / 2)"), poly(4), box(1, 120), 0.2),
+        "0.22/1.06 * p1**2 + (1.06 - (0.22*0.16 + 1)/1.06) * q1*p1 + 0.16/1.06 * q1**2"),
     # h = 1: λ = e^{iπ/3}, λ⁶ = 1, so that Re ζ⁶ is conserved besides |ζ|²; the map moves and has
     # as many independent invariants as coordinates, since its sixth iterate is the identity
-    "sixth of a turn in each step": case(
-        (OSCILLATOR, poly(6), box(1, 120), 1.0), (energy(1.0, 1.0), hexagon)
-    ),
+    "sixth of a turn in each step": case((OSCILLATOR, poly(6), box(1, 120), 1.0),
+        (energy(1.0, 1.0), hexagon)),
     # as above, and the quadratic form of an oscillator that turns by another angle
-    "sixth of a turn and another oscillator": case(
-        (spring(1.0, 0.3), poly(6, ["q1", "p1"]) + poly(2, ["q2", "p2"]), box(2, 150), 1.0),
-        (*energies(1.0, 1.0, 0.3), hexagon),
-    ),
+    "sixth of a turn and another oscillator": case((spring(1.0, 0.3),
+        poly(6, ["q1", "p1"]) + poly(2, ["q2", "p2"]), box(2, 150), 1.0),
+        (*energies(1.0, 1.0, 0.3), hexagon)),
     # H_D = p: q1 = q + h, p1 = p conserves p and functions of q with the period h
-    "translation by a period of the basis": case(
-        (system("sum(p)"), poly(2) + trig(1, "q", period=0.5), sized(1, 80, 3.0, 1.0), 0.5),
-        ("p1", "cos(4 * pi * q1)"),
-    ),
+    "translation by a period of the basis": case((system("sum(p)"),
+        poly(2) + trig(1, "q", period=0.5), sized(1, 80, 3.0, 1.0), 0.5),
+        ("p1", "cos(4 * pi * q1)")),
     # momenta, and angular momentum: 2n − 1
     "free particle in the plane": case((FREE, poly(2), box(2, 100)), ("p1", "p2", L)),
     # momenta and angular momenta, of which p·L = 0
     "free particle in space": case((FREE, poly(2), box(3, 120)), (*MOMENTA, "p3", L, L23)),
     # p1 = p, q1 = q + h p³
     "twist map": case((system("sum(p**4) / 4"), poly(4), box(1, 120), 1.0), "p1"),
-    "a degree of freedom at rest": case(
-        (system("p1**2 / 2"), poly(3), box(2, 120)), ("p1", "q2", "p2")
-    ),
+    "a degree of freedom at rest": case((system("p1**2 / 2"), poly(3), box(2, 120)),
+        ("p1", "q2", "p2")),
     "McMillan's map": case((MCMILLAN, poly(4), box(1, 120), 1.0), BIQUADRATIC),
     # μ = 1.5
-    "McMillan's map, unstable at the origin": case(
-        (qrt(1, 0, 1, -3.0, 0), poly(4), box(1, 120, -2.0, 2.0), 1.0), biquadratic(1, 0, 1, -3.0, 0)
-    ),
-    **{
-        f"symmetric QRT map with {name}": case(
-            (qrt(*c), poly(degree), box(1, 120), 1.0), biquadratic(*c)
-        )
-        for name, degree, c in (
-            ("all coefficients", 5, (1.0, 0.5, 2.0, -1.2, 0.3)),
-            ("a cubic invariant", 4, (0.0, 1.0, 3.0, -1.5, 0.2)),
-        )
-    },
+    "McMillan's map, unstable at the origin": case((qrt(1, 0, 1, -3.0, 0), poly(4),
+        box(1, 120, -2.0, 2.0), 1.0), biquadratic(1, 0, 1, -3.0, 0)),
+    **{f"symmetric QRT map with {name}": case((qrt(*c), poly(degree), box(1, 120), 1.0),
+        biquadratic(*c)) for name, degree, c in (("all coefficients", 5,
+        (1.0, 0.5, 2.0, -1.2, 0.3)), ("a cubic invariant", 4, (0.0, 1.0, 3.0, -1.5, 0.2)))},
     # different curves for x and y
-    "asymmetric QRT map": case(
-        (asymmetric(0.8, 0.3, 1.5, -0.4), poly(4), box(1, 120), 1.0),
-        "q1**2*p1**2 + p1**2 + 1.5*q1**2 + 0.8*q1*p1 + 0.3*p1 - 0.4*q1",
-    ),
+    "asymmetric QRT map": case((asymmetric(0.8, 0.3, 1.5, -0.4), poly(4), box(1, 120), 1.0),
+        "q1**2*p1**2 + p1**2 + 1.5*q1**2 + 0.8*q1*p1 + 0.3*p1 - 0.4*q1"),
     # Lyness 1945, x₊x₋ = a + x: (1 + x)(1 + y)(a + x + y)/(xy)
     "Lyness' map in logarithms": case((lyness(2.0), EXPONENTIALS, box(1, 80), 1.0), of_lyness(2.0)),
     # Suris 1989, Funct. Anal. Appl. 23, 74: for given x = q the two roots y = q − p of
     # cos(x − y) + k (cos x + cos y) have the sum 2 arg(e^{ix} + k)
-    "Suris' trigonometric map": case(
-        (suris(0.4), WAVES + poly(2), box(1, 100, -3.0, 3.0), 1.0),
-        "cos(p1) + 0.4 * (cos(q1) + cos(q1 - p1))",
-    ),
-    "discrete Toda lattice of two particles, open": case(
-        (toda(0.5), toda_basis(0.5, 2), box(2, 80), 0.5), ("p1 + p2", of_toda(0.5, 2)[0])
-    ),
-    "discrete Toda lattice of three particles, open": case(
-        (toda(0.5), toda_basis(0.5, 3), box(3, 100), 0.5), ("sum(p)", *of_toda(0.5, 3))
-    ),
-    "discrete Toda lattice of three particles, periodic": case(
-        (toda(0.5, True), toda_basis(0.5, 3, True), box(3, 120), 0.5),
-        ("sum(p)", *of_toda(0.5, 3, True)),
-    ),
+    "Suris' trigonometric map": case((suris(0.4), WAVES + poly(2), box(1, 100, -3.0, 3.0), 1.0),
+        "cos(p1) + 0.4 * (cos(q1) + cos(q1 - p1))"),
+    "discrete Toda lattice of two particles, open": case((toda(0.5), toda_basis(0.5, 2), box(2, 80),
+        0.5), ("p1 + p2", of_toda(0.5, 2)[0])),
+    "discrete Toda lattice of three particles, open": case((toda(0.5), toda_basis(0.5, 3),
+        box(3, 100), 0.5), ("sum(p)", *of_toda(0.5, 3))),
+    "discrete Toda lattice of three particles, periodic": case((toda(0.5, True),
+        toda_basis(0.5, 3, True), box(3, 120), 0.5), ("sum(p)", *of_toda(0.5, 3, True))),
     # x₊ + x₋ = 2μx/(1 + |x|²) conserves |x|²|y|² + |x|² + |y|² − 2μ x·y and x ∧ y: the isotropic
     # case of Garnier's system
-    "radial McMillan map in the plane": case(
-        (garnier(0.7, 0.7), poly(4), box(2, 150), 1.0), (L, of_garnier(0.7, 0.7))
-    ),
-    "discrete Garnier system": case(
-        (garnier(0.9, 0.5), poly(4), box(2, 150), 1.0),
-        (of_garnier(0.9, 0.5), of_garnier_too(0.9, 0.5)),
-    ),
+    "radial McMillan map in the plane": case((garnier(0.7, 0.7), poly(4), box(2, 150), 1.0),
+        (L, of_garnier(0.7, 0.7))),
+    "discrete Garnier system": case((garnier(0.9, 0.5), poly(4), box(2, 150), 1.0),
+        (of_garnier(0.9, 0.5), of_garnier_too(0.9, 0.5))),
     # separable: one invariant each
-    "McMillan's map and an oscillator": case(
-        (
-            separable("q1**2 - 0.7 * log(1 + q1**2) + 0.3 * q2**2 / 2"),
-            poly(4, ["q1", "p1"]) + poly(4, ["q2", "p2"]),
-            box(2, 120),
-            1.0,
-        ),
-        (BIQUADRATIC, energy(0.3, 1.0, 2)),
-    ),
-    "integrable discrete Duffing oscillator": case(
-        (duffing(1.0, 0.5, 0.25), poly(4), box(1, 120), 0.25), of_duffing(1.0, 0.5, 0.25)
-    ),
+    "McMillan's map and an oscillator": case((separable(
+        "q1**2 - 0.7 * log(1 + q1**2) + 0.3 * q2**2 / 2"),
+        poly(4, ["q1", "p1"]) + poly(4, ["q2", "p2"]), box(2, 120), 1.0),
+        (BIQUADRATIC, energy(0.3, 1.0, 2))),
+    "integrable discrete Duffing oscillator": case((duffing(1.0, 0.5, 0.25), poly(4), box(1, 120),
+        0.25), of_duffing(1.0, 0.5, 0.25)),
     # H = N², N = (q² + p²)/2 is a quadratic invariant of the equations: HLW IV.2.1
-    "function of an action, Gauss–Legendre": case(
-        (system("sum((q**2 + p**2)**2) / 4"), poly(4), box(1, 120), 0.3),
-        "q1**2 + p1**2",
-        method=GAUSS,
-    ),
+    "function of an action, Gauss–Legendre": case((system("sum((q**2 + p**2)**2) / 4"), poly(4),
+        box(1, 120), 0.3), "q1**2 + p1**2", method=GAUSS),
     # H = N₁² + N₁N₂: both actions are quadratic invariants of the equations: HLW IV.2.1
     "function of two actions, midpoint rule": case(
-        (
-            system("((q1**2 + p1**2) / 2)**2 + (q1**2 + p1**2) * (q2**2 + p2**2) / 4"),
-            poly(3),
-            box(2, 120),
-            0.3,
-        ),
-        ("q1**2 + p1**2", "q2**2 + p2**2"),
-        method=MIDPOINT,
-    ),
+        (system("((q1**2 + p1**2) / 2)**2 + (q1**2 + p1**2) * (q2**2 + p2**2) / 4"), poly(3),
+        box(2, 120), 0.3), ("q1**2 + p1**2", "q2**2 + p2**2"), method=MIDPOINT),
     # q1 = q/(1 − hq), p1 = p(1 − hq)², contracting in q, conserves p q²
-    "flow of a projective vector field": case(
-        (system("sum(p * q**2 / (1 - 0.25 * q))"), poly(4), box(1, 120), 0.25), "p1 * q1**2"
-    ),
+    "flow of a projective vector field": case((system("sum(p * q**2 / (1 - 0.25 * q))"), poly(4),
+        box(1, 120), 0.25), "p1 * q1**2"),
     # q1 = (1 + h) q, p1 = p/(1 + h) conserves q p
     "dilation": case((system("sum(q * p)"), poly(4), box(1, 120), 0.5), "q1 * p1"),
     # cos θ₁ = 3/4 and cos θ₂ = 4 cos³ θ₁ − 3 cos θ₁ = −9/16, so that ζ₁³ conj ζ₂ is conserved
-    "resonance 1:3 of the map": case(
-        (spring(0.5, 3.125), poly(4), box(2, 150), 1.0),
-        (*energies(1.0, 0.5, 3.125), resonant(0.5, 3, 3.125, 1)),
-    ),
+    "resonance 1:3 of the map": case((spring(0.5, 3.125), poly(4), box(2, 150), 1.0),
+        (*energies(1.0, 0.5, 3.125), resonant(0.5, 3, 3.125, 1))),
     # q₊ = p + f(q)/2 with f = 1.4 q/(1 + q²): the biquadratic and a constant
-    "McMillan's map by Strang's method": case(
-        (MCMILLAN, poly(4) + functions("1 / (1 + q1**2)"), box(1, 100), 1.0),
-        "(1 + q1**2) * p1**2 + q1**2 + 0.49 / (1 + q1**2)",
-        method=STRANG,
-    ),
+    "McMillan's map by Strang's method": case((MCMILLAN, poly(4) + functions("1 / (1 + q1**2)"),
+        box(1, 100), 1.0), "(1 + q1**2) * p1**2 + q1**2 + 0.49 / (1 + q1**2)", method=STRANG),
     # drift–kick: q₊ = q + p, the biquadratic of q and q + p
-    "McMillan's map by the adjoint method": case(
-        (MCMILLAN, poly(4), box(1, 100), 1.0), lambda q, p, t: BIQUADRATIC(q, -p, t), method=ADJOINT
-    ),
+    "McMillan's map by the adjoint method": case((MCMILLAN, poly(4), box(1, 100), 1.0), lambda q, p,
+        t: BIQUADRATIC(q, -p, t), method=ADJOINT),
     # q₊ + q₋ = a/q + b/q²: x²y² − a xy − b (x + y)
     "autonomous discrete Painlevé I with poles of order 2": case(
         (separable("sum(q**2 - 0.8 * log(q) + 0.3 / q)"), poly(4), POSITIVE, 1.0),
-        biquadratic(1.0, 0.0, 0.0, -0.8, -0.3),
-    ),
+        biquadratic(1.0, 0.0, 0.0, -0.8, -0.3)),
     # q₊ + q + q₋ = a/q + b: xy(x + y) − b xy − a (x + y)
     "autonomous discrete Painlevé I with poles of order 1": case(
         (separable("sum(1.5 * q**2 - 0.5 * q - 0.8 * log(q))"), poly(4), POSITIVE, 1.0),
-        biquadratic(0.0, 1.0, 0.0, -0.5, -0.8),
-    ),
+        biquadratic(0.0, 1.0, 0.0, -0.5, -0.8)),
     # q₊ + q₋ = (a q + b)/(1 − q²): −x²y² + x² + y² − a xy − b (x + y)
-    "autonomous discrete Painlevé II": case(
-        (qrt(-1.0, 0.0, 1.0, -0.8, -0.2), poly(4), box(1, 100, -0.9, 0.9), 1.0),
-        biquadratic(-1.0, 0.0, 1.0, -0.8, -0.2),
-    ),
+    "autonomous discrete Painlevé II": case((qrt(-1.0, 0.0, 1.0, -0.8, -0.2), poly(4),
+        box(1, 100, -0.9, 0.9), 1.0), biquadratic(-1.0, 0.0, 1.0, -0.8, -0.2)),
     # q·q, q·p and p·p are quadratic invariants of the equations: HLW IV.2.1
-    "free top by two vectors, midpoint rule": case(
-        (TWO_VECTORS, poly(2), box(3, 70), 0.2), ("q @ q", "q @ p", "p @ p"), method=MIDPOINT
-    ),
+    "free top by two vectors, midpoint rule": case((TWO_VECTORS, poly(2), box(3, 70), 0.2),
+        ("q @ q", "q @ p", "p @ p"), method=MIDPOINT),
     # as in the plane, with three components of x ∧ y, and functions of scalar products
-    "radial McMillan map in space": case(
-        (garnier(*SPACE), poly(2) + SCALAR_PRODUCTS, box(3, 90), 1.0),
-        (*ANGULAR, of_garnier(*SPACE)),
-    ),
-}
+    "radial McMillan map in space": case((garnier(*SPACE), poly(2) + SCALAR_PRODUCTS, box(3, 90),
+        1.0), (*ANGULAR, of_garnier(*SPACE))),
+}  # fmt: skip
 CASES = named("integrable", _CASES)

@@ -60,87 +60,51 @@ CHAIN = "[q1 - q4, q2 - q1, q3 - q2, q4 - q3]"
 GAUSS = dvi.GaussLegendre(2)
 
 _CASES = {
-    **{
-        f"three bodies in the plane, {name}": case(
-            (bodies(), bilinear(3), box((3, 2), 110), 0.05), of_bodies(*MASSES), method=method
-        )
-        for name, method in (
-            ("type II", dvi.TypeII()),
-            ("Strang", dvi.Strang()),
-            ("Yoshida", dvi.Yoshida(4)),
-            ("adjoint", dvi.Adjoint()),
-        )
-    },
-    "two bodies in the plane, Gauss–Legendre": case(
-        (PAIR, bilinear(2), box((2, 2), 60), 0.05), of_bodies(1, 1), method=GAUSS
-    ),
+    **{f"three bodies in the plane, {name}": case((bodies(), bilinear(3), box((3, 2), 110), 0.05),
+        of_bodies(*MASSES), method=method) for name, method in (("type II", dvi.TypeII()),
+        ("Strang", dvi.Strang()), ("Yoshida", dvi.Yoshida(4)), ("adjoint", dvi.Adjoint()))},
+    "two bodies in the plane, Gauss–Legendre": case((PAIR, bilinear(2), box((2, 2), 60), 0.05),
+        of_bodies(1, 1), method=GAUSS),
     # Galilei boosts: m₁q₁ + m₂q₂ − t (p₁ + p₂), since q1 = q + h p1/m and the total momentum is
     # constant
-    "centre of mass of two bodies on a line": case(
-        (
-            system("p1**2 / 2 + p2**2 / 4 + cosh(q1 - q2)"),
-            poly(2, ["q1", "q2", "p1", "p2", "t"]),
-            timed(box(2, 80)),
-        ),
-        ("p1 + p2", "q1 + 2 * q2 - t * (p1 + p2)"),
-    ),
+    "centre of mass of two bodies on a line": case((system("p1**2 / 2 + p2**2 / 4 + cosh(q1 - q2)"),
+        poly(2, ["q1", "q2", "p1", "p2", "t"]), timed(box(2, 80))),
+        ("p1 + p2", "q1 + 2 * q2 - t * (p1 + p2)")),
     "central force in the plane, quartic": case((CENTRAL, poly(4), box(2, 150), 0.3), L),
     "central force in space": case((CENTRAL, poly(2), box(3, 80), 0.3), ANGULAR),
-    "central force in space, Gauss–Legendre": case(
-        (CENTRAL, poly(2), box(3, 80), 0.2), ANGULAR, method=GAUSS
-    ),
-    "Kepler in space, adjoint": case(
-        (KEPLER, ENERGIES, shell(3, 80)), ANGULAR, method=dvi.Adjoint()
-    ),
-    "Kepler in space, Yoshida": case(
-        (KEPLER, ENERGIES, shell(3, 80), 0.3), ANGULAR, method=dvi.Yoshida(4)
-    ),
+    "central force in space, Gauss–Legendre": case((CENTRAL, poly(2), box(3, 80), 0.2), ANGULAR,
+        method=GAUSS),
+    "Kepler in space, adjoint": case((KEPLER, ENERGIES, shell(3, 80)), ANGULAR,
+        method=dvi.Adjoint()),
+    "Kepler in space, Yoshida": case((KEPLER, ENERGIES, shell(3, 80), 0.3), ANGULAR,
+        method=dvi.Yoshida(4)),
     # H does not depend on q₂, so that p₂ is conserved
     "cyclic coordinate with a mass that varies": case(
-        (system("p1**2 / 2 + p2**2 / (2 * (1 + q1**2)) + q1**4"), poly(3), box(2, 100)), "p2"
-    ),
+        (system("p1**2 / 2 + p2**2 / (2 * (1 + q1**2)) + q1**4"), poly(3), box(2, 100)), "p2"),
     # the azimuth is cyclic; type II solves for p_θ alone
-    "spherical pendulum in angles": case(
-        (
-            SPHERE,
-            poly(3, MOMENTA) + trig(2, "q1") + (poly(1, MOMENTA) * trig(1, "q1")),
-            ON_SPHERE,
-            0.05,
-        ),
-        "p2",
-    ),
-    "spherical pendulum in angles, Strang": case(
-        (SPHERE, poly(3, MOMENTA) + trig(2, "q1"), ON_SPHERE, 0.05), "p2", method=dvi.Strang()
-    ),
+    "spherical pendulum in angles": case((SPHERE,
+        poly(3, MOMENTA) + trig(2, "q1") + (poly(1, MOMENTA) * trig(1, "q1")), ON_SPHERE, 0.05),
+        "p2"),
+    "spherical pendulum in angles, Strang": case((SPHERE, poly(3, MOMENTA) + trig(2, "q1"),
+        ON_SPHERE, 0.05), "p2", method=dvi.Strang()),
     # turning both arms: p₁ + p₂, for the kinetic energy depends on q₁ − q₂
-    "double pendulum without gravity": case(
-        (PENDULA, ANGLES, box(2, 80), 0.05), "p1 + p2", method=dvi.Strang()
-    ),
+    "double pendulum without gravity": case((PENDULA, ANGLES, box(2, 80), 0.05), "p1 + p2",
+        method=dvi.Strang()),
     # translations; Fermi, Pasta, Ulam & Tsingou 1955
-    "periodic chain of four masses": case(
-        (
-            separable(f"sum(array({CHAIN})**2 / 2 + 0.25 * array({CHAIN})**3 / 3)"),
-            poly(2),
-            box(4, 110),
-        ),
-        "sum(p)",
-        method=dvi.Strang(),
-    ),
+    "periodic chain of four masses": case((separable(
+        f"sum(array({CHAIN})**2 / 2 + 0.25 * array({CHAIN})**3 / 3)"), poly(2), box(4, 110)),
+        "sum(p)", method=dvi.Strang()),
     # x cos z + y sin z is invariant under turns about z by α with shifts of z by α: L₃ + p₃
-    "screw symmetry": case(
-        (separable("q1 * cos(q3) + q2 * sin(q3)"), poly(2), box(3, 80), 0.3), f"{L} + p3"
-    ),
+    "screw symmetry": case((separable("q1 * cos(q3) + q2 * sin(q3)"), poly(2), box(3, 80), 0.3),
+        f"{L} + p3"),
     # linear map: p₁ − q₂/2, p₂ + q₁/2 (translations) and the kinetic energy; L depends on them
-    "magnetic field, symmetric gauge": case(
-        (system(KINETIC), poly(2), box(2, 80)), ("p1 - q2/2", "p2 + q1/2", KINETIC)
-    ),
+    "magnetic field, symmetric gauge": case((system(KINETIC), poly(2), box(2, 80)),
+        ("p1 - q2/2", "p2 + q1/2", KINETIC)),
     # Froeschlé's map with the coupling cos(q₁ + q₂) alone: p₁ − p₂
-    "coupled standard maps with one sum of angles": case(
-        (separable("-0.8 * cos(q1 + q2)"), ANGLES, box(2, 80, -3.0, 3.0), 1.0), "p1 - p2"
-    ),
+    "coupled standard maps with one sum of angles": case((separable("-0.8 * cos(q1 + q2)"), ANGLES,
+        box(2, 80, -3.0, 3.0), 1.0), "p1 - p2"),
     # potential of q₁² + q₂² and q₃: L₃ only, in space
     "two springs with equal constants, and a third axis": case(
-        (separable("(q1**2 + q2**2)**2 / 4 + q3**4 / 4 + q3 * (q @ q)"), poly(2), box(3, 80)), L
-    ),
-}
+        (separable("(q1**2 + q2**2)**2 / 4 + q3**4 / 4 + q3 * (q @ q)"), poly(2), box(3, 80)), L),
+}  # fmt: skip
 CASES = named("momentum maps", _CASES)

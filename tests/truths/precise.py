@@ -30,6 +30,7 @@ jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp  # noqa: E402
 import mpmath  # noqa: E402
 import numpy as np  # noqa: E402
+import sympy  # noqa: E402
 from jax.extend.core import ClosedJaxpr  # noqa: E402
 from jax.interpreters import partial_eval  # noqa: E402
 
@@ -253,7 +254,8 @@ class Step:
         return solved(lambda y: y - function(y), first)
 
     def _gauss(self, stages, q, p, t0, t1, h):
-        nodes = [r.real for r in mpmath.polyroots(_legendre(stages), maxsteps=200, extraprec=200)]
+        roots = sympy.Poly(sympy.legendre(stages, sympy.Symbol("x"))).nroots(n=70)
+        nodes = [mpf(str(r)) for r in roots]
         c = [(x + 1) / 2 for x in sorted(nodes)]
         powers = mpmath.matrix([[x**k for x in c] for k in range(stages)])
         b = mpmath.lu_solve(powers, mpmath.matrix([mpf(1) / (k + 1) for k in range(stages)]))
@@ -280,18 +282,6 @@ class Step:
         f = rates(z)
         z1 = z0 + h * sum(b[j] * f[j] for j in range(stages))
         return z1[:n].reshape(self.shape), z1[n:].reshape(self.shape)
-
-
-def _legendre(n):
-    """Coefficients, highest power first."""
-    low, high = [mpf(1)], [mpf(1), mpf(0)]
-    if n == 0:
-        return low
-    for k in range(1, n):
-        longer = [(2 * k + 1) * x for x in [*high, 0]]
-        shorter = [0, 0, *[k * x for x in low]]
-        low, high = high, [(x - y) / (k + 1) for x, y in zip(longer, shorter, strict=True)]
-    return high
 
 
 def eliminated(matrix, zero):

@@ -147,107 +147,53 @@ IN_TIME = timed(LINE, 0.0, 3.0)
 _EXACT = {
     "central force in the plane": fixed(CENTRAL, box(2, 200), (1,), TURN, basis=poly(1)),
     "linear map of one oscillator": fixed(OSCILLATOR, LINE, (2,), FIRST, DILATION, variational=1),
-    "linear map of one oscillator, with time": moving(
-        OSCILLATOR, LINE, (3,), TIME, FIRST, DILATION, variational=2
-    ),
-    "linear map of one oscillator, quadratic vector fields": fixed(
-        OSCILLATOR, LINE, (2,), FIRST, DILATION, variational=1, basis=poly(2)
-    ),
-    "linear map of one oscillator, cubic vector fields": fixed(
-        OSCILLATOR, box(1, 80), (4,), FIRST, DILATION, variational=1, basis=poly(3)
-    ),
-    "linear map of two equal oscillators": fixed(
-        system(TWO), PLANE, (8,), FIRST, SECOND, TURN, DILATION, variational=3
-    ),
-    "linear map of frequencies 1 and √2": fixed(
-        OSCILLATORS[0], PLANE, (4,), FIRST, flow(form(2, 2)), only(0, 2), only(1, 2), variational=2
-    ),
-    "linear map of frequencies 1, 1 and √2": fixed(
-        OSCILLATORS[1],
-        box(3, 80),
-        (10,),
-        *(FIRST, SECOND, TURN, flow(form(3, 2)), only(2, 3), DILATION),
-        variational=4,
-    ),
-    "linear map of frequencies 1 and 1.0005": fixed(
-        OSCILLATORS[2],
-        PLANE,
-        (4,),
-        *(FIRST, flow(form(2, 1.001)), only(0, 2), only(1, 2)),
-        variational=2,
-    ),
-    "linear map over a hill": fixed(
-        system("(p @ p - q @ q) / 2"), LINE, (2,), flow(OVER_THE_HILL), DILATION, variational=1
-    ),
-    "free particle on a line": moving(
-        FREE_SYSTEM,
-        IN_TIME,
-        (7,),
-        *(TIME, ALONG, boost([1.0]), scaling(0.5, -0.5, 1.0)),
-        basis=TIMED[0],
-    ),
-    "free particle on a line, without time": fixed(
-        FREE_SYSTEM, LINE, (3,), ALONG, DILATION, variational=1
-    ),
-    "falling particle, without time": fixed(
-        FALLING, IN_TIME, (3,), ALONG, boost([1.0]), basis=TIMED[0]
-    ),
+    "linear map of one oscillator, with time": moving(OSCILLATOR, LINE, (3,), TIME, FIRST, DILATION,
+        variational=2),
+    "linear map of one oscillator, quadratic vector fields": fixed(OSCILLATOR, LINE, (2,), FIRST,
+        DILATION, variational=1, basis=poly(2)),
+    "linear map of one oscillator, cubic vector fields": fixed(OSCILLATOR, box(1, 80), (4,), FIRST,
+        DILATION, variational=1, basis=poly(3)),
+    "linear map of two equal oscillators": fixed(system(TWO), PLANE, (8,), FIRST, SECOND, TURN,
+        DILATION, variational=3),
+    "linear map of frequencies 1 and √2": fixed(OSCILLATORS[0], PLANE, (4,), FIRST,
+        flow(form(2, 2)), only(0, 2), only(1, 2), variational=2),
+    "linear map of frequencies 1, 1 and √2": fixed(OSCILLATORS[1], box(3, 80), (10,),
+        *(FIRST, SECOND, TURN, flow(form(3, 2)), only(2, 3), DILATION), variational=4),
+    "linear map of frequencies 1 and 1.0005": fixed(OSCILLATORS[2], PLANE, (4,),
+        *(FIRST, flow(form(2, 1.001)), only(0, 2), only(1, 2)), variational=2),
+    "linear map over a hill": fixed(system("(p @ p - q @ q) / 2"), LINE, (2,), flow(OVER_THE_HILL),
+        DILATION, variational=1),
+    "free particle on a line": moving(FREE_SYSTEM, IN_TIME, (7,),
+        *(TIME, ALONG, boost([1.0]), scaling(0.5, -0.5, 1.0)), basis=TIMED[0]),
+    "free particle on a line, without time": fixed(FREE_SYSTEM, LINE, (3,), ALONG, DILATION,
+        variational=1),
+    "falling particle, without time": fixed(FALLING, IN_TIME, (3,), ALONG, boost([1.0]),
+        basis=TIMED[0]),
     "central force, with time": moving(CENTRAL, PLANE, (2,), TIME, TURN),
-    "rotations of a central force in space": fixed(
-        CENTRAL, box(3, 100), (3,), TURN, rotation(1, 2), rotation(0, 2)
-    ),
+    "rotations of a central force in space": fixed(CENTRAL, box(3, 100), (3,), TURN, rotation(1, 2),
+        rotation(0, 2)),
     "central force, few samples": fixed(CENTRAL, box(2, 14), (1,), TURN),
     "central force, 5 % outliers": fixed(CENTRAL, OUTLIERS, (1,), TURN),
-    **{
-        f"central force about ({c:g}, {c:g})": fixed(
-            system(central(offset=c)), moved(PLANE, q=c), (1,), around(c)
-        )
-        for c in (3.0, 1000.0)
-    },
+    **{f"central force about ({c:g}, {c:g})": fixed(system(central(offset=c)), moved(PLANE, q=c),
+        (1,), around(c)) for c in (3.0, 1000.0)},
     "cyclic coordinate": fixed(CYCLIC, PLANE, (2,), RIGHT),
-    "quartic well: scaling of the time": moving(
-        WELL,
-        timed(box(1, 80), 0.0, 3.0),
-        (2,),
-        *(TIME, scaling(1.0, 2.0, -1.0)),
-        variational=1,
-        basis=TIMED[0],
-    ),
-    "Kepler's third law": moving(
-        KEPLER_SYSTEM,
-        timed(between(2, 120), 0.0, 3.0),
-        (3,),
-        *(TIME, TURN, scaling(1.0, -0.5, 1.5)),
-        variational=2,
-        basis=TIMED[1],
-    ),
+    "quartic well: scaling of the time": moving(WELL, timed(box(1, 80), 0.0, 3.0), (2,),
+        *(TIME, scaling(1.0, 2.0, -1.0)), variational=1, basis=TIMED[0]),
+    "Kepler's third law": moving(KEPLER_SYSTEM, timed(between(2, 120), 0.0, 3.0), (3,),
+        *(TIME, TURN, scaling(1.0, -0.5, 1.5)), variational=2, basis=TIMED[1]),
     "Kepler, samples close to the centre": fixed(KEPLER_SYSTEM, near_and_far, (1,), TURN),
     "orbits of the Earth in km and s": fixed(EARTH, orbits_in_km, (1,), TURN, h=10.0),
-    "inverse square potential: scaling is variational": moving(
-        INVERSE_SQUARE,
-        timed(between(2, 120), 0.0, 3.0),
-        (3,),
-        *(TIME, TURN, scaling(0.5, -0.5, 1.0)),
-        basis=TIMED[1],
-    ),
-    "two bodies in the plane": fixed(
-        PAIR,
-        box((2, 2), 80),
-        (11,),
-        *(RIGHT, space_translation([0.0, 1.0]), TURN, CENTRE_TURNED, CENTRE),
-        variational=4,
-    ),
-    "two bodies on a line, with boosts": fixed(
-        PAIR,
-        timed(box((2, 1), 80), 0.0, 3.0),
-        (4,),
-        *(ALONG, boost([1.0], [1.0, 2.0])),
-        basis=TIMED[1],
-    ),
+    "inverse square potential: scaling is variational": moving(INVERSE_SQUARE,
+        timed(between(2, 120), 0.0, 3.0), (3,), *(TIME, TURN, scaling(0.5, -0.5, 1.0)),
+        basis=TIMED[1]),
+    "two bodies in the plane": fixed(PAIR, box((2, 2), 80), (11,),
+        *(RIGHT, space_translation([0.0, 1.0]), TURN, CENTRE_TURNED, CENTRE), variational=4),
+    "two bodies on a line, with boosts": fixed(PAIR, timed(box((2, 1), 80), 0.0, 3.0), (4,),
+        *(ALONG, boost([1.0], [1.0, 2.0])), basis=TIMED[1]),
     "three bodies on a line": fixed(TRIPLE, box((3, 1), 80), (3,), ALONG, CENTRE, variational=1),
     "Hénon–Heiles, with time": moving(HENON_HEILES, PLANE, (1,), TIME),
     "pendulum in affine vector fields": moving(system("p @ p / 2 - cos(q1)"), LINE, (1,), TIME),
-}
+}  # fmt: skip
 _BROKEN = {
     "central force with an axis stiffer by 1e-3": fixed(system(central(1e-3)), PLANE, (0,)),
     "central force with an axis stiffer by 1e-6": fixed(system(central(1e-6)), PLANE, (0,)),
@@ -266,34 +212,21 @@ _BROKEN = {
 _FIRST = {
     "central perturbation": fixed(perturbed("q @ q", central()), PLANE, (1, 1), TURN),
     "perturbation of one axis": fixed(perturbed("q1**2", central()), PLANE, (1, 0)),
-    "perturbation of one axis by 1e-12": fixed(
-        perturbed("1e-12 * q1**2", central()), PLANE, (1, 0)
-    ),
-    "spring of one oscillator, order 2": fixed(
-        forced("-q"), LINE, (2, 2, 2), FIRST, DILATION, variational=1
-    ),
+    "perturbation of one axis by 1e-12": fixed(perturbed("1e-12 * q1**2", central()), PLANE,
+        (1, 0)),
+    "spring of one oscillator, order 2": fixed(forced("-q"), LINE, (2, 2, 2), FIRST, DILATION,
+        variational=1),
     "friction of one oscillator": fixed(forced("-p"), LINE, (2, 2), FIRST, DILATION, variational=0),
     "cubic force on one oscillator, affine vector fields": fixed(forced("-q**3"), LINE, (2, 0)),
-    "cubic force on one oscillator, cubic vector fields": fixed(
-        forced("-q**3"), box(1, 100), (4, 1), FIRST, basis=poly(3)
-    ),
-    "friction under a central force": fixed(
-        forced("-p", central()), PLANE, (1, 1), TURN, variational=0
-    ),
-    "friction and translations": fixed(
-        forced("-p", springs(2)), box((2, 1), 80), (3, 3), ALONG, CENTRE, variational=0
-    ),
-    "two equal oscillators, coupled by q1q2": fixed(
-        perturbed("q1*q2"),
-        PLANE,
-        (8, 4),
-        flow(TOTAL),
-        flow(MIXED),
-        DILATION,
-        SWAPPED,
-        variational=2,
-    ),
-}
+    "cubic force on one oscillator, cubic vector fields": fixed(forced("-q**3"), box(1, 100),
+        (4, 1), FIRST, basis=poly(3)),
+    "friction under a central force": fixed(forced("-p", central()), PLANE, (1, 1), TURN,
+        variational=0),
+    "friction and translations": fixed(forced("-p", springs(2)), box((2, 1), 80), (3, 3), ALONG,
+        CENTRE, variational=0),
+    "two equal oscillators, coupled by q1q2": fixed(perturbed("q1*q2"), PLANE, (8, 4), flow(TOTAL),
+        flow(MIXED), DILATION, SWAPPED, variational=2),
+}  # fmt: skip
 
 STILL, TURNING = box(1, 40), (TURN, NONE)
 TWO_OF = box(2, 60)
@@ -302,71 +235,52 @@ _GAUGES = {
     # H_D is the same for rotated states: G = 0
     "rotation under a central force": gauge((CENTRAL, poly(1), TWO_OF), TURN, closes=(True,)),
     # the torque is a cubic polynomial
-    "rotation, Hénon–Heiles, linear gauges": gauge(
-        (HENON_HEILES, poly(1), TWO_OF), TURN, closes=(False,)
-    ),
+    "rotation, Hénon–Heiles, linear gauges": gauge((HENON_HEILES, poly(1), TWO_OF), TURN,
+        closes=(False,)),
     # trivial
-    "rotation, Hénon–Heiles, quadratic gauges": gauge(
-        (HENON_HEILES, poly(2), TWO_OF), TURN, closes=(True,)
-    ),
+    "rotation, Hénon–Heiles, quadratic gauges": gauge((HENON_HEILES, poly(2), TWO_OF), TURN,
+        closes=(True,)),
     # N = p·v/h (h − h) − …: G = −q; p is conserved, and N is −v·p
-    **{
-        f"boost of a free particle, gauge {v}": gauge(
-            (FREE_SYSTEM, poly(1, v), timed(STILL, 0.0, 3.0)), boost([1.0]), closes=(v == "q",)
-        )
-        for v in ("q", "p")
-    },
+    **{f"boost of a free particle, gauge {v}": gauge((FREE_SYSTEM, poly(1, v),
+        timed(STILL, 0.0, 3.0)), boost([1.0]), closes=(v == "q",)) for v in ("q", "p")},
     # H_D does not depend on the time: G = 0
-    "time under Kepler's force": gauge(
-        (KEPLER_SYSTEM, poly(1), between(2, 60)), TIME, closes=(True,)
-    ),
+    "time under Kepler's force": gauge((KEPLER_SYSTEM, poly(1), between(2, 60)), TIME,
+        closes=(True,)),
     # the power of the drive depends on the time
     "time under a drive": gauge((DRIVEN, poly(2), IN_TIME), TIME, closes=(False,)),
     # the force is constant: G = t; q does not grow as t
-    **{
-        f"translation in a uniform field, gauge {v}": gauge(
-            (FALLING, poly(1, v), timed(STILL, 0.0, 3.0)), ALONG, closes=(v == "t",)
-        )
-        for v in ("t", "q")
-    },
+    **{f"translation in a uniform field, gauge {v}": gauge((FALLING, poly(1, v),
+        timed(STILL, 0.0, 3.0)), ALONG, closes=(v == "t",)) for v in ("t", "q")},
     # it doubles the action, which is quadratic
-    "scaling of an oscillator, linear gauges": gauge(
-        (OSCILLATOR, poly(1), LINE), DILATION, closes=(False,)
-    ),
+    "scaling of an oscillator, linear gauges": gauge((OSCILLATOR, poly(1), LINE), DILATION,
+        closes=(False,)),
     # trivial
-    "scaling of an oscillator, quadratic gauges": gauge(
-        (OSCILLATOR, poly(2), LINE), DILATION, closes=(True,)
-    ),
+    "scaling of an oscillator, quadratic gauges": gauge((OSCILLATOR, poly(2), LINE), DILATION,
+        closes=(True,)),
     # G = K − ξ·p
     "flow of the form of an oscillator": gauge((OSCILLATOR, poly(2), LINE), FIRST, closes=(True,)),
     # H1_D is the same for rotated states
-    "rotation and a central perturbation": gauge(
-        (perturbed("(q @ q)**2", central()), poly(1), TWO_OF), TURNING, closes=(True, True)
-    ),
+    "rotation and a central perturbation": gauge((perturbed("(q @ q)**2", central()), poly(1),
+        TWO_OF), TURNING, closes=(True, True)),
     # the torque is −2 q1q2, not a difference
-    "rotation and a perturbation of one axis": gauge(
-        (perturbed("q1**2", central()), poly(1), TWO_OF), TURNING, closes=(True, False)
-    ),
+    "rotation and a perturbation of one axis": gauge((perturbed("q1**2", central()), poly(1),
+        TWO_OF), TURNING, closes=(True, False)),
     # the torque of friction is −L, which does not change at ε = 0
-    "rotation and friction, linear gauges": gauge(
-        (forced("-p", central()), poly(1), TWO_OF), TURNING, closes=(True, False)
-    ),
+    "rotation and friction, linear gauges": gauge((forced("-p", central()), poly(1), TWO_OF),
+        TURNING, closes=(True, False)),
     # trivial
-    "rotation and friction, quadratic gauges": gauge(
-        (forced("-p", central()), poly(2), TWO_OF), TURNING, closes=(True, True)
-    ),
+    "rotation and friction, quadratic gauges": gauge((forced("-p", central()), poly(2), TWO_OF),
+        TURNING, closes=(True, True)),
     # H_D + ε H1_D does not depend on the time
-    "time and a perturbation of an oscillator": gauge(
-        (perturbed("q1**2 / 2", ONE), poly(2), LINE), (TIME, NONE), closes=(True, True)
-    ),
+    "time and a perturbation of an oscillator": gauge((perturbed("q1**2 / 2", ONE), poly(2), LINE),
+        (TIME, NONE), closes=(True, True)),
     # the work −q0 (q1 − q0) is a difference less (q1 − q0)²/2, whose mean is not zero; the form,
     # which may be added to G_0, is conserved at order 1
-    "time and a spring as a force": gauge(
-        (forced("-q"), poly(2), LINE), (TIME, NONE), closes=(True, False)
-    ),
+    "time and a spring as a force": gauge((forced("-q"), poly(2), LINE), (TIME, NONE),
+        closes=(True, False)),
     # the mean power of friction is balanced by the decay of a multiple of the form in G_0
     "time and friction": gauge((forced("-p"), poly(2), LINE), (TIME, NONE), closes=(True, True)),
-}
+}  # fmt: skip
 SYMMETRIES = (
     *named("symmetries", _EXACT),
     *named("broken symmetries", _BROKEN),
