@@ -237,6 +237,8 @@ def library_problem(
     start: Start,
     parameters: Mapping[str, Parameter] = MappingProxyType({}),
     observables: Sequence[Callable[..., Any]] = (),
+    *,
+    q0_p0_h: tuple[Any, Any, float],
     autonomous: bool = True,
     **fields: Any,
 ) -> Problem:
@@ -244,13 +246,14 @@ def library_problem(
 
     - `system`: the `System`, or its Hamiltonian.
     - `start`: check of initial conditions; those of `parameters` are added to it.
+    - `q0_p0_h`: initial conditions and step size. `fields`: the other fields of `Problem`.
     - `autonomous`: whether H is independent of time at ε = 0. The energy is then an observable and
       an invariant, and the translation in time a symmetry, though not one of a system with a slow
       time or a constraint: symmetries are those of the type II map.
-    - `fields`: the other fields of `Problem`.
     """
     system = system if isinstance(system, System) else System(system)
-    fields = {"units": DIMENSIONLESS, **fields}
+    q0, p0, h = q0_p0_h
+    fields = {"units": DIMENSIONLESS, "q0": q0, "p0": p0, "h": h, **fields}
     if autonomous:
         observables = (at_end(system.H_D), *observables)
         fields["invariants"] = ("energy", *fields.get("invariants", ()))

@@ -81,9 +81,7 @@ def dipole_field(radius: float = 50.0) -> Problem:
             "the dipole field holds one particle in space", (3,), singular={"the dipole": (0, 0, 0)}
         ),
         name="dipole_field",
-        q0=np.array([radius, 0.0, 0.0]),
-        p0=v0 + A,
-        h=0.1,
+        q0_p0_h=(np.array([radius, 0.0, 0.0]), v0 + A, 0.1),
         parameters={
             **guiding_centre.PARTICLE,
             "B0": Parameter(

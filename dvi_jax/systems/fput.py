@@ -58,9 +58,7 @@ def fput(n: int = 31, alpha: float = 0.25, beta: float = 0.0) -> Problem:
         hamiltonian,
         Start("the FPUT chain is a row of particles between two walls", (None,)),
         name="fput",
-        q0=np.sin(np.pi * np.arange(1, n + 1) / (n + 1)),
-        p0=np.zeros(n),
-        h=0.2,
+        q0_p0_h=(np.sin(np.pi * np.arange(1, n + 1) / (n + 1)), np.zeros(n), 0.2),
         parameters={
             "alpha": Parameter(alpha, "quadratic part of a spring's force [1]", finite),
             "beta": Parameter(beta, "cubic part of a spring's force [1]", finite),

@@ -80,9 +80,7 @@ def relativistic_kepler() -> Problem:
             check=_misses_the_centre,
         ),
         name="relativistic_kepler",
-        q0=np.array([0.6, 0.0]),
-        p0=np.array([0.0, 1.5]),
-        h=0.02,
+        q0_p0_h=(np.array([0.6, 0.0]), np.array([0.0, 1.5]), 0.02),
         parameters={
             "K": Parameter(1.0, "root of the strength of attraction, K² = GM [length^(3/2)/time]"),
             "c": Parameter(10.0, "speed of light [length/time]"),

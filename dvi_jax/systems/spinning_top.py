@@ -158,9 +158,7 @@ def spinning_top() -> Problem:
         hamiltonian,
         Start("the top has Euler's angles (φ, θ, ψ)", (3,), check=_leans),
         name="spinning_top",
-        q0=np.array([0.0, 0.6, 0.0]),
-        p0=np.array([2.4, 0.1, 2.5]),
-        h=0.02,
+        q0_p0_h=(np.array([0.0, 0.6, 0.0]), np.array([2.4, 0.1, 2.5]), 0.02),
         parameters={
             "A": Parameter(
                 1.0, "moment of inertia about the fixed point, across the axis [mass length²]"
