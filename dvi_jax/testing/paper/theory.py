@@ -261,20 +261,11 @@ def _kepler_balance(triples, gain):
     epsilon = jnp.asarray(EPSILON)
 
     def terms(previous, current, second, gain):
-        def identity(order):
-            return dvi.noether_identity(
-                problem.system,
-                series,
-                gauges,
-                order,
-                current,
-                second,
-                epsilon,
-                problem.args,
-            )
-
         velocity = (second.q - current.q) / (second.t - current.t)
-        zeroth, first = identity(0), identity(1)
+        place = current, second, epsilon, problem.args
+        zeroth, first = (
+            dvi.noether_identity(problem.system, series, gauges, order, *place) for order in (0, 1)
+        )
         _, xi, _ = CLOCKED_ROTATION(current, problem.args)
         work = EPSILON**2 * jnp.sum(-current.q * (xi - velocity))
         defect = dvi.lattice_defect(
