@@ -88,9 +88,7 @@ def encounter_time(t, q, p, args):
 
 
 OBSERVABLES: dict[str, Callable[..., Any]] = {
-    "energy": energy,
-    "linear_momentum": linear_momentum,
-    "angular_momentum": angular_momentum,
+    f.__name__: f for f in (energy, linear_momentum, angular_momentum)
 }
 
 

@@ -65,10 +65,8 @@ def exact(t, q0, p0, args):
     large, sign = jnp.where(swings, 2.0, m), jnp.where(p0 < 0, -1.0, 1.0)
     root = jnp.sqrt(large)
     _, _, dn, am = jacobi(root * w * t + first_kind(sign * q0 / 2, 1 / large), 1 / large)
-    q, p = (
-        jnp.where(swings, q_swing, 2 * sign * am),
-        jnp.where(swings, p_swing, 2 * sign * w * root * dn),
-    )
+    q = jnp.where(swings, q_swing, 2 * sign * am)
+    p = jnp.where(swings, p_swing, 2 * sign * w * root * dn)
     return q + 0 * m, p + 0 * m
 
 

@@ -71,14 +71,10 @@ def relativistic_kepler() -> Problem:
 
     **Source** Sommerfeld 1916, *Ann. Phys.* 356, 1.
     """
+    rule = "the relativistic Kepler problem is in the plane"
     return library_problem(
         hamiltonian,
-        Start(
-            "the relativistic Kepler problem is in the plane",
-            (2,),
-            singular={"the centre": (0, 0)},
-            check=_misses_the_centre,
-        ),
+        Start(rule, (2,), singular={"the centre": (0, 0)}, check=_misses_the_centre),
         name="relativistic_kepler",
         q0_p0_h=(np.array([0.6, 0.0]), np.array([0.0, 1.5]), 0.02),
         parameters={

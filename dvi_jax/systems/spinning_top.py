@@ -74,12 +74,8 @@ def _turning_points(E, p_phi, p_psi, args):
     def polish(x, sign):
         """A root x = 1 + sign u: the same cubic in x, times A²."""
         P, free = p_phi + sign * p_psi, E + sign * w
-        cubic = (
-            2 * sign * A * w,
-            -4 * sign * A * w - 2 * A * free - p_psi**2,
-            4 * A * free + 2 * sign * P * p_psi,
-            -(P**2),
-        )
+        cubic = 2 * sign * A * w, -4 * sign * A * w - 2 * A * free - p_psi**2
+        cubic = (*cubic, 4 * A * free + 2 * sign * P * p_psi, -(P**2))
         for _ in range(4):
             value, slope = cubic[0], 0.0
             for coefficient in cubic[1:]:

@@ -106,6 +106,6 @@ def uniform_field() -> Problem:
         units={"q": "1", "p": "1", "t": "1/gyrofrequency", "energy": "1"},
         source="Jackson 1999, Classical Electrodynamics, 12.2–12.3",
         invariants=("magnetic_moment", "pseudomomentum"),
-        symmetries={**{f"magnetic_translation_{x}": _translation(i) for i, x in enumerate("xyz")}},
+        symmetries={f"magnetic_translation_{x}": _translation(i) for i, x in enumerate("xyz")},
         exact=exact,
     )

@@ -34,12 +34,7 @@ class Certificate:
     @property
     def failures(self) -> list[tuple[str, str, Measured]]:
         """(method, check, measured) wherever a method lacks a property that it claims."""
-        return [
-            (method, check, result)
-            for method, row in self.rows.items()
-            for check, result in row.items()
-            if not result.ok
-        ]
+        return [(m, c, x) for m, row in self.rows.items() for c, x in row.items() if not x.ok]
 
     @property
     def missed(self) -> list[Control]:
