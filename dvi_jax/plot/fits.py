@@ -320,7 +320,7 @@ def _of_parameters(fit: Any, params: Sequence[str] | None) -> tuple[list[int], n
     """(numbers of the parameters that are drawn, values of all), checked."""
     names, variances = list(fit.names), np.diag(np.asarray(fit.covariance))
     pairs = zip(names, variances, strict=True)
-    determinate = [name for name, v in pairs if np.isfinite(v) and v > 0]
+    determinate = [name for name, variance in pairs if np.isfinite(variance) and variance > 0]
     if params is None:
         draw.at_most(_PARAMETERS, len(names), "parameters", f"params={names[:3]}")
     params = names if params is None else [params] if isinstance(params, str) else [*params]

@@ -63,7 +63,7 @@ class _Points(NamedTuple):
             "did not cross": none if none < total else 0,
             "have no count of crossings": ~np.isfinite(counts) & ~has_failed,
         }
-        sums = {f"of {total} orbits {text}": np.sum(n) for text, n in texts.items()}
+        sums = {f"of {total} orbits {text}": np.sum(number) for text, number in texts.items()}
         return counts_text(sums)
 
     def draw(

@@ -34,7 +34,8 @@ class Certificate:
     @property
     def failures(self) -> list[tuple[str, str, Measured]]:
         """(method, check, measured) wherever a method lacks a property that it claims."""
-        return [(m, c, x) for m, row in self.rows.items() for c, x in row.items() if not x.ok]
+        results = ((name, check, row[check]) for name, row in self.rows.items() for check in row)
+        return [entry for entry in results if not entry[2].ok]
 
     @property
     def missed(self) -> list[Control]:

@@ -127,7 +127,7 @@ def _with_other_digits() -> dvi.Method:
     return dvi.Composition(c, order=2)
 
 
-_first, _second = (partial(altered, x) for x in (dvi.TypeII(), dvi.Strang()))
+_first, _second = (partial(altered, base) for base in (dvi.TypeII(), dvi.Strang()))
 _RK4 = altered(dvi.RungeKutta4(), is_symplectic=True)
 _OTHER_DIGITS = "KahanLi8 with coefficients changed by 1e-3, declared of order 8"
 _FIXED_TIME = "Strang with the force at the initial time of the step only"

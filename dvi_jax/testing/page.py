@@ -103,7 +103,7 @@ def markdown(
     versions = ", ".join(f"{n} {version(n)}" for n in ("dvi-jax", "jax", "jaxlib", "numpy"))
     python = ".".join(platform.python_version_tuple()[:2])
     checks = {name for table in sheets for name in table.columns} & set(CHECKS)
-    parts = [f"## {t.title}\n\n{markdown_table(t.columns, t.rows)}" for t in sheets]
+    parts = [f"## {sheet.title}\n\n{markdown_table(sheet.columns, sheet.rows)}" for sheet in sheets]
     if failures:
         faults = [
             f"- {method}, {check}: {result.verdict}, allowed {result.allowed}. {result.detail}"

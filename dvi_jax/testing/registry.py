@@ -12,7 +12,7 @@ _JUMP = 1 / (2 - 2 ** (1 / 3))
 
 def _family(method: type[Any], *numbers: int) -> dict[str, dvi.Method]:
     """Methods by their name with the order or the number of stages."""
-    return {f"{method.__name__}{n}": method(n) for n in numbers}
+    return {f"{method.__name__}{number}": method(number) for number in numbers}
 
 
 METHODS: dict[str, dvi.Method] = {
