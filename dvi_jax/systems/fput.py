@@ -15,8 +15,8 @@ def hamiltonian(t0, t1, q0, p1, args):
     d_i = q0_{i+1} − q0_i,    q0_0 = q0_{n+1} = 0
     """
     d = jnp.diff(jnp.pad(q0, 1))
-    springs = d**2 / 2 + args["alpha"] * d**3 / 3 + args["beta"] * d**4 / 4
-    return jnp.sum(p1**2) / 2 + jnp.sum(springs)
+    kinetic = jnp.sum(p1**2) / 2
+    return kinetic + jnp.sum(d**2 / 2 + args["alpha"] * d**3 / 3 + args["beta"] * d**4 / 4)
 
 
 def frequencies(n):
