@@ -16,7 +16,7 @@ def _names_in(file: str, pattern: str) -> tuple[str, ...]:
 
 VERSION = _names_in("__init__.py", r'^__version__ = "(.*)"')[0]
 
-SYSTEMS = _names_in("systems/__init__.py", r'^    "(\w+)": \w+,$')
+SYSTEMS = tuple(", ".join(_names_in("systems/__init__.py", r"^        \*\((.+)\),$")).split(", "))
 """Systems of the library."""
 
 METHODS = _names_in("testing/registry.py", r'^    "(\w+)": ')

@@ -10,7 +10,7 @@ from .assumed import Assumptions
 from .jaxprs.jaxapi import ClosedJaxpr, Jaxpr, Literal
 from .llvm.ir import NotCompilable, Num, check_size, check_type
 from .llvm.memory import Buffer, load, load_row, store, store_row
-from .llvm.values import MOST_ENTRIES, SMALL, Entries, Value, objects
+from .llvm.values import MOST_ENTRIES, SMALL, Entries, Value, Values, objects
 from .module import Module
 
 RULES: dict[str, Callable] = {}
@@ -257,9 +257,7 @@ _ENDS = frozenset(["custom_linear_solve", "eliminate"])
 def check_types(rule: Callable) -> Callable:
     """A rule for results of the types that are compiled."""
 
-    def rule_with_check(
-        evaluator: Evaluator, eqn: Any, values: list[Value], places: list
-    ) -> list[Value]:
+    def rule_with_check(evaluator: Evaluator, eqn: Any, values: Values, places: list) -> Values:
         for var in eqn.outvars:
             check_type(var.aval.dtype, f"results of {eqn.primitive.name}")
         return rule(evaluator, eqn, values, places)

@@ -10,17 +10,8 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 
-from .jaxprs.jaxapi import (
-    ClosedJaxpr,
-    batch_in_front,
-    drops_outputs,
-    has_derivative,
-    linear_map,
-    lower_on,
-    manual_axes,
-    primitive,
-    with_equal_axes,
-)
+from .jaxprs import jaxapi
+from .jaxprs.jaxapi import ClosedJaxpr, linear_map, manual_axes, with_equal_axes
 from .jaxprs.traced import Trace
 from .llvm.ir import NotCompilable
 from .native import handler, machine
@@ -224,7 +215,7 @@ _through_xla.shape_of = _shape_of  # pyright: ignore[reportFunctionMemberAccess]
 
 def _batch_rule(operands, axes, *, program: Callee, lanes: int | None, lane_flags):
     """One more axis of trajectories: all of them become one."""
-    size, arrays, axes_in_front = batch_in_front(operands, axes)
+    size, arrays, axes_in_front = jaxapi.batch_in_front(operands, axes)
     outer = [axis is not None for axis in axes_in_front]
     if lanes is None:
         outs = _lanewise.bind(*arrays, program=program, lanes=size, lane_flags=tuple(outer))
@@ -237,9 +228,9 @@ def _batch_rule(operands, axes, *, program: Callee, lanes: int | None, lane_flag
     return [x.reshape(size, lanes, *x.shape[1:]) for x in outs], [0] * len(outs)
 
 
-_lanewise = primitive("lanewise", _through_xla, _batch_rule, multiple=True)
+_lanewise = jaxapi.primitive("lanewise", _through_xla, _batch_rule, multiple=True)
 for _platform in TARGETS:
-    lower_on(_platform, _lanewise, functools.partial(_lower, platform=_platform))
+    jaxapi.lower_on(_platform, _lanewise, functools.partial(_lower, platform=_platform))
 
 
 def _derivative(primals, changes: dict[int, Any], **params):
@@ -279,7 +270,7 @@ def _derivative(primals, changes: dict[int, Any], **params):
     return outs, [next(tangents) if is_real(x) else None for x in outs]
 
 
-has_derivative(_lanewise, _derivative)
+jaxapi.has_derivative(_lanewise, _derivative)
 
 
 def _eagerly(*operands, **params):
@@ -304,7 +295,7 @@ def _with_outputs(params: dict[str, Any], flags: list[bool]) -> dict[str, Any]:
     return dict(params, program=Callee(program.trace.with_outputs(flags), program.layout))
 
 
-drops_outputs(_lanewise, _with_outputs)
+jaxapi.drops_outputs(_lanewise, _with_outputs)
 
 
 def _merge(x: Any, has_outer: bool, has_inner: bool, size: int, lanes: int) -> Any:

@@ -51,13 +51,8 @@ class DiscreteMap(diffrax.AbstractSolver):
         term, direction = term_and_direction(terms)
         # One step of `integrate`, so that its arithmetic and its status are the same.
         step = {"t0": direction * t0, "h": direction * (t1 - t0), "num_steps": 1, "args": args}
-        options: Any = {
-            "method": self.method,
-            "root_finder": self.root_finder,
-            "adjoint": dvi.Direct(),
-        }
-        options |= {"epsilon": term.epsilon, "throw": False}
-        options |= {"save": dvi.Save(final=True)}
+        options: Any = {"method": self.method, "root_finder": self.root_finder, "throw": False}
+        options |= {"adjoint": dvi.Direct(), "epsilon": term.epsilon, "save": dvi.Save(final=True)}
         solution = dvi.integrate(term.system, q0, p0, **step, **options)
         y1 = type(y0)((solution.qs[-1], solution.ps[-1]))  # a pair of diffrax's kind
         slopes = {

@@ -26,6 +26,5 @@ def system_of(problem: Any) -> dvi.System:
     """The `System` itself, or that of a `Problem`. **Raises** `TypeError` for anything else."""
     hint = "For a continuous Hamiltonian H give dvi.System(dvi.discretise(H))."
     problem = problem.system if isinstance(problem, Problem) else problem
-    return instance(
-        "system", problem, dvi.System, "a problem of dvi_jax.systems or a dvi.System", hint
-    )
+    kinds = "a problem of dvi_jax.systems or a dvi.System"
+    return instance("system", problem, dvi.System, kinds, hint)

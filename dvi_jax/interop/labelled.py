@@ -11,7 +11,7 @@ import dvi_jax as dvi
 
 from ..base.checks import instance
 from ..base.inputs import refuse_unit_or_mask
-from ..base.results import STATUS_NAMES
+from ..base.results import STATUS_NAMES, status_code
 from .extras import require
 
 _RESERVED_NAMES = ("t", "q", "p", "h", "status", "time", "save", "step")
@@ -68,10 +68,8 @@ def to_xarray(
     ts, hs = np.asarray(solution.ts), np.asarray(solution.hs)
     *batch, count = ts.shape
     if len(dims) != len(batch):
-        sizes = tuple(batch)
-        raise ValueError(
-            f"dims must have {len(batch)} names, of axes of sizes {sizes}, got {dims}."
-        )
+        n, sizes = len(batch), tuple(batch)
+        raise ValueError(f"dims must have {n} names, of axes of sizes {sizes}, got {dims}.")
     for name in dims:
         _check_free("dims", name, name in _RESERVED_NAMES or dims.count(name) > 1)
     rows = ts.reshape(-1, count)
@@ -86,10 +84,9 @@ def to_xarray(
 
     def add(name: str, axes: Sequence[str], value: Any) -> None:
         first = name.partition(".")[0]
-        name_in_use = first if first in _RESERVED_NAMES else name
-        _check_free(
-            "observe of dvi.integrate", name_in_use, first in _RESERVED_NAMES or name in variables
-        )
+        is_reserved = first in _RESERVED_NAMES
+        is_taken = is_reserved or name in variables
+        _check_free("observe of dvi.integrate", first if is_reserved else name, is_taken)
         variables[name] = ((*dims, *axes), np.asarray(value))
 
     for name, value, per_step in _observed(solution.observed, observe):
@@ -103,8 +100,8 @@ def to_xarray(
         add(name, [*front, *_dims_of(name, own_shape[len(front) :])], value)
     flags: dict[str, Any] = {"flag_values": np.arange(len(STATUS_NAMES), dtype=np.int8)}
     flags |= {"flag_meanings": " ".join(STATUS_NAMES)}
-    matches = [np.asarray(solution.result == getattr(dvi.RESULTS, name)) for name in STATUS_NAMES]
-    variables["status"] = (dims, np.argmax(matches, axis=0).astype(np.int8), flags)
+    codes = np.asarray(status_code(solution.result))
+    variables["status"] = (dims, codes.astype(np.int8), flags)
     for name, value in solution.stats.items():
         if name != "num_steps":
             add(name, _dims_of(name, np.shape(value)[len(batch) :]), value)
@@ -166,10 +163,8 @@ def to_inference_data(samples: dvi.Samples, observed: Any = None) -> Any:
             instance("observed", arc, dvi.Observations, "dvi.Observations, or a list of these")
             end = "" if len(arcs) == 1 else f"_{i}"
             values, name_of_values = np.asarray(arc.values), f"values{end}"
-            arrays[name_of_values] = (
-                (f"ts{end}", *_dims_of(name_of_values, values.shape[1:])),
-                values,
-            )
+            axes = (f"ts{end}", *_dims_of(name_of_values, values.shape[1:]))
+            arrays[name_of_values] = (axes, values)
             where[f"ts{end}"] = np.asarray(arc.ts)
         groups["observed_data"] = xr.Dataset(arrays, where)
     attributes = {"inference_library": "dvi_jax", "inference_library_version": dvi.__version__}

@@ -16,12 +16,11 @@ from ..systems import Problem
 from ..systems._problem import at_end
 from ..systems.n_body import (
     INVARIANTS,
+    OBSERVABLES,
     PARAMETERS,
-    angular_momentum,
     check_bodies,
     energy_of,
     hamiltonian,
-    linear_momentum,
     symmetries,
 )
 from .extras import require
@@ -152,8 +151,7 @@ def from_rebound(
     texts_of: dict[str, Any] = {"units": units, "check": check_bodies}
     texts_of |= {"source": "a simulation of REBOUND"}
     texts_of |= {"parameters": {name: parameters.get(name, "b [length]") for name in args}}
-    momenta = {"linear_momentum": linear_momentum, "angular_momentum": angular_momentum}
-    texts_of |= {"observables": {"energy": at_end(function), **momenta}}
+    texts_of |= {"observables": OBSERVABLES | {"energy": at_end(function)}}
     if not softening:
         texts_of |= {"invariants": INVARIANTS, "symmetries": symmetries(3)}
     theirs = {"names": names, "velocities": v, "radii": rows[:, 7], "t0": numbers["t"]}

@@ -173,10 +173,8 @@ def _output(
         status, message = 1, "A termination event occurred."
         at_end = np.asarray([end]) if times is None else times[np.asarray(times) == end]
         early = good & (sign * t < sign * end)
-        t, y = (
-            np.append(t[early], at_end),
-            np.concatenate([y[early], y_end[None][: at_end.size]]),
-        )
+        t = np.append(t[early], at_end)
+        y = np.concatenate([y[early], y_end[None][: at_end.size]])
         crossings = [
             (ts[sign * ts <= sign * end], ys[sign * ts <= sign * end]) for ts, ys in crossings
         ]

@@ -205,12 +205,7 @@ def integrate(
     numbers = {name: _number(u, name, x, unit) for name, x, unit in inputs}
     numbers |= {"args": _arguments(u, args, target), "num_steps": num_steps}
     sol = dvi.integrate(system, **numbers, **options)
-    arrays = (
-        (sol.ts, target.t),
-        (sol.qs, target.q),
-        (sol.ps, target.p),
-        (sol.hs, target.t),
-    )
+    arrays = (sol.ts, target.t), (sol.qs, target.q), (sol.ps, target.p), (sol.hs, target.t)
     with_unit = [u.Quantity(np.asarray(x), unit) for x, unit in arrays]
     return UnitSolution(*with_unit, observed=sol.observed, units=target, solution=sol)
 
@@ -234,9 +229,8 @@ def _with_defaults(
     q0 = u.Quantity(problem.q0, basis.q) if q0 is None else q0
     p0 = u.Quantity(problem.p0, basis.p) if p0 is None else p0
     if isinstance(defaults, Mapping):
-        of_args = {
-            n: u.Quantity(v, basis.args[n]) if n in basis.args else v for n, v in defaults.items()
-        }
+        units = basis.args
+        of_args = {n: u.Quantity(v, units[n]) if n in units else v for n, v in defaults.items()}
         args = of_args | dict(args or {})
     return q0, p0, args
 

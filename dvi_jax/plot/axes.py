@@ -220,11 +220,7 @@ def without_place_entries(counts: Any, total: int, invalid: str, zero: str) -> l
     """Legend entries of the marks that `without_place` draws."""
     marks = zip(counts, "xv", (invalid, zero), strict=True)
     look: Any = {"color": PALE, "ls": "none"}
-    return [
-        entry(f"{number} of {total} {text}", marker=marker, **look)
-        for number, marker, text in marks
-        if number
-    ]
+    return [entry(f"{n} of {total} {text}", marker=mark, **look) for n, mark, text in marks if n]
 
 
 def guide(axis: Any, x: Sequence[float], y: float, slope: float, **look: Any) -> None:

@@ -83,7 +83,7 @@ def reduce_to_pixels(
     shape, points = tuple(len(b.starts) for b in bins.values()), 0
     values = np.full(math.prod(shape), 0.0 if reduce == "mean" else np.nan)
     counts = np.zeros(values.size, np.int64)
-    for pixels, block in blocks(data, bins, lines, whole_pixels=reduce == "median"):
+    for pixels, block in blocks(data, bins, lines, one_block=reduce == "median"):
         finite = np.isfinite(block)
         points += block.size
         where, numbers = pixels[finite], block[finite]
@@ -111,17 +111,14 @@ def count_codes(data: Any, bins: Mapping[str, Bins], codes: Sequence[int]) -> np
 
 
 def blocks(
-    data: Any,
-    bins: Mapping[str, Bins],
-    lines: LineFunction | None = None,
-    whole_pixels: bool = False,
+    data: Any, bins: Mapping[str, Bins], lines: LineFunction | None = None, one_block: bool = False
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """(number of the pixel of each point, the points), both of shape (rest, *points).
 
-    `whole`: every pixel lies in one block, as a median needs it.
+    `one_block`: every pixel lies in one block, as a median needs it.
     """
     shape = [len(pixels_of.starts) for pixels_of in bins.values()]
-    for selection in selections(data, bins, None if lines is None else lines.dim, whole_pixels):
+    for selection in selections(data, bins, None if lines is None else lines.dim, one_block):
         block = data.variable.isel(selection).values
         names = list(data.dims)
         if lines is not None:
@@ -136,16 +133,16 @@ def blocks(
 
 
 def selections(
-    data: Any, bins: Mapping[str, Bins], line: str | None = None, whole_pixels: bool = False
+    data: Any, bins: Mapping[str, Bins], line: str | None = None, one_block: bool = False
 ) -> Iterator[dict[str, Any]]:
     """Selections of at most a block, last dimension first, that hold whole lines along `line`.
 
-    A block consists of units: single points, chunks if they are known and fit, or for `whole` all
-    numbers of a pixel. **Raises** `ValueError` if a pixel is larger than a block.
+    A block consists of units: single points, chunks if they are known and fit, or all numbers of a
+    pixel for `one_block`. **Raises** `ValueError` if a pixel is larger than a block.
     """
     sizes = dict(zip(data.dims, data.shape, strict=True))
-    unit = {d: n if d == line or (whole_pixels and d not in bins) else 1 for d, n in sizes.items()}
-    if whole_pixels:
+    unit = {d: n if d == line or (one_block and d not in bins) else 1 for d, n in sizes.items()}
+    if one_block:
         unit |= {d: int(np.diff(b.ends).max()) for d, b in bins.items() if d != line}
         if math.prod(unit.values()) > BLOCK:
             raise ValueError(
@@ -154,18 +151,15 @@ def selections(
             )
     else:
         preferences = data.encoding.get("preferred_chunks") or {}
-        chunks = {
-            d: min(preferences[d], n)
-            for d, n in sizes.items()
-            if isinstance(preferences.get(d), int)
-        }
+        lengths = {d: n for d, n in preferences.items() if isinstance(n, int)}
+        chunks = {d: min(lengths[d], n) for d, n in sizes.items() if d in lengths}
         chunks |= {line: sizes[line]} if line is not None else {}
         if len(chunks) == len(sizes) and math.prod(chunks.values()) <= BLOCK:
             unit = chunks
     room, parts = max(1, BLOCK // math.prod(unit.values())), {}
     for d in reversed(data.dims):
         size, step = sizes[d], unit[d]
-        pixels = bins[d] if whole_pixels and d in bins and d != line else None
+        pixels = bins[d] if one_block and d in bins and d != line else None
         total = -(-size // step) if pixels is None else len(pixels.starts)
         count = min(total, max(room, 1))
         room //= count

@@ -80,10 +80,8 @@ def animate(
     lanes = lanes_of(orbits, look.labels, momenta=False)
     view_options = {name: extra[name] for name in _VIEW if name in extra}
     shape = one_shape(lanes)
-    if (
-        math.prod(shape) == 1
-        and view_options.get("coordinates") is view_options.get("names") is None
-    ):
+    is_default = view_options.get("coordinates") is view_options.get("names") is None
+    if math.prod(shape) == 1 and is_default:
         view: Any = Plane((0,) * len(shape), (1,))
     else:
         view = view_of(lanes, **view_options)

@@ -63,10 +63,8 @@ def fit_residuals(
     texts = labels_of(names, components, "components", "names")
     panels = [[i] for i in numbers] if len(numbers) <= _PANELS else [numbers]
     count, new = len(panels), axes is None
-    height, purpose = (
-        2.6 + 0.9 * (count - 1) + 0.6,
-        "one for each panel and one for the distribution",
-    )
+    height = 2.6 + 0.9 * (count - 1) + 0.6
+    purpose = "one for each panel and one for the distribution"
     places = [[f"panel {i}", "distribution"] for i in range(count)]
     drawn_axes, _ = stack(axes, places, purpose, (7.4, height), width_ratios=(5, 1))
     if new:  # a mosaic lists the distribution after the first panel
@@ -153,9 +151,8 @@ def fit_against_data(
     _check(fit, "ts", "observed", "predicted", "errors")
     (arc,) = selected_numbers("arc", arc, len(fit.ts))
     ts = np.asarray(fit.ts[arc])
-    observations, model = (
-        np.asarray(x[arc]).reshape(len(ts), -1) for x in (fit.observed, fit.predicted)
-    )
+    pair = fit.observed[arc], fit.predicted[arc]
+    observations, model = (np.asarray(x).reshape(len(ts), -1) for x in pair)
     components = observations.shape[1]
     columns = selected_numbers("component", component, components)
     texts = labels_of(names, components, "components", "names")
@@ -217,11 +214,8 @@ def learning_curve(fit: Any, ax: Any = None) -> Any:
     stage, loss, is_accepted, horizon = (np.asarray(fit.history[name]) for name in columns)
     draw.check_not_empty("fit.history", loss, "the fit took no step, see fit.status")
     ax, new = canvas(ax)
-    steps, is_accepted, finite = (
-        np.arange(1, len(loss) + 1),
-        is_accepted.astype(bool),
-        np.isfinite(loss),
-    )
+    steps, finite = np.arange(1, len(loss) + 1), np.isfinite(loss)
+    is_accepted = is_accepted.astype(bool)
     looks = zip(np.unique(stage), itertools.cycle(COLOURS[:-1]), itertools.cycle(MARKERS))
     for number, colour, marker in looks:
         rows = stage == number
@@ -238,9 +232,8 @@ def learning_curve(fit: Any, ax: Any = None) -> Any:
     if not is_accepted.all():
         rows = ~is_accepted & finite
         ax.plot(steps[rows], loss[rows], "x", label="step rejected", **cross)
-    for text in counts_text(
-        {f"of {len(loss)} losses are not finite (at the top)": np.sum(~finite)}
-    ):
+    cause = f"of {len(loss)} losses are not finite (at the top)"
+    for text in counts_text({cause: np.sum(~finite)}):
         draw.at_edge(ax, steps[~finite], "x", 0.985, label=text, **cross)
     ax.set_yscale("log" if finite.any() and loss[finite].min() > 0 else "linear")
     ax.set(xlabel="step", ylabel="loss")
@@ -326,11 +319,8 @@ def fit_corner(
 def _of_parameters(fit: Any, params: Sequence[str] | None) -> tuple[list[int], np.ndarray]:
     """(numbers of the parameters that are drawn, values of all), checked."""
     names, variances = list(fit.names), np.diag(np.asarray(fit.covariance))
-    determinate = [
-        n
-        for n, variance in zip(names, variances, strict=True)
-        if np.isfinite(variance) and variance > 0
-    ]
+    pairs = zip(names, variances, strict=True)
+    determinate = [name for name, variance in pairs if np.isfinite(variance) and variance > 0]
     if params is None:
         draw.at_most(_PARAMETERS, len(names), "parameters", f"params={names[:3]}")
     params = names if params is None else [params] if isinstance(params, str) else [*params]

@@ -125,9 +125,8 @@ def names_of(data: Any) -> str:
     """Names that can be an axis, for an error message."""
     sizes = ", ".join(f"{d} ({n})" for d, n in data.sizes.items())
     coordinates = [str(c) for c in data.coords if c not in data.dims and data.coords[c].ndim == 1]
-    return (sizes or "none") + (
-        f", with the coordinates {', '.join(coordinates)}" if coordinates else ""
-    )
+    tail = f", with the coordinates {', '.join(coordinates)}" if coordinates else ""
+    return (sizes or "none") + tail
 
 
 def label_of(variable: Any, name: Any) -> str:
@@ -276,9 +275,7 @@ def _panels(data: Any, facet: str | None) -> list[tuple[str, Any]]:
     coordinate = data.coords.get(facet)
     name, _, units = label_of(coordinate, facet).partition(" [")
     values = np.arange(count) if coordinate is None else coordinate.values
-    texts = [
-        f"{value:.4g}" if np.issubdtype(type(value), np.number) else str(value) for value in values
-    ]
+    texts = [f"{v:.4g}" if np.issubdtype(type(v), np.number) else str(v) for v in values]
     tail = f" {units.rstrip(']')}" if units else ""
     return [(f"{name} = {t}{tail}", data.isel({dim: i})) for i, t in enumerate(texts)]
 

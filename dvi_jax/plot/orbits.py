@@ -10,29 +10,9 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 
 from ..base.checks import positive, whole
-from .axes import (
-    at_most,
-    canvas,
-    check_not_empty,
-    check_shapes,
-    entry,
-    labels_of,
-    legend,
-    path,
-    stack,
-)
-from .states import (
-    Lane,
-    Looks,
-    check_momenta,
-    index_label,
-    lanes_of,
-    looks_of,
-    one_shape,
-    place_in,
-    selected_numbers,
-    troubles,
-)
+from . import axes as draw, states
+from .axes import canvas, check_shapes, entry, labels_of, legend, stack
+from .states import Lane, Looks, index_label, lanes_of, looks_of, one_shape, place_in, troubles
 from .style import COLOURS, CROSS, DASHES, MARKS, STAR, START, in_style, look_of, with_unit
 
 _PANELS, _MARKS, _MESH, _NARROW = 6, 9, 161, 0.45
@@ -102,13 +82,12 @@ def phase_portrait(
 def _planes(shape: tuple[int, ...], dof: Any) -> list["Plane"]:
     places = list(np.ndindex(shape))
     if dof is not None:
-        places = [
-            place_in("dof", shape, index) for index in (dof if isinstance(dof, list) else [dof])
-        ]
+        selection = dof if isinstance(dof, list) else [dof]
+        places = [place_in("dof", shape, index) for index in selection]
     else:
         example = "0, 1" if len(shape) == 1 else "(0, 0), (0, 1)"
-        at_most(_PANELS, len(places), "degrees of freedom", f"dof=[{example}]")
-    check_not_empty("dof", places, f"choose some of {[*np.ndindex(shape)]}")
+        draw.at_most(_PANELS, len(places), "degrees of freedom", f"dof=[{example}]")
+    draw.check_not_empty("dof", places, f"choose some of {[*np.ndindex(shape)]}")
     return [Plane(place, shape) for place in places]
 
 
@@ -122,9 +101,7 @@ def _fold(q: np.ndarray, p: np.ndarray, period: float | None) -> tuple[np.ndarra
     return q, np.insert(p.astype(float), round_again, np.nan)
 
 
-def _draw_orbit(
-    axis: Any, lane: Lane, xy: Sequence[np.ndarray], looks: Looks, i: int, dots: bool
-) -> None:
+def _draw_orbit(axis: Any, lane: Lane, xy: Sequence[Any], looks: Looks, i: int, dots: bool) -> None:
     """A line with a circle at its start, and a cross at its end if that came too early."""
     look, n, count = looks.line(i, 1.0), len(xy[0]), len(looks.colours)
     look["label"] = lane.label or None
@@ -137,7 +114,7 @@ def _draw_orbit(
         if 1 < count <= len(COLOURS) and looks.scale is None:
             marks = _spread(xy, n // _MARKS * (2 * i + 1) // (2 * count))
             look |= {"marker": MARKS[i], "marks": marks, "ms": 4.5}
-        path(axis, *xy, **look)
+        draw.path(axis, *xy, **look)
     if count <= len(COLOURS):
         axis.plot(*(x[:1] for x in xy), color=looks.colours[i], zorder=3, **START)
     if lane.trouble:
@@ -172,16 +149,14 @@ def _entries(lanes: Sequence[Lane], looks: Looks) -> list[Any]:
     return start + looks.entries + troubles(lanes)
 
 
-def _level_lines(
-    axis: Any, hamiltonian: Any, lane: Lane, place: tuple[int, ...], levels: Any
-) -> None:
+def _level_lines(axis: Any, energy: Any, lane: Lane, place: tuple[int, ...], levels: Any) -> None:
     """Level lines over the whole panel, after the orbits have set its limits."""
     x, y = (np.linspace(low, high, _MESH) for low, high in (axis.get_xlim(), axis.get_ylim()))
     assert lane.ps is not None
     q, p = (jnp.asarray(state[0], float) for state in (lane.qs, lane.ps))
 
     def value(a, b):
-        return hamiltonian(q.at[place].set(a), p.at[place].set(b))
+        return energy(q.at[place].set(a), p.at[place].set(b))
 
     H = np.asarray(jax.jit(jax.vmap(jax.vmap(value, (0, None)), (None, 0)))(x, y))
     rule = "hamiltonian(q, p) must return one number"
@@ -249,7 +224,7 @@ class Plane(NamedTuple):
 
     def coordinates_of(self, lane: Lane, k: int = 0) -> Any:
         """(q, p) along an orbit, shape (S,) each."""
-        check_momenta([lane])
+        states.check_momenta([lane])
         assert lane.ps is not None
         return [x[(slice(None), *self.place)] for x in (lane.qs, lane.ps)]
 
@@ -327,17 +302,16 @@ def view_of(
     rule = "the states of orbits must have shape (n,) or (bodies, dim)"
     check_shapes(len(shape) in (1, 2), rule, state=lanes[0].qs[0])
     has_bodies, dim, count = len(shape) == 2, shape[-1], shape[0] if len(shape) == 2 else 1
-    axes = tuple(selected_numbers("coordinates", coordinates, dim))
+    axes = tuple(states.selected_numbers("coordinates", coordinates, dim))
     if len(axes) not in (2, 3):
         remedy = "use coordinates=(0, 1)" if dim > 1 else "use phase_portrait"
         raise ValueError(f"coordinates must select two or three, got {len(axes)}: {remedy}.")
-    numbers = selected_numbers("bodies", bodies, count)
+    numbers = states.selected_numbers("bodies", bodies, count)
     view = View(axes, numbers, [], has_bodies)
     if isinstance(centre, int | np.integer) and has_bodies:
         origin = whole("centre", centre, 0, count - 1)
-        view = view._replace(
-            origin=origin, mark=np.zeros(len(axes)), mark_name=f"body {origin + 1}"
-        )
+        name = f"body {origin + 1}"
+        view = view._replace(origin=origin, mark=np.zeros(len(axes)), mark_name=name)
         numbers = [b for b in numbers if b != origin] if bodies is None else numbers
     elif centre is not None:
         point = np.asarray(centre, float)
@@ -386,7 +360,7 @@ def trajectory(
     for i, values in enumerate(flat.T):
         look: Any = {"color": COLOURS[i % len(COLOURS)], "ls": DASHES[i % len(DASHES)]}
         label = f"q$_{{{i + 1}}}$" if flat.shape[1] <= 12 else None
-        path(axis, t, values, lw=1, label=label, **look)
+        draw.path(axis, t, values, lw=1, label=label, **look)
     axis.set(xlabel=time, ylabel=with_unit("q", position), title=title)
     legend(axis, new, troubles(lanes))
     return axis

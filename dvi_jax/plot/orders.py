@@ -276,9 +276,8 @@ def drift_bound(
     for row in np.fmax.accumulate(changes, axis=1):
         axis.plot(n[1:], np.where(row > 0, row, np.nan), color=COLOURS[0], lw=0.7)
     line = n[1:] * (bound.per_step[invariant] + bound.rounding[invariant])
-    axis.plot(
-        n[1:], line, color=COLOURS[1], ls="--", label="proved for all initial states in the domain"
-    )
+    text = "proved for all initial states in the domain"
+    axis.plot(n[1:], line, color=COLOURS[1], ls="--", label=text)
     if bound.level is not None and bound.steps <= n[-1]:
         axis.axvline(bound.steps, **draw.GUIDE)
     axis.set(xscale="log", yscale="log", xlabel="number of steps N", title=title)

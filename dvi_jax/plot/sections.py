@@ -54,10 +54,7 @@ class _Points(NamedTuple):
         total, room = self.qs.shape[:2]
         none = int(np.sum((counts == 0) & ~has_failed & (statuses != "stopped")))
         reasons = np.where(np.isin(self.reasons, _GOOD), "", self.reasons)[has_failed].tolist()
-        causes = {
-            f": {r.replace('_', ' ')}" if r else "": number
-            for r, number in Counter(reasons).items()
-        }
+        causes = Counter(f": {r.replace('_', ' ')}" if r else "" for r in reasons)
         texts = {
             f"crossed less than the required {room} times": statuses == "too_few_crossings",
             "stopped": statuses == "stopped",
@@ -66,9 +63,8 @@ class _Points(NamedTuple):
             "did not cross": none if none < total else 0,
             "have no count of crossings": ~np.isfinite(counts) & ~has_failed,
         }
-        return counts_text(
-            {f"of {total} orbits {text}": np.sum(number) for text, number in texts.items()}
-        )
+        sums = {f"of {total} orbits {text}": np.sum(number) for text, number in texts.items()}
+        return counts_text(sums)
 
     def draw(
         self, axis: Any, x: Any, y: Any, colours: Any, size: float | None, names: Any = None, skip=0
@@ -88,9 +84,8 @@ class _Points(NamedTuple):
         total = int(valid.sum())
         diameter = float(np.clip(150 / math.sqrt(total), 0.5, 2.5)) if size is None else size
         look: Any = {"s": diameter**2, "linewidths": 0, "rasterized": total > _PIXEL_COUNT}
-        for k, group in enumerate(
-            np.eye(len(x), dtype=bool) if names else (~has_failed, has_failed)
-        ):
+        groups = np.eye(len(x), dtype=bool) if names else (~has_failed, has_failed)
+        for k, group in enumerate(groups):
             rows = valid & group[:, None]
             if names or rows.any():
                 label, repeats = (names[k] or None, 1) if names else (None, rows.sum(1)[group])
@@ -172,10 +167,8 @@ def _points_of(crossings: Any) -> _Points:
     counts, reasons = np.ravel(np.asarray(crossing.count)), status
     if hasattr(crossing, "status"):  # a PoincareSection, which stops at this number
         counts = np.minimum(counts, room)
-        status, reasons = (
-            crossing.status,
-            status_name(crossing.run) if hasattr(crossing, "run") else "",
-        )
+        reasons = status_name(crossing.run) if hasattr(crossing, "run") else ""
+        status = crossing.status
     texts = (np.broadcast_to(np.asarray(x, object), lead).ravel() for x in (status, reasons))
     return _Points(qs.reshape(shape), ps.reshape(shape), counts, *(t.astype(str) for t in texts))
 

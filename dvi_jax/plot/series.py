@@ -9,32 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..base.checks import one_of
-from .axes import (
-    at_most,
-    canvas,
-    check_not_empty,
-    check_real,
-    check_shapes,
-    counts_text,
-    envelope,
-    guide,
-    labels_of,
-    legend,
-    stack,
-)
+from . import axes as draw
+from .axes import canvas, check_shapes, counts_text, labels_of, legend, stack
 from .states import Lane, check_momenta, each_state, lanes_of, looks_of, troubles
-from .style import (
-    COLOURS,
-    CROSS,
-    DASHES,
-    GREY,
-    GUIDE,
-    SMALL,
-    in_style,
-    look_of,
-    sign_text,
-    with_unit,
-)
+from .style import COLOURS, CROSS, DASHES, GREY, SMALL, in_style, look_of, sign_text, with_unit
 
 _CHANGES = {
     "relative": ("relative change", "|ΔI/I$_0$|"), "absolute": ("change", "|ΔI|"),
@@ -58,7 +36,7 @@ def draw_series(
     if log:
         masks |= {"are exactly 0": values == 0, "are below 0": values < 0}
     numbers = np.where(np.logical_or.reduce(list(masks.values())), np.nan, values)
-    axis.plot(*envelope(t, numbers), label=label or None, **look)
+    axis.plot(*draw.envelope(t, numbers), label=label or None, **look)
     return {text: int(mask.sum()) for text, mask in masks.items()}
 
 
@@ -100,7 +78,7 @@ def invariants(
         raise ValueError(f"{zero[0]!r} is 0 at the start of every orbit: use change='absolute'.")
     on_one_axis = log and len(ts) == 1 < len(quantities)
     count = 1 if on_one_axis else len(quantities)
-    at_most(_PANELS, count, "quantities", "values={...}")
+    draw.at_most(_PANELS, count, "quantities", "values={...}")
     size = (6.4, 4.2) if count == 1 else (6.4, 1.4 + 1.45 * count)
     axes, new = stack(look.ax, count, "one for each quantity", size, sharex=True)
     looks = looks_of(len(quantities)) if on_one_axis else looks_of(len(ts), look.colour)
@@ -124,12 +102,9 @@ def invariants(
             kind = f"{kind} {size}".lstrip() if on_one_axis else size
         unit = look.units.get(quantity) if change != "relative" and not on_one_axis else None
         title = "" if on_one_axis else textwrap.fill(title, 20) if kind else title
-        label = (
-            f"{title}\n{with_unit(kind, unit)}"
-            if kind and title
-            else with_unit(title or kind, unit)
-        )
-        axis.set_ylabel(label, fontsize=9 if count > 1 else None)
+        kind = with_unit(kind, unit) if kind else ""
+        text = f"{title}\n{kind}" if kind and title else kind or with_unit(title, unit)
+        axis.set_ylabel(text, fontsize=9 if count > 1 else None)
         if log:
             axis.set_yscale("log")
     for axis in axes:
@@ -144,7 +119,7 @@ def invariants(
 
 def _change_of(name: str, v: np.ndarray, change: str, log: bool) -> np.ndarray | None:
     """Changes since the first finite value, shape (S,); None if they are relative to 0."""
-    check_real(f"values[{name!r}]", v)
+    draw.check_real(f"values[{name!r}]", v)
     v = v.reshape(len(v), -1).astype(float)
     first = next((row for row in v if np.isfinite(row).all()), np.full(v.shape[1], np.nan))
     v = v if change == "value" else v - first
@@ -186,9 +161,7 @@ def _read(
         for name in tables[0]:
             if all(name in part for part in tables):
                 pairs = zip(parts, tables, strict=True)
-                quantities[name] = [
-                    row for part, table in pairs for row in _rows(name, table, part)
-                ]
+                quantities[name] = [x for part, table in pairs for x in _rows(name, table, part)]
     for name, column in (values or {}).items():
         if callable(column):
             check_momenta(lanes)
@@ -198,17 +171,15 @@ def _read(
         elif isinstance(column, list) and len(column) == len(lanes):
             quantities[name] = [np.asarray(x) for x in column]
         else:
-            kind = (
-                f"list of length {len(column)}"
-                if isinstance(column, list)
-                else type(column).__name__
-            )
+            kind = type(column).__name__
+            kind += f" of length {len(column)}" if isinstance(column, list) else ""
             raise ValueError(
                 f"values[{name!r}] must be a function (q, p), or a list of {len(lanes)} arrays, of "
                 f"one for each orbit, got {kind}."
             )
     name = "the list of observables with a value per step" if values is None else "values"
-    check_not_empty(name, quantities, "give values={'energy': f}, of a function (q, p) or an array")
+    hint = "give values={'energy': f}, of a function (q, p) or an array"
+    draw.check_not_empty(name, quantities, hint)
     return ts, names, lanes, quantities
 
 
@@ -378,16 +349,15 @@ def indicator(
         points += [(t[positive], v[positive])] if positive.any() else []
     axis.set(xscale="log" if xlog else "linear", yscale="log" if ylog else "linear")
     if traits.level is not None:
-        axis.axhline(traits.level, label=f"regular: {traits.level:g}", **GUIDE)
+        axis.axhline(traits.level, label=f"regular: {traits.level:g}", **draw.GUIDE)
     if traits.slope is not None and points:
         # Over all times, through the largest of the first values.
         value, first = max((v[0], t[0]) for t, v in points)
         ends = first, max(t[-1] for t, _ in points)
-        guide(axis, ends, value, traits.slope, label=f"slope {sign_text(traits.slope)}")
+        draw.guide(axis, ends, value, traits.slope, label=f"slope {sign_text(traits.slope)}")
     time, units = "time since the start |t − t$_0$|" if from_start else "time t", look.units
-    axis.set(
-        xlabel=with_unit(time, units.get("t")), ylabel=with_unit(traits.label, units.get("value"))
-    )
+    axis.set_xlabel(with_unit(time, units.get("t")))
+    axis.set_ylabel(with_unit(traits.label, units.get("value")))
     notes = counts_text({f"values {text}": n for text, n in counter.items()})
     looks.finish([axis], look, new, [*looks.entries, *notes])
     return axis

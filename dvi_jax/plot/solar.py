@@ -38,10 +38,8 @@ def planet_orbits(positions: Any, names: Sequence[str], ax: Any = None) -> Any:
         else:
             legend(axis, new)
     if new:
-        axes[0].figure.suptitle(
-            "Heliocentric orbits on the ecliptic of J2000; marks: positions at the start",
-            fontsize=10,
-        )
+        heading = "Heliocentric orbits on the ecliptic of J2000; marks: positions at the start"
+        axes[0].figure.suptitle(heading, fontsize=10)
     return np.asarray(axes)
 
 

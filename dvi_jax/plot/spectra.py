@@ -12,8 +12,8 @@ from .axes import canvas, check_shapes, counts_text, labels_of, legend
 from .states import looks_of
 from .style import COLOURS, DASHES, GREY, MARKERS, SMALL, in_style, sign_text, with_unit
 
-_PERCENTILES = (2, 98)
-"""Range of the colours, so that a few extreme values do not determine it."""
+_RANGE = (2, 98)
+"""Percentiles at the ends of the colours, so that a few extreme values do not determine them."""
 
 
 @in_style
@@ -110,9 +110,7 @@ def frequency_map(
         )
     axis, new = canvas(ax, (6.0, 4.8))
     numbers = D if on_grid or D is None else D[np.isfinite(x) & np.isfinite(y)]
-    norm, ends = (
-        (None, "") if numbers is None else draw.scale_of(numbers, limits, False, _PERCENTILES)
-    )
+    norm, ends = (None, "") if numbers is None else draw.scale_of(numbers, limits, False, _RANGE)
     artist, extra = (_draw_plane if on_grid else _draw_points)(axis, x, y, D, norm)
     if D is not None:
         axis.figure.colorbar(artist, ax=axis, label=diffusion_label, extend=ends)
@@ -145,12 +143,8 @@ def _draw_points(axis: Any, x: Any, y: Any, D: Any, norm: Any) -> tuple[Any, lis
     grey, count = valid & ~has_value, int(valid.sum())
     look: Any = {"s": float(np.clip(3000 / max(count, 1), 2, 16)), "linewidths": 0}
     look["rasterized"] = count > 3000
-    palette = (
-        {"color": COLOURS[0]}
-        if D is None
-        else {"c": D[has_value], "norm": norm, "cmap": draw.SHADES}
-    )
-    artist = axis.scatter(x[has_value], y[has_value], **palette, **look)
+    shades = {} if D is None else {"c": D[has_value], "norm": norm, "cmap": draw.SHADES}
+    artist = axis.scatter(x[has_value], y[has_value], **shades or {"color": COLOURS[0]}, **look)
     if grey.any():
         label = f"{grey.sum()} orbits without a diffusion"
         axis.scatter(x[grey], y[grey], color=draw.PALE, label=label, **look)

@@ -12,16 +12,8 @@ import numpy as np
 from matplotlib.cm import ScalarMappable
 
 from ..base.checks import whole
-from .axes import (
-    check_not_empty,
-    check_real,
-    check_shapes,
-    counts_text,
-    entry,
-    labels_of,
-    legend,
-    scale_of,
-)
+from . import axes as draw
+from .axes import check_shapes, counts_text, entry, labels_of, legend, scale_of
 from .style import COLOURS, CROSS, DASHES, PALE, SHADES, Look, with_unit
 
 _GOOD = ("", "successful", "stopped")
@@ -59,7 +51,7 @@ def lanes_of(orbits: Any, labels: Sequence[str] | None = None, momenta: bool = T
     """
     parts = orbits if isinstance(orbits, list) else [orbits]
     lanes = [lane for part in parts for lane in _lanes_of_one(part)]
-    check_not_empty("orbits", lanes, "give at least one orbit")
+    draw.check_not_empty("orbits", lanes, "give at least one orbit")
     if momenta:
         check_momenta(lanes)
     names = labels_of(labels, len(lanes), "orbits")
@@ -82,7 +74,7 @@ def _lanes_of_one(part: Any) -> list[Lane]:
         raise TypeError(f"each orbit must be a Solution or arrays (ts, qs, ps), got {kind}.")
     ts, *states = (np.asarray(x) for x in arrays if x is not None)
     for name, x in zip(("ts", "qs", "ps"), (ts, *states), strict=False):
-        check_real(f"{name} of an orbit", x, "iuf")
+        draw.check_real(f"{name} of an orbit", x, "iuf")
     if ts.ndim and states[0].shape == ts.shape:  # a state that is one number
         states = [x[..., None] for x in states]
     fits = all(x.shape[: ts.ndim] == ts.shape and x.ndim > ts.ndim for x in states)
@@ -110,7 +102,7 @@ def one_shape(lanes: Sequence[Lane]) -> tuple[int, ...]:
 def selected_numbers(name: str, selection: Any, count: int) -> list[int]:
     """Numbers below `count`: all of them for None."""
     numbers = range(count) if selection is None else np.ravel(selection).tolist()
-    check_not_empty(name, numbers, f"choose numbers from 0 to {count - 1}")
+    draw.check_not_empty(name, numbers, f"choose numbers from 0 to {count - 1}")
     return [whole(name, i, 0, count - 1) for i in numbers]
 
 
@@ -164,7 +156,7 @@ def each_state(function: Callable[..., Any], qs: Any, ps: Any) -> np.ndarray:
     """A function ``(q, p)`` of every state, shape (N, ...)."""
     values = np.asarray(jax.vmap(function)(qs, ps))
     name = getattr(function, "__name__", type(function).__name__)
-    check_real(f"the results of the function {name}", values)
+    draw.check_real(f"the results of the function {name}", values)
     return values
 
 
@@ -214,7 +206,6 @@ def troubles(lanes: Sequence[Lane]) -> list[Any]:
     texts = []
     for reason, count in Counter(lane.trouble for lane in lanes if lane.trouble).items():
         orbits = "" if len(lanes) == 1 else f"{count} of {len(lanes)} orbits "
-        texts.append(
-            f"{orbits}{'' if reason == 'stopped' else 'failed: '}{reason.replace('_', ' ')}"
-        )
+        verdict = "" if reason == "stopped" else "failed: "
+        texts.append(f"{orbits}{verdict}{reason.replace('_', ' ')}")
     return [entry(text, ls="none", **CROSS) for text in texts]

@@ -19,9 +19,8 @@ from matplotlib.colors import ListedColormap
 P = ParamSpec("P")
 R = TypeVar("R")
 
-_SETTINGS = mpl.rc_params_from_file(
-    Path(__file__).with_name("dvi.mplstyle"), use_default_template=False
-)
+_FILE = Path(__file__).with_name("dvi.mplstyle")
+_SETTINGS = mpl.rc_params_from_file(_FILE, use_default_template=False)
 
 COLOURS: tuple[str, ...] = tuple(_SETTINGS["axes.prop_cycle"].by_key()["color"])
 """The palette of Okabe and Ito (2008), dark first. Lines differ by marker or dash as well."""

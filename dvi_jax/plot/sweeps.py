@@ -14,19 +14,10 @@ from matplotlib.patches import Patch
 
 from ..base.checks import one_of
 from ..base.keywords import checked_keywords
+from . import grid as layout
 from .axes import at_edge, cells, entry, flat_cells, legend, scale_of
 from .blocks import REDUCTIONS, LineFunction, Picture, count_codes, reduce_to_pixels
-from .grid import (
-    Grid,
-    GridSettings,
-    NumberSettings,
-    arrange,
-    checked_array,
-    dim_of,
-    label_of,
-    names_of,
-    two_numbers,
-)
+from .grid import Grid, GridSettings, NumberSettings, arrange, checked_array, dim_of
 from .style import COLOURS, GREY, HATCH, NO_NUMBER, SHADES, ZERO, in_style
 
 _NOT_COMPUTED = "#ffffff"
@@ -93,7 +84,7 @@ def sweep_map(
     data = checked_array(data)
     one_of("reduce", reduce, REDUCTIONS)
     grid = arrange(data, x, y, settings)
-    label = label_of(data, data.name or "value")
+    label = layout.label_of(data, data.name or "value")
     fewer = any(len(place.centres) < place.bins.size for place in grid.places)
     if fewer or any(data.sizes[dim] > 1 for dim in grid.reduced_dims):
         label = f"{REDUCTIONS[reduce]} {label}"
@@ -146,15 +137,13 @@ def slope_map(
         if along not in (x, y):
             x, y = (along, y) if x is None else (x, along)
         middle = np.sqrt(values[1:] * values[:-1])
-        attributes = data.coords[along].attrs
-        replacements = {
-            along: xr.DataArray(middle, dims=[dim], coords={along: (dim, middle, attributes)})
-        }
+        coords = {along: (dim, middle, data.coords[along].attrs)}
+        replacements = {along: xr.DataArray(middle, dims=[dim], coords=coords)}
     grid = arrange(data, x, y, settings, replacements)
     lines = LineFunction(dim, partial(_slopes, np.log(values), order, floor, local))
     pictures = [reduce_to_pixels(panel, grid.bins, reduce, lines) for _, panel in grid.panels]
     name = str(data.name or "data").replace("_", " ")
-    over_what = label_of(data.coords[along], along).partition(" [")[0]
+    over_what = layout.label_of(data.coords[along], along).partition(" [")[0]
     label = f"{'local slope' if local else 'slope'} of log {name} over log {over_what}"
     scale = _scale(pictures, False, settings.get("limits"))
     return _draw(grid, pictures, label, "no slope", ax, scale)
@@ -236,7 +225,7 @@ def _scale(pictures: Sequence[Picture], log: bool | None, limits: Any) -> tuple[
             f"log=True requires values of at least 0, got {numbers.min():.3g}: draw abs(data)."
         )
     if limits is not None:
-        low, high = two_numbers(limits)
+        low, high = layout.two_numbers(limits)
         if not low < high or (log and low <= 0):
             rule = "two increasing positive numbers" if log else "two increasing numbers"
             raise ValueError(f"limits must be {rule}, got {limits!r}.")
@@ -335,14 +324,12 @@ def _positive(data: Any, coordinate: str) -> tuple[np.ndarray, np.ndarray]:
     if len(order) < 2 or (np.diff(values[order]) == 0).any():
         raise ValueError(
             f"along={coordinate!r} must have as coordinate two or more positive numbers, all "
-            f"different, got {values!r:.100}: choose one of {names_of(data)}."
+            f"different, got {values!r:.100}: choose one of {layout.names_of(data)}."
         )
     return np.asarray(values[order], float), order
 
 
-def _slopes(
-    x: np.ndarray, order: np.ndarray, floor: float, local: bool, lines: np.ndarray
-) -> np.ndarray:
+def _slopes(x: np.ndarray, order: np.ndarray, floor: float, local: bool, lines: np.ndarray) -> Any:
     """Slopes of the numbers above the floor along the first axis: between neighbours, (n − 1, ...).
 
     Not `local`: Σ (x − x̄) y / Σ (x − x̄)² over these numbers, shape (1, ...).
@@ -401,15 +388,12 @@ def _count_beside(status: Any, grid: Grid) -> _Statuses:
     status = _status_of("status", status)
     facets = [] if grid.facet is None else [dim_of(status, grid.facet)]
     dims = [*grid.bins, *facets]
-    excess = [
-        dim
-        for dim in status.dims
-        if dim not in (*dims, *grid.reduced_dims) and status.sizes[dim] > 1
-    ]
+    map_dims = (*dims, *grid.reduced_dims)
+    excess = [dim for dim in status.dims if dim not in map_dims and status.sizes[dim] > 1]
     if excess or any(dim not in status.dims for dim in dims):
         raise ValueError(
             f"status must have the dimensions {', '.join(dims)} of the map and no others, got "
-            f"{names_of(status)}: give that of the same sweep and selection."
+            f"{layout.names_of(status)}: give that of the same sweep and selection."
         )
     selections = (dict.fromkeys(facets, i) for i in range(len(grid.panels)))
     return _count("status", status, grid, (status.isel(selection) for selection in selections))

@@ -43,10 +43,8 @@ def complete(m):
     m = jnp.asarray(m)
     K, tail = _complete(m)
     end = jnp.where(m == 1, jnp.inf, jnp.nan)
-    return (
-        jnp.where(m < 1, K, end),
-        jnp.where(m < 1, K * (1 - m / 2 - tail), jnp.where(m == 1, 1.0, jnp.nan)),
-    )
+    E = jnp.where(m < 1, K * (1 - m / 2 - tail), jnp.where(m == 1, 1.0, jnp.nan))
+    return jnp.where(m < 1, K, end), E
 
 
 def swing(m):

@@ -237,6 +237,8 @@ def library_problem(
     start: Start,
     parameters: Mapping[str, Parameter] = MappingProxyType({}),
     observables: Sequence[Callable[..., Any]] = (),
+    *,
+    q0_p0_h: tuple[Any, Any, float],
     autonomous: bool = True,
     **fields: Any,
 ) -> Problem:
@@ -244,13 +246,14 @@ def library_problem(
 
     - `system`: the `System`, or its Hamiltonian.
     - `start`: check of initial conditions; those of `parameters` are added to it.
+    - `q0_p0_h`: initial conditions and step size. `fields`: the other fields of `Problem`.
     - `autonomous`: whether H is independent of time at ε = 0. The energy is then an observable and
       an invariant, and the translation in time a symmetry, though not one of a system with a slow
       time or a constraint: symmetries are those of the type II map.
-    - `fields`: the other fields of `Problem`.
     """
     system = system if isinstance(system, System) else System(system)
-    fields = {"units": DIMENSIONLESS, **fields}
+    q0, p0, h = q0_p0_h
+    fields = {"units": DIMENSIONLESS, "q0": q0, "p0": p0, "h": h, **fields}
     if autonomous:
         observables = (at_end(system.H_D), *observables)
         fields["invariants"] = ("energy", *fields.get("invariants", ()))
@@ -303,19 +306,16 @@ def over_times(
     shape t.shape + q0.shape and the dtype of the initial conditions. It **raises** `ValueError` for
     initial conditions of another shape.
     """
-    shapes = "the same shape" if shape is None else f"shape {shape}"
+    rule = (
+        "exact requires one initial condition (for several use jax.vmap(exact, (None, 0, 0, "
+        f"None))): q0 and p0 must have {'the same shape' if shape is None else f'shape {shape}'}"
+    )
 
     def decorate(at_time):
         @functools.wraps(at_time)
         def exact(t, q0, p0, args):
             t, q0, p0 = jnp.asarray(t), jnp.asarray(q0), jnp.asarray(p0)
-            check_shape(
-                q0,
-                p0,
-                lambda state_shape: shape is None or state_shape == shape,
-                "exact requires one initial condition (for several use jax.vmap(exact, (None, 0, "
-                f"0, None))): q0 and p0 must have {shapes}",
-            )
+            check_shape(q0, p0, lambda state_shape: shape in (None, state_shape), rule)
             dtype = jnp.result_type(q0, p0, float)
             q0, p0 = q0.astype(dtype), p0.astype(dtype)
             q, p = jax.vmap(lambda s: at_time(s, q0, p0, args))(t.ravel())
@@ -341,17 +341,14 @@ _THERMAL = Langevin(lambda args: args["friction"], lambda args: args["temperatur
 
 
 def thermal(
-    hamiltonian: Callable[..., Any],
-    friction: float,
-    temperature: float | None,
-    **parameters: Parameter,
+    H_D: Callable[..., Any], friction: float, temperature: float | None, **parameters: Parameter
 ) -> tuple[System, dict[str, Parameter]]:
     """A system of unit masses and its parameters, without noise if there is no temperature."""
     if temperature is None:
-        return System(hamiltonian), parameters
+        return System(H_D), parameters
     parameters["friction"] = Parameter(friction, "rate of friction γ [1/time]")
     parameters["temperature"] = Parameter(temperature, "k_B T [energy]")
-    return System(hamiltonian, noise=_THERMAL), parameters
+    return System(H_D, noise=_THERMAL), parameters
 
 
 @functools.cache

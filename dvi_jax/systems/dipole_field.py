@@ -75,15 +75,12 @@ def dipole_field(radius: float = 50.0) -> Problem:
     """
     radius = positive("radius", radius)
     v0, A = np.array([0.6, -0.8, 1.0]), np.array([0.0, -radius, 0.0])  # `vector_potential` at q0
+    dipole = {"the dipole": (0, 0, 0)}
     return library_problem(
         hamiltonian,
-        Start(
-            "the dipole field holds one particle in space", (3,), singular={"the dipole": (0, 0, 0)}
-        ),
+        Start("the dipole field holds one particle in space", (3,), singular=dipole),
         name="dipole_field",
-        q0=np.array([radius, 0.0, 0.0]),
-        p0=v0 + A,
-        h=0.1,
+        q0_p0_h=(np.array([radius, 0.0, 0.0]), v0 + A, 0.1),
         parameters={
             **guiding_centre.PARTICLE,
             "B0": Parameter(
@@ -95,8 +92,6 @@ def dipole_field(radius: float = 50.0) -> Problem:
         units={"q": "1", "p": "1", "t": "1/gyrofrequency", "energy": "1"},
         source="Störmer 1907, Arch. Sci. Phys. Nat. 24, 5; Northrop 1963",
         invariants=("stoermer_integral",),
-        adiabatic=guiding_centre.adiabatic(
-            "gyroradius over R", lambda factor: dipole_field(radius / factor)
-        ),
+        adiabatic=guiding_centre.adiabatic("gyroradius over R", lambda x: dipole_field(radius / x)),
         symmetries={"rotation": rotation(0, 1)},
     )

@@ -37,9 +37,7 @@ def double_pendulum() -> Problem:
         hamiltonian,
         Start("the double pendulum has two angles", (2,)),
         name="double_pendulum",
-        q0=np.array([np.pi / 2, np.pi / 3]),
-        p0=np.zeros(2),
-        h=0.005,
+        q0_p0_h=(np.array([np.pi / 2, np.pi / 3]), np.zeros(2), 0.005),
         parameters={
             "m1": Parameter(1.0, "mass of the upper bob [kg]"),
             "m2": Parameter(1.0, "mass of the lower bob [kg]"),

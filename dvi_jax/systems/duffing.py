@@ -66,9 +66,7 @@ def duffing() -> Problem:
         System(hamiltonian, friction_and_drive),
         Start("Duffing's oscillator has one degree of freedom", (1,)),
         name="duffing",
-        q0=np.array([-1.2]),
-        p0=np.array([0.2]),
-        h=0.1,
+        q0_p0_h=(np.array([-1.2]), np.array([0.2]), 0.1),
         parameters={  # with β ≤ 0 the motion is unbounded
             "alpha": Parameter(
                 -1.0, "linear part of the spring, negative for two wells [1/time²]", finite

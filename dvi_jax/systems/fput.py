@@ -15,9 +15,8 @@ def hamiltonian(t0, t1, q0, p1, args):
     d_i = q0_{i+1} − q0_i,    q0_0 = q0_{n+1} = 0
     """
     d = jnp.diff(jnp.pad(q0, 1))
-    return jnp.sum(p1**2) / 2 + jnp.sum(
-        d**2 / 2 + args["alpha"] * d**3 / 3 + args["beta"] * d**4 / 4
-    )
+    kinetic = jnp.sum(p1**2) / 2
+    return kinetic + jnp.sum(d**2 / 2 + args["alpha"] * d**3 / 3 + args["beta"] * d**4 / 4)
 
 
 def frequencies(n):
@@ -58,9 +57,7 @@ def fput(n: int = 31, alpha: float = 0.25, beta: float = 0.0) -> Problem:
         hamiltonian,
         Start("the FPUT chain is a row of particles between two walls", (None,)),
         name="fput",
-        q0=np.sin(np.pi * np.arange(1, n + 1) / (n + 1)),
-        p0=np.zeros(n),
-        h=0.2,
+        q0_p0_h=(np.sin(np.pi * np.arange(1, n + 1) / (n + 1)), np.zeros(n), 0.2),
         parameters={
             "alpha": Parameter(alpha, "quadratic part of a spring's force [1]", finite),
             "beta": Parameter(beta, "cubic part of a spring's force [1]", finite),

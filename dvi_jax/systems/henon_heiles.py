@@ -28,8 +28,6 @@ def henon_heiles() -> Problem:
         hamiltonian,
         Start("the Hénon–Heiles system is in the plane", (2,)),
         name="henon_heiles",
-        q0=[0.0, y],
-        p0=[px, py],
-        h=0.1,
+        q0_p0_h=([0.0, y], [px, py], 0.1),
         source="Hénon & Heiles 1964, Astron. J. 69, 73",
     )

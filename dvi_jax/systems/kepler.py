@@ -40,17 +40,12 @@ def exact(t, q0, p0, args):
 
 def kepler() -> Problem:
     """The paper's Kepler problem with its initial conditions and h = 0.1; dimensionless, K = 1."""
+    rule = "the Kepler problem is in the plane (for more dimensions or bodies take n_body)"
     return library_problem(
         System(hamiltonian, linear_force),
-        Start(
-            "the Kepler problem is in the plane (for more dimensions or bodies take n_body)",
-            (2,),
-            singular={"the centre": (0, 0)},
-        ),
+        Start(rule, (2,), singular={"the centre": (0, 0)}),
         name="kepler",
-        q0=[0.0, 1.2],
-        p0=[-1.0, -0.6],
-        h=0.1,
+        q0_p0_h=([0.0, 1.2], [-1.0, -0.6], 0.1),
         parameters={
             "K": Parameter(1.0, "root of the strength of attraction, K² = GM [length^(3/2)/time]")
         },

@@ -3,17 +3,9 @@
 import jax.numpy as jnp
 import numpy as np
 
+from ..problem.system import System
 from ._elliptic import swing
-from ._problem import (
-    Adiabatic,
-    Parameter,
-    Problem,
-    Start,
-    System,
-    at_end,
-    interval,
-    library_problem,
-)
+from ._problem import Adiabatic, Parameter, Problem, Start, at_end, interval, library_problem
 from .pendulum import exact as of_pendulum
 
 
@@ -76,9 +68,7 @@ def lorentz_pendulum() -> Problem:
         System(hamiltonian, slow_time=True),
         Start("Lorentz's pendulum has one angle", (1,)),
         name="lorentz_pendulum",
-        q0=np.array([1.0]),
-        p0=np.array([0.0]),
-        h=0.02,
+        q0_p0_h=(np.array([1.0]), np.array([0.0]), 0.02),
         parameters={
             "mass": Parameter(1.0, "of the bob [kg]"),
             "g": Parameter(9.81, "gravity [m/s²]"),

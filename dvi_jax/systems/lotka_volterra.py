@@ -60,9 +60,7 @@ def lotka_volterra() -> Problem:
         hamiltonian,
         Start("q0 and p0 are the logarithms of one prey and one predator population", (1,)),
         name="lotka_volterra",
-        q0=q0,
-        p0=p0,
-        h=0.05,
+        q0_p0_h=(q0, p0, 0.05),
         parameters={
             "alpha": Parameter(0.55, "growth of prey [1/year]"),
             "beta": Parameter(0.028, "prey eaten, for each predator [1/(year thousand)]"),

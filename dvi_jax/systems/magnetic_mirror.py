@@ -80,14 +80,12 @@ def magnetic_mirror(length: float = 20.0, distance: float = 2.0) -> Problem:
     Particles*.
     """
     length, distance = positive("length", length), finite("distance", distance)
-    x, vy, vz = distance + 1, -1.0, 0.8
+    x, vy, vz = distance + 1, -1.0, 0.8  # where A = (0, x/2, 0)
     return library_problem(
         hamiltonian,
         Start("the magnetic mirror holds one particle in space", (3,)),
         name="magnetic_mirror",
-        q0=[x, 0.0, 0.0],
-        p0=[0.0, vy + x / 2, vz],  # A = (0, x/2, 0) there
-        h=0.1,
+        q0_p0_h=([x, 0.0, 0.0], [0.0, vy + x / 2, vz], 0.1),
         parameters={
             **guiding_centre.PARTICLE,
             "B0": Parameter(1.0, "field in the middle [mass/(charge time)]", nonzero),

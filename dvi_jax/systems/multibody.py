@@ -63,7 +63,7 @@ def spherical_pendulum() -> Problem:
         {"m": Parameter(1.0, "mass [kg]"), "l": Parameter(1.0, "length of the rod [m]"),
          "g": _GRAVITY},
         [vertical_momentum], name="spherical_pendulum", invariants=("vertical_momentum",),
-        q0=np.array([0.8, 0.0, -0.6]), p0=np.array([0.3, 1.0, 0.4]), h=0.01, units=_SI,
+        q0_p0_h=(np.array([0.8, 0.0, -0.6]), np.array([0.3, 1.0, 0.4]), 0.01), units=_SI,
         exact=_exact_on_sphere,
         source="Whittaker 1937, Analytical Dynamics, §55",
     )  # fmt: skip
@@ -83,9 +83,9 @@ def chain(links: int = 20) -> Problem:
         System(_weights, constraint=_links),
         Start("the chain has positions of n masses", (None, None)),
         {"m": Parameter(1.0, "mass of each link [kg]"),
-         "l": Parameter(0.1, "length of each link [m]"), "g": _GRAVITY},
-        name="chain", q0=distances * np.array([np.sin(0.4), -np.cos(0.4)]), p0=np.zeros((links, 2)),
-        h=0.002, units=_SI, source="Leimkuhler & Reich 2004, Simulating Hamiltonian Dynamics, 7",
+         "l": Parameter(0.1, "length of each link [m]"), "g": _GRAVITY}, name="chain", units=_SI,
+        q0_p0_h=(distances * np.array([np.sin(0.4), -np.cos(0.4)]), np.zeros((links, 2)), 0.002),
+        source="Leimkuhler & Reich 2004, Simulating Hamiltonian Dynamics, 7",
     )  # fmt: skip
 
 
@@ -130,11 +130,11 @@ def slider_crank() -> Problem:
     x, y, rate = l1 / 2, l1 * np.sqrt(3) / 2, 5.0
     reach = np.sqrt(args["l2"] ** 2 - y**2)
     A, B = rate * np.array([[-y, x], [-y - x * y / reach, 0.0]])  # velocities
+    q0, p0 = np.array([[x, y], [x + reach, 0.0]]), np.array([a * A + b * B, b * A + c * B])
     return library_problem(
         System(_crank_energy, constraint=_rods_and_rail),
         Start("the slider-crank has positions (A, B) in the plane", (2, 2)),
-        parameters, name="slider_crank", q0=np.array([[x, y], [x + reach, 0.0]]),
-        p0=np.array([a * A + b * B, b * A + c * B]), h=0.002, units=_SI,
+        parameters, name="slider_crank", units=_SI, q0_p0_h=(q0, p0, 0.002),
         source="García de Jalón & Bayo 1994, Kinematic and Dynamic Simulation, 2 and 4",
     )  # fmt: skip
 
@@ -166,6 +166,7 @@ def dumbbell() -> Problem:
     """
     c, s = np.cos(0.5), np.sin(0.5)
     sides = np.array([[-1 / 3], [2 / 3]])  # of the centre of mass, as parts of the rod
+    place = np.array([1.0, 0.0, 0.0]) + sides * np.array([0.1 * c, 0.1 * s, 0.0])
     turning = np.array([0.0, 1.05, 0.1]) + sides * np.array([-0.12 * s, 0.12 * c, 0.06])
     return library_problem(
         System(_dumbbell_energy, constraint=_rod),
@@ -174,7 +175,6 @@ def dumbbell() -> Problem:
          "l": Parameter(0.1, "length of the rod [length]"),
          "mu": Parameter(1.0, "strength of the centre [length³/time²]")},
         [angular_momentum], name="dumbbell", invariants=("angular_momentum",),
-        q0=np.array([1.0, 0.0, 0.0]) + sides * np.array([0.1 * c, 0.1 * s, 0.0]),
-        p0=np.array([[1.0], [0.5]]) * turning, h=0.02,
+        q0_p0_h=(place, np.array([[1.0], [0.5]]) * turning, 0.02),
         source="Celletti & Sidorenko 2008, Celest. Mech. Dyn. Astr. 101, 105",
     )  # fmt: skip

@@ -72,9 +72,7 @@ def nls_lattice(n: int = 8) -> Problem:
         hamiltonian,
         Start("the lattice is a ring of at least three sites", (None,), smallest=3),
         name="nls_lattice",
-        q0=q0,
-        p0=p0,
-        h=0.02,
+        q0_p0_h=(q0, p0, 0.02),
         parameters={
             "kappa": Parameter(1.0, "coupling of neighbours [1/time]", finite),
             "gamma": Parameter(

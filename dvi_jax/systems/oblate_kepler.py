@@ -90,14 +90,12 @@ def oblate_kepler() -> Problem:
     NASA/TP-1998-206861).
     """
     mu, a, e, i = 398600.4415, 8000.0, 0.1, np.deg2rad(50)
-    speed = np.sqrt(mu / a * (1 + e) / (1 - e))
+    v = np.sqrt(mu / a * (1 + e) / (1 - e)) * np.array([0.0, np.cos(i), np.sin(i)])
     return library_problem(
         hamiltonian,
         Start("the satellite is one body in space", (3,), check=_above_surface),
         name="oblate_kepler",
-        q0=np.array([a * (1 - e), 0.0, 0.0]),
-        p0=speed * np.array([0.0, np.cos(i), np.sin(i)]),
-        h=10.0,
+        q0_p0_h=(np.array([a * (1 - e), 0.0, 0.0]), v, 10.0),
         parameters={
             "mu": Parameter(mu, "G times the mass of the planet [km³/s²]"),
             "R": Parameter(6378.1363, "equatorial radius of the planet [km]"),

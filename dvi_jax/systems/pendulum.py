@@ -65,10 +65,8 @@ def exact(t, q0, p0, args):
     large, sign = jnp.where(swings, 2.0, m), jnp.where(p0 < 0, -1.0, 1.0)
     root = jnp.sqrt(large)
     _, _, dn, am = jacobi(root * w * t + first_kind(sign * q0 / 2, 1 / large), 1 / large)
-    q, p = (
-        jnp.where(swings, q_swing, 2 * sign * am),
-        jnp.where(swings, p_swing, 2 * sign * w * root * dn),
-    )
+    q = jnp.where(swings, q_swing, 2 * sign * am)
+    p = jnp.where(swings, p_swing, 2 * sign * w * root * dn)
     return q + 0 * m, p + 0 * m
 
 
@@ -85,9 +83,7 @@ def pendulum() -> Problem:
         System(hamiltonian, friction),
         Start("the pendulum has one angle", (1,)),
         name="pendulum",
-        q0=np.array([1.5]),
-        p0=np.array([1.0]),
-        h=0.1,
+        q0_p0_h=(np.array([1.5]), np.array([1.0]), 0.1),
         parameters={"omega": Parameter(1.0, "frequency of small oscillations [1/time]")},
         observables=[action],
         units={"q": "rad", "p": "1", "t": "1", "energy": "1"},

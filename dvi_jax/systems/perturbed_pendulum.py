@@ -33,9 +33,7 @@ def perturbed_pendulum() -> Problem:
         System(hamiltonian, perturbation=coupling),
         Start("the perturbed pendulum has one angle", (1,)),
         name="perturbed_pendulum",
-        q0=[0.5],
-        p0=[0.3],
-        h=0.1,
+        q0_p0_h=([0.5], [0.3], 0.1),
         source="our own choice",
         exact=exact,
     )

@@ -71,18 +71,12 @@ def relativistic_kepler() -> Problem:
 
     **Source** Sommerfeld 1916, *Ann. Phys.* 356, 1.
     """
+    rule = "the relativistic Kepler problem is in the plane"
     return library_problem(
         hamiltonian,
-        Start(
-            "the relativistic Kepler problem is in the plane",
-            (2,),
-            singular={"the centre": (0, 0)},
-            check=_misses_the_centre,
-        ),
+        Start(rule, (2,), singular={"the centre": (0, 0)}, check=_misses_the_centre),
         name="relativistic_kepler",
-        q0=np.array([0.6, 0.0]),
-        p0=np.array([0.0, 1.5]),
-        h=0.02,
+        q0_p0_h=(np.array([0.6, 0.0]), np.array([0.0, 1.5]), 0.02),
         parameters={
             "K": Parameter(1.0, "root of the strength of attraction, K² = GM [length^(3/2)/time]"),
             "c": Parameter(10.0, "speed of light [length/time]"),

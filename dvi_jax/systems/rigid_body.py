@@ -145,9 +145,7 @@ def rigid_body() -> Problem:
         hamiltonian,
         Start("the rigid body has angles (l, g, k) and momenta (L, G, K)", (3,), check=_possible),
         name="rigid_body",
-        q0=np.array([0.1, 0.0, 0.4]),
-        p0=np.array([0.1, 1.0, 0.6]),
-        h=0.05,
+        q0_p0_h=(np.array([0.1, 0.0, 0.4]), np.array([0.1, 1.0, 0.6]), 0.05),
         parameters={
             f"I{i}": Parameter(moment, f"moment of inertia about principal axis {i} [mass length²]")
             for i, moment in enumerate((1.0, 2.0, 2.5), 1)

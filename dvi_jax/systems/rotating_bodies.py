@@ -30,7 +30,7 @@ def _body(name, energy, parameters, state, observables, source, **properties) ->
                    [y * z, y * c, b]])  # fmt: skip
     p0 = q0 @ np.cross(np.eye(3), pi / I) * (np.sum(I) / 2 - I)
     start = Start(f"the {name.replace('_', ' ')} has a rotation matrix", (3, 3))
-    properties |= {"name": name, "q0": q0, "p0": p0, "h": h, "source": source}
+    properties |= {"name": name, "q0_p0_h": (q0, p0, h), "source": source}
     system = System(energy, constraint=rigid.orthonormal)
     return library_problem(system, start, parameters, observables, **properties)
 

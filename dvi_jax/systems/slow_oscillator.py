@@ -4,16 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..discover.symmetries.library import scaling
-from ._problem import (
-    Adiabatic,
-    Parameter,
-    Problem,
-    Start,
-    System,
-    at_end,
-    interval,
-    library_problem,
-)
+from ..problem.system import System
+from ._problem import Adiabatic, Parameter, Problem, Start, at_end, interval, library_problem
 from .oscillator import exact as of_oscillator
 
 
@@ -49,16 +41,13 @@ def slow_oscillator() -> Problem:
     **Source** Ehrenfest 1916, *Ann. Phys.* 356, 327; Arnold 1989, *Mathematical Methods of
     Classical Mechanics*, §52.
     """
+    depth = Parameter(0.3, "relative change of the frequency [1]", interval(-1, 1))
     return library_problem(
         System(hamiltonian, slow_time=True),
         Start("the slow oscillator has one degree of freedom", (1,)),
         name="slow_oscillator",
-        q0=np.array([0.4]),
-        p0=np.array([0.3]),
-        h=0.1,
-        parameters={
-            "depth": Parameter(0.3, "relative change of the frequency [1]", interval(-1, 1))
-        },
+        q0_p0_h=(np.array([0.4]), np.array([0.3]), 0.1),
+        parameters={"depth": depth},
         observables=[action],
         source="Ehrenfest 1916, Ann. Phys. 356, 327; Arnold 1989, §52",
         invariants=("action",),

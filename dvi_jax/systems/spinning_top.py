@@ -74,12 +74,8 @@ def _turning_points(E, p_phi, p_psi, args):
     def polish(x, sign):
         """A root x = 1 + sign u: the same cubic in x, times A²."""
         P, free = p_phi + sign * p_psi, E + sign * w
-        cubic = (
-            2 * sign * A * w,
-            -4 * sign * A * w - 2 * A * free - p_psi**2,
-            4 * A * free + 2 * sign * P * p_psi,
-            -(P**2),
-        )
+        cubic = 2 * sign * A * w, -4 * sign * A * w - 2 * A * free - p_psi**2
+        cubic = (*cubic, 4 * A * free + 2 * sign * P * p_psi, -(P**2))
         for _ in range(4):
             value, slope = cubic[0], 0.0
             for coefficient in cubic[1:]:
@@ -158,9 +154,7 @@ def spinning_top() -> Problem:
         hamiltonian,
         Start("the top has Euler's angles (φ, θ, ψ)", (3,), check=_leans),
         name="spinning_top",
-        q0=np.array([0.0, 0.6, 0.0]),
-        p0=np.array([2.4, 0.1, 2.5]),
-        h=0.02,
+        q0_p0_h=(np.array([0.0, 0.6, 0.0]), np.array([2.4, 0.1, 2.5]), 0.02),
         parameters={
             "A": Parameter(
                 1.0, "moment of inertia about the fixed point, across the axis [mass length²]"

@@ -46,15 +46,9 @@ def stiff_fput(m: int = 3, omega: float = 50.0) -> Problem:
         hamiltonian,
         Start("the stiff FPUT chain has centres and lengths of m springs", (2, None)),
         name="stiff_fput",
-        q0=q0,
-        p0=p0,
-        h=0.5 / omega,
+        q0_p0_h=(q0, p0, 0.5 / omega),
         parameters={"omega": Parameter(omega, "frequency of the stiff springs [1/time]")},
         observables=[stiff_energies, oscillatory_energy],
         source="Hairer, Lubich & Wanner 2006, Geometric Numerical Integration, I.5.1",
-        adiabatic={
-            "oscillatory_energy": Adiabatic(
-                "1/ω", 1, smaller=lambda factor: stiff_fput(m, omega / factor)
-            )
-        },
+        adiabatic={"oscillatory_energy": Adiabatic("1/ω", 1, lambda x: stiff_fput(m, omega / x))},
     )

@@ -30,9 +30,7 @@ def double_well(temperature: float | None = None, friction: float = 1.0) -> Prob
         Start("the particle in a double well has one degree of freedom", (1,)),
         parameters,
         name="double_well",
-        q0=np.array([1.2]),
-        p0=np.array([0.2]),
-        h=0.1,
+        q0_p0_h=(np.array([1.2]), np.array([0.2]), 0.1),
         observables=[configurational(well)],
         source="Kramers 1940, Physica 7, 284",
     )
@@ -72,9 +70,7 @@ def thermal_chain(n: int = 10, temperature: float | None = None, friction: float
         Start("the thermal chain is a row of particles", (None,)),
         parameters,
         name="thermal_chain",
-        q0=np.linspace(0.0, 0.5, n),
-        p0=np.linspace(0.3, -0.3, n),
-        h=0.1,
+        q0_p0_h=(np.linspace(0.0, 0.5, n), np.linspace(0.3, -0.3, n), 0.1),
         observables=[bonds, configurational(chain)],
         source="Lepri, Livi & Politi 2003, Phys. Rep. 377, 1",
     )

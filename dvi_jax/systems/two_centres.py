@@ -56,9 +56,7 @@ def two_centres() -> Problem:
         hamiltonian,
         Start("the problem of two centres is in space", (3,), singular=centres),
         name="two_centres",
-        q0=np.array([2.0, 0.0, 0.5]),
-        p0=np.array([0.1, 0.6, 0.5]),
-        h=0.02,
+        q0_p0_h=(np.array([2.0, 0.0, 0.5]), np.array([0.1, 0.6, 0.5]), 0.02),
         parameters={
             "mu1": Parameter(1.0, "strength of the centre at z = d [length³/time²]", finite),
             "mu2": Parameter(0.6, "strength of the centre at z = −d [length³/time²]", finite),

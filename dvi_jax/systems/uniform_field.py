@@ -93,9 +93,7 @@ def uniform_field() -> Problem:
         hamiltonian,
         Start("the field holds one particle in space", (3,)),
         name="uniform_field",
-        q0=np.array([1.0, 0.0, 0.0]),
-        p0=np.array([0.0, -0.5, 0.2]),
-        h=0.1,
+        q0_p0_h=(np.array([1.0, 0.0, 0.0]), np.array([0.0, -0.5, 0.2]), 0.1),
         parameters={
             "charge": Parameter(1.0, "e [charge]", nonzero),
             "mass": Parameter(1.0, "m [mass]"),
@@ -108,6 +106,6 @@ def uniform_field() -> Problem:
         units={"q": "1", "p": "1", "t": "1/gyrofrequency", "energy": "1"},
         source="Jackson 1999, Classical Electrodynamics, 12.2–12.3",
         invariants=("magnetic_moment", "pseudomomentum"),
-        symmetries={**{f"magnetic_translation_{x}": _translation(i) for i, x in enumerate("xyz")}},
+        symmetries={f"magnetic_translation_{x}": _translation(i) for i, x in enumerate("xyz")},
         exact=exact,
     )

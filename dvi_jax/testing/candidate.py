@@ -10,6 +10,7 @@ import numpy as np
 
 import dvi_jax as dvi
 from dvi_jax.systems import Problem
+from dvi_jax.systems.kepler import angular_momentum
 
 from . import problems
 from .problems import CENTRAL, COUPLED, SINGLE, inputs, state
@@ -69,9 +70,8 @@ class Candidate:
             def loss_of_run(x, adjoint=ADJOINTS["Direct"]):
                 return loss(self.run(x, adjoint)[0])
 
-            backward = {
-                name: jax.grad(loss_of_run)(x, adjoint) for name, adjoint in ADJOINTS.items()
-            }
+            slope = jax.grad(loss_of_run)
+            backward = {name: slope(x, adjoint) for name, adjoint in ADJOINTS.items()}
             return backward, jax.jvp(loss_of_run, (x,), (jax.tree.map(jnp.ones_like, x),))[1]
 
         backward, forward = jax.jit(derivatives)(inputs(self.small))
@@ -87,12 +87,9 @@ class Candidate:
     @functools.cached_property
     def long_run(self) -> dvi.Solution:
         """`LONG` steps of `CENTRAL`: slope and range of the energy, drift of q × p."""
-        energy, momentum = problems.central_energy, problems.angular_momentum
-        observe = {
-            "slope": dvi.Trend(energy),
-            "range": dvi.Range(energy),
-            "momentum": dvi.MaxDrift(momentum),
-        }
+        energy = problems.central_energy
+        observe: dict[str, Any] = {"slope": dvi.Trend(energy), "range": dvi.Range(energy)}
+        observe["momentum"] = dvi.MaxDrift(angular_momentum)
         x = inputs(CENTRAL, 0.0) | {"h": LONG_H, "epsilon": 0.0}
         return problems.run(CENTRAL, self.method, x, LONG, observe)
 

@@ -34,12 +34,8 @@ class Certificate:
     @property
     def failures(self) -> list[tuple[str, str, Measured]]:
         """(method, check, measured) wherever a method lacks a property that it claims."""
-        return [
-            (method, check, result)
-            for method, row in self.rows.items()
-            for check, result in row.items()
-            if not result.ok
-        ]
+        results = ((name, check, row[check]) for name, row in self.rows.items() for check in row)
+        return [entry for entry in results if not entry[2].ok]
 
     @property
     def missed(self) -> list[Control]:

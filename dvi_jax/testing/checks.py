@@ -192,10 +192,8 @@ def check_momentum(candidate: Candidate) -> Measured:
 def _of_long_run(candidate, value: float, bound: float, detail: str = "") -> Measured:
     run, claim = candidate.long_run, candidate.method.is_symplectic
     if run.status != "successful":
-        step = int(run.stats["failed_step"])
-        return not_measured(
-            f"≤ {bound:g}", f"the trajectory failed at step {step}: {run.status}", claim
-        )
+        cause = f"the trajectory failed at step {int(run.stats['failed_step'])}: {run.status}"
+        return not_measured(f"≤ {bound:g}", cause, claim)
     return at_most(value, bound, claim, detail)
 
 

@@ -3,8 +3,8 @@
 # Abstract variables of equinox stay arguments of a subclass for pyright, though not at run time.
 # pyright: reportCallIssue=false
 
-import functools
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -80,12 +80,12 @@ def _backwards(method, equations, interval, q, p):
     return method.step(equations, interval.reversed(), q, p)
 
 
-def _not_quite_inverse(method, equations, interval, q, p):
+def _inexact(method, equations, interval, q, p):
     q, p, info = method.inverse(equations, interval, q, p)
     return q * (1 + 1e-8), p, info
 
 
-def _without_gradient_of_h(method, equations, interval, q, p):
+def _without_slope(method, equations, interval, q, p):
     fixed = interval._replace(h=jax.lax.stop_gradient(interval.h))
     return method.step(equations, fixed, q, p)
 
@@ -127,55 +127,28 @@ def _with_other_digits() -> dvi.Method:
     return dvi.Composition(c, order=2)
 
 
-_FIRST, _SECOND = dvi.TypeII(), dvi.Strang()
+_first, _second = (partial(altered, base) for base in (dvi.TypeII(), dvi.Strang()))
 _RK4 = altered(dvi.RungeKutta4(), is_symplectic=True)
+_OTHER_DIGITS = "KahanLi8 with coefficients changed by 1e-3, declared of order 8"
+_FIXED_TIME = "Strang with the force at the initial time of the step only"
+_COUNTER = "TypeII with a Python counter that changes at each trace"
 
 CONTROLS: tuple[Control, ...] = (
-    Control("TypeII declared to be of order 2", "order", altered(_FIRST, order=2)),
-    Control("Strang declared to be of order 1", "order", altered(_SECOND, order=1)),
-    Control(
-        "KahanLi8 with coefficients changed by 1e-3, declared of order 8",
-        "order",
-        altered(_with_other_digits(), order=8),
-    ),
-    Control(
-        "Strang with the force at the initial time of the step only",
-        "forced-order",
-        altered(_SECOND, _with_frozen_time),
-    ),
+    Control("TypeII declared to be of order 2", "order", _first(order=2)),
+    Control("Strang declared to be of order 1", "order", _second(order=1)),
+    Control(_OTHER_DIGITS, "order", altered(_with_other_digits(), order=8)),
+    Control(_FIXED_TIME, "forced-order", _second(_with_frozen_time)),
     Control("RungeKutta4 declared to be symplectic", "symplecticity", _RK4),
-    Control("explicit Euler in place of TypeII", "symplecticity", altered(_FIRST, _explicit_euler)),
-    Control("TypeII declared to be symmetric", "reversal", altered(_FIRST, is_symmetric=True)),
-    Control(
-        "TypeII with the step −h as its inverse", "adjoint", altered(_FIRST, inverse=_backwards)
-    ),
+    Control("explicit Euler in place of TypeII", "symplecticity", _first(_explicit_euler)),
+    Control("TypeII declared to be symmetric", "reversal", _first(is_symmetric=True)),
+    Control("TypeII with the step −h as its inverse", "adjoint", _first(inverse=_backwards)),
     Control("RungeKutta4 declared to be symplectic", "energy", _RK4),
     Control("RungeKutta4 declared to be symplectic", "momentum", _RK4),
-    Control(
-        "TypeII without the derivative with respect to h",
-        "gradient",
-        altered(_FIRST, _without_gradient_of_h),
-    ),
-    Control(
-        "TypeII with an inverse that is wrong by 1e-8",
-        "modes",
-        altered(_FIRST, inverse=_not_quite_inverse),
-    ),
-    Control(
-        "TypeII with a Python counter that changes at each trace",
-        "jit",
-        altered(_FIRST, _with_a_number_from_python),
-    ),
-    Control(
-        "TypeII with a batching rule that mixes trajectories",
-        "vmap",
-        altered(_FIRST, _mixing_lanes),
-    ),
-    Control("TypeII that replaces NaN by numbers", "failure", altered(_FIRST, _hiding_nan)),
-    Control(
-        "TypeII whose instances never compare equal",
-        "traces",
-        altered(_FIRST, functools.partial(_step)),
-    ),
+    Control("TypeII without the derivative with respect to h", "gradient", _first(_without_slope)),
+    Control("TypeII with an inverse that is wrong by 1e-8", "modes", _first(inverse=_inexact)),
+    Control(_COUNTER, "jit", _first(_with_a_number_from_python)),
+    Control("TypeII with a batching rule that mixes trajectories", "vmap", _first(_mixing_lanes)),
+    Control("TypeII that replaces NaN by numbers", "failure", _first(_hiding_nan)),
+    Control("TypeII whose instances never compare equal", "traces", _first(partial(_step))),
 )
 """Each of them must fail its check by a number that is measured."""

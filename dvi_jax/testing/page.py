@@ -3,7 +3,7 @@
 import math
 import platform
 import string
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
@@ -70,18 +70,12 @@ def tables(
         if names:
             sheets.append(Sheet(title, list(columns), list(zip(*columns.values(), strict=True))))
     if controls:
-        words = {True: "caught", False: "MISSED"}
-        body = [
-            [
-                control.check,
-                control.name,
-                cell(control.check, result),
-                result.allowed,
-                words[result.verdict == "FAIL"],
-            ]
-            for control, result in controls
-        ]
         columns = ["check", "broken method", "measured", "allowed", "verdict"]
+        body = []
+        for control, result in controls:
+            verdict = "caught" if result.verdict == "FAIL" else "MISSED"
+            measured = cell(control.check, result), result.allowed
+            body.append([control.check, control.name, *measured, verdict])
         sheets.append(Sheet("Controls", columns, body))
     return sheets
 
@@ -109,7 +103,7 @@ def markdown(
     versions = ", ".join(f"{n} {version(n)}" for n in ("dvi-jax", "jax", "jaxlib", "numpy"))
     python = ".".join(platform.python_version_tuple()[:2])
     checks = {name for table in sheets for name in table.columns} & set(CHECKS)
-    parts = [f"## {table.title}\n\n{_as_markdown(table)}" for table in sheets]
+    parts = [f"## {sheet.title}\n\n{markdown_table(sheet.columns, sheet.rows)}" for sheet in sheets]
     if failures:
         faults = [
             f"- {method}, {check}: {result.verdict}, allowed {result.allowed}. {result.detail}"
@@ -126,8 +120,8 @@ def markdown(
     )
 
 
-def _as_markdown(table: Sheet) -> str:
-    rows = [table.columns, ["---"] * len(table.columns), *table.rows]
-    return "\n".join(
-        "| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows
-    )
+def markdown_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table with these names of columns."""
+    header, *body = ([cell.replace("|", "\\|") for cell in row] for row in (columns, *rows))
+    lines = header, ["---"] * len(header), *body
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)

@@ -9,6 +9,7 @@ import numpy as np
 
 import dvi_jax as dvi
 from dvi_jax.systems import Problem
+from dvi_jax.systems._problem import at_end
 
 STRENGTH = 0.2
 """ε where the force is on."""
@@ -38,14 +39,8 @@ def modulation(t0, t1, q0, p1, args):
     return -q0 * jnp.cos(t0)
 
 
-def central_energy(t0, t1, q0, p0, q1, p1, args):
-    """H of `CENTRAL` at the end of a step."""
-    return central_hamiltonian(t1, t1, q1, p1, args)
-
-
-def angular_momentum(t0, t1, q0, p0, q1, p1, args):
-    """q × p at the end of a step."""
-    return q1[0] * p1[1] - q1[1] * p1[0]
+central_energy = at_end(central_hamiltonian)
+"""H of `CENTRAL` at the end of a step."""
 
 
 def _problem(name, hamiltonian, force, q0, p0) -> Problem:

@@ -30,11 +30,7 @@ def read_columns(path: Path, key: str = "data.file") -> dict[str, np.ndarray]:
 def _npz(path: Path) -> dict[str, np.ndarray]:
     with np.load(path, allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
-    return {
-        n: array
-        for n, array in arrays.items()
-        if array.ndim and np.issubdtype(array.dtype, np.number)
-    }
+    return {name: x for name, x in arrays.items() if x.ndim and np.issubdtype(x.dtype, np.number)}
 
 
 def _csv(path: Path, key: str) -> dict[str, np.ndarray]:

@@ -73,9 +73,8 @@ def fit_file(
             result = dvi.fit(**arguments, **options, progress=recorder(last, show))
     with report.writing(keep=CHECKPOINT):
         result.save(report.path("fit.npz"))
-        trajectory, status = _trajectory(
-            arguments["model"], arguments["data"].in_time_order(), result
-        )
+        data = arguments["data"].in_time_order()
+        trajectory, status = _trajectory(arguments["model"], data, result)
         report.write_arrays("trajectory.npz", trajectory)
         report.contents |= _contents(arguments, result)
         report.contents |= {"columns": columns, "trajectory": status}

@@ -26,14 +26,16 @@ def read_observables(texts: dict[str, str] | None, source: Source) -> dict[str, 
     """
     defaults = dict(source.problem.observables) if source.problem is not None else {}
     if texts is None:
-        return {
-            **defaults,
-            **{f"{name}_drift": dvi.MaxDrift(function) for name, function in defaults.items()},
-        }
+        return with_drifts(defaults)
     return {
         key: _observable(f"observables.{key}", text, defaults, source)
         for key, text in texts.items()
     }
+
+
+def with_drifts(observables: dict[str, Any]) -> dict[str, Any]:
+    """Observables, and the largest drift of each."""
+    return observables | {f"{name}_drift": dvi.MaxDrift(f) for name, f in observables.items()}
 
 
 def _observable(key: str, text: str, names: dict[str, Callable], source: Source) -> Any:

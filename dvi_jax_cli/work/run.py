@@ -10,12 +10,13 @@ import numpy as np
 
 import dvi_jax as dvi
 from dvi_jax import plot
+from dvi_jax.systems.n_body import OBSERVABLES
 from dvi_jax.systems.planets.solar_system import check_covered
 
 from .._errors import as_input_error
 from .._show import TextTable
 from . import solar
-from .observables import Observed, observe, read_observables
+from .observables import Observed, observe, read_observables, with_drifts
 from .output import Report, open_report
 from .schema import RunFile
 from .system import Source, find_source
@@ -50,7 +51,7 @@ def run_file(
         run = _arguments(file, source)
         # Those of the file come in the report; the ephemeris is compared with the same in each run.
         observables = {"own": read_observables(file.observables, source)}
-        observables["always"] = {} if source.jd is None else solar.conserved_observables()
+        observables["always"] = {} if source.jd is None else with_drifts(OBSERVABLES)
         began = time.perf_counter()
         rule = "functions, state and args that fit one another"
         with source.at_work("system", "integrated", rule):
@@ -98,14 +99,9 @@ def _describe(
     stats = {name: np.asarray(value) for name, value in solution.stats.items()}
     step, steps = int(stats["failed_step"]), int(stats["num_steps"])
     residual, message = float(stats["failed_residual"]), dvi.RESULTS[solution.result]
+    status = {"result": solution.status, "message": message, "failed_step": step}
     report.contents |= {
-        "status": {
-            "result": solution.status,
-            "message": message,
-            "failed_step": step,
-            "failed_residual": residual,
-            "num_steps": steps,
-        },
+        "status": status | {"failed_residual": residual, "num_steps": steps},
         "stats": stats | {"seconds": seconds, "saved": len(solution.ts)},
         "results": {name: entry.summary() for name, entry in observed.items()},
     }
@@ -124,9 +120,8 @@ def _describe(
 def _row(name: str, observable: Observed) -> list[str]:
     summary = observable.summary()
     if observable.reduction:
-        relative = (
-            f"{summary['relative']:.2e}" if "relative" in summary and observable.is_relative else ""
-        )
+        has_relative = "relative" in summary and observable.is_relative
+        relative = f"{summary['relative']:.2e}" if has_relative else ""
         return [name, observable.reduction, "", _number(summary["value"], 4), relative]
     change = f"{summary['largest_saved_change']:.2e}"
     return [name, "", _number(summary["start"]), _number(summary["end"]), change]

@@ -12,33 +12,20 @@ from typing_extensions import TypeAliasType
 
 from .._errors import describe, require
 from .._names import FILES as KINDS
+from . import table as toml
 from .ring import RingFile
 from .table import (
-    AN_AXIS,
     Array,
-    AxisName,
-    AxisTable,
     Count,
-    Fraction,
-    JsonSchema,
-    Limit,
     NonEmpty,
     NonNegative,
     Number,
-    NumberOrArray,
-    Scalar,
-    StateOrAxis,
-    StepSize,
-    SweepParameter,
     Text,
     TomlTable,
     Two,
     check,
     key,
-    number_or_axis,
-    type_tag,
     union,
-    union_by_kind,
 )
 
 ARRAY = "an array of finite numbers, or of such arrays with rows of one length"
@@ -52,7 +39,7 @@ STEP_SIZE = "a finite number that is not zero (negative runs backwards)"
 BOOLEAN = "true or false"
 BOX = "{q = […], p = […]}: numbers, or arrays of the shape of q"
 NEW_DIRECTORY = "the path of a directory that does not exist yet"
-OR_AXIS = f"; or an axis, {AN_AXIS}"
+OR_AXIS = f"; or an axis, {toml.AN_AXIS}"
 SEED = "a whole number that is not negative"
 TIMES = "at least two times, all increasing or all decreasing"
 
@@ -64,7 +51,7 @@ Date = Annotated[
     WithJsonSchema({"type": ["string", "number"]}),
 ]
 Parameter = TypeAliasType(
-    "Parameter", union(boolean=bool, number=Scalar, array=Array, table=dict[str, "Parameter"])
+    "Parameter", union(boolean=bool, number=toml.Scalar, array=Array, table=dict[str, "Parameter"])
 )
 
 
@@ -90,7 +77,7 @@ class SystemFile(TomlTable):
     state: State = State()
     args: dict[str, Parameter] | None = key(None, ARGS)
     t0: Number = key(0.0, FINITE)
-    h: StepSize | None = key(None, STEP_SIZE)
+    h: toml.StepSize | None = key(None, STEP_SIZE)
     method: Text = key("TypeII", METHOD)
 
 
@@ -164,21 +151,21 @@ class RunFile(SystemFile, Integration):
 class SweepState(State):
     """The initial condition, with axes."""
 
-    q0: StateOrAxis | None = key(None, f"{ARRAY}; numbers in it may be axes")
-    p0: StateOrAxis | None = key(None, f"{ARRAY}; numbers in it may be axes")
+    q0: toml.StateOrAxis | None = key(None, f"{ARRAY}; numbers in it may be axes")
+    p0: toml.StateOrAxis | None = key(None, f"{ARRAY}; numbers in it may be axes")
 
 
 class StatePair(TomlTable):
     """Two values, for q and for p."""
 
-    q: NumberOrArray = key(..., "a number, or an array of the shape of q")
-    p: NumberOrArray = key(..., "a number, or an array of the shape of q")
+    q: toml.NumberOrArray = key(..., "a number, or an array of the shape of q")
+    p: toml.NumberOrArray = key(..., "a number, or an array of the shape of q")
 
 
 class _Start(TomlTable):
     count: Count = key(..., COUNT)
     seed: NonNegative = key(0, SEED)
-    name: AxisName = key("start", "a name such as start")
+    name: toml.AxisName = key("start", "a name such as start")
 
 
 class BoxStart(_Start):
@@ -215,7 +202,7 @@ class OwnStart(TomlTable):
     starts: Text = key(..., f"{FILE}, a dvi.starts.Starts")
 
 
-Start = union_by_kind(BoxStart, NormalStart, EnergyShellStart, OwnStart)
+Start = toml.union_by_kind(BoxStart, NormalStart, EnergyShellStart, OwnStart)
 
 
 class SaveEvery(TomlTable):
@@ -240,17 +227,17 @@ class SweepFile(SystemFile, Integration):
 
     state: SweepState = SweepState()
     start: Start | None = key(None, "a table, kind = halton, random, normal, energy_shell or own")
-    args: dict[str, SweepParameter] | None = key(
-        None, f"{ARGS}; a number may be an axis, {AN_AXIS}"
+    args: dict[str, toml.SweepParameter] | None = key(
+        None, f"{ARGS}; a number may be an axis, {toml.AN_AXIS}"
     )
     stop: Text | None = key(None, f"{FILE}, a dvi.Stop that ends trajectories")
-    t0: number_or_axis(Number) = key(0.0, FINITE + OR_AXIS)
-    h: number_or_axis(StepSize) | None = key(None, STEP_SIZE + OR_AXIS)
-    steps: number_or_axis(Count, Annotated[Count, BeforeValidator(_to_integer)]) | None = key(
+    t0: toml.number_or_axis(Number) = key(0.0, FINITE + OR_AXIS)
+    h: toml.number_or_axis(toml.StepSize) | None = key(None, STEP_SIZE + OR_AXIS)
+    steps: toml.number_or_axis(Count, Annotated[Count, BeforeValidator(_to_integer)]) | None = key(
         None, f"{COUNT}{OR_AXIS} of such numbers"
     )
-    epsilon: number_or_axis(Number) | None = key(None, FINITE + OR_AXIS)
-    method: union(text=Text, array=NonEmpty[Text], table=AxisTable[Text]) = key(
+    epsilon: toml.number_or_axis(Number) | None = key(None, FINITE + OR_AXIS)
+    method: union(text=Text, array=NonEmpty[Text], table=toml.AxisTable[Text]) = key(
         "TypeII", f"{METHOD}; or an array of such texts"
     )
     save: union(text=Literal["final"], table=SaveEvery) | None = key(None, '"final", {every = n}')
@@ -275,14 +262,14 @@ def _flat(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return pairs
 
 
-Limits = TypeAliasType("Limits", union(number=Limit, array=list["Limits"]))
+Limits = TypeAliasType("Limits", union(number=toml.Limit, array=list["Limits"]))
 Bounds = TypeAliasType("Bounds", union(array=Two[Limits], table=dict[str, "Bounds"]))
-Priors = TypeAliasType("Priors", union(array=Two[NumberOrArray], table=dict[str, "Priors"]))
+Priors = TypeAliasType("Priors", union(array=Two[toml.NumberOrArray], table=dict[str, "Priors"]))
 
 
 def _sigma_tag(value: Any) -> str:
     is_names = isinstance(value, list) and value and isinstance(value[0], str)
-    return "<names>" if is_names else type_tag(value)
+    return "<names>" if is_names else toml.type_tag(value)
 
 
 Sigma = union(
@@ -323,7 +310,7 @@ class Options(TomlTable):
         "auto", '"auto", "none", or an array of growing times'
     )
     max_steps: Count | None = key(None, COUNT)
-    tolerance: Fraction = key(1e-4, FRACTION)
+    tolerance: toml.Fraction = key(1e-4, FRACTION)
     curvature: bool = key(True, BOOLEAN)
 
 
@@ -362,7 +349,7 @@ class SampleBox(TomlTable):
 
 
 def _strengths(value: Any) -> list[float]:
-    strengths = value.elements if isinstance(value, AxisTable) else value
+    strengths = value.elements if isinstance(value, toml.AxisTable) else value
     if len(strengths) < 3 or min(strengths) <= 0 or len(set(strengths)) < len(strengths):
         raise ValueError
     return strengths
@@ -372,7 +359,7 @@ class Drift(TomlTable):
     """How drifts are measured."""
 
     epsilons: Annotated[
-        union(array=list[Number], table=AxisTable[Number]), AfterValidator(_strengths)
+        union(array=list[Number], table=toml.AxisTable[Number]), AfterValidator(_strengths)
     ] = key(
         [1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2],
         "three numbers or more above zero, no two the same: an array, or {geomspace = [a, b, n]}",
@@ -390,7 +377,7 @@ class DiscoverFile(SystemFile):
         f'text such as "Polynomials(4)", "Polynomials(2) + Radial((-1,))", or {FILE} of a basis',
     )
     order: NonNegative = key(1, SEED)
-    tolerance: Fraction | None = key(None, f"{FRACTION}; not given: exact invariants alone")
+    tolerance: toml.Fraction | None = key(None, f"{FRACTION}; not given: exact invariants alone")
     representative: Literal["least", "simplest"] = key("least", '"least" or "simplest"')
     samples: SampleBox = key(..., "[samples], a table with the box of the samples")
     drift: Drift = Drift()
@@ -444,7 +431,7 @@ def json_schema(kind: str | None = None) -> dict[str, Any]:
     """The JSON schema of the files of one kind, or of a file of any kind."""
     models = [FILES[kind]] if kind else list(FILES.values())
     inputs: Any = [(model, "validation") for model in models]
-    refs, definitions = models_json_schema(inputs, schema_generator=JsonSchema)
+    refs, definitions = models_json_schema(inputs, schema_generator=toml.JsonSchema)
     definitions["anyOf"] = [refs[model, "validation"] for model in models]
     title = f"dvi-jax {kind or 'TOML'} file"
-    return {"$schema": JsonSchema.schema_dialect, "title": title} | definitions
+    return {"$schema": toml.JsonSchema.schema_dialect, "title": title} | definitions

@@ -8,14 +8,8 @@ import numpy as np
 import dvi_jax as dvi
 from dvi_jax import plot
 from dvi_jax.systems.n_body import OBSERVABLES
-from dvi_jax.systems.planets.solar_system import (
-    AU_IN_KM,
-    BODIES,
-    GM,
-    ephemeris,
-    perihelion_longitude,
-    to_ecliptic,
-)
+from dvi_jax.systems.planets import solar_system as planets
+from dvi_jax.systems.planets.solar_system import AU_IN_KM, BODIES, GM, to_ecliptic
 
 from .._show import TextTable
 from .observables import Observed
@@ -69,15 +63,15 @@ def compare(jd: np.ndarray, qs: np.ndarray, ps: np.ndarray, masses: np.ndarray) 
 
     **Source** Einstein 1915; Park et al. 2017, *AJ* 153, 121 (42.98″ per century).
     """
-    q_tab, v_tab = ephemeris(jd)
+    q_tab, v_tab = planets.ephemeris(jd)
     vs = ps / masses[:, None]
     q, v, q_tab, v_tab = (to_ecliptic(x - x[:, :1]) for x in (qs, vs, q_tab, v_tab))
     distance = np.linalg.norm(q - q_tab, axis=-1)
     radius = np.maximum(np.linalg.norm(q_tab, axis=-1), np.finfo(float).tiny)
 
     m, mu = _MERCURY, GM[0] + GM[_MERCURY]
-    longitude = perihelion_longitude(q_tab[:, m], v_tab[:, m], mu)
-    own_longitude = perihelion_longitude(q[:, m], v[:, m], masses[0] + masses[m])
+    longitude = planets.perihelion_longitude(q_tab[:, m], v_tab[:, m], mu)
+    own_longitude = planets.perihelion_longitude(q[:, m], v[:, m], masses[0] + masses[m])
     difference = (longitude - own_longitude) * _ARCSEC
     years = (jd - jd[0]) / 365.25
 
@@ -114,7 +108,7 @@ def own_share(run: dict[str, Any], qs: np.ndarray, ps: np.ndarray) -> float:
         pair = (np.asarray(q), np.asarray(p) / masses)
         q, v = (to_ecliptic(x[:, _MERCURY] - x[:, 0]) for x in pair)
         mu = float(masses[0, 0] + masses[_MERCURY, 0])
-        longitudes.append(perihelion_longitude(q, v, mu))
+        longitudes.append(planets.perihelion_longitude(q, v, mu))
     full, half = longitudes
     slope, _, _ = _line(span * np.arange(count + 1) / CENTURY, (half - full) * _ARCSEC)
     return slope / (1 - 0.5 ** run["method"].order)
@@ -130,26 +124,13 @@ def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
     return float(slope), float(intercept), float(np.sqrt(np.mean(residual**2)))
 
 
-def conserved_observables() -> dict[str, Any]:
-    """Observables of every run of the solar system: all that is conserved, and its drift."""
-    return {
-        **OBSERVABLES,
-        **{f"{name}_drift": dvi.MaxDrift(function) for name, function in OBSERVABLES.items()},
-    }
-
-
 def report(
-    report: Report,
-    jd: np.ndarray,
-    qs: np.ndarray,
-    ps: np.ndarray,
-    run: dict[str, Any],
-    observed: dict[str, Observed],
+    report: Report, jd: Any, qs: Any, ps: Any, run: dict[str, Any], observed: dict[str, Observed]
 ) -> dict[str, Callable[[], Any]]:
     """Add the comparison to a report: contents, tables, notes.
 
     - `jd`, `qs`, `ps`: the saved states, as for `compare`. `run`: the arguments of `dvi.integrate`.
-    - `observed`: those of `conserved_observables`.
+    - `observed`: `OBSERVABLES` and their drifts.
 
     **Returns** file name → function that draws: orbits, the comparison, conserved quantities.
     """

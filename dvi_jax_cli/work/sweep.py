@@ -100,17 +100,10 @@ def _check_folder(folder: Path, key: str, resume: bool) -> None:
 
 def _report(result: dvi.SweepResult, last: dvi.SweepProgress) -> Report:
     counts, observed = result.status_counts(), _statistics(result)
-    report = Report(
-        {
-            "store": str(result.path),
-            "dims": result.dims,
-            "tasks": {"done": last.tasks_done, "all": last.num_tasks},
-            "trajectories": counts,
-            "seconds": last.seconds,
-            "steps_per_second": last.rate,
-        },
-        [_status_table(counts)],
-    )
+    tasks = {"done": last.tasks_done, "all": last.num_tasks}
+    contents = {"store": str(result.path), "dims": result.dims, "tasks": tasks}
+    contents |= {"trajectories": counts, "seconds": last.seconds, "steps_per_second": last.rate}
+    report = Report(contents, [_status_table(counts)])
     if observed:
         report.contents["observed"] = observed
         rows = [[name, *(f"{x:.6g}" for x in values.values())] for name, values in observed.items()]
@@ -139,10 +132,8 @@ def _statistics(result: dvi.SweepResult) -> dict[str, dict[str, float]]:
             name, values = f"|{name}|", np.abs(values)
         values = values[np.isfinite(values)]
         if values.size:
-            functions = {"min": np.min, "median": np.median, "max": np.max}
-            statistics[name] = {
-                word: float(function(values)) for word, function in functions.items()
-            }
+            words = ("min", "median", "max")
+            statistics[name] = {word: float(getattr(np, word)(values)) for word in words}
     return statistics
 
 
@@ -307,36 +298,25 @@ def sweep_status(store: str | Path) -> Report:
     tasks_done, lanes, total = len(records), sum(sizes), math.prod(result.dims.values())
     left, rate = total - lanes, lanes / seconds if seconds else 0.0
     speed = None if math.isnan(work) else work / seconds if seconds else 0.0
-    contents = {
-        "store": str(result.path),
-        "dims": result.dims,
-        "tasks": {
-            "done": tasks_done,
-            "left": result.num_tasks - tasks_done,
-            "all": result.num_tasks,
-        },
-        "trajectories": ({"not_computed": left} if left else {}) | dict(statuses),
-        "seconds": seconds,
-        "trajectories_per_second": rate,
-        "steps_per_second": speed,
-        "seconds_left": left / rate if rate else None,
-        "bytes": _size(Path(store)),
-        "provenance": {k: v for k, v in result.attributes.items() if k not in _NOT_OURS},
-    }
-    origin = [[name, str(value)] for name, value in contents["provenance"].items()]
+    tasks_left, size = result.num_tasks - tasks_done, _size(Path(store))
+    tasks = {"done": tasks_done, "left": tasks_left, "all": result.num_tasks}
+    counts = ({"not_computed": left} if left else {}) | dict(statuses)
+    origin = {k: v for k, v in result.attributes.items() if k not in _NOT_OURS}
+    contents = {"store": str(result.path), "dims": result.dims, "tasks": tasks}
+    contents |= {"trajectories": counts, "seconds": seconds, "trajectories_per_second": rate}
+    contents |= {"steps_per_second": speed, "seconds_left": left / rate if rate else None}
+    contents |= {"bytes": size, "provenance": origin}
+    rows = [[name, str(value)] for name, value in origin.items()]
     grid = " × ".join(f"{name} {n}" for name, n in result.dims.items())
-    remainder = f", {result.num_tasks - tasks_done} left" if tasks_done < result.num_tasks else ""
+    remainder = f", {tasks_left} left" if tasks_left > 0 else ""
     remainder += f" (about {left / rate:.3g} s)" if left and rate else ""
-    return Report(
-        contents,
-        [
-            _status_table(contents["trajectories"]),
-            TextTable("Provenance", ["what", "value"], origin),
-        ],
-        summary=f"{result.path}: {grid}; {tasks_done} of {result.num_tasks} tasks done{remainder}; "
+    tables = [_status_table(counts), TextTable("Provenance", ["what", "value"], rows)]
+    summary = (
+        f"{result.path}: {grid}; {tasks_done} of {result.num_tasks} tasks done{remainder}; "
         f"{rate:.3g} trajectories/s{'' if speed is None else f', {speed:.3g} steps/s'}; "
-        f"{contents['bytes'] / 1e6:.3g} MB",
+        f"{size / 1e6:.3g} MB"
     )
+    return Report(contents, tables, summary=summary)
 
 
 def _steps(result: dvi.SweepResult) -> Callable[[list[int]], float]:

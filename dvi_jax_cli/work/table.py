@@ -10,19 +10,8 @@ from types import NoneType
 from typing import TYPE_CHECKING, Annotated, Any, Generic, TypeVar, Union, get_args
 
 import numpy as np
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Discriminator,
-    Field,
-    StringConstraints,
-    Tag,
-    ValidationError,
-    WithJsonSchema,
-    model_validator,
-)
+import pydantic
+from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, WithJsonSchema
 from pydantic.json_schema import GenerateJsonSchema
 from typing_extensions import TypeAliasType
 
@@ -36,21 +25,21 @@ def key(default: Any, rule: str) -> Any:
     return Field(default, description=rule)
 
 
-class TomlTable(BaseModel):
+class TomlTable(pydantic.BaseModel):
     """A table of a TOML file. The description of a field is what its key allows."""
 
-    model_config = ConfigDict(
+    model_config = pydantic.ConfigDict(
         extra="forbid", strict=True, frozen=True, arbitrary_types_allowed=True
     )
 
     # Each table converts its own errors, because only here the fields and their descriptions are
     # known; the table around it then puts its key in front.
-    @model_validator(mode="wrap")
+    @pydantic.model_validator(mode="wrap")
     @classmethod
     def _name_the_keys(cls, value: Any, read: Callable[[Any], Any]) -> Any:
         try:
             return read(value)
-        except ValidationError as error:
+        except pydantic.ValidationError as error:
             first, *successors = [e for entry in error.errors() for e in cls._errors(entry)]
             raise InputError(first.key, first.seen, first.allowed, successors) from None
 
@@ -70,11 +59,8 @@ class TomlTable(BaseModel):
         if context.get("discriminator") == "'kind'":  # the key that selects a table of a union
             tag, kinds = context.get("tag", ""), context.get("expected_tags", rule)
             suggestion = nearest(tag, re.findall(r"\w+", kinds))
-            return [
-                InputError(
-                    path(place, "kind"), describe(tag) if tag else NO_KEY, kinds + suggestion
-                )
-            ]
+            defect = describe(tag) if tag else NO_KEY
+            return [InputError(path(place, "kind"), defect, kinds + suggestion)]
         return [InputError(path(place), NO_KEY if kind == "missing" else defect, rule)]
 
 
@@ -110,7 +96,7 @@ def read_file(file: Path, model: type[T]) -> tuple[T, dict[str, Any]]:
         raw = tomllib.loads(text)
     try:
         return model.model_validate(raw), raw
-    except ValidationError as error:  # pydantic wraps the one of the outermost table
+    except pydantic.ValidationError as error:  # pydantic wraps the one of the outermost table
         context: Any = error.errors()[0].get("ctx")
         raise context["error"] from None
 
@@ -149,7 +135,7 @@ def type_tag(value: Any) -> str:
 
 def union(tag_of: Callable[[Any], str] = type_tag, **kinds: Any) -> Any:
     """The union of types: type of a value in TOML, or what `tag_of` returns → type."""
-    members = [Annotated[kind, Tag(f"<{name}>")] for name, kind in kinds.items()]
+    members = [Annotated[kind, pydantic.Tag(f"<{name}>")] for name, kind in kinds.items()]
     _TAGS.update(f"<{name}>" for name in kinds)
     return Annotated[Union[tuple(members)], Discriminator(tag_of)]  # noqa: UP007
 
@@ -179,7 +165,7 @@ def _is_finite(value: int | float) -> bool:
         return False
 
 
-Text = Annotated[str, StringConstraints(pattern=r"\S")]
+Text = Annotated[str, pydantic.StringConstraints(pattern=r"\S")]
 Count = Annotated[int, Field(ge=1)]
 NonNegative = Annotated[int, Field(ge=0)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -259,12 +245,11 @@ class AxisTable(TomlTable, Generic[V]):
     axis: AxisName | None = key(None, "a name for this axis, by default the key")
     units: str = key("", 'text such as "m/s"')
 
-    @model_validator(mode="after")
+    @pydantic.model_validator(mode="after")
     def _one_kind(self) -> Any:
         fields = {name: getattr(self, name) for name in self.model_fields_set}
-        require(
-            len(fields.keys() & {*KINDS}) == 1, "", describe(fields), f"exactly one of {AN_AXIS}"
-        )
+        fits = len(fields.keys() & {*KINDS}) == 1
+        require(fits, "", describe(fields), f"exactly one of {AN_AXIS}")
         return self
 
     @classmethod

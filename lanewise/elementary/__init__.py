@@ -40,17 +40,7 @@ from jax import Array
 
 from .circular import acos, asin, atan, atan2, cos, sin, sincos as sincos, tan
 from .exponential import cosh, erf, erfc, exp, exp2, expm1, logistic, sinh, tanh
-from .logarithmic import (
-    acosh,
-    asinh,
-    atanh,
-    cbrt,
-    erf_inv,
-    half_integer_power as half_integer_power,
-    log,
-    log1p,
-    pow,
-)
+from .logarithmic import acosh, asinh, atanh, cbrt, erf_inv, log, log1p, pow
 
 # From the name of a primitive of JAX to its function of float64 scalars.
 FUNCTIONS: dict[str, Callable[..., Array]] = {

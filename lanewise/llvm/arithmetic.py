@@ -11,14 +11,8 @@ from .ir import FLOATS, TYPES, NotCompilable, Num, Writer, call_of, check_type
 _HANDED_ON = frozenset(["add", "sub", "mul", "fma", "neg", "sqrt", "same"])
 _MOST_SEEN = 300  # operations that are followed back: more would take longer than what they save
 _MOST_COMPARED = 12  # with more numbers than this each of them is checked
-_COMPARISONS: dict[str, Callable] = {
-    "eq": np.equal,
-    "ne": np.not_equal,
-    "lt": np.less,
-    "le": np.less_equal,
-    "gt": np.greater,
-    "ge": np.greater_equal,
-}
+_COMPARISONS: dict[str, Callable] = {"eq": np.equal, "ne": np.not_equal, "lt": np.less}
+_COMPARISONS |= {"le": np.less_equal, "gt": np.greater, "ge": np.greater_equal}
 _LOGIC = {"and": np.bitwise_and, "or": np.bitwise_or, "xor": np.bitwise_xor}
 _SHIFTS = {"shift_left": "shl", "shift_right_logical": "lshr", "shift_right_arithmetic": "ashr"}
 

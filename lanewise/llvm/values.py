@@ -60,6 +60,9 @@ class Value:
         return out
 
 
+Values = list[Value]
+
+
 def objects(entries: Sequence[Any], shape: Sequence[int]) -> Entries:
     """An object array of these entries, in row-major order."""
     flat = np.empty(len(entries), object)

@@ -8,10 +8,11 @@ import jax
 import jax.numpy as jnp
 
 from .. import elementary as functions
+from ..elementary.logarithmic import half_integer_power
 from ..evaluator import RULES, SINE_AND_COSINE, Evaluator
 from ..jaxprs.jaxapi import ClosedJaxpr
 from ..llvm.ir import Num, call_of
-from ..llvm.values import Value, objects
+from ..llvm.values import Value, Values, objects
 from ..module import Module
 
 
@@ -56,9 +57,7 @@ def _function(module: Module, name: str, count: int, vec: bool) -> str:
     return symbol
 
 
-def sine_or_cosine(
-    evaluator: Evaluator, eqn: Any, values: list[Value], places: list
-) -> list[Value]:
+def sine_or_cosine(evaluator: Evaluator, eqn: Any, values: Values, places: list) -> Values:
     """sin x or cos x of an x of which both are needed."""
     index = 0 if eqn.primitive.name == "sin" else 1
     (value,), (out,) = values, eqn.outvars
@@ -74,7 +73,7 @@ def sine_or_cosine(
 def _by_name(name: str) -> Callable:
     """An elementary function of scalars by name; that of a power has its argument in the name."""
     if name.startswith("half_integer_power"):
-        return functions.half_integer_power(int(name.split()[1]))
+        return half_integer_power(int(name.split()[1]))
     return functions.sincos if name == "sincos" else functions.FUNCTIONS[name]
 
 

@@ -9,7 +9,7 @@ from ..evaluator import RULES, Evaluator
 from ..llvm.builder import Builder
 from ..llvm.ir import Num, check_size
 from ..llvm.memory import contiguous, load
-from ..llvm.values import MOST_ENTRIES, Value
+from ..llvm.values import MOST_ENTRIES, Value, Values
 
 # Name of a primitive → operation on an element and its update; releases of JAX differ in names.
 SCATTERS = {
@@ -109,9 +109,7 @@ def _check_update(value: Value, update: Value, limit: int) -> None:
     check_size(size, limit, "size of array × size of update", *shapes)
 
 
-def dynamic_update_slice(
-    evaluator: Evaluator, eqn: Any, values: list[Value], places: list
-) -> list[Value]:
+def dynamic_update_slice(evaluator: Evaluator, eqn: Any, values: Values, places: list) -> Values:
     value, update, *starts = values
     b = evaluator.b
     offsets = _starts(evaluator, starts, value.shape, update.shape)

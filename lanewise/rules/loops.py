@@ -13,7 +13,7 @@ from ..evaluator import RULES, Evaluator
 from ..jaxprs.dependence import cut, fixed_point, reached_outputs
 from ..jaxprs.jaxapi import ClosedJaxpr, scan_counts
 from ..llvm.ir import TYPES, NotCompilable, Num
-from ..llvm.values import Value, objects
+from ..llvm.values import Value, Values, objects
 from .rounds import Rounds, RowCollector
 
 # Primitives whose result is the same on all trajectories, even if the operands differ.
@@ -220,9 +220,7 @@ def _one_of(evaluator: Evaluator, takes, runs, vec, dtypes) -> list[Num]:
     return b.branch(b.ref(takes[0], 0, False), runs[0], others_of, vec, dtypes)
 
 
-def minimum_over_lanes(
-    evaluator: Evaluator, eqn: Any, values: list[Value], places: list
-) -> list[Value]:
+def minimum_over_lanes(evaluator: Evaluator, eqn: Any, values: Values, places: list) -> Values:
     """The least of an integer over the trajectories of a block."""
     b, x = evaluator.b, evaluator.entries(values[0])[()]
     # Not reduced over the block: the assumption is checked after some rounds.

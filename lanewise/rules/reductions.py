@@ -8,7 +8,7 @@ import numpy as np
 
 from ..evaluator import RULES, Evaluator
 from ..llvm.ir import NotCompilable, check_size
-from ..llvm.values import MOST_ENTRIES, Value, objects
+from ..llvm.values import MOST_ENTRIES, Value, Values, objects
 from .moves import CUMULATIVE, REDUCTIONS
 
 
@@ -41,9 +41,7 @@ def _neutral(op: str, dtype: str) -> Any:
     return 1 if op == "mul" else 0
 
 
-def running_reduction(
-    evaluator: Evaluator, eqn: Any, values: list[Value], places: list
-) -> list[Value]:
+def running_reduction(evaluator: Evaluator, eqn: Any, values: Values, places: list) -> Values:
     (value,), (out,) = values, eqn.outvars
     axis, reverse = eqn.params["axis"], eqn.params["reverse"]
     if value.size == 0:

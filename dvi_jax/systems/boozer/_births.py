@@ -86,9 +86,8 @@ class Births(Seeded):
         s = np.linspace(0, 1, _TABLE)
         angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
         theta, zeta = np.meshgrid(angles, angles / self.particles.field.shape.periods)
-        jacobian = np.asarray(
-            eqx.filter_jit(volume_element)(self.particles.field, s[:, None, None], theta, zeta)
-        )
+        element = eqx.filter_jit(volume_element)
+        jacobian = np.asarray(element(self.particles.field, s[:, None, None], theta, zeta))
         mean = jacobian.mean((1, 2))
         density = np.asarray(rate(jnp.asarray(s)) * jnp.ones_like(s)) * mean
         if not np.isfinite(density).all() or (density < 0).any() or not density.any():

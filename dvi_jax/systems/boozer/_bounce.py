@@ -94,15 +94,15 @@ def _end(line: _Line, zeta: Array, direction: float, turns: float) -> tuple[Arra
     return bracketed_root(line.parallel, a, previous, b, ahead, exists), exists
 
 
-def _bounce_points(line: _Line, zeta: Array, turns: float) -> tuple[Array, Array, Array]:
+def _well(field: Field, point: Any, mu: Any, energy: Any, turns: float) -> tuple[Any, ...]:
+    """The field line through a point (s, θ, ζ), the ends of the well, and whether it has both."""
+    instance("field", field, Field, "a Field, such as boozer.precise_qa()")
+    positive("turns", turns)
+    s, theta, zeta, mu, energy = (jnp.asarray(x, float) for x in (*point, mu, energy))
+    line = _Line(field, s, theta - polynomial(field.iota, s) * zeta, mu, energy)
     low, has_low = _end(line, zeta, -1.0, turns)
     high, has_high = _end(line, zeta, 1.0, turns)
-    return low, high, has_low & has_high
-
-
-def _line(field: Field, s, theta, zeta, mu, energy) -> _Line:
-    s, theta, zeta, mu, energy = (jnp.asarray(x, float) for x in (s, theta, zeta, mu, energy))
-    return _Line(field, s, theta - polynomial(field.iota, s) * zeta, mu, energy)
+    return line, low, high, has_low & has_high
 
 
 def well(
@@ -114,9 +114,7 @@ def well(
     amplitude; then by false position to the last digit. **Arguments and errors**: as for
     `second_invariant`. **Returns** a `Well`, in scalars.
     """
-    _check(field, turns)
-    line = _line(field, s, theta, zeta, mu, energy)
-    low, high, exists = _bounce_points(line, jnp.asarray(zeta, float), turns)
+    _, low, high, exists = _well(field, (s, theta, zeta), mu, energy, turns)
     return Well(*(jnp.where(exists, end, jnp.nan) for end in (low, high)))
 
 
@@ -147,9 +145,7 @@ def second_invariant(
     **Source** Northrop 1963, *The Adiabatic Motion of Charged Particles*, 3; in Boozer coordinates
     Helander 2014, *Rep. Prog. Phys.* 77, 087001, 4.3.
     """
-    _check(field, turns)
-    line = _line(field, s, theta, zeta, mu, energy)
-    low, high, exists = _bounce_points(line, jnp.asarray(zeta, float), turns)
+    line, low, high, exists = _well(field, (s, theta, zeta), mu, energy, turns)
     middle, half = (low + high) / 2, (high - low) / 2
     # Midpoints in φ, of an integrand that is even about −π/2 and π/2.
     phi = np.pi * ((np.arange(_NODES) + 0.5) / _NODES - 0.5)
@@ -162,19 +158,13 @@ def second_invariant(
     return jnp.where(exists, J, jnp.nan)
 
 
-def _check(field: Any, turns: Any) -> None:
-    instance("field", field, Field, "a Field, such as boozer.precise_qa()")
-    positive("turns", turns)
-
-
 def complete(args: Any, epsilon: Any) -> Field:
     """The field of a run: that in args, with the modes ``args["breaking"]`` times ε."""
     field = args["field"]
     if epsilon is None or "breaking" not in args:
         return field
-    return eqx.tree_at(
-        lambda f: f.coefficients, field, field.coefficients + epsilon * args["breaking"]
-    )
+    total = field.coefficients + epsilon * args["breaking"]
+    return eqx.tree_at(lambda f: f.coefficients, field, total)
 
 
 class GuidingCentre(NamedTuple):

@@ -308,17 +308,10 @@ def from_surfaces(
 
 
 def fitted_modes(
-    s: np.ndarray,
-    m: np.ndarray,
-    n: np.ndarray,
-    values: np.ndarray,
-    periods: int,
-    helicity: int,
-    degree: int,
-    box: tuple[int, int] | None,
+    s: Any, m: Any, n: Any, values: Any, periods: int, degree: int, box: tuple[int, int] | None
 ) -> np.ndarray:
     """The table of polynomials, shape (M + 1, 2K + 1, d + 1), of any function on surfaces."""
-    k = n // periods - helicity * m
+    k = n // periods
     M, K = box if box is not None else (int(m.max()), int(np.abs(k).max()))
     table = np.zeros((M + 1, 2 * K + 1, degree + 1))
     for i in np.flatnonzero((m <= M) & (np.abs(k) <= K)):

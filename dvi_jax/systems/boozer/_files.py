@@ -149,15 +149,13 @@ def read_geometry(
         ("Z", f.odd["zmns_b"], scale),
         ("nu", f.odd["pmns_b"], 1.0),
     ):
-        table = fitted_modes(f.s, f.m, f.n, factor * values, f.periods, 0, degree, box)
+        table = fitted_modes(f.s, f.m, f.n, factor * values, f.periods, degree, box)
         zeros = np.zeros_like(table)
         tables[name] = jnp.asarray(np.stack([table, zeros] if name == "R" else [zeros, table]))
     return Geometry(**tables, shape=Shape(f.periods, 0), direction=f.direction)
 
 
-def _surfaces(
-    path: Any, even: list[str], odd: list[str], psi_edge: float | None = None
-) -> _Surfaces:
+def _surfaces(path: Any, even: list[str], odd: list[str], psi: float | None = None) -> _Surfaces:
     from scipy.io import netcdf_file  # a part of import time
 
     try:
@@ -174,7 +172,7 @@ def _surfaces(
     # Surfaces are in the middle between those of VMEC, and entry 0 of profiles is not used.
     rows = variables["jlist"].astype(int) - 1
     s = (rows - 0.5) / (int(variables["ns_b"]) - 1)
-    flux = float(variables["phi_b"][-1]) / (2 * np.pi) if psi_edge is None else psi_edge
+    flux = float(variables["phi_b"][-1]) / (2 * np.pi) if psi is None else psi
     if flux == 0:
         raise ValueError(
             f"{path}: the toroidal flux phi_b at the edge is 0. Give psi_edge= (flux/2π, with its "
@@ -205,21 +203,12 @@ def _surfaces(
 def save_field(field: Field, path: Any, source: str = "") -> None:
     """Write a field as JSON. `source`: where it comes from, as text."""
     table = np.asarray(field.coefficients)
-    contents = {
-        "source": source,
-        "periods": field.shape.periods,
-        "helicity": field.shape.helicity,
-        "psi_edge": float(field.psi_edge),
-        "iota": np.asarray(field.iota).tolist(),
-        "G": np.asarray(field.G).tolist(),
-        "I": None if field.I is None else np.asarray(field.I).tolist(),
-        "modes": [
-            [m, n, *(part.reshape(-1, part.shape[-1])[i].tolist() for part in table)]
-            for i, (m, n) in enumerate(field.modes)
-            if table.reshape(len(table), -1, table.shape[-1])[:, i].any()
-        ],
-    }
-    lines = ",\n".join(json.dumps(row) for row in contents.pop("modes"))
+    profiles = {"iota": field.iota, "G": field.G, "I": field.I}
+    contents = {"source": source, **field.shape._asdict(), "psi_edge": float(field.psi_edge)}
+    contents |= {k: None if c is None else np.asarray(c).tolist() for k, c in profiles.items()}
+    parts = table.reshape(len(table), -1, table.shape[-1])
+    modes = [(m, n, parts[:, i]) for i, (m, n) in enumerate(field.modes)]
+    lines = ",\n".join(json.dumps([m, n, *b.tolist()]) for m, n, b in modes if b.any())
     text = json.dumps(contents, indent=1)[:-2] + ',\n "modes": [\n' + lines + "\n]}\n"
     Path(path).write_text(text)
 

@@ -64,10 +64,8 @@ class Regular(eqx.Module):
     def state(self, theta: Any, zeta: Any, p_theta: Any, p_zeta: Any) -> tuple[Any, Any]:
         """(q, p)."""
         r = jnp.sqrt(2 * p_theta)
-        return (
-            jnp.stack([r * jnp.sin(theta), zeta], axis=-1),
-            jnp.stack([r * jnp.cos(theta), p_zeta], axis=-1),
-        )
+        Y, X = r * jnp.sin(theta), r * jnp.cos(theta)
+        return jnp.stack([Y, zeta], axis=-1), jnp.stack([X, p_zeta], axis=-1)
 
     def angle(self, q: Any, p: Any) -> Any:
         """θ from −π to π."""

@@ -24,16 +24,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from .._problem import (
-    Parameter,
-    Problem,
-    Start,
-    System,
-    finite,
-    library_problem,
-    over_times,
-    vector,
-)
+from ...base.checks import finite
+from .._problem import Parameter, Problem, Start, System, library_problem, over_times, vector
 from .solar_system import installed_file
 
 REFERENCE = 51544.0
@@ -229,9 +221,7 @@ def polar_motion() -> Problem:
         System(hamiltonian, damping, disturbance),
         Start("the pole has one x, in q0, and one y, in p0", (1,)),
         name="polar_motion",
-        q0=[0.043301],
-        p0=[0.377867],
-        h=1.0,
+        q0_p0_h=([0.043301], [0.377867], 1.0),
         parameters={
             "period": Parameter(433.0, "of the free wobble [day]"),
             "inverse_Q": Parameter(1 / 127, "1/Q, of either sign [1]", finite),

@@ -210,14 +210,8 @@ def cavity(
     `slip`: change of phase per turn [rad], 2π (f T − number of periods) for a frequency that is not
     a multiple of 1/T.
     """
-    values = {
-        "length": length,
-        "voltage": voltage,
-        "wave_number": 2 * math.pi * frequency / C,
-        "lag": lag,
-        "phase": phase,
-        "slip": slip,
-    }
+    values = {"length": length, "voltage": voltage, "lag": lag, "phase": phase, "slip": slip}
+    values["wave_number"] = 2 * math.pi * frequency / C
     half = Part("half_drift")
     parts = (half, Part("cavity"), half) if length else (Part("cavity"),)
     return Element(name, "cavity", parts, values)

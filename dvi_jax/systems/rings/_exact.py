@@ -44,12 +44,8 @@ def rotate(z: Particle, angle: Any) -> Particle:
     c, s, pz = jnp.cos(angle), jnp.sin(angle), pz_of(z)
     p = c * pz - s * z.px
     path = z.x * s / p
-    return z._replace(
-        x=z.x * pz / p,
-        px=s * pz + c * z.px,
-        y=z.y + z.py * path,
-        zeta=z.zeta - (1 + z.delta) * path,
-    )
+    x, px, late = z.x * pz / p, s * pz + c * z.px, (1 + z.delta) * path
+    return z._replace(x=x, px=px, y=z.y + z.py * path, zeta=z.zeta - late)
 
 
 def wedge(z: Particle, angle: Any, h: Any) -> Particle:
@@ -62,8 +58,9 @@ def wedge(z: Particle, angle: Any, h: Any) -> Particle:
     return z._replace(x=x, px=px, y=z.y + z.py * path, zeta=z.zeta - (1 + z.delta) * path)
 
 
-def dipole_fringe(z: Particle, h: Any, gap: Any) -> Particle:
+def dipole_fringe(z: Particle, h: Any, gap: Any, sign: int) -> Particle:
     """The hard edge of a bend: a type-II generating function y² φ(px, py, δ)/2. Forest (13.13)."""
+    h = h if sign > 0 else -h
 
     def phi(px, py, delta):
         pz = jnp.sqrt((1 + delta) ** 2 - px * px - py * py)
@@ -71,9 +68,7 @@ def dipole_fringe(z: Particle, h: Any, gap: Any) -> Particle:
         inner = h * gap * (1 + u * u * (2 + v * v)) * pz - jnp.arctan(u / (1 + v * v))
         return -h * jnp.tan(inner)
 
-    value, (of_px, of_py, of_delta) = jax.value_and_grad(phi, argnums=(0, 1, 2))(
-        z.px, z.py, z.delta
-    )
+    value, (of_px, of_py, of_delta) = jax.value_and_grad(phi, (0, 1, 2))(z.px, z.py, z.delta)
     y = 2 * z.y / (1 + jnp.sqrt(1 - 2 * of_py * z.y))
     half = y * y / 2
     return z._replace(y=y).plus(x=of_px * half, py=-value * y, zeta=of_delta * half)

@@ -52,9 +52,10 @@ class Piece(NamedTuple):
     times: int = 1
 
 
-def forward(
-    pieces: Sequence[Piece], z: Particle, par: Parameters, turn: Any, sign: int
-) -> Particle:
+Pieces = Sequence[Piece]
+
+
+def forward(pieces: Pieces, z: Particle, par: Parameters, turn: Any, sign: int) -> Particle:
     """The map of a part of an element, or its inverse for sign −1."""
     for piece in pieces[::sign]:
 
@@ -66,12 +67,7 @@ def forward(
 
 
 def pull_back(
-    pieces: Sequence[Piece],
-    z: Particle,
-    cotangent: Particle,
-    par: Parameters,
-    moving: Any,
-    turn: Any,
+    pieces: Pieces, z: Particle, cotangent: Particle, par: Parameters, moving: Any, turn: Any
 ) -> tuple[Particle, Particle, Any]:
     """The particle before a part of an element and its cotangent, from those after it, and the
     cotangent of the parameters `moving`."""
@@ -113,11 +109,7 @@ def near_identity(change: Callable[[Particle, Parameters], dict[str, Any]]) -> P
 # The kicks of a slice: Forest & Ruth 1990 for order 4, Yoshida 1990 (solution A) for order 6.
 _FR = 1 / (2 - 2 ** (1 / 3))
 _Y = (0.784513610477560, 0.235573213359357, -1.17767998417887)
-KICKS = {
-    2: (1.0,),
-    4: (_FR, 1 - 2 * _FR, _FR),
-    6: (*_Y, 1 - 2 * sum(_Y), *reversed(_Y)),
-}
+KICKS = {2: (1.0,), 4: (_FR, 1 - 2 * _FR, _FR), 6: (*_Y, 1 - 2 * sum(_Y), *reversed(_Y))}
 
 
 def drifts_and_kicks(coast: Callable, kick: Callable, part: Part) -> list[Piece]:

@@ -78,10 +78,8 @@ class Turn(Method):
     inverse_needs_no_solve = needs_no_solve
 
     def check(self, equations, first_interval, q, p) -> None:
-        hint = "Use the system and the args of rings.problem(ring)."
-        instance(
-            "args of a run with rings.Turn()", equations.args, RingArgs, "those of a ring", hint
-        )
+        args, hint = equations.args, "Use the system and the args of rings.problem(ring)."
+        instance("args of a run with rings.Turn()", args, RingArgs, "those of a ring", hint)
         h = float(first_interval().h)
         if h != 1:
             raise ValueError(f"h must be 1, one turn, for a ring; got h = {h}.")
@@ -162,6 +160,5 @@ def problem(ring: Ring, planes: Planes = "xyz", delta: Any = 0.0) -> RingProblem
     args = RingArgs(passage, jnp.asarray(delta, float))
     perturbation = _PlaceHamiltonian(is_slope=True) if ring.extra else None
     zero = jnp.zeros(len(planes))
-    return RingProblem(
-        System(_PlaceHamiltonian(), perturbation=perturbation), zero, zero, 1.0, args
-    )
+    system = System(_PlaceHamiltonian(), perturbation=perturbation)
+    return RingProblem(system, zero, zero, 1.0, args)

@@ -231,20 +231,16 @@ def _matrix(source, energy, period, edge):
 
 _MAKERS = {
     "IdentityPass": _marker,
-    "DriftPass": _drift,
-    "ExactDriftPass": _drift,
-    "StrMPoleSymplectic4Pass": _straight,
-    "ExactMultipolePass": _straight,
-    "BndMPoleSymplectic4Pass": _bend,
-    "BndMPoleSymplectic4E2Pass": _bend,
+    **dict.fromkeys(("DriftPass", "ExactDriftPass"), _drift),
+    **dict.fromkeys(("StrMPoleSymplectic4Pass", "ExactMultipolePass"), _straight),
+    **dict.fromkeys(("BndMPoleSymplectic4Pass", "BndMPoleSymplectic4E2Pass"), _bend),
     "ExactSectorBendPass": _bend,
     "ThinMPolePass": lambda source, *_: multipole(
         source.FamName, 0.0, **_field(source, thin=True), kind=type(source).__name__.lower()
     ),
     "CorrectorPass": lambda source, *_: corrector(source.FamName, source.Length, *source.KickAngle),
     "SolenoidLinearPass": lambda source, *_: solenoid(source.FamName, source.Length, source.K),
-    "RFCavityPass": _cavity,
-    "CavityPass": _cavity,
+    **dict.fromkeys(("RFCavityPass", "CavityPass"), _cavity),
     "Matrix66Pass": _matrix,
     "AperturePass": lambda source, *_: Element(
         source.FamName,

@@ -146,9 +146,8 @@ def _track(ring: Ring, z: Array, epsilon: Array, counts: tuple[int, int, int]):
                 return jax.jvp(lambda *primals: forward(numbers, *primals)[0], primals, change)[1]
 
             axes = (None, (None, 0, 0), (None, 0, 0))
-            return jax.vmap(functools.partial(lanewise.call, derivative), axes)(
-                passage.numbers, residuals[0], change
-            )
+            batch = jax.vmap(functools.partial(lanewise.call, derivative), axes)
+            return batch(passage.numbers, residuals[0], change)
 
         def pull(residuals, cotangent):
             primals, states = residuals

@@ -91,9 +91,8 @@ def reproduce(out: Path | str, force: bool = False, console: Console | None = No
 
 
 def _summary(claims: list[Claim]) -> Table:
-    table = Table(
-        title="The paper's claims, measured", title_justify="left", box=SIMPLE_HEAD, expand=True
-    )
+    look: Any = {"title_justify": "left", "box": SIMPLE_HEAD, "expand": True}
+    table = Table(title="The paper's claims, measured", **look)
     for name, ratio in (("where", 2), ("the paper says", 4), ("measured now", 4)):
         table.add_column(name, ratio=ratio)
     table.add_column("verdict", no_wrap=True)

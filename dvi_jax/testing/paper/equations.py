@@ -4,6 +4,7 @@ import pkgutil
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -20,15 +21,12 @@ def _read() -> tuple[Equation, ...]:
     path = Path(__file__).with_name("equations.toml")
     table = tomllib.loads(path.read_text(encoding="utf-8"))
     short: dict[str, list[str]] = table["names"]
-    return tuple(
-        Equation(
-            row["number"],
-            row["what"],
-            tuple(f"dvi_jax.{part}" for name in row["code"] for part in short.get(name, [name])),
-            row.get("note", ""),
-        )
-        for row in table["equation"]
-    )
+
+    def equation(row: dict[str, Any]) -> Equation:
+        code = (f"dvi_jax.{part}" for name in row["code"] for part in short.get(name, [name]))
+        return Equation(row["number"], row["what"], tuple(code), row.get("note", ""))
+
+    return tuple(map(equation, table["equation"]))
 
 
 EQUATIONS = _read()

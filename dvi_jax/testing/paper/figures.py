@@ -60,10 +60,8 @@ def energy_error(m: Measurements, figure: Any, axes: Any) -> None:
     close.plot(run.ts[part], error[part], color=BLUE, marker="o", markersize=2.5, linewidth=0.8)
     close.plot(run.ts[part], exact[part], color=ORANGE, dashes=(5, 2))
     close.set(title="the first three periods", xlabel=TIME, ylim=(-4.5, 14), xticks=range(0, 19, 3))
-    close.legend(
-        ["(p$_k$² + q$_{k−1}$²)/2, the paper's I₀", "(p² + q² − hqp)/2, exact invariant"],
-        loc="upper right",
-    )
+    names = ["(p$_k$² + q$_{k−1}$²)/2, the paper's I₀", "(p² + q² − hqp)/2, exact invariant"]
+    close.legend(names, loc="upper right")
 
 
 @_figure(
@@ -285,9 +283,8 @@ def sweep_50(m: Measurements, figure: Any, axes: Any) -> None:
     text = "error of the order-4 method: the drift of\n(1+ε)L − H − ε|q|²/2 for every ε"
     look = {"ha": "right", "va": "top", "fontsize": 8.5, "color": GREY}
     left.text(0.1, small.literal[0] / 1.4, text, **look)
-    left.set(
-        title="invariant (50) against ε", xlabel="strength of the perturbation ε", ylim=(1e-10, 300)
-    )
+    left.set(title="invariant (50) against ε", ylim=(1e-10, 300))
+    left.set_xlabel("strength of the perturbation ε")
     left.set_ylabel("range of (50) (equal steps), drift (h → 0)")
     left.legend(fontsize=8.5, ncols=2, loc="upper center", columnspacing=1)
     for i, epsilon in enumerate(sweep.epsilons):

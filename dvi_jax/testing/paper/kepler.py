@@ -233,9 +233,7 @@ def repulsion(tick: Tick) -> dict[str, float]:
     for key, system in {"printed": dvi.System(hamiltonian), "corrected": problem.system}.items():
         variant = dataclasses.replace(problem, system=system)
         solution = run(variant, problem.h, round(DURATION / problem.h))
-        distances[f"distance_{key}"] = float(
-            np.max(np.linalg.norm(np.asarray(solution.qs), axis=1))
-        )
+        distances[f"distance_{key}"] = largest(np.linalg.norm(np.asarray(solution.qs), axis=1))
         tick(len(distances) / 2)
     return distances
 

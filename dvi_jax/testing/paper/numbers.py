@@ -14,10 +14,8 @@ Tick = Callable[[float], None]
 
 def run(problem: Problem, h: Any, num_steps: int, **options: Any) -> dvi.Solution:
     """`integrate` from the problem's initial conditions with its parameters."""
-    options = {"args": problem.args, **options}
-    return dvi.integrate(
-        problem.system, problem.q0, problem.p0, h=h, num_steps=num_steps, **options
-    )
+    options = {"h": h, "num_steps": num_steps, "args": problem.args, **options}
+    return dvi.integrate(problem.system, problem.q0, problem.p0, **options)
 
 
 def largest(values: Any) -> float:

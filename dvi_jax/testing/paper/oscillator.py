@@ -1,6 +1,7 @@
 """Measurements on the oscillator: Figures 1 to 3, the crossover, the sweep of (34)."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -92,9 +93,8 @@ def fixed_mesh(tick: Tick) -> FixedMesh:
     problem = systems.oscillator()
     h, epsilons = problem.h, np.array(EPSILONS)
     mixed_energy, energy = problem.observables["mixed_energy"], problem.observables["energy"]
-    variational = jax.vmap(lambda e: run(problem, h, STEPS, epsilon=e, observe=mixed_energy))(
-        jnp.asarray(epsilons)
-    )
+    orbits = jax.vmap(lambda e: run(problem, h, STEPS, epsilon=e, observe=mixed_energy))
+    variational = orbits(jnp.asarray(epsilons))
     tick(0.5)
     rk4 = run(problem, h, STEPS, method=dvi.RungeKutta4(), observe=energy)
     q, p = np.asarray(variational.qs)[..., 0], np.asarray(variational.ps)[..., 0]
@@ -121,10 +121,9 @@ def crossover(tick: Tick) -> Crossover:
         return run(problem, h, STEPS, save=dvi.Save(final=True), observe=observe).observed
 
     def rk4(h, num_steps, stride, progress=None):
-        options = {"save": dvi.Save(every=stride), "observe": problem.observables["energy"]}
-        return run(
-            problem, h, num_steps, method=dvi.RungeKutta4(), progress=progress, **options
-        ).observed
+        options: Any = {"save": dvi.Save(every=stride), "observe": problem.observables["energy"]}
+        options |= {"method": dvi.RungeKutta4(), "progress": progress}
+        return run(problem, h, num_steps, **options).observed
 
     bands = np.asarray(jax.vmap(band)(jnp.asarray(hs)))
     long, stride = 7_500_000, 2500

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from ..page import markdown_table
 from .claims import Claim, NumberCheck, Verdict, pretty
 from .equations import EQUATIONS, Equation
 from .experiments import Measurements
@@ -68,11 +69,6 @@ def write_json(claims: Sequence[Claim], setting: dict[str, Any], path: Path) -> 
 def write_markdown(claims: Sequence[Claim], setting: dict[str, Any], path: Path) -> None:
     """The verdicts and the table of equations as Markdown."""
 
-    def table(*rows: Sequence[str]) -> list[str]:
-        header, *body = ([cell.replace("|", "\\|") for cell in row] for row in rows)
-        lines = [header, ["---"] * len(header), *body]
-        return ["| " + " | ".join(cells) + " |" for cells in lines]
-
     def cells_of(claim: Claim) -> Sequence[str]:
         checks = "<br>".join(f"*{kind}*: {text}" for kind, text in _check_texts(claim))
         verdict = f"{MARKS[claim.verdict]} **{claim.verdict.value}**"
@@ -83,22 +79,17 @@ def write_markdown(claims: Sequence[Claim], setting: dict[str, Any], path: Path)
         (f"({e.number})", e.statement, ", ".join(f"`{code}`" for code in e.code), e.note)
         for e in EQUATIONS
     ]
-    lines = [
+    equation_columns = ("equation", "what", "code", "the print, and what is right")
+    parts = [
         "# The paper's claims, measured",
-        "",
         f"{counts(claims)}. {_setting_line(setting)}",
-        "",
-        *table(columns, *map(cells_of, claims)),
-        "",
+        markdown_table(columns, map(cells_of, claims)),
         "## Figures",
-        "",
-        *(f"![{text}](figures/{name}.png)\n\n{text}\n" for name, (_, text) in FIGURES.items()),
+        *(f"![{text}](figures/{name}.png)\n\n{text}" for name, (_, text) in FIGURES.items()),
         "## The numbered equations and the code",
-        "",
-        *table(("equation", "what", "code", "the print, and what is right"), *equations),
-        "",
+        markdown_table(equation_columns, equations) + "\n",
     ]
-    path.write_text("\n".join(lines), encoding="utf-8")
+    path.write_text("\n\n".join(parts), encoding="utf-8")
 
 
 def write_html(claims: Sequence[Claim], setting: dict[str, Any], figures: Path, path: Path) -> None:

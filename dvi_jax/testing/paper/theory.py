@@ -43,9 +43,8 @@ def limits(tick: Tick) -> dict[str, float]:
             return jnp.concatenate([solution.qs[-1], solution.ps[-1]])
 
         over_starts = jax.vmap(end_of, in_axes=(None, 0, 0))
-        return jax.vmap(over_starts, in_axes=(0, None, None))(
-            jnp.asarray(STEP_SIZES), orbit.qs, orbit.ps
-        )
+        sizes = jnp.asarray(STEP_SIZES)
+        return jax.vmap(over_starts, in_axes=(0, None, None))(sizes, orbit.qs, orbit.ps)
 
     gap = np.abs(np.asarray(flight(dvi.TypeII(), 1) - flight(dvi.Yoshida(4), 32)))
     tick(0.6)
@@ -193,10 +192,8 @@ def identities(tick: Tick) -> dict[str, float]:
         orbits.append(orbit)
         # As many triples at every h, evenly chosen: one compiled program for all of them.
         middle = np.linspace(1, round(span / h) - 1, 199).astype(int)
-        triples = [
-            dvi.LatticePoint(orbit.ts[k], orbit.qs[k], orbit.ps[k])
-            for k in (middle - 1, middle, middle + 1)
-        ]
+        places = middle - 1, middle, middle + 1
+        triples = [dvi.LatticePoint(orbit.ts[k], orbit.qs[k], orbit.ps[k]) for k in places]
         values = orbit.observed["50"]
         gain = (values[middle] - values[middle - 1]) / h
         rows.append(_kepler_balance(triples, gain))
@@ -261,25 +258,15 @@ def _kepler_balance(triples, gain):
     epsilon = jnp.asarray(EPSILON)
 
     def terms(previous, current, second, gain):
-        def identity(order):
-            return dvi.noether_identity(
-                problem.system,
-                series,
-                gauges,
-                order,
-                current,
-                second,
-                epsilon,
-                problem.args,
-            )
-
         velocity = (second.q - current.q) / (second.t - current.t)
-        zeroth, first = identity(0), identity(1)
+        place = current, second, epsilon, problem.args
+        zeroth, first = (
+            dvi.noether_identity(problem.system, series, gauges, order, *place) for order in (0, 1)
+        )
         _, xi, _ = CLOCKED_ROTATION(current, problem.args)
         work = EPSILON**2 * jnp.sum(-current.q * (xi - velocity))
-        defect = dvi.lattice_defect(
-            problem.system, (previous, current, second), epsilon, problem.args
-        )
+        points = previous, current, second
+        defect = dvi.lattice_defect(problem.system, points, epsilon, problem.args)
         symmetry = zeroth + EPSILON * first
         return {
             "identity": first,
