@@ -91,9 +91,6 @@ def apart(one, two):
     return max(np.max(np.abs(one.qs - two.qs)), np.max(np.abs(one.ps - two.ps)))
 
 
-# --- values ------------------------------------------------------------------------------------
-
-
 @slow
 def test_the_lagrangian_of_the_paper_is_its_kepler_problem():
     """Values, trajectories, and explicit where that is."""
@@ -168,8 +165,6 @@ def test_type_ii_to_type_i_and_back():
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=3e-15 * np.max(np.abs(theirs)))
     assert abs(both(p)[0][0] - both(p * 1.001)[0][0]) > 1e-5
 
-
-# --- maps --------------------------------------------------------------------------------------
 
 ADJOINT, STRANG = dvi.Adjoint(), dvi.Strang()
 KICKS, DRIFTS = STRANG, dvi.Strang(base=ADJOINT)
@@ -308,9 +303,6 @@ def test_symmetries_of_an_adapted_hamiltonian():
     assert found.variational
 
 
-# --- gradients, batches, status ----------------------------------------------------------------
-
-
 @slow
 @pytest.mark.parametrize("adapt", ["from_lagrangian", "from_type_iii"])
 def test_gradients_go_through_the_inner_solve(adapt):
@@ -373,9 +365,6 @@ def test_a_batch_is_the_loop_and_a_failed_trajectory_changes_no_other():
 )
 def test_an_inner_solve_without_a_solution_has_a_status(H_D, method):
     assert run(H_D, *ONE, 2, method, throw=False).status == "not_finite"
-
-
-# --- rejected input ----------------------------------------------------------------------------
 
 
 def test_invalid_functions_are_rejected():

@@ -49,9 +49,6 @@ def same_bits(a, b):
     return np.asarray(a).tobytes() == np.asarray(b).tobytes()
 
 
-# Compensated summation
-
-
 @pytest.mark.parametrize("order", [1, -1])
 def test_the_sum_is_exact_under_jit(order):
     """s + e = a + b in rational arithmetic; without e it is not, nor with Dekker's three sums."""
@@ -211,9 +208,6 @@ def test_a_failed_trajectory_leaves_others_unchanged(arithmetic):
     assert list(batch.status) == ["successful", "not_finite", "successful"]
     assert np.isfinite(batch.qs[::2]).all()
     assert np.isnan(batch.qs[1, 1:]).all()
-
-
-# Fixed point
 
 
 def comes_back(orbit, methods, arithmetic, num_steps, batch=None):
@@ -398,9 +392,6 @@ def test_steps_that_fixed_point_cannot_undo_are_rejected():
         run(separable, q0=np.array([0.3], np.float32), quantum=2.0**-140)
     with pytest.raises(TypeError, match="Arithmetic"):
         dvi.integrate(separable, [0.3], [1.0], h=0.1, num_steps=1, arithmetic=dvi.Compensated)
-
-
-# Gradients, and other lattices
 
 
 @functools.cache

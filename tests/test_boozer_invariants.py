@@ -109,9 +109,6 @@ def test_second_invariant_of_a_passing_particle_is_nan():
     assert low < POINT[2] < high
 
 
-# --- orbits ----------------------------------------------------------------------------
-
-
 @functools.cache
 def centres():
     symmetric, breaking = field(False).split(0)
@@ -179,9 +176,6 @@ def test_extremes_ignore_values_that_are_not_numbers():
     for k, value in enumerate([np.nan, 2.0, -1.0, np.nan]):
         memory = reduction.update(memory, jnp.asarray(k), 0.0, jnp.asarray(value))
     assert reduction.finish(memory).tolist() == [-1.0, 2.0]
-
-
-# --- the momentum p_ζ ------------------------------------------------------------------
 
 
 def passing(alphas, count, width, seed):

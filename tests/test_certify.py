@@ -127,9 +127,6 @@ def test_reference_agrees_with_scipy(problem, epsilon):
     np.testing.assert_allclose(ours.ravel(), by_scipy.y[:, -1], rtol=0, atol=2e-12)
 
 
-# What must not pass
-
-
 def _nan(method, equations, interval, q, p):
     q, p, info = method.step(equations, interval, q, p)
     return q * jnp.nan, p, info
@@ -186,9 +183,6 @@ def test_what_is_not_promised_is_measured_and_no_failure():
     assert measured.verdict == adjoint.verdict == "not claimed"
     assert 1e-9 < measured.value < 1e-4
     assert (measured.ok, measured.passed) == (True, False)
-
-
-# The function
 
 
 LIAR = altered(dvi.TypeII(), is_symmetric=True)
@@ -253,9 +247,6 @@ def test_single_precision_is_refused():
         certify(["TypeII"], ["reversal"])
 
 
-# The command
-
-
 def command(*words):
     return CliRunner().invoke(app, ["certify", *map(str, words)], env={"COLUMNS": "150"})
 
@@ -304,9 +295,6 @@ def test_quick_command():
     assert result.exit_code == 0, result.output
     assert "methods: 5 of 5" in result.output
     assert "controls: 3 of 3 caught" in result.output
-
-
-# The page in the documentation
 
 
 def test_the_page_is_of_the_methods_and_checks_that_there_are():

@@ -55,9 +55,6 @@ def by_hand(kind, stages):
     return c, b, a, *(a_hat or [a])
 
 
-# --- coefficients ------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("kind", "stages"), BY_HAND)
 def test_coefficients_are_those_in_print(kind, stages):
     for ours, printed in zip(rounded_table(kind, stages), BY_HAND[kind, stages], strict=False):
@@ -102,9 +99,6 @@ def test_other_numbers_of_stages_are_rejected(kind, range, others):
     for stages in (*others, -1, 2.5, 2.0, True, None, "2"):
         with pytest.raises(ValueError, match=f"stages must be an integer from {range}"):
             kind(stages)
-
-
-# --- the step ----------------------------------------------------------------------------------
 
 
 def step_by_hand(table, z, t, h, epsilon):
@@ -252,8 +246,6 @@ def test_lobatto_solves_for_momenta_alone_with_the_same_result(stages):
     assert np.max(np.abs(ours(z, 0.3, 0.2, 0.2001) - full)) > 1e-6
 
 
-# --- order and structure of Lobatto's pair -----------------------------------------------------
-
 T_END = 3.0
 START = np.array([0.9, 0.8])
 """Of the non-separable problem: far enough out for the errors of order 10 to be seen."""
@@ -327,9 +319,6 @@ def test_one_family_for_both_is_not_symplectic():
     assert symplectic_defect(np.asarray(jacobian(a, a_hat))) <= 1e-12
     assert symplectic_defect(np.asarray(jacobian(a, a))) > 1e-4
     assert symplectic_defect(np.asarray(jacobian(a_hat, a_hat))) > 1e-4
-
-
-# --- invariants --------------------------------------------------------------------------------
 
 
 @pytest.mark.slow

@@ -74,9 +74,6 @@ def one_step(name, method=dvi.Rattle()):
     return step
 
 
-# Order, symmetry, symplecticity
-
-
 @functools.cache
 def flow(name, method):
     """Compiled (q, p, h, n) → (q, p) after n steps, n of which is traced."""
@@ -197,9 +194,6 @@ def test_the_map_is_symplectic_on_the_manifold():
     assert defect_of_two_form(OTHERS["not separable"], 1.3, mapped, *start) < 1e-13
 
 
-# Initial states, and what is refused
-
-
 APART = np.array([0.7, 0.1, -0.9]), np.array([0.1, 1.0, 0.3])
 """A state that does not satisfy the constraint."""
 
@@ -302,9 +296,6 @@ def test_a_constraint_of_another_shape_is_refused(constraint, said):
         dvi.System(SPHERE.system.H_D, constraint=lambda q: q)
 
 
-# Forces of constraint, gradients, batches
-
-
 def test_forces_of_constraint_are_the_tension():
     watched = {"force": dvi.ConstraintForce(), "λ": dvi.ConstraintForce(multipliers=True)}
     sol = run(SPHERE, 10, h=0.05, observe=watched, save=dvi.Save())
@@ -378,9 +369,6 @@ def test_steps_are_compiled_by_lanewise():
     parts = str(lanewise.explain(f, jnp.asarray(chain.q0), jnp.asarray(chain.p0)))
     assert "machine code" in parts
     assert "XLA" not in parts
-
-
-# Against solutions in minimal coordinates, and over long times
 
 
 def by_dop853(rates, y0, time):

@@ -49,8 +49,6 @@ def observed(start, num_steps, every=None):
     return {name: np.asarray(value) for name, value in found.items()}
 
 
-# The tangent map
-
 KINDS = {
     "TypeII": dvi.TypeII(),
     "Adjoint": dvi.Adjoint(),
@@ -145,9 +143,6 @@ def test_bodies_in_space():
     # A translation of all bodies is mapped to itself.
     shift = np.concatenate([np.tile([1.0, 0.0], 3), np.zeros(6)])
     assert np.max(np.abs(M @ shift - shift)) < 1e-13
-
-
-# Lyapunov exponents
 
 
 def linear(t0, t1, q0, p1, args):
@@ -285,9 +280,6 @@ def test_backwards_the_exponents_change_their_signs():
     assert x > 1
 
 
-# MEGNO
-
-
 @pytest.mark.slow
 def test_megno_tells_order_from_chaos():
     regular, chaotic = (observed(s, 400_000, every=40_000) for s in ("regular", "chaotic"))
@@ -350,9 +342,6 @@ def test_megno_of_three_bodies_is_that_of_rebound():
     assert min(theirs, ours) > 20
 
 
-# GALI and SALI
-
-
 def brute_force(start, num_steps):
     """GALI_2, 3, 4 and SALI from the product of all tangent maps, by singular values."""
     M = np.asarray(seen(HENON.system, *start, dvi.TangentMap(), num_steps=num_steps))
@@ -402,9 +391,6 @@ def test_a_value_that_underflows_is_zero_and_its_logarithm_is_finite():
     found = seen(HENON.system, *CHAOTIC, kinds, num_steps=200_000)
     assert found[0][-1] == 0
     assert found[1][-1] < -400
-
-
-# Common properties
 
 
 @pytest.mark.slow

@@ -603,9 +603,6 @@ def test_near_resonance_shows_in_the_reach():
     assert found("cubic", 6, 1).reach[0] > 1
 
 
-# --- what misleads ---------------------------------------------------
-
-
 CENTRAL = dvi.System(lambda t0, t1, q, p, args: (p @ p + q @ q) / 2 + (q @ q) ** 2 / 4)
 
 PAIR = dvi.System(

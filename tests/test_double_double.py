@@ -190,9 +190,6 @@ def test_arrays_loops_and_solves_have_30_digits():
     assert max(abs(mp.mpf(float(a)) - b) for a, b in zip(plain, true, strict=True)) > 1e-17
 
 
-# Runs
-
-
 def strang(q, p, h, num_steps):
     for _ in range(num_steps):
         p -= h / 2 * mp.sin(q)

@@ -188,8 +188,6 @@ def test_no_initial_condition_that_succeeds_everywhere_is_reported():
     assert "left out: 2 of 2 initial conditions (not_finite): number 0, 1" in str(measured)
 
 
-# --- the order for ε → 0 ---------------------------------------------
-
 CROSSING = lambda epsilons: epsilons + 300 * epsilons**2  # noqa: E731
 
 

@@ -106,9 +106,6 @@ def test_dependence(function, expected):
     assert depends_on(function, 1, x, x) is expected
 
 
-# --- a linear map with a transpose of its own ------------------------------------------------
-
-
 def _scaled(residuals, x):
     a, _ = residuals
     return {"y": jnp.sin(a) * jnp.stack([x[0] + 2 * x[1], 3 * x[0], x[1]])}

@@ -88,9 +88,6 @@ def problem_of(data, params=START, model=MODEL, **options):
     return made, made.space.to_u(made.start)
 
 
-# --- predictions and derivatives -----------------------------------------------------------------
-
-
 def test_the_truth_is_found(regular):
     data, found = regular
     assert found.status == "converged"
@@ -146,9 +143,6 @@ def test_jacobian_against_differences_and_reverse_mode(ts):
         problem, _ = problem_of(data, model=model_of(adjoint=adjoint))
         backward = np.asarray(jax.jit(jax.grad(problem.core.scalar))(jnp.asarray(u)))
         np.testing.assert_allclose(backward, J.T @ r, rtol=1e-8, atol=1e-8 * np.abs(J.T @ r).max())
-
-
-# --- standard errors -----------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -240,9 +234,6 @@ def test_a_model_no_better_than_a_constant_is_reported(regular):
     assert "constants" not in str(good)
 
 
-# --- bounds and priors ---------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_bounds_hold_and_are_named():
     data = seen(4)
@@ -312,9 +303,6 @@ def test_a_prior_has_the_weight_of_a_measurement(regular):
     assert both.degrees_of_freedom == free.degrees_of_freedom + 1
 
 
-# --- losses --------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_outliers_have_less_influence_on_a_robust_loss():
     y = noisy(REGULAR, 7)
@@ -370,9 +358,6 @@ def test_a_likelihood_of_small_noise_with_an_idle_parameter_and_a_prior():
     assert found.names[1] == "idle"
     assert np.isinf(found.sigma[1])
     np.testing.assert_allclose(found.loss - 60 * np.log(NOISE), least.loss, rtol=1e-6)
-
-
-# --- kinds of data and parameters ----------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -454,9 +439,6 @@ def test_sizes_in_a_module_are_not_fitted():
     found = dvi.fit(model, seen(1), Drag(2, jnp.array(0.0)), bounds=bounds, **UNCHECKED)
     assert found.names == ["weight"]
     np.testing.assert_allclose(found.x, 0.01, atol=1e-3)
-
-
-# --- the way to the minimum ----------------------------------------------------------------------
 
 
 def test_horizons_lead_to_the_minimum_that_all_data_miss():
@@ -565,9 +547,6 @@ def test_one_compilation_for_many_fits_and_progress(regular):
     assert shown[-1].seconds > 0
 
 
-# --- files ---------------------------------------------------------------------------------------
-
-
 def test_saved_and_loaded(regular, tmp_path):
     _, found = regular
     found.save(tmp_path / "fit.npz")
@@ -668,8 +647,6 @@ def test_more_steps_continue_from_the_checkpoint(regular, tmp_path, monkeypatch)
     assert not file.exists()
     np.testing.assert_array_equal(more.history["x"], found.history["x"])
 
-
-# --- multiple shooting ---------------------------------------------------------------------------
 
 GUESSES = {
     "data": None,

@@ -64,9 +64,6 @@ def swinging(sigma=0.01, steps=40, seed=0):
     return dvi.Observations(sol.ts, np.asarray(sol.qs) + noise, sigma=sigma)
 
 
-# --- the density ---------------------------------------------------------------------------------
-
-
 def student(predicted, observed, sigma, params):
     return 2.5 * jnp.log1p(((predicted - observed) / sigma) ** 2 / 4)
 
@@ -185,9 +182,6 @@ def test_the_mode_and_its_covariance():
     student_t = dvi.Posterior(LINE, data, PAIR, loss=dvi.Likelihood(student))
     mode, root = student_t.laplace()
     assert np.abs(jax.grad(student_t.potential)(jnp.asarray(mode)) @ root).max() < 1e-2
-
-
-# --- draws ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -354,9 +348,6 @@ def test_warnings():
     assert "3 of 2000 draws diverged" in lost.warnings[0]
     assert "diverged" in str(lost)
     assert "100 % of the paths were truncated" in fake(good, steps=1023).warnings[0]
-
-
-# --- what is refused -----------------------------------------------------------------------------
 
 
 def test_arviz_old_new_and_none(monkeypatch):

@@ -73,9 +73,6 @@ def test_the_truth_is_within_the_errors_as_often_as_expected():
         assert abs(np.mean(np.abs(factor * off) <= 1) - 0.68) > 0.07
 
 
-# --- stuck away from the optimum
-
-
 def test_a_fit_at_a_kink_is_stalled():
     """The loss is least at a kink, where its gradient is not zero."""
 
@@ -139,9 +136,6 @@ def test_round_off_is_distinguished_from_other_causes(name):
         # Changes of u are differences of two round-offs: twice the variance of J⁺ δ.
         expected = NOISY * np.sqrt(2 * np.trace(np.linalg.inv(A.T @ A)))
         assert np.sqrt(np.mean(np.sum(end.shifts**2, axis=1))) == pytest.approx(expected, rel=0.7)
-
-
-# --- second derivatives
 
 
 @pytest.mark.slow

@@ -189,9 +189,6 @@ def test_reversible_memory_is_flat_and_direct_is_not():
     assert growth(dvi.Reversible()) < direct / 100
 
 
-# --- where a custom derivative could be missed or misapplied -----------------------------------
-
-
 def closing_over(mu, where, adjoint):
     """A loss whose parameter is not passed but closed over, in one of several places."""
     plain = SYSTEMS["kepler"][0]
@@ -288,9 +285,6 @@ def test_a_failed_trajectory_that_the_loss_omits_spoils_no_shared_parameter(form
     np.testing.assert_allclose(found, np.array(twice) / 2, rtol=1e-12)
     spoilt, _ = gradient((0.2, 1.1), every, False)
     assert np.isnan(spoilt).all()  # NaN is not hidden where the loss uses a failed trajectory
-
-
-# --- reconstruction ----------------------------------------------------------------------------
 
 
 @pytest.mark.slow

@@ -36,9 +36,6 @@ def energy(t0, t1, q0, p0, q1, p1, args):
     return H(t1, t1, q1, p1, args)
 
 
-# --- saved states ------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("save", "kept"),
     [
@@ -96,9 +93,6 @@ def test_exact_invariant_of_the_map_is_conserved_late_in_a_run():
     assert sol.observed["range"] / sol.observed["mean"] < 5e-14
 
 
-# --- given times -------------------------------------------------------------------------------
-
-
 def test_given_times_set_the_steps():
     """Equal ones are the uniform grid; unequal ones against the map by hand."""
     a = run(epsilon=0.1)
@@ -120,9 +114,6 @@ def test_given_times_of_a_problem_and_of_integers():
     assert dvi.integrate(kepler, lattice=dvi.Given(ts)).ts.tolist() == ts.tolist()
     whole = dvi.integrate(OSCILLATOR, *START, lattice=dvi.Given([0, 1, 2]))
     np.testing.assert_array_equal(whole.hs, [1.0, 1.0])
-
-
-# --- observables -------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -178,9 +169,6 @@ def test_streamed_reductions_need_no_memory_for_the_steps(form, few):
         return compiled.memory_analysis().temp_size_in_bytes
 
     assert size(1000 * few) <= size(few) + 1024
-
-
-# --- batches, compilation ----------------------------------------------------------------------
 
 
 def test_batch_equals_loop_and_jit_equals_eager():
@@ -272,9 +260,6 @@ def test_the_state_sets_the_precision():
     assert sol.qs.dtype == sol.ts.dtype == jnp.float32
 
 
-# --- failure -----------------------------------------------------------------------------------
-
-
 def test_newton_failure_is_named_with_step_and_residual():
     match = r"step 0 of 10 .*residual .*did not converge"
     with pytest.raises(dvi.IntegrationError, match=match) as e:
@@ -352,9 +337,6 @@ def test_a_light_body_is_solved_for_as_well_as_alone():
     np.testing.assert_allclose(both.ps[:, 1], alone.ps[:, 0], rtol=1e-12)
 
 
-# --- rejected input ----------------------------------------------------------------------------
-
-
 def test_a_masked_array_without_a_masked_number_is_an_array():
     given = {"h": 0.1, "num_steps": 3, "args": {"k": np.ma.array([1.0, 2.0])}}
     found = dvi.integrate(OSCILLATOR, np.ma.array(START[0]), START[1], **given)
@@ -393,9 +375,6 @@ print(run(jnp.ones(1)))
 """
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.split() == ["True", "True", "True", "float32"]
-
-
-# --- memory ------------------------------------------------------------------------------------
 
 
 def final_position(q0, save=dvi.Save()):

@@ -143,9 +143,6 @@ def test_wrong_arguments():
         interop.to_xarray(run(), coords={"time": np.arange(7) * u.km})
 
 
-# ---- ArviZ
-
-
 def draws(seed=0, chains=4, count=250):
     x = np.random.default_rng(seed).normal([1.0, -2.0], [0.1, 0.3], (chains, count, 2))
     diverging = np.zeros((chains, count), bool)
@@ -205,8 +202,6 @@ def test_arviz_base_takes_the_tree():
     assert sample.sizes["sample"] == 1000
     assert float(sample["K"].mean()) == pytest.approx(-2.0, abs=0.05)
 
-
-# ---- what is imported when
 
 THEIRS = ("diffrax", "astropy", "arviz", "arviz_base", "rebound", "scipy", "xarray")
 

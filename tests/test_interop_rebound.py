@@ -168,9 +168,6 @@ def test_a_file(tmp_path):
         interop.from_rebound(path, snapshot=7)
 
 
-# Rejected simulations
-
-
 @pytest.mark.parametrize("name", ["x", "vz", "m", "t", "G"])
 def test_numbers_that_are_not_finite(name):
     sim = three_bodies()

@@ -74,9 +74,6 @@ def threads():
     lanewise.set_threads(before)
 
 
-# --- equal bits ---------------------------------------------------
-
-
 def hostile(x, k):
     """Sines, divisions, products below the smallest normal number, a loop, rows."""
 
@@ -273,8 +270,6 @@ def test_rounds_without_rare_branches(left):
     assert not left
 
 
-# --- arrays in memory, types, sizes ---------------------------------------------------
-
 TABLE = np.sin(np.arange(300.0))
 
 
@@ -465,9 +460,6 @@ def test_single_precision_with_x64_switched_off(left):
     np.testing.assert_allclose(found[1], np.exp(VALUES), rtol=3e-7)
     np.testing.assert_allclose(found[0][1][0], rows_of(jnp.asarray(VALUES[0]), 9)[1], rtol=1e-5)
     assert not left
-
-
-# --- what JAX's functions are made of -------------------------------------------------------------
 
 
 @jax.custom_vjp
@@ -735,9 +727,6 @@ def test_code_stays_short_for_arrays():
     assert max(block.count("\n") for block in part.ir.split(":\n")) < 3000
 
 
-# --- derivatives ---------------------------------------------------
-
-
 @pytest.mark.slow
 def test_derivatives():
     x, y, n = RNG.normal(size=(9, 2)), RNG.uniform(1, 2, 9), np.arange(9)
@@ -753,9 +742,6 @@ def test_derivatives():
     assert_close(found, jax.jit(lambda *a: jax.jvp(total(jax.vmap), a, direction))(x, y), 1e-12)
     one = jax.grad(lambda x: lanewise.call(energy_like, x, y[0], n[0]))(x[0])
     assert_close(one, jax.grad(energy_like)(jnp.asarray(x[0]), y[0], n[0]), 1e-12)
-
-
-# --- linear systems ---------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -881,8 +867,6 @@ def test_gradient_of_a_solution():
     expected = jax.jit(jax.grad(total(jnp.linalg.solve), (0, 1)))(A, b)
     assert_close(found, expected, 1e-11)
 
-
-# --- the cache on disk ---------------------------------------------------
 
 CODE = "define i64 @number() {\n  ret i64 NUMBER\n}\n"
 
@@ -1059,9 +1043,6 @@ def test_compilation_cache_of_jax(tmp_path):
     assert found[0] == found[1] != []
 
 
-# --- without generated code ---------------------------------------------------
-
-
 def test_switched_off(left, monkeypatch):
     found = jax.jit(lanewise.batched(table))(VALUES)
     layout = lanewise.Layout(form="arrays")
@@ -1074,19 +1055,12 @@ def test_switched_off(left, monkeypatch):
 
 def test_one_warning_where_code_cannot_be_generated(left, monkeypatch):
     monkeypatch.setitem(sys.modules, "llvmlite.binding", None)  # as if it were not installed
-    caches = machine.start_llvm, primitive._can_start
-    for cached in caches:
-        cached.cache_clear()
-    try:
-        with warnings.catch_warnings(record=True) as seen:
-            warnings.simplefilter("always")
-            for scale in (2, 3):
-                found = jax.jit(lanewise.batched(lambda x, s=scale: s * x))(VALUES)
-                np.testing.assert_array_equal(found, scale * VALUES)
-    finally:
-        for cached in caches:
-            cached.cache_clear()
-    (warning,) = [w for w in seen if "machine code" in str(w.message)]
+    for module, name in ((machine, "start_llvm"), (primitive, "_can_start")):  # not called before
+        monkeypatch.setattr(module, name, machine.once(getattr(module, name).__wrapped__))
+    with pytest.warns(UserWarning, match="machine code") as seen:
+        found = [jax.jit(lanewise.batched(lambda x, s=s: s * x))(VALUES) for s in (2, 3)]
+    np.testing.assert_array_equal(found, [2 * VALUES, 3 * VALUES])
+    (warning,) = seen
     assert "ImportError: " in str(warning.message)
     assert "pip install --force-reinstall llvmlite" in str(warning.message)
     assert len(left) == 2
@@ -1159,8 +1133,6 @@ def test_derivative_of_loops_around_a_sort():
     assert_close(found, jax.jit(jax.vmap(jax.grad(function)))(VALUES[:5]))
 
 
-# --- other processors ---------------------------------------------------
-
 PROCESSORS = [
     ("x86_64", "haswell", "+avx2,+fma", 62),
     ("x86_64", "skylake-avx512", "+avx512f,+avx512dq,+avx512vl,-prefer-256-bit", 62),
@@ -1185,9 +1157,6 @@ def test_code_for_other_processors(width):
         made = machine.object_code(part.ir, target)
         assert made[:4] == b"\x7fELF"
         assert int.from_bytes(made[18:20], "little") == code
-
-
-# --- in JAX's surroundings ---------------------------------------------------
 
 
 def test_export_refuses():

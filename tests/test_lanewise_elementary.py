@@ -22,8 +22,6 @@ import lanewise
 from lanewise import elementary
 from lanewise.elementary import tables
 
-# --- an interpreter of jaxprs -----------------------------------------------------------------
-
 
 def _shift_right(x, count):
     return (np.asarray(x).view(np.uint64) >> np.asarray(count).view(np.uint64)).view(np.int64)
@@ -73,9 +71,6 @@ def run(function, *xs):
     with np.errstate(all="ignore"):
         out = evaluate(closed, [np.asarray(x, float) for x in xs])
     return out[0] if len(out) == 1 else out
-
-
-# --- errors -----------------------------------------------------------------------------------
 
 
 def exact(name, *xs):
@@ -238,9 +233,6 @@ def test_symmetry(name):
     np.testing.assert_array_equal(run(function, -xs), -values if name in ODD else values)
 
 
-# --- a defect must be seen --------------------------------------------------------------------
-
-
 @pytest.fixture
 def defect(monkeypatch):
     """Replaces a table; JAX must not reuse what it traced before, nor this afterwards."""
@@ -274,8 +266,6 @@ def test_error_with_fewer_digits_of_two_over_pi(defect, count):
     largest = np.random.default_rng(0).uniform(1e308, 1.7e308, 50)
     assert errors("sin", [largest], run(elementary.sin, largest)).max() > 100
 
-
-# --- special values ---------------------------------------------------------------------------
 
 INF, NAN, PI, TINY = math.inf, math.nan, math.pi, 5e-324
 SPECIAL = {
@@ -343,9 +333,6 @@ def test_special_values_of_two_arguments(name, library):
     np.testing.assert_array_equal(np.signbit(values)[number], np.signbit(expected)[number])
 
 
-# --- half-integer powers, and the table -------------------------------------------------------
-
-
 @pytest.mark.parametrize("twice", [-7, -5, -3, -1, 1, 3, 5, 7])
 def test_half_integer_powers(twice):
     rng = np.random.default_rng(4)
@@ -384,9 +371,6 @@ def test_primitives(name):
     assert set(primitives_of(closed.jaxpr)) <= {*OPERATIONS, *CONVERSIONS, "cond"}
     assert all(v.aval.shape == () for e in closed.eqns for v in (*e.invars, *e.outvars))
     assert [v.aval.dtype for v in closed.jaxpr.outvars] == [np.dtype(float)]
-
-
-# --- where constants come from ----------------------------------------------------------------
 
 
 def interpolated(function, nodes):

@@ -92,9 +92,6 @@ def nearby(name, seed):
     return rng.uniform(0, 2), q, p, jax.tree.map(scaled, args)
 
 
-# 1. Equations
-
-
 def test_every_system_has_a_derivation():
     assert set(NAMES) == set(DERIVATIONS)
 
@@ -112,9 +109,6 @@ def test_equations_are_those_of_an_independent_derivation(name):
         other = DERIVATIONS[name](t, q * (1 + 1e-6), p * (1 + 1e-6), args, epsilon)
         pairs = zip(ours, other, strict=True)
         assert any(np.max(np.abs(a - b)) > 1e-8 * np.max(np.abs(b)) for a, b in pairs)
-
-
-# 2. Invariants, and 5. exact solutions, along the flow
 
 
 @functools.cache
@@ -283,9 +277,6 @@ def test_runs_converge_to_the_exact_solution(name):
     assert abs(np.log2(off[0] / off[1]) - 4) < 0.35
 
 
-# 3. Symmetries
-
-
 BEND = dvi.Generator(xi=lambda t, q, p, args: jnp.sin(q))
 """What is added to a generator to make it wrong."""
 
@@ -364,9 +355,6 @@ def test_a_system_without_a_declared_symmetry_has_a_reason():
     assert set(NAMES) - set(SYMMETRIC) == {"lorentz_pendulum", "polar_motion", *CONSTRAINED}
 
 
-# 4. Defaults
-
-
 @pytest.mark.parametrize("name", listed(NAMES, QUICK))
 def test_defaults_run_and_their_energy_is_bounded(name):
     """The paper's map, 1000 steps of the default size: the energy oscillates and does not drift."""
@@ -380,9 +368,6 @@ def test_defaults_run_and_their_energy_is_bounded(name):
         energy = np.asarray(sol.observed["energy"])
         off = np.abs(energy - energy[0])
         assert off[500:].max() < 2.5 * off[:500].max() + 1e-12 * abs(energy[0])
-
-
-# 6. What is written of them, and what they refuse
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -564,9 +549,6 @@ def test_a_run_file_names_it(name, tmp_path):
     report = json.loads((run_file(path).folder / "report.json").read_text(encoding="utf-8"))
     assert report["status"]["result"] == "successful"
     assert set(report["results"]) >= set(made.observables)
-
-
-# Elliptic functions, and exact solutions in every regime
 
 
 @slow
@@ -785,9 +767,6 @@ def test_exact_solutions_keep_the_dtype_and_refuse_other_shapes(name):
     lanes = jax.vmap(made.exact, (None, 0, 0, None))
     for x in jax.eval_shape(lanes, ts, many, jnp.stack([p0] * 3), made.args):
         assert x.shape == (3, 1, 2, *q0.shape)
-
-
-# What the documentation says
 
 
 @pytest.mark.parametrize("name", NAMES)
