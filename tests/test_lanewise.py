@@ -857,17 +857,6 @@ def test_a_band_takes_fewer_operations():
     np.testing.assert_allclose(found[0], right, rtol=1e-12)
 
 
-def test_gradient_of_a_solution():
-    A, b = RNG.normal(size=(5, 3, 3)) + 4 * np.eye(3), RNG.normal(size=(5, 3))
-
-    def total(solve):
-        return lambda A, b: jnp.sum(jnp.sin(jax.vmap(solve)(A, b)))
-
-    found = jax.jit(jax.grad(total(lambda A, b: lanewise.call(lanewise.solve, A, b)), (0, 1)))(A, b)
-    expected = jax.jit(jax.grad(total(jnp.linalg.solve), (0, 1)))(A, b)
-    assert_close(found, expected, 1e-11)
-
-
 CODE = "define i64 @number() {\n  ret i64 NUMBER\n}\n"
 
 

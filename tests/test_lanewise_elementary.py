@@ -79,17 +79,14 @@ def exact(name, *xs):
     # The bits that small arguments of 1 + x and large ones of sin take.
     mpmath.mp.prec = 150 + 2 * max(abs(math.frexp(x)[1]) for x in xs)
     xs = [mpf(x) for x in xs]
-    if name == "logistic":
-        return 1 / (1 + mpmath.exp(-xs[0]))
-    if name == "exp2":
-        return mpf(2) ** xs[0]
-    if name == "pow":
-        return mpmath.power(*xs)
-    if name == "cbrt":
-        return mpmath.sign(xs[0]) * mpmath.cbrt(abs(xs[0]))
-    if name == "erf_inv":  # not at 0, where mpmath has no relative accuracy
-        return mpmath.erfinv(xs[0]) if abs(xs[0]) > 1e-30 else xs[0] * mpmath.sqrt(mpmath.pi) / 2
-    return getattr(mpmath, name)(*xs)
+    if name == "erf_inv" and abs(xs[0]) < 1e-30:  # where mpmath has no relative accuracy
+        return xs[0] * mpmath.sqrt(mpmath.pi) / 2
+    others = {
+        "logistic": lambda x: 1 / (1 + mpmath.exp(-x)), "exp2": lambda x: mpf(2) ** x,
+        "pow": mpmath.power, "cbrt": lambda x: mpmath.sign(x) * mpmath.cbrt(abs(x)),
+        "erf_inv": mpmath.erfinv,
+    }  # fmt: skip
+    return (others.get(name) or getattr(mpmath, name))(*xs)
 
 
 def errors(name, xs, values):
@@ -422,56 +419,44 @@ def _exp_nodes(n):
     return [sign * root for root in roots for sign in (-1, 1)]
 
 
-def _in_squares(length, bits=20):
-    return lambda n: one_sided(mpf(length), n, bits)
-
-
-# The function that a table approximates, and the nodes for n coefficients.
-DERIVATIONS = {
-    "SIN": lambda: (
-        series(lambda k: mpf((-1) ** k) / mpmath.factorial(2 * k + 1), 1),
-        _in_squares(0.625),
-    ),
-    "COS": lambda: (
-        series(lambda k: mpf((-1) ** k) / mpmath.factorial(2 * k), 2),
-        _in_squares(0.625),
-    ),
-    "ATAN": lambda: (series(lambda k: mpf((-1) ** k) / (2 * k + 1), 1), _in_squares(0.09)),
-    "ASIN": lambda: (
-        series(lambda k: mpmath.binomial(2 * k, k) / mpf(4) ** k / (2 * k + 1), 1),
-        _in_squares(0.25),
-    ),
-    "LOG": lambda: (series(lambda k: mpf(2) / (2 * k + 1), 1), _in_squares(0.02945)),
-    "EXP": lambda: (lambda r: (mpmath.expm1(r) - r) / r**2, _exp_nodes),
-    "LOG2_5": lambda: (
-        series(lambda k: 2 / mpmath.log(2) / (2 * k + 1), 2),
-        _in_squares("0.00348", None),
-    ),
-    "CBRT": lambda: (
-        lambda m: 1 / mpmath.cbrt(m),
-        lambda n: chebyshev(mpf(1), mpf(2), n),
-    ),
-    "ERF": lambda: (
-        lambda z: mpmath.erf(mpmath.sqrt(z)) / mpmath.sqrt(z) - 1,
-        lambda n: chebyshev(mpf(0), mpf(9) / 16, n),
-    ),
-    "ERF_INV": lambda: (
-        lambda v: _erf_inv_factor(v + mpf(25) / 8),
-        lambda n: chebyshev(-mpf(25) / 8, mpf(25) / 8, n),
-    ),
-    "ERF_INV_TAIL": lambda: (
+# Tables of coefficients a_k in Σ a_k z^(k − first): k → a_k, first, largest z, bits of the nodes.
+SERIES = {
+    "SIN": (lambda k: mpf((-1) ** k) / mpmath.factorial(2 * k + 1), 1, 0.625, 20),
+    "COS": (lambda k: mpf((-1) ** k) / mpmath.factorial(2 * k), 2, 0.625, 20),
+    "ATAN": (lambda k: mpf((-1) ** k) / (2 * k + 1), 1, 0.09, 20),
+    "ASIN": (lambda k: mpmath.binomial(2 * k, k) / mpf(4) ** k / (2 * k + 1), 1, 0.25, 20),
+    "LOG": (lambda k: mpf(2) / (2 * k + 1), 1, 0.02945, 20),
+    "LOG2_5": (lambda k: 2 / mpmath.log(2) / (2 * k + 1), 2, "0.00348", None),
+}
+# Other tables: the function, and the ends of the interval whose Chebyshev nodes are taken.
+FITTED = {
+    "CBRT": (lambda m: 1 / mpmath.cbrt(m), lambda: (mpf(1), mpf(2))),
+    "ERF": (lambda z: mpmath.erf(mpmath.sqrt(z)) / mpmath.sqrt(z) - 1, lambda: (0, mpf(9) / 16)),
+    "ERF_INV": (lambda v: _erf_inv_factor(v + mpf(25) / 8), lambda: (-mpf(25) / 8, mpf(25) / 8)),
+    "ERF_INV_TAIL": (
         lambda v: _erf_inv_factor((6 / (1 - v) - 2) ** 2),
-        lambda n: chebyshev(1 - 6 / mpf("4.49"), 1 - 6 / mpf("8.02"), n),
+        lambda: (1 - 6 / mpf("4.49"), 1 - 6 / mpf("8.02")),
     ),
-    "ERFC": lambda: (_erfc_factor, lambda n: chebyshev(1 - 8 / mpf(3.75), 1 - 8 / mpf(31), n)),
+    "ERFC": (_erfc_factor, lambda: (1 - 8 / mpf(3.75), 1 - 8 / mpf(31))),
 }
 
 
-@pytest.mark.parametrize("table", DERIVATIONS)
+def derivation(table):
+    """The function that a table approximates, and the nodes for n coefficients."""
+    if table in SERIES:
+        of, first, length, bits = SERIES[table]
+        return series(of, first), lambda n: one_sided(mpf(length), n, bits)
+    if table == "EXP":
+        return lambda r: (mpmath.expm1(r) - r) / r**2, _exp_nodes
+    function, ends = FITTED[table]
+    return function, lambda n: chebyshev(*ends(), n)
+
+
+@pytest.mark.parametrize("table", [*SERIES, *FITTED, "EXP"])
 def test_coefficients_are_interpolated(table):
     mine = getattr(tables, table)
     with mpmath.workprec(1500 if table == "ERFC" else 400):
-        function, nodes = DERIVATIONS[table]()
+        function, nodes = derivation(table)
         derived = interpolated(function, nodes(len(mine)))
         assert tuple(map(float, derived)) == mine
         if table == "ERFC":
