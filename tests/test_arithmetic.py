@@ -133,6 +133,7 @@ def test_every_method_is_the_same_in_local_coordinates(system, method, newton, m
         assert two > final_state(system, method, dvi.Compensated())[1]
 
 
+@pytest.mark.slow
 def test_an_equilibrium_is_solved_for_in_its_own_size():
     """p relaxes to 3, where increments are round-off: by their own size they settle late."""
     s = dvi.System(pendulum, force=lambda t0, t1, q0, p1, args: jnp.sin(q0) + 3 - p1)

@@ -43,7 +43,7 @@ IN_EVERY_RUN = {
     ("GaussLegendre2", "forced-order"),
     ("RungeKutta4", "order"),
     *(("Yoshida4", check) for check in ("energy", "momentum")),
-    *(("TypeII", check) for check in CHECKS if check not in ("gradient", "modes")),
+    *(("TypeII", check) for check in CHECKS if check not in ("gradient", "modes", "jit")),
 }
 
 
@@ -68,7 +68,7 @@ def test_method_keeps_what_it_promises(method, check):
     assert measured.ok, measured
 
 
-SLOW_CHECKS = ("forced-order", "gradient", "modes")
+SLOW_CHECKS = ("forced-order", "gradient", "modes", "vmap", "jit")
 FIRST_CONTROL = {c.check: c for c in reversed(CONTROLS)}
 
 

@@ -198,7 +198,9 @@ def compiled(by, seed, n):
     return {name: (xs, np.asarray(found[name])[: len(xs[0])]) for name, xs in of.items()}
 
 
-@pytest.mark.parametrize(("by", "n"), [(of_generated_code, 250), (of_xla, 40)])
+@pytest.mark.parametrize(
+    ("by", "n"), [(of_generated_code, 250), pytest.param(of_xla, 40, marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize("name", elementary.FUNCTIONS)
 def test_error_when_compiled(name, by, n):
     """With fused multiply-adds; XLA simplifies sums of several constants, which must not spoil an
