@@ -407,63 +407,6 @@ def test_a_chain_of_20_links_moves_as_in_angles():
     assert off < 1e-9
 
 
-@slow
-def test_a_slider_crank_moves_as_in_its_angle():
-    made = systems.slider_crank()
-    a = made.args
-
-    def place(theta):
-        """(A, B), as complex numbers for derivatives in the direction i."""
-        y = a["l1"] * np.sin(theta)
-        x = a["l1"] * np.cos(theta)
-        return x, y, x + np.sqrt(a["l2"] ** 2 - y**2)
-
-    def inertia_and_height(theta):
-        """T = J(θ) θ'²/2 and V, from velocities of the points of uniform rods."""
-        step = 1e-30
-        y = place(theta)[1]
-        dx, dy, ds = (z.imag / step for z in place(theta.real + 1j * step))
-        crank = a["m1"] / 3 * (dx**2 + dy**2)
-        rod = a["m2"] / 3 * (dx**2 + dx * ds + ds**2 + dy**2)
-        return crank + rod + a["m3"] * ds**2, a["g"] * (a["m1"] + a["m2"]) / 2 * y
-
-    def rates(y):
-        theta, turn = y
-        d = 1e-4
-        J = [inertia_and_height(np.asarray(theta + k * d))[0] for k in (-2, -1, 0, 1, 2)]
-        V = [inertia_and_height(np.asarray(theta + k * d))[1] for k in (-2, -1, 0, 1, 2)]
-        dJ, dV = ((8 * (f[3] - f[1]) - f[4] + f[0]) / (12 * d) for f in (J, V))
-        return np.array([turn, (-dJ * turn**2 / 2 - dV) / J[2]])
-
-    theta, _ = by_dop853(rates, [np.pi / 3, 5.0], 2.0)
-    x, y, s = place(theta)
-    sol = run(made, 1000, h=2e-3, method=EIGHTH)
-    off = np.max(np.abs(sol.qs[-1] - np.array([[x, y], [s, 0.0]])))
-    print(f"slider-crank, 2 s: {off:.1e}, angle {theta:.2f}")
-    assert off < 1e-9
-
-
-@slow
-def test_a_spherical_pendulum_moves_as_in_angles():
-    g = SPHERE.args["g"]
-
-    def rates(y):  # θ from the upward vertical; p_φ = sin² θ φ'
-        theta, _, p, spin = y
-        s, c = np.sin(theta), np.cos(theta)
-        return np.array([p, spin / s**2, spin**2 * c / s**3 + g * s, 0.0])
-
-    s, c = np.array([0.8, -0.6])
-    p = np.asarray(P)
-    start = [np.arctan2(s, c), 0.0, p @ [c, 0, -s], s * p[1]]
-    theta, phi, _, _ = by_dop853(rates, start, 5.0)
-    expected = [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)]
-    off = np.max(np.abs(run(SPHERE, 1000, h=5e-3, method=EIGHTH).qs[-1] - np.array(expected)))
-    exact = np.max(np.abs(run(SPHERE, 1000, h=5e-3, method=EIGHTH).qs[-1] - exact_end(5.0)[:3]))
-    print(f"spherical pendulum, 5 s: {off:.1e} from DOP853, {exact:.1e} from elliptic functions")
-    assert off < 1e-9
-    assert exact < 1e-11
-
-
 def violation(made):
     """max |g| of a state."""
 
