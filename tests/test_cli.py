@@ -54,8 +54,6 @@ def ended(calls):
     return json.loads(done.stdout)
 
 
-# Help, errors and completion without JAX
-
 LIGHT = {"--help": 0, "--version": 0, "sweep run --help": 0, "wlak": 2, "run --forse": 2}
 COMPLETED = {
     "systems ke": ["kepler"],
@@ -146,9 +144,6 @@ def test_names_that_complete_are_those_of_the_package():
     extras = set(project["optional-dependencies"]) - {"test", "docs", "peers"}
     assert set(known.EXTRAS) == extras
     assert dvi.__version__ == known.VERSION
-
-
-# Output for programs, and errors
 
 
 @pytest.mark.parametrize("kind", [*known.FILES, None])
@@ -249,9 +244,6 @@ def test_too_little_memory_is_a_failure_with_its_size():
     assert "does not have the memory for this: Unable to allocate 7.28 TiB" in message
 
 
-# info
-
-
 def test_info(monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", "") + " ")
     monkeypatch.setitem(known.EXTRAS, "export", ("a_module_that_is_not_there",))
@@ -266,9 +258,6 @@ def test_info(monkeypatch):
     assert info["extras"]["export"] == missing
     assert info["extras"]["bayes"] == {"missing": [], "install": None}
     assert install in command("info").output
-
-
-# new
 
 
 @pytest.fixture(scope="module")

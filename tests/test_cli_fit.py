@@ -90,9 +90,6 @@ def setup(folder, text):
     return fit_problem(file, find_source(file, folder))
 
 
-# What a fit finds and writes
-
-
 @pytest.mark.slow
 def test_a_small_fit(folder, data):
     """Parameters within their errors; the files agree; the order of the rows has no effect."""
@@ -182,9 +179,6 @@ def test_an_error_during_the_work_is_a_fault_and_not_bad_input(folder, monkeypat
     assert not (folder / "out").exists()
 
 
-# Data and options
-
-
 def test_columns_of_a_csv(tmp_path):
     """Comments, separators, missing values."""
     path = write(tmp_path, "# first\n\n t ; x;y\n0;1.5;\n1;nan;-2e3\n", "a.csv")
@@ -220,8 +214,6 @@ def test_bounds_priors_and_options(folder):
     assert arguments["horizons"] is None
     assert set(arguments["params"]) == {"epsilon", "args"}
 
-
-# Rejected input: the key, what was seen, what is allowed
 
 HEAD = "t,x\n"
 AWAY = "but h = 0.1 leads to later times. Give h = -0.1, or"
