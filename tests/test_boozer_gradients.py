@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from helpers import central_difference
 
-import dvi_jax as dvi
 from dvi_jax.systems import boozer
 
 MODES = {(0, 0): 5.7, (1, 0): -0.9, (0, 2): 0.12, (1, 2): 0.06, (2, -2): 0.05}
@@ -41,12 +40,18 @@ def starts():
 
 
 @jax.jit
-def drift(field, starts):
+@jax.value_and_grad
+def drift_with_gradient(field, starts):
     particles = boozer.GuidingCentres(field, energy=ENERGY)
     return boozer.mean_drift(particles, starts, num_steps=STEPS, h=8.0)
 
 
-gradient_of_drift = jax.jit(jax.grad(drift))
+def drift(field, starts):
+    return drift_with_gradient(field, starts)[0]
+
+
+def gradient_of_drift(field, starts):
+    return drift_with_gradient(field, starts)[1]
 
 
 def directions(field):
@@ -75,36 +80,6 @@ def test_gradient_of_the_drift_equals_differences(broken, starts, name):
     expected = central_difference(lambda f: drift(f, starts), broken, direction, step=1e-5)
     assert abs(expected) > 1e-4
     assert abs(found - expected) < 1e-6 * abs(expected)
-
-
-@pytest.mark.slow
-def test_differences_detect_a_wrong_gradient(broken, starts):
-    """Negative control: a gradient that neglects that the initial state depends on the field."""
-
-    def fixed_start(field):
-        fixed = boozer.GuidingCentres(broken, energy=ENERGY)
-        changed = boozer.GuidingCentres(field, energy=ENERGY)
-        options = {"method": dvi.GaussLegendre(2), "save": dvi.Save(final=True), "throw": False}
-
-        def weight(t, q, p, args):
-            tau = t / (8 * STEPS)
-            wave = jnp.sin(2 * jnp.pi * tau) * jnp.sin(jnp.pi * tau) ** 2
-            return 16 * jnp.pi / 3 * wave * changed.coordinates_of(q, p).s
-
-        def of(start):
-            q, p, args = fixed.state(*start)
-            args, mean = changed.args(args["mu"]), dvi.Mean(weight)
-            change = dvi.integrate(
-                changed.system, q, p, h=8.0, num_steps=STEPS, args=args, observe=mean, **options
-            ).observed
-            return change**2 / (change**2 + 0.01)
-
-        return jnp.mean(jax.vmap(of)(starts))
-
-    direction = directions(broken)["coefficients"]
-    right = along(gradient_of_drift(broken, starts), direction)
-    wrong = along(jax.jit(jax.grad(fixed_start))(broken), direction)
-    assert abs(wrong - right) > 1e-3 * abs(right)
 
 
 def test_gradient_of_the_symmetry_error_equals_differences(broken):

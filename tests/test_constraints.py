@@ -220,12 +220,16 @@ TWICE = dvi.System(SPHERE.system.H_D, constraint=lambda q, args: jnp.stack([q @ 
 """The same constraint two times."""
 
 
-def test_inconsistent_and_redundant_starts_are_refused():
-    q, p = SPHERE.q0, SPHERE.p0
+def test_inconsistent_starts_are_refused():
     with pytest.raises(ValueError, match=r"the constraint must be 0 to round-off, .* is 0\.0672"):
         run(SPHERE, 1, q0=np.array([0.88, 0.0, -0.6]))
     with pytest.raises(ValueError, match=r"rate of change .* is 0\.01\. Use dvi\.project"):
-        run(SPHERE, 1, p0=p + np.array([0.0125, 0.0, 0.0]))
+        run(SPHERE, 1, p0=SPHERE.p0 + np.array([0.0125, 0.0, 0.0]))
+
+
+@slow
+def test_redundant_constraints_and_those_without_a_solution_are_refused():
+    q, p = SPHERE.q0, SPHERE.p0
     with pytest.raises(ValueError, match=r"rank .* must be 2, .* got 1: 1 of them"):
         dvi.integrate(TWICE, q, p, h=0.1, num_steps=1, args=SPHERE.args)
     with pytest.raises(ValueError, match="redundant"):
@@ -328,15 +332,15 @@ def loss(x, adjoint):
 )
 def test_gradients_are_those_of_differences(adjoint):
     x = jnp.asarray(0.9), jnp.asarray(0.7), dict(SPHERE.args)
-    value = jax.jit(lambda x: loss(x, adjoint))
-    found = jax.jit(jax.grad(lambda x: loss(x, adjoint)))(x)
+    both = jax.jit(jax.value_and_grad(lambda x: loss(x, adjoint)))
+    found = both(x)[1]
     for change in (
         (1.0, 0.0, {"m": 0.0, "l": 0.0, "g": 0.0}),
         (0.0, 1.0, {"m": 1.0, "l": 0.0, "g": 1.0}),
     ):
 
         def along(s, change=change):
-            return value(jax.tree.map(lambda u, v: jnp.asarray(u + s * v, float), x, change))
+            return both(jax.tree.map(lambda u, v: jnp.asarray(u + s * v, float), x, change))[0]
 
         d = 1e-3  # of order 4: an error of 1e-12 of the value, and rounding of 1e-13
         difference = (8 * (along(d) - along(-d)) - along(2 * d) + along(-2 * d)) / (12 * d)
