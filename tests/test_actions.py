@@ -280,16 +280,13 @@ def test_axes_of_the_state_are_distinguished_from_those_of_a_batch():
     np.testing.assert_allclose(one.frequencies, w, rtol=1e-12)
 
 
-def test_axes_added_by_vmap_are_batch():
+def test_shapes_of_batches():
     rows, sols = TS + 0j * np.ones((2, 1)), as_solution(np.ones((2, 256), complex))
     each = jax.eval_shape(jax.vmap(lambda row: frequencies(TS, row, throw=False)), rows)
     assert each.frequencies.shape == (2, 8)
     assert each.state_axes == 0
     assert jax.eval_shape(lambda z: frequencies(TS, z, throw=False), rows).state_axes == 1
     assert jax.eval_shape(lambda s: frequencies(s, throw=False), sols).state_axes == 0
-
-
-def test_an_empty_batch_has_shapes_and_types():
     none = np.zeros((0, 2, 256), complex)
     torus = fundamental_frequencies(frequencies(TS, none, count=4))
     assert torus.frequencies.shape == (0, 2)
@@ -305,7 +302,7 @@ def planted(*lines):
     return frequencies(TS, np.stack([z, z]), count=4, throw=False)
 
 
-def test_leading_lines_that_are_not_a_basis():
+def test_lines_that_are_not_a_basis_or_no_combination():
     """2ω₁ leads; the basis is among the weaker lines."""
     a, b = 0.7, 0.7 * 0.3819660113
     torus = fundamental_frequencies(planted((2 * a, 1), (a + b, 0.4), (a, 0.3), (b, 0.1)))
@@ -315,9 +312,6 @@ def test_leading_lines_that_are_not_a_basis():
     M = np.rint(np.linalg.lstsq(torus.combinations[0], known, rcond=None)[0])
     assert abs(round(np.linalg.det(M))) == 1
     np.testing.assert_allclose(M @ [a, b], torus.frequencies, rtol=1e-9)
-
-
-def test_a_line_that_is_not_a_combination_gives_a_status():
     lines = planted((1.0, 1), (0.6180339887, 0.5), (0.7390851332, 0.2), (2.0, 0.1))
     with pytest.raises(FrequencyError, match="not a sum of lines") as info:
         fundamental_frequencies(lines)

@@ -332,9 +332,6 @@ def test_states_are_multiples_of_the_quantum():
     sol = dvi.integrate(dvi.System(pendulum), *start, arithmetic=dvi.FixedPoint(2.0**-8), **how)
     assert sol.qs[0, 0] == 77 / 256  # 76.8 quanta
     assert same_bits(sol.ps[0], np.zeros(1))  # half a quantum goes to even, to zero
-
-
-def test_rounding_is_odd_and_has_slope_one():
     x = jnp.array([0.3, 0.5, 1.5, -0.5, 2.49, 1e6 + 0.2])
     np.testing.assert_array_equal(to_grid(x, 1.0), [0, 0, 2, -0.0, 2, 1e6])
     np.testing.assert_array_equal(to_grid(-x, 0.25), -to_grid(x, 0.25))

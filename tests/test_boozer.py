@@ -242,15 +242,11 @@ def test_orbits_cross_the_magnetic_axis():
 
 
 @slow
-def test_a_start_at_the_edge_is_lost_at_once():
+def test_orbits_that_are_lost():
     particles = boozer.GuidingCentres(axisymmetric(current=False))
     q, p, args = particles.start(1.0, 0.1, 0.0, 0.5)
     sol = integrate(particles, q, p, args, 2.0, 10, stop=particles.loss)
     assert (sol.status, float(sol.stop.t)) == ("stopped", 0.0)
-
-
-@slow
-def test_without_rotational_transform():
     field = boozer.from_modes([0, 1], [0, 0], [[5.7], [-0.5]], psi_edge=EDGE, iota=0.0, G=57.0)
     particles = boozer.GuidingCentres(field)
     q, p, args = particles.start(0.2, 0.3, 0.0, 0.5)

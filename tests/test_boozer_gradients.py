@@ -152,7 +152,7 @@ def test_isotropic_particles_change_p_zeta_by_the_symmetry_error(broken):
 
 
 @pytest.mark.slow
-def test_a_descent_lowers_the_drift(broken, starts):
+def test_a_descent_lowers_the_drift_and_losses_have_times(broken, starts):
     """Only the breaking modes change."""
     _, breaking = broken.split()
     field, first = broken, drift(broken, starts)
@@ -161,10 +161,6 @@ def test_a_descent_lowers_the_drift(broken, starts):
         step = -0.01 * slope / jnp.linalg.norm(slope)
         field = eqx.tree_at(lambda f: f.coefficients, field, field.coefficients + step)
     assert drift(field, starts) < 0.8 * first
-
-
-@pytest.mark.slow
-def test_times_of_losses(broken):
     inside, at_edge = [0.1, 0.3, 0.0, 0.9], [0.99, 1.5, 0.3, 0.1]
     time = functools.partial(boozer.lost_at, boozer.GuidingCentres(broken), num_steps=200)
     times = jax.jit(jax.vmap(time))(jnp.asarray([inside, at_edge]))

@@ -154,13 +154,19 @@ def test_nan_never_passes(check, nan_candidate):
         assert not measured.ok
 
 
-def test_too_few_points_above_round_off_are_no_measurement():
+def test_measurements_that_fail_or_are_not_promised():
     """The Gauss method of order 16 is there after a few steps."""
     accurate = Candidate(dvi.GaussLegendre(8))
     accurate.__dict__["flow"] = problems.most_accurate(problems.COUPLED)
     measured = CHECKS["order"](accurate)
     assert measured.verdict == "NOT MEASURED"
     assert re.search(r"^\d points above round-off, at least 6 needed", measured.detail)
+    measured = CHECKS["reversal"](Candidate(altered(dvi.Strang(), _broken)))
+    assert (measured.verdict, measured.detail) == ("NOT MEASURED", "RuntimeError: no luck")
+    measured, adjoint = (CHECKS[c](candidate("RungeKutta4")) for c in ("reversal", "adjoint"))
+    assert measured.verdict == adjoint.verdict == "not claimed"
+    assert 1e-9 < measured.value < 1e-4
+    assert (measured.ok, measured.passed) == (True, False)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -171,18 +177,6 @@ def test_a_passed_value_is_a_number(value):
 
 def _broken(method, equations, interval, q, p):
     raise RuntimeError("no luck\nat all")
-
-
-def test_an_exception_is_a_failure_that_names_itself():
-    measured = CHECKS["reversal"](Candidate(altered(dvi.Strang(), _broken)))
-    assert (measured.verdict, measured.detail) == ("NOT MEASURED", "RuntimeError: no luck")
-
-
-def test_what_is_not_promised_is_measured_and_no_failure():
-    measured, adjoint = (CHECKS[c](candidate("RungeKutta4")) for c in ("reversal", "adjoint"))
-    assert measured.verdict == adjoint.verdict == "not claimed"
-    assert 1e-9 < measured.value < 1e-4
-    assert (measured.ok, measured.passed) == (True, False)
 
 
 LIAR = altered(dvi.TypeII(), is_symmetric=True)
@@ -264,12 +258,16 @@ def test_command_writes_the_page(tmp_path):
 
 
 @pytest.mark.slow
-def test_command_fails_with_a_method(monkeypatch):
+def test_commands(monkeypatch):
     monkeypatch.setitem(METHODS, "Liar", LIAR)
     result = command("--method", "Liar", "--check", "reversal")
     assert result.exit_code == 1
     assert "Liar, reversal: FAIL, allowed ≤ 1e-12" in result.output
     assert "methods: 0 of 1" in result.output
+    result = command("--quick", "--check", "order")
+    assert result.exit_code == 0, result.output
+    assert "methods: 5 of 5" in result.output
+    assert "controls: 3 of 3 caught" in result.output
 
 
 def test_command_refuses_bad_input(tmp_path):
@@ -287,14 +285,6 @@ def test_command_refuses_bad_input(tmp_path):
         assert result.exit_code == 2, words
         assert said in result.output.replace("\n", " ")
     assert other.read_text(encoding="utf-8") == "# My notes\n"
-
-
-@pytest.mark.slow
-def test_quick_command():
-    result = command("--quick", "--check", "order")
-    assert result.exit_code == 0, result.output
-    assert "methods: 5 of 5" in result.output
-    assert "controls: 3 of 3 caught" in result.output
 
 
 def test_the_page_is_of_the_methods_and_checks_that_there_are():

@@ -167,7 +167,7 @@ def test_it_is_the_variational_map_of_a_stationary_value(kind, stages):
 
 
 @pytest.mark.slow
-def test_slow_time_and_perturbation_are_used():
+def test_slow_time_and_perturbation_are_used_and_solves_only_where_needed():
     """ε t by hand, and the perturbation added to H_D by hand, give the same step."""
 
     def H(t0, t1, q0, p1, args):
@@ -190,6 +190,10 @@ def test_slow_time_and_perturbation_are_used():
     np.testing.assert_allclose(a, b, rtol=0, atol=1e-15)
     fast = flow(dvi.System(H, push, bump), method, 0.2, t0=4.0, epsilon=0.1)(z)
     assert np.max(np.abs(fast - a)) > 1e-3
+    steps = {"h": 0.1, "num_steps": 3, "method": LOBATTO(2)}
+    for system, epsilon in ((dvi.System(pendulum), 0.0), (dvi.System(pendulum, damped), 0.1)):
+        sol = dvi.integrate(system, [0.4], [0.7], epsilon=epsilon, **steps)
+        assert (int(sol.stats["newton_iterations"]) > 0) == (epsilon > 0)
 
 
 @pytest.mark.parametrize("system", ["kepler", "non_separable"])
@@ -218,14 +222,6 @@ def test_declared_properties():
         assert method.is_explicit(dvi.System(pendulum)) == (method in explicit)
         assert not method.is_explicit(dvi.System(non_separable))
         assert not method.is_explicit(dvi.System(pendulum, damped))
-
-
-@pytest.mark.slow
-def test_two_lobatto_stages_solve_only_where_it_is_needed():
-    steps = {"h": 0.1, "num_steps": 3, "method": LOBATTO(2)}
-    for system, epsilon in ((dvi.System(pendulum), 0.0), (dvi.System(pendulum, damped), 0.1)):
-        sol = dvi.integrate(system, [0.4], [0.7], epsilon=epsilon, **steps)
-        assert (int(sol.stats["newton_iterations"]) > 0) == (epsilon > 0)
 
 
 @pytest.mark.slow

@@ -240,7 +240,7 @@ def test_redundant_constraints_and_those_without_a_solution_are_refused():
 
 
 @slow
-def test_a_traced_start_has_a_status():
+def test_a_batch_has_the_numbers_of_single_runs_and_a_status_for_each_start():
     starts = jnp.array([[0.8, 0.0, -0.6], [0.8, 0.0, -0.61], [0.8, jnp.nan, -0.6]])
     sol = jax.vmap(lambda q: run(SPHERE, 2, q0=q, throw=False))(starts)
     assert list(sol.status) == ["successful", "inconsistent", "not_finite"]
@@ -248,6 +248,12 @@ def test_a_traced_start_has_a_status():
     assert not np.isnan(sol.qs[0]).any()
     how = {"h": 0.1, "num_steps": 1, "args": SPHERE.args, "throw": False}
     assert jax.jit(lambda q: dvi.integrate(TWICE, q, P, **how))(Q).status == "redundant"
+    angles = jnp.array([0.2, 0.6, 1.0, 1.5])
+    q = jnp.stack([jnp.sin(angles), 0 * angles, -jnp.cos(angles)], axis=1)
+    p = jnp.stack([0 * angles, 1 + angles, 0 * angles], axis=1)
+    together = jax.vmap(lambda q, p: run(SPHERE, 10, q0=q, p0=p).qs[-1])(q, p)
+    for i in range(4):
+        assert np.array_equal(together[i], run(SPHERE, 10, q0=q[i], p0=p[i]).qs[-1])
 
 
 @pytest.mark.parametrize(
@@ -349,16 +355,6 @@ def test_gradients_are_those_of_differences(adjoint):
 
 
 @slow
-def test_a_batch_has_the_numbers_of_single_runs():
-    angles = jnp.array([0.2, 0.6, 1.0, 1.5])
-    q = jnp.stack([jnp.sin(angles), 0 * angles, -jnp.cos(angles)], axis=1)
-    p = jnp.stack([0 * angles, 1 + angles, 0 * angles], axis=1)
-    together = jax.vmap(lambda q, p: run(SPHERE, 10, q0=q, p0=p).qs[-1])(q, p)
-    for i in range(4):
-        assert np.array_equal(together[i], run(SPHERE, 10, q0=q[i], p0=p[i]).qs[-1])
-
-
-@slow
 def test_states_between_steps_lie_on_the_manifold():
     sol = run(SPHERE, 20, save=dvi.Save(ts=[0.0, 0.003, 0.1, 0.2]))
     assert sol.status == "successful"
@@ -367,7 +363,7 @@ def test_states_between_steps_lie_on_the_manifold():
 
 
 @slow
-def test_steps_are_compiled_by_lanewise():
+def test_runs_of_a_chain_are_compiled_and_move_as_in_angles():
     chain = systems.chain(20)
 
     def f(q, p):
@@ -376,6 +372,13 @@ def test_steps_are_compiled_by_lanewise():
     parts = str(lanewise.explain(f, jnp.asarray(chain.q0), jnp.asarray(chain.p0)))
     assert "machine code" in parts
     assert "XLA" not in parts
+    made = systems.chain(20)
+    sol = run(made, 1000, h=1e-3, method=EIGHTH)
+    expected = chain_in_angles(np.full(20, 0.4), 1.0, made.args)
+    off = np.max(np.abs(sol.qs[-1] - expected))
+    print(f"chain of 20 links, 1 s: {off:.1e}")
+    assert np.max(np.abs(expected - made.q0)) > 0.3
+    assert off < 1e-9
 
 
 def by_dop853(rates, y0, time):
@@ -398,17 +401,6 @@ def chain_in_angles(angles, time, args):
 
     y = by_dop853(rates, np.concatenate([angles, np.zeros(n)]), time)
     return length * np.cumsum(np.stack([np.sin(y[:n]), -np.cos(y[:n])], axis=1), axis=0)
-
-
-@slow
-def test_a_chain_of_20_links_moves_as_in_angles():
-    made = systems.chain(20)
-    sol = run(made, 1000, h=1e-3, method=EIGHTH)
-    expected = chain_in_angles(np.full(20, 0.4), 1.0, made.args)
-    off = np.max(np.abs(sol.qs[-1] - expected))
-    print(f"chain of 20 links, 1 s: {off:.1e}")
-    assert np.max(np.abs(expected - made.q0)) > 0.3
-    assert off < 1e-9
 
 
 def violation(made):

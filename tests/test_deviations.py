@@ -154,7 +154,7 @@ def damping(t0, t1, q0, p1, args):
 
 
 @pytest.mark.slow
-def test_lyapunov_exponents_of_a_damped_linear_system():
+def test_lyapunov_exponents_of_damped_linear_systems():
     """Those of its map: logarithms of the eigenvalues' sizes; their sum is that of its volume."""
     system = dvi.System(linear, force=damping)
     options = {"h": 0.1, "epsilon": 0.2}
@@ -164,6 +164,15 @@ def test_lyapunov_exponents_of_a_damped_linear_system():
     assert np.max(np.abs(found - exact)) < 2e-3  # O(1/t), t = 300
     assert abs(np.sum(found) - np.log(np.linalg.det(M)) / 0.1) < 1e-13
     assert abs(np.sum(exact) + 2 * 0.2) < 1e-3  # −ε for each degree of freedom, and O(h²)
+    # Of a damped system: what shrank grows, and ⟨Y⟩ with it.
+    system, kinds = dvi.System(linear, force=damping), (dvi.LyapunovSpectrum(), dvi.MEGNO())
+    (ahead, y), (back, x) = (
+        seen(system, *DAMPED, kinds, h=h, epsilon=0.2, num_steps=1000) for h in (0.1, -0.1)
+    )
+    assert np.max(np.abs(ahead + back[::-1])) < 5e-3
+    assert np.all(np.asarray(back) > 0.09)
+    assert y < -1
+    assert x > 1
 
 
 def by_scipy(start, first, t):
@@ -268,20 +277,7 @@ def test_indicators_in_single_precision():
 
 
 @pytest.mark.slow
-def test_backwards_the_exponents_change_their_signs():
-    """Of a damped system: what shrank grows, and ⟨Y⟩ with it."""
-    system, kinds = dvi.System(linear, force=damping), (dvi.LyapunovSpectrum(), dvi.MEGNO())
-    (ahead, y), (back, x) = (
-        seen(system, *DAMPED, kinds, h=h, epsilon=0.2, num_steps=1000) for h in (0.1, -0.1)
-    )
-    assert np.max(np.abs(ahead + back[::-1])) < 5e-3
-    assert np.all(np.asarray(back) > 0.09)
-    assert y < -1
-    assert x > 1
-
-
-@pytest.mark.slow
-def test_megno_tells_order_from_chaos():
+def test_megno_tells_order_from_chaos_in_any_units():
     regular, chaotic = (observed(s, 400_000, every=40_000) for s in ("regular", "chaotic"))
     away = np.abs(regular["megno"] - 2)
     assert np.all(np.diff(away) < 0)
@@ -290,6 +286,10 @@ def test_megno_tells_order_from_chaos():
     assert chaotic["megno"][-1] > 50
     exponent = chaotic["lyapunov"][-1, 0]
     assert 0.6 < chaotic["megno"][-1] / (exponent * t / 2) < 1.5
+    kind = dvi.MEGNO(scale=(10.0, np.array([1.0, 3.0])))
+    scaled = seen(HENON.system, *REGULAR, kind, num_steps=400_000)
+    assert abs(scaled - observed("regular", 400_000)["megno"]) > 1e-6
+    assert abs(scaled - 2) < 0.01
 
 
 def drive(t0, t1, q0, p1, args):
@@ -365,7 +365,7 @@ def test_gali_and_sali_are_volumes_of_unit_vectors(start):
 
 
 @pytest.mark.slow
-def test_gali_of_chaos_falls_as_its_exponents_say():
+def test_gali_falls_as_theory_says():
     """ln GALI_k(t) = −Σ (λ_1 − λ_i) t, far beyond round-off."""
     num_steps = 100_000
     found, t = observed("chaotic", num_steps), 0.05 * num_steps
@@ -375,18 +375,10 @@ def test_gali_of_chaos_falls_as_its_exponents_say():
         assert law < -20  # by how much is a matter of the last digits of the arithmetic
         assert abs(found["gali"][k - 2] - law) < 0.02 * abs(law) + 2
     assert abs(found["sali"] - found["gali"][0]) < 1e-9  # of a small angle
-
-
-@pytest.mark.slow
-def test_gali_of_a_torus_of_two_dimensions_falls_by_powers():
-    """GALI_2 stays, GALI_3 ~ t⁻², GALI_4 ~ t⁻⁴."""
+    # GALI_2 stays, GALI_3 ~ t⁻², GALI_4 ~ t⁻⁴.
     found = observed("regular", 400_000, every=40_000)["gali"]
     slopes = np.polyfit(np.log10(np.arange(1, 11)), found, 1)[0]
     assert np.max(np.abs(slopes - [0, -2, -4])) < 0.25
-
-
-@pytest.mark.slow
-def test_a_value_that_underflows_is_zero_and_its_logarithm_is_finite():
     kinds = (dvi.GALI(4), dvi.GALI(4, log10=True))
     found = seen(HENON.system, *CHAOTIC, kinds, num_steps=200_000)
     assert found[0][-1] == 0
@@ -394,15 +386,7 @@ def test_a_value_that_underflows_is_zero_and_its_logarithm_is_finite():
 
 
 @pytest.mark.slow
-def test_units_do_not_matter_in_the_limit():
-    kind = dvi.MEGNO(scale=(10.0, np.array([1.0, 3.0])))
-    scaled = seen(HENON.system, *REGULAR, kind, num_steps=400_000)
-    assert abs(scaled - observed("regular", 400_000)["megno"]) > 1e-6
-    assert abs(scaled - 2) < 0.01
-
-
-@pytest.mark.slow
-def test_running_values_are_those_of_shorter_runs():
+def test_running_values():
     along = observed("chaotic", 2000, every=500)
     for i, n in enumerate((500, 1000, 1500, 2000)):
         for name, value in observed("chaotic", n).items():
@@ -414,10 +398,6 @@ def test_running_values_are_those_of_shorter_runs():
     pieces = seen(HENON.system, *CHAOTIC, kinds, progress=progress, **options)
     assert calls
     assert np.max(np.abs(along["megno"] - pieces["megno"])) < 1e-7
-
-
-@pytest.mark.slow
-def test_running_values_beside_others():
     energy = HENON.observables["energy"]
     mean_energy, options = dvi.Mean(energy), {"num_steps": 1000, "save": dvi.Save(every=100)}
 

@@ -403,14 +403,11 @@ def test_a_file_without_one_entry_is_named(tmp_path):
             dvi.Discovery.load(path, dvi.Polynomials(2))
 
 
-def test_an_order_that_the_basis_cannot_express_is_reported():
+def test_series_are_differentiable_and_orders_beyond_the_basis_reported():
     d = found("cubic", 2, 1)
     assert (d.survivors, d.count) == ((1, 0), 0)
     assert d.obstructions[0].kind == "unexplained"
     assert "it may be too small" in str(d)
-
-
-def test_a_series_is_differentiable_and_refuses_to_guess():
     series = found("cubic", 4, 1).invariants[0]
     q, p = jnp.array([0.4]), jnp.array([0.3])
     slope = jax.grad(series.evaluate, argnums=2)(q, p, 0.1)
@@ -521,7 +518,7 @@ def test_what_fits_the_samples_by_chance_is_refused():
     assert "held-out samples decide" in str(symmetries)
 
 
-def test_derivatives_that_are_not_finite_are_named():
+def test_what_rounding_hides_or_is_not_finite_is_named():
     q, p = box(1, 80)
     q[7] = p[7] = 0
     radius = dvi.Basis({"r": lambda q, p: jnp.sqrt(q[0] ** 2 + p[0] ** 2)})
@@ -530,6 +527,15 @@ def test_derivatives_that_are_not_finite_are_named():
     root = dvi.Basis({"root": lambda q, p: jnp.sqrt(jnp.abs(q[0])), "E": lambda q, p: q @ q})
     with pytest.raises(ValueError, match=r"derivative of the basis function 'root' .* at 1 of 80"):
         discover(SPRING, root, samples=(q, p))
+    # Functions given by the user are not expanded about another point.
+    offset = 1e5
+    q, p = box(1, 100)
+    basis = dvi.Basis({"q": lambda q, p: q[0], "p": lambda q, p: p[0]}) + QUADRATICS
+    d = discover(away(offset), basis, samples=(q + offset, p))
+    assert d.count == 0
+    assert d.undecided >= 1
+    assert any("cannot be decided in this arithmetic" in text for text in d.warnings)
+    assert all(text in str(d) for text in d.warnings)
 
 
 @pytest.mark.slow
@@ -602,18 +608,6 @@ def test_invariants_far_from_the_origin_are_found(offset, tmp_path):
     again = dvi.Discovery.load(tmp_path / "far.npz", dvi.Polynomials(4))
     np.testing.assert_array_equal(again.coefficients, d.coefficients)
     assert str(again) == str(d)
-
-
-def test_what_rounding_hides_is_reported():
-    """Functions given by the user are not expanded about another point."""
-    offset = 1e5
-    q, p = box(1, 100)
-    basis = dvi.Basis({"q": lambda q, p: q[0], "p": lambda q, p: p[0]}) + QUADRATICS
-    d = discover(away(offset), basis, samples=(q + offset, p))
-    assert d.count == 0
-    assert d.undecided >= 1
-    assert any("cannot be decided in this arithmetic" in text for text in d.warnings)
-    assert all(text in str(d) for text in d.warnings)
 
 
 @pytest.mark.slow

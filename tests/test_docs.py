@@ -77,13 +77,10 @@ def printed(page):
     return "".join(PRINTED.findall(page.read_text(encoding="utf-8"))).splitlines()
 
 
-def test_the_first_page_shows_what_it_prints():
+def test_pages_show_what_they_print_and_say_what_is_left_out(tmp_path):
     formula, *last = printed(DOCS / "index.md")
     assert formula.startswith("0.5 q² − 0.05 q p + 0.5 p² + ε (")
     assert last == ["ε^1.99"]
-
-
-def test_examples_that_are_left_out_say_why(tmp_path):
     reasons = {page.stem: examples(page)[1] for page in sorted(DOCS.glob("*.md"))}
     assert {name for name in reasons if reasons[name]} <= {"clusters"}
     assert len(PAGES) >= 10
@@ -164,15 +161,11 @@ def dead_links(folder):
 
 
 @pytest.mark.slow
-def test_links_resolve(site, tmp_path):
+def test_links_and_names_of_the_site(site, tmp_path):
     assert len(list(site.rglob("*.html"))) > 40
     assert dead_links(site) == []
     (tmp_path / "a.html").write_text('<p id="x"><a href="b.html">b</a><a href="#x"><a href="#y">')
     assert dead_links(tmp_path) == [("a.html", "b.html"), ("a.html", "#y")]
-
-
-@pytest.mark.slow
-def test_every_public_name_has_an_entry(site):
     import dvi_jax as dvi
     from dvi_jax import _namespaces
 
@@ -236,7 +229,7 @@ def extensions():
         sys.path.remove(str(DOCS / "_ext"))
 
 
-def test_indices_and_numbers_of_running_text(extensions):
+def test_docstrings_and_running_text_as_html(extensions):
     as_html = extensions[1].as_html
     assert as_html("q_{k+1} − ξ0_m < h^−order") == (
         "q<sub>k+1</sub> − ξ0<sub>m</sub> &lt; h<sup>−order</sup>"
@@ -247,6 +240,13 @@ def test_indices_and_numbers_of_running_text(extensions):
     )
     for plain in ("num_steps", "t_eval", "a < b", "2000 steps", "in 5 to 10"):
         assert as_html(plain) is None, plain
+    import dvi_jax as dvi
+
+    reference = extensions[0]
+    assert reference.literally("E⁻_k and `a_b`, Φ*_h\n\n    x_1 *") == (
+        r"E⁻\_k and `a_b`, Φ\*\_h" + "\n\n    x_1 *"
+    )
+    assert reference.signature(dvi.Adjoint) == "(method: Method = TypeII())"
 
 
 @pytest.mark.parametrize("dpi", [110, 220, None])
@@ -262,16 +262,6 @@ def test_the_size_of_a_picture_does_not_depend_on_its_pixels(tmp_path, dpi):
     width, height = pictures.size(name)
     assert width == pytest.approx(550 / (dpi or 110), rel=1e-3)
     assert height == pytest.approx(330 / (dpi or 110), rel=1e-3)
-
-
-def test_docstrings_are_taken_literally_and_defaults_told(extensions):
-    import dvi_jax as dvi
-
-    reference = extensions[0]
-    assert reference.literally("E⁻_k and `a_b`, Φ*_h\n\n    x_1 *") == (
-        r"E⁻\_k and `a_b`, Φ\*\_h" + "\n\n    x_1 *"
-    )
-    assert reference.signature(dvi.Adjoint) == "(method: Method = TypeII())"
 
 
 BROWSER = next(

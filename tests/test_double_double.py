@@ -122,11 +122,8 @@ def test_functions_have_30_digits(name):
         assert worst(function, reference, drawn(low, high)) < 5e-31, (low, high)
 
 
-def test_products_have_31_digits_in_xla():
+def test_products_in_xla_and_functions_of_two_pairs():
     assert worst(pairs.mul, operator.mul, *ONES, by=jax.vmap) < 1e-30
-
-
-def test_functions_of_two_pairs():
     x, y = drawn(-3, 3), drawn(-2, 2)
     assert worst(functions.atan2, mp.atan2, x, y) < 1e-30
     assert worst(functions.general_power, lambda x, y: x**y, drawn(0.1, 10), y) < 1e-30

@@ -75,16 +75,20 @@ def test_mesh_plateau_is_excluded_and_reported(observable):
     assert "10 at ε = 0.0001 … 0.1, within ten times of the drift at ε = 0" in str(measured)
 
 
-def test_drift_is_the_largest_over_the_starts():
+def test_drift_is_the_largest_over_the_starts_in_either_precision():
     measured = usual()
     assert measured.start_drifts.shape == measured.statuses.shape == (11, 8)
     np.testing.assert_array_equal(measured.drifts, measured.start_drifts[:-1].max(axis=1))
     alone = sweep(starts=STARTS[:, 3], batched=False)
     np.testing.assert_allclose(alone.drifts, measured.start_drifts[:-1, 3], rtol=1e-9)
     assert alone.kept.shape == (1,)
+    measured = sweep(starts=STARTS.astype(np.float32))
+    assert measured.floor_cause == "round-off"
+    assert measured.floor > 1e-8
+    assert measured.slope == pytest.approx(1, abs=0.05)
 
 
-def test_a_failed_initial_condition_is_reported_and_changes_no_other():
+def test_failed_initial_conditions_are_reported():
     starts = STARTS.copy()
     starts[:, 3] = 50.0
     measured = sweep(starts=starts)
@@ -99,9 +103,6 @@ def test_a_failed_initial_condition_is_reported_and_changes_no_other():
     np.testing.assert_array_equal(measured.drifts, measured.start_drifts[:-1, others].max(axis=1))
     assert measured.slope == pytest.approx(1, abs=0.01)
     assert "left out: 1 of 8 initial conditions (not_finite): number 3" in str(measured)
-
-
-def test_an_epsilon_at_which_most_initial_conditions_fail_is_excluded():
     epsilons = np.append(EPSILONS, 1e6)
     measured = sweep(epsilons=epsilons)
     assert measured.excluded.tolist() == [""] * 10 + ["failed"]
@@ -112,16 +113,13 @@ def test_an_epsilon_at_which_most_initial_conditions_fail_is_excluded():
     assert "excluded: 1 at ε = 1e+06, too many of the initial conditions failed" in str(measured)
 
 
-def test_nothing_is_concluded_without_an_unperturbed_run():
+def test_failures_leave_no_conclusion():
     measured = sweep(starts=np.full((2, 1, 1), 0.1), h=3.0)  # beyond the stability limit
     assert (measured.statuses == "not_finite").all()
     assert set(measured.excluded) == {"failed"}
     assert np.isnan(measured.slope)
     assert np.isnan(measured.floor)
     assert measured.floor_cause == "failed"
-
-
-def test_an_observable_that_is_not_finite_is_a_failure():
     starts = STARTS.copy()
     starts[:, 2] = 0.0  # stays at rest: log 0
     measured = sweep(lambda *step: jnp.log(KEPT(*step)), starts)
@@ -131,7 +129,7 @@ def test_an_observable_that_is_not_finite_is_a_failure():
     assert "(observable_not_finite): number 2" in str(measured)
 
 
-def test_a_plateau_that_the_unperturbed_run_does_not_show_is_excluded():
+def test_plateaus_and_points_near_round_off_are_excluded():
     rng = np.random.default_rng(1)
     epsilons = np.geomspace(1e-5, 1, 26)
     noise = 1e-9 * np.exp(0.3 * rng.standard_normal(26))
@@ -145,9 +143,6 @@ def test_a_plateau_that_the_unperturbed_run_does_not_show_is_excluded():
     everything_flat = synthetic(np.full(10, 1e-3))
     assert set(everything_flat.excluded) == {"flat"}
     assert everything_flat.slope_of_all == pytest.approx(0, abs=1e-12)
-
-
-def test_points_near_round_off_are_excluded():
     measured = synthetic(EPSILONS**3 + 1e-15)
     assert measured.floor_cause == "round-off"
     np.testing.assert_array_equal(measured.used, EPSILONS**3 > 1e-14)
@@ -164,7 +159,7 @@ def test_fewer_than_three_points_give_no_slope(points):
 
 @pytest.mark.slow
 def test_interval_covers_the_truth_as_often_as_it_promises_with_three_points():
-    """With more points: `test_orders_of_400_synthetic_curves`."""
+    """With more points: `test_synthetic_curves`."""
     rng, epsilons = np.random.default_rng(2), np.geomspace(1e-3, 1e-1, 3)
     runs, hits = 300, 0
     for _ in range(runs):
@@ -204,7 +199,7 @@ def resonantly_forced(smallest, num_steps=1000):
     return dvi.drift_order(system, ENERGY, [0.4], [0.3], epsilons=epsilons, **run)
 
 
-def test_a_crossover_between_two_powers_has_the_order_of_the_smaller_power():
+def test_crossovers_between_two_powers():
     measured = resonantly_forced(2e-3)
     assert measured.fit.line_slope > 1.5  # what was reported before, as ± 0.18
     assert measured.resolved
@@ -215,17 +210,14 @@ def test_a_crossover_between_two_powers_has_the_order_of_the_smaller_power():
     assert covers(measured.fit, 1)
     assert str(measured).startswith("for ε → 0 the drift tends to ε^")
     assert "not one power: sum of two powers near ε = 0.01" in str(measured)
-
-
-def test_a_crossover_below_the_range_is_reported_as_the_power_in_the_range():
-    """No measurement excludes another power at smaller ε: a limit of the method."""
+    # No measurement excludes another power at smaller ε: a limit of the method.
     measured = resonantly_forced(1.0)
     assert measured.slope == pytest.approx(2, abs=0.03)
     assert not covers(measured.fit, 1)
 
 
 @pytest.mark.slow
-def test_orders_of_400_synthetic_curves():
+def test_synthetic_curves():
     """95 % intervals that contain the true order in 93 to 97 %, and few curves unresolved."""
     found = curves.measured(seed=0)
     assert 0.93 <= found.covered <= 0.97
@@ -234,10 +226,6 @@ def test_orders_of_400_synthetic_curves():
     assert found.clean_resolved > 0.98
     assert found.sums_resolved > 0.5
     assert found.covered_by_line < 0.8
-
-
-@pytest.mark.slow
-def test_sums_with_clear_separation_are_resolved():
     rng = np.random.default_rng(1)
     epsilons = np.geomspace(1e-4, 1e-1, 8)
     noises = np.exp(0.03 * rng.standard_normal((40, 8)))
@@ -292,7 +280,7 @@ def test_laws_without_noise_are_recognised(law, model, order, within):
     assert np.isnan(measured.fit.crossover) == (model == "power")
 
 
-def test_a_clean_power_has_the_line_of_least_squares():
+def test_a_clean_power_and_scatter():
     drifts = EPSILONS**2 * np.exp(0.02 * np.random.default_rng(4).standard_normal(10))
     measured = synthetic(drifts)
     slope = np.polyfit(np.log(EPSILONS), np.log(drifts), 1)[0]
@@ -301,6 +289,10 @@ def test_a_clean_power_has_the_line_of_least_squares():
     low, high = exponents.line_interval(slope, measured.fit.line_stderr, 10)
     assert np.ptp(measured.interval) == pytest.approx(high - low, rel=0.5)
     assert str(measured).startswith("drift ∝ ε^")
+    # Negative control: drifts that are random, whatever ε.
+    rng = np.random.default_rng(5)
+    epsilons, random = np.geomspace(1e-2, 1e-1, 6), np.exp(rng.standard_normal((8, 6)))
+    assert not any(small_epsilon_exponent(epsilons, drifts).resolved for drifts in random)
 
 
 def test_what_is_not_resolved_is_reported_with_the_range_that_would_do():
@@ -349,13 +341,6 @@ def test_a_range_hidden_by_the_drift_at_zero_is_not_recommended():
     assert not few.curved
 
 
-def test_scatter_has_no_order():
-    """Negative control: drifts that are random, whatever ε."""
-    rng = np.random.default_rng(5)
-    epsilons, random = np.geomspace(1e-2, 1e-1, 6), np.exp(rng.standard_normal((8, 6)))
-    assert not any(small_epsilon_exponent(epsilons, drifts).resolved for drifts in random)
-
-
 def test_order_and_units_of_the_points_do_not_matter():
     law = EPSILONS + 30 * EPSILONS**2
     shuffled = np.random.default_rng(6).permutation(10)
@@ -379,13 +364,6 @@ def test_a_surface_marks_orders_that_are_not_resolved():
     assert f"{clear.slope:.3f} " in text
     assert f"{unclear.slope:.3f}?" in text
     assert "? no order resolved in this range of ε: slope of the straight line" in text
-
-
-def test_single_precision_has_its_own_floor():
-    measured = sweep(starts=STARTS.astype(np.float32))
-    assert measured.floor_cause == "round-off"
-    assert measured.floor > 1e-8
-    assert measured.slope == pytest.approx(1, abs=0.05)
 
 
 @pytest.mark.slow

@@ -167,7 +167,7 @@ def test_a_linear_map_uses_its_own_transpose(derivative):
     assert bool(marks) == is_reverse  # the given transpose is used
 
 
-def test_derivatives_of_a_linear_map_are_those_of_its_definition():
+def test_a_definition_gives_derivatives_and_on_any_takes_one_boolean():
     """By the residuals; negative control: a definition with another dependence on them."""
 
     def of(definition):
@@ -175,9 +175,6 @@ def test_derivatives_of_a_linear_map_are_those_of_its_definition():
 
     np.testing.assert_allclose(of(_scaled), np.cos(0.7) * 7, rtol=1e-13)
     assert abs(float(of(lambda r, x: _scaled((2 * r[0], None), x))) - np.cos(0.7) * 7) > 0.1
-
-
-def test_arguments_of_on_any():
     with pytest.raises(TypeError, match="must be one boolean"):
         lanewise.on_any(jnp.array([1.5, 2.0]))
     with pytest.raises(TypeError, match="rare"):

@@ -86,17 +86,13 @@ def test_crossings_converge_with_the_order_of_the_method(order):
 
 
 @pytest.mark.slow
-def test_direction_is_chosen():
+def test_directions_and_the_capacity_of_sections():
     up, down, both = (crossings_of(2, d, 0.01) for d in (1, -1, 0))
     assert (int(up.count), int(down.count), int(both.count)) == (2, 2, 4)
     assert np.all(np.asarray(up.ps[:2, 1]) > 0)
     assert np.all(np.asarray(down.ps[:2, 1]) < 0)
     together = np.sort(np.concatenate([up.ts[:2], down.ts[:2]]))
     np.testing.assert_array_equal(together, both.ts[:4])
-
-
-@pytest.mark.slow
-def test_crossings_beyond_the_capacity_are_counted():
     sol = kepler(observe=dvi.Section(on_axis, max_crossings=3))
     assert int(sol.observed.count) == 4
     assert np.isfinite(np.asarray(sol.observed.ts)).all()
@@ -168,7 +164,7 @@ def test_requested_times_have_the_order_of_the_method(order):
 
 
 @pytest.mark.slow
-def test_requested_times_on_the_grid_give_its_states():
+def test_requested_times_on_the_grid_and_several_in_one_step():
     observe = {"L": momentum, "max": dvi.MaxDrift(momentum)}
     every = kepler(save=dvi.Save(every=100), observe=observe)
     asked = kepler(save=dvi.Save(ts=every.ts), observe=observe)
@@ -177,10 +173,6 @@ def test_requested_times_on_the_grid_give_its_states():
     # Two programs: the last bit of the round-off that the drift is may differ.
     np.testing.assert_allclose(asked.observed["max"], every.observed["max"], rtol=0, atol=1e-14)
     np.testing.assert_allclose(asked.hs[1:], every.hs, rtol=1e-9)
-
-
-@pytest.mark.slow
-def test_several_times_in_one_step_and_backwards():
     ts = np.array([-0.001, -0.002, -0.0021, -0.5])
     back = kepler(-0.02, 30, save=dvi.Save(ts=ts))
     ahead = kepler(0.02, 30, save=dvi.Save(ts=-ts))
@@ -189,17 +181,21 @@ def test_several_times_in_one_step_and_backwards():
 
 
 @pytest.mark.slow
-def test_times_outside_of_the_run():
+def test_times_outside_of_the_run_and_those_between_grid_points():
     late = kepler(num_steps=50, save=dvi.Save(ts=[0.5, 1.0, 1.01]), throw=False)
     assert late.status == "not_reached"
     assert np.isfinite(np.asarray(late.qs[:2])).all()
     assert np.isnan(np.asarray(late.qs[2])).all()
     with pytest.raises(dvi.IntegrationError, match=r"lies outside of the run"):
         kepler(num_steps=50, save=dvi.Save(ts=[-0.5, 1.0]))
+    sol = kepler(num_steps=4, method=dvi.TypeII(), save=dvi.Save(ts=np.linspace(0.01, 0.07, 5)))
+    with pytest.raises(ValueError, match="at requested times"):
+        dvi.noether_balance(KEPLER, [dvi.generators.time_translation()], [None], sol)
 
 
 @pytest.mark.slow
-def test_gradient_in_the_requested_times_is_the_velocity():
+def test_clocks_and_the_gradient_in_the_requested_times():
+
     def at(t, adjoint):
         return kepler(num_steps=100, save=dvi.Save(ts=t[None]), adjoint=adjoint).qs[0]
 
@@ -208,11 +204,7 @@ def test_gradient_in_the_requested_times_is_the_velocity():
     for adjoint in (dvi.Direct(), dvi.Reversible()):
         slope = jax.jacobian(lambda t, a=adjoint: at(t, a))(t)
         np.testing.assert_allclose(slope, p, rtol=1e-3)  # of the map's curve: order h²
-
-
-@pytest.mark.slow
-def test_a_clock_of_ones_own():
-    """States at given angles of the pendulum that turns over."""
+    # States at given angles of the pendulum that turns over.
     angles = np.linspace(0.1, 30.0, 7)
     save = dvi.Save(ts=angles, clock=lambda t, q, p, args: q[0])
     options = {"h": 0.05, "num_steps": 400, "method": dvi.Yoshida(4)}
@@ -253,7 +245,7 @@ def test_stops_of_a_batch_and_their_gradient():
     assert float(jax.grad(value)(p)) == pytest.approx(float(expected), rel=1e-6)
 
 
-def test_a_start_beyond_the_stop_and_a_stop_that_is_not_met():
+def test_starts_beyond_a_stop_and_clocks_that_jump_have_a_status():
     sol = kepler(num_steps=5, stop=dvi.Stop(lambda t, q, p, args: 1 - radius(t, q, p, args)))
     assert sol.status == "stopped"
     assert float(sol.stop.t) == 0.0
@@ -262,6 +254,11 @@ def test_a_start_beyond_the_stop_and_a_stop_that_is_not_met():
     assert sol.status == "successful"
     assert np.isnan(float(sol.stop.t))
     assert kepler(num_steps=20).stop is None
+    save = dvi.Save(ts=[0.0, 0.5], clock=lambda t, q, p, args: jnp.arctan2(-p[0], q[0]))
+    options = {"h": 0.1, "num_steps": 100, "throw": False, "save": save}
+    sol = dvi.integrate(SPRING, [np.cos(1.0)], [-np.sin(1.0)], **options)
+    assert sol.status == "not_reached"
+    assert np.isnan(np.asarray(sol.qs)).all()
 
 
 @pytest.mark.slow
@@ -313,14 +310,6 @@ def test_slope_at_the_start_and_round_off_at_the_end():
     assert np.isnan(positions(np.array([1.0 + 1e-12]), h=1 / 49, num_steps=49)).all()
 
 
-def test_a_clock_that_jumps_has_a_status():
-    save = dvi.Save(ts=[0.0, 0.5], clock=lambda t, q, p, args: jnp.arctan2(-p[0], q[0]))
-    options = {"h": 0.1, "num_steps": 100, "throw": False, "save": save}
-    sol = dvi.integrate(SPRING, [np.cos(1.0)], [-np.sin(1.0)], **options)
-    assert sol.status == "not_reached"
-    assert np.isnan(np.asarray(sol.qs)).all()
-
-
 @pytest.mark.slow
 def test_memory_does_not_grow_with_the_steps():
     """Neither that of a run nor that of its gradient: as with Save(final=True)."""
@@ -336,13 +325,6 @@ def test_memory_does_not_grow_with_the_steps():
     asked, final = size(dvi.Save(ts=[0.5, 0.7]), 10_000), size(dvi.Save(final=True), 10_000)
     assert asked < final + 20_000
     assert size(dvi.Save(), 10_000) > 3 * final
-
-
-@pytest.mark.slow
-def test_a_balance_needs_grid_points():
-    sol = kepler(num_steps=4, method=dvi.TypeII(), save=dvi.Save(ts=np.linspace(0.01, 0.07, 5)))
-    with pytest.raises(ValueError, match="at requested times"):
-        dvi.noether_balance(KEPLER, [dvi.generators.time_translation()], [None], sol)
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])

@@ -96,7 +96,7 @@ def test_slopes_against_differences(loss, sigma):
 
 
 @pytest.mark.slow
-def test_second_derivatives_and_both_modes():
+def test_derivatives_and_failing_trajectories():
     posterior = dvi.Posterior(OSCILLATOR, swinging(), NEAR, gradient="forward")
     u, d = jnp.asarray(posterior.start), jnp.array([1.0, -2.0, 0.5])
     slope = jax.grad(posterior.potential)
@@ -105,6 +105,23 @@ def test_second_derivatives_and_both_modes():
     h = 1e-5
     by_differences = (slope(u + h * d) - slope(u - h * d)) / (2 * h)
     np.testing.assert_allclose(jax.jvp(slope, (u,), (d,))[1], by_differences, rtol=1e-6)
+
+    def explosive(t0, t1, q0, p1, args):
+        return p1 @ p1 / 2 - jnp.sum(jnp.exp(args["b"] * q0))
+
+    ts = H * np.arange(30)
+    data = dvi.Observations(ts, np.ones((30, 1)), sigma=0.1)
+    model = dvi.Model(dvi.System(explosive), h=H, q0=jnp.ones(1), p0=jnp.ones(1))
+    for gradient in ("reverse", "forward"):
+        posterior = dvi.Posterior(model, data, {"args": {"b": 0.01}}, gradient=gradient)
+        value, slope = jax.vmap(jax.value_and_grad(posterior.potential))(jnp.array([[0.01], [9.0]]))
+        assert np.isfinite(value[0])
+        assert value[1] == np.inf
+        assert slope[0] != 0
+        assert slope[1] == 0
+        assert posterior.log_density(jnp.array([9.0])) == -np.inf
+    with pytest.raises(ValueError, match=r"got 0 at args.b = 9"):
+        posterior.laplace([9.0])
 
 
 @pytest.mark.slow
@@ -149,26 +166,6 @@ def test_unknown_errors_are_integrated_out():
     np.testing.assert_allclose(found - found[0], want - want[0], rtol=1e-8, atol=1e-9)
     plug_in = distance / 2  # the size taken for known, at its estimate
     assert np.abs(found - found[0] - plug_in + plug_in[0]).max() > 0.1
-
-
-@pytest.mark.slow
-def test_a_failing_trajectory_has_density_0_and_no_nan():
-    def explosive(t0, t1, q0, p1, args):
-        return p1 @ p1 / 2 - jnp.sum(jnp.exp(args["b"] * q0))
-
-    ts = H * np.arange(30)
-    data = dvi.Observations(ts, np.ones((30, 1)), sigma=0.1)
-    model = dvi.Model(dvi.System(explosive), h=H, q0=jnp.ones(1), p0=jnp.ones(1))
-    for gradient in ("reverse", "forward"):
-        posterior = dvi.Posterior(model, data, {"args": {"b": 0.01}}, gradient=gradient)
-        value, slope = jax.vmap(jax.value_and_grad(posterior.potential))(jnp.array([[0.01], [9.0]]))
-        assert np.isfinite(value[0])
-        assert value[1] == np.inf
-        assert slope[0] != 0
-        assert slope[1] == 0
-        assert posterior.log_density(jnp.array([9.0])) == -np.inf
-    with pytest.raises(ValueError, match=r"got 0 at args.b = 9"):
-        posterior.laplace([9.0])
 
 
 @pytest.mark.slow

@@ -34,13 +34,10 @@ def wobble():
     return example("polar_motion")
 
 
-def test_components_are_those_of_the_orbit(relativity):
+def test_components_and_waves_of_residuals(relativity):
     q, v = np.array([[2.0, 0.0, 0.0]]), np.array([[0.5, 3.0, 0.0]])
     off = np.array([[5.0, 7.0, 11.0]])
     np.testing.assert_allclose(relativity.components(off, q, v), [[7.0, 5.0, 11.0]], rtol=1e-15)
-
-
-def test_a_wave_stands_where_its_period_is(relativity):
     t = 10.0 * np.arange(3652)
     period, amplitude = relativity.spectrum(3.0 * np.cos(2 * np.pi * t / 400) + 1e-4 * t)
     top = np.argmax(amplitude)

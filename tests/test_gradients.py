@@ -119,7 +119,7 @@ def test_second_derivative_and_batched_gradient():
 
 
 @pytest.mark.slow
-def test_gradient_through_given_times():
+def test_gradients_into_times_and_modules():
     s, q, p = SYSTEMS["kepler"]
 
     def final(ts, adjoint):
@@ -132,11 +132,7 @@ def test_gradient_through_given_times():
         axis = jnp.zeros(5).at[i].set(1.0)
         expected = central_difference(lambda t: final(t, "Direct"), ts, axis)
         assert abs(float(g[i] - expected)) < 1e-8
-
-
-@pytest.mark.slow
-def test_gradient_into_a_module_force():
-    """W as an equinox module: its arrays are differentiable, no args needed."""
+    # W as an equinox module: its arrays are differentiable, no args needed.
     net = eqx.nn.MLP(1, 1, 4, 1, key=jax.random.key(0))
     net = jax.tree.map(lambda x: x.astype(jnp.float64) if eqx.is_array(x) else x, net)
 
@@ -146,12 +142,12 @@ def test_gradient_into_a_module_force():
         def __call__(self, t0, t1, q0, p1, args):
             return self.net(q0)
 
-    def final(force, adjoint):
+    def end_of(force, adjoint):
         system = dvi.System(SYSTEMS["pendulum"][0].H_D, force=force)
         how = {"h": 0.1, "num_steps": 30, "epsilon": 0.5, "adjoint": ADJOINTS[adjoint]}
         return jnp.sum(dvi.integrate(system, [0.4], [0.7], **how).qs[-1])
 
-    a, b = (eqx.filter_grad(final)(Force(net), adjoint) for adjoint in ("Reversible", "Direct"))
+    a, b = (eqx.filter_grad(end_of)(Force(net), adjoint) for adjoint in ("Reversible", "Direct"))
     assert_same(a, b, rtol=1e-10, atol=1e-14)
     assert max(float(jnp.max(jnp.abs(u))) for u in jax.tree.leaves(a)) > 1e-3
 

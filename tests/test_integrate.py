@@ -76,14 +76,11 @@ def test_states_of_any_shape(shape):
     np.testing.assert_allclose(sol.qs, expected, rtol=1e-14)
 
 
-def test_times_do_not_accumulate_round_off():
+def test_late_times_and_invariants_do_not_accumulate_round_off():
     sol = run(num_steps=10_000, t0=5.0, save=dvi.Save(every=1000))
     np.testing.assert_array_equal(sol.ts, 5.0 + 0.1 * np.arange(0, 10_001, 1000))
     assert np.cumsum(np.full(10_000, 0.1))[-1] != 1000.0  # a running sum would
-
-
-def test_exact_invariant_of_the_map_is_conserved_late_in_a_run():
-    """h reaches the step as it is, not as a difference of large times."""
+    # h reaches the step as it is, not as a difference of large times.
 
     def invariant(t0, t1, q0, p0, q1, p1, args):
         return jnp.sum(p1**2 + q1**2 - 0.1 * q1 * p1) / 2
@@ -93,7 +90,7 @@ def test_exact_invariant_of_the_map_is_conserved_late_in_a_run():
     assert sol.observed["range"] / sol.observed["mean"] < 5e-14
 
 
-def test_given_times_set_the_steps():
+def test_given_times():
     """Equal ones are the uniform grid; unequal ones against the map by hand."""
     a = run(epsilon=0.1)
     b = dvi.integrate(OSCILLATOR, *START, lattice=dvi.Given(0.1 * np.arange(24)), epsilon=0.1)
@@ -107,9 +104,6 @@ def test_given_times_set_the_steps():
         q = q + h * p
         np.testing.assert_allclose(sol.qs[k + 1], q, rtol=1e-14)
     np.testing.assert_array_equal(sol.ts, ts)
-
-
-def test_given_times_of_a_problem_and_of_integers():
     kepler, ts = dvi.systems.kepler(), np.array([0.0, 0.1, 0.3])
     assert dvi.integrate(kepler, lattice=dvi.Given(ts)).ts.tolist() == ts.tolist()
     whole = dvi.integrate(OSCILLATOR, *START, lattice=dvi.Given([0, 1, 2]))
@@ -136,7 +130,8 @@ def test_reductions_equal_numpy_on_the_full_record():
     np.testing.assert_array_equal(sol.observed["last"], q[-1])
 
 
-def test_an_observable_sees_both_ends_of_its_step():
+def test_observables_of_a_step():
+
     def seen(t0, t1, q0, p0, q1, p1, args):
         return jnp.stack([t0, t1, q0[0], p0[0], q1[0], p1[0], args["a"]])
 
@@ -146,8 +141,6 @@ def test_an_observable_sees_both_ends_of_its_step():
         expected = [full.ts[k - 1], full.ts[k], full.qs[k - 1, 0], full.ps[k - 1, 0]]
         np.testing.assert_allclose(row, [*expected, full.qs[k, 0], full.ps[k, 0], 3.0], rtol=1e-13)
 
-
-def test_boolean_observables_are_counted():
     def right(t0, t1, q0, p0, q1, p1, args):
         return q1[0] > 0
 
@@ -303,15 +296,14 @@ def test_a_failed_trajectory_leaves_the_others_of_a_batch_unchanged():
     np.testing.assert_array_equal(np.isfinite(gradients), [True, False, True])
 
 
-def test_a_batch_raises_for_a_failed_trajectory_with_throw():
+def test_failures_in_a_batch_are_an_error_or_a_status():
+
     def go(h):
         return dvi.integrate(NON_SEPARABLE, [3.0], [4.0], h=h, num_steps=10).qs
 
     with pytest.raises(Exception, match="did not converge"):
         jax.block_until_ready(jax.vmap(go)(jnp.array([0.001, 10.0])))
 
-
-def test_traced_invalid_input_becomes_a_status():
     def solve(q, h):
         return dvi.integrate(OSCILLATOR, [q], [0.1], h=h, num_steps=3, throw=False)
 

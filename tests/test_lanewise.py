@@ -714,15 +714,12 @@ def test_functions(left, name):
     assert not left, left
 
 
-def test_no_warning_from_constants():
+def test_constants_give_short_code_and_no_warning():
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
         least = jax.device_put(np.int32(-(2**31)))
         found = jax.jit(lanewise.batched(lambda x: (-least) * x))(np.arange(9, dtype="int32"))
     np.testing.assert_array_equal(found[:3], [0, -(2**31), 0])
-
-
-def test_code_stays_short_for_arrays():
     (part,) = lanewise.explain(lambda x: jnp.full((128,), x), 1.0).parts
     assert max(block.count("\n") for block in part.ir.split(":\n")) < 3000
 
@@ -812,7 +809,7 @@ def refusing(name, is_suited=True):
     return SimpleNamespace(name=name, suits=lambda closed: is_suited, write=write)
 
 
-def test_first_target_with_code_is_used_and_reasons_of_others_are_collected():
+def test_targets_and_their_parameters():
     program = primitive.Callee(Trace.from_function(jnp.sin, [1.0], jax.tree.structure((1.0,))))
     targets = [refusing("unsuited", False), refusing("first"), *TARGETS["cpu"], refusing("last")]
     result = compiled_by(targets, program, [True], 8)
@@ -820,9 +817,6 @@ def test_first_target_with_code_is_used_and_reasons_of_others_are_collected():
     assert result.reasons == {"first": "refused by first"}
     with pytest.raises(NotCompilable, match="refused by a; refused by b"):
         compiled_by([refusing("a"), refusing("b")], program, [True], 8)
-
-
-def test_parameters_of_a_call():
     code = Code("", 8, values=(100, 7), operations=5)
     outs = [jax.ShapeDtypeStruct((3,), np.float64), jax.ShapeDtypeStruct((), np.int32)]
     # Trajectories, operations × longest loop, bytes of each result, values.

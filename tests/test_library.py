@@ -556,11 +556,7 @@ def test_elliptic_integrals_and_functions_are_those_of_scipy():
     assert np.max(np.abs(ours(u, m**1.001)[0] - ellipj(u, m)[0])) > 1e-4
     np.testing.assert_allclose(swing(m), ellipe(m) - (1 - m) * ellipk(m), rtol=0, atol=1e-15)
     np.testing.assert_allclose(swing(1e-12) / 1e-12, np.pi / 4, rtol=1e-12)
-
-
-@slow
-def test_integrals_of_the_third_kind_are_those_of_scipy():
-    """Both signs of n, up to 1 − n = 1e-12 and n = −1e8; negative control: another n."""
+    # Both signs of n, up to 1 − n = 1e-12 and n = −1e8; negative control: another n.
     rng = np.random.default_rng(1)
     m, phi = rng.uniform(0, 1, 100), rng.uniform(-20, 20, 100)
     large, small = 1 + 10 ** rng.uniform(-3, 8, 50), 10 ** rng.uniform(-12, 0, 50)
@@ -580,15 +576,12 @@ def test_integrals_of_the_third_kind_are_those_of_scipy():
     assert np.max(np.abs(other - wanted) / np.abs(wanted)) > 1e-10
 
 
-def test_complete_integrals_at_the_end_of_their_range():
+def test_limits_of_elliptic_integrals_and_periods():
     m = jnp.array([1.0, 1.1, 1 - 1e-12])
     K, E = jax.jit(complete)(m)
     np.testing.assert_array_equal([K[:2], E[:2]], [[np.inf, np.nan], [1, np.nan]])
     np.testing.assert_array_equal(jax.jit(swing)(m)[:2], [1, np.nan])
     np.testing.assert_allclose([K[2], E[2]], [ellipk(1 - 1e-12), ellipe(1 - 1e-12)], rtol=1e-14)
-
-
-def test_the_period_of_the_pendulum_on_and_near_its_separatrix():
     args, q = problem("pendulum").args, jnp.zeros(1)
     turn = jax.jit(lambda p: period(q, jnp.stack([p]), args))
     assert float(turn(2.0)) == math.inf
@@ -692,19 +685,7 @@ def test_exact_solutions_hold_at_long_times_and_near_singularities(name, q0, p0,
 
 
 @slow
-def test_duffing_swings_harmonically_at_the_bottom_of_a_well():
-    """q = −1 − δ cos √2 t + O(δ²) from a distance δ, and rest at the bottom itself."""
-    made, ts = problem("duffing"), np.array([0.0, 1.0, 2.0, 5.0])
-    w = np.sqrt(2)
-    for size in (1e-5, 1e-7, 1e-8, 1e-9, 0.0):
-        q, p = made.exact(ts, [-1.0 - size], [0.0], made.args)
-        off = np.hypot(q[:, 0] + 1 + size * np.cos(w * ts), p[:, 0] - size * w * np.sin(w * ts))
-        assert np.max(off) < 20 * size**2 + 1e-15
-    assert np.max(np.abs(p[:, 0] - 1e-9 * np.sin(ts))) > 1e-10  # another frequency
-
-
-@slow
-def test_the_pendulum_carries_gradients_at_rest():
+def test_the_pendulum_and_duffing_at_rest():
     """Those of the linear oscillator. So do action, integrals and Van der Pol's amplitude."""
     at_rest, made, t = jnp.zeros(1), problem("pendulum"), 1.7
     of = jax.jit(jax.jacrev(lambda q, p: made.exact(t, q, p, made.args), (0, 1)))
@@ -722,6 +703,14 @@ def test_the_pendulum_carries_gradients_at_rest():
     of_amplitude = jax.grad(lambda q, p: amplitude(0, 0, q, p, q, p, None))
     assert of_amplitude(at_rest, at_rest)[0] == 0
     assert float(of_amplitude(jnp.ones(1), 2 * jnp.ones(1))[0]) == pytest.approx(5**-0.5)
+    # q = −1 − δ cos √2 t + O(δ²) from a distance δ, and rest at the bottom itself.
+    made, ts = problem("duffing"), np.array([0.0, 1.0, 2.0, 5.0])
+    w = np.sqrt(2)
+    for size in (1e-5, 1e-7, 1e-8, 1e-9, 0.0):
+        q, p = made.exact(ts, [-1.0 - size], [0.0], made.args)
+        off = np.hypot(q[:, 0] + 1 + size * np.cos(w * ts), p[:, 0] - size * w * np.sin(w * ts))
+        assert np.max(off) < 20 * size**2 + 1e-15
+    assert np.max(np.abs(p[:, 0] - 1e-9 * np.sin(ts))) > 1e-10  # another frequency
 
 
 @slow
