@@ -894,7 +894,7 @@ def test_cache_is_read(folder, made):
 
 
 @pytest.mark.parametrize("damage", ["cut", "changed", "empty", "of other code"])
-def test_a_damaged_file_or_one_of_other_code_is_replaced(folder, made, damage):
+def test_a_damaged_file_is_replaced(folder, made, damage):
     number(42)
     (other,) = folder.iterdir()
     number(41)
