@@ -107,7 +107,7 @@ def test_a_constant_speed_is_a_uniform_grid(kind, method, rtol):
         )
 
 
-@pytest.mark.parametrize("method", [dvi.Strang(), dvi.McLachlan(4)])
+@pytest.mark.parametrize("method", [dvi.Strang(), pytest.param(dvi.McLachlan(4), marks=SLOW)])
 def test_the_order_is_that_of_the_method(method):
     """With a force, a g that depends on time and momentum, at requested times, against DOP853."""
 
@@ -215,6 +215,7 @@ def test_machine_code_for_the_whole_run():
     assert "XLA" not in str(found), str(found)
 
 
+@SLOW
 def test_the_pythagorean_problem_after_its_closest_encounter():
     """At t = 20, with the speed of N bodies; the place is that of the Taylor series below."""
     problem, lattice = systems.pythagorean(), dvi.AdaptiveReversible(encounter_time)
