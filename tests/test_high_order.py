@@ -148,27 +148,37 @@ def change_in_a_step(series, powers, q, p, epsilon, h):
     return value(q + h * p1, p1) - value(q, p)
 
 
-def test_an_invariant_of_order_six_changes_by_epsilon_to_the_seventh():
+@pytest.mark.parametrize(
+    ("order", "degree", "survivors", "wrong_at", "largest"),
+    [
+        (2, 4, (2, 1, 1), 1, 40),
+        # The survivors by the degree that is left for corrections.
+        pytest.param(6, 8, (4, 3, 3, 2, 2, 1, 1), 4, 2, marks=pytest.mark.slow),
+    ],
+)
+def test_an_invariant_of_an_order_changes_by_the_next_power_of_epsilon(
+    order, degree, survivors, wrong_at, largest
+):
     force = lambda t0, t1, q, p, args: -(q**2)  # noqa: E731
     system = dvi.System(lambda t0, t1, q, p, args: (p @ p + q @ q) / 2, force=force)
     samples = np.random.default_rng(0).uniform(-0.5, 0.5, (2, 120, 1))
-    found = dvi.discover_invariants(system, dvi.Polynomials(8), 6, h=0.1, samples=samples)
-    assert found.survivors == (4, 3, 3, 2, 2, 1, 1)  # by the degree that is left for corrections
-    assert found.count == 1
+    found = dvi.discover_invariants(system, dvi.Polynomials(degree), order, h=0.1, samples=samples)
+    assert (found.survivors, found.count) == (survivors, 1)
     powers = found.basis.function.counts
     wrong = np.array(found.coefficients[0])
-    wrong[4, np.argmax(np.abs(wrong[4]))] *= 2
+    wrong[wrong_at, np.argmax(np.abs(wrong[wrong_at]))] *= 2
     slopes = []
     for series in (np.asarray(found.coefficients[0]), wrong):
         changes = [
             abs(change_in_a_step(series, powers, Fraction(2, 5), Fraction(1, 3), e, Fraction(0.1)))
-            for e in (Fraction(1, 2), Fraction(1, 4))
+            for e in (Fraction(1, largest), Fraction(1, 2 * largest))
         ]
         slopes.append(np.log2(float(changes[0] / changes[1])))
-    assert slopes[0] == pytest.approx(7, abs=0.2)
-    assert slopes[1] < 5  # 4 in the limit of small ε
+    assert slopes[0] == pytest.approx(order + 1, abs=0.2)
+    assert slopes[1] < wrong_at + 1  # wrong_at in the limit of small ε
 
 
+@pytest.mark.slow
 def test_orders_above_six_are_not_silent():
     system = dvi.System(lambda t0, t1, q, p, args: (p @ p + q @ q) / 2)
     samples = np.random.default_rng(0).uniform(-1, 1, (2, 40, 1))
