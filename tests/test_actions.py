@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import pendulum
 from scipy import special
 
 import dvi_jax as dvi
@@ -125,10 +126,6 @@ def slow(t0, t1, q, p, args):
     """An oscillator whose frequency goes from 1 to 1.5 at a rate."""
     omega = 1.25 + 0.25 * jnp.tanh(args * (t0 - 300.0))
     return jnp.sum(p**2) / 2 + omega**2 * jnp.sum(q**2) / 2
-
-
-def pendulum(t0, t1, q, p, args):
-    return jnp.sum(p**2) / 2 - jnp.sum(jnp.cos(q))
 
 
 RATES = np.array([0.1, 1.0, 30.0])

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
 import pytest
+from helpers import pendulum
 
 import dvi_jax as dvi
 import lanewise
@@ -26,10 +27,6 @@ KEPLER = systems.kepler()
 def many_digits():
     with mp.workdps(60):
         yield
-
-
-def pendulum(t0, t1, q0, p1, args):
-    return jnp.sum(p1**2) / 2 - jnp.sum(jnp.cos(q0))
 
 
 def coupled(t0, t1, q0, p1, args):

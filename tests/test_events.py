@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import central_difference, measured_orders
+from helpers import central_difference, measured_orders, pendulum
 from scipy.integrate import solve_ivp
 
 import dvi_jax as dvi
@@ -15,10 +15,6 @@ E = 0.6
 START = [1 - E, 0.0], [0.0, np.sqrt((1 + E) / (1 - E))]
 KEPLER = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 - 1 / jnp.sqrt(q @ q))
 SPRING = dvi.System(lambda t0, t1, q0, p1, args: (p1 @ p1 + q0 @ q0) / 2)
-
-
-def pendulum(t0, t1, q, p, args):
-    return jnp.sum(p**2) / 2 - jnp.sum(jnp.cos(q))
 
 
 def on_axis(t, q, p, args):
