@@ -161,7 +161,7 @@ def test_an_equilibrium_is_solved_for_in_its_own_size():
 
 
 @pytest.mark.slow
-def test_memory_goes_along_in_pieces_and_in_batches():
+def test_memory_of_sums_in_pieces_batches_and_single_precision():
     """With progress the run is in pieces; in a batch trajectories are as alone."""
     s, q, p = SYSTEMS["pendulum"]
     how = {"h": 0.0625, "num_steps": 3000, "epsilon": 0.0, "save": dvi.Save(every=10)}
@@ -179,11 +179,7 @@ def test_memory_goes_along_in_pieces_and_in_batches():
     batch = jax.vmap(lambda a: run(a * q, a * p).qs)(jnp.array([1.0, 0.5]))
     np.testing.assert_allclose(batch[0], whole.qs, atol=1e-12)
     np.testing.assert_allclose(batch[1], run(q / 2, p / 2).qs, atol=1e-12)
-
-
-@pytest.mark.slow
-def test_compensation_works_in_single_precision():
-    """Against double precision: the error of float32 without it is ten times as large."""
+    # Against double precision: the error of float32 without it is ten times as large.
     s = dvi.System(pendulum)
     q, p = np.array([0.4]), np.array([0.7])
 

@@ -89,10 +89,30 @@ def test_broken_method_is_caught_by_a_number(control):
     assert measured.verdict == "FAIL", measured
 
 
-def test_every_check_has_a_control_and_a_place():
+def test_checks_controls_and_the_page_are_complete():
     assert {c.check for c in CONTROLS} == set(CHECKS)
     assert [name for group in GROUPS.values() for name in group] == list(CHECKS)
     assert set(QUICK) <= set(METHODS)
+    # If not, run `dvi-jax certify --out docs/certificate.md`.
+    page = PAGE.read_text(encoding="utf-8")
+    head, *sections = re.split(r"^## ", page, flags=re.MULTILINE)
+    assert head.startswith(TITLE)
+    assert f"methods: {len(METHODS)} of {len(METHODS)}" in head
+    assert f"controls: {len(CONTROLS)} of {len(CONTROLS)} caught" in head
+    by_title = {section.partition("\n")[0]: section for section in sections}
+    assert "Failures" not in by_title
+    for title, checks in GROUPS.items():
+        columns, _, *rows = [
+            [cell.strip() for cell in line.strip("|").split("|")]
+            for line in by_title[title].splitlines()
+            if line.startswith("|")
+        ]
+        assert [c for c in columns if c in CHECKS] == list(checks)
+        assert [row[0] for row in rows] == list(METHODS)
+        for row in rows:
+            for name, cell in zip(columns, row, strict=True):
+                assert name not in CHECKS or cell.startswith(("pass", "not claimed")), row
+    assert by_title["Controls"].count("| caught |") == len(CONTROLS)
 
 
 @pytest.mark.slow
@@ -246,7 +266,7 @@ def command(*words):
 
 
 @pytest.mark.slow
-def test_command_writes_the_page(tmp_path):
+def test_the_page_is_written_and_its_example_runs(tmp_path):
     page = tmp_path / "sub" / "page.md"
     result = command("--method", "RungeKutta4", "--check", "reversal", "--out", page)
     assert result.exit_code == 0, result.output
@@ -255,6 +275,10 @@ def test_command_writes_the_page(tmp_path):
     assert page.read_text(encoding="utf-8").startswith(TITLE)
     assert page_for(page) == page  # a certificate may be replaced by a newer one
     assert page_for(tmp_path) == page_for(tmp_path / "new").parent.parent / "certificate.md"
+    (code,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    scope = {}
+    exec(code, scope)
+    assert scope["certificate"].ok
 
 
 @pytest.mark.slow
@@ -285,34 +309,3 @@ def test_command_refuses_bad_input(tmp_path):
         assert result.exit_code == 2, words
         assert said in result.output.replace("\n", " ")
     assert other.read_text(encoding="utf-8") == "# My notes\n"
-
-
-def test_the_page_is_of_the_methods_and_checks_that_there_are():
-    """If not, run `dvi-jax certify --out docs/certificate.md`."""
-    page = PAGE.read_text(encoding="utf-8")
-    head, *sections = re.split(r"^## ", page, flags=re.MULTILINE)
-    assert head.startswith(TITLE)
-    assert f"methods: {len(METHODS)} of {len(METHODS)}" in head
-    assert f"controls: {len(CONTROLS)} of {len(CONTROLS)} caught" in head
-    by_title = {section.partition("\n")[0]: section for section in sections}
-    assert "Failures" not in by_title
-    for title, checks in GROUPS.items():
-        columns, _, *rows = [
-            [cell.strip() for cell in line.strip("|").split("|")]
-            for line in by_title[title].splitlines()
-            if line.startswith("|")
-        ]
-        assert [c for c in columns if c in CHECKS] == list(checks)
-        assert [row[0] for row in rows] == list(METHODS)
-        for row in rows:
-            for name, cell in zip(columns, row, strict=True):
-                assert name not in CHECKS or cell.startswith(("pass", "not claimed")), row
-    assert by_title["Controls"].count("| caught |") == len(CONTROLS)
-
-
-@pytest.mark.slow
-def test_the_example_on_the_page_runs():
-    (code,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-    scope = {}
-    exec(code, scope)
-    assert scope["certificate"].ok

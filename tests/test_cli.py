@@ -220,15 +220,12 @@ def test_closed_outputs_raise_no_error():
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_no_control_codes_without_a_terminal():
+def test_no_control_codes_without_a_terminal_and_ascii():
     result = command("systems", env={"COLUMNS": "60"})
     assert "\x1b" not in result.output
     assert max(map(cell_len, result.stdout.splitlines())) <= 60
     wide = command("systems", env={"COLUMNS": "100"})  # the control
     assert max(map(cell_len, wide.stdout.splitlines())) > 60
-
-
-def test_an_output_in_ascii():
     done = process(MAIN, "discover", "--help", PYTHONIOENCODING="ascii", COLUMNS="99")
     assert (done.returncode, done.stderr) == (0, "")
     assert "invariants in ? as formulas" in done.stdout
@@ -277,7 +274,7 @@ def inside(project, monkeypatch):
 PROJECT = [kind for kind in known.FILES if kind != "bound"]  # which needs the extra `proof`
 
 
-def test_new_writes_a_project(project):
+def test_new_writes_a_project_with_a_valid_notebook(project):
     assert {p.name for p in project.iterdir()} == {
         *("README.md", "system.py", "observations.csv", "explore.py", "explore.ipynb"),
         *(f"{kind}.toml" for kind in PROJECT),
@@ -288,9 +285,6 @@ def test_new_writes_a_project(project):
         assert "{{" not in path.read_text(encoding="utf-8"), path
     for name in PROJECT:
         assert f"dvi-jax {name} {name}.toml" in readme
-
-
-def test_its_notebook_is_valid_and_is_its_script(project):
     nbformat = pytest.importorskip("nbformat")
     file = nbformat.read(project / "explore.ipynb", as_version=4)
     nbformat.validate(file)

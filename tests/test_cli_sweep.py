@@ -279,15 +279,12 @@ def test_a_batch_job_is_resumed_in_a_terminal(small, monkeypatch):
     assert result.exit_code == 0, result.stderr
 
 
-def test_a_dry_run_estimates_and_writes_nothing(folder):
+def test_a_dry_run_writes_nothing_and_a_place_without_a_store(folder):
     result = command("sweep", write(folder, SMALL), "--dry-run")
     assert result.exit_code == 0, result.stderr
     assert "3 tasks of 4 trajectories" in result.stdout
     assert "| 1e+12 | 2.5e+11 |" in result.stdout
     assert not (folder / "out.zarr").exists()
-
-
-def test_a_place_without_a_store(folder):
     path = write(folder, SMALL)
     for place in (folder, "own.py"):
         result = command("sweep", path, "--resume", "--store", place)

@@ -278,7 +278,7 @@ def test_order_unperturbed_and_with_a_damped_and_driven_force(stages):
         assert abs(found - LOBATTO(stages).order) < 0.2
 
 
-def test_a_wrong_node_or_a_wrong_coefficient_costs_the_order():
+def test_wrong_coefficients_cost_the_order_or_symplecticity():
     c, b, a, a_hat = by_hand(LOBATTO, 3)
     wrong = a_hat + np.array([[0, 0, 0], [0.01, -0.01, 0], [0, 0, 0]])
 
@@ -288,6 +288,16 @@ def test_a_wrong_node_or_a_wrong_coefficient_costs_the_order():
     assert abs(order(c, b, a, a_hat) - 4) < 0.2
     assert order([0, 0.51, 1], b, a, a_hat) < 1.5  # the driving force at a wrong time
     assert order(c, b, a, wrong) < 2.5
+    # By hand on the non-separable problem: IIIA with IIIB is, IIIA or IIIB with itself is not.
+    c, b, *both = (jnp.asarray(part, float) for part in by_hand(LOBATTO, 3))
+
+    @jax.jit
+    def jacobian(a, a_hat):
+        return jax.jacfwd(lambda z: step_by_hand((c, b, a, a_hat), z, 0.0, 0.4, 0.0))(START)
+
+    assert symplectic_defect(np.asarray(jacobian(*both))) <= 1e-12
+    for a in both:
+        assert symplectic_defect(np.asarray(jacobian(a, a))) > 1e-4
 
 
 @pytest.mark.parametrize("stages", [2, *(pytest.param(s, marks=SLOW) for s in (5, 6))])
@@ -299,19 +309,6 @@ def test_the_step_reverses_and_is_symplectic_unless_damped(stages):
     jacobian = jax.jit(jax.jacfwd(lambda z, epsilon: step(z, 0.0, 0.1, epsilon)))
     assert symplectic_defect(np.asarray(jacobian(z, 0.0))) <= 1e-12
     assert np.linalg.det(jacobian(z, 0.3)) < 0.99
-
-
-def test_one_family_for_both_is_not_symplectic():
-    """By hand on the non-separable problem: IIIA with IIIB is, IIIA or IIIB with itself is not."""
-    c, b, *both = (jnp.asarray(part, float) for part in by_hand(LOBATTO, 3))
-
-    @jax.jit
-    def jacobian(a, a_hat):
-        return jax.jacfwd(lambda z: step_by_hand((c, b, a, a_hat), z, 0.0, 0.4, 0.0))(START)
-
-    assert symplectic_defect(np.asarray(jacobian(*both))) <= 1e-12
-    for a in both:
-        assert symplectic_defect(np.asarray(jacobian(a, a))) > 1e-4
 
 
 @pytest.mark.slow

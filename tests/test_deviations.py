@@ -116,7 +116,7 @@ def test_tangent_map_of_a_perturbation_is_symplectic():
 
 
 @pytest.mark.slow
-def test_tangent_map_as_a_function_on_other_lattices_and_in_compensated_sums():
+def test_tangent_maps_as_functions_and_of_bodies_in_space():
     """One step by default; all of those of a lattice of given times."""
     system, q, p = SYSTEMS["kepler"]
     options, times = {"epsilon": 0.3, "args": ARGS, "method": dvi.Strang()}, np.arange(6) * 0.1
@@ -130,11 +130,7 @@ def test_tangent_map_as_a_function_on_other_lattices_and_in_compensated_sums():
         assert np.max(np.abs(found - plain)) < 1e-13
     bad = dvi.tangent_map(system, [0.0, 0.0], p, h=0.1, throw=False, **options)
     assert np.isnan(bad).all()
-
-
-@pytest.mark.slow
-def test_bodies_in_space():
-    """A state of shape (3, 2): the order of the components is that of ravel."""
+    # A state of shape (3, 2): the order of the components is that of ravel.
     eight = systems.figure_eight()
     given = {"h": 0.01, "num_steps": 10, "args": eight.args}
     M = seen(eight.system, eight.q0, eight.p0, dvi.TangentMap(), **given)
@@ -419,7 +415,7 @@ def test_running_values():
 
 
 @pytest.mark.slow
-def test_batches_and_layouts():
+def test_batches_layouts_and_sweeps():
     q, p = (np.array([a, b]) for a, b in zip(REGULAR, CHAOTIC, strict=True))
     kinds = (dvi.MEGNO(), dvi.LyapunovSpectrum(), dvi.GALI(3, log10=True))
     forms = [
@@ -435,6 +431,19 @@ def test_batches_and_layouts():
         for form in forms:
             for a, b in zip(alone, form, strict=True):
                 assert np.max(np.abs(a - b[i])) < 1e-8
+    # Orbits and ε in a grid, each with a status; the same numbers as one by one.
+    system = dvi.System(HENON.system.H_D, force=lambda t0, t1, q0, p1, args: -p1)
+    result = dvi.sweep(
+        system, HENON.q0, [HENON.p0[0], dvi.Axis("py", np.array([0.0, 0.2, 3.0]))],
+        epsilon=np.array([0.0, 1e-3]), h=0.05, num_steps=1000, method=dvi.Strang(),
+        observe={"megno": dvi.MEGNO(), "lyapunov": dvi.LyapunovSpectrum(2)},
+    ).to_xarray()  # fmt: skip
+    assert result.megno.dims == ("epsilon", "py")
+    assert result.lyapunov.shape == (2, 3, 2)
+    assert list(result.status.values[0]) == [0, 0, 2]  # the last one has energy to escape
+    assert np.isnan(result.megno.values[:, 2]).all()
+    alone = seen(system, HENON.q0, [HENON.p0[0], 0.2], dvi.MEGNO(), epsilon=1e-3, num_steps=1000)
+    assert abs(result.megno.values[1, 1] - alone) < 1e-10
 
 
 @pytest.mark.slow
@@ -510,23 +519,6 @@ def test_memory_does_not_grow_with_the_steps():
     along = jax.jit(lambda q, p: seen(HENON.system, q, p, energy, **options))
     stored = along.lower(*map(jnp.asarray, REGULAR)).compile().memory_analysis()
     assert stored.output_size_in_bytes > 1_000_000  # the control: values saved at every step
-
-
-@pytest.mark.slow
-def test_indicators_under_sweep():
-    """Orbits and ε in a grid, each with a status; the same numbers as one by one."""
-    system = dvi.System(HENON.system.H_D, force=lambda t0, t1, q0, p1, args: -p1)
-    result = dvi.sweep(
-        system, HENON.q0, [HENON.p0[0], dvi.Axis("py", np.array([0.0, 0.2, 3.0]))],
-        epsilon=np.array([0.0, 1e-3]), h=0.05, num_steps=1000, method=dvi.Strang(),
-        observe={"megno": dvi.MEGNO(), "lyapunov": dvi.LyapunovSpectrum(2)},
-    ).to_xarray()  # fmt: skip
-    assert result.megno.dims == ("epsilon", "py")
-    assert result.lyapunov.shape == (2, 3, 2)
-    assert list(result.status.values[0]) == [0, 0, 2]  # the last one has energy to escape
-    assert np.isnan(result.megno.values[:, 2]).all()
-    alone = seen(system, HENON.q0, [HENON.p0[0], 0.2], dvi.MEGNO(), epsilon=1e-3, num_steps=1000)
-    assert abs(result.megno.values[1, 1] - alone) < 1e-10
 
 
 class SumOfSquares(dvi.Reduction):

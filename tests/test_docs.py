@@ -60,13 +60,20 @@ def too_long(text):
     return [line for block in code for line in block.splitlines() if len(line) > 100]
 
 
-def test_code_fits_its_page():
+def test_code_fits_and_links_lead_to_files():
     pages = [ROOT / "README.md", *DOCS.glob("*.md")]
     long = {page.name: too_long(page.read_text(encoding="utf-8")) for page in pages}
     assert {name: lines for name, lines in long.items() if lines} == {}
     line = "x" * 101
     assert too_long(f"```\n{line}\n```\n") == [line]
     assert too_long(f"a\n\n    {line}\n\n{line}\n") == [f"    {line}"]
+    # Pages are read on a code host, too.
+    pages = [*ROOT.glob("*.md"), *DOCS.glob("*.md")]
+    assert len(pages) > 25
+    missing = {p.name: missing_files(p, p.read_text(encoding="utf-8")) for p in pages}
+    assert {name: links for name, links in missing.items() if links} == {}
+    links = "[a](docs/none.md) [b](docs/faq.md)"
+    assert missing_files(ROOT / "README.md", links) == ["docs/none.md"]
 
 
 PRINTED = re.compile(r"^<!-- printed -->\n```text\n(.*?)^```", re.S | re.M)
@@ -96,16 +103,6 @@ def missing_files(page, text):
     found = re.findall(r"\]\((?!https?:|mailto:|#)([^)#\s]+)", text)
     made = ("reference/",)  # by the build
     return [x for x in found if not x.startswith(made) and not (page.parent / x).exists()]
-
-
-def test_links_lead_to_files_of_the_repository():
-    """Pages are read on a code host, too."""
-    pages = [*ROOT.glob("*.md"), *DOCS.glob("*.md")]
-    assert len(pages) > 25
-    missing = {p.name: missing_files(p, p.read_text(encoding="utf-8")) for p in pages}
-    assert {name: links for name, links in missing.items() if links} == {}
-    links = "[a](docs/none.md) [b](docs/faq.md)"
-    assert missing_files(ROOT / "README.md", links) == ["docs/none.md"]
 
 
 @pytest.fixture(scope="module")
@@ -161,7 +158,7 @@ def dead_links(folder):
 
 
 @pytest.mark.slow
-def test_links_and_names_of_the_site(site, tmp_path):
+def test_links_names_and_sizes_of_the_site(site, tmp_path):
     assert len(list(site.rglob("*.html"))) > 40
     assert dead_links(site) == []
     (tmp_path / "a.html").write_text('<p id="x"><a href="b.html">b</a><a href="#x"><a href="#y">')
@@ -173,6 +170,15 @@ def test_links_and_names_of_the_site(site, tmp_path):
     names = [n for n in _namespaces.names() if callable(getattr(dvi, n))]
     assert len(names) > 120
     assert [n for n in names if f'id="dvi_jax.{n}"' not in text] == []
+    # With its pictures; scripts and styles are loaded once for all pages.
+    large = {}
+    for path in site.rglob("*.html"):
+        text = path.read_text(encoding="utf-8")
+        pictures = {path.parent / name for name in re.findall(r'<img[^>]* src="([^":]+)"', text)}
+        size = path.stat().st_size + sum(picture.stat().st_size for picture in pictures)
+        if size > 500e3:
+            large[path.name] = size
+    assert large == {}
 
 
 def entry(site, page, name):
@@ -182,7 +188,7 @@ def entry(site, page, name):
 
 
 @pytest.mark.slow
-def test_names_lead_where_they_are_meant(site):
+def test_names_and_formulas_of_the_site(site):
     """A parameter `fit` is no link; a picture's name is a picture; theirs is not ours."""
     assert "#dvi_jax.fit" not in entry(site, "plot", "plot.fit_against_data")
     assert "#dvi_jax.FitResult" in entry(site, "plot", "plot.fit_against_data")
@@ -199,11 +205,7 @@ def test_names_lead_where_they_are_meant(site):
     first = re.findall(r"<tr[^>]*><td>(.*?)</td>", theirs, re.S)
     assert any("LobattoIIIAIIIB" in cell for cell in first)
     assert not [cell for cell in first if "<a " in cell]
-
-
-@pytest.mark.slow
-def test_formulas_in_characters_come_through(site):
-    """No emphasis between the underscores of q_k and p_k; indices are set as indices."""
+    # No emphasis between the underscores of q_k and p_k; indices are set as indices.
     emphasised = [
         (path.name, words)
         for path in site.rglob("*.html")
@@ -396,19 +398,6 @@ def page():
         tab.faults, tab.open_page = faults, open_page
         yield tab
         browser.close()
-
-
-@pytest.mark.slow
-def test_no_page_is_larger_than_500_kilobytes(site):
-    """With its pictures; scripts and styles are loaded once for all pages."""
-    large = {}
-    for path in site.rglob("*.html"):
-        text = path.read_text(encoding="utf-8")
-        pictures = {path.parent / name for name in re.findall(r'<img[^>]* src="([^":]+)"', text)}
-        size = path.stat().st_size + sum(picture.stat().st_size for picture in pictures)
-        if size > 500e3:
-            large[path.name] = size
-    assert large == {}
 
 
 @pytest.mark.slow

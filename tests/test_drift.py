@@ -320,9 +320,6 @@ def test_what_is_not_resolved_is_reported_with_the_range_that_would_do():
     better = sweep_of(np.geomspace(smallest, largest, 10))
     assert better.resolved
     assert covers(better.fit, 1)
-
-
-def test_a_range_hidden_by_the_drift_at_zero_is_not_recommended():
     epsilons = np.geomspace(1e-2, 1e-1, 5)
     drifts = epsilons + 30 * epsilons**2
     fit = small_epsilon_exponent(epsilons, drifts)
@@ -351,19 +348,6 @@ def test_order_and_units_of_the_points_do_not_matter():
     ):
         np.testing.assert_allclose(other.interval, one.interval, atol=1e-6)
         assert other.model == one.model
-
-
-def test_a_surface_marks_orders_that_are_not_resolved():
-    epsilons = np.geomspace(3e-3, 3e-2, 5)
-    noise = np.exp(0.05 * np.random.default_rng(0).standard_normal(5))
-    clear = synthetic(epsilons**2, epsilons=epsilons)
-    unclear = synthetic(CROSSING(epsilons) * noise, epsilons=epsilons)
-    hs, steps, none = np.array([0.1, 0.2]), np.array([10, 5]), np.array([False, False])
-    surface = orders.DriftSurface(epsilons, hs, steps, (clear, unclear), none, np.nan, np.nan)
-    text = str(surface)
-    assert f"{clear.slope:.3f} " in text
-    assert f"{unclear.slope:.3f}?" in text
-    assert "? no order resolved in this range of ε: slope of the straight line" in text
 
 
 @pytest.mark.slow
@@ -404,7 +388,7 @@ def test_surface_measures_the_order_of_the_mesh_defect():
     assert f"drift at ε = 0 ∝ h^{surface.mesh_slope:.4g}" in text
 
 
-def test_surface_has_an_order_at_each_h_and_none_where_it_failed():
+def test_surfaces_have_orders_and_mark_those_that_are_not_resolved():
     surface = surface_of(kept=True)
     np.testing.assert_allclose(surface.slopes[:2], 1, atol=0.01)
     np.testing.assert_array_equal(surface.drifts[:, 1], usual().drifts)
@@ -417,6 +401,16 @@ def test_surface_has_an_order_at_each_h_and_none_where_it_failed():
     assert surface.mesh_used.tolist() == [False, False, True]
     assert np.isnan(surface.mesh_slope)
     assert "above round-off at 1 of 3 step sizes" in str(surface)
+    epsilons = np.geomspace(3e-3, 3e-2, 5)
+    noise = np.exp(0.05 * np.random.default_rng(0).standard_normal(5))
+    clear = synthetic(epsilons**2, epsilons=epsilons)
+    unclear = synthetic(CROSSING(epsilons) * noise, epsilons=epsilons)
+    hs, steps, none = np.array([0.1, 0.2]), np.array([10, 5]), np.array([False, False])
+    surface = orders.DriftSurface(epsilons, hs, steps, (clear, unclear), none, np.nan, np.nan)
+    text = str(surface)
+    assert f"{clear.slope:.3f} " in text
+    assert f"{unclear.slope:.3f}?" in text
+    assert "? no order resolved in this range of ε: slope of the straight line" in text
 
 
 def legend(axis):

@@ -95,7 +95,7 @@ def test_directions_and_the_capacity_of_sections():
 
 
 @pytest.mark.slow
-def test_a_batch_of_sections():
+def test_batches_and_gradients_of_sections():
     """Hénon and Heiles' surface of section; a trajectory that fails does not affect the others."""
     system, section = (
         dvi.systems.henon_heiles().system,
@@ -118,20 +118,7 @@ def test_a_batch_of_sections():
         assert n == int(found.count[i]) > 4
         np.testing.assert_allclose(found.qs[i, :n], alone.qs[:n], atol=1e-11)
         np.testing.assert_allclose(found.qs[i, :n, 0], 0.0, atol=1e-14)
-
-
-def section_loss(x, adjoint):
-    p, h = x
-    options = {"num_steps": 150, "method": dvi.Strang(), "save": dvi.Save(final=True)}
-    section = dvi.Section(on_axis, max_crossings=4)
-    sol = dvi.integrate(KEPLER, START[0], p, h=h, adjoint=adjoint, observe=section, **options)
-    found = sol.observed
-    return found.ts[0] ** 2 + found.qs[0, 0] * found.ps[0, 1]
-
-
-@pytest.mark.slow
-def test_gradient_of_a_crossing():
-    """Time and state of the crossing, in forward and both ways of reverse mode."""
+    # Time and state of the crossing, in forward and both ways of reverse mode.
     x = (jnp.asarray(START[1]), jnp.asarray(0.03))
     ones = jax.tree.map(jnp.ones_like, x)
     value = jax.jit(lambda x: section_loss(x, dvi.Direct()))
@@ -141,6 +128,15 @@ def test_gradient_of_a_crossing():
     for adjoint in (dvi.Direct(), dvi.Reversible(checkpoint_every=10)):
         back = jax.tree.leaves(jax.grad(lambda x, a=adjoint: section_loss(x, a))(x))
         assert sum(float(jnp.sum(g)) for g in back) == pytest.approx(forward, rel=1e-9)
+
+
+def section_loss(x, adjoint):
+    p, h = x
+    options = {"num_steps": 150, "method": dvi.Strang(), "save": dvi.Save(final=True)}
+    section = dvi.Section(on_axis, max_crossings=4)
+    sol = dvi.integrate(KEPLER, START[0], p, h=h, adjoint=adjoint, observe=section, **options)
+    found = sol.observed
+    return found.ts[0] ** 2 + found.qs[0, 0] * found.ps[0, 1]
 
 
 @pytest.mark.slow
@@ -258,7 +254,7 @@ def test_starts_beyond_a_stop_and_clocks_that_jump_have_a_status():
 
 
 @pytest.mark.slow
-def test_in_a_transformed_time():
+def test_transformed_time_implicit_steps_and_progress():
     """Sections, times and stops use t, not the fictitious time."""
     ts, section = np.array([0.0, 1.0, 3.3, 7.7]), dvi.Section(on_axis, 1, max_crossings=2)
     settings = {"lattice": dvi.TimeTransformed(radius), "method": dvi.Yoshida(6)}
@@ -271,10 +267,6 @@ def test_in_a_transformed_time():
     assert end.status == "stopped"
     far = exact(14.0, lambda t, q, p, args: np.hypot(*q) - 1.5, 1)
     assert float(end.stop.t) == pytest.approx(far.t_events[0][0], abs=1e-5)
-
-
-@pytest.mark.slow
-def test_implicit_forced_steps_and_progress():
     system = dvi.System(pendulum, force=lambda t0, t1, q, p, args: -p + jnp.cos(t0))
     options = {"h": 0.05, "num_steps": 200, "epsilon": 0.1, "method": dvi.Strang()}
     options |= {"save": dvi.Save(ts=[0.33, 6.66]), "observe": dvi.Section(first_component)}

@@ -347,7 +347,7 @@ def test_warnings():
     assert "100 % of the paths were truncated" in fake(good, steps=1023).warnings[0]
 
 
-def test_arviz_old_new_and_none(monkeypatch):
+def test_packages_that_are_old_or_missing(monkeypatch):
     found = fake(np.random.default_rng(0).normal(size=(2, 50)))
     new = types.SimpleNamespace(__version__="1.0.0")
     old = types.SimpleNamespace(__version__="0.22.0", InferenceData=lambda **groups: groups)
@@ -358,9 +358,6 @@ def test_arviz_old_new_and_none(monkeypatch):
     monkeypatch.setitem(sys.modules, "arviz", None)
     with pytest.raises(ImportError, match="pip install arviz"):
         found.to_arviz()
-
-
-def test_without_numpyro_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "numpyro.infer", None)
     with pytest.raises(ImportError, match=r"dvi-jax\[bayes\]"):
         dvi.sample(LINE, on_a_line(), PAIR)

@@ -100,7 +100,7 @@ def test_adjoints_agree_to_round_off_for_every_way_of_saving(system, adjoint, sa
 
 
 @pytest.mark.slow
-def test_second_derivative_and_batched_gradient():
+def test_second_derivatives_and_batches_in_every_mode():
     x = point("non_separable")
 
     def in_epsilon(adjoint):
@@ -116,6 +116,21 @@ def test_second_derivative_and_batched_gradient():
     es = jnp.array([0.1, 0.2, 0.3])
     batch = jax.jit(jax.vmap(jax.grad(in_epsilon("Reversible"))))(es)
     np.testing.assert_allclose(batch, [slope(e) for e in es], rtol=1e-11)
+    # Of a batch with a shared parameter.
+
+    def derivative(adjoint, *modes):
+        f = functools.partial(shared, adjoint=adjoint)
+        for mode in modes:
+            f = mode(f)
+        return jax.jit(f)(1.0)
+
+    forward, reverse = jax.jacfwd, jax.grad
+    expected = derivative("Direct", reverse)
+    for mode in (forward, reverse):
+        np.testing.assert_allclose(derivative("Reversible", mode), expected, rtol=1e-11)
+    expected = derivative("Direct", forward, forward)
+    for modes in itertools.product((forward, reverse), repeat=2):
+        np.testing.assert_allclose(derivative("Reversible", *modes), expected, rtol=1e-10)
 
 
 @pytest.mark.slow
@@ -225,25 +240,6 @@ def shared(mu, adjoint):
         return dvi.integrate(SYSTEMS["kepler"][0], q, [-1.0, -0.6], observe=positive, **how).qs
 
     return jnp.sum(jax.vmap(one)(jnp.array([[0.5, 0.3], [0.0, 1.2]])) ** 2)
-
-
-@pytest.mark.slow
-def test_first_and_second_derivatives_in_every_combination_of_modes():
-    """Of a batch with a shared parameter."""
-
-    def derivative(adjoint, *modes):
-        f = functools.partial(shared, adjoint=adjoint)
-        for mode in modes:
-            f = mode(f)
-        return jax.jit(f)(1.0)
-
-    forward, reverse = jax.jacfwd, jax.grad
-    expected = derivative("Direct", reverse)
-    for mode in (forward, reverse):
-        np.testing.assert_allclose(derivative("Reversible", mode), expected, rtol=1e-11)
-    expected = derivative("Direct", forward, forward)
-    for modes in itertools.product((forward, reverse), repeat=2):
-        np.testing.assert_allclose(derivative("Reversible", *modes), expected, rtol=1e-10)
 
 
 @pytest.mark.parametrize(

@@ -100,7 +100,7 @@ def series_system(seed=0, orders=4, size=9, secular=3):
     return terms
 
 
-def test_null_vectors_order_by_order_are_those_of_the_whole_matrix():
+def test_null_vectors_and_solutions_order_by_order():
     terms = series_system()
     system = BlockTriangular(terms, larger_than(1e-10))
     counts = [tuple(c.shape[2] for c in system.null(k)) for k in range(4)]
@@ -119,9 +119,6 @@ def test_null_vectors_order_by_order_are_those_of_the_whole_matrix():
         assert not shifts[:9].any()
     terms[:, 3, -1] += 1e-3 * np.random.default_rng(1).normal(size=40)  # lost at order 3 as well
     assert BlockTriangular(terms, larger_than(1e-10)).null(3)[0].shape[2] == 0
-
-
-def test_solutions_order_by_order_have_only_the_coefficients_that_are_free():
     terms, rng = series_system(), np.random.default_rng(2)
     free = rng.uniform(size=(4, 9)) < 0.7
     c = np.where(free, rng.normal(size=(4, 9)), 0.0)[..., None]

@@ -180,7 +180,7 @@ def test_batch_equals_loop_and_jit_equals_eager():
     np.testing.assert_allclose(jax.jit(final)(es[1]), final(es[1]), rtol=1e-14, atol=1e-16)
 
 
-def test_one_trace_per_shape():
+def test_one_trace_per_shape_and_of_each_step():
     traces = []
 
     def counted(t0, t1, q0, p1, args):
@@ -197,10 +197,7 @@ def test_one_trace_per_shape():
     assert go(np.ones(2), 0.1, 0.0, 1.0) > 1
     assert go(np.zeros(2), 0.2, 0.5, 2.0) <= 1  # the check of shapes
     assert go(np.ones(3), 0.1, 0.0, 1.0) > 1
-
-
-def test_the_step_is_traced_once():
-    """For a forward run and for its gradient; H_D once for its shape and once for each half."""
+    # For a forward run and for its gradient; H_D once for its shape and once for each half.
     calls = []
 
     def H_D(t0, t1, q0, p1, args):
@@ -253,7 +250,7 @@ def test_the_state_sets_the_precision():
     assert sol.qs.dtype == sol.ts.dtype == jnp.float32
 
 
-def test_newton_failure_is_named_with_step_and_residual():
+def test_failures_are_named_and_keep_the_states_before():
     match = r"step 0 of 10 .*residual .*did not converge"
     with pytest.raises(dvi.IntegrationError, match=match) as e:
         dvi.integrate(NON_SEPARABLE, [3.0], [4.0], h=10.0, num_steps=10)
@@ -262,10 +259,7 @@ def test_newton_failure_is_named_with_step_and_residual():
     lattice = dvi.Given(np.array([0.0, 0.001, 10.0]))
     with pytest.raises(dvi.IntegrationError, match=r"step 1 of 2 .*h = 9.999"):
         dvi.integrate(NON_SEPARABLE, [3.0], [4.0], lattice=lattice)
-
-
-def test_failure_later_in_the_run_keeps_the_states_before():
-    """H = p²/2 + √(1/2 − q) ends at q = 1/2: the orbit until then is there, the rest is NaN."""
+    # H = p²/2 + √(1/2 − q) ends at q = 1/2: the orbit until then is there, the rest is NaN.
     system = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + jnp.sum(jnp.sqrt(0.5 - q)))
     how = {"h": 0.2, "num_steps": 9, "observe": dvi.Range(energy)}
     sol = dvi.integrate(system, [0.0], [1.0], throw=False, **how)
@@ -400,9 +394,6 @@ def test_results_of_a_batch_are_counted_together(monkeypatch):
     ):
         with pytest.raises(ValueError, match=r"10 saved states of each of 12 trajectories"):
             f(jnp.ones((3, 4, 2)))
-
-
-def test_results_that_fit_are_computed(monkeypatch):
     monkeypatch.setattr(_memory, "machine_memory", lambda: 4 * 480)
     assert jax.vmap(final_position)(jnp.ones((4, 2))).shape == (4, 2)
     monkeypatch.setattr(_memory, "machine_memory", lambda: 2 * 48)
@@ -411,7 +402,7 @@ def test_results_that_fit_are_computed(monkeypatch):
     assert final_position(jnp.ones(2)).shape == (2,)
 
 
-def test_the_memory_of_this_machine_is_known(monkeypatch, tmp_path):
+def test_the_memory_of_this_machine_and_of_devices(monkeypatch, tmp_path):
     found, read = _memory.machine_memory(), _memory.Path.read_text
     assert found is None or found > 2**28
     monkeypatch.setattr(_memory, "_CGROUPS", tmp_path)
@@ -423,8 +414,6 @@ def test_the_memory_of_this_machine_is_known(monkeypatch, tmp_path):
     monkeypatch.setattr(_memory.Path, "read_text", read_text)
     assert 12345678 in _memory._limits()
 
-
-def test_results_on_other_devices_have_the_memory_of_these(monkeypatch):
     def device(limit):
         return SimpleNamespace(memory_stats=lambda: {"bytes_limit": limit} if limit else None)
 

@@ -86,17 +86,14 @@ def test_gradients_are_those_of_the_map(method):
 
 
 @pytest.mark.slow
-def test_a_batch_is_the_loop():
+def test_batches_and_failed_solves():
+
     def end(q0):
         return by_diffrax(interop.diffrax_solver(dvi.Strang()), 1.0, q0=q0).ys[0][-1]
 
     starts = Q0[None] + jnp.array([[0.0, 0.0], [0.1, 0.2], [-0.3, 0.1]])
     together = jax.vmap(end)(starts)
     np.testing.assert_allclose(together, jnp.stack([end(q) for q in starts]), rtol=0, atol=1e-14)
-
-
-@pytest.mark.slow
-def test_a_failed_solve_has_a_status_of_diffrax():
     term, solver = interop.diffrax_term(dvi.System(non_separable)), interop.diffrax_solver()
     y0 = jnp.array([3.0]), jnp.array([3.0])
 

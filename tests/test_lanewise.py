@@ -1081,7 +1081,7 @@ def loops_around_a_callback(x, y):
     return last, called_back(last) + 1.0, x, 3.0, y
 
 
-def test_loops_around_a_callback_are_compiled(left):
+def test_loops_around_a_callback_or_a_sort_are_compiled(left):
     found = jax.jit(lanewise.batched(loops_around_a_callback, in_axes=(0, None)))(VALUES, 0.3)
     expected = jax.jit(jax.vmap(loops_around_a_callback, in_axes=(0, None)))(VALUES, 0.3)
     assert_close(found, expected)
@@ -1091,6 +1091,13 @@ def test_loops_around_a_callback_are_compiled(left):
     parts = lanewise.explain(loops_around_a_callback, 1.0, 0.3).parts
     kinds = ["code" if p.reason is None else p.reason.split()[-1] for p in parts]
     assert kinds == ["code", "pure_callback", "code", "code", "pure_callback"]
+
+    def function(x):
+        row = jnp.sort(lax.fori_loop(0, 5, lambda _, z: 0.9 * z, x * jnp.arange(20.0)))
+        return lax.fori_loop(0, 5, lambda _, z: jnp.sin(z), row[-1])
+
+    found = jax.jit(jax.vmap(jax.grad(lambda x: lanewise.call(function, x))))(VALUES[:5])
+    assert_close(found, jax.jit(jax.vmap(jax.grad(function)))(VALUES[:5]))
 
 
 def test_loops_that_are_too_large_together_end_in_xla(left, monkeypatch):
@@ -1105,15 +1112,6 @@ def test_loops_that_are_too_large_together_end_in_xla(left, monkeypatch):
 
     assert_close(jax.jit(lanewise.batched(function))(VALUES), jax.jit(jax.vmap(function))(VALUES))
     assert len(left) == 1
-
-
-def test_derivative_of_loops_around_a_sort():
-    def function(x):
-        row = jnp.sort(lax.fori_loop(0, 5, lambda _, z: 0.9 * z, x * jnp.arange(20.0)))
-        return lax.fori_loop(0, 5, lambda _, z: jnp.sin(z), row[-1])
-
-    found = jax.jit(jax.vmap(jax.grad(lambda x: lanewise.call(function, x))))(VALUES[:5])
-    assert_close(found, jax.jit(jax.vmap(jax.grad(function)))(VALUES[:5]))
 
 
 PROCESSORS = [

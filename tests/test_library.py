@@ -508,7 +508,7 @@ def test_singular_starts_are_refused(name, q0, p0, said):
         problem(name).check(q0, p0, problem(name).args)
 
 
-def test_facts_about_nothing_are_refused():
+def test_facts_and_observables_of_problems():
     """A `Problem` does not promise what it cannot show."""
     made = problem("kepler")
     parts = {"name": "x", "system": made.system, "q0": [0.0], "p0": [0.0], "h": 0.1}
@@ -519,9 +519,6 @@ def test_facts_about_nothing_are_refused():
     ):
         with pytest.raises(ValueError, match=message):
             systems.Problem(**parts, **facts)
-
-
-def test_an_observable_in_slow_time_asks_for_epsilon():
     action = problem("slow_oscillator").observables["action"]
     at = (0.0, 0.1, *(jnp.ones(1) for _ in range(4)), {"depth": 0.3})
     with pytest.raises(ValueError, match="needs the value of epsilon"):
