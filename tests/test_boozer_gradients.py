@@ -15,7 +15,6 @@ from helpers import central_difference
 from dvi_jax.systems import boozer
 
 MODES = {(0, 0): 5.7, (1, 0): -0.9, (0, 2): 0.12, (1, 2): 0.06, (2, -2): 0.05}
-BREAKING = [mode for mode in MODES if mode[1] != 0]
 ENERGY = 3.5e4
 STEPS = 250
 

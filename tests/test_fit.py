@@ -579,16 +579,14 @@ def test_resumed_with_the_same_bits(kind, tmp_path, monkeypatch):
     np.testing.assert_array_equal(again.covariance, whole.covariance)
 
 
-def stiffer(t0, t1, q0, p1, args):
-    return H(t0, t1, q0, p1, args) + jnp.sum(q0**4)
-
-
 def test_a_checkpoint_of_another_fit_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "_INTERVAL", 0.0)
     data, file = seen(11), tmp_path / "fit.npz"
     with pytest.raises(Interrupted):
         dvi.fit(MODEL, data, START, checkpoint=file, progress=interrupt(1))
-    other = model_of(dvi.System(stiffer, force=W))
+    other = model_of(
+        dvi.System(lambda t0, t1, q0, p1, args: H(t0, t1, q0, p1, args) + jnp.sum(q0**4), force=W)
+    )
     for change in (
         {"loss": dvi.Cauchy()},
         {"priors": {"epsilon": dvi.Prior(0.5, 1e-3)}},

@@ -28,10 +28,6 @@ def cubic(t0, t1, q0, p1, args):
     return (p1 @ p1 + args["k"] * q0 @ q0) / 2
 
 
-def pull(t0, t1, q0, p1, args):
-    return -(q0**3)
-
-
 LINE = dvi.Model(dvi.System(free), h=H)
 PAIR = {"q0": np.array([0.1]), "p0": np.array([0.9])}
 
@@ -50,7 +46,9 @@ def line_by_hand(data, sigma):
     return C @ A.T @ data.values[:, 0] / sigma, C
 
 
-OSCILLATOR = dvi.Model(dvi.System(cubic, force=pull), h=H, p0=jnp.array([0.3]))
+OSCILLATOR = dvi.Model(
+    dvi.System(cubic, force=lambda t0, t1, q0, p1, args: -(q0**3)), h=H, p0=jnp.array([0.3])
+)
 NEAR = {"epsilon": 0.03, "q0": np.array([0.8]), "args": {"k": 1.1}}
 LIMITS = {"epsilon": dvi.Bounds(0.0, 0.2), "args": {"k": dvi.Bounds(lower=0.5)}}
 

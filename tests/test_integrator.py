@@ -47,10 +47,6 @@ def poincare(system=PENDULUM, **how):
     return dvi.poincare_section(system, *START_OF_SECTION, crossing, **SECTION, **how).qs
 
 
-def return_map(**how):
-    return dvi.ReturnMap(PENDULUM, crossing, 0.1, 200, **how)(jnp.array([0.5]), jnp.array([0.0])).q
-
-
 def drift_order(**how):
     run = {"h": 0.1, "num_steps": 50, **DRIFT}
     return dvi.drift_order(FORCED, velocity, [0.4], [0.1], **run, **how).drifts
@@ -65,7 +61,9 @@ CALLS = {
     "integrate": last,
     "sweep": sweep,
     "poincare_section": poincare,
-    "ReturnMap": return_map,
+    "ReturnMap": lambda **how: (
+        dvi.ReturnMap(PENDULUM, crossing, 0.1, 200, **how)(jnp.array([0.5]), jnp.array([0.0])).q
+    ),
     "tangent_map": lambda **how: dvi.tangent_map(PENDULUM, **START, num_steps=20, **how),
     "drift_order": drift_order,
     "discover_invariants": invariants,
@@ -149,10 +147,6 @@ def symmetries(**how):
     return dvi.find_symmetries(PENDULUM, basis, **SAMPLED, time=False, **how).singular_values
 
 
-def type_iii(t0, t1, q1, p0, args):
-    return p0 @ p0 / 2 - jnp.sum(jnp.cos(q1))
-
-
 IMPLICIT = dvi.System(implicit)
 ROOT_FINDERS = {
     **CALLS,
@@ -164,7 +158,9 @@ ROOT_FINDERS = {
     "solution_pairs": lambda **how: dvi.solution_pairs(IMPLICIT, h=0.1, samples=LEFT, **how)[1].q,
     "legendre": lambda **how: value_of(dvi.legendre(lagrangian, **how)),
     "from_lagrangian": lambda **how: value_of(dvi.from_lagrangian(action, **how)),
-    "from_type_iii": lambda **how: value_of(dvi.from_type_iii(type_iii, **how)),
+    "from_type_iii": lambda **how: value_of(
+        dvi.from_type_iii(lambda t0, t1, q1, p0, args: p0 @ p0 / 2 - jnp.sum(jnp.cos(q1)), **how)
+    ),
     "solve_ivp": lambda **how: interop.solve_ivp(IMPLICIT, (0, 1.0), [0.5, 0.1], h=0.1, **how).y,
 }
 """Public functions with the keyword `root_finder`; three of them also take `newton`."""

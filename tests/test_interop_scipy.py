@@ -12,15 +12,10 @@ from dvi_jax import interop, systems
 KEPLER = systems.kepler()
 
 
-def pendulum(t0, t1, q0, p1, args):
-    return jnp.sum(p1**2) / 2 - args * jnp.sum(jnp.cos(q0))
-
-
-def drive(t0, t1, q0, p1, args):
-    return jnp.full_like(q0, jnp.cos(2 * t0))
-
-
-SYSTEM = dvi.System(pendulum, force=drive)
+SYSTEM = dvi.System(
+    lambda t0, t1, q0, p1, args: jnp.sum(p1**2) / 2 - args * jnp.sum(jnp.cos(q0)),
+    force=lambda t0, t1, q0, p1, args: jnp.full_like(q0, jnp.cos(2 * t0)),
+)
 Y0, K, EPSILON = [0.9, 0.3], 1.3, 0.05
 FIELD = jax.jit(interop.vector_field(SYSTEM, EPSILON))
 

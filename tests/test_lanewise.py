@@ -318,10 +318,6 @@ def nested_and_reversed(x):
     return lax.scan(outer, x, jnp.arange(40), reverse=True)
 
 
-def old_carry_as_row(x):
-    return lax.scan(lambda c, k: (0.9 * c + k, c), x, jnp.asarray(TABLE))
-
-
 def swapped_carry(x):
     def step(c, _):
         a, b, n = c
@@ -364,7 +360,7 @@ CASES = {
     "nested and reversed": (nested_and_reversed, VALUES),
     "reversed": (lambda x: rows_of(x, 200, reverse=True), VALUES),
     "1000 rows": (lambda x: rows_of(x, 1000), VALUES),
-    "old carry": (old_carry_as_row, VALUES),
+    "old carry": (lambda x: lax.scan(lambda c, k: (0.9 * c + k, c), x, jnp.asarray(TABLE)), VALUES),
     "swapped carry": (swapped_carry, VALUES),
     "rows that do not vary": (rows_that_do_not_vary, VALUES),
     "used after saving": (used_after_saving, VALUES),
