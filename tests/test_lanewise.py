@@ -506,41 +506,10 @@ def rows_in_a_while_loop(x):
     return lax.while_loop(lambda c: (c[0] < 6) & (c[2] < 1.9), body, (0, jnp.zeros(6), x))
 
 
-def outside_of_arrays(x):
-    five = jnp.arange(5.0)
-    k = (x * 3).astype(int)
-    return (
-        lax.dynamic_slice(five, (jnp.int32(9),), (2,)),
-        jnp.arange(5)[jnp.int32(-7)],
-        jnp.zeros(3).at[7].set(x),
-        jnp.zeros(3).at[-1].set(x),
-        jnp.zeros(3).at[-4].add(x),
-        five[k],
-        five.at[k].get(mode="fill", fill_value=-1.0),
-        five.at[k].set(x, mode="drop"),
-    )
-
-
 def of_truth(x):
     a, b = x > 0, x > 1
     rows = jnp.stack([a, x < 1])
     return a * 2.0, a + b, a == b, a < b, jnp.maximum(a, b), jnp.sum(rows), jnp.cumsum(rows)
-
-
-def remainders(x):
-    return x % 0.7, jnp.fmod(x, 0.3), x // 0.3, jnp.divmod(x, -0.7), lax.rem(x, 0.0)
-
-
-def powers(x):
-    y = jnp.abs(x)
-    return y**x, x**2, x**-3, 2.0**x, y**0.5, jnp.power(x, 3.0), 0.0 ** (x * 0), x**0.0, y**2.7
-
-
-def to_integers(x):
-    wide = (jnp.int8, jnp.uint8, jnp.int16, jnp.int32, jnp.uint32, jnp.int64)
-    return [[(x * s).astype(t) for t in wide] for s in (1.0, 1e3, 1e10, 1e30)], jnp.log(x).astype(
-        int
-    )
 
 
 def a_root(x):
@@ -658,11 +627,7 @@ FUNCTIONS = {
     "rows in a branch": (rows_in_a_branch, VALUES),
     "on_any": (on_any_in_a_branch, VALUES),
     "rows in a while loop": (rows_in_a_while_loop, VALUES),
-    "outside of arrays": (outside_of_arrays, VALUES),
     "truth": (of_truth, VALUES),
-    "remainders": (remainders, VALUES),
-    "powers": (powers, VALUES),
-    "to integers": (to_integers, VALUES),
     "root": (a_root, np.abs(VALUES)),
     "matrices": (
         lambda m: (jnp.einsum("ij,jk->ki", m, m), jnp.kron(m[0], m[1]), jnp.tensordot(m, m, 2),
@@ -693,9 +658,9 @@ FUNCTIONS = {
 QUICK = {
     "start and tail", "saved in blocks", "rows that do not vary", "table", "long and scanned",
     "wide sum", "long truth", "uint32", "int8", "no step", "an empty operand", "a call in a call",
-    "tables", "stacks of systems", "late to vary", "rows in a branch", "outside of arrays",
-    "rows in a while loop", "truth", "powers", "to integers", "root", "along axes", "used twice",
-    "rounds of each row", "derivatives inside", "product with an empty sum",
+    "tables", "stacks of systems", "late to vary", "rows in a branch", "rows in a while loop",
+    "truth", "root", "along axes", "used twice", "rounds of each row", "derivatives inside",
+    "product with an empty sum",
 }  # fmt: skip
 
 
