@@ -101,8 +101,9 @@ def test_gradient_of_the_second_invariant():
 
 def test_second_invariant_of_a_passing_particle_and_extremes_ignore_nan():
     assert np.isnan(compiled()(field(), 0.4, 0.3, 0.2, 0.3 / 5, 0.5)[0])
-    assert np.isnan(boozer.well(field(), 0.4, 0.3, 0.2, 0.3 / 5).low)
-    low, high = boozer.well(field(), *POINT)
+    well = jax.jit(boozer.well)
+    assert np.isnan(well(field(), 0.4, 0.3, 0.2, 0.3 / 5, 0.5).low)
+    low, high = well(field(), *POINT)
     alpha = POINT[1] - (IOTA[0] + IOTA[1] * POINT[0]) * POINT[2]
     for end in (low, high):
         assert strength(POINT[0], alpha, float(end)) == pytest.approx(5.05, rel=1e-13)

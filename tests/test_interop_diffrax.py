@@ -45,6 +45,7 @@ def test_states_are_those_of_integrate(method):
     assert jnp.max(jnp.abs(theirs.ys[0] - unperturbed.qs)) > 1e-4
 
 
+@pytest.mark.slow
 def test_steps_backwards_and_of_any_size():
     """The states differ by the round-off of the times."""
     theirs = by_diffrax(interop.diffrax_solver(dvi.Strang()), h=0.1)

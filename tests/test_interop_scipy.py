@@ -93,7 +93,10 @@ def test_events_are_where_those_of_scipy_are(t_span, direction):
             np.testing.assert_allclose(a, b.reshape(a.shape), rtol=0, atol=2e-8)
 
 
-@pytest.mark.parametrize(("terminal", "t_span"), [(True, (0.0, 9.0)), (2, (2.0, -7.0))])
+BACKWARDS = pytest.param(2, (2.0, -7.0), marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize(("terminal", "t_span"), [(True, (0.0, 9.0)), BACKWARDS])
 def test_a_terminal_event_truncates_the_output(terminal, t_span):
     events = [marked(high, terminal), marked(low)]
     wanted, found = theirs(t_span, events=events), ours(t_span, events=events)
@@ -138,6 +141,7 @@ def test_a_failure_is_reported_and_not_raised():
     assert (early.status, list(early.t)) == (-1, [1.0])
 
 
+@pytest.mark.slow
 def test_successes_before_a_failure_and_events_with_numbers_of_numpy():
     found = collapsing(events=marked(lambda t, y: y[0] - 0.8, terminal=True))
     assert (found.status, found.success) == (1, True)
