@@ -277,6 +277,7 @@ def test_axes_of_the_state_are_distinguished_from_those_of_a_batch():
     np.testing.assert_allclose(one.frequencies, w, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_shapes_of_batches():
     rows, sols = TS + 0j * np.ones((2, 1)), as_solution(np.ones((2, 256), complex))
     each = jax.eval_shape(jax.vmap(lambda row: frequencies(TS, row, throw=False)), rows)
