@@ -38,7 +38,7 @@ MOST = set(NAMES) - ALIKE
 CONSTRAINED = {"spherical_pendulum", "chain", "slider_crank", "dumbbell", "heavy_top", "satellite"}
 """Those with a constraint, whose forces are added to the flow, and whose method is `Rattle`."""
 FLOWS = {"oscillator", "pendulum", "duffing", "kepler", "relativistic_kepler", "henon_heiles"}
-FLOWS |= {"lotka_volterra", "two_centres", "slow_oscillator", "rigid_body", "dumbbell"}
+FLOWS |= {"lotka_volterra", "slow_oscillator", "dumbbell"}
 """Those whose flow is in every run of the tests, one of each kind."""
 ELLIPTIC = {"spherical_pendulum", "heavy_top", "spinning_top", "rigid_body"}
 """Those whose exact solutions take more than two seconds to trace."""
