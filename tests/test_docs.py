@@ -170,7 +170,7 @@ def test_links_names_and_sizes_of_the_site(site, tmp_path):
     names = [n for n in _namespaces.names() if callable(getattr(dvi, n))]
     assert len(names) > 120
     assert [n for n in names if f'id="dvi_jax.{n}"' not in text] == []
-    # With its pictures; scripts and styles are loaded once for all pages.
+    # At most 500 kB with its pictures; scripts and styles are loaded once for all pages.
     large = {}
     for path in site.rglob("*.html"):
         text = path.read_text(encoding="utf-8")

@@ -149,7 +149,7 @@ def change_in_a_step(series, powers, q, p, epsilon, h):
     ("order", "degree", "survivors", "wrong_at", "largest"),
     [
         (2, 4, (2, 1, 1), 1, 40),
-        # The survivors by the degree that is left for corrections.
+        # Fewer with each order, by the degree that remains for corrections.
         pytest.param(6, 8, (4, 3, 3, 2, 2, 1, 1), 4, 2, marks=pytest.mark.slow),
     ],
 )
