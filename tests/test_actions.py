@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import pendulum
 from scipy import special
 
 import dvi_jax as dvi
@@ -125,10 +126,6 @@ def slow(t0, t1, q, p, args):
     """An oscillator whose frequency goes from 1 to 1.5 at a rate."""
     omega = 1.25 + 0.25 * jnp.tanh(args * (t0 - 300.0))
     return jnp.sum(p**2) / 2 + omega**2 * jnp.sum(q**2) / 2
-
-
-def pendulum(t0, t1, q, p, args):
-    return jnp.sum(p**2) / 2 - jnp.sum(jnp.cos(q))
 
 
 RATES = np.array([0.1, 1.0, 30.0])
@@ -280,16 +277,14 @@ def test_axes_of_the_state_are_distinguished_from_those_of_a_batch():
     np.testing.assert_allclose(one.frequencies, w, rtol=1e-12)
 
 
-def test_axes_added_by_vmap_are_batch():
+@pytest.mark.slow
+def test_shapes_of_batches():
     rows, sols = TS + 0j * np.ones((2, 1)), as_solution(np.ones((2, 256), complex))
     each = jax.eval_shape(jax.vmap(lambda row: frequencies(TS, row, throw=False)), rows)
     assert each.frequencies.shape == (2, 8)
     assert each.state_axes == 0
     assert jax.eval_shape(lambda z: frequencies(TS, z, throw=False), rows).state_axes == 1
     assert jax.eval_shape(lambda s: frequencies(s, throw=False), sols).state_axes == 0
-
-
-def test_an_empty_batch_has_shapes_and_types():
     none = np.zeros((0, 2, 256), complex)
     torus = fundamental_frequencies(frequencies(TS, none, count=4))
     assert torus.frequencies.shape == (0, 2)
@@ -305,7 +300,7 @@ def planted(*lines):
     return frequencies(TS, np.stack([z, z]), count=4, throw=False)
 
 
-def test_leading_lines_that_are_not_a_basis():
+def test_lines_that_are_not_a_basis_or_no_combination():
     """2ω₁ leads; the basis is among the weaker lines."""
     a, b = 0.7, 0.7 * 0.3819660113
     torus = fundamental_frequencies(planted((2 * a, 1), (a + b, 0.4), (a, 0.3), (b, 0.1)))
@@ -315,9 +310,6 @@ def test_leading_lines_that_are_not_a_basis():
     M = np.rint(np.linalg.lstsq(torus.combinations[0], known, rcond=None)[0])
     assert abs(round(np.linalg.det(M))) == 1
     np.testing.assert_allclose(M @ [a, b], torus.frequencies, rtol=1e-9)
-
-
-def test_a_line_that_is_not_a_combination_gives_a_status():
     lines = planted((1.0, 1), (0.6180339887, 0.5), (0.7390851332, 0.2), (2.0, 0.1))
     with pytest.raises(FrequencyError, match="not a sum of lines") as info:
         fundamental_frequencies(lines)

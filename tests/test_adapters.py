@@ -91,11 +91,8 @@ def apart(one, two):
     return max(np.max(np.abs(one.qs - two.qs)), np.max(np.abs(one.ps - two.ps)))
 
 
-# --- values ------------------------------------------------------------------------------------
-
-
 @slow
-def test_the_lagrangian_of_the_paper_is_its_kepler_problem():
+def test_the_hamiltonians_of_discrete_and_continuous_lagrangians():
     """Values, trajectories, and explicit where that is."""
     H_D, exact = dvi.legendre(kepler_lagrangian), KEPLER.system.H_D
     assert abs(H_D(0.0, 0.1, Q, P, K) - exact(0.0, 0.1, Q, P, K)) < 2e-16
@@ -107,11 +104,7 @@ def test_the_lagrangian_of_the_paper_is_its_kepler_problem():
         return jnp.sum(v**2) - kepler_lagrangian(t0, t1, q, v, args)
 
     assert apart(run(dvi.legendre(printed), Q, P, 10), run(exact, Q, P, 10)) > 1e-2
-
-
-@slow
-def test_a_continuous_lagrangian_gives_its_hamiltonian():
-    """Against H by hand; one that is not quadratic too, up to momenta far beyond its mass."""
+    # Against H by hand; one that is not quadratic too, up to momenta far beyond its mass.
     H = dvi.legendre(curved)
     q, p = jnp.array([0.4, -1.0]), jnp.array([0.7, 2.0])
     np.testing.assert_allclose(H(0.0, q, p, None), curved_energy(0, 0, q, p, None), rtol=1e-15)
@@ -168,8 +161,6 @@ def test_type_ii_to_type_i_and_back():
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=3e-15 * np.max(np.abs(theirs)))
     assert abs(both(p)[0][0] - both(p * 1.001)[0][0]) > 1e-5
 
-
-# --- maps --------------------------------------------------------------------------------------
 
 ADJOINT, STRANG = dvi.Adjoint(), dvi.Strang()
 KICKS, DRIFTS = STRANG, dvi.Strang(base=ADJOINT)
@@ -308,9 +299,6 @@ def test_symmetries_of_an_adapted_hamiltonian():
     assert found.variational
 
 
-# --- gradients, batches, status ----------------------------------------------------------------
-
-
 @slow
 @pytest.mark.parametrize("adapt", ["from_lagrangian", "from_type_iii"])
 def test_gradients_go_through_the_inner_solve(adapt):
@@ -375,10 +363,8 @@ def test_an_inner_solve_without_a_solution_has_a_status(H_D, method):
     assert run(H_D, *ONE, 2, method, throw=False).status == "not_finite"
 
 
-# --- rejected input ----------------------------------------------------------------------------
+def test_invalid_functions_and_a_slow_time_are_rejected():
 
-
-def test_invalid_functions_are_rejected():
     def three(t, q, v):
         return 0.0
 
@@ -403,9 +389,6 @@ def test_invalid_functions_are_rejected():
         system = dvi.System(adapt(lambda t0, t1, a, b, args: a * b))
         with pytest.raises(ValueError, match=rf"{name}\(.*must return a real scalar .*\(2,\) and"):
             run(system, Q, P, 1)
-
-
-def test_a_slow_time_has_no_step_in_it():
     for adapt in (dvi.from_lagrangian, dvi.from_type_iii):
         with pytest.raises(ValueError, match="step as t1 − t0"):
             dvi.System(adapt(backwards), slow_time=True)

@@ -107,7 +107,7 @@ def test_a_constant_speed_is_a_uniform_grid(kind, method, rtol):
         )
 
 
-@pytest.mark.parametrize("method", [dvi.Strang(), dvi.McLachlan(4)])
+@pytest.mark.parametrize("method", [dvi.Strang(), pytest.param(dvi.McLachlan(4), marks=SLOW)])
 def test_the_order_is_that_of_the_method(method):
     """With a force, a g that depends on time and momentum, at requested times, against DOP853."""
 
@@ -149,25 +149,28 @@ def test_events_and_observables():
 
 
 @pytest.mark.parametrize(
-    "lattice", [CLOSE, pytest.param(dvi.TimeTransformed(radius_32), marks=SLOW)]
+    ("lattice", "adjoint"),
+    [
+        (CLOSE, dvi.Reversible()),
+        *(pytest.param(CLOSE, x(), marks=SLOW) for x in (dvi.Checkpointed, dvi.Direct)),
+        pytest.param(dvi.TimeTransformed(radius_32), dvi.Reversible(), marks=SLOW),
+    ],
 )
-def test_gradients_and_batches(lattice):
-    def last(e, adjoint):
+def test_gradients_and_batches(lattice, adjoint):
+    def last(e):
         q = jnp.stack([1 - e, 0.0 * e])
         p = jnp.stack([0.0 * e, jnp.sqrt((1 + e) / (1 - e))])
         how = {"h": 0.1 + 0.05 * e, "num_steps": 30, "save": LAST, "adjoint": adjoint}
         sol = run(q, p, lattice=lattice, **how)
         return sol.qs[-1, 0] + sol.ts[-1] + sol.stats.get("resume_h", 0.0)
 
-    e, step, usual = jnp.asarray(0.5), 1e-5, dvi.Reversible()
-    value = jax.jit(lambda e: last(e, usual))
+    e, step, value = jnp.asarray(0.5), 1e-5, jax.jit(last)
     expected = (value(e + step) - value(e - step)) / (2 * step)
-    for adjoint in (usual, dvi.Checkpointed(), dvi.Direct()):
-        slope = jax.jit(jax.grad(lambda e, a=adjoint: last(e, a)))(e)
-        assert slope == pytest.approx(float(expected), rel=1e-7)
+    slope = jax.jit(jax.grad(last))(e)
+    assert slope == pytest.approx(float(expected), rel=1e-7)
     tangent = jax.jit(lambda e: jax.jvp(value, (e,), (jnp.ones(()),))[1])(e)
     assert tangent == pytest.approx(float(slope), rel=1e-9)
-    batch = jax.jit(jax.vmap(lambda e: last(e, usual)))(jnp.array([0.3, 0.5]))
+    batch = jax.jit(jax.vmap(last))(jnp.array([0.3, 0.5]))
     assert batch[1] == value(e)  # to the bit
 
 
@@ -212,6 +215,7 @@ def test_machine_code_for_the_whole_run():
     assert "XLA" not in str(found), str(found)
 
 
+@SLOW
 def test_the_pythagorean_problem_after_its_closest_encounter():
     """At t = 20, with the speed of N bodies; the place is that of the Taylor series below."""
     problem, lattice = systems.pythagorean(), dvi.AdaptiveReversible(encounter_time)

@@ -49,9 +49,6 @@ def same_bits(a, b):
     return np.asarray(a).tobytes() == np.asarray(b).tobytes()
 
 
-# Compensated summation
-
-
 @pytest.mark.parametrize("order", [1, -1])
 def test_the_sum_is_exact_under_jit(order):
     """s + e = a + b in rational arithmetic; without e it is not, nor with Dekker's three sums."""
@@ -136,6 +133,7 @@ def test_every_method_is_the_same_in_local_coordinates(system, method, newton, m
         assert two > final_state(system, method, dvi.Compensated())[1]
 
 
+@pytest.mark.slow
 def test_an_equilibrium_is_solved_for_in_its_own_size():
     """p relaxes to 3, where increments are round-off: by their own size they settle late."""
     s = dvi.System(pendulum, force=lambda t0, t1, q0, p1, args: jnp.sin(q0) + 3 - p1)
@@ -163,7 +161,7 @@ def test_an_equilibrium_is_solved_for_in_its_own_size():
 
 
 @pytest.mark.slow
-def test_memory_goes_along_in_pieces_and_in_batches():
+def test_memory_of_sums_in_pieces_batches_and_single_precision():
     """With progress the run is in pieces; in a batch trajectories are as alone."""
     s, q, p = SYSTEMS["pendulum"]
     how = {"h": 0.0625, "num_steps": 3000, "epsilon": 0.0, "save": dvi.Save(every=10)}
@@ -181,11 +179,7 @@ def test_memory_goes_along_in_pieces_and_in_batches():
     batch = jax.vmap(lambda a: run(a * q, a * p).qs)(jnp.array([1.0, 0.5]))
     np.testing.assert_allclose(batch[0], whole.qs, atol=1e-12)
     np.testing.assert_allclose(batch[1], run(q / 2, p / 2).qs, atol=1e-12)
-
-
-@pytest.mark.slow
-def test_compensation_works_in_single_precision():
-    """Against double precision: the error of float32 without it is ten times as large."""
+    # Against double precision: the error of float32 without it is ten times as large.
     s = dvi.System(pendulum)
     q, p = np.array([0.4]), np.array([0.7])
 
@@ -211,9 +205,6 @@ def test_a_failed_trajectory_leaves_others_unchanged(arithmetic):
     assert list(batch.status) == ["successful", "not_finite", "successful"]
     assert np.isfinite(batch.qs[::2]).all()
     assert np.isnan(batch.qs[1, 1:]).all()
-
-
-# Fixed point
 
 
 def comes_back(orbit, methods, arithmetic, num_steps, batch=None):
@@ -337,9 +328,6 @@ def test_states_are_multiples_of_the_quantum():
     sol = dvi.integrate(dvi.System(pendulum), *start, arithmetic=dvi.FixedPoint(2.0**-8), **how)
     assert sol.qs[0, 0] == 77 / 256  # 76.8 quanta
     assert same_bits(sol.ps[0], np.zeros(1))  # half a quantum goes to even, to zero
-
-
-def test_rounding_is_odd_and_has_slope_one():
     x = jnp.array([0.3, 0.5, 1.5, -0.5, 2.49, 1e6 + 0.2])
     np.testing.assert_array_equal(to_grid(x, 1.0), [0, 0, 2, -0.0, 2, 1e6])
     np.testing.assert_array_equal(to_grid(-x, 0.25), -to_grid(x, 0.25))
@@ -398,9 +386,6 @@ def test_steps_that_fixed_point_cannot_undo_are_rejected():
         run(separable, q0=np.array([0.3], np.float32), quantum=2.0**-140)
     with pytest.raises(TypeError, match="Arithmetic"):
         dvi.integrate(separable, [0.3], [1.0], h=0.1, num_steps=1, arithmetic=dvi.Compensated)
-
-
-# Gradients, and other lattices
 
 
 @functools.cache

@@ -31,7 +31,7 @@ def test_bases_add_and_multiply():
     np.testing.assert_allclose(basis(q, p)[:3], [0.2, 0.6, 0.8])
 
 
-def test_chebyshev_polynomials_are_those_of_numpy():
+def test_families_have_the_functions_that_their_names_say():
     basis = dvi.Chebyshev(6, "t", domain=[0.0, 4.0]).for_shape(())
     t = 1.3
     expected = [np.polynomial.chebyshev.chebval(t / 2 - 1, np.eye(6)[k]) for k in range(6)]
@@ -39,17 +39,11 @@ def test_chebyshev_polynomials_are_those_of_numpy():
     assert basis.names[:3] == ("1", "T1(t)", "T2(t)")
     assert basis.uses_time
     assert not dvi.Chebyshev(6, "q").for_shape(()).uses_time
-
-
-def test_trigonometric_functions_have_their_period():
     basis = dvi.Trigonometric(2, "q", period=np.pi, constant=True).for_shape(())
     np.testing.assert_allclose(
         basis(0.3, 0.0), [1, np.cos(0.6), np.sin(0.6), np.cos(1.2), np.sin(1.2)]
     )
     assert basis.names == ("1", "cos 2q", "sin 2q", "cos 4q", "sin 4q")
-
-
-def test_radial_functions_are_powers_of_the_radius():
     q, p = np.array([3.0, 4.0]), np.array([0.6, 0.8])
     basis = dvi.Radial([-1, 0, 3]).for_shape((2,))
     np.testing.assert_allclose(basis(q, p), [0.2, 1, 125])
@@ -58,15 +52,12 @@ def test_radial_functions_are_powers_of_the_radius():
     np.testing.assert_allclose(of_p(q, p), [1.0])
 
 
-def test_formulas_read_well():
+def test_formulas_and_functions_of_time():
     basis = dvi.Polynomials(1, constant=True).for_shape(())
     assert basis.names == ("1", "q", "p")
     assert basis.formula([0.5, 1.0, -2.0]) == "0.5 + q − 2 p"
     assert basis.formula([-1.0, 0.0, 0.0]) == "−1"
     assert basis.formula([0.0, 0.0, 0.0]) == "0"
-
-
-def test_functions_of_time_are_recognised():
     timed = dvi.Basis({"q t": lambda q, p, t: q * t}).for_shape(())
     plain = dvi.Basis({"q": lambda q, p: q}).for_shape(())
     assert (timed.uses_time, plain.uses_time) == (True, False)

@@ -196,6 +196,7 @@ def test_both_charts_and_the_nested_solve_give_one_orbit():
     assert difference(c, a[1]) < 1e-8
 
 
+@slow
 def test_energy_error_scales_with_the_order_and_does_not_grow():
     start = [np.array(x)[1:2] for x in ORBITS["axisymmetric"]]
     coarse, fine = (
@@ -207,12 +208,13 @@ def test_energy_error_scales_with_the_order_and_does_not_grow():
 
 
 def test_the_toroidal_momentum_is_conserved_in_an_axisymmetric_field():
-    found = final("axisymmetric", [np.array(x) for x in ORBITS["axisymmetric"]], 4.0, stages=2)
-    assert np.abs(found.p[:, 1] / found.p0[:, 1] - 1).max() < 1e-12
-    found = final("helical", [np.array(x) for x in ORBITS["helical"]], 0.5)
-    assert np.abs(found.p[:, 1] / found.p0[:, 1] - 1).max() > 1e-3  # no symmetry
+    found = final("axisymmetric", [np.array(x) for x in ORBITS["axisymmetric"]], 0.8)
+    change = np.abs(found.p / found.p0 - 1).max(axis=0)
+    assert change[1] < 1e-12
+    assert change[0] > 1e-3  # of the poloidal one: |B| depends on θ
 
 
+@slow
 def test_a_step_is_symplectic():
     particles, _ = _run("helical", "regular", 3)
     q, p, args = particles.start(0.3, 0.2, 0.1, 0.4)
@@ -239,15 +241,12 @@ def test_orbits_cross_the_magnetic_axis():
     assert abs(found.z[2, 3]) > 1e-3  # it is accelerated along the field
 
 
-def test_a_start_at_the_edge_is_lost_at_once():
+@slow
+def test_orbits_that_are_lost():
     particles = boozer.GuidingCentres(axisymmetric(current=False))
     q, p, args = particles.start(1.0, 0.1, 0.0, 0.5)
     sol = integrate(particles, q, p, args, 2.0, 10, stop=particles.loss)
     assert (sol.status, float(sol.stop.t)) == ("stopped", 0.0)
-
-
-@slow
-def test_without_rotational_transform():
     field = boozer.from_modes([0, 1], [0, 0], [[5.7], [-0.5]], psi_edge=EDGE, iota=0.0, G=57.0)
     particles = boozer.GuidingCentres(field)
     q, p, args = particles.start(0.2, 0.3, 0.0, 0.5)
@@ -371,7 +370,10 @@ def test_reading_a_file_of_booz_xform(tmp_path, sign):
     assert jax.tree.all(jax.tree.map(lambda a, b: (a == b).all(), field, again))
 
 
-@pytest.mark.parametrize("name", ["precise QA", "precise QH", "r2 section 5.5"])
+NEAR_AXIS = ["precise QA", *(pytest.param(x, marks=slow) for x in ("precise QH", "r2 section 5.5"))]
+
+
+@pytest.mark.parametrize("name", NEAR_AXIS)
 def test_near_axis_expansions(name):
     """Against |B| as the package qsc computes it."""
     qsc = pytest.importorskip("qsc", reason='pip install "dvi-jax[stellarator]"')

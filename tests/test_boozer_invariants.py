@@ -99,17 +99,20 @@ def test_gradient_of_the_second_invariant():
     assert float(of_field.coefficients[place]) == pytest.approx(float(difference), rel=1e-7)
 
 
-def test_second_invariant_of_a_passing_particle_is_nan():
+def test_second_invariant_of_a_passing_particle_and_extremes_ignore_nan():
     assert np.isnan(compiled()(field(), 0.4, 0.3, 0.2, 0.3 / 5, 0.5)[0])
-    assert np.isnan(boozer.well(field(), 0.4, 0.3, 0.2, 0.3 / 5).low)
-    low, high = boozer.well(field(), *POINT)
+    well = jax.jit(boozer.well)
+    assert np.isnan(well(field(), 0.4, 0.3, 0.2, 0.3 / 5, 0.5).low)
+    low, high = well(field(), *POINT)
     alpha = POINT[1] - (IOTA[0] + IOTA[1] * POINT[0]) * POINT[2]
     for end in (low, high):
         assert strength(POINT[0], alpha, float(end)) == pytest.approx(5.05, rel=1e-13)
     assert low < POINT[2] < high
-
-
-# --- orbits ----------------------------------------------------------------------------
+    reduction = boozer.Extremes(lambda q, p: q)
+    memory = reduction.start(jnp.zeros(()))
+    for k, value in enumerate([np.nan, 2.0, -1.0, np.nan]):
+        memory = reduction.update(memory, jnp.asarray(k), 0.0, jnp.asarray(value))
+    assert reduction.finish(memory).tolist() == [-1.0, 2.0]
 
 
 @functools.cache
@@ -151,17 +154,13 @@ def spreads(h, epsilon):
 
 
 @pytest.mark.slow
-def test_second_invariant_at_the_tips_of_banana_orbits_is_constant():
+def test_classes_of_orbits_and_the_invariant_at_the_tips_of_bananas():
     """At a tip u = 0 and p_ζ = −χ(s)/ρ: all tips of an axisymmetric field are on one surface. The
     method leaves O(h⁴). Where the symmetry is broken J∥ varies."""
     coarse, fine = spreads(12.0, 0.0), spreads(6.0, 0.0)
     assert fine < 1e-6
     assert np.log2(coarse / fine) > 3.65
     assert spreads(6.0, 1.0) > 1e3 * fine
-
-
-@pytest.mark.slow
-def test_classes_of_orbits():
     J, margins = seen(6.0, 0.0)
     assert boozer.classify(margins).tolist() == ["trapped", "transitional", "passing"]
     assert np.isnan(J[2]).all()  # it does not bounce; the trapped one does: see `spreads`
@@ -171,17 +170,6 @@ def test_classes_of_orbits():
         boozer.classify(np.zeros(3))
     with pytest.raises(ValueError, match="at_epsilon"):
         _ = centres().trapping
-
-
-def test_extremes_ignore_values_that_are_not_numbers():
-    reduction = boozer.Extremes(lambda q, p: q)
-    memory = reduction.start(jnp.zeros(()))
-    for k, value in enumerate([np.nan, 2.0, -1.0, np.nan]):
-        memory = reduction.update(memory, jnp.asarray(k), 0.0, jnp.asarray(value))
-    assert reduction.finish(memory).tolist() == [-1.0, 2.0]
-
-
-# --- the momentum p_ζ ------------------------------------------------------------------
 
 
 def passing(alphas, count, width, seed):

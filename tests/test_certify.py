@@ -43,7 +43,7 @@ IN_EVERY_RUN = {
     ("GaussLegendre2", "forced-order"),
     ("RungeKutta4", "order"),
     *(("Yoshida4", check) for check in ("energy", "momentum")),
-    *(("TypeII", check) for check in CHECKS if check not in ("gradient", "modes")),
+    *(("TypeII", check) for check in CHECKS if check not in ("gradient", "modes", "jit")),
 }
 
 
@@ -68,7 +68,7 @@ def test_method_keeps_what_it_promises(method, check):
     assert measured.ok, measured
 
 
-SLOW_CHECKS = ("forced-order", "gradient", "modes")
+SLOW_CHECKS = ("forced-order", "gradient", "modes", "vmap", "jit")
 FIRST_CONTROL = {c.check: c for c in reversed(CONTROLS)}
 
 
@@ -89,10 +89,30 @@ def test_broken_method_is_caught_by_a_number(control):
     assert measured.verdict == "FAIL", measured
 
 
-def test_every_check_has_a_control_and_a_place():
+def test_checks_controls_and_the_page_are_complete():
     assert {c.check for c in CONTROLS} == set(CHECKS)
     assert [name for group in GROUPS.values() for name in group] == list(CHECKS)
     assert set(QUICK) <= set(METHODS)
+    # If not, run `dvi-jax certify --out docs/certificate.md`.
+    page = PAGE.read_text(encoding="utf-8")
+    head, *sections = re.split(r"^## ", page, flags=re.MULTILINE)
+    assert head.startswith(TITLE)
+    assert f"methods: {len(METHODS)} of {len(METHODS)}" in head
+    assert f"controls: {len(CONTROLS)} of {len(CONTROLS)} caught" in head
+    by_title = {section.partition("\n")[0]: section for section in sections}
+    assert "Failures" not in by_title
+    for title, checks in GROUPS.items():
+        columns, _, *rows = [
+            [cell.strip() for cell in line.strip("|").split("|")]
+            for line in by_title[title].splitlines()
+            if line.startswith("|")
+        ]
+        assert [c for c in columns if c in CHECKS] == list(checks)
+        assert [row[0] for row in rows] == list(METHODS)
+        for row in rows:
+            for name, cell in zip(columns, row, strict=True):
+                assert name not in CHECKS or cell.startswith(("pass", "not claimed")), row
+    assert by_title["Controls"].count("| caught |") == len(CONTROLS)
 
 
 @pytest.mark.slow
@@ -127,9 +147,6 @@ def test_reference_agrees_with_scipy(problem, epsilon):
     np.testing.assert_allclose(ours.ravel(), by_scipy.y[:, -1], rtol=0, atol=2e-12)
 
 
-# What must not pass
-
-
 def _nan(method, equations, interval, q, p):
     q, p, info = method.step(equations, interval, q, p)
     return q * jnp.nan, p, info
@@ -157,13 +174,19 @@ def test_nan_never_passes(check, nan_candidate):
         assert not measured.ok
 
 
-def test_too_few_points_above_round_off_are_no_measurement():
+def test_measurements_that_fail_or_are_not_promised():
     """The Gauss method of order 16 is there after a few steps."""
     accurate = Candidate(dvi.GaussLegendre(8))
     accurate.__dict__["flow"] = problems.most_accurate(problems.COUPLED)
     measured = CHECKS["order"](accurate)
     assert measured.verdict == "NOT MEASURED"
     assert re.search(r"^\d points above round-off, at least 6 needed", measured.detail)
+    measured = CHECKS["reversal"](Candidate(altered(dvi.Strang(), _broken)))
+    assert (measured.verdict, measured.detail) == ("NOT MEASURED", "RuntimeError: no luck")
+    measured, adjoint = (CHECKS[c](candidate("RungeKutta4")) for c in ("reversal", "adjoint"))
+    assert measured.verdict == adjoint.verdict == "not claimed"
+    assert 1e-9 < measured.value < 1e-4
+    assert (measured.ok, measured.passed) == (True, False)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -174,21 +197,6 @@ def test_a_passed_value_is_a_number(value):
 
 def _broken(method, equations, interval, q, p):
     raise RuntimeError("no luck\nat all")
-
-
-def test_an_exception_is_a_failure_that_names_itself():
-    measured = CHECKS["reversal"](Candidate(altered(dvi.Strang(), _broken)))
-    assert (measured.verdict, measured.detail) == ("NOT MEASURED", "RuntimeError: no luck")
-
-
-def test_what_is_not_promised_is_measured_and_no_failure():
-    measured, adjoint = (CHECKS[c](candidate("RungeKutta4")) for c in ("reversal", "adjoint"))
-    assert measured.verdict == adjoint.verdict == "not claimed"
-    assert 1e-9 < measured.value < 1e-4
-    assert (measured.ok, measured.passed) == (True, False)
-
-
-# The function
 
 
 LIAR = altered(dvi.TypeII(), is_symmetric=True)
@@ -253,15 +261,12 @@ def test_single_precision_is_refused():
         certify(["TypeII"], ["reversal"])
 
 
-# The command
-
-
 def command(*words):
     return CliRunner().invoke(app, ["certify", *map(str, words)], env={"COLUMNS": "150"})
 
 
 @pytest.mark.slow
-def test_command_writes_the_page(tmp_path):
+def test_the_page_is_written_and_its_example_runs(tmp_path):
     page = tmp_path / "sub" / "page.md"
     result = command("--method", "RungeKutta4", "--check", "reversal", "--out", page)
     assert result.exit_code == 0, result.output
@@ -270,15 +275,23 @@ def test_command_writes_the_page(tmp_path):
     assert page.read_text(encoding="utf-8").startswith(TITLE)
     assert page_for(page) == page  # a certificate may be replaced by a newer one
     assert page_for(tmp_path) == page_for(tmp_path / "new").parent.parent / "certificate.md"
+    (code,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    scope = {}
+    exec(code, scope)
+    assert scope["certificate"].ok
 
 
 @pytest.mark.slow
-def test_command_fails_with_a_method(monkeypatch):
+def test_commands(monkeypatch):
     monkeypatch.setitem(METHODS, "Liar", LIAR)
     result = command("--method", "Liar", "--check", "reversal")
     assert result.exit_code == 1
     assert "Liar, reversal: FAIL, allowed ≤ 1e-12" in result.output
     assert "methods: 0 of 1" in result.output
+    result = command("--quick", "--check", "order")
+    assert result.exit_code == 0, result.output
+    assert "methods: 5 of 5" in result.output
+    assert "controls: 3 of 3 caught" in result.output
 
 
 def test_command_refuses_bad_input(tmp_path):
@@ -296,45 +309,3 @@ def test_command_refuses_bad_input(tmp_path):
         assert result.exit_code == 2, words
         assert said in result.output.replace("\n", " ")
     assert other.read_text(encoding="utf-8") == "# My notes\n"
-
-
-@pytest.mark.slow
-def test_quick_command():
-    result = command("--quick", "--check", "order")
-    assert result.exit_code == 0, result.output
-    assert "methods: 5 of 5" in result.output
-    assert "controls: 3 of 3 caught" in result.output
-
-
-# The page in the documentation
-
-
-def test_the_page_is_of_the_methods_and_checks_that_there_are():
-    """If not, run `dvi-jax certify --out docs/certificate.md`."""
-    page = PAGE.read_text(encoding="utf-8")
-    head, *sections = re.split(r"^## ", page, flags=re.MULTILINE)
-    assert head.startswith(TITLE)
-    assert f"methods: {len(METHODS)} of {len(METHODS)}" in head
-    assert f"controls: {len(CONTROLS)} of {len(CONTROLS)} caught" in head
-    by_title = {section.partition("\n")[0]: section for section in sections}
-    assert "Failures" not in by_title
-    for title, checks in GROUPS.items():
-        columns, _, *rows = [
-            [cell.strip() for cell in line.strip("|").split("|")]
-            for line in by_title[title].splitlines()
-            if line.startswith("|")
-        ]
-        assert [c for c in columns if c in CHECKS] == list(checks)
-        assert [row[0] for row in rows] == list(METHODS)
-        for row in rows:
-            for name, cell in zip(columns, row, strict=True):
-                assert name not in CHECKS or cell.startswith(("pass", "not claimed")), row
-    assert by_title["Controls"].count("| caught |") == len(CONTROLS)
-
-
-@pytest.mark.slow
-def test_the_example_on_the_page_runs():
-    (code,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-    scope = {}
-    exec(code, scope)
-    assert scope["certificate"].ok

@@ -54,8 +54,6 @@ def ended(calls):
     return json.loads(done.stdout)
 
 
-# Help, errors and completion without JAX
-
 LIGHT = {"--help": 0, "--version": 0, "sweep run --help": 0, "wlak": 2, "run --forse": 2}
 COMPLETED = {
     "systems ke": ["kepler"],
@@ -148,9 +146,6 @@ def test_names_that_complete_are_those_of_the_package():
     assert dvi.__version__ == known.VERSION
 
 
-# Output for programs, and errors
-
-
 @pytest.mark.parametrize("kind", [*known.FILES, None])
 def test_the_json_schema_accepts_the_examples_and_no_unknown_key(kind):
     schema = json.loads(command("schema", *([kind] if kind else [])).stdout)
@@ -225,15 +220,12 @@ def test_closed_outputs_raise_no_error():
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_no_control_codes_without_a_terminal():
+def test_no_control_codes_without_a_terminal_and_ascii():
     result = command("systems", env={"COLUMNS": "60"})
     assert "\x1b" not in result.output
     assert max(map(cell_len, result.stdout.splitlines())) <= 60
     wide = command("systems", env={"COLUMNS": "100"})  # the control
     assert max(map(cell_len, wide.stdout.splitlines())) > 60
-
-
-def test_an_output_in_ascii():
     done = process(MAIN, "discover", "--help", PYTHONIOENCODING="ascii", COLUMNS="99")
     assert (done.returncode, done.stderr) == (0, "")
     assert "invariants in ? as formulas" in done.stdout
@@ -247,9 +239,6 @@ def test_too_little_memory_is_a_failure_with_its_size():
     kind, message = Session(False, False, False).kind_and_message(error)
     assert kind == "failed"
     assert "does not have the memory for this: Unable to allocate 7.28 TiB" in message
-
-
-# info
 
 
 def test_info(monkeypatch):
@@ -266,9 +255,6 @@ def test_info(monkeypatch):
     assert info["extras"]["export"] == missing
     assert info["extras"]["bayes"] == {"missing": [], "install": None}
     assert install in command("info").output
-
-
-# new
 
 
 @pytest.fixture(scope="module")
@@ -288,7 +274,7 @@ def inside(project, monkeypatch):
 PROJECT = [kind for kind in known.FILES if kind != "bound"]  # which needs the extra `proof`
 
 
-def test_new_writes_a_project(project):
+def test_new_writes_a_project_with_a_valid_notebook(project):
     assert {p.name for p in project.iterdir()} == {
         *("README.md", "system.py", "observations.csv", "explore.py", "explore.ipynb"),
         *(f"{kind}.toml" for kind in PROJECT),
@@ -299,9 +285,6 @@ def test_new_writes_a_project(project):
         assert "{{" not in path.read_text(encoding="utf-8"), path
     for name in PROJECT:
         assert f"dvi-jax {name} {name}.toml" in readme
-
-
-def test_its_notebook_is_valid_and_is_its_script(project):
     nbformat = pytest.importorskip("nbformat")
     file = nbformat.read(project / "explore.ipynb", as_version=4)
     nbformat.validate(file)

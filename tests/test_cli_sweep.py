@@ -101,9 +101,6 @@ def assert_same(a, b):
         np.testing.assert_array_equal(a[name], b[name])
 
 
-# What a file means
-
-
 @pytest.mark.slow
 def test_the_same_sweep_in_python(folder):
     """A store is resumed only by the same sweep: axes, methods, functions, to the last bit."""
@@ -241,9 +238,6 @@ def test_starts_with_parameters_and_a_stop_from_a_file(folder):
             sweep_file(write(folder, wrong, "wrong.toml"), store=folder / "other.zarr")
 
 
-# Stores
-
-
 @pytest.mark.slow
 def test_a_store_is_resumed_only_with_resume(folder, small):
     """And only by the same sweep; --store takes the place of output.store."""
@@ -285,15 +279,12 @@ def test_a_batch_job_is_resumed_in_a_terminal(small, monkeypatch):
     assert result.exit_code == 0, result.stderr
 
 
-def test_a_dry_run_estimates_and_writes_nothing(folder):
+def test_a_dry_run_writes_nothing_and_a_place_without_a_store(folder):
     result = command("sweep", write(folder, SMALL), "--dry-run")
     assert result.exit_code == 0, result.stderr
     assert "3 tasks of 4 trajectories" in result.stdout
     assert "| 1e+12 | 2.5e+11 |" in result.stdout
     assert not (folder / "out.zarr").exists()
-
-
-def test_a_place_without_a_store(folder):
     path = write(folder, SMALL)
     for place in (folder, "own.py"):
         result = command("sweep", path, "--resume", "--store", place)
@@ -366,8 +357,6 @@ def test_ctrl_c_leaves_a_store_that_can_be_resumed(folder):
     sweep_file(path, store="whole.zarr")
     assert_same(contents("out.zarr"), contents("whole.zarr"))
 
-
-# Rejected input: the key, what was seen, what is allowed
 
 KEPLER = 'system = "kepler"\nsteps = 5\n'
 EPS = KEPLER + "epsilon = {values = [0.1]}\n"

@@ -15,9 +15,6 @@ from scipy.integrate import solve_ivp
 
 import dvi_jax as dvi
 from dvi_jax.methods import _gauss_legendre, _lobatto_pair
-from dvi_jax.systems import figure_eight
-from dvi_jax.systems.figure_eight import PERIOD
-from dvi_jax.systems.n_body import angular_momentum, energy
 
 SLOW = pytest.mark.slow
 GAUSS, LOBATTO = dvi.GaussLegendre, dvi.LobattoIIIAIIIB
@@ -53,9 +50,6 @@ def by_hand(kind, stages):
     """(c, b, a, â); Gauss' a serves both."""
     c, b, a, *a_hat = map(np.array, BY_HAND[kind, stages])
     return c, b, a, *(a_hat or [a])
-
-
-# --- coefficients ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("kind", "stages"), BY_HAND)
@@ -102,9 +96,6 @@ def test_other_numbers_of_stages_are_rejected(kind, range, others):
     for stages in (*others, -1, 2.5, 2.0, True, None, "2"):
         with pytest.raises(ValueError, match=f"stages must be an integer from {range}"):
             kind(stages)
-
-
-# --- the step ----------------------------------------------------------------------------------
 
 
 def step_by_hand(table, z, t, h, epsilon):
@@ -176,7 +167,7 @@ def test_it_is_the_variational_map_of_a_stationary_value(kind, stages):
 
 
 @pytest.mark.slow
-def test_slow_time_and_perturbation_are_used():
+def test_slow_time_and_perturbation_are_used_and_solves_only_where_needed():
     """ε t by hand, and the perturbation added to H_D by hand, give the same step."""
 
     def H(t0, t1, q0, p1, args):
@@ -199,6 +190,10 @@ def test_slow_time_and_perturbation_are_used():
     np.testing.assert_allclose(a, b, rtol=0, atol=1e-15)
     fast = flow(dvi.System(H, push, bump), method, 0.2, t0=4.0, epsilon=0.1)(z)
     assert np.max(np.abs(fast - a)) > 1e-3
+    steps = {"h": 0.1, "num_steps": 3, "method": LOBATTO(2)}
+    for system, epsilon in ((dvi.System(pendulum), 0.0), (dvi.System(pendulum, damped), 0.1)):
+        sol = dvi.integrate(system, [0.4], [0.7], epsilon=epsilon, **steps)
+        assert (int(sol.stats["newton_iterations"]) > 0) == (epsilon > 0)
 
 
 @pytest.mark.parametrize("system", ["kepler", "non_separable"])
@@ -230,14 +225,6 @@ def test_declared_properties():
 
 
 @pytest.mark.slow
-def test_two_lobatto_stages_solve_only_where_it_is_needed():
-    steps = {"h": 0.1, "num_steps": 3, "method": LOBATTO(2)}
-    for system, epsilon in ((dvi.System(pendulum), 0.0), (dvi.System(pendulum, damped), 0.1)):
-        sol = dvi.integrate(system, [0.4], [0.7], epsilon=epsilon, **steps)
-        assert (int(sol.stats["newton_iterations"]) > 0) == (epsilon > 0)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("stages", [2, 4])
 def test_lobatto_solves_for_momenta_alone_with_the_same_result(stages):
     """Adding 0·q·p makes ∂H/∂p depend on q, in the jaxpr only."""
@@ -251,8 +238,6 @@ def test_lobatto_solves_for_momenta_alone_with_the_same_result(stages):
     np.testing.assert_allclose(ours(z, 0.3, 0.2, 0.2), full, rtol=0, atol=2e-16)
     assert np.max(np.abs(ours(z, 0.3, 0.2, 0.2001) - full)) > 1e-6
 
-
-# --- order and structure of Lobatto's pair -----------------------------------------------------
 
 T_END = 3.0
 START = np.array([0.9, 0.8])
@@ -293,7 +278,7 @@ def test_order_unperturbed_and_with_a_damped_and_driven_force(stages):
         assert abs(found - LOBATTO(stages).order) < 0.2
 
 
-def test_a_wrong_node_or_a_wrong_coefficient_costs_the_order():
+def test_wrong_coefficients_cost_the_order_or_symplecticity():
     c, b, a, a_hat = by_hand(LOBATTO, 3)
     wrong = a_hat + np.array([[0, 0, 0], [0.01, -0.01, 0], [0, 0, 0]])
 
@@ -303,6 +288,16 @@ def test_a_wrong_node_or_a_wrong_coefficient_costs_the_order():
     assert abs(order(c, b, a, a_hat) - 4) < 0.2
     assert order([0, 0.51, 1], b, a, a_hat) < 1.5  # the driving force at a wrong time
     assert order(c, b, a, wrong) < 2.5
+    # By hand on the non-separable problem: IIIA with IIIB is, IIIA or IIIB with itself is not.
+    c, b, *both = (jnp.asarray(part, float) for part in by_hand(LOBATTO, 3))
+
+    @jax.jit
+    def jacobian(a, a_hat):
+        return jax.jacfwd(lambda z: step_by_hand((c, b, a, a_hat), z, 0.0, 0.4, 0.0))(START)
+
+    assert symplectic_defect(np.asarray(jacobian(*both))) <= 1e-12
+    for a in both:
+        assert symplectic_defect(np.asarray(jacobian(a, a))) > 1e-4
 
 
 @pytest.mark.parametrize("stages", [2, *(pytest.param(s, marks=SLOW) for s in (5, 6))])
@@ -314,57 +309,6 @@ def test_the_step_reverses_and_is_symplectic_unless_damped(stages):
     jacobian = jax.jit(jax.jacfwd(lambda z, epsilon: step(z, 0.0, 0.1, epsilon)))
     assert symplectic_defect(np.asarray(jacobian(z, 0.0))) <= 1e-12
     assert np.linalg.det(jacobian(z, 0.3)) < 0.99
-
-
-def test_one_family_for_both_is_not_symplectic():
-    """By hand on the non-separable problem: IIIA with IIIB is, IIIA or IIIB with itself is not."""
-    c, b, a, a_hat = (jnp.asarray(part, float) for part in by_hand(LOBATTO, 3))
-
-    @jax.jit
-    def jacobian(a, a_hat):
-        return jax.jacfwd(lambda z: step_by_hand((c, b, a, a_hat), z, 0.0, 0.4, 0.0))(START)
-
-    assert symplectic_defect(np.asarray(jacobian(a, a_hat))) <= 1e-12
-    assert symplectic_defect(np.asarray(jacobian(a, a))) > 1e-4
-    assert symplectic_defect(np.asarray(jacobian(a_hat, a_hat))) > 1e-4
-
-
-# --- invariants --------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_energy_of_oscillators_is_conserved_to_round_off():
-    """Quadratic, of value 2.12; RungeKutta4 loses it."""
-
-    def oscillators(t0, t1, q0, p1, args):
-        return (p1 @ p1 + q0[0] ** 2 + 2 * q0[1] ** 2 + q0[0] * p1[1]) / 2
-
-    def their_energy(t0, t1, q0, p0, q1, p1, args):
-        return oscillators(t1, t1, q1, p1, args)
-
-    def drift(method):
-        how = {"h": 0.3, "num_steps": 2000, "observe": dvi.MaxDrift(their_energy)}
-        start = [0.0, 1.2], [-1.0, -0.6]
-        return dvi.integrate(dvi.System(oscillators), *start, method=method, **how).observed
-
-    assert drift(GAUSS(2)) < 1e-13
-    assert drift(dvi.RungeKutta4()) > 1e-3
-
-
-@pytest.mark.slow
-def test_figure_eight_returns_after_a_period():
-    problem = figure_eight()
-    solution = dvi.integrate(
-        problem.system, problem.q0, problem.p0, h=PERIOD / 1000, num_steps=1000, args=problem.args,
-        method=GAUSS(2), save=dvi.Save(final=True),
-        observe={"L": dvi.MaxDrift(angular_momentum), "H": dvi.MaxDrift(energy)},
-    )  # fmt: skip
-    np.testing.assert_allclose(solution.qs[-1], problem.q0, rtol=0, atol=2e-7)  # digits as printed
-    assert float(solution.observed["L"]) < 1e-14
-    start = energy(0, 0, None, None, problem.q0, problem.p0, problem.args)
-    end = energy(0, 0, None, None, solution.qs[-1], solution.ps[-1], problem.args)
-    assert abs(end / start - 1) < 1e-14  # back after a period of a symmetric orbit
-    assert 1e-12 < float(solution.observed["H"]) < 1e-10  # in between it oscillates, O(h⁴)
 
 
 @pytest.mark.slow

@@ -145,6 +145,9 @@ def test_one_device_and_what_is_refused():
     with pytest.raises(ValueError, match=r"shape \(\)"):
         dvi.over_devices(jnp.add)(x, c)
     assert jax.device_count() == 1
+    for form in ("gpu", "components", "kernel"):
+        with pytest.raises(ValueError, match='"auto" or "arrays"'):
+            dvi.Layout(form=form)  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.slow
@@ -175,9 +178,3 @@ def test_hosts_are_killed_and_the_fit_is_the_same(tmp_path):
     assert abs(float(last[0][0]) - 0.02) < 1e-9
     a, b = (json.loads((tmp_path / f"{n}.json").read_text()) for n in "ab")
     assert a == b
-
-
-def test_layout_rejects_unknown_forms():
-    for form in ("gpu", "components", "kernel"):
-        with pytest.raises(ValueError, match='"auto" or "arrays"'):
-            dvi.Layout(form=form)  # pyright: ignore[reportArgumentType]

@@ -60,13 +60,20 @@ def too_long(text):
     return [line for block in code for line in block.splitlines() if len(line) > 100]
 
 
-def test_code_fits_its_page():
+def test_code_fits_and_links_lead_to_files():
     pages = [ROOT / "README.md", *DOCS.glob("*.md")]
     long = {page.name: too_long(page.read_text(encoding="utf-8")) for page in pages}
     assert {name: lines for name, lines in long.items() if lines} == {}
     line = "x" * 101
     assert too_long(f"```\n{line}\n```\n") == [line]
     assert too_long(f"a\n\n    {line}\n\n{line}\n") == [f"    {line}"]
+    # Pages are read on a code host, too.
+    pages = [*ROOT.glob("*.md"), *DOCS.glob("*.md")]
+    assert len(pages) > 25
+    missing = {p.name: missing_files(p, p.read_text(encoding="utf-8")) for p in pages}
+    assert {name: links for name, links in missing.items() if links} == {}
+    links = "[a](docs/none.md) [b](docs/faq.md)"
+    assert missing_files(ROOT / "README.md", links) == ["docs/none.md"]
 
 
 PRINTED = re.compile(r"^<!-- printed -->\n```text\n(.*?)^```", re.S | re.M)
@@ -77,13 +84,10 @@ def printed(page):
     return "".join(PRINTED.findall(page.read_text(encoding="utf-8"))).splitlines()
 
 
-def test_the_first_page_shows_what_it_prints():
+def test_pages_show_what_they_print_and_say_what_is_left_out(tmp_path):
     formula, *last = printed(DOCS / "index.md")
     assert formula.startswith("0.5 q² − 0.05 q p + 0.5 p² + ε (")
     assert last == ["ε^1.99"]
-
-
-def test_examples_that_are_left_out_say_why(tmp_path):
     reasons = {page.stem: examples(page)[1] for page in sorted(DOCS.glob("*.md"))}
     assert {name for name in reasons if reasons[name]} <= {"clusters"}
     assert len(PAGES) >= 10
@@ -99,16 +103,6 @@ def missing_files(page, text):
     found = re.findall(r"\]\((?!https?:|mailto:|#)([^)#\s]+)", text)
     made = ("reference/",)  # by the build
     return [x for x in found if not x.startswith(made) and not (page.parent / x).exists()]
-
-
-def test_links_lead_to_files_of_the_repository():
-    """Pages are read on a code host, too."""
-    pages = [*ROOT.glob("*.md"), *DOCS.glob("*.md")]
-    assert len(pages) > 25
-    missing = {p.name: missing_files(p, p.read_text(encoding="utf-8")) for p in pages}
-    assert {name: links for name, links in missing.items() if links} == {}
-    links = "[a](docs/none.md) [b](docs/faq.md)"
-    assert missing_files(ROOT / "README.md", links) == ["docs/none.md"]
 
 
 @pytest.fixture(scope="module")
@@ -164,15 +158,11 @@ def dead_links(folder):
 
 
 @pytest.mark.slow
-def test_links_resolve(site, tmp_path):
+def test_links_names_and_sizes_of_the_site(site, tmp_path):
     assert len(list(site.rglob("*.html"))) > 40
     assert dead_links(site) == []
     (tmp_path / "a.html").write_text('<p id="x"><a href="b.html">b</a><a href="#x"><a href="#y">')
     assert dead_links(tmp_path) == [("a.html", "b.html"), ("a.html", "#y")]
-
-
-@pytest.mark.slow
-def test_every_public_name_has_an_entry(site):
     import dvi_jax as dvi
     from dvi_jax import _namespaces
 
@@ -180,6 +170,15 @@ def test_every_public_name_has_an_entry(site):
     names = [n for n in _namespaces.names() if callable(getattr(dvi, n))]
     assert len(names) > 120
     assert [n for n in names if f'id="dvi_jax.{n}"' not in text] == []
+    # At most 500 kB with its pictures; scripts and styles are loaded once for all pages.
+    large = {}
+    for path in site.rglob("*.html"):
+        text = path.read_text(encoding="utf-8")
+        pictures = {path.parent / name for name in re.findall(r'<img[^>]* src="([^":]+)"', text)}
+        size = path.stat().st_size + sum(picture.stat().st_size for picture in pictures)
+        if size > 500e3:
+            large[path.name] = size
+    assert large == {}
 
 
 def entry(site, page, name):
@@ -189,7 +188,7 @@ def entry(site, page, name):
 
 
 @pytest.mark.slow
-def test_names_lead_where_they_are_meant(site):
+def test_names_and_formulas_of_the_site(site):
     """A parameter `fit` is no link; a picture's name is a picture; theirs is not ours."""
     assert "#dvi_jax.fit" not in entry(site, "plot", "plot.fit_against_data")
     assert "#dvi_jax.FitResult" in entry(site, "plot", "plot.fit_against_data")
@@ -206,11 +205,7 @@ def test_names_lead_where_they_are_meant(site):
     first = re.findall(r"<tr[^>]*><td>(.*?)</td>", theirs, re.S)
     assert any("LobattoIIIAIIIB" in cell for cell in first)
     assert not [cell for cell in first if "<a " in cell]
-
-
-@pytest.mark.slow
-def test_formulas_in_characters_come_through(site):
-    """No emphasis between the underscores of q_k and p_k; indices are set as indices."""
+    # No emphasis between the underscores of q_k and p_k; indices are set as indices.
     emphasised = [
         (path.name, words)
         for path in site.rglob("*.html")
@@ -236,7 +231,7 @@ def extensions():
         sys.path.remove(str(DOCS / "_ext"))
 
 
-def test_indices_and_numbers_of_running_text(extensions):
+def test_docstrings_and_running_text_as_html(extensions):
     as_html = extensions[1].as_html
     assert as_html("q_{k+1} − ξ0_m < h^−order") == (
         "q<sub>k+1</sub> − ξ0<sub>m</sub> &lt; h<sup>−order</sup>"
@@ -247,6 +242,13 @@ def test_indices_and_numbers_of_running_text(extensions):
     )
     for plain in ("num_steps", "t_eval", "a < b", "2000 steps", "in 5 to 10"):
         assert as_html(plain) is None, plain
+    import dvi_jax as dvi
+
+    reference = extensions[0]
+    assert reference.literally("E⁻_k and `a_b`, Φ*_h\n\n    x_1 *") == (
+        r"E⁻\_k and `a_b`, Φ\*\_h" + "\n\n    x_1 *"
+    )
+    assert reference.signature(dvi.Adjoint) == "(method: Method = TypeII())"
 
 
 @pytest.mark.parametrize("dpi", [110, 220, None])
@@ -262,16 +264,6 @@ def test_the_size_of_a_picture_does_not_depend_on_its_pixels(tmp_path, dpi):
     width, height = pictures.size(name)
     assert width == pytest.approx(550 / (dpi or 110), rel=1e-3)
     assert height == pytest.approx(330 / (dpi or 110), rel=1e-3)
-
-
-def test_docstrings_are_taken_literally_and_defaults_told(extensions):
-    import dvi_jax as dvi
-
-    reference = extensions[0]
-    assert reference.literally("E⁻_k and `a_b`, Φ*_h\n\n    x_1 *") == (
-        r"E⁻\_k and `a_b`, Φ\*\_h" + "\n\n    x_1 *"
-    )
-    assert reference.signature(dvi.Adjoint) == "(method: Method = TypeII())"
 
 
 BROWSER = next(
@@ -406,19 +398,6 @@ def page():
         tab.faults, tab.open_page = faults, open_page
         yield tab
         browser.close()
-
-
-@pytest.mark.slow
-def test_no_page_is_larger_than_500_kilobytes(site):
-    """With its pictures; scripts and styles are loaded once for all pages."""
-    large = {}
-    for path in site.rglob("*.html"):
-        text = path.read_text(encoding="utf-8")
-        pictures = {path.parent / name for name in re.findall(r'<img[^>]* src="([^":]+)"', text)}
-        size = path.stat().st_size + sum(picture.stat().st_size for picture in pictures)
-        if size > 500e3:
-            large[path.name] = size
-    assert large == {}
 
 
 @pytest.mark.slow

@@ -142,16 +142,13 @@ def entries():
     return {shown: thing for page in pages.values() for shown, thing in page.values()}
 
 
-def test_every_name_that_a_user_calls_has_an_example(entries):
+def test_every_name_has_one_example(entries):
     assert without(entries, PAGE) == []
     code = {name: text for name, text in PAGE.code.items() if name != "plot.orbit"}
     assert without(entries, PAGE._replace(code=code)) == ["plot.orbit"]
     assert without({"dvi.planted": lambda x: x}, PAGE) == ["dvi.planted"]
-
-
-def test_the_page_has_each_name_once_and_no_others(entries):
-    """An entry with an example in its docstring keeps that; an object that users do not make is a
-    class, whose entry names a function or a class that is in the reference."""
+    # An entry with an example in its docstring keeps that; an object that users do not make is a
+    # class, whose entry names a function or a class that is in the reference.
     listed = [*DOCSTRINGS, *PAGE.code, *PAGE.origins]
     assert len(listed) == len(set(listed)) > 200
     assert set(listed) - set(entries) == {"systems", "plot"}

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
 import pytest
+from helpers import pendulum
 
 import dvi_jax as dvi
 import lanewise
@@ -26,10 +27,6 @@ KEPLER = systems.kepler()
 def many_digits():
     with mp.workdps(60):
         yield
-
-
-def pendulum(t0, t1, q0, p1, args):
-    return jnp.sum(p1**2) / 2 - jnp.sum(jnp.cos(q0))
 
 
 def coupled(t0, t1, q0, p1, args):
@@ -122,11 +119,8 @@ def test_functions_have_30_digits(name):
         assert worst(function, reference, drawn(low, high)) < 5e-31, (low, high)
 
 
-def test_products_have_31_digits_in_xla():
+def test_products_in_xla_and_functions_of_two_pairs():
     assert worst(pairs.mul, operator.mul, *ONES, by=jax.vmap) < 1e-30
-
-
-def test_functions_of_two_pairs():
     x, y = drawn(-3, 3), drawn(-2, 2)
     assert worst(functions.atan2, mp.atan2, x, y) < 1e-30
     assert worst(functions.general_power, lambda x, y: x**y, drawn(0.1, 10), y) < 1e-30
@@ -157,6 +151,7 @@ def of_arrays(x):
     return A @ moved + lanewise.solve(A, x) + jnp.cumsum(sums) + jnp.floor(3 * x) + ends
 
 
+@pytest.mark.slow
 def test_arrays_loops_and_solves_have_30_digits():
     """Against the same function of float64 numbers with half as many digits in each."""
     x = jnp.array([0.7, -1.3, 0.2, 1.1])
@@ -188,9 +183,6 @@ def test_arrays_loops_and_solves_have_30_digits():
     assert max(abs(a - b) for a, b in zip(found, true, strict=True)) < 1e-29
     plain = np.asarray(of_arrays(x))
     assert max(abs(mp.mpf(float(a)) - b) for a, b in zip(plain, true, strict=True)) > 1e-17
-
-
-# Runs
 
 
 def strang(q, p, h, num_steps):
@@ -226,7 +218,7 @@ RUNS = {
 
 @pytest.mark.parametrize(
     "name",
-    ["GaussLegendre", *(pytest.param(n, marks=pytest.mark.slow) for n in ("Strang", "Picard"))],
+    ["Strang", *(pytest.param(n, marks=pytest.mark.slow) for n in list(RUNS)[1:])],
 )
 def test_a_run_agrees_with_many_digits(name):
     """Observables are of the pairs, so that they show the lower part of the last state."""
@@ -285,11 +277,8 @@ def test_the_invariant_of_a_quadratic_map():
     assert drift(dvi.FloatingPoint()) > 1e-15
 
 
-@pytest.mark.parametrize(
-    "method",
-    [dvi.Strang(), pytest.param(dvi.GaussLegendre(2), marks=pytest.mark.slow)],
-    ids=repr,
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [dvi.Strang(), dvi.GaussLegendre(2)], ids=repr)
 def test_a_batch_has_the_bits_of_single_runs(method):
     def one(q, p):
         sol = dvi.integrate(
@@ -376,18 +365,19 @@ def test_constants_have_the_digits_of_the_operations_that_make_them():
     assert rounded == mp.mpf(1 / 3)
 
 
+@pytest.mark.slow
 def test_the_derivative_of_a_function_in_pairs_is_that_of_float64():
-    def f(x):
-        return jnp.sum(in_pairs(lambda x: jnp.sin(x) / (1 + x**2), x).hi)
-
-    def g(x):
-        return jnp.sum(jnp.sin(x) / (1 + x**2))
+    def plain(x):
+        return jnp.sin(x) / (1 + x**2)
 
     x = jnp.array([0.3, 2.0])
-    np.testing.assert_allclose(jax.grad(f)(x), jax.grad(g)(x), rtol=1e-14)
-    np.testing.assert_allclose(jax.jacfwd(f)(x), jax.grad(g)(x), rtol=1e-14)
+    expected = jax.grad(lambda x: jnp.sum(plain(x)))(x)
+    for derivative in (jax.grad, jax.jacfwd):
+        found = derivative(lambda x: jnp.sum(in_pairs(plain, x).hi))(x)
+        np.testing.assert_allclose(found, expected, rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_other_parts_of_a_run_accept_pairs():
     """Sections, running values, deviation vectors, a Stop and pieces, as in float64."""
     L = KEPLER.observables["angular_momentum"]

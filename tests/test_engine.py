@@ -64,7 +64,7 @@ def test_batched_linear_systems_call_lapack_only_above_the_limit(n):
     assert has_lapack(jax.vmap(jnp.linalg.solve))
 
 
-@pytest.mark.parametrize("n", [5, 16])
+@pytest.mark.parametrize("n", [pytest.param(5, marks=pytest.mark.slow), 16])
 def test_batched_linear_systems_are_solved_with_exchanges_of_rows(n):
     rng = np.random.default_rng(n)
     A, b = rng.normal(size=(40, n, n)), rng.normal(size=(40, n))
@@ -106,9 +106,6 @@ def test_dependence(function, expected):
     assert depends_on(function, 1, x, x) is expected
 
 
-# --- a linear map with a transpose of its own ------------------------------------------------
-
-
 def _scaled(residuals, x):
     a, _ = residuals
     return {"y": jnp.sin(a) * jnp.stack([x[0] + 2 * x[1], 3 * x[0], x[1]])}
@@ -135,10 +132,10 @@ DERIVATIVES = [
     lambda f: f,
     lambda f: jax.grad(f, 1),
     lambda f: jax.jacfwd(f, 1),
-    lambda f: jax.jacrev(jax.grad(f, 0), 1),
     *(
         pytest.param(derivative, marks=pytest.mark.slow)
         for derivative in (
+            lambda f: jax.jacrev(jax.grad(f, 0), 1),
             lambda f: jax.grad(f, 0),
             lambda f: jax.hessian(f, 1),
             lambda f: jax.jacfwd(jax.grad(f, 1), 0),
@@ -170,7 +167,7 @@ def test_a_linear_map_uses_its_own_transpose(derivative):
     assert bool(marks) == is_reverse  # the given transpose is used
 
 
-def test_derivatives_of_a_linear_map_are_those_of_its_definition():
+def test_a_definition_gives_derivatives_and_on_any_takes_one_boolean():
     """By the residuals; negative control: a definition with another dependence on them."""
 
     def of(definition):
@@ -178,9 +175,6 @@ def test_derivatives_of_a_linear_map_are_those_of_its_definition():
 
     np.testing.assert_allclose(of(_scaled), np.cos(0.7) * 7, rtol=1e-13)
     assert abs(float(of(lambda r, x: _scaled((2 * r[0], None), x))) - np.cos(0.7) * 7) > 0.1
-
-
-def test_arguments_of_on_any():
     with pytest.raises(TypeError, match="must be one boolean"):
         lanewise.on_any(jnp.array([1.5, 2.0]))
     with pytest.raises(TypeError, match="rare"):

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import central_difference, measured_orders
+from helpers import central_difference, measured_orders, pendulum
 from scipy.integrate import solve_ivp
 
 import dvi_jax as dvi
@@ -15,10 +15,6 @@ E = 0.6
 START = [1 - E, 0.0], [0.0, np.sqrt((1 + E) / (1 - E))]
 KEPLER = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 - 1 / jnp.sqrt(q @ q))
 SPRING = dvi.System(lambda t0, t1, q0, p1, args: (p1 @ p1 + q0 @ q0) / 2)
-
-
-def pendulum(t0, t1, q, p, args):
-    return jnp.sum(p**2) / 2 - jnp.sum(jnp.cos(q))
 
 
 def on_axis(t, q, p, args):
@@ -86,24 +82,20 @@ def test_crossings_converge_with_the_order_of_the_method(order):
 
 
 @pytest.mark.slow
-def test_direction_is_chosen():
+def test_directions_and_the_capacity_of_sections():
     up, down, both = (crossings_of(2, d, 0.01) for d in (1, -1, 0))
     assert (int(up.count), int(down.count), int(both.count)) == (2, 2, 4)
     assert np.all(np.asarray(up.ps[:2, 1]) > 0)
     assert np.all(np.asarray(down.ps[:2, 1]) < 0)
     together = np.sort(np.concatenate([up.ts[:2], down.ts[:2]]))
     np.testing.assert_array_equal(together, both.ts[:4])
-
-
-@pytest.mark.slow
-def test_crossings_beyond_the_capacity_are_counted():
     sol = kepler(observe=dvi.Section(on_axis, max_crossings=3))
     assert int(sol.observed.count) == 4
     assert np.isfinite(np.asarray(sol.observed.ts)).all()
 
 
 @pytest.mark.slow
-def test_a_batch_of_sections():
+def test_batches_and_gradients_of_sections():
     """Hénon and Heiles' surface of section; a trajectory that fails does not affect the others."""
     system, section = (
         dvi.systems.henon_heiles().system,
@@ -126,20 +118,7 @@ def test_a_batch_of_sections():
         assert n == int(found.count[i]) > 4
         np.testing.assert_allclose(found.qs[i, :n], alone.qs[:n], atol=1e-11)
         np.testing.assert_allclose(found.qs[i, :n, 0], 0.0, atol=1e-14)
-
-
-def section_loss(x, adjoint):
-    p, h = x
-    options = {"num_steps": 150, "method": dvi.Strang(), "save": dvi.Save(final=True)}
-    section = dvi.Section(on_axis, max_crossings=4)
-    sol = dvi.integrate(KEPLER, START[0], p, h=h, adjoint=adjoint, observe=section, **options)
-    found = sol.observed
-    return found.ts[0] ** 2 + found.qs[0, 0] * found.ps[0, 1]
-
-
-@pytest.mark.slow
-def test_gradient_of_a_crossing():
-    """Time and state of the crossing, in forward and both ways of reverse mode."""
+    # Time and state of the crossing, in forward and both ways of reverse mode.
     x = (jnp.asarray(START[1]), jnp.asarray(0.03))
     ones = jax.tree.map(jnp.ones_like, x)
     value = jax.jit(lambda x: section_loss(x, dvi.Direct()))
@@ -149,6 +128,15 @@ def test_gradient_of_a_crossing():
     for adjoint in (dvi.Direct(), dvi.Reversible(checkpoint_every=10)):
         back = jax.tree.leaves(jax.grad(lambda x, a=adjoint: section_loss(x, a))(x))
         assert sum(float(jnp.sum(g)) for g in back) == pytest.approx(forward, rel=1e-9)
+
+
+def section_loss(x, adjoint):
+    p, h = x
+    options = {"num_steps": 150, "method": dvi.Strang(), "save": dvi.Save(final=True)}
+    section = dvi.Section(on_axis, max_crossings=4)
+    sol = dvi.integrate(KEPLER, START[0], p, h=h, adjoint=adjoint, observe=section, **options)
+    found = sol.observed
+    return found.ts[0] ** 2 + found.qs[0, 0] * found.ps[0, 1]
 
 
 @pytest.mark.slow
@@ -168,7 +156,7 @@ def test_requested_times_have_the_order_of_the_method(order):
 
 
 @pytest.mark.slow
-def test_requested_times_on_the_grid_give_its_states():
+def test_requested_times_on_the_grid_and_several_in_one_step():
     observe = {"L": momentum, "max": dvi.MaxDrift(momentum)}
     every = kepler(save=dvi.Save(every=100), observe=observe)
     asked = kepler(save=dvi.Save(ts=every.ts), observe=observe)
@@ -177,10 +165,6 @@ def test_requested_times_on_the_grid_give_its_states():
     # Two programs: the last bit of the round-off that the drift is may differ.
     np.testing.assert_allclose(asked.observed["max"], every.observed["max"], rtol=0, atol=1e-14)
     np.testing.assert_allclose(asked.hs[1:], every.hs, rtol=1e-9)
-
-
-@pytest.mark.slow
-def test_several_times_in_one_step_and_backwards():
     ts = np.array([-0.001, -0.002, -0.0021, -0.5])
     back = kepler(-0.02, 30, save=dvi.Save(ts=ts))
     ahead = kepler(0.02, 30, save=dvi.Save(ts=-ts))
@@ -189,17 +173,21 @@ def test_several_times_in_one_step_and_backwards():
 
 
 @pytest.mark.slow
-def test_times_outside_of_the_run():
+def test_times_outside_of_the_run_and_those_between_grid_points():
     late = kepler(num_steps=50, save=dvi.Save(ts=[0.5, 1.0, 1.01]), throw=False)
     assert late.status == "not_reached"
     assert np.isfinite(np.asarray(late.qs[:2])).all()
     assert np.isnan(np.asarray(late.qs[2])).all()
     with pytest.raises(dvi.IntegrationError, match=r"lies outside of the run"):
         kepler(num_steps=50, save=dvi.Save(ts=[-0.5, 1.0]))
+    sol = kepler(num_steps=4, method=dvi.TypeII(), save=dvi.Save(ts=np.linspace(0.01, 0.07, 5)))
+    with pytest.raises(ValueError, match="at requested times"):
+        dvi.noether_balance(KEPLER, [dvi.generators.time_translation()], [None], sol)
 
 
 @pytest.mark.slow
-def test_gradient_in_the_requested_times_is_the_velocity():
+def test_clocks_and_the_gradient_in_the_requested_times():
+
     def at(t, adjoint):
         return kepler(num_steps=100, save=dvi.Save(ts=t[None]), adjoint=adjoint).qs[0]
 
@@ -208,11 +196,7 @@ def test_gradient_in_the_requested_times_is_the_velocity():
     for adjoint in (dvi.Direct(), dvi.Reversible()):
         slope = jax.jacobian(lambda t, a=adjoint: at(t, a))(t)
         np.testing.assert_allclose(slope, p, rtol=1e-3)  # of the map's curve: order h²
-
-
-@pytest.mark.slow
-def test_a_clock_of_ones_own():
-    """States at given angles of the pendulum that turns over."""
+    # States at given angles of the pendulum that turns over.
     angles = np.linspace(0.1, 30.0, 7)
     save = dvi.Save(ts=angles, clock=lambda t, q, p, args: q[0])
     options = {"h": 0.05, "num_steps": 400, "method": dvi.Yoshida(4)}
@@ -253,7 +237,7 @@ def test_stops_of_a_batch_and_their_gradient():
     assert float(jax.grad(value)(p)) == pytest.approx(float(expected), rel=1e-6)
 
 
-def test_a_start_beyond_the_stop_and_a_stop_that_is_not_met():
+def test_starts_beyond_a_stop_and_clocks_that_jump_have_a_status():
     sol = kepler(num_steps=5, stop=dvi.Stop(lambda t, q, p, args: 1 - radius(t, q, p, args)))
     assert sol.status == "stopped"
     assert float(sol.stop.t) == 0.0
@@ -262,10 +246,15 @@ def test_a_start_beyond_the_stop_and_a_stop_that_is_not_met():
     assert sol.status == "successful"
     assert np.isnan(float(sol.stop.t))
     assert kepler(num_steps=20).stop is None
+    save = dvi.Save(ts=[0.0, 0.5], clock=lambda t, q, p, args: jnp.arctan2(-p[0], q[0]))
+    options = {"h": 0.1, "num_steps": 100, "throw": False, "save": save}
+    sol = dvi.integrate(SPRING, [np.cos(1.0)], [-np.sin(1.0)], **options)
+    assert sol.status == "not_reached"
+    assert np.isnan(np.asarray(sol.qs)).all()
 
 
 @pytest.mark.slow
-def test_in_a_transformed_time():
+def test_transformed_time_implicit_steps_and_progress():
     """Sections, times and stops use t, not the fictitious time."""
     ts, section = np.array([0.0, 1.0, 3.3, 7.7]), dvi.Section(on_axis, 1, max_crossings=2)
     settings = {"lattice": dvi.TimeTransformed(radius), "method": dvi.Yoshida(6)}
@@ -278,10 +267,6 @@ def test_in_a_transformed_time():
     assert end.status == "stopped"
     far = exact(14.0, lambda t, q, p, args: np.hypot(*q) - 1.5, 1)
     assert float(end.stop.t) == pytest.approx(far.t_events[0][0], abs=1e-5)
-
-
-@pytest.mark.slow
-def test_implicit_forced_steps_and_progress():
     system = dvi.System(pendulum, force=lambda t0, t1, q, p, args: -p + jnp.cos(t0))
     options = {"h": 0.05, "num_steps": 200, "epsilon": 0.1, "method": dvi.Strang()}
     options |= {"save": dvi.Save(ts=[0.33, 6.66]), "observe": dvi.Section(first_component)}
@@ -313,14 +298,6 @@ def test_slope_at_the_start_and_round_off_at_the_end():
     assert np.isnan(positions(np.array([1.0 + 1e-12]), h=1 / 49, num_steps=49)).all()
 
 
-def test_a_clock_that_jumps_has_a_status():
-    save = dvi.Save(ts=[0.0, 0.5], clock=lambda t, q, p, args: jnp.arctan2(-p[0], q[0]))
-    options = {"h": 0.1, "num_steps": 100, "throw": False, "save": save}
-    sol = dvi.integrate(SPRING, [np.cos(1.0)], [-np.sin(1.0)], **options)
-    assert sol.status == "not_reached"
-    assert np.isnan(np.asarray(sol.qs)).all()
-
-
 @pytest.mark.slow
 def test_memory_does_not_grow_with_the_steps():
     """Neither that of a run nor that of its gradient: as with Save(final=True)."""
@@ -336,13 +313,6 @@ def test_memory_does_not_grow_with_the_steps():
     asked, final = size(dvi.Save(ts=[0.5, 0.7]), 10_000), size(dvi.Save(final=True), 10_000)
     assert asked < final + 20_000
     assert size(dvi.Save(), 10_000) > 3 * final
-
-
-@pytest.mark.slow
-def test_a_balance_needs_grid_points():
-    sol = kepler(num_steps=4, method=dvi.TypeII(), save=dvi.Save(ts=np.linspace(0.01, 0.07, 5)))
-    with pytest.raises(ValueError, match="at requested times"):
-        dvi.noether_balance(KEPLER, [dvi.generators.time_translation()], [None], sol)
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])

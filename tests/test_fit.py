@@ -88,9 +88,6 @@ def problem_of(data, params=START, model=MODEL, **options):
     return made, made.space.to_u(made.start)
 
 
-# --- predictions and derivatives -----------------------------------------------------------------
-
-
 def test_the_truth_is_found(regular):
     data, found = regular
     assert found.status == "converged"
@@ -106,7 +103,7 @@ def test_the_truth_is_found(regular):
 
 
 @pytest.mark.slow
-def test_predictions_between_grid_points_have_the_order_of_the_method():
+def test_predictions_at_and_between_grid_points():
     errors, omega, gamma = [], np.sqrt(1.3 - 0.01**2), 0.01
     t = IRREGULAR
     exact = np.exp(-gamma * t) * (np.cos(omega * t) + gamma / omega * np.sin(omega * t))
@@ -116,10 +113,6 @@ def test_predictions_between_grid_points_have_the_order_of_the_method():
         errors.append(np.abs(np.asarray(found)[0, :, 0] - exact).max())
     assert errors[0] < 5e-3
     assert 3.4 < errors[0] / errors[1] < 4.6
-
-
-@pytest.mark.slow
-def test_grid_points_are_picked():
     problem, u = problem_of(observed(np.zeros((60, 1))), TRUE)
     assert problem.groups[0].block == 10
     ((found, _),) = problem.weighted_residuals(u)[1]
@@ -148,9 +141,6 @@ def test_jacobian_against_differences_and_reverse_mode(ts):
         np.testing.assert_allclose(backward, J.T @ r, rtol=1e-8, atol=1e-8 * np.abs(J.T @ r).max())
 
 
-# --- standard errors -----------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_covariance_is_the_inverse_of_the_exact_hessian_at_a_perfect_fit():
     data = observed(np.asarray(states_at(REGULAR).qs))
@@ -162,17 +152,14 @@ def test_covariance_is_the_inverse_of_the_exact_hessian_at_a_perfect_fit():
     np.testing.assert_allclose(found.curvature, 1.0, atol=1e-6)
 
 
-def test_curvature_of_a_model_that_does_not_describe_the_data():
-    bent = noisy(REGULAR, 2) + 0.5 * np.sign(np.sin(1.14 * REGULAR))[:, None]
-    assert np.abs(dvi.fit(MODEL, observed(bent), START).curvature - 1).max() > 0.02
-
-
-def test_errors_found_from_the_residuals(regular):
+def test_errors_from_residuals_and_curvature(regular):
     data, known = regular
     unknown = dvi.fit(MODEL, observed(data.values, sigma=None), START)
     np.testing.assert_allclose(unknown.x, known.x, atol=1e-6)
     spread = np.sqrt(known.reduced_chi2)
     np.testing.assert_allclose(unknown.sigma, known.sigma * spread, rtol=1e-5)
+    bent = noisy(REGULAR, 2) + 0.5 * np.sign(np.sin(1.14 * REGULAR))[:, None]
+    assert np.abs(dvi.fit(MODEL, observed(bent), START).curvature - 1).max() > 0.02
 
 
 @pytest.mark.slow
@@ -200,7 +187,7 @@ def test_undetermined_directions_are_named_and_take_no_degree_of_freedom():
     np.testing.assert_allclose(idle.sigma[:2], plain.sigma, rtol=1e-5)
 
 
-def test_uncertainty_of_a_known_matrix():
+def test_uncertainty_and_explained_variance_are_those_of_their_definitions(regular):
     about = uncertainty(np.array([[3.0, 0.0], [0.0, 0.5], [0.0, 0.0]]), 4.0)
     np.testing.assert_allclose(about.covariance, np.diag([4 / 9, 16.0]))
     np.testing.assert_allclose(correlations(about.covariance), np.eye(2))
@@ -210,10 +197,7 @@ def test_uncertainty_of_a_known_matrix():
     # x + y is known exactly: y has the error of −x.
     tied = uncertainty(np.eye(3), 1.0, null_space(C))
     np.testing.assert_allclose(tied.covariance[:2, :2], [[0.5, -0.5], [-0.5, 0.5]], atol=1e-12)
-
-
-def test_the_explained_variance_is_that_of_its_definition(regular):
-    """With errors of each value, a missing one, and a mean for each component."""
+    # With errors of each value, a missing one, and a mean for each component.
     random = np.random.default_rng(0)
     values, model, errors = random.normal(size=(3, 9, 2))
     values[4, 1], errors = np.nan, np.abs(errors) + 0.1
@@ -240,9 +224,6 @@ def test_a_model_no_better_than_a_constant_is_reported(regular):
     assert "constants" not in str(good)
 
 
-# --- bounds and priors ---------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_bounds_hold_and_are_named():
     data = seen(4)
@@ -261,27 +242,6 @@ def test_bounds_hold_and_are_named():
         near = dvi.fit(MODEL, data, {**START, "epsilon": 1e-6}, bounds={"epsilon": bounds})
         assert np.abs((near.x - inside.x) / inside.sigma).max() < 0.01
         assert near.at_bounds == []
-
-
-def test_a_parameter_at_its_bound_is_neither_undetermined_nor_of_unknown_error():
-    """Far beyond the bound dx/du vanishes, and no covariance is found."""
-    model, bounds = model_of(q0=[1.0], epsilon=0.02), {"args": {"k": dvi.Bounds(0.0, 1.0)}}
-    found = dvi.fit(model, seen(4), {"args": {"k": 0.8}}, bounds=bounds, **UNCHECKED)
-    assert found.at_bounds == ["args.k"]
-    assert found.undetermined == []
-    assert "args.k  1 at its bound: no symmetric error" in str(found)
-    for words in ("nan", "not determined", "no errors"):
-        assert words not in str(found)
-
-
-def test_a_bounded_parameter_without_a_finite_error_is_at_a_bound_only_if_it_is_on_it():
-    space, _ = make_space([0.5] * 3, [dvi.Bounds(0.0, 1.0)] * 3)
-    x, sigma = np.array([0.5, 1e-170, 1 - 1e-16]), np.array([np.inf, np.nan, np.nan])
-    assert space.at_bounds(x, sigma) == ["[1]", "[2]"]
-
-
-@pytest.mark.slow
-def test_a_small_parameter_is_not_at_its_bound():
     data = observed(np.asarray(states_at(REGULAR).qs), sigma=1e-7)
 
     def model(params):
@@ -290,6 +250,20 @@ def test_a_small_parameter_is_not_at_its_bound():
     found = dvi.fit(model, data, {"small": 1e-6}, bounds={"small": dvi.Bounds(0.0)})
     np.testing.assert_allclose(found.x, 2e-6, rtol=1e-4)
     assert found.at_bounds == []
+
+
+def test_parameters_at_their_bounds():
+    """Far beyond the bound dx/du vanishes, and no covariance is found."""
+    model, bounds = model_of(q0=[1.0], epsilon=0.02), {"args": {"k": dvi.Bounds(0.0, 1.0)}}
+    found = dvi.fit(model, seen(4), {"args": {"k": 0.8}}, bounds=bounds, **UNCHECKED)
+    assert found.at_bounds == ["args.k"]
+    assert found.undetermined == []
+    assert "args.k  1 at its bound: no symmetric error" in str(found)
+    for words in ("nan", "not determined", "no errors"):
+        assert words not in str(found)
+    space, _ = make_space([0.5] * 3, [dvi.Bounds(0.0, 1.0)] * 3)
+    x, sigma = np.array([0.5, 1e-170, 1 - 1e-16]), np.array([np.inf, np.nan, np.nan])
+    assert space.at_bounds(x, sigma) == ["[1]", "[2]"]
 
 
 @pytest.mark.parametrize(("lower", "upper"), [(1.1, 2.0), (-2.0, -1.1), (0.0, 1e-300), (-3.0, 0.0)])
@@ -310,9 +284,6 @@ def test_a_prior_has_the_weight_of_a_measurement(regular):
     np.testing.assert_allclose((both.x[0] - free.x[0]) / free.sigma[0], 1.0, rtol=0.02)
     np.testing.assert_allclose(both.sigma[0], free.sigma[0] / np.sqrt(2), rtol=0.02)
     assert both.degrees_of_freedom == free.degrees_of_freedom + 1
-
-
-# --- losses --------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -346,7 +317,7 @@ def density(predicted, observed, sigma, params):
 
 
 @pytest.mark.slow
-def test_a_likelihood_with_an_unknown_noise_level():
+def test_likelihoods():
     """The maximum and its Hessian are known in closed form."""
     data, start = observed(noisy(REGULAR, 8), sigma=None), {"e": 0.01, "k": 1.29}
     given = {"loss": dvi.Likelihood(density), "tolerance": 1e-3}
@@ -356,10 +327,6 @@ def test_a_likelihood_with_an_unknown_noise_level():
     rms = np.sqrt(np.mean(least.residuals[0] ** 2))
     np.testing.assert_allclose(np.exp(found.x[2]), rms, rtol=1e-4)
     np.testing.assert_allclose(found.sigma[2], 1 / np.sqrt(2 * 60), rtol=1e-3)
-
-
-@pytest.mark.slow
-def test_a_likelihood_of_small_noise_with_an_idle_parameter_and_a_prior():
     y, start = noisy(REGULAR, 8), {"e": 0.01, "k": 1.29, "idle": 0.0}
     priors = {"k": dvi.Prior(1.3, 1e-4)}
     options = {"loss": dvi.Likelihood(density), "priors": priors}
@@ -370,9 +337,6 @@ def test_a_likelihood_of_small_noise_with_an_idle_parameter_and_a_prior():
     assert found.names[1] == "idle"
     assert np.isinf(found.sigma[1])
     np.testing.assert_allclose(found.loss - 60 * np.log(NOISE), least.loss, rtol=1e-6)
-
-
-# --- kinds of data and parameters ----------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -410,7 +374,7 @@ def test_observables(observe):
     np.testing.assert_allclose(dvi.fit(model_of(h=h), data, START).x, TRUTH, atol=1e-6)
 
 
-def test_results_have_the_order_of_the_given_observations(regular):
+def test_rows_of_results_and_of_arcs(regular):
     """Newest first: the same parameters, and rows of the result that belong to the given times."""
     data, known = regular
     found = dvi.fit(MODEL, observed(data.values[::-1], REGULAR[::-1]), START)
@@ -418,16 +382,10 @@ def test_results_have_the_order_of_the_given_observations(regular):
     for name in ("ts", "observed", "predicted", "whitened", "errors", "residuals"):
         of_one, of_other = getattr(found, name)[0], getattr(known, name)[0]
         np.testing.assert_array_equal(of_one, of_other[::-1])
-
-
-def test_rows_for_arcs_are_counted(regular):
     for rows in (2, 4):
         model = model_of(q0=np.ones((rows, 1)), p0=np.zeros((3, 1)))
         with pytest.raises(ValueError, match="one row for each arc"):
             dvi.fit(model, [regular[0]] * 3, {"epsilon": 0.0, "args": {"k": 1.3}})
-
-
-def test_masked_values_are_missing(regular):
     masked = np.ma.masked_array(regular[0].values, np.arange(60)[:, None] == 5)
     values = dvi.Observations(REGULAR, masked).values
     assert np.isnan(values[5, 0])
@@ -454,9 +412,6 @@ def test_sizes_in_a_module_are_not_fitted():
     found = dvi.fit(model, seen(1), Drag(2, jnp.array(0.0)), bounds=bounds, **UNCHECKED)
     assert found.names == ["weight"]
     np.testing.assert_allclose(found.x, 0.01, atol=1e-3)
-
-
-# --- the way to the minimum ----------------------------------------------------------------------
 
 
 def test_horizons_lead_to_the_minimum_that_all_data_miss():
@@ -512,7 +467,7 @@ def test_batches_draw_arcs():
 
 
 @pytest.mark.slow
-def test_nearly_collinear_parameters_are_followed_to_the_minimum():
+def test_difficult_ways_to_the_minimum():
     small = 1e-5
 
     def model(params):
@@ -525,11 +480,7 @@ def test_nearly_collinear_parameters_are_followed_to_the_minimum():
     found = dvi.fit(model, observed(y, sigma=small * NOISE), {"a": 0.9, "b": -0.5}, **UNCHECKED)
     assert found.status == "converged"
     assert off(found, [0.0, 1.0]) < 4
-
-
-@pytest.mark.slow
-def test_a_failed_trial_step_does_not_end_the_fit():
-    """A trial step that leaves the region where the model has an answer is taken back."""
+    # A trial step that leaves the region where the model has an answer is taken back.
 
     def well(t0, t1, q0, p1, args):
         return jnp.sum(p1**2) / 2 + jnp.sum(jnp.sqrt(args["k"]) * q0**2)
@@ -563,9 +514,6 @@ def test_one_compilation_for_many_fits_and_progress(regular):
     np.testing.assert_array_equal([p.loss for p in shown], found.history["loss"])
     assert shown[-1].names == found.names
     assert shown[-1].seconds > 0
-
-
-# --- files ---------------------------------------------------------------------------------------
 
 
 def test_saved_and_loaded(regular, tmp_path):
@@ -631,16 +579,14 @@ def test_resumed_with_the_same_bits(kind, tmp_path, monkeypatch):
     np.testing.assert_array_equal(again.covariance, whole.covariance)
 
 
-def stiffer(t0, t1, q0, p1, args):
-    return H(t0, t1, q0, p1, args) + jnp.sum(q0**4)
-
-
 def test_a_checkpoint_of_another_fit_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "_INTERVAL", 0.0)
     data, file = seen(11), tmp_path / "fit.npz"
     with pytest.raises(Interrupted):
         dvi.fit(MODEL, data, START, checkpoint=file, progress=interrupt(1))
-    other = model_of(dvi.System(stiffer, force=W))
+    other = model_of(
+        dvi.System(lambda t0, t1, q0, p1, args: H(t0, t1, q0, p1, args) + jnp.sum(q0**4), force=W)
+    )
     for change in (
         {"loss": dvi.Cauchy()},
         {"priors": {"epsilon": dvi.Prior(0.5, 1e-3)}},
@@ -668,8 +614,6 @@ def test_more_steps_continue_from_the_checkpoint(regular, tmp_path, monkeypatch)
     assert not file.exists()
     np.testing.assert_array_equal(more.history["x"], found.history["x"])
 
-
-# --- multiple shooting ---------------------------------------------------------------------------
 
 GUESSES = {
     "data": None,

@@ -28,10 +28,6 @@ def cubic(t0, t1, q0, p1, args):
     return (p1 @ p1 + args["k"] * q0 @ q0) / 2
 
 
-def pull(t0, t1, q0, p1, args):
-    return -(q0**3)
-
-
 LINE = dvi.Model(dvi.System(free), h=H)
 PAIR = {"q0": np.array([0.1]), "p0": np.array([0.9])}
 
@@ -50,7 +46,9 @@ def line_by_hand(data, sigma):
     return C @ A.T @ data.values[:, 0] / sigma, C
 
 
-OSCILLATOR = dvi.Model(dvi.System(cubic, force=pull), h=H, p0=jnp.array([0.3]))
+OSCILLATOR = dvi.Model(
+    dvi.System(cubic, force=lambda t0, t1, q0, p1, args: -(q0**3)), h=H, p0=jnp.array([0.3])
+)
 NEAR = {"epsilon": 0.03, "q0": np.array([0.8]), "args": {"k": 1.1}}
 LIMITS = {"epsilon": dvi.Bounds(0.0, 0.2), "args": {"k": dvi.Bounds(lower=0.5)}}
 
@@ -62,9 +60,6 @@ def swinging(sigma=0.01, steps=40, seed=0):
     )
     noise = 0.01 * np.random.default_rng(seed).normal(size=sol.qs.shape)
     return dvi.Observations(sol.ts, np.asarray(sol.qs) + noise, sigma=sigma)
-
-
-# --- the density ---------------------------------------------------------------------------------
 
 
 def student(predicted, observed, sigma, params):
@@ -99,7 +94,7 @@ def test_slopes_against_differences(loss, sigma):
 
 
 @pytest.mark.slow
-def test_second_derivatives_and_both_modes():
+def test_derivatives_and_failing_trajectories():
     posterior = dvi.Posterior(OSCILLATOR, swinging(), NEAR, gradient="forward")
     u, d = jnp.asarray(posterior.start), jnp.array([1.0, -2.0, 0.5])
     slope = jax.grad(posterior.potential)
@@ -108,6 +103,23 @@ def test_second_derivatives_and_both_modes():
     h = 1e-5
     by_differences = (slope(u + h * d) - slope(u - h * d)) / (2 * h)
     np.testing.assert_allclose(jax.jvp(slope, (u,), (d,))[1], by_differences, rtol=1e-6)
+
+    def explosive(t0, t1, q0, p1, args):
+        return p1 @ p1 / 2 - jnp.sum(jnp.exp(args["b"] * q0))
+
+    ts = H * np.arange(30)
+    data = dvi.Observations(ts, np.ones((30, 1)), sigma=0.1)
+    model = dvi.Model(dvi.System(explosive), h=H, q0=jnp.ones(1), p0=jnp.ones(1))
+    for gradient in ("reverse", "forward"):
+        posterior = dvi.Posterior(model, data, {"args": {"b": 0.01}}, gradient=gradient)
+        value, slope = jax.vmap(jax.value_and_grad(posterior.potential))(jnp.array([[0.01], [9.0]]))
+        assert np.isfinite(value[0])
+        assert value[1] == np.inf
+        assert slope[0] != 0
+        assert slope[1] == 0
+        assert posterior.log_density(jnp.array([9.0])) == -np.inf
+    with pytest.raises(ValueError, match=r"got 0 at args.b = 9"):
+        posterior.laplace([9.0])
 
 
 @pytest.mark.slow
@@ -155,26 +167,6 @@ def test_unknown_errors_are_integrated_out():
 
 
 @pytest.mark.slow
-def test_a_failing_trajectory_has_density_0_and_no_nan():
-    def explosive(t0, t1, q0, p1, args):
-        return p1 @ p1 / 2 - jnp.sum(jnp.exp(args["b"] * q0))
-
-    ts = H * np.arange(30)
-    data = dvi.Observations(ts, np.ones((30, 1)), sigma=0.1)
-    model = dvi.Model(dvi.System(explosive), h=H, q0=jnp.ones(1), p0=jnp.ones(1))
-    for gradient in ("reverse", "forward"):
-        posterior = dvi.Posterior(model, data, {"args": {"b": 0.01}}, gradient=gradient)
-        value, slope = jax.vmap(jax.value_and_grad(posterior.potential))(jnp.array([[0.01], [9.0]]))
-        assert np.isfinite(value[0])
-        assert value[1] == np.inf
-        assert slope[0] != 0
-        assert slope[1] == 0
-        assert posterior.log_density(jnp.array([9.0])) == -np.inf
-    with pytest.raises(ValueError, match=r"got 0 at args.b = 9"):
-        posterior.laplace([9.0])
-
-
-@pytest.mark.slow
 def test_the_mode_and_its_covariance():
     data = on_a_line()
     posterior = dvi.Posterior(LINE, data, {"q0": np.array([3.0]), "p0": np.array([-2.0])})
@@ -185,9 +177,6 @@ def test_the_mode_and_its_covariance():
     student_t = dvi.Posterior(LINE, data, PAIR, loss=dvi.Likelihood(student))
     mode, root = student_t.laplace()
     assert np.abs(jax.grad(student_t.potential)(jnp.asarray(mode)) @ root).max() < 1e-2
-
-
-# --- draws ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -356,10 +345,7 @@ def test_warnings():
     assert "100 % of the paths were truncated" in fake(good, steps=1023).warnings[0]
 
 
-# --- what is refused -----------------------------------------------------------------------------
-
-
-def test_arviz_old_new_and_none(monkeypatch):
+def test_packages_that_are_old_or_missing(monkeypatch):
     found = fake(np.random.default_rng(0).normal(size=(2, 50)))
     new = types.SimpleNamespace(__version__="1.0.0")
     old = types.SimpleNamespace(__version__="0.22.0", InferenceData=lambda **groups: groups)
@@ -370,9 +356,6 @@ def test_arviz_old_new_and_none(monkeypatch):
     monkeypatch.setitem(sys.modules, "arviz", None)
     with pytest.raises(ImportError, match="pip install arviz"):
         found.to_arviz()
-
-
-def test_without_numpyro_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "numpyro.infer", None)
     with pytest.raises(ImportError, match=r"dvi-jax\[bayes\]"):
         dvi.sample(LINE, on_a_line(), PAIR)

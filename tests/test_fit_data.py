@@ -80,7 +80,7 @@ def test_the_step_of_a_model_is_a_number(h):
         dvi.Model(SYSTEM, h=h)
 
 
-def test_invalid_covariances_of_two_components():
+def test_covariances_of_two_components():
     values = np.stack([np.cos(TS), np.sin(TS)], 1)
     with pytest.raises(ValueError, match="known exactly"):
         dvi.Observations(TS, values, covariance=np.ones((2, 2)))
@@ -88,6 +88,12 @@ def test_invalid_covariances_of_two_components():
     full[7, 0, 1] = 0.5
     with pytest.raises(ValueError, match="observation 7 must be symmetric"):
         dvi.Observations(TS, values, covariance=full)
+    C = np.array([[2.0, 0.9], [0.9, 1.0]])
+    values = np.stack([np.cos(TS), np.sin(TS)], 1)
+    values[4, 0] = np.nan
+    weights = dvi.Observations(TS, values, covariance=C).whitening()
+    np.testing.assert_allclose(weights[0].T @ weights[0], np.linalg.inv(C), rtol=1e-12)
+    np.testing.assert_allclose(weights[4], [[0, 0], [0, 1.0]], rtol=1e-12)
 
 
 @pytest.mark.parametrize("sign", [1, -1], ids=["after t0", "before t0"])
@@ -212,8 +218,10 @@ def test_invalid_input_of_a_fit(error, wrong, says):
         fit(**wrong)
 
 
-def test_a_model_takes_a_masked_array_without_a_masked_number():
+def test_masked_values_of_models_and_single_precision():
     assert type(starting(q0=np.ma.array([1.0]))(PARAMS)["q0"]) is np.ndarray
+    with jax.enable_x64(False), pytest.raises(ValueError, match="jax_enable_x64"):
+        fit()
 
 
 @pytest.mark.parametrize("loss", [dvi.SoftL1, dvi.Cauchy])
@@ -223,23 +231,14 @@ def test_a_robust_loss_has_a_positive_scale(loss):
 
 
 @pytest.mark.slow
-def test_fewer_values_than_parameters():
+def test_numbers_of_values():
     few, params = data(VALUES[:1], TS[:1]), {"epsilon": 0.0, "args": {"k": 1.0}}
     with pytest.raises(ValueError, match=r"at least 2 observed .*, got 1"):
         fit(data=few, params=params)
     priors = {"epsilon": dvi.Prior(0.0, 0.1)}
     assert fit(data=few, params=params, priors=priors).degrees_of_freedom == 0
-
-
-@pytest.mark.slow
-def test_a_difference_in_size_may_be_intended():
     found = fit(data=data(1e4 * VALUES), check_units=False, throw=False)
     assert found.status in ("converged", "stalled", "max_steps_reached")
-
-
-def test_single_precision_is_refused():
-    with jax.enable_x64(False), pytest.raises(ValueError, match="jax_enable_x64"):
-        fit()
 
 
 @pytest.mark.slow
@@ -253,12 +252,3 @@ def test_missing_values_do_not_count():
     np.testing.assert_allclose(found.covariance, same.covariance, rtol=1e-6)
     assert np.isnan(found.whitened[0][::3]).all()
     assert np.isnan(found.residuals[0][::3]).all()
-
-
-def test_a_missing_component_leaves_the_others_their_covariance():
-    C = np.array([[2.0, 0.9], [0.9, 1.0]])
-    values = np.stack([np.cos(TS), np.sin(TS)], 1)
-    values[4, 0] = np.nan
-    weights = dvi.Observations(TS, values, covariance=C).whitening()
-    np.testing.assert_allclose(weights[0].T @ weights[0], np.linalg.inv(C), rtol=1e-12)
-    np.testing.assert_allclose(weights[4], [[0, 0], [0, 1.0]], rtol=1e-12)

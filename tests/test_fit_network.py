@@ -50,7 +50,7 @@ def test_damping_never_does_positive_work(seed, size, of):
 
 
 @pytest.mark.slow
-def test_the_conservative_part_is_the_slope_of_a_potential():
+def test_parts_of_a_network():
     net = network(3, width=5)
     q, p = jnp.array([0.3, -0.2, 0.5]), jnp.array([0.1, 0.4, -0.3])
     d = 1e-5 * np.eye(3)
@@ -64,10 +64,6 @@ def test_the_conservative_part_is_the_slope_of_a_potential():
     J = jax.jacobian(net.conservative)(q)
     np.testing.assert_allclose(J, J.T, atol=1e-14)
     assert np.abs(J).max() > 1e-4
-
-
-@pytest.mark.slow
-def test_parts_are_switched_off_separately():
     q, p = jnp.array([0.3]), jnp.array([0.4])
     still, free = network(dissipative=False), network(conservative=False)
     assert np.all(still.dissipation(q, p) == 0)
@@ -78,6 +74,8 @@ def test_parts_are_switched_off_separately():
     assert free.power(q, p) < 0
     assert still.size + free.size == network().size
     assert network(width=6, depth=1).size == 37
+    with pytest.raises(ValueError, match=r"\(2,\), got shape \(1,\)"):
+        network(2).conservative(jnp.array([1.0]))
 
 
 @pytest.mark.slow
@@ -116,7 +114,7 @@ OPTIONS = {"priors": dvi.Prior(0.0, 1.0), "throw": False, "check_curvature": Fal
 
 
 @pytest.mark.slow
-def test_a_network_is_fitted_by_least_squares():
+def test_a_network_is_fitted_by_least_squares_and_by_gradients():
     net = network(width=4, depth=1)
     least = dvi.fit(model, observed(), net, horizons=[1.0, 2.0], max_steps=80, **OPTIONS)
     assert isinstance(least.params, dvi.NetworkForce)
@@ -128,10 +126,6 @@ def test_a_network_is_fitted_by_least_squares():
     assert np.abs(least.params(*at) + 0.4) < np.abs(net(*at) + 0.4)
     start = least.history["loss"][least.history["horizon"] == np.inf][0]
     assert least.loss < start
-
-
-@pytest.mark.slow
-def test_a_network_is_fitted_by_gradients_too():
     given = {"horizons": None, "max_steps": 150, "optimiser": optax.adam(1e-2), **OPTIONS}
     adam = dvi.fit(model, observed(), network(width=4, depth=1), **given)
     assert isinstance(adam.params, dvi.NetworkForce)
@@ -156,12 +150,6 @@ def test_a_network_is_fitted_by_gradients_too():
 def test_invalid_networks(change, error, match):
     with pytest.raises(error, match=match):
         network(**change)
-
-
-@pytest.mark.slow
-def test_a_state_of_another_shape_is_refused():
-    with pytest.raises(ValueError, match=r"\(2,\), got shape \(1,\)"):
-        network(2).conservative(jnp.array([1.0]))
 
 
 def benchmark():

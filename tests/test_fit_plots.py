@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from matplotlib.colors import to_hex
 from matplotlib.patches import Ellipse
 from pictures import closed, legend, lies_within, marked, refuses  # noqa: F401
 
@@ -56,32 +55,23 @@ def test_residuals_are_drawn_at_their_times_next_to_their_distribution():
     fit = made()
     fit.whitened[0][7, 1] = -12.0  # an outlier stays in the picture
     axes = plot.fit_residuals(fit)
-    assert axes.shape == (2,)
     for k, drawn in enumerate(points(axes[0])[:2]):
         same(drawn, np.stack([fit.ts[0], fit.whitened[0][:, k]], 1))
-    levels = {line.get_ydata()[0] for line in axes[0].lines if line.get_marker() == "None"}
-    assert levels == {0, 1, -1, 3, -3}
     assert sum(patch.get_width() for patch in axes[1].patches) == 119  # one is missing
     assert axes[-1].get_xlabel() == "count\n1 of 120\nnot finite"
     curve = next(line for line in axes[1].lines if len(line.get_xdata()) == 200)
     area = np.trapezoid(curve.get_xdata(), curve.get_ydata())
     assert area == pytest.approx(119 * axes[1].patches[0].get_height(), rel=1e-3)
     assert axes[0].get_ylim()[0] == axes[1].get_ylim()[0] < -12
-    assert axes[0].get_ylabel() == "observed − predicted\n[standard errors]"
-    assert legend(axes[0]) == ["component 0", "component 1"]
+    assert "[standard errors]" in axes[0].get_ylabel()
 
 
-def test_residuals_of_unknown_errors_are_in_the_estimated_error():
+def test_residuals_of_unknown_errors_and_of_several_arcs():
     fit = made(sigma=None)
     axes = plot.fit_residuals(fit, component=1)
-    (drawn,) = points(axes[0])
     s = np.sqrt(fit.reduced_chi2)
-    close(drawn[:, 1], fit.whitened[0][:, 1] / s)
-    assert 0.8 < np.std(drawn[:, 1]) < 1.2
+    close(points(axes[0])[0][:, 1], fit.whitened[0][:, 1] / s)
     assert f"s = {s:.3g}" in axes[0].get_ylabel()
-
-
-def test_arcs_have_panels_until_there_are_many():
     assert len(plot.fit_residuals(made(3))) == 4
     panel, _ = plot.fit_residuals(made(9))
     assert len(points(panel)) == 18
@@ -111,23 +101,17 @@ def edge(ellipse):
 def test_ellipses_and_marginals_are_those_of_the_covariance():
     axes = plot.fit_corner(made())
     # Units of the axes, read from their labels.
-    assert axes[2, 0].get_xlabel() == "args.mu − 1.000632\n[$10^{-5}$]"
-    assert axes[2, 1].get_xlabel() == "epsilon"
-    assert axes[2, 2].get_xlabel() == "q0[0]\n[$10^{-3}$]"
+    labels = ["args.mu − 1.000632\n[$10^{-5}$]", "epsilon", "q0[0]\n[$10^{-3}$]"]
+    assert [axis.get_xlabel() for axis in axes[2]] == labels
     scale = np.array([1e-5, 1.0, 1e-3])
     for i, j in ((1, 0), (2, 0), (2, 1)):
         pair = C[np.ix_([j, i], [j, i])]
         found = [p for p in axes[i, j].patches if isinstance(p, Ellipse)]
         for size, ellipse in zip((1, 2), found, strict=True):
             off = (edge(ellipse) - np.array(ellipse.center)) * scale[[j, i]]
-            distance = np.einsum("ni,ij,nj->n", off, np.linalg.inv(pair), off)
-            close(distance, size**2, rtol=1e-6)
-            close(np.ptp(off, axis=0) / 2, size * SIGMA[[j, i]], rtol=2e-3)
-    centre = np.array(axes[2, 1].patches[0].center)
-    close(centre * scale[[1, 2]], X[[1, 2]])
-    assert axes[0, 1].texts[0].get_text() == "+0.60"
-    assert axes[1, 2].texts[0].get_text() == "−0.80"
-    assert axes[0, 2].texts[0].get_text() == "0.00"
+            close(np.einsum("ni,ij,nj->n", off, np.linalg.inv(pair), off), size**2, rtol=1e-6)
+    close(np.array(axes[2, 1].patches[0].center) * scale[[1, 2]], X[[1, 2]])
+    assert [axes[i].texts[0].get_text() for i in ((0, 1), (1, 2))] == ["+0.60", "−0.80"]
     assert axes[0, 0].get_title() == "args.mu\n1.000632 ± 0.000020"
     for i in range(3):  # normal densities
         x, y = axes[i, i].lines[0].get_data()
@@ -135,16 +119,20 @@ def test_ellipses_and_marginals_are_those_of_the_covariance():
         assert y.max() == pytest.approx(scale[i] / (SIGMA[i] * np.sqrt(2 * np.pi)), rel=1e-3)
 
 
-def test_parameters_are_chosen_and_ordered():
-    axes = plot.fit_corner(made(), ["epsilon", "args.mu"])
-    assert axes.shape == (2, 2)
+def test_parameters_are_chosen_and_ordered_and_must_be_determined():
+    axes = plot.fit_corner(made(), ["epsilon", "args.mu"], axes=plt.subplots(2, 2)[1])
     assert axes[1, 0].get_xlabel() == "epsilon"
-    mine = plt.subplots(2, 2)[1]
     strong = C.copy()
     strong[0, 1] = strong[1, 0] = -0.9996 * SIGMA[0] * SIGMA[1]
-    axes = plot.fit_corner(made(covariance=strong), NAMES[:2], axes=mine)
-    assert axes[1, 0] is mine[1, 0]
+    axes = plot.fit_corner(made(covariance=strong), NAMES[:2])
     assert axes[0, 1].texts[0].get_text() == "−0.9996"
+    singular = C.copy()
+    singular[1, :] = singular[:, 1] = np.nan
+    singular[1, 1] = np.inf
+    fit = made(covariance=singular)
+    with pytest.raises(ValueError, match=r"of 'epsilon', got inf.*'args.mu', 'q0\[0\]'"):
+        plot.fit_corner(fit)
+    assert plot.fit_corner(fit, ["args.mu", "q0[0]"]).shape == (2, 2)
 
 
 def test_draws_lie_under_the_ellipses():
@@ -155,21 +143,9 @@ def test_draws_lie_under_the_ellipses():
     close(cloud * [1.0, 1e-3], draws.reshape(-1, 3)[:, [1, 2]])
     bars = sum(p.get_height() * p.get_width() for p in axes[0, 0].patches)
     assert bars == pytest.approx(1)
-    own = types.SimpleNamespace(
-        names=NAMES, x=draws, mean=draws.mean((0, 1)), samples=samples,
-        covariance=np.cov(draws.reshape(-1, 3).T),
-    )  # fmt: skip
+    own = {"mean": draws.mean((0, 1)), "covariance": np.cov(draws.reshape(-1, 3).T)}
+    own = types.SimpleNamespace(names=NAMES, x=draws, samples=samples, **own)
     assert plot.fit_corner(own, samples=own).shape == (3, 3)
-
-
-def test_what_is_not_determined_is_named():
-    singular = C.copy()
-    singular[1, :] = singular[:, 1] = np.nan
-    singular[1, 1] = np.inf
-    fit = made(covariance=singular)
-    with pytest.raises(ValueError, match=r"of 'epsilon', got inf.*'args.mu', 'q0\[0\]'"):
-        plot.fit_corner(fit)
-    assert plot.fit_corner(fit, ["args.mu", "q0[0]"]).shape == (2, 2)
 
 
 def bars(axis):
@@ -188,9 +164,12 @@ def test_data_with_their_errors_beside_the_prediction():
     for line, values in zip(axis.lines, (fit.predicted[0], fit.observed[0]), strict=False):
         same(line.get_xydata(), np.stack([fit.ts[0], values[:, 1]], 1))
     assert legend(axis) == ["y: fit", "y: observed"]
-    both = plot.fit_against_data(fit)
-    shown = [to_hex(line.get_color()).upper() for line in both.lines[::2]]
-    assert shown == list(plot.COLOURS[:2])
+    sizes = np.linspace(0.1, 0.2, 60)
+    each = made(errors=[sizes[:, None] * np.ones(2)])
+    lengths = bars(plot.fit_against_data(each, component=0))[0]
+    close([b for b in lengths if np.isfinite(b)], np.delete(sizes, 3), atol=1e-12)
+    fit = made(sigma=None)
+    close(bars(plot.fit_against_data(fit, component=1))[0], np.sqrt(fit.reduced_chi2))
 
 
 def test_predictions_that_do_not_show_the_curve_are_crosses():
@@ -203,29 +182,17 @@ def test_predictions_that_do_not_show_the_curve_are_crosses():
     same(axis.lines[0].get_data(), [t, np.sin(t)])
 
 
-def test_error_bars_are_those_of_the_data():
-    sizes = np.linspace(0.1, 0.2, 60)
-    errors = sizes[:, None] * np.ones(2)
-    lengths = bars(plot.fit_against_data(made(errors=[errors]), component=0))[0]
-    close([b for b in lengths if np.isfinite(b)], np.delete(sizes, 3), atol=1e-12)
-    fit = made(sigma=None)
-    close(bars(plot.fit_against_data(fit, component=1))[0], np.sqrt(fit.reduced_chi2))
-
-
 def test_losses_by_stage_with_rejected_steps():
-    axis = plot.learning_curve(made())
+    fit, axis = made(), plot.learning_curve(made())
     same(axis.lines[0].get_xydata(), [[1, 1e3], [2, 40]])
     same(axis.lines[1].get_xdata(), [3, 4, 5])
     same(marked(axis, "x"), [[[4, 90]]])
     stages = ["stage 1: up to 5 after the start", "stage 2: all data"]
     assert legend(axis) == [*stages, "step rejected"]
     assert axis.get_yscale() == "log"
-    fit = made()
-    fit.history["loss"][4] = -3.0
-    assert plot.learning_curve(fit).get_yscale() == "linear"
-    fit.history["loss"][3] = np.inf
+    fit.history["loss"][3:] = np.inf, -3.0
     axis = plot.learning_curve(fit)
-    same(marked(axis, "x"), [[[4, 0.985]]])
+    assert axis.get_yscale() == "linear"
     assert legend(axis)[-1] == "1 of 5 losses are not finite (at the top)"
 
 

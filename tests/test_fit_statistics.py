@@ -13,15 +13,10 @@ PROBLEMS = 200
 NOISE = 2e-3
 
 
-def kepler(t0, t1, q0, p1, args):
-    return p1 @ p1 / 2 - args["mu"] / jnp.linalg.norm(q0)
-
-
-def drag(t0, t1, q0, p1, args):
-    return -p1
-
-
-SYSTEM = dvi.System(kepler, force=drag)
+SYSTEM = dvi.System(
+    lambda t0, t1, q0, p1, args: p1 @ p1 / 2 - args["mu"] / jnp.linalg.norm(q0),
+    force=lambda t0, t1, q0, p1, args: -p1,
+)
 MODEL = dvi.Model(SYSTEM, h=0.05, method=dvi.Strang())
 TS = np.arange(1, 41) * 0.5
 

@@ -42,13 +42,10 @@ def test_the_equation_is_few_frames_from_the_call(method, frames, files, call):
     assert len(set(found)) <= files
 
 
-def test_the_check_of_shapes_calls_first():
+def test_the_frames_are_counted():
     """The count above is of the run, which begins with the second call of H_D."""
     found = frames_to_the_equation(1)
     assert [Path(file).stem for file in found] == ["integrate", "preparation", "system", "system"]
-
-
-def test_more_frames_are_counted():
-    """A method around the map adds frames, so that the numbers above could fail."""
+    # A method around the map adds frames, so that the numbers above could fail.
     nested = dvi.Composition((1.0,), base=dvi.Composition((0.5, 0.5), base=dvi.Strang()))
     assert len(frames_to_the_equation(2, method=nested)) > 16

@@ -176,19 +176,7 @@ def test_a_real_signal_has_the_same_positive_frequencies_in_both_directions_of_t
     assert np.abs(wrong.amplitudes[:2] - np.array(expected)).min() > 0.01
 
 
-def test_signals_with_unresolved_lines_evaluate_to_nan():
-    values = np.asarray(analysed().evaluate(TS[:7]))
-    assert values.shape == (len(NAMES), 7)
-    lost = np.isnan(values)
-    for name, status in zip(NAMES, analysed().status, strict=True):
-        known = status in ("successful", "no_signal")  # missing lines are not unresolved
-        assert (lost[NAMES.index(name)] == (not known)).all(), name
-    assert np.isnan(of("noisy").frequencies).any()
-    assert np.isfinite(of("unresolved").frequencies).any()  # which is not the whole signal
-    np.testing.assert_allclose(values[NAMES.index("no_signal")], 0.3 + 0.1j, atol=1e-14)
-
-
-def test_lines_are_evaluated_at_times_of_any_shape():
+def test_lines_evaluate_at_times_of_any_shape_or_to_nan():
     found, values = analysed(), analysed().evaluate(TS[:7].reshape(7, 1))
     assert values.shape == (len(NAMES), 7, 1)
     expected = SIGNALS["successful"][:7]
@@ -198,6 +186,15 @@ def test_lines_are_evaluated_at_times_of_any_shape():
             evaluation = jax.eval_shape(lambda f, ts=ts: f.evaluate(ts), lines)
             assert evaluation.shape == (*batch, *shape)
     assert np.isnan(found.evaluate(np.where(np.arange(7) == 3, np.nan, 0.0))[0]).sum() == 1
+    values = np.asarray(analysed().evaluate(TS[:7]))
+    assert values.shape == (len(NAMES), 7)
+    lost = np.isnan(values)
+    for name, status in zip(NAMES, analysed().status, strict=True):
+        known = status in ("successful", "no_signal")  # missing lines are not unresolved
+        assert (lost[NAMES.index(name)] == (not known)).all(), name
+    assert np.isnan(of("noisy").frequencies).any()
+    assert np.isfinite(of("unresolved").frequencies).any()  # which is not the whole signal
+    np.testing.assert_allclose(values[NAMES.index("no_signal")], 0.3 + 0.1j, atol=1e-14)
 
 
 @pytest.mark.parametrize("start", [0.0, 1000.0])

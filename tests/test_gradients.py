@@ -53,12 +53,8 @@ def point(system):
 
 @functools.cache
 def gradient(system, adjoint, save=EVERY_FOURTH):
-    return jax.jit(jax.grad(lambda x: loss(x, system, ADJOINTS[adjoint], save)))
-
-
-@functools.cache
-def value(system):
-    return jax.jit(lambda x: loss(x, system, ADJOINTS["Direct"]))
+    """The compiled loss with its gradient."""
+    return jax.jit(jax.value_and_grad(lambda x: loss(x, system, ADJOINTS[adjoint], save)))
 
 
 PAIRS = [
@@ -77,12 +73,12 @@ PAIRS = [
 )
 def test_gradient_equals_central_differences(system, adjoint):
     """In every input at once: along each axis of (q0, p0, h, t0, ε, args)."""
-    x = point(system)
+    x, both = point(system), gradient(system, adjoint)
     flat, unravel = ravel_pytree(x)
-    g, _ = ravel_pytree(gradient(system, adjoint)(x))
+    g, _ = ravel_pytree(both(x)[1])
     for i in range(flat.size):
         axis = unravel(jnp.zeros_like(flat).at[i].set(1.0))
-        expected = central_difference(value(system), x, axis)
+        expected = central_difference(lambda x: both(x)[0], x, axis)
         assert abs(float(g[i]) - float(expected)) <= 1e-6 * abs(float(expected)) + 1e-9, i
 
 
@@ -104,7 +100,7 @@ def test_adjoints_agree_to_round_off_for_every_way_of_saving(system, adjoint, sa
 
 
 @pytest.mark.slow
-def test_second_derivative_and_batched_gradient():
+def test_second_derivatives_and_batches_in_every_mode():
     x = point("non_separable")
 
     def in_epsilon(adjoint):
@@ -120,10 +116,25 @@ def test_second_derivative_and_batched_gradient():
     es = jnp.array([0.1, 0.2, 0.3])
     batch = jax.jit(jax.vmap(jax.grad(in_epsilon("Reversible"))))(es)
     np.testing.assert_allclose(batch, [slope(e) for e in es], rtol=1e-11)
+    # Of a batch with a shared parameter.
+
+    def derivative(adjoint, *modes):
+        f = functools.partial(shared, adjoint=adjoint)
+        for mode in modes:
+            f = mode(f)
+        return jax.jit(f)(1.0)
+
+    forward, reverse = jax.jacfwd, jax.grad
+    expected = derivative("Direct", reverse)
+    for mode in (forward, reverse):
+        np.testing.assert_allclose(derivative("Reversible", mode), expected, rtol=1e-11)
+    expected = derivative("Direct", forward, forward)
+    for modes in itertools.product((forward, reverse), repeat=2):
+        np.testing.assert_allclose(derivative("Reversible", *modes), expected, rtol=1e-10)
 
 
 @pytest.mark.slow
-def test_gradient_through_given_times():
+def test_gradients_into_times_and_modules():
     s, q, p = SYSTEMS["kepler"]
 
     def final(ts, adjoint):
@@ -136,11 +147,7 @@ def test_gradient_through_given_times():
         axis = jnp.zeros(5).at[i].set(1.0)
         expected = central_difference(lambda t: final(t, "Direct"), ts, axis)
         assert abs(float(g[i] - expected)) < 1e-8
-
-
-@pytest.mark.slow
-def test_gradient_into_a_module_force():
-    """W as an equinox module: its arrays are differentiable, no args needed."""
+    # W as an equinox module: its arrays are differentiable, no args needed.
     net = eqx.nn.MLP(1, 1, 4, 1, key=jax.random.key(0))
     net = jax.tree.map(lambda x: x.astype(jnp.float64) if eqx.is_array(x) else x, net)
 
@@ -150,12 +157,12 @@ def test_gradient_into_a_module_force():
         def __call__(self, t0, t1, q0, p1, args):
             return self.net(q0)
 
-    def final(force, adjoint):
+    def end_of(force, adjoint):
         system = dvi.System(SYSTEMS["pendulum"][0].H_D, force=force)
         how = {"h": 0.1, "num_steps": 30, "epsilon": 0.5, "adjoint": ADJOINTS[adjoint]}
         return jnp.sum(dvi.integrate(system, [0.4], [0.7], **how).qs[-1])
 
-    a, b = (eqx.filter_grad(final)(Force(net), adjoint) for adjoint in ("Reversible", "Direct"))
+    a, b = (eqx.filter_grad(end_of)(Force(net), adjoint) for adjoint in ("Reversible", "Direct"))
     assert_same(a, b, rtol=1e-10, atol=1e-14)
     assert max(float(jnp.max(jnp.abs(u))) for u in jax.tree.leaves(a)) > 1e-3
 
@@ -187,9 +194,6 @@ def test_reversible_memory_is_flat_and_direct_is_not():
     direct = growth(dvi.Direct())
     assert direct > 20_000 * 8 * 10
     assert growth(dvi.Reversible()) < direct / 100
-
-
-# --- where a custom derivative could be missed or misapplied -----------------------------------
 
 
 def closing_over(mu, where, adjoint):
@@ -238,49 +242,35 @@ def shared(mu, adjoint):
     return jnp.sum(jax.vmap(one)(jnp.array([[0.5, 0.3], [0.0, 1.2]])) ** 2)
 
 
-@pytest.mark.slow
-def test_first_and_second_derivatives_in_every_combination_of_modes():
-    """Of a batch with a shared parameter."""
-
-    def derivative(adjoint, *modes):
-        f = functools.partial(shared, adjoint=adjoint)
-        for mode in modes:
-            f = mode(f)
-        return jax.jit(f)(1.0)
-
-    forward, reverse = jax.jacfwd, jax.grad
-    expected = derivative("Direct", reverse)
-    for mode in (forward, reverse):
-        np.testing.assert_allclose(derivative("Reversible", mode), expected, rtol=1e-11)
-    expected = derivative("Direct", forward, forward)
-    for modes in itertools.product((forward, reverse), repeat=2):
-        np.testing.assert_allclose(derivative("Reversible", *modes), expected, rtol=1e-10)
-
-
-@pytest.mark.parametrize("form", ["arrays", pytest.param("auto", marks=pytest.mark.slow)])
-def test_a_failed_trajectory_that_the_loss_omits_spoils_no_shared_parameter(form):
-    """A start of NaN, and an implicit step without a root."""
-    q = jnp.array([[0.3, 0.0], [jnp.nan, 0.1], [0.1, 0.1], [0.2, 0.1]])
+@pytest.mark.parametrize(
+    ("system", "form"),
+    [
+        ("kepler", "auto"),
+        *(pytest.param("non_separable", x, marks=pytest.mark.slow) for x in ("arrays", "auto")),
+    ],
+)
+def test_a_failed_trajectory_that_the_loss_omits_spoils_no_shared_parameter(system, form):
+    """A start of NaN or at the centre, and an implicit step without a root."""
+    bad = [0.0, 0.0] if system == "kepler" else [0.1, 0.1]
+    q = jnp.array([[0.3, 0.0], [jnp.nan, 0.1], bad, [0.2, 0.1]])
     p = jnp.array([[0.3, 0.0], [0.1, 0.2], [60.0, 60.0], [0.0, 0.1]])
     how = {"h": 0.05, "num_steps": 20, "save": FINAL, "observe": dvi.Mean(product),
            "throw": False, "layout": dvi.Layout(form=form)}  # fmt: skip
 
-    def total(x, which, omit):
+    @jax.jit
+    @functools.partial(jax.grad, has_aux=True)
+    def gradient(x, which, omit):
         epsilon, K = x
 
         def one(q, p):
-            system = SYSTEMS["non_separable"][0]
-            sol = dvi.integrate(system, q, p, epsilon=epsilon, args={"K": K}, **how)
+            sol = dvi.integrate(SYSTEMS[system][0], q, p, epsilon=epsilon, args={"K": K}, **how)
             ok = sol.result == dvi.RESULTS.successful
-            end, mean = sol.qs[-1], sol.observed
-            if omit:
-                end, mean = jnp.where(ok, end, 0.0), jnp.where(ok, mean, 0.0)
+            end, mean = (jnp.where(ok | ~omit, x, 0.0) for x in (sol.qs[-1], sol.observed))
             return jnp.sum(end**2) + jnp.sum(mean), ok
 
         values, ok = jax.vmap(one)(q[which], p[which])
         return jnp.sum(values), ok
 
-    gradient = jax.jit(jax.grad(total, has_aux=True), static_argnums=2)
     every, good_twice = np.arange(4), np.array([0, 3, 0, 3])
     found, ok = gradient((0.2, 1.1), every, True)
     assert list(ok) == [True, False, False, True]
@@ -288,9 +278,6 @@ def test_a_failed_trajectory_that_the_loss_omits_spoils_no_shared_parameter(form
     np.testing.assert_allclose(found, np.array(twice) / 2, rtol=1e-12)
     spoilt, _ = gradient((0.2, 1.1), every, False)
     assert np.isnan(spoilt).all()  # NaN is not hidden where the loss uses a failed trajectory
-
-
-# --- reconstruction ----------------------------------------------------------------------------
 
 
 @pytest.mark.slow

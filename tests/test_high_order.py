@@ -100,7 +100,7 @@ def series_system(seed=0, orders=4, size=9, secular=3):
     return terms
 
 
-def test_null_vectors_order_by_order_are_those_of_the_whole_matrix():
+def test_null_vectors_and_solutions_order_by_order():
     terms = series_system()
     system = BlockTriangular(terms, larger_than(1e-10))
     counts = [tuple(c.shape[2] for c in system.null(k)) for k in range(4)]
@@ -119,9 +119,6 @@ def test_null_vectors_order_by_order_are_those_of_the_whole_matrix():
         assert not shifts[:9].any()
     terms[:, 3, -1] += 1e-3 * np.random.default_rng(1).normal(size=40)  # lost at order 3 as well
     assert BlockTriangular(terms, larger_than(1e-10)).null(3)[0].shape[2] == 0
-
-
-def test_solutions_order_by_order_have_only_the_coefficients_that_are_free():
     terms, rng = series_system(), np.random.default_rng(2)
     free = rng.uniform(size=(4, 9)) < 0.7
     c = np.where(free, rng.normal(size=(4, 9)), 0.0)[..., None]
@@ -148,27 +145,37 @@ def change_in_a_step(series, powers, q, p, epsilon, h):
     return value(q + h * p1, p1) - value(q, p)
 
 
-def test_an_invariant_of_order_six_changes_by_epsilon_to_the_seventh():
+@pytest.mark.parametrize(
+    ("order", "degree", "survivors", "wrong_at", "largest"),
+    [
+        (2, 4, (2, 1, 1), 1, 40),
+        # Fewer with each order, by the degree that remains for corrections.
+        pytest.param(6, 8, (4, 3, 3, 2, 2, 1, 1), 4, 2, marks=pytest.mark.slow),
+    ],
+)
+def test_an_invariant_of_an_order_changes_by_the_next_power_of_epsilon(
+    order, degree, survivors, wrong_at, largest
+):
     force = lambda t0, t1, q, p, args: -(q**2)  # noqa: E731
     system = dvi.System(lambda t0, t1, q, p, args: (p @ p + q @ q) / 2, force=force)
     samples = np.random.default_rng(0).uniform(-0.5, 0.5, (2, 120, 1))
-    found = dvi.discover_invariants(system, dvi.Polynomials(8), 6, h=0.1, samples=samples)
-    assert found.survivors == (4, 3, 3, 2, 2, 1, 1)  # by the degree that is left for corrections
-    assert found.count == 1
+    found = dvi.discover_invariants(system, dvi.Polynomials(degree), order, h=0.1, samples=samples)
+    assert (found.survivors, found.count) == (survivors, 1)
     powers = found.basis.function.counts
     wrong = np.array(found.coefficients[0])
-    wrong[4, np.argmax(np.abs(wrong[4]))] *= 2
+    wrong[wrong_at, np.argmax(np.abs(wrong[wrong_at]))] *= 2
     slopes = []
     for series in (np.asarray(found.coefficients[0]), wrong):
         changes = [
             abs(change_in_a_step(series, powers, Fraction(2, 5), Fraction(1, 3), e, Fraction(0.1)))
-            for e in (Fraction(1, 2), Fraction(1, 4))
+            for e in (Fraction(1, largest), Fraction(1, 2 * largest))
         ]
         slopes.append(np.log2(float(changes[0] / changes[1])))
-    assert slopes[0] == pytest.approx(7, abs=0.2)
-    assert slopes[1] < 5  # 4 in the limit of small ε
+    assert slopes[0] == pytest.approx(order + 1, abs=0.2)
+    assert slopes[1] < wrong_at + 1  # wrong_at in the limit of small ε
 
 
+@pytest.mark.slow
 def test_orders_above_six_are_not_silent():
     system = dvi.System(lambda t0, t1, q, p, args: (p @ p + q @ q) / 2)
     samples = np.random.default_rng(0).uniform(-1, 1, (2, 40, 1))

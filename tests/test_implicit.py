@@ -51,12 +51,17 @@ def test_all_methods_agree_with_the_closed_form(method):
     np.testing.assert_allclose(a.ps[-1], b.ps[-1], rtol=0, atol=2e-14)
 
 
-def test_a_force_acts_in_the_solve_of_all_unknowns():
+def test_forces_and_perturbations():
     friction = {"force": lambda t0, t1, q0, p1, args: -p1}
     a, b = (run(H, dvi.GaussLegendre(2), **friction) for H in (BY_VELOCITY, closed))
     np.testing.assert_allclose(a.ps[-1], b.ps[-1], rtol=0, atol=1e-14)
     free = run(closed, dvi.GaussLegendre(2))
     assert np.abs(a.ps[-1] - free.ps[-1]).max() > 1e-3
+    system = dvi.System(oscillator(1.0), perturbation=extra)
+    for epsilon in (0.0, 0.3):
+        a = dvi.integrate(system, [1.0], [0.2], h=0.1, num_steps=20, epsilon=epsilon)
+        b = dvi.integrate(dvi.System(oscillator(1.0 + epsilon)), [1.0], [0.2], h=0.1, num_steps=20)
+        np.testing.assert_allclose(a.qs, b.qs, atol=1e-13)
 
 
 @pytest.mark.parametrize("method", [dvi.TypeII(), *SLOW])
@@ -93,14 +98,6 @@ def oscillator(omega):
 def extra(t0, t1, q0, p1, args, epsilon):
     """What makes 1 + ε of ω = 1, which is not linear in ε."""
     return (2.0 + epsilon) * (q0 @ q0) / 2
-
-
-def test_a_perturbation_may_take_epsilon():
-    system = dvi.System(oscillator(1.0), perturbation=extra)
-    for epsilon in (0.0, 0.3):
-        a = dvi.integrate(system, [1.0], [0.2], h=0.1, num_steps=20, epsilon=epsilon)
-        b = dvi.integrate(dvi.System(oscillator(1.0 + epsilon)), [1.0], [0.2], h=0.1, num_steps=20)
-        np.testing.assert_allclose(a.qs, b.qs, atol=1e-13)
 
 
 @pytest.mark.slow

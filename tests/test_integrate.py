@@ -36,9 +36,6 @@ def energy(t0, t1, q0, p0, q1, p1, args):
     return H(t1, t1, q1, p1, args)
 
 
-# --- saved states ------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("save", "kept"),
     [
@@ -79,14 +76,11 @@ def test_states_of_any_shape(shape):
     np.testing.assert_allclose(sol.qs, expected, rtol=1e-14)
 
 
-def test_times_do_not_accumulate_round_off():
+def test_late_times_and_invariants_do_not_accumulate_round_off():
     sol = run(num_steps=10_000, t0=5.0, save=dvi.Save(every=1000))
     np.testing.assert_array_equal(sol.ts, 5.0 + 0.1 * np.arange(0, 10_001, 1000))
     assert np.cumsum(np.full(10_000, 0.1))[-1] != 1000.0  # a running sum would
-
-
-def test_exact_invariant_of_the_map_is_conserved_late_in_a_run():
-    """h reaches the step as it is, not as a difference of large times."""
+    # h reaches the step as it is, not as a difference of large times.
 
     def invariant(t0, t1, q0, p0, q1, p1, args):
         return jnp.sum(p1**2 + q1**2 - 0.1 * q1 * p1) / 2
@@ -96,10 +90,7 @@ def test_exact_invariant_of_the_map_is_conserved_late_in_a_run():
     assert sol.observed["range"] / sol.observed["mean"] < 5e-14
 
 
-# --- given times -------------------------------------------------------------------------------
-
-
-def test_given_times_set_the_steps():
+def test_given_times():
     """Equal ones are the uniform grid; unequal ones against the map by hand."""
     a = run(epsilon=0.1)
     b = dvi.integrate(OSCILLATOR, *START, lattice=dvi.Given(0.1 * np.arange(24)), epsilon=0.1)
@@ -113,16 +104,10 @@ def test_given_times_set_the_steps():
         q = q + h * p
         np.testing.assert_allclose(sol.qs[k + 1], q, rtol=1e-14)
     np.testing.assert_array_equal(sol.ts, ts)
-
-
-def test_given_times_of_a_problem_and_of_integers():
     kepler, ts = dvi.systems.kepler(), np.array([0.0, 0.1, 0.3])
     assert dvi.integrate(kepler, lattice=dvi.Given(ts)).ts.tolist() == ts.tolist()
     whole = dvi.integrate(OSCILLATOR, *START, lattice=dvi.Given([0, 1, 2]))
     np.testing.assert_array_equal(whole.hs, [1.0, 1.0])
-
-
-# --- observables -------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -145,7 +130,8 @@ def test_reductions_equal_numpy_on_the_full_record():
     np.testing.assert_array_equal(sol.observed["last"], q[-1])
 
 
-def test_an_observable_sees_both_ends_of_its_step():
+def test_observables_of_a_step():
+
     def seen(t0, t1, q0, p0, q1, p1, args):
         return jnp.stack([t0, t1, q0[0], p0[0], q1[0], p1[0], args["a"]])
 
@@ -155,8 +141,6 @@ def test_an_observable_sees_both_ends_of_its_step():
         expected = [full.ts[k - 1], full.ts[k], full.qs[k - 1, 0], full.ps[k - 1, 0]]
         np.testing.assert_allclose(row, [*expected, full.qs[k, 0], full.ps[k, 0], 3.0], rtol=1e-13)
 
-
-def test_boolean_observables_are_counted():
     def right(t0, t1, q0, p0, q1, p1, args):
         return q1[0] > 0
 
@@ -180,9 +164,6 @@ def test_streamed_reductions_need_no_memory_for_the_steps(form, few):
     assert size(1000 * few) <= size(few) + 1024
 
 
-# --- batches, compilation ----------------------------------------------------------------------
-
-
 def test_batch_equals_loop_and_jit_equals_eager():
     """Of the other methods `test_certify.py` tests it."""
     system, q, p = SYSTEMS["double_pendulum"]
@@ -199,7 +180,7 @@ def test_batch_equals_loop_and_jit_equals_eager():
     np.testing.assert_allclose(jax.jit(final)(es[1]), final(es[1]), rtol=1e-14, atol=1e-16)
 
 
-def test_one_trace_per_shape():
+def test_one_trace_per_shape_and_of_each_step():
     traces = []
 
     def counted(t0, t1, q0, p1, args):
@@ -216,10 +197,7 @@ def test_one_trace_per_shape():
     assert go(np.ones(2), 0.1, 0.0, 1.0) > 1
     assert go(np.zeros(2), 0.2, 0.5, 2.0) <= 1  # the check of shapes
     assert go(np.ones(3), 0.1, 0.0, 1.0) > 1
-
-
-def test_the_step_is_traced_once():
-    """For a forward run and for its gradient; H_D once for its shape and once for each half."""
+    # For a forward run and for its gradient; H_D once for its shape and once for each half.
     calls = []
 
     def H_D(t0, t1, q0, p1, args):
@@ -272,10 +250,7 @@ def test_the_state_sets_the_precision():
     assert sol.qs.dtype == sol.ts.dtype == jnp.float32
 
 
-# --- failure -----------------------------------------------------------------------------------
-
-
-def test_newton_failure_is_named_with_step_and_residual():
+def test_failures_are_named_and_keep_the_states_before():
     match = r"step 0 of 10 .*residual .*did not converge"
     with pytest.raises(dvi.IntegrationError, match=match) as e:
         dvi.integrate(NON_SEPARABLE, [3.0], [4.0], h=10.0, num_steps=10)
@@ -284,10 +259,7 @@ def test_newton_failure_is_named_with_step_and_residual():
     lattice = dvi.Given(np.array([0.0, 0.001, 10.0]))
     with pytest.raises(dvi.IntegrationError, match=r"step 1 of 2 .*h = 9.999"):
         dvi.integrate(NON_SEPARABLE, [3.0], [4.0], lattice=lattice)
-
-
-def test_failure_later_in_the_run_keeps_the_states_before():
-    """H = p²/2 + √(1/2 − q) ends at q = 1/2: the orbit until then is there, the rest is NaN."""
+    # H = p²/2 + √(1/2 − q) ends at q = 1/2: the orbit until then is there, the rest is NaN.
     system = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + jnp.sum(jnp.sqrt(0.5 - q)))
     how = {"h": 0.2, "num_steps": 9, "observe": dvi.Range(energy)}
     sol = dvi.integrate(system, [0.0], [1.0], throw=False, **how)
@@ -318,15 +290,14 @@ def test_a_failed_trajectory_leaves_the_others_of_a_batch_unchanged():
     np.testing.assert_array_equal(np.isfinite(gradients), [True, False, True])
 
 
-def test_a_batch_raises_for_a_failed_trajectory_with_throw():
+def test_failures_in_a_batch_are_an_error_or_a_status():
+
     def go(h):
         return dvi.integrate(NON_SEPARABLE, [3.0], [4.0], h=h, num_steps=10).qs
 
     with pytest.raises(Exception, match="did not converge"):
         jax.block_until_ready(jax.vmap(go)(jnp.array([0.001, 10.0])))
 
-
-def test_traced_invalid_input_becomes_a_status():
     def solve(q, h):
         return dvi.integrate(OSCILLATOR, [q], [0.1], h=h, num_steps=3, throw=False)
 
@@ -350,9 +321,6 @@ def test_a_light_body_is_solved_for_as_well_as_alone():
     both = dvi.integrate(system, [1.0, 1.0], m, args=m, **how)
     alone = dvi.integrate(system, [1.0], m[1:], args=m[1:], **how)
     np.testing.assert_allclose(both.ps[:, 1], alone.ps[:, 0], rtol=1e-12)
-
-
-# --- rejected input ----------------------------------------------------------------------------
 
 
 def test_a_masked_array_without_a_masked_number_is_an_array():
@@ -395,9 +363,6 @@ print(run(jnp.ones(1)))
     assert out.stdout.split() == ["True", "True", "True", "float32"]
 
 
-# --- memory ------------------------------------------------------------------------------------
-
-
 def final_position(q0, save=dvi.Save()):
     return dvi.integrate(OSCILLATOR, q0, START[1], h=0.1, num_steps=9, save=save).qs[-1]
 
@@ -429,9 +394,6 @@ def test_results_of_a_batch_are_counted_together(monkeypatch):
     ):
         with pytest.raises(ValueError, match=r"10 saved states of each of 12 trajectories"):
             f(jnp.ones((3, 4, 2)))
-
-
-def test_results_that_fit_are_computed(monkeypatch):
     monkeypatch.setattr(_memory, "machine_memory", lambda: 4 * 480)
     assert jax.vmap(final_position)(jnp.ones((4, 2))).shape == (4, 2)
     monkeypatch.setattr(_memory, "machine_memory", lambda: 2 * 48)
@@ -440,7 +402,7 @@ def test_results_that_fit_are_computed(monkeypatch):
     assert final_position(jnp.ones(2)).shape == (2,)
 
 
-def test_the_memory_of_this_machine_is_known(monkeypatch, tmp_path):
+def test_the_memory_of_this_machine_and_of_devices(monkeypatch, tmp_path):
     found, read = _memory.machine_memory(), _memory.Path.read_text
     assert found is None or found > 2**28
     monkeypatch.setattr(_memory, "_CGROUPS", tmp_path)
@@ -452,8 +414,6 @@ def test_the_memory_of_this_machine_is_known(monkeypatch, tmp_path):
     monkeypatch.setattr(_memory.Path, "read_text", read_text)
     assert 12345678 in _memory._limits()
 
-
-def test_results_on_other_devices_have_the_memory_of_these(monkeypatch):
     def device(limit):
         return SimpleNamespace(memory_stats=lambda: {"bytes_limit": limit} if limit else None)
 

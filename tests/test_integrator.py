@@ -47,10 +47,6 @@ def poincare(system=PENDULUM, **how):
     return dvi.poincare_section(system, *START_OF_SECTION, crossing, **SECTION, **how).qs
 
 
-def return_map(**how):
-    return dvi.ReturnMap(PENDULUM, crossing, 0.1, 200, **how)(jnp.array([0.5]), jnp.array([0.0])).q
-
-
 def drift_order(**how):
     run = {"h": 0.1, "num_steps": 50, **DRIFT}
     return dvi.drift_order(FORCED, velocity, [0.4], [0.1], **run, **how).drifts
@@ -65,7 +61,9 @@ CALLS = {
     "integrate": last,
     "sweep": sweep,
     "poincare_section": poincare,
-    "ReturnMap": return_map,
+    "ReturnMap": lambda **how: (
+        dvi.ReturnMap(PENDULUM, crossing, 0.1, 200, **how)(jnp.array([0.5]), jnp.array([0.0])).q
+    ),
     "tangent_map": lambda **how: dvi.tangent_map(PENDULUM, **START, num_steps=20, **how),
     "drift_order": drift_order,
     "discover_invariants": invariants,
@@ -75,7 +73,15 @@ CALLS = {
 }
 
 
-@pytest.mark.parametrize("name", CALLS)
+QUICK = ("integrate", "Integrator", "Model", "drift_order", "tangent_map", "from_lagrangian")
+
+
+def each(calls):
+    """Names of calls, marked slow if they take seconds to compile."""
+    return [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in calls]
+
+
+@pytest.mark.parametrize("name", each(CALLS))
 def test_an_integrator_means_the_same_as_its_keywords(name):
     call = CALLS[name]
     found, expected, other = (
@@ -86,13 +92,17 @@ def test_an_integrator_means_the_same_as_its_keywords(name):
     assert np.max(np.abs(found - other)) > 1e-4
 
 
-def test_all_fields_are_used():
+def test_all_fields_are_used_or_rejected():
     how = {"method": dvi.Strang(), "arithmetic": dvi.Compensated(), "newton": dvi.Newton()}
     one = dvi.Integrator(dvi.Strang(), dvi.Newton(), arithmetic=dvi.Compensated())
     assert last(integrator=one) == last(**how)
     ts = np.linspace(0, 1, 11)
     given = dvi.Integrator(lattice=dvi.Given(ts))
     np.testing.assert_array_equal(dvi.integrate(PENDULUM, [0.5], [0.1], integrator=given).ts, ts)
+    with pytest.raises(ValueError, match="arithmetic of discover_invariants must be"):
+        invariants(integrator=ACCURATE)
+    with pytest.raises(ValueError, match="find_symmetries does not use method"):
+        symmetries(integrator=STRANG)
 
 
 def implicit(t0, t1, q, p, args):
@@ -137,10 +147,6 @@ def symmetries(**how):
     return dvi.find_symmetries(PENDULUM, basis, **SAMPLED, time=False, **how).singular_values
 
 
-def type_iii(t0, t1, q1, p0, args):
-    return p0 @ p0 / 2 - jnp.sum(jnp.cos(q1))
-
-
 IMPLICIT = dvi.System(implicit)
 ROOT_FINDERS = {
     **CALLS,
@@ -152,13 +158,15 @@ ROOT_FINDERS = {
     "solution_pairs": lambda **how: dvi.solution_pairs(IMPLICIT, h=0.1, samples=LEFT, **how)[1].q,
     "legendre": lambda **how: value_of(dvi.legendre(lagrangian, **how)),
     "from_lagrangian": lambda **how: value_of(dvi.from_lagrangian(action, **how)),
-    "from_type_iii": lambda **how: value_of(dvi.from_type_iii(type_iii, **how)),
+    "from_type_iii": lambda **how: value_of(
+        dvi.from_type_iii(lambda t0, t1, q1, p0, args: p0 @ p0 / 2 - jnp.sum(jnp.cos(q1)), **how)
+    ),
     "solve_ivp": lambda **how: interop.solve_ivp(IMPLICIT, (0, 1.0), [0.5, 0.1], h=0.1, **how).y,
 }
 """Public functions with the keyword `root_finder`; three of them also take `newton`."""
 
 
-@pytest.mark.parametrize("name", ROOT_FINDERS)
+@pytest.mark.parametrize("name", each(ROOT_FINDERS))
 def test_a_root_finder_is_used(name):
     """`newton` is another name of it for `integrate` and `Integrator` only."""
     call, solver = ROOT_FINDERS[name], dvi.Newton(max_steps=30)
@@ -209,13 +217,6 @@ def test_searches_list_their_keywords_and_name_the_one_that_is_unknown(search):
     name, hint = ("methd", "Did you mean 'method'") if SEARCHES[search] else ("method", "Its argu")
     with pytest.raises(TypeError, match=f"{search.__name__} has no argument '{name}'. {hint}"):
         search(PENDULUM, **{name: dvi.Strang()})
-
-
-def test_fields_without_effect_are_rejected():
-    with pytest.raises(ValueError, match="arithmetic of discover_invariants must be"):
-        invariants(integrator=ACCURATE)
-    with pytest.raises(ValueError, match="find_symmetries does not use method"):
-        symmetries(integrator=STRANG)
 
 
 def test_one_default_for_every_function():

@@ -45,13 +45,12 @@ def test_states_are_those_of_integrate(method):
     assert jnp.max(jnp.abs(theirs.ys[0] - unperturbed.qs)) > 1e-4
 
 
-def test_a_step_size_that_is_not_a_power_of_two():
+@pytest.mark.slow
+def test_steps_backwards_and_of_any_size():
     """The states differ by the round-off of the times."""
     theirs = by_diffrax(interop.diffrax_solver(dvi.Strang()), h=0.1)
     np.testing.assert_allclose(theirs.ys[0][-1], ours(dvi.Strang(), 20, 0.1).qs[-1], atol=1e-13)
 
-
-def test_backwards_in_time():
     def driven(t0, t1, q0, p1, args):
         return -q0 * jnp.cos(3 * t0)  # a time of the wrong sign would be seen
 
@@ -88,17 +87,14 @@ def test_gradients_are_those_of_the_map(method):
 
 
 @pytest.mark.slow
-def test_a_batch_is_the_loop():
+def test_batches_and_failed_solves():
+
     def end(q0):
         return by_diffrax(interop.diffrax_solver(dvi.Strang()), 1.0, q0=q0).ys[0][-1]
 
     starts = Q0[None] + jnp.array([[0.0, 0.0], [0.1, 0.2], [-0.3, 0.1]])
     together = jax.vmap(end)(starts)
     np.testing.assert_allclose(together, jnp.stack([end(q) for q in starts]), rtol=0, atol=1e-14)
-
-
-@pytest.mark.slow
-def test_a_failed_solve_has_a_status_of_diffrax():
     term, solver = interop.diffrax_term(dvi.System(non_separable)), interop.diffrax_solver()
     y0 = jnp.array([3.0]), jnp.array([3.0])
 
@@ -155,7 +151,8 @@ def test_arguments_of_a_wrong_type():
 
 
 @pytest.mark.slow
-def test_dense_output_has_order_four_and_is_not_the_map():
+def test_order_of_dense_output_and_other_solvers():
+
     def error(h):
         ts = jnp.linspace(0.03, 1.97, 23)
         solver, saveat = interop.diffrax_solver(dvi.KahanLi(8)), diffrax.SaveAt(ts=ts)
@@ -165,6 +162,9 @@ def test_dense_output_has_order_four_and_is_not_the_map():
 
     orders = measured_orders([error(h) for h in (1 / 8, 1 / 16, 1 / 32)], 2, 1e-13)
     assert np.all(np.abs(orders - 4) < 0.5), orders
+    sol = by_diffrax(diffrax.Dopri8(), 3.0, epsilon=0.0, stepsize_controller=ACCURATE)
+    q, _ = KEPLER.exact(3.0, Q0, P0, KEPLER.args)
+    np.testing.assert_allclose(sol.ys[0][-1], q, rtol=0, atol=1e-10)
 
 
 @pytest.mark.slow
@@ -190,13 +190,6 @@ def test_the_map_tends_to_the_vector_field():
     orders = measured_orders([error(n) for n in (40, 80, 160)], 2, 1e-11)
     assert np.all(np.abs(orders - 2) < 0.35), orders
     assert error(160, epsilon=0.11) > 30 * error(160)  # the control: another field
-
-
-@pytest.mark.slow
-def test_solvers_of_diffrax_with_our_term():
-    sol = by_diffrax(diffrax.Dopri8(), 3.0, epsilon=0.0, stepsize_controller=ACCURATE)
-    q, _ = KEPLER.exact(3.0, Q0, P0, KEPLER.args)
-    np.testing.assert_allclose(sol.ys[0][-1], q, rtol=0, atol=1e-10)
 
 
 @pytest.mark.slow

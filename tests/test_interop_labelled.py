@@ -76,15 +76,12 @@ def test_a_batch_goes_to_a_file_and_comes_back(tmp_path):
         assert not read.identical(data.assign_attrs(software="another"))
 
 
-def test_trajectories_with_times_of_their_own():
+def test_times_of_their_own_and_failures():
     sols = jax.vmap(lambda h: run(h=h, observe=None))(jnp.array([0.1, 0.2]))
     data = interop.to_xarray(sols, dims="h_size")
     assert data.q.dims == ("h_size", "save", "component")
     assert np.array_equal(data.t, sols.ts)
     assert "time" not in data.dims
-
-
-def test_a_failure_has_its_status_and_nan():
     sol = run(h=1e200, throw=False, observe=None)
     data = interop.to_xarray(sol)
     assert int(data.status) in (1, 2)
@@ -92,13 +89,18 @@ def test_a_failure_has_its_status_and_nan():
     assert np.isnan(data.q[-1]).all()
 
 
-def test_bodies_and_axes_have_names():
+def test_names_of_components_and_observables():
     problem = systems.n_body()
     steps = {"h": 0.01, "num_steps": 2, "args": problem.args}
     sol = dvi.integrate(problem.system, problem.q0, problem.p0, **steps)
     data = interop.to_xarray(sol, components={"body": ["a", "b", "c"], "axis": ["x", "y"]})
     assert np.array_equal(data.p.sel(body="b", axis="y"), sol.ps[:, 1, 1])
     assert interop.to_xarray(sol).q.dims == ("time", "component_0", "component_1")
+    assert interop.to_xarray(run(observe=ENERGY), observe=ENERGY).observed.dims == ("step",)
+    listed = [dvi.TangentMap(), ENERGY]
+    data = interop.to_xarray(run(observe=listed), observe=listed)
+    assert data["observed.0"].shape == (4, 4)
+    assert data["observed.1"].dims == ("step",)
 
 
 @pytest.mark.parametrize(
@@ -123,14 +125,6 @@ def test_names_in_use(name):
         interop.to_xarray(run(observe=observe), observe=observe)
 
 
-def test_observables_without_a_name_get_one():
-    assert interop.to_xarray(run(observe=ENERGY), observe=ENERGY).observed.dims == ("step",)
-    listed = [dvi.TangentMap(), ENERGY]
-    data = interop.to_xarray(run(observe=listed), observe=listed)
-    assert data["observed.0"].shape == (4, 4)
-    assert data["observed.1"].dims == ("step",)
-
-
 def test_wrong_arguments():
     with pytest.raises(TypeError, match=r"dvi\.Solution"):
         interop.to_xarray({"q": 1})
@@ -141,9 +135,6 @@ def test_wrong_arguments():
     u = pytest.importorskip("astropy.units")
     with pytest.raises(TypeError, match="coords time has the unit 'km'"):
         interop.to_xarray(run(), coords={"time": np.arange(7) * u.km})
-
-
-# ---- ArviZ
 
 
 def draws(seed=0, chains=4, count=250):
@@ -205,8 +196,6 @@ def test_arviz_base_takes_the_tree():
     assert sample.sizes["sample"] == 1000
     assert float(sample["K"].mean()) == pytest.approx(-2.0, abs=0.05)
 
-
-# ---- what is imported when
 
 THEIRS = ("diffrax", "astropy", "arviz", "arviz_base", "rebound", "scipy", "xarray")
 

@@ -28,7 +28,7 @@ def run(units, **changes):
     return interop.integrate(SYSTEM, units=units, **{**given, "method": dvi.KahanLi(8), **changes})
 
 
-def test_the_orbit_is_the_same_in_other_units():
+def test_orbits_and_observables_are_the_same_in_other_units():
     a, b = run(SOLAR), run(SI)
     assert (a.qs.unit, b.qs.unit) == (u.au, u.m)
     assert a.ps.unit == u.Msun * u.au / u.day
@@ -41,6 +41,15 @@ def test_the_orbit_is_the_same_in_other_units():
     other = run(SOLAR, h=2 * u.day, num_steps=50, method=dvi.Strang())
     assert np.abs((other.qs[-1] - a.qs[-1]).to_value(u.au)).max() > 1e-7
 
+    def energy(t0, t1, q0, p0, q1, p1, args):
+        return H(t1, q1, p1, args)
+
+    a, b = (run(units, observe={"E": energy}) for units in (SOLAR, SI))
+    joule = [(x.observed["E"] * x.units.energy).to_value(u.J) for x in (a, b)]
+    np.testing.assert_allclose(*joule, rtol=1e-13)
+    np.testing.assert_allclose(joule[0][-1], joule[0][0], rtol=1e-11)
+    assert a.units.energy.is_equivalent(u.J)
+
 
 @pytest.mark.slow
 def test_arguments_in_other_units_of_the_same_kind():
@@ -51,17 +60,6 @@ def test_arguments_in_other_units_of_the_same_kind():
     at = run(SOLAR, ts=[0, 12, 36] * u.hour)
     np.testing.assert_allclose(at.ts.to_value(u.hour), [0, 12, 36], rtol=1e-15)
     np.testing.assert_allclose(at.solution.ts, [0, 0.5, 1.5], rtol=1e-15)
-
-
-def test_observables_see_numbers_in_the_units():
-    def energy(t0, t1, q0, p0, q1, p1, args):
-        return H(t1, q1, p1, args)
-
-    a, b = (run(units, observe={"E": energy}) for units in (SOLAR, SI))
-    joule = [(x.observed["E"] * x.units.energy).to_value(u.J) for x in (a, b)]
-    np.testing.assert_allclose(*joule, rtol=1e-13)
-    np.testing.assert_allclose(joule[0][-1], joule[0][0], rtol=1e-11)
-    assert a.units.energy.is_equivalent(u.J)
 
 
 @pytest.mark.parametrize(
@@ -114,7 +112,13 @@ def test_a_system_needs_units_and_a_problem_has_them():
         interop.integrate(systems.kepler(), h=1 * u.s, num_steps=3)
 
 
-def test_angles_and_their_momenta():
+def test_kinds_of_units():
+    with pytest.raises(ValueError, match=r"time must be a unit of time.*\(length\)"):
+        interop.UnitSystem(u.m, u.m, u.kg)
+    with pytest.raises(ValueError, match="q must be a unit of astropy"):
+        interop.UnitSystem(u.m, u.s, u.kg, q="longitude")
+    made = interop.UnitSystem(u.m, u.s, u.kg, args={"mu": u.au**3 / u.yr**2})
+    assert made.args["mu"] == u.m**3 / u.s**2
     problem = systems.double_pendulum()
     a = interop.integrate(problem, np.rad2deg(problem.q0) * u.deg, h=1e-3 * u.s, num_steps=5)
     b = interop.integrate(problem, h=1 * u.ms, num_steps=5)
@@ -123,15 +127,6 @@ def test_angles_and_their_momenta():
     made = interop.UnitSystem("km", "s", "kg", q="angle", p="angular momentum")
     assert made.p == u.kg * u.km**2 / u.s
     assert made.p != problem.units["p"]
-
-
-def test_a_unit_of_another_kind_is_no_base():
-    with pytest.raises(ValueError, match=r"time must be a unit of time.*\(length\)"):
-        interop.UnitSystem(u.m, u.m, u.kg)
-    with pytest.raises(ValueError, match="q must be a unit of astropy"):
-        interop.UnitSystem(u.m, u.s, u.kg, q="longitude")
-    made = interop.UnitSystem(u.m, u.s, u.kg, args={"mu": u.au**3 / u.yr**2})
-    assert made.args["mu"] == u.m**3 / u.s**2
 
 
 SPRING = dvi.System(lambda t0, t1, q0, p1, args: (p1 @ p1 + args["k"] * (q0 @ q0)) / 2)
@@ -188,15 +183,12 @@ def weights(masses, k=1 * u.N / u.m, kinds=None):
     return interop.integrate(dvi.System(dvi.discretise(energy)), *state, **given).qs[-1].value
 
 
-def test_a_unit_applies_to_all_parameters_below_its_name():
+def test_units_of_parameters():
     wanted = weights([1, 2] * u.kg)
     np.testing.assert_array_equal(weights([1 * u.kg, 2000 * u.g]), wanted)
     assert np.abs(weights([1 * u.kg, 2 * u.g]) - wanted).max() > 1e-3
     with pytest.raises(TypeError, match=r"args masses.0 = 1.0 has no unit"):
         weights([1.0, 2.0])
-
-
-def test_mistyped_names_of_parameters():
     with pytest.raises(ValueError, match=r"units for 'kk', .* without a unit: 'k'\. "):
         weights([1, 2] * u.kg, k=5.0, kinds={"kk": u.N / u.m})
     with pytest.raises(ValueError, match=r"'J22', but oblate_kepler has no such.*mu, R, J2"):

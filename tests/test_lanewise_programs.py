@@ -53,9 +53,6 @@ FUNCTIONS: dict[str, Callable] = {}
 """The function of a key, of one trajectory; which gives an array or a tuple."""
 
 
-# --- operations ---------------------------------------------------------------------------------
-
-
 def same_shape(*xs):
     shape = max((x.shape for x in xs), key=len)
     return [jnp.broadcast_to(x, shape) for x in xs]
@@ -325,9 +322,6 @@ LOOPS = {
 SHAPE_OF = {"": (), "2": (2,), "3": (3,), "23": (2, 3)}
 
 
-# --- a generator of programs ----------------------------------------------------------------------
-
-
 class Generator:
     """Random nodes for a list of values, of which shapes and types are known."""
 
@@ -535,8 +529,6 @@ def programs(seed, count, length):
         found.append(tuple(generator.nodes))
     return found
 
-
-# --- comparison -----------------------------------------------------------------------------------
 
 _FLAT = 6 * LANES
 
