@@ -21,8 +21,7 @@ from .results import (
 )
 from .torus import FundamentalFrequencies, as_batch, search_of, tori_of
 
-_CONSTANT = 64 * EPS
-"""A q or p of which the spread is below this fraction of its size is constant to round-off."""
+_CONSTANT = 64 * EPS  # A q or p with less spread, relative to its size, is constant to round-off
 
 
 class Actions(WithStatus):

@@ -27,8 +27,7 @@ from .results import (
     with_code,
 )
 
-_FEWEST = 32
-"""Least number of samples of a signal."""
+_FEWEST = 32  # Least number of samples of a signal
 
 
 class Frequencies(WithStatus):

@@ -12,21 +12,13 @@ from .results import CODE
 
 EPS = float(np.finfo(np.float64).eps)
 
+# Newton steps to the maximum of an amplitude; Gauss–Newton steps after each line, and rounds of
+# them after the last. Both converge quadratically below some hundredths of the resolution.
 _ASCENT, _FIT_STEPS, _FINAL_ROUNDS = 4, 3, 4
-"""Newton steps to the maximum of an amplitude; Gauss–Newton steps after each line, and rounds of
-them after the last. Both converge quadratically below some hundredths of the resolution."""
-
-_FLOOR = 256 * EPS
-"""A line below this fraction of the largest value of the signal is round-off of its samples."""
-
-_ECHO = 1e-9
-"""A line weaker by this factor than another one within the resolution is round-off of that one."""
-
-_RIDGE = 1e-13
-"""Added to a diagonal of ones, so that lines which coincide do not give a negative pivot."""
-
-_CONVERGENCE = 1e-2
-"""Last correction to a frequency, over the resolution, up to which it counts as converged."""
+_FLOOR = 256 * EPS  # A line below this fraction of the largest value of the signal is round-off
+_ECHO = 1e-9  # A line weaker by this factor than another within the resolution is its round-off
+_RIDGE = 1e-13  # Added to a diagonal of ones: lines that coincide do not give a negative pivot
+_CONVERGENCE = 1e-2  # Last correction to a converged frequency, over the resolution, at most
 
 
 class LineSettings(NamedTuple):

@@ -101,9 +101,7 @@ NAMES, SECTION_NAMES = (
     tuple(vars(results)["_name_to_item"]) for results in (FREQUENCY_RESULTS, SECTION_RESULTS)
 )
 
-CODE = {name: i for i, name in enumerate(NAMES)}
-"""The index of a status in `NAMES`."""
-
+CODE = {name: i for i, name in enumerate(NAMES)}  # Indices in `NAMES`
 code_of: Callable[[Any], Array] = status_code
 """The index of a status in `NAMES`, for each signal of a batch."""
 

@@ -20,14 +20,9 @@ from .results import (
     with_code,
 )
 
-_TOLERANCE = 1e-2
-"""Default tolerance of a combination, over the resolution."""
-
-_ORDERS = {1: 64, 2: 20, 3: 12, 4: 8, 5: 6}
-"""Default order by the number of frequencies, 5 for more: some thousand combinations each."""
-
-_SUBSETS = 300
-"""Sets of lines that are tried as a basis."""
+_TOLERANCE = 1e-2  # Default tolerance of a combination, over the resolution
+_ORDERS = {1: 64, 2: 20, 3: 12, 4: 8, 5: 6}  # Default order by the number of frequencies, else 5
+_SUBSETS = 300  # Sets of lines that are tried as a basis
 
 
 class FundamentalFrequencies(WithStatus):

@@ -26,14 +26,9 @@ from .solvers import is_gauss_newton, is_optax, solver_for
 from .stages import JACOBIAN_LIMIT, Minimum, by_gradient, in_segments, least_squares
 from .uncertainty import Uncertainty, in_words, uncertainty
 
-_CURVATURE_LIMIT = 50
-"""Parameters up to which second derivatives are computed."""
-
-_SMALL = 1_000_000
-"""Steps of trajectories that take less time than the compilation of exact second derivatives."""
-
-_PART = 0.01
-"""Part of a standard error over which Jacobians are subtracted."""
+_CURVATURE_LIMIT = 50  # Parameters up to which second derivatives are computed
+_SMALL = 1_000_000  # Steps of trajectories that take less time than compiling exact derivatives
+_PART = 0.01  # Part of a standard error over which Jacobians are subtracted
 
 
 @checked_keywords

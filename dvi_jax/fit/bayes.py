@@ -24,11 +24,8 @@ from .posterior import Posterior
 from .result import FitResult, with_error
 from .uncertainty import correlations
 
-_R_HAT = 1.01
-"""Largest R̂ of chains that count as mixed (Vehtari et al. 2021)."""
-
-_TRUNCATION_LIMIT = 0.01
-"""Fraction of draws with a truncated path above which a warning is given."""
+_R_HAT = 1.01  # Largest R̂ of chains that count as mixed (Vehtari et al. 2021)
+_TRUNCATION_LIMIT = 0.01  # Fraction of draws with a truncated path above which a warning is given
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,17 +13,10 @@ from .problem import FitProblem
 from .solvers import levenberg_marquardt
 from .uncertainty import Uncertainty, in_words, inverse_or, uncertainty
 
-_REFIT = 30
-"""Steps of a refit, which begins next to its minimum."""
-
-_PRECISE = 1e-4
-"""Tolerance of a refit in standard errors: 1e-8 in chi²."""
-
-_MARGIN = 3.0
-"""Penalties by which the criterion may exceed the best before the elimination ends."""
-
-_ROUNDING = 1e-11
-"""Least relative error of any data: exact ones contain no information below it."""
+_REFIT = 30  # Steps of a refit, which begins next to its minimum
+_PRECISE = 1e-4  # Tolerance of a refit in standard errors: 1e-8 in chi²
+_MARGIN = 3.0  # Penalties by which the criterion may exceed the best before the end
+_ROUNDING = 1e-11  # Least relative error of any data: exact ones have no information below it
 
 
 @dataclass(frozen=True)

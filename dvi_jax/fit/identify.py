@@ -24,17 +24,13 @@ from .problem import FitProblem
 from .result import FitResult, with_error
 from .shooting import MultipleShooting, SingleShooting
 
+# Width of a prior: the change of the predictions by the candidate alone, to first order, in
+# scatters of the data. It hardly affects terms that the data determine, and holds combinations that
+# they do not.
 _GUARD = 3.0
-"""Width of a prior: the change of the predictions by the candidate alone, to first order, in
-scatters of the data. It hardly affects terms that the data determine, and holds combinations that
-they do not."""
-
-_PROVISIONAL_ERROR = 1e-3
-"""Provisional errors of data without any, in scatters of the data."""
-
-
+_PROVISIONAL_ERROR = 1e-3  # Provisional errors of data without any, in scatters of the data
+# Keywords of `fit` for the fit of all candidates and for the last one.
 _OF_ALL = ("max_steps", "tolerance", "check_units", "progress")
-"""Keywords of `fit` for the fit of all candidates and for the last one."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,9 +17,7 @@ from ..base.types import Args, Scalar, State
 from ..problem.system import System
 from .checks import require_shape
 
-KEY = "coefficients"
-"""Key of the coefficients in args and parameters."""
-
+KEY = "coefficients"  # Key of the coefficients in args and parameters
 _SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 

@@ -24,17 +24,15 @@ from ..observe.solution import Save
 from ..problem.system import System
 from .observations import Observations
 
+# Steps beyond the ends of shorter arcs above which another program is compiled for them.
 _WASTE = 2_000_000
-"""Steps beyond the ends of shorter arcs above which another program is compiled for them."""
-
 _OPTIONS = (
     *("method", "lattice", "newton", "root_finder", "adjoint", "arithmetic", "layout"),
     *("integrator", "num_steps"),
 )
 _MAY_BE_FITTED = ("q0", "p0", "epsilon", "args")
-_MOST_STEPS = 2e9
-"""Steps of a trajectory: their number is a 32-bit integer."""
-
+_MOST_STEPS = 2e9  # Steps of a trajectory: their number is a 32-bit integer
+# Arguments of `integrate` that `fit` sets itself, and why, for messages.
 _REASONS = {
     "num_steps": "it follows from h and the times of the data",
     "save": "the times of the data determine which states are saved",
@@ -43,7 +41,6 @@ _REASONS = {
     "observe": "it is an argument of dvi.Observations",
     "t0": "give it as dvi.Observations(..., t0=...)",
 }
-"""Arguments of `integrate` that `fit` sets itself, and why, for messages."""
 
 
 class Model(eqx.Module):

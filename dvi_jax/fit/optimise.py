@@ -16,22 +16,16 @@ from .roundoff import STIFFNESS, Evaluation, settle, undamped_step
 from .solvers import is_optax
 from .uncertainty import inverse_or
 
-_REJECTIONS = 12
-"""Rejected steps in a row after which no further step is expected to help."""
-
+_REJECTIONS = 12  # Rejected steps in a row after which no further step is expected to help
+# Length of an undamped step in standard errors up to which a third of them are enough.
 _SHORT_STEP = 1.0
-"""Length of an undamped step in standard errors up to which a third of them are enough."""
-
+# Relative change of u that makes as little difference as round-off of the predictions may make.
+# Where an undamped step is not larger, one rejected step is enough.
 _SMALL = 1e-13
-"""Relative change of u that makes as little difference as round-off of the predictions may make.
-Where an undamped step is not larger, one rejected step is enough."""
-
-_REJECTED_ON_LINE = 40
-"""The same for a line search that halves: it does not know the scale to begin with."""
-
+_REJECTED_ON_LINE = 40  # The same for a line search, which halves from an unknown scale
+# Length of an undamped step in standard errors below which a loss that no longer decreases is at
+# its minimum, up to rounding.
 _FLAT = 1e-3
-"""Length of an undamped step in standard errors below which a loss that no longer decreases is at
-its minimum, up to rounding."""
 
 
 class FIT_RESULTS(eqx.Enumeration):

@@ -53,8 +53,7 @@ class Prior:
     sigma: Any
 
 
-_UNDERFLOW = 1e-150
-"""Distance from a bound below which the square of dx/du is zero, and no error is found."""
+_UNDERFLOW = 1e-150  # Distance from a bound at which the square of dx/du is zero: no error there
 
 
 class Space(eqx.Module):

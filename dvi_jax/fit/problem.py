@@ -21,9 +21,9 @@ from .observations import Observations
 from .parameters import Space, make_space
 from .roundoff import Evaluation
 
+# Factor by which data and model may differ in size at the start of a fit: beyond it the units
+# differ, or the trajectory diverges.
 _UNITS = 1e3
-"""Factor by which data and model may differ in size at the start of a fit: beyond it the units
-differ, or the trajectory diverges."""
 
 
 class Core(eqx.Module):

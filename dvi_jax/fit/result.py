@@ -26,11 +26,8 @@ _PLAIN = (
 _BY_ARC = ("ts", "observed", "predicted", "whitened", "errors")
 """Fields that a file has as JSON, and those that are a list of arrays."""
 
-_NOTABLE = 0.01
-"""Part of a standard error from which on round-off is reported."""
-
-_LITTLE = 0.1
-"""Fraction of the variance below which a model is reported as little better than a constant."""
+_NOTABLE = 0.01  # Part of a standard error from which on round-off is reported
+_LITTLE = 0.1  # A model that explains less of the variance is little better than a constant
 
 
 @dataclass(frozen=True, eq=False)

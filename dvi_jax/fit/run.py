@@ -22,9 +22,7 @@ from .checks import same_fit
 from .optimise import Position, Record, StageTask
 from .problem import FitProblem
 
-_INTERVAL = 5.0
-"""Seconds between checkpoints."""
-
+_INTERVAL = 5.0  # Seconds between checkpoints
 _FORMAT = 3
 
 _VECTORS = ("base", "scale", "z")

@@ -20,22 +20,15 @@ from .shooting import Segments
 from .solvers import is_optax
 from .uncertainty import inverse_or, null_space
 
+# Parameters beyond which the default is a gradient method without a covariance: each column of a
+# Jacobian costs a trajectory.
 JACOBIAN_LIMIT = 400
-"""Parameters beyond which the default is a gradient method without a covariance: each column of a
-Jacobian costs a trajectory."""
-
-_BEFORE_LAST = 15
-"""Steps of a stage that is not the last."""
-
-_IN_SEGMENTS = 40
-"""Steps of a stage of multiple shooting."""
-
-_LEAST_GROWTH = 1.02
-"""Least factor between horizons where trajectories that fail do not let them double."""
-
+_BEFORE_LAST = 15  # Steps of a stage that is not the last
+_IN_SEGMENTS = 40  # Steps of a stage of multiple shooting
+_LEAST_GROWTH = 1.02  # Least factor between horizons where failing trajectories prevent a double
+# Misfit, relative to the scatter of the data, up to which a fit of all data is expected to find the
+# nearest minimum: half of it is a sixth of a period's phase.
 _MISFIT_LIMIT = 0.5
-"""Misfit, relative to the scatter of the data, up to which a fit of all data is expected to find
-the nearest minimum: half of it is a sixth of a period's phase."""
 
 
 class Minimum(NamedTuple):

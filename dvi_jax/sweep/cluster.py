@@ -23,14 +23,9 @@ from .program import Sweep, SweepProgram
 from .store import MemorySink, Store, StoreError
 from .workers import Counter, SweepProgress, compute
 
-_AHEAD = 4
-"""Tasks for each thread of the cluster that are submitted at a time."""
-
-_LARGE = 2**20
-"""Bytes of a pickled sweep above which it is not sent with each task."""
-
-_ATTEMPTS = 10
-"""Number of times that a task may be lost with its worker before it is taken to be the cause."""
+_AHEAD = 4  # Tasks for each thread of the cluster that are submitted at a time
+_LARGE = 2**20  # Bytes of a pickled sweep above which it is not sent with each task
+_ATTEMPTS = 10  # Losses of a task with its worker before it is taken to be the cause
 
 
 class ClusterError(RuntimeError):

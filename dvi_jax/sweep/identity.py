@@ -28,9 +28,7 @@ from .plan import SweepPlan
 from .program import Sweep, state_of
 from .variables import Variable
 
-FORMAT = 1
-"""The format of a store: a greater number when stores of this format cannot be read any more."""
-
+FORMAT = 1  # Of a store; greater when stores of this format cannot be read any more
 PROGRAM = "program"
 
 # In the text of a jaxpr or an object: what differs between processes or terminals.

@@ -18,9 +18,7 @@ from ..base.types import Args, Scalar
 from ..engine.bracket import bracketed_root
 from .axes import refuse_non_finite
 
-_TRIES = 64
-"""Points that are tried for one initial condition on an energy shell."""
-
+_TRIES = 64  # Points that are tried for one initial condition on an energy shell
 _DOUBLINGS = 100
 
 

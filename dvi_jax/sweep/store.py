@@ -30,9 +30,7 @@ from .variables import Variable
 
 CLAIMS = ".claims"
 
-_SHARE = 0.5
-"""Fraction of the memory of the machine that results in memory may take."""
-
+_SHARE = 0.5  # Fraction of the memory of the machine that results in memory may take
 _RESTORE = (
     "If this is a store, its zarr.json was damaged or lost, but the results are in other files: "
     "restore it from a backup, or copy it from a new store (the same call with another path, "

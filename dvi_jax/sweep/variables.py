@@ -14,8 +14,8 @@ from .program import Sweep
 
 _NAME = re.compile(r"[\w +-]+(\.[\w +-]+)*")
 
+# Names that the result itself uses.
 RESERVED_NAMES = ("status", "failed_step", "residual", "stop_t", "t", "q", "p", "save", "q0", "p0")
-"""Names that the result itself uses."""
 
 
 @dataclass(frozen=True)

@@ -25,12 +25,8 @@ from .plan import SweepTask
 from .program import SweepProgram
 from .store import MemorySink, Store
 
-_PAUSE = 0.2
-"""Seconds between two checks of tasks that another process computes."""
-
-_WRITES = 2
-"""Tasks for each thread that may wait to be written."""
-
+_PAUSE = 0.2  # Seconds between two checks of tasks that another process computes
+_WRITES = 2  # Tasks for each thread that may wait to be written
 GOOD = ("successful", "stopped")
 
 

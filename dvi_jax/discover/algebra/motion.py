@@ -12,20 +12,6 @@ UNCLEAR = 1e-6
 ROUNDING = 1e-12  # Rows are weighted so that their rounding is below this; `NULL` is above it
 _SHARE = 1e-3  # Rounding may be this share of a change that counts as not zero
 _COEFFICIENTS = 1e-15  # Errors of the coefficients of a null vector, relative to its length
-# Samples at which functions are so many times larger than at three quarters of them count less.
-_RARE = 100.0
-
-
-def typical_sizes(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Root mean squares of functions on samples, shape (size,), and weights of the samples, (S,):
-    1, and less where functions are larger than at nearly all others. `values`: (S, size)."""
-    units = np.median(np.abs(values), axis=0)
-    units = np.where(units > 0, units, np.max(np.abs(values), axis=0))
-    units = np.where(units > 0, units, 1.0)
-    relative = values / units
-    size = np.max(np.abs(relative), axis=1)
-    weights = np.minimum(1, _RARE * np.quantile(size, 0.75) / np.maximum(size, 1.0))
-    return units * np.sqrt(np.mean((weights[:, None] * relative) ** 2, axis=0)), weights
 
 
 def times(x: np.ndarray, matrix: np.ndarray) -> np.ndarray:
@@ -166,8 +152,8 @@ def _thinning(samples: int, rows: int, size: int) -> slice:
 
 
 def coefficient_errors(terms: np.ndarray) -> np.ndarray:
-    """What errors of the coefficients of a series of length one change at each sample, (S,): all
-    are known to the same absolute size. `terms`: see `conserved_series`."""
+    """What errors of the coefficients of a series of length one, equal for all, change at each
+    sample, (S,). `terms`: see `conserved_series`."""
     return _COEFFICIENTS * np.linalg.norm(terms.reshape(len(terms), -1), axis=1)
 
 

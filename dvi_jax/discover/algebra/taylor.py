@@ -134,11 +134,9 @@ class _Operation:
 
     def advance(self, k: int) -> None:
         """Compute the coefficients k of the outputs."""
-        if k == 0:
-            for series, term in zip(self.outputs, self.function(*self.values(0)), strict=True):
-                series.terms.append(term)
-        elif any(series.moves for series in self.outputs):
-            for series, term in zip(self.outputs, self.coefficients(k), strict=True):
+        if k == 0 or any(series.moves for series in self.outputs):
+            terms = self.coefficients(k) if k else self.function(*self.values(0))
+            for series, term in zip(self.outputs, terms, strict=True):
                 series.terms.append(term)
 
     def coefficients(self, k: int) -> list[Any]:
@@ -177,9 +175,8 @@ class _Operation:
         values = self.values(0)
         jaxpr = jax.make_jaxpr(change)(values, [values[i] for i in moving])
         inputs = [*self.operands, *(_Derivative(self.operands[i]) for i in moving)]
-        return _SeriesProgram(
-            jaxpr, inputs, (*self.context, (self.eqn, self.operands, self.outputs))
-        )
+        own = self.eqn, self.operands, self.outputs
+        return _SeriesProgram(jaxpr, inputs, (*self.context, own))
 
 
 def _is_real(atom: Any) -> bool:

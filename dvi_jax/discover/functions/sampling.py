@@ -17,11 +17,11 @@ from ...base.types import Args, Interval
 from ...engine.newton import Newton, RootSolver
 from ...integration.arithmetic import Arithmetic
 from ...integration.integrator import only
-from ...integration.keywords import ArithmeticSettings, MapSettings, integrator_of
+from ...integration.keywords import MapSettings, integrator_of
 from ...methods import Method
 from ...methods.step import Equations, step
 from ...problem.system import System, check_system
-from .basis import BoundBasis, check_step_size
+from .basis import BoundBasis, check_step_size as check_step_size
 from .generators import LatticePoint
 
 
@@ -57,12 +57,8 @@ LEAST_STEP = 1e-11  # A relative step below this is not known to three digits, b
 # what changes by less than rounding may be conserved, or an expansion in the step or about the
 # samples.
 SMALL = 1e-2
-# A sample that is farther from the median than this many typical distances does not count in the
-# spread of the others.
-_FAR = 100.0
-# Polynomials are taken about the middle of the samples where they would lose so much by rounding
-# about the origin.
-_LOSS = 1e5
+_FAR = 100.0  # Typical distances from the median beyond which a sample is left out of the spread
+_LOSS = 1e5  # Rounding of polynomials about the origin above which they are taken about the middle
 
 
 def spread(values: np.ndarray) -> float:
@@ -90,8 +86,7 @@ class Displacements(NamedTuple):
     @property
     def relative_step(self) -> float:
         """Median distance by which a step moves the samples, as a share of their spread."""
-        sizes = spreads(self.samples)
-        return float(np.median(np.max(np.abs(self.values) / sizes, axis=1)))
+        return float(np.median(np.max(np.abs(self.values) / spreads(self.samples), axis=1)))
 
     @property
     def nonlinearity(self) -> float:
@@ -197,9 +192,7 @@ class Map(NamedTuple):
         return Equations(system, jnp.zeros(()), self.args, self.root_finder)
 
 
-def map_of(
-    function: str, system: System, settings: MapSettings | ArithmeticSettings, *fields: str
-) -> Map:
+def map_of(function: str, system: System, settings: Any, *fields: str) -> Map:
     """The map from the keywords of a search; `fields`: those of an `Integrator` that the search
     uses besides `root_finder`.
 
@@ -243,11 +236,10 @@ def require_steps(good: Any, samples: SamplePoints) -> None:
         )
 
 
-def require_finite(
-    values: np.ndarray,
-    name: Callable[..., str],
-    hint: str = "keep the samples away from its singularities",
-) -> None:
+_NEAR_SINGULARITIES = "keep the samples away from its singularities"
+
+
+def require_finite(values: np.ndarray, name: Callable, hint: str = _NEAR_SINGULARITIES) -> None:
     """Reject values, shape (S, …), that are not finite; `name`: of them, from the indices that
     follow the sample."""
     bad = ~np.isfinite(values)

@@ -17,15 +17,10 @@ from ...problem.system import System, check_system
 from ..algebra.echelon import reduction
 from ..algebra.nullspace import series_changes, solve_series
 from ..algebra.taylor import taylor_coefficients
+from ..functions import sampling
 from ..functions.basis import AbstractBasis, BoundBasis, bind_basis, check_step_size
 from ..functions.generators import Generator, LatticePoint
-from ..functions.sampling import (
-    Displacements,
-    as_samples,
-    require_enough,
-    require_steps,
-    require_times,
-)
+from ..functions.sampling import Displacements
 from .noether import noether_identity
 
 _ROUNDINGS = 64.0  # An identity below so many roundings of its terms is zero
@@ -133,7 +128,7 @@ def solve_gauge(
     **Source** our own; the identities: the paper, (25) and (28).
     """
     check_system(system, "solve_gauge")
-    samples = as_samples(samples, t0)
+    samples = sampling.as_samples(samples, t0)
     single = isinstance(generators, Generator)
     if single or len(generators) == 0:
         raise ValueError(
@@ -141,13 +136,13 @@ def solve_gauge(
             f"{'a Generator: give [generator]' if single else 'an empty list'}."
         )
     bound, h = bind_basis(basis, samples.q.shape[1:]), check_step_size(h)
-    require_enough(samples, bound.size)
-    require_times(bound.uses_time, samples)
+    sampling.require_enough(samples, bound.size)
+    sampling.require_times(bound.uses_time, samples)
     held_out, order = samples.held_out, len(generators) - 1
     equations = Equations(system, jnp.zeros(()), args)
     arrays = _identity_terms(equations, h, list(generators), bound, samples)
     terms, sizes, displacement, good = map(np.asarray, arrays)
-    require_steps(good, samples)
+    sampling.require_steps(good, samples)
     n, changes, size = terms[:, :, 0], terms[:, :, 1:] / h, bound.size
     largest = np.max(np.abs(n), axis=1)
     scale = _scale(largest, sizes)
@@ -207,8 +202,7 @@ def _identity_terms(equations, h, generators, basis, samples):
             second, _ = next_point(epsilon)
             of_order = identities(epsilon, second, generators)
             total = sum(epsilon**m * N for m, N in enumerate(of_order))
-            change = basis(second.q, second.p, second.t) - basis(q, p, first.t)
-            return jnp.append(total, change)
+            return jnp.append(total, basis(second.q, second.p, second.t) - basis(q, p, first.t))
 
         second, good = next_point(zero)
 

@@ -41,9 +41,8 @@ class Units:
     def determining(self, raw: Conditions) -> tuple[FieldMotion, np.ndarray]:
         """`FieldMotion` of the user's functions, and the determining equations, (S, z + 1, rows, C,
         B). All samples count alike, also where the derivatives of F are large."""
-        jacobian = (
-            raw.jacobian[:, 0][..., self.columns] * self.rows[:, None, None] * self.components
-        )
+        jacobian = raw.jacobian[:, 0][..., self.columns] * self.rows[:, None, None]
+        jacobian = jacobian * self.components
         motion = _motion(raw, jacobian, self.last_digit)
         size = np.max(motion.second, axis=1)
         size = np.where(size > 0, size, 1.0)
