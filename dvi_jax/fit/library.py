@@ -42,9 +42,7 @@ class ForceLibrary(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     coefficients: Array | None
 
-    def __init__(
-        self, candidates: Mapping[str, Callable[..., Any]], coefficients: Any = None
-    ) -> None:
+    def __init__(self, candidates: Mapping[str, Callable[..., Any]], coefficients: Any = None):
         a_dict = "a dict {name: function (t0, t1, q0, p1, args)}"
         instance("the candidates of a dvi.ForceLibrary", candidates, Mapping, a_dict)
         if not candidates:

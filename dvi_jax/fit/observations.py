@@ -77,9 +77,8 @@ class Observations:
         _check_times(ts)
         require_all("values", values, ~np.isinf(values), "finite", "NaN means a missing value.")
         if np.isnan(values).all():
-            raise ValueError(
-                f"values must have at least one number, got {values.size} values, all NaN."
-            )
+            count = values.size
+            raise ValueError(f"values must have at least one number, got {count} values, all NaN.")
         refuse_unit_or_mask("t0", self.t0)
         t0 = finite("t0", ts[0] if self.t0 is None else self.t0)
         if ts.min() < t0 < ts.max():

@@ -95,11 +95,9 @@ def settle(
     forward, backward = (np.asarray(evaluate(u + sign * d).residual) for sign in (1, -1))
     # The difference of both sides has no quadratic term.
     defect = evaluation._replace(residual=(forward - backward) / 2 - J @ d)
-    if not (
-        np.isfinite(defect.residual).all() and undamped_step(defect, scale)[1] <= _LINEAR * reach
-    ):
-        return None
-    return End(u, evaluation, np.array(shifts))
+    if np.isfinite(defect.residual).all() and undamped_step(defect, scale)[1] <= _LINEAR * reach:
+        return End(u, evaluation, np.array(shifts))
+    return None
 
 
 def _norm(evaluation: Evaluation) -> float:

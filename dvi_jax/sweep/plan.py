@@ -106,9 +106,8 @@ def make_plan(
     - `steps`: of one trajectory. `bytes_per_lane`: of its results.
     - `lanes`: trajectories of one task at most; None: chosen from `steps` and `bytes_per_lane`.
     """
-    separate, grid = (
-        list(dims.values())[part] for part in (slice(compiled_dims), slice(compiled_dims, None))
-    )
+    lengths = list(dims.values())
+    separate, grid = lengths[:compiled_dims], lengths[compiled_dims:]
     if lanes is None:
         steps = max(steps, 1)
         power_of_two = 1 << max((WORK // steps).bit_length() - 1, 0)

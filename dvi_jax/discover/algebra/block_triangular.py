@@ -90,9 +90,7 @@ class BlockTriangular:
     - `unit`: of singular values; the largest of A_0 if left out.
     """
 
-    def __init__(
-        self, terms: np.ndarray, cut: Cut, free: np.ndarray | None = None, unit: float | None = None
-    ):
+    def __init__(self, terms: np.ndarray, cut: Cut, free: np.ndarray | None = None, unit=None):
         orders, size = terms.shape[1:]
         self.blocks = np.ascontiguousarray(np.moveaxis(terms, 1, 0))
         self.free = np.ones((orders, size), bool) if free is None else free
@@ -125,9 +123,8 @@ class BlockTriangular:
 
     def left_sides(self, series: np.ndarray) -> np.ndarray:
         """A_k c_0 + … + A_0 c_k for each order of series, shape (orders, rows, count)."""
-        return np.stack(
-            [self.defects(series[:k]) + self.blocks[0] @ c for k, c in enumerate(series)]
-        )
+        sums = [self.defects(series[:k]) + self.blocks[0] @ c for k, c in enumerate(series)]
+        return np.stack(sums)
 
     def solve(self, right: np.ndarray, leading: bool = True) -> np.ndarray:
         """A solution c, shape (orders, size, count), of the conditions of the first orders, with r

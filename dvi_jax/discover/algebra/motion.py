@@ -31,7 +31,6 @@ class Motion(NamedTuple):
     rounding: np.ndarray
 
     def subset(self, index: Any) -> "Motion":
-        """Of some of the samples."""
         return Motion(*(field[index] for field in self))
 
     def in_functions(self, combinations: np.ndarray) -> "Motion":
@@ -96,7 +95,6 @@ class FieldMotion(NamedTuple):
     rounding: np.ndarray
 
     def subset(self, index: Any) -> "FieldMotion":
-        """Of some of the samples."""
         return FieldMotion(*(field[index] for field in self))
 
     def in_functions(self, combinations: np.ndarray) -> "FieldMotion":
@@ -152,16 +150,12 @@ def _thinning(samples: int, rows: int, size: int) -> slice:
 
 
 def coefficient_errors(terms: np.ndarray) -> np.ndarray:
-    """What errors of the coefficients of a series of length one, equal for all, change at each
-    sample, (S,). `terms`: see `conserved_series`."""
+    """What equal errors of a series of length one change at each sample; `terms`: (S, z + 1, …)."""
     return _COEFFICIENTS * np.linalg.norm(terms.reshape(len(terms), -1), axis=1)
 
 
 def conserved_series(
-    leading: np.ndarray,
-    terms: np.ndarray,
-    motion: Motion | FieldMotion,
-    tolerance: float | None = None,
+    leading: np.ndarray, terms: np.ndarray, motion: Motion | FieldMotion, tolerance: Any = None
 ) -> tuple[np.ndarray, int]:
     """The combinations of series that change in a step by no more than rounding, each measured by
     what its own slopes predict, sample by sample; and how many are unclear.
@@ -193,12 +187,7 @@ def conserved_series(
 
 
 def relative_changes(
-    terms: np.ndarray,
-    series: np.ndarray,
-    motion: Motion | FieldMotion,
-    spread: float,
-    digits: np.ndarray | float = 0.0,
-    approximately: bool = False,
+    terms: np.ndarray, series, motion: Motion | FieldMotion, spread, digits, approximately=False
 ) -> np.ndarray:
     """The change of one series, shape (z + 1, size), at each order, by the measure of
     `conserved_series`: shape (S, z + 1). `spread`: of its leading-order term; `digits`: see

@@ -35,8 +35,7 @@ def triangle(matrix: np.ndarray) -> np.ndarray:
 
 
 def singular_vectors(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The singular value of each column's direction, descending, zeros included, shape (columns,);
-    and all right singular vectors as rows."""
+    """Singular values, descending, one for each column, and all right singular vectors as rows."""
     rows, columns = matrix.shape
     if matrix.size == 0:
         return np.zeros(columns), np.eye(columns)
@@ -117,8 +116,7 @@ def orthonormal_range(columns: np.ndarray, threshold: float = RANK) -> np.ndarra
 
 
 def independent_columns(columns: np.ndarray, complexity: Any, threshold: float) -> np.ndarray:
-    """Numbers of the columns, ascending, of which more than the share `threshold` is orthogonal to
-    those of lower complexity."""
+    """Numbers of the columns of which more than `threshold` is orthogonal to simpler ones."""
     places, span = [], np.zeros((len(columns), 0))
     for j in np.argsort(complexity, kind="stable"):
         remainder = columns[:, j] / max(np.linalg.norm(columns[:, j]), 1e-300)

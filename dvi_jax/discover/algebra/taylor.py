@@ -41,8 +41,7 @@ def taylor_coefficients(function: Callable[[Array], Array], point: Array, order:
 
 
 class _Series:
-    """A series in ε: `self[k]` is its coefficient, None where it is zero by structure. `moves`:
-    whether it depends on ε."""
+    """A series in ε, `self[k]` None where zero by structure; `moves`: whether it depends on ε."""
 
     def __init__(self, moves: bool, *terms: Any):
         self.moves, self.terms = moves, list(terms)
@@ -93,7 +92,6 @@ class _SeriesProgram:
         self.outputs = list(map(series_of, jaxpr.outvars))
 
     def advance(self, k: int) -> None:
-        """Compute the coefficients k."""
         for part in self.parts:
             part.advance(k)
 

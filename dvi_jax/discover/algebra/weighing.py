@@ -56,12 +56,9 @@ class WeightedConditions(NamedTuple, Generic[M]):
         return (np.linalg.solve(self.R, blocks) * sizes).reshape(columns.shape)
 
 
-def weigh(
-    values: np.ndarray, terms: np.ndarray, motion: M, fit: np.ndarray, in_sizes: bool = True
-) -> WeightedConditions[M]:
-    """Weighted conditions from `values` of φ, shape (S, size), and `terms` A, shape (S, z + 1, …,
-    size); `fit`: which samples are fitted, (S,). `in_sizes`: whether the units of φ are `rms`,
-    or 1."""
+def weigh(values, terms, motion: M, fit: np.ndarray, in_sizes=True) -> WeightedConditions[M]:
+    """From `values` of φ, shape (S, size), and `terms` A, shape (S, z + 1, …, size); `fit`: which
+    samples are fitted, (S,). `in_sizes`: whether the units of φ are `rms`, or 1."""
     rms, calm = typical_sizes(values)
     units = rms if in_sizes else np.ones(len(rms))
     R = triangle((calm[:, None] * values)[fit] / units) / np.sqrt(np.sum(fit))

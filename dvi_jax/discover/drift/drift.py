@@ -162,10 +162,8 @@ def drift_surface(
 
 
 class Drifts(NamedTuple):
-    """Results of a sweep, shape (E + 1, S), the last row at ε = 0.
-
-    `sizes` of the observable; `epsilon`: the relative rounding of one operation.
-    """
+    """Results of a sweep, shape (E + 1, S), the last row at ε = 0; `sizes` of the observable;
+    `epsilon`: the relative rounding of one operation."""
 
     drifts: np.ndarray
     sizes: np.ndarray

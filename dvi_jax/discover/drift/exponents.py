@@ -48,11 +48,8 @@ class Exponent(NamedTuple):
         return self.points >= LEAST_POINTS and self.probabilities["power"] < _UNLIKELY
 
     def report(self, points: int, target: tuple[float, float]) -> list[str]:
-        """Lines of text: the order and its interval, or that none is resolved.
-
-        - `points`: the number before points were excluded. `target`: what `resolving_range`
-          returns.
-        """
+        """Lines of text: the order and its interval, or that none is resolved. `points`: the number
+        before points were excluded; `target`: see `resolving_range`."""
         low, high = self.interval
         law = f"not one power: {self.model} near ε = {self.crossover:.2g}"
         if self.crossover > self.range[1]:
@@ -137,9 +134,7 @@ def small_epsilon_exponent(epsilons: Any, drifts: Any, floor: float = 0.0) -> Ex
     return Exponent(*order, line_slope, line_stderr, curvature, len(x), ends)
 
 
-def resolving_range(
-    fit: Exponent, epsilons: Any, drifts: Any, smallest_drift: float = 0.0
-) -> tuple[float, float]:
+def resolving_range(fit: Exponent, epsilons: Any, drifts: Any, smallest_drift: float = 0.0):
     """The smallest and the largest ε of a sweep that should resolve the order.
 
     For a straight line: the same range, extended downward by a factor of 10. For a curve: from

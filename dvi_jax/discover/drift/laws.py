@@ -22,11 +22,9 @@ def _exp(v: np.ndarray) -> np.ndarray:
 
 
 class _Law(NamedTuple):
-    """A family of shapes g(u, size, sharpness), and its prior.
-
-    `sizes`: (value, probability) of single sizes; `ranges`: (from, to, probability) of sizes with
-    constant density; `sharpnesses`: (value, probability).
-    """
+    """A family of shapes g(u, size, sharpness), and its prior. `sizes`: (value, probability) of
+    single sizes; `ranges`: (from, to, probability) of sizes with constant density; `sharpnesses`:
+    (value, probability)."""
 
     name: str
     shape: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -94,11 +92,8 @@ _NEGLIGIBLE = 12.0
 
 
 class _Cells(NamedTuple):
-    """Cells of the parameters of the shapes, each field of shape (G,).
-
-    `centres`, `sizes`: the middle of a cell; `widths`, `size_widths`: its lengths; `density`: of
-    the prior.
-    """
+    """Cells of the parameters of the shapes, each field of shape (G,). `centres`, `sizes`: the
+    middle of a cell; `widths`, `size_widths`: its lengths; `density`: of the prior."""
 
     laws: np.ndarray
     centres: np.ndarray

@@ -137,8 +137,7 @@ class _Selection(eqx.Module):
 
 
 def linear_text(coefficients: np.ndarray, names: Sequence[str], digits: Any = 6) -> str:
-    """A linear combination as text, without what has the coefficient 0; the name "1" is implied.
-    `digits`: of all coefficients, or of each."""
+    """A linear combination as text, without zeros; `digits`: of all coefficients, or of each."""
     text, digits = "", np.broadcast_to(digits, len(names))
     for value, name, precision in zip(coefficients, names, digits, strict=True):
         if value == 0:

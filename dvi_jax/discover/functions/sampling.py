@@ -33,7 +33,6 @@ class SamplePoints(NamedTuple):
     t: np.ndarray
 
     def subset(self, index: Any) -> "SamplePoints":
-        """Some of the samples."""
         return SamplePoints(*(field[index] for field in self))
 
     @property
@@ -44,7 +43,6 @@ class SamplePoints(NamedTuple):
         return mask
 
     def text(self, i: int) -> str:
-        """A sample for a message."""
         q, p = (f"{x[i].tolist()!s:.80}" for x in self[:2])
         return f"at index {i}: q = {q}, p = {p}, t = {self.t[i]:g}"
 
@@ -62,8 +60,7 @@ _LOSS = 1e5  # Rounding of polynomials about the origin above which they are tak
 
 
 def spread(values: np.ndarray) -> float:
-    """Standard deviation of the components about their means; 1 where nothing varies. Samples far
-    away from nearly all others are left out."""
+    """Standard deviation of the components, 1 where nothing varies; far samples are left out."""
     distance = np.abs(values - np.median(values, axis=0))
     is_near = distance <= _FAR * np.median(distance, axis=0)
     is_near = is_near.reshape(len(values), -1).all(axis=1)
@@ -90,8 +87,7 @@ class Displacements(NamedTuple):
 
     @property
     def nonlinearity(self) -> float:
-        """Median distance of the map from a linear one, as a share of how much it varies on the
-        samples."""
+        """Median distance of the map from a linear one, as a share of how much it varies."""
         sizes = spreads(self.samples)
         z = np.concatenate([x.reshape(len(x), -1) for x in self.samples[:2]], axis=1)
         z = np.column_stack([(z - np.median(z, axis=0)) / sizes, np.ones(len(z))])
@@ -194,10 +190,7 @@ class Map(NamedTuple):
 
 def map_of(function: str, system: System, settings: Any, *fields: str) -> Map:
     """The map from the keywords of a search; `fields`: those of an `Integrator` that the search
-    uses besides `root_finder`.
-
-    By default by Newton's iteration, through which Taylor coefficients in ε are exact.
-    """
+    uses besides `root_finder`, by default Newton's, through which Taylor coefficients are exact."""
     integrator, run = integrator_of(settings)
     only(integrator, function, *fields, "root_finder")
     root_finder = integrator.root_finder
@@ -240,8 +233,7 @@ _NEAR_SINGULARITIES = "keep the samples away from its singularities"
 
 
 def require_finite(values: np.ndarray, name: Callable, hint: str = _NEAR_SINGULARITIES) -> None:
-    """Reject values, shape (S, …), that are not finite; `name`: of them, from the indices that
-    follow the sample."""
+    """Reject values, shape (S, …), that are not finite; `name`: of the value with other indices."""
     bad = ~np.isfinite(values)
     if bad.any():
         i, *index = np.argwhere(bad)[0]
@@ -258,10 +250,8 @@ def check_finite(basis: BoundBasis, values: np.ndarray) -> None:
 
 
 def check_basis(basis: BoundBasis, values: np.ndarray) -> float:
-    """Reject functions that are not finite on the samples, or dependent; `values`: (S, size).
-
-    Returns the condition number of the functions, each scaled to one size.
-    """
+    """Reject functions that are not finite on the samples, or dependent; `values`: (S, size). The
+    condition number of the others, each scaled to one size."""
     check_finite(basis, values)
     values = values / np.maximum(np.max(np.abs(values), axis=0), np.finfo(float).tiny)
     scale = np.linalg.norm(values, axis=0)

@@ -69,7 +69,6 @@ class Changes(NamedTuple):
     good: np.ndarray
 
     def subset(self, index: np.ndarray) -> "Changes":
-        """Of some of the samples."""
         arrays = {k: x[index] for k, x in self._asdict().items() if isinstance(x, np.ndarray)}
         samples, motion = self.samples.subset(index), self.motion.subset(index)
         return self._replace(samples=samples, motion=motion, **arrays)
@@ -100,13 +99,11 @@ def changes_at(step_map: StepMap, order: int, samples: SamplePoints) -> Changes:
 
 
 def checked_changes(step_map: StepMap, order: int, samples: SamplePoints) -> Changes:
-    """The same, or an error for steps that fail, numbers that are not finite, and a time that is
-    not sampled."""
+    """The same, or an error for failing steps, NaN or infinity, and a time that is not sampled."""
     names, changes = step_map.basis.names, changes_at(step_map, order, samples)
     if not changes.good.all():
-        sampling.require_steps(
-            batched_changes(step_map.without_names(), order, samples)[3], samples
-        )
+        good = batched_changes(step_map.without_names(), order, samples)[3]
+        sampling.require_steps(good, samples)
     sampling.check_finite(step_map.basis, changes.values)
 
     def change(m, j):
@@ -237,8 +234,8 @@ def terms_in_pairs(step_map: StepMap, order: int, samples: SamplePoints) -> Pair
 
 
 def _log_determinant(D: Array) -> Array:
-    """The series of log |det D|, without its order 0, from that of D, shape (z + 1, n, n): with
-    D' = D X its derivative is tr X."""
+    """The series of log |det D|, with order 0 as 0, from that of D: with D' = D X it has the
+    derivative tr X."""
     divide = jax.vmap(lanewise.solve, (None, 1), 1)
     growth: list[Array] = []
     for k in range(len(D) - 1):

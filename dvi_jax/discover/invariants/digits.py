@@ -24,11 +24,8 @@ _TIMES = {"": 1.0, "√2": 2**0.5, "√3": 3**0.5, "√5": 5**0.5, "π": np.pi, 
 
 class LinearConditions(NamedTuple):
     """The linear conditions on a series, with rows weighted by the typical change in a step, for
-    functions that are scaled to one size on the samples.
-
-    `terms`: A_0 … A_z, shape (rows, z + 1, size); up to `DENSE` coefficients their Toeplitz matrix
-    as one order.
-    """
+    functions scaled to one size on the samples. `terms`: A_0 … A_z, shape (rows, z + 1, size); up
+    to `DENSE` coefficients their Toeplitz matrix as one order."""
 
     terms: np.ndarray
 
@@ -59,8 +56,8 @@ class LinearConditions(NamedTuple):
         return shares - solver.solve(self._residual(shares)).reshape(shares.shape)
 
     def without_rounding(self, shares: np.ndarray, change: Callable) -> np.ndarray:
-        """The series without the coefficients that are rounding: without them it changes by no more
-        on the held-out samples. `change`: the change of a series there."""
+        """The series without the coefficients that are rounding: it changes no more without them;
+        `change`: that of a series on the held-out samples."""
         size, limit, count = np.abs(shares), None, np.count_nonzero(shares)
         for level in _LEVELS:
             is_kept = size > level * np.max(size)

@@ -60,8 +60,8 @@ class _EnergyFunction(eqx.Module):
 
 
 def unconserved_energy(null: NullSpaces) -> Energy | None:
-    """The energy, if it is neither among the invariants of order 0 nor conserved to rounding by the
-    map, and its change in a step is a power of h."""
+    """The energy, if it is not among the invariants of order 0 nor conserved to rounding, and its
+    change in a step is a power of h."""
     changes, step_map = null.changes, null.changes.step_map
     energy = _EnergyFunction(step_map.equations)
     q, p, t = (jnp.asarray(x[0]) for x in changes.samples)

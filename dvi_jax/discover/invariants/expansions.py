@@ -129,8 +129,7 @@ class Larger(NamedTuple):
 
 
 def common_warnings(result: Any, remedy: str, subject: str) -> list[str]:
-    """Reasons why a `Discovery` or `Symmetries` is not reliable; `remedy`: of a gap that is not
-    clear, `subject`: what may be conserved."""
+    """Reasons not to rely on a result; `remedy`: of an unclear gap; `subject`: what is sought."""
     reasons, count = [], result.survivors[0]
     if count and result.gap < CLEAR:
         reasons.append(f"the gap is not clear: {remedy}")

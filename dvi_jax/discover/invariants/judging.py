@@ -24,10 +24,8 @@ class Judge(NamedTuple):
     approximately: bool = False
 
     def quantiles(self, coefficients: np.ndarray, share: float, sizes=None) -> np.ndarray:
-        """The change that the given share of the samples stays below, shape (count, z + 1).
-
-        `sizes`: of the leading-order terms on the samples that were fitted, if these are others.
-        """
+        """The change that the given share of the samples stays below, shape (count, z + 1);
+        `sizes`: of the leading-order terms on the samples that were fitted, if these are others."""
         out = np.zeros(coefficients.shape[:2])
         sizes = self.sizes(coefficients) if sizes is None else sizes
         for i, c in enumerate(coefficients):

@@ -109,17 +109,14 @@ def null_spaces(changes: Changes, tolerance=None, pairs: Pair | None = None) -> 
         motion = motion._replace(rounding=rounding * motion.rounding)
         conditions = conditions._replace(motion=motion)
         errors = rounding * changes.motion.rounding
-        spaces, pair_unclear = spaces_in_pairs(
-            pairs, conditions.scale, conditions.orthonormal, motion.weights(), ~fit, errors, trivial
-        )
+        problem = pairs, conditions.scale, conditions.orthonormal, motion.weights(), ~fit
+        spaces, pair_unclear = spaces_in_pairs(*problem, errors, trivial)
     return NullSpaces(changes, tolerance, conditions, spaces, pair_unclear, constant, condition)
 
 
 def _shares_of_constant(rms, values, calm, slopes) -> np.ndarray | None:
-    """The combination that is 1 everywhere (and not only on these samples), if there is one.
-
-    `values`: of the functions, times the weights `calm` of the samples.
-    """
+    """The combination that is 1 everywhere (and not only on these samples), if there is one;
+    `values`: of the functions, times the weights `calm` of the samples."""
     shares = np.linalg.lstsq(values / rms, calm, rcond=None)[0]
     shares = np.where(np.abs(shares) > 1e-9 * np.max(np.abs(shares)), shares, 0.0)
     terms = np.maximum(np.abs(values / rms) @ np.abs(shares), np.finfo(float).tiny)

@@ -169,8 +169,7 @@ def find_symmetries(
 
 def _default_gauges(basis: AbstractBasis, shape: tuple[int, ...]) -> AbstractBasis:
     """The functions times 1 and the coordinates, all quadratic polynomials, and t."""
-    uses_time = bind_basis(basis, shape).uses_time
-    variables = coordinate_names(shape) + (("t",) if uses_time else ())
+    variables = coordinate_names(shape) + ("t",) * bind_basis(basis, shape).uses_time
 
     def products(basis):
         match basis:
@@ -191,9 +190,7 @@ def _default_gauges(basis: AbstractBasis, shape: tuple[int, ...]) -> AbstractBas
 _CLOCK = Basis({TIME[0]: lambda q, p, t: t})
 
 
-def _independent_gauges(
-    basis: BoundBasis, raw: Conditions, samples: SamplePoints, h: float
-) -> np.ndarray:
+def _independent_gauges(basis: BoundBasis, raw: Conditions, samples: SamplePoints, h: float):
     """Numbers of the gauge functions that are not constant and do not depend on simpler ones."""
     units = np.append(abs(h), sampling.spreads(samples))
     typical = typical_sizes(values_at(basis, samples))[0]

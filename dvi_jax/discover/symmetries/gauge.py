@@ -25,8 +25,7 @@ from .noether import noether_identity
 
 _ROUNDINGS = 64.0  # An identity below so many roundings of its terms is zero
 _UNCLEAR = 1e-6  # Where rounding makes a larger residual, it does not decide whether a gauge exists
-# A sample is compared with itself where the identity is so many times larger than at 75 %.
-_STRONG = 100.0
+_STRONG = 100.0  # An identity so many times larger than at 75 % of the samples is its own scale
 
 
 class BasisGauge(eqx.Module):
@@ -166,11 +165,8 @@ def solve_gauge(
 
 
 def _scale(n: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Scale of the residual of each sample, shape (S,): the largest identity without gauges, or
-    its own where that is far larger than at nearly all samples.
-
-    `n`: the identity without gauges; `sizes`: of its terms before they cancel.
-    """
+    """Scale of the residual of each sample, shape (S,): the largest identity `n` without gauges, or
+    its own where that is far larger than at most; `sizes`: of its terms before they cancel."""
     if np.mean(n <= _ROUNDINGS * np.finfo(float).eps * sizes) > 0.95:
         n = sizes  # the identity closes by itself: n is rounding
     usual = n <= _STRONG * np.quantile(n, 0.75)
@@ -222,8 +218,7 @@ def _identity_terms(equations, h, generators, basis, samples):
 
 
 def _times_weights(generator: Generator, first: LatticePoint, weights: Array) -> Generator:
-    """The generator with components times weights, at the first point and elsewhere, shape
-    (2, 2n + 1)."""
+    """The generator times weights (2, 2n + 1) of components, at the first point and elsewhere."""
 
     def component(place):
         def function(t, q, p, args):

@@ -184,8 +184,8 @@ class SymmetrySearch:
         return self._simplest(columns @ first, columns @ shifts)
 
     def _representatives(self, space, excluded_series, free) -> np.ndarray:
-        """One series for each leading-order term of a space without those of excluded series, the
-        simplest up to free ones."""
+        """The simplest series, up to free ones, for each leading-order term of a space, without
+        those of excluded series."""
         basis = nullspace.orthonormal_range(excluded_series[: self.size])
         leading = space[: self.size]
         first, _ = by_leading(leading - basis @ (basis.T @ leading))
@@ -294,10 +294,8 @@ class SymmetrySearch:
         return relative_changes(terms, series, motion, size, size * errors)
 
     def powers(self, symmetries: Symmetries, raw: Conditions, factors: np.ndarray) -> np.ndarray:
-        """The powers of the samples' size by which residuals grow, see `growth`.
-
-        `raw`: the conditions at the larger samples; `factors`: by what these are larger.
-        """
+        """The powers of the samples' size by which residuals grow, see `growth`; `raw`: the
+        conditions at the larger samples; `factors`: by what these are larger."""
         motion, determining = self.units.determining(raw)
         finite = [np.isfinite(x.reshape(len(x), -1)).all(axis=1) for x in (determining, *motion)]
         good = (raw.good[:, 0] == 1) & np.all(finite, axis=0)
@@ -322,11 +320,8 @@ class SymmetrySearch:
         return np.max(np.abs(identity[self.held_out]), axis=2) / sizes[:, None]
 
     def _depends(self, c, simpler: list[Symmetry]) -> bool:
-        """Whether X_0 is a combination of simpler ones, with invariants for coefficients.
-
-        Invariants have one value at both points of a pair: the vectors at both, as one vector,
-        are then dependent.
-        """
+        """Whether X_0 is a combination of simpler ones, with invariants for coefficients: the
+        vectors at both points of a pair, as one vector, are then dependent."""
         leading = np.stack([*(s.coefficients[0] for s in simpler if not s.is_dependent), c[0]])
         shares = leading / self.units.components[:, None]
         vectors = np.einsum("sjb,kcb->skjc", self.raw.values[self._sparse, 0], shares)

@@ -57,8 +57,7 @@ class Units:
 
 
 def _motion(raw: Conditions, jacobian: np.ndarray, last_digit: float) -> FieldMotion:
-    """Of the user's functions. `jacobian`: ∂F/∂z of both points, shape (S, 2n, 2, C), without
-    units; `last_digit`: see `Units`."""
+    """Of the user's functions. `jacobian`: ∂F/∂z of both points without units, (S, 2n, 2, C)."""
     values, later = raw.values[:, 0, 0], raw.values[:, 0, 1]
     places = raw.points[:, 0]
     slopes = raw.slopes[:, 0].swapaxes(1, 2)

@@ -14,8 +14,8 @@ from ._exact import (
     wedge,
 )
 from ._maps import (
-    Part,
     Piece,
+    RingPart,
     affine,
     cavity,
     corrector,
@@ -57,7 +57,7 @@ def _exact_fringe(side: int, order: int, skips_b0: bool) -> list[Piece]:
     )
 
 
-_MAPS: dict[str, Callable[[Part], list[Piece]]] = {
+_MAPS: dict[str, Callable[[RingPart], list[Piece]]] = {
     "drift": lambda p: _flow(drift),
     "half_drift": lambda p: _flow(lambda z, length, par: drift(z, length / 2, par)),
     "exact_drift": lambda p: _flow(exact_drift),
@@ -101,7 +101,7 @@ _MAPS: dict[str, Callable[[Part], list[Piece]]] = {
 
 
 @functools.cache
-def pieces_of(part: Part) -> tuple[Piece, ...]:
+def pieces_of(part: RingPart) -> tuple[Piece, ...]:
     """The maps of a part; none of an aperture, which does not move a particle."""
     make = _MAPS.get(part.name)
     return () if make is None else tuple(make(part))
