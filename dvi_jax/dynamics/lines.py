@@ -155,8 +155,8 @@ def lines_of(z: Array, settings: LineSettings) -> SpectralLines:
     rounds = count + (_FINAL_ROUNDS if settings.refine else 0)
     begin = (s, A, is_line, blocks - A[0], jnp.zeros(slots))
     s, A, is_line, remainder, change = lax.fori_loop(0, rounds, advance, begin)
-    rest = jnp.sum(grid.weights * jnp.abs(remainder) ** 2)
-    residual = jnp.sqrt(rest / jnp.where(spread > 0, spread, 1.0))
+    power = jnp.sum(grid.weights * jnp.abs(remainder) ** 2)
+    residual = jnp.sqrt(power / jnp.where(spread > 0, spread, 1.0))
     constant = A[0] * largest
     s, A, is_line, change = (x[1::per_line] for x in (s, A, is_line, change))
     order = jnp.argsort(jnp.where(is_line, -jnp.abs(A), jnp.inf))

@@ -185,9 +185,9 @@ def make_space(
         duplicate = next(name for name in names if names.count(name) > 1)
         raise ValueError(f"the names of params must differ, got {duplicate} twice: rename a key.")
     x = np.concatenate([np.ravel(np.asarray(leaf, float)) for _, leaf in paths])
-    infinite, unknown = {"lower": -np.inf, "upper": np.inf}, {"mean": np.nan, "sigma": np.nan}
-    (lower, upper), _ = _entries(bounds, Bounds, infinite, places, len(x))
-    (mean, sigma), has_prior = _entries(priors, Prior, unknown, places, len(x))
+    no_bounds, no_prior = {"lower": -np.inf, "upper": np.inf}, {"mean": np.nan, "sigma": np.nan}
+    (lower, upper), _ = _entries(bounds, Bounds, no_bounds, places, len(x))
+    (mean, sigma), has_prior = _entries(priors, Prior, no_prior, places, len(x))
     for bad, text in (
         (~np.isfinite(x), "the parameter {0} starts at {1}: every start must be a finite number."),
         (~(lower < upper), "the bounds of {0} are {2} and {3}: the lower one must be less."),

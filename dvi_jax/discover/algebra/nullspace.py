@@ -215,7 +215,7 @@ def series_spaces(
     for space in _spaces_of_orders(rows, tolerance):
         first, free = by_leading(space.columns[:size], max(RANK, tolerance or 0.0))
         leading, shifts = space.columns @ first, space.columns @ free
-        leading = without(trivial, leading)
+        leading = remove(trivial, leading)
         count = leading.shape[1] + shifts.shape[1]
         leading, shifts, unclear = judge(leading, shifts)
         if spaces:
@@ -234,7 +234,7 @@ def intersection(leading: np.ndarray, span: np.ndarray) -> np.ndarray:
     return leading @ V[cosines > 0.9].T
 
 
-def without(direction: np.ndarray | None, leading: np.ndarray) -> np.ndarray:
+def remove(direction: np.ndarray | None, leading: np.ndarray) -> np.ndarray:
     """The combinations whose first blocks are orthogonal to a direction; all where it is outside of
     their span, or None."""
     shares = np.zeros(0) if direction is None else direction @ leading[: len(direction)]

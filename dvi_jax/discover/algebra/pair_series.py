@@ -15,7 +15,7 @@ import numpy as np
 from ...engine.pair_matrices import Left, exact, plus, zeros
 from ...engine.pairs import Pair, div, power
 from ...integration.arithmetic import Arithmetic, DoubleDouble, FloatingPoint
-from .nullspace import HELD_OUT, SeriesSpace, intersection, singular_vectors, triangle, without
+from .nullspace import HELD_OUT, SeriesSpace, intersection, remove, singular_vectors, triangle
 
 ROUNDING = 2.0**-104  # Relative rounding of pairs
 # A singular value counts as zero below so many times the rounding that was seen at lower orders,
@@ -213,7 +213,7 @@ def spaces_in_pairs(
         changes, V = singular_vectors(x[held_out])
         leading = np.asarray(step.series.hi) @ V[changes <= HELD_OUT * _ZERO * step.noise].T
         count = leading.shape[1]
-        leading = without(trivial, leading)
+        leading = remove(trivial, leading)
         if spaces:
             leading = intersection(leading, spaces[-1].leading[:size])
         singular = np.sort(np.concatenate([*nonzero, step.zeros]))[::-1]

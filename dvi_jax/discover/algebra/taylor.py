@@ -173,8 +173,8 @@ class _Operation:
         values = self.values(0)
         jaxpr = jax.make_jaxpr(change)(values, [values[i] for i in moving])
         inputs = [*self.operands, *(_Derivative(self.operands[i]) for i in moving)]
-        own = self.eqn, self.operands, self.outputs
-        return _SeriesProgram(jaxpr, inputs, (*self.context, own))
+        equation = self.eqn, self.operands, self.outputs
+        return _SeriesProgram(jaxpr, inputs, (*self.context, equation))
 
 
 def _is_real(atom: Any) -> bool:

@@ -200,6 +200,6 @@ def _at_larger(changes: Changes, order: int) -> tuple[Larger, ...]:
 
     larger = at_larger_step(samples, h, displacements, count)
     if order == 0:
-        constrained = changes.step_map.is_constrained
-        larger += in_larger_box(samples, h, displacements, count, constrained)
+        is_constrained = changes.step_map.is_constrained
+        larger += in_larger_box(samples, h, displacements, count, is_constrained)
     return larger

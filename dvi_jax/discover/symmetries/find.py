@@ -116,10 +116,10 @@ def find_symmetries(
         values = values_at(functions, samples)
         sampling.check_finite(functions, values)
         sampling.check_basis(functions, typical_sizes(values)[1][:, None] * values)
-    nameless = bound.without_names(), gauge_basis.without_names()
+    unnamed_bases = bound.without_names(), gauge_basis.without_names()
 
     def conditions(shifts, points=samples, step=h, order=order):
-        arrays = at_samples(equations, jnp.asarray(step), *nameless, order, points, shifts)
+        arrays = at_samples(equations, jnp.asarray(step), *unnamed_bases, order, points, shifts)
         return Conditions(*map(np.asarray, arrays))
 
     shifts = later(h)

@@ -280,8 +280,8 @@ class SymmetrySearch:
 
     def _best_gauge(self, identity) -> np.ndarray:
         """The gauge that closes the identity best on the fitted samples."""
-        fitted = (x[~self.held_out] for x in (self.gauge, -identity))
-        series, _ = nullspace.solve_series(*(rows_of(np.moveaxis(x, 1, 2)) for x in fitted))
+        arrays = (x[~self.held_out] for x in (self.gauge, -identity))
+        series, _ = nullspace.solve_series(*(rows_of(np.moveaxis(x, 1, 2)) for x in arrays))
         return series.reshape(self.order + 1, self.gauge_basis.size)
 
     def _residuals(self, x, motion: FieldMotion, determining, errors) -> np.ndarray:
