@@ -212,7 +212,9 @@ def _check_input(library: Any, params, bounds, priors, loss, penalty) -> None:
     for name, value in (("params", params), ("bounds", bounds), ("priors", priors)):
         instance(name, {} if value is None else value, Mapping, "a dict or None")
         if value is not None and KEY in value:
-            raise ValueError(f"{name} must not contain {KEY!r}: dvi.identify adds them.")
+            raise ValueError(
+                f"{name} must not contain {KEY!r}: dvi.identify adds the coefficients."
+            )
     if penalty is not None:
         positive("penalty", penalty)
 

@@ -98,11 +98,11 @@ class Request:
     def _with_defaults(self) -> "Request":
         """The same, with the defaults of a problem of the library."""
         has_start = self.start is not None or isinstance(self.system, System)
-        names = ("system", "q0", "p0", "h", "args")
-        values = of_problem(*(getattr(self, name) for name in names), has_start)
-        check_system(values[0], noise_allowed=True)
-        fields = dict(zip(names, values, strict=True))
-        return dataclasses.replace(self, **fields, epsilon=values[0].strength(self.epsilon))
+        system, *values = of_problem(self.system, self.q0, self.p0, self.h, self.args, has_start)
+        check_system(system, noise_allowed=True)
+        fields = dict(zip(("q0", "p0", "h", "args"), values, strict=True))
+        epsilon = system.strength(self.epsilon)
+        return dataclasses.replace(self, system=system, epsilon=epsilon, **fields)
 
     def _sweep(self) -> Sweep:
         inputs = self._inputs()
