@@ -9,20 +9,13 @@ import numpy as np
 from jaxtyping import Array
 
 from ..base.checks import positive
+from . import results
 from .frequencies import Frequencies, analyse, check_count, settings_of, signals_of
 from .lines import EPS
-from .results import (
-    CODE,
-    FREQUENCY_RESULTS,
-    WithStatus,
-    lacks_numbers,
-    refuse_traced,
-    require_success,
-)
+from .results import CODE, FREQUENCY_RESULTS, WithStatus, lacks_numbers, require_success
 from .torus import FundamentalFrequencies, as_batch, search_of, tori_of
 
-_CONSTANT = 64 * EPS
-"""A q or p of which the spread is below this fraction of its size is constant to round-off."""
+_CONSTANT = 64 * EPS  # A q or p with less spread, relative to its size, is constant to round-off
 
 
 class Actions(WithStatus):
@@ -108,10 +101,9 @@ def actions(
     settings = settings_of(count, window, True)
     ts, signal, eps, axes = signals_of(ts, signal)
     if not jnp.iscomplexobj(signal):
-        raise TypeError(
-            f"signal must be complex, q − i p, got a real array of shape {signal.shape}."
-        )
-    refuse_traced("actions", ts, signal)
+        shape = signal.shape
+        raise TypeError(f"signal must be complex, q − i p, got a real array of shape {shape}.")
+    results.refuse_traced("actions", ts, signal)
     # One axis for all degrees of freedom of a trajectory.
     lead, N = signal.shape[: signal.ndim - 1 - axes], signal.shape[-1]
     signal = signal.reshape(*lead, math.prod(signal.shape[len(lead) : -1]), N)
@@ -139,12 +131,11 @@ def actions(
     for i in range(len(codes)):
         if lacks_numbers(codes[i]):
             continue
-        residual[i], action, error, is_accurate = _of_torus(
-            combinations[i], is_combination[i], power[i], doubt[i], fraction[i], size[i]
-        )
+        arrays = combinations, is_combination, power, doubt, fraction, size
+        residual[i], action, error, is_accurate = _of_torus(*(x[i] for x in arrays))
         if codes[i] in (0, CODE["not_quasi_periodic"]):
-            is_quasi_periodic = is_accurate and residual[i] <= leftover
-            codes[i] = 0 if is_quasi_periodic else CODE["not_quasi_periodic"]
+            is_torus = is_accurate and residual[i] <= leftover
+            codes[i] = 0 if is_torus else CODE["not_quasi_periodic"]
         if codes[i] == 0:
             J[i], errors[i] = action, error
     torus = as_batch(tori, codes, lead)

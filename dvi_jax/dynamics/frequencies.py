@@ -27,8 +27,7 @@ from .results import (
     with_code,
 )
 
-_FEWEST = 32
-"""Least number of samples of a signal."""
+_FEWEST = 32  # Least number of samples of a signal
 
 
 class Frequencies(WithStatus):
@@ -69,10 +68,7 @@ class Frequencies(WithStatus):
         ts = _real_times("ts", ts)
         times, batch = ts.reshape(-1), self.constant.shape
         is_line = jnp.isfinite(self.frequencies)
-        omega, A = (
-            jnp.where(is_line, self.frequencies, 0.0),
-            jnp.where(is_line, self.amplitudes, 0.0),
-        )
+        omega, A = (jnp.where(is_line, x, 0.0) for x in (self.frequencies, self.amplitudes))
         phases = omega[..., :, None] * jnp.expand_dims(times, tuple(range(omega.ndim)))
         z = self.constant[..., None] + jnp.sum(A[..., :, None] * jnp.exp(1j * phases), axis=-2)
         code = code_of(self.result)
@@ -221,10 +217,8 @@ def check_count(settings: LineSettings, signal: Array, where: str = "") -> None:
 
 
 def _check_samples(signal: Array, fewest: int) -> None:
-    if signal.shape[-1] < fewest:
-        raise ValueError(
-            f"signal must have at least {fewest} samples, got {signal.shape[-1]}: save more often."
-        )
+    if (N := signal.shape[-1]) < fewest:
+        raise ValueError(f"signal must have at least {fewest} samples, got {N}: save more often.")
 
 
 def signals_of(ts: Any, signal: Any) -> tuple[Array, Array, float, int]:
@@ -330,17 +324,13 @@ def analyse(
 
 
 @eqx.filter_jit
-def _analyse_rows(
-    ts: Array, signal: Array, settings: LineSettings, eps: Array
-) -> tuple[Frequencies, SpectralLines]:
+def _analyse_rows(ts: Array, signal: Array, settings: LineSettings, eps: Array):
     """`analyse` for signals (M, N) at times (M, N)."""
     h, centre, _ = _lattice(ts)
     N = signal.shape[-1]
     lines = jax.vmap(lambda z: lines_of(z, settings))(signal)
-    irregular = ~(_unevenness(ts, eps) <= 1)
-    code = jnp.where(
-        (lines.code != CODE["not_finite"]) & irregular, CODE["irregular_times"], lines.code
-    )
+    irregular = ~(_unevenness(ts, eps) <= 1) & (lines.code != CODE["not_finite"])
+    code = jnp.where(irregular, CODE["irregular_times"], lines.code)
 
     scale = 2 / (N * h)
     omega = lines.s * scale[..., None]

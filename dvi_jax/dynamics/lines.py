@@ -12,21 +12,13 @@ from .results import CODE
 
 EPS = float(np.finfo(np.float64).eps)
 
+# Newton steps to the maximum of an amplitude; Gauss–Newton steps after each line, and rounds of
+# them after the last. Both converge quadratically below some hundredths of the resolution.
 _ASCENT, _FIT_STEPS, _FINAL_ROUNDS = 4, 3, 4
-"""Newton steps to the maximum of an amplitude; Gauss–Newton steps after each line, and rounds of
-them after the last. Both converge quadratically below some hundredths of the resolution."""
-
-_FLOOR = 256 * EPS
-"""A line below this fraction of the largest value of the signal is round-off of its samples."""
-
-_ECHO = 1e-9
-"""A line weaker by this factor than another one within the resolution is round-off of that one."""
-
-_RIDGE = 1e-13
-"""Added to a diagonal of ones, so that lines which coincide do not give a negative pivot."""
-
-_CONVERGENCE = 1e-2
-"""Last correction to a frequency, over the resolution, up to which it counts as converged."""
+_FLOOR = 256 * EPS  # A line below this fraction of the largest value of the signal is round-off
+_ECHO = 1e-9  # A line weaker by this factor than another within the resolution is its round-off
+_RIDGE = 1e-13  # Added to a diagonal of ones: lines that coincide do not give a negative pivot
+_CONVERGENCE = 1e-2  # Last correction to a converged frequency, over the resolution, at most
 
 
 class LineSettings(NamedTuple):
@@ -131,18 +123,14 @@ def _sinc(x: Array) -> tuple[Array, Array, Array]:
 
 
 def lines_of(z: Array, settings: LineSettings) -> SpectralLines:
-    """The lines of one signal.
-
-    Slot 0 is the constant; a line of a real signal has a second slot, of −ω.
-    """
+    """The lines of one signal. Slot 0 is the constant; a real signal has slots of ω and −ω."""
     is_real, count, N = not jnp.iscomplexobj(z), settings.lines, z.shape[-1]
     grid, per_line = _grid(N, settings.window), 2 if is_real else 1
     finite = jnp.all(jnp.isfinite(z))
     z = jnp.where(finite, z, 0.0).astype(complex)
     largest = jnp.max(jnp.abs(z))
     z = z / jnp.where(largest > 0, largest, 1.0)  # so that squares neither over- nor underflow
-    pad = grid.weights.size - N
-    blocks = jnp.pad(z, (0, pad)).reshape(grid.weights.shape)
+    blocks = jnp.pad(z, (0, grid.weights.size - N)).reshape(grid.weights.shape)
 
     slots = 1 + count * per_line
     s, A = jnp.zeros(slots), jnp.zeros(slots, complex).at[0].set(jnp.sum(grid.weights * blocks))
@@ -167,9 +155,8 @@ def lines_of(z: Array, settings: LineSettings) -> SpectralLines:
     rounds = count + (_FINAL_ROUNDS if settings.refine else 0)
     begin = (s, A, is_line, blocks - A[0], jnp.zeros(slots))
     s, A, is_line, remainder, change = lax.fori_loop(0, rounds, advance, begin)
-    residual = jnp.sqrt(
-        jnp.sum(grid.weights * jnp.abs(remainder) ** 2) / jnp.where(spread > 0, spread, 1.0)
-    )
+    power = jnp.sum(grid.weights * jnp.abs(remainder) ** 2)
+    residual = jnp.sqrt(power / jnp.where(spread > 0, spread, 1.0))
     constant = A[0] * largest
     s, A, is_line, change = (x[1::per_line] for x in (s, A, is_line, change))
     order = jnp.argsort(jnp.where(is_line, -jnp.abs(A), jnp.inf))
@@ -224,9 +211,7 @@ def _strongest(grid: _Grid, r: Array, is_real: bool) -> tuple[Array, Array]:
     return s, amplitude
 
 
-def _exceeds_noise(
-    grid: _Grid, r: Array, position: Array, size: Array, s: Array, A: Array, is_line: Array
-) -> Array:
+def _exceeds_noise(grid: _Grid, r, position, size, s, A, is_line) -> Array:
     """Whether a maximum exceeds white noise and round-off.
 
     The largest |⟨r, e^{isy}⟩|² of N values of noise is about ln N times its mean, which is the
@@ -262,9 +247,8 @@ def _correction(grid, s, A, remainder, is_line, with_frequencies: bool, damping)
     length, K = jnp.abs(A), s.shape[0]
     unit = jnp.where(length > 0, A / jnp.where(length > 0, length, 1.0), 1.0)
     is_pair = is_line[:, None] & is_line[None, :]
-    r = jnp.where(
-        is_line[None, :], jnp.conj(unit)[None, :] * _moments(grid, grid.weights * remainder, s), 0.0
-    )
+    r = jnp.conj(unit)[None, :] * _moments(grid, grid.weights * remainder, s)
+    r = jnp.where(is_line[None, :], r, 0.0)
     W, W1, W2 = _kernel(grid, s[None, :] - s[:, None])
     turn = jnp.where(is_pair, jnp.conj(unit)[:, None] * unit[None, :], 0.0)
     G0 = turn * W + jnp.diag(jnp.where(is_line, _RIDGE, 1.0))
@@ -276,8 +260,8 @@ def _correction(grid, s, A, remainder, is_line, with_frequencies: bool, damping)
     free = is_line.at[0].set(False)  # the constant stays one
     S = jnp.where(free[:, None] & free[None, :], jnp.real(G2 - product[:, :K]), 0.0)
     S = S + jnp.diag(jnp.where(free, _RIDGE + damping, 1.0))
-    rhs = jnp.where(free, jnp.imag(r[1] - product[:, K]), 0.0)
-    g = _solve(S, rhs[:, None])[:, 0]
+    right = jnp.where(free, jnp.imag(r[1] - product[:, K]), 0.0)
+    g = _solve(S, right[:, None])[:, 0]
     c = solution[:, K] - 1j * (solution[:, :K] @ g.astype(complex))
     return unit * c, g / jnp.where(length > 0, length, 1.0)
 
@@ -298,10 +282,8 @@ def _solve(M: Array, B: Array) -> Array:
 
 
 def _fit(grid, blocks, s, A, is_line, with_frequencies: bool):
-    """A few steps of least squares, with more damping if a step does not reduce the residual.
-
-    Returns s, A, the residual, and the last undamped step in s.
-    """
+    """A few steps of least squares, with more damping if a step does not reduce the residual: s, A,
+    the residual, and the last undamped step in s."""
 
     def remainder_of(s, A):
         outer = jnp.exp(1j * grid.rows[:, None] * s[None, :]) * A[None, :]

@@ -101,11 +101,8 @@ NAMES, SECTION_NAMES = (
     tuple(vars(results)["_name_to_item"]) for results in (FREQUENCY_RESULTS, SECTION_RESULTS)
 )
 
-CODE = {name: i for i, name in enumerate(NAMES)}
-"""The index of a status in `NAMES`."""
-
-code_of: Callable[[Any], Array] = status_code
-"""The index of a status in `NAMES`, for each signal of a batch."""
+CODE = {name: i for i, name in enumerate(NAMES)}  # Indices in `NAMES`
+code_of: Callable[[Any], Array] = status_code  # The same of a status, for each signal of a batch
 
 
 def lacks_numbers(code: Any) -> Any:
@@ -132,13 +129,11 @@ def with_code(code: Any) -> FREQUENCY_RESULTS:
 
 def judge(count: Array, capacity: int, run: RESULTS) -> SECTION_RESULTS:
     """The status of an orbit with `count` of `capacity` crossings."""
-    result = SECTION_RESULTS.where(
-        count == 0, SECTION_RESULTS.never_crossed, SECTION_RESULTS.too_few_crossings
-    )
-    result = SECTION_RESULTS.where(run == RESULTS.stopped, SECTION_RESULTS.stopped, result)
-    ended_well = (run == RESULTS.successful) | (run == RESULTS.stopped)
-    result = SECTION_RESULTS.where(ended_well, result, SECTION_RESULTS.failed)
-    return SECTION_RESULTS.where(count >= capacity, SECTION_RESULTS.successful, result)
+    kinds, is_stopped = SECTION_RESULTS, run == RESULTS.stopped
+    result = kinds.where(count == 0, kinds.never_crossed, kinds.too_few_crossings)
+    result = kinds.where(is_stopped, kinds.stopped, result)
+    result = kinds.where((run == RESULTS.successful) | is_stopped, result, kinds.failed)
+    return kinds.where(count >= capacity, kinds.successful, result)
 
 
 class _WithFound(RuntimeError):

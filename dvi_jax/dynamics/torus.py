@@ -20,14 +20,9 @@ from .results import (
     with_code,
 )
 
-_TOLERANCE = 1e-2
-"""Default tolerance of a combination, over the resolution."""
-
-_ORDERS = {1: 64, 2: 20, 3: 12, 4: 8, 5: 6}
-"""Default order by the number of frequencies, 5 for more: some thousand combinations each."""
-
-_SUBSETS = 300
-"""Sets of lines that are tried as a basis."""
+_TOLERANCE = 1e-2  # Default tolerance of a combination, over the resolution
+_ORDERS = {1: 64, 2: 20, 3: 12, 4: 8, 5: 6}  # Default order by the number of frequencies, else 5
+_SUBSETS = 300  # Sets of lines that are tried as a basis
 
 
 class FundamentalFrequencies(WithStatus):
@@ -125,9 +120,7 @@ class BasisSearch(NamedTuple):
     guess: np.ndarray | None
 
 
-def search_of(
-    n: int, num: Any, guess: Any, order: Any, tolerance: Any, threshold: Any
-) -> BasisSearch:
+def search_of(n: int, num, guess, order, tolerance, threshold) -> BasisSearch:
     if n == 0:
         raise ValueError("signal or lines must have degrees of freedom, got 0.")
     if guess is not None:
@@ -145,14 +138,9 @@ def search_of(
     return BasisSearch(num, order, tolerance, float(threshold), guess)
 
 
-def tori_of(
-    omega, A, code, resolution, search: BasisSearch, soft: bool
-) -> tuple[list[np.ndarray], np.ndarray]:
+def tori_of(omega, A, code, resolution, search: BasisSearch, soft: bool):
     """The arrays of `FundamentalFrequencies`, each with the trajectories along its first axis, and
-    the codes of their statuses.
-
-    `soft`: the status of an analysis with unresolved lines is that of the torus too.
-    """
+    the codes of their statuses; `soft`: that of an analysis with unresolved lines is kept."""
     n, count = omega.shape[-2:]
     M = math.prod(omega.shape[:-2])
     lines = (x.reshape(M, n, count) for x in (omega, A))
@@ -202,9 +190,8 @@ def _torus(nu, size, resolution, tolerance, search: BasisSearch) -> tuple[tuple[
         basis, k, _, is_combination = _fit(basis, strong, weight, tolerance, search.order)
         complexity = float(np.sum(np.abs(k).sum(axis=1) * weight * is_combination))
         score = (np.sum(~is_combination), complexity)
-        if score[0] < best_score[0] or (
-            score[0] == best_score[0] and score[1] < 0.8 * best_score[1]
-        ):
+        is_simpler = score[0] == best_score[0] and score[1] < 0.8 * best_score[1]
+        if score[0] < best_score[0] or is_simpler:
             best, best_score = basis, score
         if best_score[0] == 0 and len(basis) < search.num:
             break  # fewer frequencies explain all lines
@@ -233,8 +220,7 @@ def _bases(nu, strong, resolution, tolerance, search: BasisSearch):
     """Sets of frequencies that may be a basis, the most natural first."""
     num, order = search.num, search.order
     if search.guess is not None:
-        low = combinations_up_to(num, 4)
-        k, _, close = _match(search.guess, strong, resolution / 2, low)
+        k, _, close = _match(search.guess, strong, resolution / 2, combinations_up_to(num, 4))
         close &= np.abs(k).sum(axis=1) > 0
         if np.linalg.matrix_rank(k[close]) == num:
             yield np.linalg.lstsq(k[close].astype(float), strong[close], rcond=None)[0]
@@ -258,10 +244,8 @@ def _bases(nu, strong, resolution, tolerance, search: BasisSearch):
 
 
 def _independent(basis: np.ndarray, tolerance: float, order: int) -> bool:
-    k = combinations_up_to(len(basis), order)
-    return bool(
-        (np.abs(k[1:] @ basis) > tolerance * np.maximum(1, np.abs(k[1:]).max(axis=1))).all()
-    )
+    k = combinations_up_to(len(basis), order)[1:]
+    return bool((np.abs(k @ basis) > tolerance * np.maximum(1, np.abs(k).max(axis=1))).all())
 
 
 def _fit(basis, lines, weight, tolerance, order):
@@ -294,10 +278,8 @@ def combinations_up_to(num: int, order: int) -> np.ndarray:
     for _ in range(num):
         left = order - np.abs(table).sum(axis=1)
         fits = {k: left >= abs(k) for k in range(-order, order + 1)}
-        table = np.concatenate(
-            [np.column_stack([table[fit], np.full(fit.sum(), k)]) for k, fit in fits.items()]
-        )
+        longer = [np.column_stack([table[fit], np.full(fit.sum(), k)]) for k, fit in fits.items()]
+        table = np.concatenate(longer)
     size = np.abs(table)
-    return table[
-        np.argsort(size.sum(axis=1) + size.max(axis=1, initial=0) / (order + 1), kind="stable")
-    ]
+    complexity = size.sum(axis=1) + size.max(axis=1, initial=0) / (order + 1)
+    return table[np.argsort(complexity, kind="stable")]

@@ -26,14 +26,9 @@ from .solvers import is_gauss_newton, is_optax, solver_for
 from .stages import JACOBIAN_LIMIT, Minimum, by_gradient, in_segments, least_squares
 from .uncertainty import Uncertainty, in_words, uncertainty
 
-_CURVATURE_LIMIT = 50
-"""Parameters up to which second derivatives are computed."""
-
-_SMALL = 1_000_000
-"""Steps of trajectories that take less time than the compilation of exact second derivatives."""
-
-_PART = 0.01
-"""Part of a standard error over which Jacobians are subtracted."""
+_CURVATURE_LIMIT = 50  # Parameters up to which second derivatives are computed
+_SMALL = 1_000_000  # Steps of trajectories that take less time than compiling exact derivatives
+_PART = 0.01  # Part of a standard error over which Jacobians are subtracted
 
 
 @checked_keywords
@@ -166,9 +161,8 @@ def _horizons(horizons: Any) -> list[float] | None:
         return [np.inf]
     times = np.asarray(horizons, float)
     if times.ndim != 1 or not (np.diff(times) > 0).all() or not (times > 0).all():
-        raise ValueError(
-            f"horizons must be 'auto', None or increasing positive times, got {horizons!r:.200}."
-        )
+        rule = "'auto', None or increasing positive times"
+        raise ValueError(f"horizons must be {rule}, got {horizons!r:.200}.")
     return [*times.tolist(), np.inf]
 
 
@@ -232,9 +226,7 @@ def _result(run: FitRun, minimum: Minimum, check_curvature: bool) -> FitResult:
     )
 
 
-def _curvature_ratio(
-    problem: FitProblem, u: Any, r: np.ndarray, J: np.ndarray, spectrum: Uncertainty
-) -> np.ndarray:
+def _curvature_ratio(problem: FitProblem, u: Any, r, J, spectrum: Uncertainty) -> np.ndarray:
     """Second derivative of the loss along each principal direction over Gauss–Newton's, which
     lacks r · r''.
 
@@ -244,8 +236,7 @@ def _curvature_ratio(
     D = spectrum.directions[:, : spectrum.directions.shape[1] - spectrum.null_directions.shape[1]]
     squares = np.sum((J @ D) ** 2, axis=0)
     if 2 * problem.size * (problem.size + 1) * problem.steps > _SMALL:
-        exact = np.asarray(problem.curvature(u, D.T)) if D.shape[1] else np.zeros(0)
-        return exact / squares
+        return (np.asarray(problem.curvature(u, D.T)) if D.shape[1] else np.zeros(0)) / squares
     t = _PART * np.linalg.norm(r) / np.sqrt(squares * max(problem.degrees_of_freedom, 1))
     ratios = []
     for d, step, square in zip(D.T, t, squares, strict=True):

@@ -24,11 +24,8 @@ from .posterior import Posterior
 from .result import FitResult, with_error
 from .uncertainty import correlations
 
-_R_HAT = 1.01
-"""Largest R̂ of chains that count as mixed (Vehtari et al. 2021)."""
-
-_TRUNCATION_LIMIT = 0.01
-"""Fraction of draws with a truncated path above which a warning is given."""
+_R_HAT = 1.01  # Largest R̂ of chains that count as mixed (Vehtari et al. 2021)
+_TRUNCATION_LIMIT = 0.01  # Fraction of draws with a truncated path above which a warning is given
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,12 +229,9 @@ def _numpyro(part: str) -> Any:
 
 
 def start_of(posterior: Posterior, start: Any, bounds: PyTree, priors: PyTree) -> np.ndarray:
-    """The free vector of a fit or of a pytree.
-
-    A number that the fit left at a bound, where u is infinite, starts as in `params`.
-
-    **Raises** `ValueError` for one of other parameters, or a pytree outside of the bounds.
-    """
+    """The free vector of a fit or of a pytree; a number that the fit left at a bound, where u is
+    infinite, starts as in `params`. **Raises** `ValueError` for other parameters, or a pytree
+    outside of the bounds."""
     is_fit = isinstance(start, FitResult)
     arguments = (start.params,) if is_fit else (start, bounds, priors)
     space, x = make_space(*arguments)
@@ -260,9 +254,7 @@ def _starts(potential: Callable[[Array], Array], chains: int, size: int, seed: i
     return jnp.zeros((chains, size))  # the mode, where it is positive
 
 
-def collect(
-    posterior: Posterior, x: Any, statistics: Any, notes: list[str], longest: int
-) -> Samples:
+def collect(posterior: Posterior, x: Any, statistics: Any, notes: list, longest: int) -> Samples:
     """Draws with their diagnostics."""
     x, diagnostics = np.asarray(x), _numpyro("diagnostics")
     columns = {name: x[..., i] for i, name in enumerate(posterior.names)}

@@ -31,10 +31,8 @@ def requires(fits: Any, subject: str, condition: str, value: str, hint: str = ""
 def enough_values(count: int, minimum: int, purpose: str) -> None:
     """**Raises** `ValueError` for fewer observed values than a fit needs."""
     if count < minimum:
-        raise ValueError(
-            f"data must have at least {minimum} observed values, one for each of {purpose}, got "
-            f"{count}."
-        )
+        rule = f"{minimum} observed values, one for each of {purpose}"
+        raise ValueError(f"data must have at least {rule}, got {count}.")
 
 
 def same_parameters(name: str, names: Sequence[str], reference: Sequence[str], owner: str) -> None:

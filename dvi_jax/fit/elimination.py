@@ -1,5 +1,6 @@
 """Terms of a force removed one by one: backward elimination by a criterion."""
 
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,17 +14,10 @@ from .problem import FitProblem
 from .solvers import levenberg_marquardt
 from .uncertainty import Uncertainty, in_words, inverse_or, uncertainty
 
-_REFIT = 30
-"""Steps of a refit, which begins next to its minimum."""
-
-_PRECISE = 1e-4
-"""Tolerance of a refit in standard errors: 1e-8 in chi²."""
-
-_MARGIN = 3.0
-"""Penalties by which the criterion may exceed the best before the elimination ends."""
-
-_ROUNDING = 1e-11
-"""Least relative error of any data: exact ones contain no information below it."""
+_REFIT = 30  # Steps of a refit, which begins next to its minimum
+_PRECISE = 1e-4  # Tolerance of a refit in standard errors: 1e-8 in chi²
+_MARGIN = 3.0  # Penalties by which the criterion may exceed the best before the end
+_ROUNDING = 1e-11  # Least relative error of any data: exact ones have no information below it
 
 
 @dataclass(frozen=True)
@@ -55,9 +49,7 @@ class Elimination:
     - `path`; `best`: the free variables at the least criterion, `keep`: which of them take part.
     """
 
-    def __init__(
-        self, problem: FitProblem, library: ForceLibrary, penalty: float | None, has_errors: bool
-    ):
+    def __init__(self, problem: FitProblem, library: ForceLibrary, penalty, has_errors: bool):
         self.problem, self.library, self.has_errors = problem, library, has_errors
         self.where = places(problem, library)
         usual = np.log(problem.count) + 2 * np.log(len(library))
@@ -80,20 +72,15 @@ class Elimination:
         return self._terms_of(self.keep)
 
     def _terms_of(self, keep: np.ndarray) -> tuple[str, ...]:
-        return tuple(
-            name for name, k in zip(self.library.names, keep[self.where], strict=True) if k
-        )
+        return tuple(itertools.compress(self.library.names, keep[self.where]))
 
     def eliminate(self) -> None:
-        """Remove terms until the criterion exceeds its minimum by a few penalties, or none is
-        left."""
-        u, keep, name = self.best, self.keep, None
-        minimum = np.inf
+        """Remove terms until none is left, or the criterion is far above its minimum."""
+        u, keep, name, minimum = self.best, self.keep, None, np.inf
         while True:
             u, evaluation, status = self._refit(u, keep)
-            r = np.asarray(evaluation.residual)
+            r, value = np.asarray(evaluation.residual), np.inf
             chi2 = float(r @ r)
-            value = np.inf
             if np.isfinite(chi2):
                 value = self._misfit(chi2) + self.penalty * int(keep[self.where].sum())
             self.path.append(Removal(name, self._terms_of(keep), chi2, value, status))
@@ -110,8 +97,7 @@ class Elimination:
             i = self._weakest(u, J, keep, spectrum)
             remainder = keep & (np.arange(len(u)) != self.where[i])
             u = _eliminate(u, np.asarray(evaluation.jacobian), self.where[i], remainder)
-            keep = remainder
-            name = self.library.names[i]
+            keep, name = remainder, self.library.names[i]
 
     def _refit(self, u: np.ndarray, keep: np.ndarray) -> tuple[Any, Evaluation, FIT_RESULTS]:
         """The minimum near u; where it is worse than no force at all, the minimum near that."""
@@ -143,9 +129,7 @@ class Elimination:
         size = max(float(np.abs(g.values * g.whiten).max()) for g in self.problem.groups)
         return count * float(np.log(chi2 / count + (_ROUNDING * size) ** 2 + 1e-300))
 
-    def _weakest(
-        self, u: np.ndarray, J: np.ndarray, keep: np.ndarray, spectrum: Uncertainty
-    ) -> int:
+    def _weakest(self, u: np.ndarray, J, keep, spectrum: Uncertainty) -> int:
         """The number of the term with the least |c|/sigma; of those without an error (in a
         combination that is not determined) the one of least effect."""
         sigma = np.full(len(u), np.inf)
@@ -189,8 +173,7 @@ class Elimination:
 
 
 def _eliminate(u: np.ndarray, J: np.ndarray, s: int, remainder: np.ndarray) -> np.ndarray:
-    """Variables without number s, the rest moved so that predictions change least, to first
-    order."""
+    """Variables without number s, the rest moved so that predictions change least (first order)."""
     variables = u.copy()
     variables[s] = 0.0
     if remainder.any():

@@ -24,17 +24,13 @@ from .problem import FitProblem
 from .result import FitResult, with_error
 from .shooting import MultipleShooting, SingleShooting
 
+# Width of a prior: the change of the predictions by the candidate alone, to first order, in
+# scatters of the data. It hardly affects terms that the data determine, and holds combinations that
+# they do not.
 _GUARD = 3.0
-"""Width of a prior: the change of the predictions by the candidate alone, to first order, in
-scatters of the data. It hardly affects terms that the data determine, and holds combinations that
-they do not."""
-
-_PROVISIONAL_ERROR = 1e-3
-"""Provisional errors of data without any, in scatters of the data."""
-
-
+_PROVISIONAL_ERROR = 1e-3  # Provisional errors of data without any, in scatters of the data
+# Keywords of `fit` for the fit of all candidates and for the last one.
 _OF_ALL = ("max_steps", "tolerance", "check_units", "progress")
-"""Keywords of `fit` for the fit of all candidates and for the last one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,9 +154,8 @@ def identify(
     full_model = _with_library(model, library, is_list, params)
     start = {**params, KEY: dict.fromkeys(library.names, 0.0)}
     arcs_with_errors = [_with_errors(arc) for arc in arcs]
-    guard = _guard(
-        FitProblem(full_model, arcs_with_errors, is_list, start, bounds=bounds, loss=loss), library
-    )
+    full_problem = full_model, arcs_with_errors, is_list
+    guard = _guard(FitProblem(*full_problem, start, bounds=bounds, loss=loss), library)
     setting = {"bounds": bounds, "priors": {**(priors or {}), KEY: guard}, "loss": loss}
     common: dict[str, Any] = {name: x for name, x in settings.items() if name in _OF_ALL}
     first: dict[str, Any] = {**common, **setting, "shooting": shooting, "throw": False}
@@ -172,11 +167,9 @@ def identify(
         if full.status != "not_finite":
             break
     else:
-        raise FitError(
-            f"the fit of all terms failed; it is the attribute `fit`. {FIT_RESULTS[full.result]}",
-            full,
-        )
-    problem = FitProblem(full_model, arcs_with_errors, is_list, full.params, **setting)
+        text = f"the fit of all terms failed; it is the attribute `fit`. {FIT_RESULTS[full.result]}"
+        raise FitError(text, full)
+    problem = FitProblem(*full_problem, full.params, **setting)
     search = Elimination(problem, library, penalty, arcs[0].has_errors)
     search.eliminate()
     terms = search.terms
@@ -210,9 +203,7 @@ def identify(
     )
 
 
-def _check_input(
-    library: Any, params: Any, bounds: Any, priors: Any, loss: Any, penalty: Any
-) -> None:
+def _check_input(library: Any, params, bounds, priors, loss, penalty) -> None:
     instance("library", library, ForceLibrary, "a dvi.ForceLibrary")
     if library.coefficients is not None:
         raise ValueError(f"library must have no coefficients, got {library.coefficients}.")
@@ -229,11 +220,8 @@ def _check_input(
 
 
 class _ModelWithLibrary(eqx.Module):
-    """The user's model with the library's force, for parameters with coefficients.
-
-    - `alone`: whether the model leaves ε out, which is then 1. Decided beforehand: inside of
-      compiled code its number is not known.
-    """
+    """The user's model with the library's force, for parameters with coefficients; `alone`: whether
+    the model leaves ε out, which is then 1 (in compiled code its number is not known)."""
 
     model: Any
     library: ForceLibrary
@@ -251,23 +239,18 @@ class _ModelWithLibrary(eqx.Module):
         if not coefficients:
             return spec
         library = self.library.only(coefficients)
-        args = {
-            **(spec.get("args") or {}),
-            KEY: jnp.stack([coefficients[name] for name in library.names]),
-        }
+        values = jnp.stack([coefficients[name] for name in library.names])
+        args = {**(spec.get("args") or {}), KEY: values}
         return {**spec, "system": with_force(spec["system"], library), "args": args}
 
 
-def _with_library(
-    model: Callable[..., Any], library: ForceLibrary, is_list: bool, params: Mapping[str, Any]
-) -> _ModelWithLibrary:
+def _with_library(model: Any, library: ForceLibrary, is_list: bool, params: Mapping[str, Any]):
     """The model with the library; refuses one to which it cannot be added."""
     spec = specification(model, params, 0, is_list)
     args, system, epsilon = spec.get("args"), spec["system"], spec.get("epsilon", 0.0)
     if not (args is None or (isinstance(args, Mapping) and KEY not in args)):
-        raise TypeError(
-            f"args of the model must be None or a dict without {KEY!r}, got {args!r:.200}."
-        )
+        rule = f"None or a dict without {KEY!r}"
+        raise TypeError(f"args of the model must be {rule}, got {args!r:.200}.")
     is_perturbed = system.force is not None or system.perturbation is not None
     if "epsilon" in params and not is_perturbed:
         raise ValueError(

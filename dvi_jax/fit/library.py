@@ -17,9 +17,7 @@ from ..base.types import Args, Scalar, State
 from ..problem.system import System
 from .checks import require_shape
 
-KEY = "coefficients"
-"""Key of the coefficients in args and parameters."""
-
+KEY = "coefficients"  # Key of the coefficients in args and parameters
 _SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -44,9 +42,7 @@ class ForceLibrary(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     coefficients: Array | None
 
-    def __init__(
-        self, candidates: Mapping[str, Callable[..., Any]], coefficients: Any = None
-    ) -> None:
+    def __init__(self, candidates: Mapping[str, Callable[..., Any]], coefficients: Any = None):
         a_dict = "a dict {name: function (t0, t1, q0, p1, args)}"
         instance("the candidates of a dvi.ForceLibrary", candidates, Mapping, a_dict)
         if not candidates:

@@ -24,17 +24,15 @@ from ..observe.solution import Save
 from ..problem.system import System
 from .observations import Observations
 
+# Steps beyond the ends of shorter arcs above which another program is compiled for them.
 _WASTE = 2_000_000
-"""Steps beyond the ends of shorter arcs above which another program is compiled for them."""
-
 _OPTIONS = (
     *("method", "lattice", "newton", "root_finder", "adjoint", "arithmetic", "layout"),
     *("integrator", "num_steps"),
 )
 _MAY_BE_FITTED = ("q0", "p0", "epsilon", "args")
-_MOST_STEPS = 2e9
-"""Steps of a trajectory: their number is a 32-bit integer."""
-
+_MOST_STEPS = 2e9  # Steps of a trajectory: their number is a 32-bit integer
+# Arguments of `integrate` that `fit` sets itself, and why, for messages.
 _REASONS = {
     "num_steps": "it follows from h and the times of the data",
     "save": "the times of the data determine which states are saved",
@@ -43,7 +41,6 @@ _REASONS = {
     "observe": "it is an argument of dvi.Observations",
     "t0": "give it as dvi.Observations(..., t0=...)",
 }
-"""Arguments of `integrate` that `fit` sets itself, and why, for messages."""
 
 
 class Model(eqx.Module):
@@ -86,9 +83,8 @@ class Model(eqx.Module):
                 arguments = ", ".join(("system", "h", *_MAY_BE_FITTED, *_OPTIONS))
                 hint = _REASONS.get(name, f"its arguments are {arguments}")
                 raise TypeError(f"dvi.Model has no argument {name!r}: {hint}.")
-        # Arrays, so that another value needs no other compilation.
         fixed = {"q0": q0, "p0": p0, "epsilon": epsilon, "args": args}
-        self.fixed = jax.tree.map(_as_array, fixed)
+        self.fixed = jax.tree.map(_as_array, fixed)  # Arrays need no other compilation
         self.settings = {"system": system, "h": check_step_size(h), **options}
 
     def __call__(self, params: Mapping[str, Any], arc: Any = None) -> dict[str, Any]:
@@ -117,9 +113,8 @@ class Model(eqx.Module):
     def check_rows(self, params: Mapping[str, Any], arcs: int) -> None:
         """Reject q0 and p0 with more rows than there are arcs."""
         for name in ("q0", "p0"):
-            _check_rows(
-                name, shape := np.shape(params.get(name, self.fixed[name])), shape[0] == arcs
-            )
+            shape = np.shape(params.get(name, self.fixed[name]))
+            _check_rows(name, shape, shape[0] == arcs)
 
 
 def _as_array(x: Any) -> Any:
@@ -260,9 +255,7 @@ def _steps(arc: Observations, spec: Mapping[str, Any]) -> int:
     return max(1, math.ceil((arc.ts[-1] - arc.t0) / float(spec["h"]) - 1e-9))
 
 
-def make_group(
-    numbers: list[int], arcs: list[Any], spec: Mapping[str, Any], num_steps: int
-) -> Group:
+def make_group(numbers: list[int], arcs: list[Any], spec: Mapping, num_steps: int) -> Group:
     """One group of arcs (`Observations` or parts of them) with `num_steps` steps each."""
     rows = max(len(arc.ts) for arc in arcs)
 
@@ -333,9 +326,7 @@ def predict(
     return jnp.reshape(values, (len(ts), -1)), (sol.qs[-1], sol.ps[-1]), sol.result
 
 
-def _states_off_grid(
-    spec: dict[str, Any], t0: Array, ts: Array, sol: Any, group: Group
-) -> tuple[Array, Array]:
+def _states_off_grid(spec: dict[str, Any], t0: Array, ts: Array, sol: Any, group: Group):
     """States at times between grid points."""
     stride = group.block * float(spec["h"])
     index = jnp.ceil((ts - t0) / stride - 1e-9).astype(int) - 1

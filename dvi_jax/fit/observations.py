@@ -12,15 +12,14 @@ from ..base.inputs import refuse_unit_or_mask
 from ..base.signature import accepts, signature_of
 from .checks import require_all, require_shape
 
+# Standard errors relative to the largest value for which a sum of squares can be computed.
 _RANGE = (1e-140, 1e140)
-"""Standard errors relative to the largest value for which a sum of squares can be computed."""
-
+# Observables of a state that have a name.
 OBSERVABLES: dict[str, Callable[..., Any]] = {
     "positions": lambda t, q, p, args: q,
     "momenta": lambda t, q, p, args: p,
     "state": lambda t, q, p, args: jnp.concatenate([jnp.ravel(q), jnp.ravel(p)]),
 }
-"""Observables of a state that have a name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,9 +77,8 @@ class Observations:
         _check_times(ts)
         require_all("values", values, ~np.isinf(values), "finite", "NaN means a missing value.")
         if np.isnan(values).all():
-            raise ValueError(
-                f"values must have at least one number, got {values.size} values, all NaN."
-            )
+            count = values.size
+            raise ValueError(f"values must have at least one number, got {count} values, all NaN.")
         refuse_unit_or_mask("t0", self.t0)
         t0 = finite("t0", ts[0] if self.t0 is None else self.t0)
         if ts.min() < t0 < ts.max():
@@ -151,8 +149,8 @@ class Observations:
         return factors
 
 
+# One arc, or several.
 Data: TypeAlias = Observations | list[Observations] | tuple[Observations, ...]
-"""One arc, or several."""
 
 
 def as_arcs(data: Any) -> tuple[list[Observations], bool]:

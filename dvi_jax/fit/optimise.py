@@ -16,22 +16,16 @@ from .roundoff import STIFFNESS, Evaluation, settle, undamped_step
 from .solvers import is_optax
 from .uncertainty import inverse_or
 
-_REJECTIONS = 12
-"""Rejected steps in a row after which no further step is expected to help."""
-
+_REJECTIONS = 12  # Rejected steps in a row after which no further step is expected to help
+# Length of an undamped step in standard errors up to which a third of them are enough.
 _SHORT_STEP = 1.0
-"""Length of an undamped step in standard errors up to which a third of them are enough."""
-
+# Relative change of u that makes as little difference as round-off of the predictions may make.
+# Where an undamped step is not larger, one rejected step is enough.
 _SMALL = 1e-13
-"""Relative change of u that makes as little difference as round-off of the predictions may make.
-Where an undamped step is not larger, one rejected step is enough."""
-
-_REJECTED_ON_LINE = 40
-"""The same for a line search that halves: it does not know the scale to begin with."""
-
+_REJECTED_ON_LINE = 40  # The same for a line search, which halves from an unknown scale
+# Length of an undamped step in standard errors below which a loss that no longer decreases is at
+# its minimum, up to rounding.
 _FLAT = 1e-3
-"""Length of an undamped step in standard errors below which a loss that no longer decreases is at
-its minimum, up to rounding."""
 
 
 class FIT_RESULTS(eqx.Enumeration):
@@ -125,10 +119,8 @@ class Position:
 
 @dataclass(frozen=True)
 class StageTask:
-    """One stage: its number and horizon, when it ends, and who watches its steps.
-
-    - `max_steps`: those before it was resumed included. `resume`: the position to continue from.
-    """
+    """One stage: its number and horizon, when it ends, and who watches its steps. `max_steps`:
+    those before it was resumed included; `resume`: the position to continue from."""
 
     stage: int
     horizon: float
@@ -180,9 +172,7 @@ _cached_state = functools.lru_cache(maxsize=64)(_state)
 
 
 @eqx.filter_jit
-def _advance(
-    solver: Any, z: Array, linearisation: tuple[Any, Any], state: Any
-) -> tuple[Array, Any]:
+def _advance(solver: Any, z: Array, linearisation: tuple[Any, Any], state: Any):
     z, state, _ = solver.step(_function, z, linearisation, {}, state, frozenset())
     return z, state
 
@@ -209,12 +199,7 @@ class LeastSquaresStage:
         return self.evaluate(jnp.asarray(u), jnp.asarray(horizon), extra)
 
     def run(
-        self,
-        u: np.ndarray,
-        task: StageTask,
-        degrees: int,
-        first: Evaluation | None = None,
-        extra: Any = None,
+        self, u: np.ndarray, task: StageTask, degrees: int, first: Any = None, extra: Any = None
     ) -> tuple[np.ndarray, Evaluation, FIT_RESULTS]:
         """u at the minimum, the evaluation there, and the status.
 
@@ -292,11 +277,9 @@ def _is_near(position: Position, size: float, spread: float) -> bool:
 
 
 def _scalar_function(core: Any, divisor: float) -> Callable[..., Any]:
-    """The scalar loss over `per` for optimistix, a function of z and (base, scale, horizon, arcs).
-
-    Its derivative is by reverse mode, whichever mode the solver uses: memory does not grow with the
-    number of steps.
-    """
+    """The scalar loss over `divisor` for optimistix, a function of z and (base, scale, horizon,
+    arcs). Its derivative is by reverse mode, whichever mode the solver uses: memory does not grow
+    with the number of steps."""
 
     def value(z, setting):
         base, scale, horizon, choice = setting
@@ -313,9 +296,7 @@ def _scalar_function(core: Any, divisor: float) -> Callable[..., Any]:
 
 
 @eqx.filter_jit
-def _descend(
-    solver: Any, core: Any, divisor: float, z: Array, setting: tuple, state: Any
-) -> tuple[Array, Any, Array]:
+def _descend(solver: Any, core: Any, divisor: float, z: Array, setting: tuple, state: Any):
     function = _scalar_function(core, divisor)
     new, state, _ = solver.step(function, z, setting, {}, state, frozenset())
     is_end, _ = solver.terminate(function, new, setting, {}, state, frozenset())
@@ -323,20 +304,14 @@ def _descend(
 
 
 class ScalarStage:
-    """A minimiser of optimistix, or one of optax, on the scalar loss, in u = base + scale z.
-
-    - `core`: has ``scalar(u, horizon, choice)``, the loss. `divisor`: what it is divided by.
-    """
+    """A minimiser of optimistix or optax on the scalar loss ``core.scalar(u, horizon, choice)``
+    over `divisor`, in u = base + scale z."""
 
     def __init__(self, core: Any, divisor: float, solver: Any):
         self.core, self.divisor, self.solver = core, divisor, solver
 
     def run(
-        self,
-        u: np.ndarray,
-        task: StageTask,
-        scale: np.ndarray,
-        choose: Callable[[int], Any] | None = None,
+        self, u: np.ndarray, task: StageTask, scale: np.ndarray, choose: Any = None
     ) -> tuple[np.ndarray, FIT_RESULTS]:
         """u at the end, and the status.
 
@@ -382,10 +357,8 @@ class ScalarStage:
                     position.status = "converged"
                 elif position.rejected >= _REJECTED_ON_LINE:
                     position.status = "stalled"
-            loss *= self.divisor
-            task.watch(
-                Record(task.stage, task.horizon, loss, length, bool(length > 0), x), position
-            )
+            step = loss * self.divisor, length, bool(length > 0), x
+            task.watch(Record(task.stage, task.horizon, *step), position)
         usual = "steps_done" if fixed_steps else "max_steps_reached"
         return np.asarray(base + size * z), getattr(FIT_RESULTS, position.status or usual)
 

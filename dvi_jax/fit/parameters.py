@@ -53,8 +53,7 @@ class Prior:
     sigma: Any
 
 
-_UNDERFLOW = 1e-150
-"""Distance from a bound below which the square of dx/du is zero, and no error is found."""
+_UNDERFLOW = 1e-150  # Distance from a bound at which the square of dx/du is zero: no error there
 
 
 class Space(eqx.Module):
@@ -121,7 +120,7 @@ class Space(eqx.Module):
         return np.asarray(jax.jvp(self.to_x, (u,), (jnp.ones_like(u),))[1])
 
     def at_bounds(self, x: np.ndarray, sigma: np.ndarray) -> list[str]:
-        """Names of the numbers within a tenth of their standard error from a bound, or, without a
+        """Names of the numbers within a tenth of their standard error from a bound; without a
         finite error, on it up to rounding."""
         distance = np.minimum(x - np.asarray(self.lower), np.asarray(self.upper) - x)
         reach = np.where(np.isfinite(sigma), 0.1 * sigma, 1e-12 * np.abs(x) + _UNDERFLOW)
@@ -169,9 +168,8 @@ def make_space(
     numbers, constants = eqx.partition(params, jax.tree_util.tree_map_with_path(_is_number, params))
     paths, tree = jax.tree_util.tree_flatten_with_path(numbers)
     if not paths:
-        raise ValueError(
-            f"params must have a number or an array that can be fitted, got {params!r:.200}."
-        )
+        rule = "a number or an array that can be fitted"
+        raise ValueError(f"params must have {rule}, got {params!r:.200}.")
     names, places = [], {}
     for path, leaf in paths:
         name, shape = _name(path), np.shape(leaf)
@@ -187,11 +185,9 @@ def make_space(
         duplicate = next(name for name in names if names.count(name) > 1)
         raise ValueError(f"the names of params must differ, got {duplicate} twice: rename a key.")
     x = np.concatenate([np.ravel(np.asarray(leaf, float)) for _, leaf in paths])
-    limits, _ = _entries(bounds, Bounds, {"lower": -np.inf, "upper": np.inf}, places, len(x))
-    (mean, sigma), has_prior = _entries(
-        priors, Prior, {"mean": np.nan, "sigma": np.nan}, places, len(x)
-    )
-    lower, upper = limits
+    no_bounds, no_prior = {"lower": -np.inf, "upper": np.inf}, {"mean": np.nan, "sigma": np.nan}
+    (lower, upper), _ = _entries(bounds, Bounds, no_bounds, places, len(x))
+    (mean, sigma), has_prior = _entries(priors, Prior, no_prior, places, len(x))
     for bad, text in (
         (~np.isfinite(x), "the parameter {0} starts at {1}: every start must be a finite number."),
         (~(lower < upper), "the bounds of {0} are {2} and {3}: the lower one must be less."),
@@ -232,10 +228,8 @@ def _is_number(path: Any, x: Any) -> bool:
 def _entries(
     tree: PyTree, kind: type, fields: dict[str, float], places: dict[str, np.ndarray], size: int
 ) -> tuple[list[np.ndarray], np.ndarray]:
-    """The fields of the bounds or priors of all numbers, and which numbers have some.
-
-    - `fields`: names with defaults. `places`: where the numbers of each leaf are in x.
-    """
+    """The fields of the bounds or priors of all numbers, and which numbers have some; `fields`:
+    names with defaults; `places`: where the numbers of each leaf are in x."""
     columns = {name: np.full(size, default) for name, default in fields.items()}
     mask, noun = np.zeros(size, bool), {Bounds: "bounds", Prior: "priors"}[kind]
     for path, entry in jax.tree_util.tree_leaves_with_path(tree):
@@ -249,10 +243,8 @@ def _entries(
         prefixes = tuple(name + end for end in ("[", "."))
         leaves = [k for k in places if not path or k == name or k.startswith(prefixes)]
         if not leaves:
-            raise ValueError(
-                f"{noun} must be for fitted parameters, {', '.join(map(repr, places))}, got "
-                f"{name!r}."
-            )
+            names = ", ".join(map(repr, places))
+            raise ValueError(f"{noun} must be for fitted parameters, {names}, got {name!r}.")
         where = np.concatenate([places[k].ravel() for k in leaves])
         mask[where] = True
         for label, numbers in columns.items():

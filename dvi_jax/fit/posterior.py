@@ -223,9 +223,7 @@ def log_slope(space: Space, u: Array) -> Array:
     return jnp.where(two_sided, interior, jnp.where(has_lower ^ has_upper, u, 0.0))
 
 
-def _finite_potential(
-    value: Callable[[Array], Array], slopes: Callable[[Array], tuple[Array, Array]]
-):
+def _finite_potential(value: Callable[..., Array], slopes: Callable[..., tuple[Array, Array]]):
     """The potential, +inf with slope 0 where it is not finite, with its derivative by `slopes`."""
 
     @jax.custom_jvp

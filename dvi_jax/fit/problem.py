@@ -21,9 +21,9 @@ from .observations import Observations
 from .parameters import Space, make_space
 from .roundoff import Evaluation
 
+# Factor by which data and model may differ in size at the start of a fit: beyond it the units
+# differ, or the trajectory diverges.
 _UNITS = 1e3
-"""Factor by which data and model may differ in size at the start of a fit: beyond it the units
-differ, or the trajectory diverges."""
 
 
 class Core(eqx.Module):
@@ -119,12 +119,10 @@ class Core(eqx.Module):
         keep, values = horizon_mask(group, horizon), jnp.asarray(group.values)
         sigma = 1 / jnp.where(keep, jnp.asarray(group.whiten), 1.0)
         # Missing values get the observed ones as predictions, so that no NaN reaches the density.
-        densities = jax.vmap(self.loss.negative_log_density, in_axes=(0, 0, 0, None))(
-            jnp.where(keep, predictions, values), values, sigma, params
-        )
-        require_shape(
-            "−log density by dvi.Likelihood, with all arcs,", densities, predictions.shape
-        )
+        density = jax.vmap(self.loss.negative_log_density, in_axes=(0, 0, 0, None))
+        densities = density(jnp.where(keep, predictions, values), values, sigma, params)
+        label = "−log density by dvi.Likelihood, with all arcs,"
+        require_shape(label, densities, predictions.shape)
         return jnp.sum(jnp.where(keep, densities, 0.0))
 
     def hessian(self, u: Array) -> Array:
@@ -162,8 +160,7 @@ def _warn_of_times(model: Model, params: Any, arcs: list[Observations]) -> None:
 
 def horizon_mask(group: Group, horizon: Any) -> Array:
     """Which values were observed within the horizon, shape (A, N, K)."""
-    times_since_start = abs(group.ts - group.t0[:, None])
-    return group.mask & (times_since_start <= horizon)[..., None]
+    return group.mask & (abs(group.ts - group.t0[:, None]) <= horizon)[..., None]
 
 
 def _whiten(group: Group, predictions: Array, horizon: Any) -> Array:
@@ -255,26 +252,22 @@ class FitProblem:
         minimum = self.size - self.space.count_of_priors
         enough_values(self.count, minimum, f"{minimum} parameters without a prior")
 
-    # ---- the functions of `core`, compiled
+    # ---- the functions of `core`, compiled; see there
 
     def evaluate(self, u: Any, horizon: Any = np.inf, extra: Any = None) -> Evaluation:
         """`Core.evaluate`; there is nothing `extra`."""
         return _evaluate(self.core, jnp.asarray(u), jnp.asarray(horizon, float))
 
     def weighted_residuals(self, u: Any, horizon: Any = np.inf) -> tuple[list[Array], list[Any]]:
-        """`Core.weighted_residuals`."""
         return _weighted_residuals(self.core, jnp.asarray(u), jnp.asarray(horizon, float))
 
     def root_rows(self, u: Any, rows: list[Any]) -> np.ndarray:
-        """`Core.root_rows`."""
         return np.asarray(_root_rows(self.core, jnp.asarray(u), rows))
 
     def hessian(self, u: Any) -> Array:
-        """`Core.hessian`."""
         return _hessian(self.core, jnp.asarray(u))
 
     def curvature(self, u: Any, directions: Any) -> Array:
-        """`Core.curvature`."""
         return _curvature(self.core, jnp.asarray(u), jnp.asarray(directions))
 
     def by_arc(self, rows: list[Any], predictions: list[Any]) -> tuple[list, list, list[str]]:
@@ -301,10 +294,7 @@ class FitProblem:
 
     def check_start(self, predictions: list[Any], check_units: bool = True) -> None:
         """Refuse a start at which the model fails from the first observation on, or whose
-        predictions differ in size from the data.
-
-        - `predictions`: with the statuses of each group.
-        """
+        `predictions` (with the statuses of each group) differ in size from the data."""
         for group, (values_of_group, result) in zip(self.groups, predictions, strict=True):
             names = np.atleast_1d(status_name(result))
             for a, arc in enumerate(group.arcs):
@@ -315,9 +305,8 @@ class FitProblem:
                     if str(names[a]) == "successful":
                         hint = "another observe: the trajectory does not fail"
                     value, t = values[~np.isfinite(values)][0], group.ts[a, first]
-                    self._refuse_start(
-                        f"{value} for the first observation of arc {arc}, at t = {t:g}", hint
-                    )
+                    moment = f"the first observation of arc {arc}, at t = {t:g}"
+                    self._refuse_start(f"{value} for {moment}", hint)
         if check_units:
             self._check_sizes([np.asarray(values_of_group) for values_of_group, _ in predictions])
 

@@ -26,11 +26,8 @@ _PLAIN = (
 _BY_ARC = ("ts", "observed", "predicted", "whitened", "errors")
 """Fields that a file has as JSON, and those that are a list of arrays."""
 
-_NOTABLE = 0.01
-"""Part of a standard error from which on round-off is reported."""
-
-_LITTLE = 0.1
-"""Fraction of the variance below which a model is reported as little better than a constant."""
+_NOTABLE = 0.01  # Part of a standard error from which on round-off is reported
+_LITTLE = 0.1  # A model that explains less of the variance is little better than a constant
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,15 +156,14 @@ class FitResult:
         a, b = (np.concatenate([pair[i].ravel() for pair in pairs]) for i in (0, 1))
         is_pair = np.isfinite(a) & np.isfinite(b)
         total = (r**2).mean()
+        has_pairs = is_pair.any() and total
         return {
             "rms": float(np.sqrt(total)),
             "mean": float(mean),
             "largest": float(np.abs(r).max()),
             "skewness": float((((r - mean) / safe) ** 3).mean()),
             "excess": float((((r - mean) / safe) ** 4).mean() - 3),
-            "lag_one": float((a[is_pair] * b[is_pair]).mean() / total)
-            if is_pair.any() and total
-            else 0.0,
+            "lag_one": float((a[is_pair] * b[is_pair]).mean() / total) if has_pairs else 0.0,
         }
 
     def __str__(self) -> str:
@@ -228,9 +224,8 @@ class FitResult:
             params = jax.tree.map(np.array, header["shape"], is_leaf=lambda x: isinstance(x, list))
         space, _ = make_space(params)
         same_parameters("params", space.names, header["names"], f"the fit in {path}")
-        by_arc: dict[str, Any] = {
-            n: [arrays[f"{n}.{i}"] for i in range(header["arcs"])] for n in _BY_ARC
-        }
+        numbers = range(header["arcs"])
+        by_arc: dict[str, Any] = {n: [arrays[f"{n}.{i}"] for i in numbers] for n in _BY_ARC}
         return cls(
             params=space.to_params(jnp.asarray(arrays["x"])),
             x=arrays["x"],

@@ -13,22 +13,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Array
 
+# Length of the columns of the scaled Jacobian. Optimistix begins with a damping of 1, which then is
+# Marquardt's 1e-3 of the squared columns.
 STIFFNESS = 30.0
-"""Length of the columns of the scaled Jacobian. Optimistix begins with a damping of 1, which then
-is Marquardt's 1e-3 of the squared columns."""
-
-_STEPS = 4
-"""Undamped steps, each of which is a sample of the round-off."""
-
+_STEPS = 4  # Undamped steps, each of which is a sample of the round-off
+# Factor by which a step may increase the residuals, `small` changes apart: of residuals that are
+# round-off themselves, those of the first point are the smallest by chance.
 _WORSE = 2.0
-"""Factor by which a step may increase the residuals, `small` changes apart: of residuals that are
-round-off themselves, those of the first point are the smallest by chance."""
-
+# Size of the steps, over that of the round-off, that must change the predictions linearly.
 _STEP_RATIO = 30.0
-"""Size of the steps, over that of the round-off, that must change the predictions linearly."""
-
-_LINEAR = 0.3
-"""Relative error of the derivative allowed there. That of a sample of the round-off is 0.03."""
+_LINEAR = 0.3  # Relative error of the derivative allowed there; of a round-off sample 0.03
 
 
 class Evaluation(NamedTuple):
@@ -101,11 +95,9 @@ def settle(
     forward, backward = (np.asarray(evaluate(u + sign * d).residual) for sign in (1, -1))
     # The difference of both sides has no quadratic term.
     defect = evaluation._replace(residual=(forward - backward) / 2 - J @ d)
-    if not (
-        np.isfinite(defect.residual).all() and undamped_step(defect, scale)[1] <= _LINEAR * reach
-    ):
-        return None
-    return End(u, evaluation, np.array(shifts))
+    if np.isfinite(defect.residual).all() and undamped_step(defect, scale)[1] <= _LINEAR * reach:
+        return End(u, evaluation, np.array(shifts))
+    return None
 
 
 def _norm(evaluation: Evaluation) -> float:

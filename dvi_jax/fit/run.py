@@ -22,9 +22,7 @@ from .checks import same_fit
 from .optimise import Position, Record, StageTask
 from .problem import FitProblem
 
-_INTERVAL = 5.0
-"""Seconds between checkpoints."""
-
+_INTERVAL = 5.0  # Seconds between checkpoints
 _FORMAT = 3
 
 _VECTORS = ("base", "scale", "z")
@@ -102,7 +100,7 @@ class FitRun:
         return self.max_steps - len(self.records)
 
     def task(self, stage: int, horizon: float, tolerance: float, limit: int | None) -> StageTask:
-        """The next stage, of at most `most` steps, which continues from the checkpoint once."""
+        """The next stage, of at most `limit` steps, which continues from the checkpoint once."""
         resume, self.resume = self.resume, None
         count = 0 if resume is None else resume.done
         steps = count + self.left
@@ -143,9 +141,8 @@ def _columns(records: list[Record]) -> dict[str, np.ndarray]:
 def identity(problem: FitProblem, u: np.ndarray, *settings_of_call: Any) -> str:
     """Hash by which a checkpoint is recognised: data, names, start and settings."""
     # The repr of an optax optimiser does not contain its numbers: its functions read them.
-    read = [
-        (n, mark) for n, mark in reads(problem.core.model, *settings_of_call) if mark[0] == "value"
-    ]
+    marks = reads(problem.core.model, *settings_of_call)
+    read = [(name, mark) for name, mark in marks if mark[0] == "value"]
     settings = repr((problem.space.names, problem.loss, *settings_of_call, read))
     settings = re.sub(r" at 0x[0-9a-f]+", "", settings)
     groups = [(g.ts, g.values, g.mask, g.whiten, g.t0) for g in problem.groups]

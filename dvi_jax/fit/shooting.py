@@ -51,13 +51,10 @@ class MultipleShooting:
     def __post_init__(self):
         whole("segments", self.segments, 2)
         fraction("tolerance", self.tolerance)
-        is_name = self.guess is None or (
-            isinstance(self.guess, str) and self.guess in ("data", "model")
-        )
-        if not (is_name or callable(self.guess)):
-            raise TypeError(
-                f'guess must be "data", "model", None or a function t → (q, p), got {self.guess!r}.'
-            )
+        is_name = isinstance(self.guess, str) and self.guess in ("data", "model")
+        if not (is_name or self.guess is None or callable(self.guess)):
+            choices = '"data", "model", None or a function t → (q, p)'
+            raise TypeError(f"guess must be {choices}, got {self.guess!r}.")
 
 
 class _SegmentData:
@@ -149,10 +146,8 @@ class Segments:
             is_dense = np.isfinite(arc.values.reshape(len(arc.ts), -1)).all(axis=1).sum() >= 4
             guess = "data" if is_state and is_dense else "model"
         if callable(guess):
-            pairs = [guess(t) for t in times]
-            states_of_cuts = np.array(
-                [np.concatenate([np.ravel(q), np.ravel(p)]) for q, p in pairs], float
-            )
+            pairs = [[np.ravel(q), np.ravel(p)] for q, p in map(guess, times)]
+            states_of_cuts = np.array([np.concatenate(pair) for pair in pairs], float)
             name = f"the array of q and p by guess, each of shape {self.shape}, at all cuts"
             require_shape(name, states_of_cuts, (len(times), 2 * self.half))
         elif guess == "data":
@@ -172,8 +167,7 @@ class Segments:
         return states_of_cuts
 
     def _specification(self, u: Array, arc: Any) -> dict[str, Any]:
-        space = self.problem.space
-        core = self.problem.core
+        space, core = self.problem.space, self.problem.core
         return specification(core.model, space.to_params(space.to_x(u)), arc, core.is_list)
 
     def _segment(self, x: Array, segment: dict[str, Any]) -> tuple[Array, Array]:
@@ -223,8 +217,7 @@ class Segments:
         columns = n + self.next_of[:, None] * 2 * self.half + part
         J_tied = J_tied.at[gap, part, columns].add(-root / self.orbit[None])
         J_prior = jnp.zeros((n, self.size)).at[:, :n].set(jax.jacfwd(prior)(u))
-        J_data = self._in_place(Jr, np.arange(len(r)))
-        blocks = (J_data, J_prior, J_tied)
+        blocks = self._in_place(Jr, np.arange(len(r))), J_prior, J_tied
         J = jnp.concatenate([x.reshape(-1, self.size) for x in blocks])
         return Evaluation(residual, J, gaps.ravel())
 

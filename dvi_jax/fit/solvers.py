@@ -11,48 +11,41 @@ from ..base.checks import instance
 from .checks import requires
 
 
+def _optimistix() -> Any:
+    import optimistix
+
+    return optimistix
+
+
 @functools.cache
 def levenberg_marquardt() -> Any:
-    """One object, so that all fits share what is compiled for it.
-
-    Its own tolerances are never met: `LeastSquaresStage` decides when it ends.
-    """
-    import optimistix as optx
-
-    return optx.LevenbergMarquardt(rtol=1e-14, atol=1e-300)
+    """One object, so that all fits share what is compiled for it. Its own tolerances are never met:
+    `LeastSquaresStage` decides when it ends."""
+    return _optimistix().LevenbergMarquardt(rtol=1e-14, atol=1e-300)
 
 
 @functools.cache
 def bfgs() -> Any:
     """One object, as above."""
-    import optimistix as optx
-
-    return optx.BFGS(rtol=1e-10, atol=1e-10)
+    return _optimistix().BFGS(rtol=1e-10, atol=1e-10)
 
 
 def is_optax(solver: Any) -> bool:
     """Whether its steps are those of a gradient transformation, without a line search."""
-    import optimistix as optx
-
-    return isinstance(solver, optx.OptaxMinimiser)
+    return isinstance(solver, _optimistix().OptaxMinimiser)
 
 
 def is_gauss_newton(solver: Any) -> bool:
     """Whether it works on the vector of residuals."""
-    import optimistix as optx
-
-    return isinstance(solver, optx.AbstractGaussNewton)
+    return isinstance(solver, _optimistix().AbstractGaussNewton)
 
 
 def solver_for(optimiser: Any, residuals: bool, is_large: bool, steps: int) -> Any:
-    """The optimistix solver for the user's choice.
-
-    - `residuals`: whether the loss has a residual vector. `many`: whether there are too many
-      parameters for a Jacobian. `steps`: how many Adam takes by default.
-    """
+    """The optimistix solver for the user's choice. `residuals`: whether the loss has a vector of
+    them; `is_large`: whether there are too many parameters for a Jacobian; `steps`: of Adam."""
     import optax
-    import optimistix as optx
 
+    optx = _optimistix()
     if optimiser is None:
         if not is_large:
             return levenberg_marquardt() if residuals else bfgs()

@@ -20,22 +20,15 @@ from .shooting import Segments
 from .solvers import is_optax
 from .uncertainty import inverse_or, null_space
 
+# Parameters beyond which the default is a gradient method without a covariance: each column of a
+# Jacobian costs a trajectory.
 JACOBIAN_LIMIT = 400
-"""Parameters beyond which the default is a gradient method without a covariance: each column of a
-Jacobian costs a trajectory."""
-
-_BEFORE_LAST = 15
-"""Steps of a stage that is not the last."""
-
-_IN_SEGMENTS = 40
-"""Steps of a stage of multiple shooting."""
-
-_LEAST_GROWTH = 1.02
-"""Least factor between horizons where trajectories that fail do not let them double."""
-
+_BEFORE_LAST = 15  # Steps of a stage that is not the last
+_IN_SEGMENTS = 40  # Steps of a stage of multiple shooting
+_LEAST_GROWTH = 1.02  # Least factor between horizons where failing trajectories prevent a double
+# Misfit, relative to the scatter of the data, up to which a fit of all data is expected to find the
+# nearest minimum: half of it is a sixth of a period's phase.
 _MISFIT_LIMIT = 0.5
-"""Misfit, relative to the scatter of the data, up to which a fit of all data is expected to find
-the nearest minimum: half of it is a sixth of a period's phase."""
 
 
 class Minimum(NamedTuple):
@@ -54,9 +47,7 @@ class Minimum(NamedTuple):
     shifts: np.ndarray | None = None
 
 
-def least_squares(
-    run: FitRun, u: np.ndarray, solver: Any, horizons: Any, check_units: bool
-) -> Minimum:
+def least_squares(run: FitRun, u: np.ndarray, solver: Any, horizons: Any, check: bool) -> Minimum:
     """Stages of growing horizon with a solver for the residual vector."""
     problem = run.problem
     stage = LeastSquaresStage(problem.evaluate, solver)
@@ -69,16 +60,13 @@ def least_squares(
             evaluation = Evaluation(np.where(keep, r, 0.0), np.where(keep[:, None], J, 0.0), aux)
         return stage.run(u, task, problem.degrees_of_freedom, evaluation)
 
-    cut = FIT_RESULTS.max_steps_reached
-    tolerance = max(1e-2, run.tolerance)
-    u, end, status = _stages(
-        run, u, horizons, check_units, stage.values_at, solve, (_BEFORE_LAST, tolerance, cut)
-    )
+    shorter = _BEFORE_LAST, max(1e-2, run.tolerance), FIT_RESULTS.max_steps_reached
+    u, end, status = _stages(run, u, horizons, check, stage.values_at, solve, shorter)
     return Minimum(u, status, end.jacobian, None, end.aux, stage.shifts)
 
 
 def by_gradient(
-    run: FitRun, u: np.ndarray, solver: Any, horizons: Any, check_units: bool, batch: Any, seed: int
+    run: FitRun, u: np.ndarray, solver: Any, horizons: Any, check: bool, batch: Any, seed: int
 ) -> Minimum:
     """The same with a minimiser of the scalar loss."""
     problem, optax = run.problem, is_optax(solver)
@@ -100,10 +88,8 @@ def by_gradient(
         return u, look(u), status
 
     cut = FIT_RESULTS.steps_done if optax else FIT_RESULTS.max_steps_reached
-    short = run.max_steps // 8 if optax else _BEFORE_LAST
-    u, end, status = _stages(
-        run, u, horizons, check_units, look, solve, (short, run.tolerance, cut)
-    )
+    shorter = (run.max_steps // 8 if optax else _BEFORE_LAST), run.tolerance, cut
+    u, end, status = _stages(run, u, horizons, check, look, solve, shorter)
     if problem.size > JACOBIAN_LIMIT or status == FIT_RESULTS.not_finite:
         J = None
     elif isinstance(problem.loss, Likelihood):
@@ -152,9 +138,7 @@ def _stages(
 # ---- horizons
 
 
-def _horizon(
-    problem: FitProblem, horizons: list[float] | None, number: int, rows: list[Any], at_least: float
-) -> float:
+def _horizon(problem: FitProblem, horizons: Any, number: int, rows: list, at_least: float) -> float:
     """The horizon of a stage; infinite for all data.
 
     Where none are `horizons`: the longest of full, full/2, full/4, … over which the misfit is small
@@ -172,9 +156,8 @@ def _horizon(
 
     spans = [np.abs(g.ts - g.t0[:, None]) for g in problem.groups]
     full, shortest = max(float(span.max()) for span in spans), np.inf
-    threshold = _MISFIT_LIMIT * np.sqrt(
-        np.mean(observed_entries(map(_scatter, problem.groups)) ** 2)
-    )
+    scatter = observed_entries(map(_scatter, problem.groups))
+    threshold = _MISFIT_LIMIT * np.sqrt(np.mean(scatter**2))
     times_since_start = observed_entries(span[..., None] for span in spans)
     misfit = observed_entries(map(np.asarray, rows))
     minimum_count = 2 * max(problem.size - problem.space.count_of_priors, 1)

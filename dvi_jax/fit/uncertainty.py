@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+# Singular value of the scaled Jacobian, relative to the largest, below which a direction counts as
+# not determined: derivatives have relative errors of about 1e-12.
 _RANK = 1e-9
-"""Singular value of the scaled Jacobian, relative to the largest, below which a direction counts
-as not determined: derivatives have relative errors of about 1e-12."""
 
 
 class Uncertainty(NamedTuple):

@@ -19,7 +19,7 @@ from ..engine.rounding import each, one_by_one
 from ..methods import Method
 from ..methods.step import Equations
 from ..observe import Crossings, Reduction, Section, Stop, Stopped, is_observable
-from ..observe._kept import RequestedTimes, Start, event, from_rows, shown
+from ..observe._kept import RequestedTimes, StepStart, event, from_rows, shown
 from ..observe.solution import Save
 from .task import Task
 
@@ -44,14 +44,14 @@ class Curve(eqx.Module):
         # In fixed point the curve would be a staircase, on which no root can be found.
         return cls(method, dataclasses.replace(equations, quantum=None), layout)
 
-    def point(self, start: Start, theta: Scalar) -> PointAndStatus:
+    def point(self, start: StepStart, theta: Scalar) -> PointAndStatus:
         """(t, q, p) at the fraction θ of the step."""
         h = theta * (start.t1 - start.t0)
         t = start.t0 + h
         q, p, info = self.method.step(self.equations, Interval(start.t0, t, h), start.q0, start.p0)
         return (t, q, p), info.result
 
-    def where(self, g: Callable[..., Any], start: Start, exists: Array) -> PointAndStatus:
+    def where(self, g: Callable[..., Any], start: StepStart, exists: Array) -> PointAndStatus:
         """The point of the step where g(t, q, p, args) = 0, or its end if none `exists`."""
         args = self.equations.args
 
@@ -94,7 +94,7 @@ def requested_times(save: Save, task: Task, num_steps: int) -> tuple[RequestedTi
 
 
 def crossings(
-    curve: Curve, section: Section, record: tuple[Array, Array], safe: Start
+    curve: Curve, section: Section, record: tuple[Array, Array], safe: StepStart
 ) -> tuple[Crossings, RESULTS]:
     """The crossings in the steps that a section has recorded, and their status. `safe` is any step
     that exists."""
@@ -107,14 +107,14 @@ def crossings(
     return Crossings(ts, qs, ps, jnp.where(is_known, count, 0).astype(jnp.int32)), status
 
 
-def _crossing(surface: tuple[Curve, Callable], start: Start, exists: Array) -> PointAndStatus:
+def _crossing(surface: tuple[Curve, Callable], start: StepStart, exists: Array) -> PointAndStatus:
     curve, g = surface
     return curve.where(g, start, exists)
 
 
 def at_times(
-    curve: Curve, request: RequestedTimes, record: tuple[Array, Array], safe: Start
-) -> tuple[Array, Start, Point, RESULTS]:
+    curve: Curve, request: RequestedTimes, record: tuple[Array, Array], safe: StepStart
+) -> tuple[Array, StepStart, Point, RESULTS]:
     """For each requested time: is it reached, the step that contains it, and the point there; and
     the status of these points."""
     exists, starts = _steps(record[0], safe)
@@ -152,14 +152,14 @@ Clock = tuple[Curve, Any]
 """A curve, and the function whose value is the time (None: t itself)."""
 
 
-def _reading(clock: Clock, start: Start) -> Scalar:
+def _reading(clock: Clock, start: StepStart) -> Scalar:
     """The value of the clock at the start of a step."""
     curve, function = clock
     return shown(function, start.t0, start.q0, start.p0, curve.equations.args)
 
 
 def _point_at(
-    clock: Clock, start: Start, time: Scalar, is_reached: Array
+    clock: Clock, start: StepStart, time: Scalar, is_reached: Array
 ) -> tuple[Point, RESULTS, Array]:
     """The point of the step at a requested time, its status, and whether the clock shows that time
     there."""
@@ -180,14 +180,14 @@ def _point_at(
     return (t, q, p), status, error <= tolerance * (span + jnp.abs(time))
 
 
-def _just_after(time: Scalar, start: Start) -> Scalar:
+def _just_after(time: Scalar, start: StepStart) -> Scalar:
     """A time slightly later than `time`, with the same derivative."""
     # At the start of the run the substep would have h = 0, and an H_D may divide by t1 − t0.
     part = jnp.finfo(start.q0.dtype).eps ** 0.4
     return time + lax.stop_gradient(part * (start.t1 - start.t0))
 
 
-def stop_point(curve: Curve, stop: Stop, row: Array, safe: Start) -> tuple[Stopped, RESULTS]:
+def stop_point(curve: Curve, stop: Stop, row: Array, safe: StepStart) -> tuple[Stopped, RESULTS]:
     """The point g = 0 in the last step of a run, the start of that step if g ≥ 0 there already; and
     its status."""
     exists, start = _steps(row, safe)
@@ -202,7 +202,7 @@ def stop_point(curve: Curve, stop: Stop, row: Array, safe: Start) -> tuple[Stopp
     return Stopped(*_or_nan(exists, point)), status
 
 
-def _steps(rows: Array, safe: Start) -> tuple[Array, Start]:
+def _steps(rows: Array, safe: StepStart) -> tuple[Array, StepStart]:
     """The steps in the rows, and the safe one for an empty row."""
     # Points are computed for empty rows as well, in a batch: from NaN the derivative would be NaN.
     exists, starts = from_rows(rows, safe.q0.shape)

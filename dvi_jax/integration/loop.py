@@ -18,7 +18,7 @@ from ..engine.pairs import rounded
 from ..lattices import Place, Uniform
 from ..methods.constraint import start_status
 from ..observe import Deviations, Pushed, Reduction, has_initial_value
-from ..observe._kept import Start, as_row, event
+from ..observe._kept import StepStart, as_row, event
 from .task import Carry, Ends, Outcome, Plan, Rows, Task, adds_start_outside, or_nan
 
 Loop = Callable[[Callable, Any, None, int], tuple[Any, Any]]
@@ -60,7 +60,7 @@ def start(task: Task, q0: State, p0: State) -> Carry:
         result = RESULTS.where(~is_failure & jnp.isnan(value), RESULTS.event_not_finite, result)
         is_failure = is_failure | jnp.isnan(value)
         result = RESULTS.where(is_end, RESULTS.stopped, result)
-        stop = as_row(is_end, Start(task.t0, interval.t1, interval.t1, q0, p0))
+        stop = as_row(is_end, StepStart(task.t0, interval.t1, interval.t1, q0, p0))
     good = result == RESULTS.successful
     # A typed zero: the carry of a scan must not change its type, and a Python integer would.
     zero = jnp.asarray(0, jnp.int32)
@@ -222,7 +222,7 @@ def _stop(
     value = event(task.stop.g, interval.t1, q1, p1, task.args)
     good = result == RESULTS.successful
     is_end = good & (value >= 0)
-    row = as_row(is_end, Start(interval.t0, interval.t1, interval.t1, carry.q, carry.p))
+    row = as_row(is_end, StepStart(interval.t0, interval.t1, interval.t1, carry.q, carry.p))
     result = RESULTS.where(good & jnp.isnan(value), RESULTS.event_not_finite, result)
     return RESULTS.where(is_end, RESULTS.stopped, result), jnp.where(is_end, row, carry.stop)
 

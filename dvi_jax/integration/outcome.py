@@ -18,7 +18,7 @@ from ..engine.newton import relative_size
 from ..engine.rounding import each
 from ..lattices import Place, Run
 from ..observe import OfState, Reduction, RequestedTimes, Running, Section, is_observable
-from ..observe._kept import Start
+from ..observe._kept import StepStart
 from ..observe.solution import Solution
 from .dense import Curve, at_times, crossings, stop_point
 from .task import Ends, Outcome, Plan, Task
@@ -32,7 +32,7 @@ def as_solution(
     curve = Curve.create(task.method, task.equations, layout)
     first = task.first_interval()
     # A batch element without a step to interpolate in uses the first one: its numbers are finite.
-    safe = Start(first.t0, first.t1, first.t1, q0, p0)
+    safe = StepStart(first.t0, first.t1, first.t1, q0, p0)
     _, reductions = task.observables()
     status, results = carry.result, list(values)
     for i, reduction in enumerate(reductions):

@@ -84,7 +84,7 @@ class Reversible(AbstractAdjoint):
             ends = run(task, plan, start(task, q0, p0), lax.scan, self._inner_loop)
             carry, rows, results, _ = outcome(task, plan, ends, q0, p0)
             rows, integers = eqx.partition(rows, eqx.is_inexact_array)
-            return Smooth(carry.q, carry.p, rows, results), Trace(*ends, integers)
+            return Smooth(carry.q, carry.p, rows, results), Tape(*ends, integers)
 
         if reason := _obstacle(task, forward, inputs, counts):
             if self.report_defect:
@@ -169,7 +169,7 @@ class Reversible(AbstractAdjoint):
         return state, ends
 
 
-class Trace(NamedTuple):
+class Tape(NamedTuple):
     """What a run leaves besides its differentiable outputs."""
 
     carry: Carry

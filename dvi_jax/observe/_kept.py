@@ -20,7 +20,7 @@ _UNKNOWN = -(2**30)
 """The count after a row whose flag is NaN: whether that step belongs to the list is not known."""
 
 
-class Start(NamedTuple):
+class StepStart(NamedTuple):
     """Start of a step, and its end t1, which is `until` by the clock."""
 
     t0: Scalar
@@ -74,17 +74,17 @@ class KeptSteps(Reduction):
         return rows + self.change(value[None], (steps == k)[:, None]), steps, count
 
 
-def as_row(hit: Array, start: Start) -> Float[Array, " width"]:
+def as_row(hit: Array, start: StepStart) -> Float[Array, " width"]:
     """One step as a row of numbers, the first of which is `hit`: 0, 1, 2, or NaN if not known."""
     parts = (hit.astype(start.q0.dtype), start.t0, start.t1, start.until)
     return jnp.concatenate([jnp.stack(parts), start.q0.ravel(), start.p0.ravel()])
 
 
-def from_rows(rows: Float[Array, "... width"], shape: tuple[int, ...]) -> tuple[Array, Start]:
+def from_rows(rows: Float[Array, "... width"], shape: tuple[int, ...]) -> tuple[Array, StepStart]:
     """Which rows hold a step, and the steps, for positions of this shape."""
     lead = rows.shape[:-1]
     q0, p0 = (x.reshape(*lead, *shape) for x in jnp.split(rows[..., 4:], 2, axis=-1))
-    return rows[..., 0] >= 1, Start(rows[..., 1], rows[..., 2], rows[..., 3], q0, p0)
+    return rows[..., 0] >= 1, StepStart(rows[..., 1], rows[..., 2], rows[..., 3], q0, p0)
 
 
 class Crossings(eqx.Module):
@@ -171,7 +171,7 @@ class Section(KeptSteps):
         # After a failure the state is NaN: the crossings before are still known.
         is_state = jnp.all(jnp.isfinite(q1)) & jnp.all(jnp.isfinite(p1))
         flag = jnp.where((jnp.isnan(g0) | jnp.isnan(g1)) & is_state, jnp.nan, flag)
-        return as_row(flag, Start(t0, t1, t1, q0, p0))
+        return as_row(flag, StepStart(t0, t1, t1, q0, p0))
 
 
 class RequestedTimes(KeptSteps):
@@ -203,7 +203,7 @@ class RequestedTimes(KeptSteps):
         backwards = count(start, "left") > count(end, "left")  # [end, start)
         hit = jnp.where(end >= start, forwards, backwards)
         # A failed step has no curve on which a state could be computed.
-        return as_row(hit & jnp.all(jnp.isfinite(q1)), Start(t0, t1, end, q0, p0))
+        return as_row(hit & jnp.all(jnp.isfinite(q1)), StepStart(t0, t1, end, q0, p0))
 
 
 def shown(clock: Callable[..., Any] | None, t: Scalar, q: State, p: State, args: Args) -> Scalar:

@@ -24,8 +24,7 @@ from .store import MemorySink, Store
 from .variables import check_names, own_dims
 from .workers import SweepProgress, run_here
 
-_MANY_STARTS = 100_000
-"""Number of initial conditions up to which they are written into the result."""
+_MANY_STARTS = 100_000  # Initial conditions up to which they are written into the result
 
 
 class SweepInterrupted(KeyboardInterrupt):

@@ -24,10 +24,8 @@ _mine: set[tuple[Path, int]] = set()
 
 @contextlib.contextmanager
 def claim(file: Path, number: int) -> Iterator[bool]:
-    """Whether nobody else holds this number, for as long as the context lasts.
-
-    The operating system releases the locks of a process that dies.
-    """
+    """Whether nobody else holds this number, for as long as the context lasts. The operating system
+    releases the locks of a process that dies."""
     key = (file.resolve(), number)
     with _lock:
         mine = key not in _mine and _lock_byte(*key)

@@ -11,7 +11,6 @@ import pickle
 import threading
 import uuid
 from collections import Counter as Counts, deque
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -21,16 +20,11 @@ from lanewise.jaxprs.jaxapi import backends_are_initialized, x64_enabled
 from .plan import SweepPlan
 from .program import Sweep, SweepProgram
 from .store import MemorySink, Store, StoreError
-from .workers import Counter, SweepProgress, compute
+from .workers import Counter, Report, compute
 
-_AHEAD = 4
-"""Tasks for each thread of the cluster that are submitted at a time."""
-
-_LARGE = 2**20
-"""Bytes of a pickled sweep above which it is not sent with each task."""
-
-_ATTEMPTS = 10
-"""Number of times that a task may be lost with its worker before it is taken to be the cause."""
+_AHEAD = 4  # Tasks for each thread of the cluster that are submitted at a time
+_LARGE = 2**20  # Bytes of a pickled sweep above which it is not sent with each task
+_ATTEMPTS = 10  # Losses of a task with its worker before it is taken to be the cause
 
 
 class ClusterError(RuntimeError):
@@ -39,11 +33,7 @@ class ClusterError(RuntimeError):
 
 
 def run_on(
-    client: Any,
-    sweep: Sweep,
-    plan: SweepPlan,
-    sink: MemorySink | Store,
-    report: Callable[[SweepProgress], None] | None,
+    client: Any, sweep: Sweep, plan: SweepPlan, sink: MemorySink | Store, report: Report
 ) -> bool:
     """Compute the tasks that `sink` lacks on the workers of a `distributed.Client`. False: it was
     interrupted. **Raises** `ClusterError`, `StoreError`, and errors of a task."""
@@ -150,7 +140,7 @@ _lock = threading.Lock()
 
 
 def _task(job: bytes, number: int) -> tuple[Any, dict[str, int]]:
-    """On a worker: compute a task and commit it if there is a store. Its results, if there is no
+    """On a worker: compute a task, and commit it if there is a store. Its results, if there is no
     store, and its statuses."""
     with _lock:  # threads of a worker share one job
         program, path, sha, x64 = _job(job)

@@ -11,12 +11,10 @@ from .program import Sweep, SweepProgram
 from .variables import Variable
 from .workers import default_threads
 
+# Time to write a task, at least: files are forced to the disk one after the other. The directory of
+# a cluster may take longer.
 SECONDS_TO_COMMIT = 0.02
-"""Time to write a task, at least: files are forced to the disk one after the other. The directory
-of a cluster may take longer."""
-
-LONG = 2.0
-"""Seconds of a task above which it is not measured a third time."""
+LONG = 2.0  # Seconds of a task above which it is not measured a third time
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,8 +125,8 @@ def size(number: float) -> str:
     return f"{number:.3g} PiB"
 
 
+# Units of time: name, seconds, and the least number of them that is written in this unit.
 _UNITS = (("years", 365.25 * 86400, 2), ("days", 86400, 2), ("h", 3600, 1.5), ("min", 60, 1.5))
-"""Units of time: name, seconds, and the least number of them that is written in this unit."""
 
 
 def span(seconds: float) -> str:

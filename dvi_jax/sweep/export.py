@@ -23,9 +23,8 @@ def _whole_or_not(path: Any, force: bool, package: str) -> Iterator[Path]:
     try:
         __import__(package)
     except ImportError:
-        raise ImportError(
-            f'the export requires {package}: pip install "dvi-jax[export]".'
-        ) from None
+        text = f'the export requires {package}: pip install "dvi-jax[export]".'
+        raise ImportError(text) from None
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
     try:
         yield temporary
@@ -53,12 +52,8 @@ def to_netcdf(dataset: Any, boxes: Iterator[dict[str, slice]], path: Any, force:
                     array[...] = variable.values.astype(object) if is_text else variable.values
                 elif auxiliary:
                     dims = set(variable.dims)
-                    coordinates = " ".join(
-                        coordinate
-                        for coordinate in auxiliary
-                        if set(dataset[coordinate].dims) <= dims
-                    )
-                    array.attrs["coordinates"] = coordinates or " "
+                    names = [x for x in auxiliary if set(dataset[x].dims) <= dims]
+                    array.attrs["coordinates"] = " ".join(names) or " "
             for box in boxes:
                 for name in dataset.data_vars:
                     part = dataset[name].isel(box)
@@ -67,10 +62,8 @@ def to_netcdf(dataset: Any, boxes: Iterator[dict[str, slice]], path: Any, force:
 
 
 def to_parquet(dataset: Any, boxes: Iterator[dict[str, slice]], path: Any, force: bool) -> None:
-    """Write one row for each trajectory: the values of its axes, its results and its status.
-
-    Results with dimensions of their own become one column for each entry: ``q_1_0`` is ``q[1, 0]``.
-    """
+    """Write one row for each trajectory: its axes, results and status. Results with dimensions of
+    their own become one column for each entry: ``q_1_0`` is ``q[1, 0]``."""
     with _whole_or_not(path, force, "pyarrow") as temporary, contextlib.ExitStack() as stack:
         import pyarrow as pa
         import pyarrow.parquet as pq

@@ -10,7 +10,7 @@ import platform
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -28,9 +28,7 @@ from .plan import SweepPlan
 from .program import Sweep, state_of
 from .variables import Variable
 
-FORMAT = 1
-"""The format of a store: a greater number when stores of this format cannot be read any more."""
-
+FORMAT = 1  # Of a store; greater when stores of this format cannot be read any more
 PROGRAM = "program"
 
 # In the text of a jaxpr or an object: what differs between processes or terminals.
@@ -47,10 +45,7 @@ _SIGNATURES = {
 
 
 def description(
-    sweep: Sweep,
-    plan: SweepPlan,
-    variables: Mapping[str, Variable],
-    programs: Sequence[ClosedJaxpr],
+    sweep: Sweep, plan: SweepPlan, variables: Mapping[str, Variable], programs: list[ClosedJaxpr]
 ) -> dict[str, Any]:
     """Everything that the numbers depend on, as JSON.
 
@@ -62,6 +57,7 @@ def description(
     q0, args, t0 = _example(sweep)
     describe = Describer(jnp.asarray(t0, q0.dtype), q0, args)
     axes = {location: axis.name for location, axis in axes_in(sweep.inputs)}
+    arrays = {n: [v.dtype, list(v.shape), list(v.dims)] for n, v in variables.items()}
     return {
         "format": FORMAT,
         "system": describe(sweep.system),
@@ -75,10 +71,7 @@ def description(
         "dims": dict(plan.dims),
         "axes": axes,
         "chunk": list(plan.chunk),
-        "variables": {
-            n: [variable.dtype, list(variable.shape), list(variable.dims)]
-            for n, variable in variables.items()
-        },
+        "variables": arrays,
     }
 
 
@@ -153,9 +146,8 @@ class Describer:
         if isinstance(x, list | tuple):
             return [self(value) for value in x]
         if dataclasses.is_dataclass(x) and not isinstance(x, type):
-            fields = {
-                field.name: self(getattr(x, field.name, None)) for field in dataclasses.fields(x)
-            }
+            names = [field.name for field in dataclasses.fields(x)]
+            fields = {name: self(getattr(x, name, None)) for name in names}
             code = {"function": self.function(x)} if callable(x) else {}
             return {"is": type(x).__qualname__, **fields, **code}
         if isinstance(x, type):
@@ -167,9 +159,7 @@ class Describer:
     def function(self, subject: Callable[..., Any]) -> str:
         """The hash of what a function computes, or of its code where it cannot be traced alone."""
         number_required = _arity(subject)
-        for count in sorted(
-            _SIGNATURES, key=lambda count_of_arguments: count_of_arguments != number_required
-        ):
+        for count in sorted(_SIGNATURES, key=lambda number: number != number_required):
             if not accepts(subject, count):
                 continue
             try:

@@ -19,14 +19,9 @@ from .identity import FORMAT, digest
 from .plan import SweepPlan, SweepTask
 from .variables import Variable, check_array_name
 
-TASKS = ".tasks"
-"""The directory of the records of tasks."""
-
-STATUS = "status"
-"""The variable of which the shard is written last."""
-
-CHUNK_BYTES = 2**22
-"""Size of an inner chunk of a shard: the least that is read to see one number."""
+TASKS = ".tasks"  # The directory of the records of tasks
+STATUS = "status"  # The variable of which the shard is written last
+CHUNK_BYTES = 2**22  # An inner chunk of a shard: the least that is read to see one number
 
 
 class StoreError(Exception):

@@ -16,10 +16,7 @@ def lazy_array(store: Store, name: str) -> Any:
 
 
 class _StoreArray(BackendArray):
-    """An array of which shards without a record count as not computed.
-
-    Such a shard belongs to a task that was interrupted while its results were being written.
-    """
+    """An array of which shards without a record, of interrupted tasks, count as not computed."""
 
     def __init__(self, store: Store, name: str):
         self.store, self.name = store, name
@@ -27,9 +24,8 @@ class _StoreArray(BackendArray):
         self.shape, self.dtype = array.shape, array.dtype
 
     def __getitem__(self, key: Any) -> Any:
-        return indexing.explicit_indexing_adapter(
-            key, self.shape, indexing.IndexingSupport.OUTER, self._get
-        )
+        support = indexing.IndexingSupport.OUTER
+        return indexing.explicit_indexing_adapter(key, self.shape, support, self._get)
 
     def _get(self, key: tuple[Any, ...]) -> np.ndarray:
         plan, fill = self.store.plan, self.store.variables[self.name].fill

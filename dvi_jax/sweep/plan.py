@@ -9,15 +9,12 @@ import numpy as np
 
 from ..base.checks import whole
 
+# Trajectory steps of one task: some tenths of a second of work; and the least number for which a
+# task is made smaller so that there are more of them.
 WORK, SMALLEST_WORK = 2**28, 2**22
-"""Trajectory steps of one task: some tenths of a second of work; and the least number for which a
-task is made smaller so that there are more of them."""
-
+# Trajectories of one task, at least and at most; tasks of a sweep, at least.
 FEWEST_LANES, MOST_LANES, FEWEST_TASKS = 256, 2**17, 32
-"""Trajectories of one task, at least and at most; tasks of a sweep, at least."""
-
-BYTES = 2**26
-"""Results of one task, at most (one trajectory may have more)."""
+BYTES = 2**26  # Results of one task, at most (one trajectory may have more)
 
 
 class SweepTask(NamedTuple):
@@ -109,9 +106,8 @@ def make_plan(
     - `steps`: of one trajectory. `bytes_per_lane`: of its results.
     - `lanes`: trajectories of one task at most; None: chosen from `steps` and `bytes_per_lane`.
     """
-    separate, grid = (
-        list(dims.values())[part] for part in (slice(compiled_dims), slice(compiled_dims, None))
-    )
+    lengths = list(dims.values())
+    separate, grid = lengths[:compiled_dims], lengths[compiled_dims:]
     if lanes is None:
         steps = max(steps, 1)
         power_of_two = 1 << max((WORK // steps).bit_length() - 1, 0)

@@ -62,19 +62,19 @@ class Sweep:
         return max(int(v) for v in num_steps.values) if is_axis(num_steps) else num_steps
 
 
-class Rows(eqx.Module):
+class AxisValues(eqx.Module):
     """The values of an axis in one task; `name` is that of its dimension."""
 
     values: Any
     name: str = eqx.field(static=True)
 
 
-def _is_rows(x: Any) -> bool:
-    return isinstance(x, Rows)
+def _varies(x: Any) -> bool:
+    return isinstance(x, AxisValues)
 
 
 class Lanes(eqx.Module):
-    """The trajectories of a task as one pytree: `Rows` in the inputs differ between them.
+    """The trajectories of a task as one pytree: `AxisValues` in the inputs differ between them.
 
     - `names`: the dimensions of the task. It has one method and one number of steps.
     """
@@ -88,14 +88,11 @@ class Lanes(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     reads: Reads = eqx.field(static=True)
 
-    def one_trajectory(
-        self, task_index: tuple[Any, ...], grid_index: tuple[Any, ...]
-    ) -> dict[str, Any]:
-        """The variables of one trajectory, from its index along each dimension of the task, and of
-        the whole sweep."""
+    def one_trajectory(self, task_index: tuple, grid_index: tuple) -> dict[str, Any]:
+        """The variables of one trajectory, from its index in each dimension of task and sweep."""
         index = dict(zip(self.names, task_index, strict=True))
         inputs = jax.tree.map(
-            lambda x: x.values[index[x.name]] if _is_rows(x) else x, self.inputs, is_leaf=_is_rows
+            lambda x: x.values[index[x.name]] if _varies(x) else x, self.inputs, is_leaf=_varies
         )
         if self.start is None:
             q0, p0 = (state_of(inputs.pop(name)) for name in ("q0", "p0"))
@@ -129,7 +126,7 @@ def lanes_of(sweep: Sweep, task_start: tuple[int, ...], values: Any) -> Lanes:
         if not is_axis(leaf):
             return leaf
         if leaf.name in sweep.of_grid:
-            return Rows(values(leaf), leaf.name)
+            return AxisValues(values(leaf), leaf.name)
         return leaf.values[task_start[list(sweep.dims).index(leaf.name)]]
 
     inputs = jax.tree.map(value_of, dict(sweep.inputs), is_leaf=is_axis)
@@ -217,8 +214,7 @@ class SweepProgram:
 
 
 def trace(sweep: Sweep) -> tuple[dict[str, Any], list[ClosedJaxpr]]:
-    """Shape and dtype of the variables of one trajectory, by tracing; and its program for each
-    method and number of steps."""
+    """Shape and dtype of each variable of a trajectory; its programs, by method and num_steps."""
     shapes: dict[str, Any] = {}
     programs, kinds = [], set()
     zeros = tuple(np.zeros((), np.int32) for _ in sweep.of_grid)

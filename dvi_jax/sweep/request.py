@@ -98,14 +98,11 @@ class Request:
     def _with_defaults(self) -> "Request":
         """The same, with the defaults of a problem of the library."""
         has_start = self.start is not None or isinstance(self.system, System)
-        system, q0, p0, h, args = of_problem(
-            self.system, self.q0, self.p0, self.h, self.args, has_start
-        )
+        system, *values = of_problem(self.system, self.q0, self.p0, self.h, self.args, has_start)
         check_system(system, noise_allowed=True)
+        fields = dict(zip(("q0", "p0", "h", "args"), values, strict=True))
         epsilon = system.strength(self.epsilon)
-        return dataclasses.replace(
-            self, system=system, q0=q0, p0=p0, h=h, args=args, epsilon=epsilon
-        )
+        return dataclasses.replace(self, system=system, epsilon=epsilon, **fields)
 
     def _sweep(self) -> Sweep:
         inputs = self._inputs()
@@ -157,8 +154,7 @@ class Request:
         inputs = numbers | {"args": self.args, **self._states()}
         # Only where there is one: stores of sweeps without noise are described without it.
         if self.path is not None:
-            has_axis = bool(axes_in({"path": self.path}))
-            inputs["path"] = self.path if has_axis else as_path(self.path)
+            inputs["path"] = self.path if axes_in({"path": self.path}) else as_path(self.path)
         return inputs
 
     def _states(self) -> dict[str, Any]:
@@ -180,17 +176,11 @@ class Request:
 
     def _integrator(self, method: Any) -> Integrator:
         for value in method.values if is_axis(method) else ():
-            instance(
-                f"each value of the axis {method.name!r} of method", value, Method, "a dvi.Method"
-            )
-        return chosen(
-            self.integrator,
-            method=None if is_axis(method) else method,
-            lattice=self.lattice,
-            root_finder=self.root_finder,
-            arithmetic=self.arithmetic,
-            layout=self.layout,
-        )
+            label = f"each value of the axis {method.name!r} of method"
+            instance(label, value, Method, "a dvi.Method")
+        names = ("lattice", "root_finder", "arithmetic", "layout")
+        parts = {name: getattr(self, name) for name in names}
+        return chosen(self.integrator, method=None if is_axis(method) else method, **parts)
 
 
 def _check_dims(dims: Mapping[str, int]) -> None:

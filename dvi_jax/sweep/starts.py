@@ -18,9 +18,7 @@ from ..base.types import Args, Scalar
 from ..engine.bracket import bracketed_root
 from .axes import refuse_non_finite
 
-_TRIES = 64
-"""Points that are tried for one initial condition on an energy shell."""
-
+_TRIES = 64  # Points that are tried for one initial condition on an energy shell
 _DOUBLINGS = 100
 
 
@@ -41,8 +39,7 @@ class Starts(eqx.Module):
 
 
 def _box(owner: str, **ends: Any) -> tuple[list[tuple[float, ...]], tuple[int, ...]]:
-    """Pairs (q, p) as flat tuples of numbers, and the shape of q. The first must not exceed the
-    last."""
+    """Pairs (q, p), the first at most the last, as flat tuples of numbers, and the shape of q."""
     arrays = []
     for name, pair in ends.items():
         if not isinstance(pair, tuple | list) or len(pair) != 2:

@@ -30,9 +30,7 @@ from .variables import Variable
 
 CLAIMS = ".claims"
 
-_SHARE = 0.5
-"""Fraction of the memory of the machine that results in memory may take."""
-
+_SHARE = 0.5  # Fraction of the memory of the machine that results in memory may take
 _RESTORE = (
     "If this is a store, its zarr.json was damaged or lost, but the results are in other files: "
     "restore it from a backup, or copy it from a new store (the same call with another path, "
@@ -63,9 +61,8 @@ class MemorySink:
     def __init__(self, plan: SweepPlan, variables: Mapping[str, Variable]):
         _check_memory(plan.lanes * sum(variable.bytes for variable in variables.values()))
         self.plan, self.variables = plan, dict(variables)
-        self.arrays = {
-            name: np.full((*plan.shape, *v.shape), v.fill, v.dtype) for name, v in variables.items()
-        }
+        shape = plan.shape
+        self.arrays = {n: np.full(shape + v.shape, v.fill, v.dtype) for n, v in variables.items()}
         self._done_tasks: set[int] = set()
 
     def done_tasks(self):

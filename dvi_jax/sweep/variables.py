@@ -14,8 +14,8 @@ from .program import Sweep
 
 _NAME = re.compile(r"[\w +-]+(\.[\w +-]+)*")
 
+# Names that the result itself uses.
 RESERVED_NAMES = ("status", "failed_step", "residual", "stop_t", "t", "q", "p", "save", "q0", "p0")
-"""Names that the result itself uses."""
 
 
 @dataclass(frozen=True)
@@ -59,9 +59,7 @@ def variables(sweep: Sweep, shapes: Mapping[str, Any]) -> dict[str, Variable]:
     # than states, except for `Save(ts=...)`.
     save = sweep.options["save"]
     rows = "save" if save is not None and save.ts is not None else "saved_step"
-    first = {
-        name: rows for name, observable in observables if not isinstance(observable, Reduction)
-    }
+    first = {name: rows for name, f in observables if not isinstance(f, Reduction)}
     first |= dict.fromkeys("tqp", "save")
     arrays = {}
     for name, array in shapes.items():
@@ -97,9 +95,7 @@ def refuse_reserved_name(label: str, name: str) -> None:
         )
 
 
-def check_names(
-    dims: Mapping[str, int], variables: Mapping[str, Variable], coordinates: Mapping[str, Any]
-) -> None:
+def check_names(dims: Mapping, variables: Mapping[str, Variable], coordinates: Mapping) -> None:
     """Refuse names that would mean two things in one result."""
     dims_of_results = {dim for variable in variables.values() for dim in variable.dims}
     for dims_of_coordinate, *_ in coordinates.values():

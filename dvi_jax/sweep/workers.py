@@ -25,12 +25,8 @@ from .plan import SweepTask
 from .program import SweepProgram
 from .store import MemorySink, Store
 
-_PAUSE = 0.2
-"""Seconds between two checks of tasks that another process computes."""
-
-_WRITES = 2
-"""Tasks for each thread that may wait to be written."""
-
+_PAUSE = 0.2  # Seconds between two checks of tasks that another process computes
+_WRITES = 2  # Tasks for each thread that may wait to be written
 GOOD = ("successful", "stopped")
 
 
@@ -55,12 +51,13 @@ class SweepProgress:
     seconds_left: float
 
 
+Report = Callable[[SweepProgress], None] | None
+
+
 class Counter:
     """Counts tasks and calls `report`. `done_tasks`: those that were finished earlier."""
 
-    def __init__(
-        self, program: SweepProgram, done_tasks: Collection[int], report: Callable[..., None] | None
-    ):
+    def __init__(self, program: SweepProgram, done_tasks: Collection[int], report: Report):
         self.program, self.report = program, report
         self.plan, self.began = program.plan, time.monotonic()
         self.tasks_before = len(done_tasks)
@@ -89,9 +86,7 @@ class Counter:
         self.report(SweepProgress(*tasks, *lanes, self.failures, rate, seconds, left))
 
 
-def compute(
-    program: SweepProgram, task: SweepTask, device: Any
-) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def compute(program: SweepProgram, task: SweepTask, device: Any):
     """The results of a task and the facts for its record."""
     began = time.monotonic()  # not time.time(): the clock of the machine may be set back meanwhile
     results = program(task, device)
@@ -113,12 +108,7 @@ def default_threads() -> int:
     return processors() if devices[0].platform == "cpu" else len(devices)
 
 
-def run_here(
-    program: SweepProgram,
-    sink: MemorySink | Store,
-    threads: int | None,
-    report: Callable[[SweepProgress], None] | None,
-) -> bool:
+def run_here(program: SweepProgram, sink: MemorySink | Store, threads: Any, report: Report) -> bool:
     """Compute the tasks that `sink` lacks, on all local devices. False: it was interrupted by
     Ctrl-C; the tasks that were being computed then have been stored. **Raises** the first error of
     a task or of its writing, once the other threads have ended."""

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+# How many singular values, descending and in units of a given one, are not zero.
 Cut = Callable[[np.ndarray], int]
-"""How many singular values, descending and in units of a given one, are not zero."""
 
 
 def larger_than(share: float) -> Cut:
@@ -90,9 +90,7 @@ class BlockTriangular:
     - `unit`: of singular values; the largest of A_0 if left out.
     """
 
-    def __init__(
-        self, terms: np.ndarray, cut: Cut, free: np.ndarray | None = None, unit: float | None = None
-    ):
+    def __init__(self, terms: np.ndarray, cut: Cut, free: np.ndarray | None = None, unit=None):
         orders, size = terms.shape[1:]
         self.blocks = np.ascontiguousarray(np.moveaxis(terms, 1, 0))
         self.free = np.ones((orders, size), bool) if free is None else free
@@ -114,8 +112,7 @@ class BlockTriangular:
             self.series[k, columns] = corrections
             conditions = np.pad(conditions, np.array([(0, 0), (0, step.null.shape[1])]))
             self.steps.append(step)
-            first = self.steps[0].null.shape[1]
-            self.orders.append(Secular.factor(conditions, first, cut, unit))
+            self.orders.append(Secular.factor(conditions, self.steps[0].null.shape[1], cut, unit))
 
     def defects(self, series: np.ndarray) -> np.ndarray:
         """A_k c_0 + … + A_1 c_{k−1} of series of the orders below k, shape (k, size, count)."""
@@ -138,8 +135,7 @@ class BlockTriangular:
             secular.append(step.residual(target))
             solution = np.pad(solution, np.array([(0, 1), (0, 0), (0, 0)]))
             solution[-1, columns] = step.solve(target)
-        order = self.orders[len(right) - 1]
-        a = order.solve(np.concatenate(secular), leading)
+        a = self.orders[len(right) - 1].solve(np.concatenate(secular), leading)
         return solution + self.series[: len(right), :, : len(a)] @ a
 
     def null(self, k: int) -> tuple[np.ndarray, np.ndarray]:

@@ -7,10 +7,8 @@ import numpy as np
 from .nullspace import RANK
 
 
-def echelon(
-    columns: np.ndarray, complexity: np.ndarray, threshold: float = RANK
-) -> tuple[list[int], np.ndarray]:
-    """Columns of the same span, each with a pivot row in which those after it are zero.
+def echelon(columns: np.ndarray, complexity: np.ndarray, threshold: float = RANK):
+    """Pivot rows, and columns of the same span: in the pivot row of one those after it are zero.
 
     Rows are gone through from the most complex function to the simplest. An entry up to the share
     `threshold` of the largest in its column is taken for zero.
@@ -41,17 +39,13 @@ def echelon(
     return pivots, np.stack(out, axis=1) if out else columns[:, :0]
 
 
-def reduced_echelon(
-    columns: np.ndarray, complexity: np.ndarray, threshold: float = RANK
-) -> np.ndarray:
+def reduced_echelon(columns: np.ndarray, complexity: np.ndarray, threshold: float = RANK):
     """The same span, its leading-order terms in reduced echelon form: one pivot for each column.
 
     `columns` may have more rows below the leading-order term, which are combined in the same way.
     """
-    pivots, _ = echelon(columns[: len(complexity)], complexity, threshold)
-    pivots = pivots[::-1]  # simplest first
-    at_pivots = columns[pivots]
-    return columns @ np.linalg.pinv(at_pivots) if pivots else columns[:, :0]
+    pivots = echelon(columns[: len(complexity)], complexity, threshold)[0][::-1]  # simplest first
+    return columns @ np.linalg.pinv(columns[pivots]) if pivots else columns[:, :0]
 
 
 def reduction(

@@ -12,20 +12,6 @@ UNCLEAR = 1e-6
 ROUNDING = 1e-12  # Rows are weighted so that their rounding is below this; `NULL` is above it
 _SHARE = 1e-3  # Rounding may be this share of a change that counts as not zero
 _COEFFICIENTS = 1e-15  # Errors of the coefficients of a null vector, relative to its length
-# Samples at which functions are so many times larger than at three quarters of them count less.
-_RARE = 100.0
-
-
-def typical_sizes(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Root mean squares of functions on samples, shape (size,), and weights of the samples, (S,):
-    1, and less where functions are larger than at nearly all others. `values`: (S, size)."""
-    units = np.median(np.abs(values), axis=0)
-    units = np.where(units > 0, units, np.max(np.abs(values), axis=0))
-    units = np.where(units > 0, units, 1.0)
-    relative = values / units
-    size = np.max(np.abs(relative), axis=1)
-    weights = np.minimum(1, _RARE * np.quantile(size, 0.75) / np.maximum(size, 1.0))
-    return units * np.sqrt(np.mean((weights[:, None] * relative) ** 2, axis=0)), weights
 
 
 def times(x: np.ndarray, matrix: np.ndarray) -> np.ndarray:
@@ -45,7 +31,6 @@ class Motion(NamedTuple):
     rounding: np.ndarray
 
     def subset(self, index: Any) -> "Motion":
-        """Of some of the samples."""
         return Motion(*(field[index] for field in self))
 
     def in_functions(self, combinations: np.ndarray) -> "Motion":
@@ -110,7 +95,6 @@ class FieldMotion(NamedTuple):
     rounding: np.ndarray
 
     def subset(self, index: Any) -> "FieldMotion":
-        """Of some of the samples."""
         return FieldMotion(*(field[index] for field in self))
 
     def in_functions(self, combinations: np.ndarray) -> "FieldMotion":
@@ -166,16 +150,12 @@ def _thinning(samples: int, rows: int, size: int) -> slice:
 
 
 def coefficient_errors(terms: np.ndarray) -> np.ndarray:
-    """What errors of the coefficients of a series of length one change at each sample, (S,): all
-    are known to the same absolute size. `terms`: see `conserved_series`."""
+    """What equal errors of a series of length one change at each sample; `terms`: (S, z + 1, …)."""
     return _COEFFICIENTS * np.linalg.norm(terms.reshape(len(terms), -1), axis=1)
 
 
 def conserved_series(
-    leading: np.ndarray,
-    terms: np.ndarray,
-    motion: Motion | FieldMotion,
-    tolerance: float | None = None,
+    leading: np.ndarray, terms: np.ndarray, motion: Motion | FieldMotion, tolerance: Any = None
 ) -> tuple[np.ndarray, int]:
     """The combinations of series that change in a step by no more than rounding, each measured by
     what its own slopes predict, sample by sample; and how many are unclear.
@@ -207,12 +187,7 @@ def conserved_series(
 
 
 def relative_changes(
-    terms: np.ndarray,
-    series: np.ndarray,
-    motion: Motion | FieldMotion,
-    spread: float,
-    digits: np.ndarray | float = 0.0,
-    approximately: bool = False,
+    terms: np.ndarray, series, motion: Motion | FieldMotion, spread, digits, approximately=False
 ) -> np.ndarray:
     """The change of one series, shape (z + 1, size), at each order, by the measure of
     `conserved_series`: shape (S, z + 1). `spread`: of its leading-order term; `digits`: see

@@ -35,8 +35,7 @@ def triangle(matrix: np.ndarray) -> np.ndarray:
 
 
 def singular_vectors(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The singular value of each column's direction, descending, zeros included, shape (columns,);
-    and all right singular vectors as rows."""
+    """Singular values, descending, one for each column, and all right singular vectors as rows."""
     rows, columns = matrix.shape
     if matrix.size == 0:
         return np.zeros(columns), np.eye(columns)
@@ -53,13 +52,8 @@ def by_leading(leading: np.ndarray, threshold: float = RANK) -> tuple[np.ndarray
     return V[large].T / singular[large], V[~large].T
 
 
-def null_space(
-    matrix: np.ndarray,
-    tolerance: float | None = None,
-    unit: float | None = None,
-    limit: float = NULL,
-) -> NullSpace:
-    """Directions that the matrix takes to zero.
+def null_space(matrix: np.ndarray, tolerance: float | None = None, unit=None, limit=NULL):
+    """The `NullSpace` of directions that the matrix takes to zero.
 
     With a tolerance: all singular values at most that share of the largest. Without: those
     before the widest gap, as long as they are under `limit`, in units of `unit` or of the largest.
@@ -92,8 +86,7 @@ def _spaces_of_orders(terms: np.ndarray, tolerance: float | None) -> list[NullSp
     """The null space of the Toeplitz matrix of each order: by its own singular values up to `DENSE`
     columns and with a tolerance, else by those of A_0 and of the secular terms."""
     if tolerance is not None or terms.shape[1] * terms.shape[2] <= DENSE:
-        orders = range(terms.shape[1])
-        return [null_space(toeplitz(terms, k), tolerance, 1.0) for k in orders]
+        return [null_space(toeplitz(terms, k), tolerance, 1.0) for k in range(terms.shape[1])]
     system, spaces = BlockTriangular(terms, lambda relative: _cut(relative, None)[0], unit=1.0), []
     for k, (step, order) in enumerate(zip(system.steps, system.orders, strict=True)):
         leading, shifts = (c.reshape((k + 1) * terms.shape[2], -1) for c in system.null(k))
@@ -123,8 +116,7 @@ def orthonormal_range(columns: np.ndarray, threshold: float = RANK) -> np.ndarra
 
 
 def independent_columns(columns: np.ndarray, complexity: Any, threshold: float) -> np.ndarray:
-    """Numbers of the columns, ascending, of which more than the share `threshold` is orthogonal to
-    those of lower complexity."""
+    """Numbers of the columns of which more than `threshold` is orthogonal to simpler ones."""
     places, span = [], np.zeros((len(columns), 0))
     for j in np.argsort(complexity, kind="stable"):
         remainder = columns[:, j] / max(np.linalg.norm(columns[:, j]), 1e-300)
@@ -223,16 +215,14 @@ def series_spaces(
     for space in _spaces_of_orders(rows, tolerance):
         first, free = by_leading(space.columns[:size], max(RANK, tolerance or 0.0))
         leading, shifts = space.columns @ first, space.columns @ free
-        if trivial is not None:
-            leading = leading @ orthogonal_to(trivial @ leading[:size])
+        leading = remove(trivial, leading)
         count = leading.shape[1] + shifts.shape[1]
         leading, shifts, unclear = judge(leading, shifts)
         if spaces:
             leading = intersection(leading, spaces[-1].leading[:size])
         rejections = count - leading.shape[1] - shifts.shape[1]
-        spaces.append(
-            SeriesSpace(leading, shifts, space.singular_values, space.gap, rejections, unclear)
-        )
+        fields = space.singular_values, space.gap, rejections, unclear
+        spaces.append(SeriesSpace(leading, shifts, *fields))
     return spaces
 
 
@@ -244,12 +234,14 @@ def intersection(leading: np.ndarray, span: np.ndarray) -> np.ndarray:
     return leading @ V[cosines > 0.9].T
 
 
-def orthogonal_to(direction: np.ndarray) -> np.ndarray:
-    """Orthonormal columns orthogonal to a direction, or all of them where it is outside."""
-    length = np.linalg.norm(direction)
+def remove(direction: np.ndarray | None, leading: np.ndarray) -> np.ndarray:
+    """The combinations whose first blocks are orthogonal to a direction; all where it is outside of
+    their span, or None."""
+    shares = np.zeros(0) if direction is None else direction @ leading[: len(direction)]
+    length = np.linalg.norm(shares)
     if length < 1e-6:
-        return np.eye(len(direction))
-    return np.linalg.svd((direction / length)[None])[2][1:].T
+        return leading
+    return leading @ np.linalg.svd((shares / length)[None])[2][1:].T
 
 
 def solve_series(terms: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

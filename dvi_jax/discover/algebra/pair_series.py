@@ -15,14 +15,7 @@ import numpy as np
 from ...engine.pair_matrices import Left, exact, plus, zeros
 from ...engine.pairs import Pair, div, power
 from ...integration.arithmetic import Arithmetic, DoubleDouble, FloatingPoint
-from .nullspace import (
-    HELD_OUT,
-    SeriesSpace,
-    intersection,
-    orthogonal_to,
-    singular_vectors,
-    triangle,
-)
+from .nullspace import HELD_OUT, SeriesSpace, intersection, remove, singular_vectors, triangle
 
 ROUNDING = 2.0**-104  # Relative rounding of pairs
 # A singular value counts as zero below so many times the rounding that was seen at lower orders,
@@ -95,9 +88,7 @@ class _StagedSVD:
         return _correct(self.stages, zeros(len(self.null.hi), x.hi.shape[1]), x)
 
 
-def _correct(
-    stages: Sequence[_Factors], c: Pair, left: Pair, inner: bool = False
-) -> tuple[Pair, Pair]:
+def _correct(stages: Sequence[_Factors], c: Pair, left: Pair, inner=False) -> tuple[Pair, Pair]:
     """c and the left side without the part of it in the range of the stages; `inner`: c in terms of
     the columns of the stage."""
     first = last = None
@@ -222,8 +213,7 @@ def spaces_in_pairs(
         changes, V = singular_vectors(x[held_out])
         leading = np.asarray(step.series.hi) @ V[changes <= HELD_OUT * _ZERO * step.noise].T
         count = leading.shape[1]
-        if trivial is not None:
-            leading = leading @ orthogonal_to(trivial @ leading[:size])
+        leading = remove(trivial, leading)
         if spaces:
             leading = intersection(leading, spaces[-1].leading[:size])
         singular = np.sort(np.concatenate([*nonzero, step.zeros]))[::-1]
@@ -233,16 +223,13 @@ def spaces_in_pairs(
     return spaces, sum(step.unclear for step in steps)
 
 
-def _left_sides(
-    blocks: Sequence[Pair], basis: np.ndarray, series: Sequence[Pair]
-) -> list[np.ndarray]:
+def _left_sides(blocks: list[Pair], basis: np.ndarray, series: list[Pair]) -> list[np.ndarray]:
     """The left side of the condition of order k for the series of order k, for each k."""
     size, columns = len(basis), Left(basis)
     ends = np.cumsum([c.hi.shape[1] for c in series])
     total = zeros(len(blocks[0].hi), int(ends[-1]))
     for m, block in enumerate(blocks):
         later = [_block(c, k - m, size) for k, c in enumerate(series) if k >= m]
-        padding = zeros(size, int(ends[m - 1]) if m else 0)
-        c = _stack([padding, *later], axis=1)
+        c = _stack([zeros(size, int(ends[m - 1]) if m else 0), *later], axis=1)
         total = plus(total, Left(block) @ (columns @ c))
     return np.split(total.hi, ends[:-1], axis=1)

@@ -41,8 +41,7 @@ def taylor_coefficients(function: Callable[[Array], Array], point: Array, order:
 
 
 class _Series:
-    """A series in ε: `self[k]` is its coefficient, None where it is zero by structure. `moves`:
-    whether it depends on ε."""
+    """A series in ε, `self[k]` None where zero by structure; `moves`: whether it depends on ε."""
 
     def __init__(self, moves: bool, *terms: Any):
         self.moves, self.terms = moves, list(terms)
@@ -93,7 +92,6 @@ class _SeriesProgram:
         self.outputs = list(map(series_of, jaxpr.outvars))
 
     def advance(self, k: int) -> None:
-        """Compute the coefficients k."""
         for part in self.parts:
             part.advance(k)
 
@@ -134,11 +132,9 @@ class _Operation:
 
     def advance(self, k: int) -> None:
         """Compute the coefficients k of the outputs."""
-        if k == 0:
-            for series, term in zip(self.outputs, self.function(*self.values(0)), strict=True):
-                series.terms.append(term)
-        elif any(series.moves for series in self.outputs):
-            for series, term in zip(self.outputs, self.coefficients(k), strict=True):
+        if k == 0 or any(series.moves for series in self.outputs):
+            terms = self.coefficients(k) if k else self.function(*self.values(0))
+            for series, term in zip(self.outputs, terms, strict=True):
                 series.terms.append(term)
 
     def coefficients(self, k: int) -> list[Any]:
@@ -177,9 +173,8 @@ class _Operation:
         values = self.values(0)
         jaxpr = jax.make_jaxpr(change)(values, [values[i] for i in moving])
         inputs = [*self.operands, *(_Derivative(self.operands[i]) for i in moving)]
-        return _SeriesProgram(
-            jaxpr, inputs, (*self.context, (self.eqn, self.operands, self.outputs))
-        )
+        equation = self.eqn, self.operands, self.outputs
+        return _SeriesProgram(jaxpr, inputs, (*self.context, equation))
 
 
 def _is_real(atom: Any) -> bool:

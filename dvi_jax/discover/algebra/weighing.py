@@ -4,10 +4,24 @@ from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from .motion import FieldMotion, Motion, typical_sizes
+from .motion import FieldMotion, Motion
 from .nullspace import epsilon_scale, in_units_of, triangle
 
 M = TypeVar("M", Motion, FieldMotion)
+# Samples at which functions are so many times larger than at three quarters of them count less.
+_RARE = 100.0
+
+
+def typical_sizes(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Root mean squares of functions on samples, shape (size,), and weights of the samples, (S,):
+    1, and less where functions are larger than at nearly all others. `values`: (S, size)."""
+    units = np.median(np.abs(values), axis=0)
+    units = np.where(units > 0, units, np.max(np.abs(values), axis=0))
+    units = np.where(units > 0, units, 1.0)
+    relative = values / units
+    size = np.max(np.abs(relative), axis=1)
+    weights = np.minimum(1, _RARE * np.quantile(size, 0.75) / np.maximum(size, 1.0))
+    return units * np.sqrt(np.mean((weights[:, None] * relative) ** 2, axis=0)), weights
 
 
 class WeightedConditions(NamedTuple, Generic[M]):
@@ -42,12 +56,9 @@ class WeightedConditions(NamedTuple, Generic[M]):
         return (np.linalg.solve(self.R, blocks) * sizes).reshape(columns.shape)
 
 
-def weigh(
-    values: np.ndarray, terms: np.ndarray, motion: M, fit: np.ndarray, in_sizes: bool = True
-) -> WeightedConditions[M]:
-    """Weighted conditions from `values` of φ, shape (S, size), and `terms` A, shape (S, z + 1, …,
-    size); `fit`: which samples are fitted, (S,). `in_sizes`: whether the units of φ are `rms`,
-    or 1."""
+def weigh(values, terms, motion: M, fit: np.ndarray, in_sizes=True) -> WeightedConditions[M]:
+    """From `values` of φ, shape (S, size), and `terms` A, shape (S, z + 1, …, size); `fit`: which
+    samples are fitted, (S,). `in_sizes`: whether the units of φ are `rms`, or 1."""
     rms, calm = typical_sizes(values)
     units = rms if in_sizes else np.ones(len(rms))
     R = triangle((calm[:, None] * values)[fit] / units) / np.sqrt(np.sum(fit))

@@ -95,12 +95,9 @@ def noether_balance(
             f"solution must have the state at every lattice point, got {steps + 1} states, at some "
             f"or at requested times, for num_steps={num_steps}: integrate with save=dvi.Save()."
         )
-    return _balance(
-        system,
-        AdiabaticInvariant(generators, gauges, system, jnp.asarray(system.strength(epsilon))),
-        LatticePoint(solution.ts, solution.qs, solution.ps),
-        args,
-    )
+    strength = jnp.asarray(system.strength(epsilon))
+    invariant = AdiabaticInvariant(generators, gauges, system, strength)
+    return _balance(system, invariant, LatticePoint(solution.ts, solution.qs, solution.ps), args)
 
 
 @eqx.filter_jit

@@ -89,8 +89,7 @@ def drift_order(
     epsilons = _positive("epsilons", epsilons)
     starts = _starts(q0, p0, batched)
     h = float(as_scalar("h", h, starts[0].dtype, zero_allowed=False))
-    run = _run_settings(settings)
-    lanes = _sweep(system, invariant, starts, epsilons, h, num_steps, run)
+    lanes = _sweep(system, invariant, starts, epsilons, h, num_steps, _run_settings(settings))
     return order_of(epsilons, lanes, valid_starts(lanes.good))
 
 
@@ -140,8 +139,7 @@ def drift_surface(
             f"duration must be a finite number of at least {2 * hs[-1]}, twice the longest step in "
             f"hs, got {duration!r:.200}."
         )
-    is_list = isinstance(invariant, Sequence)
-    invariants = list(invariant) if is_list else [invariant] * len(hs)
+    invariants = list(invariant if isinstance(invariant, Sequence) else [invariant] * len(hs))
     if len(invariants) != len(hs):
         raise ValueError(
             f"invariant must be one observable, or a list of {len(hs)}, one for each step size in "
@@ -164,10 +162,8 @@ def drift_surface(
 
 
 class Drifts(NamedTuple):
-    """Results of a sweep, shape (E + 1, S), the last row at ε = 0.
-
-    `sizes` of the observable; `epsilon`: the relative rounding of one operation.
-    """
+    """Results of a sweep, shape (E + 1, S), the last row at ε = 0; `sizes` of the observable;
+    `epsilon`: the relative rounding of one operation."""
 
     drifts: np.ndarray
     sizes: np.ndarray
@@ -190,9 +186,8 @@ def _sweep(system, invariant, starts, epsilons, h, num_steps, run) -> Drifts:
     arrays = run_trajectories(system, invariant, strengths, starts, run, reads(invariant))
     drifts, last, result = arrays
     if drifts.ndim != 1:
-        raise ValueError(
-            f"invariant must return a scalar, got an array of shape {drifts.shape[1:]}."
-        )
+        shape = drifts.shape[1:]
+        raise ValueError(f"invariant must return a scalar, got an array of shape {shape}.")
     drifts = np.asarray(drifts, float)
     # An odd observable may end near zero: its drift shows how large it was.
     sizes = np.abs(np.asarray(last, float)[:, -1]) + drifts
@@ -217,8 +212,7 @@ def run_trajectories(system, invariant, strengths, starts, run, _: Reads = ()):
 
 
 def valid_starts(good: np.ndarray) -> np.ndarray:
-    """The initial conditions that succeed wherever most of them do, shape (S,); `good`: (points,
-    S)."""
+    """The initial conditions that succeed wherever most do, shape (S,); `good`: (points, S)."""
     return np.all(good[_passable(good)], axis=0)
 
 

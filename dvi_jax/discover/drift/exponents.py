@@ -48,11 +48,8 @@ class Exponent(NamedTuple):
         return self.points >= LEAST_POINTS and self.probabilities["power"] < _UNLIKELY
 
     def report(self, points: int, target: tuple[float, float]) -> list[str]:
-        """Lines of text: the order and its interval, or that none is resolved.
-
-        - `points`: the number before points were excluded. `target`: what `resolving_range`
-          returns.
-        """
+        """Lines of text: the order and its interval, or that none is resolved. `points`: the number
+        before points were excluded; `target`: see `resolving_range`."""
         low, high = self.interval
         law = f"not one power: {self.model} near ε = {self.crossover:.2g}"
         if self.crossover > self.range[1]:
@@ -70,17 +67,11 @@ class Exponent(NamedTuple):
         ]
         if self.curved:
             lines.append(f"  {law}")
+        remedy = "reduce the drift at ε = 0 first: it hides the smaller ε that are required"
         if np.isfinite(target).all():
-            lines.append(
-                f"  to resolve it, take more points (eight or more) at ε = {target[0]:.2g} … "
-                f"{target[1]:.2g}"
-            )
-        else:
-            lines.append(
-                "  to resolve it, reduce the drift at ε = 0 first: it hides the smaller ε that "
-                "are required"
-            )
-        return lines
+            ends = " … ".join(f"{x:.2g}" for x in target)
+            remedy = f"take more points (eight or more) at ε = {ends}"
+        return [*lines, f"  to resolve it, {remedy}"]
 
 
 def small_epsilon_exponent(epsilons: Any, drifts: Any, floor: float = 0.0) -> Exponent:
@@ -119,15 +110,13 @@ def small_epsilon_exponent(epsilons: Any, drifts: Any, floor: float = 0.0) -> Ex
     """
     epsilons, drifts = np.asarray(epsilons, float), np.asarray(drifts, float)
     if len(epsilons) < LEAST_POINTS:
-        nan = np.nan
-        pair, count = (nan, nan), len(epsilons)
-        return Exponent(nan, pair, nan, False, "", {}, nan, nan, nan, nan, count, pair)
+        nan, pair = np.nan, (np.nan, np.nan)
+        return Exponent(nan, pair, nan, False, "", {}, nan, nan, nan, nan, len(epsilons), pair)
     x, y = np.log(epsilons), np.log(drifts)
     freedom = len(x) - 2
     fits = fits_of_laws(x, drifts, floor)
-    probabilities = {
-        name: float(fits.weights[fits.laws == i].sum()) for i, name in enumerate(names())
-    }
+    by_law = [float(fits.weights[fits.laws == i].sum()) for i in range(len(names()))]
+    probabilities = dict(zip(names(), by_law, strict=True))
     model = max(probabilities, key=lambda name: probabilities[name])
     of_model = fits.laws == list(probabilities).index(model)
     crossover = np.nan
@@ -145,9 +134,7 @@ def small_epsilon_exponent(epsilons: Any, drifts: Any, floor: float = 0.0) -> Ex
     return Exponent(*order, line_slope, line_stderr, curvature, len(x), ends)
 
 
-def resolving_range(
-    fit: Exponent, epsilons: Any, drifts: Any, smallest_drift: float = 0.0
-) -> tuple[float, float]:
+def resolving_range(fit: Exponent, epsilons: Any, drifts: Any, smallest_drift: float = 0.0):
     """The smallest and the largest ε of a sweep that should resolve the order.
 
     For a straight line: the same range, extended downward by a factor of 10. For a curve: from

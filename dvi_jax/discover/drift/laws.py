@@ -22,11 +22,9 @@ def _exp(v: np.ndarray) -> np.ndarray:
 
 
 class _Law(NamedTuple):
-    """A family of shapes g(u, size, sharpness), and its prior.
-
-    `sizes`: (value, probability) of single sizes; `ranges`: (from, to, probability) of sizes with
-    constant density; `sharpnesses`: (value, probability).
-    """
+    """A family of shapes g(u, size, sharpness), and its prior. `sizes`: (value, probability) of
+    single sizes; `ranges`: (from, to, probability) of sizes with constant density; `sharpnesses`:
+    (value, probability)."""
 
     name: str
     shape: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -34,10 +32,8 @@ class _Law(NamedTuple):
     sizes: tuple[tuple[float, float], ...] = ()
     ranges: tuple[tuple[float, float, float], ...] = ()
     sharpnesses: tuple[tuple[float, float], ...] = ((1.0, 1.0),)
-    points: int = 0
-    """How many points it needs."""
-    is_open: bool = True
-    """Whether its centre may lie above the largest ε."""
+    points: int = 0  # How many it needs
+    is_open: bool = True  # Whether its centre may lie above the largest ε
 
 
 _LAWS = (
@@ -96,11 +92,8 @@ _NEGLIGIBLE = 12.0
 
 
 class _Cells(NamedTuple):
-    """Cells of the parameters of the shapes, each field of shape (G,).
-
-    `centres`, `sizes`: the middle of a cell; `widths`, `size_widths`: its lengths; `density`: of
-    the prior.
-    """
+    """Cells of the parameters of the shapes, each field of shape (G,). `centres`, `sizes`: the
+    middle of a cell; `widths`, `size_widths`: its lengths; `density`: of the prior."""
 
     laws: np.ndarray
     centres: np.ndarray
@@ -158,9 +151,7 @@ def fits_of_laws(x: np.ndarray, drifts: np.ndarray, floor: float) -> Fits:
 
 def _refined_fits(x: np.ndarray, y: np.ndarray, log_prior: float):
     """Cells, slopes, sums of squares and logarithms of the probabilities of all shapes."""
-    freedom = len(x) - 2
-    cells = _first_cells(x)
-    out = []
+    freedom, cells, out = len(x) - 2, _first_cells(x), []
     for level in range(_LEVELS):
         slopes, squares = lines(x, y - _shapes(x, cells))
         squares = squares + freedom * _LEAST_SCATTER**2
@@ -221,12 +212,9 @@ def _table(points: int) -> np.ndarray:
         for first, last, prior in law.ranges:
             edges = np.linspace(first, last, 5)
             sizes += [((a + b) / 2, b - a, prior / 4) for a, b in itertools.pairwise(edges)]
-        for (region, r), (size, range_, p), (sharpness, q) in itertools.product(
-            regions, sizes, law.sharpnesses
-        ):
-            density = law.prior * r * p * q / _COUNTS[region]
-            rows += [
-                (region, number, i, size, range_, sharpness, density)
-                for number in range(_COUNTS[region])
-            ]
+        cells = itertools.product(regions, sizes, law.sharpnesses)
+        for (region, r), (size, range_, p), (sharpness, q) in cells:
+            count = _COUNTS[region]
+            shape = size, range_, sharpness, law.prior * r * p * q / count
+            rows += [(region, number, i, *shape) for number in range(count)]
     return np.array(rows).T

@@ -77,9 +77,8 @@ class DriftOrder(NamedTuple):
         NaN if smaller ε are required and the drift at ε = 0 hides them, or with fewer than three
         points used. See `small_epsilon_exponent`.
         """
-        return resolving_range(
-            self.fit, self.epsilons[self.used], self.drifts[self.used], ABOVE_FLOOR * self.floor
-        )
+        points = self.epsilons[self.used], self.drifts[self.used]
+        return resolving_range(self.fit, *points, ABOVE_FLOOR * self.floor)
 
     @property
     def successful(self) -> np.ndarray:

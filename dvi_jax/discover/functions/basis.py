@@ -16,6 +16,8 @@ from jaxtyping import Array, Float
 from ...base.checks import function, instance
 from ...base.types import Scalar, State
 
+Function = Callable[..., Any]
+
 
 class AbstractBasis(eqx.Module):
     """A family of functions of (q, p, t); `for_shape` fixes it for states of one shape.
@@ -91,10 +93,9 @@ class BoundBasis(eqx.Module):
         def is_basis(part):
             return isinstance(part, BoundBasis)
 
-        def strip(part):
-            return part.without_names() if is_basis(part) else part
-
-        function = jax.tree.map(strip, self.function, is_leaf=is_basis)
+        function = jax.tree.map(
+            lambda x: x.without_names() if is_basis(x) else x, self.function, is_leaf=is_basis
+        )
         return dataclasses.replace(self, function=function, names=("",) * self.size)
 
     def select(self, places: np.ndarray) -> "BoundBasis":
@@ -109,9 +110,7 @@ class BoundBasis(eqx.Module):
         is_large = np.abs(c) > drop * np.max(np.abs(c), initial=0.0)
         return linear_text(np.where(is_large, c, 0), self.names, digits)
 
-    def recentre(
-        self, middle: np.ndarray, exactly: bool = False
-    ) -> "tuple[BoundBasis, np.ndarray]":
+    def recentre(self, middle: np.ndarray, exactly=False) -> "tuple[BoundBasis, np.ndarray]":
         """Functions ψ of z − middle that span the same space, and N with ψ = N φ + constants.
 
         - `middle`: of z = (q, p, t), shape (2n + 1,). Polynomials are taken about it, other
@@ -138,8 +137,7 @@ class _Selection(eqx.Module):
 
 
 def linear_text(coefficients: np.ndarray, names: Sequence[str], digits: Any = 6) -> str:
-    """A linear combination as text, without what has the coefficient 0; the name "1" is implied.
-    `digits`: of all coefficients, or of each."""
+    """A linear combination as text, without zeros; `digits`: of all coefficients, or of each."""
     text, digits = "", np.broadcast_to(digits, len(names))
     for value, name, precision in zip(coefficients, names, digits, strict=True):
         if value == 0:
@@ -175,15 +173,12 @@ class Basis(AbstractBasis):
     names: tuple[str, ...] = eqx.field(static=True)
     complexity: int = eqx.field(static=True)
 
-    def __init__(
-        self,
-        functions: Sequence[Callable[..., Any]] | dict[str, Callable[..., Any]],
-        complexity: int = 1,
-    ):
+    def __init__(self, functions: Sequence[Function] | dict[str, Function], complexity: int = 1):
+        members: dict[str, Function] = {}
         if isinstance(functions, dict):
-            members = dict(functions)
+            members |= functions
         else:
-            members = {_name(member, i): member for i, member in enumerate(tuple(functions))}
+            members |= {_name(member, i): member for i, member in enumerate(tuple(functions))}
         if not members:
             raise ValueError("functions must have at least one function (q, p) → scalar.")
         for name, member in members.items():
@@ -200,10 +195,11 @@ class Basis(AbstractBasis):
         takes_time = tuple(not _takes(f, 2) for f in self.functions)
         for name, member, with_time in zip(self.names, self.functions, takes_time, strict=True):
             _require_real_scalar(name, member, with_time, shape)
-        complexity = (self.complexity,) * len(self.names)
-        return BoundBasis(
-            _Values(self.functions, takes_time), self.names, complexity, any(takes_time)
+        values, complexity = (
+            _Values(self.functions, takes_time),
+            (self.complexity,) * len(self.names),
         )
+        return BoundBasis(values, self.names, complexity, any(takes_time))
 
 
 def _takes(function: Callable[..., Any], count: int) -> bool:

@@ -70,8 +70,7 @@ def power_text(name: str, k: int) -> str:
     return name if k == 1 else name + str(k).translate(_SUPERSCRIPTS)
 
 
-# Monomials of a basis: its samples and singular values are dense matrices of this width.
-_MOST_MONOMIALS = 10_000
+_MOST_MONOMIALS = 10_000  # Of a basis: singular values are of dense matrices of this width
 
 
 class Polynomials(AbstractBasis):
@@ -134,8 +133,7 @@ class _Monomials(eqx.Module):
         flat = _components(self.places, q, p, t)
         if self.middle is not None:
             flat = flat - self.middle
-        counts = self.counts
-        powers = [jnp.ones_like(flat)]
+        counts, powers = self.counts, [jnp.ones_like(flat)]
         for _ in range(int(counts.max())):
             powers.append(powers[-1] * flat)
         table = jnp.stack(powers)  # (power, variable)

@@ -105,9 +105,8 @@ def _multiple(component, number, *point):
 
 def symplectic_gradient(function: Callable[..., Any]) -> Generator:
     """ξ = ∂K/∂p, η = −∂K/∂q of a function K(t, q, p, args)."""
-    return Generator(
-        xi=eqx.Partial(_slope, function, 2, 1.0), eta=eqx.Partial(_slope, function, 1, -1.0)
-    )
+    xi, eta = (eqx.Partial(_slope, function, *place) for place in ((2, 1.0), (1, -1.0)))
+    return Generator(xi=xi, eta=eta)
 
 
 def _slope(function, argnum, sign, t, q, p, args):

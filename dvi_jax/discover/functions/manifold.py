@@ -16,9 +16,8 @@ _DEPENDENT = 1e-10  # A function that differs by less from a combination of othe
 
 
 def on_manifold(equations: Equations, basis: BoundBasis, samples: SamplePoints) -> BoundBasis:
-    """The functions that are independent on the samples of a constrained system, the simpler ones
-    first: on a unit vector γ the function |γ|² γ₁ is γ₁. **Raises** `ValueError` for samples off
-    the manifold."""
+    """The functions that do not depend on simpler ones on the samples of a constrained system: for
+    a unit vector γ, |γ|² γ₁ is γ₁. **Raises** `ValueError` for samples off the manifold."""
     if equations.system.constraint is None:
         return basis
     good, values = map(np.asarray, _at_samples(equations, basis, samples))

@@ -17,11 +17,11 @@ from ...base.types import Args, Interval
 from ...engine.newton import Newton, RootSolver
 from ...integration.arithmetic import Arithmetic
 from ...integration.integrator import only
-from ...integration.keywords import ArithmeticSettings, MapSettings, integrator_of
+from ...integration.keywords import MapSettings, integrator_of
 from ...methods import Method
 from ...methods.step import Equations, step
 from ...problem.system import System, check_system
-from .basis import BoundBasis, check_step_size
+from .basis import BoundBasis, check_step_size as check_step_size
 from .generators import LatticePoint
 
 
@@ -33,7 +33,6 @@ class SamplePoints(NamedTuple):
     t: np.ndarray
 
     def subset(self, index: Any) -> "SamplePoints":
-        """Some of the samples."""
         return SamplePoints(*(field[index] for field in self))
 
     @property
@@ -44,7 +43,6 @@ class SamplePoints(NamedTuple):
         return mask
 
     def text(self, i: int) -> str:
-        """A sample for a message."""
         q, p = (f"{x[i].tolist()!s:.80}" for x in self[:2])
         return f"at index {i}: q = {q}, p = {p}, t = {self.t[i]:g}"
 
@@ -57,17 +55,12 @@ LEAST_STEP = 1e-11  # A relative step below this is not known to three digits, b
 # what changes by less than rounding may be conserved, or an expansion in the step or about the
 # samples.
 SMALL = 1e-2
-# A sample that is farther from the median than this many typical distances does not count in the
-# spread of the others.
-_FAR = 100.0
-# Polynomials are taken about the middle of the samples where they would lose so much by rounding
-# about the origin.
-_LOSS = 1e5
+_FAR = 100.0  # Typical distances from the median beyond which a sample is left out of the spread
+_LOSS = 1e5  # Rounding of polynomials about the origin above which they are taken about the middle
 
 
 def spread(values: np.ndarray) -> float:
-    """Standard deviation of the components about their means; 1 where nothing varies. Samples far
-    away from nearly all others are left out."""
+    """Standard deviation of the components, 1 where nothing varies; far samples are left out."""
     distance = np.abs(values - np.median(values, axis=0))
     is_near = distance <= _FAR * np.median(distance, axis=0)
     is_near = is_near.reshape(len(values), -1).all(axis=1)
@@ -90,13 +83,11 @@ class Displacements(NamedTuple):
     @property
     def relative_step(self) -> float:
         """Median distance by which a step moves the samples, as a share of their spread."""
-        sizes = spreads(self.samples)
-        return float(np.median(np.max(np.abs(self.values) / sizes, axis=1)))
+        return float(np.median(np.max(np.abs(self.values) / spreads(self.samples), axis=1)))
 
     @property
     def nonlinearity(self) -> float:
-        """Median distance of the map from a linear one, as a share of how much it varies on the
-        samples."""
+        """Median distance of the map from a linear one, as a share of how much it varies."""
         sizes = spreads(self.samples)
         z = np.concatenate([x.reshape(len(x), -1) for x in self.samples[:2]], axis=1)
         z = np.column_stack([(z - np.median(z, axis=0)) / sizes, np.ones(len(z))])
@@ -197,14 +188,9 @@ class Map(NamedTuple):
         return Equations(system, jnp.zeros(()), self.args, self.root_finder)
 
 
-def map_of(
-    function: str, system: System, settings: MapSettings | ArithmeticSettings, *fields: str
-) -> Map:
+def map_of(function: str, system: System, settings: Any, *fields: str) -> Map:
     """The map from the keywords of a search; `fields`: those of an `Integrator` that the search
-    uses besides `root_finder`.
-
-    By default by Newton's iteration, through which Taylor coefficients in ε are exact.
-    """
+    uses besides `root_finder`, by default Newton's, through which Taylor coefficients are exact."""
     integrator, run = integrator_of(settings)
     only(integrator, function, *fields, "root_finder")
     root_finder = integrator.root_finder
@@ -243,13 +229,11 @@ def require_steps(good: Any, samples: SamplePoints) -> None:
         )
 
 
-def require_finite(
-    values: np.ndarray,
-    name: Callable[..., str],
-    hint: str = "keep the samples away from its singularities",
-) -> None:
-    """Reject values, shape (S, …), that are not finite; `name`: of them, from the indices that
-    follow the sample."""
+_NEAR_SINGULARITIES = "keep the samples away from its singularities"
+
+
+def require_finite(values: np.ndarray, name: Callable, hint: str = _NEAR_SINGULARITIES) -> None:
+    """Reject values, shape (S, …), that are not finite; `name`: of the value with other indices."""
     bad = ~np.isfinite(values)
     if bad.any():
         i, *index = np.argwhere(bad)[0]
@@ -266,10 +250,8 @@ def check_finite(basis: BoundBasis, values: np.ndarray) -> None:
 
 
 def check_basis(basis: BoundBasis, values: np.ndarray) -> float:
-    """Reject functions that are not finite on the samples, or dependent; `values`: (S, size).
-
-    Returns the condition number of the functions, each scaled to one size.
-    """
+    """Reject functions that are not finite on the samples, or dependent; `values`: (S, size). The
+    condition number of the others, each scaled to one size."""
     check_finite(basis, values)
     values = values / np.maximum(np.max(np.abs(values), axis=0), np.finfo(float).tiny)
     scale = np.linalg.norm(values, axis=0)

@@ -20,21 +20,12 @@ from ...methods import Method
 from ...methods.step import Equations
 from ..algebra.motion import Motion
 from ..algebra.taylor import taylor_coefficients
+from ..functions import sampling
 from ..functions.basis import BoundBasis
-from ..functions.sampling import (
-    Displacements,
-    SamplePoints,
-    check_finite,
-    later,
-    require_finite,
-    require_steps,
-    require_times,
-)
+from ..functions.sampling import Displacements, SamplePoints, require_finite
 
-# A series whose relative change at large ε is smaller is exact and not an expansion.
-_EXACT = 1e-12
-# The ε at which that is tried, in units of that at which the perturbation is as large as H_D.
-_TRIAL_EPSILONS = (0.5, -0.3)
+_EXACT = 1e-12  # A series with less relative change at large ε is exact and not an expansion
+_TRIAL_EPSILONS = (0.5, -0.3)  # They are tried where |ε| = 1 makes the perturbation as large as H_D
 _EXACT_STEPS = 100  # Steps over which it is tried
 
 
@@ -78,9 +69,7 @@ class Changes(NamedTuple):
     good: np.ndarray
 
     def subset(self, index: np.ndarray) -> "Changes":
-        """Of some of the samples."""
-        fields = self._asdict().items()
-        arrays = {name: x[index] for name, x in fields if isinstance(x, np.ndarray)}
+        arrays = {k: x[index] for k, x in self._asdict().items() if isinstance(x, np.ndarray)}
         samples, motion = self.samples.subset(index), self.motion.subset(index)
         return self._replace(samples=samples, motion=motion, **arrays)
 
@@ -110,12 +99,12 @@ def changes_at(step_map: StepMap, order: int, samples: SamplePoints) -> Changes:
 
 
 def checked_changes(step_map: StepMap, order: int, samples: SamplePoints) -> Changes:
-    """The same, or an error for steps that fail, numbers that are not finite, and a time that is
-    not sampled."""
+    """The same, or an error for failing steps, NaN or infinity, and a time that is not sampled."""
     names, changes = step_map.basis.names, changes_at(step_map, order, samples)
     if not changes.good.all():
-        require_steps(batched_changes(step_map.without_names(), order, samples)[3], samples)
-    check_finite(step_map.basis, changes.values)
+        good = batched_changes(step_map.without_names(), order, samples)[3]
+        sampling.require_steps(good, samples)
+    sampling.check_finite(step_map.basis, changes.values)
 
     def change(m, j):
         term = "the change" if m == 0 else f"the term of order {m} in ε of the change"
@@ -129,7 +118,7 @@ def checked_changes(step_map: StepMap, order: int, samples: SamplePoints) -> Cha
     require_finite(changes.slopes, derivative)
     require_finite(np.where(changes.good, 0, np.nan), lambda: "the derivative of the map", hint)
     if np.ptp(samples.t) == 0 and _may_depend_on_time(step_map.equations, samples):
-        require_times(_depends_on_time(changes, order), samples, "the map")
+        sampling.require_times(_depends_on_time(changes, order), samples, "the map")
     return changes
 
 
@@ -139,7 +128,7 @@ def _depends_on_time(changes: Changes, order: int) -> bool:
     limits = 1e-8 * np.max(np.abs(changes.terms), axis=0, keepdims=True)
     limits = np.broadcast_to(limits, changes.terms.shape).copy()
     predictions = np.sum(np.abs(changes.motion.changes), axis=1)
-    for shift in later(float(step_map.h), changes.displacements.relative_step):
+    for shift in sampling.later(float(step_map.h), changes.displacements.relative_step):
         # t1 − t0 loses digits at a later time, and a step is in proportion to it.
         loss = 4 * np.finfo(float).eps * (np.max(np.abs(samples.t)) + shift) / abs(step_map.h)
         other = changes_at(step_map, order, samples._replace(t=samples.t + shift)).terms
@@ -206,8 +195,7 @@ def batched_changes(step_map: StepMap, order: int, samples):
         def change_and_matrix(epsilon):
             """The change, and the matrix DΦ."""
             D, (*end, _) = jax.jacfwd(image, has_aux=True)(z, epsilon)
-            change = basis(*end) - basis(q, p, t)
-            return jnp.concatenate([change, D[:-1, :-1].ravel()])
+            return jnp.concatenate([basis(*end) - basis(q, p, t), D[:-1, :-1].ravel()])
 
         zero, volumes = jnp.zeros(()), jnp.zeros(order + 1)
         if order == 0:
@@ -246,8 +234,8 @@ def terms_in_pairs(step_map: StepMap, order: int, samples: SamplePoints) -> Pair
 
 
 def _log_determinant(D: Array) -> Array:
-    """The series of log |det D|, without its order 0, from that of D, shape (z + 1, n, n): with
-    D' = D X its derivative is tr X."""
+    """The series of log |det D|, with order 0 as 0, from that of D: with D' = D X it has the
+    derivative tr X."""
     divide = jax.vmap(lanewise.solve, (None, 1), 1)
     growth: list[Array] = []
     for k in range(len(D) - 1):

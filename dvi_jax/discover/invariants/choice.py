@@ -1,6 +1,6 @@
 """The choice of the series that represent invariants: in few functions, with known digits."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,8 +13,7 @@ from .judging import CLEARLY, Fewest, Judge, clean
 from .representatives import Span
 from .search import NullSpaces
 
-# Coefficients are known up to this share of the largest, over the gap in singular values.
-_FUZZY = 30.0
+_FUZZY = 30.0  # Coefficients are known up to this share of the largest, over the gap
 _FUZZIEST = 1e-3  # No larger shares than this are taken for errors of others
 _AS_GOOD = 10.0  # An invariant with fewer terms may change by so many times more
 _ROUND_OFF = 1e-12  # Changes below this need not be smaller
@@ -65,8 +64,7 @@ class Chooser(NamedTuple):
         """One series for each leading-order term, in functions of the basis; `blur`: see `Span`."""
         null, span = self.null, Span(self.null, blur)
         shape = -1, null.order + 1, null.basis.size
-        groups: dict[bool, list[Any]] = {True: [], False: []}
-        flags = []
+        groups, flags = {True: [], False: []}, []
         for series, is_independent in span.representatives():
             coefficients, is_exact_series = self._representative(span, series, representative)
             groups[is_independent].append(_normalise(coefficients, null.conditions.rms))
@@ -80,9 +78,8 @@ class Chooser(NamedTuple):
             rejections = np.concatenate([changes[~good], other_changes[~other_good]])
             coefficients, exact, changes = (x[good] for x in (coefficients, exact, changes))
             dependent = dependent[other_good]
-        # Conserved to rounding before approximate, at every ε before to an order, few terms before
-        # many.
         terms = np.count_nonzero(coefficients, (1, 2))
+        # Conserved to rounding before approximate, at every ε before to an order, then few terms.
         order = np.lexsort((terms, ~exact, ~(changes <= CLEARLY)))
         coefficients, exact = coefficients[order], tuple(exact[order].tolist())
         errors = [self.linear.errors(c * self.null.sizes, null.tolerance) for c in coefficients]
@@ -90,9 +87,7 @@ class Chooser(NamedTuple):
         unclear = int(np.sum(rejections < UNCLEAR))
         return Choice(coefficients, dependent, errors, exact, len(rejections), unclear, blur)
 
-    def _representative(
-        self, span: Span, series: np.ndarray, representative: str
-    ) -> tuple[np.ndarray, bool]:
+    def _representative(self, span: Span, series: np.ndarray, representative: str):
         """Coefficients, shape (order + 1, size), and whether the series is exact."""
         null = self.null
         if null.order == 0:
@@ -109,11 +104,11 @@ class Chooser(NamedTuple):
         return self._without_rounding(clean(span.smallest(series))) / self.null.sizes, exact
 
     def _without_rounding(self, shares: np.ndarray) -> np.ndarray:
-        if self.null.tolerance is not None:
-            return shares
-        return self.linear.without_rounding(
-            shares, lambda candidate: self.judge.largest((candidate / self.null.sizes)[None])[0]
-        )
+        def change(candidate):
+            return self.judge.largest((candidate / self.null.sizes)[None])[0]
+
+        is_exact = self.null.tolerance is None
+        return self.linear.without_rounding(shares, change) if is_exact else shares
 
     def _of_order_0(self, series: np.ndarray, blur: float) -> np.ndarray:
         """Shares of an invariant of order 0, with as few terms and as many digits as can be."""
@@ -129,9 +124,8 @@ class Chooser(NamedTuple):
         candidates = [shares for shares in candidates if shares.any()] or [series]
         changes = changes_of(candidates)
         if np.min(changes) > CLEARLY:  # rows weighted by what its own slopes predict
-            rows = (
-                self.judge_fitted.own_rows(series / self.null.sizes[0]) / self.null.conditions.rms
-            )
+            rows = self.judge_fitted.own_rows(series / self.null.sizes[0])
+            rows = rows / self.null.conditions.rms
             singular, V = singular_vectors(rows)
             null = V[singular <= CLEARLY * np.sqrt(len(rows))]
             projection = null.T @ (null @ series)

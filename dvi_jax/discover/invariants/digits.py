@@ -1,21 +1,19 @@
 """Digits of the coefficients that a search finds: rounding, known digits, and closed forms."""
 
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..algebra.block_triangular import BlockTriangular, larger_than
 from ..algebra.nullspace import DENSE, NULL, series_changes, toeplitz, triangle
 
-# Coefficients below such shares of the largest may be rounding; the first level that the held-out
-# samples confirm counts.
+# Coefficients below such shares of the largest may be rounding; the first that held-out samples
+# confirm counts.
 _LEVELS = 10.0 ** -np.arange(7.0, 13.0)
 _GROWS = 2.0  # A series with fewer terms may change by so many times more, or by rounding
 _ROUND_OFF = 1e-13
-_DETERMINACY = (
-    1e-6  # Coefficients are solved for again along directions that are determined so well
-)
+_DETERMINACY = 1e-6  # Coefficients are solved for again along directions determined so well
 _PROBES = 64  # Random residuals by which errors are estimated beyond
 _MOST_DIGITS = 6  # Digits that a formula shows
 _SAFETY = 3.0  # Errors of a coefficient within which a closed form has to agree
@@ -26,11 +24,8 @@ _TIMES = {"": 1.0, "√2": 2**0.5, "√3": 3**0.5, "√5": 5**0.5, "π": np.pi, 
 
 class LinearConditions(NamedTuple):
     """The linear conditions on a series, with rows weighted by the typical change in a step, for
-    functions that are scaled to one size on the samples.
-
-    `terms`: A_0 … A_z, shape (rows, z + 1, size); up to `DENSE` coefficients their Toeplitz matrix
-    as one order.
-    """
+    functions scaled to one size on the samples. `terms`: A_0 … A_z, shape (rows, z + 1, size); up
+    to `DENSE` coefficients their Toeplitz matrix as one order."""
 
     terms: np.ndarray
 
@@ -53,21 +48,17 @@ class LinearConditions(NamedTuple):
 
     def _residual(self, shares: np.ndarray) -> np.ndarray:
         """The left sides, shape (orders, rows, 1)."""
-        series = shares.reshape(-1, 1)
-        return np.moveaxis(series_changes(self.terms, series), 1, 0)
+        return np.moveaxis(series_changes(self.terms, shares.reshape(-1, 1)), 1, 0)
 
     def nearest_solution(self, shares: np.ndarray) -> np.ndarray:
         """The nearest solution with the same coefficients equal to zero."""
         solver = self._solver(self._free(shares), _DETERMINACY)
         return shares - solver.solve(self._residual(shares)).reshape(shares.shape)
 
-    def without_rounding(
-        self, shares: np.ndarray, change: Callable[[np.ndarray], float]
-    ) -> np.ndarray:
-        """The series without the coefficients that are rounding: without them it changes by no more
-        on the held-out samples. `change`: the change of a series there."""
-        size, limit = np.abs(shares), None
-        count = np.count_nonzero(shares)
+    def without_rounding(self, shares: np.ndarray, change: Callable) -> np.ndarray:
+        """The series without the coefficients that are rounding: it changes no more without them;
+        `change`: that of a series on the held-out samples."""
+        size, limit, count = np.abs(shares), None, np.count_nonzero(shares)
         for level in _LEVELS:
             is_kept = size > level * np.max(size)
             if np.count_nonzero(is_kept) == count:
@@ -94,9 +85,7 @@ class LinearConditions(NamedTuple):
         return residual * np.linalg.norm(solver.solve(right), axis=2).reshape(shares.shape)
 
 
-def digits_of(
-    values: np.ndarray, errors: np.ndarray | None, largest: int = _MOST_DIGITS
-) -> np.ndarray:
+def digits_of(values: np.ndarray, errors: Any, largest: int = _MOST_DIGITS) -> np.ndarray:
     """How many digits of each value its error leaves, from 2 to `largest`."""
     if errors is None:
         return np.full(np.shape(values), largest)

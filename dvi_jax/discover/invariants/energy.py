@@ -19,8 +19,7 @@ from .search import NullSpaces
 
 _SAME_AS_INVARIANT = 0.05  # Energy differs by so little from an invariant that was found
 _IN_BASIS = 1e-6  # … or from a combination of the basis functions
-# A search with a tolerance of this share of the change of the energy finds it, and not much more.
-_TOLERANCE = 0.12
+_TOLERANCE = 0.12  # Share of the energy's change with which a search finds it, and not much more
 _ORDERS = 0.5, 20.0  # Orders in h that the change of an energy may have
 
 
@@ -61,8 +60,8 @@ class _EnergyFunction(eqx.Module):
 
 
 def unconserved_energy(null: NullSpaces) -> Energy | None:
-    """The energy, if it is neither among the invariants of order 0 nor conserved to rounding by the
-    map, and its change in a step is a power of h."""
+    """The energy, if it is not among the invariants of order 0 nor conserved to rounding, and its
+    change in a step is a power of h."""
     changes, step_map = null.changes, null.changes.step_map
     energy = _EnergyFunction(step_map.equations)
     q, p, t = (jnp.asarray(x[0]) for x in changes.samples)
@@ -98,6 +97,5 @@ def unconserved_energy(null: NullSpaces) -> Energy | None:
     order = float(np.log2(ratio / half)) if half > 0 and ratio > CLEARLY else np.nan
     if not _ORDERS[0] < order < _ORDERS[1] or ratio > 1 or from_invariants < 3 * ratio:
         return None
-    is_in_basis = distance(functions) < _IN_BASIS
-    tolerance = float(f"{_TOLERANCE * ratio:.0e}") if is_in_basis else np.nan
+    tolerance = float(f"{_TOLERANCE * ratio:.0e}") if distance(functions) < _IN_BASIS else np.nan
     return Energy(order, ratio, tolerance, isinstance(step_map.method, TypeII))

@@ -11,22 +11,16 @@ from ..functions.sampling import LEAST_STEP, SMALL, Displacements, SamplePoints
 from .changes import Changes
 from .judging import CLEARLY, Judge
 
-# Sizes of the samples, about their middle, on which an exact invariant is conserved too.
-_LARGER = (2.0, 4.0, 8.0)
-# Relative size of the larger step at which the number of invariants is counted again.
-_MODERATE = 0.03
-
-# Nonlinearity of the map on larger samples, and how many times larger they are at most.
-_NONLINEAR, _WIDEST = 0.3, 1e3
+_LARGER = (2.0, 4.0, 8.0)  # Sizes of the samples on which an exact invariant is conserved too
+_MODERATE = 0.03  # Relative size of the larger step at which invariants are counted again
+_NONLINEAR, _WIDEST = 0.3, 1e3  # Nonlinearity of the map on larger samples; their largest factor
 _LINEAR = 1e-9  # A map that differs by less from a linear one may be linear
-# A map that moves nothing, to rounding, at a step so many times larger moves nothing at all.
-_LAST = 1e30
+_LAST = 1e30  # A map that does not move at a step so many times larger does not move at all
 _HARDLY = 2.0  # A step, or samples, larger by a smaller factor say nothing new
 
+# (samples, h) → displacements in a step h; and how many are conserved, None where it is undefined
 DisplacementFunction = Callable[[SamplePoints, float], Displacements]
-"""(samples, h) → displacements of the samples in a step h."""
 CountFunction = Callable[[SamplePoints, float], int | None]
-"""(samples, h) → how many are conserved; None where the map is not defined there."""
 
 
 def powers_of_size(
@@ -58,17 +52,13 @@ def powers_of_size(
     return growth(changes, factors, larger.good, larger_changes)
 
 
-def larger_samples(
-    samples: SamplePoints, is_constrained: bool = False
-) -> tuple[SamplePoints, np.ndarray]:
+def larger_samples(samples: SamplePoints, is_constrained=False) -> tuple[SamplePoints, np.ndarray]:
     """The samples, each farther from their median, and by which of the factors `_LARGER`."""
     factors = np.resize(_LARGER, len(samples.q))
     return farther(samples, factors, is_constrained), factors
 
 
-def farther(
-    samples: SamplePoints, factors: np.ndarray | float, is_constrained: bool = False
-) -> SamplePoints:
+def farther(samples: SamplePoints, factors: Any, is_constrained: bool = False) -> SamplePoints:
     """Samples so many times as far from their median, or on a manifold so many times as fast:
     positions stay on it, and multiples of momenta along it are along it."""
     if is_constrained:
@@ -139,8 +129,7 @@ class Larger(NamedTuple):
 
 
 def common_warnings(result: Any, remedy: str, subject: str) -> list[str]:
-    """Reasons why a `Discovery` or `Symmetries` is not reliable; `remedy`: of a gap that is not
-    clear, `subject`: what may be conserved."""
+    """Reasons not to rely on a result; `remedy`: of an unclear gap; `subject`: what is sought."""
     reasons, count = [], result.survivors[0]
     if count and result.gap < CLEAR:
         reasons.append(f"the gap is not clear: {remedy}")

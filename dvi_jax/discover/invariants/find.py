@@ -13,17 +13,10 @@ from ...integration.keywords import ArithmeticSettings
 from ...problem.system import System, check_system
 from ..algebra.nullspace import in_units_of
 from ..algebra.pair_series import uses_pairs
+from ..functions import sampling
 from ..functions.basis import AbstractBasis, bind_basis, check_step_size
 from ..functions.manifold import on_manifold
-from ..functions.sampling import (
-    Displacements,
-    SamplePoints,
-    as_samples,
-    map_of,
-    middle,
-    require_enough,
-    require_times,
-)
+from ..functions.sampling import Displacements, SamplePoints
 from .changes import Changes, StepMap, checked_changes, terms_in_pairs
 from .choice import chooser
 from .discovery import Discovery
@@ -107,8 +100,8 @@ def discover_invariants(
     """
     start = time.perf_counter()
     check_system(system)
-    one_step = map_of("discover_invariants", system, settings, "method", "arithmetic")
-    samples = as_samples(samples, one_step.t0)
+    one_step = sampling.map_of("discover_invariants", system, settings, "method", "arithmetic")
+    samples = sampling.as_samples(samples, one_step.t0)
     order = whole("order", order, low=0)
     in_pairs = uses_pairs(one_step.arithmetic, tolerance)
     if order > _RELIABLE and not in_pairs:
@@ -121,11 +114,11 @@ def discover_invariants(
         tolerance = fraction("tolerance", tolerance)
     one_of("representative", representative, ("least", "simplest"))
     bound, h = bind_basis(basis, samples.q.shape[1:]), check_step_size(h)
-    require_enough(samples, bound.size)
-    require_times(bound.uses_time, samples)
+    sampling.require_enough(samples, bound.size)
+    sampling.require_times(bound.uses_time, samples)
     equations = one_step.equations(system, samples)
     bound = on_manifold(equations, bound, samples)
-    centre = middle(samples, max(bound.complexity))
+    centre = sampling.middle(samples, max(bound.complexity))
     inner, to_basis = bound.recentre(centre)
     step_map = StepMap(equations, np.asarray(h), one_step.method, inner)
     changes = checked_changes(step_map, order, samples)

@@ -9,8 +9,7 @@ from ..algebra.nullspace import RANK, null_space, triangle
 from .changes import Changes
 
 CLEARLY = 1e-9  # Changes of an invariant, by the measure of `Motion`, for nearly all samples
-# Two functions whose difference is this share of them are one, with and without errors.
-_DIFFERENCE = 1e-3
+_DIFFERENCE = 1e-3  # Two functions that differ by this share are one, with and without errors
 _ROUND_OFF = 1e-13  # Shares below this of the largest are not there
 
 
@@ -25,10 +24,8 @@ class Judge(NamedTuple):
     approximately: bool = False
 
     def quantiles(self, coefficients: np.ndarray, share: float, sizes=None) -> np.ndarray:
-        """The change that the given share of the samples stays below, shape (count, z + 1).
-
-        `sizes`: of the leading-order terms on the samples that were fitted, if these are others.
-        """
+        """The change that the given share of the samples stays below, shape (count, z + 1);
+        `sizes`: of the leading-order terms on the samples that were fitted, if these are others."""
         out = np.zeros(coefficients.shape[:2])
         sizes = self.sizes(coefficients) if sizes is None else sizes
         for i, c in enumerate(coefficients):
@@ -41,12 +38,14 @@ class Judge(NamedTuple):
 
     def sizes(self, coefficients: np.ndarray) -> np.ndarray:
         """Root mean squares of the leading-order terms, shape (count,)."""
-        calm = self.calm**2 / np.sum(self.calm**2)
-        return np.sqrt(calm @ (self.changes.values @ coefficients[:, 0].T) ** 2)
+        return np.sqrt(self._squares @ (self.changes.values @ coefficients[:, 0].T) ** 2)
+
+    @property
+    def _squares(self) -> np.ndarray:
+        return self.calm**2 / np.sum(self.calm**2)
 
     def _spread(self, leading: np.ndarray) -> float:
-        calm = self.calm**2 / np.sum(self.calm**2)
-        values = self.changes.values @ leading
+        calm, values = self._squares, self.changes.values @ leading
         spread = np.sqrt(calm @ (values - calm @ values) ** 2)
         size = self.sizes(leading[None, None])[0]
         return float(max(spread, 1e-6 * size, np.finfo(float).tiny))

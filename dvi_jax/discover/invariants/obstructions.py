@@ -13,8 +13,7 @@ from ..functions.families import power_text
 from .search import NullSpaces
 from .series import short_text
 
-# A drift law is reported when it leaves less than this share of the drift unexplained.
-EXPLANATION = 1e-6
+EXPLANATION = 1e-6  # A law is reported when it leaves less of the drift unexplained
 _FORMULA_TERMS = 12  # Terms of a formula in a law
 _DEGREE = 4  # A law is sought as a polynomial of the leading-order term up to this degree
 _POWERS = ("1", *(power_text("I", k) for k in range(1, _DEGREE + 1)))
@@ -60,10 +59,8 @@ class DriftLaw(NamedTuple):
         return text
 
 
-def drift_laws(
-    null: NullSpaces, volume: np.ndarray, slow_time: bool, blur: float
-) -> tuple[DriftLaw, ...]:
-    """The laws of all leading-order terms that are lost at order 1, 2, ….
+def drift_laws(null: NullSpaces, volume: np.ndarray, slow_time: bool, blur: float):
+    """A `DriftLaw` for each of the leading-order terms that are lost at order 1, 2, ….
 
     For a series c that is invariant up to order m − 1 the condition of order m,
     Σ_k A_{m−k} c_k + A_0 c_m = 0, has no solution c_m; with a function of what order 0 conserves
@@ -94,8 +91,7 @@ def drift_laws(
             c = shares / rms
             normal = 1 / (2 * c[np.argmax(np.abs(shares))])
             shares, c = shares * normal, c * normal
-            series = np.linalg.lstsq(lower[:size], R @ shares, rcond=blur)[0]
-            drift = drifts @ series
+            drift = drifts @ np.linalg.lstsq(lower[:size], R @ shares, rcond=blur)[0]
             solution = solver.solve(drift[:, None])[:, 0]
             rate = max(np.linalg.norm(drift), np.finfo(float).tiny)
             residual = float(np.linalg.norm(system @ solution - drift) / rate)

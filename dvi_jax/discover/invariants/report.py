@@ -27,10 +27,9 @@ def report(discovery: Any) -> str:
         f"{discovery.count} independent {kind}conserved quantit{plural}{_up_to(discovery.order)} "
         f"among the combinations of {discovery.basis.size} functions{time}"
     ]
-    if discovery.tolerance is not None:
-        limit = f"{discovery.tolerance:g} of the largest"
-        lines.append(f"  singular values up to {limit} count as zero")
-    lines += [f"  {line}" for line in (*_numbers(discovery), *discovery.warnings)]
+    if (limit := discovery.tolerance) is not None:
+        lines.append(f"  singular values up to {limit:g} of the largest count as zero")
+    lines += [f"  {line}" for line in (_numbers(discovery), *discovery.warnings)]
     if discovery.count and discovery.count == 2 * int(np.prod(discovery.shape, dtype=int)):
         lines.append(
             "  as many independent invariants as coordinates: each orbit of the map has "
@@ -45,11 +44,11 @@ def report(discovery: Any) -> str:
     for i, series in enumerate(discovery.invariants):
         lines.append(f"  I = {series.formula(_FORMULA_TERMS, drop, digits)}")
         lines += _invariant_lines(discovery, i, series)
-    if len(discovery.dependent):
-        lines.append(f"  functions of these that are conserved too: {len(discovery.dependent)}")
+    if count := len(discovery.dependent):
+        lines.append(f"  functions of these that are conserved too: {count}")
         for series in discovery.dependent_invariants[:3]:
             lines.append(f"      {series.formula(_FORMULA_TERMS, drop, digits)}")
-        if len(discovery.dependent) > 3:
+        if count > 3:
             lines.append("      … (all of them in dependent_invariants)")
     return "\n".join(lines + _not_conserved(discovery))
 
@@ -58,32 +57,26 @@ def _up_to(order: int) -> str:
     return f" up to order {power_text('ε', order)}" if order else ""
 
 
-def _numbers(discovery: Any) -> list[str]:
+def _numbers(discovery: Any) -> str:
     """How many combinations are conserved at each order, and how clear that is."""
     counts = [f"{count}{_up_to(m) or ' for ε = 0'}" for m, count in enumerate(discovery.survivors)]
     next_value = f"the smallest singular value of the others is {discovery.gap:.1e} times as large"
-    return [f"combinations conserved: {', '.join(counts)}; {next_value}"]
+    return f"combinations conserved: {', '.join(counts)}; {next_value}"
 
 
 def _invariant_lines(discovery: Any, i: int, series: Any) -> list[str]:
     """What is known of one invariant."""
     half, large = np.max(discovery.typical_residuals[i], axis=0)
-    notes = []
-    if discovery.exact[i]:
-        notes.append("exact at every ε tried")
-    elif np.isfinite(discovery.reach[i]):
-        notes.append(
-            f"corrections are as large as the leading-order term at ε = {discovery.reach[i]:.2g}"
-        )
     lines = [
         f"      changes in a step on held-out samples: median {half:.1e}, 95 % below {large:.1e}, "
-        f"largest {np.max(discovery.residuals[i]):.1e} of what its slopes predict",
-        *(f"      {note}" for note in notes),
-        *growth_note("changes grow", discovery.powers[i]),
+        f"largest {np.max(discovery.residuals[i]):.1e} of what its slopes predict"
     ]
-    forms = [
-        f"{number} = {form}" for number, form in series.recognised.items() if form not in _OBVIOUS
-    ]
+    if discovery.exact[i]:
+        lines.append("      exact at every ε tried")
+    elif np.isfinite(size := discovery.reach[i]):
+        lines.append(f"      corrections are as large as the leading-order term at ε = {size:.2g}")
+    lines += growth_note("changes grow", discovery.powers[i])
+    forms = [f"{n} = {form}" for n, form in series.recognised.items() if form not in _OBVIOUS]
     if forms and discovery.tolerance is None:
         total = f", … ({len(forms)} in all)" if len(forms) > _CLOSED_FORMS else ""
         lines.append(f"      recognised: {', '.join(forms[:_CLOSED_FORMS])}{total}")

@@ -39,16 +39,14 @@ class Span(NamedTuple):
         """One series, shape (order + 1, size), for each leading-order term, the simplest first; and
         whether it is independent of those before it: its differential is, at generic points,
         outside the span of theirs."""
-        changes = self.null.of_fit
-        representatives: list[tuple[np.ndarray, bool]] = []
         if self.space.leading.shape[1] == 0:
-            return representatives
+            return []
+        changes, representatives = self.null.of_fit, []
         slopes = changes.slopes[:: max(1, len(changes.good) // 40), :, :-1]
         # in units of the spread of (q, p), so that their own units do not matter
         gradients = slopes * spreads(changes.samples) / self.conditions.rms[:, None]
         complexity, span = np.array(self.null.basis.complexity), np.zeros((self.size, 0))
-        differentials: list[np.ndarray] = []
-        shares = self.conditions.shares(self.space.leading)
+        differentials, shares = [], self.conditions.shares(self.space.leading)
         for level in sorted(set(self.null.basis.complexity)):
             candidates = self._up_to(level, shares)
             for vector in reduced_echelon(candidates, complexity, self.blur).T:

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...engine.pairs import Pair
-from ..algebra.motion import Motion, conserved_series, typical_sizes
+from ..algebra.motion import Motion, conserved_series
 from ..algebra.nullspace import SeriesSpace, compress, series_spaces
 from ..algebra.pair_series import ROUNDING, spaces_in_pairs
-from ..algebra.weighing import WeightedConditions, times_weights, weigh
+from ..algebra.weighing import WeightedConditions, times_weights, typical_sizes, weigh
 from ..functions.basis import BoundBasis
 from ..functions.sampling import check_basis
 from .changes import Changes
@@ -86,9 +86,7 @@ class NullSpaces:
         return unclear if self.tolerance is None else 0
 
 
-def null_spaces(
-    changes: Changes, tolerance: float | None = None, pairs: Pair | None = None
-) -> NullSpaces:
+def null_spaces(changes: Changes, tolerance=None, pairs: Pair | None = None) -> NullSpaces:
     """The null spaces of all orders; `pairs`: the terms in pairs of numbers, to decide by them."""
     fit = ~changes.samples.held_out
     calm = typical_sizes(changes.values)[1][fit]
@@ -107,26 +105,21 @@ def null_spaces(
         rows = compress(times_weights(conditions.terms, conditions.weights)[fit])
         spaces, pair_unclear = series_spaces(rows, judge, tolerance, trivial), 0
     else:
-        rounding = ROUNDING / np.finfo(float).eps
-        motion = conditions.motion
+        rounding, motion = ROUNDING / np.finfo(float).eps, conditions.motion
         motion = motion._replace(rounding=rounding * motion.rounding)
         conditions = conditions._replace(motion=motion)
         errors = rounding * changes.motion.rounding
-        spaces, pair_unclear = spaces_in_pairs(
-            pairs, conditions.scale, conditions.orthonormal, motion.weights(), ~fit, errors, trivial
-        )
+        problem = pairs, conditions.scale, conditions.orthonormal, motion.weights(), ~fit
+        spaces, pair_unclear = spaces_in_pairs(*problem, errors, trivial)
     return NullSpaces(changes, tolerance, conditions, spaces, pair_unclear, constant, condition)
 
 
 def _shares_of_constant(rms, values, calm, slopes) -> np.ndarray | None:
-    """The combination that is 1 everywhere (and not only on these samples), if there is one.
-
-    `values`: of the functions, times the weights `calm` of the samples.
-    """
+    """The combination that is 1 everywhere (and not only on these samples), if there is one;
+    `values`: of the functions, times the weights `calm` of the samples."""
     shares = np.linalg.lstsq(values / rms, calm, rcond=None)[0]
     shares = np.where(np.abs(shares) > 1e-9 * np.max(np.abs(shares)), shares, 0.0)
-    terms = np.abs(values / rms) @ np.abs(shares)
-    terms = np.maximum(terms, np.finfo(float).tiny)
+    terms = np.maximum(np.abs(values / rms) @ np.abs(shares), np.finfo(float).tiny)
     if np.max(np.abs(values / rms @ shares - calm) / terms) > 1e4 * np.finfo(float).eps:
         return None
     slopes = slopes / rms[:, None]

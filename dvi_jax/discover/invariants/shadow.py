@@ -98,12 +98,9 @@ class ShadowHamiltonian(eqx.Module):
     def bind(self, system: System, epsilon: Any) -> "ShadowHamiltonian":
         """The same Hamiltonian for this system and ε, unless they were given before."""
         check_system(system, "ShadowHamiltonian")
-        return ShadowHamiltonian(
-            self.order,
-            system if self.system is None else self.system,
-            epsilon if self.epsilon is None else self.epsilon,
-            self.h,
-        )
+        system = system if self.system is None else self.system
+        epsilon = epsilon if self.epsilon is None else self.epsilon
+        return ShadowHamiltonian(self.order, system, epsilon, self.h)
 
     def terms(self, t: Any, q: Any, p: Any, args: Args = None) -> Float[Array, " order+1"]:
         r"""H̃_0, …, H̃_{order} at (t, q, p), shape (order + 1,); H̃_i in [energy / time^i].
@@ -171,9 +168,8 @@ def _series_along_orbit(
 
     # p_{k+1} = p_k − h ∂H_D/∂q0: each pass of the fixed-point iteration gains one power of h, and
     # the last one has H_D and its slopes at the p_{k+1} of the pass before.
-    is_explicit = not depends_on(
-        lambda p1: jax.grad(hamiltonian, argnums=2)(t, t, q, p1), 0, jnp.zeros_like(p)
-    )
+    slope = jax.grad(hamiltonian, argnums=2)
+    is_explicit = not depends_on(lambda p1: slope(t, t, q, p1), 0, jnp.zeros_like(p))
     passes = min(order, 1) + 1 if is_explicit else order + 1
 
     def step(state, k):
@@ -184,13 +180,11 @@ def _series_along_orbit(
             return H, dp, ps - _times_h(dq)
 
         H, dp, ps1 = lax.fori_loop(0, passes, one_pass, (ps[:, 0], ps, ps))
-        b = H - _product(ps1 - first, dp)
-        return (qs + _times_h(dp), ps1), b
+        return (qs + _times_h(dp), ps1), H - _product(ps1 - first, dp)
 
     first = _constant(p, order)
     steps = jnp.arange(order + 1, dtype=q.dtype)
-    _, b = lax.scan(step, (_constant(q, order), first), steps)
-    return b
+    return lax.scan(step, (_constant(q, order), first), steps)[1]
 
 
 def _constant(value: State, order: int) -> Float[Array, "order+1 n"]:

@@ -10,40 +10,18 @@ from ...base.checks import fraction, whole
 from ...base.keywords import checked_keywords
 from ...integration.keywords import MapSettings
 from ...problem.system import System, check_system
-from ..algebra.motion import typical_sizes
 from ..algebra.nullspace import independent_columns, triangle
-from ..functions.basis import (
-    AbstractBasis,
-    Basis,
-    BoundBasis,
-    Product,
-    Sum,
-    bind_basis,
-    check_step_size,
-)
+from ..algebra.weighing import typical_sizes
+from ..functions import sampling
+from ..functions.basis import AbstractBasis, Basis, BoundBasis, Product, Sum, bind_basis
 from ..functions.families import TIME, Polynomials, coordinate_names
-from ..functions.sampling import (
-    SMALL,
-    SamplePoints,
-    as_samples,
-    check_basis,
-    check_finite,
-    later,
-    map_of,
-    middle,
-    require_enough,
-    require_steps,
-    require_times,
-    spreads,
-    values_at,
-)
+from ..functions.sampling import SamplePoints, later, require_times, values_at
 from ..invariants.expansions import at_larger_step, in_larger_box, larger_samples
 from .conditions import Conditions, at_samples, require_finite_conditions
-from .search import rows_of, weigh_conditions
+from .search import SymmetrySearch, rows_of
 from .symmetry import Symmetries
 
-# A step that moves the samples by less than this share of their spread is rounding.
-_NO_STEP = 1e-13
+_NO_STEP = 1e-13  # A step that moves the samples by less, relative to their spread, is rounding
 
 
 @checked_keywords
@@ -121,32 +99,32 @@ def find_symmetries(
     if tolerance is not None:
         tolerance = fraction("tolerance", tolerance)
     check_system(system, "find_symmetries")
-    one_step = map_of("find_symmetries", system, settings)
-    samples, h = as_samples(samples, one_step.t0), check_step_size(h)
+    one_step = sampling.map_of("find_symmetries", system, settings)
+    samples, h = sampling.as_samples(samples, one_step.t0), sampling.check_step_size(h)
     shape = samples.q.shape[1:]
     bound = bind_basis(basis, shape)
     gauge_basis = bind_basis(_default_gauges(basis, shape) if gauges is None else gauges, shape)
     user_bases = (bound,) if gauges is None else (bound, gauge_basis)
     require_times(any(basis.uses_time for basis in user_bases), samples)
-    centre = middle(samples, max(gauge_basis.complexity))
+    centre = sampling.middle(samples, max(gauge_basis.complexity))
     bound, gauge_basis = bound.recentre(centre, exactly=True)[0], gauge_basis.recentre(centre)[0]
     n = int(np.prod(shape, dtype=int))
-    require_enough(samples, (2 * n + bool(time)) * bound.size, 2 * n)
-    require_enough(samples, gauge_basis.size, 1 + 2 * n)
+    sampling.require_enough(samples, (2 * n + bool(time)) * bound.size, 2 * n)
+    sampling.require_enough(samples, gauge_basis.size, 1 + 2 * n)
     equations = one_step.equations(system, samples)
     for functions in (bound,) if gauges is None else (bound, gauge_basis):
         values = values_at(functions, samples)
-        check_finite(functions, values)
-        check_basis(functions, typical_sizes(values)[1][:, None] * values)
-    bases = bound.without_names(), gauge_basis.without_names()
+        sampling.check_finite(functions, values)
+        sampling.check_basis(functions, typical_sizes(values)[1][:, None] * values)
+    unnamed_bases = bound.without_names(), gauge_basis.without_names()
 
     def conditions(shifts, points=samples, step=h, order=order):
-        arrays = at_samples(equations, jnp.asarray(step), *bases, order, points, shifts)
+        arrays = at_samples(equations, jnp.asarray(step), *unnamed_bases, order, points, shifts)
         return Conditions(*map(np.asarray, arrays))
 
     shifts = later(h)
     raw = conditions(shifts)
-    require_steps(raw.good[:, 0] == 1, samples)
+    sampling.require_steps(raw.good[:, 0] == 1, samples)
     require_finite_conditions(raw)
     relative = raw.displacements(samples).relative_step
     if relative < _NO_STEP:
@@ -154,16 +132,16 @@ def find_symmetries(
             f"one step must change the samples by at least {_NO_STEP:g} times their spread, got "
             f"{relative:.0e} for h = {h:g}: take a larger |h|, or samples away from equilibria."
         )
-    if relative < SMALL and np.ptp(samples.t) == 0:
+    if relative < sampling.SMALL and np.ptp(samples.t) == 0:
         shifts = later(h, relative)
         raw = conditions(shifts)
     require_times(raw.depends_on_time(samples, h, shifts[-1]), samples, "the map")
     gauge_places = _independent_gauges(gauge_basis, raw, samples, h)
-    gauge_basis = gauge_basis.select(gauge_places)
+    bases = bound, gauge_basis.select(gauge_places)
 
     def search(raw, points=samples, step=h):
         raw = raw._replace(gauge=raw.gauge[..., gauge_places])
-        return weigh_conditions(raw, points, step, bool(time), bound, gauge_basis, tolerance)
+        return SymmetrySearch(raw, points, step, bool(time), bases, tolerance)
 
     original = search(raw)
     symmetries = original.result()
@@ -191,8 +169,7 @@ def find_symmetries(
 
 def _default_gauges(basis: AbstractBasis, shape: tuple[int, ...]) -> AbstractBasis:
     """The functions times 1 and the coordinates, all quadratic polynomials, and t."""
-    uses_time = bind_basis(basis, shape).uses_time
-    variables = coordinate_names(shape) + (("t",) if uses_time else ())
+    variables = coordinate_names(shape) + ("t",) * bind_basis(basis, shape).uses_time
 
     def products(basis):
         match basis:
@@ -213,11 +190,9 @@ def _default_gauges(basis: AbstractBasis, shape: tuple[int, ...]) -> AbstractBas
 _CLOCK = Basis({TIME[0]: lambda q, p, t: t})
 
 
-def _independent_gauges(
-    basis: BoundBasis, raw: Conditions, samples: SamplePoints, h: float
-) -> np.ndarray:
+def _independent_gauges(basis: BoundBasis, raw: Conditions, samples: SamplePoints, h: float):
     """Numbers of the gauge functions that are not constant and do not depend on simpler ones."""
-    units = np.append(abs(h), spreads(samples))
+    units = np.append(abs(h), sampling.spreads(samples))
     typical = typical_sizes(values_at(basis, samples))[0]
     rows = raw.gauge[~samples.held_out, 0] * units[:, None]
     rows = rows / np.where(typical > 0, typical, abs(h))

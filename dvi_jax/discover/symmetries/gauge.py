@@ -17,21 +17,15 @@ from ...problem.system import System, check_system
 from ..algebra.echelon import reduction
 from ..algebra.nullspace import series_changes, solve_series
 from ..algebra.taylor import taylor_coefficients
+from ..functions import sampling
 from ..functions.basis import AbstractBasis, BoundBasis, bind_basis, check_step_size
 from ..functions.generators import Generator, LatticePoint
-from ..functions.sampling import (
-    Displacements,
-    as_samples,
-    require_enough,
-    require_steps,
-    require_times,
-)
+from ..functions.sampling import Displacements
 from .noether import noether_identity
 
 _ROUNDINGS = 64.0  # An identity below so many roundings of its terms is zero
 _UNCLEAR = 1e-6  # Where rounding makes a larger residual, it does not decide whether a gauge exists
-# A sample is compared with itself where the identity is so many times larger than at 75 %.
-_STRONG = 100.0
+_STRONG = 100.0  # An identity so many times larger than at 75 % of the samples is its own scale
 
 
 class BasisGauge(eqx.Module):
@@ -133,7 +127,7 @@ def solve_gauge(
     **Source** our own; the identities: the paper, (25) and (28).
     """
     check_system(system, "solve_gauge")
-    samples = as_samples(samples, t0)
+    samples = sampling.as_samples(samples, t0)
     single = isinstance(generators, Generator)
     if single or len(generators) == 0:
         raise ValueError(
@@ -141,13 +135,13 @@ def solve_gauge(
             f"{'a Generator: give [generator]' if single else 'an empty list'}."
         )
     bound, h = bind_basis(basis, samples.q.shape[1:]), check_step_size(h)
-    require_enough(samples, bound.size)
-    require_times(bound.uses_time, samples)
+    sampling.require_enough(samples, bound.size)
+    sampling.require_times(bound.uses_time, samples)
     held_out, order = samples.held_out, len(generators) - 1
     equations = Equations(system, jnp.zeros(()), args)
     arrays = _identity_terms(equations, h, list(generators), bound, samples)
     terms, sizes, displacement, good = map(np.asarray, arrays)
-    require_steps(good, samples)
+    sampling.require_steps(good, samples)
     n, changes, size = terms[:, :, 0], terms[:, :, 1:] / h, bound.size
     largest = np.max(np.abs(n), axis=1)
     scale = _scale(largest, sizes)
@@ -171,11 +165,8 @@ def solve_gauge(
 
 
 def _scale(n: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Scale of the residual of each sample, shape (S,): the largest identity without gauges, or
-    its own where that is far larger than at nearly all samples.
-
-    `n`: the identity without gauges; `sizes`: of its terms before they cancel.
-    """
+    """Scale of the residual of each sample, shape (S,): the largest identity `n` without gauges, or
+    its own where that is far larger than at most; `sizes`: of its terms before they cancel."""
     if np.mean(n <= _ROUNDINGS * np.finfo(float).eps * sizes) > 0.95:
         n = sizes  # the identity closes by itself: n is rounding
     usual = n <= _STRONG * np.quantile(n, 0.75)
@@ -207,8 +198,7 @@ def _identity_terms(equations, h, generators, basis, samples):
             second, _ = next_point(epsilon)
             of_order = identities(epsilon, second, generators)
             total = sum(epsilon**m * N for m, N in enumerate(of_order))
-            change = basis(second.q, second.p, second.t) - basis(q, p, first.t)
-            return jnp.append(total, change)
+            return jnp.append(total, basis(second.q, second.p, second.t) - basis(q, p, first.t))
 
         second, good = next_point(zero)
 
@@ -228,8 +218,7 @@ def _identity_terms(equations, h, generators, basis, samples):
 
 
 def _times_weights(generator: Generator, first: LatticePoint, weights: Array) -> Generator:
-    """The generator with components times weights, at the first point and elsewhere, shape
-    (2, 2n + 1)."""
+    """The generator times weights (2, 2n + 1) of components, at the first point and elsewhere."""
 
     def component(place):
         def function(t, q, p, args):

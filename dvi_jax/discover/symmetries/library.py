@@ -81,9 +81,8 @@ def boost(direction: Any, mass: Any = 1.0) -> Generator:
     """
     masses = _array("mass", mass, "positive for every body", lambda masses: (masses > 0).all())
     velocity = _direction(direction)
-    return Generator(
-        xi=eqx.Partial(_boost, velocity, None), eta=eqx.Partial(_boost, velocity, masses)
-    )
+    xi, eta = (eqx.Partial(_boost, velocity, mass) for mass in (None, masses))
+    return Generator(xi=xi, eta=eta)
 
 
 def hamiltonian_flow(function: Callable[..., Any]) -> Generator:

@@ -1,36 +1,13 @@
 """The linear algebra of a search for symmetries: null series, their kinds and representatives."""
 
-from dataclasses import dataclass
-
 import jax.numpy as jnp
 import numpy as np
 
+from ..algebra import nullspace
 from ..algebra.echelon import reduced_echelon, reduction
-from ..algebra.motion import (
-    FieldMotion,
-    coefficient_errors,
-    conserved_series,
-    relative_changes,
-    typical_sizes,
-)
-from ..algebra.nullspace import (
-    HELD_OUT,
-    NULL,
-    RANK,
-    SeriesSpace,
-    by_leading,
-    compress,
-    in_units_of,
-    null_space,
-    orthonormal_range,
-    series_changes,
-    series_spaces,
-    singular_vectors,
-    solve_series,
-    toeplitz,
-    triangle,
-)
-from ..algebra.weighing import WeightedConditions, of_orthonormal, times_weights, weigh
+from ..algebra.motion import FieldMotion, coefficient_errors, conserved_series, relative_changes
+from ..algebra.nullspace import NULL, by_leading, compress, in_units_of, singular_vectors
+from ..algebra.weighing import of_orthonormal, times_weights, typical_sizes, weigh
 from ..functions.basis import BoundBasis
 from ..functions.families import coordinate_names
 from ..functions.generators import Generator
@@ -42,55 +19,13 @@ from .gauge import BasisGauge
 from .symmetry import Symmetries, Symmetry
 from .units import Units
 
+Bases = tuple[BoundBasis, BoundBasis]  # Of the components of fields, and of the gauges
+
 _NEARLY = 1e-8  # Noether's identity has to close to this at least
 _SMALLEST = 1e-4  # Terms of a sample are at least this fraction of the median of all samples
 _TINY = 1e-12  # Coefficients whose share of a generator is below this are round-off
 
 
-def weigh_conditions(
-    raw: Conditions, samples: SamplePoints, h: float, time: bool, basis, gauge_basis, tolerance
-) -> "SymmetrySearch":
-    """The conditions without units, in orthonormal functions: what a search looks for is null."""
-    held_out = samples.held_out
-    units = Units.from_samples(raw, samples, h, time)
-    motion, determining = units.determining(raw)
-    conditions = weigh(raw.values[:, 0, 0], determining, motion, ~held_out, in_sizes=False)
-    # What rounding hides, as a share of what fields typically change by.
-    rounding = np.median(1 / (conditions.weights * conditions.motion.typical()))
-    identity, gauge = units.closing(raw)
-    size = typical_sizes(rows_of(gauge[:, 0]))[0]
-    gauge_units = np.where(size > 0, size, 1.0)
-    gauge = gauge / gauge_units
-    # Every sample counts alike, however strong its kick.
-    terms = of_orthonormal(identity, conditions.units, conditions.R)
-    size = np.sqrt(np.sum(terms[:, 0] ** 2, axis=(1, 2, 3, 4)))
-    size = np.hypot(np.where(size > 0, size, 1.0), np.linalg.norm(gauge[:, 0], axis=(1, 2)))
-    identity, terms, gauge = (
-        in_units_of(conditions.scale, times_weights(x, 1 / size)) for x in (identity, terms, gauge)
-    )
-    gauge_rows = rows_of(gauge[~held_out, 0])
-    return SymmetrySearch(
-        raw=raw,
-        basis=basis,
-        gauge_basis=gauge_basis,
-        shape=samples.q.shape[1:],
-        held_out=held_out,
-        tolerance=tolerance,
-        units=units,
-        conditions=conditions,
-        motion=motion,
-        determining=in_units_of(conditions.scale, determining),
-        identity=identity.sum(axis=2),
-        identity_parts=identity[:, 0],
-        identity_terms=terms.sum(axis=2),
-        gauge=gauge,
-        gauge_units=gauge_units,
-        R_gauge=triangle(gauge_rows) / np.sqrt(len(gauge_rows)),
-        null=tolerance or NULL * max(1.0, float(rounding)),
-    )
-
-
-@dataclass(frozen=True)
 class SymmetrySearch:
     """The linear algebra: unknowns are shares of orthonormal functions, rows without units.
 
@@ -105,23 +40,35 @@ class SymmetrySearch:
     - `null`: the largest relative singular value of a null vector.
     """
 
-    raw: Conditions
-    basis: BoundBasis
-    gauge_basis: BoundBasis
-    shape: tuple[int, ...]
-    held_out: np.ndarray
-    tolerance: float | None
-    units: Units
-    conditions: WeightedConditions[FieldMotion]
-    motion: FieldMotion
-    determining: np.ndarray
-    identity: np.ndarray
-    identity_parts: np.ndarray
-    identity_terms: np.ndarray
-    gauge: np.ndarray
-    gauge_units: np.ndarray
-    R_gauge: np.ndarray
-    null: float
+    def __init__(
+        self, raw: Conditions, samples: SamplePoints, h: float, time: bool, bases: Bases, tolerance
+    ):
+        self.raw, self.shape, self.tolerance = raw, samples.q.shape[1:], tolerance
+        self.basis, self.gauge_basis = bases
+        self.held_out, self.units = samples.held_out, Units.from_samples(raw, samples, h, time)
+        self.motion, determining = self.units.determining(raw)
+        values, fit = raw.values[:, 0, 0], ~self.held_out
+        self.conditions = weigh(values, determining, self.motion, fit, in_sizes=False)
+        # What rounding hides, as a share of what fields typically change by.
+        rounding = np.median(1 / (self.conditions.weights * self.conditions.motion.typical()))
+        self.null = self.tolerance or NULL * max(1.0, float(rounding))
+        identity, gauge = self.units.closing(raw)
+        size = typical_sizes(rows_of(gauge[:, 0]))[0]
+        self.gauge_units = np.where(size > 0, size, 1.0)
+        gauge = gauge / self.gauge_units
+        # Every sample counts alike, however strong its kick.
+        terms = of_orthonormal(identity, self.conditions.units, self.conditions.R)
+        size = np.sqrt(np.sum(terms[:, 0] ** 2, axis=(1, 2, 3, 4)))
+        size = np.hypot(np.where(size > 0, size, 1.0), np.linalg.norm(gauge[:, 0], axis=(1, 2)))
+        scale = self.conditions.scale
+        identity, terms, self.gauge = (
+            in_units_of(scale, times_weights(x, 1 / size)) for x in (identity, terms, gauge)
+        )
+        self.determining = in_units_of(scale, determining)
+        self.identity, self.identity_parts = identity.sum(axis=2), identity[:, 0]
+        self.identity_terms = terms.sum(axis=2)
+        gauge_rows = rows_of(self.gauge[fit, 0])
+        self.R_gauge = nullspace.triangle(gauge_rows) / np.sqrt(len(gauge_rows))
 
     @property
     def order(self) -> int:
@@ -137,7 +84,7 @@ class SymmetrySearch:
         """The number of coordinates q."""
         return len(self.units.rows) // 2
 
-    def spaces(self) -> list[SeriesSpace]:
+    def spaces(self) -> list[nullspace.SeriesSpace]:
         """The null spaces of the determining equations, order by order."""
         motion, terms = self.conditions.motion, self._unknowns(self.conditions.terms)
 
@@ -151,8 +98,8 @@ class SymmetrySearch:
             later = np.hstack(judge(later @ first, later @ free)[:2])
             return leading, np.vstack([np.zeros((self.size, later.shape[1])), later]), unclear
 
-        rows = np.moveaxis(times_weights(terms, self.conditions.weights), 1, 2)
-        return series_spaces(compress(rows_of(rows[~self.held_out])), judge, self.tolerance)
+        rows = np.moveaxis(times_weights(terms, self.conditions.weights), 1, 2)[~self.held_out]
+        return nullspace.series_spaces(compress(rows_of(rows)), judge, self.tolerance)
 
     def result(self) -> Symmetries:
         """The symmetries, in as few functions as can be."""
@@ -179,9 +126,8 @@ class SymmetrySearch:
                 else:
                     symmetries.append(symmetry)
         if self.tolerance is None:
-            unclear = rejections + max(space.unclear for space in spaces)
             count = self.conditions.motion.unclear_count() - spaces[0].leading.shape[1]
-            unclear += max(count, 0)
+            unclear = rejections + max(space.unclear for space in spaces) + max(count, 0)
         return Symmetries(
             found=tuple(symmetries),
             survivors=tuple(space.leading.shape[1] for space in spaces),
@@ -210,14 +156,14 @@ class SymmetrySearch:
         terms = np.moveaxis(terms, 1, 2)
 
         def conditions(index):
-            matrix = toeplitz(compress(rows_of(terms[index])), self.order)
+            matrix = nullspace.toeplitz(compress(rows_of(terms[index])), self.order)
             blocks = matrix.reshape(len(matrix), orders, terms.shape[-1])
             of_series, of_gauge = blocks[:, :, :size], blocks[:, :, size:]
             of_series = of_series.reshape(len(matrix), orders * size) @ null
             return np.hstack([of_series, of_gauge.reshape(len(matrix), -1)])
 
         fit = conditions(~self.held_out)
-        columns = null_space(fit, self.tolerance, limit=limit).columns
+        columns = nullspace.null_space(fit, self.tolerance, limit=limit).columns
         if columns.shape[1]:
             # A vector can be null only because its leading-order term is small, therefore the
             # leading-order terms are made orthonormal; then all samples have to take it for null.
@@ -225,7 +171,7 @@ class SymmetrySearch:
             rows = np.vstack([fit, conditions(self.held_out)])
             norm = max(np.linalg.norm(rows, 2), np.finfo(float).tiny)
             singular, V = singular_vectors(rows @ columns / norm)
-            columns = columns @ V[singular <= HELD_OUT * limit].T
+            columns = columns @ V[singular <= nullspace.HELD_OUT * limit].T
         # No gauge closes the identity of X = 0: constants have been left out.
         return null @ columns[:count], columns[count:]
 
@@ -238,9 +184,10 @@ class SymmetrySearch:
         return self._simplest(columns @ first, columns @ shifts)
 
     def _representatives(self, space, excluded_series, free) -> np.ndarray:
-        """One series for each leading-order term of a space without those of excluded series, the
-        simplest up to free ones."""
-        basis, leading = orthonormal_range(excluded_series[: self.size]), space[: self.size]
+        """The simplest series, up to free ones, for each leading-order term of a space, without
+        those of excluded series."""
+        basis = nullspace.orthonormal_range(excluded_series[: self.size])
+        leading = space[: self.size]
         first, _ = by_leading(leading - basis @ (basis.T @ leading))
         _, shifts = by_leading(leading)
         free = np.hstack([self.conditions.shares(free), self.conditions.shares(space @ shifts)])
@@ -260,7 +207,7 @@ class SymmetrySearch:
             values = self.raw.values[self._sparse, 0, 0]
             rows.append(np.einsum("sb,mbk->smk", values, c[:, 0]).reshape(-1, series.shape[1]))
         singular, V = singular_vectors(np.concatenate(rows) / np.sqrt(len(slopes)))
-        return series @ V[singular <= RANK].T
+        return series @ V[singular <= nullspace.RANK].T
 
     @property
     def _sparse(self) -> slice:
@@ -292,20 +239,20 @@ class SymmetrySearch:
         largest = np.argmax(np.round(np.abs(sizes) / np.max(np.abs(sizes)), 6))
         scale = 1 / sizes.ravel()[largest]
         x = x * scale
-        identity = series_changes(self._unknowns(self.identity), x.reshape(-1, 1))[..., 0]
+        identity = nullspace.series_changes(self._unknowns(self.identity), x.reshape(-1, 1))[..., 0]
         if variational:
             g = vector[orders * self.size :].reshape(orders, self.gauge_basis.size)
             g = np.where(np.abs(g) > (smallest if self.null > NULL else 0), g, 0.0) * scale
         else:
             g = self._best_gauge(identity)
-        identity = identity + series_changes(self.gauge, g.reshape(-1, 1))[..., 0]
+        identity = identity + nullspace.series_changes(self.gauge, g.reshape(-1, 1))[..., 0]
         motion, determining = self.motion.subset(held_out), self.determining[held_out]
         errors = coefficient_errors(self.conditions.terms[held_out])
         residuals = self._residuals(x, motion, determining, errors)
         identity_residuals = self._relative(identity, x[0])
         c = x * self.units.components[:, None]
         c, g = (in_units_of(1 / self.conditions.scale, x, axis=0) for x in (c, g))
-        generators = tuple(self._generator(x) for x in c)
+        generators = tuple(map(self._generator, c))
         gauges = tuple(BasisGauge(self.gauge_basis, jnp.asarray(x / self.gauge_units)) for x in g)
         return Symmetry(
             generators=generators,
@@ -328,16 +275,14 @@ class SymmetrySearch:
         n, shape = self.n, (*self.shape, -1)
         xi0 = c[0] if len(c) > 2 * n else np.zeros(self.basis.size)
         parts = xi0, c[-2 * n : -n].reshape(shape), c[-n:].reshape(shape)
-        return Generator(
-            *(BasisGauge(self.basis, jnp.asarray(x)) if x.any() else None for x in parts)
-        )
+        fields = (BasisGauge(self.basis, jnp.asarray(x)) if x.any() else None for x in parts)
+        return Generator(*fields)
 
     def _best_gauge(self, identity) -> np.ndarray:
         """The gauge that closes the identity best on the fitted samples."""
-        terms, right = (
-            rows_of(np.moveaxis(x[~self.held_out], 1, 2)) for x in (self.gauge, -identity)
-        )
-        return solve_series(terms, right)[0].reshape(self.order + 1, self.gauge_basis.size)
+        arrays = (x[~self.held_out] for x in (self.gauge, -identity))
+        series, _ = nullspace.solve_series(*(rows_of(np.moveaxis(x, 1, 2)) for x in arrays))
+        return series.reshape(self.order + 1, self.gauge_basis.size)
 
     def _residuals(self, x, motion: FieldMotion, determining, errors) -> np.ndarray:
         """The residuals of a field in the determining equations, by the measure of `FieldMotion`,
@@ -349,10 +294,8 @@ class SymmetrySearch:
         return relative_changes(terms, series, motion, size, size * errors)
 
     def powers(self, symmetries: Symmetries, raw: Conditions, factors: np.ndarray) -> np.ndarray:
-        """The powers of the samples' size by which residuals grow, see `growth`.
-
-        `raw`: the conditions at the larger samples; `factors`: by what these are larger.
-        """
+        """The powers of the samples' size by which residuals grow, see `growth`; `raw`: the
+        conditions at the larger samples; `factors`: by what these are larger."""
         motion, determining = self.units.determining(raw)
         finite = [np.isfinite(x.reshape(len(x), -1)).all(axis=1) for x in (determining, *motion)]
         good = (raw.good[:, 0] == 1) & np.all(finite, axis=0)
@@ -360,15 +303,8 @@ class SymmetrySearch:
         def changes(index):
             terms = determining[index]
             errors = coefficient_errors(terms @ self.conditions.orthonormal)
-            residuals = [
-                self._residuals(
-                    s.coefficients / self.units.components[:, None],
-                    motion.subset(index),
-                    terms,
-                    errors,
-                )
-                for s in symmetries
-            ]
+            units, data = self.units.components[:, None], (motion.subset(index), terms, errors)
+            residuals = [self._residuals(s.coefficients / units, *data) for s in symmetries]
             return np.quantile(np.array(residuals)[:, :, 0], 0.95, axis=1)
 
         typical = np.array([s.typical_residuals[0, 1] for s in symmetries])
@@ -384,11 +320,8 @@ class SymmetrySearch:
         return np.max(np.abs(identity[self.held_out]), axis=2) / sizes[:, None]
 
     def _depends(self, c, simpler: list[Symmetry]) -> bool:
-        """Whether X_0 is a combination of simpler ones, with invariants for coefficients.
-
-        Invariants have one value at both points of a pair: the vectors at both, as one vector,
-        are then dependent.
-        """
+        """Whether X_0 is a combination of simpler ones, with invariants for coefficients: the
+        vectors at both points of a pair, as one vector, are then dependent."""
         leading = np.stack([*(s.coefficients[0] for s in simpler if not s.is_dependent), c[0]])
         shares = leading / self.units.components[:, None]
         vectors = np.einsum("sjb,kcb->skjc", self.raw.values[self._sparse, 0], shares)

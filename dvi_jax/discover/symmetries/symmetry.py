@@ -115,9 +115,8 @@ def _shares(coefficients: np.ndarray, scale: float, sizes: np.ndarray | None) ->
 
 def _series(basis: BoundBasis, coefficients: np.ndarray) -> str:
     """c_0·φ + ε (c_1·φ) + … as text; orders that are zero are left out."""
-    return in_powers_of_epsilon(
-        basis.formula(block, drop=0.0) if block.any() else "" for block in coefficients
-    )
+    texts = (basis.formula(block, drop=0.0) if block.any() else "" for block in coefficients)
+    return in_powers_of_epsilon(texts)
 
 
 class Symmetries(eqx.Module):

@@ -41,9 +41,8 @@ class Units:
     def determining(self, raw: Conditions) -> tuple[FieldMotion, np.ndarray]:
         """`FieldMotion` of the user's functions, and the determining equations, (S, z + 1, rows, C,
         B). All samples count alike, also where the derivatives of F are large."""
-        jacobian = (
-            raw.jacobian[:, 0][..., self.columns] * self.rows[:, None, None] * self.components
-        )
+        jacobian = raw.jacobian[:, 0][..., self.columns] * self.rows[:, None, None]
+        jacobian = jacobian * self.components
         motion = _motion(raw, jacobian, self.last_digit)
         size = np.max(motion.second, axis=1)
         size = np.where(size > 0, size, 1.0)
@@ -58,8 +57,7 @@ class Units:
 
 
 def _motion(raw: Conditions, jacobian: np.ndarray, last_digit: float) -> FieldMotion:
-    """Of the user's functions. `jacobian`: ∂F/∂z of both points, shape (S, 2n, 2, C), without
-    units; `last_digit`: see `Units`."""
+    """Of the user's functions. `jacobian`: ∂F/∂z of both points without units, (S, 2n, 2, C)."""
     values, later = raw.values[:, 0, 0], raw.values[:, 0, 1]
     places = raw.points[:, 0]
     slopes = raw.slopes[:, 0].swapaxes(1, 2)

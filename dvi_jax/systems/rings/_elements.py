@@ -7,7 +7,7 @@ from typing import Any, Literal, TypedDict, Unpack, get_args
 
 from ...base.checks import finite, instance, one_of, positive, whole
 from ...base.keywords import checked_keywords
-from ._maps import KICKS, Part
+from ._maps import KICKS, RingPart
 
 Model = Literal["paraxial", "exact"]
 C = 299792458.0
@@ -20,13 +20,13 @@ class Element:
 
     name: str
     kind: str
-    parts: tuple[Part, ...] = ()
+    parts: tuple[RingPart, ...] = ()
     values: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     def placed(self, dx: float = 0.0, dy: float = 0.0, roll: float = 0.0) -> "Element":
         """The element shifted by (dx, dy) [m], then rolled about its axis [rad]."""
         values = {"dx": dx, "dy": dy, "roll": roll}
-        return self.within(Part("placed_in"), Part("placed_out"), **values)
+        return self.within(RingPart("placed_in"), RingPart("placed_out"), **values)
 
     def inside(
         self, *, rectangle: Sequence[float] | None = None, ellipse: Sequence[float] | None = None
@@ -44,11 +44,11 @@ class Element:
                         f"{name} of element {self.name!r} must be ({', '.join(keys)}), got "
                         f"{limits!r}."
                     )
-                ends = Part(name), Part(name)
+                ends = RingPart(name), RingPart(name)
                 element = element.within(*ends, **dict(zip(keys, limits, strict=True)))
         return element
 
-    def within(self, first: Part, last: Part, **values: Any) -> "Element":
+    def within(self, first: RingPart, last: RingPart, **values: Any) -> "Element":
         """The element between two parts with parameters of their own."""
         return dataclasses.replace(
             self,
@@ -60,7 +60,7 @@ class Element:
 def drift(name: str, length: float, model: Model = "paraxial") -> Element:
     """A space without field."""
     one_of("model", model, get_args(Model))
-    part = Part("drift" if model == "paraxial" else "exact_drift")
+    part = RingPart("drift" if model == "paraxial" else "exact_drift")
     return Element(name, "drift", (part,), {"length": finite("length", length)})
 
 
@@ -108,11 +108,11 @@ def multipole(
     slices, scheme, fringe, model = _slicing(**options)
     values["length"] = finite("length", length)
     if length == 0:
-        return Element(name, kind, (Part("thin", order),), values)
-    body = Part("straight" if model == "paraxial" else "exact_straight", order, scheme, slices)
+        return Element(name, kind, (RingPart("thin", order),), values)
+    body = RingPart("straight" if model == "paraxial" else "exact_straight", order, scheme, slices)
     edge = "fringe" if model == "paraxial" else "multipole_fringe"
     has_edges = fringe and (model == "exact" or order > 0)
-    parts = (Part(f"{edge}_in", order), body, Part(f"{edge}_out", order))
+    parts = (RingPart(f"{edge}_in", order), body, RingPart(f"{edge}_out", order))
     return Element(name, kind, parts if has_edges else (body,), values)
 
 
@@ -160,19 +160,19 @@ def bend(
     slices, scheme, fringe, model = _slicing(**settings)
     if model == "exact" and angle != 0:
         ends = ["rotation", "dipole_fringe", *["gradient_fringe"] * fringe, "wedge"]
-        body = Part("exact_bend", order, scheme, slices)
+        body = RingPart("exact_bend", order, scheme, slices)
     else:
         ends = ["edge", *["fringe"] * (fringe and order > 0)]
-        body = Part("bend" if model == "paraxial" else "exact_straight", order, scheme, slices)
-    first = [Part(f"{end}_in", order) for end in ends]
-    last = [Part(f"{end}_out", order) for end in reversed(ends)]
+        body = RingPart("bend" if model == "paraxial" else "exact_straight", order, scheme, slices)
+    first = [RingPart(f"{end}_in", order) for end in ends]
+    last = [RingPart(f"{end}_out", order) for end in reversed(ends)]
     return Element(name, "bend", (*first, body, *last), values)
 
 
 def corrector(name: str, length: float, kick_x: float, kick_y: float) -> Element:
     """A dipole corrector with kicks of px and py [rad]."""
     values = {"length": length, "kick_x": kick_x, "kick_y": kick_y}
-    return Element(name, "corrector", (Part("corrector"),), values)
+    return Element(name, "corrector", (RingPart("corrector"),), values)
 
 
 def lens(name: str, potential: Callable[..., Any], **values: float) -> Element:
@@ -186,13 +186,13 @@ def lens(name: str, potential: Callable[..., Any], **values: float) -> Element:
     jnp.log(1 + x * x) / 2, g=1.6)``
     """
     values = {key: finite(f"{key} of lens {name!r}", value) for key, value in values.items()}
-    part = Part("lens", potential=instance("potential", potential, Callable, "a function"))
+    part = RingPart("lens", potential=instance("potential", potential, Callable, "a function"))
     return Element(name, "lens", (part,), {**values, "length": 0.0})
 
 
 def solenoid(name: str, length: float, ks: float) -> Element:
     """A solenoid with hard edges, ks = B/(Bρ) [1/m]."""
-    return Element(name, "solenoid", (Part("solenoid"),), {"length": length, "ks": ks})
+    return Element(name, "solenoid", (RingPart("solenoid"),), {"length": length, "ks": ks})
 
 
 def cavity(
@@ -212,8 +212,8 @@ def cavity(
     """
     values = {"length": length, "voltage": voltage, "lag": lag, "phase": phase, "slip": slip}
     values["wave_number"] = 2 * math.pi * frequency / C
-    half = Part("half_drift")
-    parts = (half, Part("cavity"), half) if length else (Part("cavity"),)
+    half = RingPart("half_drift")
+    parts = (half, RingPart("cavity"), half) if length else (RingPart("cavity"),)
     return Element(name, "cavity", parts, values)
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from ._maps import KICKS, Parameters, Part, Particle, Piece, field, near_identity
+from ._maps import KICKS, Parameters, Particle, Piece, RingPart, field, near_identity
 
 
 def pz_of(z: Particle, px: Any = None) -> Any:
@@ -157,7 +157,7 @@ def _second_order_kick(z: Particle, length: Any, par: Parameters, order: int) ->
     )
 
 
-def second_order_bend(part: Part) -> list[Piece]:
+def second_order_bend(part: RingPart) -> list[Piece]:
     kicks, order = KICKS[part.scheme], part.order
     coasts = [(a + b) / 2 for a, b in zip((0.0, *kicks), (*kicks, 0.0), strict=True)]
 

@@ -29,7 +29,7 @@ Parameters = Mapping[str, Any]
 """The parameters of one element by name; see `Ring`."""
 
 
-class Part(NamedTuple):
+class RingPart(NamedTuple):
     """A part of an element: the name of its map, the order of its field, the order of the scheme
     in each of its slices, the potential of a lens."""
 
@@ -40,7 +40,7 @@ class Part(NamedTuple):
     potential: Callable[..., Any] | None = None
 
 
-def distinct(parts: Iterable[Part]) -> list[Part]:
+def distinct(parts: Iterable[RingPart]) -> list[RingPart]:
     """The different parts, sorted; lenses in the order in which they are given."""
     return sorted(dict.fromkeys(parts), key=lambda part: part[:4])
 
@@ -112,7 +112,7 @@ _Y = (0.784513610477560, 0.235573213359357, -1.17767998417887)
 KICKS = {2: (1.0,), 4: (_FR, 1 - 2 * _FR, _FR), 6: (*_Y, 1 - 2 * sum(_Y), *reversed(_Y))}
 
 
-def drifts_and_kicks(coast: Callable, kick: Callable, part: Part) -> list[Piece]:
+def drifts_and_kicks(coast: Callable, kick: Callable, part: RingPart) -> list[Piece]:
     """``coast(z, length, par)`` and ``kick(z, length, par, order)`` by turns in each slice. The two
     coasts between slices are one; half a coast before the first slice and after the last completes
     them."""

@@ -4,7 +4,7 @@ import functools
 from collections.abc import Callable
 
 from . import _exact as exact, _maps as maps
-from ._maps import Part, Piece
+from ._maps import RingPart, Piece
 
 
 def _flow(move: Callable) -> list[Piece]:
@@ -29,7 +29,7 @@ def _exact_fringe(side: int, order: int, skips_b0: bool) -> list[Piece]:
     return _near_identity_map(lambda z, par: exact.multipole_fringe(z, par, side, order, skips_b0))
 
 
-Make = Callable[[Part], list[Piece]]
+Make = Callable[[RingPart], list[Piece]]
 
 
 def _ends(side: str, sign: int) -> dict[str, Make]:
@@ -77,7 +77,7 @@ _MAPS: dict[str, Make] = {
 
 
 @functools.cache
-def pieces_of(part: Part) -> tuple[Piece, ...]:
+def pieces_of(part: RingPart) -> tuple[Piece, ...]:
     """The maps of a part; none of an aperture, which does not move a particle."""
     make = _MAPS.get(part.name)
     return () if make is None else tuple(make(part))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ._elements import C, Element, bend, cavity, corrector, drift, multipole, solenoid
-from ._maps import Part
+from ._maps import RingPart
 from ._ring import Ring
 
 # Our (x, px, y, py, ζ, δ) is _ORDER @ (x, px, y, py, δ, ct) of pyAT.
@@ -136,7 +136,7 @@ def _with_placement(element: Element, source: Any) -> Element:
     if all(np.array_equal(x, y) for x, y in zip(values, _placement(None), strict=True)):
         return element
     names = "matrix_in", "shift_in", "matrix_out", "shift_out"
-    ends = Part("affine_in"), Part("affine_out")
+    ends = RingPart("affine_in"), RingPart("affine_out")
     return element.within(*ends, **dict(zip(names, values, strict=True)))
 
 
@@ -226,7 +226,7 @@ def _matrix(source, energy, period, edge):
     R1, T1, R2, T2 = _placement(source)
     M = R2 @ _ORDER @ source.M66 @ _ORDER.T
     values = {"length": source.Length, "matrix_in": M @ R1, "shift_in": M @ T1 + T2}
-    return Element(source.FamName, "matrix", (Part("affine_in"),), values)
+    return Element(source.FamName, "matrix", (RingPart("affine_in"),), values)
 
 
 _MAKERS = {
@@ -245,7 +245,7 @@ _MAKERS = {
     "AperturePass": lambda source, *_: Element(
         source.FamName,
         "aperture",
-        (Part("rectangle"),),
+        (RingPart("rectangle"),),
         dict(zip(("x_min", "x_max", "y_min", "y_max"), source.Limits, strict=True), length=0.0),
     ),
 }

@@ -15,7 +15,7 @@ from lanewise.jaxprs.jaxapi import is_traced
 from ...base.checks import instance, positive, whole
 from ...base.precision import require_double
 from ._elements import C, Element
-from ._maps import Part, distinct
+from ._maps import RingPart, distinct
 
 Where = str | int | Sequence[int]
 
@@ -27,7 +27,7 @@ class RingStructure(eqx.Module):
     kinds: tuple[str, ...] = eqx.field(static=True)
     parameters: tuple[frozenset[str], ...] = eqx.field(static=True)
     """The parameters of each element."""
-    parts: tuple[Part, ...] = eqx.field(static=True)
+    parts: tuple[RingPart, ...] = eqx.field(static=True)
     """The different parts."""
     rows: tuple[tuple[int, int], ...] = eqx.field(static=True)
     """(number of the part, number of the element), in the order of passage."""

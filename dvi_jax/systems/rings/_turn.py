@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 import lanewise
 
-from ._maps import APERTURES, Part, Particle, forward, pull_back
+from ._maps import APERTURES, Particle, RingPart, forward, pull_back
 from ._parts import pieces_of
 from ._ring import Ring
 
@@ -82,7 +82,7 @@ class Passage(eqx.Module):
     rows: Rows
     slopes: Rows
     numbers: Rows
-    parts: tuple[Part, ...] = eqx.field(static=True)
+    parts: tuple[RingPart, ...] = eqx.field(static=True)
 
     @classmethod
     def from_ring(cls, ring: Ring) -> "Passage":
