@@ -30,6 +30,7 @@ NUMBERS = (-1e3, 1e3), (1e-300, 1e-3), (-1e-3, -1e-300), (1e3, 1e15)
 POSITIVE = (1e-300, 1e300), (0.2, 4.0), (1.0, 1 + 1e-9)
 EXPONENTS = (-700.0, 700.0), (-40.0, 40.0), (-2.0, 2.0), (1e-300, 1e-3), (-1e-3, -1e-300)
 
+POWERS = (-24.0, -3.0, -1.5, -0.5, 0.3, 0.5, 2.5, 7.0, 65.0)
 mp = mpmath.mp
 FUNCTIONS = {
     "exp": (jnp.exp, mp.exp, EXPONENTS),
@@ -53,7 +54,7 @@ FUNCTIONS = {
     "acos": (jnp.arccos, mp.acos, ((-0.9999, 0.9999), (0.99, 1 - 1e-12), (1e-300, 1e-3))),
     **{
         f"power {y}": (lambda x, y=y: jax.lax.pow(x, y), lambda x, y=y: x**y, POSITIVE)
-        for y in (-24.0, -3.0, -1.5, -0.5, 0.3, 0.5, 2.5, 7.0, 65.0)
+        for y in POWERS
     },
     "a whole power": (lambda x: x**-7, lambda x: x**-7, POSITIVE),
 }  # fmt: skip
@@ -118,7 +119,7 @@ def largest_share(name, way, count):
     function, reference, ranges = CASES[name]
     x = arguments(ranges, count)
     claim = claims(function, x, way)
-    with mpmath.workprec(2200):  # large arguments, and differences of numbers near each other
+    with mpmath.workprec(200):
         pairs = zip(computed(function, x, way), x, claim, strict=True)
         shares = [
             float(abs(mp.mpf(float(y)) - reference(mp.mpf(float(v)))) / mp.mpf(c))
@@ -129,7 +130,7 @@ def largest_share(name, way, count):
     return max(shares)
 
 
-QUICK = "log1p", "sinh", "tanh", "power -1.5", "exp(x) exp(y)", "quotients"
+QUICK = "log1p", "sinh", "tanh", "power -3.0", "exp(x) exp(y)", "quotients"
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -138,12 +139,16 @@ def test_an_error_is_at_most_its_claim(name, way):
     assert 0.01 < largest_share(name, way, 40) <= 1
 
 
+TIGHT = "sqrt", "inverse", "rsqrt", "a whole power", *(f"power {y}" for y in POWERS), *REWRITTEN
+"""Cases with operations that are rounded to nearest, whose errors reach their bounds."""
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("name", CASES)
 def test_an_error_is_at_most_its_claim_at_many_points(name, way):
-    """0.7 and not 1: the errors of other points may be larger."""
-    assert largest_share(name, way, 1500) <= 0.7
+    """Half of it for elementary functions: the errors of other points may be larger."""
+    assert largest_share(name, way, 400) <= (1 if name in TIGHT else 0.5)
 
 
 @pytest.mark.slow
@@ -155,6 +160,18 @@ def test_xla_has_the_functions_of_pairs_of_the_machine_code(name):
 
 
 # --- the controls --------------------------------------------------------------------------------
+
+
+def test_a_negative_power_in_machine_code_has_more_error_than_a_quotient():
+    """The claim for 1/x³ is false for x**-3, which is (1/x)³ in machine code."""
+    x = arguments(((0.2, 4.0),), 1000)
+    claim = claims(lambda x: 1 / (x * x * x), x, "machine code")
+    values = computed(lambda x: x**-3, x, "machine code")
+    with mpmath.workprec(200):
+        pairs = zip(values, x, strict=True)
+        errors = [float(abs(mp.mpf(float(y)) - mp.mpf(float(v)) ** -3)) for y, v in pairs]
+    assert (np.array(errors) > claim).any()
+    assert (errors <= claims(lambda x: x**-3, x, "machine code")).all()
 
 
 @pytest.mark.parametrize("name", ["log1p", "cosh", "tanh", "exp(x) exp(y)"])

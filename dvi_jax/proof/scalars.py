@@ -150,7 +150,9 @@ class ProgramNumber:
         """selfⁿ: n − 1 products."""
         if n < 1:
             unit = self.program.constant(1.0)
-            return unit / self.power(-n) if n else unit
+            result = unit / self.power(-n) if n else unit
+            # The machine code computes (1/x)ⁿ, in which the error of 1/x counts n times.
+            return result.inexact(-n - 1) if n < -1 and result.value is None else result
         if n == 1:
             return self
         square = (self * self).power(n // 2)
