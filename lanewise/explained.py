@@ -103,8 +103,10 @@ def left_to_xla(function: Callable, *args: Any, batch: int = 1024) -> str | None
         return f"the variable {SWITCH} is off, or LLVM did not start"
     jaxpr = jax.make_jaxpr(function)(*args).jaxpr
     for program in _calls(jaxpr):
+        # Without the pieces of `_parts`: a program that is cut is in part computed by XLA.
+        flags = [True] * len(program.trace.all_inputs.jaxpr.invars)
         try:
-            flags = [True] * len(program.trace.all_inputs.jaxpr.invars)
+            # This writes the code and does not compile it, which would take seconds.
             compile_program(program, flags, batch, "cpu")
         except NotCompilable as reason:
             return str(reason)
