@@ -14,7 +14,7 @@ from .jaxprs.jaxapi import jaxprs_in_params
 from .jaxprs.traced import Trace
 from .llvm.ir import NotCompilable
 from .native import handler, machine
-from .primitive import AUTO, Callee, Layout, pieces_of
+from .primitive import AUTO, SWITCH, Callee, Layout, generates, pieces_of
 from .targets import compile_program
 
 
@@ -92,6 +92,25 @@ def explain(
     # Without a call in it, the function is explained as if it were called.
     programs = _calls(trace.closed_jaxpr.jaxpr) or [Callee(trace, layout)]
     return Explanation(tuple(part for program in programs for part in _parts(program, batch)))
+
+
+def left_to_xla(function: Callable, *args: Any, batch: int = 1024) -> str | None:
+    """Why XLA computes a call of `lanewise` in ``function(*args)``, or a part of one.
+
+    None if machine code is generated for all of them. Nothing is compiled.
+    """
+    if not generates():
+        return f"the variable {SWITCH} is off, or LLVM did not start"
+    jaxpr = jax.make_jaxpr(function)(*args).jaxpr
+    for program in _calls(jaxpr):
+        # Without the pieces of `_parts`: a program that is cut is in part computed by XLA.
+        flags = [True] * len(program.trace.all_inputs.jaxpr.invars)
+        try:
+            # This writes the code and does not compile it, which would take seconds.
+            compile_program(program, flags, batch, "cpu")
+        except NotCompilable as reason:
+            return str(reason)
+    return None
 
 
 def _calls(jaxpr: Any) -> list[Any]:

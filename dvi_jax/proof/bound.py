@@ -6,6 +6,8 @@ from typing import Any, TypedDict, Unpack
 import jax.numpy as jnp
 import numpy as np
 
+from lanewise import Layout
+
 from ..base.checks import finite, positive, whole
 from ..base.keywords import checked_keywords
 from ..base.machine import processors
@@ -14,12 +16,13 @@ from ..discover.functions.basis import check_step_size
 from ..discover.invariants.discovery import Discovery
 from ..discover.invariants.series import InvariantSeries
 from ..integration.arithmetic import Arithmetic, DoubleDouble, FixedPoint, FloatingPoint
-from ..integration.integrator import Integrator, chosen, only
+from ..integration.integrator import Integrator
 from ..methods import Method
 from ..problem.system import check_system, of_problem
 from .confinement import confine
 from .programs import Region, functions_of, programs_of
 from .result import DriftBound, tools
+from .ways import MACHINE_CODE, XLA, integrator_of, way_of_running
 from .workers import Workers
 
 _RESIDUAL = {"float64": 2.0**-49, "pairs of float64": 2.0**-94}
@@ -39,6 +42,7 @@ class BoundSettings(TypedDict, total=False):
     method: Method | str | None
     arithmetic: Arithmetic | None
     integrator: Integrator | None
+    layout: Layout | None
     ratio: float
     max_boxes: int
     max_seconds: float
@@ -80,7 +84,9 @@ def bound_drift(
     - `h`, `args`: of the map. `method`: an explicit one, or `TypeII()`, whose implicit step is a
       function of (q0, p1). `arithmetic`: the one whose rounding is bounded, `FloatingPoint()`,
       `DoubleDouble()` or `FixedPoint(quantum)`; in the latter each increment is rounded by at most
-      quantum/2. `integrator`: an object that contains these two.
+      quantum/2. `layout`: as for `integrate`. The rounding is that of the way in which `integrate`
+      runs the system in this process, machine code or XLA, which the certificate names.
+      `integrator`: an object that contains these three.
     - `change`: of an invariant, for which a number of steps is stated.
     - `ratio`: the boxes are cut until no bound exceeds the largest change seen by this factor, by
       default 2, or the limits `max_boxes` (2000) or `max_seconds` (300) are reached. After one
@@ -90,12 +96,15 @@ def bound_drift(
     **Returns** a `DriftBound`; ``print`` shows what is proved.
 
     **Raises** `ProofError` if nothing is bounded on a part of the domain: a singularity, an ε that
-    is too large. `ValueError` for a function that is not analytic, or depends on the time.
+    is too large. `ValueError` for a function that is not analytic, or depends on the time,
+    and if JAX does not compute on a CPU.
     `ImportError` without python-flint.
 
     **Assumes** that each operation of float64 is rounded to nearest, with or without contraction
     of products and sums, that elementary functions have errors of at most 4 ulp; and that the
-    solver of an implicit step accepts residuals of at most 8 units of round-off of the momenta.
+    solver of an implicit step accepts residuals of at most 8 units of round-off of the momenta. For
+    XLA larger errors of some functions are assumed, and those of the operations that it rewrites
+    (page "Proved bounds").
     For `DoubleDouble` these are relative errors of 2⁻¹⁰³ of sums, products and roots, 2⁻¹⁰² of
     quotients and 2⁻¹⁰⁰ of functions (proved by Joldes et al., functions measured), and 2⁻⁹⁴.
 
@@ -126,9 +135,7 @@ def bound_drift(
     h, args = settings.get("h"), settings.get("args")
     system, _, _, h, args = of_problem(system, None, None, h, args, has_start=True)
     check_system(system, "bound_drift")
-    method, arithmetic = settings.get("method"), settings.get("arithmetic")
-    options = chosen(settings.get("integrator"), method=method, arithmetic=arithmetic)
-    integrator = only(options, "bound_drift", "method", "arithmetic")
+    integrator = integrator_of(settings, "bound_drift")
     if not isinstance(integrator.arithmetic, FloatingPoint | DoubleDouble | FixedPoint):
         raise ValueError(
             "arithmetic must be dvi.FloatingPoint(), dvi.DoubleDouble() or "
@@ -146,7 +153,12 @@ def bound_drift(
             "inside(q, p) must be ≥ 0 somewhere in the domain, but is negative for all of 4096 "
             "random states. Use a smaller domain around those that you mean."
         )
-    step_map, programs = programs_of(system, integrator, args, functions, inside, region, points)
+    way, reason = way_of_running(system, integrator, shape, h, args)
+    if way not in (MACHINE_CODE, XLA):
+        raise ValueError(f"the rounding is known for machine code and XLA on a CPU, but {reason}.")
+    step_map, programs = programs_of(
+        system, integrator, args, functions, inside, region, points, way
+    )
     n, t = len(lower) // 2, ["input", len(lower)]
     certificate = {
         "format": exact.FORMAT,

@@ -5,7 +5,7 @@ It needs python-flint only. A certificate states, for a map Φ and functions I_k
 
 1. |I_k(Φ(x, t, ε), t1, ε) − I_k(x, t, ε)| ≤ `per_step`[k] in exact arithmetic, in the domain, for
    all t and ε of their intervals, with t1 = t + h, or t + εh if t is a slow time;
-2. a step that is computed in the `arithmetic` changes I_k by at most `rounding`[k] more, and moves
+2. a step computed in the `arithmetic` by the `way` changes I_k by ≤ `rounding`[k] more, and moves
    no coordinate by more than `reach`; no intermediate number overflows;
 3. trajectories that start in the domain at the time `start` with Σ w_k I_k ≤ c, where (w, c) is the
    `level`, stay in the domain for `steps` steps, exact or computed; the state `example` is one.
@@ -28,13 +28,14 @@ from fractions import Fraction
 
 from flint import arb, arb_series, ctx, fmpq, fmpq_mpoly_ctx, fmpz_mpoly_ctx
 
-FORMAT = "dvi_jax drift bound 2"
+FORMAT = "dvi_jax drift bound 3"
 FUNCTIONS = ("exp", "log", "sin", "cos", "tan", "atan", "asin", "acos", "sqrt", "inverse")
 ULPS = {"sqrt": 1, "inverse": 1}  # errors of functions in units of round-off; 8 (4 ulp) for others
 UNITS = {"float64": Fraction(1, 2**53), "pairs of float64": Fraction(1, 2**103)}  # round-off
 LEVEL = 30  # bits for levels, where nothing cancels
-SMALLEST = 2.0**-1000  # added to each error, for results below the normal numbers
 LARGEST = 2.0**990  # of a number that is computed: its product with 2^27, in pairs, is finite
+# Error of tiny results, and largest number. XLA regroups products: those of seven shall be finite.
+WAYS = {"machine code": (2.0**-1000, LARGEST), "XLA": (2.0**-400, 2.0**128)}
 
 
 class Failure(Exception):
@@ -171,17 +172,17 @@ class Rounding:
     """Values (ball, error): a computed number differs by at most `error` from one in the ball. Each
     operation has a relative error of at most `unit`, a quotient of two. A sum has any order."""
 
-    def __init__(self, unit):
-        self.unit = ball(Fraction(unit))
+    def __init__(self, unit, limits=WAYS["machine code"]):
+        self.unit, (self.smallest, self.largest) = ball(Fraction(unit)), limits
 
     def constant(self, value, error=0):
-        return ball(value), ball(Fraction(error))
+        return self.inexact((ball(value), ball(Fraction(error))), 0)
 
     def inexact(self, a, units, size=0):
         """`size`: of the value and of what is computed on the way to it."""
         size = size or abs(a[0]) + a[1]
-        require(self.unit == 0 or size < LARGEST, "an intermediate number may overflow")
-        return a[0], arb((a[1] + units * self.unit * size + SMALLEST).upper())
+        require(self.unit == 0 or size < self.largest, "an intermediate number may overflow")
+        return a[0], arb((a[1] + units * self.unit * size + self.smallest).upper())
 
     def sum(self, *terms):
         value, error = sum(t[0] for t in terms), sum(t[1] for t in terms)
@@ -242,7 +243,8 @@ class Checker:
         require(self.h != 0, "h is zero")
         self.quantum, self.residual_limit = (number(c[x], 0) for x in ("quantum", "accepted"))
         self.bits, self.orders = whole(400, c["bits"], low=8) + whole(60, c["orders"], low=1)
-        self.arithmetic, self.unit = c["arithmetic"], UNITS[c["arithmetic"]]
+        self.arithmetic, self.way = c["arithmetic"], c["way"]
+        self.unit, self.limits = UNITS[self.arithmetic], WAYS[self.way]
         self.step, self.invariants, self.inside = c["step"], c["invariants"], c["inside"]
         used = [operation[1] for operation in self.inside["operations"] if operation[0] == "input"]
         require(all(k < 2 * self.n for k in used), "inside depends on t or ε")
@@ -312,8 +314,8 @@ class Checker:
 
     def rounding(self, box):
         """The changes of the I_k by the rounding of a step, and the errors of the coordinates."""
-        algebra, exactly, n = Rounding(self.unit), Rounding(0), self.n
-        x = [(ball((a + b) / 2, (b - a) / 2), arb(0)) for a, b in box]
+        algebra, exactly, n = Rounding(self.unit, self.limits), Rounding(0), self.n
+        x = [algebra.inexact((ball((a + b) / 2, (b - a) / 2), arb(0)), 0) for a, b in box]
         x[-2] = x[-2][0], 2 * ball(UNITS["float64"]) * abs(x[-2][0])  # t = t0 + kh in float64
         start, end = self.states_of_step(x, algebra)
         if self.implicit:  # the solver accepts a p1 whose residual is `accepted` and as computed
@@ -322,9 +324,8 @@ class Checker:
             inputs = [*x[:n], *momenta, *x[-2:], exactly.constant(self.h)]
             lipschitz = max(round_up(e) * 2.0**60 for _, e in run(self.step, inputs, exactly)[:n])
             require(lipschitz < 1 / 3, "the implicit step is not shown to be a contraction", box)
-            error = max(
-                (e + arb(round_up(self.residual_limit)) for _, e in start[n : 2 * n]), key=round_up
-            )
+            limit = arb(round_up(self.residual_limit))
+            error = max((e + limit for _, e in start[n : 2 * n]), key=round_up)
             x[n:-2] = [(p1, error / (1 - arb(lipschitz))) for p1, _ in momenta]
             end = self.states_of_step(x, algebra)[1]
         changes = [run(function, end, exactly)[0][1] for function in self.invariants]
@@ -413,9 +414,8 @@ def check(certificate):
     sides = [(a - w, b + w) for (a, b), w in zip(checker.root(), [*reach, 0, 0], strict=True)]
     for box, claim in leaves(sides, c["shell"]):
         check_confined(checker, box, claim, weights, value + steps * sum(rates), reach)
-    text += (
-        f"\n- trajectories from there{f' and t = {float(start)!r}' * is_timed} with Σ w_k I_k ≤ "
-    )
+    time = f" and t = {float(start)!r}" * is_timed
+    text += f"\n- trajectories from there{time} with Σ w_k I_k ≤ "
     return f"{text}{float(value)!r}, w = {[*map(float, weights)]}, stay there for {steps} steps"
 
 
@@ -429,10 +429,10 @@ def statement(checker, count, *bounds):
         f"from {lower} to {upper}{' with inside ≥ 0' * bool(checker.inside['outputs'])}, all t"
         f"{', which is ε times the time,' * checker.slow} in {time} and all ε in {epsilon}:"
         f"\n- a step changes I by ≤ {per_step} in exact arithmetic"
-        f"\n- its rounding in {checker.arithmetic} to nearest changes I by ≤ {rounding} more"
+        f"\n- its rounding in {checker.arithmetic} by {checker.way} changes I by ≤ {rounding} more"
         f"{f', of increments to multiples of {float(checker.quantum)!r}' * bool(checker.quantum)}"
         f"{f', for residuals ≤ {float(checker.residual_limit):.3g}' * checker.implicit}"
-        "\n- not checked: whether these operations are those of a program (see holds_for)"
+        "\n- not checked: that a program has these operations (holds_for), with functions to 4 ulp"
     )
 
 

@@ -21,8 +21,8 @@ POINTS = 48
 """Points of a comparison: a difference on a tenth of the domain passes with probability 0.6 %."""
 
 SLACK = 2.0**22
-"""XLA's sinh has errors of 6e5 units of round-off where the bound assumes 8; a conversion to
-float32, the finest difference that matters, has up to 3e8."""
+"""XLA's functions have errors of up to 500 units of round-off where the bound assumes 8; a
+conversion to float32, the finest difference that matters, has up to 3e8."""
 
 _CANDIDATES = 4096
 

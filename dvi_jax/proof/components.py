@@ -11,9 +11,7 @@ type, an index or a condition that is computed from the state, any other operati
 """
 
 import math
-import operator
 from collections.abc import Callable, Sequence
-from fractions import Fraction
 from typing import Any
 
 import jax
@@ -22,7 +20,9 @@ import numpy as np
 
 from lanewise.jaxprs.jaxapi import ClosedJaxpr, Literal, scan_counts
 
-UNARY = ("exp", "log", "sin", "cos", "tan", "atan", "asin", "acos", "sqrt")
+from .scalars import UNARY, NotAnalytic as NotAnalytic, ProgramNumber, ScalarProgram, total
+from .ways import ARGUMENT_UNITS, MACHINE_CODE, RESULT_UNITS, XLA
+
 _MOVES = (
     "reshape", "broadcast_in_dim", "squeeze", "transpose", "slice", "rev", "concatenate", "gather",
     "dynamic_slice", "pad", "select_n", "dynamic_update_slice", "scatter", "split",
@@ -38,151 +38,12 @@ _CALLS = ("pjit", "jit", "closed_call", "core_call", "remat", "checkpoint", "cus
           "custom_vjp_call", "custom_lin")  # fmt: skip
 
 
-class NotAnalytic(ValueError):
-    """A function that has no list of operations; the message says what is in it."""
-
-
-class ScalarProgram:
-    """Operations (name, operands), written one by one; equal ones are written once."""
-
-    def __init__(self):
-        self.operations: list[list[Any]] = []
-        self._numbers: dict[tuple, int] = {}
-        self.constants: dict[int, float] = {}
-
-    def write(self, name: str, *operands: Any) -> "ProgramNumber":
-        key = (name, *operands)
-        if key not in self._numbers:
-            self._numbers[key] = len(self.operations)
-            self.operations.append([name, *operands])
-        return ProgramNumber(self, self._numbers[key])
-
-    def constant(self, value: float) -> "ProgramNumber":
-        if not math.isfinite(value):
-            return self.write("unknown", f"the constant {float(value)}")
-        scalar = self.write("constant", float(value).hex())
-        self.constants[scalar.index] = float(value)
-        return scalar
-
-    def as_json(self, outputs: Sequence["ProgramNumber"]) -> dict[str, Any]:
-        """With the operations that the outputs need only."""
-        indices = set()
-        stack = [out.index for out in outputs]
-        while stack:
-            i = stack.pop()
-            if i not in indices:
-                indices.add(i)
-                stack.extend(_operands(self.operations[i]))
-        order = sorted(indices)
-        primitives = {self.operations[i][1] for i in order if self.operations[i][0] == "unknown"}
-        if primitives:
-            names = ", ".join(sorted(primitives)).replace("select_n", "select_n (jnp.where)")
-            raise NotAnalytic(
-                f"a proof does not allow: {names} of JAX, only + − × /, constant powers, sinh, "
-                f"cosh, tanh, {', '.join(UNARY)}."
-            )
-        numbers = {old: i for i, old in enumerate(order)}
-        operations = []
-        for i in order:
-            name, *arguments = self.operations[i]
-            count = len(_operands(self.operations[i]))
-            operations.append([name, *(numbers[j] for j in arguments[:count]), *arguments[count:]])
-        return {"operations": operations, "outputs": [numbers[out.index] for out in outputs]}
-
-
-def _operands(operation: list[Any]) -> list[int]:
-    name, *arguments = operation
-    return [] if name in ("input", "constant", "unknown") else arguments
-
-
-class ProgramNumber:
-    """One number of a program, with Python's operators."""
-
-    __slots__ = ("index", "program")
-
-    def __init__(self, program: ScalarProgram, index: int):
-        self.program, self.index = program, index
-
-    @property
-    def value(self) -> float | None:
-        return self.program.constants.get(self.index)
-
-    def _scalar(self, other: Any) -> "ProgramNumber":
-        return other if isinstance(other, ProgramNumber) else self.program.constant(other)
-
-    def _constant(self, operation: Callable, other: "ProgramNumber") -> "ProgramNumber | None":
-        """The result for two constants, if it is a number of float64."""
-        if self.value is None or other.value is None:
-            return None
-        value = operation(Fraction(self.value), Fraction(other.value))
-        is_exact = abs(value) < 2**1000 and Fraction(float(value)) == value
-        return self.program.constant(float(value)) if is_exact else None
-
-    def __add__(self, other: Any) -> "ProgramNumber":
-        other = self._scalar(other)
-        if self.value == 0:
-            return other
-        if other.value == 0:
-            return self
-        constant = self._constant(operator.add, other)
-        return constant or self.program.write("sum", self.index, other.index)
-
-    def __neg__(self) -> "ProgramNumber":
-        if self.value is not None:
-            return self.program.constant(-self.value)
-        return self * -1.0
-
-    def __sub__(self, other: Any) -> "ProgramNumber":
-        return self + -self._scalar(other)
-
-    def __mul__(self, other: Any) -> "ProgramNumber":
-        other = self._scalar(other)
-        for a, b in ((self, other), (other, self)):
-            if a.value == 0 or b.value == 1:
-                return a
-        constant = self._constant(operator.mul, other)
-        return constant or self.program.write("multiply", self.index, other.index)
-
-    def __truediv__(self, other: Any) -> "ProgramNumber":
-        other = self._scalar(other)
-        if self.value == 0 or other.value == 1:
-            return self
-        if other.value and math.frexp(other.value)[0] in (0.5, -0.5):
-            return self * (1 / other.value)  # exact
-        return self * other.apply("inverse")
-
-    __radd__, __rmul__ = __add__, __mul__
-
-    def __rsub__(self, other: Any) -> "ProgramNumber":
-        return self._scalar(other) - self
-
-    def __rtruediv__(self, other: Any) -> "ProgramNumber":
-        return self._scalar(other) / self
-
-    def power(self, n: int) -> "ProgramNumber":
-        """selfⁿ: n − 1 products."""
-        if n < 1:
-            unit = self.program.constant(1.0)
-            return unit / self.power(-n) if n else unit
-        if n == 1:
-            return self
-        square = (self * self).power(n // 2)
-        return square * self if n % 2 else square
-
-    def apply(self, name: str) -> "ProgramNumber":
-        return self.program.write(name, self.index)
-
-
-def total(scalars: Sequence[Any]) -> Any:
-    """The sum of several numbers as one operation, whose order is open."""
-    parts = [s for s in scalars if not (isinstance(s, ProgramNumber) and s.value == 0)]
-    if len(parts) < 2:
-        return parts[0] if parts else scalars[0]
-    return parts[0].program.write("sum", *(part.index for part in parts))
-
-
-def program_of(function: Callable, *shapes: tuple[int, ...]) -> dict[str, Any]:
+def program_of(
+    function: Callable, *shapes: tuple[int, ...], way: str = MACHINE_CODE
+) -> dict[str, Any]:
     """The list of operations of a function of arrays of float64 with these shapes.
+
+    `way`: the way of running whose rounding the list describes.
 
     Returns ``{"operations": [[name, *operands], ...], "outputs": [...]}``: an operand is the number
     of an earlier operation; inputs and outputs are in the order of the raveled arrays.
@@ -191,7 +52,7 @@ def program_of(function: Callable, *shapes: tuple[int, ...]) -> dict[str, Any]:
     """
     structs = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes]
     closed_jaxpr = jax.make_jaxpr(function)(*structs)
-    program, inputs, offset = ScalarProgram(), [], 0
+    program, inputs, offset = ScalarProgram(way), [], 0
     for shape in shapes:
         size = int(np.prod(shape))
         numbers = [program.write("input", offset + i) for i in range(size)]
@@ -269,12 +130,21 @@ def _apply(program: ScalarProgram, equation: Any, values: list) -> list:
     array = None
     if not obstacle:
         arrays = [_symbolic(program, v) for v in values]
+        arrays = [_inexact(program, x, ARGUMENT_UNITS.get(name)) for x in arrays]
         array = _arithmetic(program, equation, arrays, values)
+        array = _inexact(program, array, RESULT_UNITS.get(name))
     if array is None:  # which is an error only if an output needs it: a status does not
         placeholder = program.write("unknown", obstacle or name)
         shapes = [v.aval.shape for v in equation.outvars]
         return [_array([placeholder] * int(np.prod(shape)), shape) for shape in shapes]
     return [array]
+
+
+def _inexact(program: ScalarProgram, scalars: Any, units: int | None) -> Any:
+    """Numbers with an error of so many units, where XLA computes them."""
+    if scalars is None or units is None or program.way != XLA:
+        return scalars
+    return _array([x.inexact(units) for x in scalars.ravel()], scalars.shape)
 
 
 def _obstacle(equation: Any, values: list) -> str:

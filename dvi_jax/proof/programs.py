@@ -26,6 +26,7 @@ from ..problem.system import System
 from .comparison import compare, random_points
 from .components import NotAnalytic, program_of
 from .rational import ExactInvariant
+from .ways import MACHINE_CODE
 
 
 @dataclass(frozen=True)
@@ -61,22 +62,28 @@ def programs_of(
     inside: Callable | None,
     region: Region,
     points: list[np.ndarray],
+    way: str,
 ) -> tuple[Callable, dict[str, Any]]:
     """The step of many states, and what a certificate has about the map and the invariants: their
-    lists of operations, compared with them at the points, and the digests of their programs."""
+    lists of operations, compared with them at the points, and the digests of their programs.
+
+    `way`: how the step is run. In pairs XLA has the same functions as the machine code.
+    """
     quantum = getattr(integrator.arithmetic, "quantum", 0.0)
     step_of_states, step, is_implicit = _step_of(system, integrator, args, region)
     step_points = points[: 6 if quantum else 5]
     is_paired = isinstance(integrator.arithmetic, DoubleDouble)
     inside = inside or (lambda q, p: jnp.zeros(0))
+    way_of_functions = MACHINE_CODE if is_paired else way
     return step_of_states, {
-        "step": _program("the step of the system", step, step_points, None),
+        "step": _program("the step of the system", step, step_points, None, way_of_functions),
         "invariants": [_program(f"the invariant {n}", f, points[:5], 0) for f, n in functions],
         "inside": _program("inside", inside, points[:2], None),
         "implicit": is_implicit,
         "slow": system.slow_time,
         "quantum": float(quantum).hex(),
         "arithmetic": "pairs of float64" if is_paired else "float64",
+        "way": way,
         "shape": list(region.shape),
         "program": {
             "step": _digest(step, step_points),
@@ -203,9 +210,11 @@ def _require_time(fits: Any, subject: str) -> None:
         )
 
 
-def _program(subject: str, function: Callable, points: list, ndim: int | None) -> dict[str, Any]:
+def _program(
+    subject: str, function: Callable, points: list, ndim: int | None, way: str = MACHINE_CODE
+) -> dict[str, Any]:
     """The operations of a function, whose result must have so many axes (None: any), compared with
-    the function at points."""
+    the function at points. The rounding of invariants is not part of a proof: it has no `way`."""
     shapes = [column.shape[1:] for column in points]
     structs = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes]
     result = jax.eval_shape(function, *structs)
@@ -214,7 +223,7 @@ def _program(subject: str, function: Callable, points: list, ndim: int | None) -
         description = f"shape {result.shape}" if hasattr(result, "shape") else kind
         raise ValueError(f"{subject} must return one number, got {description}.")
     try:
-        program = program_of(function, *shapes)
+        program = program_of(function, *shapes, way=way)
     except NotAnalytic as error:
         raise NotAnalytic(f"{subject}: {error}") from None
     compare(subject, function, program, points)

@@ -134,7 +134,7 @@ class DriftBound(eqx.Module):
             f"proved for each step from a state with {sides}"
             + (" and inside(q, p) ≥ 0" if c["inside"]["outputs"] else "")
             + f", for all ε in [{low:.6g}, {high:.6g}], h = {float.fromhex(c['h']):.6g}, "
-            + f"computed in {c['arithmetic']}"
+            + f"computed in {c['arithmetic']} by {c['way']}"
             + (f" with increments on a grid of {quantum:.3g}:" if quantum else ":"),
             f"{'':4}{'change ≤':>10} {'seen':>9} {'rounding ≤':>10} "
             f"{'steps for ' + format(self.change, 'g'):>18}",

@@ -106,7 +106,7 @@ def curved_axes(checker: Any) -> set[int]:
         if name == "input" and i in indices:
             inputs.add(operands[0])
         elif name in exact.FUNCTIONS or (i in indices and name != "constant"):
-            indices.update(operands)
+            indices.update(operands[:1] if name == "inexact" else operands)
     return inputs & {*range(2 * checker.n + 2)}
 
 
