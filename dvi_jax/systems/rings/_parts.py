@@ -4,7 +4,7 @@ import functools
 from collections.abc import Callable
 
 from . import _exact as exact, _maps as maps
-from ._maps import RingPart, Piece
+from ._maps import Piece, RingPart
 
 
 def _flow(move: Callable) -> list[Piece]:
