@@ -66,12 +66,12 @@ def largest_angles(
     for _ in range(64 if any(flags) else 0):
         point = [a + (b - a) * Fraction(rng.random()) for a, b in checker.root()]
         try:
-            before, after = checker.states_of_step(
+            start, end = checker.states_of_step(
                 [(exact.ball(v), exact.arb(0)) for v in point], algebra
             )
         except search.SINGULAR:
             continue
-        pairs = zip(before[: checker.n], after, strict=False)
+        pairs = zip(start[: checker.n], end, strict=False)
         values = np.array([float(abs(b[0] - a[0]).upper()) for a, b in pairs])
         moves = np.maximum(moves, np.where(np.isfinite(values), values, 0))
     smallest = min((s for s in changes if s), default=0.0)

@@ -278,7 +278,8 @@ def _strengths(epsilon: Any, system: System) -> tuple[float, float]:
     if epsilon is None and not (is_perturbed or system.slow_time):
         return 0.0, 0.0
     hint = "Only systems without force, perturbation and slow time need no epsilon."
-    if not np.ndim(epsilon) and finite("epsilon", epsilon, hint) == 0:
+    is_pair = epsilon is not None and np.ndim(epsilon) > 0
+    if not is_pair and finite("epsilon", epsilon, hint) == 0:
         return 0.0, 0.0
     return _interval("epsilon", epsilon)
 

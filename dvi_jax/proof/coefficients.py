@@ -1,6 +1,6 @@
 """`exact_coefficients`: those of a discovered invariant as small rational functions of h.
 
-A coefficient c at one h has several forms (n_0 + n_1 h + n_2 h²)/d. If h is a fraction of small
+A coefficient c at one h has open_places forms (n_0 + n_1 h + n_2 h²)/d. If h is a fraction of small
 numbers, such as 1/4, 1 and h and h² are dependent: all forms of c are the same number, and the
 fraction n_0/d is taken. If h is near such a fraction, as 0.1 is, −7/10 and −7h are different
 numbers that agree to 17 digits, more than c has. Then the map decides: conservation is linear in
@@ -87,7 +87,7 @@ def exact_coefficients(
     h = check_step_size(finite("h", h))
     c = np.asarray(invariant.coefficients, float)
     largest = np.max(np.abs(c))
-    pivot = c.flat[np.flatnonzero(np.abs(c) > 0.999 * largest)[0]]
+    pivot = float(c.flat[np.flatnonzero(np.abs(c) > 0.999 * largest)[0]])
     ratios = np.where(np.abs(c) > _DROP * largest, c / pivot, 0.0)
     errors = np.zeros_like(c) if invariant.errors is None else np.asarray(invariant.errors, float)
     forms = {}
@@ -134,10 +134,10 @@ def _forms(ratio: float, h: float, error: float) -> list[tuple[int, ...]]:
         if form[0]:
             terms = sum(n != 0 for n in form[1:])
             forms.setdefault(form, max(map(abs, form)) ** (terms + 1))
-    ordered = sorted(forms, key=lambda form: forms[form])
+    choices = sorted(forms, key=lambda form: forms[form])
     if Fraction(h).denominator <= 64:
-        ordered.sort(key=lambda form: any(form[2:]))
-    return ordered
+        choices.sort(key=lambda form: any(form[2:]))
+    return choices
 
 
 def _relation(ratio: float, h: float, error: float, powers: Sequence[int]) -> tuple[int, ...]:
@@ -167,22 +167,25 @@ def _compare(
     if shape is None:
         return
     ends = [(-np.ones(shape), np.ones(shape))] * 2 + [(0.0, 0.1), (0.0, 1.0)]
-    coefficients = np.abs(np.asarray(invariant.coefficients)) / abs(pivot)
+    # What `_forms` may change: a share of each coefficient, and its error.
+    errors = 0.0 if invariant.errors is None else 3 * np.asarray(invariant.errors)
+    limits = np.abs(10 * _DROP * np.asarray(invariant.coefficients)) + errors
+    limits = np.sum(limits + _DROP * np.max(np.abs(invariant.coefficients)), axis=0) / abs(pivot)
 
-    def both(q, p, epsilon, t):
-        size = jnp.abs(invariant.basis(q, p, t)) @ jnp.sum(coefficients, axis=0)
+    def pair(q, p, epsilon, t):
+        limit = jnp.abs(invariant.basis(q, p, t)) @ limits
         values = invariant.evaluate(q, p, epsilon, t) / pivot
-        return exact_invariant.evaluate(q, p, epsilon, h, t), values, size
+        return exact_invariant.evaluate(q, p, epsilon, h, t), values, limit
 
-    for *x, value, expected, size in zip(
-        *(points := random_points(ends)), *map(np.asarray, jax.vmap(both)(*points)), strict=True
+    for *x, value, discovered_value, limit in zip(
+        *(points := random_points(ends)), *map(np.asarray, jax.vmap(pair)(*points)), strict=True
     ):
-        if np.isfinite(size) and not abs(value - expected) <= 10 * _DROP * size:
+        if np.isfinite(limit) and not abs(value - discovered_value) <= limit:
             state = [np.asarray(part).tolist() for part in x]
             raise ValueError(
                 f"the invariant with exact coefficients is {value:.17g} at (q, p, ε, t) = {state}, "
-                f"but the discovered one is {expected:.17g}. Please report this: they have to be "
-                "the same."
+                f"but the discovered one is {discovered_value:.17g}. Please report this: they have "
+                "to be the same."
             )
 
 
@@ -236,7 +239,7 @@ class _Equations:
                 x = [*x[:n], *(p - m for p, m in zip(p1, moves, strict=True))]
             t1 = t + (epsilon * h if self.slow else h)
             values = (exact.run(self.basis, z, _Series) for z in ([*end, t1], [*x, t]))
-            rows = [after - before for after, before in zip(*values, strict=True)]
+            rows = [end_value - start_value for end_value, start_value in zip(*values, strict=True)]
         except search.SINGULAR:
             return None
         table = [[row[k] for k in range(self.orders)] for row in rows]
@@ -247,10 +250,10 @@ class _Equations:
     def column(self, place: tuple[int, ...]) -> list[Any]:
         """What a coefficient of 1 adds to each equation."""
         m, j = place
-        shifted = [
+        rows = [
             [0] * m + row[: self.orders - m] for row in (y[j].tolist() for _, y in self.changes)
         ]
-        return [value for row in shifted for value in row]
+        return [value for row in rows for value in row]
 
     def check(self, coefficients: dict[tuple[int, ...], Fraction]) -> None:
         """**Raises** `ValueError` if the invariant with these coefficients changes in a step."""
@@ -303,13 +306,13 @@ def _decide(
 
     exact, _ = tools()
     exact.ctx.prec = _DIGITS
-    several = [x for x, choices in forms.items() if len({_value(f, h) for f in choices}) > 1]
-    if not several:
+    open_places = [x for x, choices in forms.items() if len({_value(f, h) for f in choices}) > 1]
+    if not open_places:
         return
-    columns = [equations.column(place) for place in several]
+    columns = [equations.column(place) for place in open_places]
     right = [0] * len(columns[0])
     for place, choices in forms.items():
-        if place not in several:
+        if place not in open_places:
             factor = exact.ball(_value(choices[0], h))
             pairs = zip(right, equations.column(place), strict=True)
             right = [a - factor * b for a, b in pairs]
@@ -320,7 +323,7 @@ def _decide(
         )
     except ZeroDivisionError:
         return
-    for i, place in enumerate(several):
+    for i, place in enumerate(open_places):
         root = solution[i, 0]
         fits = [f for f in forms[place] if abs(root - exact.ball(_value(f, h))) < _NOISE]
         forms[place] = fits or forms[place]
