@@ -32,6 +32,7 @@ class DriftBound(eqx.Module):
     - `start_time`: the time at which these trajectories start, if the map depends on the time: the
       begin of the interval if the steps go forwards, its end if they go backwards (h < 0, or ε < 0
       for a slow time), and a time between them for an interval of ε with both signs.
+    - Of an angle (`periodic`) the domain is the circle, for computed states up to a largest |q|.
     - `boxes`: number of boxes of the proof. `formulas`: the invariants as text.
     - `certificate`: all that `dvi-jax verify` checks, see `save`.
     """
@@ -63,7 +64,7 @@ class DriftBound(eqx.Module):
         proved to stay in the domain; 0 if nothing is proved for it.
 
         - `q0`, `p0`: the start, with the shape that the domain has. If the map depends on the time,
-          the start is at the time `start_time`. `epsilon`: its ε.
+          the start is at the time `start_time`. An angle may have made turns. `epsilon`: its ε.
 
         With C = Σ w_k I_k and the `level` (w, c), the trajectory is in the domain as long as
         C(q0, p0) + N Σ |w_k| (per_step[k] + rounding[k]) ≤ c + `steps` Σ |w_k| (…).
