@@ -21,8 +21,18 @@ def energy(q, p, epsilon):
 def singular(q, p, epsilon):
     return 1 / q[0]
 
+def pair(q, p):
+    return energy(q, p, 0.0)
+
+kicked = dvi.System(lambda t0, t1, q0, p1, args: p1 @ p1 / 2, force=lambda *x: -x[2])
+
 def inside(q, p):
     return 0.1 - q @ q
+
+rotor = dvi.System(lambda t0, t1, q0, p1, args: p1 @ p1 / 2 - jnp.sum(jnp.cos(q0)))
+
+def rotation(q, p):
+    return p @ p / 2 - jnp.sum(jnp.cos(q)) - 0.05 * p @ jnp.sin(q)
 """
 
 SMALL = """
@@ -72,6 +82,24 @@ def test_a_small_proof(folder):
     content["h"] = (0.2).hex()
     path.write_text(json.dumps(content))
     assert command("verify", "out/certificate.json").exit_code == 1
+
+
+def test_no_epsilon_without_a_perturbation(folder):
+    text = SMALL.replace("epsilon = [0.0, 0.1]", "").replace("energy", "pair")
+    assert found("bound", write(folder, text))["per_step"] == [0.0]
+    refuses(
+        command("bound", write(folder, text.replace("own.py:system", "own.py:kicked"))), "epsilon"
+    )
+
+
+def test_an_angle(folder):
+    text = SMALL.replace("epsilon = [0.0, 0.1]", "").replace("energy", "rotation")
+    text = text.replace("own.py:system", "own.py:rotor").replace("1e-4", "0.1")
+    angle = text.replace("[domain]", "[domain]\nperiodic = [true]")
+    refuses(command("bound", write(folder, angle)), "domain of the angle q1 must be a whole turn")
+    contents = found("bound", write(folder, angle.replace("0.5]", "3.2]").replace("0.5}", "3}")))
+    assert contents["level"][1] > 1
+    assert command("verify", "out/certificate.json").exit_code == 0
 
 
 def test_nothing_is_proved_at_a_singularity(folder):

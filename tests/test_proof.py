@@ -285,6 +285,28 @@ def test_a_combination_of_invariants_confines():
     assert bound.steps_inside([0.5, 0.4], [0.4, 0.5], 0.05) == 0
 
 
+def test_epsilon_is_not_necessary_without_a_perturbation():
+    """Also an invariant (q, p); with ε = 0.0 the perturbed map is the unperturbed one."""
+    spring, domain = dvi.System(CUBIC.H_D), np.array([0.5])
+
+    def function(q, p):
+        return energy_of_the_map(q, p, 0.0)
+
+    bound = dvi.bound_drift(function, spring, h=0.1, domain=domain)
+    assert bound.per_step == (0.0,)
+    assert bound.certificate["epsilon"] == [(0.0).hex()] * 2
+    assert bound.steps_inside([0.1], [0.1]) > bound.steps > 1e11
+    assert "for all ε in [0, 0]" in str(bound)
+    assert "all ε in [0.0, 0.0]" in exact.check(bound.certificate)
+    assert dvi.proof.holds_for(spring, bound, function)
+    assert not dvi.proof.holds_for(spring, bound, lambda q, p: function(q, p) + 1e-9 * q @ q)
+    assert proved(function, epsilon=0.0).per_step == (0.0,)  # of a system with a force
+    with pytest.raises(ValueError, match=r"Only systems without force, .* need no epsilon"):
+        dvi.bound_drift(function, CUBIC, h=0.1, domain=domain)
+    with pytest.raises(TypeError, match=r"found must take the arguments \(q, p\)"):
+        proved(lambda q: q[0])
+
+
 def test_a_map_that_depends_on_a_slow_time():
     """H = p²/2 + (1 + ε sin τ) q²/2, τ = εt: the energy changes by O(ε²) in a step, if h is 0."""
     system = dvi.System(

@@ -2,6 +2,7 @@
 
 from .binding import Binding as Binding, holds_for as holds_for
 from .bound import ProofError as ProofError, bound_drift as bound_drift
+from .coefficients import exact_coefficients as exact_coefficients
 from .noether import NoetherProof as NoetherProof, prove_noether as prove_noether
-from .rational import ExactInvariant as ExactInvariant, exact_coefficients as exact_coefficients
+from .rational import ExactInvariant as ExactInvariant
 from .result import DriftBound as DriftBound

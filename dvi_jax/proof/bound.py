@@ -18,7 +18,8 @@ from ..discover.invariants.series import InvariantSeries
 from ..integration.arithmetic import Arithmetic, DoubleDouble, FixedPoint, FloatingPoint
 from ..integration.integrator import Integrator
 from ..methods import Method
-from ..problem.system import check_system, of_problem
+from ..problem.system import System, check_system, of_problem
+from .angles import angles_of, circles, largest_angles
 from .confinement import confine
 from .programs import Region, functions_of, programs_of
 from .result import DriftBound, tools
@@ -43,6 +44,7 @@ class BoundSettings(TypedDict, total=False):
     arithmetic: Arithmetic | None
     integrator: Integrator | None
     layout: Layout | None
+    periodic: Any
     ratio: float
     max_boxes: int
     max_seconds: float
@@ -53,8 +55,8 @@ def bound_drift(
     found: Discovery | InvariantSeries | Callable | Sequence[Any],
     system: Any,
     *,
-    epsilon: Any,
     domain: Any,
+    epsilon: Any = None,
     time: Any = None,
     inside: Callable | None = None,
     change: float = 1e-3,
@@ -71,13 +73,19 @@ def bound_drift(
 
     **Arguments**
 
-    - `found`: a `Discovery`, an `InvariantSeries`, an `ExactInvariant`, a function ``(q, p,
-      epsilon)`` or ``(q, p, epsilon, t)`` → scalar, or a list of these. `system`: a `System` or a
-      problem of the library.
-    - `epsilon`: the largest ε of an interval from 0, or the pair (least, largest).
+    - `found`: a `Discovery`, an `InvariantSeries`, an `ExactInvariant`, a function ``(q, p)``,
+      ``(q, p, epsilon)`` or ``(q, p, epsilon, t)`` → scalar, or a list of these. `system`: a
+      `System` or a problem of the library.
+    - `epsilon`: the largest ε of an interval from 0, or the pair (least, largest), or 0.0 for
+      ε = 0 alone. Not necessary for a system without force, perturbation and slow time: ε is 0.
     - `domain`: an array of half-widths like q, |q_i|, |p_i| ≤ r_i, or one number r if `found` is a
       `Discovery`; or a pair for q and p, each half-widths or an array (lower, upper) of shape
       (2, *shape of q).
+    - `periodic`: True, or a boolean array like q: which q_i are angles. Their domain is the circle,
+      given as an interval of a whole turn, such as the half-width np.pi, so that a trajectory that
+      rotates stays in it. Step, `found` and `inside` must be unchanged by a turn, which adds one
+      to q_i: q_i is an argument of sin and cos, times an integer. The proof is for all turns, and
+      for computed steps while |q_i| is at most a bound that is chosen for `change` and printed.
     - `inside`: function ``(q, p)`` → array; the domain has only states where no value is negative.
     - `time`: if the map or an invariant depends on the time, the interval (t_begin, t_end) in which
       steps begin, of the slow time τ = εt where the system has one (`slow_time`).
@@ -143,7 +151,9 @@ def bound_drift(
         )
     h = check_step_size(h)
     shape, (lower, upper) = _domain(domain, found)
-    strengths = _interval("epsilon", epsilon)
+    angles = angles_of(settings.get("periodic"), shape)
+    lower, upper = circles((lower, upper), angles)
+    strengths = _strengths(epsilon, system)
     times = None if time is None else _interval("time", time)
     region = Region(shape, (lower, upper), times or (0.0, 0.0), strengths, h, time is not None)
     functions = functions_of(found, system, region.is_timed)
@@ -182,6 +192,12 @@ def bound_drift(
         certificate["spread"] = _spread(step_map, region)
     checker = exact.Checker(certificate)
     estimates = search.estimate(checker)
+    if any(angles):
+        certificate["angles"] = largest_angles(checker, angles, estimates, change)
+        try:
+            checker = exact.Checker(certificate)
+        except exact.Failure as error:
+            raise ValueError(f"periodic must be False for what is no angle: {error}.") from None
     identities = frozenset(k for k, s in enumerate(estimates) if s == 0 and checker.is_identity(k))
     search.resolve(checker, estimates, ratio)
     certificate["bits"] = checker.bits
@@ -266,6 +282,18 @@ def _domain(
         lower.extend(low.tolist())
         upper.extend(high.tolist())
     return shape, (lower, upper)
+
+
+def _strengths(epsilon: Any, system: System) -> tuple[float, float]:
+    """The interval of ε; 0 alone for the number 0, and where a map has no perturbation."""
+    is_perturbed = system.force is not None or system.perturbation is not None
+    if epsilon is None and not (is_perturbed or system.slow_time):
+        return 0.0, 0.0
+    hint = "Only systems without force, perturbation and slow time need no epsilon."
+    is_pair = epsilon is not None and np.ndim(epsilon) > 0
+    if not is_pair and finite("epsilon", epsilon, hint) == 0:
+        return 0.0, 0.0
+    return _interval("epsilon", epsilon)
 
 
 def _interval(name: str, ends: Any) -> tuple[float, float]:

@@ -2,21 +2,22 @@
 
 It needs python-flint only. A certificate states, for a map Φ and functions I_k of x = (q, p), t and
 ε, given as lists of scalar operations, which also contain h:
-
 1. |I_k(Φ(x, t, ε), t1, ε) − I_k(x, t, ε)| ≤ `per_step`[k] in exact arithmetic, in the domain, for
    all t and ε of their intervals, with t1 = t + h, or t + εh if t is a slow time;
 2. a step computed in the `arithmetic` by the `way` changes I_k by ≤ `rounding`[k] more, and moves
    no coordinate by more than `reach`; no intermediate number overflows;
 3. trajectories that start in the domain at the time `start` with Σ w_k I_k ≤ c, where (w, c) is the
    `level`, stay in the domain for `steps` steps, exact or computed; the state `example` is one.
+A turn of an angle q_i, 2π, has no effect but a turn after the step. The domain contains one turn of
+it, and 1 to 3 hold for all turns, for computed steps while |q_i| is at most `angles`[i].
 
 For 1 and 2 boxes cover the domain. On a box a function is a polynomial with integer coefficients
 and a bound of the remainder (a Taylor model; Makino & Berz 2003); balls (Arb) enclose elementary
-functions. For 3, boxes cover all places outside of the domain that one step can reach, and on each
+functions. For 3, boxes cover all places that a step can reach outside of the domain; on each
 Σ w_k I_k exceeds c by more than `steps` steps can change it. An implicit step is a function of
 (q0, p1): each (q0, p0) of the domain has one p1 within `spread`, because p1 → p0 + h·rate maps this
-box into itself and is a contraction. If increments are rounded to multiples of `quantum`, the step
-has one more input, the error of each of them.
+box into itself and is a contraction. If increments are multiples of `quantum`, the step has one
+more input, the error of each.
 """
 
 import hashlib
@@ -48,8 +49,7 @@ def require(condition, message, box=()):
         raise Failure(f"{message} on the box {where}" if box else message)
 
 
-def digest(certificate):
-    """SHA-256 of everything in a certificate but the hash itself."""
+def digest(certificate):  # SHA-256 of everything in it but the hash itself
     text = json.dumps({k: v for k, v in certificate.items() if k != "hash"}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -66,14 +66,12 @@ def numbers(texts, count, low=-LARGEST):
 
 
 def whole(high, *values, low=0):
-    for value in values:
-        is_whole = type(value) is int and low <= value <= high
-        require(is_whole, f"{value!r:.64} is not a whole number from {low} to {high}")
+    fits = all(type(value) is int and low <= value <= high for value in values)
+    require(fits, f"{values!r:.64} are not whole numbers from {low} to {high}")
     return values
 
 
-def round_up(value):
-    """A fraction or a ball, rounded up to a float."""
+def round_up(value):  # a fraction or a ball, rounded up to a float
     if isinstance(value, arb):
         return math.nextafter(float(value.upper()), math.inf) if value.is_finite() else math.inf
     nearest = float(value)
@@ -84,15 +82,13 @@ def ball(value, radius=0):
     return arb(value.numerator) / value.denominator + arb(0, round_up(Fraction(radius)))
 
 
-def series(name, point, length):
-    """The Taylor coefficients of a function at a point, or balls of them on a ball."""
+def series(name, point, length):  # of Taylor coefficients at a point, or balls of them on a ball
     ctx.cap = length
     x = arb_series([point, 1], length)
     return 1 / x if name == "inverse" else getattr(x, name)()
 
 
-def run(program, inputs, algebra):
-    """The outputs of a list of operations (name, operands): numbers of earlier operations."""
+def run(program, inputs, algebra):  # the outputs of a list of operations (name, operands)
     values = []
     for name, *operands in program["operations"]:
         if name == "input":
@@ -135,8 +131,7 @@ class Models:
         error += int(sum(map(abs, (product - self.unit * integers).coeffs())))
         return integers, (error >> self.bits) + 1
 
-    def range(self, a):
-        """A lower and an upper bound of the value; an even power of s is not negative."""
+    def range(self, a):  # bounds of the value; an even power of s is not negative
         low, high = -a[1], a[1]
         for powers, c in a[0].to_dict().items():
             span = (0, c) if any(powers) else (c, c)
@@ -178,8 +173,7 @@ class Rounding:
     def constant(self, value, error=0):
         return self.inexact((ball(value), ball(Fraction(error))), 0)
 
-    def inexact(self, a, units, size=0):
-        """`size`: of the value and of what is computed on the way to it."""
+    def inexact(self, a, units, size=0):  # size: of all numbers on the way to the value
         size = size or abs(a[0]) + a[1]
         require(self.unit == 0 or size < self.largest, "an intermediate number may overflow")
         return a[0], arb((a[1] + units * self.unit * size + self.smallest).upper())
@@ -200,11 +194,11 @@ class Rounding:
 
 class Identities:
     """Quotients (numerator, denominator) of polynomials with rational coefficients, in x and in
-    each value f(a) of an elementary function, of which nothing else is used."""
+    each value f(a) of an elementary function, of which only the period in x_angle is used."""
 
-    def __init__(self, size):
+    def __init__(self, size, angle=None):
         self.ring = fmpq_mpoly_ctx.get([f"x{i}" for i in range(size + 40)], "lex")
-        self.unit, self.values = self.ring.constant(1), {}
+        self.unit, self.values, self.angle = self.ring.constant(1), {}, angle
         self.x, self.free = self.ring.gens()[:size], list(self.ring.gens()[size:])
 
     def constant(self, value, error=0):
@@ -222,9 +216,17 @@ class Identities:
     def apply(self, name, a):
         if name == "inverse":
             return a[1], a[0]
+        for k in self.turns(a).coeffs() if self.angle is not None else ():
+            require(k.q == 1 and name in ("sin", "cos"), f"{name} is not periodic")
         key = name, str(a[0]), str(a[1])
         self.values[key] = self.values.get(key) or (self.free.pop(), self.unit)
         return self.values[key]
+
+    def turns(self, a):  # of a value by one turn of the angle: its derivative, if that is a number
+        slope = a[0].derivative(self.angle) * a[1] - a[0] * a[1].derivative(self.angle)
+        turns = slope // (a[1] * a[1])
+        require(turns.is_constant() and slope == turns * a[1] * a[1], "a value is not periodic")
+        return turns
 
 
 class Checker:
@@ -233,56 +235,61 @@ class Checker:
     def __init__(self, certificate):
         c, lower = certificate, certificate["domain"][0]
         self.n, self.slow, self.implicit = len(lower) // 2, c["slow"], c["implicit"]
-        require(0 < self.n == len(lower) / 2, "the domain has no q or p, or not as many of each")
         self.lower, self.upper = (numbers(side, 2 * self.n) for side in c["domain"])
         self.time, self.epsilon = numbers(c["time"], 2), numbers(c["epsilon"], 2)
         self.ends = [*zip(self.lower, self.upper, strict=True), self.time, self.epsilon]
-        require(all(a <= b for a, b in self.ends), "a lower end is larger than an upper end")
-        require({type(self.slow), type(self.implicit)} == {bool}, "slow, implicit: true or false")
+        fits = self.n > 0 and all(a <= b for a, b in self.ends)
+        require(fits, "the domain has no q and p, or a lower end is larger than an upper end")
         self.h, self.spread = number(c["h"]), numbers(c["spread"], self.n, 0)
-        require(self.h != 0, "h is zero")
+        fits = self.h != 0 and {type(self.slow), type(self.implicit)} == {bool}
+        require(fits, "h is zero, or slow or implicit are not true or false")
         self.quantum, self.residual_limit = (number(c[x], 0) for x in ("quantum", "accepted"))
         self.bits, self.orders = whole(400, c["bits"], low=8) + whole(60, c["orders"], low=1)
         self.arithmetic, self.way = c["arithmetic"], c["way"]
         self.unit, self.limits = UNITS[self.arithmetic], WAYS[self.way]
         self.step, self.invariants, self.inside = c["step"], c["invariants"], c["inside"]
         used = [operation[1] for operation in self.inside["operations"] if operation[0] == "input"]
-        require(all(k < 2 * self.n for k in used), "inside depends on t or ε")
         has_grid = ["input", 2 * self.n + 3] in self.step["operations"]
-        require(has_grid == (self.quantum > 0), "a grid is used or stated, but not both")
+        fits = has_grid == (self.quantum > 0) and all(k < 2 * self.n for k in used)
+        require(fits, "inside depends on t or ε, or a grid is used or stated, but not both")
         ctx.prec = self.bits + 60
+        self.angles = numbers(c.get("angles", [(0.0).hex()] * self.n), self.n, 0)
+        for i in [i for i, largest in enumerate(self.angles) if largest]:
+            self.require_angle(i)
 
-    def root(self):
-        """The box of all boxes: the domain, where p1 may differ from p0 by `spread`."""
+    def require_angle(self, i):  # a turn of q_i is one after a step, too, without other effects
+        (a, b), largest, algebra = self.ends[i], self.angles[i], Identities(2 * self.n + 2, i)
+        fits = ball(b - a) > 2 * arb.pi() and -largest <= a and b <= largest
+        require(fits, "the domain has less than a turn of an angle, or more than stated")
+        step = self.states_of_step([(x, algebra.unit) for x in algebra.x], algebra)
+        values = [v for f in (*self.invariants, self.inside) for v in run(f, step[0], algebra)]
+        fits = all(algebra.turns(v) == int(k == i) for x in step for k, v in enumerate(x))
+        require(fits and not any(map(algebra.turns, values)), f"a turn changes more than q{i + 1}")
+
+    def root(self):  # the box of all boxes: the domain, where p1 may differ from p0 by `spread`
         wide = [Fraction(0)] * self.n + self.spread
         box = [(a - w, b + w) for a, b, w in zip(self.lower, self.upper, wide, strict=True)]
         return [*box, tuple(self.time), tuple(self.epsilon)]
 
-    def models(self, box):
-        """The coordinates of a box as Taylor models; ε from 0 keeps its orders apart."""
+    def models(self, box):  # its coordinates as Taylor models; ε from 0 keeps its orders apart
         algebra = Models(len(box), self.bits, self.orders)
         parts = [((a + b) / 2, (b - a) / 2) for a, b in box]
         parts[-1] = (Fraction(0), box[-1][1]) if box[-1][0] == 0 else parts[-1]
-        gens = [(s * algebra.unit, 0) for s in algebra.ring.gens()]
-        c = [[algebra.constant(value) for value in part] for part in parts]
-        pairs = zip(gens, c, strict=True)
+        x, parts = algebra.ring.gens(), [map(algebra.constant, part) for part in parts]
+        pairs = zip([(s * algebra.unit, 0) for s in x], parts, strict=True)
         return algebra, [algebra.sum(a, algebra.multiply(s, b)) for s, (a, b) in pairs]
 
-    def is_inside(self, box):
-        """Whether all states of a box are shown to be in the domain."""
-        sides = zip(box, self.ends, strict=True)
-        is_between = all(low <= a and b <= high for (a, b), (low, high) in sides)
+    def is_inside(self, box):  # whether all its states are shown to be in the domain
+        is_between = all(c <= a and b <= d for (a, b), (c, d) in zip(box, self.ends, strict=True))
         algebra, x = self.models(box)
         return is_between and all(algebra.range(g)[0] >= 0 for g in run(self.inside, x, algebra))
 
-    def is_outside(self, algebra, x):
-        """Whether no state of these models is in the domain."""
+    def is_outside(self, algebra, x):  # whether no state of these models is in the domain
         sides = zip(map(algebra.range, x), self.lower, self.upper, strict=False)
         is_separate = any(high < lower or low > upper for (low, high), lower, upper in sides)
         return is_separate or any(algebra.range(g)[1] < 0 for g in run(self.inside, x, algebra))
 
-    def states_of_step(self, x, algebra):
-        """(q, p, t, ε, h) before and after a step, from the coordinates of a box."""
+    def states_of_step(self, x, algebra):  # (q, p, t, ε, h) before and after, from x in a box
         q0, p0, (t0, epsilon) = x[: self.n], x[self.n : -2], x[-2:]
         h, error = algebra.constant(self.h), algebra.constant(Fraction(0), self.quantum / 2)
         end = run(self.step, [*x, h, error], algebra)
@@ -300,22 +307,22 @@ class Checker:
         rates = [self.h * e for e in self.epsilon] if self.slow else [self.h]
         return start + steps * min(0, *rates), start + steps * max(0, *rates)
 
-    def displacement(self, step, algebra):
-        """How far a step moves each coordinate, in exact arithmetic."""
-        pairs = list(zip(*step, strict=True))[: 2 * self.n]
-        return [algebra.bound(algebra.sum(b, (-a[0], a[1]))) for a, b in pairs]
+    def displacement(self, step, algebra):  # how far it moves each coordinate, if it is exact
+        changes = [algebra.sum(b, (-a[0], a[1])) for a, b in zip(*step, strict=True)]
+        return [algebra.bound(change) for change in changes[: 2 * self.n]]
 
-    def is_identity(self, k):
-        """Whether I_k is conserved exactly, for all x, t and ε."""
+    def is_identity(self, k):  # whether I_k is conserved exactly, for all x, t and ε
         algebra = Identities(2 * self.n + 2)
-        step = self.states_of_step([(x, algebra.unit) for x in algebra.x], algebra)
+        pairs = zip(algebra.x, self.ends, strict=True)
+        x = [(s, algebra.unit) if a < b else algebra.constant(a) for s, (a, b) in pairs]
+        step = self.states_of_step(x, algebra)
         numerator, denominator = self.change(k, step, algebra)
         return numerator == 0 and denominator != 0
 
-    def rounding(self, box):
-        """The changes of the I_k by the rounding of a step, and the errors of the coordinates."""
+    def rounding(self, box):  # changes of the I_k by that of a step; errors of the coordinates
         algebra, exactly, n = Rounding(self.unit, self.limits), Rounding(0), self.n
         x = [algebra.inexact((ball((a + b) / 2, (b - a) / 2), arb(0)), 0) for a, b in box]
+        x[:n] = [(arb(0, float(q)), v[1]) if q else v for q, v in zip(self.angles, x, strict=False)]
         x[-2] = x[-2][0], 2 * ball(UNITS["float64"]) * abs(x[-2][0])  # t = t0 + kh in float64
         start, end = self.states_of_step(x, algebra)
         if self.implicit:  # the solver accepts a p1 whose residual is `accepted` and as computed
@@ -324,28 +331,25 @@ class Checker:
             inputs = [*x[:n], *momenta, *x[-2:], exactly.constant(self.h)]
             lipschitz = max(round_up(e) * 2.0**60 for _, e in run(self.step, inputs, exactly)[:n])
             require(lipschitz < 1 / 3, "the implicit step is not shown to be a contraction", box)
-            limit = arb(round_up(self.residual_limit))
-            error = max((e + limit for _, e in start[n : 2 * n]), key=round_up)
+            error = max((error for _, error in start[n : 2 * n]), key=round_up)
+            error += arb(round_up(self.residual_limit))
             x[n:-2] = [(p1, error / (1 - arb(lipschitz))) for p1, _ in momenta]
             end = self.states_of_step(x, algebra)[1]
         changes = [run(function, end, exactly)[0][1] for function in self.invariants]
         return list(map(round_up, changes)), [round_up(error) for _, error in end[: 2 * n]]
 
 
-def leaves(box, node):
-    """The boxes of a tree of cuts ["cut", axis, where, part, part], with what is claimed there."""
+def leaves(box, node):  # of a tree of cuts ["cut", axis, where, part, part], with the claims there
     if isinstance(node, str):
         return (yield box, node)
     cut, axis, where, *parts = node
-    require(cut == "cut" and len(parts) == 2, "a cut has not two parts", box)
     (a, b), c = box[whole(len(box) - 1, axis)[0]], number(where)
-    require(a <= c <= b, "a cut is outside of its box,", box)
+    require(cut == "cut" and len(parts) == 2 and a <= c <= b, "not a cut in two parts", box)
     for side, part in zip(((a, c), (c, b)), parts, strict=True):
         yield from leaves([*box[:axis], side, *box[axis + 1 :]], part)
 
 
-def check_step(checker, box, claim, limits):
-    """Statements 1 and 2 on one box; `limits`: the numbers per_step, rounding and reach."""
+def check_step(checker, box, claim, limits):  # 1 and 2; the limits per_step, rounding and reach
     require(claim in ("bounded", "outside"), f"{claim:.64} is no claim", box)
     algebra, x = checker.models(box)
     if claim == "outside" and not checker.implicit:  # the step may be singular there
@@ -359,20 +363,18 @@ def check_step(checker, box, claim, limits):
     changes = [algebra.bound(checker.change(k, step, algebra)) for k in range(len(roundings))]
     changes = [0 if limits[k] == 0 and checker.is_identity(k) else b for k, b in enumerate(changes)]
     moves = [m + Fraction(e) for m, e in zip(moves, errors, strict=True)]
-    fits = [a <= b for a, b in zip([*changes, *roundings, *moves], limits, strict=True)]
-    return require(all(fits), "a change, a rounding or a move is larger than stated", box)
+    fits = all(a <= b for a, b in zip([*changes, *roundings, *moves], limits, strict=True))
+    return require(fits, "a change, a rounding or a move is larger than stated", box)
 
 
-def combination_model(checker, weights, box):
-    """Σ w_k I_k as a model on a box."""
+def combination_model(checker, weights, box):  # Σ w_k I_k as a model on a box
     algebra, x = checker.models(box)
     x, pairs = [*x, algebra.constant(checker.h)], zip(weights, checker.invariants, strict=True)
     terms = [algebra.multiply(algebra.constant(w), run(f, x, algebra)[0]) for w, f in pairs if w]
     return algebra, algebra.sum(*terms)
 
 
-def check_confined(checker, box, claim, weights, limit, reach):
-    """Statement 3 on one box: no trajectory gets there, or it is in the domain there."""
+def check_confined(checker, box, claim, weights, limit, reach):  # 3: why no trajectory leaves there
     if claim == "unreachable":
         wide = [(a - w, b + w) for (a, b), w in zip(box[:-2], reach, strict=True)]
         is_shown = checker.is_outside(*checker.models([*wide, *box[-2:]]))
@@ -384,8 +386,7 @@ def check_confined(checker, box, claim, weights, limit, reach):
     require(is_shown, f"{claim:.64} is not shown", box)
 
 
-def check(certificate):
-    """What a certificate proves, as text. **Raises** `Failure` if it does not."""
+def check(certificate):  # what is proved, as text; raises `Failure` if it is not
     c = certificate
     require(c["format"] == FORMAT, f"the format is not {FORMAT!r}")
     require(digest(c) == c["hash"], "the file was changed: its hash differs")
@@ -403,27 +404,28 @@ def check(certificate):
     (weights, value), (steps,) = c["level"], whole(2**200, c["steps"], low=1)
     weights, value, start = numbers(weights, count), number(value), number(c["start"])
     rates = [abs(w) * (b + r) for w, b, r in zip(weights, per_step, rounding, strict=True)]
-    programs = [checker.step, *checker.invariants]
-    is_timed = any(["input", 2 * checker.n] in program["operations"] for program in programs)
+    lists = [program["operations"] for program in (checker.step, *checker.invariants)]
+    is_timed = any(["input", 2 * checker.n] in operations for operations in lists)
     first, last = checker.times(start, steps)
     is_long = is_timed and (first < checker.time[0] or last > checker.time[1])
     require(not is_long, "the steps last longer than the time", [checker.time])
     checker.bits = LEVEL
     algebra, least = combination_model(checker, weights, example)
     require(algebra.range(least)[1] <= value, "the example is above the level")
-    sides = [(a - w, b + w) for (a, b), w in zip(checker.root(), [*reach, 0, 0], strict=True)]
+    triples = [*zip(checker.angles, reach, checker.ends, strict=False)]
+    fits = all(not q or q >= max(-a, b) + steps * m for q, m, (a, b) in triples)
+    require(fits, "an angle may be larger than stated")
+    wide = [*(0 if q else m for q, m, _ in triples), *reach[checker.n :], 0, 0]
+    sides = [(a - w, b + w) for (a, b), w in zip(checker.root(), wide, strict=True)]
     for box, claim in leaves(sides, c["shell"]):
         check_confined(checker, box, claim, weights, value + steps * sum(rates), reach)
-    time = f" and t = {float(start)!r}" * is_timed
-    text += f"\n- trajectories from there{time} with Σ w_k I_k ≤ "
-    return f"{text}{float(value)!r}, w = {[*map(float, weights)]}, stay there for {steps} steps"
+    text += f"\n- trajectories from there{f' and t = {float(start)!r}' * is_timed} with Σ w_k I_k ≤"
+    return f"{text} {float(value)!r}, w = {[*map(float, weights)]}, stay there for {steps} steps"
 
 
-def statement(checker, count, *bounds):
-    """What statements 1 and 2 say, and what they assume."""
-    lower, upper, time, epsilon, per_step, rounding = (
-        [*map(float, row)] for row in (checker.lower, checker.upper, *checker.ends[-2:], *bounds)
-    )
+def statement(checker, count, *bounds):  # what 1 and 2 say, and what they assume
+    rows = checker.lower, checker.upper, *checker.ends[-2:], *bounds
+    lower, upper, time, epsilon, per_step, rounding = ([*map(float, row)] for row in rows)
     return (
         f"on {count} boxes, with h = {float(checker.h)!r}, for all (q, p) "
         f"from {lower} to {upper}{' with inside ≥ 0' * bool(checker.inside['outputs'])}, all t"
@@ -432,17 +434,16 @@ def statement(checker, count, *bounds):
         f"\n- its rounding in {checker.arithmetic} by {checker.way} changes I by ≤ {rounding} more"
         f"{f', of increments to multiples of {float(checker.quantum)!r}' * bool(checker.quantum)}"
         f"{f', for residuals ≤ {float(checker.residual_limit):.3g}' * checker.implicit}"
+        f"{f', q are angles up to {[*map(float, checker.angles)]}' * any(checker.angles)}"
         "\n- not checked: that a program has these operations (holds_for), with functions to 4 ulp"
     )
 
 
-def main(path):
-    """Check one file. Returns the exit code: 0 for a proof, 1 otherwise."""
+def main(path):  # check one file; the exit code is 0 for a proof, 1 otherwise
     try:
         print("proved:", check(json.loads(pathlib.Path(path).read_text(encoding="utf-8"))))
     except Exception as error:  # whatever is wrong with a file, nothing is proved
-        print(f"not proved: {type(error).__name__}: {error}")
-        return 1
+        return print(f"not proved: {type(error).__name__}: {error}") or 1
     return 0
 
 

@@ -35,6 +35,8 @@ def confine(
     names = ("per_step", "rounding", "reach")
     per_step, rounding, reach = ([exact.number(x) for x in certificate[name]] for name in names)
     start, limit = _start(checker)
+    turns = [*zip(checker.angles, reach, checker.ends, strict=False)]
+    rotations = [int((q - max(-a, b)) / m) for q, m, (a, b) in turns if q and m]
     certificate["start"] = start.hex()
     reason = "no combination of the invariants is larger all around the domain than inside"
     for weights, minimum, border, state in _candidates(checker, functions, inside, shape, reach):
@@ -43,6 +45,7 @@ def confine(
         steps = math.floor(Fraction(change) / rate) if rate else 2**62
         if certificate["timed"]:
             steps = min(steps, limit)
+        steps = min(steps, *rotations, 2**62)
         if not steps:
             reason = f"{combination(weights)} may change by more than change={change:g} in one step"
             continue
@@ -152,9 +155,10 @@ def _points(checker: Any, inside: Any, shape: Any, reach: list) -> tuple[np.ndar
     """Random states of the domain, and around it within `reach`."""
     rng, wide = np.random.default_rng(0), np.array(reach)
     low, high = (np.array([float(x) for x in side]) for side in (checker.lower, checker.upper))
+    has_end = np.array([not q for q in checker.angles] + [True] * checker.n)  # a circle has none
     inner = rng.uniform(low, high, (4000, len(low)))
     border_points = rng.uniform(low, high, (40000, len(low)))
-    axis = rng.integers(0, len(low), len(border_points))
+    axis = rng.choice(np.flatnonzero(has_end), len(border_points))
     rows = np.arange(len(border_points))
     side = rng.random(len(border_points)) < 0.5
     border_points[rows, axis] = np.where(side, low[axis], high[axis])
@@ -167,7 +171,7 @@ def _points(checker: Any, inside: Any, shape: Any, reach: list) -> tuple[np.ndar
     border_points = rng.uniform(low, high, (200000, len(low)))
     border_points = border_points[np.asarray(keep(border_points))]
     neighbours = border_points + rng.choice([-1.0, 1.0], border_points.shape) * wide
-    is_outside = (neighbours < low).any(1) | (neighbours > high).any(1)
+    is_outside = (((neighbours < low) | (neighbours > high)) & has_end).any(1)
     is_outside |= ~np.asarray(keep(neighbours))
     return border_points[:4000], neighbours[is_outside][:40000]
 
@@ -179,7 +183,7 @@ def _state(z: Any, shape: Any) -> tuple[Any, Any]:
 
 def _scale(checker: Any, weights: list, level: Fraction) -> float:
     """The largest factor (to 1 %) by which the domain may be scaled about its middle so that
-    Σ w_k I_k ≤ level in it."""
+    Σ w_k I_k ≤ level in it. Angles are not scaled."""
     exact, search = tools()
     *sides, (begin, end), epsilon = checker.root()
     width = (end - begin) / 16
@@ -188,6 +192,8 @@ def _scale(checker: Any, weights: list, level: Fraction) -> float:
     while bad - good > 1:
         i = (good + bad) // 2
         box = [((a + b) / 2 - i * (b - a) / 200, (a + b) / 2 + i * (b - a) / 200) for a, b in sides]
+        pairs = zip(checker.angles, checker.ends, box[: checker.n], strict=False)
+        box[: checker.n] = [circle if q else part for q, circle, part in pairs]
         try:
             parts = [
                 exact.combination_model(checker, weights, [*box, span, epsilon]) for span in spans

@@ -15,7 +15,7 @@ import numpy as np
 
 import lanewise.elementary
 
-from ..base.signature import accepts
+from ..base.signature import accepts, check_takes
 from ..base.types import Interval
 from ..discover.invariants.discovery import Discovery
 from ..discover.invariants.series import InvariantSeries
@@ -186,14 +186,17 @@ def functions_of(invariants: Any, system: System, with_time: bool) -> list[tuple
         ]
     if isinstance(invariants, str) or not (callable(invariants) or np.iterable(invariants)):
         raise TypeError(
-            "found must be a Discovery, InvariantSeries, ExactInvariant, a function (q, p, "
-            f"epsilon[, t]) or a list of these, got {invariants!r:.200}."
+            "found must be a Discovery, InvariantSeries, ExactInvariant, a function (q, p[, "
+            f"epsilon[, t]]) or a list of these, got {invariants!r:.200}."
         )
     if callable(invariants):
         name = getattr(invariants, "__name__", type(invariants).__name__)
         if accepts(invariants, 4) and (with_time or not accepts(invariants, 3)):
             return [(lambda q, p, t, epsilon, h: invariants(q, p, epsilon, t), name)]
-        return [(lambda q, p, t, epsilon, h: invariants(q, p, epsilon), name)]
+        if accepts(invariants, 3):
+            return [(lambda q, p, t, epsilon, h: invariants(q, p, epsilon), name)]
+        check_takes("found", invariants, "(q, p)")
+        return [(lambda q, p, t, epsilon, h: invariants(q, p), name)]
     pairs = [pair for item in invariants for pair in functions_of(item, system, with_time)]
     if not pairs:
         raise ValueError(

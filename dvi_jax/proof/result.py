@@ -32,6 +32,7 @@ class DriftBound(eqx.Module):
     - `start_time`: the time at which these trajectories start, if the map depends on the time: the
       begin of the interval if the steps go forwards, its end if they go backwards (h < 0, or ε < 0
       for a slow time), and a time between them for an interval of ε with both signs.
+    - Of an angle (`periodic`) the domain is the circle, for computed states up to a largest |q|.
     - `boxes`: number of boxes of the proof. `formulas`: the invariants as text.
     - `certificate`: all that `dvi-jax verify` checks, see `save`.
     """
@@ -58,12 +59,12 @@ class DriftBound(eqx.Module):
         rate = self.per_step[invariant] + self.rounding[invariant]
         return math.floor(change / rate) if rate else math.inf
 
-    def steps_inside(self, q0: Any, p0: Any, epsilon: float) -> int:
+    def steps_inside(self, q0: Any, p0: Any, epsilon: float = 0.0) -> int:
         """The number of steps, exact or computed, within which the trajectory from this start is
         proved to stay in the domain; 0 if nothing is proved for it.
 
         - `q0`, `p0`: the start, with the shape that the domain has. If the map depends on the time,
-          the start is at the time `start_time`. `epsilon`: its ε.
+          the start is at the time `start_time`. An angle may have made turns. `epsilon`: its ε.
 
         With C = Σ w_k I_k and the `level` (w, c), the trajectory is in the domain as long as
         C(q0, p0) + N Σ |w_k| (per_step[k] + rounding[k]) ≤ c + `steps` Σ |w_k| (…).
@@ -88,7 +89,10 @@ class DriftBound(eqx.Module):
         point = [Fraction(float(v)) for v in (*x, start, epsilon)]
         algebra, zero = exact.Rounding(0), exact.ball(Fraction(0))
         state = [(exact.ball(v), zero) for v in point]
-        sides = zip(point, checker.lower, checker.upper, strict=False)
+        n = checker.n
+        lower = [-q or a for q, a in zip(checker.angles, checker.lower[:n], strict=True)]
+        upper = [q or b for q, b in zip(checker.angles, checker.upper[:n], strict=True)]
+        sides = zip(point, lower + checker.lower[n:], upper + checker.upper[n:], strict=False)
         margins = [g for g, _ in exact.run(checker.inside, state, algebra)]
         if not (all(a <= v <= b for v, a, b in sides) and all(g >= 0 for g in margins)):
             return 0
@@ -104,6 +108,10 @@ class DriftBound(eqx.Module):
         value = sum(exact.ball(w) * v for w, v in zip(weights, values, strict=True))
         margin = level + self.steps * rate - Fraction(exact.round_up(value))
         steps = max(0, math.floor(margin / rate)) if rate else (2**62 if margin >= 0 else 0)
+        # A computed angle grows, and its rounding is bounded up to a largest angle only.
+        reach = [exact.number(x) for x in self.certificate["reach"][:n]]
+        triples = [*zip(checker.angles, point, reach, strict=False)]
+        steps = min([steps, *(int((q - abs(v)) / m) for q, v, m in triples if q and m)])
         rate = checker.h * (Fraction(float(epsilon)) if checker.slow else 1)
         end = checker.time[0] if rate < 0 else checker.time[1]
         if self.certificate["timed"] and rate:
@@ -126,9 +134,12 @@ class DriftBound(eqx.Module):
         if c["timed"]:
             names.append("τ" if c["slow"] else "t")
         ends = [*zip(*c["domain"], strict=True), c["time"]]
+        angles = [float.fromhex(x) for x in c.get("angles", [])] + [0.0] * len(names)
         sides = ", ".join(
-            f"{name} in [{float.fromhex(a):.6g}, {float.fromhex(b):.6g}]"
-            for name, (a, b) in zip(names, ends, strict=False)
+            f"an angle {name}, |{name}| ≤ {angle:.3g} where it is computed"
+            if angle
+            else f"{name} in [{float.fromhex(a):.6g}, {float.fromhex(b):.6g}]"
+            for name, (a, b), angle in zip(names, ends, angles, strict=False)
         )
         lines = [
             f"proved for each step from a state with {sides}"

@@ -356,7 +356,8 @@ def enclose(
     """
     end, count = time.monotonic() + max_seconds, 0
     *ranges, span, epsilon = checker.root()
-    ranges = [(a - w, b + w) for (a, b), w in zip(ranges, reach, strict=True)]
+    has_end = [not q for q in checker.angles] + [True] * checker.n  # a circle has none
+    ranges = [(a - w * e, b + w * e) for (a, b), w, e in zip(ranges, reach, has_end, strict=True)]
     root, sides = [*ranges, span, epsilon], [*zip(checker.lower, checker.upper, strict=True)]
     domain = np.array(sides, float).T
     top: list = [None]
@@ -371,7 +372,8 @@ def enclose(
         minimum, low = np.min(values[is_outside], initial=math.inf), values.min() <= float(limit)
         heapq.heappush(heap, (float(minimum), number, box, borders, bool(low), *home))
 
-    add(root, 1, [(i, side) for i, pair in enumerate(sides) for side in pair], top, 0)
+    borders = [(i, side) for i, pair in enumerate(sides) if has_end[i] for side in pair]
+    add(root, 1, borders, top, 0)
     claim_on = partial(_claim, checker, (weights, limit, reach), root)
     while heap:
         batch = [heapq.heappop(heap) for _ in range(min(_BATCH, len(heap)))]

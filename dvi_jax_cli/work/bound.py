@@ -8,11 +8,12 @@ import numpy as np
 
 import dvi_jax as dvi
 
-from .._errors import as_input_error
+from .._errors import as_input_error, require
 from .._show import TextTable
 from .discover import box_of
 from .output import Report, open_report
 from .system import find_source
+from .table import NO_KEY
 
 RESULT_FILES = ("bound.json", "certificate.json")
 """Every file that a proof may write; with `force` these are replaced and nothing else."""
@@ -31,7 +32,13 @@ def bound_file(path: str | Path, out: str | Path | None = None, force: bool = Fa
     functions = source.loader.load("invariants", file.invariants)
     condition = file.domain.inside and source.loader.load("domain.inside", file.domain.inside)
     options = {"h": float(source.h), "args": source.args, "method": source.method(file.method)}
-    options |= {"epsilon": tuple(file.epsilon), "time": file.domain.times, "inside": condition}
+    options |= {"time": file.domain.times, "inside": condition}
+    system = source.system
+    is_perturbed = system.force is not None or system.perturbation is not None or system.slow_time
+    options["periodic"] = np.asarray(file.domain.periodic)
+    rule = "[least, largest] for a system with a perturbation or a slow time"
+    require(file.epsilon is not None or not is_perturbed, "epsilon", NO_KEY, rule)
+    options["epsilon"] = file.epsilon and tuple(file.epsilon)
     options["domain"] = tuple(np.stack(pair) for pair in zip(low, high, strict=True))
     rule = "invariants, a domain and a method that fit the system"
     began, bound = time.perf_counter(), None

@@ -388,6 +388,7 @@ class DiscoverFile(SystemFile):
 
 
 Above0 = Annotated[Number, check(lambda value: value > 0)]
+Interval = Annotated[Two[Number], check(lambda ends: ends[0] < ends[1])]
 
 
 class Domain(TomlTable):
@@ -396,7 +397,8 @@ class Domain(TomlTable):
     low: StatePair = key(..., f"a corner of the box, {BOX}")
     high: StatePair = key(..., f"a corner of the box, {BOX}")
     inside: Text | None = key(None, f"{FILE} of a function (q, p) that is ≥ 0 in the domain")
-    times: Annotated[Two[Number], check(lambda span: span[0] < span[1])] | None = key(
+    periodic: union(boolean=bool, array=NonEmpty[bool]) = key(False, "true, or booleans like q")
+    times: Interval | None = key(
         None, "[first, last]: times at which steps begin, where the map depends on the time"
     )
 
@@ -413,10 +415,8 @@ class Bound(TomlTable):
 class BoundFile(SystemFile):
     """A proof of how much invariants change."""
 
-    invariants: Text = key(..., f"{FILE} of a Discovery, or of a function (q, p, epsilon)")
-    epsilon: Annotated[Two[Number], check(lambda ends: ends[0] < ends[1])] = key(
-        ..., "[least, largest] strength of the perturbation"
-    )
+    invariants: Text = key(..., f"{FILE} of a Discovery, or of a function (q, p[, epsilon])")
+    epsilon: Interval | None = key(None, "[least, largest], if the system has a perturbation")
     domain: Domain = key(..., "[domain], a table with the box of the states")
     bound: Bound = Bound()
     output: Output = Output()
