@@ -209,6 +209,23 @@ def test_rounding_in_pairs_is_bounded():
     assert 1e-33 < float(drift) < 1000 * bound.rounding[0] < 1e-27
 
 
+def test_the_rounding_of_times_is_that_of_the_largest_one():
+    """t = t0 + kh near 0 has the round-off of t0 and kh, where a force of 1000 t feels it."""
+    system = dvi.System(
+        lambda t0, t1, q, p, args: p @ p / 2,
+        force=lambda t0, t1, q, p, args: jnp.arctan(1000 * t0) * jnp.ones(1),
+    )
+    how = {"r": 1.0, "epsilon": (0.5, 1.0), "time": (-1000.0, 1000.0), "max_boxes": 300}
+    bound = proved(lambda q, p, e, t: jnp.sum(p), system, **how)
+    t0, k = -999.9871, 9998
+    sol = dvi.integrate(system, [0.0], [0.0], h=0.1, t0=t0, num_steps=k + 4, epsilon=1.0)
+    with mpmath.workdps(40):
+        h, momenta = mpmath.mpf(0.1), [mpmath.mpf(float(x)) for x in sol.ps[k:, 0]]
+        kicks = [h * mpmath.atan(1000 * (mpmath.mpf(t0) + j * h)) for j in range(k, k + 4)]
+        errors = [abs(b - a - x) for a, b, x in zip(momenta[:-1], momenta[1:], kicks, strict=True)]
+        assert bound.rounding[0] / 3000 < max(errors) <= bound.rounding[0]
+
+
 def test_trajectories_stay_below_the_line(cubic):
     k, s = 0, cubic.start * 0.5
     q, p = np.random.default_rng(2).uniform(-s, s, (2, 64, 1))

@@ -314,7 +314,7 @@ class Checker:
         """The changes of the I_k by the rounding of a step, and the errors of the coordinates."""
         algebra, exactly, n = Rounding(self.unit), Rounding(0), self.n
         x = [(ball((a + b) / 2, (b - a) / 2), arb(0)) for a, b in box]
-        x[-2] = x[-2][0], 2 * ball(UNITS["float64"]) * abs(x[-2][0])  # t = t0 + kh in float64
+        x[-2] = x[-2][0], ball(4 * UNITS["float64"] * max(map(abs, self.time)))  # t = t0 + kh
         start, end = self.states_of_step(x, algebra)
         if self.implicit:  # the solver accepts a p1 whose residual is `accepted` and as computed
             # A Lipschitz constant of p1 → h·rate(q0, p1) in the maximum norm: the effect of errors.
