@@ -466,6 +466,13 @@ def test_no_number_of_steps_is_claimed(epsilon, function):
 
 
 KICKED = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + jnp.sum(jnp.cos(q - t0)))
+PERIODIC = dvi.System(  # of which whole times are alike
+    lambda t0, t1, q, p, args: p @ p / 2 + jnp.sin(2 * jnp.pi * t0) * jnp.sum(q)
+)
+LATE = dvi.System(
+    lambda t0, t1, q, p, args: (p @ p + q @ q) / 2,
+    force=lambda t0, t1, q, p, args: jnp.where(t0 > 5, 1.0, 0.0) * jnp.ones_like(q),
+)
 FOLDED = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + jnp.sum(jnp.abs(q)))
 
 
@@ -476,6 +483,8 @@ FOLDED = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + jnp.sum(jnp.abs(q)))
         ({"function": "energy"}, TypeError, "found must be a Discovery"),
         ({"function": lambda q, p, e: jnp.abs(q[0])}, NotAnalytic, "<lambda>: .* not allow: abs"),
         ({"system": KICKED}, ValueError, "depends on the time"),
+        ({"system": PERIODIC}, ValueError, "depends on the time"),
+        ({"system": LATE}, NotAnalytic, "select_n"),
         ({"system": FOLDED}, NotAnalytic, "select_n"),
         ({"epsilon": (0.1, 0.1)}, ValueError, "with least < largest"),
         ({"ratio": 1.0}, ValueError, "larger than 1"),
@@ -491,6 +500,24 @@ FOLDED = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + jnp.sum(jnp.abs(q)))
 def test_bad_input(how, kind, message):
     with pytest.raises(kind, match=message):
         proved(**{"function": energy_of_the_map, **how})
+
+
+def test_a_step_of_times_is_no_time():
+    """H_D may use t1 − t0, which is h: such a map does not depend on the time."""
+    system = dvi.System(
+        lambda t0, t1, q, p, args: (p @ p + q @ q) / 2 + (2 * t1 - 2 * t0) * (q @ q) / 8
+    )
+    assert proved(energy_of_the_map, system).per_step[0] > 0
+    mean = dvi.System(lambda t0, t1, q, p, args: (p @ p + q @ q) / 2 + (t1 + t0) * (q @ q))
+    with pytest.raises(ValueError, match="depends on the time"):
+        proved(energy_of_the_map, mean)
+
+
+def test_an_implicit_step_that_depends_on_the_time():
+    system = dvi.System(lambda t0, t1, q, p, a: (p @ p) * (1 + t0 * (q @ q) / 4) / 2 + q @ q / 2)
+    bound = proved(energy_of_the_map, system, r=0.3, time=(1.0, 2.0), max_boxes=300)
+    assert bound.certificate["implicit"]
+    assert 0 < bound.per_step[0] < 0.01
 
 
 def test_functions_become_the_same_numbers():
