@@ -160,10 +160,10 @@ class ProgramNumber:
         return self._scalar(other) / self
 
     def power(self, n: int) -> "ProgramNumber":
-        """selfⁿ: n − 1 products."""
+        """selfⁿ: n − 1 products; for n < 0 of 1/self, as in machine code, which rounds more."""
         if n < 1:
             unit = self.program.constant(1.0)
-            return unit / self.power(-n) if n else unit
+            return (unit / self).power(-n) if n else unit
         if n == 1:
             return self
         square = (self * self).power(n // 2)
@@ -434,7 +434,8 @@ def _scan(program: ScalarProgram, params: Any, values: list) -> list:
     if params["reverse"]:
         rows.reverse()
     stacks = [
-        np.stack([_symbolic(program, np.asarray(y) if not _is_symbolic(y) else y) for y in ys])
+        # Counters remain integers: they are indices in the derivative of the loop.
+        np.stack([_symbolic(program, y) for y in ys] if any(map(_is_symbolic, ys)) else ys)
         for ys in zip(*rows, strict=True)
     ]
     return [*carry, *stacks]
