@@ -649,14 +649,14 @@ def powers(h=0.02):
 
 
 def negative_power(h=1.0):
-    """The force ε q⁻⁷ and the invariant p, where nearly all rounding is that of the power."""
-    system = dvi.System(kinetic, force=lambda t0, t1, q, p, args: q**-7)
-    domain = np.array([[1.4], [1.5]]), box(1e-9)
+    """The force ε q⁻¹⁵ and the invariant p, where nearly all rounding is that of the power."""
+    system = dvi.System(kinetic, force=lambda t0, t1, q, p, args: q**-15)
+    domain = np.array([[1.98], [1.9999]]), box(1e-9)
     return Subject(
         system,
         lambda q, p, e: p[0],
         {"h": h, "epsilon": (0.999, 1.0), "domain": domain},
-        euler(lambda m, q, t, e: [e / q[0] ** 7], h),
+        euler(lambda m, q, t, e: [e / q[0] ** 15], h),
         [lambda m, q, p, e, t: p[0]],
     )
 

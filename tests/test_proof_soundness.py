@@ -77,7 +77,7 @@ def test_computed_steps_have_errors_below_the_proved_rounding(way, capsys):
 
 
 def test_the_rounding_of_a_negative_power_is_that_of_the_power_of_the_inverse(capsys):
-    """The machine code computes (1/q)⁷, whose error is larger than that of 1/q⁷."""
+    """The machine code computes (1/q)¹⁵, whose error is larger than that of 1/q¹⁵."""
     check_rounding("negative power", "machine code", 20_000, capsys)
 
 
