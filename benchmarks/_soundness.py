@@ -827,7 +827,7 @@ class Truth:
         reach = np.max(np.abs(x[:-2] - middle) / half, axis=0)
         q, p, *_ = self.split(x)
         outside = ~self.is_inside(q, p)
-        return np.where(outside, np.maximum(reach, 2.0), reach)
+        return np.where(outside, np.fmax(reach, 2.0), reach)  # not a number: outside
 
     def farthest(self, x: np.ndarray, steps: np.ndarray | int) -> np.ndarray:
         """The largest `reach` of trajectories within a number of steps of each."""

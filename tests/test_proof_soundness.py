@@ -61,6 +61,34 @@ def test_no_state_of_a_hundred_thousand_ascents_disproves_a_proof(name, capsys):
     check(name, 100_000, capsys)
 
 
+@pytest.mark.parametrize("forwards", [True, False])
+def test_steps_inside_end_with_the_interval_of_times(forwards):
+    """The force −ε q t⁴ from t = 3 backwards, or from −3 forwards; a little later it is large."""
+    h, time = (0.1, (-3.0, 0.0)) if forwards else (-0.1, (0.0, 3.0))
+    subject = SOUNDNESS["driven"](h, 1e-5, time)
+    bound, truth = subject.prove(), Truth(subject)
+    assert bound.start_time == (-3.0 if forwards else 3.0)
+    x = np.array([[0.2, 0.1, bound.start_time, 1e-5], [0.0, 0.3, bound.start_time, 5e-6]]).T
+    counts = [bound.steps_inside(c[:1], c[1:2], c[3]) for c in x.T]
+    assert all(20 < n <= 30 for n in counts)
+    assert np.max(truth.farthest(x, np.array(counts))) <= 1
+    with np.errstate(all="ignore"):
+        assert np.min(truth.farthest(x, 2000)) > 1
+
+
+@pytest.mark.parametrize("h", [0.1, -0.1])
+def test_steps_inside_of_a_slow_time_have_its_direction(h):
+    """From the middle of the interval τ goes with ε h, up or down."""
+    subject = SOUNDNESS["slow_spring"](h, (-0.02, 0.02), (-0.5, 0.5))
+    bound, truth = subject.prove(), Truth(subject)
+    assert abs(bound.start_time) < 1e-9
+    for epsilon in (-0.02, -0.005, 0.015, 0.02):
+        count = bound.steps_inside([0.02], [0.01], epsilon)
+        assert 0 < count <= 0.5 / abs(h * epsilon) + 1
+        x = np.array([[0.02, 0.01, bound.start_time, epsilon]]).T
+        assert np.max(truth.farthest(x, count)) <= 1
+
+
 # --- the rounding of computed steps --------------------------------------------------------------
 
 
