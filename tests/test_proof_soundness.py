@@ -78,7 +78,7 @@ def test_steps_inside_end_with_the_interval_of_times(forwards):
 
 @pytest.mark.parametrize("h", [0.1, -0.1])
 def test_steps_inside_of_a_slow_time_have_its_direction(h):
-    """From the middle of the interval τ goes with ε h, up or down."""
+    """From the middle of the interval τ changes by ε h in a step, up or down."""
     subject = SOUNDNESS["slow_spring"](h, (-0.02, 0.02), (-0.5, 0.5))
     bound, truth = subject.prove(), Truth(subject)
     assert abs(bound.start_time) < 1e-9
