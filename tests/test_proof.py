@@ -209,6 +209,23 @@ def test_rounding_in_pairs_is_bounded():
     assert 1e-33 < float(drift) < 1000 * bound.rounding[0] < 1e-27
 
 
+def test_the_rounding_of_times_is_that_of_the_largest_one():
+    """t = t0 + kh near 0 has the round-off of t0 and kh, where a force of 1000 t feels it."""
+    system = dvi.System(
+        lambda t0, t1, q, p, args: p @ p / 2,
+        force=lambda t0, t1, q, p, args: jnp.arctan(1000 * t0) * jnp.ones(1),
+    )
+    how = {"r": 1.0, "epsilon": (0.5, 1.0), "time": (-1000.0, 1000.0), "max_boxes": 300}
+    bound = proved(lambda q, p, e, t: jnp.sum(p), system, **how)
+    t0, k = -999.9871, 9998
+    sol = dvi.integrate(system, [0.0], [0.0], h=0.1, t0=t0, num_steps=k + 4, epsilon=1.0)
+    with mpmath.workdps(40):
+        h, momenta = mpmath.mpf(0.1), [mpmath.mpf(float(x)) for x in sol.ps[k:, 0]]
+        kicks = [h * mpmath.atan(1000 * (mpmath.mpf(t0) + j * h)) for j in range(k, k + 4)]
+        errors = [abs(b - a - x) for a, b, x in zip(momenta[:-1], momenta[1:], kicks, strict=True)]
+        assert bound.rounding[0] / 3000 < max(errors) <= bound.rounding[0]
+
+
 def test_trajectories_stay_below_the_line(cubic):
     k, s = 0, cubic.start * 0.5
     q, p = np.random.default_rng(2).uniform(-s, s, (2, 64, 1))
@@ -471,6 +488,13 @@ def test_no_number_of_steps_is_claimed(epsilon, function):
 
 
 KICKED = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + jnp.sum(jnp.cos(q - t0)))
+PERIODIC = dvi.System(  # of which whole times are alike
+    lambda t0, t1, q, p, args: p @ p / 2 + jnp.sin(2 * jnp.pi * t0) * jnp.sum(q)
+)
+LATE = dvi.System(
+    lambda t0, t1, q, p, args: (p @ p + q @ q) / 2,
+    force=lambda t0, t1, q, p, args: jnp.where(t0 > 5, 1.0, 0.0) * jnp.ones_like(q),
+)
 FOLDED = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + jnp.sum(jnp.abs(q)))
 
 
@@ -481,6 +505,8 @@ FOLDED = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + jnp.sum(jnp.abs(q)))
         ({"function": "energy"}, TypeError, "found must be a Discovery"),
         ({"function": lambda q, p, e: jnp.abs(q[0])}, NotAnalytic, "<lambda>: .* not allow: abs"),
         ({"system": KICKED}, ValueError, "depends on the time"),
+        ({"system": PERIODIC}, ValueError, "depends on the time"),
+        ({"system": LATE}, NotAnalytic, "select_n"),
         ({"system": FOLDED}, NotAnalytic, "select_n"),
         ({"epsilon": (0.1, 0.1)}, ValueError, "with least < largest"),
         ({"ratio": 1.0}, ValueError, "larger than 1"),
@@ -496,6 +522,24 @@ FOLDED = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + jnp.sum(jnp.abs(q)))
 def test_bad_input(how, kind, message):
     with pytest.raises(kind, match=message):
         proved(**{"function": energy_of_the_map, **how})
+
+
+def test_a_step_of_times_is_no_time():
+    """H_D may use t1 − t0, which is h: such a map does not depend on the time."""
+    system = dvi.System(
+        lambda t0, t1, q, p, args: (p @ p + q @ q) / 2 + (2 * t1 - 2 * t0) * (q @ q) / 8
+    )
+    assert proved(energy_of_the_map, system).per_step[0] > 0
+    mean = dvi.System(lambda t0, t1, q, p, args: (p @ p + q @ q) / 2 + (t1 + t0) * (q @ q))
+    with pytest.raises(ValueError, match="depends on the time"):
+        proved(energy_of_the_map, mean)
+
+
+def test_an_implicit_step_that_depends_on_the_time():
+    system = dvi.System(lambda t0, t1, q, p, a: (p @ p) * (1 + t0 * (q @ q) / 4) / 2 + q @ q / 2)
+    bound = proved(energy_of_the_map, system, r=0.3, time=(1.0, 2.0), max_boxes=300)
+    assert bound.certificate["implicit"]
+    assert 0 < bound.per_step[0] < 0.01
 
 
 def test_functions_become_the_same_numbers():

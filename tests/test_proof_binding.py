@@ -65,6 +65,25 @@ def test_it_does_not_hold_for_another(bound, name):
     assert word in str(binding)
 
 
+@pytest.mark.parametrize("part", ["H_D", "invariant", "inside", "args"])
+def test_another_number_of_coordinates_is_a_difference(part):
+    free = dvi.System(lambda t0, t1, q, p, args: p @ p / 2)
+    bound = dvi.bound_drift(
+        lambda q, p, epsilon: p[0], free, h=0.1, epsilon=0.1, domain=np.array([0.5])
+    )
+    assert dvi.holds_for(free, bound)
+    one = lambda q, p, epsilon: p[0]  # noqa: E731
+    binding = {
+        "H_D": lambda: dvi.holds_for(SYSTEM, bound, **HOW),
+        "args": lambda: dvi.holds_for(
+            dvi.System(lambda t0, t1, q, p, args: args @ p), bound, args=STIFFNESS),
+        "invariant": lambda: dvi.holds_for(free, bound, lambda q, p, epsilon: p @ STIFFNESS),
+        "inside": lambda: dvi.holds_for(free, bound, one, inside=lambda q, p: q + STIFFNESS @ p),
+    }[part]()  # fmt: skip
+    assert not binding
+    assert "number of coordinates: q and p of the certificate have the shape (1,)" in str(binding)
+
+
 def test_other_elementary_functions_are_another_program(bound, monkeypatch):
     from dvi_jax.proof import programs
 

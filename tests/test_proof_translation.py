@@ -52,6 +52,7 @@ TRANSLATED = {
     "cumsum": lambda x: jnp.cumsum(x[::-1]) * jnp.cumsum(x),
     "convolution": lambda x: jnp.stack([x[:2] @ TABLE[:2], x[1:] @ TABLE[:2]]),
     "loop": loop,
+    "derivative of a loop with indices": jax.grad(lambda x: jnp.sum(loop(x))),
     "scan backwards": lambda x: jax.lax.scan(
         lambda c, y: (c * y + 1, c), 0.5 * x[0], x, reverse=True
     )[1],

@@ -5,6 +5,9 @@ import os
 from pathlib import Path
 from typing import Any, NamedTuple, TypedDict, Unpack
 
+import jax
+import jax.numpy as jnp
+
 from lanewise import Layout
 
 from ..base.keywords import checked_keywords
@@ -12,7 +15,7 @@ from ..base.precision import refuse_double_without_x64
 from ..integration.arithmetic import Arithmetic
 from ..integration.integrator import Integrator
 from ..methods import Method
-from ..problem.system import check_system, of_problem
+from ..problem.system import System, check_system, of_problem
 from .programs import Region, functions_of, programs_of
 from .result import DriftBound, tools
 from .ways import XLA, integrator_of, way_of_running
@@ -114,6 +117,9 @@ def holds_for(
     region = Region(shape, (low, high), (begin, end), (least, largest), h, c["timed"])
     functions = [] if found is None else functions_of(found, system, region.is_timed)
     inside = settings.get("inside")
+    misfit = _misfit(system, args, functions, inside, shape)
+    if misfit:
+        return Binding(False, (misfit,), ())
     points = region.points(inside)
     _, programs = programs_of(system, integrator, args, functions, inside, region, points, c["way"])
     parts = [part for part in _PARTS if found is not None or part != "invariants"]
@@ -140,6 +146,23 @@ def holds_for(
         if mine[name] != its[name] and programs[name] == c[name]
     ]
     return Binding(not differences, tuple(differences), tuple(remarks))
+
+
+def _misfit(system: System, args: Any, functions: list, inside: Any, shape: tuple) -> str:
+    """Why a system cannot have states of this shape; empty if it can."""
+    state, number = jnp.zeros(shape), jnp.zeros(())
+    try:
+        system.check_shapes(number, state, state, number, args)
+        for function, _ in functions:
+            jax.eval_shape(function, state, state, number, number, number)
+        if inside is not None:
+            jax.eval_shape(inside, state, state)
+    except Exception as error:  # of the user's functions: any
+        return (
+            f"the number of coordinates: q and p of the certificate have the shape {shape}, for "
+            f"which the functions of this system raise {type(error).__name__}: {error}"
+        )
+    return ""
 
 
 def _contents(certificate: Any) -> dict[str, Any]:

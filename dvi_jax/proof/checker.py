@@ -31,7 +31,6 @@ from flint import arb, arb_series, ctx, fmpq, fmpq_mpoly_ctx, fmpz_mpoly_ctx
 
 FORMAT = "dvi_jax drift bound 3"
 FUNCTIONS = ("exp", "log", "sin", "cos", "tan", "atan", "asin", "acos", "sqrt", "inverse")
-ULPS = {"sqrt": 1, "inverse": 1}  # errors of functions in units of round-off; 8 (4 ulp) for others
 UNITS = {"float64": Fraction(1, 2**53), "pairs of float64": Fraction(1, 2**103)}  # round-off
 LEVEL = 30  # bits for levels, where nothing cancels
 LARGEST = 2.0**990  # of a number that is computed: its product with 2^27, in pairs, is finite
@@ -189,7 +188,8 @@ class Rounding:
     def apply(self, name, a):
         derivatives = series(name, a[0] + arb(0, round_up(a[1])), 2)
         require(derivatives[1].is_finite(), f"{name} is singular")
-        return self.inexact((derivatives[0], abs(derivatives[1]) * a[1]), ULPS.get(name, 8))
+        units = {"sqrt": 1, "inverse": 2 if self.unit < 2.0**-60 else 1}.get(name, 8)  # 8: 4 ulp
+        return self.inexact((derivatives[0], abs(derivatives[1]) * a[1]), units)
 
 
 class Identities:
@@ -323,16 +323,15 @@ class Checker:
         algebra, exactly, n = Rounding(self.unit, self.limits), Rounding(0), self.n
         x = [algebra.inexact((ball((a + b) / 2, (b - a) / 2), arb(0)), 0) for a, b in box]
         x[:n] = [(arb(0, float(q)), v[1]) if q else v for q, v in zip(self.angles, x, strict=False)]
-        x[-2] = x[-2][0], 2 * ball(UNITS["float64"]) * abs(x[-2][0])  # t = t0 + kh in float64
+        x[-2] = x[-2][0], ball(4 * UNITS["float64"] * max(map(abs, self.time)))  # t = t0 + kh
         start, end = self.states_of_step(x, algebra)
         if self.implicit:  # the solver accepts a p1 whose residual is `accepted` and as computed
             # A Lipschitz constant of p1 → h·rate(q0, p1) in the maximum norm: the effect of errors.
             momenta = [(p1, arb(2) ** -60) for p1, _ in x[n:-2]]
-            inputs = [*x[:n], *momenta, *x[-2:], exactly.constant(self.h)]
+            inputs = [*x[:n], *momenta, (x[-2][0], arb(0)), x[-1], exactly.constant(self.h)]
             lipschitz = max(round_up(e) * 2.0**60 for _, e in run(self.step, inputs, exactly)[:n])
             require(lipschitz < 1 / 3, "the implicit step is not shown to be a contraction", box)
-            error = max((error for _, error in start[n : 2 * n]), key=round_up)
-            error += arb(round_up(self.residual_limit))
+            error = max((e for _, e in start[n : 2 * n]), key=round_up) + ball(self.residual_limit)
             x[n:-2] = [(p1, error / (1 - arb(lipschitz))) for p1, _ in momenta]
             end = self.states_of_step(x, algebra)[1]
         changes = [run(function, end, exactly)[0][1] for function in self.invariants]

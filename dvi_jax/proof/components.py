@@ -304,7 +304,8 @@ def _scan(program: ScalarProgram, params: Any, values: list) -> list:
     if params["reverse"]:
         rows.reverse()
     stacks = [
-        np.stack([_symbolic(program, np.asarray(y) if not _is_symbolic(y) else y) for y in ys])
+        # Counters remain integers: they are indices in the derivative of the loop.
+        np.stack([_symbolic(program, y) for y in ys] if any(map(_is_symbolic, ys)) else ys)
         for ys in zip(*rows, strict=True)
     ]
     return [*carry, *stacks]

@@ -147,12 +147,10 @@ class ProgramNumber:
         return self._scalar(other) / self
 
     def power(self, n: int) -> "ProgramNumber":
-        """selfⁿ: n − 1 products."""
+        """selfⁿ: n − 1 products; for n < 0 of 1/self, as in machine code, which rounds more."""
         if n < 1:
             unit = self.program.constant(1.0)
-            result = unit / self.power(-n) if n else unit
-            # The machine code computes (1/x)ⁿ, in which the error of 1/x counts n times.
-            return result.inexact(-n - 1) if n < -1 and result.value is None else result
+            return (unit / self).power(-n) if n else unit
         if n == 1:
             return self
         square = (self * self).power(n // 2)
