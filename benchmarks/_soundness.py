@@ -982,7 +982,7 @@ def rounding(name: str, way: str, count: int) -> tuple[str, list[str]]:
     """A row of a table, and what is wrong: computed steps of one program in one way of running,
     against the rounding and the reach that are proved."""
     subject = CORPUS[name]()
-    bound = subject.prove()
+    bound = subject.prove(layout=LAYOUTS[way])
     with np.errstate(all="ignore"):
         worst, slack, moves, total = ComputedSteps(subject, LAYOUTS[way]).largest(count)
     reach = [float.fromhex(x) for x in bound.certificate["reach"]]

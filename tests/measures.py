@@ -38,11 +38,11 @@ PACKAGES = ("dvi_jax", "lanewise", "dvi_jax_cli")
 LONGEST_FILE, MOST_PARAMETERS = 450, 9
 
 LIMITS: dict[str, float] = {
-    "lines of the core": 12_710,
-    "lines of the questions": 20_540,
-    "lines of the leaves": 17_460,
-    "lines of lanewise": 7_460,
-    "lines of the command line": 4_490,
+    "lines of the core": 12_630,
+    "lines of the questions": 20_560,
+    "lines of the leaves": 17_000,
+    "lines of lanewise": 7_489,
+    "lines of the command line": 4_400,
     "raise statements": 600,
     "characters of error text": 45_000,
     "functions with more than 9 parameters": 2,

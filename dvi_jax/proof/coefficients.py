@@ -32,6 +32,7 @@ from .components import program_of
 from .programs import Region, programs_of
 from .rational import ExactInvariant
 from .result import tools
+from .ways import MACHINE_CODE
 
 _DROP = 1e-9  # Coefficients below this share of the largest are rounding
 _ERROR = 1e-12  # Least relative error of a coefficient
@@ -207,7 +208,7 @@ class _Equations:
             shape, ([-1.0] * 2 * size, [1.0] * 2 * size), (0.0, 1.0), (0.0, 0.1), h, True
         )
         points = region.points(None)
-        _, programs = programs_of(system, integrator, args, [], None, region, points)
+        _, programs = programs_of(system, integrator, args, [], None, region, points, MACHINE_CODE)
         self.step, self.is_implicit = programs["step"], programs["implicit"]
         self.h, self.slow, self.size = Fraction(h), system.slow_time, size
         self.basis = program_of(basis, shape, shape, ())

@@ -32,14 +32,14 @@ def bound_file(path: str | Path, out: str | Path | None = None, force: bool = Fa
     functions = source.loader.load("invariants", file.invariants)
     condition = file.domain.inside and source.loader.load("domain.inside", file.domain.inside)
     options = {"h": float(source.h), "args": source.args, "method": source.method(file.method)}
-    options |= {"time": file.domain.times, "inside": condition}
+    times, periodic = file.domain.times, np.asarray(file.domain.periodic)
+    options |= {"time": times, "inside": condition, "periodic": periodic}
     system = source.system
     is_perturbed = system.force is not None or system.perturbation is not None or system.slow_time
-    options["periodic"] = np.asarray(file.domain.periodic)
     rule = "[least, largest] for a system with a perturbation or a slow time"
     require(file.epsilon is not None or not is_perturbed, "epsilon", NO_KEY, rule)
-    options["epsilon"] = file.epsilon and tuple(file.epsilon)
-    options["domain"] = tuple(np.stack(pair) for pair in zip(low, high, strict=True))
+    domain = tuple(np.stack(pair) for pair in zip(low, high, strict=True))
+    options |= {"epsilon": file.epsilon and tuple(file.epsilon), "domain": domain}
     rule = "invariants, a domain and a method that fit the system"
     began, bound = time.perf_counter(), None
     with report.reservation(), source.at_work("invariants", "bounded", rule):
