@@ -1,4 +1,4 @@
-"""Runs that end early, and evaluations beside the steps: gradients and statuses."""
+"""Runs that end early, and evaluations between the steps: gradients and statuses."""
 
 import jax
 import jax.numpy as jnp

@@ -119,7 +119,7 @@ def first_of(statuses: RESULTS, exists: Array) -> RESULTS:
 
 
 def with_auxiliary(status: RESULTS, auxiliary: RESULTS) -> RESULTS:
-    """The status of a run whose evaluations beside its steps have the status `auxiliary`."""
+    """The status of a run whose evaluations between its steps have the status `auxiliary`."""
     is_good = (status == RESULTS.successful) | (status == RESULTS.stopped)
     return RESULTS.where(is_good & (auxiliary != RESULTS.successful), auxiliary, status)
 

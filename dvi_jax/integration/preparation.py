@@ -110,8 +110,7 @@ def _check_start(task: Task, q0: State, p0: State) -> None:
 def _task(run: Run, integrator: Integrator, method: Method, h: Array) -> tuple[Task, State, State]:
     """The trajectory to compute, and its initial state in the representation of the arithmetic."""
     system, epsilon = run.system, run.epsilon
-    is_perturbed = system.force is not None or system.perturbation is not None
-    if not (is_perturbed or system.slow_time or is_traced(epsilon)) and float(epsilon) != 0:
+    if not (system.depends_on_epsilon or is_traced(epsilon)) and float(epsilon) != 0:
         warnings.warn(
             f"epsilon = {float(epsilon):g} has no effect: the system has neither a force nor a "
             "perturbation. Leave epsilon out, or add force= or perturbation= in dvi.System(...).",

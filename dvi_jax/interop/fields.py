@@ -70,8 +70,7 @@ def system_and_strength(system: Any, epsilon: Any) -> tuple[dvi.System, Any]:
         value = float(epsilon)
     except (TypeError, jax.errors.ConcretizationTypeError):  # traced: its value is not known
         value = 0.0
-    has_effect = system.force is not None or system.perturbation is not None or system.slow_time
-    if value != 0 and not has_effect:
+    if value != 0 and not system.depends_on_epsilon:
         text = f"epsilon = {value:g} has no effect without a force or a perturbation: leave it out."
         warnings.warn(text, stacklevel=3)
     return system, epsilon

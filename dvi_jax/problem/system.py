@@ -104,6 +104,11 @@ class System(eqx.Module):
             refuse_step_from_times("perturbation with slow_time=True", self.perturbation)
 
     @property
+    def depends_on_epsilon(self) -> bool:
+        """Whether ε has an effect: on a force, a perturbation or the time."""
+        return self.force is not None or self.perturbation is not None or self.slow_time
+
+    @property
     def _is_nonlinear(self) -> bool:
         """Whether the perturbation takes ε."""
         function = self.perturbation

@@ -286,8 +286,7 @@ def _domain(
 
 def _strengths(epsilon: Any, system: System) -> tuple[float, float]:
     """The interval of ε; 0 alone for the number 0, and where a map has no perturbation."""
-    is_perturbed = system.force is not None or system.perturbation is not None
-    if epsilon is None and not (is_perturbed or system.slow_time):
+    if epsilon is None and not system.depends_on_epsilon:
         return 0.0, 0.0
     hint = "Only systems without force, perturbation and slow time need no epsilon."
     is_pair = epsilon is not None and np.ndim(epsilon) > 0

@@ -34,10 +34,9 @@ def bound_file(path: str | Path, out: str | Path | None = None, force: bool = Fa
     options = {"h": float(source.h), "args": source.args, "method": source.method(file.method)}
     times, periodic = file.domain.times, np.asarray(file.domain.periodic)
     options |= {"time": times, "inside": condition, "periodic": periodic}
-    system = source.system
-    is_perturbed = system.force is not None or system.perturbation is not None or system.slow_time
+    has_epsilon = file.epsilon is not None or not source.system.depends_on_epsilon
     rule = "[least, largest] for a system with a perturbation or a slow time"
-    require(file.epsilon is not None or not is_perturbed, "epsilon", NO_KEY, rule)
+    require(has_epsilon, "epsilon", NO_KEY, rule)
     domain = tuple(np.stack(pair) for pair in zip(low, high, strict=True))
     options |= {"epsilon": file.epsilon and tuple(file.epsilon), "domain": domain}
     rule = "invariants, a domain and a method that fit the system"
