@@ -40,7 +40,7 @@ dist: $(READY)
 	sed -n '/^```python$$/,/^```$$/{/^```/!p}' README.md > dist/readme.py
 	cd dist && MPLBACKEND=Agg venv/bin/python -P readme.py
 
-## make test        every part of the package at least once, in about five minutes
+## make test        every part of the package at least once, in about ten minutes
 test: $(READY)
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --durations=20
 
