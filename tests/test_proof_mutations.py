@@ -289,10 +289,10 @@ def accepts(c, seconds=20):
     return True
 
 
-LONG = [pytest.param(2_000, seed, marks=pytest.mark.slow) for seed in range(5)]
+TEN_THOUSAND = [pytest.param(2_000, seed, marks=pytest.mark.slow) for seed in range(5)]
 
 
-@pytest.mark.parametrize(("count", "seed"), [(200, 200), *LONG])
+@pytest.mark.parametrize(("count", "seed"), [(200, 200), *TEN_THOUSAND])
 def test_what_is_accepted_after_a_change_is_true(certificates, count, seed, capsys):
     rng, accepted = np.random.default_rng(seed), 0
     for i in range(count):
