@@ -300,33 +300,34 @@ def test_a_batch_has_the_bits_of_single_runs(method):
     [
         ("pendulum", dvi.Strang(), 25),
         ("kepler", dvi.Strang(), 25),
-        # The target of 25 is missed: in float64 most of this step is fused multiply-adds, each of
-        # which takes about 25 operations in pairs.
-        ("henon_heiles", dvi.Strang(), 35),
+        # 17 to 21: in float64 most of this step is fused multiply-adds, each of which takes about 25
+        # operations in pairs.
+        ("henon_heiles", dvi.Strang(), 30),
         ("kepler", dvi.GaussLegendre(2), 25),
     ],
 )
 def test_cost_of_a_step(name, method, most):
-    """In a batch, relative to float64: the least of some runs of each."""
+    """In a batch, relative to float64: the least of some runs of each, in turn."""
     problem = systems.LIBRARY[name]()
 
-    def seconds(arithmetic):
+    def program(arithmetic):
         def one(q):
-            how = {"args": problem.args, "h": 0.01, "num_steps": 500, "epsilon": 0.0}
+            how = {"args": problem.args, "h": 1e-3, "num_steps": 5000, "epsilon": 0.0}
             how |= {"method": method, "arithmetic": arithmetic, "save": FINAL}
             return dvi.integrate(problem.system, q, problem.p0, **how).qs[-1]
 
-        run = jax.jit(jax.vmap(one))
-        q = jnp.linspace(0.9, 1.1, 256)[:, None] * jnp.asarray(problem.q0)[None]
-        run(q).block_until_ready()
-        times = []
-        for _ in range(5):
+        return jax.jit(jax.vmap(one))
+
+    q = jnp.linspace(0.9, 1.1, 256)[:, None] * jnp.asarray(problem.q0)[None]
+    programs = [program(dvi.DoubleDouble()), program(dvi.FloatingPoint())]
+    times: list[list[float]] = [[], []]
+    for _ in range(6):  # the first run compiles
+        for run, seconds in zip(programs, times, strict=True):
             before = time.process_time()
             run(q).block_until_ready()
-            times.append(time.process_time() - before)
-        return min(times)
-
-    ratio = seconds(dvi.DoubleDouble()) / seconds(dvi.FloatingPoint())
+            seconds.append(time.process_time() - before)
+    pairs, floats = (min(seconds[1:]) for seconds in times)
+    ratio = pairs / floats
     print(f"{name}, {method!r}: a step in pairs takes {ratio:.1f} times as long")
     assert 2 < ratio < most
 

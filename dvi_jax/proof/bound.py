@@ -197,7 +197,10 @@ def bound_drift(
         try:
             checker = exact.Checker(certificate)
         except exact.Failure as error:
-            raise ValueError(f"periodic must be False for what is no angle: {error}.") from None
+            raise ValueError(
+                f"periodic must be False for what is no angle: {error} (an invariant, inside, or "
+                "more of the step)."
+            ) from None
     identities = frozenset(k for k, s in enumerate(estimates) if s == 0 and checker.is_identity(k))
     search.resolve(checker, estimates, ratio)
     certificate["bits"] = checker.bits
