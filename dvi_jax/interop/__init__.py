@@ -4,9 +4,9 @@
 there is an `ImportError` with the line that installs it.
 """
 
+from .arviz_side import to_inference_data as to_inference_data
 from .diffrax_side import diffrax_solver as diffrax_solver, diffrax_term as diffrax_term
 from .fields import vector_field as vector_field
-from .labelled import to_inference_data as to_inference_data, to_xarray as to_xarray
 from .rebound_side import (
     ReboundProblem as ReboundProblem,
     from_rebound as from_rebound,

@@ -1,6 +1,7 @@
 """The result of `integrate`, and the choice of the states that it saves."""
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -16,6 +17,8 @@ from ..base.inputs import as_times
 from ..base.results import RESULTS, status_name
 from ..base.signature import check_takes
 from ..base.types import State
+from .labelled import dataset_of, table_of
+from .saved import read, write
 
 
 # The times are an array, not static: they may be traced, and new times need no new compilation.
@@ -122,6 +125,93 @@ class Solution(eqx.Module):
     def p_final(self) -> Array:
         """The last saved momenta, shape (*batch, *q0.shape)."""
         return jnp.take(self.ps, -1, axis=self.ts.ndim - 1)
+
+    def to_xarray(
+        self,
+        *,
+        dims: Sequence[str] | str | None = None,
+        coords: Mapping[str, Any] | None = None,
+        observe: Any = None,
+        components: Mapping[str, Any] | Sequence[Any] | None = None,
+        units: Mapping[str, str] | None = None,
+        attrs: Mapping[str, Any] | None = None,
+    ) -> Any:
+        """This trajectory, or batch of them, as an `xarray.Dataset`.
+
+        - `dims`: names for the dimensions of the batch, in order (default ``trajectory``);
+          `coords`: name → values along one.
+        - `observe`: the same as for `integrate`, from which follows which observables have one
+          value for each state or step. Without it their dimensions are not called so.
+        - `components`: labels along the axes of q and p: ``["x", "y"]`` for one axis, or name →
+          labels for each axis, ``{"body": ["Sun", "Jupiter"], "axis": ["x", "y", "z"]}``.
+        - `units`: name of a variable → text, such as ``problem.units``; `attrs`: attributes of the
+          whole, numbers and text as they are, anything else (a method) as its text.
+
+        **Returns** a dataset with dimensions `dims`, then
+
+        - ``time`` where all trajectories are saved at the same times, which are its coordinate;
+          else ``save``, and the times are a variable `t`;
+        - ``component`` or the names in `components`;
+        - ``step`` for values of the step that ended at a saved time: its index is that of the
+          state at its end (for ``Save(ts=...)`` the dimension of the states itself).
+
+        Variables: `q`, `p`, `h`; observables by their place in the pytree, joined by points, one
+        alone as ``observed``, the first of a list as ``observed.0``; `status` (int8, with
+        ``flag_values`` and ``flag_meanings``); the arrays in `stats`; ``stop_t``, ``stop_q``,
+        ``stop_p`` for a run with a `Stop`. NaN stays NaN.
+        ``sol.to_xarray().to_netcdf(path, engine="h5netcdf")`` writes it (extra ``export``).
+
+        **Raises** `ValueError` for a number of `dims` that is not that of the batch, labels that
+        do not fit, an `observe` of another structure, and names that are in use; `TypeError` for
+        coords with units (which belong in `units`), and under jit.
+        """
+        options = {"dims": dims, "coords": coords, "observe": observe, "components": components}
+        return dataset_of(self, **options, units=units, attrs=attrs)
+
+    def to_dataframe(
+        self,
+        *,
+        dims: Sequence[str] | str | None = None,
+        coords: Mapping[str, Any] | None = None,
+        observe: Any = None,
+        components: Mapping[str, Any] | Sequence[Any] | None = None,
+    ) -> Any:
+        """A `pandas.DataFrame` with a row for each saved state.
+
+        Columns: ``t``; ``q_0``, ``q_1``, … or ``q_x``, ``q_y`` with `components`, likewise of p;
+        ``h`` and observables with a value for each state or step (those of `observe`); ``status``.
+        Values of a step stand in the row of the state at its end, NaN in that of the start.
+        Reductions, which have one value for a run, are not in it. A batch has the rows of its
+        trajectories one after the other, with `dims` (default ``trajectory``) and ``save`` as
+        index. Arguments and errors are those of `to_xarray`.
+        """
+        return table_of(self, dims=dims, coords=coords, observe=observe, components=components)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write it to one file (NumPy's npz), whole or not at all; `Solution.load` reads it.
+
+        **Raises** `FileNotFoundError` without a directory for it; `TypeError` for observables in
+        another pytree than dicts, lists and tuples, and under jit.
+        """
+        write(self, path)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> "Solution":
+        """Read what `save` wrote: the same numbers, with the same digits.
+
+        **Raises** `FileNotFoundError`; `ValueError` for a damaged or another file;
+        `TypeError` for float64 numbers where x64 is off.
+
+        **Example**
+
+        ```python
+        orbit = dvi.integrate(systems.kepler(), h=0.05, num_steps=400)
+        orbit.save("orbit.npz")
+        print(np.array_equal(dvi.Solution.load("orbit.npz").qs, orbit.qs))
+        # True
+        ```
+        """
+        return cls(**read(path))
 
     def __getattr__(self, name: str) -> Any:
         # Called for names that do not exist only.
