@@ -82,22 +82,6 @@ ALIASES = {
 """Other names of public objects: terms of the field and of other packages. The table in
 docs/migration.md lists them."""
 
-SHORT = (
-    *("System", "discretise", "from_lagrangian", "velocity_force"),
-    *("integrate", "Integrator", "Save", "Solution", "RESULTS", "IntegrationError"),
-    *("TypeII", "SymplecticEuler", "Strang", "StormerVerlet", "Yoshida", "GaussLegendre"),
-    *("Uniform", "TimeTransformed", "Variational", "Compensated", "DoubleDouble", "FixedPoint"),
-    *("Newton", "SimplifiedNewton", "Picard", "Reversible", "Checkpointed"),
-    *("MaxDrift", "Range", "Trend", "Mean", "Section", "Stop"),
-    *("discover_invariants", "find_symmetries", "drift_order", "bound_drift"),
-    *("Polynomials", "ShadowHamiltonian"),
-    *("sweep", "Axis", "open_sweep", "fit", "Observations"),
-    *("poincare_section", "frequencies", "tangent_map"),
-    "over_devices",
-)
-"""Names that `dir(dvi_jax)` lists next to the namespaces. All other names are listed in their
-namespace; each is also an attribute of `dvi_jax`."""
-
 
 def names() -> list[str]:
     """All names of `dvi_jax` that are objects, aliases left out."""
@@ -119,7 +103,7 @@ def _hint(name: str) -> str:
         return f" Did you mean {_FOREIGN_NAMES[name]!r}?"
     candidates = {*names(), *ALIASES, *NAMESPACES}
     close = difflib.get_close_matches(name, candidates, 1, 0.7)
-    return f" Did you mean {close[0]!r}?" if close else " dir(dvi_jax) lists the main names."
+    return f" Did you mean {close[0]!r}?" if close else " dir(dvi_jax) lists them."
 
 
 class Package(ModuleType):
@@ -146,7 +130,7 @@ class Package(ModuleType):
             super().__setattr__(name, value)
 
     def __dir__(self) -> list[str]:
-        return sorted({*SHORT, *NAMESPACES, "__version__", "__doc__", "__file__", "__path__"})
+        return sorted({*names(), *NAMESPACES, "__version__", "__doc__", "__file__", "__path__"})
 
 
 class Folders(MetaPathFinder, Loader):

@@ -25,7 +25,7 @@ from sphinx.util.docutils import SphinxDirective
 
 import dvi_jax
 import lanewise
-from dvi_jax._namespaces import SHORT, names
+from dvi_jax._namespaces import names
 from dvi_jax.base.checks import settings_type
 from dvi_jax.testing.paper.equations import EQUATIONS
 
@@ -276,16 +276,32 @@ def _entry(full: str, shown: str, thing: Any) -> str:
     return "\n".join([*lines, ":::::", ""])
 
 
+FIRST = (
+    *("System", "discretise", "from_lagrangian", "velocity_force"),
+    *("integrate", "Integrator", "Save", "Solution", "RESULTS", "IntegrationError"),
+    *("TypeII", "SymplecticEuler", "Strang", "StormerVerlet", "Yoshida", "GaussLegendre"),
+    *("Uniform", "TimeTransformed", "Variational", "Compensated", "DoubleDouble", "FixedPoint"),
+    *("Newton", "SimplifiedNewton", "Picard", "Reversible", "Checkpointed"),
+    *("MaxDrift", "Range", "Trend", "Mean", "Section", "Stop"),
+    *("discover_invariants", "find_symmetries", "drift_order", "bound_drift"),
+    *("Polynomials", "ShadowHamiltonian"),
+    *("sweep", "Axis", "open_sweep", "fit", "Observations"),
+    *("poincare_section", "frequencies", "tangent_map"),
+    "over_devices",
+)
+"""Names that most programs use; a table of the reference begins with them."""
+
+
 def _rank(item: tuple[str, tuple[str, Any]]) -> tuple[int, str]:
-    """Names that `dir(dvi_jax)` lists first, then the others, then errors and statuses."""
+    """The names that most programs use, then the others, then errors and statuses."""
     _, (shown, thing) = item
     name = shown.rpartition(".")[2]
     is_status = inspect.isclass(thing) and (
         issubclass(thing, BaseException) or hasattr(thing, "_name_to_item")
     )
-    if name in SHORT and not is_status:
-        return SHORT.index(name), ""
-    return len(SHORT) + is_status, name.lower()
+    if name in FIRST and not is_status:
+        return FIRST.index(name), ""
+    return len(FIRST) + is_status, name.lower()
 
 
 def _summary(thing: Any) -> str:

@@ -99,6 +99,14 @@ def status_name(result: RESULTS) -> Any:
     return STATUS_NAMES[int(code)] if code.ndim == 0 else np.array(STATUS_NAMES)[code]
 
 
+def status_counts(names: Any) -> str:
+    """Statuses in words: the name of one, or "57 successful, 3 not_finite" for a batch."""
+    values, counts = np.unique(np.asarray(names), return_counts=True)
+    if np.ndim(names) == 0:
+        return str(names)
+    return ", ".join(f"{n} {name}" for n, name in zip(counts, values, strict=True))
+
+
 def status_code(result: RESULTS) -> Array:
     """The index of a status in `STATUS_NAMES`, for each trajectory of a batch."""
     (code,) = jax.tree.leaves(result)  # an Enumeration has one leaf, its index

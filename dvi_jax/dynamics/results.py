@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from lanewise.jaxprs.jaxapi import is_traced
 
-from ..base.results import RESULTS, status_code
+from ..base.results import RESULTS, status_code, status_counts
 
 
 class FREQUENCY_RESULTS(eqx.Enumeration):
@@ -119,6 +119,21 @@ class WithStatus(eqx.Module):
         all_names = NAMES if isinstance(self.result, FREQUENCY_RESULTS) else SECTION_NAMES
         names = np.array(all_names)[np.asarray(code_of(self.result))]
         return str(names) if names.ndim == 0 else names
+
+    def __repr__(self: Any) -> str:
+        """Statuses, and every array: its values if they are few, else its shape."""
+        fields = {name: x for name, x in vars(self).items() if name not in ("result", "run")}
+        if is_traced(status_code(self.result)):
+            return eqx.tree_pformat(self)
+        lines = [f"{type(self).__name__}: {status_counts(self.status)}"]
+        for name, value in fields.items():
+            text = eqx.tree_pformat(value)
+            if eqx.is_array_like(value) and np.size(value) <= 8:
+                text = np.array2string(np.asarray(value), precision=8, separator=", ")
+            elif isinstance(value, eqx.Module):
+                text = type(value).__name__
+            lines.append(f"  {name} = {' '.join(text.split())}")
+        return "\n".join(lines)
 
 
 def with_code(code: Any) -> FREQUENCY_RESULTS:

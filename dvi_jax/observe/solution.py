@@ -14,7 +14,7 @@ from lanewise.jaxprs.jaxapi import is_traced
 
 from ..base.checks import in_order, only_one, whole
 from ..base.inputs import as_times
-from ..base.results import RESULTS, status_name
+from ..base.results import RESULTS, status_counts, status_name
 from ..base.signature import check_takes
 from ..base.types import State
 from .labelled import dataset_of, table_of
@@ -225,15 +225,12 @@ class Solution(eqx.Module):
         if any(is_traced(x) for x in jax.tree.leaves((self.ts, self.qs, self.result))):
             return f"Solution(ts={eqx.tree_pformat(self.ts)}, qs={eqx.tree_pformat(self.qs)}, …)"
         *batch, states = self.ts.shape
-        names = np.atleast_1d(np.asarray(self.status, dtype=str))
-        counts = {str(name): int((names == name).sum()) for name in np.unique(names)}
-        status = ", ".join(f"{n} {s}" for s, n in counts.items()) if batch else str(self.status)
         size = f"{' × '.join(map(str, batch))} trajectories, " if batch else ""
         shape = self.qs.shape[len(batch) + 1 :]
         # The times of the first trajectory; those of others in the batch may differ.
         t = np.asarray(self.ts).reshape(-1, states)[0]
         lines = [
-            f"Solution: {size}{status}; {self.stats['num_steps']} steps, {states} saved states of "
+            f"Solution: {size}{status_counts(self.status)}; {self.stats['num_steps']} steps, {states} saved states of "
             f"shape {shape}, t = {t[0]:g} … {t[-1]:g}"
         ]
         if not batch:

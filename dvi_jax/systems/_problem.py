@@ -84,6 +84,29 @@ class Problem:
     exact: Callable[..., tuple[Any, Any]] | None = None
     exact_epsilon: float = 0.0
 
+    def __repr__(self) -> str:
+        """What a user gives to `integrate`, and what is known, in at most eight lines."""
+
+        def short(x: Any) -> str:
+            x = np.asarray(x)
+            few = x.size <= 6
+            text = np.array2string(x, precision=6, separator=", ") if few else f"shape {x.shape}"
+            return " ".join(text.split())
+
+        args = self.args if isinstance(self.args, Mapping) else {}
+        lines = [
+            f"Problem {self.name!r}: {self.source}",
+            f"  q0 = {short(self.q0)}, p0 = {short(self.p0)}, h = {short(self.h)}",
+        ]
+        lines += [f"  args: {', '.join(f'{n} = {short(x)}' for n, x in args.items())}"] * bool(args)
+        for label, names in (
+            ("observables", self.observables),
+            ("conserved for ε = 0", self.invariants),
+            ("symmetries", [*self.symmetries, *self.flow_symmetries]),
+        ):
+            lines += [f"  {label}: {', '.join(names)}"] * bool(names)
+        return "\n".join(lines)
+
     def __post_init__(self):
         if self.system.epsilon is None:  # what is known is known of the unperturbed motion
             object.__setattr__(self, "system", replace(self.system, epsilon=0.0))
