@@ -230,8 +230,8 @@ class Solution(eqx.Module):
         # The times of the first trajectory; those of others in the batch may differ.
         t = np.asarray(self.ts).reshape(-1, states)[0]
         lines = [
-            f"Solution: {size}{status_counts(self.status)}; {self.stats['num_steps']} steps, {states} saved states of "
-            f"shape {shape}, t = {t[0]:g} … {t[-1]:g}"
+            f"Solution: {size}{status_counts(self.status)}; {self.stats['num_steps']} steps, "
+            f"{states} saved states of shape {shape}, t = {t[0]:g} … {t[-1]:g}"
         ]
         if not batch:
             short = {"precision": 6, "threshold": 12, "separator": ", "}
