@@ -300,8 +300,7 @@ def test_a_batch_has_the_bits_of_single_runs(method):
     [
         ("pendulum", dvi.Strang(), 25),
         ("kepler", dvi.Strang(), 25),
-        # 17 to 21: in float64 most of this step is fused multiply-adds, each of which takes about 25
-        # operations in pairs.
+        # 17 to 21: most of this step in float64 is fused multiply-adds, which take 25 in pairs.
         ("henon_heiles", dvi.Strang(), 30),
         ("kepler", dvi.GaussLegendre(2), 25),
     ],
