@@ -66,7 +66,7 @@ def read_polar_motion(path: str | Path | None = None) -> PolarMotion:
     0.1 mas from about 2000: far below the effect of atmosphere and ocean, which are not modelled
     (about 20 mas in some years).
 
-    **Raises** `ImportError` without the extra `ephemeris`; `ValueError` for a file without a
+    **Raises** `EphemerisMissing` without the extra `ephemeris`; `ValueError` for a file without a
     measured line, or with a line that cannot be read.
 
     **Source** IERS Rapid Service/Prediction Centre at the U.S. Naval Observatory: public data, free

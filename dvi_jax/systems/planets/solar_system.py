@@ -50,16 +50,20 @@ _OBLIQUITY = np.deg2rad(84381.448 / 3600)  # of the ecliptic at J2000 (IAU 1976)
 _EXTRA = 'pip install "dvi-jax[ephemeris]"'
 
 
+class EphemerisMissing(ImportError):
+    """The ephemeris or its reader is not installed; the message has the command."""
+
+
 def installed_file(name: str, contents: str) -> Path:
     """A file of the package skyfield-data; `what`: its contents, for the message.
 
-    Nothing is downloaded. **Raises** `ImportError` where it is not installed.
+    Nothing is downloaded. **Raises** `EphemerisMissing` where it is not installed.
     """
     # The package is located, not imported: its import warns about the age of its files.
     package = find_spec("skyfield_data")
     path = Path(getattr(package, "origin", None) or "").parent / "data" / name
     if package is None or not path.is_file():
-        raise ImportError(
+        raise EphemerisMissing(
             f"{contents} requires {name} of the package skyfield-data: {_EXTRA}, or install its "
             "newest version"
         )
@@ -112,7 +116,7 @@ def ephemeris(jd: Any) -> tuple[np.ndarray, np.ndarray]:
     velocities are derivatives of the ephemeris's Chebyshev polynomials. The file is the one in the
     package skyfield-data; nothing is downloaded.
 
-    **Raises** `ImportError` without the extra `ephemeris`; `ValueError` for dates outside
+    **Raises** `EphemerisMissing` without the extra `ephemeris`; `ValueError` for dates outside
     `COVERAGE`.
 
     **Source** Folkner, Williams & Boggs 2009, *The planetary and lunar ephemeris DE 421*, IPN
@@ -177,5 +181,5 @@ def _kernel() -> Any:
     try:
         from jplephem.spk import SPK
     except ImportError:
-        raise ImportError(f"an ephemeris requires jplephem: {_EXTRA}") from None
+        raise EphemerisMissing(f"an ephemeris requires jplephem: {_EXTRA}") from None
     return SPK.open(installed_file("de421.bsp", "the ephemeris DE421"))
