@@ -26,7 +26,12 @@ def test_results_print_their_statuses_and_small_arrays():
     assert text.splitlines()[0] == "Frequencies: 1 not_finite, 1 successful"
     assert "frequencies = [[ 1.], [nan]]" in text
     section = dvi.poincare_section(
-        systems.oscillator(), g=lambda t, q, p, args: q[0], num_steps=400, crossings=6, throw=False
+        systems.oscillator(),
+        g=lambda t, q, p, args: q[0],
+        h=0.1,
+        num_steps=400,
+        crossings=20,
+        throw=False,
     )
     assert len(repr(section).splitlines()) <= 8
     assert "''" not in repr(section)
