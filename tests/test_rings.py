@@ -31,6 +31,9 @@ ELEMENTS = {
     "solenoid": rings.solenoid("S", 0.6, 0.8),
     "cavity": rings.cavity("RF", 0.4, 1e-3, 5e8, lag=0.05),
     "placed": rings.quadrupole("Q", 0.3, 1.1, slices=2).placed(1e-4, -2e-4, 0.05),
+    "misaligned bend": rings.bend("B", 1.1, 0.2, (0, -0.5), edge_in=0.1, slices=3).placed(
+        1e-4, -2e-4, 0.05, ds=1e-4, pitch=0.02, yaw=-0.03, anchor="middle", tilt=0.1
+    ),
 }
 
 
