@@ -235,7 +235,7 @@ def weak_focusing(pieces, turns=1, n=0.1):
 
 
 def solenoids(pieces):
-    sol = rings.solenoid("S", 8.0 / pieces, 3.0)
+    sol = rings.solenoid("S", 8.0 / pieces, 1.6)
     return rings.Ring([rings.quadrupole("QF", 0.3, 0.6), *[sol] * pieces, rings.drift("D", 1.0),
                        rings.quadrupole("QD", 0.3, -0.5)])  # fmt: skip
 
