@@ -31,6 +31,9 @@ ELEMENTS = {
     "solenoid": rings.solenoid("S", 0.6, 0.8),
     "cavity": rings.cavity("RF", 0.4, 1e-3, 5e8, lag=0.05),
     "placed": rings.quadrupole("Q", 0.3, 1.1, slices=2).placed(1e-4, -2e-4, 0.05),
+    "misaligned bend": rings.bend("B", 1.1, 0.2, (0, -0.5), edge_in=0.1, slices=3).placed(
+        1e-4, -2e-4, 0.05, ds=1e-4, pitch=0.02, yaw=-0.03, anchor="middle", tilt=0.1
+    ),
 }
 
 
@@ -189,11 +192,65 @@ def test_the_hamiltonian_is_that_of_the_bodies():
     )
     problem = rings.problem(ring)
     z = np.array([1e-2, 1e-3, 5e-3, -1e-3, 0, 2e-2])
-    options = {"h": 1 / 48, "num_steps": 48, "method": dvi.GaussLegendre(3)}
-    sol = dvi.integrate(problem, z[::2], z[1::2], **options)
+    options = {"h": 1 / 48, "num_steps": 48, "method": dvi.GaussLegendre(3), "args": problem.args}
+    sol = dvi.integrate(dvi.System(problem.system.H_D.value), z[::2], z[1::2], **options)
     out = rings.track(ring, z).z
     np.testing.assert_allclose(sol.qs[-1], out[::2], atol=1e-9)
     np.testing.assert_allclose(sol.ps[-1], out[1::2], atol=1e-9)
+
+
+THIN = ring_of(
+    rings.quadrupole("QF", 0.5, 0.6, slices=1), rings.multipole("S", 0.0, (0.0, 0.0, 40.0)),
+    rings.drift("D", 2.0), rings.quadrupole("QD", 0.5, -0.5, slices=1), rings.drift("D", 2.0),
+)  # fmt: skip
+TURN = rings.problem(THIN, planes="x")
+
+
+def turned(system=TURN.system, **options):
+    options = {"h": 1.0, "num_steps": 3, "args": TURN.args, **options}
+    return dvi.integrate(system, [3e-3], [0.0], **options)
+
+
+@pytest.mark.parametrize("method", ["Strang", "TypeII", "GaussLegendre2", dvi.RungeKutta4()])
+def test_other_methods_than_a_turn_are_refused(method):
+    """Also compiled, by other steps, and where a function examines equations (12)-(13)."""
+    message = "no equations of motion other than its one-turn map"
+    for h in (1.0, 0.1):
+        with pytest.raises(ValueError, match=message):
+            turned(method=method, h=h)
+    with pytest.raises(ValueError, match=message):
+        jax.jit(lambda q: dvi.integrate(TURN.system, q, [0.0], h=1.0, num_steps=1, method=method,
+                                        args=TURN.args).qs)(jnp.ones(1))  # fmt: skip
+    with pytest.raises(ValueError, match=message):
+        dvi.interop.vector_field(TURN.system)(0.0, (jnp.ones(1), jnp.ones(1)), TURN.args)
+
+
+def test_a_turn_refuses_what_it_would_ignore():
+    H_D = TURN.system.H_D
+    force = {"force": lambda t0, t1, q, p, args: -p}
+    others = (force, {"perturbation": lambda t0, t1, q, p, args: q @ q}, {"slow_time": True})
+    for options in others:
+        with pytest.raises(ValueError, match=f"as it is, got {next(iter(options))}"):
+            turned(dvi.System(H_D, **options), epsilon=0.1)
+    with pytest.raises(ValueError, match="as it is, got"):
+        turned(lattice=dvi.TimeTransformed(lambda t, q, p, args: 2.0))
+
+
+def test_parts_of_a_turn_do_not_exist():
+    """Of the times of a grid, of requested times, and under `jit`: a status."""
+    whole = turned().qs[:, 0]
+    options = {"h": None, "num_steps": None, "throw": False}
+    sol = turned(lattice=dvi.Given([0.0, 1.0, 1.5, 2.5]), **options)
+    assert sol.status == "bad_step_size"
+    np.testing.assert_array_equal(sol.qs[:2, 0], whole[:2])
+    assert np.isnan(sol.qs[2:]).all()
+    between = turned(save=dvi.Save(ts=[0.0, 1.0, 2.5, 3.0]), throw=False)
+    assert between.status == "bad_step_size"
+    np.testing.assert_array_equal(np.delete(between.qs, 2), np.delete(whole, 2))
+    half = jax.jit(lambda h: turned(h=h, throw=False).result)(0.5)
+    assert dvi.RESULTS[half] == dvi.RESULTS[dvi.RESULTS.bad_step_size]
+    backwards = turned(method=dvi.Adjoint(rings.Turn()), throw=False)
+    assert backwards.status == "bad_step_size"
 
 
 def turns(ring, size, **options):

@@ -160,6 +160,104 @@ def test_driving_terms_of_thin_multipoles_are_the_formulas():
         rings.resonance_driving_terms(ring, ("h2100",))
 
 
+TERMS = ("h30000", "h10020", "h10200", "h20010", "h20100", "h00300")
+"""Of order 3, each with other harmonics."""
+
+
+def lattice_with(magnet, *more):
+    """Coupled, with a vertical and a horizontal closed orbit where `more` has kicks."""
+    return rings.Ring(
+        [rings.quadrupole("QF", 0.5, 0.6), rings.drift("D", 2.0), magnet,
+         rings.quadrupole("QD", 0.5, -0.5), rings.drift("D", 1.0), *more, rings.drift("D", 1.0)]
+    )  # fmt: skip
+
+
+KICKS = rings.corrector("C", 0.0, 2e-4, -1e-4), rings.multipole("K", 0.0, (0, 0), (0, 0.05))
+ROLL, SHIFT = 0.4, 1e-3
+SAME_MAPS = {
+    "rolled": ({"roll": np.pi / 6, "b2": 2.0}, {"a2": -2.0}),
+    "displaced": ({"dx": SHIFT, "b3": 100.0}, {"b0": -1e-7, "b1": 3e-4, "b2": -0.3, "b3": 100.0}),
+    "rolled by any angle": (
+        {"roll": ROLL, "b2": 2.0, "b3": 50.0},
+        {"b2": 2.0 * np.cos(3 * ROLL), "b3": 50.0 * np.cos(4 * ROLL),
+         "a2": -2.0 * np.sin(3 * ROLL), "a3": -50.0 * np.sin(4 * ROLL)},
+    ),
+}  # fmt: skip
+
+
+def test_driving_terms_are_those_of_the_same_map_described_otherwise():
+    magnet = rings.multipole("M", 0.0, (0, 0, 0, 0)).placed()
+    ring, z = lattice_with(magnet, *KICKS), jnp.array([1e-3, 2e-4, 5e-4, -1e-4, 0, 0])
+    for case, values in SAME_MAPS.items():
+        both = [ring.set("M", **v) for v in values]
+        maps = [rings.one_turn(r, z) for r in both]
+        np.testing.assert_allclose(*maps, rtol=0, atol=1e-17, err_msg=case)
+        first, second = (rings.resonance_driving_terms(r, (*TERMS, "h21000")) for r in both)
+        size = max(abs(complex(x)) for x in first.values())
+        for name in first:
+            np.testing.assert_allclose(first[name], second[name], rtol=0, atol=1e-10 * size)
+
+
+def test_driving_terms_are_the_harmonics_of_the_potential_on_the_motion():
+    """About the closed orbit, in coupled motion: the potential at the magnet, as a function of the
+    phases of both modes and of a factor of the amplitudes."""
+    b2, b3, shift = 2.0, 50.0, 3e-4 + 2e-4j
+    magnet = rings.multipole("M", 0.0, (0, 0, b2, b3)).placed(shift.real, shift.imag)
+    ring = lattice_with(magnet, *KICKS)
+    found = rings.resonance_driving_terms(ring, TERMS)
+    o, n = rings.optics(ring, chromatic=False), 16
+    assert np.abs(o.orbit[2, :3:2]).min() > 1e-5
+    assert np.abs(o.gamma - 1).max() > 1e-3
+    phases = np.exp(2j * np.pi * np.arange(n) / n)
+    factors = 1e-3 * np.arange(-3, 4)
+    A, B, factor = np.meshgrid(phases, phases, factors, indexing="ij")
+    x, y = (np.real(o.modes[2, 0, i] * A + o.modes[2, 1, i] * B) * factor for i in (0, 2))
+    w = complex(o.orbit[2, 0], o.orbit[2, 2]) - shift + x + 1j * y
+    potential = np.real(b2 * w**3 / 3 + b3 * w**4 / 4)
+    harmonics = np.fft.fft2(potential, axes=(0, 1)).reshape(n * n, -1) / n**2
+    cubic = np.polynomial.polynomial.polyfit(factors / 1e-3, harmonics.T, 4)[3].reshape(n, n) / 1e-9
+    for name in TERMS:
+        j, k, m, q = map(int, name[1:5])
+        np.testing.assert_allclose(found[name], cubic[(j - k) % n, (m - q) % n], rtol=1e-6)
+
+
+def test_driving_terms_of_a_lens_are_refused():
+    ring = lattice_with(rings.lens("L", lambda x, y, par: x**3))
+    with pytest.raises(ValueError, match="must not contain a lens"):
+        rings.resonance_driving_terms(ring)
+
+
+def weak_focusing(pieces, turns=1, n=0.1):
+    angle = 2 * np.pi * turns / pieces
+    return rings.Ring(
+        [rings.bend("B", angle, angle, (0, -n), slices=64 * turns // pieces)] * pieces
+    )
+
+
+def solenoids(pieces):
+    sol = rings.solenoid("S", 8.0 / pieces, 1.6)
+    return rings.Ring([rings.quadrupole("QF", 0.3, 0.6), *[sol] * pieces, rings.drift("D", 1.0),
+                       rings.quadrupole("QD", 0.3, -0.5)])  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("make", "tunes"),
+    [
+        (weak_focusing, [np.sqrt(0.9), np.sqrt(0.1)]),
+        (lambda pieces: weak_focusing(pieces, 2, 0.04), [2 * np.sqrt(0.96), 0.4]),
+        pytest.param(solenoids, None, marks=pytest.mark.slow),
+    ],
+)
+def test_tunes_have_their_whole_part_also_where_one_magnet_turns_the_phase_more_than_once(
+    make, tunes
+):
+    one, many = (rings.optics(make(pieces)) for pieces in (1, 8))
+    np.testing.assert_allclose(one.tune, many.tune, atol=1e-5)
+    np.testing.assert_allclose(one.chromaticity, many.chromaticity, atol=1e-3)
+    if tunes is not None:
+        np.testing.assert_allclose(one.tune, tunes, atol=1e-4)
+
+
 @pytest.mark.slow
 def test_apertures_of_a_ring_with_limits():
     limits = rings.aperture("A", rectangle=(-0.01, 0.02, -0.005, 0.005))

@@ -34,7 +34,7 @@ class RESULTS(eqx.Enumeration):
     )
     bad_step_size = (
         "The step size h is zero or not finite. On a `Given` lattice: two neighbouring times "
-        "are equal or the times change direction."
+        "are equal or the times change direction. A ring has whole turns only, h = 1."
     )
     no_root = (
         "The lattice equation (14) has no root near the last step: no h satisfies the energy "

@@ -10,6 +10,7 @@ from ...base.keywords import checked_keywords
 from ._maps import KICKS, RingPart
 
 Model = Literal["paraxial", "exact"]
+Anchor = Literal["entrance", "middle"]
 C = 299792458.0
 """Speed of light [m/s]."""
 
@@ -23,10 +24,44 @@ class Element:
     parts: tuple[RingPart, ...] = ()
     values: dict[str, Any] = dataclasses.field(default_factory=dict)
 
-    def placed(self, dx: float = 0.0, dy: float = 0.0, roll: float = 0.0) -> "Element":
-        """The element shifted by (dx, dy) [m], then rolled about its axis [rad]."""
+    def placed(
+        self,
+        dx: float = 0.0,
+        dy: float = 0.0,
+        roll: float = 0.0,
+        *,
+        ds: float = 0.0,
+        pitch: float = 0.0,
+        yaw: float = 0.0,
+        anchor: Anchor = "entrance",
+        tilt: float = 0.0,
+    ) -> "Element":
+        """The element with errors of its alignment: it is moved as a rigid body, and the reference
+        orbit is not.
+
+        **Arguments** `dx`, `dy`, `ds`: shift along x, y and s [m]. `roll`, `pitch`, `yaw`: angles
+        [rad] that turn x towards y, s towards y, and s towards x, in this order, about the
+        `anchor`: "entrance", or "middle" of the reference orbit in the element, whose axes are
+        those of x, y and s. `tilt`: angle [rad] of the *design* about the s-axis, x towards y; the
+        reference orbit follows it, so that π/2 makes a vertical bend.
+
+        **Raises** `ValueError` for an element that is placed already.
+
+        **Source** EALIGN of MAD-X, with DPHI = pitch, DTHETA = yaw, DPSI = roll at the entrance.
+        """
         values = {"dx": dx, "dy": dy, "roll": roll}
-        return self.within(RingPart("placed_in"), RingPart("placed_out"), **values)
+        further = {"ds": ds, "pitch": pitch, "yaw": yaw}
+        for name, value in {**values, **further, "tilt": tilt}.items():
+            finite(f"{name} of element {self.name!r}", value)
+        middle = {"entrance": 0.0, "middle": 0.5}[one_of("anchor", anchor, get_args(Anchor))]
+        element, name = self, "placed"
+        if tilt != 0:
+            element = element.within(RingPart("tilted_in"), RingPart("tilted_out"), tilt=tilt)
+        # The ends of a curved element have different frames; those of other elements need them
+        # only if they are inclined.
+        if "h" in self.values or any(value != 0 for value in further.values()):
+            values, name = {**values, **further, "anchor": middle}, "moved"
+        return element.within(RingPart(f"{name}_in"), RingPart(f"{name}_out"), **values)
 
     def inside(
         self, *, rectangle: Sequence[float] | None = None, ellipse: Sequence[float] | None = None
@@ -49,7 +84,15 @@ class Element:
         return element
 
     def within(self, first: RingPart, last: RingPart, **values: Any) -> "Element":
-        """The element between two parts with parameters of their own."""
+        """The element between two parts with parameters of their own. **Raises** `ValueError` if it
+        has one of these parameters already."""
+        same = sorted(values.keys() & self.values.keys())
+        if same:
+            raise ValueError(
+                f"element {self.name!r} must have one value of each parameter, got {same} again. "
+                "Give all misalignments in one call of `placed`, each kind of aperture once in "
+                "`inside`, or use an element `aperture`, and other names for those of a `lens`."
+            )
         return dataclasses.replace(
             self,
             parts=(first, *self.parts, last) if self.parts else (first, last),
@@ -186,6 +229,8 @@ def lens(name: str, potential: Callable[..., Any], **values: float) -> Element:
     jnp.log(1 + x * x) / 2, g=1.6)``
     """
     values = {key: finite(f"{key} of lens {name!r}", value) for key, value in values.items()}
+    if "length" in values:
+        raise ValueError(f"length of lens {name!r} is zero: use another name for its parameter.")
     part = RingPart("lens", potential=instance("potential", potential, Callable, "a function"))
     return Element(name, "lens", (part,), {**values, "length": 0.0})
 

@@ -250,20 +250,6 @@ def solenoid(z: Particle, par: Parameters, turn: Any, sign: int) -> Particle:
     )
 
 
-def element_coordinates(z: Particle, par: Parameters, sign: int) -> Particle:
-    """Coordinates relative to an element that is shifted by (dx, dy) [m] and then rolled."""
-    c, s = jnp.cos(par["roll"]), jnp.sin(par["roll"])
-
-    def rotate(u, v, s):
-        return c * u + s * v, c * v - s * u
-
-    x, y = (z.x - par["dx"], z.y - par["dy"]) if sign > 0 else (z.x, z.y)
-    (x, y), (px, py) = rotate(x, y, sign * s), rotate(z.px, z.py, sign * s)
-    if sign < 0:
-        x, y = x + par["dx"], y + par["dy"]
-    return z._replace(x=x, px=px, y=y, py=py)
-
-
 def affine(side: str) -> Piece:
     """M z + v, given as ``matrix_…`` and ``shift_…``."""
 

@@ -1,6 +1,7 @@
 """Detuning with amplitude, driving terms, dynamic and momentum aperture, frequency maps."""
 
 import functools
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -77,14 +78,16 @@ def resonance_driving_terms(
 
         ∫ Re Σ_N (b_N + i a_N)(x + iy)^{N+1}/(N + 1) ds/(1 + δ) = Σ h_jkmnp A^j Ā^k B^m B̄^n δ^p
 
-    in A = √(2J_x) e^{iφ_x} and B = √(2J_y) e^{iφ_y} at the start, x = Re(v_x A) + D_x δ, and
-    y = Re(v_y B). Gauss quadrature inside each magnet, with the optics there, in 4D. The
-    perturbation includes quadrupoles in terms with δ; it does not include bends and their edges.
+    in A = √(2J_1) e^{iφ_1} and B = √(2J_2) e^{iφ_2} at the start, about the closed orbit:
+    (x, y) = (x₀, y₀) + Re(v_1 A + v_2 B) + (D_x, D_y) δ in the frame of each magnet. Rolls,
+    displacements, the orbit in a magnet and a coupling of the planes are thus part of the terms.
+    Gauss quadrature inside each magnet, with the optics there, in 4D. The perturbation includes
+    quadrupoles in terms with δ; it does not include bends, fringe fields, solenoids and matrices.
 
     **Arguments** `terms`: names "hjkmnp", such as "h21000", or "h22000" of octupoles.
 
     **Returns** name → complex number [m^{1−(j+k+m+n)/2}], differentiable by the parameters of the
-    ring. **Raises** `ValueError` for another name; as `optics`.
+    ring. **Raises** `ValueError` for another name and for a ring with a `lens`; as `optics`.
 
     **Source** Bengtsson 1997, SLS note 9/97, with the signs of pyAT, where β of a magnet is its
     mean and the phase that in its middle.
@@ -92,6 +95,11 @@ def resonance_driving_terms(
     for name in terms:
         if len(name) != 6 or name[0] != "h" or not name[1:].isdigit():
             raise ValueError(f"terms must be names such as 'h21000', got {name!r}.")
+    if any(part.name == "lens" for part in ring.program.parts):
+        raise ValueError(
+            "the ring must not contain a lens, whose potential is not in the driving terms: use "
+            "rings.multipole with length 0 where it is a polynomial."
+        )
     optics(ring, dp, chromatic=False)
     return _driving_terms(ring, jnp.zeros(6).at[5].set(dp), tuple(terms))
 
@@ -99,33 +107,51 @@ def resonance_driving_terms(
 @eqx.filter_jit
 def _driving_terms(ring: Ring, z: Array, terms: tuple[str, ...]) -> dict[str, Array]:
     o, _ = analysis(ring, z, jnp.zeros(()), False, False, True)
-    apply, xs = maps(four(ring), 0.0)
-    names = np.asarray([ring.program.parts[part].name for part, _ in ring.program.rows])
+    apply, xs, pieces = maps(four(ring), 0.0)
+    names = np.asarray([ring.program.parts[part].name for part, _ in ring.program.rows])[pieces]
     mine = np.flatnonzero(np.isin(names, (*SLICED_PARTS, "thin", "second_order_bend")))
     points, weights = np.polynomial.legendre.leggauss(5)
 
     def point_optics(x, share):
+        """w = x + iy on the orbit, and its derivatives by A, Ā, B, B̄ and δ."""
         (par, *tail), z, v, D = x
         part = {**par, "length": share * par["length"]}
-        M = jax.jacfwd(lambda z: jnp.stack(apply(Particle(*z), (part, *tail))))(z)
-        return M[0, :4] @ v[0], M[2, :4] @ v[1], M[0, :4] @ D + M[0, 5]
+
+        def end(z):
+            z = jnp.stack(apply(Particle(*z), (part, *tail)))
+            return z, z
+
+        M, z = jax.jacfwd(end, has_aux=True)(z)
+        u, D = M[0] + 1j * M[2], jnp.append(D, jnp.zeros(1))
+        slopes = [(u[:4] @ mode) / 2 for k in (0, 1) for mode in (v[k], jnp.conj(v[k]))]
+        return z[0] + 1j * z[2], jnp.stack([*slopes, u[:5] @ D + u[5]])
 
     magnets = jax.tree.map(lambda a: a[mine], (xs, o.orbit, o.modes, o.dispersion))
-    x, y, D = lax.map(lambda s: lax.map(lambda e: point_optics(e, s), magnets), (1 + points) / 2)
-    par = magnets[0][0]
-    length = np.outer(weights / 2, 1.0) * jnp.where(names[mine] == "thin", 1.0, par["length"])[None]
+    w, slopes = lax.map(lambda s: lax.map(lambda e: point_optics(e, s), magnets), (1 + points) / 2)
+    par, steps = magnets[0][0], magnets[0][-1]
+    length = jnp.where(names[mine] == "thin", 1.0, par["length"] * jnp.sum(steps, 1))
+    length = np.outer(weights / 2, 1.0) * length[None]
+    orders = itertools.takewhile(lambda n: f"b{n}" in par, itertools.count())
+    field = [(par[f"b{n}"] + 1j * par[f"a{n}"])[None] for n in orders]
+
+    def product(powers):
+        return math.prod(slopes[..., i] ** n for i, n in enumerate(powers))
+
     totals = {}
     for name in terms:
         j, k, m, n, p = map(int, name[1:])
         totals[name] = jnp.zeros((), complex)
         for q in range(p + 1):
-            N, ny = j + k + m + n + q, m + n
-            field = par.get(f"{'ab'[ny % 2 == 0]}{N - 1}")
-            if N > 1 and field is not None:
-                count = math.comb(N, ny) * math.comb(ny, m) * math.comb(N - ny, q)
-                count *= math.comb(j + k, j) * (-1) ** (p - q + (ny + 1) // 2)
-                term = x**j * jnp.conj(x) ** k * y**m * jnp.conj(y) ** n * D**q
-                totals[name] += count / N / 2 ** (j + k + ny) * jnp.sum(length * field[None] * term)
+            powers, mirror = (j, k, m, n, q), (k, j, n, m, q)
+            N = sum(powers)
+            if not 1 < N <= len(field):
+                continue
+            # The coefficient of order N - 1 of the field about the orbit.
+            about = sum(math.comb(i, N - 1) * c * w ** (i - N + 1)
+                        for i, c in enumerate(field) if i >= N - 1)  # fmt: skip
+            count = (-1) ** (p - q) * math.factorial(N - 1) / math.prod(map(math.factorial, powers))
+            term = about * product(powers) + jnp.conj(about * product(mirror))
+            totals[name] += count / 2 * jnp.sum(length * term)
     return totals
 
 

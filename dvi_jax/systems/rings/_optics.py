@@ -14,7 +14,7 @@ import lanewise
 from lanewise.jaxprs.jaxapi import is_traced
 
 from ...base.checks import instance
-from ._maps import KICKS, Particle, distinct, forward
+from ._maps import KICKS, Particle, RingPart, distinct, forward
 from ._parts import pieces_of
 from ._ring import Ring
 from ._turn import Passage, coordinates, parameters_at
@@ -24,6 +24,8 @@ _MOST_ITERATIONS, _EXTRA_ITERATIONS, _SMALL = 15, 3, 1e-9
 """Newton iterations at most, and after the first correction that is smaller than the last one."""
 _EQUAL = 1e-12
 """Difference of two eigenvalues that is round-off."""
+_KICKS = 12
+"""Most kicks in a piece of a magnet, so that its phase advance is less than 2π."""
 _UNSTABLE = 1e-11
 """Area in phase space of an eigenvector of length 1, below which it is round-off."""
 
@@ -38,7 +40,8 @@ class Optics(NamedTuple):
     - `modes`: the vectors v of the normal modes, z = Re Σ_k √(2J_k) e^{iφ_k} v_k, shape
       (n, modes, 4 or 6): β_k = \|v_x\|², α_k = −Re v̄_x v_px.
     - `gamma`: γ of Edwards & Teng, shape (n,); their β and α are those here over γ².
-    - `tune`, with its whole part; that of the synchrotron motion is positive. `chromaticity`:
+    - `tune`, with its whole part, to which a part given as a matrix, such as pyAT's `M66`,
+      contributes less than 1; that of the synchrotron motion is positive. `chromaticity`:
       dQ/dδ; in 6D the frequency of the cavities changes δ. Shapes (modes,).
     - `compaction`: momentum compaction, the relative change of the length over δ.
     """
@@ -165,8 +168,19 @@ def four(ring: Ring) -> Ring:
     return eqx.tree_at(lambda other: other.columns, ring, columns)
 
 
-def maps(ring: Ring, epsilon: Any) -> tuple[Callable, Any]:
-    """``apply(z, x)``, the map of a part of an element, and x for all parts in a row.
+def _divided(part: RingPart) -> list[np.ndarray]:
+    """The pieces of a part, as kicks over its length: their sums are shares of its length."""
+    if part.name in SLICED_PARTS:
+        kicks, n = KICKS[part.scheme], part.slices
+        most = max(1, _KICKS // len(kicks))
+        return [np.array([0.0, *kicks * min(most, n - i)]) / n for i in range(0, n, most)]
+    count = {"solenoid": 8, "second_order_bend": part.slices}.get(part.name, 1)
+    return [np.array([1 / count])] * count
+
+
+def maps(ring: Ring, epsilon: Any) -> tuple[Callable, Any, np.ndarray]:
+    """``apply(z, x)``, the map of a piece of a part of an element, x for all pieces in a row, and
+    for each piece the number of its part in `ring.program.rows`.
 
     Less code is compiled than for tracking: magnets in slices of any number and scheme are one
     sequence of kicks, with drifts between them.
@@ -174,15 +188,19 @@ def maps(ring: Ring, epsilon: Any) -> tuple[Callable, Any]:
     passage = Passage.from_ring(ring)
     parts, thick = passage.parts, {"scheme": 2, "slices": 1}
     order = max(p.order for p in parts)
-    kinds = [p._replace(order=order, **(thick if p.name in SLICED_PARTS else {})) for p in parts]
-    kicks = [np.divide([0.0, *KICKS.get(p.scheme, ()) * p.slices], p.slices) for p in parts]
-    steps = np.stack([np.pad(k, (0, max(map(len, kicks)) + 1 - len(k))) for k in kicks])
+    changes = {**dict.fromkeys(SLICED_PARTS, thick), "second_order_bend": {"slices": 1}}
+    kinds = [p._replace(order=order, **changes.get(p.name, {})) for p in parts]
     all_kinds = distinct(kinds)
     numbers = np.asarray([all_kinds.index(kind) for kind in kinds], np.int32)
+    pieces = [_divided(p) for p in parts]
+    part, width = passage.numbers["part"], max(len(k) for p in pieces for k in p)
+    steps = np.stack([np.pad(k, (0, width + 1 - len(k))) for i in part for k in pieces[i]])
+    rows = np.repeat(np.arange(len(part)), [len(pieces[i]) for i in part])
 
     def apply(z, columns):
         values, slopes, part, steps = columns
         par = parameters_at(values, slopes, epsilon)
+        share = {**par, "length": jnp.sum(steps) * par["length"]}
 
         def kind_map(kind):
             pieces = pieces_of(kind)
@@ -195,29 +213,28 @@ def maps(ring: Ring, epsilon: Any) -> tuple[Callable, Any]:
 
             if kind.name in SLICED_PARTS:
                 return lambda z: lax.scan(kick, z, jnp.stack([steps[:-1], steps[1:]], 1))[0]
-            return lambda z: forward(pieces, z, par, 0, 1)
+            return lambda z: forward(pieces, z, share, 0, 1)
 
         return lax.switch(part, [kind_map(kind) for kind in all_kinds], z)
 
-    part = passage.numbers["part"]
     # Recomputed in reverse mode: otherwise each part stores what every kind of part would need.
-    rows, slopes = passage.rows, passage.slopes
-    return jax.checkpoint(apply), (rows, slopes, numbers[part], steps[part])
+    tables = jax.tree.map(lambda column: column[rows], (passage.rows, passage.slopes))
+    return jax.checkpoint(apply), (*tables, numbers[part][rows], steps), rows
 
 
 @eqx.filter_jit
 def analysis(
     ring: Ring, z: Array, epsilon: Array, six: bool, chromatic: bool, by_part: bool = False
 ) -> tuple[Optics, Array]:
-    """See `optics`; also the last correction of the closed orbit. `inside`: before each part of an
-    element and at the end, not at the elements (but for `s`)."""
+    """See `optics`; also the last correction of the closed orbit. `by_part`: before each piece of
+    `maps` and at the end, not at the elements (but for `s`)."""
     c, shift, n, (e_zeta, e_delta) = ring.columns, 0.0, 6 if six else 4, np.eye(6)[4:]
     if six:
         # The change of ζ per turn of a particle that keeps its phase in the cavities.
         active = c["voltage"] != 0
         slip = jnp.where(active, c["slip"] / jnp.where(active, c["wave_number"], 1.0), 0.0)
         shift = -jnp.sum(slip) / jnp.sum(active)
-    apply, xs = maps(ring if six else four(ring), epsilon)
+    apply, xs, pieces = maps(ring if six else four(ring), epsilon)
 
     def states(z):
         zs = lax.scan(lambda z, x: (apply(z, x),) * 2, Particle(*z), xs)[1]
@@ -258,7 +275,8 @@ def analysis(
     mu = jnp.where(np.arange(n // 2)[None] < 2, (mu + 0.5) % (2 * np.pi) - 0.5, mu)
     mu = jnp.concatenate([jnp.zeros((1, n // 2)), jnp.cumsum(mu, 0)])
     Ds = jnp.real(vs[:, 2] / vs[:, 2, 5:]) if six else Ms @ D
-    index = np.searchsorted([element for _, element in ring.program.rows], np.arange(len(ring) + 1))
+    elements = np.asarray([element for _, element in ring.program.rows])[pieces]
+    index = np.searchsorted(elements, np.arange(len(ring) + 1))
     index, tune = np.arange(rows) if by_part else index, mu[-1] / (2 * np.pi)
     twiss = Optics(
         s=ring.places,

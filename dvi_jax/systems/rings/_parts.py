@@ -3,7 +3,7 @@
 import functools
 from collections.abc import Callable
 
-from . import _exact as exact, _maps as maps
+from . import _exact as exact, _frames as frames, _maps as maps
 from ._maps import Piece, RingPart
 
 
@@ -51,7 +51,13 @@ def _ends(side: str, sign: int) -> dict[str, Make]:
             lambda z, par, direction: exact.wedge(z, -direction * par[f"edge_{side}"], par["h"])
         ),
         f"placed_{side}": lambda p: _plain(
-            lambda z, par, direction: maps.element_coordinates(z, par, sign * direction)
+            lambda z, par, direction: frames.placed(z, par, sign * direction)
+        ),
+        f"tilted_{side}": lambda p: _plain(
+            lambda z, par, direction: frames.turned(z, sign * direction * par["tilt"])
+        ),
+        f"moved_{side}": lambda p: _plain(
+            lambda z, par, direction: frames.moved(z, par, (1 - sign) / 2, sign * direction)
         ),
         f"affine_{side}": lambda p: [maps.affine(side)],
     }

@@ -46,8 +46,13 @@ class Turn(Method):
 
     A step is the map of `track`, exact up to round-off: the order says nothing about it. A particle
     that is lost has the status `lost`. `losses`: False for the map without apertures and limits of
-    the coordinates, of which `bound_drift` can prove a bound. **Raises** `ValueError` for another
-    system or step.
+    the coordinates, of which `bound_drift` can prove a bound.
+
+    The map exists for whole turns only: a part of one, such as at a time of `Save(ts=...)` that is
+    not an integer, has the status `bad_step_size`.
+
+    **Raises** `ValueError` for another system, one with a force, noise, slow time or a perturbation
+    of its own, a first step other than 1, and the lattice `TimeTransformed`.
     """
 
     losses: bool = eqx.field(static=True, default=True)
@@ -58,19 +63,20 @@ class Turn(Method):
     is_invertible: ClassVar[bool] = True
 
     def step(self, equations, interval, q0, p0):
+        _require_ring(equations.system)
         ring, epsilon = equations.args, equations.epsilon
         z, turn = ring.particle(q0, p0), jnp.round(interval.t0)
         if not self.losses:
-            return _state(ring.passage.image(z, turn, epsilon), q0)
+            return _state(ring.passage.image(z, turn, epsilon), q0, interval.h)
         flight = ring.passage.fly(start(z), turn, epsilon)
-        q, p, info = _state(flight.z, q0)
+        q, p, info = _state(flight.z, q0, interval.h)
         result = RESULTS.where(flight.element >= 0, RESULTS.lost, info.result)
         return q, p, info._replace(result=result)
 
     def inverse(self, equations, interval, q1, p1):
         ring, epsilon = equations.args, equations.epsilon
         turn, z = jnp.round(interval.t0), ring.particle(q1, p1)
-        return _state(ring.passage.image(z, turn, epsilon, -1), q1)
+        return _state(ring.passage.image(z, turn, epsilon, -1), q1, interval.h)
 
     def needs_no_solve(self, equations, interval, q) -> bool:
         return True
@@ -78,6 +84,7 @@ class Turn(Method):
     inverse_needs_no_solve = needs_no_solve
 
     def check(self, equations, first_interval, q, p) -> None:
+        _require_ring(equations.system)
         args, hint = equations.args, "Use the system and the args of rings.problem(ring)."
         instance("args of a run with rings.Turn()", args, RingArgs, "those of a ring", hint)
         h = float(first_interval().h)
@@ -85,20 +92,55 @@ class Turn(Method):
             raise ValueError(f"h must be 1, one turn, for a ring; got h = {h}.")
 
 
-def _state(z: Particle, like: Array) -> tuple[Array, Array, Any]:
+def _require_ring(system: Any) -> None:
+    """**Raises** `ValueError` for a system with more than a ring, which `Turn` would ignore."""
+    more = [name for name in ("force", "noise", "slow_time") if getattr(system, name, None)]
+    if not isinstance(getattr(system, "perturbation", None), _PlaceHamiltonian | None):
+        more.append("perturbation")
+    if not isinstance(system, System):
+        more.append(type(system).__name__)
+    if more or not isinstance(system.H_D, _PlaceHamiltonian):
+        raise ValueError(
+            "rings.Turn() computes the map of a ring alone: give it the system of "
+            f"rings.problem(ring) as it is, got {', '.join(more) or 'another Hamiltonian'}. For "
+            "a perturbation use ring.perturbed(...), for another time grid dvi.Given of integers."
+        )
+
+
+def _state(z: Particle, like: Array, h: Array) -> tuple[Array, Array, Any]:
     size = like.shape[0]
     q, p = jnp.stack([z.x, z.y, z.zeta])[:size], jnp.stack([z.px, z.py, z.delta])[:size]
-    return q, p, judge(no_solve(q), q, p)
+    info = judge(no_solve(q), q, p)
+    result = RESULTS.where(jnp.abs(h - 1) < 1e-6, info.result, RESULTS.bad_step_size)
+    return q, p, info._replace(result=result)
+
+
+@jax.custom_jvp
+def _value_only(energy: Array) -> Array:
+    return energy
+
+
+@_value_only.defjvp
+def _(primals, tangents):
+    # Every other method, and all that examines equations (12)–(13), needs this derivative. Edges,
+    # thin elements, cavities and misalignments are not in it: the motion would be another one.
+    raise ValueError(
+        "the system of rings.problem(ring) has no equations of motion other than its one-turn map: "
+        "use method=rings.Turn(), the default, and functions that examine the map."
+    )
 
 
 class _PlaceHamiltonian(eqx.Module):
     """The paraxial Hamiltonian at the place s = t C, over one turn of length C, or its derivative
-    by ε, with b' in place of b."""
+    by ε, with b' in place of b. It has values only; see `_value_only`."""
 
     is_slope: bool = eqx.field(static=True, default=False)
     own_method: ClassVar[Method] = Turn()
 
     def __call__(self, t0, t1, q0, p1, args):
+        return _value_only(self.value(t0, t1, q0, p1, args))
+
+    def value(self, t0, t1, q0, p1, args):
         ends = args.ends
         z = args.particle(q0, p1)
         row = jnp.searchsorted(ends, (t0 - jnp.floor(t0)) * ends[-1], side="right")
@@ -132,10 +174,11 @@ class RingProblem(NamedTuple):
 def problem(ring: Ring, planes: Planes = "xyz", delta: Any = 0.0) -> RingProblem:
     r"""The one-turn map of a ring as a system with q = (x, y, ζ), p = (px, py, δ) and h = 1.
 
-    Runs have the method `Turn`. ε multiplies what `Ring.perturbed` set aside. The Hamiltonian of
-    the system is that of the bodies of the elements at the place s = t C, which other methods can
-    integrate: (px² + py²)/(2 (1 + δ)) − h x δ + h² x²/2 + Re Σ (b_n + i a_n)(x + i y)^{n+1}/(n+1);
-    edges, thin elements and cavities are not in it.
+    Runs have the method `Turn`; other methods raise `ValueError`. ε multiplies what
+    `Ring.perturbed` set aside. The value of the Hamiltonian is that of the bodies of the elements
+    at the place s = t C, (px² + py²)/(2 (1 + δ)) − h x δ + h² x²/2 +
+    Re Σ (b_n + i a_n)(x + i y)^{n+1}/(n+1). Edges, thin elements, cavities and misalignments are
+    not in it, so that it cannot be differentiated.
 
     **Arguments** `planes`: "x": q = (x,), p = (px,), with y = py = 0; "xy": q = (x, y); both with
     ζ = 0 at the start of each turn and δ = `delta`.
