@@ -360,8 +360,7 @@ def test_noise_in_units_of_atoms_and_single_precision():
             end.append(({n: jnp.float32(x) for n, x in args.items()}, jnp.float32(0.02 * period)))
             own.append(({n: jnp.float32(x) for n, x in unit.items()}, jnp.float32(0.02)))
         run = jax.vmap(lambda args, h, method=method: last(args, h, method))
-        stack = lambda runs: jax.tree.map(lambda *x: jnp.stack(x), *runs)  # noqa: E731
-        ends, expected = run(*stack(end)), run(*stack(own))
+        ends, expected = (run(*jax.tree.map(lambda *x: jnp.stack(x), *runs)) for runs in (end, own))
         thermal_sizes = [np.sqrt(args["T"] / args["k"]) for args in (argon, electron, cold)]
         np.testing.assert_allclose(ends / np.array(thermal_sizes), expected, rtol=1e-3, atol=1e-3)
         assert np.abs(expected).min() > 0.01

@@ -17,6 +17,7 @@ from ._gauss_legendre import GaussLegendre
 from ._type_ii import TypeII
 from .step import Equations
 
+
 class NoisySystem(eqx.Module):
     r"""A system with the noise of one step as constant rates Ḃ = ΔB/h.
 
@@ -108,8 +109,8 @@ class StochasticEuler(_WithNoise):
     that depends on t and q only.
 
     **Accuracy** strong and weak order 1 for momentum noise, for one noise Hamiltonian and for
-    several whose Poisson brackets vanish; otherwise strong order 1/2. The increments of `Brownian` are
-    limited to six standard deviations, which 2 of 10⁹ exceed.
+    several whose Poisson brackets vanish; otherwise strong order 1/2. The increments of
+    `Brownian` are limited to six standard deviations, which 2 of 10⁹ exceed.
 
     **Raises** `ValueError` for momentum noise σ that depends on p.
 

@@ -227,10 +227,11 @@ class Brownian(BrownianPath):
     - `substeps`: n, number of the equal parts of a step. ΔB_k is √(h/n) times the sum of the n
       numbers z with the indices n (first_step + k), …. Steps h, h/2, h/4 with n = 4, 2, 1 have the
       same path B(t), as tests of convergence require. `OBABO`, with two increments, doubles n.
-    - `first_step`: number of the first step, an integer; N continues a run over N steps from its last state.
+    - `first_step`: number of the first step, an integer; N continues a run over N steps from its
+      last state.
 
-    **Raises** `ValueError` or `TypeError` for another key; `ValueError` for a `first_step` that is not
-    an integer, and for more than 2³² parts.
+    **Raises** `ValueError` or `TypeError` for another key; `ValueError` for a `first_step` that is
+    not an integer, and for more than 2³² parts.
 
     **Source** counter-based generators: Salmon, Moraes, Dror & Shaw 2011.
     """
