@@ -423,3 +423,59 @@ def test_the_memory_of_this_machine_and_of_devices(monkeypatch, tmp_path):
         _memory._devices_memory.cache_clear()
         assert _memory.results_memory() == expected
     _memory._devices_memory.cache_clear()
+
+
+COUPLED = dvi.System(non_separable)
+OF_NO_TRAJECTORY = {
+    "explicit": {},
+    "status": {"throw": False},
+    "arrays": {"layout": dvi.Layout(form="arrays")},
+    "pairs": {"arithmetic": dvi.DoubleDouble()},
+    "steps by (14)": {"lattice": dvi.Variational()},
+    "times": {"save": dvi.Save(ts=jnp.array([0.05, 0.2]))},
+    "stop": {"stop": dvi.Stop(lambda t, q, p, args: q[0] - 0.5)},
+    "observables": {"observe": [dvi.MaxDrift(lambda q, p: q[0]), lambda q, p: q @ p, dvi.MEGNO()]},
+}
+
+
+@pytest.mark.parametrize("options", OF_NO_TRAJECTORY.values(), ids=OF_NO_TRAJECTORY)
+def test_a_batch_of_no_trajectories_has_arrays_of_length_zero(options):
+    def run(q):
+        sol = dvi.integrate(COUPLED, q, jnp.zeros(1), h=0.1, num_steps=3, **options)
+        return sol.qs, sol.ts, sol.observed
+
+    alone = jax.eval_shape(run, jnp.ones(1))
+    for function, q in (
+        (jax.vmap(run), jnp.ones((0, 1))),
+        (jax.vmap(jax.jit(run)), jnp.ones((0, 1))),
+        (jax.vmap(jax.vmap(run)), jnp.ones((2, 0, 1))),
+    ):
+        lead = q.shape[:-1]
+        shapes = [x.shape for x in jax.tree.leaves(function(q))]
+        assert shapes == [(*lead, *x.shape) for x in jax.tree.leaves(alone)]
+
+
+@pytest.mark.parametrize("adjoint", [dvi.Reversible(), dvi.Direct(), dvi.Checkpointed()])
+def test_gradients_of_a_batch_of_no_trajectories(adjoint):
+    def loss(h, q):
+        def last(q):
+            return dvi.integrate(COUPLED, q, q, h=h, num_steps=3, adjoint=adjoint).qs[-1, 0]
+
+        return jnp.sum(jax.vmap(last)(q))
+
+    of_h, of_q = jax.grad(loss, (0, 1))(0.1, jnp.ones((0, 1)))
+    assert of_h == 0
+    assert of_q.shape == (0, 1)
+    # The control: of one trajectory it is not zero.
+    assert abs(jax.grad(loss)(0.1, jnp.ones((1, 1)))) > 0.1
+
+
+def test_failures_in_batches_are_errors_also_inside_jit():
+    def run(q):
+        return dvi.integrate(COUPLED, q, q, h=0.1, num_steps=3).qs
+
+    q = jnp.array([[1.0], [jnp.nan]])
+    for function in (jax.vmap(run), jax.jit(jax.vmap(run)), jax.vmap(jax.jit(run))):
+        with pytest.raises(Exception, match="became NaN or infinite"):
+            jax.block_until_ready(function(q))
+        assert np.isfinite(function(q[:1])).all()

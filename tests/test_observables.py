@@ -101,3 +101,67 @@ def test_a_solution_reads_well(plain):
     batch = jax.vmap(lambda q: run(q, throw=False))(jnp.array([1.0, 0.5]))
     assert "2 trajectories, 2 successful" in repr(batch)
     assert (batch.q_final.shape, batch.t_final.shape) == ((2, 1), (2,))
+
+
+LARGE = 2**53
+
+
+def count(t, q, p, args):
+    """2⁵³ + 2k + 1 at step k: float64 has no odd numbers of this size."""
+    return jnp.int64(LARGE + 1) + 2 * jnp.floor(t / 0.1 + 0.5).astype(jnp.int64)
+
+
+INTEGERS = {
+    "last": dvi.Last(count),
+    "drift": dvi.MaxDrift(count),
+    "range": dvi.Range(count),
+    "running": dvi.Running(dvi.Last(count)),
+    "is_positive": dvi.Last(lambda q, p: jnp.stack([q[0] > 0, q[0] < 0])),
+    "change": dvi.MaxDrift(lambda q, p: q > 0.5),
+    "fraction": dvi.Mean(lambda q, p: q[0] > 0.5),
+    # 200, 140, 80, 20, then modulo 256: a difference of unsigned numbers has no sign
+    "unsigned": dvi.Range(
+        lambda t, q, p, args: (
+            jnp.uint8(200) - jnp.uint8(60) * jnp.asarray(t / 0.1 + 0.5).astype(jnp.uint8)
+        )
+    ),
+    # 3·2⁶² − 1 is above the largest integer
+    "wide": dvi.Range(
+        lambda t, q, p, args: jnp.where(t < 0.05, -jnp.int64(2**63 - 1), jnp.int64(2**62))
+    ),
+}
+
+
+@pytest.mark.parametrize("adjoint", [dvi.Direct(), dvi.Reversible()])
+def test_integers_and_booleans_stay_what_they_are(adjoint):
+    observe = {n: f for n, f in INTEGERS.items() if n != "running" or adjoint == dvi.Direct()}
+    found = run(num_steps=3, observe=observe, adjoint=adjoint).observed
+    assert found["last"].dtype == jnp.int64
+    assert int(found["last"]) == LARGE + 7
+    assert float(found["drift"]) == float(found["range"]) == 6
+    assert found["is_positive"].dtype == bool
+    assert found["is_positive"].tolist() == [True, False]
+    assert float(found["change"][0]) == 0
+    assert float(found["fraction"]) == 1
+    assert float(found["unsigned"]) == 180
+    assert float(found["wide"]) == pytest.approx(3 * 2.0**62, rel=1e-15)
+    if "running" in found:
+        assert found["running"].tolist() == [LARGE + 3, LARGE + 5, LARGE + 7]
+    # The control: as a real number the last value is another one.
+    as_real = dvi.Last(lambda t, q, p, args: count(t, q, p, args) * 1.0)
+    assert int(run(num_steps=3, observe=as_real).observed) != LARGE + 7
+
+
+def test_integers_next_to_a_gradient_and_after_a_failure():
+    observe = {"n": dvi.Last(count), "E": dvi.Last(energy), "r": dvi.Range(count)}
+
+    def of_energy(mu, adjoint):
+        found = run(mu=mu, observe=observe, adjoint=adjoint, num_steps=4).observed
+        return found["E"] + found["r"] + found["n"].astype(float)
+
+    slopes = [jax.grad(of_energy)(1.1, dvi.Reversible()), jax.jacfwd(of_energy)(1.1, dvi.Direct())]
+    assert slopes[0] == pytest.approx(float(slopes[1]), rel=1e-10)
+    with pytest.raises(dvi.IntegrationError) as error:
+        run(mu=np.nan, observe=dvi.Running(dvi.Last(count)), num_steps=2)
+    # An integer has no NaN.
+    assert error.value.solution.observed.tolist() == [np.iinfo(np.int64).min] * 2

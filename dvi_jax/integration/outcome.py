@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 import lanewise
 from lanewise import Layout
@@ -151,11 +151,24 @@ def raise_on_failure(solution: Solution, task: Task) -> Solution:
     )
 
 
+@jax.custom_batching.custom_vmap
+def _largest_of_batch(code: Array) -> Array:
+    """The largest code of the batches around this trajectory."""
+    # As equinox forms it, but a batch of no trajectories has one as well.
+    return code
+
+
+@_largest_of_batch.def_vmap
+def _(_size, _is_batched, code):
+    return _largest_of_batch(jnp.max(code, axis=0, initial=0)), False
+
+
 def _when_compiled(solution: Solution) -> Solution:
     """The solution, whose failure raises an error when the compiled program runs."""
     # Its status is not known before: only an error of equinox can report it, without the solution.
     status = solution.result
     is_failure = (status != RESULTS.successful) & (status != RESULTS.stopped)
+    status = jax.tree.map(_largest_of_batch, status)
     arrays, functions = eqx.partition(solution, eqx.is_array)
     if not manual_axes(*jax.tree.leaves(arrays)):
         return status.error_if(solution, is_failure)
