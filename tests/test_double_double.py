@@ -129,13 +129,19 @@ EXTREMES = {
 }
 
 
-def test_functions_of_large_and_small_numbers():
-    """The digits of all functions, also next to the limits of float64."""
-    for name, ranges in EXTREMES.items():
-        function, reference, _ = FUNCTIONS[name]
-        for low, high in ranges:
-            x = Pair(drawn(low, high).hi, jnp.zeros(100))
-            assert worst(function, reference, x, by=jax.vmap) < 1e-30, (name, low)
+@pytest.mark.parametrize(
+    "name", [n if n == "log" else pytest.param(n, marks=pytest.mark.slow) for n in EXTREMES]
+)
+def test_functions_of_large_and_small_numbers(name):
+    """Digits next to the limits of float64 (the cube root of XLA has an error of 1e-14)."""
+    function, reference, _ = FUNCTIONS[name]
+    for low, high in EXTREMES[name]:
+        x = Pair(drawn(low, high).hi, jnp.zeros(100))
+        assert worst(function, reference, x, by=jax.vmap) < (1e-27 if name == "cbrt" else 1e-30)
+
+
+@pytest.mark.slow
+def test_powers_of_large_and_small_and_negative_numbers():
     third = Pair(jnp.full(100, 0.3), jnp.zeros(100))
     for low, high in ((1e300, 1e308), (1e-306, 1e-290)):
         x = Pair(drawn(low, high).hi, jnp.zeros(100))
