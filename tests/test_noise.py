@@ -405,6 +405,9 @@ def test_compensated_summation_sees_the_whole_momentum():
     np.testing.assert_allclose(other.qs, plain.qs, atol=1e-12)
 
 
+ON_CIRCLE = dvi.System(
+    H_D, noise=dvi.Langevin(1.0, 0.5), constraint=lambda q, args: jnp.array([q @ q - 1])
+)
 SIGMA_OF_P = dvi.System(H_D, noise=lambda t, q, p, args: p)
 
 
@@ -432,6 +435,10 @@ SIGMA_OF_P = dvi.System(H_D, noise=lambda t, q, p, args: p)
         ({"path": dvi.Brownian(0, first_step=np.arange(2))}, "first_step must be an integer, got"),
         ({"system": dvi.System(H_D, noise=lambda t, q, p, args: jnp.ones(3))}, r"got shape \(3,\)"),
         ({"system": dvi.System(H_D, noise=dvi.Langevin(jnp.ones(2)))}, r"must broadcast with q0"),
+        *(
+            ({"system": ON_CIRCLE, "method": method}, "noise and a constraint together: no method")
+            for method in (None, dvi.BAOAB(), dvi.Rattle(), dvi.Yoshida(4, base=dvi.Rattle()))
+        ),
     ],
 )
 def test_what_does_not_fit_is_refused(more, message):

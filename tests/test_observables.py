@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import dvi_jax as dvi
+from dvi_jax import systems
 
 SYSTEM = dvi.System(
     lambda t0, t1, q0, p1, args: p1 @ p1 / 2 - args * jnp.sum(jnp.cos(q0)),
@@ -165,3 +166,47 @@ def test_integers_next_to_a_gradient_and_after_a_failure():
         run(mu=np.nan, observe=dvi.Running(dvi.Last(count)), num_steps=2)
     # An integer has no NaN.
     assert error.value.solution.observed.tolist() == [np.iinfo(np.int64).min] * 2
+
+
+def slow_energy(tau0, tau1, q0, p0, q1, p1, args):
+    return p1 @ p1 / 2 + (1 + tau1) * (q1 @ q1) / 2
+
+
+OF_SLOW_TIME = {
+    "step": systems.InSlowTime(slow_energy),
+    "state": systems.InSlowTime(lambda tau, q, p, args: p @ p / 2 + (1 + tau) * (q @ q) / 2),
+    "largest": dvi.MaxDrift(systems.InSlowTime(lambda tau, q, p, args: tau)),
+    "last": dvi.Last(systems.InSlowTime(lambda q, p: q[0])),
+    "q": systems.InSlowTime(lambda q, p: q[0]),
+    "running": dvi.Running(dvi.Last(systems.InSlowTime(lambda tau, q, p, args: tau))),
+    "time": lambda t, q, p, args: t,
+}
+
+
+@pytest.mark.parametrize("lattice", [dvi.Uniform(), dvi.TimeTransformed(lambda t, q, p, args: 1.0)])
+def test_observables_in_slow_time_have_all_forms(lattice):
+    """H_D receives τ = εt, observables receive t; those of InSlowTime receive τ."""
+    slow = dvi.System(
+        lambda t0, t1, q0, p1, args: p1 @ p1 / 2 + (1 + t0) * (q0 @ q0) / 2, slow_time=True
+    )
+    observe = dict(OF_SLOW_TIME)
+    if lattice != dvi.Uniform():
+        del observe["running"]
+    options = {"h": 0.1, "num_steps": 10, "epsilon": 0.3, "lattice": lattice}
+    sol = dvi.integrate(slow, [1.0], [0.2], observe=observe, **options)
+    ts, q, p = np.asarray(sol.ts), np.asarray(sol.qs[:, 0]), np.asarray(sol.ps[:, 0])
+    energies = p**2 / 2 + (1 + 0.3 * ts) * q**2 / 2
+    np.testing.assert_allclose(sol.observed["state"], energies, rtol=1e-13)
+    np.testing.assert_allclose(sol.observed["step"], energies[1:], rtol=1e-13)
+    np.testing.assert_allclose(sol.observed["time"], ts, rtol=1e-13)
+    np.testing.assert_allclose(sol.observed["q"], q, rtol=1e-13)
+    assert sol.observed["largest"] == pytest.approx(0.3 * ts[-1], rel=1e-13)
+    assert sol.observed["last"] == q[-1]
+    if "running" in observe:
+        np.testing.assert_allclose(sol.observed["running"], 0.3 * ts[1:], rtol=1e-13)
+    # Called by a user, with the arguments of a step.
+    step = (0.0, 0.1, *(jnp.ones(1) * x for x in (1.0, 0.2, q[1], p[1])), None)
+    for name in ("step", "state"):
+        assert observe[name].bind(slow, 0.3)(*step) == pytest.approx(energies[1], rel=1e-13)
+        with pytest.raises(ValueError, match="needs the value of epsilon"):
+            observe[name](*step)

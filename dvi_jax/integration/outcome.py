@@ -98,6 +98,7 @@ def with_initial_values(solution: Solution, run: Run, layout: Layout) -> Solutio
     def with_first_row(observable, values):
         if not isinstance(observable, OfState):
             return values
+        observable = observable.bind(run.system, run.epsilon)
 
         def at_start(t, q, p, args):
             return jnp.asarray(observable(t, t, q, p, q, p, args))
@@ -109,7 +110,7 @@ def with_initial_values(solution: Solution, run: Run, layout: Layout) -> Solutio
     return dataclasses.replace(solution, observed=rows)
 
 
-def raise_on_failure(solution: Solution, task: Task) -> Solution:
+def raise_on_failure(solution: Solution, task: Task, run: Run) -> Solution:
     """The solution. **Raises** `IntegrationError` if the run has failed; inside a transformation of
     JAX an error of equinox."""
     status = solution.result
@@ -144,10 +145,33 @@ def raise_on_failure(solution: Solution, task: Task) -> Solution:
     if int(stats["newton_iterations"]) > 0:
         residual = float(stats["failed_residual"])
         details += f" and relative residual {residual:.3g} of the implicit solve"
+    if bool(status == RESULTS.not_finite):
+        remark = _infinite_derivative(solution, run) + remark
     raise IntegrationError(
         f"the trajectory failed at step {step} of {stats['num_steps']} (the first step has number "
         f"0), with {details}. {remark}",
         solution,
+    )
+
+
+def _infinite_derivative(solution: Solution, run: Run) -> str:
+    """A sentence on a derivative of H_D that is not finite at the last finite state that was saved,
+    where H_D is; else empty."""
+    rows = (np.asarray(x).reshape(len(x), -1) for x in (solution.ts, solution.qs, solution.ps))
+    finite = np.flatnonzero(np.isfinite(np.concatenate([*rows], axis=1)).all(axis=1))
+    if not finite.size:
+        return ""
+    t, q, p = (x[finite[-1]] for x in (solution.ts, solution.qs, solution.ps))
+    H = jax.value_and_grad(run.system.hamiltonian, (2, 3))
+    value, slopes = H(t, t, q, p, run.epsilon, run.args)
+    if not np.isfinite(value) or all(np.isfinite(slope).all() for slope in slopes):
+        return ""
+    name = "q" if not np.isfinite(slopes[0]).all() else "p"
+    place = np.array2string(np.asarray(q), threshold=6)
+    return (
+        f"∂H_D/∂{name} is not finite at t = {float(t):.6g}, q = {place}, where H_D is: a branch of "
+        "jnp.where that is undefined there, a norm or a root of zero. Give it another argument, as "
+        "in jnp.where(r > 0, f(jnp.where(r > 0, r, 1)), 0) (a double where). "
     )
 
 

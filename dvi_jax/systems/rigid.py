@@ -2,9 +2,9 @@
 
 The state of a body is its rotation matrix R from body axes to fixed axes with the momentum P, both
 (3, 3); a free body has its position and momentum in a fourth row, (4, 3). D = diag(d) has the
-second moments d_k = ∫ x_k² dm = (I1 + I2 + I3)/2 − I_k along the principal axes. A flat body has one
-d_k = 0 and a rod two, for which D has no inverse: such a body is given a thickness, d_k = 1e-8 (I1 +
-I2 + I3), which changes its moments by as little.
+second moments d_k = ∫ x_k² dm = (I1 + I2 + I3)/2 − I_k along the principal axes. A flat body has
+one d_k = 0 and a rod two, for which D has no inverse: such a body is given a thickness, d_k = 1e-8
+(I1 + I2 + I3), which changes its moments by as little.
 
 **Source** Hairer, Lubich & Wanner 2006, *Geometric Numerical Integration*, VII.5; Leimkuhler &
 Reich 2004, *Simulating Hamiltonian Dynamics*, 8.
