@@ -138,7 +138,7 @@ def _power_of_two(n: Array) -> Array:
     return lax.bitcast_convert_type(exponent << 52, jnp.float64)
 
 
-def _scaled(x: Number, factor: Array) -> Any:
+def _multiple(x: Number, factor: Array) -> Any:
     """x times a power of two, which is exact: a product would lose the smallest numbers."""
     return jax.tree.map(lambda part: part * factor, x)
 
@@ -166,7 +166,7 @@ def _logarithm(x: Number, excess: Number, guess: Array) -> Pair:
     # Where e⁻ʸ has too few digits, next to the smallest numbers, that of x/2^n, n = ±512.
     n = jnp.where(jnp.abs(guess) > 300, jnp.sign(guess) * 512, 0)
     octave = Pair(*(64 * n * part for part in _tables()[2][:2]))  # n ln 2
-    x = _scaled(x, _power_of_two(-n))
+    x = _multiple(x, _power_of_two(-n))
     guess = jnp.where(jnp.isfinite(guess), guess - octave.hi, guess)
     power, change = _exponential(-guess)
     shrunk = add(sub(power, _UNIT), mul(power, change))  # e⁻ʸ − 1
@@ -214,8 +214,8 @@ def cbrt(x: Number) -> Pair:
     # Products of small numbers would have too few digits.
     x = as_pair(x)
     is_small = jnp.abs(x.hi) < 2.0**-300
-    root = _cube_root(_scaled(x, jnp.where(is_small, 2.0**600, 1.0)))
-    return _scaled(root, jnp.where(is_small, 2.0**-200, 1.0))
+    root = _cube_root(_multiple(x, jnp.where(is_small, 2.0**600, 1.0)))
+    return _multiple(root, jnp.where(is_small, 2.0**-200, 1.0))
 
 
 def _cube_root(x: Pair) -> Pair:

@@ -20,7 +20,7 @@ from ..lattices import Lattice
 from ..methods import Method
 from ..methods.step import Equations
 from ..observe import Deviations, Reduction, Running, Stop, is_observable
-from ..observe._reductions import missing
+from ..observe._reductions import no_value
 from ..observe.solution import Save
 from ..problem.noise import NoisePath
 from .arithmetic import Arithmetic, FloatingPoint
@@ -233,4 +233,4 @@ class Outcome(NamedTuple):
 
 def or_nan(good: Array, x: Any) -> Any:
     """x where it is good, else NaN."""
-    return jax.tree.map(lambda x: jnp.where(good, x, missing(x)), x)
+    return jax.tree.map(lambda x: jnp.where(good, x, no_value(x)), x)

@@ -70,7 +70,7 @@ class Reduction(eqx.Module):
         return jax.vjp(value_of_all, t, value)[1](cotangent)
 
 
-def missing(value: Array) -> Array:
+def no_value(value: Array) -> Array:
     """NaN; for integers the smallest one of the type, for booleans False."""
     if jnp.issubdtype(value.dtype, jnp.inexact):
         return jnp.full_like(value, jnp.nan)
@@ -145,7 +145,7 @@ class Range(_OfFunction):
     keeps_integers: ClassVar[bool] = True
 
     def start(self, value):
-        nan, step = missing(value), jnp.full(value.shape, -1, jnp.int32)
+        nan, step = no_value(value), jnp.full(value.shape, -1, jnp.int32)
         return nan, nan, step, step
 
     def update(self, memory, k, t, value):
@@ -206,7 +206,7 @@ class _WithCount(_OfFunction):
     """Base of the reductions with a memory of a value and the number of steps."""
 
     def start(self, value):
-        return missing(value), jnp.asarray(0, jnp.int32)
+        return no_value(value), jnp.asarray(0, jnp.int32)
 
     def finish(self, memory):
         return memory[0]

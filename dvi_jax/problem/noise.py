@@ -107,8 +107,8 @@ class Langevin(Noise):
             invalid = entries <= 0 if is_mass else entries < 0  # NaN gives the state NaN
             if invalid.any():
                 rule = "positive" if is_mass else "zero or positive"
-                got = entries[invalid][0]
-                raise ValueError(f"{name} of dvi.Langevin must be {rule}, got {got}.")
+                number = entries[invalid][0]
+                raise ValueError(f"{name} of dvi.Langevin must be {rule}, got {number}.")
 
     def _values(self, args: Args, like: State) -> list[Array]:
         parameters = (self.friction, self.temperature, self.mass)
