@@ -135,7 +135,7 @@ def on_any(x: Array, rare: bool = True) -> Array:
 def _least_of_batch(arrays, axes, *, rare):
     (x,), (axis,) = arrays, axes
     # Without a batch axis, so that a `cond` on it stays a branch and does not become a selection.
-    return _minimum.bind(jnp.min(x, axis=axis), rare=rare), None
+    return _minimum.bind(jnp.min(x, axis=axis, initial=1), rare=rare), None
 
 
 _minimum = primitive("least_over_lanes", lambda x, *, rare: x, _least_of_batch)

@@ -153,6 +153,8 @@ def _in_jax(program: Callee, lanes: int | None, lane_flags: tuple[bool, ...]) ->
     """The program as a function of JAX; operands with a flag and outputs begin with the batch."""
     if lanes is None:
         return program.trace
+    if lanes == 0:  # batched operations such as a minimum would have no value
+        return lambda *_: [jnp.zeros(x.shape, x.dtype) for x in program.shape_of(lanes)]
     axes = [0 if has_lanes else None for has_lanes in lane_flags]
     return jax.vmap(program.trace, axes, 0, axis_size=lanes)
 

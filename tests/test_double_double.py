@@ -119,6 +119,46 @@ def test_functions_have_30_digits(name):
         assert worst(function, reference, drawn(low, high)) < 5e-31, (low, high)
 
 
+EXTREMES = {
+    "sin": [(1e9, 1e12), (1e12, 3.5e13)],
+    "tan": [(1e9, 3.5e13)],
+    "log": [(1e300, 1e308), (1e-306, 1e-290), (1e100, 1e200)],
+    "log2": [(1e300, 1e308)],
+    "log1p": [(1e300, 1e308)],
+    "cbrt": [(1e290, 1e308), (1e-306, 1e-80)],
+}
+
+
+@pytest.mark.parametrize(
+    "name", [n if n == "log" else pytest.param(n, marks=pytest.mark.slow) for n in EXTREMES]
+)
+def test_functions_of_large_and_small_numbers(name):
+    """Digits next to the limits of float64 (the cube root of XLA has an error of 1e-14)."""
+    function, reference, _ = FUNCTIONS[name]
+    for low, high in EXTREMES[name]:
+        x = Pair(drawn(low, high).hi, jnp.zeros(100))
+        assert worst(function, reference, x, by=jax.vmap) < (1e-27 if name == "cbrt" else 1e-30)
+
+
+@pytest.mark.slow
+def test_powers_of_large_and_small_and_negative_numbers():
+    third = Pair(jnp.full(100, 0.3), jnp.zeros(100))
+    for low, high in ((1e300, 1e308), (1e-306, 1e-290)):
+        x = Pair(drawn(low, high).hi, jnp.zeros(100))
+        assert worst(functions.general_power, lambda x, y: x**y, x, third, by=jax.vmap) < 1e-29
+    cube = functions.general_power(Pair(-2 - jnp.ones(1) / 3, jnp.zeros(1)), jnp.asarray(3.0))
+    exact_cube = mp.mpf(float(-2 - 1 / 3)) ** 3
+    assert abs(exact(cube)[0] / exact_cube - 1) < 1e-29
+
+
+@pytest.mark.parametrize("size", [4e13, 1e16, 1e25, 1e300])
+def test_angles_without_digits_are_nan(size):
+    """No number of a wrong size: of |x| > 2⁴⁵ the functions of an angle are NaN."""
+    x = Pair(jnp.array([size, -size]), jnp.zeros(2))
+    for value in (*functions.sin_cos(x), functions.tan(x)):
+        assert np.isnan(value.hi).all()
+
+
 def test_products_in_xla_and_functions_of_two_pairs():
     assert worst(pairs.mul, operator.mul, *ONES, by=jax.vmap) < 1e-30
     x, y = drawn(-3, 3), drawn(-2, 2)

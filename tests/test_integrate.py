@@ -423,3 +423,102 @@ def test_the_memory_of_this_machine_and_of_devices(monkeypatch, tmp_path):
         _memory._devices_memory.cache_clear()
         assert _memory.results_memory() == expected
     _memory._devices_memory.cache_clear()
+
+
+COUPLED = dvi.System(non_separable)
+OF_NO_TRAJECTORY = {
+    "explicit": {},
+    "status": {"throw": False},
+    "arrays": {"layout": dvi.Layout(form="arrays")},
+    "pairs": {"arithmetic": dvi.DoubleDouble()},
+    "steps by (14)": {"lattice": dvi.Variational()},
+    "times": {"save": dvi.Save(ts=jnp.array([0.05, 0.2]))},
+    "stop": {"stop": dvi.Stop(lambda t, q, p, args: q[0] - 0.5)},
+    "observables": {"observe": [dvi.MaxDrift(lambda q, p: q[0]), lambda q, p: q @ p, dvi.MEGNO()]},
+}
+
+
+@pytest.mark.parametrize("options", OF_NO_TRAJECTORY.values(), ids=OF_NO_TRAJECTORY)
+def test_a_batch_of_no_trajectories_has_arrays_of_length_zero(options):
+    def run(q):
+        sol = dvi.integrate(COUPLED, q, jnp.zeros(1), h=0.1, num_steps=3, **options)
+        return sol.qs, sol.ts, sol.observed
+
+    alone = jax.eval_shape(run, jnp.ones(1))
+    for function, q in (
+        (jax.vmap(run), jnp.ones((0, 1))),
+        (jax.vmap(jax.jit(run)), jnp.ones((0, 1))),
+        (jax.vmap(jax.vmap(run)), jnp.ones((2, 0, 1))),
+    ):
+        lead = q.shape[:-1]
+        shapes = [x.shape for x in jax.tree.leaves(function(q))]
+        assert shapes == [(*lead, *x.shape) for x in jax.tree.leaves(alone)]
+
+
+@pytest.mark.parametrize("adjoint", [dvi.Reversible(), dvi.Direct(), dvi.Checkpointed()])
+def test_gradients_of_a_batch_of_no_trajectories(adjoint):
+    def loss(h, q):
+        def last(q):
+            return dvi.integrate(COUPLED, q, q, h=h, num_steps=3, adjoint=adjoint).qs[-1, 0]
+
+        return jnp.sum(jax.vmap(last)(q))
+
+    of_h, of_q = jax.grad(loss, (0, 1))(0.1, jnp.ones((0, 1)))
+    assert of_h == 0
+    assert of_q.shape == (0, 1)
+    # The control: of one trajectory it is not zero.
+    assert abs(jax.grad(loss)(0.1, jnp.ones((1, 1)))) > 0.1
+
+
+def test_failures_in_batches_are_errors_also_inside_jit():
+    def run(q):
+        return dvi.integrate(COUPLED, q, q, h=0.1, num_steps=3).qs
+
+    q = jnp.array([[1.0], [jnp.nan]])
+    for function in (jax.vmap(run), jax.jit(jax.vmap(run)), jax.vmap(jax.jit(run))):
+        with pytest.raises(Exception, match="became NaN or infinite"):
+            jax.block_until_ready(function(q))
+        assert np.isfinite(function(q[:1])).all()
+
+
+def well(q):
+    """1 − cos|q| for |q| < 1, else constant."""
+    r = jnp.linalg.norm(q)
+    return jnp.where(r < 1, 1 - jnp.cos(r), 1 - np.cos(1.0))
+
+
+UNDEFINED = {
+    "norm": (lambda q: jnp.linalg.norm(q) ** 2, [0.0, 0.0], "q"),
+    "branch": (lambda q: jnp.where(q[0] > 0, jnp.sqrt(q[0]) ** 3, 0.0), [0.0, 1.0], "q"),
+    "quotient": (lambda q: jnp.where(q[0] == 0, 1.0, jnp.sin(q[0]) / q[0]), [0.0, 1.0], "q"),
+    "both sides": (well, [0.0, 0.0], "q"),
+}
+
+
+@pytest.mark.parametrize(("V", "q0", "name"), UNDEFINED.values(), ids=UNDEFINED)
+def test_a_derivative_that_is_not_finite_is_named(V, q0, name):
+    system = dvi.System(lambda t0, t1, q0, p1, args: p1 @ p1 / 2 + V(q0))
+    run = {"h": 0.1, "num_steps": 4}
+    with pytest.raises(dvi.IntegrationError, match=rf"∂H_D/∂{name} is not finite at t = 0.*double"):
+        dvi.integrate(system, q0, [0.0, 0.1], **run)
+    assert dvi.integrate(system, q0, [0.0, 0.1], throw=False, **run).status == "not_finite"
+    # Where the motion begins elsewhere, the run is successful.
+    assert dvi.integrate(system, [0.5, 0.5], [0.0, 0.1], **run).status == "successful"
+
+
+def test_other_causes_of_nan_are_not_called_derivatives():
+    """A singularity of H_D itself, an orbit that escapes; and the remedy of the message works."""
+    attraction = dvi.System(lambda t0, t1, q0, p1, args: p1 @ p1 / 2 - 1 / jnp.sum(q0**2))
+    escape = dvi.System(lambda t0, t1, q0, p1, args: p1 @ p1 / 2 - jnp.sum(q0**6))
+    for system, q0 in ((attraction, [0.0]), (escape, [2.0])):
+        with pytest.raises(dvi.IntegrationError, match="NaN or infinite") as error:
+            dvi.integrate(system, q0, [0.0], h=0.5, num_steps=20)
+        assert "∂H_D" not in str(error.value)
+
+    def V(q):
+        r2 = q @ q
+        r = jnp.sqrt(jnp.where(r2 > 0, r2, 1.0))
+        return jnp.where(r2 > 0, 1 - jnp.cos(r), 0.0)
+
+    safe = dvi.System(lambda t0, t1, q0, p1, args: p1 @ p1 / 2 + V(q0))
+    assert dvi.integrate(safe, [0.0, 0.0], [0.0, 0.1], h=0.1, num_steps=4).status == "successful"

@@ -316,12 +316,98 @@ def test_gradients_at_zero_temperature_are_finite():
     assert float(slope) == pytest.approx((ends[1] - ends[0]) / 2e-5, rel=1e-8)
 
 
+OSCILLATOR = dvi.System(
+    lambda t0, t1, q0, p1, args: p1 @ p1 / (2 * args["m"]) + args["k"] * (q0 @ q0) / 2,
+    noise=dvi.Langevin(lambda args: args["g"], lambda args: args["T"], lambda args: args["m"]),
+)
+METHODS_FOR_NOISE = [dvi.BAOAB(), dvi.OBABO(), dvi.StochasticMidpoint(), dvi.StochasticEuler()]
+
+
+@pytest.mark.parametrize("method", METHODS_FOR_NOISE)
+def test_invalid_parameters_of_a_bath_are_not_zero_noise(method):
+    """A NaN or a wrong sign gives a status, alone and next to good trajectories of a batch."""
+    nan, good = np.nan, (0.5, 1.0, 1.0)
+    invalid = [(0.5, nan, 1.0), (0.5, -1.0, 1.0), (-0.5, 1.0, 1.0), (-0.5, -1.0, 1.0),
+               (0.5, 1.0, nan), (-0.5, 0.0, 1.0), (0.5, -1e-300, 1.0), (nan, 0.0, 1.0)]  # fmt: skip
+    rows = np.array([good, *invalid, (0.5, 0.0, 1.0), (0.0, 1.0, 1.0), (0.0, 0.0, 2.0)])
+    columns = dict(zip("gTm", rows.T, strict=True), k=np.ones(len(rows)))
+    sol = jax.vmap(
+        lambda args: dvi.integrate(OSCILLATOR, [1.0], [0.0], h=0.1, num_steps=20, args=args, path=3,
+                                   method=method, throw=False)
+    )(columns)  # fmt: skip
+    is_valid = sol.result == dvi.RESULTS.successful
+    assert is_valid.tolist() == [True] + [False] * len(invalid) + [True] * 3
+    assert np.isnan(np.asarray(sol.qs)[1 : len(invalid) + 1, -1]).all()
+
+
+def test_noise_in_units_of_atoms_and_single_precision():
+    """m T underflows in float32. The same run in units of the system has the same noise."""
+    argon = {"m": 6.63e-26, "T": 4.14e-21, "k": 1.0, "g": 1e12}
+    electron = {"m": 9.11e-31, "T": 4.14e-21, "k": 1e-3, "g": 1e13}
+    cold = {"m": 1.4e-25, "T": 1.38e-29, "k": 1e-14, "g": 1e4}
+
+    def last(args, h, method):
+        sol = dvi.integrate(OSCILLATOR, jnp.zeros(1, "float32"), jnp.zeros(1, "float32"), h=h,
+                            num_steps=300, args=args, path=1, method=method,
+                            save=dvi.Save(final=True))  # fmt: skip
+        return sol.qs[-1, 0]
+
+    for method in (dvi.BAOAB(), dvi.StochasticEuler()):
+        end, own = [], []
+        for args in (argon, electron, cold):
+            period = np.sqrt(args["m"] / args["k"])
+            unit = {"m": 1.0, "T": 1.0, "k": 1.0, "g": args["g"] * period}
+            end.append(({n: jnp.float32(x) for n, x in args.items()}, jnp.float32(0.02 * period)))
+            own.append(({n: jnp.float32(x) for n, x in unit.items()}, jnp.float32(0.02)))
+        run = jax.vmap(lambda args, h, method=method: last(args, h, method))
+        ends, expected = (run(*jax.tree.map(lambda *x: jnp.stack(x), *runs)) for runs in (end, own))
+        thermal_sizes = [np.sqrt(args["T"] / args["k"]) for args in (argon, electron, cold)]
+        np.testing.assert_allclose(ends / np.array(thermal_sizes), expected, rtol=1e-3, atol=1e-3)
+        assert np.abs(expected).min() > 0.01
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ((-1.0, 0.5), "friction .* must be zero or positive, got -1.0"),
+        ((1.0, -0.5), "temperature .* must be zero or positive, got -0.5"),
+        ((1.0, 0.5, -1.0), "mass .* must be positive, got -1.0"),
+        ((1.0, 0.5, 0), "mass .* must be positive, got 0"),
+        ((1.0, jnp.array([0.5, -2.0])), "temperature .* got -2.0"),
+    ],
+)
+def test_negative_parameters_of_a_bath_are_refused(parameters, message):
+    with pytest.raises(ValueError, match=message):
+        dvi.Langevin(*parameters)
+
+
+class Spike(dvi.BrownianPath):
+    """The increment `size` in step 2, and 0 in the others."""
+
+    size: float
+
+    def increments(self, k, interval, parts, count):
+        return jnp.where(k == 2, self.size, 0.0) * jnp.ones((parts, count))
+
+
+@pytest.mark.parametrize("method", METHODS_FOR_NOISE)
+def test_increments_of_a_user_are_used_as_they_are(method):
+    p = momenta(Spike(100.0), method=method)
+    assert p[-1] == pytest.approx(100.0 * method.increments)
+    for size in (np.inf, -np.inf, np.nan):
+        with pytest.raises(dvi.IntegrationError, match="NaN or infinite"):
+            momenta(Spike(size), method=method)
+
+
 def test_compensated_summation_sees_the_whole_momentum():
     plain = thermal(3, h=0.01, num_steps=300)
     other = thermal(3, h=0.01, num_steps=300, arithmetic=dvi.Compensated())
     np.testing.assert_allclose(other.qs, plain.qs, atol=1e-12)
 
 
+ON_CIRCLE = dvi.System(
+    H_D, noise=dvi.Langevin(1.0, 0.5), constraint=lambda q, args: jnp.array([q @ q - 1])
+)
 SIGMA_OF_P = dvi.System(H_D, noise=lambda t, q, p, args: p)
 
 
@@ -343,8 +429,16 @@ SIGMA_OF_P = dvi.System(H_D, noise=lambda t, q, p, args: p)
         ({"path": jax.random.split(jax.random.key(0), 3)}, "use jax.vmap"),
         ({"path": jax.random.key(0, impl="rbg")}, "generator threefry2x32"),
         ({"path": dvi.Brownian(0, first_step=-1)}, "first_step must be an integer from 0"),
+        ({"path": dvi.Brownian(0, first_step=1.5)}, "first_step must be an integer, got"),
+        ({"path": dvi.Brownian(0, first_step=True)}, "first_step must be an integer, got"),
+        ({"path": dvi.Brownian(0, first_step=np.nan)}, "first_step must be an integer, got"),
+        ({"path": dvi.Brownian(0, first_step=np.arange(2))}, "first_step must be an integer, got"),
         ({"system": dvi.System(H_D, noise=lambda t, q, p, args: jnp.ones(3))}, r"got shape \(3,\)"),
         ({"system": dvi.System(H_D, noise=dvi.Langevin(jnp.ones(2)))}, r"must broadcast with q0"),
+        *(
+            ({"system": ON_CIRCLE, "method": method}, "noise and a constraint together: no method")
+            for method in (None, dvi.BAOAB(), dvi.Rattle(), dvi.Yoshida(4, base=dvi.Rattle()))
+        ),
     ],
 )
 def test_what_does_not_fit_is_refused(more, message):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import dvi_jax as dvi
+from dvi_jax import systems
 
 SYSTEM = dvi.System(
     lambda t0, t1, q0, p1, args: p1 @ p1 / 2 - args * jnp.sum(jnp.cos(q0)),
@@ -101,3 +102,111 @@ def test_a_solution_reads_well(plain):
     batch = jax.vmap(lambda q: run(q, throw=False))(jnp.array([1.0, 0.5]))
     assert "2 trajectories, 2 successful" in repr(batch)
     assert (batch.q_final.shape, batch.t_final.shape) == ((2, 1), (2,))
+
+
+LARGE = 2**53
+
+
+def count(t, q, p, args):
+    """2⁵³ + 2k + 1 at step k: float64 has no odd numbers of this size."""
+    return jnp.int64(LARGE + 1) + 2 * jnp.floor(t / 0.1 + 0.5).astype(jnp.int64)
+
+
+INTEGERS = {
+    "last": dvi.Last(count),
+    "drift": dvi.MaxDrift(count),
+    "range": dvi.Range(count),
+    "running": dvi.Running(dvi.Last(count)),
+    "is_positive": dvi.Last(lambda q, p: jnp.stack([q[0] > 0, q[0] < 0])),
+    "change": dvi.MaxDrift(lambda q, p: q > 0.5),
+    "fraction": dvi.Mean(lambda q, p: q[0] > 0.5),
+    # 200, 140, 80, 20, then modulo 256: a difference of unsigned numbers has no sign
+    "unsigned": dvi.Range(
+        lambda t, q, p, args: (
+            jnp.uint8(200) - jnp.uint8(60) * jnp.asarray(t / 0.1 + 0.5).astype(jnp.uint8)
+        )
+    ),
+    # 3·2⁶² − 1 is above the largest integer
+    "wide": dvi.Range(
+        lambda t, q, p, args: jnp.where(t < 0.05, -jnp.int64(2**63 - 1), jnp.int64(2**62))
+    ),
+}
+
+
+@pytest.mark.parametrize("adjoint", [dvi.Direct(), dvi.Reversible()])
+def test_integers_and_booleans_stay_what_they_are(adjoint):
+    observe = {n: f for n, f in INTEGERS.items() if n != "running" or adjoint == dvi.Direct()}
+    found = run(num_steps=3, observe=observe, adjoint=adjoint).observed
+    assert found["last"].dtype == jnp.int64
+    assert int(found["last"]) == LARGE + 7
+    assert float(found["drift"]) == float(found["range"]) == 6
+    assert found["is_positive"].dtype == bool
+    assert found["is_positive"].tolist() == [True, False]
+    assert float(found["change"][0]) == 0
+    assert float(found["fraction"]) == 1
+    assert float(found["unsigned"]) == 180
+    assert float(found["wide"]) == pytest.approx(3 * 2.0**62, rel=1e-15)
+    if "running" in found:
+        assert found["running"].tolist() == [LARGE + 3, LARGE + 5, LARGE + 7]
+    # The control: as a real number the last value is another one.
+    as_real = dvi.Last(lambda t, q, p, args: count(t, q, p, args) * 1.0)
+    assert int(run(num_steps=3, observe=as_real).observed) != LARGE + 7
+
+
+def test_integers_next_to_a_gradient_and_after_a_failure():
+    observe = {"n": dvi.Last(count), "E": dvi.Last(energy), "r": dvi.Range(count)}
+
+    def of_energy(mu, adjoint):
+        found = run(mu=mu, observe=observe, adjoint=adjoint, num_steps=4).observed
+        return found["E"] + found["r"] + found["n"].astype(float)
+
+    slopes = [jax.grad(of_energy)(1.1, dvi.Reversible()), jax.jacfwd(of_energy)(1.1, dvi.Direct())]
+    assert slopes[0] == pytest.approx(float(slopes[1]), rel=1e-10)
+    with pytest.raises(dvi.IntegrationError) as error:
+        run(mu=np.nan, observe=dvi.Running(dvi.Last(count)), num_steps=2)
+    # An integer has no NaN.
+    assert error.value.solution.observed.tolist() == [np.iinfo(np.int64).min] * 2
+
+
+def slow_energy(tau0, tau1, q0, p0, q1, p1, args):
+    return p1 @ p1 / 2 + (1 + tau1) * (q1 @ q1) / 2
+
+
+OF_SLOW_TIME = {
+    "step": systems.InSlowTime(slow_energy),
+    "state": systems.InSlowTime(lambda tau, q, p, args: p @ p / 2 + (1 + tau) * (q @ q) / 2),
+    "largest": dvi.MaxDrift(systems.InSlowTime(lambda tau, q, p, args: tau)),
+    "last": dvi.Last(systems.InSlowTime(lambda q, p: q[0])),
+    "q": systems.InSlowTime(lambda q, p: q[0]),
+    "running": dvi.Running(dvi.Last(systems.InSlowTime(lambda tau, q, p, args: tau))),
+    "time": lambda t, q, p, args: t,
+}
+
+
+@pytest.mark.parametrize("lattice", [dvi.Uniform(), dvi.TimeTransformed(lambda t, q, p, args: 1.0)])
+def test_observables_in_slow_time_have_all_forms(lattice):
+    """H_D receives τ = εt, observables receive t; those of InSlowTime receive τ."""
+    slow = dvi.System(
+        lambda t0, t1, q0, p1, args: p1 @ p1 / 2 + (1 + t0) * (q0 @ q0) / 2, slow_time=True
+    )
+    observe = dict(OF_SLOW_TIME)
+    if lattice != dvi.Uniform():
+        del observe["running"]
+    options = {"h": 0.1, "num_steps": 10, "epsilon": 0.3, "lattice": lattice}
+    sol = dvi.integrate(slow, [1.0], [0.2], observe=observe, **options)
+    ts, q, p = np.asarray(sol.ts), np.asarray(sol.qs[:, 0]), np.asarray(sol.ps[:, 0])
+    energies = p**2 / 2 + (1 + 0.3 * ts) * q**2 / 2
+    np.testing.assert_allclose(sol.observed["state"], energies, rtol=1e-13)
+    np.testing.assert_allclose(sol.observed["step"], energies[1:], rtol=1e-13)
+    np.testing.assert_allclose(sol.observed["time"], ts, rtol=1e-13)
+    np.testing.assert_allclose(sol.observed["q"], q, rtol=1e-13)
+    assert sol.observed["largest"] == pytest.approx(0.3 * ts[-1], rel=1e-13)
+    assert sol.observed["last"] == q[-1]
+    if "running" in observe:
+        np.testing.assert_allclose(sol.observed["running"], 0.3 * ts[1:], rtol=1e-13)
+    # Called by a user, with the arguments of a step.
+    step = (0.0, 0.1, *(jnp.ones(1) * x for x in (1.0, 0.2, q[1], p[1])), None)
+    for name in ("step", "state"):
+        assert observe[name].bind(slow, 0.3)(*step) == pytest.approx(energies[1], rel=1e-13)
+        with pytest.raises(ValueError, match="needs the value of epsilon"):
+            observe[name](*step)

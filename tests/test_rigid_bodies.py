@@ -59,6 +59,79 @@ def test_momenta_and_energies_are_those_of_the_inertia_tensor():
     assert np.max(np.abs(velocity.T @ R + R.T @ velocity)) < 1e-15
 
 
+FLAT = {
+    "water": (1.022, 1.920, 2.942),
+    "plate": (1.0, 1.0, 2.0),
+    "ring": (2.0, 1.0, 1.0),
+    "plate with rounded moments": (0.1, 0.2, 0.1 + 0.2),
+    "rod": (0.0, 1.0, 1.0),
+    "rod along the third axis": (0.7, 0.7, 0.0),
+    "nearly flat": (1.0, 2.0, 3.0 - 1e-6),
+    "solid": (1.0, 1.6, 2.0),
+}
+
+
+def test_flat_bodies_and_rods_turn_as_by_eulers_equations():
+    """Against DOP853 for Ω and R, with moments between those of solids, plates and rods."""
+    body = dvi.System(
+        lambda t0, t1, q0, p1, args: rigid.rotational_energy(p1, args), constraint=rigid.orthonormal
+    )
+    R0 = rigid.rotation(0.1, 0.2, 0.3)
+    moments = np.array([*FLAT.values()])
+    spins = np.where(moments > 0, [0.3, 1.1, -0.7], 0.0)
+
+    def end(I, spin):  # noqa: E741
+        P0 = rigid.momentum(R0, I * spin, I)
+        sol = dvi.integrate(body, R0, P0, args=I, h=0.02, num_steps=100,
+                            method=dvi.Yoshida(4, base=dvi.Rattle()))  # fmt: skip
+        energies = jax.vmap(lambda P: rigid.rotational_energy(P, I))(sol.ps)
+        return sol.qs[-1], rigid.body_momentum(sol.qs[-1], sol.ps[-1]), energies
+
+    for name, I, spin, R, pi, energies in zip(  # noqa: E741
+        FLAT, moments, spins, *jax.vmap(end)(jnp.asarray(moments), jnp.asarray(spins)), strict=True
+    ):
+        divisor = np.where(I > 0, I, 1.0)
+
+        def rates(t, y, I=I, divisor=divisor):  # noqa: E741
+            turning = np.cross(I * y[:3], y[:3]) / divisor
+            spin = np.cross(np.eye(3), y[:3])
+            return np.concatenate([turning, (y[3:].reshape(3, 3) @ spin).ravel()])
+
+        start = np.concatenate([spin, np.asarray(R0).ravel()])
+        exact = solve_ivp(rates, (0, 2), start, method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
+        assert np.max(np.abs(R - exact[3:].reshape(3, 3))) < 1e-6, name
+        assert np.max(np.abs(pi - I * exact[:3])) < 1e-6, name
+        assert np.max(np.abs(energies / energies[0] - 1)) < 1e-6, name
+        kinetic = np.sum(I * spin**2) / 2
+        assert energies[0] == pytest.approx(kinetic, rel=1e-7), name
+
+
+@pytest.mark.parametrize("I", [(1.0, 1.0, 3.0), (0.1, 0.2, 0.31), (0.0, 1.0, 2.0)])
+def test_moments_that_no_body_has_are_refused(I):  # noqa: E741
+    R, pi = jnp.eye(3), jnp.array([0.1, 0.2, 0.3])
+    for function in (
+        rigid.second_moments,
+        functools.partial(rigid.momentum, R, pi),
+        functools.partial(rigid.rotational_energy, R),
+    ):
+        with pytest.raises(ValueError, match="at most the sum of the two others, got"):
+            function(np.array(I))
+        # Traced moments give NaN, in some component.
+        assert np.isnan(jax.jit(function)(jnp.array(I))).any()
+    free = systems.rigid_body()
+    named = dict(zip(("I1", "I2", "I3"), I, strict=True))
+    with pytest.raises(ValueError, match="I"):
+        free.check(free.q0, free.p0, named)
+    top = systems.spinning_top()
+    with pytest.raises(ValueError, match="C must be at most 2 A"):
+        top.check(top.q0, top.p0, {"A": 1.0, "C": 2.5, "w": 1.0})
+
+
+def test_derivatives_of_flat_bodies_are_those_of_the_moments():
+    slopes = jax.jacfwd(rigid.second_moments)(jnp.array([1.0, 1.0, 2.0]))
+    np.testing.assert_allclose(slopes, 0.5 - np.eye(3))
+
+
 @slow
 def test_the_nearest_rotation_is_the_polar_factor():
     rng = np.random.default_rng(0)

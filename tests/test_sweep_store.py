@@ -508,3 +508,33 @@ def test_killed_many_times(tmp_path):
     assert len({record["pid"] for record in found.records()}) > 2
     cut_off = commits(path, "begin").total() - commits(path, "end").total()
     assert cut_off > 0, "no kill met a task that was being written: nothing was tested"
+
+
+def test_observables_without_entries_are_stored(tmp_path):
+    """Of shapes (0,), (3, 0) and (0, 2), next to others."""
+
+    def momentum(t, q, p, args):
+        return p[0]
+
+    observe = {
+        "empty": dvi.Last(lambda q, p: q[:0]),
+        "rows": lambda q, p: np.ones((3, 0)) * p[0],
+        "columns": dvi.Mean(lambda q, p: np.ones((0, 2)) * p[0]),
+        "end": dvi.Last(momentum),
+    }
+    options = {"q0": [1.0], "p0": dvi.Axis("start", [[0.1], [0.2], [0.3]]), "h": 0.1}
+    options |= {"num_steps": 4, "observe": observe, "save": dvi.Save(every=2), "progress": False}
+    system = dvi.System(lambda t0, t1, q0, p1, args: p1 @ p1 / 2)
+    path = tmp_path / "s.zarr"
+    shapes = {"empty": (3, 0), "rows": (3, 3, 3, 0), "columns": (3, 0, 2), "end": (3,)}
+    for result in (
+        dvi.sweep(system, store=path, **options),
+        dvi.sweep(system, store=path, **options),
+        dvi.open_sweep(path),
+        dvi.sweep(system, **options),
+    ):
+        assert {name: np.asarray(result[name]).shape for name in shapes} == shapes
+        assert np.asarray(result["end"]).tolist() == [0.1, 0.2, 0.3]
+    assert dvi.open_sweep(path).verify() == (1, {}, 0)
+    with xr.open_zarr(path) as data:
+        assert data["rows"].load().shape == shapes["rows"]

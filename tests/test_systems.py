@@ -1,6 +1,7 @@
 """Single systems of the library against references of their own, and what their runs conserve."""
 
 import functools
+from fractions import Fraction
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +22,7 @@ from dvi_jax.systems.magnetic_mirror import magnetic_field, vector_potential
 from dvi_jax.systems.n_body import angular_momentum
 from dvi_jax.systems.nls_lattice import plane_wave
 from dvi_jax.systems.oblate_kepler import elements, secular_rates
+from dvi_jax.systems.planets.outer_solar_system import _POSITIONS, _VELOCITIES
 from dvi_jax.systems.relativistic_kepler import precession
 from dvi_jax.systems.restricted_three_body import EARTH_MOON, lagrange_points, momentum
 from dvi_jax.systems.spinning_top import steady_precession
@@ -404,6 +406,24 @@ def errors_of_200_000_days(method, h):
     return float(sol.observed["energy"] / abs(E)), float(
         jnp.max(sol.observed["angular_momentum"]) / jnp.max(jnp.abs(L))
     )
+
+
+def test_the_barycentre_of_the_outer_solar_system_rests():
+    """Differences are those of the table; the barycentre moves by round-off in 10 Myr."""
+    made = systems.outer_solar_system()
+    m = [Fraction(float(x)) for x in made.args["masses"]]
+    for x, table in (
+        (made.q0, _POSITIONS),
+        (made.p0 / made.args["masses"][:, None], _VELOCITIES),
+    ):
+        np.testing.assert_allclose(x[1:] - x[0], table[1:], rtol=0, atol=4e-15)
+        for column in x.T:
+            mean = sum(a * Fraction(float(b)) for a, b in zip(m, column, strict=True)) / sum(m)
+            assert abs(float(mean)) < 1e-15 * np.abs(table).max()
+    total = [sum(map(Fraction, map(float, column))) / sum(m) for column in made.p0.T]
+    assert max(abs(float(v)) for v in total) * 365.25e7 < 1e-8  # au; 22 555 au for the table itself
+    heliocentric = np.sum(np.array(_VELOCITIES).T * made.args["masses"], axis=1)
+    assert np.linalg.norm(heliocentric) / np.sum(made.args["masses"]) * 365.25e7 > 2e4
 
 
 OUTER_ERRORS = [  # method, h [day], relative error of the energy from, to

@@ -29,8 +29,10 @@ class RESULTS(eqx.Enumeration):
     )
     not_finite = (
         "The state became NaN or infinite. Likely causes: (a) the initial state or args contain a "
-        "value that is not finite; (b) a singularity of H_D was met (two bodies at one place, "
-        "say); (c) h is beyond the stability limit and the orbit escaped."
+        "value that is not finite, or a negative temperature, friction or mass for dvi.Langevin; "
+        "(b) a singularity of H_D was met (two bodies at one place, say), or of its derivative: "
+        "that of jnp.where(r > 0, f(r), 0) is NaN at r = 0, unless r is replaced inside of f too, "
+        "as f(jnp.where(r > 0, r, 1)); (c) h is beyond the stability limit and the orbit escaped."
     )
     bad_step_size = (
         "The step size h is zero or not finite. On a `Given` lattice: two neighbouring times "

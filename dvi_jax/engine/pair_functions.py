@@ -8,7 +8,9 @@ import math
 from collections.abc import Sequence
 from decimal import Decimal, localcontext
 from fractions import Fraction
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -97,10 +99,16 @@ _COSINE = [Fraction((-1) ** n, math.factorial(2 * n)) for n in range(1, 8)]
 _EXPONENTIAL = [Fraction(1, math.factorial(n)) for n in range(2, 13)]
 
 
+_LARGEST_ANGLE = 2.0**45
+"""Of larger angles, the step in three parts is not accurate enough."""
+
+
 def sin_cos(x: Number) -> tuple[Pair, Pair]:
-    """sin x and cos x, for |x| < 2⁴⁰."""
+    """sin x and cos x, NaN for |x| > 2⁴⁵."""
     step, circle, *_ = _tables()
-    k, r = _reduce(as_pair(x), step)
+    x = as_pair(x)
+    x = Pair(jnp.where(jnp.abs(x.hi) <= _LARGEST_ANGLE, x.hi, jnp.nan), x.lo)
+    k, r = _reduce(x, step)
     row = _row(circle, k)
     s, c = Pair(row[..., 0], row[..., 1]), Pair(row[..., 2], row[..., 3])
     square = mul(r, r)
@@ -130,6 +138,11 @@ def _power_of_two(n: Array) -> Array:
     return lax.bitcast_convert_type(exponent << 52, jnp.float64)
 
 
+def _multiple(x: Number, factor: Array) -> Any:
+    """x times a power of two, which is exact: a product would lose the smallest numbers."""
+    return jax.tree.map(lambda part: part * factor, x)
+
+
 def exp(x: Number) -> Pair:
     power, change = _exponential(x)
     return _in_range(x, add(power, mul(power, change)), jnp.exp(as_pair(x).hi))
@@ -149,7 +162,12 @@ def _in_range(x: Number, value: Pair, plain: Array) -> Pair:
 
 
 def _logarithm(x: Number, excess: Number, guess: Array) -> Pair:
-    """log x near a guess y, from x and `less`, x − 1: y + log(1 + δ) with δ = x e⁻ʸ − 1."""
+    """log x near a guess y, from x and `excess`, x − 1: y + log(1 + δ) with δ = x e⁻ʸ − 1."""
+    # Where e⁻ʸ has too few digits, next to the smallest numbers, that of x/2^n, n = ±512.
+    n = jnp.where(jnp.abs(guess) > 300, jnp.sign(guess) * 512, 0)
+    octave = Pair(*(64 * n * part for part in _tables()[2][:2]))  # n ln 2
+    x = _multiple(x, _power_of_two(-n))
+    guess = jnp.where(jnp.isfinite(guess), guess - octave.hi, guess)
     power, change = _exponential(-guess)
     shrunk = add(sub(power, _UNIT), mul(power, change))  # e⁻ʸ − 1
     small = add(excess, mul(x, shrunk))  # near x = 1 the digits of x e⁻ʸ − 1 would cancel
@@ -157,7 +175,7 @@ def _logarithm(x: Number, excess: Number, guess: Array) -> Pair:
     delta = where(jnp.abs(guess) < 0.5, small, large)
     d = delta.hi  # pyright: ignore[reportAttributeAccessIssue]
     # log(1 + δ) to third order: δ is the error of the guess, and may be 1e-16.
-    value = add(guess, add(delta, d * d * (d * (1 / 3) - 0.5)))
+    value = add(octave, add(guess, add(delta, d * d * (d * (1 / 3) - 0.5))))
     good = jnp.isfinite(guess)
     return Pair(jnp.where(good, value.hi, guess), jnp.where(good, value.lo, 0.0))
 
@@ -172,7 +190,7 @@ def log1p(x: Number) -> Pair:
 
 
 def exp2(x: Number) -> Pair:
-    return exp(mul(x, log(_TWO)))
+    return _in_range(x, exp(mul(x, log(_TWO))), jnp.exp2(as_pair(x).hi))
 
 
 def log2(x: Number) -> Pair:
@@ -180,10 +198,10 @@ def log2(x: Number) -> Pair:
 
 
 def general_power(x: Number, y: Number) -> Pair:
-    """xʸ = exp(y log x); where x is not positive, the value in float64."""
-    plain, base = jnp.power(as_pair(x).hi, as_pair(y).hi), as_pair(x).hi
-    value = _in_range(x, exp(mul(y, log(x))), plain)
-    return Pair(jnp.where(base > 0, value.hi, plain), jnp.where(base > 0, value.lo, 0.0))
+    """xʸ = ± exp(y log |x|), NaN for x < 0 unless y is an integer."""
+    plain = jnp.power(as_pair(x).hi, as_pair(y).hi)
+    value = exp(mul(y, log(magnitude(x))))
+    return _in_range(x, where(plain < 0, negate(value), value), plain)
 
 
 def root_power(x: Number, n: int) -> Number:
@@ -193,7 +211,15 @@ def root_power(x: Number, n: int) -> Number:
 
 
 def cbrt(x: Number) -> Pair:
-    root = jnp.cbrt(as_pair(x).hi)
+    # Products of small numbers would have too few digits.
+    x = as_pair(x)
+    is_small = jnp.abs(x.hi) < 2.0**-300
+    root = _cube_root(_multiple(x, jnp.where(is_small, 2.0**600, 1.0)))
+    return _multiple(root, jnp.where(is_small, 2.0**-200, 1.0))
+
+
+def _cube_root(x: Pair) -> Pair:
+    root = jnp.cbrt(x.hi)
     defect = as_pair(sub(x, power(root, 3))).hi / (3 * root * root)
     return add(root, jnp.where((root != 0) & jnp.isfinite(root), defect, 0.0))
 

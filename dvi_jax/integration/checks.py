@@ -19,7 +19,7 @@ from ..lattices import Lattice, Run
 from ..methods import Method
 from ..observe import FORMS, Deviations, Range, Reduction, Running, Section, is_observable
 from ..observe.solution import Save
-from ..problem.noise import BrownianPath, NoisePath
+from ..problem.noise import Brownian, BrownianPath, NoisePath
 from .arithmetic import Compensated, FloatingPoint
 from .integrator import Integrator
 from .task import Plan, Task
@@ -119,7 +119,10 @@ def noise_path(
     assert noise is not None
     assert path is not None
     path.check(num_steps)
-    return NoisePath(path, method.increments, noise.count(run.t0, run.q0, run.p0, run.args))
+    count = noise.count(run.t0, run.q0, run.p0, run.args)
+    # What a path of the user contains is what the user wants.
+    limit = method.largest_increment if isinstance(path, Brownian) else None
+    return NoisePath(path, method.increments, count, limit)
 
 
 def check_memory(

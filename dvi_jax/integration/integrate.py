@@ -157,7 +157,7 @@ def integrate(
     request = Run(system, t0, q0, p0, epsilon, args, observe, save, stop)
     trajectory = prepare(request, integrator, h, num_steps, as_path(path))
     solution = solve(trajectory, progress)
-    return raise_on_failure(solution, trajectory.task) if throw else solution
+    return raise_on_failure(solution, trajectory.task, request) if throw else solution
 
 
 def solve(trajectory: PreparedRun, progress: Any = None) -> Solution:

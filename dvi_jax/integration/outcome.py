@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 import lanewise
 from lanewise import Layout
@@ -98,6 +98,7 @@ def with_initial_values(solution: Solution, run: Run, layout: Layout) -> Solutio
     def with_first_row(observable, values):
         if not isinstance(observable, OfState):
             return values
+        observable = observable.bind(run.system, run.epsilon)
 
         def at_start(t, q, p, args):
             return jnp.asarray(observable(t, t, q, p, q, p, args))
@@ -109,7 +110,7 @@ def with_initial_values(solution: Solution, run: Run, layout: Layout) -> Solutio
     return dataclasses.replace(solution, observed=rows)
 
 
-def raise_on_failure(solution: Solution, task: Task) -> Solution:
+def raise_on_failure(solution: Solution, task: Task, run: Run) -> Solution:
     """The solution. **Raises** `IntegrationError` if the run has failed; inside a transformation of
     JAX an error of equinox."""
     status = solution.result
@@ -144,6 +145,8 @@ def raise_on_failure(solution: Solution, task: Task) -> Solution:
     if int(stats["newton_iterations"]) > 0:
         residual = float(stats["failed_residual"])
         details += f" and relative residual {residual:.3g} of the implicit solve"
+    if bool(status == RESULTS.not_finite):
+        remark = _infinite_derivative(solution, run) + remark
     raise IntegrationError(
         f"the trajectory failed at step {step} of {stats['num_steps']} (the first step has number "
         f"0), with {details}. {remark}",
@@ -151,11 +154,45 @@ def raise_on_failure(solution: Solution, task: Task) -> Solution:
     )
 
 
+def _infinite_derivative(solution: Solution, run: Run) -> str:
+    """A sentence on a derivative of H_D that is not finite at the last finite state that was saved,
+    where H_D is; else empty."""
+    rows = (np.asarray(x).reshape(len(x), -1) for x in (solution.ts, solution.qs, solution.ps))
+    finite = np.flatnonzero(np.isfinite(np.concatenate([*rows], axis=1)).all(axis=1))
+    if not finite.size:
+        return ""
+    t, q, p = (x[finite[-1]] for x in (solution.ts, solution.qs, solution.ps))
+    H = jax.value_and_grad(run.system.hamiltonian, (2, 3))
+    value, slopes = H(t, t, q, p, run.epsilon, run.args)
+    if not np.isfinite(value) or all(np.isfinite(slope).all() for slope in slopes):
+        return ""
+    name = "q" if not np.isfinite(slopes[0]).all() else "p"
+    place = np.array2string(np.asarray(q), threshold=6)
+    return (
+        f"∂H_D/∂{name} is not finite at t = {float(t):.6g}, q = {place}, where H_D is: a branch of "
+        "jnp.where that is undefined there, a norm or a root of zero. Give it another argument, as "
+        "in jnp.where(r > 0, f(jnp.where(r > 0, r, 1)), 0) (a double where). "
+    )
+
+
+@jax.custom_batching.custom_vmap
+def _largest_of_batch(code: Array) -> Array:
+    """The largest code of the batches around this trajectory."""
+    # As equinox forms it, but a batch of no trajectories has one as well.
+    return code
+
+
+@_largest_of_batch.def_vmap
+def _(_size, _is_batched, code):
+    return _largest_of_batch(jnp.max(code, axis=0, initial=0)), False
+
+
 def _when_compiled(solution: Solution) -> Solution:
     """The solution, whose failure raises an error when the compiled program runs."""
     # Its status is not known before: only an error of equinox can report it, without the solution.
     status = solution.result
     is_failure = (status != RESULTS.successful) & (status != RESULTS.stopped)
+    status = jax.tree.map(_largest_of_batch, status)
     arrays, functions = eqx.partition(solution, eqx.is_array)
     if not manual_axes(*jax.tree.leaves(arrays)):
         return status.error_if(solution, is_failure)

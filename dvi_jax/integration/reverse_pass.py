@@ -105,7 +105,7 @@ class ReversePass(eqx.Module):
         q1, p1, _ = task.method.step(equations, interval, q0, p0)
         step = Ends(interval.t0, interval.t1, q0, p0, q1, p1)
         values = [step.value(function, task.args) for function in functions]
-        numbers = [task.number(reduction, step) for reduction in reductions]
+        numbers = [_real(task.number(reduction, step), q1) for reduction in reductions]
         return (q1, p1, interval.t1), eqx.filter(values, eqx.is_inexact_array), numbers
 
     def reductions(self) -> list[tuple[Reduction, Any, Any]]:
@@ -230,7 +230,7 @@ class ReversePass(eqx.Module):
             step = Ends(t0, t0, q0, p0, q0, p0)
             _, reductions = task.observables()
             initial = [item for item in reductions if has_initial_value(item.function)]
-            return t0, [task.number(reduction, step) for reduction in initial]
+            return t0, [_real(task.number(reduction, step), q0) for reduction in initial]
 
         (t0, values), pull = jax.vjp(values_of, self.theta, *start)
         seeds = _of_values(reductions, jnp.asarray(-1, jnp.int32), t0, values)
@@ -246,10 +246,18 @@ def _of_values(
     k = −1: at the initial state."""
     of_t1, of_values = jnp.zeros_like(t1), []
     for (reduction, memory, cotangent), value in zip(reductions, values, strict=True):
+        if not jax.tree.leaves(cotangent):  # its results are integers
+            of_values.append(jnp.zeros_like(value))
+            continue
         of_t, of_value = reduction.pull(memory, cotangent, number_of(reduction, k), t1, value)
         of_t1 = of_t1 + of_t
         of_values.append(of_value.astype(value.dtype))
     return of_t1, of_values
+
+
+def _real(value: Array, like: Array) -> Array:
+    """A value with a tangent: zero for an integer."""
+    return value if jnp.issubdtype(value.dtype, jnp.inexact) else value.astype(like.dtype)
 
 
 def _any_nonzero(cotangents: Any) -> Array:

@@ -83,8 +83,9 @@ class Reversible(AbstractAdjoint):
             task = eqx.combine(theta, counts, functions)
             ends = run(task, plan, start(task, q0, p0), lax.scan, self._inner_loop)
             carry, rows, results, _ = outcome(task, plan, ends, q0, p0)
-            rows, integers = eqx.partition(rows, eqx.is_inexact_array)
-            return Smooth(carry.q, carry.p, rows, results), Tape(*ends, integers)
+            smooth = Smooth(carry.q, carry.p, rows, results)
+            smooth, integers = eqx.partition(smooth, eqx.is_inexact_array)
+            return smooth, Tape(*ends, integers)
 
         if reason := _obstacle(task, forward, inputs, counts):
             if self.report_defect:
@@ -143,7 +144,8 @@ class Reversible(AbstractAdjoint):
 
             values = lax.stop_gradient((theta, counts, (q0, p0), trace.rows, trace.tail))
             defect = lanewise.call(largest_defect, *values, layout=layout)
-        rows = eqx.combine(smooth.rows, trace.integers)
+        smooth = eqx.combine(smooth, trace.integers)
+        rows = smooth.rows
         if adds_start_outside(plan):
             rows = with_start(rows, q0, p0)
         # The differentiable outputs take the place of their copies in the carry, which have none.
@@ -175,7 +177,7 @@ class Tape(NamedTuple):
     carry: Carry
     rows: Rows
     tail: Rows | None
-    integers: Rows  # those of the rows, which have no derivative
+    integers: Smooth  # those of the outputs, which have no derivative
 
     def record(self) -> tuple[list[Any], Rows, Rows | None]:
         """Only what the reverse pass reads: the other values need not be computed."""

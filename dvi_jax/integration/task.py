@@ -20,6 +20,7 @@ from ..lattices import Lattice
 from ..methods import Method
 from ..methods.step import Equations
 from ..observe import Deviations, Reduction, Running, Stop, is_observable
+from ..observe._reductions import no_value
 from ..observe.solution import Save
 from ..problem.noise import NoisePath
 from .arithmetic import Arithmetic, FloatingPoint
@@ -96,7 +97,8 @@ class Task(eqx.Module):
 
     def number(self, reduction: Reduction, ends: "Ends") -> Array:
         """The value of the observable of a reduction on a step."""
-        return ends.number(self.bound(reduction.function), self.args)
+        function = self.bound(reduction.function)
+        return ends.number(function, self.args, reduction.keeps_integers)
 
     def constant_unless(
         self, good: Array, function: Callable, succeeds: Callable | None = None
@@ -198,10 +200,10 @@ class Ends(NamedTuple):
     def value(self, observable: Callable, args: Args) -> Array:
         return jnp.asarray(observable(*self, args))
 
-    def number(self, observable: Callable, args: Args) -> Array:
-        """The value for a reduction, as real numbers also if it is integer or boolean."""
+    def number(self, observable: Callable, args: Args, integers: bool) -> Array:
+        """The value for a reduction; as real numbers, unless it may be an integer or boolean."""
         value = self.value(observable, args)
-        if not jnp.issubdtype(value.dtype, jnp.inexact):
+        if not integers and not jnp.issubdtype(value.dtype, jnp.inexact):
             value = value.astype(self.q1.dtype)
         # The barrier keeps a product in the value from being contracted (FMA) with the difference
         # in a reduction: equal values would then have a drift of one rounding error.
@@ -231,4 +233,4 @@ class Outcome(NamedTuple):
 
 def or_nan(good: Array, x: Any) -> Any:
     """x where it is good, else NaN."""
-    return jax.tree.map(lambda x: jnp.where(good, x, jnp.full_like(x, jnp.nan)), x)
+    return jax.tree.map(lambda x: jnp.where(good, x, no_value(x)), x)

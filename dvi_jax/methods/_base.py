@@ -33,6 +33,9 @@ class Method(eqx.Module):
     increments: ClassVar[int] = 0
     """Increments of noise that a step takes; 0: no method for systems with noise."""
 
+    largest_increment: ClassVar[float | None] = None
+    """Limit of the increments of `Brownian`, in standard deviations; None: no limit."""
+
     is_the_map: ClassVar[bool] = False
     """Whether `step` is the map (12)–(13) itself, whose only unknown is p1."""
 

@@ -17,9 +17,6 @@ from ._gauss_legendre import GaussLegendre
 from ._type_ii import TypeII
 from .step import Equations
 
-_LARGEST = 6.0
-"""Largest increment of noise in a step that may be implicit, in standard deviations."""
-
 
 class NoisySystem(eqx.Module):
     r"""A system with the noise of one step as constant rates Ḃ = ΔB/h.
@@ -71,6 +68,8 @@ class _WithNoise(Method):
     is_symplectic: ClassVar[bool] = True
     is_invertible: ClassVar[bool] = True
     increments: ClassVar[int] = 1
+    # Arbitrarily large increments, which are arbitrarily rare, would have no solution.
+    largest_increment: ClassVar[float | None] = 6.0
 
     # Both with the rates of the step forwards, so that the inverse goes back along the same path.
     def step(self, equations, interval, q0, p0):
@@ -96,10 +95,7 @@ class _WithNoise(Method):
             noise.check_fixed_momentum(type(self).__name__, *place)
         # Without increments the equations are only examined, for whether they need a solve.
         dB = jnp.zeros(noise.count(*place), q.dtype) if dB is None else dB[0]
-        # Arbitrarily large increments, which are arbitrarily rare, would have no solution.
-        largest = _LARGEST * jnp.sqrt(jnp.abs(interval.h))
-        rates = jnp.clip(dB, -largest, largest) / interval.h
-        system = NoisySystem(equations.system, rates, interval.h, is_map)
+        system = NoisySystem(equations.system, dB / interval.h, interval.h, is_map)
         return dataclasses.replace(equations, system=system, increments=None)
 
 
@@ -113,8 +109,8 @@ class StochasticEuler(_WithNoise):
     that depends on t and q only.
 
     **Accuracy** strong and weak order 1 for momentum noise, for one noise Hamiltonian and for
-    several whose Poisson brackets vanish; otherwise strong order 1/2. Increments are limited to six
-    standard deviations, which 2 of 10⁹ exceed.
+    several whose Poisson brackets vanish; otherwise strong order 1/2. The increments of
+    `Brownian` are limited to six standard deviations, which 2 of 10⁹ exceed.
 
     **Raises** `ValueError` for momentum noise σ that depends on p.
 
@@ -137,7 +133,7 @@ class StochasticMidpoint(_WithNoise):
     h_m are conserved to round-off.
 
     **Accuracy** weak order 1, and strong order 1 for one noise and for several that commute,
-    otherwise 1/2. Increments are limited to six standard deviations.
+    otherwise 1/2. The increments of `Brownian` are limited to six standard deviations.
 
     **Source** Milstein, Repin & Tretyakov 2002, *SIAM J. Numer. Anal.* 39, 2066, (4.15).
     """

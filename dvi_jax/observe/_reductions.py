@@ -24,6 +24,8 @@ class Reduction(eqx.Module):
 
     function: eqx.AbstractVar[Callable[..., Any]]
     has_running_value: ClassVar[bool] = True
+    keeps_integers: ClassVar[bool] = False
+    """Whether `update` receives integers and booleans as they are, not as real numbers."""
 
     @abc.abstractmethod
     def start(self, value: Array) -> Any:
@@ -35,7 +37,7 @@ class Reduction(eqx.Module):
 
     @abc.abstractmethod
     def finish(self, memory: Any) -> Any:
-        """The reduced value (real arrays), NaN when there was no step."""
+        """The reduced value (real arrays, or integers as `Last`), NaN when there was no step."""
 
     def combine(self, memory: Any, k: Array, t: Scalar, value: Array) -> Any:
         """The memory of all steps as a function of t and value of step k, which is one of them.
@@ -68,6 +70,22 @@ class Reduction(eqx.Module):
         return jax.vjp(value_of_all, t, value)[1](cotangent)
 
 
+def no_value(value: Array) -> Array:
+    """NaN; for integers the smallest one of the type, for booleans False."""
+    if jnp.issubdtype(value.dtype, jnp.inexact):
+        return jnp.full_like(value, jnp.nan)
+    return jnp.full_like(value, value.dtype != bool and jnp.iinfo(value.dtype).min)
+
+
+def _difference(a: Array, b: Array) -> Array:
+    """a − b; for integers the real number |a − b|, whose digits are not lost before."""
+    if jnp.issubdtype(a.dtype, jnp.inexact):
+        return a - b
+    # Without a sign, no difference of two integers is too large for the type.
+    a, b, is_larger = (*(x.astype(f"uint{8 * x.dtype.itemsize}") for x in (a, b)), a >= b)
+    return jnp.where(is_larger, a - b, b - a).astype(float)
+
+
 class _OfFunction(Reduction):
     """A reduction whose only field is its observable."""
 
@@ -96,13 +114,16 @@ class MaxDrift(_OfFunction):
 
     relative: bool = eqx.field(static=True, default=False)
 
+    keeps_integers: ClassVar[bool] = True
+
     def start(self, value):
-        return value, jnp.full_like(value, jnp.nan), jnp.zeros(value.shape, jnp.int32)
+        nan = jnp.full_like(_difference(value, value), jnp.nan)
+        return value, nan, jnp.zeros(value.shape, jnp.int32)
 
     def update(self, memory, k, t, value):
         first, farthest, step = memory
         first = jnp.where(k == 0, value, first)
-        far = value - first
+        far = _difference(value, first)
         # A comparison with NaN is false: NaN, once stored, stays.
         larger = (jnp.abs(far) > jnp.abs(farthest)) | jnp.isnan(far) | (k == 0)
         return first, jnp.where(larger, far, farthest), jnp.where(larger, k, step)
@@ -121,8 +142,10 @@ class MaxDrift(_OfFunction):
 class Range(_OfFunction):
     """Largest minus smallest value of an observable f, max_k f_k − min_k f_k, elementwise."""
 
+    keeps_integers: ClassVar[bool] = True
+
     def start(self, value):
-        nan, step = jnp.full_like(value, jnp.nan), jnp.zeros(value.shape, jnp.int32)
+        nan, step = no_value(value), jnp.full(value.shape, -1, jnp.int32)
         return nan, nan, step, step
 
     def update(self, memory, k, t, value):
@@ -135,7 +158,8 @@ class Range(_OfFunction):
         return low, high, jnp.where(lower, k, at_low), jnp.where(higher, k, at_high)
 
     def finish(self, memory):
-        return memory[1] - memory[0]
+        low, high, at_low, _ = memory
+        return jnp.where(at_low < 0, jnp.nan, _difference(high, low))
 
     def combine(self, memory, k, t, value):
         low, high, *steps = memory
@@ -182,7 +206,7 @@ class _WithCount(_OfFunction):
     """Base of the reductions with a memory of a value and the number of steps."""
 
     def start(self, value):
-        return jnp.full_like(value, jnp.nan), jnp.asarray(0, jnp.int32)
+        return no_value(value), jnp.asarray(0, jnp.int32)
 
     def finish(self, memory):
         return memory[0]
@@ -203,7 +227,13 @@ class Mean(_WithCount):
 
 
 class Last(_WithCount):
-    """The value of an observable at the last step."""
+    """The value of an observable at the last step, of its own type.
+
+    Integers and booleans have no NaN: without a step, the value is the smallest integer of the
+    type, or False.
+    """
+
+    keeps_integers: ClassVar[bool] = True
 
     def update(self, memory, k, t, value):
         return value, k

@@ -8,6 +8,7 @@ import jax
 from jaxtyping import PyTree
 
 from ..base.signature import accepts, signature_of
+from ..base.types import Bindable
 from ._reductions import Reduction, Running, is_observable
 
 FORMS = "(q, p), (t, q, p, args) or (t0, t1, q0, p0, q1, p1, args)"
@@ -23,9 +24,44 @@ class OfState(eqx.Module):
     def __call__(self, t0, t1, q0, p0, q1, p1, args):
         return self.function(t1, q1, p1, args) if self.takes_time else self.function(q1, p1)
 
+    def bind(self, system: Any, epsilon: Any) -> "OfState":
+        """The same observable, for a function that requires the system or ε."""
+        if not isinstance(self.function, Bindable):
+            return self
+        return OfState(self.function.bind(system, epsilon), self.takes_time)
+
     @property
     def __name__(self) -> str:
         return getattr(self.function, "__name__", type(self.function).__name__)
+
+
+class InSlowTime(eqx.Module):
+    """An observable of a system with ``slow_time=True`` that receives τ = εt in place of t.
+
+    - `function`: ``(τ0, τ1, q0, p0, q1, p1, args)``, ``(τ, q, p, args)`` or ``(q, p)`` → array.
+
+    `integrate` supplies ε; without it: ``observable.bind(system, epsilon)(...)``.
+
+    **Raises** `ValueError` when called with times without ε.
+    """
+
+    function: Callable[..., Any]
+    epsilon: Any = None
+
+    def bind(self, system: Any, epsilon: Any) -> "InSlowTime":
+        """The same observable, for this ε."""
+        return InSlowTime(self.function, epsilon)
+
+    def __call__(self, *arguments):
+        count = {7: 2, 4: 1}.get(len(arguments), 0)  # of the times, which come first
+        if count and self.epsilon is None:
+            raise ValueError(
+                f"{getattr(self.function, '__name__', 'f')} needs the value of epsilon, since its "
+                "system has slow_time=True: call its method bind(system, epsilon)."
+            )
+        function = _of_step(self.function) if count == 2 else self.function
+        times = (self.epsilon * t for t in arguments[:count])
+        return function(*times, *arguments[count:])
 
 
 def has_initial_value(function: Any) -> bool:
@@ -47,6 +83,9 @@ def _of_step(leaf: Any) -> Any:
         if observable is function or not isinstance(observable, OfState):
             return leaf
         return eqx.tree_at(lambda r: r.function, leaf, observable)
+    if isinstance(leaf, InSlowTime):
+        observable = _of_step(leaf.function)
+        return OfState(leaf, observable.takes_time) if isinstance(observable, OfState) else leaf
     # The longest form first: a function with defaults or *rest accepts several of them.
     if not callable(leaf) or isinstance(leaf, type) or accepts(leaf, 7):
         return leaf

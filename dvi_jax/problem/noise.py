@@ -88,7 +88,9 @@ class Langevin(Noise):
     `friction` is γ [1/time], `temperature` is T, which means k_B T [energy], and `mass` is m, that
     of H [energy·time²/(unit of q)²].
 
-    **Raises** `ValueError` for values that do not broadcast with q0.
+    **Raises** `ValueError` for a friction or temperature below 0, a mass that is not positive, and
+    values that do not broadcast with q0. Such values from args, or traced ones, give the status
+    `not_finite`, as NaN does.
 
     **Source** Langevin 1908; Leimkuhler & Matthews 2015, *Molecular Dynamics*, 6.
     """
@@ -96,6 +98,17 @@ class Langevin(Noise):
     friction: Any
     temperature: Any = 0.0
     mass: Any = 1.0
+
+    def __check_init__(self):
+        for name, value in vars(self).items():
+            if callable(value) or is_traced(value):  # known in a run only
+                continue
+            entries, is_mass = np.asarray(value), name == "mass"
+            invalid = entries <= 0 if is_mass else entries < 0  # NaN gives the state NaN
+            if invalid.any():
+                rule = "positive" if is_mass else "zero or positive"
+                number = entries[invalid][0]
+                raise ValueError(f"{name} of dvi.Langevin must be {rule}, got {number}.")
 
     def _values(self, args: Args, like: State) -> list[Array]:
         parameters = (self.friction, self.temperature, self.mass)
@@ -115,14 +128,15 @@ class Langevin(Noise):
 
     def force(self, t, q, p, args, rates):
         friction, temperature, mass = self._values(args, p)
-        return -friction * p + _root(2 * friction * temperature * mass) * rates.reshape(p.shape)
+        return -friction * p + _amplitude(2 * friction, temperature, mass) * rates.reshape(p.shape)
 
     def kick(self, t, q, p, args, h, dB):
         # The Ornstein–Uhlenbeck process, exact in distribution: its noise is normal with this
         # variance, and the increment takes the place of its integral.
         friction, temperature, mass = self._values(args, p)
-        variance = -jnp.expm1(-2 * friction * h) * temperature * mass
-        return jnp.expm1(-friction * h) * p + _root(variance / h) * dB.reshape(p.shape)
+        rate = -jnp.expm1(-2 * friction * h) / h
+        noise = _amplitude(rate, temperature, mass) * dB.reshape(p.shape)
+        return jnp.expm1(-friction * h) * p + noise
 
 
 class NoiseHamiltonians(Noise):
@@ -163,10 +177,17 @@ class NoiseHamiltonians(Noise):
         )
 
 
+def _amplitude(rate: Array, temperature: Array, mass: Array) -> Array:
+    """√(rate T m); NaN if a factor is negative or NaN, or m = 0."""
+    # The root of each factor: in units of atoms and in float32 their product underflows to 0, and
+    # the product of two negative numbers is positive.
+    return _root(rate) * _root(temperature) * jnp.where(mass > 0, jnp.sqrt(mass), jnp.nan)
+
+
 def _root(x: Array) -> Array:
     """√x with a derivative of 0 at x = 0."""
     # At a temperature of 0 that of √x would be infinite, and the gradients of all else NaN.
-    return jnp.where(x > 0, jnp.sqrt(jnp.where(x > 0, x, 1)), 0)
+    return jnp.where(x == 0, 0, jnp.sqrt(jnp.where(x == 0, 1, x)))
 
 
 def as_noise(noise: Any) -> Noise | None:
@@ -206,9 +227,11 @@ class Brownian(BrownianPath):
     - `substeps`: n, number of the equal parts of a step. ΔB_k is √(h/n) times the sum of the n
       numbers z with the indices n (first_step + k), …. Steps h, h/2, h/4 with n = 4, 2, 1 have the
       same path B(t), as tests of convergence require. `OBABO`, with two increments, doubles n.
-    - `first_step`: number of the first step; N continues a run over N steps from its last state.
+    - `first_step`: number of the first step, an integer; N continues a run over N steps from its
+      last state.
 
-    **Raises** `ValueError` or `TypeError` for another key; `ValueError` for more than 2³² parts.
+    **Raises** `ValueError` or `TypeError` for another key; `ValueError` for a `first_step` that is
+    not an integer, and for more than 2³² parts.
 
     **Source** counter-based generators: Salmon, Moraes, Dror & Shaw 2011.
     """
@@ -222,10 +245,13 @@ class Brownian(BrownianPath):
         whole("substeps", self.substeps)
 
     def check(self, num_steps):
-        if not is_traced(self.first_step):  # twice, for methods with two increments per step
+        first = jnp.asarray(self.first_step)
+        if first.ndim or not jnp.issubdtype(first.dtype, jnp.integer):
+            raise ValueError(f"first_step must be an integer, got {self.first_step!r:.200}.")
+        if not is_traced(first):  # twice, for methods with two increments per step
             largest = 2**32 // (2 * self.substeps) - num_steps
             hint = "A path has 2³² parts: continue a longer run with another key."
-            whole("first_step", int(self.first_step), 0, largest, hint)
+            whole("first_step", int(first), 0, largest, hint)
 
     def increments(self, k, interval, parts, count):
         # Modulo 2³², as the numbers of `fold_in` are; `check` excludes that they repeat.
@@ -243,18 +269,24 @@ class Brownian(BrownianPath):
 
 
 class NoisePath(eqx.Module):
-    """The path of a run: a step has `parts` parts, with the increments of `count` motions each."""
+    """The path of a run: a step has `parts` parts, with the increments of `count` motions each, of
+    at most `limit` standard deviations (None: any)."""
 
     path: BrownianPath
     parts: int = eqx.field(static=True)
     count: int = eqx.field(static=True)
+    limit: float | None = eqx.field(static=True)
 
     def increments_of(self, k: Int[Array, ""], interval: Interval) -> Array:
         """The increments of step k, shape (parts, count)."""
         increments = self.path.increments(k, interval, self.parts, self.count)
         name = f"the increments (parts, motions) of {type(self.path).__name__}"
         array(name, increments, (self.parts, self.count), integers=True)
-        return increments.astype(interval.h.dtype)  # a path of the user may have another type
+        increments = increments.astype(interval.h.dtype)  # a path of the user may have another type
+        if self.limit is None:
+            return increments
+        largest = self.limit * jnp.sqrt(jnp.abs(interval.h))
+        return jnp.clip(increments, -largest, largest)
 
 
 def as_path(path: Any) -> BrownianPath | None:

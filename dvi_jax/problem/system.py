@@ -36,7 +36,8 @@ class System(eqx.Module):
       ``epsilon * H1_D`` is added to H_D: a perturbation that derives from a Hamiltonian. It may
       take ``epsilon`` as a sixth argument, for an energy that is not linear in ε.
     - `slow_time`: if True all three functions receive the slow times ``epsilon * t0`` and
-      ``epsilon * t1`` in place of t0 and t1.
+      ``epsilon * t1`` in place of t0 and t1. Observables and the g of `Stop` and `Section` receive
+      the time t; ``systems.InSlowTime(f)`` is an observable that receives ε t.
     - `noise`: a function σ ``(t, q, p, args)`` → array like q0, or of the shape (*q0.shape, m), for
       ``dp = … + σ ∘ dB`` [unit of p/√time]; a `Langevin`; or `NoiseHamiltonians`. Runs then need a
       path and a method for noise. ε does not multiply noise; integrals are Stratonovich's.

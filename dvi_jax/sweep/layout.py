@@ -44,7 +44,7 @@ def layout(chunk: tuple[int, ...], variable: Variable) -> dict[str, Any]:
     """The options of zarr for an array: a shard for each task, in it chunks of some megabytes."""
     from zarr import codecs
 
-    shard = (*chunk, *variable.shape)
+    shard = tuple(max(n, 1) for n in (*chunk, *variable.shape))  # zarr has no chunks of length 0
     inner = list(shard)
     size = math.prod(shard) * np.dtype(variable.dtype).itemsize
     for i, n in enumerate(shard):
@@ -69,6 +69,8 @@ def layout(chunk: tuple[int, ...], variable: Variable) -> dict[str, Any]:
 
 def shard(plan: SweepPlan, variable: Variable, task: SweepTask, values: np.ndarray) -> bytes:
     """The bytes of one shard, made in memory so that they can be written in one piece."""
+    if variable.bytes == 0:  # an array without entries has no chunks
+        return b""
     import zarr
     from zarr.storage import MemoryStore
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +13,7 @@ import numpy as np
 from ..base.checks import all_finite, array, finite as finite, positive as positive
 from ..discover.functions.generators import Generator
 from ..discover.symmetries.library import time_translation
+from ..observe import InSlowTime as InSlowTime
 from ..problem.noise import Langevin
 from ..problem.system import System as System
 
@@ -290,32 +290,6 @@ def library_problem(
         observables={f.__name__: InSlowTime(f) if system.slow_time else f for f in observables},
         **fields,
     )
-
-
-class InSlowTime(eqx.Module):
-    """An observable of a system with ``slow_time=True``: it receives ε·t0 and ε·t1 as its times.
-
-    - `function`: ``(τ0, τ1, q0, p0, q1, p1, args)`` → array, τ = εt.
-
-    `integrate` supplies ε; without it: ``observable.bind(system, epsilon)(...)``.
-
-    **Raises** `ValueError` when called without ε.
-    """
-
-    function: Callable[..., Any]
-    epsilon: Any = None
-
-    def bind(self, system: Any, epsilon: Any) -> "InSlowTime":
-        """The same observable, for this ε."""
-        return InSlowTime(self.function, epsilon)
-
-    def __call__(self, t0, t1, q0, p0, q1, p1, args):
-        if self.epsilon is None:
-            raise ValueError(
-                f"{getattr(self.function, '__name__', 'f')} needs the value of epsilon, since its "
-                "system has slow_time=True: call its method bind(system, epsilon)."
-            )
-        return self.function(self.epsilon * t0, self.epsilon * t1, q0, p0, q1, p1, args)
 
 
 def over_times(

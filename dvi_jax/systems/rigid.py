@@ -2,7 +2,9 @@
 
 The state of a body is its rotation matrix R from body axes to fixed axes with the momentum P, both
 (3, 3); a free body has its position and momentum in a fourth row, (4, 3). D = diag(d) has the
-second moments d_k = ∫ x_k² dm = (I1 + I2 + I3)/2 − I_k along the principal axes.
+second moments d_k = ∫ x_k² dm = (I1 + I2 + I3)/2 − I_k along the principal axes. A flat body has
+one d_k = 0 and a rod two, for which D has no inverse: such a body is given a thickness, d_k = 1e-8
+(I1 + I2 + I3), which changes its moments by as little.
 
 **Source** Hairer, Lubich & Wanner 2006, *Geometric Numerical Integration*, VII.5; Leimkuhler &
 Reich 2004, *Simulating Hamiltonian Dynamics*, 8.
@@ -13,7 +15,10 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array
+
+from lanewise.jaxprs.jaxapi import is_traced
 
 
 def orthonormal(q: Array, args: Any = None) -> Array:
@@ -22,8 +27,23 @@ def orthonormal(q: Array, args: Any = None) -> Array:
 
 
 def second_moments(I: Any) -> Array:  # noqa: E741
-    """d_k = (I1 + I2 + I3)/2 − I_k of principal moments of inertia I, shape (3,)."""
-    return jnp.sum(jnp.asarray(I)) / 2 - jnp.asarray(I)
+    """d_k = (I1 + I2 + I3)/2 − I_k of principal moments of inertia I, shape (3,); at least 1e-8 of
+    their sum (8e-7 in float32).
+
+    **Raises** `ValueError` for a moment that is larger than the sum of the two others, which no
+    body has; if it is traced, the result is NaN.
+    """
+    d = jnp.sum(jnp.asarray(I)) / 2 - jnp.asarray(I)
+    smallest = max(1e-8, 8 * float(jnp.finfo(d.dtype).eps)) * jnp.sum(jnp.asarray(I))
+    is_impossible = ~(d >= -smallest)
+    if not is_traced(d) and is_impossible.any():
+        raise ValueError(
+            "each of the principal moments I must be at most the sum of the two others, got "
+            f"{np.asarray(I).tolist()}. A flat body has I3 = I1 + I2, a rod I1 = 0 and I2 = I3."
+        )
+    # The derivative is that of d, also for a flat body.
+    d = d + lax.stop_gradient(jnp.maximum(d, smallest) - d)
+    return jnp.where(is_impossible, jnp.nan, d)
 
 
 def rotational_energy(P: Array, I: Any) -> Array:  # noqa: E741
@@ -39,9 +59,11 @@ def body_momentum(R: Array, P: Array) -> Array:
 
 def momentum(R: Array, pi: Any, I: Any) -> Array:  # noqa: E741
     """P = R Ω̂ D of a body with angular momentum π = I Ω on its axes."""
-    x, y, z = jnp.asarray(pi) / jnp.asarray(I)
+    d, I = second_moments(I), jnp.asarray(I)  # noqa: E741
+    thickness = d - (jnp.sum(I) / 2 - I)  # zero unless the body is flat
+    x, y, z = jnp.asarray(pi) / (I + jnp.sum(thickness) - thickness)
     spin = jnp.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return R @ spin * second_moments(I)[None]
+    return R @ spin * d[None]
 
 
 def rotation(phi: Any, theta: Any, psi: Any) -> Array:

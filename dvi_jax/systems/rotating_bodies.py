@@ -13,9 +13,9 @@ from .spinning_top import exact as exact_of_top
 
 def _moments(name, value):
     vector(3)(name, value)
-    if not 2 * np.max(value) < np.sum(value) or np.min(value) <= 0:
+    if not 2 * np.max(value) <= (1 + 1e-8) * np.sum(value) or np.min(value) <= 0:
         raise ValueError(
-            f"{name} must be three positive moments, each smaller than the sum of the others, got "
+            f"{name} must be three positive moments, each at most the sum of the others, got "
             f"{value}."
         )
 

@@ -140,6 +140,10 @@ def exact(t, q0, p0, args):
 
 def _leans(q, p, args):
     interval(0.0, np.pi)("q0[1], the angle θ,", q[1])  # Euler's angles are singular at 0 and π
+    if args["C"] > 2 * (1 + 1e-8) * args["A"]:
+        raise ValueError(
+            f"C must be at most 2 A, as for every rigid body, got C = {args['C']}, A = {args['A']}."
+        )
 
 
 def spinning_top() -> Problem:

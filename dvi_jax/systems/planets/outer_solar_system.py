@@ -1,5 +1,6 @@
 """The Sun and the planets from Jupiter to Pluto, with printed initial conditions."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -28,16 +29,25 @@ _VELOCITIES = [
 ]
 
 
+def _barycentric(masses: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Vectors relative to their mean, weighted by the masses."""
+    # Sums without rounding: a drift of the barycentre grows for millions of years.
+    total = math.fsum(masses)
+    return x - [math.fsum(column) / total for column in (masses[:, None] * x).T]
+
+
 def outer_solar_system() -> Problem:
     """The Sun, Jupiter, Saturn, Uranus, Neptune and Pluto on 5 September 1994 at 0h.
 
-    q [au] relative to the Sun at the start, t [day], masses in solar masses with
-    G = 2.95912208286e-4. The step suits `WisdomHolman`, with an energy error of 3e-7.
+    q [au] and p relative to the barycentre, which rests at 0 (the table is heliocentric), t [day],
+    masses in solar masses with G = 2.95912208286e-4. The step suits `WisdomHolman`, with an energy
+    error of 3e-7.
 
     **Source** Ahnerts Kalender für Sternfreunde 1994, in Hairer, Lubich & Wanner 2006, *Geometric
     Numerical Integration*, I.2.4, table 2.2.
     """
-    masses, q, v = (np.array(x, float) for x in (_MASSES, _POSITIONS, _VELOCITIES))
+    masses = np.array(_MASSES)
+    q, v = (_barycentric(masses, np.array(x, float)) for x in (_POSITIONS, _VELOCITIES))
     return replace(
         n_body(masses, q, masses[:, None] * v, h=100.0, G=2.95912208286e-4),
         name="outer_solar_system",
