@@ -86,7 +86,7 @@ def _line_of(names: list[str], use: str | None, path: Path) -> str:
         more = ", …" if len(names) > 10 else ""
         raise ValueError(
             f"use must be the name of a sequence or line of {path.name}: "
-            f"{', '.join(names[:10]) or 'there is none'}{more}; got {use!r}."
+            f"{', '.join(names[:10]) or 'it contains neither'}{more}; got {use!r}."
         )
     return labels[choice.lower()]
 
