@@ -80,7 +80,7 @@ def read_lattice(path: Path, use: str | None, options: dict[str, Any]) -> Any:
 
 def _line_of(names: list[str], use: str | None, path: Path) -> str:
     """The name of the sequence or line to read."""
-    labels = {name.lower(): name for name in names}
+    labels = {name.lower().replace(".", "_"): name for name in names}
     choice = "ring" if use is None and len(names) != 1 else (use or names[0]).replace(".", "_")
     if choice.lower() not in labels:
         more = ", …" if len(names) > 10 else ""
