@@ -55,6 +55,24 @@ def test_what_does_not_fit_a_ring_is_rejected(folder):
         refuses(command("run", "file.toml", "--out", "out"), seen, allowed)
 
 
+def test_the_sequence_and_the_model_of_a_file(folder):
+    bend = "b: sbend,l=1.5,angle=0.2,k1=-0.4; d: drift,l=1; "
+    lines = "one: line=(b,d); two: line=(d,b,d); beam,energy=1;"
+    (folder / "ring.seq").write_text(bend + lines)
+    keys = 'file = "ring.seq"\nuse = "two"\nmodel = "exact"'
+    run = RUN.replace('file = "hmba.mat"', keys).replace("steps = 20", "steps = 2")
+    write(folder, run)
+    assert found("run", "file.toml", "--out", "out")["status"]["result"] == "successful"
+    got = np.load(folder / "out/trajectory.npz")
+    z = jnp.array([1e-3, 0.0, 1e-3, 0.0, 0.0, 0.0])
+    ring = rings.load("ring.seq", use="two", model="exact")
+    np.testing.assert_allclose(got["qs"][-1], rings.track(ring, z, 2).z[jnp.array([0, 2])])
+    for old, new, seen, allowed in (("two", "three", "use must", "lattice file"),
+                                    ("exact", "thick", "thick", "paraxial")):  # fmt: skip
+        write(folder, run.replace(f'"{old}"', f'"{new}"'))
+        refuses(command("run", "file.toml", "--out", "out2"), seen, allowed)
+
+
 @pytest.mark.slow
 def test_the_example_finds_the_particles_that_are_lost(folder):
     shutil.copy(EXAMPLES / "ring.toml", folder / "ring.toml")

@@ -453,6 +453,6 @@ def test_files_of_xsuite(at, tmp_path):
     content["elements"]["limit"] = {"__class__": "LimitEllipse", "a": 0.01, "b": 0.01}
     content["element_names"].insert(5, "limit")
     path.write_text(json.dumps(content))
-    message = r"5: limit \(Marker, IdentityPass\): pyAT has no element for Xsuite's LimitEllipse"
+    message = r"5: limit \(Marker, IdentityPass\): pyAT has no element for LimitEllipse"
     with warnings.catch_warnings(action="ignore"), pytest.raises(ValueError, match=message):
         rings.load(path)

@@ -13,3 +13,5 @@ class RingFile(TomlTable):
     planes: Literal["x", "xy", "xyz"] = key("xyz", '"x", "xy" or "xyz"')
     delta: Number = key(0.0, "a finite number: δ if planes is not xyz")
     symplectic: bool = key(False, "true or false")
+    use: Text | None = key(None, "the name of a sequence or line in the file")
+    model: Literal["paraxial", "exact"] | None = key(None, '"paraxial" or "exact"')

@@ -170,7 +170,8 @@ def _of_a_ring(file: SystemFile, loader: Loader) -> Source:
     assert ring is not None
     prefix, rule = f"{ring.file!r} cannot be read: ", "a lattice file that pyAT can read"
     with as_input_error("ring.file", rule, Exception, prefix=prefix, text=in_one_line):
-        read = rings.load(loader.folder / ring.file, symplectic=ring.symplectic)
+        options = {"use": ring.use, "symplectic": ring.symplectic, "model": ring.model}
+        read = rings.load(loader.folder / ring.file, **options)
     record = rings.problem(read, planes=ring.planes, delta=ring.delta)
     units = {"q": "m", "t": "turns"}
     problem = systems.Problem("ring", *record[:4], args=record.args, units=units)

@@ -12,7 +12,8 @@ At the magnetic axis the angle θ is not defined. The canonical coordinates of t
 
     Y = √(2p_θ) sin θ,    X = √(2p_θ) cos θ,    dp_θ ∧ dθ = dX ∧ dY,
 
-with q = (Y, ζ) and p = (X, p_ζ), in which H is smooth everywhere.
+with q = (Y, ζ) and p = (X, p_ζ), in which H is smooth everywhere. A negative charge has ρ < 0 and
+p_θ < 0: then Y = −√(−2p_θ) sin θ and X = √(−2p_θ) cos θ.
 """
 
 from typing import Any
@@ -50,26 +51,31 @@ def speed_along(field: Field, rho: Any, s: Any, p_zeta: Any, B: Any) -> Array:
 
 
 class Regular(eqx.Module):
-    """The chart (Y, ζ; X, p_ζ), smooth at the axis."""
+    """The chart (Y, ζ; X, p_ζ), smooth at the axis; `negative`: of a negative charge."""
+
+    negative: bool = eqx.field(static=True, default=False)
+
+    def _signed(self, x: Any) -> Any:
+        return -x if self.negative else x
 
     def momentum(self, q: Any, p: Any) -> Any:
         """p_θ [m]."""
-        return (p[0] ** 2 + q[0] ** 2) / 2
+        return self._signed((p[0] ** 2 + q[0] ** 2) / 2)
 
     def point(self, field: Field, rho: Any, q: Any, p: Any, s: Any) -> tuple[Any, Any]:
         """√s cos θ and √s sin θ."""
-        scale = jnp.sqrt(_per_action(field, rho, p[1], s) / 2)
-        return scale * p[0], scale * q[0]
+        scale = jnp.sqrt(self._signed(_per_action(field, rho, p[1], s)) / 2)
+        return scale * p[0], scale * self._signed(q[0])
 
     def state(self, theta: Any, zeta: Any, p_theta: Any, p_zeta: Any) -> tuple[Any, Any]:
         """(q, p)."""
-        r = jnp.sqrt(2 * p_theta)
-        Y, X = r * jnp.sin(theta), r * jnp.cos(theta)
+        r = jnp.sqrt(2 * self._signed(p_theta))
+        Y, X = r * self._signed(jnp.sin(theta)), r * jnp.cos(theta)
         return jnp.stack([Y, zeta], axis=-1), jnp.stack([X, p_zeta], axis=-1)
 
     def angle(self, q: Any, p: Any) -> Any:
         """θ from −π to π."""
-        return jnp.arctan2(q[0], p[0])
+        return jnp.arctan2(self._signed(q[0]), p[0])
 
 
 class Angles(eqx.Module):

@@ -22,7 +22,7 @@ from ._motion import Angles, Breaking, Regular, continuous_hamiltonian, flux, sp
 # CODATA 2018: e and the electronvolt exactly, and the mass of the alpha particle.
 _EV = 1.602176634e-19
 _ALPHA_MASS = 6.6446573357e-27
-_CHARTS = {"regular": Regular(), "angles": Angles()}
+_CHARTS = ("regular", "angles")
 
 
 class Coordinates(NamedTuple):
@@ -44,9 +44,9 @@ class GuidingCentres(eqx.Module):
         H = u²/2 + μB,   p_θ = ψ/ρ + u I/B,   p_ζ = −χ/ρ + u G/B,   u = v∥/v0,   ρ = m v0/(Ze)
 
     The state is q = (Y, ζ), p = (X, p_ζ) with X + iY = √(2p_θ) e^{iθ} (`coordinates="regular"`:
-    smooth at the magnetic axis), or q = (θ, ζ), p = (p_θ, p_ζ) (`"angles"`). There are no
-    collisions, no electric field and no finite gyroradius: H is the drift Hamiltonian of first
-    order in ρ. The energy is H = 1/2.
+    smooth at the magnetic axis; with −p_θ and −θ for a negative charge, whose p_θ is negative), or
+    q = (θ, ζ), p = (p_θ, p_ζ) (`"angles"`). There are no collisions, no electric field and no
+    finite gyroradius: H is the drift Hamiltonian of first order in ρ. The energy is H = 1/2.
 
     **Arguments**
 
@@ -93,7 +93,7 @@ class GuidingCentres(eqx.Module):
 
     @property
     def chart(self) -> Any:
-        return _CHARTS[self.coordinates]
+        return Angles() if self.coordinates == "angles" else Regular(self.charge < 0)
 
     @property
     def system(self) -> System:

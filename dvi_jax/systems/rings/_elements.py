@@ -192,6 +192,12 @@ def bend(
     fringe field integral [m], all 0 by default; other `options` as for `multipole`: the exact model
     has the hard edges of the main field.
 
+    In the exact model b_n and a_n are the field in the plane of the bend, B_y = Σ b_n x^n and
+    B_x = Σ a_n x^n over Bρ, as K_n/n! of MAD-X; the rest follows from Maxwell's equations in curved
+    coordinates, and there are multipoles in the wedges at the pole faces. The paraxial model leaves
+    out both: its field is b_n x^n/(1 + hx), which changes chromaticities by terms of the order
+    h b_1.
+
     **Raises** `ValueError` for a length that is not positive.
     """
     positive("length of a bend", length)

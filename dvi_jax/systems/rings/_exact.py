@@ -58,6 +58,19 @@ def wedge(z: Particle, angle: Any, h: Any) -> Particle:
     return z._replace(x=x, px=px, y=z.y + z.py * path, zeta=z.zeta - (1 + z.delta) * path)
 
 
+def wedge_kick(z: Particle, tangent: Any, par: Parameters, order: int) -> Particle:
+    """The kick of the multipoles between the end of a bend and a pole face, a plane at the distance
+    −x · `tangent` in front of it.
+
+    To first order in the field: in the plane y = 0 the integral of B_y is x · `tangent` Σ b_n x^n.
+    An integral over the whole edge is a harmonic function of x and y, so that these are multipoles
+    of the order n + 1.
+    """
+    re, im = field(z, par, order)
+    dpx, dpy = z.x * re - z.y * im, z.x * im + z.y * re
+    return z.plus(px=-tangent * dpx, py=tangent * dpy)
+
+
 def dipole_fringe(z: Particle, h: Any, gap: Any, sign: int) -> Particle:
     """The hard edge of a bend: a type-II generating function y² φ(px, py, δ)/2. Forest (13.13)."""
     h = h if sign > 0 else -h

@@ -3,7 +3,9 @@
 import functools
 from collections.abc import Callable
 
-from . import _exact as exact, _frames as frames, _maps as maps
+import jax.numpy as jnp
+
+from . import _curved as curved, _exact as exact, _frames as frames, _maps as maps
 from ._maps import Piece, RingPart
 
 
@@ -29,6 +31,20 @@ def _exact_fringe(side: int, order: int, skips_b0: bool) -> list[Piece]:
     return _near_identity_map(lambda z, par: exact.multipole_fringe(z, par, side, order, skips_b0))
 
 
+def _uniform_wedge(side: str) -> Piece:
+    """Motion in the main field from a pole face to the end of a bend, or back."""
+    return Piece(lambda z, par, turn, sign: exact.wedge(z, -sign * par[f"edge_{side}"], par["h"]))
+
+
+def _wedge(side: str, end: int, order: int) -> list[Piece]:
+    """The same in the main field and in multipoles."""
+
+    def kick(z, par, turn, sign):
+        return exact.wedge_kick(z, -sign * jnp.tan(par[f"edge_{side}"]), par, order)
+
+    return [_uniform_wedge(side), Piece(kick)][::end]
+
+
 Make = Callable[[RingPart], list[Piece]]
 
 
@@ -47,9 +63,8 @@ def _ends(side: str, sign: int) -> dict[str, Make]:
         f"rotation_{side}": lambda p: _plain(
             lambda z, par, direction: exact.rotate(z, direction * par[f"edge_{side}"])
         ),
-        f"wedge_{side}": lambda p: _plain(
-            lambda z, par, direction: exact.wedge(z, -direction * par[f"edge_{side}"], par["h"])
-        ),
+        f"wedge_{side}": lambda p: _wedge(side, sign, p.order),
+        f"at_wedge_{side}": lambda p: [_uniform_wedge(side)],
         f"placed_{side}": lambda p: _plain(
             lambda z, par, direction: frames.placed(z, par, sign * direction)
         ),
@@ -70,7 +85,8 @@ _MAPS: dict[str, Make] = {
     "straight": lambda p: maps.drifts_and_kicks(maps.drift, maps.kick, p),
     "bend": lambda p: maps.drifts_and_kicks(maps.drift, maps.curved_kick, p),
     "exact_straight": lambda p: maps.drifts_and_kicks(exact.exact_drift, maps.kick, p),
-    "exact_bend": lambda p: maps.drifts_and_kicks(exact.exact_bend, maps.kick, p),
+    "exact_bend": lambda p: maps.drifts_and_kicks(exact.exact_bend, curved.curved_kick, p),
+    "at_exact_bend": lambda p: maps.drifts_and_kicks(exact.exact_bend, maps.kick, p),
     "second_order_bend": exact.second_order_bend,
     "thin": lambda p: _plain(functools.partial(maps.thin_kick, order=p.order)),
     "lens": lambda p: _plain(functools.partial(maps.lens, potential=p.potential)),  # pyright: ignore[reportArgumentType]

@@ -1,15 +1,17 @@
-"""Rings from pyAT, and from the files that it reads: .mat, .m, .json, also those of Xsuite."""
+"""Rings from pyAT, and from the files that it reads."""
 
 import dataclasses
 import math
 import os
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 
-from ._elements import C, Element, bend, cavity, corrector, drift, multipole, solenoid
+from ...base.checks import one_of
+from ._elements import C, Element, Model, bend, cavity, corrector, drift, multipole, solenoid
+from ._files import check_source, read_lattice
 from ._maps import RingPart
 from ._ring import Ring
 
@@ -30,7 +32,22 @@ _WITHOUT_EFFECT = {
 }
 _BARE = ("RFCavityPass", "CavityPass", "AperturePass", "Matrix66Pass")
 """Pass methods without apertures; only that of a matrix may be misaligned."""
-_FIELD_FREE = ("", "Drift", "Marker")
+_AT_PARTS = ("exact_bend", "wedge_in", "wedge_out")
+"""Parts of exact bends that are others in pyAT: with the field of straight multipoles in the body,
+and without multipoles in the wedges."""
+
+
+class Settings(NamedTuple):
+    """What all elements of a lattice need: energy [eV], period [s], name of the edges of bends, and
+    the model, or None for that of the pass method."""
+
+    energy: float
+    period: float
+    edge: str
+    model: Model | None
+
+    def is_exact(self, source: Any) -> bool:
+        return self.model == "exact" or (not self.model and source.PassMethod.startswith("Exact"))
 
 
 def to_at(z: Any) -> np.ndarray:
@@ -38,11 +55,26 @@ def to_at(z: Any) -> np.ndarray:
     return np.asfortranarray(np.moveaxis(np.asarray(z) @ _ORDER, -1, 0))
 
 
-def load(path: str | os.PathLike[str], *, symplectic: bool = False, **options: Any) -> Ring:
-    """The ring in a file that pyAT can read; `options` goes to its ``load_lattice``.
+def load(
+    path: str | os.PathLike[str],
+    *,
+    use: str | None = None,
+    symplectic: bool = False,
+    model: Model | None = None,
+    **options: Any,
+) -> Ring:
+    """The ring in a file that pyAT can read.
 
     .mat, .m, .repr and .json of Accelerator Toolbox, .json of Xsuite (and so of MAD-X through
-    Xsuite), .seq of MAD-X and others. See `from_at` for `symplectic` and what is refused.
+    Xsuite), .seq and .madx of MAD-X, .mad8 of MAD8, .lte of elegant, .lat of Tracy.
+
+    **Arguments** `use`: the name of the sequence or line, by default the only one, or the one that
+    is called ring. `symplectic`, `model`: see `from_at`. `options` go to pyAT's reader: `energy`
+    [eV], `periodicity`, values of variables of a MAD file, ``strict=True`` for an error if it does
+    not define all of them.
+
+    **Raises** `ValueError` for a file that cannot be read, and as `from_at`, also for attributes
+    that pyAT leaves out, such as K0 of a bend that is not ANGLE/L.
     """
     try:
         import at
@@ -51,7 +83,7 @@ def load(path: str | os.PathLike[str], *, symplectic: bool = False, **options: A
             'rings.load requires accelerator-toolbox: pip install "dvi-jax[rings]".'
         ) from error
     Path(path).stat()  # a missing file has a clear error here, and none in some of the readers
-    lattice = at.load_lattice(os.fspath(path), **options)
+    lattice = read_lattice(Path(path), use, options)
     cavities = [e.FamName for e in lattice if isinstance(e, at.RFCavity) and _is_off(e)]
     if cavities and Path(path).suffix not in (".mat", ".m", ".repr"):
         warnings.warn(
@@ -61,32 +93,36 @@ def load(path: str | os.PathLike[str], *, symplectic: bool = False, **options: A
             "rings.from_at.",
             stacklevel=2,
         )
-    return from_at(lattice, symplectic=symplectic)
+    return from_at(lattice, symplectic=symplectic, model=model)
 
 
 def _is_off(cavity: Any) -> bool:
     return cavity.PassMethod in ("IdentityPass", "DriftPass") and cavity.Voltage != 0
 
 
-def from_at(lattice: Any, *, symplectic: bool = False) -> Ring:
+def from_at(lattice: Any, *, symplectic: bool = False, model: Model | None = None) -> Ring:
     """The ring of a pyAT ``at.Lattice``, with the same maps.
 
-    Without `symplectic` the result agrees with pyAT's tracking to round-off. pyAT's edges with a
-    fringe field depend on δ without the change of ζ that belongs to it; with ``symplectic=True``
-    it is added. Radiation and collective effects are not supported.
+    Without `symplectic` and `model` the result agrees with pyAT's tracking to round-off. pyAT's
+    edges with a fringe field depend on δ without the change of ζ that belongs to it; with
+    ``symplectic=True`` it is added. `model`: "exact" or "paraxial" for all drifts, multipoles and
+    bends, whatever their pass method is; "exact" has multipoles of bends in curved coordinates, see
+    `bend`. Radiation and collective effects are not supported.
 
-    **Raises** `ValueError` with a list of all elements, with name and number, that have no
-    counterpart here.
+    **Raises** `ValueError` with the first ten elements, with name and number, that have no
+    counterpart here or that pyAT has replaced by a drift or marker.
     """
+    one_of("model", model, (None, *get_args(Model)))
     reasons: list[str] = []
     particle = getattr(lattice, "particle", None)
     rest_energy = getattr(particle, "rest_energy", 0.0) or 0.0
     gamma = lattice.energy / rest_energy if rest_energy else math.inf
     period = lattice.get_s_pos(len(lattice))[0] / (C * math.sqrt(1 - 1 / gamma**2))
+    settings = Settings(lattice.energy, period, "edge" if symplectic else "at_edge", model)
     elements = []
     for i, source in enumerate(lattice):
         try:
-            element = _element(source, lattice.energy, period, "edge" if symplectic else "at_edge")
+            element = _element(source, settings)
         except ValueError as reason:
             reasons.append(
                 f"  {i}: {source.FamName} ({type(source).__name__}, {source.PassMethod}): {reason}"
@@ -96,27 +132,27 @@ def from_at(lattice: Any, *, symplectic: bool = False) -> Ring:
     if reasons:
         raise ValueError(
             f"{len(reasons)} of {len(lattice)} elements have no counterpart here:\n"
-            + "\n".join(reasons)
+            + "\n".join(
+                [*reasons[:10], *([f"  and {len(reasons) - 10} more"] * (len(reasons) > 10))]
+            )
         )
     return Ring(elements, lattice.energy, int(lattice.periodicity))
 
 
-def _element(source: Any, energy: float, period: float, edge: str) -> Element:
+def _element(source: Any, settings: Settings) -> Element:
     """One element. **Raises** `ValueError` with the reason if it has no counterpart."""
+    check_source(source)
     for name, neutral in _WITHOUT_EFFECT.items():
         value = getattr(source, name, neutral[0])
         if value not in neutral:
             raise ValueError(f"{name} = {value} is not supported")
-    origin = getattr(source, "origin", "")
-    if type(source).__name__ in ("Marker", "Drift") and origin not in _FIELD_FREE:
-        raise ValueError(f"pyAT has no element for Xsuite's {origin}")
     make = _MAKERS.get(source.PassMethod)
     if make is None:
         remedy = "; to switch it off: lattice.enable_6d(dipole_pass=None, quadrupole_pass=None)"
         radiates = any(name in source.PassMethod for name in ("Rad", "Quant"))
         message = f"radiation is not supported{remedy}" if radiates else "its map is not supported"
         raise ValueError(message)
-    element = make(source, energy, period, edge)
+    element = make(source, settings)
     if source.PassMethod in _BARE:
         return element
     rectangle, ellipse = (getattr(source, f"{k}Apertures", None) for k in "RE")
@@ -150,12 +186,12 @@ def _field(source: Any, thin: bool = False) -> dict[str, Any]:
     return {"b": b, "a": a}
 
 
-def _drift(source, energy, period, edge):
-    model = "exact" if source.PassMethod.startswith("Exact") else "paraxial"
+def _drift(source, settings):
+    model = "exact" if settings.is_exact(source) else "paraxial"
     return drift(source.FamName, source.Length, model)
 
 
-def _marker(source, energy, period, edge):
+def _marker(source, settings):
     return Element(source.FamName, type(source).__name__.lower(), (), {"length": source.Length})
 
 
@@ -173,10 +209,10 @@ def _remove_ends(element: Element, name: str, flags: list[bool]) -> Element:
     return dataclasses.replace(element, parts=tuple(parts))
 
 
-def _straight(source, energy, period, edge):
+def _straight(source, settings):
     if source.Length == 0:
-        return _marker(source, energy, period, edge)
-    exact, field = source.PassMethod.startswith("Exact"), _field(source)
+        return _marker(source, settings)
+    exact, field = settings.is_exact(source), _field(source)
     fringes = _fringes(source, exact, field["b"])
     element = multipole(
         source.FamName, source.Length, **field, slices=source.NumIntSteps, fringe=any(fringes),
@@ -185,15 +221,16 @@ def _straight(source, energy, period, edge):
     return _remove_ends(element, "fringe", fringes)
 
 
-def _bend(source, energy, period, edge):
-    exact, second = source.PassMethod.startswith("Exact"), "E2" in source.PassMethod
+def _bend(source, settings):
+    exact, at_exact = settings.is_exact(source), source.PassMethod.startswith("Exact")
+    second = "E2" in source.PassMethod and settings.model is None
     field = _field(source)
     sides = (1, "Entrance"), (2, "Exit")
     method = [getattr(source, f"FringeBend{side}", 1) for _, side in sides]
     gap = getattr(source, "FullGap", 0.0)
     gaps = [gap * getattr(source, f"FringeInt{i}", 0.0) * (m != 0 or second)
             for m, (i, _) in zip(method, sides, strict=True)]  # fmt: skip
-    gaps = [getattr(source, "gK", 0.0)] * 2 if exact else gaps
+    gaps = [getattr(source, "gK", 0.0)] * 2 if at_exact else gaps
     fringes = [False, False] if second else _fringes(source, exact, field["b"])
     element = bend(
         source.FamName, source.Length, source.BendingAngle, **field, edge_in=source.EntranceAngle,
@@ -201,9 +238,13 @@ def _bend(source, energy, period, edge):
         fringe=any(fringes), model="exact" if exact else "paraxial",
     )  # fmt: skip
     element = _remove_ends(element, "gradient_fringe" if exact else "fringe", fringes)
+    if exact and at_exact:
+        element = _remove_ends(element, "dipole_fringe", [m != 0 for m in method])
     if exact:
-        return _remove_ends(element, "dipole_fringe", [m != 0 for m in method])
-    edge = "second_order_edge" if second else edge
+        prefixes = ("at_" * (settings.model is None and p.name in _AT_PARTS) for p in element.parts)
+        parts = (p._replace(name=k + p.name) for k, p in zip(prefixes, element.parts, strict=True))
+        return dataclasses.replace(element, parts=tuple(parts))
+    edge = "second_order_edge" if second else settings.edge
     replacements = {
         "edge_in": {"name": f"{edge}_in", "scheme": method[0]},
         "edge_out": {"name": f"{edge}_out", "scheme": method[1]},
@@ -213,16 +254,17 @@ def _bend(source, energy, period, edge):
     return dataclasses.replace(element, parts=parts)
 
 
-def _cavity(source, energy, period, edge):
+def _cavity(source, settings):
     by_turn = source.PassMethod == "RFCavityPass"
-    slip = 2 * math.pi * (source.HarmNumber - source.Frequency * period) if by_turn else 0.0
+    slip = source.HarmNumber - source.Frequency * settings.period if by_turn else 0.0
     lag, phase = (getattr(source, name, 0.0) for name in ("TimeLag", "PhaseLag"))
     return cavity(
-        source.FamName, source.Length, source.Voltage / energy, source.Frequency, lag, phase, slip
-    )
+        source.FamName, source.Length, source.Voltage / settings.energy, source.Frequency, lag,
+        phase, 2 * math.pi * slip,
+    )  # fmt: skip
 
 
-def _matrix(source, energy, period, edge):
+def _matrix(source, settings):
     R1, T1, R2, T2 = _placement(source)
     M = R2 @ _ORDER @ source.M66 @ _ORDER.T
     values = {"length": source.Length, "matrix_in": M @ R1, "shift_in": M @ T1 + T2}
