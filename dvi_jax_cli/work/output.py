@@ -13,7 +13,7 @@ import numpy as np
 
 from dvi_jax import plot
 
-from .._errors import as_input_error, reason, require
+from .._errors import as_input_error, reason, require, user_path
 from .._show import TextTable, json_types
 from .schema import FILES
 from .table import read_file
@@ -140,7 +140,7 @@ def open_report(
     versions["python"] = platform.python_version()
     contents = {kind: str(path), "config": raw, "versions": versions}
     key = "--out" if out is not None else "output.dir"
-    folder = Path(out or file.output.dir or f"results/{path.stem}")
+    folder = user_path(key, out or file.output.dir or f"results/{path.stem}")
     return file, FolderReport(contents, folder=folder, key=key, names=names, force=force)
 
 

@@ -15,7 +15,7 @@ from dvi_jax.base.signature import accepts
 from dvi_jax.systems import rings
 from dvi_jax.systems.planets.solar_system import EphemerisMissing, julian_date
 
-from .._errors import InputError, as_input_error, describe, require, require_name
+from .._errors import InputError, as_input_error, describe, require, require_name, user_path
 from .expressions import parse_method
 from .loader import Loader, in_one_line
 from .schema import COUNT, RunFile, SweepFile, SystemFile, Times
@@ -170,7 +170,8 @@ def _of_a_ring(file: SystemFile, loader: Loader) -> Source:
     assert ring is not None
     prefix, rule = f"{ring.file!r} cannot be read: ", "a lattice file that pyAT can read"
     with as_input_error("ring.file", rule, Exception, prefix=prefix, text=in_one_line):
-        read = rings.load(loader.folder / ring.file, symplectic=ring.symplectic)
+        path = loader.folder / user_path("ring.file", ring.file)
+        read = rings.load(path, symplectic=ring.symplectic)
     record = rings.problem(read, planes=ring.planes, delta=ring.delta)
     units = {"q": "m", "t": "turns"}
     problem = systems.Problem("ring", *record[:4], args=record.args, units=units)

@@ -13,6 +13,7 @@ from rich.table import Table
 
 import dvi_jax as dvi
 
+from ...base.files import user_folder
 from .claims import Claim, Verdict, judge, pretty
 from .experiments import Measurements, measure
 from .figures import FIGURES, draw
@@ -47,9 +48,7 @@ def reproduce(out: Path | str, force: bool = False, console: Console | None = No
 
     **Source** the paper, Section 5; the verdicts' criteria are ours.
     """
-    out = Path(out)
-    if out.exists() and not out.is_dir():
-        raise NotADirectoryError(f"out must be a folder, but {out} is a file.")
+    out = user_folder("out", out)
     if out.exists() and any(out.iterdir()) and not force:
         raise FileExistsError(
             f"out must be a new or an empty folder, but {out} is not empty: choose another folder, "
