@@ -43,7 +43,7 @@ class Session:
     """
 
     unwritten = "the results cannot be written"
-    interruption = "by Ctrl-C; nothing has been written"
+    interruption = "by Ctrl-C or SIGTERM; nothing has been written"
     hint = ""
 
     def __init__(self, as_json: bool, verbose: bool, debug: bool):

@@ -112,6 +112,28 @@ def _make_folders(folder: Path) -> list[Path]:
     return [new.parent for new in folders]
 
 
+_reserved: dict[Path, list[Path]] = {}
+"""A directory of results that are not yet written → what was made for it, innermost first."""
+
+
+def reserve(folder: Path) -> None:
+    """Make a directory for results before the work begins, so that it fails early."""
+    new = _reserved.setdefault(folder, [])
+    while not folder.exists():
+        new.append(folder)
+        folder = folder.parent
+    for part in reversed(new):
+        part.mkdir(exist_ok=True)
+
+
+def release(*folders: Path) -> None:
+    """Remove what `reserve` has made for these directories, or for all, where it is still empty."""
+    for folder in folders or tuple(_reserved):
+        for part in _reserved.pop(folder, ()):
+            with contextlib.suppress(OSError):  # it has files
+                part.rmdir()
+
+
 def sync(folder: Path) -> None:
     """Write the entries of a folder to the disk."""
     if os.name == "nt":  # where folders cannot be opened
