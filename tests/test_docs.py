@@ -76,6 +76,63 @@ def test_code_fits_and_links_lead_to_files():
     assert missing_files(ROOT / "README.md", links) == ["docs/none.md"]
 
 
+RAW = re.compile(r":::|```|\{(?:container|toctree|figure|note|math)\}|\]\([^)\s]*\)|<!--|&lt;!--")
+"""Markup of MyST that a reader must not see."""
+
+
+class _Text(html.parser.HTMLParser):
+    """The text of a page without that of scripts and programs."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.inside, self.texts = [], []
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        if tag in ("script", "style", "pre", "code"):
+            self.inside.append(tag)
+
+    def handle_endtag(self, tag):
+        if self.inside and self.inside[-1] == tag:
+            self.inside.pop()
+
+    def handle_data(self, data):
+        if not self.inside:
+            self.texts.append(data)
+
+
+def raw_markup(page):
+    """Markup that is left over in the HTML of a page."""
+    return RAW.findall("".join(_Text(page).texts))
+
+
+def loose_fences(text):
+    """Lines with colons of a container that are not alone on their line, and open containers."""
+    lines = [line for line in text.splitlines() if ":::" in line]
+    fences = [re.fullmatch(r"(:{3,})(\{\w+\}.*)?", line) for line in lines]
+    open_fences = []
+    for match in filter(None, fences):
+        if match[2]:
+            open_fences.append(match[1])
+        elif not open_fences or open_fences.pop() != match[1]:
+            return [match[0]]
+    return [line for line, match in zip(lines, fences, strict=True) if not match] + open_fences
+
+
+def test_containers_of_pages_are_fences():
+    """A paragraph that is filled again joins the lines of containers to text."""
+    pages = {page.name: page.read_text(encoding="utf-8") for page in DOCS.glob("*.md")}
+    assert ":::" in pages["index.md"]
+    assert {name: loose_fences(text) for name, text in pages.items() if loose_fences(text)} == {}
+    assert loose_fences("::::{container} a\ntext :::: ::::{container} b\n::::\n") != []
+    assert loose_fences(":::{note}\ntext\n") == [":::"]
+    assert loose_fences("::::{a}\n:::{b}\n::::\n:::\n") != []
+    assert loose_fences("::::{a}\n:::{b}\n:::\n::::\n") == []
+    for left in ("a :::: b", "```text", "[a](b.md)", "{toctree}"):
+        assert raw_markup(f"<p>{left}</p>") != [], left
+    assert raw_markup("<script>a:::b</script><pre>```</pre><p>a::b (c)</p>") == []
+
+
 PRINTED = re.compile(r"^<!-- printed -->\n```text\n(.*?)^```", re.S | re.M)
 
 
@@ -161,6 +218,8 @@ def dead_links(folder):
 def test_links_names_and_sizes_of_the_site(site, tmp_path):
     assert len(list(site.rglob("*.html"))) > 40
     assert dead_links(site) == []
+    left = {p.name: raw_markup(p.read_text(encoding="utf-8")) for p in site.rglob("*.html")}
+    assert {name: words for name, words in left.items() if words} == {}
     (tmp_path / "a.html").write_text('<p id="x"><a href="b.html">b</a><a href="#x"><a href="#y">')
     assert dead_links(tmp_path) == [("a.html", "b.html"), ("a.html", "#y")]
     import dvi_jax as dvi
