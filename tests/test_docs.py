@@ -14,6 +14,7 @@ import threading
 import urllib.parse
 from pathlib import Path
 
+import pages
 import pytest
 from compilation import flags_of_users
 
@@ -43,14 +44,35 @@ PAGES = [p for p in sorted(DOCS.glob("*.md")) if examples(p)[0] and p.stem not i
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_examples_run(page, tmp_path):
-    env = {**os.environ, "JAX_PLATFORMS": "cpu", "MPLBACKEND": "Agg", "XLA_FLAGS": flags_of_users()}
-    out = subprocess.run(
-        [sys.executable, "-W", "error::DeprecationWarning:dvi_jax", "-c", examples(page)[0]],
-        capture_output=True, text=True, check=False, cwd=tmp_path, env=env, timeout=500,
-    )  # fmt: skip
-    assert out.returncode == 0, out.stderr[-3000:]
+    options = {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags_of_users()}
+    lines = pages.run(examples(page)[0], tmp_path, **options)
     for line in printed(page):
-        assert line in out.stdout.splitlines()
+        assert line in lines
+
+
+def test_a_wrong_number_of_a_comment_is_seen(tmp_path):
+    code = "print(0.0712, 2.5e-11)  # 0.071 and 2.5e-11: the errors\nx = 1  # 3 bodies\n"
+    code += "for k in range(2):\n    print(k, 'of', x)\n# 0 of 1\n# 1 of …\n"
+    code += "print(3.14159)  # 3.14…\n"
+    code += "print(-0.5, 1e-4)  # −0.5, and the other below 1e-3; 7 is not of it\n"
+    code += "def f():\n    print(1)  # 2\nprint(3e-16)  # 8e-16: round-off\nprint('a')  # words\n"
+    assert pages.run(code, tmp_path)[0] == "0.0712 2.5e-11"
+    stated = [claim.text.strip() for claim in pages.claims(code)]
+    assert stated[:3] == ["0.071 and 2.5e-11", "0 of 1\n1 of …", "3.14…"]
+    assert len(stated) == 5
+    for right, wrong in (
+        ("# 0.071", "# 0.072"), ("and 2.5e-11", "and 2e-08"), ("# 0 of 1", "# 0 of 2"),
+        ("# 3.14…", "# 3.15…"), ("# −0.5", "# 0.5"), ("below 1e-3", "below 1e-5"),
+        ("# 8e-16", "# 8e-11"),
+    ):  # fmt: skip
+        assert code.count(right) == 1
+        with pytest.raises(AssertionError, match=re.escape(wrong.split(" ")[-1])):
+            pages.run(code.replace(right, wrong), tmp_path)
+    code = "a = f()  # 0.25\nb = g()  # 8e-16\nc = h()  # 3 bodies\n"
+    assert pages.wrong_values(code, {"a": 0.2502, "b": 1e-15}) == {}
+    assert pages.wrong_values(code, {"a": 0.2602, "b": 1e-9}) == {
+        "a": ("0.25", 0.2602), "b": ("8e-16", 1e-9)
+    }  # fmt: skip
 
 
 def too_long(text):
