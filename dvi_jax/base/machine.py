@@ -7,7 +7,31 @@ from pathlib import Path
 
 import jax
 
+from lanewise.jaxprs.jaxapi import backends_are_initialized
+
 _CGROUPS = Path("/sys/fs/cgroup")
+
+_state = {"is_fork": False}
+
+
+def _after_fork() -> None:
+    _state["is_fork"] = backends_are_initialized()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
+
+
+def refuse_fork() -> None:
+    """**Raises** `RuntimeError` in a process that was forked after JAX had started: the threads of
+    JAX do not exist there, and the first compilation waits for them without end."""
+    if _state["is_fork"]:
+        raise RuntimeError(
+            "this process was made by fork after JAX had started, so that JAX would not return. "
+            "Start processes afresh: multiprocessing.get_context('spawn'), or mp_context= of "
+            "ProcessPoolExecutor. Mostly none are needed: jax.vmap and dvi.sweep use all "
+            "processors, dvi.sweep(client=...) a cluster."
+        )
 
 
 def results_memory() -> int | None:
