@@ -27,9 +27,8 @@ def user_path(name: str, path: Any) -> Path:
         raise TypeError(f"{name} must be a path, a string or a pathlib.Path, got {path!r:.100}.")
     try:
         expanded = Path(path).expanduser()
-        expanded.stat()  # raises for names that are too long or have a NUL
-    except (FileNotFoundError, NotADirectoryError, PermissionError):
-        pass
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError, PermissionError):
+            expanded.stat()  # raises for names that are too long or have a NUL
     except (OSError, ValueError, RuntimeError) as error:
         cause = getattr(error, "strerror", None) or str(error).rstrip(".")
         raise ValueError(

@@ -41,6 +41,7 @@ def folder() -> Path | None:
     if setting.lower() in ("off", "0", "no", "false"):
         return None
     base = Path(os.environ.get("XDG_CACHE_HOME", "").strip())
+    where = None
     try:
         if setting:
             where = Path(setting).expanduser()
