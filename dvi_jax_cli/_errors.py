@@ -60,11 +60,18 @@ def require_name(
     require(name in names, key, defect or describe(name), rule.format(one_of(names, name)))
 
 
+def user_path(key: str, path: str | Path) -> Path:
+    """A path that a user gives, with ``~`` as the home directory. **Raises** `InputError`."""
+    rule = "a path; ~ is the home directory, and ./~name a file whose name begins with ~"
+    with as_input_error(key, rule, RuntimeError, prefix=f"{path}: "):
+        return Path(path).expanduser()
+
+
 def require_file(key: str, path: Path, rule: str) -> Path:
     """The absolute path of a file. **Raises** `InputError` if it does not exist."""
     # For a name that no file can have.
     with as_input_error(key, rule, OSError, ValueError, prefix=f"{path}: ", text=reason):
-        path = path.resolve()
+        path = user_path(key, path).resolve()
         require(path.is_file(), key, f"there is no file {path}", rule)
     return path
 

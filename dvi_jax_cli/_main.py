@@ -1,56 +1,91 @@
-"""The entry point: Ctrl-C ends any command with exit code 130, also while it is being imported."""
+"""The entry point: Ctrl-C, SIGTERM and SIGHUP end any command in the same way, also while it is
+being imported, with exit code 128 + the number of the signal."""
 
 import functools
+import os
 import signal
 import sys
 import threading
 import time
 from _thread import interrupt_main
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
+
+INTERRUPTION = 130
 
 _LATER = 0.02
 """Seconds after which a Ctrl-C that was not raised is tried again."""
 
 _PATIENCE = 10.0
-"""Seconds for which a Ctrl-C waits for the end of an import."""
+"""Seconds for which a Ctrl-C waits for the end of an import, and SIGTERM for that of other code in
+which Python cannot raise, such as a long run in XLA."""
+
+_DEFAULTS = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+if hasattr(signal, "SIGHUP"):  # not on Windows
+    _DEFAULTS[signal.SIGHUP] = signal.SIG_DFL
 
 
 def main() -> None:
     """The entry point ``dvi-jax``."""
-    try:
-        with interrupts_guarded():
+    code: Any = INTERRUPTION
+    numbers: list[int] = []
+    with suppress(KeyboardInterrupt), interrupts_guarded(numbers):
+        try:
             from ._app import run  # inside, as it may take a second
 
             run()
-    except KeyboardInterrupt:
-        sys.exit(130)
-    finally:
-        # The interpreter waits for timers: for a minute if JAX was interrupted before it cancelled
-        # the one that warns of a slow start of a device.
-        for thread in threading.enumerate():
-            if isinstance(thread, threading.Timer):
-                thread.cancel()
+            code = 0
+        except SystemExit as error:
+            code = error.code
+    for number in _DEFAULTS:  # from here on there is nothing to interrupt
+        signal.signal(number, signal.SIG_IGN)
+    if code == INTERRUPTION:
+        _leave(128 + numbers[0] if numbers else INTERRUPTION)
+    if numbers and isinstance(code, int):
+        _leave(code)
+    sys.exit(code)
+
+
+def _leave(code: int) -> None:
+    """End the process without the end of the interpreter: a thread of XLA that still compiles would
+    then use what is no longer there (a segmentation fault), and timers of JAX would be waited for.
+    """
+    if files := sys.modules.get("dvi_jax.base.files"):
+        files.release()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(AttributeError, OSError, ValueError):  # there is none, or it is closed
+            stream.flush()
+    os._exit(code)
+
+
+def _watch(reader: int, numbers: list[int]) -> None:
+    """End the process after SIGTERM if Python cannot raise it, because XLA does not return."""
+    while True:
+        for number in os.read(reader, 64):
+            numbers.append(number)  # also one for which a sweep has a handler of its own
+            if number != signal.SIGINT:
+                time.sleep(_PATIENCE)
+                print(f"interrupted: by signal {number}", file=sys.stderr)
+                _leave(128 + number)
 
 
 @contextmanager
-def interrupts_guarded() -> Iterator[None]:
-    """Inside of this a Ctrl-C is raised where it can be, and raised again where it was lost.
+def interrupts_guarded(numbers: list[int]) -> Iterator[None]:
+    """Inside of this Ctrl-C, SIGTERM and SIGHUP are raised as `KeyboardInterrupt` where it can be,
+    and raised again where it was lost; `numbers` gets the numbers of the signals.
 
     Python raises `KeyboardInterrupt` on any line. In a callback of the garbage collector (JAX has
     one) it is only reported, to `sys.unraisablehook`; an extension module that is interrupted at
     its import gives an `ImportError` or ends the process. So it waits until imports have ended.
     """
-    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:  # ignored, say
-        yield
-        return
     hook, began = sys.unraisablehook, -1.0
 
     @functools.wraps(signal.default_int_handler)
     def handle(number: int, frame: Any) -> None:
         nonlocal began
         began = time.monotonic() if began < 0 else began
+        numbers.append(number)
         if _is_importing(frame) and time.monotonic() - began < _PATIENCE:
             _retry()
         else:
@@ -62,13 +97,20 @@ def interrupts_guarded() -> Iterator[None]:
         else:
             hook(event)
 
-    signal.signal(signal.SIGINT, handle)
+    # Those that are ignored, as after nohup, or handled otherwise, stay so.
+    own = [n for n, handler in _DEFAULTS.items() if signal.getsignal(n) is handler]
+    for number in own:
+        signal.signal(number, handle)
+    if own and os.name != "nt":
+        reader, writer = os.pipe()
+        os.set_blocking(writer, False)
+        signal.set_wakeup_fd(writer, warn_on_full_buffer=False)  # written to by C, at once
+        threading.Thread(target=_watch, args=(reader, numbers), daemon=True).start()
     sys.unraisablehook = report
     try:
         yield
     finally:
         sys.unraisablehook = hook
-        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _retry() -> None:

@@ -160,7 +160,9 @@ def fit(
         dvi-jax fit fit.toml --resume      continues from its checkpoint, or begins
         dvi-jax fit fit.toml --json | jq .parameters
     """
-    session.interruption = "by Ctrl-C; there is a checkpoint if the fit had run for some seconds"
+    session.interruption = (
+        "by Ctrl-C or SIGTERM; there is a checkpoint if the fit had run for some seconds"
+    )
     session.hint = RESUME_HINT
     from .work.fit import fit_file
 

@@ -6,12 +6,13 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
-from typing import Annotated, Any
+from pathlib import Path
+from typing import Annotated, Any, get_args
 
 import typer
 from typer.core import TyperCommand
 
-from ._errors import InputError
+from ._errors import InputError, user_path
 from ._names import VERSION
 from ._show import console, print_error, print_json, print_tables
 
@@ -42,7 +43,7 @@ class Session:
     """
 
     unwritten = "the results cannot be written"
-    interruption = "by Ctrl-C; nothing has been written"
+    interruption = "by Ctrl-C or SIGTERM; nothing has been written"
     hint = ""
 
     def __init__(self, as_json: bool, verbose: bool, debug: bool):
@@ -148,6 +149,9 @@ def command(
     def register(function: Callable[..., None]) -> Callable[..., None]:
         kind = inspect.Parameter.KEYWORD_ONLY
         options = list(inspect.signature(function).parameters.values())[1:]
+        # Shells leave ~ alone in --out=~/x.
+        hints = {p.name: get_args(p.annotation) for p in options}
+        paths = {n: h[1].metavar or f"--{n}" for n, h in hints.items() if h and _is_path(h[0])}
         common = [
             inspect.Parameter(n, kind, default=False, annotation=a) for n, a in _COMMON.items()
         ]
@@ -158,6 +162,9 @@ def command(
             try:
                 if jax:
                     session.start_jax()
+                for name in paths.keys() & values.keys():
+                    if values[name] is not None:
+                        values[name] = user_path(paths[name], values[name])
                 function(session, **values)
                 sys.stdout.flush()  # so that a closed pipe raises here
             except (typer.Exit, typer.Abort):
@@ -186,6 +193,10 @@ def command(
         return function
 
     return register
+
+
+def _is_path(hint: Any) -> bool:
+    return Path in (hint, *get_args(hint))
 
 
 def shown_examples(lines: Iterable[str]) -> str:

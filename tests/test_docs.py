@@ -14,6 +14,7 @@ import threading
 import urllib.parse
 from pathlib import Path
 
+import pages
 import pytest
 from compilation import flags_of_users
 
@@ -43,14 +44,35 @@ PAGES = [p for p in sorted(DOCS.glob("*.md")) if examples(p)[0] and p.stem not i
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_examples_run(page, tmp_path):
-    env = {**os.environ, "JAX_PLATFORMS": "cpu", "MPLBACKEND": "Agg", "XLA_FLAGS": flags_of_users()}
-    out = subprocess.run(
-        [sys.executable, "-W", "error::DeprecationWarning:dvi_jax", "-c", examples(page)[0]],
-        capture_output=True, text=True, check=False, cwd=tmp_path, env=env, timeout=500,
-    )  # fmt: skip
-    assert out.returncode == 0, out.stderr[-3000:]
+    options = {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags_of_users()}
+    lines = pages.run(examples(page)[0], tmp_path, **options)
     for line in printed(page):
-        assert line in out.stdout.splitlines()
+        assert line in lines
+
+
+def test_a_wrong_number_of_a_comment_is_seen(tmp_path):
+    code = "print(0.0712, 2.5e-11)  # 0.071 and 2.5e-11: the errors\nx = 1  # 3 bodies\n"
+    code += "for k in range(2):\n    print(k, 'of', x)\n# 0 of 1\n# 1 of …\n"
+    code += "print(3.14159)  # 3.14…\n"
+    code += "print(-0.5, 1e-4)  # −0.5, and the other below 1e-3; 7 is not of it\n"
+    code += "def f():\n    print(1)  # 2\nprint(3e-16)  # 8e-16: round-off\nprint('a')  # words\n"
+    assert pages.run(code, tmp_path)[0] == "0.0712 2.5e-11"
+    stated = [claim.text.strip() for claim in pages.claims(code)]
+    assert stated[:3] == ["0.071 and 2.5e-11", "0 of 1\n1 of …", "3.14…"]
+    assert len(stated) == 5
+    for right, wrong in (
+        ("# 0.071", "# 0.072"), ("and 2.5e-11", "and 2e-08"), ("# 0 of 1", "# 0 of 2"),
+        ("# 3.14…", "# 3.15…"), ("# −0.5", "# 0.5"), ("below 1e-3", "below 1e-5"),
+        ("# 8e-16", "# 8e-11"),
+    ):  # fmt: skip
+        assert code.count(right) == 1
+        with pytest.raises(AssertionError, match=re.escape(wrong.split(" ")[-1])):
+            pages.run(code.replace(right, wrong), tmp_path)
+    code = "a = f()  # 0.25\nb = g()  # 8e-16\nc = h()  # 3 bodies\n"
+    assert pages.wrong_values(code, {"a": 0.2502, "b": 1e-15}) == {}
+    assert pages.wrong_values(code, {"a": 0.2602, "b": 1e-9}) == {
+        "a": ("0.25", 0.2602), "b": ("8e-16", 1e-9)
+    }  # fmt: skip
 
 
 def too_long(text):
@@ -74,6 +96,63 @@ def test_code_fits_and_links_lead_to_files():
     assert {name: links for name, links in missing.items() if links} == {}
     links = "[a](docs/none.md) [b](docs/faq.md)"
     assert missing_files(ROOT / "README.md", links) == ["docs/none.md"]
+
+
+RAW = re.compile(r":::|```|\{(?:container|toctree|figure|note|math)\}|\]\([^)\s]*\)|<!--|&lt;!--")
+"""Markup of MyST that a reader must not see."""
+
+
+class _Text(html.parser.HTMLParser):
+    """The text of a page without that of scripts and programs."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.inside, self.texts = [], []
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        if tag in ("script", "style", "pre", "code"):
+            self.inside.append(tag)
+
+    def handle_endtag(self, tag):
+        if self.inside and self.inside[-1] == tag:
+            self.inside.pop()
+
+    def handle_data(self, data):
+        if not self.inside:
+            self.texts.append(data)
+
+
+def raw_markup(page):
+    """Markup that is left over in the HTML of a page."""
+    return RAW.findall("".join(_Text(page).texts))
+
+
+def loose_fences(text):
+    """Lines with colons of a container that are not alone on their line, and open containers."""
+    lines = [line for line in text.splitlines() if ":::" in line]
+    fences = [re.fullmatch(r"(:{3,})(\{\w+\}.*)?", line) for line in lines]
+    open_fences = []
+    for match in filter(None, fences):
+        if match[2]:
+            open_fences.append(match[1])
+        elif not open_fences or open_fences.pop() != match[1]:
+            return [match[0]]
+    return [line for line, match in zip(lines, fences, strict=True) if not match] + open_fences
+
+
+def test_containers_of_pages_are_fences():
+    """A paragraph that is filled again joins the lines of containers to text."""
+    pages = {page.name: page.read_text(encoding="utf-8") for page in DOCS.glob("*.md")}
+    assert ":::" in pages["index.md"]
+    assert {name: loose_fences(text) for name, text in pages.items() if loose_fences(text)} == {}
+    assert loose_fences("::::{container} a\ntext :::: ::::{container} b\n::::\n") != []
+    assert loose_fences(":::{note}\ntext\n") == [":::"]
+    assert loose_fences("::::{a}\n:::{b}\n::::\n:::\n") != []
+    assert loose_fences("::::{a}\n:::{b}\n:::\n::::\n") == []
+    for left in ("a :::: b", "```text", "[a](b.md)", "{toctree}"):
+        assert raw_markup(f"<p>{left}</p>") != [], left
+    assert raw_markup("<script>a:::b</script><pre>```</pre><p>a::b (c)</p>") == []
 
 
 PRINTED = re.compile(r"^<!-- printed -->\n```text\n(.*?)^```", re.S | re.M)
@@ -161,6 +240,8 @@ def dead_links(folder):
 def test_links_names_and_sizes_of_the_site(site, tmp_path):
     assert len(list(site.rglob("*.html"))) > 40
     assert dead_links(site) == []
+    left = {p.name: raw_markup(p.read_text(encoding="utf-8")) for p in site.rglob("*.html")}
+    assert {name: words for name, words in left.items() if words} == {}
     (tmp_path / "a.html").write_text('<p id="x"><a href="b.html">b</a><a href="#x"><a href="#y">')
     assert dead_links(tmp_path) == [("a.html", "b.html"), ("a.html", "#y")]
     import dvi_jax as dvi

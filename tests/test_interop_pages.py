@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pages
 import pytest
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -16,6 +17,7 @@ def run(page):
     names: dict = {}
     for i, block in enumerate(blocks):
         exec(compile(block, f"{page}, block {i + 1}", "exec"), names)
+    assert pages.wrong_values("\n".join(blocks), names) == {}
     return names, len(blocks)
 
 

@@ -1,11 +1,11 @@
 """The README's Python blocks run as printed."""
 
-import os
 import re
 import subprocess
 import sys
 from pathlib import Path
 
+import pages
 import pytest
 from compilation import flags_of_users
 
@@ -23,13 +23,8 @@ def blocks(page):
 
 
 def output_of(code, folder):
-    """The lines that a program prints."""
-    out = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=folder,
-        env={**os.environ, "MPLBACKEND": "Agg"},
-    )  # fmt: skip
-    assert out.returncode == 0, out.stderr
-    return out.stdout.strip().splitlines()
+    """The lines that a program prints; the numbers in its comments are compared."""
+    return pages.run(code, folder)
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -81,3 +82,58 @@ def test_structures_are_those_of_the_header_of_xla(tmp_path):
     assert [int(x) for x in printed.split()] == [
         offset(name, field) for name in xla for field in fields[name]
     ]
+
+
+FORKS = """
+import multiprocessing, os
+from concurrent.futures import ProcessPoolExecutor
+import jax, jax.numpy as jnp
+jax.config.update("jax_enable_x64", True)
+import dvi_jax as dvi
+
+SYSTEM = dvi.System(lambda t0, t1, q0, p1, args: (p1 @ p1 + q0 @ q0) / 2)
+HOW = {"h": 0.1, "num_steps": 3}
+CALLS = {
+    "integrate": lambda: dvi.integrate(SYSTEM, [1.0], [0.0], **HOW).status,
+    "sweep": lambda: dvi.sweep(SYSTEM, [1.0], [0.0], epsilon=[0.1], **HOW, progress=False),
+    "search": lambda: dvi.discover_invariants(SYSTEM, dvi.Polynomials(2), order=0, h=0.1,
+                                              samples=None),
+    "drift": lambda: dvi.drift_order(SYSTEM, lambda q, p: p @ p, [1.0], [0.0], **HOW,
+                                     epsilons=[0.1]),
+}
+
+def outcome(name):
+    try:
+        return CALLS[name]()
+    except RuntimeError as error:
+        return "refused: " + str("get_context('spawn')" in str(error))
+
+def in_a_fork(name):
+    reader, writer = os.pipe()
+    if os.fork() == 0:
+        os.write(writer, outcome(name).encode())
+        os._exit(0)
+    os.wait()
+    return os.read(reader, 100).decode()
+
+if __name__ == "__main__":
+    print(in_a_fork("integrate"))  # JAX has not started: right there
+    print(outcome("integrate"))
+    print(in_a_fork("integrate"))
+    fork = multiprocessing.get_context("fork")
+    with fork.Pool(1) as pool:
+        print(pool.map_async(outcome, ["sweep"]).get(20)[0])
+        print(pool.map_async(in_a_fork, ["drift"]).get(20)[0])  # the child of a child
+    with ProcessPoolExecutor(1, mp_context=fork) as pool:
+        print(pool.submit(outcome, "search").result(20))
+"""
+
+
+def test_a_fork_after_jax_has_started_is_refused_instead_of_waiting(tmp_path):
+    (tmp_path / "forks.py").write_text(FORKS)
+    out = subprocess.run(
+        [sys.executable, "-W", "ignore", "forks.py"], cwd=tmp_path, capture_output=True, text=True,
+        check=False, timeout=100, env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])},
+    )  # fmt: skip
+    assert out.returncode == 0, out.stderr[-2000:]
+    assert out.stdout.split("\n")[:-1] == ["successful"] * 2 + ["refused: True"] * 4

@@ -1,9 +1,11 @@
-"""Files that are written whole or not at all."""
+"""Paths that users give, and files that are written whole or not at all."""
 
 import contextlib
+import errno
 import io
 import json
 import os
+import stat
 import uuid
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,6 +15,67 @@ import numpy as np
 
 TEMPORARY = ".tmp"
 """Suffix of files that are still being written."""
+
+
+def user_path(name: str, path: Any) -> Path:
+    """A path that a user gives as the argument `name`: ``~`` is the home directory, as in a shell.
+
+    **Raises** `TypeError` for another type, `ValueError` for ``~name`` of an unknown user and for a
+    path that cannot exist.
+    """
+    if not isinstance(path, str | os.PathLike):
+        raise TypeError(f"{name} must be a path, a string or a pathlib.Path, got {path!r:.100}.")
+    try:
+        expanded = Path(path).expanduser()
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError, PermissionError):
+            expanded.stat()  # raises for names that are too long or have a NUL
+    except (OSError, ValueError, RuntimeError) as error:
+        cause = getattr(error, "strerror", None) or str(error).rstrip(".")
+        raise ValueError(
+            f"{name}={os.fspath(path)!r:.100} cannot be a path ({cause}). ~ means the home "
+            "directory, ~name that of a user; ./~name is the file of this name."
+        ) from None
+    return expanded
+
+
+def user_file(name: str, path: Any) -> Path:
+    """The path of an existing file that a user gives. **Raises** as `user_path`;
+    `FileNotFoundError`; `ValueError` for a directory, a pipe or a device."""
+    file = user_path(name, path)
+    if not file.is_file():
+        if not file.exists():
+            raise FileNotFoundError(f"{name}: there is no file at the path {str(file)!r}.")
+        raise ValueError(f"{name} must be a file, but '{file}' is a {kind_of_file(file)}.")
+    return file
+
+
+def user_folder(name: str, path: Any) -> Path:
+    """The path of a directory that a user gives, which exists or can be made.
+
+    **Raises** as `user_path`; `NotADirectoryError` if the path or a part of it is something else.
+    """
+    folder = user_path(name, path)
+    nearest = next(part for part in (folder, *folder.absolute().parents) if part.exists())
+    if not nearest.is_dir():
+        raise NotADirectoryError(
+            f"{name} must be a directory, but '{nearest}' is a {kind_of_file(nearest)}: give "
+            "another path."
+        )
+    return folder
+
+
+def kind_of_file(path: Path) -> str:
+    """What is at a path, in words."""
+    mode = path.stat().st_mode
+    kinds = {stat.S_IFDIR: "directory", stat.S_IFREG: "file", stat.S_IFIFO: "pipe"}
+    return kinds.get(stat.S_IFMT(mode), "device or socket")
+
+
+def content_of(path: Path) -> bytes:
+    """The bytes of a file. **Raises** `OSError`, also for a pipe, which could block for ever."""
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise OSError(errno.EINVAL, f"it is a {kind_of_file(path)}, not a file", str(path))
+    return path.read_bytes()
 
 
 def publish(path: Path, content: bytes) -> None:
@@ -48,6 +111,28 @@ def _make_folders(folder: Path) -> list[Path]:
     return [new.parent for new in folders]
 
 
+_reserved: dict[Path, list[Path]] = {}
+"""A directory of results that are not yet written → what was made for it, innermost first."""
+
+
+def reserve(folder: Path) -> None:
+    """Make a directory for results before the work begins, so that it fails early."""
+    new = _reserved.setdefault(folder, [])
+    while not folder.exists():
+        new.append(folder)
+        folder = folder.parent
+    for part in reversed(new):
+        part.mkdir(exist_ok=True)
+
+
+def release(*folders: Path) -> None:
+    """Remove what `reserve` has made for these directories, or for all, where it is still empty."""
+    for folder in folders or tuple(_reserved):
+        for part in _reserved.pop(folder, ()):
+            with contextlib.suppress(OSError):  # it has files
+                part.rmdir()
+
+
 def sync(folder: Path) -> None:
     """Write the entries of a folder to the disk."""
     if os.name == "nt":  # where folders cannot be opened
@@ -69,7 +154,7 @@ def publish_npz(
     **Raises** `FileNotFoundError` without a directory for it, `OSError` for a file that cannot be
     written; an older file of that name is then unchanged.
     """
-    path, content = Path(path), io.BytesIO()
+    path, content = user_path("path", path), io.BytesIO()
     header = {"format": form, "holds": sorted(arrays), **header}  # so that a lost array is noticed
     if not path.parent.is_dir():
         raise FileNotFoundError(
@@ -89,9 +174,10 @@ def read_npz(
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Header and arrays of a file of `publish_npz`; `kind` names its content in messages.
     **Raises** `FileNotFoundError`; `ValueError` for a damaged or another file, or another form."""
-    path = Path(path)
-    if not path.is_file():
+    path = user_path("path", path)
+    if not path.exists():
         raise FileNotFoundError(f"there is no file '{path}' of a {kind}.")
+    path = user_file("path", path)
     try:
         # Without pickles: loading one would execute code from the file.
         with np.load(path, allow_pickle=False) as file:

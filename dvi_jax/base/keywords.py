@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 from .checks import argument_names, only_one, refuse_unknown, require, settings_type
+from .machine import refuse_fork
 
 F = TypeVar("F", bound=Callable[..., Any])
 T = TypeVar("T")
@@ -14,7 +15,8 @@ _ABSENT = object()
 
 def checked_keywords(function: F) -> F:
     """Decorator of a function with ``**settings: Unpack[...]``, which Python itself does not check:
-    an unknown keyword, or the absence of a necessary one, **raises** `TypeError`."""
+    an unknown keyword, or the absence of a necessary one, **raises** `TypeError`. In a process that
+    was forked after JAX had started it raises `RuntimeError`."""
     names = frozenset(argument_names(function))
     necessary = sorted(getattr(settings_type(function), "__required_keys__", ()))
 
@@ -24,6 +26,7 @@ def checked_keywords(function: F) -> F:
         refuse_unknown(function.__name__, function, unknown)
         values: dict[str, Any] = {name: keywords.get(name, _ABSENT) for name in necessary}
         require(function.__name__, values, _ABSENT)
+        refuse_fork()
         return function(*args, **keywords)
 
     return call  # pyright: ignore[reportReturnType]

@@ -7,7 +7,31 @@ from pathlib import Path
 
 import jax
 
+from lanewise.jaxprs.jaxapi import backends_are_initialized
+
 _CGROUPS = Path("/sys/fs/cgroup")
+
+_state = {"is_fork": False}
+
+
+def _after_fork() -> None:
+    _state["is_fork"] = backends_are_initialized()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
+
+
+def refuse_fork() -> None:
+    """**Raises** `RuntimeError` in a process that was forked after JAX had started: the threads of
+    JAX do not exist there, and the first compilation waits for them without end."""
+    if _state["is_fork"]:
+        raise RuntimeError(
+            "this process was made by fork after JAX had started, so that JAX would not return. "
+            "Start processes afresh: multiprocessing.get_context('spawn'), or mp_context= of "
+            "ProcessPoolExecutor. Mostly none are needed: jax.vmap and dvi.sweep use all "
+            "processors, dvi.sweep(client=...) a cluster."
+        )
 
 
 def results_memory() -> int | None:
@@ -19,25 +43,53 @@ def results_memory() -> int | None:
     return None if machine is None else machine * jax.process_count()
 
 
-@functools.cache
 def machine_memory() -> int | None:
     """Bytes of memory that this process may use: the memory of the machine, or the limit of a
-    container or of a queueing system; None: not known."""
+    container, of a queueing system or of the process (``ulimit -v``); None: not known."""
+    sizes = [*_constant_limits(), *_process_limits()]
+    return min(sizes, default=None)
+
+
+@functools.cache
+def _constant_limits() -> list[int]:
     sizes = _limits()
     with contextlib.suppress(AttributeError, ValueError, OSError):  # Windows has no sysconf
         sizes.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    return min(sizes, default=None)
+    return sizes
+
+
+def _process_limits() -> list[int]:
+    """What is left of the limits of this process, which a program may change."""
+    try:
+        import resource
+    except ImportError:  # on Windows
+        return []
+    # The address space, and the data: places in statm. Programs of XLA and their threads take some
+    # gigabytes of address space, so that what is in use counts.
+    limits = {0: resource.getrlimit(resource.RLIMIT_AS)[0]}
+    limits[5] = resource.getrlimit(resource.RLIMIT_DATA)[0]
+    limits = {place: limit for place, limit in limits.items() if limit != resource.RLIM_INFINITY}
+    pages = [0] * 6
+    if limits:
+        with contextlib.suppress(OSError, ValueError):  # Linux has it
+            pages = [int(x) for x in Path("/proc/self/statm").read_text().split()]
+    page = resource.getpagesize()
+    return [max(limit - pages[place] * page, 0) for place, limit in limits.items()]
 
 
 def _limits() -> list[int]:
     """The limits of the control groups of this process (Linux): its own and those above it."""
-    files = [_CGROUPS / "memory/memory.limit_in_bytes"]  # version 1
+    files = [_CGROUPS / "memory/memory.limit_in_bytes"]
     limits: list[int] = []
     with contextlib.suppress(OSError):
         for line in Path("/proc/self/cgroup").read_text().splitlines():
-            if line.startswith("0::/"):  # version 2
-                group = _CGROUPS / line.removeprefix("0::/")
-                files += [folder / "memory.max" for folder in (group, *group.parents)]
+            _, names, group = line.split(":", 2)
+            if not names:  # version 2
+                folder = _CGROUPS / group.strip("/")
+                files += [part / "memory.max" for part in (folder, *folder.parents)]
+            elif "memory" in names.split(","):  # version 1
+                folder = _CGROUPS / "memory" / group.strip("/")
+                files += [part / "memory.limit_in_bytes" for part in (folder, *folder.parents)]
         for file in files:
             with contextlib.suppress(OSError, ValueError):  # no such limit, or the word "max"
                 limits.append(int(file.read_text()))

@@ -3,7 +3,6 @@
 import os
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, Unpack
 
 import jax.numpy as jnp
@@ -11,6 +10,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from ..base.checks import fraction, instance, one_of, whole
+from ..base.files import user_path
 from ..base.keywords import checked_keywords
 from ..base.precision import require_double
 from .checks import requires
@@ -141,7 +141,7 @@ def fit(
     status = minimum.status
     fine = bool((status == FIT_RESULTS.converged) | (status == FIT_RESULTS.steps_done))
     if checkpoint is not None and fine:
-        Path(checkpoint).unlink(missing_ok=True)
+        user_path("checkpoint", checkpoint).unlink(missing_ok=True)
     if fine or not throw:
         return estimate
     raise FitError(

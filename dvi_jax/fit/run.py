@@ -7,7 +7,6 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -15,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..base.files import publish_npz, read_npz
+from ..base.files import publish_npz, read_npz, user_file, user_path
 from ..base.progress import bar_of, reporter
 from ..base.reads import reads
 from .checks import same_fit
@@ -84,7 +83,7 @@ class FitRun:
 
     def __post_init__(self):
         if self.checkpoint is not None:
-            file = Path(self.checkpoint)
+            file = self.checkpoint = user_path("checkpoint", self.checkpoint)
             if not file.parent.is_dir():
                 raise FileNotFoundError(
                     f"there is no directory for checkpoint={str(file)!r}: create it."
@@ -92,6 +91,7 @@ class FitRun:
             if file.is_dir():
                 raise IsADirectoryError(f"checkpoint={str(file)!r} is a directory: give a file.")
             if file.exists():
+                user_file("checkpoint", file)
                 self.resume, self.records = _read_checkpoint(file, self.identity)
 
     @property

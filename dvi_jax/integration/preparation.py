@@ -81,7 +81,7 @@ def prepare(
     plan = make_plan(run.save, num_steps)
     leaves = jax.tree.leaves((task, q0, p0))
     # An allocation that fails ends the process, or makes the machine swap.
-    check_memory(run.save, plan, q0, check_observe(task, q0, p0), leaves, layout)
+    check_memory(run.save, plan, q0, check_observe(task, q0, p0), leaves, integrator)
     has_tracer = any(is_traced(leaf) for leaf in leaves)
     # Traced values are not known before the compiled program runs: they give a status.
     if not has_tracer:

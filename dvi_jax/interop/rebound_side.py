@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ import numpy as np
 import dvi_jax as dvi
 
 from ..base.checks import instance, positive
+from ..base.files import user_file
 from ..base.inputs import refuse_unit_or_mask
 from ..systems import Problem
 from ..systems._problem import at_end
@@ -112,11 +112,7 @@ def from_rebound(
     """
     rebound = require("rebound", "interop.from_rebound")
     if isinstance(simulation, str | PathLike):
-        if not Path(simulation).is_file():
-            raise FileNotFoundError(
-                "simulation must be the path of a Simulationarchive, got no file at the path "
-                f"{str(simulation)!r}."
-            )
+        simulation = user_file("simulation", simulation)
         try:
             simulation = rebound.Simulation(str(simulation), snapshot=snapshot)
         except (RuntimeError, ValueError) as error:

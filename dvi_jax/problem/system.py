@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from ..base.checks import array, finite, instance, require
 from ..base.indices import out_of_bounds
+from ..base.machine import refuse_fork
 from ..base.reads import Reads, differences, reads
 from ..base.signature import accepts, check_takes, tracing_note, warn_of_exchanged
 from ..base.types import Args, ConstraintFn, ForceFn, HamiltonianFn, Scalar, State
@@ -206,6 +207,7 @@ def check_system(system: Any, of_map: str = "", noise_allowed: bool = False) -> 
     """**Raises** `TypeError` for an object that is not a `System`, `ValueError` for a system whose
     functions read a value that has changed since it was made, for one with noise, and for a
     constraint if `of_map` is the name of a function that examines the map (12)–(13) itself."""
+    refuse_fork()
     if not isinstance(system, System):
         hint = "Write dvi.System(H_D) for a function H_D(t0, t1, q0, p1, args)."
         if isinstance(getattr(system, "system", None), System):

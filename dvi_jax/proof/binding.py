@@ -2,7 +2,6 @@
 
 import json
 import os
-from pathlib import Path
 from typing import Any, NamedTuple, TypedDict, Unpack
 
 import jax
@@ -10,6 +9,7 @@ import jax.numpy as jnp
 
 from lanewise import Layout
 
+from ..base.files import user_file
 from ..base.keywords import checked_keywords
 from ..base.precision import refuse_double_without_x64
 from ..integration.arithmetic import Arithmetic
@@ -171,8 +171,9 @@ def _contents(certificate: Any) -> dict[str, Any]:
     contents = certificate
     if isinstance(certificate, str | os.PathLike):
         try:
-            contents = json.loads(Path(certificate).read_text(encoding="utf-8"))
-        except ValueError as error:
+            text = user_file("certificate", certificate).read_text(encoding="utf-8")
+            contents = json.loads(text)
+        except (ValueError, RecursionError) as error:
             raise ValueError(
                 f"certificate {str(certificate)!r} is no JSON file: {error}."
             ) from None

@@ -5,14 +5,13 @@ import math
 import os
 from collections.abc import Sequence
 from fractions import Fraction
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import numpy as np
 
 from ..base.checks import finite
-from ..base.files import publish
+from ..base.files import publish, user_path
 
 
 class DriftBound(eqx.Module):
@@ -120,7 +119,7 @@ class DriftBound(eqx.Module):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the certificate, a JSON file that ``dvi-jax verify`` checks."""
-        publish(Path(path), (json.dumps(self.certificate, indent=1) + "\n").encode())
+        publish(user_path("path", path), (json.dumps(self.certificate, indent=1) + "\n").encode())
 
     def __repr__(self) -> str:
         return self.report()

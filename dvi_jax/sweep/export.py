@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from ..base.files import user_path
 from ..base.results import STATUS_NAMES
 
 
 @contextlib.contextmanager
 def _whole_or_not(path: Any, force: bool, package: str) -> Iterator[Path]:
     """A temporary name next to `path`, renamed once everything is written."""
-    path = Path(path)
+    path = user_path("path", path)
     if path.exists() and not force:
         raise FileExistsError(
             f"'{path}' already exists: give another path, or force=True to replace it."

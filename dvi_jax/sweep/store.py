@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..base.files import TEMPORARY, publish
+from ..base.files import TEMPORARY, content_of, publish, user_folder
 from ..base.machine import machine_memory
 from ..base.results import STATUS_NAMES
 from .claims import claim
@@ -108,7 +108,7 @@ class Store:
             if not (path / "zarr.json").exists():
                 remedy = _RESTORE if has_tasks else "Check the path: there is no sweep here."
                 raise StoreError(f"{path}: the file zarr.json does not exist. {remedy}")
-            text = (path / "zarr.json").read_text()
+            text = content_of(path / "zarr.json")
         if not has_tasks:
             raise StoreError(
                 f"{path} has no directory {TASKS}, which a store must have: copy also the files "
@@ -122,7 +122,7 @@ class Store:
                     f"dvi-jax {attributes.get('dvi-jax', '(unknown version)')}, which made it."
                 )
             store = cls(path, attributes)
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
+        except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
             raise StoreError(
                 f"{path}: zarr.json does not describe a sweep ({type(error).__name__}: {error}). "
                 f"{_RESTORE}"
@@ -210,7 +210,7 @@ class Store:
             array = self._group()[name]
             # There is one chunk. zarr would read a missing chunk as zeros.
             file = self.path.joinpath(name, "c", *("0" for _ in array.shape))
-            if not file.exists():
+            if not file.is_file():
                 raise FileNotFoundError(errno.ENOENT, "no such file", str(file))
             values = array[:]
         except Exception as error:  # codecs have many errors for bytes that they cannot decode
@@ -253,7 +253,7 @@ class Store:
     def _read_record(self, number: int) -> dict[str, Any] | None:
         """The record of a task as it was written; None if it is missing or damaged."""
         try:
-            text = self.record_path(number).read_bytes()
+            text = content_of(self.record_path(number))
         except OSError:
             return None
         body, _, checksum = text.rstrip(b"\n").rpartition(b"\n")
@@ -269,7 +269,7 @@ class Store:
                 and counts.keys() <= set(STATUS_NAMES)
                 and sum(counts.values()) == task.lanes
             )
-        except (AttributeError, KeyError, TypeError, ValueError):
+        except (AttributeError, KeyError, TypeError, ValueError, RecursionError):
             return None
         return record if is_of_task else None
 
@@ -283,7 +283,7 @@ class Store:
             file, facts = self.shard_path(name, number), record["shards"][name]
             try:
                 size = file.stat().st_size
-                content = b"" if size_only else file.read_bytes()
+                content = b"" if size_only else content_of(file)
             except OSError as error:
                 return file, f"the shard of {name} cannot be read ({error.strerror})"
             if size != facts["bytes"]:
@@ -371,8 +371,10 @@ def _check_memory(size: int) -> None:
 
 def _store_path(path: str | os.PathLike) -> Path:
     try:
-        absolute = Path(path).resolve()
+        absolute = user_folder("store", path).resolve()
         absolute.exists()
+    except NotADirectoryError as error:
+        raise StoreError(str(error)) from None
     except (OSError, ValueError, RuntimeError) as error:
         raise StoreError(
             f"{os.fspath(path)!r:.80} cannot be the path of a store "

@@ -186,22 +186,32 @@ def run_here(program: SweepProgram, sink: MemorySink | Store, threads: Any, repo
 
 @contextlib.contextmanager
 def _instead_of_interrupt(*events: threading.Event) -> Iterator[None]:
-    """The first Ctrl-C sets these events. The exception that Python raises instead can occur at any
-    line, and is lost in some, such as a callback of the garbage collector."""
-    in_main = threading.current_thread() is threading.main_thread()
-    handler: Any = signal.getsignal(signal.SIGINT)
+    """The first Ctrl-C, or SIGTERM where it is handled in the same way, sets these events. The
+    exception that Python raises instead can occur at any line, and is lost in some, such as a
+    callback of the garbage collector."""
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    handlers: dict[int, Any] = {number: signal.getsignal(number) for number in numbers}
     # Python's handler, or one that wraps it.
-    if not in_main or getattr(handler, "__wrapped__", handler) is not signal.default_int_handler:
-        yield
-        return
+    handlers = {
+        number: handler
+        for number, handler in handlers.items()
+        if getattr(handler, "__wrapped__", handler) is signal.default_int_handler
+    }
+    if threading.current_thread() is not threading.main_thread():
+        handlers = {}
+
+    def restore() -> None:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
 
     def handle(number: int, frame: Any) -> None:
-        signal.signal(signal.SIGINT, handler)
+        restore()
         for event in events:
             event.set()
 
-    signal.signal(signal.SIGINT, handle)
+    for number in handlers:
+        signal.signal(number, handle)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, handler)
+        restore()

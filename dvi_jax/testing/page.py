@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import dvi_jax as dvi
 
+from ..base.files import user_path
 from .check import CHECKS, Measured
 from .controls import Control
 
@@ -29,7 +30,7 @@ def page_for(out: Path) -> Path:
 
     **Raises** `ValueError` for a file that exists and is not a certificate.
     """
-    out = Path(out)
+    out = user_path("--out", out)
     page = out if out.suffix == ".md" and not out.is_dir() else out / "certificate.md"
     fault = ""
     if out.exists() and not out.is_dir() and page != out:

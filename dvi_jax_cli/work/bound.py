@@ -8,7 +8,7 @@ import numpy as np
 
 import dvi_jax as dvi
 
-from .._errors import as_input_error, require
+from .._errors import as_input_error, require, user_path
 from .._show import TextTable
 from .discover import box_of
 from .output import Report, open_report
@@ -26,8 +26,9 @@ def bound_file(path: str | Path, out: str | Path | None = None, force: bool = Fa
 
     **Raises** `InputError` for bad input; nothing is written then.
     """
-    file, report = open_report("bound", Path(path), out, RESULT_FILES, force)
-    source = find_source(file, Path(path).parent)
+    path = user_path("CONFIG", path)
+    file, report = open_report("bound", path, out, RESULT_FILES, force)
+    source = find_source(file, path.parent)
     low, high = box_of(file.domain, "domain", source)
     functions = source.loader.load("invariants", file.invariants)
     condition = file.domain.inside and source.loader.load("domain.inside", file.domain.inside)

@@ -10,7 +10,7 @@ import numpy as np
 import dvi_jax as dvi
 from dvi_jax import plot
 
-from .._errors import as_input_error, describe, require
+from .._errors import as_input_error, describe, require, user_path
 from .._show import TextTable
 from .expressions import parse_basis
 from .output import Report, open_report
@@ -41,8 +41,9 @@ def discover_file(
 
     **Raises** `InputError` for bad input; nothing is written then.
     """
-    file, report = open_report("discover", Path(path), out, RESULT_FILES, force)
-    source = find_source(file, Path(path).parent)
+    path = user_path("CONFIG", path)
+    file, report = open_report("discover", path, out, RESULT_FILES, force)
+    source = find_source(file, path.parent)
     search, starts = _arguments(file, source)
     show = progress if progress is not None else lambda count, parts: None
     drift = {name: search[name] for name in ("h", "t0", "args", "method")}

@@ -13,7 +13,7 @@ from dvi_jax import plot
 from dvi_jax.fit.result import little_explained, numbers_in_words
 from dvi_jax.fit.run import progress_display as shown_bar
 
-from .._errors import InputError, one_of, require, require_name
+from .._errors import InputError, one_of, require, require_name, user_path
 from .._show import TextTable
 from .columns import column, read_columns
 from .loader import Loader
@@ -59,8 +59,9 @@ def fit_file(
 
     **Raises** `InputError` for bad input; nothing is written then.
     """
-    file, report = open_report("fit", Path(path), out, RESULT_FILES, force or resume)
-    source = find_source(file, Path(path).parent)
+    path = user_path("CONFIG", path)
+    file, report = open_report("fit", path, out, RESULT_FILES, force or resume)
+    source = find_source(file, path.parent)
     arguments, columns = fit_problem(file, source)
     checkpoint = report.folder / CHECKPOINT
     last: list[dvi.FitProgress] = []
@@ -162,7 +163,7 @@ def _observations(
     table: Data, loader: Loader, shape: tuple[int, ...], t0: float | None
 ) -> tuple[dvi.Observations, list[str]]:
     """The data, and the names of their columns."""
-    columns = read_columns(loader.folder / table.file)
+    columns = read_columns(loader.folder / user_path("data.file", table.file))
     ts = column(columns, "data.time", table.time)
     sigma, sigma_columns = table.sigma, []
     if isinstance(sigma, list):  # columns that have the standard errors

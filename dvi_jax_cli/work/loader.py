@@ -28,7 +28,7 @@ class Loader:
         running the file fails: with the line that failed.
         """
         file, _, name = text.rpartition(":")
-        leaves = os.path.isabs(file) or ".." in Path(file).parts
+        leaves = os.path.isabs(os.path.expanduser(file)) or ".." in Path(file).parts
         require(not leaves, key, f"{text!r} is not in the folder of the TOML file", _RULE)
         path = require_file(key, self.folder / file, _RULE)
         if path not in self.modules:

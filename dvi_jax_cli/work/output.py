@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from dvi_jax import plot
+from dvi_jax.base.files import release, reserve
 
-from .._errors import as_input_error, reason, require
+from .._errors import as_input_error, reason, require, user_path
 from .._show import TextTable, json_types
 from .schema import FILES
 from .table import read_file
@@ -61,20 +62,18 @@ class FolderReport(Report):
         **Raises** `InputError` where it cannot be made, or has files.
         """
         rule = "a directory that does not exist or is empty; with --force, one to write into"
-        folder, is_new = self.folder, False
+        folder = self.folder
         try:
             kinds = OSError, ValueError
             with as_input_error(self.key, rule, *kinds, prefix=f"{folder}: ", text=reason):
-                is_new = not folder.exists()
-                if is_new:
-                    folder.mkdir(parents=True)
+                if not folder.exists():
+                    reserve(folder)
                 is_free = not folder.is_dir() or self.force or not any(folder.iterdir())
             require(folder.is_dir(), self.key, f"{folder} is not a directory", rule)
             require(is_free, self.key, f"{folder} exists and is not empty", rule)
             yield
         except BaseException:  # Ctrl-C may come on any line, also right after mkdir
-            if is_new and folder.is_dir() and not any(folder.iterdir()):
-                folder.rmdir()
+            release(folder)
             raise
 
     @contextmanager
@@ -96,12 +95,16 @@ class FolderReport(Report):
         try:
             yield
         except KeyboardInterrupt:
-            names = ", ".join(sorted(file.name for file in self.folder.iterdir())) or "nothing"
+            names = ", ".join(sorted(file.name for file in self.folder.iterdir()))
+            if not names:
+                raise
             last = f" {self.files[-1]} may be incomplete." if self.files else ""
             raise KeyboardInterrupt(
-                f"by Ctrl-C while results were written. {self.folder} contains: {names}.{last} "
-                "--force writes all files again"
+                f"by Ctrl-C or SIGTERM while results were written. {self.folder} contains: "
+                f"{names}.{last} --force writes all files again"
             ) from None
+        finally:
+            release(self.folder)
 
     def path(self, name: str) -> Path:
         """The path of a file that is about to be written."""
@@ -140,7 +143,7 @@ def open_report(
     versions["python"] = platform.python_version()
     contents = {kind: str(path), "config": raw, "versions": versions}
     key = "--out" if out is not None else "output.dir"
-    folder = Path(out or file.output.dir or f"results/{path.stem}")
+    folder = user_path(key, out or file.output.dir or f"results/{path.stem}")
     return file, FolderReport(contents, folder=folder, key=key, names=names, force=force)
 
 

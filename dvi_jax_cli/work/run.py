@@ -13,7 +13,7 @@ from dvi_jax import plot
 from dvi_jax.systems.n_body import OBSERVABLES
 from dvi_jax.systems.planets.solar_system import check_covered
 
-from .._errors import as_input_error
+from .._errors import as_input_error, user_path
 from .._show import TextTable
 from . import solar
 from .observables import Observed, observe, read_observables, with_drifts
@@ -45,9 +45,10 @@ def run_file(
 
     **Raises** `InputError` for bad input; nothing is written then.
     """
-    file, report = open_report("run", Path(path), out, RESULT_FILES, force)
+    path = user_path("CONFIG", path)
+    file, report = open_report("run", path, out, RESULT_FILES, force)
     with report.reservation():
-        source = find_source(file, Path(path).parent)
+        source = find_source(file, path.parent)
         run = _arguments(file, source)
         # Those of the file come in the report; the ephemeris is compared with the same in each run.
         observables = {"own": read_observables(file.observables, source)}

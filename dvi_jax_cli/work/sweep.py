@@ -18,7 +18,7 @@ import dvi_jax as dvi
 from dvi_jax.sweep.bar import progress_display as shown_bar
 from dvi_jax.sweep.variables import RESERVED_NAMES
 
-from .._errors import InputError, as_input_error, describe, require
+from .._errors import InputError, as_input_error, describe, require, user_path
 from .._show import TextTable
 from .expressions import parse_method
 from .observables import read_observables
@@ -58,10 +58,11 @@ def sweep_file(
     for a store of another sweep, `StoreError` or `OSError` for one that cannot be written;
     `SweepInterrupted` after Ctrl-C.
     """
-    path = Path(path)
+    path = user_path("CONFIG", path)
     file, _ = read_file(path, SweepFile)
-    folder = Path(store or file.output.store or f"results/{path.stem}.zarr")
-    _check_folder(folder, "--store" if store is not None else "output.store", resume)
+    key = "--store" if store is not None else "output.store"
+    folder = user_path(key, store or file.output.store or f"results/{path.stem}.zarr")
+    _check_folder(folder, key, resume)
     source, arguments = sweep_problem(file, path.parent)
     last: list[dvi.SweepProgress] = []
     with shown_bar(progress) as show, source.at_work(str(path), "swept", _RULE, last):
@@ -76,8 +77,9 @@ def sweep_cost(path: str | Path) -> Report:
 
     **Raises** `InputError` for bad input.
     """
-    file, _ = read_file(Path(path), SweepFile)
-    source, arguments = sweep_problem(file, Path(path).parent)
+    path = user_path("CONFIG", path)
+    file, _ = read_file(path, SweepFile)
+    source, arguments = sweep_problem(file, path.parent)
     with source.at_work(str(path), "swept", _RULE):
         cost = dvi.sweep_cost(**arguments)
     contents = dataclasses.asdict(cost) | {"seconds": cost.seconds()}
@@ -298,7 +300,7 @@ def sweep_status(store: str | Path) -> Report:
     tasks_done, lanes, total = len(records), sum(sizes), math.prod(result.dims.values())
     left, rate = total - lanes, lanes / seconds if seconds else 0.0
     speed = None if math.isnan(work) else work / seconds if seconds else 0.0
-    tasks_left, size = result.num_tasks - tasks_done, _size(Path(store))
+    tasks_left, size = result.num_tasks - tasks_done, _size(result.path)
     tasks = {"done": tasks_done, "left": tasks_left, "all": result.num_tasks}
     counts = ({"not_computed": left} if left else {}) | dict(statuses)
     origin = {k: v for k, v in result.attributes.items() if k not in _NOT_OURS}

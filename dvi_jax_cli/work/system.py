@@ -15,7 +15,7 @@ from dvi_jax.base.signature import accepts
 from dvi_jax.systems import rings
 from dvi_jax.systems.planets.solar_system import EphemerisMissing, julian_date
 
-from .._errors import InputError, as_input_error, describe, require, require_name
+from .._errors import InputError, as_input_error, describe, require, require_name, user_path
 from .expressions import parse_method
 from .loader import Loader, in_one_line
 from .schema import COUNT, RunFile, SweepFile, SystemFile, Times
@@ -171,7 +171,7 @@ def _of_a_ring(file: SystemFile, loader: Loader) -> Source:
     prefix, rule = f"{ring.file!r} cannot be read: ", "a lattice file that pyAT can read"
     with as_input_error("ring.file", rule, Exception, prefix=prefix, text=in_one_line):
         options = {"use": ring.use, "symplectic": ring.symplectic, "model": ring.model}
-        read = rings.load(loader.folder / ring.file, **options)
+        read = rings.load(loader.folder / user_path("ring.file", ring.file), **options)
     record = rings.problem(read, planes=ring.planes, delta=ring.delta)
     units = {"q": "m", "t": "turns"}
     problem = systems.Problem("ring", *record[:4], args=record.args, units=units)

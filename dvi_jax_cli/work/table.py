@@ -90,6 +90,9 @@ def read_file(file: Path, model: type[T]) -> tuple[T, dict[str, Any]]:
     """
     key, kinds = str(file), (OSError, UnicodeDecodeError)
     with as_input_error(key, "a TOML file in UTF-8", *kinds, text=_unreadable):
+        # A pipe that has a name may never have a writer; those of a shell's <(…) have one.
+        is_named_pipe = file.is_fifo() and not str(file).startswith(("/dev/", "/proc/"))
+        require(not is_named_pipe, key, "it is a pipe", "a TOML file in UTF-8")
         text = file.read_text(encoding="utf-8-sig")  # some editors begin with a BOM
     kinds = ValueError, RecursionError  # of thousands of brackets
     with as_input_error(key, "https://toml.io", *kinds, prefix="it is not TOML: "):

@@ -48,10 +48,12 @@ def compare_system(certificate: Path, system: str, method: str) -> tuple[dict[st
     """Whether a certificate is about the system ``file.py:name``, and the message if it is not."""
     from dvi_jax import holds_for
 
+    from .._errors import user_path
     from .loader import Loader
 
     path, _, name = system.rpartition(":")
-    loaded = Loader(Path(path).parent).load("--system", f"{Path(path).name}:{name}")
+    file = user_path("--system", path)
+    loaded = Loader(file.parent).load("--system", f"{file.name}:{name}")
     binding = holds_for(loaded, certificate, method=method or None)
     contents = {"system": system, "text": str(binding), **binding._asdict()}
     return contents, "" if binding else f"the certificate is not about {system}"

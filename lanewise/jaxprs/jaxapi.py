@@ -25,11 +25,12 @@ def is_traced(x: object) -> bool:
     return isinstance(x, Tracer)
 
 
-def batch_size(values: Iterable[Any]) -> tuple[int, bool]:
-    """The number of elements of all batches of `vmap` around these values; and whether they are
-    values of a function that is compiled, around which there may be more batches."""
+def batch_size(values: Iterable[Any]) -> tuple[int, bool, bool]:
+    """The number of elements of all batches of `vmap` around these values; whether they are values
+    of a function that is compiled, around which there may be more batches; and whether they are
+    differentiated."""
     sizes: dict[Any, int] = {}
-    is_compiled = False
+    is_compiled = is_differentiated = False
     for x in values:
         # Transformations nest: a tracer may hold the tracer of another transformation.
         while isinstance(x, Tracer):
@@ -39,11 +40,11 @@ def batch_size(values: Iterable[Any]) -> tuple[int, bool]:
                 sizes[id(getattr(inner, "_trace", None))] = inner.val.shape[axis]
                 x = inner.val
             elif hasattr(inner, "primal"):
-                x = inner.primal
+                x, is_differentiated = inner.primal, True
             else:
                 is_compiled = True
                 break
-    return math.prod(sizes.values()), is_compiled
+    return math.prod(sizes.values()), is_compiled, is_differentiated
 
 
 def threefry2x32(key: jax.Array, first: jax.Array, second: jax.Array) -> list[jax.Array]:

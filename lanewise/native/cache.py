@@ -8,10 +8,13 @@ process never sees half of one; the oldest are removed when the folder grows bey
 """
 
 import contextlib
+import functools
 import hashlib
 import os
+import re
 import stat
 import tempfile
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +24,10 @@ LARGEST = 256 * 2**20  # bytes that the folder may hold
 
 # The first bytes of each file: other files in a folder that the user named are not taken for code.
 _MARK = b"lanewise"
+
+
+# The names of our files: the folder may be one in which the user has others.
+_NAME = re.compile(r"[0-9a-f]{64}|\.new-.*")
 
 
 def key(*parts: Any) -> str:
@@ -33,13 +40,29 @@ def folder() -> Path | None:
     setting = os.environ.get(VARIABLE, "").strip()
     if setting.lower() in ("off", "0", "no", "false"):
         return None
-    if setting:
-        return Path(setting).expanduser()
-    base = os.environ.get("XDG_CACHE_HOME", "").strip()
+    base = Path(os.environ.get("XDG_CACHE_HOME", "").strip())
+    where = None
     try:
-        return (Path(base) if base else Path.home() / ".cache") / "dvi_jax"
-    except RuntimeError:  # no home directory
-        return None
+        if setting:
+            where = Path(setting).expanduser()
+        else:  # the standard ignores a relative one, also one that begins with ~
+            where = (base if base.is_absolute() else Path.home() / ".cache") / "dvi_jax"
+        nearest = next(part for part in (where, *where.absolute().parents) if part.exists())
+        is_folder = nearest.is_dir()
+    except (OSError, ValueError, RuntimeError):  # no home directory, or a name that cannot exist
+        is_folder = False
+    if not is_folder and setting:
+        _warn_once(setting)
+    return where if is_folder else None
+
+
+@functools.cache
+def _warn_once(setting: str) -> None:
+    warnings.warn(
+        f"{VARIABLE}={setting!r} is not a folder and cannot become one: machine code is not "
+        f"stored, and each process makes it again. Give a folder, or {VARIABLE}=off.",
+        stacklevel=2,
+    )
 
 
 def _is_safe(path: Path) -> bool:
@@ -60,6 +83,8 @@ def read(name: str) -> bytes | None:
     path = where / name
     try:
         if not _is_safe(where):
+            return None
+        if not path.is_file():  # a pipe would block
             return None
         with path.open("rb") as file:
             # A file in a safe folder may still have been moved there by somebody else.
@@ -105,7 +130,7 @@ def write(name: str, code: bytes) -> None:
 def _bound(where: Path) -> None:
     """Remove the files that were not used for longest, down to three quarters of `LARGEST`."""
     files = []
-    for entry in os.scandir(where):
+    for entry in filter(lambda entry: _NAME.fullmatch(entry.name), os.scandir(where)):
         with contextlib.suppress(OSError):
             status = entry.stat()
             files.append((status.st_mtime, status.st_size, entry.path))

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ...base.checks import positive
+from ...base.files import user_file, user_path
 from ._field import Field, fitted_modes, from_modes, from_surfaces
 from ._sums import Coefficients, Shape, total
 
@@ -158,6 +159,7 @@ def read_geometry(
 def _surfaces(path: Any, even: list[str], odd: list[str], psi: float | None = None) -> _Surfaces:
     from scipy.io import netcdf_file  # a part of import time
 
+    path = user_file("path", path)
     try:
         with netcdf_file(str(path), "r", mmap=False) as file:
             variables = {k: np.array(v.data) for k, v in file.variables.items()}
@@ -210,13 +212,14 @@ def save_field(field: Field, path: Any, source: str = "") -> None:
     modes = [(m, n, parts[:, i]) for i, (m, n) in enumerate(field.modes)]
     lines = ",\n".join(json.dumps([m, n, *b.tolist()]) for m, n, b in modes if b.any())
     text = json.dumps(contents, indent=1)[:-2] + ',\n "modes": [\n' + lines + "\n]}\n"
-    Path(path).write_text(text)
+    user_path("path", path).write_text(text)
 
 
 def load_field(path: Any) -> Field:
     """A field that `save_field` has written. **Raises** `ValueError` for another file."""
+    text = user_file("path", path).read_bytes()
     try:
-        contents = json.loads(Path(path).read_text())
+        contents = json.loads(text)
         rows = contents["modes"]
         return from_modes(
             [row[0] for row in rows],
@@ -224,7 +227,7 @@ def load_field(path: Any) -> Field:
             np.moveaxis(np.array([row[2:] for row in rows], float), 1, 0),
             **{k: contents[k] for k in ("psi_edge", "iota", "G", "I", "periods", "helicity")},
         )
-    except (KeyError, IndexError, TypeError, json.JSONDecodeError) as error:
+    except (LookupError, TypeError, ValueError, RecursionError) as error:
         raise ValueError(
             f"{path} is not a field that save_field has written: {error!r}."
         ) from error

@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ...base.checks import finite
+from ...base.files import user_file
 from .._problem import Parameter, Problem, Start, System, library_problem, over_times, vector
 from .solar_system import installed_file
 
@@ -73,7 +74,7 @@ def read_polar_motion(path: str | Path | None = None) -> PolarMotion:
     to use with acknowledgement. Format: readme.finals2000A of the same centre. Method of Bulletin
     A: McCarthy & Luzum 1991, *Bull. Géod.* 65, 22.
     """
-    path = Path(path or installed_file("finals2000A.all", "the measured polar motion"))
+    path = user_file("path", path or installed_file("finals2000A.all", "the measured polar motion"))
     with path.open(encoding="ascii", errors="replace") as file:
         lines = [(i, line) for i, line in enumerate(file, 1) if line[_FLAG : _FLAG + 1] == "I"]
     if not lines:

@@ -4,12 +4,12 @@ import dataclasses
 import math
 import os
 import warnings
-from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
 
 from ...base.checks import one_of
+from ...base.files import user_file
 from ._elements import C, Element, Model, bend, cavity, corrector, drift, multipole, solenoid
 from ._files import check_source, read_lattice
 from ._maps import RingPart
@@ -82,10 +82,10 @@ def load(
         raise ImportError(
             'rings.load requires accelerator-toolbox: pip install "dvi-jax[rings]".'
         ) from error
-    Path(path).stat()  # a missing file has a clear error here, and none in some of the readers
-    lattice = read_lattice(Path(path), use, options)
+    path = user_file("path", path)  # some of the readers of pyAT have no clear error
+    lattice = read_lattice(path, use, options)
     cavities = [e.FamName for e in lattice if isinstance(e, at.RFCavity) and _is_off(e)]
-    if cavities and Path(path).suffix not in (".mat", ".m", ".repr"):
+    if cavities and path.suffix not in (".mat", ".m", ".repr"):
         warnings.warn(
             "pyAT switches off the cavities of this file and may ignore their phases: "
             f"{cavities[:8]}. For a ring in 6D read the lattice with pyAT, set TimeLag of the "

@@ -13,6 +13,7 @@ from rich.table import Table
 
 import dvi_jax as dvi
 
+from ...base.files import release, reserve, user_folder
 from .claims import Claim, Verdict, judge, pretty
 from .experiments import Measurements, measure
 from .figures import FIGURES, draw
@@ -47,19 +48,21 @@ def reproduce(out: Path | str, force: bool = False, console: Console | None = No
 
     **Source** the paper, Section 5; the verdicts' criteria are ours.
     """
-    out = Path(out)
-    if out.exists() and not out.is_dir():
-        raise NotADirectoryError(f"out must be a folder, but {out} is a file.")
+    out = user_folder("out", out)
     if out.exists() and any(out.iterdir()) and not force:
         raise FileExistsError(
             f"out must be a new or an empty folder, but {out} is not empty: choose another folder, "
             "or use force=True (--force), which overwrites files of the same names."
         )
-    out.mkdir(parents=True, exist_ok=True)
     console = Console() if console is None else console
     began = time.perf_counter()
-    with jax.enable_x64(True), _on_cpu():
-        measurements = measure(console)
+    reserve(out)
+    try:
+        with jax.enable_x64(True), _on_cpu():
+            measurements = measure(console)
+    except BaseException:
+        release(out)
+        raise
     claims = judge(measurements)
     seconds = time.perf_counter() - began
 
