@@ -18,7 +18,7 @@ from ..base.types import Interval, State
 from ..problem.flows import Flow, Kepler, Known
 from ..problem.split import Split
 from ..problem.system import System
-from ._base import InLoop, Method
+from ._base import Coordinates, InLoop, Method
 from ._gauss_legendre import GaussLegendre
 from ._schemes import as_scheme, check_scheme, sequence_of
 from ._strang import Strang
@@ -68,6 +68,9 @@ class SplittingMethod(Method):
 
     scheme: eqx.AbstractVar[Any]
 
+    has_coordinates: ClassVar[bool] = False
+    """Whether the coordinates of the parts are others than (q, p)."""
+
     is_symplectic: ClassVar[bool] = True
     is_invertible: ClassVar[bool] = True
 
@@ -81,6 +84,12 @@ class SplittingMethod(Method):
 
     def leave(self, equations: Equations, interval: Interval, q: State, p: State) -> StateAndInfo:
         """The inverse of `enter`."""
+        return q, p, no_step_yet(q)
+
+    def correct(
+        self, equations: Equations, interval: Interval, q: State, p: State, sign: int
+    ) -> StateAndInfo:
+        """In these coordinates, a map before the first step (`sign` 1), or its inverse (−1)."""
         return q, p, no_step_yet(q)
 
     # A type checker would require abstract variables as arguments of every subclass.
@@ -103,25 +112,18 @@ class SplittingMethod(Method):
         return tuple(c for i, c in sequence_of(self.scheme, 2) if i == 1)
 
     def step(self, equations, interval, q0, p0):
-        stages = stages_of(self._sequence(equations, interval, q0))
-        return self._in_coordinates(equations, interval, stages, q0, p0)
+        middle = _InCoordinates(self).step
+        return _in_turn(equations, interval, q0, p0, self.enter, middle, self.leave)
 
     def inverse(self, equations, interval, q1, p1):
-        stages = stages_of(self._sequence(equations, interval, q1))
-        reverse = [stage.inverse() for stage in reversed(stages)]
-        return self._in_coordinates(equations, interval, reverse, q1, p1)
+        middle = _InCoordinates(self).inverse
+        return _in_turn(equations, interval, q1, p1, self.enter, middle, self.leave)
 
     def _sequence(self, equations, interval, q):
         return sequence_of(self.scheme, len(self.parts(equations, interval, q)))
 
-    def _in_coordinates(self, equations, interval, stages, q, p) -> StateAndInfo:
-        q, p, first = self.enter(equations, interval, q, p)
-        q, p, info = self.compose(equations, interval, stages, q, p)
-        q, p, last = self.leave(equations, interval, q, p)
-        return q, p, first.then(info).then(last)
-
     def compose(
-        self, equations: Equations, interval: Interval, stages: list[Stage], q: State, p: State
+        self, equations: Equations, interval: Interval, q: State, p: State, stages: list[Stage]
     ) -> StateAndInfo:
         """One flow after another."""
         parts = self.parts(equations, interval, q)
@@ -152,30 +154,82 @@ class SplittingMethod(Method):
         sequence = sequence_of(self.scheme, len(parts))
         # Two flows of the first part are one only if they are exact.
         (_, a), *flows = sequence
-        return _in_loop(self, a) if self.is_symmetric and flows and parts[0].is_exact else None
+        return _joined(self, a) if self.is_symmetric and flows and parts[0].is_exact else None
+
+    def in_coordinates(self, equations, interval, q):
+        if not self.has_coordinates:
+            return None
+        return Coordinates(self.enter, _InCoordinates(self), self.leave)
 
     def needs_no_solve(self, equations, interval, q) -> bool:
         return all(part.is_exact for part in self.parts(equations, interval, q))
 
 
-def _in_loop(method: SplittingMethod, a: float) -> InLoop:
+def _in_turn(equations: Equations, interval: Interval, q: State, p: State, *maps) -> StateAndInfo:
+    """The state after one map after the other, and the status of all."""
+    q, p, info = maps[0](equations, interval, q, p)
+    for advance in maps[1:]:
+        q, p, later = advance(equations, interval, q, p)
+        info = info.then(later)
+    return q, p, info
+
+
+def _joined(method: SplittingMethod, a: float) -> InLoop:
     """(A(a) W A(a))ⁿ is A(a) (W A(2a))ⁿ A(−a), which has one flow less per step."""
 
-    def first_part(equations, interval, q, p):
-        q, p, first = method.enter(equations, interval, q, p)
-        q, p, info = method.compose(equations, interval, [Stage(0, 0.0, -a, -a)], q, p)
-        return q, p, first.then(info)
+    def part(stage: Stage) -> Callable:
+        return functools.partial(method.compose, stages=[stage])
+
+    def first(*state):
+        before = functools.partial(method.correct, sign=1)
+        return _in_turn(*state, method.enter, before, part(Stage(0, 0.0, -a, -a)))
 
     def step(equations, interval, q, p):
         _, *middle, _ = method._sequence(equations, interval, q)
-        return method.compose(equations, interval, stages_of([(0, 2 * a), *middle], -a), q, p)
+        return method.compose(equations, interval, q, p, stages_of([(0, 2 * a), *middle], -a))
 
-    def last_part(equations, interval, q, p):
-        q, p, info = method.compose(equations, interval, [Stage(0, 1 - a, 1.0, a)], q, p)
-        q, p, last = method.leave(equations, interval, q, p)
-        return q, p, info.then(last)
+    def last(*state):
+        after = functools.partial(method.correct, sign=-1)
+        return _in_turn(*state, part(Stage(0, 1 - a, 1.0, a)), after, method.leave)
 
-    return InLoop(first_part, step, last_part)
+    return InLoop(first, step, last)
+
+
+class _InCoordinates(Method):
+    """A method without the conversions to the coordinates of its parts and back."""
+
+    method: SplittingMethod
+
+    is_invertible: ClassVar[bool] = True
+
+    @property
+    def order(self) -> int:
+        return self.method.order
+
+    @property
+    def is_symmetric(self) -> bool:
+        return self.method.is_symmetric
+
+    @property
+    def is_symplectic(self) -> bool:
+        return self.method.is_symplectic
+
+    def needs_no_solve(self, equations, interval, q) -> bool:
+        return self.method.needs_no_solve(equations, interval, q)
+
+    def step(self, equations, interval, q0, p0):
+        stages = stages_of(self.method._sequence(equations, interval, q0))
+        return self._corrected(equations, interval, stages, q0, p0)
+
+    def inverse(self, equations, interval, q1, p1):
+        stages = stages_of(self.method._sequence(equations, interval, q1))
+        reverse = [stage.inverse() for stage in reversed(stages)]
+        return self._corrected(equations, interval, reverse, q1, p1)
+
+    def _corrected(self, equations, interval, stages, q, p) -> StateAndInfo:
+        before, after = (functools.partial(self.method.correct, sign=sign) for sign in (1, -1))
+        compose = functools.partial(self.method.compose, stages=stages)
+        return _in_turn(equations, interval, q, p, before, compose, after)
 
 
 class Splitting(SplittingMethod):
