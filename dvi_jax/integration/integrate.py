@@ -184,7 +184,7 @@ def solve(trajectory: PreparedRun, progress: Any = None) -> Solution:
     observables = jax.tree.leaves(request.observe, is_leaf=is_observable)
     # In the variables of the request: those of the lattice may have no initial state of this form.
     if any(isinstance(observable, OfState) for observable in observables):
-        return with_initial_values(solution, request, layout)
+        return with_initial_values(solution, request, layout, task.reads)
     return solution
 
 
