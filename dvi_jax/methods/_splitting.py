@@ -4,12 +4,14 @@ import abc
 import dataclasses
 import functools
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from lanewise.jaxprs.dependence import depends_on
@@ -24,6 +26,9 @@ from ._schemes import as_scheme, check_scheme, sequence_of
 from ._strang import Strang
 from ._type_ii import TypeII
 from .step import Equations, StepInfo, judge, no_solve, no_step_yet
+
+_SMALL = 0.1
+"""A first part that is smaller than this, relative to the second, causes a warning."""
 
 StateAndInfo = tuple[State, State, StepInfo]
 
@@ -244,7 +249,8 @@ class Splitting(SplittingMethod):
       flows of one part are joined, so that ``Strang()`` is A(h/2) B(h) A(h/2).
     - generalised orders (n₁, n₂, …) for two parts A + εB, with an error O(ε h^n₁ + ε² h^n₂ + …):
       (2, 2), (4, 2), … (10, 2) of Laskar & Robutel, (8, 4) of McLachlan, (10, 4), (8, 6, 4) and
-      (10, 6, 4) of Blanes et al. They need a small second part, not a small h.
+      (10, 6, 4) of Blanes et al. They need a small second part, not a small h: a run in which the
+      first part is the smaller one at the initial state warns.
 
     A step is explicit where all flows are known or exact. Parts with both q0 and p1 are advanced by
     `GaussLegendre`, of the order of the scheme.
@@ -265,7 +271,10 @@ class Splitting(SplittingMethod):
         check_scheme(self.scheme)
 
     def check(self, equations, first_interval, q, p):
-        """**Raises** `ValueError` if a flow of the user is not that of its Hamiltonian there."""
+        """**Raises** `ValueError` if a flow of the user is not that of its Hamiltonian there.
+        Warns where generalised orders are used with the smaller part first."""
+        if isinstance(self.scheme, tuple):
+            self._check_sizes(equations, first_interval(), q, p)
         interval = first_interval()
         t, zero = interval.t0, jnp.zeros_like(interval.h)
         for i, H_i in enumerate(getattr(equations.system.H_D, "parts", ())):
@@ -282,6 +291,24 @@ class Splitting(SplittingMethod):
                         "identity at h = 0, with the derivative (∂H/∂p, −∂H/∂q); at the initial "
                         f"state the difference is {defect:.3g}."
                     )
+
+    def _check_sizes(self, equations, interval, q, p):
+        parts = getattr(equations.system.H_D, "parts", ())
+        all_equations = [dataclasses.replace(equations, system=System(H_i)) for H_i in parts]
+        rates = np.array([equations_i.rates(interval, q, p) for equations_i in all_equations])
+        # Positions and momenta have different units: each is relative to the largest one.
+        rates = np.abs(rates).reshape(len(parts), 2, -1).max(axis=-1)
+        largest = np.maximum(rates.max(axis=0), np.finfo(rates.dtype).tiny)
+        first, *others = (rates / largest).max(axis=1)
+        # A first part that is at rest, as T(p) at p = 0, is not known to be small.
+        if len(others) == 1 and 0 < first < _SMALL * others[0]:
+            warnings.warn(
+                f"the first part of dvi.Split is the smaller one: at the initial state it changes "
+                f"the state {others[0] / first:.2g} times less than the second. The orders "
+                f"{self.scheme} hold for A + εB with a small second part: write the larger part "
+                "first.",
+                stacklevel=5,  # the call of `integrate`
+            )
 
     def is_double_only(self, equations) -> bool:
         return any(isinstance(part, Kepler) for part in getattr(equations.system.H_D, "parts", ()))
