@@ -355,7 +355,7 @@ def kinetic(t0, t1, q0, p1, args):
     [
         ([quartic, flows.Harmonic(omega=1.3)], (8, 4), True),
         ([quartic, flows.Kepler(k=1.0)], (4, 2), True),
-        ([lambda *at: 1e-3 * large(*at), kinetic], (2, 2), True),
+        ([lambda *at: 1e-3 * large(*at), large], (2, 2), True),
         ([flows.Harmonic(omega=1.3), quartic], (8, 4), False),
         ([kinetic, lambda *at: large(*at) - kinetic(*at)], (4, 2), False),
         ([quartic, flows.Harmonic(omega=1.3)], dvi.Strang(), False),

@@ -105,16 +105,17 @@ def take_step(
     interval = task.in_precision(interval)
     equations = task.equations_at(carry.k, interval)
     step = task.arithmetic.interpret(task.method.step if in_loop is None else in_loop.step)
-    is_converted = carry.method_state is not None
-    before = carry.method_state if is_converted else (carry.q, carry.p)
+    # Maps to the coordinates of the method and back, where the carry has both.
+    conversion = None if carry.method_state is None else in_loop
+    before = carry.method_state or (carry.q, carry.p)
 
     def one_step(q, p):
         local, *state = task.arithmetic.enter(equations, q, p, carry.remainder)
         q1, p1, info = step(local, interval, *state)
         q1, p1, remainder = task.arithmetic.leave(q, p, q1, p1)
-        if not is_converted:
+        if conversion is None:
             return (q1, p1, None), (remainder, rounded(info))
-        x1, y1, last = in_loop.last(local, interval, q1, p1)
+        x1, y1, last = conversion.last(local, interval, q1, p1)
         return (x1, y1, (q1, p1)), (remainder, info.then(last))
 
     def has_succeeded(result):
@@ -125,8 +126,8 @@ def take_step(
     if task.has_deviations:
         # One linearisation serves all deviation vectors of all reductions.
         state, push, (remainder, info) = jax.linearize(advance, *before, has_aux=True)
-        if is_converted:
-            first, of_method = functools.partial(in_loop.first, equations, interval), push
+        if conversion is not None:
+            first, of_method = functools.partial(conversion.first, equations, interval), push
             _, enter = jax.linearize(lambda *state: first(*state)[:2], carry.q, carry.p)
             push = lambda *change: of_method(*enter(*change))  # noqa: E731
     else:
@@ -262,7 +263,9 @@ def run(
 
     def leave(carry):
         """The carry with the state in (q, p), at the end of its last step."""
-        return _advanced(task, in_loop.last, carry, carry.k - 1) if is_joined else carry
+        if in_loop is None or not in_loop.is_joined:
+            return carry
+        return _advanced(task, in_loop.last, carry, carry.k - 1)
 
     def over_steps(body, state, count):
         if inner_loop is None:

@@ -207,17 +207,19 @@ class _InCoordinates(Method):
 
     is_invertible: ClassVar[bool] = True
 
-    @property
-    def order(self) -> int:
-        return self.method.order
+    is_symplectic: ClassVar[bool] = True
+    if TYPE_CHECKING:
+        order: ClassVar[int]
+        is_symmetric: ClassVar[bool]
+    else:
 
-    @property
-    def is_symmetric(self) -> bool:
-        return self.method.is_symmetric
+        @property
+        def order(self) -> int:
+            return self.method.order
 
-    @property
-    def is_symplectic(self) -> bool:
-        return self.method.is_symplectic
+        @property
+        def is_symmetric(self) -> bool:
+            return self.method.is_symmetric
 
     def needs_no_solve(self, equations, interval, q) -> bool:
         return self.method.needs_no_solve(equations, interval, q)
