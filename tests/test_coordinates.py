@@ -16,7 +16,7 @@ TWO = systems.n_body(
     p0=[[0.0, -1.05 * MASS], [0.0, 1.05 * MASS]],
     h=H,
 )
-"""The map of `WisdomHolman` is the exact motion of two bodies: what is left are rounding errors."""
+"""The map of `WisdomHolman` is the exact motion of two bodies: all errors are rounding errors."""
 ENERGY = TWO.observables["energy"]
 
 
