@@ -1,5 +1,6 @@
 """Batches of trajectories compiled to machine code, from functions written in JAX for one."""
 
+from .derivative import with_derivative as with_derivative
 from .explained import Explanation as Explanation, Part as Part, explain as explain
 from .implicit import implicit_root as implicit_root
 from .linear import on_any as on_any, solve as solve, unit_vectors as unit_vectors

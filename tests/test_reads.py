@@ -14,6 +14,7 @@ import pytest
 
 import dvi_jax as dvi
 from dvi_jax.base.reads import reads
+from dvi_jax.observe import Reduction, of_steps
 
 STIFFNESS = 1.0
 TABLE = np.array([1.0, 2.0])
@@ -252,3 +253,86 @@ def test_no_warning_from_reading():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         reads(lambda: (ARRAY, np, jnp, warnings))
+
+
+class Path(dvi.BrownianPath):
+    def increments(self, k, interval, parts, count):
+        return jnp.full((parts, count), STIFFNESS) * jnp.sqrt(interval.h)
+
+
+class Mine(dvi.TypeII):
+    factor = STIFFNESS
+
+    def step(self, equations, interval, q0, p0):
+        return super().step(equations, interval, q0 * STIFFNESS * self.factor, p0)
+
+
+class Largest(Reduction):
+    function: object
+
+    def start(self, value):
+        return value
+
+    def update(self, memory, k, t, value):
+        return jnp.maximum(memory, STIFFNESS * value)
+
+    def finish(self, memory):
+        return memory
+
+
+def free(t0, t1, q0, p1, args):
+    return p1 @ p1 / 2 + q0 @ q0 / 2
+
+
+PLAIN = dvi.System(free)
+NOISY = dvi.System(free, noise=lambda t, q, p, args: jnp.ones(1))
+TWO = dvi.systems.n_body([1.0, 1e-3], [[0.0, 0.0], [1.0, 0.0]], [[0.0, 0.0], [0.0, 1e-3]])
+
+
+def run(system=PLAIN, q0=(1.0,), p0=(0.0,), **options):
+    return dvi.integrate(system, np.array(q0), np.array(p0), h=0.1, num_steps=9, **options)
+
+
+def clock(t, q, p, args):
+    return STIFFNESS * t
+
+
+WHAT_A_RUN_CALLS = {
+    "clock": lambda: run(save=dvi.Save(ts=[0.2, 0.3], clock=clock)).qs,
+    "path": lambda: run(NOISY, path=Path(), method=dvi.BAOAB()).qs,
+    "method": lambda: run(method=Mine()).qs,
+    "base of a method": lambda: run(method=dvi.Strang(base=Mine())).qs,
+    "reduction": lambda: run(observe=Largest(of_steps(lambda q, p: q[0]))).observed,
+    "initial value": lambda: run(observe=lambda q, p: STIFFNESS * q[0]).observed[:1],
+    "gravity": lambda: run(
+        TWO.system, TWO.q0, TWO.p0, args=TWO.args, method=dvi.WisdomHolman(G=lambda args: STIFFNESS)
+    ).qs,
+    "section": lambda: dvi.poincare_section(
+        PLAIN, [[1.0]], [[0.5]], lambda t, q, p, args: q[0] - 0.1 * STIFFNESS, h=0.1, num_steps=99,
+        crossings=1, method=dvi.Strang(),
+    ).ts,
+}  # fmt: skip
+
+
+SLOW = ("gravity", "section")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in WHAT_A_RUN_CALLS],
+)
+def test_all_that_a_run_calls_reads_the_new_value(name, monkeypatch):
+    f = WHAT_A_RUN_CALLS[name]
+    monkeypatch.setitem(globals(), "STIFFNESS", 1.0)
+    first = np.asarray(f())
+    monkeypatch.setitem(globals(), "STIFFNESS", 2.0)
+    second = np.asarray(f())
+    assert not np.array_equal(first, second, equal_nan=True)
+    jax.clear_caches()
+    np.testing.assert_array_equal(second, f())
+
+
+def test_a_constant_of_a_class_is_read(monkeypatch):
+    first = np.asarray(run(method=Mine()).qs)
+    monkeypatch.setattr(Mine, "factor", 2.0)
+    assert not np.array_equal(first, run(method=Mine()).qs)

@@ -1,5 +1,7 @@
 """Splitting methods: known flows, generalised orders, and the method of Wisdom and Holman."""
 
+import warnings
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -338,6 +340,34 @@ def test_a_flow_of_another_hamiltonian_is_refused():
     for wrong in (lambda h, q, p, a: (q, p + h * q**3), lambda h, q, p, a: (q, 2 * p)):
         with pytest.raises(ValueError, match="flow of part 1 of Split must be that"):
             end(dvi.Splitting(), 0.1, 5, make(wrong), eps=0.1)
+
+
+def large(t0, t1, q0, p1, args):
+    return p1 @ p1 / 2 + q0 @ q0 / 2
+
+
+def kinetic(t0, t1, q0, p1, args):
+    return p1 @ p1 / 2
+
+
+@pytest.mark.parametrize(
+    ("parts", "scheme", "warns"),
+    [
+        ([quartic, flows.Harmonic(omega=1.3)], (8, 4), True),
+        ([quartic, flows.Kepler(k=1.0)], (4, 2), True),
+        ([lambda *at: 1e-3 * large(*at), large], (2, 2), True),
+        ([flows.Harmonic(omega=1.3), quartic], (8, 4), False),
+        ([kinetic, lambda *at: large(*at) - kinetic(*at)], (4, 2), False),
+        ([quartic, flows.Harmonic(omega=1.3)], dvi.Strang(), False),
+    ],
+)
+def test_the_smaller_part_first_warns(parts, scheme, warns):
+    """The error of (8, 4) is then 2 000 times as large; that of `Strang` is about the same."""
+    system, method = dvi.System(dvi.Split(parts)), dvi.Splitting(scheme)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        end(method, 0.1, 2, system)
+    assert any("smaller one" in str(w.message) for w in caught) is warns
 
 
 THREE = systems.n_body(

@@ -7,7 +7,7 @@ import functools
 import inspect
 import sys
 import types
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
@@ -45,7 +45,8 @@ class _Identity:
 
 
 def reads(*values: Any) -> Reads:
-    """The values that functions read from outside: those in `values`, in pytrees and in modules.
+    """The values that functions read from outside: those in `values`, in pytrees and in modules,
+    and the methods of the classes that a user has written for these.
 
     - Numbers, strings, tuples, lists, dictionaries and NumPy arrays are compared by value (arrays
       above 1 MiB and lists above 1000 entries in part), other objects by identity.
@@ -54,8 +55,10 @@ def reads(*values: Any) -> Reads:
       `jax.jit` has compiled for the user, files, and results of calls are not seen.
     """
     reader = _Reader()
-    for value in values:
-        for function in _functions(value):
+    for function in _functions(values):
+        if isinstance(function, type):
+            reader.follow_class(function)
+        else:
             reader.follow(function)
     return tuple(reader.values.items())
 
@@ -76,11 +79,16 @@ def _difference(old: Any, new: Any) -> str:
     return "an array whose values have changed" if old[0] == new[0] == "array" else "replaced"
 
 
-def _functions(value: Any) -> Iterator[Callable]:
-    """The functions in a pytree, a module, or a container."""
+def _functions(value: Any) -> Iterator[Any]:
+    """The functions in a pytree, a module, or a container; and the classes of its modules that are
+    not of a library, whose methods a run may call."""
     # Arrays in a module are arguments of a compiled program, not constants: they may change.
     if isinstance(value, eqx.Module):
-        for inner in vars(value).values():
+        fields = vars(value)
+        if fields.get("reads"):  # a system, whose values are compared when a run begins
+            return
+        yield from _user_classes(type(value))
+        for inner in fields.values():
             yield from _functions(inner)
         if callable(value):
             yield inspect.unwrap(type(value).__call__)
@@ -92,6 +100,11 @@ def _functions(value: Any) -> Iterator[Callable]:
             yield from _functions(inner)
     elif callable(value) and not isinstance(value, type):
         yield value
+
+
+@functools.lru_cache(maxsize=4096)
+def _user_classes(kind: type) -> tuple[type, ...]:
+    return tuple(base for base in kind.__mro__ if not _is_of_a_library(base.__module__))
 
 
 class _Reader:
@@ -128,6 +141,20 @@ class _Reader:
                 self.follow(inner)
         elif callable(function) and inspect.ismethod(function.__call__):
             self.follow(function.__call__)
+
+    def follow_class(self, kind: type) -> None:
+        """Collect the constants of a class, and what its methods and properties read."""
+        if not self.is_new(kind):
+            return
+        for name, member in vars(kind).items():
+            if name.startswith("__") and name != "__call__":
+                continue
+            if isinstance(member, property):
+                self.follow(member.fget)
+            elif callable(function := getattr(kind, name, None)):
+                self.follow(inspect.unwrap(function))
+            elif isinstance(member, (*_SIMPLE, np.ndarray, list, tuple, dict)):
+                self.note(f"{kind.__name__}.{name}", member, ())
 
     def follow_code(self, function: types.FunctionType) -> None:
         code = function.__code__

@@ -16,6 +16,7 @@ from lanewise.jaxprs.jaxapi import is_traced
 from ..base.checks import finite, positive, whole
 from ..base.inputs import as_parameter, as_scalar, start_state
 from ..base.keywords import checked_keywords
+from ..base.reads import Reads, reads
 from ..base.results import RESULTS, status_name
 from ..base.types import Args, Scalar, State
 from ..engine.newton import RootSolver
@@ -92,14 +93,17 @@ def _of_orbit(tree: Any, i: Array) -> Any:
     return jax.tree.map(lambda x: x.values[i] if is_per_orbit(x) else x, tree, is_leaf=is_per_orbit)
 
 
+# The last argument, of both functions, is a part of the key of compiled programs.
 @eqx.filter_jit
-def _orbits(run: _SectionRun, start, h, epsilon, args, count: int) -> PoincareSection:
+def _orbits(run: _SectionRun, start, h, epsilon, args, count: int, _: Reads) -> PoincareSection:
     inputs = (start, h, epsilon, args)
     return jax.vmap(lambda i: run.orbit(*_of_orbit(inputs, i))[0])(jnp.arange(count))
 
 
 @eqx.filter_jit
-def _one_after_another(run: _SectionRun, start, h, epsilon, args, count: int) -> PoincareSection:
+def _one_after_another(
+    run: _SectionRun, start, h, epsilon, args, count: int, _: Reads
+) -> PoincareSection:
     """Each orbit from the final state of the one before; from the start if that one failed."""
 
     def advance(state, i):
@@ -169,7 +173,7 @@ def poincare_section(
                 f"length {length}."
             )
     try:
-        orbits = _orbits(run, (t0, _PerOrbit(q), _PerOrbit(p)), *inputs, q.shape[0])
+        orbits = _orbits(run, (t0, _PerOrbit(q), _PerOrbit(p)), *inputs, q.shape[0], reads(run))
     except Exception as error:
         if any("called with q0 of shape" in note for note in getattr(error, "__notes__", ())):
             error.add_note(
@@ -220,7 +224,8 @@ def bifurcation(
             f"got {text or 'only numbers'}."
         )
     compute = _one_after_another if follow else _orbits
-    return _require_crossings(compute(run, start, *inputs, counts.pop()), run, settings)
+    sections = compute(run, start, *inputs, counts.pop(), reads(run))
+    return _require_crossings(sections, run, settings)
 
 
 def stroboscope(period: float, phase: float = 0.0) -> Callable[..., Any]:

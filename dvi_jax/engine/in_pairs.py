@@ -39,23 +39,35 @@ def in_pairs(function: Callable, *args: Any) -> Any:
     program = trace.all_inputs
 
     # Values of an outer trace that the function closes over are operands: they have a derivative.
-    @jax.custom_jvp
-    def evaluate(operands: list[Any]) -> list[Any]:
+    operands = [*trace.outer, *leaves]
+    arrays, of_operands = jax.tree.flatten(operands)
+    positions = jax.tree.leaves(rounded(jax.tree.unflatten(of_operands, range(len(arrays)))))
+    results: list[Any] = []
+
+    def evaluate(*arrays: Array) -> list[Array]:
         # Machine code also within a derivative, which XLA computes: it compiles pairs slowly.
-        return lanewise.call(_as_function(program), *operands)
+        operands = jax.tree.unflatten(of_operands, arrays)
+        out, tree = jax.tree.flatten(lanewise.call(_as_function(program), *operands))
+        results.append(tree)
+        return out
 
-    @evaluate.defjvp
-    def _(primals, tangents):
-        out = evaluate(*primals)
+    def slope(arrays: list[Array], changes: dict[int, Array]) -> list[Array | None]:
         # In float64: the lower parts would change derivatives by round-off only.
-        plain = jaxpr_as_fun(program)
-        _, change = jax.jvp(plain, rounded(*primals), rounded(*tangents))
-        return out, [
-            Pair(tangent, jnp.zeros_like(tangent)) if is_pair(x) else tangent
-            for x, tangent in zip(out, change, strict=True)
-        ]
+        moving = [i for i in positions if i in changes]
 
-    return jax.tree.unflatten(trace.out_tree, evaluate([*trace.outer, *leaves]))
+        def of_moving(values: list[Array]) -> list[Array]:
+            upper = dict(zip(moving, values, strict=True))
+            return jaxpr_as_fun(program)(*(upper.get(i, arrays[i]) for i in positions))
+
+        point, tangents = [arrays[i] for i in moving], [changes[i] for i in moving]
+        _, change = jax.jvp(of_moving, (point,), (tangents,))
+        places = rounded(jax.tree.unflatten(results[0], range(results[0].num_leaves)))
+        of_place = dict(zip(places, change, strict=True))
+        of_all = [of_place.get(i) for i in range(results[0].num_leaves)]
+        return [c if c is not None and c.dtype != jax.dtypes.float0 else None for c in of_all]
+
+    out = lanewise.with_derivative(evaluate, slope, arrays)
+    return jax.tree.unflatten(trace.out_tree, jax.tree.unflatten(results[0], out))
 
 
 def at_points_in_pairs(function: Callable, *points: Array) -> list[Any]:

@@ -184,7 +184,7 @@ def solve(trajectory: PreparedRun, progress: Any = None) -> Solution:
     observables = jax.tree.leaves(request.observe, is_leaf=is_observable)
     # In the variables of the request: those of the lattice may have no initial state of this form.
     if any(isinstance(observable, OfState) for observable in observables):
-        return with_initial_values(solution, request, layout)
+        return with_initial_values(solution, request, layout, task.reads)
     return solution
 
 
@@ -224,7 +224,14 @@ _solution = eqx.filter_jit(as_solution)
 
 # The parts of a run with progress. Each is compiled for itself; the carry between them has all that
 # a step depends on, so that the numbers are those of one run.
-_begin = eqx.filter_jit(start)
+@eqx.filter_jit
+def _begin(task: Task, q0, p0, layout: Layout):
+    arrays, functions = eqx.partition(task, eqx.is_array)
+
+    def begin(arrays, q0, p0):
+        return start(eqx.combine(arrays, functions), q0, p0)
+
+    return lanewise.call(begin, arrays, q0, p0, layout=layout)
 
 
 @eqx.filter_jit
@@ -242,7 +249,7 @@ def _in_pieces(task: Task, plan: Plan, q0, p0, report, layout) -> Outcome:
     """The same run in pieces between save points, with a report after each."""
     # Whole blocks, and as many in each piece (the last one may have fewer): one program serves all.
     size = max(1, -(-plan.num_blocks // _MOST_REPORTS))
-    carry, blocks, parts, is_last = _begin(task, q0, p0), 0, [], False
+    carry, blocks, parts, is_last = _begin(task, q0, p0, layout), 0, [], False
     while not is_last:
         count = min(size, plan.num_blocks - blocks)
         blocks += count

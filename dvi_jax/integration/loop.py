@@ -1,5 +1,6 @@
 """The loop over the steps of a time grid, with status, saved states and observables."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -16,6 +17,7 @@ from ..base.types import Interval, Scalar, State
 from ..engine.newton import no_residual, worse
 from ..engine.pairs import rounded
 from ..lattices import Place, Uniform
+from ..methods import InLoop
 from ..methods.constraint import start_status
 from ..observe import Deviations, Pushed, Reduction, has_initial_value
 from ..observe._kept import StepStart, as_row, event
@@ -64,7 +66,7 @@ def start(task: Task, q0: State, p0: State) -> Carry:
     good = result == RESULTS.successful
     # A typed zero: the carry of a scan must not change its type, and a Python integer would.
     zero = jnp.asarray(0, jnp.int32)
-    return Carry(
+    carry = Carry(
         k=zero,
         q=or_nan(good, q0),
         p=or_nan(good, p0),
@@ -78,12 +80,19 @@ def start(task: Task, q0: State, p0: State) -> Carry:
         remainder=task.arithmetic.start(q0, p0),
         stop=stop,
     )
+    in_loop = _in_loop(task, q0)
+    if in_loop is None:
+        return carry
+    entered = _advanced(task, in_loop.first, carry, zero)
+    good = entered.result == RESULTS.successful
+    q, p = or_nan(good, (carry.q, carry.p))
+    return entered._replace(q=q, p=p, method_state=(entered.q, entered.p))
 
 
 def take_step(
-    task: Task, carry: Carry, step: Callable | None = None
+    task: Task, carry: Carry, in_loop: InLoop | None = None
 ) -> tuple[Carry, Interval, Ends]:
-    """The next step, its status and its reductions; `step`: another one than that of the method."""
+    """The next step, its status and its reductions."""
     was_good = carry.result == RESULTS.successful
 
     def next_interval(memory, q, p):
@@ -95,13 +104,19 @@ def take_step(
     )
     interval = task.in_precision(interval)
     equations = task.equations_at(carry.k, interval)
-    step = task.arithmetic.interpret(step or task.method.step)
+    step = task.arithmetic.interpret(task.method.step if in_loop is None else in_loop.step)
+    # Maps to the coordinates of the method and back, where the carry has both.
+    conversion = None if carry.method_state is None else in_loop
+    before = carry.method_state or (carry.q, carry.p)
 
     def one_step(q, p):
         local, *state = task.arithmetic.enter(equations, q, p, carry.remainder)
         q1, p1, info = step(local, interval, *state)
         q1, p1, remainder = task.arithmetic.leave(q, p, q1, p1)
-        return (q1, p1), (remainder, rounded(info))
+        if conversion is None:
+            return (q1, p1, None), (remainder, rounded(info))
+        x1, y1, last = conversion.last(local, interval, q1, p1)
+        return (x1, y1, (q1, p1)), (remainder, info.then(last))
 
     def has_succeeded(result):
         _, (_, info) = result
@@ -110,16 +125,22 @@ def take_step(
     advance = task.constant_unless(was_good, one_step, has_succeeded)
     if task.has_deviations:
         # One linearisation serves all deviation vectors of all reductions.
-        (q1, p1), push, (remainder, info) = jax.linearize(advance, carry.q, carry.p, has_aux=True)
+        state, push, (remainder, info) = jax.linearize(advance, *before, has_aux=True)
+        if conversion is not None:
+            first, of_method = functools.partial(conversion.first, equations, interval), push
+            _, enter = jax.linearize(lambda *state: first(*state)[:2], carry.q, carry.p)
+            push = lambda *change: of_method(*enter(*change))  # noqa: E731
     else:
-        ((q1, p1), (remainder, info)), push = advance(carry.q, carry.p), None
+        (state, (remainder, info)), push = advance(*before), None
+    q1, p1, method_state = state
     result = info.result if exists is None else first_failure(exists, info.result)
     result, stop = _stop(task, carry, interval, q1, p1, result)
     # After a failure the state is NaN, so that no later step is good: the test of one step is
     # enough, and the loop needs no flag.
     good = result == RESULTS.successful
     residual = lax.stop_gradient(info.residual)
-    new = _with_failure(carry, q1, p1, result, good, residual)
+    carry_after = carry._replace(method_state=method_state)
+    new = _with_failure(carry_after, q1, p1, result, good, residual)
     ends = Ends(interval.t0, interval.t1, carry.q, carry.p, new.q, new.p)
     memories = _memories(task, carry, ends, remainder, push, interval.h, good)
     if stop is not None:
@@ -151,17 +172,18 @@ def _with_failure(
             # The state after a failed step is not a result: as NaN it cannot be mistaken for one.
             or_nan(good, q1),
             or_nan(good, p1),
+            or_nan(good, carry.method_state),
             first_failure(carry.result, result),
             jnp.where(fails, carry.k, carry.failed_step),
             jnp.where(fails, residual, carry.failed_residual),
         )
 
     def keep():
-        return q1, p1, carry.result, carry.failed_step, carry.failed_residual
+        return q1, p1, carry.method_state, carry.result, carry.failed_step, carry.failed_residual
 
     # The branch keeps this work out of steps in which nothing fails, which is nearly every step.
     values = lax.cond(lanewise.on_any(~good), note, keep)
-    names = "q", "p", "result", "failed_step", "failed_residual"
+    names = "q", "p", "method_state", "result", "failed_step", "failed_residual"
     return carry._replace(**dict(zip(names, values, strict=True)))
 
 
@@ -207,7 +229,7 @@ def _deviations(push: Callable, vectors: Array, ends: Ends, h: Scalar) -> Pushed
     # Vectors are flat, so that observers of deviations need not know the shape of a state.
     def push_flat(vector):
         dq, dp = (x.reshape(ends.q0.shape) for x in jnp.split(vector, 2))
-        return jnp.concatenate([x.ravel() for x in push(dq, dp)])
+        return jnp.concatenate([x.ravel() for x in push(dq, dp)[:2]])
 
     good = jnp.all(jnp.isfinite(ends.q1)) & jnp.all(jnp.isfinite(ends.p1))
     return Pushed(or_nan(good, jax.vmap(push_flat)(vectors)), h)
@@ -236,8 +258,14 @@ def run(
     else it receives a function as well, the state of a carry.
     """
     functions, _ = task.observables()
-    step, enter, leave = _in_loop(task, carry.q)
-    carry = enter(carry)
+    in_loop = _in_loop(task, carry.q)
+    is_joined = in_loop is not None and in_loop.is_joined
+
+    def leave(carry):
+        """The carry with the state in (q, p), at the end of its last step."""
+        if in_loop is None or not in_loop.is_joined:
+            return carry
+        return _advanced(task, in_loop.last, carry, carry.k - 1)
 
     def over_steps(body, state, count):
         if inner_loop is None:
@@ -252,66 +280,69 @@ def run(
         return interval if has_memory else None, (ends.q0, ends.p0) if functions else None
 
     def body(state, _):
-        carry, interval, ends = take_step(task, state[0], step)
+        carry, interval, ends = take_step(task, state[0], in_loop)
         return (carry, last_values(carry, interval, ends)), None
 
     def steps(carry, _, count=plan.block):
         """The next `count` steps, and the row of the save point at their end."""
         inner, interval = None, task.interval(carry.k + (count - 1))
+        if is_joined:  # the state in (q, p) is not needed before the next save point
+            q, p = carry.method_state
+            carry = carry._replace(q=q, p=p, method_state=None)
         if count == 1:  # a loop around one step would take time to compile
-            carry, interval, ends = take_step(task, carry, step)
+            carry, interval, ends = take_step(task, carry, in_loop)
         else:
             last = last_values(carry, interval, Ends(*interval[:2], *[carry.q, carry.p] * 2))
             (carry, (last_interval, start)), inner = over_steps(body, (carry, last), count)
             interval = last_interval if has_memory else interval
             q0, p0 = start if functions else (carry.q, carry.p)
             ends = Ends(interval.t0, interval.t1, q0, p0, carry.q, carry.p)
-        end = leave(carry)
-        if end is not carry:
+        if is_joined:
             # A state that cannot be computed at a save point ends the trajectory.
-            good = end.result == RESULTS.successful
-            carry = end._replace(q=or_nan(good, carry.q), p=or_nan(good, carry.p))
             start = leave(carry._replace(k=carry.k - 1, q=ends.q0, p=ends.p0))
+            end = leave(carry)
+            state = or_nan(end.result == RESULTS.successful, (carry.q, carry.p))
+            carry = end._replace(method_state=state)
             ends = Ends(*ends[:2], start.q, start.p, end.q, end.p)
         good = carry.result == RESULTS.successful
         observed = task.constant_unless(good, task.at_save)(carry, ends)
-        return carry, Rows(interval.t1, interval.h, end.q, end.p, observed, inner)
+        return carry, Rows(interval.t1, interval.h, carry.q, carry.p, observed, inner)
 
     carry, rows = loop(steps, carry, None, plan.num_blocks)
     # The tail is outside of the scan, whose rows all have the same number of steps.
     if not plan.tail:
-        return leave(carry), rows, None
+        return carry, rows, None
     carry, tail = steps(carry, None, plan.tail)
-    return leave(carry), rows, tail
+    return carry, rows, tail
 
 
-def _in_loop(task: Task, q: State) -> tuple[Callable | None, Callable, Callable]:
-    """The step in the loop (None: that of the method), and the functions to its carry and back."""
-    is_simple = type(task.lattice) is Uniform and task.arithmetic.is_plain and task.stop is None
-    quick = None
-    # Reductions read the states of all steps.
-    if is_simple and not task.observables()[1]:
-        quick = task.method.in_loop(task.equations, task.first_interval(), q)
-    if quick is None:
-        return None, lambda carry: carry, lambda carry: carry
+def _in_loop(task: Task, q: State) -> InLoop | None:
+    """The step in the loop, and the maps from (q, p) and back; None: that of the method."""
+    if not task.arithmetic.is_plain:
+        return None
+    point = task.equations, task.first_interval(), q
+    # Reductions and a `Stop` read the states of all steps.
+    reads_all = task.stop is not None or bool(task.observables()[1])
+    if type(task.lattice) is Uniform and not reads_all and (joined := task.method.in_loop(*point)):
+        return joined
+    # Conversions in each step would round the state in one direction.
+    coordinates = task.method.in_coordinates(*point)
+    if coordinates is None:
+        return None
+    return InLoop(coordinates.enter, coordinates.method.step, coordinates.leave, is_joined=False)
 
-    def substep(advance, carry, k):
-        def part(q, p):
-            return advance(task.equations, task.interval(k), q, p)
 
-        was_good = carry.result == RESULTS.successful
-        q, p, info = task.constant_unless(was_good, part)(carry.q, carry.p)
-        good = info.result == RESULTS.successful
-        new = _with_failure(
-            carry._replace(k=k), q, p, info.result, good, lax.stop_gradient(info.residual)
-        )
-        return new._replace(k=carry.k)
+def _advanced(task: Task, advance: Callable, carry: Carry, k: Array) -> Carry:
+    """The carry with the state after `advance`, a part of step k, and with its status."""
 
-    return (
-        quick.step,
-        lambda carry: substep(quick.first, carry, carry.k),
-        lambda carry: substep(quick.last, carry, carry.k - 1),
-    )
+    def part(q, p):
+        return advance(task.equations, task.interval(k), q, p)
+
+    was_good = carry.result == RESULTS.successful
+    q, p, info = task.constant_unless(was_good, part)(carry.q, carry.p)
+    good, residual = info.result == RESULTS.successful, lax.stop_gradient(info.residual)
+    new = _with_failure(carry._replace(k=k), q, p, info.result, good, residual)
+    return new._replace(k=carry.k)
 
 
 def outcome(

@@ -13,6 +13,7 @@ import lanewise
 from lanewise import Layout
 from lanewise.jaxprs.jaxapi import is_traced, manual_axes
 
+from ..base.reads import Reads
 from ..base.results import RESULTS, IntegrationError, status_code, status_name, with_auxiliary
 from ..engine.newton import relative_size
 from ..engine.rounding import each
@@ -92,7 +93,7 @@ def observed_values(observe: PyTree, columns: list[Any], results: list[Any]) -> 
 
 
 @eqx.filter_jit
-def with_initial_values(solution: Solution, run: Run, layout: Layout) -> Solution:
+def with_initial_values(solution: Solution, run: Run, layout: Layout, _: Reads = ()) -> Solution:
     """The solution, with values at the initial state in front of those of functions of a state."""
 
     def with_first_row(observable, values):

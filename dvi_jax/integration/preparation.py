@@ -91,6 +91,8 @@ def prepare(
         # `as_solution` evaluates the method between their ends.
         steps = requested_times(image.save, task, num_steps)
         task = dataclasses.replace(task, observe=steps)
+    # A part of the key of compiled programs: with another value one is compiled again.
+    vars(task)["reads"] = reads(task, run.observe, integrator.adjoint)
     adjoint, observe = integrator.adjoint, image.observe
     return PreparedRun(run, task, plan, q0, p0, observe, undo, adjoint, layout, has_tracer)
 
@@ -124,7 +126,5 @@ def _task(run: Run, integrator: Integrator, method: Method, h: Array) -> tuple[T
 
     kind = type(arithmetic)
     equations, q0, p0 = kind.prepare(arithmetic, method, equations, first_interval, run.q0, run.p0)
-    # A part of the key of compiled programs: with another value one is compiled again.
-    values = reads(run.observe, run.stop, lattice)
-    task = Task(equations, method, lattice, run.observe, run.t0, h, arithmetic, run.stop, values)
+    task = Task(equations, method, lattice, run.observe, run.t0, h, arithmetic, run.stop)
     return task, q0, p0

@@ -185,6 +185,7 @@ class Carry(NamedTuple):
     reductions: list[Any]
     remainder: Any = None  # what the arithmetic stores next to q and p
     stop: Any = None  # with a `Stop`: the last step, as a row
+    method_state: Any = None  # of a method with an `InLoop`: the state in its own coordinates
 
 
 class Ends(NamedTuple):

@@ -1,7 +1,7 @@
 """How one step is composed of maps: methods over one abstract base."""
 
 from ._adjoint import Adjoint as Adjoint
-from ._base import Method as Method
+from ._base import InLoop as InLoop, Method as Method
 from ._composition import Composition as Composition
 from ._dissipation import warn_of_dissipation as warn_of_dissipation
 from ._gauss_legendre import GaussLegendre as GaussLegendre

@@ -62,6 +62,10 @@ class Adjoint(Method):
     def inverse(self, equations, interval, q1, p1):
         return self.method.step(equations, interval.reversed(), q1, p1)
 
+    def in_coordinates(self, equations, interval, q):
+        inner = self.method.in_coordinates(equations, interval, q)
+        return inner and inner.of_part(self, "method")
+
     def needs_no_solve(self, equations, interval, q) -> bool:
         # A step of the adjoint is an inverse step of the method: the two answers are exchanged.
         return self.method.inverse_needs_no_solve(equations, interval, q)

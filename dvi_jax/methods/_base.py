@@ -15,11 +15,13 @@ from .step import Equations, StepInfo
 
 
 class InLoop(NamedTuple):
-    """Functions as `Method.step`: last ∘ stepⁿ ∘ first is n steps of equal length."""
+    """Functions as `Method.step`: last ∘ stepⁿ ∘ first is n steps; of equal length if they are
+    joined, so that neighbours have a part in common."""
 
     first: Callable
     step: Callable
     last: Callable
+    is_joined: bool = True
 
 
 class Method(eqx.Module):
@@ -61,6 +63,12 @@ class Method(eqx.Module):
 
     def in_loop(self, equations: Equations, interval: Interval, q: State) -> InLoop | None:
         """The same steps with less work, where they have some in common (None: nowhere)."""
+        return None
+
+    def in_coordinates(
+        self, equations: Equations, interval: Interval, q: State
+    ) -> "Coordinates | None":
+        """The method in the coordinates that it computes in; None: (q, p)."""
         return None
 
     def check(
@@ -114,6 +122,19 @@ class Method(eqx.Module):
                 f"{type(error).__name__}: {error}"
             ) from error
         return answers[0]
+
+
+class Coordinates(NamedTuple):
+    """A method in other coordinates, and the maps from (q, p) and back, functions as `step`."""
+
+    enter: Callable
+    method: Method
+    leave: Callable
+
+    def of_part(self, whole: Method, name: str) -> "Coordinates":
+        """`whole`, which has the method as its field `name`, in these coordinates."""
+        method = eqx.tree_at(lambda method: getattr(method, name), whole, self.method)
+        return self._replace(method=method)
 
 
 def check_invertible(name: str, method: Any) -> None:

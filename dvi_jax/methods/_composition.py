@@ -68,6 +68,10 @@ class CompositionMethod(Method):
     def needs_constraint(self) -> bool:
         return self.base.needs_constraint()
 
+    def in_coordinates(self, equations, interval, q):
+        inner = self.base.in_coordinates(equations, interval, q)
+        return inner and inner.of_part(self, "base")
+
     @property
     def has_negative_substeps(self) -> bool:
         """Whether a substep goes backwards in time, where a dissipative force increases motion."""

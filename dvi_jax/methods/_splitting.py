@@ -4,12 +4,14 @@ import abc
 import dataclasses
 import functools
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from lanewise.jaxprs.dependence import depends_on
@@ -18,12 +20,15 @@ from ..base.types import Interval, State
 from ..problem.flows import Flow, Kepler, Known
 from ..problem.split import Split
 from ..problem.system import System
-from ._base import InLoop, Method
+from ._base import Coordinates, InLoop, Method
 from ._gauss_legendre import GaussLegendre
 from ._schemes import as_scheme, check_scheme, sequence_of
 from ._strang import Strang
 from ._type_ii import TypeII
 from .step import Equations, StepInfo, judge, no_solve, no_step_yet
+
+_SMALL = 0.1
+"""A first part that is smaller than this, relative to the second, causes a warning."""
 
 StateAndInfo = tuple[State, State, StepInfo]
 
@@ -68,6 +73,9 @@ class SplittingMethod(Method):
 
     scheme: eqx.AbstractVar[Any]
 
+    has_coordinates: ClassVar[bool] = False
+    """Whether the coordinates of the parts are others than (q, p)."""
+
     is_symplectic: ClassVar[bool] = True
     is_invertible: ClassVar[bool] = True
 
@@ -81,6 +89,12 @@ class SplittingMethod(Method):
 
     def leave(self, equations: Equations, interval: Interval, q: State, p: State) -> StateAndInfo:
         """The inverse of `enter`."""
+        return q, p, no_step_yet(q)
+
+    def correct(
+        self, equations: Equations, interval: Interval, q: State, p: State, sign: int
+    ) -> StateAndInfo:
+        """In these coordinates, a map before the first step (`sign` 1), or its inverse (−1)."""
         return q, p, no_step_yet(q)
 
     # A type checker would require abstract variables as arguments of every subclass.
@@ -103,25 +117,18 @@ class SplittingMethod(Method):
         return tuple(c for i, c in sequence_of(self.scheme, 2) if i == 1)
 
     def step(self, equations, interval, q0, p0):
-        stages = stages_of(self._sequence(equations, interval, q0))
-        return self._in_coordinates(equations, interval, stages, q0, p0)
+        middle = _InCoordinates(self).step
+        return _in_turn(equations, interval, q0, p0, self.enter, middle, self.leave)
 
     def inverse(self, equations, interval, q1, p1):
-        stages = stages_of(self._sequence(equations, interval, q1))
-        reverse = [stage.inverse() for stage in reversed(stages)]
-        return self._in_coordinates(equations, interval, reverse, q1, p1)
+        middle = _InCoordinates(self).inverse
+        return _in_turn(equations, interval, q1, p1, self.enter, middle, self.leave)
 
     def _sequence(self, equations, interval, q):
         return sequence_of(self.scheme, len(self.parts(equations, interval, q)))
 
-    def _in_coordinates(self, equations, interval, stages, q, p) -> StateAndInfo:
-        q, p, first = self.enter(equations, interval, q, p)
-        q, p, info = self.compose(equations, interval, stages, q, p)
-        q, p, last = self.leave(equations, interval, q, p)
-        return q, p, first.then(info).then(last)
-
     def compose(
-        self, equations: Equations, interval: Interval, stages: list[Stage], q: State, p: State
+        self, equations: Equations, interval: Interval, q: State, p: State, stages: list[Stage]
     ) -> StateAndInfo:
         """One flow after another."""
         parts = self.parts(equations, interval, q)
@@ -152,30 +159,84 @@ class SplittingMethod(Method):
         sequence = sequence_of(self.scheme, len(parts))
         # Two flows of the first part are one only if they are exact.
         (_, a), *flows = sequence
-        return _in_loop(self, a) if self.is_symmetric and flows and parts[0].is_exact else None
+        return _joined(self, a) if self.is_symmetric and flows and parts[0].is_exact else None
+
+    def in_coordinates(self, equations, interval, q):
+        if not self.has_coordinates:
+            return None
+        return Coordinates(self.enter, _InCoordinates(self), self.leave)
 
     def needs_no_solve(self, equations, interval, q) -> bool:
         return all(part.is_exact for part in self.parts(equations, interval, q))
 
 
-def _in_loop(method: SplittingMethod, a: float) -> InLoop:
+def _in_turn(equations: Equations, interval: Interval, q: State, p: State, *maps) -> StateAndInfo:
+    """The state after one map after the other, and the status of all."""
+    q, p, info = maps[0](equations, interval, q, p)
+    for advance in maps[1:]:
+        q, p, later = advance(equations, interval, q, p)
+        info = info.then(later)
+    return q, p, info
+
+
+def _joined(method: SplittingMethod, a: float) -> InLoop:
     """(A(a) W A(a))ⁿ is A(a) (W A(2a))ⁿ A(−a), which has one flow less per step."""
 
-    def first_part(equations, interval, q, p):
-        q, p, first = method.enter(equations, interval, q, p)
-        q, p, info = method.compose(equations, interval, [Stage(0, 0.0, -a, -a)], q, p)
-        return q, p, first.then(info)
+    def part(stage: Stage) -> Callable:
+        return functools.partial(method.compose, stages=[stage])
+
+    def first(*state):
+        before = functools.partial(method.correct, sign=1)
+        return _in_turn(*state, method.enter, before, part(Stage(0, 0.0, -a, -a)))
 
     def step(equations, interval, q, p):
         _, *middle, _ = method._sequence(equations, interval, q)
-        return method.compose(equations, interval, stages_of([(0, 2 * a), *middle], -a), q, p)
+        return method.compose(equations, interval, q, p, stages_of([(0, 2 * a), *middle], -a))
 
-    def last_part(equations, interval, q, p):
-        q, p, info = method.compose(equations, interval, [Stage(0, 1 - a, 1.0, a)], q, p)
-        q, p, last = method.leave(equations, interval, q, p)
-        return q, p, info.then(last)
+    def last(*state):
+        after = functools.partial(method.correct, sign=-1)
+        return _in_turn(*state, part(Stage(0, 1 - a, 1.0, a)), after, method.leave)
 
-    return InLoop(first_part, step, last_part)
+    return InLoop(first, step, last)
+
+
+class _InCoordinates(Method):
+    """A method without the conversions to the coordinates of its parts and back."""
+
+    method: SplittingMethod
+
+    is_invertible: ClassVar[bool] = True
+
+    is_symplectic: ClassVar[bool] = True
+    if TYPE_CHECKING:
+        order: ClassVar[int]
+        is_symmetric: ClassVar[bool]
+    else:
+
+        @property
+        def order(self) -> int:
+            return self.method.order
+
+        @property
+        def is_symmetric(self) -> bool:
+            return self.method.is_symmetric
+
+    def needs_no_solve(self, equations, interval, q) -> bool:
+        return self.method.needs_no_solve(equations, interval, q)
+
+    def step(self, equations, interval, q0, p0):
+        stages = stages_of(self.method._sequence(equations, interval, q0))
+        return self._corrected(equations, interval, stages, q0, p0)
+
+    def inverse(self, equations, interval, q1, p1):
+        stages = stages_of(self.method._sequence(equations, interval, q1))
+        reverse = [stage.inverse() for stage in reversed(stages)]
+        return self._corrected(equations, interval, reverse, q1, p1)
+
+    def _corrected(self, equations, interval, stages, q, p) -> StateAndInfo:
+        before, after = (functools.partial(self.method.correct, sign=sign) for sign in (1, -1))
+        compose = functools.partial(self.method.compose, stages=stages)
+        return _in_turn(equations, interval, q, p, before, compose, after)
 
 
 class Splitting(SplittingMethod):
@@ -190,7 +251,8 @@ class Splitting(SplittingMethod):
       flows of one part are joined, so that ``Strang()`` is A(h/2) B(h) A(h/2).
     - generalised orders (n₁, n₂, …) for two parts A + εB, with an error O(ε h^n₁ + ε² h^n₂ + …):
       (2, 2), (4, 2), … (10, 2) of Laskar & Robutel, (8, 4) of McLachlan, (10, 4), (8, 6, 4) and
-      (10, 6, 4) of Blanes et al. They need a small second part, not a small h.
+      (10, 6, 4) of Blanes et al. They need a small second part, not a small h: a run in which the
+      first part is the smaller one at the initial state warns.
 
     A step is explicit where all flows are known or exact. Parts with both q0 and p1 are advanced by
     `GaussLegendre`, of the order of the scheme.
@@ -211,7 +273,10 @@ class Splitting(SplittingMethod):
         check_scheme(self.scheme)
 
     def check(self, equations, first_interval, q, p):
-        """**Raises** `ValueError` if a flow of the user is not that of its Hamiltonian there."""
+        """**Raises** `ValueError` if a flow of the user is not that of its Hamiltonian there.
+        Warns where generalised orders are used with the smaller part first."""
+        if isinstance(self.scheme, tuple):
+            self._check_sizes(equations, first_interval(), q, p)
         interval = first_interval()
         t, zero = interval.t0, jnp.zeros_like(interval.h)
         for i, H_i in enumerate(getattr(equations.system.H_D, "parts", ())):
@@ -228,6 +293,24 @@ class Splitting(SplittingMethod):
                         "identity at h = 0, with the derivative (∂H/∂p, −∂H/∂q); at the initial "
                         f"state the difference is {defect:.3g}."
                     )
+
+    def _check_sizes(self, equations, interval, q, p):
+        parts = getattr(equations.system.H_D, "parts", ())
+        all_equations = [dataclasses.replace(equations, system=System(H_i)) for H_i in parts]
+        rates = np.array([equations_i.rates(interval, q, p) for equations_i in all_equations])
+        # Positions and momenta have different units: each is relative to the largest one.
+        rates = np.abs(rates).reshape(len(parts), 2, -1).max(axis=-1)
+        largest = np.maximum(rates.max(axis=0), np.finfo(rates.dtype).tiny)
+        first, *others = (rates / largest).max(axis=1)
+        # A first part that is at rest, as T(p) at p = 0, is not known to be small.
+        if len(others) == 1 and 0 < first < _SMALL * others[0]:
+            warnings.warn(
+                f"the first part of dvi.Split is the smaller one: at the initial state it changes "
+                f"the state {others[0] / first:.2g} times less than the second. The orders "
+                f"{self.scheme} hold for A + εB with a small second part: write the larger part "
+                "first.",
+                stacklevel=5,  # the call of `integrate`
+            )
 
     def is_double_only(self, equations) -> bool:
         return any(isinstance(part, Kepler) for part in getattr(equations.system.H_D, "parts", ()))

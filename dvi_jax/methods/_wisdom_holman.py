@@ -1,6 +1,6 @@
 """Splittings of N bodies around Kepler orbits: the method of Wisdom and Holman."""
 
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 import equinox as eqx
 import jax
@@ -113,9 +113,11 @@ class WisdomHolman(SplittingMethod):
     - `G`: the gravitational constant in the Kepler part, a number or a function of args; None:
       ``args["G"]`` if there is one, else 1. Another value changes the accuracy, not the limit.
 
-    Between save points, where nothing is observed, the two half flows at the ends of neighbouring
-    steps are one. An orbit may have any eccentricity. Bodies close to another body than the first
-    are not resolved: use `KahanLi` or `AdaptiveReversible` for close encounters.
+    A run stays in these coordinates, also where states are observed: those that are saved or
+    observed are converted copies. Between save points, where nothing is observed, the two half
+    flows at the ends of neighbouring steps are one. An orbit may have any eccentricity. Bodies
+    close to another body than the first are not resolved: use `KahanLi` or `AdaptiveReversible` for
+    close encounters.
 
     **Raises** `ValueError` for another corrector or other coordinates and, in a run, for positions
     of another shape, a system that is not T(p) + V(q), and a T of another form.
@@ -130,6 +132,8 @@ class WisdomHolman(SplittingMethod):
     corrector: int = eqx.field(static=True, default=0)
     scheme: Any = eqx.field(static=True, default_factory=Strang, converter=as_scheme)
     G: Any = None
+
+    has_coordinates: ClassVar[bool] = True
 
     def __check_init__(self):
         one_of("coordinates", self.coordinates, get_args(Coordinates))
@@ -232,19 +236,35 @@ class WisdomHolman(SplittingMethod):
 
         return [PartFlow(kepler, True), PartFlow(interaction, not implicit)]
 
+    def in_loop(self, equations, interval, q):
+        is_fixed = self._is_fixed(equations, interval, q)
+        return super().in_loop(equations, interval, q) if is_fixed else None
+
+    def in_coordinates(self, equations, interval, q):
+        is_fixed = self._is_fixed(equations, interval, q)
+        return super().in_coordinates(equations, interval, q) if is_fixed else None
+
+    def _is_fixed(self, equations, interval, q) -> bool:
+        """Whether the masses, and so the coordinates, are the same in all steps."""
+
+        def masses(t):
+            return self._frame(equations, interval._replace(t0=t, t1=t), q).masses
+
+        return not depends_on(masses, 0, interval.t0)
+
     def enter(self, equations, interval, q, p):
         frame = self._frame(equations, interval, q)
         X, V = frame.from_bodies(q), frame.velocities_of(p / frame.masses[:, None])
-        return self._correct(equations, interval, X, V, 1)
+        return X, V, no_step_yet(X)
 
     def leave(self, equations, interval, q, p):
-        X, V, info = self._correct(equations, interval, q, p, -1)
-        frame = self._frame(equations, interval, X)
-        return frame.to_bodies(X), frame.masses[:, None] * frame.velocities_back(V), info
+        frame = self._frame(equations, interval, q)
+        x, v = frame.to_bodies(q), frame.velocities_back(p)
+        return x, frame.masses[:, None] * v, no_step_yet(q)
 
-    def _correct(self, equations, interval, X, V, sign):
+    def correct(self, equations, interval, q, p, sign):
         if not self.corrector:
-            return X, V, no_step_yet(X)
+            return super().correct(equations, interval, q, p, sign)
         # The inverse of Z(a, b) is Z(−a, b), and a and −a are at opposite places: b changes sign.
         sequence = join_neighbours(
             stage
@@ -252,7 +272,7 @@ class WisdomHolman(SplittingMethod):
             for stage in ((0, a), (1, sign * b), (0, -2 * a), (1, -sign * b), (0, a))
         )
         stages = [Stage(part, 0.0, 0.0, c) for part, c in sequence]
-        return self.compose(equations, interval, stages, X, V)
+        return self.compose(equations, interval, q, p, stages)
 
 
 def _gravity(args: Args) -> Any:

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+import lanewise
 from lanewise.jaxprs.dependence import depends_on
 
 from ..base.results import RESULTS, first_failure
@@ -131,16 +132,17 @@ def _rates(system: System | Any, *point) -> tuple[State, State]:
     return velocity, -gradient + system.disturbing_force(*point).astype(gradient.dtype)
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
 def to_grid(x: State, quantum: float) -> State:
     """The multiple of `quantum`, a power of two, nearest to x (half to even)."""
-    return jnp.round(x * (1 / quantum)) * quantum
 
+    def nearest(x):
+        return [jnp.round(x * (1 / quantum)) * quantum]
 
-@to_grid.defjvp
-def _(quantum, primals, tangents):
-    # Slope 1, that of the map without rounding; the slope of a staircase is zero.
-    return to_grid(*primals, quantum), tangents[0]
+    def slope(operands, changes):
+        # Slope 1, that of the map without rounding; the slope of a staircase is zero.
+        return [changes[0]]
+
+    return lanewise.with_derivative(nearest, slope, [x])[0]
 
 
 def step(

@@ -183,7 +183,7 @@ def _sweep(system, invariant, starts, epsilons, h, num_steps, run) -> Drifts:
     strengths = jnp.repeat(jnp.append(jnp.asarray(epsilons, dtype), 0), shape[1])
     starts = tuple(jnp.concatenate([x] * shape[0]) for x in starts)
     run = {"h": h, "num_steps": num_steps, **run}
-    arrays = run_trajectories(system, invariant, strengths, starts, run, reads(invariant))
+    arrays = run_trajectories(system, invariant, strengths, starts, run, reads(invariant, run))
     drifts, last, result = arrays
     if drifts.ndim != 1:
         shape = drifts.shape[1:]

@@ -1,0 +1,181 @@
+"""Methods that compute in coordinates of their own: the run stays in them, whatever is observed."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dvi_jax as dvi
+from dvi_jax import systems
+from dvi_jax.problem import flows
+
+MASS, H, STEPS = 1e-3, 0.06, 20000
+TWO = systems.n_body(
+    masses=[1.0, MASS],
+    q0=[[0.0, 0.0], [1.0, 0.0]],
+    p0=[[0.0, -1.05 * MASS], [0.0, 1.05 * MASS]],
+    h=H,
+)
+"""The map of `WisdomHolman` is the exact motion of two bodies: all errors are rounding errors."""
+ENERGY = TWO.observables["energy"]
+
+
+def energy(q, p):
+    """In extended precision."""
+    q, p = (np.asarray(x, np.longdouble) for x in (q, p))
+    masses = np.array([1, MASS], np.longdouble)
+    return (p**2 / masses[:, None]).sum() / 2 - masses[1] / np.sqrt(((q[1] - q[0]) ** 2).sum())
+
+
+def exact_separation(t):
+    """Of the two bodies, which begin at the pericentre of an ellipse."""
+    total, speed = np.longdouble(1) + np.longdouble(MASS), np.longdouble(1.05 * MASS)
+    speed = speed / np.longdouble(MASS) + speed
+    a = 1 / (2 - speed**2 / total)
+    e, mean = 1 - 1 / a, np.sqrt(total / a**3) * t
+    u = mean
+    for _ in range(50):
+        u = u - (u - e * np.sin(u) - mean) / (1 - e * np.cos(u))
+    return np.array([a * (np.cos(u) - e), a * np.sqrt(1 - e**2) * np.sin(u)])
+
+
+def never(t, q, p, args):
+    return q[1, 0] - 100.0
+
+
+def plain_speed(t, q, p, args):
+    return 1.0 + 0.0 * q[1, 0]
+
+
+MODES = {
+    "a reduction": {"observe": dvi.MaxDrift(ENERGY)},
+    "requested times": {"save": dvi.Save(ts=[STEPS * H])},
+    "a stop": {"stop": dvi.Stop(never)},
+    "a section": {"observe": dvi.Section(lambda t, q, p, args: q[1, 1])},
+    "another grid": {"lattice": dvi.Given(np.arange(STEPS + 1) * H)},
+    "adaptive steps": {"lattice": dvi.AdaptiveReversible(plain_speed)},
+    "generalised orders": {
+        "method": dvi.WisdomHolman(scheme=(4, 2)),
+        "observe": dvi.Mean(ENERGY),
+    },
+    "a composition": {
+        "method": dvi.Yoshida(4, base=dvi.WisdomHolman()),
+        "save": dvi.Save(every=STEPS // 4),
+    },
+    "an adjoint": {"method": dvi.Adjoint(dvi.WisdomHolman()), "save": dvi.Save(every=1)},
+}
+FAST = ("a reduction", "requested times", "a composition")
+
+
+@pytest.mark.parametrize(
+    "mode", [m if m in FAST else pytest.param(m, marks=pytest.mark.slow) for m in MODES]
+)
+def test_rounding_does_not_accumulate_in_any_mode(mode):
+    """A conversion of the coordinates in every step would change the energy by 3e-12."""
+    options = {"method": dvi.WisdomHolman(), "save": dvi.Save(final=True), **MODES[mode]}
+    if mode != "another grid":
+        options |= {"h": H, "num_steps": STEPS}
+    sol = dvi.integrate(TWO, **options)
+    q, p, initial = sol.qs[-1], sol.ps[-1], energy(TWO.q0, TWO.p0)
+    assert abs(energy(q, p) / initial - 1) < 3e-13
+    apart = np.asarray(q[1] - q[0]) - exact_separation(np.longdouble(H) * STEPS)
+    assert np.abs(apart).max() < 3e-10
+
+
+def test_the_energy_of_a_million_observed_steps():
+    options = {"h": H, "num_steps": 10**6, "method": dvi.WisdomHolman()}
+    save, drift = dvi.Save(final=True), dvi.MaxDrift(ENERGY)
+    sol = dvi.integrate(TWO, **options, save=save, observe=drift)
+    initial = energy(TWO.q0, TWO.p0)
+    assert float(sol.observed) < 1e-12 * abs(initial)
+    assert abs(energy(sol.qs[-1], sol.ps[-1]) / initial - 1) < 1e-12
+
+
+THREE = systems.n_body(
+    masses=[1.0, 1e-3, 3e-4],
+    q0=[[0.0, 0.0], [1.0, 0.0], [-0.3, 1.8]],
+    p0=[[0.0, 0.0], [0.0, 1e-3], [-2.2e-4, -0.3e-4]],
+    h=0.3,
+)
+
+
+def quartic(t0, t1, q0, p1, args):
+    return 1e-2 * jnp.sum(q0**4)
+
+
+SPLIT = dvi.System(dvi.Split([flows.Kepler(k=1.0), quartic]))
+RUNS = {
+    "joined": (THREE, {"method": dvi.WisdomHolman()}),
+    "observed": (THREE, {"method": dvi.WisdomHolman(), "observe": dvi.MaxDrift(ENERGY)}),
+    "corrected": (THREE, {"method": dvi.WisdomHolman(corrector=3), "save": dvi.Save(every=7)}),
+    "split": (SPLIT, {"q0": [1.0, 0.0], "p0": [0.2, 1.1], "h": 0.3, "save": dvi.Save(every=1)}),
+}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "joined",
+        "split",
+        *(pytest.param(n, marks=pytest.mark.slow) for n in ("observed", "corrected")),
+    ],
+)
+def test_progress_does_not_change_a_bit(name):
+    system, options = RUNS[name]
+    options = {"num_steps": 250, **options}
+    reports = []
+    sol = dvi.integrate(system, **options)
+    other = dvi.integrate(system, **options, progress=lambda *steps: reports.append(steps))
+    assert len(reports) > 10
+    for a, b in zip(jax.tree.leaves(sol), jax.tree.leaves(other), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.slow
+def test_deviation_vectors_are_those_of_the_states():
+    options = {"h": 0.3, "num_steps": 4, "method": dvi.WisdomHolman(), "args": TWO.args}
+
+    def final(z):
+        sol = dvi.integrate(TWO.system, *z.reshape(2, 2, 2), **options, save=dvi.Save(final=True))
+        return jnp.concatenate([sol.q_final.ravel(), sol.p_final.ravel()])
+
+    z = jnp.concatenate([jnp.ravel(TWO.q0), jnp.ravel(TWO.p0)])
+    sol = dvi.integrate(TWO, **options, observe=dvi.TangentMap())
+    np.testing.assert_allclose(sol.observed, jax.jit(jax.jacfwd(final))(z), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("adjoint", [dvi.Reversible(), dvi.Direct()])
+def test_gradients_of_observed_runs(adjoint):
+    def loss(mass):
+        args = {**TWO.args, "masses": jnp.stack([1.0 + 0 * mass, mass])}
+        sol = dvi.integrate(
+            TWO.system, TWO.q0, TWO.p0, args=args, h=0.3, num_steps=8, adjoint=adjoint,
+            method=dvi.WisdomHolman(), save=dvi.Save(final=True),
+            observe=dvi.Mean(lambda q, p: q[1] @ q[1]),
+        )  # fmt: skip
+        return sol.observed + jnp.sum(sol.q_final**2)
+
+    f = jax.jit(loss)
+    expected = (f(1.0001e-3) - f(0.9999e-3)) / 2e-7
+    np.testing.assert_allclose(jax.jit(jax.grad(loss))(1e-3), expected, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_masses_that_change_with_time():
+    """The coordinates of one step are then not those of the next."""
+
+    def heavier(t0, t1, q0, p1, args):
+        masses = jnp.array([1.0, 1e-3]) * (1 + 0.2 * t0)
+        r = jnp.sqrt(jnp.sum((q0[1] - q0[0]) ** 2))
+        return jnp.sum(p1**2 / (2 * masses[:, None])) - 1e-3 / r
+
+    def final(method, **options):
+        sol = dvi.integrate(
+            dvi.System(heavier), TWO.q0, TWO.p0, h=0.005, num_steps=400, method=method, **options
+        )
+        return np.asarray(sol.qs[-1])
+
+    expected = final(dvi.GaussLegendre(2))
+    for options in ({"save": dvi.Save(final=True)}, {"observe": dvi.MaxDrift(lambda q, p: q[0])}):
+        assert np.abs(final(dvi.WisdomHolman(), **options) - expected).max() < 5e-3

@@ -1,0 +1,144 @@
+"""Functions with a derivative of their own, in second derivatives of loops and branches."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+import dvi_jax as dvi
+import lanewise
+from dvi_jax.engine.guard import constant_unless, nan_if_used
+from dvi_jax.engine.in_pairs import in_pairs
+from dvi_jax.methods.step import to_grid
+from dvi_jax.systems.boozer import _sums
+
+
+def hypotenuse(p):
+    """√(1 + p²), the Hamiltonian of the Lagrangian −√(1 − v²)."""
+    H = dvi.legendre(lambda t, q, v, args: -jnp.sqrt(1 - v @ v))
+    return H(0.0, jnp.zeros(1), p[None], None)
+
+
+def root(x):
+    """The y with y + y³ = x."""
+
+    def solve(f, y):
+        return lax.fori_loop(0, 30, lambda _, y: y - f(y) / (1 + 3 * y * y), y), ()
+
+    def divide(linear, b):
+        return b / linear(jnp.ones_like(b))
+
+    return lanewise.implicit_root(lambda y: y + y**3 - x[None], jnp.ones(1), solve, divide)[0][0]
+
+
+def cardano(x):
+    w = jnp.sqrt(x * x / 4 + 1 / 27)
+    return jnp.cbrt(x / 2 + w) + jnp.cbrt(x / 2 - w)
+
+
+MODES = jnp.asarray(np.random.default_rng(0).normal(size=(1, 3, 3, 2)))
+SHAPE = _sums.Shape(periods=2, helicity=0)
+
+
+def in_run(adjoint, arithmetic):
+    def last(x):
+        system = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + jnp.sum(jnp.cos(q)) * x)
+        sol = dvi.integrate(
+            system, x[None], jnp.ones(1), h=0.2, num_steps=2, method=dvi.Strang(), adjoint=adjoint,
+            arithmetic=arithmetic, save=dvi.Save(final=True),
+        )  # fmt: skip
+        return sol.q_final[0]
+
+    return last
+
+
+RULES = {
+    "to_grid": (lambda x: to_grid(jnp.sin(x), 2.0**-40), jnp.sin),
+    "in_pairs": (lambda x: in_pairs(jnp.sin, x).hi, jnp.sin),
+    "constant_unless": (
+        lambda x: constant_unless(x > -9, jnp.sin, x, succeeds=lambda y: y > -9),
+        jnp.sin,
+    ),
+    "nan_if_used": (lambda x: nan_if_used(jnp.sin(x), x), jnp.sin),
+    "legendre": (hypotenuse, lambda p: jnp.sqrt(1 + p * p)),
+    "implicit_root": (root, cardano),
+    "boozer": (
+        lambda x: _sums.total(MODES, SHAPE, x, 0.3 * x, 0.7),
+        lambda x: _sums.derivatives(MODES, SHAPE, x, 0.3 * x, 0.7, order=0)[0],
+    ),
+}
+SITES = {
+    "scan": lambda f: lambda k: lax.scan(lambda c, _: (f(k * c), None), k, None, 3)[0],
+    "branch": lambda f: lambda k: lax.cond(k > 0, lambda k: f(k * k), jnp.sin, k),
+    "checkpoint": lambda f: (
+        lambda k: lax.scan(jax.checkpoint(lambda c, _: (k * f(c), None)), k, None, 2)[0]
+    ),
+    "machine code": lambda f: (
+        lambda k: lanewise.call(lambda k: lax.scan(lambda c, _: (f(k * c), None), k, None, 3)[0], k)
+    ),
+}
+ORDERS = [
+    lambda f: jax.jacfwd(jax.grad(f)),
+    lambda f: jax.jacfwd(jax.jacfwd(f)),
+    lambda f: jax.grad(jax.grad(f)),
+    lambda f: jax.grad(jax.jacfwd(f)),
+]
+K = jnp.array([0.4, 0.9])
+
+
+def seconds(f):
+    """The second derivatives in all orders, in a batch."""
+    return jax.jit(jax.vmap(lambda k: jnp.stack([order(f)(k) for order in ORDERS])))(K)
+
+
+QUICK = [(rule, "scan") for rule in ("to_grid", "in_pairs", "nan_if_used")]
+CASES = [(rule, site) for rule in RULES for site in SITES]
+
+
+@pytest.mark.parametrize(
+    ("rule", "site"),
+    [c if c in QUICK else pytest.param(*c, marks=pytest.mark.slow) for c in CASES],
+)
+def test_second_derivatives_in_all_orders(rule, site):
+    function, plain = RULES[rule]
+    expected = jax.vmap(jax.jacfwd(jax.jacfwd(SITES[site](plain))))(K)
+    result = seconds(SITES[site](function))
+    np.testing.assert_allclose(result, np.repeat(expected[:, None], 4, 1), rtol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rule", RULES)
+def test_forward_mode_of_a_loop_of_unknown_length(rule):
+    function, plain = RULES[rule]
+
+    def loop(f):
+        return lambda k: lax.while_loop(
+            lambda s: s[0] < 3, lambda s: (s[0] + 1, f(k * s[1])), (0, k)
+        )[1]
+
+    f, g = (jax.jit(jax.jacfwd(jax.jacfwd(loop(f)))) for f in (function, plain))
+    np.testing.assert_allclose(f(0.4), g(0.4), rtol=1e-9)
+
+
+def test_a_custom_jvp_loses_its_rule_in_a_scan():
+    """The control: where JAX has corrected this, `with_derivative` is not needed any more."""
+
+    @jax.custom_jvp
+    def rounded(x):
+        return jnp.round(x * 2.0**40) * 2.0**-40
+
+    rounded.defjvp(lambda primals, tangents: (rounded(*primals), tangents[0]))
+    result = seconds(SITES["scan"](lambda x: rounded(jnp.sin(x))))
+    assert np.ptp(np.asarray(result[0])) > 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("arithmetic", [dvi.FixedPoint(2.0**-45), dvi.DoubleDouble()])
+@pytest.mark.parametrize("adjoint", [dvi.Reversible(), dvi.Direct()])
+def test_second_derivatives_of_runs(arithmetic, adjoint):
+    plain = in_run(dvi.Direct(), dvi.FloatingPoint())
+    f = jax.jit(jax.grad(plain))
+    expected = [(f(k + 1e-5) - f(k - 1e-5)) / 2e-5 for k in K]
+    result = seconds(in_run(adjoint, arithmetic))
+    np.testing.assert_allclose(result, np.repeat(np.array(expected)[:, None], 4, 1), rtol=1e-7)
