@@ -370,6 +370,60 @@ def test_reading_a_file_of_booz_xform(tmp_path, sign):
     assert jax.tree.all(jax.tree.map(lambda a, b: (a == b).all(), field, again))
 
 
+SPACINGS = {
+    "even": lambda count: np.linspace(0.02, 0.96, count),
+    "half mesh": lambda count: (np.arange(count) + 0.2) / (count - 0.6),
+    "dense at the axis": lambda count: 0.01 + 0.98 * np.linspace(0, 1, count) ** 2,
+}
+
+
+def spectrum(parts):
+    """Modes up to m = 14 that are no polynomials, with the irregularities of an equilibrium."""
+    m, k = (x.ravel() for x in np.meshgrid(np.arange(15), np.arange(-3, 4), indexing="ij"))
+    m, k = (x[(m > 0) | (k >= 0)] for x in (m, k))
+    random = np.random.default_rng(parts)
+    size, rate, phase = random.uniform([[-1], [0], [0]], [[1], [4], [6]], (3, parts * len(m)))
+    size, rate, phase = (x.reshape(parts, 1, -1) for x in (size, rate, phase))
+
+    def values(s):
+        s = np.asarray(s)[:, None]
+        B = size * np.exp(-0.7 * m - np.abs(k)) * s ** (m / 2) * np.exp(-rate * s)
+        B = B + 1e-5 * size * s ** np.minimum(m / 2, 2) * np.sin(40 * s + phase)
+        B[..., (m == 0) & (k == 0)] = 5.0
+        B[1:, ..., m == 0] = 0.0
+        return B if parts == 2 else B[0]
+
+    return m, 3 * k, values
+
+
+@pytest.mark.parametrize("parts", [1, 2])
+@pytest.mark.parametrize("spacing", SPACINGS)
+def test_fields_between_the_surfaces_of_a_file(parts, spacing):
+    """Against the functions of s themselves, also at the axis and the edge: with few surfaces a
+    polynomial of degree 6 passes through all values and oscillates in between."""
+    m, n, values = spectrum(parts)
+    s = np.linspace(0, 1, 21)
+    theta, zeta = np.random.default_rng(0).uniform(0, 6, (2, 20, 1))
+    waves = np.stack([np.cos(m * theta - n * zeta), np.sin(m * theta - n * zeta)])[:parts]
+    true = np.einsum("pam,psm->as", waves, np.atleast_3d(values(s)).reshape(parts, 21, -1))
+    error = {}
+    for count in (3, 6, 7, 9, 12, 25):
+        given = SPACINGS[spacing](count)
+        profiles = {"iota": 0.4 + 0.3 * np.exp(-given), "G": 50 + np.cos(given), "psi_edge": 8.0}
+        try:
+            made = boozer.from_surfaces(given, m, n, values(given), periods=3, **profiles)
+        except ValueError as refusal:
+            assert "surfaces" in str(refusal)
+        else:
+            error[count] = np.abs(np.asarray(made.strength(s, theta, zeta)) / true - 1).max()
+            iota = np.polynomial.polynomial.polyval(s, made.iota)
+            np.testing.assert_allclose(iota, 0.4 + 0.3 * np.exp(-s), atol=7e-3)
+    assert max(error.values()) < 1e-2
+    assert {12, 25} <= error.keys()
+    assert error[25] < 1e-3
+    assert 3 not in error  # an error instead
+
+
 NEAR_AXIS = ["precise QA", *(pytest.param(x, marks=slow) for x in ("precise QH", "r2 section 5.5"))]
 
 
@@ -423,7 +477,11 @@ ERRORS = [
     (lambda _: modes([0], [0], [[np.nan]]), ValueError, "B must be finite, got nan"),
     (lambda _: modes([0, 1.5], [0, 0], [[1.0], [0.1]]), ValueError, "m must be integers.* 1.5"),
     (lambda _: modes([0], [0, 1], [[1.0]]), ValueError, "one entry for each mode"),
-    (lambda _: surfaces(np.array([0.1, 0.95])), ValueError, "more than 6 surfaces"),
+    (lambda _: surfaces(np.array([0.1, 0.95])), ValueError, "at least 3 surfaces, got 2"),
+    (lambda _: surfaces(np.array([0.1, 0.5, 0.95]), iota=[0.4, 0.9, 0.1]), ValueError,
+     "iota must be determined .* with 3 surfaces.*more surfaces"),
+    (lambda _: surfaces(G=np.arange(20) % 2 + 1.0), ValueError, "G must be determined"),
+    (lambda _: surfaces(I=0.2 * np.arange(20) % 2), ValueError, "I must be determined"),
     (lambda _: surfaces(np.linspace(0.05, 0.8, 20)), ValueError, "to the edge"),
     (lambda _: surfaces(iota=np.ones(3)), ValueError, r"iota must be .* got shape \(3,\)"),
     (lambda _: surfaces(box=3), TypeError, "box must be a pair"),
