@@ -109,7 +109,8 @@ def ripple(n, size):
 
 
 MANY_MINIMA = [
-    *(((ripple, n, size), (0.4, 0.3, 0.2, 0.3)) for n, size in ((20, 0.02), (60, 0.003))),
+    ((ripple, 20, 0.02), (0.4, 0.3, 0.2, 0.3)),
+    pytest.param((ripple, 60, 0.003), (0.4, 0.3, 0.2, 0.3), marks=pytest.mark.slow),
     ((boozer.w7x,), (0.6487, 4.4, 2.2, 0.12)),
     ((boozer.w7x,), (0.3, 1.0, 0.3, -0.2)),
 ]

@@ -70,10 +70,13 @@ class _Line(eqx.Module):
 
     def step(self) -> Array:
         """A step in ζ that resolves |B|: a part of the shortest wavelength of its modes, each
-        weighted by (amplitude/largest)^{1/5} on this surface."""
+        weighted by (amplitude/largest)^{1/5}, here or at the edge."""
         m, n = np.array(self.field.modes).T
         powers = self.s ** np.arange(self.field.coefficients.shape[3])
-        size = jnp.abs(self.field.coefficients @ powers).sum(0).ravel() * self.s ** (m / 2)
+        here, at_edge = (
+            jnp.abs(self.field.coefficients @ x).sum(0).ravel() for x in (powers, powers**0)
+        )
+        size = jnp.maximum(here * self.s ** (m / 2), at_edge)
         size = jnp.where((m != 0) | (n != 0), size, 0.0)
         weight = (size / jnp.maximum(jnp.max(size), 1e-300)) ** 0.2
         wave = jnp.max(jnp.abs(m * self.iota - n) * weight)
@@ -138,7 +141,7 @@ def second_invariant(
     - `turns`: distance of the search for bounce points, in toroidal turns on each side.
 
     **Returns** J∥; NaN for a passing particle (without bounce points within `turns`, `well` is NaN
-    too), and for a well of which the quadrature does not resolve |B|.
+    too), and for a well of which the quadrature does not resolve |B|, or that has a barrier inside.
 
     **Raises** `TypeError` for another field, `ValueError` for turns that are not positive.
 
@@ -177,18 +180,18 @@ def _integral(line: _Line, low: Array, high: Array, blocks: int) -> tuple[Array,
         # Two selections: the derivative of √ at 0 is infinite, and infinity times zero NaN.
         speed = jnp.where(kinetic > 0, jnp.sqrt(2 * jnp.where(kinetic > 0, kinetic, 1.0)), 0.0)
         terms = speed * line.length(B) * cosine
-        total, third, deepest = state
-        deepest = jnp.maximum(deepest, lax.stop_gradient(jnp.max(kinetic)))
-        return (total + jnp.sum(terms), third + jnp.sum(terms[1::3]), deepest), None
+        total, third, least, largest = state
+        fixed = lax.stop_gradient(kinetic)
+        least, largest = jnp.minimum(least, jnp.min(fixed)), jnp.maximum(largest, jnp.max(fixed))
+        return (total + jnp.sum(terms), third + jnp.sum(terms[1::3]), least, largest), None
 
-    start = (0.0 * half,) * 3
     sines = jnp.asarray(np.sin(phi)), jnp.asarray(np.cos(phi))
-    (total, third, deepest), _ = lax.scan(add, start, sines)
+    (total, third, least, largest), _ = lax.scan(add, (0.0 * half,) * 4, sines)
     # Both sums have the rounding of E − μB.
     rounding = 100 * jnp.finfo(total.dtype).eps * line.energy
-    allowed = (_RESOLVED * deepest + rounding) * total
-    is_resolved = lax.stop_gradient(jnp.abs(3 * third - total) * deepest <= allowed)
-    return 2 * np.pi / count * half * total, is_resolved
+    is_equal = jnp.abs(3 * third - total) * largest <= (_RESOLVED * largest + rounding) * total
+    # E < μB inside: the search for the ends passed over a narrow barrier.
+    return 2 * np.pi / count * half * total, lax.stop_gradient(is_equal) & (least >= -rounding)
 
 
 def complete(args: Any, epsilon: Any) -> Field:
