@@ -1,5 +1,6 @@
 """Guiding centres in Boozer coordinates: fields, equations of motion, files, initial conditions."""
 
+import contextlib
 import dataclasses
 import functools
 from typing import NamedTuple
@@ -98,8 +99,8 @@ def integrate(particles, q, p, args, h, num_steps, **options):
 
 
 @functools.cache
-def _run(name, coordinates, stages):
-    particles = boozer.GuidingCentres(FIELDS[name](), coordinates=coordinates)
+def _run(name, coordinates, stages, charge=2.0):
+    particles = boozer.GuidingCentres(FIELDS[name](), charge=charge, coordinates=coordinates)
     args = particles.args(0.0)
     system = particles.system
 
@@ -126,9 +127,9 @@ class Final(NamedTuple):
     mu: np.ndarray
 
 
-def final(name, start, h, blocks=1, stages=3, coordinates="regular"):
+def final(name, start, h, blocks=1, stages=3, coordinates="regular", charge=2.0):
     """A batch of orbits after ``blocks · BLOCK`` steps."""
-    particles, run = _run(name, coordinates, stages)
+    particles, run = _run(name, coordinates, stages, charge)
     q, p, args = particles.start(*(np.asarray(x, float) for x in start))
     p0, drifts, before = np.asarray(p), [], np.ones(len(p))
     for _ in range(blocks):
@@ -211,6 +212,48 @@ def test_negative_charges_agree_with_the_equations_of_the_literature(name, charg
         place = [x[i] for x in start]
         wanted = orbit_of_literature(name, particles, *place, args["mu"][i], 50.0)
         assert difference(z[i], wanted) < 1e-8
+
+
+@slow
+@pytest.mark.parametrize("charge", [-1.0, -2.0])
+def test_orbits_of_a_negative_charge_agree_with_the_literature(charge):
+    start = [np.array(x) for x in ORBITS["axisymmetric"]]
+    orbits = final("axisymmetric", start, 0.8, 2, charge=charge)
+    particles, _ = _run("axisymmetric", "regular", 3, charge)
+    for i, z in enumerate(orbits.z):
+        at = [x[i] for x in start]
+        args = particles, *at, orbits.mu[i], 1.6 * BLOCK
+        assert difference(z, orbit_of_literature("axisymmetric", *args)) < 1e-8
+    assert orbits.drift.max() < 1e-9
+    near = np.array([0.0, 1e-14]), np.zeros(2), np.zeros(2), np.array([0.7, 0.7])
+    across = final("axisymmetric", near, 0.8, charge=charge)
+    assert difference(across.z[0], across.z[1]) < 1e-5
+    assert 0 < across.z[0, 0] < 0.05
+
+
+@pytest.mark.parametrize("charge", [-2.0, -1.0, 1.0])
+@pytest.mark.parametrize("with_current", [True, False])
+def test_the_regular_chart_for_charges_of_both_signs(charge, with_current):
+    """It has the coordinates and the energy of the start, and Y, X are canonical as θ, p_θ are."""
+    point = 0.3, 2.1, -0.4, 0.6
+    regular, angles = (
+        boozer.GuidingCentres(axisymmetric(with_current), charge=charge, coordinates=name)
+        for name in ("regular", "angles")
+    )
+    q, p, args = regular.start(*point)
+    at = regular.coordinates_of(q, p)
+    assert [float(x) for x in at[:3]] == pytest.approx(point[:3], rel=1e-13)
+    assert float(at.v_parallel / regular.speed) == pytest.approx(point[3], rel=1e-13)
+    assert float(regular.system.hamiltonian(0.0, 0.0, q, p, 0.0, args)) == pytest.approx(0.5)
+    (theta, _), (p_theta, p_zeta), _ = angles.start(*point)
+    assert np.sign(p_theta) == np.sign(charge)
+
+    def chart(z):
+        q, p = regular.chart.state(z[0], -0.4, z[1], p_zeta)
+        return jnp.stack([q[0], p[0]])
+
+    slopes = jax.jacfwd(chart)(jnp.stack([theta, p_theta]))
+    assert float(jnp.linalg.det(slopes)) == pytest.approx(1, rel=1e-13)
 
 
 @slow
@@ -402,6 +445,58 @@ def test_reading_a_file_of_booz_xform(tmp_path, sign):
     assert jax.tree.all(jax.tree.map(lambda a, b: (a == b).all(), field, again))
 
 
+SPACINGS = {
+    "even": lambda count: np.linspace(0.02, 0.96, count),
+    "half mesh": lambda count: (np.arange(count) + 0.2) / (count - 0.6),
+    "dense at the axis": lambda count: 0.01 + 0.98 * np.linspace(0, 1, count) ** 2,
+}
+
+
+def spectrum(parts):
+    """Modes up to m = 14 that are no polynomials, with the irregularities of an equilibrium."""
+    m, k = (x.ravel() for x in np.meshgrid(np.arange(15), np.arange(-3, 4), indexing="ij"))
+    m, k = (x[(m > 0) | (k >= 0)] for x in (m, k))
+    random = np.random.default_rng(parts)
+    size, rate, phase = random.uniform([[-1], [0], [0]], [[1], [4], [6]], (3, parts * len(m)))
+    size, rate, phase = (x.reshape(parts, 1, -1) for x in (size, rate, phase))
+
+    def values(s):
+        s = np.asarray(s)[:, None]
+        B = size * np.exp(-0.7 * m - np.abs(k)) * s ** (m / 2) * np.exp(-rate * s)
+        B = B + 1e-5 * size * s ** np.minimum(m / 2, 2) * np.sin(40 * s + phase)
+        B[..., (m == 0) & (k == 0)] = 5.0
+        B[1:, ..., m == 0] = 0.0
+        return B if parts == 2 else B[0]
+
+    return m, 3 * k, values
+
+
+@pytest.mark.parametrize("parts", [1, 2])
+@pytest.mark.parametrize("spacing", SPACINGS)
+def test_fields_between_the_surfaces_of_a_file(parts, spacing):
+    """Against the functions of s themselves, also at the axis and the edge: with few surfaces a
+    polynomial of degree 6 passes through all values and oscillates in between."""
+    m, n, values = spectrum(parts)
+    s = np.linspace(0, 1, 21)
+    theta, zeta = np.random.default_rng(0).uniform(0, 6, (2, 20, 1))
+    waves = np.stack([np.cos(m * theta - n * zeta), np.sin(m * theta - n * zeta)])[:parts]
+    true = np.einsum("pam,psm->as", waves, np.atleast_3d(values(s)).reshape(parts, 21, -1))
+    error = {}
+    for count in (3, 6, 7, 9, 12, 25):
+        given = SPACINGS[spacing](count)
+        profiles = {"iota": 0.4 + 0.3 * np.exp(-given), "G": 50 + np.cos(given), "psi_edge": 8.0}
+        # Three are refused, and this message would fail for any other reason.
+        refusal = pytest.raises(ValueError, match="with 3 surfaces")
+        with refusal if count == 3 else contextlib.nullcontext():
+            made = boozer.from_surfaces(given, m, n, values(given), periods=3, **profiles)
+        if count > 3:
+            error[count] = np.abs(np.asarray(made.strength(s, theta, zeta)) / true - 1).max()
+            iota = np.polynomial.polynomial.polyval(s, made.iota)
+            np.testing.assert_allclose(iota, 0.4 + 0.3 * np.exp(-s), atol=7e-3)
+    assert max(error.values()) < 1e-2
+    assert error[25] < 1e-3
+
+
 NEAR_AXIS = ["precise QA", *(pytest.param(x, marks=slow) for x in ("precise QH", "r2 section 5.5"))]
 
 
@@ -455,7 +550,11 @@ ERRORS = [
     (lambda _: modes([0], [0], [[np.nan]]), ValueError, "B must be finite, got nan"),
     (lambda _: modes([0, 1.5], [0, 0], [[1.0], [0.1]]), ValueError, "m must be integers.* 1.5"),
     (lambda _: modes([0], [0, 1], [[1.0]]), ValueError, "one entry for each mode"),
-    (lambda _: surfaces(np.array([0.1, 0.95])), ValueError, "more than 6 surfaces"),
+    (lambda _: surfaces(np.array([0.1, 0.95])), ValueError, "at least 3 surfaces, got 2"),
+    (lambda _: surfaces(np.array([0.1, 0.5, 0.95]), iota=[0.4, 0.9, 0.1]), ValueError,
+     "iota must be determined .* with 3 surfaces.*more surfaces"),
+    (lambda _: surfaces(G=np.arange(20) % 2 + 1.0), ValueError, "G must be determined"),
+    (lambda _: surfaces(I=0.2 * np.arange(20) % 2), ValueError, "I must be determined"),
     (lambda _: surfaces(np.linspace(0.05, 0.8, 20)), ValueError, "to the edge"),
     (lambda _: surfaces(iota=np.ones(3)), ValueError, r"iota must be .* got shape \(3,\)"),
     (lambda _: surfaces(box=3), TypeError, "box must be a pair"),
@@ -474,6 +573,90 @@ ERRORS = [
 def test_bad_fields_and_particles(make, kind, message):
     with pytest.raises(kind, match=message):
         make(boozer.GuidingCentres(axisymmetric()))
+
+
+# Tables of the modes (1, 0), (1, 12) and (3, −12), and ι: the ripple is in all of the field, only
+# between the axis and the edge, and where ι is large at the edge only.
+RIPPLES = {
+    "everywhere": ([[-0.6, 0.0], [0.1, 0.0], [0.0, 0.0]], [0.42, 0.05]),
+    "not at the edge": ([[-0.6, 0.0], [0.4, -0.4], [0.0, 0.0]], [0.42, 0.05]),
+    "with shear": ([[-0.6, 0.0], [0.0, 0.0], [0.1, 0.05]], [0.05, 2.5]),
+}
+
+
+def rippled(name):
+    table, iota = RIPPLES[name]
+    return boozer.from_modes(
+        [0, 1, 1, 3], [0, 0, 12, -12], [[5.7, 0.05], *table], psi_edge=EDGE, iota=iota, G=57.0,
+        periods=4,
+    )  # fmt: skip
+
+
+@functools.cache
+def _energy_error():
+    """Largest change of the energy at ε, in a field and modes that break its symmetry."""
+
+    @jax.jit
+    def error(field, breaking, h, epsilon):
+        alphas = boozer.GuidingCentres(field, breaking=breaking)
+        q, p, args = alphas.state(*map(jnp.asarray, (0.75, 0.7, 0.1, 0.7)))
+
+        def energy(q, p):
+            at = alphas.coordinates_of(q, p, epsilon)
+            return (at.v_parallel / alphas.speed) ** 2 / 2 + args["mu"] * at.B
+
+        options = {"epsilon": epsilon, "observe": dvi.MaxDrift(energy), "throw": False}
+        return integrate(alphas, q, p, args, h, 200, **options).observed
+
+    return error
+
+
+def split(name):
+    symmetric, breaking = rippled(name).split()
+    return boozer.GuidingCentres(symmetric, breaking=breaking)
+
+
+@pytest.mark.parametrize(("name", "m", "n"), [*zip(RIPPLES, (1, 1, 3), (12, 12, -12), strict=True)])
+def test_the_step_is_that_of_all_modes_and_surfaces(name, m, n):
+    """Also of the modes of `breaking`, of those inside of the edge, and of ι there."""
+    alphas, table = split(name), RIPPLES[name][0][1 if m == 1 else 2]
+    assert alphas.h == boozer.GuidingCentres(rippled(name)).h == alphas.at_epsilon(1.0).h
+    assert alphas.at_epsilon(0.0).h > 2.5 * alphas.h
+    s = np.linspace(0, 1, 2001)
+    B, iota = 5.7 + 0.05 * s, RIPPLES[name][1][0] + RIPPLES[name][1][1] * s
+    size = s ** (m / 2) * (table[0] + table[1] * s)
+    waves = np.abs(m * iota - n) * (size / B) ** 0.2 * B / 57
+    assert alphas.h == pytest.approx(0.4 / waves.max(), rel=1e-3)
+
+
+@slow
+@pytest.mark.parametrize("name", RIPPLES)
+def test_the_step_keeps_the_energy_with_modes_that_break_the_symmetry(name):
+    alphas, error = split(name), _energy_error()
+    right, wrong = (
+        error(alphas.field, alphas.breaking, h, 1.0) for h in (alphas.h, alphas.at_epsilon(0.0).h)
+    )
+    assert right < 1e-4
+    assert wrong > 20 * right  # with the step of the field without these modes
+
+
+@pytest.mark.parametrize("coordinates", ["regular", "angles"])
+def test_coordinates_with_modes_that_break_the_symmetry(coordinates):
+    """v∥ and |B| at an ε are those of the complete field, and H is the energy of the system."""
+    alphas = dataclasses.replace(split("everywhere"), coordinates=coordinates)
+    q, p, args = alphas.start(0.5, 0.7, 0.1, 0.4)
+    for epsilon in (0.0, 0.5, 2.0):
+        at = alphas.coordinates_of(q, p, epsilon)
+        complete = alphas.at_epsilon(epsilon)
+        for a, b in zip(at, complete.coordinates_of(q, p), strict=True):
+            assert float(a) == pytest.approx(float(b), rel=1e-13)
+        assert float(at.B) == pytest.approx(float(complete.field.strength(*at[:3])), rel=1e-13)
+        energy = (at.v_parallel / alphas.speed) ** 2 / 2 + args["mu"] * at.B
+        system = alphas.system
+        H = system.hamiltonian(0.0, 0.0, q, p, 0.0, args)
+        H = H + epsilon * system.perturbation(0.0, 0.0, q, p, args, epsilon)
+        assert float(energy) == pytest.approx(float(H), rel=1e-13)
+    assert abs(at.B / alphas.coordinates_of(q, p).B - 1) > 1e-3  # negative control: without ε
 
 
 @slow

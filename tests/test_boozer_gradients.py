@@ -185,3 +185,19 @@ def test_the_example_runs(tmp_path, capsys):
     module.main(["--quick", str(tmp_path)])
     assert "with its gradient" in capsys.readouterr().out
     assert (tmp_path / "alpha_optimise.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_a_step_that_is_too_large_for_the_field_is_no_success():
+    """The default step is that of smooth fields; W7-X with its coil ripple requires a smaller one:
+    the energy error of a run with the default would be 0.1 and more."""
+    alphas = boozer.GuidingCentres(boozer.w7x(), energy=3.5e4)
+    lows, highs = [0.2, 0, 0, -1], [0.8, 6, 6, 1]
+    starts = jnp.asarray(np.random.default_rng(0).uniform(lows, highs, (16, 4)))
+    run = jax.jit(
+        jax.vmap(lambda x, h: boozer.radial_drift(alphas, x, num_steps=300, h=h), in_axes=(0, None))
+    )
+    drift, is_success = run(starts, 4.0)
+    assert 0 < is_success.sum() < 12
+    assert (drift[~is_success] == 0).all()
+    assert run(starts, alphas.h)[1].all()

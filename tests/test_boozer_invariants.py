@@ -76,6 +76,57 @@ def test_second_invariant_is_the_integral_of_scipy(B_bounce):
     assert abs(wrong / by_quad(*at) - 1) > 0.02
 
 
+def by_many_points(field, s, low, high, alpha, mu):
+    """J∥ and the number of minima, by the midpoint rule with 20 000 points."""
+    polynomial = np.polynomial.polynomial.polyval
+    m, n = np.array(field.modes).T
+    c = np.asarray(field.coefficients)[0].reshape(len(m), -1)
+    I = np.zeros(1) if field.I is None else field.I  # noqa: E741
+    iota, G, I = (polynomial(s, np.asarray(x)) for x in (field.iota, field.G, I))  # noqa: E741
+    size = polynomial(s, c.T) * s ** (m / 2)
+
+    def strength(zeta):
+        return np.cos(np.outer(alpha + iota * zeta, m) - np.outer(zeta, n)) @ size
+
+    phi = np.pi * ((np.arange(20_000) + 0.5) / 20_000 - 0.5)
+    half = (high - low) / 2
+    B = strength((low + high) / 2 + half * np.sin(phi))
+    J = np.sum(np.sqrt(np.maximum(1 - 2 * mu * B, 0)) / B * np.cos(phi)) * abs(G + iota * I)
+    change = np.diff(strength(np.linspace(low, high, 4001)))
+    return 2 * half * J * np.pi / 20_000, int(np.sum((change[:-1] < 0) & (change[1:] > 0)))
+
+
+@functools.cache
+def wells():
+    return jax.jit(lambda *a: (boozer.second_invariant(*a), boozer.well(*a)))
+
+
+def ripple(n, size):
+    """A banana in whose well there are about n/2 minima."""
+    return boozer.from_modes(
+        [0, 1, 0], [0, 0, n], [[5.0], [-0.6], [size]], psi_edge=8.0, iota=0.45, G=50.0
+    )
+
+
+MANY_MINIMA = [
+    ((ripple, 20, 0.02), (0.4, 0.3, 0.2, 0.3)),
+    pytest.param((ripple, 60, 0.003), (0.4, 0.3, 0.2, 0.3), marks=pytest.mark.slow),
+    ((boozer.w7x,), (0.6487, 4.4, 2.2, 0.12)),
+    ((boozer.w7x,), (0.3, 1.0, 0.3, -0.2)),
+]
+
+
+@pytest.mark.parametrize(("make", "point"), MANY_MINIMA)
+def test_second_invariant_of_wells_with_many_minima(make, point):
+    field, (s, theta, zeta, pitch) = make[0](*make[1:]), point
+    mu = (1 - pitch**2) / (2 * float(field.strength(s, theta, zeta)))
+    J, (low, high) = wells()(field, s, theta, zeta, mu)
+    iota = np.polynomial.polynomial.polyval(s, np.asarray(field.iota))
+    reference, minima = by_many_points(field, s, float(low), float(high), theta - iota * zeta, mu)
+    assert float(J) == pytest.approx(reference, rel=1e-9)
+    assert minima >= 4
+
+
 def test_gradient_of_the_second_invariant():
     """In the point, μ, E and the modes, against differences of fourth order of the integral of
     scipy, and for the modes of second order."""

@@ -255,13 +255,18 @@ def from_surfaces(
       those of the sine terms.
     - `iota`, `G`, `I`: values on the surfaces [1, T m, T m]; `psi_edge`, `periods`, `helicity` as
       for `from_modes`.
-    - `degree`: of the polynomials of the modes; those of the profiles have two more.
+    - `degree`: largest degree of the polynomials of the modes; those of the profiles have up to two
+      more. Each takes the degree that predicts best the values on surfaces that are left out.
     - `box`: (M, K), only modes with m ≤ M and |n/periods −
       helicity·m| ≤ K. The cost of a step is proportional to (M + 1)(2K + 1).
-    - `tolerance`: largest error of |B| over its mean, on the given surfaces.
+    - `tolerance`: largest error of |B| over its mean, and of ι, G and I (over G).
 
-    **Raises** `ValueError` for surfaces that do not reach the edge, or if the error of |B| is
-    larger than `tolerance`. The modes outside of `box` are not part of that error.
+    **Raises** `ValueError` for surfaces that do not reach the edge, or if an error is larger than
+    `tolerance`: too few surfaces, or a degree that is too low.
+
+    **Accuracy** The error is measured by leaving each surface out and predicting it from the
+    others, so that it holds between the surfaces; at the ends it is scaled to the distance from
+    s = 0 and s = 1. The modes outside of `box` are not part of it.
     """
     s, values = _array("s", s, "surfaces"), _parts(B)
     periods, helicity = settings.get("periods", 1), settings.get("helicity", 0)
@@ -271,8 +276,8 @@ def from_surfaces(
             "s must increase, from 0 or more to the edge (0.9 to 1), got "
             f"{np.array2string(s, threshold=4)}. Divide s and psi_edge of an inner grid by s[-1]."
         )
-    if len(s) <= degree:
-        raise ValueError(f"degree={degree} requires more than {degree} surfaces, got {len(s)}.")
+    if len(s) < 3:
+        raise ValueError(f"s must have at least 3 surfaces, got {len(s)}.")
     ms, ns = (_integers(name, x) for name, x in (("m", m), ("n", n)))
     array("B", values[0], (len(s), len(ms)), integers=True)
     names = ["iota", "G", *(["I"] if settings.get("I") is not None else [])]
@@ -283,45 +288,97 @@ def from_surfaces(
         M, K = (whole(f"entry {i} of box", x, 0) for i, x in enumerate(box))
         in_box = (ms <= M) & (np.abs(ns / periods - helicity * ms) <= K)
         ms, ns, values = ms[in_box], ns[in_box], [x[:, in_box] for x in values]
-    fits = [
-        np.stack([_fit(s, x[:, i], degree, power / 2) for i, power in enumerate(ms)])
-        for x in values
-    ]
-    errors = [
-        np.abs(s ** (power / 2) * np.polynomial.polynomial.polyval(s, c) - x[:, i])
-        for x, fit in zip(values, fits, strict=True)
-        for i, (power, c) in enumerate(zip(ms, fit, strict=True))
-    ]
-    error = np.sum(errors, axis=0)
     mean = np.abs(values[0][:, (ms == 0) & (ns == 0)]).mean() if len(ms) else 0.0
-    if mean > 0 and error.max() > finite("tolerance", tolerance) * mean:
-        raise ValueError(
-            f"tolerance={tolerance} is exceeded by degree={degree}: the error of |B| is "
-            f"{error.max() / mean:.1g} of its mean. Give a larger degree, or fewer large m."
-        )
-    high = min(degree + 2, len(s) - 1)
-    current, settings["I"] = profiles.get("I"), None
-    settings["iota"], settings["G"] = (_fit(s, profiles[name], high) for name in ("iota", "G"))
-    if current is not None and np.abs(current).max() > 1e-9 * np.abs(profiles["G"]).max():
-        settings["I"] = np.append(0.0, _fit(s, current, high - 1, 1.0))
+    fits, errors = zip(*(_fit_modes(s, ms, x, degree) for x in values), strict=True)
+    if mean > 0:
+        _check_fit("|B|", np.sum(errors, axis=(0, 2)), mean, tolerance)
+    current = profiles.pop("I", None)
+    for name, profile in profiles.items():
+        settings[name], error = _fit(s, profile, degree + 2)
+        _check_fit(name, error, np.abs(profile).max(), tolerance)
+    settings["I"], largest = None, np.abs(profiles["G"]).max()
+    if current is not None and np.abs(current).max() > 1e-9 * largest:
+        fit, error = _fit(s, current, degree + 1, 1.0)
+        _check_fit("I", error, largest, tolerance)
+        settings["I"] = np.append(0.0, fit)
     return from_modes(ms, ns, np.stack(fits), **settings)
 
 
 def fitted_modes(
-    s: Any, m: Any, n: Any, values: Any, periods: int, degree: int, box: tuple[int, int] | None
+    name: str, s: Any, m: Any, n: Any, values: Any, scale: float, settings: tuple[Any, ...]
 ) -> np.ndarray:
-    """The table of polynomials, shape (M + 1, 2K + 1, d + 1), of any function on surfaces."""
+    """The table of polynomials, shape (M + 1, 2K + 1, d + 1), of any function on surfaces.
+
+    `settings`: periods, degree, box, and the largest error of the function over `scale`.
+    """
+    periods, degree, box, tolerance = settings
     k = n // periods
     M, K = box if box is not None else (int(m.max()), int(np.abs(k).max()))
+    in_box = (m <= M) & (np.abs(k) <= K)
+    fit, errors = _fit_modes(s, m[in_box], values[:, in_box], degree)
+    _check_fit(name, np.sum(errors, axis=1), scale, tolerance)
     table = np.zeros((M + 1, 2 * K + 1, degree + 1))
-    for i in np.flatnonzero((m <= M) & (np.abs(k) <= K)):
-        table[m[i], k[i] + K] += _fit(s, values[:, i], degree, m[i] / 2)
+    np.add.at(table, (m[in_box], k[in_box] + K), fit)
     return table
 
 
-def _fit(s: np.ndarray, values: np.ndarray, degree: int, power: float = 0.0) -> np.ndarray:
-    """c with values ≈ s^power Σ_d c_d s^d, by least squares in Chebyshev polynomials of 2s − 1."""
-    columns = np.polynomial.chebyshev.chebvander(2 * s - 1, degree) * (s**power)[:, None]
-    c, *_ = np.linalg.lstsq(columns, values, rcond=1e-10)
-    series = np.polynomial.chebyshev.Chebyshev(c, domain=[0, 1])
-    return np.pad(series.convert(kind=np.polynomial.Polynomial).coef, (0, degree + 1))[: degree + 1]
+def _check_fit(name: str, errors: np.ndarray, scale: float, tolerance: float) -> None:
+    """**Raises** `ValueError` if an error at one of the surfaces is too large."""
+    if errors.max() > finite("tolerance", tolerance) * scale:
+        raise ValueError(
+            f"{name} must be determined by its values on the surfaces to tolerance={tolerance} of "
+            f"its size, got {errors.max() / scale if scale else np.inf:.2g} with {len(errors)} "
+            "surfaces, each predicted by the others. Give more surfaces, a larger degree, fewer "
+            "large m (box=), or a larger tolerance."
+        )
+
+
+def _fit_modes(
+    s: np.ndarray, m: np.ndarray, values: np.ndarray, degree: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """`_fit` of each mode, with the power m/2."""
+    fits, errors = np.zeros((len(m), degree + 1)), np.zeros(values.shape)
+    for power in np.unique(m):
+        fits[m == power], errors[:, m == power] = _fit(s, values[:, m == power], degree, power / 2)
+    return fits, errors
+
+
+def _fit(
+    s: np.ndarray, values: np.ndarray, degree: int, power: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """c with values ≈ s^power Σ_d c_d s^d by least squares, shape (…, degree + 1), and the error at
+    each surface, for values of shape (surfaces, …).
+
+    With few surfaces the residual is no measure: a polynomial of a high degree passes through all
+    values and oscillates in between. The error is that of the prediction from the other surfaces,
+    residual/(1 − H_ii) with the projection H of the fit, and the degree is the one, up to `degree`,
+    for which it is smallest. The errors at both ends, where this is an extrapolation, are scaled
+    to the distance from s = 0 and s = 1.
+    """
+    columns = values.reshape(len(s), -1)
+    c, errors = np.zeros((columns.shape[1], degree + 1)), np.abs(columns)  # without any term
+    weights = np.ones((len(s), 1))
+    weights[[0, -1], 0] = s[0] / (s[1] - s[0]), (1 - s[-1]) / (s[-1] - s[-2])
+    for d in range(min(degree, len(s) - 2) + 1):
+        basis = np.polynomial.chebyshev.chebvander(2 * s - 1, d) * (s**power)[:, None]
+        left, sizes, right = np.linalg.svd(basis, full_matrices=False)
+        rank = int(np.sum(sizes > 1e-10 * sizes[0]))
+        left, inverse = left[:, :rank], right[:rank].T / sizes[:rank]
+        residuals = np.abs(columns - left @ (left.T @ columns))
+        freedom = 1 - np.sum(left**2, axis=1, keepdims=True)
+        # A surface that the others do not predict at all has no freedom, up to rounding.
+        left_out = np.where(freedom > 1e-8, weights * residuals / freedom.clip(1e-8), np.inf)
+        predicted = np.maximum(residuals, left_out)
+        better = np.sum(predicted**2, axis=0) < np.sum(errors**2, axis=0)
+        errors[:, better], c[better] = predicted[:, better], 0.0
+        c[better, : d + 1] = (inverse @ (left.T @ columns[:, better])).T @ _monomials(d)
+    return c.reshape(*values.shape[1:], degree + 1), errors.reshape(values.shape)
+
+
+def _monomials(degree: int) -> np.ndarray:
+    """Coefficients in powers of s of the Chebyshev polynomials of 2s − 1, one in a row."""
+    rows = np.zeros((degree + 1, degree + 1))
+    for k in range(degree + 1):
+        series = np.polynomial.Chebyshev.basis(k, domain=[0, 1])
+        rows[k, : k + 1] = series.convert(kind=np.polynomial.Polynomial).coef
+    return rows

@@ -133,9 +133,17 @@ def from_near_axis(stellarator: Any, minor_radius: float) -> Field:
 
 
 def read_geometry(
-    path: Any, *, box: tuple[int, int] | None = None, degree: int = 6, scale: float = 1.0
+    path: Any,
+    *,
+    box: tuple[int, int] | None = None,
+    degree: int = 6,
+    scale: float = 1.0,
+    tolerance: float = 1e-2,
 ) -> Geometry:
     """The `Geometry` of such a file, for a stellarator-symmetric field; lengths times `scale`.
+
+    `box`, `degree`: as for `from_surfaces`. `tolerance`: largest error of R and Z over the mean of
+    R, and of ν [rad], measured as there.
 
     **Raises** as `read_booz_xform`; `ValueError` for a field without that symmetry.
     """
@@ -144,13 +152,14 @@ def read_geometry(
         raise ValueError(
             f"{path}: read_geometry requires the symmetry (θ, ζ) → (−θ, −ζ), got bmns_b."
         )
-    tables = {}
-    for name, values, factor in (
-        ("R", f.even["rmnc_b"], scale),
-        ("Z", f.odd["zmns_b"], scale),
+    tables, settings = {}, (f.periods, degree, box, tolerance)
+    length = scale * np.abs(f.even["rmnc_b"][:, (f.m == 0) & (f.n == 0)]).mean()
+    for name, values, size in (
+        ("R", scale * f.even["rmnc_b"], length),
+        ("Z", scale * f.odd["zmns_b"], length),
         ("nu", f.odd["pmns_b"], 1.0),
     ):
-        table = fitted_modes(f.s, f.m, f.n, factor * values, f.periods, degree, box)
+        table = fitted_modes(name, f.s, f.m, f.n, values, size, settings)
         zeros = np.zeros_like(table)
         tables[name] = jnp.asarray(np.stack([table, zeros] if name == "R" else [zeros, table]))
     return Geometry(**tables, shape=Shape(f.periods, 0), direction=f.direction)

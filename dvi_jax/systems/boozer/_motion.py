@@ -12,8 +12,8 @@ At the magnetic axis the angle θ is not defined. The canonical coordinates of t
 
     Y = √(2p_θ) sin θ,    X = √(2p_θ) cos θ,    dp_θ ∧ dθ = dX ∧ dY,
 
-with q = (Y, ζ) and p = (X, p_ζ), in which H is smooth everywhere. A negative charge has ρ < 0 and
-p_θ < 0: then Y = −√(−2p_θ) sin θ and X = √(−2p_θ) cos θ.
+with q = (Y, ζ) and p = (X, p_ζ), in which H is smooth everywhere. For a negative charge ρ and p_θ
+are negative: then Y = √(−2p_θ) cos θ and X = √(−2p_θ) sin θ, of which dp_θ ∧ dθ = dX ∧ dY as well.
 """
 
 from typing import Any
@@ -51,31 +51,35 @@ def speed_along(field: Field, rho: Any, s: Any, p_zeta: Any, B: Any) -> Array:
 
 
 class Regular(eqx.Module):
-    """The chart (Y, ζ; X, p_ζ), smooth at the axis; `negative`: of a negative charge."""
+    """The chart (Y, ζ; X, p_ζ), smooth at the axis; `sign`: that of the charge."""
 
-    negative: bool = eqx.field(static=True, default=False)
+    sign: int = eqx.field(static=True, default=1)
 
-    def _signed(self, x: Any) -> Any:
-        return -x if self.negative else x
+    def _cartesian(self, q: Any, p: Any) -> tuple[Any, Any]:
+        """√|2p_θ| cos θ and √|2p_θ| sin θ."""
+        return (p[0], q[0]) if self.sign > 0 else (q[0], p[0])
 
     def momentum(self, q: Any, p: Any) -> Any:
         """p_θ [m]."""
-        return self._signed((p[0] ** 2 + q[0] ** 2) / 2)
+        return self.sign * (p[0] ** 2 + q[0] ** 2) / 2
 
     def point(self, field: Field, rho: Any, q: Any, p: Any, s: Any) -> tuple[Any, Any]:
         """√s cos θ and √s sin θ."""
-        scale = jnp.sqrt(self._signed(_per_action(field, rho, p[1], s)) / 2)
-        return scale * p[0], scale * self._signed(q[0])
+        scale = jnp.sqrt(self.sign * _per_action(field, rho, p[1], s) / 2)
+        x, y = self._cartesian(q, p)
+        return scale * x, scale * y
 
     def state(self, theta: Any, zeta: Any, p_theta: Any, p_zeta: Any) -> tuple[Any, Any]:
         """(q, p)."""
-        r = jnp.sqrt(2 * self._signed(p_theta))
-        Y, X = r * self._signed(jnp.sin(theta)), r * jnp.cos(theta)
+        r = jnp.sqrt(2 * self.sign * p_theta)
+        x, y = r * jnp.cos(theta), r * jnp.sin(theta)
+        Y, X = (y, x) if self.sign > 0 else (x, y)
         return jnp.stack([Y, zeta], axis=-1), jnp.stack([X, p_zeta], axis=-1)
 
     def angle(self, q: Any, p: Any) -> Any:
         """θ from −π to π."""
-        return jnp.arctan2(self._signed(q[0]), p[0])
+        x, y = self._cartesian(q, p)
+        return jnp.arctan2(y, x)
 
 
 class Angles(eqx.Module):

@@ -8,16 +8,17 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
+from numpy.polynomial.polynomial import polyval
 
 from ...base.checks import array, instance, one_of, positive
 from ...observe import Crossings, Section, Stop
 from ...problem.discretise import discretise
 from ...problem.system import System
 from .._problem import nonzero
-from ._bounce import Pitch, SecondInvariant, at_crossings, complete
+from ._bounce import Pitch, SecondInvariant, at_crossings, centre_of, complete
 from ._classes import Trapping, largest_strength
 from ._field import Field, as_numbers, polynomial
-from ._motion import Angles, Breaking, Regular, continuous_hamiltonian, flux, speed_along
+from ._motion import Angles, Breaking, Regular, continuous_hamiltonian, flux
 
 # CODATA 2018: e and the electronvolt exactly, and the mass of the alpha particle.
 _EV = 1.602176634e-19
@@ -43,10 +44,10 @@ class GuidingCentres(eqx.Module):
 
         H = u²/2 + μB,   p_θ = ψ/ρ + u I/B,   p_ζ = −χ/ρ + u G/B,   u = v∥/v0,   ρ = m v0/(Ze)
 
-    The state is q = (Y, ζ), p = (X, p_ζ) with X + iY = √(2p_θ) e^{iθ} (`coordinates="regular"`:
-    smooth at the magnetic axis; with −p_θ and −θ for a negative charge, whose p_θ is negative), or
-    q = (θ, ζ), p = (p_θ, p_ζ) (`"angles"`). There are no collisions, no electric field and no
-    finite gyroradius: H is the drift Hamiltonian of first order in ρ. The energy is H = 1/2.
+    The state is q = (Y, ζ), p = (X, p_ζ) with X + iY = √(2p_θ) e^{iθ}, or for a negative charge
+    Y + iX = √(−2p_θ) e^{iθ} (`coordinates="regular"`: smooth at the magnetic axis), or q = (θ, ζ),
+    p = (p_θ, p_ζ) (`"angles"`). There are no collisions, no electric field and no finite
+    gyroradius: H is the drift Hamiltonian of first order in ρ. The energy is H = 1/2.
 
     **Arguments**
 
@@ -93,7 +94,7 @@ class GuidingCentres(eqx.Module):
 
     @property
     def chart(self) -> Any:
-        return Angles() if self.coordinates == "angles" else Regular(self.charge < 0)
+        return Angles() if self.coordinates == "angles" else Regular(1 if self.charge > 0 else -1)
 
     @property
     def system(self) -> System:
@@ -104,23 +105,27 @@ class GuidingCentres(eqx.Module):
 
     @property
     def h(self) -> float:
-        """A step for `GaussLegendre(2)` [m]: 0.4/k with the largest k∥ = |mι − n| |B|/|G|.
+        """A step for `GaussLegendre(2)` [m]: 0.4/k, k = max |mι − n| |B|/|G + ιI| of modes and s.
 
-        Each mode is weighted by (amplitude at the edge/|B|)^{1/5}, as in an error of fourth
-        order. The energy then oscillates by less than about 1e-5 of itself; check it with
-        `MaxDrift`.
+        Each mode is weighted by (amplitude/|B|)^{1/5}, as in an error of fourth order. The energy
+        then oscillates by less than about 1e-5 of itself; check it with `MaxDrift`. The modes of
+        `breaking` count as at ε = 1; ``at_epsilon(ε).h`` is the step of another ε.
         """
         # NumPy, so that it is a number also while a function that uses it is traced.
-        field = self.field
-        iota, G = np.asarray(field.iota)[0], abs(np.asarray(field.G)[0])
-        table = np.abs(np.asarray(field.coefficients).sum(3)).sum(0).ravel()  # at the edge
+        field, s = self.field, np.linspace(0, 1, 33)
+        I = np.zeros(1) if field.I is None else field.I  # noqa: E741
+        iota, G, I = (polyval(s, np.asarray(c)) for c in (field.iota, field.G, I))  # noqa: E741
+        c = np.asarray(field.coefficients)
+        c = c if self.breaking is None else c + np.asarray(self.breaking)
         m, n = np.array(field.modes).T
+        size = np.abs(polyval(s, np.moveaxis(c, -1, 0))).sum(0).reshape(-1, len(s))
+        size = size * s ** (m[:, None] / 2)
         wave = (m != 0) | (n != 0)
-        B = float(table[~wave][0])
+        B = size[~wave][0]
+        k = np.abs(np.outer(m, iota) - n[:, None])[wave] * (size[wave] / B) ** 0.2
         # A passing particle goes around the axis as the mode (1, 0).
-        k = [abs(iota), *(np.abs(m * iota - n)[wave] * (table[wave] / B) ** 0.2)]
-        largest = max(k) * B / G
-        return float(0.4 / largest) if largest > 0 else float(G / B)
+        largest = np.max(np.vstack([np.abs(iota), k]) * B / np.abs(G + iota * I))
+        return float(0.4 / largest) if largest > 0 else float(np.min(np.abs(G) / B))
 
     def step(self, seconds: Any) -> Any:
         """The h or t of a run [m] for a time in seconds."""
@@ -141,7 +146,8 @@ class GuidingCentres(eqx.Module):
 
     def start(self, s: Any, theta: Any, zeta: Any, pitch: Any) -> tuple[Array, Array, dict]:
         """(q0, p0, args) at s, θ, ζ with the pitch v∥/v0; arrays of one shape, which is that of
-        the batch: map `integrate` over q0, p0 and args["mu"].
+        the batch: map `integrate` over q0, p0 and args["mu"]. |B| is that of the field without
+        `breaking`, so that a start does not depend on ε: the energy is 1/2 at ε = 0.
 
         **Raises** `ValueError` for s outside of [0, 1], or a pitch outside of [−1, 1].
         """
@@ -164,17 +170,16 @@ class GuidingCentres(eqx.Module):
         q, p = self.chart.state(theta, zeta, p_theta, p_zeta)
         return q, p, self.args((1 - pitch**2) / (2 * B))
 
-    def coordinates_of(self, q: Any, p: Any) -> Coordinates:
-        """Boozer coordinates of states: q, p of shape (…, 2) → arrays of shape (…)."""
+    def coordinates_of(self, q: Any, p: Any, epsilon: Any = None) -> Coordinates:
+        """Boozer coordinates of states: q, p of shape (…, 2) → arrays of shape (…).
+
+        - `epsilon`: that of the run, if `breaking` is given: v∥ and |B| depend on it.
+        """
 
         @functools.partial(jnp.vectorize, signature="(n),(n)->(),(),(),(),()")
         def coordinates(q, p):
-            args = self.args(0.0)
-            s = flux(self.chart, q, p, args)
-            x, y = self.chart.point(self.field, self.rho, q, p, s)
-            B = self.field.at(x, y, q[1])
-            u = speed_along(self.field, self.rho, s, p[1], B)
-            return s, self.chart.angle(q, p), q[1], self.speed * u, B
+            centre = centre_of(self.chart, q, p, self.args(0.0), epsilon)
+            return *centre[:3], self.speed * centre.u, centre.B
 
         return Coordinates(*coordinates(jnp.asarray(q), jnp.asarray(p)))
 

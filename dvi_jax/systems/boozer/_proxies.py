@@ -18,11 +18,16 @@ from ...integration.reversible import Reversible
 from ...methods import GaussLegendre
 from ...observe import Mean
 from ...observe.solution import Save
+from ._bounce import centre_of
 from ._field import Field
 from ._motion import flux
 from ._particles import GuidingCentres
 
 SURFACES = tuple(np.linspace(0.1, 1.0, 10).tolist())
+
+
+_ENERGY_ERROR = 1e-3
+"""Relative change of the energy in a run with a step that is too large for the field."""
 
 
 def symmetry_error(
@@ -102,7 +107,9 @@ def radial_drift(
     - `start`: s, θ, ζ and v∥/v0. For a batch map over it: `jax.vmap`, or `mean_drift`.
     - `h`: step [m], in units of the particles (h/v0 in seconds).
 
-    **Returns** Δs, and whether the run succeeded; Δs is 0 otherwise. There is no loss at s = 1: B
+    **Returns** Δs, and whether the run succeeded and the energy at its end differs from that at the
+    start by less than 1e-3; Δs is 0 otherwise. A field with short wavelengths requires a smaller
+    `h`, such as ``particles.h``. There is no loss at s = 1: B
     is continued by its polynomials.
 
     **Accuracy** that of `GaussLegendre(2)`, O(h⁴). Differentiable in the arrays of `particles` and
@@ -114,7 +121,12 @@ def radial_drift(
     num_steps = whole("num_steps", num_steps)
     adjoint, mean = Reversible(checkpoint_every=25), Mean(_Weight(particles.chart))
     sol = _run(particles, start, (num_steps, h), adjoint=adjoint, observe=mean)
-    is_success = sol.result == RESULTS.successful
+    q, p, args = particles.state(*start)
+    states = (q, p), (sol.qs[-1], sol.ps[-1])
+    epsilon = None if particles.breaking is None else 1.0
+    first, last = (centre_of(particles.chart, *x, args, epsilon).energy for x in states)
+    is_accurate = jnp.abs(last - first) < _ENERGY_ERROR * first
+    is_success = (sol.result == RESULTS.successful) & is_accurate
     return -jnp.where(is_success, sol.observed, 0.0), is_success
 
 
