@@ -20,6 +20,7 @@ _ECHO = 1e-9  # A line weaker by this factor than another within the resolution 
 _RIDGE = 1e-13  # Added to a diagonal of ones: lines that coincide do not give a negative pivot
 _GROUP = 6.0  # Lines within so many resolutions may be the width of one that decays
 _EXPLAINED = 0.3  # Share of what a constant amplitude leaves that a decaying one may leave
+_AS_GOOD = 30.0  # Times as much may be left by it as by the lines
 _CONVERGENCE = 1e-2  # Last correction to a converged frequency, over the resolution, at most
 
 
@@ -192,11 +193,10 @@ def _with_decaying_line(grid: _Grid, remainder, is_real: bool, largest, s, A, is
     which cannot be resolved, are one line whose amplitude decays or grows."""
     y = grid.rows[:, None] + grid.columns[None, :]
     group = is_line & (jnp.abs(s - s[0]) < _GROUP * np.pi)
-    waves = (
-        jnp.exp(1j * s[:, None, None] * y)
-        * (A / jnp.where(largest > 0, largest, 1.0))[:, None, None]
-    )
-    sums = jnp.sum(jnp.where(group[:, None, None], waves, 0.0), axis=0)
+    # A is in units of the signal, the remainder in those of its largest value.
+    sizes = jnp.where(group, A / jnp.where(largest > 0, largest, 1.0), 0.0)
+    outer = jnp.exp(1j * grid.rows[:, None] * s[None, :]) * sizes[None, :]
+    sums = outer @ jnp.exp(1j * s[:, None] * grid.columns[None, :])
     signal = remainder + (2 * jnp.real(sums) if is_real else sums)
     position, mean = _strongest(grid, signal, is_real)
     wave = jnp.exp(1j * position * y)
@@ -217,7 +217,9 @@ def _with_decaying_line(grid: _Grid, remainder, is_real: bool, largest, s, A, is
         line = 2 * jnp.real(line) if is_real else line
         return jnp.sum(grid.weights * jnp.abs(signal - line) ** 2)
 
-    explains = power(size * decay * wave) < _EXPLAINED**2 * power(mean * wave)
+    # Two lines that are not resolved leave less than one that decays, but for noise.
+    left = power(size * decay * wave)
+    explains = (left < _EXPLAINED**2 * power(mean * wave)) & (left < _AS_GOOD**2 * power(sums))
     replaces = is_line[0] & ~sure[0] & explains & (jnp.abs(position - s[0]) < np.pi)
     return (
         s.at[0].set(jnp.where(replaces, position, s[0])),
