@@ -49,5 +49,5 @@ def test_a_pendulum_with_friction():
     )
     run = {"h": 0.1, "num_steps": 3000, "epsilon": 0.01, "method": dvi.Strang()}
     sol = dvi.integrate(system, [0.3], [0.0], **run)
-    found = dvi.frequencies(sol, count=5, throw=False)
+    found = dvi.frequencies(sol, throw=False)
     assert 0.994 < abs(float(found.frequencies[0, 0])) < 1.001

@@ -20,7 +20,7 @@ _ECHO = 1e-9  # A line weaker by this factor than another within the resolution 
 _RIDGE = 1e-13  # Added to a diagonal of ones: lines that coincide do not give a negative pivot
 _GROUP = 6.0  # Lines within so many resolutions may be the width of one that decays
 _EXPLAINED = 0.3  # Share of what a constant amplitude leaves that a decaying one may leave
-_AS_GOOD = 30.0  # Times as much may be left by it as by the lines
+_SEVERAL, _AS_GOOD = 5, 30.0  # Than so many lines it may be so many times worse
 _CONVERGENCE = 1e-2  # Last correction to a converged frequency, over the resolution, at most
 
 
@@ -217,9 +217,10 @@ def _with_decaying_line(grid: _Grid, remainder, is_real: bool, largest, s, A, is
         line = 2 * jnp.real(line) if is_real else line
         return jnp.sum(grid.weights * jnp.abs(signal - line) ** 2)
 
-    # Two lines that are not resolved leave less than one that decays, but for noise.
+    # Few lines that are not resolved leave less than one that decays.
+    share = jnp.where(jnp.sum(group) < _SEVERAL, 1.0, _AS_GOOD)
     left = power(size * decay * wave)
-    explains = (left < _EXPLAINED**2 * power(mean * wave)) & (left < _AS_GOOD**2 * power(sums))
+    explains = (left < _EXPLAINED**2 * power(mean * wave)) & (left < share**2 * power(sums))
     replaces = is_line[0] & ~sure[0] & explains & (jnp.abs(position - s[0]) < np.pi)
     return (
         s.at[0].set(jnp.where(replaces, position, s[0])),
