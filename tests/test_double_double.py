@@ -422,7 +422,7 @@ def test_other_parts_of_a_run_accept_pairs():
     """Sections, running values, deviation vectors, a Stop and pieces, as in float64."""
     L = KEPLER.observables["angular_momentum"]
     observe = {
-        "section": dvi.Section(lambda t, q, p, args: q[1], max_crossings=3),
+        "section": dvi.Section(lambda t, q, p, args: q[1], 0, max_crossings=3),
         "running": dvi.Running(dvi.MaxDrift(L)),
         "trend": dvi.Trend(KEPLER.observables["energy"]),
         "lyapunov": dvi.LyapunovSpectrum(2),

@@ -144,8 +144,8 @@ def test_an_event_that_is_nan(h):
     sol = go(stop=dvi.Stop(lambda *point: g(*point) - 1))
     assert sol.status == "event_not_finite"
     assert sol.stats["failed_step"] == 5
-    sol = go(observe=dvi.Section(g))
+    sol = go(observe=dvi.Section(g, 0))
     assert sol.status == "event_not_finite"
     np.testing.assert_allclose(sol.observed.ts[0], 0.34 * np.sign(h))
     with pytest.raises(dvi.IntegrationError, match="The function g of"):
-        dvi.integrate(free, [0.0], [1.0], h=h, num_steps=10, observe=dvi.Section(g))
+        dvi.integrate(free, [0.0], [1.0], h=h, num_steps=10, observe=dvi.Section(g, 0))

@@ -89,7 +89,7 @@ def test_directions_and_the_capacity_of_sections():
     assert np.all(np.asarray(down.ps[:2, 1]) < 0)
     together = np.sort(np.concatenate([up.ts[:2], down.ts[:2]]))
     np.testing.assert_array_equal(together, both.ts[:4])
-    sol = kepler(observe=dvi.Section(on_axis, max_crossings=3))
+    sol = kepler(observe=dvi.Section(on_axis, 0, max_crossings=3))
     assert int(sol.observed.count) == 4
     assert np.isfinite(np.asarray(sol.observed.ts)).all()
 
@@ -133,7 +133,7 @@ def test_batches_and_gradients_of_sections():
 def section_loss(x, adjoint):
     p, h = x
     options = {"num_steps": 150, "method": dvi.Strang(), "save": dvi.Save(final=True)}
-    section = dvi.Section(on_axis, max_crossings=4)
+    section = dvi.Section(on_axis, 0, max_crossings=4)
     sol = dvi.integrate(KEPLER, START[0], p, h=h, adjoint=adjoint, observe=section, **options)
     found = sol.observed
     return found.ts[0] ** 2 + found.qs[0, 0] * found.ps[0, 1]
@@ -269,7 +269,7 @@ def test_transformed_time_implicit_steps_and_progress():
     assert float(end.stop.t) == pytest.approx(far.t_events[0][0], abs=1e-5)
     system = dvi.System(pendulum, force=lambda t0, t1, q, p, args: -p + jnp.cos(t0))
     options = {"h": 0.05, "num_steps": 200, "epsilon": 0.1, "method": dvi.Strang()}
-    options |= {"save": dvi.Save(ts=[0.33, 6.66]), "observe": dvi.Section(first_component)}
+    options |= {"save": dvi.Save(ts=[0.33, 6.66]), "observe": dvi.Section(first_component, 0)}
     calls = []
     sol, shown = (
         dvi.integrate(system, [0.4], [0.7], progress=progress, **options)

@@ -186,7 +186,7 @@ SEEN = {
         "save": dvi.Save(ts=np.linspace(0.01, 0.39, 6)),
         "observe": lambda t0, t1, q0, p0, q, p, args: jnp.arctan(q[0]),
     },
-    "crossings": {"observe": dvi.Section(lambda t, q, p, args: q[0] - 0.5, max_crossings=2)},
+    "crossings": {"observe": dvi.Section(lambda t, q, p, args: q[0] - 0.5, 0, max_crossings=2)},
     "stop": {"stop": dvi.Stop(lambda t, q, p, args: jnp.sin(q[0]) - 0.5)},
 }
 

@@ -65,6 +65,21 @@ def test_crossings_of_many_orbits():
     assert np.array_equal(later.count, found.count - 30)
 
 
+@pytest.mark.parametrize("h", [0.1, -0.1])
+def test_one_default_direction(h):
+    """Increasing g, for a section, an observed one and a return map: against cos t, whose zeros
+    are known."""
+    q, p = jnp.array([1.0]), jnp.array([0.0])
+    run = {"h": h, "num_steps": 200, "method": dvi.GaussLegendre(4)}
+    known = (1.5 if h > 0 else -0.5) * np.pi + np.sign(h) * 2 * np.pi * np.arange(3)
+    many = dvi.poincare_section(SPRING, q[None], p[None], plane, crossings=3, **run)
+    one = dvi.integrate(SPRING, q, p, observe=dvi.Section(plane, max_crossings=3), **run).observed
+    np.testing.assert_allclose(many.ts[0], known, rtol=1e-8)
+    np.testing.assert_allclose(one.ts, known, rtol=1e-8)
+    both = dvi.Section(plane, 0, max_crossings=6)
+    assert int(dvi.integrate(SPRING, q, p, observe=both, **run).observed.count) > 5
+
+
 def test_crossings_are_those_of_the_flow():
     """SciPy's events on equations by hand, to 1e-11; a leapfrog's are off by its error."""
     q, p = starts(2)

@@ -32,6 +32,8 @@ ONCE_WRONG = {
     "rotations under a central force at h = 1e-06",
     "flow of a quartic spring at h = 1e-05",
     "gauge of a field that is no symmetry, h = 1e-11",
+    "quartic oscillator slower by 0.001 in a box of 1000",
+    "quartic oscillator slower by 1e-06 in a box of 1000",
 }
 RUN = [i for i, case in enumerate(CASES) if i % 3 == 0 or case.name in ONCE_WRONG]
 QUICK = {
@@ -60,15 +62,16 @@ def test_nothing_false_and_nothing_missed_without_a_warning(i):
 
 @pytest.mark.slow
 def test_few_cases_are_undecided():
-    """Of one case in three, without those that were added because they were once wrong."""
-    drawn = range(0, len(CASES), 3)
+    """Of one case in three, without those that were added because they were once wrong, and those
+    with slow motion, whose expansions are conserved to rounding and reported with a warning."""
+    drawn = [i for i in range(0, len(CASES), 3) if CASES[i].kind != "fast and slow motion"]
     undecided = [CASES[i].name for i in drawn if outcome(i) == "undecided"]
     assert len(undecided) <= UNDECIDED * len(drawn), undecided
 
 
 def test_names_are_distinct():
     names = {case.name for case in CASES}
-    assert len(names) == len(CASES) == 437
+    assert len(names) == len(CASES) == 461
     assert names >= ONCE_WRONG | QUICK
 
 

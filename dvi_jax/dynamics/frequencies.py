@@ -37,7 +37,9 @@ class Frequencies(WithStatus):
         x(t) ≈ c + Re Σ_k A_k e^{iω_k t}       (real, ω_k > 0)
 
     - `frequencies`: ω_k [rad per unit of time], shape (count,); `amplitudes`: A_k, complex, units
-      of the signal, shape (count,). NaN for missing or unresolved lines.
+      of the signal, shape (count,). NaN for missing or unresolved lines. Where the unresolved ones
+      are one line whose amplitude decays or grows exponentially, the first is its frequency and its
+      amplitude in the middle of the window; the status is `unresolved` all the same.
     - `constant`: c, complex (its imaginary part is 0 for a real signal).
     - `residual`: root mean square, in the window, of z minus all lines, divided by that of z − c.
       Unresolved lines are included, so that it is not the error of `evaluate`.

@@ -18,6 +18,9 @@ _ASCENT, _FIT_STEPS, _FINAL_ROUNDS = 4, 3, 4
 _FLOOR = 256 * EPS  # A line below this fraction of the largest value of the signal is round-off
 _ECHO = 1e-9  # A line weaker by this factor than another within the resolution is its round-off
 _RIDGE = 1e-13  # Added to a diagonal of ones: lines that coincide do not give a negative pivot
+_GROUP = 6.0  # Lines within so many resolutions may be the width of one that decays
+_EXPLAINED = 0.3  # Share of what a constant amplitude leaves that a decaying one may leave
+_SEVERAL, _AS_GOOD = 5, 30.0  # Than so many lines it may be so many times worse
 _CONVERGENCE = 1e-2  # Last correction to a converged frequency, over the resolution, at most
 
 
@@ -162,6 +165,7 @@ def lines_of(z: Array, settings: LineSettings) -> SpectralLines:
     order = jnp.argsort(jnp.where(is_line, -jnp.abs(A), jnp.inf))
     s, A, is_line, change = s[order], A[order] * largest, is_line[order], change[order]
     sure, code = _reliability(grid, s, is_line, change)
+    s, A, sure = _with_decaying_line(grid, remainder, is_real, largest, s, A, is_line, sure)
     code = jnp.where(is_line[0] & (spread > (64 * EPS) ** 2), code, CODE["no_signal"])
     code = jnp.where(finite, code, CODE["not_finite"])
     return SpectralLines(s, A, sure, constant, residual, code)
@@ -182,6 +186,47 @@ def _reliability(grid: _Grid, s: Array, is_line: Array, change: Array) -> tuple[
     ):
         code = jnp.where(applies, CODE[name], code)
     return is_line & ~is_inaccurate & ~is_ambiguous, code
+
+
+def _with_decaying_line(grid: _Grid, remainder, is_real: bool, largest, s, A, is_line, sure):
+    """The lines with the strongest one replaced by A e^{(is − g)y}, where it and lines next to it,
+    which cannot be resolved, are one line whose amplitude decays or grows."""
+    y = grid.rows[:, None] + grid.columns[None, :]
+    group = is_line & (jnp.abs(s - s[0]) < _GROUP * np.pi)
+    # A is in units of the signal, the remainder in those of its largest value.
+    sizes = jnp.where(group, A / jnp.where(largest > 0, largest, 1.0), 0.0)
+    outer = jnp.exp(1j * grid.rows[:, None] * s[None, :]) * sizes[None, :]
+    sums = outer @ jnp.exp(1j * s[:, None] * grid.columns[None, :])
+    signal = remainder + (2 * jnp.real(sums) if is_real else sums)
+    position, mean = _strongest(grid, signal, is_real)
+    wave = jnp.exp(1j * position * y)
+    centre = jnp.real(jnp.sum(grid.weights * y * signal / wave) / jnp.where(mean == 0, 1.0, mean))
+
+    def improve(_, rate):
+        """Newton's step to the rate at which ⟨y⟩ over the decaying amplitude is `centre`."""
+        w = grid.weights * jnp.exp(-rate * y)
+        w = w / jnp.sum(w)
+        first = jnp.sum(w * y)
+        return rate + jnp.clip((first - centre) / jnp.sum(w * (y - first) ** 2), -1.0, 1.0)
+
+    rate = lax.fori_loop(0, 20, improve, jnp.zeros(()))
+    decay = jnp.exp(-rate * y)
+    size = jnp.sum(grid.weights * decay * signal / wave) / jnp.sum(grid.weights * decay**2)
+
+    def power(line):
+        line = 2 * jnp.real(line) if is_real else line
+        return jnp.sum(grid.weights * jnp.abs(signal - line) ** 2)
+
+    # Few lines that are not resolved leave less than one that decays.
+    share = jnp.where(jnp.sum(group) < _SEVERAL, 1.0, _AS_GOOD)
+    left = power(size * decay * wave)
+    explains = (left < _EXPLAINED**2 * power(mean * wave)) & (left < share**2 * power(sums))
+    replaces = is_line[0] & ~sure[0] & explains & (jnp.abs(position - s[0]) < np.pi)
+    return (
+        s.at[0].set(jnp.where(replaces, position, s[0])),
+        A.at[0].set(jnp.where(replaces, size * largest, A[0])),
+        sure.at[0].set(sure[0] | replaces),
+    )
 
 
 def _strongest(grid: _Grid, r: Array, is_real: bool) -> tuple[Array, Array]:

@@ -51,7 +51,8 @@ class FREQUENCY_RESULTS(eqx.Enumeration):
         "Two lines are closer than the resolution 2π/T: their frequencies and amplitudes cannot be "
         "separated, and are NaN. Likely causes: (a) the trajectory is too short: take a longer "
         "one; (b) the motion is chaotic; (c) count is larger than the number of lines: take a "
-        "smaller one."
+        "smaller one; (d) friction: of one line that decays the frequency is given with "
+        "throw=False, or take count=1."
     )
     not_converged = (
         "The joint refinement of all lines did not converge for some of them, which are NaN. "

@@ -111,8 +111,8 @@ class Section(KeptSteps):
     **Arguments**
 
     - `g`: function ``(t, q, p, args)`` → scalar. For an angle use sin or cos, which do not jump.
-    - `direction`: 1 for crossings where g increases with time, −1 where it decreases, 0 for both;
-      the same points for h > 0 and h < 0.
+    - `direction`: 1 (the default, as in `poincare_section` and `ReturnMap`) for crossings where g
+      increases with time, −1 where it decreases, 0 for both; the same points for h > 0 and h < 0.
     - `max_crossings`: the largest number that is stored; static.
     - `skip`: number of crossings at the beginning that are left out (a transient); static.
 
@@ -138,12 +138,12 @@ class Section(KeptSteps):
     """
 
     g: Callable[..., Any]
-    direction: int = eqx.field(static=True, default=0)
+    direction: int = eqx.field(static=True, default=1)
     capacity: int = eqx.field(static=True, default=1000)
     skip: int = eqx.field(static=True, default=0)
 
     def __init__(
-        self, g: Callable[..., Any], direction: int = 0, max_crossings: int = 1000, skip: int = 0
+        self, g: Callable[..., Any], direction: int = 1, max_crossings: int = 1000, skip: int = 0
     ):
         self.g = g
         self.direction = direction.item() if isinstance(direction, np.integer) else direction

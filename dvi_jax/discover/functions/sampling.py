@@ -86,6 +86,12 @@ class Displacements(NamedTuple):
         return float(np.median(np.max(np.abs(self.values) / spreads(self.samples), axis=1)))
 
     @property
+    def relative_steps(self) -> np.ndarray:
+        """The same of q and of p alone, shape (2,)."""
+        relative = np.abs(self.values) / spreads(self.samples)
+        return np.median(np.max(relative.reshape(len(relative), 2, -1), axis=2), axis=0)
+
+    @property
     def nonlinearity(self) -> float:
         """Median distance of the map from a linear one, as a share of how much it varies."""
         sizes = spreads(self.samples)

@@ -16,6 +16,8 @@ _MODERATE = 0.03  # Relative size of the larger step at which invariants are cou
 _NONLINEAR, _WIDEST = 0.3, 1e3  # Nonlinearity of the map on larger samples; their largest factor
 _LINEAR = 1e-9  # A map that differs by less from a linear one may be linear
 _LAST = 1e30  # A map that does not move at a step so many times larger does not move at all
+_UNEQUAL = 30.0  # A step that moves q by so many times more of its spread than p, or p than q
+_SIMILAR = 3.0  # A ratio at which they are moved by similar shares
 _HARDLY = 2.0  # A step, or samples, larger by a smaller factor say nothing new
 
 # (samples, h) → displacements in a step h; and how many are conserved, None where it is undefined
@@ -99,32 +101,69 @@ def growth(
     return powers
 
 
+class _Kind(NamedTuple):
+    """What is small, what is conserved there besides invariants, a remedy, and a larger one."""
+
+    small: str
+    expansion: str
+    remedy: str
+    where: str
+    condition: str = ""
+
+
+_KINDS = {
+    "step": _Kind(
+        "the step is small",
+        "an expansion in h",
+        "a larger h",
+        "at a step {} times as large",
+        " (or H_D is made for this h)",
+    ),
+    "box": _Kind(
+        "the samples lie close to their median",
+        "an expansion about it",
+        "samples that spread wider",
+        "on samples {} times as far from it",
+    ),
+} | {
+    x: _Kind(
+        f"the samples of {x} lie close to their median, compared with those of {y}",
+        "an expansion about it",
+        f"samples whose {x} spread wider",
+        "on samples {} times as far from it",
+    )
+    for x, y in ("qp", "pq")
+}
+
+
 class Larger(NamedTuple):
-    """How many are conserved at a `factor` times larger "step", or on samples that are so many
-    times as far from their median ("box"); NaN if no larger one could be tried."""
+    """How many are conserved at a `factor` times larger "step", or on samples of which all
+    coordinates ("box") or those of one kind ("q", "p") are so many times as far from their median;
+    NaN if no larger one could be tried. `coordinates`: of a block that is searched alone, and
+    `whole`: how many of its functions are conserved as given."""
 
     kind: str
     factor: float
     number: int
+    coordinates: str = ""
+    whole: int | None = None
 
     def warning(self, count: int) -> str | None:
         """Why `count` that are conserved at a small step, or in a small box, may not be exact."""
+        count = count if self.whole is None else self.whole
         if self.number >= count:
             return None
-        step = self.kind == "step"
-        small = "the step is small" if step else "the samples lie close to their median"
-        expansion = "an expansion in h" if step else "an expansion about it"
+        kind, block = _KINDS[self.kind], self.coordinates
+        small = f"for {block} alone, {kind.small}" if block else kind.small
         if np.isnan(self.factor):
-            other = "a larger h" if step else "samples that spread wider"
             return (
                 f"{small}, and no larger one can be tried: an invariant cannot be distinguished "
-                f"from {expansion}; take {other}"
+                f"from {kind.expansion}; take {kind.remedy}"
             )
-        where = "at a step {} times as large" if step else "on samples {} times as far from it"
-        condition = " (or H_D is made for this h)" if step else ""
         return (
             f"{small}: {count} functions are conserved to rounding, and {self.number} of them "
-            f"{where.format(f'{self.factor:.2g}')}; each of the others is {expansion}{condition}"
+            f"{kind.where.format(f'{self.factor:.2g}')}; each of the others is {kind.expansion}"
+            f"{kind.condition}"
         )
 
 
@@ -149,6 +188,36 @@ def growth_note(subject: str, power: float) -> list[str]:
         f"      not exact: with the size of the samples {subject} as its power {power:.2g}, as "
         "those of an expansion about their middle do"
     ]
+
+
+def in_equal_steps(
+    samples: SamplePoints, h: float, step: DisplacementFunction, count: CountFunction
+) -> tuple[SamplePoints, tuple[Larger, ...]]:
+    """Samples of which a step moves q and p by similar shares of their spread, and how many are
+    conserved there: where it moves one by far more than the other, they lie close to a curve, and
+    all that changes slowly along it is conserved, or a step is small that moves one of them far."""
+    steps = step(samples, h).relative_steps
+    if not LEAST_STEP < steps.min() < steps.max() / _UNEQUAL:
+        return samples, ()
+    i, factor, wider = int(np.argmax(steps)), 1.0, samples
+    while steps[i] > _SIMILAR * steps[1 - i] and factor < _LAST:
+        factor *= float(np.sqrt(steps[i] / steps[1 - i]))
+        wider = _stretch_one(samples, i, factor)
+        steps = step(wider, h).relative_steps
+        if not steps.min() > LEAST_STEP:
+            return samples, ()
+
+    def number(factor):
+        return count(_stretch_one(samples, i, factor), h)
+
+    larger = _larger("qp"[i], factor, number)
+    return (samples if np.isnan(larger.factor) else wider), (larger,)
+
+
+def _stretch_one(samples: SamplePoints, i: int, factor: float) -> SamplePoints:
+    """The samples with only q (i = 0) or p (1) so many times as far from its median."""
+    name = "qp"[i]
+    return samples._replace(**{name: getattr(farther(samples, factor), name)})
 
 
 def at_larger_step(

@@ -17,11 +17,12 @@ from ..functions import sampling
 from ..functions.basis import AbstractBasis, bind_basis, check_step_size
 from ..functions.manifold import on_manifold
 from ..functions.sampling import Displacements, SamplePoints
+from .blocks import BlockSearch, search_blocks
 from .changes import Changes, StepMap, checked_changes, terms_in_pairs
 from .choice import chooser
 from .discovery import Discovery
 from .energy import unconserved_energy
-from .expansions import Larger, at_larger_step, in_larger_box, powers_of_size
+from .expansions import Larger, at_larger_step, in_equal_steps, in_larger_box, powers_of_size
 from .judging import reach
 from .obstructions import drift_laws
 from .search import null_spaces
@@ -123,12 +124,14 @@ def discover_invariants(
     step_map = StepMap(equations, np.asarray(h), one_step.method, inner)
     changes = checked_changes(step_map, order, samples)
     terms = terms_in_pairs(step_map, order, samples) if in_pairs else None
-    null = null_spaces(changes, tolerance, terms)
+    blocks = search_blocks(changes) if tolerance is None else []
+    filters = () if in_pairs else [block.without_false for block in blocks]
+    null = null_spaces(changes, tolerance, terms, filters)
     representatives = chooser(null)
     choice, judge = representatives.best(representative), representatives.judge
     coefficients, dependent = choice.coefficients, choice.dependent
     count = null.count if order else len(coefficients) + len(dependent)
-    larger = _at_larger(changes, order) if tolerance is None and count else ()
+    larger = _at_larger(changes, order, blocks) if tolerance is None and count else ()
     count += null.constant is not None
     residuals = np.stack([judge.quantiles(coefficients, x) for x in (0.5, 0.95)], axis=-1)
     powers = np.full(len(coefficients), np.nan)
@@ -146,7 +149,10 @@ def discover_invariants(
         rejections += len(coefficients) + len(dependent)
         coefficients, dependent = coefficients[:0], dependent[:0]
     number, scale = len(coefficients), null.conditions.scale
-    unclear = max(null.conditions.motion.unclear_count() - count, 0) + null.unclear + choice.unclear
+    unclear = sum(block.unclear for block in blocks)
+    if not blocks:
+        unclear = max(null.conditions.motion.unclear_count() - count, 0)
+    unclear += null.unclear + choice.unclear
     volume = np.max(np.abs(in_units_of(scale, changes.volume)), axis=0)
     parts = null.conditions.orthonormal @ null.spaces[-1].leading[: inner.size]
     return Discovery(
@@ -184,12 +190,26 @@ def discover_invariants(
     )
 
 
-def _at_larger(changes: Changes, order: int) -> tuple[Larger, ...]:
-    """How many are conserved at a larger step and, at order 0, in a larger box."""
+def _at_larger(changes: Changes, order: int, blocks: list[BlockSearch]) -> tuple[Larger, ...]:
+    """How many are conserved at a larger step and, at order 0, in a larger box: of all functions
+    and of those of each block."""
     samples, h = changes.samples, float(changes.step_map.h)
 
     def recompute(points: SamplePoints, step: float) -> Changes:
         return changes if points is samples and step == h else changes.recompute(points, step)
+
+    is_constrained = changes.step_map.is_constrained
+    larger = _larger_of(samples, h, recompute, not blocks, order == 0, is_constrained)
+    for search in blocks:
+        block, count = search.block, search.null.count
+        if count:
+            of_block = _larger_of(block.samples, h, block.recompute)
+            larger += tuple(x._replace(coordinates=block.text, whole=count) for x in of_block)
+    return larger
+
+
+def _larger_of(samples, h: float, recompute, equal=True, boxes=True, is_constrained=False):
+    """The same for functions whose `Changes` are recompute(samples, h)."""
 
     def displacements(points: SamplePoints, step: float) -> Displacements:
         return recompute(points, step).displacements
@@ -198,8 +218,10 @@ def _at_larger(changes: Changes, order: int) -> tuple[Larger, ...]:
         other = recompute(points, step)
         return null_spaces(other).count if other.good.all() else None
 
-    larger = at_larger_step(samples, h, displacements, count)
-    if order == 0:
-        is_constrained = changes.step_map.is_constrained
+    larger: tuple[Larger, ...] = ()
+    if boxes and equal and not is_constrained:
+        samples, larger = in_equal_steps(samples, h, displacements, count)
+    larger += at_larger_step(samples, h, displacements, count)
+    if boxes:
         larger += in_larger_box(samples, h, displacements, count, is_constrained)
     return larger

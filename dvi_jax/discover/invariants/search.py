@@ -1,6 +1,7 @@
 """The null space of a search for invariants."""
 
 import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -86,8 +87,14 @@ class NullSpaces:
         return unclear if self.tolerance is None else 0
 
 
-def null_spaces(changes: Changes, tolerance=None, pairs: Pair | None = None) -> NullSpaces:
-    """The null spaces of all orders; `pairs`: the terms in pairs of numbers, to decide by them."""
+def null_spaces(
+    changes: Changes,
+    tolerance=None,
+    pairs: Pair | None = None,
+    filters: Sequence[Callable[[np.ndarray, WeightedConditions[Motion]], np.ndarray]] = (),
+) -> NullSpaces:
+    """The null spaces of all orders; `pairs`: the terms in pairs of numbers, to decide by them;
+    `filters`: (leading, conditions) → those series that other tests of order 0 leave."""
     fit = ~changes.samples.held_out
     calm = typical_sizes(changes.values)[1][fit]
     values = calm[:, None] * changes.values[fit]
@@ -100,6 +107,8 @@ def null_spaces(changes: Changes, tolerance=None, pairs: Pair | None = None) -> 
         def judge(leading, shifts):
             terms, motion = conditions.terms, conditions.motion
             leading, unclear = conserved_series(leading, terms, motion, tolerance)
+            for leave in filters if len(leading) == terms.shape[2] else ():
+                leading = leave(leading, conditions)
             return leading, shifts, unclear
 
         rows = compress(times_weights(conditions.terms, conditions.weights)[fit])
