@@ -182,38 +182,6 @@ def test_orbits_agree_with_the_equations_of_the_literature(name, h, blocks):
     assert found.drift.max() < 1e-9
 
 
-@pytest.mark.parametrize(
-    ("name", "charge"),
-    [
-        ("axisymmetric", -1.0),
-        *[pytest.param(n, -2.0, marks=slow) for n in ("helical", "precise_qa")],
-    ],
-)
-def test_negative_charges_agree_with_the_equations_of_the_literature(name, charge):
-    """Their p_θ is negative. The last orbit starts on the axis."""
-    particles = boozer.GuidingCentres(FIELDS[name](), charge=charge)
-    start = [np.append(x, last) for x, last in zip(ORBITS[name], (0, 0, 0, 0.7), strict=True)]
-    q, p, args = particles.start(*start)
-    again = particles.coordinates_of(q, p)
-    np.testing.assert_allclose(again.theta[:-1], start[1][:-1])
-    method = dvi.GaussLegendre(3)
-
-    @jax.jit
-    @jax.vmap
-    def run(q, p, mu):
-        options = {"h": 0.5, "num_steps": 100, "method": method}
-        sol = integrate(particles, q, p, {**args, "mu": mu}, **options)
-        return sol.qs[-1], sol.ps[-1]
-
-    at = particles.coordinates_of(*run(q, p, args["mu"]))
-    z = np.stack([at.s, at.theta, at.zeta, at.v_parallel / particles.speed], axis=-1)
-    assert np.isfinite(z).all()
-    for i in range(len(z) - 1):
-        place = [x[i] for x in start]
-        wanted = orbit_of_literature(name, particles, *place, args["mu"][i], 50.0)
-        assert difference(z[i], wanted) < 1e-8
-
-
 @slow
 @pytest.mark.parametrize("charge", [-1.0, -2.0])
 def test_orbits_of_a_negative_charge_agree_with_the_literature(charge):
