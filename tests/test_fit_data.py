@@ -338,3 +338,13 @@ def test_multiple_shooting_of_angles():
     start = {"q0": np.array([6.9]), "p0": np.array([0.81])}
     fit = dvi.fit(dvi.Model(TURN, h=0.5), data, start, shooting=dvi.MultipleShooting(4))
     np.testing.assert_allclose(fit.x, np.polyfit(ts, line, 1), rtol=1e-6)
+
+
+@pytest.mark.parametrize("values", [VALUES[:, 0], VALUES])
+def test_values_of_shape_n_and_n_1_have_the_same_residuals(values):
+    """Rows are in the order of the data, whichever shape an observable of one component has."""
+    data = dvi.Observations(TS, values + 0.01 * TS.reshape(-1, *[1] * (values.ndim - 1)), t0=0.0)
+    fit = dvi.fit(MODEL, data, PARAMS, check_curvature=False)
+    exact = np.exp(-fit.x[0] * TS / 2) * np.cos(np.sqrt(1 - fit.x[0] ** 2 / 4) * TS)
+    np.testing.assert_allclose(fit.predicted[0].ravel(), exact, atol=0.05)
+    np.testing.assert_allclose(fit.whitened[0].ravel(), fit.residuals[0].ravel())

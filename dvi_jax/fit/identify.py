@@ -1,5 +1,6 @@
 """Identification of an unknown force among many candidate terms."""
 
+import itertools
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -30,6 +31,7 @@ from .shooting import MultipleShooting, SingleShooting
 # they do not.
 _GUARD = 3.0
 _SPAN = 3.0  # Characteristic times, over which the candidate acts in the beginning
+_FOLLOWS = 0.5  # Fraction of the variance that a fit which follows the data explains
 _PROVISIONAL_ERROR = 1e-3  # Provisional errors of data without any, in scatters of the data
 # Keywords of `fit` for the fit of all candidates and for the last one.
 _OF_ALL = ("max_steps", "tolerance", "check_units", "progress")
@@ -163,7 +165,7 @@ def identify(
     common: dict[str, Any] = {name: x for name, x in settings.items() if name in _OF_ALL}
     observations = arcs_with_errors if is_list else arcs_with_errors[0]
 
-    def guarded(params: Any, span: float = _SPAN) -> dict[str, Any]:
+    def guarded(params: Any, span: float) -> dict[str, Any]:
         guard = _guard(unguarded, library, unguarded.space.to_u(make_space(params)[1]), span)
         return {"bounds": bounds, "priors": {**(priors or {}), KEY: guard}, "loss": loss}
 
@@ -171,13 +173,17 @@ def identify(
         options = {**common, **setting, **options, "throw": False, "check_curvature": False}
         return fit(full_model, observations, params, **options)
 
-    setting, full = guarded(start), None
-    for path in (horizons, None):
-        # A fit of the beginning may diverge later; without a force nothing does.
-        full = fit_all(start, setting, shooting=shooting, horizons=path)
-        if full.status != "not_finite":
+    setting, full = {}, None
+    # The effects over all data bound the terms best. If they are far too large (of a particle at
+    # rest, whose force acts for ever), or a fit of the beginning diverges later, the next may not.
+    for span, path in itertools.product((np.inf, _SPAN), (horizons, None)):
+        trial = guarded(start, span)
+        result = fit_all(start, trial, shooting=shooting, horizons=path)
+        if full is None or full.status == "not_finite" or result.explained > full.explained:
+            setting, full = trial, result
+        if full.status != "not_finite" and full.explained > _FOLLOWS:
             break
-    else:
+    if full.status == "not_finite":
         text = f"the fit of all terms failed; it is the attribute `fit`. {FIT_RESULTS[full.result]}"
         raise FitError(text, full)
     # Only now is there a trajectory along all data, from which the effects of terms are known.
