@@ -63,7 +63,7 @@ class Elimination:
         self.combinations: list[str] = []
         self.best = problem.space.to_u(problem.start)
         self.keep, self.minimum = np.ones(problem.size, bool), np.inf
-        self.worse: dict[tuple[int | None, int], float] = {}
+        self.worse: dict[tuple[int | None, int | None], float] = {}
 
     def _evaluate(self, u: Array, horizon: Any, keep: Array) -> Evaluation:
         """Residual and Jacobian with the variables that are not kept at zero."""
@@ -80,7 +80,7 @@ class Elimination:
         return tuple(itertools.compress(self.library.names, keep[self.where]))
 
     def search(self) -> None:
-        """Remove terms, then exchange or add single ones as long as the criterion decreases.
+        """Remove terms, then exchange, add or remove single ones while the criterion decreases.
 
         A term is removed when the others are not yet the right ones, so that the removal may be
         wrong. The derivatives at the minimum propose a change; the refit decides.
@@ -90,15 +90,17 @@ class Elimination:
             for rise, i, k in sorted(self._changes(), key=lambda change: change[0]):
                 if rise > -_GAIN:
                     return
-                keep = self.keep.copy()
-                keep[self.where[[k] if i is None else [i, k]]] = (
-                    [True] if i is None else [False, True]
+                keep, names = (
+                    self.keep.copy(),
+                    [None if x is None else self.library.names[x] for x in (i, k)],
                 )
+                for x, is_kept in ((i, False), (k, True)):
+                    if x is not None:
+                        keep[self.where[x]] = is_kept
                 u, evaluation, _ = self._refit(self.best, keep)
                 value = self._criterion(evaluation, keep)
                 if value < self.minimum - _GAIN:
-                    names = self.library.names
-                    self._eliminate(u, keep, None if i is None else names[i], names[k])
+                    self._eliminate(u, keep, *names)
                     break
                 self.worse[i, k] = value - self.minimum
             else:
@@ -182,13 +184,13 @@ class Elimination:
         """
         names, replacements = self.library.names, {}
         for rise, i, k in self._changes():
-            if i is not None and rise < self.penalty:
+            if i is not None and k is not None and rise < self.penalty:
                 replacements.setdefault(names[i], []).append((names[k], rise))
         return {name: sorted(x, key=lambda pair: pair[1]) for name, x in replacements.items()}
 
-    def _changes(self) -> Iterator[tuple[float, int | None, int]]:
+    def _changes(self) -> Iterator[tuple[float, int | None, int | None]]:
         """The rise of the criterion when candidate k takes the place of term i, or is added to the
-        terms (i None), as (rise, i, k)."""
+        terms (i None), or term i is removed (k None), as (rise, i, k)."""
         evaluation = self.stage.values_at(self.best, np.inf, jnp.ones(self.problem.size, bool))
         r, J = self._of_data(evaluation.residual), self._of_data(evaluation.jacobian)
         if not (np.isfinite(r).all() and np.isfinite(J).all()):
@@ -201,6 +203,9 @@ class Elimination:
                 remainder[s], bare = False, r - J[:, s] * self.best[s]
             Q, _ = np.linalg.qr(J[:, remainder])
             bare = bare - Q @ (Q.T @ bare)
+            if i is not None:
+                rise = self._misfit(float(bare @ bare)) - criterion - self.penalty
+                yield self.worse.get((i, None), rise), i, None
             for k in np.flatnonzero(~selection).tolist():
                 column = J[:, self.where[k]]
                 component = column - Q @ (Q.T @ column)
