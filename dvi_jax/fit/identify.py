@@ -173,7 +173,8 @@ def identify(
         options = {**common, **setting, **options, "throw": False, "check_curvature": False}
         return fit(full_model, observations, params, **options)
 
-    setting, full = {}, None
+    setting: dict[str, Any] = {}
+    full: Any = None
     # The effects over all data bound the terms best. If they are far too large (of a particle at
     # rest, whose force acts for ever), or a fit of the beginning diverges later, the next may not.
     for span, path in itertools.product((np.inf, _SPAN), (horizons, None)):

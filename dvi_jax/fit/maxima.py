@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from .posterior import Posterior
@@ -44,7 +45,9 @@ def explored(
         if value > least + _CLOSE or any(_is_same(posterior, x, value, m) for m in maxima):
             continue
         maximum = maximum_near(posterior, x)
-        if maximum and not any(_is_same(posterior, *maximum[::2], m) for m in maxima):
+        if maximum and not any(
+            _is_same(posterior, maximum.u, maximum.potential, m) for m in maxima
+        ):
             maxima.append(maximum)
     volumes = np.array([m.log_volume for m in maxima])
     shares = np.exp(volumes - volumes.max())
@@ -97,7 +100,7 @@ def _draws(
     with np.errstate(invalid="ignore"):  # ∞ − ∞ where it is not used
         uniform = lower + p * (upper - lower)
         x = np.where(has_prior, mean + sigma * ndtri(low + p * (high - low)), uniform)
-    x = np.where(has_prior | has_bounds, x, np.asarray(posterior.to_x(first.u)))
+    x = np.where(has_prior | has_bounds, x, np.asarray(posterior.to_x(jnp.asarray(first.u))))
     u = posterior.to_u(x)
     size = np.maximum(np.abs(first.u), _LEAST * np.linalg.norm(first.root, axis=1))
     leaves = [name.split("[")[0] for name in posterior.names]
