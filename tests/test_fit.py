@@ -9,6 +9,7 @@ import numpy as np
 import optax
 import optimistix as optx
 import pytest
+from scipy import stats
 
 import dvi_jax as dvi
 from dvi_jax.fit import problem as problems, run
@@ -222,6 +223,42 @@ def test_a_model_no_better_than_a_constant_is_reported(regular):
     assert "better than constants do" in str(bad)
     assert 0.99 < good.explained < 1
     assert "constants" not in str(good)
+
+
+@pytest.mark.parametrize("degrees", [3, 57, 2000])
+def test_residuals_contradict_sigma_beyond_the_quantiles_of_chi2(regular, degrees):
+    """The rule is that of scipy's χ² distribution on both sides, at a probability of 1e-4."""
+    fit = regular[1]
+    for quantile, side in ((stats.chi2.isf(1e-4, degrees), 1), (stats.chi2.ppf(1e-4, degrees), -1)):
+        for factor in (0.999, 1.001):
+            total = quantile * factor
+            r = fit.whitened[0] * np.sqrt(total / fit.chi2)
+            fields = {"whitened": [r], "loss": total / 2, "degrees_of_freedom": degrees}
+            text = str(dataclasses.replace(fit, **fields))
+            assert ("contradict sigma" in text) == ((factor > 1) == (side > 0))
+            assert ("sigma is too large" in text) == (factor < 1 and side < 0)
+
+
+def test_residuals_that_contradict_sigma(regular):
+    data, fit = regular
+    assert "contradict" not in str(fit)
+    small, large = (observed(data.values, sigma=NOISE * s) for s in (0.5, 3.0))
+    assert "or sigma is too small" in str(dvi.fit(MODEL, small, START))
+    assert "sigma is too large" in str(dvi.fit(MODEL, large, START))
+    incomplete = dvi.fit(
+        MODEL,
+        data,
+        {"q0": np.array([0.9]), "args": {"k": 1.2}, "epsilon": 0.0},
+        bounds={"epsilon": dvi.Bounds(-0.005, 0.005)},
+    )
+    assert incomplete.status == "converged"
+    assert "the model is incomplete" in str(incomplete)
+    unknown = dvi.fit(MODEL, observed(data.values, sigma=None), START)
+    assert "contradict" not in str(unknown)
+    outliers = data.values.copy()
+    outliers[::10] += 0.5
+    assert "contradict" in str(dvi.fit(MODEL, observed(outliers), START))
+    assert "contradict" not in str(dvi.fit(MODEL, observed(outliers), START, loss=dvi.Cauchy()))
 
 
 @pytest.mark.slow

@@ -11,7 +11,9 @@ import pytest
 import xarray as xr
 
 import dvi_jax as dvi
-from dvi_jax.fit import bayes, posterior as posterior_module
+from dvi_jax.fit import bayes, maxima, posterior as posterior_module
+from dvi_jax.fit.parameters import make_space
+from dvi_jax.fit.posterior import Posterior
 
 N, H = 12, 0.1
 
@@ -312,6 +314,94 @@ def test_errors_of_unknown_size_with_bounds_and_a_prior_from_a_fit_of_its_own():
         sigma.append(found.sigma[found.names.index("args.k")])
     assert sigma[0] > 2e-3
     assert 0.7e-3 < sigma[1] < 1.05e-3
+
+
+class Bumps(Posterior):
+    """A density in place of that of data: exp(−potential) of one or two numbers."""
+
+    def __init__(self, params, value, bounds=None, priors=None):
+        self.space, x = make_space(params, bounds, priors)
+        self.names, self.size = list(self.space.names), self.space.size
+        self.start = self.space.to_u(x)
+        self._value = lambda u: value(self.space.to_x(u)) + self._log_prior(u)
+        self._slopes = jax.value_and_grad(self._value)
+        self._potential = jax.jit(self._value)
+        self._local = jax.jit(self._exact)
+
+
+def alias(x):
+    """Maxima of equal height at 1.1 and 2π − 1.1, of a frequency observed at whole times."""
+    ts = jnp.arange(1.0, 21.0)
+    return jnp.sum((jnp.cos(1.1 * ts) - jnp.cos(x * ts)) ** 2) / (2 * 0.05**2)
+
+
+def either_sign(x):
+    return jnp.sum((x**2 - 1) ** 2) / (2 * 0.1**2)
+
+
+WIDE = dvi.Bounds(0.1, 7.0)
+# Density, start, bounds, priors → maxima.
+SEVERAL = {
+    "alias": (alias, [1.08], WIDE, None, [[1.1], [2 * np.pi - 1.1]]),
+    "prior": (either_sign, [0.9], None, dvi.Prior(0.0, 1.0), [[-1.0], [1.0]]),
+    "near the start": (either_sign, [0.9], None, None, [[-1.0], [1.0]]),
+    "four": (
+        either_sign,
+        [0.9, 1.1],
+        dvi.Bounds(-3.0, 3.0),
+        None,
+        [[-1, -1], [-1, 1], [1, -1], [1, 1]],
+    ),
+    "one": (lambda x: jnp.sum((x - 1) ** 2) * 50, [0.9], WIDE, None, [[1.0]]),
+    "low": (
+        lambda x: either_sign(x) + 10 * jnp.sum(x < 0),
+        [0.9],
+        None,
+        dvi.Prior(0.0, 1.0),
+        [[1.0]],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SEVERAL)
+def test_maxima_besides_the_start_are_explored(name):
+    value, start, bounds, priors, expected = SEVERAL[name]
+    posterior = Bumps(np.array(start), value, bounds, priors)
+    mode, root = posterior.laplace()
+    first = maxima.Maximum(mode, root, posterior.look(mode)[0])
+    listing, text = maxima.explored(posterior, first, 64, 0)
+    x = np.array(sorted(posterior.to_x(m.u).tolist() for m in listing))
+    np.testing.assert_allclose(x, expected, atol=0.02)
+    assert sum(m.share for m in listing) == pytest.approx(1, abs=1e-3)
+    assert text.startswith(f"{len(expected)} maxim")
+    assert ("drawn near the start only: params" in text) == (name == "near the start")
+
+
+@pytest.mark.slow
+def test_two_maxima_of_equal_height_are_not_mixed():
+    """Observed at whole times, the frequencies w and 2π − w fit equally well: whichever the start,
+    there are chains at both, and the result says so."""
+    ts = np.arange(1.0, 21.0)
+    values = np.cos(1.1 * ts) + 0.05 * np.random.default_rng(3).normal(size=20)
+    data = dvi.Observations(ts, values[:, None], sigma=0.05, t0=0.0)
+    spring = dvi.System(lambda t0, t1, q, p, args: (p @ p + args["w"] ** 2 * (q @ q)) / 2)
+    model = dvi.Model(spring, h=0.1, q0=[1.0], p0=[0.0], method=dvi.KahanLi(8))
+    options = {"num_samples": 60, "num_warmup": 60, "chains": 2, "bounds": {"args": {"w": WIDE}}}
+    with pytest.warns(UserWarning, match="the density has 2 maxima"):
+        it = dvi.sample(model, data, {"args": {"w": 1.08}}, **options)
+    assert it.status == "not_mixed"
+    np.testing.assert_allclose(np.sort(it.x.mean(axis=(1, 2))), [1.1, 2 * np.pi - 1.1], atol=0.02)
+    assert "2 maxima from 64 draws of priors and bounds" in str(it)
+    alone = {**options, "bounds": {"args": {"w": dvi.Bounds(0.1, 3.0)}}}
+    one = dvi.sample(model, data, {"args": {"w": 1.08}}, **alone)
+    assert len(one.maxima) == 1
+    assert "explored: 1 maximum" in str(one)
+
+
+def test_more_maxima_than_chains_are_not_mixed():
+    good = fake(np.random.default_rng(0).normal(size=(1, 500)))
+    assert good.status == "mixed"
+    assert dataclasses.replace(good, maxima=np.zeros((2, 1))).status == "not_mixed"
 
 
 def fake(x, diverging=0, steps=3):

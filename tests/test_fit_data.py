@@ -1,5 +1,7 @@
 """Invalid observations, models and options of `dvi.fit`, and missing values."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -252,3 +254,97 @@ def test_missing_values_do_not_count():
     np.testing.assert_allclose(found.covariance, same.covariance, rtol=1e-6)
     assert np.isnan(found.whitened[0][::3]).all()
     assert np.isnan(found.residuals[0][::3]).all()
+
+
+def turning(t0, t1, q0, p1, args):
+    return p1 @ p1 / 2
+
+
+TURN = dvi.System(turning)
+# Unit of the angle, period → angles in (−P/2, P/2] or [0, P).
+BRANCHES = {
+    "radians": (2 * np.pi, lambda x: (x + np.pi) % (2 * np.pi) - np.pi),
+    "degrees": (360.0, lambda x: x % 360.0),
+    "hours": (24.0, lambda x: x % 24.0),
+}
+
+
+@pytest.mark.parametrize("name", BRANCHES)
+def test_angles_that_cross_the_end_of_their_range(name):
+    """With a period the fit is that of a straight line through the unwrapped angles."""
+    period, wrap = BRANCHES[name]
+    ts, sigma = np.arange(1.0, 41.0), 2e-3 * period
+    line = 0.45 * period + 0.07 * period * ts + sigma * np.random.default_rng(2).normal(size=40)
+    values = wrap(line)
+    assert np.abs(np.diff(values)).max() > 0.9 * period
+    model = dvi.Model(TURN, h=0.5)
+    start = {"q0": np.array([0.44 * period]), "p0": np.array([0.0705 * period])}
+    options = {"check_curvature": False}
+    data = dvi.Observations(ts, values, sigma=sigma, t0=0.0, period=period)
+    fit = dvi.fit(model, data, start, **options)
+    slope, offset = np.polyfit(ts, line, 1)
+    np.testing.assert_allclose(fit.x, [slope, offset], rtol=1e-7)
+    np.testing.assert_allclose(
+        fit.residuals[0].ravel(), line - offset - slope * ts, atol=1e-7 * period
+    )
+    assert 0.5 < fit.reduced_chi2 < 1.6
+    assert fit.status == "converged"
+    # Without a period the same data contradict their errors, and the result says so.
+    naive = dvi.fit(model, dataclasses.replace(data, period=None), start, throw=False, **options)
+    assert "contradict sigma" in str(naive)
+
+
+def test_a_period_of_one_component_and_a_hint_without():
+    ts = np.arange(1.0, 31.0)
+    angle = 0.9 * np.pi + 0.3 * np.sin(ts)
+    states = np.stack([(angle + np.pi) % (2 * np.pi) - np.pi, 0.3 * np.cos(ts)], axis=1)
+    states += 1e-3 * np.random.default_rng(0).normal(size=states.shape)
+    swing = dvi.System(lambda t0, t1, q, p, args: (p @ p + (q - args["c"]) @ (q - args["c"])) / 2)
+    model = dvi.Model(swing, h=0.05, q0=[0.9 * np.pi], p0=[0.3], method=dvi.KahanLi(8))
+    start = {"args": {"c": 2.8}}
+    options = {"observe": "state", "t0": 0.0, "sigma": 1e-3}
+    data = dvi.Observations(ts, states, period=[2 * np.pi, np.inf], **options)
+    fit = dvi.fit(model, data, start, check_curvature=False)
+    assert abs(fit.x[0] - 0.9 * np.pi) < 4 * fit.sigma[0]
+    assert "period" not in str(fit)
+    # A few angles on the other branch, where the fit is otherwise right.
+    other = dataclasses.replace(fit, observed=[states], predicted=[fit.predicted[0] * 1.0])
+    other.predicted[0][:, 0] = np.where(angle < np.pi, angle, angle - 2 * np.pi)
+    other.predicted[0][3, 0] += 2 * np.pi
+    assert "1 residuals are near ±2π: if the values are angles" in str(other)
+
+
+@pytest.mark.parametrize(
+    ("period", "match"),
+    [
+        (0.0, "period must be positive"),
+        (-1.0, "period must be positive"),
+        (np.nan, "period must be positive"),
+        ([1.0, 2.0, 3.0], "period must broadcast"),
+    ],
+)
+def test_invalid_periods(period, match):
+    with pytest.raises(ValueError, match=match):
+        dvi.Observations(np.arange(3.0), np.zeros((3, 2)), period=period)
+
+
+@pytest.mark.slow
+def test_multiple_shooting_of_angles():
+    """States at the cuts are interpolated between neighbouring branches."""
+    ts = np.arange(0.0, 40.0, 0.5)
+    line = 7.0 + 0.8 * ts + 1e-3 * np.random.default_rng(1).normal(size=ts.shape)
+    values = ((line + np.pi) % (2 * np.pi) - np.pi)[:, None]
+    data = dvi.Observations(ts, values, sigma=1e-3, period=2 * np.pi, t0=0.0)
+    start = {"q0": np.array([6.9]), "p0": np.array([0.81])}
+    fit = dvi.fit(dvi.Model(TURN, h=0.5), data, start, shooting=dvi.MultipleShooting(4))
+    np.testing.assert_allclose(fit.x, np.polyfit(ts, line, 1), rtol=1e-6)
+
+
+@pytest.mark.parametrize("values", [VALUES[:, 0], VALUES])
+def test_values_of_shape_n_and_n_1_have_the_same_residuals(values):
+    """Rows are in the order of the data, whichever shape an observable of one component has."""
+    data = dvi.Observations(TS, values + 0.01 * TS.reshape(-1, *[1] * (values.ndim - 1)), t0=0.0)
+    fit = dvi.fit(MODEL, data, PARAMS, check_curvature=False)
+    exact = np.exp(-fit.x[0] * TS / 2) * np.cos(np.sqrt(1 - fit.x[0] ** 2 / 4) * TS)
+    np.testing.assert_allclose(fit.predicted[0].ravel(), exact, atol=0.05)
+    np.testing.assert_allclose(fit.whitened[0].ravel(), fit.residuals[0].ravel())

@@ -6,8 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import dvi_jax as dvi
+from dvi_jax.fit.elimination import Elimination
 
 H = 0.1
 
@@ -210,6 +212,99 @@ def test_a_library_is_the_sum_of_its_candidates():
 Q, P = jnp.array([0.7]), jnp.array([0.1])
 AT = (0.0, H, Q, P)
 SCALAR = dvi.ForceLibrary({"f": lambda *a: 1.0}, [1.0])
+
+
+def free_flight(t0, t1, q0, p1, args):
+    return p1 @ p1 / 2
+
+
+def hyperbolic(t0, t1, q0, p1, args):
+    return (p1 @ p1 - q0 @ q0) / 2
+
+
+def van_der_pol(x):
+    return [x[1], -x[0] - (1 - x[0] ** 2) * x[1]]
+
+
+def duffing(x):
+    return [x[1], -x[0] - 0.3 * x[0] ** 3 - 0.1 * x[1]]
+
+
+def two_coupled(x):
+    return [x[2], x[3], -x[0] - 2 * x[0] * x[1], -2 * x[1] - x[0] ** 2]
+
+
+CUBICS, QUADRATICS = dvi.ForceLibrary.monomials(3, 1), dvi.ForceLibrary.monomials(2, 2, "q")
+COUPLINGS = {"q1 e1": -1, "q2 e2": -2, "q1 q2 e1": -2, "q1² e2": -1}
+# H_D without a force leaves the region of the data: (H_D, truth, library, terms, start, noise).
+LEAVING = {
+    "exact": (free_flight, van_der_pol, CUBICS, {"q": -1, "p": -1, "q² p": 1}, [1, -2], 0.0),
+    "at rest": (free_flight, duffing, CUBICS, {"q": -1, "q³": -0.3, "p": -0.1}, [1.5, 0], 0.01),
+    "two": (free_flight, two_coupled, QUADRATICS, COUPLINGS, [0.4, 0.2, 0, 0.1], 0.01),
+    "hyperbolic": (
+        *(hyperbolic, lambda x: [x[1], -x[0] - 0.2 * x[1]], CUBICS, {"q": -2, "p": -0.2}),
+        *([1, 0.3], 0.01),
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", LEAVING)
+def test_a_model_whose_trajectory_leaves_the_data(name):
+    """The prior of a coefficient follows from effects near the data, not from those far away."""
+    hamiltonian, field, library, planted, start, noise = LEAVING[name]
+    ts, n = np.arange(0, 15, 0.1), len(start) // 2
+    exact = {"method": "DOP853", "rtol": 1e-11, "atol": 1e-11, "t_eval": ts}
+    values = solve_ivp(lambda t, x: field(x), (0, 15), start, **exact).y.T
+    sigma = noise * values.std() or None
+    values += (sigma or 0.0) * np.random.default_rng(0).normal(size=values.shape)
+    system = dvi.System(dvi.discretise(lambda t, q, p, args: hamiltonian(t, t, q, p, args)))
+    model = dvi.Model(system, h=0.05, method=dvi.GaussLegendre(3))
+    data = dvi.Observations(ts, values, "state", sigma, t0=0.0)
+    params = {"q0": np.array(start[:n], float), "p0": np.array(start[n:], float)}
+    it = dvi.identify(model, data, library, params, check_units=False)
+    assert set(it.terms) == set(planted)
+    error = np.abs(it.coefficients - [planted[term] for term in it.terms])
+    assert (error < (4 * it.sigma if noise else 1e-6)).all()
+    assert it.is_unique
+    assert "contradict" not in str(it)
+
+
+@pytest.mark.parametrize("first", ["cubic", pytest.param("friction", marks=pytest.mark.slow)])
+def test_a_term_that_was_removed_by_mistake_returns(first, monkeypatch):
+    """The removal of the weakest term is a guess: an exchange or an addition corrects it."""
+    library, weakest = SMALL.only(["spring", "friction", "cubic"]), Elimination._weakest
+
+    def mistaken(self, u, J, keep, spectrum):
+        return (
+            self.library.names.index(first)
+            if len(self.path) == 1
+            else weakest(self, u, J, keep, spectrum)
+        )
+
+    planted = {"friction": 0.05, "cubic": 0.3}
+    truth = dvi.System(H_D, force=library.with_coefficients(planted))
+    data = observed(truth, [1.2], [0.0], 100, 0)
+    monkeypatch.setattr(Elimination, "_weakest", mistaken)
+    it = dvi.identify(dvi.Model(FREE, h=H, q0=[1.2], p0=[0.0]), data, library)
+    assert it.path[1].removed == first
+    assert set(it.terms) == set(planted)
+    best = min(it.path, key=lambda step: step.criterion)
+    assert best.terms == it.terms
+    assert not any(rise < 0 for pairs in it.alternatives.values() for _, rise in pairs)
+
+
+@pytest.mark.slow
+def test_an_identification_says_that_residuals_contradict_sigma():
+    data = observed(
+        dvi.System(H_D, force=SMALL.with_coefficients({"cubic": 0.3})), [1.2], [0.0], 100, 0
+    )
+    incomplete = SMALL.only(["friction"])
+    it = dvi.identify(dvi.Model(FREE, h=H, q0=[1.2], p0=[0.0]), data, incomplete, {"q0": [1.2]})
+    assert it.fit.status == "converged"
+    assert "the residuals contradict sigma: reduced chi² must be 1 ± 0.1 and is" in str(it)
+
+
 INVALID_LIBRARIES = [
     (lambda: dvi.ForceLibrary([Q]), TypeError, "must be a dict"),
     (lambda: dvi.ForceLibrary({}), ValueError, "at least one"),

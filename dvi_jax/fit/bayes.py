@@ -2,7 +2,7 @@
 
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Unpack
 
@@ -18,10 +18,12 @@ from ._fit import fit
 from .checks import package, same_parameters
 from .keywords import LossSettings, SampleSettings, select
 from .losses import Likelihood
+from .maxima import Maximum, explored
 from .observations import Data
 from .parameters import make_space
 from .posterior import Posterior
 from .result import FitResult, with_error
+from .stages import JACOBIAN_LIMIT
 from .uncertainty import correlations
 
 _R_HAT = 1.01  # Largest R̂ of chains that count as mixed (Vehtari et al. 2021)
@@ -38,9 +40,13 @@ class Samples:
       energy, (chains, draws). `steps`: leapfrog steps of each path; `acceptance`: mean
       probability of each chain, (chains,).
     - `r_hat`, `ess`: name → split R̂, 1 for chains that agree, and effective number of draws.
-    - `status`: ``"mixed"``; ``"diverging"``: some paths diverged, so that a narrow part of the
-      density may be missing; ``"not_mixed"``: some R̂ is above 1.01 or NaN, so that the draws do
-      not yet represent the density. `warnings`: the same as text.
+    - `maxima`, `shares`: the maxima of the density at which chains started, (k, n), and parts of
+      the probability by normal approximations there, (k,); `explored`: as text, how they were
+      found. Maxima that were not found have no chain.
+    - `status`: ``"mixed"``: the chains agree over what was `explored`; ``"diverging"``: some paths
+      diverged, so that a narrow part of the density may be missing; ``"not_mixed"``: some R̂ is
+      above 1.01 or NaN, or there are more maxima than chains, so that the draws do not yet
+      represent the density. `warnings`: the same as text.
     """
 
     names: list[str]
@@ -53,6 +59,9 @@ class Samples:
     r_hat: dict[str, float]
     ess: dict[str, float]
     warnings: list[str] = field(default_factory=list)
+    maxima: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    shares: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    explored: str = ""
 
     @property
     def samples(self) -> dict[str, np.ndarray]:
@@ -67,7 +76,7 @@ class Samples:
     @property
     def status(self) -> str:
         """``"mixed"``, ``"diverging"`` or ``"not_mixed"``, the worst that applies."""
-        if not all(r <= _R_HAT for r in self.r_hat.values()):
+        if len(self.maxima) > len(self.x) or not all(r <= _R_HAT for r in self.r_hat.values()):
             return "not_mixed"
         return "diverging" if self.divergences else "mixed"
 
@@ -107,6 +116,7 @@ class Samples:
             )
         if len(self.names) > 40:
             lines.append(f"  … and {len(self.names) - 40} more")
+        lines += [f"explored: {self.explored}"] if self.explored else []
         return "\n".join(lines + self.warnings)
 
     __repr__ = __str__
@@ -155,7 +165,9 @@ def sample(
 
     The sampler moves in z, u = mode + L z, where L Lᵀ is the covariance of the normal
     approximation (`Posterior.laplace`): a well-determined posterior is nearly round in z, and needs
-    little warm-up. Chains start at draws of that approximation.
+    little warm-up. Chains start at draws of such approximations, in turn at each maximum of the
+    density: descents from draws of the priors and bounds look for those besides the mode. A narrow
+    maximum may be missed: the field `explored` of the result says what was looked at.
 
     - `model`, `data`, `params`, `bounds`, `priors`, `loss`, `gradient`: as for `Posterior`.
     - `num_samples`, `num_warmup`: draws of each chain that are kept, and draws before them in
@@ -165,6 +177,8 @@ def sample(
       `params`. A parameter that such a fit left at a bound starts at its value in `params`.
     - `target_accept`: acceptance for the step size, by default 0.8; nearer to 1 against
       divergences. `max_tree_depth`: a path has at most 2^max_tree_depth steps, by default 2¹⁰.
+    - `explore`: number of draws for that, by default 64; 0: all chains start at the mode.
+      Parameters without a prior or two bounds are drawn near the start, as far as twice their size.
     - `progress`: True shows a bar, False none, None where there is a terminal.
 
     **Returns** `Samples`, with a `UserWarning` and a text in ``warnings`` for chains that do not
@@ -184,6 +198,7 @@ def sample(
     whole("num_warmup", num_warmup, 0)
     whole("chains", chains)
     whole("seed", seed, 0)
+    explore = whole("explore", settings.get("explore", 64), 0)
     depth = whole("max_tree_depth", settings.get("max_tree_depth", 10))
     acceptance = fraction("target_accept", settings.get("target_accept", 0.8))
     progress = settings.get("progress")
@@ -200,7 +215,11 @@ def sample(
         notes.append(f"the chains start from a fit that did not converge: {start.status}.")
     limits = terms.get("bounds"), terms.get("priors")
     mode, root = posterior.laplace(start_of(posterior, start, *limits))
-    centre, L = jnp.asarray(mode), jnp.asarray(root)
+    maxima, text = [Maximum(mode, root, 0.0)], "only the surroundings of the start"
+    if explore and posterior.size <= JACOBIAN_LIMIT:
+        first = maxima[0]._replace(potential=posterior.look(mode)[0])
+        maxima, text = explored(posterior, first, explore, seed)
+    centre, L = jnp.asarray(maxima[0].u), jnp.asarray(maxima[0].root)
 
     def in_z(z):
         return posterior.potential(centre + L @ z)
@@ -208,7 +227,7 @@ def sample(
     kernel = infer.NUTS(potential_fn=in_z, target_accept_prob=acceptance, max_tree_depth=depth)
     shows = sys.stderr.isatty() if progress is None else progress
     mcmc = infer.MCMC(kernel, **counts, chain_method="vectorized", progress_bar=shows)
-    begin = _starts(in_z, chains, posterior.size, seed)
+    begin = _starts(in_z, maxima, chains, seed)
     with jax.numpy_rank_promotion("allow"):  # numpyro's own arithmetic
         mcmc.run(
             jax.random.key(seed),
@@ -218,7 +237,7 @@ def sample(
     z = mcmc.get_samples(group_by_chain=True)
     x = jax.jit(jax.vmap(jax.vmap(lambda z: posterior.to_x(centre + L @ z))))(z)
     statistics = mcmc.get_extra_fields(group_by_chain=True)
-    samples = collect(posterior, x, statistics, notes, 2**depth - 1)
+    samples = collect(posterior, x, statistics, notes, 2**depth - 1, maxima, text)
     for text in samples.warnings:
         warnings.warn(text, UserWarning, stacklevel=3)
     return samples
@@ -237,24 +256,37 @@ def start_of(posterior: Posterior, start: Any, bounds: PyTree, priors: PyTree) -
     space, x = make_space(*arguments)
     same_parameters("start", space.names, posterior.names, "params")
     if is_fit:
-        at_bounds = np.isin(posterior.names, posterior._space.at_bounds(x, start.sigma))
+        at_bounds = np.isin(posterior.names, posterior.space.at_bounds(x, start.sigma))
         x = np.where(at_bounds, posterior.to_x(jnp.asarray(posterior.start)), x)
     return posterior.to_u(x)
 
 
-def _starts(potential: Callable[[Array], Array], chains: int, size: int, seed: int) -> Array:
-    """Normal draws (chains, size), halved until their density is positive."""
-    z = np.random.default_rng(seed).standard_normal((chains, size))
-    look = jax.jit(jax.vmap(potential))
+def _starts(potential: Callable[[Array], Array], maxima: list[Maximum], chains: int, seed: int):
+    """Normal draws (chains, size) around the maxima in turn, halved until their density is
+    positive, in z of the first maximum."""
+    z = np.random.default_rng(seed).standard_normal((chains, len(maxima[0].u)))
+    look, home = jax.jit(jax.vmap(potential)), maxima[0]
+    turns = [maxima[i % len(maxima)] for i in range(chains)]
+    centres = np.stack([np.linalg.solve(home.root, m.u - home.u) for m in turns])
+    maps = [np.linalg.solve(home.root, m.root) for m in turns]
     for _ in range(20):
-        bad = ~np.isfinite(np.asarray(look(jnp.asarray(z))))
+        points = centres + np.stack([M @ x for M, x in zip(maps, z, strict=True)])
+        bad = ~np.isfinite(np.asarray(look(jnp.asarray(points))))
         if not bad.any():
-            return jnp.asarray(z)
+            return jnp.asarray(points)
         z[bad] /= 2
-    return jnp.zeros((chains, size))  # the mode, where it is positive
+    return jnp.asarray(centres)  # the maxima, where it is positive
 
 
-def collect(posterior: Posterior, x: Any, statistics: Any, notes: list, longest: int) -> Samples:
+def collect(
+    posterior: Posterior,
+    x: Any,
+    statistics: Any,
+    notes: list,
+    longest: int,
+    maxima: Sequence[Maximum] = (),
+    text: str = "",
+) -> Samples:
     """Draws with their diagnostics."""
     x, diagnostics = np.asarray(x), _numpyro("diagnostics")
     columns = {name: x[..., i] for i, name in enumerate(posterior.names)}
@@ -272,6 +304,9 @@ def collect(posterior: Posterior, x: Any, statistics: Any, notes: list, longest:
         r_hat=r_hat,
         ess=ess,
         warnings=notes,
+        maxima=np.array([np.asarray(posterior.to_x(jnp.asarray(m.u))) for m in maxima]),
+        shares=np.array([m.share for m in maxima]),
+        explored=text,
     )
     notes += _doubts(samples, longest)
     return samples
@@ -286,6 +321,14 @@ def _doubts(samples: Samples, longest: int) -> list[str]:
             f"the chains do not agree: R̂ is above {_R_HAT} for {len(worst)} of "
             f"{len(samples.names)} parameters ({examples}). Draw more samples after more warm-up; "
             "if R̂ stays large, give priors: the density has several maxima or is not determined."
+        )
+    if len(samples.maxima) > 1 and samples.status == "not_mixed":
+        pairs = zip(samples.maxima, samples.shares, strict=True)
+        listing = [f"{_in_words(samples.names, x)} ({100 * s:.2g} %)" for x, s in pairs]
+        notes.append(
+            f"the density has {len(listing)} maxima, with parts of the probability by normal "
+            f"approximations: {'; '.join(listing[:8])}. The draws have one part for each chain. "
+            "Give bounds or priors that contain one maximum, and weigh the results by these parts."
         )
     if samples.divergences:
         notes.append(
@@ -302,9 +345,13 @@ def _doubts(samples: Samples, longest: int) -> list[str]:
     return notes
 
 
+def _in_words(names: list[str], x: np.ndarray) -> str:
+    return ", ".join(f"{n} = {v:.6g}" for n, v in zip(names[:3], x, strict=False))
+
+
 def _batch_of_params(posterior: Posterior, x: np.ndarray) -> PyTree:
     """The pytree of parameters with (chains, draws) in front of its numbers."""
-    space = posterior._space
+    space = posterior.space
     example = posterior.to_params(jnp.asarray(posterior.start))
     constants = eqx.filter(example, eqx.is_inexact_array, inverse=True)
     batch = jax.vmap(jax.vmap(lambda x: eqx.filter(space.to_params(x), eqx.is_inexact_array)))

@@ -1,6 +1,7 @@
 """Terms of a force removed one by one: backward elimination by a criterion."""
 
 import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +18,7 @@ from .uncertainty import Uncertainty, in_words, inverse_or, uncertainty
 _REFIT = 30  # Steps of a refit, which begins next to its minimum
 _PRECISE = 1e-4  # Tolerance of a refit in standard errors: 1e-8 in chi²
 _MARGIN = 3.0  # Penalties by which the criterion may exceed the best before the end
+_GAIN = 1e-3  # Decrease of the criterion from which on an exchange counts
 _ROUNDING = 1e-11  # Least relative error of any data: exact ones have no information below it
 
 
@@ -24,7 +26,8 @@ _ROUNDING = 1e-11  # Least relative error of any data: exact ones have no inform
 class Removal:
     """One stage of an identification.
 
-    - `removed`: the candidate that was removed, None for the beginning with all of them.
+    - `removed`: the candidate that was removed, None for the beginning with all of them; `added`:
+      the one that was added, in its place or (`removed` is None) to the others.
     - `terms`: the remaining ones. `chi2`: Σ of the squared whitened residuals of their fit.
     - `criterion`: the quantity to minimise. `status`: of the refit.
     """
@@ -34,6 +37,7 @@ class Removal:
     chi2: float
     criterion: float
     status: FIT_RESULTS
+    added: str | None = None
 
 
 def places(problem: FitProblem, library: ForceLibrary) -> np.ndarray:
@@ -43,7 +47,7 @@ def places(problem: FitProblem, library: ForceLibrary) -> np.ndarray:
 
 
 class Elimination:
-    """Backward elimination of the terms of a force.
+    """Backward elimination of the terms of a force, then exchanges of single terms.
 
     - `problem`: with all coefficients, at their minimum, held by a wide prior each.
     - `path`; `best`: the free variables at the least criterion, `keep`: which of them take part.
@@ -58,7 +62,8 @@ class Elimination:
         self.path: list[Removal] = []
         self.combinations: list[str] = []
         self.best = problem.space.to_u(problem.start)
-        self.keep = np.ones(problem.size, bool)
+        self.keep, self.minimum = np.ones(problem.size, bool), np.inf
+        self.worse: dict[tuple[int | None, int | None], float] = {}
 
     def _evaluate(self, u: Array, horizon: Any, keep: Array) -> Evaluation:
         """Residual and Jacobian with the variables that are not kept at zero."""
@@ -74,30 +79,59 @@ class Elimination:
     def _terms_of(self, keep: np.ndarray) -> tuple[str, ...]:
         return tuple(itertools.compress(self.library.names, keep[self.where]))
 
-    def eliminate(self) -> None:
+    def search(self) -> None:
+        """Remove terms, then exchange, add or remove single ones while the criterion decreases.
+
+        A term is removed when the others are not yet the right ones, so that the removal may be
+        wrong. The derivatives at the minimum propose a change; the refit decides.
+        """
+        self._eliminate(self.best, self.keep)
+        while True:
+            for rise, i, k in sorted(self._changes(), key=lambda change: change[0]):
+                if rise > -_GAIN:
+                    return
+                keep, names = (
+                    self.keep.copy(),
+                    [None if x is None else self.library.names[x] for x in (i, k)],
+                )
+                for x, is_kept in ((i, False), (k, True)):
+                    if x is not None:
+                        keep[self.where[x]] = is_kept
+                u, evaluation, _ = self._refit(self.best, keep)
+                value = self._criterion(evaluation, keep)
+                if value < self.minimum - _GAIN:
+                    self._eliminate(u, keep, *names)
+                    break
+                self.worse[i, k] = value - self.minimum
+            else:
+                return
+
+    def _criterion(self, evaluation: Evaluation, keep: np.ndarray) -> float:
+        """The quantity to minimise, ∞ if it is not finite."""
+        value = self._misfit(self._chi2(evaluation)) + self.penalty * int(keep[self.where].sum())
+        return value if np.isfinite(value) else np.inf
+
+    def _eliminate(self, u: np.ndarray, keep: np.ndarray, name: Any = None, added: Any = None):
         """Remove terms until none is left, or the criterion is far above its minimum."""
-        u, keep, name, minimum = self.best, self.keep, None, np.inf
         while True:
             u, evaluation, status = self._refit(u, keep)
-            r, value = np.asarray(evaluation.residual), np.inf
-            chi2 = float(r @ r)
-            if np.isfinite(chi2):
-                value = self._misfit(chi2) + self.penalty * int(keep[self.where].sum())
-            self.path.append(Removal(name, self._terms_of(keep), chi2, value, status))
-            if value < minimum:
-                minimum, self.best, self.keep = value, u, keep
-            is_worse = not np.isfinite(value) or value > minimum + _MARGIN * self.penalty
+            value = self._criterion(evaluation, keep)
+            numbers = self._chi2(evaluation), value
+            self.path.append(Removal(name, self._terms_of(keep), *numbers, status, added))
+            if value < self.minimum:
+                self.minimum, self.best, self.keep, self.worse = value, u, keep, {}
+            is_worse = not np.isfinite(value) or value > self.minimum + _MARGIN * self.penalty
             if is_worse or not keep[self.where].any():
                 return
-            J = self._of_data(evaluation)
+            J = self._of_data(evaluation.jacobian)
             spectrum = uncertainty(J[:, keep], 1.0)
-            if name is None:
+            if len(self.path) == 1:
                 names = [n.removeprefix(f"{KEY}.") for n in self.problem.space.names]
                 self.combinations = [in_words(d, names) for d in spectrum.null_directions.T]
             i = self._weakest(u, J, keep, spectrum)
             remainder = keep & (np.arange(len(u)) != self.where[i])
             u = _eliminate(u, np.asarray(evaluation.jacobian), self.where[i], remainder)
-            keep, name = remainder, self.library.names[i]
+            keep, name, added = remainder, self.library.names[i], None
 
     def _refit(self, u: np.ndarray, keep: np.ndarray) -> tuple[Any, Evaluation, FIT_RESULTS]:
         """The minimum near u; where it is worse than no force at all, the minimum near that."""
@@ -115,11 +149,14 @@ class Elimination:
             outcome = self.stage.run(zero, task, degrees, extra=extra)
         return outcome
 
-    def _of_data(self, evaluation: Evaluation) -> np.ndarray:
-        """The Jacobian without the priors of the coefficients."""
-        J = np.array(evaluation.jacobian)
-        J[len(J) - self.problem.size + self.where] = 0.0
-        return J
+    def _of_data(self, rows: Any) -> np.ndarray:
+        """Residuals, or their Jacobian, without the priors that hold the coefficients."""
+        rows = np.array(rows)
+        rows[len(rows) - self.problem.size + self.where] = 0.0
+        return rows
+
+    def _chi2(self, evaluation: Evaluation) -> float:
+        return float(np.sum(self._of_data(evaluation.residual) ** 2))
 
     def _misfit(self, chi2: float) -> float:
         """−2 log likelihood at its maximum over an unknown error, up to a constant."""
@@ -142,34 +179,41 @@ class Elimination:
     def alternatives(self) -> dict[str, list[tuple[str, float]]]:
         """For each term the candidates that would raise the criterion by less than a penalty.
 
-        By the derivatives at the minimum: exact for candidates with the same effect, and those
-        with another effect are far off in any case.
+        By the derivatives at the minimum, or the refit of those that promised a decrease: exact
+        for candidates with the same effect, and those with another effect are far off in any case.
         """
+        names, replacements = self.library.names, {}
+        for rise, i, k in self._changes():
+            if i is not None and k is not None and rise < self.penalty:
+                replacements.setdefault(names[i], []).append((names[k], rise))
+        return {name: sorted(x, key=lambda pair: pair[1]) for name, x in replacements.items()}
+
+    def _changes(self) -> Iterator[tuple[float, int | None, int | None]]:
+        """The rise of the criterion when candidate k takes the place of term i, or is added to the
+        terms (i None), or term i is removed (k None), as (rise, i, k)."""
         evaluation = self.stage.values_at(self.best, np.inf, jnp.ones(self.problem.size, bool))
-        r, J = np.asarray(evaluation.residual), self._of_data(evaluation)
-        replacements: dict[str, list[tuple[str, float]]] = {}
+        r, J = self._of_data(evaluation.residual), self._of_data(evaluation.jacobian)
         if not (np.isfinite(r).all() and np.isfinite(J).all()):
-            return replacements
+            return
         criterion, selection = self._misfit(float(r @ r)), self.keep[self.where]
-        for i in np.flatnonzero(selection):
-            s = self.where[i]
-            remainder = self.keep & (np.arange(len(self.keep)) != s)
-            # Without the term: its part of the prediction is removed, the rest adapts.
-            bare, (Q, _) = r - J[:, s] * self.best[s], np.linalg.qr(J[:, remainder])
+        for i in [*np.flatnonzero(selection).tolist(), None]:
+            remainder, bare, price = self.keep.copy(), r, self.penalty
+            if i is not None:  # Its part of the prediction is removed, the rest adapts.
+                s, price = self.where[i], 0.0
+                remainder[s], bare = False, r - J[:, s] * self.best[s]
+            Q, _ = np.linalg.qr(J[:, remainder])
             bare = bare - Q @ (Q.T @ bare)
-            candidates = []
-            for k in np.flatnonzero(~selection):
+            if i is not None:
+                rise = self._misfit(float(bare @ bare)) - criterion - self.penalty
+                yield self.worse.get((i, None), rise), i, None
+            for k in np.flatnonzero(~selection).tolist():
                 column = J[:, self.where[k]]
                 component = column - Q @ (Q.T @ column)
                 if component @ component <= 1e-18 * (column @ column):
                     continue
                 residual = bare - component * (component @ bare) / (component @ component)
-                rise = self._misfit(float(residual @ residual)) - criterion
-                if rise < self.penalty:
-                    candidates.append((self.library.names[k], rise))
-            if candidates:
-                replacements[self.library.names[i]] = sorted(candidates, key=lambda pair: pair[1])
-        return replacements
+                rise = self._misfit(float(residual @ residual)) - criterion + price
+                yield self.worse.get((i, k), rise), i, k
 
 
 def _eliminate(u: np.ndarray, J: np.ndarray, s: int, remainder: np.ndarray) -> np.ndarray:

@@ -1,5 +1,7 @@
 """Identification of an unknown force among many candidate terms."""
 
+import itertools
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Unpack
@@ -16,18 +18,20 @@ from .elimination import Elimination, Removal, places
 from .keywords import OptimiserSettings
 from .library import KEY, ForceLibrary, with_force
 from .losses import LeastSquares, Loss
-from .model import specification
+from .model import Group, specification
 from .observations import Data, Observations, as_arcs
 from .optimise import FIT_RESULTS, FitError
-from .parameters import Prior
+from .parameters import Prior, make_space
 from .problem import FitProblem
-from .result import FitResult, with_error
+from .result import FitResult, contradiction, with_error
 from .shooting import MultipleShooting, SingleShooting
 
 # Width of a prior: the change of the predictions by the candidate alone, to first order, in
 # scatters of the data. It hardly affects terms that the data determine, and holds combinations that
 # they do not.
 _GUARD = 3.0
+_SPAN = 3.0  # Characteristic times, over which the candidate acts in the beginning
+_FOLLOWS = 0.5  # Fraction of the variance that a fit which follows the data explains
 _PROVISIONAL_ERROR = 1e-3  # Provisional errors of data without any, in scatters of the data
 # Keywords of `fit` for the fit of all candidates and for the last one.
 _OF_ALL = ("max_steps", "tolerance", "check_units", "progress")
@@ -42,7 +46,7 @@ class Identification:
       include that the terms were chosen by the same data.
     - `system`: the model's `System` with the identified force and its coefficients. It belongs to
       the `epsilon` of the model, 1 where that had none.
-    - `path`: a `Removal` for each set of candidates that was tried, largest first.
+    - `path`: a `Removal` for each set of candidates, largest first, then those after an exchange.
     - `penalty`: the minimum decrease of the criterion for a term to be kept.
     - `alternatives`: for each term, candidates that could replace it, as pairs (name, increase of
       the criterion).
@@ -90,6 +94,7 @@ class Identification:
         if self.fit is not None:
             chi2 = f", reduced chi² {self.fit.reduced_chi2:.4g}" if self.fit.has_errors else ""
             lines.append(f"rms {self.fit.rms:.4g}, {self.fit.num_observed} values{chi2}")
+            lines += filter(None, [contradiction(self.fit)])
         return "\n".join(lines)
 
     __repr__ = __str__
@@ -114,7 +119,8 @@ def identify(
 
     All coefficients are fitted to the trajectories themselves, by `fit`: data are not
     differentiated. Then the term with the smallest |c|/sigma is removed and the rest fitted again
-    from its present values, repeatedly, and of these sets the one with the least
+    from its present values, repeatedly; after that single terms are exchanged or added as long as
+    this is better. Of these sets the one with the least
 
         χ² + k λ         (data with errors),      N log(χ²/N) + k λ      (without)
 
@@ -155,23 +161,40 @@ def identify(
     start = {**params, KEY: dict.fromkeys(library.names, 0.0)}
     arcs_with_errors = [_with_errors(arc) for arc in arcs]
     full_problem = full_model, arcs_with_errors, is_list
-    guard = _guard(FitProblem(*full_problem, start, bounds=bounds, loss=loss), library)
-    setting = {"bounds": bounds, "priors": {**(priors or {}), KEY: guard}, "loss": loss}
+    unguarded = FitProblem(*full_problem, start, bounds=bounds, loss=loss)
     common: dict[str, Any] = {name: x for name, x in settings.items() if name in _OF_ALL}
-    first: dict[str, Any] = {**common, **setting, "shooting": shooting, "throw": False}
     observations = arcs_with_errors if is_list else arcs_with_errors[0]
+
+    def guarded(params: Any, span: float) -> dict[str, Any]:
+        guard = _guard(unguarded, library, unguarded.space.to_u(make_space(params)[1]), span)
+        return {"bounds": bounds, "priors": {**(priors or {}), KEY: guard}, "loss": loss}
+
+    def fit_all(params: Any, setting: dict[str, Any], **options: Any) -> FitResult:
+        options = {**common, **setting, **options, "throw": False, "check_curvature": False}
+        return fit(full_model, observations, params, **options)
+
+    setting: dict[str, Any] = {}
     full: Any = None
-    for path in (horizons, None):
-        # A fit of the beginning may diverge later; without a force nothing does.
-        full = fit(full_model, observations, start, horizons=path, check_curvature=False, **first)
-        if full.status != "not_finite":
+    # The effects over all data bound the terms best. If they are far too large (of a particle at
+    # rest, whose force acts for ever), or a fit of the beginning diverges later, the next may not.
+    for span, path in itertools.product((np.inf, _SPAN), (horizons, None)):
+        trial = guarded(start, span)
+        result = fit_all(start, trial, shooting=shooting, horizons=path)
+        if full is None or full.status == "not_finite" or result.explained > full.explained:
+            setting, full = trial, result
+        if full.status != "not_finite" and full.explained > _FOLLOWS:
             break
-    else:
+    if full.status == "not_finite":
         text = f"the fit of all terms failed; it is the attribute `fit`. {FIT_RESULTS[full.result]}"
         raise FitError(text, full)
+    # Only now is there a trajectory along all data, from which the effects of terms are known.
+    refined = guarded(full.params, np.inf)
+    again = fit_all(full.params, refined, horizons=None)
+    if again.status != "not_finite":
+        setting, full = refined, again
     problem = FitProblem(*full_problem, full.params, **setting)
     search = Elimination(problem, library, penalty, arcs[0].has_errors)
-    search.eliminate()
+    search.search()
     terms = search.terms
     best: Any = problem.space.to_params(problem.space.to_x(jnp.asarray(search.best)))
     values: Any = {**best, KEY: {name: best[KEY][name] for name in terms}}
@@ -273,8 +296,11 @@ def _with_errors(arc: Observations) -> Observations:
     return replace(arc, sigma=_PROVISIONAL_ERROR * scatter)
 
 
-def _guard(problem: FitProblem, library: ForceLibrary) -> dict[str, Prior]:
-    """A wide prior for each coefficient, by the candidate's effect on the predictions."""
+def _guard(
+    problem: FitProblem, library: ForceLibrary, u: np.ndarray, span: float
+) -> dict[str, Prior]:
+    """A wide prior for each coefficient, by the candidate's effect on the predictions at u, over
+    `span` characteristic times of the data."""
 
     def in_errors(arc):  # 1 where errors are covariances
         if arc.covariance is not None:
@@ -282,11 +308,33 @@ def _guard(problem: FitProblem, library: ForceLibrary) -> dict[str, Prior]:
         return arc.whitening() * np.nan_to_num(arc.values.reshape(len(arc.ts), -1))
 
     where = places(problem, library)
-    u = problem.space.to_u(problem.start)
-    J = np.asarray(problem.evaluate(u).jacobian)[: -problem.size, where]
+    _, J, (_, predictions) = problem.evaluate(u)
+    pairs = zip(problem.groups, predictions, strict=True)
+    rows = [_in_region(group, np.asarray(x), span).ravel() for group, (x, _) in pairs]
+    J = np.asarray(J)[: -problem.size][np.concatenate(rows)][:, where]
     size = max(float(np.sqrt(np.mean(in_errors(arc) ** 2))) for arc in problem.arcs)
     effect = np.sqrt(np.mean(J**2, axis=0))
     # A candidate without a finite effect gets any prior: the fit itself reports it.
     good = np.isfinite(effect) & (effect > 0) & (size > 0)
     sigma = np.where(good, _GUARD * size / np.where(good, effect, 1.0), 1.0)
+    # Over a long arc a small change of a coefficient is a large one of the phase.
+    sigma = np.maximum(sigma, _GUARD * np.abs(u[where]))
     return {name: Prior(0.0, float(x)) for name, x in zip(library.names, sigma, strict=True)}
+
+
+def _in_region(group: Group, predictions: np.ndarray, span: float) -> np.ndarray:
+    """Which values, (A, N, K), were observed within `span` characteristic times of the start and
+    before the predictions leave the region of the data, where a candidate such as q³ has an effect
+    of any size. The first observation of an arc always is."""
+    values = np.where(group.mask, group.values, np.nan)
+    with warnings.catch_warnings(), np.errstate(invalid="ignore", divide="ignore"):
+        warnings.simplefilter("ignore")  # of components that were never observed
+        low, high = np.nanmin(values, 1, keepdims=True), np.nanmax(values, 1, keepdims=True)
+        is_near = np.abs(predictions - (low + high) / 2) <= 1.5 * (high - low)
+        rate = np.diff(values, axis=1) / np.diff(group.ts, axis=1)[..., None]
+        # Of a sine wave this is 1/frequency.
+        time = np.nanmax(np.nanstd(values, 1) / np.sqrt(np.nanmean(rate**2, 1)), 1)
+    rows = np.logical_and.accumulate((is_near | ~group.mask).all(axis=2), axis=1)
+    rows &= ~(np.abs(group.ts - group.t0[:, None]) > span * time[:, None])
+    rows[:, 0] = True
+    return rows[..., None] & group.mask

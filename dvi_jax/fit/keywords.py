@@ -40,6 +40,7 @@ class SampleSettings(LossSettings, total=False):
     gradient: str
     target_accept: float
     max_tree_depth: int
+    explore: int
     progress: bool | None
 
 

@@ -184,8 +184,8 @@ class Group(eqx.Module):
 
     Arrays have the arcs in front and are padded to one number of observations N of K components:
     `arcs` (A,), `t0` (A,), `ts` (A, N), `values` and `mask` (A, N, K), `whiten` (A, N, K) or
-    (A, N, K, K). Padding is not seen, and has the time of the last observation. `block` and
-    `pick` say how observations are found on the time grid, see `predict`.
+    (A, N, K, K), `period` (A, K) or None. Padding is not seen, and has the time of the last
+    observation. `block` and `pick` say how observations are found on the time grid, see `predict`.
     """
 
     arcs: np.ndarray
@@ -195,6 +195,7 @@ class Group(eqx.Module):
     mask: np.ndarray
     whiten: np.ndarray
     pick: np.ndarray | None
+    period: np.ndarray | None
     observe: Callable[..., Any] = eqx.field(static=True)
     num_steps: int = eqx.field(static=True)
     block: int = eqx.field(static=True)
@@ -282,7 +283,18 @@ def make_group(numbers: list[int], arcs: list[Any], spec: Mapping, num_steps: in
         num_steps=num_steps,
         block=block,
         pick=pick,
+        period=_periods(arcs),
     )
+
+
+def _periods(arcs: list[Any]) -> np.ndarray | None:
+    """Periods of the components of each arc, (A, K); None if none is periodic."""
+    if all(arc.period is None for arc in arcs):
+        return None
+    sizes = [
+        np.full(arc.values.shape[1:], np.inf if arc.period is None else arc.period) for arc in arcs
+    ]
+    return np.stack([size.ravel() for size in sizes])
 
 
 def _blocks(places: np.ndarray, num_steps: int) -> tuple[int, np.ndarray | None]:

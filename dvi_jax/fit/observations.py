@@ -40,6 +40,10 @@ class Observations:
     - `t0`: time of the arc's start, to which the model's q0 and p0 belong; ``ts[0]`` if left out.
       A fit of a model with a given q0 or p0 warns then, unless ``ts[0]`` is 0.
       The sign of the model's h must lead from t0 to the observations.
+    - `period`: of values that are equal modulo it, such as angles (2π, 360): one positive number,
+      or an array that broadcasts to one value, infinite for components without. Residuals then
+      are between −period/2 and period/2, and the predictions of a result on the branch nearest to
+      the observed values.
 
     Observations of several kinds along one arc are one `observe` that returns them all, at
     the union of their times, with NaN for what was not observed.
@@ -55,6 +59,7 @@ class Observations:
     sigma: Any = None
     covariance: Any = None
     t0: float | None = None
+    period: Any = None
     t0_is_given: bool = field(init=False, default=False, repr=False)
 
     def __post_init__(self):
@@ -92,6 +97,8 @@ class Observations:
             if self.sigma is not None:
                 raise ValueError("only one of sigma and covariance can be given, got both.")
             fields["covariance"] = _covariance(self.covariance, values)
+        if self.period is not None:
+            fields["period"] = _period(self.period, values.shape[1:])
         fields["t0_is_given"] = self.t0 is not None
         for name, value in fields.items():
             object.__setattr__(self, name, value)
@@ -222,6 +229,29 @@ def _sigma(sigma: Any, values: np.ndarray) -> np.ndarray:
     is_valid = (full > low) & (full < high) | is_missing
     require_all("sigma", full, is_valid, rule, "Give sigma in the units of the values.")
     return full
+
+
+def _period(period: Any, shape: tuple[int, ...]) -> np.ndarray:
+    period = _real("period", period)
+    try:
+        full = np.array(np.broadcast_to(period, shape))
+    except ValueError:
+        raise ValueError(
+            f"period must broadcast to the shape {shape} of one value, got shape {period.shape}."
+        ) from None
+    hint = "An infinite one is that of a component that is not periodic."
+    require_all("period", full, full > 0, "positive", hint)
+    return full
+
+
+def nearest_branch(values: Any, observed: Any, period: Any) -> Any:
+    """Predictions shifted by whole periods to the branch nearest to the observed values; `period`:
+    infinite for components that are not periodic, or None for all."""
+    if period is None:
+        return values
+    period = jnp.broadcast_to(period, values.shape)
+    turns = jnp.round((values - observed) / period)
+    return values - jnp.where(jnp.isfinite(period), period, 0.0) * turns
 
 
 def _covariance(covariance: Any, values: np.ndarray) -> np.ndarray:

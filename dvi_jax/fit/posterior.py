@@ -71,12 +71,12 @@ class Posterior:
         # Priors are added here, so that they also work with errors of unknown size.
         self._problem = FitProblem(model, arcs, is_list, params, bounds=bounds, loss=loss)
         self._core = self._problem.core
-        self._space, x = make_space(params, bounds, priors)
-        self.names, self.size = list(self._space.names), self._space.size
-        self.start = self._space.to_u(x)
+        self.space, x = make_space(params, bounds, priors)
+        self.names, self.size = list(self.space.names), self.space.size
+        self.start = self.space.to_u(x)
         self._has_density = isinstance(loss, Likelihood)
-        is_proper = np.asarray(self._space.prior_weight) > 0
-        is_proper |= np.array(self._space.has_lower) & self._space.has_upper
+        is_proper = np.asarray(self.space.prior_weight) > 0
+        is_proper |= np.array(self.space.has_lower) & self.space.has_upper
         free, count = int((~is_proper).sum()), self._problem.count
         unknown_scale = not (self._problem.has_errors or self._has_density)
         purpose = f"{free} parameters without a prior or two bounds"
@@ -99,19 +99,19 @@ class Posterior:
 
     def to_x(self, u: Array) -> Array:
         """Values of the parameters, within their bounds, shape (n,)."""
-        return self._space.to_x(u)
+        return self.space.to_x(u)
 
     def to_u(self, x: Any) -> np.ndarray:
         """The free vector of x."""
-        return self._space.to_u(x)
+        return self.space.to_u(x)
 
     def to_params(self, u: Array) -> PyTree:
         """The pytree of parameters at u."""
-        return self._space.to_params(self._space.to_x(u))
+        return self.space.to_params(self.space.to_x(u))
 
     def _log_prior(self, u: Array) -> Array:
         """−log of prior and Jacobian."""
-        space = self._space
+        space = self.space
         deviation = (space.to_x(u) - space.prior_mean) * space.prior_weight
         return jnp.sum(deviation**2) / 2 - jnp.sum(log_slope(space, u))
 
@@ -143,7 +143,7 @@ class Posterior:
 
     def _quadratic(self, u: Array) -> tuple[Array, Array, Array]:
         """Potential, its slope, and A with AᵀA its Gauss–Newton Hessian, priors last."""
-        space, unit_vector = self._space, jnp.ones_like(u)
+        space, unit_vector = self.space, jnp.ones_like(u)
         value, slope, J = self._with_jacobian(u)
         stretch = jax.jvp(space.to_x, (u,), (unit_vector,))[1]
         bend = jax.jvp(jax.grad(lambda u: -jnp.sum(log_slope(space, u))), (u,), (unit_vector,))[1]
@@ -170,7 +170,7 @@ class Posterior:
         if self.size > JACOBIAN_LIMIT:
             self._check_value(u, float(self._potential(jnp.asarray(u))))
             return u, np.eye(self.size)
-        u, A = self._descend(u, max_steps)
+        u, _, A = self.descend(u, max_steps)
         spectrum = uncertainty(A, 1.0)
         if spectrum.null_directions.size:
             words = "; ".join(in_words(d, self.names) for d in spectrum.null_directions.T)
@@ -185,13 +185,14 @@ class Posterior:
             x = np.asarray(self.to_x(jnp.asarray(u)))
             raise ValueError(
                 f"the posterior density must be positive at the start, got 0 at "
-                f"{self._space.in_words(x)}: the trajectory fails there, or the log likelihood is "
+                f"{self.space.in_words(x)}: the trajectory fails there, or the log likelihood is "
                 "not finite."
             )
 
-    def _descend(self, u: np.ndarray, max_steps: int) -> tuple[np.ndarray, np.ndarray]:
-        """The mode by Levenberg–Marquardt, until a step would gain less than 1e-8, and A there."""
-        value, g, A = self._look(u)
+    def descend(self, u: np.ndarray, max_steps: int) -> tuple[np.ndarray, float, np.ndarray]:
+        """The mode by Levenberg–Marquardt, until a step would gain less than 1e-8; the potential
+        and A there."""
+        value, g, A = self.look(u)
         self._check_value(u, value)
         damping = 1e-3
         for _ in range(max_steps):
@@ -202,14 +203,15 @@ class Posterior:
             step = -np.linalg.solve(matrix, g / length) / length
             if not -g @ step > 1e-8:
                 break
-            new, *derivatives = self._look(u + step)
+            new, *derivatives = self.look(u + step)
             if new < value and all(np.isfinite(x).all() for x in derivatives):
                 u, value, (g, A), damping = u + step, new, derivatives, damping / 10
             else:
                 damping *= 10
-        return u, A
+        return u, value, A
 
-    def _look(self, u: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    def look(self, u: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        """The potential, its slope, and A with AᵀA its Gauss–Newton Hessian."""
         value, g, A = self._local(jnp.asarray(u))
         return float(value), np.asarray(g), np.asarray(A)
 

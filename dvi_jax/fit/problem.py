@@ -17,7 +17,7 @@ from ..problem.system import check_system
 from .checks import enough_values, require_shape, requires
 from .losses import LeastSquares, Likelihood, Loss
 from .model import Group, Model, check_observable, make_groups, predict, specification, weigh
-from .observations import Observations
+from .observations import Observations, nearest_branch
 from .parameters import Space, make_space
 from .roundoff import Evaluation
 
@@ -44,12 +44,13 @@ class Core(eqx.Module):
     def predict(self, params: PyTree, group: Group) -> tuple[Array, RESULTS]:
         """Predictions (A, N, K) and a status for each arc of a group."""
 
-        def predict_arc(arc, t0, ts, pick):
+        def predict_arc(arc, t0, ts, pick, observed, period):
             spec = specification(self.model, params, arc, self.is_list)
             values, _, result = predict(spec, t0, ts, pick, group)
-            return values, result
+            return nearest_branch(values, observed, period), result
 
-        arrays = jax.tree.map(jnp.asarray, (group.arcs, group.t0, group.ts, group.pick))
+        names = ("arcs", "t0", "ts", "pick", "values", "period")
+        arrays = jax.tree.map(jnp.asarray, tuple(getattr(group, name) for name in names))
         if len(group.arcs) == 1:  # a batch of one takes twice the time of a single trajectory
             values = predict_arc(*jax.tree.map(lambda x: x[0], arrays))
             return jax.tree.map(lambda x: x[None], values)
@@ -278,7 +279,7 @@ class FitProblem:
             status = np.atleast_1d(status_name(result))
             for a, i in enumerate(group.arcs):
                 arc, n = self.arcs[i], len(self.arcs[i].ts)
-                order = slice(None, None, 1 if arc is self.data[i] else -1)
+                order = slice(None, None, 1 if arc.ts[0] == self.data[i].ts[0] else -1)
                 values_of_arc = np.asarray(values[a, :n]).reshape(arc.values.shape)[order]
                 residual = np.where(group.mask[a, :n], -np.asarray(r[a, :n]), np.nan)[order]
                 rows_of_arcs[i] = values_of_arc, residual, str(status[a])

@@ -27,6 +27,8 @@ _BY_ARC = ("ts", "observed", "predicted", "whitened", "errors")
 """Fields that a file has as JSON, and those that are a list of arrays."""
 
 _NOTABLE = 0.01  # Part of a standard error from which on round-off is reported
+_NEAR_TURN = 0.05  # Distance from a turn, in turns, that looks like an angle on another branch
+_SIGNIFICANCE = 1e-4  # Probability of a χ² below which the residuals contradict sigma
 _LITTLE = 0.1  # A model that explains less of the variance is little better than a constant
 
 
@@ -44,7 +46,7 @@ class FitResult:
       `loss`, `step`, `accepted`, and `x`, shape (steps, n).
     - `result`: how it ended, one of `FIT_RESULTS`; `status` its name.
     - `ts`, `observed`, `predicted`, `errors`: lists with an array for each arc, (N,) and (N, ...);
-      errors are NaN where none were given.
+      errors are NaN where none were given, periodic predictions on the branch of the observed.
     - `whitened`: observed minus predicted in standard errors, (N, K) for each arc, independent of
       one another where covariances were given; NaN for missing values.
     - `loss`: ½ Σ ρ(r²) + priors; `num_observed`: number of values; `degrees_of_freedom`: values and
@@ -142,7 +144,8 @@ class FitResult:
     @property
     def reduced_chi2(self) -> float:
         """`chi2` and `prior_chi2` over the degrees of freedom: about 1 for right model, errors and
-        priors."""
+        priors. If it is so far from 1 that its probability is below 1e-4, the printed result says
+        that the residuals contradict sigma (not for robust losses and likelihoods)."""
         total = self.chi2 + self.prior_chi2
         return total / self.degrees_of_freedom if self.degrees_of_freedom else np.nan
 
@@ -183,7 +186,7 @@ class FitResult:
             f"{self.degrees_of_freedom} degrees of freedom"
         )
         lines += [self.start] if self.start else []
-        lines += [words for words in [little_explained(self), rounding_remark(self)] if words]
+        lines += [*remarks(self), *filter(None, [rounding_remark(self)])]
         lines += [f"not determined: {words}" for words in self.undetermined]
         if self.result != FIT_RESULTS.converged and str(FIT_RESULTS[self.result]):
             lines.append(str(FIT_RESULTS[self.result]))
@@ -248,7 +251,51 @@ def numbers_in_words(fit: FitResult) -> list[str]:
     ]
 
 
-def little_explained(fit: FitResult) -> str:
+def remarks(fit: FitResult) -> list[str]:
+    """What a user must know before the numbers are used."""
+    return list(filter(None, [_little_explained(fit), contradiction(fit), _whole_turns(fit)]))
+
+
+def contradiction(fit: FitResult) -> str:
+    """The remark on residuals that contradict sigma, by the χ² distribution; empty for others."""
+    from scipy.special import gammainc, gammaincc  # importing the package does not import it
+
+    total, degrees = fit.chi2 + fit.prior_chi2, fit.degrees_of_freedom
+    # Robust losses expect outliers, and a likelihood has its own use of sigma.
+    is_square = abs(2 * fit.loss - total) <= 1e-9 * total
+    if not (fit.has_errors and is_square and degrees > 0):
+        return ""
+    is_large = total > degrees
+    probability = float((gammaincc if is_large else gammainc)(degrees / 2, total / 2))
+    if probability >= _SIGNIFICANCE:
+        return ""
+    causes = "sigma is too large, or the data are not independent"
+    if is_large:
+        causes = (
+            "the model is incomplete, this is a local minimum, h is too large, or sigma is too "
+            "small. The standard errors do not include this"
+        )
+    return (
+        f"the residuals contradict sigma: reduced chi² must be 1 ± {np.sqrt(2 / degrees):.2g} and "
+        f"is {fit.reduced_chi2:.4g} (probability {max(probability, 1e-300):.0e}). Likely causes: "
+        f"{causes}."
+    )
+
+
+def _whole_turns(fit: FitResult) -> str:
+    """The remark on angles whose residuals are small apart from some of a whole turn."""
+    sizes = np.abs(np.concatenate([r[np.isfinite(r)] for r in fit.residuals]))
+    for name, turn in (("2π", 2 * np.pi), ("360", 360.0)):
+        count = int((np.abs(sizes - turn) < _NEAR_TURN * turn).sum())
+        if count and np.median(sizes) < _NEAR_TURN * turn:
+            return (
+                f"{count} residuals are near ±{name}: if the values are angles, give their period "
+                "to dvi.Observations(..., period=...)."
+            )
+    return ""
+
+
+def _little_explained(fit: FitResult) -> str:
     """The remark on a fit that is hardly better than a constant; empty for a better one."""
     if not fit.explained < _LITTLE:
         return ""

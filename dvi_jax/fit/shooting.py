@@ -15,7 +15,7 @@ from ..integration.integrate import integrate
 from ..observe.solution import Save
 from .checks import require_shape, requires
 from .model import make_group, predict, specification, weigh
-from .observations import Observations
+from .observations import Observations, nearest_branch
 from .problem import FitProblem
 from .roundoff import Evaluation
 
@@ -66,7 +66,7 @@ class _SegmentData:
         else:  # a segment without data: one time of no weight
             self.ts, self._whitening = np.array([t0]), np.zeros((1, *whitening.shape[1:]))
             self.values = np.full((1, *arc.values.shape[1:]), np.nan)
-        self.t0, self.function = t0, arc.function
+        self.t0, self.function, self.period = t0, arc.function, arc.period
 
     def whitening(self) -> np.ndarray:
         return self._whitening
@@ -180,13 +180,14 @@ class Segments:
             spec[name] = jnp.where(segment["first"], start, of_node.reshape(self.shape))
         times = segment["t0"], segment["ts"], segment["pick"]
         predictions, (q1, p1), _ = predict(spec, *times, self.group)
+        predictions = nearest_branch(predictions, segment["values"], segment["period"])
         difference = jnp.where(segment["mask"], predictions - segment["values"], 0.0)
         r = problem.core.root(weigh(difference, segment["whiten"])).ravel()
         return r, jnp.concatenate([q1.ravel(), p1.ravel()]) / self.orbit
 
     def _all_segments(self, w: Array) -> Any:
         """Residuals and ends of all segments, and their derivatives in (u, own start)."""
-        names = ("t0", "ts", "pick", "values", "mask", "whiten")
+        names = ("t0", "ts", "pick", "values", "mask", "whiten", "period")
         segments = {name: getattr(self.group, name) for name in names}
         segments |= {"arc": self.group.arcs, "first": self.first}
         nodes = self._nodes(w)[np.maximum(self.node_of, 0)]
@@ -248,7 +249,13 @@ def from_data(arc: Observations, spec: dict[str, Any], times: np.ndarray) -> np.
     )
     flat = arc.values.reshape(len(arc.ts), -1)
     good = np.isfinite(flat).all(axis=1)
-    ts, flat = arc.ts[good], flat[good]
+    ts, flat = arc.ts[good], flat[good].copy()
+    if arc.period is not None:  # Interpolate between neighbouring branches, from that of the model.
+        start = np.concatenate([np.ravel(spec["q0"]), np.ravel(spec["p0"])])
+        for k in np.flatnonzero(np.isfinite(arc.period)):
+            length = arc.period.flat[k]
+            column = np.unwrap(flat[:, k], period=length)
+            flat[:, k] = column + length * np.round((start[k] - column[0]) / length)
     order = np.argsort(ts)
 
     def interpolate(x):

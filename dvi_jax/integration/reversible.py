@@ -35,9 +35,12 @@ class Reversible(AbstractAdjoint):
     Memory does not grow with num_steps, except for one state about every `checkpoint_every` steps,
     from which the reconstruction restarts: it amplifies round-off on chaotic or dissipative arcs.
     Where a reconstructed component differs from the stored one by more than `max_defect` of its
-    size (None means 1e-6 in float64 and 1e-3 in float32; more where that is round-off of the
+    size (None means 1e-10 in float64 and 1e-3 in float32; more where that is round-off of the
     largest component), or an inverse step has no solution, the steps of the trajectory from that
     checkpoint are computed again and their states stored: slower, and correct for any dynamics.
+    A step is linearised at the reconstructed state, so that the relative error of a gradient is
+    that difference times the sensitivity of the step's derivative. With the default it is below
+    1e-8 in float64 for Kepler orbits of e = 0.99 in Strang's method.
     With `report_defect` the solution has the largest of these differences, in
     ``stats["round_trip_defect"]`` (relative, ∞ where an inverse step has no solution). It takes as
     much time as the reconstruction of the states.
@@ -69,7 +72,7 @@ class Reversible(AbstractAdjoint):
 
     def tolerance(self, dtype) -> float:
         """The largest relative difference that is accepted."""
-        return self.max_defect or (1e-6 if jnp.dtype(dtype).itemsize >= 8 else 1e-3)
+        return self.max_defect or (1e-10 if jnp.dtype(dtype).itemsize >= 8 else 1e-3)
 
     def rollout(self, task, plan, q0, p0, layout=Layout()):
         theta, remainder = eqx.partition(task, eqx.is_inexact_array)

@@ -10,7 +10,7 @@ import numpy as np
 
 import dvi_jax as dvi
 from dvi_jax import plot
-from dvi_jax.fit.result import little_explained, numbers_in_words
+from dvi_jax.fit.result import numbers_in_words, remarks
 from dvi_jax.fit.run import progress_display as shown_bar
 
 from .._errors import InputError, one_of, require, require_name, user_path
@@ -289,8 +289,7 @@ def _correlation_table(names: list[str], matrix: np.ndarray) -> TextTable:
 
 def _notes(result: dvi.FitResult) -> list[str]:
     notes = [f"not determined by the data: {words}" for words in result.undetermined]
-    if little := little_explained(result):
-        notes.append(little[0].upper() + little[1:])
+    notes += [words[0].upper() + words[1:] for words in remarks(result)]
     if result.at_bounds:
         at_bounds = ", ".join(result.at_bounds)
         notes.append(f"at their bounds, where an error is not symmetric: {at_bounds}")
