@@ -1,9 +1,10 @@
 """Errors of the input: the key, what was seen, what is allowed."""
 
 import difflib
+import os
 import reprlib
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -63,8 +64,11 @@ def require_name(
 def user_path(key: str, path: str | Path) -> Path:
     """A path that a user gives, with ``~`` as the home directory. **Raises** `InputError`."""
     rule = "a path; ~ is the home directory, and ./~name a file whose name begins with ~"
-    with as_input_error(key, rule, RuntimeError, prefix=f"{path}: "):
-        return Path(path).expanduser()
+    with as_input_error(key, rule, RuntimeError, ValueError, prefix=f"{path!s:.200}: "):
+        expanded = Path(path).expanduser()
+        with suppress(OSError):
+            os.stat(expanded)  # raises ValueError for a name with a NUL
+        return expanded
 
 
 def require_file(key: str, path: Path, rule: str) -> Path:

@@ -1,5 +1,7 @@
-"""The entry point: Ctrl-C, SIGTERM and SIGHUP end any command in the same way, also while it is
-being imported, with exit code 128 + the number of the signal."""
+"""The entry point. Signals end any command in the same way, also while it is being imported.
+
+These are Ctrl-C, SIGTERM and SIGHUP; the exit code is 128 + the number of the signal.
+"""
 
 import functools
 import os
@@ -54,7 +56,7 @@ def _leave(code: int) -> None:
     if files := sys.modules.get("dvi_jax.base.files"):
         files.release()
     for stream in (sys.stdout, sys.stderr):
-        with suppress(AttributeError, OSError, ValueError):  # there is none, or it is closed
+        with suppress(AttributeError, OSError, ValueError):  # it does not exist or is closed
             stream.flush()
     os._exit(code)
 

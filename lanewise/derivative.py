@@ -20,6 +20,18 @@ def with_derivative(function: Callable, rule: Rule, operands: Sequence[Any]) -> 
     partial evaluation moves operations out of the loop that depend on its constants alone, and
     replaces calls with a rule by their bodies. Second derivatives by reverse mode are then those of
     the body.) Neither function may close over traced values: they have to be operands.
+
+    **Example**
+
+    ```python
+    import lanewise
+
+    def rounded(x):                                     # a step function, with the slope 1
+        return lanewise.with_derivative(lambda x: [jnp.round(x)], lambda x, dx: [dx[0]], [x])[0]
+
+    print(*jax.value_and_grad(rounded)(1.7))
+    # 2.0 1.0
+    ```
     """
     program = jax.make_jaxpr(lambda *operands: list(function(*operands)))(*operands)
     return _operation.bind(*operands, program=program, rule=rule)

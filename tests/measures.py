@@ -38,12 +38,12 @@ PACKAGES = ("dvi_jax", "lanewise", "dvi_jax_cli")
 LONGEST_FILE, MOST_PARAMETERS = 450, 9
 
 LIMITS: dict[str, float] = {
-    "lines of the core": 12_630,
-    "lines of the questions": 20_560,
-    "lines of the leaves": 17_000,
-    "lines of lanewise": 7_489,
-    "lines of the command line": 4_400,
-    "raise statements": 600,
+    "lines of the core": 13_550,
+    "lines of the questions": 21_270,
+    "lines of the leaves": 17_580,
+    "lines of lanewise": 7_560,
+    "lines of the command line": 4_490,
+    "raise statements": 625,
     "characters of error text": 45_000,
     "functions with more than 9 parameters": 2,
     "files of more than 450 lines": 0,

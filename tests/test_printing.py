@@ -25,8 +25,12 @@ def test_results_print_their_statuses_and_small_arrays():
     text = repr(lines)
     assert text.splitlines()[0] == "Frequencies: 1 not_finite, 1 successful"
     assert "frequencies = [[ 1.], [nan]]" in text
+    spring = systems.oscillator()
     section = dvi.poincare_section(
-        systems.oscillator(),
+        spring.system,
+        np.asarray(spring.q0)[None],
+        np.asarray(spring.p0)[None],
+        args=spring.args,
         g=lambda t, q, p, args: q[0],
         h=0.1,
         num_steps=400,

@@ -446,7 +446,7 @@ def test_files_of_xsuite(at, tmp_path):
     z = particles(5) * 0.1
     with pytest.warns(UserWarning, match="pyAT switches off the cavities of this file"):
         ring = rings.load(path)
-    with pytest.raises(FileNotFoundError, match="No such file"):
+    with pytest.raises(FileNotFoundError, match="there is no file"):
         rings.load(tmp_path / "missing.mat")
     np.testing.assert_array_equal(rings.track(ring, z).z, rings.track(rings.from_at(lattice), z).z)
     content = json.loads(path.read_text())

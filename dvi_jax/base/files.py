@@ -67,6 +67,7 @@ def user_folder(name: str, path: Any) -> Path:
 def kind_of_file(path: Path) -> str:
     """What is at a path, in words."""
     mode = path.stat().st_mode
+    # Other kinds are rare: one word serves them all.
     kinds = {stat.S_IFDIR: "directory", stat.S_IFREG: "file", stat.S_IFIFO: "pipe"}
     return kinds.get(stat.S_IFMT(mode), "device or socket")
 

@@ -15,6 +15,7 @@ _state = {"is_fork": False}
 
 
 def _after_fork() -> None:
+    # A child of a process in which JAX has not started may start it.
     _state["is_fork"] = backends_are_initialized()
 
 
@@ -59,7 +60,7 @@ def _constant_limits() -> list[int]:
 
 
 def _process_limits() -> list[int]:
-    """What is left of the limits of this process, which a program may change."""
+    """The unused part of the limits of this process, which a program may change."""
     try:
         import resource
     except ImportError:  # on Windows
@@ -69,6 +70,7 @@ def _process_limits() -> list[int]:
     limits = {0: resource.getrlimit(resource.RLIMIT_AS)[0]}
     limits[5] = resource.getrlimit(resource.RLIMIT_DATA)[0]
     limits = {place: limit for place, limit in limits.items() if limit != resource.RLIM_INFINITY}
+    # Without statm, as on macOS, the limits count whole.
     pages = [0] * 6
     if limits:
         with contextlib.suppress(OSError, ValueError):  # Linux has it

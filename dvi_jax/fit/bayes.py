@@ -167,7 +167,7 @@ def sample(
     approximation (`Posterior.laplace`): a well-determined posterior is nearly round in z, and needs
     little warm-up. Chains start at draws of such approximations, in turn at each maximum of the
     density: descents from draws of the priors and bounds look for those besides the mode. A narrow
-    maximum may be missed: the field `explored` of the result says what was looked at.
+    maximum may be missed: the field `explored` of the result says where it was searched.
 
     - `model`, `data`, `params`, `bounds`, `priors`, `loss`, `gradient`: as for `Posterior`.
     - `num_samples`, `num_warmup`: draws of each chain that are kept, and draws before them in

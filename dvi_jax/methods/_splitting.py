@@ -173,6 +173,7 @@ class SplittingMethod(Method):
 def _in_turn(equations: Equations, interval: Interval, q: State, p: State, *maps) -> StateAndInfo:
     """The state after one map after the other, and the status of all."""
     q, p, info = maps[0](equations, interval, q, p)
+    # A failure of any of them is one of the step.
     for advance in maps[1:]:
         q, p, later = advance(equations, interval, q, p)
         info = info.then(later)
@@ -186,6 +187,7 @@ def _joined(method: SplittingMethod, a: float) -> InLoop:
         return functools.partial(method.compose, stages=[stage])
 
     def first(*state):
+        # A half flow back: the loop then begins in the middle of the first part.
         before = functools.partial(method.correct, sign=1)
         return _in_turn(*state, method.enter, before, part(Stage(0, 0.0, -a, -a)))
 
@@ -194,6 +196,7 @@ def _joined(method: SplittingMethod, a: float) -> InLoop:
         return method.compose(equations, interval, q, p, stages_of([(0, 2 * a), *middle], -a))
 
     def last(*state):
+        # The half flow that is left, then out of the coordinates of the parts.
         after = functools.partial(method.correct, sign=-1)
         return _in_turn(*state, part(Stage(0, 1 - a, 1.0, a)), after, method.leave)
 

@@ -74,6 +74,7 @@ def no_value(value: Array) -> Array:
     """NaN; for integers the smallest one of the type, for booleans False."""
     if jnp.issubdtype(value.dtype, jnp.inexact):
         return jnp.full_like(value, jnp.nan)
+    # They have no NaN; the status of the run says that nothing was computed.
     return jnp.full_like(value, value.dtype != bool and jnp.iinfo(value.dtype).min)
 
 

@@ -109,6 +109,7 @@ def table_of(solution: Any, **labels: Any) -> Any:
     def add(name: str, values: Any) -> None:
         columns[name] = np.broadcast_to(values, (*batch, count)).ravel()
 
+    # Reductions and statistics have one value for a run, which is no column of its states.
     add("t", data.time if axis == "time" else data.t)
     for name, variable in data.data_vars.items():
         front = variable.dims[: len(dims) + 1]
@@ -128,8 +129,10 @@ def table_of(solution: Any, **labels: Any) -> Any:
             add("_".join(map(str, (name, *labels_of))), values[(..., *place)])
     add("status", np.asarray(status_name(solution.result))[..., None])
     index = {d: data[d].values if d in data.coords else np.arange(data.sizes[d]) for d in dims}
-    index["save" if dims else None] = np.arange(count)
-    rows = pd.MultiIndex.from_product(index.values(), names=index) if dims else None
+    # The state within a trajectory is the last level of the index.
+    index["save"] = np.arange(count)
+    # One trajectory has no names for its rows: their numbers are those of the states.
+    rows = pd.MultiIndex.from_product([*index.values()], names=[*index]) if dims else None
     return pd.DataFrame(columns, rows)
 
 

@@ -23,6 +23,7 @@ def write(solution: Any, path: str | os.PathLike[str]) -> None:
         raise TypeError(
             "solution must have numbers, got JAX tracers: call save outside of jit and vmap."
         )
+    # Text and arrays alone, no pickle: loading one would run code from the file.
     arrays = {name: np.asarray(getattr(solution, name)) for name in _STATES}
     arrays["status"] = np.asarray(status_code(solution.result))
     header = {
@@ -43,6 +44,7 @@ def read(path: str | os.PathLike[str]) -> dict[str, Any]:
         )
     refuse_double_without_x64("a saved Solution", arrays["ts"].dtype)
     fields: dict[str, Any] = {name: jnp.asarray(arrays[name]) for name in _STATES}
+    # A status is made from its index: an Enumeration has one leaf.
     (index,) = jax.tree.leaves(RESULTS.successful)
     code = jnp.asarray(arrays["status"], index.dtype)
     fields["result"] = eqx.tree_at(lambda r: jax.tree.leaves(r)[0], RESULTS.successful, code)

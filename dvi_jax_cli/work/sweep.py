@@ -292,6 +292,7 @@ def sweep_status(store: str | Path) -> Report:
     **Raises** `InputError` where there is no store.
     """
     result = _open_store(store)
+    assert result.path is not None
     steps, records = _steps(result), list(result.records())
     statuses = sum((Counter(record["statuses"]) for record in records), Counter())
     sizes = [math.prod(record["size"]) for record in records]
