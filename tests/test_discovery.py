@@ -683,12 +683,8 @@ import dvi_jax as dvi
 samples = tuple(np.random.default_rng(3).uniform(-1, 1, (2, 300, 2)))
 system = dvi.System(lambda t0, t1, q, p, a: (p @ p + q @ q) / 2,
                     perturbation=lambda t0, t1, q, p, a: q[0] ** 2 * q[1] - q[1] ** 3 / 3)
-basis, method = dvi.Polynomials({degree}), dvi.GaussLegendre(4)
-for _ in range({repeats}):
-    if {order} < 0:
-        dvi.find_symmetries(system, dvi.Polynomials(1), h=0.02, samples=samples)
-    else:
-        dvi.discover_invariants(system, basis, {order}, h=0.02, samples=samples, method=method)
+for _ in range(10):
+    SEARCH
 """
 
 
