@@ -388,7 +388,7 @@ def test_a_discovery_is_saved_and_loaded(tmp_path, monkeypatch):
     for damaged in (path.with_suffix(".npy"), path):
         with pytest.raises(ValueError, match="damaged, or not the file of a discovery"):
             dvi.Discovery.load(damaged, named)
-    with pytest.raises(FileNotFoundError, match=r"there is no file .* of a discovery"):
+    with pytest.raises(FileNotFoundError, match=r"discovery: there is no file .*'.*"):
         dvi.Discovery.load(path.with_suffix(".none"), named)
 
 

@@ -148,7 +148,7 @@ def test_a_file(tmp_path):
     assert not np.array_equal(first.q0, last.q0)
     with pytest.raises(TypeError, match=r"archive\[i\]"):
         interop.from_rebound(rebound.Simulationarchive(str(path)))
-    with pytest.raises(FileNotFoundError, match=r"no file at the path .*none\.bin'"):
+    with pytest.raises(FileNotFoundError, match=r"no file at the path: .*none\.bin'"):
         interop.from_rebound(tmp_path / "none.bin")
     with pytest.raises(ValueError, match="cannot read snapshot 7 of"):
         interop.from_rebound(path, snapshot=7)

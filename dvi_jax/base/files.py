@@ -44,7 +44,8 @@ def user_file(name: str, path: Any) -> Path:
     file = user_path(name, path)
     if not file.is_file():
         if not file.exists():
-            raise FileNotFoundError(f"{name}: there is no file at the path {str(file)!r}.")
+            cause = f"{name}: there is no file at the path"
+            raise FileNotFoundError(errno.ENOENT, cause, str(file))
         raise ValueError(f"{name} must be a file, but '{file}' is a {kind_of_file(file)}.")
     return file
 
@@ -175,10 +176,7 @@ def read_npz(
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Header and arrays of a file of `publish_npz`; `kind` names its content in messages.
     **Raises** `FileNotFoundError`; `ValueError` for a damaged or another file, or another form."""
-    path = user_path("path", path)
-    if not path.exists():
-        raise FileNotFoundError(f"there is no file '{path}' of a {kind}.")
-    path = user_file("path", path)
+    path = user_file(kind, path)
     try:
         # Without pickles: loading one would execute code from the file.
         with np.load(path, allow_pickle=False) as file:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool
 
-from lanewise.jaxprs.jaxapi import linear_map
+from lanewise.jaxprs.jaxapi import linear_map, with_equal_axes
 from lanewise.jaxprs.traced import Trace
 
 
@@ -73,6 +73,7 @@ def nan_if_used(values: Any, inputs: Any) -> Any:
         of_inputs = [jnp.where(is_nan, jnp.full_like(x, jnp.nan), 0) for x in like]
         return cotangents, jax.tree.unflatten(tree, of_inputs)
 
+    values, inputs = with_equal_axes((values, inputs))
     leaves, tree = jax.tree.flatten(inputs)
     like = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
 

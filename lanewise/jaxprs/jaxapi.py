@@ -115,16 +115,18 @@ def without_manual_axes(x: Any) -> Any:
     return jax.ShapeDtypeStruct(x.shape, x.dtype) if manual_axes(x) else x
 
 
-def with_equal_axes(xs: Sequence[Any]) -> list[Any]:
+def with_equal_axes(values: Any) -> Any:
     """Floating-point values that all vary along the axes of `jax.shard_map` along which one of them
     varies, so that their derivatives are summed over devices where they must be."""
-    axes = manual_axes(*xs)
-    return [
-        jax.lax.pcast(x, tuple(axes - manual_axes(x)), to="varying")
-        if axes - manual_axes(x) and jnp.issubdtype(jax.typeof(x).dtype, jnp.floating)
-        else x
-        for x in xs
-    ]
+    axes = manual_axes(*jax.tree.leaves(values))
+
+    def varying(x: Any) -> Any:
+        missing = axes - manual_axes(x)
+        if not missing or not jnp.issubdtype(jax.typeof(x).dtype, jnp.floating):
+            return x
+        return jax.lax.pcast(x, tuple(missing), to="varying")
+
+    return jax.tree.map(varying, values)
 
 
 def _lowering(function: Callable, multiple: bool) -> Callable:
