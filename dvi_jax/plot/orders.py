@@ -178,8 +178,8 @@ def drift_surface(
 ) -> Any:
     """Drifts over ε and h (`drift_surface`), and their orders in ε at each h.
 
-    - `surface`: a result of `dvi.drift_surface`. `expected`: the order z + 1; `promised` is an older
-      name.
+    - `surface`: a result of `dvi.drift_surface`. `expected`: the order z + 1 (`promised` is an
+      older name).
     - `ax`: two `Axes`, of the drifts and of their orders.
 
     Dots mark drifts that are excluded from the fits; bars are 95 % intervals, and orders that are

@@ -42,7 +42,8 @@ def echelon(columns: np.ndarray, complexity: np.ndarray, threshold: float = RANK
 def reduced_echelon(columns: np.ndarray, complexity: np.ndarray, threshold: float = RANK):
     """Basis of the same span whose leading-order terms are in reduced echelon form.
 
-    Each column has one pivot. `columns` may have more rows below the leading-order term, which are combined in the same way.
+    Each column has one pivot. Rows of `columns` below the leading-order term are combined in the
+    same way.
     """
     pivots = echelon(columns[: len(complexity)], complexity, threshold)[0][::-1]  # simplest first
     return columns @ np.linalg.pinv(columns[pivots]) if pivots else columns[:, :0]
