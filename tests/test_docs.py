@@ -190,12 +190,13 @@ def site(tmp_path_factory):
     folder = tmp_path_factory.mktemp("docs")
     ignore = shutil.ignore_patterns("_build", "reference", "__pycache__")
     shutil.copytree(DOCS, folder / "docs", ignore=ignore)
-    shutil.copytree(ROOT / "notebooks", folder / "notebooks")
+    for name in ("notebooks", "examples"):
+        shutil.copytree(ROOT / name, folder / name)
     shutil.copy(ROOT / "CHANGELOG.md", folder)
     words = "-m sphinx -W --keep-going -q -b html -j auto docs html"
     out = subprocess.run(
         [sys.executable, *words.split()], cwd=folder, capture_output=True, text=True, check=False,
-        env={**os.environ, "JAX_PLATFORMS": "cpu", "NO_COLOR": "1"}, timeout=500,
+        env={**os.environ, "JAX_PLATFORMS": "cpu", "NO_COLOR": "1"}, timeout=900,
     )  # fmt: skip
     assert out.returncode == 0, out.stderr
     assert out.stderr == ""
