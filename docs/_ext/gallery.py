@@ -25,7 +25,6 @@ import matplotlib
 import usage
 from docutils import nodes
 from PIL import Image, ImageDraw, ImageFont
-from sphinx import addnodes
 from sphinx.util.docutils import SphinxDirective
 
 DOCS = Path(__file__).parents[1]
@@ -74,11 +73,12 @@ EXAMPLES = {
 
 
 class Card(NamedTuple):
-    """A thumbnail: its name, its caption, and the domain, type and target of its link."""
+    """A thumbnail: its name, its caption, the address of its page, and its file if it has one."""
 
     name: str
     caption: str
-    link: tuple[str, str, str]
+    address: str
+    file: str = ""
 
 
 def plot_functions() -> list[str]:
@@ -104,7 +104,7 @@ def _summary(name: str) -> str:
     """The first sentence of an example."""
     text = (DOCS.parent / "examples" / name).read_text(encoding="utf-8")
     head = text.split("\n\n")[0] if name.endswith(".py") else text.split("\n#\n")[0]
-    return " ".join(head.strip('"').replace("# ", "").split()).split(". ")[0].rstrip('."')
+    return " ".join(re.sub(r'"""|^# |`', "", head, flags=re.M).split()).split(". ")[0].rstrip(".")
 
 
 def cards(kind: str) -> list[Card]:
@@ -112,11 +112,12 @@ def cards(kind: str) -> list[Card]:
     if kind == "notebooks":
         names = sorted(path.stem for path in (DOCS.parent / "notebooks").glob("*.ipynb"))
         names.sort(key=lambda name: list(NOTEBOOKS).index(name) if name in NOTEBOOKS else 99)
-        return [Card(name, _title(name), ("std", "doc", f"/notebooks/{name}")) for name in names]
+        return [Card(name, _title(name), f"notebooks/{name}.html") for name in names]
     if kind == "plots":
-        return [Card(name, name, ("py", "obj", f"dvi_jax.{name}")) for name in plot_functions()]
-    found = [(name, f"/{page}") for name, (page, _) in EXAMPLES.items()]
-    return [Card(name, f"{_summary(name)}. `{name}`", ("std", "doc", to)) for name, to in found]
+        place = "reference/plot.html#dvi_jax"
+        return [Card(name, name, f"{place}.{name}") for name in plot_functions()]
+    listed = EXAMPLES.items()
+    return [Card(name, _summary(name), f"{page}.html", name) for name, (page, _) in listed]
 
 
 def thumbnail(image: Image.Image) -> Image.Image:
@@ -221,7 +222,7 @@ KINDS = ("notebooks", "examples", "plots")
 
 
 def draw_plots(folder: Path, names: list[str]) -> None:
-    """Run the examples of plot functions, each of the shared lines once, and save what they draw."""
+    """Run the examples of plot functions, the shared lines once, and save what they draw."""
     import matplotlib.pyplot as plt
 
     page, known = usage.page(), {}
@@ -255,17 +256,12 @@ class Gallery(SphinxDirective):
     def _cards(self) -> Iterator[nodes.Node]:
         kind = self.arguments[0]
         for card in cards(kind):
-            domain, role, target = card.link
-            link = addnodes.pending_xref(
-                "", refdoc=self.env.docname, refdomain=domain, reftype=role, reftarget=target,
-                refexplicit=True, refwarn=True,
-            )  # fmt: skip
-            text, _, file = card.caption.partition(" `")
             picture = f"thumbnails/{path_of(kind, card.name).name}"
-            link += nodes.inline("", "", nodes.image(uri=picture, alt=""), nodes.Text(text))
+            image = nodes.image(uri=picture, alt=f"Picture of {card.name}")
+            link = nodes.reference("", "", image, nodes.Text(card.caption), refuri=card.address)
             body = nodes.paragraph("", "", link)
-            if file:
-                body += nodes.literal(file[:-1], file[:-1])
+            if card.file:
+                body += nodes.literal(card.file, card.file)
             yield nodes.container("", body, classes=["card"])
 
 
