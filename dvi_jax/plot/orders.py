@@ -183,7 +183,7 @@ def drift_surface(
     - `ax`: two `Axes`, of the drifts and of their orders.
 
     Dots mark drifts that are excluded from the fits; bars are 95 % intervals, and orders that are
-    not resolved are hollow. Drifts that are exactly 0 have no place on a logarithmic scale: they
+    not resolved are hollow. A logarithmic scale cannot show drifts that are exactly 0: they
     are black. Those that failed are hatched; the legend counts both. **Returns** the `Axes`, shape
     (2,).
     """
