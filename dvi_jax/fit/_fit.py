@@ -70,7 +70,7 @@ def fit(
       adds later data step by step. None fits all data at once. With a list of times since t0, the
       fit first uses the data up to each of them, then all data.
     - `batch`: with optax, how many arcs of each group are drawn for each step; `seed` of the draw.
-    - `check_units`: refuse data that differ from the model by orders of magnitude (by default).
+    - `check_units`: reject data that differ from the model by orders of magnitude (default).
     - `check_curvature`: compare the Gauss–Newton errors with second derivatives, for up to 50
       parameters (by default).
     - `checkpoint`: a file that is written every few seconds. The same call continues from it, with
