@@ -23,6 +23,7 @@ extensions = [
     "reference",
     "scripts",
     "pictures",
+    "gallery",
 ]
 source_suffix = {".md": "myst-nb", ".ipynb": "myst-nb"}
 # The reference has the examples, each in its entry.

@@ -186,7 +186,7 @@ def drift_orders(out):
             h=0.1,
             num_steps=5000,
         )
-    return plot.save(plot.drift_orders(orders, promised=[1, 2]), out / "drift_orders.png")
+    return plot.save(plot.drift_orders(orders, expected=[1, 2]), out / "drift_orders.png")
 
 
 def drift_surface(out):
@@ -202,7 +202,7 @@ def drift_surface(out):
         hs=np.array([0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.5]),
         duration=200.0,
     )
-    return plot.save(plot.drift_surface(found, promised=1), out / "drift_surface.png")
+    return plot.save(plot.drift_surface(found, expected=1), out / "drift_surface.png")
 
 
 # --- chaos --------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""A system and its adiabatic invariant, of which `dvi-jax bound` proves how little it changes."""
+"""A system and its adiabatic invariant, of whose change `dvi-jax bound` proves a bound."""
 
 import numpy as np
 

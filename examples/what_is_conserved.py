@@ -52,7 +52,7 @@ def cubic(out):
         )
         print(f"order {z}: {series.formula(6)}\n  {orders[f'order {z}']}")
     with plot.style():
-        figure = plot.drift_orders(orders, promised=[1, 2, 3, 4])
+        figure = plot.drift_orders(orders, expected=[1, 2, 3, 4])
         print(f"written: {plot.save(figure, out / 'drift_orders.png')}")
 
 

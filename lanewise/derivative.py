@@ -14,7 +14,7 @@ These are given by position, for those that change; None for a result that does 
 
 
 def with_derivative(function: Callable, rule: Rule, operands: Sequence[Any]) -> list[Array]:
-    """``function(*operands)``, a list of arrays, with the derivative `rule`.
+    """The list of arrays ``function(*operands)``, with the user-defined derivative `rule`.
 
     It is used in derivatives of every order. (JAX loses the rule of a `jax.custom_jvp` in a loop:
     partial evaluation moves operations out of the loop that depend on its constants alone, and

@@ -104,7 +104,7 @@ _eliminate = primitive("eliminate", _in_arrays, _in_batches)
 
 
 def unit_vectors(n: int, dtype) -> Array:
-    """The identity matrix, whose zeros are known to be zeros where code is generated."""
+    """The identity matrix; generated code omits operations with its zeros."""
     return _unit_vectors.bind(n=n, dtype=jnp.dtype(dtype))
 
 

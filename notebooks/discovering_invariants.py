@@ -57,7 +57,7 @@ for z in range(3):
     assert abs(orders[f"order {z}"].limit - (z + 1)) < 0.1
 
 # %%
-axis = plot.drift_orders(orders, promised=[1, 2, 3], title="A cubic spring, 10 000 steps")
+axis = plot.drift_orders(orders, expected=[1, 2, 3], title="A cubic spring, 10 000 steps")
 plt.show()
 
 # %% [markdown]

@@ -100,7 +100,7 @@ assert np.isnan(orders["energy"].slope)  # hidden by the energy error of the map
 assert abs(orders["I₀ alone"].slope - 1) < 0.05
 
 # %%
-axis = plot.drift_orders(orders, promised=[None, 1, 2], title="Largest change in 5000 steps")
+axis = plot.drift_orders(orders, expected=[None, 1, 2], title="Largest change in 5000 steps")
 plt.show()
 
 # %% [markdown]

@@ -155,6 +155,36 @@ def test_containers_of_pages_are_fences():
     assert raw_markup("<script>a:::b</script><pre>```</pre><p>a::b (c)</p>") == []
 
 
+TOCTREE = re.compile(r"^```\{toctree\}\n((?:.+\n|\n)*?)```", re.M)
+
+
+def children(page):
+    """The pages that a page lists in its table of contents, which the sidebar shows."""
+    lines = "".join(TOCTREE.findall(page.read_text(encoding="utf-8"))).splitlines()
+    return [line for line in lines if line and not line.startswith(":")]
+
+
+def test_the_sidebar_is_short_and_has_every_page_once():
+    assert len(children(DOCS / "index.md")) <= 30
+    listed = [child for page in DOCS.glob("*.md") for child in children(page)]
+    assert len(set(listed)) == len(listed)
+    notebooks = {f"notebooks/{path.stem}" for path in (ROOT / "notebooks").glob("*.ipynb")}
+    pages = {path.stem for path in DOCS.glob("*.md")} - {"index", "examples"}
+    assert set(listed) == pages | notebooks | {"reference/index"}
+
+
+def test_the_gallery_has_every_notebook_example_and_plot(extensions):
+    gallery = importlib.import_module("gallery")
+    names = {kind: {card.name for card in gallery.cards(kind)} for kind in gallery.KINDS}
+    files = [*(ROOT / "examples").glob("*.py"), *(ROOT / "examples").glob("*.toml")]
+    assert names["examples"] == {path.name for path in files}
+    assert names["notebooks"] == {path.stem for path in (ROOT / "notebooks").glob("*.ipynb")}
+    from dvi_jax import plot
+
+    functions = {f"plot.{n}" for n in extensions[0].public(plot)} - {"plot.save", "plot.style"}
+    assert names["plots"] == functions
+
+
 PRINTED = re.compile(r"^<!-- printed -->\n```text\n(.*?)^```", re.S | re.M)
 
 
@@ -190,12 +220,13 @@ def site(tmp_path_factory):
     folder = tmp_path_factory.mktemp("docs")
     ignore = shutil.ignore_patterns("_build", "reference", "__pycache__")
     shutil.copytree(DOCS, folder / "docs", ignore=ignore)
-    shutil.copytree(ROOT / "notebooks", folder / "notebooks")
+    for name in ("notebooks", "examples"):
+        shutil.copytree(ROOT / name, folder / name)
     shutil.copy(ROOT / "CHANGELOG.md", folder)
     words = "-m sphinx -W --keep-going -q -b html -j auto docs html"
     out = subprocess.run(
         [sys.executable, *words.split()], cwd=folder, capture_output=True, text=True, check=False,
-        env={**os.environ, "JAX_PLATFORMS": "cpu", "NO_COLOR": "1"}, timeout=500,
+        env={**os.environ, "JAX_PLATFORMS": "cpu", "NO_COLOR": "1"}, timeout=900,
     )  # fmt: skip
     assert out.returncode == 0, out.stderr
     assert out.stderr == ""

@@ -72,6 +72,7 @@ def test_mesh_plateau_is_excluded_and_reported(observable):
     assert np.isnan([measured.slope, measured.stderr, *measured.interval, measured.limit]).all()
     assert abs(measured.slope_of_all) < 0.05
     assert "no order: 0 of 10 points" in str(measured)
+    assert "(discretisation)" in str(measured)
     assert "10 at ε = 0.0001 … 0.1, within ten times of the drift at ε = 0" in str(measured)
 
 
@@ -426,7 +427,7 @@ def test_pictures_show_what_was_excluded():
         hollow = [line for line in axis.lines if line.get_markerfacecolor() == "white"]
         assert sum(len(line.get_xdata()) for line in hollow) == 10
         for surface in map(surface_of, (True, False)):
-            axes = plot.drift_surface(surface, promised=1)
+            axes = plot.drift_surface(surface, expected=1)
             excluded = sum(len(line.get_xdata()) for line in axes[0].lines)
             assert excluded == np.sum(~surface.used & np.isfinite(surface.drifts))
     plt.close("all")
@@ -436,7 +437,7 @@ def test_arguments_of_a_picture_of_orders():
     with pytest.raises(ValueError, match=r"each of 2 results, got \[1\]"):
         plot.drift_orders([usual(), usual()], [1])
     with pytest.raises(TypeError, match="expected and promised are two names of one argument"):
-        plot.drift_orders(usual(), 1, expected=1)
+        plot.drift_orders(usual(), 1, promised=1)
     for wrong in ("abc", [1.0], {"energy": None}):
         with pytest.raises(TypeError, match=r"results must be one dvi\.DriftOrder, .* got"):
             plot.drift_orders(wrong)
@@ -455,7 +456,7 @@ def test_a_surface_shows_zeros_failures_and_limits():
             orders=[made(drifts=drifts[:, i], resolved=i != 1, used=used[:, i]) for i in range(3)],
         )  # fmt: skip
 
-    left, right = plot.drift_surface(surface(np.nan), promised=1)
+    left, right = plot.drift_surface(surface(np.nan), expected=1)
     mesh, black = left.collections
     assert (mesh.norm.vmin, mesh.norm.vmax) == (0.1, 80.0)
     assert (~black.get_array().mask).sum() == 1

@@ -187,7 +187,7 @@ def test_losses_by_stage_with_rejected_steps():
     same(axis.lines[0].get_xydata(), [[1, 1e3], [2, 40]])
     same(axis.lines[1].get_xdata(), [3, 4, 5])
     same(marked(axis, "x"), [[[4, 90]]])
-    stages = ["stage 1: up to 5 after the start", "stage 2: all data"]
+    stages = ["stage 1: t ≤ t0 + 5", "stage 2: all data"]
     assert legend(axis) == [*stages, "step rejected"]
     assert axis.get_yscale() == "log"
     fit.history["loss"][3:] = np.inf, -3.0

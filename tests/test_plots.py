@@ -512,6 +512,7 @@ def test_the_balance_is_a_stack_whose_ends_add_up_to_the_drift():
     parts = dict(zip(("symmetry", "work", "lattice"), causes.values(), strict=True))
     top, _ = plot.balance(SimpleNamespace(ts=t, drift=drift, **parts))
     same(top.lines[0].get_ydata(), drift)
+    assert legend(top) == ["symmetry", "work", "time grid", "drift"]
     refuses(
         plot.balance,
         ((t, drift, {"a": np.ones(3)}), {}, r"a of shape \(3,\)"),
@@ -747,7 +748,7 @@ def test_drifts_that_failed_or_are_0_keep_their_place():
     close(marked(axis, "v")[0][:, 0], [0.1, 0.07])
     assert legend(axis)[-2:] == ["1 of 5 drifts failed", "2 of 5 drifts are exactly 0"]
     order.drifts, order.floor = np.array([0.05, 0.1, 0.2, 0.3]), 1e-3
-    whole = legend(plot.drift_orders({"a": order}, promised=1))
+    whole = legend(plot.drift_orders({"a": order}, expected=1))
     assert whole[0] == "a: slope 1.00 ± 0.10, expected 1"
     assert not any("drifts" in text for text in whole)
 

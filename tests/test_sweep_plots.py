@@ -199,6 +199,7 @@ def test_fitted_slopes_against_polyfit():
         close(slope, np.polyfit(np.log(EPS[good]), np.log(y[good]), 1)[0], rtol=1e-12)
     assert np.isnan(slopes[4])
     assert texts(axis) == ["no slope: 1 of 5 (20 %)"]
+    assert axis.get_ylabel() == "exponent s in drift ∝ ε^s"
 
 
 def test_local_slopes_lie_between_the_points():

@@ -25,7 +25,7 @@ def over_devices(
     ``jax.jit(jax.vmap(one))(q0, p0)``; each device computes its part of the batch. It can be
     differentiated and compiled like any function: for the gradient of a mean, for instance. Under
     `jax.distributed.initialize` the devices are those of all hosts, which run the same program. For
-    independent trajectories use `sweep`, which loses nothing when a host fails.
+    independent trajectories use `sweep`, which keeps all finished results if a host fails.
 
     **Arguments**
 

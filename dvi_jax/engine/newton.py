@@ -42,7 +42,7 @@ class RootInfo(NamedTuple):
 
 
 class RootSolver(eqx.Module):
-    """Base of the methods for the implicit part of a step, F(x) = 0: the type of `newton=`.
+    """Base class of the root solvers for the equations F(x) = 0 of an implicit step.
 
     The Jacobian of F tends to the identity as h → 0, and a guess is known. All methods find the
     root to round-off and have the same derivatives, those of the implicit function, to any order;

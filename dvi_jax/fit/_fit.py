@@ -66,11 +66,11 @@ def fit(
     - `tolerance`: a fit has converged when the next step would change the predictions by less than
       this many standard errors in total, by default 1e-4, or if round-off of the predictions
       prevents that.
-    - `horizons`: ``"auto"`` fits the beginning of the arcs first where the start is so far off
-      that later data would mislead the fit, and extends it step by step; None fits all data at
-      once; or a list of times since t0 to fit up to before all data.
+    - `horizons`: with ``"auto"``, if the initial guess is poor, the fit uses early data first and
+      adds later data step by step. None fits all data at once. With a list of times since t0, the
+      fit first uses the data up to each of them, then all data.
     - `batch`: with optax, how many arcs of each group are drawn for each step; `seed` of the draw.
-    - `check_units`: refuse data that differ from the model by orders of magnitude (by default).
+    - `check_units`: reject data that differ from the model by orders of magnitude (default).
     - `check_curvature`: compare the Gauss–Newton errors with second derivatives, for up to 50
       parameters (by default).
     - `checkpoint`: a file that is written every few seconds. The same call continues from it, with

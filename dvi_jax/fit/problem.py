@@ -294,8 +294,10 @@ class FitProblem:
     # ---- checks of the start
 
     def check_start(self, predictions: list[Any], check_units: bool = True) -> None:
-        """Refuse a start at which the model fails from the first observation on, or whose
-        `predictions` (with the statuses of each group) differ in size from the data."""
+        """Raise an error if the model fails at the first observation for the initial parameters.
+
+        Also if the `predictions` (with the statuses of each group) differ in size from the data.
+        """
         for group, (values_of_group, result) in zip(self.groups, predictions, strict=True):
             names = np.atleast_1d(status_name(result))
             for a, arc in enumerate(group.arcs):

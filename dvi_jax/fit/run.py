@@ -32,7 +32,7 @@ _LISTS = ("leaves", "extra")
 @dataclass(frozen=True)
 class FitProgress:
     """Progress of a fit: `step` of the optimiser of at most `max_steps`, the `stage` and its
-    `horizon`, the `loss`, the parameters `x` with their `names`, `seconds` since the start."""
+    `horizon`, the `loss`, the parameters `x` with their `names`, `seconds` since the fit began."""
 
     step: int
     max_steps: int

@@ -53,7 +53,7 @@ def _direct_rollout(
 
 
 class Direct(AbstractAdjoint):
-    """Forward and reverse mode through the scan itself.
+    """Forward and reverse mode of `jax.lax.scan` itself; reverse mode stores every step.
 
     For short runs: reverse mode stores values of each step, so that memory grows with num_steps.
     """

@@ -219,7 +219,7 @@ def _memories(
 
 
 def number_of(reduction: Reduction, k: Int[Array, ""]) -> Int[Array, ""]:
-    """Number of the value at the end of step k; number 0 is the initial state if it has one."""
+    """Index of the value at the end of step k; index 0 is the initial value, if there is one."""
     return k + 1 if has_initial_value(reduction.function) else k
 
 

@@ -102,7 +102,7 @@ def from_rebound(
     callbacks (``sim.copy()`` leaves them out), REBOUNDx, boundaries, collisions, gravity that is
     off, approximate or custom, shear (SEI), variational particles, exit distances, massive test
     particles, a simulation that is not synchronised, bodies without mass; for numbers that are NaN
-    or infinite; and for bodies at one place; `FileNotFoundError` for a path where there is no
+    or infinite; and for two bodies at the same place; `FileNotFoundError` for a path without a
     file; `ImportError` without rebound, `TypeError` for another object.
 
     **Accuracy** q, masses, G and t are the same bits; p0 = m v is rounded. Units: REBOUND's solar

@@ -38,9 +38,9 @@ class AdaptiveReversible(StepSizes):
         1/h_{1/2}   = 1/(δ g_0) + G_0/2,
 
     with ∂H/∂p and −∂H/∂q + εW as the derivatives of q and p. An explicit method stays explicit, and
-    a step costs little more than an equal one. Steps backwards have the same sizes: where the
-    system is reversible and g does not depend on the signs of the momenta, so is the map, and
-    invariants of nearly integrable motion do not drift. It is not symplectic.
+    a step costs little more than one of constant size. A backward run takes the same steps. The map
+    is therefore reversible if the system is reversible and g is even in the momenta; then
+    invariants of nearly integrable motion do not drift. The map is not symplectic.
 
     **Arguments** `speed`: g, function ``(t, q, p, args)`` → positive scalar, as for
     `TimeTransformed`; |q|^{3/2} is a good choice for Kepler's problem. H is H_D at t1 = t0.
@@ -51,11 +51,11 @@ class AdaptiveReversible(StepSizes):
     `Stop`). Gradients are those of the map; `Reversible` works as `Checkpointed`, because a step
     depends on the one before it.
 
-    The status `step_control_failed` reports an h that has lost its sign, or differs from δ g by
-    more than a factor of four: δ is then too large for the change of g in one step.
+    The status `step_control_failed` reports a step size whose sign has changed, or that differs
+    from δ g by more than a factor of four: δ is then too large for the change of g in one step.
 
     **Limits** The error of h is of second order in δ. It does not reduce the order of the method,
-    since every h is a step of it, but a large error of the state also makes steps other than δ g.
+    since every h is a step of it, but with a large error of the state the steps differ from δ g.
     In dissipative motion, on a limit cycle for example, errors of h do not cancel: steps slowly
     depart from δ g, until the run ends with this status. `TimeTransformed` has no such errors.
 

@@ -21,7 +21,7 @@ from ..problem.system import System
 
 
 class Place(NamedTuple):
-    """A trajectory before step k: the time and the step of its start, k, and the state."""
+    """A trajectory before step k: initial time t0, initial step size h, k, and the state."""
 
     t0: Scalar
     h: Scalar

@@ -173,7 +173,7 @@ def _require_independent(defects: _Defects) -> None:
 
 
 class Projection(NamedTuple):
-    """A consistent state (q, p), and how far it is from the one given: |q − q0| and |p − p0|."""
+    """A consistent state (q, p), and its distances |q − q0| and |p − p0| from the given state."""
 
     q: State
     p: State

@@ -27,7 +27,7 @@ def _times(ts: Any) -> Any:
 
 
 class Save(eqx.Module):
-    """The states that a run saves. The start is always one of them, except with `ts`.
+    """The states that a run saves. The initial state is one of them, except with `ts`.
 
     - ``Save(every=m)``: the states after m, 2m, 3m, … steps.
     - ``Save(final=True)``: the state after the last step; together with `every`, also when

@@ -50,7 +50,7 @@ def animate(
     progress: Callable[[int, int], Any] | None = None,
     **options: Any,
 ) -> Path:
-    """An animation of orbits with a fading tail, in equal steps of time.
+    """An animation of orbits whose tails fade; the frames are equally spaced in time.
 
     Orbits of one degree of freedom are drawn in the plane (q, p).
 

@@ -220,7 +220,7 @@ def learning_curve(fit: Any, ax: Any = None) -> Any:
     for number, colour, marker in looks:
         rows = stage == number
         end = horizon[rows][0]
-        data = "all data" if np.isinf(end) else f"up to {end:.3g} after the start"
+        data = "all data" if np.isinf(end) else f"t ≤ t0 + {end:.3g}"
         look = {"c": colour, "label": f"stage {int(number) + 1}: {data}"}
         if rows.sum() <= 100:
             places = np.flatnonzero(is_accepted[rows]).tolist()

@@ -15,7 +15,7 @@ from .style import with_unit
 _PIXELS = 480, 320
 """Largest numbers of pixels in x and y."""
 
-_GREEK = {"epsilon": "ε", "h": "step size h", "start": "number of the start", "t0": "t$_0$"}
+_GREEK = {"epsilon": "ε", "h": "step size h", "start": "initial condition", "t0": "t$_0$"}
 _MOST_NAMES, _MOST_PANELS = 12, 16
 """Names that are written along an axis; panels of a figure."""
 

@@ -333,7 +333,7 @@ def trajectory(
     title: str = "",
     ax: Any = None,
 ) -> Any:
-    """A picture of a trajectory, of the kind that suits the shape of its states.
+    """A plot of a trajectory: phase portrait, orbit or time series, by the shape of its states.
 
     One degree of freedom: (q, p). Two, or bodies in the plane or in space: orbits in the first
     two coordinates. More: every position against time.

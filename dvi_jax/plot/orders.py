@@ -15,7 +15,8 @@ from .axes import canvas, counts_text, entry, legend, stack
 from .style import COLOURS, DASHES, MARKERS, SMALL, ZERO, in_style, sign_text, with_unit
 
 _HATCHES = ("", "////", "....", "\\\\\\\\", "xxxx", "++++")
-_CAUSES = ("symmetry", "work", "lattice")
+_CAUSES = {"symmetry": "symmetry", "work": "work", "lattice": "time grid"}
+"""Attribute of a `Balance` → its label."""
 _EPSILON = "strength ε of the perturbation"
 _BAR: dict[str, Any] = {"marker": "_", "ms": 12, "mew": 2, "ls": "none"}
 
@@ -47,7 +48,8 @@ def balance(
     without drift or causes, `ValueError` for shapes that do not fit.
     """
     if all(hasattr(ts, name) for name in ("ts", "drift", *_CAUSES)):
-        causes = {name: getattr(ts, name) for name in _CAUSES} if causes is None else causes
+        if causes is None:
+            causes = {label: getattr(ts, name) for name, label in _CAUSES.items()}
         ts, drift = ts.ts, ts.drift if drift is None else drift
     if drift is None or not causes:
         name, value = ("drift", drift) if drift is None else ("causes", causes)
@@ -88,26 +90,23 @@ def balance(
 @in_style
 def drift_orders(
     results: DriftOrder | Mapping[str, DriftOrder] | Sequence[DriftOrder],
-    promised: Sequence[float | None] | float | None = None,
+    expected: Sequence[float | None] | float | None = None,
     title: str = "Largest drift against the perturbation",
     ax: Any = None,
     *,
-    expected: Sequence[float | None] | float | None = None,
+    promised: Sequence[float | None] | float | None = None,
 ) -> Any:
     """Drifts over ε (`drift_order`) and the orders that are expected.
 
     - `results`: one measured order, label → measured order, or a sequence of them.
-    - `promised`, or `expected`: the order z + 1 of each result in turn (None: unknown), or one for
-      all; a grey line of that slope goes through the first point of the fit.
+    - `expected`: the order z + 1 of each result in turn (None: unknown), or one for all; a grey
+      line of that slope is drawn through the first point of the fit. `promised` is an older name.
 
     Hollow points are excluded from the fit; bars at the left end mark the drift at ε = 0. The
     legend counts drifts that failed, crosses at the top, and those exactly 0, triangles at the
     bottom. **Returns** the `Axes`. **Raises** `TypeError` for anything but a `DriftOrder`.
     """
-    if expected is not None:
-        if promised is not None:
-            raise TypeError("expected and promised are two names of one argument: give one.")
-        promised = expected
+    expected = _one_of(expected, promised)
     if isinstance(results, DriftOrder):
         results = {"drift": results}
     elif not isinstance(results, Mapping):
@@ -115,11 +114,10 @@ def drift_orders(
     for order in results.values():
         rule = "results must be one dvi.DriftOrder, or a dict or a sequence of them"
         draw.check_attributes(order, ("drifts", "epsilons"), rule)
-    slopes = [*promised] if isinstance(promised, Sequence) else [promised] * len(results)
+    slopes = [*expected] if isinstance(expected, Sequence) else [expected] * len(results)
     if len(slopes) != len(results):
         raise ValueError(
-            f"promised (expected) must have one order for each of {len(results)} results, got "
-            f"{slopes}."
+            f"expected must have one order for each of {len(results)} results, got {slopes}."
         )
     axis, new = canvas(ax, (6.4, 4.8))
     left = 0.7 * min(order.epsilons.min() for order in results.values())
@@ -145,12 +143,19 @@ def drift_orders(
     axis.set(xscale="log", yscale="log", xlabel=_EPSILON, ylabel="largest drift", title=title)
     marks: Any = {"color": "#444444", "ls": "none"}
     hollow = marks | {"marker": "o", "mfc": "white"}
-    extra = [entry("expected slope", **draw.GUIDE)] if promised is not None else []
+    extra = [entry("expected slope", **draw.GUIDE)] if expected is not None else []
     extra += [entry("excluded from the fit", **hollow)] if has_excluded else []
     extra.append(entry("at ε = 0", **marks | _BAR))
     extra += draw.without_place_entries(outliers, total, "drifts failed", "drifts are exactly 0")
     legend(axis, new, extra)
     return axis
+
+
+def _one_of(expected: Any, promised: Any) -> Any:
+    """The expected order, under either of its names."""
+    if expected is not None and promised is not None:
+        raise TypeError("expected and promised are two names of one argument: give one.")
+    return promised if expected is None else expected
 
 
 def _slope_text(order: DriftOrder) -> str:
@@ -165,17 +170,20 @@ def _slope_text(order: DriftOrder) -> str:
 @in_style
 def drift_surface(
     surface: DriftSurface,
-    promised: float | None = None,
+    expected: float | None = None,
     title: str = "Largest drift over ε and h",
     ax: Any = None,
+    *,
+    promised: float | None = None,
 ) -> Any:
     """Drifts over ε and h (`drift_surface`), and their orders in ε at each h.
 
-    - `surface`: what `drift_surface` returned. `promised`: the expected order z + 1.
+    - `surface`: a result of `dvi.drift_surface`. `expected`: the order z + 1 (`promised` is an
+      older name).
     - `ax`: two `Axes`, of the drifts and of their orders.
 
     Dots mark drifts that are excluded from the fits; bars are 95 % intervals, and orders that are
-    not resolved are hollow. Drifts that are exactly 0 have no place on a logarithmic scale: they
+    not resolved are hollow. A logarithmic scale cannot show drifts that are exactly 0: they
     are black. Those that failed are hatched; the legend counts both. **Returns** the `Axes`, shape
     (2,).
     """
@@ -184,7 +192,7 @@ def drift_surface(
     edges = draw.cell_edges(surface.epsilons, log=True), draw.cell_edges(surface.hs, log=True)
     entries = _draw_drifts(left, surface, edges)
     left.set(xscale="log", yscale="log", xlabel=_EPSILON, ylabel="step size h", title=title)
-    _draw_orders_in_epsilon(right, surface, promised)
+    _draw_orders_in_epsilon(right, surface, _one_of(expected, promised))
     right.set(xscale="log", xlabel="step size h", ylabel="order in ε", title="Order in ε")
     right.set_xlim(*edges[1][[0, -1]])
     orders = right.get_legend_handles_labels()[0]

@@ -59,7 +59,7 @@ def invariants(
       length of the change, relative to the length of I₀.
     - `log`: sizes, such as |ΔI/I₀|, on a logarithmic axis, on which several quantities of one orbit
       share a panel, and relative changes are compared with the machine epsilon. The legend counts
-      values that are exactly 0, which have no place there.
+      values that are exactly 0, which such an axis cannot show.
     - `labels`, `colour`, `colour_label`, `units` (of "t", and of quantities whose change is not
       relative), `title`, `ax` (one `Axes` for each panel): as for all pictures.
 

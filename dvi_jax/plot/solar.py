@@ -12,7 +12,7 @@ from .style import COLOURS, MARKERS, STAR, in_style
 
 @in_style
 def planet_orbits(positions: Any, names: Sequence[str], ax: Any = None) -> Any:
-    """Heliocentric orbits on the ecliptic [au], the inner four planets and the others.
+    """Heliocentric orbits projected onto the ecliptic [au]: the inner planets, and the others.
 
     - `positions`: shape (times, planets, 3); `names` of the planets. `ax`: two `Axes`.
 

@@ -144,7 +144,7 @@ def slope_map(
     pictures = [reduce_to_pixels(panel, grid.bins, reduce, lines) for _, panel in grid.panels]
     name = str(data.name or "data").replace("_", " ")
     over_what = layout.label_of(data.coords[along], along).partition(" [")[0]
-    label = f"{'local slope' if local else 'slope'} of log {name} over log {over_what}"
+    label = f"{'local ' if local else ''}exponent s in {name} ∝ {over_what}^s"
     scale = _scale(pictures, False, settings.get("limits"))
     return _draw(grid, pictures, label, "no slope", ax, scale)
 

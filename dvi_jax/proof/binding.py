@@ -72,7 +72,7 @@ def holds_for(
     found: Any = None,
     **settings: Unpack[BindingSettings],
 ) -> Binding:
-    """Whether a certificate of `bound_drift` is about a system: its map is read again and compared.
+    """Check whether a certificate of `bound_drift` is about a system, by reading its map again.
 
     The step of the system is traced, read as a list of operations, compared with the traced
     function at random points of the domain, and then with the list of the certificate. The

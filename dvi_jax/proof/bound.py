@@ -32,7 +32,7 @@ units of round-off, and twice what `DoubleDouble` leaves out."""
 
 
 class ProofError(Exception):
-    """Nothing is proved: the message says what failed, and for which states."""
+    """Raised if nothing can be proved; the message says what failed, and for which states."""
 
 
 class BoundSettings(TypedDict, total=False):
@@ -62,7 +62,7 @@ def bound_drift(
     change: float = 1e-3,
     **settings: Unpack[BoundSettings],
 ) -> DriftBound:
-    r"""Prove how little invariants of the map change in a step, for all states of a domain.
+    r"""Prove an upper bound of the change of invariants in a step, for all states of a domain.
 
     The change I(Φ(x, ε), ε) − I(x, ε) of each invariant I = Σ ε^m I_m is expanded on boxes that
     cover the domain, in exact arithmetic and with a rigorous bound of the remainder, so that terms

@@ -15,7 +15,7 @@ class ExactInvariant(eqx.Module):
 
     - `basis`: φ. `numbers`: the integers (d, n_0, n_1, n_2), shape (order + 1, functions, 4).
 
-    Give it to `bound_drift`, which proves that it is conserved exactly, or how little it changes.
+    Give it to `bound_drift`, which proves that it is conserved exactly, or a bound of its change.
     """
 
     basis: BoundBasis

@@ -65,8 +65,8 @@ def sweep(
     **Arguments** otherwise as for `integrate`, and
 
     - `observe`: pytree of observables and reductions. `save`: which states are stored; None: none.
-    - `units`: of observables (and of t, q, p), name → text, for labels; those of a store are given
-      when it is made.
+    - `units`: of observables (and of t, q, p), name → text, for labels; a store keeps those of
+      the first call.
     - `store`: a directory. Each task is written there when it is done; the same call again resumes
       an interrupted sweep. Several processes may work on one store. Without one the results stay
       in memory.

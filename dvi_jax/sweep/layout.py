@@ -30,7 +30,7 @@ class StoreError(Exception):
 
 @contextlib.contextmanager
 def as_store_error(path: Path, failure: str, remedy: str = "") -> Iterator[None]:
-    """Turn an error of the operating system into a `StoreError` with this remedy."""
+    """Raise an error of the operating system as a `StoreError`: what failed, and what to do."""
     try:
         yield
     except OSError as error:

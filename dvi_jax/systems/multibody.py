@@ -53,7 +53,9 @@ def _exact_on_sphere(t, q0, p0, args):
 
 
 def spherical_pendulum() -> Problem:
-    """A mass of 1 kg on a rod of 1 m, around q = 0; z points up. Start and step are ours.
+    """A mass of 1 kg on a rod of 1 m, around q = 0; z points up.
+
+    Initial state and step are our choice.
 
     **Source** Whittaker 1937, *Analytical Dynamics*, §55; Hairer, Lubich & Wanner 2006, VII.1.
     """
@@ -72,7 +74,8 @@ def spherical_pendulum() -> Problem:
 def chain(links: int = 20) -> Problem:
     """A hanging chain of point masses of 1 kg on links of 0.1 m, released 0.4 rad to the side.
 
-    In the plane or in space: q0 has the shape (n, 2) or (n, 3). Start and step are ours.
+    In the plane or in space: q0 has the shape (n, 2) or (n, 3). Initial state and step are our
+    choice.
 
     **Raises** `ValueError` for a number of links that is not a positive integer.
 

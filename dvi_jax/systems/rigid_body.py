@@ -70,7 +70,7 @@ def body_angular_momentum(t0, t1, q0, p0, q1, p1, args):
 
 @over_times((3,))
 def exact(t, q0, p0, args):
-    r"""The state at times t for I1 < I2 < I3.
+    r"""Exact solution by elliptic functions: the state at times t, for I1 < I2 < I3.
 
         M = (a cn, b sn, c dn)(λt + u | m)    where G² > 2 E I2, else with 1 and 3 exchanged
         dg/dt = G (sin² l/I1 + cos² l/I2),    l = atan2(M1, M2), without jumps

@@ -40,9 +40,10 @@ def echelon(columns: np.ndarray, complexity: np.ndarray, threshold: float = RANK
 
 
 def reduced_echelon(columns: np.ndarray, complexity: np.ndarray, threshold: float = RANK):
-    """The same span, its leading-order terms in reduced echelon form: one pivot for each column.
+    """Basis of the same span whose leading-order terms are in reduced echelon form.
 
-    `columns` may have more rows below the leading-order term, which are combined in the same way.
+    Each column has one pivot. Rows of `columns` below the leading-order term are combined in the
+    same way.
     """
     pivots = echelon(columns[: len(complexity)], complexity, threshold)[0][::-1]  # simplest first
     return columns @ np.linalg.pinv(columns[pivots]) if pivots else columns[:, :0]

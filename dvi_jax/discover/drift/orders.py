@@ -15,6 +15,8 @@ _MEANINGS = {
     "mesh": "within ten times of the drift at ε = 0",
     "flat": "within ten times of a plateau at the smallest ε",
 }
+_CAUSES = {"mesh": "discretisation"}
+"""Cause in the data → in a report."""
 
 
 def _of_fit(name: str, doc: str) -> Any:
@@ -102,7 +104,8 @@ class DriftOrder(NamedTuple):
                 f"no order: {num_used} of {points} points can be used, {LEAST_POINTS} are needed "
                 f"(through all of them the slope is {self.slope_of_all:.2g})"
             ]
-        lines.append(f"  drift at ε = 0: {self.floor:.2g} ({self.floor_cause})")
+        cause = _CAUSES.get(self.floor_cause, self.floor_cause)
+        lines.append(f"  drift at ε = 0: {self.floor:.2g} ({cause})")
         for reason, meaning in _MEANINGS.items():
             where = self.epsilons[self.excluded == reason]
             if len(where):

@@ -254,7 +254,7 @@ def _of_radius(k: int) -> str:
 
 
 class Radial(AbstractBasis):
-    r"""Powers r^k of the radius r = √(q·q), taken over all components of q, or those named.
+    r"""Powers r^k of the radius r = √(q·q), of all components of q, or of chosen ones.
 
     - `powers`: integers k, default (−1,): 1/r. 0 stands for the constant 1.
     - `variables`: names of the components that r is made of; None for all of q.

@@ -314,7 +314,7 @@ def _step_pairs(equations, h, samples):
 def random_pairs(
     *, h: float, samples: Any, t0: float = 0.0, seed: int = 0
 ) -> tuple[LatticePoint, LatticePoint]:
-    """Pairs of lattice points off the solutions: each sample, and another one at random.
+    """Pairs of lattice points that are not on one solution: each sample, and a random one.
 
     For `conformal_factor`, whose Λ holds at all points. The second point is at t + h.
 

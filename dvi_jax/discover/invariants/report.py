@@ -37,9 +37,9 @@ def report(discovery: Any) -> str:
         )
     if discovery.refused:
         lines.append(
-            f"  {discovery.refused} combinations fit the samples that were fitted and were "
-            "rejected: held-out samples, their own slopes or a lower order decide (chaos, too few "
-            "samples, or too large a tolerance)"
+            f"  {discovery.refused} combinations rejected: they fit the fitted samples, but not "
+            "held-out samples, their own slopes or a lower order (chaos, too few samples, or too "
+            "large a tolerance)"
         )
     for i, series in enumerate(discovery.invariants):
         lines.append(f"  I = {series.formula(_FORMULA_TERMS, drop, digits)}")

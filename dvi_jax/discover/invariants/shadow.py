@@ -23,7 +23,7 @@ from ..functions.generators import require_bound
 
 
 class ShadowHamiltonian(eqx.Module):
-    r"""The modified Hamiltonian of a discrete Hamiltonian, cut off after h^order.
+    r"""The modified Hamiltonian of a discrete Hamiltonian, as a series up to h^order.
 
         H̃(t, q, p; h) = H̃_0 + h H̃_1 + … + h^r H̃_r,    r = order
 

@@ -18,7 +18,7 @@ from ..functions.generators import Generator, LatticePoint, symplectic_gradient
 
 
 def time_translation() -> Generator:
-    """X = ∂/∂t: ξ0 = 1. Conserves the energy, on the variational lattice."""
+    """X = ∂/∂t: ξ0 = 1. Conserves the energy on the time grid `Variational`."""
     return Generator(xi0=_unit)
 
 

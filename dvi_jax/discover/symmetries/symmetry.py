@@ -224,8 +224,8 @@ class Symmetries(eqx.Module):
             )
         if self.refused:
             lines.append(
-                f"  {self.refused} null vectors of the fitted samples refused: held-out samples "
-                "decide, and there they leave too much (chaos, too few samples, or too large a "
+                f"  {self.refused} null vectors of the fitted samples rejected: their residual on "
+                "the held-out samples is too large (chaos, too few samples, or too large a "
                 "tolerance)"
             )
         return "\n".join(lines)

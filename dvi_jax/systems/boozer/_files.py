@@ -140,10 +140,10 @@ def read_geometry(
     scale: float = 1.0,
     tolerance: float = 1e-2,
 ) -> Geometry:
-    """The `Geometry` of such a file, for a stellarator-symmetric field; lengths times `scale`.
+    """The `Geometry` of a stellarator-symmetric field, from a file of booz_xform or DESC.
 
-    `box`, `degree`: as for `from_surfaces`. `tolerance`: largest error of R and Z over the mean of
-    R, and of ν [rad], measured as there.
+    `scale`: factor of all lengths. `box`, `degree`: as for `from_surfaces`. `tolerance`:
+    largest error of R and Z over the mean of R, and of ν [rad], measured as there.
 
     **Raises** as `read_booz_xform`; `ValueError` for a field without that symmetry.
     """
@@ -225,7 +225,7 @@ def save_field(field: Field, path: Any, source: str = "") -> None:
 
 
 def load_field(path: Any) -> Field:
-    """A field that `save_field` has written. **Raises** `ValueError` for another file."""
+    """Read a field that `save_field` has written. **Raises** `ValueError` for another file."""
     text = user_file("path", path).read_bytes()
     try:
         contents = json.loads(text)

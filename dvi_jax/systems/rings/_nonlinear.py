@@ -78,8 +78,8 @@ def resonance_driving_terms(
 
         ∫ Re Σ_N (b_N + i a_N)(x + iy)^{N+1}/(N + 1) ds/(1 + δ) = Σ h_jkmnp A^j Ā^k B^m B̄^n δ^p
 
-    in A = √(2J_1) e^{iφ_1} and B = √(2J_2) e^{iφ_2} at the start, about the closed orbit:
-    (x, y) = (x₀, y₀) + Re(v_1 A + v_2 B) + (D_x, D_y) δ in the frame of each magnet. Rolls,
+    in A = √(2J_1) e^{iφ_1} and B = √(2J_2) e^{iφ_2} at the entrance of the ring, about the closed
+    orbit: (x, y) = (x₀, y₀) + Re(v_1 A + v_2 B) + (D_x, D_y) δ in the frame of each magnet. Rolls,
     displacements, the orbit in a magnet and a coupling of the planes are thus part of the terms.
     Gauss quadrature inside each magnet, with the optics there, in 4D. The perturbation includes
     quadrupoles in terms with δ; it does not include bends, fringe fields, solenoids and matrices.
@@ -89,8 +89,8 @@ def resonance_driving_terms(
     **Returns** name → complex number [m^{1−(j+k+m+n)/2}], differentiable by the parameters of the
     ring. **Raises** `ValueError` for another name and for a ring with a `lens`; as `optics`.
 
-    **Source** Bengtsson 1997, SLS note 9/97, with the signs of pyAT, where β of a magnet is its
-    mean and the phase that in its middle.
+    **Source** Bengtsson 1997, SLS note 9/97, with the signs of pyAT, which uses the
+    mean of β in a magnet, and the phase in its middle.
     """
     for name in terms:
         if len(name) != 6 or name[0] != "h" or not name[1:].isdigit():

@@ -80,7 +80,7 @@ def one_turn(ring: Ring, z: Any, epsilon: Any = 0.0) -> Array:
 
 
 def closed_orbit(ring: Ring, dp: Any = None, guess: Any = None, epsilon: Any = 0.0) -> Array:
-    """Closed orbit at the start, shape (6,); see `optics`. The motion may be unstable."""
+    """Closed orbit at the entrance of a ring, shape (6,); see `optics`. Also of unstable motion."""
     return _analyse(ring, dp, guess, epsilon, False, False).orbit[0]
 
 
