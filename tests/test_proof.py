@@ -542,6 +542,16 @@ def test_an_implicit_step_that_depends_on_the_time():
     assert 0 < bound.per_step[0] < 0.01
 
 
+def test_an_identity_with_many_functions():
+    """41 sines; the polynomials have one variable for each."""
+    k = jnp.arange(1.0, 42.0)
+    pair = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + jnp.mean(jnp.cos(k * (q[0] - q[1]))))
+    bound = proved(lambda q, p, epsilon: p[0] + p[1], pair, n=2, r=0.1, max_boxes=1)
+    assert bound.per_step == (0.0,)
+    shift = dvi.generators.space_translation(jnp.ones(2))
+    assert dvi.prove_noether(pair, [shift], [None], jnp.zeros(2)).conserved
+
+
 def test_functions_become_the_same_numbers():
     def function(q, p):
         A = jnp.outer(q, p) + jnp.eye(2)
