@@ -79,6 +79,18 @@ TRANSLATED = {
     "constant of float32": lambda x: x * jnp.float32(0.1),
     "constant of integers": lambda x: x * jnp.arange(3) + 7 // 2,
     "remainder of constants": lambda x: x[jnp.arange(3) % 2],
+    "computed powers": lambda x: x**x + 0.3**x + x**-0.3 + jnp.exp2(x),
+    "inverse functions": lambda x: (
+        jnp.arcsinh(-x) + jnp.arccosh(1 + x) - jnp.arctanh(x) * jnp.cbrt(x)
+    ),
+    "angles in all quadrants": lambda x: jnp.stack(
+        [jnp.arctan2(a * x[0], b * x[1]) for a in (1, -1) for b in (1, -1)]
+    ),
+    "multiply at places": lambda x: x.at[jnp.array([0, 2, 0])].multiply(x + 1).at[9].multiply(3),
+    "cumulative products": lambda x: jnp.stack(
+        [jnp.cumprod(x), jax.lax.cumprod(x, reverse=True), jax.lax.stop_gradient(x)]
+    ),
+    "constants without rounding": lambda x: x * jnp.round(jnp.sort(jnp.asarray(TABLE[:3])) % 2),
     "derivative of a changed array": jax.grad(lambda y: jnp.sum(y.at[1].add(2) ** 3)),
 }
 
@@ -114,6 +126,8 @@ REFUSED = {
         lambda x: jax.lax.cond(x[0] > 0.5, lambda y: y, lambda y: -y, x), "cond|convert|bool"),
     "an infinite constant": (lambda x: x * jnp.inf, "inf"),
     "an error function": (jax.scipy.special.erf, "erf"),
+    "a constant of another function": (
+        lambda x: x * jax.lax.lgamma(jnp.asarray(0.3)), "lgamma of constants"),
     "complex numbers": (lambda x: jnp.real(jnp.exp(1j * x)), "complex|real"),
 }  # fmt: skip
 
@@ -198,7 +212,7 @@ MISTRANSLATIONS = {
     "a + b as a": ("matrix", of_rule("add", lambda a, b: a)),
     "a b as a": ("norm times a number", of_rule("mul", lambda a, b: a)),
     "a power with |n|": ("powers", of_numbers("power", lambda f: lambda x, n: f(x, abs(n)))),
-    "√x for x^y": ("powers", of_module("_real_power", lambda f: lambda x, y: x.apply("sqrt"))),
+    "√x for x^y": ("powers", of_rule("pow", lambda x, y: x.apply("sqrt"))),
     "a constant with an error of 1e-8": ("functions", of_numbers("_scalar", rounded)),
     "a product transposed": ("matrix", of_module("_dot", result(lambda out: out[:, ::-1]))),
     "a sum without its last term": ("matrix", of_module("total", lambda f: lambda x: f(x[:-1]))),
