@@ -90,6 +90,9 @@ TRANSLATED = {
     "cumulative products": lambda x: jnp.stack(
         [jnp.cumprod(x), jax.lax.cumprod(x, reverse=True), jax.lax.stop_gradient(x)]
     ),
+    "loop with a count": lambda x: jax.lax.while_loop(
+        lambda c: c[0] < 3, lambda c: (c[0] + 1, c[1] * x + c[0]), (0, x)
+    )[1],
     "constants without rounding": lambda x: x * jnp.round(jnp.sort(jnp.asarray(TABLE[:3])) % 2),
     "derivative of a changed array": jax.grad(lambda y: jnp.sum(y.at[1].add(2) ** 3)),
 }
@@ -120,6 +123,8 @@ REFUSED = {
     "sign": (lambda x: jnp.sign(x - 0.5), "sign"),
     "sorted": (lambda x: jnp.sort(x) * x, "sort"),
     "interpolation": (lambda x: jnp.interp(x, jnp.arange(4.0), TABLE), "select_n|int|computed"),
+    "loop without an end": (
+        lambda x: jax.lax.while_loop(lambda n: n >= 0, lambda n: n * 0, 0) * x, "int64"),
     "loop until": (
         lambda x: jax.lax.while_loop(lambda y: y[0] < 2, lambda y: y * 2, x), "while"),
     "branch of the state": (
@@ -127,7 +132,7 @@ REFUSED = {
     "an infinite constant": (lambda x: x * jnp.inf, "inf"),
     "an error function": (jax.scipy.special.erf, "erf"),
     "a constant of another function": (
-        lambda x: x * jax.lax.lgamma(jnp.asarray(0.3)), "lgamma of constants"),
+        lambda x: x * jax.lax.lgamma(jnp.asarray(0.3)), "lgamma .*outside"),
     "complex numbers": (lambda x: jnp.real(jnp.exp(1j * x)), "complex|real"),
 }  # fmt: skip
 

@@ -38,6 +38,10 @@ _CALLS = ("pjit", "jit", "closed_call", "core_call", "remat", "checkpoint", "cus
           "custom_vjp_call", "custom_lin")  # fmt: skip
 
 
+_MOST_ROUNDS = 1000
+"""Of a loop without a stated length, which may have no end."""
+
+
 def program_of(
     function: Callable, *shapes: tuple[int, ...], way: str = MACHINE_CODE
 ) -> dict[str, Any]:
@@ -111,6 +115,8 @@ def _apply(program: ScalarProgram, equation: Any, values: list) -> list:
         return _evaluate(program, inner, [], values)
     if name == "scan":
         return _scan(program, params, values)
+    if name == "while" and (carry := _while(program, params, values)) is not None:
+        return carry
     values = [_concrete(v) for v in values]
     if name == "cond" and not _is_symbolic(values[0]):
         branches = params["branches"]
@@ -119,7 +125,7 @@ def _apply(program: ScalarProgram, equation: Any, values: list) -> list:
     is_constant = not any(map(_is_symbolic, values))
     # The run may compute another number than is computed here, unless it has no rounding.
     is_inexact = any(jnp.issubdtype(v.aval.dtype, jnp.inexact) for v in equation.outvars)
-    if is_constant and not (is_inexact and name not in _EXACT):
+    if is_constant and name != "while" and (name in _EXACT or not is_inexact):
         out = equation.primitive.bind(*map(jnp.asarray, values), **params)
         return list(out) if equation.primitive.multiple_results else [out]
     obstacle = _obstacle(equation, values)
@@ -134,8 +140,7 @@ def _apply(program: ScalarProgram, equation: Any, values: list) -> list:
         array = _arithmetic(program, equation, arrays, values)
         array = _inexact(program, array, RESULT_UNITS.get(name))
     if array is None:  # which is an error only if an output needs it: a status does not
-        hint = " of constants (compute them outside of the function)" * is_constant
-        placeholder = program.write("unknown", obstacle or name + hint)
+        placeholder = program.write("unknown", obstacle or name)
         shapes = [v.aval.shape for v in equation.outvars]
         return [_array([placeholder] * int(np.prod(shape)), shape) for shape in shapes]
     return [array]
@@ -239,7 +244,7 @@ _ELEMENTWISE: dict[str, Callable] = {
 _EXACT = {
     *_MOVES, "neg", "abs", "sign", "floor", "ceil", "round", "max", "min", "clamp", "rem", "iota",
     "convert_element_type", "reduce_max", "reduce_min", "cummax", "cummin", "sort", "real", "imag",
-    "complex", "device_put",
+    "complex", "device_put", "scatter-min", "scatter-max",
 }  # fmt: skip
 """Operations without rounding: their results for constants are the same in every program."""
 
@@ -317,6 +322,22 @@ def _products(equation: Any, arrays: list, values: list) -> np.ndarray:
         target = np.asarray(equation.primitive.bind(*operands, **equation.params)) == 2.0
         out[target] = [x * arrays[2][place] for x in out[target]]
     return out
+
+
+def _while(program: ScalarProgram, params: Any, values: list) -> list | None:
+    """A loop whose condition is one of constants, such as a count, written out; None for others."""
+    counts, rounds = (params["cond_nconsts"], params["body_nconsts"]), 0
+    condition, body = params["cond_jaxpr"], params["body_jaxpr"]
+    first, carry = values[: counts[0]], values[sum(counts) :]
+    while rounds < _MOST_ROUNDS:
+        (goes_on,) = _evaluate(program, condition.jaxpr, condition.consts, [*first, *carry])
+        if _is_symbolic(goes_on):
+            return None
+        if not goes_on:
+            return carry
+        inputs = [*values[counts[0] : sum(counts)], *carry]
+        carry, rounds = _evaluate(program, body.jaxpr, body.consts, inputs), rounds + 1
+    return None
 
 
 def _scan(program: ScalarProgram, params: Any, values: list) -> list:
