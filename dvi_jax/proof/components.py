@@ -34,8 +34,7 @@ _INDICES = {
     "dynamic_slice": range(1, 99), "dynamic_update_slice": range(2, 99),
 }  # fmt: skip
 """Operands that say where numbers go, and are not such numbers themselves."""
-_CALLS = ("pjit", "jit", "closed_call", "core_call", "remat", "checkpoint", "custom_jvp_call",
-          "custom_vjp_call", "custom_lin")  # fmt: skip
+_CALLS = ("remat", "remat2", "checkpoint", "custom_lin")  # next to names with "call" or "jit"
 
 
 _MOST_ROUNDS = 1000
@@ -197,6 +196,8 @@ def _arithmetic(
         flips = slice(None, None, -1 if params["reverse"] else 1)
         columns = np.moveaxis(arrays[0], params["axis"], 0)[flips]
         return np.moveaxis(np.cumprod(columns, axis=0)[flips], 0, params["axis"])
+    if name == "conv_general_dilated":
+        return _convolution(program, equation, *arrays)
     if name == "scatter-mul":
         return _products(equation, arrays, values)
     return None
@@ -310,6 +311,23 @@ def _linear(program: ScalarProgram, equation: Any, values: list) -> np.ndarray:
         for k in range(int(np.prod(shape)))
     ]
     return _array(sums, shape)
+
+
+def _convolution(
+    program: ScalarProgram, equation: Any, signal: np.ndarray, kernel: np.ndarray
+) -> np.ndarray:
+    """Sums of products: the number of the factor in the kernel is the output for one unit."""
+    labels = jnp.arange(1.0, kernel.size + 1).reshape(kernel.shape)
+    terms: list[list] = [
+        [program.constant(0.0)] for _ in range(math.prod(equation.outvars[0].aval.shape))
+    ]
+    for place in np.ndindex(signal.shape):
+        unit = np.zeros(signal.shape)
+        unit[place] = 1.0
+        factors = np.ravel(equation.primitive.bind(jnp.asarray(unit), labels, **equation.params))
+        for k in np.flatnonzero(factors):
+            terms[k].append(signal[place] * kernel.flat[round(factors[k]) - 1])
+    return _array([total(x) for x in terms], equation.outvars[0].aval.shape)
 
 
 def _products(equation: Any, arrays: list, values: list) -> np.ndarray:
