@@ -467,6 +467,12 @@ def test_a_singularity_in_the_domain():
         proved(angular_momentum, KEPLER, 2, epsilon=0.1, max_boxes=4)
 
 
+def test_a_power_of_a_negative_number():
+    free = dvi.System(lambda t0, t1, q, p, args: p @ p / 2)
+    with pytest.raises(dvi.ProofError, match=r"log is singular.*x\*\*-0.3 .* must be positive"):
+        proved(lambda q, p: jnp.sum((q - 1) ** -0.3) + p @ p, free, max_boxes=2)
+
+
 def test_a_wrong_invariant_confines_nothing():
     bound = proved(lambda q, p, e: q[0] * p[0])
     assert bound.level is None

@@ -245,7 +245,8 @@ _ELEMENTWISE: dict[str, Callable] = {
 _EXACT = {
     *_MOVES, "neg", "abs", "sign", "floor", "ceil", "round", "max", "min", "clamp", "rem", "iota",
     "convert_element_type", "reduce_max", "reduce_min", "cummax", "cummin", "sort", "real", "imag",
-    "complex", "device_put", "scatter-min", "scatter-max",
+    "complex", "device_put", "scatter-min", "scatter-max", "bitcast_convert_type",
+    "reduce_precision",
 }  # fmt: skip
 """Operations without rounding: their results for constants are the same in every program."""
 
