@@ -467,6 +467,12 @@ def test_a_singularity_in_the_domain():
         proved(angular_momentum, KEPLER, 2, epsilon=0.1, max_boxes=4)
 
 
+def test_a_power_of_a_negative_number():
+    free = dvi.System(lambda t0, t1, q, p, args: p @ p / 2)
+    with pytest.raises(dvi.ProofError, match=r"log is singular.*x\*\*-0.3 .* must be positive"):
+        proved(lambda q, p: jnp.sum((q - 1) ** -0.3) + p @ p, free, max_boxes=2)
+
+
 def test_a_wrong_invariant_confines_nothing():
     bound = proved(lambda q, p, e: q[0] * p[0])
     assert bound.level is None
@@ -540,6 +546,14 @@ def test_an_implicit_step_that_depends_on_the_time():
     bound = proved(energy_of_the_map, system, r=0.3, time=(1.0, 2.0), max_boxes=300)
     assert bound.certificate["implicit"]
     assert 0 < bound.per_step[0] < 0.01
+
+
+def test_an_identity_with_many_functions(cubic):
+    """41 sines; the polynomials have one variable for each."""
+    still = {"operations": [["input", 0], ["input", 1]], "outputs": [0, 1]}
+    sines = program_of(lambda x: jnp.sum(jnp.sin(jnp.arange(1.0, 42.0) * x[1])), (2,))
+    checker = exact.Checker(cubic.certificate | {"step": still, "invariants": [sines]})
+    assert checker.is_identity(0)
 
 
 def test_functions_become_the_same_numbers():

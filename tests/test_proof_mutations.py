@@ -194,6 +194,15 @@ def test_the_certificates_are_accepted_and_true(certificates):
     assert sum(c["level"] is not None for c in certificates) >= 3
 
 
+def test_the_example_of_a_level_is_at_the_start(certificates):
+    """Otherwise no state at the start need satisfy the level."""
+    c = copy.deepcopy(certificates[3])
+    assert exact.check(c)
+    c["example"][-2] = (0.5 * float.fromhex(c["start"])).hex()
+    with pytest.raises(exact.Failure, match="no start"):
+        exact.check(c | {"hash": exact.digest(c)})
+
+
 def test_the_search_for_counterexamples_finds_them(certificates):
     """The control: bounds and levels that are false by a little."""
     c = certificates[0]

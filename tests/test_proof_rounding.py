@@ -57,6 +57,17 @@ FUNCTIONS = {
         for y in POWERS
     },
     "a whole power": (lambda x: x**-7, lambda x: x**-7, POSITIVE),
+    "a computed power": (lambda x: x ** (x - 0.7), lambda x: x ** (x - mp.mpf(0.7)),
+                         ((1e-300, 1.0), (0.2, 4.0), (1.0, 100.0))),
+    "a power of a constant": (lambda x: 0.3**x, lambda x: mp.mpf(0.3) ** x, EXPONENTS),
+    "exp2": (jnp.exp2, lambda x: mp.mpf(2) ** x, EXPONENTS),
+    "cbrt": (jnp.cbrt, mp.cbrt, POSITIVE),
+    "asinh": (jnp.arcsinh, mp.asinh, NUMBERS),
+    "acosh": (jnp.arccosh, mp.acosh, ((1.0001, 2.0), (1.0, 1 + 1e-9), (2.0, 1e15))),
+    "atanh": (jnp.arctanh, mp.atanh, ((-0.999, 0.999), (1e-300, 1e-3), (-1e-3, -1e-300))),
+    "atan2": (lambda x: jnp.arctan2(x, 0.7 - x), lambda x: mp.atan2(x, mp.mpf(0.7) - x), NUMBERS),
+    "atan2 of a small number": (lambda x: jnp.arctan2(x, x * x), lambda x: mp.atan2(x, x * x),
+                                ((1e-12, 1e3), (-3.0, 3.0))),
 }  # fmt: skip
 
 ORDINARY = ((-30.0, 30.0), (1e-12, 1.0), (22.0, 29.0))
@@ -183,6 +194,28 @@ def test_without_the_model_of_xla_a_claim_is_false(name, monkeypatch):
     monkeypatch.setattr(components, "ARGUMENT_UNITS", {})
     monkeypatch.setattr(scalars, "exponentials_in_products", lambda operations: 0)
     assert largest_share(name, "XLA", 200) > 1
+
+
+LARGE_ERRORS = {  # with the range of arguments where the error is large
+    "log1p": (jnp.log1p, np.log1p, (-0.4143, -0.4141)),
+    "atanh": (jnp.arctanh, np.arctanh, (-0.4143, -0.4141)),
+    "expm1": (jnp.expm1, np.expm1, (-0.01, 0.01)),
+    "tanh": (jnp.tanh, np.tanh, (-5.0, 5.0)),
+    "logistic": (jax.nn.sigmoid, lambda x: 1 / (1 + np.exp(-x)), (-40.0, -1.0)),
+    "pow": (lambda x: jax.lax.pow(x, 0.3), lambda x: x ** np.longdouble(0.3), (0.9, 1.1)),
+}
+
+
+def test_the_errors_of_xla_are_at_most_half_of_those_of_its_model():
+    """And more than an eighth of them: where a number of the model is too small, this fails."""
+    rng = np.random.default_rng(0)
+    assert LARGE_ERRORS.keys() == ways.RESULT_UNITS.keys()
+    for name, (function, reference, ends) in LARGE_ERRORS.items():
+        x = rng.uniform(*ends, 20_000)
+        exact_values = reference(x.astype(np.longdouble))
+        errors = np.abs(computed(function, x, "XLA") - exact_values) / np.abs(exact_values)
+        units = ways.RESULT_UNITS[name]
+        assert units / 8 < float(np.max(errors)) * 2.0**53 <= units / 2, name
 
 
 def test_products_that_xla_regroups_are_in_range():

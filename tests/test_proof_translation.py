@@ -50,7 +50,7 @@ TRANSLATED = {
     "pad": lambda x: jnp.pad(x, (1, 2), constant_values=3.5) ** 2,
     "where with constants": lambda x: jnp.where(jnp.arange(3) > 1, x, 1 / x),
     "cumsum": lambda x: jnp.cumsum(x[::-1]) * jnp.cumsum(x),
-    "convolution": lambda x: jnp.stack([x[:2] @ TABLE[:2], x[1:] @ TABLE[:2]]),
+    "convolution": lambda x: jnp.convolve(x, TABLE[:2] + 1) * jnp.convolve(x[:2], x),
     "loop": loop,
     "derivative of a loop with indices": jax.grad(lambda x: jnp.sum(loop(x))),
     "scan backwards": lambda x: jax.lax.scan(
@@ -59,7 +59,9 @@ TRANSLATED = {
     "solve by hand": solve,
     "matrix": lambda x: x @ MATRIX @ x + MATRIX @ x,
     "batched product": lambda x: jnp.einsum("ij,jk,k->i", jnp.outer(x, x), MATRIX, x),
-    "custom derivative": lambda x: cube(x) + jax.grad(lambda y: jnp.sum(cube(y)))(x),
+    "custom derivative": lambda x: (
+        jax.checkpoint(cube)(x) + jax.grad(lambda y: jnp.sum(cube(y)))(x)
+    ),
     "branch of a constant": lambda x: jax.lax.cond(
         jnp.asarray(True), lambda y: y * 2, lambda y: y * 3, x
     ),
@@ -79,6 +81,21 @@ TRANSLATED = {
     "constant of float32": lambda x: x * jnp.float32(0.1),
     "constant of integers": lambda x: x * jnp.arange(3) + 7 // 2,
     "remainder of constants": lambda x: x[jnp.arange(3) % 2],
+    "computed powers": lambda x: x**x + 0.3**x + x**-0.3 + jnp.exp2(x),
+    "inverse functions": lambda x: (
+        jnp.arcsinh(-x) + jnp.arccosh(1 + x) - jnp.arctanh(x) * jnp.cbrt(x)
+    ),
+    "angles in all quadrants": lambda x: jnp.stack(
+        [jnp.arctan2(a * x[0], b * x[1]) for a in (1, -1) for b in (1, -1)]
+    ),
+    "multiply at places": lambda x: x.at[jnp.array([0, 2, 0])].multiply(x + 1).at[9].multiply(3),
+    "cumulative products": lambda x: jnp.stack(
+        [jnp.cumprod(x), jax.lax.cumprod(x, reverse=True), jax.lax.stop_gradient(x)]
+    ),
+    "loop with a count": lambda x: jax.lax.while_loop(
+        lambda c: c[0] < 3, lambda c: (c[0] + 1, c[1] * x + c[0]), (0, x)
+    )[1],
+    "constants without rounding": lambda x: x * jnp.round(jnp.sort(jnp.asarray(TABLE[:3])) % 2),
     "derivative of a changed array": jax.grad(lambda y: jnp.sum(y.at[1].add(2) ** 3)),
 }
 
@@ -108,12 +125,16 @@ REFUSED = {
     "sign": (lambda x: jnp.sign(x - 0.5), "sign"),
     "sorted": (lambda x: jnp.sort(x) * x, "sort"),
     "interpolation": (lambda x: jnp.interp(x, jnp.arange(4.0), TABLE), "select_n|int|computed"),
+    "loop without an end": (
+        lambda x: jax.lax.while_loop(lambda n: n >= 0, lambda n: n * 0, 0) * x, "int64"),
     "loop until": (
         lambda x: jax.lax.while_loop(lambda y: y[0] < 2, lambda y: y * 2, x), "while"),
     "branch of the state": (
         lambda x: jax.lax.cond(x[0] > 0.5, lambda y: y, lambda y: -y, x), "cond|convert|bool"),
     "an infinite constant": (lambda x: x * jnp.inf, "inf"),
     "an error function": (jax.scipy.special.erf, "erf"),
+    "a constant of another function": (
+        lambda x: x * jax.lax.lgamma(jnp.asarray(0.3)), "lgamma .*outside"),
     "complex numbers": (lambda x: jnp.real(jnp.exp(1j * x)), "complex|real"),
 }  # fmt: skip
 
@@ -198,7 +219,7 @@ MISTRANSLATIONS = {
     "a + b as a": ("matrix", of_rule("add", lambda a, b: a)),
     "a b as a": ("norm times a number", of_rule("mul", lambda a, b: a)),
     "a power with |n|": ("powers", of_numbers("power", lambda f: lambda x, n: f(x, abs(n)))),
-    "√x for x^y": ("powers", of_module("_real_power", lambda f: lambda x, y: x.apply("sqrt"))),
+    "√x for x^y": ("powers", of_rule("pow", lambda x, y: x.apply("sqrt"))),
     "a constant with an error of 1e-8": ("functions", of_numbers("_scalar", rounded)),
     "a product transposed": ("matrix", of_module("_dot", result(lambda out: out[:, ::-1]))),
     "a sum without its last term": ("matrix", of_module("total", lambda f: lambda x: f(x[:-1]))),

@@ -210,7 +210,11 @@ def bound_drift(
         try:
             result = search.subdivide(checker, identities, estimates, ratio=ratio, **limits)
         except exact.Failure as error:
-            raise ProofError(f"{error}.") from None
+            is_log = ": log is singular" in str(error)
+            hint = (
+                " Powers such as x**-0.3 and cbrt(x) contain log(x): x must be positive." * is_log
+            )
+            raise ProofError(f"{error}.{hint}") from None
         per_step = [exact.round_up(b) for b in result.bounds]
         certificate |= {
             "per_step": [b.hex() for b in per_step],

@@ -13,11 +13,10 @@ it, and 1 to 3 hold for all turns, for computed steps while |q_i| is at most `an
 
 For 1 and 2 boxes cover the domain. On a box a function is a polynomial with integer coefficients
 and a bound of the remainder (a Taylor model; Makino & Berz 2003); balls (Arb) enclose elementary
-functions. For 3, boxes cover all places that a step can reach outside of the domain; on each
-Σ w_k I_k exceeds c by more than `steps` steps can change it. An implicit step is a function of
-(q0, p1): each (q0, p0) of the domain has one p1 within `spread`, because p1 → p0 + h·rate maps this
-box into itself and is a contraction. If increments are multiples of `quantum`, the step has one
-more input, the error of each.
+functions. For 3, boxes cover all that a step can reach outside of the domain; on each Σ w_k I_k
+exceeds c by more than `steps` steps can change it. An implicit step is a function of (q0, p1): each
+(q0, p0) of the domain has one p1 within `spread`, as p1 → p0 + h·rate is a contraction of this box
+into itself. If increments are multiples of `quantum`, their error is one more input of the step.
 """
 
 import hashlib
@@ -196,8 +195,9 @@ class Identities:
     """Quotients (numerator, denominator) of polynomials with rational coefficients, in x and in
     each value f(a) of an elementary function, of which only the period in x_angle is used."""
 
-    def __init__(self, size, angle=None):
-        self.ring = fmpq_mpoly_ctx.get([f"x{i}" for i in range(size + 40)], "lex")
+    def __init__(self, size, programs, angle=None):  # each of these runs at most twice
+        count = size + 2 * sum(op[0] in FUNCTIONS[:-1] for f in programs for op in f["operations"])
+        self.ring = fmpq_mpoly_ctx.get([f"x{i}" for i in range(count)], "lex")
         self.unit, self.values, self.angle = self.ring.constant(1), {}, angle
         self.x, self.free = self.ring.gens()[:size], list(self.ring.gens()[size:])
 
@@ -248,6 +248,7 @@ class Checker:
         self.arithmetic, self.way = c["arithmetic"], c["way"]
         self.unit, self.limits = UNITS[self.arithmetic], WAYS[self.way]
         self.step, self.invariants, self.inside = c["step"], c["invariants"], c["inside"]
+        self.programs = [self.step, *self.invariants, self.inside]
         used = [operation[1] for operation in self.inside["operations"] if operation[0] == "input"]
         has_grid = ["input", 2 * self.n + 3] in self.step["operations"]
         fits = has_grid == (self.quantum > 0) and all(k < 2 * self.n for k in used)
@@ -258,11 +259,12 @@ class Checker:
             self.require_angle(i)
 
     def require_angle(self, i):  # a turn of q_i is one after a step, too, without other effects
-        (a, b), largest, algebra = self.ends[i], self.angles[i], Identities(2 * self.n + 2, i)
-        fits = ball(b - a) > 2 * arb.pi() and -largest <= a and b <= largest
+        algebra = Identities(2 * self.n + 2, self.programs, i)
+        (a, b), q = self.ends[i], self.angles[i]
+        fits = ball(b - a) > 2 * arb.pi() and -q <= a and b <= q
         require(fits, "the domain has less than a turn of an angle, or more than stated")
         step = self.states_of_step([(x, algebra.unit) for x in algebra.x], algebra)
-        values = [v for f in (*self.invariants, self.inside) for v in run(f, step[0], algebra)]
+        values = [v for f in self.programs[1:] for v in run(f, step[0], algebra)]
         fits = all(algebra.turns(v) == int(k == i) for x in step for k, v in enumerate(x))
         require(fits and not any(map(algebra.turns, values)), f"a turn changes more than q{i + 1}")
 
@@ -312,11 +314,10 @@ class Checker:
         return [algebra.bound(change) for change in changes[: 2 * self.n]]
 
     def is_identity(self, k):  # whether I_k is conserved exactly, for all x, t and ε
-        algebra = Identities(2 * self.n + 2)
+        algebra = Identities(2 * self.n + 2, self.programs)
         pairs = zip(algebra.x, self.ends, strict=True)
         x = [(s, algebra.unit) if a < b else algebra.constant(a) for s, (a, b) in pairs]
-        step = self.states_of_step(x, algebra)
-        numerator, denominator = self.change(k, step, algebra)
+        numerator, denominator = self.change(k, self.states_of_step(x, algebra), algebra)
         return numerator == 0 and denominator != 0
 
     def rounding(self, box):  # changes of the I_k by that of a step; errors of the coordinates
@@ -403,14 +404,13 @@ def check(certificate):  # what is proved, as text; raises `Failure` if it is no
     (weights, value), (steps,) = c["level"], whole(2**200, c["steps"], low=1)
     weights, value, start = numbers(weights, count), number(value), number(c["start"])
     rates = [abs(w) * (b + r) for w, b, r in zip(weights, per_step, rounding, strict=True)]
-    lists = [program["operations"] for program in (checker.step, *checker.invariants)]
-    is_timed = any(["input", 2 * checker.n] in operations for operations in lists)
+    is_timed = any(["input", 2 * checker.n] in f["operations"] for f in checker.programs)
     first, last = checker.times(start, steps)
     is_long = is_timed and (first < checker.time[0] or last > checker.time[1])
     require(not is_long, "the steps last longer than the time", [checker.time])
     checker.bits = LEVEL
     algebra, least = combination_model(checker, weights, example)
-    require(algebra.range(least)[1] <= value, "the example is above the level")
+    require(example[-2][0] == start and algebra.range(least)[1] <= value, "the example is no start")
     triples = [*zip(checker.angles, reach, checker.ends, strict=False)]
     fits = all(not q or q >= max(-a, b) + steps * m for q, m, (a, b) in triples)
     require(fits, "an angle may be larger than stated")

@@ -26,16 +26,19 @@ from .ways import ARGUMENT_UNITS, MACHINE_CODE, RESULT_UNITS, XLA
 _MOVES = (
     "reshape", "broadcast_in_dim", "squeeze", "transpose", "slice", "rev", "concatenate", "gather",
     "dynamic_slice", "pad", "select_n", "dynamic_update_slice", "scatter", "split",
-    "stack", "unstack", "copy", "copy_p", "optimization_barrier",
+    "stack", "unstack", "copy", "copy_p", "optimization_barrier", "stop_gradient",
 )  # fmt: skip
 _SUMS = ("scatter-add", "cumsum", "reduce_window_sum")
 _INDICES = {
-    "gather": (1,), "scatter": (1,), "scatter-add": (1,), "select_n": (0,),
+    "gather": (1,), "scatter": (1,), "scatter-add": (1,), "scatter-mul": (1,), "select_n": (0,),
     "dynamic_slice": range(1, 99), "dynamic_update_slice": range(2, 99),
 }  # fmt: skip
 """Operands that say where numbers go, and are not such numbers themselves."""
-_CALLS = ("pjit", "jit", "closed_call", "core_call", "remat", "checkpoint", "custom_jvp_call",
-          "custom_vjp_call", "custom_lin")  # fmt: skip
+_CALLS = ("remat", "remat2", "checkpoint", "custom_lin")  # next to names with "call" or "jit"
+
+
+_MOST_ROUNDS = 1000
+"""Of a loop without a stated length, which may have no end."""
 
 
 def program_of(
@@ -111,15 +114,17 @@ def _apply(program: ScalarProgram, equation: Any, values: list) -> list:
         return _evaluate(program, inner, [], values)
     if name == "scan":
         return _scan(program, params, values)
+    if name == "while" and (carry := _while(program, params, values)) is not None:
+        return carry
     values = [_concrete(v) for v in values]
     if name == "cond" and not _is_symbolic(values[0]):
         branches = params["branches"]
         branch = branches[min(max(int(values[0]), 0), len(branches) - 1)]
         return _evaluate(program, branch.jaxpr, branch.consts, values[1:])
-    rounds = name in _ROUNDING_OPERATIONS and any(
-        jnp.issubdtype(v.aval.dtype, jnp.inexact) for v in equation.outvars
-    )
-    if not (rounds or any(map(_is_symbolic, values))):
+    is_constant = not any(map(_is_symbolic, values))
+    # The run may compute another number than is computed here, unless it has no rounding.
+    is_inexact = any(jnp.issubdtype(v.aval.dtype, jnp.inexact) for v in equation.outvars)
+    if is_constant and name != "while" and (name in _EXACT or not is_inexact):
         out = equation.primitive.bind(*map(jnp.asarray, values), **params)
         return list(out) if equation.primitive.multiple_results else [out]
     obstacle = _obstacle(equation, values)
@@ -178,10 +183,6 @@ def _arithmetic(
         return _array([x.apply(name) for x in arrays[0].ravel()], shape)
     if name == "integer_pow":
         return _array([x.power(int(params["y"])) for x in arrays[0].ravel()], shape)
-    if name == "pow" and not _is_symbolic(values[1]):
-        exponent = np.broadcast_to(np.asarray(values[1]), shape).ravel()
-        pairs = zip(np.broadcast_to(arrays[0], shape).ravel(), exponent, strict=True)
-        return _array([_real_power(x, float(y)) for x, y in pairs], shape)
     if name in ("reduce_sum", "reduce_prod"):
         columns = np.moveaxis(arrays[0], params["axes"], range(len(params["axes"])))
         flat = columns.reshape(-1, int(np.prod(shape)))
@@ -191,15 +192,29 @@ def _arithmetic(
         return _dot(params["dimension_numbers"], *arrays).reshape(shape)
     if name in _SUMS:
         return _linear(program, equation, values)
+    if name == "cumprod":
+        flips = slice(None, None, -1 if params["reverse"] else 1)
+        columns = np.moveaxis(arrays[0], params["axis"], 0)[flips]
+        return np.moveaxis(np.cumprod(columns, axis=0)[flips], 0, params["axis"])
+    if name == "conv_general_dilated":
+        return _convolution(program, equation, *arrays)
+    if name == "scatter-mul":
+        return _products(equation, arrays, values)
     return None
 
 
-def _real_power(x: ProgramNumber, y: float) -> ProgramNumber:
-    if y.is_integer():
-        return x.power(int(y))
-    if (2 * y).is_integer():
-        return x.apply("sqrt").power(int(2 * y))
-    return (x.apply("log") * y).apply("exp")
+def _power(x: ProgramNumber, y: ProgramNumber) -> ProgramNumber:
+    """x^y: of a computed exponent, or one that is not half of an integer, for x > 0 only."""
+    if y.value is None or not (2 * y.value).is_integer():
+        return (x.apply("log") * y).apply("exp")
+    return (
+        x.power(int(y.value)) if y.value.is_integer() else x.apply("sqrt").power(int(2 * y.value))
+    )
+
+
+def _atan2(y: ProgramNumber, x: ProgramNumber) -> ProgramNumber:
+    """The angle of (x, y), without a value where it jumps: at y = 0, x < 0."""
+    return 2.0 * (y / ((x * x + y * y).apply("sqrt") + x)).apply("atan")
 
 
 _ELEMENTWISE: dict[str, Callable] = {
@@ -217,14 +232,23 @@ _ELEMENTWISE: dict[str, Callable] = {
     "tanh": lambda a: 1.0 - 2.0 / ((a * 2.0).apply("exp") + 1.0),
     "sinh": lambda a: (a.apply("exp") - (-a).apply("exp")) * 0.5,
     "cosh": lambda a: (a.apply("exp") + (-a).apply("exp")) * 0.5,
+    "asinh": lambda a: (a + (a.power(2) + 1.0).apply("sqrt")).apply("log"),
+    "acosh": lambda a: (a + (a.power(2) - 1.0).apply("sqrt")).apply("log"),
+    "atanh": lambda a: ((1.0 + a).apply("log") - (1.0 - a).apply("log")) * 0.5,
+    "exp2": lambda a: (a * a.program.constant(2.0).apply("log")).apply("exp"),
+    "cbrt": lambda a: (a.apply("log") / 3.0).apply("exp"),
+    "pow": _power,
+    "atan2": _atan2,
 }
 
 
-_ROUNDING_OPERATIONS = {
-    *_ELEMENTWISE, *UNARY, "pow", "integer_pow", "reduce_sum", "reduce_prod", "dot_general",
-    "cumsum",
-} - {"neg"}  # fmt: skip
-"""Operations whose results float64 rounds."""
+_EXACT = {
+    *_MOVES, "neg", "abs", "sign", "floor", "ceil", "round", "max", "min", "clamp", "rem", "iota",
+    "convert_element_type", "reduce_max", "reduce_min", "cummax", "cummin", "sort", "real", "imag",
+    "complex", "device_put", "scatter-min", "scatter-max", "bitcast_convert_type",
+    "reduce_precision",
+}  # fmt: skip
+"""Operations without rounding: their results for constants are the same in every program."""
 
 
 def _dot(dimensions: Any, a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -288,6 +312,51 @@ def _linear(program: ScalarProgram, equation: Any, values: list) -> np.ndarray:
         for k in range(int(np.prod(shape)))
     ]
     return _array(sums, shape)
+
+
+def _convolution(
+    program: ScalarProgram, equation: Any, signal: np.ndarray, kernel: np.ndarray
+) -> np.ndarray:
+    """Sums of products: the number of the factor in the kernel is the output for one unit."""
+    labels = jnp.arange(1.0, kernel.size + 1).reshape(kernel.shape)
+    terms: list[list] = [
+        [program.constant(0.0)] for _ in range(math.prod(equation.outvars[0].aval.shape))
+    ]
+    for place in np.ndindex(signal.shape):
+        unit = np.zeros(signal.shape)
+        unit[place] = 1.0
+        factors = np.ravel(equation.primitive.bind(jnp.asarray(unit), labels, **equation.params))
+        for k in np.flatnonzero(factors):
+            terms[k].append(signal[place] * kernel.flat[round(factors[k]) - 1])
+    return _array([total(x) for x in terms], equation.outvars[0].aval.shape)
+
+
+def _products(equation: Any, arrays: list, values: list) -> np.ndarray:
+    """Each number of an array times those that a scatter moves to its place."""
+    out, ones = arrays[0].copy(), [np.ones(np.shape(v)) for v in values]
+    for place in np.ndindex(arrays[2].shape):
+        factors = ones[2].copy()
+        factors[place] = 2.0
+        operands = map(jnp.asarray, (ones[0], values[1], factors))
+        target = np.asarray(equation.primitive.bind(*operands, **equation.params)) == 2.0
+        out[target] = [x * arrays[2][place] for x in out[target]]
+    return out
+
+
+def _while(program: ScalarProgram, params: Any, values: list) -> list | None:
+    """A loop whose condition is one of constants, such as a count, written out; None for others."""
+    counts, rounds = (params["cond_nconsts"], params["body_nconsts"]), 0
+    condition, body = params["cond_jaxpr"], params["body_jaxpr"]
+    first, carry = values[: counts[0]], values[sum(counts) :]
+    while rounds < _MOST_ROUNDS:
+        (goes_on,) = _evaluate(program, condition.jaxpr, condition.consts, [*first, *carry])
+        if _is_symbolic(goes_on):
+            return None
+        if not goes_on:
+            return carry
+        inputs = [*values[counts[0] : sum(counts)], *carry]
+        carry, rounds = _evaluate(program, body.jaxpr, body.consts, inputs), rounds + 1
+    return None
 
 
 def _scan(program: ScalarProgram, params: Any, values: list) -> list:

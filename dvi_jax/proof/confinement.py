@@ -39,7 +39,9 @@ def confine(
     rotations = [int((q - max(-a, b)) / m) for q, m, (a, b) in turns if q and m]
     certificate["start"] = start.hex()
     reason = "no combination of the invariants is larger all around the domain than inside"
-    for weights, minimum, border, state in _candidates(checker, functions, inside, shape, reach):
+    for weights, minimum, border, state in _candidates(
+        checker, functions, inside, shape, reach, start
+    ):
         w = [Fraction(x) for x in weights]
         rate = sum(abs(x) * (b + r) for x, b, r in zip(w, per_step, rounding, strict=True))
         steps = math.floor(Fraction(change) / rate) if rate else 2**62
@@ -92,17 +94,19 @@ def _value(functions: list, weights: list[float], shape: Any, h: float) -> Any:
     )
 
 
-def _candidates(checker: Any, functions: list, inside: Any, shape: Any, reach: list) -> list[tuple]:
-    """(weights, least value in the domain, least value around it, the state (q, p, t, ε) of the
-    former) of Σ w_k I_k where the latter is larger, those first that leave most of the domain; from
-    random points."""
+def _candidates(
+    checker: Any, functions: list, inside: Any, shape: Any, reach: list, start: float
+) -> list[tuple]:
+    """(weights, least value in the domain at the start, least value around it, the state
+    (q, p, t, ε) of the former) of Σ w_k I_k where the latter is larger, those first that leave most
+    of the domain; from random points."""
     inner, outer = _points(checker, inside, shape, [float(x) for x in reach])
     middle = (np.array(checker.lower, float) + np.array(checker.upper, float))[None] / 2
+    starts = [(start, float(e)) for e in checker.epsilon]
     pairs = [(float(t), float(e)) for t in checker.time for e in checker.epsilon]
-
     h = float(checker.h)
 
-    def values(z):
+    def values(z, pairs):
         evaluate = jax.jit(
             jax.vmap(
                 lambda z, t, e: jnp.stack([f(*_state(z, shape), t, e, h) for f, _ in functions]),
@@ -112,7 +116,8 @@ def _candidates(checker: Any, functions: list, inside: Any, shape: Any, reach: l
         rows = np.concatenate([np.asarray(evaluate(z, t, e)) for t, e in pairs])
         return np.where(np.isfinite(rows), rows, 0.0)  # candidates only: the checker decides
 
-    inner_values, outer_values, center = values(inner), values(outer), values(middle)[0]
+    inner_values, outer_values = values(inner, starts), values(outer, pairs)
+    center = values(middle, starts)[0]
     weights = [sign * unit for unit in np.eye(len(functions)) for sign in (1, -1)]
     if len(functions) > 1:
         weights[:0] = _best_combination(inner_values - center, outer_values - center)
@@ -122,7 +127,7 @@ def _candidates(checker: Any, functions: list, inside: Any, shape: Any, reach: l
         if border > minimum:
             share = float(np.mean(inner_values @ w < border))
             lap, place = divmod(int(np.argmin(inner_values @ w)), len(inner))
-            state = [*inner[place].tolist(), *pairs[lap]]
+            state = [*inner[place].tolist(), *starts[lap]]
             candidates.append((share, (w.tolist(), minimum, border, state)))
     return [item for _, item in sorted(candidates, key=lambda pair: -pair[0])]
 

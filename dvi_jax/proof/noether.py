@@ -154,7 +154,7 @@ def prove_noether(
             f"Noether's identity is singular at most of the {POINTS} random points near q0, so "
             "that its list of operations cannot be compared with it. Give another q0."
         )
-    algebra = exact.Identities(2 * int(np.prod(shape)) + 4)
+    algebra = exact.Identities(2 * int(np.prod(shape)) + 4, [program])
     values = exact.run(program, [(x, algebra.unit) for x in algebra.x], algebra)
     zero = [bool(numerator == 0 and denominator != 0) for numerator, denominator in values]
     return NoetherProof(tuple(zero[: z + 1]), zero[z + 1], all(zero[z + 3 :]), zero[z + 2])

@@ -56,8 +56,9 @@ class ScalarProgram:
         if primitives:
             names = ", ".join(sorted(primitives)).replace("select_n", "select_n (jnp.where)")
             raise NotAnalytic(
-                f"a proof does not allow: {names} of JAX, only + − × /, constant powers, sinh, "
-                f"cosh, tanh, {', '.join(UNARY)}."
+                f"a proof does not allow: {names} of JAX, only + − × /, powers, exp2, cbrt, atan2, "
+                f"hyperbolic functions and {', '.join(UNARY)}. Compute constants by other "
+                "functions before, outside of this one."
             )
         numbers, operations = {}, []
         exponentials = exponentials_in_products(self.operations) if self.way == XLA else 0
