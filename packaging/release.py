@@ -1,8 +1,8 @@
 """Version and address of a release, in all files that repeat them.
 
-    python packaging/release.py                         check that all files have one version
-    python packaging/release.py --tag v1.0.0            … and that a tag is that of this version
-    python packaging/release.py --write                 write the version, and the address if there is one
+    python packaging/release.py                   check that all files have one version
+    python packaging/release.py --tag v1.0.0      … and that a tag is that of this version
+    python packaging/release.py --write           write the version, and the address if there is one
     python packaging/release.py --write --repository https://HOST/OWNER/NAME
 
 The version is `__version__` of `dvi_jax/__init__.py`. The address is the setting `repository` of

@@ -1,4 +1,4 @@
-"""Files of a release: one version, requirements that agree, links that lead to files of the project."""
+"""Files of a release: one version, requirements that agree, links to files that exist."""
 
 import importlib.util
 import json
@@ -80,7 +80,7 @@ def test_the_address_is_one_setting_that_all_links_are_made_of(copy):
     assert json.loads(after["codemeta.json"])["codeRepository"] == base
     assert f'repository-code: "{base}"\n' in after["CITATION.cff"]
     assert f"  repository: {base}\n" in after["packaging/conda/recipe.yaml"]
-    # A second address replaces the first one, except in the README, which has no relative link then.
+    # A second address replaces the first one, but in the README: no link is relative any more.
     assert run(copy, "--write", "--repository", base + "2.git").returncode == 0
     project = tomllib.loads((copy / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert set(project["urls"].values()) == {
