@@ -148,3 +148,17 @@ def test_the_article_cites_what_its_bibliography_has():
     for path in re.findall(r"\]\(([^)]+)\)", body):
         assert (ROOT / path).exists(), path
     assert 600 < len(body.split()) < 1000  # two pages with the figure
+
+
+@pytest.mark.slow
+def test_each_page_of_the_reference_says_how_stable_its_names_are(monkeypatch, tmp_path):
+    pytest.importorskip("sphinx")
+    monkeypatch.syspath_prepend(str(ROOT / "docs" / "_ext"))
+    reference = importlib.import_module("reference")
+    reference.write(tmp_path)
+    for page in reference.TITLES:
+        text = (tmp_path / f"{page}.md").read_text(encoding="utf-8")
+        assert ("are **provisional**" in text) == (page in reference.PROVISIONAL)
+        assert ("are stable" in text) == (page not in reference.PROVISIONAL)
+    assert set(reference.PROVISIONAL) < set(reference.TITLES)
+    assert "(stability)=" in (tmp_path / "index.md").read_text(encoding="utf-8")
