@@ -329,8 +329,8 @@ PROVISIONAL_NOTE = (
 STABILITY = """(stability)=
 ## Stability
 
-Versions are numbered MAJOR.MINOR.PATCH. Each page of the reference says whether its names are stable
-or provisional.
+Versions are numbered MAJOR.MINOR.PATCH. Each page of the reference says whether its names are
+stable or provisional.
 
 - *Stable* names, their keywords and their statuses keep their meaning until the next major release.
   A name that is to be removed works for at least two minor releases and one year after the release
