@@ -8,8 +8,9 @@ VENV ?= .venv
 OUT ?= paper-out
 JOBS ?= 2
 PART ?= 1
-EXTRAS = test,ephemeris
-LOWEST = tests/test_readme.py
+# Runs, files, gradients, implicit methods, command line, and each extra.
+LOWEST = $(addprefix tests/test_,run.py integrate.py collocation.py solution_data.py cli.py fit_bayes.py \
+  proof.py rings_files.py sweep_store.py sweep_cluster.py) $(wildcard tests/test_interop_*.py)
 BIN = $(VENV)/bin
 READY = $(VENV)/ready
 SCHEMA = $(BIN)/check-jsonschema --quiet --builtin-schema vendor
@@ -39,6 +40,7 @@ dist: $(READY)
 	rm -rf dist
 	$(BIN)/uv build -q --no-build-isolation --python $(BIN)/python --out-dir dist
 	$(BIN)/twine check --strict dist/*.whl dist/*.tar.gz
+	test $$(tar tzf dist/*.tar.gz | grep -c -E '/(Makefile|requirements.lock.txt)$$') = 2
 	$(BIN)/uv venv -q --python $(BIN)/python dist/venv
 	$(BIN)/uv pip install -q --python dist/venv/bin/python --constraint requirements.lock.txt dist/*.whl
 	sed -n '/^```python$$/,/^```$$/{/^```/!p}' README.md > dist/readme.py
@@ -49,7 +51,7 @@ lowest: $(READY)
 	rm -rf build/lowest
 	$(BIN)/uv venv -q --python $(BIN)/python build/lowest
 	$(BIN)/uv pip install -q --python build/lowest/bin/python --resolution lowest-direct \
-	  -e ".[$(EXTRAS)]"
+	  -e ".[test,ephemeris]"
 	build/lowest/bin/python -m pytest -q -n $(JOBS) --dist loadfile $(LOWEST)
 
 ## make test        every part of the package at least once, in about ten minutes
