@@ -161,4 +161,4 @@ def test_each_page_of_the_reference_says_how_stable_its_names_are(monkeypatch, t
         assert ("are **provisional**" in text) == (page in reference.PROVISIONAL)
         assert ("are stable" in text) == (page not in reference.PROVISIONAL)
     assert set(reference.PROVISIONAL) < set(reference.TITLES)
-    assert "(stability)=" in (tmp_path / "index.md").read_text(encoding="utf-8")
+    assert "## Stability" in (tmp_path / "index.md").read_text(encoding="utf-8")

@@ -326,8 +326,7 @@ PROVISIONAL_NOTE = (
     "([stability](index.md#stability))."
 )
 
-STABILITY = """(stability)=
-## Stability
+STABILITY = """## Stability
 
 Versions are numbered MAJOR.MINOR.PATCH. Each page of the reference says whether its names are
 stable or provisional.
