@@ -8,12 +8,16 @@ VENV ?= .venv
 OUT ?= paper-out
 JOBS ?= 2
 PART ?= 1
+# Runs, files, gradients, implicit methods, command line, and each extra.
+LOWEST = $(addprefix tests/test_,run.py integrate.py collocation.py solution_data.py cli.py fit_bayes.py \
+  proof.py rings_files.py sweep_store.py sweep_cluster.py) $(wildcard tests/test_interop_*.py)
 BIN = $(VENV)/bin
 READY = $(VENV)/ready
+SCHEMA = $(BIN)/check-jsonschema --quiet --builtin-schema vendor
 
 export JAX_PLATFORMS ?= cpu
 
-.PHONY: help paper notebooks docs dist test test-all test-part test-fast lint types format lock clean
+.PHONY: help paper notebooks docs dist lowest test test-all test-part test-fast lint types format lock clean
 
 help:
 	@sed -n 's/^## //p' $(MAKEFILE_LIST)
@@ -35,10 +39,20 @@ docs: $(READY)
 dist: $(READY)
 	rm -rf dist
 	$(BIN)/uv build -q --no-build-isolation --python $(BIN)/python --out-dir dist
+	$(BIN)/twine check --strict dist/*.whl dist/*.tar.gz
+	test $$(tar tzf dist/*.tar.gz | grep -c -E '/(Makefile|requirements.lock.txt)$$') = 2
 	$(BIN)/uv venv -q --python $(BIN)/python dist/venv
 	$(BIN)/uv pip install -q --python dist/venv/bin/python --constraint requirements.lock.txt dist/*.whl
 	sed -n '/^```python$$/,/^```$$/{/^```/!p}' README.md > dist/readme.py
 	cd dist && MPLBACKEND=Agg venv/bin/python -P readme.py
+
+## make lowest      quick tests with the lowest versions that pyproject.toml allows (Python 3.11)
+lowest: $(READY)
+	rm -rf build/lowest
+	$(BIN)/uv venv -q --python $(BIN)/python build/lowest
+	$(BIN)/uv pip install -q --python build/lowest/bin/python --resolution lowest-direct \
+	  -e ".[test,ephemeris]"
+	build/lowest/bin/python -m pytest -q -n $(JOBS) --dist loadfile $(LOWEST)
 
 ## make test        every part of the package at least once, in about ten minutes
 test: $(READY)
@@ -54,10 +68,20 @@ test-part: $(READY)
 
 test-fast: test
 
-## make lint        style and formatting
+## make lint        style, formatting, and the files that other services read
 lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/python packaging/release.py
+	$(BIN)/validate-pyproject pyproject.toml
+	$(SCHEMA).github-workflows .github/workflows/*.yml
+	$(SCHEMA).github-issue-forms $(filter-out %/config.yml,$(wildcard .github/ISSUE_TEMPLATE/*.yml))
+	$(SCHEMA).github-issue-config .github/ISSUE_TEMPLATE/config.yml
+	$(SCHEMA).dependabot .github/dependabot.yml
+	$(SCHEMA).readthedocs .readthedocs.yaml
+	$(SCHEMA).citation-file-format CITATION.cff
+	$(BIN)/zizmor --quiet --offline --min-severity medium .github
+	! command -v actionlint >/dev/null || actionlint
 
 ## make types       static types
 types: $(READY)

@@ -124,4 +124,4 @@ else:
     sys.modules[__name__].__class__ = _Package
     sys.meta_path.insert(0, _Folders())
 
-__version__ = "0.1.0"
+__version__ = "1.0.0rc1"

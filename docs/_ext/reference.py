@@ -317,6 +317,35 @@ def _table(listed: Iterable[tuple[str, Any]]) -> list[str]:
     return ["| name | summary |", "| --- | --- |", *rows, ""]
 
 
+PROVISIONAL = ("noise", "proof", "boozer", "rings", GENERATOR)
+"""Pages whose names may change in a minor release."""
+
+STABLE_NOTE = "The names on this page are stable ([stability](index.md#stability))."
+PROVISIONAL_NOTE = (
+    "The names on this page are **provisional**: they may change in a minor release "
+    "([stability](index.md#stability))."
+)
+
+STABILITY = """## Stability
+
+Versions are numbered MAJOR.MINOR.PATCH. Each page of the reference says whether its names are
+stable or provisional.
+
+- *Stable* names, their keywords and their statuses keep their meaning until the next major release.
+  A name that is to be removed works for at least two minor releases and one year after the release
+  that deprecates it. Until then its use gives a `DeprecationWarning`, which names the replacement.
+- *Provisional* names may change in a minor release. The changelog says how to change a program.
+- A correction may change numbers in any release, and the changelog reports it. The bits of a result
+  are the same only for the same versions of this package, JAX and llvmlite on the same processor.
+- Files that a release writes (solutions, discoveries, certificates, fits) can be read by all later
+  releases with the same major number. A store of a sweep can be continued only by the release that
+  began it.
+- Everything else may change at any time: names that begin with an underscore, modules that are not
+  in the reference, and the words of messages and of printed reports. TOML files and the options of
+  `dvi-jax` are stable.
+"""
+"""Section of the index of the reference; CONTRIBUTING.md has the rules for developers."""
+
 AFTER = "The examples run after [these lines](index.md#examples)."
 """Above the table of each page."""
 
@@ -329,7 +358,8 @@ def write(folder: Path) -> None:
     for page, title in TITLES.items():
         if not found[page]:
             continue
-        parts = [f"# {title}", "", AFTER, "", usage.page().markdown(page), ""]
+        note = PROVISIONAL_NOTE if page in PROVISIONAL else STABLE_NOTE
+        parts = [f"# {title}", "", f"{note} {AFTER}", "", usage.page().markdown(page), ""]
         parts += _table(found[page].values())
         parts += [_entry(full, *rest) for full, rest in found[page].items()]
         pages[page] = "\n".join(parts)
@@ -344,6 +374,7 @@ def write(folder: Path) -> None:
         "",
         f"```python\n{usage.page().imports}```",
         "",
+        STABILITY,
     ]
     index += ["```{toctree}", ":hidden:", "", *pages, "```", ""]
     for page in pages:
