@@ -162,6 +162,42 @@ def test_gradients_of_observed_runs(adjoint):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("adjoint", [dvi.Checkpointed(), dvi.Direct()])
+@pytest.mark.parametrize("coordinates", ["jacobi", "democratic"])
+def test_gradients_of_runs_that_stop(coordinates, adjoint):
+    """Stop time and state, the states before, by a shared mass and by the start; in a batch of
+    which one does not stop and one fails in its first step."""
+    speeds = jnp.array([1.0, 1.05, 0.4, jnp.nan])
+    end = dvi.Stop(lambda t, q, p, args: q[1, 1] - 0.5)
+
+    def run(mass, speed):
+        args = {**TWO.args, "masses": jnp.stack([1.0 + 0 * mass, mass])}
+        p0 = jnp.array([[0.0, -1.0], [0.0, 1.0]]) * speed * MASS
+        return dvi.integrate(
+            TWO.system, TWO.q0, p0, args=args, h=0.11, num_steps=6, adjoint=adjoint, stop=end,
+            method=dvi.WisdomHolman(coordinates), save=dvi.Save(every=2), throw=False,
+        )  # fmt: skip
+
+    batch = jax.jit(jax.vmap(run, (None, 0)))
+    assert batch(MASS, speeds).stop.t[:2].max() < 0.6
+    assert np.isnan(batch(MASS, speeds).stop.t[2:]).all()
+
+    def loss(mass, speeds):
+        sol = jax.vmap(run, (None, 0))(mass, speeds)
+        values = [sol.stop.t, sol.stop.q, 300 * sol.stop.p, sol.qs]
+        return sum(jnp.sum(jnp.where(jnp.isfinite(x), x, 0.0)) for x in values)
+
+    f = jax.jit(loss)
+    of_mass, of_speeds = jax.jit(jax.grad(loss, (0, 1)))(MASS, speeds)
+    difference = (f(1.001 * MASS, speeds) - f(0.999 * MASS, speeds)) / (0.002 * MASS)
+    np.testing.assert_allclose(of_mass, difference, rtol=1e-5)
+    for i in range(3):
+        d = jnp.zeros(4).at[i].set(1e-5)
+        difference = (f(MASS, speeds + d) - f(MASS, speeds - d)) / 2e-5
+        np.testing.assert_allclose(of_speeds[i], difference, rtol=1e-6)
+
+
+@pytest.mark.slow
 def test_masses_that_change_with_time():
     """The coordinates of one step are then not those of the next."""
 
