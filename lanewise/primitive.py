@@ -245,7 +245,7 @@ def _derivative(primals, changes: dict[int, Any], **params):
         return function(*(values.get(i, x) for i, x in enumerate(primals)))
 
     def is_real(x: Any) -> bool:
-        return jnp.issubdtype(x.dtype, jnp.inexact)
+        return jnp.issubdtype(jnp.result_type(x), jnp.inexact)  # a constant may be a number
 
     # Outside of `jax.shard_map` JAX's own rules do everything.
     if not manual_axes(*primals, *vectors):

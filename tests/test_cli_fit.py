@@ -202,6 +202,27 @@ def test_columns_observables_and_errors(folder, data):
     np.testing.assert_array_equal(setup(folder, of_npz)[0]["data"].values, xs[:, None])
 
 
+@pytest.mark.parametrize(
+    ("columns", "key", "period"),
+    [
+        ("x", "360", [360.0]),
+        ("x", "[360]", [360.0]),
+        ("x,y", "6.5", [6.5, 6.5]),
+        ("x,y", "[6.5, inf]", [6.5, np.inf]),
+        ("x", None, None),
+    ],
+)
+def test_periods(folder, columns, key, period):
+    """Of one column or of all, in the shape of one value."""
+    count = len(columns.split(","))
+    write(folder, f"t,{columns}\n0.3{',1' * count}\n0.6{',2' * count}\n", "seen.csv")
+    text = SMALL.replace("q0 = [1.0]", f"q0 = {[1.0] * count}")
+    text = text.replace("p0 = [0.0]", f"p0 = {[0.0] * count}")
+    arguments, _ = setup(folder, text.replace(SIGMA, f"{SIGMA}\nperiod = {key}" if key else SIGMA))
+    result = arguments["data"].period
+    assert (result is None) if period is None else result.tolist() == period
+
+
 def test_bounds_priors_and_options(folder):
     text = SMALL.replace("curvature = false", 'loss = "Cauchy"\nsegments = 3\nhorizons = "none"')
     text += "[bounds]\nepsilon = [-0.1, inf]\n[bounds.args]\nk = [0.5, 2]\n"
@@ -254,6 +275,10 @@ REJECTED = [
     ("seen.csv", "sen.csv", "data.file: there is no file", "a CSV or npz file"),
     (SIGMA, "sigma = [0.01, 0.02]", "data.sigma: it has 2 columns", "one column for all"),
     (SIGMA, 'sigma = "s"', "data.sigma: the file has no column 's'", "a column of the file"),
+    (SIGMA, "period = 0", "data.period: the value is 0", "a positive number"),
+    (SIGMA, "period = [nan]", "data.period", "a positive number"),
+    (SIGMA, "period = []", "data.period: the value is []", "a positive number"),
+    (SIGMA, "period = [1, inf]", "data.period: it has 2 numbers", "one number, or 1"),
     (SIGMA, 'observe = "position"', "data.observe", "did you mean positions?"),
     (SIGMA, 'observe = "own.py:too_few"', "data: observe must be", "values that fit observe"),
     (CURVATURE, "tolerance = 2", "options.tolerance: the value is 2", "between 0 and 1"),

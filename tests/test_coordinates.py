@@ -162,6 +162,32 @@ def test_gradients_of_observed_runs(adjoint):
 
 
 @pytest.mark.slow
+def test_derivatives_of_runs_that_stop():
+    """Stop time and state by a shared mass, in forward mode; one of the batch does not stop, and
+    one fails in its first step."""
+    speeds = jnp.array([1.0, 1.05, 0.4, jnp.nan])
+    end = dvi.Stop(lambda t, q, p, args: q[1, 1] - 0.5)
+
+    def run(mass, speed):
+        args = {**TWO.args, "masses": jnp.stack([1.0 + 0 * mass, mass])}
+        p0 = jnp.array([[0.0, -1.0], [0.0, 1.0]]) * speed * MASS
+        return dvi.integrate(
+            TWO.system, TWO.q0, p0, args=args, h=0.11, num_steps=6, stop=end, throw=False,
+            method=dvi.WisdomHolman(), save=dvi.Save(final=True), adjoint=dvi.Direct(),
+        ).stop  # fmt: skip
+
+    batch = jax.jit(lambda mass: jax.vmap(run, (None, 0))(mass, speeds))
+    assert batch(MASS).t[:2].max() < 0.6
+    assert np.isnan(batch(MASS).t[2:]).all()
+    _, slopes = jax.jit(lambda mass: jax.jvp(batch, (mass,), (1.0,)))(MASS)
+    ends = batch(1.001 * MASS), batch(0.999 * MASS)
+    for slope, a, b in zip(slopes, *ends, strict=True):
+        np.testing.assert_allclose(
+            slope[:2], (a[:2] - b[:2]) / (0.002 * MASS), rtol=1e-5, atol=1e-5
+        )
+
+
+@pytest.mark.slow
 def test_masses_that_change_with_time():
     """The coordinates of one step are then not those of the next."""
 

@@ -149,3 +149,76 @@ def test_an_event_that_is_nan(h):
     np.testing.assert_allclose(sol.observed.ts[0], 0.34 * np.sign(h))
     with pytest.raises(dvi.IntegrationError, match="The function g of"):
         dvi.integrate(free, [0.0], [1.0], h=h, num_steps=10, observe=dvi.Section(g, 0))
+
+
+def slow(value):
+    return pytest.param(value, marks=pytest.mark.slow)
+
+
+def name_of(value):
+    return type(value).__name__
+
+
+# What a run computes after its loop, between the steps and at the start.
+BETWEEN = {
+    "times": {"save": dvi.Save(ts=[0.3, 0.55]), "observe": lambda t, q, p, k: k * q[0] ** 2},
+    "clock": {"save": dvi.Save(ts=[0.3, 0.55], clock=lambda t, q, p, k: k * t)},
+    "section": {"observe": dvi.Section(lambda t, q, p, k: t + k - 1.32)},
+    "stop": {"stop": dvi.Stop(lambda t, q, p, k: t + k - 1.32)},
+    "start": {"observe": lambda t, q, p, k: k * q[0] ** 2},
+}
+# The second of three trajectories has no step: (q0, h) and the power of q in H_D.
+WITHOUT_STEPS = {
+    "q0 is NaN": (np.nan, 0.05),
+    "h is NaN": (0.2, np.nan),
+    "∇H_D is NaN": (-0.2, 0.05),
+}
+
+
+@pytest.mark.parametrize("fails", ["q0 is NaN", *map(slow, [*WITHOUT_STEPS][1:])])
+@pytest.mark.parametrize("name", ["times", *map(slow, [*BETWEEN][1:])])
+@pytest.mark.parametrize("adjoint", [ADJOINTS[1], slow(ADJOINTS[0])], ids=name_of)
+def test_a_trajectory_without_a_step_and_shared_gradients(adjoint, name, fails):
+    """Its derivatives are not those of the others, which have points between the steps."""
+    q, h = (jnp.array([a, b, a]) for a, b in zip((1.0, 0.05), WITHOUT_STEPS[fails], strict=True))
+
+    def run(k, q, h):
+        options = {"h": h, "num_steps": 12, "args": k, "throw": False, "adjoint": adjoint}
+        return dvi.integrate(HALF, q[None], 0 * q[None], **options, **BETWEEN[name])
+
+    def loss(k):
+        sol = jax.vmap(run, (None, 0, 0))(k, q, h)
+        values = [sol.qs, sol.observed, sol.stop.t if sol.stop else 0.0]
+        leaves = [x for x in map(jnp.asarray, jax.tree.leaves(values)) if x.dtype.kind == "f"]
+        return sum(jnp.sum(jnp.where(jnp.isfinite(x), x, 0.0)) for x in leaves)
+
+    function = jax.jit(loss)
+    reverse = jax.jit(jax.grad(loss))(1.0)
+    np.testing.assert_allclose(reverse, central_difference(function, 1.0, 1.0), rtol=1e-5)
+
+
+# Divisions and roots of args, at the start of the run and in each step.
+OF_ARGS = {
+    "quotient": {"stop": dvi.Stop(lambda t, q, p, a: 0.1 + a / 3 - q[0])},
+    "root": {"stop": dvi.Stop(lambda t, q, p, a: jnp.sqrt(a) / 2 - q[0])},
+    "drift": {"observe": dvi.MaxDrift(lambda t, q, p, a: p @ p / a + a / 3)},
+    "section": {"observe": dvi.Section(lambda t, q, p, a: p[0] + 1 / a, direction=0)},
+}
+
+
+@pytest.mark.parametrize("name", ["quotient", *map(slow, [*OF_ARGS][1:])])
+def test_divisions_of_numbers_that_do_not_change(name):
+    """A number that is computed before the loop is not one that a step carries to the next."""
+
+    def run(q, a, form):
+        options = {"h": 0.05, "num_steps": 30, "throw": False, "save": dvi.Save(every=3)}
+        layout = dvi.Layout(form=form)
+        method = dvi.Strang()
+        return dvi.integrate(
+            OSCILLATOR, q, 0 * q, args=a, method=method, layout=layout, **options, **OF_ARGS[name]
+        )
+
+    batch = jax.vmap(run, (0, 0, None))
+    results = (batch(STARTS, jnp.array([1.0, 1.1, 1.2]), form) for form in ("auto", "arrays"))
+    for a, b in zip(*map(jax.tree.leaves, results), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-12)

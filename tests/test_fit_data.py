@@ -328,6 +328,20 @@ def test_invalid_periods(period, match):
         dvi.Observations(np.arange(3.0), np.zeros((3, 2)), period=period)
 
 
+@pytest.mark.parametrize(
+    ("values", "period", "match"),
+    [
+        ((3,), -1.0, r"got -1.0\. An infinite"),
+        ((3, 2), [1.0, -1.0], r"got -1.0 at index \[1\]\."),
+        ((3, 2, 2), [[1.0, 2.0], [0.0, 1.0]], r"got 0.0 at index \[1, 0\]\."),
+    ],
+)
+def test_the_place_of_an_invalid_period(values, period, match):
+    """A single number has no index."""
+    with pytest.raises(ValueError, match=match):
+        dvi.Observations(np.arange(3.0), np.zeros(values), period=period)
+
+
 @pytest.mark.slow
 def test_multiple_shooting_of_angles():
     """States at the cuts are interpolated between neighbouring branches."""

@@ -1,12 +1,14 @@
 """Random systems and runs against plain arrays on XLA, with controls."""
 
+import copy
+import functools
 import subprocess
 import sys
 
 import jax
 import numpy as np
 import pytest
-from random_programs import checks, search
+from random_programs import checks, kind_checks, search
 from random_programs.checks import Case, _same_bits_elsewhere, check, load
 from random_programs.programs import HEAD
 
@@ -53,6 +55,38 @@ def test_random_programs_agree(tmp_path, seed, count):
     assert sum(int(line.split()[0]) for line in checked) > count - max(count // 3, 2)
     has_gradient = any("gradient" in line and "no gradient" not in line for line in checked)
     assert has_gradient or count < 10
+
+
+structure = functools.cache(kind_checks.structure)
+
+
+@pytest.mark.parametrize(
+    "number", [5, *(pytest.param(n, marks=pytest.mark.slow) for n in range(24) if n != 5)]
+)
+def test_random_structures_agree_with_plain_loops(number):
+    """Stops, splittings, noise, constraints, pairs, rings: see `kinds`."""
+    compiled, is_quick = structure(number), number == 5
+    if not is_quick:
+        compiled.check_empty()
+    for i in range(10):
+        compiled.check(100_000 + i, slopes=not is_quick)
+
+
+def test_a_wrong_loop_and_a_valid_number_are_reported():
+    """Controls of the test above."""
+    compiled = copy.copy(structure(5))
+    kind = compiled.kind
+
+    def wrong(numbers):
+        values = kind.loop(numbers)
+        return {**values, "z": values["z"] * (1 + 1e-8)}
+
+    compiled.kind = kind._replace(loop=wrong)
+    with pytest.raises(AssertionError, match="z of 0"):
+        compiled.check(0, slopes=False)
+    compiled.kind = kind._replace(invalid=[lambda numbers: {**numbers, "z": 0 * numbers["z"]}])
+    with pytest.raises(AssertionError, match="successful"):
+        compiled.check(0, slopes=False)
 
 
 def test_a_small_program_passes():

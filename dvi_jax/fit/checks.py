@@ -18,8 +18,9 @@ def require_all(name: str, values: np.ndarray, fits: np.ndarray, rule: str, hint
     """**Raises** `ValueError` with the first of the values for which `fits` is false."""
     if not fits.all():
         index = np.argwhere(~fits)[0].tolist()
+        place = f" at index {index}" if index else ""
         value = values[tuple(index)]
-        raise ValueError(f"{name} must be {rule}, got {value} at index {index}.{_sentence(hint)}")
+        raise ValueError(f"{name} must be {rule}, got {value}{place}.{_sentence(hint)}")
 
 
 def requires(fits: Any, subject: str, condition: str, value: str, hint: str = "") -> None:

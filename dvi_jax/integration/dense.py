@@ -15,6 +15,7 @@ from lanewise import Layout
 from ..base.results import RESULTS, first_of
 from ..base.types import Interval, Scalar, State
 from ..engine.bracket import bracketed_root
+from ..engine.guard import constant_unless, nan_if_used
 from ..engine.rounding import each, one_by_one
 from ..methods import Method
 from ..methods.step import Equations
@@ -100,7 +101,8 @@ def crossings(
     that exists."""
     rows, count = record
     exists, starts = _steps(rows, safe)
-    points, statuses = each(_crossing, (curve, section.g), starts, exists, layout=curve.layout)
+    point_of = guarded(_crossing, (curve, section.g), curve.layout, has_succeeded)
+    points, statuses = jax.vmap(point_of)(exists, starts, exists)
     ts, qs, ps = _or_nan(exists, points)
     is_known = ~jnp.isnan(count)
     status = RESULTS.where(is_known, first_of(statuses, exists), RESULTS.event_not_finite)
@@ -132,12 +134,11 @@ def at_times(
         is_first = time == first
         if request.clock is None:
             time = jnp.where(is_first, _just_after(time, start), time)
-        point, status, is_shown = one_by_one(
-            _point_at, clock, start, time, is_reached, layout=curve.layout
-        )
+        point_of = guarded(_point_at, clock, curve.layout, has_succeeded)
+        point, status, is_shown = point_of(is_reached | is_first, start, time, is_reached)
         origin = (safe.t0, safe.q0, safe.p0)
         if request.clock is None:  # the value of the start to the bit, the slope of the curve
-            origin = jax.tree.map(lambda a, b: a + lax.stop_gradient(b - a), point, origin)
+            origin = jax.tree.map(_with_slope, point, origin)
         point = jax.tree.map(lambda a, b: jnp.where(is_first, b, a), point, origin)
         has_point = (is_reached & is_shown) | is_first
         # The state at the start needs no step.
@@ -196,15 +197,44 @@ def stop_point(curve: Curve, stop: Stop, row: Array, safe: StepStart) -> tuple[S
     is_start = value >= 0
     surface = (curve, stop.g)
     has_root = exists & ~is_start
-    point, status = one_by_one(_crossing, surface, start, has_root, layout=curve.layout)
+    point_of = guarded(_crossing, surface, curve.layout, has_succeeded)
+    point, status = point_of(has_root, start, has_root)
     point = jax.tree.map(lambda a, b: jnp.where(is_start, b, a), point, origin)
     status = RESULTS.where(has_root, status, RESULTS.successful)
     return Stopped(*_or_nan(exists, point)), status
 
 
+def guarded(
+    function: Callable, constants: Any, layout: Layout, succeeds: Callable | None = None
+) -> Callable:
+    """``(exists, *row) → function(constants, *row)`` with the bits of a call for one row alone. Its
+    derivative is zero where no such row `exists`, or ``succeeds(result)`` is False; it is NaN where
+    a loss uses a value that is NaN."""
+
+    def value(*row):
+        return one_by_one(function, constants, *row, layout=layout)
+
+    def guarded_value(exists, *row):
+        result = constant_unless(exists, value, *row, succeeds=succeeds)
+        smooth, others = eqx.partition(result, eqx.is_inexact_array)
+        inputs = eqx.filter((constants, row), eqx.is_inexact_array)
+        return eqx.combine(nan_if_used(smooth, inputs), others)
+
+    return guarded_value
+
+
+def has_succeeded(result: Any) -> Array:
+    """Whether a point, whose status is the second entry, has been computed."""
+    return result[1] == RESULTS.successful
+
+
+def _with_slope(curve: Array, value: Array) -> Array:
+    """`value` to the bit, with the derivative of `curve`, or its own where `curve` is NaN."""
+    return jnp.where(jnp.isnan(curve), value, curve + lax.stop_gradient(value - curve))
+
+
 def _steps(rows: Array, safe: StepStart) -> tuple[Array, StepStart]:
     """The steps in the rows, and the safe one for an empty row."""
-    # Points are computed for empty rows as well, in a batch: from NaN the derivative would be NaN.
     exists, starts = from_rows(rows, safe.q0.shape)
 
     def fill(x, substitute):

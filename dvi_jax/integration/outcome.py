@@ -16,12 +16,11 @@ from lanewise.jaxprs.jaxapi import is_traced, manual_axes
 from ..base.reads import Reads
 from ..base.results import RESULTS, IntegrationError, status_code, status_name, with_auxiliary
 from ..engine.newton import relative_size
-from ..engine.rounding import each
 from ..lattices import Place, Run
 from ..observe import OfState, Reduction, RequestedTimes, Running, Section, is_observable
 from ..observe._kept import StepStart
 from ..observe.solution import Solution
-from .dense import Curve, at_times, crossings, stop_point
+from .dense import Curve, at_times, crossings, guarded, stop_point
 from .task import Ends, Outcome, Plan, Task
 
 
@@ -32,7 +31,7 @@ def as_solution(
     carry, rows, values, defect = outcome
     curve = Curve.create(task.method, task.equations, layout)
     first = task.first_interval()
-    # A batch element without a step to interpolate in uses the first one: its numbers are finite.
+    # A batch element without a step to interpolate in uses the first one.
     safe = StepStart(first.t0, first.t1, first.t1, q0, p0)
     _, reductions = task.observables()
     status, results = carry.result, list(values)
@@ -50,7 +49,8 @@ def as_solution(
         results, hs = results[1:], ts - starts.t0
         steps = Ends(starts.t0, ts, starts.q0, starts.p0, qs, ps)
         functions, _ = dataclasses.replace(task, observe=observe).observables()
-        columns = each(_values, (functions, task.args), steps, layout=layout)
+        has_state = ~jnp.isnan(qs.reshape(len(qs), -1)).any(axis=1)
+        columns = jax.vmap(guarded(_values, (functions, task.args), layout))(has_state, steps)
     else:
         ts = jnp.concatenate([task.t0[None], rows.t])
         qs, ps, hs, columns = rows.q, rows.p, rows.h, rows.observed
@@ -101,10 +101,11 @@ def with_initial_values(solution: Solution, run: Run, layout: Layout, _: Reads =
             return values
         observable = observable.bind(run.system, run.epsilon)
 
-        def at_start(t, q, p, args):
+        def at_start(_, t, q, p, args):
             return jnp.asarray(observable(t, t, q, p, q, p, args))
 
-        first = lanewise.call(at_start, run.t0, run.q0, run.p0, run.args, layout=layout)
+        is_state = jnp.all(jnp.isfinite(run.q0)) & jnp.all(jnp.isfinite(run.p0))
+        first = guarded(at_start, None, layout)(is_state, run.t0, run.q0, run.p0, run.args)
         return jnp.concatenate([first[None].astype(values.dtype), values])
 
     rows = jax.tree.map(with_first_row, run.observe, solution.observed, is_leaf=is_observable)

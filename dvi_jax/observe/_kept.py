@@ -168,9 +168,11 @@ class Section(KeptSteps):
         tolerance = jnp.finfo(g0.dtype).eps ** 0.4
         begins_on_it = jnp.abs(g0) <= tolerance * jnp.abs(g1 - g0)
         flag = jnp.where(hit & begins_on_it, _UNLESS_FIRST, hit.astype(g0.dtype))
-        # After a failure the state is NaN: the crossings before are still known.
+        # After a failure the state is NaN, and there are no crossings, also of a g that depends on
+        # the time only; those before are still known.
         is_state = jnp.all(jnp.isfinite(q1)) & jnp.all(jnp.isfinite(p1))
-        flag = jnp.where((jnp.isnan(g0) | jnp.isnan(g1)) & is_state, jnp.nan, flag)
+        flag = jnp.where(jnp.isnan(g0) | jnp.isnan(g1), jnp.nan, flag)
+        flag = jnp.where(is_state, flag, 0)
         return as_row(flag, StepStart(t0, t1, t1, q0, p0))
 
 

@@ -186,10 +186,17 @@ def _observations(
         rule = f"one column for all, or {len(names)}, one for each column of values"
         require(fits, "data.sigma", f"it has {sigma.shape[-1]} columns", rule)
         sigma = np.broadcast_to(sigma, flat.shape).reshape(observed.shape)
+    period = table.period
+    if isinstance(period, list):
+        size, required_size = len(period), observed[0].size
+        defect, rule = f"it has {size} numbers", f"one number, or {required_size}, one a column"
+        require(size == required_size, "data.period", defect, rule)
+        period = np.reshape(period, observed.shape[1:])
     fits, rule = len(ts) > 1 or t0 is not None, "at least two, or an earlier time t0"
     require(fits, "data.file", "there is only one observation", rule)
     try:
-        return dvi.Observations(ts, observed, observe, sigma=sigma, t0=t0), names
+        options = {"sigma": sigma, "t0": t0, "period": period}
+        return dvi.Observations(ts, observed, observe, **options), names
     except (TypeError, ValueError) as error:
         key = "data.time" if str(error).startswith("ts") else "data"
         rule = (

@@ -279,6 +279,7 @@ Sigma = union(
     text=Annotated[Text, AfterValidator(lambda name: [name])],
     names=list[Text],
 )
+Period = Annotated[toml.Limit, check(lambda period: period > 0)]
 
 
 class Data(TomlTable):
@@ -296,6 +297,11 @@ class Data(TomlTable):
         None,
         "standard errors: a positive number, an array of them, one for each column, or names of "
         "columns",
+    )
+    period: union(number=Period, array=NonEmpty[Period]) | None = key(
+        None,
+        "period of angles, such as 360: a positive number, or an array, one for each column, with "
+        "inf for columns that are not periodic",
     )
 
 

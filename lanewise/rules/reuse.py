@@ -34,6 +34,8 @@ def carried_over(state_before: Sequence[Num], state_after: Sequence[Num]) -> lis
             ends.setdefault(form, y)
     pairs, serials = [], set()
     for x in numbers:
+        if x.serial < first.first_serial:  # computed before the loop, for another purpose
+            continue
         form = first.key(x)
         # A number that is the same on all trajectories is cheap.
         if form in ends and _is_costly(x) and x.vec and x.write and ends[form].vec:
