@@ -1,0 +1,1 @@
+"""A page on this machine on which a system is explored: sliders, sections, orbit diagrams."""
