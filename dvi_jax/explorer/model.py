@@ -22,7 +22,7 @@ from .subject import Settings, Subject, with_leaf
 STEPS = (1000, 10_000, 100_000)
 """Choices of the number of steps; each is compiled once."""
 
-MOST_POINTS, BINS = 5000, 600
+MOST_POINTS, BINS = 15_000, 600
 """Points of a trajectory that are drawn, and pairs of least and largest values of a series."""
 
 SECTION_STEPS, CROSSINGS = 20_000, 400

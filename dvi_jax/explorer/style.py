@@ -26,7 +26,6 @@ COLOURS = """
   --bk-minor-tick-line-color: var(--line); --bk-major-label-text-color: var(--ink);
   --bk-axis-label-text-color: var(--ink); --bk-label-text-color: var(--ink);
   --bk-text-color: var(--ink); --bk-title-text-color: var(--ink);
-  --bk-legend-background-fill-color: var(--paper); --bk-legend-border-line-color: var(--line);
   --bk-bar-line-color: var(--line);
 }
 """
@@ -76,29 +75,37 @@ table { border-collapse: collapse; width: 100%; font-size: 14px; }
 td, th { text-align: left; padding: 5px 8px; border-bottom: 1px solid var(--line);
   vertical-align: top; overflow-wrap: anywhere; }
 progress { width: 100%; accent-color: var(--accent); }
+.names { margin: 0 0 0 52px; } .names span { margin: 0 4px 0 8px; }
 .swatch { display: inline-block; width: 11px; height: 11px; border-radius: 50%; }
 """
 
 WIDGET = """
 :host { color: var(--ink); font: 14px/1.4 system-ui, "Segoe UI", Roboto, sans-serif; }
-label, .bk-slider-title, .slider-edit, .bk-slider-value { color: var(--ink); }
-label { font-size: 13px; }
-.bk-input, select.bk-input, textarea.bk-input { background-color: var(--field); color: var(--ink);
-  border: 1px solid var(--line); border-radius: 6px; font: inherit; font-size: 13px; }
-.bk-input:focus { border-color: var(--accent); outline: none; }
-.noUi-target { background: var(--track); border: none; box-shadow: none; }
-.noUi-connect { background: var(--accent); }
-.noUi-handle { background: var(--accent); border: 2px solid var(--paper); box-shadow: none;
-  border-radius: 50%; }
-.noUi-handle::before, .noUi-handle::after { display: none; }
-.bk-spin-btn, .bk-spin-btn-up, .bk-spin-btn-down { background: var(--field); }
-.bk-btn, .bk-btn-default, a { background: var(--field); color: var(--ink); font: inherit;
-  font-size: 13px; border: 1px solid var(--line); border-radius: 7px; padding: 6px 11px;
-  text-decoration: none; }
-.bk-btn:hover, a:hover { border-color: var(--accent); background: var(--field);
-  color: var(--accent); }
-.bk-btn-primary { background: var(--accent); color: var(--accent-ink); border-color: var(--accent);}
-.bk-btn-primary:hover { background: var(--accent); color: var(--accent-ink); opacity: .9; }
+label { color: var(--ink); font-size: 13px; }
+.bk-input { background-color: var(--field) !important; color: var(--ink) !important;
+  border: 1px solid var(--line) !important; border-radius: 6px; font-size: 13px; }
+.bk-input:focus { border-color: var(--accent) !important; outline: none; }
+select.bk-input { background-image: linear-gradient(45deg, transparent 50%, var(--soft) 50%),
+  linear-gradient(135deg, var(--soft) 50%, transparent 50%) !important;
+  background-position: calc(100% - 15px) 55%, calc(100% - 10px) 55% !important;
+  background-size: 5px 5px !important; background-repeat: no-repeat !important; }
+.bk-spin-btn { background-color: transparent !important; }
+.bk-spin-btn::before { border-bottom-color: var(--soft) !important;
+  border-top-color: var(--soft) !important; }
+.noUi-target { background: var(--track) !important; border: none !important;
+  box-shadow: none !important; height: 5px !important; border-radius: 3px; }
+.noUi-connect { background: var(--accent) !important; }
+.noUi-handle { background: var(--accent) !important; border: 2px solid var(--paper) !important;
+  box-shadow: none !important; border-radius: 50% !important; width: 17px !important;
+  height: 17px !important; top: -6px !important; right: -8px !important; cursor: pointer; }
+.noUi-handle::before, .noUi-handle::after { display: none !important; }
+.bk-btn, a { background: var(--field) !important; color: var(--ink) !important;
+  font-size: 13px !important; border: 1px solid var(--line) !important;
+  border-radius: 7px !important; padding: 6px 11px !important; text-decoration: none; }
+.bk-btn:hover { border-color: var(--accent) !important; color: var(--accent) !important; }
+.bk-btn-primary { background: var(--accent) !important; color: var(--accent-ink) !important; }
+.bk-btn-primary:hover { color: var(--accent-ink) !important; opacity: .9; }
+.bk-btn:disabled { opacity: .5; }
 .bk-btn:focus-visible, .noUi-handle:focus-visible { outline: 2px solid var(--accent);
   outline-offset: 2px; }
 textarea.bk-input { font: 12px/1.45 ui-monospace, "DejaVu Sans Mono", monospace; }
