@@ -1,11 +1,11 @@
 """`explore`: the page of a system, in a browser or in a notebook."""
 
-import importlib
 import socket
 from typing import Any, Never
 
 from ..base.checks import refuse_unknown, whole
 from ..systems import LIBRARY, Problem
+from .packages import require_panel
 from .subject import Subject
 
 ADDRESS = "127.0.0.1"
@@ -107,7 +107,7 @@ class Explorer:
         names = [f"{host}:{port}" for host in (ADDRESS, "localhost")]
         server = pn.serve(
             application, port=port, address=ADDRESS, websocket_origin=names, show=False,
-            start=False, title=f"{self.subject.title} – dvi_jax",
+            start=False, verbose=False, title=f"{self.subject.title} – dvi_jax",
         )  # fmt: skip
         url = f"http://{ADDRESS}:{port}"
         if open_browser:
@@ -118,19 +118,6 @@ class Explorer:
             server.run_until_shutdown()
         finally:
             server.stop()
-
-
-def require_panel() -> Any:
-    """The module panel. **Raises** `ImportError` with the line that installs it."""
-    try:
-        importlib.import_module("bokeh")
-        return importlib.import_module("panel")
-    except ImportError as error:
-        if error.name not in ("panel", "bokeh"):
-            raise  # it is installed, and something that it needs is not
-        raise ImportError(
-            'explore requires panel and bokeh: pip install "dvi-jax[explore]".', name=error.name
-        ) from None
 
 
 def _is_of_library(problem: Any) -> bool:

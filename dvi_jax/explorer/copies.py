@@ -158,6 +158,7 @@ def _drift(model: Model) -> str:
     corners = (_array(x) for x in model.box())
     q_low, p_low, q_high, p_high = corners
     degree, shape = model.settings.degree, tuple(model.subject.shape)
+    span = 1.0 if model.subject.system.slow_time else DRIFT_STEPS * abs(model.settings.h)
     return (
         "# A box around the trajectory, from which samples are drawn.\n"
         f"q_box = {q_low}, {q_high}\np_box = {p_low}, {p_high}\n"
@@ -165,10 +166,11 @@ def _drift(model: Model) -> str:
         f"count = max(64, 4 * basis.for_shape({shape}).size)\n"
         "random = np.random.default_rng(0)\n"
         f"samples = [random.uniform(*box, (count, *{shape})) for box in (q_box, p_box)]\n"
+        f"samples.append(random.uniform(0.0, {span!r}, count))  # times\n"
         f"starts = [random.uniform(*box, ({DRIFT_STARTS}, *{shape})) for box in (q_box, p_box)]\n"
         'options = {"h": run["h"], "args": args, "method": method}\n'
         "discovery = dvi.discover_invariants(\n"
-        "    system, basis, 1, samples=[*samples, np.zeros(count)],\n"
+        "    system, basis, 1, samples=samples,\n"
         '    representative="simplest", **options,\n)\n'
         "print(discovery)\n"
         "orders = [\n"

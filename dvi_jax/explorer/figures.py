@@ -3,14 +3,15 @@
 from typing import Any
 
 import numpy as np
-from bokeh.models import ColorBar, ColumnDataSource, LinearColorMapper
+from bokeh.models import ColumnDataSource
 from bokeh.palettes import Viridis256
 from bokeh.plotting import figure
 
 from .model import Diagram, Drifts, Motion, SectionPicture
 from .style import COLOURS, PALETTE
 
-_SHADES = Viridis256[20:226]  # without the ends, which vanish on black or on white
+SHADES = Viridis256[60:222]
+"""Colours of numbers, without the ends of viridis, which vanish on black or on white."""
 
 
 def _figure(height: int, **options: Any) -> Any:
@@ -27,16 +28,20 @@ def _figure(height: int, **options: Any) -> Any:
     return plot
 
 
+def _source(name: str, *columns: str) -> ColumnDataSource:
+    return ColumnDataSource({column: [] for column in ("x", "y", *columns)}, name=name)
+
+
 class MotionFigures:
     """Trajectory, observable over time, and changes of the invariants."""
 
     def __init__(self, invariants: list[str]):
-        self.lines, self.dots = (ColumnDataSource({"x": [], "y": [], "colour": []}) for _ in "ab")
+        self.lines, self.dots = _source("lines", "colour"), _source("dots", "colour")
         self.path, self.series, self.changes = _figure(420), _figure(200), _figure(220,
             y_axis_type="log")  # fmt: skip
         self.path.multi_line("x", "y", color="colour", line_width=0.9, source=self.lines)
         self.path.scatter("x", "y", color="colour", size=2, line_color=None, source=self.dots)
-        self.values = ColumnDataSource({"t": [], "y": []})
+        self.values = ColumnDataSource({"t": [], "y": []}, name="series")
         self.series.line("t", "y", color=PALETTE[0], line_width=1.2, source=self.values)
         self.sources = {name: ColumnDataSource({"t": [], "y": []}) for name in invariants}
         for source, colour in zip(self.sources.values(), PALETTE, strict=False):
@@ -77,46 +82,42 @@ class SectionFigure:
     """Points of a Poincaré section, a colour for each orbit or for a number of each orbit."""
 
     def __init__(self) -> None:
-        self.points = ColumnDataSource({"x": [], "y": [], "colour": []})
-        self.starts = ColumnDataSource({"x": [], "y": []})
+        self.points, self.starts = _source("section", "colour"), _source("starts")
         self.plot = _figure(560)
         self.plot.scatter("x", "y", color="colour", size=3, line_color=None, source=self.points)
         self.plot.scatter(
             "x", "y", size=9, fill_color=None, line_color=PALETTE[5], line_width=1.6,
             source=self.starts,
         )  # fmt: skip
-        self.mapper = LinearColorMapper(_SHADES, low=0, high=1)
-        self.bar = ColorBar(color_mapper=self.mapper, width=10, visible=False, title="")
-        self.plot.add_layout(self.bar, "right")
 
-    def draw(self, picture: SectionPicture, kind: str) -> None:
-        """Show a section; `kind`: what the colours mean."""
+    def draw(self, picture: SectionPicture) -> tuple[float, float] | None:
+        """Show a section. Returns the ends of the scale of the colours, if they are numbers."""
         good = np.isfinite(picture.x) & np.isfinite(picture.y)
-        colours = [PALETTE[i % len(PALETTE)] for i in range(len(picture.x))]
-        self.bar.visible = picture.colour is not None
+        colours, ends = [PALETTE[i % len(PALETTE)] for i in range(len(picture.x))], None
         if picture.colour is not None:
             finite = picture.colour[np.isfinite(picture.colour)]
             low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
             # Equal numbers, up to rounding, get one colour.
-            high = high if high - low > 1e-9 * abs(high) else low + 1.0
-            self.mapper.low, self.mapper.high, self.bar.title = float(low), float(high), kind
-            places = (np.nan_to_num(picture.colour, nan=low) - low) / (high - low)
-            shades = [_SHADES[int(x)] for x in places * (len(_SHADES) - 1)]
+            size = high - low if high - low > 1e-9 * abs(high) else 1.0
+            places = (np.nan_to_num(picture.colour, nan=low) - low) / size * (len(SHADES) - 1)
             is_number = np.isfinite(picture.colour)
-            colours = [c if ok else "#7f8791" for c, ok in zip(shades, is_number, strict=True)]
+            shades = [SHADES[int(x)] for x in places]
+            colours = [c if ok else PALETTE[8] for c, ok in zip(shades, is_number, strict=True)]
+            ends = float(low), float(high)
         self.points.data = {
             "x": picture.x[good], "y": picture.y[good],
             "colour": np.repeat(colours, good.sum(axis=1)),
         }  # fmt: skip
         self.starts.data = dict(zip("xy", picture.starts.T, strict=True))
         self.plot.xaxis[0].axis_label, self.plot.yaxis[0].axis_label = picture.labels
+        return ends
 
 
 class DiagramFigure:
     """Orbit diagram."""
 
     def __init__(self) -> None:
-        self.points = ColumnDataSource({"x": [], "y": []})
+        self.points = _source("diagram")
         self.plot = _figure(520)
         self.plot.scatter("x", "y", size=2.2, color=PALETTE[0], line_color=None, source=self.points)
 
@@ -132,8 +133,9 @@ class DriftFigure:
     """Drifts of invariants against ε."""
 
     def __init__(self) -> None:
-        self.points = ColumnDataSource({"x": [], "y": [], "colour": []})
-        self.lines = ColumnDataSource({"x": [], "y": [], "colour": []})
+        self.points, self.lines = (
+            _source(f"drift {name}", "colour") for name in ("points", "lines")
+        )
         self.plot = _figure(380, x_axis_type="log", y_axis_type="log")
         self.plot.multi_line("x", "y", color="colour", line_width=1.6, source=self.lines)
         self.plot.scatter("x", "y", color="colour", size=8, source=self.points)

@@ -303,7 +303,9 @@ class Model:
         count = max(64, 4 * size)
         samples = [random.uniform(a, b, (count, *subject.shape))
                    for a, b in ((q_low, q_high), (p_low, p_high))]  # fmt: skip
-        samples.append(np.zeros(count))
+        # Different times, for a map that depends on them; of a slow time one unit.
+        span = 1.0 if subject.system.slow_time else DRIFT_STEPS * abs(settings.h)
+        samples.append(random.uniform(0.0, span, count))
         starts = [random.uniform(a, b, (DRIFT_STARTS, *subject.shape))
                   for a, b in ((q_low, q_high), (p_low, p_high))]  # fmt: skip
         options = self.run_options()

@@ -10,12 +10,14 @@ import panel as pn
 from bokeh.events import Tap
 
 from . import copies, style
-from .figures import DiagramFigure, DriftFigure, MotionFigures, SectionFigure
+from .figures import SHADES, DiagramFigure, DriftFigure, MotionFigures, SectionFigure
 from .model import STEPS, Drifts, Model
 from .subject import Subject
 
+_TABS = ("Motion", "Section", "Orbit diagram", "Drift")
 COLOURINGS = ("orbit", "MEGNO", "frequency")
 _DELAY = 15  # milliseconds in which further moves of a slider join the same picture
+_FORMAT = "0[.][000000]"
 _WIDGET = {"stylesheets": [style.WIDGET], "sizing_mode": "stretch_width", "margin": (3, 4)}
 _BLOCK = {"stylesheets": [style.TEXT], "sizing_mode": "stretch_width", "margin": (0, 4)}
 
@@ -40,13 +42,25 @@ class Page:
         self.section, self.diagram, self.drift = SectionFigure(), DiagramFigure(), DriftFigure()
         self.section.plot.on_event(Tap, lambda event: self.click(event.x, event.y))
         self.diagram.plot.on_event(Tap, lambda event: self._open_section(event.x))
-        self.tabs = pn.Tabs(
-            ("Motion", self._motion_tab()), ("Section", self._section_tab()),
-            ("Orbit diagram", self._diagram_tab()), ("Drift", self._drift_tab()),
-            stylesheets=[style.TABS], sizing_mode="stretch_width",
-        )  # fmt: skip
-        self._watch(self.tabs, lambda _: self._schedule(), "active")
+        self.tabs = pn.widgets.RadioButtonGroup(
+            name="Picture",
+            options=dict(zip(_TABS, copies.VIEWS, strict=True)),
+            value="motion",
+            stylesheets=[style.TABS],
+            sizing_mode="stretch_width",
+            margin=(0, 0, 6, 0),
+        )
+        parts = self._motion_tab, self._section_tab, self._diagram_tab, self._drift_tab
+        self._parts = {name: part() for name, part in zip(copies.VIEWS, parts, strict=True)}
+        self._watch(self.tabs, self._open)
+        self._open("motion", draws=False)
         self.view = self._layout()
+
+    def _open(self, view: str, draws: bool = True) -> None:
+        for name, part in self._parts.items():
+            part.visible = name == view
+        if draws:
+            self._schedule()
 
     # The parts of the page
 
@@ -73,7 +87,10 @@ class Page:
             head, self.message,
             pn.FlexBox(
                 pn.Column(*side, stylesheets=[style.SIDE]),
-                pn.Column(self.tabs, self.state, self._copies(), stylesheets=[style.MAIN]),
+                pn.Column(
+                    self.tabs, *self._parts.values(), self.state, self._copies(),
+                    stylesheets=[style.MAIN],
+                ),
                 flex_wrap="wrap", gap="14px", align_items="flex-start",
                 sizing_mode="stretch_width",
             ),
@@ -122,9 +139,10 @@ class Page:
             "Click in the picture: an orbit begins there. On a surface q[i] = value it has the "
             "energy of the initial condition."
         )
+        self.scale = pn.pane.HTML("", css_classes=["scale"], **_BLOCK)
         return pn.Column(
             _row(surface, value, period, colour, _button("Clear the orbits", self.clear)),
-            pn.pane.HTML(f"<p class='note'>{hint}</p>", **_BLOCK), self.section.plot,
+            pn.pane.HTML(f"<p class='note'>{hint}</p>", **_BLOCK), self.scale, self.section.plot,
             sizing_mode="stretch_width",
         )  # fmt: skip
 
@@ -134,7 +152,8 @@ class Page:
             text = "The system has neither a perturbation nor parameters to vary."
             return pn.pane.HTML(f"<p>{text}</p>", **_BLOCK)
         name, low, high = self.model.diagram_range()
-        chosen = _select("Parameter", names, name)
+        labels = {"ε" if n == "epsilon" else n.removeprefix("args."): n for n in names}
+        chosen = _select("Parameter", labels, name)
         ends = _number("from", low), _number("to", high)
 
         def choose(name: str) -> None:
@@ -213,7 +232,7 @@ class Page:
         name = self.model.diagram_range()[0]
         if self._attempt(lambda: self.model.move(name, float(value))):
             self._show_values()
-            self.tabs.active = copies.VIEWS.index("section")
+            self.tabs.value = "section"
 
     def copy(self, kind: str) -> None:
         """Show the code of the picture, or the run file, and copy it."""
@@ -256,7 +275,7 @@ class Page:
     def draw(self) -> None:
         """Draw the picture that is in view. An error leaves the last one, and is shown."""
         self._is_pending = False
-        view = copies.VIEWS[self.tabs.active]
+        view = self.tabs.value
         result: list[Any] = []
         if view == "drift":
             self.state.object = ""
@@ -269,12 +288,22 @@ class Page:
             unit = self.model.subject.units.get("t", "1")
             self.motion.draw(picture, "t" if unit in ("", "1") else f"t [{unit}]")
         elif view == "section":
-            self.section.draw(picture, self.model.settings.colour)
+            self._show_scale(self.section.draw(picture))
         else:
             self.diagram.draw(picture)
         self._show(picture.message)
         text = f"computed in {1000 * picture.seconds:.0f} ms"
         self.state.object = f"<p class='note'>{text}</p>"
+
+    def _show_scale(self, ends: tuple[float, float] | None) -> None:
+        """The scale of the colours of a section."""
+        self.scale.object = ""
+        if ends is not None:
+            colours = ", ".join(SHADES[:: len(SHADES) // 8])
+            low, high = (f"{x:.4g}" for x in ends)
+            bar = f"<span class='scale' style='background: linear-gradient(90deg, {colours})'>"
+            kind = self.model.settings.colour
+            self.scale.object = f"<p class='note'>{kind} {low}{bar}</span>{high}</p>"
 
     def _schedule(self) -> None:
         """Draw soon, once for all changes that arrive until then."""
@@ -349,7 +378,7 @@ class Page:
         self._is_quiet = False
 
     def _text(self, kind: str) -> str:
-        view = copies.VIEWS[self.tabs.active]
+        view = self.tabs.value
         return copies.python(self.model, view) if kind == "python" else copies.toml(self.model)
 
     def _file(self, kind: str) -> Any:
@@ -384,7 +413,8 @@ class Slider:
             stylesheets=[style.WIDGET],
             margin=(0, 4),
         )
-        label = pn.pane.HTML(html.escape(control.label), **{**_BLOCK, "margin": (4, 4, 0, 4)})
+        text = f"<span class='label'>{html.escape(control.label)}</span>"
+        label = pn.pane.HTML(text, **{**_BLOCK, "margin": (4, 4, 0, 4)})
         head = pn.Row(label, self.number, sizing_mode="stretch_width")
         self.view = pn.Column(head, self.bar, sizing_mode="stretch_width")
 
@@ -394,14 +424,14 @@ class Slider:
         self.bar.value = min(max(value, self.bar.start), self.bar.end)
 
 
-def _select(name: str, options: list[Any], value: Any) -> Any:
+def _select(name: str, options: Any, value: Any) -> Any:
     return pn.widgets.Select(name=name, options=options, value=value, width=150,
                              stylesheets=[style.WIDGET], margin=(3, 4))  # fmt: skip
 
 
 def _number(name: str, value: float) -> Any:
-    return pn.widgets.FloatInput(name=name, value=value, width=110, stylesheets=[style.WIDGET],
-                                 margin=(3, 4))  # fmt: skip
+    return pn.widgets.FloatInput(name=name, value=value, width=110, format=_FORMAT,
+                                 stylesheets=[style.WIDGET], margin=(3, 4))  # fmt: skip
 
 
 def _button(name: str, action: Callable[[], Any], kind: str = "default") -> Any:

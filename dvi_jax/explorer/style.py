@@ -26,7 +26,6 @@ COLOURS = """
   --bk-minor-tick-line-color: var(--line); --bk-major-label-text-color: var(--ink);
   --bk-axis-label-text-color: var(--ink); --bk-label-text-color: var(--ink);
   --bk-text-color: var(--ink); --bk-title-text-color: var(--ink);
-  --bk-bar-line-color: var(--line);
 }
 """
 """Custom properties; those of bokeh begin with --bk- and set the colours of its figures."""
@@ -76,6 +75,8 @@ td, th { text-align: left; padding: 5px 8px; border-bottom: 1px solid var(--line
   vertical-align: top; overflow-wrap: anywhere; }
 progress { width: 100%; accent-color: var(--accent); }
 .names { margin: 0 0 0 52px; } .names span { margin: 0 4px 0 8px; }
+.label { color: var(--ink); font-size: 13px; }
+.scale { display: inline-block; width: 160px; height: 10px; border-radius: 5px; margin: 0 8px; }
 .swatch { display: inline-block; width: 11px; height: 11px; border-radius: 50%; }
 """
 
@@ -99,9 +100,10 @@ select.bk-input { background-image: linear-gradient(45deg, transparent 50%, var(
   box-shadow: none !important; border-radius: 50% !important; width: 17px !important;
   height: 17px !important; top: -6px !important; right: -8px !important; cursor: pointer; }
 .noUi-handle::before, .noUi-handle::after { display: none !important; }
-.bk-btn, a { background: var(--field) !important; color: var(--ink) !important;
+a { color: inherit !important; text-decoration: none !important; }
+.bk-btn { background: var(--field) !important; color: var(--ink) !important;
   font-size: 13px !important; border: 1px solid var(--line) !important;
-  border-radius: 7px !important; padding: 6px 11px !important; text-decoration: none; }
+  border-radius: 7px !important; padding: 6px 11px !important; }
 .bk-btn:hover { border-color: var(--accent) !important; color: var(--accent) !important; }
 .bk-btn-primary { background: var(--accent) !important; color: var(--accent-ink) !important; }
 .bk-btn-primary:hover { color: var(--accent-ink) !important; opacity: .9; }
@@ -112,11 +114,13 @@ textarea.bk-input { font: 12px/1.45 ui-monospace, "DejaVu Sans Mono", monospace;
 """
 
 TABS = """
-:host { color: var(--ink); }
-.bk-header { border-bottom: 1px solid var(--line) !important; }
-.bk-tab { color: var(--soft) !important; background: none !important; border: none !important;
-  border-bottom: 2px solid transparent !important; font: 600 14px system-ui, sans-serif;
-  padding: 7px 12px !important; }
-.bk-tab.bk-active { color: var(--accent) !important; border-bottom-color: var(--accent)!important;}
-.bk-tab:focus-visible { outline: 2px solid var(--accent); }
+:host { border-bottom: 1px solid var(--line); }
+.bk-btn-group { flex-wrap: wrap; gap: 0 !important; }
+.bk-btn { background: none !important; border: none !important; color: var(--soft) !important;
+  border-bottom: 2px solid transparent !important; border-radius: 0 !important;
+  box-shadow: none !important; padding: 7px 12px !important;
+  font: 600 14px system-ui, "Segoe UI", Roboto, sans-serif !important; }
+.bk-btn.bk-active { color: var(--accent) !important;
+  border-bottom-color: var(--accent) !important; }
+.bk-btn:focus-visible { outline: 2px solid var(--accent); }
 """
