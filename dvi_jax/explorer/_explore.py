@@ -114,10 +114,7 @@ class Explorer:
             server.io_loop.add_callback(server.show, "/")
         if ready is not None:
             server.io_loop.add_callback(ready, url)
-        try:
-            server.run_until_shutdown()
-        finally:
-            server.stop()
+        server.run_until_shutdown()
 
 
 def _is_of_library(problem: Any) -> bool:
