@@ -76,9 +76,7 @@ def test_a_slider_moves_the_picture_and_a_bad_value_keeps_it(page):
     handle.focus()
     for _ in range(3):
         handle.press("ArrowRight")
-    page.wait_for_function(
-        f"t => ({DATA})('series').t.at(-1) > t", arg=list(before["t"].values())[-1]
-    )
+    page.wait_for_function(f"t => ({DATA})('series').t.at(-1) > t", arg=before["t"][-1])
     field = page.locator("input.bk-input[type=text]").first
     h = float(field.input_value())
     assert h > 0.1
@@ -90,24 +88,31 @@ def test_a_slider_moves_the_picture_and_a_bad_value_keeps_it(page):
     assert page.evaluate(DATA, "series") == moved
     page.get_by_role("button", name="Reset the sliders").click()
     page.wait_for_function(f"t => ({DATA})('series').t.at(-1) == t",
-                           arg=list(before["t"].values())[-1])  # fmt: skip
+                           arg=before["t"][-1])  # fmt: skip
     assert page.locator("[role=alert]").count() == 0
+
+
+def copied(page, words):
+    """The text of the clipboard, once it contains these words."""
+    for _ in range(200):
+        text = page.evaluate("() => navigator.clipboard.readText()")
+        if words in text:
+            return text
+        page.wait_for_timeout(50)
+    raise AssertionError(text)
 
 
 @pytest.mark.slow
 def test_code_is_copied_and_downloaded(page):
     page.get_by_role("button", name="Copy as Python").click()
-    page.wait_for_function("() => navigator.clipboard.readText().then(t => t.includes('dvi.'))")
-    code = page.evaluate("() => navigator.clipboard.readText()")
-    assert "dvi.systems.henon_heiles()" in code
+    code = copied(page, "dvi.systems.henon_heiles()")
     compile(code, "copy.py", "exec")
     with page.expect_download() as event:
         page.get_by_text("Download py", exact=True).click()
     assert event.value.suggested_filename == "explore.py"
     assert event.value.path().read_text() == code
     page.get_by_role("button", name="Copy as TOML").click()
-    page.wait_for_function("() => navigator.clipboard.readText().then(t => t.includes('steps'))")
-    assert 'system = "henon_heiles"' in page.evaluate("() => navigator.clipboard.readText()")
+    copied(page, 'system = "henon_heiles"')
 
 
 @pytest.mark.slow
@@ -120,10 +125,6 @@ def test_a_click_begins_an_orbit(page):
     page.mouse.click(*middle)
     page.wait_for_function(f"() => ({SIZE})('starts') == 1")
     page.wait_for_function(f"n => ({SIZE})('section') > n", arg=count)
-    page.mouse.click(box["x"] + box["width"] - 60, box["y"] + 12)  # of too large energy
-    page.wait_for_selector("[role=alert]")
-    assert "no state at" in page.locator("[role=alert]").inner_text()
-    assert page.evaluate(SIZE, "starts") == 1
 
 
 @pytest.mark.slow
@@ -179,6 +180,9 @@ def test_the_page_without_a_browser():
     page._open_section(0.03)
     assert page.model.settings.epsilon == pytest.approx(0.03)
     assert page._controls["epsilon"].number.value == pytest.approx(0.03)
+    page.click(5.0, 5.0)
+    assert "no state at (5, 5)" in page.message.object
+    assert page.model.orbits == []
     page.model.change(degree=10)
     page.discover()
     for _ in range(100):

@@ -69,13 +69,15 @@ def _setting(model: Model) -> str:
 def _motion(model: Model) -> str:
     subject, settings = model.subject, model.settings
     names, text = list(subject.observables), ""
-    own = subject.problem.observables if subject.problem is not None else {}
-    if "energy" in names and "energy" not in own:
+    library = subject.problem.observables if subject.problem is not None else {}
+    if "energy" in names and "energy" not in library:
         text = (
             "\n\ndef energy(t0, t1, q0, p0, q1, p1, args):\n"
             f"    return system.hamiltonian(t1, t1, q1, p1, {settings.epsilon!r}, args)\n\n\n"
         )
-    rows = [f'"{n}": problem.observables["{n}"]' if n in own else f'"{n}": energy' for n in names]
+    rows = [
+        f'"{n}": problem.observables["{n}"]' if n in library else f'"{n}": energy' for n in names
+    ]
     x, y = model.orbit_axes()
     name = settings.observable or model.series()[0]
     values = (
@@ -144,13 +146,13 @@ def _diagram(model: Model) -> str:
         keys = "".join(f"[{_key(part)}]" for part in label.split("."))
         change = f'args{keys} = dvi.Axis("parameter", values)\n'
     x, _ = model.section_axes()
-    shown = "ε" if name == "epsilon" else label
+    symbol = "ε" if name == "epsilon" else label
     return (
         f"{_surface(model)}values = np.linspace({low!r}, {high!r}, {RUNS})\n{change}"
         "diagram = dvi.bifurcation(\n"
         f"    system, q0, p0, surface, crossings={DIAGRAM_CROSSINGS}, skip={DIAGRAM_SKIP},\n"
         f"    num_steps={DIAGRAM_STEPS}, method=method, **run, throw=False,\n)\n"
-        f"dvi.plot.bifurcation(values, diagram, y={x!r}, name={shown!r})\n"
+        f"dvi.plot.bifurcation(values, diagram, y={x!r}, name={symbol!r})\n"
     )
 
 
@@ -227,10 +229,10 @@ def _key(part: str) -> str:
 
 def _array(x: Any) -> str:
     text = repr(np.asarray(x).tolist())
-    return f"np.array({text})" if len(text) < 80 else _filled("np.array(", text)
+    return f"np.array({text})" if len(text) < 80 else _lines_of("np.array(", text)
 
 
-def _filled(head: str, text: str) -> str:
+def _lines_of(head: str, text: str) -> str:
     lines = textwrap.wrap(text, 92, break_long_words=False, break_on_hyphens=False)
     return head + "\n    " + "\n    ".join(lines) + "\n)"
 

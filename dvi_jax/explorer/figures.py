@@ -61,7 +61,7 @@ class MotionFigures:
         }
         empty = {name: [] for name in columns}
         self.lines.data = columns if motion.is_line else empty
-        self.dots.data = empty if motion.is_line else _joined(columns)
+        self.dots.data = empty if motion.is_line else _points_of(columns)
         self.path.xaxis[0].axis_label, self.path.yaxis[0].axis_label, label = motion.labels
         self.series.yaxis[0].axis_label = label.replace("_", " ")
         self.series.xaxis[0].axis_label = self.changes.xaxis[0].axis_label = time
@@ -70,7 +70,7 @@ class MotionFigures:
             source.data = dict(zip("ty", motion.changes[name], strict=True))
 
 
-def _joined(columns: dict[str, list[Any]]) -> dict[str, np.ndarray]:
+def _points_of(columns: dict[str, list[Any]]) -> dict[str, np.ndarray]:
     lengths = [len(x) for x in columns["x"]]
     return {
         "x": np.concatenate(columns["x"]), "y": np.concatenate(columns["y"]),
@@ -148,4 +148,4 @@ class DriftFigure:
         pairs = [(o.epsilons, np.where(o.drifts > 0, o.drifts, np.nan)) for o in drifts.orders]
         columns = {"x": [x for x, _ in pairs], "y": [y for _, y in pairs], "colour": colours}
         self.lines.data = columns
-        self.points.data = _joined(columns) if pairs else {"x": [], "y": [], "colour": []}
+        self.points.data = _points_of(columns) if pairs else {"x": [], "y": [], "colour": []}

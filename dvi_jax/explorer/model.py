@@ -138,9 +138,8 @@ class Model:
 
     def section_axes(self) -> tuple[str, str]:
         """The coordinates that a section shows: those chosen, or the first free pair."""
-        chosen = self.settings.axes
-        if chosen:
-            return chosen
+        if self.settings.axes:
+            return self.settings.axes
         names = [n for n, (kind, _) in self.subject.coordinates.items() if kind == "q"]
         free = next(n for n in names if n != self.surface)
         return free, "p" + free[1:]
@@ -153,11 +152,11 @@ class Model:
 
     def diagram_range(self) -> tuple[str, float, float]:
         """The parameter of the orbit diagram, and its ends."""
-        chosen, subject = self.settings.parameter, self.subject
+        subject = self.subject
         names = self.diagram_parameters()
         if not names:
             raise ValueError(f"{subject.title} has neither a perturbation nor parameters to vary.")
-        name = chosen or names[0]
+        name = self.settings.parameter or names[0]
         control = next(c for c in subject.controls() if c.key == name)
         ends = self.settings.ends or (0.0 if name == "epsilon" else control.low, control.high)
         return name, *ends
@@ -231,9 +230,9 @@ class Model:
             "orbits failed": int((~good).sum()),
             "orbits do not cross the surface": int((~np.isfinite(x)).all(axis=1).sum()),
         }
-        text = "; ".join(f"{n} of {len(is_state)} {what}" for what, n in counts.items() if n)
+        message = "; ".join(f"{n} of {len(is_state)} {text}" for text, n in counts.items() if n)
         labels = subject.label(axes[0]), subject.label(axes[1])
-        return SectionPicture(x, y, colour, starts, labels, text, time.perf_counter() - began)
+        return SectionPicture(x, y, colour, starts, labels, message, time.perf_counter() - began)
 
     def section_states(self) -> tuple[np.ndarray, np.ndarray]:
         """The initial conditions of the orbits of a section, that of the sliders first."""
@@ -281,7 +280,7 @@ class Model:
         q_high, p_high = (np.round(b + w, 6) for b, w in zip(high, wide, strict=True))
         return q_low, p_low, q_high, p_high
 
-    def drifts(self, report: Callable[[int, int], None] = lambda done, total: None) -> Drifts:
+    def drifts(self, report: Callable[[int, int], None] = lambda count, total: None) -> Drifts:
         """Discover invariants in polynomials of order one in ε; measure their drifts against ε.
 
         - `report`: called with the parts that are done, and all parts.
@@ -374,8 +373,8 @@ class Model:
         return array if array.ndim == 1 else _size(array)
 
     def _paths(self, qs: np.ndarray, ps: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        every = max(1, -(-len(qs) // MOST_POINTS))
-        qs, ps = qs[::every], ps[::every]
+        stride = max(1, -(-len(qs) // MOST_POINTS))
+        qs, ps = qs[::stride], ps[::stride]
         subject = self.subject
         if len(subject.shape) == 2 and not self.settings.path:
             bodies, size = subject.shape

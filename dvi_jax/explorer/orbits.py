@@ -51,8 +51,8 @@ def onto_energy(
 ) -> Array:
     """The momenta p of states (q, p), shape (orbits, …), with H = `energy`: p[index] is replaced.
 
-    The root is that at which q[index] increases, ∂H/∂p[index] > 0; NaN if there is none within
-    about 80 times the largest momentum.
+    The root is that at which q[index] increases, ∂H/∂p[index] > 0; NaN without a root within about
+    80 times the largest momentum.
     """
 
     def momentum(q, p):
@@ -85,21 +85,21 @@ def onto_energy(
 
 @eqx.filter_jit
 def _megno(system: System, method: Method, q, p, h, epsilon, args, steps: int):
-    def one(q, p):
+    def orbit(q, p):
         options = {"epsilon": epsilon, "args": args, "observe": MEGNO(), "throw": False}
         options |= {"h": h, "num_steps": steps, "method": method, "save": Save(final=True)}
         return integrate(system, q, p, **options).observed
 
-    return jax.vmap(one)(q, p)
+    return jax.vmap(orbit)(q, p)
 
 
 @eqx.filter_jit
 def _samples(system: System, method: Method, q, p, h, epsilon, args, steps: int):
-    def one(q, p):
+    def orbit(q, p):
         options = {"epsilon": epsilon, "args": args, "save": Save(every=SIGNAL), "throw": False}
         return integrate(system, q, p, h=h, num_steps=steps, method=method, **options)
 
-    return jax.vmap(one)(q, p)
+    return jax.vmap(orbit)(q, p)
 
 
 def indicator(
@@ -110,12 +110,12 @@ def indicator(
     - `options`: h, epsilon, args and method. `states`: q and p of the orbits.
     """
     h, epsilon = (as_parameter(float(options[name])) for name in ("h", "epsilon"))
-    traced = h, epsilon, options["args"], steps
+    inputs = h, epsilon, options["args"], steps
 
     def of_chunk(q, p):
         if kind == "MEGNO":
-            return _megno(system, options["method"], q, p, *traced)
-        orbits = _samples(system, options["method"], q, p, *traced)
+            return _megno(system, options["method"], q, p, *inputs)
+        orbits = _samples(system, options["method"], q, p, *inputs)
         signal = orbits.qs[(..., *index)] - 1j * orbits.ps[(..., *index)]
         lines = frequencies(orbits.ts[0], signal, count=1, refine=False, throw=False)
         return jnp.abs(lines.frequencies[:, 0])

@@ -13,13 +13,11 @@ from . import copies, style
 from .figures import SHADES, DiagramFigure, DriftFigure, MotionFigures, SectionFigure
 from .model import STEPS, Drifts, Model
 from .subject import Subject
+from .widgets import BLOCK, WIDGET, Slider, button, number, row, select
 
 _TABS = ("Motion", "Section", "Orbit diagram", "Drift")
 COLOURINGS = ("orbit", "MEGNO", "frequency")
 _DELAY = 15  # milliseconds in which further moves of a slider join the same picture
-_FORMAT = "0[.][000000]"
-_WIDGET = {"stylesheets": [style.WIDGET], "sizing_mode": "stretch_width", "margin": (3, 4)}
-_BLOCK = {"stylesheets": [style.TEXT], "sizing_mode": "stretch_width", "margin": (0, 4)}
 
 
 class Page:
@@ -30,8 +28,8 @@ class Page:
 
     def __init__(self, subject: Subject):
         self.model = Model(subject)
-        self.message = pn.pane.HTML("", css_classes=["message"], visible=False, **_BLOCK)
-        self.state = pn.pane.HTML("", css_classes=["state"], **_BLOCK)
+        self.message = pn.pane.HTML("", css_classes=["message"], visible=False, **BLOCK)
+        self.state = pn.pane.HTML("", css_classes=["state"], **BLOCK)
         self._is_pending = self._is_quiet = False
         self._document: Any = None
         self._controls = {c.key: Slider(c, self._value(c.key)) for c in subject.controls()}
@@ -68,20 +66,20 @@ class Page:
         subject, problem = self.model.subject, self.model.subject.problem
         source = f"<p>{html.escape(problem.source)}</p>" if problem and problem.source else ""
         title = html.escape(subject.title.replace("_", " "))
-        head = pn.pane.HTML(f"<h1>{title}</h1>{source}", **_BLOCK)
-        method = _select("Method", list(subject.methods), self.model.settings.method)
+        head = pn.pane.HTML(f"<h1>{title}</h1>{source}", **BLOCK)
+        method = select("Method", list(subject.methods), self.model.settings.method)
         self._watch(method, lambda value: self._choose(method=value))
-        reset = _button("Reset the sliders", self.reset)
+        reset = button("Reset the sliders", self.reset)
         groups = {"Perturbation and step": ("epsilon", "h"), "Parameters": ("args",),
                   "Initial condition": ("q0", "p0")}  # fmt: skip
         side: list[Any] = [method]
         for name, starts in groups.items():
             sliders = [s.view for key, s in self._controls.items() if key.startswith(starts)]
-            heading = [pn.pane.HTML(f"<h2>{name}</h2>", **_BLOCK)] if sliders else []
+            heading = [pn.pane.HTML(f"<h2>{name}</h2>", **BLOCK)] if sliders else []
             side += [*heading, *sliders]
         if not any(key[0] in "qp" for key in self._controls):
             text = "The initial condition has too many coordinates for sliders."
-            side.append(pn.pane.HTML(f"<p class='note'>{text}</p>", **_BLOCK))
+            side.append(pn.pane.HTML(f"<p class='note'>{text}</p>", **BLOCK))
         side.append(reset)
         return pn.Column(
             head, self.message,
@@ -100,11 +98,11 @@ class Page:
     def _motion_tab(self) -> Any:
         model, names = self.model, list(self.model.subject.coordinates)
         x, y = model.orbit_axes()
-        steps = _select("Steps", {f"{n:,}".replace(",", " "): n for n in STEPS}, STEPS[1])
-        shown = _select("Over time", model.series(), model.series()[0])
-        axes = _select("Horizontal", names, x), _select("Vertical", names, y)
+        steps = select("Steps", {f"{n:,}".replace(",", " "): n for n in STEPS}, STEPS[1])
+        observable = select("Over time", model.series(), model.series()[0])
+        axes = select("Horizontal", names, x), select("Vertical", names, y)
         self._watch(steps, lambda value: self._choose(steps=value))
-        self._watch(shown, lambda value: self._choose(observable=value))
+        self._watch(observable, lambda value: self._choose(observable=value))
         for axis in axes:
             self._watch(axis, lambda _: self._choose(path=tuple(a.value for a in axes)))
         swatches = "".join(
@@ -112,17 +110,17 @@ class Page:
             for i, name in enumerate(model.subject.invariants)
         )
         return pn.Column(
-            _row(steps, shown, *axes), self.motion.path, self.motion.series,
-            pn.pane.HTML(f"<p class='note names'>{swatches}</p>", **_BLOCK), self.motion.changes,
+            row(steps, observable, *axes), self.motion.path, self.motion.series,
+            pn.pane.HTML(f"<p class='note names'>{swatches}</p>", **BLOCK), self.motion.changes,
             sizing_mode="stretch_width",
         )  # fmt: skip
 
     def _section_tab(self) -> Any:
         model = self.model
-        surface = _select("Surface", model.surfaces(), model.surface)
-        colour = _select("Colour", list(COLOURINGS), model.settings.colour)
-        value = _number("at the value", model.settings.value)
-        period = _number("Period", model.settings.period)
+        surface = select("Surface", model.surfaces(), model.surface)
+        colour = select("Colour", list(COLOURINGS), model.settings.colour)
+        value = number("at the value", model.settings.value)
+        period = number("Period", model.settings.period)
         value.visible, period.visible = (surface.value != "stroboscope",
                                          surface.value == "stroboscope")  # fmt: skip
 
@@ -139,10 +137,10 @@ class Page:
             "Click in the picture: an orbit begins there. On a surface q[i] = value it has the "
             "energy of the initial condition."
         )
-        self.scale = pn.pane.HTML("", css_classes=["scale"], **_BLOCK)
+        self.scale = pn.pane.HTML("", css_classes=["scale"], **BLOCK)
         return pn.Column(
-            _row(surface, value, period, colour, _button("Clear the orbits", self.clear)),
-            pn.pane.HTML(f"<p class='note'>{hint}</p>", **_BLOCK), self.scale, self.section.plot,
+            row(surface, value, period, colour, button("Clear the orbits", self.clear)),
+            pn.pane.HTML(f"<p class='note'>{hint}</p>", **BLOCK), self.scale, self.section.plot,
             sizing_mode="stretch_width",
         )  # fmt: skip
 
@@ -150,11 +148,11 @@ class Page:
         names = self.model.diagram_parameters()
         if not names:
             text = "The system has neither a perturbation nor parameters to vary."
-            return pn.pane.HTML(f"<p>{text}</p>", **_BLOCK)
+            return pn.pane.HTML(f"<p>{text}</p>", **BLOCK)
         name, low, high = self.model.diagram_range()
         labels = {"ε" if n == "epsilon" else n.removeprefix("args."): n for n in names}
-        chosen = _select("Parameter", labels, name)
-        ends = _number("from", low), _number("to", high)
+        parameter = select("Parameter", labels, name)
+        ends = number("from", low), number("to", high)
 
         def choose(name: str) -> None:
             self.model.change(parameter=name, ends=None)
@@ -164,33 +162,33 @@ class Page:
             self._is_quiet = False
             self._schedule()
 
-        self._watch(chosen, choose)
+        self._watch(parameter, choose)
         for end in ends:
             self._watch(end, lambda _: self._choose(ends=tuple(e.value for e in ends)))
         hint = "Click at a value of the parameter to open its section."
         return pn.Column(
-            _row(chosen, *ends), pn.pane.HTML(f"<p class='note'>{hint}</p>", **_BLOCK),
+            row(parameter, *ends), pn.pane.HTML(f"<p class='note'>{hint}</p>", **BLOCK),
             self.diagram.plot, sizing_mode="stretch_width",
         )  # fmt: skip
 
     def _drift_tab(self) -> Any:
-        degree = _select("Polynomials of degree", [2, 3, 4, 5, 6, 8], self.model.settings.degree)
+        degree = select("Polynomials of degree", [2, 3, 4, 5, 6, 8], self.model.settings.degree)
         self._watch(degree, lambda value: self.model.change(degree=value))
-        self.search = _button("Discover invariants", self.discover, "primary")
-        self.progress = pn.pane.HTML("", css_classes=["progress"], **_BLOCK)
-        self.formulas = pn.pane.HTML("", css_classes=["formulas"], **_BLOCK)
+        self.search = button("Discover invariants", self.discover, "primary")
+        self.progress = pn.pane.HTML("", css_classes=["progress"], **BLOCK)
+        self.formulas = pn.pane.HTML("", css_classes=["formulas"], **BLOCK)
         hint = (
             "Searches the map for adiabatic invariants of order 1 in a box around the trajectory, "
             "and measures how much they change in 1000 steps at six values of ε."
         )
         return pn.Column(
-            pn.pane.HTML(f"<p class='note'>{hint}</p>", **_BLOCK), _row(degree, self.search),
+            pn.pane.HTML(f"<p class='note'>{hint}</p>", **BLOCK), row(degree, self.search),
             self.progress, self.drift.plot, self.formulas, sizing_mode="stretch_width",
         )  # fmt: skip
 
     def _copies(self) -> Any:
         self.code = pn.widgets.TextAreaInput(
-            value="", rows=12, visible=False, disabled=False, css_classes=["code"], **_WIDGET
+            value="", rows=12, visible=False, disabled=False, css_classes=["code"], **WIDGET
         )
         # The browser copies only after a click, and the text comes a moment after it.
         self.code.jscallback(value="navigator.clipboard?.writeText(cb_obj.value).catch(() => {})")
@@ -203,10 +201,10 @@ class Page:
             for kind, suffix in (("python", "py"), ("toml", "toml"))
         ]  # fmt: skip
         buttons = [
-            _button("Copy as Python", lambda: self.copy("python")),
-            _button("Copy as TOML", lambda: self.copy("toml")),
+            button("Copy as Python", lambda: self.copy("python")),
+            button("Copy as TOML", lambda: self.copy("toml")),
         ]
-        return pn.Column(_row(*buttons, *files), self.code, sizing_mode="stretch_width")
+        return pn.Column(row(*buttons, *files), self.code, sizing_mode="stretch_width")
 
     # What the user does
 
@@ -248,9 +246,9 @@ class Page:
         model = Model(self.model.subject)
         model.settings = self.model.settings
 
-        def report(done: int, total: int) -> None:
-            text = f"<progress value='{done}' max='{total}'></progress><p class='note'>"
-            text += "searching the map" if not done else f"{done} of {total} parts"
+        def report(count: int, total: int) -> None:
+            text = f"<progress value='{count}' max='{total}'></progress><p class='note'>"
+            text += "searching the map" if not count else f"{count} of {total} parts"
             self._later(lambda: setattr(self.progress, "object", text + "</p>"))
 
         def work() -> None:
@@ -362,11 +360,11 @@ class Page:
         self._schedule()
 
     def _watch(self, widget: Any, function: Callable[[Any], Any], name: str = "value") -> None:
-        def changed(event: Any) -> None:
+        def handle(event: Any) -> None:
             if not self._is_quiet:
                 function(event.new)
 
-        widget.param.watch(changed, name)
+        widget.param.watch(handle, name)
 
     def _value(self, key: str) -> float:
         return self.model.subject.read(self.model.settings, key)
@@ -393,57 +391,6 @@ def _line(error: BaseException) -> str:
     """An exception for the reader: the message of invalid input, of others with the type."""
     text = str(error).strip() or type(error).__name__
     return text if isinstance(error, ValueError) else f"{type(error).__name__}: {text}"
-
-
-class Slider:
-    """A slider with a field for its number, which may lie outside of the slider."""
-
-    def __init__(self, control: Any, value: float):
-        step = 10.0 ** np.floor(np.log10((control.high - control.low) / 200))
-        self.bar = pn.widgets.FloatSlider(
-            value=value, start=control.low, end=control.high, step=step, show_value=False,
-            css_classes=["slider"], stylesheets=[style.WIDGET], sizing_mode="stretch_width",
-            margin=(2, 14, 8, 10),
-        )  # fmt: skip
-        self.number = pn.widgets.FloatInput(
-            value=value,
-            step=step,
-            format="0[.]000000",
-            width=104,
-            stylesheets=[style.WIDGET],
-            margin=(0, 4),
-        )
-        text = f"<span class='label'>{html.escape(control.label)}</span>"
-        label = pn.pane.HTML(text, **{**_BLOCK, "margin": (4, 4, 0, 4)})
-        head = pn.Row(label, self.number, sizing_mode="stretch_width")
-        self.view = pn.Column(head, self.bar, sizing_mode="stretch_width")
-
-    def show(self, value: float) -> None:
-        """Show a number; the slider itself ends at its ends."""
-        self.number.value = value
-        self.bar.value = min(max(value, self.bar.start), self.bar.end)
-
-
-def _select(name: str, options: Any, value: Any) -> Any:
-    return pn.widgets.Select(name=name, options=options, value=value, width=150,
-                             stylesheets=[style.WIDGET], margin=(3, 4))  # fmt: skip
-
-
-def _number(name: str, value: float) -> Any:
-    return pn.widgets.FloatInput(name=name, value=value, width=110, format=_FORMAT,
-                                 stylesheets=[style.WIDGET], margin=(3, 4))  # fmt: skip
-
-
-def _button(name: str, action: Callable[[], Any], kind: str = "default") -> Any:
-    button = pn.widgets.Button(name=name, button_type=kind, stylesheets=[style.WIDGET],
-                               margin=(3, 4), align="end")  # fmt: skip
-    button.on_click(lambda _: action())
-    return button
-
-
-def _row(*widgets: Any) -> Any:
-    return pn.FlexBox(*widgets, flex_wrap="wrap", align_items="flex-end", gap="4px",
-                      sizing_mode="stretch_width")  # fmt: skip
 
 
 def _swatch(i: int) -> str:

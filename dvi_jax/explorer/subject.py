@@ -99,14 +99,14 @@ class Subject:
         method = next(iter(self.methods))
         self.start = Settings(float(epsilon), float(h), args, q0, p0, method)
         self.start = replace(self.start, period=_period(args))
-        own = dict(self.problem.observables) if self.problem else {}
-        if "energy" not in own and self.system.constraint is None:
-            own = {"energy": _Energy(self.system), **own}
-        self.observables: dict[str, Any] = {name: of_steps(f) for name, f in own.items()}
+        observables = dict(self.problem.observables) if self.problem else {}
+        if "energy" not in observables and self.system.constraint is None:
+            observables = {"energy": _Energy(self.system), **observables}
+        self.observables: dict[str, Any] = {name: of_steps(f) for name, f in observables.items()}
         adiabatic = self.problem.adiabatic if self.problem else {}
-        conserved = self.problem.invariants if self.problem else ()
+        invariants = self.problem.invariants if self.problem else ()
         # The energy, and all that is known to be conserved or nearly so.
-        names = ["energy", *conserved, *adiabatic]
+        names = ["energy", *invariants, *adiabatic]
         self.invariants = [name for name in dict.fromkeys(names) if name in self.observables]
         self.coordinates = {
             kind + _brackets(index): (kind, index)
@@ -191,9 +191,9 @@ class Subject:
         if key.startswith("args"):
             return replace(settings, args=with_leaf(settings.args, key, float(value)))
         array, (_, index) = key[:2], self.coordinates[key[0] + key[2:]]
-        changed = getattr(settings, array).copy()
-        changed[index] = value
-        return replace(settings, **{array: changed})
+        state = getattr(settings, array).copy()
+        state[index] = value
+        return replace(settings, **{array: state})
 
     def check(self, settings: Settings) -> None:
         """**Raises** `ValueError` for an initial condition or parameters that do not fit."""
@@ -223,7 +223,7 @@ class _Energy(eqx.Module):
 def with_leaf(args: Any, key: str, value: Any) -> Any:
     """args with another value at "args.name" or "args.name[1]"."""
 
-    def replaced(path: Any, leaf: Any) -> Any:
+    def new_leaf(path: Any, leaf: Any) -> Any:
         name = _name(path)
         if name == key:
             return value
@@ -233,7 +233,7 @@ def with_leaf(args: Any, key: str, value: Any) -> Any:
         array[tuple(int(i) for i in key[len(name) + 1 : -1].split(","))] = value
         return array
 
-    return jax.tree_util.tree_map_with_path(replaced, args)
+    return jax.tree_util.tree_map_with_path(new_leaf, args)
 
 
 def _leaves(args: Any) -> dict[str, Any]:
