@@ -10,8 +10,8 @@ the median is above 100 ms. `--picture` requires Chromium and playwright.
 import argparse
 import shutil
 import statistics
+import subprocess
 import sys
-import threading
 import time
 
 import jax
@@ -47,19 +47,17 @@ def draw(path: str) -> None:
     """The section of Hénon and Heiles with orbits that were begun by clicks."""
     from playwright.sync_api import sync_playwright
 
-    pages: list[str] = []
-    explorer = dvi.explore(dvi.systems.henon_heiles(), method="Strang")
-    serve = {"open_browser": False, "ready": pages.append}
-    threading.Thread(target=explorer.serve, kwargs=serve, daemon=True).start()
-    while not pages:
-        time.sleep(0.1)
+    words = ["-m", "dvi_jax", "explore", "henon_heiles", "--no-browser"]
+    server = subprocess.Popen([sys.executable, *words], stdout=subprocess.PIPE, text=True)
+    assert server.stdout is not None
+    address = server.stdout.readline().split()[0]
     with sync_playwright() as play:
         browser = play.chromium.launch(
             executable_path=shutil.which("chromium"), args=["--no-sandbox", "--disable-gpu"]
         )
         page = browser.new_page(viewport={"width": 1000, "height": 760}, device_scale_factor=1.4)
         page.set_default_timeout(240_000)
-        page.goto(pages[0])
+        page.goto(address)
         page.wait_for_selector("text=computed in")
         page.get_by_role("button", name="Section").click()
         page.wait_for_function("Bokeh.documents[0].get_model_by_name('section').data.x.length > 99")
@@ -73,6 +71,7 @@ def draw(path: str) -> None:
         page.wait_for_timeout(1500)
         page.screenshot(path=path)
         browser.close()
+    server.terminate()
 
 
 def main(arguments: list[str] | None = None) -> int:

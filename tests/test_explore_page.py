@@ -154,9 +154,12 @@ def test_the_page_without_a_browser():
     pytest.importorskip("panel")
     from dvi_jax.explorer.page import Page
 
-    page = dvi.explore(systems.kepler(), h=0.05, method="Strang")._new_page()
+    explorer = dvi.explore(systems.kepler(), h=0.05, method="Strang")
+    bundle = explorer._repr_mimebundle_()  # of a notebook
+    bundle = bundle[0] if isinstance(bundle, tuple) else bundle
+    assert "bk-" in bundle["text/html"] or "bokeh" in bundle["text/html"]
+    page = explorer._page
     assert isinstance(page, Page)
-    page.draw()
     assert "computed in" in page.state.object
     points = page.motion.lines.data["x"][0]
     slider = page._controls["epsilon"]

@@ -38,6 +38,9 @@ class Page:
                 self._watch(widget, lambda value, key=key: self._slide(key, value))
         self.motion = MotionFigures(subject.invariants)
         self.section, self.diagram, self.drift = SectionFigure(), DiagramFigure(), DriftFigure()
+        figures = [self.motion.path, self.motion.series, self.motion.changes]
+        figures += [figure.plot for figure in (self.section, self.diagram, self.drift)]
+        self._panes = [pn.pane.Bokeh(figure) for figure in figures]
         self.section.plot.on_event(Tap, lambda event: self.click(event.x, event.y))
         self.diagram.plot.on_event(Tap, lambda event: self._open_section(event.x))
         self.tabs = pn.widgets.RadioButtonGroup(
@@ -110,8 +113,8 @@ class Page:
             for i, name in enumerate(model.subject.invariants)
         )
         return pn.Column(
-            row(steps, observable, *axes), self.motion.path, self.motion.series,
-            pn.pane.HTML(f"<p class='note names'>{swatches}</p>", **BLOCK), self.motion.changes,
+            row(steps, observable, *axes), self._panes[0], self._panes[1],
+            pn.pane.HTML(f"<p class='note names'>{swatches}</p>", **BLOCK), self._panes[2],
             sizing_mode="stretch_width",
         )  # fmt: skip
 
@@ -140,7 +143,7 @@ class Page:
         self.scale = pn.pane.HTML("", css_classes=["scale"], **BLOCK)
         return pn.Column(
             row(surface, value, period, colour, button("Clear the orbits", self.clear)),
-            pn.pane.HTML(f"<p class='note'>{hint}</p>", **BLOCK), self.scale, self.section.plot,
+            pn.pane.HTML(f"<p class='note'>{hint}</p>", **BLOCK), self.scale, self._panes[3],
             sizing_mode="stretch_width",
         )  # fmt: skip
 
@@ -168,7 +171,7 @@ class Page:
         hint = "Click at a value of the parameter to open its section."
         return pn.Column(
             row(parameter, *ends), pn.pane.HTML(f"<p class='note'>{hint}</p>", **BLOCK),
-            self.diagram.plot, sizing_mode="stretch_width",
+            self._panes[4], sizing_mode="stretch_width",
         )  # fmt: skip
 
     def _drift_tab(self) -> Any:
@@ -183,7 +186,7 @@ class Page:
         )
         return pn.Column(
             pn.pane.HTML(f"<p class='note'>{hint}</p>", **BLOCK), row(degree, self.search),
-            self.progress, self.drift.plot, self.formulas, sizing_mode="stretch_width",
+            self.progress, self._panes[5], self.formulas, sizing_mode="stretch_width",
         )  # fmt: skip
 
     def _copies(self) -> Any:
@@ -273,6 +276,11 @@ class Page:
     def draw(self) -> None:
         """Draw the picture that is in view. An error leaves the last one, and is shown."""
         self._is_pending = False
+        self._draw()
+        if self._document is None:  # a notebook receives changes of figures when they are sent
+            pn.io.push_notebook(*self._panes)
+
+    def _draw(self) -> None:
         view = self.tabs.value
         result: list[Any] = []
         if view == "drift":
