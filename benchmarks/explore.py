@@ -55,7 +55,7 @@ def draw(path: str) -> None:
         browser = play.chromium.launch(
             executable_path=shutil.which("chromium"), args=["--no-sandbox", "--disable-gpu"]
         )
-        page = browser.new_page(viewport={"width": 1000, "height": 760}, device_scale_factor=1.4)
+        page = browser.new_page(viewport={"width": 1000, "height": 900}, device_scale_factor=1.4)
         page.set_default_timeout(240_000)
         page.goto(address)
         page.wait_for_selector("text=computed in")
@@ -63,7 +63,15 @@ def draw(path: str) -> None:
         page.wait_for_function("Bokeh.documents[0].get_model_by_name('section').data.x.length > 99")
         box = page.locator(".bk-Figure:visible").bounding_box()
         assert box is not None
-        places = [(0.3, 0.5), (0.45, 0.5), (0.55, 0.45), (0.65, 0.5), (0.8, 0.5), (0.5, 0.25)]
+        places = [
+            (0.3, 0.5),
+            (0.8, 0.6),
+            (0.4, 0.5),
+            (0.5, 0.5),
+            (0.6, 0.5),
+            (0.7, 0.5),
+            (0.3, 0.6),
+        ]
         for i, (x, y) in enumerate(places):
             page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
             page.wait_for_timeout(2500 if i else 6000)

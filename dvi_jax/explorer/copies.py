@@ -109,7 +109,7 @@ def _surface(model: Model) -> str:
 
 def _section(model: Model) -> str:
     q, p = model.section_states()
-    is_state = np.isfinite(p).all(axis=tuple(range(1, p.ndim)))
+    is_state = np.isfinite(p.reshape(len(p), -1)).all(axis=1)
     x, y = model.section_axes()
     index = _subscript(model.subject.coordinates[x][1])
     steps = f"num_steps={SECTION_STEPS}, method=method, **run, throw=False"

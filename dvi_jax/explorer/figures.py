@@ -54,12 +54,12 @@ class MotionFigures:
     def draw(self, motion: Motion, time: str) -> None:
         """Show a motion; `time`: the label of its axis."""
         names = list(motion.paths)
-        columns = {
+        columns: dict[str, Any] = {
             "x": [x for x, _ in motion.paths.values()],
             "y": [y for _, y in motion.paths.values()],
             "colour": [PALETTE[i % len(PALETTE)] for i in range(len(names))],
         }
-        empty = {name: [] for name in columns}
+        empty: dict[str, Any] = {name: [] for name in columns}
         self.lines.data = columns if motion.is_line else empty
         self.dots.data = empty if motion.is_line else _points_of(columns)
         self.path.xaxis[0].axis_label, self.path.yaxis[0].axis_label, label = motion.labels
@@ -70,7 +70,7 @@ class MotionFigures:
             source.data = dict(zip("ty", motion.changes[name], strict=True))
 
 
-def _points_of(columns: dict[str, list[Any]]) -> dict[str, np.ndarray]:
+def _points_of(columns: dict[str, Any]) -> dict[str, Any]:
     lengths = [len(x) for x in columns["x"]]
     return {
         "x": np.concatenate(columns["x"]), "y": np.concatenate(columns["y"]),
@@ -146,6 +146,10 @@ class DriftFigure:
         """Show measured drifts."""
         colours = [PALETTE[i % len(PALETTE)] for i in range(len(drifts.orders))]
         pairs = [(o.epsilons, np.where(o.drifts > 0, o.drifts, np.nan)) for o in drifts.orders]
-        columns = {"x": [x for x, _ in pairs], "y": [y for _, y in pairs], "colour": colours}
+        columns: dict[str, Any] = {
+            "x": [x for x, _ in pairs],
+            "y": [y for _, y in pairs],
+            "colour": colours,
+        }
         self.lines.data = columns
         self.points.data = _points_of(columns) if pairs else {"x": [], "y": [], "colour": []}

@@ -205,7 +205,7 @@ class Model:
         began = time.perf_counter()
         subject, settings = self.subject, self.settings
         q, p = self.section_states()
-        is_state = np.isfinite(p).all(axis=tuple(range(1, p.ndim)))
+        is_state: Any = np.all(np.isfinite(p.reshape(len(p), -1)), axis=1)
         q, p = q[is_state], p[is_state]
         options, surface = self.run_options(), self._surface()
 
@@ -339,8 +339,8 @@ class Model:
         is no such state; those of a stroboscope as they are."""
         subject, settings = self.subject, self.settings
         q, p = (np.repeat(x[None], len(points), 0) for x in (settings.q0, settings.p0))
+        _, index = subject.coordinates.get(self.surface, ("", ()))
         if self.surface != STROBE:
-            index = subject.coordinates[self.surface][1]
             q[(..., *index)] = settings.value
         for name, values in zip(self.section_axes(), np.transpose(points), strict=True):
             subject.column(name, q, p)[...] = values

@@ -58,9 +58,9 @@ def onto_energy(
     def momentum(q, p):
         def excess(s):
             at_s = p.at[index].set(s)
-            return system.hamiltonian(0.0, 0.0, q, at_s, epsilon, args) - energy
+            return system.hamiltonian(time, time, q, at_s, epsilon, args) - energy
 
-        slope = jax.grad(excess)
+        time, slope = jnp.zeros((), q.dtype), jax.grad(excess)
         # The minimum if H is quadratic in this momentum: narrow pairs of roots are next to it.
         minimum = -slope(0.0) / jax.grad(slope)(0.0)
         middle = jnp.where(jnp.isfinite(minimum), minimum, 0.0)

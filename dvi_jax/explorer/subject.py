@@ -80,8 +80,8 @@ class Subject:
     def __init__(
         self, problem: Any, start: Mapping[str, Any], lines: str = "", name: str = "", title=""
     ):
-        values = {key: start.get(key) for key in ("q0", "p0", "h", "args")}
-        self.system, q0, p0, h, args = of_problem(problem, *values.values())
+        q0, p0, h, args = (start.get(key) for key in ("q0", "p0", "h", "args"))
+        self.system, q0, p0, h, args = of_problem(problem, q0, p0, h, args)
         check_system(self.system)
         if h is None:
             raise ValueError("explore requires h, the step size: the system has no default.")
@@ -275,5 +275,4 @@ def _text_of(method: Method) -> str:
 def _period(args: Any) -> float:
     """The period of a drive, if args has its frequency."""
     omega = args.get("omega") if isinstance(args, Mapping) else None
-    is_number = isinstance(omega, float) and omega > 0
-    return 2 * math.pi / omega if is_number else 2 * math.pi
+    return 2 * math.pi / (omega if isinstance(omega, float) and omega > 0 else 1.0)
