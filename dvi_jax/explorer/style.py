@@ -100,7 +100,7 @@ select.bk-input { background-image: linear-gradient(45deg, transparent 50%, var(
   box-shadow: none !important; border-radius: 50% !important; width: 17px !important;
   height: 17px !important; top: -6px !important; right: -8px !important; cursor: pointer; }
 .noUi-handle::before, .noUi-handle::after { display: none !important; }
-a { color: inherit !important; text-decoration: none !important; }
+a { color: inherit !important; padding: 0 !important; text-decoration: none !important; }
 .bk-btn { background: var(--field) !important; color: var(--ink) !important;
   font-size: 13px !important; border: 1px solid var(--line) !important;
   border-radius: 7px !important; padding: 6px 11px !important; }
