@@ -103,6 +103,7 @@ if TYPE_CHECKING:  # names that are imported at their first use: `_namespaces` h
     from .discover.symmetries import library as _library
     from .dynamics import *  # noqa: F403
     from .dynamics import frequencies as _frequencies
+    from .explorer import *  # noqa: F403
     from .fit import *  # noqa: F403
     from .proof import *  # noqa: F403
     from .sweep import *  # noqa: F403

@@ -13,7 +13,7 @@ NAMESPACES = {
         name: f"dvi_jax.{name}"
         for name in (
             *("methods", "lattices", "observe", "discover", "dynamics", "proof"),
-            *("systems", "plot", "interop", "testing"),
+            *("systems", "plot", "explorer", "interop", "testing"),
         )
     },
     # The functions `dvi.sweep` and `dvi.fit` have the names of their folders.
@@ -46,6 +46,7 @@ HOMES = {
         *("SectionError", "actions", "bifurcation", "frequencies", "frequency_diffusion"),
         *("fundamental_frequencies", "poincare_section", "stroboscope", "tangent_map"),
     ),
+    "explorer": ("Explorer", "explore"),
     "fit": (
         *("FIT_RESULTS", "Bounds", "Cauchy", "FitError", "FitProgress", "FitResult"),
         *("ForceLibrary", "Identification", "LeastSquares", "Likelihood", "Model"),

@@ -7,7 +7,7 @@ import traceback
 
 # Each adds its commands to the application; in the order of the help page, not of the alphabet.
 # isort: off
-from . import _new, _runs, _checks  # noqa: F401
+from . import _new, _runs, _explore, _checks  # noqa: F401
 
 # isort: on
 from ._group import app

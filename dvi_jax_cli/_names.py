@@ -35,6 +35,7 @@ EXTRAS = {
     "bayes": ("numpyro",),
     "export": ("h5netcdf", "h5py", "pyarrow"),
     "proof": ("flint",),
+    "explore": ("panel", "bokeh"),
     "ephemeris": ("jplephem", "skyfield_data"),
     "stellarator": ("qsc",),
     "rings": ("at",),

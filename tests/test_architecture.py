@@ -20,7 +20,15 @@ ROOT = Path(dvi.__file__).parent
 STAIR = [
     *(["base"], ["engine"], ["problem"], ["methods"], ["observe"], ["lattices"], ["integration"]),
     *(["discover"], ["sweep", "fit", "proof"], ["dynamics"]),
-    *(["systems", "plot"], ["_namespaces"], ["__init__"], ["testing"], ["interop"], ["__main__"]),
+    *(
+        ["systems", "plot"],
+        ["explorer"],
+        ["_namespaces"],
+        ["__init__"],
+        ["testing"],
+        ["interop"],
+        ["__main__"],
+    ),
 ]
 """Folders and files of `dvi_jax`, each with imports from those before it only."""
 
@@ -41,7 +49,7 @@ MOVING = ("jax._src", "jax.interpreters", "jax.extend", "jax.core")
 LATER = (
     "optax", "optimistix", "lineax", "matplotlib", "scipy", "xarray", "zarr", "rich", "typer",
     "numpyro", "distributed", "diffrax", "rebound", "astropy", "arviz", "jplephem", "sympy",
-    "pydantic",
+    "pydantic", "panel", "bokeh",
 )  # fmt: skip
 """Each of these is imported by the function that needs it."""
 

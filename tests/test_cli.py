@@ -24,7 +24,7 @@ from dvi_jax_cli._new import notebook
 from dvi_jax_cli._session import CODES, Session
 
 COMMANDS = ["new", "systems", "schema", "run", "sweep", "fit", "discover", "bound", "paper"]
-COMMANDS += ["certify", "verify", "info"]
+COMMANDS += ["certify", "verify", "info", "explore"]
 
 CALLS = """
 import contextlib, io, json, os, sys

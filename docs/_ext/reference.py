@@ -41,6 +41,7 @@ PAGES = {
     "sweeps": "Sweeps",
     "fitting": "Fits",
     "dynamics": "Sections, frequencies, actions",
+    "explorer": "The explorer",
 }
 """Page → title."""
 
@@ -61,6 +62,7 @@ FOLDERS = {
     "dvi_jax.sweep": "sweeps",
     "dvi_jax.fit": "fitting",
     "dvi_jax.dynamics": "dynamics",
+    "dvi_jax.explorer": "explorer",
 }
 """Package or module → the page of its public names; the longest name that fits decides."""
 
