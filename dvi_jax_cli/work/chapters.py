@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import shlex
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -59,6 +60,8 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def _in_words(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
     if isinstance(value, float):
         return f"{value:.8g}"
     if isinstance(value, dict):
@@ -173,11 +176,10 @@ def solution_chapter(path: Path) -> Chapter:
     chapter.pictures[f"Trajectory{few}"] = lambda: view(part)
     if isinstance(solution.observed, dict) and solution.observed:
         chapter.pictures[f"Observables{few}"] = lambda: plot.invariants(part, change="value")
-    name = json.dumps(str(path), ensure_ascii=False)
-    chapter.command = f"python -c 'import jax; jax.config.update(\"jax_enable_x64\", True); \
-import dvi_jax as dvi; print(dvi.Solution.load({name}))'"
-    chapter.remarks = ["The file has states and statuses, but not the call that computed them. The "
-                       "command reads it."]  # fmt: skip
+    code = f"import dvi_jax as dvi; print(dvi.Solution.load({str(path)!r}))"
+    chapter.command = "JAX_ENABLE_X64=1 " + shlex.join(["python", "-c", code])
+    chapter.remarks = ["The file has states and statuses, but not the call that computed them."]
+    chapter.remarks.append("The command reads the file.")
     return chapter
 
 
@@ -238,10 +240,9 @@ def discover_chapter(folder: Path) -> Chapter:
     invariants = contents["invariants"]
     chapter.verdict = f"{len(invariants)} invariant{'s' * (len(invariants) != 1)}"
     chapter.grade = "good" if invariants else "open"
-    names = {"samples": "samples", "functions": "functions of the basis", "seconds": "seconds"}
-    for key, name in names.items():
-        value = len(contents[key]) if key == "functions" else contents[key]
-        chapter.facts[name] = _in_words(value)
+    chapter.facts["samples"] = str(contents["samples"])
+    chapter.facts["functions of the basis"] = str(len(contents["functions"]))
+    chapter.facts["seconds"] = f"{contents['seconds']:.3g}"
     chapter.tables = discovery_tables(contents)
     chapter.formulas = [f"I{i} = {x['formula']}" for i, x in enumerate(invariants, 1)]
     for key, words in (("dependent", "a function of these"), ("lost", "not conserved")):
@@ -262,9 +263,8 @@ def discover_chapter(folder: Path) -> Chapter:
 
 def _add_drift(chapter: Chapter, name: str, drift: dict[str, Any]) -> None:
     """Points of a measured drift that do not count, as statuses and failures."""
-    reasons = [str(x) or "used in the fit" for x in drift["excluded"]]
-    for reason, count in Counter(reasons).items():
-        chapter.statuses[f"{name}: ε {reason}"] = count
+    reasons = [f"ε: {x or 'used in the fit'}" for x in drift["excluded"]]
+    chapter.statuses = dict(Counter(chapter.statuses) + Counter(reasons))
     failed = [e for e, x in zip(drift["epsilons"], drift["excluded"], strict=True) if x == "failed"]
     chapter.failures += [f"{name}: trajectories failed at ε = {e:.4g}" for e in failed]
     if lost := drift["starts"] - drift["starts_kept"]:
@@ -320,7 +320,7 @@ def certificate_chapter(path: Path) -> Chapter:
     chapter.tables = bound_tables(contents)
     _check(chapter, path)
     _add_line(chapter, contents)
-    chapter.command = chapter.command or f"dvi-jax verify {path}"
+    chapter.command = chapter.command or shlex.join(["dvi-jax", "verify", str(path)])
     return chapter
 
 

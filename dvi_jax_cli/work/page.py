@@ -108,9 +108,6 @@ def _write(article: Element, chapter: Chapter, budget: int) -> None:
     _add_statuses(article, chapter)
     for note in chapter.notes:
         _add(article, "p", _short(note, _CELL), class_="note")
-    if chapter.formulas:
-        _add(article, "h2", "Formulas")
-        _add(article, "pre", _short("\n".join(chapter.formulas), _TEXT), class_="formulas")
     if chapter.pictures:
         _add(article, "h2", "Pictures")
         pictures = SubElement(article, "div", {"class": "pictures"})
@@ -118,6 +115,9 @@ def _write(article: Element, chapter: Chapter, budget: int) -> None:
             _add_picture(pictures, description, source, budget)
     for table in chapter.tables:
         _add_table(article, table)
+    if chapter.formulas:
+        _add(article, "h2", "Formulas")
+        _add(article, "pre", _short("\n".join(chapter.formulas), _TEXT), class_="formulas")
     _add(article, "h2", "How to repeat it")
     if chapter.command:
         _add(article, "pre", chapter.command, class_="command")
