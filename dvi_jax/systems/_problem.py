@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..base.checks import all_finite, array, finite as finite, positive as positive
+from ..base.printing import first_lines
 from ..discover.functions.generators import Generator
 from ..discover.symmetries.library import time_translation
 from ..observe import InSlowTime as InSlowTime
@@ -105,7 +106,7 @@ class Problem:
             ("symmetries", [*self.symmetries, *self.flow_symmetries]),
         ):
             lines += [f"  {label}: {', '.join(names)}"] * bool(names)
-        return "\n".join(lines)
+        return first_lines("\n".join(lines), "")
 
     def __post_init__(self):
         if self.system.epsilon is None:  # what is known is known of the unperturbed motion
