@@ -27,6 +27,7 @@ def printable(kind: T) -> T:
     has_report = kind.__str__ is not object.__str__
 
     def __repr__(self: Any) -> str:
+        # Under jit a report, which formats numbers, would raise.
         if has_report and not _has_tracers(self):
             return first_lines(str(self))
         entries = [f"{name} = {text}" for name, text in fields_of(self)]
@@ -44,6 +45,7 @@ def printable(kind: T) -> T:
         rows = "".join(f"<tr><th>{name}</th><td>{text}</td></tr>" for name, text in cells)
         return f"<table><caption>{html.escape(type(self).__name__)}</caption>{rows}</table>"
 
+    # Set after the class is made: dataclasses and named tuples write a __repr__ of their own.
     methods: list[Callable[..., Any]] = [__repr__, _repr_html_]
     for method in methods:
         method.__qualname__ = f"{kind.__qualname__}.{method.__name__}"
@@ -55,6 +57,7 @@ def first_lines(text: str, hint: str = ": print shows them") -> str:
     """At most eight lines, none of them longer than a few lines of a terminal."""
     lines = text.splitlines()
     excess = len(lines) - _LINES
+    # The last line says how many are missing, so that nobody takes the beginning for the whole.
     if excess > 0:
         lines[_LINES - 1 :] = [f"… and {excess + 1} more lines{hint}"]
     return "\n".join(line if len(line) <= 500 else f"{line[:500]} …" for line in lines)
@@ -73,6 +76,7 @@ def fields_of(thing: Any) -> list[tuple[str, str]]:
 def short(value: Any) -> str:
     """One line: numbers if they are few, else type and shape; of other objects the beginning."""
     if isinstance(value, np.ndarray | jax.Array) and not is_traced(value):
+        # NumPy cannot convert keys of random numbers.
         if jax.dtypes.issubdtype(value.dtype, jax.dtypes.prng_key):
             return f"key of shape {value.shape}"
         if value.size > _NUMBERS:

@@ -265,8 +265,9 @@ def _add_drift(chapter: Chapter, name: str, drift: dict[str, Any]) -> None:
     """Points of a measured drift that do not count, as statuses and failures."""
     reasons = [f"ε: {x or 'used in the fit'}" for x in drift["excluded"]]
     chapter.statuses = dict(Counter(chapter.statuses) + Counter(reasons))
-    failed = [e for e, x in zip(drift["epsilons"], drift["excluded"], strict=True) if x == "failed"]
-    chapter.failures += [f"{name}: trajectories failed at ε = {e:.4g}" for e in failed]
+    pairs = zip(drift["epsilons"], drift["excluded"], strict=True)
+    lines = [f"{name}: trajectories failed at ε = {e:.4g}" for e, x in pairs if x == "failed"]
+    chapter.failures += lines
     if lost := drift["starts"] - drift["starts_kept"]:
         chapter.failures.append(f"{name}: {lost} of {drift['starts']} trajectories do not count")
 
@@ -434,7 +435,7 @@ def _add_maps(chapter: Chapter, data: Any) -> None:
         }
         label = with_unit(name.replace("_", " "), data[name].attrs.get("units"))
         chapter.pictures[f"Map of {label}"] = _drawing(plot.sweep_map, data[name], **options)
-    if others := [n for n in names if n not in drawn]:
+    if excess := [n for n in names if n not in drawn]:
         chapter.notes.append(
-            f"Not drawn, because they are too many or too large: {', '.join(others)}."
+            f"Not drawn, because they are too many or too large: {', '.join(excess)}."
         )

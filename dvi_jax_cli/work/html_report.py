@@ -9,7 +9,7 @@ import numpy as np
 
 from dvi_jax.base.files import publish
 
-from .._errors import InputError, as_input_error, reason, require, user_path
+from .._errors import as_input_error, reason, require, user_path
 from . import chapters
 from .output import Report
 from .page import MAX_BYTES, Chapter, page
@@ -22,6 +22,13 @@ _FOLDERS: dict[str, Callable[[Path], Chapter]] = {
     "zarr.json": chapters.sweep_chapter,
 }
 """File that a folder of results has → what makes the chapter."""
+
+_FILES = [
+    ({"stats", "observed"}, chapters.solution_chapter),
+    ({"arcs", "result"}, chapters.saved_fit_chapter),
+    ({"per_step", "domain", "boxes"}, chapters.certificate_chapter),
+]
+"""Entries of the header of a single file → what makes the chapter."""
 
 _RULE = (
     "the folder of a run, fit, discover or bound, the store of a sweep, or a file of "
@@ -76,13 +83,13 @@ def chapters_of(path: Path) -> list[Chapter]:
     with as_input_error("PATH", _RULE, OSError, prefix=f"{path}: ", text=reason):
         names = {entry.name for entry in path.iterdir()}
     kinds = [kind for name, kind in _FOLDERS.items() if name in names]
-    if kinds:
-        return [_read(kind, path) for kind in kinds]
     inner = sorted(str(path / n) for n in names if any((path / n / f).is_file() for f in _FOLDERS))
     rule = f"one of the results in it, such as {inner[0]}" if inner else _RULE
-    shown = ", ".join(sorted(names)[:_MAX_NAMES]) or "nothing"
+    contents = ", ".join(sorted(names)[:_MAX_NAMES]) or "nothing"
     excess = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
-    raise InputError("PATH", f"{path} has no results of dvi-jax; it contains {shown}{excess}", rule)
+    defect = f"{path} has no results of dvi-jax; it contains {contents}{excess}"
+    require(kinds, "PATH", defect, rule)
+    return [_read(kind, path) for kind in kinds]
 
 
 def _kind_of(path: Path) -> Callable[[Path], Chapter]:
@@ -90,8 +97,6 @@ def _kind_of(path: Path) -> Callable[[Path], Chapter]:
     key, header = str(path), {}
     if path.suffix == ".json":
         header = chapters.read_json(path)
-        if str(header.get("format", "")).startswith("dvi_jax drift bound"):
-            return chapters.certificate_chapter
     elif path.suffix == ".npz":
         rule = "a file of Solution.save or FitResult.save"
         with (
@@ -99,25 +104,20 @@ def _kind_of(path: Path) -> Callable[[Path], Chapter]:
             np.load(path, allow_pickle=False) as file,
         ):
             header = json.loads(str(file["about"])) if "about" in file.files else {}
-    if {"stats", "observed"} <= header.keys():
-        return chapters.solution_chapter
-    if {"arcs", "result"} <= header.keys():
-        return chapters.saved_fit_chapter
-    raise InputError(key, "it is not a file of results that can be shown alone", _RULE)
+    kinds = [kind for names, kind in _FILES if names <= header.keys()]
+    require(kinds, key, "it is not a file of results that can be shown alone", _RULE)
+    return kinds[0]
 
 
 def _read(kind: Callable[[Path], Chapter], path: Path) -> Chapter:
-    """The chapter; files that lack something are an `InputError`."""
-    try:
-        return kind(path)
-    except KeyError as error:
-        raise _damage(path, f"there is no {error.args[0]!r}") from error
-    except (AttributeError, IndexError, TypeError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise _damage(path, f"{type(error).__name__}: {error}") from error
-
-
-def _damage(path: Path, defect: str) -> InputError:
+    """The chapter. **Raises** `InputError` for files that lack something."""
+    kinds = AttributeError, LookupError, TypeError, ValueError
+    prefix = "the results are damaged or of another version: "
     rule = "files as dvi-jax wrote them; repeat the command with --force"
-    return InputError(str(path), f"the results are damaged or of another version: {defect}", rule)
+    with as_input_error(str(path), rule, *kinds, prefix=prefix, text=_defect):
+        return kind(path)
+
+
+def _defect(error: BaseException) -> str:
+    is_gap = isinstance(error, KeyError)
+    return f"there is no {error.args[0]!r}" if is_gap else f"{type(error).__name__}: {error}"

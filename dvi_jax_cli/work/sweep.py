@@ -296,7 +296,7 @@ def _start(table: Any, source: Source) -> dvi.starts.Starts:
 
 
 def open_store(store: str | Path) -> dvi.SweepResult:
-    """The results in a store. **Raises** `InputError` where there is none."""
+    """The results in a store. **Raises** `InputError` for another directory."""
     with as_input_error("STORE", "the directory of a sweep", dvi.StoreError):
         return dvi.open_sweep(store)
 
