@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from lanewise.jaxprs.jaxapi import is_traced
@@ -77,7 +78,7 @@ def short(value: Any) -> str:
     """One line: numbers if they are few, else type and shape; of other objects the beginning."""
     if isinstance(value, np.ndarray | jax.Array) and not is_traced(value):
         # NumPy cannot convert keys of random numbers.
-        if jax.dtypes.issubdtype(value.dtype, jax.dtypes.prng_key):
+        if jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
             return f"key of shape {value.shape}"
         if value.size > _NUMBERS:
             return f"{value.dtype} of shape {value.shape}"

@@ -111,8 +111,8 @@ def run_chapter(folder: Path) -> Chapter:
             series = np.concatenate([np.asarray(entry["start"], float)[None], values])
             observed[name] = Observed(series[0], series, entry["scale"], "")
     drawn = dict(itertools.islice(observed.items(), _SERIES))
-    states = [arrays[name] for name in ("ts", "qs", "ps")]
-    pictures = run_pictures({"units": {}, "name": chapter.title} | contents, *states, drawn)
+    ts, qs, ps = (arrays[name] for name in ("ts", "qs", "ps"))
+    pictures = run_pictures({"units": {}, "name": chapter.title} | contents, ts, qs, ps, drawn)
     title = "Observables: change since the start"
     if len(observed) > _SERIES:
         title += f" (the first {_SERIES} of {len(observed)})"

@@ -2,7 +2,6 @@
 
 import base64
 import io
-import itertools
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -171,7 +170,7 @@ def _add_table(parent: Element, table: TextTable) -> None:
     body = SubElement(grid, "tbody")
     for cells in table.rows[:_ROWS]:
         row = SubElement(body, "tr")
-        for cell, side in itertools.zip_longest(cells, sides, fillvalue=""):
+        for cell, side in zip([*cells, *[""] * (len(sides) - len(cells))], sides, strict=True):
             _add(row, "td", _short(cell, _CELL), **side)
     if len(table.rows) > _ROWS:
         _add(parent, "p", f"… and {len(table.rows) - _ROWS} more rows")
