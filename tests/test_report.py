@@ -204,11 +204,12 @@ def test_a_saved_batch_counts_its_statuses(results):
         energy = {"height": lambda t0, t1, q0, p0, q1, p1, args: q1[0]}
         return dvi.integrate(system, jnp.array([0.5]), p[None], observe=energy, **options)
 
-    batch = jax.vmap(one)(jnp.array([0.0, -1.0, -9.0]))
+    batch = jax.vmap(one)(jnp.array([5.0, -1.0, -9.0]))
     batch.save("batch.npz")
     chapter, reader = report_of("batch.npz")
     assert chapter["statuses"] == Counter(batch.status.tolist())
     assert chapter["failures"] == sum(name != "successful" for name in batch.status)
+    assert 0 < chapter["failures"] < 3
     step = int(batch.stats["failed_step"][2])
     assert reader.texts["li"][-1].startswith("trajectory 2: ")
     assert f"at step {step} of 30" in reader.texts["li"][-1]
@@ -309,6 +310,7 @@ def test_large_results_are_shortened_with_a_remark(tmp_path, monkeypatch):
     reader = checked(tmp_path / "page.html")
     text = " ".join(reader.texts["p"])
     assert "… and 440 more rows" in text
+    assert reader.tags.count("tr") == 61
     assert "… and 12335 more failures" in text
     assert " … and 100000 more characters" in "".join(reader.texts["config"])
     assert [v[:15] for _, n, v in reader.attributes if n == "src"] == ["data:image/png;"]
