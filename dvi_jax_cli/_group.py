@@ -68,13 +68,15 @@ app = typer.Typer(
             "dvi-jax run run.toml                one trajectory, report, pictures",
             "dvi-jax sweep sweep.toml --resume   many; continues after an interruption",
             "dvi-jax fit fit.toml --json         parameters from observations",
+            "dvi-jax report results/run          one HTML page about the results",
             "dvi-jax paper --out paper-out       the paper's figures and numbers",
             "dvi-jax --install-completion        completion in bash, zsh, fish",
         ]
     ),
 )
 
-RUNS, INVERSE, CHECKING, START = "Trajectories", "From data", "Checks", "Getting started"
+RUNS, INVERSE, RESULTS = "Trajectories", "From data", "Results"
+CHECKING, START = "Checks", "Getting started"
 
 
 def _show_version(is_requested: bool) -> None:

@@ -1,4 +1,4 @@
-"""Commands that work on a TOML file: run, sweep, fit, discover, bound; sweep status and verify."""
+"""Commands that work on a TOML file or its results: run, sweep, fit, discover, bound, report."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from ._group import INVERSE, RUNS, app
+from ._group import INVERSE, RESULTS, RUNS, app
 from ._session import RESUME_HINT, Session, command
 from ._show import progress_bar
 
@@ -206,3 +206,34 @@ def bound(session: Session, config: Config, out: Out = None, force: Force = Fals
 
     session.note(f"reading {config}")
     session.finish_report(bound_file(config, out=out, force=force))
+
+
+# Results of all kinds
+
+
+@command(app, "report", RESULTS)
+def report(
+    session: Session,
+    path: Annotated[
+        Path, typer.Argument(metavar="PATH", help="Folder of results, store, or saved file.")
+    ],
+    out: Annotated[Path | None, typer.Option(help="The page; PATH.html if not given.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace the page if it exists.")] = False,
+) -> None:
+    """Write one HTML page about results: statuses, pictures, tables, how to repeat the work.
+
+    PATH is what run, sweep, fit, discover or bound wrote, or a file of Solution.save. The page
+    needs no other file and no server.
+
+    Exit code 0: done, whatever the results are. 1: the page cannot be written. 2: there are no
+    results, or they are damaged.
+
+    Examples
+        dvi-jax report results/kepler              writes results/kepler.html
+        dvi-jax report results/sweep.zarr --out sweep.html
+        dvi-jax report orbit.npz --force
+    """
+    session.unwritten = "the page cannot be written"
+    from .work.html_report import html_report
+
+    session.finish_report(html_report(path, out, force))

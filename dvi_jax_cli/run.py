@@ -6,6 +6,7 @@
 from ._errors import InputError as InputError
 from .work.discover import discover_file as discover_file
 from .work.fit import fit_file as fit_file
+from .work.html_report import html_report as html_report
 from .work.library import library_tables as library_tables
 from .work.run import run_file as run_file
 from .work.sweep import (

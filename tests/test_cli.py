@@ -23,7 +23,18 @@ from dvi_jax_cli import app
 from dvi_jax_cli._new import notebook
 from dvi_jax_cli._session import CODES, Session
 
-COMMANDS = ["new", "systems", "schema", "run", "sweep", "fit", "discover", "bound", "paper"]
+COMMANDS = [
+    "new",
+    "systems",
+    "schema",
+    "run",
+    "sweep",
+    "fit",
+    "discover",
+    "bound",
+    "report",
+    "paper",
+]
 COMMANDS += ["certify", "verify", "info", "explore"]
 
 CALLS = """

@@ -4,10 +4,12 @@ The matrix runs over `systems.LIBRARY`: a system is tested by being registered t
 its `Problem` says of it. Its equations need a line in `derivations.py`.
 """
 
+import copy
 import functools
 import itertools
 import json
 import math
+import pickle
 import re
 from pathlib import Path
 
@@ -767,3 +769,51 @@ def test_the_table_in_the_documentation_says_the_same(name):
     holds = {None: "–", 0.0: "yes", 1.0: "ε = 1"}
     assert exact.strip() == holds[made.exact_epsilon if made.exact else None]
     assert source.strip() == made.source
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_problem_can_be_pickled_and_copied(name):
+    try:
+        problem = systems.LIBRARY[name]()
+    except EphemerisMissing:
+        pytest.skip("there is no ephemeris")
+    for again in (pickle.loads(pickle.dumps(problem)), copy.deepcopy(problem)):
+        assert type(again) is systems.Problem
+        assert repr(again) == repr(problem)
+        assert np.array_equal(again.q0, problem.q0)
+        assert again.observables.keys() == problem.observables.keys()
+        for kind in ("observables", "adiabatic", "symmetries", "flow_symmetries", "parameters"):
+            assert getattr(again, kind).keys() == getattr(problem, kind).keys()
+        if again.check is not None:  # the checks have their limits
+            again.check(again.q0, again.p0, again.args)
+            with pytest.raises((ValueError, TypeError)):
+                again.check(np.full_like(np.asarray(again.q0), np.nan)[None], again.p0, again.args)
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[] if n == "duffing" else pytest.mark.slow) for n in NAMES]
+)
+def test_a_pickled_problem_integrates_to_the_same_bits(name):
+    try:
+        problem = systems.LIBRARY[name]()
+    except EphemerisMissing:
+        pytest.skip("there is no ephemeris")
+    again = pickle.loads(pickle.dumps(problem))
+    method = dvi.Rattle() if problem.system.constraint is not None else dvi.Strang()
+    runs = [
+        dvi.integrate(p, num_steps=5, method=method, observe=p.observables, throw=False)
+        for p in (problem, again)
+    ]
+    for first, second in zip(*map(jax.tree.leaves, runs), strict=True):
+        assert np.array_equal(first, second, equal_nan=True)
+    for kind in ("symmetries", "flow_symmetries"):
+        for key, generator in getattr(problem, kind).items():
+            for part in ("xi", "eta"):
+                f, g = (getattr(x, part, None) for x in (generator, getattr(again, kind)[key]))
+                if callable(f):
+                    point = (0.3, problem.q0 + 0.1, problem.p0 + 0.2, problem.args)
+                    assert np.array_equal(f(*point), g(*point))
+    for key, invariant in problem.adiabatic.items():
+        if invariant.smaller is not None:
+            other = again.adiabatic[key].smaller(2.0)
+            assert repr(other) == repr(invariant.smaller(2.0))

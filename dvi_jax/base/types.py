@@ -5,6 +5,8 @@ from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 from jaxtyping import Array, Float, Inexact
 
+from .printing import printable
+
 Scalar: TypeAlias = Float[Array, ""]
 State: TypeAlias = Inexact[Array, "..."]
 Args: TypeAlias = Any
@@ -19,6 +21,7 @@ ConstraintFn: TypeAlias = Callable[..., Any]
 """``g(q, args)`` → shape (m,), zero for the positions allowed."""
 
 
+@printable
 class Interval(NamedTuple):
     """One interval of the time grid: its ends and its length."""
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from ..base.checks import whole
 from ..base.keywords import checked_keywords
+from ..base.printing import printable
 from ..base.signature import accepts
 from ..integration.integrate import integrate
 from ..integration.keywords import IntegrationSettings
@@ -19,6 +20,7 @@ from ..problem.noise import Brownian
 from ..problem.system import System, check_system, of_problem
 
 
+@printable
 class InvariantDiffusion(eqx.Module):
     """Drift and diffusion of an invariant I: coefficients A and B of the Fokker–Planck equation
     ∂f/∂t = −∂(A f)/∂I + ½ ∂²(B f)/∂I².

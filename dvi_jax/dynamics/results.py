@@ -11,6 +11,7 @@ from jaxtyping import Array
 
 from lanewise.jaxprs.jaxapi import is_traced
 
+from ..base.printing import fields_of, first_lines
 from ..base.results import RESULTS, status_code, status_counts
 
 
@@ -123,18 +124,13 @@ class WithStatus(eqx.Module):
 
     def __repr__(self: Any) -> str:
         """Statuses, and every array: its values if they are few, else its shape."""
-        fields = {name: x for name, x in vars(self).items() if name not in ("result", "run")}
         if is_traced(status_code(self.result)):
             return eqx.tree_pformat(self)
         lines = [f"{type(self).__name__}: {status_counts(self.status)}"]
-        for name, value in fields.items():
-            text = eqx.tree_pformat(value)
-            if eqx.is_array_like(value) and np.size(value) <= 8:
-                text = np.array2string(np.asarray(value), precision=8, separator=", ")
-            elif isinstance(value, eqx.Module):
-                text = type(value).__name__
-            lines.append(f"  {name} = {' '.join(text.split())}")
-        return "\n".join(lines)
+        for name, text in fields_of(self):
+            if name not in ("result", "run"):
+                lines.append(f"  {name} = {text}")
+        return first_lines("\n".join(lines), "")
 
 
 def with_code(code: Any) -> FREQUENCY_RESULTS:

@@ -16,6 +16,7 @@ from lanewise.jaxprs.jaxapi import is_traced
 from ..base.checks import finite, positive, whole
 from ..base.inputs import as_parameter, as_scalar, start_state
 from ..base.keywords import checked_keywords
+from ..base.printing import printable
 from ..base.reads import Reads, reads
 from ..base.results import RESULTS, status_name
 from ..base.types import Args, Scalar, State
@@ -253,6 +254,7 @@ class Return(WithStatus):
     result: SECTION_RESULTS
 
 
+@printable
 class ReturnMap(eqx.Module):
     r"""Poincaré map: the map of a section g(t, q, p, args) = 0 onto itself.
 

@@ -14,6 +14,7 @@ from jaxtyping import Array, PyTree
 
 from ..base.checks import fraction, instance, whole
 from ..base.keywords import checked_keywords
+from ..base.printing import printable
 from ._fit import fit
 from .checks import package, same_parameters
 from .keywords import LossSettings, SampleSettings, select
@@ -30,6 +31,7 @@ _R_HAT = 1.01  # Largest R̂ of chains that count as mixed (Vehtari et al. 2021)
 _TRUNCATION_LIMIT = 0.01  # Fraction of draws with a truncated path above which a warning is given
 
 
+@printable
 @dataclass(frozen=True, eq=False)
 class Samples:
     r"""Samples of a posterior.
@@ -118,8 +120,6 @@ class Samples:
             lines.append(f"  … and {len(self.names) - 40} more")
         lines += [f"explored: {self.explored}"] if self.explored else []
         return "\n".join(lines + self.warnings)
-
-    __repr__ = __str__
 
     def to_xarray(self) -> Any:
         """A `DataTree` with groups ``posterior`` and ``sample_stats``, dimensions chain and draw,

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..base.checks import instance, positive
 from ..base.keywords import checked_keywords
+from ..base.printing import printable
 from ..problem.system import System
 from ._fit import fit
 from .elimination import Elimination, Removal, places
@@ -37,6 +38,7 @@ _PROVISIONAL_ERROR = 1e-3  # Provisional errors of data without any, in scatters
 _OF_ALL = ("max_steps", "tolerance", "check_units", "progress")
 
 
+@printable
 @dataclass(frozen=True, eq=False)
 class Identification:
     r"""Terms of an unknown force that the data support.
@@ -96,8 +98,6 @@ class Identification:
             lines.append(f"rms {self.fit.rms:.4g}, {self.fit.num_observed} values{chi2}")
             lines += filter(None, [contradiction(self.fit)])
         return "\n".join(lines)
-
-    __repr__ = __str__
 
 
 @checked_keywords

@@ -14,6 +14,7 @@ from lanewise.jaxprs.jaxapi import is_traced
 
 from ..base.checks import instance, whole
 from ..base.inputs import as_parameter, start_state
+from ..base.printing import printable
 from ..base.results import RESULTS
 from ..base.signature import accepts
 from ..discover.functions.basis import check_step_size
@@ -43,6 +44,7 @@ _REASONS = {
 }
 
 
+@printable
 class Model(eqx.Module):
     """A system with its known quantities; parameters replace them or add the unknown ones.
 

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..base.checks import argument_names, function, one_of, positive, refuse_unknown, whole
+from ..base.printing import printable
 from ..base.types import Args, Scalar, State
 from .checks import require_shape
 
@@ -27,6 +28,7 @@ def _momentum(q: Any, p: Any) -> Any:
     return p
 
 
+@printable
 class NetworkForce(eqx.Module):
     r"""A force from two networks: a potential and a damping.
 

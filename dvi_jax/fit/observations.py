@@ -9,6 +9,7 @@ import numpy as np
 
 from ..base.checks import finite, instance
 from ..base.inputs import refuse_unit_or_mask
+from ..base.printing import printable
 from ..base.signature import accepts, signature_of
 from .checks import require_all, require_shape
 
@@ -22,6 +23,7 @@ OBSERVABLES: dict[str, Callable[..., Any]] = {
 }
 
 
+@printable
 @dataclass(frozen=True, eq=False)
 class Observations:
     r"""Observed values along one arc of a trajectory.

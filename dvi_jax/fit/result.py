@@ -12,6 +12,7 @@ from jaxtyping import PyTree
 
 from ..base.checks import one_of
 from ..base.files import publish_npz, read_npz
+from ..base.printing import printable
 from .checks import same_parameters
 from .optimise import FIT_RESULTS, NAMES, name_of
 from .parameters import make_space
@@ -32,6 +33,7 @@ _SIGNIFICANCE = 1e-4  # Probability of a χ² below which the residuals contradi
 _LITTLE = 0.1  # A model that explains less of the variance is little better than a constant
 
 
+@printable
 @dataclass(frozen=True, eq=False)
 class FitResult:
     r"""Parameters fitted to observations.
@@ -191,8 +193,6 @@ class FitResult:
         if self.result != FIT_RESULTS.converged and str(FIT_RESULTS[self.result]):
             lines.append(str(FIT_RESULTS[self.result]))
         return "\n".join(lines)
-
-    __repr__ = __str__
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write everything but functions into one file (.npz), atomically."""

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..base.files import publish_npz, read_npz, user_file, user_path
+from ..base.printing import printable
 from ..base.progress import bar_of, reporter
 from ..base.reads import reads
 from .checks import same_fit
@@ -29,6 +30,7 @@ _LISTS = ("leaves", "extra")
 """Fields of `Position` that a checkpoint has as arrays; the others are in its header."""
 
 
+@printable
 @dataclass(frozen=True)
 class FitProgress:
     """Progress of a fit: `step` of the optimiser of at most `max_steps`, the `stage` and its

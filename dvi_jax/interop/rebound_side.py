@@ -12,6 +12,7 @@ import dvi_jax as dvi
 from ..base.checks import instance, positive
 from ..base.files import user_file
 from ..base.inputs import refuse_unit_or_mask
+from ..base.printing import printable
 from ..systems import Problem
 from ..systems._problem import at_end
 from ..systems.n_body import (
@@ -58,6 +59,7 @@ def softened_hamiltonian(t0, t1, q0, p1, args):
     return energy_of(q0, p1, args, args["softening"])
 
 
+@printable
 @dataclass(frozen=True)
 class ReboundProblem(Problem):
     """A `Problem` of N bodies from a simulation of REBOUND.

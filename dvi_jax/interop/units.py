@@ -12,6 +12,7 @@ import numpy as np
 import dvi_jax as dvi
 
 from ..base.checks import instance
+from ..base.printing import printable
 from ..systems import Problem
 from .extras import require, system_of
 
@@ -109,6 +110,7 @@ class UnitSystem:
         return f"UnitSystem(q [{self.q}], p [{self.p}], t [{self.t}]{of_args})"
 
 
+@printable
 @dataclass(frozen=True, eq=False)
 class UnitSolution:
     """A computed trajectory with units.

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Int, PyTree
 from lanewise.jaxprs.jaxapi import is_traced
 
 from ..base.checks import require, whole
+from ..base.printing import printable
 from ..base.results import RESULTS
 from ..base.types import Args, Interval, Scalar, State
 from ..methods.step import Equations
@@ -20,6 +21,7 @@ from ..observe.solution import Save, Solution
 from ..problem.system import System
 
 
+@printable
 class Place(NamedTuple):
     """A trajectory before step k: initial time t0, initial step size h, k, and the state."""
 

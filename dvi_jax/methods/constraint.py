@@ -16,6 +16,7 @@ from lanewise.jaxprs.dependence import depends_on
 from lanewise.jaxprs.jaxapi import is_traced
 
 from ..base.inputs import as_parameter, as_scalar, start_state
+from ..base.printing import printable
 from ..base.results import RESULTS
 from ..base.types import Args, Interval, Scalar, State
 from ..engine.newton import RootInfo, RootSolver, find_root
@@ -172,6 +173,7 @@ def _require_independent(defects: _Defects) -> None:
         )
 
 
+@printable
 class Projection(NamedTuple):
     """A consistent state (q, p), and its distances |q − q0| and |p − p0| from the given state."""
 

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 import lanewise
 from lanewise.jaxprs.dependence import depends_on
 
+from ..base.printing import printable
 from ..base.results import RESULTS, first_failure
 from ..base.types import Args, Interval, Scalar, State
 from ..engine.newton import Newton, RootInfo, RootSolver, find_root, no_residual, worse
@@ -42,6 +43,7 @@ def no_step_yet(like: State) -> StepInfo:
     return StepInfo(good, *no_solve(like)[1:3])
 
 
+@printable
 class Equations(eqx.Module):
     """The discrete equations of a system for one ε and one set of args.
 

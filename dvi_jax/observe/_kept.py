@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..base.checks import array, one_of, whole
+from ..base.printing import printable
 from ..base.signature import check_takes
 from ..base.types import Args, Scalar, State
 from ._reductions import Reduction
@@ -87,6 +88,7 @@ def from_rows(rows: Float[Array, "... width"], shape: tuple[int, ...]) -> tuple[
     return rows[..., 0] >= 1, StepStart(rows[..., 1], rows[..., 2], rows[..., 3], q0, p0)
 
 
+@printable
 class Crossings(eqx.Module):
     """The points where a trajectory crossed a section, in the order of time.
 

@@ -14,6 +14,7 @@ from lanewise.jaxprs.jaxapi import is_traced
 
 from ..base.checks import in_order, only_one, whole
 from ..base.inputs import as_times
+from ..base.printing import first_lines
 from ..base.results import RESULTS, status_counts, status_name
 from ..base.signature import check_takes
 from ..base.types import State
@@ -239,7 +240,7 @@ class Solution(eqx.Module):
             lines.append(f"  p_final = {np.array2string(np.asarray(self.p_final), **short)}")
         if self.observed is not None:
             lines.append(f"  observed = {eqx.tree_pformat(self.observed)}")
-        return "\n".join(lines)
+        return first_lines("\n".join(lines), "")
 
 
 _OTHER_NAMES = {

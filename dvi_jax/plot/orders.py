@@ -268,7 +268,8 @@ def drift_bound(
 
     - `bound`: a `DriftBound`. `invariant`: the number k of its I_k.
     - `steps`: numbers of steps N, shape (S,), the first is 0. `values`: I_k after these steps,
-      shape (S,) or (..., S) for several trajectories; the largest change so far is drawn.
+      shape (S,) or (..., S) for several trajectories, (0, S) for none; the largest change so far
+      is drawn.
 
     A grey line marks the number of steps within which trajectories are proved to stay in the
     domain. The legend counts changes that are not finite, and those exactly 0. **Returns** the
@@ -295,7 +296,7 @@ def drift_bound(
         "changes are exactly 0": (changes == 0).sum(),
     }
     look = entry(f"computed, {len(changes)} trajectories", color=COLOURS[0], lw=1)
-    legend(axis, new, [look, *counts_text(marks)])
+    legend(axis, new, [*[look][: len(changes)], *counts_text(marks)])
     return axis
 
 

@@ -6,10 +6,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from ..base.printing import printable
 from ..base.types import Scalar, State
 from ..discover.functions.basis import BoundBasis
 
 
+@printable
 class ExactInvariant(eqx.Module):
     r"""An invariant Σ_m ε^m Σ_j c_mj φ_j(q, p, t) with exact c = (n_0 + n_1 h + n_2 h²)/d.
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..base.checks import finite
 from ..base.files import publish, user_path
+from ..base.printing import first_lines
 
 
 class DriftBound(eqx.Module):
@@ -122,6 +123,9 @@ class DriftBound(eqx.Module):
         publish(user_path("path", path), (json.dumps(self.certificate, indent=1) + "\n").encode())
 
     def __repr__(self) -> str:
+        return first_lines(self.report(), "")
+
+    def __str__(self) -> str:
         return self.report()
 
     def report(self) -> str:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from ..base.printing import printable
 from .plan import SweepPlan
 from .program import Sweep, SweepProgram
 from .variables import Variable
@@ -17,6 +18,7 @@ SECONDS_TO_COMMIT = 0.02
 LONG = 2.0  # Seconds of a task above which it is not measured a third time
 
 
+@printable
 @dataclasses.dataclass(frozen=True)
 class SweepCost:
     """Estimated cost of a sweep.

@@ -19,6 +19,7 @@ import numpy as np
 from lanewise.jaxprs.jaxapi import x64_enabled
 
 from ..base.machine import processors
+from ..base.printing import printable
 from ..base.results import STATUS_NAMES
 from .layout import STATUS
 from .plan import SweepTask
@@ -30,6 +31,7 @@ _WRITES = 2  # Tasks for each thread that may wait to be written
 GOOD = ("successful", "stopped")
 
 
+@printable
 @dataclass(frozen=True)
 class SweepProgress:
     """Progress of a sweep.

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..base.checks import all_finite, array, finite as finite, positive as positive
+from ..base.printing import first_lines
 from ..discover.functions.generators import Generator
 from ..discover.symmetries.library import time_translation
 from ..observe import InSlowTime as InSlowTime
@@ -105,7 +106,7 @@ class Problem:
             ("symmetries", [*self.symmetries, *self.flow_symmetries]),
         ):
             lines += [f"  {label}: {', '.join(names)}"] * bool(names)
-        return "\n".join(lines)
+        return first_lines("\n".join(lines), "")
 
     def __post_init__(self):
         if self.system.epsilon is None:  # what is known is known of the unperturbed motion
@@ -126,6 +127,14 @@ class Problem:
                     f"{field_name} of {self.name!r} must be names in {kind}, {sorted(names)}, got "
                     f"{name!r}."
                 )
+
+
+def bound(function: Callable[..., Any], *values: Any) -> Callable[..., Any]:
+    """The function with its first arguments fixed. Unlike a local function it can be pickled; it
+    has the name, without underscores in front, and the docstring of the function."""
+    fixed = functools.partial(function, *values)
+    fixed.__dict__.update(__name__=function.__name__.lstrip("_"), __doc__=function.__doc__)
+    return fixed
 
 
 Check = Callable[[str, Any], Any]
@@ -223,27 +232,25 @@ def nonzero(name: str, value: Any) -> None:
 
 def interval(low: float, high: float) -> Check:
     """A check for a number in the open interval."""
+    return bound(_check_interval, low, high)
 
-    def check(name: str, value: Any) -> None:
-        if not low < finite(name, value) < high:
-            raise ValueError(
-                f"{name} must be between {low} and {high} (both excluded), got {value}."
-            )
 
-    return check
+def _check_interval(low: float, high: float, name: str, value: Any) -> None:
+    if not low < finite(name, value) < high:
+        raise ValueError(f"{name} must be between {low} and {high} (both excluded), got {value}.")
 
 
 def vector(size: int) -> Check:
     """A check for `size` finite numbers."""
+    return bound(_check_vector, size)
 
-    def check(name: str, value: Any) -> None:
-        try:
-            array(name, np.asarray(value, float), (size,), integers=True)
-        except TypeError as error:
-            raise ValueError(f"{name}: {error}.") from None
-        all_finite(name, value)
 
-    return check
+def _check_vector(size: int, name: str, value: Any) -> None:
+    try:
+        array(name, np.asarray(value, float), (size,), integers=True)
+    except TypeError as error:
+        raise ValueError(f"{name}: {error}.") from None
+    all_finite(name, value)
 
 
 @dataclass(frozen=True)
@@ -326,12 +333,12 @@ def over_times(
 @functools.cache  # observables are compared by identity: another function would compile again
 def at_end(hamiltonian: Callable[..., Any]) -> Callable[..., Any]:
     """The observable `energy` of a Hamiltonian."""
+    return bound(_energy, hamiltonian)
 
-    def energy(t0, t1, q0, p0, q1, p1, args):
-        """H(t1, q1, p1) at the end of the step: the energy of the continuous system."""
-        return hamiltonian(t1, t1, q1, p1, args)
 
-    return energy
+def _energy(hamiltonian, t0, t1, q0, p0, q1, p1, args):
+    """H(t1, q1, p1) at the end of the step: the energy of the continuous system."""
+    return hamiltonian(t1, t1, q1, p1, args)
 
 
 _THERMAL = Langevin(lambda args: args["friction"], lambda args: args["temperature"])
@@ -351,13 +358,13 @@ def thermal(
 @functools.cache
 def configurational(hamiltonian: Callable[..., Any]) -> Callable[..., Any]:
     """The observable `configurational`, from which a temperature follows."""
+    return bound(_configurational, hamiltonian)
 
-    def configurational(t0, t1, q0, p0, q1, p1, args):
-        """(|∂V/∂q|², ∂²V/∂q·∂q) at t1, shape (2,); the ratio of their canonical means is T."""
-        slope, curvature = (
-            d(lambda q: hamiltonian(t1, t1, q, jnp.zeros_like(q), args))(q1)
-            for d in (jax.grad, jax.hessian)
-        )
-        return jnp.stack([jnp.sum(slope**2), jnp.trace(curvature)])
 
-    return configurational
+def _configurational(hamiltonian, t0, t1, q0, p0, q1, p1, args):
+    """(|∂V/∂q|², ∂²V/∂q·∂q) at t1, shape (2,); the ratio of their canonical means is T."""
+    slope, curvature = (
+        d(lambda q: hamiltonian(t1, t1, q, jnp.zeros_like(q), args))(q1)
+        for d in (jax.grad, jax.hessian)
+    )
+    return jnp.stack([jnp.sum(slope**2), jnp.trace(curvature)])

@@ -5,7 +5,7 @@ import numpy as np
 
 from ..discover.symmetries.library import rotation
 from . import _guiding_centre as guiding_centre
-from ._problem import Parameter, Problem, Start, library_problem, nonzero, positive
+from ._problem import Parameter, Problem, Start, bound, library_problem, nonzero, positive
 
 
 def vector_potential(q, args):
@@ -92,6 +92,10 @@ def dipole_field(radius: float = 50.0) -> Problem:
         units={"q": "1", "p": "1", "t": "1/gyrofrequency", "energy": "1"},
         source="Störmer 1907, Arch. Sci. Phys. Nat. 24, 5; Northrop 1963",
         invariants=("stoermer_integral",),
-        adiabatic=guiding_centre.adiabatic("gyroradius over R", lambda x: dipole_field(radius / x)),
+        adiabatic=guiding_centre.adiabatic("gyroradius over R", bound(_smaller, radius)),
         symmetries={"rotation": rotation(0, 1)},
     )
+
+
+def _smaller(radius, factor):
+    return dipole_field(radius / factor)

@@ -4,7 +4,17 @@ import jax.numpy as jnp
 
 from ..discover.symmetries.library import rotation
 from . import _guiding_centre as guiding_centre
-from ._problem import Parameter, Problem, Start, at_end, finite, library_problem, nonzero, positive
+from ._problem import (
+    Parameter,
+    Problem,
+    Start,
+    at_end,
+    bound,
+    finite,
+    library_problem,
+    nonzero,
+    positive,
+)
 
 
 def vector_potential(q, args):
@@ -94,8 +104,10 @@ def magnetic_mirror(length: float = 20.0, distance: float = 2.0) -> Problem:
         observables=[canonical_angular_momentum, magnetic_moment, corrected_moment, bounce_action],
         source="our own choice of field; Northrop 1963, The Adiabatic Motion of Charged Particles",
         invariants=("canonical_angular_momentum",),
-        adiabatic=guiding_centre.adiabatic(
-            "gyroradius over ℓ", lambda factor: magnetic_mirror(length / factor, distance / factor)
-        ),
+        adiabatic=guiding_centre.adiabatic("gyroradius over ℓ", bound(_smaller, length, distance)),
         symmetries={"rotation": rotation(0, 1)},
     )
+
+
+def _smaller(length, distance, factor):
+    return magnetic_mirror(length / factor, distance / factor)

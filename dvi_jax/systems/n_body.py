@@ -10,7 +10,7 @@ from ..base.checks import array, finite, require
 from ..discover.functions.generators import Generator
 from ..discover.symmetries.library import rotation, scaling, space_translation, time_translation
 from ..problem.system import System
-from ._problem import DIMENSIONLESS, Problem, at_end, check_parameter, check_shape, parameter
+from ._problem import DIMENSIONLESS, Problem, at_end, bound, check_parameter, check_shape, parameter
 
 _PLACE, _SPEED = np.array([0.97000436, -0.24308753]), np.array([-0.93240737, -0.86473146])
 EIGHT_POSITIONS = np.array([_PLACE, -_PLACE, np.zeros(2)])
@@ -150,14 +150,15 @@ def symmetries(dim: int) -> dict[str, Generator]:
 
 def _boost(direction):
     """`library.boost` for the masses of args: ξ = t v, η_i = m_i v."""
+    return Generator(xi=bound(_xi, direction), eta=bound(_eta, direction))
 
-    def shift(t, q, p, args):
-        return t * jnp.broadcast_to(jnp.asarray(direction, q.dtype), q.shape)
 
-    def push(t, q, p, args):
-        return jnp.asarray(args["masses"], p.dtype)[:, None] * jnp.asarray(direction, p.dtype)[None]
+def _xi(direction, t, q, p, args):
+    return t * jnp.broadcast_to(jnp.asarray(direction, q.dtype), q.shape)
 
-    return Generator(xi=shift, eta=push)
+
+def _eta(direction, t, q, p, args):
+    return jnp.asarray(args["masses"], p.dtype)[:, None] * jnp.asarray(direction, p.dtype)[None]
 
 
 def n_body(

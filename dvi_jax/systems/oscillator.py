@@ -6,7 +6,16 @@ from ..discover.functions.generators import Generator
 from ..discover.symmetries.library import scaling
 from ._problem import Problem, Start, System, at_end, library_problem, over_times
 
-PHASE = Generator(xi=lambda t, q, p, args: p, eta=lambda t, q, p, args: -q)
+
+def _xi(t, q, p, args):
+    return p
+
+
+def _eta(t, q, p, args):
+    return -q
+
+
+PHASE = Generator(xi=_xi, eta=_eta)
 """The rotation of the phase plane, ξ = p, η = −q: the flow of the oscillator."""
 
 

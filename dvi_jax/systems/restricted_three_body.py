@@ -87,8 +87,8 @@ def restricted_three_body() -> Problem:
     """
     q0 = lagrange_points(EARTH_MOON)[3] + [0.01, 0.0, 0.02]
     bodies = {
-        "the large body": lambda args: (-args["mu"], 0.0, 0.0),
-        "the small body": lambda args: (1 - args["mu"], 0.0, 0.0),
+        "the large body": _large_body,
+        "the small body": _small_body,
     }
     meaning = "share of the small body in the mass of both, at most 1/2 [1]"
     return library_problem(
@@ -102,3 +102,11 @@ def restricted_three_body() -> Problem:
         source="Szebehely 1967, Theory of Orbits, 1 and 4",
         invariants=("jacobi_constant",),
     )
+
+
+def _large_body(args):
+    return -args["mu"], 0.0, 0.0
+
+
+def _small_body(args):
+    return 1 - args["mu"], 0.0, 0.0

@@ -159,7 +159,11 @@ def rigid_body() -> Problem:
             "turn_about_z": space_translation([0.0, 0.0, 1.0]),
             "scaling": scaling(q=0.0, p=1.0, t=-1.0),
             # ∂/∂K: the energy is independent of the direction of the angular momentum.
-            "tilt": Generator(eta=lambda t, q, p, args: jnp.zeros_like(p).at[2].set(1.0)),
+            "tilt": Generator(eta=_tilt),
         },
         exact=exact,
     )
+
+
+def _tilt(t, q, p, args):
+    return jnp.zeros_like(p).at[2].set(1.0)

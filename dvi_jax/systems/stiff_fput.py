@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..base.checks import whole
-from ._problem import Adiabatic, Parameter, Problem, Start, library_problem, positive
+from ._problem import Adiabatic, Parameter, Problem, Start, bound, library_problem, positive
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -50,5 +50,9 @@ def stiff_fput(m: int = 3, omega: float = 50.0) -> Problem:
         parameters={"omega": Parameter(omega, "frequency of the stiff springs [1/time]")},
         observables=[stiff_energies, oscillatory_energy],
         source="Hairer, Lubich & Wanner 2006, Geometric Numerical Integration, I.5.1",
-        adiabatic={"oscillatory_energy": Adiabatic("1/ω", 1, lambda x: stiff_fput(m, omega / x))},
+        adiabatic={"oscillatory_energy": Adiabatic("1/ω", 1, bound(_smaller, m, omega))},
     )
+
+
+def _smaller(m, omega, factor):
+    return stiff_fput(m, omega / factor)

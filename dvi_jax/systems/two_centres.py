@@ -49,8 +49,8 @@ def two_centres() -> Problem:
     Rev.* 75, 29.
     """
     centres = {
-        "the first centre": lambda args: (0.0, 0.0, args["d"]),
-        "the second centre": lambda args: (0.0, 0.0, -args["d"]),
+        "the first centre": _first_centre,
+        "the second centre": _second_centre,
     }
     return library_problem(
         hamiltonian,
@@ -67,3 +67,11 @@ def two_centres() -> Problem:
         invariants=("axial_angular_momentum", "euler_integral"),
         symmetries={"rotation": rotation(0, 1)},
     )
+
+
+def _first_centre(args):
+    return 0.0, 0.0, args["d"]
+
+
+def _second_centre(args):
+    return 0.0, 0.0, -args["d"]

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..discover.functions.generators import Generator
-from ._problem import Parameter, Problem, Start, library_problem, nonzero, over_times, vector
+from ._problem import Parameter, Problem, Start, bound, library_problem, nonzero, over_times, vector
 
 
 def vector_potential(q, args):
@@ -50,11 +50,15 @@ def pseudomomentum(t0, t1, q0, p0, q1, p1, args):
 def _translation(axis):
     """ξ = a, η = e B × a/2: a translation with the change of gauge that A needs."""
     a = np.eye(3)[axis]
+    return Generator(xi=bound(_xi, a), eta=bound(_eta, a))
 
-    def push(t, q, p, args):
-        return args["charge"] * args["B"] / 2 * jnp.asarray([-a[1], a[0], 0.0], p.dtype)
 
-    return Generator(xi=lambda t, q, p, args: jnp.asarray(a, q.dtype), eta=push)
+def _xi(a, t, q, p, args):
+    return jnp.asarray(a, q.dtype)
+
+
+def _eta(a, t, q, p, args):
+    return args["charge"] * args["B"] / 2 * jnp.asarray([-a[1], a[0], 0.0], p.dtype)
 
 
 @over_times((3,))

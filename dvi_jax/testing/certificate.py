@@ -8,6 +8,7 @@ from typing import Any
 import dvi_jax as dvi
 
 from ..base.checks import instance, positive
+from ..base.printing import printable
 from .candidate import Candidate
 from .check import CHECKS, Measured, require_double_precision, selected_names
 from .controls import CONTROLS, Control
@@ -19,6 +20,7 @@ _WORKERS = 2
 """Methods at a time: while one compiles another is traced."""
 
 
+@printable
 @dataclass(frozen=True)
 class Certificate:
     """The measurements of `certify`.

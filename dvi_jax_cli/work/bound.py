@@ -52,7 +52,10 @@ def bound_file(path: str | Path, out: str | Path | None = None, force: bool = Fa
         if bound is not None:
             bound.save(report.path("certificate.json"))
             report.contents |= _contents(bound)
-            report.notes, report.tables = str(bound).splitlines(), _tables(bound)
+            report.notes = str(bound).splitlines()
+            report.tables = bound_tables(report.contents)
+        else:
+            report.contents["message"] = report.message
         report.write_contents("bound.json")
     report.summary = f"{time.perf_counter() - began:.1f} s"
     return report
@@ -63,10 +66,11 @@ def _contents(bound: dvi.DriftBound) -> dict[str, Any]:
     return {"formulas": bound.formulas} | {name: getattr(bound, name) for name in names}
 
 
-def _tables(bound: dvi.DriftBound) -> list[TextTable]:
-    rows = []
-    for k, b in enumerate(bound.per_step):
-        steps = bound.num_steps(bound.change, k)
-        rows.append([f"I_{k}", f"{b:.2e}", f"{bound.rounding[k]:.2e}", f"{steps:.3g}"])
-    columns = ["invariant", "change in a step ≤", "by rounding ≤", f"steps for {bound.change:g}"]
+def bound_tables(contents: dict[str, Any]) -> list[TextTable]:
+    """The bound of each invariant, from the contents of bound.json."""
+    rows, change = [], contents["change"]
+    for k, (b, r) in enumerate(zip(contents["per_step"], contents["rounding"], strict=True)):
+        steps = change // (b + r) if b + r else np.inf
+        rows.append([f"I_{k}", f"{b:.2e}", f"{r:.2e}", f"{steps:.3g}"])
+    columns = ["invariant", "change in a step ≤", "by rounding ≤", f"steps for {change:g}"]
     return [TextTable("Proved bounds", columns, rows)]

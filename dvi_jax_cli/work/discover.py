@@ -69,7 +69,7 @@ def discover_file(
             labels = {f"invariant {i + 1}": order for i, order in enumerate(orders)}
             slopes = [None if exact else discovery.order + 1 for exact in discovery.exact]
             report.draw({"drifts.png": lambda: plot.drift_orders(labels, slopes)})
-    report.tables = _tables(report.contents)
+    report.tables = discovery_tables(report.contents)
     report.notes = str(discovery).splitlines()
     report.summary = f"{seconds:.1f} s (compilation included)"
     return report
@@ -155,7 +155,8 @@ def _invariant(result: dvi.Discovery, orders: list[dvi.DriftOrder], i: int) -> d
     return invariant | {"drift": drift | {"starts": len(mask), "starts_kept": int(mask.sum())}}
 
 
-def _tables(contents: dict[str, Any]) -> list[TextTable]:
+def discovery_tables(contents: dict[str, Any]) -> list[TextTable]:
+    """The invariants with their residuals and drifts, from the contents of invariants.json."""
     rows = []
     for i, invariant in enumerate(contents["invariants"], 1):
         residual = f"{np.max(invariant['residuals']):.1e}"

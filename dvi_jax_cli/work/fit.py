@@ -81,9 +81,9 @@ def fit_file(
         report.contents |= {"columns": columns, "trajectory": status}
         report.write_contents("fit.json")
         if file.output.plots:
-            report.draw(_pictures(columns, result))
+            report.draw(fit_pictures(columns, result))
     steps = f"{report.contents['steps']} steps"
-    report.tables, report.notes = _tables(result, report.contents), _notes(result)
+    report.tables, report.notes = fit_tables(result, report.contents), fit_notes(result)
     seconds = f"{result.seconds:.1f} s (compilation included)"
     report.summary = f"{result.status} after {steps}, {seconds}"
     if result.status != "converged":
@@ -262,7 +262,8 @@ def _contents(arguments: dict[str, Any], result: dvi.FitResult) -> dict[str, Any
     }
 
 
-def _tables(result: dvi.FitResult, contents: dict[str, Any]) -> list[TextTable]:
+def fit_tables(result: dvi.FitResult, contents: dict[str, Any]) -> list[TextTable]:
+    """Parameters, correlations and residuals; `contents`: those of fit.json."""
     values = zip(contents["parameters"].items(), numbers_in_words(result), strict=True)
     rows = [[name, words, f"{p['start']:.6g}"] for (name, p), words in values]
     tables = [TextTable("Parameters, ± standard error", ["name", "value", "start"], rows)]
@@ -294,7 +295,8 @@ def _correlation_table(names: list[str], matrix: np.ndarray) -> TextTable:
     return TextTable("Correlations", ["", *names[:-1]], rows[1:])
 
 
-def _notes(result: dvi.FitResult) -> list[str]:
+def fit_notes(result: dvi.FitResult) -> list[str]:
+    """What a reader must know before using the numbers."""
     notes = [f"not determined by the data: {words}" for words in result.undetermined]
     notes += [words[0].upper() + words[1:] for words in remarks(result)]
     if result.at_bounds:
@@ -318,7 +320,7 @@ def _notes(result: dvi.FitResult) -> list[str]:
     return notes
 
 
-def _pictures(columns: list[str], result: dvi.FitResult) -> dict[str, Callable[[], Any]]:
+def fit_pictures(columns: list[str], result: dvi.FitResult) -> dict[str, Callable[[], Any]]:
     """File name → function that draws, for the pictures that this fit can have."""
     pictures: dict[str, Callable[[], Any]] = {
         "data.png": partial(plot.fit_against_data, result, names=columns),

@@ -21,8 +21,10 @@ from .output import Report, open_report
 from .schema import RunFile
 from .system import Source, find_source
 
-_IMAGES = ("invariants.png", "trajectory.png", "orbits.png", "ephemeris.png")
-RESULT_FILES = ("trajectory.npz", "report.json", *_IMAGES)
+SOLAR_IMAGES = ("orbits.png", "ephemeris.png", "invariants.png")
+"""Pictures of the comparison with an ephemeris."""
+
+RESULT_FILES = ("trajectory.npz", "report.json", "trajectory.png", *SOLAR_IMAGES)
 """Every file that a run may write; with `force` these are replaced and nothing else."""
 
 
@@ -62,13 +64,15 @@ def run_file(
     with report.writing():
         changes = [observe(run, observables[x], result.observed[x]) for x in ("own", "always")]
         observed, conservation = changes
+        units = dict(source.problem.units) if source.problem is not None else {}
+        report.contents |= {"name": source.name, "units": units}
         _describe(report, result, observed, seconds)
         arrays = {name: np.asarray(getattr(result, name)) for name in ("ts", "qs", "ps", "hs")}
         values = {f"observed/{name}": np.asarray(result.observed["own"][name]) for name in observed}
         report.write_arrays("trajectory.npz", arrays | values)
         ts, qs, ps, _ = arrays.values()
         if source.jd is None:
-            pictures = _pictures(source, ts, qs, ps, observed)
+            pictures = run_pictures(report.contents, ts, qs, ps, observed)
         else:
             pictures = solar.report(report, source.jd + (ts - ts[0]), qs, ps, run, conservation)
         report.write_contents("report.json")
@@ -106,10 +110,7 @@ def _describe(
         "stats": stats | {"seconds": seconds, "saved": len(solution.ts)},
         "results": {name: entry.summary() for name, entry in observed.items()},
     }
-    if observed:
-        title = "Observables (changes: relative, where the start is not zero)"
-        columns = ["name", "reduction", "start", "end or value", "change"]
-        report.tables.append(TextTable(title, columns, [_row(*item) for item in observed.items()]))
+    report.tables += run_tables(report.contents["results"])
     report.summary = f"{steps} steps in {seconds:.1f} s (compilation included)"
     if solution.status != "successful":
         report.message = (
@@ -118,12 +119,18 @@ def _describe(
         )
 
 
-def _row(name: str, observable: Observed) -> list[str]:
-    summary = observable.summary()
-    if observable.reduction:
-        has_relative = "relative" in summary and observable.is_relative
+def run_tables(results: dict[str, Any]) -> list[TextTable]:
+    """The table of the observables, from their entries in the report; none without observables."""
+    title = "Observables (changes: relative, where the start is not zero)"
+    columns = ["name", "reduction", "start", "end or value", "change"]
+    return [TextTable(title, columns, [_row(*x) for x in results.items()])] if results else []
+
+
+def _row(name: str, summary: dict[str, Any]) -> list[str]:
+    if "reduction" in summary:
+        has_relative = "relative" in summary and summary["scale"] != 1.0
         relative = f"{summary['relative']:.2e}" if has_relative else ""
-        return [name, observable.reduction, "", _number(summary["value"], 4), relative]
+        return [name, summary["reduction"], "", _number(summary["value"], 4), relative]
     change = f"{summary['largest_saved_change']:.2e}"
     return [name, "", _number(summary["start"]), _number(summary["end"]), change]
 
@@ -138,12 +145,19 @@ def _number(value: Any, limit: int = 0) -> str:
     return f"|…| = {np.linalg.norm(value):.3g}"
 
 
-def _pictures(
-    source: Source, ts: np.ndarray, qs: np.ndarray, ps: np.ndarray, observed: dict[str, Observed]
+def run_pictures(
+    contents: dict[str, Any],
+    ts: np.ndarray,
+    qs: np.ndarray,
+    ps: np.ndarray,
+    observed: dict[str, Observed],
 ) -> dict[str, Any]:
-    """File name → function that draws: the trajectory, and the changes of the observables."""
-    units = dict(source.problem.units) if source.problem is not None else {}
-    unit, title = units.get("t", ""), source.name.replace("_", " ")
+    """File name → function that draws: the trajectory, and the changes of the observables.
+
+    - `contents`: of the report, with `name` and `units`.
+    """
+    units = contents["units"]
+    unit, title = units.get("t", ""), contents["name"].replace("_", " ")
     time = "t" if unit in ("", "1") else f"t [{unit}]"
     of_state = units.get("q"), units.get("p")
     pictures = {"trajectory.png": lambda: plot.trajectory(ts, qs, ps, time, *of_state, title)}

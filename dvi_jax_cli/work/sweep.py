@@ -15,11 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import dvi_jax as dvi
+from dvi_jax.base.files import publish
 from dvi_jax.sweep.bar import progress_display as shown_bar
 from dvi_jax.sweep.variables import RESERVED_NAMES
 
 from .._errors import InputError, as_input_error, describe, require, user_path
-from .._show import TextTable
+from .._show import TextTable, json_types
 from .expressions import parse_method
 from .observables import read_observables
 from .output import Report, recorder
@@ -29,6 +30,9 @@ from .table import AN_AXIS, NO_KEY, AxisTable, axes_in, read_file, select
 
 _MAX_NUMBERS = 10_000_000
 """Numbers up to which results are read again for the table at the end."""
+
+REQUEST = ".toml.json"
+"""File of a store with the path and the values of the TOML file that it is computed from."""
 
 _NOT_OURS = ("config", "config_sha256", "Conventions", "coordinates", "dvi_jax_sweep")
 """Attributes of a store that say how to read it, not where it comes from."""
@@ -59,7 +63,7 @@ def sweep_file(
     `SweepInterrupted` after Ctrl-C.
     """
     path = user_path("CONFIG", path)
-    file, _ = read_file(path, SweepFile)
+    file, raw = read_file(path, SweepFile)
     key = "--store" if store is not None else "output.store"
     folder = user_path(key, store or file.output.store or f"results/{path.stem}.zarr")
     _check_folder(folder, key, resume)
@@ -67,7 +71,12 @@ def sweep_file(
     last: list[dvi.SweepProgress] = []
     with shown_bar(progress) as show, source.at_work(str(path), "swept", _RULE, last):
         arguments |= {"store": folder, "threads": threads, "progress": recorder(last, show)}
-        result = dvi.sweep(**arguments)
+        try:
+            result = dvi.sweep(**arguments)
+        finally:  # also after Ctrl-C: a store of its own sweep has progress
+            if last:
+                contents = json_types({"sweep": str(path), "config": raw}, str)
+                publish(folder / REQUEST, json.dumps(contents, ensure_ascii=False).encode())
     return _report(result, last[0])
 
 
@@ -101,16 +110,14 @@ def _check_folder(folder: Path, key: str, resume: bool) -> None:
 
 
 def _report(result: dvi.SweepResult, last: dvi.SweepProgress) -> Report:
-    counts, observed = result.status_counts(), _statistics(result)
+    counts, observed = result.status_counts(), statistics_of(result)
     tasks = {"done": last.tasks_done, "all": last.num_tasks}
     contents = {"store": str(result.path), "dims": result.dims, "tasks": tasks}
     contents |= {"trajectories": counts, "seconds": last.seconds, "steps_per_second": last.rate}
     report = Report(contents, [_status_table(counts)])
     if observed:
         report.contents["observed"] = observed
-        rows = [[name, *(f"{x:.6g}" for x in values.values())] for name, values in observed.items()]
-        title = "Observables of the successful trajectories"
-        report.tables.append(TextTable(title, ["name", "min", "median", "max"], rows))
+    report.tables += observed_tables(observed)
     speed = f"{last.seconds:.1f} s (compilation included), {last.rate:.3g} steps/s"
     report.summary = (
         f"{last.num_lanes} trajectories in {last.num_tasks} tasks; "
@@ -119,7 +126,7 @@ def _report(result: dvi.SweepResult, last: dvi.SweepProgress) -> Report:
     return report
 
 
-def _statistics(result: dvi.SweepResult) -> dict[str, dict[str, float]]:
+def statistics_of(result: dvi.SweepResult) -> dict[str, dict[str, float]]:
     """Name → least, median and largest over the successful trajectories. Empty without observables,
     and where there is too much to read."""
     data = result.to_xarray()
@@ -137,6 +144,13 @@ def _statistics(result: dvi.SweepResult) -> dict[str, dict[str, float]]:
             words = ("min", "median", "max")
             statistics[name] = {word: float(getattr(np, word)(values)) for word in words}
     return statistics
+
+
+def observed_tables(statistics: dict[str, dict[str, float]]) -> list[TextTable]:
+    """The table of `statistics_of`; none without observables."""
+    rows = [[name, *(f"{x:.6g}" for x in values.values())] for name, values in statistics.items()]
+    title = "Observables of the successful trajectories"
+    return [TextTable(title, ["name", "min", "median", "max"], rows)] if rows else []
 
 
 def _status_table(counts: dict[str, int]) -> TextTable:
@@ -281,7 +295,8 @@ def _start(table: Any, source: Source) -> dvi.starts.Starts:
 # Stores
 
 
-def _open_store(store: str | Path) -> dvi.SweepResult:
+def open_store(store: str | Path) -> dvi.SweepResult:
+    """The results in a store. **Raises** `InputError` for another directory."""
     with as_input_error("STORE", "the directory of a sweep", dvi.StoreError):
         return dvi.open_sweep(store)
 
@@ -291,7 +306,7 @@ def sweep_status(store: str | Path) -> Report:
 
     **Raises** `InputError` where there is no store.
     """
-    result = _open_store(store)
+    result = open_store(store)
     assert result.path is not None
     steps, records = _steps(result), list(result.records())
     statuses = sum((Counter(record["statuses"]) for record in records), Counter())
@@ -358,7 +373,7 @@ def verify_store(store: str | Path, progress: Callable[[int, int], None] | None 
 
     **Raises** `InputError` where there is no store, `OSError` where it cannot be changed.
     """
-    verification = _open_store(store).verify(progress)
+    verification = open_store(store).verify(progress)
     contents = {"store": str(store), **verification._asdict()}
     counts = f"{verification.sound} tasks are correct, {len(verification.bad)} bad"
     summary = f"{store}: {counts}, {verification.todo} to do"

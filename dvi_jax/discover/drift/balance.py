@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from lanewise.jaxprs.jaxapi import is_traced
 
+from ...base.printing import printable
 from ...base.types import Args
 from ...observe.solution import Solution
 from ...problem.system import System, check_system
@@ -17,6 +18,7 @@ from ..functions.generators import Generator, LatticePoint
 from ..symmetries.noether import AdiabaticInvariant, Gauge, lattice_defect, noether_identity
 
 
+@printable
 class Balance(NamedTuple):
     """The drift of I_z over each step and its causes, shape (steps − 1,), [unit of I / time].
 

@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...base.printing import printable
 from .exponents import LEAST_POINTS, Exponent, line, line_interval, resolving_range
 
 # A point counts when its drift is this many times the one that does not come from ε.
@@ -23,6 +24,7 @@ def _of_fit(name: str, doc: str) -> Any:
     return property(lambda self: getattr(self.fit, name), doc=doc)
 
 
+@printable
 class DriftOrder(NamedTuple):
     """The measured order in ε of a drift; print it for a report.
 
@@ -123,6 +125,7 @@ def _of_each_order(name: str, doc: str, axis: int = 0) -> Any:
     return property(stack, doc=doc)
 
 
+@printable
 class DriftSurface(NamedTuple):
     """Drifts over ε and h, with their orders; print it for a table.
 

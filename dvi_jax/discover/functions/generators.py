@@ -8,11 +8,13 @@ import jax
 import jax.numpy as jnp
 
 from ...base.checks import function
+from ...base.printing import printable
 from ...base.types import Args, Scalar, State
 
 T = TypeVar("T")
 
 
+@printable
 class LatticePoint(NamedTuple):
     """One point (t, q, p) of the lattice."""
 

@@ -12,6 +12,7 @@ from jaxtyping import Array
 
 from ...base.files import publish_npz, read_npz
 from ...base.precision import refuse_double_without_x64
+from ...base.printing import printable
 from ...base.types import State
 from ..functions.basis import AbstractBasis, BoundBasis, bind_basis
 from ..functions.sampling import SamplePoints, values_at
@@ -25,6 +26,7 @@ _ILL = 1e8  # Condition number of a basis from which on formulas have lost half 
 _FORMAT = 2  # Of a file
 
 
+@printable
 class Discovery(eqx.Module):
     """Result of `discover_invariants`.
 

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ...base.printing import printable
 from ..algebra.block_triangular import TruncatedSVD, larger_than
 from ..algebra.echelon import reduced_echelon
 from ..algebra.nullspace import RANK, orthonormal_range
@@ -19,6 +20,7 @@ _DEGREE = 4  # A law is sought as a polynomial of the leading-order term up to t
 _POWERS = ("1", *(power_text("I", k) for k in range(1, _DEGREE + 1)))
 
 
+@printable
 class DriftLaw(NamedTuple):
     """The averaged drift of a leading-order invariant I without a correction at some order.
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ...base.printing import printable
 from ...base.types import Scalar, State
 from ...problem.system import System
 from ..functions.basis import BoundBasis
@@ -19,6 +20,7 @@ from .digits import closed_form, digits_of
 _DROP = 1e-9  # Formulas leave out terms below this share of the largest
 
 
+@printable
 class InvariantSeries(eqx.Module):
     r"""An invariant Σ_m ε^m c_m·φ(q, p, t), as an observable.
 

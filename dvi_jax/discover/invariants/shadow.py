@@ -15,6 +15,7 @@ from lanewise.jaxprs.jaxapi import is_traced
 
 from ...base.checks import instance, whole
 from ...base.precision import refuse_double_without_x64
+from ...base.printing import printable
 from ...base.types import Args, Scalar, State
 from ...problem.system import System, check_system
 from ..algebra.taylor import taylor_coefficients
@@ -22,6 +23,7 @@ from ..functions.basis import check_step_size
 from ..functions.generators import require_bound
 
 
+@printable
 class ShadowHamiltonian(eqx.Module):
     r"""The modified Hamiltonian of a discrete Hamiltonian, as a series up to h^order.
 

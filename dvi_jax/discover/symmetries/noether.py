@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 
+from ...base.printing import printable
 from ...base.types import Args, Scalar
 from ...problem.energies import disturbing_work, incoming_energy, outgoing_energy
 from ...problem.system import System, check_system
@@ -78,6 +79,7 @@ def noether_identity(
     return identity
 
 
+@printable
 class AdiabaticInvariant(eqx.Module):
     r"""The adiabatic invariant of order z of a series of generators and gauges.
 

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import equinox as eqx
 import numpy as np
 
+from ...base.printing import printable
 from ..algebra.nullspace import in_units_of
 from ..functions.basis import BoundBasis
 from ..functions.generators import Generator
@@ -17,6 +18,7 @@ _COARSE = 1e-5  # A search that cannot see terms of this relative size says so
 _ROUND_OFF = 1e-9  # Terms of a formula below this share of the largest are left out
 
 
+@printable
 class Symmetry(eqx.Module):
     r"""A symmetry Σ_m ε^m X_m that `find_symmetries` found; as formulas: `str`.
 
@@ -119,6 +121,7 @@ def _series(basis: BoundBasis, coefficients: np.ndarray) -> str:
     return in_powers_of_epsilon(texts)
 
 
+@printable
 class Symmetries(eqx.Module):
     """Result of `find_symmetries`; print it for a report. A sequence of `Symmetry`.
 

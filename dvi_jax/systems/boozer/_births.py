@@ -10,6 +10,7 @@ import numpy as np
 from jax import lax
 
 from ...base.checks import function, instance
+from ...base.printing import printable
 from ...sweep.starts import Seeded
 from ._field import Field, polynomial
 from ._particles import GuidingCentres, check_range
@@ -41,6 +42,7 @@ def volume_element(field: Field, s: Any, theta: Any, zeta: Any) -> Any:
     return jnp.abs(polynomial(field.G, s) + current) / field.strength(s, theta, zeta) ** 2
 
 
+@printable
 class Births(Seeded):
     r"""Random guiding centres of particles at birth: isotropic, at the rate of the reactions.
 

@@ -19,6 +19,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ...base.checks import instance, positive
+from ...base.printing import printable
 from ...engine.bracket import bracketed_root
 from ._field import Field, polynomial
 from ._motion import Angles, Regular, flux, speed_along
@@ -33,6 +34,7 @@ _RESOLVED = 1e-7
 """Largest relative difference between the sums over all points and over every third."""
 
 
+@printable
 class Well(NamedTuple):
     """The ζ of both bounce points of a well of |B| on a field line; NaN if there is no such well"""
 

@@ -9,12 +9,14 @@ from jaxtyping import Array, Float
 
 from ...base.checks import all_finite, array, finite, positive, whole
 from ...base.keywords import checked_keywords
+from ...base.printing import printable
 from ._sums import Coefficients, Shape, total
 
 Profile = Float[Array, " d"]
 """A polynomial in s: its coefficients, the constant first."""
 
 
+@printable
 class Field(eqx.Module):
     r"""A magnetic field in Boozer coordinates (ψ, θ, ζ), right-handed, s = ψ/ψ_edge.
 

@@ -11,12 +11,14 @@ from jaxtyping import Array
 
 from ...base.checks import positive
 from ...base.files import user_file, user_path
+from ...base.printing import printable
 from ._field import Field, fitted_modes, from_modes, from_surfaces
 from ._sums import Coefficients, Shape, total
 
 DATA = Path(__file__).with_name("data")
 
 
+@printable
 class Geometry(eqx.Module):
     """Cylindrical coordinates of the points (s, θ, ζ) of a field.
 

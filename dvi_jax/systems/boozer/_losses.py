@@ -5,8 +5,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...base.checks import positive
+from ...base.printing import printable
 
 
+@printable
 class LossFraction(NamedTuple):
     """Fraction of lost particles at times: the estimate, and the ends of its interval."""
 

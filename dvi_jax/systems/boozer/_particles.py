@@ -11,6 +11,7 @@ from jaxtyping import Array
 from numpy.polynomial.polynomial import polyval
 
 from ...base.checks import array, instance, one_of, positive
+from ...base.printing import printable
 from ...observe import Crossings, Section, Stop
 from ...problem.discretise import discretise
 from ...problem.system import System
@@ -26,6 +27,7 @@ _ALPHA_MASS = 6.6446573357e-27
 _CHARTS = ("regular", "angles")
 
 
+@printable
 class Coordinates(NamedTuple):
     """Boozer coordinates of guiding centres: s = ψ/ψ_edge, θ and ζ [rad], v∥ [m/s], |B| [T]."""
 
@@ -36,6 +38,7 @@ class Coordinates(NamedTuple):
     B: Array
 
 
+@printable
 class GuidingCentres(eqx.Module):
     r"""Guiding centres of particles of one species and one energy in a magnetic field.
 

@@ -7,6 +7,7 @@ from typing import Any, Literal, TypedDict, Unpack, get_args
 
 from ...base.checks import finite, instance, one_of, positive, whole
 from ...base.keywords import checked_keywords
+from ...base.printing import printable
 from ._maps import KICKS, RingPart
 
 Model = Literal["paraxial", "exact"]
@@ -15,6 +16,7 @@ C = 299792458.0
 """Speed of light [m/s]."""
 
 
+@printable
 @dataclasses.dataclass(frozen=True)
 class Element:
     """One element: its name and kind, its parts in order, and its parameters by name."""

@@ -16,6 +16,7 @@ from jaxtyping import Array
 import lanewise
 
 from ...base.checks import finite, positive, whole
+from ...base.printing import printable
 from ...base.progress import bar_of, reporter
 from ...dynamics.frequencies import frequencies, frequency_diffusion
 from ._maps import Particle
@@ -33,6 +34,7 @@ _BATCH = 4096
 """Particles tracked in one call: more do not become faster, and progress is reported between."""
 
 
+@printable
 class FrequencyMap(NamedTuple):
     """Tunes of particles: `tune`, the fractional parts in the first half of the turns, and `second`
     in the second half, shape (…, 2); `diffusion`, log10 of the length of their difference, shape

@@ -14,6 +14,7 @@ import lanewise
 from lanewise.jaxprs.jaxapi import is_traced
 
 from ...base.checks import instance
+from ...base.printing import printable
 from ._maps import KICKS, Particle, RingPart, distinct, forward
 from ._parts import pieces_of
 from ._ring import Ring
@@ -30,6 +31,7 @@ _UNSTABLE = 1e-11
 """Area in phase space of an eigenvector of length 1, below which it is round-off."""
 
 
+@printable
 class Optics(NamedTuple):
     r"""Linear motion about the closed orbit, at n places: the entrance of each element and the end.
 

@@ -2,6 +2,7 @@
 
 import difflib
 import fnmatch
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -14,6 +15,7 @@ from lanewise.jaxprs.jaxapi import is_traced
 
 from ...base.checks import instance, positive, whole
 from ...base.precision import require_double
+from ...base.printing import printable, short
 from ._elements import C, Element
 from ._maps import RingPart, distinct
 
@@ -33,6 +35,7 @@ class RingStructure(eqx.Module):
     """(number of the part, number of the element), in the order of passage."""
 
 
+@printable
 class Ring(eqx.Module):
     r"""A ring or a cell of one: elements in the order of passage.
 
@@ -92,6 +95,20 @@ class Ring(eqx.Module):
         }  # fmt: skip
         self.columns = {name: jnp.asarray(column) for name, column in columns.items()}
         self.extra = {}
+
+    def __str__(self) -> str:
+        counts = Counter(self.kinds).most_common()
+        length = "" if is_traced(self.columns["length"]) else f", {self.places[-1]:.8g} m"
+        lines = [
+            f"Ring of {len(self)} elements{length}, energy {self.energy:.6g} eV, "
+            f"{self.periods} period{'s' * (self.periods != 1)}",
+            f"  kinds: {', '.join(f'{n} {kind}' for kind, n in counts)}",
+            f"  names: {short(', '.join(dict.fromkeys(self.names)))[1:-1]}",
+            f"  parameters: {', '.join(self.columns)}",
+        ]
+        if self.extra:
+            lines.append(f"  perturbed, times epsilon: {', '.join(self.extra)}")
+        return "\n".join(lines)
 
     # --- elements and their parameters ------------------------------------------------------------
 

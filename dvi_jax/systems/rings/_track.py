@@ -16,12 +16,14 @@ from lanewise.jaxprs.jaxapi import linear_map
 
 from ...base.checks import instance, whole
 from ...base.machine import results_memory
+from ...base.printing import printable
 from ...integration.reconstruction import fold_blocks
 from ._maps import Particle
 from ._ring import Ring
 from ._turn import Passage, coordinates, start
 
 
+@printable
 class Tracked(NamedTuple):
     """Particles after some turns.
 
