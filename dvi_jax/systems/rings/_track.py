@@ -144,12 +144,14 @@ def _track(ring: Ring, z: Array, epsilon: Array, counts: tuple[int, int, int]):
         def derivative(numbers, primals, change):
             return jax.jvp(lambda *primals: forward(numbers, *primals)[0], primals, change)[1]
 
-        def push(residuals, change, function=functools.partial(lanewise.call, derivative)):
-            axes = (None, (None, 0, 0), (None, 0, 0))
-            return jax.vmap(function, axes)(passage.numbers, residuals[0], change)
+        axes = (None, (None, 0, 0), (None, 0, 0))
+
+        def push(residuals, change):
+            batch = jax.vmap(functools.partial(lanewise.call, derivative), axes)
+            return batch(passage.numbers, residuals[0], change)
 
         def definition(residuals, change):  # machine code has no transpose
-            return push(residuals, change, derivative)
+            return jax.vmap(derivative, axes)(passage.numbers, residuals[0], change)
 
         def pull(residuals, cotangent):
             primals, states = residuals
