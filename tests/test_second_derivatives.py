@@ -142,3 +142,20 @@ def test_second_derivatives_of_runs(arithmetic, adjoint):
     expected = [(f(k + 1e-5) - f(k - 1e-5)) / 2e-5 for k in K]
     result = seconds(in_run(adjoint, arithmetic))
     np.testing.assert_allclose(result, np.repeat(np.array(expected)[:, None], 4, 1), rtol=1e-7)
+
+
+@pytest.mark.slow
+def test_second_derivatives_of_tracked_particles():
+    from dvi_jax.systems import rings
+
+    parts = [rings.quadrupole("QF", 0.5, k1=0.6), rings.sextupole("S", 0.2, 3.0)]
+    ring = rings.Ring([*parts, rings.drift("D", 2.0)])
+    z = jnp.array([1e-2, 1e-3, 2e-3, -1e-3, 0.0, 1e-3])
+
+    def f(k):
+        return rings.track(ring, k * z, 2).z @ jnp.array([1.0, 2.0, -1.0, 0.5, 0.0, 0.0])
+
+    slope = jax.jit(jax.grad(f))
+    expected = (slope(0.9 + 1e-4) - slope(0.9 - 1e-4)) / 2e-4
+    for order in ORDERS[:3]:
+        np.testing.assert_allclose(jax.jit(order(f))(0.9), expected, rtol=1e-6)

@@ -95,7 +95,8 @@ SYSTEM = dvi.System(lambda t0, t1, q0, p1, args: (p1 @ p1 + q0 @ q0) / 2)
 HOW = {"h": 0.1, "num_steps": 3}
 CALLS = {
     "integrate": lambda: dvi.integrate(SYSTEM, [1.0], [0.0], **HOW).status,
-    "sweep": lambda: dvi.sweep(SYSTEM, [1.0], [0.0], epsilon=[0.1], **HOW, progress=False),
+    "sweep": lambda: dvi.sweep(SYSTEM, [1.0], [0.0], epsilon=[0.1], **HOW, progress=False,
+                               save=dvi.Save(final=True)).status,
     "search": lambda: dvi.discover_invariants(SYSTEM, dvi.Polynomials(2), order=0, h=0.1,
                                               samples=None),
     "drift": lambda: dvi.drift_order(SYSTEM, lambda q, p: p @ p, [1.0], [0.0], **HOW,

@@ -88,10 +88,11 @@ def integrate(
       or implicit; or `Variational()`, whose steps solve (14), and h is the first of them.
     - `save`: the states to save, see `Save`.
     - `observe`: pytree of observables → array: functions ``(q, p)`` or ``(t, q, p, args)`` of the
-      state, or ``(t0, t1, q0, p0, q1, p1, args)`` of a step. A function of the state is evaluated
-      at every saved state, one of a step on the steps that end at a saved state; in `MaxDrift`,
-      `Range`, `Trend`, `Mean`, `Last` it is reduced over every step in constant memory. A
-      `Section` finds the crossings of a surface.
+      state, or ``(t0, t1, q0, p0, q1, p1, args)`` of a step. They receive the time t, also where
+      H_D receives τ = εt (``slow_time=True``): ``systems.InSlowTime(f)`` is an observable with τ.
+      A function of the state is evaluated at every saved state, one of a step on the steps that
+      end at a saved state; in `MaxDrift`, `Range`, `Trend`, `Mean`, `Last` it is reduced over every
+      step in constant memory. A `Section` finds the crossings of a surface.
     - `layout`: machine code or arrays, see `Layout`.
     - `stop`: a `Stop`, the condition of an early end (a collision, an escape); or None.
     - `adjoint`: the computation of reverse-mode gradients: `Reversible`, `Checkpointed`, `Direct`.

@@ -1,7 +1,10 @@
-"""Degrees of freedom that a map does not couple: each block is searched alone, in its own motion.
+"""Degrees of freedom that a map couples weakly or not: each block is searched in its own motion.
 
 The change in a step of a function of slow degrees of freedom is small against what fast ones move
-by, so that the whole search takes every expansion of their motion for conserved.
+by, so that the whole search takes every expansion of their motion for conserved. Functions of
+blocks that are not coupled are therefore searched alone. Where a weak coupling remains, what is
+conserved is found together, and functions of one block are tested in its motion with all others
+held: a function of the block that is conserved wherever the others are is conserved there too.
 """
 
 from typing import Any, NamedTuple
@@ -9,12 +12,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..algebra.nullspace import orthonormal_range, singular_vectors
-from ..functions.sampling import SamplePoints, spreads
+from ..functions.sampling import Displacements, SamplePoints, spreads
 from .changes import Changes
 from .search import NullSpaces, null_spaces
 
 _ROUNDING = 64 * np.finfo(float).eps  # Displacements that differ by less are the same
-_INSIDE = 1e-4  # Functions whose slopes are below this share of their size do not depend on a block
+_WEAK = 1e-2  # A coupling by which a step changes by less than this share of itself is weak
+INSIDE = 1e-4  # Functions whose slopes are below this share of their size do not depend on a block
 
 
 def _columns(x: np.ndarray) -> np.ndarray:
@@ -69,60 +73,100 @@ class Block(NamedTuple):
         )
 
     def recompute(self, samples: SamplePoints, h: Any) -> Changes:
-        """Of order 0 at other states of the block, or with another step. All others are where they
-        move least: they may be too fast for a step that is larger for this block."""
-        whole, calm = self.whole, self._calmest()
-        q, p = (np.repeat(_columns(x)[[calm]], len(samples.t), 0) for x in whole.samples[:2])
-        q[:, self.places], p[:, self.places] = samples.q, samples.p
-        shape = -1, *whole.samples.q.shape[1:]
-        points = SamplePoints(q.reshape(shape), p.reshape(shape), samples.t)
-        return self.restrict(whole.recompute(points, h))
+        """Of order 0 at other states of the block, or with another step, where all others are
+        held."""
+        points = with_others_held(samples, self.places, self.whole.displacements)
+        return self.restrict(self.whole.recompute(points, h))
 
-    def _calmest(self) -> int:
-        """The sample at which the other degrees of freedom move least."""
-        relative = np.abs(self.whole.shifts[:, :-1]) / spreads(self.whole.samples)
-        return int(np.argmin(np.max(np.delete(relative, self.coordinates[:-1], axis=1), axis=1)))
+    def number_inside(self, leading: np.ndarray, conditions: Any) -> int:
+        """How many combinations of orthonormal columns, shares of the orthonormal functions of the
+        whole search, are functions of this block."""
+        R = conditions.R / np.linalg.norm(conditions.R, 2)
+        own = orthonormal_range(R[:, self.functions], 1e-12)
+        cosines = singular_vectors(own.T @ leading[: len(R)])[0]
+        return int(np.sum(cosines > 1 - INSIDE**2))
 
 
-def blocks_of(changes: Changes) -> list[Block]:
-    """The blocks that a map does not couple; none where it couples all degrees of freedom, or
-    samples lie on the manifold of a constraint."""
+def with_others_held(
+    samples: SamplePoints, places: np.ndarray, steps: Displacements
+) -> SamplePoints:
+    """States of some degrees of freedom, with all others where they move least: they may be too
+    fast for a step that is larger for these."""
+    n = steps.samples.q[0].size
+    relative = np.abs(steps.values) / spreads(steps.samples)
+    others = np.delete(relative, np.concatenate([places, n + places]), axis=1)
+    calm = int(np.argmin(np.max(others, axis=1)))
+    q, p = (np.repeat(_columns(x)[[calm]], len(samples.t), 0) for x in steps.samples[:2])
+    q[:, places], p[:, places] = samples.q, samples.p
+    shape = -1, *steps.samples.q.shape[1:]
+    return SamplePoints(q.reshape(shape), p.reshape(shape), samples.t)
+
+
+def blocks_of(changes: Changes) -> tuple[list[Block], list[Block]]:
+    """The blocks that a map does not couple, and others that it couples weakly; none where all
+    degrees of freedom are coupled, or samples lie on the manifold of a constraint."""
     if changes.step_map.is_constrained or changes.samples.q[0].size < 2:
-        return []
-    groups, depends = _groups(_couplings(changes)), np.any(changes.slopes != 0, axis=0)
-    if len(groups) == 1:
-        return []
-    blocks = []
-    for group in groups:
+        return [], []
+    couples, strengths = _couplings(changes)
+    apart, nearly_apart = groups(couples), weak_groups(strengths)
+    weak = [x for x in nearly_apart if not any(np.array_equal(x, y) for y in apart)]
+    return _blocks(changes, apart), _blocks(changes, weak)
+
+
+def _blocks(changes: Changes, places: list[np.ndarray]) -> list[Block]:
+    """The blocks that have functions, without one of all degrees of freedom."""
+    depends, blocks = np.any(changes.slopes != 0, axis=0), []
+    for group in places:
         block = Block(changes, group, np.zeros(0, int))
         others = np.delete(depends, block.coordinates, axis=1)
         functions = np.flatnonzero(~others.any(axis=1))
-        if depends[functions].any():
+        if len(others[0]) and depends[functions].any():
             blocks.append(block._replace(functions=functions))
-    return blocks
+    return [b for b in blocks if len(b.functions) * 2 <= len(changes.good)]
 
 
-def _couplings(changes: Changes) -> np.ndarray:
+def _couplings(changes: Changes) -> tuple[np.ndarray, np.ndarray]:
     """Whether the step of degree of freedom i depends on j, shape (n, n): it differs where those of
-    j are exchanged between samples."""
+    j are exchanged between samples; and by which share of the larger of the two steps."""
     (q, p, t), n = changes.samples, changes.samples.q[0].size
     z = np.concatenate([_columns(q), _columns(p)], axis=1)
     limits = _ROUNDING * np.max(np.abs(z) + np.abs(z + changes.shifts[:, :-1]), axis=0)
-    couples = np.zeros((n, n), bool)
+    couples, strengths = np.zeros((n, n), bool), np.zeros((n, n))
     for j in range(n):
         other = z.copy()
         other[:, [j, n + j]] = np.roll(z[:, [j, n + j]], 1, axis=0)
         points = SamplePoints(other[:, :n].reshape(q.shape), other[:, n:].reshape(q.shape), t)
         moved = changes.recompute(points).shifts[:, :-1]
         # Where the step is not defined elsewhere, nothing shows that it couples nothing.
-        differs = np.any(~(np.abs(moved - changes.shifts[:, :-1]) <= limits), axis=0)
+        differences = np.nan_to_num(np.abs(moved - changes.shifts[:, :-1]), nan=np.inf)
+        differs = np.any(differences > limits, axis=0)
         couples[:, j] = differs[:n] | differs[n:]
-    return couples | np.eye(n, dtype=bool)
+        strengths[:, j] = largest(differences, changes.samples)
+    return couples, relative_to(strengths, changes.displacements)
 
 
-def _groups(couples: np.ndarray) -> list[np.ndarray]:
+def largest(differences: np.ndarray, samples: SamplePoints) -> np.ndarray:
+    """Of differences of (q, p), (S, 2n), the largest of each degree of freedom, (n,), in units of
+    the spread of the samples."""
+    shares = np.max(differences, axis=0) / spreads(samples)
+    return np.max(shares.reshape(2, -1), axis=0)
+
+
+def relative_to(strengths: np.ndarray, steps: Displacements) -> np.ndarray:
+    """What degrees of freedom i change by because of j, (n, n), as a share of the larger of their
+    steps."""
+    own = largest(np.abs(steps.values), steps.samples)
+    return strengths / np.maximum(np.maximum(own, own[:, None]), np.finfo(float).tiny)
+
+
+def weak_groups(strengths: np.ndarray) -> list[np.ndarray]:
+    """Degrees of freedom that only weak couplings connect with others; see `relative_to`."""
+    return groups(strengths > _WEAK)
+
+
+def groups(couples: np.ndarray) -> list[np.ndarray]:
     """The connected components of a graph."""
-    reach = (couples | couples.T).astype(float)
+    reach = (couples | couples.T | np.eye(len(couples), dtype=bool)).astype(float)
     for _ in range(len(reach).bit_length()):
         reach = (reach @ reach > 0).astype(float)
     rows = {tuple(np.flatnonzero(row).tolist()): None for row in reach}
@@ -160,16 +204,12 @@ class BlockSearch(NamedTuple):
         """Of candidates of the whole search, columns with orthonormal leading-order terms: those
         that are no function of a quantity that this block does not conserve."""
         size = len(conditions.R)
-        R = conditions.R / np.linalg.norm(conditions.R, 2)
-        own = orthonormal_range(R[:, self.block.functions], 1e-12)
-        cosines = singular_vectors(own.T @ leading[:size])[0]
-        if np.sum(cosines > 1 - _INSIDE**2) <= self.null.count:
+        if self.block.number_inside(leading, conditions) <= self.null.count:
             return leading
         slopes, V = singular_vectors(self.foreign_slopes(conditions) @ leading[:size])
-        return leading @ V[slopes <= _INSIDE].T
+        return leading @ V[slopes <= INSIDE].T
 
 
-def search_blocks(changes: Changes) -> list[BlockSearch]:
-    """What is conserved in the functions of each block alone."""
-    blocks = [b for b in blocks_of(changes) if len(b.functions) * 2 <= len(changes.good)]
-    return [BlockSearch(block, null_spaces(block.restrict(changes))) for block in blocks]
+def search_block(block: Block) -> BlockSearch:
+    """What is conserved in the functions of a block that is not coupled."""
+    return BlockSearch(block, null_spaces(block.restrict(block.whole)))

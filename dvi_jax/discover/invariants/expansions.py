@@ -269,3 +269,42 @@ def _larger(kind: str, factor: float, count: Callable[[float], int | None]) -> L
             return Larger(kind, factor, number)
         factor /= 10
     return Larger(kind, np.nan, 0)
+
+
+def at_larger_sizes(
+    samples: SamplePoints,
+    h: float,
+    step: DisplacementFunction,
+    count: CountFunction,
+    kinds: str = "equal step box",
+    is_constrained: bool = False,
+) -> tuple[Larger, ...]:
+    """How many are conserved in equal steps of q and p, at a larger step and in a larger box; of
+    these the `kinds`."""
+    larger: tuple[Larger, ...] = ()
+    if "equal" in kinds:
+        samples, larger = in_equal_steps(samples, h, step, count)
+    larger += at_larger_step(samples, h, step, count)
+    if "box" in kinds:
+        larger += in_larger_box(samples, h, step, count, is_constrained)
+    return larger
+
+
+def larger_of_block(
+    number: int,
+    samples: SamplePoints,
+    h: float,
+    step: DisplacementFunction,
+    count: CountFunction,
+    coordinates: str,
+) -> tuple[Larger, ...]:
+    """The same for some degrees of freedom with all others held, where `number` functions of them
+    are conserved by the whole map."""
+    if not number or (alone := count(samples, h)) is None:
+        return ()
+    if alone < number and step(samples, h).relative_step < SMALL:
+        # Where their own motion does not show the same, it says nothing on a larger step.
+        return (Larger("step", np.nan, 0, coordinates, number),)
+    larger = at_larger_sizes(samples, h, step, count) if alone else ()
+    whole = min(number, alone)
+    return tuple(x._replace(coordinates=coordinates, whole=whole) for x in larger)

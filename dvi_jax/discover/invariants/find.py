@@ -17,15 +17,15 @@ from ..functions import sampling
 from ..functions.basis import AbstractBasis, bind_basis, check_step_size
 from ..functions.manifold import on_manifold
 from ..functions.sampling import Displacements, SamplePoints
-from .blocks import BlockSearch, search_blocks
+from .blocks import Block, BlockSearch, blocks_of, search_block
 from .changes import Changes, StepMap, checked_changes, terms_in_pairs
 from .choice import chooser
 from .discovery import Discovery
 from .energy import unconserved_energy
-from .expansions import Larger, at_larger_step, in_equal_steps, in_larger_box, powers_of_size
+from .expansions import Larger, at_larger_sizes, larger_of_block, powers_of_size
 from .judging import reach
 from .obstructions import drift_laws
-from .search import null_spaces
+from .search import NullSpaces, null_spaces
 
 _RELIABLE = 6  # The largest order that float64 decides reliably
 
@@ -124,14 +124,17 @@ def discover_invariants(
     step_map = StepMap(equations, np.asarray(h), one_step.method, inner)
     changes = checked_changes(step_map, order, samples)
     terms = terms_in_pairs(step_map, order, samples) if in_pairs else None
-    blocks = search_blocks(changes) if tolerance is None else []
+    apart, weak = blocks_of(changes) if tolerance is None else ([], [])
+    blocks = [search_block(block) for block in apart]
     filters = () if in_pairs else [block.without_false for block in blocks]
     null = null_spaces(changes, tolerance, terms, filters)
     representatives = chooser(null)
     choice, judge = representatives.best(representative), representatives.judge
     coefficients, dependent = choice.coefficients, choice.dependent
     count = null.count if order else len(coefficients) + len(dependent)
-    larger = _at_larger(changes, order, blocks) if tolerance is None and count else ()
+    larger = _of_weak_blocks(weak, null)
+    if tolerance is None and count:
+        larger += _at_larger(changes, order, blocks)
     count += null.constant is not None
     residuals = np.stack([judge.quantiles(coefficients, x) for x in (0.5, 0.95)], axis=-1)
     powers = np.full(len(coefficients), np.nan)
@@ -208,8 +211,25 @@ def _at_larger(changes: Changes, order: int, blocks: list[BlockSearch]) -> tuple
     return larger
 
 
+def _of_weak_blocks(blocks: list[Block], null: NullSpaces) -> tuple[Larger, ...]:
+    """The same for blocks that are coupled weakly, with all others held."""
+    larger: tuple[Larger, ...] = ()
+    for block in blocks:
+        number = block.number_inside(null.spaces[0].leading, null.conditions)
+        h = float(block.whole.step_map.h)
+        tests = _tests(block.recompute)
+        larger += larger_of_block(number, block.samples, h, *tests, block.text)
+    return larger
+
+
 def _larger_of(samples, h: float, recompute, equal=True, boxes=True, is_constrained=False):
     """The same for functions whose `Changes` are recompute(samples, h)."""
+    kinds = "step" + " box" * boxes + " equal" * (boxes and equal and not is_constrained)
+    return at_larger_sizes(samples, h, *_tests(recompute), kinds, is_constrained)
+
+
+def _tests(recompute):
+    """The displacements of a step, and how many functions are conserved."""
 
     def displacements(points: SamplePoints, step: float) -> Displacements:
         return recompute(points, step).displacements
@@ -218,10 +238,4 @@ def _larger_of(samples, h: float, recompute, equal=True, boxes=True, is_constrai
         other = recompute(points, step)
         return null_spaces(other).count if other.good.all() else None
 
-    larger: tuple[Larger, ...] = ()
-    if boxes and equal and not is_constrained:
-        samples, larger = in_equal_steps(samples, h, displacements, count)
-    larger += at_larger_step(samples, h, displacements, count)
-    if boxes:
-        larger += in_larger_box(samples, h, displacements, count, is_constrained)
-    return larger
+    return displacements, count

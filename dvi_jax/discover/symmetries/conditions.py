@@ -35,6 +35,11 @@ class Conditions(NamedTuple):
     points: Any  # (S, z + 1, 2, 1 + 2n): both points (t, q, p)
     good: Any  # (S, z + 1): at z = 0, 1 where the step succeeds
 
+    @property
+    def all_good(self) -> bool:
+        """Whether all steps succeed at ε = 0, and all is finite."""
+        return bool(self.good[:, 0].all()) and all(np.isfinite(x).all() for x in self)
+
     def displacements(self, samples: SamplePoints) -> Displacements:
         """What the step changes (q, p) by at the samples."""
         return Displacements(samples, np.diff(self.points[:, 0, :, 1:], axis=1)[:, 0])

@@ -17,6 +17,7 @@ from ..functions.basis import AbstractBasis, Basis, BoundBasis, Product, Sum, bi
 from ..functions.families import TIME, Polynomials, coordinate_names
 from ..functions.sampling import SamplePoints, later, require_times, values_at
 from ..invariants.expansions import at_larger_step, in_larger_box, larger_samples
+from .blocks import larger_of_blocks
 from .conditions import Conditions, at_samples, require_finite_conditions
 from .search import SymmetrySearch, rows_of
 from .symmetry import Symmetries
@@ -152,13 +153,15 @@ def find_symmetries(
         is_original = points is samples and step == h
         return (raw if is_original else conditions(shifts, points, step)).displacements(points)
 
+    def of_order_0(points, step):
+        return conditions(shifts, points, step, order=0)
+
     def count(points, step):
-        larger = conditions(shifts, points, step, order=0)
-        if not all(np.isfinite(x).all() for x in larger) or not larger.good[:, 0].all():
-            return None
-        return search(larger, points, step).spaces()[0].leading.shape[1]
+        larger = of_order_0(points, step)
+        return search(larger, points, step).count if larger.all_good else None
 
     larger = at_larger_step(samples, h, displacements, count)
+    larger += larger_of_blocks(original, raw, samples, h, of_order_0)
     if order > 0:
         return replace(symmetries, larger=larger)
     points, factors = larger_samples(samples)

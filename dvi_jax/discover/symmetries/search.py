@@ -101,6 +101,11 @@ class SymmetrySearch:
         rows = np.moveaxis(times_weights(terms, self.conditions.weights), 1, 2)[~self.held_out]
         return nullspace.series_spaces(compress(rows_of(rows)), judge, self.tolerance)
 
+    @property
+    def count(self) -> int:
+        """How many fields are symmetries of order 0."""
+        return self.spaces()[0].leading.shape[1]
+
     def result(self) -> Symmetries:
         """The symmetries, in as few functions as can be."""
         spaces = self.spaces()

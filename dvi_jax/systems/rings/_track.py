@@ -143,19 +143,23 @@ def _track(ring: Ring, z: Array, epsilon: Array, counts: tuple[int, int, int]):
             lambda t, x, flag: t if flag else jnp.zeros_like(x), tangents, primals, moves
         )
 
-        def push(residuals, change):
-            def derivative(numbers, primals, change):
-                return jax.jvp(lambda *primals: forward(numbers, *primals)[0], primals, change)[1]
+        def derivative(numbers, primals, change):
+            return jax.jvp(lambda *primals: forward(numbers, *primals)[0], primals, change)[1]
 
-            axes = (None, (None, 0, 0), (None, 0, 0))
+        axes = (None, (None, 0, 0), (None, 0, 0))
+
+        def push(residuals, change):
             batch = jax.vmap(functools.partial(lanewise.call, derivative), axes)
             return batch(passage.numbers, residuals[0], change)
+
+        def definition(residuals, change):  # machine code has no transpose
+            return jax.vmap(derivative, axes)(passage.numbers, residuals[0], change)
 
         def pull(residuals, cotangent):
             primals, states = residuals
             return _pull(passage, primals, states, cotangent, counts, moves)
 
-        slopes_of_states = linear_map(push, pull, push, (primals, states), change)
+        slopes_of_states = linear_map(push, pull, definition, (primals, states), change)
         none = [np.zeros(x.shape, jax.dtypes.float0) for x in losses[:2]]
         return (states, losses), (slopes_of_states, (*none, jnp.zeros_like(losses[2])))
 
