@@ -7,6 +7,8 @@ from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 
+from .base.keywords import explain_calls as explain_calls
+
 # Together they import matplotlib, pydantic and other libraries, which most programs do not need.
 NAMESPACES = {
     **{
@@ -111,11 +113,15 @@ class Package(ModuleType):
 
     def __getattr__(self, name: str):
         if name in NAMESPACES:
-            return importlib.import_module(NAMESPACES[name])
+            module = importlib.import_module(NAMESPACES[name])
+            explain_calls(module)
+            return module
         if name in ALIASES:
             value = getattr(self, ALIASES[name])
         elif name in LAZY:
-            value = getattr(importlib.import_module(f"{self.__name__}.{LAZY[name]}"), name)
+            module = importlib.import_module(f"{self.__name__}.{LAZY[name]}")
+            explain_calls(module)
+            value = getattr(module, name)
         else:
             raise AttributeError(
                 f"module {self.__name__!r} has no attribute {name!r}.{_hint(name)}", name=name
@@ -125,6 +131,8 @@ class Package(ModuleType):
         return value
 
     def __setattr__(self, name: str, value: object) -> None:
+        if isinstance(value, ModuleType) and name in {*NAMESPACES, *HOMES}:
+            explain_calls(value)
         # An import of the package `dvi_jax.fit` would hide the function `dvi_jax.fit`.
         if not (isinstance(value, ModuleType) and name in LAZY):
             super().__setattr__(name, value)

@@ -1,10 +1,13 @@
-"""Keywords that a function declares as ``**settings: Unpack[...]`` of a `TypedDict`."""
+"""Calls with arguments that a function does not have, or without those that it needs."""
 
 import functools
+import inspect
+import sys
 from collections.abc import Callable
+from types import ModuleType
 from typing import Any, TypeVar
 
-from .checks import argument_names, only_one, refuse_unknown, require, settings_type
+from .checks import argument_names, arguments_text, only_one, refuse_unknown, require, settings_type
 from .machine import refuse_fork
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -46,3 +49,85 @@ def accept_newton(cls: type[T]) -> type[T]:
     # In place: `isinstance` and pickles refer to this class, not to a subclass of it.
     cls.__init__ = init
     return cls
+
+
+_OWN = ("dvi_jax", "lanewise")
+_BETWEEN = (*_OWN, "equinox", "jaxtyping", "beartype", "contextlib")
+
+
+def user_level() -> int:
+    """The `stacklevel` of a warning that shows the line of the user's program."""
+    # Counted, because it is one more frame under some decorators.
+    frame, level = sys._getframe(1), 1
+    while frame.f_back and frame.f_globals.get("__name__", "").split(".")[0] in _BETWEEN:
+        frame, level = frame.f_back, level + 1
+    return level
+
+
+def explain_calls(module: ModuleType) -> None:
+    """Make the public functions and classes of a module explain a call with wrong arguments."""
+    # The error of Python has neither the names that are allowed nor the one that was meant.
+    for name, value in list(vars(module).items()):
+        owner = getattr(value, "__module__", None) or ""
+        if isinstance(value, ModuleType):
+            # A package in a package, such as `boozer` in `systems`.
+            if value.__name__ == f"{module.__name__}.{name}" and hasattr(value, "__path__"):
+                explain_calls(value)
+        elif name.startswith("_") or owner.split(".")[0] not in _OWN:
+            continue
+        elif inspect.isfunction(value) and not hasattr(value, "explains_calls"):
+            # A pickle looks a function up where it was defined.
+            home = sys.modules[owner]
+            call = getattr(home, value.__name__, None)
+            if call is value:
+                call = _explained(value, value.__name__, value)
+                setattr(home, value.__name__, call)
+            if getattr(call, "__wrapped__", None) is value:
+                setattr(module, name, call)
+        elif isinstance(value, type) and not issubclass(value, BaseException):
+            init = vars(value).get("__init__")
+            if inspect.isfunction(init) and not hasattr(init, "explains_calls"):
+                call = _explained(init, value.__name__, functools.partial(init, None))
+                value.__init__ = call  # in place, as in `accept_newton`
+
+
+def _explained(function: Callable[..., Any], name: str, signature: Any) -> Callable[..., Any]:
+    """The function, with `signature` as the arguments that a user gives."""
+
+    @functools.wraps(function)
+    def call(*args: Any, **keywords: Any) -> Any:
+        try:
+            return function(*args, **keywords)
+        except TypeError as error:
+            traceback = error.__traceback__
+            while traceback is not None and traceback.tb_next is not None:
+                traceback = traceback.tb_next
+            # An error of the call itself has no frame inside of the function.
+            if traceback is None or traceback.tb_frame.f_code.co_filename != __file__:
+                raise
+        count = len(args) - (signature is not function)
+        _refuse_call(name, signature, count, keywords)
+
+    vars(call)["explains_calls"] = True
+    return call
+
+
+def _refuse_call(name: str, function: Callable[..., Any], count: int, keywords: Any) -> None:
+    """**Raise** `TypeError` for a call with `count` arguments by position and these keywords."""
+    names = argument_names(function)
+    refuse_unknown(name, function, [keyword for keyword in keywords if keyword not in names])
+    parameters = list(inspect.signature(function).parameters.values())
+    by_position = [p.name for p in parameters if p.kind <= p.POSITIONAL_OR_KEYWORD]
+    absent = {
+        p.name: None
+        for p in parameters
+        if p.default is p.empty
+        and p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)
+        and p.name not in (*by_position[:count], *keywords)
+    }
+    hint = arguments_text(names)
+    require(name, absent, hint=hint)
+    raise TypeError(
+        f"{name} takes {len(by_position)} argument(s) by position, got {count}"
+        f"{f' and {list(keywords)} by name' if keywords else ''}. {hint}"
+    )

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 
 from .checks import function as check_function
+from .keywords import user_level
 
 
 def accepts(function: Callable[..., Any], count: int) -> bool:
@@ -61,7 +62,7 @@ def warn_of_exchanged(name: str, function: Callable[..., Any], arguments: str) -
             f"{name} is called with {arguments}, but its definition has the arguments "
             f"({', '.join(names)}). If it takes p before q, exchange them in the definition. If "
             "only the names are exchanged, rename them.",
-            stacklevel=5,
+            stacklevel=user_level(),
         )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from ...base.checks import one_of
 from ...base.files import user_file
+from ...base.keywords import user_level
 from ._elements import C, Element, Model, bend, cavity, corrector, drift, multipole, solenoid
 from ._files import check_source, read_lattice
 from ._maps import RingPart
@@ -91,7 +92,7 @@ def load(
             f"{cavities[:8]}. For a ring in 6D read the lattice with pyAT, set TimeLag of the "
             "cavities, call lattice.enable_6d(dipole_pass=None, quadrupole_pass=None) and then "
             "rings.from_at.",
-            stacklevel=2,
+            stacklevel=user_level(),
         )
     return from_at(lattice, symplectic=symplectic, model=model)
 
