@@ -217,7 +217,7 @@ ERRORS = [
     (lambda: run(observe=lambda q, p: (q, p)), "one array"),
     (lambda: run(observe=lambda q, p: q[0] if q[0] > 0 else p[0]), "jnp.where"),
     (lambda: run(stop=energy), "dvi.Stop"),
-    (lambda: dvi.Stop(lambda q, p: q[0]), "\\(t, q, p, args\\)"),
+    (lambda: dvi.Stop(lambda q, p, args: q[0]), "\\(q, p\\) or \\(t, q, p, args\\)"),
     (lambda: run(progress=5), "progress"),
     (lambda: jax.jit(lambda q: run(q0=q, p0=q, progress=True).qs[-1])(jnp.ones(1)), "progress"),
     (lambda: hamiltonian(lambda t0, t1, q0, p1, args: jnp.exp(q0 @ q0) + p1 @ p1, q0=[9.0],

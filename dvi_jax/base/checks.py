@@ -32,6 +32,12 @@ def positive(name: str, value: Any, zero: bool = False, hint: str = "") -> float
     return _number(name, value, kind, lambda x: x > 0 or (zero and x == 0), hint)
 
 
+def electronvolts(name: str, value: Any, low: float) -> float:
+    """An energy [eV] not below `low`, as one in another unit is. **Raises** `ValueError`."""
+    hint = "The unit is eV: 1 MeV is 1e6, 1 GeV is 1e9."
+    return _number(name, value, f"an energy of at least {low:g} eV", lambda x: x >= low, hint)
+
+
 def fraction(name: str, value: Any) -> float:
     """A number between 0 and 1, both excluded. **Raises** `ValueError`."""
     return _number(name, value, "between 0 and 1 (both excluded)", lambda x: 0 < x < 1)
@@ -157,7 +163,7 @@ def instance(name: str, value: Any, kind: Any, description: str, hint: str = "")
 
 def function(name: str, value: Any, arguments: str = "", hint: str = "") -> Callable[..., Any]:
     """A function; `arguments`: of what, such as "(t, q, p, args)". **Raises** `TypeError`."""
-    if not callable(value):
+    if not callable(value) or isinstance(value, type):
         signature = f" of {arguments}" if arguments else ""
         raise TypeError(
             f"{name} must be a function{signature}, got {value!r:.200}.{_sentence(hint)}"

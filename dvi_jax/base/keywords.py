@@ -2,6 +2,7 @@
 
 import functools
 import inspect
+import re
 import sys
 from collections.abc import Callable
 from types import ModuleType
@@ -85,31 +86,43 @@ def explain_calls(module: ModuleType) -> None:
             if getattr(call, "__wrapped__", None) is value:
                 setattr(module, name, call)
         elif isinstance(value, type) and not issubclass(value, BaseException):
-            init = vars(value).get("__init__")
-            if inspect.isfunction(init) and not hasattr(init, "explains_calls"):
-                call = _explained(init, value.__name__, functools.partial(init, None))
-                value.__init__ = call  # in place, as in `accept_newton`
+            for attribute, method in list(vars(value).items()):
+                is_public = attribute == "__init__" or not attribute.startswith("_")
+                if is_public and inspect.isfunction(method):
+                    label = f"{value.__name__}.{attribute}".removesuffix(".__init__")
+                    call = _explained(method, label, functools.partial(method, None))
+                    setattr(value, attribute, call)  # in place, as in `accept_newton`
 
 
 def _explained(function: Callable[..., Any], name: str, signature: Any) -> Callable[..., Any]:
     """The function, with `signature` as the arguments that a user gives."""
+    if hasattr(function, "explains_calls"):
+        return function
 
     @functools.wraps(function)
     def call(*args: Any, **keywords: Any) -> Any:
         try:
             return function(*args, **keywords)
         except TypeError as error:
-            traceback = error.__traceback__
-            while traceback is not None and traceback.tb_next is not None:
-                traceback = traceback.tb_next
-            # An error of the call itself has no frame inside of the function.
-            if traceback is None or traceback.tb_frame.f_code.co_filename != __file__:
+            own = args[1:] if signature is not function else args
+            # Most errors come from inside of the function, and not from this call of it.
+            if not _CALL.search(str(error)) or _fits(signature, own, keywords):
                 raise
-        count = len(args) - (signature is not function)
-        _refuse_call(name, signature, count, keywords)
+        _refuse_call(name, signature, len(own), keywords)
 
     vars(call)["explains_calls"] = True
     return call
+
+
+_CALL = re.compile(r"\(\) (got (an unexpected|multiple)|missing \d|takes )")
+
+
+def _fits(function: Callable[..., Any], args: tuple[Any, ...], keywords: dict[str, Any]) -> bool:
+    try:
+        inspect.signature(function).bind(*args, **keywords)
+    except TypeError:
+        return False
+    return True
 
 
 def _refuse_call(name: str, function: Callable[..., Any], count: int, keywords: Any) -> None:

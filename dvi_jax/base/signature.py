@@ -5,9 +5,12 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 
 from .checks import function as check_function
+from .indices import out_of_bounds
 from .keywords import user_level
 
 
@@ -23,19 +26,55 @@ def accepts(function: Callable[..., Any], count: int) -> bool:
     return True
 
 
+class _OfPoint(eqx.Module):
+    """A function (q, p) that is called with (t, q, p, args)."""
+
+    function: Callable[..., Any]
+
+    def __call__(self, t, q, p, args):
+        return self.function(q, p)
+
+    @property
+    def __name__(self) -> str:
+        return getattr(self.function, "__name__", type(self.function).__name__)
+
+
+class _OfStep(_OfPoint):
+    """A function (q0, v) that is called with (t0, t1, q0, v, args)."""
+
+    def __call__(self, t0, t1, q0, v, args):
+        return self.function(q0, v)
+
+
+def with_time(
+    name: str, function: Any, arguments: str = "(t, q, p, args)", hints: Any = None
+) -> Callable[..., Any]:
+    """A function of `arguments`, the times and args among them; from one of the state alone, such
+    as (q, p), too. **Raises** `TypeError` for another one; `hints`: as for `check_takes`."""
+    names = arguments.strip("()").split(", ")
+    short = f"({', '.join(n for n in names if n[0] != 't' and n != 'args')})"
+    if callable(function) and not accepts(function, len(names)) and accepts(function, 2):
+        warn_of_exchanged(name, function, short)
+        return (_OfPoint if len(names) == 4 else _OfStep)(function)
+    check_takes(name, function, arguments, hints, f"{short} or ")
+    return function
+
+
 def check_takes(
-    name: str, function: Any, arguments: str, hints: dict[int, str] | None = None
+    name: str, function: Any, arguments: str, hints: dict[int, str] | None = None, short: str = ""
 ) -> None:
     """**Raises** `TypeError` for an object that is not a function of these positional arguments,
-    such as "(t, q, p, args)"; `hints`: advice for functions of another number of arguments."""
-    check_function(name, function, arguments)
+    such as "(t, q, p, args)"; `hints`: advice for functions of another number of arguments;
+    `short`: other arguments, for the message."""
+    check_function(name, function, f"{short}{arguments}")
     count = arguments.count(",") + 1
     if accepts(function, count):
         return
     signature = inspect.signature(function)
     hint = (hints or {}).get(len(signature.parameters), "")
     raise TypeError(
-        f"{name} must take the arguments {arguments}, got {signature_of(function)}. {hint}".rstrip()
+        f"{name} must take the arguments {short}{arguments}, got "
+        f"{signature_of(function)}. {hint}".rstrip()
     )
 
 
@@ -64,6 +103,33 @@ def warn_of_exchanged(name: str, function: Callable[..., Any], arguments: str) -
             "only the names are exchanged, rename them.",
             stacklevel=user_level(),
         )
+
+
+def array_type(name: str, value: Any, hint: str = "") -> jax.ShapeDtypeStruct:
+    """Shape and type of what a user's function returned. **Raises** `TypeError` for no array."""
+    if isinstance(value, int | float):
+        return jax.ShapeDtypeStruct((), jnp.result_type(value))
+    if not hasattr(value, "shape"):
+        kind = "None (is a return missing?)" if value is None else type(value).__name__
+        raise TypeError(f"{name} must return one array, got {kind}. {hint}".rstrip())
+    return jax.ShapeDtypeStruct(value.shape, value.dtype)
+
+
+def output_of(
+    name: str, function: Callable[..., Any], *arguments: Any, hint: str = ""
+) -> jax.ShapeDtypeStruct:
+    """Shape and type of the value of a user's function; `name`: of what, for its errors."""
+    try:
+        program, *out = eqx.filter_make_jaxpr(function)(*arguments)
+    except Exception as error:
+        # The error itself stays: its type and traceback show the line of the user.
+        error.add_note(f"(in {name})")
+        error.add_note(tracing_note(name.partition("(")[0], error))
+        raise
+    # JAX moves such an index to the end of the array, so that the result would be wrong silently.
+    for index, size in out_of_bounds(program):
+        raise IndexError(f"{name} uses the index {index}, out of bounds for an axis of {size}.")
+    return array_type(name, eqx.combine(*out), hint)
 
 
 def tracing_note(name: str, error: Exception) -> str:
