@@ -103,6 +103,9 @@ _FOREIGN_NAMES = {
 def _hint(name: str) -> str:
     if name in _FOREIGN_NAMES:
         return f" Did you mean {_FOREIGN_NAMES[name]!r}?"
+    for space in () if name.startswith("_") else ("systems", "rings", "plot"):
+        if hasattr(importlib.import_module(NAMESPACES[space]), name):
+            return f" Did you mean 'dvi_jax.{space}.{name}'?"
     candidates = {*names(), *ALIASES, *NAMESPACES}
     close = difflib.get_close_matches(name, candidates, 1, 0.7)
     return f" Did you mean {close[0]!r}?" if close else " dir(dvi_jax) lists them."

@@ -79,12 +79,12 @@ assert abs(order.slope - 2) < 0.02
 
 
 # %%
-def energy(t0, t1, q0, p0, q1, p1, args):  # an observable is a function of one step
-    return (p1 @ p1 + q1 @ q1) / 2
+def energy(q, p):  # an observable is a function of the state
+    return (p @ p + q @ q) / 2
 
 
-def I_0(t0, t1, q0, p0, q1, p1, args):
-    return (p1 @ p1 - 0.1 * (q1 @ p1) + q1 @ q1) / 2
+def I_0(q, p):
+    return (p @ p - 0.1 * (q @ p) + q @ q) / 2
 
 
 epsilons = np.geomspace(0.005, 0.1, 6)

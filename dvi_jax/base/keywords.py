@@ -1,5 +1,6 @@
 """Calls with arguments that a function does not have, or without those that it needs."""
 
+import difflib
 import functools
 import inspect
 import re
@@ -68,6 +69,8 @@ def user_level() -> int:
 def explain_calls(module: ModuleType) -> None:
     """Make the public functions and classes of a module explain a call with wrong arguments."""
     # The error of Python has neither the names that are allowed nor the one that was meant.
+    if module.__name__ in sys.modules and not hasattr(module, "__getattr__"):
+        vars(module)["__getattr__"] = functools.partial(_refuse_name, module)
     for name, value in list(vars(module).items()):
         owner = getattr(value, "__module__", None) or ""
         if isinstance(value, ModuleType):
@@ -92,6 +95,14 @@ def explain_calls(module: ModuleType) -> None:
                     label = f"{value.__name__}.{attribute}".removesuffix(".__init__")
                     call = _explained(method, label, functools.partial(method, None))
                     setattr(value, attribute, call)  # in place, as in `accept_newton`
+
+
+def _refuse_name(module: ModuleType, name: str) -> None:
+    names = [n for n, x in vars(module).items() if not (n[0] == "_" or isinstance(x, ModuleType))]
+    close = difflib.get_close_matches(name.lower(), names, 3, 0.5)
+    hint = f" Did you mean {' or '.join(close)}?" if close else f" See dir({module.__name__})."
+    text = f"module {module.__name__!r} has no attribute {name!r}.{hint}"
+    raise AttributeError(text, name=name, obj=module)
 
 
 def _explained(function: Callable[..., Any], name: str, signature: Any) -> Callable[..., Any]:

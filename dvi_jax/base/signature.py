@@ -2,7 +2,8 @@
 
 import inspect
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import equinox as eqx
@@ -95,8 +96,10 @@ def warn_of_exchanged(name: str, function: Callable[..., Any], arguments: str) -
         return
     letters = [argument[0] for argument in arguments.strip("()").split(", ")]
     initials = [name[:1].lower() for name in names]
-    places = [letters.index("q"), letters.index("p")]
-    if max(places) < len(names) and [initials[i] for i in places] == ["p", "q"]:
+    places = [i for i, letter in enumerate(letters) if letter in "qpv"][:2]
+    if max(places) < len(names) and [initials[i] for i in places] == [
+        letters[i] for i in places[::-1]
+    ]:
         warnings.warn(
             f"{name} is called with {arguments}, but its definition has the arguments "
             f"({', '.join(names)}). If it takes p before q, exchange them in the definition. If "
@@ -115,17 +118,24 @@ def array_type(name: str, value: Any, hint: str = "") -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(value.shape, value.dtype)
 
 
-def output_of(
-    name: str, function: Callable[..., Any], *arguments: Any, hint: str = ""
-) -> jax.ShapeDtypeStruct:
-    """Shape and type of the value of a user's function; `name`: of what, for its errors."""
+@contextmanager
+def notes_of(name: str) -> Iterator[None]:
+    """Within this an error in a user's function, `name`, gets notes for the user."""
     try:
-        program, *out = eqx.filter_make_jaxpr(function)(*arguments)
+        yield
     except Exception as error:
         # The error itself stays: its type and traceback show the line of the user.
         error.add_note(f"(in {name})")
         error.add_note(tracing_note(name.partition("(")[0], error))
         raise
+
+
+def output_of(
+    name: str, function: Callable[..., Any], *arguments: Any, hint: str = ""
+) -> jax.ShapeDtypeStruct:
+    """Shape and type of the value of a user's function; `name`: of what, for its errors."""
+    with notes_of(name):
+        program, *out = eqx.filter_make_jaxpr(function)(*arguments)
     # JAX moves such an index to the end of the array, so that the result would be wrong silently.
     for index, size in out_of_bounds(program):
         raise IndexError(f"{name} uses the index {index}, out of bounds for an axis of {size}.")
