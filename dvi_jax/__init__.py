@@ -126,6 +126,7 @@ else:
     )
 
     _explain_calls(sys.modules[__name__])
+    _explain_calls(flows)
     sys.modules[__name__].__class__ = _Package
     sys.meta_path.insert(0, _Folders())
 

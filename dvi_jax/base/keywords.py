@@ -77,7 +77,7 @@ def explain_calls(module: ModuleType) -> None:
             # A package in a package, such as `boozer` in `systems`.
             if value.__name__ == f"{module.__name__}.{name}" and hasattr(value, "__path__"):
                 explain_calls(value)
-        elif name.startswith("_") or owner.split(".")[0] not in _OWN:
+        elif name.startswith("_") or not owner.startswith((module.__name__, "lanewise")):
             continue
         elif inspect.isfunction(value) and not hasattr(value, "explains_calls"):
             # A pickle looks a function up where it was defined.

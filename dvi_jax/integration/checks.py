@@ -1,6 +1,5 @@
 """Checks before a run: its observables, its noise, and the memory of its results."""
 
-import inspect
 from typing import Any
 
 import equinox as eqx
@@ -49,8 +48,7 @@ def check_observe(task: Task, q0: Array, p0: Array) -> int:
         name = getattr(function, "__name__", type(function).__name__)
         check_function(f"the argument of {type(leaf).__name__}", function, FORMS)
         t0, bound = task.t0, task.bound(function)
-        # Of a `Section` the function is a method of it.
-        subject = f"the observable {type(leaf).__name__ if inspect.ismethod(function) else name!r}"
+        subject = f"the observable {'Section' if isinstance(leaf, Section) else repr(name)}"
         hint = "Stack several values with jnp.stack, or observe a dict of functions."
         value = output_of(subject, bound, t0, t0, q0, p0, q0, p0, task.args, hint=hint)
         if isinstance(leaf, Range) and jnp.issubdtype(jnp.result_type(value), jnp.complexfloating):
