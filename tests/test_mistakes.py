@@ -432,6 +432,8 @@ CALLS = [
     (lambda: run(stop=dvi.Stop(lambda q, p: None)), "^TypeError: g.*a return missing"),
     (lambda: adaptive(lambda q, p: None), "^TypeError: speed.*a return missing"),
     (lambda: adaptive(lambda t, q, p, args: args["k"]), "if speed uses args, pass args"),
+    (lambda: run(observe=lambda t, q: q[0]), r"^TypeError: an observable.*\(q, p\)"),
+    (lambda: dvi.Stop(lambda t, q: q[0]), r"^TypeError: g of Stop must take.*\(q, p\) or"),
     (lambda: dvi.System(dict), "^TypeError: H_D must be a function"),
     (lambda: dvi.Split(H_D), "^TypeError: parts of Split must be a list"),
     # numbers

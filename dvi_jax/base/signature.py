@@ -27,6 +27,15 @@ def accepts(function: Callable[..., Any], count: int) -> bool:
     return True
 
 
+def takes_state(function: Callable[..., Any]) -> bool:
+    """Whether `function` takes (q, p), and not (t, q) or (q, args) by the names of its arguments."""
+    try:
+        names = list(inspect.signature(function).parameters)[:2]
+    except (TypeError, ValueError):
+        names = []
+    return accepts(function, 2) and not {"t", "t0", "t1", "time", "tau", "args"} & set(names)
+
+
 class _OfPoint(eqx.Module):
     """A function (q, p) that is called with (t, q, p, args)."""
 
@@ -54,7 +63,7 @@ def with_time(
     as (q, p), too. **Raises** `TypeError` for another one; `hints`: as for `check_takes`."""
     names = arguments.strip("()").split(", ")
     short = f"({', '.join(n for n in names if n[0] != 't' and n != 'args')})"
-    if callable(function) and not accepts(function, len(names)) and accepts(function, 2):
+    if callable(function) and not accepts(function, len(names)) and takes_state(function):
         warn_of_exchanged(name, function, short)
         return (_OfPoint if len(names) == 4 else _OfStep)(function)
     check_takes(name, function, arguments, hints, f"{short} or ")

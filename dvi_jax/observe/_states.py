@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 from jaxtyping import PyTree
 
-from ..base.signature import accepts, signature_of, warn_of_exchanged
+from ..base.signature import accepts, signature_of, takes_state, warn_of_exchanged
 from ..base.types import Bindable
 from ._reductions import Reduction, Running, is_observable
 
@@ -106,8 +106,8 @@ def _of_step(leaf: Any) -> Any:
     # The longest form first: a function with defaults or *rest accepts several of them.
     if not callable(leaf) or isinstance(leaf, type) or accepts(leaf, 7):
         return leaf
-    for count in (4, 2):
-        if accepts(leaf, count):
+    for count, fits in ((4, accepts(leaf, 4)), (2, takes_state(leaf))):
+        if fits:
             warn_of_exchanged("an observable", leaf, {2: "(q, p)", 4: "(t, q, p, args)"}[count])
             return OfState(leaf, count == 4)
     raise TypeError(f"an observable must be a function of {FORMS}, got {signature_of(leaf)}.")

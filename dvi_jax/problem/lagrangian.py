@@ -13,7 +13,7 @@ import lanewise
 from lanewise.jaxprs.dependence import depends_on
 
 from ..base.checks import array
-from ..base.signature import accepts, check_takes, signature_of, with_time
+from ..base.signature import accepts, check_takes, signature_of, takes_state, with_time
 from ..base.types import Args, ForceFn, HamiltonianFn, Scalar, State
 from ..engine.newton import Newton, Vector, find_root
 
@@ -137,7 +137,7 @@ def legendre(L: Callable[..., Any], root_finder: Newton = Newton()) -> Callable[
 
     **Source** the paper, (36); Marsden & West 2001, *Acta Numerica* 10, 357, 1.4.
     """
-    if callable(L) and accepts(L, 2) and not (accepts(L, 4) or accepts(L, 5)):
+    if callable(L) and takes_state(L) and not (accepts(L, 4) or accepts(L, 5)):
         L = with_time("L", L, "(t, q, v, args)")
     # The number of arguments decides; a function that takes four and five cannot be classified.
     discrete, continuous = (callable(L) and accepts(L, count) for count in (5, 4))
