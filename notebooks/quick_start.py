@@ -119,7 +119,8 @@ with plot.style():
     figure, axis = plt.subplots(figsize=(6.4, 3.2))
     for name in orders:
         values = sol.observed[name]
-        axis.plot(sol.ts[1:], values / values[0] - 1, lw=1.1, label=name)
+        # The invariant is a function of a step and has no value at the start.
+        axis.plot(sol.ts[-len(values) :], values / values[0] - 1, lw=1.1, label=name)
     axis.set(xlabel="time t", ylabel="relative change", title="ε = 0.1")
     figure.legend(loc="outside lower center", ncols=3)
 plt.show()

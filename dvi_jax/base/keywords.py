@@ -121,10 +121,12 @@ def _explained(function: Callable[..., Any], name: str, signature: Any) -> Calla
                 raise
         _refuse_call(name, signature, len(own), keywords)
 
+    # A mark, since a module may be explained more than once.
     vars(call)["explains_calls"] = True
     return call
 
 
+# What Python says of arguments that do not fit; an error inside of the function may say it, too.
 _CALL = re.compile(r"\(\) (got (an unexpected|multiple)|missing \d|takes )")
 
 
@@ -140,6 +142,7 @@ def _refuse_call(name: str, function: Callable[..., Any], count: int, keywords: 
     """**Raise** `TypeError` for a call with `count` arguments by position and these keywords."""
     names = argument_names(function)
     refuse_unknown(name, function, [keyword for keyword in keywords if keyword not in names])
+    # First unknown names: a misspelt argument is missing as well.
     parameters = list(inspect.signature(function).parameters.values())
     by_position = [p.name for p in parameters if p.kind <= p.POSITIONAL_OR_KEYWORD]
     absent = {

@@ -28,7 +28,7 @@ def accepts(function: Callable[..., Any], count: int) -> bool:
 
 
 def takes_state(function: Callable[..., Any]) -> bool:
-    """Whether `function` takes (q, p), and not (t, q) or (q, args) by the names of its arguments."""
+    """Whether `function` takes (q, p); (t, q) and (q, args) do not, by their names."""
     try:
         names = list(inspect.signature(function).parameters)[:2]
     except (TypeError, ValueError):
@@ -36,6 +36,7 @@ def takes_state(function: Callable[..., Any]) -> bool:
     return accepts(function, 2) and not {"t", "t0", "t1", "time", "tau", "args"} & set(names)
 
 
+# Modules and not closures: compiled programs are looked up by the function inside.
 class _OfPoint(eqx.Module):
     """A function (q, p) that is called with (t, q, p, args)."""
 
@@ -63,6 +64,7 @@ def with_time(
     as (q, p), too. **Raises** `TypeError` for another one; `hints`: as for `check_takes`."""
     names = arguments.strip("()").split(", ")
     short = f"({', '.join(n for n in names if n[0] != 't' and n != 'args')})"
+    # The longest form first: a function with defaults or *rest accepts several of them.
     if callable(function) and not accepts(function, len(names)) and takes_state(function):
         warn_of_exchanged(name, function, short)
         return (_OfPoint if len(names) == 4 else _OfStep)(function)

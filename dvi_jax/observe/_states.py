@@ -44,6 +44,7 @@ class AtEnd(eqx.Module):
 
     function: Callable[..., Any]
 
+    # A step of length zero: both ends are the state.
     def __call__(self, t, q, p, args):
         return self.function(t, t, q, p, q, p, args)
 
