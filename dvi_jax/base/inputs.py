@@ -52,6 +52,7 @@ def _join(value: Any) -> Any:
 
 def real_numbers(name: str, value: Any) -> Array:
     """Real numbers as an array of floats. **Raises** `TypeError` for anything else."""
+    # Text first becomes an array of text in NumPy, of which JAX does not say the name.
     value = _join(value)
     value = value if is_traced(value) else _as_numpy(name, value)
     _require_real(name, value)

@@ -121,6 +121,7 @@ def warn_of_exchanged(name: str, function: Callable[..., Any], arguments: str) -
 
 def array_type(name: str, value: Any, hint: str = "") -> jax.ShapeDtypeStruct:
     """Shape and type of what a user's function returned. **Raises** `TypeError` for no array."""
+    # A constant of Python is an array of no axes.
     if isinstance(value, int | float):
         return jax.ShapeDtypeStruct((), jnp.result_type(value))
     if not hasattr(value, "shape"):
