@@ -37,20 +37,22 @@ def takes_state(function: Callable[..., Any]) -> bool:
 
 
 # Modules and not closures: compiled programs are looked up by the function inside.
-class _OfPoint(eqx.Module):
-    """A function (q, p) that is called with (t, q, p, args)."""
-
+class _Short(eqx.Module):
     function: Callable[..., Any]
-
-    def __call__(self, t, q, p, args):
-        return self.function(q, p)
 
     @property
     def __name__(self) -> str:
         return getattr(self.function, "__name__", type(self.function).__name__)
 
 
-class _OfStep(_OfPoint):
+class _OfPoint(_Short):
+    """A function (q, p) that is called with (t, q, p, args)."""
+
+    def __call__(self, t, q, p, args):
+        return self.function(q, p)
+
+
+class _OfStep(_Short):
     """A function (q0, v) that is called with (t0, t1, q0, v, args)."""
 
     def __call__(self, t0, t1, q0, v, args):
