@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 import jax.numpy as jnp
 import numpy as np
 
-from ..base.checks import finite, instance, one_of
+from ..base.checks import finite, instance
 from ..base.inputs import refuse_unit_or_mask
 from ..base.signature import with_time
 from .checks import require_all, require_shape
@@ -68,10 +68,14 @@ class Observations:
             values = np.ma.filled(values.astype(float), np.nan)
         ts, values = _real("ts", self.ts), _real("values", values)
         is_name, observe = isinstance(self.observe, str), self.observe
-        if is_name or not callable(observe):
-            one_of("observe", observe, OBSERVABLES, "It may be a function (q, p), too.")
-        else:
-            object.__setattr__(self, "observe", with_time("observe", observe))
+        if is_name and observe not in OBSERVABLES:
+            raise TypeError(
+                'observe must be "positions", "momenta", "state" or a function (q, p) or '
+                f"(t, q, p, args), got {observe!r:.200}."
+            )
+        if not is_name:
+            hint = 'or "positions", "momenta" or "state"'
+            object.__setattr__(self, "observe", with_time(f"observe ({hint})", observe))
         if ts.ndim != 1 or ts.size == 0 or values.shape[:1] != ts.shape:
             raise ValueError(
                 "ts must be a one-dimensional array of times, not empty, and values must have one "
