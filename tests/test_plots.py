@@ -440,7 +440,7 @@ def test_solutions_of_several_runs_share_a_panel_for_observables_of_all(single, 
     short = SimpleNamespace(ts=single.ts[:21], qs=single.qs[:21], observed=observed)
     axis = plot.invariants([good, short], labels=["a", "b", "c"])
     assert [len(xy[0]) for xy in lines(axis)] == [61, 61, 21]
-    same(lines(axis)[0][1][:20], lines(axis)[2][1])
+    same(lines(axis)[0][1][:21], lines(axis)[2][1])
     mine = {"E": [np.ones(61), np.ones(61), np.r_[1, 2 * np.ones(20)]]}
     assert lines(plot.invariants([good, short], mine))[2][1].max() == 1
     refuses(plot.invariants, (([good, short], {"E": np.ones(61)}), {}, "a list of 3 arrays"))
