@@ -120,8 +120,14 @@ if TYPE_CHECKING:  # names that are imported at their first use: `_namespaces` h
     Chord, SaveAt, Event, naff = SimplifiedNewton, Save, Stop, _frequencies
     LinearTrend, PeakToPeak = Trend, Range
 else:
-    from ._namespaces import Folders as _Folders, Package as _Package
+    from ._namespaces import (
+        Folders as _Folders,
+        Package as _Package,
+        explain_calls as _explain_calls,
+    )
 
+    _explain_calls(sys.modules[__name__])
+    _explain_calls(flows)
     sys.modules[__name__].__class__ = _Package
     sys.meta_path.insert(0, _Folders())
 

@@ -7,6 +7,8 @@ from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 
+from .base.keywords import explain_calls as explain_calls
+
 # Together they import matplotlib, pydantic and other libraries, which most programs do not need.
 NAMESPACES = {
     **{
@@ -102,6 +104,9 @@ _FOREIGN_NAMES = {
 def _hint(name: str) -> str:
     if name in _FOREIGN_NAMES:
         return f" Did you mean {_FOREIGN_NAMES[name]!r}?"
+    for space in () if name.startswith("_") else ("systems", "rings", "plot"):
+        if hasattr(importlib.import_module(NAMESPACES[space]), name):
+            return f" Did you mean 'dvi_jax.{space}.{name}'?"
     candidates = {*names(), *ALIASES, *NAMESPACES}
     close = difflib.get_close_matches(name, candidates, 1, 0.7)
     return f" Did you mean {close[0]!r}?" if close else " dir(dvi_jax) lists them."
@@ -112,11 +117,15 @@ class Package(ModuleType):
 
     def __getattr__(self, name: str):
         if name in NAMESPACES:
-            return importlib.import_module(NAMESPACES[name])
+            module = importlib.import_module(NAMESPACES[name])
+            explain_calls(module)
+            return module
         if name in ALIASES:
             value = getattr(self, ALIASES[name])
         elif name in LAZY:
-            value = getattr(importlib.import_module(f"{self.__name__}.{LAZY[name]}"), name)
+            module = importlib.import_module(f"{self.__name__}.{LAZY[name]}")
+            explain_calls(module)
+            value = getattr(module, name)
         else:
             raise AttributeError(
                 f"module {self.__name__!r} has no attribute {name!r}.{_hint(name)}", name=name
@@ -126,6 +135,8 @@ class Package(ModuleType):
         return value
 
     def __setattr__(self, name: str, value: object) -> None:
+        if isinstance(value, ModuleType) and name in {*NAMESPACES, *HOMES}:
+            explain_calls(value)
         # An import of the package `dvi_jax.fit` would hide the function `dvi_jax.fit`.
         if not (isinstance(value, ModuleType) and name in LAZY):
             super().__setattr__(name, value)

@@ -2,6 +2,7 @@
 
 import difflib
 import os
+import re
 import reprlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -32,6 +33,26 @@ class InputError(ValueError):
         return "\n".join(texts)
 
 
+_IN_TOML = (
+    (r"dvi\.\w+\(\.\.\., (\w+)=\.\.\.\)", r"the key \1"),
+    (r"\b(\w+)=dvi\.(\w+\([^()]*\))", r'\1 = "\2"'),
+    (r"\bdvi\.(\w+\([^()]*\))", r'"\1"'),
+    (r"\bdvi\.(\w)", r"\1"),
+    (r"\b(\w+)=\.\.\.", r"\1 = …"),
+    (r"\bnum_steps\b", "steps"),
+    (r"\bobserve\b=", "observables ="),
+)
+"""Pattern in a message of dvi_jax → the same in a TOML file."""
+
+
+def in_toml(message: Any) -> str:
+    """A message of dvi_jax, which names arguments of Python, with the keys of a TOML file."""
+    text = str(message)
+    for pattern, replacement in _IN_TOML:
+        text = re.sub(pattern, replacement, text)
+    return text
+
+
 def require(fits: Any, key: str, defect: str, rule: str) -> None:
     """**Raises** `InputError` unless something `fits`."""
     if not fits:
@@ -40,7 +61,7 @@ def require(fits: Any, key: str, defect: str, rule: str) -> None:
 
 @contextmanager
 def as_input_error(
-    key: str, rule: str, *kinds: type[BaseException], prefix: str = "", text: Any = str
+    key: str, rule: str, *kinds: type[BaseException], prefix: str = "", text: Any = in_toml
 ) -> Iterator[None]:
     """Within this an exception of these kinds, by default `ValueError` and `TypeError`, is an
     `InputError` with the prefix and what `text` makes of it."""

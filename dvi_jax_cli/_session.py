@@ -5,6 +5,7 @@ import inspect
 import os
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, get_args
@@ -12,7 +13,7 @@ from typing import Annotated, Any, get_args
 import typer
 from typer.core import TyperCommand
 
-from ._errors import InputError, user_path
+from ._errors import InputError, in_toml, user_path
 from ._names import VERSION
 from ._show import console, print_error, print_json, print_tables
 
@@ -50,6 +51,7 @@ class Session:
         self.as_json, self.verbose, self.debug = as_json, verbose, debug
         self._began = time.perf_counter()
         self._compile_seconds: list[float] = []
+        self._warnings: set[str] = set()
 
     def start_jax(self) -> None:
         """Set double precision and pictures without a window; with --verbose, show what JAX has."""
@@ -76,6 +78,14 @@ class Session:
         if self.verbose:
             console(stderr=True).print(text, markup=False, soft_wrap=True, style="dim")
 
+    def warn(self, message: Any, *_: Any) -> None:
+        """A warning on stderr, once, without the line of Python that gave it."""
+        text = f"warning: {in_toml(message)}"
+        # An overflow in NumPy is in the results, with a status.
+        if text not in self._warnings and " encountered in " not in text:
+            self._warnings.add(text)
+            console(stderr=True).print(text, markup=False, soft_wrap=True, style="yellow")
+
     def line(self, text: str, style: str | None = None) -> None:
         """A line for the reader, without --json."""
         if not self.as_json:
@@ -97,7 +107,7 @@ class Session:
             error = {"error": {"kind": "failed", "message": failure}} if failure else {}
             print_json({**contents, **error})
         elif failure:
-            print_error("failed", failure)
+            print_error("failed", in_toml(failure))
         if failure:
             raise typer.Exit(FAILURE)
 
@@ -159,7 +169,10 @@ def command(
         @functools.wraps(function)
         def call(as_json: bool, verbose: bool, debug: bool, **values: Any) -> None:
             session = Session(as_json, verbose, debug)
+            showwarning = warnings.showwarning
             try:
+                if not debug:
+                    warnings.showwarning = session.warn
                 if jax:
                     session.start_jax()
                 for name in paths.keys() & values.keys():
@@ -180,6 +193,8 @@ def command(
                 if is_raised:
                     raise
                 raise typer.Exit(CODES[kind]) from None
+            finally:
+                warnings.showwarning = showwarning
 
         del call.__dict__["__wrapped__"]  # its signature is not this one's
         parameters = [*(p.replace(kind=kind) for p in options), *common]

@@ -139,7 +139,7 @@ def swing(epsilon):
         pendulum.system, pendulum.q0, pendulum.p0, h=h, num_steps=steps, epsilon=epsilon,
         args=pendulum.args, method=dvi.GaussLegendre(2), observe=pendulum.observables["action"],
     )  # fmt: skip
-    return sol.ts[1:], sol.observed
+    return sol.ts, sol.observed
 
 
 t, action = map(np.asarray, jax.jit(jax.vmap(swing))(epsilons))

@@ -79,12 +79,12 @@ assert abs(order.slope - 2) < 0.02
 
 
 # %%
-def energy(t0, t1, q0, p0, q1, p1, args):  # an observable is a function of one step
-    return (p1 @ p1 + q1 @ q1) / 2
+def energy(q, p):  # an observable is a function of the state
+    return (p @ p + q @ q) / 2
 
 
-def I_0(t0, t1, q0, p0, q1, p1, args):
-    return (p1 @ p1 - 0.1 * (q1 @ p1) + q1 @ q1) / 2
+def I_0(q, p):
+    return (p @ p - 0.1 * (q @ p) + q @ q) / 2
 
 
 epsilons = np.geomspace(0.005, 0.1, 6)
@@ -119,7 +119,8 @@ with plot.style():
     figure, axis = plt.subplots(figsize=(6.4, 3.2))
     for name in orders:
         values = sol.observed[name]
-        axis.plot(sol.ts[1:], values / values[0] - 1, lw=1.1, label=name)
+        # The invariant is a function of a step and has no value at the start.
+        axis.plot(sol.ts[-len(values) :], values / values[0] - 1, lw=1.1, label=name)
     axis.set(xlabel="time t", ylabel="relative change", title="ε = 0.1")
     figure.legend(loc="outside lower center", ncols=3)
 plt.show()

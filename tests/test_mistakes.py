@@ -4,7 +4,9 @@ Each row is one mistake. An error names what was seen and what to do. Where the 
 it, the type of the error is tested as well.
 """
 
+import inspect
 import math
+import pickle
 import re
 import warnings
 
@@ -14,7 +16,8 @@ import numpy as np
 import pytest
 
 import dvi_jax as dvi
-from dvi_jax import interop, systems
+from dvi_jax import interop, plot, rings, systems
+from dvi_jax.systems import boozer
 
 
 def H_D(t0, t1, q0, p1, args):
@@ -217,7 +220,7 @@ ERRORS = [
     (lambda: run(observe=lambda q, p: (q, p)), "one array"),
     (lambda: run(observe=lambda q, p: q[0] if q[0] > 0 else p[0]), "jnp.where"),
     (lambda: run(stop=energy), "dvi.Stop"),
-    (lambda: dvi.Stop(lambda q, p: q[0]), "\\(t, q, p, args\\)"),
+    (lambda: dvi.Stop(lambda q, p, args: q[0]), "\\(q, p\\) or \\(t, q, p, args\\)"),
     (lambda: run(progress=5), "progress"),
     (lambda: jax.jit(lambda q: run(q0=q, p0=q, progress=True).qs[-1])(jnp.ones(1)), "progress"),
     (lambda: hamiltonian(lambda t0, t1, q0, p1, args: jnp.exp(q0 @ q0) + p1 @ p1, q0=[9.0],
@@ -356,6 +359,91 @@ REFUSALS = [
 """(call with a mistake, what the type and the message of its error contain)."""
 
 
+RING = rings.Ring([rings.quadrupole("QF", 0.5, 0.6), rings.drift("D", 2.0),
+                   rings.quadrupole("QD", 0.5, -0.6), rings.drift("D", 2.0)])  # fmt: skip
+TURN = rings.problem(RING, planes="x")
+X, PX = [1e-3], [0.0]
+NEAR = {"samples": 1e-3 * SAMPLES, "h": 1.0, "args": TURN.args}
+
+
+def lens(potential, **values):
+    return rings.lens("L", potential, **values)
+
+
+CALLS = [
+    # arguments that do not exist, are missing, or too many
+    (lambda: rings.quadrupole("Q", 0.5, K1=0.6), "^TypeError: quadrupole.*'K1'.*mean 'k1'"),
+    (lambda: rings.drift(1.0), "^TypeError: drift requires length. Its arguments are name, length"),
+    (lambda: rings.drift("D", L=1.0), "'L'. Did you mean 'length'"),
+    (lambda: rings.aperture(0.02, 0.02), "^TypeError: aperture takes 1.*got 2.*rectangle, ellipse"),
+    (lambda: rings.drift("D", 1.0).inside(0.02), "^TypeError: Element.inside takes 0.*ellipse"),
+    (lambda: dvi.AdaptiveReversible(rtol=1e-6), "'rtol'.*choose h"),
+    (dvi.Given, "^TypeError: Given requires ts"),
+    (lambda: dvi.Newton(tol=1e-9), "^TypeError: Newton.*mean 'rtol'"),
+    (lambda: dvi.System(H_D, W=W), "^TypeError: System.*mean 'force'"),
+    (lambda: dvi.Integrator(solver=dvi.Strang()), "^TypeError: Integrator.*mean 'method'"),
+    (lambda: dvi.frequencies(1, 2, 3), "^TypeError: frequencies takes 2.*got 3.*ts, signal"),
+    (lambda: systems.kepler(mu=1.0), "^TypeError: kepler.*'mu'. It has no arguments"),
+    (lambda: plot.conserved([0.0], [1.0]), "^TypeError: conserved requires time and title"),
+    (lambda: boozer.from_near_axis(None), "^TypeError: from_near_axis requires minor_radius"),
+    # names
+    (lambda: systems.keppler, "mean kepler"),
+    (lambda: rings.quad, "mean quadrupole"),
+    (lambda: dvi.kepler, "'dvi_jax.systems.kepler'"),
+    (lambda: run()["q"], "^TypeError.*no items.*qs, ps"),
+    # rings
+    *((lambda m=m: dvi.integrate(TURN, X, PX, num_steps=2, method=m),
+     "^ValueError.*method=rings.Turn") for m in ("Strang", dvi.TypeII(), dvi.GaussLegendre(2))),
+    (lambda: dvi.sweep(TURN, X, PX, num_steps=2, method="Strang", epsilon=[0.0, 0.1],
+     observe=dvi.Last(energy), progress=False), "^ValueError.*method=rings.Turn"),
+    (lambda: dvi.discover_invariants(TURN.system, dvi.Polynomials(2), method="Strang", **NEAR),
+     "^ValueError.*method=rings.Turn"),
+    (lambda: dvi.poincare_section(TURN.system, np.array([X]), np.array([PX]), lambda q, p: q[0],
+     h=1.0, num_steps=5, args=TURN.args, method="Strang"), "^ValueError.*method=rings.Turn"),
+    (lambda: rings.optics(TURN), "^TypeError: ring must be a rings.Ring"),
+    (lambda: dvi.integrate(TURN.system, X, PX, h=1.0, num_steps=2), "args=problem.args"),
+    (lambda: dvi.discover_invariants(TURN.system, dvi.Polynomials(2), **{**NEAR, "args": None}),
+     "args=problem.args"),
+    (lambda: rings.load("no such file.mat"), "^FileNotFoundError.*no such file"),
+    (lambda: rings.load(3), "path"),
+    (lambda: boozer.from_near_axis("precise QA", 1.0), "^TypeError: stellarator.*Qsc"),
+    (lambda: boozer.GuidingCentres(boozer.precise_qa(), energy=3.5), "^ValueError.*1 MeV is 1e6"),
+    (lambda: rings.Ring([rings.drift("D", 1.0)], energy=6.0), "^ValueError.*1 GeV is 1e9"),
+    (lambda: rings.Ring(rings.drift("D", 1.0)), "^TypeError: elements must be a list"),
+    (lambda: rings.marker(0.5), "^TypeError: name of an element must be text"),
+    (lambda: rings.solenoid("S", 1.0, "0.1"), "^ValueError: ks of element 'S'"),
+    (lambda: rings.aperture("A", ellipse=0.02), r"^ValueError: ellipse.*\(radius_x, radius_y\)"),
+    (lambda: rings.aperture("A", rectangle="abcd"), "^ValueError: rectangle"),
+    (lambda: rings.track(RING, "abc", 2), "^TypeError: z must be.*real numbers"),
+    (lambda: rings.optics(RING, dp="0"), "^TypeError: dp must be.*real numbers"),
+    (lambda: lens(lambda x, y, par: np.log(1 + x)), "lens 'L'.*jnp"),
+    (lambda: lens(lambda x, y, par: x if x > 0 else y), "jnp.where"),
+    (lambda: lens(lambda x, y, par: par["k"] * x), "^KeyError: 'k'.*par = {}"),
+    (lambda: lens(lambda x, y, par: None), "^TypeError.*a return missing"),
+    (lambda: lens(lambda x: x), r"^TypeError: potential must take.*\(x, y, par\)"),
+    # a state that is one number
+    (lambda: run(q0=1.0, p0=0.0), r"q0=\[1.0\] of shape \(1,\)"),
+    (lambda: discover(samples=SAMPLES[:, :, 0]), r"samples of shape \(2, N, 1\)"),
+    # functions
+    (lambda: run(observe=lambda q, p: q[3]), "^IndexError: the observable.*index 3"),
+    (lambda: run(observe=dvi.Section(lambda q, p: q[3])), "^IndexError: the observable Section"),
+    (lambda: run(stop=dvi.Stop(lambda q, p: q[3])), "^IndexError: g.*Stop.*index 3"),
+    (lambda: adaptive(lambda q, p: q[3]), "^IndexError: speed.*index 3"),
+    (lambda: run(stop=dvi.Stop(lambda q, p: None)), "^TypeError: g.*a return missing"),
+    (lambda: adaptive(lambda q, p: None), "^TypeError: speed.*a return missing"),
+    (lambda: adaptive(lambda t, q, p, args: args["k"]), "if speed uses args, pass args"),
+    (lambda: run(observe=lambda t, q: q[0]), r"^TypeError: an observable.*\(q, p\)"),
+    (lambda: dvi.Stop(lambda t, q: q[0]), r"^TypeError: g of Stop must take.*\(q, p\) or"),
+    (lambda: dvi.System(dict), "^TypeError: H_D must be a function"),
+    (lambda: dvi.Split(H_D), "^TypeError: parts of Split must be a list"),
+    # numbers
+    (lambda: systems.double_well(temperature=-0.5), "^ValueError: temperature must be"),
+    (lambda: dvi.Langevin("a", 1.0), "^ValueError: friction"),
+    (lambda: dvi.integrate(FREE, Q, P, h=0.1, t1="1"), "^TypeError.*t1='1'"),
+    (lambda: run(throw="no"), "^TypeError: throw must be True or False"),
+]  # fmt: skip
+
+
 def loop(t0, t1, q0, p1, args):
     while q0[0] > 1:
         q0 = q0 / 2
@@ -374,7 +462,7 @@ def without_x64(call):
         jax.config.update("jax_enable_x64", True)
 
 
-@pytest.mark.parametrize(("call", "words"), [*ERRORS, *REFUSALS])
+@pytest.mark.parametrize(("call", "words"), [*ERRORS, *REFUSALS, *CALLS])
 def test_an_error_helps(call, words):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -398,6 +486,7 @@ WARNINGS = [
     (lambda: dvi.System(lambda t0, t1, p1, q0, args: p1 @ p1 / 2 + jnp.cos(q0[0])),
      "exchange them"),
     (lambda: dvi.discretise(lambda t, p, q, args: p @ p), "exchange them"),
+    (lambda: run(observe=lambda p, q: p @ p), "exchange them"),
     (lambda: dvi.System(H_D, force=lambda t0, t1, p, q, args: -q), "exchange them"),
 ]  # fmt: skip
 
@@ -406,6 +495,63 @@ WARNINGS = [
 def test_a_warning_helps(call, words):
     with pytest.warns(UserWarning, match=words):
         call()
+
+
+SPACES = {"dvi": dvi, "rings": rings, "systems": systems, "boozer": boozer, "plot": plot,
+          "interop": interop, "flows": dvi.flows, "starts": dvi.starts}  # fmt: skip
+
+
+def explained():
+    for space, module in SPACES.items():
+        for name in dir(module):
+            thing = getattr(module, name)
+            if name.startswith("_") or not thing.__class__.__module__.startswith(
+                ("abc", "builtins")
+            ):
+                continue
+            init = vars(thing).get("__init__") if isinstance(thing, type) else thing
+            home = str(getattr(thing, "__module__", ""))
+            own = home.startswith((module.__name__, "lanewise"))
+            is_error = isinstance(thing, type) and issubclass(thing, BaseException)
+            if own and not is_error and inspect.isfunction(init):
+                yield f"{space}.{name}", thing, init
+
+
+def test_every_public_function_and_class_explains_a_wrong_argument():
+    count = 0
+    for label, thing, init in explained():
+        kinds = [p.kind for p in inspect.signature(init).parameters.values()]
+        text = message_of(lambda thing=thing: thing(no_such_argument=1))
+        is_abstract = "abstract" in text
+        if inspect.Parameter.VAR_KEYWORD in kinds:
+            assert "no_such_argument" in text, (label, text)
+        elif not is_abstract:
+            assert re.search(r"has no argument 'no_such_argument'\. (Its|It|Did)", text), (
+                label,
+                text,
+            )
+        count += not is_abstract
+    assert count > 150
+
+
+def test_an_error_inside_of_a_function_stays_itself():
+    def f(q, p):
+        return len(q, p)
+
+    assert message_of(lambda: run(observe=f)).startswith("TypeError: len() takes exactly one")
+
+
+def test_functions_and_objects_can_be_pickled():
+    for thing in (dvi.integrate, dvi.sweep, rings.drift, systems.kepler, plot.orbit):
+        assert pickle.loads(pickle.dumps(thing)) is thing
+    assert pickle.loads(pickle.dumps(dvi.Yoshida(4))) == dvi.Yoshida(4)
+
+
+def test_a_warning_shows_the_line_of_the_user():
+    for call, words in WARNINGS[:3]:
+        with pytest.warns(UserWarning, match=words) as record:
+            call()
+        assert record[0].filename == __file__
 
 
 def final(**how):

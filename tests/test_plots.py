@@ -418,7 +418,7 @@ def test_invariants_are_changes_since_the_first_value(single):
     (axis,) = [a for a in axes if a.get_ylabel() == "energy\nrelative change"]
     E = np.asarray(single.observed["energy"])
     t, change = lines(axis)[0]
-    same(t, single.ts[1:])
+    same(t, single.ts)
     close(change, (E - E[0]) / abs(E[0]), atol=1e-15)
 
 
@@ -436,11 +436,11 @@ def test_functions_of_the_state_begin_at_the_initial_condition(good):
 
 
 def test_solutions_of_several_runs_share_a_panel_for_observables_of_all(single, good):
-    observed = {"energy": single.observed["energy"][:20]}
+    observed = {"energy": single.observed["energy"][:21]}
     short = SimpleNamespace(ts=single.ts[:21], qs=single.qs[:21], observed=observed)
     axis = plot.invariants([good, short], labels=["a", "b", "c"])
-    assert [len(xy[0]) for xy in lines(axis)] == [60, 60, 20]
-    same(lines(axis)[0][1][:20], lines(axis)[2][1])
+    assert [len(xy[0]) for xy in lines(axis)] == [61, 61, 21]
+    same(lines(axis)[0][1][:21], lines(axis)[2][1])
     mine = {"E": [np.ones(61), np.ones(61), np.r_[1, 2 * np.ones(20)]]}
     assert lines(plot.invariants([good, short], mine))[2][1].max() == 1
     refuses(plot.invariants, (([good, short], {"E": np.ones(61)}), {}, "a list of 3 arrays"))

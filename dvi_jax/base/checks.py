@@ -32,6 +32,12 @@ def positive(name: str, value: Any, zero: bool = False, hint: str = "") -> float
     return _number(name, value, kind, lambda x: x > 0 or (zero and x == 0), hint)
 
 
+def electronvolts(name: str, value: Any, low: float) -> float:
+    """An energy [eV] not below `low`, as one in another unit is. **Raises** `ValueError`."""
+    hint = "The unit is eV: 1 MeV is 1e6, 1 GeV is 1e9."
+    return _number(name, value, f"an energy of at least {low:g} eV", lambda x: x >= low, hint)
+
+
 def fraction(name: str, value: Any) -> float:
     """A number between 0 and 1, both excluded. **Raises** `ValueError`."""
     return _number(name, value, "between 0 and 1 (both excluded)", lambda x: 0 < x < 1)
@@ -157,7 +163,7 @@ def instance(name: str, value: Any, kind: Any, description: str, hint: str = "")
 
 def function(name: str, value: Any, arguments: str = "", hint: str = "") -> Callable[..., Any]:
     """A function; `arguments`: of what, such as "(t, q, p, args)". **Raises** `TypeError`."""
-    if not callable(value):
+    if not callable(value) or isinstance(value, type):
         signature = f" of {arguments}" if arguments else ""
         raise TypeError(
             f"{name} must be a function{signature}, got {value!r:.200}.{_sentence(hint)}"
@@ -178,6 +184,16 @@ SYNONYMS = {
     "events": "stop",
     "grid": "lattice",
     "newton": "root_finder",
+    **dict.fromkeys(("H", "hamiltonian", "Hamiltonian"), "H_D"),
+    **dict.fromkeys(("W", "F", "forces"), "force"),
+    **dict.fromkeys(("L", "l"), "length"),
+    **dict.fromkeys(("errors", "error", "std", "yerr"), "sigma"),
+    **dict.fromkeys(("x", "y", "data"), "values"),
+    **dict.fromkeys(("E", "E0"), "energy"),
+    **dict.fromkeys(("T", "kT", "k_BT"), "temperature"),
+    **dict.fromkeys(("x0", "y0", "q"), "q0"),
+    **dict.fromkeys(("v0", "p0_"), "p0"),
+    **dict.fromkeys(("g", "dt_dtau", "monitor"), "speed"),
 }
 """Names of arguments in other packages → the name here."""
 
@@ -201,16 +217,23 @@ def refuse_unknown(name: str, function: Callable[..., Any], keywords: Iterable[s
     """**Raises** `TypeError` for keywords that the function does not have, with the one meant."""
     for keyword in keywords:
         names = argument_names(function)
-        close = difflib.get_close_matches(keyword, names, 1, 0.6)
+        # Upper case is no other word: K1 is k1.
+        spellings = {name.lower(): name for name in reversed(names)}
+        close = difflib.get_close_matches(keyword.lower(), spellings, 1, 0.6)
         # Synonyms first: by spelling alone the nearest name to dt0 would be t0.
         suggestion = SYNONYMS.get(keyword) if SYNONYMS.get(keyword) in names else None
-        suggestion = suggestion or (close[0] if close else None)
-        hint = f" Its arguments are {', '.join(names)}."
+        suggestion = suggestion or (spellings[close[0]] if close else None)
+        hint = f" {arguments_text(names)}"
         if suggestion:
             hint = f" Did you mean {suggestion!r}?"
         if keyword in ("rtol", "atol", "tolerance"):
             hint = " No tolerance controls the size of the steps: choose h."
         raise TypeError(f"{name} has no argument {keyword!r}.{hint}")
+
+
+def arguments_text(names: list[str]) -> str:
+    """A sentence with the arguments of a function, for messages."""
+    return f"Its arguments are {', '.join(names)}." if names else "It has no arguments."
 
 
 def _is_number(value: Any) -> bool:

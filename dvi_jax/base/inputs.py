@@ -50,6 +50,23 @@ def _join(value: Any) -> Any:
     return jnp.asarray(value) if is_list and any(map(is_traced, jax.tree.leaves(value))) else value
 
 
+def real_numbers(name: str, value: Any) -> Array:
+    """Real numbers as an array of floats. **Raises** `TypeError` for anything else."""
+    # Text first becomes an array of text in NumPy, of which JAX does not say the name.
+    value = _join(value)
+    value = value if is_traced(value) else _as_numpy(name, value)
+    _require_real(name, value)
+    return jnp.asarray(value, float)
+
+
+def _require_real(name: str, value: Any) -> None:
+    if not _is_real(value.dtype):
+        excerpt = f": {value!s:.80}" if isinstance(value, np.ndarray) else ""
+        raise TypeError(
+            f"{name} must be an array of real numbers, got dtype {value.dtype}{excerpt}."
+        )
+
+
 def _real_array(name: str, value: Any) -> Array:
     value = original = _join(value)
     if not (isinstance(value, jax.Array) and is_traced(value)):
@@ -62,9 +79,7 @@ def _real_array(name: str, value: Any) -> Array:
             f"{name} must be real, got dtype {kind}: for ψ = (q0 + i p0)/√2 give q0 = √2 Re ψ and "
             "p0 = √2 Im ψ."
         )
-    if not _is_real(kind):
-        excerpt = f": {value!s:.80}" if isinstance(value, np.ndarray) else ""
-        raise TypeError(f"{name} must be an array of real numbers, got dtype {kind}{excerpt}.")
+    _require_real(name, value)
     # A traced value that is not finite becomes the status of its trajectory.
     if isinstance(value, np.ndarray):
         all_finite(name, value)

@@ -1,10 +1,15 @@
-"""Keywords that a function declares as ``**settings: Unpack[...]`` of a `TypedDict`."""
+"""Calls with arguments that a function does not have, or without those that it needs."""
 
+import difflib
 import functools
+import inspect
+import re
+import sys
 from collections.abc import Callable
+from types import ModuleType
 from typing import Any, TypeVar
 
-from .checks import argument_names, only_one, refuse_unknown, require, settings_type
+from .checks import argument_names, arguments_text, only_one, refuse_unknown, require, settings_type
 from .machine import refuse_fork
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -46,3 +51,110 @@ def accept_newton(cls: type[T]) -> type[T]:
     # In place: `isinstance` and pickles refer to this class, not to a subclass of it.
     cls.__init__ = init
     return cls
+
+
+_OWN = ("dvi_jax", "lanewise")
+_BETWEEN = (*_OWN, "equinox", "jaxtyping", "beartype", "contextlib")
+
+
+def user_level() -> int:
+    """The `stacklevel` of a warning that shows the line of the user's program."""
+    # Counted, because it is one more frame under some decorators.
+    frame, level = sys._getframe(1), 1
+    while frame.f_back and frame.f_globals.get("__name__", "").split(".")[0] in _BETWEEN:
+        frame, level = frame.f_back, level + 1
+    return level
+
+
+def explain_calls(module: ModuleType) -> None:
+    """Make the public functions and classes of a module explain a call with wrong arguments."""
+    # The error of Python has neither the names that are allowed nor the one that was meant.
+    if module.__name__ in sys.modules and not hasattr(module, "__getattr__"):
+        vars(module)["__getattr__"] = functools.partial(_refuse_name, module)
+    for name, value in list(vars(module).items()):
+        owner = getattr(value, "__module__", None) or ""
+        if isinstance(value, ModuleType):
+            # A package in a package, such as `boozer` in `systems`.
+            if value.__name__ == f"{module.__name__}.{name}" and hasattr(value, "__path__"):
+                explain_calls(value)
+        elif name.startswith("_") or not owner.startswith((module.__name__, "lanewise")):
+            continue
+        elif inspect.isfunction(value) and not hasattr(value, "explains_calls"):
+            # A pickle looks a function up where it was defined.
+            home = sys.modules[owner]
+            call = getattr(home, value.__name__, None)
+            if call is value:
+                call = _explained(value, value.__name__, value)
+                setattr(home, value.__name__, call)
+            if getattr(call, "__wrapped__", None) is value:
+                setattr(module, name, call)
+        elif isinstance(value, type) and not issubclass(value, BaseException):
+            for attribute, method in list(vars(value).items()):
+                is_public = attribute == "__init__" or not attribute.startswith("_")
+                if is_public and inspect.isfunction(method):
+                    label = f"{value.__name__}.{attribute}".removesuffix(".__init__")
+                    call = _explained(method, label, functools.partial(method, None))
+                    setattr(value, attribute, call)  # in place, as in `accept_newton`
+
+
+def _refuse_name(module: ModuleType, name: str) -> None:
+    names = [n for n, x in vars(module).items() if not (n[0] == "_" or isinstance(x, ModuleType))]
+    close = difflib.get_close_matches(name.lower(), names, 3, 0.5)
+    hint = f" Did you mean {' or '.join(close)}?" if close else f" See dir({module.__name__})."
+    text = f"module {module.__name__!r} has no attribute {name!r}.{hint}"
+    raise AttributeError(text, name=name, obj=module)
+
+
+def _explained(function: Callable[..., Any], name: str, signature: Any) -> Callable[..., Any]:
+    """The function, with `signature` as the arguments that a user gives."""
+    if hasattr(function, "explains_calls"):
+        return function
+
+    @functools.wraps(function)
+    def call(*args: Any, **keywords: Any) -> Any:
+        try:
+            return function(*args, **keywords)
+        except TypeError as error:
+            own = args[1:] if signature is not function else args
+            # Most errors come from inside of the function, and not from this call of it.
+            if not _CALL.search(str(error)) or _fits(signature, own, keywords):
+                raise
+        _refuse_call(name, signature, len(own), keywords)
+
+    # A mark, since a module may be explained more than once.
+    vars(call)["explains_calls"] = True
+    return call
+
+
+# What Python says of arguments that do not fit; an error inside of the function may say it, too.
+_CALL = re.compile(r"\(\) (got (an unexpected|multiple)|missing \d|takes )")
+
+
+def _fits(function: Callable[..., Any], args: tuple[Any, ...], keywords: dict[str, Any]) -> bool:
+    try:
+        inspect.signature(function).bind(*args, **keywords)
+    except TypeError:
+        return False
+    return True
+
+
+def _refuse_call(name: str, function: Callable[..., Any], count: int, keywords: Any) -> None:
+    """**Raise** `TypeError` for a call with `count` arguments by position and these keywords."""
+    names = argument_names(function)
+    refuse_unknown(name, function, [keyword for keyword in keywords if keyword not in names])
+    # First unknown names: a misspelt argument is missing as well.
+    parameters = list(inspect.signature(function).parameters.values())
+    by_position = [p.name for p in parameters if p.kind <= p.POSITIONAL_OR_KEYWORD]
+    absent = {
+        p.name: None
+        for p in parameters
+        if p.default is p.empty
+        and p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)
+        and p.name not in (*by_position[:count], *keywords)
+    }
+    hint = arguments_text(names)
+    require(name, absent, hint=hint)
+    raise TypeError(
+        f"{name} takes {len(by_position)} argument(s) by position, got {count}"
+        f"{f' and {list(keywords)} by name' if keywords else ''}. {hint}"
+    )

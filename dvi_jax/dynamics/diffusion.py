@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from ..base.checks import whole
 from ..base.keywords import checked_keywords
 from ..base.printing import printable
-from ..base.signature import accepts
+from ..base.signature import with_time
 from ..integration.integrate import integrate
 from ..integration.keywords import IntegrationSettings
 from ..observe import Mean
@@ -82,7 +82,7 @@ def invariant_diffusion(
     noise = system.noise
     if noise is None:
         raise ValueError("system must have noise, such as dvi.System(H_D, noise=...).")
-    value = invariant if accepts(invariant, 4) else (lambda t, q, p, args: invariant(q, p))
+    value = with_time("invariant", invariant)
     epsilon = system.strength(settings.get("epsilon"))
     options: dict[str, Any] = {**settings, "h": h, "args": args, "epsilon": epsilon}
 

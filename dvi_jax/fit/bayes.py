@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from ..base.checks import fraction, instance, whole
-from ..base.keywords import checked_keywords
+from ..base.keywords import checked_keywords, user_level
 from ..base.printing import printable
 from ._fit import fit
 from .checks import package, same_parameters
@@ -239,7 +239,7 @@ def sample(
     statistics = mcmc.get_extra_fields(group_by_chain=True)
     samples = collect(posterior, x, statistics, notes, 2**depth - 1, maxima, text)
     for text in samples.warnings:
-        warnings.warn(text, UserWarning, stacklevel=3)
+        warnings.warn(text, UserWarning, stacklevel=user_level())
     return samples
 
 

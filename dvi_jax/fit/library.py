@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..base.checks import instance, one_of, whole
-from ..base.signature import check_takes
+from ..base.signature import with_time
 from ..base.types import Args, Scalar, State
 from ..problem.system import System
 from .checks import require_shape
@@ -43,14 +43,17 @@ class ForceLibrary(eqx.Module):
     coefficients: Array | None
 
     def __init__(self, candidates: Mapping[str, Callable[..., Any]], coefficients: Any = None):
-        a_dict = "a dict {name: function (t0, t1, q0, p1, args)}"
+        a_dict = "a dict {name: function (q0, p1) or (t0, t1, q0, p1, args)}"
         instance("the candidates of a dvi.ForceLibrary", candidates, Mapping, a_dict)
         if not candidates:
             raise ValueError("a dvi.ForceLibrary must have at least one candidate, got {}.")
-        for name, function in candidates.items():
+        for name in candidates:
             instance("the name of a candidate", name, str, "a string")
-            check_takes(f"the candidate {name!r}", function, "(t0, t1, q0, p1, args)")
-        self.functions, self.names = tuple(candidates.values()), tuple(candidates)
+        arguments = "(t0, t1, q0, p1, args)"
+        self.functions = tuple(
+            with_time(f"the candidate {name!r}", f, arguments) for name, f in candidates.items()
+        )
+        self.names = tuple(candidates)
         if coefficients is not None:
             coefficients = jnp.asarray(coefficients, float)
             self._check_shape(coefficients, "coefficients")

@@ -10,7 +10,7 @@ import numpy as np
 from ..base.checks import finite, instance
 from ..base.inputs import refuse_unit_or_mask
 from ..base.printing import printable
-from ..base.signature import accepts, signature_of
+from ..base.signature import with_time
 from .checks import require_all, require_shape
 
 # Standard errors relative to the largest value for which a sum of squares can be computed.
@@ -33,8 +33,8 @@ class Observations:
     - `values`: observed values, shape (N, ...), for one component also (N,); NaN, or a masked
       number, where a component is missing. Only `values` may be masked.
     - `observe`: the observable of a state: ``"positions"`` (q, the default), ``"momenta"`` (p),
-      ``"state"`` (both in one vector), or a function ``(t, q, p, args)`` that returns an array of
-      the shape of one value: a range, an angle, one body of many.
+      ``"state"`` (both in one vector), or a function ``(q, p)`` or ``(t, q, p, args)`` that
+      returns an array of the shape of one value: a range, an angle, one body of many.
     - `sigma`: standard errors: one number, or an array that broadcasts to `values`. Without them
       all values have the same error, whose size is estimated from the residuals.
     - `covariance`: instead of sigma, covariances of the K components of one observation in the
@@ -70,12 +70,14 @@ class Observations:
             values = np.ma.filled(values.astype(float), np.nan)
         ts, values = _real("ts", self.ts), _real("values", values)
         is_name, observe = isinstance(self.observe, str), self.observe
-        if not (observe in OBSERVABLES if is_name else callable(observe) and accepts(observe, 4)):
-            description = signature_of(observe) if callable(observe) else f"{observe!r:.200}"
+        if is_name and observe not in OBSERVABLES:
             raise TypeError(
-                'observe must be "positions", "momenta", "state" or a function (t, q, p, args), '
-                f"got {description}."
+                'observe must be "positions", "momenta", "state" or a function (q, p) or '
+                f"(t, q, p, args), got {observe!r:.200}."
             )
+        if not is_name:
+            hint = 'or "positions", "momenta" or "state"'
+            object.__setattr__(self, "observe", with_time(f"observe ({hint})", observe))
         if ts.ndim != 1 or ts.size == 0 or values.shape[:1] != ts.shape:
             raise ValueError(
                 "ts must be a one-dimensional array of times, not empty, and values must have one "

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from ..base.checks import instance
+from ..base.keywords import user_level
 from ..base.reads import Reads, reads
 from ..base.results import RESULTS, status_name
 from ..problem.system import check_system
@@ -155,7 +156,7 @@ def _warn_of_times(model: Model, params: Any, arcs: list[Observations]) -> None:
                 f"arc {i}: t0 is not given, so the fit uses {' and '.join(fixed)} of the model at "
                 f"the first observation, t = {arc.t0:g}. If the state of the model belongs to "
                 "another time, give this time: dvi.Observations(..., t0=...).",
-                stacklevel=5,
+                stacklevel=user_level(),
             )
 
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..base.files import publish_npz, read_npz, user_file, user_path
+from ..base.keywords import user_level
 from ..base.printing import printable
 from ..base.progress import bar_of, reporter
 from ..base.reads import reads
@@ -122,7 +123,7 @@ class FitRun:
                     f"the checkpoint {self.checkpoint} cannot be written. The fit continues and "
                     "tries again later. If an earlier checkpoint exists, it is unchanged. Cause: "
                     f"{error}.",
-                    stacklevel=2,
+                    stacklevel=user_level(),
                 )
             self.save_time = time.monotonic()
         if self.show is not None:

@@ -13,7 +13,7 @@ from lanewise.primitive import generates
 
 from ..base.checks import function as check_function
 from ..base.machine import results_memory
-from ..base.signature import tracing_note
+from ..base.signature import output_of
 from ..lattices import Lattice, Run
 from ..methods import Method
 from ..observe import FORMS, Deviations, Range, Reduction, Running, Section, is_observable
@@ -29,6 +29,8 @@ def check_observe(task: Task, q0: Array, p0: Array) -> int:
     """**Raises** `TypeError` or `ValueError` for observables that are not functions of a step with
     an array as value. **Returns** the bytes of those without a reduction, at one save point."""
     size = 0
+    if task.stop is not None:
+        output_of("g(t, q, p, args) of Stop", task.stop.g, task.t0, q0, p0, task.args)
     for leaf in jax.tree.leaves(task.observe, is_leaf=is_observable):
         is_class = isinstance(leaf, type) and issubclass(leaf, Reduction | Running)
         if is_class or not is_observable(leaf):
@@ -46,19 +48,9 @@ def check_observe(task: Task, q0: Array, p0: Array) -> int:
         name = getattr(function, "__name__", type(function).__name__)
         check_function(f"the argument of {type(leaf).__name__}", function, FORMS)
         t0, bound = task.t0, task.bound(function)
-        try:
-            value = eqx.filter_eval_shape(bound, t0, t0, q0, p0, q0, p0, task.args)
-        except Exception as error:
-            # The error itself stays: its type and traceback show the line of the user.
-            error.add_note(f"(in the observable {name}, with the arguments {FORMS})")
-            error.add_note(tracing_note(name, error))
-            raise
-        if not hasattr(value, "shape") and not isinstance(value, int | float):
-            kind = "None (is a return missing?)" if value is None else type(value).__name__
-            raise TypeError(
-                f"the observable {name!r} must return one array, got {kind}. Stack several values "
-                "with jnp.stack, or observe a dict of functions."
-            )
+        subject = f"the observable {'Section' if isinstance(leaf, Section) else repr(name)}"
+        hint = "Stack several values with jnp.stack, or observe a dict of functions."
+        value = output_of(subject, bound, t0, t0, q0, p0, q0, p0, task.args, hint=hint)
         if isinstance(leaf, Range) and jnp.issubdtype(jnp.result_type(value), jnp.complexfloating):
             raise TypeError(
                 f"dvi.Range requires real values, but {name!r} returns complex ones: observe their "

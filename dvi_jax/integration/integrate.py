@@ -144,6 +144,7 @@ def integrate(
     integrator = chosen(integrator, **options)
     instance("save", save, Save, "a dvi.Save(...)", _save_hint(save))
     instance("stop", stop, Stop | None, "a dvi.Stop(g)")
+    instance("throw", throw, bool, "True or False")
     q0, p0 = start_state(q0, p0)
     if observe is not None:
         observe = of_steps(observe)

@@ -12,6 +12,7 @@ from jaxtyping import Array, PyTree
 from lanewise import Layout
 from lanewise.jaxprs.jaxapi import is_traced
 
+from ..base.keywords import user_level
 from ..base.reads import reads
 from ..base.types import Interval, State
 from ..lattices import Lattice, Run
@@ -116,7 +117,7 @@ def _task(run: Run, integrator: Integrator, method: Method, h: Array) -> tuple[T
         warnings.warn(
             f"epsilon = {float(epsilon):g} has no effect: the system has neither a force nor a "
             "perturbation. Leave epsilon out, or add force= or perturbation= in dvi.System(...).",
-            stacklevel=4,  # the call of `integrate`
+            stacklevel=user_level(),
         )
     lattice, arithmetic = integrator.lattice, integrator.arithmetic
     equations = Equations(system, epsilon, run.args, integrator.root_finder)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import dvi_jax as dvi
 
 from ..base.inputs import refuse_unit_or_mask
+from ..base.keywords import user_level
 from .extras import system_of
 
 
@@ -72,5 +73,5 @@ def system_and_strength(system: Any, epsilon: Any) -> tuple[dvi.System, Any]:
         value = 0.0
     if value != 0 and not system.depends_on_epsilon:
         text = f"epsilon = {value:g} has no effect without a force or a perturbation: leave it out."
-        warnings.warn(text, stacklevel=3)
+        warnings.warn(text, stacklevel=user_level())
     return system, epsilon

@@ -14,7 +14,7 @@ from ..base.files import user_file
 from ..base.inputs import refuse_unit_or_mask
 from ..base.printing import printable
 from ..systems import Problem
-from ..systems._problem import at_end
+from ..systems._problem import at_end, of_state
 from ..systems.n_body import (
     INVARIANTS,
     OBSERVABLES,
@@ -149,7 +149,7 @@ def from_rebound(
     texts_of: dict[str, Any] = {"units": units, "check": check_bodies}
     texts_of |= {"source": "a simulation of REBOUND"}
     texts_of |= {"parameters": {name: parameters.get(name, "b [length]") for name in args}}
-    texts_of |= {"observables": OBSERVABLES | {"energy": at_end(function)}}
+    texts_of |= {"observables": OBSERVABLES | {"energy": of_state(at_end(function))}}
     if not softening:
         texts_of |= {"invariants": INVARIANTS, "symmetries": symmetries(3)}
     theirs = {"names": names, "velocities": v, "radii": rows[:, 7], "t0": numbers["t"]}

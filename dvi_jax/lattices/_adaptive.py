@@ -10,7 +10,7 @@ from jax import lax
 from lanewise.rules.exact import two_sum
 
 from ..base.results import RESULTS
-from ..base.signature import check_takes
+from ..base.signature import with_time
 from ..base.types import Interval, Scalar
 from ..engine.rounding import one_by_one
 from ..methods.step import Equations
@@ -42,7 +42,7 @@ class AdaptiveReversible(StepSizes):
     is therefore reversible if the system is reversible and g is even in the momenta; then
     invariants of nearly integrable motion do not drift. The map is not symplectic.
 
-    **Arguments** `speed`: g, function ``(t, q, p, args)`` → positive scalar, as for
+    **Arguments** `speed`: g, function ``(q, p)`` or ``(t, q, p, args)`` → positive scalar, as for
     `TimeTransformed`; |q|^{3/2} is a good choice for Kepler's problem. H is H_D at t1 = t0.
 
     The method must be symmetric, such as `Strang` or `KahanLi`. `integrate` interprets `h` as δ
@@ -69,7 +69,7 @@ class AdaptiveReversible(StepSizes):
 
     ```python
     kepler = systems.kepler()
-    close = dvi.AdaptiveReversible(lambda t, q, p, args: jnp.sqrt(q @ q))
+    close = dvi.AdaptiveReversible(lambda q, p: jnp.sqrt(q @ q))
     sol = dvi.integrate(kepler.system, kepler.q0, kepler.p0, args=kepler.args, h=0.1, num_steps=100,
                         lattice=close, method=dvi.Strang())
     print(round(float(sol.hs.min()), 3), round(float(sol.hs.max()), 3))
@@ -81,8 +81,8 @@ class AdaptiveReversible(StepSizes):
 
     has_memory: ClassVar[bool] = True
 
-    def __check_init__(self):
-        check_takes("the speed of AdaptiveReversible", self.speed, "(t, q, p, args)")
+    def __init__(self, speed: Callable[..., Any]):
+        self.speed = with_time("the speed of AdaptiveReversible", speed)
 
     def check(self, method, arithmetic):
         if not method.is_symmetric:

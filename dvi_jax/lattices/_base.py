@@ -14,6 +14,7 @@ from lanewise.jaxprs.jaxapi import is_traced
 from ..base.checks import require, whole
 from ..base.printing import printable
 from ..base.results import RESULTS
+from ..base.signature import output_of
 from ..base.types import Args, Interval, Scalar, State
 from ..methods.step import Equations
 from ..observe import Stop
@@ -130,7 +131,9 @@ def check_rounding(owner: str, arithmetic: Any) -> None:
 def check_speed(owner: str, speed: Callable[..., Any], run: Run) -> None:
     """**Raises** `ValueError` for a speed that is not a positive scalar at the start of a run."""
     # At the start only: values at later states are checked by the status of the run.
-    value = jnp.asarray(speed(run.t0, run.q0, run.p0, run.args))
+    arguments = run.t0, run.q0, run.p0, run.args
+    output_of(f"speed(t, q, p, args) of {owner}", speed, *arguments)
+    value = jnp.asarray(speed(*arguments))
     if value.shape != () or (not is_traced(value) and not float(value) > 0):
         raise ValueError(
             f"speed of {owner} must return one positive number, but at the initial state it "

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..base.inputs import start_state
-from ..base.signature import check_takes
+from ..base.signature import with_time
 from ..base.types import Args, Bindable, Scalar, State
 from ..engine.rounding import one_by_one
 from ..observe import (
@@ -41,8 +41,8 @@ class TimeTransformed(Uniform):
     Every method keeps its structure in the extended phase space; a step size that is chosen at each
     step would destroy it. H is H_D at t1 = t0; a force W becomes g W for p and −g W·∂H/∂p for p_t.
 
-    **Arguments** `speed`: g, function ``(t, q, p, args)`` → positive scalar; for Kepler's problem
-    |q| or |q|^{3/2}, for example.
+    **Arguments** `speed`: g, function ``(q, p)`` or ``(t, q, p, args)`` → positive scalar; for
+    Kepler's problem |q| or |q|^{3/2}, for example.
 
     `integrate` then interprets `h` as the step of σ [time / unit of g], and takes num_steps of
     them; ``solution.hs`` are the steps of t. Observables receive t. K couples q and p even where
@@ -58,7 +58,7 @@ class TimeTransformed(Uniform):
 
     ```python
     kepler = systems.kepler()
-    slow_near_the_sun = dvi.TimeTransformed(lambda t, q, p, args: jnp.sqrt(q @ q))
+    slow_near_the_sun = dvi.TimeTransformed(lambda q, p: jnp.sqrt(q @ q))
     sol = dvi.integrate(kepler.system, kepler.q0, kepler.p0, args=kepler.args, h=0.1, num_steps=100,
                         lattice=slow_near_the_sun, method=dvi.Strang())
     print(round(float(sol.hs.min()), 3), round(float(sol.hs.max()), 3))
@@ -71,8 +71,8 @@ class TimeTransformed(Uniform):
     # The steps are equal in σ: their number does not follow from a time t1.
     steps_to = Lattice.steps_to
 
-    def __check_init__(self):
-        check_takes("the speed of TimeTransformed", self.speed, "(t, q, p, args)")
+    def __init__(self, speed: Callable[..., Any]):
+        self.speed = with_time("the speed of TimeTransformed", speed)
 
     def transform(self, run):
         """The run in extended phase space, in the time σ from 0 on."""

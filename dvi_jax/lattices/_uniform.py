@@ -19,9 +19,10 @@ class Uniform(StepSizes):
         arguments += f"duration={duration!r}" if t1 is None else f"t1={t1!r}, t0={t0!r}"
         require("duration" if t1 is None else "t1", {"h": h})
         try:
-            length = float(duration) if t1 is None else float(t1) - float(t0)
+            # A sum first: float() alone would accept text.
+            length = float(0.0 + duration) if t1 is None else float(0.0 + t1) - float(0.0 + t0)
             # h = 0 has its own message later.
-            steps = length / (float(h) or 1.0)
+            steps = length / (float(0.0 + h) or 1.0)
         except TypeError:
             raise TypeError(
                 f"{span} and h must be numbers that are not traced, got {arguments}: give "

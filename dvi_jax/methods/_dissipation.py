@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..base.keywords import user_level
 from ..base.types import Interval, State
 from ._base import Method
 from .step import Equations
@@ -43,7 +44,7 @@ def warn_of_dissipation(
             f"{growth:.3g}. Above {_STRONG} the map is not more accurate than a map of order 2; "
             "at 1 it is singular. Use a smaller h, or a method without substeps backwards in "
             "time, such as dvi.Strang() or dvi.GaussLegendre(2).",
-            stacklevel=5,  # the call of `integrate`
+            stacklevel=user_level(),
         )
 
 

@@ -16,6 +16,7 @@ from jax import lax
 
 from lanewise.jaxprs.dependence import depends_on
 
+from ..base.keywords import user_level
 from ..base.types import Interval, State
 from ..problem.flows import Flow, Kepler, Known
 from ..problem.split import Split
@@ -312,7 +313,7 @@ class Splitting(SplittingMethod):
                 f"the state {others[0] / first:.2g} times less than the second. The orders "
                 f"{self.scheme} hold for A + εB with a small second part: write the larger part "
                 "first.",
-                stacklevel=5,  # the call of `integrate`
+                stacklevel=user_level(),
             )
 
     def is_double_only(self, equations) -> bool:

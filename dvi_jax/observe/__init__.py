@@ -23,6 +23,7 @@ from ._reductions import (
 )
 from ._states import (
     FORMS as FORMS,
+    AtEnd as AtEnd,
     InSlowTime as InSlowTime,
     OfState as OfState,
     has_initial_value as has_initial_value,

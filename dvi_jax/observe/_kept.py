@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from ..base.checks import array, one_of, whole
 from ..base.printing import printable
-from ..base.signature import check_takes
+from ..base.signature import array_type, with_time
 from ..base.types import Args, Scalar, State
 from ._reductions import Reduction
 
@@ -112,7 +112,8 @@ class Section(KeptSteps):
 
     **Arguments**
 
-    - `g`: function ``(t, q, p, args)`` → scalar. For an angle use sin or cos, which do not jump.
+    - `g`: function ``(q, p)`` or ``(t, q, p, args)`` → scalar. For an angle use sin or cos, which
+      do not jump.
     - `direction`: 1 (the default, as in `poincare_section` and `ReturnMap`) for crossings where g
       increases with time, −1 where it decreases, 0 for both; the same points for h > 0 and h < 0.
     - `max_crossings`: the largest number that is stored; static.
@@ -130,7 +131,7 @@ class Section(KeptSteps):
 
     ```python
     kepler = systems.kepler()
-    axis = dvi.Section(lambda t, q, p, args: q[0], direction=1, max_crossings=20)
+    axis = dvi.Section(lambda q, p: q[0], direction=1, max_crossings=20)
     sol = dvi.integrate(kepler.system, kepler.q0, kepler.p0, args=kepler.args, h=0.1, num_steps=600,
                         observe={"axis": axis}, method=dvi.Yoshida(4), save=dvi.Save(final=True))
     crossed = sol.observed["axis"]
@@ -147,13 +148,12 @@ class Section(KeptSteps):
     def __init__(
         self, g: Callable[..., Any], direction: int = 1, max_crossings: int = 1000, skip: int = 0
     ):
-        self.g = g
+        self.g = with_time("g of Section", g)
         self.direction = direction.item() if isinstance(direction, np.integer) else direction
         self.capacity = whole("max_crossings", max_crossings)
         self.skip = whole("skip", skip, 0, hint="It is a number of crossings.")
 
     def __check_init__(self):
-        check_takes("g of Section", self.g, "(t, q, p, args)")
         hint = "1 selects the crossings where g increases, -1 where it decreases, 0 both."
         one_of("direction", self.direction, (1, -1, 0), hint)
 
@@ -219,7 +219,9 @@ def event(
     g: Callable[..., Any], t: Scalar, q: State, p: State, args: Args, name: str = "g"
 ) -> Scalar:
     """g at a point, refused unless it is a real scalar that can pass through a value."""
-    value = jnp.asarray(g(t, q, p, args))
+    value = g(t, q, p, args)
+    array_type(f"{name}(t, q, p, args)", value)
+    value = jnp.asarray(value)
     hint = "For a condition such as |q| > 2 take the difference |q| − 2."
     array(f"{name}(t, q, p, args)", value, (), verb="return", hint=hint)
     return value.astype(q.dtype)

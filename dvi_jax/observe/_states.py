@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 from jaxtyping import PyTree
 
-from ..base.signature import accepts, signature_of
+from ..base.signature import accepts, signature_of, takes_state, warn_of_exchanged
 from ..base.types import Bindable
 from ._reductions import Reduction, Running, is_observable
 
@@ -16,19 +16,37 @@ FORMS = "(q, p), (t, q, p, args) or (t0, t1, q0, p0, q1, p1, args)"
 
 
 class OfState(eqx.Module):
-    """A function of the state at the end of a step, which has a value at the initial state, too."""
+    """A function of the state at the end of a step, which has a value at the initial state, too.
+
+    It is called with the arguments of a step or with (t, q, p, args).
+    """
 
     function: Callable[..., Any]
     takes_time: bool = eqx.field(static=True)
 
-    def __call__(self, t0, t1, q0, p0, q1, p1, args):
-        return self.function(t1, q1, p1, args) if self.takes_time else self.function(q1, p1)
+    def __call__(self, *arguments):
+        t, q, p, args = (arguments[1], *arguments[4:]) if len(arguments) == 7 else arguments
+        return self.function(t, q, p, args) if self.takes_time else self.function(q, p)
 
     def bind(self, system: Any, epsilon: Any) -> "OfState":
         """The same observable, for a function that requires the system or ε."""
         if not isinstance(self.function, Bindable):
             return self
         return OfState(self.function.bind(system, epsilon), self.takes_time)
+
+    @property
+    def __name__(self) -> str:
+        return getattr(self.function, "__name__", type(self.function).__name__)
+
+
+class AtEnd(eqx.Module):
+    """A function of a step that depends on its end alone, as one of the state."""
+
+    function: Callable[..., Any]
+
+    # A step of length zero: both ends are the state.
+    def __call__(self, t, q, p, args):
+        return self.function(t, t, q, p, q, p, args)
 
     @property
     def __name__(self) -> str:
@@ -89,7 +107,8 @@ def _of_step(leaf: Any) -> Any:
     # The longest form first: a function with defaults or *rest accepts several of them.
     if not callable(leaf) or isinstance(leaf, type) or accepts(leaf, 7):
         return leaf
-    for count in (4, 2):
-        if accepts(leaf, count):
+    for count, fits in ((4, accepts(leaf, 4)), (2, takes_state(leaf))):
+        if fits:
+            warn_of_exchanged("an observable", leaf, {2: "(q, p)", 4: "(t, q, p, args)"}[count])
             return OfState(leaf, count == 4)
     raise TypeError(f"an observable must be a function of {FORMS}, got {signature_of(leaf)}.")

@@ -16,7 +16,7 @@ from ..base.checks import in_order, only_one, whole
 from ..base.inputs import as_times
 from ..base.printing import first_lines
 from ..base.results import RESULTS, status_counts, status_name
-from ..base.signature import check_takes
+from ..base.signature import with_time
 from ..base.types import State
 from .labelled import dataset_of, table_of
 from .saved import read, write
@@ -25,6 +25,10 @@ from .saved import read, write
 # The times are an array, not static: they may be traced, and new times need no new compilation.
 def _times(ts: Any) -> Any:
     return None if ts is None else as_times("Save(ts=...)", ts)
+
+
+def _clock(clock: Any) -> Any:
+    return None if clock is None else with_time("the clock of Save", clock)
 
 
 class Save(eqx.Module):
@@ -38,8 +42,8 @@ class Save(eqx.Module):
       grid points it is a shorter step of the method to that time, which has the order of the
       method. Times outside of the run give NaN and the status `not_reached`. Invariants of the map
       at step h are conserved at grid points only, not at the end of a shorter step.
-      With ``clock=f``, a function ``(t, q, p, args)`` → scalar that grows along the trajectory, an
-      angle for instance, `ts` are values of it.
+      With ``clock=f``, a function ``(q, p)`` or ``(t, q, p, args)`` → scalar that grows along the
+      trajectory, an angle for instance, `ts` are values of it.
 
     **Raises** `ValueError` for an `every` that is not a positive integer, for `ts` together with
     another choice, and for times that are not one-dimensional, finite and in order.
@@ -60,13 +64,11 @@ class Save(eqx.Module):
     every: int | None = eqx.field(static=True, default=None)
     final: bool = eqx.field(static=True, default=False)
     ts: Float[Array, " times"] | None = eqx.field(default=None, converter=_times)
-    clock: Callable[..., Any] | None = None
+    clock: Callable[..., Any] | None = eqx.field(default=None, converter=_clock)
 
     def __check_init__(self):
         if self.every is not None:
             whole("every in Save(every=...)", self.every)
-        if self.clock is not None:
-            check_takes("the clock of Save", self.clock, "(t, q, p, args)")
         if self.ts is None:
             if self.clock is not None:
                 raise ValueError("clock of Save requires ts, its values.")
@@ -220,6 +222,12 @@ class Solution(eqx.Module):
         hint = hint or "attributes are " + ", ".join([*self.__dataclass_fields__, "status"])
         text = f"a Solution has no attribute {name!r}. The {hint}."
         raise AttributeError(text, name=name, obj=self)
+
+    def __getitem__(self, name: Any) -> Any:
+        raise TypeError(
+            f"a Solution has no items, got [{name!r}]. Its arrays are ts, qs, ps and observed; "
+            "values of an observable are in observed[name]."
+        )
 
     def __repr__(self) -> str:
         """Status, size and last state in words; the shapes under jit."""

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..base.checks import whole
-from ..base.signature import check_takes, warn_of_exchanged
+from ..base.signature import warn_of_exchanged, with_time
 from ..base.types import Args, HamiltonianFn, Scalar, State
 
 
@@ -101,7 +101,7 @@ def discretise(H: Callable[..., Any], order: int = 1) -> HamiltonianFn:
 
     **Arguments**
 
-    - `H`: function ``(t, q, p, args)`` → scalar [energy]; smooth.
+    - `H`: function ``(q, p)`` or ``(t, q, p, args)`` → scalar [energy]; smooth.
     - `order`: r = 1, 2, 3 or 4.
 
     **Returns** a function ``(t0, t1, q0, p1, args)`` → scalar [energy], for `System`.
@@ -131,7 +131,7 @@ def discretise(H: Callable[..., Any], order: int = 1) -> HamiltonianFn:
     # 0.60009
     ```
     """
-    check_takes("H", H, "(t, q, p, args)", {5: _DISCRETE})
+    H = with_time("H", H, hints={5: _DISCRETE})
     warn_of_exchanged("H", H, "(t, q, p, args)")
     order = whole("order", order, 1, 4, "A composition has more, such as method=dvi.Yoshida(6).")
     return _LeftRule(H) if order == 1 else _ActionRule(H, order)

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..base.signature import check_takes
+from ..base.signature import check_takes, notes_of
 from ..base.types import Args, HamiltonianFn, Scalar, State
 from . import kepler as _kepler
 
@@ -18,8 +18,10 @@ Parameter = Any
 
 def value_of(parameter: Parameter, args: Args, like: Array) -> Array:
     """The value of a parameter, in the precision of another array."""
-    value = parameter(args) if callable(parameter) else parameter
-    return jnp.asarray(value, like.dtype)
+    if callable(parameter):
+        with notes_of("the function of args that gives a parameter"):
+            parameter = parameter(args)
+    return jnp.asarray(parameter, like.dtype)
 
 
 class Flow(eqx.Module):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 import lanewise
 
-from ..base.signature import check_takes
+from ..base.signature import check_takes, with_time
 from ..base.types import Args, Scalar, State
 from ..engine.newton import Newton, RootSolver, Vector, find_root
 
@@ -25,7 +25,7 @@ class Implicit(eqx.Module):
     - `energy`: E, function ``(t, q, p, y, args)`` → scalar [energy].
     - `relation`: R, function of the same arguments → array like y, zero at the y wanted, with a
       regular ∂R/∂y there.
-    - `guess`: function ``(t, q, p, args)`` → y of shape (k,), near that root.
+    - `guess`: function ``(q, p)`` or ``(t, q, p, args)`` → y of shape (k,), near that root.
     - `root_finder`: of the inner solve, where there is one.
 
     `GaussLegendre` needs no inner solve: it takes the y of each stage among its unknowns, and
@@ -41,13 +41,12 @@ class Implicit(eqx.Module):
 
     energy: Callable[..., Any]
     relation: Callable[..., Any]
-    guess: Callable[..., Any]
+    guess: Callable[..., Any] = eqx.field(converter=lambda guess: with_time("guess", guess))
     root_finder: RootSolver = Newton()
 
     def __check_init__(self):
         check_takes("energy", self.energy, "(t, q, p, y, args)")
         check_takes("relation", self.relation, "(t, q, p, y, args)")
-        check_takes("guess", self.guess, "(t, q, p, args)")
 
     def solved(self, t: Scalar, q: State, p: State, args: Args) -> Vector:
         """y at (t, q, p); NaN where it is not found. Differentiable to any order."""

@@ -13,7 +13,7 @@ import lanewise
 from lanewise.jaxprs.dependence import depends_on
 
 from ..base.checks import array
-from ..base.signature import accepts, check_takes, signature_of
+from ..base.signature import accepts, check_takes, signature_of, takes_state, with_time
 from ..base.types import Args, ForceFn, HamiltonianFn, Scalar, State
 from ..engine.newton import Newton, Vector, find_root
 
@@ -118,7 +118,7 @@ def legendre(L: Callable[..., Any], root_finder: Newton = Newton()) -> Callable[
     **Arguments**
 
     - `L`: L_D, function ``(t0, t1, q0, v, args)`` → scalar [energy]; or L, function
-      ``(t, q, v, args)`` → scalar [energy]. v is an array like q0.
+      ``(q, v)`` or ``(t, q, v, args)`` → scalar [energy]. v is an array like q0.
     - `root_finder`: settings of the inner solve.
 
     **Returns** for five arguments a function ``(t0, t1, q0, p1, args)`` → scalar for `System`, for
@@ -137,12 +137,14 @@ def legendre(L: Callable[..., Any], root_finder: Newton = Newton()) -> Callable[
 
     **Source** the paper, (36); Marsden & West 2001, *Acta Numerica* 10, 357, 1.4.
     """
+    if callable(L) and takes_state(L) and not (accepts(L, 4) or accepts(L, 5)):
+        L = with_time("L", L, "(t, q, v, args)")
     # The number of arguments decides; a function that takes four and five cannot be classified.
     discrete, continuous = (callable(L) and accepts(L, count) for count in (5, 4))
     if discrete == continuous:
         description = signature_of(L) if callable(L) else repr(L)  # the value of a number, say
         raise TypeError(
-            f"L must be a function of (t, q, v, args) or of (t0, t1, q0, v, args), got "
+            f"L must be a function of (q, v), (t, q, v, args) or of (t0, t1, q0, v, args), got "
             f"{description}, which accepts {'both' if discrete else 'neither'}."
         )
     kind = _DiscreteLegendreTransform if discrete else _LegendreTransform
@@ -250,7 +252,7 @@ def velocity_force(H_D: HamiltonianFn, F: Callable[..., Any]) -> ForceFn:
     **Arguments**
 
     - `H_D`: the discrete Hamiltonian of the same `System`; v does not include its perturbation.
-    - `F`: function ``(t0, t1, q0, v, args)`` → array like q0 [energy / unit of q].
+    - `F`: function ``(q0, v)`` or ``(t0, t1, q0, v, args)`` → array like q0 [energy / unit of q].
 
     **Returns** a function ``(t0, t1, q0, p1, args)`` → array like q0, for `System`.
 
@@ -261,8 +263,7 @@ def velocity_force(H_D: HamiltonianFn, F: Callable[..., Any]) -> ForceFn:
     **Source** (12); Marsden & West 2001, 3.2.1.
     """
     check_takes("H_D", H_D, "(t0, t1, q0, p1, args)")
-    check_takes("F", F, "(t0, t1, q0, v, args)")
-    return _VelocityForce(H_D, F)
+    return _VelocityForce(H_D, with_time("F", F, "(t0, t1, q0, v, args)"))
 
 
 def _legendre_transform(

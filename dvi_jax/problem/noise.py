@@ -16,7 +16,7 @@ from lanewise.jaxprs.dependence import depends_on
 from lanewise.jaxprs.jaxapi import is_traced, threefry2x32
 
 from ..base.checks import array, whole
-from ..base.signature import check_takes, warn_of_exchanged
+from ..base.signature import warn_of_exchanged, with_time
 from ..base.types import Args, Interval, Scalar, State
 from .flows import value_of
 
@@ -104,7 +104,9 @@ class Langevin(Noise):
             if callable(value) or is_traced(value):  # known in a run only
                 continue
             entries, is_mass = np.asarray(value), name == "mass"
-            invalid = entries <= 0 if is_mass else entries < 0  # NaN gives the state NaN
+            invalid = np.full(entries.shape, entries.dtype.kind not in "iuf")
+            if not invalid.any():  # NaN gives the state NaN
+                invalid = entries <= 0 if is_mass else entries < 0
             if invalid.any():
                 rule = "positive" if is_mass else "zero or positive"
                 number = entries[invalid][0]
@@ -146,7 +148,8 @@ class NoiseHamiltonians(Noise):
 
     Its flow is symplectic for each path if W = 0. ε does not multiply the noise.
 
-    **Arguments** `h`: function ``(t, q, p, args)`` → array of shape (m,) [energy·√time].
+    **Arguments** `h`: function ``(q, p)`` or ``(t, q, p, args)`` → array of shape (m,)
+    [energy·√time].
 
     **Raises** `TypeError` for another function, `ValueError` if it returns another shape.
 
@@ -156,8 +159,8 @@ class NoiseHamiltonians(Noise):
 
     h: Callable[..., Any]
 
-    def __check_init__(self):
-        check_takes("h of dvi.NoiseHamiltonians", self.h, _NAMES)
+    def __init__(self, h: Callable[..., Any]):
+        self.h = with_time("h of dvi.NoiseHamiltonians", h)
 
     def count(self, t, q, p, args):
         energies = jax.eval_shape(self.h, t, q, p, args)
@@ -194,7 +197,7 @@ def as_noise(noise: Any) -> Noise | None:
     """The noise of a system: an object, or σ as a function. **Raises** `TypeError`."""
     if noise is None or isinstance(noise, Noise):
         return noise
-    check_takes("noise", noise, _NAMES)
+    noise = with_time("noise", noise)
     warn_of_exchanged("noise", noise, _NAMES)
     return MomentumNoise(noise)
 

@@ -1,12 +1,12 @@
 """Hamiltonians that are sums of parts with simpler flows."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 
-from ..base.checks import whole
+from ..base.checks import instance, whole
 from ..base.signature import check_takes
 from ..base.types import Args, HamiltonianFn, Scalar, State
 from .discretise import refuse_step_from_times
@@ -43,7 +43,7 @@ class Split(eqx.Module):
     def __init__(
         self, parts: Sequence[HamiltonianFn], flows: Any = None, perturbed: int | None = None
     ):
-        parts = list(parts)
+        parts = list(instance("parts of Split", parts, Iterable, "a list of functions"))
         if len(parts) < 2:
             raise ValueError(f"parts of Split must be two or more functions, got {len(parts)}.")
         all_flows = [None] * len(parts) if flows is None else list(flows)

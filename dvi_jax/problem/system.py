@@ -12,7 +12,7 @@ from ..base.checks import array, finite, instance, require
 from ..base.indices import out_of_bounds
 from ..base.machine import refuse_fork
 from ..base.reads import Reads, differences, reads
-from ..base.signature import accepts, check_takes, tracing_note, warn_of_exchanged
+from ..base.signature import accepts, array_type, check_takes, tracing_note, warn_of_exchanged
 from ..base.types import Args, ConstraintFn, ForceFn, HamiltonianFn, Scalar, State
 from .discretise import refuse_step_from_times
 from .noise import Noise, as_noise
@@ -275,6 +275,11 @@ def _traced_output(
     except Exception as error:
         error.add_note(f"(in {name}{names}, called with q0 of shape {q.shape} and args={args!r})")
         error.add_note(tracing_note(name, error))
+        if q.ndim == 0:
+            error.add_note(
+                "The state is one number. For one coordinate give arrays: q0=[1.0] of shape (1,), "
+                "samples of shape (2, N, 1)."
+            )
         if q.ndim > 1:
             error.add_note(f"{name} receives the whole q0. For a batch of states use jax.vmap.")
         raise
@@ -290,9 +295,4 @@ def _traced_output(
         marks = dict(values)
         changes = {name for name, mark in new_values if marks.get(name) != mark}
         _CHANGED_BY_TRACING[function] = _changed_by_tracing(function) | changes
-    if out is None or not hasattr(out, "shape"):
-        if isinstance(out, int | float):
-            return outputs.setdefault(kinds, jax.ShapeDtypeStruct((), jnp.result_type(float)))
-        description = "None (is a return missing?)" if out is None else f"type {type(out).__name__}"
-        raise TypeError(f"{name}{names} must return an array, got {description}.")
-    return outputs.setdefault(kinds, jax.ShapeDtypeStruct(out.shape, out.dtype))
+    return outputs.setdefault(kinds, array_type(f"{name}{names}", out))

@@ -10,7 +10,7 @@ import numpy as np
 from ..base.inputs import start_state
 from ..base.types import Args, Interval
 from ..discover.functions.generators import Generator, LatticePoint
-from ..discover.symmetries.noether import AdiabaticInvariant, Gauge, noether_identity
+from ..discover.symmetries.noether import AdiabaticInvariant, Gauge, gauge_value, noether_identity
 from ..methods.step import Equations
 from ..problem.energies import disturbing_work, outgoing_energy
 from ..problem.system import check_system, of_problem
@@ -130,7 +130,9 @@ def prove_noether(
         start_value, clock = jnp.zeros(()), jnp.zeros(())
         for m, (x, gauge) in enumerate(zip(points_of_generators, gauges, strict=True)):
             term = jnp.sum(x.q * p0) - x.t * energy
-            start_value += epsilon**m * (term if gauge is None else term + gauge(*first, args))
+            if gauge is not None:
+                term = term + gauge_value(gauge, first, args)
+            start_value += epsilon**m * term
             clock += epsilon**m * x.t
         work_done = disturbing_work(system, t0, t1, q0, q1, p1, epsilon, args)
         residual = outgoing_energy(system, t0, t1, q0, p1, epsilon, args) - energy - work_done

@@ -20,6 +20,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from ..base.keywords import user_level
+
 _SECONDS = 1.0
 """Processes start after so many seconds: about as many may be left, and a start takes 0.2 s."""
 
@@ -104,7 +106,7 @@ class Workers:
             f"a process of bound_drift {event}. The search continues in one process: this takes "
             "longer, the result is the same. If memory is the cause, allow fewer processors.",
             RuntimeWarning,
-            stacklevel=2,
+            stacklevel=user_level(),
         )
 
 

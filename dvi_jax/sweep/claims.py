@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from ..base.keywords import user_level
 from .layout import as_store_error
 
 fcntl: Any = None
@@ -58,6 +59,6 @@ def _lock_byte(file: Path, number: int) -> bool:
             f"{file.parent}: files cannot be locked here ({error.strerror or error}). If several "
             "processes work on this store, they may compute the same tasks. The results stay "
             "correct. To avoid repeated work, use one process.",
-            stacklevel=2,
+            stacklevel=user_level(),
         )
     return True

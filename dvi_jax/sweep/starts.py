@@ -13,7 +13,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..base.checks import finite, function, positive, whole
+from ..base.checks import finite, positive, whole
+from ..base.signature import with_time
 from ..base.types import Args, Scalar
 from ..engine.bracket import bracketed_root
 from .axes import refuse_non_finite
@@ -197,7 +198,8 @@ class EnergyShell(Seeded):
     `not_finite`. H should grow with λ, as kinetic energies do. The distribution is not the
     microcanonical measure; for that weight the points by |dλ/dE| λ^(n−1).
 
-    - `count`: number of initial conditions. `H`: function ``(t, q, p, args)`` → scalar.
+    - `count`: number of initial conditions.
+    - `H`: function ``(q, p)`` or ``(t, q, p, args)`` → scalar.
     - `energy`: the value of H. `low`, `high`: corners of the box in q.
     - `seed`, `name`: as for `Random`.
     """
@@ -217,7 +219,7 @@ class EnergyShell(Seeded):
         seed: int = 0,
         name: str = "start",
     ):
-        self.H = function("H of EnergyShell", H, "(t, q, p, args)")
+        self.H = with_time("H of EnergyShell", H)
         ends, shape = _box("EnergyShell", low=(low, low), high=(high, high))
         self.low, self.high = (x[: len(x) // 2] for x in ends)
         self.energy = finite("energy of EnergyShell", energy)

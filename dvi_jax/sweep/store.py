@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..base.files import TEMPORARY, content_of, publish, user_folder
+from ..base.keywords import user_level
 from ..base.machine import machine_memory
 from ..base.results import STATUS_NAMES
 from .claims import claim
@@ -309,7 +310,7 @@ class Store:
                 f"{self.path}: for {len(files)} of {len(damages)} finished tasks, a file is "
                 f"missing, unreadable or of the wrong size; the first is {files[0]}. These tasks "
                 "count as not computed: dvi.sweep with the same arguments computes them again.",
-                stacklevel=2,
+                stacklevel=user_level(),
             )
         return [i for i, damage in damages.items() if not damage]
 

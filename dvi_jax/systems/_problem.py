@@ -10,11 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lanewise.jaxprs.jaxapi import is_traced
+
 from ..base.checks import all_finite, array, finite as finite, positive as positive
 from ..base.printing import first_lines
 from ..discover.functions.generators import Generator
 from ..discover.symmetries.library import time_translation
-from ..observe import InSlowTime as InSlowTime
+from ..observe import AtEnd, InSlowTime as InSlowTime, OfState
 from ..problem.noise import Langevin
 from ..problem.system import System as System
 
@@ -45,7 +47,8 @@ class Problem:
     - `system`: the `System`; its H_D is H by the paper's rule, H_D(t0, t1, q0, p1) = H(t0, q0, p1),
       with H the energy of the unperturbed system. `args`: its parameters.
     - `q0`, `p0`, `h`: initial conditions and a suitable step size.
-    - `observables`: name → function of one step ``(t0, t1, q0, p0, q1, p1, args)``.
+    - `observables`: name → function of the state ``(t, q, p, args)`` or of one step
+      ``(t0, t1, q0, p0, q1, p1, args)``; those of the library accept both.
     - `units`: units of q, p, t and energy.
     - `source`: reference for equations and values.
     - `check`: function ``(q0, p0, args)`` that raises `ValueError` for invalid initial
@@ -270,17 +273,22 @@ def library_problem(
     *,
     q0_p0_h: tuple[Any, Any, float],
     autonomous: bool = True,
+    of_steps: Sequence[str] = (),
     **fields: Any,
 ) -> Problem:
     """A `Problem` of the library.
 
     - `system`: the `System`, or its Hamiltonian.
     - `start`: check of initial conditions; those of `parameters` are added to it.
+    - `of_steps`: names of the observables that depend on more than the end of a step.
     - `q0_p0_h`: initial conditions and step size. `fields`: the other fields of `Problem`.
     - `autonomous`: whether H is independent of time at ε = 0. The energy is then an observable and
       an invariant, and the translation in time a symmetry, though not one of a system with a slow
       time or a constraint: symmetries are those of the type II map.
     """
+    for name, entry in parameters.items():
+        if not is_traced(entry.value):
+            entry.check(name, entry.value)
     system = system if isinstance(system, System) else System(system)
     q0, p0, h = q0_p0_h
     fields = {"units": DIMENSIONLESS, "q0": q0, "p0": p0, "h": h, **fields}
@@ -294,9 +302,18 @@ def library_problem(
         args={name: entry.value for name, entry in parameters.items()} or None,
         check=replace(start, parameters={name: entry.check for name, entry in parameters.items()}),
         parameters={name: entry.meaning for name, entry in parameters.items()},
-        observables={f.__name__: InSlowTime(f) if system.slow_time else f for f in observables},
+        observables={
+            f.__name__: f if f.__name__ in of_steps else of_state(f, system.slow_time)
+            for f in observables
+        },
         **fields,
     )
+
+
+def of_state(function: Callable[..., Any], slow_time: bool = False) -> Callable[..., Any]:
+    """A function of a step that depends on its end alone, as an observable of the state."""
+    observable = AtEnd(function)
+    return InSlowTime(observable) if slow_time else OfState(observable, True)
 
 
 def over_times(

@@ -50,6 +50,7 @@ def kepler() -> Problem:
             "K": Parameter(1.0, "root of the strength of attraction, K² = GM [length^(3/2)/time]")
         },
         observables=[mixed_energy, angular_momentum],
+        of_steps=["mixed_energy"],
         source="the paper, Section 5.2",
         invariants=("angular_momentum",),
         symmetries={"rotation": rotation(), "scaling": scaling(q=1.0, p=-0.5, t=1.5)},

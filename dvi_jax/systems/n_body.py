@@ -10,7 +10,16 @@ from ..base.checks import array, finite, require
 from ..discover.functions.generators import Generator
 from ..discover.symmetries.library import rotation, scaling, space_translation, time_translation
 from ..problem.system import System
-from ._problem import DIMENSIONLESS, Problem, at_end, bound, check_parameter, check_shape, parameter
+from ._problem import (
+    DIMENSIONLESS,
+    Problem,
+    at_end,
+    bound,
+    check_parameter,
+    check_shape,
+    of_state,
+    parameter,
+)
 
 _PLACE, _SPEED = np.array([0.97000436, -0.24308753]), np.array([-0.93240737, -0.86473146])
 EIGHT_POSITIONS = np.array([_PLACE, -_PLACE, np.zeros(2)])
@@ -88,7 +97,7 @@ def encounter_time(t, q, p, args):
 
 
 OBSERVABLES: dict[str, Callable[..., Any]] = {
-    f.__name__: f for f in (energy, linear_momentum, angular_momentum)
+    f.__name__: of_state(f) for f in (energy, linear_momentum, angular_momentum)
 }
 
 

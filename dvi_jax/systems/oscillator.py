@@ -60,6 +60,7 @@ def oscillator() -> Problem:
         name="oscillator",
         q0_p0_h=([0.01], [0.01], 0.1),
         observables=[mixed_energy, map_invariant],
+        of_steps=["mixed_energy", "map_invariant"],
         units={"q": "1", "p": "1", "t": "1/ω", "energy": "1"},
         source="the paper, Section 5.1",
         symmetries={"scaling": scaling()},

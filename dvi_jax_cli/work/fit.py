@@ -13,7 +13,7 @@ from dvi_jax import plot
 from dvi_jax.fit.result import numbers_in_words, remarks
 from dvi_jax.fit.run import progress_display as shown_bar
 
-from .._errors import InputError, one_of, require, require_name, user_path
+from .._errors import InputError, in_toml, one_of, require, require_name, user_path
 from .._show import TextTable
 from .columns import column, read_columns
 from .loader import Loader
@@ -202,7 +202,7 @@ def _observations(
         rule = (
             f"finite times in order in the column {table.time}, values that fit observe, sigma > 0"
         )
-        raise InputError(key, str(error), rule) from None
+        raise InputError(key, in_toml(error), rule) from None
 
 
 def _observe(text: str, loader: Loader) -> Any:

@@ -9,14 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 
 import dvi_jax as dvi
-from dvi_jax.base.signature import accepts, signature_of
-from dvi_jax.systems.n_body import linear_momentum
+from dvi_jax.base.signature import signature_of
+from dvi_jax.observe import FORMS, OfState, of_steps
+from dvi_jax.systems.n_body import OBSERVABLES
 
-from .._errors import require, require_name
+from .._errors import as_input_error, require, require_name
 from .expressions import Expressions, public
 from .system import Source
 
-_A_FUNCTION = "a function (t0, t1, q0, p0, q1, p1, args)"
+_A_FUNCTION = f"a function {FORMS}"
 
 
 def read_observables(texts: dict[str, str] | None, source: Source) -> dict[str, Any]:
@@ -54,9 +55,10 @@ def _observable(key: str, text: str, names: dict[str, Callable], source: Source)
         defect = f"{inner!r} has the type {type(function).__name__}"
         require(callable(function), key, defect, _A_FUNCTION)
         # An energy has `bind` and is called with the system.
-        fits = hasattr(function, "bind") or accepts(function, 7)
-        defect = f"{inner!r}, {signature_of(function)}, is called with 7 arguments"
-        require(fits, key, defect, _A_FUNCTION)
+        if not hasattr(function, "bind"):
+            defect = f"{inner!r} has other arguments, {signature_of(function)}"
+            with as_input_error(key, _A_FUNCTION, text=lambda _: defect):
+                function = of_steps(function)
         return wrap(function)
     calls = ", ".join(f"{name}()" for name in indicators)
     rule = f'{{}}; or "file.py:name"; alone or in {", ".join(reductions)}; or {calls}'
@@ -121,12 +123,14 @@ def observe(
         function: Any = observable.function if reduction else observable
         if hasattr(function, "bind"):  # it requires the system and ε of the run
             function = function.bind(run["system"], run["epsilon"])
+        is_of_state = isinstance(function, OfState)
         start = np.asarray(function(t0, t0, q0, p0, q0, p0, run["args"]))  # a step of length zero
         scale = float(np.linalg.norm(start))
-        if function is linear_momentum:
+        if function is OBSERVABLES["linear_momentum"]:
             scale = float(np.linalg.norm(run["p0"], axis=-1).sum())
         scale = scale if np.isfinite(scale) and scale else 1.0
         series = np.asarray(values[name])
-        series = series if reduction else np.concatenate([start[None], series])
+        if not (reduction or is_of_state):  # no step has reached the start
+            series = np.concatenate([start[None], series])
         results[name] = Observed(start, series, scale, reduction)
     return results

@@ -7,8 +7,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ...base.checks import function
 from ...base.printing import printable
+from ...base.signature import with_time
 from ...base.types import Args, Scalar, State
 
 T = TypeVar("T")
@@ -26,7 +26,7 @@ class LatticePoint(NamedTuple):
 class Generator(eqx.Module):
     r"""A generator X = ξ0 ∂/∂t + ξ·∂/∂q + η·∂/∂p at a lattice point.
 
-    - `xi0`: ξ0, function ``(t, q, p, args)`` → scalar [time].
+    - `xi0`: ξ0, function ``(q, p)`` or ``(t, q, p, args)`` → scalar [time].
     - `xi`: ξ, function of the same → array like q. `eta`: η → array like p.
 
     None means zero. A series in ε, (18)–(20) of the paper, is a list of generators, order 0 first.
@@ -39,10 +39,10 @@ class Generator(eqx.Module):
     xi: Callable[..., Any] | None = None
     eta: Callable[..., Any] | None = None
 
-    def __check_init__(self):
+    def __post_init__(self):
         for name in _COMPONENTS:
             if getattr(self, name) is not None:
-                function(name, getattr(self, name), "(t, q, p, args)", "None means zero.")
+                setattr(self, name, with_time(name, getattr(self, name)))
 
     def __call__(self, point: LatticePoint, args: Args = None) -> LatticePoint:
         """(ξ0, ξ, η) at the point, shaped like (t, q, p)."""

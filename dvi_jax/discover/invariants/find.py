@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ...base.checks import fraction, one_of, whole
-from ...base.keywords import checked_keywords
+from ...base.keywords import checked_keywords, user_level
 from ...integration.keywords import ArithmeticSettings
 from ...problem.system import System, check_system
 from ..algebra.nullspace import in_units_of
@@ -109,7 +109,7 @@ def discover_invariants(
         warnings.warn(
             f"order={order}: above order {_RELIABLE} rounding in float64 can hide an invariant, or "
             "add a false invariant to the result. Use arithmetic=dvi.DoubleDouble().",
-            stacklevel=2,
+            stacklevel=user_level(),
         )
     if tolerance is not None:
         tolerance = fraction("tolerance", tolerance)

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ...base import checks as _checks
+from ...base.signature import with_time
 from ...base.types import State
 from ..functions.generators import Generator, LatticePoint, symplectic_gradient
 
@@ -88,13 +89,12 @@ def boost(direction: Any, mass: Any = 1.0) -> Generator:
 def hamiltonian_flow(function: Callable[..., Any]) -> Generator:
     """The Hamiltonian vector field of a function K: ξ = ∂K/∂p, η = −∂K/∂q.
 
-    - `function`: K, function ``(t, q, p, args)`` → scalar [action]. With an invariant of the
-      map it is a symmetry of a symplectic map, and K what it conserves (gauge K − ξ·p).
+    - `function`: K, function ``(q, p)`` or ``(t, q, p, args)`` → scalar [action]. With an invariant
+      of the map it is a symmetry of a symplectic map, and K what it conserves (gauge K − ξ·p).
 
     **Raises** `TypeError` for what is not callable. **Source** Olver 1993, Chapter 6.
     """
-    _checks.function("the argument of hamiltonian_flow", function, "(t, q, p, args) → scalar")
-    return symplectic_gradient(function)
+    return symplectic_gradient(with_time("the argument of hamiltonian_flow", function))
 
 
 def bracket(first: Generator, second: Generator) -> Generator:

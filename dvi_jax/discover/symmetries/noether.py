@@ -7,12 +7,18 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from ...base.printing import printable
+from ...base.signature import with_time
 from ...base.types import Args, Scalar
 from ...problem.energies import disturbing_work, incoming_energy, outgoing_energy
 from ...problem.system import System, check_system
 from ..functions.generators import Generator, LatticePoint, prolong, require_bound
 
-Gauge = Callable[..., Any]  # ``G(t, q, p, args)`` → scalar [action] at a lattice point
+Gauge = Callable[..., Any]  # ``G(q, p)`` or ``G(t, q, p, args)`` → scalar [action]
+
+
+def gauge_value(gauge: Gauge, point: Sequence[Any], args: Args) -> Scalar:
+    """A gauge at a lattice point."""
+    return with_time("a gauge", gauge)(*point, args)
 
 
 def lattice_defect(
@@ -75,7 +81,8 @@ def noether_identity(
         identity = identity + jnp.sum(W * (xi - (second.q - first.q) / h * xi0))
     gauge = gauges[order]
     if gauge is not None:
-        identity = identity + (gauge(*second, args) - gauge(*first, args)) / h
+        change = gauge_value(gauge, second, args) - gauge_value(gauge, first, args)
+        identity = identity + change / h
     return identity
 
 
@@ -92,7 +99,7 @@ class AdiabaticInvariant(eqx.Module):
     single H_D: there E⁻ is taken of the whole step and differs from the energy by O(h).)
 
     - `generators`, `gauges`: one for each order, order 0 first; z is their number less one. A
-      gauge G is a function ``(t, q, p, args)`` → scalar [action], or None for zero.
+      gauge G is a function ``(q, p)`` or ``(t, q, p, args)`` → scalar [action], or None for zero.
 
     `noether_identity` shows whether it *is* invariant to that order.
 
@@ -145,6 +152,6 @@ class AdiabaticInvariant(eqx.Module):
             xi0, xi, _ = generator(end, args)
             term = jnp.sum(xi * p1) - xi0 * energy
             if gauge is not None:
-                term = term + gauge(*end, args)
+                term = term + gauge_value(gauge, end, args)
             total = total + self.epsilon**m * term
         return total

@@ -2,14 +2,14 @@
 
 import json
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ...base.checks import positive
+from ...base.checks import instance, positive
 from ...base.files import user_file, user_path
 from ...base.printing import printable
 from ._field import Field, fitted_modes, from_modes, from_surfaces
@@ -90,6 +90,15 @@ def read_booz_xform(
     )  # fmt: skip
 
 
+@runtime_checkable
+class _NearAxis(Protocol):
+    """What a `Qsc` has, which is no dependency of this package."""
+
+    spsi: Any
+    iotaN: Any
+    etabar: Any
+
+
 def from_near_axis(stellarator: Any, minor_radius: float) -> Field:
     r"""A `Field` from an expansion about the axis, of first or second order in the distance r.
 
@@ -104,7 +113,9 @@ def from_near_axis(stellarator: Any, minor_radius: float) -> Field:
 
     **Source** Landreman & Sengupta 2019, *J. Plasma Phys.* 85, 815850601.
     """
-    q, a = stellarator, positive("minor_radius", minor_radius)
+    hint = 'Give the object itself, such as qsc.Qsc.from_paper("precise QA").'
+    q = instance("stellarator", stellarator, _NearAxis, "a Qsc of the package qsc", hint)
+    a = positive("minor_radius", minor_radius)
     if q.spsi != 1:
         raise ValueError(f"from_near_axis requires spsi = 1 (ψ ≥ 0), got spsi = {q.spsi}.")
     N = round(float(q.iota - q.iotaN))

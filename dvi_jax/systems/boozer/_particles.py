@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array
 from numpy.polynomial.polynomial import polyval
 
-from ...base.checks import array, instance, one_of, positive
+from ...base.checks import array, electronvolts, instance, one_of, positive
 from ...base.printing import printable
 from ...observe import Crossings, Section, Stop
 from ...problem.discretise import discretise
@@ -77,8 +77,8 @@ class GuidingCentres(eqx.Module):
 
     def __check_init__(self):
         instance("field", self.field, Field, "a Field, such as boozer.precise_qa()")
-        for name in ("energy", "mass"):
-            positive(name, getattr(self, name))
+        electronvolts("energy of the particles", self.energy, 10.0)
+        positive("mass", self.mass)
         nonzero("charge", self.charge)
         one_of("coordinates", self.coordinates, _CHARTS)
         if self.breaking is not None:

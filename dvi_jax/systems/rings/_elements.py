@@ -5,9 +5,13 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Literal, TypedDict, Unpack, get_args
 
-from ...base.checks import finite, instance, one_of, positive, whole
+import jax.numpy as jnp
+import numpy as np
+
+from ...base.checks import array, finite, instance, one_of, positive, whole
 from ...base.keywords import checked_keywords
 from ...base.printing import printable
+from ...base.signature import check_takes, output_of
 from ._maps import KICKS, RingPart
 
 Model = Literal["paraxial", "exact"]
@@ -25,6 +29,12 @@ class Element:
     kind: str
     parts: tuple[RingPart, ...] = ()
     values: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self):
+        instance("name of an element", self.name, str, "text")
+        for key, value in self.values.items():
+            if np.ndim(value) == 0:
+                finite(f"{key} of element {self.name!r}", value)
 
     def placed(
         self,
@@ -76,7 +86,7 @@ class Element:
             ("ellipse", ellipse, ("radius_x", "radius_y")),
         ):
             if limits is not None:
-                if len(limits) != len(keys):
+                if np.shape(limits) != (len(keys),):
                     raise ValueError(
                         f"{name} of element {self.name!r} must be ({', '.join(keys)}), got "
                         f"{limits!r}."
@@ -239,8 +249,12 @@ def lens(name: str, potential: Callable[..., Any], **values: float) -> Element:
     values = {key: finite(f"{key} of lens {name!r}", value) for key, value in values.items()}
     if "length" in values:
         raise ValueError(f"length of lens {name!r} is zero: use another name for its parameter.")
-    part = RingPart("lens", potential=instance("potential", potential, Callable, "a function"))
-    return Element(name, "lens", (part,), {**values, "length": 0.0})
+    check_takes("potential", potential, "(x, y, par)")
+    subject = f"potential(x, y, par) of lens {name!r} with par = {values}"
+    values = {**values, "length": 0.0}
+    x, par = jnp.zeros(()), {key: jnp.asarray(value) for key, value in values.items()}
+    array(subject, output_of(subject, potential, x, x, par), (), verb="return")
+    return Element(name, "lens", (RingPart("lens", potential=potential),), values)
 
 
 def solenoid(name: str, length: float, ks: float) -> Element:
@@ -270,9 +284,14 @@ def cavity(
     return Element(name, "cavity", parts, values)
 
 
-def aperture(name: str, **limits: Any) -> Element:
+def aperture(
+    name: str,
+    *,
+    rectangle: Sequence[float] | None = None,
+    ellipse: Sequence[float] | None = None,
+) -> Element:
     """An aperture; arguments as for `Element.inside`, at least one of them."""
-    element = Element(name, "aperture").inside(**limits)
+    element = Element(name, "aperture").inside(rectangle=rectangle, ellipse=ellipse)
     if not element.parts:
         raise ValueError(
             f"aperture {name!r} must have the limits rectangle=... or ellipse=..., got neither."

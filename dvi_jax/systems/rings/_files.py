@@ -8,6 +8,8 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+from ...base.keywords import user_level
+
 _PARSERS = {
     ".seq": "MadxParser", ".madx": "MadxParser", ".mad8": "Mad8Parser", ".lte": "ElegantParser",
 }  # fmt: skip
@@ -126,7 +128,7 @@ def _parsed(parser: Any, path: Path, use: str | None, options: dict[str, Any]) -
         warnings.warn(
             f"{path.name} does not define {names}: zero, as in MAD. Pass their values, such as "
             f"rings.load(path, {undefined[0]}=1.0), or strict=True for an error.",
-            stacklevel=4,
+            stacklevel=user_level(),
         )
     return lattice
 

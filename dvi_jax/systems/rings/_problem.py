@@ -85,11 +85,15 @@ class Turn(Method):
 
     def check(self, equations, first_interval, q, p) -> None:
         _require_ring(equations.system)
-        args, hint = equations.args, "Use the system and the args of rings.problem(ring)."
-        instance("args of a run with rings.Turn()", args, RingArgs, "those of a ring", hint)
+        _require_args(equations.args)
         h = float(first_interval().h)
         if h != 1:
             raise ValueError(f"h must be 1, one turn, for a ring; got h = {h}.")
+
+
+def _require_args(args: Any) -> None:
+    hint = "Give args=problem.args with problem.system, or the problem itself."
+    instance("args of the system of a ring", args, RingArgs, "those of rings.problem(ring)", hint)
 
 
 def _require_ring(system: Any) -> None:
@@ -141,6 +145,7 @@ class _PlaceHamiltonian(eqx.Module):
         return _value_only(self.value(t0, t1, q0, p1, args))
 
     def value(self, t0, t1, q0, p1, args):
+        _require_args(args)
         ends = args.ends
         z = args.particle(q0, p1)
         row = jnp.searchsorted(ends, (t0 - jnp.floor(t0)) * ends[-1], side="right")

@@ -8,8 +8,9 @@ from typing import Any, NamedTuple, get_args
 
 import numpy as np
 
-from ...base.checks import one_of
+from ...base.checks import instance, one_of
 from ...base.files import user_file
+from ...base.keywords import user_level
 from ._elements import C, Element, Model, bend, cavity, corrector, drift, multipole, solenoid
 from ._files import check_source, read_lattice
 from ._maps import RingPart
@@ -76,12 +77,7 @@ def load(
     **Raises** `ValueError` for a file that cannot be read, and as `from_at`, also for attributes
     that pyAT leaves out, such as K0 of a bend that is not ANGLE/L.
     """
-    try:
-        import at
-    except ImportError as error:
-        raise ImportError(
-            'rings.load requires accelerator-toolbox: pip install "dvi-jax[rings]".'
-        ) from error
+    at = _accelerator_toolbox()
     path = user_file("path", path)  # some of the readers of pyAT have no clear error
     lattice = read_lattice(path, use, options)
     cavities = [e.FamName for e in lattice if isinstance(e, at.RFCavity) and _is_off(e)]
@@ -91,9 +87,19 @@ def load(
             f"{cavities[:8]}. For a ring in 6D read the lattice with pyAT, set TimeLag of the "
             "cavities, call lattice.enable_6d(dipole_pass=None, quadrupole_pass=None) and then "
             "rings.from_at.",
-            stacklevel=2,
+            stacklevel=user_level(),
         )
     return from_at(lattice, symplectic=symplectic, model=model)
+
+
+def _accelerator_toolbox() -> Any:
+    try:
+        import at
+    except ImportError as error:
+        raise ImportError(
+            'rings.load requires accelerator-toolbox: pip install "dvi-jax[rings]".'
+        ) from error
+    return at
 
 
 def _is_off(cavity: Any) -> bool:
@@ -112,6 +118,8 @@ def from_at(lattice: Any, *, symplectic: bool = False, model: Model | None = Non
     **Raises** `ValueError` with the first ten elements, with name and number, that have no
     counterpart here or that pyAT has replaced by a drift or marker.
     """
+    hint = "For the file of a lattice use rings.load(path)."
+    instance("lattice", lattice, _accelerator_toolbox().Lattice, "an at.Lattice of pyAT", hint)
     one_of("model", model, (None, *get_args(Model)))
     reasons: list[str] = []
     particle = getattr(lattice, "particle", None)

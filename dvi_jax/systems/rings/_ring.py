@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from lanewise.jaxprs.jaxapi import is_traced
 
-from ...base.checks import instance, positive, whole
+from ...base.checks import electronvolts, instance, whole
 from ...base.precision import require_double
 from ...base.printing import printable, short
 from ._elements import C, Element
@@ -70,12 +70,12 @@ class Ring(eqx.Module):
 
     def __init__(self, elements: Iterable[Element], energy: float = 1e9, periods: int = 1):
         require_double("a ring")
-        elements = list(elements)
+        elements = list(instance("elements", elements, Iterable, "a list of elements"))
         for i, element in enumerate(elements):
             instance(f"elements[{i}]", element, Element, "an element such as rings.drift('D', 1.0)")
         if not any(element.parts for element in elements):
             raise ValueError("elements must contain one that acts on particles, got none.")
-        self.energy = positive("energy", energy)
+        self.energy = electronvolts("energy of a ring", energy, 1e5)
         self.periods = whole("periods", periods)
         parts = tuple(distinct(part for element in elements for part in element.parts))
         number = {part: i for i, part in enumerate(parts)}

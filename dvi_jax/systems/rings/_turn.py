@@ -13,6 +13,7 @@ from jaxtyping import Array
 
 import lanewise
 
+from ...base.inputs import real_numbers
 from ._maps import APERTURES, Particle, RingPart, forward, pull_back
 from ._parts import pieces_of
 from ._ring import Ring
@@ -36,7 +37,7 @@ class Flight(NamedTuple):
 
 def coordinates(name: str, z: Any) -> Array:
     """(x, px, y, py, ζ, δ) on the last axis of an array. **Raises** `ValueError` for others."""
-    z = jnp.asarray(z, float)
+    z = real_numbers(name, z)
     if z.shape[-1:] != (6,):
         raise ValueError(f"{name} must have 6 coordinates on its last axis, got shape {z.shape}.")
     return z

@@ -207,8 +207,8 @@ def long_runs(tick: Tick) -> dict[str, LongRun]:
             name=name,
             ts=ts,
             qs=qs,
-            energy_errors=(np.asarray(solution.observed["energy"]) - energy0) / abs(energy0),
-            momentum_errors=np.asarray(solution.observed["angular_momentum"]) - momentum0,
+            energy_errors=(np.asarray(solution.observed["energy"])[1:] - energy0) / abs(energy0),
+            momentum_errors=np.asarray(solution.observed["angular_momentum"])[1:] - momentum0,
             apocentre_radii=np.interp(passages, angle, np.linalg.norm(qs, axis=1)),
             turn=float(np.polyfit(ts, direction, 1)[0] * ts[-1] / revolutions),
         )

@@ -106,7 +106,7 @@ def fixed_mesh(tick: Tick) -> FixedMesh:
         mixed_energy=np.asarray(variational.observed),
         # The perturbed map is the unperturbed one with stiffness 1 + ε, and so is its invariant.
         exact=((p**2 + stiffness * q**2 - h * stiffness * q * p) / 2)[:, 1:],
-        rk4=np.asarray(rk4.observed),
+        rk4=np.asarray(rk4.observed)[1:],
         energy=_start(problem),
     )
 
@@ -123,7 +123,7 @@ def crossover(tick: Tick) -> Crossover:
     def rk4(h, num_steps, stride, progress=None):
         options: Any = {"save": dvi.Save(every=stride), "observe": problem.observables["energy"]}
         options |= {"method": dvi.RungeKutta4(), "progress": progress}
-        return run(problem, h, num_steps, **options).observed
+        return run(problem, h, num_steps, **options).observed[1:]
 
     bands = np.asarray(jax.vmap(band)(jnp.asarray(hs)))
     long, stride = 7_500_000, 2500

@@ -199,7 +199,7 @@ def identities(tick: Tick) -> dict[str, float]:
         rows.append(_kepler_balance(triples, gain))
         tick(0.4 + 0.6 * (i + 1) / len(hs))
     column = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
-    momentum = np.asarray(orbits[0].observed["49"])
+    momentum = np.asarray(orbits[0].observed["49"])[1:]
     q, p = np.asarray(orbits[0].qs)[1:], np.asarray(orbits[0].ps)[1:]
 
     def turned_times_p(v):

@@ -20,7 +20,7 @@ settings = {"h": 0.05, "args": {"mass": 1.0, "stiffness": 1.0}, "method": dvi.St
 # %% [markdown]
 # ## One trajectory
 #
-# `observe` takes functions of one step; in a reduction they cost no memory.
+# `observe` takes functions of the state; in a reduction they cost no memory.
 
 # %%
 observe = {"energy": dvi.Range(energy), "angular momentum": dvi.MaxDrift(angular_momentum)}
@@ -38,9 +38,9 @@ plot.orbit(solution)
 
 
 # %%
-def modified_energy(t0, t1, q0, p0, q1, p1, args):
-    shift = (t1 - t0) * args["stiffness"] / (2 * args["mass"])
-    return energy(t0, t1, q0, p0, q1, p1, args) - shift * (q1 @ p1)
+def modified_energy(t, q, p, args):
+    shift = settings["h"] * args["stiffness"] / (2 * args["mass"])
+    return energy(t, q, p, args) - shift * (q @ p)
 
 
 epsilons = np.geomspace(1e-4, 1e-2, 5)

@@ -28,13 +28,12 @@ def W(t0, t1, q0, p1, args):
 system = dvi.System(H_D, force=W)
 
 
-# An observable is a function of one step, of both its ends.
-def energy(t0, t1, q0, p0, q1, p1, args):
-    """The energy at the end of the step, without the perturbation [J]."""
-    return p1 @ p1 / (2 * args["mass"]) + args["stiffness"] * (q1 @ q1) / 2
+# An observable is a function of the state: (q, p), or (t, q, p, args) if it needs t or args.
+def energy(t, q, p, args):
+    """The energy without the perturbation [J]."""
+    return p @ p / (2 * args["mass"]) + args["stiffness"] * (q @ q) / 2
 
 
-def angular_momentum(t0, t1, q0, p0, q1, p1, args):
+def angular_momentum(q, p):
     """q × p [kg m²/s]: conserved to round-off, because the system has no preferred direction."""
-    (x, y), (u, v) = q1, p1  # JAX clips an index: q1[2] would be q1[1], without an error
-    return x * v - y * u
+    return q[0] * p[1] - q[1] * p[0]
