@@ -28,7 +28,7 @@ PARTS = {
         *("__init__", "__main__", "_namespaces"),
     ],
     "the questions": ["discover", "sweep", "fit", "proof", "dynamics"],
-    "the leaves": ["systems", "plot", "testing", "interop"],
+    "the leaves": ["systems", "plot", "explorer", "testing", "interop"],
     "lanewise": ["lanewise"],
     "the command line": ["dvi_jax_cli"],
 }
@@ -38,12 +38,12 @@ PACKAGES = ("dvi_jax", "lanewise", "dvi_jax_cli")
 LONGEST_FILE, MOST_PARAMETERS = 450, 9
 
 LIMITS: dict[str, float] = {
-    "lines of the core": 13_550,
-    "lines of the questions": 21_270,
-    "lines of the leaves": 17_580,
+    "lines of the core": 14_000,
+    "lines of the questions": 21_660,
+    "lines of the leaves": 19_830,
     "lines of lanewise": 7_560,
-    "lines of the command line": 4_490,
-    "raise statements": 625,
+    "lines of the command line": 5_580,
+    "raise statements": 645,
     "characters of error text": 45_000,
     "functions with more than 9 parameters": 2,
     "files of more than 450 lines": 0,
@@ -150,7 +150,8 @@ def long_signatures_of(module) -> Iterator[str]:
                 name not in ("self", "cls") for name in inspect.signature(function).parameters
             )
             # An `__init__` that a dataclass has made has no code of its own.
-            if count > MOST_PARAMETERS and not function.__code__.co_filename.startswith("<"):
+            code = inspect.unwrap(function).__code__
+            if count > MOST_PARAMETERS and not code.co_filename.startswith("<"):
                 yield f"{module.__name__}.{function.__qualname__}: {count} parameters"
 
 
