@@ -31,6 +31,9 @@ system = dvi.System(H_D)
 
 def height(t0, t1, q0, p0, q1, p1, args):
     return q1[0]
+
+def level(q, p):
+    return q[0]
 """
 
 RUN = """
@@ -44,6 +47,7 @@ p0 = [0.5]
 k = 1.0
 [observables]
 "<b>height" = "own.py:height"
+level = "own.py:level"
 largest = "Range(own.py:height)"
 [output]
 dir = "{name}"
@@ -157,7 +161,7 @@ def test_a_run_has_its_status_observables_and_command(results):
     assert chapter["statuses"] == {status: 1}
     assert chapter["failures"] == 0
     assert reader.texts["verdict good"] == ["successful"]
-    assert reader.tags.count("img") == 2
+    assert reader.tags.count("img") == 2  # of functions of a step and of a state
     assert "<b>height" in reader.texts["td"]  # the name of an observable, not markup
     assert shlex.split(chapter["command"]) == ["dvi-jax", "run", "good.toml", "--out", "good-again"]
     assert reader.texts["command"] == [chapter["command"]]

@@ -107,9 +107,10 @@ def run_chapter(folder: Path) -> Chapter:
     for name, entry in contents["results"].items():
         if "reduction" not in entry:
             values = arrays[f"observed/{name}"]
-            # The file has the values on the steps; the start is in the report.
-            series = np.concatenate([np.asarray(entry["start"], float)[None], values])
-            observed[name] = Observed(series[0], series, entry["scale"], "")
+            # A function of a step has no value in the file for the start; the report has it.
+            if len(values) < len(arrays["ts"]):
+                values = np.concatenate([np.asarray(entry["start"], float)[None], values])
+            observed[name] = Observed(values[0], values, entry["scale"], "")
     drawn = dict(itertools.islice(observed.items(), _SERIES))
     ts, qs, ps = (arrays[name] for name in ("ts", "qs", "ps"))
     pictures = run_pictures({"units": {}, "name": chapter.title} | contents, ts, qs, ps, drawn)
