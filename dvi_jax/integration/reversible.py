@@ -40,7 +40,7 @@ class Reversible(AbstractAdjoint):
     checkpoint are computed again and their states stored: slower, and correct for any dynamics.
     A step is linearised at the reconstructed state, so that the relative error of a gradient is
     that difference times the sensitivity of the step's derivative. With the default, in float64,
-    errors up to 3.4e-8 were measured in 4000 steps of Strang's method along Kepler orbits (e = 0.9).
+    errors up to 3.4e-8 were measured in 4000 steps of `Strang` along Kepler orbits (e = 0.9).
     With `report_defect` the solution has the largest of these differences, in
     ``stats["round_trip_defect"]`` (relative, ∞ where an inverse step has no solution). It takes as
     much time as the reconstruction of the states.
