@@ -270,6 +270,48 @@ def test_a_model_whose_trajectory_leaves_the_data(name):
     assert "contradict" not in str(it)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("steps", "noise"), [(1000, 0.02), (300, 0.05)])
+def test_terms_are_not_held_by_a_prior_of_a_particle_at_rest(steps, noise):
+    """Without the force it stays where it is, so that the force acts ever longer: the priors of the
+    beginning bring the first fit near the data (1000 steps), and those of that fit are the last."""
+    library, start = SMALL.only(["spring", "friction", "cubic"]), {"q0": [1.5], "p0": [0.0]}
+    force = library.with_coefficients({"spring": 1.0, "friction": 0.02})
+    system, save = dvi.System(free_flight, force=force), dvi.Save(every=4)
+    sol = dvi.integrate(system, **start, h=H, num_steps=steps, epsilon=1.0, save=save)
+    values = np.concatenate([sol.qs, sol.ps], axis=1)
+    values += noise * np.random.default_rng(0).normal(size=values.shape)
+    data = dvi.Observations(np.asarray(sol.ts), values, "state", noise)
+    it = dvi.identify(dvi.Model(dvi.System(free_flight), h=H, **start), data, library)
+    assert (it.full.status, set(it.terms)) == ("converged", {"spring", "friction"})
+    assert it.full.explained > 0.99
+    # The criterion of the chosen terms is that of their fit without any prior.
+    k, (stage, *_) = len(it.terms), (step for step in it.path if step.terms == it.terms)
+    chi2 = it.fit.reduced_chi2 * (it.fit.num_observed - k)
+    assert stage.criterion == pytest.approx(chi2 + k * it.penalty, abs=1e-3)
+
+
+@pytest.mark.slow
+def test_the_effect_of_a_term_outside_of_the_data_does_not_count():
+    """Alone, H_D leaves the data exponentially: there q⁹ is ten orders of magnitude larger."""
+
+    def top(t0, t1, q0, p1, args):
+        return (p1 @ p1 - 4 * q0 @ q0) / 2
+
+    library = dvi.ForceLibrary({"ninth": lambda t0, t1, q, p, args: -(q**9)})
+    truth, start = (
+        dvi.System(top, force=library.with_coefficients([4.0])),
+        {"q0": [0.1], "p0": [0.0]},
+    )
+    sol = dvi.integrate(truth, **start, h=H, num_steps=40, epsilon=1.0)
+    values = np.concatenate([sol.qs, sol.ps], axis=1)
+    values += 0.02 * np.random.default_rng(0).normal(size=values.shape)
+    data = dvi.Observations(np.asarray(sol.ts), values, "state", 0.02)
+    it = dvi.identify(dvi.Model(dvi.System(top), h=H, **start), data, library)
+    assert it.terms == ("ninth",)
+    assert abs(it.coefficients[0] - 4) < 4 * it.sigma[0] < 1
+
+
 @pytest.mark.parametrize("first", ["cubic", pytest.param("friction", marks=pytest.mark.slow)])
 def test_a_term_that_was_removed_by_mistake_returns(first, monkeypatch):
     """The removal of the weakest term is a guess: an exchange or an addition corrects it."""

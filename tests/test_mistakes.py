@@ -542,7 +542,8 @@ def test_an_error_inside_of_a_function_stays_itself():
 
 
 def test_functions_and_objects_can_be_pickled():
-    for thing in (dvi.integrate, dvi.sweep, rings.drift, systems.kepler, plot.orbit):
+    library = systems.LIBRARY.values()
+    for thing in (dvi.integrate, dvi.sweep, rings.drift, plot.orbit, *library):
         assert pickle.loads(pickle.dumps(thing)) is thing
     assert pickle.loads(pickle.dumps(dvi.Yoshida(4))) == dvi.Yoshida(4)
 

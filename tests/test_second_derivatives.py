@@ -10,6 +10,8 @@ import dvi_jax as dvi
 import lanewise
 from dvi_jax.engine.guard import constant_unless, nan_if_used
 from dvi_jax.engine.in_pairs import in_pairs
+from dvi_jax.fit.optimise import _scalar_function
+from dvi_jax.fit.posterior import _finite_potential
 from dvi_jax.methods.step import to_grid
 from dvi_jax.systems.boozer import _sums
 
@@ -35,6 +37,25 @@ def root(x):
 def cardano(x):
     w = jnp.sqrt(x * x / 4 + 1 / 27)
     return jnp.cbrt(x / 2 + w) + jnp.cbrt(x / 2 - w)
+
+
+def potential(x):
+    def value(u):
+        return jnp.sum(jnp.sin(u))
+
+    return _finite_potential(value, jax.value_and_grad(value))(x[None])
+
+
+class Core:
+    """The loss sin u in place of that of a fit."""
+
+    def scalar(self, u, horizon, choice):
+        return jnp.sum(jnp.sin(u))
+
+
+def scaled_loss(x):
+    setting = jnp.zeros(1), 2.0, None, None
+    return _scalar_function(Core(), 2.0)(x[None], setting)[0]
 
 
 MODES = jnp.asarray(np.random.default_rng(0).normal(size=(1, 3, 3, 2)))
@@ -63,6 +84,8 @@ RULES = {
     "nan_if_used": (lambda x: nan_if_used(jnp.sin(x), x), jnp.sin),
     "legendre": (hypotenuse, lambda p: jnp.sqrt(1 + p * p)),
     "implicit_root": (root, cardano),
+    "potential": (potential, jnp.sin),
+    "scaled loss": (scaled_loss, lambda x: jnp.sin(2 * x) / 2),
     "boozer": (
         lambda x: _sums.total(MODES, SHAPE, x, 0.3 * x, 0.7),
         lambda x: _sums.derivatives(MODES, SHAPE, x, 0.3 * x, 0.7, order=0)[0],

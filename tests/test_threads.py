@@ -85,7 +85,7 @@ def test_structures_are_those_of_the_header_of_xla(tmp_path):
 
 
 FORKS = """
-import multiprocessing, os
+import multiprocessing, os, select
 from concurrent.futures import ProcessPoolExecutor
 import jax, jax.numpy as jnp
 jax.config.update("jax_enable_x64", True)
@@ -111,11 +111,14 @@ def outcome(name):
 
 def in_a_fork(name):
     reader, writer = os.pipe()
-    if os.fork() == 0:
+    child = os.fork()
+    if child == 0:
         os.write(writer, outcome(name).encode())
         os._exit(0)
-    os.wait()
-    return os.read(reader, 100).decode()
+    answers, _, _ = select.select([reader], [], [], 20)
+    os.kill(child, 9)  # one that waits must not outlive the test
+    os.waitpid(child, 0)
+    return os.read(reader, 100).decode() if answers else "waits"
 
 if __name__ == "__main__":
     print(in_a_fork("integrate"))  # JAX has not started: right there

@@ -95,6 +95,17 @@ def explain_calls(module: ModuleType) -> None:
                     label = f"{value.__name__}.{attribute}".removesuffix(".__init__")
                     call = _explained(method, label, functools.partial(method, None))
                     setattr(value, attribute, call)  # in place, as in `accept_newton`
+    for name, table in vars(module).items():
+        if isinstance(table, dict) and not name.startswith("_"):
+            table.update({key: _replacement(value) for key, value in table.items()})
+
+
+def _replacement(value: Any) -> Any:
+    """What has taken the place of a function, such as one in `systems.LIBRARY`, where it was
+    defined; else the value itself."""
+    home = sys.modules.get(str(getattr(value, "__module__", "")))
+    call = getattr(home, str(getattr(value, "__name__", "")), None)
+    return call if getattr(call, "__wrapped__", None) is value else value
 
 
 def _refuse_name(module: ModuleType, name: str) -> None:

@@ -39,8 +39,8 @@ class Reversible(AbstractAdjoint):
     largest component), or an inverse step has no solution, the steps of the trajectory from that
     checkpoint are computed again and their states stored: slower, and correct for any dynamics.
     A step is linearised at the reconstructed state, so that the relative error of a gradient is
-    that difference times the sensitivity of the step's derivative. With the default it is below
-    1e-8 in float64 for Kepler orbits of e = 0.99 in Strang's method.
+    that difference times the sensitivity of the step's derivative. With the default, in float64,
+    errors up to 3.4e-8 were measured in 4000 steps of `Strang` along Kepler orbits (e = 0.9).
     With `report_defect` the solution has the largest of these differences, in
     ``stats["round_trip_defect"]`` (relative, ∞ where an inverse step has no solution). It takes as
     much time as the reconstruction of the states.
