@@ -8,7 +8,7 @@ import sys
 import jax
 import numpy as np
 import pytest
-from random_programs import checks, kind_checks, search
+from random_programs import checks, kind_checks, kinds, search
 from random_programs.checks import Case, _same_bits_elsewhere, check, load
 from random_programs.programs import HEAD
 
@@ -70,6 +70,17 @@ def test_random_structures_agree_with_plain_loops(number):
         compiled.check_empty()
     for i in range(10):
         compiled.check(100_000 + i, slopes=not is_quick)
+
+
+def test_requested_times_are_in_the_run_for_a_shared_step():
+    """A batch shares the step of its first trajectory, and times after the end are a failure."""
+    random, kind = np.random.default_rng(0), kinds.stop(np.random.default_rng(52700))
+    assert ", ts " in kind.text
+    lanes = [kind.draw(random) for _ in range(20)]
+    for numbers in lanes:
+        states = kind.loop({**numbers, "h": lanes[0]["h"], "c": np.array(100.0)})
+        assert states["status"]
+        assert np.isfinite(states["qs"]).all()
 
 
 def test_a_wrong_loop_and_a_valid_number_are_reported():

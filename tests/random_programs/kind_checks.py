@@ -79,7 +79,7 @@ class Compiled:
         def slopes(shared, own):
             moving = {name: own[name] for name in self.kind.own}
             of_all = lambda shared, moving: self._total(shared, {**own, **moving}, {})  # noqa: E731
-            return jax.grad(of_all, (0, 1))(shared, moving)
+            return jax.value_and_grad(of_all, (0, 1))(shared, moving)
 
         return jax.jit(slopes)
 
@@ -169,7 +169,9 @@ class Compiled:
         coarse, fine = ((a[0] - b[0]) / (2 * d) for (a, b), d in zip(pairs, deltas, strict=True))
         own = stacked(own)
         moving = stacked(moves) if kind.own else {}
-        of_shared, of_own = self.reverse(shared, own)
+        value, (of_shared, of_own) = self.reverse(shared, own)
+        expected = total(0.0)[0]
+        assert abs(value - expected) <= 1e-7 * (1 + abs(expected)), f"loss {value}, {expected}"
         pieces = [
             *((of_shared[n], ways[n]) for n in ways),
             *((of_own[n], moving[n]) for n in moving),
