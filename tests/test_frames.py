@@ -33,7 +33,7 @@ def frames_to_the_equation(call: int, **how) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("method", "frames", "files"), [(dvi.TypeII(), 14, 5), (dvi.Strang(), 16, 6)]
+    ("method", "frames", "files"), [(dvi.TypeII(), 15, 6), (dvi.Strang(), 17, 7)]
 )
 @pytest.mark.parametrize("call", [2, 3], ids=["momentum", "position"])
 def test_the_equation_is_few_frames_from_the_call(method, frames, files, call):
@@ -45,7 +45,8 @@ def test_the_equation_is_few_frames_from_the_call(method, frames, files, call):
 def test_the_frames_are_counted():
     """The count above is of the run, which begins with the second call of H_D."""
     found = frames_to_the_equation(1)
-    assert [Path(file).stem for file in found] == ["integrate", "preparation", "system", "system"]
+    files = ["keywords", "integrate", "preparation", "system", "system"]
+    assert [Path(file).stem for file in found] == files
     # A method around the map adds frames, so that the numbers above could fail.
     nested = dvi.Composition((1.0,), base=dvi.Composition((0.5, 0.5), base=dvi.Strang()))
-    assert len(frames_to_the_equation(2, method=nested)) > 16
+    assert len(frames_to_the_equation(2, method=nested)) > 17

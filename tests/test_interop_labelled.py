@@ -32,7 +32,7 @@ def test_one_trajectory():
     assert dict(data.sizes) == {"time": 7, "component": 2, "step": 6}
     assert np.array_equal(data.q.sel(component="y"), sol.qs[:, 1])
     assert np.array_equal(data.time, sol.ts)
-    assert data.E.dims == data.h.dims == ("step",)
+    assert (data.E.dims, data.h.dims) == (("time",), ("step",))
     assert data["kept.drift"].dims == ()
     assert float(data["kept.drift"]) == float(sol.observed["kept"]["drift"]) > 1e-3
     assert (data.E.attrs["units"], data.time.attrs["units"]) == ("J", "s")
@@ -47,7 +47,7 @@ def test_what_is_saved_is_labelled_by_its_time(save):
     sol = run(save=save)
     data = sol.to_xarray(observe=OBSERVE)
     assert np.array_equal(data.time, sol.ts)
-    assert data.E.dims == (("time",) if save.ts is not None else ("step",))
+    assert data.E.dims == ("time",)
     assert np.array_equal(data.E, sol.observed["E"])
 
 
@@ -96,11 +96,11 @@ def test_names_of_components_and_observables():
     data = sol.to_xarray(components={"body": ["a", "b", "c"], "axis": ["x", "y"]})
     assert np.array_equal(data.p.sel(body="b", axis="y"), sol.ps[:, 1, 1])
     assert sol.to_xarray().q.dims == ("time", "component_0", "component_1")
-    assert run(observe=ENERGY).to_xarray(observe=ENERGY).observed.dims == ("step",)
+    assert run(observe=ENERGY).to_xarray(observe=ENERGY).observed.dims == ("time",)
     listed = [dvi.TangentMap(), ENERGY]
     data = run(observe=listed).to_xarray(observe=listed)
     assert data["observed.0"].shape == (4, 4)
-    assert data["observed.1"].dims == ("step",)
+    assert data["observed.1"].dims == ("time",)
 
 
 @pytest.mark.parametrize(

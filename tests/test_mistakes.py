@@ -376,7 +376,6 @@ CALLS = [
     (lambda: rings.drift(1.0), "^TypeError: drift requires length. Its arguments are name, length"),
     (lambda: rings.drift("D", L=1.0), "'L'. Did you mean 'length'"),
     (lambda: rings.aperture(0.02, 0.02), "^TypeError: aperture takes 1.*got 2.*rectangle, ellipse"),
-    (lambda: rings.drift("D", 1.0).inside(0.02), "^TypeError: Element.inside takes 0.*ellipse"),
     (lambda: dvi.AdaptiveReversible(rtol=1e-6), "'rtol'.*choose h"),
     (dvi.Given, "^TypeError: Given requires ts"),
     (lambda: dvi.Newton(tol=1e-9), "^TypeError: Newton.*mean 'rtol'"),

@@ -451,7 +451,7 @@ def test_other_functions_and_arguments_are_refused():
     for make, error, message in (
         (lambda: dvi.drift_order(THERMAL, q0=[1.0], p0=[0.0], epsilons=[0.1], **how), ValueError,
          "must not have noise"),
-        (lambda: dvi.System(H_D, noise=lambda q, p: q), TypeError, "noise must take the arguments"),
+        (lambda: dvi.System(H_D, noise=lambda t, q: q), TypeError, "noise must take the arguments"),
         (lambda: dvi.Brownian(0, substeps=0), ValueError, "substeps must be .* at least 1, got 0"),
         (lambda: dvi.invariant_diffusion(dvi.System(H_D), [1.0], [0.0], **how), ValueError,
          "must have noise"),

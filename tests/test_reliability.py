@@ -35,6 +35,7 @@ ALLOWED = {
     "dvi_jax_cli/work/loader.py": {"exec_module"},  # the Python files that a TOML file names
     "dvi_jax/interop/extras.py": {"import_module"},  # names that are in the code
     "dvi_jax/_namespaces.py": {"import_module"},  # names that are in the code
+    "dvi_jax/explorer/packages.py": {"import_module"},  # names that are in the code
     "dvi_jax/fit/checks.py": {"import_module"},  # names that are in the code
     "dvi_jax_cli/work/verify.py": {"import_module"},  # names that are in the code
     "dvi_jax/sweep/export.py": {"__import__"},

@@ -56,7 +56,7 @@ def test_a_batch_in_a_file_and_in_a_table(tmp_path):
     assert table.index.names == ["start", "save"]
     row = table.loc[(6, 3)]
     np.testing.assert_array_equal(row[["q_x", "q_y"]].astype(float), sols.qs[2, 3])
-    assert sols.observed["E"][2, 2] == row.E  # of the step that ended there
+    assert sols.observed["E"][2, 3] == row.E
     assert row.r == sols.observed["r"][2, 3]
     assert np.isnan(table.loc[(4, 0)].h)
     assert set(table.loc[5].status) == {"not_finite"}

@@ -404,7 +404,7 @@ VALUE_ERRORS = {
     "must have one shape": lambda: starts.Random(3, LOW, ([1.0], [0.0])),
     "seed": lambda: starts.Halton(3, LOW, HIGH, seed=-1),
     "sigma of Normal must be zero": lambda: starts.Normal(3, [0.0], [0.0], (-1.0, 0.0)),
-    "energy of EnergyShell": lambda: starts.EnergyShell(3, energy, np.inf, *BOX),
+    "energy of EnergyShell": lambda: starts.EnergyShell(3, lambda q, p: p @ p, np.inf, *BOX),
 }
 TYPE_ERRORS = {
     "must be a list or array": lambda: dvi.Axis("a", 3.0),

@@ -88,13 +88,10 @@ def explain_calls(module: ModuleType) -> None:
                 setattr(home, value.__name__, call)
             if getattr(call, "__wrapped__", None) is value:
                 setattr(module, name, call)
-        elif isinstance(value, type) and not issubclass(value, BaseException):
-            for attribute, method in list(vars(value).items()):
-                is_public = attribute == "__init__" or not attribute.startswith("_")
-                if is_public and inspect.isfunction(method):
-                    label = f"{value.__name__}.{attribute}".removesuffix(".__init__")
-                    call = _explained(method, label, functools.partial(method, None))
-                    setattr(value, attribute, call)  # in place, as in `accept_newton`
+        elif isinstance(value, type) and inspect.isfunction(init := vars(value).get("__init__")):
+            # Not other methods: each would be a frame more in the errors of a user's functions.
+            call = _explained(init, value.__name__, functools.partial(init, None))
+            setattr(value, "__init__", call)  # noqa: B010  in place, as in `accept_newton`
     for name, table in vars(module).items():
         if isinstance(table, dict) and not name.startswith("_"):
             table.update({key: _replacement(value) for key, value in table.items()})

@@ -20,8 +20,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from ..base.keywords import user_level
-
 _SECONDS = 1.0
 """Processes start after so many seconds: about as many may be left, and a start takes 0.2 s."""
 
@@ -100,6 +98,9 @@ class Workers:
             self.free.put(process)
 
     def _continue_alone(self, event: str) -> None:
+        # Not at the top: this file is also a program that does not import the package.
+        from ..base.keywords import user_level
+
         self.__exit__()
         self.count, self.processes = 1, []
         warnings.warn(
