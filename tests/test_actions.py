@@ -210,6 +210,7 @@ def test_an_action_below_its_error_is_nan(weak, status):
         assert np.isnan([*torus.actions, *torus.errors, *torus.frequencies]).all()
 
 
+@pytest.mark.slow
 def test_a_degree_of_freedom_at_rest_does_not_contribute_to_an_action():
     z = np.stack([np.exp(1j * TS), np.full(256, 3.0 - 2j)])
     torus = actions(TS, z, count=4, num=1)

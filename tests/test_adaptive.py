@@ -61,6 +61,7 @@ def test_steps_obey_the_rule_of_the_controller():
     assert hs.max() > 7 * hs.min()
 
 
+@pytest.mark.slow
 def test_the_map_is_reversible_and_can_be_resumed():
     """Back from the end, with −p or with −δ; and in two parts as in one."""
     q, p = start(0.9)
@@ -107,6 +108,7 @@ def test_a_constant_speed_is_a_uniform_grid(kind, method, rtol):
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [dvi.Strang(), pytest.param(dvi.McLachlan(4), marks=SLOW)])
 def test_the_order_is_that_of_the_method(method):
     """With a force, a g that depends on time and momentum, at requested times, against DOP853."""
@@ -130,6 +132,7 @@ def test_the_order_is_that_of_the_method(method):
     np.testing.assert_allclose(orders, method.order, atol=0.25)
 
 
+@pytest.mark.slow
 def test_events_and_observables():
     """Against Kepler's equation: crossings of the minor axis, and a stop; a trend in t."""
     e = 0.6
@@ -148,6 +151,7 @@ def test_events_and_observables():
     assert abs(float(sol.observed["trend"])) < 1e-7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lattice", "adjoint"),
     [
@@ -174,6 +178,7 @@ def test_gradients_and_batches(lattice, adjoint):
     assert batch[1] == value(e)  # to the bit
 
 
+@pytest.mark.slow
 def test_steps_that_cannot_follow_are_reported():
     """A δ too large; a g that becomes negative; and the other trajectory of the batch is intact."""
     q, p = (jnp.asarray(x) for x in start(0.9))
@@ -207,6 +212,7 @@ def test_steps_that_cannot_follow_are_reported():
     assert run([1.0], [0.0], **how).status == "step_control_failed"
 
 
+@pytest.mark.slow
 def test_machine_code_for_the_whole_run():
     def both(q, p):
         return run(q, p, save=LAST, observe=dvi.MaxDrift(energy), method=dvi.KahanLi(8)).qs

@@ -158,6 +158,7 @@ ORBITS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "h", "blocks"),
     [

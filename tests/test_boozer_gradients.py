@@ -70,6 +70,7 @@ def along(gradient, direction):
     return jax.tree.reduce(jnp.add, jax.tree.map(lambda a, b: jnp.sum(a * b), gradient, direction))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [pytest.param("coefficients", marks=pytest.mark.slow), "iota", "psi_edge", "G"]
 )
@@ -81,6 +82,7 @@ def test_gradient_of_the_drift_equals_differences(broken, starts, name):
     assert abs(found - expected) < 1e-6 * abs(expected)
 
 
+@pytest.mark.slow
 def test_gradient_of_the_symmetry_error_equals_differences(broken):
     error = jax.jit(jax.value_and_grad(boozer.symmetry_error))
     gradient, direction = error(broken)[1], directions(broken)["coefficients"]
@@ -90,6 +92,7 @@ def test_gradient_of_the_symmetry_error_equals_differences(broken):
     assert not any(jnp.any(x) for x in (gradient.iota, gradient.psi_edge, gradient.G))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("helicity", [0, 1])
 def test_the_symmetry_error_is_the_measure_of_two_terms(helicity):
     field = field_of(MODES, I=[0.0, 3.0])

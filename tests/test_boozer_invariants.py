@@ -66,6 +66,7 @@ def compiled():
     return jax.jit(jax.value_and_grad(boozer.second_invariant, argnums=(0, 1, 2, 3, 4, 5)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("B_bounce", [4.9, 5.05, 5.2])
 def test_second_invariant_is_the_integral_of_scipy(B_bounce):
     s, theta, zeta, _, E = POINT
@@ -116,6 +117,7 @@ MANY_MINIMA = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("make", "point"), MANY_MINIMA)
 def test_second_invariant_of_wells_with_many_minima(make, point):
     field, (s, theta, zeta, pitch) = make[0](*make[1:]), point

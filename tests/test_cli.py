@@ -221,6 +221,7 @@ def test_debug_shows_the_traceback_and_has_the_same_exit_code():
     assert done.stderr.rstrip().endswith("allowed: a TOML file in UTF-8")
 
 
+@pytest.mark.slow
 def test_closed_outputs_raise_no_error():
     """A pipe that is closed, and a standard output that is closed from the start."""
     words = ["sh", "-c", f'"{sys.executable}" -c "{MAIN}" info | head -n 1']
@@ -308,6 +309,7 @@ def test_new_writes_a_project_with_a_valid_notebook(project):
             ast.parse(cell.source)
 
 
+@pytest.mark.slow
 def test_its_run(inside):
     results = found("run", "run.toml")["results"]
     assert results["angular_momentum_drift"]["value"] < 1e-13

@@ -78,6 +78,7 @@ def test_signals_during_the_imports(module, name, tmp_path):
     assert module == "typer" or message.startswith("interrupted: by Ctrl-C or SIGTERM")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
 def test_signals_in_the_garbage_collector(name, tmp_path):
     """Python only reports an exception of its callbacks; without more the run would continue."""

@@ -300,6 +300,7 @@ def test_wrong_coefficients_cost_the_order_or_symplecticity():
         assert symplectic_defect(np.asarray(jacobian(a, a))) > 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stages", [2, *(pytest.param(s, marks=SLOW) for s in (5, 6))])
 def test_the_step_reverses_and_is_symplectic_unless_damped(stages):
     step, z = advance(LOBATTO, stages), state("non_separable")

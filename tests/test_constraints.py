@@ -91,6 +91,7 @@ def exact_end(time):
     return np.concatenate([np.ravel(x) for x in jax.jit(SPHERE.exact)(time, Q, P, SPHERE.args)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "order"), [(dvi.Rattle(), 2), pytest.param(FOURTH, 4, marks=slow)]
 )
@@ -101,6 +102,7 @@ def test_it_converges_to_the_exact_solution_with_its_order(method, order):
     assert np.allclose(np.log2(errors[:-1]) - np.log2(errors[1:]), order, atol=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMED)
 def test_other_hamiltonians_have_order_2_too(name):
     a, b, c = (flow(name, dvi.Rattle())(*map(jnp.asarray, START), 0.4 / n, n) for n in (4, 8, 16))
@@ -179,6 +181,7 @@ def not_symplectic(q, p, h=0.1):
     return q, p - q * (q @ p)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["sphere", pytest.param("not separable", marks=slow)])
 def test_the_map_is_symplectic_on_the_manifold(name):
     step = one_step(name)
@@ -199,6 +202,7 @@ APART = np.array([0.7, 0.1, -0.9]), np.array([0.1, 1.0, 0.3])
 """A state that does not satisfy the constraint."""
 
 
+@pytest.mark.slow
 def test_a_projection_is_the_nearest_consistent_state():
     (q0, p0), found = APART, dvi.project(SPHERE, *APART)
     nearest = q0 / np.linalg.norm(q0)
@@ -307,6 +311,7 @@ def test_a_constraint_of_another_shape_is_refused(constraint, said):
         dvi.System(SPHERE.system.H_D, constraint=lambda q: q)
 
 
+@pytest.mark.slow
 def test_forces_of_constraint_are_the_tension():
     watched = {"force": dvi.ConstraintForce(), "λ": dvi.ConstraintForce(multipliers=True)}
     sol = run(SPHERE, 10, h=0.05, observe=watched, save=dvi.Save())
@@ -332,6 +337,7 @@ def loss(x, adjoint):
     return jnp.sum(jnp.sin(sol.qs[-1])) + sol.ps[-1] @ jnp.array([1.0, 2.0, 3.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "adjoint",
     [dvi.Reversible(), *(pytest.param(x(), marks=slow) for x in (dvi.Direct, dvi.Checkpointed))],

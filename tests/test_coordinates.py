@@ -67,6 +67,7 @@ MODES = {
 FAST = ("a reduction", "requested times", "a composition")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "mode", [m if m in FAST else pytest.param(m, marks=pytest.mark.slow) for m in MODES]
 )
@@ -112,6 +113,7 @@ RUNS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [

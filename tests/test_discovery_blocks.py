@@ -73,6 +73,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 def test_an_expansion_of_slow_motion_is_not_taken_for_conserved():
     for name, (rate, parts, coupling, size) in CASES.items():
         a = arguments(rate, coupling, **parts)

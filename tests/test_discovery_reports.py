@@ -109,6 +109,7 @@ def test_formulas_show_the_digits_that_errors_leave():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("method", "order"), [(dvi.TypeII(), 1), (dvi.Strang(), 2)])
 def test_an_energy_that_is_not_found_has_a_reason_and_a_remedy(method, order):
     found = discover(QUARTIC, 4, method=method)
@@ -125,6 +126,7 @@ def test_an_energy_that_is_not_found_has_a_reason_and_a_remedy(method, order):
     assert nearly.energy is None
 
 
+@pytest.mark.slow
 def test_the_report_is_in_plain_words(tmp_path):
     found = discover(QUARTIC, 4)
     text = str(found)

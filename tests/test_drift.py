@@ -200,6 +200,7 @@ def resonantly_forced(smallest, num_steps=1000):
     return dvi.drift_order(system, ENERGY, [0.4], [0.3], epsilons=epsilons, **run)
 
 
+@pytest.mark.slow
 def test_crossovers_between_two_powers():
     measured = resonantly_forced(2e-3)
     assert measured.fit.line_slope > 1.5  # what was reported before, as ± 0.18
@@ -281,6 +282,7 @@ def test_laws_without_noise_are_recognised(law, model, order, within):
     assert np.isnan(measured.fit.crossover) == (model == "power")
 
 
+@pytest.mark.slow
 def test_a_clean_power_and_scatter():
     drifts = EPSILONS**2 * np.exp(0.02 * np.random.default_rng(4).standard_normal(10))
     measured = synthetic(drifts)

@@ -49,6 +49,7 @@ def failed(k, adjoint, omits):
     return jnp.sum(jnp.where(kept, values, 0.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", [of_time, of_states])
 @pytest.mark.parametrize("adjoint", ADJOINTS[1:], ids=lambda a: type(a).__name__)
 def test_gradients_of_runs_that_stop(loss, adjoint):
@@ -70,6 +71,7 @@ def test_second_derivatives_of_runs_that_stop(loss):
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("omits", ["trajectories", "values", "none"])
 @pytest.mark.parametrize("adjoint", ADJOINTS, ids=lambda a: type(a).__name__)
 def test_gradients_of_a_batch_in_which_one_fails(omits, adjoint):
@@ -115,6 +117,7 @@ def test_a_flow_that_closes_a_joined_step_and_fails(options):
     np.testing.assert_array_equal(np.isnan(sol.qs[:, 0]), has_failed)
 
 
+@pytest.mark.slow
 def test_points_between_the_steps_that_fail():
     saved = run(0.55, first=False, save=dvi.Save(ts=[0.3, 0.55, 0.8]))
     assert saved.status == "not_finite"
@@ -131,6 +134,7 @@ def test_points_between_the_steps_that_fail():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("h", [0.1, -0.1])
 def test_an_event_that_is_nan(h):
     def g(t, q, p, args):
@@ -175,6 +179,7 @@ WITHOUT_STEPS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fails", ["q0 is NaN", *map(slow, [*WITHOUT_STEPS][1:])])
 @pytest.mark.parametrize("name", ["times", *map(slow, [*BETWEEN][1:])])
 @pytest.mark.parametrize("adjoint", [ADJOINTS[1], slow(ADJOINTS[0])], ids=name_of)

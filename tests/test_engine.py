@@ -64,6 +64,7 @@ def test_batched_linear_systems_call_lapack_only_above_the_limit(n):
     assert has_lapack(jax.vmap(jnp.linalg.solve))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [pytest.param(5, marks=pytest.mark.slow), 16])
 def test_batched_linear_systems_are_solved_with_exchanges_of_rows(n):
     rng = np.random.default_rng(n)
@@ -148,6 +149,7 @@ DERIVATIVES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("derivative", DERIVATIVES)
 def test_a_linear_map_uses_its_own_transpose(derivative):
     """Forward, reverse, second derivatives, batched or not; against the map itself."""

@@ -237,6 +237,7 @@ def test_stops_of_a_batch_and_their_gradient():
     assert float(jax.grad(value)(p)) == pytest.approx(float(expected), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_starts_beyond_a_stop_and_clocks_that_jump_have_a_status():
     sol = kepler(num_steps=5, stop=dvi.Stop(lambda t, q, p, args: 1 - radius(t, q, p, args)))
     assert sol.status == "stopped"

@@ -78,6 +78,7 @@ def test_sliders_compile_nothing(heiles):
     assert programs != []
 
 
+@pytest.mark.slow
 def test_motion_is_that_of_integrate(heiles):
     settings = heiles.settings
     sol = dvi.integrate(
@@ -243,6 +244,7 @@ def test_python_of_a_motion(heiles):
     np.testing.assert_array_equal(picture.series[1], names["values"])
 
 
+@pytest.mark.slow
 def test_toml_is_a_run_file(tmp_path):
     page = model("kepler", method="Strang")
     page.change(steps=1000)

@@ -257,6 +257,7 @@ def beyond_1():
     return dataclasses.replace(data, values=data.values + 1), mean + 1, sigma
 
 
+@pytest.mark.slow
 def test_a_fit_that_ended_at_a_bound_is_a_start():
     """There u is infinite: the number starts where `params` has it, inside of the bounds."""
     data, _, _ = beyond_1()

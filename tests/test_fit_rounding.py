@@ -47,6 +47,7 @@ def repeated(count, values, noise):
     return found, np.array(off)
 
 
+@pytest.mark.slow
 def test_residuals_of_pure_rounding():
     """4000 steps with another order of operations: 8 fits end at the truth, and report why."""
     found, off = repeated(8, positions(dvi.System(reordered), dvi.FloatingPoint()), 0.0)

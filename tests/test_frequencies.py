@@ -86,6 +86,7 @@ WITH_STATUS += [("zero", "no_signal"), ("noise", "no_signal"), ("drift", "window
 IN_JIT = pytest.param("irregular_times", "irregular_times", marks=pytest.mark.slow)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "status"), [*WITH_STATUS, IN_JIT])
 def test_signals_without_reliable_frequencies_have_a_status_and_nan(name, status):
     # Outside jit irregular times are an error.

@@ -41,6 +41,7 @@ def test_a_pair_that_is_not_resolved_is_no_damped_line():
     assert np.isnan(given).any()
 
 
+@pytest.mark.slow
 def test_a_pendulum_with_friction():
     """Its frequency is near 1 and increases as it slows down."""
     system = dvi.System(

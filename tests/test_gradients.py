@@ -64,6 +64,7 @@ PAIRS = [
 """`Checkpointed` has no rules of its own for implicit steps: one system is enough for it."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("system", "adjoint"),
     [

@@ -78,6 +78,7 @@ def test_taylor_coefficients_of_order_eight_are_the_known_ones():
     np.testing.assert_allclose(two, known * 2.0 ** np.arange(9), atol=1e-13)
 
 
+@pytest.mark.slow
 def test_operations_of_a_series_do_not_double_with_each_order():
     def operations(order, series):
         f = lambda e: jnp.tanh(jnp.sin(X + e) / (1 + e) * jnp.exp(e))  # noqa: E731
@@ -145,6 +146,7 @@ def change_in_a_step(series, powers, q, p, epsilon, h):
     return value(q + h * p1, p1) - value(q, p)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("order", "degree", "survivors", "wrong_at", "largest"),
     [

@@ -91,6 +91,7 @@ def test_late_times_and_invariants_do_not_accumulate_round_off():
     assert sol.observed["range"] / sol.observed["mean"] < 5e-14
 
 
+@pytest.mark.slow
 def test_given_times():
     """Equal ones are the uniform grid; unequal ones against the map by hand."""
     a = run(epsilon=0.1)
@@ -165,6 +166,7 @@ def test_streamed_reductions_need_no_memory_for_the_steps(form, few):
     assert size(1000 * few) <= size(few) + 1024
 
 
+@pytest.mark.slow
 def test_batch_equals_loop_and_jit_equals_eager():
     """Of the other methods `test_certify.py` tests it."""
     system, q, p = SYSTEMS["double_pendulum"]
@@ -181,6 +183,7 @@ def test_batch_equals_loop_and_jit_equals_eager():
     np.testing.assert_allclose(jax.jit(final)(es[1]), final(es[1]), rtol=1e-14, atol=1e-16)
 
 
+@pytest.mark.slow
 def test_one_trace_per_shape_and_of_each_step():
     traces = []
 
@@ -239,6 +242,7 @@ def test_progress_reports_and_changes_nothing():
     assert [c[0] for c in calls] == sorted({c[0] for c in calls})
 
 
+@pytest.mark.slow
 def test_the_state_sets_the_precision():
     q, p = jnp.float32([0.3]), jnp.float32([0.4])
     sol = dvi.integrate(NON_SEPARABLE, q, p, h=0.01, num_steps=100)
@@ -251,6 +255,7 @@ def test_the_state_sets_the_precision():
     assert sol.qs.dtype == sol.ts.dtype == jnp.float32
 
 
+@pytest.mark.slow
 def test_failures_are_named_and_keep_the_states_before():
     match = r"step 0 of 10 .*residual .*did not converge"
     with pytest.raises(dvi.IntegrationError, match=match) as e:
@@ -383,6 +388,7 @@ def test_results_that_no_memory_can_hold_are_rejected_before_the_run(monkeypatch
         run(num_steps=9, observe=position)  # 10 · 2 · 8 bytes more
 
 
+@pytest.mark.slow
 def test_results_of_a_batch_are_counted_together(monkeypatch):
     monkeypatch.setattr(_memory, "machine_memory", lambda: 2.5 * 3 * 4 * 480 - 1)
     batch = jax.vmap(jax.vmap(final_position))
@@ -403,6 +409,7 @@ def test_results_of_a_batch_are_counted_together(monkeypatch):
     assert final_position(jnp.ones(2)).shape == (2,)
 
 
+@pytest.mark.slow
 def test_the_memory_of_a_derivative_is_counted(monkeypatch):
     """Measured for 160 MB of saved states: 421 MB, and 741 MB with the reverse pass."""
 
@@ -505,6 +512,7 @@ OF_NO_TRAJECTORY = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", OF_NO_TRAJECTORY.values(), ids=OF_NO_TRAJECTORY)
 def test_a_batch_of_no_trajectories_has_arrays_of_length_zero(options):
     def run(q):
@@ -522,6 +530,7 @@ def test_a_batch_of_no_trajectories_has_arrays_of_length_zero(options):
         assert shapes == [(*lead, *x.shape) for x in jax.tree.leaves(alone)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("adjoint", [dvi.Reversible(), dvi.Direct(), dvi.Checkpointed()])
 def test_gradients_of_a_batch_of_no_trajectories(adjoint):
     def loss(h, q):
@@ -537,6 +546,7 @@ def test_gradients_of_a_batch_of_no_trajectories(adjoint):
     assert abs(jax.grad(loss)(0.1, jnp.ones((1, 1)))) > 0.1
 
 
+@pytest.mark.slow
 def test_failures_in_batches_are_errors_also_inside_jit():
     def run(q):
         return dvi.integrate(COUPLED, q, q, h=0.1, num_steps=3).qs
@@ -573,6 +583,7 @@ def test_a_derivative_that_is_not_finite_is_named(V, q0, name):
     assert dvi.integrate(system, [0.5, 0.5], [0.0, 0.1], **run).status == "successful"
 
 
+@pytest.mark.slow
 def test_other_causes_of_nan_are_not_called_derivatives():
     """A singularity of H_D itself, an orbit that escapes; and the remedy of the message works."""
     attraction = dvi.System(lambda t0, t1, q0, p1, args: p1 @ p1 / 2 - 1 / jnp.sum(q0**2))

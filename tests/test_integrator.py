@@ -219,6 +219,7 @@ def test_searches_list_their_keywords_and_name_the_one_that_is_unknown(search):
         search(PENDULUM, **{name: dvi.Strang()})
 
 
+@pytest.mark.slow
 def test_one_default_for_every_function():
     """The map of H_D as it is written; Strang's of one that `discretise` made with order 1."""
     for system, method in ((PENDULUM, dvi.TypeII()), (CONTINUOUS, dvi.Strang())):

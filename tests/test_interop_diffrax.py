@@ -30,6 +30,7 @@ def ours(method, num_steps, h=H, system=KEPLER.system, **options):
     return dvi.integrate(system, Q0, P0, h=h, num_steps=num_steps, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method", [dvi.Strang(), *(pytest.param(m, marks=pytest.mark.slow) for m in MORE)], ids=str
 )
@@ -118,6 +119,7 @@ def test_no_failure_is_promoted_to_success():
     assert len(set(texts.values())) == 4
 
 
+@pytest.mark.slow
 def test_nothing_is_silently_ignored():
     solver, term = interop.diffrax_solver(), interop.diffrax_term(KEPLER)
 

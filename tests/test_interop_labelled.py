@@ -167,6 +167,7 @@ def check_groups(found, group):
     assert np.array_equal(seen["values"], SEEN.values)
 
 
+@pytest.mark.slow
 def test_samples_in_arviz():
     arviz = pytest.importorskip("arviz")
     found = interop.to_inference_data(draws(), SEEN)
@@ -198,6 +199,7 @@ def test_arviz_base_takes_the_tree():
 THEIRS = ("diffrax", "astropy", "arviz", "arviz_base", "rebound", "scipy", "xarray")
 
 
+@pytest.mark.slow
 def test_importing_interop_imports_none_of_them():
     """And the package imports neither `interop` nor `testing`."""
     code = (

@@ -41,6 +41,7 @@ def at_start(problem, name, **args):
     return problem.observables[name](0.0, 0.0, q, p, q, p, {**problem.args, **args})
 
 
+@pytest.mark.slow
 def test_the_problem_of_a_simulation():
     """Names, units, times; energy and angular momentum are those of REBOUND."""
     sim = three_bodies()

@@ -79,6 +79,7 @@ def test_lattice_points_and_many_crossings():
     assert len(found.t_events[0]) == 286
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("t_span", [(0.0, 9.0), (2.0, -7.0)])
 @pytest.mark.parametrize(
     "direction", [0, *(pytest.param(d, marks=pytest.mark.slow) for d in (1, -1))]
@@ -96,6 +97,7 @@ def test_events_are_where_those_of_scipy_are(t_span, direction):
 BACKWARDS = pytest.param(2, (2.0, -7.0), marks=pytest.mark.slow)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("terminal", "t_span"), [(True, (0.0, 9.0)), BACKWARDS])
 def test_a_terminal_event_truncates_the_output(terminal, t_span):
     events = [marked(high, terminal), marked(low)]

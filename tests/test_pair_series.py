@@ -98,6 +98,7 @@ def find(degree, order, system=DAMPED, args=0.0, **how):
         )
 
 
+@pytest.mark.slow
 def test_terms_in_pairs_are_those_of_exact_arithmetic():
     """Polynomials in ε: with p1 = p + h (−q − ε q²), q1 = q + h p1."""
     basis, h = dvi.Polynomials(4).for_shape((1,)), Fraction(0.1)
@@ -123,6 +124,7 @@ def test_terms_in_pairs_are_those_of_exact_arithmetic():
     assert float(np.max(np.abs(terms.lo))) > 1e-20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rate", "arithmetic", "count"),
     [

@@ -111,6 +111,7 @@ def test_results_in_the_home_directory(home, store):
 RUN = 'system = "oscillator"\nh = 0.1\nsteps = 3\n[output]\n'
 
 
+@pytest.mark.slow
 def test_paths_of_the_command_line(home):
     write(home, RUN)
     result = command("run", "~/file.toml", "--out=~/out")

@@ -818,6 +818,7 @@ def frames(path):
     return pictures, delays
 
 
+@pytest.mark.slow
 def test_a_film_has_the_requested_frames_and_length(tmp_path, batch):
     calls = []
     path = plot.animate(
@@ -864,6 +865,7 @@ def test_a_film_shows_times_that_are_evenly_spaced(tmp_path):
     assert np.diff(heads).mean() > 20
 
 
+@pytest.mark.slow
 def test_films_beside_phase_portraits_and_invariants_and_in_space(tmp_path, single):
     t = np.linspace(0, 20, 30)
     qs = np.stack([np.cos(t), np.sin(t), t], 1)

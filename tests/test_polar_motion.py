@@ -153,6 +153,7 @@ def test_damping_is_the_same_in_every_direction():
     assert distance(run(LOSSY, 1.0, 100), LOSSY) < 1e-9
 
 
+@pytest.mark.slow
 def test_damping_is_that_of_q_times_epsilon():
     """e^{−επ/Q} in each turn."""
     for epsilon in (1.0, 0.5):

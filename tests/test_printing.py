@@ -26,6 +26,7 @@ def test_a_problem_prints_what_one_gives_to_integrate(name):
     assert all(observable in repr(problem) for observable in problem.observables)
 
 
+@pytest.mark.slow
 def test_results_print_their_statuses_and_small_arrays():
     ts = np.arange(4096) * 0.05
     signals = jnp.array([np.cos(ts), np.full_like(ts, np.nan)])

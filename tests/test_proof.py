@@ -384,6 +384,7 @@ def test_the_picture_of_a_bound(cubic):
     dvi.plot.plt.close(axis.figure)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("h", [0.1, pytest.param(0.3, marks=pytest.mark.slow)])
 def test_exact_coefficients(h):
     """q² + p² − h q p and q1 p2 − q2 p1 of two oscillators, found, made exact, and proved."""

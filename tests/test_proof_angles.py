@@ -39,6 +39,7 @@ def rotor():
     return proved()
 
 
+@pytest.mark.slow
 def test_a_rotor_is_confined(rotor):
     """Also above the separatrix, whose energy is 1; without `periodic` below it only."""
     _, level = rotor.level
@@ -139,6 +140,7 @@ def test_what_is_no_angle(how, message):
         proved(**how)
 
 
+@pytest.mark.slow
 def test_two_coupled_angles_and_one_that_is_not():
     """Differences of angles, times integers, have the period as well."""
     system = dvi.System(lambda t0, t1, q, p, args: coupled(q, p, 0.0))
@@ -155,6 +157,7 @@ def changed(certificate, **entries):
     return new | {"hash": exact.digest(new)}
 
 
+@pytest.mark.slow
 def test_a_forged_angle_is_refused(rotor):
     c = rotor.certificate
     (lower, upper), (largest,) = c["domain"], (float.fromhex(x) for x in c["angles"])

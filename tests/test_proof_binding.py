@@ -107,6 +107,7 @@ def test_what_is_no_certificate_is_refused(tmp_path):
         dvi.holds_for(SYSTEM, 3, **HOW)
 
 
+@pytest.mark.slow
 def test_the_command_line_compares_a_system(bound, tmp_path):
     (tmp_path / "model.py").write_text(
         "import dvi_jax as dvi\n"

@@ -48,6 +48,7 @@ def test_at_a_small_fraction_h_the_coefficients_are_fractions(h):
         dvi.exact_coefficients(energy(h), h, spring(7, 11))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("h", [0.5, 0.1])
 def test_the_map_decides_between_forms(h):
     """At h = 0.1 the number −0.7 is −1 + 3h, −7h and −7/10, to 17 digits."""
@@ -77,6 +78,7 @@ def test_each_order_is_conserved():
     dvi.exact_coefficients(series(zero), h, system)  # conserved at the order of the invariant
 
 
+@pytest.mark.slow
 def test_an_implicit_step_and_elementary_functions():
     """The angular momentum of a force that is a function of |q|, with a step that is implicit."""
     system = dvi.System(

@@ -70,6 +70,7 @@ def test_a_small_search_starts_no_process(one, started, monkeypatch):
     assert started == []
 
 
+@pytest.mark.slow
 def test_a_killed_process(one, started, monkeypatch):
     """The search continues in this process, with the same result."""
     send = workers._send

@@ -46,6 +46,7 @@ def searched(tmp_path, count, seed):
     return [line for line in done.stdout.splitlines() if "of 5 traj" in line]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "count"),
     [(20, 3), *(pytest.param(*pair, marks=pytest.mark.slow) for pair in [(24, 16), (100, 70)])],

@@ -119,6 +119,7 @@ def test_a_new_system_reads_the_new_value_and_the_old_one_raises(name, monkeypat
         final(system)
 
 
+@pytest.mark.slow
 def test_value_and_gradient_belong_to_one_hamiltonian(monkeypatch):
     def last(x):
         return dvi.integrate(dvi.System(of_global), x[None], jnp.zeros(1), **RUN).qs[-1, 0]
@@ -160,6 +161,7 @@ def test_a_sweep_reads_the_new_value(monkeypatch):
     assert last() == pytest.approx(exact(4.0), rel=1e-14)
 
 
+@pytest.mark.slow
 def test_observables_of_a_sweep_and_of_a_drift_read_the_new_value():
     """The system stays the same, and so do the functions."""
     scale = {"s": 1.0}
@@ -317,6 +319,7 @@ WHAT_A_RUN_CALLS = {
 SLOW = ("gravity", "section")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in WHAT_A_RUN_CALLS],

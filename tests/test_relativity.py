@@ -105,6 +105,7 @@ def test_hamiltonian_accelerates_as_the_force_does():
     np.testing.assert_allclose(orders, [[2, 2, 1, 1]] * 2, atol=0.1)
 
 
+@pytest.mark.slow
 def test_velocities_are_those_of_hamiltons_equations():
     masses = np.array([0.6, 0.1, 0.03])  # with a Sun that recoils
     args = {"masses": masses, "G": G, "c": 9.0}

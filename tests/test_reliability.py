@@ -60,6 +60,7 @@ def executing(tree):
                 yield "np.load without allow_pickle=False"
 
 
+@pytest.mark.slow
 def test_no_data_file_can_execute_code():
     found = {
         str(p.relative_to(ROOT)): {*executing(ast.parse(p.read_text("utf-8")))} for p in SOURCES
@@ -204,6 +205,7 @@ def test_a_damaged_checkpoint_is_refused_and_stays(tmp_path, monkeypatch):
     assert file.read_bytes() == damaged
 
 
+@pytest.mark.slow
 def test_every_test_that_the_page_on_reliability_names_exists():
     page = (ROOT / "docs" / "reliability.md").read_text("utf-8")
     rows = [line for line in page.splitlines() if line.startswith("| ")]

@@ -25,6 +25,7 @@ LAGRANGE = systems.heavy_top()
 MOMENTS = np.array([1.0, 2.0, 2.5])
 
 
+@pytest.mark.slow
 def test_rotations_and_quaternions_are_those_of_scipy():
     angles = np.array([0.3, 0.7, -1.1])
     R = rigid.rotation(*angles)
@@ -45,6 +46,7 @@ def test_rotations_and_quaternions_are_those_of_scipy():
     assert np.max(np.abs(back - many)) > 1
 
 
+@pytest.mark.slow
 def test_momenta_and_energies_are_those_of_the_inertia_tensor():
     R, pi = rigid.rotation(0.4, 1.1, -0.3), jnp.array([0.3, -0.2, 0.5])
     P = rigid.momentum(R, pi, MOMENTS)
@@ -71,6 +73,7 @@ FLAT = {
 }
 
 
+@pytest.mark.slow
 def test_flat_bodies_and_rods_turn_as_by_eulers_equations():
     """Against DOP853 for Ω and R, with moments between those of solids, plates and rods."""
     body = dvi.System(
@@ -127,6 +130,7 @@ def test_moments_that_no_body_has_are_refused(I):  # noqa: E741
         top.check(top.q0, top.p0, {"A": 1.0, "C": 2.5, "w": 1.0})
 
 
+@pytest.mark.slow
 def test_derivatives_of_flat_bodies_are_those_of_the_moments():
     slopes = jax.jacfwd(rigid.second_moments)(jnp.array([1.0, 1.0, 2.0]))
     np.testing.assert_allclose(slopes, 0.5 - np.eye(3))

@@ -191,6 +191,7 @@ MADX = {
 }
 
 
+@pytest.mark.slow
 def test_a_misaligned_bend_is_that_of_xsuite_and_madx():
     """The differences of up to 1e-7 are those of the hard edges of the three models."""
     bend = rings.bend("B", LENGTH, ANGLE, model="exact")

@@ -63,6 +63,7 @@ def slope(order, epsilons, turns=5000):
     return drift.slope
 
 
+@pytest.mark.slow
 def test_invariant_of_the_linear_map_is_that_of_courant_and_snyder():
     """With α not zero: the cell begins in the middle of a drift."""
     space = rings.drift("D", 1.0)
@@ -126,6 +127,7 @@ def test_a_proved_bound_of_the_drift_of_a_cell_with_one_sextupole(order, least):
     assert bound.steps > least
 
 
+@pytest.mark.slow
 def test_a_bound_requires_the_map_without_losses():
     problem, beta = with_sextupole(), linear()[1]
     domain = np.array([0.003]), np.array([0.003 / beta])
@@ -166,6 +168,7 @@ def test_mcmillan_ring_conserves_its_invariant_to_round_off():
     assert change(1e-3).min() > 1e-4  # a control: a lens for a wrong phase advance
 
 
+@pytest.mark.slow
 def test_mcmillan_invariant_is_found():
     problem = rings.problem(mcmillan_ring(), planes="x")
     _, beta = linear()
@@ -270,6 +273,7 @@ def test_elliptic_potential_is_that_of_multipoles():
     np.testing.assert_allclose(*found, rtol=1e-9, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_danilov_nagaitsev_optics_conserve_both_invariants_up_to_the_slices():
     errors = np.array([changes(*nagaitsev(n)) for n in (8, 16, 32)])
     orders = np.log2(errors[:-1] / errors[1:])
@@ -290,6 +294,7 @@ def test_what_breaks_the_invariants_of_danilov_and_nagaitsev():
         assert (large / small < 2.4).all()
 
 
+@pytest.mark.slow
 def test_lens_is_differentiable_by_its_parameters():
     ring, _ = nagaitsev(2)
     z = jnp.asarray([3e-3, 1e-3, 2e-3, -1e-3, 0.0, 0.01])

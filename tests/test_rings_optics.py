@@ -42,6 +42,7 @@ def close(a, b, error):
     assert np.max(np.abs(a - b)) <= error * np.max(np.abs(b)), (a, b)
 
 
+@pytest.mark.slow
 def test_fodo_cell_has_the_tunes_and_beta_functions_of_its_matrix():
     found = rings.optics(cell())
     for plane, sign in ((0, 1), (1, -1)):
@@ -101,6 +102,7 @@ def test_six_dimensions_synchrotron_tune_and_compaction():
     close(turned / np.exp(2j * np.pi * np.asarray(six.tune) * [1, 1, -1]), six.modes[0].T, 1e-10)
 
 
+@pytest.mark.slow
 def test_one_turn_agrees_with_tracking_and_with_the_matrix():
     ring = cell(b2=3.0, angle=0.2)
     z = jnp.asarray([[1e-3, 0, 1e-3, 0, 0, 1e-3], [0, 1e-4, 0, 1e-4, 0, 0]])
@@ -111,6 +113,7 @@ def test_one_turn_agrees_with_tracking_and_with_the_matrix():
     close(rings.matrix(ring, 0.002), M, 1e-12)
 
 
+@pytest.mark.slow
 def test_unstable_motion_and_missing_orbits_are_errors():
     ring = cell(k=2.5)
     with pytest.raises(ValueError, match=r"unstable: half of the trace .* in x, y"):
@@ -185,6 +188,7 @@ SAME_MAPS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_driving_terms_are_those_of_the_same_map_described_otherwise():
     magnet = rings.multipole("M", 0.0, (0, 0, 0, 0)).placed()
     ring, z = lattice_with(magnet, *KICKS), jnp.array([1e-3, 2e-4, 5e-4, -1e-4, 0, 0])
@@ -198,6 +202,7 @@ def test_driving_terms_are_those_of_the_same_map_described_otherwise():
             np.testing.assert_allclose(first[name], second[name], rtol=0, atol=1e-10 * size)
 
 
+@pytest.mark.slow
 def test_driving_terms_are_the_harmonics_of_the_potential_on_the_motion():
     """About the closed orbit, in coupled motion: the potential at the magnet, as a function of the
     phases of both modes and of a factor of the amplitudes."""
@@ -240,6 +245,7 @@ def solenoids(pieces):
                        rings.quadrupole("QD", 0.3, -0.5)])  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "tunes"),
     [

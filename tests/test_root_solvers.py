@@ -273,6 +273,7 @@ def test_a_long_run_conserves_energy_as_newton_does(name):
     assert abs(energy_after_many_steps(OTHERS[name]) - energy_after_many_steps(Newton())) < 3e-14
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "solver", [Newton(), *(pytest.param(OTHERS[n], marks=pytest.mark.slow) for n in OTHERS)]
 )
@@ -504,6 +505,7 @@ def test_trajectories_that_need_pivots_agree_and_leave_others_unchanged():
     np.testing.assert_array_equal(q[::2], calm[::2])
 
 
+@pytest.mark.slow
 def test_simplified_newton_is_compiled_as_one_piece():
     """Gauss' method with three coordinates: twelve unknowns."""
     how = {"h": 0.05, "num_steps": 4, "newton": SimplifiedNewton()}

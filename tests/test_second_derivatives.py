@@ -119,6 +119,7 @@ QUICK = [(rule, "scan") for rule in ("to_grid", "in_pairs", "nan_if_used")]
 CASES = [(rule, site) for rule in RULES for site in SITES]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rule", "site"),
     [c if c in QUICK else pytest.param(*c, marks=pytest.mark.slow) for c in CASES],

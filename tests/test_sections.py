@@ -80,6 +80,7 @@ def test_one_default_direction(h):
     assert int(dvi.integrate(SPRING, q, p, observe=both, **run).observed.count) > 5
 
 
+@pytest.mark.slow
 def test_crossings_are_those_of_the_flow():
     """SciPy's events on equations by hand, to 1e-11; a leapfrog's are off by its error."""
     q, p = starts(2)

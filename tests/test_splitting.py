@@ -50,6 +50,7 @@ def advanced(h, q, v):
     return jax.vmap(one)(h, q, v)
 
 
+@pytest.mark.slow
 def test_kepler_flow_conserves_the_orbit_for_all_eccentricities_and_long_steps():
     eccentricities = np.repeat([0.0, 0.3, 0.9, 0.999, 1.0, 1.2, 10.0], 6)
     hs = np.tile([1e-3, 0.3, -2.0, 20.0, -300.0, 4000.0], 7)
@@ -85,6 +86,7 @@ def test_kepler_flow_agrees_with_kepler_equation():
     assert np.abs(found[:, :2] - exact).max() < 1e-13
 
 
+@pytest.mark.slow
 def test_derivative_of_kepler_flow_on_both_sides_of_a_parabola():
     def final(x):
         dq, dv, _ = change(x[0], x[None, 1:3], x[None, 3:5], x[5:])
@@ -111,6 +113,7 @@ def test_a_body_at_the_centre_fails_and_does_not_affect_the_others():
     np.testing.assert_array_equal(sol.qs[0], sol.qs[2])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "flow",
     [
@@ -191,6 +194,7 @@ def test_generalised_orders_in_epsilon_and_h():
     assert np.log(strang[0] / strang[1]) / np.log(1.5) == pytest.approx(2, abs=0.5)
 
 
+@pytest.mark.slow
 def test_parts_that_are_not_exact_are_solved_to_the_order_of_the_scheme():
     def coupled(t0, t1, q0, p1, args):
         return args["eps"] * (q0 @ p1) ** 2
@@ -206,6 +210,7 @@ def test_parts_that_are_not_exact_are_solved_to_the_order_of_the_scheme():
     assert dvi.Splitting().is_explicit(SPLIT, Q0, {"eps": 0.1})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("perturbed", [1, pytest.param(None, marks=pytest.mark.slow)])
 def test_perturbing_force_and_time_enter_a_part(perturbed):
     def force(t0, t1, q0, p1, args):
@@ -243,6 +248,7 @@ def defects(method, system, q, p, args=None, h=0.3):
 WRONG = flows.Known(quartic, lambda h, q, p, args: (q, p - h * jnp.stack([q[1], -q[0]])))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method",
     [dvi.Splitting(), *(pytest.param(m, marks=pytest.mark.slow)
@@ -256,6 +262,7 @@ def test_steps_are_symplectic_and_invertible(method):
     assert wrong[0] > 0.1
 
 
+@pytest.mark.slow
 def test_saved_states_do_not_depend_on_how_often_they_are_saved():
     method = dvi.Splitting()
     options = {"h": 0.2, "num_steps": 120, "args": {"eps": 1e-3}, "method": method}
@@ -289,6 +296,7 @@ def gradient(adjoint):
     return jax.jit(jax.grad(lambda x: loss(x, adjoint)))(jnp.array([*Q0, *P0, 0.05]))
 
 
+@pytest.mark.slow
 def test_gradient_by_reconstructed_states():
     f, x = jax.jit(lambda x: loss(x, dvi.Reversible())), jnp.array([*Q0, *P0, 0.05])
     other = [central_difference(f, x, e, step=1e-4) for e in jnp.eye(5)]
@@ -328,6 +336,7 @@ def test_bad_parts_and_schemes_are_refused(make, error, word):
         make()
 
 
+@pytest.mark.slow
 def test_a_flow_of_another_hamiltonian_is_refused():
     def make(flow):
         return dvi.System(dvi.Split([flows.Harmonic(omega=1.3), quartic], flows=[None, flow]))
@@ -350,6 +359,7 @@ def kinetic(t0, t1, q0, p1, args):
     return p1 @ p1 / 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("parts", "scheme", "warns"),
     [
@@ -458,6 +468,7 @@ def test_wisdom_holman_refuses_other_systems():
         dvi.integrate(systems.kepler(), h=0.1, num_steps=2, method=dvi.WisdomHolman())
 
 
+@pytest.mark.slow
 def test_wisdom_holman_in_float32_and_with_compensated_sums():
     q, p = (np.asarray(x, np.float32) for x in (THREE.q0, THREE.p0))
     args = jax.tree.map(np.float32, THREE.args)

@@ -325,6 +325,7 @@ def test_random_states_differ_beyond_32_bits():
     assert np.abs(a - b).max() > 1e-6
 
 
+@pytest.mark.slow
 def test_normal_states_have_their_spread():
     x = generated(starts.Normal(20000, [1.0, 2.0], [0.0, 0.0], ([0.1, 0.0], 0.3)), range(20000))
     near(x[:, 1], 2.0)
@@ -423,6 +424,7 @@ TYPE_ERRORS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("errors", "error"), [(VALUE_ERRORS, ValueError), (TYPE_ERRORS, TypeError)]
 )

@@ -136,6 +136,7 @@ def test_what_changes_numbers_changes_the_description(what):
     assert digest(identity(**DIFFERENT[what][0])) == digest(a)
 
 
+@pytest.mark.slow
 def test_the_code_of_generated_initial_conditions_is_part_of_it(monkeypatch):
     """And a program that was compiled with another value is not used again."""
 

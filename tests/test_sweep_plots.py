@@ -144,6 +144,7 @@ def test_maps_on_given_axes_have_their_legends_below_the_labels(layout):
         assert lies_within(axis.get_legend(), figure)
 
 
+@pytest.mark.slow
 def test_cells_without_a_number_are_grey_and_counted():
     """With a status, those that are not computed are white."""
     data = with_status()

@@ -373,6 +373,7 @@ def test_multiples_by_invariants_are_marked_as_dependent():
     assert dependent == [False, False, True, False, False]  # p ∂q; the dilation is no such
 
 
+@pytest.mark.slow
 def test_too_small_a_gauge_basis_is_suspected():
     """The flow of the oscillator needs the gauge (q² − p²)/2."""
     small = dvi.Basis({"q": lambda q, p: q[0]})
@@ -447,6 +448,7 @@ def test_friction_of_any_strength_leaves_conformal_symmetries_only(strength):
     assert f"ε ({strength / 2:.6g} q)" in turning
 
 
+@pytest.mark.slow
 def test_other_samples_compile_nothing():
     """What was compiled for one set of samples serves another, far from it."""
     compiled = []

@@ -207,6 +207,7 @@ def test_steps_that_are_solved_for_have_the_same_bits_in_a_batch():
         np.testing.assert_array_equal(a[4], b)
 
 
+@pytest.mark.slow
 def test_gradient_equals_central_differences():
     value = jax.jit(lambda x: ends(x, dvi.Variational(), dvi.Direct()))
     ones = jax.tree.map(jnp.ones_like, POINT)

@@ -77,6 +77,7 @@ COUNTED = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("problem", "method"),
     [pytest.param(*pair, marks=[pytest.mark.slow] * (i > 1)) for i, pair in enumerate(COUNTED)],
@@ -123,6 +124,7 @@ def test_the_reference_is_as_good_as_its_floor(bench):
     assert truth.error(q * (1 + 3e-11), p) > 4 * truth.floor
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "is_wrong"), [("Strang", False), ("BlanesMoan6", False), ("BlanesMoan6", True)]
 )
