@@ -54,7 +54,7 @@ lowest: $(READY)
 	  -e ".[test,ephemeris]"
 	build/lowest/bin/python -m pytest -q -n $(JOBS) --dist loadfile $(LOWEST)
 
-## make test        every part of the package at least once, in about ten minutes
+## make test        every part of the package at least once, in about eight minutes
 test: $(READY)
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --durations=20
 
