@@ -98,6 +98,7 @@ RUN_BY = {
     "sweep examples/sweep.toml": "test_cli_sweep.py",
     "fit examples/fit.toml": "test_cli_fit.py",
     "bound examples/bound.toml": "test_cli_bound.py",
+    "report results/kepler": "test_run.py",
     "certify --quick": "test_certify.py",
     "paper": "test_paper.py",
 }

@@ -87,6 +87,8 @@ def test_kepler_example(folder):
         np.testing.assert_allclose(saved["observed/energy"], alone.observed, rtol=0, atol=1e-9)
         assert saved["ps"].shape == (2501, 2)
         assert saved["hs"].shape == (2500,)
+    assert command("report", "results/kepler").exit_code == 0
+    assert (folder / "results" / "kepler.html").exists()
 
 
 @pytest.mark.slow
