@@ -706,24 +706,27 @@ INLINE void NAME(mirror_step)(REAL *q, REAL *p, double h, double kick)
         }                                                                                          \
     }
 
-/* Energy E_k after each step: max |E_k - E_1|, and its slope against time,
-   sum (k - m)(E_k - E_1) / (h sum (k - m)^2) with m = (N + 1)/2 and N (N^2 - 1)/12 for that sum. */
+/* Energy E_k of the initial state, k = 0, and after each of N steps: max |E_k - E_0|, and its slope
+   against time, sum (k - m)(E_k - E_0) / (h sum (k - m)^2) with m = N/2 and M (M^2 - 1)/12,
+   M = N + 1, for that sum. */
 #define DEFINE_EXPLICIT_STREAMED(system, n, many)                                                  \
     void NAME(system##_streamed)(long lanes, long steps, double h, double eps, const double *q0,   \
                                  const double *p0, double *q1, double *p1, double *drift,          \
                                  double *slope)                                                    \
     {                                                                                              \
-        double N = steps, scale = 12.0 / (h * N * (N * N - 1.0));                                  \
+        double M = steps + 1.0, scale = 12.0 / (h * M * (M * M - 1.0));                            \
         for (long first = 0; first < lanes; first += (many) * LANES_OF_REAL) {                     \
             LOAD_STATE(n, many)                                                                    \
             REAL V[many], start[many], largest[many], moment[many];                                \
             UNROLL for (int b = 0; b < (many); b++) {                                              \
                 V[b] = NAME(system##_potential)(q[b]);                                             \
-                start[b] = NAME(system##_watched)(q[b], p[b], &V[b], h, h * eps);                  \
+                start[b] = V[b];                                                                   \
+                for (int i = 0; i < (n); i++)                                                      \
+                    start[b] += 0.5 * p[b][i] * p[b][i];                                           \
                 largest[b] = moment[b] = 0.0 * start[b];                                           \
             }                                                                                      \
-            double weight = 2.0 - (N + 1.0) / 2.0;                                                 \
-            for (long k = 1; k < steps; k++) {                                                     \
+            double weight = 1.0 - 0.5 * steps;                                                     \
+            for (long k = 0; k < steps; k++) {                                                     \
                 UNROLL for (int b = 0; b < (many); b++) {                                          \
                     REAL energy = NAME(system##_watched)(q[b], p[b], &V[b], h, h * eps);           \
                     REAL change = energy - start[b];                                               \
