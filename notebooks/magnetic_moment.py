@@ -64,7 +64,7 @@ with plot.style():
     left.set(xlabel="z, along the axis", ylabel="x", title="One bounce, ℓ = 40")
     for name, key in {"μ₀": "magnetic_moment", "μ₀ + μ₁": "corrected_moment"}.items():
         values = np.asarray(sol.observed[key])
-        right.plot(sol.ts[1:], values / values[0], lw=0.8, label=name)
+        right.plot(sol.ts, values / values[0], lw=0.8, label=name)
     right.set(
         xlabel="time [gyrofrequency⁻¹]", ylabel="value / initial value", title="Magnetic moment"
     )
@@ -136,7 +136,7 @@ for run, length in zip(runs, lengths, strict=True):
 # %%
 gyration = []
 for run, length in zip(runs, lengths, strict=True):
-    x, y, z = np.asarray(run.qs)[1:].T
+    x, y, z = np.asarray(run.qs).T
     B = np.linalg.norm(np.stack([-x * z, -y * z, length**2 + z**2]) / length**2, axis=0)
     gyration.append(relative_range(np.asarray(run.observed["magnetic_moment"]) * B))
 slope = -np.polyfit(np.log(lengths), np.log(gyration), 1)[0]
