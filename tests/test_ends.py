@@ -163,10 +163,11 @@ def name_of(value):
     return type(value).__name__
 
 
-# What a run computes after its loop, between the steps and at the start.
+# What a run computes after its loop, between the steps and at the start. The times that a clock
+# moves are not those of the steps, where the state between the steps has a kink.
 BETWEEN = {
     "times": {"save": dvi.Save(ts=[0.3, 0.55]), "observe": lambda t, q, p, k: k * q[0] ** 2},
-    "clock": {"save": dvi.Save(ts=[0.3, 0.55], clock=lambda t, q, p, k: k * t)},
+    "clock": {"save": dvi.Save(ts=[0.32, 0.57], clock=lambda t, q, p, k: k * t)},
     "section": {"observe": dvi.Section(lambda t, q, p, k: t + k - 1.32)},
     "stop": {"stop": dvi.Stop(lambda t, q, p, k: t + k - 1.32)},
     "start": {"observe": lambda t, q, p, k: k * q[0] ** 2},
