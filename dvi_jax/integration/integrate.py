@@ -133,7 +133,7 @@ def integrate(
     print(sol.status, sol.ts.shape, sol.qs.shape)
     # successful (101,) (101, 2)
     print(round(float(sol.observed["drift"]), 4))
-    # 0.0633
+    # 0.0627
     ```
     """
     refuse_unknown("integrate", integrate, unknown)
