@@ -12,8 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from ..base.checks import positive, whole
 from . import axes as draw, states
 from .axes import canvas, check_shapes, entry, labels_of, legend, stack
-from .states import Lane, Looks, check_of_state, index_label, lanes_of, looks_of, one_shape
-from .states import place_in, troubles
+from .states import Lane, Looks, index_label, lanes_of, looks_of, one_shape, place_in, troubles
 from .style import COLOURS, CROSS, DASHES, MARKS, STAR, START, in_style, look_of, with_unit
 
 _PANELS, _MARKS, _MESH, _NARROW = 6, 9, 161, 0.45
@@ -71,7 +70,7 @@ def phase_portrait(
             if math.isclose(period, 2 * math.pi):
                 axis.set_xticks(np.arange(-2, 3) * math.pi / 2, ["−π", "−π/2", "0", "π/2", "π"])
         if hamiltonian is not None:
-            check_of_state("hamiltonian", hamiltonian)
+            states.check_of_state("hamiltonian", hamiltonian)
             _level_lines(axis, hamiltonian, lanes[0], plane.place, levels)
     entries = _entries(lanes, looks)
     if hamiltonian is not None:

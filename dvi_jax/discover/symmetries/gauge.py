@@ -109,7 +109,7 @@ def solve_gauge(
         n_k + (1/h) Σ_{m≤k} A_{k−m} g_m = 0    for k = 0 … z
 
     with n_k the Taylor coefficients of the sum without gauges and A_k those of φ(Φ_ε) − φ.
-    (If the unperturbed map is inserted, as (28) is printed, terms are lost; this is why (34) fails.)
+    (With the unperturbed map, as (28) is printed, terms are lost; this is why (34) fails.)
 
     On solutions every generator with ξ0 = 0 has the gauge −ξ·p, whose invariant is 0. Therefore
     check also that the invariant is not 0; a small residual is not sufficient. `find_symmetries`
