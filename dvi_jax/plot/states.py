@@ -165,10 +165,7 @@ def each_state(function: Callable[..., Any], qs: Any, ps: Any, name: str = "") -
 
 def check_of_state(name: str, function: Any) -> None:
     """**Raises** `TypeError` for a function that needs more than (q, p), such as t and args."""
-    hint = (
-        "Give it to integrate as observe={...} and plot the solution, or fix the other arguments: "
-        "lambda q, p: f(t, q, p, args)."
-    )
+    hint = "Plot the values of observe={...} of integrate, or give lambda q, p: f(t, q, p, args)."
     inner = function.function if isinstance(function, OfState) else function
     check_takes(name, inner, "(q, p)", dict.fromkeys((4, 7), hint))
 
