@@ -363,6 +363,9 @@ def states(*shapes, dtype=float):
     return tuple(np.ones(shape, dtype) for shape in shapes)
 
 
+ENERGY = systems.kepler().observables["energy"]  # of (t, q, p, args)
+
+
 def test_orbits_and_choices_that_do_not_fit_are_named():
     two, bodies = arrays(n=2), arrays(n=6, shape=(3, 2))
     refuses(
@@ -383,6 +386,7 @@ def test_orbits_and_choices_that_do_not_fit_are_named():
         ((two,), {"period": 0}, "period must be a positive"),
         ((arrays(3),), {"colour": [1, 2]}, r"shape \(3,\); got colour of shape \(2,\)"),
         ((two, 0, lambda q, p: q), {}, r"must return one number; .*shape \(2,\)"),
+        ((two, 0, ENERGY), {}, r"hamiltonian must take.*\(q, p\), got energy", TypeError),
     )
     refuses(
         plot.orbit,
@@ -479,6 +483,8 @@ def test_invariants_that_cannot_be_drawn_are_named(single):
         ((t, {}), {}, "values is empty: give"),
         ((t, dict.fromkeys("abcdefghijklm", 1 + t)), {}, "13 quantities are too"),
         ((single,), {"change": "log"}, "change must be one of 'relative', 'absolute', 'value'"),
+        ((single, {"E": ENERGY}), {}, r"values\['E'\] must.*\(q, p\).*observe=", TypeError),
+        ((single, {"E": lambda t, q, p, args: t}), {}, r"\(q, p\).*observe=", TypeError),
     )
     refuses(plot.conserved, ((t, {"E": np.ones(3)}, "t", ""), {}, "'E' must have one number"))
 

@@ -318,7 +318,10 @@ def test_large_results_are_shortened_with_a_remark(tmp_path, monkeypatch):
     assert "… and 12335 more failures" in text
     assert " … and 100000 more characters" in "".join(reader.texts["config"])
     assert [v[:15] for _, n, v in reader.attributes if n == "src"] == ["data:image/png;"]
-    assert any("file cannot be drawn: its file has 3 MB" in t for t in reader.texts["figcaption"])
+    assert any(
+        "file cannot be drawn: 3 MB do not fit into the page" in t
+        for t in reader.texts["figcaption"]
+    )
 
 
 def test_a_table_is_written_as_toml_and_read_again():

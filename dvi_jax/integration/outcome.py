@@ -136,8 +136,8 @@ def raise_on_failure(solution: Solution, task: Task, run: Run) -> Solution:
     step = int(stats["failed_step"])
     if step < 0:
         raise IntegrationError(
-            "all steps succeeded, but not the computation of a point between their ends: of a time "
-            f"of Save(ts=...), a crossing of a Section, or the end by a Stop. {remark}",
+            "all steps succeeded, but a point within a step could not be computed: a time of "
+            f"Save(ts=...), a crossing of a Section, or the end by a Stop. {remark}",
             solution,
         )
     if task.lattice.has_memory:

@@ -69,17 +69,17 @@ def solve_ivp(
 ) -> Any:
     r"""One trajectory with the arguments and the results of `scipy.integrate.solve_ivp`.
 
-        y = (q, p) in one vector,    the map of method on t0, t0 + h', …, t1,   h' = (t1 − t0)/N
+        y = (q, p) in one vector;  the times t0, t0 + h', …, t1 of the steps, with h' = (t1 − t0)/N
 
-    with N the smallest number of steps that are not longer than h.
+    where N is the smallest number of steps that are not longer than h.
 
-    - `system`: a `System` in place of SciPy's right side; or a problem of the library, whose args
-      are taken where `args` is left out.
-    - `t_span`: (t0, t1); t1 < t0 runs backwards. `y0`: q0 and p0, raveled, one after the other; the
-      run has its precision. `shape`: of q, where it is more than a vector, such as (bodies, 3).
+    - `system`: a `System` in place of SciPy's right-hand side; or a problem of the library, whose
+      own args are used if `args` is omitted.
+    - `t_span`: (t0, t1); t1 < t0 runs backwards. `y0`: q0 and p0 in one vector, which determines
+      the precision of the run. `shape`: of q, if q is not a vector, such as (bodies, 3).
     - `method`: a `Method`, or its name in ``testing.METHODS``, such as ``"KahanLi8"``.
-    - `t_eval`: times of the output, in order and within t_span; all lattice points where left out.
-      Between lattice points it is the step of the method to that time.
+    - `t_eval`: times of the output, in order and within t_span; default: the times of all steps. A
+      time within a step is reached by a shorter step of the method.
     - `h`: the longest step [time]. `epsilon`, `args`, `root_finder`: as for ``dvi.integrate``.
     - `events`: one function or several, ``event(t, y)`` or ``event(t, y, args)`` → scalar, written
       with jax.numpy, with SciPy's attributes `terminal` (False, True, or a number of crossings) and
@@ -93,12 +93,11 @@ def solve_ivp(
     `num_steps`, `newton_iterations`, `solution` (the `Solution`). A failure raises no error, as in
     SciPy: `t` and `y` end before it. There is no `nfev`.
 
-    **Raises** `TypeError` for arguments of SciPy's that have no meaning on a fixed lattice (rtol,
-    …), each with its reason, and as ``dvi.integrate``; `ValueError` for invalid t_span, t_eval, y0
-    and h.
+    **Raises** `TypeError` for arguments of SciPy that have no meaning for equal steps (rtol, …),
+    with the reason, and as ``dvi.integrate``; `ValueError` for invalid t_span, t_eval, y0 and h.
 
-    **Accuracy** the order of the method in h. Values are NumPy's: nothing can be differentiated
-    through it; take ``dvi.integrate`` for that.
+    **Accuracy** the order of the method in h. Results are NumPy arrays without derivatives; use
+    ``dvi.integrate`` for gradients.
     """
     for name in excess:
         reason = _REASONS.get(name, "Check its name: SciPy's solve_ivp does not have it either")

@@ -26,17 +26,17 @@ class UnitSystem:
     equations between quantities are also equations between the numbers.
 
     - `length`, `time`, `mass`: units of astropy, or their names.
-    - `q`, `p`: ``"length"``, ``"angle"``; ``"momentum"``, ``"velocity"`` (unit mass), ``"angular
-      momentum"``, ``"specific angular momentum"``; ``"dimensionless"``; or any unit of that kind.
-    - `args`: name of a parameter → some unit of its kind, ``{"mu": u.m**3 / u.s**2}``; of nested
-      ones by path, ``"planet.mass"``; a name applies to all that is below it. Others are numbers
-      without a unit.
+    - `q`: ``"length"``, ``"angle"``. `p`: ``"momentum"``, ``"velocity"`` (unit mass), ``"angular
+      momentum"``, ``"specific angular momentum"``. Both: ``"dimensionless"``, or a unit of astropy.
+    - `args`: name of a parameter → a unit of the same dimension, ``{"mu": u.m**3 / u.s**2}``. A
+      path, ``"planet.mass"``, names a nested parameter; a name applies to all parameters below it.
+      Parameters that are not named are numbers without a unit.
 
     Its `q`, `p`, `t`, `energy` (p q/t) and `args` are the units of the numbers. `UnitSystem.of`
     reads those of a problem of the library.
 
-    **Raises** `ImportError` without astropy; `ValueError` for a unit of another kind than length,
-    time or mass, and for names that are not known.
+    **Raises** `ImportError` without astropy; `ValueError` for a unit of a wrong dimension, and for
+    an unknown name.
     """
 
     def __init__(

@@ -189,7 +189,7 @@ class BAOAB(_Splitting):
     B and A are together the map (12)–(13) over h/2, and after O its adjoint, also for H_D that are
     not separable. At T = 0 areas shrink by e^{−γh} exactly: the step is conformally symplectic.
 
-    **Arguments** `base`: the map of the halves, any method with an inverse.
+    **Arguments** `base`: the method of the half steps B and A, any method with an inverse.
 
     **Accuracy** weak order 2, strong order 1. For H_D = Σ p²/(2m) + V the error of averages of q is
     O(h²); it vanishes for harmonic V, and is O(h⁴) for large γ.

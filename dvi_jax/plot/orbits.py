@@ -70,6 +70,7 @@ def phase_portrait(
             if math.isclose(period, 2 * math.pi):
                 axis.set_xticks(np.arange(-2, 3) * math.pi / 2, ["−π", "−π/2", "0", "π/2", "π"])
         if hamiltonian is not None:
+            states.check_of_state("hamiltonian", hamiltonian)
             _level_lines(axis, hamiltonian, lanes[0], plane.place, levels)
     entries = _entries(lanes, looks)
     if hamiltonian is not None:

@@ -165,7 +165,8 @@ def _read(
     for name, column in (values or {}).items():
         if callable(column):
             check_momenta(lanes)
-            quantities[name] = [each_state(column, lane.qs, lane.ps) for lane in lanes]
+            label = f"values[{name!r}]"
+            quantities[name] = [each_state(column, lane.qs, lane.ps, label) for lane in lanes]
         elif not isinstance(orbits, list):
             quantities[name] = _rows(name, {name: column}, orbits)
         elif isinstance(column, list) and len(column) == len(lanes):

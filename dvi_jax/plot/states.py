@@ -12,6 +12,8 @@ import numpy as np
 from matplotlib.cm import ScalarMappable
 
 from ..base.checks import whole
+from ..base.signature import check_takes
+from ..observe import OfState
 from . import axes as draw
 from .axes import check_shapes, counts_text, entry, labels_of, legend, scale_of
 from .style import COLOURS, CROSS, DASHES, PALE, SHADES, Look, with_unit
@@ -152,12 +154,20 @@ def component(
     return lambda qs, ps: (qs if letter == "q" else ps)[(slice(None), *place)], label
 
 
-def each_state(function: Callable[..., Any], qs: Any, ps: Any) -> np.ndarray:
-    """A function ``(q, p)`` of every state, shape (N, ...)."""
+def each_state(function: Callable[..., Any], qs: Any, ps: Any, name: str = "") -> np.ndarray:
+    """A function ``(q, p)`` of every state, shape (N, ...); `name`: of the function, in errors."""
+    name = name or f"the function {getattr(function, '__name__', type(function).__name__)}"
+    check_of_state(name, function)
     values = np.asarray(jax.vmap(function)(qs, ps))
-    name = getattr(function, "__name__", type(function).__name__)
-    draw.check_real(f"the results of the function {name}", values)
+    draw.check_real(f"the results of {name}", values)
     return values
+
+
+def check_of_state(name: str, function: Any) -> None:
+    """**Raises** `TypeError` for a function that needs more than (q, p), such as t and args."""
+    hint = "Plot the values of observe={...} of integrate, or give lambda q, p: f(t, q, p, args)."
+    inner = function.function if isinstance(function, OfState) else function
+    check_takes(name, inner, "(q, p)", dict.fromkeys((4, 7), hint))
 
 
 class Looks(NamedTuple):

@@ -198,8 +198,8 @@ def bound_drift(
             checker = exact.Checker(certificate)
         except exact.Failure as error:
             raise ValueError(
-                f"periodic must be False for what is no angle: {error} (an invariant, inside, or "
-                "more of the step)."
+                f"periodic must be False unless q and q + 2π are the same state: {error}. The "
+                "step, the invariants and `inside` must not change with such a turn."
             ) from None
     identities = frozenset(k for k, s in enumerate(estimates) if s == 0 and checker.is_identity(k))
     search.resolve(checker, estimates, ratio)

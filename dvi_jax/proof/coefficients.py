@@ -270,8 +270,8 @@ class _Equations:
                 raise ValueError(
                     "the invariant with exact coefficients is not conserved: at (q, p, t) = "
                     f"{self.changes[number][0]} a step changes it by {float(exact.arb(total)):.3g} "
-                    f"at the order ε^{order}. Its coefficients have other forms, or it is an "
-                    "invariant up to an error only."
+                    f"at the order ε^{order}. It is conserved approximately only, its coefficients "
+                    "have other forms, or a constant of the system is rounded: 0.3 is not 3/10."
                 )
 
 

@@ -292,8 +292,8 @@ def check_failure(candidate: Candidate) -> Measured:
     ".0f",
 )
 def check_traces(candidate: Candidate) -> Measured:
-    """Number of times that a run is traced again if q0, p0, t0, h, ε and args change and the method
-    is a new instance that is equal. It must be 0."""
+    """Number of times that JAX traces a run again for other values of q0, p0, t0, h, ε and args and
+    an equal new instance of the method. It must be 0."""
     calls, counts = 0, []
 
     def count_calls(t0, t1, q0, p0, q1, p1, args):

@@ -193,7 +193,7 @@ def _image(source: Callable[[], Any] | bytes, budget: int) -> tuple[bytes, str]:
     (PNG), as fine as there is space for. **Raises** `ValueError` where it is too large."""
     if isinstance(source, bytes):
         if len(source) > budget:
-            raise ValueError(f"its file has {len(source) / 1e6:.2g} MB")
+            raise ValueError(f"{len(source) / 1e6:.2g} MB do not fit into the page")
         return source, "png"
     settings: Any = {"svg.hashsalt": "dvi-jax", "svg.fonttype": "path"}
     with plot.style(), mpl.rc_context(settings):

@@ -26,12 +26,13 @@ class InvariantSeries(eqx.Module):
 
     - `coefficients`: c, shape (order + 1, basis size). `basis`: φ.
     - `slow_time`: whether φ is a function of the slow time τ = εt in place of t.
-    - `sizes`: shape of `coefficients`: size of a term with coefficient 1 on the samples of the
-      search, by which terms of a formula are left out; None: all have the same size.
-    - `errors`: shape of `coefficients`: their estimated errors, by which digits of a formula are
-      left out; None: unknown.
+    - `sizes`: size of each basis function on the samples of the search, shape of `coefficients`.
+      The formula leaves out terms that are small on the samples. None: equal sizes.
+    - `errors`: estimated errors of `coefficients`, same shape. The formula has only the digits that
+      they allow. None: unknown.
 
-    Give it to `integrate` as it is: the run binds it to its ε. As a formula: `str`.
+    Pass it to `integrate` in ``observe=``; the run supplies its ε. `str` gives the formula, and
+    ``evaluate(q, p, epsilon)`` the value at one state.
     """
 
     basis: BoundBasis

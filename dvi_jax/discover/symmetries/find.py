@@ -38,34 +38,33 @@ def find_symmetries(
     tolerance: float | None = None,
     **settings: Unpack[MapSettings],
 ) -> Symmetries:
-    r"""The symmetries of order z of the perturbed discrete equations that a basis can express.
+    r"""Search for symmetries of order z of the perturbed discrete equations, in a basis.
 
     Every component of every X_m, m = 0 … z, is a combination of the basis functions φ(q, p, t).
     With Φ_ε the map (12)–(13), the determining equations
 
         Σ_m ε^m pr X_m(F)(z, Φ_ε(z)) = O(ε^{z+1})
 
-    are linear in its coefficients; their Taylor coefficients in ε at sampled points z = (q, p)
-    are a block-Toeplitz system, whose null space is found by singular values (the basis made
-    orthonormal on the samples first). On F = 0 this condition is sufficient: a smooth pointwise
-    conformal factor then exists (see `conformal_factor`).
+    are linear in the coefficients of these combinations. Their Taylor coefficients in ε at sampled
+    points z = (q, p) are a block-Toeplitz system. A singular value decomposition gives its null
+    space, in a basis that is orthonormal on the samples. On F = 0 this condition is sufficient: a
+    smooth conformal factor then exists at each point (see `conformal_factor`).
 
-    A symmetry is variational when a gauge closes Noether's identity. On the solutions *any* X
-    with ξ0 = 0 closes it, by G = −ξ·p; the criterion is that the identity Σ ε^m N_m and its first
-    derivatives with respect to q1 and p0 vanish off the solutions (then X is variational up to a
-    trivial symmetry). For ξ0 = 0 that means: X is the Hamiltonian vector field of its invariant
-    ξ·p + G. The others are conformal only.
+    A symmetry is variational if it satisfies Noether's identity with some gauge. On solutions *any*
+    X with ξ0 = 0 does, with G = −ξ·p. Therefore the criterion is that Σ ε^m N_m and its first
+    derivatives with respect to q1 and p0 vanish for states that are not solutions, too (X is then
+    variational up to a trivial symmetry). If ξ0 = 0, X is then the Hamiltonian vector field of its
+    invariant ξ·p + G. All other symmetries are conformal only.
 
     **Arguments**
 
     - `basis`: with constants for translations: ``Polynomials(2, constant=True)``.
     - `order`: z ≥ 0. `h`: step size [time].
-    - `samples`: (qs, ps) at t0, shapes (S, *q.shape), points of the domain of interest, or (qs,
-      ps, ts) with their times, shape (S,), where basis or system depend on t. A quarter is held
-      out.
+    - `samples`: (qs, ps) at t0, shapes (S, *q.shape), in the domain of interest; or (qs, ps, ts)
+      with their times, shape (S,), if the basis or the system depends on t. A quarter is held out.
     - `gauges`: basis of the gauges; None for φ times 1 and each coordinate, all quadratic
       polynomials, and t.
-    - `time`: whether ξ0 is sought too. Where it depends on the point it changes h.
+    - `time`: whether ξ0 may be nonzero. A ξ0 that depends on the point changes h.
     - `tolerance`: relative singular value below which a vector is null; None for those below the
       widest gap, at most 1e-11 of the typical residual of vector fields, or rounding.
     - the keywords `t0`, `args`, `root_finder`, `integrator`: as for `integrate`; the

@@ -100,25 +100,25 @@ def solve_gauge(
     t0: float = 0.0,
     args: Args = None,
 ) -> GaugeSolution:
-    r"""Least-squares gauge functions that close Noether's identities on the perturbed map.
+    r"""Gauge functions with which generators satisfy Noether's identities, by least squares.
 
-    With Φ_ε the map (12)–(13), the sum Σ_m ε^m N_m of the identities (28) has to vanish on
-    (q, p) → Φ_ε(q, p) up to O(ε^{z+1}). Powers of ε are collected *after* the map is put in:
+    With Φ_ε the map (12)–(13), the sum Σ_m ε^m N_m of the identities (28) must be O(ε^{z+1}) on
+    each step (q, p) → Φ_ε(q, p). First the perturbed map is inserted, then the coefficient of each
+    power of ε must vanish:
 
         n_k + (1/h) Σ_{m≤k} A_{k−m} g_m = 0    for k = 0 … z
 
     with n_k the Taylor coefficients of the sum without gauges and A_k those of φ(Φ_ε) − φ.
-    (Order by order with the unperturbed map, as (28) is printed, terms are lost: (34) therefore
-    fails.)
+    (With the unperturbed map, as (28) is printed, terms are lost; this is why (34) fails.)
 
-    On the solutions every generator with ξ0 = 0 has the gauge −ξ·p, whose invariant is 0: where
-    the basis contains it, look at the invariant and not at the residual alone. `find_symmetries`
+    On solutions every generator with ξ0 = 0 has the gauge −ξ·p, whose invariant is 0. Therefore
+    check also that the invariant is not 0; a small residual is not sufficient. `find_symmetries`
     distinguishes such generators from those that lead to an invariant.
 
     **Arguments** `generators`: the series, order 0 first; `basis`: φ(q, p) of the gauges; `h`,
     `t0`, `args`: of the step; `samples`: (qs, ps) at t0, shapes (S, *q.shape), or (qs, ps, ts)
-    with the times of the samples, shape (S,); a quarter of them is held out. No sample counts
-    more than another, however large the identity is there.
+    with the times of the samples, shape (S,); a quarter of them is held out. All samples have the
+    same weight, whatever the size of the identity.
 
     **Returns** a `GaugeSolution`.
 
