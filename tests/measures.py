@@ -38,7 +38,7 @@ PACKAGES = ("dvi_jax", "lanewise", "dvi_jax_cli")
 LONGEST_FILE, MOST_PARAMETERS = 450, 9
 
 LIMITS: dict[str, float] = {
-    "lines of the core": 14_000,
+    "lines of the core": 14_030,
     "lines of the questions": 21_660,
     "lines of the leaves": 19_830,
     "lines of lanewise": 7_560,

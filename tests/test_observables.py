@@ -210,3 +210,22 @@ def test_observables_in_slow_time_have_all_forms(lattice):
         assert observe[name].bind(slow, 0.3)(*step) == pytest.approx(energies[1], rel=1e-13)
         with pytest.raises(ValueError, match="needs the value of epsilon"):
             observe[name](*step)
+
+
+def test_an_argument_tau_that_would_receive_t_is_refused():
+    slow = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + (1 + t0) * q @ q / 2, slow_time=True)
+    of_tau = lambda tau, q, p, args: (1 + tau) * q[0]  # noqa: E731
+    inputs = {"h": 0.1, "num_steps": 3, "epsilon": 0.3}
+    for options in (
+        {"observe": of_tau},
+        {"observe": {"E": slow_energy}},
+        {"observe": dvi.Running(dvi.MaxDrift(of_tau))},
+        {"observe": dvi.Section(of_tau)},
+        {"stop": dvi.Stop(of_tau)},
+        {"save": dvi.Save(ts=[0.2], clock=of_tau)},
+    ):
+        with pytest.raises(TypeError, match="is the time t, not τ"):
+            dvi.integrate(slow, [1.0], [0.2], **inputs, **options)
+    # A system without a slow time has no τ = εt.
+    fast = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + q @ q / 2)
+    dvi.integrate(fast, [1.0], [0.2], h=0.1, num_steps=3, observe=of_tau)

@@ -29,11 +29,16 @@ def accepts(function: Callable[..., Any], count: int) -> bool:
 
 def takes_state(function: Callable[..., Any]) -> bool:
     """Whether `function` takes (q, p); (t, q) and (q, args) do not, by their names."""
-    try:
-        names = list(inspect.signature(function).parameters)[:2]
-    except (TypeError, ValueError):
-        names = []
+    names = argument_names(function)[:2]
     return accepts(function, 2) and not {"t", "t0", "t1", "time", "tau", "args"} & set(names)
+
+
+def argument_names(function: Callable[..., Any]) -> list[str]:
+    """The names of the arguments; none for a builtin function without a signature."""
+    try:
+        return list(inspect.signature(function).parameters)
+    except (TypeError, ValueError):
+        return []
 
 
 # Modules and not closures: compiled programs are looked up by the function inside.
@@ -103,10 +108,7 @@ def signature_of(function: Callable[..., Any]) -> str:
 
 def warn_of_exchanged(name: str, function: Callable[..., Any], arguments: str) -> None:
     """Warn if the names of the arguments suggest that the function takes p before q."""
-    try:
-        names = list(inspect.signature(function).parameters)
-    except (TypeError, ValueError):
-        return
+    names = argument_names(function)
     letters = [argument[0] for argument in arguments.strip("()").split(", ")]
     initials = [name[:1].lower() for name in names]
     places = [i for i, letter in enumerate(letters) if letter in "qpv"][:2]

@@ -19,7 +19,7 @@ from ..base.progress import bar_of, reporter
 from ..engine.newton import RootSolver
 from ..lattices import Lattice, Run
 from ..methods import Method
-from ..observe import OfState, Stop, is_observable, of_steps
+from ..observe import OfState, Stop, is_observable, of_steps, refuse_slow_time
 from ..observe.solution import Save, Solution
 from ..problem.noise import as_path
 from ..problem.system import System, check_system, of_problem
@@ -148,6 +148,8 @@ def integrate(
     q0, p0 = start_state(q0, p0)
     if observe is not None:
         observe = of_steps(observe)
+    if system.slow_time:
+        refuse_slow_time(observe, stop, save.clock)
     grid = integrator.lattice
     # The h of a problem does not count where the times are given.
     h = default_h if type(grid).takes_h else h

@@ -28,5 +28,6 @@ from ._states import (
     OfState as OfState,
     has_initial_value as has_initial_value,
     of_steps as of_steps,
+    refuse_slow_time as refuse_slow_time,
 )
 from ._stop import Stop as Stop, Stopped as Stopped

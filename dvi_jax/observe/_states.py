@@ -7,12 +7,16 @@ import equinox as eqx
 import jax
 from jaxtyping import PyTree
 
-from ..base.signature import accepts, signature_of, takes_state, warn_of_exchanged
+from ..base.signature import accepts, argument_names, signature_of, takes_state, warn_of_exchanged
 from ..base.types import Bindable
 from ._reductions import Reduction, Running, is_observable
 
 FORMS = "(q, p), (t, q, p, args) or (t0, t1, q0, p0, q1, p1, args)"
 """Arguments that an observable can have."""
+
+
+TAU = {"tau", "tau0", "τ", "τ0"}
+"""Names of the first argument of functions of a slow time."""
 
 
 class OfState(eqx.Module):
@@ -90,6 +94,21 @@ def has_initial_value(function: Any) -> bool:
 def of_steps(observe: PyTree) -> PyTree:
     """The observables, all as functions of a step. **Raises** `TypeError` for other functions."""
     return jax.tree.map(_of_step, observe, is_leaf=is_observable)
+
+
+def refuse_slow_time(*functions: PyTree) -> None:
+    """**Raises** `TypeError` for a function with an argument τ in a place where it receives t."""
+    for leaf in jax.tree.leaves(functions, is_leaf=is_observable):
+        function = leaf
+        for name in ("reduction", "g", "function", "function"):  # of a reduction, of OfState
+            if not isinstance(function, InSlowTime):
+                function = getattr(function, name, function)
+        if not isinstance(function, InSlowTime) and {*argument_names(function)[:1]} & TAU:
+            raise TypeError(
+                f"the first argument of {signature_of(function)} is the time t, not τ = εt, in "
+                "integrate with slow_time=True. For τ observe systems.InSlowTime(f); elsewhere "
+                "compute ε t in f."
+            )
 
 
 def _of_step(leaf: Any) -> Any:
