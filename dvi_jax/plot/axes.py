@@ -144,7 +144,7 @@ class _FewLabels(LogFormatterSciNotation):
     """Labels of 2 and 5 alone between powers of ten; of at most three ticks on a shorter axis."""
 
     def set_locs(self, locs: Any = None) -> None:
-        low, high = sorted(self.axis.get_view_interval())
+        low, high = sorted(self.axis.get_view_interval())  # pyright: ignore[reportOptionalMemberAccess]
         x = np.ravel(locs)
         x = x[(low <= x) & (x <= high)]
         if high <= 2.5 * low:  # 1, 2 and 5 may be out of view
