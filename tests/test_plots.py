@@ -725,6 +725,19 @@ def test_work_precision_measures_slopes_before_round_off(runs, slope):
     same(axis.lines[0].get_data(), np.asarray(runs, float)[:, order])
 
 
+@pytest.mark.parametrize(("ratio", "count"), [(1.3, 3), (4, 2), (12, 3), (200, 3)])
+def test_labels_of_a_short_logarithmic_axis_do_not_touch(ratio, count):
+    _, ax = plt.subplots(figsize=(4, 3))
+    axis = plot.work_precision({"a": ([0.013, 0.013 * ratio], [0.1, 0.01])}, ax=ax)
+    axis.figure.draw_without_rendering()
+    left, right = axis.get_window_extent().intervalx
+    labels = [x for x in axis.get_xticklabels(which="both") if x.get_text()]
+    boxes = sorted((x.get_window_extent() for x in labels), key=lambda box: box.x0)
+    boxes = [box for box in boxes if left < 0.5 * (box.x0 + box.x1) < right]
+    assert len(boxes) == count
+    assert all(a.x1 + 4 < b.x0 for a, b in itertools.pairwise(boxes))
+
+
 def test_work_precision_finds_the_front_and_marks_runs_without_a_place():
     errors = {"two": COST**-2, "four": np.maximum(1e4 * COST**-4, 1e-14)}
     axis = plot.work_precision({name: (COST, e) for name, e in errors.items()})

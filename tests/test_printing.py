@@ -80,6 +80,7 @@ OBJECTS = {
     "model": lambda: dvi.Model(systems.kepler().system, h=0.1, q0=np.ones(2), p0=np.ones(2)),
     "tracked": lambda: rings.Tracked(np.ones((50, 6)), np.ones(50), np.ones(50), np.ones((50, 6))),
     "optics": lambda: rings.Optics(*(jnp.ones((30, 6)) for _ in range(12))),
+    "shell": lambda: dvi.starts.EnergyShell(9, lambda q, p: q @ q, 1.0, -np.ones(4), np.ones(4)),
     "map": lambda: rings.FrequencyMap(*(jnp.ones((9, 9, 2)) for _ in range(3))),
 }
 
@@ -97,6 +98,15 @@ def test_objects_print_in_eight_lines_and_as_a_table(name):
     assert html.startswith(("<table>", "<pre>"))
     assert "<D>" not in html
     assert name != "ring" or "&lt;D&gt;" in html
+
+
+@pytest.mark.parametrize("kind", [dvi.MaxDrift, dvi.Mean, dvi.Section, dvi.Stop])
+def test_what_records_an_observable_of_the_library_prints_its_name(kind):
+    energy = systems.magnetic_mirror().observables["energy"]
+    assert repr(energy) == "<energy of the state>"
+    assert repr(kind(energy)).startswith(f"{kind.__name__}(")
+    assert "<energy of the state>" in repr(kind(energy))
+    assert len(repr(kind(energy)).splitlines()) <= 8
 
 
 def test_a_long_report_is_cut_and_small_numbers_are_shown():

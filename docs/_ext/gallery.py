@@ -1,7 +1,7 @@
 """The gallery: a thumbnail for each notebook, example and plot function, made by the build.
 
-Thumbnails of plot functions are drawn by the examples of docs/examples.md, those of run files by
-`dvi-jax`; an example without a picture has a picture of its text. They are stored in
+Most thumbnails of plot functions are drawn by the examples of docs/examples.md, those of run files
+by `dvi-jax`; an example without a picture has a picture of its text. They are stored in
 docs/thumbnails, and drawn again if what they are made from has changed.
 
     python docs/_ext/gallery.py FOLDER NAME ...   (called by the build) draw plot functions
@@ -10,6 +10,7 @@ docs/thumbnails, and drawn again if what they are made from has changed.
 import ast
 import base64
 import hashlib
+import inspect
 import json
 import os
 import re
@@ -22,9 +23,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import matplotlib
+import numpy as np
 import usage
 from docutils import nodes
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageChops, ImageDraw, ImageFilter, ImageFont
 from sphinx.util.docutils import SphinxDirective
 
 DOCS = Path(__file__).parents[1]
@@ -70,6 +72,15 @@ EXAMPLES = {
     "alpha_losses.toml": ("alpha-particles", ""),
 }
 """Example → its page, and its picture: of docs/pictures, or of a command, or of its text."""
+
+PLOTS: dict[str, Any] = {
+    "plot.phase_portrait": "plot_phase_portrait.png", "plot.section": "plot_section.png",
+    "plot.balance": "plot_balance.png", "plot.drift_orders": "drift_orders.png",
+    "plot.tune_map": "ring_tunes.png", "plot.sweep_map": ("sweeps", 0),
+    "plot.slope_map": ("sweeps", 1), "plot.failure_map": ("sweeps", 2),
+}  # fmt: skip
+"""Plot function whose short example has too few points → a picture of docs/pictures, or a notebook
+and which of its pictures."""
 
 
 class Card(NamedTuple):
@@ -121,16 +132,29 @@ def cards(kind: str) -> list[Card]:
 
 
 def thumbnail(image: Image.Image) -> Image.Image:
-    """A picture on a white ground of the size of thumbnails, in few colours."""
+    """A picture on a white ground of the size of thumbnails, in few colours, its lines thick."""
     image = image.convert("RGBA")
     flat = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image).convert("RGB")
-    panels = round(flat.width / flat.height / 1.3)
-    if panels > 1:  # of several panels the first: they would be too small
-        flat = flat.crop((0, 0, flat.width // panels, flat.height))
-    flat.thumbnail(SIZE, Image.Resampling.LANCZOS)
+    flat = flat.crop((0, 0, _first_panel(flat), flat.height))
+    flat = flat.crop(ImageChops.invert(flat.convert("L")).getbbox())
+    # Lines are thick enough to have a pixel of the thumbnail.
+    width, height = SIZE[0] - 8, SIZE[1] - 8
+    shrinkage = max(flat.width / width, flat.height / height)
+    flat = flat.filter(ImageFilter.MinFilter(2 * round(shrinkage / 3) + 1))
+    flat.thumbnail((width, height), Image.Resampling.LANCZOS)
     ground = Image.new("RGB", SIZE, "white")
     ground.paste(flat, ((SIZE[0] - flat.width) // 2, (SIZE[1] - flat.height) // 2))
-    return ground.quantize(32, dither=Image.Dither.NONE)
+    return ground.quantize(64, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+
+
+def _first_panel(image: Image.Image) -> int:
+    """Where the first of several panels in a row ends, at white columns; or the whole width."""
+    if image.width < 1.7 * image.height:
+        return image.width
+    columns = np.asarray(image.convert("L")).min(axis=0) > 250
+    first, last = round(0.2 * image.width), round(0.8 * image.width)
+    gaps = np.flatnonzero(columns[first:last])
+    return first + int(gaps[0]) if gaps.size else image.width
 
 
 def _text_picture(path: Path) -> Image.Image:
@@ -142,16 +166,17 @@ def _text_picture(path: Path) -> Image.Image:
         body = [node for node in ast.parse(text).body if not isinstance(node, plain)]
         start = body[0].lineno - 1
     lines = [line for line in text.splitlines()[start:] if line.strip("# ")]
-    font = ImageFont.truetype(matplotlib.get_data_path() + "/fonts/ttf/DejaVuSansMono.ttf", 17)
-    image = Image.new("RGB", (480, 320), "white")
-    ImageDraw.Draw(image).multiline_text((16, 12), "\n".join(lines[:15]), "#333", font)
+    font = ImageFont.truetype(matplotlib.get_data_path() + "/fonts/ttf/DejaVuSansMono.ttf", 11)
+    image = Image.new("RGB", (SIZE[0] - 8, SIZE[1] - 8), "white")
+    ImageDraw.Draw(image).multiline_text((0, 0), "\n".join(lines[:10]), "#333", font)
     return image
 
 
-def _draw_notebook(name: str) -> Image.Image:
+def _draw_notebook(name: str, number: int | None = None) -> Image.Image:
     outputs = [o for cell in _notebook(name)["cells"] for o in cell.get("outputs", ())]
     pictures = [o["data"]["image/png"] for o in outputs if "image/png" in o.get("data", {})]
-    png = base64.b64decode(pictures[min(NOTEBOOKS.get(name, 0), len(pictures) - 1)])
+    number = NOTEBOOKS.get(name, 0) if number is None else number
+    png = base64.b64decode(pictures[min(number, len(pictures) - 1)])
     return Image.open(BytesIO(png))
 
 
@@ -178,17 +203,25 @@ def _draw_example(name: str) -> Image.Image:
         return Image.open(Path(folder) / "made" / file).copy()
 
 
+def _draw_plot(name: str) -> Image.Image:
+    source = PLOTS[name]
+    is_file = isinstance(source, str)
+    return Image.open(DOCS / "pictures" / source) if is_file else _draw_notebook(*source)
+
+
 def _key(kind: str, name: str) -> str:
     """A number that changes with what a thumbnail is made from."""
-    if kind == "plots":
-        page = usage.page()
-        content = page.markdown(name).encode()
+    if name in PLOTS:
+        content = _draw_plot(name).tobytes()
+    elif kind == "plots":
+        content = usage.page().markdown(name).encode()
     elif kind == "notebooks":
         content = (DOCS.parent / "notebooks" / f"{name}.ipynb").read_bytes()
     else:
         content = (DOCS.parent / "examples" / name).read_bytes() + repr(EXAMPLES[name]).encode()
         if (picture := DOCS / "pictures" / EXAMPLES[name][1]).is_file():
             content += picture.read_bytes()
+    content += inspect.getsource(thumbnail).encode()
     return hashlib.sha256(content).hexdigest()[:12]
 
 
@@ -199,19 +232,19 @@ def path_of(kind: str, name: str) -> Path:
 def make() -> None:
     """Draw the thumbnails that do not exist, and remove those of earlier states."""
     drawers: dict[str, Callable[[str], Image.Image]]
-    drawers = {"notebooks": _draw_notebook, "examples": _draw_example}
+    drawers = {"notebooks": _draw_notebook, "examples": _draw_example, "plots": _draw_plot}
     paths = {(kind, c.name): path_of(kind, c.name) for kind in KINDS for c in cards(kind)}
     folder = DOCS / "thumbnails"
     folder.mkdir(exist_ok=True)
     for stale in set(folder.glob("*.png")) - set(paths.values()):
         stale.unlink()
     missing = [key for key, path in paths.items() if not path.exists()]
-    functions = [name for kind, name in missing if kind == "plots"]
+    functions = [name for kind, name in missing if kind == "plots" and name not in PLOTS]
     with tempfile.TemporaryDirectory() as drawn:
         if functions:
             _call(__file__, drawn, *functions, folder=drawn)
         for kind, name in missing:
-            if kind == "plots":
+            if name in functions:
                 image = Image.open(Path(drawn) / f"{name}.png")
             else:
                 image = drawers[kind](name)

@@ -1,4 +1,4 @@
-"""Pictures of several panels slide on a phone, where they would be too small; all have a text."""
+"""Wide pictures slide on a phone, and a click shows them in full size; all have a text."""
 
 import struct
 from pathlib import Path
@@ -6,11 +6,10 @@ from typing import Any
 
 from docutils import nodes
 from sphinx.transforms.post_transforms import SphinxPostTransform
+from sphinx.util.osutil import relative_uri
 
-WIDE = 1.75
-"""Width over height from which a picture has several panels in a row."""
-LARGE = 9.0
-"""Inches of width from which it has, whatever its height."""
+WIDE, WIDER = 7.5, 11.0
+"""Inches of width from which a phone or a desk shows the text of a picture too small."""
 
 
 def size(path: Path) -> tuple[float, float] | None:
@@ -29,12 +28,16 @@ class Pictures(SphinxPostTransform):
     formats = ("html",)
 
     def run(self, **kwargs: Any) -> None:
-        for image in self.document.findall(nodes.image):
+        for image in list(self.document.findall(nodes.image)):
             found = size(Path(self.app.srcdir) / image["uri"])
-            if found and (found[0] > WIDE * found[1] or found[0] >= LARGE):
-                image["classes"].append("wide")
+            width = found[0] if found else 0.0
             if not image.get("alt"):
                 image["alt"] = f"Picture drawn by the cell above ({self._title(image)})"
+            if width >= WIDE:
+                image["classes"] += ["wide", "wider"][: 1 + (width >= WIDER)]
+                file = f"{self.app.builder.imagedir}/{self.env.images[image['uri']][1]}"
+                address = relative_uri(self.app.builder.get_target_uri(self.env.docname), file)
+                image.replace_self(nodes.reference("", "", image.deepcopy(), refuri=address))
 
     @staticmethod
     def _title(node: nodes.Node) -> str:

@@ -96,12 +96,15 @@ class Explorer:
         port = whole("port", port, 0) or _free_port()
         _check_port(port)
 
+        from bokeh.models import CustomJS
+
+        from .style import PAGE, REDRAW
+
         def application() -> Any:
             page = self._new_page()
             pn.state.onload(page.load)
+            pn.state.curdoc.js_on_event("document_ready", CustomJS(code=REDRAW))
             return page.view
-
-        from .style import PAGE
 
         pn.config.raw_css = [*pn.config.raw_css, PAGE]
         names = [f"{host}:{port}" for host in (ADDRESS, "localhost")]

@@ -37,6 +37,13 @@ body { margin: 0; background: var(--page); color: var(--ink); }
 """
 )
 
+REDRAW = """
+matchMedia('(prefers-color-scheme: dark)').addEventListener('change', () => {
+  for (const model of cb_obj.all_models) if (model.type === 'Figure') model.change.emit();
+});
+"""
+"""Script of the document: a figure is a canvas, which has its colours until it is drawn again."""
+
 ROOT = """
 :host { background: var(--page); color: var(--ink); box-sizing: border-box; gap: 14px;
   padding: 14px 18px 28px; max-width: 1500px; margin: 0 auto;

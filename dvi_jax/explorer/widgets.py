@@ -44,14 +44,14 @@ class Slider:
 
 
 def select(name: str, options: Any, value: Any) -> Any:
-    """A choice among options."""
-    return pn.widgets.Select(name=name, options=options, value=value, width=150,
+    """A choice among options; with two numbers it fills a row of a phone."""
+    return pn.widgets.Select(name=name, options=options, value=value, width=134,
                              stylesheets=[style.WIDGET], margin=(3, 4))  # fmt: skip
 
 
 def number(name: str, value: float) -> Any:
     """A field for a number."""
-    return pn.widgets.FloatInput(name=name, value=value, width=110, format=_FORMAT,
+    return pn.widgets.FloatInput(name=name, value=value, width=94, format=_FORMAT,
                                  stylesheets=[style.WIDGET], margin=(3, 4))  # fmt: skip
 
 

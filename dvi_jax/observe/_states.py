@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 from jaxtyping import PyTree
+from wadler_lindig import TextDoc
 
 from ..base.signature import accepts, argument_names, signature_of, takes_state, warn_of_exchanged
 from ..base.types import Bindable
@@ -31,6 +32,9 @@ class OfState(eqx.Module):
     def __call__(self, *arguments):
         t, q, p, args = (arguments[1], *arguments[4:]) if len(arguments) == 7 else arguments
         return self.function(t, q, p, args) if self.takes_time else self.function(q, p)
+
+    def __pdoc__(self, **_options: Any) -> TextDoc:  # what equinox prints, also in other modules
+        return TextDoc(f"<{self.__name__} of the state>")
 
     def bind(self, system: Any, epsilon: Any) -> "OfState":
         """The same observable, for a function that requires the system or ε."""

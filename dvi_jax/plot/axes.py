@@ -11,6 +11,7 @@ from matplotlib.cbook import normalize_kwargs
 from matplotlib.collections import QuadMesh
 from matplotlib.colors import ListedColormap, LogNorm, Normalize
 from matplotlib.lines import Line2D
+from matplotlib.ticker import LogFormatterSciNotation
 from matplotlib.transforms import ScaledTranslation
 
 from ..base.checks import instance
@@ -137,6 +138,30 @@ def legend(axis: Any, new: bool, extra: Iterable[Any] = (), artists: bool = True
     longest = max(len(str(h.get_label())) for h in handles)
     columns = int(np.clip(figure.get_figwidth() / 0.066 // (longest + 6), 1, len(handles)))
     return figure.legend(handles=handles, loc="outside lower center", ncols=columns)
+
+
+class _FewLabels(LogFormatterSciNotation):
+    """Labels of 2 and 5 alone between powers of ten; of at most three ticks on a shorter axis."""
+
+    def set_locs(self, locs: Any = None) -> None:
+        low, high = sorted(self.axis.get_view_interval())  # pyright: ignore[reportOptionalMemberAccess]
+        x = np.ravel(locs)
+        x = x[(low <= x) & (x <= high)]
+        if high <= 2.5 * low:  # 1, 2 and 5 may be out of view
+            self.shown = x[:: max(1, -(-len(x) // 3))]
+        else:
+            digits = np.round(x / 10.0 ** np.floor(np.log10(x) + 1e-9))
+            self.shown = x[np.isin(digits, (2, 5)) & (high < 20 * low)]
+
+    def __call__(self, x: float, pos: Any = None) -> str:
+        return super().__call__(x, pos) if np.isclose(x, self.shown, atol=0).any() else ""
+
+
+def log_x(*axes: Any) -> None:
+    """A logarithmic x axis, whose labels do not touch: 3×10⁻¹ and 4×10⁻¹ would."""
+    for axis in axes:
+        axis.set_xscale("log")
+        axis.xaxis.set_minor_formatter(_FewLabels())
 
 
 def counts_text(counts: dict[str, Any]) -> list[str]:

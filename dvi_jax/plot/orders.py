@@ -140,7 +140,8 @@ def drift_orders(
             draw.guide(axis, (x[first], x.max()), y[first], slope, zorder=1)
         outliers += draw.without_place(axis, np.append(x, left), np.append(y, order.floor), colour)
         total += len(y) + 1
-    axis.set(xscale="log", yscale="log", xlabel=_EPSILON, ylabel="largest drift", title=title)
+    draw.log_x(axis)
+    axis.set(yscale="log", xlabel=_EPSILON, ylabel="largest drift", title=title)
     marks: Any = {"color": "#444444", "ls": "none"}
     hollow = marks | {"marker": "o", "mfc": "white"}
     extra = [entry("expected slope", **draw.GUIDE)] if expected is not None else []
@@ -191,9 +192,10 @@ def drift_surface(
     (left, right), new = stack(ax, 2, purpose, (9.6, 4.2), ncols=2, width_ratios=ratios)
     edges = draw.cell_edges(surface.epsilons, log=True), draw.cell_edges(surface.hs, log=True)
     entries = _draw_drifts(left, surface, edges)
-    left.set(xscale="log", yscale="log", xlabel=_EPSILON, ylabel="step size h", title=title)
+    draw.log_x(left, right)
+    left.set(yscale="log", xlabel=_EPSILON, ylabel="step size h", title=title)
     _draw_orders_in_epsilon(right, surface, _one_of(expected, promised))
-    right.set(xscale="log", xlabel="step size h", ylabel="order in ε", title="Order in ε")
+    right.set(xlabel="step size h", ylabel="order in ε", title="Order in ε")
     right.set_xlim(*edges[1][[0, -1]])
     orders = right.get_legend_handles_labels()[0]
     legend(left, new, entries + (orders if new else []), artists=False)
@@ -289,7 +291,8 @@ def drift_bound(
     axis.plot(n[1:], line, color=COLOURS[1], ls="--", label=text)
     if bound.level is not None and bound.steps <= n[-1]:
         axis.axvline(bound.steps, **draw.GUIDE)
-    axis.set(xscale="log", yscale="log", xlabel="number of steps N", title=title)
+    draw.log_x(axis)
+    axis.set(yscale="log", xlabel="number of steps N", title=title)
     axis.set_ylabel(f"largest |I$_{{{invariant}}}$(N) − I$_{{{invariant}}}$(0)|")
     marks = {
         "changes are not finite": (~np.isfinite(changes)).sum(),
@@ -338,7 +341,8 @@ def work_precision(
         look = {"color": colour, "marker": marker, "ls": dash, "lw": 1.2}
         axis.loglog(costs[good], errors[good], label=label, **look)
         marks += draw.without_place(axis, costs, errors, colour)
-    axis.set(xscale="log", yscale="log", xlabel=cost, ylabel=error, title=title)
+    draw.log_x(axis)
+    axis.set(yscale="log", xlabel=cost, ylabel=error, title=title)
     extra, total = [], points.shape[1]
     # In the order of cost, a run is in front if its error is below those of all before it.
     finite = points[:, np.isfinite(points[1]) & (points[1] > 0)]

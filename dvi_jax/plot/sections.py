@@ -10,7 +10,7 @@ from matplotlib.colors import to_rgba_array
 
 from ..base.checks import whole
 from ..base.results import status_name
-from .axes import at_edge, canvas, check_shapes, counts_text, labels_of, legend
+from .axes import at_edge, canvas, check_shapes, counts_text, labels_of, legend, log_x
 from .states import component, looks_of
 from .style import COLOURS, GREY, SMALL, in_style, look_of
 
@@ -237,7 +237,7 @@ def bifurcation(
     axis, new = canvas(look.ax, (6.8, 4.4))
     axis.set(xlabel=name, ylabel=label, title=look.title)
     if log:
-        axis.set_xscale("log")
+        log_x(axis)
     black = np.tile((0.0, 0.0, 0.0, 1.0), (len(values), 1))
     notes = points.notes() + points.draw(axis, x, values, black, size, skip=skip)
     silent = ~np.isfinite(values).any(1)

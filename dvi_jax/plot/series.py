@@ -348,7 +348,9 @@ def indicator(
         counter["are not positive"] += counts.get("are exactly 0", 0) + counts.get("are below 0", 0)
         positive = (t > 0) & (v > 0) & np.isfinite(v)
         points += [(t[positive], v[positive])] if positive.any() else []
-    axis.set(xscale="log" if xlog else "linear", yscale="log" if ylog else "linear")
+    if xlog:
+        draw.log_x(axis)
+    axis.set_yscale("log" if ylog else "linear")
     if traits.level is not None:
         axis.axhline(traits.level, label=f"regular: {traits.level:g}", **draw.GUIDE)
     if traits.slope is not None and points:

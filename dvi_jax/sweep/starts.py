@@ -14,6 +14,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..base.checks import finite, positive, whole
+from ..base.printing import printable
 from ..base.signature import with_time
 from ..base.types import Args, Scalar
 from ..engine.bracket import bracketed_root
@@ -189,6 +190,7 @@ def _primes(count: int) -> list[int]:
     return primes
 
 
+@printable
 class EnergyShell(Seeded):
     r"""Random initial conditions on the surface H(t0, q, p, args) = energy.
 
