@@ -36,7 +36,9 @@ def decide(program: ScalarProgram, equation: Any, arrays: list[np.ndarray]) -> n
     if name in _AXES:
         axes, sign = equation.params["axes"], _EXTREMES[name[-3:]]
         columns = np.moveaxis(arrays[0], axes, range(len(axes))).reshape(-1, output.aval.size).T
-        results = [_place(x, sign) if "arg" in name else extreme(*x, sign) for x in columns]
+        results: list[Any] = [
+            _place(x, sign) if "arg" in name else extreme(*x, sign) for x in columns
+        ]
     else:
         rows = zip(*(np.broadcast_to(a, shape).ravel() for a in arrays), strict=True)
         results = [_result(program, name, dtype, row) for row in rows]
@@ -74,7 +76,7 @@ def _result(program: ScalarProgram, name: str, dtype: Any, x: Sequence[ProgramNu
     return _whole(program, name, x[0]) if name in _WHOLE else None
 
 
-def _place(x: Sequence[ProgramNumber], sign: float) -> int | None:
+def _place(x: Any, sign: float) -> int | None:
     """The place of the largest number, of the least one if `sign` is −1."""
     program = x[0].program
     samples = [sign * np.ravel(program.samples(y))[0] for y in x]
