@@ -513,7 +513,7 @@ FOLDED = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + jnp.sum(jnp.abs(q)))
         ({"function": lambda q, p, e: jnp.abs(q[0])}, NotAnalytic, "<lambda>: .* not allow: abs"),
         ({"system": KICKED}, ValueError, "depends on the time"),
         ({"system": PERIODIC}, ValueError, "depends on the time"),
-        ({"system": LATE}, NotAnalytic, "select_n"),
+        ({"system": LATE}, ValueError, "depends on the time"),
         ({"system": FOLDED}, NotAnalytic, "select_n"),
         ({"epsilon": (0.1, 0.1)}, ValueError, "with least < largest"),
         ({"ratio": 1.0}, ValueError, "larger than 1"),

@@ -66,6 +66,7 @@ FUNCTIONS = {
     "acosh": (jnp.arccosh, mp.acosh, ((1.0001, 2.0), (1.0, 1 + 1e-9), (2.0, 1e15))),
     "atanh": (jnp.arctanh, mp.atanh, ((-0.999, 0.999), (1e-300, 1e-3), (-1e-3, -1e-300))),
     "atan2": (lambda x: jnp.arctan2(x, 0.7 - x), lambda x: mp.atan2(x, mp.mpf(0.7) - x), NUMBERS),
+    "hypot": (lambda x: jnp.hypot(x, 0.7 - x), lambda x: mp.hypot(x, mp.mpf(0.7) - x), NUMBERS),
     "atan2 of a small number": (lambda x: jnp.arctan2(x, x * x), lambda x: mp.atan2(x, x * x),
                                 ((1e-12, 1e3), (-3.0, 3.0))),
 }  # fmt: skip
@@ -151,7 +152,15 @@ def test_an_error_is_at_most_its_claim(name, way):
     assert 0.01 < largest_share(name, way, 40) <= 1
 
 
-TIGHT = "sqrt", "inverse", "rsqrt", "a whole power", *(f"power {y}" for y in POWERS), *REWRITTEN
+TIGHT = (
+    "hypot",
+    "sqrt",
+    "inverse",
+    "rsqrt",
+    "a whole power",
+    *(f"power {y}" for y in POWERS),
+    *REWRITTEN,
+)
 """Cases with operations that are rounded to nearest, whose errors reach their bounds."""
 
 
@@ -171,6 +180,27 @@ def test_xla_has_the_functions_of_pairs_of_the_machine_code(name):
         with mpmath.workdps(60):
             error = worst(function, reference, drawn(low, high), by=jax.vmap)
         assert error < 5e-31
+
+
+def test_a_linear_system_is_solved_with_at_most_the_claimed_error():
+    """Its rows are exchanged, in machine code, as in the list."""
+    rows = [[0.1, 2.0, 0.3], [4.0, 0.2, -1.0], [0.3, 0.1, 1.0]]
+    function = lambda x: jnp.linalg.solve(jnp.asarray(rows) + x, jnp.arange(3.0) * x)[0]  # noqa: E731
+    x = arguments(((0.2, 0.9),), 200)
+    program = program_of(function, (), points=[x])
+    algebra, claim = exact.Rounding(exact.UNITS["float64"]), []
+    exact.ctx.prec = 160
+    for value in x:
+        start = [(exact.ball(Fraction(float(value))), arb(0))]
+        claim.append(exact.round_up(exact.run(program, start, algebra)[0][1]))
+    errors = []
+    with mpmath.workprec(200):
+        for v, y in zip(x, computed(function, x, "machine code"), strict=True):
+            matrix = mp.matrix(rows) + mp.matrix(3, 3).apply(lambda _, v=v: mp.mpf(float(v)))
+            right = mp.matrix([k * mp.mpf(float(v)) for k in range(3)])
+            errors.append(float(abs(mp.lu_solve(matrix, right)[0] - mp.mpf(float(y)))))
+    shares = np.array(errors) / claim
+    assert 0.01 < shares.max() <= 1
 
 
 # --- the controls --------------------------------------------------------------------------------

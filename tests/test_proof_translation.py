@@ -99,10 +99,52 @@ TRANSLATED = {
     "derivative of a changed array": jax.grad(lambda y: jnp.sum(y.at[1].add(2) ** 3)),
 }
 
+MATRIX_OF = lambda x: jnp.asarray([[2.0, 0.3], [-0.5, 1.5]]) + jnp.outer(x[:2], x[1:])  # noqa: E731
+UP = np.array([0.0, 1.0, 2.0])
+CONDITIONS = {  # which are the same for all states of the box, but not for those of a wider one
+    "abs": lambda x: jnp.abs(x) + jnp.abs(-x) * x,
+    "sign": lambda x: jnp.sign(-x) * x + jnp.heaviside(x, 0.5),
+    "where": lambda x: jnp.where(x > 0.2, x * x, jnp.sqrt(x - 0.6)),
+    "where of abs": lambda x: jnp.where(jnp.abs(x - 0.6) < 1, x, 0.0),
+    "cond": lambda x: jax.lax.cond(x[0] < 1, lambda y: y * y, lambda y: y, x),
+    "clip": lambda x: jnp.clip(x, 0.1, 0.95) * x + jnp.clip(x, 1.0, 2.0) ** 2,
+    "minimum, maximum": lambda x: jnp.minimum(x, 2 * x) + jnp.maximum(x, 0.1) + jnp.fmax(x, 0.2),
+    "floor, ceil, trunc": lambda x: (jnp.floor(x + 2) + jnp.ceil(-x) - jnp.trunc(x + 1)) * x,
+    "round": lambda x: jnp.round(x + 0.3, 0) * x,
+    "mod, fmod": lambda x: jnp.mod(-x, 1.0) * jnp.fmod(-x - 2, 1.2) + x // 0.95,
+    "integers": lambda x: x * (x + 1.05).astype(int) + x.astype(bool),
+    "computed index": lambda x: jnp.asarray(TABLE)[(x + 2.05).astype(int)] * x,
+    "interp": lambda x: jnp.interp(x, jnp.asarray([0.0, 0.25, 0.95, 2.0]), TABLE),
+    "softplus, logaddexp": lambda x: jax.nn.softplus(x) * jnp.logaddexp(x, -x - 0.5),
+    "relu, elu": lambda x: jax.nn.relu(x) + jax.nn.elu(-x) * jax.nn.leaky_relu(-x),
+    "softmax": lambda x: jax.nn.softmax(x + UP) - jax.nn.logsumexp(x + UP),
+    "sinc": jnp.sinc,
+    "norms": lambda x: jnp.linalg.norm(x, ord=4) * x + jnp.linalg.norm(x + UP, ord=jnp.inf),
+    "sort": lambda x: jnp.sort(x[::-1] + UP) * x + jnp.argsort(-x - UP),
+    "largest": lambda x: jnp.max(x + UP) * jnp.argmin(x + UP[::-1]) - jnp.min(x - UP),
+    "at min, max": lambda x: x.at[0].min(0.95).at[1].max(1.5).at[jnp.array([2])].max(0.1),
+    "while": lambda x: jax.lax.while_loop(lambda y: y[0] < 2, lambda y: y + 0.95, x),
+    "derivative": jax.grad(lambda x: jnp.sum(jnp.abs(x) ** 3) + jnp.hypot(x[0] + 1, x[1])),
+    "tile": lambda x: jnp.tile(x, 2)[1:4] * jnp.nan_to_num(x),
+    "solve": lambda x: (
+        jnp.linalg.solve(MATRIX_OF(x), x[:2]) + jnp.linalg.inv(MATRIX[:2, :2]) @ x[:2]
+    ),
+    "determinant": lambda x: jnp.linalg.det(3 * jnp.eye(4) + jnp.outer(UP[:1] + x[0], UP[1:2])) * x,
+    "Cholesky": lambda x: jnp.linalg.cholesky(jnp.diag(x) + 0.1) @ x,
+    "hypot": lambda x: jnp.hypot(x, x[::-1]) + jnp.hypot(x[0], 0.3),
+}
+ANYWHERE = (
+    "hypot",
+    "Cholesky",
+    "determinant",
+    "solve",
+    "tile",
+)  # the checker rejects singular states
+
 REFUSED = {
-    "staircase": (lambda x: x - x.astype(int), "int"),
+    "staircase": (lambda x: x - (3 * x).astype(int), "int"),
     "conversion to float32": (lambda x: x.astype(jnp.float32).astype(float) ** 3, "float32"),
-    "conversion to bool": (lambda x: x * x.astype(bool), "bool"),
+    "conversion to bool": (lambda x: x * (x - 0.5).astype(bool), "bool"),
     "product in float32": (
         lambda x: jax.lax.dot(x, x, preferred_element_type=jnp.float32) * x, "float32"),
     "reduced precision": (lambda x: jax.lax.reduce_precision(x, 8, 10), "reduce_precision"),
@@ -110,7 +152,7 @@ REFUSED = {
     "slice at a computed place": (
         lambda x: jax.lax.dynamic_slice(x, ((x[0] * 2).astype(int),), (1,)), "indices"),
     "update at a computed place": (
-        lambda x: jax.lax.dynamic_update_slice(x, x[:1] ** 2, (x[0].astype(int),)), "indices"),
+        lambda x: jax.lax.dynamic_update_slice(x, x[:1], ((x[0] * 2).astype(int),)), "indices"),
     "addition at a computed place": (lambda x: x.at[(x[0] * 2).astype(int)].add(1.0), "indices"),
     "largest": (lambda x: x * jnp.argmax(x), "int"),
     "index out of range": (
@@ -124,7 +166,7 @@ REFUSED = {
     "clip": (lambda x: jnp.clip(x, 0.4, 0.5), "max|min|clamp"),
     "sign": (lambda x: jnp.sign(x - 0.5), "sign"),
     "sorted": (lambda x: jnp.sort(x) * x, "sort"),
-    "interpolation": (lambda x: jnp.interp(x, jnp.arange(4.0), TABLE), "select_n|int|computed"),
+    "interpolation": (lambda x: jnp.interp(3 * x, jnp.arange(4.0), TABLE), "select_n|int|computed"),
     "loop without an end": (
         lambda x: jax.lax.while_loop(lambda n: n >= 0, lambda n: n * 0, 0) * x, "int64"),
     "loop until": (
@@ -143,11 +185,11 @@ def points():
     return random_points([BOX])
 
 
-@pytest.mark.parametrize("name", TRANSLATED)
+@pytest.mark.parametrize("name", [*TRANSLATED, *CONDITIONS])
 def test_the_list_is_the_function(name):
     """In long double, at random points, without the comparison of the package."""
-    function = TRANSLATED[name]
-    program = program_of(function, (3,))
+    function = (TRANSLATED | CONDITIONS)[name]
+    program = program_of(function, (3,), points=points() if name in CONDITIONS else None)
     (x,) = points()
     values = exact.run(program, list(x.T.astype(np.longdouble)), LONG_DOUBLE)
     values = np.stack([np.broadcast_to(v, len(x)) for v in values]).astype(float)
@@ -159,7 +201,89 @@ def test_the_list_is_the_function(name):
 def test_what_a_list_cannot_express_is_refused_by_name(name):
     function, word = REFUSED[name]
     with pytest.raises(NotAnalytic, match=word):
-        program_of(function, (3,))
+        program_of(function, (3,), points=points())
+
+
+@pytest.mark.parametrize("name", [name for name in CONDITIONS if name not in ANYWHERE])
+def test_a_condition_that_changes_in_the_domain_is_refused(name):
+    wide = random_points([(np.full(3, -2.2), np.full(3, 2.1))])
+    for seen in (wide, None):
+        with pytest.raises(NotAnalytic, match="does not allow"):
+            program_of(CONDITIONS[name], (3,), points=seen)
+
+
+def system_of(name):
+    """One step adds the function to p; the invariant has it, too."""
+    function = (TRANSLATED | CONDITIONS)[name]
+    system = dvi.System(
+        lambda t0, t1, q, p, args: (p @ p + q @ q) / 2,
+        force=lambda t0, t1, q, p, args: jnp.zeros(3) + jnp.sum(jnp.atleast_1d(function(q))),
+    )
+    return system, lambda q, p: p @ UP + jnp.sum(function(q)) * 0.3 + q @ p
+
+
+DOMAIN = np.stack([np.full(3, 0.35), np.full(3, 0.85)]), np.full(3, 0.02)
+
+
+def largest_change(name):
+    """By ascent from random states, of the step and the invariant computed by JAX."""
+    system, invariant = system_of(name)
+    rng = np.random.default_rng(0)
+    low, high = (np.stack([DOMAIN[0][k], (2 * k - 1) * DOMAIN[1]]) for k in (0, 1))
+
+    def change(x):
+        p1 = x[1] + 0.1 * (system.force(0.0, 0.1, x[0], x[1], None) - x[0])
+        return jnp.abs(invariant(x[0] + 0.1 * p1, p1) - invariant(*x))
+
+    change, x = jax.jit(jax.vmap(change)), rng.uniform(low, high, (4000, 2, 3))
+    for k in range(12):
+        best = x[np.argsort(change(x))[-200:]]
+        shift = 0.5**k * (high - low) * rng.normal(size=(20, 200, 2, 3))
+        x = np.clip(best + shift, low, high).reshape(4000, 2, 3)
+    return float(np.max(change(x)))
+
+
+def check_bound(name):
+    system, invariant = system_of(name)
+    how = {"h": 0.1, "epsilon": (1.0, 1.0 + 2**-40), "domain": DOMAIN, "ratio": 3.0}
+    bound = dvi.bound_drift(invariant, system, **how, max_boxes=300)
+    largest = largest_change(name)
+    assert 0 < largest <= bound.per_step[0] * (1 + 1e-12) <= 8 * largest
+    assert dvi.holds_for(system, bound, invariant)
+    return bound
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in CONDITIONS if name != "where of abs"])
+def test_a_bound_with_conditions_is_above_the_largest_change(name):
+    check_bound(name)
+
+
+def test_the_checker_proves_a_condition():
+    """In a wider domain, where |x − 0.6| < 1 does not hold, the same list is rejected."""
+    certificate = check_bound("where of abs").certificate
+    assert "a step changes I" in exact.check(certificate)
+    for side, value in ((0, -0.5), (1, 1.7)):
+        domain = [[*ends] for ends in certificate["domain"]]
+        domain[side][0] = value.hex()
+        other = certificate | {"domain": domain}
+        with pytest.raises(exact.Failure, match="sqrt is singular"):
+            exact.check(other | {"hash": exact.digest(other)})
+
+
+def test_a_condition_that_changes_between_the_points_is_not_proved():
+    """(q − 0.6)² < 1e-12 holds at none of the points."""
+    force = lambda t0, t1, q, p, args: jnp.where((q - 0.6) ** 2 < 1e-12, 5.0, q)  # noqa: E731
+    system = dvi.System(lambda t0, t1, q, p, args: p @ p / 2, force=force)
+    how = {"h": 0.1, "epsilon": 1.0, "domain": (np.array([[0.3], [0.8]]), np.array([0.1]))}
+    with pytest.raises(dvi.ProofError, match="a condition"):
+        dvi.bound_drift(lambda q, p: jnp.sum(p), system, **how, max_boxes=50)
+
+
+def test_linear_systems_are_refused_where_xla_solves_them():
+    solve = CONDITIONS["solve"]
+    with pytest.raises(NotAnalytic, match="triangular_solve"):
+        program_of(solve, (3,), way="XLA", points=points())
 
 
 # --- the comparison ------------------------------------------------------------------------------

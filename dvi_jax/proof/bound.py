@@ -210,11 +210,13 @@ def bound_drift(
         try:
             result = search.subdivide(checker, identities, estimates, ratio=ratio, **limits)
         except exact.Failure as error:
-            is_log = ": log is singular" in str(error)
-            hint = (
-                " Powers such as x**-0.3 and cbrt(x) contain log(x): x must be positive." * is_log
-            )
-            raise ProofError(f"{error}.{hint}") from None
+            hints = {
+                "log": " Powers such as x**-0.3 and cbrt(x) contain log(x): x must be positive.",
+                "sqrt": " It may be a condition: x > 1 is in the list as sqrt(x - 1), and must not "
+                "change in the domain.",
+            }
+            shown = (text for name, text in hints.items() if f": {name} is singular" in str(error))
+            raise ProofError(f"{error}.{next(shown, '')}") from None
         per_step = [exact.round_up(b) for b in result.bounds]
         certificate |= {
             "per_step": [b.hex() for b in per_step],

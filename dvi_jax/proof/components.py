@@ -6,11 +6,14 @@ reshapes, gathers) disappear; what remains are sums, products, quotients, intege
 elementary functions. Those of constants remain, too, where float64 would round the result.
 
 What the list cannot express is refused by name: a number of the state that is converted to another
-type, an index or a condition that is computed from the state, any other operation. The module
-`comparison` compares the list with the function afterwards.
+type, an index or a condition that differs between states (`conditions`), any other operation. The
+module `comparison` compares the list with the function afterwards.
 """
 
+import contextlib
+import functools
 import math
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -18,19 +21,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lanewise.jaxprs.jaxapi import ClosedJaxpr, Literal, scan_counts
+from lanewise.jaxprs.jaxapi import ClosedJaxpr, Literal, scan_counts, without_outputs
+from lanewise.llvm.ir import NotCompilable
+from lanewise.rules.written import EXPANSIONS
 
+from .conditions import CONDITIONS, decide, extreme
 from .scalars import UNARY, NotAnalytic as NotAnalytic, ProgramNumber, ScalarProgram, total
 from .ways import ARGUMENT_UNITS, MACHINE_CODE, RESULT_UNITS, XLA
 
 _MOVES = (
     "reshape", "broadcast_in_dim", "squeeze", "transpose", "slice", "rev", "concatenate", "gather",
     "dynamic_slice", "pad", "select_n", "dynamic_update_slice", "scatter", "split",
-    "stack", "unstack", "copy", "copy_p", "optimization_barrier", "stop_gradient",
+    "stack", "unstack", "tile", "copy", "copy_p", "optimization_barrier", "stop_gradient",
 )  # fmt: skip
 _SUMS = ("scatter-add", "cumsum", "reduce_window_sum")
 _INDICES = {
     "gather": (1,), "scatter": (1,), "scatter-add": (1,), "scatter-mul": (1,), "select_n": (0,),
+    "scatter-min": (1,), "scatter-max": (1,),
     "dynamic_slice": range(1, 99), "dynamic_update_slice": range(2, 99),
 }  # fmt: skip
 """Operands that say where numbers go, and are not such numbers themselves."""
@@ -42,11 +49,15 @@ _MOST_ROUNDS = 1000
 
 
 def program_of(
-    function: Callable, *shapes: tuple[int, ...], way: str = MACHINE_CODE
+    function: Callable,
+    *shapes: tuple[int, ...],
+    way: str = MACHINE_CODE,
+    points: Sequence[np.ndarray] | None = None,
 ) -> dict[str, Any]:
     """The list of operations of a function of arrays of float64 with these shapes.
 
-    `way`: the way of running whose rounding the list describes.
+    `way`: the way of running whose rounding the list describes. `points`: for each argument an
+    array of its values at points of the domain, at which conditions are decided.
 
     Returns ``{"operations": [[name, *operands], ...], "outputs": [...]}``: an operand is the number
     of an earlier operation; inputs and outputs are in the order of the raveled arrays.
@@ -55,7 +66,10 @@ def program_of(
     """
     structs = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes]
     closed_jaxpr = jax.make_jaxpr(function)(*structs)
-    program, inputs, offset = ScalarProgram(way), [], 0
+    # Conditions of what no output needs, such as a status, are not decided.
+    closed_jaxpr = without_outputs(closed_jaxpr, [True] * len(closed_jaxpr.out_avals))
+    rows = None if points is None else np.hstack([np.reshape(x, (len(x), -1)) for x in points])
+    program, inputs, offset = ScalarProgram(way, rows), [], 0
     for shape in shapes:
         size = int(np.prod(shape))
         numbers = [program.write("input", offset + i) for i in range(size)]
@@ -109,11 +123,18 @@ def _apply(program: ScalarProgram, equation: Any, values: list) -> list:
     name, params = equation.primitive.name, equation.params
     inner = params.get("jaxpr") or params.get("call_jaxpr") or params.get("fun_jaxpr")
     if inner is not None and (name in _CALLS or "call" in name or "jit" in name):
+        if params.get("name") == "hypot" and _is_hypot(equation, inner):
+            return [_hypot(program, equation, values)]
         if isinstance(inner, ClosedJaxpr):
             return _evaluate(program, inner.jaxpr, inner.consts, values)
         return _evaluate(program, inner, [], values)
     if name == "scan":
         return _scan(program, params, values)
+    if name == "custom_linear_solve":  # what it solves with
+        lengths, body = params["const_lengths"], params["jaxprs"].solve
+        first = lengths.matvec + lengths.vecmat
+        consts = values[first : first + lengths.solve]
+        return _evaluate(program, body.jaxpr, body.consts, [*consts, *values[sum(lengths) :]])
     if name == "while" and (carry := _while(program, params, values)) is not None:
         return carry
     values = [_concrete(v) for v in values]
@@ -127,6 +148,20 @@ def _apply(program: ScalarProgram, equation: Any, values: list) -> list:
     if is_constant and name != "while" and (name in _EXACT or not is_inexact):
         out = equation.primitive.bind(*map(jnp.asarray, values), **params)
         return list(out) if equation.primitive.multiple_results else [out]
+    if name in CONDITIONS and not is_constant:
+        result = decide(program, equation, [_symbolic(program, v) for v in values])
+        if result is not None:
+            return [result]
+    # XLA solves linear systems by other programs, and pairs by corrections: a sort has no rounding.
+    if name in EXPANSIONS and (program.way == MACHINE_CODE or not is_inexact or name == "sort"):
+        with contextlib.suppress(NotCompilable):
+            body = jax.make_jaxpr(functools.partial(EXPANSIONS[name], **params))(
+                *(v.aval for v in equation.invars)
+            )
+            results = _evaluate(program, body.jaxpr, body.consts, values)
+            numbers = [x for result in results if _is_symbolic(result) for x in result.ravel()]
+            if not any(program.operations[x.index][0] == "unknown" for x in numbers):
+                return results
     obstacle = _obstacle(equation, values)
     if not obstacle and name in _MOVES:
         return _rearrange(program, equation, values)
@@ -143,6 +178,25 @@ def _apply(program: ScalarProgram, equation: Any, values: list) -> list:
         shapes = [v.aval.shape for v in equation.outvars]
         return [_array([placeholder] * int(np.prod(shape)), shape) for shape in shapes]
     return [array]
+
+
+def _is_hypot(equation: Any, inner: Any) -> bool:
+    """Whether an inner function is `jnp.hypot`, and not a derivative of it or another function."""
+    structs = [
+        jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype, weak_type=v.aval.weak_type)
+        for v in equation.invars
+    ]
+    return len(structs) == 2 and str(inner) == str(
+        jax.make_jaxpr(jnp.hypot)(*structs).eqns[0].params["jaxpr"]
+    )
+
+
+def _hypot(program: ScalarProgram, equation: Any, values: list) -> np.ndarray:
+    """√(x² + y²), which is computed as a√(1 + (b/a)²) with a ≥ b and at most 2 units more."""
+    arrays = np.broadcast_arrays(*(_symbolic(program, v) for v in values))
+    pairs = zip(*(x.ravel() for x in arrays), strict=True)
+    roots = [(x.power(2) + y.power(2)).apply("sqrt").inexact(2) for x, y in pairs]
+    return _array(roots, equation.outvars[0].aval.shape)
 
 
 def _inexact(program: ScalarProgram, scalars: Any, units: int | None) -> Any:
@@ -198,8 +252,8 @@ def _arithmetic(
         return np.moveaxis(np.cumprod(columns, axis=0)[flips], 0, params["axis"])
     if name == "conv_general_dilated":
         return _convolution(program, equation, *arrays)
-    if name == "scatter-mul":
-        return _products(equation, arrays, values)
+    if name in _AT_PLACES:
+        return _at_places(equation, arrays, values)
     return None
 
 
@@ -331,16 +385,25 @@ def _convolution(
     return _array([total(x) for x in terms], equation.outvars[0].aval.shape)
 
 
-def _products(equation: Any, arrays: list, values: list) -> np.ndarray:
-    """Each number of an array times those that a scatter moves to its place."""
+_AT_PLACES: dict[str, tuple[float, Callable]] = {
+    "scatter-mul": (2.0, operator.mul),
+    "scatter-min": (0.0, lambda x, y: extreme(x, y, -1.0)),
+    "scatter-max": (2.0, lambda x, y: extreme(x, y, 1.0)),
+}
+"""Scatters: a number that changes 1, and what is done to a number and another one."""
+
+
+def _at_places(equation: Any, arrays: list, values: list) -> np.ndarray | None:
+    """Each number of an array combined with those that a scatter moves to its place."""
+    number, combine = _AT_PLACES[equation.primitive.name]
     out, ones = arrays[0].copy(), [np.ones(np.shape(v)) for v in values]
     for place in np.ndindex(arrays[2].shape):
         factors = ones[2].copy()
-        factors[place] = 2.0
+        factors[place] = number
         operands = map(jnp.asarray, (ones[0], values[1], factors))
-        target = np.asarray(equation.primitive.bind(*operands, **equation.params)) == 2.0
-        out[target] = [x * arrays[2][place] for x in out[target]]
-    return out
+        target = np.asarray(equation.primitive.bind(*operands, **equation.params)) == number
+        out[target] = [combine(x, arrays[2][place]) for x in out[target]]
+    return None if any(x is None for x in out.ravel()) else out
 
 
 def _while(program: ScalarProgram, params: Any, values: list) -> list | None:

@@ -71,11 +71,11 @@ def programs_of(
     `way`: how the step is run. In pairs XLA has the same functions as the machine code.
     """
     quantum = getattr(integrator.arithmetic, "quantum", 0.0)
-    step_of_states, step, is_implicit = _step_of(system, integrator, args, region)
+    step_of_states, step, is_implicit = _step_of(system, integrator, args, region, points)
     step_points = points[: 6 if quantum else 5]
     is_paired = isinstance(integrator.arithmetic, DoubleDouble)
     inside = inside or (lambda q, p: jnp.zeros(0))
-    way_of_functions = MACHINE_CODE if is_paired else way
+    way_of_functions = "pairs" if is_paired else way
     return step_of_states, {
         "step": _program("the step of the system", step, step_points, None, way_of_functions),
         "invariants": [_program(f"the invariant {n}", f, points[:5], 0) for f, n in functions],
@@ -124,7 +124,7 @@ class _WithErrors(Equations):
 
 
 def _step_of(
-    system: System, integrator: Integrator, args: Any, region: Region
+    system: System, integrator: Integrator, args: Any, region: Region, points: list[np.ndarray]
 ) -> tuple[Callable, Callable, bool]:
     """The step of many states; that of one as a function of (q, p, t, ε, h[, error]), which is that
     at t = 0 if the region has no times; and whether p is p1, because the step is implicit."""
@@ -154,7 +154,7 @@ def _step_of(
         # From the operations, since a force may begin late, or be the same at all times of a test.
         numbers = (), (), ()  # t, ε, h
         try:
-            program = program_of(step_map, shape, shape, *numbers)
+            program = program_of(step_map, shape, shape, *numbers, points=points[:5])
         except NotAnalytic as error:
             raise NotAnalytic(f"the step of the system: {error}") from None
         _require_time(not depends_on_input(program, 2 * int(np.prod(shape))), "the map")
@@ -192,7 +192,8 @@ def depends_on_input(program: dict[str, Any], place: int) -> bool:
                     slope = known[0] if known else None
         slopes.append(slope)
         factors.append(factor)
-    return any(slopes[i] != 0 for i in program["outputs"])
+    # Only the list of a condition has a number that may depend on it, but no output that does.
+    return None in slopes or any(slopes[i] != 0 for i in program["outputs"])
 
 
 def functions_of(invariants: Any, system: System, with_time: bool) -> list[tuple[Callable, str]]:
@@ -258,7 +259,7 @@ def _program(
         description = f"shape {result.shape}" if hasattr(result, "shape") else kind
         raise ValueError(f"{subject} must return one number, got {description}.")
     try:
-        program = program_of(function, *shapes, way=way)
+        program = program_of(function, *shapes, way=way, points=points)
     except NotAnalytic as error:
         raise NotAnalytic(f"{subject}: {error}") from None
     compare(subject, function, program, points)

@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 from fractions import Fraction
 from typing import Any
 
+import numpy as np
+
 from .ways import MACHINE_CODE, XLA, exponentials_in_products
 
 UNARY = ("exp", "log", "sin", "cos", "tan", "atan", "asin", "acos", "sqrt")
@@ -20,13 +22,18 @@ class ScalarProgram:
     """Operations (name, operands), written one by one; equal ones are written once.
 
     `way`: `MACHINE_CODE` or `XLA`, the way of running whose rounding the list describes.
+    `points`: rows of inputs, at which conditions are decided; None: these are not in the list.
     """
 
-    def __init__(self, way: str = MACHINE_CODE):
-        self.way = way
+    def __init__(self, way: str = MACHINE_CODE, points: np.ndarray | None = None):
+        self.way, self.points = way, points
         self.operations: list[list[Any]] = []
         self._numbers: dict[tuple, int] = {}
         self.constants: dict[int, float] = {}
+        self.infinite: dict[int, float] = {}  # or NaN
+        self._samples: list[Any] = []
+        self._magnitudes: dict[int, ProgramNumber] = {}  # absolute values that are not decided
+        self.guards: list[int] = []  # what must have a value, next to the outputs
 
     def write(self, name: str, *operands: Any) -> "ProgramNumber":
         key = (name, *operands)
@@ -37,15 +44,64 @@ class ScalarProgram:
 
     def constant(self, value: float) -> "ProgramNumber":
         if not math.isfinite(value):
-            return self.write("unknown", f"the constant {float(value)}")
+            unknown = self.write("unknown", f"the constant {float(value)}")
+            self.infinite[unknown.index] = float(value)
+            return unknown
         scalar = self.write("constant", float(value).hex())
         self.constants[scalar.index] = float(value)
         return scalar
 
+    def samples(self, x: "ProgramNumber") -> Any:
+        """The values of a number at the points, in float64."""
+        with np.errstate(all="ignore"):
+            for i in range(len(self._samples), x.index + 1):
+                self._samples.append(self._sample(i, *self.operations[i]))
+        return self._samples[x.index]
+
+    def _sample(self, i: int, name: str, *operands: Any) -> Any:
+        if name == "input":
+            return np.nan if self.points is None else self.points[:, operands[0]]
+        if name in ("constant", "unknown"):
+            return self.constants.get(i, self.infinite.get(i, np.nan))
+        values = [self._samples[k] for k in _operands([name, *operands])]
+        if name in ("sum", "multiply"):
+            return sum(values) if name == "sum" else values[0] * values[1]
+        if name in ("inverse", "inexact"):
+            return 1 / values[0] if name == "inverse" else values[0]
+        return getattr(np, f"arc{name[1:]}" if name[0] == "a" else name)(values[0])
+
+    def sign(self, x: "ProgramNumber") -> float | None:
+        """The sign of a number, if it is the same at all points: then √(sign x) is a guard."""
+        if x.value is not None:
+            return float(np.sign(x.value))
+        for sign in (1.0, -1.0):
+            if self.points is not None and np.all(sign * self.samples(x) > 0):
+                self.guards.append((x * sign).apply("sqrt").index)
+                return sign
+        return None
+
+    def magnitude(self, x: "ProgramNumber") -> "ProgramNumber":
+        """|x| of an x with both signs: not in a list, but may be known to be below a number."""
+        unknown = self.write("unknown", "abs", x.index)
+        self._magnitudes[unknown.index] = x
+        return unknown
+
+    def order(self, a: "ProgramNumber", b: "ProgramNumber") -> float | None:
+        """The sign of a − b, if it is the same at all points; a or b may be an infinite constant or
+        NaN, or both the same number."""
+        for x, y, sign in ((a, b, 1.0), (b, a, -1.0)):
+            limit = 0.0 if a.index == b.index else sign * self.infinite.get(x.index, 0.0)
+            if (limit or a.index == b.index) and np.all(np.isfinite(self.samples(y))):
+                self.guards.append(y.index)
+                return limit
+            if (u := self._magnitudes.get(x.index)) is not None:
+                return -sign if self.sign(y - u) == self.sign(y + u) == 1.0 else None
+        return self.sign(a - b)
+
     def as_json(self, outputs: Sequence["ProgramNumber"]) -> dict[str, Any]:
-        """With the operations that the outputs need only."""
+        """With the operations that the outputs and guards need only."""
         indices = set()
-        stack = [out.index for out in outputs]
+        stack = [*(out.index for out in outputs), *self.guards]
         while stack:
             i = stack.pop()
             if i not in indices:
