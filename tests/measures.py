@@ -39,8 +39,8 @@ LONGEST_FILE, MOST_PARAMETERS = 450, 9
 
 LIMITS: dict[str, float] = {
     "lines of the core": 14_030,
-    "lines of the questions": 21_660,
-    "lines of the leaves": 19_830,
+    "lines of the questions": 21_890,
+    "lines of the leaves": 19_870,
     "lines of lanewise": 7_560,
     "lines of the command line": 5_580,
     "raise statements": 645,
