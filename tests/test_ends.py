@@ -228,3 +228,32 @@ def test_divisions_of_numbers_that_do_not_change(name):
     results = (batch(STARTS, jnp.array([1.0, 1.1, 1.2]), form) for form in ("auto", "arrays"))
     for a, b in zip(*map(jax.tree.leaves, results), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "adjoint", [dvi.Direct(), *(pytest.param(x, marks=pytest.mark.slow) for x in (
+        dvi.Checkpointed(), dvi.Reversible()))],
+)  # fmt: skip
+def test_a_reduction_of_an_invalid_start_has_no_derivative(adjoint):
+    """Reductions of the state begin with the initial one, which may be NaN or infinite."""
+    system = dvi.System(lambda t0, t1, q, p, k: p @ p / 2 + k * q @ q / 2)
+    q = jnp.array([[0.5], [np.nan], [0.5]])
+    p = jnp.array([[0.3], [0.3], [np.inf]])
+
+    @jax.jit
+    @jax.grad
+    def gradient(z):
+        def one(q, p):
+            energy = dvi.Mean(lambda t, q, p, k: p @ p / 2 + k * q @ q)
+            sol = dvi.integrate(system, q, p, args=z[2], h=0.1, num_steps=2, observe=energy,
+                                save=dvi.Save(final=True), adjoint=adjoint, throw=False)  # fmt: skip
+            return jnp.where(sol.result == dvi.RESULTS.successful, sol.observed, 0.0)
+
+        return jnp.sum(jax.vmap(one)(z[0], z[1]))
+
+    of_q, of_p, of_k = gradient((q, p, 2.0))
+    assert np.isfinite(of_k)
+    assert of_k > 0.1
+    for slope in (of_q, of_p):
+        np.testing.assert_array_equal(slope[1:], 0)
+        assert abs(slope[0, 0]) > 0.1

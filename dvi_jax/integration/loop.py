@@ -47,7 +47,7 @@ def start(task: Task, q0: State, p0: State) -> Carry:
             memory = reduction.start(jnp.zeros(like.shape, like.dtype))
             if not has_initial_value(reduction.function):
                 return memory
-            value = task.number(reduction, ends)
+            value = _value(task, ~is_failure, reduction, ends)
             return reduction.update(memory, jnp.asarray(0, jnp.int32), interval.t0, value)
 
         return task.evaluate(reduction, initial_memory, at_start)
@@ -209,13 +209,17 @@ def _memories(
             return reduction.update(memory, k, ends.t1, vectors)
 
         def with_value(ends, memory):
-            value_of = task.constant_unless(good, lambda *ends: task.number(reduction, Ends(*ends)))
-            value = value_of(*ends)
+            value = _value(task, good, reduction, ends)
             return reduction.update(memory, k, ends.t1, value)
 
         return task.evaluate(reduction, with_value, Ends(*ends[:2], *start, *end), memory)
 
     return [update(*pair) for pair in zip(reductions, carry.reductions, strict=True)]
+
+
+def _value(task: Task, good: Array, reduction: Reduction, ends: Ends) -> Array:
+    """The value of an observable, a constant where the state is not `good`."""
+    return task.constant_unless(good, lambda *ends: task.number(reduction, Ends(*ends)))(*ends)
 
 
 def number_of(reduction: Reduction, k: Int[Array, ""]) -> Int[Array, ""]:
