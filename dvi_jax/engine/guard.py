@@ -4,6 +4,7 @@ After its end a trajectory is NaN, and so are the derivatives there. A loss that
 has the cotangent zero, and zero times NaN would be NaN.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -54,6 +55,12 @@ def constant_unless(
         return outs, push(*map(guarded, changes))
 
     return result_of(value(*inputs))
+
+
+def all_finite(values: Any) -> Bool[Array, ""]:
+    """Whether all arrays of a tree are finite."""
+    leaves = jax.tree.leaves(values)
+    return functools.reduce(jnp.logical_and, [jnp.all(jnp.isfinite(x)) for x in leaves])
 
 
 def nan_if_used(values: Any, inputs: Any) -> Any:

@@ -14,6 +14,7 @@ import lanewise
 
 from ..base.results import RESULTS, first_failure
 from ..base.types import Interval, Scalar, State
+from ..engine.guard import all_finite
 from ..engine.newton import no_residual, worse
 from ..engine.pairs import rounded
 from ..lattices import Place, Uniform
@@ -47,7 +48,9 @@ def start(task: Task, q0: State, p0: State) -> Carry:
             memory = reduction.start(jnp.zeros(like.shape, like.dtype))
             if not has_initial_value(reduction.function):
                 return memory
-            value = _value(task, ~is_failure, reduction, ends)
+            # NaN parameters, by which the first step will fail, make it NaN at a valid state.
+            good = ~is_failure & all_finite(task.number(reduction, ends))
+            value = _value(task, good, reduction, ends)
             return reduction.update(memory, jnp.asarray(0, jnp.int32), interval.t0, value)
 
         return task.evaluate(reduction, initial_memory, at_start)
