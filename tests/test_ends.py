@@ -265,3 +265,24 @@ def test_observables_of_an_invalid_start_have_no_derivative(adjoint):
     for slope in own:
         np.testing.assert_array_equal(slope[1:], 0)
         assert abs(jnp.ravel(slope)[0]) > 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("adjoint", ADJOINTS, ids=lambda a: type(a).__name__)
+def test_an_observable_that_is_nan_at_a_valid_state_has_no_derivative(adjoint):
+    """The explicit step leaves the domain of H; the next one fails, and the loss omits the run."""
+
+    def energy(t, q, p, k):
+        return p @ p / 2 + k * jnp.sum(jnp.sqrt(q))
+
+    def loss(k):
+        observe = dvi.MaxDrift(energy), energy
+        sol = of_batch(HALF, k, adjoint, 30, save=dvi.Save(every=3), observe=observe)
+        good = sol.result == dvi.RESULTS.successful
+        total = sol.observed[0] + jnp.sum(sol.observed[1], axis=1)
+        return jnp.sum(jnp.where(good, total, 0.0)), good
+
+    slope, good = jax.jit(jax.grad(loss, has_aux=True))(1.0)
+    assert list(good) == [True, False, True]
+    values = [jax.jit(loss)(k)[0] for k in (1 + 1e-5, 1 - 1e-5)]
+    np.testing.assert_allclose(slope, (values[0] - values[1]) / 2e-5, rtol=1e-7)

@@ -48,9 +48,7 @@ def start(task: Task, q0: State, p0: State) -> Carry:
             memory = reduction.start(jnp.zeros(like.shape, like.dtype))
             if not has_initial_value(reduction.function):
                 return memory
-            # NaN parameters, by which the first step will fail, make it NaN at a valid state.
-            good = ~is_failure & all_finite(task.number(reduction, ends))
-            value = _value(task, good, reduction, ends)
+            value = _value(task, ~is_failure, reduction, ends)
             return reduction.update(memory, jnp.asarray(0, jnp.int32), interval.t0, value)
 
         return task.evaluate(reduction, initial_memory, at_start)
@@ -221,8 +219,12 @@ def _memories(
 
 
 def _value(task: Task, good: Array, reduction: Reduction, ends: Ends) -> Array:
-    """The value of an observable, a constant where the state is not `good`."""
-    return task.constant_unless(good, lambda *ends: task.number(reduction, Ends(*ends)))(*ends)
+    """The value of an observable, a constant where it is not finite or the state is not `good`."""
+
+    def value(*ends):
+        return task.number(reduction, Ends(*ends))
+
+    return task.constant_unless(good & all_finite(value(*ends)), value)(*ends)
 
 
 def number_of(reduction: Reduction, k: Int[Array, ""]) -> Int[Array, ""]:
