@@ -4,7 +4,6 @@ After its end a trajectory is NaN, and so are the derivatives there. A loss that
 has the cotangent zero, and zero times NaN would be NaN.
 """
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -59,8 +58,8 @@ def constant_unless(
 
 def all_finite(values: Any) -> Bool[Array, ""]:
     """Whether all arrays of a tree are finite."""
-    leaves = jax.tree.leaves(values)
-    return functools.reduce(jnp.logical_and, [jnp.all(jnp.isfinite(x)) for x in leaves])
+    finite = jax.tree.map(lambda x: jnp.all(jnp.isfinite(x)), values)
+    return jax.tree.reduce(jnp.logical_and, finite)
 
 
 def nan_if_used(values: Any, inputs: Any) -> Any:

@@ -220,11 +220,8 @@ def _memories(
 
 def _value(task: Task, good: Array, reduction: Reduction, ends: Ends) -> Array:
     """The value of an observable, a constant where it is not finite or the state is not `good`."""
-
-    def value(*ends):
-        return task.number(reduction, Ends(*ends))
-
-    return task.constant_unless(good & all_finite(value(*ends)), value)(*ends)
+    value = functools.partial(task.number, reduction)
+    return task.constant_unless(good & all_finite(value(ends)), value)(ends)
 
 
 def number_of(reduction: Reduction, k: Int[Array, ""]) -> Int[Array, ""]:
