@@ -1,5 +1,7 @@
 """Runs that end early, and evaluations between the steps: gradients and statuses."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -228,3 +230,59 @@ def test_divisions_of_numbers_that_do_not_change(name):
     results = (batch(STARTS, jnp.array([1.0, 1.1, 1.2]), form) for form in ("auto", "arrays"))
     for a, b in zip(*map(jax.tree.leaves, results), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "adjoint", [dvi.Direct(), *(pytest.param(x, marks=pytest.mark.slow) for x in (
+        dvi.Checkpointed(), dvi.Reversible()))],
+)  # fmt: skip
+def test_observables_of_an_invalid_start_have_no_derivative(adjoint):
+    """Those of the state begin at the initial one. It, or a parameter, may be NaN or infinite."""
+    system = dvi.System(lambda t0, t1, q, p, a: a["m"] * p @ p / 2 + a["k"] * q @ q / 2)
+    q = jnp.array([[0.5], [np.nan], [0.5], [0.5]])
+    p = jnp.array([[0.3], [0.3], [np.inf], [0.3]])
+    m = jnp.array([1.0, 1.0, 1.0, np.nan])
+
+    def energy(t, q, p, a):
+        return a["m"] * p @ p / 2 + a["k"] * q @ q
+
+    @jax.jit
+    @functools.partial(jax.grad, argnums=(0, 1))
+    def gradient(z, k):
+        def one(q, p, m):
+            sol = dvi.integrate(
+                system, q, p, args={"k": k, "m": m}, h=0.1, num_steps=2, adjoint=adjoint,
+                observe=(dvi.Mean(energy), energy), save=dvi.Save(final=True), throw=False,
+            )  # fmt: skip
+            mean, values = sol.observed
+            ok = sol.result == dvi.RESULTS.successful
+            return jnp.where(ok, mean + jnp.sum(values), 0.0)
+
+        return jnp.sum(jax.vmap(one)(*z))
+
+    own, of_k = gradient((q, p, m), 2.0)
+    assert of_k > 0.1
+    for slope in own:
+        np.testing.assert_array_equal(slope[1:], 0)
+        assert abs(jnp.ravel(slope)[0]) > 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("adjoint", ADJOINTS, ids=lambda a: type(a).__name__)
+def test_an_observable_that_is_nan_at_a_valid_state_has_no_derivative(adjoint):
+    """The explicit step leaves the domain of H; the next one fails, and the loss omits the run."""
+
+    def energy(t, q, p, k):
+        return p @ p / 2 + k * jnp.sum(jnp.sqrt(q))
+
+    def loss(k):
+        observe = dvi.MaxDrift(energy), energy
+        sol = of_batch(HALF, k, adjoint, 30, save=dvi.Save(every=3), observe=observe)
+        good = sol.result == dvi.RESULTS.successful
+        total = sol.observed[0] + jnp.sum(sol.observed[1], axis=1)
+        return jnp.sum(jnp.where(good, total, 0.0)), good
+
+    slope, good = jax.jit(jax.grad(loss, has_aux=True))(1.0)
+    assert list(good) == [True, False, True]
+    values = [jax.jit(loss)(k)[0] for k in (1 + 1e-5, 1 - 1e-5)]
+    np.testing.assert_allclose(slope, (values[0] - values[1]) / 2e-5, rtol=1e-7)

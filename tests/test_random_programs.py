@@ -65,7 +65,7 @@ structure = functools.cache(kind_checks.structure)
     "number", [5, *(pytest.param(n, marks=pytest.mark.slow) for n in range(24) if n != 5)]
 )
 def test_random_structures_agree_with_plain_loops(number):
-    """Stops, splittings, noise, constraints, pairs, rings: see `kinds`."""
+    """Stops, splittings, noise, constraints, pairs, rings, the library: see `kinds`, `library`."""
     compiled, is_quick = structure(number), number == 5
     if not is_quick:
         compiled.check_empty()

@@ -10,7 +10,7 @@ import dvi_jax as dvi
 import lanewise
 from dvi_jax.engine.guard import constant_unless, nan_if_used
 from dvi_jax.engine.in_pairs import in_pairs
-from dvi_jax.fit.optimise import _scalar_function
+from dvi_jax.fit.optimise import _residual, _scalar_function
 from dvi_jax.fit.posterior import _finite_potential
 from dvi_jax.methods.step import to_grid
 from dvi_jax.systems.boozer import _sums
@@ -58,6 +58,15 @@ def scaled_loss(x):
     return _scalar_function(Core(), 2.0)(x[None], setting)[0]
 
 
+SLOPES = jnp.array([[1.0], [-0.7]])
+
+
+def residuals(x):
+    """A linear residual vector whose value and Jacobian are inputs, as in a step of a fit."""
+    linearisation = lax.stop_gradient((SLOPES @ x[None], SLOPES))
+    return jnp.sum(jnp.sin(_residual(x[None], linearisation)) * jnp.array([1.0, 2.0]))
+
+
 MODES = jnp.asarray(np.random.default_rng(0).normal(size=(1, 3, 3, 2)))
 SHAPE = _sums.Shape(periods=2, helicity=0)
 
@@ -85,6 +94,7 @@ RULES = {
     "legendre": (hypotenuse, lambda p: jnp.sqrt(1 + p * p)),
     "implicit_root": (root, cardano),
     "potential": (potential, jnp.sin),
+    "residuals": (residuals, lambda x: jnp.sin(x) - 2 * jnp.sin(0.7 * x)),
     "scaled loss": (scaled_loss, lambda x: jnp.sin(2 * x) / 2),
     "boozer": (
         lambda x: _sums.total(MODES, SHAPE, x, 0.3 * x, 0.7),

@@ -56,6 +56,12 @@ def constant_unless(
     return result_of(value(*inputs))
 
 
+def all_finite(values: Any) -> Bool[Array, ""]:
+    """Whether all arrays of a tree are finite."""
+    finite = jax.tree.map(lambda x: jnp.all(jnp.isfinite(x)), values)
+    return jax.tree.reduce(jnp.logical_and, finite)
+
+
 def nan_if_used(values: Any, inputs: Any) -> Any:
     """The floating-point arrays `values`. If a loss depends on one of them that is NaN, its
     gradient by all `inputs` is NaN: zero would hide that the loss is not a number."""

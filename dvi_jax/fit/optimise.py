@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array
 
 from .checks import same_fit
@@ -137,15 +138,10 @@ class StageTask:
 
 # Optimistix differentiates the residual function itself. Here it gets a function whose value and
 # derivative are inputs, so that the one large program, that of both, is called outside of its step.
-@eqx.filter_custom_jvp
-def _residual(z, linearisation):
-    return linearisation[0]
-
-
-@_residual.def_jvp
-def _(primals, tangents):
-    residual, jacobian = primals[1]
-    return residual, jacobian @ tangents[0]
+# (A derivative rule of its own would be lost in second derivatives.)
+def _residual(z: Array, linearisation: tuple[Array, Array]) -> Array:
+    residual, jacobian = linearisation
+    return residual + jacobian @ (z - lax.stop_gradient(z))
 
 
 def _function(z, linearisation):

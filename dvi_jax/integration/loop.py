@@ -14,6 +14,7 @@ import lanewise
 
 from ..base.results import RESULTS, first_failure
 from ..base.types import Interval, Scalar, State
+from ..engine.guard import all_finite
 from ..engine.newton import no_residual, worse
 from ..engine.pairs import rounded
 from ..lattices import Place, Uniform
@@ -47,7 +48,7 @@ def start(task: Task, q0: State, p0: State) -> Carry:
             memory = reduction.start(jnp.zeros(like.shape, like.dtype))
             if not has_initial_value(reduction.function):
                 return memory
-            value = task.number(reduction, ends)
+            value = _value(task, ~is_failure, reduction, ends)
             return reduction.update(memory, jnp.asarray(0, jnp.int32), interval.t0, value)
 
         return task.evaluate(reduction, initial_memory, at_start)
@@ -209,13 +210,18 @@ def _memories(
             return reduction.update(memory, k, ends.t1, vectors)
 
         def with_value(ends, memory):
-            value_of = task.constant_unless(good, lambda *ends: task.number(reduction, Ends(*ends)))
-            value = value_of(*ends)
+            value = _value(task, good, reduction, ends)
             return reduction.update(memory, k, ends.t1, value)
 
         return task.evaluate(reduction, with_value, Ends(*ends[:2], *start, *end), memory)
 
     return [update(*pair) for pair in zip(reductions, carry.reductions, strict=True)]
+
+
+def _value(task: Task, good: Array, reduction: Reduction, ends: Ends) -> Array:
+    """The value of an observable, a constant where it is not finite or the state is not `good`."""
+    value = functools.partial(task.number, reduction)
+    return task.constant_unless(good & all_finite(value(ends)), value)(ends)
 
 
 def number_of(reduction: Reduction, k: Int[Array, ""]) -> Int[Array, ""]:

@@ -13,6 +13,7 @@ from jaxtyping import Array
 import lanewise
 
 from ..base.types import State
+from ..engine.guard import all_finite
 from ..engine.newton import KnownRoot
 from ..observe import Reduction, has_initial_value
 from .loop import number_of
@@ -83,7 +84,7 @@ class ReversePass(eqx.Module):
         of_t1, of_values = _of_values(self.reductions(), k, t1, values)
         pulled = pull(((after_step.q, after_step.p, of_t1), observed, of_values))
         # A failed step is a constant, NaN: zero times its derivative would be NaN as well.
-        good = _all_finite(start) & _all_finite(end)
+        good = all_finite(start) & all_finite(end)
         of_theta, q, p = lax.cond(
             lanewise.on_any(~good),
             lambda: jax.tree.map(lambda x: jnp.where(good, x, 0), pulled),
@@ -124,8 +125,8 @@ class ReversePass(eqx.Module):
         is_exact = is_solved & jnp.all(defects <= self.states.tolerance)
         # A batch must not wait for the steps of a trajectory that fails in this arc, unless
         # reductions read those before.
-        is_used = _all_finite(arc.end) | _any_nonzero(self.cotangent.results)
-        is_wrong = ~is_exact & _all_finite(arc.start) & is_used
+        is_used = all_finite(arc.end) | _any_nonzero(self.cotangent.results)
+        is_wrong = ~is_exact & all_finite(arc.start) & is_used
 
         def correct(cheap):
             exact = self.steps_again(cotangents, arc, save)
@@ -172,7 +173,7 @@ class ReversePass(eqx.Module):
         result of a reduction."""
 
         def is_used(of_values, state):
-            return _any_nonzero(of_values) & ~_all_finite(state)
+            return _any_nonzero(of_values) & ~all_finite(state)
 
         states = jax.tree.map(lambda x: x[1 : 1 + self.states.plan.num_blocks], starts)
         of_saved = jax.tree.map(lambda x: x[: len(states[0])], of_rows[2:5])
@@ -234,7 +235,8 @@ class ReversePass(eqx.Module):
 
         (t0, values), pull = jax.vjp(values_of, self.theta, *start)
         seeds = _of_values(reductions, jnp.asarray(-1, jnp.int32), t0, values)
-        good = _all_finite(start)
+        # NaN parameters make the value of a valid state NaN.
+        good = all_finite(start) & (all_finite(values) | _any_nonzero(seeds))
         pulled = jax.tree.map(lambda x: jnp.where(good, x, 0), pull(seeds))
         return jax.tree.map(jnp.add, cotangents, Cotangents(*pulled))
 
@@ -262,7 +264,3 @@ def _real(value: Array, like: Array) -> Array:
 
 def _any_nonzero(cotangents: Any) -> Array:
     return jnp.any(jnp.asarray([jnp.any(x != 0) for x in jax.tree.leaves(cotangents)], bool))
-
-
-def _all_finite(point: Point) -> Array:
-    return jnp.all(jnp.isfinite(point[0])) & jnp.all(jnp.isfinite(point[1]))

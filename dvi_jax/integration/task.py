@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int, PyTree
 from ..base.reads import Reads
 from ..base.results import RESULTS
 from ..base.types import Args, Bindable, Interval, Scalar, State
-from ..engine.guard import constant_unless
+from ..engine.guard import all_finite, constant_unless
 from ..engine.pairs import rounded
 from ..lattices import Lattice
 from ..methods import Method
@@ -85,7 +85,8 @@ class Task(eqx.Module):
                 next(memories)
             else:
                 assert ends is not None
-                values.append(ends.value(self.bound(leaf), self.args))
+                value = functools.partial(ends.value, self.bound(leaf), self.args)
+                values.append(self.constant_unless(all_finite(value()), value)())
         return values
 
     def evaluate(self, reduction: Reduction, function: Callable, *args: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Checks of the runs of `kinds`, and the search for numbers with which one fails.
+"""Checks of the runs of `kinds` and `library`, and the search for numbers with which one fails.
 
 python tests/random_programs/kind_checks.py [--count 1000] [--seed S] [--kinds stop noise …]
 
@@ -6,7 +6,6 @@ A seed is a random structure with `PER_STRUCTURE` sets of random numbers. The ex
 anything has failed.
 """
 
-import argparse
 import collections
 import functools
 import os
@@ -25,7 +24,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from random_programs.kinds import KINDS, Kind, Numbers
+from random_programs import kinds
+from random_programs.kinds import Kind, Numbers
+from random_programs.library import library
+from random_programs.search import arguments
+
+KINDS = (*kinds.KINDS, library)
+"""The functions that draw a structure; the structures of a search take them by turns."""
 
 LANES = 6
 """Trajectories of a batch; the last one is invalid."""
@@ -187,8 +192,8 @@ class Compiled:
 
 def structure(seed: int, names: Any = None) -> Compiled:
     """The random structure with this number; the kinds follow by turns."""
-    kinds = [kind for kind in KINDS if not names or kind.__name__ in names]
-    return Compiled(kinds[seed % len(kinds)](np.random.default_rng(seed)))
+    chosen = [kind for kind in KINDS if not names or kind.__name__ in names]
+    return Compiled(chosen[seed % len(chosen)](np.random.default_rng(seed)))
 
 
 def search(count: int, seed: int, names: Any) -> int:
@@ -221,9 +226,7 @@ def search(count: int, seed: int, names: Any) -> int:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description="Search for random runs that fail.")
-    parser.add_argument("--count", type=int, default=1000, help="programs (default 1000)")
-    parser.add_argument("--seed", type=int, default=0, help="the first structure (default 0)")
+    parser = arguments("Search for random runs that fail.", 1000)
     parser.add_argument("--kinds", nargs="*", choices=[kind.__name__ for kind in KINDS])
     given = parser.parse_args()
     os.environ.setdefault("JAX_PLATFORMS", "cpu")

@@ -148,11 +148,17 @@ def search(count: int, minutes: float, seed: int, out: Path) -> int:
     return 1 if found else 0
 
 
+def arguments(description: str, count: int) -> argparse.ArgumentParser:
+    """The parser of the arguments that both searches have; `count`: the default."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--count", type=int, default=count, help=f"programs (default {count})")
+    parser.add_argument("--seed", type=int, default=0, help="the first one (default 0)")
+    return parser
+
+
 def main() -> int:
-    parser = argparse.ArgumentParser(description="Search for random programs that fail.")
-    parser.add_argument("--count", type=int, default=2000, help="programs (default 2000)")
+    parser = arguments("Search for random programs that fail.", 2000)
     parser.add_argument("--minutes", type=float, default=1e9, help="at most (default: no limit)")
-    parser.add_argument("--seed", type=int, default=0, help="of the first portion (default 0)")
     parser.add_argument("--out", type=Path, default=Path("random-programs"), help="folder")
     parser.add_argument("--child", type=int, help=argparse.SUPPRESS)
     given = parser.parse_args()
