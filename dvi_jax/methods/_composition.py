@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from ..base.checks import whole
+from ..base.checks import array, known, whole
 from ._base import Method, check_invertible
 from ._order_conditions import order_defects
 from ._type_ii import TypeII
@@ -150,13 +150,8 @@ def of_strang(*outer: float) -> tuple[float, ...]:
 
 
 def _as_coefficients(values: Sequence[float]) -> tuple[float, ...]:
-    try:
-        return tuple(float(value) for value in values)
-    except (TypeError, ValueError):
-        raise TypeError(
-            "coefficients of Composition must be a sequence of numbers that are not traced, got "
-            f"{values!r:.200}."
-        ) from None
+    name = "coefficients of Composition"
+    return tuple(array(name, known(name, values, float), ("n",)).tolist())
 
 
 class Composition(CompositionMethod):
