@@ -59,10 +59,8 @@ def in_range(name: str, values: Any, low: float, high: float, hint: str = "") ->
     """**Raises** `ValueError` for a number that is not from `low` to `high`; `TypeError` for what
     is not a number."""
     entries = known(name, values, float)
-    if wrong := entries[~((entries >= low) & (entries <= high))].ravel().tolist():
-        raise ValueError(
-            f"{name} must be between {low:g} and {high:g}, got {wrong[0]}.{_sentence(hint)}"
-        )
+    for x in entries[~((entries >= low) & (entries <= high))].ravel().tolist():
+        raise ValueError(f"{name} must be between {low:g} and {high:g}, got {x}.{_sentence(hint)}")
 
 
 def fraction(name: str, value: Any) -> float:

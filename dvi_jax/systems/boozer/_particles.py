@@ -78,8 +78,7 @@ class GuidingCentres(eqx.Module):
         instance("field", self.field, Field, "a Field, such as boozer.precise_qa()")
         electronvolts("energy of the particles", self.energy, 10.0)
         in_range("mass", self.mass, 1e-31, 1e-24, "The unit is kg: 4 u are 6.64e-27.")
-        size = abs(finite("charge", self.charge))
-        in_range("the modulus of charge", size, 0.01, 200.0, "The unit is e, that of a proton.")
+        in_range("|charge|", abs(finite("charge", self.charge)), 0.01, 200.0, "The unit is e.")
         one_of("coordinates", self.coordinates, _CHARTS)
         if self.breaking is not None:
             shape, hint = self.field.coefficients.shape, "Take the result of Field.split."

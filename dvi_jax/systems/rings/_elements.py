@@ -292,8 +292,7 @@ def cavity(
     a multiple of 1/T.
     """
     if not is_traced(voltage):
-        hint = "It is the voltage over the energy: eV over eV."
-        in_range("voltage of a cavity", voltage, -1.0, 1.0, hint)
+        in_range("voltage of a cavity", voltage, -1.0, 1.0, "It is that over the energy.")
     values = {"length": length, "voltage": voltage, "lag": lag, "phase": phase, "slip": slip}
     values["wave_number"] = 2 * math.pi * frequency / C
     half = RingPart("half_drift")
