@@ -450,7 +450,7 @@ CALLS = [
     (lambda: traced(lambda x: dvi.Newton(rtol=x)), "^TypeError: rtol.*is traced by JAX"),
     (lambda: traced(lambda x: rings.track(RING, np.zeros(6), x)), "^ValueError: turns.*is traced"),
     (lambda: traced(lambda x: dvi.Composition([x, 1.0 - x])), "^TypeError: coeff.*is traced by"),
-    (lambda: traced(lambda x: sweep(h=x)), "^TypeError: each value of a sweep.*is traced by JAX"),
+    (lambda: traced(lambda x: sweep(h=x, observe=dvi.Last(energy))), "each value of a.*is traced"),
     (lambda: traced(lambda x: plot.orbit((x, x))), "^TypeError: an orbit.*is traced by JAX"),
     # units, and values out of range
     (lambda: boozer.GuidingCentres(boozer.precise_qa(), mass=4.0), "^ValueError: mass.*is kg"),
