@@ -60,7 +60,7 @@ def user_folder(name: str, path: Any) -> Path:
     nearest = next(part for part in (folder, *folder.absolute().parents) if part.exists())
     if not nearest.is_dir():
         raise NotADirectoryError(
-            f"{name} must be a directory, but '{nearest}' is a {kind_of_file(nearest)}: use another."
+            f"{name} must be a directory, but '{nearest}' is a {kind_of_file(nearest)}: give one."
         )
     return folder
 
