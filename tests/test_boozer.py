@@ -531,7 +531,7 @@ ERRORS = [
     (lambda x: x.start([0.5, 1.2], 0.0, 0.0, 0.1), ValueError, "s must be between 0 and 1.* 1.2"),
     (lambda x: x.start(0.5, 0.0, 0.0, np.nan), ValueError, "pitch must be between -1 and 1.*nan"),
     (lambda x: boozer.GuidingCentres(x.field, charge=np.nan), ValueError, "charge must be a fin"),
-    (lambda x: boozer.GuidingCentres(x.field, charge=0.0), ValueError, "charge must not be zero"),
+    (lambda x: boozer.GuidingCentres(x.field, charge=0.0), ValueError, r"charge\| must be between"),
     (lambda x: boozer.GuidingCentres(x.field, breaking=np.zeros((1, 1, 1, 1))), ValueError,
      "breaking must be .*shape"),
     (lambda x: boozer.Births(10, x, rate=lambda s: s - 0.5), ValueError, "rate"),

@@ -440,7 +440,51 @@ CALLS = [
     (lambda: dvi.Langevin("a", 1.0), "^ValueError: friction"),
     (lambda: dvi.integrate(FREE, Q, P, h=0.1, t1="1"), "^TypeError.*t1='1'"),
     (lambda: run(throw="no"), "^TypeError: throw must be True or False"),
+    # a flag that is not True or False, in functions, classes and settings
+    (lambda: dvi.MaxDrift(energy, relative=1e-3), "^TypeError: relative must be True or False"),
+    (lambda: rings.quadrupole("Q", 0.5, 0.6, fringe="no"), "^TypeError: fringe must be True or"),
+    (lambda: dvi.GALI(2, log10=2), "^TypeError: log10 must be True or False"),
+    # values that are traced where they must be known
+    (lambda: traced(lambda x: rings.Ring([rings.drift("D", 1.0)], energy=x)),
+     "^TypeError: energy of a ring.*is traced by JAX"),
+    (lambda: traced(lambda x: dvi.Newton(rtol=x)), "^TypeError: rtol.*is traced by JAX"),
+    (lambda: traced(lambda x: rings.track(RING, np.zeros(6), x)), "^ValueError: turns.*is traced"),
+    (lambda: traced(lambda x: dvi.Composition([x, 1.0 - x])), "^TypeError: coeff.*is traced by"),
+    (lambda: traced(lambda x: sweep(h=x, observe=dvi.Last(energy))), "each value of a.*is traced"),
+    (lambda: traced(lambda x: plot.orbit((x, x))), "^TypeError: an orbit.*is traced by JAX"),
+    # units, and values out of range
+    (lambda: boozer.GuidingCentres(boozer.precise_qa(), mass=4.0), "^ValueError: mass.*is kg"),
+    (lambda: boozer.GuidingCentres(boozer.precise_qa(), charge=3e-19), "charge.*The unit is e"),
+    (lambda: boozer.well(boozer.precise_qa(), 2.0, 0.0, 0.0, 0.5), "^ValueError: s must be betw"),
+    (lambda: rings.cavity("C", 0.0, 2e6, 5e8), "^ValueError: voltage.*over the energy"),
+    (lambda: rings.optics(RING, dp=5.0), "^ValueError: dp must be.*not per cent"),
+    (lambda: rings.optics(RING, dp=[0.0, 1e-3]), "^ValueError: dp must be.*scalar.*jax.vmap"),
+    (lambda: rings.dynamic_aperture(RING, largest=(40.0, 30.0)), "^ValueError: largest.*is m"),
+    (lambda: rings.dynamic_aperture(RING, largest=0.04), r"^ValueError: largest.*\(x_max, y_max\)"),
+    (lambda: rings.aperture("A", ellipse=(-0.02, 0.02)), "^ValueError: each width of the ellip"),
+    (lambda: rings.aperture("A", rectangle=(0.1, -0.1, -0.1, 0.1)), "^ValueError: each width"),
+    (lambda: dvi.flows.Kepler(mass=0.0), "^ValueError: mass of flows.Kepler must be positive"),
+    (lambda: dvi.flows.Harmonic(omega=np.nan), "^ValueError: omega of flows.Harmonic"),
+    (lambda: dvi.integrate(systems.kepler(), [1.0], [0.0], h=0.1, num_steps=2), "in the plane"),
+    (lambda: dvi.integrate(systems.kepler(), h=0.1, num_steps=2, args={"k": 1.0}),
+     "^ParameterError.*K is missing"),
+    (lambda: dvi.explore(systems.kepler(), h=0.0), "^ValueError: h must not be zero"),
+    # objects of another kind
+    (lambda: dvi.System(H_D, noise=dvi.Langevin), "^TypeError: noise must be a function"),
+    (lambda: dvi.Polynomials(2) + 1, "^TypeError: the second part of a sum of bases"),
+    (lambda: rings.multipole("M", 0.5, 3.0), "^TypeError: b of element 'M' must be a list"),
+    (lambda: RING.set("QF", b1="1"), "^TypeError: b1 must be.*real numbers"),
+    (lambda: plot.work_precision([1, 2]), "^TypeError: results must be a dict"),
+    (lambda: plot.drift_orders(3.0), "^TypeError: results must be one dvi.DriftOrder"),
+    (lambda: plot.twiss(RING, RING), "^TypeError: optics must be the result of rings.optics"),
+    (lambda: dvi.lattice_defect(FREE, [0.0]), "^ValueError: number of points.*got 1"),
+    (lambda: boozer.loss_fraction([1.0], "a"), "^TypeError: times must be.*real numbers"),
+    (lambda: rings.frequency_map(RING, [1e-3, 2e-3], np.ones(3)), "^ValueError: y.*np.meshgrid"),
 ]  # fmt: skip
+
+
+def traced(call):
+    return jax.eval_shape(call, jnp.ones(()))
 
 
 def loop(t0, t1, q0, p1, args):
@@ -487,6 +531,7 @@ WARNINGS = [
     (lambda: dvi.discretise(lambda t, p, q, args: p @ p), "exchange them"),
     (lambda: run(observe=lambda p, q: p @ p), "exchange them"),
     (lambda: dvi.System(H_D, force=lambda t0, t1, p, q, args: -q), "exchange them"),
+    (lambda: rings.aperture("A", ellipse=(40.0, 30.0)), "no effect.*The unit is m"),
 ]  # fmt: skip
 
 

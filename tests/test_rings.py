@@ -456,3 +456,27 @@ def test_files_of_xsuite(at, tmp_path):
     message = r"5: limit \(Marker, IdentityPass\): pyAT has no element for LimitEllipse"
     with warnings.catch_warnings(action="ignore"), pytest.raises(ValueError, match=message):
         rings.load(path)
+
+
+def test_strengths_can_be_traced_where_elements_are_made():
+    """Values and derivatives are those of a ring with other parameters."""
+
+    def made(x):
+        parts = [
+            rings.quadrupole("Q", 0.5, x),
+            rings.drift("D", 1.0 + x).inside(ellipse=(x, 0.1)),
+            rings.lens("L", lambda x, y, par: par["k"] * x**3, k=x),
+            rings.corrector("C", 0.1, x, 0.0).placed(dx=x),
+        ]
+        return rings.Ring(parts)
+
+    def of_set(x):
+        ring = known.set("Q", b1=x).set("D", length=1.0 + x, radius_x=x).set("L", k=x)
+        return ring.set("C", kick_x=x, dx=x)
+
+    known = made(0.3)
+    for change in (jax.jit, lambda f: jax.jit(jax.jacfwd(f))):
+        found, expected = (change(lambda x, f=f: f(x).columns)(0.2) for f in (made, of_set))
+        assert found.keys() == expected.keys()
+        for name in found:
+            np.testing.assert_allclose(found[name], expected[name], rtol=1e-15)

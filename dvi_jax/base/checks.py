@@ -15,6 +15,22 @@ Dimension = int | str
 Shape = tuple[Dimension, ...]
 
 
+_TRACED = "it is traced by JAX, but must be known here: compute it outside of jit, grad and vmap."
+
+
+def known(name: str, values: Any, dtype: Any = None) -> np.ndarray:
+    """An array of NumPy. **Raises** `TypeError` for traced values, for a list with parts of
+    different lengths, and for values that do not have the `dtype`."""
+    try:
+        entries = np.asarray(values)
+        return entries if dtype is None else entries.astype(dtype, casting="same_kind", copy=False)
+    except (TypeError, ValueError) as error:
+        raise TypeError(
+            f"{name} must be a real number or an array of real numbers, got {values!r:.200}: "
+            f"{_TRACED if 'Tracer' in type(error).__name__ else error}"
+        ) from None
+
+
 def whole(name: str, value: Any, low: int = 1, high: int | None = None, hint: str = "") -> int:
     """A whole number from `low` to `high` (None: any), not a bool. **Raises** `ValueError`."""
     # True is an integer in Python, but as a number it is nearly always a mistake.
@@ -22,6 +38,7 @@ def whole(name: str, value: Any, low: int = 1, high: int | None = None, hint: st
     if not fits or value < low or (high is not None and value > high):
         span = f"of at least {low}" if high is None else f"from {low} to {high}"
         text = f"{value!r:.200}" + ("" if fits else f" (type {type(value).__name__})")
+        hint = f"However, {_TRACED}" if "Tracer" in type(value).__name__ else hint
         raise ValueError(f"{name} must be an integer {span}, got {text}.{_sentence(hint)}")
     return int(value)
 
@@ -38,6 +55,14 @@ def electronvolts(name: str, value: Any, low: float) -> float:
     return _number(name, value, f"an energy of at least {low:g} eV", lambda x: x >= low, hint)
 
 
+def in_range(name: str, values: Any, low: float, high: float, hint: str = "") -> None:
+    """**Raises** `ValueError` for a number that is not from `low` to `high`; `TypeError` for what
+    is not a number."""
+    entries = known(name, values, float)
+    for x in entries[~((entries >= low) & (entries <= high))].ravel().tolist():
+        raise ValueError(f"{name} must be between {low:g} and {high:g}, got {x}.{_sentence(hint)}")
+
+
 def fraction(name: str, value: Any) -> float:
     """A number between 0 and 1, both excluded. **Raises** `ValueError`."""
     return _number(name, value, "between 0 and 1 (both excluded)", lambda x: 0 < x < 1)
@@ -51,7 +76,7 @@ def finite(name: str, value: Any, hint: str = "") -> float:
 def _number(
     name: str, value: Any, kind: str, is_allowed: Callable[[Any], bool], hint: str = ""
 ) -> float:
-    if not _is_number(value) or not math.isfinite(value) or not is_allowed(value):
+    if not _is_number(name, value) or not math.isfinite(value) or not is_allowed(value):
         raise ValueError(f"{name} must be {kind}, got {value!r}.{_sentence(hint)}")
     return float(value)
 
@@ -82,24 +107,23 @@ def array(
 
 def all_finite(name: str, values: Any, positive: bool = False, hint: str = "") -> None:
     """**Raises** `ValueError` for an array with a number that is not finite, or not `positive`."""
-    entries = np.asarray(values)
+    entries = known(name, values)
     is_real = entries.dtype.kind in "iubf" or "float" in str(entries.dtype)
     is_good = np.isfinite(entries) if is_real else np.zeros(entries.shape, bool)
     if is_real and positive:
         is_good = is_good & (entries > 0)
     if not is_good.all():
         index = tuple(np.argwhere(~is_good)[0].tolist())
-        place = f" at index {list(index)}" if index else ""
+        place = (f" at index {list(index)}" if index else "") + f".{_sentence(hint)}"
         raise ValueError(
-            f"{name} must be {'positive and ' * positive}finite, got {entries[index]}{place}."
-            f"{_sentence(hint)}"
+            f"{name} must be {'positive and ' * positive}finite, got {entries[index]}{place}"
         )
 
 
 def in_order(name: str, values: Any, strictly: bool = False, hint: str = "") -> None:
     """**Raises** `ValueError` unless the values are finite, in ascending or descending order;
     `strictly`: without equal neighbours."""
-    entries = np.asarray(values)
+    entries = known(name, values)
     steps = np.diff(entries)
     rises = steps * (np.sign(steps[steps != 0][:1]).sum() or 1)
     is_good = np.isfinite(steps) & (rises > 0 if strictly else rises >= 0)
@@ -164,10 +188,8 @@ def instance(name: str, value: Any, kind: Any, description: str, hint: str = "")
 def function(name: str, value: Any, arguments: str = "", hint: str = "") -> Callable[..., Any]:
     """A function; `arguments`: of what, such as "(t, q, p, args)". **Raises** `TypeError`."""
     if not callable(value) or isinstance(value, type):
-        signature = f" of {arguments}" if arguments else ""
-        raise TypeError(
-            f"{name} must be a function{signature}, got {value!r:.200}.{_sentence(hint)}"
-        )
+        kind = f" of {arguments}" if arguments else ""
+        raise TypeError(f"{name} must be a function{kind}, got {value!r:.200}.{_sentence(hint)}")
     return value
 
 
@@ -236,11 +258,11 @@ def arguments_text(names: list[str]) -> str:
     return f"Its arguments are {', '.join(names)}." if names else "It has no arguments."
 
 
-def _is_number(value: Any) -> bool:
-    """Whether it is a real number of Python, NumPy or JAX, or an array of one."""
+def _is_number(name: str, value: Any) -> bool:
+    """Whether it is a real number of Python, NumPy or JAX, or an array of one; `name`: of what."""
     # Arrays of JAX, traced or not, by their attributes: this file does not import JAX.
     if isinstance(value, np.ndarray) or hasattr(value, "__jax_array__") or hasattr(value, "aval"):
-        value = np.asarray(value)
+        value = known(name, value)
         return value.ndim == 0 and (value.dtype.kind in "iu" or "float" in str(value.dtype))
     return isinstance(value, numbers.Real | np.number) and not isinstance(value, bool)
 

@@ -39,8 +39,7 @@ def over_devices(
     """
     check_function("the argument of over_devices", function, hint="Give jax.vmap(f), for example.")
     array = np.asarray(jax.devices() if devices is None else list(devices))
-    if array.size == 0:
-        raise ValueError("devices must have at least one device, got none.")
+    whole("the number of devices", array.size)
     whole("out_axes", out_axes, low=0)
     # Auto: shardings of arguments outside are left to JAX, and need not be declared.
     mesh = jax.sharding.Mesh(array, (LANES,), axis_types=(AxisType.Auto,))
@@ -50,8 +49,7 @@ def over_devices(
         entries = list(axes) if isinstance(axes, list | tuple) else [axes] * len(args)
         if len(entries) != len(args):
             raise ValueError(
-                f"in_axes must have one entry for each of the {len(args)} arguments, got "
-                f"{in_axes!r}."
+                f"in_axes must have one entry for {len(args)} arguments, got {in_axes!r}."
             )
         for axis in entries:
             instance("each entry of in_axes", axis, int | None, "a whole number or None")

@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from .checks import instance
+
 TEMPORARY = ".tmp"
 """Suffix of files that are still being written."""
 
@@ -23,8 +25,7 @@ def user_path(name: str, path: Any) -> Path:
     **Raises** `TypeError` for another type, `ValueError` for ``~name`` of an unknown user and for a
     path that cannot exist.
     """
-    if not isinstance(path, str | os.PathLike):
-        raise TypeError(f"{name} must be a path, a string or a pathlib.Path, got {path!r:.100}.")
+    instance(name, path, str | os.PathLike, "a path, a string or a pathlib.Path")
     try:
         expanded = Path(path).expanduser()
         with contextlib.suppress(FileNotFoundError, NotADirectoryError, PermissionError):
@@ -59,8 +60,7 @@ def user_folder(name: str, path: Any) -> Path:
     nearest = next(part for part in (folder, *folder.absolute().parents) if part.exists())
     if not nearest.is_dir():
         raise NotADirectoryError(
-            f"{name} must be a directory, but '{nearest}' is a {kind_of_file(nearest)}: give "
-            "another path."
+            f"{name} must be a directory, but '{nearest}' is a {kind_of_file(nearest)}: give one."
         )
     return folder
 
@@ -78,6 +78,15 @@ def content_of(path: Path) -> bytes:
     if not stat.S_ISREG(path.stat().st_mode):
         raise OSError(errno.EINVAL, f"it is a {kind_of_file(path)}, not a file", str(path))
     return path.read_bytes()
+
+
+def writable_path(path: Any) -> Path:
+    """The path of a file to be written. **Raises** as `user_path`; `FileNotFoundError`."""
+    file = user_path("path", path)
+    if not file.parent.is_dir():
+        cause = f"the file '{file.name}' cannot be written: there is no directory '{file.parent}'."
+        raise FileNotFoundError(cause)
+    return file
 
 
 def publish(path: Path, content: bytes) -> None:
@@ -156,12 +165,8 @@ def publish_npz(
     **Raises** `FileNotFoundError` without a directory for it, `OSError` for a file that cannot be
     written; an older file of that name is then unchanged.
     """
-    path, content = user_path("path", path), io.BytesIO()
+    path, content = writable_path(path), io.BytesIO()
     header = {"format": form, "holds": sorted(arrays), **header}  # so that a lost array is noticed
-    if not path.parent.is_dir():
-        raise FileNotFoundError(
-            f"the file '{path.name}' cannot be written: there is no directory '{path.parent}'."
-        )
     np.savez(content, about=np.array(json.dumps(header)), **arrays)
     try:
         publish(path, content.getvalue())

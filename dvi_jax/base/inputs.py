@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 from lanewise.jaxprs.jaxapi import is_traced
 
-from .checks import all_finite, array, finite
+from .checks import all_finite, array, finite, known
 from .precision import refuse_double_without_x64
 
 
@@ -17,9 +17,7 @@ def start_state(q0: Any, p0: Any) -> tuple[Array, Array]:
     """Initial conditions, of one shape and precision. **Raises** `ValueError` or `TypeError`."""
     q, p = _real_array("q0", q0), _real_array("p0", p0)
     if q.shape != p.shape:
-        raise ValueError(
-            f"q0 and p0 must have the same shape, got {q.shape} for q0 and {p.shape} for p0."
-        )
+        raise ValueError(f"q0 and p0 must have the same shape, got {q.shape} and {p.shape}.")
     if q.size == 0:
         raise ValueError(f"q0 must not be empty, got shape {q.shape}.")
     if q.dtype != p.dtype:
@@ -39,8 +37,7 @@ def as_times(call: str, ts: Any) -> Array:
         refuse_double_without_x64("ts", ts.dtype)
     if jnp.issubdtype(ts.dtype, jnp.integer):
         ts = ts.astype(jnp.result_type(float))
-    if not jnp.issubdtype(ts.dtype, jnp.floating):
-        raise TypeError(f"ts in {call} must be real numbers, got dtype {ts.dtype}.")
+    _require_real(f"ts in {call}", ts)
     return jnp.asarray(array(f"ts in {call}", ts, ("times",)))
 
 
@@ -61,10 +58,8 @@ def real_numbers(name: str, value: Any) -> Array:
 
 def _require_real(name: str, value: Any) -> None:
     if not _is_real(value.dtype):
-        excerpt = f": {value!s:.80}" if isinstance(value, np.ndarray) else ""
-        raise TypeError(
-            f"{name} must be an array of real numbers, got dtype {value.dtype}{excerpt}."
-        )
+        text = f": {value!s:.80}" if isinstance(value, np.ndarray) else ""
+        raise TypeError(f"{name} must be an array of real numbers, got dtype {value.dtype}{text}.")
 
 
 def _real_array(name: str, value: Any) -> Array:
@@ -76,8 +71,7 @@ def _real_array(name: str, value: Any) -> Array:
     kind = value.dtype
     if kind.kind == "c":
         raise TypeError(
-            f"{name} must be real, got dtype {kind}: for ψ = (q0 + i p0)/√2 give q0 = √2 Re ψ and "
-            "p0 = √2 Im ψ."
+            f"{name} must be real, got {kind}: for ψ = (q0 + i p0)/√2 give √2 Re ψ and √2 Im ψ."
         )
     _require_real(name, value)
     # A traced value that is not finite becomes the status of its trajectory.
@@ -128,12 +122,7 @@ def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> A
 
 def _as_numpy(name: str, value: Any) -> np.ndarray:
     refuse_unit_or_mask(name, value)
-    try:
-        return np.asarray(value)
-    except (TypeError, ValueError) as error:
-        raise TypeError(
-            f"{name} must be a real number or an array of real numbers, got {value!r:.200}: {error}"
-        ) from None
+    return known(name, value)
 
 
 def as_parameter(leaf: Any) -> Any:
@@ -143,9 +132,7 @@ def as_parameter(leaf: Any) -> Any:
         leaf = np.asarray(leaf)
         refuse_double_without_x64("args", leaf.dtype)
         if leaf.dtype.kind in "OMm":
-            raise TypeError(
-                f"args must contain arrays of numbers, got dtype {leaf.dtype}: {leaf!s:.80}."
-            )
+            raise TypeError(f"args must contain arrays of numbers, got {leaf.dtype}: {leaf!s:.80}.")
         return jnp.asarray(leaf)
     if not isinstance(leaf, jax.Array):
         # Everything but arrays is static: compiled programs are looked up by its hash.

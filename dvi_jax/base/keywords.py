@@ -9,7 +9,10 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any, TypeVar
 
-from .checks import argument_names, arguments_text, only_one, refuse_unknown, require, settings_type
+import numpy as np
+
+from . import checks
+from .checks import argument_names, arguments_text, only_one, refuse_unknown, require
 from .machine import refuse_fork
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -23,7 +26,7 @@ def checked_keywords(function: F) -> F:
     an unknown keyword, or the absence of a necessary one, **raises** `TypeError`. In a process that
     was forked after JAX had started it raises `RuntimeError`."""
     names = frozenset(argument_names(function))
-    necessary = sorted(getattr(settings_type(function), "__required_keys__", ()))
+    necessary = sorted(getattr(checks.settings_type(function), "__required_keys__", ()))
 
     @functools.wraps(function)
     def call(*args: Any, **keywords: Any) -> Any:
@@ -118,8 +121,15 @@ def _explained(function: Callable[..., Any], name: str, signature: Any) -> Calla
     if hasattr(function, "explains_calls"):
         return function
 
+    settings = getattr(checks.settings_type(function), "__annotations__", {})
+    kinds = {**function.__annotations__, **settings}
+    flags = {argument for argument, kind in kinds.items() if kind is bool}
+
     @functools.wraps(function)
     def call(*args: Any, **keywords: Any) -> Any:
+        # Text such as "no" would count as True.
+        for flag in flags & keywords.keys():
+            checks.instance(flag, keywords[flag], bool | np.bool_, "True or False")
         try:
             return function(*args, **keywords)
         except TypeError as error:

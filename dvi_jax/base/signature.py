@@ -72,7 +72,8 @@ def with_time(
     names = arguments.strip("()").split(", ")
     short = f"({', '.join(n for n in names if n[0] != 't' and n != 'args')})"
     # The longest form first: a function with defaults or *rest accepts several of them.
-    if callable(function) and not accepts(function, len(names)) and takes_state(function):
+    is_short = not isinstance(function, type) and not accepts(function, len(names))
+    if callable(function) and is_short and takes_state(function):
         warn_of_exchanged(name, function, short)
         return (_OfPoint if len(names) == 4 else _OfStep)(function)
     check_takes(name, function, arguments, hints, f"{short} or ")

@@ -12,7 +12,7 @@ from jaxtyping import Array, Complex, Float
 
 from lanewise.jaxprs.jaxapi import is_traced, x64_enabled
 
-from ..base.checks import one_of, whole
+from ..base.checks import known, one_of, whole
 from ..base.inputs import refuse_unit_or_mask
 from ..base.precision import refuse_double_without_x64
 from ..observe.solution import Solution
@@ -276,7 +276,7 @@ def _real_times(name: str, value: Any) -> Array:
 def _double(name: str, value: Any) -> Array:
     """An array in double precision, real or complex."""
     refuse_unit_or_mask(name, value)
-    value = value if isinstance(value, jax.Array) else np.asarray(value)
+    value = value if isinstance(value, jax.Array) else known(name, value)
     refuse_double_without_x64(name, value.dtype)
     if value.dtype.kind not in "fciu":
         raise TypeError(f"{name} must be an array of numbers, got dtype {value.dtype}.")

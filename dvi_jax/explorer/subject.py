@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from ..base.inputs import as_scalar, start_state
 from ..base.precision import refuse_double_without_x64
 from ..integration.integrator import default_method
 from ..methods import Method
@@ -86,11 +87,13 @@ class Subject:
         if h is None:
             raise ValueError("explore requires h, the step size: the system has no default.")
         self.problem = problem if isinstance(problem, Problem) else None
-        q0, p0 = (np.array(x, float) for x in (q0, p0))
+        q0, p0 = (np.array(x, float) for x in start_state(q0, p0))
         refuse_double_without_x64("q0", q0.dtype)
+        h = as_scalar("h", h, float, zero_allowed=False)
         epsilon = start.get("epsilon")
         if epsilon is None:
             epsilon = self.system.epsilon or 0.0
+        epsilon = as_scalar("epsilon", epsilon, float)
         self.title = title or (self.problem.name if self.problem else "a system")
         self.lines, self.name = lines, name
         self.units = dict(self.problem.units) if self.problem else {}

@@ -13,6 +13,7 @@ from jaxtyping import Array, PyTree
 
 from lanewise.jaxprs.jaxapi import is_traced
 
+from ..base.checks import known
 from ..base.inputs import refuse_unit_or_mask
 from .checks import require_shape
 
@@ -256,10 +257,7 @@ def _entries(
 
 def _spread(value: Any, size: int, shape: tuple[int, ...], label: str) -> np.ndarray:
     refuse_unit_or_mask(label, value)
-    try:
-        value = np.asarray(value, float)
-    except (TypeError, ValueError):
-        raise TypeError(f"{label} must be a real number or array, got {value!r:.200}.") from None
+    value = known(label, value, float)
     require_shape(label, value, *dict.fromkeys([(), shape]))
     return value.ravel() if value.ndim else np.full(size, float(value))
 

@@ -12,6 +12,7 @@ from jaxtyping import PyTree
 
 import lanewise
 from lanewise import Layout
+from lanewise.jaxprs.jaxapi import is_traced
 
 from ..base.checks import instance, refuse_unknown
 from ..base.inputs import as_parameter, as_scalar, start_state
@@ -137,15 +138,17 @@ def integrate(
     ```
     """
     refuse_unknown("integrate", integrate, unknown)
-    system, q0, p0, default_h, args = of_problem(system, q0, p0, h, args)
+    problem, (system, q0, p0, default_h, args) = system, of_problem(system, q0, p0, h, args)
     check_system(system, noise_allowed=True)
     options = {"method": method, "lattice": lattice, "adjoint": adjoint, "newton": newton}
     options |= {"root_finder": root_finder, "arithmetic": arithmetic, "layout": layout}
     integrator = chosen(integrator, **options)
     instance("save", save, Save, "a dvi.Save(...)", _save_hint(save))
     instance("stop", stop, Stop | None, "a dvi.Stop(g)")
-    instance("throw", throw, bool, "True or False")
     q0, p0 = start_state(q0, p0)
+    check = getattr(problem, "check", None)
+    if check is not None and not any(map(is_traced, jax.tree.leaves((q0, p0, args)))):
+        check(q0, p0, args)
     if observe is not None:
         observe = of_steps(observe)
     if system.slow_time:
@@ -170,10 +173,7 @@ def solve(trajectory: PreparedRun, progress: Any = None) -> Solution:
     if progress is None or progress is False:
         solution = _in_one_program(task, plan, observe, q0, p0, adjoint, layout)
     elif has_tracer:
-        raise ValueError(
-            "progress cannot be reported inside of a transformation of JAX, such as jax.jit or "
-            "jax.vmap."
-        )
+        raise ValueError("progress cannot be reported inside of jax.jit or another transformation.")
     elif getattr(adjoint, "report_defect", False):
         raise ValueError(
             "dvi.Reversible(report_defect=True) cannot be combined with progress: leave one out."

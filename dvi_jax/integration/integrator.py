@@ -95,9 +95,7 @@ class Integrator(eqx.Module):
         for name, kinds in plain.items() if has_constraint else ():
             if type(value := getattr(self, name)) not in kinds:
                 choices = " or ".join(f"dvi.{kind.__name__}" for kind in kinds)
-                raise ValueError(
-                    f"a system with a constraint needs {name}={choices}, got {value!r:.200}."
-                )
+                raise ValueError(f"a system with a constraint needs {name}={choices}, got {value}.")
         return method
 
 

@@ -121,9 +121,7 @@ def raise_on_failure(solution: Solution, task: Task, run: Run) -> Solution:
         return _when_compiled(solution)
     if status_name(status) in ("successful", "stopped"):
         return solution
-    remark = (
-        f"{RESULTS[status]} The attribute `solution` of this error is what throw=False returns."
-    )
+    remark = f"{RESULTS[status]} Its attribute `solution` is what throw=False returns."
     if bool(status == RESULTS.not_reached):
         is_missing = np.isnan(np.asarray(solution.qs)).reshape(len(solution.ts), -1).any(1)
         first = float(solution.ts[is_missing.argmax()])

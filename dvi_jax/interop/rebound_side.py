@@ -256,9 +256,7 @@ def _finite(owner: str, source: Any, fields: Sequence[str]) -> dict[str, float]:
 
 def _check_finite(name: str, values: np.ndarray) -> None:
     if (bad := ~np.isfinite(values)).any():
-        raise ValueError(
-            f"{name} must be finite, got {values[bad][0]}: give a state before the failure."
-        )
+        raise ValueError(f"{name} must be finite, got {values[bad][0]}: give an earlier state.")
 
 
 def _with_mass(sim: Any, masses: np.ndarray, massless: float | None) -> np.ndarray:

@@ -151,8 +151,7 @@ def check_num_steps(num_steps: object) -> int:
         count = None
     if count is None:
         raise TypeError(
-            f"num_steps must be an integer that is not traced (static_argnames of jax.jit), got "
-            f"{num_steps!r}."
+            f"num_steps must be an integer, in jax.jit a static argument, got {num_steps!r}."
         )
     hint = "A negative h runs backwards in time."
     return whole("num_steps", count, 0, 2**31 - 2, hint)  # steps are counted in 32 bits

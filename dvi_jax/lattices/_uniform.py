@@ -15,8 +15,8 @@ class Uniform(StepSizes):
     def steps_to(self, t0, h, num_steps, t1, duration):
         only_one(num_steps=num_steps, t1=t1, duration=duration)
         span = "duration" if t1 is None else "t1 − t0"
-        arguments = f"h={h!r}, "
-        arguments += f"duration={duration!r}" if t1 is None else f"t1={t1!r}, t0={t0!r}"
+        texts = f"h={h!r}, "
+        texts += f"duration={duration!r}" if t1 is None else f"t1={t1!r}, t0={t0!r}"
         require("duration" if t1 is None else "t1", {"h": h})
         try:
             # A sum first: float() alone would accept text.
@@ -25,18 +25,15 @@ class Uniform(StepSizes):
             steps = length / (float(0.0 + h) or 1.0)
         except TypeError:
             raise TypeError(
-                f"{span} and h must be numbers that are not traced, got {arguments}: give "
-                "num_steps."
+                f"{span} and h must be numbers that are not traced, got {texts}: give num_steps."
             ) from None
         count = round(steps) if math.isfinite(steps) else -1
         if count < 0:
-            raise ValueError(
-                f"{span} and h must be finite and have the same sign, got {arguments}."
-            )
+            raise ValueError(f"{span} and h must be finite and have the same sign, got {texts}.")
         # (t1 − t0)/h has round-off, which is not a remaining part of a step.
         if abs(steps - count) > 1e-9 * max(1, count):
             raise ValueError(
-                f"{span} must be a whole multiple of h, got {arguments}. Use "
+                f"{span} must be a whole multiple of h, got {texts}. Use "
                 f"h={length / max(1, count):.12g} or num_steps."
             )
         return count

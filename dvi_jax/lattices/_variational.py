@@ -89,7 +89,7 @@ class Variational(StepSizes):
         one_of("on_no_root", self.on_no_root, get_args(Policy))
         if not (isinstance(self.reach, int | float) and 1 < self.reach < float("inf")):
             raise ValueError(
-                f"reach of Variational must be a finite number above 1, got {self.reach!r}."
+                f"reach of Variational must be finite and above 1, got {self.reach!r}."
             )
         try:
             smallest, largest = map(float, self.bounds)

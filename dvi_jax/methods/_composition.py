@@ -4,7 +4,7 @@ import abc
 import functools
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from ..base.checks import whole
+from ..base.checks import array, instance, known, whole
 from ._base import Method, check_invertible
 from ._order_conditions import order_defects
 from ._type_ii import TypeII
@@ -150,13 +150,9 @@ def of_strang(*outer: float) -> tuple[float, ...]:
 
 
 def _as_coefficients(values: Sequence[float]) -> tuple[float, ...]:
-    try:
-        return tuple(float(value) for value in values)
-    except (TypeError, ValueError):
-        raise TypeError(
-            "coefficients of Composition must be a sequence of numbers that are not traced, got "
-            f"{values!r:.200}."
-        ) from None
+    name = "coefficients of Composition, a sequence of numbers,"
+    numbers = known(name, list(instance(name, values, Iterable, "one")), float)
+    return tuple(array(name, numbers, ("n",), empty=True).tolist())
 
 
 class Composition(CompositionMethod):
@@ -198,8 +194,7 @@ class Composition(CompositionMethod):
         check_invertible("base", base)  # the defects below depend on the base
         if not c or not all(math.isfinite(x) for x in c) or abs(math.fsum(c) - 1) > 1e-12:
             raise ValueError(
-                f"coefficients of Composition must be finite and sum to 1 up to 1e-12, got {c} "
-                f"with the sum {sum(c)!r}."
+                f"coefficients of Composition must be finite, sum to 1, got {c}, sum {sum(c)!r}."
             )
         hint = "Conditions of higher orders cannot be checked."
         whole("order", order, high=_MOST_CHECKED, hint=hint)

@@ -100,8 +100,7 @@ def check_scheme(scheme: Any) -> None:
             raise ValueError(f"scheme must be {names}, got {scheme}.")
     elif not isinstance(scheme, CompositionMethod) or scheme.base != TypeII():
         raise TypeError(
-            f"scheme must be a composition of dvi.TypeII(), such as dvi.Strang(), or {names}, got "
-            f"{scheme!r}."
+            f"scheme must be a composition such as dvi.Strang(), or {names}, got {scheme!r}."
         )
 
 

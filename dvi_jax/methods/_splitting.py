@@ -324,8 +324,7 @@ class Splitting(SplittingMethod):
         H = system.H_D
         if not isinstance(H, Split):
             raise TypeError(
-                "method=dvi.Splitting(...) requires dvi.System(dvi.Split([H_A, H_B])), got an H_D "
-                f"that is {H!r:.100}."
+                f"dvi.Splitting requires dvi.System(dvi.Split([H_A, H_B])), got {H!r:.100}."
             )
         perturbations = system.force, system.perturbation
         parts: list[Any] = [(H_i, None, None) for H_i in H.parts]

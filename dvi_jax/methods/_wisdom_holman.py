@@ -177,10 +177,9 @@ class WisdomHolman(SplittingMethod):
 
         is_coupled = depends_on(lambda q: velocity(q, jnp.ones_like(q)), 0, q)
         if is_coupled or depends_on(inverse_mass, 0, q):
-            reason = "q0 enters ∂H_D/∂p1" if is_coupled else "T is not quadratic in the momenta"
+            reason = "q0 enters ∂H_D/∂p1" if is_coupled else "it is not quadratic in p1"
             raise ValueError(
-                "dvi.WisdomHolman requires H_D = T(p1) + V(q0) with T = Σ |p_i|²/(2 m_i), but "
-                f"{reason}."
+                f"dvi.WisdomHolman requires H_D = Σ |p_i|²/(2 m_i) + V(q0), but {reason}."
             )
         return _COORDINATES[self.coordinates](1 / inverse_mass(q)[:, 0])
 

@@ -20,9 +20,7 @@ _STATES = ("ts", "qs", "ps", "hs")
 def write(solution: Any, path: str | os.PathLike[str]) -> None:
     """`Solution.save`, which see."""
     if solution.result.is_traced():
-        raise TypeError(
-            "solution must have numbers, got JAX tracers: call save outside of jit and vmap."
-        )
+        raise TypeError("a solution with JAX tracers cannot be saved: call save outside of jit.")
     # Text and arrays alone, no pickle: loading one would run code from the file.
     arrays = {name: np.asarray(getattr(solution, name)) for name in _STATES}
     arrays["status"] = np.asarray(status_code(solution.result))
@@ -39,9 +37,7 @@ def read(path: str | os.PathLike[str]) -> dict[str, Any]:
     header, arrays = read_npz(path, _FORMAT, "solution")
     gaps = [name for name in (*_STATES, "status") if name not in arrays]
     if gaps := [*gaps, *(name for name in ("stats", "observed", "stop") if name not in header)]:
-        raise ValueError(
-            f"'{path}' is not the file of a solution: it has no {gaps[0]!r}. Check the path."
-        )
+        raise ValueError(f"'{path}' is not the file of a solution: {gaps[0]!r} is missing in it.")
     refuse_double_without_x64("a saved Solution", arrays["ts"].dtype)
     fields: dict[str, Any] = {name: jnp.asarray(arrays[name]) for name in _STATES}
     # A status is made from its index: an Enumeration has one leaf.

@@ -103,7 +103,7 @@ def labels_of(labels: Any, count: int, things: str, name: str = "labels") -> lis
     texts = [labels] if isinstance(labels, str) else labels
     if len(texts) != count or isinstance(labels, str):
         raise ValueError(
-            f"{name} must be a list of {count} names of the {things}, got {labels!r:.200}."
+            f"{name} must be a list of {count} names of {things}, got {labels!r:.200}."
         )
     return [str(label) for label in texts]
 

@@ -15,7 +15,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from PIL import Image
 
 from ..base.checks import one_of, positive
-from ..base.files import user_path
+from ..base.files import writable_path
 from . import series
 from .axes import at_most, check_not_empty, legend
 from .orbits import Plane, phase_portrait, view_of
@@ -72,7 +72,7 @@ def animate(
     GIF of more than 2²⁸ pixels, and as `orbit` does; `TypeError` for unknown keywords;
     `RuntimeError` for an MP4 without ffmpeg.
     """
-    path = user_path("path", path)
+    path = writable_path(path)
     suffix = path.suffix.lower()
     _check_film(path, suffix, seconds, fps, tail, beside)
     extra_names = {name for names in (_VIEW, _CANVAS, *_SECOND.values()) for name in names}

@@ -175,9 +175,7 @@ class Grid(NamedTuple):
         count = len(self.panels)
         if ax is not None:
             if count > 1:
-                raise ValueError(
-                    f"facet={self.facet!r} makes a new figure of {count} maps: leave out ax."
-                )
+                raise ValueError(f"facet={self.facet!r} makes a figure of {count} maps: omit ax.")
             return [canvas(ax)[0]]
         if count == 1:
             size = None if height is None else (plt.rcParams["figure.figsize"][0], height)

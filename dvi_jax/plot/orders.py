@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.patches import Patch
 
-from ..base.checks import one_of
+from ..base.checks import instance, one_of
 from ..discover import DriftOrder, DriftSurface
 from . import axes as draw
 from .axes import canvas, counts_text, entry, legend, stack
@@ -110,15 +110,14 @@ def drift_orders(
     if isinstance(results, DriftOrder):
         results = {"drift": results}
     elif not isinstance(results, Mapping):
+        instance("results", results, Sequence, "one dvi.DriftOrder, or a dict or list of them")
         results = {f"observable {i}": order for i, order in enumerate(results, 1)}
     for order in results.values():
         rule = "results must be one dvi.DriftOrder, or a dict or a sequence of them"
         draw.check_attributes(order, ("drifts", "epsilons"), rule)
     slopes = [*expected] if isinstance(expected, Sequence) else [expected] * len(results)
     if len(slopes) != len(results):
-        raise ValueError(
-            f"expected must have one order for each of {len(results)} results, got {slopes}."
-        )
+        raise ValueError(f"expected must have one order for {len(results)} results, got {slopes}.")
     axis, new = canvas(ax, (6.4, 4.8))
     left = 0.7 * min(order.epsilons.min() for order in results.values())
     looks = zip(results.items(), slopes, itertools.cycle(COLOURS), itertools.cycle(MARKERS))
@@ -328,6 +327,7 @@ def work_precision(
     exactly 0, triangles at the bottom. **Returns** the `Axes`. **Raises** `ValueError` for no
     methods, for shapes that do not fit and for costs that are not positive.
     """
+    instance("results", results, Mapping, "a dict such as {'Verlet': (costs, errors)}")
     draw.check_not_empty("results", results, "give {'Verlet': (costs, errors)}")
     axis, new = canvas(ax, (6.4, 4.8))
     runs = {name: _costs_and_errors(name, pair) for name, pair in results.items()}

@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from .axes import check_shapes, entry, legend, stack
+from ..base.checks import known
+from .axes import check_attributes, check_shapes, entry, legend, stack
 from .spectra import frequency_map
 from .style import COLOURS, DASHES, GREY, in_style
 
@@ -27,9 +28,10 @@ def twiss(ring: Any, optics: Any, title: str = "", ax: Any = None) -> Any:
     **Returns** the two `Axes`; the dispersion has a scale of its own on the right. **Raises**
     `ValueError` for the optics of another ring.
     """
-    s, orbit, beta, alpha, D = (
-        np.asarray(getattr(optics, n)) for n in ("s", "orbit", "beta", "alpha", "dispersion")
-    )
+    names = "s", "orbit", "beta", "alpha", "dispersion"
+    check_attributes(optics, names, "optics must be the result of rings.optics")
+    check_attributes(ring, ["columns"], "ring must be a rings.Ring")
+    s, orbit, beta, alpha, D = (known(name, getattr(optics, name)) for name in names)
     check_shapes(len(s) == len(ring) + 1, "optics must be those of this ring", s=s)
     p = 1 + orbit[:, 5]
     layout, purpose = {"height_ratios": [5, 1], "sharex": True}, "for functions and for magnets"

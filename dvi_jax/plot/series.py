@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..base.checks import one_of
+from ..base.checks import instance, one_of
 from . import axes as draw
 from .axes import canvas, check_shapes, counts_text, labels_of, legend, stack
 from .states import Lane, check_momenta, each_state, lanes_of, looks_of, troubles
@@ -149,8 +149,7 @@ def _read(
         lanes, times = [], np.asarray(getattr(orbits, "ts", orbits))
         if times.dtype.kind not in "iuf" or times.ndim == 0:
             raise TypeError(
-                "orbits must be a Solution, arrays (ts, qs, ps), a list of these, or times, got "
-                f"{orbits!r:.60}."
+                f"orbits must be a Solution, (ts, qs, ps), a list, or times, got {orbits!r:.60}."
             )
         ts = list(times.reshape(-1, times.shape[-1]))
         names = labels_of(labels, len(ts), "orbits")
@@ -226,6 +225,7 @@ def changes(ts: Any, series: Mapping[str, Any], time: str, title: str, ax: Any =
     A panel reports how many of its changes are not finite. **Returns** the `Axes`, shape
     (quantities,).
     """
+    instance("series", series, Mapping, "a dict {name: values}")
     size = (6.4, 1.2 + 1.35 * len(series))
     axes, _ = stack(ax, len(series), "one for each quantity", size, sharex=True)
     colours = itertools.cycle(COLOURS)

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from matplotlib.cm import ScalarMappable
 
-from ..base.checks import whole
+from ..base.checks import known, whole
 from ..base.signature import check_takes
 from ..observe import OfState
 from . import axes as draw
@@ -74,7 +74,7 @@ def _lanes_of_one(part: Any) -> list[Lane]:
     else:
         kind = type(part).__name__ + (f" of length {len(part)}" if isinstance(part, tuple) else "")
         raise TypeError(f"each orbit must be a Solution or arrays (ts, qs, ps), got {kind}.")
-    ts, *states = (np.asarray(x) for x in arrays if x is not None)
+    ts, *states = (known("an orbit", x) for x in arrays if x is not None)
     for name, x in zip(("ts", "qs", "ps"), (ts, *states), strict=False):
         draw.check_real(f"{name} of an orbit", x, "iuf")
     if ts.ndim and states[0].shape == ts.shape:  # a state that is one number

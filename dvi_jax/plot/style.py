@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import ListedColormap
 
-from ..base.files import user_path
+from ..base.files import writable_path
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -117,7 +117,7 @@ def save(drawn: Any, path: str | Path) -> Path:
     `drawn`: a figure, or axes of one, as every function of `dvi_jax.plot` returns them. **Raises**
     `TypeError` for anything else, `ValueError` for axes of several figures.
     """
-    path = user_path("path", path)
+    path = writable_path(path)
     axes = np.ravel(np.asarray(drawn, object)).tolist()
     if not axes or not all(hasattr(axis, "figure") for axis in axes):
         raise TypeError(f"drawn must be a figure, or the Axes of one, got {drawn!r:.200}.")

@@ -8,6 +8,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from lanewise.jaxprs.jaxapi import is_traced
+
+from ..base.checks import all_finite
 from ..base.signature import check_takes, notes_of
 from ..base.types import Args, HamiltonianFn, Scalar, State
 from . import kepler as _kepler
@@ -30,6 +33,11 @@ class Flow(eqx.Module):
     A flow is called as a discrete Hamiltonian, ``(t0, t1, q0, p1, args)`` → scalar [energy], and
     `change` advances a state by the exact flow.
     """
+
+    def __check_init__(self):
+        for name, value in vars(self).items():
+            if not (callable(value) or is_traced(value)):
+                all_finite(f"{name} of flows.{type(self).__name__}", value, name == "mass")
 
     @abc.abstractmethod
     def __call__(self, t0: Scalar, t1: Scalar, q0: State, p1: State, args: Args) -> Scalar:

@@ -127,10 +127,7 @@ class System(eqx.Module):
         names += ["a perturbation"] * (self.perturbation is not None)
         names += ["slow_time=True"] * self.slow_time
         if names:
-            raise ValueError(
-                f"epsilon=... must be given for a system with {' and '.join(names)}: it is their "
-                "factor."
-            )
+            raise ValueError(f"epsilon=... must be given for a system with {' and '.join(names)}.")
         return 0.0
 
     def hamiltonian(

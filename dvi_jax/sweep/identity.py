@@ -22,6 +22,7 @@ import numpy as np
 from lanewise.jaxprs.extent import functions_in
 from lanewise.jaxprs.jaxapi import ClosedJaxpr, bodies, is_traced
 
+from ..base.checks import known
 from ..base.signature import accepts
 from .axes import axes_in, is_axis
 from .plan import SweepPlan
@@ -140,7 +141,7 @@ class Describer:
             values = x.values if isinstance(x.values, np.ndarray) else list(x.values)
             return {"axis": x.name, "values": self(values)}
         if isinstance(x, np.ndarray | np.generic | jax.Array):
-            return _of_array(np.asarray(x))
+            return _of_array(known("each value of a sweep", x))
         if isinstance(x, Mapping):
             return {str(k): self(value) for k, value in x.items()}
         if isinstance(x, list | tuple):

@@ -83,9 +83,7 @@ def dipole_field(radius: float = 50.0) -> Problem:
         q0_p0_h=(np.array([radius, 0.0, 0.0]), v0 + A, 0.1),
         parameters={
             **guiding_centre.PARTICLE,
-            "B0": Parameter(
-                1.0, "field at r = radius on the equator [mass/(charge time)]", nonzero
-            ),
+            "B0": Parameter(1.0, "field at r = radius, equator [mass/(charge time)]", nonzero),
             "radius": Parameter(radius, "R, where the field is B0 [length]"),
         },
         observables=[stoermer_integral, magnetic_moment, corrected_moment, bounce_action],

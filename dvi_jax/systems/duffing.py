@@ -68,9 +68,7 @@ def duffing() -> Problem:
         name="duffing",
         q0_p0_h=(np.array([-1.2]), np.array([0.2]), 0.1),
         parameters={  # with β ≤ 0 the motion is unbounded
-            "alpha": Parameter(
-                -1.0, "linear part of the spring, negative for two wells [1/time²]", finite
-            ),
+            "alpha": Parameter(-1.0, "linear part, negative for two wells [1/time²]", finite),
             "beta": Parameter(1.0, "cubic part of the spring, positive [1/(length² time²)]"),
             "delta": Parameter(0.3, "friction at ε = 1 [1/time]", finite),
             "gamma": Parameter(0.5, "amplitude of the drive at ε = 1 [length/time²]", finite),

@@ -75,9 +75,7 @@ def nls_lattice(n: int = 8) -> Problem:
         q0_p0_h=(q0, p0, 0.02),
         parameters={
             "kappa": Parameter(1.0, "coupling of neighbours [1/time]", finite),
-            "gamma": Parameter(
-                1.0, "attraction on a site, negative for repulsion [1/time]", finite
-            ),
+            "gamma": Parameter(1.0, "attraction on a site, below 0 for repulsion [1/time]", finite),
         },
         observables=[norm, densities],
         source="Kevrekidis 2009, The Discrete Nonlinear Schrödinger Equation",

@@ -122,9 +122,7 @@ def exact(t, q0, p0, args):
 def _possible(q, p, args):
     moments = [args["I1"], args["I2"], args["I3"]]
     if 2 * max(moments) > (1 + 1e-8) * sum(moments):  # of a flat body they may be rounded
-        raise ValueError(
-            f"I1, I2 and I3 must each be at most the sum of the other two, got {moments}."
-        )
+        raise ValueError(f"I1, I2 and I3 must be at most the sum of the other two, got {moments}.")
     L, G, K = p
     if not (abs(L) < G and abs(K) <= G):
         raise ValueError(

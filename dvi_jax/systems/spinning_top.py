@@ -161,12 +161,10 @@ def spinning_top() -> Problem:
         q0_p0_h=(np.array([0.0, 0.6, 0.0]), np.array([2.4, 0.1, 2.5]), 0.02),
         parameters={
             "A": Parameter(
-                1.0, "moment of inertia about the fixed point, across the axis [mass length²]"
+                1.0, "moment of inertia about the point, across the axis [mass length²]"
             ),
             "C": Parameter(0.5, "moment of inertia along the axis [mass length²]"),
-            "w": Parameter(
-                1.0, "m g l, the weight times its distance from the fixed point [energy]"
-            ),
+            "w": Parameter(1.0, "m g l, weight times its distance from the fixed point [energy]"),
         },
         observables=[vertical_momentum, axial_momentum, height],
         units={"q": "rad", "p": "1", "t": "1", "energy": "1"},

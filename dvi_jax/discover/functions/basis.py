@@ -17,6 +17,7 @@ from ...base.checks import function, instance
 from ...base.types import Scalar, State
 
 Function = Callable[..., Any]
+_KINDS = "a basis such as dvi.Polynomials(4), dvi.Basis([f, g]), or a sum or product of them"
 
 
 class AbstractBasis(eqx.Module):
@@ -32,16 +33,19 @@ class AbstractBasis(eqx.Module):
         """The functions for states of this shape, with names and complexities."""
 
     def __add__(self, other: "AbstractBasis") -> "AbstractBasis":
-        return Sum(self, other) if isinstance(other, AbstractBasis) else NotImplemented
+        return Sum(
+            self, instance("the second part of a sum of bases", other, AbstractBasis, _KINDS)
+        )
 
     def __mul__(self, other: "AbstractBasis") -> "AbstractBasis":
-        return Product(self, other) if isinstance(other, AbstractBasis) else NotImplemented
+        return Product(
+            self, instance("the second part of a product of bases", other, AbstractBasis, _KINDS)
+        )
 
 
 def bind_basis(basis: Any, shape: tuple[int, ...]) -> "BoundBasis":
     """`basis.for_shape(shape)`, or a `TypeError` for any other object."""
-    kinds = "a basis such as dvi.Polynomials(4), dvi.Basis([f, g]), or a sum or product of them"
-    instance("basis", basis, AbstractBasis, kinds)
+    instance("basis", basis, AbstractBasis, _KINDS)
     return dataclasses.replace(basis.for_shape(shape), shape=shape)
 
 

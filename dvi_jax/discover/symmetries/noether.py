@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 
+from ...base.checks import instance, whole
 from ...base.printing import printable
 from ...base.signature import with_time
 from ...base.types import Args, Scalar
@@ -35,6 +36,8 @@ def lattice_defect(
     differentiates it in t_{k−1}; stationarity in t_k gives the form above.
     """
     check_system(system, "lattice_defect")
+    instance("points", points, Sequence, "three dvi.LatticePoint in the order of time")
+    whole("number of points", len(points), 3, 3, "They are those before, at and after the middle.")
     (t_, q_, _), (t0, q0, p0), (t1, q1, p1) = points
     work = disturbing_work(system, t0, t1, q0, q1, p1, epsilon, args)
     outgoing = outgoing_energy(system, t0, t1, q0, p1, epsilon, args)

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ...base.checks import function, instance
+from ...base.checks import function, in_range, instance
 from ...base.printing import printable
 from ...sweep.starts import Seeded
 from ._field import Field, polynomial
-from ._particles import GuidingCentres, check_range
+from ._particles import GuidingCentres
 
 _TABLE = 513
 """Points of the table of the distribution in s."""
@@ -79,7 +79,7 @@ class Births(Seeded):
         self.particles = instance("particles", particles, GuidingCentres, "GuidingCentres", hint)
         function("rate", rate, "(s)")
         if surface is not None:
-            check_range("surface", surface, 0.0)
+            in_range("surface", surface, 0.0, 1.0)
         self.surface = surface
         self.cumulative, self.largest = self._tables(rate)
 

@@ -18,7 +18,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ...base.checks import instance, positive
+from lanewise.jaxprs.jaxapi import is_traced
+
+from ...base.checks import in_range, instance, positive
 from ...base.printing import printable
 from ...engine.bracket import bracketed_root
 from ._field import Field, polynomial
@@ -108,6 +110,8 @@ def _well(field: Field, point: Any, mu: Any, energy: Any, turns: float) -> tuple
     """The field line through a point (s, θ, ζ), the ends of the well, and whether it has both."""
     instance("field", field, Field, "a Field, such as boozer.precise_qa()")
     positive("turns", turns)
+    if not is_traced(point[0]):
+        in_range("s", point[0], 0.0, 1.0)
     s, theta, zeta, mu, energy = (jnp.asarray(x, float) for x in (*point, mu, energy))
     line = _Line(field, s, theta - polynomial(field.iota, s) * zeta, mu, energy)
     low, has_low = _end(line, zeta, -1.0, turns)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ...base.checks import all_finite, array, finite, positive, whole
+from ...base.checks import all_finite, array, finite, known, positive, whole
 from ...base.keywords import checked_keywords
 from ...base.printing import printable
 from ._sums import Coefficients, Shape, total
@@ -117,16 +117,8 @@ def polynomial(c: Profile, s: Any) -> Array:
     return value
 
 
-def as_numbers(name: str, values: Any) -> np.ndarray:
-    """An array of floating-point numbers. **Raises** `TypeError`."""
-    try:
-        return np.asarray(values, float)
-    except (TypeError, ValueError) as error:
-        raise TypeError(f"{name} must be an array of numbers, got {values!r:.200}.") from error
-
-
 def _array(name: str, values: Any, *shape: int | str) -> np.ndarray:
-    entries = array(name, as_numbers(name, values), shape, integers=True, empty=True)
+    entries = array(name, known(name, values, float), shape, integers=True, empty=True)
     all_finite(name, entries)
     return entries
 
@@ -182,7 +174,7 @@ def from_modes(
         _array(name, profile, "degree")
     if profiles[2][0] != 0:
         raise ValueError(
-            f"I must be zero on the axis, I = [0, ...], got the constant {profiles[2][0]}."
+            f"I must be zero on the axis, [0, ...], got the constant {profiles[2][0]}."
         )
     iota, G, current = map(jnp.asarray, profiles)
     psi, current = jnp.asarray(float(psi_edge)), None if I is None else current

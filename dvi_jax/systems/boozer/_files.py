@@ -162,9 +162,7 @@ def read_geometry(
     """
     f = _surfaces(path, ["bmnc_b", "rmnc_b"], ["zmns_b", "pmns_b", "bmns_b"])
     if "bmns_b" in f.odd:
-        raise ValueError(
-            f"{path}: read_geometry requires the symmetry (θ, ζ) → (−θ, −ζ), got bmns_b."
-        )
+        raise ValueError(f"{path}: the symmetry (θ, ζ) → (−θ, −ζ) is required, got bmns_b.")
     tables, settings = {}, (f.periods, degree, box, tolerance)
     length = scale * np.abs(f.even["rmnc_b"][:, (f.m == 0) & (f.n == 0)]).mean()
     for name, values, size in (

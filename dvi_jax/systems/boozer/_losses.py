@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...base.checks import positive
+from ...base.checks import known, positive
 from ...base.printing import printable
 
 
@@ -32,7 +32,7 @@ def loss_fraction(stop_t: Any, times: Any, sigmas: float = 1.0) -> LossFraction:
     **Source** Wilson 1927, *J. Am. Stat. Assoc.* 22, 209.
     """
     z = positive("sigmas", sigmas)
-    stops, times = np.asarray(stop_t, float).ravel(), np.asarray(times, float)
+    stops, times = known("stop_t", stop_t, float).ravel(), known("times", times, float)
     if stops.size == 0:
         raise ValueError("stop_t must have an entry for each particle, got none.")
     losses = np.sort(stops[np.isfinite(stops)])

@@ -10,15 +10,14 @@ import numpy as np
 from jaxtyping import Array
 from numpy.polynomial.polynomial import polyval
 
-from ...base.checks import array, electronvolts, instance, one_of, positive
+from ...base.checks import array, electronvolts, finite, in_range, instance, one_of, positive
 from ...base.printing import printable
 from ...observe import Crossings, Section, Stop
 from ...problem.discretise import discretise
 from ...problem.system import System
-from .._problem import nonzero
 from ._bounce import Pitch, SecondInvariant, at_crossings, centre_of, complete
 from ._classes import Trapping, largest_strength
-from ._field import Field, as_numbers, polynomial
+from ._field import Field, polynomial
 from ._motion import Angles, Breaking, Regular, continuous_hamiltonian, flux
 
 # CODATA 2018: e and the electronvolt exactly, and the mass of the alpha particle.
@@ -78,8 +77,8 @@ class GuidingCentres(eqx.Module):
     def __check_init__(self):
         instance("field", self.field, Field, "a Field, such as boozer.precise_qa()")
         electronvolts("energy of the particles", self.energy, 10.0)
-        positive("mass", self.mass)
-        nonzero("charge", self.charge)
+        in_range("mass", self.mass, 1e-31, 1e-24, "The unit is kg: 4 u are 6.64e-27.")
+        in_range("|charge|", abs(finite("charge", self.charge)), 0.01, 200.0, "The unit is e.")
         one_of("coordinates", self.coordinates, _CHARTS)
         if self.breaking is not None:
             shape, hint = self.field.coefficients.shape, "Take the result of Field.split."
@@ -155,7 +154,7 @@ class GuidingCentres(eqx.Module):
         **Raises** `ValueError` for s outside of [0, 1], or a pitch outside of [−1, 1].
         """
         for name, value, low in (("s", s, 0.0), ("pitch", pitch, -1.0)):
-            check_range(name, value, low)
+            in_range(name, value, low, 1.0)
         s, theta, zeta, pitch = jnp.broadcast_arrays(
             *(jnp.asarray(values, jnp.result_type(float)) for values in (s, theta, zeta, pitch))
         )
@@ -244,9 +243,3 @@ class _Edge(eqx.Module):
 
     def __call__(self, t, q, p, args):
         return flux(self.chart, q, p, args) - 1
-
-
-def check_range(name: str, value: Any, low: float) -> None:
-    numbers = as_numbers(name, value)
-    if wrong := numbers[~((numbers >= low) & (numbers <= 1))].ravel().tolist():
-        raise ValueError(f"{name} must be between {low:g} and 1, got {wrong[0]}.")

@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from ...base.checks import instance, positive, whole
+from ...base.checks import array, in_range, instance, known, positive, whole
 from ...base.results import RESULTS
 from ...integration.integrate import integrate
 from ...integration.reversible import Reversible
@@ -56,10 +56,10 @@ def symmetry_error(
     """
     instance("field", field, Field, "a Field, such as boozer.precise_qa()")
     periods, h = field.shape
+    points = array("points", known("points", points), (2,), integers=True, hint="They are (θ, ζ).")
+    in_range("surfaces", surfaces, 0.0, 1.0)
     N = periods * (h if helicity is None else whole("helicity", helicity, -99))
-    theta, zeta = (
-        2 * np.pi * np.arange(whole(f"points[{i}]", n)) / n for i, n in enumerate(points)
-    )
+    theta, zeta = (2 * np.pi * np.arange(whole("points", n)) / n for n in points)
     s, theta, zeta = np.meshgrid(np.asarray(surfaces, float), theta, zeta / periods, indexing="ij")
     s, theta, zeta = map(jnp.asarray, (s, theta, zeta))
     direction = jnp.full_like(theta, N), jnp.ones_like(zeta)
@@ -81,6 +81,7 @@ class _Weight(eqx.Module):
 
 def _run(particles: GuidingCentres, start: Any, duration: tuple[int, Any], **options: Any):
     """A run of one particle with `duration` = (num_steps, h), of which the last state is saved."""
+    start = array("start", jnp.asarray(start), (4,), integers=True, hint="It is s, θ, ζ, v∥/v0.")
     (num_steps, h), (q, p, args) = duration, particles.state(*start)
     args |= {"duration": num_steps * h}
     return integrate(

@@ -226,14 +226,10 @@ def polar_motion() -> Problem:
         parameters={
             "period": Parameter(433.0, "of the free wobble [day]"),
             "inverse_Q": Parameter(1 / 127, "1/Q, of either sign [1]", finite),
-            "prograde": _pair(
-                0.0065, -0.0138, "what drives the annual wobble, (real, imaginary) [arcsec]"
-            ),
+            "prograde": _pair(0.0065, -0.0138, "drive of the annual wobble (real, imag.) [arcsec]"),
             "retrograde": _pair(-0.0042, -0.0069, "the same, turning the other way [arcsec]"),
             "mean": _pair(0.0550, 0.3205, "mean pole (x, y) at t = 0 [arcsec]"),
-            "drift": _pair(
-                0.001677, 0.003460, "of the mean pole (x, y) in a year [arcsec/365.25 day]"
-            ),
+            "drift": _pair(0.001677, 0.003460, "of the mean pole (x, y) [arcsec/365.25 day]"),
         },
         observables=[amplitude, free_amplitude],
         autonomous=False,

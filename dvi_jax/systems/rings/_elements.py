@@ -2,14 +2,17 @@
 
 import dataclasses
 import math
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Literal, TypedDict, Unpack, get_args
 
 import jax.numpy as jnp
 import numpy as np
 
-from ...base.checks import array, finite, instance, one_of, positive, whole
-from ...base.keywords import checked_keywords
+from lanewise.jaxprs.jaxapi import is_traced
+
+from ...base.checks import array, finite, in_range, instance, one_of, positive, whole
+from ...base.keywords import checked_keywords, user_level
 from ...base.printing import printable
 from ...base.signature import check_takes, output_of
 from ._maps import KICKS, RingPart
@@ -34,7 +37,7 @@ class Element:
         instance("name of an element", self.name, str, "text")
         for key, value in self.values.items():
             if np.ndim(value) == 0:
-                finite(f"{key} of element {self.name!r}", value)
+                strength(f"{key} of element {self.name!r}", value)
 
     def placed(
         self,
@@ -64,14 +67,14 @@ class Element:
         values = {"dx": dx, "dy": dy, "roll": roll}
         further = {"ds": ds, "pitch": pitch, "yaw": yaw}
         for name, value in {**values, **further, "tilt": tilt}.items():
-            finite(f"{name} of element {self.name!r}", value)
+            strength(f"{name} of element {self.name!r}", value)
         middle = {"entrance": 0.0, "middle": 0.5}[one_of("anchor", anchor, get_args(Anchor))]
         element, name = self, "placed"
-        if tilt != 0:
+        if not _is_zero(tilt):
             element = element.within(RingPart("tilted_in"), RingPart("tilted_out"), tilt=tilt)
         # The ends of a curved element have different frames; those of other elements need them
         # only if they are inclined.
-        if "h" in self.values or any(value != 0 for value in further.values()):
+        if "h" in self.values or not all(map(_is_zero, further.values())):
             values, name = {**values, **further, "anchor": middle}, "moved"
         return element.within(RingPart(f"{name}_in"), RingPart(f"{name}_out"), **values)
 
@@ -86,10 +89,21 @@ class Element:
             ("ellipse", ellipse, ("radius_x", "radius_y")),
         ):
             if limits is not None:
-                if np.shape(limits) != (len(keys),):
+                is_list = isinstance(limits, Iterable) and not isinstance(limits, str)
+                if not is_list or len(list(limits)) != len(keys):
                     raise ValueError(
-                        f"{name} of element {self.name!r} must be ({', '.join(keys)}), got "
-                        f"{limits!r}."
+                        f"{name} of {self.name!r} must be ({', '.join(keys)}), got {limits!r}."
+                    )
+                pairs = zip(limits[::2], limits[1::2], strict=True)
+                widths = limits if name == "ellipse" else [high - low for low, high in pairs]
+                sizes = [width for width in widths if not is_traced(width)]
+                for width in sizes:
+                    positive(f"each width of the {name} of element {self.name!r}", width)
+                if max(sizes, default=0.0) > 2:
+                    warnings.warn(
+                        f"the {name} of element {self.name!r} has no effect, since particles are "
+                        f"lost at 1 m. The unit is m, got {limits!r}.",
+                        stacklevel=user_level(),
                     )
                 ends = RingPart(name), RingPart(name)
                 element = element.within(*ends, **dict(zip(keys, limits, strict=True)))
@@ -116,7 +130,7 @@ def drift(name: str, length: float, model: Model = "paraxial") -> Element:
     """A space without field."""
     one_of("model", model, get_args(Model))
     part = RingPart("drift" if model == "paraxial" else "exact_drift")
-    return Element(name, "drift", (part,), {"length": finite("length", length)})
+    return Element(name, "drift", (part,), {"length": strength("length", length)})
 
 
 def marker(name: str, kind: str = "marker") -> Element:
@@ -161,8 +175,8 @@ def multipole(
     """
     order, values = _field(name, b, a)
     slices, scheme, fringe, model = _slicing(**options)
-    values["length"] = finite("length", length)
-    if length == 0:
+    values["length"] = strength("length", length)
+    if _is_zero(length):
         return Element(name, kind, (RingPart("thin", order),), values)
     body = RingPart("straight" if model == "paraxial" else "exact_straight", order, scheme, slices)
     edge = "fringe" if model == "paraxial" else "multipole_fringe"
@@ -212,14 +226,14 @@ def bend(
 
     **Raises** `ValueError` for a length that is not positive.
     """
-    positive("length of a bend", length)
+    length = length if is_traced(length) else positive("length of a bend", length)
     order, values = _field(name, b, a)
-    values |= {"length": length, "h": finite("angle", angle) / length}
+    values |= {"length": length, "h": strength("angle", angle) / length}
     settings: dict[str, Any] = {**options}
     for end in ("edge_in", "edge_out", "fringe_in", "fringe_out"):
-        values[end] = finite(end, settings.pop(end, 0.0))
+        values[end] = strength(end, settings.pop(end, 0.0))
     slices, scheme, fringe, model = _slicing(**settings)
-    if model == "exact" and angle != 0:
+    if model == "exact" and not _is_zero(angle):
         ends = ["rotation", "dipole_fringe", *["gradient_fringe"] * fringe, "wedge"]
         body = RingPart("exact_bend", order, scheme, slices)
     else:
@@ -246,7 +260,7 @@ def lens(name: str, potential: Callable[..., Any], **values: float) -> Element:
     **Example** The kick in x of a McMillan map: ``rings.lens("M", lambda x, y, par: -par["g"] *
     jnp.log(1 + x * x) / 2, g=1.6)``
     """
-    values = {key: finite(f"{key} of lens {name!r}", value) for key, value in values.items()}
+    values = {key: strength(f"{key} of lens {name!r}", value) for key, value in values.items()}
     if "length" in values:
         raise ValueError(f"length of lens {name!r} is zero: use another name for its parameter.")
     check_takes("potential", potential, "(x, y, par)")
@@ -277,10 +291,12 @@ def cavity(
     `slip`: change of phase per turn [rad], 2π (f T − number of periods) for a frequency that is not
     a multiple of 1/T.
     """
+    if not is_traced(voltage):
+        in_range("voltage of a cavity", voltage, -1.0, 1.0, "It is that over the energy.")
     values = {"length": length, "voltage": voltage, "lag": lag, "phase": phase, "slip": slip}
     values["wave_number"] = 2 * math.pi * frequency / C
     half = RingPart("half_drift")
-    parts = (half, RingPart("cavity"), half) if length else (RingPart("cavity"),)
+    parts = (half, RingPart("cavity"), half) if not _is_zero(length) else (RingPart("cavity"),)
     return Element(name, "cavity", parts, values)
 
 
@@ -299,14 +315,28 @@ def aperture(
     return element
 
 
+def strength(name: str, value: Any) -> Any:
+    """A finite number, or one that is traced, so that results can be differentiated by it."""
+    return value if is_traced(value) and value.shape == () else finite(name, value)
+
+
+def _is_zero(value: Any) -> bool:
+    """Whether it is known to be zero. The parts of an element cannot depend on a traced value."""
+    return not is_traced(value) and value == 0
+
+
+def _coefficients(name: str, values: Any) -> tuple[Any, ...]:
+    return tuple(instance(name, values, Iterable, "a list, from n = 0 (dipole)"))
+
+
 def _field(name: str, b: Iterable[float], a: Iterable[float]) -> tuple[int, dict[str, Any]]:
-    b, a = tuple(b), tuple(a)
+    b, a = (_coefficients(f"{key} of element {name!r}", x) for key, x in (("b", b), ("a", a)))
     order = max(len(b), len(a), 1) - 1
     values = {}
     for key, coefficients in (("b", b), ("a", a)):
         for n in range(order + 1):
             value = coefficients[n] if n < len(coefficients) else 0.0
-            values[f"{key}{n}"] = finite(f"{key}{n} of element {name!r}", value)
+            values[f"{key}{n}"] = strength(f"{key}{n} of element {name!r}", value)
     return order, values
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Array
 
 import lanewise
 
-from ...base.checks import finite, positive, whole
+from ...base.checks import array, finite, in_range, known, positive, whole
 from ...base.printing import printable
 from ...base.progress import bar_of, reporter
 from ...dynamics.frequencies import frequencies, frequency_diffusion
@@ -176,7 +176,8 @@ def dynamic_aperture(
     grid: ``rings.track(ring, z, turns).lost``. **Raises** as `optics`; `ValueError`.
     """
     angles = np.linspace(0, np.pi, angles) if np.ndim(angles) == 0 else np.asarray(angles)
-    limits = [positive("largest", a) for a in largest]
+    limits = array("largest", known("largest", largest, float), (2,), hint="It is (x_max, y_max).")
+    in_range("largest", limits, 1e-9, 1.0, "The unit is m.")
     rays = jnp.stack([limits[0] * np.cos(angles), limits[1] * np.sin(angles)], 1)
     o, ring = optics(ring, dp, chromatic=False), ring if dp is None else four(ring)
 
@@ -205,7 +206,8 @@ def momentum_aperture(
     """
     orbit = optics(ring, chromatic=False).orbit
     first = np.repeat(np.arange(len(ring)) if where is None else ring.where(where), 2)
-    side = positive("largest", largest) * np.resize([-1.0, 1.0], len(first))
+    in_range("largest", largest, 1e-9, 1.0, "It is Δp/p, not per cent.")
+    side = largest * np.resize([-1.0, 1.0], len(first))
     begins, passage = orbit[first] + 1e-6 * _XY.sum(0)[None], Passage.from_ring(ring)
 
     def end_of_turn(passage, z, first):
@@ -238,6 +240,9 @@ def frequency_map(
     **Raises** `ValueError` for shapes that do not match; as `optics`. **Source** Laskar 2003.
     """
     o, ring = optics(ring, dp, chromatic=False), ring if dp is None else four(ring)
+    x, y = known("x", x, float), known("y", y, float)
+    if x.ndim and y.ndim:
+        array("y", y, x.shape, hint="x and y are arrays of one shape: use np.meshgrid.")
     xy = 1e-9 + np.stack(np.broadcast_arrays(x, y), -1).reshape(-1, 2)
     whole("turns", turns, 64)
 

@@ -13,7 +13,7 @@ from jaxtyping import Array
 import lanewise
 from lanewise.jaxprs.jaxapi import is_traced
 
-from ...base.checks import instance
+from ...base.checks import array, in_range, instance
 from ...base.inputs import real_numbers
 from ...base.printing import printable
 from ._maps import KICKS, Particle, RingPart, distinct, forward
@@ -142,7 +142,10 @@ def _analyse(ring: Ring, dp: Any, guess: Any, epsilon: Any, chromatic: bool, sta
     voltage = ring.columns.get("voltage", np.zeros(1))
     six = dp is None and (is_traced(voltage) or bool(np.any(np.asarray(voltage) != 0)))
     z = coordinates("guess", np.zeros(6) if guess is None else guess)
-    dp = None if dp is None else real_numbers("dp", dp)
+    if dp is not None:
+        dp = array("dp", real_numbers("dp", dp), (), hint="For several values use jax.vmap.")
+        if not is_traced(dp):
+            in_range("dp", dp, -1.0, 1.0, "It is Δp/p, not per cent.")
     if not six:
         z = z.at[4].set(0.0).at[5].set(0.0 if dp is None else dp)
     twiss, change = analysis(ring, z, jnp.asarray(epsilon, float), six, chromatic)

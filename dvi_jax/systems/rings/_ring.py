@@ -14,6 +14,7 @@ from jaxtyping import Array
 from lanewise.jaxprs.jaxapi import is_traced
 
 from ...base.checks import electronvolts, instance, whole
+from ...base.inputs import real_numbers
 from ...base.precision import require_double
 from ...base.printing import printable, short
 from ._elements import C, Element
@@ -87,9 +88,12 @@ class Ring(eqx.Module):
             parts,
             tuple(rows),
         )
+        # In NumPy, which is faster, unless a value is traced.
+        values = [x for element in elements for x in element.values.values()]
+        xp = jnp if any(map(is_traced, values)) else np
         names = {name: np.shape(x) for element in elements for name, x in element.values.items()}
         columns = {
-            name: np.stack([np.asarray(element.values.get(name, np.zeros(shape)), float)
+            name: xp.stack([xp.asarray(element.values.get(name, np.zeros(shape)), float)
                             for element in elements])
             for name, shape in sorted(names.items())
         }  # fmt: skip
@@ -142,8 +146,7 @@ class Ring(eqx.Module):
             numbers = np.atleast_1d(np.asarray(selection))
             if numbers.dtype.kind != "i" or (numbers >= len(self)).any() or (numbers < 0).any():
                 raise ValueError(
-                    f"elements must be a pattern of names or numbers from 0 to {len(self) - 1}, "
-                    f"got {selection!r}."
+                    f"elements must be a pattern or numbers below {len(self)}, got {selection!r}."
                 )
             return numbers
         matches = [
@@ -155,7 +158,7 @@ class Ring(eqx.Module):
             labels = sorted({*self.names, *self.kinds})
             suggestions = difflib.get_close_matches(selection, labels, 3, 0.4) or labels[:8]
             raise ValueError(
-                f"no element matches {selection!r}. Names are, for example: {suggestions}."
+                f"no element matches {selection!r}. Names are, for example, {suggestions}."
             )
         return np.asarray(matches)
 
@@ -169,7 +172,7 @@ class Ring(eqx.Module):
         for each of them. **Raises** `ValueError` for a parameter that an element does not have."""
         columns = dict(self.columns)
         for name, value in values.items():
-            numbers, value = self._numbers(selection, name), jnp.asarray(value)
+            numbers, value = self._numbers(selection, name), real_numbers(name, value)
             if value.ndim and len(value) != len(numbers):
                 raise ValueError(
                     f"{name} must be one number or {len(numbers)}, one for each element that "
