@@ -38,12 +38,12 @@ PACKAGES = ("dvi_jax", "lanewise", "dvi_jax_cli")
 LONGEST_FILE, MOST_PARAMETERS = 450, 9
 
 LIMITS: dict[str, float] = {
-    "lines of the core": 14_030,
+    "lines of the core": 14_050,
     "lines of the questions": 21_890,
-    "lines of the leaves": 19_870,
+    "lines of the leaves": 19_890,
     "lines of lanewise": 7_560,
     "lines of the command line": 5_580,
-    "raise statements": 645,
+    "raise statements": 640,
     "characters of error text": 45_000,
     "functions with more than 9 parameters": 2,
     "files of more than 450 lines": 0,
