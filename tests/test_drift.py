@@ -436,7 +436,7 @@ def test_pictures_show_what_was_excluded():
 
 
 def test_arguments_of_a_picture_of_orders():
-    with pytest.raises(ValueError, match=r"each of 2 results, got \[1\]"):
+    with pytest.raises(ValueError, match=r"for 2 results, got \[1\]"):
         plot.drift_orders([usual(), usual()], [1])
     with pytest.raises(TypeError, match="expected and promised are two names of one argument"):
         plot.drift_orders(usual(), 1, promised=1)

@@ -214,7 +214,7 @@ def test_invalid_input_is_rejected():
         ((bare,), {}, "must be a FitResult.*whitened", TypeError),
         ((fit,), {"arcs": 1}, "arcs must be .* 0 to 0, got 1"),
         ((fit,), {"component": "q"}, "component must be .*'q'"),
-        ((fit,), {"names": ["x"]}, r"2 names of the components, got \['x'\]"),
+        ((fit,), {"names": ["x"]}, r"2 names of components, got \['x'\]"),
         ((fit,), {"arcs": []}, "arcs is empty: choose"),
         ((fit,), {"axes": three}, r"needs 2 Axes, one for each panel.*got 3"),
     )
@@ -233,7 +233,7 @@ def test_invalid_input_is_rejected():
     refuses(
         plot.fit_against_data,
         ((bare,), {}, "must be a FitResult", TypeError),
-        ((fit,), {"names": "xy"}, "2 names of the components, got 'xy'"),
+        ((fit,), {"names": "xy"}, "2 names of components, got 'xy'"),
         ((fit,), {"arc": 2}, "arc must be .*got 2"),
         ((fit,), {"component": -1}, "component must be .*got -1"),
         ((fit,), {"curve": (X, X)}, "with 2 components"),

@@ -314,9 +314,9 @@ VALUE_ERRORS = {
     "at least 1, got 2.0": lambda: frequencies(TS, torus(), count=2.0),
     "from 1 to 21, got 22": lambda: frequencies(TS[:64], torus()[:64], count=22),
     "from 0 to 5, got 6": lambda: frequencies(TS, torus(), window=6),
-    "True, False, got 'no'": lambda: frequencies(TS, torus(), refine="no"),
 }
 TYPE_ERRORS = {
+    "refine must be True or False, got 'no'": lambda: frequencies(TS, torus(), refine="no"),
     "give the times first": lambda: frequencies(torus(), TS),
     "signal must be an array of numbers": lambda: frequencies(TS, ["a"] * N),
     "ts must be real, got dtype complex128": lambda: analysed().evaluate(1j),

@@ -111,7 +111,7 @@ CONDITIONS = {  # which are the same for all states of the box, but not for thos
     "minimum, maximum": lambda x: jnp.minimum(x, 2 * x) + jnp.maximum(x, 0.1) + jnp.fmax(x, 0.2),
     "floor, ceil, trunc": lambda x: (jnp.floor(x + 2) + jnp.ceil(-x) - jnp.trunc(x + 1)) * x,
     "round": lambda x: jnp.round(x + 0.3, 0) * x,
-    "mod, fmod": lambda x: jnp.mod(-x, 1.0) * jnp.fmod(-x - 2, 1.2) + x // 0.95,
+    "mod, fmod": lambda x: jnp.mod(-x, 1.0) * jnp.fmod(-x - 2, 1.5) + x // 0.95,
     "integers": lambda x: x * (x + 1.05).astype(int) + x.astype(bool),
     "computed index": lambda x: jnp.asarray(TABLE)[(x + 2.05).astype(int)] * x,
     "interp": lambda x: jnp.interp(x, jnp.asarray([0.0, 0.25, 0.95, 2.0]), TABLE),

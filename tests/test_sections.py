@@ -199,7 +199,7 @@ def diagram(q, p, **options):
 
 
 BAD = {
-    r"the same shape, got \(3, 2\) for q0 and \(2, 2\)": lambda q, p: section(q, p[:2]),
+    r"the same shape, got \(3, 2\) and \(2, 2\)": lambda q, p: section(q, p[:2]),
     r"first axis.*got shape \(\)": lambda q, p: section(0.0, 0.0),
     "num_steps must be an integer of at least 1": lambda q, p: section(q, p, num_steps=0),
     "orbits in q0, got length 2": lambda q, p: section(q, p, epsilon=[0.0, 0.1]),

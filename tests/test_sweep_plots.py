@@ -414,7 +414,7 @@ def test_invalid_input_is_rejected():
         ((np.ones(3),), {}, "must be an xarray.DataArray", TypeError),
         ((with_status(),), {}, "one variable.*drift, status", TypeError),
         ((two + 1j,), {}, "real numbers, got .* complex128", TypeError),
-        ((three,), {"facet": "a", "ax": ax}, "leave out ax"),
+        ((three,), {"facet": "a", "ax": ax}, "omit ax"),
         ((many,), {"facet": "dim_0"}, r"40 values.*at most 16.*slice\(None, None, 3\)"),
         ((drift(),), {"status": status}, "the same sweep and selection"),
     )

@@ -132,7 +132,7 @@ def as_parameter(leaf: Any) -> Any:
         leaf = np.asarray(leaf)
         refuse_double_without_x64("args", leaf.dtype)
         if leaf.dtype.kind in "OMm":
-            raise TypeError(f"args must contain arrays of numbers, got {leaf.dtype}: {leaf!s:.80}.")
+            raise TypeError(f"args must be arrays of numbers, got dtype {leaf.dtype}: {leaf!s:.80}")
         return jnp.asarray(leaf)
     if not isinstance(leaf, jax.Array):
         # Everything but arrays is static: compiled programs are looked up by its hash.

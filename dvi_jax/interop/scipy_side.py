@@ -214,7 +214,8 @@ def _halves(y0: Any, shape: Any) -> tuple[np.ndarray, np.ndarray]:
     shape = (y0.size // 2,) if shape is None else tuple(np.ravel(shape).tolist())
     if y0.ndim != 1 or y0.size == 0 or y0.size != 2 * math.prod(shape):
         raise ValueError(
-            f"y0 must be a vector of {size} length, q0 and then p0, got shape {y0.shape}."
+            f"y0 must be a vector with all of q0 and then all of p0, of {size} length, got shape "
+            f"{y0.shape}."
         )
     q0, p0 = np.split(y0, 2)
     return q0.reshape(shape), p0.reshape(shape)
