@@ -455,6 +455,8 @@ def test_other_functions_and_arguments_are_refused():
         (lambda: dvi.Brownian(0, substeps=0), ValueError, "substeps must be .* at least 1, got 0"),
         (lambda: dvi.invariant_diffusion(dvi.System(H_D), [1.0], [0.0], **how), ValueError,
          "must have noise"),
+        (lambda: dvi.invariant_diffusion(THERMAL, [1.0], [0.0], **how | {"invariant": lambda q, p: q}),
+         ValueError, "invariant must return a real scalar"),
     ):  # fmt: skip
         with pytest.raises(error, match=message):
             make()

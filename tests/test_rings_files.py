@@ -87,6 +87,12 @@ def test_elements_that_are_switched_off_are_read(read, element):
     assert read(with_element(element)).places[-1] == pytest.approx(10.0)
 
 
+@pytest.mark.parametrize("content", ["{broken", "[1, 2]", '{"a": 1}'])
+def test_a_json_file_that_is_no_lattice(read, content):
+    with pytest.raises(ValueError, match=r"file\.json cannot be read: "):
+        read(content, ".json")
+
+
 def test_what_elegant_has_and_pyat_does_not(read):
     lines = FODO[".lte"].replace("=(QF", "=(E,QF")
     for element, reason in (

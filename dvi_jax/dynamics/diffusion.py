@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ..base.checks import whole
+from ..base.checks import array, whole
 from ..base.keywords import checked_keywords
 from ..base.printing import printable
 from ..base.signature import with_time
@@ -105,7 +105,10 @@ def invariant_diffusion(
             """g_m·∇I, shape (m,)."""
             return jax.grad(rate)(none, *z)
 
-        rate = derivative_along(lambda q, p: value(t, q, p, args))
+        def number(q, p):
+            return array("invariant", value(t, q, p, args), (), verb="return")
+
+        rate = derivative_along(number)
         second = jnp.trace(jax.jacfwd(derivative_along(by_noise))(none, q, p))
         return jnp.stack([rate(none, q, p) + second / 2, jnp.sum(by_noise(q, p) ** 2)])
 

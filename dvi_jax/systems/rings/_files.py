@@ -66,11 +66,10 @@ def read_lattice(path: Path, use: str | None, options: dict[str, Any]) -> Any:
     suffix = path.suffix.lower()
     if suffix in _PARSERS:
         return _parsed(getattr(at, _PARSERS[suffix])(), path, use, options)
-    if suffix == ".json":
-        data = json.loads(path.read_text())
+    try:
+        data = json.loads(path.read_text()) if suffix == ".json" else {}
         if "__class__" in data and "atjson" not in data and not options.get("from_at"):
             return _of_xsuite(data, path, use, options)
-    try:
         return at.load_lattice(str(path), **({} if use is None else {"use": use}), **options)
     except KeyError as error:
         if "extension" not in str(error):
@@ -78,6 +77,8 @@ def read_lattice(path: Path, use: str | None, options: dict[str, Any]) -> Any:
         names = [*_PARSERS, ".mat", ".m", ".repr", ".json", ".lat"]
         message = f"path must end with one of {names}, got {path.name!r}."
         raise ValueError(message) from None
+    except (TypeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path.name} cannot be read: {error}") from error
 
 
 def _line_of(names: list[str], use: str | None, path: Path) -> str:
