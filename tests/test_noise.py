@@ -448,6 +448,7 @@ def test_what_does_not_fit_is_refused(more, message):
 
 def test_other_functions_and_arguments_are_refused():
     how = {"invariant": lambda q, p: q[0], "h": 0.1, "num_steps": 10, "args": ARGS}
+    vector = lambda q, p: q  # noqa: E731
     for make, error, message in (
         (lambda: dvi.drift_order(THERMAL, q0=[1.0], p0=[0.0], epsilons=[0.1], **how), ValueError,
          "must not have noise"),
@@ -455,7 +456,7 @@ def test_other_functions_and_arguments_are_refused():
         (lambda: dvi.Brownian(0, substeps=0), ValueError, "substeps must be .* at least 1, got 0"),
         (lambda: dvi.invariant_diffusion(dvi.System(H_D), [1.0], [0.0], **how), ValueError,
          "must have noise"),
-        (lambda: dvi.invariant_diffusion(THERMAL, [1.0], [0.0], **how | {"invariant": lambda q, p: q}),
+        (lambda: dvi.invariant_diffusion(THERMAL, [1.0], [0.0], **how | {"invariant": vector}),
          ValueError, "invariant must return a real scalar"),
     ):  # fmt: skip
         with pytest.raises(error, match=message):
