@@ -78,3 +78,35 @@ _MOVES = (
     "unstack pad rev copy convert_element_type stop_gradient"
 )
 _FREE = frozenset(_MOVES.split())
+
+
+LONG_CARRY, LONG_VALUE = 48, 4096
+
+
+def has_long_arrays(jaxpr: Any) -> bool:
+    """Whether a loop carries an array of more than 48 elements, or computes one of more than 4096
+    in a round. Rows that a loop collects do not count."""
+    for eqn in jaxpr.eqns:
+        functions = [*bodies(eqn), *functions_in(eqn)]
+        if eqn.primitive.name in ("scan", "while"):
+            for function in bodies(eqn):
+                if any(aval.size > LONG_CARRY for aval in _carried(eqn)) or _computes_long(function):
+                    return True
+        if any(has_long_arrays(function.jaxpr) for function in functions):
+            return True
+    return False
+
+
+def _carried(eqn: Any) -> list[Any]:
+    count = scan_counts(eqn.params)[1] if eqn.primitive.name == "scan" else len(eqn.outvars)
+    return [var.aval for var in eqn.outvars[:count]]
+
+
+def _computes_long(function: ClosedJaxpr) -> bool:
+    for eqn in function.jaxpr.eqns:
+        values = _carried(eqn) if eqn.primitive.name == "scan" else [v.aval for v in eqn.outvars]
+        if any(aval.size > LONG_VALUE for aval in values):
+            return True
+        if any(_computes_long(inner) for inner in (*bodies(eqn), *functions_in(eqn))):
+            return True
+    return False

@@ -145,7 +145,7 @@ def gather(evaluator: Evaluator, eqn: Any, values: list[Value], places: list) ->
     entries = evaluator.entries(value) if value.is_small else None
     small = Value(value.shape, value.dtype, entries, value.buffer)
     fill = params["fill_value"]
-    fill = b.const(_default_fill(value.dtype) if fill is None else fill, value.dtype)
+    fill = b.const(default_fill(value.dtype) if fill is None else fill, value.dtype)
     results = []
     for o in np.ndindex(*shape):
         where = tuple(o[d] for d in batch)
@@ -166,7 +166,7 @@ def gather(evaluator: Evaluator, eqn: Any, values: list[Value], places: list) ->
     return [evaluator.value(results, out.aval)]
 
 
-def _default_fill(dtype: str) -> Any:
+def default_fill(dtype: str) -> Any:
     """The value that JAX returns for elements outside of an array."""
     if np.issubdtype(dtype, np.floating):
         return np.nan

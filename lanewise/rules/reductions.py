@@ -16,7 +16,7 @@ def reduction(evaluator: Evaluator, eqn: Any, values: list[Value], places: list)
     (value,), (out,) = values, eqn.outvars
     op, axes = REDUCTIONS[eqn.primitive.name], tuple(eqn.params["axes"])
     if value.size == 0:
-        return [evaluator.constant(np.full(out.aval.shape, _neutral(op, value.dtype), value.dtype))]
+        return [evaluator.constant(np.full(out.aval.shape, neutral(op, value.dtype), value.dtype))]
     rows = np.moveaxis(evaluator.entries(value), axes, range(len(axes)))
     rows = rows.reshape((-1, out.aval.size))
     # From the first row to the last, whatever the batch is: another order has other bits.
@@ -28,7 +28,7 @@ def reduction(evaluator: Evaluator, eqn: Any, values: list[Value], places: list)
     return [evaluator.value(totals, out.aval)]
 
 
-def _neutral(op: str, dtype: str) -> Any:
+def neutral(op: str, dtype: str) -> Any:
     """The result of a reduction of nothing."""
     if op in ("max", "min"):
         if dtype == "bool":

@@ -6,10 +6,11 @@ XLA is no target: it compiles what all targets refuse.
 from collections.abc import Sequence
 from typing import Any
 
+from .elements import Elements
 from .numbers import Numbers
 from .target import Code as Code, CompiledProgram as CompiledProgram, Target as Target, compiled_by
 
-TARGETS: dict[str, tuple[Target, ...]] = {"cpu": (Numbers(),)}
+TARGETS: dict[str, tuple[Target, ...]] = {"cpu": (Elements(), Numbers())}
 
 
 def compile_program(

@@ -1,0 +1,9 @@
+"""Functions with long arrays as loops over elements: the lanes of a vector are neighbours in an
+array.
+
+`equations` makes a tree of statements (`tree`) from a jaxpr, with arrays as `boxes`; `schedule`
+joins statements into loops, `places` decides which arrays share memory, and `nests` and `code`
+write LLVM IR.
+"""
+
+from . import flow as flow, indices as indices, reductions as reductions  # they register rules

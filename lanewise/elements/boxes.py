@@ -1,0 +1,434 @@
+"""Arrays as boxes of their index space, each with an expression of the index.
+
+Slices, rolls, pads, concatenations and broadcasts change boxes and index maps; they compute nothing
+and write nothing.
+"""
+
+import itertools
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+SHORT = 8
+"""Axes of at most so many elements are written out; longer ones become loops."""
+
+_FUNCTIONS = frozenset(
+    "sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp exp2 expm1 log log1p "
+    "log2 cbrt erf erfc erf_inv logistic pow".split()
+)
+_OTHER_COSTS = {"div": 6, "sqrt": 6, "rsqrt": 12, "rem": 12}
+
+
+class NotABoxError(Exception):
+    """The result has no boxes: the array must be written to memory first."""
+
+
+class IndexMap(NamedTuple):
+    """i = rows · j + offsets: the index of an old array at the index j of a new one."""
+
+    rank: int  # of the new array
+    rows: tuple[tuple[int, ...], ...]
+    offsets: tuple[int, ...]
+
+
+class Expression:
+    """A number as a function of the index; equal expressions of a table are one object.
+
+    - ``known``: `value` is the number. ``number``: `value` is an object that holds a number of the
+      code, the same for all indices.
+    - ``index``: strides · index + offset.
+    - ``load``: an element of the memory `value`, at strides · index + offset, plus the argument if
+      there is one.
+    - ``operation``: `name` of the arguments, with the parameters `value`.
+
+    `depth`: the number of axes from the first to the last that it depends on. `cost`: operations
+    for each element. `height`: of the tree.
+    """
+
+    __slots__ = (
+        "args",
+        "cost",
+        "depth",
+        "dtype",
+        "height",
+        "kind",
+        "name",
+        "offset",
+        "serial",
+        "strides",
+        "table",
+        "value",
+    )
+
+    table: "Table"
+    serial: int
+    kind: str
+    name: str
+    strides: tuple[int, ...]
+    offset: int
+    args: tuple["Expression", ...]
+    dtype: str
+    value: Any
+    depth: int
+    cost: int
+    height: int
+
+    def moved(self, index_map: IndexMap) -> "Expression":
+        """The expression at the index ``index_map(j)``, as a function of j."""
+        key = (self.serial, index_map)
+        if key not in self.table.moves:
+            self.table.moves[key] = self._moved(index_map)
+        return self.table.moves[key]
+
+    def _moved(self, index_map: IndexMap) -> "Expression":
+        if self.kind in ("known", "number"):
+            return self
+        args = tuple(arg.moved(index_map) for arg in self.args)
+        strides, offset = self.strides, self.offset
+        if self.kind != "operation":
+            rows, offsets = index_map.rows, index_map.offsets
+            columns = range(index_map.rank)
+            offset += sum(s * x for s, x in zip(strides, offsets, strict=True))
+            strides = tuple(
+                sum(s * row[k] for s, row in zip(strides, rows, strict=True)) for k in columns
+            )
+        return self.table.expression(
+            self.kind, self.dtype, args, self.name, strides, offset, self.value
+        )
+
+    def loads(self, visited: set[int]) -> Iterable["Expression"]:
+        """The loads and numbers in it that were not visited yet."""
+        stack = [self]
+        while stack:
+            node = stack.pop()
+            if node.serial in visited:
+                continue
+            visited.add(node.serial)
+            if node.kind in ("load", "number"):
+                yield node
+            stack += node.args
+
+
+class Table:
+    """The expressions of one program."""
+
+    def __init__(self):
+        self.moves: dict[Any, Expression] = {}
+        self._expressions: dict[Any, Expression] = {}
+
+    def expression(
+        self,
+        kind: str,
+        dtype: str,
+        args: tuple[Expression, ...] = (),
+        name: str = "",
+        strides: tuple[int, ...] = (),
+        offset: int = 0,
+        value: Any = None,
+        key: Any = None,
+    ) -> Expression:
+        # An operation's parameters are part of its name; other values have a key or are objects.
+        which = key if key is not None else None if kind == "operation" else id(value)
+        full = (kind, dtype, tuple(a.serial for a in args), name, strides, offset, which)
+        old = self._expressions.get(full)
+        if old is not None:
+            return old
+        new = self._expressions[full] = Expression()
+        new.table, new.serial, new.kind, new.dtype = self, len(self._expressions), kind, dtype
+        new.args, new.name, new.strides, new.offset, new.value = args, name, strides, offset, value
+        own_depth = max((axis + 1 for axis, s in enumerate(strides) if s), default=0)
+        new.depth = max([own_depth, *(a.depth for a in args)])
+        # What is the same for all elements is computed before the loops over them.
+        cost = 0
+        if kind == "operation" and new.depth:
+            word = name.split()[0]
+            cost = 24 if word in _FUNCTIONS else _OTHER_COSTS.get(word, 1)
+        new.cost = cost + sum(a.cost for a in args)
+        new.height = 1 + max((a.height for a in args), default=0)
+        return new
+
+    def known(self, value: Any, dtype: Any) -> Expression:
+        number = np.asarray(value, dtype)[()]
+        return self.expression("known", str(dtype), value=number, key=number.tobytes())
+
+    def operation(self, name: str, params: dict, args: Sequence[Expression], dtype: Any):
+        key = f"{name} {sorted(params.items())!r}" if params else name
+        return self.expression("operation", str(dtype), tuple(args), key, value=params)
+
+
+class Box(NamedTuple):
+    """The indices lower ≤ i < upper, and the expression there."""
+
+    lower: tuple[int, ...]
+    upper: tuple[int, ...]
+    expression: Expression
+
+
+class Array:
+    """Disjoint boxes that fill an index space."""
+
+    def __init__(self, table: Table, shape: Sequence[int], dtype: Any, boxes: Sequence[Box]):
+        self.table, self.shape, self.dtype = table, tuple(map(int, shape)), str(dtype)
+        self.boxes = list(boxes)
+
+    @classmethod
+    def uniform(cls, expression: Expression, shape: Sequence[int]) -> "Array":
+        """One expression for all elements."""
+        boxes = [Box((0,) * len(shape), tuple(map(int, shape)), expression)]
+        size = math.prod(shape)
+        return cls(expression.table, shape, expression.dtype, boxes if size else [])
+
+    @property
+    def size(self) -> int:
+        return math.prod(self.shape)
+
+    @property
+    def expression(self) -> Expression | None:
+        """The expression, if it is one for the whole array."""
+        return self.boxes[0].expression if len(self.boxes) == 1 else None
+
+    @property
+    def cost(self) -> int:
+        return max((box.expression.cost for box in self.boxes), default=0)
+
+    @property
+    def height(self) -> int:
+        return max((box.expression.height for box in self.boxes), default=0)
+
+    @property
+    def is_written_out(self) -> bool:
+        """Whether all axes are short: the array is a few numbers."""
+        return all(n <= SHORT for n in self.shape)
+
+    def loads(self) -> list[Expression]:
+        """The loads and the numbers in its expressions."""
+        visited: set[int] = set()
+        return [node for box in self.boxes for node in box.expression.loads(visited)]
+
+    def moved(self, shape: Sequence[int], rows: Sequence[Sequence[int]], offsets) -> "Array":
+        """The array whose element j is this one's element rows · j + offsets."""
+        rank = len(shape)
+        index_map = IndexMap(rank, tuple(tuple(r) for r in rows), tuple(int(x) for x in offsets))
+        boxes = []
+        for lower, upper, expression in self.boxes:
+            low, high, is_empty = [0] * rank, list(map(int, shape)), False
+            axes = zip(index_map.rows, index_map.offsets, lower, upper, strict=True)
+            for row, offset, first, end in axes:
+                uses = [(k, s) for k, s in enumerate(row) if s]
+                if not uses:
+                    is_empty |= not first <= offset < end
+                    continue
+                ((k, s),) = uses
+                if s > 0:
+                    start, stop = -((offset - first) // s), -((offset - end) // s)
+                else:
+                    start, stop = -((end - 1 - offset) // -s), (offset - first) // -s + 1
+                low[k], high[k] = max(low[k], start), min(high[k], stop)
+            if not is_empty and all(p < q for p, q in zip(low, high, strict=True)):
+                boxes.append(Box(tuple(low), tuple(high), expression.moved(index_map)))
+        return Array(self.table, shape, self.dtype, boxes)
+
+    def along(self, shape: Sequence[int], axes: Sequence[int | None], offsets=None) -> "Array":
+        """The same elements with other axes: axis a of this array is `axes[a]` of the new one, or
+        has one index, that in `offsets`, where it is None."""
+        rows = [[int(k == axis) for k in range(len(shape))] for axis in axes]
+        return self.moved(shape, rows, [0] * len(axes) if offsets is None else offsets)
+
+    def components(self) -> tuple[list[int], list[int], dict[tuple[int, ...], "Array"]]:
+        """The short axes, the long ones, and for each index of the short axes the array of the
+        long ones."""
+        short = [a for a, n in enumerate(self.shape) if n <= SHORT]
+        long = [a for a, n in enumerate(self.shape) if n > SHORT]
+        shape, parts = [self.shape[a] for a in long], {}
+        for index in itertools.product(*(range(self.shape[a]) for a in short)):
+            offsets = [0] * len(self.shape)
+            for a, i in zip(short, index, strict=True):
+                offsets[a] = i
+            axes = [long.index(a) if a in long else None for a in range(len(self.shape))]
+            parts[index] = self.along(shape, axes, offsets)
+        return short, long, parts
+
+
+def common_boxes(arrays: Sequence[Array]) -> list[tuple[tuple, tuple, tuple[Expression, ...]]]:
+    """The boxes in which every one of some arrays of one shape has one expression."""
+    cells: list[Any] = [(lower, upper, (node,)) for lower, upper, node in arrays[0].boxes]
+    for array in arrays[1:]:
+        refined = []
+        for lower, upper, nodes in cells:
+            for first, end, node in array.boxes:
+                low, high = tuple(map(max, lower, first)), tuple(map(min, upper, end))
+                if all(p < q for p, q in zip(low, high, strict=True)):
+                    refined.append((low, high, (*nodes, node)))
+        cells = refined
+    return cells
+
+
+def joined(boxes: Iterable[Box], rank: int) -> list[Box]:
+    """The same array with fewer boxes: neighbours with one expression become one."""
+    boxes = list(boxes)
+    for axis in range(rank) if len(boxes) > 1 else ():
+        rows: dict[Any, list[Box]] = {}
+        for box in sorted(boxes, key=lambda box: box.lower):
+            lower, upper = list(box.lower), list(box.upper)
+            lower[axis] = upper[axis] = 0
+            row = rows.setdefault((box.expression.serial, *lower, *upper), [])
+            if row and row[-1].upper[axis] == box.lower[axis]:
+                row[-1] = Box(row[-1].lower, box.upper, box.expression)
+            else:
+                row.append(box)
+        boxes = [box for row in rows.values() for box in row]
+    return boxes
+
+
+def elementwise(name: str, params: dict, args: Sequence[Array], shape, dtype) -> Array:
+    """An operation on each element; axes of length 1 and arrays without axes are repeated."""
+    shape = tuple(shape)
+    args = [a if a.shape == shape else repeat(a, shape) for a in args]
+    table = args[0].table
+    boxes = [
+        Box(lower, upper, table.operation(name, params, nodes, dtype))
+        for lower, upper, nodes in common_boxes(args)
+    ]
+    return Array(table, shape, dtype, joined(boxes, len(shape)))
+
+
+def repeat(x: Array, shape: Sequence[int], dimensions: Sequence[int] | None = None) -> Array:
+    """`broadcast_in_dim`; without `dimensions` the axes are the first ones."""
+    dimensions = range(len(x.shape)) if dimensions is None else dimensions
+    axes = [k if n == shape[k] else None for n, k in zip(x.shape, dimensions, strict=True)]
+    return x.along(shape, axes)
+
+
+# --- primitives that move elements ----------------------------------------------------------------
+
+
+def _broadcast_in_dim(x: Array, *, shape, broadcast_dimensions) -> Array:
+    return repeat(x, shape, broadcast_dimensions)
+
+
+def _reshape(x: Array, *, new_sizes, dimensions=None) -> Array:
+    if dimensions is not None:
+        x = _transpose(x, permutation=dimensions)
+    old = [a for a, n in enumerate(x.shape) if n != 1]
+    new = [k for k, n in enumerate(new_sizes) if n != 1]
+    if [x.shape[a] for a in old] != [new_sizes[k] for k in new]:
+        raise NotABoxError
+    axes: list[int | None] = [None] * len(x.shape)
+    for a, k in zip(old, new, strict=True):
+        axes[a] = k
+    return x.along(new_sizes, axes)
+
+
+def _squeeze(x: Array, *, dimensions) -> Array:
+    return _reshape(x, new_sizes=[n for a, n in enumerate(x.shape) if a not in dimensions])
+
+
+def _expand_dims(x: Array, *, dimensions) -> Array:
+    sizes = iter(x.shape)
+    rank = len(x.shape) + len(dimensions)
+    return _reshape(x, new_sizes=[1 if a in dimensions else next(sizes) for a in range(rank)])
+
+
+def _slice(x: Array, *, start_indices, limit_indices, strides=None) -> Array:
+    rank = len(x.shape)
+    strides = strides or (1,) * rank
+    ends = zip(start_indices, limit_indices, strides, strict=True)
+    shape = [max(0, -((first - end) // step)) for first, end, step in ends]
+    rows = [[int(strides[a]) if a == k else 0 for k in range(rank)] for a in range(rank)]
+    return x.moved(shape, rows, start_indices)
+
+
+def _transpose(x: Array, *, permutation) -> Array:
+    axes = [list(permutation).index(a) for a in range(len(x.shape))]
+    return x.along([x.shape[p] for p in permutation], axes)
+
+
+def _rev(x: Array, *, dimensions) -> Array:
+    rank = len(x.shape)
+    signs = [-1 if a in dimensions else 1 for a in range(rank)]
+    rows = [[signs[a] if a == k else 0 for k in range(rank)] for a in range(rank)]
+    return x.moved(x.shape, rows, [n - 1 if s < 0 else 0 for n, s in zip(x.shape, signs)])  # noqa: B905
+
+
+def _split(x: Array, *, sizes, axis) -> tuple[Array, ...]:
+    parts, start = [], 0
+    for n in sizes:
+        first, end = [0] * len(x.shape), list(x.shape)
+        first[axis], end[axis] = start, start + n
+        parts.append(_slice(x, start_indices=first, limit_indices=end))
+        start += n
+    return tuple(parts)
+
+
+def _unstack(x: Array, *, axis) -> tuple[Array, ...]:
+    parts = _split(x, sizes=[1] * x.shape[axis], axis=axis)
+    return tuple(_squeeze(part, dimensions=(axis,)) for part in parts)
+
+
+def _shifted(x: Array, start: Sequence[int], shape: Sequence[int]) -> list[Box]:
+    """The boxes of an array whose element 0 is element `start` of a larger one."""
+    rank = len(shape)
+    rows = [[int(a == k) for k in range(rank)] for a in range(rank)]
+    return x.moved(shape, rows, [-s for s in start]).boxes
+
+
+def _concatenate(*xs: Array, dimension) -> Array:
+    shape = list(xs[0].shape)
+    shape[dimension] = sum(x.shape[dimension] for x in xs)
+    boxes, start = [], [0] * len(shape)
+    for x in xs:
+        boxes += _shifted(x, start, shape)
+        start[dimension] += x.shape[dimension]
+    return Array(xs[0].table, shape, xs[0].dtype, joined(boxes, len(shape)))
+
+
+def _stack(*xs: Array, axis) -> Array:
+    return _concatenate(*(_expand_dims(x, dimensions=(axis,)) for x in xs), dimension=axis)
+
+
+def _tile(x: Array, *, reps) -> Array:
+    for axis, count in enumerate(reps):
+        x = _concatenate(*[x] * count, dimension=axis)
+    return x
+
+
+def _pad(x: Array, fill: Array, *, padding_config) -> Array:
+    if any(inner for *_, inner in padding_config):
+        raise NotABoxError
+    sizes = zip(x.shape, padding_config, strict=True)
+    shape = [max(0, n + int(low) + int(high)) for n, (low, high, _) in sizes]
+    start = [int(low) for low, *_ in padding_config]
+    (node,) = (box.expression for box in fill.boxes)
+    boxes = _shifted(x, start, shape)
+    sides = zip(start, x.shape, shape, strict=True)
+    inside = [(min(max(s, 0), m), max(min(s + n, m), 0)) for s, n, m in sides]
+    if any(p >= q for p, q in inside):
+        return Array.uniform(node, shape)
+    for axis, end in enumerate(shape):
+        # Outside of x along this axis, and inside along those before it.
+        front, back = inside[:axis], [(0, n) for n in shape[axis + 1 :]]
+        for side in ((0, inside[axis][0]), (inside[axis][1], end)):
+            edges = [*front, side, *back]
+            if all(p < q for p, q in edges):
+                boxes.append(Box(tuple(p for p, _ in edges), tuple(q for _, q in edges), node))
+    return Array(x.table, shape, x.dtype, joined(boxes, len(shape)))
+
+
+BOX_MOVES: dict[str, Callable] = {
+    "broadcast_in_dim": _broadcast_in_dim,
+    "reshape": _reshape,
+    "squeeze": _squeeze,
+    "expand_dims": _expand_dims,
+    "slice": _slice,
+    "transpose": _transpose,
+    "rev": _rev,
+    "split": _split,
+    "unstack": _unstack,
+    "concatenate": _concatenate,
+    "stack": _stack,
+    "tile": _tile,
+    "pad": _pad,
+}
+"""Name of a primitive → function of arrays; **raises** `NotABoxError`."""

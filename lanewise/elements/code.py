@@ -1,0 +1,182 @@
+"""The kernel of a program on long arrays: one trajectory after the other."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ..evaluator import Evaluator
+from ..jaxprs.jaxapi import ClosedJaxpr
+from ..llvm.ir import Num, check_type
+from ..llvm.memory import stored_type
+from ..module import Module
+from .equations import Translation, row_major
+from .nests import Nests
+from .places import places
+from .schedule import Group, dead_memories, schedule
+from .tree import Block, Branch, Loop, Memory
+
+
+class Kernel:
+    """The text of a kernel, and what it needs: bytes of memory and constants."""
+
+    def __init__(self, module: Module, function: ClosedJaxpr, lane_flags: Sequence[bool]):
+        self.module, self.b = module, module.b
+        jaxpr = function.jaxpr
+        for v in (*jaxpr.invars, *jaxpr.outvars):
+            check_type(v.aval.dtype, "arguments and results")
+        translation = Translation()
+        inputs = [_outside(v.aval) for v in jaxpr.invars]
+        results = [_outside(v.aval) for v in jaxpr.outvars]
+        arrays = [memory.load(translation.table) for memory in inputs]
+        outs = translation.evaluate(function, arrays, [memory.place for memory in results])
+        for x, memory in zip(outs, results, strict=True):
+            if x.size:
+                translation.store(x, memory.place)
+        program = translation.block
+        schedule(program)
+        dead = dead_memories(program)
+        at, self.scratch = places(program, dead)
+        self.operands = tuple(array for _, array in translation.operands)
+        self.nests = Nests(Evaluator(module), at, dead)
+        self._count = len(jaxpr.invars), len(jaxpr.outvars)
+        bases = self._pointers("%args", "a", len(inputs) + len(self.operands))
+        ends = self._pointers("%rets", "r", len(results))
+        constants = [memory for memory, _ in translation.operands]
+        self.nests.pointers |= dict(zip(constants, bases[len(inputs) :], strict=True))
+
+        def trajectory(i: str) -> None:
+            lane = self.b.new(f"add i64 %first, {i}")
+            for memory, base, has_lanes in zip(inputs, bases, lane_flags, strict=False):
+                self.nests.pointers[memory] = self._lane(base, memory, lane) if has_lanes else base
+            for memory, base in zip(results, ends, strict=True):
+                self.nests.pointers[memory] = self._lane(base, memory, lane)
+            self.block(program)
+
+        self.b.repeat("%count", trajectory)
+
+    def _pointers(self, source: str, letter: str, count: int) -> list[str]:
+        for i in range(count):
+            self.b.emit(f"%{letter}p{i} = getelementptr ptr, ptr {source}, i64 {i}")
+            self.b.emit(f"%{letter}{i} = load ptr, ptr %{letter}p{i}")
+        return [f"%{letter}{i}" for i in range(count)]
+
+    def _lane(self, base: str, memory: Memory, lane: str) -> str:
+        distance = self.b.new(f"mul i64 {lane}, {memory.size}")
+        return self.b.pointer(stored_type(memory.dtype), base, distance)
+
+    # --- loops and branches ----------------------------------------------------------------------
+
+    def block(self, block: Block) -> None:
+        for item in block.items:
+            if isinstance(item, Group):
+                self.nests.group(item)
+            elif isinstance(item, Loop):
+                self.loop(item)
+            else:
+                self.branch(item)
+
+    def numbers(self, expressions: Sequence[Any]) -> list[Num]:
+        with self.nests.scalars():
+            return [self.b.opaque(self.nests.number(node, [])) for node in expressions]
+
+    def loop(self, loop: Loop) -> None:
+        b, nests = self.b, self.nests
+        carried = [number for number, _, _ in loop.numbers]
+        start = self.numbers([first for _, first, _ in loop.numbers])
+        if loop.length is not None:
+            end = self.module.parameter(loop.length)
+
+        def begin(state: Sequence[Num], counter: str) -> None:
+            nests.numbers.update(zip(carried, state, strict=True))
+            nests.numbers[loop.counter] = b.number([counter], "int64", False)
+
+        def test(state: list[Num], counter: str) -> str:
+            begin(state, counter)
+            if loop.length is not None:
+                return b.new(f"icmp slt i64 {counter}, {end.names[0]}")
+            self.block(loop.test)
+            (goes_on,) = self.numbers([loop.condition])
+            return b.ref(goes_on, 0, False)
+
+        def body(state: list[Num], counter: str) -> list[Num]:
+            self.block(loop.body)
+            after = self.numbers([after for _, _, after in loop.numbers])
+            for now, new in loop.memories:
+                self.copy(new, now)
+            return after
+
+        with nests.scalars():
+            flags = [False] * len(start)
+        final = b.loop(start, flags, test, body, count=True)
+        nests.numbers.update(zip(carried, final, strict=True))
+
+    def copy(self, source: Memory, target: Memory) -> None:
+        nests = self.nests
+        if nests.places[source] == nests.places[target]:
+            return
+        size = source.size * np.dtype(source.dtype).itemsize
+        self.b.declare("void @llvm.memcpy.p0.p0.i64(ptr, ptr, i64, i1)")
+        to, of = nests.pointer(target), nests.pointer(source)
+        self.b.emit(f"call void @llvm.memcpy.p0.p0.i64(ptr {to}, ptr {of}, i64 {size}, i1 false)")
+
+    def branch(self, branch: Branch) -> None:
+        (index,) = self.numbers([branch.index])
+        dtypes = [number.dtype for number, _ in branch.numbers]
+
+        def run(i: int) -> list[Num]:
+            self.block(branch.blocks[i])
+            return self.numbers([of[i] for _, of in branch.numbers])
+
+        def from_block(i: int) -> list[Num]:
+            if i == len(branch.blocks) - 1:
+                return run(i)
+            b = self.b
+            # The index is cut: all that is less than 1 is the first block.
+            takes = b.compare("le", index, b.const(i, index.dtype))
+            if takes.value is not None:
+                return run(i) if takes.value else from_block(i + 1)
+            vec = [False] * len(dtypes)
+            return b.branch(b.ref(takes, 0, False), lambda: run(i), lambda: from_block(i + 1), vec, dtypes)
+
+        results = from_block(0)
+        self.nests.numbers.update(zip((n for n, _ in branch.numbers), results, strict=True))
+
+    # --- text ------------------------------------------------------------------------------------
+
+    def text(self, head: int) -> str:
+        """`head`: parameters in front of those of the results."""
+        module, b = self.module, self.b
+        _, outs = self._count
+        prologue = ["  %lanes = load i64, ptr %params", "  %count = sub i64 %last, %first"]
+        for i in range(len(module.values)):
+            prologue += [
+                f"  %par{i}.at = getelementptr i64, ptr %params, i64 {head + outs + i}",
+                f"  %par{i} = load i64, ptr %par{i}.at",
+            ]
+        epilogue = []
+        if self.scratch:
+            b.declarations |= {"declare ptr @malloc(i64)", "declare void @free(ptr)"}
+            prologue += [
+                f"  %memory = call ptr @malloc(i64 {self.scratch + 64})",
+                "  %address = ptrtoint ptr %memory to i64",
+                "  %up = add i64 %address, 63",
+                "  %aligned = and i64 %up, -64",
+                "  %scratch = inttoptr i64 %aligned to ptr",
+            ]
+            epilogue.append("  call void @free(ptr %memory)")
+        body = "\n".join([*prologue, *self.nests.head, *b.lines, *epilogue, "  ret void"])
+        declarations = "\n".join(sorted(module.declarations | b.declarations))
+        functions = "\n".join(module.functions.values())
+        front = (
+            "define internal void @lanewise_kernel(ptr %args, ptr %rets, ptr %params, "
+            "i64 %first, i64 %last) alignstack(64) align 64 {\nentry:"
+        )
+        return "\n".join(["\n".join(module.globals), declarations, functions, front, body, "}\n"])
+
+
+def _outside(aval: Any) -> Memory:
+    """An operand or a result: its pointer is known when the code runs."""
+    return Memory(aval.shape, aval.dtype, row_major(aval.shape), pointer="outside")
+
+

@@ -1,0 +1,540 @@
+"""Loops over the elements of arrays: the code of one group of statements.
+
+The lanes of a vector are neighbours along the innermost axis. Numbers are computed by the rules of
+`lanewise.rules.elementwise`, those of a value that is the same for all elements as scalars.
+"""
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+
+from ..evaluator import Evaluator
+from ..llvm.ir import Num
+from ..llvm.memory import stored_type
+from ..rules.elementwise import ELEMENTWISE
+from ..rules.reductions import neutral
+from .boxes import Array, Expression, common_boxes
+from .schedule import Group, arrays
+from .tree import Let, Memory, Number, Reduce, Statement, Store, Update
+
+PARTIAL_SUMS = 32
+"""Element k of a row is added to partial sum k mod 32, whatever the length of a vector is."""
+
+_CHEAP = 40  # bodies of so many operations are repeated until one vector of each partial sum is done
+_FEW = 4  # columns of fewer elements are computed one by one
+
+
+class Nests:
+    """Writes groups. `pointers` and `numbers` hold what is known by name in the code so far."""
+
+    def __init__(self, evaluator: Evaluator, places: dict[Memory, int], dead: set[Memory]):
+        self.e, self.b = evaluator, evaluator.b
+        self.vector_width = self.b.W
+        self.places, self.dead = places, dead
+        self.pointers: dict[Memory, str] = {}
+        self.numbers: dict[Number, Num] = {}
+        self.head: list[str] = []  # lines of the entry of the function
+        self._sums: dict[Reduce, str] = {}
+        self._group: Group | None = None
+
+    # --- groups ----------------------------------------------------------------------------------
+
+    def group(self, group: Group) -> None:
+        statements = [s for s in group.statements if not isinstance(s, Let)]
+        if not group.shape:
+            with self.scalars():
+                for s in group.statements:
+                    self.scalar_statement(s)
+            return
+        if len(statements) == 1 and isinstance(statements[0], Update):
+            self.update(statements[0])
+            return
+        of_each = [[array for array in arrays(s)][-1] for s in statements]
+        cells = []
+        for lower, upper, nodes in sorted(common_boxes(of_each), key=lambda c: c[:2]):
+            items = list(zip(statements, nodes, strict=True))
+            if items := [(s, node) for s, node in items if not self.is_in_place(s, node)]:
+                cells.append((lower, upper, items))
+        if not cells:
+            return
+        self._group = group
+        self.b.scopes.append({})
+        for s in statements:
+            if isinstance(s, Reduce):
+                self.begin_reduction(s, group.shape, cells)
+        for lower, upper, items in cells:
+            with self.scope():
+                self.nest(lower, upper, items, [])
+        for s in statements:
+            if isinstance(s, Reduce) and isinstance(s.result, Number):
+                self.numbers[s.result] = self.total(s)
+        self.b.scopes.pop()
+
+    def is_in_place(self, s: Statement, node: Expression) -> bool:
+        """Whether a statement would copy an element to where it is."""
+        if not isinstance(s, Store) or node.kind != "load" or node.args or s.memory in self.dead:
+            return False
+        if node is s.target:
+            return True
+        mine, other = self.places.get(s.memory), self.places.get(node.value)
+        is_same = mine is not None and mine == other and s.memory.dtype == node.dtype
+        return is_same and (node.strides, node.offset) == (s.strides, s.offset)
+
+    def scalar_statement(self, s: Statement) -> None:
+        x = self.number(arrays(s)[-1].boxes[0].expression, [])
+        if isinstance(s, Let):
+            self.numbers[s.number] = self.b.opaque(x)
+        elif isinstance(s, Update):
+            self.update_element(s, self.number(s.distance.boxes[0].expression, []), x, [])
+        elif isinstance(s, Store):
+            if s.memory not in self.dead:
+                self.store(self.address(s.memory, s.strides, s.offset, []), x, 0)
+            self.b.note(("node", s.target.serial), self.b.opaque(x))
+        else:
+            raise AssertionError("a reduction without axes")
+
+    def nest(self, lower, upper, items, index: list[Num]) -> None:
+        """Loops over the axes from number len(index) on."""
+        b, d, rank = self.b, len(index), len(lower)
+        with self.scalars():
+            self.hoist(items, d, index)
+        sums = [s for s, _ in items if isinstance(s, Reduce) and self.first_summed(s) == d > 0]
+        for s in sums:
+            self.clear(s)
+        if d < rank - 1:
+            first = b.const(lower[d], "int64")
+
+            def turn(i: Num) -> None:
+                self.nest(lower, upper, items, [*index, b.add(i, first)])
+
+            self.count(upper[d] - lower[d], turn)
+        else:
+            self.innermost(lower[d], upper[d], items, index)
+        for s in sums:
+            with self.scope():
+                total = self.total(s)
+                with self.scalars():
+                    where = self.address(s.memory, s.strides, s.offset, index)  # pyright: ignore[reportArgumentType]
+                    if s not in self._direct:
+                        total = self.e.combine(s.op, self.load(where, s.array.dtype, 0), total)
+                    self.store(where, total, 0)
+
+    def innermost(self, lower: int, upper: int, items, index: list[Num]) -> None:
+        """The loop over the innermost axis, in vectors."""
+        b, count, W = self.b, upper - lower, self.vector_width
+
+        def at(i: Num, step: int, first: int) -> Num:
+            return b.add(b.mul(i, b.const(step, "int64")), b.const(lower + first, "int64"))
+
+        if count < _FEW:
+            with self.scalars():
+                for k in range(count):
+                    with self.scope():
+                        self.body(items, [*index, b.const(lower + k, "int64")], None, k)
+            return
+        sums = [s for s, _ in items if isinstance(s, Reduce) and self.first_summed(s) is not None]
+        cost = sum(node.cost for _, node in items)
+        vectors, rest = divmod(count, W)
+        repeats = PARTIAL_SUMS // W if sums and cost < _CHEAP else 1
+        rounds = vectors // repeats
+        if rounds:
+
+            def turn(i: Num) -> None:
+                for u in range(repeats):
+                    k = b.const(u * W, "int64")
+                    if sums and repeats == 1:  # a long body: its partial sum by a computed index
+                        k = b.mul(b.logic("and", i, b.const(PARTIAL_SUMS // W - 1, "int64")), b.const(W, "int64"))
+                    with self.scope():
+                        self.body(items, [*index, at(i, repeats * W, u * W)], None, k)
+
+            self.count(rounds, turn)
+        for v in range(rounds * repeats, vectors):
+            with self.scope():
+                start = b.const(lower + v * W, "int64")
+                self.body(items, [*index, start], None, v * W % PARTIAL_SUMS)
+        if rest:
+            bits = ", ".join(f"i1 {'true' if i < rest else 'false'}" for i in range(W))
+            with self.scope():
+                start = b.const(lower + vectors * W, "int64")
+                self.body(items, [*index, start], f"<{bits}>", vectors * W % PARTIAL_SUMS)
+
+    def body(self, items, index: list[Num], mask: str | None, k: "Num | int") -> None:
+        """All statements at one place of the loops; `k`: where a row's partial sum is."""
+        b = self.b
+        # All loads before all stores: an array may be written over another one.
+        results = []
+        for s, node in items:
+            x = self.number(node, index, mask)
+            results.append((s, x))
+            if isinstance(s, Store):
+                b.note(("node", s.target.serial), b.opaque(x))
+        for s, x in results:
+            if isinstance(s, Store):
+                if s.memory not in self.dead:
+                    where = self.address(s.memory, s.strides, s.offset, index)
+                    self.store(where, x, s.strides[-1], mask)
+                continue
+            if self.first_summed(s) is None:
+                assert s.memory is not None
+                where, stride = self.address(s.memory, s.strides, s.offset, index), s.strides[-1]
+                old = self.load(where, s.array.dtype, stride, mask)
+                self.store(where, self.e.combine(s.op, old, x), stride, mask)
+                continue
+            dtype = s.array.dtype
+            where = b.new(f"getelementptr {stored_type(dtype)}, ptr {self._sums[s]}, i64 {self.ref(k)}")
+            old = self.load(where, dtype, 1)
+            new = self.e.combine(s.op, old, x)
+            if mask is not None:
+                kind, bits = b.type(dtype, True), b.type("bool", True)
+                names = b.ref(new, 0, True), b.ref(old, 0, True)
+                chosen = b.new(f"select {bits} {mask}, {kind} {names[0]}, {kind} {names[1]}")
+                new = b.number([chosen], dtype, True)
+            self.store(where, new, 1)
+
+    def ref(self, k: "Num | int") -> str:
+        return str(k) if isinstance(k, int) else self.b.ref(k, 0, False)
+
+    def hoist(self, items, depth: int, index: list[Num]) -> None:
+        """Compute what depends on the loops that are opened so far and on no others."""
+        visited: set[int] = set()
+        assert self._group is not None
+
+        def visit(node: Expression) -> None:
+            if node.serial in visited:
+                return
+            visited.add(node.serial)
+            if node.depth > depth:
+                for arg in node.args:
+                    visit(arg)
+            elif node.kind not in ("known", "number") and not self._group.is_handed_on(node):  # pyright: ignore[reportOptionalMemberAccess]
+                self.number(node, index)
+
+        for _, node in items:
+            visit(node)
+
+    # --- reductions ------------------------------------------------------------------------------
+
+    def first_summed(self, s: Reduce) -> int | None:
+        """The axis from which on all axes vanish: their sums are kept in registers. None if the
+        innermost axis is kept."""
+        d = len(s.strides)
+        while d > 0 and d - 1 in s.axes:
+            d -= 1
+        return d if d < len(s.strides) else None
+
+    def begin_reduction(self, s: Reduce, shape, cells) -> None:
+        self._direct = getattr(self, "_direct", set())
+        item = stored_type(s.array.dtype)
+        if self.first_summed(s) is not None and s not in self._sums:
+            name = f"%sums{len(self._sums)}"
+            self.head.append(f"  {name} = alloca [{PARTIAL_SUMS} x {item}], align 64")
+            self._sums[s] = name
+        if isinstance(s.result, Number):
+            self.clear(s)
+            return
+        # A row that is one cell gives the result at once.
+        d = self.first_summed(s)
+        if d is not None and s.axes == set(range(d, len(shape))):
+            if all(low[d:] == (0,) * (len(shape) - d) and up[d:] == tuple(shape[d:]) for low, up, _ in cells):
+                self._direct.add(s)
+                return
+        kept = [k for k in range(len(shape)) if k not in s.axes]
+        start = Array.uniform(s.array.table.known(neutral(s.op, s.array.dtype), s.array.dtype), [shape[k] for k in kept])
+        fill = Store(s.result, [s.strides[k] for k in kept], s.offset, start)
+        group, self._group = self._group, Group(start.shape, [fill])
+        for lower, upper, node in start.boxes:
+            with self.scope():
+                self.nest(lower, upper, [(fill, node)], [])
+        self._group = group
+
+    def clear(self, s: Reduce) -> None:
+        """All partial sums of nothing."""
+        dtype = s.array.dtype
+        x = self.b.const(neutral(s.op, dtype), dtype)
+        for k in range(0, PARTIAL_SUMS, self.vector_width):
+            where = self.b.new(f"getelementptr {stored_type(dtype)}, ptr {self._sums[s]}, i64 {k}")
+            self.store(where, x, 1)
+
+    def total(self, s: Reduce) -> Num:
+        """The partial sums combined by halves: in one order for all lengths of vectors."""
+        b, dtype, W = self.b, s.array.dtype, self.vector_width
+        item, vectors = stored_type(dtype), []
+        for k in range(0, PARTIAL_SUMS, W):
+            where = b.new(f"getelementptr {item}, ptr {self._sums[s]}, i64 {k}")
+            vectors.append(self.load(where, dtype, 1))
+        while len(vectors) > 1:
+            half = len(vectors) // 2
+            vectors = [
+                self.e.combine(s.op, x, y)
+                for x, y in zip(vectors[:half], vectors[half:], strict=True)
+            ]
+        kind, name = b.type(dtype, True), b.ref(vectors[0], 0, True)
+        with self.scalars():
+            ones = [
+                b.number([b.new(f"extractelement {kind} {name}, i64 {i}")], dtype, False)
+                for i in range(W)
+            ]
+            while len(ones) > 1:
+                half = len(ones) // 2
+                ones = [
+                    self.e.combine(s.op, x, y) for x, y in zip(ones[:half], ones[half:], strict=True)
+                ]
+        return b.opaque(ones[0])
+
+    # --- updates at computed places --------------------------------------------------------------
+
+    def update(self, s: Update) -> None:
+        """Elements written one after the other, or in vectors if all are moved by one distance."""
+        self._group = Group(s.array.shape, [s])
+        distance = s.distance.expression
+        is_uniform = s.op is None and distance is not None and distance.depth == 0
+        for lower, upper, (node, far) in sorted(common_boxes([s.array, s.distance]), key=lambda c: c[:2]):
+            with self.scope():
+                self._update(s, lower, upper, node, far, [], is_uniform)
+
+    def _update(self, s: Update, lower, upper, node, far, index: list[Num], is_uniform) -> None:
+        b, d = self.b, len(index)
+        if d < len(lower) - int(is_uniform):
+            first = b.const(lower[d], "int64")
+
+            def turn(i: Num) -> None:
+                self._update(s, lower, upper, node, far, [*index, b.add(i, first)], is_uniform)
+
+            self.count(upper[d] - lower[d], turn)
+        elif not is_uniform:
+            with self.scalars():
+                self.update_element(s, self.number(far, index), self.number(node, index), index)
+        else:
+            with self.scalars():
+                by = self.number(far, index)
+                self.hoist([(s, node)], d, index)
+
+            def part(start: Num, mask: str | None, stride: int) -> None:
+                here = [*index, start]
+                x = self.number(node, here, mask)
+                where = self.address(s.memory, s.strides, s.offset, here, by)
+                self.store(where, x, stride, mask)
+
+            self.in_vectors(lower[d], upper[d], part, s.strides[-1])
+
+    def in_vectors(self, lower: int, upper: int, part: Callable, stride: int) -> None:
+        b, W = self.b, self.vector_width
+        vectors, rest = divmod(upper - lower, W)
+
+        def turn(i: Num) -> None:
+            start = b.add(b.mul(i, b.const(W, "int64")), b.const(lower, "int64"))
+            part(start, None, stride)
+
+        if vectors:
+            self.count(vectors, turn)
+        if rest:
+            bits = ", ".join(f"i1 {'true' if i < rest else 'false'}" for i in range(W))
+            with self.scope():
+                part(b.const(lower + vectors * W, "int64"), f"<{bits}>", stride)
+
+    def update_element(self, s: Update, distance: Num, x: Num, index: list[Num]) -> None:
+        b = self.b
+        if s.op is None:
+            self.store(self.address(s.memory, s.strides, s.offset, index, distance), x, 0)
+            return
+        # A negative distance says that there is no such element.
+        is_inside = b.compare("ge", distance, b.const(0, "int64"))
+        where = self.address(s.memory, s.strides, s.offset, index, b.maximum(distance, b.const(0, "int64")))
+        old = self.load(where, s.array.dtype, 0)
+        if s.op == "":
+            new = x
+        else:
+            new = b.sub(old, x) if s.op == "sub" else self.e.combine(s.op, old, x)
+        self.store(where, b.select(is_inside, new, old), 0)
+
+    # --- numbers ---------------------------------------------------------------------------------
+
+    @contextlib.contextmanager
+    def scope(self) -> Iterator[None]:
+        self.b.scopes.append({})
+        yield
+        self.b.scopes.pop()
+
+    @contextlib.contextmanager
+    def scalars(self) -> Iterator[None]:
+        """Code without vectors; its numbers are good for vectors too."""
+        before, self.b.W = self.b.W, 1
+        yield
+        self.b.W = before
+
+    def count(self, length: int, turn: Callable[[Num], None]) -> None:
+        """``turn(i)`` for i = 0, …, length − 1."""
+        b = self.b
+        if length == 1:
+            with self.scope():
+                turn(b.const(0, "int64"))
+            return
+        b.repeat(length, lambda i: turn(b.number([i], "int64", False)))
+
+    def number(self, node: Expression, index: Sequence[Num], mask: str | None = None) -> Num:
+        """The value of an expression, at an index of which the last part begins a vector."""
+        b = self.b
+        if node.kind == "number":
+            return self.numbers[node.value]
+        if node.kind == "known":
+            return b.const(node.value, node.dtype)
+        key = ("node", node.serial)
+        x = b.find(key)
+        if x is not None:
+            return x
+        varies = b.W > 1 and bool(node.strides) and len(index) == len(node.strides)
+        varies = varies and node.strides[-1] != 0
+        if node.kind == "operation":
+            args = [self.number(arg, index, mask) for arg in node.args]
+            x = ELEMENTWISE[node.name.split()[0]](self.e, node.value or {}, *args)
+        elif node.kind == "load":
+            by = self.number(node.args[0], index, mask) if node.args else None
+            if by is not None and by.vec:
+                x = self.gather(node, index, by, mask, varies)
+            else:
+                where = self.address(node.value, node.strides, node.offset, index, by)
+                x = self.load(where, node.dtype, node.strides[-1] if varies else 0, mask)
+        else:
+            x = self.linear(node.strides, node.offset, index)
+            if varies:
+                steps = ", ".join(f"i64 {node.strides[-1] * i}" for i in range(b.W))
+                name = b.new(f"add {b.type('int64', True)} {b.ref(x, 0, True)}, <{steps}>")
+                x = b.number([name], "int64", True)
+            x = b.convert(x, node.dtype)
+        b.note(key, x)
+        return x
+
+    def linear(self, strides: Sequence[int], offset: int, index: Sequence[Num]) -> Num:
+        b, total = self.b, self.b.const(offset, "int64")
+        for stride, i in zip(strides, index, strict=False):
+            if stride:
+                total = b.add(b.mul(i, b.const(stride, "int64")), total)
+        return total
+
+    def pointer(self, memory: Memory) -> str:
+        """The first element of a memory."""
+        if memory.whole is not None:
+            whole = self.pointer(memory.whole)
+            assert memory.distance is not None
+            with self.scalars():
+                distance = self.number(memory.distance, [])
+            return self.b.pointer(stored_type(memory.dtype), whole, self.b.ref(distance, 0, False))
+        if memory not in self.pointers:
+            name = f"%memory{len(self.pointers)}"
+            start = self.places[memory]
+            self.head.append(f"  {name} = getelementptr i8, ptr %scratch, i64 {start}")
+            self.pointers[memory] = name
+        return self.pointers[memory]
+
+    def address(self, memory: Memory, strides, offset: int, index, by: Num | None = None) -> str:
+        b = self.b
+        distance = self.linear(strides, offset, index)
+        if by is not None:
+            distance = b.add(distance, by)
+        return b.pointer(stored_type(memory.dtype), self.pointer(memory), b.ref(distance, 0, False))
+
+    # --- memory ----------------------------------------------------------------------------------
+
+    def _steps(self, where: str, item: str, stride: int) -> str:
+        steps = ", ".join(f"i64 {stride * i}" for i in range(self.b.W))
+        return self.b.new(f"getelementptr {item}, ptr {where}, <{self.b.W} x i64> <{steps}>")
+
+    def load(self, where: str, dtype: str, stride: int, mask: str | None = None) -> Num:
+        """A vector of elements with a stride, or with stride 0 one element for all."""
+        b, item = self.b, stored_type(dtype)
+        size, W = _item_bytes(dtype), self.b.W
+        if W == 1 or stride == 0:
+            name = b.new(f"load {item}, ptr {where}, align {size}")
+            if dtype == "bool":
+                name = b.new(f"icmp ne i8 {name}, 0")
+            return b.number([name], dtype, False)
+        kind, bits = f"<{W} x {item}>", f"<{W} x i1>"
+        if stride == 1 and mask is None:
+            name = b.new(f"load {kind}, ptr {where}, align {size}")
+        elif stride == 1:
+            name = self._masked(
+                "load", kind, f"v{W}{_suffix(item)}", "p0", f"ptr {where}", "ptr", size, f"{bits} {mask}", ""
+            )
+        else:
+            pointers = self._steps(where, item, stride)
+            name = self._gathered(pointers, kind, item, size, mask)
+        return self._number(name, kind, dtype)
+
+    def _number(self, name: str, kind: str, dtype: str) -> Num:
+        if dtype == "bool":
+            name = self.b.new(f"icmp ne {kind} {name}, zeroinitializer")
+        return self.b.number([name], dtype, True)
+
+    def gather(self, node: Expression, index, by: Num, mask: str | None, varies: bool) -> Num:
+        """Elements at distances that differ within a vector."""
+        b, item, W = self.b, stored_type(node.dtype), self.b.W
+        where = self.address(node.value, node.strides, node.offset, index)
+        distances = b.ref(by, 0, True)
+        if varies:
+            steps = ", ".join(f"i64 {node.strides[-1] * i}" for i in range(W))
+            distances = b.new(f"add <{W} x i64> {distances}, <{steps}>")
+        pointers = b.new(f"getelementptr {item}, ptr {where}, <{W} x i64> {distances}")
+        kind = f"<{W} x {item}>"
+        name = self._gathered(pointers, kind, item, _item_bytes(node.dtype), mask)
+        return self._number(name, kind, node.dtype)
+
+    def _gathered(self, pointers: str, kind: str, item: str, size: int, mask: str | None) -> str:
+        W = self.b.W
+        bits = f"<{W} x i1> {mask or 'splat (i1 true)'}"
+        return self._masked(
+            "gather", kind, f"v{W}{_suffix(item)}", f"v{W}p0", f"<{W} x ptr> {pointers}", f"<{W} x ptr>", size, bits, ""
+        )
+
+    def _masked(self, word, kind, suffix, of, pointer, pointer_type, size, bits, value) -> str:
+        """A masked load, store, gather or scatter; `value` is what a store writes."""
+        b, name = self.b, f"@llvm.masked.{word}.{suffix}.{of}"
+        mask_type = bits.split(" ", 3)
+        mask_type = " ".join(mask_type[:3])
+        typed, address = pointer.rsplit(" ", 1)
+        if value:
+            b.declare(f"void {name}({kind}, {pointer_type}, {mask_type})")
+            b.emit(f"call void {name}({kind} {value}, {typed} align {size} {address}, {bits})")
+            return ""
+        b.declare(f"{kind} {name}({pointer_type}, {mask_type}, {kind})")
+        return b.new(
+            f"call {kind} {name}({typed} align {size} {address}, {bits}, {kind} zeroinitializer)"
+        )
+
+    def store(self, where: str, x: Num, stride: int, mask: str | None = None) -> None:
+        b, dtype = self.b, x.dtype
+        item, size, W = stored_type(dtype), _item_bytes(dtype), self.b.W
+        is_vector = W > 1 and stride != 0
+        name = b.ref(x, 0, is_vector)
+        kind, bits = (f"<{W} x {item}>" if is_vector else item), f"<{W} x i1>"
+        if dtype == "bool":
+            name = b.new(f"zext {b.type('bool', is_vector)} {name} to {kind}")
+        if not is_vector or stride == 1 and mask is None:
+            b.emit(f"store {kind} {name}, ptr {where}, align {size}")
+        elif stride == 1:
+            self._masked(
+                "store", kind, f"v{W}{_suffix(item)}", "p0", f"ptr {where}", "ptr", size, f"{bits} {mask}", name
+            )
+        else:
+            pointers = self._steps(where, item, stride)
+            self._masked(
+                "scatter",
+                kind,
+                f"v{W}{_suffix(item)}",
+                f"v{W}p0",
+                f"<{W} x ptr> {pointers}",
+                f"<{W} x ptr>",
+                size,
+                f"{bits} {mask or 'splat (i1 true)'}",
+                name,
+            )
+
+
+def _suffix(item: str) -> str:
+    return {"double": "f64", "float": "f32"}.get(item, item)
+
+
+def _item_bytes(dtype: str) -> int:
+    return np.dtype(dtype).itemsize
+
+

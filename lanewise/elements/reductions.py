@@ -1,0 +1,157 @@
+"""Sums and other reductions of long arrays, matrix products, running sums."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from ..llvm.ir import NotCompilable
+from ..rules.moves import CUMULATIVE, REDUCTIONS
+from ..rules.reductions import neutral
+from .boxes import Array, Box, elementwise
+from .equations import ARRAY_RULES, Translation, expand
+from .tree import Memory, Number, Reduce
+
+
+def reduction(translation: Translation, eqn: Any, x: Array) -> list[Array]:
+    op, (out,) = REDUCTIONS[eqn.primitive.name], eqn.outvars
+    return [reduced(translation, x, op, eqn.params["axes"], out.aval.shape)]
+
+
+def reduced(translation: Translation, x: Array, op: str, axes: Sequence[int], shape) -> Array:
+    """The elements combined along some axes."""
+    if not x.size:
+        return Array.uniform(translation.table.known(neutral(op, x.dtype), x.dtype), shape)
+    if op == "and" and all(_is_finiteness(box) for box in x.boxes):
+        return _all_finite(translation, x, axes, shape)
+    short, long, parts = x.components()
+    kept = [a for a in range(len(x.shape)) if a not in axes]
+    # Short axes first, from the first element to the last.
+    totals: dict[tuple, Array] = {}
+    for index, part in parts.items():
+        key = tuple(i for a, i in zip(short, index, strict=True) if a not in axes)
+        old = totals.get(key)
+        totals[key] = part if old is None else combined(op, old, part)
+    short_kept = [kept.index(a) for a in short if a not in axes]
+    vanish = [k for k, a in enumerate(long) if a in axes]
+    if not vanish:
+        return translation.from_components(totals, shape, short_kept)
+    if len(vanish) == len(long):
+        for key, part in totals.items():
+            number = Number(x.dtype)
+            translation.add(Reduce(number, [0] * len(long), 0, part, op, vanish))
+            totals[key] = Array.uniform(translation.number(number), ())
+        return translation.from_components(totals, shape, short_kept)
+    memory = Memory(shape, x.dtype)
+    order = _order(totals.values(), len(long))
+    for key, part in totals.items():
+        offset = sum(memory.strides[a] * i for a, i in zip(short_kept, key, strict=True))
+        strides = [
+            0 if k in vanish else memory.strides[kept.index(long[k])] for k in order
+        ]
+        turned = part.along([part.shape[k] for k in order], [order.index(k) for k in range(len(long))])
+        axes_of_turned = [order.index(k) for k in vanish]
+        translation.add(Reduce(memory, strides, offset, turned, op, axes_of_turned))
+    return memory.load(translation.table)
+
+
+def _order(parts, rank: int) -> list[int]:
+    """The axes, with the one last along which most operands are contiguous."""
+    strides = [node.strides for part in parts for node in part.loads() if node.kind == "load"]
+
+    def contiguous(k: int) -> tuple[int, int]:
+        steps = [s[k] for s in strides if len(s) == rank]
+        return sum(s == 1 for s in steps) - sum(s > 1 for s in steps), k
+
+    last = max(range(rank), key=contiguous)
+    return [k for k in range(rank) if k != last] + [last]
+
+
+def combined(op: str, x: Array, y: Array) -> Array:
+    return elementwise(op, {}, [x, y], x.shape, x.dtype)
+
+
+def _is_finiteness(box: Box) -> bool:
+    node = box.expression
+    return node.kind == "operation" and node.name == "is_finite"
+
+
+def _all_finite(translation: Translation, x: Array, axes: Sequence[int], shape) -> Array:
+    # The sum of 0·x is NaN if an element is not finite: one operation for each, no comparison.
+    table, boxes = x.table, []
+    dtype = x.boxes[0].expression.args[0].dtype
+    for lower, upper, node in x.boxes:
+        (arg,) = node.args
+        zero = table.known(0, arg.dtype)
+        boxes.append(Box(lower, upper, table.operation("mul", {}, [arg, zero], arg.dtype)))
+    total = reduced(translation, Array(table, x.shape, dtype, boxes), "add", axes, shape)
+    return elementwise("is_finite", {}, [total], shape, "bool")
+
+
+def matrix_product(translation: Translation, eqn: Any, x: Array, y: Array) -> list[Array]:
+    (of_x, of_y), (batch_x, batch_y) = eqn.params["dimension_numbers"]
+    (out,) = eqn.outvars
+    dtype = str(out.aval.dtype)
+    if dtype == "bool":
+        raise NotCompilable("a matrix product of truth values")
+    x, y = translation.convert(x, dtype), translation.convert(y, dtype)
+    free_x = [a for a in range(len(x.shape)) if a not in (*of_x, *batch_x)]
+    free_y = [a for a in range(len(y.shape)) if a not in (*of_y, *batch_y)]
+    shape = [*(x.shape[a] for a in (*batch_x, *free_x)), *(y.shape[a] for a in free_y)]
+    frame = [*shape, *(x.shape[a] for a in of_x)]
+    axes_x, axes_y = [0] * len(x.shape), [0] * len(y.shape)
+    for k, a in enumerate((*batch_x, *free_x)):
+        axes_x[a] = k
+    for k, a in enumerate(batch_y):
+        axes_y[a] = k
+    for k, a in enumerate(free_y):
+        axes_y[a] = len(batch_x) + len(free_x) + k
+    for k, (a, c) in enumerate(zip(of_x, of_y, strict=True)):
+        axes_x[a] = axes_y[c] = len(shape) + k
+    product = combined("mul", x.along(frame, axes_x), y.along(frame, axes_y))
+    if not of_x:
+        return [product]
+    return [reduced(translation, product, "add", range(len(shape), len(frame)), shape)]
+
+
+def _running(op: str) -> Callable:
+    operations: dict[str, Callable] = {"add": jnp.add, "mul": jnp.multiply}
+    operations |= {"max": jnp.maximum, "min": jnp.minimum}
+
+    def function(x, *, axis, reverse):
+        rows = jnp.moveaxis(x, axis, 0)
+        start = jnp.full(rows.shape[1:], neutral(op, str(x.dtype)), x.dtype)
+
+        def step(total, row):
+            total = operations[op](total, row)
+            return total, total
+
+        _, totals = lax.scan(step, start, rows, reverse=reverse)
+        return jnp.moveaxis(totals, 0, axis)
+
+    return function
+
+
+def argument(is_largest: bool) -> Callable:
+    """argmax, argmin: the first of the largest, or the first NaN."""
+
+    def function(x, *, axes, index_dtype):
+        (axis,) = axes
+        best = (jnp.max if is_largest else jnp.min)(x, axis, keepdims=True)
+        # The largest of numbers with a NaN is NaN, and equal to none of them.
+        hits = (x == best) | ((x != x) & (best != best))
+        places = lax.broadcasted_iota(index_dtype, x.shape, axis)
+        most = np.iinfo(index_dtype).max
+        return jnp.min(jnp.where(hits, places, jnp.asarray(most, index_dtype)), axis)
+
+    return function
+
+
+ARRAY_RULES |= dict.fromkeys(REDUCTIONS, reduction)
+ARRAY_RULES |= {"dot_general": matrix_product}
+ARRAY_RULES |= {name: expand(_running(op)) for name, op in CUMULATIVE.items()}
+ARRAY_RULES |= {"argmax": expand(argument(True)), "argmin": expand(argument(False))}
+

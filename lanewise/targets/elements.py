@@ -1,0 +1,45 @@
+"""The target for long arrays on CPUs: loops over their elements, one trajectory after the other."""
+
+from collections.abc import Sequence
+
+from ..elements.code import Kernel
+from ..jaxprs.extent import has_long_arrays, operation_count
+from ..jaxprs.jaxapi import ClosedJaxpr
+from ..module import Module
+from ..native import handler, machine
+from .numbers import HEAD
+from .target import Code
+
+
+class Elements:
+    """Vectors of neighbours in an array, where a loop carries or computes long ones."""
+
+    name = "elements"
+
+    def suits(self, function: ClosedJaxpr) -> bool:
+        return has_long_arrays(function.jaxpr)
+
+    def write(
+        self, function: ClosedJaxpr, lane_flags: Sequence[bool], lanes: int, width: int | None
+    ) -> Code:
+        return self.write_for(function, lane_flags, machine.width())
+
+    def write_for(self, function: ClosedJaxpr, lane_flags: Sequence[bool], width: int) -> Code:
+        """The code for vectors of `width` numbers."""
+        module = Module(width, 1)
+        kernel = Kernel(module, function, lane_flags)
+        return Code(
+            kernel.text(HEAD),
+            block=1,
+            values=tuple(module.values),
+            operands=kernel.operands,
+            operations=operation_count(function.jaxpr),
+            scratch=kernel.scratch,
+            width=width,
+        )
+
+    def register(self, code: Code) -> str:
+        return handler.register(handler.module_text(code.text, code.block))
+
+    def assembly(self, code: Code) -> str:
+        return machine.assembly(handler.module_text(code.text, code.block))
