@@ -341,9 +341,10 @@ def _wanted(outs: Sequence[Any], places: Sequence[Place | None], needed: Sequenc
         if isinstance(token, Token) and place is not None:
             wanted.setdefault(token, place)
     for eqn, inputs, tokens in needed if wanted else ():  # from the last one to the first
-        place, name, first = wanted.get(tokens[0]), eqn.primitive.name, inputs[0]
-        if place is None:
+        place, name = wanted.get(tokens[0]), eqn.primitive.name
+        if place is None or not inputs:
             continue
+        first = inputs[0]
         shapes = [v.aval.shape for v in eqn.invars]
         if name == "concatenate":
             axis, start = eqn.params["dimension"], 0

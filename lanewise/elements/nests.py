@@ -43,7 +43,7 @@ class Nests:
     def group(self, group: Group) -> None:
         statements = [s for s in group.statements if not isinstance(s, Let)]
         if not group.shape:
-            with self.scalars():
+            with self.scalars(), self.scope():  # what is stored here may be updated later
                 for s in group.statements:
                     self.scalar_statement(s)
             return

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from .boxes import Expression
-from .schedule import Group, written
+from .schedule import Group, reads, written
 from .tree import Block, Branch, Loop, Memory, Store
 
 
@@ -83,7 +83,10 @@ class Lives:
         old: dict[Memory, list[Expression]] = {}
         for node in group.memory_reads():
             old.setdefault(node.value.root, []).append(node)
-        for memory in sorted(made, key=lambda m: m.serial):
+        # The order of the program, for the walk goes backwards.
+        for memory in sorted(made, key=lambda m: -m.serial):
+            own = [s for s in group.statements if written(s) is memory]
+            read = {n.value for s in own for n in reads(s) if n.kind == "load"}
             if memory not in self.order:
                 self.order.append(memory)
             self._conflict(memory, live | made)
@@ -91,7 +94,7 @@ class Lives:
                 if other is memory:
                     continue
                 if _takes_over(group, memory, other, nodes):
-                    if other not in live:
+                    if other not in live and other in read:
                         self._wish(memory, other)
                 else:
                     self._conflict(memory, [other])
