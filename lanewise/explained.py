@@ -25,7 +25,10 @@ class Part:
     - `reason`: why XLA computes it, None where machine code is generated.
     - `operations`: on numbers of one trajectory, loops counted once; a fused multiply-add is one.
     - `width`, `vectors`: numbers in a vector, vectors in a block.
-    - `scratch`: bytes of a block for rows that are not results.
+    - `target`: ``"numbers"`` if a vector holds one number of several trajectories,
+      ``"elements"`` if it holds neighbouring elements of an array of one trajectory.
+    - `loops`, `stores`: of ``"elements"``: loops over elements, and arrays that they write.
+    - `scratch`: bytes of a block for rows that are not results, or of a trajectory for arrays.
     - `spills`: instructions of the machine code that move a register to or from the stack.
     - `ir`: the module's LLVM IR, before optimisation.
     """
@@ -37,6 +40,9 @@ class Part:
     scratch: int = 0
     spills: int = 0
     ir: str = ""
+    target: str = "numbers"
+    loops: int = 0
+    stores: int = 0
 
     @property
     def assembly(self) -> str:
@@ -46,6 +52,12 @@ class Part:
     def __str__(self) -> str:
         if self.reason is not None:
             return f"left to XLA: {self.reason}"
+        if self.target == "elements":
+            return (
+                f"machine code: {self.operations} operations in {self.loops} loops over the "
+                f"elements of arrays, {self.stores} arrays written, vectors of {self.width} "
+                f"neighbours, {self.scratch} bytes of memory a trajectory"
+            )
         return (
             f"machine code: {self.operations} operations, blocks of {self.width * self.vectors} "
             f"trajectories ({self.vectors} vectors of {self.width}), {self.scratch} bytes of "
@@ -144,4 +156,17 @@ def _parts(program: Any, batch: int) -> list[Part]:
     assembly = result.target.assembly(code)
     spills = len(re.findall(r"\bv?mov[a-z0-9]*\s+.*\((?:%rsp|sp)\)", assembly))
     ir = handler.module_text(code.text, code.block)
-    return [Part(None, code.operations, code.width, code.vectors, code.scratch, spills, ir)]
+    return [
+        Part(
+            None,
+            code.operations,
+            code.width,
+            code.vectors,
+            code.scratch,
+            spills,
+            ir,
+            result.target.name,
+            code.loops,
+            code.stores,
+        )
+    ]

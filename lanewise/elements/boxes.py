@@ -14,9 +14,9 @@ import numpy as np
 SHORT = 8
 """Axes of at most so many elements are written out; longer ones become loops."""
 
-_FUNCTIONS = frozenset(
+_FUNCTIONS = (
     "sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp exp2 expm1 log log1p "
-    "log2 cbrt erf erfc erf_inv logistic pow".split()
+    "log2 cbrt erf erfc erf_inv logistic pow"
 )
 _OTHER_COSTS = {"div": 6, "sqrt": 6, "rsqrt": 12, "rem": 12}
 
@@ -100,7 +100,7 @@ class Expression:
 
     def loads(self, visited: set[int]) -> Iterable["Expression"]:
         """The loads and numbers in it that were not visited yet."""
-        stack = [self]
+        stack: list[Expression] = [self]
         while stack:
             node = stack.pop()
             if node.serial in visited:
@@ -144,7 +144,7 @@ class Table:
         cost = 0
         if kind == "operation" and new.depth:
             word = name.split()[0]
-            cost = 24 if word in _FUNCTIONS else _OTHER_COSTS.get(word, 1)
+            cost = 24 if word in _FUNCTIONS.split() else _OTHER_COSTS.get(word, 1)
         new.cost = cost + sum(a.cost for a in args)
         new.height = 1 + max((a.height for a in args), default=0)
         return new
@@ -187,7 +187,13 @@ class Array:
     @property
     def expression(self) -> Expression | None:
         """The expression, if it is one for the whole array."""
-        return self.boxes[0].expression if len(self.boxes) == 1 else None
+        return self.only if len(self.boxes) == 1 else None
+
+    @property
+    def only(self) -> Expression:
+        """The expression of an array that has one."""
+        (box,) = self.boxes
+        return box.expression
 
     @property
     def cost(self) -> int:
@@ -349,7 +355,7 @@ def _rev(x: Array, *, dimensions) -> Array:
     rank = len(x.shape)
     signs = [-1 if a in dimensions else 1 for a in range(rank)]
     rows = [[signs[a] if a == k else 0 for k in range(rank)] for a in range(rank)]
-    return x.moved(x.shape, rows, [n - 1 if s < 0 else 0 for n, s in zip(x.shape, signs)])  # noqa: B905
+    return x.moved(x.shape, rows, [n - 1 if a in dimensions else 0 for a, n in enumerate(x.shape)])
 
 
 def _split(x: Array, *, sizes, axis) -> tuple[Array, ...]:

@@ -84,8 +84,7 @@ class Kernel:
         b, nests = self.b, self.nests
         carried = [number for number, _, _ in loop.numbers]
         start = self.numbers([first for _, first, _ in loop.numbers])
-        if loop.length is not None:
-            end = self.module.parameter(loop.length)
+        end = "" if loop.length is None else self.module.parameter(loop.length).names[0]
 
         def begin(state: Sequence[Num], counter: str) -> None:
             nests.numbers.update(zip(carried, state, strict=True))
@@ -93,8 +92,8 @@ class Kernel:
 
         def test(state: list[Num], counter: str) -> str:
             begin(state, counter)
-            if loop.length is not None:
-                return b.new(f"icmp slt i64 {counter}, {end.names[0]}")
+            if end:
+                return b.new(f"icmp slt i64 {counter}, {end}")
             self.block(loop.test)
             (goes_on,) = self.numbers([loop.condition])
             return b.ref(goes_on, 0, False)
@@ -137,7 +136,9 @@ class Kernel:
             if takes.value is not None:
                 return run(i) if takes.value else from_block(i + 1)
             vec = [False] * len(dtypes)
-            return b.branch(b.ref(takes, 0, False), lambda: run(i), lambda: from_block(i + 1), vec, dtypes)
+            return b.branch(
+                b.ref(takes, 0, False), lambda: run(i), lambda: from_block(i + 1), vec, dtypes
+            )
 
         results = from_block(0)
         self.nests.numbers.update(zip((n for n, _ in branch.numbers), results, strict=True))
@@ -178,5 +179,3 @@ class Kernel:
 def _outside(aval: Any) -> Memory:
     """An operand or a result: its pointer is known when the code runs."""
     return Memory(aval.shape, aval.dtype, row_major(aval.shape), pointer="outside")
-
-

@@ -38,7 +38,7 @@ ARRAY_RULES: dict[str, Callable] = {}
 elements nor is elementwise. `reductions`, `indices` and `flow` fill this table."""
 
 _IDENTITIES = frozenset(
-    "reshard sharding_constraint mesh_cast least_over_lanes optimization_barrier".split()
+    ["reshard", "sharding_constraint", "mesh_cast", "least_over_lanes", "optimization_barrier"]
 )
 
 
@@ -60,11 +60,12 @@ class Translation:
     def constant(self, array: Any) -> Array:
         array = np.asarray(array)
         check_type(array.dtype)
-        if array.size == 0 or (array == array.flat[0]).all():
-            # Also of NaN or −0, which compare otherwise.
-            if array.size == 0 or len({x.tobytes() for x in array.flat}) == 1:
-                value = array.flat[0] if array.size else 0
-                return Array.uniform(self.table.known(value, array.dtype), array.shape)
+        if not array.size:
+            return Array(self.table, array.shape, array.dtype, [])
+        # One number: its bytes are compared, for NaN and −0 compare otherwise.
+        bits = np.ascontiguousarray(array).reshape(-1, 1).view(np.uint8)
+        if (bits == bits[0]).all():
+            return Array.uniform(self.table.known(array.flat[0], array.dtype), array.shape)
         key = str(array.dtype), array.shape, array.tobytes()
         if key not in self._constants:
             memory = Memory(array.shape, array.dtype, row_major(array.shape), pointer="")
@@ -106,9 +107,9 @@ class Translation:
     def in_memory(self, x: Array, row_major_order: bool = False) -> Array:
         """The array as one load; `row_major_order` says that the strides have to be those."""
         node = x.expression
-        if node is not None and node.kind == "load" and not node.args:
-            if not row_major_order or is_row_major(node.strides, x.shape):
-                return x
+        is_load = node is not None and node.kind == "load" and not node.args
+        if is_load and (not row_major_order or is_row_major(x.only.strides, x.shape)):
+            return x
         return self.store(x, Memory(x.shape, x.dtype, row_major(x.shape)).place)
 
     def let(self, x: Array) -> Array:
@@ -217,7 +218,7 @@ class Translation:
                     continue
                 if token in wanted:
                     x = self.store(x, wanted[token])
-                elif x.cost >= DEAR and uses[token] > 1 or x.height > _TALLEST:
+                elif (x.cost >= DEAR and uses[token] > 1) or x.height > _TALLEST:
                     x = self.settled(x)
                 values[token] = x
         return [read(x) for x in outs]
@@ -253,7 +254,7 @@ class Translation:
             if params.get("dimensions") is not None:
                 (x,) = self.move("transpose", {"permutation": params["dimensions"]}, [x], None)
             if x.is_written_out and math.prod(shape) <= 512:
-                flat = [part.expression for part in x.components()[2].values()]
+                flat = [part.only for part in x.components()[2].values()]
                 parts = {
                     index: Array.uniform(node, ())
                     for index, node in zip(np.ndindex(*shape), flat, strict=True)
@@ -265,7 +266,7 @@ class Translation:
                 "load", x.dtype, (), "", row_major(shape), node.offset, node.value
             )
             return [Array.uniform(other, shape)]
-        return [self._dilated(x, *rest, params["padding_config"], shape)]
+        return [self._dilated(x, rest[0], params["padding_config"], shape)]
 
     def _dilated(self, x: Array, fill: Array, padding: Any, shape) -> Array:
         """A pad with gaps between the elements: read at computed indices."""
@@ -352,9 +353,13 @@ def _wanted(outs: Sequence[Any], places: Sequence[Place | None], needed: Sequenc
                 if isinstance(x, Token) and math.prod(shape) > _LONG:
                     wanted.setdefault(x, place.part(shape, start * place.strides[axis]))
                 start += shape[axis]
-        elif name in ("squeeze", "expand_dims") or (
-            name == "reshape" and eqn.params["dimensions"] is None
+        elif (
+            (
+                name in ("squeeze", "expand_dims")
+                or (name == "reshape" and eqn.params["dimensions"] is None)
+            )
+            and is_row_major(place.strides, place.shape)
+            and isinstance(first, Token)
         ):
-            if is_row_major(place.strides, place.shape) and isinstance(first, Token):
-                wanted.setdefault(first, place.part(shapes[0], 0, row_major(shapes[0])))
+            wanted.setdefault(first, place.part(shapes[0], 0, row_major(shapes[0])))
     return wanted

@@ -31,7 +31,7 @@ class Carry:
             elif x.is_written_out:
                 parts = x.components()[2]
                 numbers = [Number(x.dtype) for _ in parts]
-                self._first += [part.expression for part in parts.values()]
+                self._first += [part.only for part in parts.values()]
                 of = {
                     index: Array.uniform(translation.number(n), ())
                     for index, n in zip(parts, numbers, strict=True)
@@ -49,7 +49,7 @@ class Carry:
         for x, memory, numbers in zip(outs, self._memories, self._numbers, strict=True):
             if numbers:
                 for number, part in zip(numbers, x.components()[2].values(), strict=True):
-                    self.loop.numbers.append((number, next(firsts), part.expression))
+                    self.loop.numbers.append((number, next(firsts), part.only))
             elif memory is not None and x.expression is not memory.load(x.table).expression:
                 new = Memory(x.shape, x.dtype)
                 translation.store(x, new.place)
@@ -212,7 +212,7 @@ def cond(
                 if of:
                     parts = x.components()[2].values()
                     for number, part in zip(of, parts, strict=True):
-                        expressions[number].append(part.expression)
+                        expressions[number].append(part.only)
                 elif is_used and x.size:
                     translation.store(x, result.expression.value.place)
     branch.numbers = list(expressions.items())

@@ -3,9 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-
 import numpy as np
-
 
 from ..llvm.ir import NotCompilable
 from ..rules.indexing import SCATTERS, default_fill
@@ -46,7 +44,9 @@ def _distance(translation: Translation, starts: Sequence[Array], shape, sizes, s
     total = translation.known(0)
     for start, n, m, stride in zip(starts, shape, sizes, strides, strict=True):
         i = _clipped(translation, start, n - m)
-        total = translation.apply("add", total, translation.apply("mul", i, translation.known(stride)))
+        total = translation.apply(
+            "add", total, translation.apply("mul", i, translation.known(stride))
+        )
     return total
 
 
@@ -148,9 +148,7 @@ def scatter(
     strides = [0] * len(shape)
     for d, k in zip(window, dims.update_window_dims, strict=True):
         strides[k] = memory.strides[d]
-    for d, k in zip(
-        dims.operand_batching_dims, dims.scatter_indices_batching_dims, strict=True
-    ):
+    for d, k in zip(dims.operand_batching_dims, dims.scatter_indices_batching_dims, strict=True):
         strides[batch[k]] = memory.strides[d]
     distance = Array.uniform(translation.table.known(0, "int64"), shape)
     is_inside = None
@@ -164,7 +162,9 @@ def scatter(
         distance = translation.apply("add", distance, step)
     if is_inside is not None:
         # An update outside of the array goes to no place: −1, after the offset is taken off.
-        distance = translation.apply("select_n", is_inside, translation.known(-1), distance, dtype="int64")
+        distance = translation.apply(
+            "select_n", is_inside, translation.known(-1), distance, dtype="int64"
+        )
     _add_update(translation, memory, strides, distance, updates, op or "")
     return [memory.load(translation.table)]
 
@@ -174,4 +174,3 @@ ARRAY_RULES |= {"dynamic_slice": dynamic_slice, "dynamic_update_slice": dynamic_
 ARRAY_RULES |= {"gather": gather, **dict.fromkeys(SCATTERS, scatter)}
 _NUMBER_BY_NUMBER = ("nextafter", "lt_to", "le_to", "threefry2x32", "platform_index")
 ARRAY_RULES |= {name: expand(EXPANSIONS[name]) for name in _NUMBER_BY_NUMBER}
-

@@ -12,6 +12,7 @@ import numpy as np
 from ..evaluator import Evaluator
 from ..llvm.ir import Num
 from ..llvm.memory import stored_type
+from ..native import machine
 from ..rules.elementwise import ELEMENTWISE
 from ..rules.reductions import neutral
 from .boxes import Array, Expression, common_boxes
@@ -21,7 +22,9 @@ from .tree import Let, Memory, Number, Reduce, Statement, Store, Update
 PARTIAL_SUMS = 32
 """Element k of a row is added to partial sum k mod 32, whatever the length of a vector is."""
 
-_CHEAP = 40  # bodies of so many operations are repeated until one vector of each partial sum is done
+_CHEAP = (
+    40  # bodies of so many operations are repeated until one vector of each partial sum is done
+)
 _FEW = 4  # columns of fewer elements are computed one by one
 
 
@@ -35,22 +38,24 @@ class Nests:
         self.pointers: dict[Memory, str] = {}
         self.numbers: dict[Number, Num] = {}
         self.head: list[str] = []  # lines of the entry of the function
+        self.loops = self.stores = 0  # innermost loops, and arrays that they write
         self._sums: dict[Reduce, str] = {}
-        self._group: Group | None = None
+        self._direct: set[Reduce] = set()
+        self._group = Group((), [])
 
     # --- groups ----------------------------------------------------------------------------------
 
     def group(self, group: Group) -> None:
-        statements = [s for s in group.statements if not isinstance(s, Let)]
+        statements = group.statements
         if not group.shape:
             with self.scalars(), self.scope():  # what is stored here may be updated later
                 for s in group.statements:
                     self.scalar_statement(s)
             return
-        if len(statements) == 1 and isinstance(statements[0], Update):
+        if isinstance(statements[0], Update):
             self.update(statements[0])
             return
-        of_each = [[array for array in arrays(s)][-1] for s in statements]
+        of_each = [arrays(s)[-1] for s in statements]
         cells = []
         for lower, upper, nodes in sorted(common_boxes(of_each), key=lambda c: c[:2]):
             items = list(zip(statements, nodes, strict=True))
@@ -59,17 +64,16 @@ class Nests:
         if not cells:
             return
         self._group = group
-        self.b.scopes.append({})
-        for s in statements:
-            if isinstance(s, Reduce):
-                self.begin_reduction(s, group.shape, cells)
-        for lower, upper, items in cells:
-            with self.scope():
-                self.nest(lower, upper, items, [])
-        for s in statements:
-            if isinstance(s, Reduce) and isinstance(s.result, Number):
-                self.numbers[s.result] = self.total(s)
-        self.b.scopes.pop()
+        with self.scope():
+            for s in statements:
+                if isinstance(s, Reduce):
+                    self.begin_reduction(s, group.shape, cells)
+            for lower, upper, items in cells:
+                with self.scope():
+                    self.nest(lower, upper, items, [])
+            for s in statements:
+                if isinstance(s, Reduce) and isinstance(s.result, Number):
+                    self.numbers[s.result] = self.total(s)
 
     def is_in_place(self, s: Statement, node: Expression) -> bool:
         """Whether a statement would copy an element to where it is."""
@@ -123,6 +127,8 @@ class Nests:
     def innermost(self, lower: int, upper: int, items, index: list[Num]) -> None:
         """The loop over the innermost axis, in vectors."""
         b, count, W = self.b, upper - lower, self.vector_width
+        self.loops += 1
+        self.stores += sum(isinstance(s, Store) and s.memory not in self.dead for s, _ in items)
 
         def at(i: Num, step: int, first: int) -> Num:
             return b.add(b.mul(i, b.const(step, "int64")), b.const(lower + first, "int64"))
@@ -144,7 +150,10 @@ class Nests:
                 for u in range(repeats):
                     k = b.const(u * W, "int64")
                     if sums and repeats == 1:  # a long body: its partial sum by a computed index
-                        k = b.mul(b.logic("and", i, b.const(PARTIAL_SUMS // W - 1, "int64")), b.const(W, "int64"))
+                        k = b.mul(
+                            b.logic("and", i, b.const(PARTIAL_SUMS // W - 1, "int64")),
+                            b.const(W, "int64"),
+                        )
                     with self.scope():
                         self.body(items, [*index, at(i, repeats * W, u * W)], None, k)
 
@@ -182,7 +191,9 @@ class Nests:
                 self.store(where, self.e.combine(s.op, old, x), stride, mask)
                 continue
             dtype = s.array.dtype
-            where = b.new(f"getelementptr {stored_type(dtype)}, ptr {self._sums[s]}, i64 {self.ref(k)}")
+            where = b.new(
+                f"getelementptr {stored_type(dtype)}, ptr {self._sums[s]}, i64 {self.ref(k)}"
+            )
             old = self.load(where, dtype, 1)
             new = self.e.combine(s.op, old, x)
             if mask is not None:
@@ -198,7 +209,6 @@ class Nests:
     def hoist(self, items, depth: int, index: list[Num]) -> None:
         """Compute what depends on the loops that are opened so far and on no others."""
         visited: set[int] = set()
-        assert self._group is not None
 
         def visit(node: Expression) -> None:
             if node.serial in visited:
@@ -207,7 +217,7 @@ class Nests:
             if node.depth > depth:
                 for arg in node.args:
                     visit(arg)
-            elif node.kind not in ("known", "number") and not self._group.is_handed_on(node):  # pyright: ignore[reportOptionalMemberAccess]
+            elif node.kind not in ("known", "number") and not self._group.is_handed_on(node):
                 self.number(node, index)
 
         for _, node in items:
@@ -224,7 +234,6 @@ class Nests:
         return d if d < len(s.strides) else None
 
     def begin_reduction(self, s: Reduce, shape, cells) -> None:
-        self._direct = getattr(self, "_direct", set())
         item = stored_type(s.array.dtype)
         if self.first_summed(s) is not None and s not in self._sums:
             name = f"%sums{len(self._sums)}"
@@ -235,12 +244,21 @@ class Nests:
             return
         # A row that is one cell gives the result at once.
         d = self.first_summed(s)
-        if d is not None and s.axes == set(range(d, len(shape))):
-            if all(low[d:] == (0,) * (len(shape) - d) and up[d:] == tuple(shape[d:]) for low, up, _ in cells):
-                self._direct.add(s)
-                return
+        if (
+            d is not None
+            and s.axes == set(range(d, len(shape)))
+            and all(
+                low[d:] == (0,) * (len(shape) - d) and up[d:] == tuple(shape[d:])
+                for low, up, _ in cells
+            )
+        ):
+            self._direct.add(s)
+            return
         kept = [k for k in range(len(shape)) if k not in s.axes]
-        start = Array.uniform(s.array.table.known(neutral(s.op, s.array.dtype), s.array.dtype), [shape[k] for k in kept])
+        start = Array.uniform(
+            s.array.table.known(neutral(s.op, s.array.dtype), s.array.dtype),
+            [shape[k] for k in kept],
+        )
         fill = Store(s.result, [s.strides[k] for k in kept], s.offset, start)
         group, self._group = self._group, Group(start.shape, [fill])
         for lower, upper, node in start.boxes:
@@ -278,7 +296,8 @@ class Nests:
             while len(ones) > 1:
                 half = len(ones) // 2
                 ones = [
-                    self.e.combine(s.op, x, y) for x, y in zip(ones[:half], ones[half:], strict=True)
+                    self.e.combine(s.op, x, y)
+                    for x, y in zip(ones[:half], ones[half:], strict=True)
                 ]
         return b.opaque(ones[0])
 
@@ -289,7 +308,9 @@ class Nests:
         self._group = Group(s.array.shape, [s])
         distance = s.distance.expression
         is_uniform = s.op is None and distance is not None and distance.depth == 0
-        for lower, upper, (node, far) in sorted(common_boxes([s.array, s.distance]), key=lambda c: c[:2]):
+        for lower, upper, (node, far) in sorted(
+            common_boxes([s.array, s.distance]), key=lambda c: c[:2]
+        ):
             with self.scope():
                 self._update(s, lower, upper, node, far, [], is_uniform)
 
@@ -340,7 +361,9 @@ class Nests:
             return
         # A negative distance says that there is no such element.
         is_inside = b.compare("ge", distance, b.const(0, "int64"))
-        where = self.address(s.memory, s.strides, s.offset, index, b.maximum(distance, b.const(0, "int64")))
+        where = self.address(
+            s.memory, s.strides, s.offset, index, b.maximum(distance, b.const(0, "int64"))
+        )
         old = self.load(where, s.array.dtype, 0)
         if s.op == "":
             new = x
@@ -436,35 +459,19 @@ class Nests:
 
     # --- memory ----------------------------------------------------------------------------------
 
-    def _steps(self, where: str, item: str, stride: int) -> str:
-        steps = ", ".join(f"i64 {stride * i}" for i in range(self.b.W))
-        return self.b.new(f"getelementptr {item}, ptr {where}, <{self.b.W} x i64> <{steps}>")
-
     def load(self, where: str, dtype: str, stride: int, mask: str | None = None) -> Num:
         """A vector of elements with a stride, or with stride 0 one element for all."""
-        b, item = self.b, stored_type(dtype)
-        size, W = _item_bytes(dtype), self.b.W
+        b, item, W = self.b, stored_type(dtype), self.b.W
         if W == 1 or stride == 0:
-            name = b.new(f"load {item}, ptr {where}, align {size}")
+            name = b.new(f"load {item}, ptr {where}, align {_bytes(dtype)}")
             if dtype == "bool":
                 name = b.new(f"icmp ne i8 {name}, 0")
             return b.number([name], dtype, False)
-        kind, bits = f"<{W} x {item}>", f"<{W} x i1>"
         if stride == 1 and mask is None:
-            name = b.new(f"load {kind}, ptr {where}, align {size}")
-        elif stride == 1:
-            name = self._masked(
-                "load", kind, f"v{W}{_suffix(item)}", "p0", f"ptr {where}", "ptr", size, f"{bits} {mask}", ""
-            )
-        else:
-            pointers = self._steps(where, item, stride)
-            name = self._gathered(pointers, kind, item, size, mask)
-        return self._number(name, kind, dtype)
-
-    def _number(self, name: str, kind: str, dtype: str) -> Num:
-        if dtype == "bool":
-            name = self.b.new(f"icmp ne {kind} {name}, zeroinitializer")
-        return self.b.number([name], dtype, True)
+            name = b.new(f"load <{W} x {item}>, ptr {where}, align {_bytes(dtype)}")
+            return self._from_vector(name, dtype)
+        pointers = where if stride == 1 else self._strided(where, item, stride)
+        return self._from_vector(self._masked(pointers, stride == 1, dtype, mask), dtype)
 
     def gather(self, node: Expression, index, by: Num, mask: str | None, varies: bool) -> Num:
         """Elements at distances that differ within a vector."""
@@ -475,66 +482,58 @@ class Nests:
             steps = ", ".join(f"i64 {node.strides[-1] * i}" for i in range(W))
             distances = b.new(f"add <{W} x i64> {distances}, <{steps}>")
         pointers = b.new(f"getelementptr {item}, ptr {where}, <{W} x i64> {distances}")
-        kind = f"<{W} x {item}>"
-        name = self._gathered(pointers, kind, item, _item_bytes(node.dtype), mask)
-        return self._number(name, kind, node.dtype)
-
-    def _gathered(self, pointers: str, kind: str, item: str, size: int, mask: str | None) -> str:
-        W = self.b.W
-        bits = f"<{W} x i1> {mask or 'splat (i1 true)'}"
-        return self._masked(
-            "gather", kind, f"v{W}{_suffix(item)}", f"v{W}p0", f"<{W} x ptr> {pointers}", f"<{W} x ptr>", size, bits, ""
-        )
-
-    def _masked(self, word, kind, suffix, of, pointer, pointer_type, size, bits, value) -> str:
-        """A masked load, store, gather or scatter; `value` is what a store writes."""
-        b, name = self.b, f"@llvm.masked.{word}.{suffix}.{of}"
-        mask_type = bits.split(" ", 3)
-        mask_type = " ".join(mask_type[:3])
-        typed, address = pointer.rsplit(" ", 1)
-        if value:
-            b.declare(f"void {name}({kind}, {pointer_type}, {mask_type})")
-            b.emit(f"call void {name}({kind} {value}, {typed} align {size} {address}, {bits})")
-            return ""
-        b.declare(f"{kind} {name}({pointer_type}, {mask_type}, {kind})")
-        return b.new(
-            f"call {kind} {name}({typed} align {size} {address}, {bits}, {kind} zeroinitializer)"
-        )
+        return self._from_vector(self._masked(pointers, False, node.dtype, mask), node.dtype)
 
     def store(self, where: str, x: Num, stride: int, mask: str | None = None) -> None:
-        b, dtype = self.b, x.dtype
-        item, size, W = stored_type(dtype), _item_bytes(dtype), self.b.W
+        b, item, W = self.b, stored_type(x.dtype), self.b.W
         is_vector = W > 1 and stride != 0
-        name = b.ref(x, 0, is_vector)
-        kind, bits = (f"<{W} x {item}>" if is_vector else item), f"<{W} x i1>"
-        if dtype == "bool":
+        name, kind = b.ref(x, 0, is_vector), f"<{W} x {item}>" if is_vector else item
+        if x.dtype == "bool":
             name = b.new(f"zext {b.type('bool', is_vector)} {name} to {kind}")
-        if not is_vector or stride == 1 and mask is None:
-            b.emit(f"store {kind} {name}, ptr {where}, align {size}")
-        elif stride == 1:
-            self._masked(
-                "store", kind, f"v{W}{_suffix(item)}", "p0", f"ptr {where}", "ptr", size, f"{bits} {mask}", name
-            )
+        if not is_vector or (stride == 1 and mask is None):
+            b.emit(f"store {kind} {name}, ptr {where}, align {_bytes(x.dtype)}")
+            return
+        pointers = where if stride == 1 else self._strided(where, item, stride)
+        self._masked(pointers, stride == 1, x.dtype, mask, name)
+
+    def _strided(self, where: str, item: str, stride: int) -> str:
+        """Pointers to the elements of a vector."""
+        steps = ", ".join(f"i64 {stride * i}" for i in range(self.b.W))
+        return self.b.new(f"getelementptr {item}, ptr {where}, <{self.b.W} x i64> <{steps}>")
+
+    def _from_vector(self, name: str, dtype: str) -> Num:
+        if dtype == "bool":  # any byte but 0 counts as true
+            name = self.b.new(f"icmp ne <{self.b.W} x i8> {name}, zeroinitializer")
+        return self.b.number([name], dtype, True)
+
+    def _masked(
+        self, pointers: str, is_row: bool, dtype: str, mask: str | None, value: str = ""
+    ) -> str:
+        """LLVM's load or store of a row, or of elements at pointers of their own, where the mask is
+        true; `value` is what is stored."""
+        b, item, W = self.b, stored_type(dtype), self.b.W
+        words = ("load", "store") if is_row else ("gather", "scatter")
+        vector, bits = f"<{W} x {item}>", f"<{W} x i1>"
+        short = {"double": "f64", "float": "f32"}.get(item, item)
+        pointer, suffix = ("ptr", "p0") if is_row else (f"<{W} x ptr>", f"v{W}p0")
+        name = f"@llvm.masked.{words[bool(value)]}.v{W}{short}.{suffix}"
+        # Newer releases of LLVM take the alignment as an attribute of the pointer.
+        align, of_pointer, number = _bytes(dtype), f"{pointer} {pointers}", []
+        if machine.start_llvm().llvm_version_info[0] >= 22:
+            of_pointer = f"{pointer} align {align} {pointers}"
         else:
-            pointers = self._steps(where, item, stride)
-            self._masked(
-                "scatter",
-                kind,
-                f"v{W}{_suffix(item)}",
-                f"v{W}p0",
-                f"<{W} x ptr> {pointers}",
-                f"<{W} x ptr>",
-                size,
-                f"{bits} {mask or 'splat (i1 true)'}",
-                name,
-            )
+            number = [f"i32 {align}"]
+        of_mask = f"{bits} {mask or 'splat (i1 true)'}"
+        kinds = [pointer, *["i32" for _ in number], bits]
+        if value:
+            b.declare(f"void {name}({', '.join([vector, *kinds])})")
+            operands = [f"{vector} {value}", of_pointer, *number, of_mask]
+            b.emit(f"call void {name}({', '.join(operands)})")
+            return ""
+        b.declare(f"{vector} {name}({', '.join([*kinds, vector])})")
+        operands = [of_pointer, *number, of_mask, f"{vector} zeroinitializer"]
+        return b.new(f"call {vector} {name}({', '.join(operands)})")
 
 
-def _suffix(item: str) -> str:
-    return {"double": "f64", "float": "f32"}.get(item, item)
-
-
-def _item_bytes(dtype: str) -> int:
+def _bytes(dtype: str) -> int:
     return np.dtype(dtype).itemsize
-
-

@@ -115,22 +115,24 @@ def _takes_over(group: Group, memory: Memory, old: Memory, nodes: list[Expressio
     element."""
     if memory.strides != old.strides or memory.dtype != old.dtype or memory.size != old.size:
         return False
-    stores = [s for s in group.statements if written(s) is not None and written(s).root is memory]  # pyright: ignore[reportOptionalMemberAccess]
-    if not all(isinstance(s, Store) and s.memory is memory and not _is_repeated(s) for s in stores):
-        return False
-    targets = {(s.strides, s.offset) for s in stores}
+    targets = set()
+    for s in group.statements:
+        own = written(s)
+        if own is None or own.root is not memory:
+            continue
+        # An axis without a stride writes one element several times.
+        if not isinstance(s, Store) or own is not memory or 0 in s.strides:
+            return False
+        targets.add((s.strides, s.offset))
     return all(
         node.value is old and not node.args and (node.strides, node.offset) in targets
         for node in nodes
     )
 
 
-def _is_repeated(store: Store) -> bool:
-    """Whether several indices write one element (an axis without a stride)."""
-    return any(s == 0 for s in store.strides)
-
-
-def places(program: Block, dead: set[Memory], lives: Lives | None = None) -> tuple[dict[Memory, int], int]:
+def places(
+    program: Block, dead: set[Memory], lives: Lives | None = None
+) -> tuple[dict[Memory, int], int]:
     """The first byte of each memory without a pointer, and the number of all bytes."""
     lives = Lives(program, dead) if lives is None else lives
     at: dict[Memory, int] = {}
@@ -161,4 +163,3 @@ def places(program: Block, dead: set[Memory], lives: Lives | None = None) -> tup
 def _bytes(memory: Memory) -> int:
     """In whole cache lines."""
     return (memory.size * np.dtype(memory.dtype).itemsize + 63) // 64 * 64
-

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from typing import Any
 
-
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -49,10 +48,10 @@ def reduced(translation: Translation, x: Array, op: str, axes: Sequence[int], sh
     order = _order(totals.values(), len(long))
     for key, part in totals.items():
         offset = sum(memory.strides[a] * i for a, i in zip(short_kept, key, strict=True))
-        strides = [
-            0 if k in vanish else memory.strides[kept.index(long[k])] for k in order
-        ]
-        turned = part.along([part.shape[k] for k in order], [order.index(k) for k in range(len(long))])
+        strides = [0 if k in vanish else memory.strides[kept.index(long[k])] for k in order]
+        turned = part.along(
+            [part.shape[k] for k in order], [order.index(k) for k in range(len(long))]
+        )
         axes_of_turned = [order.index(k) for k in vanish]
         translation.add(Reduce(memory, strides, offset, turned, op, axes_of_turned))
     return memory.load(translation.table)
@@ -154,4 +153,3 @@ ARRAY_RULES |= dict.fromkeys(REDUCTIONS, reduction)
 ARRAY_RULES |= {"dot_general": matrix_product}
 ARRAY_RULES |= {name: expand(_running(op)) for name, op in CUMULATIVE.items()}
 ARRAY_RULES |= {"argmax": expand(argument(True)), "argmin": expand(argument(False))}
-

@@ -63,7 +63,9 @@ def expressions(statement: Loop | Branch) -> list[Expression]:
 def roots_read(statement: Statement) -> set[Memory]:
     """The memories that a statement reads, with all that is in it."""
     if isinstance(statement, Loop | Branch):
-        blocks = statement.blocks if isinstance(statement, Branch) else [statement.test, statement.body]
+        blocks = (
+            statement.blocks if isinstance(statement, Branch) else [statement.test, statement.body]
+        )
         roots = {root for block in blocks for s in block.statements for root in roots_read(s)}
         nodes = [node for e in expressions(statement) for node in e.loads(set())]
     else:
@@ -186,7 +188,7 @@ def in_place(segment: Sequence[Statement], dying: set[Memory]) -> dict[int, int]
             others = [
                 k
                 for k, node in readers[old]
-                if k != i and not (at[k] < at[i] or at[k] == at[i] and is_own(statement, node))
+                if k != i and not (at[k] < at[i] or (at[k] == at[i] and is_own(statement, node)))
             ]
             if not others:
                 break

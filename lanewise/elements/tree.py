@@ -16,7 +16,7 @@ _serials = itertools.count()
 
 
 class Number:
-    """A number of the code that is the same for all elements: a sum, or a part of a loop's carry."""
+    """A number of the code, the same for all elements: a sum, or what a loop carries."""
 
     def __init__(self, dtype: str):
         self.dtype, self.serial = str(dtype), next(_serials)
@@ -141,7 +141,9 @@ class Update:
     `distance` is one expression for all elements, or depends on them.
     """
 
-    def __init__(self, memory: Memory, strides, offset: int, distance: Array, array: Array, op=None):
+    def __init__(
+        self, memory: Memory, strides, offset: int, distance: Array, array: Array, op=None
+    ):
         self.memory, self.strides, self.offset = memory, tuple(strides), offset
         self.distance, self.array, self.op = distance, array, op
 

@@ -85,28 +85,52 @@ LONG_CARRY, LONG_VALUE = 48, 4096
 
 def has_long_arrays(jaxpr: Any) -> bool:
     """Whether a loop carries an array of more than 48 elements, or computes one of more than 4096
-    in a round. Rows that a loop collects do not count."""
+    in a round; without any loop, whether an array of more than 48 elements is computed.
+
+    Rows that a loop collects do not count, nor what is done to them after it.
+    """
+    return _has_long_loop(jaxpr) or (
+        not _has_loop(jaxpr) and _longest(jaxpr, counts_moves=False) > LONG_CARRY
+    )
+
+
+def _has_long_loop(jaxpr: Any) -> bool:
     for eqn in jaxpr.eqns:
-        functions = [*bodies(eqn), *functions_in(eqn)]
-        if eqn.primitive.name in ("scan", "while"):
-            for function in bodies(eqn):
-                if any(aval.size > LONG_CARRY for aval in _carried(eqn)) or _computes_long(function):
-                    return True
-        if any(has_long_arrays(function.jaxpr) for function in functions):
+        if eqn.primitive.name in _LOOPS:
+            values = [_longest(body.jaxpr) for body in bodies(eqn)]
+            if _carried(eqn) > LONG_CARRY or max(values) > LONG_VALUE:
+                return True
+        if any(_has_long_loop(f.jaxpr) for f in (*bodies(eqn), *functions_in(eqn))):
             return True
     return False
 
 
-def _carried(eqn: Any) -> list[Any]:
+def _has_loop(jaxpr: Any) -> bool:
+    return any(
+        eqn.primitive.name in _LOOPS
+        or any(_has_loop(f.jaxpr) for f in (*bodies(eqn), *functions_in(eqn)))
+        for eqn in jaxpr.eqns
+    )
+
+
+def _carried(eqn: Any) -> int:
+    """Elements of the longest array that a loop carries."""
     count = scan_counts(eqn.params)[1] if eqn.primitive.name == "scan" else len(eqn.outvars)
-    return [var.aval for var in eqn.outvars[:count]]
+    return max((var.aval.size for var in eqn.outvars[:count]), default=0)
 
 
-def _computes_long(function: ClosedJaxpr) -> bool:
-    for eqn in function.jaxpr.eqns:
-        values = _carried(eqn) if eqn.primitive.name == "scan" else [v.aval for v in eqn.outvars]
-        if any(aval.size > LONG_VALUE for aval in values):
-            return True
-        if any(_computes_long(inner) for inner in (*bodies(eqn), *functions_in(eqn))):
-            return True
-    return False
+def _longest(jaxpr: Any, counts_moves: bool = True) -> int:
+    """Elements of the longest array that is computed, the rows of loops left out."""
+    longest = 0
+    for eqn in jaxpr.eqns:
+        inner = (*bodies(eqn), *functions_in(eqn))
+        sizes = [_longest(f.jaxpr, counts_moves) for f in inner]
+        if eqn.primitive.name == "scan":
+            sizes.append(_carried(eqn))
+        elif not inner and (counts_moves or eqn.primitive.name not in _FREE):
+            sizes += [var.aval.size for var in eqn.outvars]
+        longest = max([longest, *sizes])
+    return longest
+
+
+_LOOPS = ("scan", "while")

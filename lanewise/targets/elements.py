@@ -36,6 +36,8 @@ class Elements:
             operations=operation_count(function.jaxpr),
             scratch=kernel.scratch,
             width=width,
+            loops=kernel.nests.loops,
+            stores=kernel.nests.stores,
         )
 
     def register(self, code: Code) -> str:

@@ -19,7 +19,7 @@ class Code:
     - `block`: trajectories that are computed at once.
     - `values`: whole numbers that are inputs of the code.
     - `operands`: constants that follow the operands of the call.
-    - `operations`, `scratch`, `width`, `vectors`: see `Part`.
+    - `operations`, `scratch`, `width`, `vectors`, `loops`, `stores`: see `Part`.
     """
 
     text: str
@@ -30,6 +30,8 @@ class Code:
     scratch: int = 0
     width: int = 1
     vectors: int = 1
+    loops: int = 0
+    stores: int = 0
 
     def params(self, lanes: int | None, outs: Sequence[Any]) -> np.ndarray:
         """What the kernel reads: trajectories, cost of a block, bytes of a trajectory in each
