@@ -216,9 +216,11 @@ class Translation:
             for token, x in zip(tokens, results, strict=True):
                 if not uses[token]:
                     continue
+                # An output is written anyway.
+                least = 1 if token in outs else DEAR
                 if token in wanted:
                     x = self.store(x, wanted[token])
-                elif (x.cost >= DEAR and uses[token] > 1) or x.height > _TALLEST:
+                elif (x.cost >= least and uses[token] > 1) or x.height > _TALLEST:
                     x = self.settled(x)
                 values[token] = x
         return [read(x) for x in outs]
