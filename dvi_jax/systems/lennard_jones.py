@@ -108,6 +108,7 @@ def lennard_jones(
         side = (n / positive("density", density)) ** (1 / 3) if box is None else box
         parameters["box"] = Parameter(positive("box", side), "side of the cubic box [length]")
         cutoff = min(2.5, side / 2) if cutoff is None else cutoff
+        _check_cutoff(cutoff, side)
         spacing = side / cells
     elif box is not None:
         raise ValueError(f"box requires periodic=True, got box={box!r} and periodic={periodic!r}.")
@@ -142,13 +143,18 @@ _TEMPERATURE = temperature
 """The observable, for the function in which this name is an argument."""
 
 
+def _check_cutoff(cutoff, box):
+    if not cutoff <= box / 2 * (1 + 1e-12):
+        raise ValueError(
+            f"cutoff must be at most half of the box, {box / 2:.6g}, because each pair interacts "
+            f"through one image, got {cutoff}."
+        )
+
+
 def _check(q, p, args):
     box, cutoff = args.get("box"), args.get("cutoff")
-    if box is not None and cutoff is not None and not cutoff <= box / 2 * (1 + 1e-12):
-        raise ValueError(
-            f"cutoff must be at most half of the box, {box / 2:.6g}, for the nearest images, "
-            f"got {cutoff}."
-        )
+    if box is not None and cutoff is not None:
+        _check_cutoff(cutoff, box)
     apart = q[:, None] - q[None]
     apart = apart if box is None else apart - box * np.round(apart / box)
     i, j = np.nonzero(np.triu(np.max(np.abs(apart), axis=-1) == 0, k=1))
