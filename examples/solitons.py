@@ -76,7 +76,7 @@ def main():
         sol, *_ = kink(0.05, 60.0)
         image = draw(axes[0, 0], sol, of=lambda u: 1 - np.cos(u - np.arcsin(0.05 * DRIVE)),
                      cmap="magma")  # fmt: skip
-        figure.colorbar(image, ax=axes[0, 0], label="1 − cos(u − vacuum)")
+        figure.colorbar(image, ax=axes[0, 0], label="1 − cos(u − u₀), u₀: vacuum")
         axes[0, 0].set_title("Driven kink on a ring, ε = 0.05")
         for i, epsilon in enumerate((0.05, 0.025)):
             _, t, v, law = kink(epsilon, 3 / epsilon)
@@ -86,7 +86,7 @@ def main():
         axes[0, 1].plot(epsilon * t, law, "k--", lw=1, label="McLaughlin & Scott")
         limit = -np.pi * DRIVE / (4 * DAMPING)
         limit /= np.hypot(1, limit)
-        axes[0, 1].axhline(limit, color="0.6", lw=0.8)
+        axes[0, 1].axhline(limit, color="0.6", lw=0.8, label="friction = drive")
         axes[0, 1].set(xlabel="εt", ylabel="velocity v", title="Its velocity")
         axes[0, 1].legend()
         sol, *_ = breather(0.02, 100.0)
