@@ -23,8 +23,7 @@ Ends = tuple[str, ...]
 def shape_of(name: str, shape: Any, smallest: int = 3) -> tuple[int, ...]:
     """One to three numbers of sites. **Raises** `ValueError`."""
     sizes = (shape,) if np.ndim(shape) == 0 else tuple(shape)
-    if not 1 <= len(sizes) <= 3:
-        raise ValueError(f"{name} must be one to three numbers of sites, got {shape!r:.200}.")
+    one_of(f"number of axes in {name}", len(sizes), (1, 2, 3))
     hint = f"The lattice has at least {smallest} sites in each direction."
     return tuple(whole(name, size, smallest, hint=hint) for size in sizes)
 
@@ -32,8 +31,7 @@ def shape_of(name: str, shape: Any, smallest: int = 3) -> tuple[int, ...]:
 def ends_of(ends: str | Sequence[str], dim: int) -> Ends:
     """The kind of ends of each axis; one word is for all. **Raises** `ValueError`."""
     kinds = (ends,) * dim if isinstance(ends, str) else tuple(ends)
-    if len(kinds) != dim:
-        raise ValueError(f"ends must be one word, or one for each of {dim} axes, got {ends!r}.")
+    one_of("number of words in ends", len(kinds), (dim,), hint="One word is for all axes.")
     return tuple(one_of("ends", kind, ENDS) for kind in kinds)
 
 

@@ -3,10 +3,10 @@
 import jax.numpy as jnp
 import numpy as np
 
-from ..base.checks import positive, whole
+from ..base.checks import in_range, one_of, positive, whole
 from ..discover.symmetries.library import rotation, space_translation
 from ._problem import Parameter, Problem, Start, library_problem
-from .n_body import angular_momentum, linear_momentum
+from .n_body import angular_momentum, check_apart, linear_momentum
 
 
 def pair_energy(r, args):
@@ -110,9 +110,8 @@ def lennard_jones(
         cutoff = min(2.5, side / 2) if cutoff is None else cutoff
         _check_cutoff(cutoff, side)
         spacing = side / cells
-    elif box is not None:
-        raise ValueError(f"box requires periodic=True, got box={box!r} and periodic={periodic!r}.")
     else:
+        one_of("box with periodic=False", box, (None,))
         spacing = 1.542  # [σ] of the crystal at rest without pressure
     if cutoff is not None:
         parameters["cutoff"] = Parameter(cutoff, "distance without force [length]")
@@ -144,22 +143,13 @@ _TEMPERATURE = temperature
 
 
 def _check_cutoff(cutoff, box):
-    if not cutoff <= box / 2 * (1 + 1e-12):
-        raise ValueError(
-            f"cutoff must be at most half of the box, {box / 2:.6g}, because each pair interacts "
-            f"through one image, got {cutoff}."
-        )
+    hint = "It is at most half of the box, because each pair interacts through one image."
+    in_range("cutoff", cutoff, 0.0, box / 2 * (1 + 1e-12), hint)
 
 
 def _check(q, p, args):
-    box, cutoff = args.get("box"), args.get("cutoff")
-    if box is not None and cutoff is not None:
-        _check_cutoff(cutoff, box)
-    apart = q[:, None] - q[None]
-    apart = apart if box is None else apart - box * np.round(apart / box)
-    i, j = np.nonzero(np.triu(np.max(np.abs(apart), axis=-1) == 0, k=1))
-    if i.size:
-        raise ValueError(
-            f"particles {i[0]} and {j[0]} must have different positions, got {q[i[0]].tolist()} "
-            "for both."
-        )
+    apart, box = q[:, None] - q[None], args.get("box")
+    if box is not None:
+        _check_cutoff(args.get("cutoff", 0.0), box)
+        apart = apart - box * np.round(apart / box)
+    check_apart(np.triu(np.max(np.abs(apart), axis=-1) == 0, k=1), q, "particle {}".format)

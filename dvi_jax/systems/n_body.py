@@ -186,11 +186,15 @@ def check_bodies(q0: Any, p0: Any, args: Any, names: Sequence[str] | None = None
     separation = np.linalg.norm(q[:, None, :] - q[None, :, :], axis=-1)
     size = np.linalg.norm(q, axis=-1)
     rounding = 4 * np.finfo(float).eps * np.maximum(size[:, None], size[None, :])
-    i, j = np.nonzero(np.triu(separation <= rounding, k=1))
-    if i.size:
-        a, b = int(i[0]), int(j[0])
+    check_apart(np.triu(separation <= rounding, k=1), q, label)
+
+
+def check_apart(close: Any, q: Any, label: Callable[[int], str]) -> None:
+    """**Raises** `ValueError` if a pair (i, j) of `close` is at one position, with their labels."""
+    if close.any():
+        i, j = map(int, np.argwhere(close)[0])
         raise ValueError(
-            f"{label(a)} and {label(b)} must have different positions, got {q[a].tolist()} for "
+            f"{label(i)} and {label(j)} must have different positions, got {q[i].tolist()} for "
             "both, up to rounding."
         )
 
@@ -202,10 +206,10 @@ def check_restricted(q0: Any, p0: Any, args: Any) -> None:
     rule = f"q0 and p0 must both have shape (bodies, 2) or (bodies, 3) with more than {m} bodies"
     check_shape(q, p, lambda shape: len(shape) == 2 and shape[1] in (2, 3) and shape[0] > m, rule)
     check_bodies(q[:m], p[:m], args)
-    touches = np.all(q[m:, None] == q[None, :m], axis=-1)
-    if touches.any() and not args.get("softening"):
-        k, j = np.argwhere(touches)[0]
-        raise ValueError(f"test particle {m + k} must not be at the position of body {j}.")
+    if not args.get("softening"):
+        touches = np.all(q[:, None] == q[None], axis=-1)
+        touches[:, :m] = touches[m:] = False
+        check_apart(touches, q, lambda i: f"test particle {i}" if i >= m else f"body {i}")
 
 
 def _not_negative(name, value):
@@ -293,7 +297,7 @@ def n_body(
     if softening:
         args["softening"] = positive("softening", softening)
     if has_tests:
-        array("masses", masses, np.shape(q0)[:1], integers=True)
+        array("masses", masses, np.asarray(q0).shape[:1], integers=True)
     check = check_restricted if has_tests else check_bodies
     check(q0, p0, args)
     known = symmetries(np.asarray(q0).shape[-1])

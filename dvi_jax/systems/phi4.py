@@ -65,11 +65,9 @@ def phi4(
     is_kink = one_of("start", start, ("kink", "thermal")) == "kink"
     first = ("fixed",) if is_kink else ("periodic",)
     kinds = ends_of(first + ("periodic",) * (len(sizes) - 1) if ends is None else ends, len(sizes))
-    if is_kink and kinds[0] == "periodic":
-        raise ValueError(
-            "ends of the first axis must be 'fixed' or 'free' with start='kink', got 'periodic': "
-            "the field after a kink has the opposite sign."
-        )
+    if is_kink:
+        hint = "The field after a kink has the opposite sign."
+        one_of("ends of the first axis with start='kink'", kinds[0], ("fixed", "free"), hint)
     x = places(sizes[0], dx).reshape(-1, *[1] * (len(sizes) - 1))
     u, rate = (np.broadcast_to(v, sizes).copy() for v in kink(0.0, x, velocity))
     cell = dx ** len(sizes)

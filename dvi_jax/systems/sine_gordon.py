@@ -25,14 +25,14 @@ def _hamiltonian(ends, t0, t1, q0, p1, args):
     return field_energy(q0, p1, args, ends, 1 - jnp.cos(q0))
 
 
-def driven(t0, t1, q0, p1, args):
+def drive_force(t0, t1, q0, p1, args):
     """W = drive dx: a constant force on each cell."""
     return jnp.full_like(q0, args["drive"] * args["dx"])
 
 
-def damped(t0, t1, q0, p1, args):
+def drive_and_friction(t0, t1, q0, p1, args):
     """W = drive dx − damping p1: a constant force and friction."""
-    return driven(t0, t1, q0, p1, args) - args["damping"] * p1
+    return drive_force(t0, t1, q0, p1, args) - args["damping"] * p1
 
 
 def kink(t, x, velocity=0.0):
@@ -114,10 +114,10 @@ def sine_gordon(
         parameters["winding"] = Parameter(1.0, "turns of u along the ring [1]", finite)
     force = None
     if damping or drive:
-        force = driven
+        force = drive_force
         parameters["drive"] = Parameter(drive, "force density at ε = 1 [1]", finite)
     if damping:  # the steps are then implicit in p
-        force = damped
+        force = drive_and_friction
         parameters["damping"] = Parameter(damping, "rate of friction at ε = 1 [1/time]", finite)
     x = places(n, dx)
     u, rate = kink(0.0, x, velocity) if is_kink else breather(0.0, x, frequency, velocity)
