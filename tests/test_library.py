@@ -35,7 +35,8 @@ QUICK = {"duffing", "kepler"}
 """Those whose runs by `integrate` are in every run of the tests; the rest are marked slow."""
 ALIKE = {"figure_eight", "pythagorean", "outer_solar_system", "solar_system"}
 ALIKE |= {"perturbed_pendulum", "lorentz_pendulum", "van_der_pol", "sine_gordon", "phi4"}
-"""Those with functions of another system."""
+ALIKE |= {"lennard_jones"}
+"""Those with functions of another system, or with the symmetries of one."""
 MOST = set(NAMES) - ALIKE
 CONSTRAINED = {"spherical_pendulum", "chain", "slider_crank", "dumbbell", "heavy_top", "satellite"}
 """Those with a constraint, whose forces are added to the flow, and whose method is `Rattle`."""

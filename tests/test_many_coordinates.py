@@ -328,9 +328,7 @@ def test_softening_and_masses_that_are_refused():
         problem.check(problem.q0, problem.p0, {**problem.args, "softening": -1.0})
     close = POSITIONS[:4].copy()
     close[3] = close[1]
-    with pytest.raises(
-        ValueError, match="body 1 and test particle 3 must have different positions"
-    ):
+    with pytest.raises(ValueError, match="body 1 and test particle 3 must have different"):
         systems.n_body(MASSES[:4], close, VELOCITIES[:4])
     assert systems.n_body(MASSES[:4], close, VELOCITIES[:4], softening=0.1).q0.shape == (4, 3)
     with pytest.raises(ValueError, match="more than 3 bodies"):
@@ -418,21 +416,13 @@ def test_a_fluid_conserves_its_momentum_and_energy_to_the_order_of_the_method():
     [
         (lennard_jones, {"n": 1}, "at least two particles"),
         (lennard_jones, {"box": 4.0, "cutoff": 2.5}, "cutoff must be .*half of the box"),
-        (
-            lennard_jones,
-            {"box": 4.0, "periodic": False},
-            "box with periodic=False must be None, got 4.0",
-        ),
+        (lennard_jones, {"box": 4.0, "periodic": False}, "periodic=False must be None, got 4.0"),
         (lennard_jones, {"temperature": -1.0}, "temperature must be zero or a positive"),
         (sine_gordon, {"start": "soliton"}, "start must be one of 'breather', 'kink'"),
         (sine_gordon, {"ends": "open"}, "ends must be one of 'periodic', 'fixed', 'free'"),
         (sine_gordon, {"velocity": 1.0}, "velocity must be between -1.0 and 1.0"),
         (sine_gordon, {"dx": 0.0}, "dx must be a positive"),
-        (
-            phi4,
-            {"ends": "periodic"},
-            "ends of the first axis with start='kink' must be one of 'fixed', 'free', got 'periodic'",
-        ),
+        (phi4, {"ends": "periodic"}, "start='kink' must be one of 'fixed', 'free', got 'pe"),
         (phi4, {"shape": (4, 4, 4, 4)}, "number of axes in shape must be one of 1, 2, 3, got 4"),
         (phi4, {"shape": (8, 2)}, "at least 3, got 2"),
         (phi4, {"shape": (8, 8), "ends": ("free",)}, "number of words in ends must be 2, got 1"),
