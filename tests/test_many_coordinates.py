@@ -1,5 +1,6 @@
 """Lattices, fields and many bodies: solitons, dispersion, test particles, forces of a fluid."""
 
+import dataclasses
 import functools
 import itertools
 
@@ -102,6 +103,10 @@ def test_winding_and_charge_of_kinks():
     assert float(wall.observables["topological_charge"](0.0, q, p, wall.args)) == pytest.approx(
         1, abs=1e-4
     )
+    # A wall of width 1.6 that moves along the first axis
+    P = wall.observables["field_momentum"](0.0, q, p, wall.args)
+    momentum = 1.6 * 8**0.5 / 3 * 0.3 / np.sqrt(1 - 0.3**2)
+    np.testing.assert_allclose(P, [momentum, 0.0], rtol=0.02, atol=1e-14)
     ring = sine_gordon(64, 0.4, start="kink", velocity=0.3)
     moved = np.append(ring.q0[1:], ring.q0[0] + 2 * np.pi), np.roll(ring.p0, -1)
     assert energy(ring, *moved) == pytest.approx(energy(ring, ring.q0, ring.p0), rel=1e-14)
@@ -211,13 +216,25 @@ def by_loops(problem, potential, ends, q, p):
     ("make", "potential"),
     [(phi4, lambda u: (u**2 - 1) ** 2 / 4), (systems.klein_gordon, lambda u: u**2 / 2)],
 )
-def test_energies_with_every_kind_of_ends(make, potential):
+def test_energies_and_momenta_with_every_kind_of_ends(make, potential):
     random = np.random.default_rng(3)
     for ends in ("free",), ("fixed", "periodic"), ("periodic", "free", "fixed"):
         shape = (4, 3, 5)[: len(ends)]
         options = {"start": "thermal"} if make is phi4 else {}
         problem = make(shape, 0.3, ends, **options)
+        sides = {name: 0.4 for name in problem.args if name == "right"}  # not that of the left
+        problem = dataclasses.replace(problem, args=problem.args | sides)
         q, p = random.normal(size=(2, *shape))
+        slopes = []
+        for axis, end in enumerate(ends):
+            widths = [(1, 1) if i == axis else (0, 0) for i in range(q.ndim)]
+            walls = [problem.args.get(name, 0.0) for name in ("left", "right")]
+            values = {"constant_values": walls} if end == "fixed" else {}
+            mode = {"periodic": "wrap", "free": "edge", "fixed": "constant"}[end]
+            u = np.moveaxis(np.pad(q, widths, mode, **values), axis, 0)
+            slopes.append(np.moveaxis(u[2:] - u[:-2], 0, axis) / 0.6)
+        momentum = problem.observables["field_momentum"](0.0, jnp.asarray(q), p, problem.args)
+        np.testing.assert_allclose(np.ravel(momentum), [-np.sum(p * x) for x in slopes], rtol=1e-12)
         wanted = by_loops(problem, potential, ends, q, p)
         assert energy(problem, q, p) == pytest.approx(wanted, rel=1e-13)
 

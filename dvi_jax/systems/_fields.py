@@ -124,6 +124,11 @@ def places(n: int, dx: float) -> np.ndarray:
     return dx * (np.arange(n) - (n - 1) / 2)
 
 
+def sech(x):
+    """1/cosh x without overflow."""
+    return 1 / np.cosh(np.clip(x, -700, 700))
+
+
 def step_size(dx: float, dim: int) -> float:
     """A quarter of dx/√dim, the largest stable step of the leapfrog method for short waves."""
     return dx / (4 * np.sqrt(dim))

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..base.checks import whole
+from ._fields import sech
 from ._problem import Parameter, Problem, Start, finite, library_problem
 from .oscillator import PHASE
 
@@ -73,7 +74,7 @@ def soliton(t, n, amplitude, velocity, args):
     kappa, gamma, x = args["kappa"], args["gamma"], np.arange(n) - n / 2
     width = amplitude * np.sqrt(gamma / (2 * kappa))
     omega = velocity**2 / (4 * kappa) - gamma * amplitude**2 / 2
-    size = np.sqrt(2) * amplitude / np.cosh(width * (x - velocity * t))
+    size = np.sqrt(2) * amplitude * sech(width * (x - velocity * t))
     phase = velocity * x / (2 * kappa) - omega * t
     return size * np.cos(phase), size * np.sin(phase)
 
@@ -91,7 +92,7 @@ def nls_lattice(n: int = 8, kappa: float = 1.0, gamma: float = 1.0) -> Problem:
     """
     n = whole("n", n, 3, hint="The lattice is a ring of at least three sites.")
     site = np.arange(n) - n / 2
-    size, phase = 1 / np.cosh(site / 1.5), 0.5 * site
+    size, phase = sech(site / 1.5), 0.5 * site
     q0, p0 = size * np.cos(phase), size * np.sin(phase)
     return library_problem(
         hamiltonian,

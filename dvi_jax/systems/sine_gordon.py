@@ -14,6 +14,7 @@ from ._fields import (
     observables_of,
     parameters_of,
     places,
+    sech,
     start_of,
     step_size,
 )
@@ -46,7 +47,7 @@ def kink(t, x, velocity=0.0):
     xi = gamma * (np.asarray(x) - velocity * np.asarray(t))
     # Both tails to full accuracy: the kink is 2π minus its mirror image.
     small = 4 * np.arctan(np.exp(-np.abs(xi)))
-    return np.where(xi > 0, 2 * np.pi - small, small), -2 * gamma * velocity / np.cosh(xi)
+    return np.where(xi > 0, 2 * np.pi - small, small), -2 * gamma * velocity * sech(xi)
 
 
 def breather(t, x, frequency=0.5, velocity=0.0):
@@ -60,7 +61,7 @@ def breather(t, x, frequency=0.5, velocity=0.0):
     x, t = np.asarray(x), np.asarray(t)
     gamma, s = 1 / np.sqrt(1 - velocity**2), np.sqrt(1 - frequency**2)
     xi, phase = gamma * (x - velocity * t), frequency * gamma * (t - velocity * x)
-    size = s / frequency / np.cosh(s * xi)
+    size = s / frequency * sech(s * xi)
     F = size * np.sin(phase)
     rate = size * gamma * frequency * np.cos(phase)
     rate = rate + F * gamma * velocity * s * np.tanh(s * xi)
