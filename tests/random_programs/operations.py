@@ -160,9 +160,11 @@ CHOICES = {
     "mask": lambda u, v, k, m, n, i: jnp.where(
         np.random.default_rng(k % 97).random(u.shape) < 0.5, u, 0.25
     ),
-    "triangle": lambda u, v, k, m, n, i: (jnp.triu if k % 2 else jnp.tril)(u, m % 3 - 1)
-    if u.ndim == 2
-    else jnp.where(v > 0.3137, u, 0.0),
+    "triangle": lambda u, v, k, m, n, i: (
+        (jnp.triu if k % 2 else jnp.tril)(u, m % 3 - 1)
+        if u.ndim == 2
+        else jnp.where(v > 0.3137, u, 0.0)
+    ),
     "and": lambda u, v, k, m, n, i: jnp.where((u > 0.1137) & ~(v < -0.4137), u * v, v),
 }
 
@@ -231,9 +233,11 @@ PRODUCTS = {
     "dot": lambda u, v, k, m, n, i: jnp.vdot(u, v) / u.size - 0.5 * v,
     "known matrix": lambda u, v, k, m, n, i: jnp.tensordot(_square(u, k), u, (m % 2, 0)),
     "matrices": _matrices,
-    "rows": lambda u, v, k, m, n, i: jnp.sum(u * v, -1) / u.shape[-1]
-    if k % 2
-    else jnp.einsum("...i,...i->...", u, v) / u.shape[-1],
+    "rows": lambda u, v, k, m, n, i: (
+        jnp.sum(u * v, -1) / u.shape[-1]
+        if k % 2
+        else jnp.einsum("...i,...i->...", u, v) / u.shape[-1]
+    ),
     "outer": _outer,
 }
 
@@ -272,8 +276,9 @@ PAIRS = {
 }
 
 CUMULATIVE = {
-    "cumsum": lambda u, v, k, m, n, i: lax.cumsum(u, _axis(u, n), reverse=bool(k % 2))
-    / u.shape[_axis(u, n)],
+    "cumsum": lambda u, v, k, m, n, i: (
+        lax.cumsum(u, _axis(u, n), reverse=bool(k % 2)) / u.shape[_axis(u, n)]
+    ),
     "cummax": lambda u, v, k, m, n, i: lax.cummax(u, _axis(u, n), reverse=bool(k % 2)),
     "cummin": lambda u, v, k, m, n, i: lax.cummin(u, _axis(u, n)),
     "cumprod": lambda u, v, k, m, n, i: lax.cumprod(

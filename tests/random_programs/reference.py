@@ -206,7 +206,9 @@ WITH_PARAMETERS: dict[str, Callable] = {
     "reduce_precision": lambda x, **_: x,
     "stop_gradient": lambda x, **_: x,
     "iota": lambda *, dtype, shape, dimension, **_: np.broadcast_to(
-        np.arange(shape[dimension]).reshape([-1 if i == dimension else 1 for i in range(len(shape))]),
+        np.arange(shape[dimension]).reshape(
+            [-1 if i == dimension else 1 for i in range(len(shape))]
+        ),
         shape,
     ).astype(dtype),
     "broadcast_in_dim": _broadcast,
