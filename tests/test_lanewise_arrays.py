@@ -6,16 +6,8 @@ import jax
 import numpy as np
 import pytest
 from random_programs import reference
-from random_programs.arrays import (
-    KINDS,
-    SMALL_KINDS,
-    TOLERANCE,
-    Program,
-    check,
-    difference,
-    search,
-    smaller,
-)
+from random_programs.array_programs import KINDS, SMALL_KINDS, Program
+from random_programs.arrays import TOLERANCE, check, difference, search, smaller
 
 from lanewise.evaluator import RULES
 from lanewise.jaxprs.jaxapi import ClosedJaxpr, Literal, scan_counts
@@ -94,8 +86,8 @@ def _body_of_the_loop(program):
 
 
 def _mutants(program):
-    """The program with one operand of one operation of a step exchanged: a new value of a carry is
-    read instead of the old one, as after a wrong update in place, or an old one instead of a new."""
+    """The program with one operand of one operation of a step exchanged: the new value of a carry
+    is read instead of the old one, as after a wrong update in place, or the old one instead."""
     k, name, carry = _body_of_the_loop(program)
     loop = program.jaxpr.jaxpr.eqns[k]
     body = loop.params[name].jaxpr

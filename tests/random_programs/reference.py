@@ -96,7 +96,7 @@ def _pad(x, value, *, padding_config):
         low + np.arange(n) * (inner + 1)
         for n, (low, _, inner) in zip(x.shape, padding_config, strict=True)
     ]
-    keep = [(0 <= at) & (at < n) for at, n in zip(places, shape, strict=True)]
+    keep = [(at >= 0) & (at < n) for at, n in zip(places, shape, strict=True)]
     if x.ndim:
         pairs = list(zip(places, keep, strict=True))
         out[np.ix_(*(at[k] for at, k in pairs))] = x[np.ix_(*keep)]
@@ -184,9 +184,10 @@ def _select(which, *cases):
 
 
 FUNCTIONS: dict[str, Callable] = {
-    **{name: getattr(np, name) for name in (
-        "sign floor ceil abs sqrt cbrt sin cos tan sinh cosh tanh exp exp2 expm1 log log1p square"
-    ).split()},
+    **{f.__name__: f for f in (np.sign, np.floor, np.ceil, np.sqrt, np.cbrt, np.sin, np.cos, np.tan,
+                               np.sinh, np.cosh, np.tanh, np.exp, np.exp2, np.expm1, np.log,
+                               np.log1p, np.square)},
+    "abs": np.abs,
     "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": _div, "rem": np.fmod,
     "max": np.maximum, "min": np.minimum, "neg": np.negative, "pow": np.power, "asin": np.arcsin,
     "acos": np.arccos, "atan": np.arctan, "atan2": np.arctan2, "rsqrt": lambda x: 1 / np.sqrt(x),
