@@ -1,4 +1,4 @@
-"""The runs of large.py: one trajectory with many coordinates, as a user of the package writes it."""
+"""The runs of large.py: one trajectory with many coordinates, as users of the package write it."""
 
 import functools
 from collections.abc import Callable
@@ -60,6 +60,10 @@ class Case(NamedTuple):
     def steps(self) -> int:
         return int(np.clip(WORK // (self.cost * np.prod(self.shape)), 10, 20_000))
 
+    @property
+    def is_implicit(self) -> bool:
+        return "root_finder" in (self.options or {})
+
     def start(self) -> list[np.ndarray]:
         rng = np.random.default_rng(5)
         return [s * rng.uniform(-1, 1, self.shape) for s in self.spread]
@@ -99,7 +103,7 @@ class Case(NamedTuple):
 
 def fput(n: int, kernel: str = "fput", work: int = 0, **options) -> Case:
     problem = systems.fput(n, alpha=0.0, beta=0.5)
-    spread, cost = (0.1, 0.1), 10 if kernel == "fput_gauss" else 1
+    spread, cost = (0.1, 0.1), 100 if kernel == "fput_gauss" else 1
     constants = (0.0, 0.5)
     return Case(
         kernel, problem.system, (n,), 0.05, spread, constants, work, problem.args, options, cost
@@ -134,7 +138,7 @@ def nls(n: int) -> Case:
 def newton(n: int) -> Case:
     options = {"root_finder": dvi.Newton()}
     spread, constants = (0.3, 0.3), (A, B, C)
-    return Case("band", dvi.System(chain), (n,), 0.02, spread, constants, 4, None, options, 10_000)
+    return Case("band", dvi.System(chain), (n,), 0.02, spread, constants, 4, None, options, 2000)
 
 
 CASES: dict[str, tuple[Callable[[], Case], float | None]] = {
