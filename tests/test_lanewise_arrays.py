@@ -13,22 +13,37 @@ from lanewise.evaluator import RULES
 from lanewise.jaxprs.jaxapi import ClosedJaxpr, Literal, scan_counts
 
 FOUR = ("in place", "moves", "loops", "branches")
-"""Kinds of which four programs are in the quick tests, of the others three: 40 programs."""
+"""Kinds of which there are four short tests, of the others three: 40 programs."""
+
+QUICK = {
+    *(("moves", 1000), ("moves", 1002), ("in place", 1000), ("in place", 1001)),
+    *(("reductions", 1001), ("reductions", 1002), ("pairs", 1000), ("cumulative", 1002)),
+    *(("indices", 1000), ("indices", 1002), ("types", 1001), ("derivatives", 1002)),
+    *(("loops", 1000), ("everything", 1001)),
+}
+"""Those that compile in about a second number by number; the others are in the long tests."""
 
 
-@pytest.mark.parametrize("kind", SMALL_KINDS)
-def test_a_few_programs(kind):
-    for seed in range(1000, 1004 if kind in FOUR else 1003):
-        outcome = check(Program(seed, kind))
-        assert not outcome.failure, (seed, outcome.failure)
-        assert not outcome.ill
+def short_tests():
+    for kind in SMALL_KINDS:
+        for seed in range(1000, 1004 if kind in FOUR else 1003):
+            marks = () if (kind, seed) in QUICK else pytest.mark.slow
+            yield pytest.param(kind, seed, marks=marks)
+
+
+@pytest.mark.parametrize(("kind", "seed"), short_tests())
+def test_a_few_programs(kind, seed):
+    outcome = check(Program(seed, kind))
+    assert not outcome.failure
+    assert not outcome.ill
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("part", range(2))
 @pytest.mark.parametrize("kind", SMALL_KINDS)
-def test_programs(kind):
+def test_programs(kind, part):
     lines = []
-    assert search([kind], 42, 2000, lines.append) == 0, "\n".join(lines)
+    assert search([kind], 21, 2000 + 21 * part, lines.append) == 0, "\n".join(lines)
 
 
 def test_a_program_is_a_function_of_its_seed_and_kind():

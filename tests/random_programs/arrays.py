@@ -171,7 +171,9 @@ def smaller(program: Program) -> Program:
     return Program(program.seed, program.kind, frozenset(removed))
 
 
-def search(kinds: list[str], count: int, seed: int, out: Any = print) -> int:
+def search(
+    kinds: list[str], count: int, seed: int, out: Any = functools.partial(print, flush=True)
+) -> int:
     """Check programs of all kinds in turn; the number of failures, which are printed."""
     ways, reasons, failures, ill = collections.Counter(), collections.Counter(), 0, 0
     began = time.process_time()
