@@ -31,7 +31,7 @@ def short_tests():
             yield pytest.param(kind, seed, marks=marks)
 
 
-@pytest.mark.parametrize(("kind", "seed"), short_tests())
+@pytest.mark.parametrize(("kind", "seed"), list(short_tests()))
 def test_a_few_programs(kind, seed):
     outcome = check(Program(seed, kind))
     assert not outcome.failure

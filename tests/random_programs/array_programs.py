@@ -269,7 +269,7 @@ BRANCHES = {
     "cond": lambda u, v, k, i, f, g, h: lax.cond(
         jnp.sum(u) / u.size > 0.1137, f, g, u, v
     ),
-    "handed through": lambda u, v, k, i, f, g, h: lax.cond(
+    "passed on": lambda u, v, k, i, f, g, h: lax.cond(
         i % 2 == 0, lambda u, v: (u, f(u, v)), lambda u, v: (v, u), u, v
     )[k % 2],
     "switch": lambda u, v, k, i, f, g, h: lax.switch(
