@@ -52,7 +52,7 @@ class Baseline:
     def __init__(self):
         self._folder = tempfile.TemporaryDirectory(prefix="dvi_jax_baseline_")
         target = Path(self._folder.name) / "baseline.so"
-        self.command = _compile(target)
+        self.command = compile_source(SOURCE, target)
         self._library = ctypes.CDLL(str(target))
         self.width = int(self._library.vector_width())
         self.has_libmvec = bool(self._library.has_libmvec())
@@ -233,7 +233,7 @@ def find_compiler() -> list[str]:
     )
 
 
-def _compile(target: Path) -> list[str]:
+def compile_source(source: Path, target: Path) -> list[str]:
     """Compiled and linked by two commands: linked with -ffast-math, a library of gcc before 13
     switches the whole process to rounding subnormal numbers to zero as it is loaded."""
     compiler, errors = find_compiler(), []
@@ -241,14 +241,14 @@ def _compile(target: Path) -> list[str]:
     for tuned in TUNED:
         for define, *libraries in VECTOR_MATH:
             command = [*compiler, *FLAGS, *tuned]
-            errors.append(_run([*command, define, "-c", str(SOURCE), "-o", compiled]))
+            errors.append(_run([*command, define, "-c", str(source), "-o", compiled]))
             if not errors[-1]:
                 errors[-1] = _run(
                     [*compiler, "-shared", compiled, "-o", str(target), *libraries, "-lm"]
                 )
             if not errors[-1]:
                 return command
-    raise NoCompilerError(f"{compiler[0]} does not compile baseline.c:\n{errors[0]}")
+    raise NoCompilerError(f"{compiler[0]} does not compile {source.name}:\n{errors[0]}")
 
 
 def _run(command: list[str]) -> str:

@@ -6,6 +6,7 @@ Legendre transform, Newton's and Lorentz's forces, equations in other variables.
 """
 
 import functools
+import itertools
 
 import numpy as np
 import sympy as sp
@@ -161,6 +162,48 @@ def hill(t, q, p, args, epsilon):
     pull = to_centre(q, 1.0)
     a = pull + np.array([3 * q[0] + 2 * v[1], -2 * v[0], -q[2]])
     return v, a + np.array([-v[1], v[0], 0.0])
+
+
+def field(slope):
+    """du/dt = p/dx^d and dp/dt = dx^d (Δu − V′(u)), each site with its neighbours, one by one.
+
+    On rings; ends with args["left"] and args["right"] along the first axis if there are such.
+    """
+
+    def rates(t, q, p, args, epsilon):
+        dx, push = args["dx"], np.zeros_like(q)
+        for site in np.ndindex(q.shape):
+            for axis, step in itertools.product(range(q.ndim), (-1, 1)):
+                place = list(site)
+                place[axis] += step
+                if 0 <= place[axis] < q.shape[axis] or axis or "left" not in args:
+                    place[axis] %= q.shape[axis]
+                    other = q[tuple(place)]
+                else:
+                    other = args["left" if step < 0 else "right"]
+                push[site] += (other - q[site]) / dx**2
+            push[site] -= slope(q[site], args)
+        return p / dx**q.ndim, push * dx**q.ndim
+
+    return rates
+
+
+def lennard_jones(t, q, p, args, epsilon):
+    """Forces of all pairs, the nearest of 27 images, less the force at the cut-off."""
+    push = np.zeros_like(q)
+    box, c, sigma = args["box"], args["cutoff"], args["sigma"]
+    cells = box * np.array(list(itertools.product((-1, 0, 1), repeat=3)))
+
+    def strength(r):
+        return 24 * args["depth"] / r * (2 * (sigma / r) ** 12 - (sigma / r) ** 6)
+
+    for i, j in itertools.permutations(range(len(q)), 2):
+        images = np.mod(q[i], box) - np.mod(q[j], box) + cells
+        d = images[np.argmin(np.sum(images**2, axis=1))]
+        r = np.sqrt(d @ d)
+        if r < c:
+            push[i] += (strength(r) - strength(c)) * d / r
+    return p / args["mass"], push
 
 
 def n_body(t, q, p, args, epsilon):
@@ -447,6 +490,10 @@ DERIVATIONS = {
     "thermal_chain": thermal_chain,
     "stiff_fput": stiff_fput,
     "nls_lattice": nls,
+    "klein_gordon": field(lambda u, args: args["mass"] ** 2 * u),
+    "sine_gordon": field(lambda u, args: np.sin(u)),
+    "phi4": field(lambda u, args: u**3 - u),
+    "lennard_jones": lennard_jones,
     "uniform_field": lorentz(
         uniform_potential,
         lambda q, args: np.array([0.0, 0.0, args["B"]]),

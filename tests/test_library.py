@@ -34,8 +34,9 @@ NAMES = list(systems.LIBRARY)
 QUICK = {"duffing", "kepler"}
 """Those whose runs by `integrate` are in every run of the tests; the rest are marked slow."""
 ALIKE = {"figure_eight", "pythagorean", "outer_solar_system", "solar_system"}
-ALIKE |= {"perturbed_pendulum", "lorentz_pendulum", "van_der_pol"}
-"""Those with functions of another system."""
+ALIKE |= {"perturbed_pendulum", "lorentz_pendulum", "van_der_pol", "sine_gordon", "phi4"}
+ALIKE |= {"lennard_jones"}
+"""Those with functions of another system, or with the symmetries of one."""
 MOST = set(NAMES) - ALIKE
 CONSTRAINED = {"spherical_pendulum", "chain", "slider_crank", "dumbbell", "heavy_top", "satellite"}
 """Those with a constraint, whose forces are added to the flow, and whose method is `Rattle`."""
@@ -744,7 +745,7 @@ def test_exact_solutions_keep_the_dtype_and_refuse_other_shapes(name):
     for x, y in zip(single, double, strict=True):
         assert (x.shape, x.dtype) == ((1, 2, *q0.shape), jnp.float32)
         assert (y.shape, y.dtype) == ((3, 1, 2, *q0.shape), jnp.float64)
-    if name not in ("oscillator", "van_der_pol", "slow_oscillator"):  # of any number of dimensions
+    if name not in ("oscillator", "van_der_pol", "slow_oscillator", "klein_gordon"):  # of any shape
         with pytest.raises(ValueError, match=r"one initial condition.*got q0 of shape \(3, "):
             made.exact(1.0, many, many, made.args)
     with pytest.raises(ValueError, match="shape"):

@@ -49,6 +49,7 @@ EXAMPLES = {
     "variational_lattice.py": ("lattices", "variational_damped.png"),
     "sweep_map.py": ("sweeps", "sweep_maps.png"),
     "many_hosts.py": ("clusters", ""),
+    "solitons.py": ("many-coordinates", "solitons.png"),
     "transit_times.py": ("splitting", "transit_times.png"),
     "general_relativity.py": ("general-relativity", "general_relativity.png"),
     "polar_motion.py": ("polar-motion", "polar_motion.png"),

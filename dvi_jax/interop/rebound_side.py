@@ -14,13 +14,11 @@ from ..base.files import user_file
 from ..base.inputs import refuse_unit_or_mask
 from ..base.printing import printable
 from ..systems import Problem
-from ..systems._problem import at_end, of_state
 from ..systems.n_body import (
     INVARIANTS,
     OBSERVABLES,
     PARAMETERS,
     check_bodies,
-    energy_of,
     hamiltonian,
     symmetries,
 )
@@ -49,14 +47,6 @@ _ASTROPY = {
     **{"mearth": "Mearth", "mjupiter": "Mjup", "aus": "au", "parsec": "pc", "gram": "g"},
 }
 """REBOUND's names of units → the usual ones; the others are the same."""
-
-
-def softened_hamiltonian(t0, t1, q0, p1, args):
-    r"""H_D = Σ_i |p1_i|² / (2 m_i) − G Σ_{i<j} m_i m_j / √(|q0_i − q0_j|² + b²), Plummer's law.
-
-    `args` as in `dvi_jax.systems.n_body.hamiltonian`, and ``"softening"``: b [length].
-    """
-    return energy_of(q0, p1, args, args["softening"])
 
 
 @printable
@@ -144,18 +134,17 @@ def from_rebound(
     check_bodies(q, p, args, texts)
     if softening := numbers["softening"]:
         args["softening"] = softening
-    function = softened_hamiltonian if softening else hamiltonian
     units, parameters = _texts(_units(simulation))
     texts_of: dict[str, Any] = {"units": units, "check": check_bodies}
     texts_of |= {"source": "a simulation of REBOUND"}
-    texts_of |= {"parameters": {name: parameters.get(name, "b [length]") for name in args}}
-    texts_of |= {"observables": OBSERVABLES | {"energy": of_state(at_end(function))}}
+    texts_of |= {"parameters": {name: parameters[name] for name in args}}
+    texts_of |= {"observables": OBSERVABLES}
     if not softening:
         texts_of |= {"invariants": INVARIANTS, "symmetries": symmetries(3)}
     theirs = {"names": names, "velocities": v, "radii": rows[:, 7], "t0": numbers["t"]}
     theirs |= {"integrator": str(simulation.integrator), "rebound_units": _units(simulation)}
     state = {"q0": q, "p0": p, "h": numbers["dt"], "args": args}
-    return ReboundProblem("rebound", dvi.System(function), **state, **texts_of, **theirs)
+    return ReboundProblem("rebound", dvi.System(hamiltonian), **state, **texts_of, **theirs)
 
 
 def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) -> Any:
@@ -178,7 +167,7 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
     instance("problem", problem, Problem, "a problem of dvi_jax.systems or of from_rebound")
     system, args = problem.system, problem.args
     differences = {
-        "another Hamiltonian": system.H_D not in (hamiltonian, softened_hamiltonian),
+        "another Hamiltonian": system.H_D is not hamiltonian,
         "args that are not a dict": not isinstance(args, Mapping),
         "a force": system.force is not None,
         "a perturbation": system.perturbation is not None,

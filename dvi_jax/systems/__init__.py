@@ -19,6 +19,8 @@ from .fput import fput as fput
 from .henon_heiles import henon_heiles as henon_heiles
 from .hill import hill as hill
 from .kepler import kepler as kepler
+from .klein_gordon import klein_gordon as klein_gordon
+from .lennard_jones import lennard_jones as lennard_jones
 from .lorentz_pendulum import lorentz_pendulum as lorentz_pendulum
 from .lotka_volterra import lotka_volterra as lotka_volterra
 from .magnetic_mirror import magnetic_mirror as magnetic_mirror
@@ -34,6 +36,7 @@ from .oblate_kepler import oblate_kepler as oblate_kepler
 from .oscillator import oscillator as oscillator
 from .pendulum import pendulum as pendulum
 from .perturbed_pendulum import perturbed_pendulum as perturbed_pendulum
+from .phi4 import phi4 as phi4
 from .planets.outer_solar_system import outer_solar_system as outer_solar_system
 from .planets.polar_motion import polar_motion as polar_motion
 from .planets.solar_system import solar_system as solar_system
@@ -42,6 +45,7 @@ from .relativistic_kepler import relativistic_kepler as relativistic_kepler
 from .restricted_three_body import restricted_three_body as restricted_three_body
 from .rigid_body import rigid_body as rigid_body
 from .rotating_bodies import heavy_top as heavy_top, satellite as satellite
+from .sine_gordon import sine_gordon as sine_gordon
 from .slow_oscillator import slow_oscillator as slow_oscillator
 from .spinning_top import spinning_top as spinning_top
 from .stiff_fput import stiff_fput as stiff_fput
@@ -59,6 +63,7 @@ LIBRARY = {
         *(kepler, relativistic_kepler, oblate_kepler, two_centres, restricted_three_body, hill),
         *(n_body, figure_eight, pythagorean, outer_solar_system, solar_system),
         *(henon_heiles, toda, fput, stiff_fput, thermal_chain, nls_lattice),
+        *(klein_gordon, sine_gordon, phi4, lennard_jones),
         *(uniform_field, magnetic_mirror, dipole_field),
         *(spherical_pendulum, chain, slider_crank, dumbbell),
         *(rigid_body, spinning_top, heavy_top, satellite, polar_motion, lotka_volterra),

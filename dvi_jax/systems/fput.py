@@ -31,11 +31,19 @@ def mode_energies(t0, t1, q0, p0, q1, p1, args):
 
     With α = β = 0 each is conserved. Their sum is the energy without the terms in α and β.
     """
-    n = q1.shape[0]
+    w = jnp.asarray(frequencies(q1.shape[0]), q1.dtype)
+    return (_sine_transform(p1) ** 2 + (w * _sine_transform(q1)) ** 2) / 2
+
+
+def _sine_transform(x):
+    """√(2/(n + 1)) Σ_i x_i sin(πik/(n + 1)), k = 1, …, n."""
+    n = x.shape[0]
+    if n > 256:  # the matrix of a long chain would be larger than all its other data
+        odd = jnp.concatenate([jnp.zeros_like(x[:1]), x, jnp.zeros_like(x[:1]), -x[::-1]])
+        return -jnp.imag(jnp.fft.rfft(odd)[1:-1]) * np.sqrt(0.5 / (n + 1))
     i = np.arange(1, n + 1)
     modes = np.sqrt(2 / (n + 1)) * np.sin(np.pi * np.outer(i, i) / (n + 1))
-    to_modes, w = jnp.asarray(modes, q1.dtype), jnp.asarray(frequencies(n), q1.dtype)
-    return ((to_modes @ p1) ** 2 + (w * (to_modes @ q1)) ** 2) / 2
+    return jnp.asarray(modes, x.dtype) @ x
 
 
 def fput(n: int = 31, alpha: float = 0.25, beta: float = 0.0) -> Problem:

@@ -19,7 +19,8 @@ from dvi_jax.base.signature import accepts
 from .kinds import LENGTHS, Kind, Random, outputs, pick, put
 
 SIZES = dict.fromkeys(("fput", "thermal_chain", "toda", "chain", "stiff_fput"), (3,))
-"""Sizes of chains, which take less time with few particles."""
+SIZES |= dict.fromkeys(("sine_gordon", "phi4", "klein_gordon", "lennard_jones"), (4,))
+"""Sizes of chains and lattices, which take less time with few particles."""
 
 PARTS = {
     "TypeII()": [("euler", 1.0)],
