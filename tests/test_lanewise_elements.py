@@ -200,8 +200,8 @@ def test_a_trajectory_has_the_same_bits_alone_and_next_to_one_that_fails():
     one = jax.jit(functools.partial(lanewise.call, chain))
     for i in range(5):
         alone = one(x[i], y[i])
-        for y, z in zip(batch, alone, strict=True):
-            np.testing.assert_array_equal(y[i], z)
+        for of_batch, of_one in zip(batch, alone, strict=True):
+            np.testing.assert_array_equal(of_batch[i], of_one)
         assert bool(jnp.isnan(alone[0]).any()) == (i == 3)
     jax.tree.map(
         functools.partial(np.testing.assert_allclose, rtol=1e-12, atol=1e-12),
