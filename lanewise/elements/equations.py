@@ -40,6 +40,7 @@ elements nor is elementwise. `reductions`, `indices` and `flow` fill this table.
 _IDENTITIES = frozenset(
     ["reshard", "sharding_constraint", "mesh_cast", "least_over_lanes", "optimization_barrier"]
 )
+_COPIES = ("copy", "copy_p", "stop_gradient", "real", "conj")
 
 
 class Token:
@@ -231,6 +232,9 @@ class Translation:
         for aval in avals:
             check_type(aval.dtype, f"results of {name}")
         shape, dtype = avals[0].shape, str(avals[0].dtype)
+        # An array that stays the same is not copied: it may be a long table.
+        if name in _COPIES or (name == "select_n" and all(x is args[1] for x in args[2:])):
+            return [args[-1]]
         if name in ELEMENTWISE:
             return [elementwise(name, params, args, shape, dtype)]
         if name in BOX_MOVES:

@@ -89,9 +89,7 @@ def has_long_arrays(jaxpr: Any) -> bool:
 
     Rows that a loop collects do not count, nor what is done to them after it.
     """
-    return _has_long_loop(jaxpr) or (
-        not _has_loop(jaxpr) and _longest(jaxpr, counts_moves=False) > LONG_CARRY
-    )
+    return _has_long_loop(jaxpr) or (not _has_loop(jaxpr) and _longest(jaxpr) > LONG_CARRY)
 
 
 def _has_long_loop(jaxpr: Any) -> bool:
@@ -119,15 +117,16 @@ def _carried(eqn: Any) -> int:
     return max((var.aval.size for var in eqn.outvars[:count]), default=0)
 
 
-def _longest(jaxpr: Any, counts_moves: bool = True) -> int:
-    """Elements of the longest array that is computed, the rows of loops left out."""
+def _longest(jaxpr: Any) -> int:
+    """Elements of the longest array that is computed. Moves, choices between arrays and the rows of
+    loops do not count: a table of a function passes through them."""
     longest = 0
     for eqn in jaxpr.eqns:
         inner = (*bodies(eqn), *functions_in(eqn))
-        sizes = [_longest(f.jaxpr, counts_moves) for f in inner]
+        sizes = [_longest(f.jaxpr) for f in inner]
         if eqn.primitive.name == "scan":
             sizes.append(_carried(eqn))
-        elif not inner and (counts_moves or eqn.primitive.name not in _FREE):
+        elif not inner and eqn.primitive.name not in (*_FREE, "select_n"):
             sizes += [var.aval.size for var in eqn.outvars]
         longest = max([longest, *sizes])
     return longest
