@@ -7,7 +7,7 @@ import numpy as np
 
 from ..evaluator import Evaluator
 from ..jaxprs.jaxapi import ClosedJaxpr
-from ..llvm.ir import Num, check_type
+from ..llvm.ir import Num, check_size, check_type
 from ..llvm.memory import stored_type
 from ..module import Module
 from .equations import Translation, row_major
@@ -71,6 +71,7 @@ class Kernel:
         for item in block.items:
             if isinstance(item, Group):
                 self.nests.group(item)
+                check_size(self.b.operations, self.b.limit, "the number of operations")
             elif isinstance(item, Loop):
                 self.loop(item)
             else:
