@@ -106,23 +106,23 @@ def explain(
     return Explanation(tuple(part for program in programs for part in _parts(program, batch)))
 
 
-def left_to_xla(function: Callable, *args: Any, batch: int = 1024) -> str | None:
-    """Why XLA computes a call of `lanewise` in ``function(*args)``, or a part of one.
-
-    None if machine code is generated for all of them. Nothing is compiled.
+def compiled_by(function: Callable, *args: Any, batch: int = 1024) -> tuple[set[str], str | None]:
+    """The targets (see `Part`) that compile the calls of `lanewise` in ``function(*args)``, and why
+    XLA computes one of them or a part of it, None if it does not. Nothing is compiled.
     """
+    names: set[str] = set()
     if not generates():
-        return f"the variable {SWITCH} is off, or LLVM did not start"
+        return names, f"the variable {SWITCH} is off, or LLVM did not start"
     jaxpr = jax.make_jaxpr(function)(*args).jaxpr
     for program in _calls(jaxpr):
         # Without the pieces of `_parts`: a program that is cut is in part computed by XLA.
         flags = [True] * len(program.trace.all_inputs.jaxpr.invars)
         try:
             # This writes the code and does not compile it, which would take seconds.
-            compile_program(program, flags, batch, "cpu")
+            names.add(compile_program(program, flags, batch, "cpu").target.name)
         except NotCompilable as reason:
-            return str(reason)
-    return None
+            return names, str(reason)
+    return names, None
 
 
 def _calls(jaxpr: Any) -> list[Any]:

@@ -359,3 +359,13 @@ def test_what_is_too_large_for_machine_code_is_run_by_xla():
     assert "number of operations" in reason
     with jax.disable_jit():
         assert ways.way_of_running(system, dvi.Integrator(), **how)[0] == "XLA"
+
+
+def test_loops_over_long_arrays_are_another_way_of_running():
+    """Their sums have another order than the one whose rounding is bounded."""
+    from dvi_jax.proof.ways import MACHINE_CODE, XLA, way_of_running
+
+    system = dvi.System(lambda t0, t1, q, p, args: jnp.sum(p**2 + q**2) / 2)
+    ways = [way_of_running(system, dvi.Integrator(), (n,), 0.1, None)[0] for n in (48, 49)]
+    assert ways[0] == MACHINE_CODE
+    assert ways[1] not in (MACHINE_CODE, XLA)

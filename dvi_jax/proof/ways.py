@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from lanewise.explained import left_to_xla
+from lanewise.explained import compiled_by
 
 from ..integration.integrate import integrate
 from ..integration.integrator import Integrator, chosen, only
@@ -54,7 +54,10 @@ def way_of_running(
         return solution.qs, solution.ps
 
     state = jnp.full(shape, 0.1)
-    reason = left_to_xla(run, state, state, jnp.asarray(0.1))
+    targets, reason = compiled_by(run, state, state, jnp.asarray(0.1))
+    if reason is None and "elements" in targets:
+        # Their sums have another order than the one that is bounded.
+        return "loops over arrays", "more than 48 coordinates are computed by loops over arrays"
     if reason is None:
         return MACHINE_CODE, ""
     flags = os.environ.get("XLA_FLAGS", "")
