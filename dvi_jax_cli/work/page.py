@@ -24,6 +24,8 @@ _PICTURES, _SVG = 3_000_000, 350_000
 """Bytes of all pictures; bytes up to which a picture is drawn by lines (SVG)."""
 _ROWS, _CELL, _TEXT = 60, 2_000, 200_000
 """Rows of a table, characters of one cell and of one block of text that are shown."""
+_LARGE = 8.0
+"""Inches from which a picture is as wide as the page."""
 _NAMED = 10
 """Failures that are named."""
 
@@ -179,22 +181,29 @@ def _add_table(parent: Element, table: TextTable) -> None:
 def _add_picture(parent: Element, description: str, source: Any, budget: int) -> None:
     figure = SubElement(parent, "figure")
     try:
-        content, kind = _image(source, budget)
+        content, kind, inches = _image(source, budget)
     except (TypeError, ValueError) as error:  # results that have no such picture
         _add(figure, "figcaption", f"{description} cannot be drawn: {error}")
         return
+    # The style sheet keeps the letters legible: two columns for a large picture, on a phone a slider.
+    figure.set("style", f"--inches: {inches:.3g}")
+    if inches >= _LARGE:
+        figure.set("class", "large")
     data = f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
     _add(figure, "img", src=data, alt=description)
     _add(figure, "figcaption", description)
 
 
-def _image(source: Callable[[], Any] | bytes, budget: int) -> tuple[bytes, str]:
-    """A picture and its type, in at most `budget` bytes: lines (SVG) if they are few, else points
-    (PNG), as fine as there is space for. **Raises** `ValueError` where it is too large."""
+def _image(source: Callable[[], Any] | bytes, budget: int) -> tuple[bytes, str, float]:
+    """A picture, its type and its width in inches, in at most `budget` bytes: lines (SVG) if they
+    are few, else points (PNG), as fine as there is space for.
+
+    **Raises** `ValueError` where it is too large.
+    """
     if isinstance(source, bytes):
         if len(source) > budget:
             raise ValueError(f"{len(source) / 1e6:.2g} MB do not fit into the page")
-        return source, "png"
+        return source, "png", float(mpl.rcParamsDefault["figure.figsize"][0])
     settings: Any = {"svg.hashsalt": "dvi-jax", "svg.fonttype": "path"}
     with plot.style(), mpl.rc_context(settings):
         drawn = source()
@@ -205,7 +214,7 @@ def _image(source: Callable[[], Any] | bytes, budget: int) -> tuple[bytes, str]:
                 options: Any = {"metadata": {"Date": None}} if kind != "png" else {}
                 figure.savefig(content, format=kind[:3], dpi=dpi, **options)
                 if content.tell() <= min(limit, budget):
-                    return content.getvalue(), kind
+                    return content.getvalue(), kind, float(figure.get_figwidth())
         finally:
             plot.plt.close(figure)
     raise ValueError("there are too many pictures for one page")
