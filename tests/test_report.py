@@ -60,6 +60,7 @@ SWEEP = """
 system = "own.py:system"
 h = 0.1
 steps = 30
+save = "final"
 [state]
 q0 = [0.5]
 p0 = [{values = [0.0, -1.0, -2.0, -5.0], axis = "px"}]
@@ -197,7 +198,10 @@ def test_a_sweep_counts_and_names_its_failures(results):
     first = dict(zip(data.status.dims, (k, p), strict=True))
     step = int(data.failed_step.isel(first))
     assert lines[0].endswith(f"at step {step}")
-    assert reader.tags.count("img") == 2
+    assert "[{values = [0, -1, -2, -5], axis = px}]" in reader.texts["dd"]
+    pictures = ["Status of each trajectory", "Map of height", "Map of p", "Map of q"]
+    assert reader.texts["figcaption"] == pictures  # of the last states, not of their times
+    assert reader.tags.count("img") == len(pictures)
     assert "[args]" in "".join(reader.texts["config"])
     expected = ["dvi-jax", "sweep", "sweep.toml", "--store", "sweep-again.zarr"]
     assert shlex.split(chapter["command"]) == expected

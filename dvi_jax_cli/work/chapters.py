@@ -67,7 +67,8 @@ def _in_words(value: Any) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{name} = {_in_words(x)}" for name, x in value.items())
     if isinstance(value, list):
-        return f"[{', '.join(map(_in_words, value))}]"
+        words = [f"{{{_in_words(x)}}}" if isinstance(x, dict) else _in_words(x) for x in value]
+        return f"[{', '.join(words)}]"
     return str(value)
 
 
@@ -392,8 +393,9 @@ def sweep_chapter(folder: Path) -> Chapter:
 
 
 def _rest(array: Any) -> list[str]:
-    """Dimensions after the first two: a map has no place for them."""
-    return [str(dim) for dim in array.dims[2:]]
+    """Components, and dimensions after the first two: a map has no place for them."""
+    dims = [*map(str, array.dims)]
+    return [dim for dim in dims if dim in dims[2:] or dim.startswith("component")]
 
 
 def _failures(result: dvi.SweepResult, data: Any) -> list[str]:
@@ -424,7 +426,9 @@ def _label(entry: Any, dim: str, index: int) -> str:
 
 
 def _add_maps(chapter: Chapter, data: Any) -> None:
-    """Maps of the observables; what is left out is said in a note."""
+    """Maps of the observables and last states; what is left out is said in a note."""
+    if "save" in data.dims:
+        data = data.isel(save=-1).drop_vars("t")
     names = [str(n) for n in data.data_vars if str(n) not in ("status", "failed_step", "residual")]
     names = [n for n in names if data[n].dtype.kind in "biuf"]
     large = [n for n in names if data[n].size > _MAX_NUMBERS]
