@@ -264,7 +264,7 @@ class Page:
             else:
                 self._later(lambda: self._finish(drifts, drifts.message))
 
-        # Python waits for its end: the interpreter cannot end while XLA computes in a daemon thread.
+        # No daemon: the interpreter cannot end while XLA computes in a thread.
         threading.Thread(target=work, name=SEARCH).start()
 
     def _finish(self, drifts: Drifts | None, message: str) -> None:

@@ -185,7 +185,7 @@ def _add_picture(parent: Element, description: str, source: Any, budget: int) ->
     except (TypeError, ValueError) as error:  # results that have no such picture
         _add(figure, "figcaption", f"{description} cannot be drawn: {error}")
         return
-    # The style sheet keeps the letters legible: two columns for a large picture, on a phone a slider.
+    # The style sheet keeps letters legible: both columns for a large picture, scrolling on a phone.
     figure.set("style", f"--inches: {inches:.3g}")
     if inches >= _LARGE:
         figure.set("class", "large")
