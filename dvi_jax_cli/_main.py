@@ -63,8 +63,7 @@ def _leave(code: int) -> None:
 
 def _is_searching() -> bool:
     """Whether the page of `explore`, whose server handles Ctrl-C itself, still computes."""
-    module = sys.modules.get("dvi_jax.explorer.page")
-    return module is not None and module.SEARCH in {t.name for t in threading.enumerate()}
+    return "search for invariants" in {thread.name for thread in threading.enumerate()}
 
 
 def _watch(reader: int, numbers: list[int]) -> None:

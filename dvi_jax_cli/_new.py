@@ -18,10 +18,6 @@ from ._session import Session, command
 _NAME = re.compile(r"[^\W_][\w. -]{0,99}")
 _DEVICES = {"con", "prn", "aux", "nul", *(f"{x}{i}" for x in ("com", "lpt") for i in range(1, 10))}
 """Names of devices on Windows."""
-_WITHOUT = (
-    "Examples of fit.toml, discover.toml and system.py are in a project without --system:\n"
-    "dvi-jax new {name}"
-)
 
 
 @command(app, "new", START, jax=False)
@@ -33,8 +29,7 @@ def new(
     system: Annotated[
         str | None,
         typer.Option(
-            help="Begin with a system of the library instead of one of your own; then without "
-            "fit.toml, discover.toml and system.py.",
+            help="Begin with a system of the library instead of one of your own.",
             **completer(SYSTEMS),
         ),
     ] = None,
@@ -64,7 +59,7 @@ def new(
     first = f"cd {shlex.quote(str(name))} && dvi-jax run run.toml"
     session.line(f"Begin with: {first}; README.md has the next steps.")
     if system:
-        session.line(_WITHOUT.format(name=shlex.quote(f"{name}_own")))
+        session.line("Only without --system: fit.toml, discover.toml and system.py, as examples.")
     session.finish({"folder": str(name), "files": sorted(files), "system": system})
 
 

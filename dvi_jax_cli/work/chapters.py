@@ -65,10 +65,9 @@ def _in_words(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.8g}"
     if isinstance(value, dict):
-        return ", ".join(f"{name} = {_in_words(x)}" for name, x in value.items())
+        return f"{{{', '.join(f'{name} = {_in_words(x)}' for name, x in value.items())}}}"
     if isinstance(value, list):
-        words = [f"{{{_in_words(x)}}}" if isinstance(x, dict) else _in_words(x) for x in value]
-        return f"[{', '.join(words)}]"
+        return f"[{', '.join(map(_in_words, value))}]"
     return str(value)
 
 
@@ -227,8 +226,7 @@ def saved_fit_chapter(path: Path) -> Chapter:
     chapter = Chapter("saved fit", path.name, "", "open")
     _add_fit(chapter, result, None)
     missing = sum(int(np.isnan(x).sum()) for x in result.observed)
-    start = dict.fromkeys(result.names, np.nan)
-    parameters = {name: {"start": x} for name, x in start.items()}
+    parameters = {name: {"start": np.nan} for name in result.names}
     contents = {"parameters": parameters, "residuals": result.statistics(), "missing": missing}
     chapter.tables = fit_tables(result, contents)
     chapter.remarks = ["The file has the result of the fit, but not the call that computed it."]
@@ -434,13 +432,10 @@ def _add_maps(chapter: Chapter, data: Any) -> None:
     large = [n for n in names if data[n].size > _MAX_NUMBERS]
     drawn = [n for n in names if n not in large][:_MAPS]
     for name in drawn:
-        options = {
-            "over": _rest(data[name]),
-            "status": data["status"] if data[name].ndim <= 2 else None,
-        }
+        status = data["status"] if data[name].ndim <= 2 else None
+        options = {"over": _rest(data[name]), "status": status}
         label = with_unit(name.replace("_", " "), data[name].attrs.get("units"))
         chapter.pictures[f"Map of {label}"] = _drawing(plot.sweep_map, data[name], **options)
     if excess := [n for n in names if n not in drawn]:
-        chapter.notes.append(
-            f"Not drawn, because they are too many or too large: {', '.join(excess)}."
-        )
+        text = f"Not drawn, because they are too many or too large: {', '.join(excess)}."
+        chapter.notes.append(text)

@@ -24,8 +24,6 @@ _PICTURES, _SVG = 3_000_000, 350_000
 """Bytes of all pictures; bytes up to which a picture is drawn by lines (SVG)."""
 _ROWS, _CELL, _TEXT = 60, 2_000, 200_000
 """Rows of a table, characters of one cell and of one block of text that are shown."""
-_LARGE = 8.0
-"""Inches from which a picture is as wide as the page."""
 _NAMED = 10
 """Failures that are named."""
 
@@ -69,11 +67,9 @@ def page(title: str, chapters: Sequence[Chapter]) -> bytes:
     html = Element("html", {"lang": "en"})
     head, body = SubElement(html, "head"), SubElement(html, "body")
     SubElement(head, "meta", {"charset": "utf-8"})
-    viewport = "width=device-width, initial-scale=1"
-    SubElement(head, "meta", {"name": "viewport", "content": viewport})
+    SubElement(head, "meta", {"name": "viewport", "content": "width=device-width, initial-scale=1"})
     _add(head, "title", f"{title}: report of dvi-jax")
-    style = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
-    SubElement(head, "style").text = style
+    SubElement(head, "style").text = Path(__file__).with_name("page.css").read_text("utf-8")
     main = SubElement(body, "main")
     budget = _PICTURES // max(1, sum(len(chapter.pictures) for chapter in chapters))
     for chapter in chapters:
@@ -185,9 +181,8 @@ def _add_picture(parent: Element, description: str, source: Any, budget: int) ->
     except (TypeError, ValueError) as error:  # results that have no such picture
         _add(figure, "figcaption", f"{description} cannot be drawn: {error}")
         return
-    # The style sheet keeps letters legible: both columns for a large picture, scrolling on a phone.
     figure.set("style", f"--inches: {inches:.3g}")
-    if inches >= _LARGE:
+    if inches >= 8:
         figure.set("class", "large")
     data = f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
     _add(figure, "img", src=data, alt=description)
@@ -195,11 +190,8 @@ def _add_picture(parent: Element, description: str, source: Any, budget: int) ->
 
 
 def _image(source: Callable[[], Any] | bytes, budget: int) -> tuple[bytes, str, float]:
-    """A picture, its type and its width in inches, in at most `budget` bytes: lines (SVG) if they
-    are few, else points (PNG), as fine as there is space for.
-
-    **Raises** `ValueError` where it is too large.
-    """
+    """A picture, its type and its width in inches, in `budget` bytes: lines (SVG) if they are few,
+    else points (PNG), as fine as there is space for. **Raises** `ValueError` if it is too large."""
     if isinstance(source, bytes):
         if len(source) > budget:
             raise ValueError(f"{len(source) / 1e6:.2g} MB do not fit into the page")
