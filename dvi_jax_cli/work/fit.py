@@ -291,7 +291,7 @@ def _correlation_table(names: list[str], matrix: np.ndarray) -> TextTable:
         strongest = sorted(pairs, key=lambda ij: -np.nan_to_num(abs(matrix[ij]), nan=-1))[:10]
         rows = [[names[i], names[j], f"{matrix[i, j]:.3f}"] for i, j in strongest]
         return TextTable("Strongest correlations", ["of", "and", "value"], rows)
-    rows = [[name, *(f"{x:.2f}" for x in matrix[i, :i])] for i, name in enumerate(names)]
+    rows = [[name, *(f"{x:z.2f}" for x in matrix[i, :i])] for i, name in enumerate(names)]
     return TextTable("Correlations", ["", *names[:-1]], rows[1:])
 
 
