@@ -8,6 +8,7 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -32,38 +33,36 @@ def constant_unless(
     # The derivative is set to zero at the inputs: at the outputs it would be multiplied by NaN
     # afterwards. Values are the same on both sides of each choice, which costs nothing. (A rule of
     # its own for the derivative would be lost in second derivatives of a scan.)
-    def chosen(good: Any, x: Any) -> Any:
-        is_variable = jnp.issubdtype(jnp.result_type(x), jnp.inexact)
-        return jnp.where(good, x, lax.stop_gradient(x)) if is_variable else x
+    def chosen(good: Any, inputs: Any) -> list[Any]:
+        smooth, others = eqx.partition([*inputs], eqx.is_inexact_array)
+        smooth = jax.tree.map(lambda x: jnp.where(good, x, lax.stop_gradient(x)), smooth)
+        return eqx.combine(smooth, others)
+
+    def guarded(good: Any, *inputs: Any) -> list[Any]:
+        return trace(*chosen(good, inputs))
 
     def result_of(outs: list[Any]) -> Any:
         return jax.tree.unflatten(trace.out_tree, outs)
 
     inputs = [*trace.outer, *leaves]
     if succeeds is None:
-        return result_of(trace(*(chosen(good, x) for x in inputs)))
-
-    def guarded(good: Any, *inputs: Any) -> list[Any]:
-        return trace(*(chosen(good, x) for x in inputs))
-
+        return result_of(guarded(good, *inputs))
     value = jax.custom_jvp(guarded)
 
     # Inputs without a change, such as h in most runs, need no derivative: it would take time.
     @functools.partial(value.defjvp, symbolic_zeros=True)
     def _(primals, tangents):
-        (good, *inputs), (_, *tangents) = primals, tangents
-        places = [i for i, x in enumerate(tangents) if not isinstance(x, SymbolicZero)]
+        (good, *inputs), changes = primals, tangents[1:]
+        values = chosen(good, inputs)
+        places = [i for i, x in enumerate(changes) if not isinstance(x, SymbolicZero)]
 
         def of_variables(*variables):
-            values = [chosen(good, x) for x in inputs]
-            for i, x in zip(places, variables, strict=True):
-                values[i] = x
-            return trace(*values)
+            new = dict(zip(places, variables, strict=True))
+            return trace(*(new.get(i, x) for i, x in enumerate(values)))
 
-        outs, push = jax.linearize(of_variables, *(chosen(good, inputs[i]) for i in places))
+        outs, push = jax.linearize(of_variables, *(values[i] for i in places))
         is_good = good & succeeds(result_of(outs))
-        changes = (jnp.where(is_good, tangents[i], jnp.zeros_like(inputs[i])) for i in places)
-        return outs, push(*changes)
+        return outs, push(*(jnp.where(is_good, changes[i], 0) for i in places))
 
     return result_of(value(good, *inputs))
 
@@ -81,15 +80,12 @@ def nan_where_used(function: Callable, *args: Any) -> Any:
     leaves, tree = jax.tree.flatten(args)
     trace = Trace.from_function(function, leaves, tree)
     inputs = [*trace.outer, *leaves]
-    outs = trace(*inputs)
-    smooth = [i for i, x in enumerate(outs) if jnp.issubdtype(x.dtype, jnp.inexact)]
-    variables = [x for x in inputs if jnp.issubdtype(jnp.result_type(x), jnp.inexact)]
-    for i, x in zip(smooth, _nan_if_used([outs[i] for i in smooth], variables), strict=True):
-        outs[i] = x
-    return jax.tree.unflatten(trace.out_tree, outs)
+    smooth, others = eqx.partition(trace(*inputs), eqx.is_inexact_array)
+    smooth = _nan_if_used(smooth, eqx.filter(inputs, eqx.is_inexact_array))
+    return jax.tree.unflatten(trace.out_tree, eqx.combine(smooth, others))
 
 
-def _nan_if_used(values: list[Array], inputs: list[Array]) -> list[Array]:
+def _nan_if_used(values: Any, inputs: Any) -> Any:
     """The floating-point `values`, with the derivative of `nan_where_used` by `inputs`."""
 
     @jax.custom_jvp
@@ -100,12 +96,13 @@ def _nan_if_used(values: list[Array], inputs: list[Array]) -> list[Array]:
         return changes[0]
 
     def pull(values, cotangents):
-        uses = [jnp.any(jnp.isnan(x) & (c != 0)) for x, c in zip(values, cotangents, strict=True)]
-        is_nan = jnp.any(jnp.asarray(uses, bool))
-        return cotangents, [jnp.where(is_nan, jnp.full_like(x, jnp.nan), 0) for x in like]
+        uses = jax.tree.map(lambda x, c: jnp.any(jnp.isnan(x) & (c != 0)), values, cotangents)
+        is_nan = jnp.any(jnp.asarray(jax.tree.leaves(uses), bool))
+        of_input = lambda x: jnp.where(is_nan, jnp.full(x.shape, jnp.nan, x.dtype), 0)  # noqa: E731
+        return cotangents, jax.tree.map(of_input, like)
 
     values, inputs = with_equal_axes((values, inputs))
-    like = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in inputs]
+    like = jax.eval_shape(lambda: inputs)
 
     @same.defjvp
     def _(primals, tangents):

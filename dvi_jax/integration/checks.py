@@ -128,49 +128,37 @@ and their cotangents."""
 
 
 def check_memory(
-    save: Save,
-    plan: Plan,
-    q0: Array,
-    observed_bytes: tuple[int, int],
-    leaves: list[Any],
-    integrator: Any,
+    save: Save, plan: Plan, q0: Array, observed: tuple[int, int], leaves: list[Any], integrator: Any
 ) -> None:
-    """**Raises** `ValueError` for a run that no memory can hold; `observed_bytes`: those of
+    """**Raises** `ValueError` for a run that no memory can hold; `observed`: the bytes of
     observables at a save point, and of reductions."""
-    memory = results_memory()
+    memory, (at_save, of_reductions) = results_memory(), observed
     num_states = plan.num_blocks + 1 + plan.save_tail if save.ts is None else save.ts.shape[0]
-    at_save, of_reductions = observed_bytes
     row = (2 * q0.size + 2) * q0.dtype.itemsize + at_save  # q, p, t and h
     lanes, is_compiled, is_differentiated = batch_size(leaves)
     size = lanes * (num_states * row + of_reductions)
-    needed = _COPIES[is_differentiated] * size
     # Reverse mode through the scan stores values of each step, among them the states before it;
     # `Reversible` stores some states between save points.
-    adjoint = integrator.adjoint
-    is_stored = is_differentiated and isinstance(adjoint, Direct)
-    if is_stored:
-        num_stored = plan.num_steps
-    else:
-        every = getattr(adjoint, "checkpoint_every", plan.num_steps + 1)
-        num_stored = plan.num_blocks * ((plan.block - 1) // every) + plan.tail // every
-    if is_differentiated:
-        needed += 2 * lanes * num_stored * 2 * q0.size * q0.dtype.itemsize
+    is_stored = is_differentiated and isinstance(integrator.adjoint, Direct)
+    every = 1 if is_stored else getattr(integrator.adjoint, "checkpoint_every", plan.num_steps + 1)
+    num_stored = plan.num_blocks * ((plan.block - (not is_stored)) // every) + plan.tail // every
+    num_stored *= is_differentiated
+    needed = _COPIES[is_differentiated] * size
+    needed += 2 * lanes * num_stored * 2 * q0.size * q0.dtype.itemsize
     if memory is None or needed <= memory:
         return
     # XLA does not compute results that the function around this one does not use.
     if is_compiled and (integrator.layout.form == "arrays" or not generates()) and not is_stored:
         return
-    remedy = "Take adjoint=dvi.Reversible(). " if is_stored else ""
-    if of_reductions > num_states * row:
-        remedy = "Reduce values of fewer entries, or take a smaller max_crossings. "
-    elif num_stored > num_states and not is_stored:
-        remedy = "Take a larger checkpoint_every. "
+    is_reduced = of_reductions > num_states * row
+    remedy = "adjoint=dvi.Reversible()" if is_stored else "a larger checkpoint_every"
+    remedy = "a smaller max_crossings, or smaller values in reductions" if is_reduced else remedy
+    remedy = f"Take {remedy}. " * (is_stored or is_reduced or num_stored > num_states)
     batch = f" of each of {lanes} trajectories" if lanes > 1 else ""
     other = ", run fewer trajectories at once, or use dvi.sweep(store=...)" if lanes > 1 else ""
     raise ValueError(
         f"the results need {size / 2**30:.3g} GiB of memory ({num_states} saved "
-        f"state{'s' * (num_states > 1)}{' and reductions' * (of_reductions > row)}{batch}), and "
-        f"the run "
+        f"state{'s' * (num_states > 1)}{' and reductions' * is_reduced}{batch}), and the run "
         f"{'with its derivative ' * is_differentiated}{needed / 2**30:.3g} GiB, but only "
         f"{memory / 2**30:.3g} GiB are available. {remedy}"
         f"Save fewer states with save=dvi.Save(every=m), final=True or ts=times{other}."
