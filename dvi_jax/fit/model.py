@@ -21,6 +21,7 @@ from ..discover.functions.basis import check_step_size
 from ..integration.integrate import integrate
 from ..integration.integrator import Integrator
 from ..lattices import Uniform
+from ..observe import refuse_slow_time
 from ..observe.solution import Save
 from ..problem.system import System
 from .observations import Observations
@@ -365,6 +366,8 @@ def check_observable(i: int, arc: Observations, spec: Mapping[str, Any]) -> bool
     **Raises** as `integrate` does for the initial state and args; `ValueError` with both shapes for
     an observable that does not return one value of the data; errors of the function with a note.
     """
+    if spec["system"].slow_time:
+        refuse_slow_time(arc.function)
     q, p = start_state(spec["q0"], spec["p0"])
     args = jax.tree.map(as_parameter, spec.get("args"))
     try:
