@@ -13,6 +13,7 @@ from jaxtyping import PyTree
 from ..base.checks import one_of
 from ..base.files import publish_npz, read_npz
 from ..base.printing import printable
+from ..base.tables import Table
 from .checks import same_parameters
 from .optimise import FIT_RESULTS, NAMES, name_of
 from .parameters import make_space
@@ -233,7 +234,7 @@ class FitResult:
             params=space.to_params(jnp.asarray(arrays["x"])),
             x=arrays["x"],
             covariance=arrays["covariance"],
-            history={k[8:]: v for k, v in arrays.items() if k.startswith("history.")},
+            history=Table({k[8:]: v for k, v in arrays.items() if k.startswith("history.")}),
             result=getattr(FIT_RESULTS, one_of(f"the status in {path}", header["result"], NAMES)),
             singular_values=arrays["values"],
             curvature=arrays.get("curvature"),

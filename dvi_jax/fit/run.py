@@ -19,6 +19,7 @@ from ..base.keywords import user_level
 from ..base.printing import printable
 from ..base.progress import bar_of, reporter
 from ..base.reads import reads
+from ..base.tables import Table
 from .checks import same_fit
 from .optimise import Position, Record, StageTask
 from .problem import FitProblem
@@ -134,7 +135,7 @@ class FitRun:
     def history(self) -> dict[str, np.ndarray]:
         """The records as arrays."""
         columns = _columns(self.records)
-        return {**columns, "x": columns["x"].reshape(-1, self.problem.size)}
+        return Table({**columns, "x": columns["x"].reshape(-1, self.problem.size)})
 
 
 def _columns(records: list[Record]) -> dict[str, np.ndarray]:

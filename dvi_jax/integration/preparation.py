@@ -14,6 +14,7 @@ from lanewise.jaxprs.jaxapi import is_traced
 
 from ..base.keywords import user_level
 from ..base.reads import reads
+from ..base.signature import output_of
 from ..base.types import Interval, State
 from ..lattices import Lattice, Run
 from ..methods import Method, warn_of_dissipation
@@ -87,6 +88,8 @@ def prepare(
     # Traced values are not known before the compiled program runs: they give a status.
     if not has_tracer:
         _check_start(task, q0, p0)
+    if run.save.clock is not None:
+        output_of("the clock of Save", run.save.clock, run.t0, run.q0, run.p0, run.args)
     if run.save.ts is not None:
         # The run itself saves nothing at these times: it stores the steps that contain them, and
         # `as_solution` evaluates the method between their ends.

@@ -10,9 +10,10 @@ import jax.numpy as jnp
 
 from ..base.checks import array, finite, instance, require
 from ..base.indices import out_of_bounds
+from ..base.keywords import tracing_note
 from ..base.machine import refuse_fork
 from ..base.reads import Reads, differences, reads
-from ..base.signature import accepts, array_type, check_takes, tracing_note, warn_of_exchanged
+from ..base.signature import accepts, array_type, check_takes, warn_of_exchanged
 from ..base.types import Args, ConstraintFn, ForceFn, HamiltonianFn, Scalar, State
 from .discretise import refuse_step_from_times
 from .noise import Noise, as_noise

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..base.results import STATUS_NAMES
+from ..base.tables import Table, unknown_name
 from .layout import STATUS, about_variable
 from .store import MemorySink, Store, StoreError, Verification
 
@@ -32,7 +33,7 @@ class SweepResult:
     @property
     def dims(self) -> dict[str, int]:
         """Name of each dimension → its length."""
-        return dict(self._plan.dims)
+        return Table(self._plan.dims)
 
     @property
     def path(self) -> Path | None:
@@ -58,8 +59,7 @@ class SweepResult:
         if name in self._coordinates:
             return self._coordinates[name][1]
         if name not in self._source.variables:
-            names = ", ".join((*self._source.variables, *self._coordinates))
-            raise KeyError(f"the sweep has no variable {name!r}: use one of {names}.")
+            raise unknown_name(name, (*self._source.variables, *self._coordinates))
         if isinstance(self._source, MemorySink):
             return self._source.arrays[name]
         return self.to_xarray()[name].values
