@@ -514,6 +514,18 @@ CALLS = [
      "^TypeError: Discovery.evaluate has no argument 'eps'. Did you mean 'epsilon'"),
     (lambda: dvi.Discovery.load("found.npz"), "^TypeError: Discovery.load requires basis"),
     (lambda: RING.get("QF"), "^TypeError: Ring.get requires parameter"),
+    # a prior and bounds, before they are used
+    (lambda: dvi.Prior(0, 0), "^ValueError: sigma of dvi.Prior must be positive.*Leave the prior"),
+    (lambda: dvi.Prior(0.0, [1.0, -1.0]), r"^ValueError: sigma of dvi.Prior.*index \[1\]"),
+    (lambda: dvi.Prior(0.0, np.inf), "^ValueError: sigma of dvi.Prior"),
+    (lambda: dvi.Prior(None, 1.0), "^ValueError: mean of dvi.Prior must be finite, got None"),
+    (lambda: dvi.Bounds(np.nan, 1.0), "^ValueError: lower must be less than upper"),
+    *((lambda f=f, V=V: rings.cavity("C", 0.0, V, f), "^ValueError: frequency of a cavity must be")
+     for f, V in ((-5e8, 1e-3), (0.0, 1e-3), (np.nan, 0.0))),
+    # more deviation vectors than a manifold has directions
+    *((lambda kind=kind: dvi.integrate(systems.spherical_pendulum(), num_steps=2, observe=kind),
+     "^ValueError: (count|k) of .* from . to 4, got 5. With a constraint")
+     for kind in (dvi.LyapunovSpectrum(5), dvi.Running(dvi.GALI(5)))),
     # rigid bodies
     (lambda: rigid.momentum(np.ones(3), np.ones(3), np.ones(3)), r"^ValueError: R must.*\(3, 3\)"),
     (lambda: rigid.momentum(np.eye(3), 1.0, np.ones(3)), r"^ValueError: pi must.*\(3,\)"),
@@ -647,6 +659,42 @@ def test_a_warning_shows_the_line_of_the_user():
         with pytest.warns(UserWarning, match=words) as record:
             call()
         assert record[0].filename == __file__
+
+
+def test_lyapunov_exponents_with_a_constraint_are_those_of_the_manifold():
+    sphere, save = systems.spherical_pendulum(), dvi.Save(final=True)
+    kinds = [dvi.LyapunovSpectrum(), dvi.LyapunovSpectrum(4)]
+    found = dvi.integrate(sphere, num_steps=20, observe=kinds, save=save).observed
+    np.testing.assert_array_equal(*found)
+    assert run(observe=dvi.LyapunovSpectrum()).observed.shape == (2,)
+
+
+def planets(h, **how):
+    outer = systems.outer_solar_system()
+    return dvi.integrate(outer, h=h, num_steps=1, method=dvi.WisdomHolman(**how))
+
+
+def test_too_few_steps_in_a_revolution_warn():
+    with pytest.warns(UserWarning, match=r"h = 2000 .* body 1 has the period 4332, .* 2.2 steps"):
+        planets(2000.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        planets(100.0)
+        planets(2000.0, scheme=(10, 6, 4))
+
+
+def test_a_close_pericentre_warns_and_an_orbit_that_is_not_bound_does_not():
+    def go(speed):
+        args = {"masses": np.array([1.0, 1e-6]), "G": 1.0}
+        q0, p0 = [[0.0, 0.0], [2.0, 0.0]], [[0.0, 0.0], [0.0, 1e-6 * speed]]
+        method = dvi.WisdomHolman()
+        return dvi.integrate(systems.n_body(), q0, p0, args=args, h=0.1, num_steps=1, method=method)
+
+    with pytest.warns(UserWarning, match="67 steps, or 1.1 at the angular velocity of its peri"):
+        go(0.2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        go(9.0)
 
 
 def final(**how):

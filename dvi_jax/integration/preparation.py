@@ -20,6 +20,7 @@ from ..lattices import Lattice, Run
 from ..methods import Method, warn_of_dissipation
 from ..methods.constraint import check_start
 from ..methods.step import Equations
+from ..observe import Deviations, Running, is_observable
 from ..observe.solution import Solution
 from ..problem.noise import BrownianPath
 from ..problem.system import System
@@ -72,6 +73,8 @@ def prepare(
     # Before anything is compiled: an error in a function of the user would otherwise come from
     # within many frames of tracing.
     System.check_shapes(run.system, run.t0, run.q0, run.p0, run.epsilon, run.args)
+    if run.system.constraint is not None:
+        run = run._replace(observe=_on_manifold(run))
     lattice, layout = integrator.lattice, integrator.layout
     noise = noise_path(run, path, integrator, method, h, num_steps)
     # The same run in the variables of the lattice, such as a fictitious time.
@@ -99,6 +102,19 @@ def prepare(
     vars(task)["reads"] = reads(task, run.observe, integrator.adjoint)
     adjoint, observe = integrator.adjoint, image.observe
     return PreparedRun(run, task, plan, q0, p0, observe, undo, adjoint, layout, has_tracer)
+
+
+def _on_manifold(run: Run) -> PyTree:
+    """The observables of a system with a constraint."""
+    components = jax.eval_shape(run.system.constraint, run.q0, run.args).size
+    dimension = 2 * (run.q0.size - components)
+
+    def convert(leaf: Any) -> Any:
+        if isinstance(leaf, Running):
+            return Running(convert(leaf.reduction))
+        return leaf.on_manifold(dimension) if isinstance(leaf, Deviations) else leaf
+
+    return jax.tree.map(convert, run.observe, is_leaf=is_observable)
 
 
 def _check_start(task: Task, q0: State, p0: State) -> None:

@@ -22,7 +22,8 @@ class SweepResult:
     - ``result["energy_drift"]``: one variable as a NumPy array.
     - `to_xarray()`: all of it with labels.
 
-    Entries that have not been computed are NaN (−1 in whole numbers) and have the status −1.
+    Entries that have not been computed are NaN (−1 in whole numbers, False in booleans) and have
+    the status −1.
     """
 
     def __init__(self, source: MemorySink | Store, coordinates: Mapping[str, Any], attributes: Any):

@@ -1,5 +1,6 @@
 """The system of a TOML file, its parameters and state, and the times of the steps."""
 
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -127,8 +128,17 @@ class Source:
     def epsilon(self) -> Any:
         """The strength of the perturbation in the file, or else of the system."""
         rule = "a number: the system has a force or a perturbation (0.0: unperturbed)"
+        value = getattr(self.file, "epsilon", None)
         with as_input_error("epsilon", rule, ValueError, text=lambda _: NO_KEY):
-            return self.system.strength(getattr(self.file, "epsilon", None))
+            strength = self.system.strength(value)
+        is_left_out = value is None and hasattr(self.file, "epsilon") and strength == 0
+        if is_left_out and self.system.depends_on_epsilon:
+            warnings.warn(
+                f"the key epsilon is missing, so the motion is that of {self.name} without its "
+                "force, perturbation or slow time: write epsilon = 0.0 if this is meant.",
+                stacklevel=2,
+            )
+        return strength
 
 
 def find_source(file: SystemFile, folder: Path) -> Source:
