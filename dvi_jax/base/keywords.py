@@ -200,6 +200,7 @@ def _note_tracing(name: str, error: Exception) -> None:
     notes = getattr(error, "__notes__", ())
     if not isinstance(error, jax.errors.JAXTypeError) or any(TRACED in note for note in notes):
         return
+    # The traceback has the frames of JAX as well, which are filtered only when it is printed.
     frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
     roots = [str(frame.f_globals.get("__name__")).split(".")[0] for frame in frames]
     owners = [root for root in roots if root not in _BELOW]

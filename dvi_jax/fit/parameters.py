@@ -56,6 +56,7 @@ class Prior:
     sigma: Any
 
     def __post_init__(self):
+        # Here and not in a fit, so that the traceback shows where it was made.
         all_finite("mean of dvi.Prior", self.mean)
         hint = "Leave the prior out where nothing is known, and fix a parameter that is known."
         all_finite("sigma of dvi.Prior", self.sigma, positive=True, hint=hint)

@@ -93,7 +93,9 @@ class FitRun:
                     f"there is no directory for checkpoint={str(file)!r}: create it."
                 )
             if file.is_dir():
-                raise IsADirectoryError(f"checkpoint={str(file)!r} is a directory: give a file.")
+                raise IsADirectoryError(
+                    f"checkpoint={str(file)!r} is a directory: give the path of a file in it."
+                )
             if file.exists():
                 user_file("checkpoint", file)
                 self.resume, self.records = _read_checkpoint(file, self.identity)

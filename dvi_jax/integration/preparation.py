@@ -106,6 +106,7 @@ def prepare(
 
 def _on_manifold(run: Run) -> PyTree:
     """The observables of a system with a constraint."""
+    # Deviation vectors across the constraint are removed by the first step.
     components = jax.eval_shape(run.system.constraint, run.q0, run.args).size
     dimension = 2 * (run.q0.size - components)
 

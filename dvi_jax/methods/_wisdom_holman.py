@@ -182,6 +182,7 @@ class WisdomHolman(SplittingMethod):
         X = np.asarray(frame.from_bodies(position), float)[1:]
         V = np.asarray(frame.velocities_of(momentum / frame.masses[:, None]), float)[1:]
         mu = np.asarray(self._strength(equations, q) * frame.central_mass(), float)
+        # From known numbers, once before a run: nothing of this is compiled.
         r2, v2, rv = (X * X).sum(axis=1), (V * V).sum(axis=1), (X * V).sum(axis=1)
         momentum = np.sqrt(np.maximum(r2 * v2 - rv * rv, 0))
         with np.errstate(all="ignore"):

@@ -128,7 +128,10 @@ class System(eqx.Module):
         names += ["a perturbation"] * (self.perturbation is not None)
         names += ["slow_time=True"] * self.slow_time
         if names:
-            raise ValueError(f"epsilon=... must be given for a system with {' and '.join(names)}.")
+            raise ValueError(
+                f"epsilon=... must be given for a system with {' and '.join(names)}: it is the "
+                "factor of the perturbation. epsilon=0.0 is the unperturbed motion."
+            )
         return 0.0
 
     def hamiltonian(

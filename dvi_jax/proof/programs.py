@@ -255,6 +255,7 @@ def _program(
     the function at points. The rounding of invariants is not part of a proof: it has no `way`."""
     shapes = [column.shape[1:] for column in points]
     structs = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes]
+    # Not of the step: `System` has checked its functions.
     if ndim is not None and len(shape := output_of(subject, function, *structs).shape) != ndim:
         raise ValueError(f"{subject} must return one number, got shape {shape}.")
     try:

@@ -16,7 +16,15 @@ from dvi_jax.base.signature import accepts
 from dvi_jax.systems import rings
 from dvi_jax.systems.planets.solar_system import EphemerisMissing, julian_date
 
-from .._errors import InputError, as_input_error, describe, require, require_name, user_path
+from .._errors import (
+    InputError,
+    as_input_error,
+    describe,
+    in_toml,
+    require,
+    require_name,
+    user_path,
+)
 from .expressions import parse_method
 from .loader import Loader, in_one_line
 from .schema import COUNT, RunFile, SweepFile, SystemFile, Times
@@ -67,7 +75,7 @@ class Source:
 
     def error_line(self, error: BaseException) -> str:
         """An exception in one line, with its place in the user's files."""
-        return in_one_line(error, *self.loader.modules)
+        return in_toml(in_one_line(error, *self.loader.modules))
 
     @cached_property
     def args(self) -> Any:
