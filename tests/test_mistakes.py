@@ -522,6 +522,9 @@ CALLS = [
     (lambda: dvi.Bounds(np.nan, 1.0), "^ValueError: lower must be less than upper"),
     *((lambda f=f, V=V: rings.cavity("C", 0.0, V, f), "^ValueError: frequency of a cavity must be")
      for f, V in ((-5e8, 1e-3), (0.0, 1e-3), (np.nan, 0.0))),
+    (lambda: rings.bend("B", 1.0, 11.25), "^ValueError: angle of a bend.*The unit is rad"),
+    (lambda: dvi.Brownian(1.5), "^ValueError: the key of a path must be an integer.*got 1.5"),
+    (lambda: dvi.Model(systems.kepler(), h=0.1), "^TypeError: system must.*is problem.system"),
     # more deviation vectors than a manifold has directions
     *((lambda kind=kind: dvi.integrate(systems.spherical_pendulum(), num_steps=2, observe=kind),
      "^ValueError: (count|k) of .* from . to 4, got 5. With a constraint")

@@ -79,7 +79,7 @@ class Model(eqx.Module):
         args: PyTree = None,
         **options: Any,
     ):
-        instance("system", system, System, "a dvi.System")
+        instance("system", system, System, "a dvi.System", "That of a problem is problem.system.")
         for name in options:
             if name not in _OPTIONS:
                 arguments = ", ".join(("system", "h", *_MAY_BE_FITTED, *_OPTIONS))

@@ -73,8 +73,9 @@ def prepare(
     # Before anything is compiled: an error in a function of the user would otherwise come from
     # within many frames of tracing.
     System.check_shapes(run.system, run.t0, run.q0, run.p0, run.epsilon, run.args)
-    if run.system.constraint is not None:
-        run = run._replace(observe=_on_manifold(run))
+    if (constraint := run.system.constraint) is not None:
+        components = jax.eval_shape(constraint, run.q0, run.args).size
+        run = run._replace(observe=_on_manifold(run.observe, 2 * (run.q0.size - components)))
     lattice, layout = integrator.lattice, integrator.layout
     noise = noise_path(run, path, integrator, method, h, num_steps)
     # The same run in the variables of the lattice, such as a fictitious time.
@@ -104,18 +105,16 @@ def prepare(
     return PreparedRun(run, task, plan, q0, p0, observe, undo, adjoint, layout, has_tracer)
 
 
-def _on_manifold(run: Run) -> PyTree:
-    """The observables of a system with a constraint."""
-    # Deviation vectors across the constraint are removed by the first step.
-    components = jax.eval_shape(run.system.constraint, run.q0, run.args).size
-    dimension = 2 * (run.q0.size - components)
+def _on_manifold(observe: PyTree, dimension: int) -> PyTree:
+    """The observables of a system with a constraint, whose states are a manifold."""
 
+    # Deviation vectors across the constraint are removed by the first step.
     def convert(leaf: Any) -> Any:
         if isinstance(leaf, Running):
             return Running(convert(leaf.reduction))
         return leaf.on_manifold(dimension) if isinstance(leaf, Deviations) else leaf
 
-    return jax.tree.map(convert, run.observe, is_leaf=is_observable)
+    return jax.tree.map(convert, observe, is_leaf=is_observable)
 
 
 def _check_start(task: Task, q0: State, p0: State) -> None:

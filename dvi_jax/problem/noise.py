@@ -246,6 +246,8 @@ class Brownian(BrownianPath):
 
     def __check_init__(self):
         whole("substeps", self.substeps)
+        if isinstance(self.key, str | float):  # other kinds may be axes, or traced
+            _words(self.key)
 
     def check(self, num_steps):
         first = jnp.asarray(self.first_step)

@@ -143,7 +143,7 @@ class Source:
         if is_left_out and self.system.depends_on_epsilon:
             warnings.warn(
                 f"the key epsilon is missing, so the motion is that of {self.name} without its "
-                "force, perturbation or slow time: write epsilon = 0.0 if this is meant.",
+                "force, perturbation or slow time: write epsilon = 0.0 for this motion.",
                 stacklevel=2,
             )
         return strength

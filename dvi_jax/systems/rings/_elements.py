@@ -225,9 +225,12 @@ def bend(
     out both: its field is b_n x^n/(1 + hx), which changes chromaticities by terms of the order
     h b_1.
 
-    **Raises** `ValueError` for a length that is not positive.
+    **Raises** `ValueError` for a length that is not positive, or an angle above 2π.
     """
     length = length if is_traced(length) else positive("length of a bend", length)
+    if not is_traced(angle):
+        hint = "The unit is rad: a degree is 0.01745."
+        in_range("angle of a bend", angle, -2 * math.pi, 2 * math.pi, hint)
     order, values = _field(name, b, a)
     values |= {"length": length, "h": strength("angle", angle) / length}
     settings: dict[str, Any] = {**options}
