@@ -655,6 +655,10 @@ def test_tables_of_names_are_dicts():
     assert table.get("energi") is None
     with pytest.raises(KeyError, match="Did you mean 'energy'"):
         table["energi"]
+    sol = dvi.integrate(systems.kepler(), num_steps=2, observe=table)
+    plain = dvi.integrate(systems.kepler(), num_steps=2, observe=dict(table))
+    assert sol.observed.keys() == plain.observed.keys() == table.keys()
+    np.testing.assert_array_equal(sol.observed["energy"], plain.observed["energy"])
 
 
 def test_a_warning_shows_the_line_of_the_user():

@@ -4,6 +4,8 @@ import difflib
 from collections.abc import Iterable
 from typing import Any
 
+import jax
+
 
 class UnknownName(KeyError):
     """A `KeyError` whose message is a sentence, without quotes around it."""
@@ -14,10 +16,20 @@ class UnknownName(KeyError):
 
 class Table(dict[str, Any]):
     """A dict that **raises** an `UnknownName` with the nearest name and all names for a key that it
-    does not have. It is not a pytree of JAX: args are a plain dict."""
+    does not have; a pytree as a dict is, so that ``observe=problem.observables`` works."""
 
     def __missing__(self, name: Any) -> Any:
         raise unknown_name(name, self)
+
+
+def _flatten(table: Table) -> tuple[tuple[Any, ...], tuple[str, ...]]:
+    names = tuple(sorted(table))
+    return tuple((jax.tree_util.DictKey(name), table[name]) for name in names), names
+
+
+jax.tree_util.register_pytree_with_keys(
+    Table, _flatten, lambda names, values: Table(zip(names, values, strict=True))
+)
 
 
 def unknown_name(name: Any, names: Iterable[Any]) -> UnknownName:
