@@ -140,10 +140,31 @@ def section() -> Iterator[Row]:
     )
 
 
+def first_calls() -> Iterator[Row]:
+    """First calls of sections with 200 crossings, in processor time, which compilation is."""
+    for form, limit in ((None, 60), ("arrays", 10)):
+        began = time.process_time()
+        y = np.linspace(-0.25, 0.3, 20)
+        dvi.poincare_section(
+            HENON.system,
+            np.stack([0 * y, y], 1),
+            np.stack([np.sqrt(2 * 0.1 - y**2 + 2 * y**3 / 3), 0 * y], 1),
+            lambda t, q, p, args: q[0],
+            h=0.05,
+            num_steps=16_000,
+            crossings=200,
+            throw=False,
+            integrator=form and dvi.Integrator(layout=dvi.Layout(form=form)),
+        )
+        taken = time.process_time() - began
+        name = f"first call, 20 × 200 crossings, layout {form or 'default'}"
+        yield name, f"{taken:.1f} s", f"{limit} s", taken < limit
+
+
 ROWS: dict[str, Callable[[], Iterator[Row]]] = {
-    f.__name__: f for f in (tangent, megno, moment, frequencies, lyapunov, section)
+    f.__name__: f for f in (first_calls, tangent, megno, moment, frequencies, lyapunov, section)
 }
-LONG = {"lyapunov", "section"}
+LONG = {"lyapunov", "section", "first_calls"}
 
 
 def main(arguments: list[str] | None = None) -> int:

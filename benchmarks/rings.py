@@ -96,16 +96,26 @@ def first_call():
     return time.perf_counter() - begin
 
 
+def first_optics(chromatic):
+    ring = rings.from_at(lattice())
+    begin = time.perf_counter()
+    jax.block_until_ready(rings.optics(ring, chromatic=chromatic))
+    return time.perf_counter() - begin
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--particles", type=int, default=10_000)
     parser.add_argument("--turns", type=int, default=100)
     parser.add_argument("--check", action="store_true")
     parser.add_argument("--first-call", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--first-optics", choices=["yes", "no"], help=argparse.SUPPRESS)
     parser.add_argument("--memory", type=int, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.first_call:
         return print(first_call())
+    if options.first_optics:
+        return print(first_optics(options.first_optics == "yes"))
     if options.memory:
         return print(memory(options.memory))
     cell = lattice()
@@ -133,6 +143,8 @@ def main():
     alone = least(lambda: rings.track(ring, single, 1000))
     row("one particle: our time over pyAT's", alone / theirs(cell, single, 1000, False), 1)
     row("first call [s]", fresh("--first-call"), 3)
+    row("first optics [s]", fresh("--first-optics", "yes"), 12)
+    row("first optics without chromaticities [s]", fresh("--first-optics", "no"), 7)
     few = jnp.asarray(particles(1000))
     columns, forward, backward = gradient(ring, few, turns)
     jax.block_until_ready((forward(columns), backward(columns)))

@@ -81,17 +81,21 @@ def verify(
         str, typer.Option(metavar="FILE.py:NAME", help="A system that the proof must be about.")
     ] = "",
     method: Annotated[str, typer.Option(help="The method of this system.")] = "",
+    invariants: Annotated[
+        str, typer.Option(metavar="FILE.py:NAME", help="Invariants that it must be about.")
+    ] = "",
 ) -> None:
     """Check a certificate of `bound_drift` with a small program of its own.
 
     It evaluates every box of the proof again, with python-flint and without JAX, in at most 1 GiB.
     With --system the map of this system is read again, and compared with that of the certificate.
     Exit code 0: the bounds are proved. 1: they are not, or for another system; the message says
-    where. 2: there is no such file.
+    where. 2: there is no such file, or it is not a certificate.
 
     Examples
         dvi-jax verify bound.json
         dvi-jax verify bound.json --system model.py:pendulum --method Strang
+        dvi-jax verify bound.json --system model.py:pendulum --invariants model.py:energy
     """
     require_file("CERTIFICATE", certificate, "a file that DriftBound.save wrote")
     from .work.verify import verify_certificate
@@ -103,7 +107,7 @@ def verify(
         session.start_jax()
         from .work.verify import compare_system
 
-        binding, message = compare_system(certificate, system, method)
+        binding, message = compare_system(certificate, system, method, invariants)
         session.line(binding["text"])
         contents["system"] = binding
     session.finish(contents, message)

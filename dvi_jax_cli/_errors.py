@@ -33,16 +33,35 @@ class InputError(ValueError):
         return "\n".join(texts)
 
 
-_IN_TOML = (
+_TEXTS = ("method", "basis")
+"""Keys whose values are the text of a call."""
+
+
+def _argument(match: re.Match[str]) -> str:
+    """An argument of Python with an object as value."""
+    key, value = match.groups()
+    return f'{key} = "{value}"' if key in _TEXTS else f"{key} = dvi\u200b.{value} in Python"
+
+
+_IN_TOML: tuple[tuple[str, Any], ...] = (
     (r"dvi\.\w+\(\.\.\., (\w+)=\.\.\.\)", r"the key \1"),
-    (r"\b(\w+)=dvi\.(\w+\([^()]*\))", r'\1 = "\2"'),
+    (r"\bobserve=\{\.\.\.\}", "a table [observables]"),
+    (r"\bsave=dvi\.Save\(final=True\)", 'save = "final"'),
+    (r"\bsave=dvi\.Save\(every=m\)", "every = m in [output] or save"),
+    (r"\blattice=dvi\.Given\((\w*)\)", r"lattice = {times = […]}"),
+    (r"\bsamples=\(qs, ps, ts\) with different times in ts", "times = [first, last] in [samples]"),
+    (r"\btime=\((\w+), (\w+)\)", r"times = [\1, \2] in [domain]"),
+    (r"\bstore=(\.\.\.|PATH)", "a store (--store)"),
+    (r"\b(\w+)=dvi\.(\w+\((?:[^()]|\([^()]*\))*\))", _argument),
     (r"\bdvi\.(\w+\([^()]*\))", r'"\1"'),
     (r"\bdvi\.(\w)", r"\1"),
+    ("\u200b", ""),
     (r"\b(\w+)=\.\.\.", r"\1 = …"),
+    (r"\b([a-z]\w*)=(?=[\d.\[{\"'-])", r"\1 = "),
     (r"\bnum_steps\b", "steps"),
-    (r"\bobserve\b=", "observables ="),
+    (r"\bobserve\b ?=", "observables ="),
 )
-"""Pattern in a message of dvi_jax → the same in a TOML file."""
+"""Pattern in a message of dvi_jax → the same in a TOML file, or "in Python" where it has no key."""
 
 
 def in_toml(message: Any) -> str:

@@ -44,7 +44,7 @@ def main() -> None:
         signal.signal(number, signal.SIG_IGN)
     if code == INTERRUPTION:
         _leave(128 + numbers[0] if numbers else INTERRUPTION)
-    if numbers and isinstance(code, int):
+    if isinstance(code, int) and (numbers or _is_searching()):
         _leave(code)
     sys.exit(code)
 
@@ -59,6 +59,11 @@ def _leave(code: int) -> None:
         with suppress(AttributeError, OSError, ValueError):  # it does not exist or is closed
             stream.flush()
     os._exit(code)
+
+
+def _is_searching() -> bool:
+    """Whether the page of `explore`, whose server handles Ctrl-C itself, still computes."""
+    return "search for invariants" in {thread.name for thread in threading.enumerate()}
 
 
 def _watch(reader: int, numbers: list[int]) -> None:

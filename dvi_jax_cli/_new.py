@@ -58,6 +58,8 @@ def new(
     session.line(f"{name}: {', '.join(sorted(files))}")
     first = f"cd {shlex.quote(str(name))} && dvi-jax run run.toml"
     session.line(f"Begin with: {first}; README.md has the next steps.")
+    if system:
+        session.line("Only without --system: fit.toml, discover.toml and system.py, as examples.")
     session.finish({"folder": str(name), "files": sorted(files), "system": system})
 
 

@@ -152,7 +152,8 @@ def fit(
     Prints parameters with errors, correlations and residuals; writes fit.json, fit.npz, the
     fitted trajectory and pictures.
 
-    Exit code 0: converged. 1: not converged (the results have been written). 2: bad input.
+    Exit code 0: converged. 1: not converged, or the model does not describe the data: reduced chi²
+    is above 10 (the results have been written). 2: bad input.
     130: Ctrl-C.
 
     Examples

@@ -100,6 +100,7 @@ class Session:
         """End a command: with --json its object, with `failure` an error."""
         if place := contents.get("folder") or contents.get("store"):
             self.note(f"written to {place}")
+        failure = in_toml(failure)
         seconds, count = time.perf_counter() - self._began, len(self._compile_seconds)
         compilation = f"; XLA compiled {count} programs in {sum(self._compile_seconds):.1f} s"
         self.note(f"{seconds:.1f} s in all{compilation if count else ''}")
@@ -107,7 +108,7 @@ class Session:
             error = {"error": {"kind": "failed", "message": failure}} if failure else {}
             print_json({**contents, **error})
         elif failure:
-            print_error("failed", in_toml(failure))
+            print_error("failed", failure)
         if failure:
             raise typer.Exit(FAILURE)
 

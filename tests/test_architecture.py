@@ -54,6 +54,14 @@ LATER = (
 """Each of these is imported by the function that needs it."""
 
 
+def test_texts_give_the_number_of_folders():
+    count = sum(path.is_dir() and path.name != "__pycache__" for path in ROOT.iterdir())
+    word = {16: "sixteen", 17: "seventeen", 18: "eighteen", 19: "nineteen"}[count]
+    for name in ("docs/decisions.md", "CONTRIBUTING.md"):
+        text = (ROOT.parent / name).read_text(encoding="utf-8")
+        assert f"`dvi_jax` has {word} folders" in text, name
+
+
 def process(code: str) -> str:
     """What a new process prints."""
     command = [sys.executable, "-c", code]

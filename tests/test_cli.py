@@ -357,6 +357,18 @@ def test_its_notebook_runs(inside, monkeypatch):
     assert float(run["slope"]) == pytest.approx(float(q[1] - q[0]) / 2e-5, rel=1e-6)
 
 
+def test_the_files_that_a_project_of_the_library_leaves_out_are_named(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    own, library = command("new", "own"), command("new", "orbits", "--system", "kepler")
+    names = set(os.listdir("own")) - set(os.listdir("orbits"))
+    table = (ROOT / "docs" / "command-line.md").read_text(encoding="utf-8")
+    (row,) = (line for line in table.splitlines() if line.startswith("| `new NAME`"))
+    for name in names - {"observations.csv"}:  # the data of fit.toml
+        assert library.stdout.count(name) == 1
+        assert name in row
+        assert own.stdout.count(name) == 1
+
+
 @pytest.mark.parametrize("name", ["kepler", "fput"])
 @pytest.mark.slow
 def test_a_project_of_a_system_of_the_library(tmp_path, monkeypatch, name):

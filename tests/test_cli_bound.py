@@ -108,6 +108,12 @@ def test_nothing_is_proved_at_a_singularity(folder):
     assert "nothing is proved: no bound was found on " in result.output
 
 
+@pytest.mark.parametrize("text", ["no JSON", "[]", '{"status": "converged"}', "é\x00"])
+def test_a_file_that_is_not_a_certificate(folder, text):
+    path = write(folder, text, "fit.json")
+    refuses(command("verify", path), f"{path} is not a certificate", "DriftBound.save")
+
+
 @pytest.mark.parametrize(
     ("old", "new", "seen"),
     [

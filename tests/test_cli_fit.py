@@ -117,6 +117,31 @@ def test_a_small_fit(folder, data):
 
 
 @pytest.mark.slow
+def test_a_model_that_does_not_describe_the_data_fails(folder):
+    """The optimiser has converged, but chi² shows that the force is not this one."""
+    text = SMALL.replace('["epsilon", "args.k"]', '["args.k"]')
+    contents = found("fit", write(folder, text.replace("sigma = 0.01", "sigma = 1e-4")), code=1)
+    assert contents["status"] == "converged"
+    assert contents["reduced_chi2"] > 10
+    assert "residuals contradict sigma" in contents["remarks"][0]
+    assert "does not describe the data" in contents["error"]["message"]
+    result = command("fit", "file.toml", "--force")
+    assert result.exit_code == 1
+    assert "converged, but the residuals contradict sigma (reduced chi² " in result.stdout
+
+
+def test_an_epsilon_that_is_left_out_warns(folder):
+    text = SMALL.replace('"own.py:system"', '"kepler"').replace("epsilon = 0.0\n", "")
+    text = text.replace('["epsilon", "args.k"]', '["q0"]').replace("[args]\nk = 1.1\n", "")
+    text = text.replace("[state]\nq0 = [1.0]\np0 = [0.0]\n", "")
+    file, _ = read_file(write(folder, text), FitFile)
+    with pytest.warns(UserWarning, match="the key epsilon is missing, so .* kepler without"):
+        assert find_source(file, folder).epsilon == 0.0
+    refuses(command("fit", write(folder, SMALL.replace("epsilon = 0.0\n", "").replace(
+        '["epsilon", "args.k"]', '["args.k"]'))), "epsilon: the key is missing")  # fmt: skip
+
+
+@pytest.mark.slow
 def test_the_example(folder):
     shutil.copy(EXAMPLES / "fit.toml", folder)
     shutil.copy(EXAMPLES / "observations.csv", folder)

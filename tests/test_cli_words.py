@@ -16,6 +16,15 @@ MESSAGES = [
     ("use dvi.BAOAB() for noise", 'use "BAOAB()" for noise'),
     ("num_steps must be an integer", "steps must be an integer"),
     ("dvi.integrate failed", "integrate failed"),
+    ("use arithmetic=dvi.DoubleDouble().", "use arithmetic = dvi.DoubleDouble() in Python."),
+    ("path=dvi.Brownian(jax.random.key(0))", "path = dvi.Brownian(jax.random.key(0)) in Python"),
+    ("give time=(t_begin, t_end) of", "give times = [t_begin, t_end] in [domain] of"),
+    (
+        "give observe={...} or save=dvi.Save(final=True)",
+        'give a table [observables] or save = "final"',
+    ),
+    ("order=9: above order 6", "order = 9: above order 6"),
+    ("in memory: give store=..., a directory", "in memory: give a store (--store), a directory"),
     ("the point (q, p) = (1, 2)", "the point (q, p) = (1, 2)"),
 ]
 

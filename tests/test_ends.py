@@ -286,3 +286,20 @@ def test_an_observable_that_is_nan_at_a_valid_state_has_no_derivative(adjoint):
     assert list(good) == [True, False, True]
     values = [jax.jit(loss)(k)[0] for k in (1 + 1e-5, 1 - 1e-5)]
     np.testing.assert_allclose(slope, (values[0] - values[1]) / 2e-5, rtol=1e-7)
+
+
+def test_a_loss_that_uses_nan_has_no_number_as_gradient_by_closed_over_values():
+    """Zero, the derivative of a failed step, would hide that the loss is not a number."""
+
+    @jax.jit
+    @jax.grad
+    def slope(k, start, uses_end):
+        system = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + k * jnp.sqrt(q[0]))
+        how = {"h": 0.1, "num_steps": 1, "adjoint": dvi.Direct(), "throw": False}
+        q = dvi.integrate(system, start, 0 * start + 0.1, **how).qs[-1, 0]
+        return jnp.where(uses_end | jnp.isfinite(q), q, 0.0)
+
+    failing, good = jnp.array([-0.2]), jnp.array([0.2])
+    assert jnp.isnan(slope(1.0, failing, True))
+    assert slope(1.0, failing, False) == 0
+    assert abs(slope(1.0, good, True)) > 1e-3

@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 
 import cli
@@ -193,6 +194,25 @@ def test_the_page_without_a_browser():
             break
         time.sleep(0.05)
     assert "lower the degree" in page.message.object
+
+
+@pytest.mark.slow
+def test_ctrl_c_does_not_end_the_interpreter_while_a_thread_searches(monkeypatch):
+    """XLA in a thread would end the process with an error: the command leaves at once."""
+    pytest.importorskip("panel")
+    from dvi_jax.explorer import page as module
+    from dvi_jax_cli import _main
+
+    end = threading.Event()
+    monkeypatch.setattr(module.Model, "drifts", lambda model, report: end.wait(20) and 1 / 0)
+    assert not _main._is_searching()
+    dvi.explore(systems.kepler(), h=0.05, method="Strang")._new_page().discover()
+    (thread,) = (t for t in threading.enumerate() if t.name == module.SEARCH)
+    assert _main._is_searching()
+    assert not thread.daemon  # a script waits for it
+    end.set()
+    thread.join(20)
+    assert not _main._is_searching()
 
 
 def test_the_object_of_a_notebook_and_its_errors(monkeypatch):

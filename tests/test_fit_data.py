@@ -168,11 +168,9 @@ REFUSED = {
         ({"params": {"q0": MASKED}}, r"q0 .*masked .*index \[0\]"),
         ({"bounds": {"epsilon": dvi.Bounds(np.ma.masked, 1)}}, "lower of epsilon .*masked"),
         ({"model": starting(q0=MASKED)}, "q0 .*masked"),
-        ({"bounds": {"epsilon": dvi.Bounds(np.nan, 1)}}, "lower one must be less"),
+        ({"bounds": {"epsilon": dvi.Bounds([np.nan], 1)}}, "lower of epsilon must have"),
         ({"bounds": {"epsilon": dvi.Bounds(0.5, 1)}}, "not between"),
         ({"bounds": {"eps": dvi.Bounds(0.5, 1)}}, "got 'eps'"),
-        ({"priors": {"epsilon": dvi.Prior(0.0, 0.0)}}, "positive sigma"),
-        ({"priors": {"epsilon": dvi.Prior(None, 1.0)}}, "finite mean"),
         ({"shooting": dvi.MultipleShooting(300)}, "from 2 to 100, got 300"),
         ({"batch": 3}, "batch requires an optimiser of optax"),
         ({"max_steps": 0}, "max_steps"),
@@ -291,7 +289,8 @@ def test_angles_that_cross_the_end_of_their_range(name):
     assert fit.status == "converged"
     # Without a period the same data contradict their errors, and the result says so.
     naive = dvi.fit(model, dataclasses.replace(data, period=None), start, throw=False, **options)
-    assert "contradict sigma" in str(naive)
+    assert "contradict sigma" in str(naive).splitlines()[0]
+    assert ("period=" in str(naive)) == (name != "hours")
 
 
 def test_a_period_of_one_component_and_a_hint_without():

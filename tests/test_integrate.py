@@ -438,6 +438,32 @@ def test_the_memory_of_a_derivative_is_counted(monkeypatch):
             assert jax.eval_shape(loss, jnp.ones(2)).shape == (2,)
 
 
+def test_the_memory_of_reductions_and_of_checkpoints_is_counted(monkeypatch):
+    """A section with room for many crossings, a large value, and states between save points."""
+    monkeypatch.setattr(_memory, "machine_memory", lambda: 20_000)
+
+    def crossings(count):
+        return dvi.Section(lambda t, q, p, args: q[0], max_crossings=count)
+
+    def last(x, observe=None, **options):
+        how = {"h": 0.1, "num_steps": 1000, "save": FINAL, "observe": observe, **options}
+        return dvi.integrate(OSCILLATOR, x, START[1], **how).q_final.sum()
+
+    def shape_of(function):
+        return jax.eval_shape(function, jnp.ones(2)).shape
+
+    large = dvi.Last(lambda q, p: jnp.zeros(2000) + q[0])
+    for observe in (crossings(200), large):
+        with pytest.raises(ValueError, match=r"saved states and reductions.*max_crossings"):
+            last(jnp.ones(2), observe)
+    assert shape_of(lambda x: last(x, crossings(10))) == ()
+    dense, sparse = (dvi.Reversible(checkpoint_every=n) for n in (1, 100))
+    with pytest.raises(ValueError, match="Take a larger checkpoint_every"):
+        shape_of(jax.grad(lambda x: last(x, adjoint=dense)))
+    assert shape_of(jax.grad(lambda x: last(x, adjoint=sparse))) == (2,)
+    assert shape_of(lambda x: last(x, adjoint=dense)) == ()
+
+
 def test_limits_of_the_process_and_of_its_groups(monkeypatch, tmp_path):
     import resource
 

@@ -17,7 +17,7 @@ import pytest
 
 import dvi_jax as dvi
 from dvi_jax import interop, plot, rings, systems
-from dvi_jax.systems import boozer
+from dvi_jax.systems import boozer, rigid
 
 
 def H_D(t0, t1, q0, p1, args):
@@ -89,9 +89,14 @@ def discover(system=FORCED, basis=dvi.Polynomials(2), **how):
     return dvi.discover_invariants(system, basis, **({"h": 0.1, "samples": SAMPLES, **how}))
 
 
-def drift(invariant=energy, **how):
+def bound(found, **how):
+    settings = {"h": 0.1, "epsilon": 0.1, "domain": np.array([0.5]), **how}
+    return dvi.bound_drift(found, FORCED, **settings)
+
+
+def drift(invariant=energy, q0=Q, **how):
     return dvi.drift_order(
-        FORCED, invariant, Q, P, **({"epsilons": [0.1, 0.2, 0.4], **STEPS, **how})
+        FORCED, invariant, q0, P, **({"epsilons": [0.1, 0.2, 0.4], **STEPS, **how})
     )
 
 
@@ -480,6 +485,57 @@ CALLS = [
     (lambda: dvi.lattice_defect(FREE, [0.0]), "^ValueError: number of points.*got 1"),
     (lambda: boozer.loss_fraction([1.0], "a"), "^TypeError: times must be.*real numbers"),
     (lambda: rings.frequency_map(RING, [1e-3, 2e-3], np.ones(3)), "^ValueError: y.*np.meshgrid"),
+    # a user's function that JAX traces: in a proof, a basis, observations, noise, a clock, a model
+    *((lambda f=f, call=call: call(f), words) for call in (
+        lambda f: bound(energy, inside=f), bound, lambda f: discover(basis=dvi.Basis([f])),
+        lambda f: fit(dvi.Observations(TS, np.ones(3), f, sigma=0.1, t0=0.0)),
+        lambda f: run(dvi.System(H_D, noise=lambda t, q, p, args: f(q, p) * q), path=1,
+                      method=dvi.StochasticEuler()),
+        lambda f: run(save=dvi.Save(ts=[0.1], clock=f)))
+     for f, words in ((lambda q, p: np.sin(q[0]) + 0 * p[0], "is traced by JAX: use jnp.cos"),
+                      (lambda q, p: q[0] if q[0] > 0 else p[0], "Use jnp.where"),
+                      (lambda q, p: q[3] + p[0], "^IndexError.*uses the index 3"))),
+    (lambda: fit(model=lambda params: {"system": FREE, "h": 0.1, "q0": [np.sin(params["epsilon"])],
+     "p0": P}), "a function that fit calls is traced by JAX: use jnp"),
+    (lambda: traced(lambda x: drift(q0=x[None])), "An argument of drift_order is traced by JAX"),
+    (lambda: bound(lambda q, p: None), "^TypeError.*a return missing"),
+    # names of tables
+    (lambda: systems.kepler().observables["energi"], "^UnknownName: there is no 'energi'. Did you "
+     "mean 'energy'. Allowed: energy, "),
+    (lambda: systems.LIBRARY["Kepler"], "there is no 'Kepler'. Did you mean 'kepler'"),
+    (lambda: systems.kepler().units["mass"], "there is no 'mass'. Allowed: q, p, t, energy"),
+    (lambda: systems.magnetic_mirror().adiabatic["moment"], "there is no 'moment'. Allowed: magn"),
+    (lambda: sweep(observe={"a": dvi.Last(energy)})["b"], "there is no 'b'.*Allowed: .*a"),
+    # methods
+    (lambda: run().save(), "^TypeError: Solution.save requires path"),
+    (lambda: boozer.GuidingCentres.start(None, 0.5, 0.0, 0.0),
+     "^TypeError: GuidingCentres.start requires pitch. Its arguments are s, theta, zeta, pitch"),
+    (lambda: dvi.Discovery.evaluate(None, jnp.ones(1), jnp.ones(1), eps=0.1),
+     "^TypeError: Discovery.evaluate has no argument 'eps'. Did you mean 'epsilon'"),
+    (lambda: dvi.Discovery.load("found.npz"), "^TypeError: Discovery.load requires basis"),
+    (lambda: RING.get("QF"), "^TypeError: Ring.get requires parameter"),
+    # a prior and bounds, before they are used
+    (lambda: dvi.Prior(0, 0), "^ValueError: sigma of dvi.Prior must be positive.*Leave the prior"),
+    (lambda: dvi.Prior(0.0, [1.0, -1.0]), r"^ValueError: sigma of dvi.Prior.*index \[1\]"),
+    (lambda: dvi.Prior(0.0, np.inf), "^ValueError: sigma of dvi.Prior"),
+    (lambda: dvi.Prior(None, 1.0), "^ValueError: mean of dvi.Prior must be finite, got None"),
+    (lambda: dvi.Bounds(np.nan, 1.0), "^ValueError: lower must be less than upper"),
+    *((lambda f=f, V=V: rings.cavity("C", 0.0, V, f), "^ValueError: frequency of a cavity must be")
+     for f, V in ((-5e8, 1e-3), (0.0, 1e-3), (np.nan, 0.0))),
+    (lambda: rings.bend("B", 1.0, 11.25), "^ValueError: angle of a bend.*The unit is rad"),
+    (lambda: dvi.Brownian(1.5), "^ValueError: the key of a path must be an integer.*got 1.5"),
+    (lambda: dvi.Model(systems.kepler(), h=0.1), "^TypeError: system must.*is problem.system"),
+    # more deviation vectors than a manifold has directions
+    *((lambda kind=kind: dvi.integrate(systems.spherical_pendulum(), num_steps=2, observe=kind),
+     "^ValueError: (count|k) of .* from . to 4, got 5. With a constraint")
+     for kind in (dvi.LyapunovSpectrum(5), dvi.Running(dvi.GALI(5)))),
+    # rigid bodies
+    (lambda: rigid.momentum(np.ones(3), np.ones(3), np.ones(3)), r"^ValueError: R must.*\(3, 3\)"),
+    (lambda: rigid.momentum(np.eye(3), 1.0, np.ones(3)), r"^ValueError: pi must.*\(3,\)"),
+    (lambda: rigid.second_moments(2.0), r"^ValueError: I must.*\(3,\)"),
+    (lambda: rigid.quaternion(np.ones(3)), r"^ValueError: R must.*3, 3\), got \(3,\)"),
+    (lambda: rigid.euler_angles(np.ones((5, 3, 3))), "^ValueError: R must.*jax.vmap"),
+    (lambda: rigid.rotation(np.ones(3), 0.0, 0.0), "^ValueError: phi of a rotation must.*scalar"),
 ]  # fmt: skip
 
 
@@ -592,11 +648,60 @@ def test_functions_and_objects_can_be_pickled():
     assert pickle.loads(pickle.dumps(dvi.Yoshida(4))) == dvi.Yoshida(4)
 
 
+def test_tables_of_names_are_dicts():
+    table = pickle.loads(pickle.dumps(systems.kepler())).observables
+    assert isinstance(table, dict)
+    assert "energi" not in table
+    assert table.get("energi") is None
+    with pytest.raises(KeyError, match="Did you mean 'energy'"):
+        table["energi"]
+    sol = dvi.integrate(systems.kepler(), num_steps=2, observe=table)
+    plain = dvi.integrate(systems.kepler(), num_steps=2, observe=dict(table))
+    assert sol.observed.keys() == plain.observed.keys() == table.keys()
+    np.testing.assert_array_equal(sol.observed["energy"], plain.observed["energy"])
+
+
 def test_a_warning_shows_the_line_of_the_user():
     for call, words in WARNINGS[:3]:
         with pytest.warns(UserWarning, match=words) as record:
             call()
         assert record[0].filename == __file__
+
+
+def test_lyapunov_exponents_with_a_constraint_are_those_of_the_manifold():
+    sphere, save = systems.spherical_pendulum(), dvi.Save(final=True)
+    kinds = [dvi.LyapunovSpectrum(), dvi.LyapunovSpectrum(4)]
+    found = dvi.integrate(sphere, num_steps=20, observe=kinds, save=save).observed
+    np.testing.assert_array_equal(*found)
+    assert run(observe=dvi.LyapunovSpectrum()).observed.shape == (2,)
+
+
+def planets(h, **how):
+    outer = systems.outer_solar_system()
+    return dvi.integrate(outer, h=h, num_steps=1, method=dvi.WisdomHolman(**how))
+
+
+def test_too_few_steps_in_a_revolution_warn():
+    with pytest.warns(UserWarning, match=r"h = 2000 .* body 1 has the period 4332, .* 2.2 steps"):
+        planets(2000.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        planets(100.0)
+        planets(2000.0, scheme=(10, 6, 4))
+
+
+def test_a_close_pericentre_warns_and_an_orbit_that_is_not_bound_does_not():
+    def go(speed):
+        args = {"masses": np.array([1.0, 1e-6]), "G": 1.0}
+        q0, p0 = [[0.0, 0.0], [2.0, 0.0]], [[0.0, 0.0], [0.0, 1e-6 * speed]]
+        method = dvi.WisdomHolman()
+        return dvi.integrate(systems.n_body(), q0, p0, args=args, h=0.1, num_steps=1, method=method)
+
+    with pytest.warns(UserWarning, match="67 steps, or 1.1 at the angular velocity of its peri"):
+        go(0.2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        go(9.0)
 
 
 def final(**how):

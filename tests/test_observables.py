@@ -223,9 +223,15 @@ def test_an_argument_tau_that_would_receive_t_is_refused():
         {"observe": dvi.Section(of_tau)},
         {"stop": dvi.Stop(of_tau)},
         {"save": dvi.Save(ts=[0.2], clock=of_tau)},
+        {"lattice": dvi.TimeTransformed(of_tau)},
+        {"lattice": dvi.AdaptiveReversible(of_tau), "method": dvi.Strang()},
     ):
         with pytest.raises(TypeError, match="is the time t, not τ"):
             dvi.integrate(slow, [1.0], [0.2], **inputs, **options)
+    data = dvi.Observations([0.1, 0.2], [1.0, 1.0], t0=0.0, observe=of_tau)
+    model = dvi.Model(slow, h=0.1, p0=[0.2], epsilon=0.3)
+    with pytest.raises(TypeError, match="is the time t, not τ"):
+        dvi.fit(model, data, {"q0": [1.0]})
     # A system without a slow time has no τ = εt.
     fast = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + q @ q / 2)
     dvi.integrate(fast, [1.0], [0.2], h=0.1, num_steps=3, observe=of_tau)

@@ -762,13 +762,15 @@ def test_drifts_that_failed_or_are_0_keep_their_place():
         used=np.array([False, True, False, True]), slope=1.0, interval=(0.9, 1.1), floor=0.0,
         resolved=True,
     )  # fmt: skip
-    axis = plot.drift_orders({"a": order})
+    axis = plot.drift_orders({"a": order}, expected=[None])  # then there is no grey line
+    assert "expected slope" not in legend(axis)
     same(marked(axis, "x")[0][:, 0], [0.4])
     close(marked(axis, "v")[0][:, 0], [0.1, 0.07])
     assert legend(axis)[-2:] == ["1 of 5 drifts failed", "2 of 5 drifts are exactly 0"]
     order.drifts, order.floor = np.array([0.05, 0.1, 0.2, 0.3]), 1e-3
     whole = legend(plot.drift_orders({"a": order}, expected=1))
     assert whole[0] == "a: slope 1.00 ± 0.10, expected 1"
+    assert "expected slope" in whole
     assert not any("drifts" in text for text in whole)
 
 

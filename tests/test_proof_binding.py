@@ -114,6 +114,10 @@ def test_the_command_line_compares_a_system(bound, tmp_path):
         "def system(k):\n"
         "    return dvi.System(lambda t0, t1, q, p, args: (p @ p + k * q @ q) / 2)\n"
         "soft, stiff = system(1.0), system(2.0)\n"
+        "def exact(q, p, epsilon):\n"
+        "    return (p @ p + q @ q - 0.1 * (q @ p)) / 2\n"
+        "def other(q, p, epsilon):\n"
+        "    return p @ p + q @ q\n"
     )
     soft = dvi.System(lambda t0, t1, q, p, args: (p @ p + 1.0 * q @ q) / 2)
     exact = lambda q, p, epsilon: (p @ p + q @ q - 0.1 * (q @ p)) / 2  # noqa: E731
@@ -121,6 +125,12 @@ def test_the_command_line_compares_a_system(bound, tmp_path):
     dvi.bound_drift(exact, soft, h=0.1, epsilon=0.1, domain=np.array([0.5])).save(path)
     model = tmp_path / "model.py"
     assert found("verify", path, "--system", f"{model}:soft")["system"]["holds"] is True
+    alone = found("verify", path, "--system", f"{model}:soft")["system"]
+    assert "give --invariants FILE.py:NAME" in alone["text"]
+    with_functions = "--system", f"{model}:soft", "--invariants"
+    both = found("verify", path, *with_functions, f"{model}:exact")["system"]
+    assert (both["holds"], both["remarks"]) == (True, [])
+    assert command("verify", path, *with_functions, f"{model}:other").exit_code == 1
     result = command("verify", path, "--system", f"{model}:stiff")
     assert result.exit_code == 1
     assert "the list of operations of the step" in result.output

@@ -20,6 +20,8 @@ from dvi_jax_cli._show import TextTable
 from dvi_jax_cli.work.page import MAX_BYTES, Chapter, page
 from dvi_jax_cli.work.repeat import plain, repetition, toml_text
 
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
+
 OWN = """
 import jax.numpy as jnp
 import dvi_jax as dvi
@@ -58,6 +60,7 @@ SWEEP = """
 system = "own.py:system"
 h = 0.1
 steps = 30
+save = "final"
 [state]
 q0 = [0.5]
 p0 = [{values = [0.0, -1.0, -2.0, -5.0], axis = "px"}]
@@ -195,7 +198,10 @@ def test_a_sweep_counts_and_names_its_failures(results):
     first = dict(zip(data.status.dims, (k, p), strict=True))
     step = int(data.failed_step.isel(first))
     assert lines[0].endswith(f"at step {step}")
-    assert reader.tags.count("img") == 2
+    assert "[{values = [0, -1, -2, -5], axis = px}]" in reader.texts["dd"]
+    pictures = ["Status of each trajectory", "Map of height", "Map of p", "Map of q"]
+    assert reader.texts["figcaption"] == pictures  # of the last states, not of their times
+    assert reader.tags.count("img") == len(pictures)
     assert "[args]" in "".join(reader.texts["config"])
     expected = ["dvi-jax", "sweep", "sweep.toml", "--store", "sweep-again.zarr"]
     assert shlex.split(chapter["command"]) == expected
@@ -309,7 +315,8 @@ def test_large_results_are_shortened_with_a_remark(tmp_path, monkeypatch):
 
     monkeypatch.setattr(page_module, "_SVG", 100)
     draw = lambda: dvi.plot.plt.figure().gca()  # noqa: E731
-    chapter.pictures = {"points": draw, "file": b"0" * 3_000_000}
+    wide = lambda: dvi.plot.plt.figure(figsize=(9, 3)).gca()  # noqa: E731
+    chapter.pictures = {"points": draw, "file": b"0" * 3_000_000, "wide": wide}
     (tmp_path / "page.html").write_bytes(page("large", [chapter]))
     reader = checked(tmp_path / "page.html")
     text = " ".join(reader.texts["p"])
@@ -317,11 +324,35 @@ def test_large_results_are_shortened_with_a_remark(tmp_path, monkeypatch):
     assert reader.tags.count("tr") == 61
     assert "… and 12335 more failures" in text
     assert " … and 100000 more characters" in "".join(reader.texts["config"])
-    assert [v[:15] for _, n, v in reader.attributes if n == "src"] == ["data:image/png;"]
+    assert [v[:15] for _, n, v in reader.attributes if n == "src"] == 2 * ["data:image/png;"]
+    assert [v for tag, n, v in reader.attributes if (tag, n) == ("figure", "class")] == ["large"]
     assert any(
         "file cannot be drawn: 3 MB do not fit into the page" in t
         for t in reader.texts["figcaption"]
     )
+
+
+@pytest.mark.slow
+def test_a_phone_shows_a_report_legibly(tmp_path):
+    """Only pictures, tables and the TOML file slide; letters of a picture are not too small."""
+    playwright = pytest.importorskip("playwright.sync_api")
+    if BROWSER is None:
+        pytest.skip("there is no Chromium")
+    chapter = Chapter("run", "long_" * 30, "successful", "good", command="dvi-jax run " * 20)
+    chapter.tables = [TextTable("x", ["a long name of a column"] * 3, [["1.2345e-12"] * 3])]
+    chapter.pictures = {"curve": lambda: dvi.plot.plt.figure(figsize=(6.4, 4.8)).gca()}
+    chapter.notes, chapter.formulas = ["word " * 100], ["q² + " * 100]
+    (tmp_path / "page.html").write_bytes(page("x", [chapter]))
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=BROWSER, args=["--no-sandbox"])
+        tab = browser.new_page(viewport={"width": 390, "height": 844})
+        tab.goto((tmp_path / "page.html").as_uri())
+        width = "e => e.scrollWidth - e.clientWidth"
+        assert tab.eval_on_selector("html", width) == 0
+        for part in ("pre.command", "pre.formulas", "p.note", "h1", "figcaption", ".wide"):
+            assert tab.eval_on_selector(part, width) == 0, part
+        assert tab.eval_on_selector("img", "e => e.clientWidth") > 70 * 6.4  # pixels per inch
+        browser.close()
 
 
 def test_a_table_is_written_as_toml_and_read_again():

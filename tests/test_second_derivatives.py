@@ -8,7 +8,7 @@ from jax import lax
 
 import dvi_jax as dvi
 import lanewise
-from dvi_jax.engine.guard import constant_unless, nan_if_used
+from dvi_jax.engine.guard import constant_unless, nan_where_used
 from dvi_jax.engine.in_pairs import in_pairs
 from dvi_jax.fit.optimise import _residual, _scalar_function
 from dvi_jax.fit.posterior import _finite_potential
@@ -90,7 +90,7 @@ RULES = {
         lambda x: constant_unless(x > -9, jnp.sin, x, succeeds=lambda y: y > -9),
         jnp.sin,
     ),
-    "nan_if_used": (lambda x: nan_if_used(jnp.sin(x), x), jnp.sin),
+    "nan_where_used": (lambda x: nan_where_used(jnp.sin, x), jnp.sin),
     "legendre": (hypotenuse, lambda p: jnp.sqrt(1 + p * p)),
     "implicit_root": (root, cardano),
     "potential": (potential, jnp.sin),
@@ -125,7 +125,7 @@ def seconds(f):
     return jax.jit(jax.vmap(lambda k: jnp.stack([order(f)(k) for order in ORDERS])))(K)
 
 
-QUICK = [(rule, "scan") for rule in ("to_grid", "in_pairs", "nan_if_used")]
+QUICK = [(rule, "scan") for rule in ("to_grid", "in_pairs", "nan_where_used")]
 CASES = [(rule, site) for rule in RULES for site in SITES]
 
 

@@ -167,14 +167,18 @@ def test_what_does_not_change_numbers_does_not_change_it(what):
     assert differences(a, b) == []
 
 
-def test_unsigned_integers_and_unknown_names(tmp_path):
-    observe = {"count": lambda *a: jnp.uint8(3), "x": dvi.Last(position)}
+def test_unsigned_integers_booleans_and_unknown_names(tmp_path):
+    late = lambda t, q, p, args: t > 0.15  # noqa: E731
+    observe = {"count": lambda *a: jnp.uint8(3), "x": dvi.Last(position), "late": late}
     found = dvi.sweep(oscillator(), Q, Q, h=0.1, num_steps=2, t0=[0.0, 1.0], observe=observe,
                       store=tmp_path / "s.zarr")  # fmt: skip
     assert found["count"].dtype == np.uint8
     assert (found["count"] == 3).all()
     np.testing.assert_array_equal(found["t0"], [0.0, 1.0])
-    with pytest.raises(KeyError, match="use one of"):
+    for flags in (found["late"], dvi.open_sweep(found.path).to_xarray()["late"]):
+        assert flags.dtype == bool
+        np.testing.assert_array_equal(flags, [[False, True], [True, True]])
+    with pytest.raises(KeyError, match="Did you mean 'count'"):
         found["cuont"]
 
 

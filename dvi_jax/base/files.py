@@ -60,7 +60,8 @@ def user_folder(name: str, path: Any) -> Path:
     nearest = next(part for part in (folder, *folder.absolute().parents) if part.exists())
     if not nearest.is_dir():
         raise NotADirectoryError(
-            f"{name} must be a directory, but '{nearest}' is a {kind_of_file(nearest)}: give one."
+            f"{name} must be a directory, but '{nearest}' is a {kind_of_file(nearest)}: give "
+            "another path."
         )
     return folder
 

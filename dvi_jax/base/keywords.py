@@ -5,10 +5,12 @@ import functools
 import inspect
 import re
 import sys
+import traceback
 from collections.abc import Callable
 from types import ModuleType
 from typing import Any, TypeVar
 
+import jax
 import numpy as np
 
 from . import checks
@@ -91,13 +93,27 @@ def explain_calls(module: ModuleType) -> None:
                 setattr(home, value.__name__, call)
             if getattr(call, "__wrapped__", None) is value:
                 setattr(module, name, call)
-        elif isinstance(value, type) and inspect.isfunction(init := vars(value).get("__init__")):
-            # Not other methods: each would be a frame more in the errors of a user's functions.
-            call = _explained(init, value.__name__, functools.partial(init, None))
-            setattr(value, "__init__", call)  # noqa: B010  in place, as in `accept_newton`
+        elif isinstance(value, type):
+            _explain_methods(value)
     for name, table in vars(module).items():
         if isinstance(table, dict) and not name.startswith("_"):
             table.update({key: _replacement(value) for key, value in table.items()})
+
+
+def _explain_methods(cls: type) -> None:
+    """Make the constructor of a class explain a call with wrong arguments, and the methods that it
+    does not have from a base: those are called in steps, where each would be a frame more in the
+    errors of a user's functions."""
+    inherited = {name for base in cls.__mro__[1:] for name in vars(base)} - {"__init__"}
+    for name, member in list(vars(cls).items()):
+        function = member.__func__ if isinstance(member, classmethod) else member
+        if name in inherited or (name[0] == "_" and name != "__init__"):
+            continue
+        if inspect.isfunction(function) and not inspect.isabstract(cls):
+            label = cls.__name__ if name == "__init__" else f"{cls.__name__}.{name}"
+            call = _explained(function, label, functools.partial(function, None))
+            # In place, as in `accept_newton`.
+            setattr(cls, name, classmethod(call) if function is not member else call)
 
 
 def _replacement(value: Any) -> Any:
@@ -134,6 +150,7 @@ def _explained(function: Callable[..., Any], name: str, signature: Any) -> Calla
             return function(*args, **keywords)
         except TypeError as error:
             own = args[1:] if signature is not function else args
+            _note_tracing(name, error)
             # Most errors come from inside of the function, and not from this call of it.
             if not _CALL.search(str(error)) or _fits(signature, own, keywords):
                 raise
@@ -176,3 +193,45 @@ def _refuse_call(name: str, function: Callable[..., Any], count: int, keywords: 
         f"{name} takes {len(by_position)} argument(s) by position, got {count}"
         f"{f' and {list(keywords)} by name' if keywords else ''}. {hint}"
     )
+
+
+def _note_tracing(name: str, error: Exception) -> None:
+    """Add advice to an error of JAX about traced values, unless it has some."""
+    notes = getattr(error, "__notes__", ())
+    if not isinstance(error, jax.errors.JAXTypeError) or any(TRACED in note for note in notes):
+        return
+    # The traceback has the frames of JAX as well, which are filtered only when it is printed.
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    roots = [str(frame.f_globals.get("__name__")).split(".")[0] for frame in frames]
+    owners = [root for root in roots if root not in _BELOW]
+    # The last line that is not of a library is in a function of the user, or in a call with a
+    # traced value.
+    is_of_user = owners and owners[-1] not in _OWN
+    error.add_note(
+        tracing_note(f"a function that {name} calls", error)
+        if is_of_user
+        else f"An argument of {name} {TRACED}, but must be known here: compute it outside of jit, "
+        "grad and vmap."
+    )
+
+
+_BELOW = ("jax", "jaxlib", "numpy", "scipy", *_BETWEEN[len(_OWN) :])
+TRACED = "is traced by JAX"
+
+
+def tracing_note(name: str, error: Exception) -> str:
+    """Advice about an error in a function of the user that JAX traces."""
+    if isinstance(error, jax.errors.TracerBoolConversionError):
+        return (
+            f"{name} is traced by JAX: its values are not known yet, so if and while cannot depend "
+            "on them. Use jnp.where(condition, a, b), jax.lax.cond or jax.lax.while_loop."
+        )
+    errors = jax.errors
+    if isinstance(error, errors.ConcretizationTypeError | errors.TracerArrayConversionError):
+        return (
+            f"{name} is traced by JAX: use jnp.cos, jnp.sqrt, … in place of np.cos, math.cos, "
+            "float() or int()."
+        )
+    if isinstance(error, TypeError) and "NoneType" in str(error):
+        return f"In this call args is None: if {name} uses args, pass args=... to the call."
+    return f"{name} is traced by JAX: it must consist of functions of jax.numpy."

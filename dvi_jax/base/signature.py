@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from .checks import function as check_function
 from .indices import out_of_bounds
-from .keywords import user_level
+from .keywords import tracing_note, user_level
 
 
 def accepts(function: Callable[..., Any], count: int) -> bool:
@@ -157,21 +157,3 @@ def output_of(
     for index, size in out_of_bounds(program):
         raise IndexError(f"{name} uses the index {index}, out of bounds for an axis of {size}.")
     return array_type(name, eqx.combine(*out), hint)
-
-
-def tracing_note(name: str, error: Exception) -> str:
-    """Advice about an error in a function of the user that JAX traces."""
-    if isinstance(error, jax.errors.TracerBoolConversionError):
-        return (
-            f"{name} is traced by JAX: its values are not known yet, so if and while cannot depend "
-            "on them. Use jnp.where(condition, a, b), jax.lax.cond or jax.lax.while_loop."
-        )
-    errors = jax.errors
-    if isinstance(error, errors.ConcretizationTypeError | errors.TracerArrayConversionError):
-        return (
-            f"{name} is traced by JAX: use jnp.cos, jnp.sqrt, … in place of np.cos, math.cos, "
-            "float() or int()."
-        )
-    if isinstance(error, TypeError) and "NoneType" in str(error):
-        return f"In this call args is None: if {name} uses args, pass args=... to the call."
-    return f"{name} is traced by JAX: it must consist of functions of jax.numpy."

@@ -4,12 +4,15 @@ After its end a trajectory is NaN, and so are the derivatives there. A loss that
 has the cotangent zero, and zero times NaN would be NaN.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool
 
 from lanewise.jaxprs.jaxapi import linear_map, with_equal_axes
@@ -30,30 +33,38 @@ def constant_unless(
     # The derivative is set to zero at the inputs: at the outputs it would be multiplied by NaN
     # afterwards. Values are the same on both sides of each choice, which costs nothing. (A rule of
     # its own for the derivative would be lost in second derivatives of a scan.)
-    def variable(x: Any) -> Any:
-        is_variable = jnp.issubdtype(jnp.result_type(x), jnp.inexact)
-        return jnp.where(good, x, lax.stop_gradient(x)) if is_variable else x
+    def chosen(good: Any, inputs: Any) -> list[Any]:
+        smooth, others = eqx.partition([*inputs], eqx.is_inexact_array)
+        smooth = jax.tree.map(lambda x: jnp.where(good, x, lax.stop_gradient(x)), smooth)
+        return eqx.combine(smooth, others)
+
+    def guarded(good: Any, *inputs: Any) -> list[Any]:
+        return trace(*chosen(good, inputs))
 
     def result_of(outs: list[Any]) -> Any:
         return jax.tree.unflatten(trace.out_tree, outs)
 
-    inputs = list(map(variable, [*trace.outer, *leaves]))
+    inputs = [*trace.outer, *leaves]
     if succeeds is None:
-        return result_of(trace(*inputs))
-    value = jax.custom_jvp(trace.__call__)
+        return result_of(guarded(good, *inputs))
+    value = jax.custom_jvp(guarded)
 
-    @value.defjvp
-    def _(inputs, changes):
-        outs, push = jax.linearize(trace, *inputs)
-        is_good = succeeds(result_of(outs))
+    # Inputs without a change, such as h in most runs, need no derivative: it would take time.
+    @functools.partial(value.defjvp, symbolic_zeros=True)
+    def _(primals, tangents):
+        (good, *inputs), changes = primals, tangents[1:]
+        values = chosen(good, inputs)
+        places = [i for i, x in enumerate(changes) if not isinstance(x, SymbolicZero)]
 
-        def guarded(change: Any) -> Any:
-            is_variable = change.dtype != jax.dtypes.float0
-            return jnp.where(is_good, change, jnp.zeros_like(change)) if is_variable else change
+        def of_variables(*variables):
+            new = dict(zip(places, variables, strict=True))
+            return trace(*(new.get(i, x) for i, x in enumerate(values)))
 
-        return outs, push(*map(guarded, changes))
+        outs, push = jax.linearize(of_variables, *(values[i] for i in places))
+        is_good = good & succeeds(result_of(outs))
+        return outs, push(*(jnp.where(is_good, changes[i], 0) for i in places))
 
-    return result_of(value(*inputs))
+    return result_of(value(good, *inputs))
 
 
 def all_finite(values: Any) -> Bool[Array, ""]:
@@ -62,9 +73,20 @@ def all_finite(values: Any) -> Bool[Array, ""]:
     return jax.tree.reduce(jnp.logical_and, finite)
 
 
-def nan_if_used(values: Any, inputs: Any) -> Any:
-    """The floating-point arrays `values`. If a loss depends on one of them that is NaN, its
-    gradient by all `inputs` is NaN: zero would hide that the loss is not a number."""
+def nan_where_used(function: Callable, *args: Any) -> Any:
+    """``function(*args)``. If a loss depends on a value of it that is NaN, its gradient by all
+    inputs is NaN, by what the function closes over too: zero would hide that the loss is not a
+    number."""
+    leaves, tree = jax.tree.flatten(args)
+    trace = Trace.from_function(function, leaves, tree)
+    inputs = [*trace.outer, *leaves]
+    smooth, others = eqx.partition(trace(*inputs), eqx.is_inexact_array)
+    smooth = _nan_if_used(smooth, eqx.filter(inputs, eqx.is_inexact_array))
+    return jax.tree.unflatten(trace.out_tree, eqx.combine(smooth, others))
+
+
+def _nan_if_used(values: Any, inputs: Any) -> Any:
+    """The floating-point `values`, with the derivative of `nan_where_used` by `inputs`."""
 
     @jax.custom_jvp
     def same(values, inputs):
@@ -76,12 +98,11 @@ def nan_if_used(values: Any, inputs: Any) -> Any:
     def pull(values, cotangents):
         uses = jax.tree.map(lambda x, c: jnp.any(jnp.isnan(x) & (c != 0)), values, cotangents)
         is_nan = jnp.any(jnp.asarray(jax.tree.leaves(uses), bool))
-        of_inputs = [jnp.where(is_nan, jnp.full_like(x, jnp.nan), 0) for x in like]
-        return cotangents, jax.tree.unflatten(tree, of_inputs)
+        of_input = lambda x: jnp.where(is_nan, jnp.full(x.shape, jnp.nan, x.dtype), 0)  # noqa: E731
+        return cotangents, jax.tree.map(of_input, like)
 
     values, inputs = with_equal_axes((values, inputs))
-    leaves, tree = jax.tree.flatten(inputs)
-    like = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
+    like = jax.eval_shape(lambda: inputs)
 
     @same.defjvp
     def _(primals, tangents):

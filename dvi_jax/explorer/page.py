@@ -17,6 +17,8 @@ from .widgets import BLOCK, WIDGET, Slider, button, number, row, select
 
 _TABS = ("Motion", "Section", "Orbit diagram", "Drift")
 COLOURINGS = ("orbit", "MEGNO", "frequency")
+SEARCH = "search for invariants"
+"""Name of the thread that computes it."""
 _DELAY = 15  # milliseconds in which further moves of a slider join the same picture
 
 
@@ -262,7 +264,8 @@ class Page:
             else:
                 self._later(lambda: self._finish(drifts, drifts.message))
 
-        threading.Thread(target=work, daemon=True).start()
+        # No daemon: the interpreter cannot end while XLA computes in a thread.
+        threading.Thread(target=work, name=SEARCH).start()
 
     def _finish(self, drifts: Drifts | None, message: str) -> None:
         self.search.disabled, self.progress.object = False, ""

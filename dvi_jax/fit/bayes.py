@@ -15,6 +15,7 @@ from jaxtyping import Array, PyTree
 from ..base.checks import fraction, instance, whole
 from ..base.keywords import checked_keywords, user_level
 from ..base.printing import printable
+from ..base.tables import Table
 from ._fit import fit
 from .checks import package, same_parameters
 from .keywords import LossSettings, SampleSettings, select
@@ -301,8 +302,8 @@ def collect(
         diverging=np.asarray(statistics["diverging"]),
         steps=np.asarray(statistics["num_steps"]),
         acceptance=np.asarray(statistics["mean_accept_prob"])[:, -1],
-        r_hat=r_hat,
-        ess=ess,
+        r_hat=Table(r_hat),
+        ess=Table(ess),
         warnings=notes,
         maxima=np.array([np.asarray(posterior.to_x(jnp.asarray(m.u))) for m in maxima]),
         shares=np.array([m.share for m in maxima]),

@@ -16,11 +16,12 @@ from ..base.checks import instance, whole
 from ..base.inputs import as_parameter, start_state
 from ..base.printing import printable
 from ..base.results import RESULTS
-from ..base.signature import accepts
+from ..base.signature import accepts, output_of
 from ..discover.functions.basis import check_step_size
 from ..integration.integrate import integrate
 from ..integration.integrator import Integrator
 from ..lattices import Uniform
+from ..observe import refuse_slow_time
 from ..observe.solution import Save
 from ..problem.system import System
 from .observations import Observations
@@ -79,7 +80,7 @@ class Model(eqx.Module):
         args: PyTree = None,
         **options: Any,
     ):
-        instance("system", system, System, "a dvi.System")
+        instance("system", system, System, "a dvi.System", "That of a problem is problem.system.")
         for name in options:
             if name not in _OPTIONS:
                 arguments = ", ".join(("system", "h", *_MAY_BE_FITTED, *_OPTIONS))
@@ -365,21 +366,18 @@ def check_observable(i: int, arc: Observations, spec: Mapping[str, Any]) -> bool
     **Raises** as `integrate` does for the initial state and args; `ValueError` with both shapes for
     an observable that does not return one value of the data; errors of the function with a note.
     """
+    if spec["system"].slow_time:
+        refuse_slow_time(arc.function)
     q, p = start_state(spec["q0"], spec["p0"])
     args = jax.tree.map(as_parameter, spec.get("args"))
-    try:
-        out = eqx.filter_eval_shape(arc.function, jnp.asarray(arc.t0), q, p, args)
-    except Exception as error:
-        error.add_note(f"(in the observe of arc {i}, called with (t, q, p, args))")
-        raise
-    shape, row_shape = getattr(out, "shape", None), arc.values.shape[1:]
+    out = output_of(f"observe of arc {i}", arc.function, jnp.asarray(arc.t0), q, p, args)
+    shape, row_shape = out.shape, arc.values.shape[1:]
     if row_shape == () and shape == (1,) and arc.covariance is None:
         return True
     if shape != row_shape:
         name = f"observe={arc.observe!r}" if isinstance(arc.observe, str) else "observe"
-        result = f"an object of type {type(out).__name__}" if shape is None else f"shape {shape}"
         raise ValueError(
             f"arc {i}: values has shape {arc.values.shape}, so observe must return shape "
-            f"{row_shape}, got {result} from {name} for q of shape {q.shape}."
+            f"{row_shape}, got shape {shape} from {name} for q of shape {q.shape}."
         )
     return False

@@ -92,7 +92,8 @@ class Observations:
         t0 = finite("t0", ts[0] if self.t0 is None else self.t0)
         if ts.min() < t0 < ts.max():
             raise ValueError(
-                f"ts must be on one side of t0 = {t0}, got times from {ts.min()} to {ts.max()}."
+                f"ts must be on one side of t0 = {t0}, got times from {ts.min()} to {ts.max()}. "
+                "Leave out those before t0, or fit the state at the first time: t0=ts[0]."
             )
         fields: dict[str, Any] = {"ts": ts, "values": values, "t0": t0}
         if self.sigma is not None:

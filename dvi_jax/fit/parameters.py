@@ -13,7 +13,7 @@ from jaxtyping import Array, PyTree
 
 from lanewise.jaxprs.jaxapi import is_traced
 
-from ..base.checks import known
+from ..base.checks import all_finite, known
 from ..base.inputs import refuse_unit_or_mask
 from .checks import require_shape
 
@@ -37,7 +37,7 @@ class Bounds:
     def __post_init__(self):
         # Arrays are compared later, when the shape of the parameter is known.
         numbers = all(isinstance(x, int | float) for x in (self.lower, self.upper))
-        if numbers and self.lower >= self.upper:
+        if numbers and not self.lower < self.upper:
             raise ValueError(
                 f"lower must be less than upper, got dvi.Bounds({self.lower!r}, {self.upper!r})."
             )
@@ -48,10 +48,18 @@ class Prior:
     """Prior knowledge of a parameter: a normal distribution, independent in components.
 
     - `mean`, `sigma`: numbers, or arrays that broadcast to the parameter.
+
+    **Raises** `ValueError` unless mean is finite, and sigma positive and finite.
     """
 
     mean: Any
     sigma: Any
+
+    def __post_init__(self):
+        # Here and not in a fit, so that the traceback shows where it was made.
+        all_finite("mean of dvi.Prior", self.mean)
+        hint = "Leave the prior out where nothing is known, and fix a parameter that is known."
+        all_finite("sigma of dvi.Prior", self.sigma, positive=True, hint=hint)
 
 
 _UNDERFLOW = 1e-150  # Distance from a bound at which the square of dx/du is zero: no error there
@@ -196,14 +204,10 @@ def make_space(
             ~((x > lower) & (x < upper)),
             "the parameter {0} starts at {1}, which is not between its bounds {2} and {3}.",
         ),
-        (
-            has_prior & ~(np.isfinite(mean) & np.isfinite(sigma) & (sigma > 0)),
-            "the prior of {0} needs a finite mean and a positive sigma, got {4} and {5}.",
-        ),
     ):
         if bad.any():
             i = int(np.argmax(bad))
-            raise ValueError(text.format(names[i], x[i], lower[i], upper[i], mean[i], sigma[i]))
+            raise ValueError(text.format(names[i], x[i], lower[i], upper[i]))
     space = Space(
         lower=jnp.asarray(lower),
         upper=jnp.asarray(upper),

@@ -13,6 +13,7 @@ from jaxtyping import PyTree
 from ..base.checks import one_of
 from ..base.files import publish_npz, read_npz
 from ..base.printing import printable
+from ..base.tables import Table
 from .checks import same_parameters
 from .optimise import FIT_RESULTS, NAMES, name_of
 from .parameters import make_space
@@ -173,7 +174,7 @@ class FitResult:
 
     def __str__(self) -> str:
         width = max(len(n) for n in self.names[:40])
-        lines = [f"{self.status} after {len(self.history['loss'])} steps, {self.seconds:.1f} s"]
+        lines = [f"{verdict(self)} after {len(self.history['loss'])} steps, {self.seconds:.1f} s"]
         for name, words in list(zip(self.names, numbers_in_words(self), strict=True))[:40]:
             lines.append(f"  {name:{width}}  {words}")
         if np.isnan(self.covariance).all() and len(self.at_bounds) < len(self.names):
@@ -233,7 +234,7 @@ class FitResult:
             params=space.to_params(jnp.asarray(arrays["x"])),
             x=arrays["x"],
             covariance=arrays["covariance"],
-            history={k[8:]: v for k, v in arrays.items() if k.startswith("history.")},
+            history=Table({k[8:]: v for k, v in arrays.items() if k.startswith("history.")}),
             result=getattr(FIT_RESULTS, one_of(f"the status in {path}", header["result"], NAMES)),
             singular_values=arrays["values"],
             curvature=arrays.get("curvature"),
@@ -254,6 +255,15 @@ def numbers_in_words(fit: FitResult) -> list[str]:
 def remarks(fit: FitResult) -> list[str]:
     """What a user must know before the numbers are used."""
     return list(filter(None, [_little_explained(fit), contradiction(fit), _whole_turns(fit)]))
+
+
+def verdict(fit: FitResult) -> str:
+    """The status in words: a fit may have converged to a model that does not describe the data."""
+    if fit.status == "converged" and contradiction(fit):
+        return (
+            f"converged, but the residuals contradict sigma (reduced chi² {fit.reduced_chi2:.4g}),"
+        )
+    return fit.status
 
 
 def contradiction(fit: FitResult) -> str:
@@ -292,6 +302,18 @@ def _whole_turns(fit: FitResult) -> str:
                 f"{count} residuals are near ±{name}: if the values are angles, give their period "
                 "to dvi.Observations(..., period=...)."
             )
+    if not (contradiction(fit) or _little_explained(fit)):
+        return ""
+    # A fit that has followed no branch has no such residuals, but its data jump within a turn.
+    for values in (column for v in fit.observed for column in v.reshape(len(v), -1).T):
+        values = values[np.isfinite(values)]
+        jump, span = (np.abs(x).max(initial=0.0) for x in (np.diff(values), np.ptp(values)))
+        for name, turn in (("2π", 2 * np.pi), ("360", 360.0)):
+            if 0.5 * turn < jump <= span <= 1.001 * turn:
+                return (
+                    f"values jump by up to {jump:.3g} in an interval of at most {name}: if they "
+                    "are angles, give their period to dvi.Observations(..., period=...)."
+                )
     return ""
 
 

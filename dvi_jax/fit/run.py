@@ -19,6 +19,7 @@ from ..base.keywords import user_level
 from ..base.printing import printable
 from ..base.progress import bar_of, reporter
 from ..base.reads import reads
+from ..base.tables import Table
 from .checks import same_fit
 from .optimise import Position, Record, StageTask
 from .problem import FitProblem
@@ -92,7 +93,9 @@ class FitRun:
                     f"there is no directory for checkpoint={str(file)!r}: create it."
                 )
             if file.is_dir():
-                raise IsADirectoryError(f"checkpoint={str(file)!r} is a directory: give a file.")
+                raise IsADirectoryError(
+                    f"checkpoint={str(file)!r} is a directory: give the path of a file in it."
+                )
             if file.exists():
                 user_file("checkpoint", file)
                 self.resume, self.records = _read_checkpoint(file, self.identity)
@@ -134,7 +137,7 @@ class FitRun:
     def history(self) -> dict[str, np.ndarray]:
         """The records as arrays."""
         columns = _columns(self.records)
-        return {**columns, "x": columns["x"].reshape(-1, self.problem.size)}
+        return Table({**columns, "x": columns["x"].reshape(-1, self.problem.size)})
 
 
 def _columns(records: list[Record]) -> dict[str, np.ndarray]:

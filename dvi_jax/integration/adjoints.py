@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+import functools
 import math
 
 import equinox as eqx
@@ -14,7 +15,7 @@ from lanewise import Layout
 
 from ..base.checks import whole
 from ..base.types import State
-from ..engine.guard import nan_if_used
+from ..engine.guard import nan_where_used
 from .loop import Loop, outcome, run, start, with_start
 from .task import Outcome, Plan, Task, adds_start_outside
 
@@ -43,10 +44,8 @@ def _direct_rollout(
         task = eqx.combine(arrays, functions)
         return outcome(task, plan, run(task, plan, start(task, q0, p0), loop), q0, p0)
 
-    result = lanewise.call(forward, arrays, q0, p0, layout=layout)
-    smooth, others = eqx.partition(result, eqx.is_inexact_array)
-    inputs = eqx.filter((arrays, q0, p0), eqx.is_inexact_array)
-    result = eqx.combine(nan_if_used(smooth, inputs), others)
+    call = functools.partial(lanewise.call, forward, layout=layout)
+    result = nan_where_used(call, arrays, q0, p0)
     if adds_start_outside(plan):
         return result._replace(rows=with_start(result.rows, q0, p0))
     return result

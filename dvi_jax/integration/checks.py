@@ -25,10 +25,11 @@ from .integrator import Integrator
 from .task import Plan, Task
 
 
-def check_observe(task: Task, q0: Array, p0: Array) -> int:
+def check_observe(task: Task, q0: Array, p0: Array) -> tuple[int, int]:
     """**Raises** `TypeError` or `ValueError` for observables that are not functions of a step with
-    an array as value. **Returns** the bytes of those without a reduction, at one save point."""
-    size = 0
+    an array as value. **Returns** the bytes of those without a reduction, at one save point, and of
+    the reductions."""
+    at_save, of_reductions = 0, 0
     if task.stop is not None:
         output_of("g(t, q, p, args) of Stop", task.stop.g, task.t0, q0, p0, task.args)
     for leaf in jax.tree.leaves(task.observe, is_leaf=is_observable):
@@ -56,9 +57,12 @@ def check_observe(task: Task, q0: Array, p0: Array) -> int:
                 f"dvi.Range requires real values, but {name!r} returns complex ones: observe their "
                 "real or imaginary part, or absolute value."
             )
-        if not isinstance(leaf, Reduction):
-            size += int(np.prod(np.shape(value), dtype=int)) * jnp.result_type(value).itemsize
-    return size
+        size = int(np.prod(np.shape(value), dtype=int)) * jnp.result_type(value).itemsize
+        if isinstance(leaf, Reduction):  # a Section has a row for each crossing
+            of_reductions += size * getattr(leaf, "capacity", 1)
+        else:
+            at_save += size
+    return at_save, of_reductions
 
 
 def _check_deviations(leaf: Deviations, task: Task, q0: Array) -> None:
@@ -124,31 +128,38 @@ and their cotangents."""
 
 
 def check_memory(
-    save: Save, plan: Plan, q0: Array, observed_bytes: int, leaves: list[Any], integrator: Any
+    save: Save, plan: Plan, q0: Array, observed: tuple[int, int], leaves: list[Any], integrator: Any
 ) -> None:
-    """**Raises** `ValueError` for a run that no memory can hold; `observed_bytes`: those of
-    observables at a save point."""
-    memory = results_memory()
+    """**Raises** `ValueError` for a run that no memory can hold; `observed`: the bytes of
+    observables at a save point, and of reductions."""
+    memory, (at_save, of_reductions) = results_memory(), observed
     num_states = plan.num_blocks + 1 + plan.save_tail if save.ts is None else save.ts.shape[0]
-    row = (2 * q0.size + 2) * q0.dtype.itemsize + observed_bytes  # q, p, t and h
+    row = (2 * q0.size + 2) * q0.dtype.itemsize + at_save  # q, p, t and h
     lanes, is_compiled, is_differentiated = batch_size(leaves)
-    size = lanes * num_states * row
-    needed = _COPIES[is_differentiated] * size
-    # Reverse mode through the scan stores values of each step, among them the states before it.
+    size = lanes * (num_states * row + of_reductions)
+    # Reverse mode through the scan stores values of each step, among them the states before it;
+    # `Reversible` stores some states between save points.
     is_stored = is_differentiated and isinstance(integrator.adjoint, Direct)
-    if is_stored:
-        needed += 2 * lanes * plan.num_steps * 2 * q0.size * q0.dtype.itemsize
+    every = 1 if is_stored else getattr(integrator.adjoint, "checkpoint_every", plan.num_steps + 1)
+    num_stored = plan.num_blocks * ((plan.block - (not is_stored)) // every) + plan.tail // every
+    num_stored *= is_differentiated
+    needed = _COPIES[is_differentiated] * size
+    needed += 2 * lanes * num_stored * 2 * q0.size * q0.dtype.itemsize
     if memory is None or needed <= memory:
         return
     # XLA does not compute results that the function around this one does not use.
     if is_compiled and (integrator.layout.form == "arrays" or not generates()) and not is_stored:
         return
+    is_reduced = of_reductions > num_states * row
+    remedy = "adjoint=dvi.Reversible()" if is_stored else "a larger checkpoint_every"
+    remedy = "a smaller max_crossings, or smaller values in reductions" if is_reduced else remedy
+    remedy = f"Take {remedy}. " * (is_stored or is_reduced or num_stored > num_states)
     batch = f" of each of {lanes} trajectories" if lanes > 1 else ""
     other = ", run fewer trajectories at once, or use dvi.sweep(store=...)" if lanes > 1 else ""
     raise ValueError(
         f"the results need {size / 2**30:.3g} GiB of memory ({num_states} saved "
-        f"state{'s' * (num_states > 1)}{batch}), and the run "
+        f"state{'s' * (num_states > 1)}{' and reductions' * is_reduced}{batch}), and the run "
         f"{'with its derivative ' * is_differentiated}{needed / 2**30:.3g} GiB, but only "
-        f"{memory / 2**30:.3g} GiB are available. {'Take adjoint=dvi.Reversible(). ' * is_stored}"
+        f"{memory / 2**30:.3g} GiB are available. {remedy}"
         f"Save fewer states with save=dvi.Save(every=m), final=True or ts=times{other}."
     )

@@ -1,6 +1,7 @@
 """The trajectory between the points of its time grid: crossings, requested times, end points."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -15,7 +16,7 @@ from lanewise import Layout
 from ..base.results import RESULTS, first_of
 from ..base.types import Interval, Scalar, State
 from ..engine.bracket import bracketed_root
-from ..engine.guard import constant_unless, nan_if_used
+from ..engine.guard import constant_unless, nan_where_used
 from ..engine.rounding import each, one_by_one
 from ..methods import Method
 from ..methods.step import Equations
@@ -215,10 +216,8 @@ def guarded(
         return one_by_one(function, constants, *row, layout=layout)
 
     def guarded_value(exists, *row):
-        result = constant_unless(exists, value, *row, succeeds=succeeds)
-        smooth, others = eqx.partition(result, eqx.is_inexact_array)
-        inputs = eqx.filter((constants, row), eqx.is_inexact_array)
-        return eqx.combine(nan_if_used(smooth, inputs), others)
+        constant = functools.partial(constant_unless, exists, value, succeeds=succeeds)
+        return nan_where_used(constant, *row)
 
     return guarded_value
 

@@ -151,9 +151,9 @@ def integrate(
         check(q0, p0, args)
     if observe is not None:
         observe = of_steps(observe)
-    if system.slow_time:
-        refuse_slow_time(observe, stop, save.clock)
     grid = integrator.lattice
+    if system.slow_time:
+        refuse_slow_time(observe, stop, save.clock, getattr(grid, "speed", None))
     # The h of a problem does not count where the times are given.
     h = default_h if type(grid).takes_h else h
     t0, h, num_steps = steps_of(grid, t0, h, num_steps, t1, duration)

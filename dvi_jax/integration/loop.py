@@ -220,8 +220,7 @@ def _memories(
 
 def _value(task: Task, good: Array, reduction: Reduction, ends: Ends) -> Array:
     """The value of an observable, a constant where it is not finite or the state is not `good`."""
-    value = functools.partial(task.number, reduction)
-    return task.constant_unless(good & all_finite(value(ends)), value)(ends)
+    return task.constant_unless(good, functools.partial(task.number, reduction), all_finite)(ends)
 
 
 def number_of(reduction: Reduction, k: Int[Array, ""]) -> Int[Array, ""]:
@@ -310,8 +309,7 @@ def run(
             state = or_nan(end.result == RESULTS.successful, (carry.q, carry.p))
             carry = end._replace(method_state=state)
             ends = Ends(*ends[:2], start.q, start.p, end.q, end.p)
-        good = carry.result == RESULTS.successful
-        observed = task.constant_unless(good, task.at_save)(carry, ends)
+        observed = task.at_save(carry, ends)
         return carry, Rows(interval.t1, interval.h, carry.q, carry.p, observed, inner)
 
     carry, rows = loop(steps, carry, None, plan.num_blocks)

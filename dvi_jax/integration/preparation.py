@@ -14,11 +14,13 @@ from lanewise.jaxprs.jaxapi import is_traced
 
 from ..base.keywords import user_level
 from ..base.reads import reads
+from ..base.signature import output_of
 from ..base.types import Interval, State
 from ..lattices import Lattice, Run
 from ..methods import Method, warn_of_dissipation
 from ..methods.constraint import check_start
 from ..methods.step import Equations
+from ..observe import Deviations, Running, is_observable
 from ..observe.solution import Solution
 from ..problem.noise import BrownianPath
 from ..problem.system import System
@@ -71,6 +73,9 @@ def prepare(
     # Before anything is compiled: an error in a function of the user would otherwise come from
     # within many frames of tracing.
     System.check_shapes(run.system, run.t0, run.q0, run.p0, run.epsilon, run.args)
+    if (constraint := run.system.constraint) is not None:
+        components = jax.eval_shape(constraint, run.q0, run.args).size
+        run = run._replace(observe=_on_manifold(run.observe, 2 * (run.q0.size - components)))
     lattice, layout = integrator.lattice, integrator.layout
     noise = noise_path(run, path, integrator, method, h, num_steps)
     # The same run in the variables of the lattice, such as a fictitious time.
@@ -87,6 +92,8 @@ def prepare(
     # Traced values are not known before the compiled program runs: they give a status.
     if not has_tracer:
         _check_start(task, q0, p0)
+    if run.save.clock is not None:
+        output_of("the clock of Save", run.save.clock, run.t0, run.q0, run.p0, run.args)
     if run.save.ts is not None:
         # The run itself saves nothing at these times: it stores the steps that contain them, and
         # `as_solution` evaluates the method between their ends.
@@ -96,6 +103,18 @@ def prepare(
     vars(task)["reads"] = reads(task, run.observe, integrator.adjoint)
     adjoint, observe = integrator.adjoint, image.observe
     return PreparedRun(run, task, plan, q0, p0, observe, undo, adjoint, layout, has_tracer)
+
+
+def _on_manifold(observe: PyTree, dimension: int) -> PyTree:
+    """The observables of a system with a constraint, whose states are a manifold."""
+
+    # Deviation vectors across the constraint are removed by the first step.
+    def convert(leaf: Any) -> Any:
+        if isinstance(leaf, Running):
+            return Running(convert(leaf.reduction))
+        return leaf.on_manifold(dimension) if isinstance(leaf, Deviations) else leaf
+
+    return jax.tree.map(convert, observe, is_leaf=is_observable)
 
 
 def _check_start(task: Task, q0: State, p0: State) -> None:

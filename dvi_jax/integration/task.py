@@ -75,18 +75,20 @@ class Task(eqx.Module):
     def at_save(self, carry: "Carry", ends: "Ends | None") -> list[Any]:
         """The values of functions without a reduction and the running values of reductions, in tree
         order, at a save point after a step with these ends."""
-        # A running value is NaN after a failure: the reduction still has that of the steps before.
+        good = carry.result == RESULTS.successful
         memories, values = iter(carry.reductions), []
         for leaf in self._leaves():
             if isinstance(leaf, Running):
-                value = self.finish(leaf.reduction, next(memories))
-                values.append(or_nan(carry.result == RESULTS.successful, value))
+                # NaN after a failure: the reduction still has the value of the steps before.
+                finish = functools.partial(self.finish, leaf.reduction)
+                value = self.constant_unless(good, finish)(next(memories))
+                values.append(or_nan(good, value))
             elif isinstance(leaf, Reduction):
                 next(memories)
             else:
                 assert ends is not None
-                value = functools.partial(ends.value, self.bound(leaf), self.args)
-                values.append(self.constant_unless(all_finite(value()), value)())
+                value = functools.partial(Ends.value, observable=self.bound(leaf), args=self.args)
+                values.append(self.constant_unless(good, value, all_finite)(ends))
         return values
 
     def evaluate(self, reduction: Reduction, function: Callable, *args: Any) -> Any:

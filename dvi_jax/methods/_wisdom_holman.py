@@ -1,5 +1,6 @@
 """Splittings of N bodies around Kepler orbits: the method of Wisdom and Holman."""
 
+import warnings
 from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 import equinox as eqx
@@ -11,6 +12,7 @@ from jaxtyping import Array
 from lanewise.jaxprs.dependence import depends_on
 
 from ..base.checks import array, one_of, whole
+from ..base.keywords import user_level
 from ..base.types import Args, Interval, State
 from ..engine.newton import find_root
 from ..problem import kepler as _kepler
@@ -19,6 +21,9 @@ from ._schemes import ORDERS_OF_CORRECTORS, as_scheme, check_scheme, corrector, 
 from ._splitting import PartFlow, SplittingMethod, Stage
 from ._strang import Strang
 from .step import Equations, judge, no_solve, no_step_yet
+
+_FEWEST = 10
+"""Evaluations of the interaction in a revolution, below which a run warns."""
 
 Coordinates = Literal["jacobi", "democratic"]
 
@@ -119,6 +124,10 @@ class WisdomHolman(SplittingMethod):
     close to another body than the first are not resolved: use `KahanLi` or `AdaptiveReversible` for
     close encounters.
 
+    A run whose h and initial state are known **warns** if the interaction is evaluated less than
+    ten times in the shortest period, or in a circle with the angular velocity of a pericentre: such
+    steps have resonances with the orbits.
+
     **Raises** `ValueError` for another corrector or other coordinates and, in a run, for positions
     of another shape, a system that is not T(p) + V(q), and a T of another form.
 
@@ -164,6 +173,35 @@ class WisdomHolman(SplittingMethod):
                 f"dvi.WisdomHolman requires the dominant body first, but body {masses.argmax()} "
                 f"has the mass {masses.max():g} and body 0 only {masses[0]:g}."
             )
+        self._check_steps(equations, interval, q, p)
+
+    def _check_steps(self, equations, interval, q, p):
+        """Warn of too few evaluations of the interaction in a revolution, or at a pericentre."""
+        frame = self._frame(equations, interval, q)
+        position, momentum = equations.absolute(q, p)
+        X = np.asarray(frame.from_bodies(position), float)[1:]
+        V = np.asarray(frame.velocities_of(momentum / frame.masses[:, None]), float)[1:]
+        mu = np.asarray(self._strength(equations, q) * frame.central_mass(), float)
+        # From known numbers, once before a run: nothing of this is compiled.
+        r2, v2, rv = (X * X).sum(axis=1), (V * V).sum(axis=1), (X * V).sum(axis=1)
+        momentum = np.sqrt(np.maximum(r2 * v2 - rv * rv, 0))
+        with np.errstate(all="ignore"):
+            a = 1 / (2 / np.sqrt(r2) - v2 / mu)
+            e = np.sqrt(np.maximum(1 - momentum**2 / (mu * a), 0))
+            # Of a full circle at the angular velocity of the pericentre.
+            times = 2 * np.pi * np.array([np.sqrt(a**3 / mu), (a * (1 - e)) ** 2 / momentum])
+        times = np.where(np.isfinite(times), times, np.inf)  # none for an orbit that is not bound
+        i, stages = int(times.min(axis=0).argmin()), len(self.substeps())
+        steps = times[:, i] / abs(float(interval.h))
+        if steps.min() * stages < _FEWEST:
+            largest = times[:, i].min() * stages / _FEWEST
+            warnings.warn(
+                f"h = {float(interval.h):g} is too long for dvi.WisdomHolman: the orbit of body "
+                f"{i + 1} has the period {times[0, i]:.4g}, which are {steps[0]:.2g} steps, or "
+                f"{steps[1]:.2g} at the angular velocity of its pericentre. At least {_FEWEST} are "
+                f"necessary: |h| ≤ {largest:.2g}, or a scheme with more stages.",
+                stacklevel=user_level(),
+            )
 
     def _frame(self, equations: Equations, interval: Interval, q: State) -> Any:
         array("q0 of dvi.WisdomHolman", q, ("bodies", 2), ("bodies", 3))
@@ -183,10 +221,13 @@ class WisdomHolman(SplittingMethod):
             )
         return _COORDINATES[self.coordinates](1 / inverse_mass(q)[:, 0])
 
+    def _strength(self, equations: Equations, q: State) -> Any:
+        """The gravitational constant."""
+        return value_of(_gravity if self.G is None else self.G, equations.args, q)
+
     def parts(self, equations, interval, q):
         frame = self._frame(equations, interval, q)
-        G = value_of(_gravity if self.G is None else self.G, equations.args, q)
-        mu = G * frame.central_mass()
+        mu = self._strength(equations, q) * frame.central_mass()
         # With an origin states are relative to it, in these coordinates too: they are linear.
         zero = jnp.zeros_like(q)
         position, momentum = equations.absolute(zero, zero)

@@ -217,7 +217,7 @@ def project(
         _require_independent(defects)
         raise ValueError(
             "no state with g = 0 was found near the one given, where g is "
-            f"{np.asarray(defects.g)!s:.80}."
+            f"{np.asarray(defects.g)!s:.80}: give one that fulfils g = 0 more closely."
         )
     return projection
 

@@ -45,12 +45,12 @@ def no_step_yet(like: State) -> StepInfo:
 
 @printable
 class Equations(eqx.Module):
-    """The discrete equations of a system for one ε and one set of args.
+    """The equations (12)–(13) of one step of a system, for one ε and one set of args.
 
-    `newton` is the solver of their implicit part. With an `origin` positions and momenta are
-    relative to it; `increments` are those of the noise in one step, shape (parts of the step, m).
-    With a `quantum` an explicit step changes the state by integer multiples of it,
-    and a rate has the same bits in every evaluation.
+    `newton` solves their implicit part. If there is an `origin`, positions and momenta are relative
+    to it. `increments` are the increments of the noise in the step, shape (parts of the step, m).
+    If there is a `quantum`, an explicit step changes the state by integer multiples of it.
+    A rate has then the same bits in every evaluation.
     """
 
     system: System | Any  # or what has its functions, such as a system with the noise of a step

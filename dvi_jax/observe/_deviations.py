@@ -1,6 +1,7 @@
 """Deviation vectors: small displacements of the start, mapped by the derivative of the steps."""
 
 import abc
+import dataclasses
 import math
 from typing import Any, ClassVar, NamedTuple
 
@@ -19,6 +20,9 @@ from ._reductions import Reduction
 
 _UNROLL_UP_TO = 12
 """Vectors up to which the Gram–Schmidt process is unrolled: a loop compiles faster for many."""
+
+
+_ON_MANIFOLD = "With a constraint no more deviation vectors are independent."
 
 
 class Pushed(NamedTuple):
@@ -49,6 +53,12 @@ class Deviations(Reduction):
     @abc.abstractmethod
     def vectors(self, memory: Any) -> Array:
         """The vectors before the next step, shape (count, 2N)."""
+
+    def on_manifold(self, dimension: int) -> "Deviations":
+        """The reduction for the states of a system with a constraint, a manifold of this dimension.
+
+        **Raises** `ValueError` for more vectors than are independent there."""
+        return self
 
     @abc.abstractmethod
     def update(self, memory: Any, k: Array, t: Scalar, value: Any) -> Any:
@@ -162,7 +172,8 @@ class LyapunovSpectrum(_FrameIndicator):
 
     **Arguments**
 
-    - `count`: number of exponents; None: all 2N. The cost grows with it.
+    - `count`: number of exponents; None: all, 2N of N coordinates, and 2(N − m) with a constraint
+      of m components, on which further ones have no meaning. The cost grows with it.
     - `seed`: of the first frame, which is random.
     - `scale`: (of q, of p): units of deviations, numbers or arrays like q; the limit is the same.
 
@@ -176,6 +187,12 @@ class LyapunovSpectrum(_FrameIndicator):
     def __check_init__(self):
         if self.count is not None:
             whole("count of LyapunovSpectrum", self.count)
+
+    def on_manifold(self, dimension):
+        if self.count is None:
+            return dataclasses.replace(self, count=dimension)
+        whole("count of LyapunovSpectrum", self.count, high=dimension, hint=_ON_MANIFOLD)
+        return self
 
     def start(self, value):
         frame = self._first_frame(value, self.count)
@@ -271,6 +288,10 @@ class GALI(_FrameIndicator):
 
     def __check_init__(self):
         whole("k of GALI", self.k, 2, hint="It is the number of deviation vectors.")
+
+    def on_manifold(self, dimension):
+        whole("k of GALI", self.k, 2, dimension, hint=_ON_MANIFOLD)
+        return self
 
     def start(self, value):
         frame = self._first_frame(value, self.k)

@@ -11,6 +11,7 @@ import numpy as np
 from ..base.files import publish_npz, read_npz
 from ..base.precision import refuse_double_without_x64
 from ..base.results import RESULTS, status_code
+from ..base.tables import Table
 from ._stop import Stopped
 
 _FORMAT = 1
@@ -53,7 +54,7 @@ def _pack(name: str, tree: Any, arrays: dict[str, np.ndarray]) -> Any:
     """A pytree in terms of JSON, in which names stand for the arrays."""
     if tree is None or type(tree) in (bool, int, float):
         return tree
-    if type(tree) is dict and all(isinstance(key, str) for key in tree):
+    if type(tree) in (dict, Table) and all(isinstance(key, str) for key in tree):
         return {"dict": {key: _pack(f"{name}.{key}", x, arrays) for key, x in tree.items()}}
     if type(tree) in (list, tuple):
         parts = [_pack(f"{name}.{i}", x, arrays) for i, x in enumerate(tree)]

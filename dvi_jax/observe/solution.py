@@ -71,7 +71,7 @@ class Save(eqx.Module):
             whole("every in Save(every=...)", self.every)
         if self.ts is None:
             if self.clock is not None:
-                raise ValueError("clock of Save requires ts, its values.")
+                raise ValueError("clock of Save requires ts, its values at which states are saved.")
             return
         only_one(ts=self.ts, every=self.every, final=self.final or None)
         if not is_traced(self.ts):

@@ -121,7 +121,7 @@ def drift_orders(
     axis, new = canvas(ax, (6.4, 4.8))
     left = 0.7 * min(order.epsilons.min() for order in results.values())
     looks = zip(results.items(), slopes, itertools.cycle(COLOURS), itertools.cycle(MARKERS))
-    outliers, total, has_excluded = np.zeros(2, int), 0, False
+    outliers, total, has_excluded, has_guide = np.zeros(2, int), 0, False, False
     for (label, order), slope, colour, marker in looks:
         x, y, in_fit = order.epsilons, np.asarray(order.drifts), order.used
         out = np.isfinite(y) & (y > 0) & ~in_fit
@@ -137,13 +137,14 @@ def drift_orders(
         if slope is not None and in_fit.any():
             first = np.argmin(np.where(in_fit, x, np.inf))
             draw.guide(axis, (x[first], x.max()), y[first], slope, zorder=1)
+            has_guide = True
         outliers += draw.without_place(axis, np.append(x, left), np.append(y, order.floor), colour)
         total += len(y) + 1
     draw.log_x(axis)
     axis.set(yscale="log", xlabel=_EPSILON, ylabel="largest drift", title=title)
     marks: Any = {"color": "#444444", "ls": "none"}
     hollow = marks | {"marker": "o", "mfc": "white"}
-    extra = [entry("expected slope", **draw.GUIDE)] if expected is not None else []
+    extra = [entry("expected slope", **draw.GUIDE)] if has_guide else []
     extra += [entry("excluded from the fit", **hollow)] if has_excluded else []
     extra.append(entry("at ε = 0", **marks | _BAR))
     extra += draw.without_place_entries(outliers, total, "drifts failed", "drifts are exactly 0")

@@ -23,8 +23,8 @@ class Implicit(eqx.Module):
     **Arguments**
 
     - `energy`: E, function ``(t, q, p, y, args)`` → scalar [energy].
-    - `relation`: R, function of the same arguments → array like y, zero at the y wanted, with a
-      regular ∂R/∂y there.
+    - `relation`: R, function of the same arguments → array like y, which is zero at the
+      solution y. ∂R/∂y must be regular there.
     - `guess`: function ``(q, p)`` or ``(t, q, p, args)`` → y of shape (k,), near that root.
     - `root_finder`: of the inner solve, where there is one.
 

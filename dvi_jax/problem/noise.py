@@ -16,7 +16,7 @@ from lanewise.jaxprs.dependence import depends_on
 from lanewise.jaxprs.jaxapi import is_traced, threefry2x32
 
 from ..base.checks import array, whole
-from ..base.signature import warn_of_exchanged, with_time
+from ..base.signature import output_of, warn_of_exchanged, with_time
 from ..base.types import Args, Interval, Scalar, State
 from .flows import value_of
 
@@ -58,7 +58,7 @@ class MomentumNoise(Noise):
 
     def count(self, t, q, p, args):
         # Traced only: at the start σ may be singular.
-        sigma = jax.eval_shape(self.sigma, t, q, p, args)
+        sigma = output_of(f"noise{_NAMES}", self.sigma, t, q, p, args)
         shapes = q.shape, (*q.shape, "m")
         array(f"noise{_NAMES}", sigma, *shapes, verb="return", integers=True, empty=True)
         return q.size if sigma.shape == q.shape else sigma.shape[-1]
@@ -246,6 +246,8 @@ class Brownian(BrownianPath):
 
     def __check_init__(self):
         whole("substeps", self.substeps)
+        if isinstance(self.key, str | float):  # other kinds may be axes, or traced
+            _words(self.key)
 
     def check(self, num_steps):
         first = jnp.asarray(self.first_step)

@@ -10,9 +10,10 @@ import jax.numpy as jnp
 
 from ..base.checks import array, finite, instance, require
 from ..base.indices import out_of_bounds
+from ..base.keywords import tracing_note
 from ..base.machine import refuse_fork
 from ..base.reads import Reads, differences, reads
-from ..base.signature import accepts, array_type, check_takes, tracing_note, warn_of_exchanged
+from ..base.signature import accepts, array_type, check_takes, warn_of_exchanged
 from ..base.types import Args, ConstraintFn, ForceFn, HamiltonianFn, Scalar, State
 from .discretise import refuse_step_from_times
 from .noise import Noise, as_noise
@@ -127,7 +128,10 @@ class System(eqx.Module):
         names += ["a perturbation"] * (self.perturbation is not None)
         names += ["slow_time=True"] * self.slow_time
         if names:
-            raise ValueError(f"epsilon=... must be given for a system with {' and '.join(names)}.")
+            raise ValueError(
+                f"epsilon=... must be given for a system with {' and '.join(names)}: it is the "
+                "factor of the perturbation. epsilon=0.0 is the unperturbed motion."
+            )
         return 0.0
 
     def hamiltonian(

@@ -16,7 +16,7 @@ import numpy as np
 
 import lanewise.elementary
 
-from ..base.signature import accepts, check_takes
+from ..base.signature import accepts, check_takes, output_of
 from ..base.types import Interval
 from ..discover.invariants.discovery import Discovery
 from ..discover.invariants.series import InvariantSeries
@@ -52,6 +52,8 @@ class Region:
         ends += [(self.h, self.h), (-1e-9, 1e-9)]
         if inside is None:
             return random_points(ends)
+        state = jax.ShapeDtypeStruct(self.shape, jnp.float64)
+        output_of("inside(q, p)", inside, state, state)
         return random_points(ends, lambda q, p, *_: jnp.all(jnp.asarray(inside(q, p)) >= 0))
 
 
@@ -253,11 +255,9 @@ def _program(
     the function at points. The rounding of invariants is not part of a proof: it has no `way`."""
     shapes = [column.shape[1:] for column in points]
     structs = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes]
-    result = jax.eval_shape(function, *structs)
-    if ndim is not None and getattr(result, "ndim", None) != ndim:
-        kind = f"a {type(result).__name__}"
-        description = f"shape {result.shape}" if hasattr(result, "shape") else kind
-        raise ValueError(f"{subject} must return one number, got {description}.")
+    # Not of the step: `System` has checked its functions.
+    if ndim is not None and len(shape := output_of(subject, function, *structs).shape) != ndim:
+        raise ValueError(f"{subject} must return one number, got shape {shape}.")
     try:
         program = program_of(function, *shapes, way=way, points=points)
     except NotAnalytic as error:

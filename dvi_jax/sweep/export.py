@@ -47,8 +47,12 @@ def to_netcdf(dataset: Any, boxes: Iterator[dict[str, slice]], path: Any, force:
             for name, variable in dataset.variables.items():
                 is_text = variable.dtype.kind == "U"
                 dtype = h5py.string_dtype() if is_text else variable.dtype
+                attributes = dict(variable.attrs)
+                if variable.dtype.kind == "b":
+                    # NetCDF has no booleans: xarray knows them by this attribute.
+                    dtype, attributes["dtype"] = np.dtype("int8"), "bool"
                 array = file.create_variable(name, variable.dims, dtype)
-                array.attrs.update(variable.attrs)
+                array.attrs.update(attributes)
                 if name in dataset.coords:
                     array[...] = variable.values.astype(object) if is_text else variable.values
                 elif auxiliary:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..base.results import STATUS_NAMES
+from ..base.tables import Table, unknown_name
 from .layout import STATUS, about_variable
 from .store import MemorySink, Store, StoreError, Verification
 
@@ -21,7 +22,8 @@ class SweepResult:
     - ``result["energy_drift"]``: one variable as a NumPy array.
     - `to_xarray()`: all of it with labels.
 
-    Entries that have not been computed are NaN (−1 in whole numbers) and have the status −1.
+    Entries that have not been computed are NaN (−1 in whole numbers, False in booleans) and have
+    the status −1.
     """
 
     def __init__(self, source: MemorySink | Store, coordinates: Mapping[str, Any], attributes: Any):
@@ -32,7 +34,7 @@ class SweepResult:
     @property
     def dims(self) -> dict[str, int]:
         """Name of each dimension → its length."""
-        return dict(self._plan.dims)
+        return Table(self._plan.dims)
 
     @property
     def path(self) -> Path | None:
@@ -58,8 +60,7 @@ class SweepResult:
         if name in self._coordinates:
             return self._coordinates[name][1]
         if name not in self._source.variables:
-            names = ", ".join((*self._source.variables, *self._coordinates))
-            raise KeyError(f"the sweep has no variable {name!r}: use one of {names}.")
+            raise unknown_name(name, (*self._source.variables, *self._coordinates))
         if isinstance(self._source, MemorySink):
             return self._source.arrays[name]
         return self.to_xarray()[name].values

@@ -37,7 +37,7 @@ class Variable:
         dtype = np.dtype(self.dtype)
         if dtype.kind == "u":
             return int(np.iinfo(dtype).max)
-        return np.nan if dtype.kind in "fc" else -1
+        return {"f": np.nan, "c": np.nan, "b": False}.get(dtype.kind, -1)
 
 
 def variables(sweep: Sweep, shapes: Mapping[str, Any]) -> dict[str, Variable]:
@@ -60,6 +60,10 @@ def variables(sweep: Sweep, shapes: Mapping[str, Any]) -> dict[str, Variable]:
     save = sweep.options["save"]
     rows = "save" if save is not None and save.ts is not None else "saved_step"
     first = {name: rows for name, f in observables if not isinstance(f, Reduction)}
+    # Functions of a state have a row for the initial state, those of a step have none.
+    lengths = {name: shapes[name].shape[0] for name in first}
+    if len({*lengths.values()}) > 1:
+        first |= {name: "save" for name, n in lengths.items() if n == max(lengths.values())}
     first |= dict.fromkeys("tqp", "save")
     arrays = {}
     for name, array in shapes.items():
@@ -72,8 +76,7 @@ def variables(sweep: Sweep, shapes: Mapping[str, Any]) -> dict[str, Variable]:
             raise TypeError(
                 f"{name!r} must have a dtype of NumPy, got {dtype}: convert it by .astype(float)."
             )
-        kind = "int8" if dtype.kind == "b" else dtype.name
-        arrays[name] = Variable(kind, array.shape, tuple(dims))
+        arrays[name] = Variable(dtype.name, array.shape, tuple(dims))
     return arrays
 
 

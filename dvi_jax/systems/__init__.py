@@ -4,6 +4,7 @@ Each is a function without obligatory arguments that returns a `Problem`. Its en
 gives the name in run files; `tests/test_library.py` tests every entry.
 """
 
+from ..base.tables import Table as _Table
 from . import boozer as boozer, rigid as rigid
 from ._problem import (
     Adiabatic as Adiabatic,
@@ -55,8 +56,8 @@ from .two_centres import two_centres as two_centres
 from .uniform_field import uniform_field as uniform_field
 from .van_der_pol import van_der_pol as van_der_pol
 
-LIBRARY = {
-    function.__name__: function
+LIBRARY = _Table(
+    (function.__name__, function)
     for function in (
         *(oscillator, duffing, double_well, van_der_pol, slow_oscillator),
         *(pendulum, perturbed_pendulum, lorentz_pendulum, double_pendulum),
@@ -68,5 +69,5 @@ LIBRARY = {
         *(spherical_pendulum, chain, slider_crank, dumbbell),
         *(rigid_body, spinning_top, heavy_top, satellite, polar_motion, lotka_volterra),
     )
-}
+)
 """Name → function that makes the `Problem`."""

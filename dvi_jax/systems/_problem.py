@@ -14,6 +14,7 @@ from lanewise.jaxprs.jaxapi import is_traced
 
 from ..base.checks import all_finite, array, finite as finite, positive as positive
 from ..base.printing import first_lines
+from ..base.tables import Table
 from ..discover.functions.generators import Generator
 from ..discover.symmetries.library import time_translation
 from ..observe import AtEnd, InSlowTime as InSlowTime, OfState
@@ -119,6 +120,9 @@ class Problem:
             if isinstance(value, list | tuple):
                 array = np.asarray(value, jnp.result_type(float))
                 object.__setattr__(self, name, array)
+        tables = ("observables", "units", "parameters", "adiabatic", "symmetries")
+        for name in (*tables, "flow_symmetries"):
+            object.__setattr__(self, name, Table(getattr(self, name)))
         args = self.args if isinstance(self.args, Mapping) else {}
         for field_name, names, kind in (
             ("invariants", self.observables, "observables"),

@@ -20,6 +20,15 @@ from jaxtyping import Array
 
 from lanewise.jaxprs.jaxapi import is_traced
 
+from ..base.checks import array
+
+_BODY = (3, 3), (4, 3)
+
+
+def _checked(name: str, value: Any, *shapes: tuple[int, ...]) -> Array:
+    hint = "For many bodies use jax.vmap."
+    return array(name, jnp.asarray(value), *shapes, integers=True, hint=hint)
+
 
 def orthonormal(q: Array, args: Any = None) -> Array:
     """The constraint RᵀR = 1 of the first three rows of q: its six different components."""
@@ -33,8 +42,9 @@ def second_moments(I: Any) -> Array:  # noqa: E741
     **Raises** `ValueError` for a moment that is larger than the sum of the two others, which no
     body has; if it is traced, the result is NaN.
     """
-    d = jnp.sum(jnp.asarray(I)) / 2 - jnp.asarray(I)
-    smallest = max(1e-8, 8 * float(jnp.finfo(d.dtype).eps)) * jnp.sum(jnp.asarray(I))
+    I = _checked("I", I, (3,))  # noqa: E741
+    d = jnp.sum(I) / 2 - I
+    smallest = max(1e-8, 8 * float(jnp.finfo(d.dtype).eps)) * jnp.sum(I)
     is_impossible = ~(d >= -smallest)
     if not is_traced(d) and is_impossible.any():
         raise ValueError(
@@ -48,12 +58,12 @@ def second_moments(I: Any) -> Array:  # noqa: E741
 
 def rotational_energy(P: Array, I: Any) -> Array:  # noqa: E741
     """tr(P D⁻¹ Pᵀ)/2, the energy of rotation with P = (dR/dt) D."""
-    return jnp.sum(P[:3] ** 2 / second_moments(I)[None]) / 2
+    return jnp.sum(_checked("P", P, *_BODY)[:3] ** 2 / second_moments(I)[None]) / 2
 
 
 def body_momentum(R: Array, P: Array) -> Array:
     """Angular momentum π on the body's axes, shape (3,): π̂ = RᵀP − PᵀR; on fixed axes it is R π."""
-    turning = R[:3].T @ P[:3]
+    turning = _checked("R", R, *_BODY)[:3].T @ _checked("P", P, *_BODY)[:3]
     return jnp.stack([turning[k - 1, k - 2] - turning[k - 2, k - 1] for k in range(3)])
 
 
@@ -61,13 +71,18 @@ def momentum(R: Array, pi: Any, I: Any) -> Array:  # noqa: E741
     """P = R Ω̂ D of a body with angular momentum π = I Ω on its axes."""
     d, I = second_moments(I), jnp.asarray(I)  # noqa: E741
     thickness = d - (jnp.sum(I) / 2 - I)  # zero unless the body is flat
-    x, y, z = jnp.asarray(pi) / (I + jnp.sum(thickness) - thickness)
+    x, y, z = _checked("pi", pi, (3,)) / (I + jnp.sum(thickness) - thickness)
     spin = jnp.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return R @ spin * d[None]
+    return _checked("R", R, (3, 3)) @ spin * d[None]
 
 
 def rotation(phi: Any, theta: Any, psi: Any) -> Array:
     """R = R_z(φ) R_x(θ) R_z(ψ) of Euler's angles [rad]."""
+
+    phi, theta, psi = (
+        _checked(f"{name} of a rotation", angle, ())
+        for name, angle in (("phi", phi), ("theta", theta), ("psi", psi))
+    )
 
     def about_z(angle):
         c, s = jnp.cos(angle), jnp.sin(angle)
@@ -79,14 +94,21 @@ def rotation(phi: Any, theta: Any, psi: Any) -> Array:
 
 def euler_angles(R: Array) -> Array:
     """Euler's angles (φ, θ, ψ) [rad] of a rotation matrix; φ and ψ jump where θ is 0 or π."""
+    R = _checked("R", R, *_BODY)
     sine = jnp.sqrt(R[2, 0] ** 2 + R[2, 1] ** 2)
     phi, psi = jnp.arctan2(R[0, 2], -R[1, 2]), jnp.arctan2(R[2, 0], R[2, 1])
     return jnp.stack([phi, jnp.arctan2(sine, R[2, 2]), psi])
 
 
-@partial(jnp.vectorize, signature="(n,n)->(m)")
 def quaternion(R: Array) -> Array:
     """The unit quaternion (w, x, y, z), w ≥ 0, of rotation matrices of shape (…, 3, 3)."""
+    if jnp.shape(R)[-2:] != (3, 3):
+        raise ValueError(f"R must have the shape (…, 3, 3), got {jnp.shape(R)}.")
+    return _quaternion(R)
+
+
+@partial(jnp.vectorize, signature="(n,n)->(m)")
+def _quaternion(R: Array) -> Array:
     (a, b, c), (d, e, f), (g, h, i) = R
     K = jnp.array([  # 4 u uᵀ of the quaternion u
         [1 + a + e + i, h - f, c - g, d - b],

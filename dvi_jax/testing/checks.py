@@ -272,8 +272,8 @@ def check_batch(candidate: Candidate) -> Measured:
 
 @check("failure", "Return the status of every solve in `info`, and never replace NaN by a number.")
 def check_failure(candidate: Candidate) -> Measured:
-    """The same as vmap, with one trajectory that overflows. It must have the status of a failure
-    and be NaN, and the others must agree to 1e-12 with those computed alone."""
+    """A batch as in the check vmap, in which one trajectory overflows. It must have a failure
+    status and be NaN, and the others must agree to 1e-12 with those computed alone."""
     xs, bad = _batch(candidate), 1
     xs[bad] |= {"q0": jnp.full_like(xs[bad]["q0"], 1e200)}
     batch, good = candidate.batch(_stack(xs))

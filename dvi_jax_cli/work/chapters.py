@@ -65,7 +65,7 @@ def _in_words(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.8g}"
     if isinstance(value, dict):
-        return ", ".join(f"{name} = {_in_words(x)}" for name, x in value.items())
+        return f"{{{', '.join(f'{name} = {_in_words(x)}' for name, x in value.items())}}}"
     if isinstance(value, list):
         return f"[{', '.join(map(_in_words, value))}]"
     return str(value)
@@ -226,8 +226,7 @@ def saved_fit_chapter(path: Path) -> Chapter:
     chapter = Chapter("saved fit", path.name, "", "open")
     _add_fit(chapter, result, None)
     missing = sum(int(np.isnan(x).sum()) for x in result.observed)
-    start = dict.fromkeys(result.names, np.nan)
-    parameters = {name: {"start": x} for name, x in start.items()}
+    parameters = {name: {"start": np.nan} for name in result.names}
     contents = {"parameters": parameters, "residuals": result.statistics(), "missing": missing}
     chapter.tables = fit_tables(result, contents)
     chapter.remarks = ["The file has the result of the fit, but not the call that computed it."]
@@ -392,8 +391,9 @@ def sweep_chapter(folder: Path) -> Chapter:
 
 
 def _rest(array: Any) -> list[str]:
-    """Dimensions after the first two: a map has no place for them."""
-    return [str(dim) for dim in array.dims[2:]]
+    """Components, and dimensions after the first two: a map has no place for them."""
+    dims = [*map(str, array.dims)]
+    return [dim for dim in dims if dim in dims[2:] or dim.startswith("component")]
 
 
 def _failures(result: dvi.SweepResult, data: Any) -> list[str]:
@@ -424,19 +424,18 @@ def _label(entry: Any, dim: str, index: int) -> str:
 
 
 def _add_maps(chapter: Chapter, data: Any) -> None:
-    """Maps of the observables; what is left out is said in a note."""
+    """Maps of the observables and last states; what is left out is said in a note."""
+    if "save" in data.dims:
+        data = data.isel(save=-1).drop_vars("t")
     names = [str(n) for n in data.data_vars if str(n) not in ("status", "failed_step", "residual")]
     names = [n for n in names if data[n].dtype.kind in "biuf"]
     large = [n for n in names if data[n].size > _MAX_NUMBERS]
     drawn = [n for n in names if n not in large][:_MAPS]
     for name in drawn:
-        options = {
-            "over": _rest(data[name]),
-            "status": data["status"] if data[name].ndim <= 2 else None,
-        }
+        status = data["status"] if data[name].ndim <= 2 else None
+        options = {"over": _rest(data[name]), "status": status}
         label = with_unit(name.replace("_", " "), data[name].attrs.get("units"))
         chapter.pictures[f"Map of {label}"] = _drawing(plot.sweep_map, data[name], **options)
     if excess := [n for n in names if n not in drawn]:
-        chapter.notes.append(
-            f"Not drawn, because they are too many or too large: {', '.join(excess)}."
-        )
+        text = f"Not drawn, because they are too many or too large: {', '.join(excess)}."
+        chapter.notes.append(text)

@@ -10,7 +10,7 @@ import numpy as np
 
 import dvi_jax as dvi
 from dvi_jax import plot
-from dvi_jax.fit.result import numbers_in_words, remarks
+from dvi_jax.fit.result import contradiction, numbers_in_words, remarks, verdict
 from dvi_jax.fit.run import progress_display as shown_bar
 
 from .._errors import InputError, in_toml, one_of, require, require_name, user_path
@@ -29,6 +29,8 @@ RESULT_FILES = ("fit.npz", "fit.json", "trajectory.npz", CHECKPOINT, *_IMAGES)
 
 _MAX_STATES = 20_000
 """Steps up to which every state of the fitted trajectory is written."""
+_LARGEST = 10.0
+"""Reduced chi² above which a fit whose residuals contradict sigma counts as failed."""
 _CORNER = 8
 """Parameters up to which pairs are drawn: the first ones."""
 _MATRIX = 8
@@ -85,7 +87,7 @@ def fit_file(
     steps = f"{report.contents['steps']} steps"
     report.tables, report.notes = fit_tables(result, report.contents), fit_notes(result)
     seconds = f"{result.seconds:.1f} s (compilation included)"
-    report.summary = f"{result.status} after {steps}, {seconds}"
+    report.summary = f"{verdict(result)} after {steps}, {seconds}"
     if result.status != "converged":
         report.message = (
             f"the fit did not converge ({result.status} after {steps}). "
@@ -93,6 +95,11 @@ def fit_file(
         )
     elif status != "successful":
         report.message = f"the fitted trajectory fails ({status}). The results have been written."
+    elif result.reduced_chi2 > _LARGEST and contradiction(result):
+        report.message = (
+            "the fitted model does not describe the data: reduced chi² is "
+            f"{result.reduced_chi2:.4g}. The results have been written."
+        )
     return report
 
 
@@ -247,6 +254,7 @@ def _contents(arguments: dict[str, Any], result: dvi.FitResult) -> dict[str, Any
     return {
         "status": result.status,
         "message": str(dvi.FIT_RESULTS[result.result]),
+        "remarks": [in_toml(words) for words in remarks(result)],
         "parameters": {
             name: {"value": x, "error": s, "start": a}
             for name, x, s, a in zip(result.names, result.x, result.sigma, start, strict=True)
@@ -291,14 +299,14 @@ def _correlation_table(names: list[str], matrix: np.ndarray) -> TextTable:
         strongest = sorted(pairs, key=lambda ij: -np.nan_to_num(abs(matrix[ij]), nan=-1))[:10]
         rows = [[names[i], names[j], f"{matrix[i, j]:.3f}"] for i, j in strongest]
         return TextTable("Strongest correlations", ["of", "and", "value"], rows)
-    rows = [[name, *(f"{x:.2f}" for x in matrix[i, :i])] for i, name in enumerate(names)]
+    rows = [[name, *(f"{x:z.2f}" for x in matrix[i, :i])] for i, name in enumerate(names)]
     return TextTable("Correlations", ["", *names[:-1]], rows[1:])
 
 
 def fit_notes(result: dvi.FitResult) -> list[str]:
     """What a reader must know before using the numbers."""
     notes = [f"not determined by the data: {words}" for words in result.undetermined]
-    notes += [words[0].upper() + words[1:] for words in remarks(result)]
+    notes += [words[0].upper() + words[1:] for words in map(in_toml, remarks(result))]
     if result.at_bounds:
         at_bounds = ", ".join(result.at_bounds)
         notes.append(f"at their bounds, where an error is not symmetric: {at_bounds}")

@@ -65,9 +65,9 @@ def in_one_line(error: BaseException, *files: Path) -> str:
     frames = [p for p in places if Path(p.filename) in files]
     where = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
     text = str(error)
-    if isinstance(
-        error, jax.errors.ConcretizationTypeError | jax.errors.TracerArrayConversionError
-    ):
+    if any("args is None" in note for note in getattr(error, "__notes__", ())):
+        text += ": if it is args that is None, write a table [args]"
+    if isinstance(error, jax.errors.JAXTypeError | jax.errors.JAXIndexError):
         text = (
             "the arguments of a function are placeholders while it is compiled; write it with "
             "jax.numpy in place of math and numpy, jnp.where in place of if"

@@ -67,11 +67,9 @@ def page(title: str, chapters: Sequence[Chapter]) -> bytes:
     html = Element("html", {"lang": "en"})
     head, body = SubElement(html, "head"), SubElement(html, "body")
     SubElement(head, "meta", {"charset": "utf-8"})
-    viewport = "width=device-width, initial-scale=1"
-    SubElement(head, "meta", {"name": "viewport", "content": viewport})
+    SubElement(head, "meta", {"name": "viewport", "content": "width=device-width, initial-scale=1"})
     _add(head, "title", f"{title}: report of dvi-jax")
-    style = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
-    SubElement(head, "style").text = style
+    SubElement(head, "style").text = Path(__file__).with_name("page.css").read_text("utf-8")
     main = SubElement(body, "main")
     budget = _PICTURES // max(1, sum(len(chapter.pictures) for chapter in chapters))
     for chapter in chapters:
@@ -179,22 +177,25 @@ def _add_table(parent: Element, table: TextTable) -> None:
 def _add_picture(parent: Element, description: str, source: Any, budget: int) -> None:
     figure = SubElement(parent, "figure")
     try:
-        content, kind = _image(source, budget)
+        content, kind, inches = _image(source, budget)
     except (TypeError, ValueError) as error:  # results that have no such picture
         _add(figure, "figcaption", f"{description} cannot be drawn: {error}")
         return
+    figure.set("style", f"--inches: {inches:.3g}")
+    if inches >= 8:
+        figure.set("class", "large")
     data = f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
     _add(figure, "img", src=data, alt=description)
     _add(figure, "figcaption", description)
 
 
-def _image(source: Callable[[], Any] | bytes, budget: int) -> tuple[bytes, str]:
-    """A picture and its type, in at most `budget` bytes: lines (SVG) if they are few, else points
-    (PNG), as fine as there is space for. **Raises** `ValueError` where it is too large."""
+def _image(source: Callable[[], Any] | bytes, budget: int) -> tuple[bytes, str, float]:
+    """A picture, its type and its width in inches, in `budget` bytes: lines (SVG) if they are few,
+    else points (PNG), as fine as there is space for. **Raises** `ValueError` if it is too large."""
     if isinstance(source, bytes):
         if len(source) > budget:
             raise ValueError(f"{len(source) / 1e6:.2g} MB do not fit into the page")
-        return source, "png"
+        return source, "png", float(mpl.rcParamsDefault["figure.figsize"][0])
     settings: Any = {"svg.hashsalt": "dvi-jax", "svg.fonttype": "path"}
     with plot.style(), mpl.rc_context(settings):
         drawn = source()
@@ -205,7 +206,7 @@ def _image(source: Callable[[], Any] | bytes, budget: int) -> tuple[bytes, str]:
                 options: Any = {"metadata": {"Date": None}} if kind != "png" else {}
                 figure.savefig(content, format=kind[:3], dpi=dpi, **options)
                 if content.tell() <= min(limit, budget):
-                    return content.getvalue(), kind
+                    return content.getvalue(), kind, float(figure.get_figwidth())
         finally:
             plot.plt.close(figure)
     raise ValueError("there are too many pictures for one page")

@@ -1,5 +1,6 @@
 """The system of a TOML file, its parameters and state, and the times of the steps."""
 
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,7 +16,15 @@ from dvi_jax.base.signature import accepts
 from dvi_jax.systems import rings
 from dvi_jax.systems.planets.solar_system import EphemerisMissing, julian_date
 
-from .._errors import InputError, as_input_error, describe, require, require_name, user_path
+from .._errors import (
+    InputError,
+    as_input_error,
+    describe,
+    in_toml,
+    require,
+    require_name,
+    user_path,
+)
 from .expressions import parse_method
 from .loader import Loader, in_one_line
 from .schema import COUNT, RunFile, SweepFile, SystemFile, Times
@@ -66,7 +75,7 @@ class Source:
 
     def error_line(self, error: BaseException) -> str:
         """An exception in one line, with its place in the user's files."""
-        return in_one_line(error, *self.loader.modules)
+        return in_toml(in_one_line(error, *self.loader.modules))
 
     @cached_property
     def args(self) -> Any:
@@ -127,8 +136,17 @@ class Source:
     def epsilon(self) -> Any:
         """The strength of the perturbation in the file, or else of the system."""
         rule = "a number: the system has a force or a perturbation (0.0: unperturbed)"
+        value = getattr(self.file, "epsilon", None)
         with as_input_error("epsilon", rule, ValueError, text=lambda _: NO_KEY):
-            return self.system.strength(getattr(self.file, "epsilon", None))
+            strength = self.system.strength(value)
+        is_left_out = value is None and hasattr(self.file, "epsilon") and strength == 0
+        if is_left_out and self.system.depends_on_epsilon:
+            warnings.warn(
+                f"the key epsilon is missing, so the motion is that of {self.name} without its "
+                "force, perturbation or slow time: write epsilon = 0.0 for this motion.",
+                stacklevel=2,
+            )
+        return strength
 
 
 def find_source(file: SystemFile, folder: Path) -> Source:

@@ -187,7 +187,9 @@ def _sweep(system, invariant, starts, epsilons, h, num_steps, run) -> Drifts:
     drifts, last, result = arrays
     if drifts.ndim != 1:
         shape = drifts.shape[1:]
-        raise ValueError(f"invariant must return a scalar, got an array of shape {shape}.")
+        raise ValueError(
+            f"invariant must return a scalar, got an array of shape {shape}: take one component."
+        )
     drifts = np.asarray(drifts, float)
     # An odd observable may end near zero: its drift shows how large it was.
     sizes = np.abs(np.asarray(last, float)[:, -1]) + drifts

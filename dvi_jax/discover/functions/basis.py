@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ...base.checks import function, instance
+from ...base.checks import array, function, instance
+from ...base.signature import output_of
 from ...base.types import Scalar, State
 
 Function = Callable[..., Any]
@@ -219,21 +220,9 @@ def _takes(function: Callable[..., Any], count: int) -> bool:
 def _require_real_scalar(name, function, with_time: bool, shape) -> None:
     """Reject a function whose value is not a real scalar, by tracing it once."""
     state, time = (jax.ShapeDtypeStruct(s, jnp.result_type(float)) for s in (shape, ()))
-    try:
-        out = eqx.filter_eval_shape(function, state, state, *([time] if with_time else []))
-    except Exception as error:
-        error.add_note(f"(in the basis function {name!r}, called with q of shape {shape})")
-        raise
-    kind, dtype = np.shape(out), getattr(out, "dtype", type(out))
-    real = np.issubdtype(dtype, np.floating) or np.issubdtype(dtype, np.integer)
-    if out is None or kind != () or not real:
-        description = f"a value of type {type(out).__name__}"
-        if hasattr(out, "dtype"):
-            description = f"an array of shape {kind}, type {dtype}"
-        raise ValueError(
-            f"the basis function {name!r} must return a real scalar, such as jnp.sum(q**2); for q "
-            f"of shape {shape} it returned {description}."
-        )
+    subject, hint = f"the basis function {name!r}", "It must be a real scalar, as jnp.sum(q**2)."
+    out = output_of(subject, function, state, state, *[time] * with_time, hint=hint)
+    array(subject, out, (), verb="return", integers=True, hint=hint)
 
 
 class _Values(eqx.Module):

@@ -1,4 +1,4 @@
-"""Infinitesimal generators at a lattice point, and their prolongation."""
+"""Infinitesimal generators at a grid point, and their prolongation."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple, TypeVar
@@ -24,7 +24,7 @@ class LatticePoint(NamedTuple):
 
 
 class Generator(eqx.Module):
-    r"""A generator X = ξ0 ∂/∂t + ξ·∂/∂q + η·∂/∂p at a lattice point.
+    r"""A generator X = ξ0 ∂/∂t + ξ·∂/∂q + η·∂/∂p at a grid point.
 
     - `xi0`: ξ0, function ``(q, p)`` or ``(t, q, p, args)`` → scalar [time].
     - `xi`: ξ, function of the same → array like q. `eta`: η → array like p.

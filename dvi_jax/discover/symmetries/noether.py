@@ -18,7 +18,7 @@ Gauge = Callable[..., Any]  # ``G(q, p)`` or ``G(t, q, p, args)`` → scalar [ac
 
 
 def gauge_value(gauge: Gauge, point: Sequence[Any], args: Args) -> Scalar:
-    """A gauge at a lattice point."""
+    """A gauge at a grid point."""
     return with_time("a gauge", gauge)(*point, args)
 
 

@@ -169,9 +169,10 @@ def multipole(
     """A straight magnet with the field Σ (b_n + i a_n)(x + i y)^n = (B_y + i B_x)/(Bρ).
 
     **Arguments** `b`, `a`: from n = 0 (dipole) [1/m^{n+1}]; MAD-X's k_n is n! b_n. Length zero: b
-    and a are integrated over the length. `options`: ``slices=10``; ``scheme=4``, the order 2, 4 or
-    6 of the composition in each slice; ``model="paraxial"`` or "exact"; ``fringe=False``, whether
-    it has the hard edges of the quadrupole, or those of all multipoles if exact.
+    and a are integrated over the length. A negative length gives the inverse map, as in pyAT.
+    `options`: ``slices=10``; ``scheme=4``, the order 2, 4 or 6 of the composition in each slice;
+    ``model="paraxial"`` or "exact"; ``fringe=False``, whether it has the hard edges of the
+    quadrupole, or those of all multipoles if exact.
     """
     order, values = _field(name, b, a)
     slices, scheme, fringe, model = _slicing(**options)
@@ -224,9 +225,12 @@ def bend(
     out both: its field is b_n x^n/(1 + hx), which changes chromaticities by terms of the order
     h b_1.
 
-    **Raises** `ValueError` for a length that is not positive.
+    **Raises** `ValueError` for a length that is not positive, or an angle above 2π.
     """
     length = length if is_traced(length) else positive("length of a bend", length)
+    if not is_traced(angle):
+        hint = "The unit is rad: a degree is 0.01745."
+        in_range("angle of a bend", angle, -2 * math.pi, 2 * math.pi, hint)
     order, values = _field(name, b, a)
     values |= {"length": length, "h": strength("angle", angle) / length}
     settings: dict[str, Any] = {**options}
@@ -287,12 +291,16 @@ def cavity(
 ) -> Element:
     """A cavity between two half drifts: δ changes by −V sin(2π f (−ζ − lag)/c − phase).
 
-    **Arguments** `voltage`: V over the energy. `frequency`: f [Hz]. `lag` [m]. `phase` [rad].
-    `slip`: change of phase per turn [rad], 2π (f T − number of periods) for a frequency that is not
-    a multiple of 1/T.
+    **Arguments** `voltage`: V over the energy. `frequency`: f [Hz], positive; 0 only with V = 0.
+    `lag` [m]. `phase` [rad]. `slip`: change of phase per turn [rad], 2π (f T − number of periods)
+    for a frequency that is not a multiple of 1/T.
     """
     if not is_traced(voltage):
         in_range("voltage of a cavity", voltage, -1.0, 1.0, "It is that over the energy.")
+    if not is_traced(frequency):
+        # Files give 0 for cavities that are off.
+        is_off = not is_traced(voltage) and voltage == 0
+        positive("frequency of a cavity", frequency, zero=is_off, hint="The unit is Hz.")
     values = {"length": length, "voltage": voltage, "lag": lag, "phase": phase, "slip": slip}
     values["wave_number"] = 2 * math.pi * frequency / C
     half = RingPart("half_drift")
