@@ -95,7 +95,7 @@ def test_arrays_that_are_read_later_keep_their_memory():
 
 def test_an_array_that_is_read_where_it_is_made_is_not_written():
     def function(x):
-        square = jnp.sin(x) * x  # dear and used twice
+        square = jnp.sin(x) * x  # many operations, and used twice
         return square + jnp.cos(square)
 
     block, _ = program(function, (N,))

@@ -1,5 +1,6 @@
-"""Functions with long arrays as loops over elements: the lanes of a vector are neighbours in an
-array.
+"""Functions with long arrays as loops over elements.
+
+The lanes of a vector are neighbours in an array.
 
 `equations` makes a tree of statements (`tree`) from a jaxpr, with arrays as `boxes`; `schedule`
 joins statements into loops, `places` decides which arrays share memory, and `nests` and `code`

@@ -77,6 +77,7 @@ class Expression:
 
     def moved(self, index_map: IndexMap) -> "Expression":
         """The expression at the index ``index_map(j)``, as a function of j."""
+        # Programs move the same expressions again and again: a chain its neighbours.
         key = (self.serial, index_map)
         if key not in self.table.moves:
             self.table.moves[key] = self._moved(index_map)
@@ -87,6 +88,7 @@ class Expression:
             return self
         args = tuple(arg.moved(index_map) for arg in self.args)
         strides, offset = self.strides, self.offset
+        # strides · (rows · j + offsets) + offset, sorted by j.
         if self.kind != "operation":
             rows, offsets = index_map.rows, index_map.offsets
             columns = range(index_map.rank)
@@ -130,8 +132,9 @@ class Table:
         key: Any = None,
     ) -> Expression:
         # An operation's parameters are part of its name; other values have a key or are objects.
-        which = key if key is not None else None if kind == "operation" else id(value)
-        full = (kind, dtype, tuple(a.serial for a in args), name, strides, offset, which)
+        # An operation's parameters are part of its name; other values have a key or are objects.
+        identity = key if key is not None else None if kind == "operation" else id(value)
+        full = (kind, dtype, tuple(a.serial for a in args), name, strides, offset, identity)
         old = self._expressions.get(full)
         if old is not None:
             return old
@@ -222,6 +225,7 @@ class Array:
             low, high, is_empty = [0] * rank, list(map(int, shape)), False
             axes = zip(index_map.rows, index_map.offsets, lower, upper, strict=True)
             for row, offset, first, end in axes:
+                # The part of the box that the new axis runs through.
                 uses = [(k, s) for k, s in enumerate(row) if s]
                 if not uses:
                     is_empty |= not first <= offset < end
@@ -232,6 +236,7 @@ class Array:
                 else:
                     start, stop = -((end - 1 - offset) // -s), (offset - first) // -s + 1
                 low[k], high[k] = max(low[k], start), min(high[k], stop)
+            # A box without elements is left out.
             if not is_empty and all(p < q for p, q in zip(low, high, strict=True)):
                 boxes.append(Box(tuple(low), tuple(high), expression.moved(index_map)))
         return Array(self.table, shape, self.dtype, boxes)
@@ -259,21 +264,23 @@ class Array:
 
 def common_boxes(arrays: Sequence[Array]) -> list[tuple[tuple, tuple, tuple[Expression, ...]]]:
     """The boxes in which every one of some arrays of one shape has one expression."""
+    # Each array cuts the boxes further.
     cells: list[Any] = [(lower, upper, (node,)) for lower, upper, node in arrays[0].boxes]
     for array in arrays[1:]:
-        refined = []
+        new_cells = []
         for lower, upper, nodes in cells:
             for first, end, node in array.boxes:
                 low, high = tuple(map(max, lower, first)), tuple(map(min, upper, end))
                 if all(p < q for p, q in zip(low, high, strict=True)):
-                    refined.append((low, high, (*nodes, node)))
-        cells = refined
+                    new_cells.append((low, high, (*nodes, node)))
+        cells = new_cells
     return cells
 
 
 def joined(boxes: Iterable[Box], rank: int) -> list[Box]:
     """The same array with fewer boxes: neighbours with one expression become one."""
     boxes = list(boxes)
+    # Otherwise each shift would double the boxes, and with them the code.
     for axis in range(rank) if len(boxes) > 1 else ():
         rows: dict[Any, list[Box]] = {}
         for box in sorted(boxes, key=lambda box: box.lower):
@@ -303,6 +310,7 @@ def elementwise(name: str, params: dict, args: Sequence[Array], shape, dtype) ->
 def repeat(x: Array, shape: Sequence[int], dimensions: Sequence[int] | None = None) -> Array:
     """`broadcast_in_dim`; without `dimensions` the axes are the first ones."""
     dimensions = range(len(x.shape)) if dimensions is None else dimensions
+    # An axis of length 1 has one index, for all indices of the new axis.
     axes = [k if n == shape[k] else None for n, k in zip(x.shape, dimensions, strict=True)]
     return x.along(shape, axes)
 
@@ -409,14 +417,14 @@ def _pad(x: Array, fill: Array, *, padding_config) -> Array:
     (node,) = (box.expression for box in fill.boxes)
     boxes = _shifted(x, start, shape)
     sides = zip(start, x.shape, shape, strict=True)
-    inside = [(min(max(s, 0), m), max(min(s + n, m), 0)) for s, n, m in sides]
-    if any(p >= q for p, q in inside):
+    interior = [(min(max(s, 0), m), max(min(s + n, m), 0)) for s, n, m in sides]
+    if any(p >= q for p, q in interior):
         return Array.uniform(node, shape)
     for axis, end in enumerate(shape):
         # Outside of x along this axis, and inside along those before it.
-        front, back = inside[:axis], [(0, n) for n in shape[axis + 1 :]]
-        for side in ((0, inside[axis][0]), (inside[axis][1], end)):
-            edges = [*front, side, *back]
+        front, tail = interior[:axis], [(0, n) for n in shape[axis + 1 :]]
+        for side in ((0, interior[axis][0]), (interior[axis][1], end)):
+            edges = [*front, side, *tail]
             if all(p < q for p, q in edges):
                 boxes.append(Box(tuple(p for p, _ in edges), tuple(q for _, q in edges), node))
     return Array(x.table, shape, x.dtype, joined(boxes, len(shape)))

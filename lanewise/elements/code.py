@@ -26,14 +26,17 @@ class Kernel:
         for v in (*jaxpr.invars, *jaxpr.outvars):
             check_type(v.aval.dtype, "arguments and results")
         translation = Translation()
-        inputs = [_outside(v.aval) for v in jaxpr.invars]
-        results = [_outside(v.aval) for v in jaxpr.outvars]
+        inputs = [_argument(v.aval) for v in jaxpr.invars]
+        results = [_argument(v.aval) for v in jaxpr.outvars]
+        # Results are written where XLA wants them as soon as they are computed.
         arrays = [memory.load(translation.table) for memory in inputs]
         outs = translation.evaluate(function, arrays, [memory.place for memory in results])
         for x, memory in zip(outs, results, strict=True):
             if x.size:
                 translation.store(x, memory.place)
         program = translation.block
+        # The whole tree exists before a line is written: only then is it known what is read
+        # later.
         schedule(program)
         dead = dead_memories(program)
         at, self.scratch = places(program, dead)
@@ -43,9 +46,11 @@ class Kernel:
         bases = self._pointers("%args", "a", len(inputs) + len(self.operands))
         ends = self._pointers("%rets", "r", len(results))
         constants = [memory for memory, _ in translation.operands]
+        # Constants follow the operands of the program.
         self.nests.pointers |= dict(zip(constants, bases[len(inputs) :], strict=True))
 
         def trajectory(i: str) -> None:
+            # One trajectory: its arrays lie one after the other.
             lane = self.b.new(f"add i64 %first, {i}")
             for memory, base, has_lanes in zip(inputs, bases, lane_flags, strict=False):
                 self.nests.pointers[memory] = self._lane(base, memory, lane) if has_lanes else base
@@ -84,6 +89,7 @@ class Kernel:
     def loop(self, loop: Loop) -> None:
         b, nests = self.b, self.nests
         carried = [number for number, _, _ in loop.numbers]
+        # Computed before the loop, in the order of the carry.
         start = self.numbers([first for _, first, _ in loop.numbers])
         end = "" if loop.length is None else self.module.parameter(loop.length).names[0]
 
@@ -102,6 +108,7 @@ class Kernel:
         def body(state: list[Num], counter: str) -> list[Num]:
             self.block(loop.body)
             after = self.numbers([after for _, _, after in loop.numbers])
+            # Where they share bytes nothing is copied.
             for now, new in loop.memories:
                 self.copy(new, now)
             return after
@@ -117,8 +124,11 @@ class Kernel:
             return
         size = source.size * np.dtype(source.dtype).itemsize
         self.b.declare("void @llvm.memcpy.p0.p0.i64(ptr, ptr, i64, i1)")
-        to, of = nests.pointer(target), nests.pointer(source)
-        self.b.emit(f"call void @llvm.memcpy.p0.p0.i64(ptr {to}, ptr {of}, i64 {size}, i1 false)")
+        target_pointer, source_pointer = nests.pointer(target), nests.pointer(source)
+        self.b.emit(
+            f"call void @llvm.memcpy.p0.p0.i64(ptr {target_pointer}, ptr {source_pointer}, "
+            f"i64 {size}, i1 false)"
+        )
 
     def branch(self, branch: Branch) -> None:
         (index,) = self.numbers([branch.index])
@@ -132,7 +142,8 @@ class Kernel:
             if i == len(branch.blocks) - 1:
                 return run(i)
             b = self.b
-            # The index is cut: all that is less than 1 is the first block.
+            # The index is cut: all that is less than 1 is the first block. Blocks in their order;
+            # the last one is taken for all that is larger.
             takes = b.compare("le", index, b.const(i, index.dtype))
             if takes.value is not None:
                 return run(i) if takes.value else from_block(i + 1)
@@ -166,6 +177,7 @@ class Kernel:
                 "  %aligned = and i64 %up, -64",
                 "  %scratch = inttoptr i64 %aligned to ptr",
             ]
+            # Not from the stack: that of a thread of XLA's pool may be small.
             epilogue.append("  call void @free(ptr %memory)")
         body = "\n".join([*prologue, *self.nests.head, *b.lines, *epilogue, "  ret void"])
         declarations = "\n".join(sorted(module.declarations | b.declarations))
@@ -177,6 +189,6 @@ class Kernel:
         return "\n".join(["\n".join(module.globals), declarations, functions, front, body, "}\n"])
 
 
-def _outside(aval: Any) -> Memory:
+def _argument(aval: Any) -> Memory:
     """An operand or a result: its pointer is known when the code runs."""
     return Memory(aval.shape, aval.dtype, row_major(aval.shape), pointer="outside")

@@ -26,7 +26,7 @@ from .boxes import (
 )
 from .tree import Block, Let, Memory, Number, Place, Statement, Store
 
-DEAR = 16
+EXPENSIVE = 16
 """An expression of so many operations that is used twice is written to memory."""
 
 _LONG = 64  # parts of so many elements are written to their place in a longer array at once
@@ -67,6 +67,7 @@ class Translation:
         bits = np.ascontiguousarray(array).reshape(-1, 1).view(np.uint8)
         if (bits == bits[0]).all():
             return Array.uniform(self.table.known(array.flat[0], array.dtype), array.shape)
+        # Operands of the call, not text: LLVM takes long to parse text of many numbers.
         key = str(array.dtype), array.shape, array.tobytes()
         if key not in self._constants:
             memory = Memory(array.shape, array.dtype, row_major(array.shape), pointer="")
@@ -119,14 +120,16 @@ class Translation:
         assert node is not None
         if node.kind in ("known", "number"):
             return x
+        # Its memory may change later: a number in a register does not.
         number = Number(x.dtype)
         self.add(Let(number, node))
         return Array.uniform(self.number(number), ())
 
-    def settled(self, x: Array) -> Array:
+    def settle(self, x: Array) -> Array:
         """The array computed here, if reading it would take operations."""
         if not x.size:
             return x
+        # A few numbers go to registers.
         if x.is_written_out:
             return self.each_component(x, self.let)
         nodes = [box.expression for box in x.boxes]
@@ -176,6 +179,7 @@ class Translation:
                 body = eqn.params["program"].trace.all_inputs
             elif name in CALLS:
                 (body,) = bodies(eqn)
+            # Of its four functions only the solution is computed.
             elif name == "custom_linear_solve":
                 lengths, body = eqn.params["const_lengths"], eqn.params["jaxprs"].solve
                 start = lengths.matvec + lengths.vecmat
@@ -197,32 +201,35 @@ class Translation:
         equations: list[Any] = []
         constants = [self.constant(c) for c in function.consts]
         outs = self.flat(function.jaxpr, constants, args, equations)
-        # What is needed, and how often.
+        # What is needed, and how often. From the outputs backwards, so that nothing is computed
+        # that nobody reads.
         uses = Counter(out for out in outs if isinstance(out, Token))
         needed = []
         for equation in reversed(equations):
             if any(uses[token] for token in equation[2]):
                 needed.append(equation)
                 uses.update(x for x in equation[1] if isinstance(x, Token))
-        wanted = _wanted(outs, places, needed)
+        destinations = _destinations(outs, places, needed)
         values: dict[Token, Array] = {}
 
         def read(x: Any) -> Array:
             return values[x] if isinstance(x, Token) else x
 
         for eqn, inputs, tokens in reversed(needed):
-            goals = [wanted.get(token) for token in tokens]
+            goals = [destinations.get(token) for token in tokens]
             used = [uses[token] > 0 for token in tokens]
             results = self.equation(eqn, [read(x) for x in inputs], goals, used)
+            # Cheap expressions are computed again wherever they are read: a load would take as
+            # long.
             for token, x in zip(tokens, results, strict=True):
                 if not uses[token]:
                     continue
                 # An output is written anyway.
-                least = 1 if token in outs else DEAR
-                if token in wanted:
-                    x = self.store(x, wanted[token])
-                elif (x.cost >= least and uses[token] > 1) or x.height > _TALLEST:
-                    x = self.settled(x)
+                price = 1 if token in outs else EXPENSIVE
+                if token in destinations:
+                    x = self.store(x, destinations[token])
+                elif (x.cost >= price and uses[token] > 1) or x.height > _TALLEST:
+                    x = self.settle(x)
                 values[token] = x
         return [read(x) for x in outs]
 
@@ -260,27 +267,30 @@ class Translation:
             if params.get("dimensions") is not None:
                 (x,) = self.move("transpose", {"permutation": params["dimensions"]}, [x], None)
             if x.is_written_out and math.prod(shape) <= 512:
+                # A few numbers are only renamed.
                 flat = [part.only for part in x.components()[2].values()]
                 parts = {
                     index: Array.uniform(node, ())
                     for index, node in zip(np.ndindex(*shape), flat, strict=True)
                 }
                 return [self.from_components(parts, shape, range(len(shape)))]
+            # Other axes of the same elements, in the order of memory.
             node = self.in_memory(x, row_major_order=True).expression
             assert node is not None
             other = self.table.expression(
                 "load", x.dtype, (), "", row_major(shape), node.offset, node.value
             )
             return [Array.uniform(other, shape)]
-        return [self._dilated(x, rest[0], params["padding_config"], shape)]
+        return [self._dilate(x, rest[0], params["padding_config"], shape)]
 
-    def _dilated(self, x: Array, fill: Array, padding: Any, shape) -> Array:
+    def _dilate(self, x: Array, fill: Array, padding: Any, shape) -> Array:
         """A pad with gaps between the elements: read at computed indices."""
         index, is_inside = [], None
         for axis, (n, (low, _, gap)) in enumerate(zip(x.shape, padding, strict=True)):
             low, step = int(low), int(gap) + 1
             strides = [int(a == axis) for a in range(len(shape))]
             node = self.table.expression("index", "int64", strides=tuple(strides), offset=-low)
+            # Number of the element, if it falls on one and not on a gap.
             i = Array.uniform(node, shape)
             quotient = self.apply("div", i, self.known(step))
             exact = self.apply("eq", self.apply("mul", quotient, self.known(step)), i, dtype="bool")
@@ -299,6 +309,7 @@ class Translation:
     def picked(self, x: Array, axes: Sequence[int], index: Sequence[Array]) -> Array:
         """The elements of x at computed indices, one array for each of its axes, which must lie
         inside. `axes[k]`: 1 + the axis of x that axis k of the result runs along, 0 for none."""
+        # Elements at any place: they have to be in memory.
         node = self.in_memory(x).expression
         assert node is not None
         total = self.known(0)
@@ -341,14 +352,18 @@ def is_row_major(strides: Sequence[int], shape: Sequence[int]) -> bool:
     return all(n == 1 or s == t for s, t, n in triples)
 
 
-def _wanted(outs: Sequence[Any], places: Sequence[Place | None], needed: Sequence[Any]) -> dict:
+def _destinations(
+    outs: Sequence[Any], places: Sequence[Place | None], needed: Sequence[Any]
+) -> dict:
     """Where results are wanted so that the outputs are in their places without a copy."""
-    wanted: dict[Token, Place] = {}
+    destinations: dict[Token, Place] = {}
     for token, place in zip(outs, places, strict=False):
         if isinstance(token, Token) and place is not None:
-            wanted.setdefault(token, place)
-    for eqn, inputs, tokens in needed if wanted else ():  # from the last one to the first
-        place, name = wanted.get(tokens[0]), eqn.primitive.name
+            destinations.setdefault(token, place)
+    # An array that is joined from parts is written part by part, without a copy: the initial
+    # state and the rows of a run, for example.
+    for eqn, inputs, tokens in needed if destinations else ():  # from the last one to the first
+        place, name = destinations.get(tokens[0]), eqn.primitive.name
         if place is None or not inputs:
             continue
         first = inputs[0]
@@ -357,7 +372,7 @@ def _wanted(outs: Sequence[Any], places: Sequence[Place | None], needed: Sequenc
             axis, start = eqn.params["dimension"], 0
             for x, shape in zip(inputs, shapes, strict=True):
                 if isinstance(x, Token) and math.prod(shape) > _LONG:
-                    wanted.setdefault(x, place.part(shape, start * place.strides[axis]))
+                    destinations.setdefault(x, place.part(shape, start * place.strides[axis]))
                 start += shape[axis]
         elif (
             (
@@ -367,5 +382,5 @@ def _wanted(outs: Sequence[Any], places: Sequence[Place | None], needed: Sequenc
             and is_row_major(place.strides, place.shape)
             and isinstance(first, Token)
         ):
-            wanted.setdefault(first, place.part(shapes[0], 0, row_major(shapes[0])))
-    return wanted
+            destinations.setdefault(first, place.part(shapes[0], 0, row_major(shapes[0])))
+    return destinations

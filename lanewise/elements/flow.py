@@ -27,9 +27,11 @@ class Carry:
             numbers: list[Number] = []
             memory = None
             if not is_moving:
-                self.now.append(translation.settled(x))
+                # Computed before the loop: a round would compute the same again.
+                self.now.append(translation.settle(x))
             elif x.is_written_out:
                 parts = x.components()[2]
+                # A few numbers stay in registers, as `phi` instructions of the loop.
                 numbers = [Number(x.dtype) for _ in parts]
                 self._first += [part.only for part in parts.values()]
                 of = {
@@ -38,6 +40,8 @@ class Carry:
                 }
                 self.now.append(translation.from_components(of, x.shape, range(len(x.shape))))
             else:
+                # The loop owns this memory: its first value is copied, unless `places` finds that
+                # both may have the same bytes.
                 memory = Memory(x.shape, x.dtype)
                 self.now.append(translation.store(x, memory.place))
             self._numbers.append(numbers)
@@ -51,12 +55,14 @@ class Carry:
                 for number, part in zip(numbers, x.components()[2].values(), strict=True):
                     self.loop.numbers.append((number, next(firsts), part.only))
             elif memory is not None and x.expression is not memory.load(x.table).expression:
+                # A memory of its own, so that the old array can still be read while it is
+                # written. Where that is not needed, `places` gives both the same bytes.
                 new = Memory(x.shape, x.dtype)
                 translation.store(x, new.place)
                 self.loop.memories.append((memory, new))
 
 
-class _In:
+class _Within:
     """Statements go to another block for a while."""
 
     def __init__(self, translation: Translation, block: Block):
@@ -88,7 +94,8 @@ def scan(
         outs = translation.evaluate(function, [*consts, *carry, *slices])
         rows = [x.along((1, *x.shape), range(1, 1 + len(x.shape))) for x in outs[num_carry:]]
         return [*outs[:num_carry], *rows]
-    consts = [translation.settled(x) for x in consts]
+    # What all rounds read is computed once.
+    consts = [translation.settle(x) for x in consts]
     loop = Loop(length)
     inputs = function.jaxpr.invars[num_consts : num_consts + num_carry]
     pairs = zip(function.jaxpr.outvars[:num_carry], inputs, strict=True)
@@ -97,14 +104,16 @@ def scan(
     rows = []
     for aval, place, is_used in zip(avals, places[num_carry:], used[num_carry:], strict=True):
         if place is None and is_used:
+            # Row by row, as the results of a run are.
             place = Memory(aval.shape, aval.dtype, row_major(aval.shape)).place
         rows.append(place)
         if place is not None:
             loop.rows.append(place.memory)
-    with _In(translation, loop.body):
+    with _Within(translation, loop.body):
         k = Array.uniform(translation.number(loop.counter), ())
         if reverse:
             k = translation.apply("sub", translation.known(length - 1), k)
+        # Each round reads and writes one row, at an address that depends on the round.
         slices = [_slice_at(translation, x, k) for x in sources]
         places_of_rows = [None if r is None else _row_place(translation, r, k) for r in rows]
         outs = translation.evaluate(
@@ -115,8 +124,8 @@ def scan(
                 translation.store(x, place)
         state.end_round(outs[:num_carry])
     translation.add(loop)
-    unused = translation.known(0)
-    return [*state.now, *(unused if r is None else r.load(table) for r in rows)]
+    zero = translation.known(0)
+    return [*state.now, *(zero if r is None else r.load(table) for r in rows)]
 
 
 def _readable(translation: Translation, x: Array) -> Array:
@@ -155,15 +164,16 @@ def while_loop(
     if test.jaxpr.outvars[0].aval.shape:
         raise NotCompilable("a loop over long arrays with a condition for each element")
     first, second = params["cond_nconsts"], params["body_nconsts"]
-    fixed = [translation.settled(x) for x in args[: first + second]]
+    # What all rounds read is computed once.
+    fixed = [translation.settle(x) for x in args[: first + second]]
     loop = Loop()
     inputs = body.jaxpr.invars[second:]
     moves = [out is not var for out, var in zip(body.jaxpr.outvars, inputs, strict=True)]
     state = Carry(translation, loop, args[first + second :], moves)
-    with _In(translation, loop.test):
+    with _Within(translation, loop.test):
         (goes_on,) = translation.evaluate(test, [*fixed[:first], *state.now])
         loop.condition = goes_on.expression
-    with _In(translation, loop.body):
+    with _Within(translation, loop.body):
         state.end_round(translation.evaluate(body, [*fixed[first:], *state.now]))
     translation.add(loop)
     return state.now
@@ -184,7 +194,8 @@ def cond(
     if index.dtype == "bool":
         node = translation.convert(index, "int32").expression
         assert node is not None
-    operands = [x if x.is_written_out else translation.settled(x) for x in operands]
+    # An expression would be computed in each branch that uses it, and again outside.
+    operands = [x if x.is_written_out else translation.settle(x) for x in operands]
     branch = Branch(node, len(branches))
     avals = [v.aval for v in eqn.outvars]
     like = [Array(table, aval.shape, aval.dtype, []) for aval in avals]
@@ -206,7 +217,7 @@ def cond(
         numbers.append(of)
     expressions: dict[Number, list] = {n: [] for of in numbers for n in of}
     for block, function in zip(branch.blocks, branches, strict=True):
-        with _In(translation, block):
+        with _Within(translation, block):
             outs = translation.evaluate(function, operands)
             for x, result, of, is_used in zip(outs, results, numbers, used, strict=True):
                 if of:

@@ -34,7 +34,7 @@ def unit_vectors(translation: Translation, eqn: Any) -> list[Array]:
     return [translation.convert(translation.apply("eq", i, j, dtype="bool"), dtype)]
 
 
-def _clipped(translation: Translation, x: Array, largest: int) -> Array:
+def _clip_index(translation: Translation, x: Array, largest: int) -> Array:
     x = translation.convert(x, "int64")
     return translation.apply("clamp", translation.known(0), x, translation.known(largest))
 
@@ -43,7 +43,7 @@ def _distance(translation: Translation, starts: Sequence[Array], shape, sizes, s
     """How many elements from the first one a part begins, moved inside of the array."""
     total = translation.known(0)
     for start, n, m, stride in zip(starts, shape, sizes, strides, strict=True):
-        i = _clipped(translation, start, n - m)
+        i = _clip_index(translation, start, n - m)
         total = translation.apply(
             "add", total, translation.apply("mul", i, translation.known(stride))
         )
@@ -53,7 +53,7 @@ def _distance(translation: Translation, starts: Sequence[Array], shape, sizes, s
 def dynamic_slice(translation: Translation, eqn: Any, x: Array, *starts: Array) -> list[Array]:
     sizes = eqn.params["slice_sizes"]
     clipped = [
-        _clipped(translation, start, n - m)
+        _clip_index(translation, start, n - m)
         for start, n, m in zip(starts, x.shape, sizes, strict=True)
     ]
     index = [repeat(start, sizes) for start in clipped]
@@ -63,6 +63,7 @@ def dynamic_slice(translation: Translation, eqn: Any, x: Array, *starts: Array) 
 def dynamic_update_slice(
     translation: Translation, eqn: Any, x: Array, update: Array, *starts: Array
 ) -> list[Array]:
+    # A copy, of which `places` makes nothing if the old array is not read any more.
     memory = Memory(x.shape, x.dtype)
     translation.store(x, memory.place)
     distance = _distance(translation, starts, x.shape, update.shape, memory.strides)
@@ -85,6 +86,7 @@ def _add_update(
 
 def _batch_index(translation: Translation, indices: Array, j: int, batch, shape) -> Array:
     """Component j of the index vectors, along the axes `batch` of an array of a shape."""
+    # The last axis of the indices is that of their components.
     rank = len(indices.shape) - 1
     axes = [batch[k] for k in range(rank)] + [None]
     x = indices.along(shape, axes, [0] * rank + [j])
@@ -116,8 +118,9 @@ def gather(translation: Translation, eqn: Any, x: Array, indices: Array) -> list
         axes[batch[k]] = d + 1
     is_inside = None
     for j, d in enumerate(dims.start_index_map):
+        # XLA moves a part that would reach beyond the end inside.
         start = _batch_index(translation, indices, j, batch, shape)
-        index[d] = _clipped(translation, start, x.shape[d] - sizes[d])
+        index[d] = _clip_index(translation, start, x.shape[d] - sizes[d])
         if "fill" in str(params["mode"]).lower():
             test = translation.apply("eq", index[d], start, dtype="bool")
             is_inside = test if is_inside is None else translation.apply("and", is_inside, test)
@@ -154,13 +157,14 @@ def scatter(
     is_inside = None
     for j, d in enumerate(dims.scatter_dims_to_operand_dims):
         start = _batch_index(translation, indices, j, batch, shape)
-        nearest = _clipped(translation, start, x.shape[d] - sizes[d])
+        nearest = _clip_index(translation, start, x.shape[d] - sizes[d])
         if "clip" not in str(params["mode"]).lower():
             test = translation.apply("eq", nearest, start, dtype="bool")
             is_inside = test if is_inside is None else translation.apply("and", is_inside, test)
         step = translation.apply("mul", nearest, translation.known(memory.strides[d]))
         distance = translation.apply("add", distance, step)
     if is_inside is not None:
+        # JAX drops it, except in the mode that moves it to the nearest place.
         # An update outside of the array goes to no place: −1, after the offset is taken off.
         distance = translation.apply(
             "select_n", is_inside, translation.known(-1), distance, dtype="int64"

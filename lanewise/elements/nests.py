@@ -7,17 +7,16 @@ The lanes of a vector are neighbours along the innermost axis. Numbers are compu
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
 
-import numpy as np
-
 from ..evaluator import Evaluator
 from ..llvm.ir import Num
 from ..llvm.memory import stored_type
-from ..native import machine
 from ..rules.elementwise import ELEMENTWISE
 from ..rules.reductions import neutral
 from .boxes import Array, Expression, common_boxes
 from .schedule import Group, arrays
 from .tree import Let, Memory, Number, Reduce, Statement, Store, Update
+from .updates import write_element, write_update
+from .vectors import first_elements, gather, load, store
 
 PARTIAL_SUMS = 32
 """Element k of a row is added to partial sum k mod 32, whatever the length of a vector is."""
@@ -25,7 +24,7 @@ PARTIAL_SUMS = 32
 _CHEAP = (
     40  # bodies of so many operations are repeated until one vector of each partial sum is done
 )
-_FEW = 4  # columns of fewer elements are computed one by one
+_SHORT_ROW = 4  # columns of fewer elements are computed one by one
 
 
 class Nests:
@@ -41,7 +40,7 @@ class Nests:
         self.loops = self.stores = 0  # innermost loops, and arrays that they write
         self._sums: dict[Reduce, str] = {}
         self._direct: set[Reduce] = set()
-        self._group = Group((), [])
+        self.group_now = Group((), [])
 
     # --- groups ----------------------------------------------------------------------------------
 
@@ -53,8 +52,9 @@ class Nests:
                     self.scalar_statement(s)
             return
         if isinstance(statements[0], Update):
-            self.update(statements[0])
+            write_update(self, statements[0])
             return
+        # The common boxes of all statements, one nest of loops for each.
         of_each = [arrays(s)[-1] for s in statements]
         cells = []
         for lower, upper, nodes in sorted(common_boxes(of_each), key=lambda c: c[:2]):
@@ -63,7 +63,7 @@ class Nests:
                 cells.append((lower, upper, items))
         if not cells:
             return
-        self._group = group
+        self.group_now = group
         with self.scope():
             for s in statements:
                 if isinstance(s, Reduce):
@@ -71,6 +71,7 @@ class Nests:
             for lower, upper, items in cells:
                 with self.scope():
                     self.nest(lower, upper, items, [])
+            # The partial sums run through all boxes: they are joined once.
             for s in statements:
                 if isinstance(s, Reduce) and isinstance(s.result, Number):
                     self.numbers[s.result] = self.total(s)
@@ -90,10 +91,10 @@ class Nests:
         if isinstance(s, Let):
             self.numbers[s.number] = self.b.opaque(x)
         elif isinstance(s, Update):
-            self.update_element(s, self.number(s.distance.boxes[0].expression, []), x, [])
+            write_element(self, s, self.number(s.distance.boxes[0].expression, []), x, [])
         elif isinstance(s, Store):
             if s.memory not in self.dead:
-                self.store(self.address(s.memory, s.strides, s.offset, []), x, 0)
+                store(self.b, self.address(s.memory, s.strides, s.offset, []), x, 0)
             self.b.note(("node", s.target.serial), self.b.opaque(x))
         else:
             raise AssertionError("a reduction without axes")
@@ -101,10 +102,12 @@ class Nests:
     def nest(self, lower, upper, items, index: list[Num]) -> None:
         """Loops over the axes from number len(index) on."""
         b, d, rank = self.b, len(index), len(lower)
+        # What does not depend on the inner loops is computed before them, as scalars.
         with self.scalars():
             self.hoist(items, d, index)
         sums = [s for s, _ in items if isinstance(s, Reduce) and self.first_summed(s) == d > 0]
         for s in sums:
+            # A row of a matrix that is summed over its last axes has sums of its own.
             self.clear(s)
         if d < rank - 1:
             first = b.const(lower[d], "int64")
@@ -120,9 +123,10 @@ class Nests:
                 total = self.total(s)
                 with self.scalars():
                     where = self.address(s.memory, s.strides, s.offset, index)  # pyright: ignore[reportArgumentType]
+                    # A row that consists of several boxes is summed in several parts.
                     if s not in self._direct:
-                        total = self.e.combine(s.op, self.load(where, s.array.dtype, 0), total)
-                    self.store(where, total, 0)
+                        total = self.e.combine(s.op, load(b, where, s.array.dtype, 0), total)
+                    store(b, where, total, 0)
 
     def innermost(self, lower: int, upper: int, items, index: list[Num]) -> None:
         """The loop over the innermost axis, in vectors."""
@@ -133,7 +137,9 @@ class Nests:
         def at(i: Num, step: int, first: int) -> Num:
             return b.add(b.mul(i, b.const(step, "int64")), b.const(lower + first, "int64"))
 
-        if count < _FEW:
+        # Ends of a chain, columns of a field: one by one. Not by the length of a vector, on which
+        # bits must not depend.
+        if count < _SHORT_ROW:
             with self.scalars():
                 for k in range(count):
                     with self.scope():
@@ -142,6 +148,9 @@ class Nests:
         sums = [s for s, _ in items if isinstance(s, Reduce) and self.first_summed(s) is not None]
         cost = sum(node.cost for _, node in items)
         vectors, rest = divmod(count, W)
+        # With sums, a round does one vector of each partial sum, so that the sums stay in
+        # registers, and the latency of an addition does not count. A long body is not repeated:
+        # it would fill the cache of instructions, and its own latency is longer.
         repeats = PARTIAL_SUMS // W if sums and cost < _CHEAP else 1
         rounds = vectors // repeats
         if rounds:
@@ -162,11 +171,11 @@ class Nests:
             with self.scope():
                 start = b.const(lower + v * W, "int64")
                 self.body(items, [*index, start], None, v * W % PARTIAL_SUMS)
+        # The last elements with a mask: number by number they would take as long as all others.
         if rest:
-            bits = ", ".join(f"i1 {'true' if i < rest else 'false'}" for i in range(W))
             with self.scope():
-                start = b.const(lower + vectors * W, "int64")
-                self.body(items, [*index, start], f"<{bits}>", vectors * W % PARTIAL_SUMS)
+                start, mask = b.const(lower + vectors * W, "int64"), first_elements(b, rest)
+                self.body(items, [*index, start], mask, vectors * W % PARTIAL_SUMS)
 
     def body(self, items, index: list[Num], mask: str | None, k: "Num | int") -> None:
         """All statements at one place of the loops; `k`: where a row's partial sum is."""
@@ -177,31 +186,35 @@ class Nests:
             x = self.number(node, index, mask)
             results.append((s, x))
             if isinstance(s, Store):
+                # Later statements read it from the register. What is written is closed off: a
+                # product is not contracted with a sum that reads it, so that bits do not depend
+                # on which statements share loops.
                 b.note(("node", s.target.serial), b.opaque(x))
         for s, x in results:
             if isinstance(s, Store):
                 if s.memory not in self.dead:
                     where = self.address(s.memory, s.strides, s.offset, index)
-                    self.store(where, x, s.strides[-1], mask)
+                    store(b, where, x, s.strides[-1], mask)
                 continue
+            # The innermost axis is kept: each element has a sum in memory.
             if self.first_summed(s) is None:
                 assert s.memory is not None
                 where, stride = self.address(s.memory, s.strides, s.offset, index), s.strides[-1]
-                old = self.load(where, s.array.dtype, stride, mask)
-                self.store(where, self.e.combine(s.op, old, x), stride, mask)
+                old = load(b, where, s.array.dtype, stride, mask)
+                store(b, where, self.e.combine(s.op, old, x), stride, mask)
                 continue
             dtype = s.array.dtype
             where = b.new(
                 f"getelementptr {stored_type(dtype)}, ptr {self._sums[s]}, i64 {self.ref(k)}"
             )
-            old = self.load(where, dtype, 1)
+            old = load(b, where, dtype, 1)
             new = self.e.combine(s.op, old, x)
             if mask is not None:
                 kind, bits = b.type(dtype, True), b.type("bool", True)
                 names = b.ref(new, 0, True), b.ref(old, 0, True)
-                chosen = b.new(f"select {bits} {mask}, {kind} {names[0]}, {kind} {names[1]}")
-                new = b.number([chosen], dtype, True)
-            self.store(where, new, 1)
+                selection = b.new(f"select {bits} {mask}, {kind} {names[0]}, {kind} {names[1]}")
+                new = b.number([selection], dtype, True)
+            store(b, where, new, 1)
 
     def ref(self, k: "Num | int") -> str:
         return str(k) if isinstance(k, int) else self.b.ref(k, 0, False)
@@ -217,7 +230,7 @@ class Nests:
             if node.depth > depth:
                 for arg in node.args:
                     visit(arg)
-            elif node.kind not in ("known", "number") and not self._group.is_handed_on(node):
+            elif node.kind not in ("known", "number") and not self.group_now.is_handed_on(node):
                 self.number(node, index)
 
         for _, node in items:
@@ -239,6 +252,7 @@ class Nests:
             name = f"%sums{len(self._sums)}"
             self.head.append(f"  {name} = alloca [{PARTIAL_SUMS} x {item}], align 64")
             self._sums[s] = name
+        # All axes vanish: one sum for all boxes.
         if isinstance(s.result, Number):
             self.clear(s)
             return
@@ -260,11 +274,11 @@ class Nests:
             [shape[k] for k in kept],
         )
         fill = Store(s.result, [s.strides[k] for k in kept], s.offset, start)
-        group, self._group = self._group, Group(start.shape, [fill])
+        group, self.group_now = self.group_now, Group(start.shape, [fill])
         for lower, upper, node in start.boxes:
             with self.scope():
                 self.nest(lower, upper, [(fill, node)], [])
-        self._group = group
+        self.group_now = group
 
     def clear(self, s: Reduce) -> None:
         """All partial sums of nothing."""
@@ -272,7 +286,7 @@ class Nests:
         x = self.b.const(neutral(s.op, dtype), dtype)
         for k in range(0, PARTIAL_SUMS, self.vector_width):
             where = self.b.new(f"getelementptr {stored_type(dtype)}, ptr {self._sums[s]}, i64 {k}")
-            self.store(where, x, 1)
+            store(self.b, where, x, 1)
 
     def total(self, s: Reduce) -> Num:
         """The partial sums combined by halves: in one order for all lengths of vectors."""
@@ -280,7 +294,7 @@ class Nests:
         item, vectors = stored_type(dtype), []
         for k in range(0, PARTIAL_SUMS, W):
             where = b.new(f"getelementptr {item}, ptr {self._sums[s]}, i64 {k}")
-            vectors.append(self.load(where, dtype, 1))
+            vectors.append(load(b, where, dtype, 1))
         while len(vectors) > 1:
             half = len(vectors) // 2
             vectors = [
@@ -300,76 +314,6 @@ class Nests:
                     for x, y in zip(ones[:half], ones[half:], strict=True)
                 ]
         return b.opaque(ones[0])
-
-    # --- updates at computed places --------------------------------------------------------------
-
-    def update(self, s: Update) -> None:
-        """Elements written one after the other, or in vectors if all are moved by one distance."""
-        self._group = Group(s.array.shape, [s])
-        distance = s.distance.expression
-        is_uniform = s.op is None and distance is not None and distance.depth == 0
-        for lower, upper, (node, far) in sorted(
-            common_boxes([s.array, s.distance]), key=lambda c: c[:2]
-        ):
-            with self.scope():
-                self._update(s, lower, upper, node, far, [], is_uniform)
-
-    def _update(self, s: Update, lower, upper, node, far, index: list[Num], is_uniform) -> None:
-        b, d = self.b, len(index)
-        if d < len(lower) - int(is_uniform):
-            first = b.const(lower[d], "int64")
-
-            def turn(i: Num) -> None:
-                self._update(s, lower, upper, node, far, [*index, b.add(i, first)], is_uniform)
-
-            self.count(upper[d] - lower[d], turn)
-        elif not is_uniform:
-            with self.scalars():
-                self.update_element(s, self.number(far, index), self.number(node, index), index)
-        else:
-            with self.scalars():
-                by = self.number(far, index)
-                self.hoist([(s, node)], d, index)
-
-            def part(start: Num, mask: str | None, stride: int) -> None:
-                here = [*index, start]
-                x = self.number(node, here, mask)
-                where = self.address(s.memory, s.strides, s.offset, here, by)
-                self.store(where, x, stride, mask)
-
-            self.in_vectors(lower[d], upper[d], part, s.strides[-1])
-
-    def in_vectors(self, lower: int, upper: int, part: Callable, stride: int) -> None:
-        b, W = self.b, self.vector_width
-        vectors, rest = divmod(upper - lower, W)
-
-        def turn(i: Num) -> None:
-            start = b.add(b.mul(i, b.const(W, "int64")), b.const(lower, "int64"))
-            part(start, None, stride)
-
-        if vectors:
-            self.count(vectors, turn)
-        if rest:
-            bits = ", ".join(f"i1 {'true' if i < rest else 'false'}" for i in range(W))
-            with self.scope():
-                part(b.const(lower + vectors * W, "int64"), f"<{bits}>", stride)
-
-    def update_element(self, s: Update, distance: Num, x: Num, index: list[Num]) -> None:
-        b = self.b
-        if s.op is None:
-            self.store(self.address(s.memory, s.strides, s.offset, index, distance), x, 0)
-            return
-        # A negative distance says that there is no such element.
-        is_inside = b.compare("ge", distance, b.const(0, "int64"))
-        where = self.address(
-            s.memory, s.strides, s.offset, index, b.maximum(distance, b.const(0, "int64"))
-        )
-        old = self.load(where, s.array.dtype, 0)
-        if s.op == "":
-            new = x
-        else:
-            new = b.sub(old, x) if s.op == "sub" else self.e.combine(s.op, old, x)
-        self.store(where, b.select(is_inside, new, old), 0)
 
     # --- numbers ---------------------------------------------------------------------------------
 
@@ -402,6 +346,7 @@ class Nests:
             return self.numbers[node.value]
         if node.kind == "known":
             return b.const(node.value, node.dtype)
+        # Equal expressions are one object: each is computed once in a scope.
         key = ("node", node.serial)
         x = b.find(key)
         if x is not None:
@@ -413,13 +358,17 @@ class Nests:
             x = ELEMENTWISE[node.name.split()[0]](self.e, node.value or {}, *args)
         elif node.kind == "load":
             by = self.number(node.args[0], index, mask) if node.args else None
+            # An index of its own for each element.
             if by is not None and by.vec:
-                x = self.gather(node, index, by, mask, varies)
+                where = self.address(node.value, node.strides, node.offset, index)
+                stride = node.strides[-1] if varies else 0
+                x = gather(b, where, node.dtype, by, stride, mask)
             else:
                 where = self.address(node.value, node.strides, node.offset, index, by)
-                x = self.load(where, node.dtype, node.strides[-1] if varies else 0, mask)
+                x = load(b, where, node.dtype, node.strides[-1] if varies else 0, mask)
         else:
             x = self.linear(node.strides, node.offset, index)
+            # Neighbours along the innermost axis.
             if varies:
                 steps = ", ".join(f"i64 {node.strides[-1] * i}" for i in range(b.W))
                 name = b.new(f"add {b.type('int64', True)} {b.ref(x, 0, True)}, <{steps}>")
@@ -439,6 +388,7 @@ class Nests:
         """The first element of a memory."""
         if memory.whole is not None:
             whole = self.pointer(memory.whole)
+            # The row of a round.
             assert memory.distance is not None
             with self.scalars():
                 distance = self.number(memory.distance, [])
@@ -456,84 +406,3 @@ class Nests:
         if by is not None:
             distance = b.add(distance, by)
         return b.pointer(stored_type(memory.dtype), self.pointer(memory), b.ref(distance, 0, False))
-
-    # --- memory ----------------------------------------------------------------------------------
-
-    def load(self, where: str, dtype: str, stride: int, mask: str | None = None) -> Num:
-        """A vector of elements with a stride, or with stride 0 one element for all."""
-        b, item, W = self.b, stored_type(dtype), self.b.W
-        if W == 1 or stride == 0:
-            name = b.new(f"load {item}, ptr {where}, align {_bytes(dtype)}")
-            if dtype == "bool":
-                name = b.new(f"icmp ne i8 {name}, 0")
-            return b.number([name], dtype, False)
-        if stride == 1 and mask is None:
-            name = b.new(f"load <{W} x {item}>, ptr {where}, align {_bytes(dtype)}")
-            return self._from_vector(name, dtype)
-        pointers = where if stride == 1 else self._strided(where, item, stride)
-        return self._from_vector(self._masked(pointers, stride == 1, dtype, mask), dtype)
-
-    def gather(self, node: Expression, index, by: Num, mask: str | None, varies: bool) -> Num:
-        """Elements at distances that differ within a vector."""
-        b, item, W = self.b, stored_type(node.dtype), self.b.W
-        where = self.address(node.value, node.strides, node.offset, index)
-        distances = b.ref(by, 0, True)
-        if varies:
-            steps = ", ".join(f"i64 {node.strides[-1] * i}" for i in range(W))
-            distances = b.new(f"add <{W} x i64> {distances}, <{steps}>")
-        pointers = b.new(f"getelementptr {item}, ptr {where}, <{W} x i64> {distances}")
-        return self._from_vector(self._masked(pointers, False, node.dtype, mask), node.dtype)
-
-    def store(self, where: str, x: Num, stride: int, mask: str | None = None) -> None:
-        b, item, W = self.b, stored_type(x.dtype), self.b.W
-        is_vector = W > 1 and stride != 0
-        name, kind = b.ref(x, 0, is_vector), f"<{W} x {item}>" if is_vector else item
-        if x.dtype == "bool":
-            name = b.new(f"zext {b.type('bool', is_vector)} {name} to {kind}")
-        if not is_vector or (stride == 1 and mask is None):
-            b.emit(f"store {kind} {name}, ptr {where}, align {_bytes(x.dtype)}")
-            return
-        pointers = where if stride == 1 else self._strided(where, item, stride)
-        self._masked(pointers, stride == 1, x.dtype, mask, name)
-
-    def _strided(self, where: str, item: str, stride: int) -> str:
-        """Pointers to the elements of a vector."""
-        steps = ", ".join(f"i64 {stride * i}" for i in range(self.b.W))
-        return self.b.new(f"getelementptr {item}, ptr {where}, <{self.b.W} x i64> <{steps}>")
-
-    def _from_vector(self, name: str, dtype: str) -> Num:
-        if dtype == "bool":  # any byte but 0 counts as true
-            name = self.b.new(f"icmp ne <{self.b.W} x i8> {name}, zeroinitializer")
-        return self.b.number([name], dtype, True)
-
-    def _masked(
-        self, pointers: str, is_row: bool, dtype: str, mask: str | None, value: str = ""
-    ) -> str:
-        """LLVM's load or store of a row, or of elements at pointers of their own, where the mask is
-        true; `value` is what is stored."""
-        b, item, W = self.b, stored_type(dtype), self.b.W
-        words = ("load", "store") if is_row else ("gather", "scatter")
-        vector, bits = f"<{W} x {item}>", f"<{W} x i1>"
-        short = {"double": "f64", "float": "f32"}.get(item, item)
-        pointer, suffix = ("ptr", "p0") if is_row else (f"<{W} x ptr>", f"v{W}p0")
-        name = f"@llvm.masked.{words[bool(value)]}.v{W}{short}.{suffix}"
-        # Newer releases of LLVM take the alignment as an attribute of the pointer.
-        align, of_pointer, number = _bytes(dtype), f"{pointer} {pointers}", []
-        if machine.start_llvm().llvm_version_info[0] >= 22:
-            of_pointer = f"{pointer} align {align} {pointers}"
-        else:
-            number = [f"i32 {align}"]
-        of_mask = f"{bits} {mask or 'splat (i1 true)'}"
-        kinds = [pointer, *["i32" for _ in number], bits]
-        if value:
-            b.declare(f"void {name}({', '.join([vector, *kinds])})")
-            operands = [f"{vector} {value}", of_pointer, *number, of_mask]
-            b.emit(f"call void {name}({', '.join(operands)})")
-            return ""
-        b.declare(f"{vector} {name}({', '.join([*kinds, vector])})")
-        operands = [of_pointer, *number, of_mask, f"{vector} zeroinitializer"]
-        return b.new(f"call {vector} {name}({', '.join(operands)})")
-
-
-def _bytes(dtype: str) -> int:
-    return np.dtype(dtype).itemsize

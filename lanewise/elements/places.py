@@ -9,7 +9,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from .boxes import Expression
-from .schedule import Group, reads, written
+from .schedule import Group, memory_of, reads
 from .tree import Block, Branch, Loop, Memory, Store
 
 
@@ -41,10 +41,12 @@ class Lives:
         for i, item in enumerate(block.items):
             if isinstance(item, Group):
                 for statement in item.statements:
-                    memory = written(statement)
+                    memory = memory_of(statement)
                     # A round of a loop writes a part of its rows: those of other rounds live on.
                     if memory is not None and memory.whole is None:
                         first.setdefault(memory, i)
+        # Backwards: what is live before an item is what is live after it, without what it makes,
+        # and with what it reads.
         for i, item in reversed(list(enumerate(block.items))):
             if isinstance(item, Loop):
                 live = self._loop(item, live)
@@ -62,7 +64,10 @@ class Lives:
         now, new = {m for m, _ in loop.memories}, {m for _, m in loop.memories}
         of_round = _roots(after for _, _, after in loop.numbers)
         of_test = _roots([] if loop.condition is None else [loop.condition])
+        # A loop may end after any round, so that all that is read after it is live in it.
         head = live | rows | now
+        # What a round reads at its beginning must survive the round before: walk until no memory
+        # is added. Conflicts are only added, so that a walk too many does no harm.
         while True:
             end = (head - now) | new | of_round
             for old, after in loop.memories:
@@ -70,25 +75,28 @@ class Lives:
                 self._conflict(old, head | (new - {after}))
                 self._conflict(after, end)
             before = self._block(loop.body, end)
-            grown = head | self._block(loop.test, before | live | of_test)
-            if grown == head:
+            new_head = head | self._block(loop.test, before | live | of_test)
+            if new_head == head:
                 break
-            head = grown
+            head = new_head
+        # Without a copy at the end of each round, if they may share bytes.
         for old, after in loop.memories:
             self._wish(after, old)
         return (head - rows) | _roots(first for _, first, _ in loop.numbers)
 
     def _group(self, group: Group, live: set[Memory], begins: set[Memory]) -> set[Memory]:
-        made = _written(group) - self.dead
+        made = _memories_of(group) - self.dead
         old: dict[Memory, list[Expression]] = {}
+        # Reads of what the group itself makes come from registers.
         for node in group.memory_reads():
             old.setdefault(node.value.root, []).append(node)
         # The order of the program, for the walk goes backwards.
         for memory in sorted(made, key=lambda m: -m.serial):
-            own = [s for s in group.statements if written(s) is memory]
+            own = [s for s in group.statements if memory_of(s) is memory]
             read = {n.value for s in own for n in reads(s) if n.kind == "load"}
             if memory not in self.order:
                 self.order.append(memory)
+            # Two arrays that a group makes are written at once.
             self._conflict(memory, live | made)
             for other, nodes in old.items():
                 if other is memory:
@@ -101,8 +109,8 @@ class Lives:
         return (live - begins) | set(old)
 
 
-def _written(group: Group) -> set[Memory]:
-    return {m.root for s in group.statements if (m := written(s)) is not None}
+def _memories_of(group: Group) -> set[Memory]:
+    return {m.root for s in group.statements if (m := memory_of(s)) is not None}
 
 
 def _roots(nodes: Iterable[Expression]) -> set[Memory]:
@@ -113,11 +121,12 @@ def _roots(nodes: Iterable[Expression]) -> set[Memory]:
 def _takes_over(group: Group, memory: Memory, old: Memory, nodes: list[Expression]) -> bool:
     """Whether a group that makes `memory` reads each element of `old` only where it makes the same
     element."""
+    # Only arrays of one layout: element by element, at one address.
     if memory.strides != old.strides or memory.dtype != old.dtype or memory.size != old.size:
         return False
     targets = set()
     for s in group.statements:
-        own = written(s)
+        own = memory_of(s)
         if own is None or own.root is not memory:
             continue
         # An axis without a stride writes one element several times.
@@ -136,9 +145,11 @@ def places(
     """The first byte of each memory without a pointer, and the number of all bytes."""
     lives = Lives(program, dead) if lives is None else lives
     at: dict[Memory, int] = {}
-    shared: dict[int, list[Memory]] = {}
+    members: dict[int, list[Memory]] = {}
     sizes: dict[int, int] = {}
     total = 0
+    # First come, first served: a wish avoids a copy or a second array, any free bytes of the
+    # right size avoid new memory.
     for memory in lives.order:
         if memory.pointer is not None or memory.root is not memory:
             continue
@@ -147,16 +158,16 @@ def places(
         wishes = [at[m] for m in lives.wishes.get(memory, []) if m in at]
         free = (
             start
-            for start in [*wishes, *shared]
-            if sizes[start] == size and not conflicts & set(shared[start])
+            for start in [*wishes, *members]
+            if sizes[start] == size and not conflicts & set(members[start])
         )
         start = next(free, None)
         if start is None:
             start = total
-            sizes[start], shared[start] = size, []
+            sizes[start], members[start] = size, []
             total += size
         at[memory] = start
-        shared[start].append(memory)
+        members[start].append(memory)
     return at, total
 
 

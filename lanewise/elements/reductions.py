@@ -17,13 +17,14 @@ from .tree import Memory, Number, Reduce
 
 def reduction(translation: Translation, eqn: Any, x: Array) -> list[Array]:
     op, (out,) = REDUCTIONS[eqn.primitive.name], eqn.outvars
-    return [reduced(translation, x, op, eqn.params["axes"], out.aval.shape)]
+    return [reduction_of(translation, x, op, eqn.params["axes"], out.aval.shape)]
 
 
-def reduced(translation: Translation, x: Array, op: str, axes: Sequence[int], shape) -> Array:
+def reduction_of(translation: Translation, x: Array, op: str, axes: Sequence[int], shape) -> Array:
     """The elements combined along some axes."""
     if not x.size:
         return Array.uniform(translation.table.known(neutral(op, x.dtype), x.dtype), shape)
+    # Every step of a run asks whether its state is finite.
     if op == "and" and all(_is_finiteness(box) for box in x.boxes):
         return _all_finite(translation, x, axes, shape)
     short, long, parts = x.components()
@@ -33,7 +34,7 @@ def reduced(translation: Translation, x: Array, op: str, axes: Sequence[int], sh
     for index, part in parts.items():
         key = tuple(i for a, i in zip(short, index, strict=True) if a not in axes)
         old = totals.get(key)
-        totals[key] = part if old is None else combined(op, old, part)
+        totals[key] = part if old is None else combine_arrays(op, old, part)
     short_kept = [kept.index(a) for a in short if a not in axes]
     vanish = [k for k, a in enumerate(long) if a in axes]
     if not vanish:
@@ -44,16 +45,17 @@ def reduced(translation: Translation, x: Array, op: str, axes: Sequence[int], sh
             translation.add(Reduce(number, [0] * len(long), 0, part, op, vanish))
             totals[key] = Array.uniform(translation.number(number), ())
         return translation.from_components(totals, shape, short_kept)
+    # Some axes are kept: the sums are elements of an array.
     memory = Memory(shape, x.dtype)
     order = _order(totals.values(), len(long))
     for key, part in totals.items():
         offset = sum(memory.strides[a] * i for a, i in zip(short_kept, key, strict=True))
         strides = [0 if k in vanish else memory.strides[kept.index(long[k])] for k in order]
-        turned = part.along(
+        view = part.along(
             [part.shape[k] for k in order], [order.index(k) for k in range(len(long))]
         )
         axes_of_turned = [order.index(k) for k in vanish]
-        translation.add(Reduce(memory, strides, offset, turned, op, axes_of_turned))
+        translation.add(Reduce(memory, strides, offset, view, op, axes_of_turned))
     return memory.load(translation.table)
 
 
@@ -65,11 +67,12 @@ def _order(parts, rank: int) -> list[int]:
         steps = [s[k] for s in strides if len(s) == rank]
         return sum(s == 1 for s in steps) - sum(s > 1 for s in steps), k
 
+    # Vectors are loads of neighbours then, and not gathers.
     last = max(range(rank), key=contiguous)
     return [k for k in range(rank) if k != last] + [last]
 
 
-def combined(op: str, x: Array, y: Array) -> Array:
+def combine_arrays(op: str, x: Array, y: Array) -> Array:
     return elementwise(op, {}, [x, y], x.shape, x.dtype)
 
 
@@ -86,7 +89,7 @@ def _all_finite(translation: Translation, x: Array, axes: Sequence[int], shape) 
         (arg,) = node.args
         zero = table.known(0, arg.dtype)
         boxes.append(Box(lower, upper, table.operation("mul", {}, [arg, zero], arg.dtype)))
-    total = reduced(translation, Array(table, x.shape, dtype, boxes), "add", axes, shape)
+    total = reduction_of(translation, Array(table, x.shape, dtype, boxes), "add", axes, shape)
     return elementwise("is_finite", {}, [total], shape, "bool")
 
 
@@ -96,6 +99,7 @@ def matrix_product(translation: Translation, eqn: Any, x: Array, y: Array) -> li
     dtype = str(out.aval.dtype)
     if dtype == "bool":
         raise NotCompilable("a matrix product of truth values")
+    # Sums of float32 are computed in the type of the result.
     x, y = translation.convert(x, dtype), translation.convert(y, dtype)
     free_x = [a for a in range(len(x.shape)) if a not in (*of_x, *batch_x)]
     free_y = [a for a in range(len(y.shape)) if a not in (*of_y, *batch_y)]
@@ -110,10 +114,11 @@ def matrix_product(translation: Translation, eqn: Any, x: Array, y: Array) -> li
         axes_y[a] = len(batch_x) + len(free_x) + k
     for k, (a, c) in enumerate(zip(of_x, of_y, strict=True)):
         axes_x[a] = axes_y[c] = len(shape) + k
-    product = combined("mul", x.along(frame, axes_x), y.along(frame, axes_y))
+    # All products as one array that is summed over its last axes. It is never written.
+    product = combine_arrays("mul", x.along(frame, axes_x), y.along(frame, axes_y))
     if not of_x:
         return [product]
-    return [reduced(translation, product, "add", range(len(shape), len(frame)), shape)]
+    return [reduction_of(translation, product, "add", range(len(shape), len(frame)), shape)]
 
 
 def _running(op: str) -> Callable:
@@ -143,8 +148,8 @@ def argument(is_largest: bool) -> Callable:
         # The largest of numbers with a NaN is NaN, and equal to none of them.
         hits = (x == best) | ((x != x) & (best != best))
         places = lax.broadcasted_iota(index_dtype, x.shape, axis)
-        most = np.iinfo(index_dtype).max
-        return jnp.min(jnp.where(hits, places, jnp.asarray(most, index_dtype)), axis)
+        largest = np.iinfo(index_dtype).max
+        return jnp.min(jnp.where(hits, places, jnp.asarray(largest, index_dtype)), axis)
 
     return function
 

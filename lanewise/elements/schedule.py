@@ -41,12 +41,12 @@ def reads(statement: Statement) -> list[Expression]:
 
 def _distances(statement: Statement, nodes: Iterable[Expression]) -> list[Expression]:
     memories = [node.value for node in nodes if node.kind == "load"]
-    if (memory := written(statement)) is not None:
+    if (memory := memory_of(statement)) is not None:
         memories.append(memory)
     return [m.distance for m in memories if m.distance is not None]
 
 
-def written(statement: Statement) -> Memory | None:
+def memory_of(statement: Statement) -> Memory | None:
     if isinstance(statement, Store | Update):
         return statement.memory
     return statement.memory if isinstance(statement, Reduce) else None
@@ -75,15 +75,18 @@ def roots_read(statement: Statement) -> set[Memory]:
 
 def schedule(block: Block, carried: frozenset[Memory] = frozenset()) -> None:
     """Fill `items` of a block and of all within it. `carried`: memories of the loop around it that
-    are written anew in each round."""
+    are written in each round."""
+    # The last statement of the block that reads a memory: after it the bytes are free.
     last_read: dict[Memory, int] = {}
     for i, statement in enumerate(block.statements):
         last_read.update(dict.fromkeys(roots_read(statement), i))
     first, segment = 0, []
+    # A memory from outside of the block may be read in the next round of a loop, but for those
+    # that get a new value at its end.
     own = set(carried)
 
     def close(end: int) -> None:
-        own.update(m for s in segment if (m := written(s)) is not None and m.pointer is None)
+        own.update(m for s in segment if (m := memory_of(s)) is not None and m.pointer is None)
         dying = {m for m in own if first <= last_read.get(m, -1) < end}
         block.items += groups(segment, dying)
 
@@ -106,15 +109,15 @@ def schedule(block: Block, carried: frozenset[Memory] = frozenset()) -> None:
 def groups(segment: Sequence[Statement], dying: set[Memory]) -> list[Group]:
     """The groups of statements without loops and branches, in the order of their levels."""
     at = levels(segment, in_place(segment, dying))
-    found: dict[tuple, list[Statement]] = {}
+    by_level: dict[tuple, list[Statement]] = {}
     for i, statement in enumerate(segment):
         shape = arrays(statement)[-1].shape
         # An update reads what it writes, in an order: nothing shares its loops.
         alone = i if isinstance(statement, Update) else -1
-        found.setdefault((at[i], shape != (), alone, shape), []).append(statement)
+        by_level.setdefault((at[i], shape != (), alone, shape), []).append(statement)
     return [
         Group(shape, statements)
-        for (*_, shape), statements in sorted(found.items(), key=lambda item: item[0][:3])
+        for (*_, shape), statements in sorted(by_level.items(), key=lambda item: item[0][:3])
     ]
 
 
@@ -127,15 +130,17 @@ def levels(segment: Sequence[Statement], lower: dict[int, int]) -> list[int]:
         level = lower.get(i, 0)
         shape = arrays(statement)[-1].shape
         for node in reads(statement):
+            # Rows of one memory are not told apart: a part counts as the whole.
             key = node.value.root if node.kind == "load" else node.value
             makers_of = makers.get(key, [])
             # What one statement has written, at the same element, no other one has written.
-            same = [m for m in makers_of if _is_same(segment[m], statement, node, shape)]
-            if same and not any(isinstance(segment[m], Update) for m in makers_of):
-                level = max([level, *(at[m] for m in same)])
+            in_loops = [m for m in makers_of if _is_same(segment[m], statement, node, shape)]
+            if in_loops and not any(isinstance(segment[m], Update) for m in makers_of):
+                level = max([level, *(at[m] for m in in_loops)])
             else:
                 level = max([level, *(at[m] + 1 for m in makers_of)])
-        own = written(statement)
+        own = memory_of(statement)
+        # It changes elements that have to be there.
         if isinstance(statement, Update):
             for m in makers.get(own.root, ()):  # pyright: ignore[reportOptionalMemberAccess]
                 level = max(level, at[m] + 1)
@@ -185,6 +190,8 @@ def in_place(segment: Sequence[Statement], dying: set[Memory]) -> dict[int, int]
                 continue
             if any(k == i and not is_own(statement, node) for k, node in readers[old]):
                 continue  # it reads other elements of the array itself
+            # Those that read the array at other elements, or later: it must stay until they are
+            # done.
             others = [
                 k
                 for k, node in readers[old]
@@ -192,6 +199,8 @@ def in_place(segment: Sequence[Statement], dying: set[Memory]) -> dict[int, int]
             ]
             if not others:
                 break
+            # The statement moves behind them, with all that reads its result. If one of them
+            # needs that result, nothing has been gained.
             trial = {**lower, i: 1 + max(at[k] for k in others)}
             new = levels(segment, trial)
             if all(new[k] < new[i] for k in others):
@@ -209,6 +218,7 @@ def is_own(statement: Store, node: Expression) -> bool:
 def dead_memories(block: Block) -> set[Memory]:
     """The memories that are read only in the group that makes them, at the same element: nothing
     is written to them."""
+    # A memory is needed if it is read in another group, or at another element, or by a loop.
     needed: set[Memory] = set()
     made: set[Memory] = set()
     for inner in block.blocks():
@@ -216,7 +226,7 @@ def dead_memories(block: Block) -> set[Memory]:
             if isinstance(item, Group):
                 needed |= {node.value.root for node in item.memory_reads()}
                 for statement in item.statements:
-                    memory = written(statement)
+                    memory = memory_of(statement)
                     if memory is None:
                         continue
                     made.add(memory)

@@ -93,6 +93,7 @@ class Place(NamedTuple):
 
 def short_first(shape: Sequence[int]) -> tuple[int, ...]:
     """Strides: short axes outside, so that the last long one is contiguous."""
+    # An array of positions (n, 3) becomes three rows of n, each of which is read in vectors.
     order = [a for a, n in enumerate(shape) if n <= SHORT]
     order += [a for a, n in enumerate(shape) if n > SHORT]
     strides, step = [0] * len(shape), 1
@@ -108,6 +109,7 @@ class Store:
     def __init__(self, memory: Memory, strides: Sequence[int], offset: int, array: Array):
         self.memory, self.strides, self.offset = memory, tuple(strides), offset
         self.array = array
+        # Compared by identity: a statement of the same loops that reads it gets the number itself.
         # The load that reads at the index i what is written there.
         self.target = memory.place.target(array.table, self.strides, offset)
 
@@ -172,6 +174,7 @@ class Loop:
         self.numbers: list[tuple[Number, Expression, Expression]] = []
         self.memories: list[tuple[Memory, Memory]] = []
         self.rows: list[Memory] = []
+        # `test` has the statements that the condition needs; it stays empty for a known length.
         self.test, self.body = Block(), Block()
         self.condition: Expression | None = None
 
