@@ -130,7 +130,7 @@ def levels(segment: Sequence[Statement], lower: dict[int, int]) -> list[int]:
         level = lower.get(i, 0)
         shape = arrays(statement)[-1].shape
         for node in reads(statement):
-            # Rows of one memory are not told apart: a part counts as the whole.
+            # Rows of one memory are not distinguished: a part counts as the whole.
             key = node.value.root if node.kind == "load" else node.value
             makers_of = makers.get(key, [])
             # What one statement has written, at the same element, no other one has written.
