@@ -50,7 +50,15 @@ def integrate(*args, **keywords):
     time.sleep(20)
 dvi_jax.integrate = integrate
 """
-RUN = 'system = "kepler"\nh = 0.1\nsteps = 20\n[output]\ndir = "a/b/out"\nplots = false\n'
+RUN = """
+system = "kepler"
+epsilon = 0.0
+h = 0.1
+steps = 20
+[output]
+dir = "a/b/out"
+plots = false
+"""
 CODES = {"SIGINT": 130, "SIGTERM": 143, "SIGHUP": 129}
 
 

@@ -100,11 +100,16 @@ def explain_calls(module: ModuleType) -> None:
             table.update({key: _replacement(value) for key, value in table.items()})
 
 
+_IN_STEPS = ("engine", "problem", "methods", "integration")
+
+
 def _explain_methods(cls: type) -> None:
-    """Make the constructor of a class explain a call with wrong arguments, and the methods that it
-    does not have from a base: those are called in steps, where each would be a frame more in the
-    errors of a user's functions."""
+    """Make the constructor of a class explain a call with wrong arguments, and its methods, but for
+    those that are called in steps, where each would be a frame more in the errors of a user's
+    functions: those of a base, and of the classes that make a step."""
     inherited = {name for base in cls.__mro__[1:] for name in vars(base)} - {"__init__"}
+    if cls.__module__.split(".")[1] in _IN_STEPS:
+        inherited |= vars(cls).keys() - {"__init__"}
     for name, member in list(vars(cls).items()):
         function = member.__func__ if isinstance(member, classmethod) else member
         if name in inherited or (name[0] == "_" and name != "__init__"):
