@@ -10,7 +10,8 @@ JOBS ?= 2
 PART ?= 1
 # Runs, files, gradients, implicit methods, command line, and each extra.
 LOWEST = $(addprefix tests/test_,run.py integrate.py collocation.py solution_data.py cli.py fit_bayes.py \
-  proof.py rings_files.py sweep_store.py sweep_cluster.py) $(wildcard tests/test_interop_*.py)
+  proof.py rings_files.py sweep_store.py sweep_cluster.py lanewise_elements.py) \
+  $(wildcard tests/test_interop_*.py)
 BIN = $(VENV)/bin
 READY = $(VENV)/ready
 SCHEMA = $(BIN)/check-jsonschema --quiet --builtin-schema vendor
