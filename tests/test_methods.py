@@ -54,7 +54,7 @@ def measured_order(method, problem):
     """The order between the two smallest steps whose errors are above round-off, force on."""
     high = [12, 16, 24, 32, 48, 64, 72]
     number = np.array([16, 32, 64, 128] if method.order <= 4 else high)
-    exact, _ = problems.reference(problem, problems.FORCED)
+    exact, _ = problems.reference(problem, problems.STRENGTH)
     advance, x = problems.flow(problem, method), problems.inputs(problem, 0.0)
     ends = [advance(x | {"h": problems.SPAN * problem.h / n}, n) for n in number]
     errors = np.array([np.max(np.abs(end - exact)) for end in ends])
