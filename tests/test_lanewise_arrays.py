@@ -11,6 +11,7 @@ from random_programs.arrays import TOLERANCE, check, difference, search, smaller
 
 from lanewise.evaluator import RULES
 from lanewise.jaxprs.jaxapi import ClosedJaxpr, Literal, scan_counts
+from lanewise.rules.elementwise import ELEMENTWISE
 
 FOUR = ("in place", "moves", "loops", "branches")
 """Kinds of which there are four short tests, of the others three: 40 programs."""
@@ -158,6 +159,8 @@ def test_a_wrong_rule_of_the_compiler_is_found(monkeypatch):
     """Control: a difference with its operands exchanged."""
     rule = RULES["sub"]
     monkeypatch.setitem(RULES, "sub", lambda e, eqn, xs, places: rule(e, eqn, xs[::-1], places))
+    of_numbers = ELEMENTWISE["sub"]
+    monkeypatch.setitem(ELEMENTWISE, "sub", lambda e, params, x, y: of_numbers(e, params, y, x))
     failures = [check(Program(1000 + k, "in place")).failure for k in range(3)]
     assert any(failures)
 

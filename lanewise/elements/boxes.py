@@ -86,7 +86,9 @@ class Expression:
     def _moved(self, index_map: IndexMap) -> "Expression":
         if self.kind in ("known", "number"):
             return self
-        args = tuple(arg.moved(index_map) for arg in self.args)
+        args = []  # not a generator: its frames would halve the depth that Python allows
+        for arg in self.args:
+            args.append(arg.moved(index_map))
         strides, offset = self.strides, self.offset
         # strides · (rows · j + offsets) + offset, sorted by j.
         if self.kind != "operation":
@@ -97,7 +99,7 @@ class Expression:
                 sum(s * row[k] for s, row in zip(strides, rows, strict=True)) for k in columns
             )
         return self.table.expression(
-            self.kind, self.dtype, args, self.name, strides, offset, self.value
+            self.kind, self.dtype, tuple(args), self.name, strides, offset, self.value
         )
 
     def loads(self, visited: set[int]) -> Iterable["Expression"]:

@@ -29,12 +29,12 @@ def reduction_of(translation: Translation, x: Array, op: str, axes: Sequence[int
         return _all_finite(translation, x, axes, shape)
     short, long, parts = x.components()
     kept = [a for a in range(len(x.shape)) if a not in axes]
-    # Short axes first, from the first element to the last.
-    totals: dict[tuple, Array] = {}
+    # Short axes first.
+    terms: dict[tuple, list[Array]] = {}
     for index, part in parts.items():
         key = tuple(i for a, i in zip(short, index, strict=True) if a not in axes)
-        old = totals.get(key)
-        totals[key] = part if old is None else combine_arrays(op, old, part)
+        terms.setdefault(key, []).append(part)
+    totals = {key: _combine_all(op, of) for key, of in terms.items()}
     short_kept = [kept.index(a) for a in short if a not in axes]
     vanish = [k for k, a in enumerate(long) if a in axes]
     if not vanish:
@@ -70,6 +70,14 @@ def _order(parts, rank: int) -> list[int]:
     # Vectors are loads of neighbours then, and not gathers.
     last = max(range(rank), key=contiguous)
     return [k for k in range(rank) if k != last] + [last]
+
+
+def _combine_all(op: str, parts: list[Array]) -> Array:
+    # Neighbours first: an expression of few levels, for its rules are recursive.
+    while len(parts) > 1:
+        pairs = [combine_arrays(op, *pair) for pair in zip(parts[::2], parts[1::2], strict=False)]
+        parts = pairs + parts[2 * len(pairs) :]
+    return parts[0]
 
 
 def combine_arrays(op: str, x: Array, y: Array) -> Array:

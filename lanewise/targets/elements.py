@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from ..elements.code import Kernel
 from ..jaxprs.extent import has_long_arrays, operation_count
 from ..jaxprs.jaxapi import ClosedJaxpr
+from ..llvm.ir import NotCompilable
 from ..module import Module
 from ..native import handler, machine
 from .numbers import HEAD
@@ -27,7 +28,10 @@ class Elements:
     def write_for(self, function: ClosedJaxpr, lane_flags: Sequence[bool], width: int) -> Code:
         """The code for vectors of `width` numbers."""
         module = Module(width, 1)
-        kernel = Kernel(module, function, lane_flags)
+        try:
+            kernel = Kernel(module, function, lane_flags)
+        except RecursionError:
+            raise NotCompilable("expressions of too many levels, for long arrays") from None
         return Code(
             kernel.text(HEAD),
             block=1,
