@@ -340,8 +340,9 @@ def test_a_batch_has_the_bits_of_single_runs(method):
     [
         ("pendulum", dvi.Strang(), 25),
         ("kepler", dvi.Strang(), 25),
-        # 17 to 21: most of this step in float64 is fused multiply-adds, which take 25 in pairs.
-        ("henon_heiles", dvi.Strang(), 30),
+        # Most of this step in float64 is fused multiply-adds, which take 25 operations in pairs:
+        # 17 to 21 on one kind of processor, 32 to 38 on another (the same commit on both).
+        ("henon_heiles", dvi.Strang(), 45),
         ("kepler", dvi.GaussLegendre(2), 25),
     ],
 )
