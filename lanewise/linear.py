@@ -1,6 +1,7 @@
 """Small dense linear systems, and Jacobians that keep the zeros of their structure."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array, lax
@@ -43,7 +44,7 @@ def _in_arrays(A: ArrayLike, right: ArrayLike) -> Array:
         return _on_each(by_elimination)(A, right)
     if right.ndim == 1 or n > IN_A_LOOP:
         return lapack(A, right)
-    return lax.platform_dependent(A, right, cpu=_on_each(_column_by_column), default=lapack)
+    return lax.platform_dependent(A, right, cpu=_on_each(column_by_column), default=lapack)
 
 
 def _on_each(solve_one: Callable) -> Callable:
@@ -70,24 +71,45 @@ def by_elimination(A: Array, b: Array) -> Array:
     return jnp.stack(x)
 
 
-def _column_by_column(A: Array, b: Array) -> Array:
+class _Columns(NamedTuple):
+    """The rows (A, b) after some columns; the next column, its pivot's row and that row over the
+    pivot; which rows were pivots, and which one for each column."""
+
+    rows: Array
+    column: Array
+    pivot: Array
+    pivot_row: Array
+    used: Array
+    order: Array
+
+
+def column_by_column(A: Array, b: Array) -> Array:
     """The solution x of A x = b by Gauss and Jordan's elimination, as a loop.
 
-    In column c the largest number of the rows not used yet is the pivot; the column is then
-    eliminated from all other rows.
+    In each column the largest number of the rows that were not yet pivots is the pivot; the column
+    is then eliminated from all other rows.
     """
     n = b.shape[0]
+    numbers = jnp.arange(n)
 
-    def eliminate(c, rows):
-        # Rows before c have been used: −1 is below every magnitude, so that none is chosen again.
-        size = jnp.where(jnp.arange(n) >= c, jnp.abs(rows[:, c]), -1.0)
-        p = jnp.argmax(size)
-        pivot, old_row = rows[p], rows[c]
-        rows = rows.at[p].set(old_row).at[c].set(pivot / pivot[c])
-        factors = jnp.where(jnp.arange(n) == c, 0.0, rows[:, c])
-        return rows - factors[:, None] * rows[c][None]
+    def choose(c, rows, used, order):
+        # What the next round reads is taken out of the rows, so that they can change in place.
+        column = lax.dynamic_index_in_dim(rows, c, 1, False)
+        p = jnp.argmax(jnp.where(used, -1.0, jnp.abs(column)))
+        pivot_row = lax.dynamic_index_in_dim(rows, p, 0, False) / column[p]
+        return _Columns(rows, column, p, pivot_row, used, order)
 
-    return lax.fori_loop(0, n, eliminate, jnp.concatenate([A, b[:, None]], axis=1))[:, n]
+    def eliminate(c, state: _Columns):
+        chosen = numbers == state.pivot
+        changed = state.rows - state.column[:, None] * state.pivot_row
+        rows = jnp.where(chosen[:, None], state.pivot_row, changed)
+        order = jnp.where(numbers == c, state.pivot, state.order)
+        return choose(jnp.minimum(c + 1, n - 1), rows, state.used | chosen, order)
+
+    rows = jnp.concatenate([A, b[:, None]], axis=1)
+    start = choose(0, rows, jnp.zeros(n, bool), jnp.zeros(n, int))
+    end = lax.fori_loop(0, n, eliminate, start)
+    return end.rows[end.order, n]
 
 
 def _in_batches(arrays, axes):

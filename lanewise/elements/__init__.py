@@ -7,4 +7,9 @@ joins statements into loops, `places` decides which arrays share memory, and `ne
 write LLVM IR.
 """
 
-from . import flow as flow, indices as indices, reductions as reductions  # they register rules
+from . import (  # they register rules
+    flow as flow,
+    indices as indices,
+    reductions as reductions,
+    systems as systems,
+)

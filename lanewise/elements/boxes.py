@@ -38,7 +38,7 @@ class Expression:
 
     - ``known``: `value` is the number. ``number``: `value` is an object that holds a number of the
       code, the same for all indices.
-    - ``index``: strides · index + offset.
+    - ``index``: strides · index + offset. ``delta``: whether that is zero.
     - ``load``: an element of the memory `value`, at strides · index + offset, plus the argument if
       there is one.
     - ``operation``: `name` of the arguments, with the parameters `value`.
@@ -120,6 +120,7 @@ class Table:
 
     def __init__(self):
         self.moves: dict[Any, Expression] = {}
+        self.deltas: dict[int, Any] = {}  # of `diagonals`
         self._expressions: dict[Any, Expression] = {}
 
     def expression(
@@ -133,7 +134,8 @@ class Table:
         value: Any = None,
         key: Any = None,
     ) -> Expression:
-        # An operation's parameters are part of its name; other values have a key or are objects.
+        if kind == "delta" and not any(strides):
+            return self.known(offset == 0, dtype)
         # An operation's parameters are part of its name; other values have a key or are objects.
         identity = key if key is not None else None if kind == "operation" else id(value)
         full = (kind, dtype, tuple(a.serial for a in args), name, strides, offset, identity)

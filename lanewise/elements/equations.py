@@ -24,6 +24,7 @@ from .boxes import (
     joined,
     repeat,
 )
+from .diagonals import MOST_DIAGONALS, diagonals, from_diagonals
 from .tree import Block, Let, Memory, Number, Place, Statement, Store
 
 EXPENSIVE = 16
@@ -55,6 +56,7 @@ class Translation:
         self.block = Block()
         self.operands: list[tuple[Memory, np.ndarray]] = []
         self._constants: dict[Any, Array] = {}
+        self.factors: dict[Any, Any] = {}  # of linear systems that are solved again
 
     # --- values --------------------------------------------------------------------------------
 
@@ -135,7 +137,12 @@ class Translation:
         nodes = [box.expression for box in x.boxes]
         if all(node.kind in ("known", "number", "load", "index") for node in nodes):
             return x
-        return self.store(x)
+        of = diagonals(x)
+        if of is None or len(of) > MOST_DIAGONALS:
+            return self.store(x)
+        # A matrix with a few diagonals is written as these.
+        stored = {d: self.store(diagonal) for d, diagonal in of.items()}
+        return from_diagonals(stored, x.shape, x.dtype, self.table)
 
     def each_component(self, x: Array, function: Callable[[Array], Array]) -> Array:
         """A written-out array with a function of its numbers."""

@@ -29,9 +29,8 @@ def empty(translation: Translation, eqn: Any, *_: Array) -> list[Array]:
 
 def unit_vectors(translation: Translation, eqn: Any) -> list[Array]:
     n, dtype = eqn.params["n"], str(eqn.params["dtype"])
-    rows = [translation.table.expression("index", "int64", strides=s) for s in ((1, 0), (0, 1))]
-    i, j = (Array.uniform(node, (n, n)) for node in rows)
-    return [translation.convert(translation.apply("eq", i, j, dtype="bool"), dtype)]
+    node = translation.table.expression("delta", "bool", strides=(1, -1))
+    return [translation.convert(Array.uniform(node, (n, n)), dtype)]
 
 
 def _clip_index(translation: Translation, x: Array, largest: int) -> Array:

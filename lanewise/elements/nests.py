@@ -373,7 +373,8 @@ class Nests:
                 steps = ", ".join(f"i64 {node.strides[-1] * i}" for i in range(b.W))
                 name = b.new(f"add {b.type('int64', True)} {b.ref(x, 0, True)}, <{steps}>")
                 x = b.number([name], "int64", True)
-            x = b.convert(x, node.dtype)
+            is_delta = node.kind == "delta"
+            x = b.compare("eq", x, b.const(0, "int64")) if is_delta else b.convert(x, node.dtype)
         b.note(key, x)
         return x
 

@@ -1,0 +1,144 @@
+"""Linear systems with a band matrix, as loops over its rows.
+
+Row i of `rows` has the numbers A[i, i − below], …, A[i, i + above]; those outside of A are zero.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array, lax
+
+LARGEST_FACTOR = 8.0
+"""Of a row that is subtracted from another; with a larger one rows are exchanged, since errors
+grow with the factors."""
+
+
+class Factors(NamedTuple):
+    """A = L U without exchanges.
+
+    - `lower`: of shape (n, below), the numbers of L below its diagonal of ones.
+    - `inverse`: of shape (n,), one over the diagonal of U.
+    - `upper`: of shape (n, above), the other numbers of U, each row times its `inverse`.
+    - `weak`: whether a number of L is large, or not finite.
+    """
+
+    lower: Array
+    inverse: Array
+    upper: Array
+    weak: Array
+
+
+def factorise(rows: Array, below: int) -> Factors:
+    """The factors of a band matrix, row by row."""
+    above = rows.shape[1] - below - 1
+
+    def step(carry, row):
+        # The last rows of U, before they are multiplied, and one over their pivots.
+        upper, inverse, weak = carry
+        entries, lower = [row[j] for j in range(below + above + 1)], []
+        for m in range(below):
+            factor = entries[m] * inverse[m]
+            lower.append(factor)
+            # Not "larger than": NaN is weak too.
+            weak |= ~(jnp.abs(factor) <= LARGEST_FACTOR)
+            for j in range(above):
+                entries[m + 1 + j] = entries[m + 1 + j] - factor * upper[m, j]
+        one_over = 1 / entries[below]
+        own = jnp.stack(entries[below + 1 :]) if above else jnp.zeros(0, rows.dtype)
+        carry = (_shifted(upper, own), _shifted(inverse, one_over), weak)
+        return carry, (jnp.stack(lower) if below else own[:0], one_over, own * one_over)
+
+    dtype = rows.dtype
+    start = (jnp.zeros((below, above), dtype), jnp.zeros(below, dtype), jnp.asarray(False))
+    (_, _, weak), (lower, inverse, upper) = lax.scan(step, start, rows)
+    return Factors(lower, inverse, upper, weak)
+
+
+def substitute(factors: Factors, right: Array) -> Array:
+    """The solutions of L U x = b for the columns of `right`, of shape (n, k)."""
+    lower, inverse, upper, _ = factors
+    below, above, columns = lower.shape[1], upper.shape[1], right.shape[1]
+
+    def forward(last, row):
+        factors_of_row, one_over, y = row
+        for m in range(below):
+            y = y - factors_of_row[m] * last[m]
+        return _shifted(last, y), y * one_over
+
+    def backward(last, row):
+        numbers, x = row
+        for j in range(above):
+            x = x - numbers[j] * last[above - 1 - j]
+        return _shifted(last, x), x
+
+    start = jnp.zeros((below, columns), right.dtype)
+    _, y = lax.scan(forward, start, (lower, inverse, right))
+    start = jnp.zeros((above, columns), right.dtype)
+    return lax.scan(backward, start, (upper, y), reverse=True)[1]
+
+
+def _shifted(last: Array, new: Array) -> Array:
+    """The last few rows, with a new one at the end."""
+    return jnp.concatenate([last[1:], new[None]]) if last.shape[0] else last
+
+
+def with_exchanges(rows: Array, right: Array, below: int) -> Array:
+    """The solutions by partial pivoting: in each column the largest of its below + 1 numbers."""
+    n, width = rows.shape
+    columns = right.shape[1]
+    # A window of below + 1 rows moves down, and one column to the right each time. Below the last
+    # row come zeros, above which no pivot is chosen if there is another one.
+    rows = jnp.concatenate([rows, jnp.zeros((below + 1, width), rows.dtype)])
+    right = jnp.concatenate([right, jnp.zeros((below + 1, columns), right.dtype)])
+    first = [
+        jnp.concatenate([rows[m, below - m :], jnp.zeros(below - m, rows.dtype)])
+        for m in range(below + 1)
+    ]
+
+    def step(window, new):
+        A, b = window
+        # With NaN in it, the first NaN.
+        p = jnp.argmax(jnp.abs(A[:, 0]))
+        chosen = jnp.arange(below + 1) == p
+        pivot, y = (jnp.sum(jnp.where(chosen[:, None], x, 0), 0) for x in (A, b))
+        A, b = (
+            jnp.where(chosen[:, None], x[0], x) for x in (A, b)
+        )
+        factors = A[1:, 0] / pivot[0]
+        A = A[1:, 1:] - factors[:, None] * pivot[1:]
+        b = b[1:] - factors[:, None] * y
+        A = jnp.concatenate([A, jnp.zeros((below, 1), A.dtype)], 1)
+        window = (jnp.concatenate([A, new[0][None]]), jnp.concatenate([b, new[1][None]]))
+        return window, (pivot, y)
+
+    start = (jnp.stack(first), right[: below + 1])
+    _, (upper, y) = lax.scan(step, start, (rows[below + 1 :], right[below + 1 :]))
+
+    def backward(last, row):
+        numbers, x = row
+        for j in range(width - 1):
+            x = x - numbers[j + 1] * last[width - 2 - j]
+        x = x / numbers[0]
+        return _shifted(last, x), x
+
+    start = jnp.zeros((width - 1, columns), right.dtype)
+    return lax.scan(backward, start, (upper, y), reverse=True)[1]
+
+
+def solve(factors: Factors, rows: Array, right: Array, below: int) -> Array:
+    """The solutions by the factors, or with exchanges where they are weak."""
+    return lax.cond(
+        factors.weak,
+        lambda: with_exchanges(rows, right, below),
+        lambda: substitute(factors, right),
+    )
+
+
+def rows_of(diagonals: Sequence[Array], offsets: Sequence[int]) -> tuple[Array, int]:
+    """The rows, and how many diagonals are below the main one, of the matrix that has
+    ``diagonals[k][i]`` at (i, i + offsets[k])."""
+    below, above = max(0, -min(offsets)), max(0, *offsets)
+    of = dict(zip(offsets, diagonals, strict=True))
+    zero = jnp.zeros_like(diagonals[0])
+    return jnp.stack([of.get(d, zero) for d in range(-below, above + 1)], axis=1), below

@@ -1,0 +1,150 @@
+"""Matrices of which some diagonals are not zero by their structure: they are never written whole.
+
+A derivative by a unit vector is zero where no ``delta`` of its expression is true. That is known
+from the expressions, without a number.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+from ..jaxprs.jaxapi import ClosedJaxpr
+from .boxes import Array, Box, Expression, IndexMap
+from .tree import Memory
+
+Delta = tuple[tuple[int, ...], int]
+"""Strides and offset of a ``delta``."""
+
+MOST_DIAGONALS = 16
+"""A matrix with more of them is written whole."""
+
+_LINEAR = ("neg", "convert_element_type", "copy", "real", "reduce_precision", "div")
+
+
+def deltas(node: Expression) -> frozenset[Delta] | None:
+    """Deltas of which one is true wherever the expression is not zero; None if there are none."""
+    memory = node.table.deltas
+    if node.serial not in memory:
+        memory[node.serial] = _deltas(node)
+    return memory[node.serial]
+
+
+def _deltas(node: Expression) -> frozenset[Delta] | None:
+    if node.kind == "delta":
+        return frozenset([(node.strides, node.offset)])
+    if node.kind == "known":
+        return None if node.value else frozenset()
+    if node.kind != "operation":
+        return None
+    of = [deltas(arg) for arg in node.args]
+    name = node.name.split()[0]
+    if name in _LINEAR:
+        return of[0]
+    if name in ("mul", "and"):
+        return next((x for x in of if x is not None), None)
+    if name in ("add", "add_any", "sub", "or"):
+        return _union(of)
+    if name == "select_n":
+        # A delta chooses between zero and something.
+        if of[0] is not None and len(of) == 3 and of[1] is not None:
+            return of[1] | (of[0] if of[2] is None else of[2])
+        return _union(of[1:])
+    return None
+
+
+def _union(of: Sequence[frozenset[Delta] | None]) -> frozenset[Delta] | None:
+    if any(x is None for x in of):
+        return None
+    return frozenset().union(*of)  # pyright: ignore[reportArgumentType]
+
+
+def _where_true(node: Expression, delta: Delta, memory: dict[int, Expression | None]):
+    """The expression where this delta is true, and no other one; None for zero."""
+    if node.serial not in memory:
+        memory[node.serial] = _on(node, delta, memory)
+    return memory[node.serial]
+
+
+def _on(node: Expression, delta: Delta, memory: dict) -> Expression | None:
+    table = node.table
+    if node.kind == "delta":
+        return table.known(True, "bool") if (node.strides, node.offset) == delta else None
+    if node.kind == "known" and not node.value:
+        return None
+    if node.kind != "operation" or deltas(node) is None:
+        return node
+    args = [_where_true(arg, delta, memory) for arg in node.args]
+    name = node.name.split()[0]
+    if name in ("mul", "and", "div", *_LINEAR):
+        if any(x is None for x in args[: 2 if name in ("mul", "and") else 1]):
+            return None
+    if name in ("mul", "and"):
+        for x, y in (args, args[::-1]):
+            if x.kind == "known" and x.value == 1:
+                return y
+    elif name in ("add", "add_any", "or"):
+        if args[0] is None or args[1] is None:
+            return args[0] if args[1] is None else args[1]
+    elif name == "sub" and args[1] is None:
+        return args[0]
+    elif name == "sub" and args[0] is None:
+        return table.operation("neg", {}, [args[1]], node.dtype)
+    elif name == "select_n":
+        if args[0] is None or args[0].kind == "known":
+            return args[1] if args[0] is None else args[1 + int(args[0].value)]
+        if all(x is None for x in args[1:]):
+            return None
+    if any(x is None for x in args):
+        args = [table.known(0, old.dtype) if x is None else x for x, old in zip(args, node.args)]
+    if node.name == "convert_element_type" or node.name.startswith("convert_element_type "):
+        if args[0].kind == "known":
+            return table.known(args[0].value, node.dtype)
+    return table.expression("operation", node.dtype, tuple(args), node.name, value=node.value)
+
+
+def diagonals(matrix: Array) -> dict[int, Array] | None:
+    """Offset d → the array of the numbers at (i, i + d), for i = 0, …; zero outside of the matrix.
+    None for a matrix that has no such structure."""
+    if len(matrix.shape) != 2:
+        return None
+    rows, columns = matrix.shape
+    found: dict[int, list[Box]] = {}
+    for (top, left), (bottom, right), node in matrix.boxes:
+        of = deltas(node)
+        if of is None:
+            return None
+        for delta in of:
+            (s, t), offset = delta
+            # i − j + d = 0, in one of two signs.
+            if s + t or abs(s) != 1:
+                return None
+            d = offset * s
+            first, end = max(top, left - d), min(bottom, right - d)
+            value = _where_true(node, delta, {})
+            if first < end and value is not None:
+                moved = value.moved(IndexMap(1, ((1,), (1,)), (0, d)))
+                found.setdefault(d, []).append(Box((first,), (end,), moved))
+    zero = matrix.table.known(0, matrix.dtype)
+    return {d: _filled(boxes, rows, zero, matrix) for d, boxes in sorted(found.items())}
+
+
+def _filled(boxes: Sequence[Box], n: int, zero: Expression, like: Array) -> Array:
+    """The array of these boxes, with zero between them."""
+    parts, end = [], 0
+    for box in sorted(boxes, key=lambda box: box.lower):
+        if end < box.lower[0]:
+            parts.append(Box((end,), box.lower, zero))
+        parts.append(box)
+        (end,) = box.upper
+    if end < n:
+        parts.append(Box((end,), (n,), zero))
+    return Array(like.table, (n,), like.dtype, parts)
+
+
+def from_diagonals(of: dict[int, Array], shape: Sequence[int], dtype: str, table: Any) -> Array:
+    """The matrix with these diagonals, each of which has one expression."""
+    node = table.known(0, dtype)
+    index_map = IndexMap(2, ((1, 0),), (0,))
+    for d, x in of.items():
+        delta = table.expression("delta", "bool", strides=(1, -1), offset=d)
+        node = table.operation("select_n", {}, [delta, node, x.only.moved(index_map)], dtype)
+    return Array.uniform(node, shape)
