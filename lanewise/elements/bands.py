@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 
 LARGEST_FACTOR = 8.0
@@ -102,9 +103,7 @@ def with_exchanges(rows: Array, right: Array, below: int) -> Array:
         p = jnp.argmax(jnp.abs(A[:, 0]))
         chosen = jnp.arange(below + 1) == p
         pivot, y = (jnp.sum(jnp.where(chosen[:, None], x, 0), 0) for x in (A, b))
-        A, b = (
-            jnp.where(chosen[:, None], x[0], x) for x in (A, b)
-        )
+        A, b = (jnp.where(chosen[:, None], x[0], x) for x in (A, b))
         factors = A[1:, 0] / pivot[0]
         A = A[1:, 1:] - factors[:, None] * pivot[1:]
         b = b[1:] - factors[:, None] * y
@@ -126,8 +125,9 @@ def with_exchanges(rows: Array, right: Array, below: int) -> Array:
     return lax.scan(backward, start, (upper, y), reverse=True)[1]
 
 
-def solve(factors: Factors, rows: Array, right: Array, below: int) -> Array:
+def solve(factors: Factors, rows: Array, right: Array) -> Array:
     """The solutions by the factors, or with exchanges where they are weak."""
+    below = factors.lower.shape[1]
     return lax.cond(
         factors.weak,
         lambda: with_exchanges(rows, right, below),
@@ -135,10 +135,21 @@ def solve(factors: Factors, rows: Array, right: Array, below: int) -> Array:
     )
 
 
-def rows_of(diagonals: Sequence[Array], offsets: Sequence[int]) -> tuple[Array, int]:
-    """The rows, and how many diagonals are below the main one, of the matrix that has
-    ``diagonals[k][i]`` at (i, i + offsets[k])."""
-    below, above = max(0, -min(offsets)), max(0, *offsets)
-    of = dict(zip(offsets, diagonals, strict=True))
-    zero = jnp.zeros_like(diagonals[0])
-    return jnp.stack([of.get(d, zero) for d in range(-below, above + 1)], axis=1), below
+def rows_of(
+    diagonals: Sequence[Array], offsets: Sequence[int], below: int, above: int, order=None
+) -> Array:
+    """The rows of the matrix that has ``diagonals[k][i]`` at (i, i + offsets[k]); with `order`
+    those of the matrix in which row i and column i are the old ones ``order[i]``."""
+    n, columns = len(diagonals[0]), range(-below, above + 1)
+    if order is None:
+        zero, of = jnp.zeros_like(diagonals[0]), dict(zip(offsets, diagonals, strict=True))
+        return jnp.stack([of.get(d, zero) for d in columns], axis=1)
+    # For each number of a row of the band its diagonal in the old matrix, or the row of zeros.
+    table = np.full((n, len(columns)), len(offsets))
+    for j, step in enumerate(columns):
+        rows = np.arange(max(0, -step), min(n, n - step))
+        distance = order[rows + step] - order[rows]
+        for k, d in enumerate(offsets):
+            table[rows[distance == d], j] = k
+    values = jnp.stack([*diagonals, jnp.zeros_like(diagonals[0])])
+    return values[table, order[:, None]]

@@ -14,6 +14,9 @@ import numpy as np
 SHORT = 8
 """Axes of at most so many elements are written out; longer ones become loops."""
 
+MOST_PARTS = 16
+"""Boxes that a reshape makes at most; an array of more is written to memory."""
+
 _FUNCTIONS = (
     "sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp exp2 expm1 log log1p "
     "log2 cbrt erf erfc erf_inv logistic pow"
@@ -329,14 +332,86 @@ def _broadcast_in_dim(x: Array, *, shape, broadcast_dimensions) -> Array:
 def _reshape(x: Array, *, new_sizes, dimensions=None) -> Array:
     if dimensions is not None:
         x = _transpose(x, permutation=dimensions)
+    new_sizes = tuple(map(int, new_sizes))
+    if not x.size:
+        return Array(x.table, new_sizes, x.dtype, [])
+    if len(x.boxes) > MOST_PARTS:
+        raise NotABoxError
     old = [a for a, n in enumerate(x.shape) if n != 1]
     new = [k for k, n in enumerate(new_sizes) if n != 1]
-    if [x.shape[a] for a in old] != [new_sizes[k] for k in new]:
+    y = x.along([x.shape[a] for a in old], _places(old, len(x.shape)))
+    for axis, n in enumerate(new_sizes[k] for k in new):
+        # One axis becomes two, or two become one, until the sizes agree from the left.
+        while axis < len(y.shape) and y.shape[axis] != n:
+            y = _split_axis(y, axis, n) if y.shape[axis] > n else _join_axes(y, axis)
+    if y.shape != tuple(new_sizes[k] for k in new):
         raise NotABoxError
-    axes: list[int | None] = [None] * len(x.shape)
-    for a, k in zip(old, new, strict=True):
-        axes[a] = k
-    return x.along(new_sizes, axes)
+    return y.along(new_sizes, new)
+
+
+def _places(axes: Sequence[int], rank: int) -> list[int | None]:
+    """For each of `rank` axes its place in a list of some of them."""
+    return [axes.index(a) if a in axes else None for a in range(rank)]
+
+
+def _split_axis(x: Array, axis: int, count: int) -> Array:
+    """The axis as two, of which the first has `count` elements."""
+    size, rest = divmod(x.shape[axis], count)
+    if rest:
+        raise NotABoxError
+    shape = [*x.shape[:axis], count, size, *x.shape[axis + 1 :]]
+    others = [k + (k > axis) for k in range(len(x.shape))]
+    if all(low[axis] == 0 and end[axis] == x.shape[axis] for low, end, _ in x.boxes):
+        rows = [[int(k == other) for k in range(len(shape))] for other in others]
+        rows[axis][axis : axis + 2] = [size, 1]
+        index_map = IndexMap(len(shape), tuple(map(tuple, rows)), (0,) * len(others))
+        boxes = [
+            Box(
+                (*low[:axis], 0, 0, *low[axis + 1 :]),
+                (*end[:axis], count, size, *end[axis + 1 :]),
+                node.moved(index_map),
+            )
+            for low, end, node in x.boxes
+        ]
+        return Array(x.table, shape, x.dtype, boxes)
+    others[axis] = axis + 1
+    boxes = []
+    for i in range(_few(count, x)):
+        offsets = [i * size if k == axis else 0 for k in range(len(x.shape))]
+        part = x.along([n if k != axis else 1 for k, n in enumerate(shape)], others, offsets)
+        boxes += [_at(box, axis, i) for box in part.boxes]
+    return Array(x.table, shape, x.dtype, joined(boxes, len(shape)))
+
+
+def _join_axes(x: Array, axis: int) -> Array:
+    """Two neighbouring axes as one, if the first has few elements."""
+    if axis + 1 == len(x.shape):
+        raise NotABoxError
+    count, size = x.shape[axis : axis + 2]
+    shape = [*x.shape[:axis], count * size, *x.shape[axis + 2 :]]
+    boxes = []
+    for i in range(_few(count, x)):
+        axes = [None if k == axis else k - (k > axis) for k in range(len(x.shape))]
+        offsets = [i if k == axis else 0 for k in range(len(x.shape))]
+        part = x.along([size if k == axis else n for k, n in enumerate(shape)], axes, offsets)
+        # Moved to its place on the new axis.
+        rank = len(shape)
+        rows = [[int(k == a) for k in range(rank)] for a in range(rank)]
+        boxes += part.moved(shape, rows, [-i * size if k == axis else 0 for k in range(rank)]).boxes
+    return Array(x.table, shape, x.dtype, joined(boxes, len(shape)))
+
+
+def _few(count: int, x: Array) -> int:
+    if count * len(x.boxes) > MOST_PARTS:
+        raise NotABoxError
+    return count
+
+
+def _at(box: Box, axis: int, i: int) -> Box:
+    lower, upper, node = box
+    return Box(
+        (*lower[:axis], i, *lower[axis + 1 :]), (*upper[:axis], i + 1, *upper[axis + 1 :]), node
+    )
 
 
 def _squeeze(x: Array, *, dimensions) -> Array:

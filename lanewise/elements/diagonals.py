@@ -7,14 +7,12 @@ from the expressions, without a number.
 from collections.abc import Sequence
 from typing import Any
 
-from ..jaxprs.jaxapi import ClosedJaxpr
-from .boxes import Array, Box, Expression, IndexMap
-from .tree import Memory
+from .boxes import SHORT, Array, Box, Expression, IndexMap, elementwise
 
 Delta = tuple[tuple[int, ...], int]
 """Strides and offset of a ``delta``."""
 
-MOST_DIAGONALS = 16
+MOST_DIAGONALS = 40
 """A matrix with more of them is written whole."""
 
 _LINEAR = ("neg", "convert_element_type", "copy", "real", "reduce_precision", "div")
@@ -103,10 +101,10 @@ def _on(node: Expression, delta: Delta, memory: dict) -> Expression | None:
 
 def diagonals(matrix: Array) -> dict[int, Array] | None:
     """Offset d → the array of the numbers at (i, i + d), for i = 0, …; zero outside of the matrix.
-    None for a matrix that has no such structure."""
-    if len(matrix.shape) != 2:
+    None for an array that is no matrix or has no such structure."""
+    if len(matrix.shape) != 2 or min(matrix.shape) <= SHORT:
         return None
-    rows, columns = matrix.shape
+    n = matrix.shape[0]
     found: dict[int, list[Box]] = {}
     for (top, left), (bottom, right), node in matrix.boxes:
         of = deltas(node)
@@ -123,8 +121,10 @@ def diagonals(matrix: Array) -> dict[int, Array] | None:
             if first < end and value is not None:
                 moved = value.moved(IndexMap(1, ((1,), (1,)), (0, d)))
                 found.setdefault(d, []).append(Box((first,), (end,), moved))
+    if len(found) > MOST_DIAGONALS:
+        return None
     zero = matrix.table.known(0, matrix.dtype)
-    return {d: _filled(boxes, rows, zero, matrix) for d, boxes in sorted(found.items())}
+    return {d: _filled(boxes, n, zero, matrix) for d, boxes in sorted(found.items())}
 
 
 def _filled(boxes: Sequence[Box], n: int, zero: Expression, like: Array) -> Array:
@@ -141,10 +141,9 @@ def _filled(boxes: Sequence[Box], n: int, zero: Expression, like: Array) -> Arra
 
 
 def from_diagonals(of: dict[int, Array], shape: Sequence[int], dtype: str, table: Any) -> Array:
-    """The matrix with these diagonals, each of which has one expression."""
-    node = table.known(0, dtype)
-    index_map = IndexMap(2, ((1, 0),), (0,))
+    """The matrix with these diagonals."""
+    matrix = Array.uniform(table.known(0, dtype), shape)
     for d, x in of.items():
-        delta = table.expression("delta", "bool", strides=(1, -1), offset=d)
-        node = table.operation("select_n", {}, [delta, node, x.only.moved(index_map)], dtype)
-    return Array.uniform(node, shape)
+        delta = Array.uniform(table.expression("delta", "bool", strides=(1, -1), offset=d), shape)
+        matrix = elementwise("select_n", {}, [delta, matrix, x.along(shape, [0])], shape, dtype)
+    return matrix

@@ -24,7 +24,7 @@ from .boxes import (
     joined,
     repeat,
 )
-from .diagonals import MOST_DIAGONALS, diagonals, from_diagonals
+from .diagonals import diagonals, from_diagonals
 from .tree import Block, Let, Memory, Number, Place, Statement, Store
 
 EXPENSIVE = 16
@@ -137,11 +137,15 @@ class Translation:
         nodes = [box.expression for box in x.boxes]
         if all(node.kind in ("known", "number", "load", "index") for node in nodes):
             return x
-        of = diagonals(x)
-        if of is None or len(of) > MOST_DIAGONALS:
+        short, _, parts = x.components()
+        if any(diagonals(part) is None for part in parts.values()):
             return self.store(x)
-        # A matrix with a few diagonals is written as these.
-        stored = {d: self.store(diagonal) for d, diagonal in of.items()}
+        # Matrices with a few diagonals are written as these.
+        stored = {index: self._settle_diagonals(part) for index, part in parts.items()}
+        return self.from_components(stored, x.shape, short)
+
+    def _settle_diagonals(self, x: Array) -> Array:
+        stored = {d: self.settle(diagonal) for d, diagonal in diagonals(x).items()}
         return from_diagonals(stored, x.shape, x.dtype, self.table)
 
     def each_component(self, x: Array, function: Callable[[Array], Array]) -> Array:

@@ -131,14 +131,15 @@ def scan(
 def _readable(translation: Translation, x: Array) -> Array:
     """An array whose rows can be read by an index that is a number of the code."""
     node = x.expression
-    if node is not None and node.kind in ("known", "number"):
+    if not x.size or (node is not None and node.kind in ("known", "number")):
         return x
     return translation.in_memory(x)
 
 
 def _slice_at(translation: Translation, x: Array, k: Array) -> Array:
-    node = x.expression
-    assert node is not None
+    if not x.size:
+        return Array(x.table, x.shape[1:], x.dtype, [])
+    node = x.only
     if node.kind in ("known", "number"):
         return Array.uniform(node, x.shape[1:])
     distance = translation.apply("mul", k, translation.known(node.strides[0])).expression

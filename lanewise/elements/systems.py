@@ -1,9 +1,13 @@
 """Linear systems of long arrays: a band by its rows, others column by column."""
 
+import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
+import numpy as np
+from scipy import sparse
+from scipy.sparse import csgraph
 
 from ..linear import by_elimination, column_by_column
 from ..llvm.ir import NotCompilable
@@ -12,57 +16,105 @@ from .boxes import SHORT, Array
 from .diagonals import diagonals
 from .equations import ARRAY_RULES, Translation
 
-WIDEST = 12
+WIDEST = 32
 """Diagonals of a band, from the lowest to the highest; a wider one is solved as a full matrix."""
 
 _MOST_UNKNOWNS = 4096
+_MOST_ENTRIES = 10**7  # of a matrix for which another order is searched
+
+
+class Band(NamedTuple):
+    """How a matrix with some diagonals becomes a band: its rows and columns in another order.
+
+    - `order`: row i of the band is row ``order[i]`` of the matrix; None if the order stays.
+    - `below`, `above`: the diagonals of the band on each side of the main one.
+    """
+
+    order: np.ndarray | None
+    below: int
+    above: int
+
+    @property
+    def width(self) -> int:
+        return self.below + self.above + 1
+
+
+def band_of(diagonals: dict[int, Array], n: int) -> Band:
+    """The order of rows and columns in which the numbers are near the main diagonal."""
+    plain = Band(None, max(0, -min(diagonals)), max(0, *diagonals))
+    if plain.width <= WIDEST or n * len(diagonals) > _MOST_ENTRIES:
+        return plain
+    # The stages of a method, or the ends of a ring, are far from each other in the given order.
+    pairs = [
+        np.stack([i := np.arange(box.lower[0], box.upper[0]), i + d])
+        for d, x in diagonals.items()
+        for box in x.boxes
+        if not (box.expression.kind == "known" and not box.expression.value)
+    ]
+    rows, columns = np.concatenate(pairs, axis=1)
+    pattern = sparse.csr_matrix((np.ones(len(rows)), (rows, columns)), (n, n))
+    pattern = pattern + pattern.T
+    orders = [csgraph.reverse_cuthill_mckee(pattern, symmetric_mode=True)]
+    # It may begin in the middle, with twice the width: another order begins at an end.
+    far = csgraph.breadth_first_order(pattern, orders[0][0], False, False)[-1]
+    from_end = csgraph.breadth_first_order(pattern, far, False, False)
+    if len(from_end) == n:
+        orders.append(from_end)
+    return min((_in_order(order, rows, columns) for order in orders), key=lambda band: band.width)
+
+
+def _in_order(order: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> Band:
+    place = np.argsort(order)
+    steps = place[columns] - place[rows]
+    return Band(order, max(0, -int(steps.min())), max(0, int(steps.max())))
 
 
 def eliminate(translation: Translation, eqn: Any, matrix: Array, right: Array) -> list[Array]:
     *front, n, _ = matrix.shape
-    (out,) = eqn.outvars
-    if any(size != 1 for size in (*front, *out.aval.shape[:-1])):
+    shape = eqn.outvars[0].aval.shape
+    if any(size != 1 for size in (*front, *shape[:-1])):
         raise NotCompilable("several linear systems at once, of long arrays")
-    A = matrix.along((n, n), [*[None] * len(front), 0, 1])
     b = right.along((n,), [*[None] * (len(right.shape) - 1), 0])
-    of = diagonals(A)
-    if n > SHORT and of and max(0, *of) - min(0, *of) < WIDEST:
-        x = _of_band(translation, matrix, of, b)
-    elif n <= SHORT:
-        (x,) = _run(translation, by_elimination, [A, b])
+    if (factors := _factors(translation, matrix)) is not None:
+        band, values = factors
+        (x,) = _run(translation, functools.partial(_solution, band), [*values, b])
     else:
         if n > _MOST_UNKNOWNS:
             raise NotCompilable(f"a full matrix of {n} unknowns (at most {_MOST_UNKNOWNS})")
-        (x,) = _run(translation, column_by_column, [A, b])
-    shape = out.aval.shape
+        A = matrix.along((n, n), [*[None] * len(front), 0, 1])
+        solve = by_elimination if n <= SHORT else column_by_column
+        (x,) = _run(translation, solve, [A, b])
     return [x.along(shape, [len(shape) - 1])]
 
 
-def _of_band(
-    translation: Translation, matrix: Array, of: dict[int, Array], b: Array
-) -> Array:
+def _factors(translation: Translation, matrix: Array) -> tuple[Band, list[Array]] | None:
+    """The rows of a band and their factors; None for a matrix without one."""
     # Newton's method solves twice with one matrix: its factors are computed once in a block.
     key = id(matrix), id(translation.block)
     if key not in translation.factors:
-        offsets = list(of)
-        below = max(0, -min(offsets))
-
-        def factors(*diagonals):
-            rows, _ = bands.rows_of(diagonals, offsets)
-            return rows, *bands.factorise(rows, below)
-
-        values = _run(translation, factors, list(of.values()))
+        *front, n, _ = matrix.shape
+        found = None
+        of = diagonals(matrix.along((n, n), [*[None] * len(front), 0, 1])) if n > SHORT else None
+        if of and (band := band_of(of, n)).width <= WIDEST:
+            function = functools.partial(_factorised, band, list(of))
+            values = _run(translation, function, list(of.values()))
+            found = band, [translation.settle(x) for x in values]
         # With the matrix, so that no other one gets its identity.
-        translation.factors[key] = matrix, below, [translation.settle(x) for x in values]
+        translation.factors[key] = matrix, found
+    return translation.factors[key][1]
 
-    _, below, (rows, *factors) = translation.factors[key]
 
-    def solve(rows, *rest):
-        *factors, b = rest
-        return bands.solve(bands.Factors(*factors), rows, b[:, None], below)[:, 0]
+def _factorised(band: Band, offsets: Sequence[int], *of: jax.Array) -> Sequence[jax.Array]:
+    rows = bands.rows_of(of, offsets, band.below, band.above, band.order)
+    return rows, *bands.factorise(rows, band.below)
 
-    (x,) = _run(translation, solve, [rows, *factors, b])
-    return x
+
+def _solution(band: Band, rows, lower, inverse, upper, weak, b) -> list[jax.Array]:
+    factors = bands.Factors(lower, inverse, upper, weak)
+    if band.order is None:
+        return [bands.solve(factors, rows, b[:, None])[:, 0]]
+    x = bands.solve(factors, rows, b[band.order][:, None])[:, 0]
+    return [x[np.argsort(band.order)]]
 
 
 def _run(translation: Translation, function: Callable, args: Sequence[Array]) -> list[Array]:
