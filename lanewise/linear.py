@@ -101,8 +101,8 @@ def column_by_column(A: Array, b: Array) -> Array:
 
     def eliminate(c, state: _Columns):
         chosen = numbers == state.pivot
-        changed = state.rows - state.column[:, None] * state.pivot_row
-        rows = jnp.where(chosen[:, None], state.pivot_row, changed)
+        changed = state.rows - state.column[:, None] * state.pivot_row[None]
+        rows = jnp.where(chosen[:, None], state.pivot_row[None], changed)
         order = jnp.where(numbers == c, state.pivot, state.order)
         return choose(jnp.minimum(c + 1, n - 1), rows, state.used | chosen, order)
 

@@ -86,7 +86,7 @@ def _shifted(last: Array, new: Array) -> Array:
 
 def with_exchanges(rows: Array, right: Array, below: int) -> Array:
     """The solutions by partial pivoting: in each column the largest of its below + 1 numbers."""
-    n, width = rows.shape
+    width = rows.shape[1]
     columns = right.shape[1]
     # A window of below + 1 rows moves down, and one column to the right each time. Below the last
     # row come zeros, above which no pivot is chosen if there is another one.
@@ -103,10 +103,10 @@ def with_exchanges(rows: Array, right: Array, below: int) -> Array:
         p = jnp.argmax(jnp.abs(A[:, 0]))
         chosen = jnp.arange(below + 1) == p
         pivot, y = (jnp.sum(jnp.where(chosen[:, None], x, 0), 0) for x in (A, b))
-        A, b = (jnp.where(chosen[:, None], x[0], x) for x in (A, b))
+        A, b = (jnp.where(chosen[:, None], x[:1], x) for x in (A, b))
         factors = A[1:, 0] / pivot[0]
-        A = A[1:, 1:] - factors[:, None] * pivot[1:]
-        b = b[1:] - factors[:, None] * y
+        A = A[1:, 1:] - factors[:, None] * pivot[None, 1:]
+        b = b[1:] - factors[:, None] * y[None]
         A = jnp.concatenate([A, jnp.zeros((below, 1), A.dtype)], 1)
         window = (jnp.concatenate([A, new[0][None]]), jnp.concatenate([b, new[1][None]]))
         return window, (pivot, y)

@@ -137,8 +137,15 @@ class Table:
         value: Any = None,
         key: Any = None,
     ) -> Expression:
-        if kind == "delta" and not any(strides):
-            return self.known(offset == 0, dtype)
+        if kind == "delta":
+            # In one form for each condition: those of other offsets exclude each other.
+            factor = math.gcd(*strides) if any(strides) else 0
+            if offset % factor if factor else offset:
+                return self.known(False, dtype)
+            if not factor:
+                return self.known(True, dtype)
+            factor *= 1 if next(filter(None, strides)) > 0 else -1
+            strides, offset = tuple(s // factor for s in strides), offset // factor
         # An operation's parameters are part of its name; other values have a key or are objects.
         identity = key if key is not None else None if kind == "operation" else id(value)
         full = (kind, dtype, tuple(a.serial for a in args), name, strides, offset, identity)

@@ -37,7 +37,7 @@ def _deltas(node: Expression) -> frozenset[Delta] | None:
     name = node.name.split()[0]
     if name in _LINEAR:
         return of[0]
-    if name in ("mul", "and"):
+    if name == "mul" or (name == "and" and node.dtype == "bool"):
         return next((x for x in of if x is not None), None)
     if name in ("add", "add_any", "sub", "or"):
         return _union(of)
@@ -56,47 +56,46 @@ def _union(of: Sequence[frozenset[Delta] | None]) -> frozenset[Delta] | None:
 
 
 def _where_true(node: Expression, delta: Delta, memory: dict[int, Expression | None]):
-    """The expression where this delta is true, and no other one; None for zero."""
+    """The expression where this delta is true; None for zero."""
     if node.serial not in memory:
-        memory[node.serial] = _on(node, delta, memory)
+        memory[node.serial] = _reduced(node, delta, memory)
     return memory[node.serial]
 
 
-def _on(node: Expression, delta: Delta, memory: dict) -> Expression | None:
+def _reduced(node: Expression, delta: Delta, memory: dict) -> Expression | None:
     table = node.table
     if node.kind == "delta":
-        return table.known(True, "bool") if (node.strides, node.offset) == delta else None
+        # Where one is true, others of the same strides are false.
+        if node.strides != delta[0]:
+            return node
+        return table.known(True, "bool") if node.offset == delta[1] else None
     if node.kind == "known" and not node.value:
         return None
     if node.kind != "operation" or deltas(node) is None:
         return node
     args = [_where_true(arg, delta, memory) for arg in node.args]
-    name = node.name.split()[0]
-    if name in ("mul", "and", "div", *_LINEAR):
-        if any(x is None for x in args[: 2 if name in ("mul", "and") else 1]):
+    present, name = [x for x in args if x is not None], node.name.split()[0]
+    is_product = name == "mul" or (name == "and" and node.dtype == "bool")
+    if name == "select_n":
+        which = args[0]
+        if which is None or which.kind == "known":
+            return args[1] if which is None else args[1 + int(which.value)]
+        if len(present) == 1:
             return None
-    if name in ("mul", "and"):
-        for x, y in (args, args[::-1]):
+    elif not present or (is_product and len(present) < 2) or (name == "div" and args[0] is None):
+        return None
+    elif is_product:
+        for x, y in (present, present[::-1]):
             if x.kind == "known" and x.value == 1:
                 return y
-    elif name in ("add", "add_any", "or"):
-        if args[0] is None or args[1] is None:
-            return args[0] if args[1] is None else args[1]
-    elif name == "sub" and args[1] is None:
-        return args[0]
-    elif name == "sub" and args[0] is None:
-        return table.operation("neg", {}, [args[1]], node.dtype)
-    elif name == "select_n":
-        if args[0] is None or args[0].kind == "known":
-            return args[1] if args[0] is None else args[1 + int(args[0].value)]
-        if all(x is None for x in args[1:]):
-            return None
-    if any(x is None for x in args):
-        args = [table.known(0, old.dtype) if x is None else x for x, old in zip(args, node.args)]
-    if node.name == "convert_element_type" or node.name.startswith("convert_element_type "):
-        if args[0].kind == "known":
-            return table.known(args[0].value, node.dtype)
-    return table.expression("operation", node.dtype, tuple(args), node.name, value=node.value)
+    elif len(present) == 1 and name in ("add", "add_any", "or", "sub"):
+        is_negative = name == "sub" and args[0] is None
+        return table.operation("neg", {}, present, node.dtype) if is_negative else present[0]
+    elif name == "convert_element_type" and present[0].kind == "known":
+        return table.known(present[0].value, node.dtype)
+    pairs = zip(args, node.args, strict=True)
+    new = tuple(table.known(0, old.dtype) if x is None else x for x, old in pairs)
+    return table.expression("operation", node.dtype, new, node.name, value=node.value)
 
 
 def diagonals(matrix: Array) -> dict[int, Array] | None:
@@ -111,11 +110,9 @@ def diagonals(matrix: Array) -> dict[int, Array] | None:
         if of is None:
             return None
         for delta in of:
-            (s, t), offset = delta
-            # i − j + d = 0, in one of two signs.
-            if s + t or abs(s) != 1:
+            strides, d = delta
+            if strides != (1, -1):  # i − j + d = 0
                 return None
-            d = offset * s
             first, end = max(top, left - d), min(bottom, right - d)
             value = _where_true(node, delta, {})
             if first < end and value is not None:

@@ -57,6 +57,7 @@ class Translation:
         self.operands: list[tuple[Memory, np.ndarray]] = []
         self._constants: dict[Any, Array] = {}
         self.factors: dict[Any, Any] = {}  # of linear systems that are solved again
+        self.branches = 0  # around the block
 
     # --- values --------------------------------------------------------------------------------
 
@@ -138,15 +139,15 @@ class Translation:
         if all(node.kind in ("known", "number", "load", "index") for node in nodes):
             return x
         short, _, parts = x.components()
-        if any(diagonals(part) is None for part in parts.values()):
-            return self.store(x)
         # Matrices with a few diagonals are written as these.
-        stored = {index: self._settle_diagonals(part) for index, part in parts.items()}
-        return self.from_components(stored, x.shape, short)
-
-    def _settle_diagonals(self, x: Array) -> Array:
-        stored = {d: self.settle(diagonal) for d, diagonal in diagonals(x).items()}
-        return from_diagonals(stored, x.shape, x.dtype, self.table)
+        matrices = {}
+        for index, part in parts.items():
+            of = diagonals(part)
+            if of is None:
+                return self.store(x)
+            settled = {d: self.settle(diagonal) for d, diagonal in of.items()}
+            matrices[index] = from_diagonals(settled, part.shape, x.dtype, self.table)
+        return self.from_components(matrices, x.shape, short)
 
     def each_component(self, x: Array, function: Callable[[Array], Array]) -> Array:
         """A written-out array with a function of its numbers."""

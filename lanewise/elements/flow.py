@@ -217,6 +217,7 @@ def cond(
             results.append(Memory(aval.shape, aval.dtype).load(table))
         numbers.append(of)
     expressions: dict[Number, list] = {n: [] for of in numbers for n in of}
+    translation.branches += 1
     for block, function in zip(branch.blocks, branches, strict=True):
         with _Within(translation, block):
             outs = translation.evaluate(function, operands)
@@ -227,6 +228,7 @@ def cond(
                         expressions[number].append(part.only)
                 elif is_used and x.size:
                     translation.store(x, result.expression.value.place)
+    translation.branches -= 1
     branch.numbers = list(expressions.items())
     translation.add(branch)
     return results

@@ -9,6 +9,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph
 
+from ..jaxprs.extent import LARGE_SYSTEM
 from ..linear import by_elimination, column_by_column
 from ..llvm.ir import NotCompilable
 from . import bands
@@ -19,7 +20,7 @@ from .equations import ARRAY_RULES, Translation
 WIDEST = 32
 """Diagonals of a band, from the lowest to the highest; a wider one is solved as a full matrix."""
 
-_MOST_UNKNOWNS = 4096
+_MOST_UNKNOWNS = 4096  # of a full matrix, in a branch
 _MOST_ENTRIES = 10**7  # of a matrix for which another order is searched
 
 
@@ -79,8 +80,10 @@ def eliminate(translation: Translation, eqn: Any, matrix: Array, right: Array) -
         band, values = factors
         (x,) = _run(translation, functools.partial(_solution, band), [*values, b])
     else:
-        if n > _MOST_UNKNOWNS:
-            raise NotCompilable(f"a full matrix of {n} unknowns (at most {_MOST_UNKNOWNS})")
+        # A branch may be for rare cases, such as Newton's method where a simpler one fails.
+        most = _MOST_UNKNOWNS if translation.branches else LARGE_SYSTEM
+        if n > most:
+            raise NotCompilable(f"a full matrix of {n} unknowns: LAPACK is faster (up to {most})")
         A = matrix.along((n, n), [*[None] * len(front), 0, 1])
         solve = by_elimination if n <= SHORT else column_by_column
         (x,) = _run(translation, solve, [A, b])

@@ -80,16 +80,27 @@ _MOVES = (
 _FREE = frozenset(_MOVES.split())
 
 
-LONG_CARRY, LONG_VALUE = 48, 4096
+LONG_CARRY, LONG_VALUE, LARGE_SYSTEM = 48, 4096, 32
 
 
 def has_long_arrays(jaxpr: Any) -> bool:
     """Whether a loop carries an array of more than 48 elements, or computes one of more than 4096
     in a round; without any loop, whether an array of more than 48 elements is computed.
 
-    Rows that a loop collects do not count, nor what is done to them after it.
+    Rows that a loop collects do not count, nor what is done to them after it. A linear system of
+    more than 32 unknowns has long arrays, too.
     """
-    return _has_long_loop(jaxpr) or (not _has_loop(jaxpr) and _longest(jaxpr) > LONG_CARRY)
+    if _has_long_loop(jaxpr) or _has_large_system(jaxpr):
+        return True
+    return not _has_loop(jaxpr) and _longest(jaxpr) > LONG_CARRY
+
+
+def _has_large_system(jaxpr: Any) -> bool:
+    return any(
+        (eqn.primitive.name == "eliminate" and eqn.invars[0].aval.shape[-1] > LARGE_SYSTEM)
+        or any(_has_large_system(f.jaxpr) for f in (*bodies(eqn), *functions_in(eqn)))
+        for eqn in jaxpr.eqns
+    )
 
 
 def _has_long_loop(jaxpr: Any) -> bool:
