@@ -39,7 +39,7 @@ def bodies(t0, t1, q0, p1, args):
 
 def fput_energy(t, q, p, args):
     """Energy of the FPUT chain."""
-    return systems.fput(2).system.hamiltonian(t, t, q, p, args)
+    return systems.fput(2).system.hamiltonian(t, t, q, p, 0.0, args)
 
 
 class Case(NamedTuple):

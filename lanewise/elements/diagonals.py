@@ -19,7 +19,7 @@ _LINEAR = ("neg", "convert_element_type", "copy", "real", "reduce_precision", "d
 
 
 def deltas(node: Expression) -> frozenset[Delta] | None:
-    """Deltas of which one is true wherever the expression is not zero; None if there are none."""
+    """Deltas of which one is true wherever the expression is not zero; None without such deltas."""
     memory = node.table.deltas
     if node.serial not in memory:
         memory[node.serial] = _deltas(node)

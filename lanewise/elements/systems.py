@@ -6,8 +6,6 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from scipy import sparse
-from scipy.sparse import csgraph
 
 from ..jaxprs.extent import LARGE_SYSTEM
 from ..linear import by_elimination, column_by_column
@@ -45,6 +43,9 @@ def band_of(diagonals: dict[int, Array], n: int) -> Band:
     plain = Band(None, max(0, -min(diagonals)), max(0, *diagonals))
     if plain.width <= WIDEST or n * len(diagonals) > _MOST_ENTRIES:
         return plain
+    from scipy import sparse  # few programs need it: a part of the import time
+    from scipy.sparse import csgraph
+
     # The stages of a method, or the ends of a ring, are far from each other in the given order.
     pairs = [
         np.stack([i := np.arange(box.lower[0], box.upper[0]), i + d])

@@ -85,7 +85,8 @@ LONG_CARRY, LONG_VALUE, LARGE_SYSTEM = 48, 4096, 32
 
 def has_long_arrays(jaxpr: Any) -> bool:
     """Whether a loop carries an array of more than 48 elements, or computes one of more than 4096
-    in a round; without any loop, whether an array of more than 48 elements is computed.
+    in a round, or both with limits of 32 and 400; without any loop, whether an array of more than
+    48 elements is computed.
 
     Rows that a loop collects do not count, nor what is done to them after it. A linear system of
     more than 32 unknowns has long arrays, too.
@@ -106,8 +107,11 @@ def _has_large_system(jaxpr: Any) -> bool:
 def _has_long_loop(jaxpr: Any) -> bool:
     for eqn in jaxpr.eqns:
         if eqn.primitive.name in _LOOPS:
-            values = [_longest(body.jaxpr) for body in bodies(eqn)]
-            if _carried(eqn) > LONG_CARRY or max(values) > LONG_VALUE:
+            value, carried = max(_longest(body.jaxpr) for body in bodies(eqn)), _carried(eqn)
+            if carried > LONG_CARRY or value > LONG_VALUE:
+                return True
+            # Twelve bodies: twice as fast in array loops, alone and in a batch.
+            if carried > 32 and value > 400:
                 return True
         if any(_has_long_loop(f.jaxpr) for f in (*bodies(eqn), *functions_in(eqn))):
             return True
