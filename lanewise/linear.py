@@ -100,11 +100,11 @@ def column_by_column(A: Array, b: Array) -> Array:
         return _Columns(rows, column, p, pivot_row, used, order)
 
     def eliminate(c, state: _Columns):
-        chosen = numbers == state.pivot
-        changed = state.rows - state.column[:, None] * state.pivot_row[None]
-        rows = jnp.where(chosen[:, None], state.pivot_row[None], changed)
+        mask = numbers == state.pivot
+        difference = state.rows - state.column[:, None] * state.pivot_row[None]
+        rows = jnp.where(mask[:, None], state.pivot_row[None], difference)
         order = jnp.where(numbers == c, state.pivot, state.order)
-        return choose(jnp.minimum(c + 1, n - 1), rows, state.used | chosen, order)
+        return choose(jnp.minimum(c + 1, n - 1), rows, state.used | mask, order)
 
     rows = jnp.concatenate([A, b[:, None]], axis=1)
     start = choose(0, rows, jnp.zeros(n, bool), jnp.zeros(n, int))

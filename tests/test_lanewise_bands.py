@@ -13,25 +13,25 @@ from dvi_jax.base.results import status_code
 from lanewise.elements import bands
 
 
-def band(n, below, above, diagonal, seed=0):
+def band(n, low, high, diagonal, seed=0):
     """A random band matrix, and its rows."""
     rng = np.random.default_rng(seed)
-    A, rows = np.zeros((n, n)), np.zeros((n, below + above + 1))
+    A, rows = np.zeros((n, n)), np.zeros((n, low + high + 1))
     for i in range(n):
-        for j in range(max(0, i - below), min(n, i + above + 1)):
-            A[i, j] = rows[i, j - i + below] = rng.normal() + diagonal * (i == j)
+        for j in range(max(0, i - low), min(n, i + high + 1)):
+            A[i, j] = rows[i, j - i + low] = rng.normal() + diagonal * (i == j)
     return A, jnp.asarray(rows)
 
 
-@pytest.mark.parametrize(("below", "above"), [(0, 0), (1, 1), (3, 0), (1, 3)])
-def test_a_band_is_solved_as_numpy_solves_it(below, above):
-    A, rows = band(40, below, above, 6.0)
+@pytest.mark.parametrize(("low", "high"), [(0, 0), (1, 1), (3, 0), (1, 3)])
+def test_a_band_is_solved_as_numpy_solves_it(low, high):
+    A, rows = band(40, low, high, 6.0)
     b = np.random.default_rng(1).normal(size=(40, 2))
     exact = np.linalg.solve(A, b)
-    factors = bands.factorise(rows, below)
+    factors = bands.factorise(rows, low)
     assert not factors.weak
     np.testing.assert_allclose(bands.substitute(factors, jnp.asarray(b)), exact, 0, 1e-14)
-    np.testing.assert_allclose(bands.with_exchanges(rows, jnp.asarray(b), below), exact, 0, 1e-14)
+    np.testing.assert_allclose(bands.with_exchanges(rows, jnp.asarray(b), low), exact, 0, 1e-14)
 
 
 def test_rows_are_exchanged_where_factors_are_large():

@@ -35,7 +35,7 @@ class Contraction(RootSolver):
     ) -> RootInfo:
         """x ← x − correction(x) from x0 until it is good to round-off, or the iteration is stopped:
         after `max_steps`, for a number that is not finite, or once a correction, relative to the
-        scales, exceeds `slowest` times the one before."""
+        scales, exceeds `slowest` times the one state."""
 
         def proceed(state: _Iterate):
             return ~state.converged & state.goes_on & (state.iterations < self.max_steps)
@@ -62,8 +62,8 @@ class Contraction(RootSolver):
         # There is no correction before the first one: every comparison with NaN is false.
         nans, scale = jnp.full_like(x0, jnp.nan), scales.represented_size
         size, none = largest(jnp.maximum(scale, jnp.abs(x0))), jnp.zeros(x0.shape, bool)
-        nothing = jnp.zeros_like(size)
-        start = _Iterate(x0, nans, none, size, nothing, nothing, nothing, zero, no, ~no)
+        zero_size = jnp.zeros_like(size)
+        start = _Iterate(x0, nans, none, size, zero_size, zero_size, zero_size, zero, no, ~no)
         end = lax.while_loop(proceed, improve, start)
         # With corrections that shrink by θ = δ_k / δ_{k−1} the sum of all further ones is
         # δ_k θ/(1 − θ), which is the error of x. It is the residual: the Jacobian is near the
@@ -74,17 +74,17 @@ class Contraction(RootSolver):
         residual = jnp.stack([error, end.size])
         return RootInfo(end.x, end.iterations, residual, end.converged)
 
-    def _verdict(self, x: Vector, x0: Vector, scales: Scales, before: "_Iterate", last, iterations):
+    def _verdict(self, x: Vector, x0: Vector, scales: Scales, state: "_Iterate", last, iterations):
         """For each component of x after some iterations from x0: is it good, is it only round-off,
-        and its scale, from its last correction and what was known `before`."""
-        finfo, previous = jnp.finfo(x.dtype), before.last
+        and its scale, from its last correction and what was known before."""
+        finfo, previous = jnp.finfo(x.dtype), state.last
         eps = float(finfo.eps)
         scale = jnp.maximum(scales.represented_size, jnp.abs(x))
         tolerance = (eps / 16 if self.rtol is None else self.rtol) * scale
         if self.atol:
             tolerance += self.atol
         # The error δ_k θ/(1 − θ) is at most the tolerance: as products, for a division takes longer
-        # than all the rest. Below the range of normal numbers products say nothing.
+        # than all the rest. Below the range of normal numbers products say zero_size.
         bound = tolerance * (previous - last)
         is_accurate = (bound > float(finfo.tiny)) & (last * last <= bound)
         if self.rtol is not None or self.atol:
@@ -96,7 +96,7 @@ class Contraction(RootSolver):
         at_rest = last <= eps * jnp.where((last >= 0.5 * previous) | was_fast, 4, 1) * scale
         # A small component that is coupled to large ones inherits their round-off. It never settles
         # relative to its own size, and is good once it no longer shrinks.
-        round_off = last <= 64 * eps * scale + 4 * eps * before.size
+        round_off = last <= 64 * eps * scale + 4 * eps * state.size
         return is_accurate | at_rest | (round_off & (last >= previous)), round_off, scale
 
 

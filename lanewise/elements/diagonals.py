@@ -58,11 +58,11 @@ def _union(of: Sequence[frozenset[Delta] | None]) -> frozenset[Delta] | None:
 def _where_true(node: Expression, delta: Delta, memory: dict[int, Expression | None]):
     """The expression where this delta is true; None for zero."""
     if node.serial not in memory:
-        memory[node.serial] = _reduced(node, delta, memory)
+        memory[node.serial] = _value_where(node, delta, memory)
     return memory[node.serial]
 
 
-def _reduced(node: Expression, delta: Delta, memory: dict) -> Expression | None:
+def _value_where(node: Expression, delta: Delta, memory: dict) -> Expression | None:
     table = node.table
     if node.kind == "delta":
         # Where one is true, others of the same strides are false.
@@ -77,9 +77,9 @@ def _reduced(node: Expression, delta: Delta, memory: dict) -> Expression | None:
     present, name = [x for x in args if x is not None], node.name.split()[0]
     is_product = name == "mul" or (name == "and" and node.dtype == "bool")
     if name == "select_n":
-        which = args[0]
-        if which is None or which.kind == "known":
-            return args[1] if which is None else args[1 + int(which.value)]
+        choice = args[0]
+        if choice is None or choice.kind == "known":
+            return args[1] if choice is None else args[1 + int(choice.value)]
         if len(present) == 1:
             return None
     elif not present or (is_product and len(present) < 2) or (name == "div" and args[0] is None):
@@ -104,7 +104,7 @@ def diagonals(matrix: Array) -> dict[int, Array] | None:
     if len(matrix.shape) != 2 or min(matrix.shape) <= SHORT:
         return None
     n = matrix.shape[0]
-    found: dict[int, list[Box]] = {}
+    boxes_of: dict[int, list[Box]] = {}
     for (top, left), (bottom, right), node in matrix.boxes:
         of = deltas(node)
         if of is None:
@@ -116,15 +116,15 @@ def diagonals(matrix: Array) -> dict[int, Array] | None:
             first, end = max(top, left - d), min(bottom, right - d)
             value = _where_true(node, delta, {})
             if first < end and value is not None:
-                moved = value.moved(IndexMap(1, ((1,), (1,)), (0, d)))
-                found.setdefault(d, []).append(Box((first,), (end,), moved))
-    if len(found) > MOST_DIAGONALS:
+                part = value.moved(IndexMap(1, ((1,), (1,)), (0, d)))
+                boxes_of.setdefault(d, []).append(Box((first,), (end,), part))
+    if len(boxes_of) > MOST_DIAGONALS:
         return None
     zero = matrix.table.known(0, matrix.dtype)
-    return {d: _filled(boxes, n, zero, matrix) for d, boxes in sorted(found.items())}
+    return {d: _array_of(boxes, n, zero, matrix) for d, boxes in sorted(boxes_of.items())}
 
 
-def _filled(boxes: Sequence[Box], n: int, zero: Expression, like: Array) -> Array:
+def _array_of(boxes: Sequence[Box], n: int, zero: Expression, like: Array) -> Array:
     """The array of these boxes, with zero between them."""
     parts, end = [], 0
     for box in sorted(boxes, key=lambda box: box.lower):

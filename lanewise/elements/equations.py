@@ -14,7 +14,6 @@ from ..llvm.ir import NotCompilable, check_type
 from ..rules.elementwise import ELEMENTWISE
 from ..rules.moves import CALLS
 from .boxes import (
-    BOX_MOVES,
     Array,
     Box,
     Expression,
@@ -25,6 +24,7 @@ from .boxes import (
     repeat,
 )
 from .diagonals import diagonals, from_diagonals
+from .moves import BOX_MOVES
 from .tree import Block, Let, Memory, Number, Place, Statement, Store
 
 EXPENSIVE = 16
@@ -145,8 +145,8 @@ class Translation:
             of = diagonals(part)
             if of is None:
                 return self.store(x)
-            settled = {d: self.settle(diagonal) for d, diagonal in of.items()}
-            matrices[index] = from_diagonals(settled, part.shape, x.dtype, self.table)
+            stored = {d: self.settle(diagonal) for d, diagonal in of.items()}
+            matrices[index] = from_diagonals(stored, part.shape, x.dtype, self.table)
         return self.from_components(matrices, x.shape, short)
 
     def each_component(self, x: Array, function: Callable[[Array], Array]) -> Array:

@@ -26,16 +26,16 @@ class Band(NamedTuple):
     """How a matrix with some diagonals becomes a band: its rows and columns in another order.
 
     - `order`: row i of the band is row ``order[i]`` of the matrix; None if the order stays.
-    - `below`, `above`: the diagonals of the band on each side of the main one.
+    - `low`, `high`: diagonals of the band below and above the main one.
     """
 
     order: np.ndarray | None
-    below: int
-    above: int
+    low: int
+    high: int
 
     @property
     def width(self) -> int:
-        return self.below + self.above + 1
+        return self.low + self.high + 1
 
 
 def band_of(diagonals: dict[int, Array], n: int) -> Band:
@@ -82,9 +82,9 @@ def eliminate(translation: Translation, eqn: Any, matrix: Array, right: Array) -
         (x,) = _run(translation, functools.partial(_solution, band), [*values, b])
     else:
         # A branch may be for rare cases, such as Newton's method where a simpler one fails.
-        most = _MOST_UNKNOWNS if translation.branches else LARGE_SYSTEM
-        if n > most:
-            raise NotCompilable(f"a full matrix of {n} unknowns: LAPACK is faster (up to {most})")
+        limit = _MOST_UNKNOWNS if translation.branches else LARGE_SYSTEM
+        if n > limit:
+            raise NotCompilable(f"a full matrix of {n} unknowns, more than {limit}: LAPACK is faster")
         A = matrix.along((n, n), [*[None] * len(front), 0, 1])
         solve = by_elimination if n <= SHORT else column_by_column
         (x,) = _run(translation, solve, [A, b])
@@ -97,20 +97,20 @@ def _factors(translation: Translation, matrix: Array) -> tuple[Band, list[Array]
     key = id(matrix), id(translation.block)
     if key not in translation.factors:
         *front, n, _ = matrix.shape
-        found = None
+        factors = None
         of = diagonals(matrix.along((n, n), [*[None] * len(front), 0, 1])) if n > SHORT else None
         if of and (band := band_of(of, n)).width <= WIDEST:
-            function = functools.partial(_factorised, band, list(of))
+            function = functools.partial(_band_factors, band, list(of))
             values = _run(translation, function, list(of.values()))
-            found = band, [translation.settle(x) for x in values]
+            factors = band, [translation.settle(x) for x in values]
         # With the matrix, so that no other one gets its identity.
-        translation.factors[key] = matrix, found
+        translation.factors[key] = matrix, factors
     return translation.factors[key][1]
 
 
-def _factorised(band: Band, offsets: Sequence[int], *of: jax.Array) -> Sequence[jax.Array]:
-    rows = bands.rows_of(of, offsets, band.below, band.above, band.order)
-    return rows, *bands.factorise(rows, band.below)
+def _band_factors(band: Band, offsets: Sequence[int], *of: jax.Array) -> Sequence[jax.Array]:
+    rows = bands.rows_of(of, offsets, band.low, band.high, band.order)
+    return rows, *bands.factorise(rows, band.low)
 
 
 def _solution(band: Band, rows, lower, inverse, upper, weak, b) -> list[jax.Array]:

@@ -107,11 +107,11 @@ def _has_large_system(jaxpr: Any) -> bool:
 def _has_long_loop(jaxpr: Any) -> bool:
     for eqn in jaxpr.eqns:
         if eqn.primitive.name in _LOOPS:
-            value, carried = max(_longest(body.jaxpr) for body in bodies(eqn)), _carried(eqn)
-            if carried > LONG_CARRY or value > LONG_VALUE:
+            value, carry = max(_longest(body.jaxpr) for body in bodies(eqn)), _carried(eqn)
+            if carry > LONG_CARRY or value > LONG_VALUE:
                 return True
             # Twelve bodies: twice as fast in array loops, alone and in a batch.
-            if carried > 32 and value > 400:
+            if carry > 32 and value > 400:
                 return True
         if any(_has_long_loop(f.jaxpr) for f in (*bodies(eqn), *functions_in(eqn))):
             return True
