@@ -156,8 +156,8 @@ def test_the_rule_of_choice_reads_the_program():
 
         return jax.lax.scan(step, x, None, length=3)[0]
 
-    assert not has_long_arrays(jax.make_jaxpr(pairs)(jnp.zeros(40)).jaxpr)
-    assert has_long_arrays(jax.make_jaxpr(pairs)(jnp.zeros(48 + 17)).jaxpr)
+    assert not has_long_arrays(jax.make_jaxpr(pairs)(jnp.zeros(32)).jaxpr)
+    assert has_long_arrays(jax.make_jaxpr(pairs)(jnp.zeros(33)).jaxpr)
     assert not has_long_arrays(jax.make_jaxpr(jnp.sin)(jnp.zeros(48)).jaxpr)
     assert has_long_arrays(jax.make_jaxpr(jnp.sin)(jnp.zeros(49)).jaxpr)
 
