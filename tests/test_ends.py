@@ -303,3 +303,59 @@ def test_a_loss_that_uses_nan_has_no_number_as_gradient_by_closed_over_values():
     assert jnp.isnan(slope(1.0, failing, True))
     assert slope(1.0, failing, False) == 0
     assert abs(slope(1.0, good, True)) > 1e-3
+
+
+# Values that a run does not have: the loss uses one of the trajectory that has no such value.
+MISSING = {
+    "stop": ({"stop": dvi.Stop(lambda q, p: 0.4 - q[0])}, lambda sol: sol.stop.q[0]),
+    "time": ({"stop": dvi.Stop(lambda q, p: 0.4 - q[0])}, lambda sol: sol.stop.t),
+    "section": (
+        {"observe": dvi.Section(lambda q, p: q[0] - 0.4, 0)},
+        lambda s: s.observed.qs[0, 0],
+    ),
+    "requested": ({"save": dvi.Save(ts=[0.4, 1.2])}, lambda sol: sol.qs[1, 0]),
+    "state": ({}, lambda sol: sol.qs[-1, 0]),
+    "observed": ({"observe": lambda t, q, p, k: k * q[0]}, lambda sol: sol.observed[-1]),
+    "root": ({"observe": lambda q, p: jnp.sqrt(q[0] - 0.1)}, lambda sol: sol.observed[5]),
+    "mean": ({"observe": dvi.Mean(lambda q, p: jnp.sqrt(q[0] - 0.1))}, lambda sol: sol.observed),
+    "infinite": ({"observe": lambda q, p: jnp.exp(1e4 * p[0] ** 2)}, lambda sol: sol.observed[20]),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "form"), [*((n, "auto") for n in MISSING), ("stop", "arrays")])
+@pytest.mark.parametrize("adjoint", ADJOINTS, ids=name_of)
+def test_a_value_that_does_not_exist_has_no_number_as_derivative(adjoint, name, form):
+    """In reverse and forward mode, of its own trajectory only, and of none if it is left out."""
+    options, value_of = MISSING[name]
+    k = jnp.array([1.0, np.nan, 1.1, 0.2])
+    q = jnp.array([1.0, 1.0, 0.05, 0.05 if name in ("root", "mean") else 3.0])
+
+    def value(k, q, omits):
+        run = {"h": 0.05, "num_steps": 24, "throw": False, "args": k, "adjoint": adjoint}
+        layout = dvi.Layout(form=form)
+        x = value_of(
+            dvi.integrate(OSCILLATOR, q[None], 0 * q[None], layout=layout, **run, **options)
+        )
+        return jnp.where(jnp.isfinite(x) | ~omits, x, 0.0)
+
+    plain = jax.jit(jax.vmap(value, (0, 0, None)))(k, q, False)
+    has_value = np.isfinite(np.asarray(plain))
+    assert has_value.any()
+    assert not has_value[1]
+    for mode in (jax.grad, jax.jacfwd):
+        slopes = jax.jit(jax.vmap(mode(value, (0, 1)), (0, 0, None)))
+        for used, omitted in zip(slopes(k, q, False), slopes(k, q, True), strict=True):
+            np.testing.assert_array_equal(np.isfinite(used), has_value)
+            np.testing.assert_array_equal(omitted[~has_value], 0)
+            np.testing.assert_array_equal(omitted[has_value], used[has_value])
+    # The derivatives of the others in the batch.
+    batch = jax.vmap(value, (0, 0, None))
+    of_all = jax.jit(jax.grad(lambda k: jnp.sum(batch(k, q, False))))(k)
+    expected = slopes(k, q, False)[0]
+    np.testing.assert_allclose(of_all, expected, rtol=1e-9, atol=1e-12)
+    near = [jax.jit(batch)(k + d, q, False) for d in (1e-5, -1e-5)]
+    np.testing.assert_allclose(
+        np.where(has_value, (near[0] - near[1]) / 2e-5, 0), np.where(has_value, expected, 0),
+        rtol=1e-5, atol=1e-6 * float(np.nanmax(np.abs(plain[has_value]))),
+    )  # fmt: skip
