@@ -14,6 +14,7 @@ ADJOINTS = dvi.Reversible(), dvi.Checkpointed(), dvi.Direct()
 OSCILLATOR = dvi.System(dvi.discretise(lambda t, q, p, k: p @ p / 2 + k * q @ q / 2))
 # ∇H_D is NaN for q < 0, where H_D is NaN.
 HALF = dvi.System(lambda t0, t1, q, p, k: p @ p / 2 + k * jnp.sum(jnp.sqrt(q)))
+FREE = dvi.System(lambda t0, t1, q, p, args: p @ p / 2)
 STARTS = jnp.array([[1.0], [0.2], [2.0]])
 
 
@@ -136,16 +137,44 @@ def test_points_between_the_steps_that_fail():
     )
 
 
+class Unjudged(dvi.Strang):
+    """A method of a user that reports success, also where its state is not finite."""
+
+    value: float = np.nan
+    fails: str = "last step"
+
+    def step(self, equations, interval, q0, p0):
+        q, p, info = super().step(equations, interval, q0, p0)
+        is_short = jnp.abs(interval.h) < 0.099
+        has_failed = is_short if self.fails == "part of a step" else interval.t1 > 0.95
+        return jnp.where(has_failed, self.value, q), p, info
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_method_that_does_not_report_its_failures(value):
+    def go(fails, **options):
+        run = {"method": Unjudged(value=value, fails=fails), "h": 0.1, "num_steps": 10}
+        return dvi.integrate(FREE, [0.0], [1.0], throw=False, **run, **options)
+
+    last = go("last step")
+    assert (last.status, int(last.stats["failed_step"])) == ("not_finite", 9)
+    assert go("part of a step").status == "successful"  # the control: whole steps are good
+    for options in (
+        {"save": dvi.Save(ts=[0.25])},
+        {"stop": dvi.Stop(lambda q, p: q[0] - 0.25)},
+        {"observe": dvi.Section(lambda q, p: q[0] - 0.25)},
+    ):
+        assert go("part of a step", **options).status == "not_finite"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("h", [0.1, -0.1])
 def test_an_event_that_is_nan(h):
     def g(t, q, p, args):
         return jnp.sqrt(0.5 - jnp.abs(q[0])) - 0.4
 
-    free = dvi.System(lambda t0, t1, q, p, args: p @ p / 2)
-
     def go(**options):
-        return dvi.integrate(free, [0.0], [1.0], h=h, num_steps=10, throw=False, **options)
+        return dvi.integrate(FREE, [0.0], [1.0], h=h, num_steps=10, throw=False, **options)
 
     sol = go(stop=dvi.Stop(lambda *point: g(*point) - 1))
     assert sol.status == "event_not_finite"
@@ -154,7 +183,7 @@ def test_an_event_that_is_nan(h):
     assert sol.status == "event_not_finite"
     np.testing.assert_allclose(sol.observed.ts[0], 0.34 * np.sign(h))
     with pytest.raises(dvi.IntegrationError, match="The function g of"):
-        dvi.integrate(free, [0.0], [1.0], h=h, num_steps=10, observe=dvi.Section(g, 0))
+        dvi.integrate(FREE, [0.0], [1.0], h=h, num_steps=10, observe=dvi.Section(g, 0))
 
 
 def slow(value):
