@@ -2,7 +2,6 @@
 
 # They become constants of a compiled program, which must not be used again once they have changed.
 
-import array
 import collections
 import contextlib
 import functools
@@ -193,8 +192,6 @@ class _Reader:
             self.add(name, ("value", repr(value)))
         elif isinstance(value, np.ndarray):
             self.add(name, ("array", value.shape, str(value.dtype), _digest(value)))
-        elif isinstance(value, array.array | bytearray):
-            self.add(name, ("value", bytes(value)))
         elif isinstance(value, set | frozenset):
             self.add(name, ("length", len(value)))
             self.add(name, ("entries", frozenset(itertools.islice(value, _MOST_ENTRIES))))
@@ -217,7 +214,7 @@ class _Reader:
         if isinstance(value, jax.Array) or is_of_user or not self.is_of_a_library:
             self.add(name, ("object", _Identity(value)))
         self.note_attributes(name, value, names)
-        if is_of_user and value is not kind and self.is_new(value):
+        if is_of_user and value is not kind and self.is_new(value, ("its special methods",)):
             # Operators and indices call methods whose names are not in the function.
             for base in _user_classes(kind):
                 for method, function in vars(base).items():
