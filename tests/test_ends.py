@@ -14,6 +14,7 @@ ADJOINTS = dvi.Reversible(), dvi.Checkpointed(), dvi.Direct()
 OSCILLATOR = dvi.System(dvi.discretise(lambda t, q, p, k: p @ p / 2 + k * q @ q / 2))
 # ∇H_D is NaN for q < 0, where H_D is NaN.
 HALF = dvi.System(lambda t0, t1, q, p, k: p @ p / 2 + k * jnp.sum(jnp.sqrt(q)))
+FREE = dvi.System(lambda t0, t1, q, p, args: p @ p / 2)
 STARTS = jnp.array([[1.0], [0.2], [2.0]])
 
 
@@ -136,16 +137,44 @@ def test_points_between_the_steps_that_fail():
     )
 
 
+class Unjudged(dvi.Strang):
+    """A method of a user that reports success, also where its state is not finite."""
+
+    value: float = np.nan
+    fails: str = "last step"
+
+    def step(self, equations, interval, q0, p0):
+        q, p, info = super().step(equations, interval, q0, p0)
+        is_short = jnp.abs(interval.h) < 0.099
+        has_failed = is_short if self.fails == "part of a step" else interval.t1 > 0.95
+        return jnp.where(has_failed, self.value, q), p, info
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_method_that_does_not_report_its_failures(value):
+    def go(fails, **options):
+        run = {"method": Unjudged(value=value, fails=fails), "h": 0.1, "num_steps": 10}
+        return dvi.integrate(FREE, [0.0], [1.0], throw=False, **run, **options)
+
+    last = go("last step")
+    assert (last.status, int(last.stats["failed_step"])) == ("not_finite", 9)
+    assert go("part of a step").status == "successful"  # the control: whole steps are good
+    for options in (
+        {"save": dvi.Save(ts=[0.25])},
+        {"stop": dvi.Stop(lambda q, p: q[0] - 0.25)},
+        {"observe": dvi.Section(lambda q, p: q[0] - 0.25)},
+    ):
+        assert go("part of a step", **options).status == "not_finite"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("h", [0.1, -0.1])
 def test_an_event_that_is_nan(h):
     def g(t, q, p, args):
         return jnp.sqrt(0.5 - jnp.abs(q[0])) - 0.4
 
-    free = dvi.System(lambda t0, t1, q, p, args: p @ p / 2)
-
     def go(**options):
-        return dvi.integrate(free, [0.0], [1.0], h=h, num_steps=10, throw=False, **options)
+        return dvi.integrate(FREE, [0.0], [1.0], h=h, num_steps=10, throw=False, **options)
 
     sol = go(stop=dvi.Stop(lambda *point: g(*point) - 1))
     assert sol.status == "event_not_finite"
@@ -154,7 +183,7 @@ def test_an_event_that_is_nan(h):
     assert sol.status == "event_not_finite"
     np.testing.assert_allclose(sol.observed.ts[0], 0.34 * np.sign(h))
     with pytest.raises(dvi.IntegrationError, match="The function g of"):
-        dvi.integrate(free, [0.0], [1.0], h=h, num_steps=10, observe=dvi.Section(g, 0))
+        dvi.integrate(FREE, [0.0], [1.0], h=h, num_steps=10, observe=dvi.Section(g, 0))
 
 
 def slow(value):
@@ -303,3 +332,59 @@ def test_a_loss_that_uses_nan_has_no_number_as_gradient_by_closed_over_values():
     assert jnp.isnan(slope(1.0, failing, True))
     assert slope(1.0, failing, False) == 0
     assert abs(slope(1.0, good, True)) > 1e-3
+
+
+# Values that a run does not have: the loss uses one of the trajectory that has no such value.
+MISSING = {
+    "stop": ({"stop": dvi.Stop(lambda q, p: 0.4 - q[0])}, lambda sol: sol.stop.q[0]),
+    "time": ({"stop": dvi.Stop(lambda q, p: 0.4 - q[0])}, lambda sol: sol.stop.t),
+    "section": (
+        {"observe": dvi.Section(lambda q, p: q[0] - 0.4, 0)},
+        lambda s: s.observed.qs[0, 0],
+    ),
+    "requested": ({"save": dvi.Save(ts=[0.4, 1.2])}, lambda sol: sol.qs[1, 0]),
+    "state": ({}, lambda sol: sol.qs[-1, 0]),
+    "observed": ({"observe": lambda t, q, p, k: k * q[0]}, lambda sol: sol.observed[-1]),
+    "root": ({"observe": lambda q, p: jnp.sqrt(q[0] - 0.1)}, lambda sol: sol.observed[5]),
+    "mean": ({"observe": dvi.Mean(lambda q, p: jnp.sqrt(q[0] - 0.1))}, lambda sol: sol.observed),
+    "infinite": ({"observe": lambda q, p: jnp.exp(1e4 * p[0] ** 2)}, lambda sol: sol.observed[20]),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "form"), [*((n, "auto") for n in MISSING), ("stop", "arrays")])
+@pytest.mark.parametrize("adjoint", ADJOINTS, ids=name_of)
+def test_a_value_that_does_not_exist_has_no_number_as_derivative(adjoint, name, form):
+    """In reverse and forward mode, of its own trajectory only, and of none if it is left out."""
+    options, value_of = MISSING[name]
+    k = jnp.array([1.0, np.nan, 1.1, 0.2])
+    q = jnp.array([1.0, 1.0, 0.05, 0.05 if name in ("root", "mean") else 3.0])
+
+    def value(k, q, omits):
+        run = {"h": 0.05, "num_steps": 24, "throw": False, "args": k, "adjoint": adjoint}
+        layout = dvi.Layout(form=form)
+        x = value_of(
+            dvi.integrate(OSCILLATOR, q[None], 0 * q[None], layout=layout, **run, **options)
+        )
+        return jnp.where(jnp.isfinite(x) | ~omits, x, 0.0)
+
+    plain = jax.jit(jax.vmap(value, (0, 0, None)))(k, q, False)
+    has_value = np.isfinite(np.asarray(plain))
+    assert has_value.any()
+    assert not has_value[1]
+    for mode in (jax.grad, jax.jacfwd):
+        slopes = jax.jit(jax.vmap(mode(value, (0, 1)), (0, 0, None)))
+        for used, omitted in zip(slopes(k, q, False), slopes(k, q, True), strict=True):
+            np.testing.assert_array_equal(np.isfinite(used), has_value)
+            np.testing.assert_array_equal(omitted[~has_value], 0)
+            np.testing.assert_array_equal(omitted[has_value], used[has_value])
+    # The derivatives of the others in the batch.
+    batch = jax.vmap(value, (0, 0, None))
+    of_all = jax.jit(jax.grad(lambda k: jnp.sum(batch(k, q, False))))(k)
+    expected = slopes(k, q, False)[0]
+    np.testing.assert_allclose(of_all, expected, rtol=1e-9, atol=1e-12)
+    near = [jax.jit(batch)(k + d, q, False) for d in (1e-5, -1e-5)]
+    np.testing.assert_allclose(
+        np.where(has_value, (near[0] - near[1]) / 2e-5, 0), np.where(has_value, expected, 0),
+        rtol=1e-5, atol=1e-6 * float(np.nanmax(np.abs(plain[has_value]))),
+    )  # fmt: skip

@@ -5,6 +5,7 @@ import functools
 import pickle
 import types
 import warnings
+from fractions import Fraction
 
 import equinox as eqx
 import jax
@@ -58,6 +59,21 @@ def weighted(k, t0, t1, q0, p1, args):
     return spring(k["k"], q0, p1)
 
 
+class Slotted:
+    __slots__ = ("k",)
+
+
+class Number:
+    """A number by its operators only."""
+
+    def __init__(self, k):
+        self.value = k
+
+    def __mul__(self, other):
+        return self.value * other
+
+
+RATIO, OPERATION, LINE = Fraction(1), jnp.abs, eqx.nn.Lambda(lambda x: x)
 RUN = {"h": 0.1, "num_steps": 3}
 
 
@@ -78,6 +94,12 @@ def cases(monkeypatch):
     def in_cell():
         cell[0] = 4.0
 
+    slotted, number, numbers, by_name = Slotted(), Number(1.0), {1.0}, types.SimpleNamespace(k=1.0)
+    slotted.k = 1.0
+
+    def potential(q):
+        return cell[0] * (q @ q) / 2
+
     return {
         "global": (of_global, new_global("STIFFNESS", 4.0)),
         "function": (of_a_function_of_a_global, new_global("STIFFNESS", 4.0)),
@@ -93,6 +115,24 @@ def cases(monkeypatch):
         "closure": (lambda t0, t1, q0, p1, args: spring(cell[0], q0, p1), in_cell),
         "partial": (functools.partial(weighted, inside), lambda: inside.update(k=4.0)),
         "adapter": (dvi.discretise(lambda t, q, p, args: spring(cell[0], q, p)), in_cell),
+        # A function without a name of a global or an attribute, which calls another one.
+        "inner": (lambda t0, t1, q0, p1, args: p1 @ p1 / 2 + potential(q0), in_cell),
+        "class": (lambda t0, t1, q0, p1, args: spring(Spring.k, q0, p1),
+                  lambda: monkeypatch.setattr(Spring, "k", 4.0)),
+        "slots": (lambda t0, t1, q0, p1, args: spring(slotted.k, q0, p1),
+                  lambda: setattr(slotted, "k", 4.0)),
+        "operator": (lambda t0, t1, q0, p1, args: spring(1.0, q0 * 0, p1) + number * (q0 @ q0) / 2,
+                     lambda: setattr(number, "value", 4.0)),
+        "by a string": (lambda t0, t1, q0, p1, args: spring(getattr(by_name, "k"), q0, p1),  # noqa: B009
+                        lambda: setattr(by_name, "k", 4.0)),
+        "set": (lambda t0, t1, q0, p1, args: spring(sum(numbers), q0, p1),
+                lambda: numbers.add(3.0)),
+        "fraction": (lambda t0, t1, q0, p1, args: spring(float(RATIO), q0, p1),
+                     new_global("RATIO", Fraction(4))),
+        "function of JAX": (lambda t0, t1, q0, p1, args: spring(OPERATION(4.0) ** 0.5 / 2, q0, p1),
+                            new_global("OPERATION", lambda x: 16 * x)),
+        "module of equinox": (lambda t0, t1, q0, p1, args: spring(LINE(1.0), q0, p1),
+                              new_global("LINE", eqx.nn.Lambda(lambda x: 4 * x))),
     }  # fmt: skip
 
 

@@ -2,9 +2,11 @@
 
 # They become constants of a compiled program, which must not be used again once they have changed.
 
+import collections
 import contextlib
 import functools
 import inspect
+import itertools
 import sys
 import types
 from collections.abc import Iterator
@@ -25,6 +27,12 @@ _MOST_ENTRIES = 1000
 _LIBRARIES = frozenset(["jax", "jaxlib", "numpy", "scipy", "equinox", "lanewise", "dvi_jax"])
 
 _SIMPLE = (bool, int, float, complex, str, bytes, type(None), np.generic)
+_CONSTANTS = (*_SIMPLE, np.ndarray, list, tuple, dict)
+
+# Special methods that no operator, index or conversion calls.
+_NOT_IMPLICIT = frozenset(
+    ["__new__", "__repr__", "__str__", "__eq__", "__hash__", "__del__", "__setattr__", "__reduce__"]
+)
 
 
 class _Identity:
@@ -48,9 +56,10 @@ def reads(*values: Any) -> Reads:
     """The values that functions read from outside: those in `values`, in pytrees and in modules,
     and the methods of the classes that a user has written for these.
 
-    - Numbers, strings, tuples, lists, dictionaries and NumPy arrays are compared by value (arrays
-      above 1 MiB and lists above 1000 entries in part), other objects by identity.
-    - Attributes of an object are compared if their names occur in the function.
+    - Numbers, strings, tuples, lists, dictionaries, sets and NumPy arrays are compared by value
+      (arrays above 1 MiB and lists above 1000 entries in part), other objects by identity.
+    - Attributes of an object or a class are compared if their names occur in the function, or in a
+      method such as ``__mul__`` or ``__getitem__`` of the object.
     - Functions that are called are followed unless they belong to a library. Programs that
       `jax.jit` has compiled for the user, files, and results of calls are not seen.
     """
@@ -113,9 +122,10 @@ class _Reader:
     def __init__(self):
         self.values: dict[str, Any] = {}
         self.objects: dict[Any, Any] = {}
+        self.is_of_a_library = False  # the function that is followed
 
-    def is_new(self, thing: Any, names: tuple[str, ...] = ()) -> bool:
-        """Whether this is the first visit."""
+    def is_new(self, thing: Any, names: tuple[str, ...] | None = None) -> bool:
+        """Whether this is the first visit; by `names`, of these attributes."""
         key = id(thing), names
         new = key not in self.objects
         self.objects[key] = thing  # held, so that no other object gets its id
@@ -130,7 +140,7 @@ class _Reader:
                 self.note("an argument of a partial", inner, ())
         elif inspect.ismethod(function):
             code = getattr(function.__func__, "__code__", None)
-            self.note("self", function.__self__, _names(code) if code else ())
+            self.note("self", function.__self__, _attributes(code) if code else ())
             self.follow(function.__func__)
         elif isinstance(function, types.FunctionType):
             self.follow_code(function)
@@ -153,23 +163,25 @@ class _Reader:
                 self.follow(member.fget)
             elif callable(function := getattr(kind, name, None)):
                 self.follow(inspect.unwrap(function))
-            elif isinstance(member, (*_SIMPLE, np.ndarray, list, tuple, dict)):
+            elif isinstance(member, _CONSTANTS):
                 self.note(f"{kind.__name__}.{name}", member, ())
 
     def follow_code(self, function: types.FunctionType) -> None:
         code = function.__code__
-        names = _names(code)
+        code_names, names = _names(code), _attributes(code)
+        outer, self.is_of_a_library = self.is_of_a_library, _is_of_a_library(function.__module__)
         for name, cell in zip(code.co_freevars, function.__closure__ or (), strict=True):
             with contextlib.suppress(ValueError):  # not assigned yet
                 self.note(name, cell.cell_contents, names)
         for value in (function.__defaults__, function.__kwdefaults__):
             if value:
                 self.note(f"the defaults of {function.__name__}", value, names)
-        if not _is_of_a_library(function.__module__):
+        if not self.is_of_a_library:
             globals_ = function.__globals__
-            for name in names:
+            for name in code_names:
                 if name in globals_:
                     self.note(name, globals_[name], names)
+        self.is_of_a_library = outer
 
     def note(self, name: str, value: Any, names: tuple[str, ...]) -> None:
         """Collect one value and what it refers to; `names` are those in the code that reads it."""
@@ -180,37 +192,58 @@ class _Reader:
             self.add(name, ("value", repr(value)))
         elif isinstance(value, np.ndarray):
             self.add(name, ("array", value.shape, str(value.dtype), _digest(value)))
-        elif isinstance(value, list | tuple):
+        elif isinstance(value, set | frozenset):
             self.add(name, ("length", len(value)))
-            for i, entry in enumerate(value[:_MOST_ENTRIES]):
+            self.add(name, ("entries", frozenset(itertools.islice(value, _MOST_ENTRIES))))
+        elif isinstance(value, list | tuple | collections.deque):
+            self.add(name, ("length", len(value)))
+            for i, entry in enumerate(itertools.islice(value, _MOST_ENTRIES)):
                 self.note(f"{name}[{i}]", entry, names)
         elif isinstance(value, dict):
             self.add(name, ("length", len(value)))
             for key in list(value)[:_MOST_ENTRIES]:
                 self.note(f"{name}[{key!r}]", value[key], names)
         else:
-            if isinstance(value, jax.Array) or not _is_of_a_library(type(value).__module__):
-                self.add(name, ("object", _Identity(value)))
-            if isinstance(value, type):
-                return
-            self.note_attributes(name, value, names)
-            if callable(value):
-                self.follow(value)
+            self.note_object(name, value, names)
+
+    def note_object(self, name: str, value: Any, names: tuple[str, ...]) -> None:
+        """Collect an object by its identity, and what it and its methods refer to."""
+        kind = value if isinstance(value, type) else type(value)
+        is_of_user = not _is_of_a_library(kind.__module__)
+        # Objects of a library that a library has made may be others in each call.
+        if isinstance(value, jax.Array) or is_of_user or not self.is_of_a_library:
+            self.add(name, ("object", _Identity(value)))
+        self.note_attributes(name, value, names)
+        if is_of_user and value is not kind and self.is_new(value, ("its special methods",)):
+            # Operators and indices call methods whose names are not in the function.
+            for base in _user_classes(kind):
+                for method, function in vars(base).items():
+                    is_special = method.startswith("__") and "init" not in method
+                    if is_special and method not in _NOT_IMPLICIT and inspect.isfunction(function):
+                        self.note_attributes(name, value, _attributes(function.__code__))
+                        self.follow(function)
+        if callable(value) and value is not kind:
+            self.follow(value)
 
     def note_attributes(self, name: str, value: Any, names: tuple[str, ...]) -> None:
         """Collect attributes of an object or of its class, and what methods and properties read."""
         fields = getattr(value, "__dict__", {})
+        kind = value if isinstance(value, type) else type(value)
         for attribute in names if self.is_new(value, names) else ():
-            if attribute in fields:
+            if attribute in fields and value is not kind:
                 self.note(f"{name}.{attribute}", fields[attribute], names)
                 continue
             # Statically: the property of a user may compute for long, or raise.
-            of_class = inspect.getattr_static(type(value), attribute, None)
+            of_class = inspect.getattr_static(kind, attribute, None)
             method = of_class.fget if isinstance(of_class, property) else of_class
+            method = getattr(method, "__func__", method)  # of the class, or static
             if isinstance(method, types.FunctionType):
-                self.note_attributes(name, value, _names(method.__code__))
+                self.note_attributes(name, value, _attributes(method.__code__))
                 self.follow(method)
-            elif isinstance(of_class, (*_SIMPLE, np.ndarray)) and of_class is not None:
+            elif isinstance(of_class, types.MemberDescriptorType):
+                with contextlib.suppress(AttributeError):  # not assigned yet
+                    self.note(f"{name}.{attribute}", getattr(value, attribute), names)
+            elif isinstance(of_class, _CONSTANTS) and of_class is not None:
                 self.note(f"{name}.{attribute}", of_class, names)
 
     def add(self, name: str, mark: Any) -> None:
@@ -233,6 +266,16 @@ def _names(code: types.CodeType) -> tuple[str, ...]:
     inner = [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
     inner_names = [name for inner_code in inner for name in _names(inner_code)]
     return tuple(dict.fromkeys([*code.co_names, *inner_names]))
+
+
+@functools.lru_cache(maxsize=4096)
+def _attributes(code: types.CodeType) -> tuple[str, ...]:
+    """The names in a function that may be attributes, those in strings for `getattr` included."""
+    names = _names(code)
+    if {"getattr", "vars", "__dict__"}.isdisjoint(names):
+        return names
+    strings = [x for x in code.co_consts if isinstance(x, str) and x.isidentifier()]
+    return tuple(dict.fromkeys([*names, *strings]))
 
 
 @functools.lru_cache(maxsize=4096)

@@ -15,7 +15,7 @@ from jax import lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool
 
-from lanewise.jaxprs.jaxapi import linear_map, with_equal_axes
+from lanewise.jaxprs.jaxapi import linear_map, manual_axes, with_equal_axes
 from lanewise.jaxprs.traced import Trace
 
 
@@ -74,13 +74,15 @@ def all_finite(values: Any) -> Bool[Array, ""]:
 
 
 def nan_where_used(function: Callable, *args: Any) -> Any:
-    """``function(*args)``. If a loss depends on a value of it that is NaN, its gradient by all
-    inputs is NaN, by what the function closes over too: zero would hide that the loss is not a
-    number."""
+    """``function(*args)``. If a loss depends on a value of it that is not finite, its gradient by
+    all inputs is NaN, by what the function closes over too, and so is the derivative of this value
+    in forward mode: zero would hide that the loss is not a number."""
     leaves, tree = jax.tree.flatten(args)
     trace = Trace.from_function(function, leaves, tree)
     inputs = [*trace.outer, *leaves]
-    smooth, others = eqx.partition(trace(*inputs), eqx.is_inexact_array)
+    # The trace is that of one device: inside of `jax.shard_map` types of results depend on others.
+    values = jax.tree.leaves(function(*args)) if manual_axes(*inputs) else trace(*inputs)
+    smooth, others = eqx.partition(values, eqx.is_inexact_array)
     smooth = _nan_if_used(smooth, eqx.filter(inputs, eqx.is_inexact_array))
     return jax.tree.unflatten(trace.out_tree, eqx.combine(smooth, others))
 
@@ -93,19 +95,31 @@ def _nan_if_used(values: Any, inputs: Any) -> Any:
         return values
 
     def push(values, changes):
-        return changes[0]
+        of_values, of_inputs = changes
+        moves = _any_of(lambda x: x != 0, of_inputs)
+        return jax.tree.map(
+            lambda x, c: jnp.where(jnp.isfinite(x) | ~moves, c, jnp.nan), values, of_values
+        )
 
     def pull(values, cotangents):
-        uses = jax.tree.map(lambda x, c: jnp.any(jnp.isnan(x) & (c != 0)), values, cotangents)
-        is_nan = jnp.any(jnp.asarray(jax.tree.leaves(uses), bool))
-        of_input = lambda x: jnp.where(is_nan, jnp.full(x.shape, jnp.nan, x.dtype), 0)  # noqa: E731
+        is_used = _any_of(lambda x, c: ~jnp.isfinite(x) & (c != 0), values, cotangents)
+        of_input = lambda x: jnp.where(is_used, jnp.full(x.shape, jnp.nan, x.dtype), 0)  # noqa: E731
         return cotangents, jax.tree.map(of_input, like)
+
+    def define(values, changes):
+        return changes[0]
 
     values, inputs = with_equal_axes((values, inputs))
     like = jax.eval_shape(lambda: inputs)
 
     @same.defjvp
     def _(primals, tangents):
-        return primals[0], linear_map(push, pull, push, primals[0], tangents)
+        return primals[0], linear_map(push, pull, define, primals[0], tangents)
 
     return same(values, inputs)
+
+
+def _any_of(condition: Callable, *trees: Any) -> Array:
+    """Whether the condition is true of a number in the arrays of these trees."""
+    parts = jax.tree.map(lambda *xs: jnp.any(condition(*xs)), *trees)
+    return jnp.any(jnp.asarray(jax.tree.leaves(parts), bool))

@@ -2,7 +2,6 @@
 
 import abc
 import dataclasses
-import functools
 import math
 
 import equinox as eqx
@@ -15,7 +14,6 @@ from lanewise import Layout
 
 from ..base.checks import whole
 from ..base.types import State
-from ..engine.guard import nan_where_used
 from .loop import Loop, outcome, run, start, with_start
 from .task import Outcome, Plan, Task, adds_start_outside
 
@@ -44,8 +42,7 @@ def _direct_rollout(
         task = eqx.combine(arrays, functions)
         return outcome(task, plan, run(task, plan, start(task, q0, p0), loop), q0, p0)
 
-    call = functools.partial(lanewise.call, forward, layout=layout)
-    result = nan_where_used(call, arrays, q0, p0)
+    result = lanewise.call(forward, arrays, q0, p0, layout=layout)
     if adds_start_outside(plan):
         return result._replace(rows=with_start(result.rows, q0, p0))
     return result

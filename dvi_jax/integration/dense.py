@@ -1,7 +1,6 @@
 """The trajectory between the points of its time grid: crossings, requested times, end points."""
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -16,10 +15,10 @@ from lanewise import Layout
 from ..base.results import RESULTS, first_of
 from ..base.types import Interval, Scalar, State
 from ..engine.bracket import bracketed_root
-from ..engine.guard import constant_unless, nan_where_used
+from ..engine.guard import constant_unless
 from ..engine.rounding import each, one_by_one
 from ..methods import Method
-from ..methods.step import Equations
+from ..methods.step import Equations, judged
 from ..observe import Crossings, Reduction, Section, Stop, Stopped, is_observable
 from ..observe._kept import RequestedTimes, StepStart, event, from_rows, shown
 from ..observe.solution import Save
@@ -51,7 +50,7 @@ class Curve(eqx.Module):
         h = theta * (start.t1 - start.t0)
         t = start.t0 + h
         q, p, info = self.method.step(self.equations, Interval(start.t0, t, h), start.q0, start.p0)
-        return (t, q, p), info.result
+        return (t, q, p), judged(self.method, info, q, p).result
 
     def where(self, g: Callable[..., Any], start: StepStart, exists: Array) -> PointAndStatus:
         """The point of the step where g(t, q, p, args) = 0, or its end if none `exists`."""
@@ -209,15 +208,13 @@ def guarded(
     function: Callable, constants: Any, layout: Layout, succeeds: Callable | None = None
 ) -> Callable:
     """``(exists, *row) → function(constants, *row)`` with the bits of a call for one row alone. Its
-    derivative is zero where no such row `exists`, or ``succeeds(result)`` is False; it is NaN where
-    a loss uses a value that is NaN."""
+    derivative is zero where no such row `exists`, or ``succeeds(result)`` is False."""
 
     def value(*row):
         return one_by_one(function, constants, *row, layout=layout)
 
     def guarded_value(exists, *row):
-        constant = functools.partial(constant_unless, exists, value, succeeds=succeeds)
-        return nan_where_used(constant, *row)
+        return constant_unless(exists, value, *row, succeeds=succeeds)
 
     return guarded_value
 

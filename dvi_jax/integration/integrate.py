@@ -17,6 +17,7 @@ from lanewise.jaxprs.jaxapi import is_traced
 from ..base.checks import instance, refuse_unknown
 from ..base.inputs import as_parameter, as_scalar, start_state
 from ..base.progress import bar_of, reporter
+from ..engine.guard import nan_where_used
 from ..engine.newton import RootSolver
 from ..lattices import Lattice, Run
 from ..methods import Method
@@ -219,8 +220,15 @@ def _save_hint(save: Any) -> str:
 def _in_one_program(
     task: Task, plan: Plan, observe: PyTree, q0, p0, adjoint: AbstractAdjoint, layout: Layout
 ) -> Solution:
-    outcome = adjoint.rollout(task, plan, q0, p0, layout)
-    return as_solution(task, plan, observe, outcome, q0, p0, layout)
+    # A loss that uses a NaN of the solution, wherever it comes from, has no number as its gradient.
+    arrays, functions = eqx.partition((task, q0, p0), eqx.is_array)
+
+    def solution_of(arrays):
+        task, q0, p0 = eqx.combine(arrays, functions)
+        outcome = adjoint.rollout(task, plan, q0, p0, layout)
+        return as_solution(task, plan, observe, outcome, q0, p0, layout)
+
+    return nan_where_used(solution_of, arrays)
 
 
 _solution = eqx.filter_jit(as_solution)

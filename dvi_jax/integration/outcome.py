@@ -15,7 +15,7 @@ from lanewise.jaxprs.jaxapi import is_traced, manual_axes
 
 from ..base.reads import Reads
 from ..base.results import RESULTS, IntegrationError, status_code, status_name, with_auxiliary
-from ..engine.guard import all_finite
+from ..engine.guard import all_finite, nan_where_used
 from ..engine.newton import relative_size
 from ..lattices import Place, Run
 from ..observe import OfState, Reduction, RequestedTimes, Running, Section, is_observable
@@ -106,7 +106,8 @@ def with_initial_values(solution: Solution, run: Run, layout: Layout, _: Reads =
             return jnp.asarray(observable(t, t, q, p, q, p, args))
 
         row = run.t0, run.q0, run.p0, run.args
-        first = guarded(at_start, None, layout, all_finite)(all_finite(row[1:3]), *row)
+        function = guarded(at_start, None, layout, all_finite)
+        first = nan_where_used(function, all_finite(row[1:3]), *row)
         return jnp.concatenate([first[None].astype(values.dtype), values])
 
     rows = jax.tree.map(with_first_row, run.observe, solution.observed, is_leaf=is_observable)

@@ -13,7 +13,7 @@ from jaxtyping import Array
 import lanewise
 
 from ..base.types import State
-from ..engine.guard import all_finite
+from ..engine.guard import all_finite, constant_unless
 from ..engine.newton import KnownRoot
 from ..observe import Reduction, has_initial_value
 from .loop import number_of
@@ -56,14 +56,13 @@ class ReversePass(eqx.Module):
     and the cotangents of saved and observed values are added where they belong.
 
     - `theta`: the arrays of the task that are differentiated. `constants`: its other parts.
-    - `memories`, `results`: of the reductions, after the run. `cotangent`: of its outputs.
+    - `memories`: of the reductions, after the run. `cotangent`: of its outputs.
     """
 
     theta: Any
     constants: Any
     states: Reconstruction
     memories: list[Any]
-    results: list[Any]
     cotangent: Smooth
 
     def task(self, theta: Any) -> Task:
@@ -105,8 +104,16 @@ class ReversePass(eqx.Module):
         equations = dataclasses.replace(task.equations_at(k, interval), newton=solver)
         q1, p1, _ = task.method.step(equations, interval, q0, p0)
         step = Ends(interval.t0, interval.t1, q0, p0, q1, p1)
-        values = [step.value(function, task.args) for function in functions]
-        numbers = [_real(task.number(reduction, step), q1) for reduction in reductions]
+        # As in the loop, a value that is not finite is a constant.
+        value_of = functools.partial(constant_unless, all_finite(step), succeeds=all_finite)
+        values = [
+            value_of(functools.partial(Ends.value, observable=function, args=task.args), step)
+            for function in functions
+        ]
+        numbers = [
+            value_of(lambda step, f=reduction: _real(task.number(f, step), q1), step)
+            for reduction in reductions
+        ]
         return (q1, p1, interval.t1), eqx.filter(values, eqx.is_inexact_array), numbers
 
     def reductions(self) -> list[tuple[Reduction, Any, Any]]:
@@ -168,26 +175,6 @@ class ReversePass(eqx.Module):
             cotangents = pieces.fold(steps, cotangents, reverse=True)
         return cotangents
 
-    def uses_failed(self, starts: Point, of_rows: Rows, end: Point) -> Array:
-        """Whether the loss depends on a value after a failure: a saved one, the last state, or a
-        result of a reduction."""
-
-        def is_used(of_values, state):
-            return _any_nonzero(of_values) & ~all_finite(state)
-
-        states = jax.tree.map(lambda x: x[1 : 1 + self.states.plan.num_blocks], starts)
-        of_saved = jax.tree.map(lambda x: x[: len(states[0])], of_rows[2:5])
-        of_end = self.cotangent.q, self.cotangent.p
-        if self.states.plan.save_tail:
-            of_end = of_end, jax.tree.map(lambda x: x[-1], of_rows[2:5])
-        of_results = jax.tree.map(
-            lambda cotangent, result: jnp.where(jnp.isfinite(result), 0, cotangent),
-            self.cotangent.results,
-            self.results,
-        )
-        in_rows = jnp.any(jax.vmap(is_used)(of_saved, states))
-        return in_rows | is_used(of_end, end) | _any_nonzero(of_results)
-
     def run(self, start: Point, rows: Rows, tail: Rows | None) -> Cotangents:
         """The cotangents of θ and of the initial state, from the states that the run has stored."""
         plan, of_rows = self.states.plan, self.cotangent.rows
@@ -198,8 +185,6 @@ class ReversePass(eqx.Module):
             of_start = of_rows.q[0], of_rows.p[0]
             of_rows = of_rows._replace(q=of_rows.q[1:], p=of_rows.p[1:])
         starts = self.states.starts(start, rows)
-        end = jax.tree.map(lambda x: x[-1], starts) if tail is None else (tail.q, tail.p)
-        uses_failed = self.uses_failed(starts, of_rows, end)
         if tail is not None:
             # Without a saved tail nothing is observed at the end of the run: cotangents of zero.
             of_tail = jax.tree.map(
@@ -215,9 +200,7 @@ class ReversePass(eqx.Module):
         if of_start is not None:
             q, p = map(jnp.add, (cotangents.q, cotangents.p), of_start)
             cotangents = cotangents._replace(q=q, p=p)
-        cotangents = self.initial_values(cotangents, start)
-        # Zero would hide that the loss is not a number.
-        return jax.tree.map(lambda x: jnp.where(uses_failed, jnp.nan, x), cotangents)
+        return self.initial_values(cotangents, start)
 
     def initial_values(self, cotangents: Cotangents, start: Point) -> Cotangents:
         """The cotangents, with those of the values of reductions at the initial state."""

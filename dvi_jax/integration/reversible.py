@@ -126,15 +126,14 @@ class Reversible(AbstractAdjoint):
             def pull(variables, constants, counts, record, cotangent):
                 theta, q0, p0 = eqx.combine(variables, constants)
                 variable, constant = eqx.partition(theta, is_variable[0])
-                (memories, rows, tail), results = record
+                memories, rows, tail = record
                 others, states = eqx.combine(constant, counts, functions), states_of(theta, counts)
-                reverse_pass = ReversePass(variable, others, states, memories, results, cotangent)
+                reverse_pass = ReversePass(variable, others, states, memories, cotangent)
                 return eqx.filter(tuple(reverse_pass.run((q0, p0), rows, tail)), is_variable)
 
             derivative = LinearMap(push, pull, layout)
             point = variables, constants, counts
-            record = trace.record(), smooth.results
-            change = derivative(point, record, eqx.filter(change, is_variable))
+            change = derivative(point, trace.record(), eqx.filter(change, is_variable))
             return (smooth, trace), (change, jax.tree.map(_no_tangent, trace))
 
         smooth, trace = trajectory(inputs, counts)

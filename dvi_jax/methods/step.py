@@ -228,3 +228,19 @@ def judge(info: RootInfo, q: State, p: State, quantum: float | None = None) -> S
     # Last, because NaN makes a solve fail as well, and is the reason that helps the user.
     result = RESULTS.where(finite, result, RESULTS.not_finite)
     return StepInfo(result, info.iterations, info.residual)
+
+
+def judged(method: eqx.Module, info: StepInfo, q: State, p: State) -> StepInfo:
+    """The status of a step of any method: one of a user may have a state that is not finite, and
+    yet the status `successful`. Those of the package judge their states themselves."""
+    if is_of_package(method):
+        return info
+    good = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(p))
+    good = good | (info.result != RESULTS.successful)
+    return info._replace(result=RESULTS.where(good, info.result, RESULTS.not_finite))
+
+
+def is_of_package(module: eqx.Module) -> bool:
+    """Whether a module and those in it are of classes of this package."""
+    modules = (value for value in vars(module).values() if isinstance(value, eqx.Module))
+    return type(module).__module__.startswith("dvi_jax.") and all(map(is_of_package, modules))
