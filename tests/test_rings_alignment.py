@@ -256,6 +256,7 @@ def test_each_parameter_is_given_once():
             make()
     for make, message in (
         (lambda: rings.lens("L", lambda x, y, par: x, length=1.0), "length of lens 'L' is zero"),
+        (lambda: rings.lens("L", lambda x, y, par: x, voltage=1.0), "voltage of lens 'L' is zero"),
         (lambda: quadrupole.placed(pitch=np.nan), "pitch of element 'Q' must be a finite"),
         (lambda: quadrupole.placed(anchor="exit"), "anchor must be one of 'entrance', 'middle'"),
     ):
@@ -265,3 +266,20 @@ def test_each_parameter_is_given_once():
     ring = rings.Ring([quadrupole.placed(dx=1e-3).inside(rectangle=limits, ellipse=(0.1, 0.1))])
     lost = rings.track(ring, [[5e-4, 0, 0, 0, 0, 0], [2e-3, 0, 0, 0, 0, 0]]).lost
     assert lost.tolist() == [False, True]
+
+
+def test_a_parameter_that_the_map_was_made_without_is_not_changed():
+    """Without an effect on the map it would change only s."""
+    for element, name in (
+        (rings.multipole("E", 0.0, (0, 0.1)), "length"),
+        (rings.cavity("E", 0.0, 1e-3, 5e8), "length"),
+        (rings.lens("E", lambda x, y, par: x), "length"),
+        (rings.bend("E", 1.0, 0.0, model="exact"), "h"),
+    ):
+        ring = rings.Ring([element, rings.drift("D", 1.0)])
+        assert ring.get("E", name) == 0
+        for change in (lambda r, n: r.set("E", **{n: 0.1}), lambda r, n: r.perturbed("E", n)):
+            with pytest.raises(ValueError, match=f"'E', was made with {name} = 0"):
+                change(ring, name)
+    ring = rings.Ring([rings.bend("E", 1.0, 0.1, model="exact"), rings.drift("D", 1.0)])
+    assert ring.set("*", length=0.5).set("E", h=0.2).places[-1] == 1.0
