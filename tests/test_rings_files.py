@@ -239,9 +239,6 @@ def test_multipoles_of_xsuite(read):
     for ring, length in ((thin, 1.0), (thick, 0.5)):
         field = [ring.get("e", f"b{n}") * length for n in (0, 1, 5)]
         np.testing.assert_allclose(np.ravel(field), [0.1, 0.2, 1.0])
-    bend = {"__class__": "Bend", "length": 1.5, "angle": 0.3, "k1": -0.4}
-    ends = [read(xsuite(**bend, edge_entry_model=m), ".json") for m in ("linear", "full")]
-    assert ["fringe_in" in str(r.program.parts) for r in ends] == [False, True]
 
 
 def test_the_exact_model_of_a_file(read):

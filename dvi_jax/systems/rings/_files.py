@@ -228,14 +228,9 @@ def _of_xsuite(data: dict[str, Any], path: Path, use: str | None, options: dict[
     lattice = line.to_at(**options)
     for element in lattice:
         element.unread = unread.get(element.FamName, {})
-        source = line.elements.get(element.FamName, {})
-        gap = source.get("edge_entry_hgap")
+        gap = line.elements.get(element.FamName, {}).get("edge_entry_hgap")
         if gap is not None:
             element.FullGap = 2 * gap  # pyAT 0.9.0 takes the half gap for the gap
-        for side in ("Entrance", "Exit"):  # and a linear edge for one with a quadrupole fringe
-            if element.origin in ("Bend", "RBend"):
-                model = source.get(f"edge_{'entry' if side == 'Entrance' else 'exit'}_model")
-                setattr(element, f"FringeQuad{side}", int(model == "full"))
     return lattice
 
 
