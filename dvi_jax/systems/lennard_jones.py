@@ -93,8 +93,8 @@ def lennard_jones(
     The observables are `energy`, `linear_momentum`, `centre_of_mass` (at t = 0), `temperature`, and
     `angular_momentum` of a cluster. All pairs are evaluated: the time of a step grows with n².
 
-    **Raises** `ValueError` for fewer than two particles, for those that overlap (closer than 0.8 σ),
-    a cut-off above half of the box, and sizes, temperatures and densities that are not positive.
+    **Raises** `ValueError` for fewer than two particles, those that overlap (closer than 0.8 σ), a
+    cut-off above half of the box, and sizes, temperatures and densities that are not positive.
 
     **Source** Lennard-Jones 1931, *Proc. Phys. Soc.* 43, 461; cut-off: Toxvaerd & Dyre 2011,
     *J. Chem. Phys.* 134, 081102.
@@ -122,7 +122,7 @@ def lennard_jones(
     if apart < _CLOSEST:
         raise ValueError(
             f"box must be at least {cells * _CLOSEST / np.sqrt(0.5):.4g} for n = {n}, so that the "
-            f"particles begin {_CLOSEST} σ apart or more, got box = {cells * spacing:.4g}, in which "
+            f"particles begin {_CLOSEST} σ apart or more, got box = {cells * spacing:.4g}, where "
             f"they are {apart:.3g} σ apart. Give a larger box, a lower density, or fewer particles."
         )
     q0, p0 = crystal(n, spacing), np.random.default_rng(seed).normal(size=(n, 3))

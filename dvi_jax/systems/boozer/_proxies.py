@@ -91,12 +91,11 @@ def _run(particles: GuidingCentres, start: Any, duration: tuple[int, Any], **opt
     )  # fmt: skip
 
 
-def _is_accurate(particles: GuidingCentres, start: Any, sol: Any) -> Array:
-    """Whether the energy at the end of a run differs little from that at its start."""
-    q, p, args = particles.state(*start)
-    states = (q, p), (sol.qs[-1], sol.ps[-1])
+def _is_accurate(particles: GuidingCentres, start: Any, q: Any, p: Any) -> Array:
+    """Whether the energy of a state of a run differs little from that at its start."""
+    q0, p0, args = particles.state(*start)
     epsilon = None if particles.breaking is None else 1.0
-    first, last = (centre_of(particles.chart, *x, args, epsilon).energy for x in states)
+    first, last = (centre_of(particles.chart, *x, args, epsilon).energy for x in ((q0, p0), (q, p)))
     return jnp.abs(last - first) < _ENERGY_ERROR * first
 
 
@@ -131,7 +130,7 @@ def radial_drift(
     num_steps = whole("num_steps", num_steps)
     adjoint, mean = Reversible(checkpoint_every=25), Mean(_Weight(particles.chart))
     sol = _run(particles, start, (num_steps, h), adjoint=adjoint, observe=mean)
-    is_success = (sol.result == RESULTS.successful) & _is_accurate(particles, start, sol)
+    is_success = (sol.result == RESULTS.successful) & _is_accurate(particles, start, sol.qs[-1], sol.ps[-1])
     return -jnp.where(is_success, sol.observed, 0.0), is_success
 
 
@@ -175,6 +174,8 @@ def lost_at(particles: GuidingCentres, start: Any, *, num_steps: int, h: Any = 4
     Arguments as for `radial_drift`. It has no useful derivative.
     """
     sol = _run(particles, start, (whole("num_steps", num_steps), h), stop=particles.loss)
-    seconds = jnp.where(sol.result == RESULTS.successful, jnp.inf, particles.seconds(sol.stop.t))
-    is_accurate = _is_accurate(particles, start, sol)
+    stays = sol.result == RESULTS.successful
+    seconds = jnp.where(stays, jnp.inf, particles.seconds(sol.stop.t))
+    ends = (sol.qs[-1], sol.stop.q), (sol.ps[-1], sol.stop.p)
+    is_accurate = _is_accurate(particles, start, *(jnp.where(stays, *end) for end in ends))
     return lax.stop_gradient(jnp.where(is_accurate, seconds, jnp.nan))
