@@ -130,7 +130,8 @@ def radial_drift(
     num_steps = whole("num_steps", num_steps)
     adjoint, mean = Reversible(checkpoint_every=25), Mean(_Weight(particles.chart))
     sol = _run(particles, start, (num_steps, h), adjoint=adjoint, observe=mean)
-    is_success = (sol.result == RESULTS.successful) & _is_accurate(particles, start, sol.qs[-1], sol.ps[-1])
+    is_accurate = _is_accurate(particles, start, sol.qs[-1], sol.ps[-1])
+    is_success = (sol.result == RESULTS.successful) & is_accurate
     return -jnp.where(is_success, sol.observed, 0.0), is_success
 
 
