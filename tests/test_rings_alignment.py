@@ -291,7 +291,7 @@ def long_cell(name):
     between = {
         "roll 0.1": rings.drift("D", 0.5).placed(roll=0.1),
         "roll −0.3": rings.drift("D", 0.5).placed(roll=-0.3),
-        "tilt": rings.quadrupole("T", 0.05, 0.02, slices=1).placed(tilt=0.3),
+        "tilt": rings.drift("D", 0.5).placed(tilt=0.3),
         "roll 2.5": rings.drift("D", 0.5).placed(roll=2.5),
         "solenoid": rings.solenoid("S", 0.5, 0.1),
         "exact bend": rings.bend("B", 0.5, 0.02, model="exact"),
