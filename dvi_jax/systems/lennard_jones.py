@@ -118,12 +118,12 @@ def lennard_jones(
         spacing = 1.542  # [σ] of the crystal at rest without pressure
     if cutoff is not None:
         parameters["cutoff"] = Parameter(cutoff, "distance without force [length]")
-    apart = np.sqrt(0.5) * spacing
-    if apart < _CLOSEST:
+    distance = np.sqrt(0.5) * spacing
+    if distance < _CLOSEST:
         raise ValueError(
             f"box must be at least {cells * _CLOSEST / np.sqrt(0.5):.4g} for n = {n}, so that the "
             f"particles begin {_CLOSEST} σ apart or more, got box = {cells * spacing:.4g}, where "
-            f"they are {apart:.3g} σ apart. Give a larger box, a lower density, or fewer particles."
+            f"they are {distance:.3g} σ apart. Give a larger box or fewer particles."
         )
     q0, p0 = crystal(n, spacing), np.random.default_rng(seed).normal(size=(n, 3))
     p0 -= p0.mean(axis=0)

@@ -16,7 +16,7 @@ def quarters(angle: Any) -> tuple[Any, Any, Any]:
     return jnp.round(jnp.cos(n)), jnp.round(jnp.sin(n)), angle - n
 
 
-def rotated(x: Any, y: Any, angle: Any) -> tuple[Any, Any]:
+def rotation(x: Any, y: Any, angle: Any) -> tuple[Any, Any]:
     """(c x + s y, c y − s x) by quarters of a turn and three shears.
 
     The determinant is 1, whatever the rounding of sines and tangents. With cosines it is their
@@ -59,7 +59,7 @@ def _arc(z: Particle, px: Any) -> Any:
 def exact_bend(z: Particle, length: Any, par: Parameters) -> Particle:
     """The flow in a uniform field h in coordinates of curvature h. Forest 1998, (12.18)."""
     h = par["h"]
-    px, excess = rotated(z.px, _beyond(z, z.px) - z.x * h, h * length)
+    px, excess = rotation(z.px, _beyond(z, z.px) - z.x * h, h * length)
     path = length + _arc(z, px) / h
     late = (1 + z.delta) * path - length
     x = (_beyond(z, px) - excess) / h
@@ -69,7 +69,7 @@ def exact_bend(z: Particle, length: Any, par: Parameters) -> Particle:
 def rotate(z: Particle, angle: Any) -> Particle:
     """Free motion to a plane that is rotated about the y-axis. Forest 1998, (10.26)."""
     pz = pz_of(z)
-    px, p = rotated(z.px, pz, angle)
+    px, p = rotation(z.px, pz, angle)
     path = z.x * jnp.sin(angle) / p
     x, late = z.x * pz / p, (1 + z.delta) * path
     return z._replace(x=x, px=px, y=z.y + z.py * path, zeta=z.zeta - late)

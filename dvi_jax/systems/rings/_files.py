@@ -237,16 +237,16 @@ def _of_xsuite(data: dict[str, Any], path: Path, use: str | None, options: dict[
 def _unread_of_xsuite(element: Any) -> dict[str, Any] | None:
     """What pyAT leaves out of an element, None of one that acts and that it does not know. What it
     misreads is changed in the element."""
-    replaced = element.origin and element.origin != type(element).__name__
+    is_replaced = element.origin and element.origin != type(element).__name__
     is_field = hasattr(element, "_set_at_poly")
-    known = {*_XSUITE_READ, *element._xsuite2at_attr, *(_XSUITE_FIELDS if is_field else ())}
+    attributes = {*_XSUITE_READ, *element._xsuite2at_attr, *(_XSUITE_FIELDS if is_field else ())}
     if element.origin == "Quadrupole":
-        known |= {"edge_entry_active", "edge_exit_active"}
+        attributes |= {"edge_entry_active", "edge_exit_active"}
     if element.origin in ("Bend", "RBend"):
-        known |= {"edge_entry_hgap", "edge_entry_active", "edge_exit_active"}
-    unread = {key: value for key, value in element.items() if key not in known}
-    if replaced:
-        return None if any(map(_acts, unread.values())) else unread
+        attributes |= {"edge_entry_hgap", "edge_entry_active", "edge_exit_active"}
+    values = {key: value for key, value in element.items() if key not in attributes}
+    if is_replaced:
+        return None if any(map(_acts, values.values())) else values
     if is_field:
         order = max(len(element.get(key, ())) for key in ("knl", "ksl")) - 1
         element["order"] = max(element.get("order", 0), order)
@@ -255,13 +255,13 @@ def _unread_of_xsuite(element: Any) -> dict[str, Any] | None:
     anchor, roll = element.get("rot_shift_anchor", 0.0), element.get("rot_s_rad", 0.0)
     if roll or not any(abs(anchor - x * element._l_anchor) < 1e-9 for x in (0, 0.5)):
         # pyAT has these without a roll of the design, at the entrance or in the middle.
-        unread |= {key: element.get(key) for key in _XSUITE_SHIFTS}
+        values |= {key: element.get(key) for key in _XSUITE_SHIFTS}
     if element.origin in ("Bend", "RBend"):
         if element.get("edge_exit_hgap") == element.get("edge_entry_hgap"):
-            unread.pop("edge_exit_hgap", None)
+            values.pop("edge_exit_hgap", None)
         for side in ("entry", "exit"):
             is_off = element.get(f"edge_{side}_model") == "suppressed"
-            unread[f"edge_{side}, suppressed"] = is_off or not element.get(f"edge_{side}_active", 1)
+            values[f"edge_{side}, suppressed"] = is_off or not element.get(f"edge_{side}_active", 1)
         length = element.get("length", 0.0)
         if element.origin == "RBend":
             half = element.get("angle", 0.0) / 2
@@ -271,8 +271,8 @@ def _unread_of_xsuite(element: Any) -> dict[str, Any] | None:
         k0 = element.pop("k0", None)  # pyAT adds it to the field that bends by the angle
         if k0 is not None and not element.get("k0_from_h", False):
             excess = k0 - angle / length
-            unread["k0 - angle/length"] = excess if abs(excess) > 1e-9 * abs(k0) else 0.0
-    return unread
+            values["k0 - angle/length"] = excess if abs(excess) > 1e-9 * abs(k0) else 0.0
+    return values
 
 
 def check_source(source: Any) -> None:

@@ -5,14 +5,14 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ._exact import pz_of, quarters, rotated
+from ._exact import pz_of, quarters, rotation
 from ._maps import Parameters, Particle
 
 
 def turned(z: Particle, angle: Any) -> Particle:
     """Coordinates relative to axes that are rotated about the s-axis, x towards y."""
-    x, y = rotated(z.x, z.y, angle)
-    py, px = rotated(z.py, z.px, -angle)  # the shears of the momenta are the transposed ones
+    x, y = rotation(z.x, z.y, angle)
+    py, px = rotation(z.py, z.px, -angle)  # the shears of the momenta are the transposed ones
     return z._replace(x=x, px=px, y=y, py=py)
 
 

@@ -202,9 +202,9 @@ class Ring(eqx.Module):
         if readers:
             part, element = np.asarray(self.program.rows).T
             reads = element[[self.program.parts[i].name in readers for i in part]]
-            if len(unread := np.setdiff1d(numbers, reads)):
+            if len(others := np.setdiff1d(numbers, reads)):
                 raise ValueError(
-                    f"{self._label(unread[0])} was made with {parameter} = 0, which is not a "
+                    f"{self._label(others[0])} was made with {parameter} = 0, which is not a "
                     "parameter of its map: make it with the value that it has."
                 )
         for i in numbers:
