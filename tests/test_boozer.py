@@ -466,6 +466,25 @@ def test_fields_between_the_surfaces_of_a_file(parts, spacing):
     assert error[25] < 1e-3
 
 
+@pytest.mark.parametrize(
+    ("given", "centre", "message"),
+    [
+        ([0.01, 0.4, 0.6, 0.75, 0.9, 1.0], 0.45, "with 6 surfaces"),
+        ([0.01, 0.4, 0.6, 0.8, 1.0], 0.45, "with 5 surfaces"),
+        ([0.01, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0], 0.3, "with 8 surfaces"),
+        ([0.01, 0.82, 0.88, 0.94, 1.0], 0.4, r"gap of more than 0\.4"),
+        ([0.5, 0.6, 0.7, 0.8, 0.9, 1.0], 0.4, r"gap of more than 0\.4"),
+    ],
+)
+def test_wide_gaps_between_surfaces_are_refused(given, centre, message):
+    """Each surface is predicted by the others, with the one before a gap as an end."""
+    given = np.array(given)
+    modes = 5 + 0.6 * np.exp(-(((given - centre) / 0.3) ** 2)) + 0.3 * given**2
+    profiles = {"iota": 0.4 + 0 * given, "G": 50 + 0 * given, "psi_edge": 8.0}
+    with pytest.raises(ValueError, match=message):
+        boozer.from_surfaces(given, [0], [0], modes[:, None], **profiles)
+
+
 NEAR_AXIS = ["precise QA", *(pytest.param(x, marks=slow) for x in ("precise QH", "r2 section 5.5"))]
 
 
@@ -625,7 +644,9 @@ def test_coordinates_with_modes_that_break_the_symmetry(coordinates):
         H = system.hamiltonian(0.0, 0.0, q, p, 0.0, args)
         H = H + epsilon * system.perturbation(0.0, 0.0, q, p, args, epsilon)
         assert float(energy) == pytest.approx(float(H), rel=1e-13)
-    assert abs(at.B / alphas.coordinates_of(q, p).B - 1) > 1e-3  # negative control: without ε
+    for function in (alphas.coordinates_of, lambda q, p: alphas.second_invariant(q, p, args)):
+        with pytest.raises(ValueError, match=r"epsilon must be that of the run, .* got None"):
+            function(q, p)
 
 
 @slow

@@ -170,6 +170,19 @@ def test_a_descent_lowers_the_drift_and_losses_have_times(broken, starts):
     assert 0 < times[1] < 1e-4
 
 
+@pytest.mark.slow
+def test_a_step_that_is_too_large_for_the_field_gives_no_time_of_a_loss():
+    """As `radial_drift`: the energy changes by far more than by the step of the field."""
+    m, n, B = [0, 1, 3], [0, 0, 12], [[5.7], [-0.6], [0.3]]
+    ripple = boozer.from_modes(m, n, B, psi_edge=8.0, iota=0.4, G=57.0, periods=12)
+    particles = boozer.GuidingCentres(ripple)
+    start = jnp.asarray([0.5, 0.3, 0.1, 0.6])
+    for h, is_accurate in ((particles.h, True), (6.0, False)):
+        drift, success = boozer.radial_drift(particles, start, num_steps=100, h=h)
+        time = boozer.lost_at(particles, start, num_steps=100, h=h)
+        assert (bool(success), not np.isnan(time)) == (is_accurate, is_accurate), (h, drift)
+
+
 def test_wrong_inputs_are_refused(broken, starts):
     with pytest.raises(TypeError, match="field must be a Field"):
         boozer.symmetry_error(broken.coefficients)

@@ -415,6 +415,25 @@ def test_energy_and_force_vanish_at_the_cut_off():
     assert inside - U == pytest.approx(-1.4 * 24 * (2 * 2.5**-13 - 2.5**-7), rel=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("options", "least", "apart"),
+    [
+        ({"n": 8, "box": 1.0}, 2.263, 0.354),
+        ({"n": 32, "density": 4.0}, 2.263, 0.707),
+        ({"n": 2, "box": 1.1}, 1.131, 0.778),
+        ({"n": 33, "box": 3.3}, 3.394, 0.778),
+    ],
+)
+def test_particles_that_overlap_are_refused(options, least, apart):
+    with pytest.raises(
+        ValueError, match=rf"box must be at least {least} .* {apart} σ apart\."
+    ):
+        lennard_jones(**options)
+    accepted = lennard_jones(options["n"], box=least + 0.001).q0
+    distances = np.linalg.norm(accepted[:, None] - accepted[None], axis=-1)
+    assert distances[~np.eye(len(accepted), dtype=bool)].min() > 0.8
+
+
 @slow
 def test_a_fluid_conserves_its_momentum_and_energy_to_the_order_of_the_method():
     problem = lennard_jones(32)

@@ -96,6 +96,7 @@ def test_a_json_file_that_is_no_lattice(read, content):
 def test_what_elegant_has_and_pyat_does_not(read):
     lines = FODO[".lte"].replace("=(QF", "=(E,QF")
     for element, reason in (
+        ("SOLENOID,L=0.4,B=0.2", "no element for SOLENOID"),
         ("SOLENOID,L=0.4,KS=0.2", "no element for SOLENOID"),
         ("MALIGN,DXP=1e-3", "no element for MALIGN"),
         ("CSBEND,L=1,ANGLE=0.1,XKICK=0.2", "leaves out xkick"),
@@ -109,9 +110,46 @@ def test_what_elegant_has_and_pyat_does_not(read):
 
 
 def test_commands_that_change_a_lattice_are_refused(read):
-    for command in ("seqedit, sequence=s; endedit;", "ealign, dx=1e-3;", "beam, bv=-1;"):
+    for command in (
+        "seqedit, sequence=s; endedit;", "ealign, dx=1e-3;", "beam, bv=-1;", "cycle, start=e;",
+        "makethin, sequence=s;", "add2expr, var=k, expr=1;",
+    ):  # fmt: skip
         with pytest.raises(ValueError, match="changes its lattice by"):
             read(with_element("drift,l=1", command))
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (
+            "k = 0.1; if (k > 0) {k = 0.3;} q: quadrupole,l=1,k1=k; s: line=(q);",
+            "conditions, loops",
+        ),
+        ("k = 0.1; while (k < 1) {k = k + 1;}; q: drift,l=1; s: line=(q);", "conditions, loops"),
+        ("a(x): macro = {k = x;}; exec, a(2); q: drift,l=1; s: line=(q);", "conditions, loops"),
+        ("q: drift,l=1; s: line=(q, -2*q);", "repeated backwards"),
+        ("q: drift,l=1; t: line=(q); s: line=(q, 2*(-t));", "repeated backwards"),
+        ("option, -rbarc; q: rbend,l=1,angle=0.1; s: line=(q);", "RBARC = FALSE"),
+        ("option, rbarc=false; q: rbend,l=1,angle=0.1; s: line=(q);", "RBARC = FALSE"),
+        ("q: drift,l=1; s: sequence,l=3; q,at=0.5; q,at=1.4; endsequence;", "the first by 0.1 m"),
+        ("q: drift,l=1; s: sequence,l=3; q,at=0.5; q,at=2.9; endsequence;", "the first by 0.4 m"),
+    ],
+)
+def test_statements_that_pyat_misreads_are_refused(read, text, reason):
+    with pytest.raises(ValueError, match=reason):
+        read(text + BEAM, use="s")
+
+
+def test_commands_without_effect_are_read(read):
+    commands = 'option,-echo; title,"a"; use,period=s; select,flag=twiss; twiss; save; stop;'
+    assert len(read(with_element("drift,l=1", commands))) == 3
+
+
+def test_attributes_that_are_assigned_later(read):
+    later = FODO[".madx"] + "qf->k1 = 0.9; qd -> k1 := -2*k; k = 0.4;"
+    np.testing.assert_allclose(read(later).get("quadrupole", "b1"), [0.9, -0.8])
+    old = read(FODO[".mad8"].replace("ring:", "qf[k1] := 0.9\nring:"), ".mad8")
+    np.testing.assert_allclose(old.get("quadrupole", "b1"), [0.9, -0.6])
 
 
 def test_the_sequence_is_selected(read):
@@ -164,6 +202,43 @@ def test_bends_of_xsuite(read):
         read(xsuite(**bend, k0=0.19), ".json")
     with pytest.raises(ValueError, match=r"0: e .*leaves out hxl = 0.1"):
         read(xsuite(__class__="Multipole", length=0.0, knl=[0.1, 0.0], hxl=0.1), ".json")
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "reason"),
+    [
+        ("Solenoid", {"length": 0.5, "ks": 0.3}, "no element for Solenoid"),
+        ("SRotation", {"angle": 0.3}, "no element for SRotation"),
+        ("CrabCavity", {"crab_voltage": 1e6}, "no element for CrabCavity"),
+        ("RFMultipole", {"knl": [0.1]}, "no element for RFMultipole"),
+        ("Translation", {"dx": 0.1}, "no element for Translation"),
+        ("Quadrupole", {"length": 0.5, "k1": 0.3, "main_is_skew": True}, "out main_is_skew"),
+        ("Quadrupole", {"length": 0.5, "rot_s_rad": 0.1, "shift_x": 1e-3}, "out shift_x"),
+        ("Quadrupole", {"length": 0.5, "rot_y_rad": 0.1, "rot_shift_anchor": 0.1}, "out rot_y_rad"),
+        ("Sextupole", {"length": 0.5, "k2": 3.0, "edge_exit_active": 1}, "out edge_exit_active"),
+        ("Bend", {"length": 1.0, "angle": 0.2, "edge_entry_active": 0}, "out edge_entry, suppr"),
+        (
+            "Bend",
+            {"length": 1.0, "angle": 0.2, "edge_exit_model": "suppressed"},
+            "out edge_exit, s",
+        ),
+        ("Bend", {"length": 1.0, "angle": 0.2, "edge_exit_hgap": 0.02}, "out edge_exit_hgap"),
+    ],
+)
+def test_what_pyat_leaves_out_of_elements_of_xsuite(read, capsys, kind, values, reason):
+    with pytest.raises(ValueError, match=rf"0: e .*{reason}"):
+        read(xsuite(__class__=kind, **values), ".json")
+    assert capsys.readouterr().out == ""
+
+
+def test_multipoles_of_xsuite(read):
+    """All orders are read, and the length of a thin one is that of its radiation."""
+    multipole = {"__class__": "Multipole", "length": 0.5, "knl": [0.1, 0.2, 0, 0, 0, 120.0]}
+    thin, thick = (read(xsuite(**multipole, isthick=x), ".json") for x in (False, True))
+    assert (thin.places[-1], thick.places[-1]) == (1.0, 1.5)
+    for ring, length in ((thin, 1.0), (thick, 0.5)):
+        field = [ring.get("e", f"b{n}") * length for n in (0, 1, 5)]
+        np.testing.assert_allclose(np.ravel(field), [0.1, 0.2, 1.0])
 
 
 def test_the_exact_model_of_a_file(read):

@@ -250,7 +250,7 @@ def solenoids(pieces):
     ("make", "tunes"),
     [
         (weak_focusing, [np.sqrt(0.9), np.sqrt(0.1)]),
-        (lambda pieces: weak_focusing(pieces, 2, 0.04), [2 * np.sqrt(0.96), 0.4]),
+        (lambda pieces: weak_focusing(2 * pieces, 2, 0.04), [2 * np.sqrt(0.96), 0.4]),
         pytest.param(solenoids, None, marks=pytest.mark.slow),
     ],
 )
@@ -262,6 +262,72 @@ def test_tunes_have_their_whole_part_also_where_one_magnet_turns_the_phase_more_
     np.testing.assert_allclose(one.chromaticity, many.chromaticity, atol=1e-3)
     if tunes is not None:
         np.testing.assert_allclose(one.tune, tunes, atol=1e-4)
+
+
+def with_defocusing(magnet, drift=2.0, k=0.6):
+    return rings.Ring([rings.quadrupole("QF", 0.5, k), rings.drift("D", drift),
+                       *[magnet, rings.drift("D", drift)]])  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "errors",
+    [
+        {"roll": np.pi / 2},
+        {"roll": 3 * np.pi / 2, "ds": 1e-9},
+        {"tilt": -np.pi / 2},
+        {"roll": np.pi / 4, "tilt": np.pi / 4},
+    ],
+)
+def test_the_tune_of_a_rolled_magnet_is_that_of_the_same_magnet_described_otherwise(errors):
+    """By 5 or 1 larger where the phase is that of the component of a mode in the rolled frame."""
+    wanted = rings.optics(with_defocusing(rings.quadrupole("QD", 0.5, -0.5)))
+    rolled = rings.optics(with_defocusing(rings.quadrupole("QD", 0.5, 0.5).placed(**errors)))
+    for name in ("tune", "chromaticity", "mu", "beta", "alpha"):
+        np.testing.assert_allclose(getattr(rolled, name), getattr(wanted, name), atol=1e-8)
+
+
+def test_the_tunes_of_a_ring_with_vertical_bends():
+    """A bend without focusing by its field is a quadrupole in its own plane."""
+    at = pytest.importorskip("at")
+    bend = rings.bend("B", 1.0, 0.9, (0, -0.3))  # it focuses in both planes
+
+    def tunes(bend, k):
+        return rings.optics(with_defocusing(bend, 0.5, k)).tune
+
+    upright = tunes(bend, 0.1)
+    np.testing.assert_allclose(tunes(bend.placed(tilt=np.pi / 2), -0.1), upright[::-1], atol=1e-12)
+    theirs = at.Dipole("B", 1.0, 0.9, -0.3)
+    at.tilt_elem(theirs, np.pi / 2)
+    line = [at.Quadrupole("QF", 0.5, -0.1), at.Drift("D", 0.5), theirs, at.Drift("D", 0.5)]
+    loaded = rings.from_at(at.Lattice(line, energy=1e9, periodicity=1))
+    np.testing.assert_allclose(rings.optics(loaded).tune, upright[::-1], atol=1e-2)
+
+
+def test_what_is_perturbed_is_part_of_each_result_at_epsilon():
+    """The voltage decides whether the motion is 6D, the lengths give s and the compaction."""
+    ring = cell(angle=0.1, voltage=1e-3)
+    found = rings.optics(ring.perturbed("C", "voltage"), epsilon=1.0)
+    np.testing.assert_allclose(found.tune, rings.optics(ring).tune, rtol=0, atol=1e-14)
+    assert rings.matrix(ring.perturbed("C", "voltage"), dp=0.0, epsilon=1.0)[5, 4] == 0
+    perturbed = ring.perturbed("D", "length")
+    for name in ("s", "compaction", "tune"):
+        one, other = (getattr(rings.optics(r, dp=0.0, epsilon=e), name)
+                      for r, e in ((ring, 0.0), (perturbed, 1.0)))  # fmt: skip
+        np.testing.assert_allclose(one, other, rtol=1e-13, err_msg=name)
+    assert perturbed.at(0.5).places[-1] == ring.places[-1] - ring.get("D", "length").sum() / 2
+
+
+@pytest.mark.slow
+def test_driving_terms_include_the_sextupoles_of_exact_bends_of_pyat():
+    at = pytest.importorskip("at")
+    line = [at.Quadrupole("QF", 0.5, 0.6), at.Drift("D", 2.0),
+            at.Dipole("B", 1.0, 0.01, PolynomB=[0.0, -0.3, 2.0], PassMethod="ExactSectorBendPass"),
+            at.Drift("D", 2.0)]  # fmt: skip
+    lattice = at.Lattice(line, energy=1e9, periodicity=1)
+    exact, paraxial = (rings.from_at(lattice, model=m) for m in (None, "paraxial"))
+    terms = [rings.resonance_driving_terms(r)["h21000"] for r in (exact, paraxial)]
+    assert abs(terms[1]) > 0.1
+    np.testing.assert_allclose(*terms, rtol=1e-2)
 
 
 @pytest.mark.slow

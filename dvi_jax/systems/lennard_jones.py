@@ -8,6 +8,9 @@ from ..discover.symmetries.library import rotation, space_translation
 from ._problem import Parameter, Problem, Start, library_problem
 from .n_body import angular_momentum, check_apart, linear_momentum
 
+_CLOSEST = 0.8
+"""Least distance of neighbours at the start [σ], where the energy of a pair is 43 depths."""
+
 
 def pair_energy(r, args):
     r"""Energy of a pair at the distance r, without the cut-off: 4 depth [(σ/r)¹² − (σ/r)⁶]."""
@@ -90,8 +93,8 @@ def lennard_jones(
     The observables are `energy`, `linear_momentum`, `centre_of_mass` (at t = 0), `temperature`, and
     `angular_momentum` of a cluster. All pairs are evaluated: the time of a step grows with n².
 
-    **Raises** `ValueError` for fewer than two particles, a cut-off above half of the box, and for
-    sizes, temperatures and densities that are not positive.
+    **Raises** `ValueError` for fewer than two particles, those that overlap (closer than 0.8 σ), a
+    cut-off above half of the box, and sizes, temperatures and densities that are not positive.
 
     **Source** Lennard-Jones 1931, *Proc. Phys. Soc.* 43, 461; cut-off: Toxvaerd & Dyre 2011,
     *J. Chem. Phys.* 134, 081102.
@@ -115,6 +118,13 @@ def lennard_jones(
         spacing = 1.542  # [σ] of the crystal at rest without pressure
     if cutoff is not None:
         parameters["cutoff"] = Parameter(cutoff, "distance without force [length]")
+    distance = np.sqrt(0.5) * spacing
+    if distance < _CLOSEST:
+        raise ValueError(
+            f"box must be at least {cells * _CLOSEST / np.sqrt(0.5):.4g} for n = {n}, so that the "
+            f"particles begin {_CLOSEST} σ apart or more, got box = {cells * spacing:.4g}, where "
+            f"they are {distance:.3g} σ apart. Give a larger box or fewer particles."
+        )
     q0, p0 = crystal(n, spacing), np.random.default_rng(seed).normal(size=(n, 3))
     p0 -= p0.mean(axis=0)
     p0 *= np.sqrt(3 * (n - 1) * temperature / np.sum(p0**2))

@@ -12,6 +12,9 @@ from ...base.keywords import checked_keywords
 from ...base.printing import printable
 from ._sums import Coefficients, Shape, total
 
+_WIDEST = 0.4
+"""Widest gap between two surfaces: in a wider one there may be what no other surface shows."""
+
 Profile = Float[Array, " d"]
 """A polynomial in s: its coefficients, the constant first."""
 
@@ -244,7 +247,7 @@ def from_surfaces(
     splines of low order would limit the order of a method. |B| is then a polynomial in √s cos θ and
     √s sin θ.
 
-    - `s`: surfaces in 0 ≤ s ≤ 1, increasing, the last one at 0.9 or more.
+    - `s`: surfaces in 0 ≤ s ≤ 1, increasing, the last one at 0.9 or more, with gaps up to 0.4.
     - `m`, `n`: mode numbers; `B`: values [T], shape (surfaces, modes), or (2, surfaces, modes) with
       those of the sine terms.
     - `iota`, `G`, `I`: values on the surfaces [1, T m, T m]; `psi_edge`, `periods`, `helicity` as
@@ -259,19 +262,23 @@ def from_surfaces(
     `tolerance`: too few surfaces, or a degree that is too low.
 
     **Accuracy** The error is measured by leaving each surface out and predicting it from the
-    others, so that it holds between the surfaces; at the ends it is scaled to the distance from
-    s = 0 and s = 1. The modes outside of `box` are not part of it.
+    others; at the ends it is scaled to the distance from s = 0 and s = 1. Between two surfaces it
+    is the change of the fit by leaving one surface out. The modes outside of `box` are not part of
+    it.
     """
     s, values = _array("s", s, "surfaces"), _parts(B)
     periods, helicity = settings.get("periods", 1), settings.get("helicity", 0)
     degree = whole("degree", degree, 0)
-    if len(s) < 2 or np.any(np.diff(s) <= 0) or s[0] < 0 or s[-1] > 1 or s[-1] < 0.9:
-        raise ValueError(
-            "s must increase, from 0 or more to the edge (0.9 to 1), got "
-            f"{np.array2string(s, threshold=4)}. Divide s and psi_edge of an inner grid by s[-1]."
-        )
+    gaps = np.diff(s)
     if len(s) < 3:
         raise ValueError(f"s must have at least 3 surfaces, got {len(s)}.")
+    is_wide = len(s) > 3 and max(s[0], *gaps) > _WIDEST
+    if gaps.min() <= 0 or s[0] < 0 or s[-1] > 1 or s[-1] < 0.9 or is_wide:
+        raise ValueError(
+            f"s must increase, without a gap of more than {_WIDEST}, from 0 or more to the edge "
+            f"(0.9 to 1), got {np.array2string(s, threshold=4)}. Divide s and psi_edge of an inner "
+            "grid by s[-1]."
+        )
     ms, ns = (_integers(name, x) for name, x in (("m", m), ("n", n)))
     array("B", values[0], (len(s), len(ms)), integers=True)
     names = ["iota", "G", *(["I"] if settings.get("I") is not None else [])]
@@ -317,13 +324,13 @@ def fitted_modes(
 
 
 def _check_fit(name: str, errors: np.ndarray, scale: float, tolerance: float) -> None:
-    """**Raises** `ValueError` if an error at one of the surfaces is too large."""
+    """**Raises** `ValueError` if an error at or between the surfaces is too large."""
     if errors.max() > finite("tolerance", tolerance) * scale:
         raise ValueError(
             f"{name} must be determined by its values on the surfaces to tolerance={tolerance} of "
-            f"its size, got {errors.max() / scale if scale else np.inf:.2g} with {len(errors)} "
-            "surfaces, each predicted by the others. Give more surfaces, a larger degree, fewer "
-            "large m (box=), or a larger tolerance."
+            f"its size, got {errors.max() / scale if scale else np.inf:.2g} with "
+            f"{len(errors) // 2 + 1} surfaces, each predicted by the others. Give more surfaces, "
+            "a larger degree, fewer large m (box=), or a larger tolerance."
         )
 
 
@@ -331,7 +338,7 @@ def _fit_modes(
     s: np.ndarray, m: np.ndarray, values: np.ndarray, degree: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """`_fit` of each mode, with the power m/2."""
-    fits, errors = np.zeros((len(m), degree + 1)), np.zeros(values.shape)
+    fits, errors = np.zeros((len(m), degree + 1)), np.zeros((2 * len(s) - 1, len(m)))
     for power in np.unique(m):
         fits[m == power], errors[:, m == power] = _fit(s, values[:, m == power], degree, power / 2)
     return fits, errors
@@ -341,32 +348,41 @@ def _fit(
     s: np.ndarray, values: np.ndarray, degree: int, power: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """c with values ≈ s^power Σ_d c_d s^d by least squares, shape (…, degree + 1), and the error at
-    each surface, for values of shape (surfaces, …).
+    each surface and in the middle between them, shape (2 surfaces − 1, …), for values of shape
+    (surfaces, …).
 
     With few surfaces the residual is no measure: a polynomial of a high degree passes through all
     values and oscillates in between. The error is that of the prediction from the other surfaces,
     residual/(1 − H_ii) with the projection H of the fit, and the degree is the one, up to `degree`,
     for which it is smallest. The errors at both ends, where this is an extrapolation, are scaled
-    to the distance from s = 0 and s = 1.
+    to the distance from s = 0 and s = 1. That in a gap, which may be wide, is the largest change of
+    the fit there if one surface is left out.
     """
     columns = values.reshape(len(s), -1)
-    c, errors = np.zeros((columns.shape[1], degree + 1)), np.abs(columns)  # without any term
+    c, middles = np.zeros((columns.shape[1], degree + 1)), (s[1:] + s[:-1]) / 2
+    # Without any term: the values themselves, also between the surfaces.
+    errors = np.abs(np.vstack([columns, (columns[1:] + columns[:-1]) / 2]))
     weights = np.ones((len(s), 1))
     weights[[0, -1], 0] = s[0] / (s[1] - s[0]), (1 - s[-1]) / (s[-1] - s[-2])
+
+    def basis_at(x, d):
+        return np.polynomial.chebyshev.chebvander(2 * x - 1, d) * (x**power)[:, None]
+
     for d in range(min(degree, len(s) - 2) + 1):
-        basis = np.polynomial.chebyshev.chebvander(2 * s - 1, d) * (s**power)[:, None]
-        left, sizes, right = np.linalg.svd(basis, full_matrices=False)
+        left, sizes, right = np.linalg.svd(basis_at(s, d), full_matrices=False)
         rank = int(np.sum(sizes > 1e-10 * sizes[0]))
         left, inverse = left[:, :rank], right[:rank].T / sizes[:rank]
         residuals = np.abs(columns - left @ (left.T @ columns))
         freedom = 1 - np.sum(left**2, axis=1, keepdims=True)
         # A surface that the others do not predict at all has no freedom, up to rounding.
-        left_out = np.where(freedom > 1e-8, weights * residuals / freedom.clip(1e-8), np.inf)
-        predicted = np.maximum(residuals, left_out)
-        better = np.sum(predicted**2, axis=0) < np.sum(errors**2, axis=0)
-        errors[:, better], c[better] = predicted[:, better], 0.0
+        left_out = np.where(freedom > 1e-8, residuals / freedom.clip(1e-8), np.inf)
+        predicted = np.maximum(residuals, weights * left_out)
+        changes = np.abs(basis_at(middles, d) @ inverse @ left.T)
+        gap_errors = np.max([np.outer(changes[:, i], left_out[i]) for i in range(len(s))], axis=0)
+        better = np.sum(predicted**2, axis=0) < np.sum(errors[: len(s)] ** 2, axis=0)
+        errors[:, better], c[better] = np.vstack([predicted, gap_errors])[:, better], 0.0
         c[better, : d + 1] = (inverse @ (left.T @ columns[:, better])).T @ _monomials(d)
-    return c.reshape(*values.shape[1:], degree + 1), errors.reshape(values.shape)
+    return c.reshape(*values.shape[1:], degree + 1), errors.reshape(-1, *values.shape[1:])
 
 
 def _monomials(degree: int) -> np.ndarray:

@@ -175,8 +175,9 @@ class GuidingCentres(eqx.Module):
     def coordinates_of(self, q: Any, p: Any, epsilon: Any = None) -> Coordinates:
         """Boozer coordinates of states: q, p of shape (…, 2) → arrays of shape (…).
 
-        - `epsilon`: that of the run, if `breaking` is given: v∥ and |B| depend on it.
+        - `epsilon`: that of the run, required if `breaking` is given: v∥ and |B| depend on it.
         """
+        self._require(epsilon)
 
         @functools.partial(jnp.vectorize, signature="(n),(n)->(),(),(),(),()")
         def coordinates(q, p):
@@ -187,7 +188,9 @@ class GuidingCentres(eqx.Module):
 
     def second_invariant(self, q: Any, p: Any, args: Any, epsilon: Any = None) -> Array:
         """J∥ = ∮ v∥ dl [m] of one state, in the well of |B| where it lies; NaN for a passing
-        particle. See `boozer.second_invariant`; E is that of the state, H(q, p)."""
+        particle. See `boozer.second_invariant`; E is that of the state, H(q, p). `epsilon`: see
+        `coordinates_of`."""
+        self._require(epsilon)
         return SecondInvariant(self.chart, epsilon).value(q, p, args)
 
     def bounces(self, max_crossings: int = 100, direction: int = 0) -> Section:
@@ -200,8 +203,14 @@ class GuidingCentres(eqx.Module):
         return Section(Pitch(self.chart), direction, max_crossings)
 
     def second_invariant_at(self, bounces: Crossings, args: Any, epsilon: Any = None) -> Array:
-        """J∥ [m] at the bounce points of one orbit, NaN after the last one."""
+        """J∥ [m] at the bounce points of one orbit, NaN after the last one; `epsilon`: see
+        `coordinates_of`."""
+        self._require(epsilon)
         return at_crossings(SecondInvariant(self.chart, epsilon), bounces, args)
+
+    def _require(self, epsilon: Any) -> None:
+        if self.breaking is not None and epsilon is None:
+            raise ValueError("epsilon must be that of the run, as `breaking` is given, got None.")
 
     @property
     def observables(self) -> dict[str, Any]:

@@ -91,6 +91,14 @@ def _run(particles: GuidingCentres, start: Any, duration: tuple[int, Any], **opt
     )  # fmt: skip
 
 
+def _is_accurate(particles: GuidingCentres, start: Any, q: Any, p: Any) -> Array:
+    """Whether the energy of a state of a run differs little from that at its start."""
+    q0, p0, args = particles.state(*start)
+    epsilon = None if particles.breaking is None else 1.0
+    first, last = (centre_of(particles.chart, *x, args, epsilon).energy for x in ((q0, p0), (q, p)))
+    return jnp.abs(last - first) < _ENERGY_ERROR * first
+
+
 def radial_drift(
     particles: GuidingCentres, start: Any, *, num_steps: int = 650, h: Any = 4.0
 ) -> tuple[Array, Array]:
@@ -122,11 +130,7 @@ def radial_drift(
     num_steps = whole("num_steps", num_steps)
     adjoint, mean = Reversible(checkpoint_every=25), Mean(_Weight(particles.chart))
     sol = _run(particles, start, (num_steps, h), adjoint=adjoint, observe=mean)
-    q, p, args = particles.state(*start)
-    states = (q, p), (sol.qs[-1], sol.ps[-1])
-    epsilon = None if particles.breaking is None else 1.0
-    first, last = (centre_of(particles.chart, *x, args, epsilon).energy for x in states)
-    is_accurate = jnp.abs(last - first) < _ENERGY_ERROR * first
+    is_accurate = _is_accurate(particles, start, sol.qs[-1], sol.ps[-1])
     is_success = (sol.result == RESULTS.successful) & is_accurate
     return -jnp.where(is_success, sol.observed, 0.0), is_success
 
@@ -165,11 +169,14 @@ def mean_drift(
 
 
 def lost_at(particles: GuidingCentres, start: Any, *, num_steps: int, h: Any = 4.0) -> Array:
-    """Time [s] at which one particle reaches s = 1; infinite if it does not, NaN if its run fails.
+    """Time [s] at which one particle reaches s = 1; infinite if it does not. NaN if its run fails,
+    or if the energy differs by more than 1e-3 at its end.
 
     Arguments as for `radial_drift`. It has no useful derivative.
     """
     sol = _run(particles, start, (whole("num_steps", num_steps), h), stop=particles.loss)
-    seconds = particles.seconds(sol.stop.t)
     stays = sol.result == RESULTS.successful
-    return lax.stop_gradient(jnp.where(stays, jnp.inf, seconds))
+    seconds = jnp.where(stays, jnp.inf, particles.seconds(sol.stop.t))
+    ends = (sol.qs[-1], sol.stop.q), (sol.ps[-1], sol.stop.p)
+    is_accurate = _is_accurate(particles, start, *(jnp.where(stays, *end) for end in ends))
+    return lax.stop_gradient(jnp.where(is_accurate, seconds, jnp.nan))

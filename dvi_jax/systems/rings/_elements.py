@@ -265,8 +265,10 @@ def lens(name: str, potential: Callable[..., Any], **values: float) -> Element:
     jnp.log(1 + x * x) / 2, g=1.6)``
     """
     values = {key: strength(f"{key} of lens {name!r}", value) for key, value in values.items()}
-    if "length" in values:
-        raise ValueError(f"length of lens {name!r} is zero: use another name for its parameter.")
+    if same := values.keys() & {"length", "voltage"}:  # that of a cavity makes a ring 6D
+        raise ValueError(
+            f"{min(same)} of lens {name!r} is zero: use another name for its parameter."
+        )
     check_takes("potential", potential, "(x, y, par)")
     subject = f"potential(x, y, par) of lens {name!r} with par = {values}"
     values = {**values, "length": 0.0}

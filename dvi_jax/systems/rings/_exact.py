@@ -4,8 +4,31 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import lax
 
 from ._maps import KICKS, Parameters, Particle, Piece, RingPart, field, near_identity
+
+
+def quarters(angle: Any) -> tuple[Any, Any, Any]:
+    """Cosine and sine of quarters of a turn, which are integers, and the rest of the angle."""
+    n = jnp.round(lax.stop_gradient(angle) / (np.pi / 2)) * (np.pi / 2)
+    return jnp.round(jnp.cos(n)), jnp.round(jnp.sin(n)), angle - n
+
+
+def rotation(x: Any, y: Any, angle: Any) -> tuple[Any, Any]:
+    """(c x + s y, c y − s x) by quarters of a turn and three shears.
+
+    The determinant is 1, whatever the rounding of sines and tangents. With cosines it is their
+    c² + s², which changes all actions by up to one unit of round-off in every turn, always with
+    the same sign.
+    """
+    c, s, rest = quarters(angle)
+    x, y = c * x + s * y, c * y - s * x
+    t = jnp.tan(rest / 2)
+    x = x + t * y
+    y = y - jnp.sin(rest) * x
+    return x + t * y, y
 
 
 def pz_of(z: Particle, px: Any = None) -> Any:
@@ -21,6 +44,12 @@ def exact_drift(z: Particle, length: Any, par: Parameters) -> Particle:
     return z.plus(x=scale * z.px, y=scale * z.py, zeta=-scale * p2 / (p + pz))
 
 
+def _beyond(z: Particle, px: Any) -> Any:
+    """pz − 1, without cancellation."""
+    squares = px * px + z.py * z.py
+    return (z.delta * (2 + z.delta) - squares) / (1 + pz_of(z, px))
+
+
 def _arc(z: Particle, px: Any) -> Any:
     """The angle between the momenta px before and after a bend, in the plane of the bend."""
     radius = jnp.sqrt((1 + z.delta) ** 2 - z.py * z.py)
@@ -30,21 +59,19 @@ def _arc(z: Particle, px: Any) -> Any:
 def exact_bend(z: Particle, length: Any, par: Parameters) -> Particle:
     """The flow in a uniform field h in coordinates of curvature h. Forest 1998, (12.18)."""
     h = par["h"]
-    excess = pz_of(z) - (1 + z.x * h)
-    c, s = jnp.cos(h * length), jnp.sin(h * length)
-    px = z.px * c + excess * s
+    px, excess = rotation(z.px, _beyond(z, z.px) - z.x * h, h * length)
     path = length + _arc(z, px) / h
-    x = (pz_of(z, px) - excess * c + z.px * s - 1) / h
     late = (1 + z.delta) * path - length
+    x = (_beyond(z, px) - excess) / h
     return z._replace(x=x, px=px, y=z.y + z.py * path, zeta=z.zeta - late)
 
 
 def rotate(z: Particle, angle: Any) -> Particle:
     """Free motion to a plane that is rotated about the y-axis. Forest 1998, (10.26)."""
-    c, s, pz = jnp.cos(angle), jnp.sin(angle), pz_of(z)
-    p = c * pz - s * z.px
-    path = z.x * s / p
-    x, px, late = z.x * pz / p, s * pz + c * z.px, (1 + z.delta) * path
+    pz = pz_of(z)
+    px, p = rotation(z.px, pz, angle)
+    path = z.x * jnp.sin(angle) / p
+    x, late = z.x * pz / p, (1 + z.delta) * path
     return z._replace(x=x, px=px, y=z.y + z.py * path, zeta=z.zeta - late)
 
 

@@ -4,6 +4,7 @@ import contextlib
 import io
 import json
 import math
+import re
 import warnings
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ _FIELD_FREE = {
 """Elements that are a drift or a marker, in lower case; apertures of MAD-X files are not read."""
 
 _STRENGTHS = {
-    "solenoid": ("ks", "ksi"),
+    "solenoid": ("ks", "ksi", "b"),
     **dict.fromkeys(("kicker", "tkicker"), ("hkick", "vkick", "kick")),
     "elseparator": ("ex", "ey", "exl", "eyl"),
     **dict.fromkeys(("crabcavity", "hacdipole", "vacdipole", "twcavity"), ("volt",)),
@@ -41,8 +42,14 @@ _OTHER_KINDS = (
 )  # fmt: skip
 """Elements of MAD-X that pyAT's parser does not know."""
 
-_CHANGES = ("seqedit", "ealign", "efcomp", "match")
-"""Commands of MAD-X that change a lattice, and that pyAT ignores."""
+_NO_CHANGES = {
+    "option", "select", "twiss", "survey", "use", "title", "assign", "value", "show", "print",
+    "printf", "plot", "setplot", "resplot", "stop", "exit", "quit", "return", "help", "save",
+    "esave", "eprint", "eoption", "set", "system", "emit", "ibs", "touschek", "dynap", "track",
+    "endtrack", "start", "observe", "run", "aperture", "sixtrack", "sodd", "beta0", "savebeta",
+    "coguess", "create", "fill", "write", "delete", "dumpsequ", "extract", "chdir", "list",
+}  # fmt: skip
+"""Commands of MAD that do not change a lattice. Other ones, such as EALIGN, are refused."""
 
 _WITHOUT_EFFECT = {
     "at", "from", "type", "comments", "apertype", "aperture", "aper_tol", "aper_offset", "aper_vx",
@@ -52,6 +59,18 @@ _WITHOUT_EFFECT = {
     "edge2_effects", "expansion_order", "steering",
 }  # fmt: skip
 """Attributes without effect on the map, or read elsewhere."""
+
+
+_XSUITE_SHIFTS = ("shift_x", "shift_y", "shift_s", "rot_x_rad", "rot_y_rad", "rot_s_rad_no_frame")
+_XSUITE_FIELDS = {
+    *_XSUITE_SHIFTS, "rot_s_rad", "rot_shift_anchor", "knl", "ksl", "delta_taper",
+    *(f"k{n}{skew}" for n in range(4) for skew in ("", "s")),
+}  # fmt: skip
+_XSUITE_READ = {
+    "order", "inv_factorial_order", "num_multipole_kicks", "isthick", "_isthick", "h", "k0_from_h",
+    "length_straight", "radiation_flag",
+}  # fmt: skip
+"""Attributes of Xsuite that are read, or have no effect on the map."""
 
 
 class _Undefined(float):
@@ -102,6 +121,8 @@ def _parsed(parser: Any, path: Path, use: str | None, options: dict[str, Any]) -
     keys = ("name", "particle", "energy", "periodicity")
     parameters = {key: options.pop(key) for key in keys if key in options}
     parser.env = {**parser.env, **_descriptions(parser)}
+    read_statement = parser._statement
+    parser._statement = lambda statement: read_statement(_readable(statement))
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # pyAT prints what it reads
             for read in (lambda: parser.parse_files(path, **options), lambda: None):
@@ -114,7 +135,10 @@ def _parsed(parser: Any, path: Path, use: str | None, options: dict[str, Any]) -
         names = ", ".join(sorted({*parser.ignored, *map(str, parser.missing)})[:10])
         unknown = f" Not known to pyAT or not defined: {names}." if names else ""
         raise ValueError(f"{path.name} cannot be read: {error}{unknown}") from error
-    changes = sorted(parser.ignored & set(_CHANGES))
+    commands = {command for _, label, command, *_ in parser.postponed if label is None}
+    changes = sorted(
+        c for c in commands & parser.ignored if c not in _NO_CHANGES and c[:4] != "ptc_"
+    )
     beams = (value for key, value in parser.items() if key.startswith("beam%"))
     if any(float(beam.get("bv", 1)) < 0 for beam in beams):
         changes.append("beam, bv=-1")
@@ -122,6 +146,12 @@ def _parsed(parser: Any, path: Path, use: str | None, options: dict[str, Any]) -
         raise ValueError(
             f"{path.name} changes its lattice by {', '.join(changes)}, which pyAT ignores. Save "
             "the sequence in MAD-X after these commands, and read that file."
+        )
+    overlaps = [e for e in lattice if e.FamName.startswith("drift_") and e.Length < 0]
+    if overlaps:
+        raise ValueError(
+            f"elements of {line} in {path.name} must not overlap, or end behind it: "
+            f"{len(overlaps)} of them do, the first by {-overlaps[0].Length:.3g} m."
         )
     undefined = sorted(k for k, v in parser.items() if isinstance(v, _Undefined) and k != "none")
     if undefined:
@@ -132,6 +162,30 @@ def _parsed(parser: Any, path: Path, use: str | None, options: dict[str, Any]) -
             stacklevel=user_level(),
         )
     return lattice
+
+
+def _readable(statement: str) -> str:
+    """The statement of a file in a form that pyAT reads. **Raises** `ValueError` for those that it
+    misreads or, as with braces that are not closed, never ends to read."""
+    text = re.sub(r"\"[^\"]*\"|'[^']*'", "", statement).lower()
+    is_line = re.search(r"\bline\s*=", text)
+    for what, is_misread in (
+        (
+            "conditions, loops and macros",
+            any(text.count(a) != text.count(b) for a, b in ("()", "{}")),
+        ),
+        ("lines that are repeated backwards", is_line and re.search(r"-\s*\d+\s*\*|\*\W*-", text)),
+        (
+            "RBARC = FALSE",
+            re.match(r"\s*option\b", text) and re.search(r"-\s*rbarc|rbarc\W*f", text),
+        ),
+    ):
+        if is_misread:
+            raise ValueError(f"pyAT does not read {what}")
+    # An attribute of an element; pyAT would make a variable.
+    return re.sub(
+        r"^\s*([\w.$]+)\s*(?:->\s*(\w+)|\[\s*(\w+)\s*\])\s*(:?=)", r"\1, \2\3\4", statement
+    )
 
 
 def _descriptions(parser: Any) -> dict[str, type]:
@@ -168,22 +222,9 @@ def _of_xsuite(data: dict[str, Any], path: Path, use: str | None, options: dict[
 
     if "lines" in data:
         use = _line_of([*data["lines"]], use, path)
-    line = XsLine.from_dict(data, use=use)
-    unread = {}
-    for name, element in line.elements.items():
-        keys = ("hxl", "hyl", "rbend_shift", "edge_entry_angle_fdown", "edge_exit_angle_fdown")
-        unread[name] = {key: element[key] for key in keys if key in element}
-        if element.origin in ("Bend", "RBend"):
-            length = element.get("length", 0.0)
-            if element.origin == "RBend":
-                half = element.get("angle", 0.0) / 2
-                straight = element.get("length_straight", length)
-                length = straight * half / math.sin(half) if half else straight
-            angle = element.setdefault("angle", element.get("h", 0.0) * length)
-            k0 = element.pop("k0", None)  # pyAT adds it to the field that bends by the angle
-            if k0 is not None and not element.get("k0_from_h", False):
-                excess = k0 - angle / length
-                unread[name]["k0 - angle/length"] = excess if abs(excess) > 1e-9 * abs(k0) else 0.0
+    with contextlib.redirect_stdout(io.StringIO()):  # pyAT prints what it does not know
+        line = XsLine.from_dict(data, use=use)
+    unread = {name: _unread_of_xsuite(element) for name, element in line.elements.items()}
     lattice = line.to_at(**options)
     for element in lattice:
         element.unread = unread.get(element.FamName, {})
@@ -191,6 +232,47 @@ def _of_xsuite(data: dict[str, Any], path: Path, use: str | None, options: dict[
         if gap is not None:
             element.FullGap = 2 * gap  # pyAT 0.9.0 takes the half gap for the gap
     return lattice
+
+
+def _unread_of_xsuite(element: Any) -> dict[str, Any] | None:
+    """What pyAT leaves out of an element, None of one that acts and that it does not know. What it
+    misreads is changed in the element."""
+    is_replaced = element.origin and element.origin != type(element).__name__
+    is_field = hasattr(element, "_set_at_poly")
+    attributes = {*_XSUITE_READ, *element._xsuite2at_attr, *(_XSUITE_FIELDS if is_field else ())}
+    if element.origin == "Quadrupole":
+        attributes |= {"edge_entry_active", "edge_exit_active"}
+    if element.origin in ("Bend", "RBend"):
+        attributes |= {"edge_entry_hgap", "edge_entry_active", "edge_exit_active"}
+    values = {key: value for key, value in element.items() if key not in attributes}
+    if is_replaced:
+        return None if any(map(_acts, values.values())) else values
+    if is_field:
+        order = max(len(element.get(key, ())) for key in ("knl", "ksl")) - 1
+        element["order"] = max(element.get("order", 0), order)
+    if element.origin == "Multipole" and not (element.get("isthick") or element.get("_isthick")):
+        element["length"] = 0.0  # that of the radiation only
+    anchor, roll = element.get("rot_shift_anchor", 0.0), element.get("rot_s_rad", 0.0)
+    if roll or not any(abs(anchor - x * element._l_anchor) < 1e-9 for x in (0, 0.5)):
+        # pyAT has these without a roll of the design, at the entrance or in the middle.
+        values |= {key: element.get(key) for key in _XSUITE_SHIFTS}
+    if element.origin in ("Bend", "RBend"):
+        if element.get("edge_exit_hgap") == element.get("edge_entry_hgap"):
+            values.pop("edge_exit_hgap", None)
+        for side in ("entry", "exit"):
+            is_off = element.get(f"edge_{side}_model") == "suppressed"
+            values[f"edge_{side}, suppressed"] = is_off or not element.get(f"edge_{side}_active", 1)
+        length = element.get("length", 0.0)
+        if element.origin == "RBend":
+            half = element.get("angle", 0.0) / 2
+            straight = element.get("length_straight", length)
+            length = straight * half / math.sin(half) if half else straight
+        angle = element.setdefault("angle", element.get("h", 0.0) * length)
+        k0 = element.pop("k0", None)  # pyAT adds it to the field that bends by the angle
+        if k0 is not None and not element.get("k0_from_h", False):
+            excess = k0 - angle / length
+            values["k0 - angle/length"] = excess if abs(excess) > 1e-9 * abs(k0) else 0.0
+    return values
 
 
 def check_source(source: Any) -> None:

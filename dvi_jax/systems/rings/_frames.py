@@ -5,15 +5,14 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ._exact import pz_of
+from ._exact import pz_of, quarters, rotation
 from ._maps import Parameters, Particle
 
 
 def turned(z: Particle, angle: Any) -> Particle:
     """Coordinates relative to axes that are rotated about the s-axis, x towards y."""
-    c, s = jnp.cos(angle), jnp.sin(angle)
-    x, y = c * z.x + s * z.y, c * z.y - s * z.x
-    px, py = c * z.px + s * z.py, c * z.py - s * z.px
+    x, y = rotation(z.x, z.y, angle)
+    py, px = rotation(z.py, z.px, -angle)  # the shears of the momenta are the transposed ones
     return z._replace(x=x, px=px, y=y, py=py)
 
 
@@ -33,27 +32,32 @@ def moved(z: Particle, par: Parameters, share: float, sign: int) -> Particle:
     the origin Aᵀ(V p + d − p). The particle moves freely from one plane to the other.
     """
     A, p = _arc(par, (share - par["anchor"]) * par["length"])
-    # Differences from the identity: without misalignments nothing changes by round-off.
-    K = _rotation(par["yaw"], par["pitch"], par["roll"]) - np.eye(3)
-    axes = np.eye(3) + A.T @ K @ A
-    origin = A.T @ (jnp.stack([par["dx"], par["dy"], par["ds"]]) + K @ p)
+    # Differences from the identity: rounding is a part of the misalignments, and without any
+    # nothing changes.
+    K = _rotation(par["yaw"], par["pitch"], par["roll"])
+    change, d = A.T @ K @ A, jnp.stack([par["dx"], par["dy"], par["ds"]])
+    origin = A.T @ (d + K @ p)
     r, u = jnp.stack([z.x, z.y, jnp.zeros_like(z.x)]), jnp.stack([z.px, z.py, pz_of(z)])
-    r, u = (axes.T @ (r - origin), axes.T @ u) if sign > 0 else (axes @ r + origin, axes @ u)
+    r = r - origin if sign > 0 else r
+    change = change.T if sign > 0 else change
+    r, u = r + change @ r, u + change @ u
+    r = r if sign > 0 else r + origin
     path = -r[2] / u[2]
     x, y = r[0] + path * u[0], r[1] + path * u[1]
     return Particle(x, u[0], y, u[1], z.zeta - path * (1 + z.delta), z.delta)
 
 
 def _rotation(yaw: Any, pitch: Any, roll: Any) -> Any:
-    """V = Θ Φ Ψ of MAD-X: s is turned towards x by `yaw` and towards y by `pitch`, x towards y by
-    `roll`, which acts first."""
-    (c, C, k), (s, S, n) = ([f(angle) for angle in (yaw, pitch, roll)] for f in (jnp.cos, jnp.sin))
-    rows = (
-        (c * k - s * S * n, -c * n - s * S * k, s * C),
-        (C * n, C * k, S),
-        (-s * k - c * S * n, s * n - c * S * k, c * C),
-    )
-    return jnp.stack([jnp.stack(row) for row in rows])
+    """V − 1 with V = Θ Φ Ψ of MAD-X: s is turned towards x by `yaw` and towards y by `pitch`, x
+    towards y by `roll`, which acts first."""
+    total = np.zeros((3, 3))
+    for angle, to, axis in ((roll, 1, 0), (pitch, 1, 2), (yaw, 0, 2)):
+        unit = np.eye(3)
+        planes = np.outer(unit[to], unit[axis])
+        diagonal = np.diag(unit[to] + unit[axis])
+        one = jnp.sin(angle) * (planes - planes.T) - 2 * jnp.sin(angle / 2) ** 2 * diagonal
+        total = one + total + one @ total
+    return total
 
 
 def _arc(par: Parameters, s: Any) -> tuple[Any, Any]:
@@ -67,3 +71,28 @@ def _arc(par: Parameters, s: Any) -> tuple[Any, Any]:
     z = jnp.cos(2 * half) * ahead - jnp.sin(2 * half) * radial
     axes = jnp.outer(x, radial) + jnp.outer(across, across) + jnp.outer(z, ahead)
     return axes, chord * (jnp.cos(half) * ahead - jnp.sin(half) * radial)
+
+
+def solenoid(z: Particle, par: Parameters, turn: Any, sign: int) -> Particle:
+    """A constant longitudinal field B with hard edges, ks = B/(Bρ): a rotation of the motion in two
+    planes with the focusing k², both of determinant 1."""
+    length, p = sign * par["length"], 1 + z.delta
+    k = par["ks"] / (2 * p)
+    u, v, x, y = z.px / p, z.py / p, z.x, z.y
+    late = length * (k * k * (x * x + y * y) + 2 * k * (u * y - v * x) + u * u + v * v) / 2
+    c, s, rest = quarters(length * k)
+    no_quarter = c == 1
+    safe = jnp.where(no_quarter, 1.0, k)
+    # sin(rest)/k, also for k = 0.
+    drift = jnp.where(no_quarter, length * jnp.sinc(length * k / np.pi), jnp.sin(rest) / safe)
+    kick = k * jnp.tan(rest / 2)
+
+    def focused(x, u):
+        x, u = c * x + s * (u / safe), c * u - s * (k * x)
+        u = u - kick * x
+        x = x + drift * u
+        return x, u - kick * x
+
+    (x, u), (y, v) = focused(x, u), focused(y, v)
+    z = Particle(x, p * u, y, p * v, z.zeta - late, z.delta)
+    return turned(z, length * k)

@@ -229,27 +229,6 @@ def corrector(z: Particle, par: Parameters, turn: Any, sign: int) -> Particle:
     return z.plus(px=kx, py=ky, zeta=-scale * squares / (2 * p), **shift)
 
 
-def solenoid(z: Particle, par: Parameters, turn: Any, sign: int) -> Particle:
-    """A constant longitudinal field B with hard edges, ks = B/(Bρ)."""
-    length, p = sign * par["length"], 1 + z.delta
-    k = par["ks"] / (2 * p)
-    s, c = jnp.sin(length * k), jnp.cos(length * k)
-    over_k = length * jnp.sinc(length * k / jnp.pi)  # sin(L k)/k, also for k = 0
-    u, v, x, y = z.px / p, z.py / p, z.x, z.y
-    # A rotation by L k of the motion in two planes with the focusing k².
-    ax, ay = c * x + over_k * u, c * y + over_k * v
-    au, av = c * u - k * s * x, c * v - k * s * y
-    late = length * (k * k * (x * x + y * y) + 2 * k * (u * y - v * x) + u * u + v * v) / 2
-    return Particle(
-        x=c * ax + s * ay,
-        px=p * (c * au + s * av),
-        y=c * ay - s * ax,
-        py=p * (c * av - s * au),
-        zeta=z.zeta - late,
-        delta=z.delta,
-    )
-
-
 def affine(side: str) -> Piece:
     """M z + v, given as ``matrix_…`` and ``shift_…``."""
 

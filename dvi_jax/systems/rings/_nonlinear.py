@@ -108,8 +108,8 @@ def resonance_driving_terms(
 
 @eqx.filter_jit
 def _driving_terms(ring: Ring, z: Array, terms: tuple[str, ...]) -> dict[str, Array]:
-    o, _ = analysis(ring, z, jnp.zeros(()), False, False, True)
-    apply, xs, pieces = maps(four(ring), 0.0)
+    o, _ = analysis(ring, z, False, False, True)
+    apply, xs, pieces = maps(four(ring))
     names = np.asarray([ring.program.parts[part].name for part, _ in ring.program.rows])[pieces]
     mine = np.flatnonzero(np.isin(names, (*SLICED_PARTS, "thin", "second_order_bend")))
     points, weights = np.polynomial.legendre.leggauss(5)

@@ -19,9 +19,9 @@ from ...base.printing import printable
 from ._maps import KICKS, Particle, RingPart, distinct, forward
 from ._parts import pieces_of
 from ._ring import Ring
-from ._turn import Passage, coordinates, parameters_at
+from ._turn import Passage, coordinates
 
-SLICED_PARTS = "straight", "bend", "exact_straight", "exact_bend"
+SLICED_PARTS = "straight", "bend", "exact_straight", "exact_bend", "at_exact_bend"
 _MOST_ITERATIONS, _EXTRA_ITERATIONS, _SMALL = 15, 3, 1e-9
 """Newton iterations at most, and after the first correction that is smaller than the last one."""
 _EQUAL = 1e-12
@@ -139,6 +139,7 @@ def optics(
 
 def _analyse(ring: Ring, dp: Any, guess: Any, epsilon: Any, chromatic: bool, stable: bool):
     instance("ring", ring, Ring, "a rings.Ring").check()
+    ring = ring.at(real_numbers("epsilon", epsilon))
     voltage = ring.columns.get("voltage", np.zeros(1))
     six = dp is None and (is_traced(voltage) or bool(np.any(np.asarray(voltage) != 0)))
     z = coordinates("guess", np.zeros(6) if guess is None else guess)
@@ -148,7 +149,7 @@ def _analyse(ring: Ring, dp: Any, guess: Any, epsilon: Any, chromatic: bool, sta
             in_range("dp", dp, -1.0, 1.0, "It is Δp/p, not per cent.")
     if not six:
         z = z.at[4].set(0.0).at[5].set(0.0 if dp is None else dp)
-    twiss, change = analysis(ring, z, jnp.asarray(epsilon, float), six, chromatic)
+    twiss, change = analysis(ring, z, six, chromatic)
     if is_traced(change):
         return twiss
     if not change < _SMALL:
@@ -185,7 +186,7 @@ def _divided(part: RingPart) -> list[np.ndarray]:
     return [np.array([1 / count])] * count
 
 
-def maps(ring: Ring, epsilon: Any) -> tuple[Callable, Any, np.ndarray]:
+def maps(ring: Ring) -> tuple[Callable, Any, np.ndarray]:
     """``apply(z, x)``, the map of a piece of a part of an element, x for all pieces in a row, and
     for each piece the number of its part in `ring.program.rows`.
 
@@ -205,8 +206,7 @@ def maps(ring: Ring, epsilon: Any) -> tuple[Callable, Any, np.ndarray]:
     rows = np.repeat(np.arange(len(part)), [len(pieces[i]) for i in part])
 
     def apply(z, columns):
-        values, slopes, part, steps = columns
-        par = parameters_at(values, slopes, epsilon)
+        par, part, steps = columns
         share = {**par, "length": jnp.sum(steps) * par["length"]}
 
         def kind_map(kind):
@@ -225,13 +225,13 @@ def maps(ring: Ring, epsilon: Any) -> tuple[Callable, Any, np.ndarray]:
         return lax.switch(part, [kind_map(kind) for kind in all_kinds], z)
 
     # Recomputed in reverse mode: otherwise each part stores what every kind of part would need.
-    tables = jax.tree.map(lambda column: column[rows], (passage.rows, passage.slopes))
-    return jax.checkpoint(apply), (*tables, numbers[part][rows], steps), rows
+    table = jax.tree.map(lambda column: column[rows], passage.rows)
+    return jax.checkpoint(apply), (table, numbers[part][rows], steps), rows
 
 
 @eqx.filter_jit
 def analysis(
-    ring: Ring, z: Array, epsilon: Array, six: bool, chromatic: bool, by_part: bool = False
+    ring: Ring, z: Array, six: bool, chromatic: bool, by_part: bool = False
 ) -> tuple[Optics, Array]:
     """See `optics`; also the last correction of the closed orbit. `by_part`: before each piece of
     `maps` and at the end, not at the elements (but for `s`)."""
@@ -241,7 +241,7 @@ def analysis(
         active = c["voltage"] != 0
         slip = jnp.where(active, c["slip"] / jnp.where(active, c["wave_number"], 1.0), 0.0)
         shift = -jnp.sum(slip) / jnp.sum(active)
-    apply, xs, pieces = maps(ring if six else four(ring), epsilon)
+    apply, xs, pieces = maps(ring if six else four(ring))
 
     def states(z):
         zs = lax.scan(lambda z, x: (apply(z, x),) * 2, Particle(*z), xs)[1]
@@ -277,7 +277,8 @@ def analysis(
     zs, Ms, slip = (jnp.where(size < _SMALL, x, jnp.nan) for x in (zs, Ms, slip))
     v, chromaticity = _modes(Ms[-1, :n, :n], dM[:n, :n])
     vs = jnp.einsum("rij,kj->rki", Ms[:, :n, :n], v)
-    x, px = (jnp.diagonal(vs[:, :, i::2], axis1=1, axis2=2) for i in (0, 1))
+    upright = _upright(ring, pieces, vs)
+    x, px = (jnp.diagonal(upright[:, :, i::2], axis1=1, axis2=2) for i in (0, 1))
     mu = jnp.angle(x[1:] * jnp.conj(x[:-1]))
     mu = jnp.where(np.arange(n // 2)[None] < 2, (mu + 0.5) % (2 * np.pi) - 0.5, mu)
     mu = jnp.concatenate([jnp.zeros((1, n // 2)), jnp.cumsum(mu, 0)])
@@ -300,6 +301,32 @@ def analysis(
         compaction=slip / ring.places[-1],
     )
     return twiss, size
+
+
+_FRAMES: dict[str, Callable] = {
+    "placed": lambda c: c["roll"],
+    "moved": lambda c: c["roll"],
+    "tilted": lambda c: c["tilt"],
+    "affine": lambda c: jnp.arctan2(c["matrix_in"][:, 0, 2], c["matrix_in"][:, 0, 0]),
+}
+"""The angle about the s-axis to the frame inside of these parts, from the columns of a ring."""
+
+
+def _upright(ring: Ring, pieces: np.ndarray, v: Array) -> Array:
+    """Vectors v before each piece and at the end, in axes that are not rolled or tilted: in those
+    of a magnet that is rolled by π/2, mode 1 has no component along x, whose phase is measured."""
+    part, element = np.asarray(ring.program.rows).T
+    names = np.asarray([p.name for p in ring.program.parts])[part]
+    angle = jnp.zeros(len(names))
+    for frame, turn in _FRAMES.items():
+        last = names == f"{frame}_out"
+        # A matrix in the place of a magnet has no affine map at its end.
+        first = (names == f"{frame}_in") & np.isin(element, element[last])
+        if last.any():
+            angle += (first * 1.0 - last) * turn(ring.columns)[element]
+    angle = jnp.append(jnp.zeros(1), jnp.cumsum(angle)[pieces])[:, None, None]
+    cos, sin, x, y = jnp.cos(angle), jnp.sin(angle), v[..., :2], v[..., 2:4]
+    return jnp.concatenate([cos * x - sin * y, cos * y + sin * x, v[..., 4:]], -1)
 
 
 def _modes(M: Array, dM: Array) -> tuple[Array, Array]:

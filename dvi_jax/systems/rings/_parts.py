@@ -92,7 +92,7 @@ _MAPS: dict[str, Make] = {
     "lens": lambda p: _plain(functools.partial(maps.lens, potential=p.potential)),  # pyright: ignore[reportArgumentType]
     "cavity": lambda p: [Piece(maps.cavity)],
     "corrector": lambda p: [Piece(maps.corrector)],
-    "solenoid": lambda p: [Piece(maps.solenoid)],
+    "solenoid": lambda p: [Piece(frames.solenoid)],
     **_ends("in", 1),
     **_ends("out", -1),
 }

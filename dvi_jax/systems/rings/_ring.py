@@ -23,6 +23,17 @@ from ._maps import RingPart, distinct
 Where = str | int | Sequence[int]
 
 
+_READERS = {
+    "length": (
+        "drift", "half_drift", "exact_drift", "corrector", "solenoid", "straight", "exact_straight",
+        "bend", "exact_bend", "at_exact_bend", "second_order_bend",
+    ),
+    "h": ("bend", "exact_bend", "at_exact_bend", "second_order_bend"),
+}  # fmt: skip
+"""Parameters of elements whose maps have other parts if it is zero → the parts that depend on it.
+"""
+
+
 class RingStructure(eqx.Module):
     """What a ring consists of, without its parameters: compared as a whole, and hashed once."""
 
@@ -172,7 +183,8 @@ class Ring(eqx.Module):
         for each of them. **Raises** `ValueError` for a parameter that an element does not have."""
         columns = dict(self.columns)
         for name, value in values.items():
-            numbers, value = self._numbers(selection, name), real_numbers(name, value)
+            numbers = self._numbers(selection, name, changes=True)
+            value = real_numbers(name, value)
             if value.ndim and len(value) != len(numbers):
                 raise ValueError(
                     f"{name} must be one number or {len(numbers)}, one for each element that "
@@ -184,8 +196,17 @@ class Ring(eqx.Module):
     def _label(self, i: int) -> str:
         return f"element {i}, the {self.kinds[i]} {self.names[i]!r},"
 
-    def _numbers(self, selection: Where, parameter: str) -> np.ndarray:
+    def _numbers(self, selection: Where, parameter: str, changes: bool = False) -> np.ndarray:
         numbers = self.where(selection)
+        readers = _READERS.get(parameter) if changes else None
+        if readers:
+            part, element = np.asarray(self.program.rows).T
+            reads = element[[self.program.parts[i].name in readers for i in part]]
+            if len(others := np.setdiff1d(numbers, reads)):
+                raise ValueError(
+                    f"{self._label(others[0])} was made with {parameter} = 0, which is not a "
+                    "parameter of its map: make it with the value that it has."
+                )
         for i in numbers:
             if parameter not in self.program.parameters[i]:
                 raise ValueError(
@@ -196,14 +217,20 @@ class Ring(eqx.Module):
 
     def perturbed(self, selection: Where, *parameters: str) -> "Ring":
         """The ring in which `parameters` of the elements `where(selection)` are multiplied by ε,
-        and are zero in the unperturbed ring."""
+        and are zero in the unperturbed ring: that of functions without an argument `epsilon`, for
+        which there is `at`."""
         columns, extra = dict(self.columns), dict(self.extra)
         for name in parameters:
-            numbers = self._numbers(selection, name)
+            numbers = self._numbers(selection, name, changes=True)
             slope = jnp.zeros_like(columns[name]).at[numbers].set(columns[name][numbers])
             extra[name] = extra.get(name, 0.0) + slope
             columns[name] = columns[name].at[numbers].set(0.0)
         return eqx.tree_at(lambda r: (r.columns, r.extra), self, (columns, extra))
+
+    def at(self, epsilon: Any) -> "Ring":
+        """The ring at ε: what `perturbed` set aside is added, times ε."""
+        sums = {name: self.columns[name] + epsilon * slope for name, slope in self.extra.items()}
+        return eqx.tree_at(lambda r: (r.columns, r.extra), self, ({**self.columns, **sums}, {}))
 
     def check(self) -> None:
         """**Raises** `ValueError` for a parameter that is not finite, unless it is traced."""
