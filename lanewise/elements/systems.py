@@ -84,7 +84,7 @@ def eliminate(translation: Translation, eqn: Any, matrix: Array, right: Array) -
         # A branch may be for rare cases, such as Newton's method where a simpler one fails.
         limit = _MOST_UNKNOWNS if translation.branches else LARGE_SYSTEM
         if n > limit:
-            raise NotCompilable(f"a full matrix of {n} unknowns, more than {limit}: LAPACK is faster")
+            raise NotCompilable(f"a full matrix of {n} unknowns (above {limit} LAPACK is faster)")
         A = matrix.along((n, n), [*[None] * len(front), 0, 1])
         solve = by_elimination if n <= SHORT else column_by_column
         (x,) = _run(translation, solve, [A, b])
