@@ -77,27 +77,11 @@ def kernel_text(module: Module, function: ClosedJaxpr, lane_flags: Sequence[bool
             f"  %par{i}.at = getelementptr i64, ptr %params, i64 {HEAD + len(results) + i}",
             f"  %par{i} = load i64, ptr %par{i}.at",
         ]
-    epilogue = []
-    if module.scratch_bytes:
-        # Not from the stack: that of a thread of XLA's pool may be small.
-        b.declarations |= {"declare ptr @malloc(i64)", "declare void @free(ptr)"}
-        size = module.scratch_bytes + 64
-        prologue += [
-            f"  %memory = call ptr @malloc(i64 {size})",
-            "  %address = ptrtoint ptr %memory to i64",
-            "  %up = add i64 %address, 63",
-            "  %aligned = and i64 %up, -64",
-            "  %scratch = inttoptr i64 %aligned to ptr",
-        ]
-        epilogue.append("  call void @free(ptr %memory)")
-    body = "\n".join([*prologue, *b.lines, *epilogue, "  ret void"])
+    body = "\n".join([*prologue, *b.lines, "  ret void"])
     declarations = "\n".join(sorted(module.declarations | b.declarations))
     functions = "\n".join(module.functions.values())
-    head = (
-        "define internal void @lanewise_kernel(ptr %args, ptr %rets, ptr %params, "
-        "i64 %first, i64 %last) alignstack(64) align 64 {\nentry:"
-    )
-    return "\n".join(["\n".join(module.globals), declarations, functions, head, body, "}\n"])
+    front = "\n".join(module.globals), declarations, functions, handler.KERNEL
+    return "\n".join([*front, body, "}\n"])
 
 
 def _lane_stride(module: Module, aval: Any) -> int | str:
@@ -157,10 +141,10 @@ class Numbers:
         return Code(text, b.W * b.U, values, (), b.operations, scratch, b.W, b.U)
 
     def register(self, code: Code) -> str:
-        return handler.register(handler.module_text(code.text, code.block))
+        return handler.register(code.module)
 
     def assembly(self, code: Code) -> str:
-        return machine.assembly(handler.module_text(code.text, code.block))
+        return machine.assembly(code.module)
 
 
 def variant(lanes: int, limit: int, width: int | None = None) -> tuple[int, int]:
