@@ -45,15 +45,23 @@ def _has_exact_products(jaxpr: Any) -> bool:
     return has_one or any(_has_exact_products(function.jaxpr) for function in functions)
 
 
+def _evaluated(eqn: Any) -> list[ClosedJaxpr]:
+    if eqn.primitive.name == "custom_linear_solve":  # only this one of its four functions is run
+        return [eqn.params["jaxprs"].solve]
+    return [*bodies(eqn), *functions_in(eqn)]
+
+
+def primitives_in(jaxpr: Any) -> set[str]:
+    """The names of the primitives of a function and of all that it calls."""
+    inner = (primitives_in(f.jaxpr) for eqn in jaxpr.eqns for f in _evaluated(eqn))
+    return {eqn.primitive.name for eqn in jaxpr.eqns}.union(*inner)
+
+
 def operation_count(jaxpr: Any) -> int:
     """How many operations on numbers the evaluation is made of, loops counted once; roughly."""
     count = 0
     for eqn in jaxpr.eqns:
-        functions = (*bodies(eqn), *functions_in(eqn))
-        if eqn.primitive.name == "custom_linear_solve":
-            # Only this one of its four functions is run.
-            functions = (eqn.params["jaxprs"].solve,)
-        inner = [operation_count(function.jaxpr) for function in functions]
+        inner = [operation_count(function.jaxpr) for function in _evaluated(eqn)]
         if inner:
             count += sum(inner)
             continue

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from typing import Any
 
 from .. import rules as rules  # each file registers its rules with the evaluator
-from ..evaluator import Evaluator
-from ..jaxprs.extent import carry_size, most_operations, operation_count
+from ..evaluator import RULES, Evaluator
+from ..jaxprs.extent import carry_size, most_operations, operation_count, primitives_in
 from ..jaxprs.jaxapi import ClosedJaxpr
-from ..llvm.ir import check_size, check_type
+from ..llvm.ir import NotCompilable, check_size, check_type
 from ..llvm.memory import Buffer, contiguous, load_row, stored_type
 from ..llvm.values import SMALL, Value, objects
 from ..module import Module
@@ -110,6 +110,9 @@ def _operand(evaluator: Evaluator, buffer: Buffer) -> Value:
     return value
 
 
+_LONG_PROGRAM = 10_000  # operations
+
+
 class Numbers:
     """Number by number, in vectors of trajectories; it is tried for every program."""
 
@@ -125,6 +128,10 @@ class Numbers:
         count = operation_count(function.jaxpr)
         limit = most_operations(function.jaxpr)
         check_size(count, limit, "the number of operations (a loop counts once)")
+        # A long program would be written for seconds up to the equation that has no rule.
+        missing = primitives_in(function.jaxpr) - RULES.keys() if count > _LONG_PROGRAM else set()
+        if missing:
+            raise NotCompilable(f"there is no rule for the primitive {min(missing)}")
         if width is not None:
             vectors = max(width // machine.width(), 1)
         else:
