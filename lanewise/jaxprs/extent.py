@@ -1,5 +1,6 @@
 """How large a function is: operations, and numbers that its loops carry."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -89,11 +90,14 @@ _FREE = frozenset(_MOVES.split())
 
 
 LONG_CARRY, LONG_VALUE = 48, 4096
+HALF_CARRY, PAIRS = 24, 384
+"""Sums over all pairs of 14 bodies or more: number by number they are slower, also in a batch."""
 
 
 def has_long_arrays(jaxpr: Any) -> bool:
     """Whether a loop carries an array of more than 48 elements, or computes one of more than 4096
-    in a round; without any loop, whether an array of more than 48 elements is computed.
+    in a round (384 if it carries more than 24 and multiplies no large matrices); without any loop,
+    whether an array of more than 48 elements is computed.
 
     Rows that a loop collects do not count, nor what is done to them after it.
     """
@@ -104,9 +108,24 @@ def _has_long_loop(jaxpr: Any) -> bool:
     for eqn in jaxpr.eqns:
         if eqn.primitive.name in _LOOPS:
             values = [_longest(body.jaxpr) for body in bodies(eqn)]
-            if _carried(eqn) > LONG_CARRY or max(values) > LONG_VALUE:
+            is_larger = _carried(eqn) > HALF_CARRY and not _multiplies_matrices(bodies(eqn))
+            limit = PAIRS if is_larger else LONG_VALUE
+            if _carried(eqn) > LONG_CARRY or max(values) > limit:
                 return True
         if any(_has_long_loop(f.jaxpr) for f in (*bodies(eqn), *functions_in(eqn))):
+            return True
+    return False
+
+
+def _multiplies_matrices(functions: Sequence[ClosedJaxpr]) -> bool:
+    """Whether a product of matrices has more than 384 elements, each a sum of more than 8 terms."""
+    for eqn in (eqn for function in functions for eqn in function.jaxpr.eqns):
+        if eqn.primitive.name == "dot_general":
+            (axes, _), _ = eqn.params["dimension_numbers"]
+            terms = np.prod([eqn.invars[0].aval.shape[i] for i in axes])
+            if eqn.outvars[0].aval.size > PAIRS and terms > 8:
+                return True
+        if _multiplies_matrices((*bodies(eqn), *functions_in(eqn))):
             return True
     return False
 
