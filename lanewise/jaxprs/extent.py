@@ -1,6 +1,6 @@
 """How large a function is: operations, and numbers that its loops carry."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -54,7 +54,7 @@ def _evaluated(eqn: Any) -> list[ClosedJaxpr]:
 
 def primitives_in(jaxpr: Any) -> set[str]:
     """The names of the primitives of a function and of all that it calls."""
-    inner = (primitives_in(f.jaxpr) for eqn in jaxpr.eqns for f in _evaluated(eqn))
+    inner = (primitives_in(body.jaxpr) for eqn in jaxpr.eqns for body in _evaluated(eqn))
     return {eqn.primitive.name for eqn in jaxpr.eqns}.union(*inner)
 
 
@@ -117,7 +117,7 @@ def _has_long_loop(jaxpr: Any) -> bool:
     return False
 
 
-def _multiplies_matrices(functions: Sequence[ClosedJaxpr]) -> bool:
+def _multiplies_matrices(functions: Iterable[ClosedJaxpr]) -> bool:
     """Whether a product of matrices has more than 384 elements, each a sum of more than 8 terms."""
     for eqn in (eqn for function in functions for eqn in function.jaxpr.eqns):
         if eqn.primitive.name == "dot_general":
