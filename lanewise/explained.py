@@ -13,7 +13,7 @@ from .jaxprs.extent import functions_in
 from .jaxprs.jaxapi import jaxprs_in_params
 from .jaxprs.traced import Trace
 from .llvm.ir import NotCompilable
-from .native import handler, machine
+from .native import machine
 from .primitive import AUTO, SWITCH, Callee, Layout, generates, pieces_of
 from .targets import compile_program
 
@@ -155,7 +155,6 @@ def _parts(program: Any, batch: int) -> list[Part]:
     # block has too many vectors.
     assembly = result.target.assembly(code)
     spills = len(re.findall(r"\bv?mov[a-z0-9]*\s+.*\((?:%rsp|sp)\)", assembly))
-    ir = handler.module_text(code.text, code.block)
     return [
         Part(
             None,
@@ -164,7 +163,7 @@ def _parts(program: Any, batch: int) -> list[Part]:
             code.vectors,
             code.scratch,
             spills,
-            ir,
+            code.module,
             result.target.name,
             code.loops,
             code.stores,

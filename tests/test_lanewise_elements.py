@@ -156,8 +156,17 @@ def test_the_rule_of_choice_reads_the_program():
 
         return jax.lax.scan(step, x, None, length=3)[0]
 
-    assert not has_long_arrays(jax.make_jaxpr(pairs)(jnp.zeros(32)).jaxpr)
-    assert has_long_arrays(jax.make_jaxpr(pairs)(jnp.zeros(33)).jaxpr)
+    def products(x):
+        def step(x, _):
+            return x + jnp.outer(x, x) @ jnp.outer(x, x) @ x, None
+
+        return jax.lax.scan(step, x, None, length=3)[0]
+
+    def has(function, n):
+        return has_long_arrays(jax.make_jaxpr(function)(jnp.zeros(n)).jaxpr)
+
+    assert [n for n in range(16, 52) if has(pairs, n)] == [*range(25, 52)]
+    assert [n for n in range(16, 52) if has(products, n)] == [49, 50, 51]
     assert not has_long_arrays(jax.make_jaxpr(jnp.sin)(jnp.zeros(48)).jaxpr)
     assert has_long_arrays(jax.make_jaxpr(jnp.sin)(jnp.zeros(49)).jaxpr)
 

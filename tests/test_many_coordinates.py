@@ -425,9 +425,7 @@ def test_energy_and_force_vanish_at_the_cut_off():
     ],
 )
 def test_particles_that_overlap_are_refused(options, least, apart):
-    with pytest.raises(
-        ValueError, match=rf"box must be at least {least} .* {apart} σ apart\."
-    ):
+    with pytest.raises(ValueError, match=rf"box must be at least {least} .* {apart} σ apart\."):
         lennard_jones(**options)
     accepted = lennard_jones(options["n"], box=least + 0.001).q0
     distances = np.linalg.norm(accepted[:, None] - accepted[None], axis=-1)

@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-SHORT = 8
-"""Axes of at most so many elements are written out; longer ones become loops."""
+from .axes import short_axes
 
 _FUNCTIONS = (
     "sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp exp2 expm1 log log1p "
@@ -220,7 +219,7 @@ class Array:
     @property
     def is_written_out(self) -> bool:
         """Whether all axes are short: the array is a few numbers."""
-        return all(n <= SHORT for n in self.shape)
+        return len(short_axes(self.shape)) == len(self.shape)
 
     def loads(self) -> list[Expression]:
         """The loads and the numbers in its expressions."""
@@ -261,8 +260,8 @@ class Array:
     def components(self) -> tuple[list[int], list[int], dict[tuple[int, ...], "Array"]]:
         """The short axes, the long ones, and for each index of the short axes the array of the
         long ones."""
-        short = [a for a, n in enumerate(self.shape) if n <= SHORT]
-        long = [a for a, n in enumerate(self.shape) if n > SHORT]
+        short = short_axes(self.shape)
+        long = [a for a in range(len(self.shape)) if a not in short]
         shape, parts = [self.shape[a] for a in long], {}
         for index in itertools.product(*(range(self.shape[a]) for a in short)):
             offsets = [0] * len(self.shape)

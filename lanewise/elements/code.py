@@ -10,6 +10,7 @@ from ..jaxprs.jaxapi import ClosedJaxpr
 from ..llvm.ir import Num, check_size, check_type
 from ..llvm.memory import stored_type
 from ..module import Module
+from ..native.handler import KERNEL
 from .equations import Translation, row_major
 from .nests import Nests
 from .places import places
@@ -167,26 +168,10 @@ class Kernel:
                 f"  %par{i}.at = getelementptr i64, ptr %params, i64 {head + outs + i}",
                 f"  %par{i} = load i64, ptr %par{i}.at",
             ]
-        epilogue = []
-        if self.scratch:
-            b.declarations |= {"declare ptr @malloc(i64)", "declare void @free(ptr)"}
-            prologue += [
-                f"  %memory = call ptr @malloc(i64 {self.scratch + 64})",
-                "  %address = ptrtoint ptr %memory to i64",
-                "  %up = add i64 %address, 63",
-                "  %aligned = and i64 %up, -64",
-                "  %scratch = inttoptr i64 %aligned to ptr",
-            ]
-            # Not from the stack: that of a thread of XLA's pool may be small.
-            epilogue.append("  call void @free(ptr %memory)")
-        body = "\n".join([*prologue, *self.nests.head, *b.lines, *epilogue, "  ret void"])
+        body = "\n".join([*prologue, *self.nests.head, *b.lines, "  ret void"])
         declarations = "\n".join(sorted(module.declarations | b.declarations))
         functions = "\n".join(module.functions.values())
-        front = (
-            "define internal void @lanewise_kernel(ptr %args, ptr %rets, ptr %params, "
-            "i64 %first, i64 %last) alignstack(64) align 64 {\nentry:"
-        )
-        return "\n".join(["\n".join(module.globals), declarations, functions, front, body, "}\n"])
+        return "\n".join(["\n".join(module.globals), declarations, functions, KERNEL, body, "}\n"])
 
 
 def _argument(aval: Any) -> Memory:

@@ -7,7 +7,8 @@ from the expressions, without a number.
 from collections.abc import Sequence
 from typing import Any
 
-from .boxes import SHORT, Array, Box, Expression, IndexMap, elementwise
+from .axes import SHORT
+from .boxes import Array, Box, Expression, IndexMap, elementwise
 
 Delta = tuple[tuple[int, ...], int]
 """Strides and offset of a ``delta``."""

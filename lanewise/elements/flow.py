@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from ..jaxprs.jaxapi import ClosedJaxpr, scan_counts
-from ..llvm.ir import NotCompilable
 from .boxes import Array
 from .equations import ARRAY_RULES, Translation, row_major
+from .reductions import reduction_of
 from .tree import Block, Branch, Loop, Memory, Number, Place
 
 
@@ -162,8 +162,7 @@ def while_loop(
 ) -> list[Array]:
     params = eqn.params
     test, body = params["cond_jaxpr"], params["body_jaxpr"]
-    if test.jaxpr.outvars[0].aval.shape:
-        raise NotCompilable("a loop over long arrays with a condition for each element")
+    shape = test.jaxpr.outvars[0].aval.shape
     first, second = params["cond_nconsts"], params["body_nconsts"]
     # What all rounds read is computed once.
     fixed = [translation.settle(x) for x in args[: first + second]]
@@ -173,9 +172,20 @@ def while_loop(
     state = Carry(translation, loop, args[first + second :], moves)
     with _Within(translation, loop.test):
         (goes_on,) = translation.evaluate(test, [*fixed[:first], *state.now])
+        goes_on = (
+            reduction_of(translation, goes_on, "or", range(len(shape)), ()) if shape else goes_on
+        )
         loop.condition = goes_on.expression
     with _Within(translation, loop.body):
-        state.end_round(translation.evaluate(body, [*fixed[first:], *state.now]))
+        outs = translation.evaluate(body, [*fixed[first:], *state.now])
+        if shape:  # a condition for each element: those that have ended keep their values
+            (is_going,) = translation.evaluate(test, [*fixed[:first], *state.now])
+            pairs = zip(state.now, outs, strict=True)
+            outs = [
+                translation.apply("select_n", is_going, old, new, dtype=new.dtype)
+                for old, new in pairs
+            ]
+        state.end_round(outs)
     translation.add(loop)
     return state.now
 

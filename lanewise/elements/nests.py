@@ -48,8 +48,7 @@ class Nests:
         statements = group.statements
         if not group.shape:
             with self.scalars(), self.scope():  # what is stored here may be updated later
-                for s in group.statements:
-                    self.scalar_statement(s)
+                self.scalar_statements(statements)
             return
         if isinstance(statements[0], Update):
             write_update(self, statements[0])
@@ -86,18 +85,23 @@ class Nests:
         is_same = mine is not None and mine == other and s.memory.dtype == node.dtype
         return is_same and (node.strides, node.offset) == (s.strides, s.offset)
 
-    def scalar_statement(self, s: Statement) -> None:
-        x = self.number(arrays(s)[-1].boxes[0].expression, [])
-        if isinstance(s, Let):
-            self.numbers[s.number] = self.b.opaque(x)
-        elif isinstance(s, Update):
-            write_element(self, s, self.number(s.distance.boxes[0].expression, []), x, [])
-        elif isinstance(s, Store):
+    def scalar_statements(self, statements: Sequence[Statement]) -> None:
+        b, results = self.b, []
+        # All loads before all stores, as in `body`: elements may be written over one another.
+        for s in statements:
+            x = self.number(arrays(s)[-1].boxes[0].expression, [])
+            if isinstance(s, Let):
+                self.numbers[s.number] = b.opaque(x)
+            elif isinstance(s, Update):
+                write_element(self, s, self.number(s.distance.boxes[0].expression, []), x, [])
+            elif isinstance(s, Store):
+                b.note(("node", s.target.serial), b.opaque(x))
+                results.append((s, x))
+            else:
+                raise AssertionError("a reduction without axes")
+        for s, x in results:
             if s.memory not in self.dead:
-                store(self.b, self.address(s.memory, s.strides, s.offset, []), x, 0)
-            self.b.note(("node", s.target.serial), self.b.opaque(x))
-        else:
-            raise AssertionError("a reduction without axes")
+                store(b, self.address(s.memory, s.strides, s.offset, []), x, 0)
 
     def nest(self, lower, upper, items, index: list[Num]) -> None:
         """Loops over the axes from number len(index) on."""

@@ -11,7 +11,8 @@ from ..jaxprs.extent import LARGE_SYSTEM
 from ..linear import by_elimination, column_by_column
 from ..llvm.ir import NotCompilable
 from . import bands
-from .boxes import SHORT, Array
+from .axes import SHORT
+from .boxes import Array
 from .diagonals import diagonals
 from .equations import ARRAY_RULES, Translation
 

@@ -10,7 +10,8 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
-from .boxes import SHORT, Array, Expression, Table
+from .axes import short_axes
+from .boxes import Array, Expression, Table
 
 _serials = itertools.count()
 
@@ -94,8 +95,8 @@ class Place(NamedTuple):
 def short_first(shape: Sequence[int]) -> tuple[int, ...]:
     """Strides: short axes outside, so that the last long one is contiguous."""
     # An array of positions (n, 3) becomes three rows of n, each of which is read in vectors.
-    order = [a for a, n in enumerate(shape) if n <= SHORT]
-    order += [a for a, n in enumerate(shape) if n > SHORT]
+    order = short_axes(shape)
+    order += [a for a in range(len(shape)) if a not in order]
     strides, step = [0] * len(shape), 1
     for a in reversed(order):
         strides[a] = step

@@ -1,5 +1,6 @@
 """How large a function is: operations, and numbers that its loops carry."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -45,15 +46,23 @@ def _has_exact_products(jaxpr: Any) -> bool:
     return has_one or any(_has_exact_products(function.jaxpr) for function in functions)
 
 
+def _evaluated(eqn: Any) -> list[ClosedJaxpr]:
+    if eqn.primitive.name == "custom_linear_solve":  # only this one of its four functions is run
+        return [eqn.params["jaxprs"].solve]
+    return [*bodies(eqn), *functions_in(eqn)]
+
+
+def primitives_in(jaxpr: Any) -> set[str]:
+    """The names of the primitives of a function and of all that it calls."""
+    inner = (primitives_in(body.jaxpr) for eqn in jaxpr.eqns for body in _evaluated(eqn))
+    return {eqn.primitive.name for eqn in jaxpr.eqns}.union(*inner)
+
+
 def operation_count(jaxpr: Any) -> int:
     """How many operations on numbers the evaluation is made of, loops counted once; roughly."""
     count = 0
     for eqn in jaxpr.eqns:
-        functions = (*bodies(eqn), *functions_in(eqn))
-        if eqn.primitive.name == "custom_linear_solve":
-            # Only this one of its four functions is run.
-            functions = (eqn.params["jaxprs"].solve,)
-        inner = [operation_count(function.jaxpr) for function in functions]
+        inner = [operation_count(function.jaxpr) for function in _evaluated(eqn)]
         if inner:
             count += sum(inner)
             continue
@@ -81,12 +90,14 @@ _FREE = frozenset(_MOVES.split())
 
 
 LONG_CARRY, LONG_VALUE, LARGE_SYSTEM = 48, 4096, 32
+HALF_CARRY, PAIRS = 24, 384
+"""Sums over all pairs of 14 bodies or more: number by number they are slower, also in a batch."""
 
 
 def has_long_arrays(jaxpr: Any) -> bool:
     """Whether a loop carries an array of more than 48 elements, or computes one of more than 4096
-    in a round, or both with limits of 32 and 400; without any loop, whether an array of more than
-    48 elements is computed.
+    in a round (384 if it carries more than 24 and has no large matrices); without any loop,
+    whether an array of more than 48 elements is computed.
 
     Rows that a loop collects do not count, nor what is done to them after it. A linear system of
     more than 32 unknowns has long arrays, too.
@@ -107,13 +118,28 @@ def _has_large_system(jaxpr: Any) -> bool:
 def _has_long_loop(jaxpr: Any) -> bool:
     for eqn in jaxpr.eqns:
         if eqn.primitive.name in _LOOPS:
-            value, carry = max(_longest(body.jaxpr) for body in bodies(eqn)), _carried(eqn)
-            if carry > LONG_CARRY or value > LONG_VALUE:
-                return True
-            # Twelve bodies: twice as fast in array loops, alone and in a batch.
-            if carry > 32 and value > 400:
+            values = [_longest(body.jaxpr) for body in bodies(eqn)]
+            is_larger = _carried(eqn) > HALF_CARRY and not _has_matrices(bodies(eqn))
+            limit = PAIRS if is_larger else LONG_VALUE
+            if _carried(eqn) > LONG_CARRY or max(values) > limit:
                 return True
         if any(_has_long_loop(f.jaxpr) for f in (*bodies(eqn), *functions_in(eqn))):
+            return True
+    return False
+
+
+def _has_matrices(functions: Iterable[ClosedJaxpr]) -> bool:
+    """Whether a linear system is solved, or a product of matrices has more than 384 elements, each
+    a sum of more than 8 terms."""
+    for eqn in (eqn for function in functions for eqn in function.jaxpr.eqns):
+        if eqn.primitive.name == "eliminate":
+            return True
+        if eqn.primitive.name == "dot_general":
+            (axes, _), _ = eqn.params["dimension_numbers"]
+            terms = np.prod([eqn.invars[0].aval.shape[i] for i in axes])
+            if eqn.outvars[0].aval.size > PAIRS and terms > 8:
+                return True
+        if _has_matrices((*bodies(eqn), *functions_in(eqn))):
             return True
     return False
 

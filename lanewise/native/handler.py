@@ -22,7 +22,7 @@ API_MAJOR, API_MINOR = 0, 1
 """The version of XLA's interface that the structures are of; newer ones of 0 keep them."""
 
 HANDLER = f"""
-declare ptr @lanewise_run(ptr, ptr, i64)
+declare ptr @lanewise_run(ptr, ptr, i64, i64)
 
 define ptr @lanewise_handler(ptr %frame) {{
   %ext.at = getelementptr i8, ptr %frame, i64 {offset("CallFrame", "extension_start")}
@@ -38,17 +38,27 @@ version:                                     ; XLA queries the version of the in
   store i32 {API_MINOR}, ptr %minor
   ret ptr null
 call:
-  %r = tail call ptr @lanewise_run(ptr %frame, ptr @lanewise_kernel, i64 BLOCK)
+  %r = tail call ptr @lanewise_run(ptr %frame, ptr @lanewise_kernel, i64 BLOCK, i64 SCRATCH)
   ret ptr %r
 }}
 """
-"""`lanewise_kernel(args, rets, params, first, last)` computes the blocks first … last − 1."""
+"""`lanewise_kernel(args, rets, params, scratch, first, last)` computes the blocks first … last − 1;
+`scratch` are SCRATCH bytes, from a multiple of 64 on."""
+
+KERNEL = (
+    "define internal void @lanewise_kernel(ptr %args, ptr %rets, ptr %params, ptr %scratch, "
+    "i64 %first, i64 %last) alignstack(64) align 64 {\nentry:"
+)
 
 # Only Linux has `madvise`. Below 32 MiB the C library reuses memory that is mapped already, so that
 # the call would cost more time than it saves.
 _LARGE = 32 * 2**20 if sys.platform == "linux" else 2**63 - 1
 
+_NO_MEMORY = "not enough memory for the arrays of a compiled function"
+_EXHAUSTED = 8  # XLA_FFI_Error_Code_RESOURCE_EXHAUSTED
+
 _RUNTIME = f"""
+@no_memory = private constant [{len(_NO_MEMORY) + 1} x i8] c"{_NO_MEMORY}\\00"
 @lanewise_threads = global i64 0
 
 declare ptr @malloc(i64)
@@ -85,8 +95,17 @@ no:
   ret void
 }}
 
-define internal void @work(ptr %job) {{
+define internal ptr @aligned(ptr %memory) {{
+  %address = ptrtoint ptr %memory to i64
+  %up = add i64 %address, 63
+  %start = and i64 %up, -64
+  %scratch = inttoptr i64 %start to ptr
+  ret ptr %scratch
+}}
+
+define internal void @work(ptr %job, ptr %memory) {{
 entry:
+  %scratch = call ptr @aligned(ptr %memory)
   {addresses("job", "Job", "next done blocks chunk kernel params args rets")}
   %blocks = load i64, ptr %job.blocks
   %chunk = load i64, ptr %job.chunk
@@ -103,7 +122,7 @@ run:
   %end = add i64 %first, %chunk
   %fits = icmp sle i64 %end, %blocks
   %last = select i1 %fits, i64 %end, i64 %blocks
-  call void %kernel(ptr %args, ptr %rets, ptr %params, i64 %first, i64 %last)
+  call void %kernel(ptr %args, ptr %rets, ptr %params, ptr %scratch, i64 %first, i64 %last)
   %mine = sub i64 %last, %first
   %ignored = atomicrmw add ptr %job.done, i64 %mine acq_rel
   br label %claim
@@ -112,7 +131,16 @@ over:
 }}
 
 define internal void @task(ptr %job) {{
-  call void @work(ptr %job)
+  {addresses("job", "Job", "scratch")}
+  %bytes = load i64, ptr %job.scratch
+  %memory = call ptr @malloc(i64 %bytes)
+  %is.none = icmp eq ptr %memory, null
+  br i1 %is.none, label %over, label %run      ; the caller has memory, and computes all
+run:
+  call void @work(ptr %job, ptr %memory)
+  call void @free(ptr %memory)
+  br label %over
+over:
   call void @drop(ptr %job)
   ret void
 }}
@@ -137,9 +165,10 @@ over:
   ret void
 }}
 
-define ptr @lanewise_run(ptr %frame, ptr %kernel, i64 %block) {{
+define ptr @lanewise_run(ptr %frame, ptr %kernel, i64 %block, i64 %scratch.size) {{
 entry:
   %count = alloca i64
+  %report = alloca [{size("Error_Create_Args")} x i8], align 8
   %query = alloca [{size("ThreadPool_NumThreads_Args")} x i8], align 8
   {addresses("frame", "CallFrame", "api ctx args.size args.args rets.size rets.rets attrs.attrs")}
   %api = load ptr, ptr %frame.api
@@ -160,6 +189,26 @@ entry:
   %bytes0 = mul i64 %pointers, 8
   %bytes = add i64 %bytes0, {size("Job")}
   %job = call ptr @malloc(i64 %bytes)
+  ; Not from the stack: that of a thread of XLA's pool may be small.
+  %memory.size = add i64 %scratch.size, 64
+  %memory = call ptr @malloc(i64 %memory.size)
+  %no.job = icmp eq ptr %job, null
+  %no.memory = icmp eq ptr %memory, null
+  %none.of = or i1 %no.job, %no.memory
+  br i1 %none.of, label %exhausted, label %start
+exhausted:
+  call void @free(ptr %job)
+  call void @free(ptr %memory)
+  {addresses("report", "Error_Create_Args", "extension_start message errc")}
+  store i64 {size("Error_Create_Args")}, ptr %report
+  store ptr null, ptr %report.extension_start
+  store ptr @no_memory, ptr %report.message
+  store i64 {_EXHAUSTED}, ptr %report.errc
+  {addresses("api", "Api", "XLA_FFI_Error_Create")}
+  %create = load ptr, ptr %api.XLA_FFI_Error_Create
+  %report.made = call ptr %create(ptr %report)
+  ret ptr %report.made
+start:
   %a = getelementptr i8, ptr %job, i64 {size("Job")}
   %r = getelementptr ptr, ptr %a, i64 %nargs
   call void @pointers(ptr %args, i64 %nargs, ptr %a)
@@ -167,7 +216,7 @@ entry:
   %sizes = getelementptr i64, ptr %params, i64 2
   br label %next.result
 next.result:
-  %n = phi i64 [0, %entry], [%n.next, %one.result]
+  %n = phi i64 [0, %start], [%n.next, %one.result]
   %n.more = icmp slt i64 %n, %nrets
   br i1 %n.more, label %one.result, label %ready.to.run
 one.result:
@@ -194,7 +243,9 @@ ready.to.run:
   %go = and i1 %may, %not.one
   br i1 %go, label %ask.pool, label %alone
 alone:
-  call void %kernel(ptr %a, ptr %r, ptr %params, i64 0, i64 %blocks)
+  %scratch = call ptr @aligned(ptr %memory)
+  call void %kernel(ptr %a, ptr %r, ptr %params, ptr %scratch, i64 0, i64 %blocks)
+  call void @free(ptr %memory)
   call void @free(ptr %job)
   ret ptr null
 
@@ -224,7 +275,7 @@ ask.pool:
   %parts.less = sub i64 %parts.up, 1
   %chunk = udiv i64 %parts.less, %parts
 
-  {addresses("job", "Job", "next done blocks chunk kernel params args rets")}
+  {addresses("job", "Job", "next done blocks chunk kernel params args rets scratch")}
   store i64 %threads, ptr %job                 ; users: each task is one, and the caller another
   store i64 0, ptr %job.next
   store i64 0, ptr %job.done
@@ -234,6 +285,7 @@ ask.pool:
   store ptr %params, ptr %job.params
   store ptr %a, ptr %job.args
   store ptr %r, ptr %job.rets
+  store i64 %memory.size, ptr %job.scratch
   %schedule = load ptr, ptr %api.XLA_FFI_ThreadPool_Schedule
   br label %next.task
 next.task:
@@ -258,7 +310,7 @@ scheduled:
   %t.next = add i64 %t, 1
   br label %next.task
 own:
-  call void @work(ptr %job)
+  call void @work(ptr %job, ptr %memory)
   br label %wait
 wait:
   %spins = phi i64 [0, %own], [%spins.next, %again]
@@ -275,6 +327,7 @@ yield:
 again:
   br label %wait
 finish:
+  call void @free(ptr %memory)
   call void @drop(ptr %job)
   ret ptr null
 }}
@@ -310,9 +363,9 @@ def _threads() -> ctypes.c_int64:
     return ctypes.c_int64.from_address(runtime().get_global_value_address("lanewise_threads"))
 
 
-def module_text(kernel: str, block: int) -> str:
+def module_text(kernel: str, block: int, scratch: int) -> str:
     """A kernel with its handler."""
-    return kernel + HANDLER.replace("BLOCK", str(block))
+    return kernel + HANDLER.replace("BLOCK", str(block)).replace("SCRATCH", str(scratch))
 
 
 def register(text: str) -> str:

@@ -45,7 +45,7 @@ class Elements:
         )
 
     def register(self, code: Code) -> str:
-        return handler.register(handler.module_text(code.text, code.block))
+        return handler.register(code.module)
 
     def assembly(self, code: Code) -> str:
-        return machine.assembly(handler.module_text(code.text, code.block))
+        return machine.assembly(code.module)

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from typing import Any
 
 from .. import rules as rules  # each file registers its rules with the evaluator
-from ..evaluator import Evaluator
-from ..jaxprs.extent import carry_size, most_operations, operation_count
+from ..evaluator import RULES, Evaluator
+from ..jaxprs.extent import carry_size, most_operations, operation_count, primitives_in
 from ..jaxprs.jaxapi import ClosedJaxpr
-from ..llvm.ir import check_size, check_type
+from ..llvm.ir import NotCompilable, check_size, check_type
 from ..llvm.memory import Buffer, contiguous, load_row, stored_type
 from ..llvm.values import SMALL, Value, objects
 from ..module import Module
@@ -77,27 +77,11 @@ def kernel_text(module: Module, function: ClosedJaxpr, lane_flags: Sequence[bool
             f"  %par{i}.at = getelementptr i64, ptr %params, i64 {HEAD + len(results) + i}",
             f"  %par{i} = load i64, ptr %par{i}.at",
         ]
-    epilogue = []
-    if module.scratch_bytes:
-        # Not from the stack: that of a thread of XLA's pool may be small.
-        b.declarations |= {"declare ptr @malloc(i64)", "declare void @free(ptr)"}
-        size = module.scratch_bytes + 64
-        prologue += [
-            f"  %memory = call ptr @malloc(i64 {size})",
-            "  %address = ptrtoint ptr %memory to i64",
-            "  %up = add i64 %address, 63",
-            "  %aligned = and i64 %up, -64",
-            "  %scratch = inttoptr i64 %aligned to ptr",
-        ]
-        epilogue.append("  call void @free(ptr %memory)")
-    body = "\n".join([*prologue, *b.lines, *epilogue, "  ret void"])
+    body = "\n".join([*prologue, *b.lines, "  ret void"])
     declarations = "\n".join(sorted(module.declarations | b.declarations))
     functions = "\n".join(module.functions.values())
-    head = (
-        "define internal void @lanewise_kernel(ptr %args, ptr %rets, ptr %params, "
-        "i64 %first, i64 %last) alignstack(64) align 64 {\nentry:"
-    )
-    return "\n".join(["\n".join(module.globals), declarations, functions, head, body, "}\n"])
+    front = "\n".join(module.globals), declarations, functions, handler.KERNEL
+    return "\n".join([*front, body, "}\n"])
 
 
 def _lane_stride(module: Module, aval: Any) -> int | str:
@@ -126,6 +110,9 @@ def _operand(evaluator: Evaluator, buffer: Buffer) -> Value:
     return value
 
 
+_LONG_PROGRAM = 10_000  # operations
+
+
 class Numbers:
     """Number by number, in vectors of trajectories; it is tried for every program."""
 
@@ -141,6 +128,10 @@ class Numbers:
         count = operation_count(function.jaxpr)
         limit = most_operations(function.jaxpr)
         check_size(count, limit, "the number of operations (a loop counts once)")
+        # A long program would be written for seconds up to the equation that has no rule.
+        missing = primitives_in(function.jaxpr) - RULES.keys() if count > _LONG_PROGRAM else set()
+        if missing:
+            raise NotCompilable(f"there is no rule for the primitive {min(missing)}")
         if width is not None:
             vectors = max(width // machine.width(), 1)
         else:
@@ -157,10 +148,10 @@ class Numbers:
         return Code(text, b.W * b.U, values, (), b.operations, scratch, b.W, b.U)
 
     def register(self, code: Code) -> str:
-        return handler.register(handler.module_text(code.text, code.block))
+        return handler.register(code.module)
 
     def assembly(self, code: Code) -> str:
-        return machine.assembly(handler.module_text(code.text, code.block))
+        return machine.assembly(code.module)
 
 
 def variant(lanes: int, limit: int, width: int | None = None) -> tuple[int, int]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..jaxprs.jaxapi import ClosedJaxpr
 from ..llvm.ir import NotCompilable
+from ..native.handler import module_text
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,6 +33,11 @@ class Code:
     vectors: int = 1
     loops: int = 0
     stores: int = 0
+
+    @property
+    def module(self) -> str:
+        """The kernel with its handler, as it is compiled."""
+        return module_text(self.text, self.block, self.scratch)
 
     def params(self, lanes: int | None, outs: Sequence[Any]) -> np.ndarray:
         """What the kernel reads: trajectories, cost of a block, bytes of a trajectory in each

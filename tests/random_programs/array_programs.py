@@ -286,6 +286,13 @@ BRANCHES = {
         lambda s: (s[0] + 1, 0.7 * f(s[1], v)),
         (0, u),
     )[1],
+    "until each": lambda u, v, k, i, f, g, h: jax.vmap(  # a condition for each row
+        lambda x: lax.while_loop(
+            lambda s: (s[0] < 4) & (jnp.max(jnp.abs(s[1])) > 0.3137),
+            lambda s: (s[0] + 1, 0.7 * jnp.sin(s[1]) + 0.1 * s[0]),
+            (0, x),
+        )[1]
+    )(f(u, v)),
 }  # fmt: skip
 """Control flow around three functions (u, v) → array like u."""
 

@@ -73,8 +73,12 @@ def _while(*inputs, cond_nconsts, cond_jaxpr, body_nconsts, body_jaxpr, **_):
     of_condition = inputs[:cond_nconsts]
     of_body = inputs[cond_nconsts : cond_nconsts + body_nconsts]
     carry = inputs[cond_nconsts + body_nconsts :]
-    while evaluate(cond_jaxpr, *of_condition, *carry)[0]:
-        carry = evaluate(body_jaxpr, *of_body, *carry)
+    while np.any(goes_on := np.asarray(evaluate(cond_jaxpr, *of_condition, *carry)[0])):
+        new = evaluate(body_jaxpr, *of_body, *carry)
+        # The condition of each element of a batch holds for the first axes of what is carried.
+        shapes = [(*goes_on.shape, *[1] * (np.ndim(x) - goes_on.ndim)) for x in new]
+        pairs = zip(shapes, new, carry, strict=True)
+        carry = [np.where(goes_on.reshape(shape), x, y) for shape, x, y in pairs]
     return carry
 
 
