@@ -1,6 +1,6 @@
 """How large a function is: operations, and numbers that its loops carry."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -102,25 +102,30 @@ def has_long_arrays(jaxpr: Any) -> bool:
     Rows that a loop collects do not count, nor what is done to them after it. A linear system of
     more than 32 unknowns has long arrays, too.
     """
-    if _has_long_loop(jaxpr) or _has_large_system(jaxpr):
+    unknowns = _most_unknowns(jaxpr)
+    if unknowns > LARGE_SYSTEM or _has_long_loop(jaxpr):
         return True
-    return not _has_loop(jaxpr) and _longest(jaxpr) > LONG_CARRY
+    # The Jacobian of a small system is no long array.
+    return not unknowns and not _has_loop(jaxpr) and _longest(jaxpr) > LONG_CARRY
 
 
-def _has_large_system(jaxpr: Any) -> bool:
-    return any(
-        (eqn.primitive.name == "eliminate" and eqn.invars[0].aval.shape[-1] > LARGE_SYSTEM)
-        or any(_has_large_system(f.jaxpr) for f in (*bodies(eqn), *functions_in(eqn)))
-        for eqn in jaxpr.eqns
-    )
+def _most_unknowns(jaxpr: Any) -> int:
+    """Unknowns of the largest linear system."""
+    most = 0
+    for eqn in jaxpr.eqns:
+        if eqn.primitive.name == "eliminate":
+            most = max(most, eqn.invars[0].aval.shape[-1])
+        for function in (*bodies(eqn), *functions_in(eqn)):
+            most = max(most, _most_unknowns(function.jaxpr))
+    return most
 
 
 def _has_long_loop(jaxpr: Any) -> bool:
     for eqn in jaxpr.eqns:
         if eqn.primitive.name in _LOOPS:
             values = [_longest(body.jaxpr) for body in bodies(eqn)]
-            is_larger = _carried(eqn) > HALF_CARRY and not _has_matrices(bodies(eqn))
-            limit = PAIRS if is_larger else LONG_VALUE
+            has_pairs = _carried(eqn) > HALF_CARRY and not _has_matrices([*bodies(eqn)])
+            limit = PAIRS if has_pairs else LONG_VALUE
             if _carried(eqn) > LONG_CARRY or max(values) > limit:
                 return True
         if any(_has_long_loop(f.jaxpr) for f in (*bodies(eqn), *functions_in(eqn))):
@@ -128,12 +133,12 @@ def _has_long_loop(jaxpr: Any) -> bool:
     return False
 
 
-def _has_matrices(functions: Iterable[ClosedJaxpr]) -> bool:
+def _has_matrices(functions: Sequence[ClosedJaxpr]) -> bool:
     """Whether a linear system is solved, or a product of matrices has more than 384 elements, each
     a sum of more than 8 terms."""
+    if any(_most_unknowns(function.jaxpr) for function in functions):
+        return True
     for eqn in (eqn for function in functions for eqn in function.jaxpr.eqns):
-        if eqn.primitive.name == "eliminate":
-            return True
         if eqn.primitive.name == "dot_general":
             (axes, _), _ = eqn.params["dimension_numbers"]
             terms = np.prod([eqn.invars[0].aval.shape[i] for i in axes])
