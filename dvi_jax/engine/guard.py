@@ -33,13 +33,13 @@ def constant_unless(
     # The derivative is set to zero at the inputs: at the outputs it would be multiplied by NaN
     # afterwards. Values are the same on both sides of each choice, which costs nothing. (A rule of
     # its own for the derivative would be lost in second derivatives of a scan.)
-    def chosen(good: Any, inputs: Any) -> list[Any]:
+    def selection(good: Any, inputs: Any) -> list[Any]:
         smooth, others = eqx.partition([*inputs], eqx.is_inexact_array)
         smooth = jax.tree.map(lambda x: jnp.where(good, x, lax.stop_gradient(x)), smooth)
         return eqx.combine(smooth, others)
 
     def guarded(good: Any, *inputs: Any) -> list[Any]:
-        return trace(*chosen(good, inputs))
+        return trace(*selection(good, inputs))
 
     def result_of(outs: list[Any]) -> Any:
         return jax.tree.unflatten(trace.out_tree, outs)
@@ -53,7 +53,7 @@ def constant_unless(
     @functools.partial(value.defjvp, symbolic_zeros=True)
     def _(primals, tangents):
         (good, *inputs), changes = primals, tangents[1:]
-        values = chosen(good, inputs)
+        values = selection(good, inputs)
         places = [i for i, x in enumerate(changes) if not isinstance(x, SymbolicZero)]
 
         def of_variables(*variables):

@@ -18,7 +18,7 @@ from ..engine.bracket import bracketed_root
 from ..engine.guard import constant_unless
 from ..engine.rounding import each, one_by_one
 from ..methods import Method
-from ..methods.step import Equations, judged
+from ..methods.step import Equations, info_of
 from ..observe import Crossings, Reduction, Section, Stop, Stopped, is_observable
 from ..observe._kept import RequestedTimes, StepStart, event, from_rows, shown
 from ..observe.solution import Save
@@ -50,7 +50,7 @@ class Curve(eqx.Module):
         h = theta * (start.t1 - start.t0)
         t = start.t0 + h
         q, p, info = self.method.step(self.equations, Interval(start.t0, t, h), start.q0, start.p0)
-        return (t, q, p), judged(self.method, info, q, p).result
+        return (t, q, p), info_of(self.method, info, q, p).result
 
     def where(self, g: Callable[..., Any], start: StepStart, exists: Array) -> PointAndStatus:
         """The point of the step where g(t, q, p, args) = 0, or its end if none `exists`."""

@@ -20,7 +20,7 @@ from ..engine.pairs import rounded
 from ..lattices import Place, Uniform
 from ..methods import InLoop
 from ..methods.constraint import start_status
-from ..methods.step import judged
+from ..methods.step import info_of
 from ..observe import Deviations, Pushed, Reduction, has_initial_value
 from ..observe._kept import StepStart, as_row, event
 from .task import Carry, Ends, Outcome, Plan, Rows, Task, adds_start_outside, or_nan
@@ -115,7 +115,7 @@ def take_step(
         local, *state = task.arithmetic.enter(equations, q, p, carry.remainder)
         q1, p1, info = step(local, interval, *state)
         q1, p1, remainder = task.arithmetic.leave(q, p, q1, p1)
-        info = judged(task.method, info, q1, p1)
+        info = info_of(task.method, info, q1, p1)
         if conversion is None:
             return (q1, p1, None), (remainder, rounded(info))
         x1, y1, last = conversion.last(local, interval, q1, p1)

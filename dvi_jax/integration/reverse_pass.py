@@ -81,13 +81,13 @@ class ReversePass(eqx.Module):
         is_saved = k == save.step
         observed = jax.tree.map(lambda c: jnp.where(is_saved, c, jnp.zeros_like(c)), save.observed)
         of_t1, of_values = _of_values(self.reductions(), k, t1, values)
-        pulled = pull(((after_step.q, after_step.p, of_t1), observed, of_values))
+        pullback = pull(((after_step.q, after_step.p, of_t1), observed, of_values))
         # A failed step is a constant, NaN: zero times its derivative would be NaN as well.
         good = all_finite(start) & all_finite(end)
         of_theta, q, p = lax.cond(
             lanewise.on_any(~good),
-            lambda: jax.tree.map(lambda x: jnp.where(good, x, 0), pulled),
-            lambda: pulled,
+            lambda: jax.tree.map(lambda x: jnp.where(good, x, 0), pullback),
+            lambda: pullback,
         )
         return Cotangents(jax.tree.map(jnp.add, after_step.theta, of_theta), q, p)
 
@@ -220,8 +220,8 @@ class ReversePass(eqx.Module):
         seeds = _of_values(reductions, jnp.asarray(-1, jnp.int32), t0, values)
         # NaN parameters make the value of a valid state NaN.
         good = all_finite(start) & (all_finite(values) | _any_nonzero(seeds))
-        pulled = jax.tree.map(lambda x: jnp.where(good, x, 0), pull(seeds))
-        return jax.tree.map(jnp.add, cotangents, Cotangents(*pulled))
+        pullback = jax.tree.map(lambda x: jnp.where(good, x, 0), pull(seeds))
+        return jax.tree.map(jnp.add, cotangents, Cotangents(*pullback))
 
 
 def _of_values(

@@ -230,7 +230,7 @@ def judge(info: RootInfo, q: State, p: State, quantum: float | None = None) -> S
     return StepInfo(result, info.iterations, info.residual)
 
 
-def judged(method: eqx.Module, info: StepInfo, q: State, p: State) -> StepInfo:
+def info_of(method: eqx.Module, info: StepInfo, q: State, p: State) -> StepInfo:
     """The status of a step of any method: one of a user may have a state that is not finite, and
     yet the status `successful`. Those of the package judge their states themselves."""
     if is_of_package(method):

@@ -71,16 +71,16 @@ def substitute(factors: Factors, right: Array) -> Array:
     low, high, columns = lower.shape[1], upper.shape[1], right.shape[1]
 
     def forward(last, row):
-        factors_of_row, one_over, y = row
+        factors_of_row, one_over, value = row
         for m in range(low):
-            y = y - factors_of_row[m] * last[m]
-        return _next_window(last, y), y * one_over
+            value = value - factors_of_row[m] * last[m]
+        return _next_window(last, value), value * one_over
 
     def backward(last, row):
-        numbers, x = row
+        numbers, value = row
         for j in range(high):
-            x = x - numbers[j] * last[high - 1 - j]
-        return _next_window(last, x), x
+            value = value - numbers[j] * last[high - 1 - j]
+        return _next_window(last, value), value
 
     start = jnp.zeros((low, columns), right.dtype)
     _, y = lax.scan(forward, start, (lower, inverse, right))
@@ -124,11 +124,11 @@ def with_exchanges(rows: Array, right: Array, low: int) -> Array:
     _, (upper, y) = lax.scan(step, start, (rows[low + 1 :], right[low + 1 :]))
 
     def backward(last, row):
-        numbers, x = row
+        numbers, value = row
         for j in range(width - 1):
-            x = x - numbers[j + 1] * last[width - 2 - j]
-        x = x / numbers[0]
-        return _next_window(last, x), x
+            value = value - numbers[j + 1] * last[width - 2 - j]
+        value = value / numbers[0]
+        return _next_window(last, value), value
 
     start = jnp.zeros((width - 1, columns), right.dtype)
     return lax.scan(backward, start, (upper, y), reverse=True)[1]

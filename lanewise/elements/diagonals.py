@@ -86,9 +86,9 @@ def _value_where(node: Expression, delta: Delta, memory: dict) -> Expression | N
     elif not present or (is_product and len(present) < 2) or (name == "div" and args[0] is None):
         return None
     elif is_product:
-        for x, y in (present, present[::-1]):
-            if x.kind == "known" and x.value == 1:
-                return y
+        for one, other in (present, present[::-1]):
+            if one.kind == "known" and one.value == 1:
+                return other
     elif len(present) == 1 and name in ("add", "add_any", "or", "sub"):
         is_negative = name == "sub" and args[0] is None
         return table.operation("neg", {}, present, node.dtype) if is_negative else present[0]
@@ -141,7 +141,11 @@ def _array_of(boxes: Sequence[Box], n: int, zero: Expression, like: Array) -> Ar
 def from_diagonals(of: dict[int, Array], shape: Sequence[int], dtype: str, table: Any) -> Array:
     """The matrix with these diagonals."""
     matrix = Array.uniform(table.known(0, dtype), shape)
-    for d, x in of.items():
-        delta = Array.uniform(table.expression("delta", "bool", strides=(1, -1), offset=d), shape)
-        matrix = elementwise("select_n", {}, [delta, matrix, x.along(shape, [0])], shape, dtype)
+    for offset, diagonal in of.items():
+        delta = Array.uniform(
+            table.expression("delta", "bool", strides=(1, -1), offset=offset), shape
+        )
+        matrix = elementwise(
+            "select_n", {}, [delta, matrix, diagonal.along(shape, [0])], shape, dtype
+        )
     return matrix

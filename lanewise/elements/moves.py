@@ -143,7 +143,7 @@ def _unstack(x: Array, *, axis) -> tuple[Array, ...]:
     return tuple(_squeeze(part, dimensions=(axis,)) for part in parts)
 
 
-def _shifted(x: Array, start: Sequence[int], shape: Sequence[int]) -> list[Box]:
+def _part_boxes(x: Array, start: Sequence[int], shape: Sequence[int]) -> list[Box]:
     """The boxes of an array whose element 0 is element `start` of a larger one."""
     rank = len(shape)
     rows = [[int(a == k) for k in range(rank)] for a in range(rank)]
@@ -155,7 +155,7 @@ def _concatenate(*xs: Array, dimension) -> Array:
     shape[dimension] = sum(x.shape[dimension] for x in xs)
     boxes, start = [], [0] * len(shape)
     for x in xs:
-        boxes += _shifted(x, start, shape)
+        boxes += _part_boxes(x, start, shape)
         start[dimension] += x.shape[dimension]
     return Array(xs[0].table, shape, xs[0].dtype, joined(boxes, len(shape)))
 
@@ -177,7 +177,7 @@ def _pad(x: Array, fill: Array, *, padding_config) -> Array:
     shape = [max(0, n + int(low) + int(high)) for n, (low, high, _) in sizes]
     start = [int(low) for low, *_ in padding_config]
     (node,) = (box.expression for box in fill.boxes)
-    boxes = _shifted(x, start, shape)
+    boxes = _part_boxes(x, start, shape)
     sides = zip(start, x.shape, shape, strict=True)
     interior = [(min(max(s, 0), m), max(min(s + n, m), 0)) for s, n, m in sides]
     if any(p >= q for p, q in interior):

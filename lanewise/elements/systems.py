@@ -49,9 +49,9 @@ def band_of(diagonals: dict[int, Array], n: int) -> Band:
 
     # The stages of a method, or the ends of a ring, are far from each other in the given order.
     pairs = [
-        np.stack([i := np.arange(box.lower[0], box.upper[0]), i + d])
-        for d, x in diagonals.items()
-        for box in x.boxes
+        np.stack([row := np.arange(box.lower[0], box.upper[0]), row + offset])
+        for offset, diagonal in diagonals.items()
+        for box in diagonal.boxes
         if not (box.expression.kind == "known" and not box.expression.value)
     ]
     rows, columns = np.concatenate(pairs, axis=1)
@@ -77,19 +77,19 @@ def eliminate(translation: Translation, eqn: Any, matrix: Array, right: Array) -
     shape = eqn.outvars[0].aval.shape
     if any(size != 1 for size in (*front, *shape[:-1])):
         raise NotCompilable("several linear systems at once, of long arrays")
-    b = right.along((n,), [*[None] * (len(right.shape) - 1), 0])
+    right = right.along((n,), [*[None] * (len(right.shape) - 1), 0])
     if (factors := _factors(translation, matrix)) is not None:
         band, values = factors
-        (x,) = _run(translation, functools.partial(_solution, band), [*values, b])
+        (solution,) = _run(translation, functools.partial(_solution, band), [*values, right])
     else:
         # A branch may be for rare cases, such as Newton's method where a simpler one fails.
         limit = _MOST_UNKNOWNS if translation.branches else LARGE_SYSTEM
         if n > limit:
             raise NotCompilable(f"a full matrix of {n} unknowns (above {limit} LAPACK is faster)")
-        A = matrix.along((n, n), [*[None] * len(front), 0, 1])
+        square = matrix.along((n, n), [*[None] * len(front), 0, 1])
         solve = by_elimination if n <= SHORT else column_by_column
-        (x,) = _run(translation, solve, [A, b])
-    return [x.along(shape, [len(shape) - 1])]
+        (solution,) = _run(translation, solve, [square, right])
+    return [solution.along(shape, [len(shape) - 1])]
 
 
 def _factors(translation: Translation, matrix: Array) -> tuple[Band, list[Array]] | None:
@@ -103,7 +103,7 @@ def _factors(translation: Translation, matrix: Array) -> tuple[Band, list[Array]
         if of and (band := band_of(of, n)).width <= WIDEST:
             function = functools.partial(_band_factors, band, list(of))
             values = _run(translation, function, list(of.values()))
-            factors = band, [translation.settle(x) for x in values]
+            factors = band, [translation.settle(value) for value in values]
         # With the matrix, so that no other one gets its identity.
         translation.factors[key] = matrix, factors
     return translation.factors[key][1]
@@ -114,17 +114,17 @@ def _band_factors(band: Band, offsets: Sequence[int], *of: jax.Array) -> Sequenc
     return rows, *bands.factorise(rows, band.low)
 
 
-def _solution(band: Band, rows, lower, inverse, upper, weak, b) -> list[jax.Array]:
+def _solution(band: Band, rows, lower, inverse, upper, weak, right) -> list[jax.Array]:
     factors = bands.Factors(lower, inverse, upper, weak)
     if band.order is None:
-        return [bands.solve(factors, rows, b[:, None])[:, 0]]
-    x = bands.solve(factors, rows, b[band.order][:, None])[:, 0]
-    return [x[np.argsort(band.order)]]
+        return [bands.solve(factors, rows, right[:, None])[:, 0]]
+    solution = bands.solve(factors, rows, right[band.order][:, None])[:, 0]
+    return [solution[np.argsort(band.order)]]
 
 
 def _run(translation: Translation, function: Callable, args: Sequence[Array]) -> list[Array]:
     """The results of a function of JAX arrays."""
-    shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in args]
+    shapes = [jax.ShapeDtypeStruct(arg.shape, arg.dtype) for arg in args]
     return translation.evaluate(jax.make_jaxpr(function)(*shapes), args)
 
 

@@ -111,13 +111,13 @@ def has_long_arrays(jaxpr: Any) -> bool:
 
 def _most_unknowns(jaxpr: Any) -> int:
     """Unknowns of the largest linear system."""
-    most = 0
+    count = 0
     for eqn in jaxpr.eqns:
         if eqn.primitive.name == "eliminate":
-            most = max(most, eqn.invars[0].aval.shape[-1])
+            count = max(count, eqn.invars[0].aval.shape[-1])
         for function in (*bodies(eqn), *functions_in(eqn)):
-            most = max(most, _most_unknowns(function.jaxpr))
-    return most
+            count = max(count, _most_unknowns(function.jaxpr))
+    return count
 
 
 def _has_long_loop(jaxpr: Any) -> bool:

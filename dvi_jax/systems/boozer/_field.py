@@ -376,11 +376,11 @@ def _fit(
         freedom = 1 - np.sum(left**2, axis=1, keepdims=True)
         # A surface that the others do not predict at all has no freedom, up to rounding.
         left_out = np.where(freedom > 1e-8, residuals / freedom.clip(1e-8), np.inf)
-        predicted = np.maximum(residuals, weights * left_out)
+        estimates = np.maximum(residuals, weights * left_out)
         changes = np.abs(basis_at(middles, d) @ inverse @ left.T)
         gap_errors = np.max([np.outer(changes[:, i], left_out[i]) for i in range(len(s))], axis=0)
-        better = np.sum(predicted**2, axis=0) < np.sum(errors[: len(s)] ** 2, axis=0)
-        errors[:, better], c[better] = np.vstack([predicted, gap_errors])[:, better], 0.0
+        better = np.sum(estimates**2, axis=0) < np.sum(errors[: len(s)] ** 2, axis=0)
+        errors[:, better], c[better] = np.vstack([estimates, gap_errors])[:, better], 0.0
         c[better, : d + 1] = (inverse @ (left.T @ columns[:, better])).T @ _monomials(d)
     return c.reshape(*values.shape[1:], degree + 1), errors.reshape(-1, *values.shape[1:])
 

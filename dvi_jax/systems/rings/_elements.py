@@ -65,8 +65,8 @@ class Element:
         **Source** EALIGN of MAD-X, with DPHI = pitch, DTHETA = yaw, DPSI = roll at the entrance.
         """
         values = {"dx": dx, "dy": dy, "roll": roll}
-        further = {"ds": ds, "pitch": pitch, "yaw": yaw}
-        for name, value in {**values, **further, "tilt": tilt}.items():
+        offsets = {"ds": ds, "pitch": pitch, "yaw": yaw}
+        for name, value in {**values, **offsets, "tilt": tilt}.items():
             strength(f"{name} of element {self.name!r}", value)
         middle = {"entrance": 0.0, "middle": 0.5}[one_of("anchor", anchor, get_args(Anchor))]
         element, name = self, "placed"
@@ -74,8 +74,8 @@ class Element:
             element = element.within(RingPart("tilted_in"), RingPart("tilted_out"), tilt=tilt)
         # The ends of a curved element have different frames; those of other elements need them
         # only if they are inclined.
-        if "h" in self.values or not all(map(_is_zero, further.values())):
-            values, name = {**values, **further, "anchor": middle}, "moved"
+        if "h" in self.values or not all(map(_is_zero, offsets.values())):
+            values, name = {**values, **offsets, "anchor": middle}, "moved"
         return element.within(RingPart(f"{name}_in"), RingPart(f"{name}_out"), **values)
 
     def inside(

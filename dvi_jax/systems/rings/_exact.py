@@ -44,7 +44,7 @@ def exact_drift(z: Particle, length: Any, par: Parameters) -> Particle:
     return z.plus(x=scale * z.px, y=scale * z.py, zeta=-scale * p2 / (p + pz))
 
 
-def _beyond(z: Particle, px: Any) -> Any:
+def _pz_excess(z: Particle, px: Any) -> Any:
     """pz − 1, without cancellation."""
     squares = px * px + z.py * z.py
     return (z.delta * (2 + z.delta) - squares) / (1 + pz_of(z, px))
@@ -59,10 +59,10 @@ def _arc(z: Particle, px: Any) -> Any:
 def exact_bend(z: Particle, length: Any, par: Parameters) -> Particle:
     """The flow in a uniform field h in coordinates of curvature h. Forest 1998, (12.18)."""
     h = par["h"]
-    px, excess = rotation(z.px, _beyond(z, z.px) - z.x * h, h * length)
+    px, excess = rotation(z.px, _pz_excess(z, z.px) - z.x * h, h * length)
     path = length + _arc(z, px) / h
     late = (1 + z.delta) * path - length
-    x = (_beyond(z, px) - excess) / h
+    x = (_pz_excess(z, px) - excess) / h
     return z._replace(x=x, px=px, y=z.y + z.py * path, zeta=z.zeta - late)
 
 

@@ -73,7 +73,7 @@ _XSUITE_READ = {
 """Attributes of Xsuite that are read, or have no effect on the map."""
 
 
-class _Undefined(float):
+class _NoValue(float):
     """The value of a variable that a file does not define."""
 
 
@@ -84,7 +84,7 @@ def read_lattice(path: Path, use: str | None, options: dict[str, Any]) -> Any:
 
     suffix = path.suffix.lower()
     if suffix in _PARSERS:
-        return _parsed(getattr(at, _PARSERS[suffix])(), path, use, options)
+        return _lattice_of(getattr(at, _PARSERS[suffix])(), path, use, options)
     try:
         data = json.loads(path.read_text()) if suffix == ".json" else {}
         if "__class__" in data and "atjson" not in data and not options.get("from_at"):
@@ -105,15 +105,15 @@ def _line_of(names: list[str], use: str | None, path: Path) -> str:
     labels = {name.lower().replace(".", "_"): name for name in names}
     choice = "ring" if use is None and len(names) != 1 else (use or names[0]).replace(".", "_")
     if choice.lower() not in labels:
-        more = ", …" if len(names) > 10 else ""
+        ellipsis = ", …" if len(names) > 10 else ""
         raise ValueError(
             f"use must be the name of a sequence or line of {path.name}: "
-            f"{', '.join(names[:10]) or 'it contains neither'}{more}; got {use!r}."
+            f"{', '.join(names[:10]) or 'it contains neither'}{ellipsis}; got {use!r}."
         )
     return labels[choice.lower()]
 
 
-def _parsed(parser: Any, path: Path, use: str | None, options: dict[str, Any]) -> Any:
+def _lattice_of(parser: Any, path: Path, use: str | None, options: dict[str, Any]) -> Any:
     """The lattice in a file of MAD or elegant. Variables that the file does not define are zero, as
     in MAD, with a warning, unless ``strict=True``."""
     options = dict(options)
@@ -127,7 +127,7 @@ def _parsed(parser: Any, path: Path, use: str | None, options: dict[str, Any]) -
         with contextlib.redirect_stdout(io.StringIO()):  # pyAT prints what it reads
             for read in (lambda: parser.parse_files(path, **options), lambda: None):
                 if not strict:
-                    parser["none"] = _Undefined()
+                    parser["none"] = _NoValue()
                 read()
             line = _line_of(parser.sequences, use, path)
             lattice = parser.lattice(use=line, **parameters)
@@ -153,12 +153,12 @@ def _parsed(parser: Any, path: Path, use: str | None, options: dict[str, Any]) -
             f"elements of {line} in {path.name} must not overlap, or end behind it: "
             f"{len(overlaps)} of them do, the first by {-overlaps[0].Length:.3g} m."
         )
-    undefined = sorted(k for k, v in parser.items() if isinstance(v, _Undefined) and k != "none")
-    if undefined:
-        names = ", ".join(undefined[:10]) + (", …" if len(undefined) > 10 else "")
+    empty_names = sorted(k for k, v in parser.items() if isinstance(v, _NoValue) and k != "none")
+    if empty_names:
+        names = ", ".join(empty_names[:10]) + (", …" if len(empty_names) > 10 else "")
         warnings.warn(
             f"{path.name} does not define {names}: zero, as in MAD. Pass their values, such as "
-            f"rings.load(path, {undefined[0]}=1.0), or strict=True for an error.",
+            f"rings.load(path, {empty_names[0]}=1.0), or strict=True for an error.",
             stacklevel=user_level(),
         )
     return lattice
@@ -169,7 +169,7 @@ def _readable(statement: str) -> str:
     misreads or, as with braces that are not closed, never ends to read."""
     text = re.sub(r"\"[^\"]*\"|'[^']*'", "", statement).lower()
     is_line = re.search(r"\bline\s*=", text)
-    for what, is_misread in (
+    for description, is_misread in (
         (
             "conditions, loops and macros",
             any(text.count(a) != text.count(b) for a, b in ("()", "{}")),
@@ -181,7 +181,7 @@ def _readable(statement: str) -> str:
         ),
     ):
         if is_misread:
-            raise ValueError(f"pyAT does not read {what}")
+            raise ValueError(f"pyAT does not read {description}")
     # An attribute of an element; pyAT would make a variable.
     return re.sub(
         r"^\s*([\w.$]+)\s*(?:->\s*(\w+)|\[\s*(\w+)\s*\])\s*(:?=)", r"\1, \2\3\4", statement
@@ -210,8 +210,8 @@ def _of_elegant(kind: type) -> type:
         # pyAT leaves out elements such as MALIGN.
         elements = elements or [at.Marker(self.name, origin=kind.__name__, **params)]
         for element in elements:
-            replaced = kind.__name__.lower() in _STRENGTHS
-            element.unread = {k: v for k, v in params.items() if replaced or k in vars(element)}
+            is_strength = kind.__name__.lower() in _STRENGTHS
+            element.unread = {k: v for k, v in params.items() if is_strength or k in vars(element)}
         return elements
 
     return type(kind.__name__, (kind,), {"to_at": to_at})

@@ -51,12 +51,12 @@ def _rotation(yaw: Any, pitch: Any, roll: Any) -> Any:
     """V − 1 with V = Θ Φ Ψ of MAD-X: s is turned towards x by `yaw` and towards y by `pitch`, x
     towards y by `roll`, which acts first."""
     total = np.zeros((3, 3))
-    for angle, to, axis in ((roll, 1, 0), (pitch, 1, 2), (yaw, 0, 2)):
+    for angle, end, axis in ((roll, 1, 0), (pitch, 1, 2), (yaw, 0, 2)):
         unit = np.eye(3)
-        planes = np.outer(unit[to], unit[axis])
-        diagonal = np.diag(unit[to] + unit[axis])
-        one = jnp.sin(angle) * (planes - planes.T) - 2 * jnp.sin(angle / 2) ** 2 * diagonal
-        total = one + total + one @ total
+        planes = np.outer(unit[end], unit[axis])
+        diagonal = np.diag(unit[end] + unit[axis])
+        turn = jnp.sin(angle) * (planes - planes.T) - 2 * jnp.sin(angle / 2) ** 2 * diagonal
+        total = turn + total + turn @ total
     return total
 
 
@@ -66,10 +66,10 @@ def _arc(par: Parameters, s: Any) -> tuple[Any, Any]:
     chord = s * jnp.sinc(half / np.pi)
     c, n = jnp.cos(par.get("tilt", 0.0)), jnp.sin(par.get("tilt", 0.0))
     # The arc bends towards −x of the axes that are tilted by the design.
-    radial, across, ahead = jnp.stack([c, n, 0 * c]), jnp.stack([-n, c, 0 * c]), np.eye(3)[2]
+    radial, lateral, ahead = jnp.stack([c, n, 0 * c]), jnp.stack([-n, c, 0 * c]), np.eye(3)[2]
     x = jnp.cos(2 * half) * radial + jnp.sin(2 * half) * ahead
     z = jnp.cos(2 * half) * ahead - jnp.sin(2 * half) * radial
-    axes = jnp.outer(x, radial) + jnp.outer(across, across) + jnp.outer(z, ahead)
+    axes = jnp.outer(x, radial) + jnp.outer(lateral, lateral) + jnp.outer(z, ahead)
     return axes, chord * (jnp.cos(half) * ahead - jnp.sin(half) * radial)
 
 

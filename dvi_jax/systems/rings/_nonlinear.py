@@ -149,10 +149,10 @@ def _driving_terms(ring: Ring, z: Array, terms: tuple[str, ...]) -> dict[str, Ar
             if not 1 < N <= len(field):
                 continue
             # The coefficient of order N - 1 of the field about the orbit.
-            about = sum(math.comb(i, N - 1) * c * w ** (i - N + 1)
+            coefficient = sum(math.comb(i, N - 1) * c * w ** (i - N + 1)
                         for i, c in enumerate(field) if i >= N - 1)  # fmt: skip
             count = (-1) ** (p - q) * math.factorial(N - 1) / math.prod(map(math.factorial, powers))
-            term = about * product(powers) + jnp.conj(about * product(mirror))
+            term = coefficient * product(powers) + jnp.conj(coefficient * product(mirror))
             totals[name] += count / 2 * jnp.sum(length * term)
     return totals
 

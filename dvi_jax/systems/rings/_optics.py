@@ -176,12 +176,12 @@ def four(ring: Ring) -> Ring:
     return eqx.tree_at(lambda other: other.columns, ring, columns)
 
 
-def _divided(part: RingPart) -> list[np.ndarray]:
+def _kick_shares(part: RingPart) -> list[np.ndarray]:
     """The pieces of a part, as kicks over its length: their sums are shares of its length."""
     if part.name in SLICED_PARTS:
         kicks, n = KICKS[part.scheme], part.slices
-        most = max(1, _KICKS // len(kicks))
-        return [np.array([0.0, *kicks * min(most, n - i)]) / n for i in range(0, n, most)]
+        limit = max(1, _KICKS // len(kicks))
+        return [np.array([0.0, *kicks * min(limit, n - i)]) / n for i in range(0, n, limit)]
     count = {"solenoid": 8, "second_order_bend": part.slices}.get(part.name, 1)
     return [np.array([1 / count])] * count
 
@@ -200,7 +200,7 @@ def maps(ring: Ring) -> tuple[Callable, Any, np.ndarray]:
     kinds = [p._replace(order=order, **changes.get(p.name, {})) for p in parts]
     all_kinds = distinct(kinds)
     numbers = np.asarray([all_kinds.index(kind) for kind in kinds], np.int32)
-    pieces = [_divided(p) for p in parts]
+    pieces = [_kick_shares(p) for p in parts]
     part, width = passage.numbers["part"], max(len(k) for p in pieces for k in p)
     steps = np.stack([np.pad(k, (0, width + 1 - len(k))) for i in part for k in pieces[i]])
     rows = np.repeat(np.arange(len(part)), [len(pieces[i]) for i in part])
