@@ -73,14 +73,16 @@ def _join_axes(x: Array, axis: int) -> Array:
     count, size = x.shape[axis : axis + 2]
     shape = [*x.shape[:axis], count * size, *x.shape[axis + 2 :]]
     boxes = []
-    for i in range(_part_count(count, x)):
+    for index in range(_part_count(count, x)):
         axes = [None if k == axis else k - (k > axis) for k in range(len(x.shape))]
-        offsets = [i if k == axis else 0 for k in range(len(x.shape))]
+        offsets = [index if k == axis else 0 for k in range(len(x.shape))]
         part = x.along([size if k == axis else n for k, n in enumerate(shape)], axes, offsets)
         # Moved to its place on the new axis.
         rank = len(shape)
         rows = [[int(k == a) for k in range(rank)] for a in range(rank)]
-        boxes += part.moved(shape, rows, [-i * size if k == axis else 0 for k in range(rank)]).boxes
+        boxes += part.moved(
+            shape, rows, [-index * size if k == axis else 0 for k in range(rank)]
+        ).boxes
     return Array(x.table, shape, x.dtype, joined(boxes, len(shape)))
 
 
@@ -90,10 +92,12 @@ def _part_count(count: int, x: Array) -> int:
     return count
 
 
-def _box_at(box: Box, axis: int, i: int) -> Box:
+def _box_at(box: Box, axis: int, index: int) -> Box:
     lower, upper, node = box
     return Box(
-        (*lower[:axis], i, *lower[axis + 1 :]), (*upper[:axis], i + 1, *upper[axis + 1 :]), node
+        (*lower[:axis], index, *lower[axis + 1 :]),
+        (*upper[:axis], index + 1, *upper[axis + 1 :]),
+        node,
     )
 
 
@@ -130,11 +134,11 @@ def _rev(x: Array, *, dimensions) -> Array:
 
 def _split(x: Array, *, sizes, axis) -> tuple[Array, ...]:
     parts, start = [], 0
-    for n in sizes:
+    for size in sizes:
         first, end = [0] * len(x.shape), list(x.shape)
-        first[axis], end[axis] = start, start + n
+        first[axis], end[axis] = start, start + size
         parts.append(_slice(x, start_indices=first, limit_indices=end))
-        start += n
+        start += size
     return tuple(parts)
 
 
