@@ -39,7 +39,7 @@ def _deltas(node: Expression) -> frozenset[Delta] | None:
     if name in _LINEAR:
         return of[0]
     if name == "mul" or (name == "and" and node.dtype == "bool"):
-        return next((x for x in of if x is not None), None)
+        return next((case for case in of if case is not None), None)
     if name in ("add", "add_any", "sub", "or"):
         return _union(of)
     if name == "select_n":
@@ -51,7 +51,7 @@ def _deltas(node: Expression) -> frozenset[Delta] | None:
 
 
 def _union(of: Sequence[frozenset[Delta] | None]) -> frozenset[Delta] | None:
-    if any(x is None for x in of):
+    if any(case is None for case in of):
         return None
     return frozenset().union(*of)  # pyright: ignore[reportArgumentType]
 

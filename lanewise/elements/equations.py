@@ -145,7 +145,7 @@ class Translation:
             of = diagonals(part)
             if of is None:
                 return self.store(x)
-            stored = {d: self.settle(diagonal) for d, diagonal in of.items()}
+            stored = {offset: self.settle(diagonal) for offset, diagonal in of.items()}
             matrices[index] = from_diagonals(stored, part.shape, x.dtype, self.table)
         return self.from_components(matrices, x.shape, short)
 
