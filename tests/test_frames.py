@@ -33,7 +33,7 @@ def frames_to_the_equation(call: int, **how) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("method", "frames", "files"), [(dvi.TypeII(), 15, 6), (dvi.Strang(), 17, 7)]
+    ("method", "frames", "files"), [(dvi.TypeII(), 19, 8), (dvi.Strang(), 21, 9)]
 )
 @pytest.mark.parametrize("call", [2, 3], ids=["momentum", "position"])
 def test_the_equation_is_few_frames_from_the_call(method, frames, files, call):
@@ -49,4 +49,4 @@ def test_the_frames_are_counted():
     assert [Path(file).stem for file in found] == files
     # A method around the map adds frames, so that the numbers above could fail.
     nested = dvi.Composition((1.0,), base=dvi.Composition((0.5, 0.5), base=dvi.Strang()))
-    assert len(frames_to_the_equation(2, method=nested)) > 17
+    assert len(frames_to_the_equation(2, method=nested)) > 21

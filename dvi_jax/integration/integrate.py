@@ -222,13 +222,18 @@ def _in_one_program(
 ) -> Solution:
     # A loss that uses a NaN of the solution, wherever it comes from, has no number as its gradient.
     arrays, functions = eqx.partition((task, q0, p0), eqx.is_array)
+    rest: list[Solution] = []  # what is no array, such as the number of steps
 
     def solution_of(arrays):
         task, q0, p0 = eqx.combine(arrays, functions)
         outcome = adjoint.rollout(task, plan, q0, p0, layout)
-        return as_solution(task, plan, observe, outcome, q0, p0, layout)
+        solution = as_solution(task, plan, observe, outcome, q0, p0, layout)
+        values, others = eqx.partition(solution, eqx.is_array)
+        rest.append(others)
+        return values
 
-    return nan_where_used(solution_of, arrays)
+    values = nan_where_used(solution_of, arrays)
+    return eqx.combine(values, rest[-1])
 
 
 _solution = eqx.filter_jit(as_solution)
