@@ -49,6 +49,17 @@ def test_rows_are_exchanged_where_factors_are_large():
     assert error(bands.substitute(factors, right)) > 1e-6  # the control: without exchanges
 
 
+def test_axes_of_length_1_in_an_array_of_many_parts():
+    def function(x):
+        parts = [x[3 * i : 3 * i + 3] * (i + 1) for i in range(30)]
+        y = jnp.concatenate(parts)[None]
+        return (y + jnp.concatenate(parts)[::-1][None])[0] * x
+
+    x = jnp.linspace(0.0, 1.0, 90)
+    found = jax.jit(lambda x: lanewise.call(function, x))(x)
+    np.testing.assert_allclose(found, function(x), rtol=1e-15)
+
+
 def random_equations(seed):
     """(n, F): equations F(x, q) = 0 of n unknowns that are coupled to some others."""
     draw = random.Random(seed)
