@@ -279,7 +279,7 @@ BRANCHES = {
         0, 2 + k % 3, lambda _, s: (s[1] + 0.1 * f(*s), s[0]), (u, v)
     )[k % 2],
     "counted": lambda u, v, k, i, f, g, h: lax.fori_loop(
-        0, i % 4, lambda j, s: f(s, v) + 0.1 * j.astype(s.dtype), u
+        0, i % 4, lambda j, s: f(s, v) + 0.1 * jnp.asarray(j, s.dtype), u
     ),
     "until": lambda u, v, k, i, f, g, h: lax.while_loop(
         lambda s: (s[0] < 4) & (jnp.max(jnp.abs(s[1])) > 0.3137),
