@@ -106,8 +106,9 @@ define internal ptr @aligned(ptr %memory) {{
 define internal void @work(ptr %job, ptr %memory) {{
 entry:
   %scratch = call ptr @aligned(ptr %memory)
-  {addresses("job", "Job", "next done blocks chunk kernel params args rets")}
+  {addresses("job", "Job", "next done blocks claims chunk kernel params args rets")}
   %blocks = load i64, ptr %job.blocks
+  %claims = load i64, ptr %job.claims
   %chunk = load i64, ptr %job.chunk
   %kernel = load ptr, ptr %job.kernel
   %params = load ptr, ptr %job.params
@@ -116,11 +117,11 @@ entry:
   br label %claim
 claim:
   %first = atomicrmw add ptr %job.next, i64 %chunk acq_rel
-  %is.over = icmp sge i64 %first, %blocks
+  %is.over = icmp sge i64 %first, %claims
   br i1 %is.over, label %over, label %run
 run:
   %end = add i64 %first, %chunk
-  %fits = icmp sle i64 %end, %blocks
+  %fits = icmp slt i64 %end, %claims
   %last = select i1 %fits, i64 %end, i64 %blocks
   call void %kernel(ptr %args, ptr %rets, ptr %params, ptr %scratch, i64 %first, i64 %last)
   %mine = sub i64 %last, %first
@@ -232,11 +233,17 @@ ready.to.run:
   %over = sub i64 %block, 1
   %lanes.up = add i64 %lanes, %over
   %blocks = udiv i64 %lanes.up, %block
+  ; A last block that is not full begins inside of the one before, and results are also the memory of
+  ; values in between: one thread computes both, one after the other.
+  %left = urem i64 %lanes, %block
+  %is.full = icmp eq i64 %left, 0
+  %all.but.one = sub i64 %blocks, 1
+  %claims = select i1 %is.full, i64 %blocks, i64 %all.but.one
 
   %set = load atomic i64, ptr @lanewise_threads monotonic, align 8
   %work = mul i64 %blocks, %cost
   %is.long = icmp sgt i64 %work, 100000
-  %is.many = icmp sgt i64 %blocks, 1
+  %is.many = icmp sgt i64 %claims, 1
   %may = and i1 %is.long, %is.many
   %one = icmp eq i64 %set, 1
   %not.one = xor i1 %one, true
@@ -266,8 +273,8 @@ ask.pool:
   %fewer = icmp slt i64 %set, %pool1
   %take = and i1 %is.set, %fewer
   %pool2 = select i1 %take, i64 %set, i64 %pool1
-  %few = icmp slt i64 %blocks, %pool2
-  %pool3 = select i1 %few, i64 %blocks, i64 %pool2
+  %few = icmp slt i64 %claims, %pool2
+  %pool3 = select i1 %few, i64 %claims, i64 %pool2
   %none = icmp slt i64 %pool3, 1
   %threads = select i1 %none, i64 1, i64 %pool3
   %parts = mul i64 %threads, 16
@@ -275,11 +282,12 @@ ask.pool:
   %parts.less = sub i64 %parts.up, 1
   %chunk = udiv i64 %parts.less, %parts
 
-  {addresses("job", "Job", "next done blocks chunk kernel params args rets scratch")}
+  {addresses("job", "Job", "next done blocks claims chunk kernel params args rets scratch")}
   store i64 %threads, ptr %job                 ; users: each task is one, and the caller another
   store i64 0, ptr %job.next
   store i64 0, ptr %job.done
   store i64 %blocks, ptr %job.blocks
+  store i64 %claims, ptr %job.claims
   store i64 %chunk, ptr %job.chunk
   store ptr %kernel, ptr %job.kernel
   store ptr %params, ptr %job.params

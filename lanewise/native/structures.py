@@ -26,7 +26,7 @@ STRUCTURES = {
     "XLA_FFI_DeviceMemory_Allocate XLA_FFI_DeviceMemory_Free "
     "XLA_FFI_ThreadPool_Schedule XLA_FFI_ThreadPool_NumThreads",
     # Our own: what the threads of one call share. The pointers themselves come after it.
-    "Job": "users next done blocks chunk kernel params args rets scratch",
+    "Job": "users next done blocks claims chunk kernel params args rets scratch",
 }
 """The fields of each structure ``XLA_FFI_…`` in the order of ``xla/ffi/api/c_api.h``, a file in
 `jax.ffi.include_dir()`. A field takes 8 bytes, also if it is shorter; two joined by + share them.
