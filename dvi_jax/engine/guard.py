@@ -4,7 +4,6 @@ After its end a trajectory is NaN, and so are the derivatives there. A loss that
 has the cotangent zero, and zero times NaN would be NaN.
 """
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -12,10 +11,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool
 
-from lanewise.jaxprs.jaxapi import linear_map, manual_axes, with_equal_axes
+from lanewise.jaxprs.jaxapi import (
+    broadcast_in_front,
+    has_derivative,
+    jaxpr_as_fun,
+    linear_map,
+    manual_axes,
+    primitive,
+    with_equal_axes,
+)
 from lanewise.jaxprs.traced import Trace
 
 
@@ -29,42 +35,51 @@ def constant_unless(
     """
     leaves, tree = jax.tree.flatten(args)
     trace = Trace.from_function(function, leaves, tree)
-
-    # The derivative is set to zero at the inputs: at the outputs it would be multiplied by NaN
-    # afterwards. Values are the same on both sides of each choice, which costs nothing. (A rule of
-    # its own for the derivative would be lost in second derivatives of a scan.)
-    def selection(good: Any, inputs: Any) -> list[Any]:
-        smooth, others = eqx.partition([*inputs], eqx.is_inexact_array)
-        smooth = jax.tree.map(lambda x: jnp.where(good, x, lax.stop_gradient(x)), smooth)
-        return eqx.combine(smooth, others)
-
-    def guarded(good: Any, *inputs: Any) -> list[Any]:
-        return trace(*selection(good, inputs))
+    inputs = [*trace.outer, *leaves]
 
     def result_of(outs: list[Any]) -> Any:
         return jax.tree.unflatten(trace.out_tree, outs)
 
-    inputs = [*trace.outer, *leaves]
-    if succeeds is None:
-        return result_of(guarded(good, *inputs))
-    value = jax.custom_jvp(guarded)
+    def is_good(good, outs):
+        return good if succeeds is None else good & succeeds(result_of(outs))
+
+    program = jax.make_jaxpr(lambda good, *inputs: trace(*inputs))(good, *inputs)
+    return result_of(_guarded.bind(good, *inputs, program=program, is_good=is_good))
+
+
+def _values(*operands: Array, program: Any, is_good: Callable) -> list[Array]:
+    return jaxpr_as_fun(program)(*operands)
+
+
+def _batch_rule(operands, axes, *, program: Any, is_good: Callable):
+    # The batch is formed now: in a derivative that is taken later `lax.cond` is a selection. (JAX
+    # forms the batch of a `custom_jvp` rule after it, and has no transpose of the result.)
+    size, operands = broadcast_in_front(operands, axes)
+    of_batch = jax.make_jaxpr(jax.vmap(jaxpr_as_fun(program), axis_size=size))(*operands)
+    outs = _guarded.bind(*operands, program=of_batch, is_good=jax.vmap(is_good))
+    return outs, [0] * len(outs)
+
+
+def _derivative(operands, changes: dict[int, Array], *, program: Any, is_good: Callable):
+    def where(good: Array, x: Array, other: Any) -> Array:
+        return jnp.where(jnp.expand_dims(good, range(good.ndim, x.ndim)), x, other)
 
     # Inputs without a change, such as h in most runs, need no derivative: it would take time.
-    @functools.partial(value.defjvp, symbolic_zeros=True)
-    def _(primals, tangents):
-        (good, *inputs), changes = primals, tangents[1:]
-        values = selection(good, inputs)
-        places = [i for i, x in enumerate(changes) if not isinstance(x, SymbolicZero)]
+    def of_variables(*variables):
+        new = dict(zip(changes, variables, strict=True))
+        return jaxpr_as_fun(program)(*(new.get(i, x) for i, x in enumerate(operands)))
 
-        def of_variables(*variables):
-            new = dict(zip(places, variables, strict=True))
-            return trace(*(new.get(i, x) for i, x in enumerate(values)))
+    # The derivative is set to zero at the inputs: at the outputs it would be multiplied by NaN
+    # afterwards. Second derivatives need constants at the point itself.
+    good, points = operands[0], [operands[i] for i in changes]
+    points = [where(good, x, lax.stop_gradient(x)) for x in points]
+    outs, push = jax.linearize(of_variables, *points)
+    good = is_good(good, outs)
+    return outs, push(*(where(good, change, 0) for change in changes.values()))
 
-        outs, push = jax.linearize(of_variables, *(values[i] for i in places))
-        is_good = good & succeeds(result_of(outs))
-        return outs, push(*(jnp.where(is_good, changes[i], 0) for i in places))
 
-    return result_of(value(good, *inputs))
+_guarded = primitive("constant_unless", _values, _batch_rule, multiple=True)
+has_derivative(_guarded, _derivative)
 
 
 def all_finite(values: Any) -> Bool[Array, ""]:

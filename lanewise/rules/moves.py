@@ -104,7 +104,7 @@ _ABOUT_DEVICES = frozenset(["sharding", "out_sharding"])
 # Calls of one jaxpr whose inputs and outputs are those of the equation.
 _CALL_NAMES = (
     "jit pjit closed_call core_call call_hi_primitive eval_jaxpr custom_jvp_call custom_vjp_call "
-    "custom_vjp_call_jaxpr implicit_root with_derivative checkpoint remat remat2"
+    "custom_vjp_call_jaxpr implicit_root with_derivative constant_unless checkpoint remat remat2"
 )
 CALLS = frozenset(_CALL_NAMES.split())
 
