@@ -14,7 +14,7 @@ from jax.custom_derivatives import SymbolicZero
 import lanewise
 from lanewise import Layout
 from lanewise.jaxprs.jaxapi import is_traced, manual_axes
-from lanewise.linear_map import LinearMap
+from lanewise.linear_map import LinearMap, with_change
 
 from ..base.checks import instance, positive, whole as check_whole
 from ..engine.pairs import rounded
@@ -112,16 +112,24 @@ class Reversible(AbstractAdjoint):
         @functools.partial(trajectory.defjvp, symbolic_zeros=True)
         def tangent(primals, tangents):
             (inputs, counts), (change, _) = primals, tangents
-            smooth, trace = trajectory(inputs, counts)
             # Inputs with a tangent of zero are constants: no derivative is computed for them.
             is_variable = jax.tree.map(lambda x: not isinstance(x, SymbolicZero), change)
             variables, constants = eqx.partition(inputs, is_variable)
 
-            def push(variables, constants, counts, change):
-                def smooth_outputs(variables):
-                    return forward(eqx.combine(variables, constants), counts)[0]
+            def value(point):
+                return trajectory(eqx.combine(*point[:2]), point[2])
 
-                return jax.jvp(smooth_outputs, (variables,), (change,))[1]
+            def together(variables, constants, counts, change):
+                def of_variables(variables):
+                    return forward(eqx.combine(variables, constants), counts)
+
+                smooth, of_smooth, tape = jax.jvp(
+                    of_variables, (variables,), (change,), has_aux=True
+                )
+                return (smooth, tape), of_smooth
+
+            def push(*point_and_change):
+                return together(*point_and_change)[1]
 
             def pull(variables, constants, counts, record, cotangent):
                 theta, q0, p0 = eqx.combine(variables, constants)
@@ -132,9 +140,14 @@ class Reversible(AbstractAdjoint):
                 return eqx.filter(tuple(reverse_pass.run((q0, p0), rows, tail)), is_variable)
 
             derivative = LinearMap(push, pull, layout)
-            point = variables, constants, counts
-            change = derivative(point, trace.record(), eqx.filter(change, is_variable))
-            return (smooth, trace), (change, jax.tree.map(_no_tangent, trace))
+            (smooth, tape), of_smooth = with_change(
+                value,
+                lambda point, ends, x: derivative(point, ends[1].record(), x),
+                lambda point, x: lanewise.call(together, *point, x, layout=layout),
+                (variables, constants, counts),
+                eqx.filter(change, is_variable),
+            )
+            return (smooth, tape), (of_smooth, jax.tree.map(_no_tangent, tape))
 
         smooth, trace = trajectory(inputs, counts)
         # In the forward pass: a reverse pass cannot return a number besides the cotangents.

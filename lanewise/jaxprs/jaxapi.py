@@ -14,7 +14,9 @@ from jax.extend.core import (
     Primitive,
     jaxpr_as_fun as jaxpr_as_fun,
     jaxprs_in_params as jaxprs_in_params,
+    set_current_trace,
 )
+from jax.extend.core.primitives import closed_call_p
 from jax.extend.random import threefry2x32_p as _threefry2x32
 from jax.interpreters import ad, batching, mlir, partial_eval
 from jax.sharding import NamedSharding, PartitionSpec
@@ -217,6 +219,35 @@ def has_derivative(operation: Primitive, rule: Callable) -> None:
         return outs, [zero if tangent is None else tangent for zero, tangent in pairs]
 
     ad.primitive_jvps[operation] = outputs_and_tangents
+
+
+def is_split(operation: Primitive, apart: Callable, values: Callable) -> None:
+    """Have reverse mode compute a primitive in two parts where its last operands, vectors, are not
+    known yet: ``values(**params)`` → the jaxpr of the first outputs, a function of the first
+    operands alone; ``apart(*operands, **params)`` computes everything in two parts."""
+
+    def split(trace, *tracers, **params):
+        if all(tracer.is_known() for tracer in tracers):
+            return trace.default_process_primitive(operation, tracers, params)
+        with set_current_trace(trace):
+            return apart(*tracers, **params)
+
+    def split_equation(_, unknown, available, eqn):
+        function, outs = values(**eqn.params), eqn.outvars
+        count, number = len(function.in_avals), len(function.out_avals)
+        residuals = [x for x, is_there in zip(eqn.invars, available, strict=True) if not is_there]
+        yes, no = [True] * len(outs), [False] * len(outs)
+        if any(unknown[:count]):
+            return None, eqn, yes, yes, residuals
+        if not any(unknown):
+            return eqn, eqn, no, yes, residuals
+        part = {"primitive": closed_call_p, "params": {"call_jaxpr": function}}
+        known = eqn.replace(invars=eqn.invars[:count], outvars=outs[:number], **part)
+        # In the reverse pass the equation is computed again, as a checkpoint asks for.
+        return known, eqn, [*no[:number], *yes[number:]], yes, residuals
+
+    partial_eval.custom_partial_eval_rules[operation] = split
+    partial_eval.partial_eval_jaxpr_custom_rules[operation] = split_equation
 
 
 def without_outputs(function: ClosedJaxpr, flags: list[bool]) -> ClosedJaxpr:

@@ -233,8 +233,8 @@ ready.to.run:
   %over = sub i64 %block, 1
   %lanes.up = add i64 %lanes, %over
   %blocks = udiv i64 %lanes.up, %block
-  ; A last block that is not full begins inside of the one before, and results are also the memory of
-  ; values in between: one thread computes both, one after the other.
+  ; A last block that is not full begins inside of the one before, and results are also the memory
+  ; of values in between: one thread computes both, one after the other.
   %left = urem i64 %lanes, %block
   %is.full = icmp eq i64 %left, 0
   %all.but.one = sub i64 %blocks, 1
