@@ -38,9 +38,9 @@ PACKAGES = ("dvi_jax", "lanewise", "dvi_jax_cli")
 LONGEST_FILE, MOST_PARAMETERS = 450, 9
 
 LIMITS: dict[str, float] = {
-    "lines of the core": 14_370,
+    "lines of the core": 14_375,
     "lines of the questions": 21_910,
-    "lines of the leaves": 20_910,
+    "lines of the leaves": 20_930,
     "lines of lanewise": 11_400,
     "lines of the command line": 5_650,
     "raise statements": 660,

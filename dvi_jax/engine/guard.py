@@ -43,6 +43,8 @@ def constant_unless(
     def is_good(good, outs):
         return good if succeeds is None else good & succeeds(result_of(outs))
 
+    # A primitive of its own: loops and checkpoints lose the rule of a `custom_jvp` when they split
+    # a program, in second derivatives too.
     program = jax.make_jaxpr(lambda good, *inputs: trace(*inputs))(good, *inputs)
     return result_of(_guarded.bind(good, *inputs, program=program, is_good=is_good))
 

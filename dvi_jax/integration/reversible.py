@@ -116,10 +116,12 @@ class Reversible(AbstractAdjoint):
             is_variable = jax.tree.map(lambda x: not isinstance(x, SymbolicZero), change)
             variables, constants = eqx.partition(inputs, is_variable)
 
+            # With this rule, which second derivatives need again.
             def value(point):
                 return trajectory(eqx.combine(*point[:2]), point[2])
 
-            def together(variables, constants, counts, change):
+            # In forward mode the values and their change come from one loop.
+            def pair(variables, constants, counts, change):
                 def of_variables(variables):
                     return forward(eqx.combine(variables, constants), counts)
 
@@ -129,7 +131,7 @@ class Reversible(AbstractAdjoint):
                 return (smooth, tape), of_smooth
 
             def push(*point_and_change):
-                return together(*point_and_change)[1]
+                return pair(*point_and_change)[1]
 
             def pull(variables, constants, counts, record, cotangent):
                 theta, q0, p0 = eqx.combine(variables, constants)
@@ -143,7 +145,7 @@ class Reversible(AbstractAdjoint):
             (smooth, tape), of_smooth = with_change(
                 value,
                 lambda point, ends, x: derivative(point, ends[1].record(), x),
-                lambda point, x: lanewise.call(together, *point, x, layout=layout),
+                lambda point, x: lanewise.call(pair, *point, x, layout=layout),
                 (variables, constants, counts),
                 eqx.filter(change, is_variable),
             )

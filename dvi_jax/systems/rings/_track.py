@@ -13,6 +13,7 @@ from jaxtyping import Array
 
 import lanewise
 from lanewise.jaxprs.jaxapi import linear_map
+from lanewise.linear_map import with_change
 
 from ...base.checks import instance, whole
 from ...base.machine import results_memory
@@ -137,31 +138,37 @@ def _track(ring: Ring, z: Array, epsilon: Array, counts: tuple[int, int, int]):
 
     @functools.partial(states_and_losses.defjvp, symbolic_zeros=True)
     def _(primals, tangents):
-        states, losses = states_and_losses(*primals)
         moves = jax.tree.map(lambda x: not isinstance(x, SymbolicZero), tangents)
-        change = jax.tree.map(
-            lambda t, x, flag: t if flag else jnp.zeros_like(x), tangents, primals, moves
-        )
+        pairs = tangents, primals
+        change = jax.tree.map(lambda t, x, flag: t if flag else jnp.zeros_like(x), *pairs, moves)
 
-        def derivative(numbers, primals, change):
-            return jax.jvp(lambda *primals: forward(numbers, *primals)[0], primals, change)[1]
+        def of_particle(numbers, primals, change):
+            line = functools.partial(forward, numbers)
+            states, slopes, losses = jax.jvp(line, primals, change, has_aux=True)
+            return (states, losses), slopes
 
         axes = (None, (None, 0, 0), (None, 0, 0))
 
-        def push(residuals, change):
-            batch = jax.vmap(functools.partial(lanewise.call, derivative), axes)
-            return batch(passage.numbers, residuals[0], change)
+        def pair(primals, change):
+            batch = jax.vmap(functools.partial(lanewise.call, of_particle), axes)
+            return batch(passage.numbers, primals, change)
 
         def definition(residuals, change):  # machine code has no transpose
-            return jax.vmap(derivative, axes)(passage.numbers, residuals[0], change)
+            return jax.vmap(of_particle, axes)(passage.numbers, residuals[0], change)[1]
 
         def pull(residuals, cotangent):
             primals, states = residuals
             return _pull(passage, primals, states, cotangent, counts, moves)
 
-        slopes_of_states = linear_map(push, pull, definition, (primals, states), change)
+        (states, losses), slopes = with_change(
+            lambda primals: states_and_losses(*primals),
+            lambda primals, ends, x: linear_map(
+                lambda point, x: pair(point[0], x)[1], pull, definition, (primals, ends[0]), x
+            ),
+            *(pair, primals, change),
+        )
         none = [np.zeros(x.shape, jax.dtypes.float0) for x in losses[:2]]
-        return (states, losses), (slopes_of_states, (*none, jnp.zeros_like(losses[2])))
+        return (states, losses), (slopes, (*none, jnp.zeros_like(losses[2])))
 
     states, losses = states_and_losses((passage.rows, passage.slopes), z, epsilon)
     return states, *losses
