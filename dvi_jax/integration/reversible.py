@@ -130,6 +130,7 @@ class Reversible(AbstractAdjoint):
                 )
                 return (smooth, tape), of_smooth
 
+            # L alone, where the values are known already: in second derivatives.
             def push(*point_and_change):
                 return pair(*point_and_change)[1]
 
