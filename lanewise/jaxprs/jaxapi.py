@@ -243,7 +243,7 @@ def is_split(operation: Primitive, apart: Callable, values: Callable) -> None:
             return eqn, eqn, no, yes, residuals
         part = {"primitive": closed_call_p, "params": {"call_jaxpr": function}}
         known = eqn.replace(invars=eqn.invars[:count], outvars=outs[:number], **part)
-        # In the reverse pass the equation is computed again, as a checkpoint asks for.
+        # In the reverse pass the equation is computed again, as in a checkpoint.
         return known, eqn, [*no[:number], *yes[number:]], yes, residuals
 
     partial_eval.custom_partial_eval_rules[operation] = split
