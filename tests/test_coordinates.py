@@ -1,5 +1,7 @@
 """Methods that compute in coordinates of their own: the run stays in them, whatever is observed."""
 
+import time
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -161,6 +163,57 @@ def test_gradients_of_observed_runs(adjoint):
     f = jax.jit(loss)
     expected = (f(1.0001e-3) - f(0.9999e-3)) / 2e-7
     np.testing.assert_allclose(jax.jit(jax.grad(loss))(1e-3), expected, rtol=1e-6)
+
+
+def driven(t0, t1, q0, p1, args):
+    return 1e-3 * jnp.cos(3 * t0) * jnp.sum(q0[1:] ** 2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("max_defect", [None, 1e-30], ids=["by inverse steps", "computed again"])
+def test_gradients_with_a_corrector(max_defect):
+    """With saved states and a time-dependent perturbation; a neighbour in the batch fails."""
+    system = dvi.System(THREE.system.H_D, perturbation=driven)
+
+    def losses(scale, mass):
+        args = {**THREE.args, "masses": THREE.args["masses"] * jnp.stack([1.0, mass, 1.0])}
+        sol = jax.vmap(
+            lambda scale: dvi.integrate(
+                system, scale * THREE.q0, mass * THREE.p0, args=args, h=0.3, num_steps=10,
+                method=dvi.WisdomHolman(corrector=3), save=dvi.Save(every=5), throw=False,
+                epsilon=0.5, adjoint=dvi.Reversible(max_defect=max_defect),
+            )
+        )(scale)  # fmt: skip
+        ok = sol.result == dvi.RESULTS.successful
+        each = jnp.sum(sol.qs[:, 1] * sol.ps[:, 2], (1, 2)) + jnp.sum(sol.qs[:, -1] ** 2, (1, 2))
+        return jnp.sum(jnp.where(ok, each, 0.0))
+
+    point, f = (jnp.array([1.0, jnp.nan]), 1.0), jax.jit(losses)
+    of_scale, of_mass = jax.jit(jax.grad(losses, (0, 1)))(*point)
+    for i, slope in enumerate((of_scale[0], of_mass)):
+        ends = [f(point[0] + s * (i == 0), point[1] + s * (i == 1)) for s in (1e-5, -1e-5)]
+        np.testing.assert_allclose(slope, (ends[0] - ends[1]) / 2e-5, rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_a_gradient_corrects_the_ends_and_not_each_step():
+    """With the corrector in each step backwards it would take 14 times as long."""
+
+    def seconds(method):
+        def loss(q0):
+            run = {"h": 0.3, "num_steps": 2000, "method": method, "save": dvi.Save(final=True)}
+            return jnp.sum(dvi.integrate(THREE.system, q0, THREE.p0, args=THREE.args, **run).qs)
+
+        gradient = jax.jit(jax.grad(loss))
+        gradient(THREE.q0).block_until_ready()
+        times = []
+        for _ in range(5):
+            start = time.perf_counter()
+            gradient(THREE.q0).block_until_ready()
+            times.append(time.perf_counter() - start)
+        return min(times)
+
+    assert seconds(dvi.WisdomHolman(corrector=3)) < 2.5 * seconds(dvi.WisdomHolman())
 
 
 @pytest.mark.slow

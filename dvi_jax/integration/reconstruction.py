@@ -11,6 +11,9 @@ from jaxtyping import Array
 
 from ..base.results import RESULTS
 from ..base.types import State
+from ..lattices import Uniform
+from ..methods import Method
+from ..methods._base import Coordinates
 from .task import Plan, Rows, Task, piece_length
 
 # Steps back between two updates of the sizes of the components, relative to which differences are
@@ -82,6 +85,37 @@ class Reconstruction(eqx.Module):
     spacing: int = eqx.field(static=True)
     tolerance: float = eqx.field(static=True)
 
+    def coordinates(self, task: Task, k: Any, q: State) -> Coordinates | None:
+        """Those of the method in step k; None: (q, p), also where functions read all states."""
+        # A function of the user receives (q, p), which would be a conversion in each step.
+        is_read = any(task.observables()) or type(task.lattice) is not Uniform
+        if is_read or not task.arithmetic.is_plain:
+            return None
+        return task.method.in_equal_steps(task.equations, task.interval(k), q)
+
+    def method(self, task: Task, k: Any, q: State) -> Method:
+        """The method of the steps between the ends of an arc."""
+        coordinates = self.coordinates(task, k, q)
+        return task.method if coordinates is None else coordinates.method
+
+    def conversion(self, direction: str, task: Task, k: Any, point: Point) -> Point:
+        """A state in the coordinates of the method ("enter"), or one there in (q, p) ("leave")."""
+        coordinates = self.coordinates(task, k, point[0])
+        if coordinates is None:
+            return point
+        # These maps are undone by the next arc: what they report is known from the run.
+        return getattr(coordinates, direction)(task.equations, task.interval(k), *point)[:2]
+
+    def ends(self, arc: Arc) -> tuple[Any, Any]:
+        """The steps in which the ends of an arc are converted, as the loop does at save points."""
+        return jnp.maximum(arc.first - 1, 0), arc.first + (arc.size - 1)
+
+    def inner_arc(self, arc: Arc) -> Arc:
+        """The arc with its ends in the coordinates of the method."""
+        points = zip(self.ends(arc), (arc.start, arc.end), strict=True)
+        start, end = (self.conversion("enter", self.task, k, point) for k, point in points)
+        return arc._replace(start=start, end=end)
+
     def starts(self, start: Point, rows: Rows) -> Point:
         """The states at the beginning of each block and of the tail: saved ones, thus exact."""
         return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, (rows.q, rows.p))
@@ -115,7 +149,8 @@ class Reconstruction(eqx.Module):
             k, state, sums, is_solved = carry
             # Without the memory of the arithmetic, whose effect is below the accepted difference.
             interval = task.interval(k)
-            q, p, info = task.method.inverse(task.equations_at(k, interval), interval, *state)
+            method = self.method(task, k, state[0])
+            q, p, info = method.inverse(task.equations_at(k, interval), interval, *state)
             sums = visit(sums, k, (q, p), state)
             return (k - 1, (q, p), sums, is_solved & (info.result == RESULTS.successful)), None
 
@@ -145,7 +180,7 @@ class Reconstruction(eqx.Module):
         plan, starts = self.plan, self.starts(start, rows)
 
         def of_arc(worst, arc):
-            _, defects, is_solved = self.steps_by_inverse(arc)
+            _, defects, is_solved = self.steps_by_inverse(self.inner_arc(arc))
             defect = jnp.max(defects, initial=0.0)
             return jnp.maximum(worst, jnp.where(is_solved, defect, jnp.inf))
 

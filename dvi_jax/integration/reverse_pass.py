@@ -102,7 +102,7 @@ class ReversePass(eqx.Module):
         is_root = task.method.is_the_map and task.arithmetic.is_plain
         solver = KnownRoot(p1.ravel(), newton) if is_root else newton
         equations = dataclasses.replace(task.equations_at(k, interval), newton=solver)
-        q1, p1, _ = task.method.step(equations, interval, q0, p0)
+        q1, p1, _ = self.states.method(task, k, q0).step(equations, interval, q0, p0)
         step = Ends(interval.t0, interval.t1, q0, p0, q1, p1)
         # As in the loop, a value that is not finite is a constant.
         value_of = functools.partial(constant_unless, all_finite(step), succeeds=all_finite)
@@ -124,6 +124,29 @@ class ReversePass(eqx.Module):
     def steps(self, cotangents: Cotangents, arc: Arc, save: SavePoint) -> Cotangents:
         """The steps of an arc, backwards from its end by inverse steps. Where these miss its start,
         by the steps from there."""
+        inner, (first, last) = self.states.inner_arc(arc), self.states.ends(arc)
+        cotangents = self.conversion("leave", last, inner.end, cotangents)
+        cotangents = self.steps_inside(cotangents, inner, save)
+        return self.conversion("enter", first, arc.start, cotangents)
+
+    def conversion(
+        self, direction: str, k: Any, point: Point, cotangents: Cotangents
+    ) -> Cotangents:
+        """The cotangents before a conversion of the point, from those after it."""
+        if self.states.coordinates(self.states.task, k, point[0]) is None:
+            return cotangents
+        _, pull = jax.vjp(
+            lambda theta, *x: self.states.conversion(direction, self.task(theta), k, x),
+            *(self.theta, *point),
+        )
+        of_theta, q, p = pull((cotangents.q, cotangents.p))
+        # A state after a failure is a constant, NaN, as in `transport`.
+        good = all_finite(point)
+        of_theta, q, p = jax.tree.map(lambda x: jnp.where(good, x, 0), (of_theta, q, p))
+        return Cotangents(jax.tree.map(jnp.add, cotangents.theta, of_theta), q, p)
+
+    def steps_inside(self, cotangents: Cotangents, arc: Arc, save: SavePoint) -> Cotangents:
+        """The same in the coordinates of the method."""
 
         def transport(cotangents, k, start, end):
             return self.transport(cotangents, k, start, end, save)
@@ -147,8 +170,8 @@ class ReversePass(eqx.Module):
 
         def forward(carry, _):
             k, state = carry
-            interval = task.interval(k)
-            q, p, _ = task.method.step(task.equations_at(k, interval), interval, *state)
+            interval, method = task.interval(k), self.states.method(task, k, state[0])
+            q, p, _ = method.step(task.equations_at(k, interval), interval, *state)
             return (k + 1, (q, p)), state
 
         def backward(carry, start):

@@ -71,6 +71,12 @@ class Method(eqx.Module):
         """The method in the coordinates that it computes in; None: (q, p)."""
         return None
 
+    def in_equal_steps(
+        self, equations: Equations, interval: Interval, q: State
+    ) -> "Coordinates | None":
+        """The same for steps of one length, without what two neighbours undo."""
+        return self.in_coordinates(equations, interval, q)
+
     def check(
         self, equations: Equations, first_interval: Callable[[], Interval], q: State, p: State
     ) -> None:

@@ -80,6 +80,11 @@ class SplittingMethod(Method):
     is_symplectic: ClassVar[bool] = True
     is_invertible: ClassVar[bool] = True
 
+    @property
+    def has_corrector(self) -> bool:
+        """Whether `correct` changes a state."""
+        return False
+
     @abc.abstractmethod
     def parts(self, equations: Equations, interval: Interval, q: State) -> list[PartFlow]:
         """The flow of each part. **Raises** for a system that has no such parts."""
@@ -167,6 +172,18 @@ class SplittingMethod(Method):
             return None
         return Coordinates(self.enter, _InCoordinates(self), self.leave)
 
+    def in_equal_steps(self, equations, interval, q):
+        coordinates = self.in_coordinates(equations, interval, q)
+        if coordinates is None or not self.has_corrector:
+            return coordinates
+        # C⁻¹ S C, n times, is C⁻¹ Sⁿ C.
+        first, last = (functools.partial(self.correct, sign=sign) for sign in (1, -1))
+        return Coordinates(
+            lambda *state: _in_turn(*state, self.enter, first),
+            _InCoordinates(self, corrects=False),
+            lambda *state: _in_turn(*state, last, self.leave),
+        )
+
     def needs_no_solve(self, equations, interval, q) -> bool:
         return all(part.is_exact for part in self.parts(equations, interval, q))
 
@@ -208,6 +225,7 @@ class _InCoordinates(Method):
     """A method without the conversions to the coordinates of its parts and back."""
 
     method: SplittingMethod
+    corrects: bool = eqx.field(static=True, default=True)
 
     is_invertible: ClassVar[bool] = True
 
@@ -238,8 +256,10 @@ class _InCoordinates(Method):
         return self._corrected(equations, interval, reverse, q1, p1)
 
     def _corrected(self, equations, interval, stages, q, p) -> StateAndInfo:
-        before, after = (functools.partial(self.method.correct, sign=sign) for sign in (1, -1))
         compose = functools.partial(self.method.compose, stages=stages)
+        if not self.corrects:
+            return compose(equations, interval, q, p)
+        before, after = (functools.partial(self.method.correct, sign=sign) for sign in (1, -1))
         return _in_turn(equations, interval, q, p, before, compose, after)
 
 

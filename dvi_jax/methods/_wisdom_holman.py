@@ -302,6 +302,10 @@ class WisdomHolman(SplittingMethod):
         x, v = frame.to_bodies(q), frame.velocities_back(p)
         return x, frame.masses[:, None] * v, no_step_yet(q)
 
+    @property
+    def has_corrector(self) -> bool:
+        return self.corrector > 0
+
     def correct(self, equations, interval, q, p, sign):
         if not self.corrector:
             return super().correct(equations, interval, q, p, sign)

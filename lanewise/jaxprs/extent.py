@@ -35,9 +35,19 @@ MOST_IN_PAIRS = 150_000
 takes minutes to run."""
 
 
+FOR_AN_EQUATION = 8
+"""Operations that are compiled in the time that XLA takes for one equation, about a millisecond."""
+
+
 def most_operations(jaxpr: Any) -> int:
     """The largest number of operations of a function for which code is generated."""
-    return MOST_IN_PAIRS if _has_exact_products(jaxpr) else MOST_OPERATIONS
+    limit = MOST_IN_PAIRS if _has_exact_products(jaxpr) else MOST_OPERATIONS
+    return max(limit, FOR_AN_EQUATION * _equation_count(jaxpr))
+
+
+def _equation_count(jaxpr: Any) -> int:
+    inner = (_equation_count(function.jaxpr) for eqn in jaxpr.eqns for function in _evaluated(eqn))
+    return len(jaxpr.eqns) + sum(inner)
 
 
 def _has_exact_products(jaxpr: Any) -> bool:
