@@ -184,9 +184,9 @@ def test_gradients_with_a_corrector(max_defect):
                 epsilon=0.5, adjoint=dvi.Reversible(max_defect=max_defect),
             )
         )(scale)  # fmt: skip
-        ok = sol.result == dvi.RESULTS.successful
-        each = jnp.sum(sol.qs[:, 1] * sol.ps[:, 2], (1, 2)) + jnp.sum(sol.qs[:, -1] ** 2, (1, 2))
-        return jnp.sum(jnp.where(ok, each, 0.0))
+        ok = (sol.result == dvi.RESULTS.successful)[:, None, None, None]
+        qs, ps = jnp.where(ok, sol.qs, 0.0), jnp.where(ok, sol.ps, 0.0)
+        return jnp.sum(qs[:, 1] * ps[:, 2]) + jnp.sum(qs[:, -1] ** 2)
 
     point, f = (jnp.array([1.0, jnp.nan]), 1.0), jax.jit(losses)
     of_scale, of_mass = jax.jit(jax.grad(losses, (0, 1)))(*point)
