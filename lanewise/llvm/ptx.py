@@ -1,7 +1,12 @@
 """LLVM IR to PTX, the assembler's language of NVIDIA GPUs, which the driver compiles further."""
 
 import dataclasses
+import importlib.util
 import re
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
 from typing import Any
 
 from ..native import cache, machine
@@ -99,3 +104,40 @@ def _with_bounds(text: str) -> str:
 def local_bytes(text: str) -> int:
     """Bytes of memory that the functions of a module reserve for a thread."""
     return sum(map(int, re.findall(r"\.local\b.*\b__local_depot\w*\[(\d+)\]", text)))
+
+
+def occupancy(registers: int, architecture: int) -> float:
+    """The fraction of the warps of a multiprocessor that can run at once."""
+    most = 64 if architecture in (80, 90, 100) else 48
+    of_block = threads_for(registers) // 32
+    of_warp = 32 * (-(-registers // 8) * 8)  # 65 536 registers are given out by eights
+    return min(65_536 // of_warp // of_block * of_block, most) / most
+
+
+def ptxas() -> str | None:
+    """The assembler of CUDA, from the path or from its package, None if it is not installed."""
+    packages = importlib.util.find_spec("nvidia")
+    places = packages.submodule_search_locations if packages else None
+    folders = [path for place in places or () for path in Path(place).glob("*/bin")]
+    return shutil.which("ptxas") or next(
+        (name for folder in folders if (name := shutil.which("ptxas", path=str(folder)))), None
+    )
+
+
+def report_of_ptxas(text: str, architecture: int) -> str | None:
+    """What CUDA's assembler says about a kernel: registers, stack and spills; None without it."""
+    program = ptxas()
+    if program is None:
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        source = Path(folder) / "kernel.ptx"
+        source.write_text(text)
+        options = f"-arch=sm_{architecture}", "-v", "-O3", "-o", str(source.with_suffix(".cubin"))
+        command = [program, *options, str(source)]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stderr
+
+
+def registers_of(text: str, architecture: int) -> int | None:
+    """Registers of a thread, None where CUDA's assembler is not installed."""
+    match = re.search(r"Used (\d+) registers", report_of_ptxas(text, architecture) or "")
+    return int(match[1]) if match else None

@@ -4,10 +4,12 @@ The numbers and operations are those of `numbers` for vectors of one element and
 trajectory, so that results have the same bits; only what surrounds them differs.
 """
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import numpy as np
 
 from ..evaluator import Evaluator
@@ -15,8 +17,16 @@ from ..jaxprs.extent import has_long_arrays, operation_count
 from ..jaxprs.jaxapi import ClosedJaxpr
 from ..llvm.ir import Num, check_size, check_that, check_type
 from ..llvm.memory import Buffer, contiguous, stored_type
-from ..llvm.ptx import THREADS, PtxKernel as PtxKernel, local_bytes, ptx_text
+from ..llvm.ptx import (
+    ARCHITECTURES,
+    THREADS,
+    PtxKernel as PtxKernel,
+    architecture_for,
+    local_bytes,
+    ptx_text,
+)
 from ..module import Module
+from ..native import cache
 from .numbers import array_at, lane_stride, operand_value
 from .target import Code
 
@@ -132,8 +142,22 @@ def kernel_text(module: ThreadModule, operands: int, results: int) -> str:
     return "\n".join(lines)
 
 
+@dataclasses.dataclass(frozen=True)
+class ThreadCode(Code):
+    """The kernel of a GPU, with how many operands and results it has."""
+
+    pointers: tuple[int, int] = (0, 0)
+
+    @property
+    def module(self) -> str:
+        return self.text  # its handler calls the driver, and is the same for all kernels
+
+
+@dataclasses.dataclass(frozen=True)
 class Threads:
-    """One thread for each trajectory."""
+    """One thread for each trajectory, for an architecture or for the GPUs of this process."""
+
+    architecture: int | None = None
 
     name = "threads"
 
@@ -142,8 +166,9 @@ class Threads:
 
     def write(
         self, function: ClosedJaxpr, lane_flags: Sequence[bool], lanes: int, width: int | None
-    ) -> Code:
+    ) -> ThreadCode:
         jaxpr = function.jaxpr
+        self._known_architecture()
         count = operation_count(jaxpr)
         check_size(count, MOST_OPERATIONS, "the number of operations of a GPU thread")
         check_that(not has_long_arrays(jaxpr), "arrays of a loop are too long for a GPU thread")
@@ -151,9 +176,44 @@ class Threads:
         text = function_text(module, function, lane_flags)
         # LLVM has no exact code of this instruction for GPUs.
         check_that(" = frem " not in text, "the remainder of floats is not exact on a GPU")
-        text += kernel_text(module, len(jaxpr.invars), len(jaxpr.outvars))
+        pointers = len(jaxpr.invars), len(jaxpr.outvars)
+        text += kernel_text(module, *pointers)
         values, operations = tuple(module.values), module.b.operations
-        return Code(text, THREADS, values, (), operations, module.scratch_bytes)
+        scratch = module.scratch_bytes
+        return ThreadCode(text, THREADS, values, (), operations, scratch, pointers=pointers)
+
+    def _known_architecture(self) -> int:
+        if self.architecture is not None:
+            return self.architecture
+        capability = least_capability()
+        architecture = architecture_for(capability)
+        check_that(architecture is not None, f"the GPU is too old: sm_{capability}, not sm_80")
+        assert architecture is not None
+        return architecture
+
+    def kernel(self, code: Code) -> PtxKernel:
+        """The PTX of some code, and what a launch needs."""
+        assert isinstance(code, ThreadCode)
+        architecture = self._known_architecture()
+        text = ptx_text(code.text, architecture)
+        sizes = THREADS, local_bytes(text), code.operations
+        return PtxKernel(text, NAME, *code.pointers, code.values, *sizes, architecture)
+
+    def register(self, code: Code) -> str:
+        return f"lanewise_cuda_{cache.key(self.kernel(code).text)[:32]}"
+
+    def assembly(self, code: Code) -> str:
+        return self.kernel(code).text
+
+
+def least_capability() -> int:
+    """Ten times the compute capability of the oldest GPU of this process, which has code that all
+    of them run; without a GPU the least one that is supported."""
+    try:
+        devices = jax.devices("cuda")
+    except RuntimeError:  # code is made for another machine
+        return min(ARCHITECTURES)
+    return min(round(10 * float(device.compute_capability)) for device in devices)
 
 
 def ptx_of(function: ClosedJaxpr, lane_flags: Sequence[bool], architecture: int) -> PtxKernel:
@@ -162,16 +222,5 @@ def ptx_of(function: ClosedJaxpr, lane_flags: Sequence[bool], architecture: int)
 
     **Raises** `NotCompilable` with the reason if no code can be generated.
     """
-    code = Threads().write(function, lane_flags, 1, None)
-    text = ptx_text(code.text, architecture)
-    return PtxKernel(
-        text,
-        NAME,
-        len(function.jaxpr.invars),
-        len(function.jaxpr.outvars),
-        code.values,
-        THREADS,
-        local_bytes(text),
-        code.operations,
-        architecture,
-    )
+    target = Threads(architecture)
+    return target.kernel(target.write(function, lane_flags, 1, None))
