@@ -9,6 +9,7 @@ import ctypes
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import partialmethod
 from typing import Any
 
 import numpy as np
@@ -167,7 +168,7 @@ class Function:
         operands = [x.strip() for x in re.split(r",(?![^({\[]*[)}\]])", rest) if x.strip()]
         name, *parts = word.split(".")
         self.module.counts[word] += 1
-        assert not {"ftz", "approx", "full", "sat", "relu"} & {*parts}, text
+        assert not {"ftz", "approx", "full", "sat", "cc"} & {*parts}, text
         if parts and parts[-1] in FLOATS and name in ROUNDED:
             assert "rn" in parts, text
         if name == "bra":
@@ -197,63 +198,44 @@ class Function:
         values = [self.read_float(y, f) for y in x[1:]]
         self.write_float(x[0], function(FLOATS[f][0], *values), f)
 
-    def _arithmetic(self, parts: list[str], x: list[str], of_floats: str, of_integers: str):
+    def _arithmetic(self, of_floats: str, of_integers: str, parts: list[str], x: list[str]) -> None:
         if parts[-1] in FLOATS:
             write = lambda kind, a, b: self.new(f"{of_floats} {kind} {a}, {b}")  # noqa: E731
             return self._of_floats(parts[-1], x, write)
         kind, (a, b) = self._values(parts, x)
         return self.write(x[0], self.new(f"{of_integers} {kind} {a}, {b}"), kind)
 
-    def do_add(self, parts: list[str], x: list[str]) -> None:
-        assert "cc" not in parts
-        self._arithmetic(parts, x, "fadd", "add")
-
-    def do_sub(self, parts: list[str], x: list[str]) -> None:
-        assert "cc" not in parts
-        self._arithmetic(parts, x, "fsub", "sub")
+    do_add = partialmethod(_arithmetic, "fadd", "add")
+    do_sub = partialmethod(_arithmetic, "fsub", "sub")
 
     def do_div(self, parts: list[str], x: list[str]) -> None:
-        self._arithmetic(parts, x, "fdiv", f"{parts[-1][0]}div")
+        self._arithmetic("fdiv", f"{parts[-1][0]}div", parts, x)
 
     def do_rem(self, parts: list[str], x: list[str]) -> None:
-        assert parts[-1] not in FLOATS
-        self._arithmetic(parts, x, "", f"{parts[-1][0]}rem")
-
-    def _wide_product(self, parts: list[str], x: list[str]) -> tuple[str, str]:
-        kind, (a, b) = self._values(parts, x)
-        wide, word = f"i{2 * bits_of(kind)}", "sext" if parts[-1][0] == "s" else "zext"
-        a, b = (self.resized(y, kind, wide, word) for y in (a, b))
-        return wide, self.new(f"mul {wide} {a}, {b}")
+        assert parts[-1] not in FLOATS  # there is no such instruction
+        self._arithmetic("", f"{parts[-1][0]}rem", parts, x)
 
     def do_mul(self, parts: list[str], x: list[str]) -> None:
         if parts[0] not in ("wide", "hi"):
-            return self._arithmetic(parts, x, "fmul", "mul")
-        wide, product = self._wide_product(parts, x)
-        if parts[0] == "wide":
-            return self.write(x[0], product, wide)
-        kind = integer_type(parts[-1])
-        high = self.new(f"lshr {wide} {product}, {bits_of(kind)}")
-        return self.write(x[0], self.resized(high, wide, kind), kind)
+            return self._arithmetic("fmul", "mul", parts, x)
+        kind, values = self._values(parts, x)
+        wide, word = f"i{2 * bits_of(kind)}", "sext" if parts[-1][0] == "s" else "zext"
+        a, b = (self.resized(y, kind, wide, word) for y in values)
+        product = self.new(f"mul {wide} {a}, {b}")
+        if parts[0] == "hi":
+            product = self.new(f"lshr {wide} {product}, {bits_of(kind)}")
+        return self.write(x[0], product, wide)
 
     def do_mad(self, parts: list[str], x: list[str]) -> None:
-        if parts[0] == "wide":
-            kind, product = self._wide_product(parts, x[:3])
-            third = self.read(x[3], kind)
-        else:
-            assert parts[0] == "lo", parts
-            kind, (a, b, third) = self._values(parts, x)
-            product = self.new(f"mul {kind} {a}, {b}")
-        self.write(x[0], self.new(f"add {kind} {product}, {third}"), kind)
+        assert parts[0] == "lo", parts
+        kind, (a, b, c) = self._values(parts, x)
+        self.write(x[0], self.new(f"add {kind} {self.new(f'mul {kind} {a}, {b}')}, {c}"), kind)
 
     def _intrinsic(self, name: str, parts: list[str], x: list[str]) -> None:
         f = parts[-1]
         self._of_floats(f, x, lambda kind, *values: self.call(name, kind, values, f))
 
-    def do_fma(self, parts: list[str], x: list[str]) -> None:
-        self._intrinsic("fma", parts, x)
-
-    def do_sqrt(self, parts: list[str], x: list[str]) -> None:
-        self._intrinsic("sqrt", parts, x)
+    do_fma, do_sqrt = partialmethod(_intrinsic, "fma"), partialmethod(_intrinsic, "sqrt")
 
     def do_rcp(self, parts: list[str], x: list[str]) -> None:
         self._of_floats(parts[-1], x, lambda kind, a: self.new(f"fdiv {kind} 1.0, {a}"))
@@ -278,18 +260,25 @@ class Function:
     def do_copysign(self, parts: list[str], x: list[str]) -> None:
         self._intrinsic("copysign", parts, [x[0], x[2], x[1]])  # the sign comes first in PTX
 
-    def _extreme(self, parts: list[str], x: list[str], of_floats: str, op: str) -> None:
-        if parts[-1] in FLOATS:
-            return self._intrinsic(of_floats, parts, x)  # a NaN is left out, −0 is below 0
+    def _extreme(self, op: str, of_zeros: str, parts: list[str], x: list[str]) -> None:
+        """The smaller or the larger of two: a NaN is left out, −0 is below 0."""
         kind, (a, b) = self._values(parts, x)
-        is_first = self.new(f"icmp {'s' if parts[-1][0] == 's' else 'u'}{op} {kind} {a}, {b}")
-        return self.write(x[0], self.new(f"select i1 {is_first}, {kind} {a}, {kind} {b}"), kind)
+        f = parts[-1]
+        if f not in FLOATS:
+            is_first = self.new(f"icmp {'s' if f[0] == 's' else 'u'}{op} {kind} {a}, {b}")
+            result = self.new(f"select i1 {is_first}, {kind} {a}, {kind} {b}")
+            return self.write(x[0], result, kind)
+        real, (c, d) = FLOATS[f][0], [self.read_float(y, f) for y in x[1:]]
+        for test, bits in (
+            (f"{'olt' if op == 'lt' else 'ogt'} {real} {c}, {d}", a),
+            (f"uno {real} {d}, {d}", a),
+            (f"oeq {real} {c}, {d}", self.new(f"{of_zeros} {kind} {a}, {b}")),
+        ):
+            b = self.new(f"select i1 {self.new(f'fcmp {test}')}, {kind} {bits}, {kind} {b}")
+        return self.write(x[0], b, kind)
 
-    def do_min(self, parts: list[str], x: list[str]) -> None:
-        self._extreme(parts, x, "minimumnum", "lt")
-
-    def do_max(self, parts: list[str], x: list[str]) -> None:
-        self._extreme(parts, x, "maximumnum", "gt")
+    do_min = partialmethod(_extreme, "lt", "or")
+    do_max = partialmethod(_extreme, "gt", "and")
 
     def do_setp(self, parts: list[str], x: list[str]) -> None:
         op, f = parts
@@ -302,12 +291,6 @@ class Function:
             result = self.new(f"icmp {sign}{op} {kind} {a}, {b}")
         self.write(x[0], result, "i1")
 
-    def do_testp(self, parts: list[str], x: list[str]) -> None:
-        assert parts[0] == "infinite", parts
-        f = parts[-1]
-        size = self.call("fabs", FLOATS[f][0], [self.read_float(x[1], f)], f)
-        self.write(x[0], self.new(f"fcmp oeq {FLOATS[f][0]} {size}, 0x7FF0000000000000"), "i1")
-
     def do_selp(self, parts: list[str], x: list[str]) -> None:
         kind, (a, b) = self._values(parts, x[:3])
         chosen = self.read(x[3], "i1")
@@ -317,14 +300,8 @@ class Function:
         kind, (a, b) = self._values(parts, x)
         self.write(x[0], self.new(f"{word} {kind} {a}, {b}"), kind)
 
-    def do_and(self, parts: list[str], x: list[str]) -> None:
-        self._logic("and", parts, x)
-
-    def do_or(self, parts: list[str], x: list[str]) -> None:
-        self._logic("or", parts, x)
-
-    def do_xor(self, parts: list[str], x: list[str]) -> None:
-        self._logic("xor", parts, x)
+    do_and, do_or = partialmethod(_logic, "and"), partialmethod(_logic, "or")
+    do_xor = partialmethod(_logic, "xor")
 
     def do_not(self, parts: list[str], x: list[str]) -> None:
         kind, (a,) = self._values(parts, x)
@@ -341,8 +318,7 @@ class Function:
             shifted = self.new(f"select i1 {is_large}, {kind} 0, {kind} {shifted}")
         self.write(x[0], shifted, kind)
 
-    def do_shl(self, parts: list[str], x: list[str]) -> None:
-        self._shift("shl", parts, x)
+    do_shl = partialmethod(_shift, "shl")
 
     def do_shr(self, parts: list[str], x: list[str]) -> None:
         self._shift("ashr" if parts[-1][0] == "s" else "lshr", parts, x)
@@ -359,38 +335,6 @@ class Function:
         left = self.new(f"shl {kind} {self.read(x[1], kind)}, {size - start - count}")
         word = "ashr" if is_signed else "lshr"
         self.write(x[0], self.new(f"{word} {kind} {left}, {size - count}"), kind)
-
-    def do_prmt(self, parts: list[str], x: list[str]) -> None:
-        """Bytes of two words of 32 bits, by four digits of 4 bits; the highest bit: the sign."""
-        low, high = (self.resized(self.read(y, "i32"), "i32", "i64") for y in x[1:3])
-        both = self.new(f"or i64 {low}, {self.new(f'shl i64 {high}, 32')}")
-        total, selector = "0", int(x[3].rstrip("U"), 0)
-        for i in range(4):
-            digit = selector >> (4 * i) & 15
-            byte = self.new(f"trunc i64 {self.new(f'lshr i64 {both}, {8 * (digit & 7)}')} to i8")
-            if digit & 8:
-                byte = self.new(f"ashr i8 {byte}, 7")
-            word = self.new(f"shl i32 {self.resized(byte, 'i8', 'i32')}, {8 * i}")
-            total = self.new(f"or i32 {total}, {word}")
-        self.write(x[0], total, "i32")
-
-    def _count(self, name: str, extra: str, parts: list[str], x: list[str]) -> None:
-        kind, (a,) = self._values(parts, x)
-        self.module.declarations.add(
-            f"declare {kind} @llvm.{name}.{kind}({kind}{extra and ', i1'})"
-        )
-        value = self.new(f"call {kind} @llvm.{name}.{kind}({kind} {a}{extra})")
-        self.write(x[0], self.resized(value, kind, "i32"), "i32")
-
-    def do_popc(self, parts: list[str], x: list[str]) -> None:
-        self._count("ctpop", "", parts, x)
-
-    def do_clz(self, parts: list[str], x: list[str]) -> None:
-        self._count("ctlz", ", i1 false", parts, x)
-
-    def do_brev(self, parts: list[str], x: list[str]) -> None:
-        kind, values = self._values(parts, x)
-        self.write(x[0], self.call("bitreverse", kind, values, kind), kind)
 
     def do_cvt(self, parts: list[str], x: list[str]) -> None:
         new, old = parts[-2:]
@@ -562,9 +506,12 @@ def run(kernel: PtxKernel, operands: Sequence[Any], shapes: Sequence[Any], lanes
     """The results of a kernel for a batch, on this machine's CPU."""
     launch, _ = launch_of(kernel.text)
     arrays = [np.ascontiguousarray(x) for x in operands]
-    # Filled with a number, so that one that is not written shows.
-    results = [np.full(x.shape, 77).astype(x.dtype) for x in shapes]
-    addresses = [x.ctypes.data for x in (*arrays, *results)]
+    # Filled with a number, so that one that is not written shows; longer than the batch, so that a
+    # thread shows that writes beyond it.
+    full = [np.full((lanes + threads, *x.shape[1:]), 77).astype(x.dtype) for x in shapes]
+    addresses = [x.ctypes.data for x in (*arrays, *full)]
     parameters = np.asarray([*addresses, lanes, *kernel.values], np.int64)
     launch(parameters.ctypes.data, -(-lanes // threads), threads)
-    return results
+    for x in full:
+        np.testing.assert_array_equal(x[lanes:], np.asarray(77).astype(x.dtype))
+    return [x[:lanes] for x in full]

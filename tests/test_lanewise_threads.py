@@ -1,12 +1,13 @@
-"""Code for NVIDIA GPUs, run on the CPU: the bits of the CPU's machine code, and what XLA computes."""
+"""Code for NVIDIA GPUs, run on the CPU: the bits of the CPU's machine code, and XLA's part."""
 
 import ctypes
+import dataclasses
 import functools
 import os
 import re
-import shutil
 import subprocess
 import sys
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import jax
@@ -15,7 +16,7 @@ import numpy as np
 import ptx_on_cpu
 import pytest
 import test_lanewise_programs as programs
-from jax import lax
+from jax import export, lax
 
 import dvi_jax as dvi
 import lanewise
@@ -28,7 +29,8 @@ from lanewise.jaxprs.extent import primitives_in
 from lanewise.llvm import ptx
 from lanewise.llvm.ir import NotCompilable
 from lanewise.native import machine
-from lanewise.rules.elementwise import ELEMENTWISE
+from lanewise.rules import exact
+from lanewise.targets import TARGETS, threads
 from lanewise.targets.numbers import Numbers
 from lanewise.targets.threads import Threads, ptx_of
 
@@ -275,24 +277,22 @@ def gradient(x, y):
     return jax.grad(lambda x: jnp.sum(programs.mixed(programs.bounded(x), y) ** 2))(x)
 
 
+FUNCTIONS = """
+    acos acosh asin asinh atanh cbrt cosh erf erf_inv erfc exp2 logistic sinh tan
+    stop_gradient optimization_barrier
+""".split()  # noqa: SIM905
 OTHERS = {
-    **{
-        name: ("f", getattr(lax, name))
-        for name in (
-            "acos acosh asin asinh atanh cbrt cosh erf erf_inv erfc exp2 logistic sinh tan "
-            "stop_gradient optimization_barrier"
-        ).split()
-    },
+    **{name: ("f", getattr(lax, name)) for name in FUNCTIONS},
     "order": ("f f", lambda x, y: (lax.lt_to_p.bind(x, y), lax.le_to_p.bind(x, y))),
     "sine and cosine": ("f", lambda x: (jnp.sin(x), jnp.cos(x))),
-    "exact product": ("f f", lambda x, y: lanewise.rules.exact.exact_product(x, y)),
+    "exact product": ("f f", exact.exact_product),
     "bits": ("f", lambda x: lax.bitcast_convert_type(x, jnp.int64) >> 3),
     "next": ("f f", jnp.nextafter),
     "reduced": ("f", lambda x: lax.reduce_precision(x, 11, 52)),
     "sorted": ("f23", lambda x: (jnp.sort(x, 1), jnp.argsort(x[0]))),
     "parts": ("f3", lambda x: jnp.split(x, [1])),
     "random": ("i i", lambda i, j: jaxapi.threefry2x32(jnp.stack([i, j]).astype("uint32"), i, j)),
-    "of a CPU": ("f", lambda x: lax.platform_dependent(x, cpu=jnp.sin, default=jnp.cos)),
+    "platform": ("f", lambda x: lax.platform_dependent(x, tpu=jnp.sin, default=jnp.cos)),
     "xor of all": ("i3", lambda i: lax.reduce_xor(i, (0,))),
     "tiles": ("f3", lambda x: jnp.tile(x, 2)),
     "systems": ("f2 f23", solved),
@@ -318,7 +318,7 @@ def in_groups(table, size):
 
 TABLES = {
     "unary": of_table(programs.UNARY, "f"),
-    "binary": of_table({k: v for k, v in programs.BINARY.items() if k != "rem"}, "f f"),
+    "binary": of_table(programs.BINARY, "f f"),
     "compared": of_table(programs.COMPARED, "f f"),
     "integers": of_table(programs.OF_INTEGERS, "i i"),
     "an integer": of_table(programs.OF_AN_INTEGER, "i"),
@@ -337,10 +337,9 @@ GROUPS = {
     for i, group in enumerate(in_groups(table, 30))
 }
 
-SAME_OR_ABSENT = frozenset(
-    "conj copy copy_p empty empty2 log2 mesh_cast one_minus_square real reshard "
-    "sharding_constraint".split()
-)
+SAME_OR_ABSENT = """
+    conj copy copy_p empty empty2 log2 mesh_cast one_minus_square real reshard sharding_constraint
+""".split()  # noqa: SIM905
 """Rules without arithmetic, or of primitives that this release of JAX does not make."""
 
 
@@ -370,6 +369,22 @@ def batch_for(needed, rng, lanes=24):
 SPECIAL = [*programs.SPECIAL, 5e-324, 1e22, 2.0**63, -(2.0**63), 0.5, 1.5]
 
 
+def names_of(group):
+    """What the functions of a group take."""
+    return [name for needed, _ in GROUPS[group].values() for name in needed.split()]
+
+
+def jaxpr_of(group):
+    """The functions of a group as one."""
+
+    def function(*args):
+        remaining = iter(args)
+        pairs = GROUPS[group].values()
+        return [jax.tree.leaves(f(*(next(remaining) for _ in n.split()))) for n, f in pairs]
+
+    return jax.make_jaxpr(function)(*map(aval_of, names_of(group)))
+
+
 def compared(function, lane_flags, operands, lanes):
     """The number of results, which have equal bits from both targets."""
     found = by_threads(function, lane_flags, operands, lanes, 16)
@@ -379,33 +394,19 @@ def compared(function, lane_flags, operands, lanes):
 
 @pytest.mark.parametrize("name", GROUPS)
 def test_rules_have_the_bits_of_the_cpu(name):
-    rng = np.random.default_rng(3)
-    needed = [n for n, _ in GROUPS[name].values()]
-    operands = [batch_for(n, rng) for one in needed for n in one.split()]
-
-    def function(*args):
-        remaining = iter(args)
-        pairs = GROUPS[name].values()
-        return [jax.tree.leaves(f(*(next(remaining) for _ in n.split()))) for n, f in pairs]
-
-    closed = jax.make_jaxpr(function)(*(aval_of(n) for one in needed for n in one.split()))
-    count = compared(closed, [True] * len(operands), operands, len(operands[0]))
-    assert count == len(closed.out_avals) >= len(needed)
-    RULES_COVERED.update(primitives_in(closed.jaxpr))
-
-
-RULES_COVERED: set[str] = set()
+    rng, names = np.random.default_rng(3), names_of(name)
+    operands = [batch_for(n, rng) for n in names]
+    count = compared(jaxpr_of(name), [True] * len(names), operands, len(operands[0]))
+    assert count >= len(GROUPS[name])
 
 
 def test_every_rule_is_compared():
     """Rules that are one function under several names count as one."""
-    for group in GROUPS.values():
-        for needed, function in group.values():
-            jaxpr = jax.make_jaxpr(function)(*map(aval_of, needed.split())).jaxpr
-            RULES_COVERED.update(primitives_in(jaxpr))
-    functions = {id(RULES[name]) for name in RULES_COVERED & RULES.keys()}
-    others = {name for name in RULES.keys() - RULES_COVERED if id(RULES[name]) not in functions}
-    assert others - SAME_OR_ABSENT <= {"sine and cosine", "rem"}
+    compared_names = set().union(*(primitives_in(jaxpr_of(name).jaxpr) for name in GROUPS))
+    functions = {id(RULES[name]) for name in compared_names & RULES.keys()}
+    others = {name for name in RULES.keys() - compared_names if id(RULES[name]) not in functions}
+    # The pair is in no program by this name.
+    assert others - {*SAME_OR_ABSENT} <= {"sine and cosine"}
 
 
 def random_programs_are_equal(seed, count, length):
@@ -426,8 +427,7 @@ def random_programs_are_equal(seed, count, length):
             return programs.evaluate(nodes, values)[len(programs.ALL) :]
 
         closed = jax.make_jaxpr(function)(*avals)
-        if "float rem" not in str([node.key for node in nodes]):
-            total += compared(closed, flags, operands, programs.LANES)
+        total += compared(closed, flags, operands, programs.LANES)
     return total
 
 
@@ -439,3 +439,289 @@ def test_random_programs_have_the_bits_of_the_cpu(seed):
 
 def test_a_few_random_programs_have_the_bits_of_the_cpu():
     assert random_programs_are_equal(100, 40, 3) > 120
+
+
+# --- controls -------------------------------------------------------------------------------------
+
+
+def product_and_sum(x, y):
+    return lax.optimization_barrier(x * y) + y
+
+
+def kernel_of(function, *avals, architecture=90):
+    closed = jax.make_jaxpr(function)(*avals)
+    return closed, ptx_of(closed, [True] * len(avals), architecture)
+
+
+def test_another_rounding_is_found():
+    """Control: one product is contracted with a sum; one sum has no word for its rounding."""
+    x, y = np.random.default_rng(1).normal(size=(2, 100))
+    closed, kernel = kernel_of(product_and_sum, 1.0, 1.0)
+    expected = by_numbers(closed, [True] * 2, [x, y], 100)
+    assert_same_bits(ptx_on_cpu.run(kernel, [x, y], [x], 100), expected)
+    product = re.search(r"mul\.rn\.f64 \t(%rd\d+), (%rd\d+), (%rd\d+);", kernel.text)
+    total = re.search(r"add\.rn\.f64 \t(%rd\d+), (%rd\d+), (%rd\d+);", kernel.text)
+    assert product
+    assert total
+    assert product[1] == total[3]
+    fused = f"fma.rn.f64 \t{total[1]}, {product[2]}, {product[3]}, {total[2]};"
+    wrong = dataclasses.replace(kernel, text=kernel.text.replace(total[0], fused))
+    assert np.any(ptx_on_cpu.run(wrong, [x, y], [x], 100)[0] != expected[0])
+    wrong = dataclasses.replace(kernel, text=kernel.text.replace("add.rn.f64", "add.f64"))
+    with pytest.raises(AssertionError, match=r"add\.f64"):
+        ptx_on_cpu.run(wrong, [x, y], [x], 100)
+
+
+def test_threads_beyond_the_last_trajectory_do_nothing():
+    """Also in a batch of one; control: without the test of the bound they write."""
+    _, kernel = kernel_of(lambda x: x + 1, 1.0)
+    for lanes, block in ((1, 64), (64, 64), (65, 64), (3, 128)):
+        x = np.arange(float(lanes))
+        assert_same_bits(ptx_on_cpu.run(kernel, [x], [x], lanes, block), [x + 1])
+    text = re.sub(r"\tsetp\.ge\.u64 .*\n\t@.*bra.*\n", "", kernel.text)
+    x = np.arange(100.0)
+    with pytest.raises(AssertionError):
+        ptx_on_cpu.run(dataclasses.replace(kernel, text=text), [x], [x], 97, 3)
+
+
+# --- the kernel -----------------------------------------------------------------------------------
+
+
+def sines(x, m):
+    return lax.scan(lambda c, r: (jnp.sin(c) + r, c), x, m)[1]
+
+
+def test_parameters_and_text_of_a_kernel():
+    def function(x, m):
+        return sines(x, m), jnp.arange(300.0) * x
+
+    closed, kernel = kernel_of(function, 1.0, jnp.zeros(200))
+    names = re.findall(r"\.param \.u64 (?:\.ptr \.global \.align \d+ )?(\w+)", kernel.text)
+    count = kernel.operands + kernel.results
+    assert (kernel.operands, kernel.results) == (2, 2)
+    assert len(names) == count + 1 + len(kernel.values)
+    assert kernel.text.count(".ptr .global") in (count, 0)  # older releases of LLVM leave it out
+    assert set(kernel.values) == {200, 300}
+    assert kernel == ptx_of(closed, [True, True], 90)
+    assert f".maxntid {kernel.threads}, 1, 1\n.minnctapersm 1\n" in kernel.text
+    assert kernel.text.count(".maxntid") == 1
+    # Another length needs no new code; a short loop is unrolled.
+    long, longer, short = (kernel_of(sines, 1.0, jnp.zeros(n))[1] for n in (200, 900, 3))
+    assert longer.text == long.text
+    assert {*long.values, *longer.values} == {200, 900}
+    assert short.values == ()
+    assert short.text.count("st.global") == 3 * long.text.count("st.global")
+
+
+def test_architectures_are_those_of_a_table():
+    pairs = {79: None, 80: 80, 87: 86, 89: 89, 90: 90, 103: 100, 120: 120, 999: 120}
+    assert {k: ptx.architecture_for(k) for k in pairs} == pairs
+    for architecture in ptx.ARCHITECTURES:
+        _, kernel = kernel_of(jnp.sin, 1.0, architecture=architecture)
+        assert f".target sm_{architecture}" in kernel.text
+    with pytest.raises(KeyError):  # LLVM would end the process
+        kernel_of(jnp.sin, 1.0, architecture=95)
+    assert [ptx.threads_for(n) for n in (32, 168, 169, 255)] == [128, 128, 64, 64]
+    assert ptx.occupancy(68, 90) == 28 / 64
+    assert ptx.occupancy(255, 80) == 8 / 64
+    assert ptx.occupancy(32, 120) == 1
+
+
+def test_text_comes_from_the_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("DVI_JAX_CACHE", str(tmp_path))
+    _, kernel = kernel_of(jnp.tanh, 1.0)
+    (path,) = tmp_path.iterdir()
+    calls, optimise = [], machine.optimise
+
+    def counted(*args, **options):
+        calls.append(args)
+        return optimise(*args, **options)
+
+    monkeypatch.setattr(machine, "optimise", counted)
+    assert kernel_of(jnp.tanh, 1.0)[1] == kernel
+    assert not calls
+    path.write_bytes(path.read_bytes()[:-1])
+    assert kernel_of(jnp.tanh, 1.0)[1] == kernel
+    assert kernel_of(jnp.tanh, 1.0, architecture=80)[1] != kernel
+    assert len(calls) == 2
+
+
+# --- what stays with XLA --------------------------------------------------------------------------
+
+
+def many_operations(x):
+    return jnp.ones((30, 30)) @ (x * jnp.ones((30, 30)))
+
+
+def memory_in_a_loop(x):
+    rows = lax.scan(lambda c, _: (jnp.sin(c), c), x, None, length=3000)[1]
+    return lax.scan(lambda c, r: (c * r + 1, None), x, rows, reverse=True)[0]
+
+
+REFUSED = {
+    "operations": (many_operations, 1.0, "the number of operations of a GPU thread"),
+    "memory": (memory_in_a_loop, 1.0, "bytes of intermediate arrays of a thread .* at most 16384"),
+    "long arrays": (
+        lambda x: lax.fori_loop(0, 9, lambda _, c: jnp.sin(c) + 1, x),
+        jnp.zeros(64),
+        "arrays of a loop are too long for a GPU thread",
+    ),
+    "complex": (lambda x: jnp.abs(x + 1j), 1.0, "float64, float32, bool or integers"),
+    "no rule": (lambda x: jnp.fft.rfft(x).real, jnp.zeros(4), "no rule|must be float64"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_stays_with_xla(name):
+    function, x, reason = REFUSED[name]
+    with pytest.raises(NotCompilable, match=reason):
+        kernel_of(function, x)
+    (part,) = lanewise.explain(function, x, device="cuda").parts
+    assert re.search(reason, part.reason)
+    assert str(part).startswith("left to XLA: ")
+
+
+def test_platform_of_a_branch():
+    def function(x):
+        return lax.platform_dependent(x, cpu=jnp.sin, cuda=jnp.cos, default=jnp.exp)
+
+    x = np.linspace(-3, 3, 50)
+    closed, kernel = kernel_of(function, 1.0)
+    (found,) = ptx_on_cpu.run(kernel, [x], [x], 50)
+    assert_same_bits([found], by_numbers(jax.make_jaxpr(jnp.cos)(1.0), [True], [x], 50))
+    assert_same_bits(
+        by_numbers(closed, [True], [x], 50),
+        by_numbers(jax.make_jaxpr(jnp.sin)(1.0), [True], [x], 50),
+    )
+
+
+# --- lowering -------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def on_gpus(monkeypatch):
+    """The switch, without an import again."""
+    monkeypatch.setitem(TARGETS, "cuda", (Threads(),))
+    for_cuda = functools.partial(primitive._lower, platform="cuda")
+    jaxapi.lower_on("cuda", primitive._lanewise, for_cuda)
+    yield
+    jaxapi.lower_on("cuda", primitive._lanewise, primitive._through_xla)
+
+
+def lowered(function, *args):
+    """The text for CUDA of a batch."""
+    traced = jax.jit(jax.vmap(function)).trace(*map(jnp.asarray, args))
+    return traced.lower(lowering_platforms=("cuda",)).as_text()
+
+
+def with_slow(names, fast):
+    """All names, those that are not `fast` as slow tests."""
+    return [name if name in fast else pytest.param(name, marks=pytest.mark.slow) for name in names]
+
+
+@pytest.mark.parametrize("name", with_slow(PROGRAMS, ["kepler", "gradient"]))
+def test_a_program_is_one_custom_call(on_gpus, name):
+    make, count = PROGRAMS[name]
+    one, inputs = make(LANES)
+    text = lowered(one, *inputs)
+    assert len(re.findall(r"custom_call @lanewise_cuda_\w+", text)) == count
+    assert "stablehlo.while" not in text
+
+
+def test_lowering_of_what_stays_with_xla(on_gpus):
+    text = lowered(lambda x: lanewise.call(jnp.fft.fft, x), np.zeros((5, 4)))
+    assert "custom_call @lanewise" not in text
+    nested = lowered(jax.vmap(lambda x: lanewise.call(jnp.sin, x)), np.zeros((5, 4)))
+    assert len(re.findall(r"custom_call @lanewise_cuda_\w+", nested)) == 1
+    arrays = lanewise.Layout(form="arrays")
+    text = lowered(lambda x: lanewise.call(jnp.sin, x, layout=arrays), np.zeros(5))
+    assert "custom_call" not in text
+    text = lowered(lambda x: lanewise.call(jnp.sin, x), np.zeros(0))
+    assert "custom_call" not in text
+
+
+def test_export_is_refused(on_gpus):
+    function = jax.jit(lanewise.batched(jnp.sin))
+    shape = jax.ShapeDtypeStruct((9,), float)
+    with pytest.raises(ValueError, match="custom calls"):
+        export.export(function, platforms=["cuda"])(shape)
+
+
+def test_the_oldest_gpu_decides(monkeypatch):
+    old, new = (SimpleNamespace(compute_capability=c) for c in ("7.5", "12.1"))
+    monkeypatch.setattr(threads.jax, "devices", lambda *_: [old, new])
+    (part,) = lanewise.explain(jnp.sin, 1.0, device="cuda:0").parts
+    assert str(part) == "left to XLA: the GPU is too old: sm_75, not sm_80"
+    monkeypatch.setattr(threads.jax, "devices", lambda *_: [new])
+    (part,) = lanewise.explain(jnp.sin, 1.0, device="cuda:0").parts
+    assert part.architecture == 120
+
+
+SWITCHES = """
+import os, sys, jax, jax.numpy as jnp, dvi_jax, lanewise
+f = jax.jit(lanewise.batched(jnp.sin)).trace(jnp.zeros(5))
+text = f.lower(lowering_platforms=("cuda",)).as_text()
+maps = open("/proc/self/maps").read() if os.path.exists("/proc/self/maps") else ""
+names = [n for n in sys.modules if n in ("lanewise.targets.threads", "lanewise.llvm.ptx")]
+print("lanewise_cuda" in text, len(names), "libcuda" in maps)
+"""
+
+
+@pytest.mark.parametrize(
+    ("switch", "printed"),
+    [("", "False 0 False"), pytest.param("on", "True 2 False", marks=pytest.mark.slow)],
+)
+def test_nothing_is_imported_without_the_switch(switch, printed):
+    run = subprocess.run(
+        [sys.executable, "-c", SWITCHES],
+        env={**os.environ, "LANEWISE_CUDA": switch, "JAX_PLATFORMS": "cpu"},
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert run.stdout.split("\n")[0] == printed
+
+
+# --- explain, and CUDA's assembler ----------------------------------------------------------------
+
+
+def test_explain_of_a_gpu(monkeypatch):
+    monkeypatch.setattr(ptx, "ptxas", lambda: None)
+    (part,) = lanewise.explain(jnp.sin, 1.0, device="cuda:0").parts
+    assert part.target == "threads"
+    assert part.architecture == 80
+    assert part.registers == 0
+    assert part.occupancy == 8 / 64
+    assert part.assembly.count(".entry") == 1
+    assert "sm_80" in str(part)
+    assert "at most 255 registers" in str(part)
+    assert lanewise.explain(jnp.sin, 1.0, device="cpu").parts[0].target == "numbers"
+    with pytest.raises(ValueError, match="device must be"):
+        lanewise.explain(jnp.sin, 1.0, device="tpu:0")
+
+
+needs_ptxas = pytest.mark.skipif(ptx.ptxas() is None, reason="nvidia-cuda-nvcc is not installed")
+
+
+def spills(text, architecture):
+    report = ptx.report_of_ptxas(text, architecture)
+    assert report is not None
+    return sum(map(int, re.findall(r"(\d+) bytes spill", report)))
+
+
+@needs_ptxas
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_ptxas_accepts_programs(name):
+    for call in calls_of_program(name):
+        for architecture in ptx.ARCHITECTURES:
+            kernel = ptx_of(call.function, call.lane_flags, architecture)
+            bytes_spilled = spills(kernel.text, architecture)
+            assert bytes_spilled == 0 or name in ("guiding centre", "8 bodies")
+            assert 0 < (ptx.registers_of(kernel.text, architecture) or 0) <= 255
+
+
+@needs_ptxas
+@pytest.mark.slow
+@pytest.mark.parametrize("name", GROUPS)
+def test_ptxas_accepts_rules(name):
+    kernel = ptx_of(jaxpr_of(name), [True] * len(names_of(name)), 90)
+    assert (ptx.registers_of(kernel.text, 90) or 0) > 0

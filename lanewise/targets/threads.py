@@ -44,6 +44,7 @@ class ThreadModule(Module):
     # The driver reserves this memory for every thread that can run at once: here 4 GiB on a GPU
     # with 270 000 threads.
     largest = 16 * 2**10
+    platform = "cuda"
 
     def __init__(self):
         super().__init__(1, 1)
