@@ -59,12 +59,13 @@ def threads_for(registers: int) -> int:
 
 def architecture_for(capability: int) -> int | None:
     """The highest architecture for which code is made that a GPU runs; None if it is too old."""
-    return max((known for known in ARCHITECTURES if known <= capability), default=None)
+    return max((number for number in ARCHITECTURES if number <= capability), default=None)
 
 
 @machine.once
 def _target_machine(architecture: int) -> Any:
     llvm = machine.start_llvm()
+    # The target of GPUs is part of the wheel of llvmlite: CUDA need not be installed.
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()
     version = ARCHITECTURES[architecture]
@@ -81,9 +82,9 @@ def ptx_text(ir: str, architecture: int) -> str:
     llvm = machine.start_llvm()
     versions = llvmlite.__version__, llvm.llvm_version_info, ARCHITECTURES[architecture]
     key = cache.key("ptx", _FORMAT, *versions, architecture, THREADS, ir)
-    stored = cache.read(key)
-    if stored is not None:
-        return stored.decode()
+    content = cache.read(key)
+    if content is not None:
+        return content.decode()
     # Short loops are unrolled: an array whose indices are known is in registers.
     target = _target_machine(architecture)
     module = machine.optimise(ir, target, level=3, unroll=True)
@@ -96,6 +97,7 @@ def _with_bounds(text: str) -> str:
     """The text with the bounds of a launch. With one block on a multiprocessor, at least, the
     driver may use all registers of a thread."""
     # LLVM before 21 writes only some of them: they are removed, and written here.
+    # The text and not an attribute of the IR, so that all releases give the same.
     text = re.sub(r"^\s*\.(?:maxntid|minnctapersm|reqntid)\b.*\n", "", text, flags=re.M)
     bounds = f".maxntid {THREADS}, 1, 1\n.minnctapersm 1\n"
     return re.sub(r"(\.entry \w+\([^)]*\)\s*)", lambda m: m[1].rstrip() + "\n" + bounds, text)
@@ -108,14 +110,17 @@ def local_bytes(text: str) -> int:
 
 def occupancy(registers: int, architecture: int) -> float:
     """The fraction of the warps of a multiprocessor that can run at once."""
-    most = 64 if architecture in (80, 90, 100) else 48
-    of_block = threads_for(registers) // 32
-    of_warp = 32 * (-(-registers // 8) * 8)  # 65 536 registers are given out by eights
-    return min(65_536 // of_warp // of_block * of_block, most) / most
+    # Cards for servers have more than those for desktops.
+    limit = 64 if architecture in (80, 90, 100) else 48
+    # A thread takes registers by eights, of 65 536; a block starts as a whole.
+    warps = 65_536 // (32 * (-(-registers // 8) * 8))
+    warps_of_block = threads_for(registers) // 32
+    return min(warps // warps_of_block * warps_of_block, limit) / limit
 
 
 def ptxas() -> str | None:
     """The assembler of CUDA, from the path or from its package, None if it is not installed."""
+    # JAX for CUDA installs it as a package of Python, outside of the path.
     packages = importlib.util.find_spec("nvidia")
     places = packages.submodule_search_locations if packages else None
     folders = [path for place in places or () for path in Path(place).glob("*/bin")]

@@ -34,7 +34,7 @@ NAME = "lanewise_kernel"
 MOST_OPERATIONS = 8_000
 """Longer programs leave the caches of instructions, and their numbers the registers."""
 
-_UNROLLED = 8
+SHORT_LOOP = 8
 """Loops of at most so many rounds are unrolled."""
 
 
@@ -52,7 +52,7 @@ class ThreadModule(Module):
 
     def parameter(self, value: int) -> Num:
         # The arrays of a short loop become registers once it is unrolled.
-        if value <= _UNROLLED:
+        if value <= SHORT_LOOP:
             return self.b.number([str(int(value))], "int64", False)
         return super().parameter(value)
 
@@ -60,7 +60,8 @@ class ThreadModule(Module):
         count, name = math.prod(shape), f"%scratch{len(self.arrays)}"
         self.scratch_bytes += count * np.dtype(dtype).itemsize
         check_size(self.scratch_bytes, self.largest, "bytes of intermediate arrays of a thread")
-        # One for each array, so that LLVM sees which accesses cannot overlap.
+        # One for each array, so that LLVM sees which accesses cannot overlap. It keeps those in
+        # registers whose indices it knows; the hardware interleaves the rest, thread by thread.
         self.arrays.append(f"  {name} = alloca [{max(count, 1)} x {stored_type(dtype)}], align 8")
         lane = 1 if has_lanes else None
         return Buffer((name,), dtype, tuple(shape), contiguous(shape), lane)
@@ -87,6 +88,7 @@ def function_text(module: ThreadModule, function: ClosedJaxpr, lane_flags: Seque
         check_type(v.aval.dtype, "arguments and results")
     evaluator = Evaluator(module)
 
+    # An array without trajectories has one address, which all threads read at once.
     def array(pointer: str, aval: Any, has_lanes: bool) -> Buffer:
         lane = lane_stride(module, aval) if has_lanes else None
         return array_at(module, pointer, aval, lane, "%lane")
@@ -123,6 +125,8 @@ def kernel_text(module: ThreadModule, operands: int, results: int) -> str:
     inner = module.parameters(operands, results)
     for name in names:
         outer = outer.replace(f"noalias {name},", f"noalias %global.{name[1:]},")
+    # Operands and results are in global memory, and do not overlap: an operand may be read through
+    # the cache of constants. A thread beyond the last trajectory does nothing.
     lines = [
         *(f"declare i32 @llvm.nvvm.read.ptx.sreg.{r}.x()" for r in registers),
         f"define ptx_kernel void @{NAME}({outer}) {{",
@@ -169,6 +173,7 @@ class Threads:
     ) -> ThreadCode:
         jaxpr = function.jaxpr
         self._known_architecture()
+        # Before code is written, as for CPUs: it would take long.
         count = operation_count(jaxpr)
         check_size(count, MOST_OPERATIONS, "the number of operations of a GPU thread")
         check_that(not has_long_arrays(jaxpr), "arrays of a loop are too long for a GPU thread")
@@ -194,6 +199,7 @@ class Threads:
         """The PTX of some code, and what a launch needs."""
         assert isinstance(code, ThreadCode)
         architecture = self._known_architecture()
+        # Not in `write`, which is called for pieces of programs that are never compiled.
         text = ptx_text(code.text, architecture)
         sizes = THREADS, local_bytes(text), code.operations
         return PtxKernel(text, NAME, *code.pointers, code.values, *sizes, architecture)
