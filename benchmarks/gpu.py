@@ -1,6 +1,13 @@
 """Batches on a GPU and on the CPU of the same machine: time per step, and whether they agree.
 
     python benchmarks/gpu.py [--quick]
+    python benchmarks/gpu.py --prepare [--carried DIR]
+    python benchmarks/gpu.py --check [--carried DIR] [--out DIR] [--only STAGE ...]
+
+`--check` checks and times the kernels of `lanewise` on a GPU in seven stages of at most 460 s in
+all; its exit status is 0 if all hold, 69 if there is no GPU, and 1 otherwise. Each result is
+printed at once, and also written to a file of the stage in the folder `--out` (by default $OUT, or
+the current folder). `--prepare` writes what some stages require, on any machine, to `--carried`.
 
 Two tasks in float64: Kepler orbits by Yoshida's method of order 4 (explicit), and alpha particles
 in `boozer.precise_qa` by Gauss' method of order 4 (implicit, a Newton iteration in each step). The
@@ -9,7 +16,10 @@ the largest relative difference of the final states of 64 trajectories.
 """
 
 import argparse
+import os
+import sys
 import time
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -72,7 +82,21 @@ def timed(one, states, device):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--prepare", action="store_true")
+    parser.add_argument("--check", action="store_true")
+    parser.add_argument("--stage", help="run one stage in this process")
+    parser.add_argument("--only", nargs="*", default=(), help="stages of --check")
+    parser.add_argument("--carried", type=Path, default=Path("build/carried"))
+    parser.add_argument("--out", type=Path, default=Path(os.environ.get("OUT", ".")))
     options = parser.parse_args()
+    if options.prepare or options.check or options.stage:
+        import _gpu_check
+
+        if options.prepare:
+            return _gpu_check.prepare(options.carried)
+        if options.stage:
+            return _gpu_check.run_stage(options.stage, options.carried)
+        return _gpu_check.check(options.carried, options.out, options.only)
     devices = {d.platform: d for d in (jax.devices("cpu")[0], jax.devices()[0])}
     print(", ".join(f"{name}: {d.device_kind}" for name, d in devices.items()), flush=True)
     for task in (kepler, alphas):
@@ -96,4 +120,4 @@ def main():
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -15,7 +15,7 @@ from .jaxprs.traced import Trace
 from .llvm.ir import NotCompilable
 from .native import machine
 from .primitive import AUTO, SWITCH, Callee, Layout, generates, pieces_of
-from .targets import compile_program
+from .targets import CompiledProgram, compile_program
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,10 +26,14 @@ class Part:
     - `operations`: on numbers of one trajectory, loops counted once; a fused multiply-add is one.
     - `width`, `vectors`: numbers in a vector, vectors in a block.
     - `target`: ``"numbers"`` if a vector holds one number of several trajectories,
-      ``"elements"`` if it holds neighbouring elements of an array of one trajectory.
+      ``"elements"`` if it holds neighbouring elements of an array of one trajectory, ``"threads"``
+      if a thread of a GPU computes a trajectory.
     - `loops`, `stores`: of ``"elements"``: loops over elements, and arrays that they write.
     - `scratch`: bytes of a block for rows that are not results, or of a trajectory for arrays.
     - `spills`: instructions of the machine code that move a register to or from the stack.
+    - `architecture`, `registers`, `occupancy`: of ``"threads"``: the GPU's; registers of a thread,
+      0 if the program ``ptxas`` of CUDA is not installed; the fraction of a multiprocessor's warps
+      that can run at once, at least that of 255 registers.
     - `ir`: the module's LLVM IR, before optimisation.
     """
 
@@ -43,15 +47,29 @@ class Part:
     target: str = "numbers"
     loops: int = 0
     stores: int = 0
+    architecture: int = 0
+    registers: int = 0
+    occupancy: float = 0.0
 
     @property
     def assembly(self) -> str:
-        """The machine code in the assembler's language; empty without machine code."""
+        """The machine code in the assembler's language, of a GPU in PTX; empty without code."""
+        if self.architecture:
+            from .llvm.ptx import ptx_text
+
+            return ptx_text(self.ir, self.architecture)
         return machine.assembly(self.ir) if self.ir else ""
 
     def __str__(self) -> str:
         if self.reason is not None:
             return f"left to XLA: {self.reason}"
+        if self.target == "threads":
+            registers = f"{self.registers} registers" if self.registers else "at most 255 registers"
+            return (
+                f"code for GPUs, sm_{self.architecture}: {self.operations} operations, one thread "
+                f"a trajectory with {registers} and {self.scratch} bytes of local memory, "
+                f"{100 * self.occupancy:.0f} % of the warps of a multiprocessor at once"
+            )
         if self.target == "elements":
             return (
                 f"machine code: {self.operations} operations in {self.loops} loops over the "
@@ -78,7 +96,11 @@ class Explanation:
 
 
 def explain(
-    function: Callable, *args: Any, batch: int = 1024, layout: Layout = AUTO
+    function: Callable,
+    *args: Any,
+    batch: int = 1024,
+    layout: Layout = AUTO,
+    device: str = "cpu",
 ) -> Explanation:
     """Report of how ``function(*args)``, of one trajectory, is compiled for a batch.
 
@@ -89,6 +111,9 @@ def explain(
 
     - `function`, `args`: as `batched` calls it for one trajectory.
     - `batch`: trajectories; all arguments are taken to differ between them.
+    - `device`: ``"cpu"``, or ``"cuda:0"`` for the code of NVIDIA GPUs, which is used only if the
+      environment variable ``LANEWISE_CUDA`` is ``on``. In a process without a GPU it is the code
+      for the oldest one that is supported.
 
     **Returns** an `Explanation`: print it, or read its `parts`, each with `ir` and `assembly`.
 
@@ -98,12 +123,18 @@ def explain(
     print(lanewise.explain(lambda x: jnp.sin(x) / x, 1.0))
     ```
     """
+    platform = str(device).partition(":")[0].lower()
+    if platform not in ("cpu", "cuda"):
+        raise ValueError(
+            f'device must be "cpu" or "cuda", with or without a number, got {device!r}.'
+        )
     # Arrays: a number of Python would be traced with a weak type, which a batch does not have.
     leaves, tree = jax.tree.flatten(jax.tree.map(jnp.asarray, args))
     trace = Trace.from_function(function, leaves, tree)
     # Without a call in it, the function is explained as if it were called.
     programs = _calls(trace.closed_jaxpr.jaxpr) or [Callee(trace, layout)]
-    return Explanation(tuple(part for program in programs for part in _parts(program, batch)))
+    parts = (part for program in programs for part in _parts(program, batch, platform))
+    return Explanation(tuple(parts))
 
 
 def compiled_by(function: Callable, *args: Any, batch: int = 1024) -> tuple[set[str], str | None]:
@@ -137,20 +168,22 @@ def _calls(jaxpr: Any) -> list[Any]:
     return programs
 
 
-def _parts(program: Any, batch: int) -> list[Part]:
+def _parts(program: Any, batch: int, platform: str) -> list[Part]:
     """How a program is compiled; its pieces if it is not compiled as a whole."""
     count = len(program.trace.all_inputs.jaxpr.invars)
     try:
-        result = compile_program(program, [True] * count, batch, "cpu")
+        result = compile_program(program, [True] * count, batch, platform)
     except NotCompilable as reason:
         parts = [
             [Part(piece.reason)]
             if piece.is_left_to_xla
-            else _parts(Callee(Trace(piece.function), program.layout), batch)
-            for piece in pieces_of(program, batch, "cpu")
+            else _parts(Callee(Trace(piece.function), program.layout), batch, platform)
+            for piece in pieces_of(program, batch, platform)
         ]
         return list(itertools.chain(*parts)) or [Part(str(reason))]
     code = result.code
+    if platform == "cuda":
+        return [_gpu_part(result)]
     # Registers that do not suffice show in moves to and from the stack; their number says whether a
     # block has too many vectors.
     assembly = result.target.assembly(code)
@@ -169,3 +202,23 @@ def _parts(program: Any, batch: int) -> list[Part]:
             code.stores,
         )
     ]
+
+
+def _gpu_part(result: CompiledProgram) -> Part:
+    # Not imported for reports about CPUs.
+    from .llvm.ptx import occupancy, registers_of
+    from .targets.threads import Threads
+
+    assert isinstance(result.target, Threads)
+    kernel = result.target.kernel(result.code)
+    registers = registers_of(kernel.text, kernel.architecture)
+    return Part(
+        None,
+        kernel.operations,
+        scratch=kernel.local_bytes,
+        ir=result.code.text,
+        target=result.target.name,
+        architecture=kernel.architecture,
+        registers=registers or 0,
+        occupancy=occupancy(registers or 255, kernel.architecture),
+    )

@@ -18,6 +18,7 @@ class Module:
 
     largest = 64 * 2**20
     """Bytes that a block may take for arrays that are not results."""
+    platform = "cpu"
 
     def __init__(self, width: int, vectors: int):
         self.b = Builder(width, vectors)

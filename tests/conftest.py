@@ -52,6 +52,7 @@ SECONDS = {
     "test_fit_library": 100,
     "test_fit_real_data": 100,
     "test_lanewise_programs": 90,
+    "test_lanewise_threads": 60,
     "test_library": 80,
     "test_docstrings": 60,
     "test_sweep_store": 80,

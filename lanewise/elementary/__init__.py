@@ -31,7 +31,8 @@ all coefficients again.
 The errors hold whether or not a compiler contracts a product and a sum into a fused multiply-add:
 a product that must be exact has few enough bits. Sums must not be reassociated. XLA does this with
 constants, (x + c) − d = x + (c − d), which the functions avoid. They are right for subnormal
-numbers too; XLA runs all code on a CPU, generated code as well, with these replaced by zero.
+numbers too, which generated code has, and which XLA's own code on a CPU replaces by zero. `rem` is
+exact, and requires contraction.
 """
 
 from collections.abc import Callable
@@ -41,6 +42,7 @@ from jax import Array
 from .circular import acos, asin, atan, atan2, cos, sin, sincos as sincos, tan
 from .exponential import cosh, erf, erfc, exp, exp2, expm1, logistic, sinh, tanh
 from .logarithmic import acosh, asinh, atanh, cbrt, erf_inv, log, log1p, pow
+from .remainder import rem as rem
 
 # From the name of a primitive of JAX to its function of float64 scalars.
 FUNCTIONS: dict[str, Callable[..., Array]] = {

@@ -1,5 +1,6 @@
 """Operations on numbers: which are written, which are known already, and which are contracted."""
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -174,9 +175,8 @@ class Operations(Writer):
         return self.select(by_zero, at_zero, value)
 
     def rem(self, a: Num, b: Num) -> Num:
-        if not a.is_float:
-            return self._integer_division("rem", a, b)
-        return self.instruction("frem", (a, b))
+        """The remainder of integers."""
+        return self._integer_division("rem", a, b)
 
     def power(self, x: Num, n: int) -> Num:
         """xⁿ by squaring; of a negative n by that of 1/x."""
@@ -402,6 +402,8 @@ class Operations(Writer):
         """Bits to the left or right; all bits are shifted out by their number or more."""
         bits, word = int(TYPES[a.dtype][1:]), _SHIFTS[op]
         if count.value is not None and 0 <= count.value < bits:
+            if a.value is not None:
+                return self._fold(functools.partial(_shift, word), a, count)
             return self.instruction(word, (a, count))
         largest = self.const(bits - 1, count.dtype)
         is_small = self.compare("le", count, largest)
@@ -411,6 +413,14 @@ class Operations(Writer):
         # LLVM leaves the result of a larger shift undefined.
         value = self.instruction(word, (a, self.select(is_small, count, largest)))
         return value if word == "ashr" else self.select(is_small, value, self.const(0, a.dtype))
+
+
+def _shift(word: str, bits: Any, count: Any) -> Any:
+    """A known integer after a shift, as LLVM's instruction of that name has it."""
+    if word == "shl":
+        return np.left_shift(bits, count)
+    integer = np.asarray(bits).view(f"u{bits.dtype.itemsize}") if word == "lshr" else bits
+    return np.right_shift(integer, integer.dtype.type(count)).view(bits.dtype)
 
 
 def is_power_of_two(x: Any) -> bool:

@@ -39,6 +39,12 @@ def check_type(dtype: Any, name: str = "numbers") -> str:
     return str(dtype)
 
 
+def check_that(condition: bool, reason: str) -> None:
+    """Refuse what has no code, with the reason."""
+    if not condition:
+        raise NotCompilable(reason)
+
+
 def check_size(size: int, limit: int, name: str, *shapes: Sequence[int]) -> None:
     """Refuse what would become too much code, or too much memory."""
     if size > limit:

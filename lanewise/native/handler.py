@@ -17,6 +17,7 @@ import jax.ffi
 
 from . import machine
 from .structures import addresses, offset, size
+from .subnormals import compute_text
 
 API_MAJOR, API_MINOR = 0, 1
 """The version of XLA's interface that the structures are of; newer ones of 0 keep them."""
@@ -103,6 +104,7 @@ define internal ptr @aligned(ptr %memory) {{
   ret ptr %scratch
 }}
 
+{compute_text()}
 define internal void @work(ptr %job, ptr %memory) {{
 entry:
   %scratch = call ptr @aligned(ptr %memory)
@@ -123,7 +125,8 @@ run:
   %end = add i64 %first, %chunk
   %fits = icmp slt i64 %end, %claims
   %last = select i1 %fits, i64 %end, i64 %blocks
-  call void %kernel(ptr %args, ptr %rets, ptr %params, ptr %scratch, i64 %first, i64 %last)
+  call void @compute(ptr %kernel, ptr %args, ptr %rets, ptr %params, ptr %scratch,
+                     i64 %first, i64 %last)
   %mine = sub i64 %last, %first
   %ignored = atomicrmw add ptr %job.done, i64 %mine acq_rel
   br label %claim
@@ -251,7 +254,7 @@ ready.to.run:
   br i1 %go, label %ask.pool, label %alone
 alone:
   %scratch = call ptr @aligned(ptr %memory)
-  call void %kernel(ptr %a, ptr %r, ptr %params, ptr %scratch, i64 0, i64 %blocks)
+  call void @compute(ptr %kernel, ptr %a, ptr %r, ptr %params, ptr %scratch, i64 0, i64 %blocks)
   call void @free(ptr %memory)
   call void @free(ptr %job)
   ret ptr null
@@ -388,13 +391,13 @@ def register(text: str) -> str:
             text = text.replace("@lanewise_handler", f"@{name}")
             engine = machine.load(text, {"lanewise_run": run})
             address = engine.get_function_address(name)
-            jax.ffi.register_ffi_target(name, _capsule(address), platform="cpu")
+            jax.ffi.register_ffi_target(name, capsule(address), platform="cpu")
             _targets[key] = name
         return _targets[key]
 
 
-def _capsule(address: int) -> Any:
-    # The form in which JAX takes the address of a handler.
+def capsule(address: int) -> Any:
+    """The form in which JAX takes the address of a handler."""
     new = ctypes.pythonapi.PyCapsule_New
     new.restype = ctypes.py_object
     new.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]

@@ -77,15 +77,16 @@ def target_machine(triple: str | None = None, cpu: str | None = None, features: 
     )
 
 
-def _optimise(ir: str, machine: Any) -> Any:
+def optimise(ir: str, machine: Any, level: int = 2, unroll: bool = False) -> Any:
     """A module after the passes that pay for code which is written number by number."""
     llvm = start_llvm()
     module = llvm.parse_assembly(ir)
     module.verify()
     module.triple, module.data_layout = machine.triple, str(machine.target_data)
     # No vectoriser, for the code consists of vectors, and no unrolling, for it fills the cache.
-    options = llvm.create_pipeline_tuning_options(speed_level=2)
-    options.slp_vectorization = options.loop_vectorization = options.loop_unrolling = False
+    options = llvm.create_pipeline_tuning_options(speed_level=level)
+    options.slp_vectorization = options.loop_vectorization = False
+    options.loop_unrolling = unroll
     builder = llvm.create_pass_builder(machine, options)
     builder.getModulePassManager().run(module, builder)
     return module
@@ -94,12 +95,12 @@ def _optimise(ir: str, machine: Any) -> Any:
 def object_code(ir: str, machine: Any = None) -> bytes:
     """The object file of a module, by default for the processor of this process."""
     machine = target_machine() if machine is None else machine
-    return machine.emit_object(_optimise(ir, machine))
+    return machine.emit_object(optimise(ir, machine))
 
 
 def assembly(ir: str) -> str:
     """The machine code of a module in the assembler's language."""
-    return target_machine().emit_assembly(_optimise(ir, target_machine()))
+    return target_machine().emit_assembly(optimise(ir, target_machine()))
 
 
 def load(ir: str, symbols: dict[str, int] | None = None) -> Any:

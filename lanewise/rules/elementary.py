@@ -74,7 +74,7 @@ def _by_name(name: str) -> Callable:
     """An elementary function of scalars by name; that of a power has its argument in the name."""
     if name.startswith("half_integer_power"):
         return half_integer_power(int(name.split()[1]))
-    return functions.sincos if name == "sincos" else functions.FUNCTIONS[name]
+    return getattr(functions, name)
 
 
 @functools.cache
@@ -116,9 +116,16 @@ def _function_text(
 
 @functools.lru_cache(maxsize=4096)
 def _at_known(name: str, args: tuple[float, ...]) -> float:
-    """The value at arguments that are known while the code is made, by XLA."""
-    with jax.enable_x64(True), jax.ensure_compile_time_eval():
-        return float(_by_name(name)(*(jnp.asarray(x, jnp.float64) for x in args)))
+    """The value at arguments that are known while the code is made.
+
+    XLA would compute it on the default device, and on a CPU with subnormal numbers as zero.
+    """
+    b, evaluator = (module := Module(1, 1)).b, Evaluator(module)
+    values = [Value((), "float64", objects([b.const(x, "float64")], ())) for x in args]
+    (out,) = evaluator.evaluate(_jaxpr_of(name, len(args)), values)
+    value = evaluator.entries(out)[()].value
+    assert value is not None, name  # all their operations are computed where operands are known
+    return float(value)
 
 
 RULES[SINE_AND_COSINE] = sine_or_cosine

@@ -118,6 +118,17 @@ def _elementary(name: str) -> Callable:
     return rule
 
 
+def _rem(evaluator: Evaluator, _: Any, x: Num, y: Num) -> Num:
+    b = evaluator.b
+    if not x.is_float:
+        return b.rem(x, y)
+    if x.value is not None and y.value is not None:
+        with np.errstate(all="ignore"):
+            return b.const(np.fmod(x.value, y.value), x.dtype)
+    # LLVM's code for its instruction rounds on a GPU, and is a call for each number on a CPU.
+    return _elementary("rem")(evaluator, {}, x, y)
+
+
 def _unit(evaluator: Evaluator, like: Num) -> Num:
     return evaluator.b.const(1, like.dtype)
 
@@ -157,7 +168,7 @@ _SHIFTS = "left right_logical right_arithmetic"
 ELEMENTWISE: dict[str, Callable] = {
     **{op: _combination(op) for op in ("add", "mul", "max", "min")},
     "add_any": _combination("add"),
-    **{name: _method(name) for name in ("sub", "div", "rem", "neg", "abs", "sqrt", "is_finite")},
+    **{name: _method(name) for name in ("sub", "div", "neg", "abs", "sqrt", "is_finite")},
     "sign": _sign,
     "clamp": _clamp,
     "select_n": _select,
@@ -169,6 +180,7 @@ ELEMENTWISE: dict[str, Callable] = {
     "floor": _integral("floor", np.floor),
     "ceil": _integral("ceil", np.ceil),
     "round": _round,
+    "rem": _rem,
     "convert_element_type": lambda e, params, x: e.b.convert(x, str(np.dtype(params["new_dtype"]))),
     "bitcast_convert_type": _bitcast,
     "reduce_precision": _reduced_precision,

@@ -192,10 +192,13 @@ def threefry2x32(*words: Array, **_) -> tuple[Array, Array]:
 _ROTATIONS = (13, 15, 26, 6), (17, 29, 16, 24)
 
 
-def platform_index(*, platforms: Sequence, **_) -> Array:
-    """The branch that is taken on a CPU."""
-    names = [("cpu",) if p is None else p for p in platforms]
-    return jnp.int32(next(i for i, p in enumerate(names) if "cpu" in p))
+def branch_on(platform: str, platforms: Sequence) -> np.int32:
+    """The branch that is taken on a platform; None is any."""
+    return np.int32(next(i for i, p in enumerate(platforms) if p is None or platform in p))
+
+
+def of_this_platform(evaluator: Evaluator, eqn: Any, values: list[Value], places: list):
+    return [evaluator.constant(branch_on(evaluator.module.platform, eqn.params["platforms"]))]
 
 
 # function(*arrays, **parameters of the equation) → the equation's results.
@@ -208,7 +211,7 @@ EXPANSIONS: dict[str, Callable] = {
     "lt_to": lambda x, y: _order_key(x) < _order_key(y),
     "le_to": lambda x, y: _order_key(x) <= _order_key(y),
     "threefry2x32": threefry2x32,
-    "platform_index": platform_index,
+    "platform_index": lambda *, platforms, **_: jnp.asarray(branch_on("cpu", platforms)),
 }
 
 
@@ -220,4 +223,5 @@ def _rule(name: str) -> Callable:
     return check_types(rule)
 
 
+RULES["platform_index"] = of_this_platform
 RULES |= {name: _rule(name) for name in EXPANSIONS if name not in RULES}

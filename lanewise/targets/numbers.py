@@ -10,7 +10,7 @@ from .. import rules as rules  # each file registers its rules with the evaluato
 from ..evaluator import RULES, Evaluator
 from ..jaxprs.extent import carry_size, most_operations, operation_count, primitives_in
 from ..jaxprs.jaxapi import ClosedJaxpr
-from ..llvm.ir import NotCompilable, check_size, check_type
+from ..llvm.ir import check_size, check_that, check_type
 from ..llvm.memory import Buffer, contiguous, load_row, stored_type
 from ..llvm.values import SMALL, Value, objects
 from ..module import Module
@@ -38,11 +38,11 @@ def kernel_text(module: Module, function: ClosedJaxpr, lane_flags: Sequence[bool
     results = pointers("%rets", "r", jaxpr.outvars)
     # Before the loop over blocks: strides, and operands that all trajectories share, are read once.
     pairs = zip(operands, lane_flags, strict=True)
-    lanes = [_lane_stride(module, aval) if has_lanes else None for (_, aval), has_lanes in pairs]
-    result_lanes = [_lane_stride(module, aval) for _, aval in results]
+    lanes = [lane_stride(module, aval) if has_lanes else None for (_, aval), has_lanes in pairs]
+    result_lanes = [lane_stride(module, aval) for _, aval in results]
     evaluator = Evaluator(module)
     shared = [
-        _operand(evaluator, _array(module, *operand, None, "")) if lane is None else None
+        operand_value(evaluator, array_at(module, *operand, None, "")) if lane is None else None
         for operand, lane in zip(operands, lanes, strict=True)
     ]
     consts = [evaluator.constant(c) for c in function.consts]
@@ -55,11 +55,11 @@ def kernel_text(module: Module, function: ClosedJaxpr, lane_flags: Sequence[bool
         fits = b.new(f"icmp slt i64 {start}, %last.start")
         start = b.new(f"select i1 {fits}, i64 {start}, i64 %last.start")
         values = [
-            value or _operand(evaluator, _array(module, *operand, lane, start))
+            value or operand_value(evaluator, array_at(module, *operand, lane, start))
             for operand, lane, value in zip(operands, lanes, shared, strict=True)
         ]
         places = [
-            _array(module, *result, lane, start)
+            array_at(module, *result, lane, start)
             for result, lane in zip(results, result_lanes, strict=True)
         ]
         outs = evaluator.jaxpr(jaxpr, consts, values, places)
@@ -84,14 +84,14 @@ def kernel_text(module: Module, function: ClosedJaxpr, lane_flags: Sequence[bool
     return "\n".join([*front, body, "}\n"])
 
 
-def _lane_stride(module: Module, aval: Any) -> int | str:
+def lane_stride(module: Module, aval: Any) -> int | str:
     """The distance between trajectories in elements; that of long arrays is an input."""
     if aval.size <= SMALL:
         return int(aval.size)
     return module.parameter(aval.size).names[0]
 
 
-def _array(module: Module, pointer: str, aval: Any, lane: int | str | None, start: str) -> Buffer:
+def array_at(module: Module, pointer: str, aval: Any, lane: int | str | None, start: str) -> Buffer:
     """An operand or a result of the block that begins at `start`; a shared one without a lane."""
     b, item = module.b, stored_type(str(aval.dtype))
     bases = [pointer] if lane is None else []
@@ -103,7 +103,7 @@ def _array(module: Module, pointer: str, aval: Any, lane: int | str | None, star
     return Buffer(tuple(bases), str(aval.dtype), aval.shape, contiguous(aval.shape), lane)
 
 
-def _operand(evaluator: Evaluator, buffer: Buffer) -> Value:
+def operand_value(evaluator: Evaluator, buffer: Buffer) -> Value:
     value = Value(buffer.shape, buffer.dtype, buffer=buffer)
     if value.size <= SMALL:
         value.entries = objects(load_row(evaluator.b, buffer), buffer.shape)
@@ -130,8 +130,7 @@ class Numbers:
         check_size(count, limit, "the number of operations (a loop counts once)")
         # A long program would be written for seconds up to the equation that has no rule.
         missing = primitives_in(function.jaxpr) - RULES.keys() if count > _LONG_PROGRAM else set()
-        if missing:
-            raise NotCompilable(f"there is no rule for the primitive {min(missing)}")
+        check_that(not missing, f"there is no rule for the primitive {min(missing, default='')}")
         if width is not None:
             vectors = max(width // machine.width(), 1)
         else:

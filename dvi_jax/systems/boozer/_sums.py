@@ -98,10 +98,8 @@ def _over_k(c: Any, s: Any, phases: Complex, n: Any, order: int) -> tuple[Comple
         return tuple(_plus(*pair) for pair in zip(sums, terms, strict=True)), None
 
     start = tuple((zero, zero) for _ in range((1, 3, 6)[order]))
-    # A loop in machine code is short to compile. On a GPU each round of a loop would be several
-    # kernels: written out it takes half the time.
-    unroll = 1 if jax.default_backend() == "cpu" else c.shape[1]
-    return lax.scan(add, start, (jnp.swapaxes(c, 0, 1), phases, n), unroll=unroll)[0]
+    # The same loop on all devices, so that a GPU computes the same bits.
+    return lax.scan(add, start, (jnp.swapaxes(c, 0, 1), phases, n))[0]
 
 
 # Jitted, so that all calls in a step share one trace.
