@@ -2,8 +2,7 @@
 
 from collections.abc import Sequence
 
-SHORT = 8
-"""A longer axis becomes a loop."""
+from ..jaxprs.extent import SHORT
 
 MOST_WRITTEN_OUT = 32
 """The short axes of an array have at most so many indices together: for each of them there is code,

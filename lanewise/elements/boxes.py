@@ -11,13 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..jaxprs.extent import cost_of
 from .axes import short_axes
-
-_FUNCTIONS = (
-    "sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp exp2 expm1 log log1p "
-    "log2 cbrt erf erfc erf_inv logistic pow"
-)
-_OTHER_COSTS = {"div": 6, "sqrt": 6, "rsqrt": 12, "rem": 12}
 
 
 class NotABoxError(Exception):
@@ -156,8 +151,7 @@ class Table:
         # What is the same for all elements is computed before the loops over them.
         cost = 0
         if kind == "operation" and new.depth:
-            word = name.split()[0]
-            cost = 24 if word in _FUNCTIONS.split() else _OTHER_COSTS.get(word, 1)
+            cost = cost_of(name.split()[0])
         new.cost = cost + sum(a.cost for a in args)
         new.height = 1 + max((a.height for a in args), default=0)
         return new

@@ -27,8 +27,8 @@ class Kernel:
         for v in (*jaxpr.invars, *jaxpr.outvars):
             check_type(v.aval.dtype, "arguments and results")
         translation = Translation()
-        inputs = [_argument(v.aval) for v in jaxpr.invars]
-        results = [_argument(v.aval) for v in jaxpr.outvars]
+        inputs = [_argument(v.aval, "operand") for v in jaxpr.invars]
+        results = [_argument(v.aval, "result") for v in jaxpr.outvars]
         # Results are written where XLA wants them as soon as they are computed.
         arrays = [memory.load(translation.table) for memory in inputs]
         outs = translation.evaluate(function, arrays, [memory.place for memory in results])
@@ -174,6 +174,6 @@ class Kernel:
         return "\n".join(["\n".join(module.globals), declarations, functions, KERNEL, body, "}\n"])
 
 
-def _argument(aval: Any) -> Memory:
-    """An operand or a result: its pointer is known when the code runs."""
-    return Memory(aval.shape, aval.dtype, row_major(aval.shape), pointer="outside")
+def _argument(aval: Any, pointer: str) -> Memory:
+    """An operand or a result: its place is known when the code runs."""
+    return Memory(aval.shape, aval.dtype, row_major(aval.shape), pointer)

@@ -7,7 +7,7 @@ from the expressions, without a number.
 from collections.abc import Sequence
 from typing import Any
 
-from .axes import SHORT
+from ..jaxprs.extent import SHORT
 from .boxes import Array, Box, Expression, IndexMap, elementwise
 
 Delta = tuple[tuple[int, ...], int]

@@ -48,12 +48,25 @@ class Token:
     """The result of an equation that is not evaluated yet."""
 
 
+class Within:
+    """Statements go to another block for a while."""
+
+    def __init__(self, translation: "Translation", block: Block):
+        self.translation, self.block = translation, block
+
+    def __enter__(self) -> None:
+        self.outer, self.translation.block = self.translation.block, self.block
+
+    def __exit__(self, *_: Any) -> None:
+        self.translation.block = self.outer
+
+
 class Translation:
-    """The tree of one program; `block` is where statements are added."""
+    """The tree of one program; `block` is where statements are added, `root` the outermost one."""
 
     def __init__(self):
         self.table = Table()
-        self.block = Block()
+        self.root = self.block = Block()
         self.operands: list[tuple[Memory, np.ndarray]] = []
         self._constants: dict[Any, Array] = {}
         self.factors: dict[Any, Any] = {}  # of linear systems that are solved again
@@ -73,7 +86,7 @@ class Translation:
         # Operands of the call, not text: LLVM takes long to parse text of many numbers.
         key = str(array.dtype), array.shape, array.tobytes()
         if key not in self._constants:
-            memory = Memory(array.shape, array.dtype, row_major(array.shape), pointer="")
+            memory = Memory(array.shape, array.dtype, row_major(array.shape), "constant")
             self.operands.append((memory, np.ascontiguousarray(array)))
             self._constants[key] = memory.load(self.table)
         return self._constants[key]

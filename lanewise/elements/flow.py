@@ -5,9 +5,9 @@ from typing import Any
 
 from ..jaxprs.jaxapi import ClosedJaxpr, scan_counts
 from .boxes import Array
-from .equations import ARRAY_RULES, Translation, row_major
+from .equations import ARRAY_RULES, Translation, Within, row_major
 from .reductions import reduction_of
-from .tree import Block, Branch, Loop, Memory, Number, Place
+from .tree import Branch, Loop, Memory, Number, Place
 
 
 class Carry:
@@ -62,19 +62,6 @@ class Carry:
                 self.loop.memories.append((memory, new))
 
 
-class _Within:
-    """Statements go to another block for a while."""
-
-    def __init__(self, translation: Translation, block: Block):
-        self.translation, self.block = translation, block
-
-    def __enter__(self) -> None:
-        self.outer, self.translation.block = self.translation.block, self.block
-
-    def __exit__(self, *_: Any) -> None:
-        self.translation.block = self.outer
-
-
 def scan(
     translation: Translation, eqn: Any, args: list[Array], places: list, used: list[bool]
 ) -> list[Array]:
@@ -109,7 +96,7 @@ def scan(
         rows.append(place)
         if place is not None:
             loop.rows.append(place.memory)
-    with _Within(translation, loop.body):
+    with Within(translation, loop.body):
         k = Array.uniform(translation.number(loop.counter), ())
         if reverse:
             k = translation.apply("sub", translation.known(length - 1), k)
@@ -170,13 +157,13 @@ def while_loop(
     inputs = body.jaxpr.invars[second:]
     moves = [out is not var for out, var in zip(body.jaxpr.outvars, inputs, strict=True)]
     state = Carry(translation, loop, args[first + second :], moves)
-    with _Within(translation, loop.test):
+    with Within(translation, loop.test):
         (goes_on,) = translation.evaluate(test, [*fixed[:first], *state.now])
         goes_on = (
             reduction_of(translation, goes_on, "or", range(len(shape)), ()) if shape else goes_on
         )
         loop.condition = goes_on.expression
-    with _Within(translation, loop.body):
+    with Within(translation, loop.body):
         outs = translation.evaluate(body, [*fixed[first:], *state.now])
         if shape:  # a condition for each element: those that have ended keep their values
             (is_going,) = translation.evaluate(test, [*fixed[:first], *state.now])
@@ -229,7 +216,7 @@ def cond(
     expressions: dict[Number, list] = {n: [] for of in numbers for n in of}
     translation.branches += 1
     for block, function in zip(branch.blocks, branches, strict=True):
-        with _Within(translation, block):
+        with Within(translation, block):
             outs = translation.evaluate(function, operands)
             for x, result, of, is_used in zip(outs, results, numbers, used, strict=True):
                 if of:

@@ -14,9 +14,10 @@ from ..rules.elementwise import ELEMENTWISE
 from ..rules.reductions import neutral
 from .boxes import Array, Expression, common_boxes
 from .schedule import Group, arrays
+from .tiles import Tiles, product_of, with_one_matrix
 from .tree import Let, Memory, Number, Reduce, Statement, Store, Update
 from .updates import write_element, write_update
-from .vectors import first_elements, gather, load, store
+from .vectors import first_elements, gather, halves, load, store
 
 PARTIAL_SUMS = 32
 """Element k of a row is added to partial sum k mod 32, whatever the length of a vector is."""
@@ -63,17 +64,44 @@ class Nests:
         if not cells:
             return
         self.group_now = group
+        cells = self.without_products(group, cells)
+        reductions = dict.fromkeys(
+            s for *_, items in cells for s, _ in items if isinstance(s, Reduce)
+        )
         with self.scope():
-            for s in statements:
-                if isinstance(s, Reduce):
-                    self.begin_reduction(s, group.shape, cells)
+            for s in reductions:
+                self.begin_reduction(s, group.shape, cells)
             for lower, upper, items in cells:
                 with self.scope():
                     self.nest(lower, upper, items, [])
             # The partial sums run through all boxes: they are joined once.
-            for s in statements:
-                if isinstance(s, Reduce) and isinstance(s.result, Number):
+            for s in reductions:
+                if isinstance(s.result, Number):
                     self.numbers[s.result] = self.total(s)
+
+    def without_products(self, group: Group, cells: list) -> list:
+        """Write the sums of products that are one box in tiles: the cells of the other statements.
+
+        They come before these: what they read may be written over, and they read no result of
+        their group.
+        """
+        if len(cells) != 1:
+            return cells
+        ((lower, upper, items),) = cells
+        products, others = [], []
+        for s, node in items:
+            product = product_of(s, node, group.shape)
+            if product is None or any(group.is_handed_on(x) for x in node.loads(set())):
+                others.append((s, node))
+            else:
+                products.append(product)
+        for of_matrix in with_one_matrix(products):
+            with self.scope():
+                tiles = Tiles(self, of_matrix, group.shape)
+                for product in of_matrix if tiles.has_parts else ():
+                    self.begin_reduction(product.sum, group.shape, cells)
+                tiles.write()
+        return [(lower, upper, others)] if others else []
 
     def is_in_place(self, s: Statement, node: Expression) -> bool:
         """Whether a statement would copy an element to where it is."""
@@ -305,19 +333,12 @@ class Nests:
                 self.e.combine(s.op, x, y)
                 for x, y in zip(vectors[:half], vectors[half:], strict=True)
             ]
-        kind, name = b.type(dtype, True), b.ref(vectors[0], 0, True)
+        total = vectors[0]
         with self.scalars():
-            ones = [
-                b.number([b.new(f"extractelement {kind} {name}, i64 {i}")], dtype, False)
-                for i in range(W)
-            ]
-            while len(ones) > 1:
-                half = len(ones) // 2
-                ones = [
-                    self.e.combine(s.op, x, y)
-                    for x, y in zip(ones[:half], ones[half:], strict=True)
-                ]
-        return b.opaque(ones[0])
+            while W > 1:
+                total = self.e.combine(s.op, *halves(b, total, W))
+                W //= 2
+        return b.opaque(total)
 
     # --- numbers ---------------------------------------------------------------------------------
 

@@ -1,5 +1,6 @@
 """Sums and other reductions of long arrays, matrix products, running sums."""
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -7,12 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from ..jaxprs.extent import SHORT
 from ..llvm.ir import NotCompilable
 from ..rules.moves import CUMULATIVE, REDUCTIONS
 from ..rules.reductions import neutral
-from .boxes import Array, Box, elementwise
-from .equations import ARRAY_RULES, Translation, expand
-from .tree import Memory, Number, Reduce
+from .boxes import Array, Box, Expression, elementwise
+from .equations import ARRAY_RULES, Translation, Within, expand, row_major
+from .tree import FIXED, Memory, Number, Reduce
+
+
+_SHORT_ROW = 32  # terms
 
 
 def reduction(translation: Translation, eqn: Any, x: Array) -> list[Array]:
@@ -112,21 +117,85 @@ def matrix_product(translation: Translation, eqn: Any, x: Array, y: Array) -> li
     free_x = [a for a in range(len(x.shape)) if a not in (*of_x, *batch_x)]
     free_y = [a for a in range(len(y.shape)) if a not in (*of_y, *batch_y)]
     shape = [*(x.shape[a] for a in (*batch_x, *free_x)), *(y.shape[a] for a in free_y)]
-    frame = [*shape, *(x.shape[a] for a in of_x)]
-    axes_x, axes_y = [0] * len(x.shape), [0] * len(y.shape)
+    x, y = _read_often(translation, x, y, free_x, free_y)
+    sums = [x.shape[a] for a in of_x]
+    is_written_out = math.prod(sums) <= SHORT
+    frame = shape if is_written_out else [*shape, *sums]
+    axes_x: list[int | None] = [None] * len(x.shape)
+    axes_y: list[int | None] = [None] * len(y.shape)
     for k, a in enumerate((*batch_x, *free_x)):
         axes_x[a] = k
-    for k, a in enumerate(batch_y):
-        axes_y[a] = k
-    for k, a in enumerate(free_y):
-        axes_y[a] = len(batch_x) + len(free_x) + k
+    for k, a in enumerate((*batch_y, *free_y)):
+        axes_y[a] = k if k < len(batch_y) else k + len(free_x)
+    if is_written_out:
+        terms = []
+        for index in np.ndindex(*sums):
+            offsets_x, offsets_y = [0] * len(x.shape), [0] * len(y.shape)
+            for a, c, i in zip(of_x, of_y, index, strict=True):
+                offsets_x[a] = offsets_y[c] = i
+            pair = x.along(frame, axes_x, offsets_x), y.along(frame, axes_y, offsets_y)
+            terms.append(combine_arrays("mul", *pair))
+        zero = Array.uniform(translation.table.known(0, dtype), shape)
+        return [_combine_all("add", terms) if terms else zero]
     for k, (a, c) in enumerate(zip(of_x, of_y, strict=True)):
         axes_x[a] = axes_y[c] = len(shape) + k
     # All products as one array that is summed over its last axes. It is never written.
     product = combine_arrays("mul", x.along(frame, axes_x), y.along(frame, axes_y))
-    if not of_x:
-        return [product]
     return [reduction_of(translation, product, "add", range(len(shape), len(frame)), shape)]
+
+
+def _read_often(
+    translation: Translation, x: Array, y: Array, free_x: list[int], free_y: list[int]
+) -> list[Array]:
+    """The operands of a product of matrices, computed before it where each element is used often,
+    and one of them with neighbours along an axis of the result."""
+    frees = free_x, free_y
+    repeats = [math.prod(a.shape[k] for k in free) for a, free in ((y, free_y), (x, free_x))]
+    pair = [
+        translation.settle(a) if a.cost and count > SHORT else a
+        for a, count in zip((x, y), repeats, strict=True)
+    ]
+    terms = x.size // max(math.prod(x.shape[k] for k in free_x), 1)
+    # What does not change is turned once, before all loops.
+    fixed = [i for i in (0, 1) if all(_is_fixed(node) for node in pair[i].loads())]
+    if min(repeats) > SHORT:
+        if any(map(_has_neighbours, pair, frees)):
+            return pair
+        which = fixed[0] if fixed else int(x.size > y.size)
+    else:
+        # A matrix times a vector: joining the partial sums of a short row takes most of the time.
+        matrices = [i for i in fixed if frees[i] and not _has_neighbours(pair[i], frees[i])]
+        if not SHORT < terms <= _SHORT_ROW or translation.block is translation.root:
+            matrices = []
+        if not matrices:
+            return pair
+        which = matrices[0]
+    pair[which] = _turned(translation, pair[which], frees[which][-1], which in fixed)
+    return pair
+
+
+def _turned(translation: Translation, x: Array, axis: int, is_fixed: bool) -> Array:
+    """An array in other memory, where neighbours along an axis are neighbours."""
+    order = [*(a for a in range(len(x.shape)) if a != axis), axis]
+    places = [order.index(a) for a in range(len(order))]
+    turned = x.along([x.shape[a] for a in order], places)
+    memory = Memory(turned.shape, turned.dtype, row_major(turned.shape))
+    with Within(translation, translation.root if is_fixed else translation.block):
+        return translation.store(turned, memory.place).along(x.shape, order)
+
+
+def _is_fixed(node: Expression) -> bool:
+    """Whether a load reads the same all the time."""
+    return node.kind == "load" and not node.args and node.value.pointer in FIXED
+
+
+def _reads(x: Array) -> list[Expression]:
+    return [node for node in x.loads() if node.kind == "load"]
+
+
+def _has_neighbours(x: Array, axes: Sequence[int]) -> bool:
+    """Whether all that an array reads lies in a row of memory along one of some axes."""
+    return any(all(node.strides[a] in (0, 1) for node in _reads(x)) for a in axes)
 
 
 def _running(op: str) -> Callable:

@@ -7,11 +7,10 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from ..jaxprs.extent import LARGE_SYSTEM
+from ..jaxprs.extent import LARGE_SYSTEM, SHORT
 from ..linear import by_elimination, column_by_column
 from ..llvm.ir import NotCompilable
 from . import bands
-from .axes import SHORT
 from .boxes import Array
 from .diagonals import diagonals
 from .equations import ARRAY_RULES, Translation

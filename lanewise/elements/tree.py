@@ -26,11 +26,16 @@ class Number:
         return f"n{self.serial}"
 
 
+FIXED = ("operand", "constant")
+"""Pointers of memories that are not written."""
+
+
 class Memory:
     """An array in memory.
 
     - `strides`: in elements. By default short axes come first, so that a long one is contiguous.
-    - `pointer`: its name in the code, for operands, results and constants; others get bytes.
+    - `pointer`: what it is if its place is known when the code runs: one of `FIXED`, or a result;
+      others get bytes.
     - `whole`, `distance`: the part of another memory that begins after `distance` elements, an
       expression.
     """

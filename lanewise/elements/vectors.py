@@ -3,7 +3,7 @@
 import numpy as np
 
 from ..llvm.builder import Builder
-from ..llvm.ir import Num
+from ..llvm.ir import TYPES, Num
 from ..llvm.memory import stored_type
 from ..native import machine
 
@@ -49,6 +49,21 @@ def store(b: Builder, where: str, x: Num, stride: int, mask: str | None = None) 
 def first_elements(b: Builder, count: int) -> str:
     """The mask of the first elements of a vector."""
     return f"<{', '.join(f'i1 {str(i < count).lower()}' for i in range(b.W))}>"
+
+
+def halves(b: Builder, x: Num, width: int) -> list[Num]:
+    """The first and the second half of a vector; each sets the length of vectors to its own."""
+    name, kind = x.names[0], f"<{width} x {TYPES[x.dtype]}>"
+    b.W = width // 2
+    if b.W == 1:
+        parts = [b.new(f"extractelement {kind} {name}, i64 {i}") for i in range(2)]
+    else:
+        parts = []
+        for first in (0, b.W):
+            places = ", ".join(f"i32 {first + i}" for i in range(b.W))
+            mask = f"<{b.W} x i32> <{places}>"
+            parts.append(b.new(f"shufflevector {kind} {name}, {kind} poison, {mask}"))
+    return [b.number([part], x.dtype, b.W > 1) for part in parts]
 
 
 def _steps(b: Builder, stride: int) -> str:

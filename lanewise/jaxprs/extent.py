@@ -1,9 +1,8 @@
 """How large a function is: operations, and numbers that its loops carry."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from typing import Any
-
-import numpy as np
 
 from ..llvm.ir import MOST_OPERATIONS
 from .jaxapi import ClosedJaxpr, bodies, scan_counts
@@ -70,26 +69,35 @@ def primitives_in(jaxpr: Any) -> set[str]:
 
 def operation_count(jaxpr: Any) -> int:
     """How many operations on numbers the evaluation is made of, loops counted once; roughly."""
-    count = 0
+    return sum(_operations(eqn) for eqn in _innermost(jaxpr))
+
+
+def _innermost(jaxpr: Any) -> Iterator[Any]:
+    """The equations of a function and of all that it calls that call no function."""
     for eqn in jaxpr.eqns:
-        inner = [operation_count(function.jaxpr) for function in _evaluated(eqn)]
-        if inner:
-            count += sum(inner)
-            continue
-        name, size = eqn.primitive.name, max((v.aval.size for v in eqn.outvars), default=0)
-        if name == "dot_general":
-            (axes, _), _ = eqn.params["dimension_numbers"]
-            # One fused multiply-add for each term.
-            size *= int(np.prod([eqn.invars[0].aval.shape[i] for i in axes]))
-        elif name.startswith("reduce_"):
-            size = eqn.invars[0].aval.size
-        elif name == "eliminate":
-            n, matrices = eqn.invars[0].aval.shape[-1], eqn.invars[0].aval.size
-            size = matrices * n // 3 + size * n - matrices  # more columns of one matrix
-        elif name in _FREE:
-            size = 0
-        count += size
-    return count
+        functions = _evaluated(eqn)
+        if not functions:
+            yield eqn
+        for function in functions:
+            yield from _innermost(function.jaxpr)
+
+
+def _operations(eqn: Any) -> int:
+    name, size = eqn.primitive.name, max((v.aval.size for v in eqn.outvars), default=0)
+    if name == "dot_general":
+        return size * _terms(eqn)  # one fused multiply-add for each term
+    if name.startswith("reduce_"):
+        return eqn.invars[0].aval.size
+    if name == "eliminate":
+        n, matrices = eqn.invars[0].aval.shape[-1], eqn.invars[0].aval.size
+        return matrices * n // 3 + size * n - matrices  # more columns of one matrix
+    return 0 if name in _FREE else size
+
+
+def _terms(eqn: Any) -> int:
+    """Terms of each sum of a matrix product."""
+    (axes, _), _ = eqn.params["dimension_numbers"]
+    return math.prod(eqn.invars[0].aval.shape[i] for i in axes)
 
 
 _MOVES = (
@@ -97,6 +105,61 @@ _MOVES = (
     "unstack pad rev copy convert_element_type stop_gradient"
 )
 _FREE = frozenset(_MOVES.split())
+
+
+_FUNCTIONS = (
+    "sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp exp2 expm1 log log1p "
+    "log2 cbrt erf erfc erf_inv logistic pow"
+)
+_COSTS = {**dict.fromkeys(_FUNCTIONS.split(), 24), "div": 6, "sqrt": 6, "rsqrt": 12, "rem": 12}
+
+
+def cost_of(name: str) -> int:
+    """The time of an elementwise operation, where that of an addition is 1."""
+    return _COSTS.get(name, 1)
+
+
+SHORT = 8
+"""An axis that is not longer is written out, not computed by a loop."""
+
+TERMS_READ_ONCE, TERMS_IN_BLOCKS = 10_000, 2**26
+"""Terms of matrix products in a round, above which XLA is faster if they take most of the time:
+where each number of a matrix is used at most 8 times, and of all others."""
+
+
+def reason_for_xla(jaxpr: Any) -> str | None:
+    """Why XLA is faster for a program with long arrays; None if it is not."""
+    for body in _loop_bodies(jaxpr) or [jaxpr]:
+        once = blocks = others = 0
+        for eqn in _innermost(body):
+            operations = _operations(eqn)
+            if eqn.primitive.name == "sort":
+                return f"the sort of {eqn.invars[0].aval.size} numbers"
+            if eqn.primitive.name != "dot_general" or _terms(eqn) <= SHORT:
+                others += operations * cost_of(eqn.primitive.name)
+            # How often each number of an operand is used.
+            elif any(operations <= SHORT * v.aval.size for v in eqn.invars):
+                once += operations
+            else:
+                blocks += operations
+        if once > max(TERMS_READ_ONCE, 3 * others):
+            return (
+                f"matrices of {once} numbers, times vectors: XLA reads them once for a whole batch"
+            )
+        if blocks > max(TERMS_IN_BLOCKS, 3 * others):
+            return f"matrix products of {blocks} terms: XLA computes them in blocks for the cache"
+    return None
+
+
+def _loop_bodies(jaxpr: Any) -> list[Any]:
+    bodies_of = []
+    for eqn in jaxpr.eqns:
+        functions = _evaluated(eqn)
+        if eqn.primitive.name in _LOOPS:
+            bodies_of += [function.jaxpr for function in functions]
+        for function in functions:
+            bodies_of += _loop_bodies(function.jaxpr)
+    return bodies_of
 
 
 LONG_CARRY, LONG_VALUE, LARGE_SYSTEM = 48, 4096, 32
@@ -150,9 +213,7 @@ def _has_matrices(functions: Sequence[ClosedJaxpr]) -> bool:
         return True
     for eqn in (eqn for function in functions for eqn in function.jaxpr.eqns):
         if eqn.primitive.name == "dot_general":
-            (axes, _), _ = eqn.params["dimension_numbers"]
-            terms = np.prod([eqn.invars[0].aval.shape[i] for i in axes])
-            if eqn.outvars[0].aval.size > PAIRS and terms > 8:
+            if eqn.outvars[0].aval.size > PAIRS and _terms(eqn) > SHORT:
                 return True
         if _has_matrices((*bodies(eqn), *functions_in(eqn))):
             return True

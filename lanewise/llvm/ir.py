@@ -31,6 +31,10 @@ class NotCompilable(Exception):
     """Something for which no code is generated; the message says what."""
 
 
+class FasterInXlaError(NotCompilable):
+    """A program that XLA computes faster than all targets."""
+
+
 def check_type(dtype: Any, name: str = "numbers") -> str:
     """The name of a type for which code is generated."""
     if str(dtype) not in TYPES:

@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 
 from ..elements.code import Kernel
-from ..jaxprs.extent import has_long_arrays, operation_count
+from ..jaxprs.extent import has_long_arrays, operation_count, reason_for_xla
 from ..jaxprs.jaxapi import ClosedJaxpr
-from ..llvm.ir import NotCompilable
+from ..llvm.ir import FasterInXlaError, NotCompilable
 from ..module import Module
 from ..native import handler, machine
 from .numbers import HEAD
@@ -27,6 +27,8 @@ class Elements:
 
     def write_for(self, function: ClosedJaxpr, lane_flags: Sequence[bool], width: int) -> Code:
         """The code for vectors of `width` numbers."""
+        if reason := reason_for_xla(function.jaxpr):
+            raise FasterInXlaError(reason)
         module = Module(width, 1)
         try:
             kernel = Kernel(module, function, lane_flags)

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from ..jaxprs.jaxapi import ClosedJaxpr
-from ..llvm.ir import NotCompilable
+from ..llvm.ir import FasterInXlaError, NotCompilable
 from ..native.handler import module_text
 
 
@@ -113,5 +113,7 @@ def compiled_by(
             return CompiledProgram(target, code, reasons)
         except NotCompilable as refusal:
             reasons[target.name] = str(refusal)
+            if isinstance(refusal, FasterInXlaError):
+                break
     # Targets share rules, and give the same reason where a rule is missing.
     raise NotCompilable("; ".join(dict.fromkeys(reasons.values())))
