@@ -228,9 +228,22 @@ def test_an_argument_tau_that_would_receive_t_is_refused():
     ):
         with pytest.raises(TypeError, match="is the time t, not τ"):
             dvi.integrate(slow, [1.0], [0.2], **inputs, **options)
+    # These places do not receive ε.
+    f = systems.InSlowTime(of_tau)
+    for options in (
+        {"observe": {"x": dvi.Section(f)}},
+        {"stop": dvi.Stop(f)},
+        {"save": dvi.Save(ts=[0.2], clock=f)},
+        {"lattice": dvi.TimeTransformed(f)},
+    ):
+        with pytest.raises(ValueError, match="do not receive ε"):
+            dvi.integrate(slow, [1.0], [0.2], **inputs, **options)
     data = dvi.Observations([0.1, 0.2], [1.0, 1.0], t0=0.0, observe=of_tau)
     model = dvi.Model(slow, h=0.1, p0=[0.2], epsilon=0.3)
     with pytest.raises(TypeError, match="is the time t, not τ"):
+        dvi.fit(model, data, {"q0": [1.0]})
+    data = dvi.Observations([0.1], [1.0], t0=0.0, observe=systems.InSlowTime(of_tau))
+    with pytest.raises(ValueError, match="do not receive ε"):
         dvi.fit(model, data, {"q0": [1.0]})
     # A system without a slow time has no τ = εt.
     fast = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + q @ q / 2)

@@ -82,8 +82,8 @@ class InSlowTime(eqx.Module):
         count = {7: 2, 4: 1}.get(len(arguments), 0)  # of the times, which come first
         if count and self.epsilon is None:
             raise ValueError(
-                f"{getattr(self.function, '__name__', 'f')} needs the value of epsilon, since its "
-                "system has slow_time=True: call its method bind(system, epsilon)."
+                f"{getattr(self.function, '__name__', 'f')} needs the value of epsilon: bind(system"
+                ", epsilon). Section, Stop, clock, speed and data do not receive ε: compute ε t."
             )
         function = _of_step(self.function) if count == 2 else self.function
         times = (self.epsilon * t for t in arguments[:count])

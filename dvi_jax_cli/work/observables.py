@@ -25,7 +25,7 @@ def read_observables(texts: dict[str, str] | None, source: Source) -> dict[str, 
 
     **Raises** `InputError`.
     """
-    defaults = dict(source.problem.observables) if source.problem is not None else {}
+    defaults = of_steps(dict(source.problem.observables)) if source.problem is not None else {}
     if texts is None:
         return with_drifts(defaults)
     return {
@@ -54,12 +54,9 @@ def _observable(key: str, text: str, names: dict[str, Callable], source: Source)
         function = source.loader.load(key, inner)
         defect = f"{inner!r} has the type {type(function).__name__}"
         require(callable(function), key, defect, _A_FUNCTION)
-        # An energy has `bind` and is called with the system.
-        if not hasattr(function, "bind"):
-            defect = f"{inner!r} has other arguments, {signature_of(function)}"
-            with as_input_error(key, _A_FUNCTION, text=lambda _: defect):
-                function = of_steps(function)
-        return wrap(function)
+        defect = f"{inner!r} has other arguments, {signature_of(function)}"
+        with as_input_error(key, _A_FUNCTION, text=lambda _: defect):
+            return wrap(of_steps(function))
     calls = ", ".join(f"{name}()" for name in indicators)
     rule = f'{{}}; or "file.py:name"; alone or in {", ".join(reductions)}; or {calls}'
     require_name(key, inner, names, rule, f"{inner!r} is unknown")
@@ -71,7 +68,7 @@ class Observed:
     """One observable of a run.
 
     - `start`: its value at the start. `values`: at the saved times, the start first, shape
-      (S, …), for one without a reduction; else the reduced value.
+      (S, …), for one without a reduction; else the reduced value; the number of crossings.
     - `scale`: size that changes are divided by; 1 where the start value is zero or not finite.
     - `reduction`: name of the reduction, or "".
     """
@@ -129,7 +126,8 @@ def observe(
         if function is OBSERVABLES["linear_momentum"]:
             scale = float(np.linalg.norm(run["p0"], axis=-1).sum())
         scale = scale if np.isfinite(scale) and scale else 1.0
-        series = np.asarray(values[name])
+        value: Any = values[name]
+        series = np.asarray(value.count if isinstance(value, dvi.Crossings) else value)
         if not (reduction or is_of_state):  # no step has reached the start
             series = np.concatenate([start[None], series])
         results[name] = Observed(start, series, scale, reduction)

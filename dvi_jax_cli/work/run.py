@@ -10,6 +10,7 @@ import numpy as np
 
 import dvi_jax as dvi
 from dvi_jax import plot
+from dvi_jax.sweep.axes import place
 from dvi_jax.systems.n_body import OBSERVABLES
 from dvi_jax.systems.planets.solar_system import check_covered
 
@@ -68,7 +69,8 @@ def run_file(
         report.contents |= {"name": source.name, "units": units}
         _describe(report, result, observed, seconds)
         arrays = {name: np.asarray(getattr(result, name)) for name in ("ts", "qs", "ps", "hs")}
-        values = {f"observed/{name}": np.asarray(result.observed["own"][name]) for name in observed}
+        leaves = jax.tree.leaves_with_path(result.observed["own"])  # several of a section
+        values = {f"observed/{place(path)}": np.asarray(leaf) for path, leaf in leaves}
         report.write_arrays("trajectory.npz", arrays | values)
         ts, qs, ps, _ = arrays.values()
         if source.jd is None:

@@ -349,7 +349,7 @@ class SampleBox(TomlTable):
     low: StatePair = key(..., f"a corner of the box, {BOX}")
     high: StatePair = key(..., f"a corner of the box, {BOX}")
     times: Annotated[Two[Number], check(lambda span: span[0] < span[1])] | None = key(
-        None, "[first, last]: times of the samples, all at t0 if not given"
+        None, "[first, last]: times of the samples (τ for a slow time), all at t0 if not given"
     )
     seed: NonNegative = key(0, SEED)
 
@@ -405,7 +405,7 @@ class Domain(TomlTable):
     inside: Text | None = key(None, f"{FILE} of a function (q, p) that is ≥ 0 in the domain")
     periodic: union(boolean=bool, array=NonEmpty[bool]) = key(False, "true, or booleans like q")
     times: Interval | None = key(
-        None, "[first, last]: times at which steps begin, where the map depends on the time"
+        None, "[first, last]: times at which steps begin (τ for a slow time), if the map has a time"
     )
 
 
