@@ -1081,6 +1081,7 @@ def test_loops_around_a_callback_or_a_sort_are_compiled(left):
 def test_loops_that_are_too_large_together_end_in_xla(left, monkeypatch):
     """Each loop could be compiled, the function of both cannot: no search without an end."""
     monkeypatch.setattr(extent, "MOST_OPERATIONS", 12)
+    monkeypatch.setattr(extent, "FOR_AN_EQUATION", 0)
 
     def loop(x):
         return lax.fori_loop(0, 3, lambda _, y: jnp.sin(jnp.sin(jnp.sin(y) + x) + x), x)
