@@ -86,7 +86,7 @@ def test_the_call_of_a_kernel_compiles_for_each_processor(processor):
     llvm.initialize_all_asmprinters()
     text = compute_text(processor) + "define ptr @use() { ret ptr @compute }"
     made = machine.target_machine(triple.get(processor, triple["x86_64"]), "", "")
-    assembly = made.emit_assembly(machine._optimise(text, made))
+    assembly = made.emit_assembly(machine.optimise(text, made))
     registers = {"x86_64": "ldmxcsr", "arm64": "FPCR, x"}
     for name, word in registers.items():
         assert (assembly.count(word) == 2) == (name == processor)

@@ -391,13 +391,13 @@ def register(text: str) -> str:
             text = text.replace("@lanewise_handler", f"@{name}")
             engine = machine.load(text, {"lanewise_run": run})
             address = engine.get_function_address(name)
-            jax.ffi.register_ffi_target(name, _capsule(address), platform="cpu")
+            jax.ffi.register_ffi_target(name, capsule(address), platform="cpu")
             _targets[key] = name
         return _targets[key]
 
 
-def _capsule(address: int) -> Any:
-    # The form in which JAX takes the address of a handler.
+def capsule(address: int) -> Any:
+    """The form in which JAX takes the address of a handler."""
     new = ctypes.pythonapi.PyCapsule_New
     new.restype = ctypes.py_object
     new.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]

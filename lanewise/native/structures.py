@@ -15,7 +15,8 @@ STRUCTURES = {
     "Array": "dtype size data",
     "Metadata_Extension": "extension_base.struct_size extension_base.type "
     "extension_base.next metadata",
-    "Metadata": f"struct_size {_VERSION}",
+    "Metadata": f"struct_size {_VERSION} traits",
+    "Stream_Get_Args": f"{_HEAD} ctx stream",
     "Error_Create_Args": f"{_HEAD} message errc",
     "ThreadPool_NumThreads_Args": f"{_HEAD} ctx num_threads",
     "ThreadPool_Schedule_Args": f"{_HEAD} ctx task data",

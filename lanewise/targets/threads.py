@@ -26,7 +26,6 @@ from ..llvm.ptx import (
     ptx_text,
 )
 from ..module import Module
-from ..native import cache
 from .numbers import array_at, lane_stride, operand_value
 from .target import Code
 
@@ -189,7 +188,8 @@ class Threads:
     def _known_architecture(self) -> int:
         if self.architecture is not None:
             return self.architecture
-        capability = least_capability()
+        # Code for the oldest one runs on all of them.
+        capability = min(capabilities(), default=min(ARCHITECTURES))
         architecture = architecture_for(capability)
         check_that(architecture is not None, f"the GPU is too old: sm_{capability}, not sm_80")
         assert architecture is not None
@@ -205,20 +205,23 @@ class Threads:
         return PtxKernel(text, NAME, *code.pointers, code.values, *sizes, architecture)
 
     def register(self, code: Code) -> str:
-        return f"lanewise_cuda_{cache.key(self.kernel(code).text)[:32]}"
+        from ..native import cuda
+
+        # Without a GPU a program is lowered for another machine, and not run.
+        kernel = self.kernel(code)
+        return cuda.register(kernel) if capabilities() else cuda.name_of(kernel)
 
     def assembly(self, code: Code) -> str:
         return self.kernel(code).text
 
 
-def least_capability() -> int:
-    """Ten times the compute capability of the oldest GPU of this process, which has code that all
-    of them run; without a GPU the least one that is supported."""
+def capabilities() -> list[int]:
+    """Ten times the compute capabilities of the GPUs of this process."""
     try:
         devices = jax.devices("cuda")
     except RuntimeError:  # code is made for another machine
-        return min(ARCHITECTURES)
-    return min(round(10 * float(device.compute_capability)) for device in devices)
+        return []
+    return [round(10 * float(device.compute_capability)) for device in devices]
 
 
 def ptx_of(function: ClosedJaxpr, lane_flags: Sequence[bool], architecture: int) -> PtxKernel:
