@@ -211,7 +211,7 @@ def _gpu_part(result: CompiledProgram) -> Part:
 
     assert isinstance(result.target, Threads)
     kernel = result.target.kernel(result.code)
-    registers = registers_of(kernel.text, kernel.architecture)
+    registers = registers_of(kernel.text, kernel.architecture)  # only CUDA's assembler knows
     return Part(
         None,
         kernel.operations,

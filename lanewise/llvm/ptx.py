@@ -68,7 +68,7 @@ def _target_machine(architecture: int) -> Any:
     # The target of GPUs is part of the wheel of llvmlite: CUDA need not be installed.
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()
-    version = ARCHITECTURES[architecture]
+    version = ARCHITECTURES[architecture]  # an unknown one ends here, and not in LLVM
     target = llvm.Target.from_triple("nvptx64-nvidia-cuda")
     return target.create_target_machine(
         cpu=f"sm_{architecture}", features=f"+ptx{version}", opt=3, reloc="default"
@@ -89,7 +89,7 @@ def ptx_text(ir: str, architecture: int) -> str:
     target = _target_machine(architecture)
     module = machine.optimise(ir, target, level=3, unroll=True)
     text = _with_bounds(target.emit_assembly(module))
-    cache.write(key, text.encode())
+    cache.write(key, text.encode())  # the driver stores what it makes of it itself
     return text
 
 
@@ -137,6 +137,7 @@ def report_of_ptxas(text: str, architecture: int) -> str | None:
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "kernel.ptx"
         source.write_text(text)
+        # The options of the driver, which compiles the text when it is loaded.
         options = f"-arch=sm_{architecture}", "-v", "-O3", "-o", str(source.with_suffix(".cubin"))
         command = [program, *options, str(source)]
         return subprocess.run(command, capture_output=True, text=True, check=True).stderr

@@ -47,7 +47,7 @@ class ThreadModule(Module):
     platform = "cuda"
 
     def __init__(self):
-        super().__init__(1, 1)
+        super().__init__(1, 1)  # a thread has one trajectory, in scalars
         self.arrays: list[str] = []
 
     def parameter(self, value: int) -> Num:
@@ -72,7 +72,7 @@ class ThreadModule(Module):
         pass
 
     def taken_back(self, x: Num, pointers: Sequence[str], vec: bool) -> Num:
-        return x
+        return x  # it is in a register still
 
     def parameters(self, operands: int, results: int, pointer: str = "ptr") -> str:
         """What the kernel and the function of one trajectory take, as text."""
@@ -133,7 +133,7 @@ def kernel_text(module: ThreadModule, operands: int, results: int) -> str:
         *(f"  %{r}.32 = call i32 @llvm.nvvm.read.ptx.sreg.{r}.x()" for r in registers),
         *(f"  %{r} = zext i32 %{r}.32 to i64" for r in registers),
         "  %first = mul i64 %ctaid, %ntid",
-        "  %lane = add i64 %first, %tid",
+        "  %lane = add i64 %first, %tid",  # in 64 bits: a batch may have more than 2³² numbers
         "  %is.inside = icmp ult i64 %lane, %lanes",
         "  br i1 %is.inside, label %run, label %over",
         "run:",
