@@ -35,9 +35,11 @@ def _by_digits(a: Array, b: Array) -> Array:
         count = lax.min(left, np.int64(_DIGITS))
         return lax.rem(lax.shift_left(r, count), m_b), left - count
 
+    # A shift by all digits at once would need an integer of 2000 bits.
     start = lax.rem(m, m_b), e - e_b
     r, _ = lax.while_loop(lambda state: state[1] > 0, next_digits, start)
     value = scale_in_two_steps(lax.convert_element_type(r, jnp.float64), e_b - 1075)
+    # A smaller dividend is the remainder itself; that of infinity, or by zero, is NaN.
     is_number = (a < jnp.inf) & (b > 0.0) & (b == b)
     return where(is_number, where(a < b, a, value), jnp.nan)
 

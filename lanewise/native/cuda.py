@@ -203,6 +203,7 @@ class Driver:
         self.call("cuDriverGetVersion", ctypes.byref(version))
         is_new = version.value >= _OLDEST_DRIVER
         check_that(is_new, f"a driver for CUDA 12 is required, this one is for {version.value}")
+        # The handlers call these functions without Python.
         for variable, name in (("launch", "cuLaunchKernel"), ("name", "cuGetErrorName")):
             address = ctypes.cast(getattr(library, name), ctypes.c_void_p).value
             _variable(f"lanewise_cuda_{variable}").value = address
@@ -224,6 +225,7 @@ class Driver:
         """The handle of a kernel on every device, from its PTX."""
         library, kernel = ctypes.c_void_p(), ctypes.c_void_p()
         log = ctypes.create_string_buffer(4096)
+        # A log, so that a reason names the line of PTX that the driver does not take.
         options = (ctypes.c_int * 2)(_LOG, _LOG_BYTES)
         values = (ctypes.c_void_p * 2)(ctypes.addressof(log), len(log))
         image = ctypes.c_char_p(text.encode())
@@ -272,6 +274,7 @@ def register(kernel: PtxKernel) -> str:
     with _lock:
         if name not in _names:
             handle = driver().load(kernel.text, kernel.name)
+            # Only the driver knows how many registers it uses, and what it moves to memory.
             local = driver().largest(_LOCAL_BYTES, handle)
             check_size(local, MOST_LOCAL_BYTES, "bytes of local memory of a GPU thread")
             threads = min(threads_for(driver().largest(_REGISTERS, handle)), kernel.threads)
@@ -286,6 +289,8 @@ def handler_address(name: str, handle: int, threads: int) -> int:
     run = _runtime().get_function_address("lanewise_cuda_run")
     text = _HANDLER.replace("NAME", name).replace("THREADS", str(threads))
     engine = machine.load(text, {"lanewise_cuda_run": run})
+    # In a variable, not in the text: the code is stored on disk, and another process has another
+    # handle.
     variable = engine.get_global_value_address(f"{name}_kernel")
     ctypes.c_void_p.from_address(variable).value = handle
     return engine.get_function_address(name)
