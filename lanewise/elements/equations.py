@@ -110,7 +110,7 @@ class Translation:
     def registers(self, shape: Sequence[int], dtype: Any) -> tuple[list[Number], Array]:
         """Numbers of the code for an array that is written out, and the array."""
         numbers = {index: Number(dtype) for index in np.ndindex(*shape)}
-        parts = {i: Array.uniform(self.number(n), ()) for i, n in numbers.items()}
+        parts = {index: Array.uniform(self.number(x), ()) for index, x in numbers.items()}
         return list(numbers.values()), self.from_components(parts, shape, range(len(shape)))
 
     def add(self, statement: Statement) -> None:

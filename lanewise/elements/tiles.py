@@ -165,7 +165,7 @@ class Tiles:
         masks = [None] * (columns // width)
         if remainder := columns % width:
             masks.append(first_elements(b, remainder))
-        lines = [(p, row) for p in self.products for row in range(rows)]
+        lines = [(member, row) for member in self.products for row in range(rows)]
         # The sums of a tile: line by line, in each of them vector by vector.
         tile = [(line, v) for line in range(len(lines)) for v in range(len(masks))]
         targets = []
@@ -176,7 +176,7 @@ class Tiles:
 
         def add(sums: Sequence[Num], term: Num) -> list[Num]:
             with nests.scalars():
-                xs = [number(p.x, row, 0, term) for p, row in lines]
+                xs = [number(member.x, row, 0, term) for member, row in lines]
             ys = [number(product.y, 0, v, term, mask) for v, mask in enumerate(masks)]
             return [
                 nests.e.combine("add", total, b.mul(xs[line], ys[v]))
