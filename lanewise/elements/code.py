@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 
 from ..evaluator import Evaluator
+from ..frame import kernel_text, pointers
 from ..jaxprs.jaxapi import ClosedJaxpr
 from ..llvm.ir import Num, check_size, check_type
 from ..llvm.memory import stored_type
 from ..module import Module
-from ..native.handler import KERNEL
 from .equations import Translation, row_major
 from .nests import Nests
 from .places import places
@@ -43,9 +43,8 @@ class Kernel:
         at, self.scratch = places(program, dead)
         self.operands = tuple(array for _, array in translation.operands)
         self.nests = Nests(Evaluator(module), at, dead)
-        self._count = len(jaxpr.invars), len(jaxpr.outvars)
-        bases = self._pointers("%args", "a", len(inputs) + len(self.operands))
-        ends = self._pointers("%rets", "r", len(results))
+        bases = pointers(self.b, "%args", "a", len(inputs) + len(self.operands))
+        ends = pointers(self.b, "%rets", "r", len(results))
         constants = [memory for memory, _ in translation.operands]
         # Constants follow the operands of the program.
         self.nests.pointers |= dict(zip(constants, bases[len(inputs) :], strict=True))
@@ -60,12 +59,7 @@ class Kernel:
             self.block(program)
 
         self.b.repeat("%count", trajectory)
-
-    def _pointers(self, source: str, letter: str, count: int) -> list[str]:
-        for i in range(count):
-            self.b.emit(f"%{letter}p{i} = getelementptr ptr, ptr {source}, i64 {i}")
-            self.b.emit(f"%{letter}{i} = load ptr, ptr %{letter}p{i}")
-        return [f"%{letter}{i}" for i in range(count)]
+        self.text = kernel_text(module, len(results), self.nests.head)
 
     def _lane(self, base: str, memory: Memory, lane: str) -> str:
         distance = self.b.new(f"mul i64 {lane}, {memory.size}")
@@ -155,23 +149,6 @@ class Kernel:
 
         results = from_block(0)
         self.nests.numbers.update(zip((n for n, _ in branch.numbers), results, strict=True))
-
-    # --- text ------------------------------------------------------------------------------------
-
-    def text(self, head: int) -> str:
-        """`head`: parameters in front of those of the results."""
-        module, b = self.module, self.b
-        _, outs = self._count
-        prologue = ["  %lanes = load i64, ptr %params", "  %count = sub i64 %last, %first"]
-        for i in range(len(module.values)):
-            prologue += [
-                f"  %par{i}.at = getelementptr i64, ptr %params, i64 {head + outs + i}",
-                f"  %par{i} = load i64, ptr %par{i}.at",
-            ]
-        body = "\n".join([*prologue, *self.nests.head, *b.lines, "  ret void"])
-        declarations = "\n".join(sorted(module.declarations | b.declarations))
-        functions = "\n".join(module.functions.values())
-        return "\n".join(["\n".join(module.globals), declarations, functions, KERNEL, body, "}\n"])
 
 
 def _argument(aval: Any, pointer: str) -> Memory:

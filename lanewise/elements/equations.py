@@ -48,7 +48,7 @@ class Token:
     """The result of an equation that is not evaluated yet."""
 
 
-class Within:
+class BlockScope:
     """Statements go to another block for a while."""
 
     def __init__(self, translation: "Translation", block: Block):
@@ -106,6 +106,12 @@ class Translation:
         if x.dtype == dtype:
             return x
         return self.apply("convert_element_type", x, dtype=dtype, new_dtype=np.dtype(dtype))
+
+    def registers(self, shape: Sequence[int], dtype: Any) -> tuple[list[Number], Array]:
+        """Numbers of the code for an array that is written out, and the array."""
+        numbers = {index: Number(dtype) for index in np.ndindex(*shape)}
+        parts = {index: Array.uniform(self.number(x), ()) for index, x in numbers.items()}
+        return list(numbers.values()), self.from_components(parts, shape, range(len(shape)))
 
     def add(self, statement: Statement) -> None:
         self.block.statements.append(statement)

@@ -5,7 +5,7 @@ from typing import Any
 
 from ..jaxprs.jaxapi import ClosedJaxpr, scan_counts
 from .boxes import Array
-from .equations import ARRAY_RULES, Translation, Within, row_major
+from .equations import ARRAY_RULES, BlockScope, Translation, row_major
 from .reductions import reduction_of
 from .tree import Branch, Loop, Memory, Number, Place
 
@@ -30,15 +30,10 @@ class Carry:
                 # Computed before the loop: a round would compute the same again.
                 self.now.append(translation.settle(x))
             elif x.is_written_out:
-                parts = x.components()[2]
                 # A few numbers stay in registers, as `phi` instructions of the loop.
-                numbers = [Number(x.dtype) for _ in parts]
-                self._first += [part.only for part in parts.values()]
-                of = {
-                    index: Array.uniform(translation.number(n), ())
-                    for index, n in zip(parts, numbers, strict=True)
-                }
-                self.now.append(translation.from_components(of, x.shape, range(len(x.shape))))
+                numbers, array = translation.registers(x.shape, x.dtype)
+                self._first += [part.only for part in x.components()[2].values()]
+                self.now.append(array)
             else:
                 # The loop owns this memory: its first value is copied, unless `places` finds that
                 # both may have the same bytes.
@@ -96,7 +91,7 @@ def scan(
         rows.append(place)
         if place is not None:
             loop.rows.append(place.memory)
-    with Within(translation, loop.body):
+    with BlockScope(translation, loop.body):
         k = Array.uniform(translation.number(loop.counter), ())
         if reverse:
             k = translation.apply("sub", translation.known(length - 1), k)
@@ -157,13 +152,13 @@ def while_loop(
     inputs = body.jaxpr.invars[second:]
     moves = [out is not var for out, var in zip(body.jaxpr.outvars, inputs, strict=True)]
     state = Carry(translation, loop, args[first + second :], moves)
-    with Within(translation, loop.test):
+    with BlockScope(translation, loop.test):
         (goes_on,) = translation.evaluate(test, [*fixed[:first], *state.now])
         goes_on = (
             reduction_of(translation, goes_on, "or", range(len(shape)), ()) if shape else goes_on
         )
         loop.condition = goes_on.expression
-    with Within(translation, loop.body):
+    with BlockScope(translation, loop.body):
         outs = translation.evaluate(body, [*fixed[first:], *state.now])
         if shape:  # a condition for each element: those that have ended keep their values
             (is_going,) = translation.evaluate(test, [*fixed[:first], *state.now])
@@ -196,27 +191,21 @@ def cond(
     operands = [x if x.is_written_out else translation.settle(x) for x in operands]
     branch = Branch(node, len(branches))
     avals = [v.aval for v in eqn.outvars]
-    like = [Array(table, aval.shape, aval.dtype, []) for aval in avals]
     results, numbers = [], []
-    for aval, x, is_used in zip(avals, like, used, strict=True):
-        of: list[Number] = []
+    for aval, is_used in zip(avals, used, strict=True):
+        members: list[Number] = []
         if not is_used:
-            results.append(translation.known(0))
-        elif x.is_written_out:
-            indices = Array.uniform(table.known(0, aval.dtype), aval.shape).components()[2]
-            of = [Number(aval.dtype) for _ in indices]
-            parts = {
-                i: Array.uniform(translation.number(n), ())
-                for i, n in zip(indices, of, strict=True)
-            }
-            results.append(translation.from_components(parts, aval.shape, range(len(aval.shape))))
+            result = translation.known(0)
+        elif Array(table, aval.shape, aval.dtype, []).is_written_out:
+            members, result = translation.registers(aval.shape, aval.dtype)
         else:
-            results.append(Memory(aval.shape, aval.dtype).load(table))
-        numbers.append(of)
+            result = Memory(aval.shape, aval.dtype).load(table)
+        results.append(result)
+        numbers.append(members)
     expressions: dict[Number, list] = {n: [] for of in numbers for n in of}
     translation.branches += 1
     for block, function in zip(branch.blocks, branches, strict=True):
-        with Within(translation, block):
+        with BlockScope(translation, block):
             outs = translation.evaluate(function, operands)
             for x, result, of, is_used in zip(outs, results, numbers, used, strict=True):
                 if of:

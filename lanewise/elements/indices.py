@@ -92,13 +92,6 @@ def _batch_index(translation: Translation, indices: Array, j: int, batch, shape)
     return translation.convert(x, "int64")
 
 
-def _index(axis: int, translation: Translation, shape) -> Array:
-    strides = tuple(int(a == axis) for a in range(len(shape)))
-    if shape[axis] == 1:
-        return Array.uniform(translation.table.known(0, "int64"), shape)
-    return Array.uniform(translation.table.expression("index", "int64", strides=strides), shape)
-
-
 def gather(translation: Translation, eqn: Any, x: Array, indices: Array) -> list[Array]:
     params, shape = eqn.params, eqn.outvars[0].aval.shape
     dims, sizes = params["dimension_numbers"], params["slice_sizes"]

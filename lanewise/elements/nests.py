@@ -88,20 +88,21 @@ class Nests:
         if len(cells) != 1:
             return cells
         ((lower, upper, items),) = cells
-        products, others = [], []
+        products, remainder = [], []
         for s, node in items:
             product = product_of(s, node, group.shape)
             if product is None or any(group.is_handed_on(x) for x in node.loads(set())):
-                others.append((s, node))
+                remainder.append((s, node))
             else:
                 products.append(product)
+        # A product of a few rows is a few sums, for short axes are written out.
         for of_matrix in with_one_matrix(products):
             with self.scope():
                 tiles = Tiles(self, of_matrix, group.shape)
                 for product in of_matrix if tiles.has_parts else ():
                     self.begin_reduction(product.sum, group.shape, cells)
                 tiles.write()
-        return [(lower, upper, others)] if others else []
+        return [(lower, upper, remainder)] if remainder else []
 
     def is_in_place(self, s: Statement, node: Expression) -> bool:
         """Whether a statement would copy an element to where it is."""

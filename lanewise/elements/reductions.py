@@ -13,9 +13,8 @@ from ..llvm.ir import NotCompilable
 from ..rules.moves import CUMULATIVE, REDUCTIONS
 from ..rules.reductions import neutral
 from .boxes import Array, Box, Expression, elementwise
-from .equations import ARRAY_RULES, Translation, Within, expand, row_major
+from .equations import ARRAY_RULES, BlockScope, Translation, expand, row_major
 from .tree import FIXED, Memory, Number, Reduce
-
 
 _SHORT_ROW = 32  # terms
 
@@ -127,6 +126,7 @@ def matrix_product(translation: Translation, eqn: Any, x: Array, y: Array) -> li
         axes_x[a] = k
     for k, a in enumerate((*batch_y, *free_y)):
         axes_y[a] = k if k < len(batch_y) else k + len(free_x)
+    # A loop over a few terms, and joining its sums, would take longer than the terms.
     if is_written_out:
         terms = []
         for index in np.ndindex(*sums):
@@ -150,6 +150,7 @@ def _read_often(
     """The operands of a product of matrices, computed before it where each element is used often,
     and one of them with neighbours along an axis of the result."""
     frees = free_x, free_y
+    # Each element is used so often: once for each element of the other one's own axes.
     repeats = [math.prod(a.shape[k] for k in free) for a, free in ((y, free_y), (x, free_x))]
     pair = [
         translation.settle(a) if a.cost and count > SHORT else a
@@ -161,7 +162,7 @@ def _read_often(
     if min(repeats) > SHORT:
         if any(map(_has_neighbours, pair, frees)):
             return pair
-        which = fixed[0] if fixed else int(x.size > y.size)
+        number = fixed[0] if fixed else int(x.size > y.size)
     else:
         # A matrix times a vector: joining the partial sums of a short row takes most of the time.
         matrices = [i for i in fixed if frees[i] and not _has_neighbours(pair[i], frees[i])]
@@ -169,19 +170,19 @@ def _read_often(
             matrices = []
         if not matrices:
             return pair
-        which = matrices[0]
-    pair[which] = _turned(translation, pair[which], frees[which][-1], which in fixed)
+        number = matrices[0]
+    pair[number] = _copy_in_rows(translation, pair[number], frees[number][-1], number in fixed)
     return pair
 
 
-def _turned(translation: Translation, x: Array, axis: int, is_fixed: bool) -> Array:
+def _copy_in_rows(translation: Translation, x: Array, axis: int, is_fixed: bool) -> Array:
     """An array in other memory, where neighbours along an axis are neighbours."""
     order = [*(a for a in range(len(x.shape)) if a != axis), axis]
     places = [order.index(a) for a in range(len(order))]
-    turned = x.along([x.shape[a] for a in order], places)
-    memory = Memory(turned.shape, turned.dtype, row_major(turned.shape))
-    with Within(translation, translation.root if is_fixed else translation.block):
-        return translation.store(turned, memory.place).along(x.shape, order)
+    copy = x.along([x.shape[a] for a in order], places)
+    memory = Memory(copy.shape, copy.dtype, row_major(copy.shape))
+    with BlockScope(translation, translation.root if is_fixed else translation.block):
+        return translation.store(copy, memory.place).along(x.shape, order)
 
 
 def _is_fixed(node: Expression) -> bool:

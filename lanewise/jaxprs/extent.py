@@ -124,29 +124,29 @@ SHORT = 8
 
 TERMS_READ_ONCE, TERMS_IN_BLOCKS = 10_000, 2**26
 """Terms of matrix products in a round, above which XLA is faster if they take most of the time:
-where each number of a matrix is used at most 8 times, and of all others."""
+where each number of a matrix is used at most twice, and of all others."""
 
 
 def reason_for_xla(jaxpr: Any) -> str | None:
     """Why XLA is faster for a program with long arrays; None if it is not."""
     for body in _loop_bodies(jaxpr) or [jaxpr]:
-        once = blocks = others = 0
+        single_use = blocks = remainder = 0
         for eqn in _innermost(body):
             operations = _operations(eqn)
+            # A network of comparisons would be longer than all other code.
             if eqn.primitive.name == "sort":
                 return f"the sort of {eqn.invars[0].aval.size} numbers"
+            # Short sums are written out, as other operations are.
             if eqn.primitive.name != "dot_general" or _terms(eqn) <= SHORT:
-                others += operations * cost_of(eqn.primitive.name)
+                remainder += operations * cost_of(eqn.primitive.name)
             # How often each number of an operand is used.
-            elif any(operations <= SHORT * v.aval.size for v in eqn.invars):
-                once += operations
+            elif any(operations <= 2 * v.aval.size for v in eqn.invars):
+                single_use += operations
             else:
                 blocks += operations
-        if once > max(TERMS_READ_ONCE, 3 * others):
-            return (
-                f"matrices of {once} numbers, times vectors: XLA reads them once for a whole batch"
-            )
-        if blocks > max(TERMS_IN_BLOCKS, 3 * others):
+        if single_use > max(TERMS_READ_ONCE, 3 * remainder):
+            return f"matrices of {single_use} numbers times vectors: XLA reads them once in a batch"
+        if blocks > max(TERMS_IN_BLOCKS, 3 * remainder):
             return f"matrix products of {blocks} terms: XLA computes them in blocks for the cache"
     return None
 
@@ -184,13 +184,8 @@ def has_long_arrays(jaxpr: Any) -> bool:
 
 def _most_unknowns(jaxpr: Any) -> int:
     """Unknowns of the largest linear system."""
-    count = 0
-    for eqn in jaxpr.eqns:
-        if eqn.primitive.name == "eliminate":
-            count = max(count, eqn.invars[0].aval.shape[-1])
-        for function in (*bodies(eqn), *functions_in(eqn)):
-            count = max(count, _most_unknowns(function.jaxpr))
-    return count
+    systems = (eqn for eqn in _innermost(jaxpr) if eqn.primitive.name == "eliminate")
+    return max((eqn.invars[0].aval.shape[-1] for eqn in systems), default=0)
 
 
 def _has_long_loop(jaxpr: Any) -> bool:
@@ -209,15 +204,10 @@ def _has_long_loop(jaxpr: Any) -> bool:
 def _has_matrices(functions: Sequence[ClosedJaxpr]) -> bool:
     """Whether a linear system is solved, or a product of matrices has more than 384 elements, each
     a sum of more than 8 terms."""
-    if any(_most_unknowns(function.jaxpr) for function in functions):
-        return True
-    for eqn in (eqn for function in functions for eqn in function.jaxpr.eqns):
-        if eqn.primitive.name == "dot_general":
-            if eqn.outvars[0].aval.size > PAIRS and _terms(eqn) > SHORT:
-                return True
-        if _has_matrices((*bodies(eqn), *functions_in(eqn))):
-            return True
-    return False
+    equations = [eqn for function in functions for eqn in _innermost(function.jaxpr)]
+    products = (eqn for eqn in equations if eqn.primitive.name == "dot_general")
+    is_large = any(eqn.outvars[0].aval.size > PAIRS and _terms(eqn) > SHORT for eqn in products)
+    return is_large or any(eqn.primitive.name == "eliminate" for eqn in equations)
 
 
 def _has_loop(jaxpr: Any) -> bool:

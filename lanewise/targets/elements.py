@@ -8,7 +8,6 @@ from ..jaxprs.jaxapi import ClosedJaxpr
 from ..llvm.ir import FasterInXlaError, NotCompilable
 from ..module import Module
 from ..native import handler, machine
-from .numbers import HEAD
 from .target import Code
 
 
@@ -35,7 +34,7 @@ class Elements:
         except RecursionError:
             raise NotCompilable("expressions of too many levels, for long arrays") from None
         return Code(
-            kernel.text(HEAD),
+            kernel.text,
             block=1,
             values=tuple(module.values),
             operands=kernel.operands,

@@ -8,6 +8,7 @@ from typing import Any
 
 from .. import rules as rules  # each file registers its rules with the evaluator
 from ..evaluator import RULES, Evaluator
+from ..frame import kernel_text, pointers
 from ..jaxprs.extent import carry_size, most_operations, operation_count, primitives_in
 from ..jaxprs.jaxapi import ClosedJaxpr
 from ..llvm.ir import check_size, check_that, check_type
@@ -17,25 +18,19 @@ from ..module import Module
 from ..native import handler, machine
 from .target import Code
 
-# Parameters in front of a kernel's own: trajectories, cost of a block; and for each result the
-# bytes of one trajectory.
-HEAD = 2
 
-
-def kernel_text(module: Module, function: ClosedJaxpr, lane_flags: Sequence[bool]) -> str:
+def kernel_of(module: Module, function: ClosedJaxpr, lane_flags: Sequence[bool]) -> str:
     """The text of the module; `lane_flags` says which inputs differ between trajectories."""
     b, jaxpr = module.b, function.jaxpr
     for v in (*jaxpr.invars, *jaxpr.outvars):
         check_type(v.aval.dtype, "arguments and results")
 
-    def pointers(source: str, letter: str, variables: Sequence[Any]) -> list[tuple[str, Any]]:
-        for i in range(len(variables)):
-            b.emit(f"%{letter}p{i} = getelementptr ptr, ptr {source}, i64 {i}")
-            b.emit(f"%{letter}{i} = load ptr, ptr %{letter}p{i}")
-        return [(f"%{letter}{i}", var.aval) for i, var in enumerate(variables)]
+    def arrays(source: str, letter: str, variables: Sequence[Any]) -> list[tuple[str, Any]]:
+        names = pointers(b, source, letter, len(variables))
+        return [(name, var.aval) for name, var in zip(names, variables, strict=True)]
 
-    operands = pointers("%args", "a", jaxpr.invars)
-    results = pointers("%rets", "r", jaxpr.outvars)
+    operands = arrays("%args", "a", jaxpr.invars)
+    results = arrays("%rets", "r", jaxpr.outvars)
     # Before the loop over blocks: strides, and operands that all trajectories share, are read once.
     pairs = zip(operands, lane_flags, strict=True)
     lanes = [lane_stride(module, aval) if has_lanes else None for (_, aval), has_lanes in pairs]
@@ -67,21 +62,7 @@ def kernel_text(module: Module, function: ClosedJaxpr, lane_flags: Sequence[bool
             evaluator.write(value, place)
 
     b.repeat("%count", write_block)
-    prologue = [
-        "  %lanes = load i64, ptr %params",
-        "  %count = sub i64 %last, %first",
-        f"  %last.start = sub i64 %lanes, {b.W * b.U}",
-    ]
-    for i in range(len(module.values)):
-        prologue += [
-            f"  %par{i}.at = getelementptr i64, ptr %params, i64 {HEAD + len(results) + i}",
-            f"  %par{i} = load i64, ptr %par{i}.at",
-        ]
-    body = "\n".join([*prologue, *b.lines, "  ret void"])
-    declarations = "\n".join(sorted(module.declarations | b.declarations))
-    functions = "\n".join(module.functions.values())
-    front = "\n".join(module.globals), declarations, functions, handler.KERNEL
-    return "\n".join([*front, body, "}\n"])
+    return kernel_text(module, len(results), [f"  %last.start = sub i64 %lanes, {b.W * b.U}"])
 
 
 def lane_stride(module: Module, aval: Any) -> int | str:
@@ -142,7 +123,7 @@ class Numbers:
             vectors = vectors_for(state, count) if state or size <= 24 else 1
         module = Module(*variant(lanes, vectors))
         module.b.limit = limit
-        text = kernel_text(module, function, lane_flags)
+        text = kernel_of(module, function, lane_flags)
         b, values, scratch = module.b, tuple(module.values), module.scratch_bytes
         return Code(text, b.W * b.U, values, (), b.operations, scratch, b.W, b.U)
 

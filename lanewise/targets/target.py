@@ -113,6 +113,7 @@ def compiled_by(
             return CompiledProgram(target, code, reasons)
         except NotCompilable as refusal:
             reasons[target.name] = str(refusal)
+            # Other targets would be slower still.
             if isinstance(refusal, FasterInXlaError):
                 break
     # Targets share rules, and give the same reason where a rule is missing.
