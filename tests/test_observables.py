@@ -248,3 +248,17 @@ def test_an_argument_tau_that_would_receive_t_is_refused():
     # A system without a slow time has no τ = εt.
     fast = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + q @ q / 2)
     dvi.integrate(fast, [1.0], [0.2], h=0.1, num_steps=3, observe=of_tau)
+
+
+def test_the_reverse_gradient_of_a_run_whose_observable_is_a_number():
+    system = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + q @ q / 2)
+    observe = (dvi.Section(lambda q, p: p[0], max_crossings=2), lambda *step: 0.7)
+
+    def loss(q):
+        run = {"h": 0.1, "num_steps": 3, "observe": observe, "save": dvi.Save(final=True)}
+        sol = dvi.integrate(system, q, q, method=dvi.TypeII(), adjoint=dvi.Reversible(), **run)
+        return sol.q_final[0] + jnp.sum(sol.observed[1])
+
+    assert jax.grad(loss)(jnp.ones(1))[0] == pytest.approx(
+        float(loss(jnp.ones(1)) - 0.7), rel=1e-12
+    )

@@ -2,11 +2,14 @@
 
 # They become constants of a compiled program, which must not be used again once they have changed.
 
+import array
 import collections
 import contextlib
 import functools
 import inspect
 import itertools
+import operator
+import re
 import sys
 import types
 from collections.abc import Iterator
@@ -28,6 +31,8 @@ _LIBRARIES = frozenset(["jax", "jaxlib", "numpy", "scipy", "equinox", "lanewise"
 
 _SIMPLE = (bool, int, float, complex, str, bytes, type(None), np.generic)
 _CONSTANTS = (*_SIMPLE, np.ndarray, list, tuple, dict)
+_LISTS = (list, tuple, collections.deque, collections.UserList)
+_TABLES = (dict, types.MappingProxyType, collections.ChainMap, collections.UserDict)
 
 # Special methods that no operator, index or conversion calls.
 _NOT_IMPLICIT = frozenset(
@@ -58,8 +63,8 @@ def reads(*values: Any) -> Reads:
 
     - Numbers, strings, tuples, lists, dictionaries, sets and NumPy arrays are compared by value
       (arrays above 1 MiB and lists above 1000 entries in part), other objects by identity.
-    - Attributes of an object or a class are compared if their names occur in the function, or in a
-      method such as ``__mul__`` or ``__getitem__`` of the object.
+    - Attributes of an object or a class are compared if their names occur in the function or in a
+      method such as ``__mul__`` of the object; those of the user's objects in any such function.
     - Functions that are called are followed unless they belong to a library. Programs that
       `jax.jit` has compiled for the user, files, and results of calls are not seen.
     """
@@ -69,6 +74,7 @@ def reads(*values: Any) -> Reads:
             reader.follow_class(function)
         else:
             reader.follow(function)
+    reader.follow_arguments()
     return tuple(reader.values.items())
 
 
@@ -122,6 +128,9 @@ class _Reader:
     def __init__(self):
         self.values: dict[str, Any] = {}
         self.objects: dict[Any, Any] = {}
+        self.names: dict[str, None] = {}  # of attributes, in all functions of the user
+        self.arguments: dict[int, tuple[str, Any]] = {}  # objects of the user
+        self.noted: set[tuple[int, str]] = set()
         self.is_of_a_library = False  # the function that is followed
 
     def is_new(self, thing: Any, names: tuple[str, ...] | None = None) -> bool:
@@ -136,6 +145,7 @@ class _Reader:
         if not self.is_new(function):
             return
         if isinstance(function, functools.partial):
+            self.names |= dict.fromkeys(x for x in function.args if isinstance(x, str))
             for inner in (function.func, function.args, function.keywords):
                 self.note("an argument of a partial", inner, ())
         elif inspect.ismethod(function):
@@ -144,6 +154,8 @@ class _Reader:
             self.follow(function.__func__)
         elif isinstance(function, types.FunctionType):
             self.follow_code(function)
+        elif isinstance(function, operator.attrgetter | operator.methodcaller):
+            self.names |= dict.fromkeys(re.findall(r"\w+", repr(function)))
         elif hasattr(function, "__wrapped__"):
             self.follow(function.__wrapped__)
         elif isinstance(function, eqx.Module):
@@ -151,6 +163,14 @@ class _Reader:
                 self.follow(inner)
         elif callable(function) and inspect.ismethod(function.__call__):
             self.follow(function.__call__)
+
+    def follow_arguments(self) -> None:
+        """Collect attributes that a function reads of an object that is its argument."""
+        size = -1
+        while size != (size := len(self.objects)):
+            for name, value in list(self.arguments.values()):
+                names = tuple(x for x in self.names if (id(value), x) not in self.noted)
+                self.note_attributes(name, value, names)
 
     def follow_class(self, kind: type) -> None:
         """Collect the constants of a class, and what its methods and properties read."""
@@ -177,6 +197,7 @@ class _Reader:
             if value:
                 self.note(f"the defaults of {function.__name__}", value, names)
         if not self.is_of_a_library:
+            self.names |= dict.fromkeys(names)
             globals_ = function.__globals__
             for name in code_names:
                 if name in globals_:
@@ -195,11 +216,13 @@ class _Reader:
         elif isinstance(value, set | frozenset):
             self.add(name, ("length", len(value)))
             self.add(name, ("entries", frozenset(itertools.islice(value, _MOST_ENTRIES))))
-        elif isinstance(value, list | tuple | collections.deque):
+        elif isinstance(value, bytearray | memoryview | array.array):
+            self.add(name, ("bytes", bytes(value[:_MOST_BYTES])))
+        elif isinstance(value, _LISTS):
             self.add(name, ("length", len(value)))
             for i, entry in enumerate(itertools.islice(value, _MOST_ENTRIES)):
                 self.note(f"{name}[{i}]", entry, names)
-        elif isinstance(value, dict):
+        elif isinstance(value, _TABLES):
             self.add(name, ("length", len(value)))
             for key in list(value)[:_MOST_ENTRIES]:
                 self.note(f"{name}[{key!r}]", value[key], names)
@@ -229,13 +252,17 @@ class _Reader:
         """Collect attributes of an object or of its class, and what methods and properties read."""
         fields = getattr(value, "__dict__", {})
         kind = value if isinstance(value, type) else type(value)
+        # A namespace is of the module `types`.
+        if kind.__module__ == "types" or not _is_of_a_library(kind.__module__):
+            self.arguments.setdefault(id(value), (name, value))
         for attribute in names if self.is_new(value, names) else ():
+            self.noted.add((id(value), attribute))
             if attribute in fields and value is not kind:
                 self.note(f"{name}.{attribute}", fields[attribute], names)
                 continue
             # Statically: the property of a user may compute for long, or raise.
             of_class = inspect.getattr_static(kind, attribute, None)
-            method = of_class.fget if isinstance(of_class, property) else of_class
+            method = getattr(of_class, "fget", getattr(of_class, "func", of_class))
             method = getattr(method, "__func__", method)  # of the class, or static
             if isinstance(method, types.FunctionType):
                 self.note_attributes(name, value, _attributes(method.__code__))
@@ -271,11 +298,11 @@ def _names(code: types.CodeType) -> tuple[str, ...]:
 @functools.lru_cache(maxsize=4096)
 def _attributes(code: types.CodeType) -> tuple[str, ...]:
     """The names in a function that may be attributes, those in strings for `getattr` included."""
-    names = _names(code)
-    if {"getattr", "vars", "__dict__"}.isdisjoint(names):
-        return names
-    strings = [x for x in code.co_consts if isinstance(x, str) and x.isidentifier()]
-    return tuple(dict.fromkeys([*names, *strings]))
+    # Also in the tuples of a `match`, and in the "a.b" of an `attrgetter`.
+    tuples = [x if isinstance(x, tuple) else (x,) for x in code.co_consts]
+    strings = ".".join(x for x in itertools.chain(*tuples) if isinstance(x, str))
+    words = (x for x in strings.split(".") if x.isidentifier())
+    return tuple(dict.fromkeys([*_names(code), *words]))
 
 
 @functools.lru_cache(maxsize=4096)

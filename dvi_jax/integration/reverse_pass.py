@@ -114,7 +114,11 @@ class ReversePass(eqx.Module):
             value_of(lambda step, f=reduction: _real(task.number(f, step), q1), step)
             for reduction in reductions
         ]
-        return (q1, p1, interval.t1), eqx.filter(values, eqx.is_inexact_array), numbers
+        return (
+            (q1, p1, interval.t1),
+            eqx.filter([jnp.asarray(x) for x in values], eqx.is_inexact_array),
+            numbers,
+        )
 
     def reductions(self) -> list[tuple[Reduction, Any, Any]]:
         """Each reduction with its memory and the cotangent of its result."""
