@@ -38,10 +38,10 @@ PACKAGES = ("dvi_jax", "lanewise", "dvi_jax_cli")
 LONGEST_FILE, MOST_PARAMETERS = 450, 9
 
 LIMITS: dict[str, float] = {
-    "lines of the core": 14_460,
+    "lines of the core": 14_500,
     "lines of the questions": 21_910,
     "lines of the leaves": 20_930,
-    "lines of lanewise": 11_400,
+    "lines of lanewise": 12_670,
     "lines of the command line": 5_650,
     "raise statements": 660,
     "characters of error text": 45_000,
