@@ -51,6 +51,22 @@ def test_several_directions_share_the_values():
     np.testing.assert_allclose(slopes, jax.jit(jax.grad(lambda q: end(1.1, q)))(Q), rtol=1e-12)
 
 
+def test_values_that_nobody_uses_are_not_computed():
+    """Times, sizes of steps and the other states of a run whose last position is needed."""
+
+    def run(q):
+        system = dvi.System(pendulum)
+        return dvi.integrate(system, q, P, h=0.1, num_steps=8, save=dvi.Save(every=4), throw=False)
+
+    def results_of(function):
+        text = jax.jit(function).lower(Q).as_text()
+        (call,) = (line for line in text.splitlines() if "custom_call @lanewise" in line)
+        return call.rpartition("->")[2].count("tensor<")
+
+    assert results_of(lambda q: run(q).qs[-1]) == 1
+    assert results_of(run) > 5
+
+
 def in_scan(body):
     return lambda k: lax.scan(lambda k, _: (k + 0.1 * body(k), None), k, None, length=2)[0]
 

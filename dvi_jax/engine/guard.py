@@ -100,7 +100,9 @@ def nan_where_used(function: Callable, *args: Any) -> Any:
     # The trace is that of one device: inside of `jax.shard_map` types of results depend on others.
     values = jax.tree.leaves(function(*args)) if manual_axes(*inputs) else trace(*inputs)
     smooth, others = eqx.partition(values, eqx.is_inexact_array)
-    smooth = _nan_if_used(smooth, eqx.filter(inputs, eqx.is_inexact_array))
+    # Each value for itself: those that nobody uses are not computed.
+    inputs = eqx.filter(inputs, eqx.is_inexact_array)
+    smooth = jax.tree.map(lambda value: _nan_if_used(value, inputs), smooth)
     return jax.tree.unflatten(trace.out_tree, eqx.combine(smooth, others))
 
 
