@@ -13,9 +13,7 @@ import pytest
 
 import dvi_jax as dvi
 import lanewise
-from lanewise.native import machine
 from lanewise.native.structures import STRUCTURES, offset
-from lanewise.native.subnormals import compute_text
 
 STEPS = 5
 
@@ -49,47 +47,6 @@ def test_threads_change_no_number(set_threads, lanes, threads):
     jax.tree.map(np.testing.assert_array_equal, batch(q, p), expected)
     failed = np.asarray(expected["result"] != dvi.RESULTS.successful)
     assert failed.tolist() == [False] * (lanes - 1) + [True]
-
-
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-@pytest.mark.parametrize("threads", [1, 2])
-@pytest.mark.parametrize("elements", [1, 60])
-def test_subnormal_numbers_are_not_replaced(set_threads, dtype, threads, elements):
-    """In machine code of ours; XLA's code on the same threads has the mode that XLA sets."""
-
-    def halved(x):
-        def body(_, state):
-            halves, total = state
-            return halves / 2, total + halves
-
-        return jax.lax.fori_loop(0, 3, body, (x, x * 0))
-
-    smallest = np.finfo(dtype).smallest_subnormal
-    row = smallest * np.array([1, 2, 12, 2.0**20 + 8], dtype)
-    x = np.resize(row, (40_000 // elements, elements)).astype(dtype)
-    both = jax.jit(lambda x: (lanewise.batched(halved)(x), x * dtype(0.5)))
-    set_threads(threads)
-    for _ in range(3):
-        (halves, totals), by_xla = jax.tree.map(np.asarray, both(x))
-        expected = [x, x / 2, x / 2 / 2]
-        np.testing.assert_array_equal(halves, expected[2] / 2)
-        np.testing.assert_array_equal(totals, sum(expected))
-        assert np.count_nonzero(halves) > 10_000
-        np.testing.assert_array_equal(by_xla, 0)
-
-
-@pytest.mark.parametrize("processor", ["x86_64", "arm64", "another"])
-def test_the_call_of_a_kernel_compiles_for_each_processor(processor):
-    triple = {"x86_64": "x86_64-unknown-linux-gnu", "arm64": "aarch64-unknown-linux-gnu"}
-    llvm = machine.start_llvm()
-    llvm.initialize_all_targets()
-    llvm.initialize_all_asmprinters()
-    text = compute_text(processor) + "define ptr @use() { ret ptr @compute }"
-    made = machine.target_machine(triple.get(processor, triple["x86_64"]), "", "")
-    assembly = made.emit_assembly(machine.optimise(text, made))
-    registers = {"x86_64": "ldmxcsr", "arm64": "FPCR, x"}
-    for name, word in registers.items():
-        assert (assembly.count(word) == 2) == (name == processor)
 
 
 IMPORT = """

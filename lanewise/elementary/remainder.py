@@ -22,7 +22,8 @@ def rem(x: Array, y: Array) -> Array:
     # because it is a multiple of the last bit of b and not larger than b.
     r = a - n * b
     r = where(r < 0.0, r + b, r)
-    is_ordinary = (quotient < 2.0**53) & (b >= TINY) & (b < jnp.inf)
+    # Its last bit must not be subnormal: a CPU may replace such a number by zero.
+    is_ordinary = (quotient < 2.0**53) & (b >= TINY * 2.0**53) & (b < jnp.inf)
     return with_sign_of(branch_unless(is_ordinary, r, _by_digits, a, b), bits_of(x))
 
 

@@ -17,7 +17,6 @@ import jax.ffi
 
 from . import machine
 from .structures import addresses, offset, size
-from .subnormals import compute_text
 
 API_MAJOR, API_MINOR = 0, 1
 """The version of XLA's interface that the structures are of; newer ones of 0 keep them."""
@@ -104,7 +103,6 @@ define internal ptr @aligned(ptr %memory) {{
   ret ptr %scratch
 }}
 
-{compute_text()}
 define internal void @work(ptr %job, ptr %memory) {{
 entry:
   %scratch = call ptr @aligned(ptr %memory)
@@ -125,8 +123,7 @@ run:
   %end = add i64 %first, %chunk
   %fits = icmp slt i64 %end, %claims
   %last = select i1 %fits, i64 %end, i64 %blocks
-  call void @compute(ptr %kernel, ptr %args, ptr %rets, ptr %params, ptr %scratch,
-                     i64 %first, i64 %last)
+  call void %kernel(ptr %args, ptr %rets, ptr %params, ptr %scratch, i64 %first, i64 %last)
   %mine = sub i64 %last, %first
   %ignored = atomicrmw add ptr %job.done, i64 %mine acq_rel
   br label %claim
@@ -254,7 +251,7 @@ ready.to.run:
   br i1 %go, label %ask.pool, label %alone
 alone:
   %scratch = call ptr @aligned(ptr %memory)
-  call void @compute(ptr %kernel, ptr %a, ptr %r, ptr %params, ptr %scratch, i64 0, i64 %blocks)
+  call void %kernel(ptr %a, ptr %r, ptr %params, ptr %scratch, i64 0, i64 %blocks)
   call void @free(ptr %memory)
   call void @free(ptr %job)
   ret ptr null
