@@ -18,6 +18,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from _workloads import WORKLOADS
 
 import dvi_jax as dvi
 from dvi_jax import systems
@@ -94,21 +95,16 @@ def pendulum_gradient(lanes, steps, layout):
 
 
 def bodies(lanes, steps, layout):
-    radius, angle, mass = 1 + np.arange(7) / 2, 2.4 * np.arange(7), 1e-4
-    outwards = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
-    along = np.stack([-np.sin(angle), np.cos(angle), 0 * angle], axis=1)
-    q0 = np.concatenate([np.zeros((1, 3)), radius[:, None] * outwards])
-    p0 = mass * np.concatenate([np.zeros((1, 3)), along / np.sqrt(radius)[:, None]])
-    problem = systems.n_body([1.0] + [mass] * 7, q0, p0)
+    case = WORKLOADS["bodies"]
 
     def one(q, p):
         return _final(dvi.integrate(
-            problem.system, q, p, h=problem.h, num_steps=steps, args=problem.args,
+            case.system, q, p, h=case.h, num_steps=steps, args=case.args,
             save=dvi.Save(final=True), throw=False, layout=layout,
         ))  # fmt: skip
 
-    scale = np.random.default_rng(5).uniform(-1, 1, (2, lanes, 8, 3))
-    return one, (q0 + 1e-3 * scale[0], p0 + 1e-6 * scale[1])
+    spread = np.random.default_rng(5).uniform(-1, 1, (2, lanes, 8, 3))
+    return one, (case.q0 + case.spread[0] * spread[0], case.p0 + case.spread[1] * spread[1])
 
 
 def alphas(lanes, steps, layout):
