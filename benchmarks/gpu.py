@@ -87,7 +87,7 @@ def main():
     parser.add_argument("--stage", help="run one stage in this process")
     parser.add_argument("--only", nargs="*", default=(), help="stages of --check")
     parser.add_argument("--carried", type=Path, default=Path("build/carried"))
-    parser.add_argument("--out", type=Path, default=Path(os.environ.get("OUT", ".")))
+    parser.add_argument("--out", type=Path, default=Path(os.environ.get("OUT", "build/gpu")))
     options = parser.parse_args()
     if options.prepare or options.check or options.stage:
         import _gpu_check
