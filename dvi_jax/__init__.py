@@ -76,7 +76,7 @@ from .observe import (
     Trend as Trend,
 )
 from .observe.solution import Save as Save, Solution as Solution
-from .problem import flows as flows
+from .problem import elements as elements, flows as flows
 from .problem.discretise import discretise as discretise
 from .problem.energies import incoming_energy as incoming_energy, outgoing_energy as outgoing_energy
 from .problem.implicit import Implicit as Implicit
@@ -127,7 +127,8 @@ else:
     )
 
     _explain_calls(sys.modules[__name__])
-    _explain_calls(flows)
+    for _module in (elements, flows):
+        _explain_calls(_module)
     sys.modules[__name__].__class__ = _Package
     sys.meta_path.insert(0, _Folders())
 

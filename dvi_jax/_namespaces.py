@@ -21,6 +21,7 @@ NAMESPACES = {
     # The functions `dvi.sweep` and `dvi.fit` have the names of their folders.
     "fitting": "dvi_jax.fit",
     "sweeps": "dvi_jax.sweep",
+    "elements": "dvi_jax.problem.elements",
     "flows": "dvi_jax.problem.flows",
     "noise": "dvi_jax.problem.noise",
     "paper": "dvi_jax.testing.paper",

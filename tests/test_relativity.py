@@ -13,7 +13,6 @@ from scipy.interpolate import CubicSpline
 import dvi_jax as dvi
 from dvi_jax.systems import solar_system
 from dvi_jax.systems.n_body import hamiltonian
-from dvi_jax.systems.oblate_kepler import elements
 from dvi_jax.systems.planets.relativity import (
     SPEED_OF_LIGHT,
     SUN_J2,
@@ -142,7 +141,8 @@ def per_turn(qs, vs, turn):
     passage = CubicSpline(np.arange(len(r)), np.sum(r * v, axis=1))
     at = passage.roots(extrapolate=False)
     at = at[passage(at, 1) > 0]
-    node, peri = elements(r, v, 1.0, np).T[3:]
+    orbit = dvi.elements.Keplerian.of(r, v, 1.0)
+    node, peri = orbit.Omega, orbit.omega
     angles = CubicSpline(np.arange(len(r)), np.unwrap([node, peri]), axis=1)(at)
     return (angles[:, -1] - angles[:, 0]) / (len(at) - 1)
 

@@ -1,7 +1,7 @@
 """Splittings of N bodies around Kepler orbits: the method of Wisdom and Holman."""
 
 import warnings
-from typing import Any, ClassVar, Literal, NamedTuple, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -17,6 +17,7 @@ from ..base.types import Args, Interval, State
 from ..engine.newton import find_root
 from ..problem import kepler as _kepler
 from ..problem.flows import value_of
+from ..problem.frames import Democratic, Jacobi
 from ._schemes import ORDERS_OF_CORRECTORS, as_scheme, check_scheme, corrector, join_neighbours
 from ._splitting import PartFlow, SplittingMethod, Stage
 from ._strang import Strang
@@ -28,71 +29,7 @@ _FEWEST = 10
 Coordinates = Literal["jacobi", "democratic"]
 
 
-class _Jacobi(NamedTuple):
-    """Row 0 is the centre of mass; row i is body i relative to that of the bodies before it."""
-
-    masses: Array  # (bodies,)
-
-    def from_bodies(self, x: Array) -> Array:
-        """Positions, velocities or accelerations of the bodies in these coordinates."""
-        eta = jnp.cumsum(self.masses)[:, None]
-        centres = jnp.cumsum(self.masses[:, None] * x, axis=0) / eta
-        return jnp.concatenate([centres[-1:], x[1:] - centres[:-1]])
-
-    def to_bodies(self, X: Array) -> Array:
-        """The inverse of `from_bodies`."""
-        part = (self.masses / jnp.cumsum(self.masses))[1:, None]
-        outer = jnp.cumsum((part * X[1:])[::-1], axis=0)[::-1]
-        centres = X[:1] - jnp.concatenate([outer, jnp.zeros_like(X[:1])])
-        return centres + jnp.concatenate([jnp.zeros_like(X[:1]), (1 - part) * X[1:]])
-
-    def central_mass(self) -> Array:
-        """The mass at the centre of the Kepler orbit of each row but the first."""
-        return jnp.cumsum(self.masses)[1:]
-
-    velocities_of, velocities_back = from_bodies, to_bodies
-
-    def drift(self, V: Array) -> Array:
-        """dQ/dt of the part B."""
-        return jnp.zeros_like(V)
-
-
-class _Democratic(NamedTuple):
-    """Row 0 is the centre of mass, others are heliocentric positions and barycentric velocities."""
-
-    masses: Array
-
-    def _centre(self, x: Array) -> Array:
-        return jnp.sum(self.masses[:, None] * x, axis=0, keepdims=True) / jnp.sum(self.masses)
-
-    def from_bodies(self, x: Array) -> Array:
-        return jnp.concatenate([self._centre(x), x[1:] - x[:1]])
-
-    def to_bodies(self, X: Array) -> Array:
-        part = self.masses[1:, None] / jnp.sum(self.masses)
-        sun = X[:1] - jnp.sum(part * X[1:], axis=0, keepdims=True)
-        return jnp.concatenate([sun, sun + X[1:]])
-
-    def central_mass(self) -> Array:
-        return jnp.broadcast_to(self.masses[0], self.masses[1:].shape)
-
-    def velocities_of(self, v: Array) -> Array:
-        centre = self._centre(v)
-        return jnp.concatenate([centre, v[1:] - centre])
-
-    def velocities_back(self, V: Array) -> Array:
-        return jnp.concatenate([V[:1] - self._recoil(V), V[:1] + V[1:]])
-
-    def _recoil(self, V: Array) -> Array:
-        momentum = jnp.sum(self.masses[1:, None] * V[1:], axis=0, keepdims=True)
-        return momentum / self.masses[0]
-
-    def drift(self, V: Array) -> Array:
-        recoil = jnp.broadcast_to(self._recoil(V), V[1:].shape)
-        return jnp.concatenate([jnp.zeros_like(V[:1]), recoil])
-
-
-_COORDINATES = {"jacobi": _Jacobi, "democratic": _Democratic}
+_COORDINATES = {"jacobi": Jacobi, "democratic": Democratic}
 
 
 class WisdomHolman(SplittingMethod):
@@ -102,7 +39,8 @@ class WisdomHolman(SplittingMethod):
 
     Any `System` with T = Σ |p_i|²/(2 m_i) and positions of shape (bodies, 2 or 3), the dominant
     body first and the others from the inside to the outside, such as those of `systems.n_body` and
-    `interop.from_rebound`. The masses are read from T. V is not restricted: all that is not in H_A
+    `interop.from_rebound`. The masses are read from T; bodies after the last entry of
+    ``args["masses"]`` are test particles of mass 0. V is not restricted: all that is not in H_A
     is in H_B, also a perturbation, an oblateness and a force εW. Forces that depend on momenta are
     solved for by the midpoint rule.
 
@@ -160,13 +98,21 @@ class WisdomHolman(SplittingMethod):
 
     def check(self, equations, first_interval, q, p):
         interval = first_interval()
-        masses = np.asarray(self._frame(equations, interval, q).masses)
+        frame, scale = self._frame(equations, interval, q)
+        masses = np.asarray(frame.masses)
         v = np.asarray(equations.position_rate(interval, q, p))
         rtol = 1e5 * float(jnp.finfo(q.dtype).eps)
-        if not (masses > 0).all() or not np.allclose(masses[:, None] * v, p, rtol=rtol, atol=0):
+        if not (scale > 0).all() or not np.allclose(scale * v, p, rtol=rtol, atol=0):
             raise ValueError(
                 "dvi.WisdomHolman requires ∂H_D/∂p1 = p/m with positive masses, but it is not p/m "
-                f"at the initial state with m = {masses}."
+                f"at the initial state with m = {scale[:, 0]}."
+            )
+        massive = _massive(equations.args, len(q))
+        if np.any(np.asarray(_conservative_force(equations, interval, q, p))[massive:]):
+            raise ValueError(
+                f"dvi.WisdomHolman takes bodies without an entry in masses of args for test "
+                f"particles of mass 0, here those after the first {massive}. They must not enter "
+                "the potential in H_D; their attraction is a force."
             )
         if masses[0] < masses.max():
             raise ValueError(
@@ -177,10 +123,10 @@ class WisdomHolman(SplittingMethod):
 
     def _check_steps(self, equations, interval, q, p):
         """Warn of too few evaluations of the interaction in a revolution, or at a pericentre."""
-        frame = self._frame(equations, interval, q)
+        frame, scale = self._frame(equations, interval, q)
         position, momentum = equations.absolute(q, p)
         X = np.asarray(frame.from_bodies(position), float)[1:]
-        V = np.asarray(frame.velocities_of(momentum / frame.masses[:, None]), float)[1:]
+        V = np.asarray(frame.velocities_of(momentum / scale), float)[1:]
         mu = np.asarray(self._strength(equations, q) * frame.central_mass(), float)
         # From known numbers, once before a run: nothing of this is compiled.
         r2, v2, rv = (X * X).sum(axis=1), (V * V).sum(axis=1), (X * V).sum(axis=1)
@@ -203,7 +149,8 @@ class WisdomHolman(SplittingMethod):
                 stacklevel=user_level(),
             )
 
-    def _frame(self, equations: Equations, interval: Interval, q: State) -> Any:
+    def _frame(self, equations: Equations, interval: Interval, q: State) -> tuple[Any, Array]:
+        """The coordinates, and p/v of each body, which is 1 for a test particle."""
         array("q0 of dvi.WisdomHolman", q, ("bodies", 2), ("bodies", 3))
         whole("the number of bodies", len(q), 2)
 
@@ -219,19 +166,21 @@ class WisdomHolman(SplittingMethod):
             raise ValueError(
                 f"dvi.WisdomHolman requires H_D = Σ |p_i|²/(2 m_i) + V(q0), but {reason}."
             )
-        return _COORDINATES[self.coordinates](1 / inverse_mass(q)[:, 0])
+        scale = 1 / inverse_mass(q)[:, :1]
+        masses = scale[:, 0].at[_massive(equations.args, len(q)) :].set(0.0)
+        return _COORDINATES[self.coordinates](masses), scale
 
     def _strength(self, equations: Equations, q: State) -> Any:
         """The gravitational constant."""
         return value_of(_gravity if self.G is None else self.G, equations.args, q)
 
     def parts(self, equations, interval, q):
-        frame = self._frame(equations, interval, q)
+        frame, scale = self._frame(equations, interval, q)
         mu = self._strength(equations, q) * frame.central_mass()
         # With an origin states are relative to it, in these coordinates too: they are linear.
         zero = jnp.zeros_like(q)
         position, momentum = equations.absolute(zero, zero)
-        base = frame.from_bodies(position), frame.velocities_of(momentum / frame.masses[:, None])
+        base = frame.from_bodies(position), frame.velocities_of(momentum / scale)
         implicit = not equations.step_is_explicit(interval, q)
 
         def attraction(X):
@@ -250,7 +199,7 @@ class WisdomHolman(SplittingMethod):
             return X1, V1, judge(no_solve(X)._replace(converged=is_root), X1, V1)
 
         def kick(interval, X, V):
-            h, x, scale = interval.h, frame.to_bodies(X), frame.masses[:, None]
+            h, x = interval.h, frame.to_bodies(X)
 
             def rate(V):
                 p = scale * frame.velocities_back(V)
@@ -288,19 +237,19 @@ class WisdomHolman(SplittingMethod):
         """Whether the masses, and so the coordinates, are the same in all steps."""
 
         def masses(t):
-            return self._frame(equations, interval._replace(t0=t, t1=t), q).masses
+            return self._frame(equations, interval._replace(t0=t, t1=t), q)[0].masses
 
         return not depends_on(masses, 0, interval.t0)
 
     def enter(self, equations, interval, q, p):
-        frame = self._frame(equations, interval, q)
-        X, V = frame.from_bodies(q), frame.velocities_of(p / frame.masses[:, None])
+        frame, scale = self._frame(equations, interval, q)
+        X, V = frame.from_bodies(q), frame.velocities_of(p / scale)
         return X, V, no_step_yet(X)
 
     def leave(self, equations, interval, q, p):
-        frame = self._frame(equations, interval, q)
+        frame, scale = self._frame(equations, interval, q)
         x, v = frame.to_bodies(q), frame.velocities_back(p)
-        return x, frame.masses[:, None] * v, no_step_yet(q)
+        return x, scale * v, no_step_yet(q)
 
     @property
     def has_corrector(self) -> bool:
@@ -317,6 +266,17 @@ class WisdomHolman(SplittingMethod):
         )
         stages = [Stage(part, 0.0, 0.0, c) for part, c in sequence]
         return self.compose(equations, interval, q, p, stages)
+
+
+def _conservative_force(equations: Equations, interval: Interval, q: State, p: State) -> Array:
+    point = (*interval[:2], *equations.absolute(q, p), equations.epsilon, equations.args)
+    return jax.grad(equations.system.hamiltonian, argnums=2)(*point)
+
+
+def _massive(args: Args, bodies: int) -> int:
+    """The number of bodies with a mass: those without an entry in masses are test particles."""
+    masses = args.get("masses") if isinstance(args, dict) else None
+    return bodies if masses is None or np.ndim(masses) != 1 else min(len(masses), bodies)
 
 
 def _gravity(args: Args) -> Any:

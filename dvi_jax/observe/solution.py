@@ -12,12 +12,13 @@ from jaxtyping import Array, Float
 
 from lanewise.jaxprs.jaxapi import is_traced
 
-from ..base.checks import in_order, only_one, whole
+from ..base.checks import in_order, only_one, require, whole
 from ..base.inputs import as_times
 from ..base.printing import first_lines
 from ..base.results import RESULTS, status_counts, status_name
 from ..base.signature import with_time
 from ..base.types import State
+from ..problem.elements import Keplerian, of_bodies, of_kind
 from .labelled import dataset_of, table_of
 from .saved import read, write
 
@@ -189,6 +190,29 @@ class Solution(eqx.Module):
         index. Arguments and errors are those of `to_xarray`.
         """
         return table_of(self, dims=dims, coords=coords, observe=observe, components=components)
+
+    def elements(
+        self,
+        masses: Any = None,
+        G: Any = 1.0,
+        *,
+        frame: Any = "jacobi",
+        mu: Any = None,
+        kind: Any = Keplerian,
+    ) -> Any:
+        """Orbital elements of the saved states, each of shape (*batch, S, bodies − 1).
+
+        - `masses`, `G`, `frame`, `kind`: see `dvi.elements.of_bodies`.
+        - `mu`: without masses, of one body around a centre, whose p is its velocity: see
+          `dvi.elements`. Each element then has the shape (*batch, S).
+
+        **Raises** `ValueError` for shapes that do not fit, `TypeError` without masses and mu.
+        """
+        only_one(masses=masses, mu=mu)
+        require("Solution.elements", {"masses or mu": mu if masses is None else masses})
+        if masses is None:
+            return of_kind(kind).of(self.qs, self.ps, mu)
+        return of_bodies(self.qs, self.ps, masses, G, frame=frame, kind=kind)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write it to one file (NumPy's npz), whole or not at all; `Solution.load` reads it.

@@ -99,20 +99,49 @@ def change(h: Scalar, q: Array, v: Array, mu: Array) -> tuple[Array, Array, Arra
     r0 = jnp.sqrt(jnp.sum(q * q, -1))
     beta = 2 * mu / r0 - jnp.sum(v * v, -1)
     orbit = _Orbit(r0, jnp.sum(q * v, -1), beta, mu - beta * r0)
-
-    def equation(X):
-        return orbit.time(X, _universal(X, beta)) - h
-
-    # The equations of different orbits do not depend on one another: `divide` solves all of them.
-    zero = jnp.zeros_like(r0)
-    X, is_root = lanewise.implicit_root(equation, zero, lambda _, __: _solve(orbit, h), divide)
-    g = orbit.on_time(h, X, _universal(X, beta))
+    g, is_root = _at(orbit, h)
     # Increments, not the new state: a small change keeps its digits next to a large coordinate.
     a = (mu * g.g2)[..., None]
     r, r0 = orbit.radius(g)[..., None], r0[..., None]
     dq = (h - mu * g.g3)[..., None] * v - a / r0 * q
     dv = -(mu * g.g1)[..., None] / (r0 * r) * q - a / r * v
     return dq, dv, is_root
+
+
+@jax.jit
+def from_pericentre(
+    time: Array, distance: Array, alpha: Array, mu: Array
+) -> tuple[Array, Array, Array]:
+    r"""Position and velocity a `time` after the pericentre, in the plane of the orbit.
+
+        x = d − μ G₂,   y = √(μ p) G₁,   ẋ = −μ G₁/r,   ẏ = √(μ p) G₀/r,   p = d (2 − α d)
+
+    - `distance`: d of the pericentre [length]. `alpha`: α = 1/a [1/length], positive for ellipses,
+      0 for a parabola, negative for hyperbolas. `mu`: μ [length³/time²]. All of one shape (…).
+
+    **Returns** (x, y) and (ẋ, ẏ) of shape (…, 2), and whether Kepler's equation was solved.
+
+    **Source** as `change`. Here e = 1 − α d and the energy are given, not computed from a state, so
+    that they keep their digits at large eccentricities.
+    """
+    beta = mu * alpha
+    orbit = _Orbit(distance, jnp.zeros_like(distance), beta, mu - beta * distance)
+    g, is_root = _at(orbit, time)
+    r, momentum = orbit.radius(g), jnp.sqrt(mu * distance * (2 - alpha * distance))
+    position = jnp.stack([distance - mu * g.g2, momentum * g.g1], -1)
+    return position, jnp.stack([-mu * g.g1 / r, momentum * g.g0 / r], -1), is_root
+
+
+def _at(orbit: _Orbit, h: Scalar) -> tuple[_G, Array]:
+    """The functions G_n at the X with t(X) = h, and whether all were found."""
+
+    def equation(X):
+        return orbit.time(X, _universal(X, orbit.beta)) - h
+
+    # The equations of different orbits do not depend on one another: `divide` solves all of them.
+    zero = jnp.zeros_like(orbit.r0)
+    X, is_root = lanewise.implicit_root(equation, zero, lambda _, __: _solve(orbit, h), divide)
+    return orbit.on_time(h, X, _universal(X, orbit.beta)), is_root
 
 
 def _solve(orbit: _Orbit, h: Scalar) -> tuple[Array, Array]:

@@ -276,8 +276,7 @@ def n_body(
     strength of a perturbation of your own into args.
 
     ``args["masses"]`` has the masses of the massive bodies only. The observables are those of the
-    massive bodies, and `test_energies`. Do not use `WisdomHolman` with test particles, because it
-    reads the masses from the kinetic energy.
+    massive bodies, and `test_energies`.
 
     **Raises** `ValueError` for initial conditions that `check_bodies` rejects, for a body of mass 0
     before one with a mass, and for a negative softening; `TypeError` when only some of masses, q0

@@ -1,11 +1,10 @@
 """A satellite of an oblate planet: the Kepler problem in space with J2."""
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 
 from ..discover.symmetries.library import rotation
+from ..problem.orbits import Keplerian
 from ._problem import Parameter, Problem, Start, finite, library_problem
 
 
@@ -30,34 +29,9 @@ def angular_momentum(t0, t1, q0, p0, q1, p1, args):
     return jnp.cross(q1, p1)
 
 
-def elements(q, p, mu, xp: Any = jnp):
-    r"""Osculating semi-major axis, eccentricity, inclination, node and argument of perigee.
-
-        L = q × p,    e = p × L/μ − q/r,    cos i = L_z/|L|,    Ω = atan2(L_x, −L_y),
-        ω = angle from the node (cos Ω, sin Ω, 0) to e about L
-
-    q [length], p [length/time]: shape (…, 3). Returns shape (…, 5), angles [rad] between −π and π;
-    the node is undefined at i = 0, and ω at e = 0. `xp`: the array module, jnp or np.
-
-    **Source** Murray & Dermott 1999, *Solar System Dynamics*, 2.8.
-    """
-
-    def length(x):
-        return xp.sqrt(xp.sum(x**2, axis=-1))
-
-    L = xp.cross(q, p)
-    e = xp.cross(p, L) / mu - q / length(q)[..., None]
-    a = 1 / (2 / length(q) - xp.sum(p**2, axis=-1) / mu)
-    node = xp.arctan2(L[..., 0], -L[..., 1])
-    to_node = xp.stack([xp.cos(node), xp.sin(node), xp.zeros_like(node)], axis=-1)
-    sine = xp.sum(xp.cross(to_node, e) * L, axis=-1) / length(L)
-    perigee = xp.arctan2(sine, xp.sum(to_node * e, axis=-1))
-    return xp.stack([a, length(e), xp.arccos(L[..., 2] / length(L)), node, perigee], axis=-1)
-
-
 def osculating_elements(t0, t1, q0, p0, q1, p1, args):
-    """`elements` at t1: (a, e, i, Ω, ω), shape (5,)."""
-    return elements(q1, p1, args["mu"])
+    """(a, e, i, Ω, ω) of `dvi.elements.Keplerian` at t1, shape (5,)."""
+    return jnp.stack(Keplerian.of(q1, p1, args["mu"])[:5])
 
 
 def secular_rates(a, e, i, args):

@@ -12,12 +12,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from ...base.checks import array, finite
+from ...problem.orbits import Keplerian
 from .._problem import Problem
 from ..n_body import check_bodies, n_body
-from ..oblate_kepler import elements
 
 _BODIES = {
     "Sun": (10, 2.959122082855911e-4),
@@ -138,15 +139,16 @@ def to_ecliptic(vectors: Any) -> np.ndarray:
 
 
 def perihelion_longitude(q: Any, v: Any, mu: float) -> np.ndarray:
-    """Longitude of perihelion of the osculating orbit, ϖ = Ω + ω of `oblate_kepler.elements` [rad].
+    """Longitude of perihelion of the osculating orbit, ϖ = Ω + ω [rad].
 
     - `q`, `v`: heliocentric position [au] and velocity [au/day] on ecliptic axes, shape
       (times, 3). `mu`: GM of the Sun plus that of the planet [au³/day²].
 
     Returns shape (times,), continuous in time (unwrapped).
     """
-    orbit = elements(np.asarray(q, float), np.asarray(v, float), mu, np)
-    return np.unwrap(orbit[..., 3] + orbit[..., 4])
+    with jax.enable_x64(True):
+        orbit = Keplerian.of(np.asarray(q, float), np.asarray(v, float), mu)
+    return np.unwrap(np.asarray(orbit.Omega) + np.asarray(orbit.omega))
 
 
 def check_start(q0: Any, p0: Any, args: Any) -> None:

@@ -1,0 +1,147 @@
+r"""Orbital elements of N bodies: their orbits around the bodies at the centre, and back.
+
+    dvi.elements.of_bodies(sol.qs, sol.ps, masses).e      # (times, bodies − 1)
+    q0, p0 = dvi.elements.to_bodies(elements, masses)
+
+The first body has no elements. `frame` says what the orbits of the others are relative to:
+
+- "jacobi": the centre of mass of the bodies before it, with μ = G times the mass of these and its
+  own. It suits planets, the inner ones first.
+- "heliocentric": the first body, with μ = G (m_0 + m_i).
+- "barycentric": the centre of mass of all, with μ = G times the mass of all.
+
+q and p have the shape (…, bodies, 2 or 3). Bodies after the last entry of `masses` are test
+particles: their mass is 0 and their row of p is the velocity, as in `systems.n_body`.
+
+**Source** Murray & Dermott 1999, *Solar System Dynamics*, 9.1.
+"""
+
+from typing import Any, Literal, get_args
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ..base.checks import array, instance, one_of
+from ..base.types import Args, Scalar, State
+from .flows import value_of
+from .frames import Barycentric, Heliocentric, Jacobi
+from .orbits import (
+    Delaunay as Delaunay,
+    Equinoctial as Equinoctial,
+    Keplerian as Keplerian,
+    ModifiedEquinoctial as ModifiedEquinoctial,
+    Poincare as Poincare,
+)
+
+Frame = Literal["jacobi", "heliocentric", "barycentric"]
+_FRAMES = {"jacobi": Jacobi, "heliocentric": Heliocentric, "barycentric": Barycentric}
+_KINDS = {
+    kind.__name__: kind
+    for kind in (Keplerian, Equinoctial, ModifiedEquinoctial, Delaunay, Poincare)
+}
+
+
+def of_bodies(
+    q: Any, p: Any, masses: Any, G: Any = 1.0, *, frame: Frame = "jacobi", kind: Any = Keplerian
+) -> Any:
+    """The elements of all bodies but the first.
+
+    - `q`, `p`: positions [length] and momenta, shape (…, bodies, 2 or 3). `masses`: of those with a
+      mass, shape (m,). `G`: the gravitational constant. `frame`: see above.
+    - `kind`: `Keplerian`, or another class of elements.
+
+    **Returns** a `kind`, each element of shape (…, bodies − 1).
+
+    **Raises** `ValueError` for shapes that do not fit and for another frame or kind.
+    """
+    q, p = jnp.asarray(q), jnp.asarray(p)
+    all_masses, scale = _masses(masses, q.shape[-2])
+    array("p", p, q.shape)
+    coordinates = _frame(frame)(all_masses)
+    rows = jnp.vectorize(coordinates.from_bodies, signature="(n,d)->(n,d)")
+    v = p / jnp.broadcast_to(scale[:, None], p.shape)
+    mu = jnp.broadcast_to(G * coordinates.central_mass(), (*q.shape[:-2], q.shape[-2] - 1))
+    return of_kind(kind).of(rows(q)[..., 1:, :], rows(v)[..., 1:, :], mu)
+
+
+def to_bodies(
+    elements: Any, masses: Any, G: Any = 1.0, *, frame: Frame = "jacobi", dim: int = 3
+) -> tuple[Array, Array]:
+    """Positions and momenta of all bodies, the centre of mass at rest at the origin.
+
+    - `elements`: of all bodies but the first, such as ``Keplerian(a, e, inc, Omega, omega, M)``,
+      numbers or arrays of shape (bodies − 1,). `masses`, `G`, `frame`: as for `of_bodies`.
+
+    **Returns** q and p of shape (bodies, dim).
+
+    **Raises** `ValueError` for shapes that do not fit; `TypeError` for elements of no kind.
+    """
+    instance("elements", elements, (*_KINDS.values(),), "elements, such as dvi.elements.Keplerian")
+    elements = type(elements)(*jnp.broadcast_arrays(*map(jnp.asarray, elements)))
+    array("the elements", elements[0], ("bodies − 1",), integers=True)
+    all_masses, scale = _masses(masses, len(elements[0]) + 1)
+    coordinates = _frame(frame)(all_masses)
+    state = elements.state(G * coordinates.central_mass(), dim)
+    q, v = (coordinates.to_bodies(jnp.concatenate([jnp.zeros((1, dim)), x])) for x in state)
+    return q, scale[:, None] * v
+
+
+def of_kind(kind: Any) -> Any:
+    """The class of elements, from the class or its name. **Raises** `ValueError` for another."""
+    return _KINDS[one_of("kind", getattr(kind, "__name__", kind), _KINDS)]
+
+
+class Elements(eqx.Module):
+    """Observable: the elements of a state.
+
+    - `kind`: `Keplerian`, or another class of elements.
+    - `frame`: of N bodies, as for `of_bodies`, with ``args["masses"]`` and ``args["G"]`` (1 without
+      it). None: q is one position, (2,) or (3,), and p the momentum for unit mass.
+    - `mu`: without a `frame`, μ [length³/time²], a number or a function of args; None:
+      ``args["mu"]``.
+
+    Its value has the shape (bodies − 1, 6), without a frame (6,), the elements in their order.
+
+    **Example**
+
+    ```python
+    outer = systems.outer_solar_system()
+    observe = {"orbits": dvi.elements.Elements(frame="jacobi")}
+    sol = dvi.integrate(outer, num_steps=3, method=dvi.WisdomHolman(), observe=observe)
+    print(np.round(sol.observed["orbits"][-1, :, :2], 3))  # a [au] and e
+    # [[5.2020e+00 4.8000e-02]
+    #  [9.5440e+00 5.3000e-02]
+    #  [1.9196e+01 4.7000e-02]
+    #  [3.0073e+01 9.0000e-03]
+    #  [3.9488e+01 2.4900e-01]]
+    ```
+    """
+
+    kind: Any = eqx.field(static=True, default=Keplerian, converter=of_kind)
+    frame: Frame | None = eqx.field(static=True, default=None)
+    mu: Any = None
+
+    def __check_init__(self):
+        if self.frame is not None:
+            _frame(self.frame)
+
+    def __call__(self, t: Scalar, q: State, p: State, args: Args) -> Array:
+        if self.frame is None:
+            mu = args["mu"] if self.mu is None else value_of(self.mu, args, q)
+            return jnp.stack(self.kind.of(q, p, mu), -1)
+        masses, G = args["masses"], args.get("G", 1.0)
+        return jnp.stack(of_bodies(q, p, masses, G, frame=self.frame, kind=self.kind), -1)
+
+
+def _frame(frame: Any) -> Any:
+    return _FRAMES[one_of("frame", frame, get_args(Frame))]
+
+
+def _masses(masses: Any, bodies: int) -> tuple[Array, Array]:
+    """The masses of all bodies, and p/v, which is 1 for a test particle."""
+    masses = jnp.asarray(masses, jnp.result_type(float))
+    array("masses", masses, ("bodies",))
+    tests = bodies - len(masses)
+    one_of("the number of test particles", tests, range(bodies))
+    return jnp.pad(masses, (0, tests)), jnp.pad(masses, (0, tests), constant_values=1.0)

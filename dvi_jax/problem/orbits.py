@@ -1,0 +1,353 @@
+r"""Orbital elements: Kepler orbits as numbers that stay constant, and back to positions.
+
+    kepler = dvi.elements.Keplerian.of(q, v, mu=1.0)     # a, e, inc, Omega, omega, M
+    q, v = kepler.state(mu=1.0)
+
+Every kind of elements has the two functions ``of(q, v, mu)`` and ``state(mu, dim=3)``:
+
+- `Keplerian` and `Delaunay` have the angles of textbooks. The node is undefined at inclination 0
+  and the pericentre at e = 0: these angles are 0 there, and their derivatives NaN.
+- `Equinoctial`, `ModifiedEquinoctial` and `Poincare` and their derivatives are regular there; they
+  are singular at inclination π (also for a plane orbit with negative angular momentum).
+- Hyperbolas have a < 0 and M = e sinh F − F. A parabola has `ModifiedEquinoctial` only.
+
+Positions q [length] and velocities v [length/time] have the shape (…, 2) or (…, 3), and `mu`
+(G times both masses, [length³/time²]) is a number or has the shape (…). Each element has the shape
+(…). Angles are in radians, between −π and π, except M of a hyperbola. All functions can be
+differentiated in every order, batched and compiled. A state at the centre, an unbound orbit of
+`Delaunay` or `Poincare` and elements that belong to no orbit give NaN.
+
+**Source** Broucke & Cefola 1972, *Celest. Mech.* 5, 303 (equinoctial); Walker, Ireland & Owens
+1985, *Celest. Mech.* 36, 409 (modified); Murray & Dermott 1999, *Solar System Dynamics*, 2.8;
+Laskar & Robutel 1995, *Celest. Mech. Dyn. Astron.* 62, 193 (Poincaré).
+"""
+
+import math
+from typing import Any, NamedTuple, Self
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+import lanewise
+
+from ..base.checks import array, one_of
+from ..engine.bracket import divide
+from . import kepler as _kepler
+
+
+class Keplerian(NamedTuple):
+    """a [length], e, inclination, node Ω, argument of the pericentre ω, mean anomaly M [rad]."""
+
+    a: Array
+    e: Array
+    inc: Array
+    Omega: Array
+    omega: Array
+    M: Array
+
+    @classmethod
+    def of(cls, q: Any, v: Any, mu: Any) -> Self:
+        """The elements of a state."""
+        plane = _plane(q, v)
+        # Near the inclination π the orbit is turned about the x axis by π, to the inclination 0.
+        turned = plane.momentum[..., 2] < 0
+        sign = jnp.where(turned, -1.0, 1.0)[..., None]
+        q, v = (jnp.concatenate([x[..., :1], sign * x[..., 1:]], -1) for x in (plane.q, plane.v))
+        a, ex, ey, hx, hy, longitude = Equinoctial.of(q, v, mu)
+        if plane.dim == 2:
+            inc = node = jnp.zeros_like(a)
+        else:
+            inc, node = 2 * jnp.arctan(_length(hx, hy)), _angle(hx, hy)
+        pericentre, e = _angle(ex, ey), _length(ex, ey)
+        # Near the circle M and ω have large errors of opposite sign. Far from it a (1 − e) and M
+        # keep their digits near the pericentre if e and M belong to the energy.
+        far = e > 0.1
+        e_far = jnp.sqrt(jnp.where(far, 1 - jnp.sum(plane.momentum**2, -1) / (mu * a), 1.0))
+        M = jnp.where(far, _mean_anomaly(q, v, mu, e_far), _wrap(longitude - pericentre))
+        e = jnp.where(far, e_far, e)
+        return cls(
+            a,
+            e,
+            jnp.where(turned, math.pi - inc, inc),
+            jnp.where(turned, _wrap(math.pi - node), node),
+            _wrap(pericentre - node + jnp.where(turned, math.pi, 0.0)),
+            M,
+        )
+
+    def state(self, mu: Any, dim: int = 3) -> tuple[Array, Array]:
+        """Position and velocity, of shape (…, dim)."""
+        a, e, inc, node, pericentre, M, mu = _same_shape(*self, mu)
+        time = jnp.where(a > 0, _wrap(M), M) * jnp.sqrt(jnp.abs(a) ** 3 / mu)
+        q, v, is_root = _kepler.from_pericentre(time, a * (1 - e), 1 / a, mu)
+        good = is_root & (e >= 0)
+
+        def in_space(x):
+            x, y = _turned(pericentre, x[..., 0], x[..., 1])
+            y, z = jnp.cos(inc) * y, jnp.sin(inc) * y
+            return jnp.where(good[..., None], jnp.stack([*_turned(node, x, y), z], -1), jnp.nan)
+
+        return _of_dim(dim, in_space(q), in_space(v))
+
+
+class ModifiedEquinoctial(NamedTuple):
+    """p = a (1 − e²) [length], e cos ϖ, e sin ϖ, tan(i/2) cos Ω, tan(i/2) sin Ω, ϖ + true anomaly.
+
+    ϖ = Ω + ω. Regular also at e = 1.
+    """
+
+    p: Array
+    ex: Array
+    ey: Array
+    hx: Array
+    hy: Array
+    longitude: Array
+
+    @classmethod
+    def of(cls, q: Any, v: Any, mu: Any) -> Self:
+        """The elements of a state."""
+        q, v, momentum, _ = _plane(q, v)
+        size = jnp.sqrt(jnp.sum(momentum**2, -1))
+        w = momentum / size[..., None]
+        hx, hy = (x / (1 + w[..., 2]) for x in (-w[..., 1], w[..., 0]))
+        r = jnp.sqrt(jnp.sum(q * q, -1))
+        p = size * size / mu
+        c, s = (jnp.sum(q * axis, -1) / r for axis in _axes(hx, hy))
+        # e cos f and e sin f of the true anomaly f, turned from the radius to the first axis.
+        along, across = p / r - 1, size * jnp.sum(q * v, -1) / (mu * r)
+        ex, ey = c * along + s * across, s * along - c * across
+        return cls(p, ex, ey, hx, hy, jnp.arctan2(s, c))
+
+    def state(self, mu: Any, dim: int = 3) -> tuple[Array, Array]:
+        """Position and velocity, of shape (…, dim)."""
+        p, ex, ey, hx, hy, longitude, mu = _same_shape(*self, mu)
+        c, s = jnp.cos(longitude), jnp.sin(longitude)
+        r, speed = p / (1 + ex * c + ey * s), jnp.sqrt(mu / p)
+        r = jnp.where(r > 0, r, jnp.nan)  # a direction beyond the asymptotes of a hyperbola
+        return _in_space(dim, hx, hy, (r * c, r * s), (-speed * (s + ey), speed * (c + ex)))
+
+
+class Equinoctial(NamedTuple):
+    """a [length], e cos ϖ, e sin ϖ, tan(i/2) cos Ω, tan(i/2) sin Ω, mean longitude λ = ϖ + M."""
+
+    a: Array
+    ex: Array
+    ey: Array
+    hx: Array
+    hy: Array
+    longitude: Array
+
+    @classmethod
+    def of(cls, q: Any, v: Any, mu: Any) -> Self:
+        """The elements of a state."""
+        p, ex, ey, hx, hy, true_longitude = ModifiedEquinoctial.of(q, v, mu)
+        r, rv, alpha = _energy(q, v, mu)
+        x, y = r * jnp.cos(true_longitude), r * jnp.sin(true_longitude)
+        bound = alpha > 0
+        # Substitutes keep the derivatives finite in the formula that is not taken.
+        inverse = jnp.where(bound, alpha, 1.0)
+        root = jnp.sqrt(jnp.where(bound, p * alpha, 1.0))
+        beta = 1 / (1 + root)
+        cosine = ex + ((1 - ex * ex * beta) * x - ex * ey * beta * y) * inverse / root
+        sine = ey + ((1 - ey * ey * beta) * y - ex * ey * beta * x) * inverse / root
+        elliptic = jnp.arctan2(sine, cosine) - rv * jnp.sqrt(inverse / mu)
+        e = jnp.sqrt(jnp.where(bound, 1.0, 1 - p * alpha))
+        hyperbolic = _mean_anomaly(q, v, mu, e) + _angle(
+            jnp.where(bound, 1.0, ex), jnp.where(bound, 0.0, ey)
+        )
+        longitude = jnp.where(bound, _wrap(elliptic), hyperbolic)
+        return cls(1 / alpha, ex, ey, hx, hy, longitude)
+
+    def state(self, mu: Any, dim: int = 3) -> tuple[Array, Array]:
+        """Position and velocity, of shape (…, dim)."""
+        a, ex, ey, hx, hy, longitude, mu = _same_shape(*self, mu)
+        e2 = ex * ex + ey * ey
+        near = e2 < 0.25
+        # Near the circle the pericentre is undefined; far from it the other iteration is slow.
+        small = jnp.where(near, ex, 0.0), jnp.where(near, ey, 0.0)
+        q_near, v_near = _near_circle(jnp.abs(a), *small, longitude, mu)
+        large = jnp.where(near, 0.5, ex), jnp.where(near, 0.0, ey)
+        e, pericentre, is_far = _length(*large), _angle(*large), jnp.where(near, 1.0, a)
+        orbit = Keplerian(is_far, e, 0 * e, 0 * e, pericentre, longitude - pericentre)
+        q_far, v_far = ((x[..., 0], x[..., 1]) for x in orbit.state(mu))
+        good = ~near | (a > 0)
+
+        def choose(x, y):
+            return jnp.where(good, jnp.where(near, x, y), jnp.nan)
+
+        q, v = (tuple(map(choose, *pair)) for pair in ((q_near, q_far), (v_near, v_far)))
+        return _in_space(dim, hx, hy, q, v)
+
+
+class Delaunay(NamedTuple):
+    """Canonical: M, ω, Ω [rad] and L = √(μa), G = L √(1 − e²), H = G cos i [length²/time].
+
+    Coordinates (l, g, h), momenta (L, G, H), for unit mass.
+    """
+
+    l: Array  # noqa: E741
+    g: Array
+    h: Array
+    L: Array
+    G: Array
+    H: Array
+
+    @classmethod
+    def of(cls, q: Any, v: Any, mu: Any) -> Self:
+        """The elements of a state."""
+        kepler, momentum = Keplerian.of(q, v, mu), _plane(q, v).momentum
+        L = _action(kepler.a, mu)
+        G = jnp.minimum(jnp.sqrt(jnp.sum(momentum**2, -1)), L)
+        return cls(kepler.M, kepler.omega, kepler.Omega, L, G, G * jnp.cos(kepler.inc))
+
+    def state(self, mu: Any, dim: int = 3) -> tuple[Array, Array]:
+        """Position and velocity, of shape (…, dim)."""
+        l, g, h, L, G, H, mu = _same_shape(*self, mu)  # noqa: E741
+        e = jnp.sqrt((L - G) * (L + G)) / L
+        inc = 2 * jnp.arctan2(jnp.sqrt(G - H), jnp.sqrt(G + H))
+        return Keplerian(L * L / mu, e, inc, h, g, l).state(mu, dim)
+
+
+class Poincare(NamedTuple):
+    r"""Canonical and regular at e = 0 and i = 0: coordinates (λ, η, q), momenta (Λ, ξ, p).
+
+        Λ = √(μa),  ξ + iη = √(2Λ(1 − √(1 − e²))) e^{−iϖ},
+        p + iq = √(2Λ √(1 − e²) (1 − cos i)) e^{−iΩ}
+
+    for unit mass: Λ [length²/time], the others but λ are roots of that.
+    """
+
+    longitude: Array
+    eta: Array
+    q: Array
+    Lambda: Array
+    xi: Array
+    p: Array
+
+    @classmethod
+    def of(cls, q: Any, v: Any, mu: Any) -> Self:
+        """The elements of a state."""
+        a, ex, ey, hx, hy, longitude = Equinoctial.of(q, v, mu)
+        action = _action(a, mu)
+        momentum = _plane(q, v).momentum
+        G = jnp.sqrt(jnp.sum(momentum**2, -1))
+        scale = jnp.sqrt(2 * action / (1 + G / action))
+        lift = jnp.sqrt(4 * G / (1 + hx * hx + hy * hy))
+        return cls(longitude, -ey * scale, -hy * lift, action, ex * scale, hx * lift)
+
+    def state(self, mu: Any, dim: int = 3) -> tuple[Array, Array]:
+        """Position and velocity, of shape (…, dim)."""
+        longitude, eta, q, action, xi, p, mu = _same_shape(*self, mu)
+        G = action - (xi * xi + eta * eta) / 2
+        scale = jnp.sqrt((1 + G / action) / (2 * action))
+        # tan²(i/2) = Z/(2G − Z) with Z = (p² + q²)/2
+        lift = 1 / jnp.sqrt(4 * G - (p * p + q * q))
+        elements = action**2 / mu, xi * scale, -eta * scale, p * lift, -q * lift, longitude
+        return Equinoctial(*elements).state(mu, dim)
+
+
+class _Plane(NamedTuple):
+    """A state in space, its angular momentum q × v for unit mass, and the dimension it came in."""
+
+    q: Array
+    v: Array
+    momentum: Array
+    dim: int
+
+
+def _plane(q: Any, v: Any) -> _Plane:
+    q, v = jnp.asarray(q), jnp.asarray(v)
+    one_of("the last axis of q", q.shape[-1:], ((2,), (3,)))
+    array("v", v, q.shape)
+    dim = q.shape[-1]
+    if dim == 2:
+        q, v = (jnp.concatenate([x, jnp.zeros_like(x[..., :1])], -1) for x in (q, v))
+    return _Plane(q, v, jnp.cross(q, v), dim)
+
+
+def _axes(hx: Array, hy: Array) -> tuple[Array, Array]:
+    """The two unit vectors of the orbit's plane from which equinoctial longitudes are counted."""
+    square = 1 + hx * hx + hy * hy
+    first = [1 + hx * hx - hy * hy, 2 * hx * hy, -2 * hy]
+    second = [2 * hx * hy, 1 - hx * hx + hy * hy, 2 * hx]
+    scale = 1 / square[..., None]
+    return scale * jnp.stack(first, -1), scale * jnp.stack(second, -1)
+
+
+def _in_space(dim: int, hx: Array, hy: Array, *vectors: Any) -> tuple[Array, Array]:
+    """Vectors (x, y) in the orbit's plane, as vectors in space."""
+    f, g = _axes(hx, hy)
+    return _of_dim(dim, *(x[..., None] * f + y[..., None] * g for x, y in vectors))
+
+
+def _of_dim(dim: int, q: Array, v: Array) -> tuple[Array, Array]:
+    one_of("dim", dim, (2, 3))
+    return q[..., :dim], v[..., :dim]
+
+
+def _near_circle(a: Array, ex: Array, ey: Array, longitude: Array, mu: Array) -> Any:
+    """Position and velocity in the plane, for e < 1/2."""
+
+    def equation(F):
+        return F - ex * jnp.sin(F) + ey * jnp.cos(F) - longitude
+
+    def solve(function, F):
+        for _ in range(6):  # Newton's method: e = 1/2 needs five
+            F = F - function(F) / (1 - ex * jnp.cos(F) - ey * jnp.sin(F))
+        return F, ()
+
+    F, _ = lanewise.implicit_root(equation, longitude, solve, divide)
+    c, s = jnp.cos(F), jnp.sin(F)
+    root = jnp.sqrt(1 - ex * ex - ey * ey)
+    beta = 1 / (1 + root)
+    x = a * ((1 - ey * ey * beta) * c + ex * ey * beta * s - ex)
+    y = a * ((1 - ex * ex * beta) * s + ex * ey * beta * c - ey)
+    rate = jnp.sqrt(mu / a) / (1 - ex * c - ey * s)
+    u = rate * (ex * ey * beta * c - (1 - ey * ey * beta) * s)
+    w = rate * ((1 - ex * ex * beta) * c - ex * ey * beta * s)
+    return (x, y), (u, w)
+
+
+def _energy(q: Any, v: Any, mu: Any) -> tuple[Array, Array, Array]:
+    """|q|, q·v and 1/a."""
+    q, v = jnp.asarray(q), jnp.asarray(v)
+    r = jnp.sqrt(jnp.sum(q * q, -1))
+    return r, jnp.sum(q * v, -1), 2 / r - jnp.sum(v * v, -1) / mu
+
+
+def _mean_anomaly(q: Any, v: Any, mu: Any, e: Array) -> Array:
+    """M of a state that is not near the circle, E − e sin E or e sinh F − F."""
+    r, rv, alpha = _energy(q, v, mu)
+    bound = alpha > 0
+    s = rv * jnp.sqrt(jnp.where(alpha == 0, jnp.nan, jnp.abs(alpha)) / mu)
+    cosine = jnp.where(bound, 1 - r * alpha, 1.0)
+    free, e = (jnp.where(bound, 0.0, s), jnp.where(bound, 1.0, e))
+    return jnp.where(bound, jnp.arctan2(s, cosine) - s, free - jnp.arcsinh(free / e))
+
+
+def _action(a: Array, mu: Any) -> Array:
+    return jnp.sqrt(jnp.where(a > 0, mu * a, jnp.nan))
+
+
+def _turned(angle: Array, x: Array, y: Array) -> tuple[Array, Array]:
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    return c * x - s * y, s * x + c * y
+
+
+def _angle(x: Array, y: Array) -> Array:
+    """The angle of (x, y), 0 at the origin whatever the sign of its zeros."""
+    return jnp.arctan2(y, jnp.where((x == 0) & (y == 0), 0.0, x))
+
+
+def _length(x: Array, y: Array) -> Array:
+    # Not hypot, whose derivative at the origin is 0 in JAX: it does not exist, and is NaN here.
+    return jnp.sqrt(x * x + y * y)
+
+
+def _wrap(angle: Array) -> Array:
+    """The angle between −π and π."""
+    return angle - 2 * math.pi * jnp.round(angle / (2 * math.pi))
+
+
+def _same_shape(*values: Any) -> list[Array]:
+    dtype = jnp.result_type(*values, 0.0)
+    return jnp.broadcast_arrays(*(jnp.asarray(x, dtype) for x in values))
