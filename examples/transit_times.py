@@ -23,7 +23,7 @@ import matplotlib as mpl
 import numpy as np
 
 import dvi_jax as dvi
-from dvi_jax import plot, systems
+from dvi_jax import elements, plot, systems
 
 jax.config.update("jax_enable_x64", True)
 mpl.use("Agg")
@@ -46,29 +46,16 @@ def state(params):
 
     Transits are at the true longitude 90°, the observer in the direction of +y.
     """
-    P, ec, es = params["period"], params["ecos"], params["esin"]
+    ex, ey = params["ecos"], params["esin"]
     masses = GM * jnp.concatenate([jnp.ones(1), params["mass"]])
-    n = 2 * jnp.pi / P
-    a = (jnp.cumsum(masses)[1:] / n**2) ** (1 / 3)
-    e, omega = jnp.hypot(ec, es), jnp.arctan2(es, ec)
-    half = jnp.sqrt((1 - e) / (1 + e))
-    at_transit = 2 * jnp.arctan(half * jnp.tan((jnp.pi / 2 - omega) / 2))
-    M = at_transit - e * jnp.sin(at_transit) - n * params["transit"]
-    E = M
-    for _ in range(8):  # Newton's method; e is small
-        E = E - (E - e * jnp.sin(E) - M) / (1 - e * jnp.cos(E))
-    c, s = jnp.cos(omega), jnp.sin(omega)
-    x, y = a * (jnp.cos(E) - e), a * jnp.sqrt(1 - e * e) * jnp.sin(E)
-    rate = n * a / (1 - e * jnp.cos(E))
-    u, v = -rate * jnp.sin(E), rate * jnp.sqrt(1 - e * e) * jnp.cos(E)
-    planet = jnp.stack([c * x - s * y, s * x + c * y], 1)
-    velocity = jnp.stack([c * u - s * v, s * u + c * v], 1)
-    q = jnp.concatenate([jnp.zeros((1, 2)), planet])
-    w = jnp.concatenate([jnp.zeros((1, 2)), velocity])
+    mu = jnp.cumsum(masses)[1:]
+    n = 2 * jnp.pi / params["period"]
+    a = (mu / n**2) ** (1 / 3)
+    at_transit = elements.ModifiedEquinoctial(a * (1 - ex**2 - ey**2), ex, ey, 0, 0, jnp.pi / 2)
+    longitude = elements.Equinoctial.from_state(*at_transit.state(mu), mu).longitude
+    start = elements.Equinoctial(a, ex, ey, 0, 0, longitude - n * params["transit"])
     # The outer planet moves around the centre of mass of the star and the inner one (Jacobi).
-    inner = masses[1] / (masses[0] + masses[1])
-    q, w = (x.at[2].add(inner * x[1]) for x in (q, w))
-    return q, masses[:, None] * w, {"masses": masses}
+    return *elements.to_bodies(start, masses, dim=2), {"masses": masses}
 
 
 SYSTEM = systems.n_body().system

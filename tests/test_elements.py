@@ -38,7 +38,7 @@ def apart(x, y):
     return float(np.max(np.linalg.norm(x - y, axis=-1) / np.linalg.norm(y, axis=-1)))
 
 
-there = {kind: jax.jit(lambda q, v, kind=kind: kind.of(q, v, MU)) for kind in KINDS}
+there = {kind: jax.jit(lambda q, v, kind=kind: kind.from_state(q, v, MU)) for kind in KINDS}
 back = jax.jit(lambda elements: elements.state(MU))
 
 
@@ -120,7 +120,7 @@ CASES += [(Keplerian, 1.01), (Keplerian, 0.3), (Delaunay, 0.3)]
 def test_derivatives_are_those_of_fifty_digits(kind, e):
     orbit = Keplerian(1.3 if e < 1 else -1.3, e, 0.4, 1.1, 0.6, 0.9)
     q, v = map(np.asarray, orbit.state(MU))
-    jacobian = jax.jit(jax.jacfwd(lambda z: jnp.stack(kind.of(z[:3], z[3:], MU))))
+    jacobian = jax.jit(jax.jacfwd(lambda z: jnp.stack(kind.from_state(z[:3], z[3:], MU))))
     derivative = np.asarray(jacobian(jnp.concatenate([q, v])))
     with mpmath.workdps(60):
         z = [mpmath.mpf(float(x)) for x in (*q, *v)]
@@ -147,13 +147,13 @@ def test_derivatives_are_those_of_fifty_digits(kind, e):
 @pytest.mark.parametrize("kind", KINDS)
 def test_derivatives_of_states_are_the_inverse(kind):
     """∂(elements)/∂(state) ∂(state)/∂(elements) = 1, and the second derivatives are finite."""
-    elements = kind.of(*Keplerian(1.3, 0.3, 0.4, 1.1, 0.6, 0.9).state(MU), MU)
+    elements = kind.from_state(*Keplerian(1.3, 0.3, 0.4, 1.1, 0.6, 0.9).state(MU), MU)
 
     def state(x):
         return jnp.concatenate(kind(*x).state(MU))
 
     def of(z):
-        return jnp.stack(kind.of(z[:3], z[3:], MU))
+        return jnp.stack(kind.from_state(z[:3], z[3:], MU))
 
     x = jnp.stack(elements)
     product = jax.jit(lambda x: jax.jacfwd(of)(state(x)) @ jax.jacrev(state)(x))(x)
@@ -164,7 +164,7 @@ def test_regular_elements_have_derivatives_on_a_circle_in_the_plane():
     circle = jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 1.0, 0.0])
 
     def derivative(kind):
-        return jax.jacfwd(lambda z: jnp.stack(kind.of(z[:3], z[3:], 1.0)))(jnp.concatenate(circle))
+        return jax.jacfwd(lambda z: jnp.stack(kind.from_state(z[:3], z[3:], 1.0)))(jnp.concatenate(circle))
 
     for kind in (Equinoctial, ModifiedEquinoctial, Poincare):
         there = derivative(kind)
@@ -172,7 +172,7 @@ def test_regular_elements_have_derivatives_on_a_circle_in_the_plane():
         def state(x, kind=kind):
             return jnp.concatenate(kind(*x).state(1.0))
 
-        again = jax.jacfwd(state)(jnp.stack(kind.of(*circle, 1.0)))
+        again = jax.jacfwd(state)(jnp.stack(kind.from_state(*circle, 1.0)))
         np.testing.assert_allclose(there @ again, np.eye(6), atol=1e-13)
     # Angles that do not exist have no derivative, and say so.
     assert np.isnan(derivative(Keplerian)).any(axis=1).tolist() == [0, 1, 1, 1, 1, 1]
@@ -184,7 +184,7 @@ def test_regular_elements_have_derivatives_on_a_circle_in_the_plane():
 )
 def test_canonical_elements(kind, canonical):
     q, v = Keplerian(1.3, 0.3, 0.4, 1.1, 0.6, 0.9).state(MU)
-    jacobian = jax.jacfwd(lambda z: jnp.stack(kind.of(z[:3], z[3:], MU)))(jnp.concatenate([q, v]))
+    jacobian = jax.jacfwd(lambda z: jnp.stack(kind.from_state(z[:3], z[3:], MU)))(jnp.concatenate([q, v]))
     assert (symplectic_defect(jacobian) < 1e-13) == canonical
 
 
@@ -192,25 +192,25 @@ def test_canonical_elements(kind, canonical):
 def test_orbits_in_a_plane(direction):
     kepler = systems.kepler()
     q, v = jnp.asarray(kepler.q0), direction * jnp.asarray(kepler.p0)
-    elements = Keplerian.of(q, v, 1.0)
+    elements = Keplerian.from_state(q, v, 1.0)
     assert float(elements.inc) == (0.0 if direction > 0 else np.pi)
     again = elements.state(1.0, dim=2)
     assert max(apart(again[0], q), apart(again[1], v)) < 1e-15
     # In the plane the direction of the pericentre has a derivative. A turn by δ changes it by δ.
     turn = jnp.array([[0.0, -1.0], [1.0, 0.0]])
-    change = jax.jvp(lambda q, v: Keplerian.of(q, v, 1.0), (q, v), (turn @ q, turn @ v))[1]
+    change = jax.jvp(lambda q, v: Keplerian.from_state(q, v, 1.0), (q, v), (turn @ q, turn @ v))[1]
     np.testing.assert_allclose(jnp.stack(change), [0, 0, 0, 0, direction, 0], atol=1e-14)
 
 
 def test_a_parabola():
     q, v = jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, np.sqrt(2.0), 0.0])
-    elements = ModifiedEquinoctial.of(q, v, 1.0)
+    elements = ModifiedEquinoctial.from_state(q, v, 1.0)
     np.testing.assert_allclose(elements, [2, 1, 0, 0, 0, 0], atol=1e-15)
     moved = elements._replace(longitude=2.0).state(1.0)
     assert abs(float(jnp.sum(moved[1] ** 2) / 2 - 1 / jnp.linalg.norm(moved[0]))) < 1e-15
-    assert np.isnan(Delaunay.of(q, 1.1 * v, 1.0).L)
-    assert np.isnan(Poincare.of(q, 1.1 * v, 1.0).Lambda)
-    beyond = ModifiedEquinoctial.of(q, 1.1 * v, 1.0)._replace(longitude=3.0)
+    assert np.isnan(Delaunay.from_state(q, 1.1 * v, 1.0).L)
+    assert np.isnan(Poincare.from_state(q, 1.1 * v, 1.0).Lambda)
+    beyond = ModifiedEquinoctial.from_state(q, 1.1 * v, 1.0)._replace(longitude=3.0)
     assert np.isnan(beyond.state(1.0)[0]).all()
 
 
@@ -334,7 +334,7 @@ def test_bad_input():
         (lambda: of_bodies(q, p, MASSES, kind="Kepler"), "kind must be one of 'Keplerian'"),
         (lambda: of_bodies(q, p, np.ones(5)), "test particles must be"),
         (lambda: of_bodies(q, p[:2], MASSES), "p must be"),
-        (lambda: Keplerian.of(q[0, :1], p[0, :1], 1.0), "last axis of q"),
+        (lambda: Keplerian.from_state(q[0, :1], p[0, :1], 1.0), "last axis of q"),
         (lambda: planets(0).state(1.0, dim=4), "dim must be one of 2, 3"),
         (lambda: Elements(frame="solar"), "frame must be one of"),
     ]:

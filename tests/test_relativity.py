@@ -141,7 +141,7 @@ def per_turn(qs, vs, turn):
     passage = CubicSpline(np.arange(len(r)), np.sum(r * v, axis=1))
     at = passage.roots(extrapolate=False)
     at = at[passage(at, 1) > 0]
-    orbit = dvi.elements.Keplerian.of(r, v, 1.0)
+    orbit = dvi.elements.Keplerian.from_state(r, v, 1.0)
     node, peri = orbit.Omega, orbit.omega
     angles = CubicSpline(np.arange(len(r)), np.unwrap([node, peri]), axis=1)(at)
     return (angles[:, -1] - angles[:, 0]) / (len(at) - 1)

@@ -69,6 +69,7 @@ FOLDERS = {
 MODULES = {
     "generators": ("Generators of common symmetries", "generators"),
     "starts": ("Initial conditions of a sweep", "starts"),
+    "elements": ("Orbital elements", "elements"),
     "systems": ("Library of systems", "systems"),
     "boozer": ("Guiding centres in Boozer coordinates", "systems.boozer"),
     "rigid": ("Rotations of rigid bodies", "systems.rigid"),

@@ -166,6 +166,7 @@ class WisdomHolman(SplittingMethod):
             raise ValueError(
                 f"dvi.WisdomHolman requires H_D = Σ |p_i|²/(2 m_i) + V(q0), but {reason}."
             )
+        # The momentum of a test particle is its velocity: T has a mass 1 where the frame has 0.
         scale = 1 / inverse_mass(q)[:, :1]
         masses = scale[:, 0].at[_massive(equations.args, len(q)) :].set(0.0)
         return _COORDINATES[self.coordinates](masses), scale

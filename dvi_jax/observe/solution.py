@@ -211,7 +211,7 @@ class Solution(eqx.Module):
         only_one(masses=masses, mu=mu)
         require("Solution.elements", {"masses or mu": mu if masses is None else masses})
         if masses is None:
-            return of_kind(kind).of(self.qs, self.ps, mu)
+            return of_kind(kind).from_state(self.qs, self.ps, mu)
         return of_bodies(self.qs, self.ps, masses, G, frame=frame, kind=kind)
 
     def save(self, path: str | os.PathLike[str]) -> None:

@@ -59,10 +59,11 @@ def of_bodies(
     all_masses, scale = _masses(masses, q.shape[-2])
     array("p", p, q.shape)
     coordinates = _frame(frame)(all_masses)
+    # Only the axis of the bodies is mixed; times and trajectories are before it.
     rows = jnp.vectorize(coordinates.from_bodies, signature="(n,d)->(n,d)")
     v = p / jnp.broadcast_to(scale[:, None], p.shape)
     mu = jnp.broadcast_to(G * coordinates.central_mass(), (*q.shape[:-2], q.shape[-2] - 1))
-    return of_kind(kind).of(rows(q)[..., 1:, :], rows(v)[..., 1:, :], mu)
+    return of_kind(kind).from_state(rows(q)[..., 1:, :], rows(v)[..., 1:, :], mu)
 
 
 def to_bodies(
@@ -129,7 +130,7 @@ class Elements(eqx.Module):
     def __call__(self, t: Scalar, q: State, p: State, args: Args) -> Array:
         if self.frame is None:
             mu = args["mu"] if self.mu is None else value_of(self.mu, args, q)
-            return jnp.stack(self.kind.of(q, p, mu), -1)
+            return jnp.stack(self.kind.from_state(q, p, mu), -1)
         masses, G = args["masses"], args.get("G", 1.0)
         return jnp.stack(of_bodies(q, p, masses, G, frame=self.frame, kind=self.kind), -1)
 
@@ -142,6 +143,7 @@ def _masses(masses: Any, bodies: int) -> tuple[Array, Array]:
     """The masses of all bodies, and p/v, which is 1 for a test particle."""
     masses = jnp.asarray(masses, jnp.result_type(float))
     array("masses", masses, ("bodies",))
+    # The momentum of a test particle would be 0 and determine no velocity.
     tests = bodies - len(masses)
     one_of("the number of test particles", tests, range(bodies))
     return jnp.pad(masses, (0, tests)), jnp.pad(masses, (0, tests), constant_values=1.0)

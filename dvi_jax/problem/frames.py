@@ -22,6 +22,7 @@ class Jacobi(NamedTuple):
 
     def to_bodies(self, X: Array) -> Array:
         """The inverse of `from_bodies`."""
+        # The centre of mass of the bodies up to each, from the outermost one inwards.
         part = (self.masses / jnp.cumsum(self.masses))[1:, None]
         outer = jnp.cumsum((part * X[1:])[::-1], axis=0)[::-1]
         centres = X[:1] - jnp.concatenate([outer, jnp.zeros_like(X[:1])])

@@ -1,9 +1,9 @@
 r"""Orbital elements: Kepler orbits as numbers that stay constant, and back to positions.
 
-    kepler = dvi.elements.Keplerian.of(q, v, mu=1.0)     # a, e, inc, Omega, omega, M
+    kepler = dvi.elements.Keplerian.from_state(q, v, mu=1.0)     # a, e, inc, Omega, omega, M
     q, v = kepler.state(mu=1.0)
 
-Every kind of elements has the two functions ``of(q, v, mu)`` and ``state(mu, dim=3)``:
+Every kind of elements has the two functions ``from_state(q, v, mu)`` and ``state(mu, dim=3)``:
 
 - `Keplerian` and `Delaunay` have the angles of textbooks. The node is undefined at inclination 0
   and the pericentre at e = 0: these angles are 0 there, and their derivatives NaN.
@@ -46,14 +46,14 @@ class Keplerian(NamedTuple):
     M: Array
 
     @classmethod
-    def of(cls, q: Any, v: Any, mu: Any) -> Self:
+    def from_state(cls, q: Any, v: Any, mu: Any) -> Self:
         """The elements of a state."""
         plane = _plane(q, v)
         # Near the inclination π the orbit is turned about the x axis by π, to the inclination 0.
-        turned = plane.momentum[..., 2] < 0
-        sign = jnp.where(turned, -1.0, 1.0)[..., None]
+        flips = plane.momentum[..., 2] < 0
+        sign = jnp.where(flips, -1.0, 1.0)[..., None]
         q, v = (jnp.concatenate([x[..., :1], sign * x[..., 1:]], -1) for x in (plane.q, plane.v))
-        a, ex, ey, hx, hy, longitude = Equinoctial.of(q, v, mu)
+        a, ex, ey, hx, hy, longitude = Equinoctial.from_state(q, v, mu)
         if plane.dim == 2:
             inc = node = jnp.zeros_like(a)
         else:
@@ -68,9 +68,9 @@ class Keplerian(NamedTuple):
         return cls(
             a,
             e,
-            jnp.where(turned, math.pi - inc, inc),
-            jnp.where(turned, _wrap(math.pi - node), node),
-            _wrap(pericentre - node + jnp.where(turned, math.pi, 0.0)),
+            jnp.where(flips, math.pi - inc, inc),
+            jnp.where(flips, _wrap(math.pi - node), node),
+            _wrap(pericentre - node + jnp.where(flips, math.pi, 0.0)),
             M,
         )
 
@@ -82,9 +82,9 @@ class Keplerian(NamedTuple):
         good = is_root & (e >= 0)
 
         def in_space(x):
-            x, y = _turned(pericentre, x[..., 0], x[..., 1])
+            x, y = _rotate(pericentre, x[..., 0], x[..., 1])
             y, z = jnp.cos(inc) * y, jnp.sin(inc) * y
-            return jnp.where(good[..., None], jnp.stack([*_turned(node, x, y), z], -1), jnp.nan)
+            return jnp.where(good[..., None], jnp.stack([*_rotate(node, x, y), z], -1), jnp.nan)
 
         return _of_dim(dim, in_space(q), in_space(v))
 
@@ -103,7 +103,7 @@ class ModifiedEquinoctial(NamedTuple):
     longitude: Array
 
     @classmethod
-    def of(cls, q: Any, v: Any, mu: Any) -> Self:
+    def from_state(cls, q: Any, v: Any, mu: Any) -> Self:
         """The elements of a state."""
         q, v, momentum, _ = _plane(q, v)
         size = jnp.sqrt(jnp.sum(momentum**2, -1))
@@ -111,19 +111,20 @@ class ModifiedEquinoctial(NamedTuple):
         hx, hy = (x / (1 + w[..., 2]) for x in (-w[..., 1], w[..., 0]))
         r = jnp.sqrt(jnp.sum(q * q, -1))
         p = size * size / mu
-        c, s = (jnp.sum(q * axis, -1) / r for axis in _axes(hx, hy))
+        cosine, sine = (jnp.sum(q * axis, -1) / r for axis in _axes(hx, hy))
         # e cos f and e sin f of the true anomaly f, turned from the radius to the first axis.
-        along, across = p / r - 1, size * jnp.sum(q * v, -1) / (mu * r)
-        ex, ey = c * along + s * across, s * along - c * across
-        return cls(p, ex, ey, hx, hy, jnp.arctan2(s, c))
+        radial, transverse = p / r - 1, size * jnp.sum(q * v, -1) / (mu * r)
+        ex, ey = cosine * radial + sine * transverse, sine * radial - cosine * transverse
+        return cls(p, ex, ey, hx, hy, jnp.arctan2(sine, cosine))
 
     def state(self, mu: Any, dim: int = 3) -> tuple[Array, Array]:
         """Position and velocity, of shape (…, dim)."""
         p, ex, ey, hx, hy, longitude, mu = _same_shape(*self, mu)
-        c, s = jnp.cos(longitude), jnp.sin(longitude)
-        r, speed = p / (1 + ex * c + ey * s), jnp.sqrt(mu / p)
+        cosine, sine = jnp.cos(longitude), jnp.sin(longitude)
+        r, speed = p / (1 + ex * cosine + ey * sine), jnp.sqrt(mu / p)
         r = jnp.where(r > 0, r, jnp.nan)  # a direction beyond the asymptotes of a hyperbola
-        return _in_space(dim, hx, hy, (r * c, r * s), (-speed * (s + ey), speed * (c + ex)))
+        velocity = -speed * (sine + ey), speed * (cosine + ex)
+        return _in_space(dim, hx, hy, (r * cosine, r * sine), velocity)
 
 
 class Equinoctial(NamedTuple):
@@ -137,9 +138,9 @@ class Equinoctial(NamedTuple):
     longitude: Array
 
     @classmethod
-    def of(cls, q: Any, v: Any, mu: Any) -> Self:
+    def from_state(cls, q: Any, v: Any, mu: Any) -> Self:
         """The elements of a state."""
-        p, ex, ey, hx, hy, true_longitude = ModifiedEquinoctial.of(q, v, mu)
+        p, ex, ey, hx, hy, true_longitude = ModifiedEquinoctial.from_state(q, v, mu)
         r, rv, alpha = _energy(q, v, mu)
         x, y = r * jnp.cos(true_longitude), r * jnp.sin(true_longitude)
         bound = alpha > 0
@@ -161,18 +162,18 @@ class Equinoctial(NamedTuple):
         """Position and velocity, of shape (…, dim)."""
         a, ex, ey, hx, hy, longitude, mu = _same_shape(*self, mu)
         e2 = ex * ex + ey * ey
-        near = e2 < 0.25
+        is_small = e2 < 0.25
         # Near the circle the pericentre is undefined; far from it the other iteration is slow.
-        small = jnp.where(near, ex, 0.0), jnp.where(near, ey, 0.0)
+        small = jnp.where(is_small, ex, 0.0), jnp.where(is_small, ey, 0.0)
         q_near, v_near = _near_circle(jnp.abs(a), *small, longitude, mu)
-        large = jnp.where(near, 0.5, ex), jnp.where(near, 0.0, ey)
-        e, pericentre, is_far = _length(*large), _angle(*large), jnp.where(near, 1.0, a)
+        large = jnp.where(is_small, 0.5, ex), jnp.where(is_small, 0.0, ey)
+        e, pericentre, is_far = _length(*large), _angle(*large), jnp.where(is_small, 1.0, a)
         orbit = Keplerian(is_far, e, 0 * e, 0 * e, pericentre, longitude - pericentre)
         q_far, v_far = ((x[..., 0], x[..., 1]) for x in orbit.state(mu))
-        good = ~near | (a > 0)
+        good = ~is_small | (a > 0)
 
         def choose(x, y):
-            return jnp.where(good, jnp.where(near, x, y), jnp.nan)
+            return jnp.where(good, jnp.where(is_small, x, y), jnp.nan)
 
         q, v = (tuple(map(choose, *pair)) for pair in ((q_near, q_far), (v_near, v_far)))
         return _in_space(dim, hx, hy, q, v)
@@ -181,30 +182,32 @@ class Equinoctial(NamedTuple):
 class Delaunay(NamedTuple):
     """Canonical: M, ω, Ω [rad] and L = √(μa), G = L √(1 − e²), H = G cos i [length²/time].
 
-    Coordinates (l, g, h), momenta (L, G, H), for unit mass.
+    Coordinates (M, ω, Ω), momenta (L, G, H), for unit mass. In textbooks the coordinates are called
+    l, g and h.
     """
 
-    l: Array  # noqa: E741
-    g: Array
-    h: Array
+    M: Array
+    omega: Array
+    Omega: Array
     L: Array
     G: Array
     H: Array
 
     @classmethod
-    def of(cls, q: Any, v: Any, mu: Any) -> Self:
+    def from_state(cls, q: Any, v: Any, mu: Any) -> Self:
         """The elements of a state."""
-        kepler, momentum = Keplerian.of(q, v, mu), _plane(q, v).momentum
+        kepler, momentum = Keplerian.from_state(q, v, mu), _plane(q, v).momentum
+        # On a circle rounding may make G larger than L, and e the root of a negative number.
         L = _action(kepler.a, mu)
         G = jnp.minimum(jnp.sqrt(jnp.sum(momentum**2, -1)), L)
         return cls(kepler.M, kepler.omega, kepler.Omega, L, G, G * jnp.cos(kepler.inc))
 
     def state(self, mu: Any, dim: int = 3) -> tuple[Array, Array]:
         """Position and velocity, of shape (…, dim)."""
-        l, g, h, L, G, H, mu = _same_shape(*self, mu)  # noqa: E741
+        M, omega, node, L, G, H, mu = _same_shape(*self, mu)
         e = jnp.sqrt((L - G) * (L + G)) / L
         inc = 2 * jnp.arctan2(jnp.sqrt(G - H), jnp.sqrt(G + H))
-        return Keplerian(L * L / mu, e, inc, h, g, l).state(mu, dim)
+        return Keplerian(L * L / mu, e, inc, node, omega, M).state(mu, dim)
 
 
 class Poincare(NamedTuple):
@@ -224,9 +227,9 @@ class Poincare(NamedTuple):
     p: Array
 
     @classmethod
-    def of(cls, q: Any, v: Any, mu: Any) -> Self:
+    def from_state(cls, q: Any, v: Any, mu: Any) -> Self:
         """The elements of a state."""
-        a, ex, ey, hx, hy, longitude = Equinoctial.of(q, v, mu)
+        a, ex, ey, hx, hy, longitude = Equinoctial.from_state(q, v, mu)
         action = _action(a, mu)
         momentum = _plane(q, v).momentum
         G = jnp.sqrt(jnp.sum(momentum**2, -1))
@@ -237,6 +240,7 @@ class Poincare(NamedTuple):
     def state(self, mu: Any, dim: int = 3) -> tuple[Array, Array]:
         """Position and velocity, of shape (…, dim)."""
         longitude, eta, q, action, xi, p, mu = _same_shape(*self, mu)
+        # Without the differences 1 − √(1 − e²) and 1 − cos i, which lose digits of small e and i.
         G = action - (xi * xi + eta * eta) / 2
         scale = jnp.sqrt((1 + G / action) / (2 * action))
         # tan²(i/2) = Z/(2G − Z) with Z = (p² + q²)/2
@@ -266,7 +270,7 @@ def _plane(q: Any, v: Any) -> _Plane:
 
 def _axes(hx: Array, hy: Array) -> tuple[Array, Array]:
     """The two unit vectors of the orbit's plane from which equinoctial longitudes are counted."""
-    square = 1 + hx * hx + hy * hy
+    square = 1 + hx * hx + hy * hy  # 1/cos²(i/2)
     first = [1 + hx * hx - hy * hy, 2 * hx * hy, -2 * hy]
     second = [2 * hx * hy, 1 - hx * hx + hy * hy, 2 * hx]
     scale = 1 / square[..., None]
@@ -275,8 +279,8 @@ def _axes(hx: Array, hy: Array) -> tuple[Array, Array]:
 
 def _in_space(dim: int, hx: Array, hy: Array, *vectors: Any) -> tuple[Array, Array]:
     """Vectors (x, y) in the orbit's plane, as vectors in space."""
-    f, g = _axes(hx, hy)
-    return _of_dim(dim, *(x[..., None] * f + y[..., None] * g for x, y in vectors))
+    first, second = _axes(hx, hy)
+    return _of_dim(dim, *(x[..., None] * first + y[..., None] * second for x, y in vectors))
 
 
 def _of_dim(dim: int, q: Array, v: Array) -> tuple[Array, Array]:
@@ -296,15 +300,14 @@ def _near_circle(a: Array, ex: Array, ey: Array, longitude: Array, mu: Array) ->
         return F, ()
 
     F, _ = lanewise.implicit_root(equation, longitude, solve, divide)
-    c, s = jnp.cos(F), jnp.sin(F)
-    root = jnp.sqrt(1 - ex * ex - ey * ey)
-    beta = 1 / (1 + root)
-    x = a * ((1 - ey * ey * beta) * c + ex * ey * beta * s - ex)
-    y = a * ((1 - ex * ex * beta) * s + ex * ey * beta * c - ey)
-    rate = jnp.sqrt(mu / a) / (1 - ex * c - ey * s)
-    u = rate * (ex * ey * beta * c - (1 - ey * ey * beta) * s)
-    w = rate * ((1 - ex * ex * beta) * c - ex * ey * beta * s)
-    return (x, y), (u, w)
+    cosine, sine = jnp.cos(F), jnp.sin(F)
+    # Written with ϖ removed, which has no value on a circle.
+    beta = 1 / (1 + jnp.sqrt(1 - ex * ex - ey * ey))
+    first, mixed, second = 1 - ey * ey * beta, ex * ey * beta, 1 - ex * ex * beta
+    position = first * cosine + mixed * sine - ex, second * sine + mixed * cosine - ey
+    rate = jnp.sqrt(mu / a) / (1 - ex * cosine - ey * sine)
+    velocity = mixed * cosine - first * sine, second * cosine - mixed * sine
+    return tuple(a * x for x in position), tuple(rate * x for x in velocity)
 
 
 def _energy(q: Any, v: Any, mu: Any) -> tuple[Array, Array, Array]:
@@ -318,6 +321,7 @@ def _mean_anomaly(q: Any, v: Any, mu: Any, e: Array) -> Array:
     """M of a state that is not near the circle, E − e sin E or e sinh F − F."""
     r, rv, alpha = _energy(q, v, mu)
     bound = alpha > 0
+    # On a parabola M does not exist.
     s = rv * jnp.sqrt(jnp.where(alpha == 0, jnp.nan, jnp.abs(alpha)) / mu)
     cosine = jnp.where(bound, 1 - r * alpha, 1.0)
     free, e = (jnp.where(bound, 0.0, s), jnp.where(bound, 1.0, e))
@@ -328,9 +332,9 @@ def _action(a: Array, mu: Any) -> Array:
     return jnp.sqrt(jnp.where(a > 0, mu * a, jnp.nan))
 
 
-def _turned(angle: Array, x: Array, y: Array) -> tuple[Array, Array]:
-    c, s = jnp.cos(angle), jnp.sin(angle)
-    return c * x - s * y, s * x + c * y
+def _rotate(angle: Array, x: Array, y: Array) -> tuple[Array, Array]:
+    cosine, sine = jnp.cos(angle), jnp.sin(angle)
+    return cosine * x - sine * y, sine * x + cosine * y
 
 
 def _angle(x: Array, y: Array) -> Array:

@@ -31,7 +31,7 @@ def angular_momentum(t0, t1, q0, p0, q1, p1, args):
 
 def osculating_elements(t0, t1, q0, p0, q1, p1, args):
     """(a, e, i, Ω, ω) of `dvi.elements.Keplerian` at t1, shape (5,)."""
-    return jnp.stack(Keplerian.of(q1, p1, args["mu"])[:5])
+    return jnp.stack(Keplerian.from_state(q1, p1, args["mu"])[:5])
 
 
 def secular_rates(a, e, i, args):

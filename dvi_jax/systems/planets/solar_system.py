@@ -147,7 +147,7 @@ def perihelion_longitude(q: Any, v: Any, mu: float) -> np.ndarray:
     Returns shape (times,), continuous in time (unwrapped).
     """
     with jax.enable_x64(True):
-        orbit = Keplerian.of(np.asarray(q, float), np.asarray(v, float), mu)
+        orbit = Keplerian.from_state(np.asarray(q, float), np.asarray(v, float), mu)
     return np.unwrap(np.asarray(orbit.Omega) + np.asarray(orbit.omega))
 
 
