@@ -38,7 +38,7 @@ PACKAGES = ("dvi_jax", "lanewise", "dvi_jax_cli")
 LONGEST_FILE, MOST_PARAMETERS = 450, 9
 
 LIMITS: dict[str, float] = {
-    "lines of the core": 15_130,
+    "lines of the core": 15_165,
     "lines of the questions": 21_910,
     "lines of the leaves": 20_930,
     "lines of lanewise": 12_670,

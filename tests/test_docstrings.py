@@ -31,8 +31,9 @@ DOCSTRINGS = {
     if inspect.isclass(getattr(dvi, name)) or inspect.isfunction(getattr(dvi, name))
 }
 DOCSTRINGS |= {
-    f"rings.{name}": usage.BLOCK.findall(inspect.getdoc(thing) or "")
-    for name, thing in vars(rings).items()
+    f"{space}.{name}": usage.BLOCK.findall(inspect.getdoc(thing) or "")
+    for space, module in {"rings": rings, "elements": dvi.elements}.items()
+    for name, thing in vars(module).items()
     if inspect.isclass(thing) or inspect.isfunction(thing)
 }
 DOCSTRINGS = {name: blocks for name, blocks in DOCSTRINGS.items() if blocks}

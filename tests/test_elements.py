@@ -1,4 +1,6 @@
-"""Orbital elements of one body and of many: there and back, derivatives, canonical pairs."""
+"""Orbital elements of one body and of many: conversions, derivatives, canonical pairs."""
+
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -69,6 +71,16 @@ def test_elements_there_and_back(e):
         assert np.max(np.abs(off)) < 3e-14, name
 
 
+@partial(jax.jit, static_argnums=0)
+def jacobian(kind, state, mu):
+    """∂(elements)/∂(q, v)."""
+
+    def elements(z):
+        return jnp.stack(kind.from_state(z[:3], z[3:], mu))
+
+    return jax.jacfwd(elements)(jnp.concatenate(state))
+
+
 def textbook(q, v, kind):
     """Elements of one state in mpmath, by vectors and the anomalies of textbooks."""
     q, v, mu = mpmath.matrix(q), mpmath.matrix(v), mpmath.mpf(MU)
@@ -120,8 +132,7 @@ CASES += [(Keplerian, 1.01), (Keplerian, 0.3), (Delaunay, 0.3)]
 def test_derivatives_are_those_of_fifty_digits(kind, e):
     orbit = Keplerian(1.3 if e < 1 else -1.3, e, 0.4, 1.1, 0.6, 0.9)
     q, v = map(np.asarray, orbit.state(MU))
-    jacobian = jax.jit(jax.jacfwd(lambda z: jnp.stack(kind.from_state(z[:3], z[3:], MU))))
-    derivative = np.asarray(jacobian(jnp.concatenate([q, v])))
+    derivative = jacobian(kind, (q, v), MU)
     with mpmath.workdps(60):
         z = [mpmath.mpf(float(x)) for x in (*q, *v)]
 
@@ -164,7 +175,7 @@ def test_regular_elements_have_derivatives_on_a_circle_in_the_plane():
     circle = jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 1.0, 0.0])
 
     def derivative(kind):
-        return jax.jacfwd(lambda z: jnp.stack(kind.from_state(z[:3], z[3:], 1.0)))(jnp.concatenate(circle))
+        return jacobian(kind, circle, 1.0)
 
     for kind in (Equinoctial, ModifiedEquinoctial, Poincare):
         there = derivative(kind)
@@ -184,8 +195,7 @@ def test_regular_elements_have_derivatives_on_a_circle_in_the_plane():
 )
 def test_canonical_elements(kind, canonical):
     q, v = Keplerian(1.3, 0.3, 0.4, 1.1, 0.6, 0.9).state(MU)
-    jacobian = jax.jacfwd(lambda z: jnp.stack(kind.from_state(z[:3], z[3:], MU)))(jnp.concatenate([q, v]))
-    assert (symplectic_defect(jacobian) < 1e-13) == canonical
+    assert (symplectic_defect(jacobian(kind, (q, v), MU)) < 1e-13) == canonical
 
 
 @pytest.mark.parametrize("direction", [1.0, -1.0])

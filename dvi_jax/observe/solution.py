@@ -18,7 +18,7 @@ from ..base.printing import first_lines
 from ..base.results import RESULTS, status_counts, status_name
 from ..base.signature import with_time
 from ..base.types import State
-from ..problem.elements import Keplerian, of_bodies, of_kind
+from ..problem.elements import Elements, Keplerian, of_bodies
 from .labelled import dataset_of, table_of
 from .saved import read, write
 
@@ -211,7 +211,7 @@ class Solution(eqx.Module):
         only_one(masses=masses, mu=mu)
         require("Solution.elements", {"masses or mu": mu if masses is None else masses})
         if masses is None:
-            return of_kind(kind).from_state(self.qs, self.ps, mu)
+            return Elements(kind).kind.from_state(self.qs, self.ps, mu)
         return of_bodies(self.qs, self.ps, masses, G, frame=frame, kind=kind)
 
     def save(self, path: str | os.PathLike[str]) -> None:

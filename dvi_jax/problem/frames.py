@@ -65,6 +65,7 @@ class Democratic(NamedTuple):
         return momentum / self.masses[0]
 
     def drift(self, V: Array) -> Array:
+        # The first body moves against the others: all heliocentric positions change by it.
         recoil = jnp.broadcast_to(self._recoil(V), V[1:].shape)
         return jnp.concatenate([jnp.zeros_like(V[:1]), recoil])
 

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..discover.symmetries.library import rotation
-from ..problem.orbits import Keplerian
+from ..problem.elements import Keplerian
 from ._problem import Parameter, Problem, Start, finite, library_problem
 
 

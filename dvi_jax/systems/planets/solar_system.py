@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from ...base.checks import array, finite
-from ...problem.orbits import Keplerian
+from ...problem.elements import Keplerian
 from .._problem import Problem
 from ..n_body import check_bodies, n_body
 

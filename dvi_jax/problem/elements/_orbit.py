@@ -1,26 +1,4 @@
-r"""Orbital elements: Kepler orbits as numbers that stay constant, and back to positions.
-
-    kepler = dvi.elements.Keplerian.from_state(q, v, mu=1.0)     # a, e, inc, Omega, omega, M
-    q, v = kepler.state(mu=1.0)
-
-Every kind of elements has the two functions ``from_state(q, v, mu)`` and ``state(mu, dim=3)``:
-
-- `Keplerian` and `Delaunay` have the angles of textbooks. The node is undefined at inclination 0
-  and the pericentre at e = 0: these angles are 0 there, and their derivatives NaN.
-- `Equinoctial`, `ModifiedEquinoctial` and `Poincare` and their derivatives are regular there; they
-  are singular at inclination π (also for a plane orbit with negative angular momentum).
-- Hyperbolas have a < 0 and M = e sinh F − F. A parabola has `ModifiedEquinoctial` only.
-
-Positions q [length] and velocities v [length/time] have the shape (…, 2) or (…, 3), and `mu`
-(G times both masses, [length³/time²]) is a number or has the shape (…). Each element has the shape
-(…). Angles are in radians, between −π and π, except M of a hyperbola. All functions can be
-differentiated in every order, batched and compiled. A state at the centre, an unbound orbit of
-`Delaunay` or `Poincare` and elements that belong to no orbit give NaN.
-
-**Source** Broucke & Cefola 1972, *Celest. Mech.* 5, 303 (equinoctial); Walker, Ireland & Owens
-1985, *Celest. Mech.* 36, 409 (modified); Murray & Dermott 1999, *Solar System Dynamics*, 2.8;
-Laskar & Robutel 1995, *Celest. Mech. Dyn. Astron.* 62, 193 (Poincaré).
-"""
+"""Elements of one orbit, of five kinds."""
 
 import math
 from typing import Any, NamedTuple, Self
@@ -30,13 +8,25 @@ from jaxtyping import Array
 
 import lanewise
 
-from ..base.checks import array, one_of
-from ..engine.bracket import divide
-from . import kepler as _kepler
+from ...base.checks import array, one_of
+from ...engine.bracket import divide
+from .. import kepler as _kepler
 
 
 class Keplerian(NamedTuple):
-    """a [length], e, inclination, node Ω, argument of the pericentre ω, mean anomaly M [rad]."""
+    """a [length], e, inclination, node Ω, argument of the pericentre ω, mean anomaly M [rad].
+
+    **Example**
+
+    ```python
+    q, v = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.1, 0.1])
+    kepler = dvi.elements.Keplerian.from_state(q, v, mu=1.0)
+    print(round(float(kepler.a), 4), round(float(kepler.e), 4), round(float(kepler.inc), 4))
+    print(np.round(kepler._replace(M=1.0).state(mu=1.0)[0], 4))        # later on the orbit
+    # 1.2821 0.22 0.0907
+    # [0.176  1.1633 0.1058]
+    ```
+    """
 
     a: Array
     e: Array

@@ -1,20 +1,4 @@
-r"""Orbital elements of N bodies: their orbits around the bodies at the centre, and back.
-
-    dvi.elements.of_bodies(sol.qs, sol.ps, masses).e      # (times, bodies − 1)
-    q0, p0 = dvi.elements.to_bodies(elements, masses)
-
-The first body has no elements. `frame` says what the orbits of the others are relative to:
-
-- "jacobi": the centre of mass of the bodies before it, with μ = G times the mass of these and its
-  own. It suits planets, the inner ones first.
-- "heliocentric": the first body, with μ = G (m_0 + m_i).
-- "barycentric": the centre of mass of all, with μ = G times the mass of all.
-
-q and p have the shape (…, bodies, 2 or 3). Bodies after the last entry of `masses` are test
-particles: their mass is 0 and their row of p is the velocity, as in `systems.n_body`.
-
-**Source** Murray & Dermott 1999, *Solar System Dynamics*, 9.1.
-"""
+"""Elements of the orbits of N bodies."""
 
 from typing import Any, Literal, get_args
 
@@ -22,17 +6,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..base.checks import array, instance, one_of
-from ..base.types import Args, Scalar, State
-from .flows import value_of
-from .frames import Barycentric, Heliocentric, Jacobi
-from .orbits import (
-    Delaunay as Delaunay,
-    Equinoctial as Equinoctial,
-    Keplerian as Keplerian,
-    ModifiedEquinoctial as ModifiedEquinoctial,
-    Poincare as Poincare,
-)
+from ...base.checks import array, instance, one_of
+from ...base.types import Args, Scalar, State
+from ..flows import value_of
+from ..frames import Barycentric, Heliocentric, Jacobi
+from ._orbit import Delaunay, Equinoctial, Keplerian, ModifiedEquinoctial, Poincare
 
 Frame = Literal["jacobi", "heliocentric", "barycentric"]
 _FRAMES = {"jacobi": Jacobi, "heliocentric": Heliocentric, "barycentric": Barycentric}
@@ -48,12 +26,21 @@ def of_bodies(
     """The elements of all bodies but the first.
 
     - `q`, `p`: positions [length] and momenta, shape (…, bodies, 2 or 3). `masses`: of those with a
-      mass, shape (m,). `G`: the gravitational constant. `frame`: see above.
+      mass, shape (m,). `G`: the gravitational constant. `frame`: see `dvi.elements`.
     - `kind`: `Keplerian`, or another class of elements.
 
     **Returns** a `kind`, each element of shape (…, bodies − 1).
 
     **Raises** `ValueError` for shapes that do not fit and for another frame or kind.
+
+    **Example**
+
+    ```python
+    outer = systems.outer_solar_system()
+    orbits = dvi.elements.of_bodies(outer.q0, outer.p0, outer.args["masses"], outer.args["G"])
+    print(np.round(orbits.a, 2))                                # [au]
+    # [ 5.2   9.54 19.2  30.07 39.49]
+    ```
     """
     q, p = jnp.asarray(q), jnp.asarray(p)
     all_masses, scale = _masses(masses, q.shape[-2])
@@ -63,7 +50,7 @@ def of_bodies(
     rows = jnp.vectorize(coordinates.from_bodies, signature="(n,d)->(n,d)")
     v = p / jnp.broadcast_to(scale[:, None], p.shape)
     mu = jnp.broadcast_to(G * coordinates.central_mass(), (*q.shape[:-2], q.shape[-2] - 1))
-    return of_kind(kind).from_state(rows(q)[..., 1:, :], rows(v)[..., 1:, :], mu)
+    return _of_kind(kind).from_state(rows(q)[..., 1:, :], rows(v)[..., 1:, :], mu)
 
 
 def to_bodies(
@@ -77,18 +64,28 @@ def to_bodies(
     **Returns** q and p of shape (bodies, dim).
 
     **Raises** `ValueError` for shapes that do not fit; `TypeError` for elements of no kind.
+
+    **Example**
+
+    ```python
+    planet = dvi.elements.Keplerian([1.0], [0.1], [0.0], [0.0], [0.0], [0.0])
+    q0, p0 = dvi.elements.to_bodies(planet, masses=[1.0, 1e-3])
+    print(np.round(q0[1], 4), np.round(p0[1], 6))
+    # [0.8991 0.     0.    ] [0.       0.001105 0.      ]
+    ```
     """
     instance("elements", elements, (*_KINDS.values(),), "elements, such as dvi.elements.Keplerian")
     elements = type(elements)(*jnp.broadcast_arrays(*map(jnp.asarray, elements)))
     array("the elements", elements[0], ("bodies − 1",), integers=True)
     all_masses, scale = _masses(masses, len(elements[0]) + 1)
     coordinates = _frame(frame)(all_masses)
+    # Row 0 is the centre of mass, for positions and velocities.
     state = elements.state(G * coordinates.central_mass(), dim)
     q, v = (coordinates.to_bodies(jnp.concatenate([jnp.zeros((1, dim)), x])) for x in state)
     return q, scale[:, None] * v
 
 
-def of_kind(kind: Any) -> Any:
+def _of_kind(kind: Any) -> Any:
     """The class of elements, from the class or its name. **Raises** `ValueError` for another."""
     return _KINDS[one_of("kind", getattr(kind, "__name__", kind), _KINDS)]
 
@@ -119,7 +116,7 @@ class Elements(eqx.Module):
     ```
     """
 
-    kind: Any = eqx.field(static=True, default=Keplerian, converter=of_kind)
+    kind: Any = eqx.field(static=True, default=Keplerian, converter=_of_kind)
     frame: Frame | None = eqx.field(static=True, default=None)
     mu: Any = None
 
