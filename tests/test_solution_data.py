@@ -63,6 +63,32 @@ def test_a_batch_in_a_file_and_in_a_table(tmp_path):
     np.testing.assert_array_equal(table.loc[4].t, sols.ts[0])
 
 
+def test_integers_and_booleans_of_steps_have_no_value_at_the_start_of_a_table():
+    """A NaN became True, 0 or the smallest integer there."""
+
+    def of_step(value):
+        return lambda t0, t1, q0, p0, q1, p1, args: value(q1)
+
+    observe = {
+        "is_left": of_step(lambda q: q[0] < 9),
+        "sides": of_step(lambda q: q > 0.1),
+        "small": of_step(lambda q: jnp.uint8(7)),
+        "large": dvi.Running(dvi.Last(lambda q, p: jnp.int64(2**53 + 1))),
+        "of_state": lambda q, p: q[0] < 9,
+    }
+    starts = jnp.array([[0.4, 0.0], [0.5, 0.1]])
+    sols = jax.vmap(lambda q: run(q, observe=observe))(starts)
+    sol = run(starts[0], observe=observe)
+    for table in (sols.to_dataframe(observe=observe), sol.to_dataframe(observe=observe)):
+        of_steps = table[["is_left", "sides_0", "sides_1", "small", "large"]]
+        is_start = table.h.isna()
+        assert of_steps[is_start].isna().all(axis=None)
+        assert not of_steps[~is_start].isna().any(axis=None)
+        assert set(table.large[~is_start]) == {2**53 + 1}
+        assert table.of_state.dtype == bool
+        assert set(table.small[~is_start]) == {7}
+
+
 def test_a_table_of_bodies_and_of_requested_times():
     problem = systems.n_body()
     sol = dvi.integrate(problem, h=0.01, num_steps=4, save=dvi.Save(ts=[0.01, 0.025]))

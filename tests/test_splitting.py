@@ -380,6 +380,43 @@ def test_the_smaller_part_first_warns(parts, scheme, warns):
     assert any("smaller one" in str(w.message) for w in caught) is warns
 
 
+def small(t0, t1, q0, p1, args):
+    return 1e-3 * large(t0, t1, q0, p1, args)
+
+
+def growing(t0, t1, q0, p1, args):
+    return 1e-3 * t0 * large(t0, t1, q0, p1, args)
+
+
+def push(t0, t1, q0, p1, args):
+    return -q0 - p1
+
+
+@pytest.mark.parametrize(
+    ("split", "options", "warns"),
+    [
+        (dvi.Split([small, large], perturbed=0), {"perturbation": large, "epsilon": 1e2}, False),
+        (dvi.Split([small, large], perturbed=0), {"perturbation": large, "epsilon": 1e-2}, True),
+        (dvi.Split([large, small], perturbed=1), {"perturbation": large, "epsilon": 1e2}, True),
+        (dvi.Split([large, small], perturbed=1), {"perturbation": large, "epsilon": 1e-2}, False),
+        (dvi.Split([small, large], perturbed=0), {"force": push, "epsilon": 1e2}, False),
+        (dvi.Split([growing, large]), {"t0": 1e3}, False),
+        (dvi.Split([growing, large]), {"t0": 1e3, "epsilon": 1e-3, "slow_time": True}, True),
+    ],
+)
+def test_the_size_of_a_part_is_that_with_its_perturbation(split, options, warns):
+    """The sizes were those of the parts alone, at the time t where they depend on ε t."""
+    terms = {k: v for k, v in options.items() if k in ("perturbation", "force", "slow_time")}
+    run = {k: v for k, v in options.items() if k not in terms}
+    method = dvi.Splitting((4, 2))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        dvi.integrate(
+            dvi.System(split, **terms), [0.6], [0.8], h=0.01, num_steps=1, method=method, **run
+        )
+    assert any("smaller one" in str(w.message) for w in caught) is warns
+
+
 THREE = systems.n_body(
     masses=[1.0, 1e-3, 3e-4],
     q0=[[0.0, 0.0], [1.0, 0.0], [-0.3, 1.8]],

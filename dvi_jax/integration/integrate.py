@@ -31,7 +31,7 @@ from .integrator import Integrator, chosen
 from .loop import results_of, run, start, with_start, with_tail
 from .outcome import as_solution, raise_on_failure, with_initial_values
 from .preparation import PreparedRun, prepare, steps_of
-from .task import Outcome, Plan, Task
+from .task import Carry, Outcome, Plan, Task
 
 _MOST_REPORTS = 100
 """Maximum number of progress reports of a run."""
@@ -242,40 +242,35 @@ _solution = eqx.filter_jit(as_solution)
 # The parts of a run with progress. Each is compiled for itself; the carry between them has all that
 # a step depends on, so that the numbers are those of one run.
 @eqx.filter_jit
-def _begin(task: Task, q0, p0, layout: Layout):
+def _piece(task: Task, plan: Plan, state: Any, layout: Layout):
     arrays, functions = eqx.partition(task, eqx.is_array)
 
-    def begin(arrays, q0, p0):
-        return start(eqx.combine(arrays, functions), q0, p0)
-
-    return lanewise.call(begin, arrays, q0, p0, layout=layout)
-
-
-@eqx.filter_jit
-def _piece(task: Task, plan: Plan, carry, layout: Layout):
-    arrays, functions = eqx.partition(task, eqx.is_array)
-
-    def piece(arrays, carry):
-        carry, rows, tail = run(eqx.combine(arrays, functions), plan, carry, lax.scan)
+    def piece(arrays, state):
+        task = eqx.combine(arrays, functions)
+        # The start is a part of the first piece: the length of the arrays of a loop decides how the
+        # whole program is compiled, on which the last bits depend.
+        carry = state if isinstance(state, Carry) else start(task, *state)
+        carry, rows, tail = run(task, plan, carry, lax.scan)
         return carry, with_tail(plan, rows, tail)
 
-    return lanewise.call(piece, arrays, carry, layout=layout)
+    return lanewise.call(piece, arrays, state, layout=layout)
 
 
 def _in_pieces(task: Task, plan: Plan, q0, p0, report, layout) -> Outcome:
     """The same run in pieces between save points, with a report after each."""
     # Whole blocks, and as many in each piece (the last one may have fewer): one program serves all.
     size = max(1, -(-plan.num_blocks // _MOST_REPORTS))
-    carry, blocks, parts, is_last = _begin(task, q0, p0, layout), 0, [], False
+    state: Any = q0, p0
+    blocks, parts, is_last = 0, [], False
     while not is_last:
         count = min(size, plan.num_blocks - blocks)
         blocks += count
         is_last = blocks >= plan.num_blocks
         tail = (plan.tail, plan.save_tail) if is_last else (0, False)
-        carry, rows = _piece(task, Plan(count, plan.block, *tail), carry, layout)
+        state, rows = _piece(task, Plan(count, plan.block, *tail), state, layout)
         # JAX computes asynchronously: without waiting all reports would come at the beginning.
-        jax.block_until_ready(carry)
+        jax.block_until_ready(state)
         parts.append(rows)
         report(plan.num_steps if is_last else blocks * plan.block, plan.num_steps)
     rows = jax.tree.map(lambda *xs: jnp.concatenate(xs), *parts)
-    return Outcome(carry, with_start(rows, q0, p0), results_of(task, carry))
+    return Outcome(state, with_start(rows, q0, p0), results_of(task, state))

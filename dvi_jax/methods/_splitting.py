@@ -275,8 +275,8 @@ class Splitting(SplittingMethod):
       flows of one part are joined, so that ``Strang()`` is A(h/2) B(h) A(h/2).
     - generalised orders (n₁, n₂, …) for two parts A + εB, with an error O(ε h^n₁ + ε² h^n₂ + …):
       (2, 2), (4, 2), … (10, 2) of Laskar & Robutel, (8, 4) of McLachlan, (10, 4), (8, 6, 4) and
-      (10, 6, 4) of Blanes et al. They need a small second part, not a small h: a run in which the
-      first part is the smaller one at the initial state warns.
+      (10, 6, 4) of Blanes et al. They need a small second part, not a small h: a run whose
+      initial state is known warns if the first part is the smaller one there.
 
     A step is explicit where all flows are known or exact. Parts with both q0 and p1 are advanced by
     `GaussLegendre`, of the order of the scheme.
@@ -299,16 +299,15 @@ class Splitting(SplittingMethod):
     def check(self, equations, first_interval, q, p):
         """**Raises** `ValueError` if a flow of the user is not that of its Hamiltonian there.
         Warns where generalised orders are used with the smaller part first."""
+        interval, part_equations = first_interval(), self._part_equations(equations)
         if isinstance(self.scheme, tuple):
-            self._check_sizes(equations, first_interval(), q, p)
-        interval = first_interval()
+            self._check_sizes(part_equations, interval, q, p)
         t, zero = interval.t0, jnp.zeros_like(interval.h)
-        for i, H_i in enumerate(getattr(equations.system.H_D, "parts", ())):
-            if isinstance(H_i, Known):
+        for i, equations_i in enumerate(part_equations):
+            if isinstance(H_i := equations_i.system.H_D, Known):
                 flow = functools.partial(H_i.change, q=q, p=p, args=equations.args)
                 change, slope = (jnp.stack(x[:2]) for x in jax.jvp(flow, (zero,), (zero + 1,)))
-                part_equations = dataclasses.replace(equations, system=System(H_i))
-                rates = jnp.stack(part_equations.rates(Interval(t, t, zero), q, p))
+                rates = jnp.stack(equations_i.rates(Interval(t, t, zero), q, p))
                 size = jnp.max(jnp.abs(jnp.stack([q, p, *rates, *slope])))
                 defect = jnp.max(jnp.abs(jnp.stack([change, slope - rates])))
                 if not defect <= 1e-5 * size:
@@ -318,12 +317,10 @@ class Splitting(SplittingMethod):
                         f"state the difference is {defect:.3g}."
                     )
 
-    def _check_sizes(self, equations, interval, q, p):
-        parts = getattr(equations.system.H_D, "parts", ())
-        all_equations = [dataclasses.replace(equations, system=System(H_i)) for H_i in parts]
-        rates = np.array([equations_i.rates(interval, q, p) for equations_i in all_equations])
+    def _check_sizes(self, part_equations, interval, q, p):
+        rates = np.array([equations_i.rates(interval, q, p) for equations_i in part_equations])
         # Positions and momenta have different units: each is relative to the largest one.
-        rates = np.abs(rates).reshape(len(parts), 2, -1).max(axis=-1)
+        rates = np.abs(rates).reshape(len(rates), 2, -1).max(axis=-1)
         largest = np.maximum(rates.max(axis=0), np.finfo(rates.dtype).tiny)
         first, *others = (rates / largest).max(axis=1)
         # A first part that is at rest, as T(p) at p = 0, is not known to be small.
@@ -339,7 +336,8 @@ class Splitting(SplittingMethod):
     def is_double_only(self, equations) -> bool:
         return any(isinstance(part, Kepler) for part in getattr(equations.system.H_D, "parts", ()))
 
-    def parts(self, equations, interval, q):
+    def _part_equations(self, equations: Equations) -> list[Equations]:
+        """The equations of each part, to one of which the perturbations belong."""
         system = equations.system
         H = system.H_D
         if not isinstance(H, Split):
@@ -352,17 +350,18 @@ class Splitting(SplittingMethod):
             parts[H.perturbed] = (H.parts[H.perturbed], *perturbations)
         elif perturbations != (None, None):
             parts.append((_no_energy, *perturbations))
+        systems = [System(*terms, slow_time=system.slow_time) for terms in parts]
+        return [dataclasses.replace(equations, system=system) for system in systems]
 
-        def part(i, H_i, *terms):
-            if isinstance(H_i, Flow):
+    def parts(self, equations, interval, q):
+        def part(i, part_equations):
+            if isinstance(H_i := part_equations.system.H_D, Flow):
                 return _flow_part(equations, H_i)
-            part_equations = System(H_i, *terms, slow_time=system.slow_time)
-            part_equations = dataclasses.replace(equations, system=part_equations)
             is_exact = _is_exact(part_equations, interval, q, has_time=i == 0)
             method = TypeII() if is_exact else GaussLegendre(-(-self.order // 2))
             return PartFlow(functools.partial(method.step, part_equations), is_exact)
 
-        return [part(i, *arguments) for i, arguments in enumerate(parts)]
+        return [part(i, of_part) for i, of_part in enumerate(self._part_equations(equations))]
 
 
 def _no_energy(t0, t1, q0, p1, args):

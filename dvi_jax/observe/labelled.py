@@ -106,8 +106,12 @@ def table_of(solution: Any, **labels: Any) -> Any:
     count = data.sizes[axis]
     columns: dict[str, Any] = {}
 
-    def add(name: str, values: Any) -> None:
-        columns[name] = np.broadcast_to(values, (*batch, count)).ravel()
+    def add(name: str, values: Any, is_of_step: bool = False) -> None:
+        column: Any = np.broadcast_to(values, (*batch, count)).flatten()
+        if is_of_step:  # no step has reached the start; integers and booleans have no NaN
+            column = column if column.dtype.kind in "fc" else pd.array(column)
+            column[::count] = np.nan if column.dtype.kind in "fc" else pd.NA
+        columns[name] = column
 
     # Reductions and statistics have one value for a run, which is no column of its states.
     add("t", data.time if axis == "time" else data.t)
@@ -117,16 +121,15 @@ def table_of(solution: Any, **labels: Any) -> Any:
         if name == "t" or not (is_of_step or front == (*dims, axis)):
             continue
         values = variable.values
-        if is_of_step:  # a row for the start, which no step has reached
-            start = np.full_like(values[(slice(None),) * len(batch) + (slice(1),)], np.nan)
-            values = np.concatenate([start, values], axis=len(batch))
+        if is_of_step:  # a row for the start
+            values = np.insert(values, 0, 0, axis=len(batch))
         own = variable.dims[len(dims) + 1 :]
         for place in np.ndindex(*values.shape[len(batch) + 1 :]):
             labels_of = [
                 data[d].values[i] if d in data.coords else i
                 for d, i in zip(own, place, strict=True)
             ]
-            add("_".join(map(str, (name, *labels_of))), values[(..., *place)])
+            add("_".join(map(str, (name, *labels_of))), values[(..., *place)], is_of_step)
     add("status", np.asarray(status_name(solution.result))[..., None])
     index = {d: data[d].values if d in data.coords else np.arange(data.sizes[d]) for d in dims}
     # The state within a trajectory is the last level of the index.

@@ -184,7 +184,8 @@ class Solution(eqx.Module):
 
         Columns: ``t``; ``q_0``, ``q_1``, … or ``q_x``, ``q_y`` with `components`, likewise of p;
         ``h`` and observables with a value for each state or step (those of `observe`); ``status``.
-        Values of a step are in the row of the state at its end, NaN in that of the start.
+        Values of a step are in the row of the state at its end, NaN in that of the start (for
+        integers and booleans ``pandas.NA``).
         Reductions, which have one value for a run, are not in it. A batch has the rows of its
         trajectories one after the other, with `dims` (default ``trajectory``) and ``save`` as
         index. Arguments and errors are those of `to_xarray`.
