@@ -261,6 +261,31 @@ def test_residuals_that_contradict_sigma(regular):
     assert "contradict" not in str(dvi.fit(MODEL, observed(outliers), START, loss=dvi.Cauchy()))
 
 
+PRIORS = {  # mean and sigma, in standard errors of the fit without priors, relative to its result
+    "agrees": (2.0, 3.0),
+    "wide and far": (600.0, 100.0),
+    "narrow": (15.0, 2.0),
+    "narrower than the errors": (6.0, 0.1),
+    "far below": (-8.0, 1.0),
+}
+
+
+@pytest.mark.parametrize("name", PRIORS)
+def test_priors_that_contradict_the_data(regular, name):
+    """One prior among many values hardly changes their χ²: its own χ² decides, by the difference
+    of two independent estimates, the prior and the fit without it."""
+    data, free = regular
+    index = free.names.index("args.k")
+    distance, width = np.array(PRIORS[name]) * free.sigma[index]
+    prior = {"args": {"k": dvi.Prior(free.x[index] + distance, width)}}
+    fit = dvi.fit(MODEL, data, START, priors=prior, check_curvature=False)
+    expected = distance**2 / (width**2 + free.covariance[index, index])
+    assert abs(fit.conflict / expected - 1) < 0.05
+    assert ("priors contradict the data" in str(fit)) == (name != "agrees")
+    assert str(fit).startswith("converged, but the" if name != "agrees" else "converged after")
+    assert fit.priors == ["args.k"]
+
+
 @pytest.mark.slow
 def test_bounds_hold_and_are_named():
     data = seen(4)

@@ -15,7 +15,7 @@ from ..base.keywords import checked_keywords
 from ..base.precision import require_double
 from .checks import requires
 from .keywords import FitSettings, LossSettings, select
-from .losses import Loss
+from .losses import LeastSquares, Loss
 from .observations import Data, as_arcs
 from .optimise import FIT_RESULTS, FitError
 from .problem import FitProblem
@@ -24,7 +24,7 @@ from .run import FitRun, identity, progress_display
 from .shooting import MultipleShooting, Segments, SingleShooting
 from .solvers import is_gauss_newton, is_optax, solver_for
 from .stages import JACOBIAN_LIMIT, Minimum, by_gradient, in_segments, least_squares
-from .uncertainty import Uncertainty, in_words, uncertainty
+from .uncertainty import Uncertainty, conflict_of_priors, in_words, uncertainty
 
 _CURVATURE_LIMIT = 50  # Parameters up to which second derivatives are computed
 _SMALL = 1_000_000  # Steps of trajectories that take less time than compiling exact derivatives
@@ -177,10 +177,12 @@ def _result(run: FitRun, minimum: Minimum, check_curvature: bool) -> FitResult:
     loss = float(np.sum(r**2) / 2) if has_residuals else float(problem.core.scalar(u))
     degrees, variance = problem.degrees_of_freedom, 1.0
     covariance, curvature, free_directions, values = np.full((n, n), np.nan), None, [], np.zeros(0)
-    rounding = np.zeros(n)
+    rounding, conflict = np.zeros(n), 0.0
     if minimum.jacobian is not None and np.isfinite(minimum.jacobian).all():
         J = np.asarray(minimum.jacobian)
         spectrum = uncertainty(J, 1.0, minimum.free)
+        if isinstance(problem.loss, LeastSquares) and minimum.status == FIT_RESULTS.converged:
+            conflict = conflict_of_priors(J, r[-n:], minimum.free)
         degrees += spectrum.null_directions.shape[1]  # undetermined directions take no degree
         if has_residuals and not problem.has_errors:
             variance = 2 * loss / degrees if degrees > 0 else np.nan
@@ -220,6 +222,8 @@ def _result(run: FitRun, minimum: Minimum, check_curvature: bool) -> FitResult:
         at_bounds=at_bounds,
         trajectories=trajectories,
         prior_chi2=float(np.sum(r[-n:] ** 2)),
+        conflict=conflict,
+        priors=[name for name, w in zip(space.names, space.prior_weight, strict=True) if w],
         rounding=rounding,
         start=problem.start_in_words(),
         seconds=time.monotonic() - run.began,

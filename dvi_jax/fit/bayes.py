@@ -24,7 +24,7 @@ from .maxima import Maximum, explored
 from .observations import Data
 from .parameters import make_space
 from .posterior import Posterior
-from .result import FitResult, with_error
+from .result import FitResult, doubts, with_error
 from .stages import JACOBIAN_LIMIT
 from .uncertainty import correlations
 
@@ -183,8 +183,9 @@ def sample(
     - `progress`: True shows a bar, False none, None where there is a terminal.
 
     **Returns** `Samples`, with a `UserWarning` and a text in ``warnings`` for chains that do not
-    agree, paths that diverged or were truncated, and a start that did not converge. The standard
-    error of a mean is sigma/√ess.
+    agree, paths that diverged or were truncated, and a fit for the start that did not converge, or
+    finds that residuals contradict sigma or priors the data. The standard error of a mean is
+    sigma/√ess.
 
     **Raises** `ImportError` without numpyro, which the extra ``bayes`` installs; `ValueError` or
     `TypeError` for invalid input, a posterior without an integral, or a start at which the
@@ -212,8 +213,10 @@ def sample(
         of_fit = terms if has_errors else {**terms, "priors": None}
         quiet: dict[str, Any] = {"check_curvature": False, "progress": False, "throw": False}
         start = fit(model, data, params, **of_fit, **quiet)
-    if isinstance(start, FitResult) and start.status != "converged":
-        notes.append(f"the chains start from a fit that did not converge: {start.status}.")
+    if isinstance(start, FitResult):
+        if start.status != "converged":
+            notes.append(f"the chains start from a fit that did not converge: {start.status}.")
+        notes += doubts(start)
     limits = terms.get("bounds"), terms.get("priors")
     mode, root = posterior.laplace(start_of(posterior, start, *limits))
     maxima, text = [Maximum(mode, root, 0.0)], "only the surroundings of the start"

@@ -24,7 +24,7 @@ from .observations import Data, Observations, as_arcs
 from .optimise import FIT_RESULTS, FitError
 from .parameters import Prior, make_space
 from .problem import FitProblem
-from .result import FitResult, contradiction, with_error
+from .result import FitResult, doubts, with_error
 from .shooting import MultipleShooting, SingleShooting
 
 # Width of a prior: the change of the predictions by the candidate alone, to first order, in
@@ -96,7 +96,7 @@ class Identification:
         if self.fit is not None:
             chi2 = f", reduced chi² {self.fit.reduced_chi2:.4g}" if self.fit.has_errors else ""
             lines.append(f"rms {self.fit.rms:.4g}, {self.fit.num_observed} values{chi2}")
-            lines += filter(None, [contradiction(self.fit)])
+            lines += doubts(self.fit)
         return "\n".join(lines)
 
 

@@ -23,7 +23,7 @@ _FORMAT = 1
 
 _PLAIN = (
     *("names", "loss", "degrees_of_freedom", "num_observed", "has_errors", "undetermined"),
-    *("at_bounds", "trajectories", "seconds", "prior_chi2", "start"),
+    *("at_bounds", "trajectories", "seconds", "prior_chi2", "conflict", "priors", "start"),
 )
 _BY_ARC = ("ts", "observed", "predicted", "whitened", "errors")
 """Fields that a file has as JSON, and those that are a list of arrays."""
@@ -54,7 +54,9 @@ class FitResult:
       one another where covariances were given; NaN for missing values.
     - `loss`: ½ Σ ρ(r²) + priors; `num_observed`: number of values; `degrees_of_freedom`: values and
       priors minus parameters, without those that are not determined.
-    - `prior_chi2`: Σ ((x − mean)/sigma)² of the priors.
+    - `prior_chi2`: Σ ((x − mean)/sigma)² of the priors; `priors`: names of their parameters.
+    - `conflict`: `prior_chi2`, and what the priors add to `chi2`, to first order: a χ² with one
+      degree of freedom for each prior if these agree with the data. 0 if not computed.
     - `undetermined`: parameter combinations that the data do not determine, as text.
     - `singular_values`: of the Jacobian with columns of unit length, largest first.
     - `curvature`: the second derivative of the loss along each principal direction over that of
@@ -88,6 +90,8 @@ class FitResult:
     at_bounds: list[str] = field(default_factory=list)
     trajectories: list[str] = field(default_factory=list)
     prior_chi2: float = 0.0
+    conflict: float = 0.0
+    priors: list[str] = field(default_factory=list)
     seconds: float = 0.0
     rounding: np.ndarray = field(default_factory=lambda: np.zeros(0))
     start: str = ""
@@ -254,7 +258,12 @@ def numbers_in_words(fit: FitResult) -> list[str]:
 
 def remarks(fit: FitResult) -> list[str]:
     """What a user must know before the numbers are used."""
-    return list(filter(None, [_little_explained(fit), contradiction(fit), _whole_turns(fit)]))
+    return list(filter(None, [_little_explained(fit), *doubts(fit), _whole_turns(fit)]))
+
+
+def doubts(fit: FitResult) -> list[str]:
+    """The remarks on residuals that contradict sigma, and on priors that contradict the data."""
+    return list(filter(None, [contradiction(fit), _prior_conflict(fit)]))
 
 
 def verdict(fit: FitResult) -> str:
@@ -263,7 +272,22 @@ def verdict(fit: FitResult) -> str:
         return (
             f"converged, but the residuals contradict sigma (reduced chi² {fit.reduced_chi2:.4g}),"
         )
-    return fit.status
+    return fit.status + ", but the priors contradict the data," * bool(_prior_conflict(fit))
+
+
+def _prior_conflict(fit: FitResult) -> str:
+    """The remark on priors that contradict the data; empty for others."""
+    from scipy.special import gammaincc  # importing the package does not import it
+
+    count = len(fit.priors)
+    probability = float(gammaincc(count / 2, fit.conflict / 2)) if count else 1.0
+    if probability >= _SIGNIFICANCE:
+        return ""
+    return (
+        f"the priors contradict the data (probability {max(probability, 1e-300):.0e}): chi² of "
+        f"their difference is {fit.conflict:.4g} for {count} of {', '.join(fit.priors[:4])}. A "
+        "prior is wrong or too narrow, the model is incomplete, or this is a local minimum."
+    )
 
 
 def contradiction(fit: FitResult) -> str:

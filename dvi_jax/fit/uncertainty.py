@@ -52,6 +52,18 @@ def uncertainty(J: np.ndarray, variance: float, basis: np.ndarray | None = None)
     return Uncertainty(covariance, V * scale[:, None], values, free_directions)
 
 
+def conflict_of_priors(J: np.ndarray, priors: np.ndarray, basis: np.ndarray | None = None) -> float:
+    """χ² of the difference between priors and data at a minimum: that of the `priors`, their
+    residuals, and what they add to that of the data, to first order."""
+    n = len(priors)
+    A, P = (x if basis is None else x @ basis for x in (J[:-n], J[-n:]))
+    scale = inverse_or(np.linalg.norm(A, axis=0), 1.0)
+    # At the minimum the derivatives of both sums are opposite.
+    root = np.linalg.qr(A * scale, mode="r").T
+    y = np.linalg.lstsq(root, scale * (P.T @ priors), _RANK)[0]
+    return float(priors @ priors + y @ y)
+
+
 def inverse_or(x: np.ndarray, other: float, numerator: float = 1.0) -> np.ndarray:
     """over / x where x is positive, `other` elsewhere."""
     return np.where(x > 0, numerator / np.where(x > 0, x, 1.0), other)

@@ -4,16 +4,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax import lax
 
-from ._maps import KICKS, Parameters, Particle, Piece, RingPart, field, near_identity
-
-
-def quarters(angle: Any) -> tuple[Any, Any, Any]:
-    """Cosine and sine of quarters of a turn, which are integers, and the rest of the angle."""
-    n = jnp.round(lax.stop_gradient(angle) / (np.pi / 2)) * (np.pi / 2)
-    return jnp.round(jnp.cos(n)), jnp.round(jnp.sin(n)), angle - n
+from ._maps import KICKS, Parameters, Particle, Piece, RingPart, field, near_identity, quarters
 
 
 def rotation(x: Any, y: Any, angle: Any) -> tuple[Any, Any]:
@@ -60,29 +52,43 @@ def exact_bend(z: Particle, length: Any, par: Parameters) -> Particle:
     """The flow in a uniform field h in coordinates of curvature h. Forest 1998, (12.18)."""
     h = par["h"]
     px, excess = rotation(z.px, _pz_excess(z, z.px) - z.x * h, h * length)
-    path = length + _arc(z, px) / h
-    late = (1 + z.delta) * path - length
+    longer = _arc(z, px) / h
+    path, late = length + longer, z.delta * length + (1 + z.delta) * longer
     x = (_pz_excess(z, px) - excess) / h
     return z._replace(x=x, px=px, y=z.y + z.py * path, zeta=z.zeta - late)
 
 
-def rotate(z: Particle, angle: Any) -> Particle:
-    """Free motion to a plane that is rotated about the y-axis. Forest 1998, (10.26)."""
-    pz = pz_of(z)
-    px, p = rotation(z.px, pz, angle)
-    path = z.x * jnp.sin(angle) / p
-    x, late = z.x * pz / p, (1 + z.delta) * path
-    return z._replace(x=x, px=px, y=z.y + z.py * path, zeta=z.zeta - late)
+# In a plane at an angle from that of the reference orbit px is relative to that of the reference
+# particle, sin(angle): the sum would have the round-off of order 1 at any amplitude.
 
 
-def wedge(z: Particle, angle: Any, h: Any) -> Particle:
-    """Motion in a uniform field h to a plane that is rotated about the y-axis. Forest (12.41)."""
-    c, s, pz = jnp.cos(angle), jnp.sin(angle), pz_of(z)
-    px = z.px * c + (pz - h * z.x) * s
-    path = (angle + _arc(z, px)) / h
-    numerator = z.x * (z.px * jnp.sin(2 * angle) + s * s * (2 * pz - h * z.x))
-    x = z.x * c + numerator / (pz_of(z, px) + pz * c - z.px * s)
+def _momenta(z: Particle, start: Any, end: Any) -> tuple[Any, Any, Any]:
+    """(px, whole px, pz) in the plane at the angle `end` of a momentum in that at `start`."""
+    s, c = jnp.sin(start), jnp.cos(start)
+    squares = z.px * (2 * s + z.px) + z.py * z.py
+    excess = (z.delta * (2 + z.delta) - squares) / (pz_of(z, s + z.px) + c)
+    px, excess = rotation(z.px, excess, end - start)
+    return px, jnp.sin(end) + px, jnp.cos(end) + excess
+
+
+def rotate(z: Particle, par: Parameters, start: Any, end: Any) -> Particle:
+    """Free motion between planes at two angles about the y-axis. Forest 1998, (10.26)."""
+    px, _, pz = _momenta(z, start, end)
+    x, path = z.x * pz_of(z, jnp.sin(start) + z.px) / pz, z.x * jnp.sin(end - start) / pz
     return z._replace(x=x, px=px, y=z.y + z.py * path, zeta=z.zeta - (1 + z.delta) * path)
+
+
+def wedge(z: Particle, par: Parameters, start: Any, end: Any) -> Particle:
+    """The same in a uniform field h. Forest 1998, (12.41)."""
+    c, s, h = jnp.cos(end - start), jnp.sin(end - start), par["h"]
+    kick, (px, free, free_pz) = h * z.x * s, _momenta(z, start, end)
+    bent = free - kick
+    pz = pz_of(z, bent)
+    slope = (free + bent) / (free_pz + pz)
+    # The angle between the momenta with and without the field, from its sine.
+    sine = kick * (pz + bent * slope) / ((1 + z.delta) ** 2 - z.py * z.py)
+    x, path = z.x * (c + s * slope), jnp.arcsin(sine) / h
+    return z._replace(x=x, px=px - kick, y=z.y + z.py * path, zeta=z.zeta - (1 + z.delta) * path)
 
 
 def wedge_kick(z: Particle, tangent: Any, par: Parameters, order: int) -> Particle:
@@ -98,7 +104,7 @@ def wedge_kick(z: Particle, tangent: Any, par: Parameters, order: int) -> Partic
     return z.plus(px=-tangent * dpx, py=tangent * dpy)
 
 
-def dipole_fringe(z: Particle, h: Any, gap: Any, sign: int) -> Particle:
+def dipole_fringe(z: Particle, h: Any, gap: Any, sign: int) -> dict[str, Any]:
     """The hard edge of a bend: a type-II generating function y² φ(px, py, δ)/2. Forest (13.13)."""
     h = h if sign > 0 else -h
 
@@ -111,7 +117,7 @@ def dipole_fringe(z: Particle, h: Any, gap: Any, sign: int) -> Particle:
     value, (of_px, of_py, of_delta) = jax.value_and_grad(phi, (0, 1, 2))(z.px, z.py, z.delta)
     y = 2 * z.y / (1 + jnp.sqrt(1 - 2 * of_py * z.y))
     half = y * y / 2
-    return z._replace(y=y).plus(x=of_px * half, py=-value * y, zeta=of_delta * half)
+    return {"x": of_px * half, "y": of_py * half, "py": -value * y, "zeta": of_delta * half}
 
 
 def multipole_fringe(z: Particle, par: Parameters, side: int, order: int, skips_b0: bool):
@@ -132,12 +138,12 @@ def multipole_fringe(z: Particle, par: Parameters, side: int, order: int, skips_
     point, p = jnp.stack([z.x, z.y]), 1 + z.delta
     f = shift(point)
     J = jax.jacfwd(shift)(point) / p
-    # (1 − Jᵀ) p' = p, two equations.
+    # (1 − Jᵀ) Δp = Jᵀ p, two equations.
     a, d, b, c = 1 - J[0, 0], 1 - J[1, 1], -J[1, 0], -J[0, 1]
-    det = a * d - b * c
-    px, py = (d * z.px - b * z.py) / det, (a * z.py - c * z.px) / det
-    late = -(px * f[0] + py * f[1]) / (p * p)
-    return z._replace(px=px, py=py).plus(x=-f[0] / p, y=-f[1] / p, zeta=-late)
+    det, (u, v) = a * d - b * c, J.T @ jnp.stack([z.px, z.py])
+    px, py = (d * u - b * v) / det, (a * v - c * u) / det
+    late = -((z.px + px) * f[0] + (z.py + py) * f[1]) / (p * p)
+    return {"x": -f[0] / p, "px": px, "y": -f[1] / p, "py": py, "zeta": -late}
 
 
 # --- bends to second order -----------------------------------------------------------------------

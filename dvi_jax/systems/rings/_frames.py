@@ -5,8 +5,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ._exact import pz_of, quarters, rotation
-from ._maps import Parameters, Particle
+from ._exact import pz_of, rotation
+from ._maps import Parameters, Particle, quarters
 
 
 def turned(z: Particle, angle: Any) -> Particle:
@@ -94,5 +94,4 @@ def solenoid(z: Particle, par: Parameters, turn: Any, sign: int) -> Particle:
         return x, u - kick * x
 
     (x, u), (y, v) = focused(x, u), focused(y, v)
-    z = Particle(x, p * u, y, p * v, z.zeta - late, z.delta)
-    return turned(z, length * k)
+    return turned(Particle(x, p * u, y, p * v, z.zeta - late, z.delta), length * k)

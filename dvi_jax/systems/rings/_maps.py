@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 import lanewise
@@ -214,10 +215,18 @@ def lens(z: Particle, par: Parameters, sign: int, potential: Callable) -> Partic
     return z.plus(px=-sign * of_x, py=-sign * of_y)
 
 
+def quarters(angle: Any) -> tuple[Any, Any, Any]:
+    """Cosine and sine of quarters of a turn, which are integers, and the rest of the angle."""
+    n = jnp.round(lax.stop_gradient(angle) / (np.pi / 2)) * (np.pi / 2)
+    return jnp.round(jnp.cos(n)), jnp.round(jnp.sin(n)), angle - n
+
+
 def cavity(z: Particle, par: Parameters, turn: Any, sign: int) -> Particle:
     """δ − V sin(k (−ζ − lag) − turn·slip − phase): V over the energy, k = 2π f/c."""
-    angle = par["wave_number"] * (-z.zeta - par["lag"]) - turn * par["slip"] - par["phase"]
-    return z.plus(delta=-sign * par["voltage"] * jnp.sin(angle))
+    # Without quarters of a turn: next to a phase of π a small ζ would lose its digits.
+    c, s, rest = quarters(par["wave_number"] * par["lag"] + turn * par["slip"] + par["phase"])
+    angle = par["wave_number"] * z.zeta + rest
+    return z.plus(delta=sign * par["voltage"] * (c * jnp.sin(angle) + s * jnp.cos(angle)))
 
 
 def corrector(z: Particle, par: Parameters, turn: Any, sign: int) -> Particle:

@@ -2,11 +2,12 @@
 
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import jax.numpy as jnp
 
 from . import _curved as curved, _exact as exact, _frames as frames, _maps as maps
-from ._maps import Piece, RingPart
+from ._maps import Parameters, Piece, RingPart
 
 
 def _flow(move: Callable) -> list[Piece]:
@@ -17,23 +18,27 @@ def _plain(move: Callable) -> list[Piece]:
     return [Piece(lambda z, par, turn, sign: move(z, par, sign))]
 
 
-def _near_identity_map(move: Callable) -> list[Piece]:
-    """A map near the identity, given as a function from state to state."""
-
-    def change(z, par):
-        image = move(z, par)
-        return {name: getattr(image, name) - getattr(z, name) for name in z._fields}
-
-    return [maps.near_identity(change)]
+def _angle(side: str, par: Parameters) -> Any:
+    """The angle of a pole face from the plane of the reference orbit."""
+    return par[f"edge_{side}"] if side == "in" else -par[f"edge_{side}"]
 
 
-def _exact_fringe(side: int, order: int, skips_b0: bool) -> list[Piece]:
-    return _near_identity_map(lambda z, par: exact.multipole_fringe(z, par, side, order, skips_b0))
+def _at_face(side: str, change: Callable) -> list[Piece]:
+    """A map near the identity in the plane of a pole face, of the whole px."""
+
+    def of_whole(z, par):
+        return change(z.plus(px=jnp.sin(_angle(side, par))), par)
+
+    return [maps.near_identity(of_whole)]
 
 
-def _uniform_wedge(side: str) -> Piece:
-    """Motion in the main field from a pole face to the end of a bend, or back."""
-    return Piece(lambda z, par, turn, sign: exact.wedge(z, -sign * par[f"edge_{side}"], par["h"]))
+def _turn(side: str, move: Callable, direction: int) -> Piece:
+    """Motion from the end of a bend to its pole face, or back for direction −1."""
+
+    def apply(z, par, turn, sign):
+        return move(z, par, *(0.0, _angle(side, par))[:: sign * direction])
+
+    return Piece(apply)
 
 
 def _wedge(side: str, end: int, order: int) -> list[Piece]:
@@ -42,7 +47,7 @@ def _wedge(side: str, end: int, order: int) -> list[Piece]:
     def kick(z, par, turn, sign):
         return exact.wedge_kick(z, -sign * jnp.tan(par[f"edge_{side}"]), par, order)
 
-    return [_uniform_wedge(side), Piece(kick)][::end]
+    return [_turn(side, exact.wedge, -end), Piece(kick)][::end]
 
 
 Make = Callable[[RingPart], list[Piece]]
@@ -55,16 +60,18 @@ def _ends(side: str, sign: int) -> dict[str, Make]:
         f"at_edge_{side}": lambda p: [maps.edge(side, False, p.scheme)],
         f"second_order_edge_{side}": lambda p: [exact.second_order_edge(side, sign)],
         f"fringe_{side}": lambda p: [maps.quadrupole_fringe(sign)],
-        f"multipole_fringe_{side}": lambda p: _exact_fringe(sign, p.order, False),
-        f"gradient_fringe_{side}": lambda p: _exact_fringe(sign, p.order, True),
-        f"dipole_fringe_{side}": lambda p: _near_identity_map(
-            lambda z, par: exact.dipole_fringe(z, par["h"], par[f"fringe_{side}"], sign)
+        f"multipole_fringe_{side}": lambda p: [
+            maps.near_identity(lambda z, par: exact.multipole_fringe(z, par, sign, p.order, False))
+        ],
+        f"gradient_fringe_{side}": lambda p: _at_face(
+            side, lambda z, par: exact.multipole_fringe(z, par, sign, p.order, True)
         ),
-        f"rotation_{side}": lambda p: _plain(
-            lambda z, par, direction: exact.rotate(z, direction * par[f"edge_{side}"])
+        f"dipole_fringe_{side}": lambda p: _at_face(
+            side, lambda z, par: exact.dipole_fringe(z, par["h"], par[f"fringe_{side}"], sign)
         ),
+        f"rotation_{side}": lambda p: [_turn(side, exact.rotate, sign)],
         f"wedge_{side}": lambda p: _wedge(side, sign, p.order),
-        f"at_wedge_{side}": lambda p: [_uniform_wedge(side)],
+        f"at_wedge_{side}": lambda p: [_turn(side, exact.wedge, -sign)],
         f"placed_{side}": lambda p: _plain(
             lambda z, par, direction: frames.placed(z, par, sign * direction)
         ),
