@@ -61,8 +61,9 @@ class Case(NamedTuple):
         return int(np.clip(WORK // (self.cost * np.prod(self.shape)), 10, 20_000))
 
     @property
-    def is_implicit(self) -> bool:
-        return "root_finder" in (self.options or {})
+    def is_iterated(self) -> bool:
+        """Whether the function in C makes a given number of iterations."""
+        return "root_finder" in (self.options or {}) and not self.kernel.endswith("_tested")
 
     def start(self) -> list[np.ndarray]:
         rng = np.random.default_rng(5)
@@ -103,7 +104,7 @@ class Case(NamedTuple):
 
 def fput(n: int, kernel: str = "fput", work: int = 0, **options) -> Case:
     problem = systems.fput(n, alpha=0.0, beta=0.5)
-    spread, cost = (0.1, 0.1), 100 if kernel == "fput_gauss" else 1
+    spread, cost = (0.1, 0.1), 1 if kernel == "fput" else 100
     constants = (0.0, 0.5)
     return Case(
         kernel, problem.system, (n,), 0.05, spread, constants, work, problem.args, options, cost
@@ -129,10 +130,10 @@ def field(n: int) -> Case:
     return Case("sine_gordon", dvi.System(sine_gordon), (n,), 0.05, (1.0, 1.0), ())
 
 
-def nls(n: int) -> Case:
+def nls(n: int, kernel: str = "nls", work: int = 2) -> Case:
     system, args = systems.nls_lattice(n).system, {"kappa": 1.0, "gamma": 1.0}
     options = {"root_finder": dvi.Picard()}
-    return Case("nls", system, (n,), 0.01, (0.5, 0.5), (1.0, 1.0), 2, args, options, 20)
+    return Case(kernel, system, (n,), 0.01, (0.5, 0.5), (1.0, 1.0), work, args, options, 20)
 
 
 def newton(n: int) -> Case:
@@ -157,6 +158,21 @@ CASES: dict[str, tuple[Callable[[], Case], float | None]] = {
     "FPUT 1000, GaussLegendre(2)": (
         functools.partial(
             fput, 1000, "fput_gauss", 6, method=dvi.GaussLegendre(2), root_finder=dvi.Picard()
+        ),
+        2.0,
+    ),
+    "NLS 512, Picard, with the test of convergence": (
+        functools.partial(nls, 512, "nls_tested", 5),
+        1.5,
+    ),
+    "FPUT 1000, GaussLegendre(2), with the test of convergence": (
+        functools.partial(
+            fput,
+            1000,
+            "fput_gauss_tested",
+            18,
+            method=dvi.GaussLegendre(2),
+            root_finder=dvi.Picard(),
         ),
         2.0,
     ),

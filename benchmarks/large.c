@@ -74,6 +74,48 @@ void fput_drift(ARGUMENTS)
     work[0] = most;
 }
 
+/* The test of convergence of dvi.Picard for one unknown: x its new value, d the size of its last
+   correction, x0 the guess, size the scale of the start. The sums are those of all unknowns. */
+typedef struct {
+    double scale, largest, factor;
+    int is_later, converged;
+} test;
+
+static inline void is_good(test *t, test *next, double x, double d, double x0, double size,
+                           double *last, double *good)
+{
+    const double eps = 0x1p-52;
+    double s = fmax(size, fabs(x)), bound = eps / 16 * s * (*last - d);
+    int accurate = (bound > 0x1p-1022) & (d * d <= bound);
+    int four = (d >= *last / 2) | (d <= t->factor * fabs(x - x0));
+    int at_rest = d <= eps * (four ? 4 : 1) * s;
+    int round_off = d <= 64 * eps * s + 4 * eps * t->scale;
+    int result = accurate | at_rest | (round_off & (((d >= *last) & t->is_later) | (*good > 0)));
+    next->converged &= result;
+    next->scale = fmax(next->scale, s);
+    next->largest = fmax(next->largest, d);
+    *good = result;
+    *last = d;
+}
+
+/* Before the first iteration, from the largest unknown; and from one iteration to the next. */
+static test first_test(const double *x, const double *y, long n, double *last, double *good)
+{
+    test t = {0, 0, 1, 0, 0};
+    for (long i = 0; i < n; i++) {
+        t.scale = fmax(t.scale, fmax(fabs(x[i]), fabs(y[i])));
+        last[i] = good[i] = 0;
+    }
+    return t;
+}
+
+static test next_test(test next, long iterations)
+{
+    next.is_later = 1;
+    next.factor = ldexp(1, -3 * (int)(iterations < 7 ? iterations : 7));
+    return next;
+}
+
 /* Gauss-Legendre collocation with two stages for the same chain: size n, iterations. The unknowns
    are the stages' rates, from those at the start; work 6 n. */
 static void fput_rates(const double *restrict x, double *restrict f, long n, double a, double b)
@@ -102,6 +144,60 @@ void fput_gauss(ARGUMENTS)
                     v[j][i] = p[i] + h * (a[j][0] * f[0][i] + a[j][1] * f[1][i]);
             for (int j = 0; j < 2; j++)
                 fput_rates(x[j], f[j], n, c[0], c[1]);
+        }
+        for (long i = 0; i < n; i++) {
+            q[i] += h / 2 * (v[0][i] + v[1][i]);
+            p[i] += h / 2 * (f[0][i] + f[1][i]);
+        }
+    }
+}
+
+/* A stage from the rates of the iteration before. */
+static void tested_stage(test *t, test *next, const double *restrict start,
+                         const double *restrict r0, const double *restrict r1, double a, double b,
+                         double *restrict x, const double *restrict guess, double *restrict last,
+                         double *restrict good, long n)
+{
+    test now = *t, later = *next;
+    for (long i = 0; i < n; i++) {
+        double new = start[i] + a * r0[i] + b * r1[i], d = fabs(new - x[i]);
+        x[i] = new;
+        is_good(&now, &later, new, d, guess[i], fmax(fabs(start[i]), fabs(guess[i])), last + i,
+                good + i);
+    }
+    *next = later;
+}
+
+/* The same, until the test of convergence is met for the stages x and v: size n; work 18 n. The
+   guess is that of the package: the rates at the start for each stage. */
+void fput_gauss_tested(ARGUMENTS)
+{
+    long n = size[0];
+    double r = sqrt(3.0) / 6, a[2][2] = {{0.25, 0.25 - r}, {0.25 + r, 0.25}};
+    double *f[2] = {work, work + n}, *v[2] = {work + 2 * n, work + 3 * n};
+    double *x[2] = {work + 4 * n, work + 5 * n};
+    double *last = work + 6 * n, *good = work + 10 * n, *guess = work + 14 * n;
+    for (long s = 0; s < steps; s++) {
+        fput_rates(q, f[0], n, c[0], c[1]);
+        for (int j = 0; j < 2; j++)
+            for (long i = 0; i < n; i++) {
+                guess[j * n + i] = x[j][i] = q[i] + h * (a[j][0] + a[j][1]) * p[i];
+                guess[(2 + j) * n + i] = v[j][i] = p[i] + h * (a[j][0] + a[j][1]) * f[0][i];
+            }
+        test t = first_test(work + 2 * n, guess, 4 * n, last, good);
+        for (int j = 0; j < 2; j++)
+            fput_rates(x[j], f[j], n, c[0], c[1]);
+        for (long k = 1; k <= 50 && !t.converged; k++) {
+            test next = {0, 0, 0, 0, 1};
+            for (int j = 0; j < 2; j++)
+                tested_stage(&t, &next, q, v[0], v[1], h * a[j][0], h * a[j][1], x[j],
+                             guess + j * n, last + j * n, good + j * n, n);
+            for (int j = 0; j < 2; j++)
+                tested_stage(&t, &next, p, f[0], f[1], h * a[j][0], h * a[j][1], v[j],
+                             guess + (2 + j) * n, last + (2 + j) * n, good + (2 + j) * n, n);
+            for (int j = 0; j < 2; j++)
+                fput_rates(x[j], f[j], n, c[0], c[1]);
+            t = next_test(next, k);
         }
         for (long i = 0; i < n; i++) {
             q[i] += h / 2 * (v[0][i] + v[1][i]);
@@ -259,6 +355,42 @@ void nls(ARGUMENTS)
         for (long k = 0; k < iterations; k++)
             for (long i = 0; i < n; i++)
                 x[i] = f[i] + h * c[1] / 2 * (q[i] * q[i] + x[i] * x[i]) * q[i];
+        for (long i = 0; i < n; i++)
+            p[i] = x[i];
+        for (long i = 0; i < n; i++)
+            q[i] -= h * c[1] / 2 * (q[i] * q[i] + p[i] * p[i]) * p[i];
+        for (long i = 0; i < n; i++) {
+            long l = i ? i - 1 : n - 1, r = i < n - 1 ? i + 1 : 0;
+            q[i] += h * c[0] * (2 * p[i] - p[l] - p[r]);
+        }
+    }
+}
+
+/* The same, until the test of convergence is met: size n; work 5 n. */
+void nls_tested(ARGUMENTS)
+{
+    long n = size[0];
+    double *restrict x = work, *restrict f = work + n;
+    double *restrict last = work + 2 * n, *restrict good = work + 3 * n;
+    for (long s = 0; s < steps; s++) {
+        for (long i = 0; i < n; i++) {
+            long l = i ? i - 1 : n - 1, r = i < n - 1 ? i + 1 : 0;
+            f[i] = p[i] - h * c[0] * (2 * q[i] - q[l] - q[r]);
+            x[i] = f[i] + h * c[1] / 2 * (q[i] * q[i] + p[i] * p[i]) * q[i];
+            work[4 * n + i] = x[i];
+        }
+        test t = first_test(p, x, n, last, good);
+        for (long k = 1; k <= 50 && !t.converged; k++) {
+            test next = {0, 0, 0, 0, 1};
+            for (long i = 0; i < n; i++) {
+                double x0 = work[4 * n + i], size0 = fmax(fabs(p[i]), fabs(x0));
+                double new = f[i] + h * c[1] / 2 * (q[i] * q[i] + x[i] * x[i]) * q[i];
+                double d = fabs(new - x[i]);
+                x[i] = new;
+                is_good(&t, &next, new, d, x0, size0, last + i, good + i);
+            }
+            t = next_test(next, k);
+        }
         for (long i = 0; i < n; i++)
             p[i] = x[i];
         for (long i = 0; i < n; i++)

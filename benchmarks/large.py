@@ -8,7 +8,7 @@ in speed.py: both sides once in each round, in random order, and the median of a
 
 - The C side is large.c, compiled here for this machine. Implicit steps make the least number of
   iterations with which the states agree with those of the package to round-off; it is in the
-  report. C has no test of convergence.
+  report. C has no test of convergence; "with the test of convergence" it has that of dvi.Picard.
 - The package's side is what a user writes: `jax.jit` of `dvi.integrate` with status and
   `throw=False`, of a system of the library or of an own H_D.
 - Before the times, the states of both sides after ten steps are compared.
@@ -110,8 +110,9 @@ def compare(found: Any, expected: Any, most: float = AGREEMENT) -> float:
 
 def iterations_needed(bench: Bench, case: Case, states: Any) -> tuple[int, float]:
     """The least number of iterations of an implicit step in C with which the states after ten steps
-    are those of the package to round-off, and their difference; 0 for an explicit step."""
-    if not case.is_implicit:
+    are those of the package to round-off, and their difference; 0 for an explicit step, and where C
+    tests convergence."""
+    if not case.is_iterated:
         return 0, compare(states, bench.kernel(case, 10)()[:2])
     for iterations in range(1, 20):
         try:

@@ -12,7 +12,7 @@ from lanewise.elements import places as places_of, schedule as schedule_of
 from lanewise.elements.equations import Translation, row_major
 from lanewise.elements.places import Lives, places
 from lanewise.elements.schedule import dead_memories, groups, schedule
-from lanewise.elements.tree import Loop, Memory, Store
+from lanewise.elements.tree import Loop, Memory, Reduce, Store
 from lanewise.jaxprs.extent import has_long_arrays
 from lanewise.targets import TARGETS
 from lanewise.targets.elements import Elements
@@ -73,6 +73,42 @@ def test_an_array_that_is_read_at_neighbours_is_not_written_over():
     at, _ = places(block, dead_memories(block))
     ((now, new),) = loop_of(block).memories
     assert at[now] != at[new]
+
+
+def guarded(x, y):
+    """A step of a reverse pass: all of it is zero after a failure."""
+
+    def step(state, _):
+        x, y = state
+        y = y + 0.1 * x
+        x = x + 0.1 * (jnp.roll(y, 1) - 2 * y + jnp.roll(y, -1))
+        ok = jnp.isfinite(x).all() & jnp.isfinite(y).all()
+        also = jnp.isfinite(x).all() | (jnp.sum(y) > 1e6)
+        state = jax.lax.cond(
+            ok & also,
+            lambda *state: state,
+            lambda *state: jax.tree.map(jnp.zeros_like, state),
+            x,
+            y,
+        )
+        return state, None
+
+    return jax.lax.scan(step, (x, y), None, length=5)[0]
+
+
+def test_what_a_branch_reads_is_written_before_others_read_it():
+    block, _ = program(guarded, (N,), (N,))
+    at, size = places(block, dead_memories(block))
+    for now, new in loop_of(block).memories:
+        assert at[now] == at[new]
+    assert size == 2 * 512
+
+
+def test_a_sum_is_computed_once_in_a_block():
+    block, _ = program(guarded, (N,), (N,))
+    body = loop_of(block).body
+    sums = [s for s in body.statements if isinstance(s, Reduce)]
+    assert len(sums) == 3  # whether x and y are finite, and the sum of y
 
 
 def test_arrays_that_are_read_later_keep_their_memory():

@@ -30,6 +30,8 @@ SMALL = {
     "half of the pairs": lambda: cases.n_body(5, "n_body_half"),
     "nls": lambda: cases.nls(7),
     "Gauss": lambda: cases.fput(7, "fput_gauss", 6, **PICARD),
+    "nls, tested": lambda: cases.nls(7, "nls_tested", 5),
+    "Gauss, tested": lambda: cases.fput(7, "fput_gauss_tested", 18, **PICARD),
     "band": lambda: cases.newton(7),
 }
 
@@ -50,7 +52,7 @@ def test_states_agree(bench, name):
     case = SMALL[name]()
     iterations, worst = large.iterations_needed(bench, case, states(case))
     assert worst < large.AGREEMENT
-    assert (iterations > 0) == case.is_implicit
+    assert (iterations > 0) == case.is_iterated
 
 
 def test_the_chain_agrees_and_another_coupling_is_found(bench):

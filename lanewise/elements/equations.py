@@ -70,6 +70,7 @@ class Translation:
         self.operands: list[tuple[Memory, np.ndarray]] = []
         self._constants: dict[Any, Array] = {}
         self.factors: dict[Any, Any] = {}  # of linear systems that are solved again
+        self.sums: dict[Any, Array] = {}
         self.branches = 0  # around the block
 
     # --- values --------------------------------------------------------------------------------
@@ -241,6 +242,8 @@ class Translation:
                 needed.append(equation)
                 uses.update(x for x in equation[1] if isinstance(x, Token))
         destinations = _destinations(outs, places, needed)
+        # What is written anyway: results, and what a branch reads.
+        written = {*outs, *(x for eqn, xs, _ in needed if eqn.primitive.name == "cond" for x in xs)}
         values: dict[Token, Array] = {}
 
         def read(x: Any) -> Array:
@@ -255,8 +258,7 @@ class Translation:
             for token, x in zip(tokens, results, strict=True):
                 if not uses[token]:
                     continue
-                # An output is written anyway.
-                price = 1 if token in outs else EXPENSIVE
+                price = 1 if token in written else EXPENSIVE
                 if token in destinations:
                     x = self.store(x, destinations[token])
                 elif (x.cost >= price and uses[token] > 1) or x.height > _TALLEST:

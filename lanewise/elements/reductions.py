@@ -44,10 +44,7 @@ def reduction_of(translation: Translation, x: Array, op: str, axes: Sequence[int
     if not vanish:
         return translation.from_components(totals, shape, short_kept)
     if len(vanish) == len(long):
-        for key, part in totals.items():
-            number = Number(x.dtype)
-            translation.add(Reduce(number, [0] * len(long), 0, part, op, vanish))
-            totals[key] = Array.uniform(translation.number(number), ())
+        totals = {key: _sum(translation, op, part) for key, part in totals.items()}
         return translation.from_components(totals, shape, short_kept)
     # Some axes are kept: the sums are elements of an array.
     memory = Memory(shape, x.dtype)
@@ -61,6 +58,17 @@ def reduction_of(translation: Translation, x: Array, op: str, axes: Sequence[int
         axes_of_turned = [order.index(k) for k in vanish]
         translation.add(Reduce(memory, strides, offset, view, op, axes_of_turned))
     return memory.load(translation.table)
+
+
+def _sum(translation: Translation, op: str, part: Array) -> Array:
+    """All elements combined, once in a block: several tests ask whether one state is finite."""
+    boxes = [(lower, upper, node.serial) for lower, upper, node in part.boxes]
+    key = translation.block, op, part.dtype, *boxes
+    if key not in translation.sums:
+        number, rank = Number(part.dtype), len(part.shape)
+        translation.add(Reduce(number, [0] * rank, 0, part, op, range(rank)))
+        translation.sums[key] = Array.uniform(translation.number(number), ())
+    return translation.sums[key]
 
 
 def _order(parts, rank: int) -> list[int]:
