@@ -22,45 +22,12 @@ import time
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
+from _gpu_programs import alphas, kepler
 
 import dvi_jax as dvi
-from dvi_jax import systems
-from dvi_jax.systems import boozer
 
 jax.config.update("jax_enable_x64", True)
-
-
-def kepler(count):
-    """(one trajectory, initial states)."""
-    problem = systems.kepler()
-
-    def one(q, p):
-        sol = dvi.integrate(
-            problem.system, q, p, h=0.05, num_steps=STEPS, args=problem.args,
-            method=dvi.Yoshida(4), save=dvi.Save(final=True), throw=False,
-        )  # fmt: skip
-        return jnp.concatenate([sol.qs[-1], sol.ps[-1]])
-
-    r = np.linspace(0.8, 1.2, count)[:, None]
-    return one, (r * np.asarray(problem.q0), np.broadcast_to(problem.p0, (count, 2)) / np.sqrt(r))
-
-
-def alphas(count):
-    """(one trajectory, initial states)."""
-    particles = boozer.GuidingCentres(boozer.precise_qa())
-    x = np.linspace(0, 1, count)
-    q, p, args = particles.start(0.1 + 0.3 * x, 40 * x, 7 * x, 0.9 * np.sin(50 * x))
-
-    def one(q, p, mu):
-        sol = dvi.integrate(
-            particles.system, q, p, h=particles.h, num_steps=STEPS, args={**args, "mu": mu},
-            method=dvi.GaussLegendre(2), save=dvi.Save(final=True), throw=False,
-        )  # fmt: skip
-        return jnp.concatenate([sol.qs[-1], sol.ps[-1]])
-
-    return one, (np.asarray(q), np.asarray(p), np.asarray(args["mu"]))
 
 
 STEPS = 200
@@ -73,10 +40,10 @@ def timed(one, states, device):
         begun = time.perf_counter()
         run = jax.jit(jax.vmap(one)).lower(*states).compile()
         compiled = time.perf_counter() - begun
-        found = jax.block_until_ready(run(*states))
+        *final_states, _ = jax.block_until_ready(run(*states))
         begun = time.perf_counter()
         jax.block_until_ready(run(*states))
-        return np.asarray(found), compiled, time.perf_counter() - begun
+        return np.concatenate(final_states, axis=-1), compiled, time.perf_counter() - begun
 
 
 def main():
@@ -100,7 +67,7 @@ def main():
     devices = {d.platform: d for d in (jax.devices("cpu")[0], jax.devices()[0])}
     print(", ".join(f"{name}: {d.device_kind}" for name, d in devices.items()), flush=True)
     for task in (kepler, alphas):
-        few = {name: timed(*task(64), d)[0] for name, d in devices.items()}
+        few = {name: timed(*task(64, STEPS, dvi.Layout()), d)[0] for name, d in devices.items()}
         first, *others = few.values()
         scale = np.abs(first).max(0)
         for name, other in zip(list(few)[1:], others, strict=True):
@@ -110,7 +77,7 @@ def main():
             for count in (1_000,) if options.quick else (1_000, 10_000, 100_000, 1_000_000):
                 if name == "cpu" and count > 10_000:
                     continue
-                _, compiled, seconds = timed(*task(count), device)
+                _, compiled, seconds = timed(*task(count, STEPS, dvi.Layout()), device)
                 print(
                     f"{task.__name__}, {name}, {count} trajectories: compilation {compiled:.1f} s, "
                     f"{seconds / STEPS * 1e6:.0f} µs a step of the batch, "

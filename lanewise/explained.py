@@ -85,14 +85,17 @@ class Part:
 
 @dataclasses.dataclass(frozen=True)
 class Explanation:
-    """Result of `explain`: one `Part` for each piece that is compiled by itself."""
+    """Result of `explain`: one `Part` for each piece that is compiled by itself; `note` says which
+    device they are for, if the one that was named does not exist."""
 
     parts: tuple[Part, ...]
+    note: str = ""
 
     def __str__(self) -> str:
         if not self.parts:
             return "no call of lanewise: the function is compiled by XLA"
-        return "\n".join(f"{i + 1}. {part}" for i, part in enumerate(self.parts))
+        lines = [f"{i + 1}. {part}" for i, part in enumerate(self.parts)]
+        return "\n".join([self.note, *lines] if self.note else lines)
 
 
 def explain(
@@ -113,7 +116,7 @@ def explain(
     - `batch`: trajectories; all arguments are taken to differ between them.
     - `device`: ``"cpu"``, or ``"cuda:0"`` for the code of NVIDIA GPUs, which is used only if the
       environment variable ``LANEWISE_CUDA`` is ``on``. In a process without a GPU it is the code
-      for the oldest one that is supported.
+      for the oldest one that is supported, and the report says so.
 
     **Returns** an `Explanation`: print it, or read its `parts`, each with `ir` and `assembly`.
 
@@ -123,18 +126,33 @@ def explain(
     print(lanewise.explain(lambda x: jnp.sin(x) / x, 1.0))
     ```
     """
-    platform = str(device).partition(":")[0].lower()
-    if platform not in ("cpu", "cuda"):
+    match = re.fullmatch(r"(cpu|cuda)(?::(\d+))?", str(device).lower())
+    if match is None:
         raise ValueError(
             f'device must be "cpu" or "cuda", with or without a number, got {device!r}.'
         )
+    platform, number = match[1], int(match[2] or 0)
     # Arrays: a number of Python would be traced with a weak type, which a batch does not have.
     leaves, tree = jax.tree.flatten(jax.tree.map(jnp.asarray, args))
     trace = Trace.from_function(function, leaves, tree)
     # Without a call in it, the function is explained as if it were called.
     programs = _calls(trace.closed_jaxpr.jaxpr) or [Callee(trace, layout)]
     parts = (part for program in programs for part in _parts(program, batch, platform))
-    return Explanation(tuple(parts))
+    return Explanation(tuple(parts), _note(platform, number))
+
+
+def _note(platform: str, number: int) -> str:
+    """What is assumed if a device does not exist."""
+    try:
+        count = len(jax.devices(platform))
+    except RuntimeError:  # JAX has no device of this kind
+        count = 0
+    if number < count:
+        return ""
+    from .llvm.ptx import ARCHITECTURES
+
+    assumed = "those that exist" if count else f"an assumed GPU, sm_{min(ARCHITECTURES)}"
+    return f"there is no device {platform}:{number} in this process: the report is for {assumed}"
 
 
 def compiled_by(function: Callable, *args: Any, batch: int = 1024) -> tuple[set[str], str | None]:

@@ -15,6 +15,7 @@ from .jaxprs.jaxapi import ClosedJaxpr, linear_map, manual_axes, with_equal_axes
 from .jaxprs.traced import Trace
 from .llvm.ir import NotCompilable
 from .native import handler, machine
+from .native.switches import is_on
 from .pieces import FunctionPiece, in_pieces, pieces
 from .targets import TARGETS, compile_program
 
@@ -113,9 +114,7 @@ def batched(function: Callable, in_axes: Any = 0, layout: Layout = AUTO) -> Call
 
 def generates() -> bool:
     """Whether machine code is generated in this process; otherwise XLA compiles everything."""
-    if os.environ.get(SWITCH, "").strip().lower() in ("off", "0", "no", "false"):
-        return False
-    return _can_start()
+    return is_on(SWITCH, default=True) and _can_start()
 
 
 @machine.once

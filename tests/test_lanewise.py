@@ -28,7 +28,7 @@ from lanewise import primitive
 from lanewise.jaxprs import extent
 from lanewise.jaxprs.traced import Trace
 from lanewise.llvm.ir import NotCompilable
-from lanewise.native import cache, machine
+from lanewise.native import cache, machine, switches
 from lanewise.rules import moves
 from lanewise.targets import TARGETS, Code
 from lanewise.targets.target import compiled_by
@@ -1012,6 +1012,23 @@ def test_switched_off(left, monkeypatch):
     assert not lanewise.generates()
     assert_close(jax.jit(lanewise.batched(table))(VALUES), found)
     assert len(left) == 2
+
+
+@pytest.mark.parametrize(
+    ("setting", "is_on"), [("", True), (" On ", True), ("NO", False), ("0", False), ("1", True)]
+)
+def test_words_of_the_switch(monkeypatch, setting, is_on):
+    monkeypatch.setenv("LANEWISE", setting)
+    with warnings.catch_warnings(action="error"):
+        assert lanewise.generates() == is_on
+
+
+@pytest.mark.parametrize("default", [True, False])
+def test_a_wrong_word_of_a_switch_warns_once(monkeypatch, default):
+    monkeypatch.setenv("LANEWISE_TEST", f"maybe{default}")
+    with pytest.warns(UserWarning, match="neither on nor off.*as LANEWISE_TEST=o[nf]") as seen:
+        assert [switches.is_on("LANEWISE_TEST", default) for _ in range(2)] == [default] * 2
+    assert len(seen) == 1
 
 
 def test_one_warning_where_code_cannot_be_generated(left, monkeypatch):

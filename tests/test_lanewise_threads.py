@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -20,8 +21,6 @@ from jax import export, lax
 
 import dvi_jax as dvi
 import lanewise
-from dvi_jax import systems
-from dvi_jax.systems import boozer
 from lanewise import primitive
 from lanewise.evaluator import RULES
 from lanewise.jaxprs import jaxapi
@@ -33,6 +32,9 @@ from lanewise.rules import exact
 from lanewise.targets import TARGETS, threads
 from lanewise.targets.numbers import Numbers
 from lanewise.targets.threads import Threads, ptx_of
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+import _gpu_programs
 
 ENTRY = """
 define void @run(ptr %args, ptr %rets, ptr %params, ptr %scratch, i64 %blocks) {
@@ -123,111 +125,26 @@ def calls_of(function, *args) -> list[Call]:
 # --- programs -------------------------------------------------------------------------------------
 
 
-def final(sol):
-    return sol.qs[-1], sol.ps[-1], sol.result
-
-
-def kepler(lanes, save=None, dtype=float):
-    problem = systems.kepler()
-    r = np.linspace(0.8, 1.2, lanes)[:, None]
-    q, p = r * np.asarray(problem.q0), np.asarray(problem.p0) / np.sqrt(r)
-    save = dvi.Save(final=True) if save is None else save
-
-    def one(q, p):
-        sol = dvi.integrate(
-            problem.system, q, p, h=0.05, num_steps=60, args=problem.args, method=dvi.Yoshida(4),
-            save=save, throw=False,
-        )  # fmt: skip
-        return sol.qs, sol.ps, sol.result
-
-    return one, (q.astype(dtype), p.astype(dtype))
-
-
-def H_pendulum(t0, t1, q0, p1, args):
-    difference = q0[0] - q0[1]
-    kinetic = (p1[0] ** 2 + 2 * p1[1] ** 2 - 2 * p1[0] * p1[1] * jnp.cos(difference)) / (
-        2 * (1 + jnp.sin(difference) ** 2)
-    )
-    return kinetic - 2 * jnp.cos(q0[0]) - jnp.cos(q0[1])
-
-
-def pendulum(lanes, **options):
-    def one(q, p):
-        sol = dvi.integrate(
-            dvi.System(H_pendulum), q, p, h=0.02, num_steps=40, save=dvi.Save(final=True),
-            throw=False, **options,
-        )  # fmt: skip
-        return final(sol)
-
-    return one, tuple(np.random.default_rng(5).uniform(-0.5, 0.5, (2, lanes, 2)))
-
-
-def pendulum_gradient(lanes):
-    one, inputs = pendulum(lanes, adjoint=dvi.Reversible())
-
-    def loss(q, p):
-        q, p, _ = one(q, p)
-        return (jnp.sum(q**2) + jnp.sum(p**2)) / 2
-
-    return jax.grad(loss, argnums=(0, 1)), inputs
-
-
-def guiding_centre(lanes):
-    particles = boozer.GuidingCentres(boozer.precise_qa())
-    x = np.linspace(0, 1, lanes)
-    q, p, args = particles.start(0.1 + 0.3 * x, 40 * x, 7 * x, 0.9 * np.sin(50 * x))
-
-    def one(q, p, mu):
-        sol = dvi.integrate(
-            particles.system, q, p, h=particles.h, num_steps=3, args={**args, "mu": mu},
-            method=dvi.GaussLegendre(2), save=dvi.Save(final=True), throw=False,
-        )  # fmt: skip
-        return final(sol)
-
-    return one, (q, p, args["mu"])
-
-
-def bodies(lanes):
-    radius, angle, mass = 1 + np.arange(7) / 2, 2.4 * np.arange(7), 1e-4
-    outwards = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
-    along = np.stack([-np.sin(angle), np.cos(angle), 0 * angle], axis=1)
-    q0 = np.concatenate([np.zeros((1, 3)), radius[:, None] * outwards])
-    p0 = mass * np.concatenate([np.zeros((1, 3)), along / np.sqrt(radius)[:, None]])
-    problem = systems.n_body([1.0] + [mass] * 7, q0, p0)
-
-    def one(q, p):
-        sol = dvi.integrate(
-            problem.system, q, p, h=problem.h, num_steps=10, args=problem.args,
-            save=dvi.Save(final=True), throw=False,
-        )  # fmt: skip
-        return final(sol)
-
-    rng = np.random.default_rng(5)
-    scale = rng.uniform(-1, 1, (2, lanes, 8, 3))
-    return one, (q0 + 1e-3 * scale[0], p0 + 1e-6 * scale[1])
-
-
 PROGRAMS = {
-    "kepler": (kepler, 1),
-    "kepler saved": (functools.partial(kepler, save=dvi.Save(every=10)), 1),
-    "kepler float32": (functools.partial(kepler, dtype=np.float32), 1),
-    "double pendulum": (pendulum, 1),
-    "gradient": (pendulum_gradient, 2),
-    "guiding centre": (guiding_centre, 1),
-    "8 bodies": (bodies, 1),
-}
-"""Name → the function that makes a batch, and the number of calls of lanewise in it."""
+    "kepler": (60, 1), "kepler_saved": (60, 1), "kepler_float32": (60, 1), "pendulum": (40, 1),
+    "pendulum_gradient": (40, 2), "alphas": (3, 1), "bodies": (10, 1),
+}  # fmt: skip
+"""Name in `_gpu_programs` → steps, and the number of calls of lanewise in it."""
 
 LANES = 37
 """Not a multiple of a block: threads after the last trajectory must do nothing."""
 
 
+def batch_of(name):
+    """(the function of one trajectory, *inputs of a batch)."""
+    one, inputs = getattr(_gpu_programs, name)(LANES, PROGRAMS[name][0], dvi.Layout())
+    return one, *map(jnp.asarray, inputs)
+
+
 @functools.cache
 def calls_of_program(name):
-    make, count = PROGRAMS[name]
-    one, inputs = make(LANES)
-    calls = calls_of(one, *map(jnp.asarray, inputs))
-    assert len(calls) == count
+    calls = calls_of(*batch_of(name))
+    assert len(calls) == PROGRAMS[name][1]
     return calls
 
 
@@ -619,12 +536,10 @@ def with_slow(names, fast):
     return [name if name in fast else pytest.param(name, marks=pytest.mark.slow) for name in names]
 
 
-@pytest.mark.parametrize("name", with_slow(PROGRAMS, ["kepler", "gradient"]))
+@pytest.mark.parametrize("name", with_slow(PROGRAMS, ["kepler", "pendulum_gradient"]))
 def test_a_program_is_one_custom_call(on_gpus, name):
-    make, count = PROGRAMS[name]
-    one, inputs = make(LANES)
-    text = lowered(one, *inputs)
-    assert len(re.findall(r"custom_call @lanewise_cuda_\w+", text)) == count
+    text = lowered(*batch_of(name))
+    assert len(re.findall(r"custom_call @lanewise_cuda_\w+", text)) == PROGRAMS[name][1]
     assert "stablehlo.while" not in text
 
 
@@ -669,7 +584,7 @@ print("lanewise_cuda" in text, len(names), "libcuda" in maps)
 
 @pytest.mark.parametrize(
     ("switch", "printed"),
-    [("", "False 0 False"), pytest.param("on", "True 2 False", marks=pytest.mark.slow)],
+    [("maybe", "False 0 False"), pytest.param("on", "True 2 False", marks=pytest.mark.slow)],
 )
 def test_nothing_is_imported_without_the_switch(switch, printed):
     run = subprocess.run(
@@ -678,6 +593,8 @@ def test_nothing_is_imported_without_the_switch(switch, printed):
         capture_output=True, text=True, check=True,
     )  # fmt: skip
     assert run.stdout.split("\n")[0] == printed
+    warning = "LANEWISE_CUDA='maybe' is neither on nor off: it has no effect, as LANEWISE_CUDA=off"
+    assert (warning in run.stderr) == (switch == "maybe")
 
 
 # --- explain, and CUDA's assembler ----------------------------------------------------------------
@@ -694,8 +611,22 @@ def test_explain_of_a_gpu(monkeypatch):
     assert "sm_80" in str(part)
     assert "at most 255 registers" in str(part)
     assert lanewise.explain(jnp.sin, 1.0, device="cpu").parts[0].target == "numbers"
-    with pytest.raises(ValueError, match="device must be"):
-        lanewise.explain(jnp.sin, 1.0, device="tpu:0")
+    for device in ("tpu:0", "cuda:", "cuda:x", "cuda:-1", "cpu0"):
+        with pytest.raises(ValueError, match="device must be"):
+            lanewise.explain(jnp.sin, 1.0, device=device)
+
+
+def test_explain_of_a_device_that_does_not_exist(monkeypatch):
+    assert not lanewise.explain(jnp.sin, 1.0, device="cpu").note
+    text = str(lanewise.explain(jnp.sin, 1.0, device="cuda:99"))
+    assert text.startswith("there is no device cuda:99 in this process: the report is for an assum")
+    assert "an assumed GPU, sm_80\n1. code for GPUs, sm_80: " in text
+    assert "cpu:99 in this process" in lanewise.explain(jnp.sin, 1.0, device="cpu:99").note
+    gpu = SimpleNamespace(compute_capability="9.0")
+    monkeypatch.setattr(threads.jax, "devices", lambda *_: [gpu, gpu])
+    for number, count in ((1, 0), (2, 1)):
+        note = lanewise.explain(jnp.sin, 1.0, device=f"CUDA:{number}").note
+        assert note.count("the report is for those that exist") == count
 
 
 needs_ptxas = pytest.mark.skipif(ptx.ptxas() is None, reason="nvidia-cuda-nvcc is not installed")
@@ -715,7 +646,7 @@ def test_ptxas_accepts_programs(name):
         for architecture in ptx.ARCHITECTURES:
             kernel = ptx_of(call.function, call.lane_flags, architecture)
             bytes_spilled = spills(kernel.text, architecture)
-            assert bytes_spilled == 0 or name in ("guiding centre", "8 bodies")
+            assert bytes_spilled == 0 or name in ("alphas", "bodies")
             assert 0 < (ptx.registers_of(kernel.text, architecture) or 0) <= 255
 
 

@@ -1,9 +1,11 @@
 """Sweeps: numbers of single runs, axes, generated initial conditions, failures, export, errors."""
 
 import contextlib
+import dataclasses
 import signal
 import threading
 import time
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -16,9 +18,10 @@ from sweep_child import energy, friction, hamiltonian
 import dvi_jax as dvi
 from dvi_jax import starts
 from dvi_jax.base.checks import argument_names
-from dvi_jax.sweep import store as stores
+from dvi_jax.sweep import cluster, store as stores, workers
 from dvi_jax.sweep.cost import span
-from dvi_jax.sweep.plan import SweepPlan, make_plan
+from dvi_jax.sweep.plan import ON_CPU, SweepPlan, make_plan, on_devices
+from dvi_jax.sweep.request import Request
 
 SYSTEM = dvi.System(hamiltonian, force=friction, epsilon=0.0)
 OBSERVE = {"drift": dvi.MaxDrift(energy), "mean": dvi.Mean(energy)}
@@ -369,8 +372,84 @@ def test_the_size_of_a_task_depends_on_steps_and_bytes():
         assert least <= make_plan({"start": count}, 0, steps, size).lanes_per_task <= most
 
 
+def gpus(*sizes):
+    """Substitutes for GPUs with so many bytes; None: unknown."""
+    return [
+        SimpleNamespace(
+            platform="gpu",
+            device_kind="none",
+            memory_stats=lambda size=size: size and {"bytes_limit": size},
+        )
+        for size in sizes
+    ]
+
+
+def lanes_on(devices, operations, steps=10_000, size=8, count=2**30, largest=16):
+    numbers = jnp.zeros(largest // 16)
+
+    def one(x):
+        for _ in range(max(operations // len(numbers), 1)):
+            x = -x
+        return x
+
+    limits, weight = on_devices(devices, jax.make_jaxpr(one)(numbers).jaxpr)
+    return make_plan({"start": count}, 0, weight * steps, size, limits=limits).lanes_per_task
+
+
+def test_the_size_of_a_task_of_a_gpu():
+    """It depends on the operations of a step, and on the smallest memory."""
+    assert on_devices(jax.devices(), None) == (ON_CPU, 1)
+    gpu = gpus(64 * 2**30)
+    assert lanes_on(gpu, 256) == 2**18
+    assert lanes_on(gpu, 512) == 2**17  # half a second of twice the work
+    assert lanes_on(gpu, 9000) == 2**16  # fewer would leave the GPU idle
+    assert lanes_on(gpu, 256, steps=1) == 2**20
+    assert lanes_on(gpu, 256, size=2**14) == 2**14  # 256 MiB of results
+    assert lanes_on(gpu, 256, count=2**17) == 2**16  # not in 32 tasks
+    # Numbers of 8 bytes are an operand and a result, in two tasks of eight copies.
+    much = 2**30
+    assert lanes_on(gpus(much), 8, largest=2**12 + 16) == 2**13
+    for largest, lanes in ((2**14, 2**12), (2**17, 2**9)):
+        for sizes in ([much], [2 * much - 1], [2 * much, None, much]):
+            assert lanes_on(gpus(*sizes), 8, largest=largest) == lanes
+        assert lanes_on(gpus(None), 8, largest=largest) == 2 * lanes
+
+
+def test_a_worker_of_a_cluster_uses_all_its_devices(monkeypatch):
+    program = SimpleNamespace(devices="abc", plan=SimpleNamespace(task=int))
+    monkeypatch.setattr(cluster, "_job", lambda job: (program, None, None, True))
+    monkeypatch.setattr(cluster, "compute", lambda p, task, device: (device, {"statuses": {}}))
+    assert "".join(cluster._task(b"", n)[0] for n in range(5)) == "abcab"
+
+
+def test_results_of_a_gpu_are_copied_while_it_computes(monkeypatch):
+    """Control: with one task at a time each waits for another until the barrier breaks."""
+    devices, used, run = gpus(None, None), [], workers.compute
+
+    def compute(program, task, device):
+        used.append(device)
+        at_once[devices.index(device)].wait()
+        return run(program, task, jax.devices()[0])
+
+    monkeypatch.setattr(workers, "compute", compute)
+    request = Request(SYSTEM, Q, P, epsilon=np.linspace(0, 0.1, 80), **DEFAULTS_OF_RUN)
+    program, arrays, programs = dataclasses.replace(request, lanes_per_task=10).prepare()
+    assert on_devices(devices, programs[0].jaxpr)[1] > 0
+    program.devices = devices
+    results = []
+    for tasks_of_a_gpu, is_broken in ((2, False), (1, True)):
+        monkeypatch.setattr(workers, "_PER_GPU", tasks_of_a_gpu)
+        at_once = [threading.Barrier(2, timeout=0.5 if is_broken else 60) for _ in devices]
+        sink = stores.MemorySink(program.plan, arrays)
+        with pytest.raises(threading.BrokenBarrierError) if is_broken else contextlib.nullcontext():
+            assert workers.run_here(program, sink, None, None)
+        results.append(sink)
+    assert all(device in used for device in devices)
+    assert [sink.done_tasks() for sink in results] == [{*range(8)}, set()]
+
+
 # Others are in `test_mistakes`.
-E, BOX = {"epsilon": [0.1]}, ([0.0], [1.0])
+E, BOX, ALL_DEVICES = {"epsilon": [0.1]}, ([0.0], [1.0]), {"devices": jax.devices()}
 STEPS = {"h": dvi.Axis("step", [0.1, 0.05]), "num_steps": dvi.Axis("step", [4, 8])}
 GIVEN = {"lattice": dvi.Given([0.0, 0.1]), "h": None}
 VALUE_ERRORS = {
@@ -392,6 +471,8 @@ VALUE_ERRORS = {
     "leave out the axis of t0": GIVEN | {"t0": [0.0, 1.0], "num_steps": None},
     "leave out num_steps": GIVEN | E,
     "threads must be": E | {"threads": 0},
+    "number of devices must be": E | {"devices": []},
+    "devices=.* has no effect with client": E | {"client": SimpleNamespace(submit=0)} | ALL_DEVICES,
     "lanes_per_task must be": E | {"lanes_per_task": 1.5},
     "each name in units must be": E | {"units": {"drft": "J"}},
     "be given together": E | {"method": METHODS[1], "integrator": dvi.Integrator()},
@@ -416,6 +497,7 @@ TYPE_ERRORS = {
     "one of dvi.starts": E | {"start": 3},
     "h must be": E | {"h": "x"},
     r"distributed\.Client": E | {"client": 3},
+    "each of devices must be": E | {"devices": ["cpu"]},
     "sweep has no argument 'epsilom'. Did you mean 'epsilon'": E | {"epsilom": 1},
     "no argument 'newton'. Did you mean 'root_finder'": E | {"newton": None},
     "high of Random must be a pair": lambda: starts.Random(3, LOW, [0.0]),

@@ -143,8 +143,10 @@ def test_another_sweep_is_rejected_with_the_differences(copy, monkeypatch):
 
 def in_a_process(path, **env):
     code = (
-        "import sweep_child, sys, jax; found = sweep_child.sweep(sys.argv[1]);"
-        "print(found.attributes['config_sha256'], jax.device_count())"
+        "import sweep_child, sys, jax; used = set(); from dvi_jax.sweep import workers as w;"
+        "run = w.compute; w.compute = lambda *a: (used.add(a[2].id), run(*a))[1];"
+        "found = sweep_child.sweep(sys.argv[1], devices=jax.devices()[-2:]);"
+        "print(found.attributes['config_sha256'], jax.device_count(), *sorted(used))"
     )
     out = subprocess.run(
         [sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True,
@@ -160,9 +162,9 @@ def test_the_identity_is_the_same_in_every_process(finished):
 
 
 @pytest.mark.slow
-def test_two_devices_give_the_bits_of_one(tmp_path, expected):
-    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=2"
-    assert in_a_process(tmp_path / "s.zarr", XLA_FLAGS=flags)[1] == "2"
+def test_two_devices_of_three_give_the_bits_of_one(tmp_path, expected):
+    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=3"
+    assert in_a_process(tmp_path / "s.zarr", XLA_FLAGS=flags)[1:] == ["3", "1", "2"]
     same(dvi.open_sweep(tmp_path / "s.zarr"), expected)
 
 

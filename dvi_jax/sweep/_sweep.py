@@ -72,8 +72,10 @@ def sweep(
       in memory.
     - `client`: a `distributed.Client`: its workers compute the tasks. If there is a store they
       write them there; all of them must see it under the same path.
-    - `threads`: of this process; None: one for each processor, or GPU.
-    - `lanes_per_task`: trajectories at a time; None: chosen from the number of steps.
+    - `devices`: of this process, such as ``jax.devices("cpu")``; None: all of `jax.local_devices`.
+    - `threads`: of this process; None: one for each processor, or two for each GPU.
+    - `lanes_per_task`: trajectories at a time; None: chosen from the number of steps, and on GPUs
+      also from the operations of a step and the memory.
     - `progress`: True or False for a bar; a function of a `SweepProgress`; None: a bar if stderr is
       a terminal.
 
@@ -109,8 +111,9 @@ def sweep(
         raise TypeError(f"client must be a distributed.Client, got {client!r:.200}.")
     if threads is not None:
         whole("threads", threads)
-        if client is not None:
-            raise ValueError(f"threads={threads} has no effect with client: leave it out.")
+    for name, value in (("threads", threads), ("devices", settings.get("devices"))):
+        if client is not None and value is not None:
+            raise ValueError(f"{name}={value} has no effect with client: leave it out.")
     config = description(definition, program.plan, arrays, programs)
     if store is None:
         sink = MemorySink(program.plan, arrays)
@@ -152,7 +155,7 @@ def sweep_cost(
     names = [field.name for field in dataclasses.fields(Request)]
     options: dict[str, Any] = {name: x for name, x in settings.items() if name in names}
     program, arrays, _ = Request(system, q0, p0, **options).prepare()
-    return cost(program.sweep, program.plan, arrays)
+    return cost(program, arrays)
 
 
 def _checked_units(units: Any, names: Iterable[str]) -> dict[str, str]:

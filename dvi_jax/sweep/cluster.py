@@ -144,7 +144,7 @@ def _task(job: bytes, number: int) -> tuple[Any, dict[str, int]]:
     store, and its statuses."""
     with _lock:  # threads of a worker share one job
         program, path, sha, x64 = _job(job)
-    task, device = program.plan.task(number), jax.local_devices()[0]
+    task, device = program.plan.task(number), program.devices[number % len(program.devices)]
     with jax.enable_x64(x64):
         if path is None:
             results, facts = compute(program, task, device)

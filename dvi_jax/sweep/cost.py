@@ -7,10 +7,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..base.printing import printable
-from .plan import SweepPlan
-from .program import Sweep, SweepProgram
+from .program import SweepProgram
 from .variables import Variable
-from .workers import default_threads
+from .workers import cores
 
 # Time to write a task, at least: files are forced to the disk one after the other. The directory of
 # a cluster may take longer.
@@ -84,10 +83,10 @@ class SweepCost:
         )
 
 
-def cost(sweep: Sweep, plan: SweepPlan, variables: Mapping[str, Variable]) -> SweepCost:
+def cost(program: SweepProgram, variables: Mapping[str, Variable]) -> SweepCost:
     """Compute the first task of each method and number of steps twice or more, and extrapolate."""
-    program = SweepProgram(sweep, plan)
-    per_value = plan.num_tasks // math.prod(plan.counts[: sweep.compiled_dims])
+    plan = program.plan
+    per_value = plan.num_tasks // math.prod(plan.counts[: program.sweep.compiled_dims])
     firsts, repeats, steps = [], [], 0
     for number in range(0, plan.num_tasks, per_value):
         task = plan.task(number)
@@ -108,13 +107,13 @@ def cost(sweep: Sweep, plan: SweepPlan, variables: Mapping[str, Variable]) -> Sw
         seconds_per_step=sum(repeats) / (plan.lanes_per_task * steps),
         seconds_per_task=sum(repeats) / len(repeats),
         compilation=max(0.0, sum(firsts) - sum(repeats)),
-        cores=default_threads(),
+        cores=cores(program.devices),
     )
 
 
 def _seconds(program: SweepProgram, task: Any) -> float:
     start = time.perf_counter()
-    program(task)
+    program(task, program.devices[0])
     return time.perf_counter() - start
 
 

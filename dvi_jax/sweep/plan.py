@@ -3,18 +3,36 @@
 import math
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from lanewise.jaxprs.extent import largest_bytes, operation_count
+
 from ..base.checks import whole
 
-# Trajectory steps of one task: some tenths of a second of work; and the least number for which a
-# task is made smaller so that there are more of them.
-WORK, SMALLEST_WORK = 2**28, 2**22
-# Trajectories of one task, at least and at most; tasks of a sweep, at least.
-FEWEST_LANES, MOST_LANES, FEWEST_TASKS = 256, 2**17, 32
-BYTES = 2**26  # Results of one task, at most (one trajectory may have more)
+FEWEST_TASKS = 32  # of a sweep
+
+
+class Limits(NamedTuple):
+    """Limits of one task: `work`, trajectory steps at most, and `least_work`, for which it is made
+    smaller so that there are more; trajectories; bytes of results (one trajectory may have more).
+    """
+
+    work: int
+    least_work: int
+    fewest_lanes: int
+    most_lanes: int
+    bytes: int
+
+
+ON_CPU = Limits(2**28, 2**22, 2**8, 2**17, 2**26)  # some tenths of a second of a core
+# By prediction: fewer trajectories leave a part of a GPU idle, and so many steps of 256 operations
+# take at most a second. Ctrl-C and the progress wait for the end of a task.
+ON_GPU = Limits(2**32, 2**30, 2**16, 2**20, 2**28)
+_STEP = 256
+_MEMORY = 2**31  # Bytes of a GPU that does not report them
+_COPIES = 16  # Arrays of a trajectory, as large as the largest, in two tasks of a GPU
 
 
 class SweepTask(NamedTuple):
@@ -93,29 +111,42 @@ class SweepPlan:
         return (self.task(i) for i in range(self.num_tasks))
 
 
+def on_devices(devices: Sequence[Any], program: Any) -> tuple[Limits, int]:
+    """The limits of a task on these devices, and what a step counts for `work`; `program` is the
+    jaxpr of a trajectory."""
+    if devices[0].platform == "cpu":
+        return ON_CPU, 1
+    memory = min((d.memory_stats() or {}).get("bytes_limit", _MEMORY) for d in devices)
+    lanes = max(memory // (_COPIES * largest_bytes(program)), 1)
+    # A power of two: another share of the memory mostly gives the same tasks, which a store needs.
+    most = min(ON_GPU.most_lanes, 1 << (lanes.bit_length() - 1))
+    return ON_GPU._replace(most_lanes=most), -(-operation_count(program) // _STEP)
+
+
 def make_plan(
     dims: Mapping[str, int],
     compiled_dims: int,
     steps: int,
     bytes_per_lane: int,
     lanes: int | None = None,
+    limits: Limits = ON_CPU,
 ) -> SweepPlan:
     """A plan for a grid.
 
     - `compiled_dims`: number of leading dimensions of which each value is compiled separately.
     - `steps`: of one trajectory. `bytes_per_lane`: of its results.
-    - `lanes`: trajectories of one task at most; None: chosen from `steps` and `bytes_per_lane`.
+    - `lanes`: trajectories of one task at most; None: chosen from the others and `limits`.
     """
     lengths = list(dims.values())
     separate, grid = lengths[:compiled_dims], lengths[compiled_dims:]
     if lanes is None:
         steps = max(steps, 1)
-        power_of_two = 1 << max((WORK // steps).bit_length() - 1, 0)
+        power_of_two = 1 << max((limits.work // steps).bit_length() - 1, 0)
         tasks_per_value = -(-FEWEST_TASKS // math.prod(separate))
-        fewest = max(FEWEST_LANES, SMALLEST_WORK // steps)
+        fewest = max(limits.fewest_lanes, limits.least_work // steps)
         share = -(-math.prod(grid) // tasks_per_value)
-        lanes = min(max(power_of_two, FEWEST_LANES), MOST_LANES, max(fewest, share))
-        lanes = max(1, min(lanes, BYTES // max(bytes_per_lane, 1)))
+        lanes = min(max(power_of_two, limits.fewest_lanes), limits.most_lanes, max(fewest, share))
+        lanes = max(1, min(lanes, limits.bytes // max(bytes_per_lane, 1)))
     free = whole("lanes_per_task", lanes)
     chunk: list[int] = []
     for n in reversed(grid):

@@ -5,7 +5,7 @@ import contextlib
 import dataclasses
 import functools
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -172,14 +172,15 @@ def state_of(state: Any) -> Any:
 
 
 class SweepProgram:
-    """Computes tasks of a sweep."""
+    """Computes tasks of a sweep on some of the devices of this process, by default on all."""
 
-    def __init__(self, sweep: Sweep, plan: SweepPlan):
+    def __init__(self, sweep: Sweep, plan: SweepPlan, devices: Sequence[Any] | None = None):
         self.sweep, self.plan = sweep, plan
+        self.devices = jax.local_devices() if devices is None else devices
         self._locks: dict[Any, threading.Lock] = collections.defaultdict(threading.Lock)
         self._compiled_programs: set[Any] = set()
 
-    def __call__(self, task: SweepTask, device: Any = None) -> dict[str, np.ndarray]:
+    def __call__(self, task: SweepTask, device: Any) -> dict[str, np.ndarray]:
         """The variables of a task, each of shape (*task.size, …), computed on a device."""
         sweep, first = self.sweep, self.sweep.compiled_dims
         chunk, size = self.plan.chunk[first:], task.size[first:]

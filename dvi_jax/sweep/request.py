@@ -2,8 +2,10 @@
 
 import dataclasses
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, TypedDict
+
+import jax
 
 from lanewise import Layout
 from lanewise.jaxprs.jaxapi import ClosedJaxpr
@@ -20,7 +22,7 @@ from ..observe.solution import Save
 from ..problem.noise import as_path
 from ..problem.system import System, check_system, of_problem
 from .axes import Axis, as_axis, axes_in, is_axis, lengths
-from .plan import make_plan
+from .plan import make_plan, on_devices
 from .program import Sweep, SweepProgram, trace
 from .starts import Starts
 from .variables import Variable, refuse_reserved_name, variables
@@ -46,6 +48,7 @@ class SweepSettings(TypedDict, total=False):
     path: Any
     start: Starts | None
     save: Save | None
+    devices: Sequence[Any] | None
     lanes_per_task: int | None
 
 
@@ -82,6 +85,7 @@ class Request:
     path: Any = None
     start: Any = None
     save: Any = None
+    devices: Any = None
     lanes_per_task: int | None = None
 
     def prepare(self) -> tuple[SweepProgram, dict[str, Variable], list[ClosedJaxpr]]:
@@ -91,9 +95,14 @@ class Request:
         shapes, programs = trace(definition)
         arrays = variables(definition, shapes)
         size = sum(variable.bytes for variable in arrays.values())
-        grid = definition.dims, definition.compiled_dims, definition.most_steps
-        plan = make_plan(*grid, size, self.lanes_per_task)
-        return SweepProgram(definition, plan), arrays, programs
+        devices = jax.local_devices() if self.devices is None else [*self.devices]
+        for device in devices:
+            instance("each of devices", device, jax.Device, "one of jax.local_devices()")
+        whole("the number of devices", len(devices))
+        limits, weight = on_devices(devices, programs[0].jaxpr)
+        grid = definition.dims, definition.compiled_dims, weight * definition.most_steps
+        plan = make_plan(*grid, size, self.lanes_per_task, limits)
+        return SweepProgram(definition, plan, devices), arrays, programs
 
     def _with_defaults(self) -> "Request":
         """The same, with the defaults of a problem of the library."""

@@ -1,4 +1,4 @@
-"""Tasks on the devices of this process: one thread for each core or GPU."""
+"""Tasks on the devices of this process: one thread for each core, two for each GPU."""
 
 import contextlib
 import math
@@ -8,7 +8,7 @@ import queue
 import signal
 import threading
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -28,6 +28,7 @@ from .store import MemorySink, Store
 
 _PAUSE = 0.2  # Seconds between two checks of tasks that another process computes
 _WRITES = 2  # Tasks for each thread that may wait to be written
+_PER_GPU = 2  # Tasks at a time: the results of one are copied while the GPU computes the other
 GOOD = ("successful", "stopped")
 
 
@@ -104,20 +105,20 @@ def compute(program: SweepProgram, task: SweepTask, device: Any):
     return results, facts
 
 
-def default_threads() -> int:
-    """One for each processor, or each GPU."""
-    devices = jax.local_devices()
+def cores(devices: Sequence[Any]) -> int:
+    """The processors, or the GPUs."""
     return processors() if devices[0].platform == "cpu" else len(devices)
 
 
 def run_here(program: SweepProgram, sink: MemorySink | Store, threads: Any, report: Report) -> bool:
-    """Compute the tasks that `sink` lacks, on all local devices. False: it was interrupted by
-    Ctrl-C; the tasks that were being computed then have been stored. **Raises** the first error of
-    a task or of its writing, once the other threads have ended."""
+    """Compute the tasks that `sink` lacks. False: it was interrupted by Ctrl-C; the tasks that were
+    being computed then have been stored. **Raises** the first error of a task or of its writing,
+    once the other threads have ended."""
     plan, done_tasks = program.plan, set(sink.done_tasks())
     counter = Counter(program, done_tasks, report)
-    devices, x64 = jax.local_devices(), x64_enabled()
-    count = threads or default_threads()
+    devices, x64 = program.devices, x64_enabled()
+    per_core = 1 if devices[0].platform == "cpu" else _PER_GPU
+    count = threads or per_core * cores(devices)
     free: queue.SimpleQueue[Any] = queue.SimpleQueue()
     for i in range(count):
         free.put(devices[i % len(devices)])

@@ -72,6 +72,13 @@ def operation_count(jaxpr: Any) -> int:
     return sum(_operations(eqn) for eqn in _innermost(jaxpr))
 
 
+def largest_bytes(jaxpr: Any) -> int:
+    """Bytes of the largest operands and results of an operation, with all arrays of one."""
+    equations = ((*eqn.invars, *eqn.outvars) for eqn in _innermost(jaxpr))
+    sizes = (sum(v.aval.size * v.aval.dtype.itemsize for v in arrays) for arrays in equations)
+    return max([1, *sizes])
+
+
 def _innermost(jaxpr: Any) -> Iterator[Any]:
     """The equations of a function and of all that it calls that call no function."""
     for eqn in jaxpr.eqns:

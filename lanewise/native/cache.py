@@ -18,6 +18,8 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+from .switches import is_off
+
 VARIABLE = "DVI_JAX_CACHE"
 
 LARGEST = 256 * 2**20  # bytes that the folder may hold
@@ -38,7 +40,7 @@ def key(*parts: Any) -> str:
 def folder() -> Path | None:
     """The folder of machine code, None if the cache is switched off."""
     setting = os.environ.get(VARIABLE, "").strip()
-    if setting.lower() in ("off", "0", "no", "false"):
+    if is_off(setting):
         return None
     base = Path(os.environ.get("XDG_CACHE_HOME", "").strip())
     where = None

@@ -15,8 +15,8 @@ import jax.ffi
 from ..llvm.ir import check_size, check_that
 from ..llvm.ptx import PtxKernel, threads_for
 from . import cache, machine
-from .handler import API_MAJOR, API_MINOR, capsule
-from .structures import addresses, offset, size
+from .handler import capsule, handler_text
+from .structures import addresses, size
 
 MOST_LOCAL_BYTES = 16 * 2**10
 """Memory of a thread for arrays and for what registers cannot hold. The driver reserves it for all
@@ -152,31 +152,17 @@ failed:
 }}
 """
 
-_HANDLER = f"""
+_COMMAND_BUFFER_COMPATIBLE = 1  # XLA_FFI_Handler_Traits
+
+_HANDLER = """
 @NAME_kernel = global ptr null
 declare ptr @lanewise_cuda_run(ptr, ptr, i64)
-
-define ptr @NAME(ptr %frame) {{
-  %ext.at = getelementptr i8, ptr %frame, i64 {offset("CallFrame", "extension_start")}
-  %ext = load ptr, ptr %ext.at
-  %is.call = icmp eq ptr %ext, null
-  br i1 %is.call, label %call, label %version
-version:                                     ; XLA queries the version of the interface
-  %meta.at = getelementptr i8, ptr %ext, i64 {offset("Metadata_Extension", "metadata")}
-  %meta = load ptr, ptr %meta.at
-  %major = getelementptr i8, ptr %meta, i64 {offset("Metadata", "api_version.major_version")}
-  store i32 {API_MAJOR}, ptr %major
-  %minor = getelementptr i8, ptr %meta, i64 {offset("Metadata", "api_version.minor_version")}
-  store i32 {API_MINOR}, ptr %minor
-  %traits = getelementptr i8, ptr %meta, i64 {offset("Metadata", "traits")}
-  store i32 1, ptr %traits                   ; COMMAND_BUFFER_COMPATIBLE
-  ret ptr null
-call:
-  %kernel = load ptr, ptr @NAME_kernel
-  %r = tail call ptr @lanewise_cuda_run(ptr %frame, ptr %kernel, i64 THREADS)
-  ret ptr %r
-}}
-"""
+""" + handler_text(
+    "NAME",
+    """%kernel = load ptr, ptr @NAME_kernel
+  %r = tail call ptr @lanewise_cuda_run(ptr %frame, ptr %kernel, i64 THREADS)""",
+    _COMMAND_BUFFER_COMPATIBLE,
+)
 
 # Several threads of Python may trace and compile at once; a name may be registered once only.
 _lock = threading.RLock()

@@ -21,10 +21,12 @@ from .structures import addresses, offset, size
 API_MAJOR, API_MINOR = 0, 1
 """The version of XLA's interface that the structures are of; newer ones of 0 keep them."""
 
-HANDLER = f"""
-declare ptr @lanewise_run(ptr, ptr, i64, i64)
 
-define ptr @lanewise_handler(ptr %frame) {{
+def handler_text(name: str, call: str, traits: int = 0) -> str:
+    """The text of a handler: `call` are the instructions that compute `%r` from `%frame`; `traits`
+    are those of XLA."""
+    return f"""
+define ptr @{name}(ptr %frame) {{
   %ext.at = getelementptr i8, ptr %frame, i64 {offset("CallFrame", "extension_start")}
   %ext = load ptr, ptr %ext.at
   %is.call = icmp eq ptr %ext, null
@@ -36,12 +38,20 @@ version:                                     ; XLA queries the version of the in
   store i32 {API_MAJOR}, ptr %major
   %minor = getelementptr i8, ptr %meta, i64 {offset("Metadata", "api_version.minor_version")}
   store i32 {API_MINOR}, ptr %minor
+  %traits = getelementptr i8, ptr %meta, i64 {offset("Metadata", "traits")}
+  store i32 {traits}, ptr %traits
   ret ptr null
 call:
-  %r = tail call ptr @lanewise_run(ptr %frame, ptr @lanewise_kernel, i64 BLOCK, i64 SCRATCH)
+  {call}
   ret ptr %r
 }}
 """
+
+
+HANDLER = "declare ptr @lanewise_run(ptr, ptr, i64, i64)\n" + handler_text(
+    "lanewise_handler",
+    "%r = tail call ptr @lanewise_run(ptr %frame, ptr @lanewise_kernel, i64 BLOCK, i64 SCRATCH)",
+)
 """`lanewise_kernel(args, rets, params, scratch, first, last)` computes the blocks first … last − 1;
 `scratch` are SCRATCH bytes, from a multiple of 64 on."""
 

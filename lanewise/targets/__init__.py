@@ -5,10 +5,10 @@ yet, and is used only if the environment variable ``LANEWISE_CUDA`` is ``on`` wh
 imported.
 """
 
-import os
 from collections.abc import Sequence
 from typing import Any
 
+from ..native.switches import is_on
 from .elements import Elements
 from .numbers import Numbers
 from .target import Code as Code, CompiledProgram as CompiledProgram, Target as Target, compiled_by
@@ -27,7 +27,7 @@ def targets_for(platform: str) -> tuple[Target, ...]:
     return TARGETS[platform]
 
 
-if os.environ.get(CUDA_SWITCH, "").strip().lower() in ("on", "1", "yes", "true"):
+if is_on(CUDA_SWITCH, default=False):
     TARGETS["cuda"] = targets_for("cuda")
 
 
