@@ -204,20 +204,23 @@ def test_variations_and_callbacks():
     assert interop.from_rebound(sim).integrator == "bs"
 
 
-def test_bodies_without_mass_need_one():
+def test_bodies_without_mass_are_test_particles():
     sim = three_bodies()
     sim.N_active = 3
     sim.add(a=3.0, e=0.2)
-    with pytest.raises(ValueError, match="index 3"):
-        interop.from_rebound(sim)
-    problem = interop.from_rebound(sim, massless=1e-20)
-    assert problem.args["masses"][3] == 1e-20
+    problem = interop.from_rebound(sim)
+    assert problem.args["masses"].shape == (3,)
+    np.testing.assert_array_equal(problem.p0[3], problem.velocities[3])
     sol = advanced(problem, 2.0, dvi.KahanLi(8))
+    assert numbers(interop.to_rebound(problem)) == numbers(sim)
+    back = interop.to_rebound(problem, sol.qs[-1], sol.ps[-1], t=sol.ts[-1])
     sim.integrate(5.0)
-    last = interop.from_rebound(sim, massless=1e-20)
-    np.testing.assert_allclose(sol.qs[-1], last.q0, rtol=0, atol=3e-12)
-    with pytest.raises(ValueError, match="positive"):
-        interop.from_rebound(sim, massless=0.0)
+    np.testing.assert_allclose(numbers(back), numbers(sim), rtol=0, atol=2e-11)
+    sim = three_bodies()
+    sim.add(a=3.0)
+    sim.add(m=1e-6, a=4.0)
+    with pytest.raises(ValueError, match="must be last.*index 3"):
+        interop.from_rebound(sim)
 
 
 def test_other_objects():

@@ -1,7 +1,7 @@
 """Simulations of REBOUND as problems of the library, and back."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from os import PathLike
 from typing import Any
 
@@ -9,18 +9,19 @@ import numpy as np
 
 import dvi_jax as dvi
 
-from ..base.checks import instance, positive
+from ..base.checks import instance
 from ..base.files import user_file
 from ..base.inputs import refuse_unit_or_mask
 from ..base.printing import printable
 from ..systems import Problem
 from ..systems.n_body import (
-    INVARIANTS,
-    OBSERVABLES,
     PARAMETERS,
+    attraction,
     check_bodies,
+    check_restricted,
     hamiltonian,
-    symmetries,
+    n_body,
+    restricted,
 )
 from .extras import require
 
@@ -54,7 +55,7 @@ _ASTROPY = {
 class ReboundProblem(Problem):
     """A `Problem` of N bodies from a simulation of REBOUND.
 
-    - `t0`: its time. `h` is its dt, `q0` its positions, `p0` the momenta m v.
+    - `t0`: its time. `h` is its dt, `q0` its positions, `p0` the momenta m v (v where m = 0).
     - `names` of the bodies, or their hashes (REBOUND 4), or None.
     - `velocities`: of the simulation, shape (bodies, 3); p0 / m may differ in the last digit.
     - `radii`: of the bodies [length]; there are no collisions here.
@@ -70,9 +71,7 @@ class ReboundProblem(Problem):
     rebound_units: tuple[str, ...] = ()
 
 
-def from_rebound(
-    simulation: Any, *, snapshot: int = -1, massless: float | None = None
-) -> ReboundProblem:
+def from_rebound(simulation: Any, *, snapshot: int = -1) -> ReboundProblem:
     r"""The N-body problem of a simulation of REBOUND: masses, G, softening, state, time, names.
 
         q0 = (x, y, z),  p0 = m (v_x, v_y, v_z),  H = Σ p²/2m − G Σ_{i<j} m_i m_j / √(r_ij² + b²)
@@ -81,9 +80,8 @@ def from_rebound(
 
     - `simulation`: a ``rebound.Simulation``, or the path of a Simulationarchive, of which
       `snapshot` is taken (−1: the last).
-    - `massless`: the mass [of the simulation] that bodies without mass get, because otherwise their
-      momentum would not determine their velocity. Without it they raise an error. Orbits change by
-      about its ratio to the other masses.
+
+    Bodies of mass 0 are test particles of `n_body`: ``args["masses"]`` ends before them.
 
     **Returns** a `ReboundProblem`, float64 arrays of shape (bodies, 3) in the simulation's units.
 
@@ -93,8 +91,8 @@ def from_rebound(
     **Raises** `ValueError` for features that cannot be converted: additional forces and other
     callbacks (``sim.copy()`` leaves them out), REBOUNDx, boundaries, collisions, gravity that is
     off, approximate or custom, shear (SEI), variational particles, exit distances, massive test
-    particles, a simulation that is not synchronised, bodies without mass; for numbers that are NaN
-    or infinite; and for two bodies at the same place; `FileNotFoundError` for a path without a
+    particles, a simulation that is not synchronised; for a body of mass 0 before one with a mass;
+    for numbers that are NaN or infinite; and for two bodies at the same place; `FileNotFoundError` for a path without a
     file; `ImportError` without rebound, `TypeError` for another object.
 
     **Accuracy** q, masses, G and t are the same bits; p0 = m v is rounded. Units: REBOUND's solar
@@ -124,27 +122,23 @@ def from_rebound(
     numbers = _finite("the simulation", simulation, ("t", "dt", "G", "softening"))
     names = tuple(_name(b) for b in simulation.particles)
     texts = [str(name or f"body {i}") for i, name in enumerate(names)]
-    fields = ("m", "x", "y", "z", "vx", "vy", "vz", "r")
+    columns = ("m", "x", "y", "z", "vx", "vy", "vz", "r")
     bodies = zip(texts, simulation.particles, strict=True)
-    rows = np.array([list(_finite(text, b, fields).values()) for text, b in bodies])
-    masses = _with_mass(simulation, rows[:, 0], massless)
+    rows = np.array([list(_finite(text, b, columns).values()) for text, b in bodies])
+    masses = _masses(simulation, rows[:, 0])
     q, v = rows[:, 1:4].copy(), rows[:, 4:7].copy()
-    p = masses[:, None] * v
-    args: dict[str, Any] = {"masses": masses, "G": numbers["G"]}
-    check_bodies(q, p, args, texts)
-    if softening := numbers["softening"]:
-        args["softening"] = softening
+    p, count = np.where(masses > 0, masses, 1.0)[:, None] * v, int(np.sum(masses > 0))
+    of_massive = {"masses": masses[:count], "G": numbers["G"]}
+    check_bodies(q[:count], p[:count], of_massive, texts[:count])
+    physics = {"G": numbers["G"], "softening": numbers["softening"]}
+    problem = n_body(masses, q, p, numbers["dt"], **physics)
     units, parameters = _texts(_units(simulation))
-    texts_of: dict[str, Any] = {"units": units, "check": check_bodies}
-    texts_of |= {"source": "a simulation of REBOUND"}
-    texts_of |= {"parameters": {name: parameters[name] for name in args}}
-    texts_of |= {"observables": OBSERVABLES}
-    if not softening:
-        texts_of |= {"invariants": INVARIANTS, "symmetries": symmetries(3)}
-    theirs = {"names": names, "velocities": v, "radii": rows[:, 7], "t0": numbers["t"]}
-    theirs |= {"integrator": str(simulation.integrator), "rebound_units": _units(simulation)}
-    state = {"q0": q, "p0": p, "h": numbers["dt"], "args": args}
-    return ReboundProblem("rebound", dvi.System(hamiltonian), **state, **texts_of, **theirs)
+    changes: dict[str, Any] = {"name": "rebound", "source": "a simulation of REBOUND"}
+    changes |= {"units": units, "parameters": {name: parameters[name] for name in problem.args}}
+    changes |= {"names": names, "velocities": v, "radii": rows[:, 7], "t0": numbers["t"]}
+    changes |= {"integrator": str(simulation.integrator), "rebound_units": _units(simulation)}
+    same = {field.name: getattr(problem, field.name) for field in fields(problem)}
+    return ReboundProblem(**{**same, **changes})
 
 
 def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) -> Any:
@@ -167,9 +161,9 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
     instance("problem", problem, Problem, "a problem of dvi_jax.systems or of from_rebound")
     system, args = problem.system, problem.args
     differences = {
-        "another Hamiltonian": system.H_D is not hamiltonian,
+        "another Hamiltonian": system.H_D not in (hamiltonian, restricted),
         "args that are not a dict": not isinstance(args, Mapping),
-        "a force": system.force is not None,
+        "a force": system.force not in (None, attraction),
         "a perturbation": system.perturbation is not None,
     }
     if any(differences.values()):
@@ -186,11 +180,13 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
     refuse_unit_or_mask("p", p)
     q, p = (np.asarray(x, float) for x in ((problem.q0, problem.p0) if q is None else (q, p)))
     t = float(t if t is not None else theirs.t0 if theirs is not None else 0.0)
-    check_bodies(q, p, args)
+    (check_restricted if system.H_D is restricted else check_bodies)(q, p, args)
     for name, values in (("q", q), ("p", p), ("t", np.array(t))):
         _check_finite(name, values)
-    v = p / masses[:, None]
-    if velocities is not None and np.array_equal(p, masses[:, None] * np.asarray(velocities)):
+    tests = (0, len(q) - len(masses))
+    scale, masses = np.pad(masses, tests, constant_values=1.0)[:, None], np.pad(masses, tests)
+    v = p / scale
+    if velocities is not None and np.array_equal(p, scale * np.asarray(velocities)):
         v = np.asarray(velocities, float)  # neither p0 nor the masses have been replaced
     if q.shape[1] == 2:
         q, v = (np.column_stack([x, np.zeros(len(x))]) for x in (q, v))
@@ -248,8 +244,8 @@ def _check_finite(name: str, values: np.ndarray) -> None:
         raise ValueError(f"{name} must be finite, got {values[bad][0]}: give an earlier state.")
 
 
-def _with_mass(sim: Any, masses: np.ndarray, massless: float | None) -> np.ndarray:
-    """Masses, those that are zero replaced; massive test particles raise an error."""
+def _masses(sim: Any, masses: np.ndarray) -> np.ndarray:
+    """The masses, zeros last. **Raises** `ValueError` for another order, and massive test particles."""
     count = int(sim.N_active)
     active = len(masses) if not 0 <= count < len(masses) else count  # −1, 2⁶⁴ − 1: all of them
     heavy = np.flatnonzero(masses[active:]) + active
@@ -259,14 +255,12 @@ def _with_mass(sim: Any, masses: np.ndarray, massless: float | None) -> np.ndarr
             f"N_active = {active}: set sim.N_active = {len(masses)}, or their masses to 0."
         )
     empty = masses == 0
-    if not empty.any():
-        return masses
-    if massless is None:
+    if empty.all() or np.any(masses[int(np.argmax(empty)) :] * empty.any()):
         raise ValueError(
-            f"every mass must be positive, got {empty.sum()} of mass 0, the first at index "
-            f"{int(np.argmax(empty))}: give massless={1e-20 * masses.max() or 1e-20:.0e}."
+            f"bodies of mass 0 must be last, after one with a mass at least, got mass 0 at index "
+            f"{int(np.argmax(empty))}: add them to the simulation after all others."
         )
-    return np.where(empty, positive("massless", massless), masses)
+    return masses
 
 
 def _name(body: Any) -> Any:
