@@ -219,7 +219,7 @@ def test_bodies_without_mass_are_test_particles():
     sim = three_bodies()
     sim.add(a=3.0)
     sim.add(m=1e-6, a=4.0)
-    with pytest.raises(ValueError, match="must be last.*index 3"):
+    with pytest.raises(ValueError, match=r"must be last.*index 3"):
         interop.from_rebound(sim)
 
 

@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 
-import dvi_jax as dvi
-
 from ..base.checks import instance
 from ..base.files import user_file
 from ..base.inputs import refuse_unit_or_mask
@@ -92,8 +90,8 @@ def from_rebound(simulation: Any, *, snapshot: int = -1) -> ReboundProblem:
     callbacks (``sim.copy()`` leaves them out), REBOUNDx, boundaries, collisions, gravity that is
     off, approximate or custom, shear (SEI), variational particles, exit distances, massive test
     particles, a simulation that is not synchronised; for a body of mass 0 before one with a mass;
-    for numbers that are NaN or infinite; and for two bodies at the same place; `FileNotFoundError` for a path without a
-    file; `ImportError` without rebound, `TypeError` for another object.
+    for numbers that are NaN or infinite; and for two bodies at the same place; `FileNotFoundError`
+    for a path without a file; `ImportError` without rebound, `TypeError` for another object.
 
     **Accuracy** q, masses, G and t are the same bits; p0 = m v is rounded. Units: REBOUND's solar
     mass is GM☉/G with its own G, 3e-5 away from others; the numbers stay those of the simulation.
@@ -245,7 +243,7 @@ def _check_finite(name: str, values: np.ndarray) -> None:
 
 
 def _masses(sim: Any, masses: np.ndarray) -> np.ndarray:
-    """The masses, zeros last. **Raises** `ValueError` for another order, and massive test particles."""
+    """The masses, zeros last. **Raises** `ValueError` for another order or massive test bodies."""
     count = int(sim.N_active)
     active = len(masses) if not 0 <= count < len(masses) else count  # −1, 2⁶⁴ − 1: all of them
     heavy = np.flatnonzero(masses[active:]) + active
