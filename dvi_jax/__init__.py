@@ -107,7 +107,7 @@ if TYPE_CHECKING:  # names that are imported at their first use: `_namespaces` h
     from .fit import *  # noqa: F403
     from .proof import *  # noqa: F403
     from .sweep import *  # noqa: F403
-    from .systems import rings as rings
+    from .systems import forces as forces, rings as rings
 
     # These use the names of this file, so that it does not import them.
     interop: ModuleType

@@ -23,6 +23,7 @@ NAMESPACES = {
     "sweeps": "dvi_jax.sweep",
     "elements": "dvi_jax.problem.elements",
     "flows": "dvi_jax.problem.flows",
+    "forces": "dvi_jax.systems.forces",
     "noise": "dvi_jax.problem.noise",
     "paper": "dvi_jax.testing.paper",
     "rings": "dvi_jax.systems.rings",

@@ -32,7 +32,7 @@ DOCSTRINGS = {
 }
 DOCSTRINGS |= {
     f"{space}.{name}": usage.BLOCK.findall(inspect.getdoc(thing) or "")
-    for space, module in {"rings": rings, "elements": dvi.elements}.items()
+    for space, module in {"rings": rings, "elements": dvi.elements, "forces": dvi.forces}.items()
     for name, thing in vars(module).items()
     if inspect.isclass(thing) or inspect.isfunction(thing)
 }

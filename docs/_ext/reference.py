@@ -70,6 +70,7 @@ MODULES = {
     "generators": ("Generators of common symmetries", "generators"),
     "starts": ("Initial conditions of a sweep", "starts"),
     "elements": ("Orbital elements", "elements"),
+    "forces": ("Forces on planets and satellites", "forces"),
     "systems": ("Library of systems", "systems"),
     "boozer": ("Guiding centres in Boozer coordinates", "systems.boozer"),
     "rigid": ("Rotations of rigid bodies", "systems.rigid"),

@@ -1,0 +1,327 @@
+"""Perturbing forces against other formulas, REBOUNDx and rates of the literature."""
+
+import ctypes
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.special import lpmv
+
+import dvi_jax as dvi
+from dvi_jax import elements, forces, systems
+from dvi_jax.systems.planets.relativity import post_newtonian_force
+
+MASSES = np.array([1.0, 1e-3, 3e-4])
+ARGS = {"masses": MASSES, "G": 0.9}
+MU, LIGHT = 1.7, 30.0
+
+
+@pytest.fixture(scope="module")
+def state():
+    orbits = elements.Keplerian(
+        [1.0, 2.0], [0.1, 0.2], [0.3, 0.2], [1.0, 2.0], [0.5, 0.1], [0.7, 2.7]
+    )
+    return elements.to_bodies(orbits, MASSES, ARGS["G"])
+
+
+def force_on(force, state, args=ARGS):
+    return np.asarray(force(0.3, 0.4, *state, args))
+
+
+def at(r, v, force, args=None, t=0.0):
+    """The acceleration of a satellite."""
+    return np.asarray(force(t, t, jnp.asarray(r), jnp.asarray(v), {"mu": MU, **(args or {})}))
+
+
+R, V = np.array([0.8, -0.5, 0.6]), np.array([0.3, 0.9, -0.2])
+
+EVERY = {
+    "harmonics": forces.Harmonics(0.3, {2: 0.1, 4: -0.03}),
+    "relativity": forces.Relativity(LIGHT),
+    "rotation": forces.LenseThirring(np.array([0.1, 0.2, 0.3]), LIGHT),
+    "tides": forces.Tides(30.0, 0.2, 0.4, (0.0, 0.0, 0.7)),
+    "radiation": forces.Radiation(np.array([0.1, 0.3]), LIGHT),
+    "damping": forces.Damping(*np.array([[-3.0, 5.0], [-2.0, -4.0], [-1.0, -8.0]])),
+    "third body": forces.ThirdBody(lambda t, args: jnp.array([5.0, 1.0, 2.0 + t]), 0.4),
+    "disk": forces.GalacticTide(0.2, (0.0, 1.0, 1.0)),
+    "mass loss": forces.MassLoss(-40.0),
+    "outgassing": forces.Outgassing(0.1, 0.2, 0.3),
+    "drag": forces.Drag(lambda r, args: jnp.exp(-r @ r), 2.0, rate=0.3),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_a_satellite_is_a_body_without_mass(name, state):
+    """The same acceleration as in a system of bodies, with the parameters of the first of them."""
+    q, p = jnp.stack([jnp.zeros(3), R, R]), jnp.stack([jnp.zeros(3), V, V])
+    of_bodies = EVERY[name](0.5, 0.5, q, p, {"masses": np.array([MU])})
+    alone = EVERY[name]
+    for kind in (forces.Radiation, forces.Damping):
+        if isinstance(alone, kind):
+            alone = jax.tree.map(lambda x: x[:1] if np.ndim(x) else x, alone)
+    np.testing.assert_allclose(at(R, V, alone, t=0.5), of_bodies[1], rtol=1e-14)
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_recoils(name, state):
+    """Total momentum is conserved by forces between bodies, and by no other."""
+    total = force_on(EVERY[name], state).sum(axis=0)
+    size = np.abs(force_on(EVERY[name], state)).max()
+    conserved = np.abs(total).max() < 1e-14 * size
+    assert conserved == (name in ("harmonics", "tides", "damping"))
+
+
+def test_harmonics_are_those_of_the_oblate_planet():
+    """Another formula: J2 in the library, J2 of the Sun in `relativity`."""
+    oblate = systems.oblate_kepler()
+    q = jnp.asarray(oblate.q0) + jnp.array([10.0, 500.0, 900.0])
+    gradient = jax.grad(oblate.system.H_D, argnums=2)
+    zero = {**oblate.args, "J2": 0.0}
+    difference = [gradient(0.0, 1.0, q, 0 * q, args) for args in (zero, oblate.args)]
+    force = forces.Harmonics(oblate.args["R"], {2: lambda args: args["J2"]})
+    ours = force(0.0, 1.0, q, 0 * q, oblate.args)
+    np.testing.assert_allclose(ours, difference[0] - difference[1], rtol=1e-9)
+
+
+@pytest.mark.parametrize("normalised", [False, True])
+def test_harmonics_of_every_order(normalised):
+    """Against associated Legendre functions in spherical coordinates on turned axes."""
+    rng = np.random.default_rng(2)
+    C, S = rng.normal(size=(2, 5, 5))
+    pole, angle, rate, t, radius = np.array([0.2, -0.5, 0.7]), 0.4, 0.3, 1.5, 0.6
+    keys = [(n, m) for n in range(2, 5) for m in range(1, n + 1)]
+    force = forces.Harmonics(
+        radius, {n: -C[n, 0] for n in range(2, 5)}, {k: (C[k], S[k]) for k in keys},
+        pole, rate, angle, normalised,
+    )  # fmt: skip
+    z = pole / np.linalg.norm(pole)
+    node = np.cross([0, 0, 1], z) / np.linalg.norm(np.cross([0, 0, 1], z))
+    other = np.cross(z, node)
+
+    def potential(r):
+        a, b, c = node @ r, other @ r, z @ r
+        distance = np.linalg.norm(r)
+        longitude = np.arctan2(b, a) - angle - rate * t
+        total = 0.0
+        for n in range(2, 5):
+            for m in range(n + 1):
+                # Without the phase (−1)^m of SciPy.
+                P = (-1) ** m * lpmv(m, n, c / distance)
+                if normalised:
+                    ratio = np.prod([1.0 / k for k in range(n - m + 1, n + m + 1)])
+                    P *= np.sqrt((1 + (m > 0)) * (2 * n + 1) * ratio)
+                wave = C[n, m] * np.cos(m * longitude) + (m > 0) * S[n, m] * np.sin(m * longitude)
+                total -= MU / distance * (radius / distance) ** n * P * wave
+        return total
+
+    step = 1e-5
+    wanted = [(potential(R - d) - potential(R + d)) / (2 * step) for d in step * np.eye(3)]
+    np.testing.assert_allclose(at(R, V, force, t=t), wanted, atol=2e-9)
+
+
+def test_the_energy_of_harmonics(state):
+    """The force is minus its derivative, on all bodies."""
+    force = EVERY["harmonics"]
+    gradient = jax.grad(force.energy, argnums=2)(0.0, 0.1, *state, ARGS)
+    np.testing.assert_allclose(force_on(force, state), -gradient, rtol=1e-12, atol=1e-18)
+
+
+def test_relativity_is_that_of_the_sun(state):
+    args = ARGS | {"c": LIGHT}
+    wanted = post_newtonian_force(0.0, 0.1, *state, args)
+    np.testing.assert_allclose(force_on(EVERY["relativity"], state), wanted, rtol=1e-13)
+
+
+def test_a_third_body_far_away_keeps_its_digits():
+    """Against the difference of two attractions in longdouble; at 1e6 it has 10 digits less."""
+    for distance in (3.0, 1e6):
+        d = np.array([1.0, 0.5, 0.2], np.longdouble) * distance
+        force = forces.ThirdBody(lambda t, args, d=d: jnp.asarray(d, float), distance**3)
+        r = R.astype(np.longdouble)
+        apart = d - r
+        wanted = distance**3 * (apart / (apart @ apart) ** 1.5 - d / (d @ d) ** 1.5)
+        np.testing.assert_allclose(
+            at(R, V, force), wanted.astype(float), rtol=1e-12 if distance < 9 else 1e-7
+        )
+
+
+def circle(a):
+    return np.array([a, 0.0, 0.0]), np.array([0.0, np.sqrt(MU / a), 0.0])
+
+
+def rate_of_a(force, a=1.3):
+    """da/dt of a circular orbit: 2 a² v·F/μ."""
+    r, v = circle(a)
+    return 2 * a**2 / MU * v @ at(r, v, force)
+
+
+def test_rates_of_circular_orbits():
+    a, n = 1.3, np.sqrt(MU / 1.3**3)
+    beta = 0.2
+    drag = rate_of_a(forces.Radiation(beta, LIGHT))
+    assert drag == pytest.approx(-2 * beta * MU / (LIGHT * a), rel=1e-12)  # Burns et al., (47)
+    assert rate_of_a(forces.Outgassing(A2=0.01, r0=a)) == pytest.approx(2 * 0.01 / n, rel=1e-12)
+    assert rate_of_a(forces.Damping(tau_a=-7.0)) == pytest.approx(-a / 7, rel=1e-12)
+    rho = 0.03
+    air = forces.Drag(lambda r, args: rho, 2.0)
+    assert rate_of_a(air) == pytest.approx(-2.0 * rho * np.sqrt(MU * a), rel=1e-12)
+    turning = forces.Drag(lambda r, args: rho, 2.0, rate=n)  # the air moves with the satellite
+    assert abs(rate_of_a(turning)) < 1e-15
+    for force in (EVERY["relativity"], EVERY["mass loss"], EVERY["third body"]):
+        assert np.isfinite(rate_of_a(force))
+
+
+@pytest.mark.parametrize(("spin", "sign"), [(0.5, -1), (1.0, 0), (2.0, 1)])
+def test_tides_pull_towards_the_rotation(spin, sign):
+    """Outside of the synchronous orbit a satellite gains angular momentum, inside it loses."""
+    masses = np.array([1.0, 0.01])
+    q, p = elements.to_bodies(elements.Keplerian([1.0], [0.0], [0.0], [0.0], [0.0], [0.0]), masses)
+    n = np.sqrt(1.01)
+    force = forces.Tides(0.3, 0.1, 0.5, (0.0, 0.0, spin * n))
+    W = force_on(force, (q, p), {"masses": masses})
+    torque = np.cross(q, W).sum(axis=0)[2]
+    if sign:
+        wanted = 3 * 0.01**2 * 0.3 * 0.1 * 0.5**5 * (spin - 1) * n  # Hut 1981, (11) for e = 0
+        assert torque == pytest.approx(wanted, rel=1e-12)
+    else:
+        assert abs(torque) < 1e-18
+
+
+def test_mass_loss_keeps_the_product_of_mass_and_axis():
+    """Adiabatic: a m is constant for a slow loss."""
+    q, p = (jnp.asarray(x) for x in circle(1.0))
+    tau = -2000.0
+    force = forces.MassLoss(lambda args: args["tau"])
+    system = dvi.System(systems.n_body().system.H_D, force=force, epsilon=1.0)
+    masses = np.array([MU, 1e-12])
+    state = jnp.stack([0 * q, q]), jnp.stack([0 * p, masses[1] * p])
+    run = {"h": 0.02, "num_steps": 10_000, "method": dvi.Strang(), "save": dvi.Save(final=True)}
+    sol = dvi.integrate(system, *state, args={"masses": masses, "tau": tau}, **run)
+    now = MU * np.exp(200 / tau)
+    # The osculating axis for the mass of that time.
+    r, v = sol.qs[-1, 1] - sol.qs[-1, 0], sol.ps[-1, 1] / masses[1] - sol.ps[-1, 0] / MU
+    a = elements.Keplerian.from_state(r, v, now).a
+    assert float(a) * now / MU == pytest.approx(1.0, abs=5e-4)
+    assert float(a) > 1.1
+
+
+def test_sums_factors_and_problems(state):
+    sum_of_two = EVERY["harmonics"] + 2.0 * EVERY["tides"]
+    wanted = force_on(EVERY["harmonics"], state) + 2 * force_on(EVERY["tides"], state)
+    np.testing.assert_allclose(force_on(sum_of_two, state), wanted, rtol=1e-14)
+    args = ARGS | {"epsilon": 3.0}
+    of_args = (lambda args: args["epsilon"]) * EVERY["harmonics"]
+    wanted = 3 * force_on(EVERY["harmonics"], state)
+    np.testing.assert_allclose(force_on(of_args, state, args), wanted, rtol=1e-14)
+    # With test particles, which have a force of their own.
+    masses = np.append(MASSES, 0.0)
+    q, p = (
+        jnp.concatenate([x, 2 * x[-1:] / (1 if i == 0 else MASSES[-1])])
+        for i, x in enumerate(state)
+    )
+    problem = systems.n_body(masses, q, p, G=0.9)
+    step = 0.0, 0.1, q, p, problem.args
+    both = EVERY["harmonics"].on(problem).system.force(*step)
+    wanted = problem.system.force(*step) + EVERY["harmonics"](*step)
+    np.testing.assert_allclose(both, wanted, rtol=1e-14)
+    with pytest.raises(TypeError, match="a problem of dvi_jax"):
+        EVERY["tides"].on(problem.system)
+    with pytest.raises(TypeError):
+        EVERY["tides"] + 1.0
+
+
+def test_only_some_bodies(state):
+    force = forces.Radiation(0.1, LIGHT, on_bodies=(2,))
+    W = force_on(force, state)
+    assert np.all(W[:2] == 0)
+    assert np.any(W[2] != 0)
+    with pytest.raises(ValueError, match="on_bodies"):
+        force_on(forces.Radiation(0.1, LIGHT, on_bodies=(3,)), state)
+    with pytest.raises(ValueError, match="degree"):
+        forces.Harmonics(1.0, {1: 0.1})
+    with pytest.raises(ValueError, match="order"):
+        forces.Harmonics(1.0, {}, {(2, 3): (0.1, 0.1)})
+    with pytest.raises(TypeError, match="path"):
+        forces.ThirdBody(np.ones(3), 1.0)
+
+
+@pytest.mark.slow
+def test_orders_and_gradients_with_wisdom_holman(state):
+    """Forces of positions and of velocities in its kicks: order two, and the derivative by args."""
+    three = EVERY["harmonics"] + EVERY["tides"] + EVERY["radiation"]
+    problem = ((lambda args: args["factor"]) * three).on(systems.n_body(MASSES, *state, G=0.9))
+
+    def end(h, factor=1.0, method=dvi.WisdomHolman()):
+        args = problem.args | {"factor": factor}
+        sol = dvi.integrate(problem.system, *state, args=args, h=h, num_steps=round(2 / h),
+                            method=method, save=dvi.Save(final=True))  # fmt: skip
+        return sol.qs[-1]
+
+    exact = end(0.01, method=dvi.GaussLegendre(4))
+    errors = [float(np.abs(end(h) - exact).max()) for h in (0.1, 0.05)]
+    assert errors[0] / errors[1] == pytest.approx(4, rel=0.2)
+    derivative = jax.grad(lambda factor: end(0.1, factor)[1, 0])(1.0)
+    slope = (end(0.1, 1.001)[1, 0] - end(0.1, 0.999)[1, 0]) / 0.002
+    assert float(derivative) == pytest.approx(float(slope), rel=1e-5)
+    assert float(jnp.abs(end(0.1, 0.0) - end(0.1)).max()) > 1e-5
+
+
+def reboundx_case(name):
+    """Sets the parameters of a force in REBOUNDx."""
+
+    def set_up(sim, extras):
+        star, *planets = (body.params for body in sim.particles)
+        force = extras.load_force(name)
+        match name:
+            case "gravitational_harmonics":
+                star["J2"], star["J4"], star["R_eq"] = 0.1, -0.03, 0.3
+            case "radiation_forces":
+                force.params["c"], star["radiation_source"] = LIGHT, 1
+                planets[0]["beta"], planets[1]["beta"] = 0.1, 0.3
+            case "tides_constant_time_lag":
+                sim.particles[0].r = 0.4
+                star["tctl_k2"], star["tctl_tau"], star["OmegaMag"] = 30.0, 0.2, 0.7
+            case "modify_orbits_forces":
+                import reboundx
+
+                force.params["coordinates"] = reboundx.coordinates["PARTICLE"]
+                star["primary"] = 1
+                for planet, taus in zip(
+                    planets, [(-3.0, -2.0, -1.0), (5.0, -4.0, -8.0)], strict=True
+                ):
+                    planet["tau_a"], planet["tau_e"], planet["tau_inc"] = taus
+            case "gr":
+                force.params["c"] = 1e5
+        return force
+
+    return set_up
+
+
+@pytest.mark.parametrize(("name", "force", "limit"), [
+    ("gravitational_harmonics", EVERY["harmonics"], 1e-13),
+    ("radiation_forces", EVERY["radiation"], 1e-13),
+    ("tides_constant_time_lag", EVERY["tides"], 1e-12),
+    ("modify_orbits_forces", EVERY["damping"], 1e-13),
+    # To first order in 1/c² and in the masses.
+    ("gr", forces.Relativity(1e5), 3e-3),
+])  # fmt: skip
+def test_accelerations_are_those_of_reboundx(name, force, limit, state):
+    rebound = pytest.importorskip("rebound")
+    reboundx = pytest.importorskip("reboundx")
+    sim = rebound.Simulation()
+    sim.G = ARGS["G"]
+    for m, x, p in zip(MASSES, *map(np.asarray, state), strict=True):
+        sim.add(m=m, **dict(zip(("x", "y", "z", "vx", "vy", "vz"), [*x, *(p / m)], strict=True)))
+
+    def accelerations():
+        rebound.clibrebound.reb_simulation_update_acceleration(ctypes.byref(sim))
+        return np.array([[body.ax, body.ay, body.az] for body in sim.particles])
+
+    before = accelerations()
+    extras = reboundx.Extras(sim)
+    extras.add_force(reboundx_case(name)(sim, extras))
+    theirs = accelerations() - before
+    ours = force_on(force, state) / MASSES[:, None]
+    assert np.abs(theirs - ours).max() < limit * np.abs(theirs).max() + 4e-16 * np.abs(before).max()
+    assert np.abs(theirs).max() > 0
