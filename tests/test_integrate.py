@@ -388,6 +388,22 @@ def test_results_that_no_memory_can_hold_are_rejected_before_the_run(monkeypatch
         run(num_steps=9, observe=position)  # 10 · 2 · 8 bytes more
 
 
+@pytest.mark.parametrize("count", [10, 25])
+def test_the_steps_that_contain_requested_times_are_counted(monkeypatch, count):
+    """Measured for 192 MB of requested states: 756 MB. A step is four numbers, q, p and its number:
+    68 bytes."""
+    save = dvi.Save(ts=np.linspace(0.0, 0.9, count))
+    batch = jax.vmap(lambda q0: final_position(q0, save))
+    needed = 3 * count * (2.5 * 48 + 68)
+    monkeypatch.setattr(_memory, "machine_memory", lambda: needed - 1)
+    with pytest.raises(ValueError, match=rf"{count} saved states of each of 3 trajectories"):
+        batch(jnp.ones((3, 2)))
+    with pytest.raises(ValueError, match="the run with its derivative"):
+        jax.grad(lambda q0: batch(q0).sum())(jnp.ones((3, 2)))
+    monkeypatch.setattr(_memory, "machine_memory", lambda: needed)
+    assert jax.eval_shape(batch, jnp.ones((3, 2))).shape == (3, 2)
+
+
 @pytest.mark.slow
 def test_results_of_a_batch_are_counted_together(monkeypatch):
     monkeypatch.setattr(_memory, "machine_memory", lambda: 2.5 * 3 * 4 * 480 - 1)

@@ -145,6 +145,8 @@ def check_memory(
     num_stored *= is_differentiated
     needed = _COPIES[is_differentiated] * size
     needed += 2 * lanes * num_stored * 2 * q0.size * q0.dtype.itemsize
+    if save.ts is not None:  # the steps that contain the times are stored before these states
+        needed += lanes * num_states * (1 + is_differentiated) * (row + 2 * q0.dtype.itemsize + 4)
     if memory is None or needed <= memory:
         return
     # XLA does not compute results that the function around this one does not use.

@@ -270,7 +270,7 @@ def _in_pieces(task: Task, plan: Plan, q0, p0, report, layout) -> Outcome:
         state, rows = _piece(task, Plan(count, plan.block, *tail), state, layout)
         # JAX computes asynchronously: without waiting all reports would come at the beginning.
         jax.block_until_ready(state)
-        parts.append(rows)
+        parts.append(rows if parts else with_start(rows, q0, p0))
         report(plan.num_steps if is_last else blocks * plan.block, plan.num_steps)
     rows = jax.tree.map(lambda *xs: jnp.concatenate(xs), *parts)
-    return Outcome(state, with_start(rows, q0, p0), results_of(task, state))
+    return Outcome(state, rows, results_of(task, state))
